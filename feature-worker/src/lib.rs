@@ -1,0 +1,12 @@
+//! The vision process: camera frames in, V_e (section 3.3.1) and episodes out.
+#![forbid(unsafe_code)]
+
+pub mod bench;
+pub mod calibrate;
+pub mod episodes;
+pub mod extract;
+pub mod inspect;
+pub mod recorder;
+pub mod source;
+pub mod view;
+pub mod worker;

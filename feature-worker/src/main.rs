@@ -1,0 +1,41 @@
+//! Command line of `feature-worker`.
+
+use std::process::ExitCode;
+
+use clap::{Parser, Subcommand};
+use feature_worker::{worker, calibrate, view, inspect, episodes, bench};
+
+/// The vision process: camera frames in, V_e and episodes out.
+#[derive(Parser)]
+#[command(version, about, after_help = shared::exit::HELP)]
+struct Cli {
+    #[command(subcommand)]
+    command: Command,
+}
+
+#[derive(Subcommand)]
+enum Command {
+    /// Measures V_e in every frame, publishes it and records episodes.
+    Run(worker::Args),
+    /// Finds the container's axes and the liquid's colour; writes the [image] section.
+    Calibrate(calibrate::Args),
+    /// Shows the live stream with what is measured, in a local web page.
+    View(view::Args),
+    /// Writes pictures and a CSV of what is measured in images or a video.
+    Inspect(inspect::Args),
+    /// Lists, shows, checks, weighs and exports episodes.
+    Episodes(episodes::Args),
+    /// Measures the time of each stage of the extraction.
+    Bench(bench::Args),
+}
+
+fn main() -> ExitCode {
+    match Cli::parse().command {
+        Command::Run(args) => worker::run(&args),
+        Command::Calibrate(args) => calibrate::run(&args),
+        Command::View(args) => view::run(&args),
+        Command::Inspect(args) => inspect::run(&args),
+        Command::Episodes(args) => episodes::run(&args),
+        Command::Bench(args) => bench::run(&args),
+    }
+}

@@ -1,0 +1,1 @@
+//! Writes episodes in a thread of its own.

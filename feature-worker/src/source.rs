@@ -1,0 +1,1 @@
+//! Frames from a device, a video, an image sequence or shared memory.

@@ -1,0 +1,12 @@
+//! Shows the live stream with what is measured, in a local web page.
+
+use std::process::ExitCode;
+
+/// Command-line arguments.
+#[derive(Debug, clap::Args)]
+pub struct Args {}
+
+/// Runs the command; the exit codes are those of [`shared::exit`].
+pub fn run(_args: &Args) -> ExitCode {
+    shared::exit::fail(shared::exit::FAILED, "not built yet")
+}

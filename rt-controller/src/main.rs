@@ -1,0 +1,3 @@
+//! Command line of `rt-controller`.
+
+fn main() {}

@@ -1,0 +1,332 @@
+//! The cell's one TOML file: `config/cell.toml` for the real cell, `config/sim.toml` for the simulated one.
+//!
+//! Read once at start by every process; allocates. Unknown keys, wrong types and values out of range are refused with
+//! file, key and the allowed range ([`ConfigError`]). Relative paths are relative to the working directory.
+
+use std::net::IpAddr;
+use std::path::{Path, PathBuf};
+
+use serde::{Deserialize, Serialize};
+
+use crate::limits::Limits;
+
+/// Why a configuration is refused.
+#[derive(Debug, thiserror::Error)]
+pub enum ConfigError {
+    /// The file cannot be read.
+    #[error("{file}: {what}")]
+    Read {
+        /// The file.
+        file: String,
+        /// The system's words.
+        what: String,
+    },
+    /// Not TOML, an unknown key, a missing key or a wrong type.
+    #[error("{file}: {what}")]
+    Parse {
+        /// The file.
+        file: String,
+        /// Line, key and what was expected.
+        what: String,
+    },
+    /// A value outside its range.
+    #[error("{file}: {key} = {value}: allowed is {allowed}")]
+    Range {
+        /// The file.
+        file: String,
+        /// The key, with its table.
+        key: String,
+        /// What was given.
+        value: String,
+        /// What is allowed.
+        allowed: String,
+    },
+}
+
+/// The whole file.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Config {
+    /// Which cell this is.
+    pub cell: CellConfig,
+    /// Where frames come from.
+    pub camera: CameraConfig,
+    /// Where the lip is in the image, and how liquid is told from background.
+    pub image: ImageConfig,
+    /// The robot and its tilting joint.
+    pub robot: RobotConfig,
+    /// Limits on alpha.
+    pub limits: Limits,
+    /// The controller process.
+    pub controller: ControllerConfig,
+    /// The feature worker process.
+    pub worker: WorkerConfig,
+    /// Episodes.
+    pub recording: RecordingConfig,
+    /// The simulated cell's own table; only `simulator` reads it.
+    #[serde(default)]
+    pub simulator: Option<toml::Table>,
+}
+
+/// `[cell]`
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct CellConfig {
+    /// Names the cell's shared memory: 1 to 32 letters, digits, '-' or '_'.
+    pub name: String,
+}
+
+/// Where frames come from.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum CameraSource {
+    /// A V4L2 device through OpenCV.
+    Device,
+    /// A video file through OpenCV.
+    Video,
+    /// An image sequence through OpenCV (`frame_%04d.png`).
+    Images,
+    /// Frames that another process publishes in the cell's shared memory (service `frame`).
+    SharedMemory,
+}
+
+/// `[camera]`
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct CameraConfig {
+    /// Where frames come from.
+    pub source: CameraSource,
+    /// Device (`/dev/v4l/by-id/...`), video file or image pattern; empty for shared memory.
+    #[serde(default)]
+    pub path: String,
+    /// Width in px.
+    pub width_px: u32,
+    /// Height in px.
+    pub height_px: u32,
+    /// Frames a second.
+    pub fps: f64,
+}
+
+/// How liquid is told from background.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum LiquidMethod {
+    /// By its colour (`[image] colour`).
+    Colour,
+    /// Clear water: by edges, texture and change.
+    Clear,
+}
+
+/// `[image]`
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct ImageConfig {
+    /// How liquid is told from background.
+    pub method: LiquidMethod,
+    /// Region at the lip, px: x, y, width, height.
+    pub region_px: [u32; 4],
+    /// x-axis of Fig. 4: two points on the glass's top edge, px: x0, y0, x1, y1.
+    pub x_axis_px: [f32; 4],
+    /// y-axis of Fig. 4: two points on the container's left side, px: x0, y0, x1, y1.
+    pub y_axis_px: [f32; 4],
+    /// Colour range of the liquid in OpenCV's HSV: h_min, s_min, v_min, h_max, s_max, v_max (h 0-179, s and v 0-255;
+    /// h_min > h_max wraps around red).
+    pub colour_hsv: [u8; 6],
+    /// Areas below this are no stream, px^2.
+    pub area_min_px2: f32,
+}
+
+/// `[robot]`
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct RobotConfig {
+    /// The UR controller's address.
+    pub address: IpAddr,
+    /// The joint that tilts the container.
+    pub joint: Joint,
+    /// Angle of that joint when the container is upright (alpha = 0), degrees.
+    pub start_joint_deg: f64,
+    /// +1 or -1: sign of the joint's motion for growing alpha.
+    pub direction: f64,
+    /// Largest distance from the start angle at which the program starts, degrees.
+    pub start_tolerance_deg: f64,
+    /// First RTDE register used, 24 to 40 (0 to 23 belong to fieldbuses).
+    pub register_base: u8,
+    /// servoj lookahead time, s.
+    pub lookahead_s: f64,
+    /// servoj gain.
+    pub gain: f64,
+}
+
+/// A joint of the UR5, base to tool.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+#[allow(missing_docs)]
+pub enum Joint {
+    Base,
+    Shoulder,
+    Elbow,
+    #[serde(rename = "wrist_1")]
+    Wrist1,
+    #[serde(rename = "wrist_2")]
+    Wrist2,
+    #[serde(rename = "wrist_3")]
+    Wrist3,
+}
+
+impl Joint {
+    /// Index in the robot's joint vectors, 0 to 5.
+    pub fn index(self) -> usize {
+        self as usize
+    }
+}
+
+/// `[controller]`
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct ControllerConfig {
+    /// Ticks a second (30 in the paper).
+    pub rate_hz: f64,
+    /// Core that the loop is pinned to.
+    pub core: usize,
+    /// SCHED_FIFO priority; 0: ordinary scheduling.
+    pub priority: u8,
+    /// The weight file; watched, and taken between pours when it changes.
+    pub weights: PathBuf,
+    /// A pour ends when the newest feature is older than this, ms.
+    pub stale_feature_ms: u32,
+    /// The robot counts as lost when its newest state is older than this, ms.
+    pub lost_robot_ms: u32,
+    /// A pour ends after this many frames.
+    pub max_frames: u32,
+    /// The container is empty after this many frames without flow at the largest tilt.
+    pub empty_frames: u32,
+    /// Largest goal that is accepted, ml (the receiving container's size, D_max of eq. 3).
+    pub goal_max_ml: f32,
+}
+
+/// `[worker]`
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct WorkerConfig {
+    /// Core that extraction is pinned to.
+    pub core: usize,
+    /// SCHED_FIFO priority of extraction; 0: ordinary scheduling.
+    pub priority: u8,
+}
+
+/// Compression of recorded images.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+#[allow(missing_docs)]
+pub enum ImageFormat {
+    Jpeg,
+    Png,
+}
+
+/// `[recording]`
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct RecordingConfig {
+    /// Directory of the episodes.
+    pub directory: PathBuf,
+    /// Compression of the images.
+    pub image_format: ImageFormat,
+    /// JPEG quality, 1 to 100.
+    pub jpeg_quality: u8,
+    /// Most images waiting to be written; further ones are dropped and counted.
+    pub queue_frames: usize,
+}
+
+impl Config {
+    /// Reads and checks `file`.
+    pub fn read(file: &Path) -> Result<Self, ConfigError> {
+        let name = file.display().to_string();
+        let text = std::fs::read_to_string(file).map_err(|e| ConfigError::Read { file: name.clone(), what: format!("{e}; give --config FILE") })?;
+        Self::parse(&text, &name)
+    }
+
+    /// Parses and checks `text`; `file` is named in errors.
+    pub fn parse(text: &str, file: &str) -> Result<Self, ConfigError> {
+        let config: Self = toml::from_str(text).map_err(|e| {
+            let line = e.span().map_or(1, |s| text[..s.start].matches('\n').count() + 1);
+            ConfigError::Parse { file: file.into(), what: format!("line {line}: {}", e.message()) }
+        })?;
+        config.check(file)?;
+        Ok(config)
+    }
+
+    fn check(&self, file: &str) -> Result<(), ConfigError> {
+        let check = Check { file };
+        let Self { cell, camera, image, robot, limits, controller, worker, recording, simulator: _ } = self;
+        let name_ok = !cell.name.is_empty() && cell.name.len() <= 32 && cell.name.chars().all(|c| c.is_ascii_alphanumeric() || c == '-' || c == '_');
+        check.rule("cell.name", &cell.name, name_ok, "1 to 32 letters, digits, '-' or '_'")?;
+
+        check.range("camera.width_px", camera.width_px.into(), 64.0, 4096.0)?;
+        check.range("camera.height_px", camera.height_px.into(), 64.0, 4096.0)?;
+        check.range("camera.fps", camera.fps, 1.0, 240.0)?;
+        let needs_path = camera.source != CameraSource::SharedMemory;
+        check.rule("camera.path", &camera.path, !needs_path || !camera.path.is_empty(), "a device, file or pattern (only source = \"shared-memory\" has none)")?;
+
+        let [x, y, w, h] = image.region_px.map(f64::from);
+        let inside = w >= 8.0 && h >= 8.0 && x + w <= f64::from(camera.width_px) && y + h <= f64::from(camera.height_px);
+        check.rule("image.region_px", &format!("{:?}", image.region_px), inside, &format!("x, y, width, height of at least 8 x 8 inside {} x {}", camera.width_px, camera.height_px))?;
+        let direction = |a: [f32; 4]| (f64::from(a[2] - a[0]), f64::from(a[3] - a[1]));
+        for (key, axis) in [("image.x_axis_px", image.x_axis_px), ("image.y_axis_px", image.y_axis_px)] {
+            let (dx, dy) = direction(axis);
+            let fine = axis.iter().all(|v| v.is_finite()) && dx.hypot(dy) >= 2.0;
+            check.rule(key, &format!("{axis:?}"), fine, "x0, y0, x1, y1 of two points at least 2 px apart")?;
+        }
+        let ((ax, ay), (bx, by)) = (direction(image.x_axis_px), direction(image.y_axis_px));
+        let sine = (ax * by - ay * bx).abs() / (ax.hypot(ay) * bx.hypot(by));
+        check.rule("image.y_axis_px", &format!("{:?}", image.y_axis_px), sine > 0.17, "an axis at least 10 degrees from image.x_axis_px (these are nearly parallel)")?;
+        let [h0, s0, v0, h1, s1, v1] = image.colour_hsv;
+        let colour_ok = h0 <= 179 && h1 <= 179 && s0 < s1 && v0 < v1;
+        check.rule("image.colour_hsv", &format!("{:?}", image.colour_hsv), colour_ok, "h_min, s_min, v_min, h_max, s_max, v_max with h 0 to 179, s_min < s_max, v_min < v_max")?;
+        check.range("image.area_min_px2", image.area_min_px2.into(), 0.0, 1e5)?;
+
+        check.range("robot.start_joint_deg", robot.start_joint_deg, -360.0, 360.0)?;
+        check.rule("robot.direction", &robot.direction.to_string(), robot.direction.abs() == 1.0, "1 or -1")?;
+        check.range("robot.start_tolerance_deg", robot.start_tolerance_deg, 0.1, 10.0)?;
+        check.range("robot.register_base", robot.register_base.into(), 24.0, 40.0)?;
+        check.range("robot.lookahead_s", robot.lookahead_s, 0.03, 0.2)?;
+        check.range("robot.gain", robot.gain, 100.0, 2000.0)?;
+
+        check.range("limits.alpha_min_deg", limits.alpha_min_deg.into(), -20.0, 0.0)?;
+        check.range("limits.alpha_max_deg", limits.alpha_max_deg.into(), 10.0, 180.0)?;
+        check.range("limits.step_deg", limits.step_deg.into(), 0.1, 6.0)?;
+        check.range("limits.rate_deg_s", limits.rate_deg_s.into(), 1.0, 180.0)?;
+        check.range("limits.acceleration_deg_s2", limits.acceleration_deg_s2.into(), 10.0, 2290.0)?;
+        check.range("limits.return_rate_deg_s", limits.return_rate_deg_s.into(), 1.0, 180.0)?;
+
+        check.range("controller.rate_hz", controller.rate_hz, 10.0, 125.0)?;
+        check.range("controller.core", controller.core as f64, 0.0, 1023.0)?;
+        check.range("controller.priority", controller.priority.into(), 0.0, 99.0)?;
+        check.range("controller.stale_feature_ms", controller.stale_feature_ms.into(), 50.0, 1000.0)?;
+        check.range("controller.lost_robot_ms", controller.lost_robot_ms.into(), 20.0, 1000.0)?;
+        check.range("controller.max_frames", controller.max_frames.into(), 30.0, 100_000.0)?;
+        check.range("controller.empty_frames", controller.empty_frames.into(), 5.0, 1000.0)?;
+        check.range("controller.goal_max_ml", controller.goal_max_ml.into(), 1.0, 5000.0)?;
+        check.range("worker.core", worker.core as f64, 0.0, 1023.0)?;
+        check.range("worker.priority", worker.priority.into(), 0.0, 99.0)?;
+        check.range("recording.jpeg_quality", recording.jpeg_quality.into(), 1.0, 100.0)?;
+        check.range("recording.queue_frames", recording.queue_frames as f64, 2.0, 1000.0)
+    }
+}
+
+struct Check<'a> {
+    file: &'a str,
+}
+
+impl Check<'_> {
+    fn rule(&self, key: &str, value: &str, holds: bool, allowed: &str) -> Result<(), ConfigError> {
+        if holds {
+            return Ok(());
+        }
+        Err(ConfigError::Range { file: self.file.into(), key: key.into(), value: value.into(), allowed: allowed.into() })
+    }
+
+    fn range(&self, key: &str, value: f64, low: f64, high: f64) -> Result<(), ConfigError> {
+        self.rule(key, &value.to_string(), value >= low && value <= high, &format!("{low} to {high}"))
+    }
+}

@@ -1,0 +1,1 @@
+//! From V_e to ml: calibration and the estimate of the volume poured.

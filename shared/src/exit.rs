@@ -1,0 +1,27 @@
+//! Exit codes and the one-line error of every binary.
+
+use std::fmt::Display;
+use std::process::ExitCode;
+
+/// The work failed on the way (a file could not be written, a check found faults).
+pub const FAILED: u8 = 1;
+/// Wrong command line, configuration or input file; nothing was changed.
+pub const BAD_INPUT: u8 = 2;
+/// Another part of the cell (controller, worker, robot, camera, simulator) cannot be reached.
+pub const UNREACHABLE: u8 = 3;
+/// The pour or recording ended for another reason than its goal.
+pub const ENDED_EARLY: u8 = 4;
+/// The controller refused the request in its present state.
+pub const REFUSED: u8 = 5;
+/// Interrupted by Ctrl-C or SIGTERM.
+pub const INTERRUPTED: u8 = 130;
+
+/// The exit codes for `--help`.
+pub const HELP: &str = "Exit codes: 0 done, 1 failed, 2 bad command line, configuration or input file, 3 another part of the cell \
+cannot be reached, 4 the pour ended early, 5 refused, 130 interrupted.";
+
+/// Prints one line to standard error and gives the exit code.
+pub fn fail(code: u8, what: impl Display) -> ExitCode {
+    eprintln!("error: {what}");
+    ExitCode::from(code)
+}

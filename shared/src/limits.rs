@@ -1,0 +1,180 @@
+//! The one place that every target passes: limits on angle, step, rate and acceleration of alpha.
+//!
+//! Pure; runs in the controller's loop: no allocation, no panic. A request that is not finite counts as "stay". What was
+//! clipped is counted. This is not a safety function: the robot's own controller is.
+
+use serde::{Deserialize, Serialize};
+
+/// Limits on alpha, the tilt from upright.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Limits {
+    /// Smallest alpha, degrees, <= 0.
+    pub alpha_min_deg: f32,
+    /// Largest alpha, degrees.
+    pub alpha_max_deg: f32,
+    /// Largest change between two ticks, degrees.
+    pub step_deg: f32,
+    /// Largest rate, degrees/s.
+    pub rate_deg_s: f32,
+    /// Largest acceleration, degrees/s^2.
+    pub acceleration_deg_s2: f32,
+    /// Rate of the way back to upright, degrees/s.
+    pub return_rate_deg_s: f32,
+}
+
+impl Default for Limits {
+    fn default() -> Self {
+        Self { alpha_min_deg: 0.0, alpha_max_deg: 110.0, step_deg: 5.0, rate_deg_s: 90.0, acceleration_deg_s2: 1500.0, return_rate_deg_s: 60.0 }
+    }
+}
+
+/// How often each limit changed a request.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+pub struct Clipped {
+    /// Requests outside the angle range.
+    pub angle: u64,
+    /// Requests beyond step or rate.
+    pub rate: u64,
+    /// Requests beyond acceleration.
+    pub acceleration: u64,
+    /// Requests that were not finite.
+    pub not_finite: u64,
+}
+
+/// Turns requested angles into angles that keep all limits.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Limiter {
+    limits: Limits,
+    period_s: f32,
+    alpha_deg: f32,
+    rate_deg_s: f32,
+    clipped: Clipped,
+}
+
+impl Limiter {
+    /// A limiter at rest at `alpha_deg`, called once every `period_s` seconds.
+    pub fn new(limits: Limits, period_s: f32, alpha_deg: f32) -> Self {
+        Self { limits, period_s, alpha_deg, rate_deg_s: 0.0, clipped: Clipped::default() }
+    }
+
+    /// The commanded alpha, degrees.
+    pub fn alpha_deg(&self) -> f32 {
+        self.alpha_deg
+    }
+
+    /// The commanded rate, degrees/s.
+    pub fn rate_deg_s(&self) -> f32 {
+        self.rate_deg_s
+    }
+
+    /// What was clipped since [`Limiter::new`].
+    pub fn clipped(&self) -> Clipped {
+        self.clipped
+    }
+
+    /// Starts again at rest at `alpha_deg`, keeping the counts.
+    pub fn rest_at(&mut self, alpha_deg: f32) {
+        self.alpha_deg = alpha_deg;
+        self.rate_deg_s = 0.0;
+    }
+
+    /// Asks for `request_deg`; answers with the angle to command in this period, degrees.
+    ///
+    /// The rate never exceeds what can be braked to rest before the end of the angle range.
+    pub fn step(&mut self, request_deg: f32) -> f32 {
+        let Limits { alpha_min_deg, alpha_max_deg, step_deg, rate_deg_s, acceleration_deg_s2, .. } = self.limits;
+        let dt = self.period_s;
+        let request = if request_deg.is_finite() {
+            request_deg
+        } else {
+            self.clipped.not_finite += 1;
+            self.alpha_deg
+        };
+        let wanted = request.clamp(alpha_min_deg, alpha_max_deg);
+        self.clipped.angle += u64::from(wanted != request);
+
+        let top = rate_deg_s.min(step_deg / dt);
+        let asked = (wanted - self.alpha_deg) / dt;
+        let rate = asked.clamp(-top, top);
+        self.clipped.rate += u64::from(rate != asked);
+
+        // The fastest rate towards the wall from which whole periods of full braking still stop in time.
+        let change = acceleration_deg_s2 * dt;
+        let wall = if rate < 0.0 { self.alpha_deg - alpha_min_deg } else { alpha_max_deg - self.alpha_deg };
+        let braking = braking_rate(wall.max(0.0), change, dt);
+        let rate = rate.clamp(-braking, braking);
+        let limited = rate.clamp(self.rate_deg_s - change, self.rate_deg_s + change);
+        self.clipped.acceleration += u64::from(limited != rate);
+
+        let next = (self.alpha_deg + limited * dt).clamp(alpha_min_deg, alpha_max_deg);
+        self.rate_deg_s = (next - self.alpha_deg) / dt;
+        self.alpha_deg = next;
+        next
+    }
+
+    /// One period of the way back to upright, at the return rate.
+    pub fn step_upright(&mut self) -> f32 {
+        let goal = 0.0_f32.clamp(self.limits.alpha_min_deg, self.limits.alpha_max_deg);
+        let far = self.limits.return_rate_deg_s * self.period_s;
+        let request = self.alpha_deg + (goal - self.alpha_deg).clamp(-far, far);
+        self.step(request)
+    }
+}
+
+/// Largest rate r such that r, r - change, r - 2 change, ... (each held for dt) travels at most `distance`.
+fn braking_rate(distance: f32, change: f32, dt: f32) -> f32 {
+    if change <= 0.0 {
+        return 0.0;
+    }
+    // With n whole periods of braking behind this one: r (n + 1) - change n (n + 1) / 2 = distance / dt, r in (n, n + 1] change.
+    let reach = distance / (dt * change);
+    let n = ((((8.0 * reach + 1.0).sqrt() - 1.0) / 2.0).ceil() - 1.0).max(0.0);
+    change * (reach / (n + 1.0) + n / 2.0)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use proptest::prelude::*;
+
+    const DT: f32 = 1.0 / 30.0;
+
+    proptest! {
+        /// Protects the robot: no request, however wild, leads beyond any limit.
+        #[test]
+        fn every_target_keeps_every_limit(requests in prop::collection::vec(prop_oneof![-1e4f32..1e4, Just(f32::NAN), Just(f32::INFINITY), -10f32..120.0], 1..200)) {
+            let limits = Limits::default();
+            let mut limiter = Limiter::new(limits, DT, 0.0);
+            let (mut alpha, mut rate) = (0.0f32, 0.0f32);
+            for request in requests {
+                let next = limiter.step(request);
+                prop_assert!(next >= limits.alpha_min_deg && next <= limits.alpha_max_deg);
+                let new_rate = (next - alpha) / DT;
+                prop_assert!(new_rate.abs() <= limits.rate_deg_s * 1.001, "rate {new_rate}");
+                prop_assert!((new_rate - rate).abs() <= limits.acceleration_deg_s2 * DT * 1.01, "from {rate} to {new_rate} at {next}");
+                (alpha, rate) = (next, new_rate);
+            }
+        }
+    }
+
+    /// Protects the pour's end: upright is reached, and exactly.
+    #[test]
+    fn the_way_back_ends_at_zero() {
+        let mut limiter = Limiter::new(Limits::default(), DT, 80.0);
+        for _ in 0..60 {
+            limiter.step_upright();
+        }
+        assert_eq!(limiter.alpha_deg(), 0.0);
+    }
+
+    /// Protects the operator's view: what was clipped is counted by cause.
+    #[test]
+    fn clipping_is_counted() {
+        let mut limiter = Limiter::new(Limits::default(), DT, 0.0);
+        limiter.step(f32::NAN);
+        limiter.step(500.0);
+        let clipped = limiter.clipped();
+        assert_eq!((clipped.not_finite, clipped.angle, clipped.rate, clipped.acceleration), (1, 1, 1, 1));
+    }
+}

@@ -1,0 +1,307 @@
+//! Fixed-layout messages that cross shared memory.
+//!
+//! Every struct is `repr(C)` without padding, carries [`LAYOUT_VERSION`] and a sequence number, and is plain data:
+//! it may be read by another process at any time. The byte tables are in `ARCHITECTURE.md` and are held by tests below.
+//! All times are CLOCK_MONOTONIC in nanoseconds. Nothing here allocates.
+
+use iceoryx2::prelude::ZeroCopySend;
+
+/// Version of all layouts in this file; part of every service's name, so that other versions never connect.
+pub const LAYOUT_VERSION: u32 = 1;
+
+/// Pixel layout of a camera frame.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[repr(u32)]
+pub enum PixelFormat {
+    /// 3 bytes a pixel: blue, green, red (OpenCV's order).
+    Bgr8 = 0,
+    /// 1 byte a pixel.
+    Mono8 = 1,
+    /// 2 bytes a pixel, 4:2:2, Y0 U Y1 V.
+    Yuyv = 2,
+}
+
+impl PixelFormat {
+    /// The format with this code, if there is one.
+    pub fn from_code(code: u32) -> Option<Self> {
+        [Self::Bgr8, Self::Mono8, Self::Yuyv].into_iter().find(|f| *f as u32 == code)
+    }
+
+    /// Bytes of one pixel.
+    pub fn bytes_per_pixel(self) -> usize {
+        match self {
+            Self::Bgr8 => 3,
+            Self::Mono8 => 1,
+            Self::Yuyv => 2,
+        }
+    }
+}
+
+/// Header of one camera frame (the user header of service `frame`; the payload is the pixels, row by row, no padding).
+#[derive(Debug, Clone, Copy, PartialEq, Default, ZeroCopySend)]
+#[repr(C)]
+pub struct FrameHeader {
+    /// [`LAYOUT_VERSION`].
+    pub version: u32,
+    /// A [`PixelFormat`] code.
+    pub format: u32,
+    /// Width in pixels.
+    pub width_px: u32,
+    /// Height in pixels.
+    pub height_px: u32,
+    /// Counts every frame that the camera exposed, also those that were dropped; starts at 1.
+    pub sequence: u64,
+    /// Middle of the exposure, CLOCK_MONOTONIC ns.
+    pub captured_at_ns: u64,
+    /// When the driver published it, CLOCK_MONOTONIC ns.
+    pub published_at_ns: u64,
+}
+
+/// Why a feature is doubtful. `None` means: trust it.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+#[repr(u32)]
+pub enum Doubt {
+    /// A good measurement.
+    #[default]
+    None = 0,
+    /// The region is too dark to see anything.
+    TooDark = 1,
+    /// The region is blown out.
+    BlownOut = 2,
+    /// Motion blur or lost focus.
+    Blurred = 3,
+    /// The camera repeats the same picture.
+    Frozen = 4,
+    /// There is liquid, but its outer edge gives no line.
+    EdgeNotFound = 5,
+    /// The stream leaves the region, so the area is a lower bound.
+    LeavesRegion = 6,
+    /// The frame has another size or format than configured.
+    WrongFormat = 7,
+}
+
+impl Doubt {
+    /// All reasons, in code order.
+    pub const ALL: [Self; 8] = [
+        Self::None,
+        Self::TooDark,
+        Self::BlownOut,
+        Self::Blurred,
+        Self::Frozen,
+        Self::EdgeNotFound,
+        Self::LeavesRegion,
+        Self::WrongFormat,
+    ];
+
+    /// The reason with this code; unknown codes count as a frame that cannot be used.
+    pub fn from_code(code: u32) -> Self {
+        Self::ALL.into_iter().find(|d| *d as u32 == code).unwrap_or(Self::WrongFormat)
+    }
+
+    /// Whether the area may still be used as a measurement.
+    pub fn usable(self) -> bool {
+        matches!(self, Self::None | Self::Blurred | Self::LeavesRegion)
+    }
+
+    /// The reason in words.
+    pub fn words(self) -> &'static str {
+        match self {
+            Self::None => "none",
+            Self::TooDark => "too dark",
+            Self::BlownOut => "blown out",
+            Self::Blurred => "blurred",
+            Self::Frozen => "frozen frame",
+            Self::EdgeNotFound => "edge not found",
+            Self::LeavesRegion => "stream leaves the region",
+            Self::WrongFormat => "wrong frame format",
+        }
+    }
+}
+
+/// What the feature worker measured in one frame (service `feature`): V_e of section 3.3.1.
+#[derive(Debug, Clone, Copy, PartialEq, Default, ZeroCopySend)]
+#[repr(C)]
+pub struct Feature {
+    /// [`LAYOUT_VERSION`].
+    pub version: u32,
+    /// A [`Doubt`] code.
+    pub doubt: u32,
+    /// The camera's frame number ([`FrameHeader::sequence`]); a gap means frames that nobody measured.
+    pub sequence: u64,
+    /// Start time of the worker process, CLOCK_MONOTONIC ns: a change means that the worker was restarted.
+    pub worker_epoch_ns: u64,
+    /// Middle of the frame's exposure, CLOCK_MONOTONIC ns.
+    pub captured_at_ns: u64,
+    /// When the worker took the frame, CLOCK_MONOTONIC ns.
+    pub received_at_ns: u64,
+    /// When the worker published this, CLOCK_MONOTONIC ns.
+    pub published_at_ns: u64,
+    /// V_e: area of the triangle in px^2, exactly 0 without a stream, >= 0, finite.
+    pub area_px2: f32,
+    /// Confidence, 0 (none) to 1 (full).
+    pub confidence: f32,
+    /// Corners of the triangle in the image, x0 y0 x1 y1 x2 y2 in px (axes' crossing, on the x-axis, on the y-axis).
+    pub triangle_px: [f32; 6],
+}
+
+/// What the controller was doing in a tick.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, serde::Serialize, serde::Deserialize)]
+#[serde(rename_all = "kebab-case")]
+#[repr(u32)]
+pub enum Phase {
+    /// No usable robot: not connected, or not allowed to move.
+    #[default]
+    NoRobot = 0,
+    /// Upright at the start angle, d = 0.
+    Idle = 1,
+    /// A goal is set; the policy decides.
+    Pouring = 2,
+    /// The pour or episode is over or aborted; on the way back to the start angle.
+    Returning = 3,
+    /// Runs the curve of eq. (1).
+    Recording = 4,
+    /// Upright; the last drops are counted before the result is given.
+    Settling = 5,
+}
+
+impl Phase {
+    /// The phase with this code; unknown codes read as [`Phase::NoRobot`].
+    pub fn from_code(code: u32) -> Self {
+        [Self::NoRobot, Self::Idle, Self::Pouring, Self::Returning, Self::Recording, Self::Settling]
+            .into_iter()
+            .find(|p| *p as u32 == code)
+            .unwrap_or_default()
+    }
+}
+
+/// What one tick of the controller saw, decided and sent (service `telemetry`); everything an episode records of it.
+#[derive(Debug, Clone, Copy, PartialEq, Default, ZeroCopySend)]
+#[repr(C)]
+pub struct Telemetry {
+    /// [`LAYOUT_VERSION`].
+    pub version: u32,
+    /// A [`Phase`] code.
+    pub phase: u32,
+    /// Counts ticks since the controller started.
+    pub tick: u64,
+    /// When the tick woke up, CLOCK_MONOTONIC ns.
+    pub at_ns: u64,
+    /// When the newest robot state in it arrived, CLOCK_MONOTONIC ns; 0 before the first.
+    pub robot_at_ns: u64,
+    /// The pour or recording that this tick belongs to: 0 = none. Unique for a controller process.
+    pub episode: u64,
+    /// [`Feature::sequence`] of the newest feature used; 0 before the first.
+    pub feature_sequence: u64,
+    /// Commanded alpha after all limits, degrees from upright.
+    pub alpha_deg: f32,
+    /// Measured alpha, degrees from upright; NaN before the first robot state.
+    pub alpha_measured_deg: f32,
+    /// Action of the policy in this tick, degrees; NaN if the policy was not asked.
+    pub dalpha_deg: f32,
+    /// V_e of the newest feature, px^2; NaN if there was none in this tick.
+    pub area_px2: f32,
+    /// Outflow attributed to the newest frame, ml.
+    pub v_ml: f32,
+    /// d: volume still to pour, ml; may be negative.
+    pub d_ml: f32,
+    /// Goal volume V_G, ml; NaN in a recording.
+    pub goal_ml: f32,
+    /// Estimated volume poured so far, ml.
+    pub poured_ml: f32,
+    /// Recording only, eq. (1): lambda, degrees.
+    pub lambda_deg: f32,
+    /// Recording only, eq. (1): gamma, 1/s^2.
+    pub gamma_per_s2: f32,
+    /// Recording only, eq. (1): beta, s.
+    pub beta_s: f32,
+    /// Reserved, 0.
+    pub reserved: f32,
+}
+
+/// What the recorder did with an episode (service `recorder`, the newest is kept for late readers).
+#[derive(Debug, Clone, Copy, PartialEq, ZeroCopySend)]
+#[repr(C)]
+pub struct RecorderReport {
+    /// [`LAYOUT_VERSION`].
+    pub version: u32,
+    /// A [`RecorderState`] code.
+    pub state: u32,
+    /// [`Telemetry::episode`].
+    pub episode: u64,
+    /// Images written.
+    pub images: u64,
+    /// Images that the recorder had to drop.
+    pub dropped: u64,
+    /// Length of `path` in bytes.
+    pub path_len: u64,
+    /// The file's absolute path, UTF-8, cut at 512 bytes; or the error's text in state [`RecorderState::Failed`].
+    pub path: [u8; 512],
+}
+
+/// State of an episode's file.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[repr(u32)]
+pub enum RecorderState {
+    /// Being written.
+    Writing = 0,
+    /// Closed and whole.
+    Complete = 1,
+    /// Could not be written; the path holds the reason.
+    Failed = 2,
+}
+
+impl RecorderState {
+    /// The state with this code; unknown codes read as [`RecorderState::Failed`].
+    pub fn from_code(code: u32) -> Self {
+        match code {
+            0 => Self::Writing,
+            1 => Self::Complete,
+            _ => Self::Failed,
+        }
+    }
+}
+
+impl RecorderReport {
+    /// A report with `text` (a path, or an error's words) cut to fit.
+    pub fn new(state: RecorderState, episode: u64, images: u64, dropped: u64, text: &str) -> Self {
+        let mut end = text.len().min(512);
+        while !text.is_char_boundary(end) {
+            end -= 1;
+        }
+        let mut path = [0; 512];
+        path[..end].copy_from_slice(&text.as_bytes()[..end]);
+        Self { version: LAYOUT_VERSION, state: state as u32, episode, images, dropped, path_len: end as u64, path }
+    }
+
+    /// The path, or the error's text.
+    pub fn text(&self) -> &str {
+        let len = usize::try_from(self.path_len).unwrap_or(0).min(self.path.len());
+        std::str::from_utf8(&self.path[..len]).unwrap_or("")
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Protects readers built from ARCHITECTURE.md's byte tables: layouts change only together with LAYOUT_VERSION.
+    #[test]
+    fn layouts_have_the_documented_sizes_and_offsets() {
+        assert_eq!(size_of::<FrameHeader>(), 40);
+        assert_eq!(std::mem::offset_of!(FrameHeader, sequence), 16);
+        assert_eq!(size_of::<Feature>(), 80);
+        assert_eq!(std::mem::offset_of!(Feature, area_px2), 48);
+        assert_eq!(std::mem::offset_of!(Feature, triangle_px), 56);
+        assert_eq!(size_of::<Telemetry>(), 96);
+        assert_eq!(std::mem::offset_of!(Telemetry, alpha_deg), 48);
+        assert_eq!(size_of::<RecorderReport>(), 552);
+    }
+
+    /// Protects operators from a cut path that is not text.
+    #[test]
+    fn a_long_path_is_cut_at_a_character() {
+        let long = "ä".repeat(400);
+        let report = RecorderReport::new(RecorderState::Complete, 1, 2, 3, &long);
+        assert_eq!(report.text(), "ä".repeat(256));
+    }
+}

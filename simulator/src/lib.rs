@@ -1,0 +1,12 @@
+//! The simulated cell: container physics, rendered camera, UR5 controller, kitchen scale. Only it knows the truth.
+#![forbid(unsafe_code)]
+
+pub mod camera;
+pub mod cell;
+pub mod evaluate;
+pub mod evaluate_camera;
+pub mod operator;
+pub mod physics;
+pub mod reproduce;
+pub mod ur;
+pub mod ur_command;

@@ -1,0 +1,41 @@
+//! Command line of `simulator`.
+
+use std::process::ExitCode;
+
+use clap::{Parser, Subcommand};
+use simulator::{cell, operator, evaluate, reproduce, evaluate_camera, ur_command};
+
+/// The simulated cell, and everything that needs it.
+#[derive(Parser)]
+#[command(version, about, after_help = shared::exit::HELP)]
+struct Cli {
+    #[command(subcommand)]
+    command: Command,
+}
+
+#[derive(Subcommand)]
+enum Command {
+    /// Runs the simulated cell: UR5 controller, container, camera, scale.
+    Run(cell::Args),
+    /// What an operator does at the cell: fill the container, read the scale.
+    Operator(operator::Args),
+    /// Pours in closed loop over a held-out grid and reports the errors.
+    Evaluate(evaluate::Args),
+    /// Repeats section 4 of the paper.
+    Reproduce(reproduce::Args),
+    /// Measures the feature extraction against rendered truth.
+    EvaluateCamera(evaluate_camera::Args),
+    /// Runs only the simulated UR5 controller.
+    Ur(ur_command::Args),
+}
+
+fn main() -> ExitCode {
+    match Cli::parse().command {
+        Command::Run(args) => cell::run(&args),
+        Command::Operator(args) => operator::run(&args),
+        Command::Evaluate(args) => evaluate::run(&args),
+        Command::Reproduce(args) => reproduce::run(&args),
+        Command::EvaluateCamera(args) => evaluate_camera::run(&args),
+        Command::Ur(args) => ur_command::run(&args),
+    }
+}

@@ -1,0 +1,1 @@
+//! Container physics: the simulators "a" (the paper's) and "b" (physical).

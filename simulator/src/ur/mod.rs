@@ -1,0 +1,1 @@
+//! The simulated UR5 controller: RTDE, URScript, dashboard.
