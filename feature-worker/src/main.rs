@@ -3,7 +3,7 @@
 use std::process::ExitCode;
 
 use clap::{Parser, Subcommand};
-use feature_worker::{worker, calibrate, view, inspect, episodes, bench};
+use feature_worker::{bench, calibrate, episodes, inspect, view, worker};
 
 /// The vision process: camera frames in, V_e and episodes out.
 #[derive(Parser)]

@@ -242,7 +242,8 @@ impl Config {
     /// Reads and checks `file`.
     pub fn read(file: &Path) -> Result<Self, ConfigError> {
         let name = file.display().to_string();
-        let text = std::fs::read_to_string(file).map_err(|e| ConfigError::Read { file: name.clone(), what: format!("{e}; give --config FILE") })?;
+        let text = std::fs::read_to_string(file)
+            .map_err(|e| ConfigError::Read { file: name.clone(), what: format!("{e}; give --config FILE") })?;
         Self::parse(&text, &name)
     }
 
@@ -259,18 +260,29 @@ impl Config {
     fn check(&self, file: &str) -> Result<(), ConfigError> {
         let check = Check { file };
         let Self { cell, camera, image, robot, limits, controller, worker, recording, simulator: _ } = self;
-        let name_ok = !cell.name.is_empty() && cell.name.len() <= 32 && cell.name.chars().all(|c| c.is_ascii_alphanumeric() || c == '-' || c == '_');
+        let name_ok =
+            !cell.name.is_empty() && cell.name.len() <= 32 && cell.name.chars().all(|c| c.is_ascii_alphanumeric() || c == '-' || c == '_');
         check.rule("cell.name", &cell.name, name_ok, "1 to 32 letters, digits, '-' or '_'")?;
 
         check.range("camera.width_px", camera.width_px.into(), 64.0, 4096.0)?;
         check.range("camera.height_px", camera.height_px.into(), 64.0, 4096.0)?;
         check.range("camera.fps", camera.fps, 1.0, 240.0)?;
         let needs_path = camera.source != CameraSource::SharedMemory;
-        check.rule("camera.path", &camera.path, !needs_path || !camera.path.is_empty(), "a device, file or pattern (only source = \"shared-memory\" has none)")?;
+        check.rule(
+            "camera.path",
+            &camera.path,
+            !needs_path || !camera.path.is_empty(),
+            "a device, file or pattern (only source = \"shared-memory\" has none)",
+        )?;
 
         let [x, y, w, h] = image.region_px.map(f64::from);
         let inside = w >= 8.0 && h >= 8.0 && x + w <= f64::from(camera.width_px) && y + h <= f64::from(camera.height_px);
-        check.rule("image.region_px", &format!("{:?}", image.region_px), inside, &format!("x, y, width, height of at least 8 x 8 inside {} x {}", camera.width_px, camera.height_px))?;
+        check.rule(
+            "image.region_px",
+            &format!("{:?}", image.region_px),
+            inside,
+            &format!("x, y, width, height of at least 8 x 8 inside {} x {}", camera.width_px, camera.height_px),
+        )?;
         let direction = |a: [f32; 4]| (f64::from(a[2] - a[0]), f64::from(a[3] - a[1]));
         for (key, axis) in [("image.x_axis_px", image.x_axis_px), ("image.y_axis_px", image.y_axis_px)] {
             let (dx, dy) = direction(axis);
@@ -279,10 +291,20 @@ impl Config {
         }
         let ((ax, ay), (bx, by)) = (direction(image.x_axis_px), direction(image.y_axis_px));
         let sine = (ax * by - ay * bx).abs() / (ax.hypot(ay) * bx.hypot(by));
-        check.rule("image.y_axis_px", &format!("{:?}", image.y_axis_px), sine > 0.17, "an axis at least 10 degrees from image.x_axis_px (these are nearly parallel)")?;
+        check.rule(
+            "image.y_axis_px",
+            &format!("{:?}", image.y_axis_px),
+            sine > 0.17,
+            "an axis at least 10 degrees from image.x_axis_px (these are nearly parallel)",
+        )?;
         let [h0, s0, v0, h1, s1, v1] = image.colour_hsv;
         let colour_ok = h0 <= 179 && h1 <= 179 && s0 < s1 && v0 < v1;
-        check.rule("image.colour_hsv", &format!("{:?}", image.colour_hsv), colour_ok, "h_min, s_min, v_min, h_max, s_max, v_max with h 0 to 179, s_min < s_max, v_min < v_max")?;
+        check.rule(
+            "image.colour_hsv",
+            &format!("{:?}", image.colour_hsv),
+            colour_ok,
+            "h_min, s_min, v_min, h_max, s_max, v_max with h 0 to 179, s_min < s_max, v_min < v_max",
+        )?;
         check.range("image.area_min_px2", image.area_min_px2.into(), 0.0, 1e5)?;
 
         check.range("robot.start_joint_deg", robot.start_joint_deg, -360.0, 360.0)?;

@@ -78,7 +78,12 @@ impl Cell {
         Ok((name, full))
     }
 
-    fn topic<T: ZeroCopySend + std::fmt::Debug + 'static>(&self, service: &str, publishers: usize, history: usize) -> Result<Topic<T>, IpcError> {
+    fn topic<T: ZeroCopySend + std::fmt::Debug + 'static>(
+        &self,
+        service: &str,
+        publishers: usize,
+        history: usize,
+    ) -> Result<Topic<T>, IpcError> {
         let (name, full) = self.name(service)?;
         self.node
             .service_builder(&name)
@@ -115,12 +120,18 @@ impl Cell {
 
     /// Wakes up when the camera driver has published a frame.
     pub fn frame_listener(&self) -> Result<FrameListener, IpcError> {
-        self.frame_event()?.listener_builder().create().map_err(|e| IpcError::Service { service: "frame-event".into(), what: format!("{e:?}") })
+        self.frame_event()?
+            .listener_builder()
+            .create()
+            .map_err(|e| IpcError::Service { service: "frame-event".into(), what: format!("{e:?}") })
     }
 
     /// For the camera driver: call `notify()` after each frame.
     pub fn frame_notifier(&self) -> Result<FrameNotifier, IpcError> {
-        self.frame_event()?.notifier_builder().create().map_err(|e| IpcError::Service { service: "frame-event".into(), what: format!("{e:?}") })
+        self.frame_event()?
+            .notifier_builder()
+            .create()
+            .map_err(|e| IpcError::Service { service: "frame-event".into(), what: format!("{e:?}") })
     }
 
     /// V_e of each frame, from one feature worker.

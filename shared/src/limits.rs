@@ -25,7 +25,14 @@ pub struct Limits {
 
 impl Default for Limits {
     fn default() -> Self {
-        Self { alpha_min_deg: 0.0, alpha_max_deg: 110.0, step_deg: 5.0, rate_deg_s: 90.0, acceleration_deg_s2: 1500.0, return_rate_deg_s: 60.0 }
+        Self {
+            alpha_min_deg: 0.0,
+            alpha_max_deg: 110.0,
+            step_deg: 5.0,
+            rate_deg_s: 90.0,
+            acceleration_deg_s2: 1500.0,
+            return_rate_deg_s: 60.0,
+        }
     }
 }
 

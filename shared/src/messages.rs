@@ -82,16 +82,8 @@ pub enum Doubt {
 
 impl Doubt {
     /// All reasons, in code order.
-    pub const ALL: [Self; 8] = [
-        Self::None,
-        Self::TooDark,
-        Self::BlownOut,
-        Self::Blurred,
-        Self::Frozen,
-        Self::EdgeNotFound,
-        Self::LeavesRegion,
-        Self::WrongFormat,
-    ];
+    pub const ALL: [Self; 8] =
+        [Self::None, Self::TooDark, Self::BlownOut, Self::Blurred, Self::Frozen, Self::EdgeNotFound, Self::LeavesRegion, Self::WrongFormat];
 
     /// The reason with this code; unknown codes count as a frame that cannot be used.
     pub fn from_code(code: u32) -> Self {

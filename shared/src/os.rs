@@ -11,9 +11,6 @@ pub fn now_ns() -> u64 {
 
 /// Sleeps until the CLOCK_MONOTONIC time `deadline_ns`; returns at once if it has passed. Signals do not cut it short.
 pub fn sleep_until_ns(deadline_ns: u64) {
-    let request = rustix::time::Timespec {
-        tv_sec: (deadline_ns / 1_000_000_000) as i64,
-        tv_nsec: (deadline_ns % 1_000_000_000) as i64,
-    };
+    let request = rustix::time::Timespec { tv_sec: (deadline_ns / 1_000_000_000) as i64, tv_nsec: (deadline_ns % 1_000_000_000) as i64 };
     while let Err(rustix::io::Errno::INTR) = rustix::thread::clock_nanosleep_absolute(rustix::thread::ClockId::Monotonic, &request) {}
 }

@@ -3,7 +3,7 @@
 use std::process::ExitCode;
 
 use clap::{Parser, Subcommand};
-use simulator::{cell, operator, evaluate, reproduce, evaluate_camera, ur_command};
+use simulator::{cell, evaluate, evaluate_camera, operator, reproduce, ur_command};
 
 /// The simulated cell, and everything that needs it.
 #[derive(Parser)]
