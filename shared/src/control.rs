@@ -54,7 +54,7 @@ pub enum Reply {
 }
 
 /// How a pour or recording ended.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct Outcome {
     /// Number of the pour or recording.
     pub episode: u64,
