@@ -209,8 +209,7 @@ pub struct Core {
 }
 
 /// A decision before anything was decided.
-const NOTHING: Decision =
-    Decision { action: 10, dalpha_deg: 0.0, v_ml: 0.0, d_ml: 0.0, poured_ml: 0.0, finished: false, flowing: false };
+const NOTHING: Decision = Decision { action: 10, dalpha_deg: 0.0, v_ml: 0.0, d_ml: 0.0, poured_ml: 0.0, finished: false, flowing: false };
 
 impl Core {
     /// A controller without robot and weights.

@@ -7,11 +7,11 @@ use std::sync::atomic::{AtomicBool, AtomicU64};
 
 use crossbeam::queue::ArrayQueue;
 use shared::agent::Agent;
-use shared::control::Outcome;
+use shared::control::{EndReason, Outcome};
 use shared::messages::Telemetry;
 
 use crate::core::{Counters, Order, Refusal};
-use crate::link::Session;
+use crate::link::{Lost, Session};
 use crate::timing::Histogram;
 
 /// What the loop tells the ordinary thread.
@@ -23,6 +23,24 @@ pub enum Event {
     Ordered(Result<(), Refusal>),
     /// A pour or recording has ended.
     Ended(Outcome),
+}
+
+/// Why the loop gives a robot's session back.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum SessionEnd {
+    /// The connection is gone.
+    Lost(Lost),
+    /// The robot may not move any more.
+    Unwell(EndReason),
+}
+
+impl std::fmt::Display for SessionEnd {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        match self {
+            Self::Lost(lost) => write!(f, "{lost}"),
+            Self::Unwell(reason) => write!(f, "{}", reason.words()),
+        }
+    }
 }
 
 /// Histograms of the loop, all in nanoseconds.
@@ -53,7 +71,7 @@ pub struct Exchange {
     /// To the loop: a connected robot.
     pub sessions: ArrayQueue<Box<Session>>,
     /// From the loop: lost robots to drop.
-    pub old_sessions: ArrayQueue<Box<Session>>,
+    pub old_sessions: ArrayQueue<(Box<Session>, SessionEnd)>,
     /// Histograms.
     pub timing: Timing,
     /// Allocations and frees of the loop since it started.

@@ -24,7 +24,7 @@ use shared::weights::Weights;
 use crate::client::MESSAGE_MAX;
 use crate::core::{Counters, Order, Refusal};
 use crate::exchange::{Event, Exchange};
-use crate::link;
+use crate::link::{self, LinkOptions};
 
 /// How often the ordinary side looks: far below a person's patience, and cheap.
 const BEAT: Duration = Duration::from_millis(20);
@@ -56,17 +56,26 @@ impl RobotNote {
 }
 
 /// Keeps a connected robot in the loop's hands; runs in a thread of its own until `stop`, because connecting blocks.
-pub fn keep_robot_connected(config: &Config, exchange: &Exchange, note: &RobotNote, connections: &std::sync::atomic::AtomicU64, stop: &AtomicBool, say: &dyn Fn(&str)) {
+pub fn keep_robot_connected(
+    config: &Config,
+    exchange: &Exchange,
+    note: &RobotNote,
+    connections: &std::sync::atomic::AtomicU64,
+    stop: &AtomicBool,
+    say: &dyn Fn(&str),
+) {
+    let options = LinkOptions::new(config);
     let mut connected = false;
     let mut next = Instant::now();
     while !stop.load(Relaxed) {
-        while let Some(dead) = exchange.old_sessions.pop() {
-            note.set(dead.obituary(), say);
+        while let Some((session, end)) = exchange.old_sessions.pop() {
+            drop(session);
+            note.set(format!("robot: {end}"), say);
             connected = false;
             next = Instant::now() + RECONNECT;
         }
         if !connected && Instant::now() >= next {
-            match link::connect(config) {
+            match link::connect(&options) {
                 Ok(session) => {
                     connected = exchange.sessions.push(Box::new(session)).is_ok();
                     connections.fetch_add(1, Relaxed);
@@ -156,12 +165,8 @@ impl<'a> Service<'a> {
         say: &'a dyn Fn(&str),
     ) -> Result<Self, IpcError> {
         let fail = |service: &str, e: String| IpcError::Service { service: service.into(), what: e };
-        let server = cell
-            .control()?
-            .server_builder()
-            .initial_max_slice_len(MESSAGE_MAX)
-            .create()
-            .map_err(|e| fail("control", format!("{e:?}")))?;
+        let server =
+            cell.control()?.server_builder().initial_max_slice_len(MESSAGE_MAX).create().map_err(|e| fail("control", format!("{e:?}")))?;
         let telemetry = cell.telemetry()?.publisher_builder().create().map_err(|e| fail("telemetry", format!("{e:?}")))?;
         // Episode numbers grow over restarts, so that a recorder never takes two runs for one.
         let next_episode = std::time::SystemTime::now().duration_since(std::time::UNIX_EPOCH).map_or(1, |d| d.as_secs());
@@ -207,18 +212,23 @@ impl<'a> Service<'a> {
                 }
                 Event::Ordered(answer) => {
                     if let Some((asked, episode)) = self.waiting.pop_front() {
-                        reply(&asked, &match answer {
-                            Ok(()) if episode == 0 => Reply::Aborting,
-                            Ok(()) => Reply::Started { episode },
-                            Err(refusal) => Reply::Refused { reason: self.words(refusal) },
-                        });
+                        reply(
+                            &asked,
+                            &match answer {
+                                Ok(()) if episode == 0 => Reply::Aborting,
+                                Ok(()) => Reply::Started { episode },
+                                Err(refusal) => Reply::Refused { reason: self.words(refusal) },
+                            },
+                        );
                     }
                 }
                 Event::Ended(outcome) => {
                     (self.say)(&format!(
                         "episode {}: {}, {} after {:.1} s",
                         outcome.episode,
-                        outcome.goal_ml.map_or("curve".into(), |g| format!("goal {g:.1} ml, {:.1} ml poured (estimate)", outcome.poured_ml)),
+                        outcome
+                            .goal_ml
+                            .map_or("curve".into(), |g| format!("goal {g:.1} ml, {:.1} ml poured (estimate)", outcome.poured_ml)),
                         outcome.reason.words(),
                         outcome.seconds
                     ));
@@ -243,7 +253,10 @@ impl<'a> Service<'a> {
     fn answer(&mut self) {
         while let Ok(Some(asked)) = self.server.receive() {
             let Ok(request) = postcard::from_bytes::<Request>(asked.payload()) else {
-                reply(&asked, &Reply::Refused { reason: "the request is in another version's words: run the same build on both sides".into() });
+                reply(
+                    &asked,
+                    &Reply::Refused { reason: "the request is in another version's words: run the same build on both sides".into() },
+                );
                 continue;
             };
             let (order, episode) = match request {

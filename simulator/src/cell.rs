@@ -33,8 +33,10 @@ const PHYSICS_NS: u64 = 4_000_000;
 
 /// Command-line arguments.
 #[derive(Debug, clap::Args)]
-#[command(after_help = "Example:\n  simulator run --config config/sim.toml\n\nThen start `feature-worker run` and `rt-controller run` with the same \
-configuration, and act as the operator with `simulator operator`.")]
+#[command(
+    after_help = "Example:\n  simulator run --config config/sim.toml\n\nThen start `feature-worker run` and `rt-controller run` with the same \
+configuration, and act as the operator with `simulator operator`."
+)]
 pub struct Args {
     /// The simulated cell's configuration.
     #[arg(long, default_value = "config/sim.toml")]
@@ -95,7 +97,10 @@ impl SimulatorConfig {
         }
         let size = (this.view.width_px, this.view.height_px);
         if size != (config.camera.width_px, config.camera.height_px) {
-            return Err(format!("simulator.view is {} x {} px, but [camera] {} x {}", size.0, size.1, config.camera.width_px, config.camera.height_px));
+            return Err(format!(
+                "simulator.view is {} x {} px, but [camera] {} x {}",
+                size.0, size.1, config.camera.width_px, config.camera.height_px
+            ));
         }
         Ok(this)
     }
@@ -158,7 +163,8 @@ fn simulate(config: Config, sim: SimulatorConfig) -> Result<(), Box<dyn std::err
     }
     let mut start_q_rad = [0.0, -1.571, 1.571, -1.571, -1.571, 0.0];
     start_q_rad[config.robot.joint.index()] = config.robot.start_joint_deg.to_radians();
-    let robot = ur::Controller::start(ur::Options { address: config.robot.address, series: sim.series, start_q_rad, ..ur::Options::default() })?;
+    let robot =
+        ur::Controller::start(ur::Options { address: config.robot.address, series: sim.series, start_q_rad, ..ur::Options::default() })?;
     let rig = sim.rig();
     let world = World { container: Mutex::new(rig.container(sim.fill_ml)), rig, robot, config, sim, stop };
 
