@@ -244,6 +244,8 @@ fn paint_board(kind: Background, side: i32, random: &mut Pcg64Mcg) -> Result<Mat
 impl Renderer {
     /// A renderer of `view`; `seed` decides background, noise, drops and drift.
     pub fn new(view: &View, seed: u64) -> Result<Self, RenderError> {
+        // One thread: what is drawn does not depend on the machine, and the other core is left to the controller.
+        core::set_num_threads(1)?;
         let mut random = Pcg64Mcg::seed_from_u64(seed);
         let (width, height) = (view.width_px as i32, view.height_px as i32);
         let side = f64::from(width).hypot(f64::from(height)) as i32 + 2;
