@@ -125,9 +125,10 @@ pub struct ImageConfig {
     pub method: LiquidMethod,
     /// Region at the lip, px: x, y, width, height.
     pub region_px: [u32; 4],
-    /// x-axis of Fig. 4: two points on the glass's top edge, px: x0, y0, x1, y1.
+    /// x-axis of Fig. 4: two points on the glass's top edge, px: x0, y0, x1, y1, from the lip's side into the mouth. The
+    /// triangle lies between this direction and that of `y_axis_px`.
     pub x_axis_px: [f32; 4],
-    /// y-axis of Fig. 4: two points on the container's left side, px: x0, y0, x1, y1.
+    /// y-axis of Fig. 4: two points on the container's left side, px: x0, y0, x1, y1, from its foot towards its rim.
     pub y_axis_px: [f32; 4],
     /// Colour range of the liquid in OpenCV's HSV: h_min, s_min, v_min, h_max, s_max, v_max (h 0-179, s and v 0-255;
     /// h_min > h_max wraps around red).
