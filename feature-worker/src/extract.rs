@@ -345,7 +345,12 @@ impl Extractor {
             PixelFormat::Bgr8 => {
                 let frame = Mat::new_rows_cols_with_bytes::<core::Vec3b>(rows, columns, image.pixels)?;
                 self.resample(&Mat::roi(&frame, region)?)?;
-                Colours { bytes: &image.pixels[bgr_start..], stride: columns as usize * 3, width: region.width as usize, height: region.height as usize }
+                Colours {
+                    bytes: &image.pixels[bgr_start..],
+                    stride: columns as usize * 3,
+                    width: region.width as usize,
+                    height: region.height as usize,
+                }
             }
             PixelFormat::Yuyv => {
                 // Pairs of pixels share their colour, so the crop starts at an even column and is then cut exactly.
@@ -497,7 +502,8 @@ impl Extractor {
             let normal = [-dy / length, dx / length];
             let line = Line { normal, distance: normal[0] * a[0] + normal[1] * a[1] };
             let near = (0.12 * length).max(2.0);
-            let support: f32 = self.edges.iter().zip(&self.edge_weights).filter(|(p, _)| line.offset(**p).abs() < near).map(|(_, w)| w).sum();
+            let support: f32 =
+                self.edges.iter().zip(&self.edge_weights).filter(|(p, _)| line.offset(**p).abs() < near).map(|(_, w)| w).sum();
             if best.is_none_or(|(s, ..)| support > s) {
                 best = Some((support, line, near));
             }
@@ -587,7 +593,8 @@ impl Extractor {
             if !complete {
                 continue;
             }
-            let mean = |range: &[[f32; 3]]| -> [f32; 3] { std::array::from_fn(|c| range.iter().map(|v| v[c]).sum::<f32>() / range.len() as f32) };
+            let mean =
+                |range: &[[f32; 3]]| -> [f32; 3] { std::array::from_fn(|c| range.iter().map(|v| v[c]).sum::<f32>() / range.len() as f32) };
             let inside = mean(&profile[..FLANK]);
             let outside = mean(&profile[2 * REACH + 1 - FLANK..]);
             let difference: [f32; 3] = std::array::from_fn(|c| inside[c] - outside[c]);
