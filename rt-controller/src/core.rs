@@ -211,7 +211,7 @@ pub struct Core {
 }
 
 /// A decision before anything was decided.
-const NOTHING: Decision = Decision { action: 10, dalpha_deg: 0.0, v_ml: 0.0, d_ml: 0.0, poured_ml: 0.0 };
+const NOTHING: Decision = Decision::NOTHING;
 
 impl Core {
     /// A controller without robot and weights.
@@ -435,14 +435,14 @@ impl Core {
             let (Some(agent), Some(_)) = (&mut self.agent, run.goal_ml) else { continue };
             let alpha_deg = self.limiter.alpha_deg();
             for _ in 0..lost {
-                self.decision = agent.step(Frame { area_px2: None, alpha_deg });
+                self.decision = agent.step(Frame { area_px2: None, alpha_deg, alpha_now_deg: alpha_deg });
             }
-            self.decision = agent.step(Frame { area_px2: measured, alpha_deg });
+            self.decision = agent.step(Frame { area_px2: measured, alpha_deg, alpha_now_deg: alpha_deg });
             let flowing = self.decision.v_ml > NO_FLOW_ML;
             run.quiet_frames = if flowing { 0 } else { run.quiet_frames + lost + 1 };
             let at_largest_tilt = alpha_deg >= self.settings.limits.alpha_max_deg - 0.5;
             run.empty_frames = if at_largest_tilt && !flowing { run.empty_frames + lost + 1 } else { 0 };
-            if self.phase == Phase::Pouring && self.decision.d_ml > 0.0 {
+            if self.phase == Phase::Pouring && !self.decision.finished {
                 request += self.decision.dalpha_deg;
                 asked = if asked.is_nan() { 0.0 } else { asked } + self.decision.dalpha_deg;
             }
@@ -464,7 +464,7 @@ impl Core {
             }
         }
         match self.phase {
-            Phase::Pouring if self.decision.d_ml <= 0.0 => self.phase = Phase::Returning,
+            Phase::Pouring if self.decision.finished => self.phase = Phase::Returning,
             Phase::Pouring if run.frames >= settings.max_frames => self.give_up(EndReason::MaxFrames),
             Phase::Pouring if run.empty_frames >= settings.empty_frames => self.give_up(EndReason::ContainerEmpty),
             Phase::Recording if run.curve.is_none_or(|c| seconds(run.started_at_ns) >= 2.0 * f64::from(c.beta_s)) => {
