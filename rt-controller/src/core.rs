@@ -20,8 +20,6 @@ use shared::messages::{Doubt, Feature, LAYOUT_VERSION, Phase, Telemetry};
 pub const MAX_FEATURES: usize = 32;
 /// A measured alpha within this of upright counts as upright, degrees.
 const UPRIGHT_DEG: f32 = 2.0;
-/// Outflow below this is no flow, ml a frame.
-const NO_FLOW_ML: f32 = 0.02;
 /// Frames without flow after which the last drops are counted.
 const SETTLE_QUIET_FRAMES: u32 = 15;
 /// Longest wait for the last drops, s.
@@ -112,7 +110,7 @@ impl std::fmt::Display for Refusal {
         match self {
             Self::Busy => write!(f, "a pour or recording is under way: wait for it, or `rt-controller abort`"),
             Self::Robot(reason) => write!(f, "the robot may not move: {}", reason.words()),
-            Self::NotUpright(deg) => write!(f, "the container is tilted by {deg:.0} degrees: bring it upright with `rt-controller abort`"),
+            Self::NotUpright(deg) => write!(f, "the container is tilted by {deg:.0} degrees: bring it upright at the robot's pendant"),
             Self::NoFeature => {
                 write!(f, "no fresh measurement from the feature worker: is `feature-worker run` running, does the camera deliver?")
             }
@@ -211,7 +209,7 @@ pub struct Core {
 }
 
 /// A decision before anything was decided.
-const NOTHING: Decision = Decision::NOTHING;
+const NOTHING: Decision = Decision { action: 10, dalpha_deg: 0.0, v_ml: 0.0, d_ml: 0.0, poured_ml: 0.0, finished: false, flowing: false };
 
 impl Core {
     /// A controller without robot and weights.
@@ -304,9 +302,7 @@ impl Core {
                     return Err(Refusal::Robot(reason));
                 }
                 if self.phase == Phase::NoRobot {
-                    // A container that was left tilted by a stop comes back from where it really is.
-                    self.limiter.rest_at(input.robot.alpha_deg);
-                    self.phase = Phase::Returning;
+                    return Err(Refusal::NotUpright(input.robot.alpha_deg));
                 }
                 self.give_up(EndReason::Aborted);
                 Ok(())
@@ -435,10 +431,10 @@ impl Core {
             let (Some(agent), Some(_)) = (&mut self.agent, run.goal_ml) else { continue };
             let alpha_deg = self.limiter.alpha_deg();
             for _ in 0..lost {
-                self.decision = agent.step(Frame { area_px2: None, alpha_deg, alpha_now_deg: alpha_deg });
+                self.decision = agent.step(Frame { area_px2: None, alpha_deg });
             }
-            self.decision = agent.step(Frame { area_px2: measured, alpha_deg, alpha_now_deg: alpha_deg });
-            let flowing = self.decision.v_ml > NO_FLOW_ML;
+            self.decision = agent.step(Frame { area_px2: measured, alpha_deg });
+            let flowing = self.decision.flowing;
             run.quiet_frames = if flowing { 0 } else { run.quiet_frames + lost + 1 };
             let at_largest_tilt = alpha_deg >= self.settings.limits.alpha_max_deg - 0.5;
             run.empty_frames = if at_largest_tilt && !flowing { run.empty_frames + lost + 1 } else { 0 };
