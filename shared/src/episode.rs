@@ -23,11 +23,14 @@ use sha2::{Digest, Sha256};
 use crate::control::Curve;
 use crate::messages::Doubt;
 
+mod alpha;
 pub mod read;
+mod rows;
 pub mod table;
 pub mod weigh;
 pub mod write;
 
+pub use alpha::AlphaTrack;
 pub use read::{EpisodeError, Image, Images, find};
 pub use table::{TableError, read_table, write_table};
 pub use weigh::{WeighError, set_weight};
@@ -114,16 +117,14 @@ pub struct Info {
 }
 
 impl Episode {
-    /// Hash of what the trainer sees (times, angles, areas, doubts), not of name, weight or file: two episodes with the
-    /// same hash are the same measurement twice.
+    /// Hash of what the trainer sees (times, angles, areas), not of name, weight or file: two episodes with the
+    /// same hash are the same measurement twice, be it as a file or as a table.
     pub fn content_sha256(&self) -> [u8; 32] {
         let mut hash = Sha256::new();
         for f in &self.frames {
             hash.update(f.t_s.to_le_bytes());
-            for v in [f.alpha_commanded_deg, f.alpha_measured_deg, f.area_px2] {
-                hash.update(if v.is_nan() { f32::NAN } else { v }.to_le_bytes());
-            }
-            hash.update([f.doubt as u8, u8::from(f.lost)]);
+            hash.update(f.alpha_commanded_deg.to_le_bytes());
+            hash.update(if f.area_px2.is_nan() { f32::NAN } else { f.area_px2 }.to_le_bytes());
         }
         hash.finalize().into()
     }
@@ -153,6 +154,6 @@ impl Episode {
 }
 
 /// Bytes as lower-case hexadecimal.
-pub(crate) fn hex(bytes: &[u8]) -> String {
+fn hex(bytes: &[u8]) -> String {
     bytes.iter().map(|b| format!("{b:02x}")).collect()
 }

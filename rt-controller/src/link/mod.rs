@@ -1,1 +1,157 @@
-//! The robot link: RTDE client and the program that runs on the robot.
+//! The robot link: targets for the tilting joint to a UR controller, its state back, over RTDE (TCP 30004).
+//!
+//! | part | thread | allocates |
+//! |---|---|---|
+//! | [`connect()`] | an ordinary thread | yes |
+//! | [`Session::poll`], [`Session::send`] | the controller's loop | no |
+//! | [`health::check`] | the controller's loop (pure) | no |
+//! | dropping a [`Session`] | an ordinary thread | frees |
+//!
+//! The loop owns a [`Session`] from the moment an ordinary thread hands it over until [`health::check`] names a reason or
+//! `poll` or `send` fails; then it stops sending and hands the session back to be dropped. Silence is the universal stop: the
+//! program on the robot (`robot/pour.script`) brings the container upright by itself 100 ms after the last target.
+//!
+//! Registers, counted from `robot.register_base` (b); all are RTDE general purpose registers:
+//!
+//! | register | holds |
+//! |---|---|
+//! | `input_int_register_b` | number of the target, 1, 2, 3, ... within a session |
+//! | `input_int_register_b+1` | what to do with it, a [`Mode`] code |
+//! | `input_double_register_b` | target angle of the tilting joint, rad |
+//! | `output_int_register_b` | what the program is doing, a [`ProgramState`] code |
+//! | `output_int_register_b+1` | number of the newest target that the program has read |
+//! | `output_int_register_b+2` | the run number that this upload was given: tells a fresh program from an old one's leavings |
+//! | `output_double_register_b` | angle that the program commands to servoj, rad |
+
+pub mod connect;
+pub mod health;
+pub mod program;
+pub mod session;
+pub mod wire;
+
+pub use connect::{LinkError, LinkOptions, connect};
+pub use session::{Lost, Session};
+
+use shared::config::{Joint, RobotConfig};
+
+/// What the program on the robot shall do; the code in `input_int_register_b+1`.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[repr(i32)]
+pub enum Mode {
+    /// Brake to rest and stay there; the target is ignored.
+    Hold = 1,
+    /// Follow the targets.
+    Stream = 2,
+    /// Come upright at the return rate, then end the program.
+    Stop = 3,
+}
+
+/// What the program on the robot says it is doing; the code in `output_int_register_b`.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+#[repr(i32)]
+pub enum ProgramState {
+    /// Nothing written yet, or a code that this version does not know.
+    #[default]
+    Unknown = 0,
+    /// Started; waits for the first target.
+    Ready = 1,
+    /// Follows the targets.
+    Following = 2,
+    /// Holds still on command.
+    Holding = 3,
+    /// No new target for 100 ms: on its way upright.
+    Returning = 4,
+    /// Ended: upright after [`ProgramState::Returning`].
+    TimedOut = 5,
+    /// On its way upright on command.
+    Stopping = 6,
+    /// Ended: upright after [`ProgramState::Stopping`].
+    Stopped = 7,
+    /// Ended without moving: the joint was too far from the start angle.
+    TooFar = 8,
+    /// The joint was not where it was commanded to be: on its way upright from where it is.
+    OffTrack = 9,
+    /// Ended: upright after [`ProgramState::OffTrack`].
+    OffTrackEnded = 10,
+    /// Ended without moving: no first target came within two seconds.
+    Unused = 11,
+}
+
+impl ProgramState {
+    /// The state with this code; codes of other versions read as [`ProgramState::Unknown`].
+    pub fn from_code(code: i32) -> Self {
+        use ProgramState::*;
+        [Ready, Following, Holding, Returning, TimedOut, Stopping, Stopped, TooFar, OffTrack, OffTrackEnded, Unused]
+            .into_iter()
+            .find(|s| *s as i32 == code)
+            .unwrap_or(Unknown)
+    }
+
+    /// Whether targets are taken in this state.
+    pub fn takes_targets(self) -> bool {
+        matches!(self, Self::Ready | Self::Following | Self::Holding)
+    }
+}
+
+/// The newest that is known of the robot.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub struct RobotState {
+    /// The robot's clock, s since its controller started.
+    pub timestamp_s: f64,
+    /// Measured alpha, degrees from upright.
+    pub alpha_deg: f32,
+    /// Measured rate of alpha, degrees/s.
+    pub alpha_rate_deg_s: f32,
+    /// Alpha that the robot's servo is steering to at this moment (`target_q`), degrees.
+    pub alpha_target_deg: f32,
+    /// Alpha that the program last gave to servoj, degrees.
+    pub alpha_command_deg: f32,
+    /// `robot_mode`; 7 = running.
+    pub robot_mode: i32,
+    /// `safety_mode`; 1 = normal, 2 = reduced.
+    pub safety_mode: i32,
+    /// `safety_status_bits`.
+    pub safety_bits: u32,
+    /// `runtime_state`; 2 = playing.
+    pub runtime_state: u32,
+    /// What the program says it is doing.
+    pub program_state: ProgramState,
+    /// Run number of the program that wrote the registers.
+    pub program_run: i32,
+    /// Number of the newest target that the program has read.
+    pub sequence_echo: i32,
+    /// When this was taken from the socket, CLOCK_MONOTONIC ns.
+    pub received_at_ns: u64,
+    /// When the robot's clock was last seen to advance, CLOCK_MONOTONIC ns.
+    pub advanced_at_ns: u64,
+    /// When the program was last seen to keep up with the targets sent, CLOCK_MONOTONIC ns.
+    pub answered_at_ns: u64,
+}
+
+/// Where the tilting joint is for a given alpha: q = start + direction * alpha.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct TiltJoint {
+    /// Which joint.
+    pub joint: Joint,
+    /// Its angle at alpha = 0, degrees.
+    pub start_deg: f64,
+    /// +1 or -1.
+    pub direction: f64,
+}
+
+impl TiltJoint {
+    /// The joint named in `[robot]`.
+    pub fn new(robot: &RobotConfig) -> Self {
+        Self { joint: robot.joint, start_deg: robot.start_joint_deg, direction: robot.direction }
+    }
+
+    /// Joint angle in rad at `alpha_deg`.
+    pub fn joint_rad(&self, alpha_deg: f32) -> f64 {
+        (self.start_deg + self.direction * f64::from(alpha_deg)).to_radians()
+    }
+
+    /// Alpha in degrees at a joint angle in rad.
+    pub fn alpha_deg(&self, joint_rad: f64) -> f32 {
+        (self.direction * (joint_rad.to_degrees() - self.start_deg)) as f32
+    }
+}

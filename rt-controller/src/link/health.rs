@@ -1,0 +1,58 @@
+//! Whether the robot may be moved now, and if not, why: a pure function of the newest state and the clock.
+//!
+//! Runs in the controller's loop each tick, after [`Session::poll`](super::Session::poll); allocates nothing. Protocol
+//! background: robot_mode, safety_mode, runtime_state and the status bits of the RTDE guide.
+
+use shared::control::EndReason;
+
+use super::{ProgramState, RobotState};
+
+/// `Ok` if targets may be sent, otherwise the one reason that comes first for the operator.
+///
+/// `lost_ns` (`controller.lost_robot_ms`) is how long the robot may be silent, its clock may stand still, and its program may
+/// leave targets unread.
+pub fn check(state: &RobotState, now_ns: u64, lost_ns: u64) -> Result<(), EndReason> {
+    let older = |at_ns: u64| now_ns.saturating_sub(at_ns) > lost_ns;
+    // A state that old says nothing about now.
+    if older(state.received_at_ns) {
+        return Err(EndReason::RobotLost);
+    }
+    if let Some(reason) = stopped_for_safety(state) {
+        return Err(reason);
+    }
+    if state.robot_mode != ROBOT_MODE_RUNNING {
+        return Err(EndReason::RobotNotRunning);
+    }
+    if older(state.advanced_at_ns) {
+        return Err(EndReason::RobotStalled);
+    }
+    match state.program_state {
+        // The robot is well and hears us, yet its program ran out of patience: we were silent.
+        ProgramState::Returning | ProgramState::TimedOut => return Err(EndReason::ControllerOverrun),
+        state if !state.takes_targets() => return Err(EndReason::ProgramStopped),
+        _ => {}
+    }
+    if state.runtime_state != RUNTIME_PLAYING || older(state.answered_at_ns) {
+        return Err(EndReason::ProgramStopped);
+    }
+    Ok(())
+}
+
+/// Why the robot's safety system keeps it from moving, if it does.
+pub(crate) fn stopped_for_safety(state: &RobotState) -> Option<EndReason> {
+    // safety_status_bits: 2 protective stop, 5 to 7 emergency stops.
+    let bit = |n: u32| state.safety_bits >> n & 1 == 1;
+    match state.safety_mode {
+        6 | 7 => Some(EndReason::EmergencyStop),
+        _ if bit(5) || bit(6) || bit(7) => Some(EndReason::EmergencyStop),
+        3 => Some(EndReason::ProtectiveStop),
+        _ if bit(2) => Some(EndReason::ProtectiveStop),
+        1 | 2 => None,
+        _ => Some(EndReason::SafetyStop),
+    }
+}
+
+/// robot_mode while the robot is powered and its brakes are released.
+pub(crate) const ROBOT_MODE_RUNNING: i32 = 7;
+/// runtime_state while a program plays.
+pub(crate) const RUNTIME_PLAYING: u32 = 2;

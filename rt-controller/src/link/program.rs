@@ -1,0 +1,75 @@
+//! The text of the program on the robot: `robot/pour.script` with this cell's values filled in.
+//!
+//! Runs on an ordinary thread at connecting; allocates. Values that the program could not keep are refused.
+
+use super::{LinkError, LinkOptions};
+
+/// The program as it stands in the repository, with example values.
+pub const SOURCE: &str = include_str!("../../robot/pour.script");
+
+/// Most cycles that the program averages over: keeps its list, and the delay, small.
+const MOST_CYCLES: f64 = 100.0;
+
+/// The program for `options` on a robot with a control cycle of `cycle_s` (0.008 on CB3, 0.002 on e-Series).
+///
+/// `run` comes back in `output_int_register_b+2`.
+pub fn text(options: &LinkOptions, cycle_s: f64, run: i32) -> Result<String, LinkError> {
+    let limits = &options.limits;
+    let period_s = 1.0 / options.rate_hz;
+    let braking_s = f64::from(limits.rate_deg_s) / f64::from(limits.acceleration_deg_s2);
+    // Cycles that the program averages over: a whole target period to be smooth, the braking time to stop in time.
+    let length = (period_s.max(braking_s) / cycle_s - 1e-6).ceil();
+    if !(1.0..=MOST_CYCLES).contains(&length) {
+        return Err(LinkError::Limits { smoothing_s: period_s.max(braking_s), most_s: MOST_CYCLES * cycle_s });
+    }
+    let rad = |deg: f32| f64::from(deg).to_radians();
+    let return_rate = rad(limits.return_rate_deg_s.min(limits.rate_deg_s));
+    let patience_s = patience_s(options.rate_hz);
+    // The way upright and its settling, four times over for a speed slider at a quarter: the program's own way comes first.
+    let way_s = patience_s + (rad(limits.alpha_max_deg - limits.alpha_min_deg)) / return_rate + length * cycle_s + 0.3;
+    let watchdog_hz = 1.0 / (1.0 + 4.0 * way_s);
+
+    let base = options.register_base;
+    let values: [(&str, String); 19] = [
+        ("RUN", run.to_string()),
+        ("FIRST", base.to_string()),
+        ("WATCHED", format!("\"input_int_register_{base}\"")),
+        ("JOINT", options.tilt.joint.index().to_string()),
+        ("START", real(options.tilt.start_deg.to_radians())),
+        ("DIRECTION", real(options.tilt.direction)),
+        ("TOLERANCE", real(options.start_tolerance_deg.to_radians())),
+        ("ALPHA_MIN", real(rad(limits.alpha_min_deg))),
+        ("ALPHA_MAX", real(rad(limits.alpha_max_deg))),
+        ("RATE", real(rad(limits.rate_deg_s))),
+        ("RETURN_RATE", real(return_rate)),
+        ("ACCELERATION", real(rad(limits.acceleration_deg_s2))),
+        ("LOOKAHEAD", real(options.lookahead_s)),
+        ("GAIN", real(options.gain)),
+        ("TARGET_HZ", real(options.rate_hz)),
+        ("PATIENCE", real(patience_s)),
+        ("WATCHDOG_HZ", real(watchdog_hz)),
+        ("LENGTH", (length as usize).to_string()),
+        ("WINDOW", format!("[{}]", vec!["0.0"; length as usize].join(", "))),
+    ];
+    let mut text = String::with_capacity(SOURCE.len() + 1024);
+    for line in SOURCE.lines() {
+        // Only the block of values is indented by two, in capitals, and among these names.
+        let filled = values.iter().find(|(name, _)| line.strip_prefix("  ").is_some_and(|l| l.starts_with(&format!("{name} = "))));
+        match filled {
+            Some((name, value)) => text.push_str(&format!("  {name} = {value}")),
+            None => text.push_str(line),
+        }
+        text.push('\n');
+    }
+    Ok(text)
+}
+
+/// How long the program goes without a new target before it comes upright, s: 100 ms, or three periods of slower streams.
+pub fn patience_s(rate_hz: f64) -> f64 {
+    (3.0 / rate_hz).max(0.1)
+}
+
+/// A number as URScript reads it: always with a decimal point, never with an exponent.
+fn real(value: f64) -> String {
+    format!("{value:.9}")
+}

@@ -1,0 +1,140 @@
+//! A connected robot in the controller's loop: drains what the robot sent, writes one target a tick.
+//!
+//! Made by [`connect`](super::connect()) on an ordinary thread, which also drops it. `poll` and `send` never block, never
+//! allocate and never panic: the one buffer holds the protocol's largest frame. Whatever goes wrong on the socket ends the
+//! session with a [`Lost`]; there is no repair in place.
+
+use std::io::{ErrorKind, Read, Write};
+use std::net::TcpStream;
+
+use super::wire::{self, Inbox, Outputs};
+use super::{Mode, RobotState, TiltJoint};
+
+/// Most reads of one [`Session::poll`]: a robot that floods us cannot keep the loop (16 x 64 KiB; 500 Hz for 10 s).
+const MOST_READS: usize = 16;
+
+/// Why a session is over.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
+pub enum Lost {
+    /// The robot closed the connection.
+    #[error("the robot closed the connection")]
+    Closed,
+    /// The connection was reset, or the system reports another error on it.
+    #[error("the connection to the robot broke")]
+    Broken,
+    /// A target would have to wait: the robot no longer takes what is sent.
+    #[error("the robot takes no more targets")]
+    WouldBlock,
+    /// What the robot sent is not RTDE, or not in the agreed recipe.
+    #[error("the robot sent what does not fit the recipe")]
+    Protocol,
+}
+
+/// A connected robot with the program running.
+#[derive(Debug)]
+pub struct Session {
+    stream: TcpStream,
+    inbox: Inbox,
+    tilt: TiltJoint,
+    output_recipe: u8,
+    input_recipe: u8,
+    version: [u32; 4],
+    state: RobotState,
+    sequence: i32,
+    texts: u64,
+}
+
+impl Session {
+    /// Takes over a connection on which recipes are agreed and data flow; `state` is the newest that was received.
+    pub(super) fn new(
+        stream: TcpStream,
+        inbox: Inbox,
+        tilt: TiltJoint,
+        (output_recipe, input_recipe): (u8, u8),
+        version: [u32; 4],
+        state: RobotState,
+    ) -> std::io::Result<Self> {
+        stream.set_nonblocking(true)?;
+        Ok(Self { stream, inbox, tilt, output_recipe, input_recipe, version, state, sequence: 0, texts: 0 })
+    }
+
+    /// PolyScope's version: major, minor, bugfix, build.
+    pub fn version(&self) -> [u32; 4] {
+        self.version
+    }
+
+    /// The newest state; old if [`Session::poll`] was not called.
+    pub fn state(&self) -> &RobotState {
+        &self.state
+    }
+
+    /// Text frames received since the hand-over.
+    pub fn texts(&self) -> u64 {
+        self.texts
+    }
+
+    /// Takes everything that has arrived and gives the newest state; once a tick, before [`super::health::check`].
+    pub fn poll(&mut self, now_ns: u64) -> Result<&RobotState, Lost> {
+        for _ in 0..MOST_READS {
+            let space = self.inbox.space();
+            let most = space.len();
+            let n = match self.stream.read(space) {
+                Ok(0) => return Err(Lost::Closed),
+                Ok(n) => n,
+                Err(e) if e.kind() == ErrorKind::WouldBlock => break,
+                Err(e) if e.kind() == ErrorKind::Interrupted => continue,
+                Err(_) => return Err(Lost::Broken),
+            };
+            self.inbox.filled(n);
+            self.take_frames(now_ns)?;
+            if n < most {
+                break;
+            }
+        }
+        Ok(&self.state)
+    }
+
+    fn take_frames(&mut self, now_ns: u64) -> Result<(), Lost> {
+        while let Some(frame) = self.inbox.next_frame().map_err(|_| Lost::Protocol)? {
+            match frame.kind {
+                wire::DATA => {
+                    let outputs = Outputs::new_checked(frame.payload, self.output_recipe).ok_or(Lost::Protocol)?;
+                    let before = self.state;
+                    outputs.fill(&self.tilt, &mut self.state);
+                    self.state.received_at_ns = now_ns;
+                    if self.state.timestamp_s > before.timestamp_s {
+                        self.state.advanced_at_ns = now_ns;
+                    }
+                    if self.state.sequence_echo == self.sequence || self.state.sequence_echo != before.sequence_echo || self.sequence == 0 {
+                        self.state.answered_at_ns = now_ns;
+                    }
+                }
+                wire::TEXT => self.texts += 1,
+                // An answer that came late, or a type of a newer protocol: not ours to judge.
+                _ => {}
+            }
+        }
+        Ok(())
+    }
+
+    /// Sends one target and gives its number. An alpha that is not finite is sent as [`Mode::Hold`].
+    ///
+    /// Either the whole frame goes to the kernel at once, or the session is over.
+    pub fn send(&mut self, mode: Mode, alpha_deg: f32) -> Result<i32, Lost> {
+        let (mode, alpha_deg) = if alpha_deg.is_finite() { (mode, alpha_deg) } else { (Mode::Hold, self.state.alpha_deg) };
+        let sequence = self.sequence.checked_add(1).unwrap_or(1);
+        let frame = wire::encode_target(self.input_recipe, sequence, mode as i32, self.tilt.joint_rad(alpha_deg));
+        loop {
+            match self.stream.write(&frame) {
+                Ok(n) if n == frame.len() => break,
+                // Part of a frame went out; the rest could only follow later.
+                Ok(_) => return Err(Lost::WouldBlock),
+                Err(e) if e.kind() == ErrorKind::WouldBlock => return Err(Lost::WouldBlock),
+                Err(e) if e.kind() == ErrorKind::Interrupted => {}
+                Err(_) => return Err(Lost::Broken),
+            }
+        }
+        self.sequence = sequence;
+        Ok(sequence)
+    }
+}
