@@ -39,7 +39,7 @@ pub struct ColourLearner {
     near: Vec<[u8; 3]>,
     near_bins: Vec<u32>,
     far_bins: Vec<u32>,
-    far: u32,
+    far: Vec<[u8; 3]>,
     hsv: Mat,
 }
 
@@ -50,7 +50,7 @@ impl ColourLearner {
     /// A learner for a container with these axes.
     pub fn new(axes: Axes) -> Self {
         let bins = BINS.iter().product();
-        Self { axes, near: Vec::new(), near_bins: vec![0; bins], far_bins: vec![0; bins], far: 0, hsv: Mat::default() }
+        Self { axes, near: Vec::new(), near_bins: vec![0; bins], far_bins: vec![0; bins], far: Vec::new(), hsv: Mat::default() }
     }
 
     fn bin([h, s, v]: [u8; 3]) -> usize {
@@ -70,14 +70,16 @@ impl ColourLearner {
             for x in ((lip_x - reach).max(0.0) as i32)..((lip_x + reach) as i32).min(columns) {
                 let at = [x as f32, y as f32];
                 let distance = (at[0] - lip_x).hypot(at[1] - lip_y);
-                let (near, far) = (distance < 16.0 * scale, distance > 110.0 * scale && (x + y) % 3 == 0);
+                let (near, far) = (distance < 16.0 * scale, distance > 110.0 * scale && (x + y) % 5 == 0);
                 if !(near || far) || self.axes.between(at) < 1.5 {
                     continue;
                 }
                 let hsv = pixels[(y * columns + x) as usize].0;
                 if far {
-                    self.far_bins[Self::bin(hsv)] += 1;
-                    self.far += 1;
+                    if self.far.len() < Self::KEEP {
+                        self.far_bins[Self::bin(hsv)] += 1;
+                        self.far.push(hsv);
+                    }
                 } else if self.near.len() < Self::KEEP {
                     self.near_bins[Self::bin(hsv)] += 1;
                     self.near.push(hsv);
@@ -89,7 +91,7 @@ impl ColourLearner {
 
     /// The range h_min, s_min, v_min, h_max, s_max, v_max for `[image] colour_hsv`.
     pub fn range(&self) -> Result<[u8; 6], CalibrateError> {
-        let (near, far) = (self.near.len().max(1) as f32, self.far.max(1) as f32);
+        let (near, far) = (self.near.len().max(1) as f32, self.far.len().max(1) as f32);
         let liquid = |hsv: &[u8; 3]| {
             let bin = Self::bin(*hsv);
             let (n, f) = (self.near_bins[bin] as f32 / near, self.far_bins[bin] as f32 / far);
@@ -120,8 +122,28 @@ impl ColourLearner {
             // Grey liquids (milk, cola in shadow) have no hue.
             return Ok([0, byte(s_low - 30.0), byte(v_low - 30.0), 179, byte(s_high + 30.0), byte(v_high + 30.0)]);
         }
+        // Shadow and exposure move value most and saturation more than hue. Where background of like colour comes nearer than
+        // these margins, the limit is half way between the two.
+        let relative_hue = |p: &[u8; 3]| (f32::from(p[0]) - mean + 270.0).rem_euclid(180.0) - 90.0;
+        let between = |loose: f32, liquid: f32, alike: &dyn Fn(&[u8; 3]) -> Option<f32>| {
+            let mut values: Vec<f32> = self.far.iter().filter_map(alike).filter(|v| (v - loose).signum() != (v - liquid).signum()).collect();
+            values.extend(self.far.iter().filter_map(alike).filter(|v| (loose < liquid) == (*v < loose)).map(|_| loose));
+            if (values.len() as f32) < 0.002 * far {
+                return loose;
+            }
+            // The most liquid-like 2 % of it are noise.
+            values.sort_by(|a, b| if loose < liquid { b.total_cmp(a) } else { a.total_cmp(b) });
+            let nearest = values[values.len() / 50];
+            if (nearest - loose).signum() == (nearest - liquid).signum() { loose } else { (nearest + liquid) / 2.0 }
+        };
+        let v_min = v_low * 0.3 - 5.0;
+        let v_max = if v_high > 150.0 { 255.0 } else { v_high * 1.7 + 10.0 };
+        let near_hue = |p: &[u8; 3]| (h_low - 12.0..=h_high + 12.0).contains(&relative_hue(p));
+        let s_min = between(s_low * 0.75 - 10.0, s_low, &|p| near_hue(p).then_some(f32::from(p[1])));
+        let alike = |p: &[u8; 3]| (f32::from(p[1]) >= s_min).then(|| relative_hue(p)).filter(|h| h.abs() < 40.0);
+        let h_min = between(h_low - 6.0, h_low, &|p| alike(p).filter(|h| *h < 0.0));
+        let h_max = between(h_high + 6.0, h_high, &|p| alike(p).filter(|h| *h > 0.0));
         let hue = |v: f32| (mean + v).rem_euclid(180.0).round().min(179.0) as u8;
-        // Shadow and exposure move value and saturation more than hue.
-        Ok([hue(h_low - 6.0), byte(s_low * 0.75 - 10.0), byte(v_low * 0.5 - 5.0), hue(h_high + 6.0), 255, 255])
+        Ok([hue(h_min), byte(s_min), byte(v_min), hue(h_max), 255, byte(v_max)])
     }
 }

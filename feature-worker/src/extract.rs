@@ -229,6 +229,7 @@ pub struct Extractor {
     // Reused from frame to frame.
     converted: Mat,
     polar: Mat,
+    smooth: Mat,
     hsv: Mat,
     mask: Mat,
     mask_b: Mat,
@@ -351,6 +352,7 @@ impl Extractor {
             wraps: h0 > h1,
             converted: Mat::default(),
             polar: Mat::default(),
+            smooth: Mat::default(),
             hsv: Mat::default(),
             mask: Mat::default(),
             mask_b: Mat::default(),
@@ -498,7 +500,10 @@ impl Extractor {
 
     /// Liquid by its colour range, into `self.mask`.
     fn segment_colour(&mut self) -> Result<(), ExtractError> {
-        imgproc::cvt_color_def(&self.polar, &mut self.hsv, imgproc::COLOR_BGR2HSV)?;
+        // Neighbouring samples together: a third of the noise, for a tenth of what smoothing the region would cost.
+        let size = core::Size::new(3, 3);
+        imgproc::blur(&self.polar, &mut self.smooth, size, core::Point::new(-1, -1), core::BORDER_REPLICATE)?;
+        imgproc::cvt_color_def(&self.smooth, &mut self.hsv, imgproc::COLOR_BGR2HSV)?;
         if self.wraps {
             // Red lies on both sides of hue 0.
             let (mut low, mut high) = (self.low, self.high);
@@ -541,6 +546,10 @@ impl Extractor {
             }
         }
         let share = filled as f32 / RAYS as f32;
+        if cut_off as f32 > 0.9 * RAYS as f32 {
+            // Everything looks like liquid: the colour does not tell them apart in this light.
+            return Ok(Measurement::nothing(0.0, Doubt::EdgeNotFound));
+        }
         if share < STREAM_RAYS {
             // A good half of the wedge full of liquid is no drop: something hides the stream.
             let mean_px = liquid_px / filled.max(1) as f32;

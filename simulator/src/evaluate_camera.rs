@@ -54,6 +54,9 @@ pub struct Args {
     /// Directory of the worst frames.
     #[arg(long, default_value = "out/evaluate-camera")]
     out: PathBuf,
+    /// Only this method.
+    #[arg(long)]
+    method: Option<String>,
 }
 
 /// Figures of one condition.
@@ -249,6 +252,9 @@ fn evaluate(args: &Args) -> Result<(), Failure> {
         let mut extractor = Extractor::new(&camera(&case.view), &case.image)?;
         let mut pixels = vec![0; (case.view.width_px * case.view.height_px * 3) as usize];
         let method = if clear { "clear" } else { "colour" };
+        if args.method.as_deref().is_some_and(|m| m != method) {
+            continue;
+        }
         for (k, scene) in scenes(&mut random, case.dry).iter().enumerate() {
             let truth = renderer.render(scene, &mut pixels)?;
             let image = Image { width_px: case.view.width_px, height_px: case.view.height_px, format: PixelFormat::Bgr8, pixels: &pixels };
