@@ -170,7 +170,8 @@ impl Capture {
         Ok(Self { capture, camera: camera.clone(), image: Mat::default(), sequence: 0, due_ns, period_ns: (1e9 / fps) as u64 })
     }
 
-    fn next(&mut self, timeout: Duration) -> Result<Next<'_>, SourceError> {
+    /// The next frame; waits up to `timeout` (a device: as long as its driver does).
+    pub fn next(&mut self, timeout: Duration) -> Result<Next<'_>, SourceError> {
         if let Some(due_ns) = self.due_ns {
             let now_ns = os::now_ns();
             let latest_ns = now_ns + timeout.as_nanos() as u64;
