@@ -205,11 +205,34 @@ pub struct Core {
     newest: Option<Feature>,
     shutdown: bool,
     last_tick_ns: u64,
+    commanded: Commanded,
     counters: Counters,
 }
 
 /// A decision before anything was decided.
-const NOTHING: Decision = Decision { action: 10, dalpha_deg: 0.0, v_ml: 0.0, d_ml: 0.0, poured_ml: 0.0, finished: false, flowing: false };
+const NOTHING: Decision = Decision::NOTHING;
+/// Commands remembered, to know which one was in force when a picture was taken.
+const COMMANDS: usize = 16;
+
+/// The newest commands with their times, oldest first; alpha in between is interpolated, as the recorder does it.
+#[derive(Debug)]
+struct Commanded([(u64, f32); COMMANDS]);
+
+impl Commanded {
+    fn push(&mut self, at_ns: u64, alpha_deg: f32) {
+        self.0.copy_within(1.., 0);
+        self.0[COMMANDS - 1] = (at_ns, alpha_deg);
+    }
+
+    fn at(&self, t_ns: u64) -> f32 {
+        let later = self.0.partition_point(|(at, _)| *at <= t_ns);
+        match (later.checked_sub(1).map(|k| self.0[k]), self.0.get(later)) {
+            (Some((t0, a0)), Some(&(t1, a1))) => a0 + (a1 - a0) * ((t_ns - t0) as f32 / (t1 - t0).max(1) as f32),
+            (Some((_, alpha)), None) | (None, Some(&(_, alpha))) => alpha,
+            (None, None) => 0.0,
+        }
+    }
+}
 
 impl Core {
     /// A controller without robot and weights.
@@ -225,6 +248,7 @@ impl Core {
             newest: None,
             shutdown: false,
             last_tick_ns: 0,
+            commanded: Commanded([(0, 0.0); COMMANDS]),
             counters: Counters::default(),
         }
     }
@@ -270,6 +294,7 @@ impl Core {
             ended = self.advance(input);
         }
         let target_deg = self.command(input, request);
+        self.commanded.push(input.now_ns, self.limiter.alpha_deg());
         Output { target_deg, ordered, ended, telemetry: self.telemetry(input, asked, area) }
     }
 
@@ -430,10 +455,12 @@ impl Core {
             run.frames += lost + 1;
             let (Some(agent), Some(_)) = (&mut self.agent, run.goal_ml) else { continue };
             let alpha_deg = self.limiter.alpha_deg();
-            for _ in 0..lost {
-                self.decision = agent.step(Frame { area_px2: None, alpha_deg });
+            for k in (1..=u64::from(lost)).rev() {
+                let at = self.commanded.at(feature.captured_at_ns.saturating_sub(k * self.settings.period_ns));
+                self.decision = agent.step(Frame { area_px2: None, alpha_deg: at, alpha_now_deg: alpha_deg });
             }
-            self.decision = agent.step(Frame { area_px2: measured, alpha_deg });
+            let at = self.commanded.at(feature.captured_at_ns);
+            self.decision = agent.step(Frame { area_px2: measured, alpha_deg: at, alpha_now_deg: alpha_deg });
             let flowing = self.decision.flowing;
             run.quiet_frames = if flowing { 0 } else { run.quiet_frames + lost + 1 };
             let at_largest_tilt = alpha_deg >= self.settings.limits.alpha_max_deg - 0.5;
