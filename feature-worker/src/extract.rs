@@ -23,16 +23,22 @@ use shared::config::{CameraConfig, ImageConfig, LiquidMethod};
 use shared::messages::{Doubt, PixelFormat};
 
 /// Rays between the axes.
-const RAYS: usize = 96;
-/// Pixels next to the lip that are not looked at: bead, rim and corner mix there.
-const NEAR_PX: usize = 3;
+const RAYS: usize = 72;
+/// Distance from the lip at which rays begin, px: bead, rim and corner mix before it.
+const NEAR_PX: f32 = 3.0;
+/// Samples along a ray are 1 px apart up to this distance from the lip, then further, up to [`STEP_MOST_PX`]: the rays only
+/// have to find the edge to within a profile's reach.
+const DENSE_PX: f32 = 48.0;
+const STEP_MOST_PX: f32 = 4.0;
 /// Profiles across the line.
-const PROFILES: usize = 56;
-/// Half length of a profile, px; its outer [`FLANK`] samples on either side tell liquid and background.
+const PROFILES: usize = 48;
+/// Samples of a profile on either side of its centre; the outer [`FLANK`] of them tell liquid and background.
 const REACH: usize = 7;
 const FLANK: usize = 3;
 /// Share of rays that a stream fills.
 const STREAM_RAYS: f32 = 0.8;
+/// More background than this before the first liquid ends a ray, px.
+const GAP_MOST_PX: f32 = 24.0;
 /// Least share of liquid between lip and edge on a ray that counts as filled.
 const FILLED: f32 = 0.55;
 /// Mean grey level below which the region counts as dark.
@@ -154,7 +160,7 @@ impl Line {
 struct Ray {
     /// Unit vector.
     along: [f32; 2],
-    /// Samples inside the region, one a px.
+    /// Samples inside the region.
     samples: usize,
 }
 
@@ -170,6 +176,9 @@ pub struct Extractor {
     y_axis: [f32; 2],
     sine: f32,
     rays: Vec<Ray>,
+    /// Distance of each sample from the lip, px, and the length that it stands for.
+    radii_px: Vec<f32>,
+    steps_px: Vec<f32>,
     map_a: Mat,
     map_b: Mat,
     low: Scalar,
@@ -247,40 +256,48 @@ impl Extractor {
 
         let cosine = x_axis[0] * y_axis[0] + x_axis[1] * y_axis[1];
         let between = sine.abs().atan2(cosine);
-        let rays: Vec<Ray> = (0..RAYS)
-            .map(|i| {
-                let (sin, cos) = ((i as f32 + 0.5) / RAYS as f32 * between * sine.signum()).sin_cos();
-                let along = [x_axis[0] * cos - x_axis[1] * sin, x_axis[0] * sin + x_axis[1] * cos];
-                // To the border of the region.
-                let length = (0..2)
-                    .map(|k| match along[k] {
-                        v if v > 1e-6 => (size[k] - 2.0 - lip[k]) / v,
-                        v if v < -1e-6 => (1.0 - lip[k]) / v,
-                        _ => f32::MAX,
-                    })
-                    .fold(f32::MAX, f32::min);
-                Ray { along, samples: length.max(0.0) as usize }
-            })
-            .collect();
-        let longest = rays.iter().map(|r| r.samples).max().unwrap_or(0);
-        if rays.iter().any(|r| r.samples < 4 * NEAR_PX) || longest < 24 {
+        // Distance from the lip to the region's border in a direction.
+        let room = |along: [f32; 2]| {
+            let to = |k: usize| match along[k] {
+                v if v > 1e-6 => (size[k] - 2.0 - lip[k]) / v,
+                v if v < -1e-6 => (1.0 - lip[k]) / v,
+                _ => f32::MAX,
+            };
+            to(0).min(to(1)).max(0.0)
+        };
+        let directions = (0..RAYS).map(|i| {
+            let (sin, cos) = ((i as f32 + 0.5) / RAYS as f32 * between * sine.signum()).sin_cos();
+            [x_axis[0] * cos - x_axis[1] * sin, x_axis[0] * sin + x_axis[1] * cos]
+        });
+        let longest = directions.clone().map(room).fold(0.0, f32::max);
+        let (mut radii_px, mut steps_px) = (Vec::new(), Vec::new());
+        let mut radius = NEAR_PX;
+        while radius <= longest {
+            let step = (radius / DENSE_PX).clamp(1.0, STEP_MOST_PX);
+            radii_px.push(radius);
+            steps_px.push(step);
+            radius += step;
+        }
+        let rays: Vec<Ray> =
+            directions.map(|along| Ray { along, samples: radii_px.iter().take_while(|r| **r <= room(along)).count() }).collect();
+        if rays.iter().any(|r| r.samples < 8) {
             return Err(fail("there is no room between the axes"));
         }
-        let shape = (RAYS as i32, longest as i32);
+        let shape = (RAYS as i32, radii_px.len() as i32);
         let mut map_x = Mat::new_rows_cols_with_default(shape.0, shape.1, CV_32FC1, Scalar::all(-1.0))?;
         let mut map_y = map_x.try_clone()?;
         for (i, ray) in rays.iter().enumerate() {
             let row_x = map_x.at_row_mut::<f32>(i as i32)?;
             let row_y = map_y.at_row_mut::<f32>(i as i32)?;
-            for r in 0..longest {
+            for r in 0..radii_px.len() {
                 // Beyond the region the last sample is repeated and never looked at.
-                let r_px = r.min(ray.samples.saturating_sub(1)) as f32;
+                let r_px = radii_px[r.min(ray.samples - 1)];
                 row_x[r] = lip[0] + r_px * ray.along[0];
                 row_y[r] = lip[1] + r_px * ray.along[1];
             }
         }
         let (mut map_a, mut map_b) = (Mat::default(), Mat::default());
-        imgproc::convert_maps(&map_x, &map_y, &mut map_a, &mut map_b, CV_16SC2, false)?;
+        imgproc::convert_maps(&map_x, &map_y, &mut map_a, &mut map_b, CV_16SC2, true)?;
 
         let [h0, s0, v0, h1, s1, v1] = image.colour_hsv.map(f64::from);
         Ok(Self {
@@ -293,6 +310,8 @@ impl Extractor {
             y_axis,
             sine: sine.abs(),
             rays,
+            radii_px,
+            steps_px,
             map_a,
             map_b,
             low: Scalar::new(h0, s0, v0, 0.0),
@@ -345,7 +364,12 @@ impl Extractor {
             PixelFormat::Bgr8 => {
                 let frame = Mat::new_rows_cols_with_bytes::<core::Vec3b>(rows, columns, image.pixels)?;
                 self.resample(&Mat::roi(&frame, region)?)?;
-                Colours { bytes: &image.pixels[bgr_start..], stride: columns as usize * 3, width: region.width as usize, height: region.height as usize }
+                Colours {
+                    bytes: &image.pixels[bgr_start..],
+                    stride: columns as usize * 3,
+                    width: region.width as usize,
+                    height: region.height as usize,
+                }
             }
             PixelFormat::Yuyv => {
                 // Pairs of pixels share their colour, so the crop starts at an even column and is then cut exactly.
@@ -391,7 +415,7 @@ impl Extractor {
     }
 
     fn resample(&mut self, region: &impl core::ToInputArray) -> Result<(), ExtractError> {
-        let (linear, border) = (imgproc::INTER_LINEAR, core::BORDER_REPLICATE);
+        let (linear, border) = (imgproc::INTER_NEAREST, core::BORDER_REPLICATE);
         imgproc::remap(region, &mut self.polar, &self.map_a, &self.map_b, linear, border, Scalar::default())?;
         Ok(())
     }
@@ -445,32 +469,33 @@ impl Extractor {
     fn find_triangle(&mut self, colours: Colours) -> Result<Measurement, ExtractError> {
         // 1. The edge on each ray: the best split into liquid before and background after it.
         self.edges.clear();
-        let (mut filled, mut cut_off, mut liquid_px) = (0usize, 0usize, 0usize);
+        let (mut filled, mut cut_off, mut liquid_px) = (0usize, 0usize, 0.0f32);
         for (i, ray) in self.rays.iter().enumerate() {
             let row = self.mask.at_row::<u8>(i as i32)?;
-            let (mut score, mut best, mut edge) = (0i32, 0i32, 0usize);
-            for (r, value) in row[..ray.samples].iter().enumerate().skip(NEAR_PX) {
-                score += if *value != 0 { 1 } else { -1 };
+            // The score counts px of liquid less px of background; its largest value is at the edge.
+            let (mut score, mut best, mut edge) = (0.0f32, 0.0f32, None);
+            for (r, (value, step)) in row[..ray.samples].iter().zip(&self.steps_px).enumerate() {
+                score += if *value != 0 { *step } else { -step };
                 if score > best {
-                    (best, edge) = (score, r + 1);
-                }
-                if score < -24 {
+                    (best, edge) = (score, Some(r));
+                } else if score < -GAP_MOST_PX {
                     break;
                 }
             }
-            if edge >= NEAR_PX + 2 && best as f32 >= (2.0 * FILLED - 1.0) * (edge - NEAR_PX) as f32 {
+            let Some(r) = edge else { continue };
+            // Between the last sample of liquid and the first of background.
+            let r_px = self.radii_px[r] + 0.5 * self.steps_px[r];
+            if r_px >= NEAR_PX + 1.0 && best >= (2.0 * FILLED - 1.0) * (r_px - NEAR_PX) {
                 filled += 1;
-                liquid_px += edge;
-                cut_off += usize::from(edge + 2 >= ray.samples);
-                // Between the last liquid and the first background sample.
-                let r_px = edge as f32 - 0.5;
+                liquid_px += r_px;
+                cut_off += usize::from(r + 1 >= ray.samples);
                 self.edges.push([self.lip[0] + r_px * ray.along[0], self.lip[1] + r_px * ray.along[1]]);
             }
         }
         let share = filled as f32 / RAYS as f32;
         if share < STREAM_RAYS {
             // A good half of the wedge full of liquid is no drop: something hides the stream.
-            let mean_px = liquid_px as f32 / filled.max(1) as f32;
+            let mean_px = liquid_px / filled.max(1) as f32;
             if share > 0.5 && mean_px > 14.0 {
                 return Ok(Measurement::nothing(0.0, Doubt::EdgeNotFound));
             }
@@ -497,7 +522,8 @@ impl Extractor {
             let normal = [-dy / length, dx / length];
             let line = Line { normal, distance: normal[0] * a[0] + normal[1] * a[1] };
             let near = (0.12 * length).max(2.0);
-            let support: f32 = self.edges.iter().zip(&self.edge_weights).filter(|(p, _)| line.offset(**p).abs() < near).map(|(_, w)| w).sum();
+            let support: f32 =
+                self.edges.iter().zip(&self.edge_weights).filter(|(p, _)| line.offset(**p).abs() < near).map(|(_, w)| w).sum();
             if best.is_none_or(|(s, ..)| support > s) {
                 best = Some((support, line, near));
             }
@@ -539,6 +565,15 @@ impl Extractor {
         Ok(Measurement { area_px2, confidence, doubt, triangle_px: [x0, y0, x1, y1, x2, y2] })
     }
 
+    /// How far `point` (in the region) lies between the axes: the smaller distance to either, px; negative outside.
+    fn between_axes(&self, point: [f32; 2]) -> f32 {
+        let p = [point[0] - self.lip[0], point[1] - self.lip[1]];
+        let turn = (self.x_axis[0] * self.y_axis[1] - self.x_axis[1] * self.y_axis[0]).signum();
+        let from_x = (self.x_axis[0] * p[1] - self.x_axis[1] * p[0]) * turn;
+        let from_y = (p[0] * self.y_axis[1] - p[1] * self.y_axis[0]) * turn;
+        from_x.min(from_y)
+    }
+
     /// Sub-pixel edge points on normals of `line` between the axes, and a Huber line through them. Returns the line, the
     /// median contrast in grey levels, the median edge width in px and the share of profiles that showed an edge.
     fn refine(&mut self, line: Line, a: f32, b: f32, colours: Colours) -> (Line, f32, f32, f32) {
@@ -549,6 +584,8 @@ impl Extractor {
         // Outwards: away from the lip.
         let outwards = if line.offset(self.lip) < 0.0 { 1.0 } else { -1.0 };
         let normal = [line.normal[0] * outwards, line.normal[1] * outwards];
+        // A small triangle has short profiles, so that their inner ends stay in the liquid.
+        let spacing = (line.offset(self.lip).abs() / 18.0).clamp(0.4, 1.0);
         self.fine.clear();
         self.fine_weights.clear();
         self.widths.clear();
@@ -575,7 +612,7 @@ impl Extractor {
             let centre = [from[0] + s * along[0] + coarse * normal[0], from[1] + s * along[1] + coarse * normal[1]];
             let mut profile = [[0.0f32; 3]; 2 * REACH + 1];
             let complete = profile.iter_mut().enumerate().all(|(j, value)| {
-                let d = j as f32 - REACH as f32;
+                let d = (j as f32 - REACH as f32) * spacing;
                 match colours.at(centre[0] + d * normal[0], centre[1] + d * normal[1]) {
                     Some(colour) => {
                         *value = colour;
@@ -587,7 +624,8 @@ impl Extractor {
             if !complete {
                 continue;
             }
-            let mean = |range: &[[f32; 3]]| -> [f32; 3] { std::array::from_fn(|c| range.iter().map(|v| v[c]).sum::<f32>() / range.len() as f32) };
+            let mean =
+                |range: &[[f32; 3]]| -> [f32; 3] { std::array::from_fn(|c| range.iter().map(|v| v[c]).sum::<f32>() / range.len() as f32) };
             let inside = mean(&profile[..FLANK]);
             let outside = mean(&profile[2 * REACH + 1 - FLANK..]);
             let difference: [f32; 3] = std::array::from_fn(|c| inside[c] - outside[c]);
@@ -606,10 +644,15 @@ impl Extractor {
             };
             let Some(half) = crossing(0.5) else { continue };
             if let (Some(high), Some(low)) = (crossing(0.8), crossing(0.2)) {
-                self.widths.push((low - high).abs());
+                self.widths.push((low - high).abs() * spacing);
             }
-            let d = half - REACH as f32;
-            self.fine.push([centre[0] + d * normal[0], centre[1] + d * normal[1]]);
+            let d = (half - REACH as f32) * spacing;
+            let point = [centre[0] + d * normal[0], centre[1] + d * normal[1]];
+            // The outline bends inwards beyond the axes, so only what lies between them counts.
+            if self.between_axes(point) < 1.0 {
+                continue;
+            }
+            self.fine.push(point);
             self.scratch.push(square.sqrt());
         }
         let used = self.fine.len() as f32 / PROFILES as f32;

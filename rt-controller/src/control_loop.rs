@@ -13,6 +13,7 @@ use shared::control::EndReason;
 
 use crate::core::{Core, Input, MAX_FEATURES, Order, Robot, Settings};
 use crate::exchange::{Event, Exchange, SessionEnd};
+use crate::journal::Tick;
 use crate::link::{Mode, Session, health};
 
 /// Receives features from shared memory.
@@ -59,10 +60,12 @@ pub fn run(settings: Settings, place: Place, lost_ns: u64, features: &Features, 
             }
             let _ = fresh.push(*sample);
         }
+        let mut taken = None;
         if core.may_exchange()
             && !exchange.old_agents.is_full()
-            && let Some(agent) = exchange.agents.pop()
+            && let Some((number, agent)) = exchange.agents.pop()
         {
+            taken = Some(number);
             exchange.agents_taken.fetch_add(1, Relaxed);
             if let Some(old) = core.exchange(agent) {
                 let _ = exchange.old_agents.push(old);
@@ -103,7 +106,17 @@ pub fn run(settings: Settings, place: Place, lost_ns: u64, features: &Features, 
         if let Some(outcome) = output.ended {
             tell(Event::Ended(outcome));
         }
-        tell(Event::Tick(output.telemetry, core.counters()));
+        let telemetry = output.telemetry;
+        let tick = Tick {
+            now_ns: woke_ns,
+            features: fresh.clone(),
+            robot,
+            order,
+            agent: taken,
+            target_deg: output.target_deg,
+            d_ml: telemetry.d_ml,
+        };
+        tell(Event::Tick(tick, telemetry, core.counters()));
 
         exchange.loop_allocations.store(os::allocations() - allocations_before, Relaxed);
         let faults = os::page_faults();

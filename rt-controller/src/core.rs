@@ -11,15 +11,18 @@
 //!     +---- any phase, when the robot may not move
 //! ```
 
+use serde::{Deserialize, Serialize};
 use shared::agent::{Agent, Decision, Frame};
 use shared::control::{Curve, EndReason, Outcome};
 use shared::limits::{Clipped, Limiter, Limits};
 use shared::messages::{Doubt, Feature, LAYOUT_VERSION, Phase, Telemetry};
 
-/// Most features that one tick takes; more than a second's worth would be stale anyway.
-pub const MAX_FEATURES: usize = 32;
+/// Most features that one tick takes, the newest ones: the loop would have to be late by a quarter of a second for more.
+pub const MAX_FEATURES: usize = 8;
 /// A measured alpha within this of upright counts as upright, degrees.
 const UPRIGHT_DEG: f32 = 2.0;
+/// Most lost frames that are bridged at once: what is longer is stale.
+const MAX_BRIDGED: u64 = 30;
 /// Frames without flow after which the last drops are counted.
 const SETTLE_QUIET_FRAMES: u32 = 15;
 /// Longest wait for the last drops, s.
@@ -30,7 +33,7 @@ const STALE_TICK_PERIODS: u64 = 3;
 pub const PATIENCE_NS: u64 = 100_000_000;
 
 /// The part of the configuration that decisions depend on.
-#[derive(Debug, Clone, Copy, PartialEq)]
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct Settings {
     /// Period of a tick, ns.
     pub period_ns: u64,
@@ -62,7 +65,7 @@ impl Settings {
 }
 
 /// What an operator orders.
-#[derive(Debug, Clone, Copy, PartialEq)]
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub enum Order {
     /// d <- V_G (eq. 4).
     Pour {
@@ -123,7 +126,7 @@ impl std::fmt::Display for Refusal {
 }
 
 /// The robot as the core sees it.
-#[derive(Debug, Clone, Copy, PartialEq)]
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct Robot {
     /// Why it may not move; `None`: it may.
     pub hindrance: Option<EndReason>,
@@ -445,7 +448,7 @@ impl Core {
             }
             // Frames between this one and the last: their liquid is bridged, but the moment to act on them has passed.
             let lost = match previous {
-                Some(p) if same_worker => (feature.sequence - p.sequence - 1).min(MAX_FEATURES as u64) as u32,
+                Some(p) if same_worker => (feature.sequence - p.sequence - 1).min(MAX_BRIDGED) as u32,
                 _ => 0,
             };
             self.counters.bridged_frames += u64::from(lost);

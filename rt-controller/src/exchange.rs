@@ -11,14 +11,15 @@ use shared::control::{EndReason, Outcome};
 use shared::messages::Telemetry;
 
 use crate::core::{Counters, Order, Refusal};
+use crate::journal::Tick;
 use crate::link::{Lost, Session};
 use crate::timing::Histogram;
 
 /// What the loop tells the ordinary thread.
-#[derive(Debug, Clone, Copy)]
+#[derive(Debug, Clone)]
 pub enum Event {
-    /// Every tick.
-    Tick(Telemetry, Counters),
+    /// Every tick: what it saw and answered, its telemetry, the counters.
+    Tick(Tick, Telemetry, Counters),
     /// The answer to an order.
     Ordered(Result<(), Refusal>),
     /// A pour or recording has ended.
@@ -64,8 +65,8 @@ pub struct Exchange {
     pub orders: ArrayQueue<Order>,
     /// From the loop: events.
     pub events: ArrayQueue<Event>,
-    /// To the loop: the newest policy.
-    pub agents: ArrayQueue<Box<Agent>>,
+    /// To the loop: the newest policy and its number.
+    pub agents: ArrayQueue<(u64, Box<Agent>)>,
     /// From the loop: policies to drop.
     pub old_agents: ArrayQueue<Box<Agent>>,
     /// To the loop: a connected robot.

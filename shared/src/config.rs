@@ -194,6 +194,9 @@ pub struct ControllerConfig {
     pub priority: u8,
     /// The weight file; watched, and taken between pours when it changes.
     pub weights: PathBuf,
+    /// Where every tick's inputs are written, for `rt-controller replay`; without it there is no journal.
+    #[serde(default)]
+    pub journal: Option<PathBuf>,
     /// A pour ends when the newest feature is older than this, ms.
     pub stale_feature_ms: u32,
     /// The robot counts as lost when its newest state is older than this, ms.

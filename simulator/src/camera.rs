@@ -244,6 +244,8 @@ fn paint_board(kind: Background, side: i32, random: &mut Pcg64Mcg) -> Result<Mat
 impl Renderer {
     /// A renderer of `view`; `seed` decides background, noise, drops and drift.
     pub fn new(view: &View, seed: u64) -> Result<Self, RenderError> {
+        // One thread: what is drawn does not depend on the machine, and the other core is left to the controller.
+        core::set_num_threads(1)?;
         let mut random = Pcg64Mcg::seed_from_u64(seed);
         let (width, height) = (view.width_px as i32, view.height_px as i32);
         let side = f64::from(width).hypot(f64::from(height)) as i32 + 2;
@@ -456,7 +458,8 @@ impl Renderer {
         Truth { area_px2: 0.5 * on_x * on_y * s * s, triangle_px: [[0.0, 0.0], [on_x, 0.0], [0.0, on_y]].map(|p| self.to_image(p)) }
     }
 
-    /// Adds a closed outline (image px) to `self.cover`, with exact coverage along rows and four lines a row.
+    /// Adds a closed outline (image px; as everywhere, whole numbers are the pixels' middles) to `self.cover`, with exact
+    /// coverage along rows and four lines a row.
     fn fill(&mut self, outline: &[[f64; 2]]) -> Result<Rect, RenderError> {
         let (width, height) = (self.view.width_px as usize, self.view.height_px as usize);
         let low = |k: usize| outline.iter().fold(f64::MAX, |m, p| m.min(p[k]));
@@ -468,7 +471,7 @@ impl Renderer {
         for y in y0..y1 {
             row[x0..x1].fill(0.0);
             for quarter in 0..4 {
-                let line = y as f64 + (f64::from(quarter) + 0.5) / 4.0;
+                let line = y as f64 - 0.5 + (f64::from(quarter) + 0.5) / 4.0;
                 self.crossings.clear();
                 for (i, a) in outline.iter().enumerate() {
                     let b = outline[(i + 1) % outline.len()];
@@ -478,7 +481,7 @@ impl Renderer {
                 }
                 self.crossings.sort_by(f64::total_cmp);
                 for span in self.crossings.chunks_exact(2) {
-                    let (from, to) = (span[0].clamp(0.0, width as f64), span[1].clamp(0.0, width as f64));
+                    let (from, to) = ((span[0] + 0.5).clamp(0.0, width as f64), (span[1] + 0.5).clamp(0.0, width as f64));
                     let (first, last) = (from as usize, to as usize);
                     if first == last {
                         row[first] += (to - from) as f32;

@@ -210,6 +210,7 @@ impl<'a> Demo<'a> {
         set("cell", "name", toml::Value::String(format!("demo-{number}")));
         set("robot", "address", toml::Value::String(format!("127.{}.{}.{}", 1 + number / 65_536 % 250, number / 256 % 256, 1 + number % 254)));
         set("controller", "weights", text(&out.join("weights.bin")));
+        set("controller", "journal", text(&out.join("journal.bin")));
         set("recording", "directory", text(&out.join("episodes")));
         set("simulator", "seed", toml::Value::Integer(args.seed as i64));
         let config_file = out.join("sim.toml");
