@@ -156,6 +156,51 @@ impl Line {
     }
 }
 
+/// The two axes of Fig. 4 in the image, px.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Axes {
+    /// Where they cross: the lip.
+    pub lip_px: [f32; 2],
+    /// Unit vector along the glass's top edge, into the mouth.
+    pub x: [f32; 2],
+    /// Unit vector along the container's left side, beyond the rim.
+    pub y: [f32; 2],
+}
+
+impl Axes {
+    /// The axes of a checked configuration (not parallel).
+    pub fn new(image: &ImageConfig) -> Self {
+        let unit = |a: [f32; 4]| {
+            let (dx, dy) = (a[2] - a[0], a[3] - a[1]);
+            let length = dx.hypot(dy);
+            [dx / length, dy / length]
+        };
+        let (x, y) = (unit(image.x_axis_px), unit(image.y_axis_px));
+        let ([x0, y0, ..], [x1, y1, ..]) = (image.x_axis_px, image.y_axis_px);
+        let along = ((x1 - x0) * y[1] - (y1 - y0) * y[0]) / (x[0] * y[1] - x[1] * y[0]);
+        Self { lip_px: [x0 + along * x[0], y0 + along * x[1]], x, y }
+    }
+
+    /// Sine of the angle from x to y; its sign is the sense of turning.
+    fn sine(&self) -> f32 {
+        self.x[0] * self.y[1] - self.x[1] * self.y[0]
+    }
+
+    /// How far `point_px` lies between the axes: the smaller distance to either, px; negative outside.
+    pub fn between(&self, point_px: [f32; 2]) -> f32 {
+        let p = [point_px[0] - self.lip_px[0], point_px[1] - self.lip_px[1]];
+        let turn = self.sine().signum();
+        let from_x = (self.x[0] * p[1] - self.x[1] * p[0]) * turn;
+        let from_y = (p[0] * self.y[1] - p[1] * self.y[0]) * turn;
+        from_x.min(from_y)
+    }
+
+    /// The point at `distance_px` from the lip in the direction `along`.
+    fn at(&self, distance_px: f32, along: [f32; 2]) -> [f32; 2] {
+        [self.lip_px[0] + distance_px * along[0], self.lip_px[1] + distance_px * along[1]]
+    }
+}
+
 #[derive(Debug, Clone, Copy)]
 struct Ray {
     /// Unit vector.
@@ -170,11 +215,8 @@ pub struct Extractor {
     area_min_px2: f32,
     size_px: [u32; 2],
     region: Rect,
-    /// Lip, relative to the region.
-    lip: [f32; 2],
-    x_axis: [f32; 2],
-    y_axis: [f32; 2],
-    sine: f32,
+    /// Relative to the region.
+    axes: Axes,
     rays: Vec<Ray>,
     /// Distance of each sample from the lip, px, and the length that it stands for.
     radii_px: Vec<f32>,
@@ -187,6 +229,7 @@ pub struct Extractor {
     // Reused from frame to frame.
     converted: Mat,
     polar: Mat,
+    smooth: Mat,
     hsv: Mat,
     mask: Mat,
     mask_b: Mat,
@@ -236,25 +279,18 @@ impl Extractor {
     pub fn new(camera: &CameraConfig, image: &ImageConfig) -> Result<Self, ExtractError> {
         let [x, y, width, height] = image.region_px;
         let region = Rect::new(x as i32, y as i32, width as i32, height as i32);
-        let direction = |a: [f32; 4]| {
-            let (dx, dy) = (a[2] - a[0], a[3] - a[1]);
-            let length = dx.hypot(dy);
-            [dx / length, dy / length]
-        };
-        let (x_axis, y_axis) = (direction(image.x_axis_px), direction(image.y_axis_px));
-        let sine = x_axis[0] * y_axis[1] - x_axis[1] * y_axis[0];
-        let [x0, y0, ..] = image.x_axis_px;
-        let [x1, y1, ..] = image.y_axis_px;
-        let along = ((x1 - x0) * y_axis[1] - (y1 - y0) * y_axis[0]) / sine;
-        let crossing = [x0 + along * x_axis[0], y0 + along * x_axis[1]];
-        let fail = |what| ExtractError::Region { region: image.region_px, lip: crossing.map(|v| v.round() as i32), what };
-        let lip = [crossing[0] - x as f32, crossing[1] - y as f32];
+        let axes = Axes::new(image);
+        let fail = |what| ExtractError::Region { region: image.region_px, lip: axes.lip_px.map(|v| v.round() as i32), what };
+        // From here on everything is relative to the region.
+        let lip = [axes.lip_px[0] - x as f32, axes.lip_px[1] - y as f32];
+        let axes = Axes { lip_px: lip, ..axes };
+        let sine = axes.sine();
         let size = [width as f32, height as f32];
         if !(0..2).all(|k| lip[k].is_finite() && lip[k] >= 1.0 && lip[k] <= size[k] - 2.0) {
             return Err(fail("the axes cross outside it"));
         }
 
-        let cosine = x_axis[0] * y_axis[0] + x_axis[1] * y_axis[1];
+        let cosine = axes.x[0] * axes.y[0] + axes.x[1] * axes.y[1];
         let between = sine.abs().atan2(cosine);
         // Distance from the lip to the region's border in a direction.
         let room = |along: [f32; 2]| {
@@ -267,7 +303,7 @@ impl Extractor {
         };
         let directions = (0..RAYS).map(|i| {
             let (sin, cos) = ((i as f32 + 0.5) / RAYS as f32 * between * sine.signum()).sin_cos();
-            [x_axis[0] * cos - x_axis[1] * sin, x_axis[0] * sin + x_axis[1] * cos]
+            [axes.x[0] * cos - axes.x[1] * sin, axes.x[0] * sin + axes.x[1] * cos]
         });
         let longest = directions.clone().map(room).fold(0.0, f32::max);
         let (mut radii_px, mut steps_px) = (Vec::new(), Vec::new());
@@ -305,10 +341,7 @@ impl Extractor {
             area_min_px2: image.area_min_px2,
             size_px: [camera.width_px, camera.height_px],
             region,
-            lip,
-            x_axis,
-            y_axis,
-            sine: sine.abs(),
+            axes,
             rays,
             radii_px,
             steps_px,
@@ -319,6 +352,7 @@ impl Extractor {
             wraps: h0 > h1,
             converted: Mat::default(),
             polar: Mat::default(),
+            smooth: Mat::default(),
             hsv: Mat::default(),
             mask: Mat::default(),
             mask_b: Mat::default(),
@@ -331,6 +365,22 @@ impl Extractor {
             last_hash: None,
             stages: Stages::default(),
         })
+    }
+
+    /// The axes in the image, px.
+    pub fn axes(&self) -> Axes {
+        Axes { lip_px: [self.axes.lip_px[0] + self.region.x as f32, self.axes.lip_px[1] + self.region.y as f32], ..self.axes }
+    }
+
+    /// The region in the image, px.
+    pub fn region(&self) -> Rect {
+        self.region
+    }
+
+    /// The coarse outer edge of the last measurement on each ray with liquid, in image coordinates, px: with the lip, the
+    /// outline of the mask.
+    pub fn outline_px(&self) -> impl Iterator<Item = [f32; 2]> + '_ {
+        self.edges.iter().map(|p| [p[0] + self.region.x as f32, p[1] + self.region.y as f32])
     }
 
     /// Time spent in the stages of the last measurement.
@@ -450,7 +500,10 @@ impl Extractor {
 
     /// Liquid by its colour range, into `self.mask`.
     fn segment_colour(&mut self) -> Result<(), ExtractError> {
-        imgproc::cvt_color_def(&self.polar, &mut self.hsv, imgproc::COLOR_BGR2HSV)?;
+        // Neighbouring samples together: a third of the noise, for a tenth of what smoothing the region would cost.
+        let size = core::Size::new(3, 3);
+        imgproc::blur(&self.polar, &mut self.smooth, size, core::Point::new(-1, -1), core::BORDER_REPLICATE)?;
+        imgproc::cvt_color_def(&self.smooth, &mut self.hsv, imgproc::COLOR_BGR2HSV)?;
         if self.wraps {
             // Red lies on both sides of hue 0.
             let (mut low, mut high) = (self.low, self.high);
@@ -489,10 +542,14 @@ impl Extractor {
                 filled += 1;
                 liquid_px += r_px;
                 cut_off += usize::from(r + 1 >= ray.samples);
-                self.edges.push([self.lip[0] + r_px * ray.along[0], self.lip[1] + r_px * ray.along[1]]);
+                self.edges.push(self.axes.at(r_px, ray.along));
             }
         }
         let share = filled as f32 / RAYS as f32;
+        if cut_off as f32 > 0.9 * RAYS as f32 {
+            // Everything looks like liquid: the colour does not tell them apart in this light.
+            return Ok(Measurement::nothing(0.0, Doubt::EdgeNotFound));
+        }
         if share < STREAM_RAYS {
             // A good half of the wedge full of liquid is no drop: something hides the stream.
             let mean_px = liquid_px / filled.max(1) as f32;
@@ -534,7 +591,7 @@ impl Extractor {
         let Some(line) = Line::fit(points.filter(|(p, _)| line.offset(*p).abs() < near)) else {
             return Ok(Measurement::nothing(0.0, Doubt::EdgeNotFound));
         };
-        let (a, b) = (line.cut(self.lip, self.x_axis), line.cut(self.lip, self.y_axis));
+        let (a, b) = (line.cut(self.axes.lip_px, self.axes.x), line.cut(self.axes.lip_px, self.axes.y));
         let longest = 2.0 * (self.region.width + self.region.height) as f32;
         if !(a > 1.0 && b > 1.0 && a < longest && b < longest) || inliers < 0.6 {
             return Ok(Measurement::nothing(0.0, Doubt::EdgeNotFound));
@@ -542,17 +599,19 @@ impl Extractor {
 
         // 3. Profiles across it.
         let (line, contrast, width, used) = self.refine(line, a, b, colours);
-        let (a, b) = (line.cut(self.lip, self.x_axis), line.cut(self.lip, self.y_axis));
+        let (a, b) = (line.cut(self.axes.lip_px, self.axes.x), line.cut(self.axes.lip_px, self.axes.y));
         if !(a > 0.0 && b > 0.0 && a < longest && b < longest) {
             return Ok(Measurement::nothing(0.0, Doubt::EdgeNotFound));
         }
-        let area_px2 = 0.5 * a * b * self.sine;
+        let area_px2 = 0.5 * a * b * self.axes.sine().abs();
         if area_px2 < self.area_min_px2 {
             return Ok(Measurement::nothing(share, Doubt::None));
         }
-        let (region_x, region_y) = (self.region.x as f32, self.region.y as f32);
-        let corner = |r: f32, axis: [f32; 2]| [region_x + self.lip[0] + r * axis[0], region_y + self.lip[1] + r * axis[1]];
-        let ([x0, y0], [x1, y1], [x2, y2]) = (corner(0.0, self.x_axis), corner(a, self.x_axis), corner(b, self.y_axis));
+        let corner = |r: f32, axis: [f32; 2]| {
+            let p = self.axes.at(r, axis);
+            [p[0] + self.region.x as f32, p[1] + self.region.y as f32]
+        };
+        let ([x0, y0], [x1, y1], [x2, y2]) = (corner(0.0, self.axes.x), corner(a, self.axes.x), corner(b, self.axes.y));
         let doubt = if cut_off as f32 > 0.06 * RAYS as f32 {
             Doubt::LeavesRegion
         } else if width > BLURRED_PX {
@@ -565,27 +624,17 @@ impl Extractor {
         Ok(Measurement { area_px2, confidence, doubt, triangle_px: [x0, y0, x1, y1, x2, y2] })
     }
 
-    /// How far `point` (in the region) lies between the axes: the smaller distance to either, px; negative outside.
-    fn between_axes(&self, point: [f32; 2]) -> f32 {
-        let p = [point[0] - self.lip[0], point[1] - self.lip[1]];
-        let turn = (self.x_axis[0] * self.y_axis[1] - self.x_axis[1] * self.y_axis[0]).signum();
-        let from_x = (self.x_axis[0] * p[1] - self.x_axis[1] * p[0]) * turn;
-        let from_y = (p[0] * self.y_axis[1] - p[1] * self.y_axis[0]) * turn;
-        from_x.min(from_y)
-    }
-
     /// Sub-pixel edge points on normals of `line` between the axes, and a Huber line through them. Returns the line, the
     /// median contrast in grey levels, the median edge width in px and the share of profiles that showed an edge.
     fn refine(&mut self, line: Line, a: f32, b: f32, colours: Colours) -> (Line, f32, f32, f32) {
-        let at = |r: f32, axis: [f32; 2]| [self.lip[0] + r * axis[0], self.lip[1] + r * axis[1]];
-        let (from, to) = (at(a, self.x_axis), at(b, self.y_axis));
+        let (from, to) = (self.axes.at(a, self.axes.x), self.axes.at(b, self.axes.y));
         let length = (to[0] - from[0]).hypot(to[1] - from[1]);
         let along = [(to[0] - from[0]) / length, (to[1] - from[1]) / length];
         // Outwards: away from the lip.
-        let outwards = if line.offset(self.lip) < 0.0 { 1.0 } else { -1.0 };
+        let outwards = if line.offset(self.axes.lip_px) < 0.0 { 1.0 } else { -1.0 };
         let normal = [line.normal[0] * outwards, line.normal[1] * outwards];
         // A small triangle has short profiles, so that their inner ends stay in the liquid.
-        let spacing = (line.offset(self.lip).abs() / 18.0).clamp(0.4, 1.0);
+        let spacing = (line.offset(self.axes.lip_px).abs() / 18.0).clamp(0.4, 1.0);
         self.fine.clear();
         self.fine_weights.clear();
         self.widths.clear();
@@ -649,7 +698,7 @@ impl Extractor {
             let d = (half - REACH as f32) * spacing;
             let point = [centre[0] + d * normal[0], centre[1] + d * normal[1]];
             // The outline bends inwards beyond the axes, so only what lies between them counts.
-            if self.between_axes(point) < 1.0 {
+            if self.axes.between(point) < 1.0 {
                 continue;
             }
             self.fine.push(point);
