@@ -1,3 +1,48 @@
 //! Command line of `rt-controller`.
 
-fn main() {}
+use std::process::ExitCode;
+
+use clap::{Parser, Subcommand};
+use rt_controller::{abort, pour, record, replay, run, status, step};
+
+/// Counts allocations, so that the loop can show that it makes none.
+#[global_allocator]
+static ALLOCATOR: shared::os::CountingAllocator = shared::os::CountingAllocator;
+
+/// The fixed-rate controller: V_e in, servo targets out.
+#[derive(Parser)]
+#[command(version, about, after_help = shared::exit::HELP)]
+struct Cli {
+    #[command(subcommand)]
+    command: Command,
+}
+
+#[derive(Subcommand)]
+enum Command {
+    /// The resident controller process.
+    Run(run::Args),
+    /// Pours an exact volume with the running controller.
+    Pour(pour::Args),
+    /// Records one experimental episode along the Gaussian curve of eq. (1).
+    Record(record::Args),
+    /// Brings the container upright at once.
+    Abort(abort::Args),
+    /// Shows state, rates, lateness histograms and counters.
+    Status(status::Args),
+    /// The controller core as a filter: V_e in, angles out, for any other simulator.
+    Step(step::Args),
+    /// Runs a journal through the same core again and compares every answer.
+    Replay(replay::Args),
+}
+
+fn main() -> ExitCode {
+    match Cli::parse().command {
+        Command::Run(args) => run::run(&args),
+        Command::Pour(args) => pour::run(&args),
+        Command::Record(args) => record::run(&args),
+        Command::Abort(args) => abort::run(&args),
+        Command::Status(args) => status::run(&args),
+        Command::Step(args) => step::run(&args),
+        Command::Replay(args) => replay::run(&args),
+    }
+}

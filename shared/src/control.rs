@@ -54,7 +54,7 @@ pub enum Reply {
 }
 
 /// How a pour or recording ended.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct Outcome {
     /// Number of the pour or recording.
     pub episode: u64,
@@ -154,8 +154,12 @@ pub struct Status {
     pub poured_ml: f32,
     /// Commanded alpha, degrees.
     pub alpha_deg: f32,
-    /// Newest V_e, px^2.
+    /// Measured alpha, degrees; NaN without a robot.
+    pub alpha_measured_deg: f32,
+    /// Newest V_e, px^2; NaN if the newest tick had none.
     pub area_px2: f32,
+    /// Camera frame of the newest V_e; 0 before the first.
+    pub feature_sequence: u64,
     /// Ticks done.
     pub ticks: u64,
     /// Ticks late by more than half a period.
@@ -168,12 +172,18 @@ pub struct Status {
     pub stale_features: u64,
     /// Lost frames bridged.
     pub bridged_frames: u64,
+    /// Features that came twice or out of order, or with another layout.
+    pub ignored_features: u64,
     /// What the limits clipped.
     pub clipped: Clipped,
     /// Robot connections made.
     pub robot_connections: u64,
     /// Heap allocations made by the loop since it started.
     pub loop_allocations: u64,
+    /// Page faults of the loop since it started.
+    pub loop_page_faults: u64,
+    /// Events that the loop could not tell, because the ordinary side fell behind.
+    pub events_lost: u64,
     /// Identity of the weights in use (first 8 bytes of their hash, hexadecimal); empty without weights.
     pub weights: String,
     /// Weight files taken since the start.

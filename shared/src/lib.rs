@@ -17,6 +17,8 @@
 //!
 //! Nothing in a module marked "yes" allocates, locks or panics after construction.
 
+#![deny(unsafe_code)]
+
 pub mod agent;
 pub mod config;
 pub mod control;
@@ -26,6 +28,7 @@ pub mod exit;
 pub mod ipc;
 pub mod limits;
 pub mod messages;
+#[allow(unsafe_code)]
 pub mod os;
 pub mod policy;
 pub mod weights;

@@ -1,7 +1,10 @@
-//! The operating system's part: the clock, and what a real-time process asks of the kernel.
+//! The operating system's part: the clock, what a real-time process asks of the kernel, and the count of allocations.
 //!
-//! Called from any thread; nothing here allocates except [`pin_and_prioritise`]'s error text. On failure the caller gets
-//! a line for the operator and goes on without the privilege.
+//! The one module of the project with `unsafe`. Called from any thread; nothing here allocates, except the error texts of
+//! [`become_realtime`]. On failure the caller gets a line for the operator and goes on without the privilege.
+
+use std::alloc::{GlobalAlloc, Layout, System};
+use std::cell::Cell;
 
 /// Now, CLOCK_MONOTONIC in nanoseconds.
 pub fn now_ns() -> u64 {
@@ -13,4 +16,84 @@ pub fn now_ns() -> u64 {
 pub fn sleep_until_ns(deadline_ns: u64) {
     let request = rustix::time::Timespec { tv_sec: (deadline_ns / 1_000_000_000) as i64, tv_nsec: (deadline_ns % 1_000_000_000) as i64 };
     while let Err(rustix::io::Errno::INTR) = rustix::thread::clock_nanosleep_absolute(rustix::thread::ClockId::Monotonic, &request) {}
+}
+
+/// Pins the calling thread to `core` and, if `priority` > 0, schedules it SCHED_FIFO with that priority (1-99).
+///
+/// Answers with what was not permitted, one line each; the thread works on without it.
+pub fn become_realtime(core: usize, priority: u8) -> Vec<String> {
+    let mut missing = Vec::new();
+    if !core_affinity::set_for_current(core_affinity::CoreId { id: core }) {
+        missing.push(format!("could not pin to core {core} (does it exist?): running on any core"));
+    }
+    if priority > 0 {
+        let param = libc::sched_param { sched_priority: i32::from(priority) };
+        // SAFETY: pid 0 is the calling thread and `param` is a valid, initialised structure that the call only reads.
+        let failed = unsafe { libc::sched_setscheduler(0, libc::SCHED_FIFO, &raw const param) } != 0;
+        if failed {
+            missing.push(format!(
+                "SCHED_FIFO {priority} is not permitted ({}): set LimitRTPRIO or CAP_SYS_NICE; running with ordinary scheduling",
+                std::io::Error::last_os_error()
+            ));
+        }
+    }
+    missing
+}
+
+/// Locks all present and future pages of the process in memory; answers with the reason when it is not permitted.
+pub fn lock_memory() -> Result<(), String> {
+    use rustix::mm::{MlockAllFlags, mlockall};
+    mlockall(MlockAllFlags::CURRENT | MlockAllFlags::FUTURE)
+        .map_err(|e| format!("mlockall is not permitted ({e}): set LimitMEMLOCK=infinity or CAP_IPC_LOCK; page faults may delay the loop"))
+}
+
+/// Page faults of the calling thread so far: (minor, major).
+pub fn page_faults() -> (u64, u64) {
+    // SAFETY: `rusage` is plain data for which all zeroes is a valid value.
+    let mut usage: libc::rusage = unsafe { std::mem::zeroed() };
+    // SAFETY: `usage` is valid for writes for the duration of the call, which only fills it.
+    if unsafe { libc::getrusage(libc::RUSAGE_THREAD, &raw mut usage) } != 0 {
+        return (0, 0);
+    }
+    (usage.ru_minflt as u64, usage.ru_majflt as u64)
+}
+
+thread_local! {
+    static ALLOCATIONS: Cell<u64> = const { Cell::new(0) };
+}
+
+/// Heap allocations and frees of the calling thread since it started; always 0 unless the binary installs
+/// [`CountingAllocator`].
+pub fn allocations() -> u64 {
+    ALLOCATIONS.try_with(Cell::get).unwrap_or(0)
+}
+
+/// The system's allocator, counting each call in the calling thread ([`allocations`]): how the loop shows that it makes none.
+pub struct CountingAllocator;
+
+fn count() {
+    // A thread that is being torn down has no counter any more, and nobody reads it.
+    let _ = ALLOCATIONS.try_with(|c| c.set(c.get() + 1));
+}
+
+// SAFETY: every call is passed on unchanged to `System`, which keeps the contract; the counter is a plain thread-local cell
+// without a destructor, so counting neither allocates nor unwinds.
+unsafe impl GlobalAlloc for CountingAllocator {
+    unsafe fn alloc(&self, layout: Layout) -> *mut u8 {
+        count();
+        // SAFETY: the caller keeps `alloc`'s contract.
+        unsafe { System.alloc(layout) }
+    }
+
+    unsafe fn dealloc(&self, ptr: *mut u8, layout: Layout) {
+        count();
+        // SAFETY: the caller keeps `dealloc`'s contract; `ptr` came from `System`.
+        unsafe { System.dealloc(ptr, layout) }
+    }
+
+    unsafe fn realloc(&self, ptr: *mut u8, layout: Layout, new_size: usize) -> *mut u8 {
+        count();
+        // SAFETY: the caller keeps `realloc`'s contract; `ptr` came from `System`.
+        unsafe { System.realloc(ptr, layout, new_size) }
+    }
 }

@@ -1,7 +1,10 @@
 //! The policy pi: (v_t, v_t-1, v_t-2, d) -> one of 21 relative angles (section 3.3.2), a 4-32-32-21 network.
 //!
 //! Runs in the controller's loop: fixed size, no allocation, no panic. The action table is Fig. 5's:
-//! `alpha_i = 5 sign(i) (i/10)^2` degrees, i = -10..10.
+//! `alpha_i = 5 sign(i) (i/10)^2` degrees, i = -10..10. Nothing here can fail: inputs that are not finite give the action
+//! "stay" through [`argmax`].
+
+use serde::{Deserialize, Serialize};
 
 /// Inputs of the network: v_t, v_t-1, v_t-2, d.
 pub const INPUTS: usize = 4;
@@ -9,9 +12,13 @@ pub const INPUTS: usize = 4;
 pub const HIDDEN: usize = 32;
 /// Actions, i = -10..=10.
 pub const ACTIONS: usize = 21;
+/// Index of the action "stay" (i = 0).
+pub const STAY: usize = ACTIONS / 2;
+/// Number of parameters of [`Mlp`].
+pub const PARAMETERS: usize = INPUTS * HIDDEN + HIDDEN + HIDDEN * HIDDEN + HIDDEN + HIDDEN * ACTIONS + ACTIONS;
 
 /// The 4-32-32-21 multilayer perceptron, ReLU in both hidden layers; 1909 parameters, f32.
-#[derive(Debug, Clone, PartialEq)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Mlp {
     /// Weights of layer 1, `[input][neuron]`.
     pub w1: [[f32; HIDDEN]; INPUTS],
@@ -25,4 +32,197 @@ pub struct Mlp {
     pub w3: [[f32; ACTIONS]; HIDDEN],
     /// Biases of the output layer.
     pub b3: [f32; ACTIONS],
+}
+
+impl Mlp {
+    /// A network whose parameters are all 0.
+    pub const ZERO: Self = Self {
+        w1: [[0.0; HIDDEN]; INPUTS],
+        b1: [0.0; HIDDEN],
+        w2: [[0.0; HIDDEN]; HIDDEN],
+        b2: [0.0; HIDDEN],
+        w3: [[0.0; ACTIONS]; HIDDEN],
+        b3: [0.0; ACTIONS],
+    };
+
+    /// Logits of the 21 actions for scaled inputs ([`InputScale::apply`]). About 1800 multiply-adds.
+    pub fn forward(&self, x: &[f32; INPUTS]) -> [f32; ACTIONS] {
+        let h1 = layer(&self.w1, &self.b1, x).map(|s| s.max(0.0));
+        let h2 = layer(&self.w2, &self.b2, &h1).map(|s| s.max(0.0));
+        layer(&self.w3, &self.b3, &h2)
+    }
+
+    /// All parameters in the order w1, b1, w2, b2, w3, b3.
+    pub fn parameters(&self) -> impl Iterator<Item = &f32> {
+        let Self { w1, b1, w2, b2, w3, b3 } = self;
+        w1.as_flattened().iter().chain(b1).chain(w2.as_flattened()).chain(b2).chain(w3.as_flattened()).chain(b3)
+    }
+
+    /// The same parameters, to be written.
+    pub fn parameters_mut(&mut self) -> impl Iterator<Item = &mut f32> {
+        let Self { w1, b1, w2, b2, w3, b3 } = self;
+        let front = w1.as_flattened_mut().iter_mut().chain(b1).chain(w2.as_flattened_mut()).chain(b2);
+        front.chain(w3.as_flattened_mut()).chain(b3)
+    }
+}
+
+/// Sums input by input, so that the compiler works on all neurons of a layer at once.
+fn layer<const N: usize, const M: usize>(w: &[[f32; M]; N], b: &[f32; M], x: &[f32; N]) -> [f32; M] {
+    let mut sum = *b;
+    for (row, xi) in w.iter().zip(x) {
+        for (s, wij) in sum.iter_mut().zip(row) {
+            *s += xi * wij;
+        }
+    }
+    sum
+}
+
+/// How the four observations enter the network: `[asinh(5 v_t), asinh(5 v_t-1), asinh(5 v_t-2), asinh(d/4)] / 2`.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+pub struct InputScale {
+    /// Factor of v before asinh, frames/ml.
+    pub v_per_ml: f32,
+    /// Divisor of d before asinh, ml.
+    pub d_ml: f32,
+    /// Factor after asinh.
+    pub gain: f32,
+}
+
+impl Default for InputScale {
+    fn default() -> Self {
+        Self { v_per_ml: 5.0, d_ml: 4.0, gain: 0.5 }
+    }
+}
+
+impl InputScale {
+    /// Scaled inputs from v_t, v_t-1, v_t-2 (ml a frame) and d (ml).
+    pub fn apply(&self, v_ml: [f32; 3], d_ml: f32) -> [f32; INPUTS] {
+        let v = v_ml.map(|v| asinh(v * self.v_per_ml) * self.gain);
+        [v[0], v[1], v[2], asinh(d_ml / self.d_ml) * self.gain]
+    }
+}
+
+/// asinh without the standard library's care for tiny arguments, which costs more than the whole first layer.
+fn asinh(x: f32) -> f32 {
+    let a = x.abs();
+    (a + (a * a + 1.0).sqrt()).ln().copysign(x)
+}
+
+/// Fig. 5's table: action index 0..21 (i = -10..10) to degrees, `5 sign(i) (i/10)^2`.
+pub const fn action_table() -> [f32; ACTIONS] {
+    let mut table = [0.0; ACTIONS];
+    let mut k = 0;
+    while k < ACTIONS {
+        let i = k as f32 - STAY as f32;
+        let square = 5.0 * i * i / 100.0;
+        table[k] = if i < 0.0 { -square } else { square };
+        k += 1;
+    }
+    table
+}
+
+/// The action of `table` nearest to `dalpha_deg`; ties and non-finite angles go to the smaller index found first.
+pub fn nearest_action(table: &[f32; ACTIONS], dalpha_deg: f32) -> usize {
+    let mut best = STAY;
+    for (k, a) in table.iter().enumerate() {
+        if (a - dalpha_deg).abs() < (table[best] - dalpha_deg).abs() {
+            best = k;
+        }
+    }
+    best
+}
+
+/// The action with the largest logit; "stay" if none is a number.
+pub fn argmax(logits: &[f32; ACTIONS]) -> usize {
+    let mut best = STAY;
+    for (k, l) in logits.iter().enumerate() {
+        if *l > logits[best] || (logits[best].is_nan() && !l.is_nan()) {
+            best = k;
+        }
+    }
+    best
+}
+
+/// Softmax of the logits; all weight on "stay" if they are not finite.
+pub fn softmax(logits: &[f32; ACTIONS]) -> [f32; ACTIONS] {
+    let top = logits.iter().fold(f32::NEG_INFINITY, |m, l| m.max(*l));
+    let mut p = logits.map(|l| (l - top).exp());
+    let sum: f32 = p.iter().sum();
+    if !(sum.is_finite() && sum > 0.0) {
+        p = [0.0; ACTIONS];
+        p[STAY] = 1.0;
+        return p;
+    }
+    p.map(|e| e / sum)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Protects the paper's shape: two hidden layers, about 2000 parameters, 1909 to the letter.
+    #[test]
+    fn the_network_has_1909_parameters() {
+        assert_eq!(PARAMETERS, 1909);
+        assert_eq!(Mlp::ZERO.parameters().count(), PARAMETERS);
+    }
+
+    /// Protects the forward pass: an independent, plain evaluation over the flat parameter list gives the same logits.
+    #[test]
+    fn forward_agrees_with_a_plain_evaluation() {
+        let mut net = Mlp::ZERO;
+        for (k, p) in net.parameters_mut().enumerate() {
+            *p = ((k as f32 * 0.37).sin() + 0.1) * 0.4;
+        }
+        let x = [0.3, -0.2, 0.9, 1.4];
+        let flat: Vec<f64> = net.parameters().map(|p| f64::from(*p)).collect();
+        let dense = |w: &[f64], b: &[f64], x: &[f64]| -> Vec<f64> {
+            (0..b.len()).map(|j| b[j] + x.iter().enumerate().map(|(i, xi)| xi * w[i * b.len() + j]).sum::<f64>()).collect()
+        };
+        let relu = |v: Vec<f64>| -> Vec<f64> { v.into_iter().map(|s| s.max(0.0)).collect() };
+        let (w1, rest) = flat.split_at(128);
+        let (b1, rest) = rest.split_at(32);
+        let (w2, rest) = rest.split_at(1024);
+        let (b2, rest) = rest.split_at(32);
+        let (w3, b3) = rest.split_at(672);
+        let h = relu(dense(w1, b1, &x.map(f64::from)));
+        let h = relu(dense(w2, b2, &h));
+        let want = dense(w3, b3, &h);
+        for (a, b) in net.forward(&x).iter().zip(&want) {
+            assert!((f64::from(*a) - b).abs() < 1e-4, "{a} {b}");
+        }
+    }
+
+    /// Protects Fig. 5's discretisation: fine near 0, +-5 degrees at the ends, odd, ascending; and its inverse.
+    #[test]
+    fn the_action_table_is_figure_5() {
+        let table = action_table();
+        assert_eq!((table[0], table[9], table[STAY], table[11], table[20]), (-5.0, -0.05, 0.0, 0.05, 5.0));
+        assert!(table.windows(2).all(|w| w[0] < w[1]));
+        for (k, a) in table.iter().enumerate() {
+            assert_eq!(nearest_action(&table, *a), k);
+        }
+        assert_eq!(nearest_action(&table, 99.0), 20);
+        assert_eq!(nearest_action(&table, f32::NAN), STAY);
+    }
+
+    /// Protects the robot from an undefined action: numbers that are none give "stay".
+    #[test]
+    fn non_finite_logits_mean_stay() {
+        assert_eq!(argmax(&[f32::NAN; ACTIONS]), STAY);
+        assert_eq!(softmax(&[f32::NAN; ACTIONS])[STAY], 1.0);
+        let mut one = [f32::NAN; ACTIONS];
+        one[3] = -7.0;
+        assert_eq!(argmax(&one), 3);
+    }
+
+    /// Protects the input scaling against its formula.
+    #[test]
+    fn inputs_are_scaled_by_asinh() {
+        let x = InputScale::default().apply([0.0, 0.2, 1.0], -40.0);
+        let want = [0.0, 1f64.asinh() / 2.0, 5f64.asinh() / 2.0, (-10f64).asinh() / 2.0];
+        for (a, b) in x.iter().zip(want) {
+            assert!((f64::from(*a) - b).abs() < 1e-6);
+        }
+    }
 }

@@ -1,18 +1,430 @@
-//! The weight file.
+//! The weight file: everything that the controller needs to pour, in one postcard blob with a CRC.
+//!
+//! Read and written by ordinary threads (allocates); the loop only sees a [`Weights`] that was checked here. A file that is
+//! truncated, damaged, of another format version, of another shape or not finite is refused with one line that says which.
+//! Writing is atomic: a temporary file in the same directory, synced, then renamed.
+//!
+//! ```text
+//! offset  bytes  what
+//!      0      8  "decant-w"
+//!      8      4  format version, little endian
+//!     12      8  shape: inputs, hidden 1, hidden 2, actions, 2 bytes each, little endian
+//!     20      4  length of the rest, little endian
+//!     24      n  postcard of `Weights`, then its CRC-32 (ISO-HDLC), 4 bytes
+//! ```
 
+use std::io::Write;
 use std::path::Path;
 
-/// Everything that the controller needs to pour: network, action table, scaling, calibration, estimator parameters.
-#[derive(Debug, Clone)]
-pub struct Weights {}
+use crc::{CRC_32_ISO_HDLC, Crc};
+use serde::{Deserialize, Serialize};
+use sha2::{Digest, Sha256};
 
-/// Why a weight file is refused.
+use crate::agent::Selection;
+use crate::estimate::Calibration;
+use crate::estimate::flow::{DELAY_MAX, FlowModel, FlowNoise, Return};
+use crate::policy::{ACTIONS, HIDDEN, INPUTS, InputScale, Mlp, nearest_action};
+
+/// Version of the file format; other versions are refused.
+pub const FORMAT_VERSION: u32 = 1;
+
+const MAGIC: &[u8; 8] = b"decant-w";
+const HEADER: usize = 24;
+const SHAPE: [usize; 4] = [INPUTS, HIDDEN, HIDDEN, ACTIONS];
+/// Room for the payload; a blob is about 9 kB.
+const PAYLOAD_MAX: usize = 64 * 1024;
+const CRC: Crc<u32> = Crc::<u32>::new(&CRC_32_ISO_HDLC);
+
+/// Everything that the controller needs to pour, and where it came from.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Weights {
+    /// The network.
+    pub policy: Mlp,
+    /// Angle of each action, degrees, ascending (Fig. 5, or two actions).
+    pub actions_deg: [f32; ACTIONS],
+    /// How outputs become an action.
+    pub selection: Selection,
+    /// How observations become inputs.
+    pub scale: InputScale,
+    /// Area to ml.
+    pub calibration: Calibration,
+    /// How the poured volume is estimated.
+    pub estimator: Estimator,
+    /// Frames a second that it was trained for.
+    pub rate_hz: f32,
+    /// Where it came from.
+    pub origin: Origin,
+    /// Seed of the training, and of [`Selection::Sampled`].
+    pub seed: u64,
+}
+
+/// How the poured volume is estimated.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum Estimator {
+    /// The paper's plain sum of the frames' volumes.
+    Sum,
+    /// Camera and container geometry, fused by a filter on the flow model.
+    Fused {
+        /// The fitted model.
+        model: FlowModel,
+        /// How the controller tilts back, to know what still flows then.
+        back: Return,
+    },
+}
+
+impl Estimator {
+    fn check(&self) -> Result<(), String> {
+        let Self::Fused { model, back } = self else { return Ok(()) };
+        let FlowModel { s, lk, p, k1, k2, tau, delay, eta, noise } = *model;
+        let FlowNoise { lambda, gamma, beta, delta, frame, v_min_ml } = noise;
+        let ranges = [
+            ("flow coefficient", lk, -20.0, 20.0),
+            ("flow exponent", p, 0.2, 5.0),
+            ("k1", k1, -20.0, 20.0),
+            ("k2", k2, -20.0, 20.0),
+            ("lag", tau, 0.0, 60.0),
+            ("delay", delay, 0.0, DELAY_MAX),
+            ("film share", eta, 0.0, 0.95),
+            ("sd of lambda", lambda, 1e-4, 5.0),
+            ("sd of gamma", gamma, 1e-4, 5.0),
+            ("sd of beta", beta, 1e-6, 5.0),
+            ("sd of the delay", delta, 1e-4, 20.0),
+            ("sd of a frame", frame, 1e-4, 5.0),
+            ("smallest outflow", v_min_ml, 0.0, 10.0),
+            ("rate back", back.rate_deg, 0.1, 10.0),
+            ("change of the rate back", back.change_deg, 0.01, 100.0),
+        ];
+        for (name, value, low, high) in ranges.into_iter().chain(s.map(|s| ("capacity a degree (log)", s, -10.0, 10.0))) {
+            if !(low..=high).contains(&value) {
+                return Err(format!("estimator: {name} is {value}, allowed is {low} to {high}"));
+            }
+        }
+        Ok(())
+    }
+}
+
+/// Where weights came from; the controller only shows it.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Origin {
+    /// Training method.
+    pub method: Method,
+    /// Number of actions trained, 2 or 21.
+    pub actions: u8,
+    /// Episodes trained on.
+    pub episodes: u32,
+    /// SHA-256 of the training data as the trainer hashes it.
+    pub data_sha256: [u8; 32],
+}
+
+/// How the policy was trained.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum Method {
+    /// The paper's eq. (5)-(8), as printed.
+    Literal,
+    /// Eq. (8) with positive weights only.
+    Paper,
+    /// Flow model, policy search in it, distilled into the network.
+    Best,
+    /// Made by hand, for tests and examples.
+    Handmade,
+}
+
+/// Why a weight file is refused or could not be written.
 #[derive(Debug, thiserror::Error)]
-pub enum WeightsError {}
+pub enum WeightsError {
+    /// The file cannot be read.
+    #[error("{file}: {what}")]
+    Read {
+        /// The file.
+        file: String,
+        /// The system's words.
+        what: String,
+    },
+    /// The file cannot be written; what was there before is still there.
+    #[error("{file}: cannot be written: {what}")]
+    Write {
+        /// The file.
+        file: String,
+        /// The system's words.
+        what: String,
+    },
+    /// Not a weight file at all.
+    #[error("{file}: not a weight file of Decant; train one with `trainer train`")]
+    Foreign {
+        /// The file.
+        file: String,
+    },
+    /// Written by another version of the format.
+    #[error("{file}: format version {found}, this program reads {FORMAT_VERSION}; train again with this version")]
+    Version {
+        /// The file.
+        file: String,
+        /// Version in the file.
+        found: u32,
+    },
+    /// A network of another shape.
+    #[error("{file}: a network of shape {found:?}, this program runs {SHAPE:?}; train again with this version")]
+    Shape {
+        /// The file.
+        file: String,
+        /// Shape in the file.
+        found: [usize; 4],
+    },
+    /// Shorter or longer than its header says.
+    #[error("{file}: truncated or with bytes too many: {found} bytes where the header says {expected}; copy it again")]
+    Length {
+        /// The file.
+        file: String,
+        /// Bytes in the file.
+        found: usize,
+        /// Bytes that the header promises.
+        expected: usize,
+    },
+    /// The checksum does not match, or the contents make no sense.
+    #[error("{file}: damaged (checksum or contents do not match); copy it again or train again")]
+    Damaged {
+        /// The file.
+        file: String,
+    },
+    /// A value that is not finite or out of its range.
+    #[error("{file}: {what}; train again")]
+    Value {
+        /// The file.
+        file: String,
+        /// Which value, and what is allowed.
+        what: String,
+    },
+}
 
 impl Weights {
+    /// Index of the action that tilts back: the one nearest to -3.2 degrees a frame.
+    pub fn back_action(&self) -> usize {
+        nearest_action(&self.actions_deg, -3.2)
+    }
+
+    /// The file's bytes. The same weights give the same bytes.
+    pub fn to_bytes(&self) -> Result<Vec<u8>, WeightsError> {
+        let mut buffer = vec![0; PAYLOAD_MAX];
+        let refused = |e: postcard::Error| WeightsError::Write { file: "weights".into(), what: e.to_string() };
+        let payload = postcard::to_slice_crc32(self, &mut buffer, CRC.digest()).map_err(refused)?;
+        let mut bytes = Vec::with_capacity(HEADER + payload.len());
+        bytes.extend_from_slice(MAGIC);
+        bytes.extend_from_slice(&FORMAT_VERSION.to_le_bytes());
+        for n in SHAPE {
+            bytes.extend_from_slice(&(n as u16).to_le_bytes());
+        }
+        bytes.extend_from_slice(&(payload.len() as u32).to_le_bytes());
+        bytes.extend_from_slice(payload);
+        Ok(bytes)
+    }
+
+    /// Checks and reads a file's bytes; `file` is named in errors.
+    pub fn from_bytes(bytes: &[u8], file: &str) -> Result<Self, WeightsError> {
+        let file = || file.to_owned();
+        if bytes.len() < HEADER {
+            return Err(if MAGIC.starts_with(bytes) || bytes.starts_with(MAGIC) {
+                WeightsError::Length { file: file(), found: bytes.len(), expected: HEADER }
+            } else {
+                WeightsError::Foreign { file: file() }
+            });
+        }
+        if !bytes.starts_with(MAGIC) {
+            return Err(WeightsError::Foreign { file: file() });
+        }
+        let u16_at = |at: usize| usize::from(u16::from_le_bytes([bytes[at], bytes[at + 1]]));
+        let u32_at = |at: usize| u32::from_le_bytes([bytes[at], bytes[at + 1], bytes[at + 2], bytes[at + 3]]);
+        let version = u32_at(8);
+        if version != FORMAT_VERSION {
+            return Err(WeightsError::Version { file: file(), found: version });
+        }
+        let shape = [u16_at(12), u16_at(14), u16_at(16), u16_at(18)];
+        if shape != SHAPE {
+            return Err(WeightsError::Shape { file: file(), found: shape });
+        }
+        let expected = HEADER.saturating_add(u32_at(20) as usize);
+        if bytes.len() != expected {
+            return Err(WeightsError::Length { file: file(), found: bytes.len(), expected });
+        }
+        let weights: Self =
+            postcard::from_bytes_crc32(&bytes[HEADER..], CRC.digest()).map_err(|_| WeightsError::Damaged { file: file() })?;
+        weights.check().map_err(|what| WeightsError::Value { file: file(), what })?;
+        Ok(weights)
+    }
+
     /// Reads and checks a weight file.
-    pub fn read(_path: &Path) -> Result<Self, WeightsError> {
-        Ok(Self {})
+    pub fn read(path: &Path) -> Result<Self, WeightsError> {
+        let file = path.display().to_string();
+        let bytes = std::fs::read(path).map_err(|e| WeightsError::Read { file: file.clone(), what: e.to_string() })?;
+        Self::from_bytes(&bytes, &file)
+    }
+
+    /// Checks and writes a weight file, atomically: a reader sees the old file or the new one, whole.
+    pub fn write(&self, path: &Path) -> Result<(), WeightsError> {
+        let file = path.display().to_string();
+        self.check().map_err(|what| WeightsError::Value { file: file.clone(), what })?;
+        let bytes = self.to_bytes()?;
+        let mut temporary = path.as_os_str().to_owned();
+        temporary.push(format!(".{}.tmp", std::process::id()));
+        let put = || -> std::io::Result<()> {
+            let mut out = std::fs::File::create(&temporary)?;
+            out.write_all(&bytes)?;
+            out.sync_all()?;
+            std::fs::rename(&temporary, path)
+        };
+        put().map_err(|e| {
+            // The half-written temporary file is of no use to anybody; that it cannot be removed changes nothing.
+            let _ = std::fs::remove_file(&temporary);
+            WeightsError::Write { file, what: e.to_string() }
+        })
+    }
+
+    /// Identity: the first 8 bytes of the SHA-256 of the file's bytes, hexadecimal.
+    pub fn identity(&self) -> String {
+        self.to_bytes().map(|bytes| Sha256::digest(&bytes)[..8].iter().map(|b| format!("{b:02x}")).collect()).unwrap_or_default()
+    }
+
+    /// Which value must not go to the robot, if any.
+    fn check(&self) -> Result<(), String> {
+        if let Some(k) = self.policy.parameters().position(|p| !p.is_finite()) {
+            return Err(format!("parameter {k} of the network is not finite"));
+        }
+        let ascending = self.actions_deg.windows(2).all(|w| w[0] <= w[1]);
+        if !ascending || self.actions_deg.iter().any(|a| !a.is_finite() || a.abs() > 10.0) {
+            return Err("the action table is not ascending within +-10 degrees".into());
+        }
+        let InputScale { v_per_ml, d_ml, gain } = self.scale;
+        let Calibration { c, q, hold_above_px2 } = self.calibration;
+        let positive = [
+            ("input scale of v", v_per_ml),
+            ("input scale of d", d_ml),
+            ("input gain", gain),
+            ("calibration c", c),
+            ("frame rate", self.rate_hz),
+        ];
+        for (name, value) in positive {
+            if !(value.is_finite() && value > 0.0) {
+                return Err(format!("{name} is {value}, not a positive number"));
+            }
+        }
+        if !(0.1..=10.0).contains(&q) {
+            return Err(format!("calibration exponent {q} is outside 0.1 to 10"));
+        }
+        if hold_above_px2.is_nan() || hold_above_px2 < 0.0 {
+            return Err(format!("dropout hold above {hold_above_px2} px^2 is not a number >= 0"));
+        }
+        self.estimator.check()
+    }
+}
+
+#[cfg(test)]
+pub(crate) mod tests {
+    use super::*;
+    use crate::policy::action_table;
+    use proptest::prelude::*;
+
+    /// A network that pours while d > 0 and stays when d is near 0; made by hand.
+    pub(crate) fn example() -> Weights {
+        let mut policy = Mlp::ZERO;
+        for (k, p) in policy.parameters_mut().enumerate() {
+            *p = (k as f32 * 0.7).sin() * 0.1;
+        }
+        Weights {
+            policy,
+            actions_deg: action_table(),
+            selection: Selection::Argmax,
+            scale: InputScale::default(),
+            calibration: Calibration { c: 0.002, q: 1.15, hold_above_px2: 60.0 },
+            estimator: Estimator::Sum,
+            rate_hz: 30.0,
+            origin: Origin { method: Method::Handmade, actions: 21, episodes: 0, data_sha256: [7; 32] },
+            seed: 1,
+        }
+    }
+
+    /// Protects the swap: what is written is what is read, with the same identity, and no temporary file is left.
+    #[test]
+    fn a_written_file_reads_back_the_same() {
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("w.bin");
+        let weights = example();
+        weights.write(&path).unwrap();
+        weights.write(&path).unwrap();
+        let read = Weights::read(&path).unwrap();
+        assert_eq!(read, weights);
+        assert_eq!(read.identity(), weights.identity());
+        assert_eq!(read.identity().len(), 16);
+        assert_eq!(std::fs::read_dir(dir.path()).unwrap().count(), 1);
+    }
+
+    /// Protects the robot: a file cut at any byte is refused, and never panics.
+    #[test]
+    fn every_truncation_is_refused() {
+        let bytes = example().to_bytes().unwrap();
+        for n in 0..bytes.len() {
+            let error = Weights::from_bytes(&bytes[..n], "w").unwrap_err();
+            assert!(matches!(error, WeightsError::Length { .. }), "{n}: {error}");
+        }
+        let mut long = bytes;
+        long.push(0);
+        assert!(matches!(Weights::from_bytes(&long, "w"), Err(WeightsError::Length { .. })));
+    }
+
+    /// Protects the robot: a single flipped bit anywhere is refused.
+    #[test]
+    fn every_flipped_bit_is_refused() {
+        let bytes = example().to_bytes().unwrap();
+        for bit in 0..bytes.len() * 8 {
+            let mut bad = bytes.clone();
+            bad[bit / 8] ^= 1 << (bit % 8);
+            assert!(Weights::from_bytes(&bad, "w").is_err(), "bit {bit}");
+        }
+    }
+
+    proptest! {
+        /// Protects the service thread: no bytes, however wild, make it panic.
+        #[test]
+        fn any_bytes_are_refused_calmly(bytes in prop::collection::vec(any::<u8>(), 0..200), keep in 0usize..30) {
+            let mut mixed = example().to_bytes().unwrap();
+            mixed.truncate(keep);
+            mixed.extend(&bytes);
+            prop_assert!(Weights::from_bytes(&mixed, "w").is_err());
+        }
+    }
+
+    /// Protects the operator: each refusal names its own reason.
+    #[test]
+    fn refusals_say_which() {
+        let good = example().to_bytes().unwrap();
+        let say = |bytes: &[u8]| Weights::from_bytes(bytes, "w.bin").unwrap_err().to_string();
+        assert!(say(b"GIF89a, a picture and no weights").contains("not a weight file"));
+        let mut other = good.clone();
+        other[8] = 9;
+        assert!(say(&other).contains("format version 9"));
+        let mut shape = good.clone();
+        shape[14] = 64;
+        assert!(say(&shape).contains("shape [4, 64, 32, 21]"));
+        assert!(say(&good[..100]).contains("truncated"));
+        let mut flipped = good.clone();
+        flipped[200] ^= 4;
+        assert!(say(&flipped).contains("damaged"));
+        for (what, change) in [
+            ("parameter 5", (|w: &mut Weights| w.policy.w1[0][5] = f32::NAN) as fn(&mut Weights)),
+            ("action table", |w| w.actions_deg[3] = 7.0),
+            ("calibration c", |w| w.calibration.c = f32::INFINITY),
+            ("exponent", |w| w.calibration.q = f32::NAN),
+            ("frame rate", |w| w.rate_hz = 0.0),
+            ("hold", |w| w.calibration.hold_above_px2 = f32::NAN),
+        ] {
+            let mut weights = example();
+            change(&mut weights);
+            let line = say(&weights.to_bytes().unwrap());
+            assert!(line.contains(what) && line.starts_with("w.bin: "), "{line}");
+            assert!(weights.write(Path::new("never-written.bin")).is_err());
+        }
+        let missing = Weights::read(Path::new("/nonexistent/w.bin")).unwrap_err().to_string();
+        assert!(missing.starts_with("/nonexistent/w.bin: "));
+        assert!(example().write(Path::new("/nonexistent/w.bin")).unwrap_err().to_string().contains("cannot be written"));
     }
 }

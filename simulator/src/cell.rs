@@ -1,12 +1,310 @@
-//! Runs the simulated cell: UR5 controller, container, camera, scale.
+//! `simulator run`: the simulated cell in real time: UR5 controller, container on its wrist, camera, kitchen scale, operator.
+//!
+//! Threads, all ordinary: the UR controller's own (see [`crate::ur`]); "physics" moves the liquid every 4 ms with the tilt that
+//! the simulated joint really has; "camera" renders and publishes frames; the main thread serves the operator's socket. The
+//! cell offers what a real one offers: RTDE and script ports, camera frames in shared memory. The truth leaves it only as
+//! pixels, joint angles and, after a pour, as the scale's reading. Errors at start are one line; afterwards a failing camera
+//! ends the process, so that nobody measures half a cell.
 
+use std::io::{BufRead, BufReader, Write};
+use std::os::unix::net::{UnixListener, UnixStream};
+use std::path::PathBuf;
 use std::process::ExitCode;
+use std::sync::atomic::{AtomicBool, Ordering::Relaxed};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::time::Duration;
+
+use rand::{RngExt, SeedableRng};
+use rand_pcg::Pcg64Mcg;
+use serde::{Deserialize, Serialize};
+use shared::config::Config;
+use shared::exit;
+use shared::ipc::Cell;
+use shared::messages::{FrameHeader, LAYOUT_VERSION, PixelFormat};
+use shared::os;
+
+use crate::camera::{Renderer, Scene, View};
+use crate::physics::container::Container;
+use crate::physics::rig::Rig;
+use crate::ur;
+
+/// Step of the liquid, ns.
+const PHYSICS_NS: u64 = 4_000_000;
 
 /// Command-line arguments.
 #[derive(Debug, clap::Args)]
-pub struct Args {}
+#[command(
+    after_help = "Example:\n  simulator run --config config/sim.toml\n\nThen start `feature-worker run` and `rt-controller run` with the same \
+configuration, and act as the operator with `simulator operator`."
+)]
+pub struct Args {
+    /// The simulated cell's configuration.
+    #[arg(long, default_value = "config/sim.toml")]
+    config: PathBuf,
+}
+
+/// The table `[simulator]` of the configuration.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct SimulatorConfig {
+    /// Draws the rig: container, lip, liquid and camera (see [`Rig::seeded`]), and all noise.
+    pub seed: u64,
+    /// Which UR controller: `cb3` (3.15, 125 Hz) or `e-series` (5.x, 500 Hz).
+    pub series: ur::Series,
+    /// Container: `cylinder`, `cone-in`, `cone-out`, `bottle` or `jug`.
+    pub container: String,
+    /// Volume in the container at the start, ml.
+    pub fill_ml: f64,
+    /// From the middle of the exposure until the frame is published, ms.
+    pub camera_delay_ms: u32,
+    /// Share of frames that the camera loses.
+    pub camera_loss: f64,
+    /// The camera's view.
+    pub view: View,
+}
+
+impl Default for SimulatorConfig {
+    fn default() -> Self {
+        Self {
+            seed: 1,
+            series: ur::Series::Cb3,
+            container: "cylinder".into(),
+            fill_ml: 300.0,
+            camera_delay_ms: 25,
+            camera_loss: 0.002,
+            view: View::default(),
+        }
+    }
+}
+
+impl SimulatorConfig {
+    /// Reads and checks the table `[simulator]`; the error is one line for the operator.
+    pub fn new(config: &Config) -> Result<Self, String> {
+        let table = config.simulator.clone().ok_or("no table [simulator]: this is not a simulated cell's configuration")?;
+        let this: Self = toml::Value::Table(table).try_into().map_err(|e: toml::de::Error| format!("[simulator]: {}", e.message()))?;
+        let rules = [
+            ("fill_ml", this.fill_ml, 0.0, 2000.0),
+            ("camera_delay_ms", this.camera_delay_ms.into(), 0.0, 200.0),
+            ("camera_loss", this.camera_loss, 0.0, 0.5),
+        ];
+        for (key, value, low, high) in rules {
+            if !(value >= low && value <= high) {
+                return Err(format!("simulator.{key} = {value}: allowed is {low} to {high}"));
+            }
+        }
+        if Rig::seeded(this.seed).with_container(&this.container).is_none() {
+            return Err(format!("simulator.container = '{}': allowed is cylinder, cone-in, cone-out, bottle or jug", this.container));
+        }
+        let size = (this.view.width_px, this.view.height_px);
+        if size != (config.camera.width_px, config.camera.height_px) {
+            return Err(format!(
+                "simulator.view is {} x {} px, but [camera] {} x {}",
+                size.0, size.1, config.camera.width_px, config.camera.height_px
+            ));
+        }
+        Ok(this)
+    }
+
+    /// The rig that the seed and the container's name stand for.
+    pub fn rig(&self) -> Rig {
+        Rig::seeded(self.seed).with_container(&self.container).unwrap_or_else(|| Rig::seeded(self.seed))
+    }
+}
+
+/// Path of the operator's socket of the cell `name`.
+pub fn operator_socket(name: &str) -> PathBuf {
+    PathBuf::from(format!("/tmp/decant_{name}/operator"))
+}
+
+/// What the threads share.
+struct World {
+    container: Mutex<Container>,
+    rig: Rig,
+    robot: ur::Handle,
+    config: Config,
+    sim: SimulatorConfig,
+    stop: Arc<AtomicBool>,
+}
+
+impl World {
+    fn container(&self) -> MutexGuard<'_, Container> {
+        self.container.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// The container's real tilt and its rate: degrees, degrees/s.
+    fn tilt(&self) -> (f64, f64) {
+        let robot = &self.config.robot;
+        let (joints, i) = (self.robot.joints(), robot.joint.index());
+        let alpha_deg = robot.direction * (joints.actual_q[i].to_degrees() - robot.start_joint_deg);
+        (alpha_deg, robot.direction * joints.actual_qd[i].to_degrees())
+    }
+}
 
 /// Runs the command; the exit codes are those of [`shared::exit`].
-pub fn run(_args: &Args) -> ExitCode {
-    shared::exit::fail(shared::exit::FAILED, "not built yet")
+pub fn run(args: &Args) -> ExitCode {
+    let config = match Config::read(&args.config) {
+        Ok(config) => config,
+        Err(e) => return exit::fail(exit::BAD_INPUT, e),
+    };
+    let sim = match SimulatorConfig::new(&config) {
+        Ok(sim) => sim,
+        Err(e) => return exit::fail(exit::BAD_INPUT, format!("{}: {e}", args.config.display())),
+    };
+    match simulate(config, sim) {
+        Ok(()) => ExitCode::SUCCESS,
+        Err(e) => exit::fail(exit::FAILED, e),
+    }
+}
+
+fn simulate(config: Config, sim: SimulatorConfig) -> Result<(), Box<dyn std::error::Error>> {
+    let stop = Arc::new(AtomicBool::new(false));
+    for signal in [signal_hook::consts::SIGINT, signal_hook::consts::SIGTERM] {
+        signal_hook::flag::register(signal, Arc::clone(&stop))?;
+    }
+    let mut start_q_rad = [0.0, -1.571, 1.571, -1.571, -1.571, 0.0];
+    start_q_rad[config.robot.joint.index()] = config.robot.start_joint_deg.to_radians();
+    let robot =
+        ur::Controller::start(ur::Options { address: config.robot.address, series: sim.series, start_q_rad, ..ur::Options::default() })?;
+    let rig = sim.rig();
+    let world = World { container: Mutex::new(rig.container(sim.fill_ml)), rig, robot, config, sim, stop };
+
+    let cell = Cell::join(&world.config.cell.name)?;
+    let socket = operator_socket(&world.config.cell.name);
+    if let Some(parent) = socket.parent() {
+        std::fs::create_dir_all(parent)?;
+    }
+    if UnixStream::connect(&socket).is_ok() {
+        return Err(format!("cell '{}' is already being simulated", world.config.cell.name).into());
+    }
+    let _ = std::fs::remove_file(&socket);
+    let listener = UnixListener::bind(&socket)?;
+    listener.set_nonblocking(true)?;
+    eprintln!("simulator: cell '{}' is up, UR5 controller on {}", world.config.cell.name, world.config.robot.address);
+
+    let result = std::thread::scope(|scope| {
+        scope.spawn(|| move_liquid(&world));
+        let camera = scope.spawn(|| {
+            let result = film(&world);
+            world.stop.store(true, Relaxed);
+            result
+        });
+        serve_operator(&world, &listener);
+        camera.join().unwrap_or_else(|_| Err("the camera thread failed".into()))
+    });
+    let _ = std::fs::remove_file(&socket);
+    drop(cell);
+    result.map_err(Into::into)
+}
+
+/// Thread "physics".
+fn move_liquid(world: &World) {
+    let mut next_ns = os::now_ns();
+    while !world.stop.load(Relaxed) {
+        next_ns += PHYSICS_NS;
+        os::sleep_until_ns(next_ns);
+        let (alpha_deg, _) = world.tilt();
+        world.container().step(PHYSICS_NS as f64 / 1e9, alpha_deg);
+    }
+}
+
+/// Thread "camera".
+fn film(world: &World) -> Result<(), String> {
+    let words = |e: &dyn std::fmt::Debug| format!("camera: {e:?}");
+    let cell = Cell::join(&world.config.cell.name).map_err(|e| e.to_string())?;
+    let topic = cell.frames().map_err(|e| e.to_string())?;
+    let view = &world.sim.view;
+    let bytes = view.width_px as usize * view.height_px as usize * PixelFormat::Bgr8.bytes_per_pixel();
+    let publisher = topic.publisher_builder().initial_max_slice_len(bytes).create().map_err(|e| words(&e))?;
+    let notifier = cell.frame_notifier().map_err(|e| e.to_string())?;
+    let mut renderer = Renderer::new(view, world.sim.seed).map_err(|e| e.to_string())?;
+    let mut random = Pcg64Mcg::seed_from_u64(world.sim.seed ^ 0xCA_3E_2A);
+    let mut pixels = vec![0; bytes];
+    let period_ns = (1e9 / world.config.camera.fps) as u64;
+    let (mut sequence, mut captured_at_ns) = (0, os::now_ns());
+    while !world.stop.load(Relaxed) {
+        captured_at_ns += period_ns;
+        os::sleep_until_ns(captured_at_ns);
+        sequence += 1;
+        let (alpha_deg, rate_deg_s) = world.tilt();
+        let scene = {
+            let container = world.container();
+            let excess_ml = container.volume_ml() - container.shape().retained_ml(alpha_deg);
+            Scene {
+                at_s: captured_at_ns as f64 / 1e9,
+                alpha_deg,
+                rate_deg_s,
+                flow_ml_s: container.lip().flow_ml_s,
+                level_mm: 1000.0 * excess_ml / container.shape().surface_mm2(alpha_deg),
+            }
+        };
+        renderer.render(&scene, &mut pixels).map_err(|e| e.to_string())?;
+        if random.random::<f64>() < world.sim.camera_loss {
+            continue;
+        }
+        os::sleep_until_ns(captured_at_ns + u64::from(world.sim.camera_delay_ms) * 1_000_000);
+        let mut sample = publisher.loan_slice_uninit(bytes).map_err(|e| words(&e))?;
+        *sample.user_header_mut() = FrameHeader {
+            version: LAYOUT_VERSION,
+            format: PixelFormat::Bgr8 as u32,
+            width_px: view.width_px,
+            height_px: view.height_px,
+            sequence,
+            captured_at_ns,
+            published_at_ns: os::now_ns(),
+        };
+        sample.write_from_slice(&pixels).send().map_err(|e| words(&e))?;
+        notifier.notify().map_err(|e| words(&e))?;
+    }
+    Ok(())
+}
+
+/// The main thread: one line asked, one line (JSON) answered; see [`crate::operator`].
+fn serve_operator(world: &World, listener: &UnixListener) {
+    let mut noise = Pcg64Mcg::seed_from_u64(world.sim.seed ^ 0x5C_A1_E0);
+    while !world.stop.load(Relaxed) {
+        match listener.accept() {
+            Ok((stream, _)) => {
+                let _ = answer(world, &mut noise, &stream);
+            }
+            Err(_) => std::thread::sleep(Duration::from_millis(20)),
+        }
+    }
+}
+
+fn answer(world: &World, noise: &mut Pcg64Mcg, mut stream: &UnixStream) -> std::io::Result<()> {
+    stream.set_nonblocking(false)?;
+    stream.set_read_timeout(Some(Duration::from_secs(1)))?;
+    let mut line = String::new();
+    BufReader::new(stream).read_line(&mut line)?;
+    let reply = match obey(world, noise, line.trim()) {
+        Ok(value) => value,
+        Err(error) => serde_json::json!({ "error": error }),
+    };
+    writeln!(stream, "{reply}")
+}
+
+fn obey(world: &World, noise: &mut Pcg64Mcg, line: &str) -> Result<serde_json::Value, String> {
+    let (verb, rest) = line.split_once(' ').unwrap_or((line, ""));
+    match verb {
+        "fill" => {
+            let volume_ml: f64 = rest.parse().map_err(|_| format!("'{rest}' is no volume in ml"))?;
+            let mut container = world.container();
+            if !(volume_ml >= 0.0 && volume_ml <= 0.92 * container.full_ml()) {
+                return Err(format!("{volume_ml} ml: this container takes 0 to {:.0} ml", 0.92 * container.full_ml()));
+            }
+            *container = world.rig.container(volume_ml);
+            Ok(serde_json::json!({ "filled_ml": volume_ml }))
+        }
+        "scale" => {
+            // A kitchen scale: half a gram of error, steps of one gram.
+            let error_g = 0.5 * noise.sample::<f64, _>(rand_distr::StandardNormal);
+            Ok(serde_json::json!({ "weight_g": (world.container().poured_ml() + error_g).round().max(0.0) }))
+        }
+        "fault" => {
+            let fault: ur::Fault = rest.parse().map_err(|e| format!("{e}"))?;
+            world.robot.inject(fault);
+            Ok(serde_json::json!({ "fault": rest }))
+        }
+        _ => Err(format!("'{verb}' is nothing that an operator can do here")),
+    }
 }

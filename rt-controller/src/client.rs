@@ -1,0 +1,160 @@
+//! The clients' side of the controller's service `control`: one request, one answer. Ordinary threads; allocates.
+
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::{Duration, Instant};
+
+use iceoryx2::port::client::Client as Port;
+use iceoryx2::service::ipc::Service as Ipc;
+use indicatif::ProgressStyle;
+use shared::control::{Outcome, Reply, Request, Status};
+use shared::ipc::{Cell, IpcError};
+use shared::messages::{RecorderReport, RecorderState};
+
+/// Largest request or answer, bytes.
+pub const MESSAGE_MAX: usize = 64 * 1024;
+
+/// Why the controller did not answer.
+#[derive(Debug, thiserror::Error)]
+pub enum ClientError {
+    /// Shared memory cannot be joined.
+    #[error(transparent)]
+    Ipc(#[from] IpcError),
+    /// No controller, or it does not answer.
+    #[error("no answer from rt-controller in cell '{cell}': is `rt-controller run` running with the same --config, as the same user?")]
+    NoAnswer {
+        /// The cell's name.
+        cell: String,
+    },
+    /// The answer cannot be read.
+    #[error("rt-controller answered in another version's words: run the same build on both sides")]
+    Version,
+}
+
+/// A connection to the running controller.
+pub struct Client {
+    port: Port<Ipc, [u8], (), [u8], ()>,
+    cell: String,
+    _cell: Cell,
+}
+
+impl Client {
+    /// Connects to the controller of the cell `name`.
+    pub fn connect(name: &str) -> Result<Self, ClientError> {
+        let cell = Cell::join(name)?;
+        let fail = |e: String| IpcError::Service { service: "control".into(), what: e };
+        let port = cell.control()?.client_builder().initial_max_slice_len(MESSAGE_MAX).create().map_err(|e| fail(format!("{e:?}")))?;
+        Ok(Self { port, cell: name.into(), _cell: cell })
+    }
+
+    /// Asks and waits up to 2 s for the answer.
+    pub fn ask(&self, request: &Request) -> Result<Reply, ClientError> {
+        let no_answer = || ClientError::NoAnswer { cell: self.cell.clone() };
+        let mut buffer = vec![0; MESSAGE_MAX];
+        let bytes = postcard::to_slice(request, &mut buffer).map_err(|_| ClientError::Version)?;
+        let loan = self.port.loan_slice_uninit(bytes.len()).map_err(|_| no_answer())?;
+        let pending = loan.write_from_slice(bytes).send().map_err(|_| no_answer())?;
+        let until = Instant::now() + Duration::from_secs(2);
+        while Instant::now() < until {
+            if let Some(response) = pending.receive().map_err(|_| no_answer())? {
+                return postcard::from_bytes(response.payload()).map_err(|_| ClientError::Version);
+            }
+            std::thread::sleep(Duration::from_millis(5));
+        }
+        Err(no_answer())
+    }
+
+    /// The controller's state.
+    pub fn status(&self) -> Result<Box<Status>, ClientError> {
+        match self.ask(&Request::Status)? {
+            Reply::Status(status) => Ok(status),
+            _ => Err(ClientError::Version),
+        }
+    }
+}
+
+/// Why a pour could not be followed to its end.
+#[derive(Debug, thiserror::Error)]
+pub enum FollowError {
+    /// The person pressed Ctrl-C; the container was brought upright.
+    #[error("interrupted")]
+    Interrupted,
+    /// The controller is gone.
+    #[error(transparent)]
+    Client(#[from] ClientError),
+}
+
+impl Client {
+    /// Shows the progress of `episode` on standard error until it has ended. Ctrl-C aborts it.
+    pub fn follow(&self, episode: u64) -> Result<Outcome, FollowError> {
+        let interrupted = Arc::new(AtomicBool::new(false));
+        for signal in [signal_hook::consts::SIGINT, signal_hook::consts::SIGTERM] {
+            let _ = signal_hook::flag::register(signal, Arc::clone(&interrupted));
+        }
+        let bar = indicatif::ProgressBar::new(1000);
+        bar.set_style(ProgressStyle::with_template("{bar:30} {msg}").unwrap_or_else(|_| ProgressStyle::default_bar()));
+        let mut aborted = false;
+        loop {
+            if interrupted.load(Ordering::Relaxed) && !aborted {
+                self.ask(&Request::Abort)?;
+                aborted = true;
+            }
+            let status = self.status()?;
+            if let Some(outcome) = status.outcomes.iter().find(|o| o.episode == episode) {
+                bar.finish_and_clear();
+                return if aborted { Err(FollowError::Interrupted) } else { Ok(*outcome) };
+            }
+            if status.episode != episode && status.episode != 0 {
+                return Err(ClientError::Version.into());
+            }
+            bar.set_position((1000.0 * (status.poured_ml / status.goal_ml).clamp(0.0, 1.0)) as u64);
+            bar.set_message(format!("alpha {:5.1} deg  poured {:5.1} ml  d {:5.1} ml", status.alpha_deg, status.poured_ml, status.d_ml));
+            std::thread::sleep(Duration::from_millis(100));
+        }
+    }
+}
+
+/// The episode's file: its path, or why there is none.
+#[derive(Debug, Clone)]
+pub struct Recorded {
+    /// Path, or the recorder's reason.
+    pub file: Result<String, String>,
+}
+
+/// Hears what the recorder says of episodes.
+pub struct RecorderEar {
+    subscriber: iceoryx2::port::subscriber::Subscriber<Ipc, RecorderReport, ()>,
+    _cell: Cell,
+}
+
+impl RecorderEar {
+    /// Listens in the cell `name`.
+    pub fn open(name: &str) -> Result<Self, IpcError> {
+        let cell = Cell::join(name)?;
+        let subscriber = cell
+            .recorder()?
+            .subscriber_builder()
+            .create()
+            .map_err(|e| IpcError::Service { service: "recorder".into(), what: format!("{e:?}") })?;
+        Ok(Self { subscriber, _cell: cell })
+    }
+
+    /// Waits until the file of `episode` is closed, up to 10 s; `None` if no recorder says anything of it.
+    pub fn wait(&self, episode: u64) -> Option<Recorded> {
+        let until = Instant::now() + Duration::from_secs(10);
+        while Instant::now() < until {
+            while let Ok(Some(report)) = self.subscriber.receive() {
+                if report.episode != episode {
+                    continue;
+                }
+                match RecorderState::from_code(report.state) {
+                    RecorderState::Writing => {}
+                    RecorderState::Complete => return Some(Recorded { file: Ok(report.text().into()) }),
+                    RecorderState::Failed => return Some(Recorded { file: Err(report.text().into()) }),
+                }
+            }
+            std::thread::sleep(Duration::from_millis(20));
+        }
+        None
+    }
+}

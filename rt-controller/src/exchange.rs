@@ -1,0 +1,113 @@
+//! What passes between the loop and the ordinary threads: bounded lock-free queues and atomics, all made before the loop starts.
+//!
+//! The loop never blocks on them and never frees what it got: boxes that it is done with go back through a queue to be dropped
+//! by an ordinary thread. When a queue is full, the loop counts what it could not tell ([`Exchange::events_lost`]).
+
+use std::sync::atomic::{AtomicBool, AtomicU64};
+
+use crossbeam::queue::ArrayQueue;
+use shared::agent::Agent;
+use shared::control::{EndReason, Outcome};
+use shared::messages::Telemetry;
+
+use crate::core::{Counters, Order, Refusal};
+use crate::journal::Tick;
+use crate::link::{Lost, Session};
+use crate::timing::Histogram;
+
+/// What the loop tells the ordinary thread.
+#[derive(Debug, Clone)]
+pub enum Event {
+    /// Every tick: what it saw and answered, its telemetry, the counters.
+    Tick(Tick, Telemetry, Counters),
+    /// The answer to an order.
+    Ordered(Result<(), Refusal>),
+    /// A pour or recording has ended.
+    Ended(Outcome),
+}
+
+/// Why the loop gives a robot's session back.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum SessionEnd {
+    /// The connection is gone.
+    Lost(Lost),
+    /// The robot may not move any more.
+    Unwell(EndReason),
+}
+
+impl std::fmt::Display for SessionEnd {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        match self {
+            Self::Lost(lost) => write!(f, "{lost}"),
+            Self::Unwell(reason) => write!(f, "{}", reason.words()),
+        }
+    }
+}
+
+/// Histograms of the loop, all in nanoseconds.
+#[derive(Debug, Default)]
+pub struct Timing {
+    /// From the deadline to the wake-up.
+    pub lateness: Histogram,
+    /// From the wake-up to the end of the tick.
+    pub execution: Histogram,
+    /// From a frame's exposure to the tick that uses its V_e.
+    pub feature_age: Histogram,
+    /// From a V_e's publication to the tick that uses it.
+    pub feature_wait: Histogram,
+    /// From the wake-up of a tick with a new V_e until the target's bytes are written.
+    pub wake_to_written: Histogram,
+}
+
+/// Everything that is shared.
+pub struct Exchange {
+    /// To the loop: orders.
+    pub orders: ArrayQueue<Order>,
+    /// From the loop: events.
+    pub events: ArrayQueue<Event>,
+    /// To the loop: the newest policy and its number.
+    pub agents: ArrayQueue<(u64, Box<Agent>)>,
+    /// From the loop: policies to drop.
+    pub old_agents: ArrayQueue<Box<Agent>>,
+    /// To the loop: a connected robot.
+    pub sessions: ArrayQueue<Box<Session>>,
+    /// From the loop: lost robots to drop.
+    pub old_sessions: ArrayQueue<(Box<Session>, SessionEnd)>,
+    /// Histograms.
+    pub timing: Timing,
+    /// Allocations and frees of the loop since it started.
+    pub loop_allocations: AtomicU64,
+    /// Page faults of the loop since it started.
+    pub loop_page_faults: AtomicU64,
+    /// Ticks late by more than half a period.
+    pub late_ticks: AtomicU64,
+    /// Periods skipped.
+    pub skipped_ticks: AtomicU64,
+    /// Policies taken.
+    pub agents_taken: AtomicU64,
+    /// Events that did not fit the queue.
+    pub events_lost: AtomicU64,
+    /// Set by the loop when it has ended, upright.
+    pub ended: AtomicBool,
+}
+
+impl Default for Exchange {
+    fn default() -> Self {
+        Self {
+            orders: ArrayQueue::new(8),
+            events: ArrayQueue::new(1024),
+            agents: ArrayQueue::new(1),
+            old_agents: ArrayQueue::new(4),
+            sessions: ArrayQueue::new(1),
+            old_sessions: ArrayQueue::new(4),
+            timing: Timing::default(),
+            loop_allocations: AtomicU64::new(0),
+            loop_page_faults: AtomicU64::new(0),
+            late_ticks: AtomicU64::new(0),
+            skipped_ticks: AtomicU64::new(0),
+            agents_taken: AtomicU64::new(0),
+            events_lost: AtomicU64::new(0),
+            ended: AtomicBool::new(false),
+        }
+    }
+}

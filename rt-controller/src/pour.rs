@@ -1,0 +1,84 @@
+//! `rt-controller pour ML`: asks the running controller for a pour, shows it, ends with its result. Ordinary process.
+
+use std::path::PathBuf;
+use std::process::ExitCode;
+
+use shared::config::Config;
+use shared::control::{EndReason, Outcome, Reply, Request};
+use shared::exit;
+
+use crate::client::{self, Client, FollowError};
+
+/// Command-line arguments.
+#[derive(Debug, clap::Args)]
+#[command(after_help = "Examples:\n  rt-controller pour 75\n  rt-controller pour 120 --json\n\n\
+Ctrl-C aborts the pour: the container comes upright.\n\
+Exit codes: 0 poured, 3 no controller, 4 ended early (the reason is printed), 5 refused, 130 interrupted.")]
+pub struct Args {
+    /// Goal volume V_G in ml.
+    goal_ml: f32,
+    /// The cell's configuration.
+    #[arg(long, default_value = "config/sim.toml")]
+    config: PathBuf,
+    /// Print the result as JSON.
+    #[arg(long)]
+    json: bool,
+}
+
+/// Runs the command; the exit codes are those of [`shared::exit`].
+pub fn run(args: &Args) -> ExitCode {
+    let config = match Config::read(&args.config) {
+        Ok(config) => config,
+        Err(e) => return exit::fail(exit::BAD_INPUT, e),
+    };
+    match order(&config.cell.name, &Request::Pour { goal_ml: args.goal_ml }) {
+        Ok((outcome, episode)) => report(&outcome, episode, args.json),
+        Err(code) => code,
+    }
+}
+
+/// Gives an order that moves the container and follows it to its end; what went wrong is printed.
+pub(crate) fn order(cell: &str, request: &Request) -> Result<(Outcome, Option<client::Recorded>), ExitCode> {
+    let client = Client::connect(cell).map_err(|e| exit::fail(exit::UNREACHABLE, e))?;
+    let recorder = client::RecorderEar::open(cell).ok();
+    let episode = match client.ask(request) {
+        Ok(Reply::Started { episode }) => episode,
+        Ok(Reply::Refused { reason }) => return Err(exit::fail(exit::REFUSED, reason)),
+        Ok(_) => return Err(exit::fail(exit::UNREACHABLE, client::ClientError::Version)),
+        Err(e) => return Err(exit::fail(exit::UNREACHABLE, e)),
+    };
+    let outcome = client.follow(episode).map_err(|e| match e {
+        FollowError::Interrupted => exit::fail(exit::INTERRUPTED, "interrupted: the container was brought upright"),
+        FollowError::Client(e) => exit::fail(exit::UNREACHABLE, e),
+    })?;
+    Ok((outcome, recorder.and_then(|r| r.wait(episode))))
+}
+
+/// Prints how it ended.
+fn report(outcome: &Outcome, recorded: Option<client::Recorded>, json: bool) -> ExitCode {
+    if json {
+        let file = recorded.as_ref().and_then(|r| r.file.as_ref().ok());
+        println!("{}", serde_json::json!({ "outcome": outcome, "episode_file": file }));
+    } else {
+        println!(
+            "{}: {:.1} ml poured (estimate) for a goal of {:.1} ml in {:.1} s; {} frames ({} bridged), {} late ticks, {} stale features",
+            outcome.reason.words(),
+            outcome.poured_ml,
+            outcome.goal_ml.unwrap_or(f32::NAN),
+            outcome.seconds,
+            outcome.frames,
+            outcome.bridged_frames,
+            outcome.late_ticks,
+            outcome.stale_features
+        );
+        match recorded.map(|r| r.file) {
+            Some(Ok(file)) => println!("recorded: {file}\nread the scale, then: feature-worker episodes weigh {file} --weight GRAMS"),
+            Some(Err(e)) => println!("not recorded: {e}"),
+            None => println!("not recorded: no recorder answered"),
+        }
+    }
+    match outcome.reason {
+        EndReason::Done => ExitCode::SUCCESS,
+        _ => ExitCode::from(exit::ENDED_EARLY),
+    }
+}

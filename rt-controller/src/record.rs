@@ -1,0 +1,100 @@
+//! `rt-controller record`: runs the Gaussian curve of eq. (1) and produces one episode. Ordinary process.
+
+use std::io::{BufRead, IsTerminal, Write};
+use std::path::{Path, PathBuf};
+use std::process::ExitCode;
+
+use shared::config::Config;
+use shared::control::{Curve, EndReason, Request};
+use shared::exit;
+
+use crate::pour;
+
+/// Alpha at the curve's first and last moment, degrees: a start without a jump.
+const END_DEG: f32 = 0.05;
+
+/// Command-line arguments.
+#[derive(Debug, clap::Args)]
+#[command(
+    after_help = "Examples:\n  rt-controller record --lambda 70 --gamma 0.3\n  rt-controller record --lambda 60 --gamma 0.5 --weight 83\n\n\
+The curve is alpha(t) = lambda exp(-gamma (t - beta)^2), from t = 0 to 2 beta. Afterwards the weight on the scale is asked for, if a\n\
+person is there; it can also be given later with `feature-worker episodes weigh FILE --weight G`."
+)]
+pub struct Args {
+    /// Height of the curve, degrees.
+    #[arg(long)]
+    lambda: f32,
+    /// Width of the curve, 1/s^2.
+    #[arg(long)]
+    gamma: f32,
+    /// Time of the curve's top, s; by default such that the curve starts at 0.05 degrees.
+    #[arg(long)]
+    beta: Option<f32>,
+    /// Weight on the scale in g, where it is known without asking.
+    #[arg(long)]
+    weight: Option<f64>,
+    /// The cell's configuration.
+    #[arg(long, default_value = "config/sim.toml")]
+    config: PathBuf,
+    /// Print the result as JSON.
+    #[arg(long)]
+    json: bool,
+}
+
+/// Runs the command; the exit codes are those of [`shared::exit`].
+pub fn run(args: &Args) -> ExitCode {
+    let config = match Config::read(&args.config) {
+        Ok(config) => config,
+        Err(e) => return exit::fail(exit::BAD_INPUT, e),
+    };
+    let beta_s = args.beta.unwrap_or_else(|| ((args.lambda / END_DEG).ln() / args.gamma).sqrt());
+    let curve = Curve { lambda_deg: args.lambda, gamma_per_s2: args.gamma, beta_s };
+    let (outcome, recorded) = match pour::order(&config.cell.name, &Request::Record(curve)) {
+        Ok(done) => done,
+        Err(code) => return code,
+    };
+    if outcome.reason != EndReason::Done {
+        return exit::fail(exit::ENDED_EARLY, format!("the recording ended early: {}", outcome.reason.words()));
+    }
+    let file = match recorded.map(|r| r.file) {
+        Some(Ok(file)) => file,
+        Some(Err(e)) => return exit::fail(exit::FAILED, format!("the curve was run, but not recorded: {e}")),
+        None => return exit::fail(exit::UNREACHABLE, "the curve was run, but no recorder answered: is `feature-worker run` running?"),
+    };
+    let weight_g = args.weight.or_else(ask_weight);
+    if let Some(weight_g) = weight_g
+        && let Err(e) = shared::episode::set_weight(Path::new(&file), weight_g)
+    {
+        return exit::fail(exit::FAILED, e);
+    }
+    if args.json {
+        println!("{}", serde_json::json!({ "outcome": outcome, "curve": curve, "episode_file": file, "weight_g": weight_g }));
+    } else {
+        println!("recorded: {file}");
+        match weight_g {
+            Some(weight_g) => println!("weight: {weight_g} g"),
+            None => println!("read the scale, then: feature-worker episodes weigh {file} --weight GRAMS"),
+        }
+    }
+    ExitCode::SUCCESS
+}
+
+/// Asks a person, if one is there; an empty line means later.
+fn ask_weight() -> Option<f64> {
+    let stdin = std::io::stdin();
+    if !stdin.is_terminal() {
+        return None;
+    }
+    loop {
+        eprint!("weight on the scale in g (empty: later): ");
+        let _ = std::io::stderr().flush();
+        let mut line = String::new();
+        if stdin.lock().read_line(&mut line).is_err() || line.trim().is_empty() {
+            return None;
+        }
+        match line.trim().replace(',', ".").parse::<f64>() {
+            Ok(weight_g) if weight_g.is_finite() && weight_g >= 0.0 => return Some(weight_g),
+            _ => eprintln!("'{}' is no weight: give grams, for example 83", line.trim()),
+        }
+    }
+}

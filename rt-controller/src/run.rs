@@ -1,0 +1,97 @@
+//! `rt-controller run`: the resident process.
+//!
+//! Main thread: clients, telemetry, weights (ordinary). Thread "loop": real-time. Thread "robot": connects. A signal brings the
+//! container upright and ends the process; a second one ends it at once (the robot's program then goes upright by itself).
+
+use std::path::PathBuf;
+use std::process::ExitCode;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering::Relaxed};
+
+use shared::config::Config;
+use shared::exit;
+use shared::ipc::Cell;
+
+use crate::control_loop::{self, Place};
+use crate::core::Settings;
+use crate::exchange::Exchange;
+use crate::service::{self, RobotNote, Service};
+
+/// Command-line arguments.
+#[derive(Debug, clap::Args)]
+#[command(after_help = "Examples:\n  rt-controller run --config config/sim.toml\n  rt-controller run --config config/cell.toml\n\n\
+Stops upright on Ctrl-C or SIGTERM.")]
+pub struct Args {
+    /// The cell's configuration.
+    #[arg(long, default_value = "config/sim.toml")]
+    config: PathBuf,
+}
+
+/// Runs the command; the exit codes are those of [`shared::exit`].
+pub fn run(args: &Args) -> ExitCode {
+    let config = match Config::read(&args.config) {
+        Ok(config) => config,
+        Err(e) => return exit::fail(exit::BAD_INPUT, e),
+    };
+    let say = |text: &str| eprintln!("rt-controller: {text}");
+    let stop = Arc::new(AtomicBool::new(false));
+    for signal in [signal_hook::consts::SIGINT, signal_hook::consts::SIGTERM] {
+        // Armed by the first signal, so that only a second one ends the process at once.
+        let second = signal_hook::flag::register_conditional_shutdown(signal, exit::INTERRUPTED.into(), Arc::clone(&stop));
+        let first = signal_hook::flag::register(signal, Arc::clone(&stop));
+        if let Err(e) = second.and(first) {
+            return exit::fail(exit::FAILED, format!("cannot handle signals: {e}"));
+        }
+    }
+
+    let exchange = Exchange::default();
+    let (note, connections) = (RobotNote::default(), AtomicU64::new(0));
+    let outcome = std::thread::scope(|scope| {
+        let cell = Cell::join(&config.cell.name)?;
+        let mut service = Service::open(&cell, &config, &exchange, &note, &connections, &say)?;
+        let (ready_sender, ready) = std::sync::mpsc::channel();
+        scope.spawn({
+            let (config, exchange, say) = (&config, &exchange, &say);
+            move || real_time(config, exchange, say, &ready_sender)
+        });
+        ready.recv().unwrap_or(Ok(()))?;
+        let end_robot = AtomicBool::new(false);
+        std::thread::scope(|inner| {
+            inner.spawn(|| service::keep_robot_connected(&config, &exchange, &note, &connections, &end_robot, &say));
+            say(&format!("running in cell '{}' at {} Hz", config.cell.name, config.controller.rate_hz));
+            service.run(&stop);
+            end_robot.store(true, Relaxed);
+        });
+        Ok::<(), shared::ipc::IpcError>(())
+    });
+    match outcome {
+        Ok(()) => {
+            say("stopped");
+            ExitCode::SUCCESS
+        }
+        Err(e) => exit::fail(exit::FAILED, e),
+    }
+}
+
+/// The real-time thread: its own node and subscriber, then the loop.
+fn real_time(config: &Config, exchange: &Exchange, say: &dyn Fn(&str), ready: &std::sync::mpsc::Sender<Result<(), shared::ipc::IpcError>>) {
+    let opened = Cell::join(&config.cell.name).and_then(|cell| {
+        let subscriber = cell.features()?.subscriber_builder().buffer_size(crate::core::MAX_FEATURES).create();
+        let subscriber = subscriber.map_err(|e| shared::ipc::IpcError::Service { service: "feature".into(), what: format!("{e:?}") })?;
+        Ok((cell, subscriber))
+    });
+    match opened {
+        Ok((_cell, subscriber)) => {
+            if let Err(line) = shared::os::lock_memory() {
+                say(&line);
+            }
+            let _ = ready.send(Ok(()));
+            let place = Place { core: config.controller.core, priority: config.controller.priority };
+            let lost_ns = u64::from(config.controller.lost_robot_ms) * 1_000_000;
+            control_loop::run(Settings::new(config), place, lost_ns, &subscriber, exchange, say);
+        }
+        Err(e) => {
+            let _ = ready.send(Err(e));
+        }
+    }
+}

@@ -1,0 +1,364 @@
+//! The controller's ordinary side: answers clients, publishes telemetry, watches the weight file, and drops what the loop is
+//! done with.
+//!
+//! Runs in the process's main thread with ordinary scheduling; may allocate and block. If it falls behind, the loop goes on and
+//! counts what it could not tell. Nothing here ends the process but a signal or another controller in the same cell.
+
+use std::collections::VecDeque;
+use std::path::{Path, PathBuf};
+use std::sync::atomic::{AtomicBool, Ordering::Relaxed};
+use std::sync::{Mutex, PoisonError};
+use std::time::{Duration, Instant};
+
+use iceoryx2::active_request::ActiveRequest;
+use iceoryx2::port::publisher::Publisher;
+use iceoryx2::port::server::Server;
+use iceoryx2::service::ipc::Service as Ipc;
+use shared::agent::Agent;
+use shared::config::Config;
+use shared::control::{Outcome, Reply, Request, Status};
+use shared::ipc::{Cell, IpcError};
+use shared::messages::{Phase, Telemetry};
+use shared::weights::Weights;
+
+use crate::client::MESSAGE_MAX;
+use crate::core::{Counters, Order, Refusal, Settings};
+use crate::exchange::{Event, Exchange};
+use crate::journal::Writer;
+use crate::link::{self, LinkOptions};
+
+/// How often the ordinary side looks: far below a person's patience, and cheap.
+const BEAT: Duration = Duration::from_millis(20);
+/// Results kept for `status`.
+const OUTCOMES: usize = 32;
+/// Wait between attempts to reach the robot.
+const RECONNECT: Duration = Duration::from_secs(1);
+
+type Asked = ActiveRequest<Ipc, [u8], (), [u8], ()>;
+
+/// What the robot's connector has to say to operators; empty when connected.
+#[derive(Debug, Default)]
+pub struct RobotNote(Mutex<String>);
+
+impl RobotNote {
+    fn set(&self, text: String, say: &dyn Fn(&str)) {
+        let mut note = self.0.lock().unwrap_or_else(PoisonError::into_inner);
+        if *note != text {
+            if !text.is_empty() {
+                say(&text);
+            }
+            *note = text;
+        }
+    }
+
+    fn get(&self) -> String {
+        self.0.lock().unwrap_or_else(PoisonError::into_inner).clone()
+    }
+}
+
+/// Keeps a connected robot in the loop's hands; runs in a thread of its own until `stop`, because connecting blocks.
+pub fn keep_robot_connected(
+    config: &Config,
+    exchange: &Exchange,
+    note: &RobotNote,
+    connections: &std::sync::atomic::AtomicU64,
+    stop: &AtomicBool,
+    say: &dyn Fn(&str),
+) {
+    let options = LinkOptions::new(config);
+    let mut connected = false;
+    let mut next = Instant::now();
+    while !stop.load(Relaxed) {
+        while let Some((session, end)) = exchange.old_sessions.pop() {
+            drop(session);
+            note.set(format!("robot: {end}"), say);
+            connected = false;
+            next = Instant::now() + RECONNECT;
+        }
+        if !connected && Instant::now() >= next {
+            match link::connect(&options) {
+                Ok(session) => {
+                    connected = exchange.sessions.push(Box::new(session)).is_ok();
+                    connections.fetch_add(1, Relaxed);
+                    note.set(String::new(), say);
+                    say("robot connected, program running");
+                }
+                Err(e) => {
+                    note.set(e.to_string(), say);
+                    next = Instant::now() + RECONNECT;
+                }
+            }
+        }
+        std::thread::sleep(BEAT);
+    }
+}
+
+/// Notices a new weight file, reads and checks it, and hands it to the loop.
+struct WeightsWatch {
+    path: PathBuf,
+    seen: Option<(std::time::SystemTime, u64, u64)>,
+    id: String,
+    /// Identity of the policy that waits in the queue for the end of a pour.
+    waiting: String,
+    refused: String,
+    /// Policies handed over so far.
+    number: u64,
+}
+
+impl WeightsWatch {
+    fn new(path: &Path) -> Self {
+        Self { path: path.into(), seen: None, id: String::new(), waiting: String::new(), refused: String::new(), number: 0 }
+    }
+
+    fn look(&mut self, exchange: &Exchange, journal: &mut Journal, say: &dyn Fn(&str)) {
+        use std::os::unix::fs::MetadataExt;
+        if exchange.agents.is_empty() && !self.waiting.is_empty() {
+            self.id = std::mem::take(&mut self.waiting);
+        }
+        let Ok(meta) = std::fs::metadata(&self.path) else {
+            if self.id.is_empty() && self.refused.is_empty() {
+                self.refused = format!("{}: not there yet", self.path.display());
+            }
+            return;
+        };
+        let stamp = meta.modified().ok().map(|m| (m, meta.ino(), meta.len()));
+        if stamp == self.seen {
+            return;
+        }
+        self.seen = stamp;
+        match Weights::read(&self.path) {
+            Ok(weights) => {
+                self.refused.clear();
+                self.waiting = weights.identity();
+                say(&format!("weights {} read from {}; the next pour uses them", self.waiting, self.path.display()));
+                self.number += 1;
+                journal.write(say, |j| j.weights(self.number, &weights));
+                // What was waiting and is displaced is dropped here, in an ordinary thread.
+                drop(exchange.agents.force_push((self.number, Box::new(Agent::new(&weights)))));
+            }
+            Err(e) => {
+                self.refused = e.to_string();
+                say(&format!("weights refused, the old ones stay: {e}"));
+            }
+        }
+    }
+}
+
+/// The journal, if one is kept; the first error ends it, not the controller.
+struct Journal(Option<Writer>);
+
+impl Journal {
+    fn write(&mut self, say: &dyn Fn(&str), what: impl FnOnce(&mut Writer) -> std::io::Result<()>) {
+        if let Some(Err(e)) = self.0.as_mut().map(what) {
+            say(&format!("journal: {e}; no more is written, the controller goes on"));
+            self.0 = None;
+        }
+    }
+}
+
+/// Everything the ordinary side keeps.
+pub struct Service<'a> {
+    exchange: &'a Exchange,
+    robot_note: &'a RobotNote,
+    robot_connections: &'a std::sync::atomic::AtomicU64,
+    say: &'a dyn Fn(&str),
+    server: Server<Ipc, [u8], (), [u8], ()>,
+    telemetry: Publisher<Ipc, Telemetry, ()>,
+    weights: WeightsWatch,
+    journal: Journal,
+    latest: Option<(Telemetry, Counters)>,
+    outcomes: VecDeque<Outcome>,
+    waiting: VecDeque<(Asked, u64)>,
+    next_episode: u64,
+}
+
+impl<'a> Service<'a> {
+    /// Opens the services; fails when another controller has them.
+    pub fn open(
+        cell: &Cell,
+        config: &Config,
+        exchange: &'a Exchange,
+        robot_note: &'a RobotNote,
+        robot_connections: &'a std::sync::atomic::AtomicU64,
+        say: &'a dyn Fn(&str),
+    ) -> Result<Self, IpcError> {
+        let fail = |service: &str, e: String| IpcError::Service { service: service.into(), what: e };
+        let server =
+            cell.control()?.server_builder().initial_max_slice_len(MESSAGE_MAX).create().map_err(|e| fail("control", format!("{e:?}")))?;
+        let telemetry = cell.telemetry()?.publisher_builder().create().map_err(|e| fail("telemetry", format!("{e:?}")))?;
+        let mut journal = None;
+        if let Some(path) = &config.controller.journal {
+            match Writer::create(path, &Settings::new(config)) {
+                Ok(writer) => journal = Some(writer),
+                Err(e) => say(&format!("{}: no journal: {e}", path.display())),
+            }
+        }
+        // Episode numbers grow over restarts, so that a recorder never takes two runs for one.
+        let next_episode = std::time::SystemTime::now().duration_since(std::time::UNIX_EPOCH).map_or(1, |d| d.as_secs());
+        Ok(Self {
+            exchange,
+            robot_note,
+            robot_connections,
+            say,
+            server,
+            telemetry,
+            weights: WeightsWatch::new(&config.controller.weights),
+            journal: Journal(journal),
+            latest: None,
+            outcomes: VecDeque::new(),
+            waiting: VecDeque::new(),
+            next_episode,
+        })
+    }
+
+    /// Works until the loop has ended.
+    pub fn run(&mut self, stop: &AtomicBool) {
+        let mut stopping = false;
+        while !self.exchange.ended.load(Relaxed) {
+            if stop.load(Relaxed) && !stopping {
+                stopping = self.exchange.orders.push(Order::Shutdown).is_ok();
+            }
+            while self.exchange.old_agents.pop().is_some() {}
+            self.weights.look(self.exchange, &mut self.journal, self.say);
+            self.hear();
+            self.answer();
+            std::thread::sleep(BEAT);
+        }
+        self.hear();
+        self.journal.write(self.say, Writer::flush);
+    }
+
+    /// Takes what the loop told.
+    fn hear(&mut self) {
+        while let Some(event) = self.exchange.events.pop() {
+            match event {
+                Event::Tick(tick, telemetry, counters) => {
+                    self.journal.write(self.say, |j| j.tick(Box::new(tick)));
+                    self.latest = Some((telemetry, counters));
+                    // Nobody listening is no error.
+                    let _ = self.telemetry.send_copy(telemetry);
+                }
+                Event::Ordered(answer) => {
+                    if let Some((asked, episode)) = self.waiting.pop_front() {
+                        reply(
+                            &asked,
+                            &match answer {
+                                Ok(()) if episode == 0 => Reply::Aborting,
+                                Ok(()) => Reply::Started { episode },
+                                Err(refusal) => Reply::Refused { reason: self.words(refusal) },
+                            },
+                        );
+                    }
+                }
+                Event::Ended(outcome) => {
+                    (self.say)(&format!(
+                        "episode {}: {}, {} after {:.1} s",
+                        outcome.episode,
+                        outcome
+                            .goal_ml
+                            .map_or("curve".into(), |g| format!("goal {g:.1} ml, {:.1} ml poured (estimate)", outcome.poured_ml)),
+                        outcome.reason.words(),
+                        outcome.seconds
+                    ));
+                    if self.outcomes.len() == OUTCOMES {
+                        self.outcomes.pop_front();
+                    }
+                    self.outcomes.push_back(outcome);
+                }
+            }
+        }
+    }
+
+    fn words(&self, refusal: Refusal) -> String {
+        match refusal {
+            Refusal::Robot(_) if !self.robot_note.get().is_empty() => self.robot_note.get(),
+            Refusal::NoWeights => format!("{refusal} ({})", self.weights.refused),
+            _ => refusal.to_string(),
+        }
+    }
+
+    /// Answers clients, or passes their orders to the loop.
+    fn answer(&mut self) {
+        while let Ok(Some(asked)) = self.server.receive() {
+            let Ok(request) = postcard::from_bytes::<Request>(asked.payload()) else {
+                reply(
+                    &asked,
+                    &Reply::Refused { reason: "the request is in another version's words: run the same build on both sides".into() },
+                );
+                continue;
+            };
+            let (order, episode) = match request {
+                Request::Status => {
+                    reply(&asked, &Reply::Status(Box::new(self.status())));
+                    continue;
+                }
+                Request::Abort => (Order::Abort, 0),
+                Request::Pour { goal_ml } => (Order::Pour { episode: self.next_episode, goal_ml }, self.next_episode),
+                Request::Record(curve) => (Order::Record { episode: self.next_episode, curve }, self.next_episode),
+            };
+            self.next_episode += u64::from(episode != 0);
+            match self.exchange.orders.push(order) {
+                Ok(()) => self.waiting.push_back((asked, episode)),
+                Err(_) => reply(&asked, &Reply::Refused { reason: "too many orders at once: try again".into() }),
+            }
+        }
+    }
+
+    fn status(&self) -> Status {
+        let (t, c) = self.latest.unwrap_or_default();
+        let x = self.exchange;
+        let timing = &x.timing;
+        let phase = Phase::from_code(t.phase);
+        let hindrance = match phase {
+            Phase::NoRobot if !self.robot_note.get().is_empty() => self.robot_note.get(),
+            Phase::NoRobot if t.alpha_measured_deg.is_finite() => Refusal::NotUpright(t.alpha_measured_deg).to_string(),
+            Phase::NoRobot => "waiting for the robot".into(),
+            _ if self.weights.id.is_empty() => format!("no weights: {}", self.weights.refused),
+            _ => String::new(),
+        };
+        Status {
+            phase,
+            hindrance,
+            episode: t.episode,
+            goal_ml: t.goal_ml,
+            d_ml: t.d_ml,
+            poured_ml: t.poured_ml,
+            alpha_deg: t.alpha_deg,
+            alpha_measured_deg: t.alpha_measured_deg,
+            area_px2: t.area_px2,
+            feature_sequence: t.feature_sequence,
+            ticks: c.ticks,
+            late_ticks: x.late_ticks.load(Relaxed),
+            skipped_ticks: x.skipped_ticks.load(Relaxed),
+            features: c.features,
+            stale_features: c.stale_features,
+            bridged_frames: c.bridged_frames,
+            ignored_features: c.ignored_features,
+            clipped: c.clipped,
+            robot_connections: self.robot_connections.load(Relaxed),
+            loop_allocations: x.loop_allocations.load(Relaxed),
+            loop_page_faults: x.loop_page_faults.load(Relaxed),
+            events_lost: x.events_lost.load(Relaxed),
+            weights: self.weights.id.clone(),
+            weights_taken: x.agents_taken.load(Relaxed),
+            weights_refused: if self.weights.id.is_empty() { String::new() } else { self.weights.refused.clone() },
+            timing: vec![
+                timing.lateness.snapshot("wake-up lateness"),
+                timing.execution.snapshot("tick execution"),
+                timing.feature_age.snapshot("exposure to use of V_e"),
+                timing.feature_wait.snapshot("publication to use of V_e"),
+                timing.wake_to_written.snapshot("wake-up to target written"),
+            ],
+            outcomes: self.outcomes.iter().copied().collect(),
+        }
+    }
+}
+
+/// Sends an answer; a client that has gone away is no error.
+fn reply(asked: &Asked, reply: &Reply) {
+    let mut buffer = vec![0; MESSAGE_MAX];
+    let Ok(bytes) = postcard::to_slice(reply, &mut buffer) else { return };
+    if let Ok(loan) = asked.loan_slice_uninit(bytes.len()) {
+        let _ = loan.write_from_slice(bytes).send();
+    }
+}

@@ -1,0 +1,69 @@
+//! `rt-controller status`: the running controller's state, counters and histograms. Ordinary process.
+
+use std::path::PathBuf;
+use std::process::ExitCode;
+
+use shared::config::Config;
+use shared::control::Status;
+use shared::exit;
+
+use crate::client::Client;
+
+/// Command-line arguments.
+#[derive(Debug, clap::Args)]
+#[command(after_help = "Examples:\n  rt-controller status\n  rt-controller status --json")]
+pub struct Args {
+    /// The cell's configuration.
+    #[arg(long, default_value = "config/sim.toml")]
+    config: PathBuf,
+    /// Print everything as JSON, histograms included.
+    #[arg(long)]
+    json: bool,
+}
+
+/// Runs the command; the exit codes are those of [`shared::exit`].
+pub fn run(args: &Args) -> ExitCode {
+    let config = match Config::read(&args.config) {
+        Ok(config) => config,
+        Err(e) => return exit::fail(exit::BAD_INPUT, e),
+    };
+    match Client::connect(&config.cell.name).and_then(|c| c.status()) {
+        Ok(status) if args.json => match serde_json::to_string_pretty(&status) {
+            Ok(text) => println!("{text}"),
+            Err(e) => return exit::fail(exit::FAILED, e),
+        },
+        Ok(status) => print(&status),
+        Err(e) => return exit::fail(exit::UNREACHABLE, e),
+    }
+    ExitCode::SUCCESS
+}
+
+fn print(s: &Status) {
+    println!("phase      {}", serde_json::to_value(s.phase).ok().and_then(|v| v.as_str().map(String::from)).unwrap_or_default());
+    if !s.hindrance.is_empty() {
+        println!("hindrance  {}", s.hindrance);
+    }
+    println!("alpha      {:.2} deg commanded, {:.2} deg measured", s.alpha_deg, s.alpha_measured_deg);
+    println!("volume     goal {:.1} ml, d {:.1} ml, poured {:.1} ml (estimate)", s.goal_ml, s.d_ml, s.poured_ml);
+    println!("weights    {} ({} taken)", if s.weights.is_empty() { "none" } else { &s.weights }, s.weights_taken);
+    if !s.weights_refused.is_empty() {
+        println!("           refused: {}", s.weights_refused);
+    }
+    println!("ticks      {} ({} late, {} skipped)", s.ticks, s.late_ticks, s.skipped_ticks);
+    println!("features   {} ({} stale, {} bridged, {} ignored)", s.features, s.stale_features, s.bridged_frames, s.ignored_features);
+    let c = s.clipped;
+    println!("clipped    angle {}, rate {}, acceleration {}, not finite {}", c.angle, c.rate, c.acceleration, c.not_finite);
+    println!("loop       {} allocations, {} page faults, {} events lost", s.loop_allocations, s.loop_page_faults, s.events_lost);
+    println!("robot      {} connections", s.robot_connections);
+    println!("\n{:<28} {:>8} {:>10} {:>10} {:>10} {:>10}", "us", "n", "p50", "p99", "p99.9", "max");
+    for h in &s.timing {
+        println!("{:<28} {:>8} {:>10.1} {:>10.1} {:>10.1} {:>10.1}", h.name, h.n, h.p50_us, h.p99_us, h.p999_us, h.max_us);
+    }
+    if !s.outcomes.is_empty() {
+        println!("\nnewest results");
+    }
+    for o in &s.outcomes {
+        let what = o.goal_ml.map_or("recording".into(), |g| format!("goal {g:6.1} ml, poured {:6.1} ml", o.poured_ml));
+        println!("{:>12}  {what}  {:5.1} s  {}", o.episode, o.seconds, o.reason.words());
+    }
+}

@@ -1,0 +1,301 @@
+//! Writes one episode's MCAP file, see [`crate::episode`]. Allocates; ordinary threads only.
+//!
+//! A chunk is built in memory and written whole at least every half second, so a recorder that is killed leaves a file that
+//! reads up to then. A new file never takes the name of one that is there.
+
+use std::collections::BTreeMap;
+use std::fs::{File, OpenOptions};
+use std::io::{BufWriter, ErrorKind};
+use std::path::{Path, PathBuf};
+use std::time::{SystemTime, UNIX_EPOCH};
+
+use mcap::records::MessageHeader;
+use mcap::{WriteOptions, Writer};
+use prost::Message as _;
+use sha2::{Digest, Sha256};
+
+use super::rows::{self, CompressedImage, FeatureRow, SampleRow, TelemetryRow};
+use super::{Kind, hex};
+use crate::config::Config;
+use crate::messages::{Doubt, Feature, Telemetry};
+
+/// A chunk is closed when it is this old, ns.
+const CHUNK_NS: u64 = 500_000_000;
+/// A chunk is closed when it is this large, bytes.
+const CHUNK_BYTES: u64 = 1 << 20;
+
+/// Why an episode cannot be written; what was written before is in the file.
+#[derive(Debug, thiserror::Error)]
+pub enum WriteError {
+    /// The directory cannot be read or made.
+    #[error("{directory}: {what}; make the directory of [recording] directory writable")]
+    Directory {
+        /// The directory.
+        directory: String,
+        /// The system's words.
+        what: String,
+    },
+    /// Creating or writing the file failed.
+    #[error("{file}: {what}; check free space and permissions")]
+    File {
+        /// The file.
+        file: String,
+        /// The system's words.
+        what: String,
+    },
+}
+
+/// What is known at an episode's start.
+#[derive(Debug, Clone)]
+pub struct Start<'a> {
+    /// [`Telemetry::episode`].
+    pub episode: u64,
+    /// What is run.
+    pub kind: Kind,
+    /// First tick of the episode, CLOCK_MONOTONIC ns.
+    pub started_at_ns: u64,
+    /// The wall clock then.
+    pub wall_clock: SystemTime,
+    /// The cell's configuration; the file gets all of it.
+    pub config: &'a Config,
+    /// Identity of the weight file; empty without one.
+    pub weights: &'a str,
+}
+
+/// One frame of an episode.
+#[derive(Debug, Clone, Copy)]
+pub struct Sample<'a> {
+    /// What was measured in it.
+    pub feature: &'a Feature,
+    /// Commanded alpha at the capture time, degrees.
+    pub alpha_commanded_deg: f32,
+    /// Measured alpha at the capture time, degrees; NaN if unknown.
+    pub alpha_measured_deg: f32,
+    /// Format (`jpeg` or `png`) and bytes of the image; `None` if it was dropped.
+    pub image: Option<(&'a str, &'a [u8])>,
+}
+
+/// How an episode ended.
+#[derive(Debug, Clone, Copy)]
+pub struct End<'a> {
+    /// Nothing is missing at the end.
+    pub complete: bool,
+    /// One line for people.
+    pub reason: &'a str,
+    /// Frames that came twice or out of order and were left out.
+    pub disordered_frames: u64,
+}
+
+/// An episode being written. Dropped without [`EpisodeWriter::finish`], its file is incomplete.
+pub struct EpisodeWriter {
+    writer: Writer<BufWriter<File>>,
+    path: PathBuf,
+    image_channel: u16,
+    feature_channel: u16,
+    telemetry_channel: u16,
+    sample_channel: u16,
+    chunk_since_ns: u64,
+}
+
+impl EpisodeWriter {
+    /// Creates the next free `episode-NNNN.mcap` in `directory` (made if missing) and writes what is known at the start.
+    pub fn create(directory: &Path, start: &Start) -> Result<Self, WriteError> {
+        let (file, path) = next_free(directory)?;
+        let fail = |e: mcap::McapError| file_error(&path, &e);
+        let options = WriteOptions::new()
+            .compression(None)
+            .chunk_size(Some(CHUNK_BYTES))
+            .disable_seeking(true)
+            .library(concat!("decant ", env!("CARGO_PKG_VERSION")));
+        let mut writer = Writer::with_options(BufWriter::with_capacity(1 << 16, file), options).map_err(fail)?;
+        let none = BTreeMap::new();
+        let schema = writer.add_schema("foxglove.CompressedImage", "protobuf", &rows::compressed_image_schema()).map_err(fail)?;
+        let image_channel = writer.add_channel(schema, rows::IMAGE_TOPIC, "protobuf", &none).map_err(fail)?;
+        let mut json = [0; 3];
+        for (channel, (name, topic, text)) in json.iter_mut().zip(rows::json_schemas()) {
+            let schema = writer.add_schema(name, "jsonschema", text.as_bytes()).map_err(fail)?;
+            *channel = writer.add_channel(schema, topic, "json", &none).map_err(fail)?;
+        }
+        let [feature_channel, telemetry_channel, sample_channel] = json;
+        let mut this =
+            Self { writer, path, image_channel, feature_channel, telemetry_channel, sample_channel, chunk_since_ns: start.started_at_ns };
+        this.describe(start)?;
+        Ok(this)
+    }
+
+    /// The file.
+    pub fn path(&self) -> &Path {
+        &self.path
+    }
+
+    fn describe(&mut self, start: &Start) -> Result<(), WriteError> {
+        let config = toml::to_string(start.config).unwrap_or_default();
+        let config_sha256 = hex(&Sha256::digest(config.as_bytes()));
+        let unix_ns = start.wall_clock.duration_since(UNIX_EPOCH).map_or(0, |d| d.as_nanos());
+        let mut about = vec![
+            ("format", rows::FORMAT.to_string()),
+            ("episode", start.episode.to_string()),
+            ("cell", start.config.cell.name.clone()),
+            ("started_at_ns", start.started_at_ns.to_string()),
+            ("started_at_unix_ns", unix_ns.to_string()),
+            ("started_at_utc", rfc3339((unix_ns / 1_000_000_000) as u64)),
+            ("config_sha256", config_sha256.clone()),
+            ("weights", start.weights.to_string()),
+        ];
+        match start.kind {
+            Kind::Recording(curve) => about.extend([
+                ("kind", "recording".to_string()),
+                ("lambda_deg", curve.lambda_deg.to_string()),
+                ("gamma_per_s2", curve.gamma_per_s2.to_string()),
+                ("beta_s", curve.beta_s.to_string()),
+            ]),
+            Kind::Pour { goal_ml } => about.extend([("kind", "pour".to_string()), ("goal_ml", goal_ml.to_string())]),
+            Kind::Table => about.push(("kind", "table".to_string())),
+        }
+        self.metadata(rows::META_EPISODE, &about)?;
+        self.metadata(rows::META_CONFIG, &[("sha256", config_sha256), ("toml", config)])?;
+        self.flush()
+    }
+
+    fn metadata(&mut self, name: &str, pairs: &[(&str, String)]) -> Result<(), WriteError> {
+        let metadata = pairs.iter().map(|(k, v)| ((*k).to_string(), v.clone())).collect();
+        let record = mcap::records::Metadata { name: name.into(), metadata };
+        self.writer.write_metadata(&record).map_err(|e| file_error(&self.path, &e))
+    }
+
+    /// Writes one frame: its row of `L_E`, its feature and its image.
+    pub fn frame(&mut self, sample: &Sample) -> Result<(), WriteError> {
+        let feature = sample.feature;
+        let at_ns = feature.captured_at_ns;
+        if let Some((format, data)) = sample.image {
+            let image = CompressedImage {
+                timestamp: Some(prost_types::Timestamp { seconds: (at_ns / 1_000_000_000) as i64, nanos: (at_ns % 1_000_000_000) as i32 }),
+                data: data.to_vec(),
+                format: format.into(),
+                frame_id: "camera".into(),
+            };
+            self.message(self.image_channel, feature.sequence, at_ns, &image.encode_to_vec())?;
+        }
+        self.json(self.feature_channel, feature.sequence, at_ns, &FeatureRow::new(feature))?;
+        let row = SampleRow {
+            sequence: feature.sequence,
+            captured_at_ns: at_ns,
+            alpha_commanded_deg: sample.alpha_commanded_deg,
+            alpha_measured_deg: sample.alpha_measured_deg,
+            area_px2: feature.area_px2,
+            doubt: Doubt::from_code(feature.doubt).words().into(),
+            image: sample.image.is_some(),
+        };
+        self.json(self.sample_channel, feature.sequence, at_ns, &row)?;
+        if at_ns.saturating_sub(self.chunk_since_ns) >= CHUNK_NS {
+            self.chunk_since_ns = at_ns;
+            self.flush()?;
+        }
+        Ok(())
+    }
+
+    /// Writes one tick of the controller.
+    pub fn telemetry(&mut self, telemetry: &Telemetry) -> Result<(), WriteError> {
+        self.json(self.telemetry_channel, telemetry.tick, telemetry.at_ns, &TelemetryRow::new(telemetry))
+    }
+
+    fn json(&mut self, channel: u16, sequence: u64, at_ns: u64, row: &impl serde::Serialize) -> Result<(), WriteError> {
+        let text = serde_json::to_vec(row).map_err(|e| file_error(&self.path, &e))?;
+        self.message(channel, sequence, at_ns, &text)
+    }
+
+    fn message(&mut self, channel_id: u16, sequence: u64, at_ns: u64, data: &[u8]) -> Result<(), WriteError> {
+        // MCAP's own sequence field has 32 bits: the low ones, for readers that look for gaps.
+        let header = MessageHeader { channel_id, sequence: sequence as u32, log_time: at_ns, publish_time: at_ns };
+        self.writer.write_to_known_channel(&header, data).map_err(|e| file_error(&self.path, &e))
+    }
+
+    /// Closes the chunk under way and hands it to the system.
+    pub fn flush(&mut self) -> Result<(), WriteError> {
+        self.writer.flush().map_err(|e| file_error(&self.path, &e))
+    }
+
+    /// Writes how it ended and the index, and waits until all is on the disk.
+    pub fn finish(mut self, end: &End) -> Result<PathBuf, WriteError> {
+        let about = [
+            ("complete", end.complete.to_string()),
+            ("reason", end.reason.to_string()),
+            ("disordered_frames", end.disordered_frames.to_string()),
+        ];
+        self.metadata(rows::META_END, &about)?;
+        let Self { mut writer, path, .. } = self;
+        writer.finish().map_err(|e| file_error(&path, &e))?;
+        let buffered = writer.into_inner();
+        let file = buffered.into_inner().map_err(|e| file_error(&path, e.error()))?;
+        file.sync_all().map_err(|e| file_error(&path, &e))?;
+        Ok(path)
+    }
+}
+
+fn file_error(path: &Path, what: &dyn std::fmt::Display) -> WriteError {
+    WriteError::File { file: path.display().to_string(), what: what.to_string() }
+}
+
+/// Creates `episode-NNNN.mcap` with the number after the highest one that is there.
+fn next_free(directory: &Path) -> Result<(File, PathBuf), WriteError> {
+    let fail = |e: std::io::Error| WriteError::Directory { directory: directory.display().to_string(), what: e.to_string() };
+    std::fs::create_dir_all(directory).map_err(fail)?;
+    let directory = directory.canonicalize().map_err(fail)?;
+    let mut number = 0;
+    for entry in std::fs::read_dir(&directory).map_err(fail)? {
+        let name = entry.map_err(fail)?.file_name();
+        let taken = name.to_str().and_then(|n| n.strip_prefix("episode-")?.strip_suffix(".mcap")?.parse::<u32>().ok());
+        number = number.max(taken.map_or(0, u64::from));
+    }
+    loop {
+        number += 1;
+        let path = directory.join(format!("episode-{number:04}.mcap"));
+        // Another recorder may take the name between the look and the creation: only a file that was not there is ours.
+        match OpenOptions::new().write(true).create_new(true).open(&path) {
+            Ok(file) => return Ok((file, path)),
+            Err(e) if e.kind() == ErrorKind::AlreadyExists => {}
+            Err(e) => return Err(file_error(&path, &e)),
+        }
+    }
+}
+
+/// Seconds since 1970 as RFC 3339 in UTC. Days to date after Howard Hinnant, "chrono-compatible low-level date algorithms".
+pub(crate) fn rfc3339(unix_s: u64) -> String {
+    let (days, second) = (unix_s / 86_400, unix_s % 86_400);
+    let z = days + 719_468;
+    let (era, doe) = (z / 146_097, z % 146_097);
+    let yoe = (doe - doe / 1460 + doe / 36_524 - doe / 146_096) / 365;
+    let doy = doe - (365 * yoe + yoe / 4 - yoe / 100);
+    let mp = (5 * doy + 2) / 153;
+    let day = doy - (153 * mp + 2) / 5 + 1;
+    let month = if mp < 10 { mp + 3 } else { mp - 9 };
+    let year = yoe + era * 400 + u64::from(month <= 2);
+    format!("{year:04}-{month:02}-{day:02}T{:02}:{:02}:{:02}Z", second / 3600, second / 60 % 60, second % 60)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Protects the wall-clock stamp in every file (leap day, year's end, the epoch).
+    #[test]
+    fn dates_are_right() {
+        assert_eq!(rfc3339(0), "1970-01-01T00:00:00Z");
+        assert_eq!(rfc3339(951_782_400), "2000-02-29T00:00:00Z");
+        assert_eq!(rfc3339(1_735_689_599), "2024-12-31T23:59:59Z");
+        assert_eq!(rfc3339(1_795_311_559), "2026-11-22T01:39:19Z");
+    }
+
+    /// Protects earlier episodes: a new one never takes a name that is there, and numbers are not used again below it.
+    #[test]
+    fn the_next_free_name_is_taken() {
+        let dir = tempfile::tempdir().unwrap();
+        std::fs::write(dir.path().join("episode-0007.mcap"), b"mine").unwrap();
+        std::fs::write(dir.path().join("episode-x.mcap"), b"other").unwrap();
+        let (_, path) = next_free(dir.path()).unwrap();
+        assert!(path.ends_with("episode-0008.mcap"), "{}", path.display());
+        let (_, path) = next_free(dir.path()).unwrap();
+        assert!(path.ends_with("episode-0009.mcap"), "{}", path.display());
+        assert_eq!(std::fs::read(dir.path().join("episode-0007.mcap")).unwrap(), b"mine");
+    }
+}

@@ -1,0 +1,329 @@
+//! Episodes as real files: round trip, damage, weights, tables.
+
+use std::path::{Path, PathBuf};
+use std::time::{Duration, UNIX_EPOCH};
+
+use proptest::prelude::*;
+use shared::config::Config;
+use shared::control::Curve;
+use shared::episode::{
+    End, Episode, EpisodeError, EpisodeWriter, Images, Kind, Sample, Start, WeighError, find, read_table, set_weight, write_table,
+};
+use shared::messages::{Doubt, Feature, LAYOUT_VERSION, Phase, Telemetry};
+
+const START_NS: u64 = 5_000_000_000;
+const FRAME_NS: u64 = 33_333_333;
+const CURVE: Curve = Curve { lambda_deg: 61.3, gamma_per_s2: 0.37, beta_s: 4.1 };
+
+fn config() -> Config {
+    Config::read(&Path::new(env!("CARGO_MANIFEST_DIR")).join("../config/sim.toml")).unwrap()
+}
+
+fn start(config: &Config) -> Start<'_> {
+    Start {
+        episode: 3,
+        kind: Kind::Recording(CURVE),
+        started_at_ns: START_NS,
+        wall_clock: UNIX_EPOCH + Duration::from_secs(1_795_311_559),
+        config,
+        weights: "0123456789abcdef",
+    }
+}
+
+fn feature(sequence: u64, doubt: Doubt) -> Feature {
+    Feature {
+        version: LAYOUT_VERSION,
+        doubt: doubt as u32,
+        sequence,
+        captured_at_ns: START_NS + sequence * FRAME_NS - 10 * FRAME_NS,
+        area_px2: 0.1 + 7.3 * sequence as f32,
+        ..Default::default()
+    }
+}
+
+fn tick(number: u64) -> Telemetry {
+    let alpha_deg = 0.5 * number as f32;
+    Telemetry {
+        version: LAYOUT_VERSION,
+        phase: Phase::Recording as u32,
+        tick: number,
+        at_ns: START_NS + number * FRAME_NS,
+        robot_at_ns: START_NS + number * FRAME_NS - 1_000_000,
+        episode: 3,
+        alpha_deg,
+        alpha_measured_deg: alpha_deg - 0.25,
+        dalpha_deg: f32::NAN,
+        goal_ml: f32::NAN,
+        ..Default::default()
+    }
+}
+
+/// An episode of 60 frames: 17 and 18 are lost, 25 is too dark, 30 is blurred (usable), the image of 40 was dropped.
+fn write(directory: &Path, finish: bool) -> PathBuf {
+    let config = config();
+    let mut writer = EpisodeWriter::create(directory, &start(&config)).unwrap();
+    for n in 8..68 {
+        if n >= 10 {
+            writer.telemetry(&tick(n - 10)).unwrap();
+        }
+        if n == 17 || n == 18 {
+            continue;
+        }
+        let doubt = match n {
+            25 => Doubt::TooDark,
+            30 => Doubt::Blurred,
+            _ => Doubt::None,
+        };
+        let f = feature(n, doubt);
+        let alpha = 0.5 * (n as f32 - 10.0);
+        let data = vec![n as u8; 300];
+        let image = (n != 40).then_some(("jpeg", data.as_slice()));
+        let sample = Sample { feature: &f, alpha_commanded_deg: alpha, alpha_measured_deg: alpha - 0.25, image };
+        writer.frame(&sample).unwrap();
+    }
+    let path = writer.path().to_path_buf();
+    if finish {
+        writer.finish(&End { complete: true, reason: "over", disordered_frames: 0 }).unwrap();
+    }
+    path
+}
+
+/// Protects training data: what is written is what is read, to the last bit, with lost frames in their places.
+#[test]
+fn an_episode_is_read_as_it_was_written() {
+    let dir = tempfile::tempdir().unwrap();
+    let path = write(dir.path(), true);
+    let episode = Episode::read(&path).unwrap();
+    assert!(episode.complete);
+    assert_eq!(episode.kind, Kind::Recording(CURVE));
+    assert_eq!(episode.weight_g, None);
+    assert_eq!(episode.info.started_at_utc, "2026-11-22T01:39:19Z");
+    assert_eq!((episode.info.cell.as_str(), episode.info.weights.as_str()), ("sim", "0123456789abcdef"));
+    assert_eq!((episode.info.ticks, episode.info.lost_ticks), (58, 0));
+    assert_eq!((episode.info.images, episode.info.dropped_images, episode.info.lost_frames), (57, 1, 2));
+
+    let sequences: Vec<u64> = episode.frames.iter().map(|f| f.sequence).collect();
+    assert_eq!(sequences, (8..68).collect::<Vec<_>>(), "one frame for each that the camera exposed");
+    for f in &episode.frames {
+        let n = f.sequence;
+        assert_eq!(f.lost, n == 17 || n == 18);
+        assert!((f.captured_at_ns as i64 - feature(n, Doubt::None).captured_at_ns as i64).abs() <= 1);
+        assert!((f.t_s - (n as f64 - 10.0) / 30.0).abs() < 1e-6);
+        assert!((f.alpha_commanded_deg - 0.5 * (n as f32 - 10.0)).abs() < 1e-3, "{n}: {}", f.alpha_commanded_deg);
+        if f.lost || n == 25 {
+            assert!(f.area_px2.is_nan());
+        } else {
+            assert_eq!(f.area_px2, 0.1 + 7.3 * n as f32);
+        }
+    }
+    assert_eq!(episode.frames[25 - 8].doubt, Doubt::TooDark);
+
+    let images: Vec<_> = Images::open(&path).unwrap().map(Result::unwrap).collect();
+    assert_eq!(images.len(), 57);
+    assert_eq!((images[0].sequence, images[0].format.as_str(), images[0].data[0]), (8, "jpeg", 8));
+    assert_eq!(images[0].captured_at_ns, episode.frames[0].captured_at_ns);
+}
+
+/// Protects people from training on half an episode: a file without its end reads, but says that it is incomplete.
+#[test]
+fn a_file_that_was_never_finished_is_incomplete() {
+    let dir = tempfile::tempdir().unwrap();
+    let episode = Episode::read(&write(dir.path(), false)).unwrap();
+    assert!(!episode.complete);
+    assert!(!episode.frames.is_empty());
+}
+
+/// Protects people from training on an episode whose camera stopped before its end: its areas do not add up to the weight.
+#[test]
+fn an_episode_whose_last_second_has_no_frames_is_incomplete() {
+    let dir = tempfile::tempdir().unwrap();
+    let config = config();
+    let mut writer = EpisodeWriter::create(dir.path(), &start(&config)).unwrap();
+    for n in 10..60 {
+        writer.telemetry(&tick(n - 10)).unwrap();
+        if n < 30 {
+            let f = feature(n, Doubt::None);
+            writer.frame(&Sample { feature: &f, alpha_commanded_deg: 0.0, alpha_measured_deg: 0.0, image: None }).unwrap();
+        }
+    }
+    let path = writer.finish(&End { complete: true, reason: "over", disordered_frames: 0 }).unwrap();
+    assert!(!Episode::read(&path).unwrap().complete);
+}
+
+/// Protects w_E and all that was recorded: the weight comes and changes, everything else stays, no other file is left.
+#[test]
+fn the_weight_is_added_afterwards_and_nothing_else_changes() {
+    let dir = tempfile::tempdir().unwrap();
+    let path = write(dir.path(), true);
+    let before = Episode::read(&path).unwrap();
+    let images: Vec<_> = Images::open(&path).unwrap().map(Result::unwrap).collect();
+    assert_eq!(set_weight(&path, 101.5).unwrap(), None);
+    assert_eq!(set_weight(&path, 98.0).unwrap(), Some(101.5));
+    let after = Episode::read(&path).unwrap();
+    assert_eq!(after.weight_g, Some(98.0));
+    assert!(after.complete);
+    assert_eq!((&after.info, after.content_sha256()), (&before.info, before.content_sha256()));
+    assert_eq!(images, Images::open(&path).unwrap().map(Result::unwrap).collect::<Vec<_>>());
+    assert_eq!(std::fs::read_dir(dir.path()).unwrap().count(), 1, "no temporary file is left");
+}
+
+/// Protects recordings from nonsense on the command line and from a weight for half an episode.
+#[test]
+fn a_wrong_weight_is_refused_and_the_file_is_as_it_was() {
+    let dir = tempfile::tempdir().unwrap();
+    let path = write(dir.path(), true);
+    let bytes = std::fs::read(&path).unwrap();
+    for grams in [f64::NAN, f64::INFINITY, -0.1] {
+        assert!(matches!(set_weight(&path, grams), Err(WeighError::Weight(_))));
+    }
+    assert_eq!(std::fs::read(&path).unwrap(), bytes);
+    std::fs::write(&path, &bytes[..bytes.len() / 2]).unwrap();
+    assert!(matches!(set_weight(&path, 10.0), Err(WeighError::Incomplete { .. })));
+    assert_eq!(std::fs::read(&path).unwrap(), bytes[..bytes.len() / 2], "what could still be read is still there");
+    assert_eq!(std::fs::read_dir(dir.path()).unwrap().count(), 1, "no temporary file is left");
+}
+
+/// Protects training from the same measurement counted twice, under another name or with another weight.
+#[test]
+fn the_same_measurement_twice_is_found() {
+    let dir = tempfile::tempdir().unwrap();
+    let path = write(dir.path(), true);
+    let copy = dir.path().join("copy.mcap");
+    std::fs::copy(&path, &copy).unwrap();
+    set_weight(&copy, 77.0).unwrap();
+    let files = find(&[dir.path().to_path_buf()]).unwrap();
+    let mut episodes: Vec<Episode> = files.iter().map(|f| Episode::read(f).unwrap()).collect();
+    assert_eq!(Episode::duplicates(&episodes), [(0, 1)]);
+    episodes[0].frames[30].area_px2 += 1.0;
+    assert_eq!(Episode::duplicates(&episodes), []);
+}
+
+/// Protects everything that reads episodes from files of other kinds.
+#[test]
+fn other_files_are_refused_in_one_line() {
+    let dir = tempfile::tempdir().unwrap();
+    let file = dir.path().join("x.mcap");
+    std::fs::write(&file, "no such thing").unwrap();
+    assert!(matches!(Episode::read(&file), Err(EpisodeError::NotAnEpisode { .. })));
+    std::fs::write(&file, "").unwrap();
+    assert!(matches!(Episode::read(&file), Err(EpisodeError::NotAnEpisode { .. })));
+    let mut foreign = mcap::Writer::new(std::io::Cursor::new(Vec::new())).unwrap();
+    foreign.finish().unwrap();
+    std::fs::write(&file, foreign.into_inner().into_inner()).unwrap();
+    let message = Episode::read(&file).unwrap_err().to_string();
+    assert!(message.contains("x.mcap") && message.contains("not an episode"), "{message}");
+    assert!(matches!(Episode::read(&dir.path().join("none.mcap")), Err(EpisodeError::Read { .. })));
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig { cases: 400, failure_persistence: None, ..Default::default() })]
+
+    /// Protects the trainer from damaged disks: wherever a file is cut, it reads as incomplete or not at all, and what is
+    /// read are the first frames of the original.
+    #[test]
+    fn a_cut_file_never_passes_as_whole(at in 0.0..1.0f64) {
+        let dir = tempfile::tempdir().unwrap();
+        let path = write(dir.path(), true);
+        let original = Episode::read(&path).unwrap();
+        let bytes = std::fs::read(&path).unwrap();
+        std::fs::write(&path, &bytes[..(bytes.len() as f64 * at) as usize]).unwrap();
+        if let Ok(episode) = Episode::read(&path) {
+            prop_assert!(!episode.complete);
+            for (a, b) in episode.frames.iter().zip(&original.frames) {
+                prop_assert_eq!(a.sequence, b.sequence);
+                prop_assert_eq!(a.captured_at_ns, b.captured_at_ns);
+                prop_assert_eq!(a.area_px2.to_bits(), b.area_px2.to_bits());
+            }
+        }
+        for image in Images::open(&path).unwrap() { let _ = image; }
+    }
+
+    /// Protects the trainer from wrong numbers: a file with one flipped bit never reads as a complete episode.
+    #[test]
+    fn a_flipped_bit_never_passes_as_whole(at in 0.0..1.0f64, bit in 0..8u32) {
+        let dir = tempfile::tempdir().unwrap();
+        let path = write(dir.path(), true);
+        let mut bytes = std::fs::read(&path).unwrap();
+        let place = (bytes.len() as f64 * at) as usize;
+        bytes[place] ^= 1 << bit;
+        std::fs::write(&path, &bytes).unwrap();
+        if let Ok(episode) = Episode::read(&path) {
+            prop_assert!(!episode.complete, "byte {} of {}, bit {}", place, bytes.len(), bit);
+        }
+        for image in Images::open(&path).unwrap() { let _ = image; }
+        prop_assert!(set_weight(&path, 1.0).is_err());
+    }
+}
+
+fn tables(features: &str, scale: &str) -> Result<Vec<Episode>, String> {
+    let dir = tempfile::tempdir().unwrap();
+    let (f, s) = (dir.path().join("features.csv"), dir.path().join("scale.csv"));
+    std::fs::write(&f, features).unwrap();
+    std::fs::write(&s, scale).unwrap();
+    read_table(&f, &s).map_err(|e| e.to_string().replace(&format!("{}/", dir.path().display()), ""))
+}
+
+const HEADING: &str = "episode,frame,t_s,alpha_deg,area_px2\n";
+
+/// Protects people with their own vision: columns in any order, extra ones, lost and unmeasured frames.
+#[test]
+fn a_table_is_read() {
+    let features = "area_px2, note, episode, frame, t_s, alpha_deg\n0,x,a,5,0.0,1\n10.5,x,a,8,0.3,4\nnan,x,b,0,0,0\n,x,b,1,0.1,0.5\n";
+    let episodes = tables(features, "episode,weight_g\nb,12\na,99.5\n").unwrap();
+    assert_eq!(episodes.iter().map(|e| (e.name.as_str(), e.weight_g)).collect::<Vec<_>>(), [("a", Some(99.5)), ("b", Some(12.0))]);
+    let a = &episodes[0].frames;
+    assert_eq!(a.iter().map(|f| (f.sequence, f.lost)).collect::<Vec<_>>(), [(5, false), (6, true), (7, true), (8, false)]);
+    assert_eq!((a[1].alpha_commanded_deg, a[3].area_px2), (2.0, 10.5));
+    assert!(episodes[1].frames.iter().all(|f| f.lost && f.area_px2.is_nan()));
+    assert!(episodes.iter().all(|e| e.complete && e.kind == Kind::Table));
+}
+
+/// Protects people from silent misreading: each fault is named with file and line.
+#[test]
+fn faults_in_tables_are_named_with_file_and_line() {
+    let good = "1,0,0.0,0,0\n1,1,0.033,0.5,3\n";
+    let scale = "episode,weight_g\n1,10\n";
+    let features = |rows: &str| format!("{HEADING}{rows}");
+    for (features, scale, expected) in [
+        ("episode,frame,t_s,area_px2\n".to_string(), scale, "features.csv:1: column 'alpha_deg' is missing"),
+        (format!("frame,{HEADING}"), scale, "features.csv:1: column 'frame' is there twice"),
+        (features(""), scale, "features.csv: no rows"),
+        (features("1,0,0.0,inf,0\n"), scale, "features.csv:2: t_s '0.0', alpha_deg 'inf'"),
+        (features("1,0,nan,1,0\n"), scale, "features.csv:2: t_s 'nan'"),
+        (features("1,0,0.0,1,inf\n"), scale, "features.csv:2: area_px2 'inf'"),
+        (features("1,0,0.0,1,-3\n"), scale, "features.csv:2: area_px2 '-3'"),
+        (features("1,0,0.0,1,many\n"), scale, "features.csv:2: area_px2 'many'"),
+        (features("1,0.5,0.0,1,2\n"), scale, "features.csv:2: frame '0.5'"),
+        (features("1,2,0.0,0,0\n1,1,0.1,0,0\n"), scale, "features.csv:3: frame 1 comes after frame 2"),
+        (features("1,1,0.0,0,0\n1,1,0.1,0,0\n"), scale, "features.csv:3: frame 1 is there twice"),
+        (features("1,1,0.1,0,0\n1,2,0.1,0,0\n"), scale, "features.csv:3: t_s 0.1 is not after"),
+        (features("1,1,0.1,0,0\n1,999999999,0.2,0,0\n"), scale, "features.csv:3: frame jumps"),
+        (features("1,0,0.0,0,0\n2,0,0,0,0\n1,1,0.1,0,0\n"), scale, "features.csv:4: episode 1 began in line 2 already"),
+        (features("1,0,0.0,0\n"), scale, "features.csv:2: 4 fields where the heading has 5"),
+        (features(good), "episode\n1\n", "scale.csv:1: column 'weight_g' is missing"),
+        (features(good), "episode,weight_g\n1,0\n", "scale.csv:2: weight_g 0"),
+        (features(good), "episode,weight_g\n1,nan\n", "scale.csv:2: weight_g 'nan'"),
+        (features(good), "episode,weight_g\n1,-2\n", "scale.csv:2: weight_g '-2'"),
+        (features(good), "episode,weight_g\n1,5\n1,6\n", "scale.csv:3: episode 1 has a weight in line 2 already"),
+        (features(good), "episode,weight_g\n1,5\n7,6\n", "scale.csv:3: episode 7 is not in"),
+        (features(good), "episode,weight_g\n", "features.csv:2: episode 1 has no weight in"),
+    ] {
+        let error = tables(&features, scale).expect_err(expected);
+        assert!(error.starts_with(expected), "{error}\n  expected {expected}");
+        assert!(!error.contains('\n'));
+    }
+}
+
+/// Protects people who take their episodes elsewhere and back: the tables hold the same measurement.
+#[test]
+fn a_table_written_from_an_episode_reads_as_the_same_measurement() {
+    let dir = tempfile::tempdir().unwrap();
+    let path = write(dir.path(), true);
+    set_weight(&path, 42.5).unwrap();
+    let episode = Episode::read(&path).unwrap();
+    let (features, scale) = (dir.path().join("features.csv"), dir.path().join("scale.csv"));
+    write_table(std::slice::from_ref(&episode), &features, &scale).unwrap();
+    let back = read_table(&features, &scale).unwrap();
+    assert_eq!((back[0].content_sha256(), back[0].weight_g), (episode.content_sha256(), Some(42.5)));
+    assert!(write_table(&[episode], &features, &scale).is_err(), "a table that is there is not overwritten");
+}

@@ -1,0 +1,65 @@
+//! The picture of one pour: alpha, V_e, d and the volume poured against time, from the controller's telemetry.
+//!
+//! Ordinary thread; allocates; an error is the drawing library's text.
+
+use std::path::Path;
+
+use plotters::prelude::*;
+use shared::messages::Telemetry;
+
+type Drawing<'a> = DrawingArea<SVGBackend<'a>, plotters::coord::Shift>;
+/// One line of a panel: its name, its colour and its points.
+type Line<'a> = (&'a str, RGBColor, Vec<(f64, f64)>);
+
+const ALPHA: RGBColor = RGBColor(31, 119, 180);
+const MEASURED: RGBColor = RGBColor(255, 127, 14);
+const AREA: RGBColor = RGBColor(44, 160, 44);
+const D: RGBColor = RGBColor(214, 39, 40);
+const POURED: RGBColor = RGBColor(148, 103, 189);
+
+/// Draws `ticks` (one pour) to `file` (SVG).
+pub fn draw(file: &Path, ticks: &[Telemetry], goal_ml: f32, scale_g: f64) -> Result<(), Box<dyn std::error::Error>> {
+    let start_ns = ticks.first().ok_or("no telemetry was heard")?.at_ns;
+    let points = |value: &dyn Fn(&Telemetry) -> f32| -> Vec<(f64, f64)> {
+        let t = |tick: &Telemetry| tick.at_ns.saturating_sub(start_ns) as f64 / 1e9;
+        ticks.iter().map(|tick| (t(tick), f64::from(value(tick)))).filter(|(_, v)| v.is_finite()).collect()
+    };
+    let root = SVGBackend::new(file, (900, 760)).into_drawing_area();
+    root.fill(&WHITE)?;
+    let title = format!("Goal {goal_ml:.0} ml, {scale_g:.0} g on the scale, error {:+.1} ml", scale_g - f64::from(goal_ml));
+    let panels = root.titled(&title, ("sans-serif", 22))?.split_evenly((3, 1));
+    panel(&panels[0], "alpha, degrees", &[("commanded", ALPHA, points(&|t| t.alpha_deg)), ("measured", MEASURED, points(&|t| t.alpha_measured_deg))])?;
+    panel(&panels[1], "V_e, px^2", &[("V_e", AREA, points(&|t| t.area_px2))])?;
+    panel(&panels[2], "ml", &[("d", D, points(&|t| t.d_ml)), ("poured (estimate)", POURED, points(&|t| t.poured_ml))])?;
+    root.present()?;
+    Ok(())
+}
+
+fn panel(area: &Drawing, unit: &str, lines: &[Line]) -> Result<(), Box<dyn std::error::Error>> {
+    let all = || lines.iter().flat_map(|l| &l.2);
+    let end_s = all().map(|p| p.0).fold(1.0, f64::max);
+    let (low, high) = all().fold((0.0f64, 1.0f64), |(l, h), p| (l.min(p.1), h.max(p.1)));
+    let margin = 0.05 * (high - low);
+    let mut chart = ChartBuilder::on(area)
+        .margin(8)
+        .x_label_area_size(36)
+        .y_label_area_size(60)
+        .build_cartesian_2d(0.0..end_s, low - if low < 0.0 { margin } else { 0.0 }..high + margin)?;
+    chart.configure_mesh().x_desc("s").y_desc(unit).light_line_style(TRANSPARENT).label_style(("sans-serif", 13)).draw()?;
+    for (name, colour, points) in lines {
+        chart
+            .draw_series(LineSeries::new(points.iter().copied(), colour.stroke_width(2)))?
+            .label(*name)
+            .legend(|(x, y)| PathElement::new([(x, y), (x + 18, y)], colour.stroke_width(2)));
+    }
+    if lines.len() > 1 {
+        chart
+            .configure_series_labels()
+            .position(SeriesLabelPosition::UpperLeft)
+            .background_style(WHITE.mix(0.8))
+            .border_style(BLACK.mix(0.3))
+            .label_font(("sans-serif", 13))
+            .draw()?;
+    }
+    Ok(())
+}
