@@ -276,7 +276,11 @@ fn the_average_covers_the_braking_time() {
 
 /// Bytes that are frames more often than not, in the types that a client reads.
 fn anything() -> impl Strategy<Value = Vec<u8>> {
-    let payload = prop_oneof![prop::collection::vec(any::<u8>(), 0..40), prop::collection::vec(0u8..8, 0..12), prop::collection::vec(any::<u8>(), 189)];
+    let payload = prop_oneof![
+        prop::collection::vec(any::<u8>(), 0..40),
+        prop::collection::vec(0u8..8, 0..12),
+        prop::collection::vec(any::<u8>(), 189)
+    ];
     let frame = (prop::sample::select(b"VvOISMU".to_vec()), payload).prop_map(|(kind, payload)| {
         let mut frame = (payload.len() as u16 + 3).to_be_bytes().to_vec();
         frame.push(kind);

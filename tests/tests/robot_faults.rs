@@ -10,7 +10,7 @@
 use std::fmt::Write as _;
 use std::io::{BufRead, BufReader, Write};
 use std::net::{IpAddr, Ipv4Addr, TcpStream};
-use std::path::{Path, PathBuf};
+use std::path::Path;
 use std::process::{Child, Command, Stdio};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering::Relaxed};
@@ -303,9 +303,7 @@ const HEAD: &str = "| fault | moment | reason | poured ml | alpha at fault | lar
 largest rate deg/s | largest acceleration deg/s^2 | next pour of 8 ml |\n|---|---|---|---|---|---|---|---|---|---|---|";
 
 fn start_controller(directory: &Path) -> Child {
-    // The test's own program is in target/release/deps, the controller in target/release.
-    let path: PathBuf = std::env::current_exe().unwrap().ancestors().nth(2).unwrap().join("rt-controller");
-    assert!(path.exists(), "{} is missing: build it first (scripts/build)", path.display());
+    let path = tests::program("rt-controller");
     let log = std::fs::OpenOptions::new().create(true).append(true).open(directory.join("log")).unwrap();
     let config = directory.join("cell.toml");
     Command::new(path).arg("run").arg("--config").arg(config).stdin(Stdio::null()).stdout(Stdio::null()).stderr(log).spawn().unwrap()
