@@ -206,13 +206,51 @@ pub struct Core {
     run: Option<Run>,
     decision: Decision,
     newest: Option<Feature>,
+    commanded: Commanded,
     shutdown: bool,
     last_tick_ns: u64,
     counters: Counters,
 }
 
-/// A decision before anything was decided.
-const NOTHING: Decision = Decision { action: 10, dalpha_deg: 0.0, v_ml: 0.0, d_ml: 0.0, poured_ml: 0.0, finished: false, flowing: false };
+/// The commanded alpha of the newest ticks: which one was in force when a frame was taken.
+#[derive(Debug, Clone, Copy)]
+struct Commanded {
+    /// (time in ns, alpha in degrees), a ring; times of 0 were never written.
+    ring: [(u64, f32); Self::TICKS],
+    next: usize,
+}
+
+impl Commanded {
+    /// About a second: a frame that is older is stale.
+    const TICKS: usize = 32;
+
+    fn new() -> Self {
+        Self { ring: [(0, 0.0); Self::TICKS], next: 0 }
+    }
+
+    fn push(&mut self, at_ns: u64, alpha_deg: f32) {
+        self.ring[self.next] = (at_ns, alpha_deg);
+        self.next = (self.next + 1) % Self::TICKS;
+    }
+
+    /// Alpha at `at_ns`, degrees: on the line between two ticks, as episodes are read; the newest or the oldest beyond them.
+    fn at(&self, at_ns: u64) -> f32 {
+        let newest_first = (1..=Self::TICKS).map(|back| self.ring[(self.next + Self::TICKS - back) % Self::TICKS]);
+        let mut later: Option<(u64, f32)> = None;
+        for (t, alpha) in newest_first {
+            match later {
+                _ if t == 0 => break,
+                Some((later_ns, later_deg)) if t <= at_ns => {
+                    let share = (at_ns - t) as f32 / (later_ns - t).max(1) as f32;
+                    return alpha + share * (later_deg - alpha);
+                }
+                None if t <= at_ns => return alpha,
+                _ => later = Some((t, alpha)),
+            }
+        }
+        later.map_or(0.0, |(_, alpha)| alpha)
+    }
+}
 
 impl Core {
     /// A controller without robot and weights.
@@ -224,8 +262,9 @@ impl Core {
             limiter: Limiter::new(settings.limits, period_s, 0.0),
             phase: Phase::NoRobot,
             run: None,
-            decision: NOTHING,
+            decision: Decision::NOTHING,
             newest: None,
+            commanded: Commanded::new(),
             shutdown: false,
             last_tick_ns: 0,
             counters: Counters::default(),
@@ -273,6 +312,9 @@ impl Core {
             ended = self.advance(input);
         }
         let target_deg = self.command(input, request);
+        if let Some(alpha_deg) = target_deg {
+            self.commanded.push(input.now_ns, alpha_deg);
+        }
         Output { target_deg, ordered, ended, telemetry: self.telemetry(input, asked, area) }
     }
 
@@ -317,7 +359,7 @@ impl Core {
                 }
                 let agent = self.agent.as_mut().ok_or(Refusal::NoWeights)?;
                 agent.start(goal_ml);
-                self.decision = Decision { d_ml: goal_ml, ..NOTHING };
+                self.decision = Decision { d_ml: goal_ml, ..Decision::NOTHING };
                 self.begin(episode, Some(goal_ml), None, Phase::Pouring, input);
                 Ok(())
             }
@@ -326,7 +368,7 @@ impl Core {
                 if !self.curve_fits(&curve) {
                     return Err(Refusal::Curve);
                 }
-                self.decision = NOTHING;
+                self.decision = Decision::NOTHING;
                 self.begin(episode, None, Some(curve), Phase::Recording, input);
                 Ok(())
             }
@@ -432,14 +474,16 @@ impl Core {
             area = measured.unwrap_or(f32::NAN);
             run.frames += lost + 1;
             let (Some(agent), Some(_)) = (&mut self.agent, run.goal_ml) else { continue };
-            let alpha_deg = self.limiter.alpha_deg();
-            for _ in 0..lost {
-                self.decision = agent.step(Frame { area_px2: None, alpha_deg });
+            let alpha_now_deg = self.limiter.alpha_deg();
+            for nth in 1..=lost {
+                let alpha_deg = self.commanded.at(between_ns(previous, feature, nth, lost));
+                self.decision = agent.step(Frame { area_px2: None, alpha_deg, alpha_now_deg });
             }
-            self.decision = agent.step(Frame { area_px2: measured, alpha_deg });
+            let alpha_deg = self.commanded.at(feature.captured_at_ns);
+            self.decision = agent.step(Frame { area_px2: measured, alpha_deg, alpha_now_deg });
             let flowing = self.decision.flowing;
             run.quiet_frames = if flowing { 0 } else { run.quiet_frames + lost + 1 };
-            let at_largest_tilt = alpha_deg >= self.settings.limits.alpha_max_deg - 0.5;
+            let at_largest_tilt = alpha_now_deg >= self.settings.limits.alpha_max_deg - 0.5;
             run.empty_frames = if at_largest_tilt && !flowing { run.empty_frames + lost + 1 } else { 0 };
             if self.phase == Phase::Pouring && !self.decision.finished {
                 request += self.decision.dalpha_deg;
@@ -559,6 +603,12 @@ impl Core {
 /// alpha(t) of eq. (1), degrees.
 pub fn curve_alpha_deg(curve: &Curve, t_s: f32) -> f32 {
     curve.lambda_deg * (-curve.gamma_per_s2 * (t_s - curve.beta_s).powi(2)).exp()
+}
+
+/// When the `nth` of `lost` frames before `feature` was taken: they lie evenly after the previous one.
+fn between_ns(previous: Option<Feature>, feature: &Feature, nth: u32, lost: u32) -> u64 {
+    let from_ns = previous.map_or(feature.captured_at_ns, |p| p.captured_at_ns);
+    from_ns + feature.captured_at_ns.saturating_sub(from_ns) * u64::from(nth) / u64::from(lost + 1)
 }
 
 /// A run that was already ending keeps its first reason, unless that was no fault.

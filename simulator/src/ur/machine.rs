@@ -507,7 +507,8 @@ impl Machine {
     /// Lets a paused program go on. False: none is paused, or the robot may not move.
     pub fn resume(&mut self) -> bool {
         let may = self.mode == RobotMode::Running && self.safety == SafetyMode::Normal;
-        if !may || self.runtime != RuntimeState::Paused || self.program.is_none() {
+        let paused = matches!(self.runtime, RuntimeState::Pausing | RuntimeState::Paused);
+        if !may || !paused || self.program.is_none() {
             return false;
         }
         self.event(format!("program {} resumed", self.program_name));

@@ -3,7 +3,8 @@
 //! Pure; source: section "Field names and associated types" of UR's RTDE guide. Used on the controller's thread.
 
 /// Controller generation.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, serde::Serialize, serde::Deserialize)]
+#[serde(rename_all = "kebab-case")]
 pub enum Series {
     /// CB3: 125 cycles a second.
     Cb3,
