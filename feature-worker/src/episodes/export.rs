@@ -146,11 +146,10 @@ fn images(file: &Path, target: &Path, bar: &ProgressBar) -> Result<PathBuf, Expo
     Ok(target.to_path_buf())
 }
 
-/// Frames a second: the median of the intervals.
+/// Frames a second; the lost ones count, because they are shown too.
 pub(crate) fn rate_hz(episode: &Episode) -> f64 {
-    let mut intervals: Vec<f64> = episode.frames.windows(2).map(|w| w[1].t_s - w[0].t_s).filter(|s| *s > 0.0).collect();
-    intervals.sort_by(f64::total_cmp);
-    intervals.get(intervals.len() / 2).map_or(30.0, |s| (1.0 / s).clamp(1.0, 240.0))
+    let rate_hz = (episode.frames.len().saturating_sub(1)) as f64 / episode.seconds();
+    if rate_hz.is_finite() { rate_hz.clamp(1.0, 240.0) } else { 30.0 }
 }
 
 /// Calls `take` once for each frame of the episode with its image, or with the one before where there is none; frames before
