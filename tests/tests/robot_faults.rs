@@ -27,7 +27,7 @@ use shared::ipc;
 use shared::messages::{Feature, LAYOUT_VERSION, Phase};
 use shared::os::now_ns;
 use shared::policy::{InputScale, Mlp, STAY, action_table};
-use shared::weights::{Method, Origin, Weights};
+use shared::weights::{Estimator, Method, Origin, Weights};
 use simulator::ur::{Controller, Fault, Handle, Options, RobotMode, RuntimeState, TraceRow};
 
 /// Millilitres in a frame per px^2 of the feature.
@@ -322,6 +322,7 @@ fn tilt_until_it_flows() -> Weights {
         selection: Selection::Argmax,
         scale: InputScale::default(),
         calibration: Calibration { c: ML_PER_PX2 as f32, q: 1.0, hold_above_px2: 1e6 },
+        estimator: Estimator::Sum,
         rate_hz: 30.0,
         origin: Origin { method: Method::Handmade, actions: 21, episodes: 0, data_sha256: [0; 32] },
         seed: 1,
