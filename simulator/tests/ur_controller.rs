@@ -361,7 +361,7 @@ fn every_variable_has_its_type_and_size() {
           actual_joint_voltage,payload_inertia",
         ),
         ("VECTOR6INT32", "joint_mode"),
-        ("VECTOR3D", "actual_tool_accelerometer,payload_cog"),
+        ("VECTOR3D", "actual_tool_accelerometer,payload_cog,elbow_position,elbow_velocity"),
         ("UINT64", "actual_digital_input_bits,actual_digital_output_bits"),
         (
             "INT32",
