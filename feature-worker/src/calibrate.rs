@@ -126,7 +126,8 @@ impl ColourLearner {
         // these margins, the limit is half way between the two.
         let relative_hue = |p: &[u8; 3]| (f32::from(p[0]) - mean + 270.0).rem_euclid(180.0) - 90.0;
         let between = |loose: f32, liquid: f32, alike: &dyn Fn(&[u8; 3]) -> Option<f32>| {
-            let mut values: Vec<f32> = self.far.iter().filter_map(alike).filter(|v| (v - loose).signum() != (v - liquid).signum()).collect();
+            let mut values: Vec<f32> =
+                self.far.iter().filter_map(alike).filter(|v| (v - loose).signum() != (v - liquid).signum()).collect();
             values.extend(self.far.iter().filter_map(alike).filter(|v| (loose < liquid) == (*v < loose)).map(|_| loose));
             if (values.len() as f32) < 0.002 * far {
                 return loose;

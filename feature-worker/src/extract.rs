@@ -30,6 +30,8 @@ const NEAR_PX: f32 = 3.0;
 /// have to find the edge to within a profile's reach.
 const DENSE_PX: f32 = 48.0;
 const STEP_MOST_PX: f32 = 4.0;
+/// Edges that are tried in pairs for the first line.
+const PICKS: usize = 13;
 /// Profiles across the line.
 const PROFILES: usize = 48;
 /// Samples of a profile on either side of its centre; the outer [`FLANK`] of them tell liquid and background.
@@ -39,6 +41,11 @@ const FLANK: usize = 3;
 const STREAM_RAYS: f32 = 0.8;
 /// More background than this before the first liquid ends a ray, px.
 const GAP_MOST_PX: f32 = 24.0;
+/// Clear water: detail counts up to this many grey levels, so that one glint does not outweigh a line.
+const DETAIL_MOST: f32 = 40.0;
+/// Clear water: least mean score of the path, in units of the noise, and least share of rays on which it is seen.
+const CLEAR_STRENGTH: f32 = 2.0;
+const CLEAR_SHARE: f32 = 0.6;
 /// Least share of liquid between lip and edge on a ray that counts as filled.
 const FILLED: f32 = 0.55;
 /// Mean grey level below which the region counts as dark.
@@ -233,6 +240,11 @@ pub struct Extractor {
     hsv: Mat,
     mask: Mat,
     mask_b: Mat,
+    grey: Mat,
+    detail: Mat,
+    path_score: Vec<f32>,
+    path_from: Vec<u16>,
+    sums: Vec<f32>,
     edges: Vec<[f32; 2]>,
     edge_weights: Vec<f32>,
     fine: Vec<[f32; 2]>,
@@ -356,6 +368,11 @@ impl Extractor {
             hsv: Mat::default(),
             mask: Mat::default(),
             mask_b: Mat::default(),
+            grey: Mat::default(),
+            detail: Mat::default(),
+            path_score: Vec::new(),
+            path_from: Vec::new(),
+            sums: Vec::new(),
             edges: Vec::with_capacity(RAYS),
             edge_weights: Vec::with_capacity(RAYS),
             fine: Vec::with_capacity(PROFILES),
@@ -446,11 +463,18 @@ impl Extractor {
         let checked = Instant::now();
         let (result, segmented) = match unusable {
             Some(doubt) => (Measurement::nothing(0.0, doubt), checked),
-            None => {
-                self.segment_colour()?;
-                let segmented = Instant::now();
-                (self.find_triangle(colours)?, segmented)
-            }
+            None => match self.method {
+                LiquidMethod::Colour => {
+                    self.segment_colour()?;
+                    let segmented = Instant::now();
+                    (self.find_triangle(colours)?, segmented)
+                }
+                LiquidMethod::Clear => {
+                    self.find_detail()?;
+                    let segmented = Instant::now();
+                    (self.follow_edge(colours)?, segmented)
+                }
+            },
         };
         let done = Instant::now();
         self.converted = converted;
@@ -465,8 +489,11 @@ impl Extractor {
     }
 
     fn resample(&mut self, region: &impl core::ToInputArray) -> Result<(), ExtractError> {
-        let (linear, border) = (imgproc::INTER_NEAREST, core::BORDER_REPLICATE);
-        imgproc::remap(region, &mut self.polar, &self.map_a, &self.map_b, linear, border, Scalar::default())?;
+        let (nearest, border) = (imgproc::INTER_NEAREST, core::BORDER_REPLICATE);
+        imgproc::remap(region, &mut self.polar, &self.map_a, &self.map_b, nearest, border, Scalar::default())?;
+        if self.method == LiquidMethod::Clear {
+            imgproc::cvt_color_def(region, &mut self.grey, imgproc::COLOR_BGR2GRAY)?;
+        }
         Ok(())
     }
 
@@ -519,6 +546,95 @@ impl Extractor {
         Ok(())
     }
 
+    /// Clear water: fine detail of the region on the rays, into `self.mask`. Water's edge is a fine line, dark or bright
+    /// depending on what it bends into sight; what stands behind is out of focus and has little detail of that size.
+    fn find_detail(&mut self) -> Result<(), ExtractError> {
+        let (size, wide) = (core::Size::new(3, 3), core::Size::new(9, 9));
+        let (anchor, border) = (core::Point::new(-1, -1), core::BORDER_REPLICATE);
+        imgproc::blur(&self.grey, &mut self.smooth, size, anchor, border)?;
+        imgproc::blur(&self.smooth, &mut self.hsv, wide, anchor, border)?;
+        core::absdiff(&self.smooth, &self.hsv, &mut self.mask_b)?;
+        imgproc::dilate(&self.mask_b, &mut self.detail, &core::no_array(), anchor, 1, border, Scalar::all(0.0))?;
+        imgproc::remap(&self.detail, &mut self.mask, &self.map_a, &self.map_b, imgproc::INTER_NEAREST, border, Scalar::default())?;
+        Ok(())
+    }
+
+    /// Clear water, step 1: the path over all rays, from axis to axis, along which there is most detail on it, some inside and
+    /// little outside (dynamic programming over the rays; no OpenCV call does this).
+    fn follow_edge(&mut self, colours: Colours) -> Result<Measurement, ExtractError> {
+        self.edges.clear();
+        let samples = self.radii_px.len();
+        // Noise: the median detail of everything between the axes.
+        let mut histogram = [0u32; 256];
+        let mut total = 0u32;
+        for (i, ray) in self.rays.iter().enumerate() {
+            for value in &self.mask.at_row::<u8>(i as i32)?[..ray.samples] {
+                histogram[usize::from(*value)] += 1;
+                total += 1;
+            }
+        }
+        let mut below = 0;
+        let noise = (0..256).find(|v| {
+            below += histogram[*v];
+            below * 2 >= total
+        });
+        let noise = noise.unwrap_or(0) as f32 + 1.0;
+
+        self.path_score.clear();
+        self.path_score.resize(RAYS * samples, f32::MIN);
+        self.path_from.clear();
+        self.path_from.resize(RAYS * samples, 0);
+        for (i, ray) in self.rays.iter().enumerate() {
+            let row = &self.mask.at_row::<u8>(i as i32)?[..ray.samples];
+            self.sums.clear();
+            self.sums.push(0.0);
+            let mut sum = 0.0;
+            for value in row {
+                sum += f32::from(*value).min(DETAIL_MOST);
+                self.sums.push(sum);
+            }
+            let mean = |from: usize, to: usize| (self.sums[to] - self.sums[from]) / (to - from).max(1) as f32;
+            for r in 3..ray.samples.saturating_sub(3) {
+                let here = f32::from(row[r]).min(DETAIL_MOST);
+                let (inside, outside) = (mean(r.saturating_sub(14), r - 2), mean((r + 3).min(ray.samples), (r + 15).min(ray.samples)));
+                let score = here + 0.7 * (inside - outside) - 1.5 * noise;
+                let (mut best, mut from) = (0.0, r);
+                if i > 0 {
+                    best = f32::MIN;
+                    for q in r.saturating_sub(3)..=(r + 3).min(samples - 1) {
+                        let before = self.path_score[(i - 1) * samples + q] - 0.6 * (q as f32 - r as f32).abs();
+                        if before > best {
+                            (best, from) = (before, q);
+                        }
+                    }
+                }
+                self.path_score[i * samples + r] = if best == f32::MIN { f32::MIN } else { best + score };
+                self.path_from[i * samples + r] = from as u16;
+            }
+        }
+        let last = &self.path_score[(RAYS - 1) * samples..];
+        let Some(end) = (0..samples).max_by(|a, b| last[*a].total_cmp(&last[*b])) else {
+            return Ok(Measurement::nothing(0.0, Doubt::EdgeNotFound));
+        };
+        let strength = last[end] / RAYS as f32 / noise;
+        let mut r = end;
+        let mut supported = 0;
+        for i in (0..RAYS).rev() {
+            let row = self.mask.at_row::<u8>(i as i32)?;
+            supported += usize::from(f32::from(row[r]) > 2.5 * noise + 1.0);
+            let r_px = self.radii_px[r];
+            self.edges.push(self.axes.at(r_px, self.rays[i].along));
+            r = usize::from(self.path_from[i * samples + r]);
+        }
+        self.edges.reverse();
+        let share = supported as f32 / RAYS as f32;
+        if strength < CLEAR_STRENGTH || share < CLEAR_SHARE {
+            self.edges.clear();
+            return Ok(Measurement::nothing((1.0 - share).clamp(0.0, 1.0), Doubt::None));
+        }
+        self.line_through_edges(share, 0, colours)
+    }
+
     fn find_triangle(&mut self, colours: Colours) -> Result<Measurement, ExtractError> {
         // 1. The edge on each ray: the best split into liquid before and background after it.
         self.edges.clear();
@@ -559,33 +675,45 @@ impl Extractor {
             return Ok(Measurement::nothing((1.0 - share).clamp(0.0, 1.0), Doubt::None));
         }
 
-        // 2. A first line: the fixed pair of edges with most others near its line, then least squares over those. Weights
-        // are distances between neighbours, so that every part of the edge counts by its length.
+        self.line_through_edges(share, cut_off, colours)
+    }
+
+    /// Steps 2 to 4 of the module's text, from `self.edges`. `share`: of rays with an edge; `cut_off`: rays whose liquid
+    /// reaches the region's border.
+    fn line_through_edges(&mut self, share: f32, cut_off: usize, colours: Colours) -> Result<Measurement, ExtractError> {
+        // 2. A first line: the pair of edges with most others near its line, then least squares over those. Weights are
+        // distances between neighbours, so that every part of the edge counts by its length; one that is far from both
+        // neighbours is alone.
         let count = self.edges.len();
+        let apart = |a: [f32; 2], b: [f32; 2]| (a[0] - b[0]).hypot(a[1] - b[1]);
         self.edge_weights.clear();
+        self.scratch.clear();
         for i in 0..count {
-            let (a, b) = (self.edges[i.saturating_sub(1)], self.edges[(i + 1).min(count - 1)]);
-            self.edge_weights.push((a[0] - b[0]).hypot(a[1] - b[1]).min(20.0) + 0.05);
+            let here = self.edges[i];
+            let before = if i > 0 { apart(here, self.edges[i - 1]) } else { f32::MAX };
+            let after = if i + 1 < count { apart(here, self.edges[i + 1]) } else { f32::MAX };
+            self.edge_weights.push(before.min(after).min(20.0) + 0.05);
+            self.scratch.push(apart(here, self.axes.lip_px));
         }
-        let mut best: Option<(f32, Line, f32)> = None;
-        for i in 0..24 {
-            let a = self.edges[i * (count / 2) / 24];
-            let b = self.edges[(i * (count / 2) / 24 + count / 2).min(count - 1)];
-            let (dx, dy) = (b[0] - a[0], b[1] - a[1]);
-            let length = dx.hypot(dy);
-            if length < 1.0 {
-                continue;
-            }
-            let normal = [-dy / length, dx / length];
-            let line = Line { normal, distance: normal[0] * a[0] + normal[1] * a[1] };
-            let near = (0.12 * length).max(2.0);
-            let support: f32 =
-                self.edges.iter().zip(&self.edge_weights).filter(|(p, _)| line.offset(**p).abs() < near).map(|(_, w)| w).sum();
-            if best.is_none_or(|(s, ..)| support > s) {
-                best = Some((support, line, near));
+        let near = (0.12 * median(&mut self.scratch)).max(1.5);
+        let mut best: Option<(f32, Line)> = None;
+        for i in 0..PICKS {
+            for j in i + PICKS / 4..PICKS {
+                let (a, b) = (self.edges[i * (count - 1) / (PICKS - 1)], self.edges[j * (count - 1) / (PICKS - 1)]);
+                let length = apart(a, b);
+                if length < 1.0 {
+                    continue;
+                }
+                let normal = [-(b[1] - a[1]) / length, (b[0] - a[0]) / length];
+                let line = Line { normal, distance: normal[0] * a[0] + normal[1] * a[1] };
+                let support: f32 =
+                    self.edges.iter().zip(&self.edge_weights).filter(|(p, _)| line.offset(**p).abs() < near).map(|(_, w)| w).sum();
+                if best.is_none_or(|(s, ..)| support > s) {
+                    best = Some((support, line));
+                }
             }
         }
-        let Some((support, line, near)) = best else { return Ok(Measurement::nothing(0.0, Doubt::EdgeNotFound)) };
+        let Some((support, line)) = best else { return Ok(Measurement::nothing(0.0, Doubt::EdgeNotFound)) };
         let inliers = support / self.edge_weights.iter().sum::<f32>();
         let points = self.edges.iter().copied().zip(self.edge_weights.iter().copied());
         let Some(line) = Line::fit(points.filter(|(p, _)| line.offset(*p).abs() < near)) else {
@@ -635,6 +763,7 @@ impl Extractor {
         let normal = [line.normal[0] * outwards, line.normal[1] * outwards];
         // A small triangle has short profiles, so that their inner ends stay in the liquid.
         let spacing = (line.offset(self.axes.lip_px).abs() / 18.0).clamp(0.4, 1.0);
+        let margin = (0.04 * line.offset(self.axes.lip_px).abs()).clamp(1.0, 1.5);
         self.fine.clear();
         self.fine_weights.clear();
         self.widths.clear();
@@ -673,6 +802,31 @@ impl Extractor {
             if !complete {
                 continue;
             }
+            if self.method == LiquidMethod::Clear {
+                // The outermost of the steep steps of brightness: there the water begins.
+                let grey = |j: usize| profile[j].iter().sum::<f32>() / 3.0;
+                let step = |j: usize| (grey(j + 1) - grey(j)).abs();
+                let steepest = (0..2 * REACH).map(step).fold(0.0, f32::max);
+                let Some(j) =
+                    (1..2 * REACH - 1).rev().find(|&j| step(j) >= 0.6 * steepest && step(j) >= step(j - 1) && step(j) >= step(j + 1))
+                else {
+                    continue;
+                };
+                if steepest < 4.0 {
+                    continue;
+                }
+                // The top of the parabola through the three steps.
+                let (left, middle, right) = (step(j - 1), step(j), step(j + 1));
+                let curvature = left - 2.0 * middle + right;
+                let shift = if curvature < -1e-3 { (0.5 * (left - right) / curvature).clamp(-0.5, 0.5) } else { 0.0 };
+                let d = (j as f32 + 0.5 + shift - REACH as f32) * spacing;
+                let point = [centre[0] + d * normal[0], centre[1] + d * normal[1]];
+                if self.axes.between(point) >= margin {
+                    self.fine.push(point);
+                    self.scratch.push(steepest);
+                }
+                continue;
+            }
             let mean =
                 |range: &[[f32; 3]]| -> [f32; 3] { std::array::from_fn(|c| range.iter().map(|v| v[c]).sum::<f32>() / range.len() as f32) };
             let inside = mean(&profile[..FLANK]);
@@ -697,8 +851,8 @@ impl Extractor {
             }
             let d = (half - REACH as f32) * spacing;
             let point = [centre[0] + d * normal[0], centre[1] + d * normal[1]];
-            // The outline bends inwards beyond the axes, so only what lies between them counts.
-            if self.axes.between(point) < 1.0 {
+            // The outline bends inwards beyond the axes, so only what lies between them counts; the rim's light spreads a little.
+            if self.axes.between(point) < margin {
                 continue;
             }
             self.fine.push(point);

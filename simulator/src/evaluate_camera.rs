@@ -277,11 +277,20 @@ fn evaluate(args: &Args) -> Result<(), Failure> {
     save_worst(&args.out, &worst)?;
 
     let figures: BTreeMap<&str, Figures> = groups.iter().map(|(name, samples)| (name.as_str(), figures(samples))).collect();
-    println!("{:<32}{:>7}{:>9}{:>8}{:>8}{:>8}{:>9}{:>8}", "condition", "frames", "median %", "p95 %", "bias %", "false %", "missed %", "doubt %");
+    println!(
+        "{:<32}{:>7}{:>9}{:>8}{:>8}{:>8}{:>9}{:>8}",
+        "condition", "frames", "median %", "p95 %", "bias %", "false %", "missed %", "doubt %"
+    );
     for (name, f) in &figures {
         println!(
             "{name:<32}{:>7}{:>9.2}{:>8.2}{:>8.2}{:>8.2}{:>9.2}{:>8.2}",
-            f.frames, f.median_error_percent, f.p95_error_percent, f.bias_percent, f.false_flow_percent, f.missed_flow_percent, f.doubt_percent
+            f.frames,
+            f.median_error_percent,
+            f.p95_error_percent,
+            f.bias_percent,
+            f.false_flow_percent,
+            f.missed_flow_percent,
+            f.doubt_percent
         );
     }
     let doubts = doubts(args.seed)?;
@@ -291,7 +300,8 @@ fn evaluate(args: &Args) -> Result<(), Failure> {
     }
     println!("\nworst frames: {}", args.out.display());
     if let Some(path) = &args.json {
-        let report = serde_json::json!({ "frames": cases * FRAMES, "seed": args.seed, "conditions": figures, "doubts_raised_percent": doubts });
+        let report =
+            serde_json::json!({ "frames": cases * FRAMES, "seed": args.seed, "conditions": figures, "doubts_raised_percent": doubts });
         std::fs::write(path, serde_json::to_string_pretty(&report)?).map_err(|e| format!("{}: {e}", path.display()))?;
     }
     Ok(())
@@ -321,7 +331,14 @@ fn figures(samples: &[Sample]) -> Figures {
 }
 
 /// The frame with what was seen (yellow, white) and the truth (magenta) drawn on it, and its conditions below.
-fn explain(pixels: &[u8], case: &Case, extractor: &Extractor, measured: &Measurement, truth: &Truth, scene: &Scene) -> Result<Mat, Failure> {
+fn explain(
+    pixels: &[u8],
+    case: &Case,
+    extractor: &Extractor,
+    measured: &Measurement,
+    truth: &Truth,
+    scene: &Scene,
+) -> Result<Mat, Failure> {
     let (rows, columns) = (case.view.height_px as i32, case.view.width_px as i32);
     let mut picture = Mat::new_rows_cols_with_bytes::<Vec3b>(rows, columns, pixels)?.try_clone()?;
     view::draw(&mut picture, extractor, measured)?;
@@ -357,7 +374,12 @@ fn doubts(seed: u64) -> Result<BTreeMap<&'static str, f64>, Failure> {
     // The doubt, the view, the flow, and whether the region is cut short.
     let bad = [
         (Doubt::TooDark, View { light: 0.06, ..base.clone() }, 8.0, false),
-        (Doubt::BlownOut, View { light: 1.98, background: Background::Plain, liquid_bgr: Some([250, 240, 180]), ..base.clone() }, 8.0, false),
+        (
+            Doubt::BlownOut,
+            View { light: 1.98, background: Background::Plain, liquid_bgr: Some([250, 240, 180]), ..base.clone() },
+            8.0,
+            false,
+        ),
         (Doubt::Blurred, View { blur_px: 4.5, ..base.clone() }, 12.0, false),
         (Doubt::LeavesRegion, base.clone(), 25.0, true),
     ];
