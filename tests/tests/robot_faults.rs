@@ -19,15 +19,14 @@ use std::time::{Duration, Instant};
 
 use rt_controller::client::Client;
 use rt_controller::link::Lost;
-use shared::agent::Selection;
 use shared::config::Config;
 use shared::control::{EndReason, Outcome, Reply, Request};
 use shared::estimate::Calibration;
 use shared::ipc;
 use shared::messages::{Feature, LAYOUT_VERSION, Phase};
 use shared::os::now_ns;
-use shared::policy::{InputScale, Mlp, STAY, action_table};
-use shared::weights::{Method, Origin, Weights};
+use shared::policy::{Mlp, STAY};
+use shared::weights::Weights;
 use simulator::ur::{Controller, Fault, Handle, Options, RobotMode, RuntimeState, TraceRow};
 
 /// Millilitres in a frame per px^2 of the feature.
@@ -176,7 +175,7 @@ impl Cell {
         };
         let episode = self.pour(goal_ml);
         match moment {
-            Moment::Returning => reached("returning", |alpha, rate| rate < -30.0 && alpha > 15.0),
+            Moment::Returning => reached("returning", |alpha, rate| rate < -30.0 && (15.0..45.0).contains(&alpha)),
             Moment::FullFlow => reached("at full flow", |alpha, rate| flow_ml_s(alpha) > 5.0 && rate.abs() < 5.0),
             _ => reached("tilting out", |alpha, rate| rate > 20.0 && alpha > 20.0),
         }
@@ -316,16 +315,8 @@ fn tilt_until_it_flows() -> Weights {
     policy.w2[0][0] = 1.0;
     policy.w3[0][STAY] = 1.0;
     policy.b3[STAY + 7] = 0.5;
-    Weights {
-        policy,
-        actions_deg: action_table(),
-        selection: Selection::Argmax,
-        scale: InputScale::default(),
-        calibration: Calibration { c: ML_PER_PX2 as f32, q: 1.0, hold_above_px2: 1e6 },
-        rate_hz: 30.0,
-        origin: Origin { method: Method::Handmade, actions: 21, episodes: 0, data_sha256: [0; 32] },
-        seed: 1,
-    }
+    let calibration = Calibration { c: ML_PER_PX2 as f32, q: 1.0, hold_above_px2: f32::INFINITY };
+    Weights { policy, calibration, ..tests::steady_weights(STAY + 7) }
 }
 
 fn flow_ml_s(alpha_deg: f64) -> f64 {
