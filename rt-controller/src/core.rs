@@ -206,49 +206,32 @@ pub struct Core {
     run: Option<Run>,
     decision: Decision,
     newest: Option<Feature>,
-    commanded: Commanded,
     shutdown: bool,
     last_tick_ns: u64,
+    commanded: Commanded,
     counters: Counters,
 }
 
-/// The commanded alpha of the newest ticks: which one was in force when a frame was taken.
-#[derive(Debug, Clone, Copy)]
-struct Commanded {
-    /// (time in ns, alpha in degrees), a ring; times of 0 were never written.
-    ring: [(u64, f32); Self::TICKS],
-    next: usize,
-}
+/// Commands remembered, to know which one was in force when a picture was taken.
+const COMMANDS: usize = 32;
+
+/// The newest commands with their times, oldest first; alpha in between is interpolated, as the recorder does it.
+#[derive(Debug)]
+struct Commanded([(u64, f32); COMMANDS]);
 
 impl Commanded {
-    /// About a second: a frame that is older is stale.
-    const TICKS: usize = 32;
-
-    fn new() -> Self {
-        Self { ring: [(0, 0.0); Self::TICKS], next: 0 }
-    }
-
     fn push(&mut self, at_ns: u64, alpha_deg: f32) {
-        self.ring[self.next] = (at_ns, alpha_deg);
-        self.next = (self.next + 1) % Self::TICKS;
+        self.0.copy_within(1.., 0);
+        self.0[COMMANDS - 1] = (at_ns, alpha_deg);
     }
 
-    /// Alpha at `at_ns`, degrees: on the line between two ticks, as episodes are read; the newest or the oldest beyond them.
-    fn at(&self, at_ns: u64) -> f32 {
-        let newest_first = (1..=Self::TICKS).map(|back| self.ring[(self.next + Self::TICKS - back) % Self::TICKS]);
-        let mut later: Option<(u64, f32)> = None;
-        for (t, alpha) in newest_first {
-            match later {
-                _ if t == 0 => break,
-                Some((later_ns, later_deg)) if t <= at_ns => {
-                    let share = (at_ns - t) as f32 / (later_ns - t).max(1) as f32;
-                    return alpha + share * (later_deg - alpha);
-                }
-                None if t <= at_ns => return alpha,
-                _ => later = Some((t, alpha)),
-            }
+    fn at(&self, t_ns: u64) -> f32 {
+        let later = self.0.partition_point(|(at, _)| *at <= t_ns);
+        match (later.checked_sub(1).map(|k| self.0[k]), self.0.get(later)) {
+            (Some((t0, a0)), Some(&(t1, a1))) => a0 + (a1 - a0) * ((t_ns - t0) as f32 / (t1 - t0).max(1) as f32),
+            (Some((_, alpha)), None) | (None, Some(&(_, alpha))) => alpha,
+            (None, None) => 0.0,
         }
-        later.map_or(0.0, |(_, alpha)| alpha)
     }
 }
 
@@ -264,9 +247,9 @@ impl Core {
             run: None,
             decision: Decision::NOTHING,
             newest: None,
-            commanded: Commanded::new(),
             shutdown: false,
             last_tick_ns: 0,
+            commanded: Commanded([(0, 0.0); COMMANDS]),
             counters: Counters::default(),
         }
     }
@@ -312,9 +295,7 @@ impl Core {
             ended = self.advance(input);
         }
         let target_deg = self.command(input, request);
-        if let Some(alpha_deg) = target_deg {
-            self.commanded.push(input.now_ns, alpha_deg);
-        }
+        self.commanded.push(input.now_ns, self.limiter.alpha_deg());
         Output { target_deg, ordered, ended, telemetry: self.telemetry(input, asked, area) }
     }
 

@@ -82,6 +82,8 @@ pub enum Selection {
 
 /// After the way back has begun, this much missing volume makes the agent pour on, ml.
 const RESUME_ML: f32 = 0.5;
+/// After flow was seen, this much of a way back without flow ends the pour, degrees.
+const BROUGHT_BACK_DEG: f32 = 10.0;
 /// Less than this still to come over the lip counts as nothing, ml.
 const NOTHING_ML: f64 = 0.05;
 
@@ -97,6 +99,8 @@ pub struct Agent {
     summed_ml: f32,
     returning: bool,
     finished: bool,
+    seen_flow: bool,
+    brought_back_deg: f32,
     carry_deg: f32,
     random: u64,
 }
@@ -118,6 +122,8 @@ impl Agent {
             summed_ml: 0.0,
             returning: false,
             finished: false,
+            seen_flow: false,
+            brought_back_deg: 0.0,
             carry_deg: 0.0,
             random: weights.seed,
         }
@@ -131,6 +137,8 @@ impl Agent {
         self.summed_ml = 0.0;
         self.returning = false;
         self.finished = false;
+        self.seen_flow = false;
+        self.brought_back_deg = 0.0;
         self.carry_deg = 0.0;
         if let Some(fused) = &mut self.fused {
             fused.restart();
@@ -165,6 +173,10 @@ impl Agent {
             let action = self.select(&logits);
             (action, self.weights.actions_deg[action])
         };
+        // A policy that stops a little early has come to its end too, although d is still above 0.
+        self.seen_flow |= self.v_ml[0] > 0.0;
+        self.brought_back_deg = if self.v_ml[0] > 0.0 || dalpha_deg > 0.0 { 0.0 } else { self.brought_back_deg - dalpha_deg };
+        self.finished |= self.seen_flow && self.brought_back_deg > BROUGHT_BACK_DEG;
         Decision {
             action: action as u8,
             dalpha_deg,

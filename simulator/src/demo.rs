@@ -22,7 +22,7 @@ use crate::pour_plot;
 /// What the operator records: millilitres filled in, and the curve's height (degrees) and width (1/s^2).
 /// A fuller container spills earlier, so it is tilted less.
 const EPISODES: [(f64, f32, f32); 5] =
-    [(430.0, 42.0, 0.35), (360.0, 56.0, 0.30), (300.0, 66.0, 0.22), (230.0, 76.0, 0.28), (160.0, 90.0, 0.24)];
+    [(430.0, 47.0, 0.25), (360.0, 60.0, 0.25), (300.0, 68.0, 0.20), (230.0, 77.0, 0.25), (160.0, 83.0, 0.25)];
 /// What is poured: millilitres filled in, and the goal. None of it was seen in training.
 const POURS: [(f64, f32); 3] = [(200.0, 35.0), (280.0, 110.0), (450.0, 180.0)];
 /// A pour further than this from its goal fails the demo, ml.

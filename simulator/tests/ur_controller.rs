@@ -361,7 +361,7 @@ fn every_variable_has_its_type_and_size() {
           actual_joint_voltage,payload_inertia",
         ),
         ("VECTOR6INT32", "joint_mode"),
-        ("VECTOR3D", "actual_tool_accelerometer,payload_cog"),
+        ("VECTOR3D", "actual_tool_accelerometer,payload_cog,elbow_position,elbow_velocity"),
         ("UINT64", "actual_digital_input_bits,actual_digital_output_bits"),
         (
             "INT32",
@@ -574,7 +574,7 @@ fn the_dashboard_answers_in_urs_words() {
         ("programState", "STOPPED <unnamed>"),
         ("PolyscopeVersion", "URSoftware 3.15.8.106339 (Jan 01 2023)"),
         ("play", "Failed to execute: play"),
-        ("stop", "Failed to execute: stop"),
+        ("stop", "Stopped"),
         ("popup hello", "showing popup"),
         ("close popup", "closing popup"),
         ("close safety popup", "closing safety popup"),
@@ -646,6 +646,13 @@ fn faults_have_names_and_arrive_over_the_operator_port() {
     let (handle, address) = start(Series::Cb3);
     send_fault(address, &Fault::EmergencyStop).unwrap();
     until("emergency stop", || state(&handle).1 == SafetyMode::RobotEmergencyStop);
+    // A fault that ends clients which came before the operator.
+    let mut clients = [Rtde::started(address, "timestamp"), Rtde::started(address, "timestamp")];
+    send_fault(address, &Fault::Fin).unwrap();
+    for client in &mut clients {
+        while client.frame().unwrap().is_some() {}
+    }
+    send_fault(address, &Fault::EmergencyRelease).unwrap();
     drop(handle);
     assert!(send_fault(address, &Fault::Fin).unwrap_err().to_string().contains("no simulated controller answers"));
 }

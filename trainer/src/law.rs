@@ -6,7 +6,7 @@
 //! vbar   = (v0 + s (v1 + v2)) / (1 + 2 s)                     the last three outflows
 //! d'     = d - d0 - kf vbar
 //! v*     = clip(c d', 0, vmax)                                wanted outflow
-//! dalpha = clip(K (v* - vbar - kd (v0 - v2)/2), -3, um);  while nothing flows: clip(K v*, 0, u0);  d' <= 0: back
+//! dalpha = clip(K (v* - vbar - kd (v0 - v2)/2), -3, um);  while nothing flows: clip(K v*, 0.2, u0);  d' <= 0: back
 //! ```
 
 use nalgebra::DMatrix;
@@ -22,6 +22,9 @@ use crate::fit::Fit;
 
 /// Frames after which a pour counts as never ending.
 pub const MAX_FRAMES: usize = 900;
+
+/// Slowest forward while nothing flows and volume is missing, degrees a frame: it must be an action that the network has.
+const CREEP_DEG: f64 = 0.2;
 
 /// The law's parameters.
 #[derive(Debug, Clone, Copy, PartialEq, serde::Serialize)]
@@ -74,7 +77,7 @@ impl Law {
         }
         let wanted = (self.c * left).clamp(0.0, self.vmax);
         Some(if v0 == 0.0 && v1 == 0.0 && v2 == 0.0 {
-            (self.k * wanted).clamp(0.0, self.u0)
+            (self.k * wanted).clamp(CREEP_DEG.min(self.u0), self.u0)
         } else {
             (self.k * (wanted - vbar - self.kd * (v0 - v2) / 2.0)).clamp(-3.0, self.um)
         })

@@ -715,6 +715,7 @@ impl Machine {
             Output::DoubleRegister(n) => vector(to, &[robot.outputs.double[usize::from(n)]]),
             Output::BitRegister(n) => to.push((robot.outputs.bits >> n & 1) as u8),
             Output::BitRegisters(n) => to.extend(((robot.outputs.bits >> n) as u32).to_be_bytes()),
+            Output::Zero(kind) => to.extend(std::iter::repeat_n(0, kind.bytes())),
             Output::Input(input) => match input {
                 Input::IntRegister(n) => to.extend(robot.inputs.int[usize::from(n)].to_be_bytes()),
                 Input::DoubleRegister(n) => vector(to, &[robot.inputs.double[usize::from(n)]]),
