@@ -14,6 +14,7 @@ use shared::exit;
 use shared::messages::Doubt;
 
 pub mod export;
+mod lerobot;
 
 /// Command-line arguments.
 #[derive(Debug, clap::Args)]

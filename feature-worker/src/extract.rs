@@ -30,6 +30,8 @@ const NEAR_PX: f32 = 3.0;
 /// have to find the edge to within a profile's reach.
 const DENSE_PX: f32 = 48.0;
 const STEP_MOST_PX: f32 = 4.0;
+/// Edges that are tried in pairs for the first line.
+const PICKS: usize = 13;
 /// Profiles across the line.
 const PROFILES: usize = 48;
 /// Samples of a profile on either side of its centre; the outer [`FLANK`] of them tell liquid and background.
@@ -39,6 +41,11 @@ const FLANK: usize = 3;
 const STREAM_RAYS: f32 = 0.8;
 /// More background than this before the first liquid ends a ray, px.
 const GAP_MOST_PX: f32 = 24.0;
+/// Clear water: detail counts up to this many grey levels, so that one glint does not outweigh a line.
+const DETAIL_MOST: f32 = 40.0;
+/// Clear water: least mean score of the path, in units of the noise, and least share of rays on which it is seen.
+const CLEAR_STRENGTH: f32 = 2.0;
+const CLEAR_SHARE: f32 = 0.6;
 /// Least share of liquid between lip and edge on a ray that counts as filled.
 const FILLED: f32 = 0.55;
 /// Mean grey level below which the region counts as dark.
@@ -156,6 +163,51 @@ impl Line {
     }
 }
 
+/// The two axes of Fig. 4 in the image, px.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Axes {
+    /// Where they cross: the lip.
+    pub lip_px: [f32; 2],
+    /// Unit vector along the glass's top edge, into the mouth.
+    pub x: [f32; 2],
+    /// Unit vector along the container's left side, beyond the rim.
+    pub y: [f32; 2],
+}
+
+impl Axes {
+    /// The axes of a checked configuration (not parallel).
+    pub fn new(image: &ImageConfig) -> Self {
+        let unit = |a: [f32; 4]| {
+            let (dx, dy) = (a[2] - a[0], a[3] - a[1]);
+            let length = dx.hypot(dy);
+            [dx / length, dy / length]
+        };
+        let (x, y) = (unit(image.x_axis_px), unit(image.y_axis_px));
+        let ([x0, y0, ..], [x1, y1, ..]) = (image.x_axis_px, image.y_axis_px);
+        let along = ((x1 - x0) * y[1] - (y1 - y0) * y[0]) / (x[0] * y[1] - x[1] * y[0]);
+        Self { lip_px: [x0 + along * x[0], y0 + along * x[1]], x, y }
+    }
+
+    /// Sine of the angle from x to y; its sign is the sense of turning.
+    fn sine(&self) -> f32 {
+        self.x[0] * self.y[1] - self.x[1] * self.y[0]
+    }
+
+    /// How far `point_px` lies between the axes: the smaller distance to either, px; negative outside.
+    pub fn between(&self, point_px: [f32; 2]) -> f32 {
+        let p = [point_px[0] - self.lip_px[0], point_px[1] - self.lip_px[1]];
+        let turn = self.sine().signum();
+        let from_x = (self.x[0] * p[1] - self.x[1] * p[0]) * turn;
+        let from_y = (p[0] * self.y[1] - p[1] * self.y[0]) * turn;
+        from_x.min(from_y)
+    }
+
+    /// The point at `distance_px` from the lip in the direction `along`.
+    fn at(&self, distance_px: f32, along: [f32; 2]) -> [f32; 2] {
+        [self.lip_px[0] + distance_px * along[0], self.lip_px[1] + distance_px * along[1]]
+    }
+}
+
 #[derive(Debug, Clone, Copy)]
 struct Ray {
     /// Unit vector.
@@ -170,11 +222,8 @@ pub struct Extractor {
     area_min_px2: f32,
     size_px: [u32; 2],
     region: Rect,
-    /// Lip, relative to the region.
-    lip: [f32; 2],
-    x_axis: [f32; 2],
-    y_axis: [f32; 2],
-    sine: f32,
+    /// Relative to the region.
+    axes: Axes,
     rays: Vec<Ray>,
     /// Distance of each sample from the lip, px, and the length that it stands for.
     radii_px: Vec<f32>,
@@ -187,9 +236,15 @@ pub struct Extractor {
     // Reused from frame to frame.
     converted: Mat,
     polar: Mat,
+    smooth: Mat,
     hsv: Mat,
     mask: Mat,
     mask_b: Mat,
+    grey: Mat,
+    detail: Mat,
+    path_score: Vec<f32>,
+    path_from: Vec<u16>,
+    sums: Vec<f32>,
     edges: Vec<[f32; 2]>,
     edge_weights: Vec<f32>,
     fine: Vec<[f32; 2]>,
@@ -236,25 +291,18 @@ impl Extractor {
     pub fn new(camera: &CameraConfig, image: &ImageConfig) -> Result<Self, ExtractError> {
         let [x, y, width, height] = image.region_px;
         let region = Rect::new(x as i32, y as i32, width as i32, height as i32);
-        let direction = |a: [f32; 4]| {
-            let (dx, dy) = (a[2] - a[0], a[3] - a[1]);
-            let length = dx.hypot(dy);
-            [dx / length, dy / length]
-        };
-        let (x_axis, y_axis) = (direction(image.x_axis_px), direction(image.y_axis_px));
-        let sine = x_axis[0] * y_axis[1] - x_axis[1] * y_axis[0];
-        let [x0, y0, ..] = image.x_axis_px;
-        let [x1, y1, ..] = image.y_axis_px;
-        let along = ((x1 - x0) * y_axis[1] - (y1 - y0) * y_axis[0]) / sine;
-        let crossing = [x0 + along * x_axis[0], y0 + along * x_axis[1]];
-        let fail = |what| ExtractError::Region { region: image.region_px, lip: crossing.map(|v| v.round() as i32), what };
-        let lip = [crossing[0] - x as f32, crossing[1] - y as f32];
+        let axes = Axes::new(image);
+        let fail = |what| ExtractError::Region { region: image.region_px, lip: axes.lip_px.map(|v| v.round() as i32), what };
+        // From here on everything is relative to the region.
+        let lip = [axes.lip_px[0] - x as f32, axes.lip_px[1] - y as f32];
+        let axes = Axes { lip_px: lip, ..axes };
+        let sine = axes.sine();
         let size = [width as f32, height as f32];
         if !(0..2).all(|k| lip[k].is_finite() && lip[k] >= 1.0 && lip[k] <= size[k] - 2.0) {
             return Err(fail("the axes cross outside it"));
         }
 
-        let cosine = x_axis[0] * y_axis[0] + x_axis[1] * y_axis[1];
+        let cosine = axes.x[0] * axes.y[0] + axes.x[1] * axes.y[1];
         let between = sine.abs().atan2(cosine);
         // Distance from the lip to the region's border in a direction.
         let room = |along: [f32; 2]| {
@@ -267,7 +315,7 @@ impl Extractor {
         };
         let directions = (0..RAYS).map(|i| {
             let (sin, cos) = ((i as f32 + 0.5) / RAYS as f32 * between * sine.signum()).sin_cos();
-            [x_axis[0] * cos - x_axis[1] * sin, x_axis[0] * sin + x_axis[1] * cos]
+            [axes.x[0] * cos - axes.x[1] * sin, axes.x[0] * sin + axes.x[1] * cos]
         });
         let longest = directions.clone().map(room).fold(0.0, f32::max);
         let (mut radii_px, mut steps_px) = (Vec::new(), Vec::new());
@@ -305,10 +353,7 @@ impl Extractor {
             area_min_px2: image.area_min_px2,
             size_px: [camera.width_px, camera.height_px],
             region,
-            lip,
-            x_axis,
-            y_axis,
-            sine: sine.abs(),
+            axes,
             rays,
             radii_px,
             steps_px,
@@ -319,9 +364,15 @@ impl Extractor {
             wraps: h0 > h1,
             converted: Mat::default(),
             polar: Mat::default(),
+            smooth: Mat::default(),
             hsv: Mat::default(),
             mask: Mat::default(),
             mask_b: Mat::default(),
+            grey: Mat::default(),
+            detail: Mat::default(),
+            path_score: Vec::new(),
+            path_from: Vec::new(),
+            sums: Vec::new(),
             edges: Vec::with_capacity(RAYS),
             edge_weights: Vec::with_capacity(RAYS),
             fine: Vec::with_capacity(PROFILES),
@@ -331,6 +382,22 @@ impl Extractor {
             last_hash: None,
             stages: Stages::default(),
         })
+    }
+
+    /// The axes in the image, px.
+    pub fn axes(&self) -> Axes {
+        Axes { lip_px: [self.axes.lip_px[0] + self.region.x as f32, self.axes.lip_px[1] + self.region.y as f32], ..self.axes }
+    }
+
+    /// The region in the image, px.
+    pub fn region(&self) -> Rect {
+        self.region
+    }
+
+    /// The coarse outer edge of the last measurement on each ray with liquid, in image coordinates, px: with the lip, the
+    /// outline of the mask.
+    pub fn outline_px(&self) -> impl Iterator<Item = [f32; 2]> + '_ {
+        self.edges.iter().map(|p| [p[0] + self.region.x as f32, p[1] + self.region.y as f32])
     }
 
     /// Time spent in the stages of the last measurement.
@@ -396,11 +463,18 @@ impl Extractor {
         let checked = Instant::now();
         let (result, segmented) = match unusable {
             Some(doubt) => (Measurement::nothing(0.0, doubt), checked),
-            None => {
-                self.segment_colour()?;
-                let segmented = Instant::now();
-                (self.find_triangle(colours)?, segmented)
-            }
+            None => match self.method {
+                LiquidMethod::Colour => {
+                    self.segment_colour()?;
+                    let segmented = Instant::now();
+                    (self.find_triangle(colours)?, segmented)
+                }
+                LiquidMethod::Clear => {
+                    self.find_detail()?;
+                    let segmented = Instant::now();
+                    (self.follow_edge(colours)?, segmented)
+                }
+            },
         };
         let done = Instant::now();
         self.converted = converted;
@@ -415,8 +489,11 @@ impl Extractor {
     }
 
     fn resample(&mut self, region: &impl core::ToInputArray) -> Result<(), ExtractError> {
-        let (linear, border) = (imgproc::INTER_NEAREST, core::BORDER_REPLICATE);
-        imgproc::remap(region, &mut self.polar, &self.map_a, &self.map_b, linear, border, Scalar::default())?;
+        let (nearest, border) = (imgproc::INTER_NEAREST, core::BORDER_REPLICATE);
+        imgproc::remap(region, &mut self.polar, &self.map_a, &self.map_b, nearest, border, Scalar::default())?;
+        if self.method == LiquidMethod::Clear {
+            imgproc::cvt_color_def(region, &mut self.grey, imgproc::COLOR_BGR2GRAY)?;
+        }
         Ok(())
     }
 
@@ -450,7 +527,10 @@ impl Extractor {
 
     /// Liquid by its colour range, into `self.mask`.
     fn segment_colour(&mut self) -> Result<(), ExtractError> {
-        imgproc::cvt_color_def(&self.polar, &mut self.hsv, imgproc::COLOR_BGR2HSV)?;
+        // Neighbouring samples together: a third of the noise, for a tenth of what smoothing the region would cost.
+        let size = core::Size::new(3, 3);
+        imgproc::blur(&self.polar, &mut self.smooth, size, core::Point::new(-1, -1), core::BORDER_REPLICATE)?;
+        imgproc::cvt_color_def(&self.smooth, &mut self.hsv, imgproc::COLOR_BGR2HSV)?;
         if self.wraps {
             // Red lies on both sides of hue 0.
             let (mut low, mut high) = (self.low, self.high);
@@ -464,6 +544,95 @@ impl Extractor {
             core::in_range(&self.hsv, &self.low, &self.high, &mut self.mask)?;
         }
         Ok(())
+    }
+
+    /// Clear water: fine detail of the region on the rays, into `self.mask`. Water's edge is a fine line, dark or bright
+    /// depending on what it bends into sight; what stands behind is out of focus and has little detail of that size.
+    fn find_detail(&mut self) -> Result<(), ExtractError> {
+        let (size, wide) = (core::Size::new(3, 3), core::Size::new(9, 9));
+        let (anchor, border) = (core::Point::new(-1, -1), core::BORDER_REPLICATE);
+        imgproc::blur(&self.grey, &mut self.smooth, size, anchor, border)?;
+        imgproc::blur(&self.smooth, &mut self.hsv, wide, anchor, border)?;
+        core::absdiff(&self.smooth, &self.hsv, &mut self.mask_b)?;
+        imgproc::dilate(&self.mask_b, &mut self.detail, &core::no_array(), anchor, 1, border, Scalar::all(0.0))?;
+        imgproc::remap(&self.detail, &mut self.mask, &self.map_a, &self.map_b, imgproc::INTER_NEAREST, border, Scalar::default())?;
+        Ok(())
+    }
+
+    /// Clear water, step 1: the path over all rays, from axis to axis, along which there is most detail on it, some inside and
+    /// little outside (dynamic programming over the rays; no OpenCV call does this).
+    fn follow_edge(&mut self, colours: Colours) -> Result<Measurement, ExtractError> {
+        self.edges.clear();
+        let samples = self.radii_px.len();
+        // Noise: the median detail of everything between the axes.
+        let mut histogram = [0u32; 256];
+        let mut total = 0u32;
+        for (i, ray) in self.rays.iter().enumerate() {
+            for value in &self.mask.at_row::<u8>(i as i32)?[..ray.samples] {
+                histogram[usize::from(*value)] += 1;
+                total += 1;
+            }
+        }
+        let mut below = 0;
+        let noise = (0..256).find(|v| {
+            below += histogram[*v];
+            below * 2 >= total
+        });
+        let noise = noise.unwrap_or(0) as f32 + 1.0;
+
+        self.path_score.clear();
+        self.path_score.resize(RAYS * samples, f32::MIN);
+        self.path_from.clear();
+        self.path_from.resize(RAYS * samples, 0);
+        for (i, ray) in self.rays.iter().enumerate() {
+            let row = &self.mask.at_row::<u8>(i as i32)?[..ray.samples];
+            self.sums.clear();
+            self.sums.push(0.0);
+            let mut sum = 0.0;
+            for value in row {
+                sum += f32::from(*value).min(DETAIL_MOST);
+                self.sums.push(sum);
+            }
+            let mean = |from: usize, to: usize| (self.sums[to] - self.sums[from]) / (to - from).max(1) as f32;
+            for r in 3..ray.samples.saturating_sub(3) {
+                let here = f32::from(row[r]).min(DETAIL_MOST);
+                let (inside, outside) = (mean(r.saturating_sub(14), r - 2), mean((r + 3).min(ray.samples), (r + 15).min(ray.samples)));
+                let score = here + 0.7 * (inside - outside) - 1.5 * noise;
+                let (mut best, mut from) = (0.0, r);
+                if i > 0 {
+                    best = f32::MIN;
+                    for q in r.saturating_sub(3)..=(r + 3).min(samples - 1) {
+                        let before = self.path_score[(i - 1) * samples + q] - 0.6 * (q as f32 - r as f32).abs();
+                        if before > best {
+                            (best, from) = (before, q);
+                        }
+                    }
+                }
+                self.path_score[i * samples + r] = if best == f32::MIN { f32::MIN } else { best + score };
+                self.path_from[i * samples + r] = from as u16;
+            }
+        }
+        let last = &self.path_score[(RAYS - 1) * samples..];
+        let Some(end) = (0..samples).max_by(|a, b| last[*a].total_cmp(&last[*b])) else {
+            return Ok(Measurement::nothing(0.0, Doubt::EdgeNotFound));
+        };
+        let strength = last[end] / RAYS as f32 / noise;
+        let mut r = end;
+        let mut supported = 0;
+        for i in (0..RAYS).rev() {
+            let row = self.mask.at_row::<u8>(i as i32)?;
+            supported += usize::from(f32::from(row[r]) > 2.5 * noise + 1.0);
+            let r_px = self.radii_px[r];
+            self.edges.push(self.axes.at(r_px, self.rays[i].along));
+            r = usize::from(self.path_from[i * samples + r]);
+        }
+        self.edges.reverse();
+        let share = supported as f32 / RAYS as f32;
+        if strength < CLEAR_STRENGTH || share < CLEAR_SHARE {
+            self.edges.clear();
+            return Ok(Measurement::nothing((1.0 - share).clamp(0.0, 1.0), Doubt::None));
+        }
+        self.line_through_edges(share, 0, colours)
     }
 
     fn find_triangle(&mut self, colours: Colours) -> Result<Measurement, ExtractError> {
@@ -489,10 +658,14 @@ impl Extractor {
                 filled += 1;
                 liquid_px += r_px;
                 cut_off += usize::from(r + 1 >= ray.samples);
-                self.edges.push([self.lip[0] + r_px * ray.along[0], self.lip[1] + r_px * ray.along[1]]);
+                self.edges.push(self.axes.at(r_px, ray.along));
             }
         }
         let share = filled as f32 / RAYS as f32;
+        if cut_off as f32 > 0.9 * RAYS as f32 {
+            // Everything looks like liquid: the colour does not tell them apart in this light.
+            return Ok(Measurement::nothing(0.0, Doubt::EdgeNotFound));
+        }
         if share < STREAM_RAYS {
             // A good half of the wedge full of liquid is no drop: something hides the stream.
             let mean_px = liquid_px / filled.max(1) as f32;
@@ -502,39 +675,51 @@ impl Extractor {
             return Ok(Measurement::nothing((1.0 - share).clamp(0.0, 1.0), Doubt::None));
         }
 
-        // 2. A first line: the fixed pair of edges with most others near its line, then least squares over those. Weights
-        // are distances between neighbours, so that every part of the edge counts by its length.
+        self.line_through_edges(share, cut_off, colours)
+    }
+
+    /// Steps 2 to 4 of the module's text, from `self.edges`. `share`: of rays with an edge; `cut_off`: rays whose liquid
+    /// reaches the region's border.
+    fn line_through_edges(&mut self, share: f32, cut_off: usize, colours: Colours) -> Result<Measurement, ExtractError> {
+        // 2. A first line: the pair of edges with most others near its line, then least squares over those. Weights are
+        // distances between neighbours, so that every part of the edge counts by its length; one that is far from both
+        // neighbours is alone.
         let count = self.edges.len();
+        let apart = |a: [f32; 2], b: [f32; 2]| (a[0] - b[0]).hypot(a[1] - b[1]);
         self.edge_weights.clear();
+        self.scratch.clear();
         for i in 0..count {
-            let (a, b) = (self.edges[i.saturating_sub(1)], self.edges[(i + 1).min(count - 1)]);
-            self.edge_weights.push((a[0] - b[0]).hypot(a[1] - b[1]).min(20.0) + 0.05);
+            let here = self.edges[i];
+            let before = if i > 0 { apart(here, self.edges[i - 1]) } else { f32::MAX };
+            let after = if i + 1 < count { apart(here, self.edges[i + 1]) } else { f32::MAX };
+            self.edge_weights.push(before.min(after).min(20.0) + 0.05);
+            self.scratch.push(apart(here, self.axes.lip_px));
         }
-        let mut best: Option<(f32, Line, f32)> = None;
-        for i in 0..24 {
-            let a = self.edges[i * (count / 2) / 24];
-            let b = self.edges[(i * (count / 2) / 24 + count / 2).min(count - 1)];
-            let (dx, dy) = (b[0] - a[0], b[1] - a[1]);
-            let length = dx.hypot(dy);
-            if length < 1.0 {
-                continue;
-            }
-            let normal = [-dy / length, dx / length];
-            let line = Line { normal, distance: normal[0] * a[0] + normal[1] * a[1] };
-            let near = (0.12 * length).max(2.0);
-            let support: f32 =
-                self.edges.iter().zip(&self.edge_weights).filter(|(p, _)| line.offset(**p).abs() < near).map(|(_, w)| w).sum();
-            if best.is_none_or(|(s, ..)| support > s) {
-                best = Some((support, line, near));
+        let near = (0.12 * median(&mut self.scratch)).max(1.5);
+        let mut best: Option<(f32, Line)> = None;
+        for i in 0..PICKS {
+            for j in i + PICKS / 4..PICKS {
+                let (a, b) = (self.edges[i * (count - 1) / (PICKS - 1)], self.edges[j * (count - 1) / (PICKS - 1)]);
+                let length = apart(a, b);
+                if length < 1.0 {
+                    continue;
+                }
+                let normal = [-(b[1] - a[1]) / length, (b[0] - a[0]) / length];
+                let line = Line { normal, distance: normal[0] * a[0] + normal[1] * a[1] };
+                let support: f32 =
+                    self.edges.iter().zip(&self.edge_weights).filter(|(p, _)| line.offset(**p).abs() < near).map(|(_, w)| w).sum();
+                if best.is_none_or(|(s, ..)| support > s) {
+                    best = Some((support, line));
+                }
             }
         }
-        let Some((support, line, near)) = best else { return Ok(Measurement::nothing(0.0, Doubt::EdgeNotFound)) };
+        let Some((support, line)) = best else { return Ok(Measurement::nothing(0.0, Doubt::EdgeNotFound)) };
         let inliers = support / self.edge_weights.iter().sum::<f32>();
         let points = self.edges.iter().copied().zip(self.edge_weights.iter().copied());
         let Some(line) = Line::fit(points.filter(|(p, _)| line.offset(*p).abs() < near)) else {
             return Ok(Measurement::nothing(0.0, Doubt::EdgeNotFound));
         };
-        let (a, b) = (line.cut(self.lip, self.x_axis), line.cut(self.lip, self.y_axis));
+        let (a, b) = (line.cut(self.axes.lip_px, self.axes.x), line.cut(self.axes.lip_px, self.axes.y));
         let longest = 2.0 * (self.region.width + self.region.height) as f32;
         if !(a > 1.0 && b > 1.0 && a < longest && b < longest) || inliers < 0.6 {
             return Ok(Measurement::nothing(0.0, Doubt::EdgeNotFound));
@@ -542,17 +727,19 @@ impl Extractor {
 
         // 3. Profiles across it.
         let (line, contrast, width, used) = self.refine(line, a, b, colours);
-        let (a, b) = (line.cut(self.lip, self.x_axis), line.cut(self.lip, self.y_axis));
+        let (a, b) = (line.cut(self.axes.lip_px, self.axes.x), line.cut(self.axes.lip_px, self.axes.y));
         if !(a > 0.0 && b > 0.0 && a < longest && b < longest) {
             return Ok(Measurement::nothing(0.0, Doubt::EdgeNotFound));
         }
-        let area_px2 = 0.5 * a * b * self.sine;
+        let area_px2 = 0.5 * a * b * self.axes.sine().abs();
         if area_px2 < self.area_min_px2 {
             return Ok(Measurement::nothing(share, Doubt::None));
         }
-        let (region_x, region_y) = (self.region.x as f32, self.region.y as f32);
-        let corner = |r: f32, axis: [f32; 2]| [region_x + self.lip[0] + r * axis[0], region_y + self.lip[1] + r * axis[1]];
-        let ([x0, y0], [x1, y1], [x2, y2]) = (corner(0.0, self.x_axis), corner(a, self.x_axis), corner(b, self.y_axis));
+        let corner = |r: f32, axis: [f32; 2]| {
+            let p = self.axes.at(r, axis);
+            [p[0] + self.region.x as f32, p[1] + self.region.y as f32]
+        };
+        let ([x0, y0], [x1, y1], [x2, y2]) = (corner(0.0, self.axes.x), corner(a, self.axes.x), corner(b, self.axes.y));
         let doubt = if cut_off as f32 > 0.06 * RAYS as f32 {
             Doubt::LeavesRegion
         } else if width > BLURRED_PX {
@@ -565,27 +752,18 @@ impl Extractor {
         Ok(Measurement { area_px2, confidence, doubt, triangle_px: [x0, y0, x1, y1, x2, y2] })
     }
 
-    /// How far `point` (in the region) lies between the axes: the smaller distance to either, px; negative outside.
-    fn between_axes(&self, point: [f32; 2]) -> f32 {
-        let p = [point[0] - self.lip[0], point[1] - self.lip[1]];
-        let turn = (self.x_axis[0] * self.y_axis[1] - self.x_axis[1] * self.y_axis[0]).signum();
-        let from_x = (self.x_axis[0] * p[1] - self.x_axis[1] * p[0]) * turn;
-        let from_y = (p[0] * self.y_axis[1] - p[1] * self.y_axis[0]) * turn;
-        from_x.min(from_y)
-    }
-
     /// Sub-pixel edge points on normals of `line` between the axes, and a Huber line through them. Returns the line, the
     /// median contrast in grey levels, the median edge width in px and the share of profiles that showed an edge.
     fn refine(&mut self, line: Line, a: f32, b: f32, colours: Colours) -> (Line, f32, f32, f32) {
-        let at = |r: f32, axis: [f32; 2]| [self.lip[0] + r * axis[0], self.lip[1] + r * axis[1]];
-        let (from, to) = (at(a, self.x_axis), at(b, self.y_axis));
+        let (from, to) = (self.axes.at(a, self.axes.x), self.axes.at(b, self.axes.y));
         let length = (to[0] - from[0]).hypot(to[1] - from[1]);
         let along = [(to[0] - from[0]) / length, (to[1] - from[1]) / length];
         // Outwards: away from the lip.
-        let outwards = if line.offset(self.lip) < 0.0 { 1.0 } else { -1.0 };
+        let outwards = if line.offset(self.axes.lip_px) < 0.0 { 1.0 } else { -1.0 };
         let normal = [line.normal[0] * outwards, line.normal[1] * outwards];
         // A small triangle has short profiles, so that their inner ends stay in the liquid.
-        let spacing = (line.offset(self.lip).abs() / 18.0).clamp(0.4, 1.0);
+        let spacing = (line.offset(self.axes.lip_px).abs() / 18.0).clamp(0.4, 1.0);
+        let margin = (0.04 * line.offset(self.axes.lip_px).abs()).clamp(1.0, 1.5);
         self.fine.clear();
         self.fine_weights.clear();
         self.widths.clear();
@@ -624,6 +802,31 @@ impl Extractor {
             if !complete {
                 continue;
             }
+            if self.method == LiquidMethod::Clear {
+                // The outermost of the steep steps of brightness: there the water begins.
+                let grey = |j: usize| profile[j].iter().sum::<f32>() / 3.0;
+                let step = |j: usize| (grey(j + 1) - grey(j)).abs();
+                let steepest = (0..2 * REACH).map(step).fold(0.0, f32::max);
+                let Some(j) =
+                    (1..2 * REACH - 1).rev().find(|&j| step(j) >= 0.6 * steepest && step(j) >= step(j - 1) && step(j) >= step(j + 1))
+                else {
+                    continue;
+                };
+                if steepest < 4.0 {
+                    continue;
+                }
+                // The top of the parabola through the three steps.
+                let (left, middle, right) = (step(j - 1), step(j), step(j + 1));
+                let curvature = left - 2.0 * middle + right;
+                let shift = if curvature < -1e-3 { (0.5 * (left - right) / curvature).clamp(-0.5, 0.5) } else { 0.0 };
+                let d = (j as f32 + 0.5 + shift - REACH as f32) * spacing;
+                let point = [centre[0] + d * normal[0], centre[1] + d * normal[1]];
+                if self.axes.between(point) >= margin {
+                    self.fine.push(point);
+                    self.scratch.push(steepest);
+                }
+                continue;
+            }
             let mean =
                 |range: &[[f32; 3]]| -> [f32; 3] { std::array::from_fn(|c| range.iter().map(|v| v[c]).sum::<f32>() / range.len() as f32) };
             let inside = mean(&profile[..FLANK]);
@@ -648,8 +851,8 @@ impl Extractor {
             }
             let d = (half - REACH as f32) * spacing;
             let point = [centre[0] + d * normal[0], centre[1] + d * normal[1]];
-            // The outline bends inwards beyond the axes, so only what lies between them counts.
-            if self.between_axes(point) < 1.0 {
+            // The outline bends inwards beyond the axes, so only what lies between them counts; the rim's light spreads a little.
+            if self.axes.between(point) < margin {
                 continue;
             }
             self.fine.push(point);

@@ -401,6 +401,7 @@ fn a_killed_recorder_leaves_a_file_that_reads_and_says_so() {
     assert_eq!(episode.info.ended, "");
     assert!(episode.frames.len() > 10, "{} frames", episode.frames.len());
     assert_eq!(Images::open(&file).unwrap().filter(Result::is_ok).count() as u64, episode.info.images);
+    assert_eq!(episode.info.images as usize, episode.frames.len(), "the cut is between two frames");
 }
 
 /// Protects the operator from silence when the disk is full: the reason is reported, the worker lives, what fits reads.

@@ -212,10 +212,8 @@ pub struct Core {
     counters: Counters,
 }
 
-/// A decision before anything was decided.
-const NOTHING: Decision = Decision::NOTHING;
 /// Commands remembered, to know which one was in force when a picture was taken.
-const COMMANDS: usize = 16;
+const COMMANDS: usize = 32;
 
 /// The newest commands with their times, oldest first; alpha in between is interpolated, as the recorder does it.
 #[derive(Debug)]
@@ -247,7 +245,7 @@ impl Core {
             limiter: Limiter::new(settings.limits, period_s, 0.0),
             phase: Phase::NoRobot,
             run: None,
-            decision: NOTHING,
+            decision: Decision::NOTHING,
             newest: None,
             shutdown: false,
             last_tick_ns: 0,
@@ -342,7 +340,7 @@ impl Core {
                 }
                 let agent = self.agent.as_mut().ok_or(Refusal::NoWeights)?;
                 agent.start(goal_ml);
-                self.decision = Decision { d_ml: goal_ml, ..NOTHING };
+                self.decision = Decision { d_ml: goal_ml, ..Decision::NOTHING };
                 self.begin(episode, Some(goal_ml), None, Phase::Pouring, input);
                 Ok(())
             }
@@ -351,7 +349,7 @@ impl Core {
                 if !self.curve_fits(&curve) {
                     return Err(Refusal::Curve);
                 }
-                self.decision = NOTHING;
+                self.decision = Decision::NOTHING;
                 self.begin(episode, None, Some(curve), Phase::Recording, input);
                 Ok(())
             }
@@ -457,16 +455,16 @@ impl Core {
             area = measured.unwrap_or(f32::NAN);
             run.frames += lost + 1;
             let (Some(agent), Some(_)) = (&mut self.agent, run.goal_ml) else { continue };
-            let alpha_deg = self.limiter.alpha_deg();
-            for k in (1..=u64::from(lost)).rev() {
-                let at = self.commanded.at(feature.captured_at_ns.saturating_sub(k * self.settings.period_ns));
-                self.decision = agent.step(Frame { area_px2: None, alpha_deg: at, alpha_now_deg: alpha_deg });
+            let alpha_now_deg = self.limiter.alpha_deg();
+            for nth in 1..=lost {
+                let alpha_deg = self.commanded.at(between_ns(previous, feature, nth, lost));
+                self.decision = agent.step(Frame { area_px2: None, alpha_deg, alpha_now_deg });
             }
-            let at = self.commanded.at(feature.captured_at_ns);
-            self.decision = agent.step(Frame { area_px2: measured, alpha_deg: at, alpha_now_deg: alpha_deg });
+            let alpha_deg = self.commanded.at(feature.captured_at_ns);
+            self.decision = agent.step(Frame { area_px2: measured, alpha_deg, alpha_now_deg });
             let flowing = self.decision.flowing;
             run.quiet_frames = if flowing { 0 } else { run.quiet_frames + lost + 1 };
-            let at_largest_tilt = alpha_deg >= self.settings.limits.alpha_max_deg - 0.5;
+            let at_largest_tilt = alpha_now_deg >= self.settings.limits.alpha_max_deg - 0.5;
             run.empty_frames = if at_largest_tilt && !flowing { run.empty_frames + lost + 1 } else { 0 };
             if self.phase == Phase::Pouring && !self.decision.finished {
                 request += self.decision.dalpha_deg;
@@ -586,6 +584,12 @@ impl Core {
 /// alpha(t) of eq. (1), degrees.
 pub fn curve_alpha_deg(curve: &Curve, t_s: f32) -> f32 {
     curve.lambda_deg * (-curve.gamma_per_s2 * (t_s - curve.beta_s).powi(2)).exp()
+}
+
+/// When the `nth` of `lost` frames before `feature` was taken: they lie evenly after the previous one.
+fn between_ns(previous: Option<Feature>, feature: &Feature, nth: u32, lost: u32) -> u64 {
+    let from_ns = previous.map_or(feature.captured_at_ns, |p| p.captured_at_ns);
+    from_ns + feature.captured_at_ns.saturating_sub(from_ns) * u64::from(nth) / u64::from(lost + 1)
 }
 
 /// A run that was already ending keeps its first reason, unless that was no fault.

@@ -7,7 +7,7 @@ use shared::control::{Curve, EndReason, Outcome};
 use shared::estimate::Calibration;
 use shared::messages::{Doubt, Feature, LAYOUT_VERSION, Phase};
 use shared::policy::{InputScale, Mlp, action_table};
-use shared::weights::{Method, Origin, Weights};
+use shared::weights::{Estimator, Method, Origin, Weights};
 
 /// A policy that always gives the action `index`; 1 px^2 is 0.001 ml.
 fn always(index: usize) -> Box<Agent> {
@@ -19,6 +19,7 @@ fn always(index: usize) -> Box<Agent> {
         selection: Selection::Argmax,
         scale: InputScale::default(),
         calibration: Calibration { c: 0.001, q: 1.0, hold_above_px2: f32::INFINITY },
+        estimator: Estimator::Sum,
         rate_hz: 30.0,
         origin: Origin { method: Method::Handmade, actions: 21, episodes: 0, data_sha256: [0; 32] },
         seed: 1,

@@ -166,6 +166,7 @@ pub struct Renderer {
     cover: Mat,
     thickness: Mat,
     crossings: Vec<f64>,
+    sides: Vec<([f64; 2], [f64; 2])>,
     polygon: Vec<[f64; 2]>,
     noise: Vec<i8>,
     vignette: Vec<u16>,
@@ -251,7 +252,7 @@ impl Renderer {
         let side = f64::from(width).hypot(f64::from(height)) as i32 + 2;
         let board = paint_board(view.background, side, &mut random)?;
         let new = |kind, value: f64| Mat::new_rows_cols_with_default(height, width, kind, Scalar::all(value));
-        let (glass_factor, glass_light) = (new(CV_8UC1, 128.0)?, new(CV_8UC1, 0.0)?);
+        let (glass_factor, glass_light) = (new(CV_8UC3, 128.0)?, new(CV_8UC3, 0.0)?);
         let pixels = (width * height) as usize;
         // A sum of four bytes is near enough to a normal distribution (and has no outliers beyond 3.5 sigma).
         let noise = (0..pixels * 3 + 65_536)
@@ -265,6 +266,7 @@ impl Renderer {
                 let (x, y) = ((i % width as usize) as f64 / f64::from(width) - 0.5, (i / width as usize) as f64 / f64::from(height) - 0.5);
                 (256.0 * (1.0 - 0.45 * (x * x + y * y))) as u16
             })
+            .flat_map(|v| [v; 3])
             .collect();
         let mut renderer = Self {
             view: view.clone(),
@@ -279,6 +281,7 @@ impl Renderer {
             cover: new(CV_8UC1, 0.0)?,
             thickness: new(CV_8UC1, 0.0)?,
             crossings: Vec::with_capacity(16),
+            sides: Vec::with_capacity(64),
             polygon: Vec::with_capacity(512),
             noise,
             vignette,
@@ -469,12 +472,16 @@ impl Renderer {
         let (y0, y1) = (clamp(low(1).floor(), height), clamp(high(1).ceil() + 1.0, height));
         let mut row = [0f32; 4097];
         for y in y0..y1 {
-            row[x0..x1].fill(0.0);
+            let (top, bottom) = (y as f64 - 0.5, y as f64 + 0.5);
+            self.sides.clear();
+            let next = outline.iter().cycle().skip(1);
+            self.sides
+                .extend(outline.iter().zip(next).filter(|(a, b)| a[1].min(b[1]) <= bottom && a[1].max(b[1]) >= top).map(|(a, b)| (*a, *b)));
+            let (mut first_used, mut last_used) = (width, 0);
             for quarter in 0..4 {
-                let line = y as f64 - 0.5 + (f64::from(quarter) + 0.5) / 4.0;
+                let line = top + (f64::from(quarter) + 0.5) / 4.0;
                 self.crossings.clear();
-                for (i, a) in outline.iter().enumerate() {
-                    let b = outline[(i + 1) % outline.len()];
+                for (a, b) in &self.sides {
                     if (a[1] <= line) != (b[1] <= line) {
                         self.crossings.push(a[0] + (b[0] - a[0]) * (line - a[1]) / (b[1] - a[1]));
                     }
@@ -483,6 +490,7 @@ impl Renderer {
                 for span in self.crossings.chunks_exact(2) {
                     let (from, to) = ((span[0] + 0.5).clamp(0.0, width as f64), (span[1] + 0.5).clamp(0.0, width as f64));
                     let (first, last) = (from as usize, to as usize);
+                    (first_used, last_used) = (first_used.min(first), last_used.max(last + 1));
                     if first == last {
                         row[first] += (to - from) as f32;
                         continue;
@@ -492,9 +500,12 @@ impl Renderer {
                     row[last] += (to - last as f64) as f32;
                 }
             }
-            let pixels = self.cover.at_row_mut::<u8>(y as i32)?;
-            for x in x0..x1 {
-                pixels[x] = pixels[x].max((row[x] * (255.0 / 4.0)).min(255.0) as u8);
+            if first_used < last_used {
+                let pixels = &mut self.cover.at_row_mut::<u8>(y as i32)?[first_used..last_used.min(width)];
+                for (pixel, share) in pixels.iter_mut().zip(&row[first_used..]) {
+                    *pixel = (*pixel).max((share * (255.0 / 4.0)).min(255.0) as u8);
+                }
+                row[first_used..last_used].fill(0.0);
             }
         }
         Ok(Rect::new(x0 as i32, y0 as i32, x1.saturating_sub(x0) as i32, y1.saturating_sub(y0) as i32))
@@ -515,14 +526,16 @@ impl Renderer {
         )?;
         Mat::roi(&self.frame, area)?.copy_to(&mut self.behind)?;
         let (rows, columns) = (area.height as usize, area.width as usize);
+        // Continuous copies, indexed directly: this loop reads around each pixel, which no OpenCV call does.
+        let behind = self.behind.data_typed::<core::Vec3b>()?;
+        let thickness = self.thickness.data_bytes()?;
         let step = (around / 2).max(1) as usize;
         let [phase, _, glitter, _] = self.ripple;
         for y in 0..rows {
             let cover = &mut self.cover.at_row_mut::<u8>(area.y + y as i32)?[area.x as usize..area.x as usize + columns];
             let frame = &mut self.frame.at_row_mut::<core::Vec3b>(area.y + y as i32)?[area.x as usize..area.x as usize + columns];
-            let above = self.thickness.at_row::<u8>(y.saturating_sub(step) as i32)?;
-            let below = self.thickness.at_row::<u8>((y + step).min(rows - 1) as i32)?;
-            let here = self.thickness.at_row::<u8>(y as i32)?;
+            let row = |y: usize| &thickness[y * columns..(y + 1) * columns];
+            let (above, here, below) = (row(y.saturating_sub(step)), row(y), row((y + step).min(rows - 1)));
             for x in 0..columns {
                 if cover[x] == 0 {
                     continue;
@@ -539,15 +552,15 @@ impl Renderer {
                         let hidden = self.view.opacity as f32 * (0.8 + 0.2 * thick);
                         let light = 0.82 + 0.22 * thick + 0.45 * lamp;
                         let glint = if lamp > 0.62 { 90.0 * (lamp - 0.62) / 0.38 } else { 0.0 };
-                        let behind = self.behind.at_2d::<core::Vec3b>(y as i32, x as i32)?;
+                        let behind = &behind[y * columns + x];
                         std::array::from_fn(|c| f32::from(behind[c]) * (1.0 - hidden) + f32::from(colour[c]) * hidden * light + glint)
                     }
                     None => {
                         // A rounded body of water shows what lies to the side, upside down near its edge, and darkens there.
                         let bend = 14.0 + 3.0 * ((x as f32 * 0.11 + y as f32 * 0.07) - phase as f32).sin();
-                        let from_x = (x as f32 + bend * slope_x * 2.0).clamp(0.0, columns as f32 - 1.0) as i32;
-                        let from_y = (y as f32 + bend * slope_y * 2.0).clamp(0.0, rows as f32 - 1.0) as i32;
-                        let behind = self.behind.at_2d::<core::Vec3b>(from_y, from_x)?;
+                        let from_x = (x as f32 + bend * slope_x * 2.0).clamp(0.0, columns as f32 - 1.0) as usize;
+                        let from_y = (y as f32 + bend * slope_y * 2.0).clamp(0.0, rows as f32 - 1.0) as usize;
+                        let behind = &behind[from_y * columns + from_x];
                         let edge = (2.0 * (1.0 - thick)).clamp(0.0, 1.0);
                         let through = 0.94 - 0.5 * edge * edge;
                         let wander = (y as f32 * 0.05 + glitter as f32).sin() * 2.0;
@@ -691,15 +704,14 @@ impl Renderer {
         Ok(())
     }
 
+    // The two loops below touch every byte of every frame; wrapping arithmetic (which cannot wrap here) lets them vectorise
+    // although overflow checks are on.
+
     fn lay_glass(&mut self) -> Result<(), RenderError> {
-        for y in 0..self.frame.rows() {
-            let (factor, light) = (self.glass_factor.at_row::<u8>(y)?, self.glass_light.at_row::<u8>(y)?);
-            let frame = self.frame.at_row_mut::<core::Vec3b>(y)?;
-            for ((pixel, factor), light) in frame.iter_mut().zip(factor).zip(light) {
-                for c in 0..3 {
-                    pixel[c] = ((u16::from(pixel[c]) * u16::from(*factor)) / 128 + u16::from(*light)).min(255) as u8;
-                }
-            }
+        let (factors, lights) = (self.glass_factor.data_bytes()?, self.glass_light.data_bytes()?);
+        for ((pixel, factor), light) in self.frame.data_bytes_mut()?.iter_mut().zip(factors).zip(lights) {
+            let through = u16::from(*pixel).wrapping_mul(u16::from(*factor)) >> 7;
+            *pixel = through.wrapping_add(u16::from(*light)).min(255) as u8;
         }
         Ok(())
     }
@@ -707,15 +719,13 @@ impl Renderer {
     /// Light, vignette and noise of the sensor.
     fn expose(&mut self, out: &mut [u8]) -> Result<(), RenderError> {
         let offset: usize = self.random.random_range(0..65_536);
-        let gain = (self.view.light * (1.0 + self.exposure) * 64.0).clamp(0.0, 1000.0) as u32;
-        let noise = self.noise[offset..].chunks_exact(3);
-        let pixels = self.frame.data_bytes()?.chunks_exact(3);
-        for (((out, pixel), noise), vignette) in out.chunks_exact_mut(3).zip(pixels).zip(noise).zip(&self.vignette) {
-            let gain = gain * u32::from(*vignette);
-            for c in 0..3 {
-                let level = (u32::from(pixel[c]) * gain) >> 14;
-                out[c] = (level as i32 + i32::from(noise[c])).clamp(0, 255) as u8;
-            }
+        let gain = (self.view.light * (1.0 + self.exposure) * 64.0).clamp(0.0, 127.0) as u16;
+        let (pixels, noise) = (self.frame.data_bytes()?, &self.noise[offset..]);
+        for (((out, pixel), noise), vignette) in out.iter_mut().zip(pixels).zip(noise).zip(&self.vignette) {
+            // 128 is a factor of 1; at most 255, so that the product fits 16 bits.
+            let factor = (gain.wrapping_mul(*vignette) >> 7).min(255);
+            let level = u16::from(*pixel).wrapping_mul(factor) >> 7;
+            *out = (level as i16).wrapping_add(i16::from(*noise)).clamp(0, 255) as u8;
         }
         Ok(())
     }

@@ -3,7 +3,7 @@
 //! Main thread: takes faults from standard input, prints the controller's log; the controller has its own thread. Ends with
 //! Ctrl-C or SIGTERM, or after `--seconds`.
 
-use std::io::BufRead;
+use std::io::{BufRead, Write};
 use std::net::{IpAddr, Ipv4Addr};
 use std::process::ExitCode;
 use std::sync::Arc;
@@ -95,21 +95,25 @@ pub fn run(args: &Args) -> ExitCode {
                 Err(error) => eprintln!("error: {error}"),
             }
         }
-        controller.take_log().iter().for_each(|l| print(l, args.json));
+        if controller.take_log().iter().try_for_each(|l| print(l, args.json)).is_err() {
+            // Nobody reads any more.
+            return ExitCode::from(exit::INTERRUPTED);
+        }
         std::thread::sleep(Duration::from_millis(50));
     }
     ExitCode::from(exit::INTERRUPTED)
 }
 
-fn print(line: &LogLine, json: bool) {
+fn print(line: &LogLine, json: bool) -> std::io::Result<()> {
+    let mut out = std::io::stdout();
     let kind = match line.kind {
         LogKind::Text => "textmsg",
         LogKind::ProgramError => "program error",
         LogKind::Event => "event",
     };
     if json {
-        println!("{}", serde_json::json!({ "timestamp_s": line.timestamp_s, "kind": kind, "text": line.text }));
+        writeln!(out, "{}", serde_json::json!({ "timestamp_s": line.timestamp_s, "kind": kind, "text": line.text }))
     } else {
-        println!("{:10.3} {kind}: {}", line.timestamp_s, line.text);
+        writeln!(out, "{:10.3} {kind}: {}", line.timestamp_s, line.text)
     }
 }

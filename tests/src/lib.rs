@@ -13,7 +13,7 @@ use serde_json::Value;
 use shared::agent::Selection;
 use shared::estimate::Calibration;
 use shared::policy::{InputScale, Mlp, action_table};
-use shared::weights::{Method, Origin, Weights};
+use shared::weights::{Estimator, Method, Origin, Weights};
 
 static NEXT: AtomicU32 = AtomicU32::new(0);
 
@@ -27,6 +27,7 @@ pub fn steady_weights(action: usize) -> Weights {
         selection: Selection::Argmax,
         scale: InputScale::default(),
         calibration: Calibration { c: 0.0002, q: 1.0, hold_above_px2: f32::INFINITY },
+        estimator: Estimator::Sum,
         rate_hz: 30.0,
         origin: Origin { method: Method::Handmade, actions: 21, episodes: 0, data_sha256: [action as u8; 32] },
         seed: 1,

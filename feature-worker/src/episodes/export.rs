@@ -13,6 +13,8 @@ use serde_json::json;
 use shared::episode::{Episode, EpisodeError, Image, Images, TableError, write_table};
 use shared::exit;
 
+use super::lerobot;
+
 /// Command-line arguments.
 #[derive(Debug, clap::Args)]
 pub struct Args {
@@ -37,6 +39,7 @@ enum Format {
     Csv,
     Images,
     Video,
+    Lerobot,
 }
 
 /// Why an export failed; what was written before stays.
@@ -98,13 +101,19 @@ fn export(args: &Args, files: &[PathBuf]) -> Result<Vec<PathBuf>, ExportError> {
         write_table(&episodes, &pair[0], &pair[1])?;
         return Ok(pair.into());
     }
-    let bar = progress(episodes.iter().map(|e| e.info.images).sum());
+    let frames: usize = episodes.iter().map(|e| e.frames.len()).sum();
+    let bar = progress(frames as u64);
+    if args.format == Format::Lerobot {
+        lerobot::write(files, &episodes, &args.to, &bar)?;
+        bar.finish_and_clear();
+        return Ok(vec![args.to.clone()]);
+    }
     let mut written = Vec::new();
     for (file, episode) in files.iter().zip(&episodes) {
         let stem = file.file_stem().unwrap_or(file.as_os_str());
         let target = args.to.join(stem);
         written.push(match args.format {
-            Format::Csv => continue,
+            Format::Csv | Format::Lerobot => continue,
             Format::Images => images(file, &target, &bar)?,
             Format::Video => {
                 let target = target.with_extension("mp4");
@@ -146,11 +155,10 @@ fn images(file: &Path, target: &Path, bar: &ProgressBar) -> Result<PathBuf, Expo
     Ok(target.to_path_buf())
 }
 
-/// Frames a second: the median of the intervals.
+/// Frames a second; the lost ones count, because they are shown too.
 pub(crate) fn rate_hz(episode: &Episode) -> f64 {
-    let mut intervals: Vec<f64> = episode.frames.windows(2).map(|w| w[1].t_s - w[0].t_s).filter(|s| *s > 0.0).collect();
-    intervals.sort_by(f64::total_cmp);
-    intervals.get(intervals.len() / 2).map_or(30.0, |s| (1.0 / s).clamp(1.0, 240.0))
+    let rate_hz = (episode.frames.len().saturating_sub(1)) as f64 / episode.seconds();
+    if rate_hz.is_finite() { rate_hz.clamp(1.0, 240.0) } else { 30.0 }
 }
 
 /// Calls `take` once for each frame of the episode with its image, or with the one before where there is none; frames before

@@ -1,7 +1,7 @@
 //! Writes one episode's MCAP file, see [`crate::episode`]. Allocates; ordinary threads only.
 //!
-//! A chunk is built in memory and written whole at least every half second, so a recorder that is killed leaves a file that
-//! reads up to then. A new file never takes the name of one that is there.
+//! A chunk is built in memory and written whole at least every half second, always between two frames, so a recorder that is
+//! killed leaves a file that reads up to then. A new file never takes the name of one that is there.
 
 use std::collections::BTreeMap;
 use std::fs::{File, OpenOptions};
@@ -22,7 +22,7 @@ use crate::messages::{Doubt, Feature, Telemetry};
 /// A chunk is closed when it is this old, ns.
 const CHUNK_NS: u64 = 500_000_000;
 /// A chunk is closed when it is this large, bytes.
-const CHUNK_BYTES: u64 = 1 << 20;
+const CHUNK_BYTES: usize = 1 << 20;
 
 /// Why an episode cannot be written; what was written before is in the file.
 #[derive(Debug, thiserror::Error)]
@@ -95,6 +95,7 @@ pub struct EpisodeWriter {
     telemetry_channel: u16,
     sample_channel: u16,
     chunk_since_ns: u64,
+    chunk_bytes: usize,
 }
 
 impl EpisodeWriter {
@@ -104,7 +105,7 @@ impl EpisodeWriter {
         let fail = |e: mcap::McapError| file_error(&path, &e);
         let options = WriteOptions::new()
             .compression(None)
-            .chunk_size(Some(CHUNK_BYTES))
+            .chunk_size(None)
             .disable_seeking(true)
             .library(concat!("decant ", env!("CARGO_PKG_VERSION")));
         let mut writer = Writer::with_options(BufWriter::with_capacity(1 << 16, file), options).map_err(fail)?;
@@ -117,8 +118,16 @@ impl EpisodeWriter {
             *channel = writer.add_channel(schema, topic, "json", &none).map_err(fail)?;
         }
         let [feature_channel, telemetry_channel, sample_channel] = json;
-        let mut this =
-            Self { writer, path, image_channel, feature_channel, telemetry_channel, sample_channel, chunk_since_ns: start.started_at_ns };
+        let mut this = Self {
+            writer,
+            path,
+            image_channel,
+            feature_channel,
+            telemetry_channel,
+            sample_channel,
+            chunk_since_ns: start.started_at_ns,
+            chunk_bytes: 0,
+        };
         this.describe(start)?;
         Ok(this)
     }
@@ -187,7 +196,7 @@ impl EpisodeWriter {
             image: sample.image.is_some(),
         };
         self.json(self.sample_channel, feature.sequence, at_ns, &row)?;
-        if at_ns.saturating_sub(self.chunk_since_ns) >= CHUNK_NS {
+        if at_ns.saturating_sub(self.chunk_since_ns) >= CHUNK_NS || self.chunk_bytes >= CHUNK_BYTES {
             self.chunk_since_ns = at_ns;
             self.flush()?;
         }
@@ -206,12 +215,14 @@ impl EpisodeWriter {
 
     fn message(&mut self, channel_id: u16, sequence: u64, at_ns: u64, data: &[u8]) -> Result<(), WriteError> {
         // MCAP's own sequence field has 32 bits: the low ones, for readers that look for gaps.
+        self.chunk_bytes += data.len();
         let header = MessageHeader { channel_id, sequence: sequence as u32, log_time: at_ns, publish_time: at_ns };
         self.writer.write_to_known_channel(&header, data).map_err(|e| file_error(&self.path, &e))
     }
 
     /// Closes the chunk under way and hands it to the system.
     pub fn flush(&mut self) -> Result<(), WriteError> {
+        self.chunk_bytes = 0;
         self.writer.flush().map_err(|e| file_error(&self.path, &e))
     }
 
@@ -297,5 +308,13 @@ mod tests {
         let (_, path) = next_free(dir.path()).unwrap();
         assert!(path.ends_with("episode-0009.mcap"), "{}", path.display());
         assert_eq!(std::fs::read(dir.path().join("episode-0007.mcap")).unwrap(), b"mine");
+
+        let names: Vec<PathBuf> = std::thread::scope(|scope| {
+            let take = || (0..100).map(|_| next_free(dir.path()).unwrap().1).collect::<Vec<_>>();
+            let threads: Vec<_> = (0..4).map(|_| scope.spawn(take)).collect();
+            threads.into_iter().flat_map(|t| t.join().unwrap()).collect()
+        });
+        let distinct: std::collections::BTreeSet<&PathBuf> = names.iter().collect();
+        assert_eq!(distinct.len(), 400, "two recorders at once never get the same file");
     }
 }

@@ -20,7 +20,11 @@ pub fn answer(line: &str, machine: &mut Machine) -> Option<String> {
             failed()
         }
         "play" => if_done(machine.resume(), "Starting program", failed),
-        "stop" => if_done(machine.stop_program(), "Stopped", failed),
+        // The same with no program: ur_rtde ends its program itself and still wants to hear this.
+        "stop" => {
+            machine.stop_program();
+            "Stopped".to_owned()
+        }
         "pause" => if_done(machine.pause(), "Pausing program", failed),
         "power on" => if_done(machine.power_on(), "Powering on", failed),
         "power off" => {

@@ -507,7 +507,8 @@ impl Machine {
     /// Lets a paused program go on. False: none is paused, or the robot may not move.
     pub fn resume(&mut self) -> bool {
         let may = self.mode == RobotMode::Running && self.safety == SafetyMode::Normal;
-        if !may || self.runtime != RuntimeState::Paused || self.program.is_none() {
+        let paused = matches!(self.runtime, RuntimeState::Pausing | RuntimeState::Paused);
+        if !may || !paused || self.program.is_none() {
             return false;
         }
         self.event(format!("program {} resumed", self.program_name));
@@ -714,6 +715,7 @@ impl Machine {
             Output::DoubleRegister(n) => vector(to, &[robot.outputs.double[usize::from(n)]]),
             Output::BitRegister(n) => to.push((robot.outputs.bits >> n & 1) as u8),
             Output::BitRegisters(n) => to.extend(((robot.outputs.bits >> n) as u32).to_be_bytes()),
+            Output::Zero(kind) => to.extend(std::iter::repeat_n(0, kind.bytes())),
             Output::Input(input) => match input {
                 Input::IntRegister(n) => to.extend(robot.inputs.int[usize::from(n)].to_be_bytes()),
                 Input::DoubleRegister(n) => vector(to, &[robot.inputs.double[usize::from(n)]]),

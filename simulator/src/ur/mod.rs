@@ -42,6 +42,9 @@ use server::{Request, Server, Shared, lock};
 /// Where faults are injected from another process.
 pub const OPERATOR_PORT: u16 = 29_995;
 
+/// SCHED_FIFO priority of the controller's thread where permitted.
+const PRIORITY: u8 = 65;
+
 /// How to start a controller.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Options {
@@ -143,7 +146,13 @@ impl Controller {
         let (requests, receiver) = mpsc::channel();
         let server = Server::new(options.address, machine, shared.clone(), receiver)?;
         let builder = std::thread::Builder::new().name("ur-controller".to_owned());
-        let thread = builder.spawn(move || server.run()).map_err(StartError::Thread)?;
+        let thread = builder
+            .spawn(move || {
+                // A real controller has a machine of its own; without the permission it shares this one as others do.
+                let _ = shared::os::prioritise(PRIORITY);
+                server.run();
+            })
+            .map_err(StartError::Thread)?;
         Ok(Handle { shared, requests, thread: Some(thread) })
     }
 }

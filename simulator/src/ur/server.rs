@@ -143,6 +143,7 @@ impl Server {
                     Request::Stop => return,
                     Request::Inject(fault, done) => {
                         self.inject(&fault);
+                        self.drop_closed();
                         // The one who asked may have given up waiting.
                         let _ = done.send(());
                     }
@@ -469,6 +470,7 @@ impl Server {
         self.clients.iter_mut().filter(|c| matches!(c.role, Role::Rtde { .. }))
     }
 
+    /// Clients that it ends are only marked: the caller drops them when it no longer holds anybody's place in the list.
     fn inject(&mut self, fault: &Fault) {
         match fault {
             Fault::Fin => {
@@ -526,7 +528,6 @@ impl Server {
                 self.machine.set_late_start(0.0);
             }
         }
-        self.drop_closed();
     }
 }
 

@@ -3,7 +3,8 @@
 //! Pure; source: section "Field names and associated types" of UR's RTDE guide. Used on the controller's thread.
 
 /// Controller generation.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, serde::Serialize, serde::Deserialize)]
+#[serde(rename_all = "kebab-case")]
 pub enum Series {
     /// CB3: 125 cycles a second.
     Cb3,
@@ -154,6 +155,8 @@ pub enum Output {
     BitRegisters(u8),
     /// An input read back.
     Input(Input),
+    /// Something that this arm has not (a tool, an elbow to watch): always 0.
+    Zero(Type),
 }
 
 /// A variable that clients write.
@@ -236,6 +239,11 @@ impl Output {
             "payload_inertia" if version.has(Some((3, 15)), Some((5, 11))) => PayloadInertia,
             "script_control_line" if version.has(Some((3, 14)), Some((5, 9))) => ScriptControlLine,
             "ft_raw_wrench" if version.has(None, Some((5, 9))) => FtRawWrench,
+            "analog_io_types" | "tool_mode" | "tool_analog_input_types" => Zero(Type::Uint32),
+            "tool_analog_input0" | "tool_analog_input1" | "tool_output_current" | "tool_temperature" => Zero(Type::Double),
+            "tool_output_voltage" => Zero(Type::Int32),
+            "tcp_offset" => Zero(Type::Vector6d),
+            "elbow_position" | "elbow_velocity" => Zero(Type::Vector3d),
             "output_bit_registers0_to_31" => BitRegisters(0),
             "output_bit_registers32_to_63" => BitRegisters(32),
             _ => {
@@ -274,6 +282,7 @@ impl Output {
             | DoubleRegister(_) => Type::Double,
             BitRegister(_) => Type::Bool,
             Input(input) => input.kind(),
+            Zero(kind) => kind,
             TargetQ
             | TargetQd
             | TargetQdd

@@ -247,15 +247,15 @@ fn arithmetic(operator: Operator, a: &Value, b: &Value) -> Result<Value, String>
         .ok_or_else(overflow),
         (Value::Int(_) | Value::Float(_), Value::Int(_) | Value::Float(_)) => {
             let (x, y) = (a.number()?, b.number()?);
-            let result = match operator {
+            // What is not a number stays so, as in any IEEE 754 arithmetic: a client may well send a NaN.
+            Ok(Value::Float(match operator {
                 Add => x + y,
                 Subtract => x - y,
                 Multiply => x * y,
                 _ if y == 0.0 => return Err("division by zero".to_owned()),
                 Divide => x / y,
                 _ => x % y,
-            };
-            if result.is_finite() { Ok(Value::Float(result)) } else { Err("result is not a finite number".to_owned()) }
+            }))
         }
         _ => Err(format!("{} and {} cannot be combined by {operator:?}", a.kind(), b.kind())),
     }
