@@ -76,9 +76,12 @@ pub enum Estimator {
 impl Estimator {
     fn check(&self) -> Result<(), String> {
         let Self::Fused { model, back } = self else { return Ok(()) };
-        let FlowModel { s, lk, p, k1, k2, tau, delay, eta, noise } = *model;
+        let FlowModel { radius_mm, height_mm, taper, s, lk, p, k1, k2, tau, delay, eta, noise } = *model;
         let FlowNoise { lambda, gamma, beta, delta, frame, v_min_ml } = noise;
         let ranges = [
+            ("radius", radius_mm, 1.0, 1000.0),
+            ("height", height_mm, 1.0, 5000.0),
+            ("taper", taper, 0.05, 20.0),
             ("flow coefficient", lk, -20.0, 20.0),
             ("flow exponent", p, 0.2, 5.0),
             ("k1", k1, -20.0, 20.0),
@@ -95,7 +98,7 @@ impl Estimator {
             ("rate back", back.rate_deg, 0.1, 10.0),
             ("change of the rate back", back.change_deg, 0.01, 100.0),
         ];
-        for (name, value, low, high) in ranges.into_iter().chain(s.map(|s| ("capacity a degree (log)", s, -10.0, 10.0))) {
+        for (name, value, low, high) in ranges.into_iter().chain(s.map(|s| ("shape of the vessel (log)", s, -10.0, 10.0))) {
             if !(low..=high).contains(&value) {
                 return Err(format!("estimator: {name} is {value}, allowed is {low} to {high}"));
             }
@@ -125,6 +128,8 @@ pub enum Method {
     Literal,
     /// Eq. (8) with positive weights only.
     Paper,
+    /// Behaviour cloning.
+    Cloning,
     /// Flow model, policy search in it, distilled into the network.
     Best,
     /// Made by hand, for tests and examples.

@@ -50,7 +50,7 @@ pub fn train(episodes: &[TrainingEpisode], options: &Options, progress: &dyn Pro
     let scale = InputScale::default();
     let table = actions_table(options.actions);
     progress.stage("teaching the network", (DISTIL.steps * (DISTIL.rounds + 1)) as u64);
-    let (net, loss) = distill::distil(&worlds, &law, &table, &scale, DISTIL, options.seed, |k, loss| {
+    let (net, loss) = distill::distil(&worlds, &law, &table, options.actions, &scale, DISTIL, options.seed, |k, loss| {
         progress.at(k as u64, &format!("loss {loss:.3}"));
     });
     let weights = Weights {

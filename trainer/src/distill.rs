@@ -7,7 +7,9 @@
 use rand::{RngExt, SeedableRng};
 use rand_pcg::Pcg64Mcg;
 use rayon::prelude::*;
-use shared::policy::{ACTIONS, InputScale, Mlp, argmax, nearest_action};
+use shared::policy::{ACTIONS, InputScale, Mlp, argmax};
+
+use crate::train::discretise;
 
 use crate::law::{Law, MAX_FRAMES, Worlds};
 use crate::net::{Adam, Net, Sample};
@@ -26,7 +28,15 @@ pub struct Size {
 }
 
 /// One pour, by `net` if there is one, else by the law; all frames labelled by the law.
-fn collect(worlds: &Worlds, law: &Law, net: Option<&Mlp>, table: &[f32; ACTIONS], scale: &InputScale, seed: u64) -> Vec<Sample> {
+fn collect(
+    worlds: &Worlds,
+    law: &Law,
+    net: Option<&Mlp>,
+    table: &[f32; ACTIONS],
+    actions: u8,
+    scale: &InputScale,
+    seed: u64,
+) -> Vec<Sample> {
     let mut pour = worlds.pour(seed);
     let mut samples = Vec::with_capacity(256);
     let mut d_ml = pour.goal_ml;
@@ -36,7 +46,7 @@ fn collect(worlds: &Worlds, law: &Law, net: Option<&Mlp>, table: &[f32; ACTIONS]
         let v = pour.v_ml.map(|v| v as f32);
         let x = scale.apply(v, d_ml as f32);
         // The frames of the way back teach what d <= 0 means, a few of them are enough.
-        samples.push(Sample { x, action: nearest_action(table, label.unwrap_or(-3.2) as f32) as u8, weight: 1.0 });
+        samples.push(Sample { x, action: discretise(table, actions, label.unwrap_or(-3.2)), weight: 1.0 });
         let mut asked = match net {
             Some(net) => Some(f64::from(table[argmax(&net.forward(&x))])),
             None => label,
@@ -61,6 +71,7 @@ pub fn distil(
     worlds: &Worlds,
     law: &Law,
     table: &[f32; ACTIONS],
+    actions: u8,
     scale: &InputScale,
     size: Size,
     seed: u64,
@@ -78,7 +89,7 @@ pub fn distil(
         let base = seed.wrapping_mul(7_368_787).wrapping_add((round * size.pours) as u64);
         let new: Vec<Vec<Sample>> = (0..size.pours as u64)
             .into_par_iter()
-            .map(|k| collect(worlds, law, mlp.as_ref(), table, scale, base.wrapping_add(k)))
+            .map(|k| collect(worlds, law, mlp.as_ref(), table, actions, scale, base.wrapping_add(k)))
             .collect();
         samples.extend(new.into_iter().flatten());
         let steps = if round + 1 == size.rounds { 2 * size.steps } else { size.steps };

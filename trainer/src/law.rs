@@ -18,7 +18,7 @@ use shared::estimate::flow::{DRIP, Flow, FlowModel, FlowState, HISTORY, Return};
 use shared::estimate::{Calibration, Hold};
 use shared::limits::{Limiter, Limits};
 
-use crate::fit::Fit;
+use crate::fit::{self, Fit};
 
 /// Frames after which a pour counts as never ending.
 pub const MAX_FRAMES: usize = 900;
@@ -134,17 +134,12 @@ impl Worlds {
         let z: Vec<f64> = (0..self.root.nrows()).map(|_| normal()).collect();
         let moved: Vec<f64> =
             (0..self.root.nrows()).map(|r| (0..=r).map(|c| self.root[(r, c)] * z[c]).sum::<f64>().clamp(-0.6, 0.6)).collect();
-        let mut model = self.nominal;
-        for (s, m) in model.s.iter_mut().zip(&moved) {
-            *s += m;
-        }
-        model.lk += moved[8] + 0.12 * normal();
-        model.p = (model.p + moved[9] + 0.03 * normal()).clamp(0.5, 3.5);
-        model.k1 += moved[10];
-        model.k2 += moved[11];
-        model.tau = (model.tau + moved[12] + 0.3 * normal()).max(0.0);
-        model.delay = (model.delay + moved[13] + 0.3 * normal()).clamp(0.0, 12.0);
-        model.eta = (model.eta + moved[14] + 0.02 * normal()).clamp(0.0, 0.4);
+        let mut model = fit::moved(&self.nominal, &moved);
+        model.lk += 0.12 * normal();
+        model.p = (model.p + 0.03 * normal()).clamp(0.5, 3.5);
+        model.tau = (model.tau + 0.3 * normal()).max(0.0);
+        model.delay = (model.delay + 0.3 * normal()).clamp(0.0, 12.0);
+        model.eta = (model.eta + 0.02 * normal()).clamp(0.0, 0.4);
         let gain = 1.0 + 0.015 * normal();
         let flow = Flow::new(&model);
         let onset = rng.random_range(self.onset_deg.0..self.onset_deg.1);

@@ -6,6 +6,7 @@ pub mod calibrate;
 pub mod check;
 pub mod data;
 pub mod distill;
+pub mod eq8;
 pub mod fit;
 pub mod inspect;
 pub mod law;

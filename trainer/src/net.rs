@@ -55,6 +55,15 @@ impl Net {
         Self::new([INPUTS, HIDDEN, HIDDEN, ACTIONS], rng)
     }
 
+    /// Makes all actions but these impossible, by biases that no training can reach.
+    pub fn keep_only(&mut self, actions: &[usize]) {
+        let m = self.sizes[3];
+        let from = self.p.len() - m;
+        for k in (0..m).filter(|k| !actions.contains(k)) {
+            self.p[from + k] = -1e4;
+        }
+    }
+
     /// Number of parameters.
     pub fn parameters(&self) -> usize {
         self.p.len()
@@ -128,12 +137,25 @@ impl Net {
         }
         let p_action = delta[action];
         let loss = -sample.weight * p_action.max(1e-30).ln();
-        // A clipped cross-entropy has no gradient where the probability is outside the clip.
-        let scale = if clip.is_some_and(|c| p_action < c || p_action > 1.0 - c) { 0.0 } else { sample.weight };
-        for d in delta.iter_mut() {
-            *d *= scale;
+        match clip {
+            None => {
+                // -dY/dlogits of eq. (8): sum(Y) p - Y = weight (p - I).
+                for d in delta.iter_mut() {
+                    *d *= sample.weight;
+                }
+                delta[action] -= sample.weight;
+            }
+            Some(clip) => {
+                // Keras clips p to [clip, 1 - clip] inside the logarithm: terms outside have no gradient.
+                let label = |k: usize, p: f32| (1.0 - sample.weight) * p + if k == action { sample.weight } else { 0.0 };
+                let inside = |p: f32| p > clip && p < 1.0 - clip;
+                let total: f32 = delta.iter().enumerate().filter(|(_, p)| inside(**p)).map(|(k, p)| label(k, *p)).sum();
+                for (k, d) in delta.iter_mut().enumerate() {
+                    let p = *d;
+                    *d = p * total - if inside(p) { label(k, p) } else { 0.0 };
+                }
+            }
         }
-        delta[action] -= scale;
         for l in (0..3).rev() {
             let (n, m) = (self.sizes[l], self.sizes[l + 1]);
             let w = &self.p[offsets[l]..offsets[l] + n * m];

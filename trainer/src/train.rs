@@ -8,11 +8,12 @@ use std::process::ExitCode;
 
 use indicatif::{ProgressBar, ProgressStyle};
 use shared::limits::Limits;
-use shared::policy::{ACTIONS, action_table};
+use shared::policy::{ACTIONS, action_table, nearest_action};
 use shared::weights::Weights;
 
 use crate::best;
 use crate::data::{self, DataError, TrainingEpisode};
+use crate::eq8;
 use crate::fit::Fit;
 use crate::law::Law;
 
@@ -30,6 +31,14 @@ pub enum Estimate {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum, serde::Serialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum MethodName {
+    /// The paper's section 3.3 as printed: eq. (5)-(8), rewards of either sign.
+    Literal,
+    /// The same, with the cross-entropy clipping probabilities to [1e-7, 1 - 1e-7], as Keras does silently.
+    LiteralClipped,
+    /// Eq. (8) repaired: positive weights only, kappa = 1, next-frame action, expected action at run time.
+    Paper,
+    /// Behaviour cloning, the largest output: eq. (8) with kappa = 1 and the same weight for every frame.
+    Cloning,
     /// Flow model fitted to the episodes, policy search in it, distilled into the network.
     Best,
 }
@@ -93,6 +102,15 @@ pub fn actions_table(actions: u8) -> [f32; ACTIONS] {
     }
 }
 
+/// The action of `table` that stands for `dalpha_deg`; of two actions the one with its sign (standing still counts as back).
+pub fn discretise(table: &[f32; ACTIONS], actions: u8, dalpha_deg: f64) -> u8 {
+    match (actions, dalpha_deg > 0.0) {
+        (2, true) => (ACTIONS - 1) as u8,
+        (2, false) => 0,
+        _ => nearest_action(table, dalpha_deg as f32) as u8,
+    }
+}
+
 /// Trains on usable episodes.
 pub fn train(episodes: &[TrainingEpisode], options: &Options, progress: &dyn Progress) -> Result<Trained, DataError> {
     if episodes.is_empty() {
@@ -100,6 +118,7 @@ pub fn train(episodes: &[TrainingEpisode], options: &Options, progress: &dyn Pro
     }
     Ok(match options.method {
         MethodName::Best => best::train(episodes, options, progress),
+        _ => eq8::train(episodes, options, progress),
     })
 }
 
@@ -122,9 +141,9 @@ pub struct Args {
     /// Number of actions: 2 (+-1 degree) or 21 (Fig. 5).
     #[arg(long, default_value_t = 21, value_parser = parse_actions)]
     actions: u8,
-    /// How d is estimated.
-    #[arg(long, value_enum, default_value = "fused")]
-    estimate: Estimate,
+    /// How d is estimated; fused with method best, sum with the others, if not given.
+    #[arg(long, value_enum)]
+    estimate: Option<Estimate>,
     /// Seed: the same seed and data give the same bytes.
     #[arg(long, default_value_t = 1)]
     seed: u64,
@@ -179,7 +198,14 @@ pub fn run(args: &Args) -> ExitCode {
     for (name, what) in &usable.left_out {
         eprintln!("left out: {name}: {what}");
     }
-    let options = Options { method: args.method, actions: args.actions, estimate: args.estimate, seed: args.seed, limits };
+    let estimate = args.estimate.unwrap_or(if args.method == MethodName::Best { Estimate::Fused } else { Estimate::Sum });
+    if estimate == Estimate::Fused && args.method != MethodName::Best {
+        return shared::exit::fail(
+            shared::exit::BAD_INPUT,
+            "--estimate fused goes with --method best: the others learn on the paper's own sum",
+        );
+    }
+    let options = Options { method: args.method, actions: args.actions, estimate, seed: args.seed, limits };
     let style = ProgressStyle::with_template("{prefix} [{wide_bar}] {pos}/{len} {msg} ({eta} left)")
         .unwrap_or_else(|_| ProgressStyle::default_bar());
     let bar = Bar(ProgressBar::new(1).with_style(style));

@@ -5,7 +5,7 @@
 //!
 //! ```text
 //! a    += clip((alpha(t - D) - a) / (1 + tau), +-3)                      the tilt that this frame shows
-//! w(a)  = exp(s(a)) sqrt(max(0.003, 1 - a/90))                           ml of capacity lost a degree, s linear between knots
+//! w(a)  = exp(s(a)) w_0(a; R, H, taper)                                  ml of capacity lost a degree, s linear between knots
 //! W(a)  = integral of w from 0 to a
 //! e     = max(0, W(a) - X)                                               liquid above the lip; W(a) = X where flow starts
 //! v     = min(e/2, exp(lk + lambda + k1 z + k2 z^2) (e / max(w, 1))^p)   over the lip, z = clip((a - 60)/30, -1.8, 1.5)
@@ -13,13 +13,20 @@
 //! F    += eta v;  drip = F/9;  F -= drip                                 film
 //! out   = (1 - eta) v + drip                                             leaves the lip
 //! ```
+//!
+//! w_0 is that of a round vessel with straight walls: the plane of the liquid turns about the lip, so
+//! `w_0 = integral of (distance from the lip) dA` over the free surface, a degree. What the vessel really is, s says.
 
 use serde::{Deserialize, Serialize};
 
-/// Angles at which s is given, degrees; constant below the first, w = e^-3 beyond the last.
-pub const KNOTS_DEG: [f64; 8] = [20.0, 35.0, 45.0, 55.0, 65.0, 75.0, 85.0, 90.0];
-/// w beyond the last knot, ml a degree.
-const W_BEYOND: f64 = 0.049_787_068_367_863_944;
+/// Angles at which s is given, degrees; constant outside.
+pub const KNOTS_DEG: [f64; KNOTS] = [20.0, 35.0, 45.0, 55.0, 65.0, 75.0, 85.0, 95.0, 108.0];
+/// Number of knots.
+pub const KNOTS: usize = 9;
+/// Least w_0, ml a degree: beyond the horizontal a straight cup is empty, other vessels are not.
+const W_MIN: f64 = 0.2;
+/// Nodes of the integral over the free surface.
+const NODES: usize = 64;
 /// Largest change of the tilt in a frame, degrees: no robot turns a full container faster.
 const TILT_STEP_DEG: f64 = 3.0;
 /// Share of the film that drips in a frame.
@@ -34,8 +41,14 @@ const STOP_FRAMES: usize = 90;
 /// Parameters of the flow model, and of the filter built on it.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct FlowModel {
-    /// s at [`KNOTS_DEG`]: logarithm of ml a degree.
-    pub s: [f64; 8],
+    /// Radius R of the straight-walled vessel at its lip, mm.
+    pub radius_mm: f64,
+    /// Its height H, mm.
+    pub height_mm: f64,
+    /// Radius at its bottom over R.
+    pub taper: f64,
+    /// s at [`KNOTS_DEG`]: logarithm of the real vessel's w over w_0.
+    pub s: [f64; KNOTS],
     /// Logarithm of the flow at an excess worth one degree, at 60 degrees, ml a frame.
     pub lk: f64,
     /// Exponent of the flow.
@@ -253,17 +266,36 @@ impl Return {
 impl FlowModel {
     /// w(a), ml a degree.
     pub fn w(&self, a_deg: f64) -> f64 {
-        let n = KNOTS_DEG.len();
-        if a_deg >= KNOTS_DEG[n - 1] {
-            return W_BEYOND;
-        }
         let k = KNOTS_DEG.partition_point(|knot| *knot <= a_deg);
         let s = if k == 0 {
             self.s[0]
+        } else if k == KNOTS {
+            self.s[KNOTS - 1]
         } else {
             let f = (a_deg - KNOTS_DEG[k - 1]) / (KNOTS_DEG[k] - KNOTS_DEG[k - 1]);
             self.s[k - 1] + f * (self.s[k] - self.s[k - 1])
         };
-        s.exp() * (1.0 - a_deg / 90.0).max(0.003).sqrt()
+        s.exp() * self.straight(a_deg).0.max(W_MIN)
+    }
+
+    /// (w_0 in ml a degree, free surface in mm^2) of the straight-walled vessel.
+    ///
+    /// At depth u below the lip the plane is at x = R - u cot(a); the section there is 2 sqrt(r^2 - x^2) wide.
+    pub fn straight(&self, a_deg: f64) -> (f64, f64) {
+        let (sin, cos) = a_deg.max(2.0).to_radians().sin_cos();
+        let cot = cos / sin;
+        let widest = self.radius_mm * self.taper.max(1.0);
+        let depth = if cot > 1e-6 { self.height_mm.min((self.radius_mm + widest) / cot) } else { self.height_mm };
+        let step = depth / NODES as f64;
+        let (mut lever, mut area) = (0.0, 0.0);
+        for k in 0..NODES {
+            let u = (k as f64 + 0.5) * step;
+            let x = self.radius_mm - u * cot;
+            let r = self.radius_mm * (1.0 + (self.taper - 1.0) * u / self.height_mm);
+            let width = 2.0 * (r * r - x * x).max(0.0).sqrt();
+            lever += width * u;
+            area += width;
+        }
+        (lever * step / (sin * sin) * std::f64::consts::PI / 180.0 / 1000.0, area * step / sin)
     }
 }
