@@ -1,1 +1,218 @@
-//! Frames from a device, a video, an image sequence or shared memory.
+//! Frames from a V4L2 device, a video file, an image sequence (all through OpenCV) or the cell's shared memory.
+//!
+//! Called from the extraction thread only; [`Source::next`] waits at most the given time (a device: as long as its driver
+//! does). Shared memory is read where it lies; OpenCV's captures reuse one matrix. Every failure is a [`SourceError`] that
+//! says what to do, also for a camera that is unplugged, a truncated file and frames that change their size.
+
+use std::time::Duration;
+
+use iceoryx2::port::subscriber::Subscriber;
+use iceoryx2::sample::Sample;
+use opencv::core::{CV_8UC1, CV_8UC3, Mat};
+use opencv::prelude::*;
+use opencv::videoio::{self, VideoCapture};
+use shared::config::{CameraConfig, CameraSource};
+use shared::ipc::{Cell, FrameListener, FrameTopic, IpcError};
+use shared::messages::{FrameHeader, LAYOUT_VERSION, PixelFormat};
+use shared::os;
+
+/// Why there are no frames.
+#[derive(Debug, thiserror::Error)]
+pub enum SourceError {
+    /// The device, video or first image cannot be opened.
+    #[error("camera.path = \"{path}\": {what}")]
+    Open {
+        /// `[camera] path`.
+        path: String,
+        /// What is wrong and what to do.
+        what: String,
+    },
+    /// The camera gave no picture any more.
+    #[error("camera \"{0}\" gives no more frames; is it unplugged? Plug it in and start again")]
+    Lost(String),
+    /// The cell's shared memory.
+    #[error(transparent)]
+    Ipc(#[from] IpcError),
+    /// The frame service works no longer.
+    #[error("shared memory of service 'frame': {0}; restart the camera driver and the feature worker")]
+    Broken(String),
+    /// OpenCV refused.
+    #[error("OpenCV: {0}")]
+    OpenCv(#[from] opencv::Error),
+}
+
+/// One frame, as the source holds it until the next call.
+#[derive(Debug, Clone, Copy)]
+pub struct Frame<'a> {
+    /// Its description.
+    pub header: FrameHeader,
+    /// Its pixels, row by row without padding.
+    pub pixels: &'a [u8],
+}
+
+/// What [`Source::next`] found.
+#[derive(Debug)]
+pub enum Next<'a> {
+    /// A frame.
+    Frame(Frame<'a>),
+    /// None came in time.
+    Nothing,
+    /// The video or the sequence is over.
+    End,
+}
+
+type Ipc = iceoryx2::service::ipc::Service;
+
+/// A stream of frames.
+pub enum Source {
+    /// Another process publishes them.
+    Shared(Box<Shared>),
+    /// OpenCV captures them.
+    Capture(Box<Capture>),
+}
+
+/// Frames in shared memory.
+pub struct Shared {
+    sample: Option<Sample<Ipc, [u8], FrameHeader>>,
+    subscriber: Subscriber<Ipc, [u8], FrameHeader>,
+    listener: FrameListener,
+    // Kept open, so that a driver that restarts finds the same service.
+    _topic: FrameTopic,
+}
+
+/// Frames through OpenCV.
+pub struct Capture {
+    capture: VideoCapture,
+    camera: CameraConfig,
+    image: Mat,
+    sequence: u64,
+    /// Files: when the next frame is due, if they are played at their own speed.
+    due_ns: Option<u64>,
+    period_ns: u64,
+}
+
+impl Source {
+    /// Opens the source of `camera`; shared memory is that of `cell`. A video or sequence is played at its own speed when
+    /// `real_time`, else as fast as it is read.
+    pub fn open(camera: &CameraConfig, cell: &Cell, real_time: bool) -> Result<Self, SourceError> {
+        if camera.source == CameraSource::SharedMemory {
+            let topic = cell.frames()?;
+            let subscriber = topic
+                .subscriber_builder()
+                .create()
+                .map_err(|e| SourceError::Broken(format!("{e:?} (at most 4 readers: is a second feature worker or view running?)")))?;
+            return Ok(Self::Shared(Box::new(Shared { sample: None, subscriber, listener: cell.frame_listener()?, _topic: topic })));
+        }
+        Ok(Self::Capture(Box::new(Capture::open(camera, real_time)?)))
+    }
+
+    /// The next frame; waits up to `timeout`.
+    pub fn next(&mut self, timeout: Duration) -> Result<Next<'_>, SourceError> {
+        match self {
+            Self::Shared(shared) => shared.next(timeout),
+            Self::Capture(capture) => capture.next(timeout),
+        }
+    }
+}
+
+impl Shared {
+    fn next(&mut self, timeout: Duration) -> Result<Next<'_>, SourceError> {
+        let broken = |e: &dyn std::fmt::Debug| SourceError::Broken(format!("{e:?}"));
+        self.sample = None;
+        self.sample = self.subscriber.receive().map_err(|e| broken(&e))?;
+        if self.sample.is_none() {
+            self.listener.timed_wait(|_| {}, timeout).map_err(|e| broken(&e))?;
+            self.sample = self.subscriber.receive().map_err(|e| broken(&e))?;
+        }
+        Ok(match &self.sample {
+            Some(sample) => Next::Frame(Frame { header: *sample.user_header(), pixels: sample.payload() }),
+            None => Next::Nothing,
+        })
+    }
+}
+
+impl Capture {
+    /// Opens a device, video or image sequence.
+    pub fn open(camera: &CameraConfig, real_time: bool) -> Result<Self, SourceError> {
+        let fail = |what: &str| SourceError::Open { path: camera.path.clone(), what: what.into() };
+        let device = camera.source == CameraSource::Device;
+        if camera.source != CameraSource::Images && !std::path::Path::new(&camera.path).exists() {
+            return Err(fail(if device { "no such device; see `ls /dev/v4l/by-id`" } else { "no such file" }));
+        }
+        let backend = match camera.source {
+            CameraSource::Device => videoio::CAP_V4L2,
+            CameraSource::Images => videoio::CAP_IMAGES,
+            _ => videoio::CAP_ANY,
+        };
+        let mut capture = VideoCapture::from_file(&camera.path, backend).map_err(|e| fail(&format!("cannot be opened: {}", e.message)))?;
+        if !capture.is_opened()? {
+            return Err(fail(match camera.source {
+                CameraSource::Device => "cannot be opened; does another program use it, and may this user read it (group 'video')?",
+                CameraSource::Images => "no first image; give a pattern such as frames/frame_%04d.png that starts at 0 or 1",
+                _ => "is no video that OpenCV can read, or it is truncated",
+            }));
+        }
+        if device {
+            for (property, value) in [
+                (videoio::CAP_PROP_FRAME_WIDTH, f64::from(camera.width_px)),
+                (videoio::CAP_PROP_FRAME_HEIGHT, f64::from(camera.height_px)),
+                (videoio::CAP_PROP_FPS, camera.fps),
+                // The newest frame, not the oldest.
+                (videoio::CAP_PROP_BUFFERSIZE, 2.0),
+            ] {
+                // A driver may refuse a property; what counts is the frame's size, which is checked.
+                let _ = capture.set(property, value)?;
+            }
+        }
+        let own_fps = capture.get(videoio::CAP_PROP_FPS)?;
+        let fps = if camera.source == CameraSource::Video && own_fps > 0.0 { own_fps } else { camera.fps };
+        let due_ns = (!device && real_time).then(os::now_ns);
+        Ok(Self { capture, camera: camera.clone(), image: Mat::default(), sequence: 0, due_ns, period_ns: (1e9 / fps) as u64 })
+    }
+
+    fn next(&mut self, timeout: Duration) -> Result<Next<'_>, SourceError> {
+        if let Some(due_ns) = self.due_ns {
+            let now_ns = os::now_ns();
+            let latest_ns = now_ns + timeout.as_nanos() as u64;
+            if due_ns > latest_ns {
+                os::sleep_until_ns(latest_ns);
+                return Ok(Next::Nothing);
+            }
+            os::sleep_until_ns(due_ns);
+            // A file that is read too slowly plays slower; it never bursts.
+            self.due_ns = Some(due_ns.max(now_ns.saturating_sub(self.period_ns)) + self.period_ns);
+        }
+        // A damaged picture in the middle is an error of the decoder; the end of a file is not.
+        let read = self.capture.read(&mut self.image).unwrap_or(false);
+        let captured_at_ns = os::now_ns();
+        if !read || self.image.empty() {
+            return match self.camera.source {
+                CameraSource::Device => Err(SourceError::Lost(self.camera.path.clone())),
+                _ if self.sequence == 0 => Err(SourceError::Open {
+                    path: self.camera.path.clone(),
+                    what: "holds no frame that can be decoded; is it truncated?".into(),
+                }),
+                _ => Ok(Next::End),
+            };
+        }
+        self.sequence += 1;
+        let format = match self.image.typ() {
+            CV_8UC3 => PixelFormat::Bgr8,
+            CV_8UC1 => PixelFormat::Mono8,
+            other => {
+                let what = format!("gives pixels of OpenCV type {other}; only 8-bit grey and colour are read");
+                return Err(SourceError::Open { path: self.camera.path.clone(), what });
+            }
+        };
+        let header = FrameHeader {
+            version: LAYOUT_VERSION,
+            format: format as u32,
+            width_px: self.image.cols() as u32,
+            height_px: self.image.rows() as u32,
+            sequence: self.sequence,
+            captured_at_ns,
+            published_at_ns: captured_at_ns,
+        };
+        Ok(Next::Frame(Frame { header, pixels: self.image.data_bytes()? }))
+    }
+}

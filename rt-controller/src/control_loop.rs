@@ -9,8 +9,12 @@ use std::sync::atomic::Ordering::Relaxed;
 use shared::messages::{Feature, Phase};
 use shared::os;
 
+use shared::control::EndReason;
+
 use crate::core::{Core, Input, MAX_FEATURES, Order, Robot, Settings};
-use crate::exchange::{Event, Exchange};
+use crate::exchange::{Event, Exchange, SessionEnd};
+use crate::journal::Tick;
+use crate::link::{Mode, Session, health};
 
 /// Receives features from shared memory.
 pub type Features = iceoryx2::port::subscriber::Subscriber<iceoryx2::service::ipc::Service, Feature, ()>;
@@ -26,11 +30,11 @@ pub struct Place {
 
 /// Runs until [`Order::Shutdown`] was obeyed and the container is upright.
 ///
-/// `say` gets what the operating system did not permit, before the loop starts.
-pub fn run(settings: Settings, place: Place, features: &Features, exchange: &Exchange, say: &dyn Fn(&str)) {
+/// `lost_ns` is how long the robot may be silent (`controller.lost_robot_ms`). `say` gets what the operating system did not permit, before the loop starts.
+pub fn run(settings: Settings, place: Place, lost_ns: u64, features: &Features, exchange: &Exchange, say: &dyn Fn(&str)) {
     let mut core = Box::new(Core::new(settings));
     let mut fresh: heapless::Vec<Feature, MAX_FEATURES> = heapless::Vec::new();
-    let mut session = None;
+    let mut session: Option<Box<Session>> = None;
     let period_ns = settings.period_ns;
     for line in os::become_realtime(place.core, place.priority) {
         say(&line);
@@ -56,10 +60,12 @@ pub fn run(settings: Settings, place: Place, features: &Features, exchange: &Exc
             }
             let _ = fresh.push(*sample);
         }
+        let mut taken = None;
         if core.may_exchange()
             && !exchange.old_agents.is_full()
-            && let Some(agent) = exchange.agents.pop()
+            && let Some((number, agent)) = exchange.agents.pop()
         {
+            taken = Some(number);
             exchange.agents_taken.fetch_add(1, Relaxed);
             if let Some(old) = core.exchange(agent) {
                 let _ = exchange.old_agents.push(old);
@@ -68,29 +74,25 @@ pub fn run(settings: Settings, place: Place, features: &Features, exchange: &Exc
         if session.is_none() {
             session = exchange.sessions.pop();
         }
-        let robot = session.as_mut().map_or(
-            Robot { hindrance: Some(shared::control::EndReason::RobotLost), alpha_deg: f32::NAN, at_ns: 0 },
-            |s| s.poll(woke_ns),
-        );
+        let (robot, mut end) = look(session.as_deref_mut(), woke_ns, lost_ns);
         let order = exchange.orders.pop();
         shutdown |= order == Some(Order::Shutdown);
 
         let output = core.step(&Input { now_ns: woke_ns, features: &fresh, robot, order });
-        let mut alive = true;
         if let (Some(session), Some(target_deg)) = (session.as_mut(), output.target_deg) {
-            alive = session.send(target_deg, woke_ns);
+            end = session.send(Mode::Stream, target_deg).err().map(SessionEnd::Lost).or(end);
             if let Some(newest) = fresh.last() {
                 exchange.timing.wake_to_written.record(os::now_ns().saturating_sub(woke_ns));
                 exchange.timing.feature_age.record(woke_ns.saturating_sub(newest.captured_at_ns));
                 exchange.timing.feature_wait.record(woke_ns.saturating_sub(newest.published_at_ns));
             }
         }
-        let lost = session.as_ref().is_some_and(|s| !alive || s.is_lost());
-        if lost
+        // A robot that may not move any more is never taken back as it is: it is handed over, and connected anew when it is well.
+        if let Some(end) = end
             && !exchange.old_sessions.is_full()
             && let Some(dead) = session.take()
         {
-            let _ = exchange.old_sessions.push(dead);
+            let _ = exchange.old_sessions.push((dead, end));
         }
 
         let tell = |event| {
@@ -104,7 +106,17 @@ pub fn run(settings: Settings, place: Place, features: &Features, exchange: &Exc
         if let Some(outcome) = output.ended {
             tell(Event::Ended(outcome));
         }
-        tell(Event::Tick(output.telemetry, core.counters()));
+        let telemetry = output.telemetry;
+        let tick = Tick {
+            now_ns: woke_ns,
+            features: fresh.clone(),
+            robot,
+            order,
+            agent: taken,
+            target_deg: output.target_deg,
+            d_ml: telemetry.d_ml,
+        };
+        tell(Event::Tick(tick, telemetry, core.counters()));
 
         exchange.loop_allocations.store(os::allocations() - allocations_before, Relaxed);
         let faults = os::page_faults();
@@ -120,6 +132,22 @@ pub fn run(settings: Settings, place: Place, features: &Features, exchange: &Exc
             exchange.skipped_ticks.fetch_add(1, Relaxed);
         }
     }
-    drop(session);
+    if let Some(mut session) = session {
+        // Upright already: this only ends the robot's program at once instead of after its patience.
+        let _ = session.send(Mode::Stop, 0.0);
+    }
     exchange.ended.store(true, Relaxed);
+}
+
+/// The robot as the core sees it, and why its session is over, if it is.
+fn look(session: Option<&mut Session>, now_ns: u64, lost_ns: u64) -> (Robot, Option<SessionEnd>) {
+    let Some(session) = session else {
+        return (Robot { hindrance: Some(EndReason::RobotLost), alpha_deg: f32::NAN, at_ns: 0 }, None);
+    };
+    let lost = session.poll(now_ns).err();
+    let state = session.state();
+    let unwell = health::check(state, now_ns, lost_ns).err();
+    let hindrance = if lost.is_some() { Some(unwell.unwrap_or(EndReason::RobotLost)) } else { unwell };
+    let end = lost.map(SessionEnd::Lost).or(unwell.map(SessionEnd::Unwell));
+    (Robot { hindrance, alpha_deg: state.alpha_deg, at_ns: state.received_at_ns }, end)
 }

@@ -11,15 +11,18 @@
 //!     +---- any phase, when the robot may not move
 //! ```
 
+use serde::{Deserialize, Serialize};
 use shared::agent::{Agent, Decision, Frame};
 use shared::control::{Curve, EndReason, Outcome};
 use shared::limits::{Clipped, Limiter, Limits};
 use shared::messages::{Doubt, Feature, LAYOUT_VERSION, Phase, Telemetry};
 
-/// Most features that one tick takes; more than a second's worth would be stale anyway.
-pub const MAX_FEATURES: usize = 32;
+/// Most features that one tick takes, the newest ones: the loop would have to be late by a quarter of a second for more.
+pub const MAX_FEATURES: usize = 8;
 /// A measured alpha within this of upright counts as upright, degrees.
 const UPRIGHT_DEG: f32 = 2.0;
+/// Most lost frames that are bridged at once: what is longer is stale.
+const MAX_BRIDGED: u64 = 30;
 /// Frames without flow after which the last drops are counted.
 const SETTLE_QUIET_FRAMES: u32 = 15;
 /// Longest wait for the last drops, s.
@@ -30,7 +33,7 @@ const STALE_TICK_PERIODS: u64 = 3;
 pub const PATIENCE_NS: u64 = 100_000_000;
 
 /// The part of the configuration that decisions depend on.
-#[derive(Debug, Clone, Copy, PartialEq)]
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct Settings {
     /// Period of a tick, ns.
     pub period_ns: u64,
@@ -62,7 +65,7 @@ impl Settings {
 }
 
 /// What an operator orders.
-#[derive(Debug, Clone, Copy, PartialEq)]
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub enum Order {
     /// d <- V_G (eq. 4).
     Pour {
@@ -123,7 +126,7 @@ impl std::fmt::Display for Refusal {
 }
 
 /// The robot as the core sees it.
-#[derive(Debug, Clone, Copy, PartialEq)]
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct Robot {
     /// Why it may not move; `None`: it may.
     pub hindrance: Option<EndReason>,
@@ -205,12 +208,32 @@ pub struct Core {
     newest: Option<Feature>,
     shutdown: bool,
     last_tick_ns: u64,
+    commanded: Commanded,
     counters: Counters,
 }
 
-/// A decision before anything was decided.
-const NOTHING: Decision =
-    Decision { action: 10, dalpha_deg: 0.0, v_ml: 0.0, d_ml: 0.0, poured_ml: 0.0, finished: false, flowing: false };
+/// Commands remembered, to know which one was in force when a picture was taken.
+const COMMANDS: usize = 32;
+
+/// The newest commands with their times, oldest first; alpha in between is interpolated, as the recorder does it.
+#[derive(Debug)]
+struct Commanded([(u64, f32); COMMANDS]);
+
+impl Commanded {
+    fn push(&mut self, at_ns: u64, alpha_deg: f32) {
+        self.0.copy_within(1.., 0);
+        self.0[COMMANDS - 1] = (at_ns, alpha_deg);
+    }
+
+    fn at(&self, t_ns: u64) -> f32 {
+        let later = self.0.partition_point(|(at, _)| *at <= t_ns);
+        match (later.checked_sub(1).map(|k| self.0[k]), self.0.get(later)) {
+            (Some((t0, a0)), Some(&(t1, a1))) => a0 + (a1 - a0) * ((t_ns - t0) as f32 / (t1 - t0).max(1) as f32),
+            (Some((_, alpha)), None) | (None, Some(&(_, alpha))) => alpha,
+            (None, None) => 0.0,
+        }
+    }
+}
 
 impl Core {
     /// A controller without robot and weights.
@@ -222,10 +245,11 @@ impl Core {
             limiter: Limiter::new(settings.limits, period_s, 0.0),
             phase: Phase::NoRobot,
             run: None,
-            decision: NOTHING,
+            decision: Decision::NOTHING,
             newest: None,
             shutdown: false,
             last_tick_ns: 0,
+            commanded: Commanded([(0, 0.0); COMMANDS]),
             counters: Counters::default(),
         }
     }
@@ -271,6 +295,7 @@ impl Core {
             ended = self.advance(input);
         }
         let target_deg = self.command(input, request);
+        self.commanded.push(input.now_ns, self.limiter.alpha_deg());
         Output { target_deg, ordered, ended, telemetry: self.telemetry(input, asked, area) }
     }
 
@@ -315,7 +340,7 @@ impl Core {
                 }
                 let agent = self.agent.as_mut().ok_or(Refusal::NoWeights)?;
                 agent.start(goal_ml);
-                self.decision = Decision { d_ml: goal_ml, ..NOTHING };
+                self.decision = Decision { d_ml: goal_ml, ..Decision::NOTHING };
                 self.begin(episode, Some(goal_ml), None, Phase::Pouring, input);
                 Ok(())
             }
@@ -324,7 +349,7 @@ impl Core {
                 if !self.curve_fits(&curve) {
                     return Err(Refusal::Curve);
                 }
-                self.decision = NOTHING;
+                self.decision = Decision::NOTHING;
                 self.begin(episode, None, Some(curve), Phase::Recording, input);
                 Ok(())
             }
@@ -421,7 +446,7 @@ impl Core {
             }
             // Frames between this one and the last: their liquid is bridged, but the moment to act on them has passed.
             let lost = match previous {
-                Some(p) if same_worker => (feature.sequence - p.sequence - 1).min(MAX_FEATURES as u64) as u32,
+                Some(p) if same_worker => (feature.sequence - p.sequence - 1).min(MAX_BRIDGED) as u32,
                 _ => 0,
             };
             self.counters.bridged_frames += u64::from(lost);
@@ -430,14 +455,16 @@ impl Core {
             area = measured.unwrap_or(f32::NAN);
             run.frames += lost + 1;
             let (Some(agent), Some(_)) = (&mut self.agent, run.goal_ml) else { continue };
-            let alpha_deg = self.limiter.alpha_deg();
-            for _ in 0..lost {
-                self.decision = agent.step(Frame { area_px2: None, alpha_deg });
+            let alpha_now_deg = self.limiter.alpha_deg();
+            for nth in 1..=lost {
+                let alpha_deg = self.commanded.at(between_ns(previous, feature, nth, lost));
+                self.decision = agent.step(Frame { area_px2: None, alpha_deg, alpha_now_deg });
             }
-            self.decision = agent.step(Frame { area_px2: measured, alpha_deg });
+            let alpha_deg = self.commanded.at(feature.captured_at_ns);
+            self.decision = agent.step(Frame { area_px2: measured, alpha_deg, alpha_now_deg });
             let flowing = self.decision.flowing;
             run.quiet_frames = if flowing { 0 } else { run.quiet_frames + lost + 1 };
-            let at_largest_tilt = alpha_deg >= self.settings.limits.alpha_max_deg - 0.5;
+            let at_largest_tilt = alpha_now_deg >= self.settings.limits.alpha_max_deg - 0.5;
             run.empty_frames = if at_largest_tilt && !flowing { run.empty_frames + lost + 1 } else { 0 };
             if self.phase == Phase::Pouring && !self.decision.finished {
                 request += self.decision.dalpha_deg;
@@ -557,6 +584,12 @@ impl Core {
 /// alpha(t) of eq. (1), degrees.
 pub fn curve_alpha_deg(curve: &Curve, t_s: f32) -> f32 {
     curve.lambda_deg * (-curve.gamma_per_s2 * (t_s - curve.beta_s).powi(2)).exp()
+}
+
+/// When the `nth` of `lost` frames before `feature` was taken: they lie evenly after the previous one.
+fn between_ns(previous: Option<Feature>, feature: &Feature, nth: u32, lost: u32) -> u64 {
+    let from_ns = previous.map_or(feature.captured_at_ns, |p| p.captured_at_ns);
+    from_ns + feature.captured_at_ns.saturating_sub(from_ns) * u64::from(nth) / u64::from(lost + 1)
 }
 
 /// A run that was already ending keeps its first reason, unless that was no fault.

@@ -7,22 +7,41 @@ use std::sync::atomic::{AtomicBool, AtomicU64};
 
 use crossbeam::queue::ArrayQueue;
 use shared::agent::Agent;
-use shared::control::Outcome;
+use shared::control::{EndReason, Outcome};
 use shared::messages::Telemetry;
 
 use crate::core::{Counters, Order, Refusal};
-use crate::link::Session;
+use crate::journal::Tick;
+use crate::link::{Lost, Session};
 use crate::timing::Histogram;
 
 /// What the loop tells the ordinary thread.
-#[derive(Debug, Clone, Copy)]
+#[derive(Debug, Clone)]
 pub enum Event {
-    /// Every tick.
-    Tick(Telemetry, Counters),
+    /// Every tick: what it saw and answered, its telemetry, the counters.
+    Tick(Tick, Telemetry, Counters),
     /// The answer to an order.
     Ordered(Result<(), Refusal>),
     /// A pour or recording has ended.
     Ended(Outcome),
+}
+
+/// Why the loop gives a robot's session back.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum SessionEnd {
+    /// The connection is gone.
+    Lost(Lost),
+    /// The robot may not move any more.
+    Unwell(EndReason),
+}
+
+impl std::fmt::Display for SessionEnd {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        match self {
+            Self::Lost(lost) => write!(f, "{lost}"),
+            Self::Unwell(reason) => write!(f, "{}", reason.words()),
+        }
+    }
 }
 
 /// Histograms of the loop, all in nanoseconds.
@@ -46,14 +65,14 @@ pub struct Exchange {
     pub orders: ArrayQueue<Order>,
     /// From the loop: events.
     pub events: ArrayQueue<Event>,
-    /// To the loop: the newest policy.
-    pub agents: ArrayQueue<Box<Agent>>,
+    /// To the loop: the newest policy and its number.
+    pub agents: ArrayQueue<(u64, Box<Agent>)>,
     /// From the loop: policies to drop.
     pub old_agents: ArrayQueue<Box<Agent>>,
     /// To the loop: a connected robot.
     pub sessions: ArrayQueue<Box<Session>>,
     /// From the loop: lost robots to drop.
-    pub old_sessions: ArrayQueue<Box<Session>>,
+    pub old_sessions: ArrayQueue<(Box<Session>, SessionEnd)>,
     /// Histograms.
     pub timing: Timing,
     /// Allocations and frees of the loop since it started.

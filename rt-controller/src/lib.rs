@@ -6,10 +6,11 @@
 //! | [`control_loop`] | the 30 Hz loop | real-time |
 //! | [`exchange`] | queues between the loop and the rest | all |
 //! | [`timing`] | the loop's histograms | all |
+//! | [`journal`] | every tick's inputs, and their replay | ordinary |
 //! | [`link`] | RTDE client and the robot's program | connects in an ordinary thread, then the loop's |
 //! | [`service`] | clients, telemetry, weight file | ordinary |
 //! | [`client`] | the clients' side | their own process |
-//! | [`run`], [`pour`], [`record`], [`abort`], [`status`], [`step`] | the commands | their own process |
+//! | [`run`], [`pour`], [`record`], [`abort`], [`status`], [`step`], [`replay`] | the commands | their own process |
 #![forbid(unsafe_code)]
 
 pub mod abort;
@@ -17,9 +18,11 @@ pub mod client;
 pub mod control_loop;
 pub mod core;
 pub mod exchange;
+pub mod journal;
 pub mod link;
 pub mod pour;
 pub mod record;
+pub mod replay;
 pub mod run;
 pub mod service;
 pub mod status;

@@ -3,7 +3,7 @@
 use std::process::ExitCode;
 
 use clap::{Parser, Subcommand};
-use rt_controller::{abort, pour, record, run, status, step};
+use rt_controller::{abort, pour, record, replay, run, status, step};
 
 /// Counts allocations, so that the loop can show that it makes none.
 #[global_allocator]
@@ -31,6 +31,8 @@ enum Command {
     Status(status::Args),
     /// The controller core as a filter: V_e in, angles out, for any other simulator.
     Step(step::Args),
+    /// Runs a journal through the same core again and compares every answer.
+    Replay(replay::Args),
 }
 
 fn main() -> ExitCode {
@@ -41,5 +43,6 @@ fn main() -> ExitCode {
         Command::Abort(args) => abort::run(&args),
         Command::Status(args) => status::run(&args),
         Command::Step(args) => step::run(&args),
+        Command::Replay(args) => replay::run(&args),
     }
 }

@@ -15,9 +15,11 @@ const END_DEG: f32 = 0.05;
 
 /// Command-line arguments.
 #[derive(Debug, clap::Args)]
-#[command(after_help = "Examples:\n  rt-controller record --lambda 70 --gamma 0.3\n  rt-controller record --lambda 60 --gamma 0.5 --weight 83\n\n\
+#[command(
+    after_help = "Examples:\n  rt-controller record --lambda 70 --gamma 0.3\n  rt-controller record --lambda 60 --gamma 0.5 --weight 83\n\n\
 The curve is alpha(t) = lambda exp(-gamma (t - beta)^2), from t = 0 to 2 beta. Afterwards the weight on the scale is asked for, if a\n\
-person is there; it can also be given later with `feature-worker episodes weigh FILE --weight G`.")]
+person is there; it can also be given later with `feature-worker episodes weigh FILE --weight G`."
+)]
 pub struct Args {
     /// Height of the curve, degrees.
     #[arg(long)]

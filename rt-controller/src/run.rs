@@ -50,7 +50,10 @@ pub fn run(args: &Args) -> ExitCode {
         let cell = Cell::join(&config.cell.name)?;
         let mut service = Service::open(&cell, &config, &exchange, &note, &connections, &say)?;
         let (ready_sender, ready) = std::sync::mpsc::channel();
-        scope.spawn(|| real_time(&config, &exchange, &say, &ready_sender));
+        scope.spawn({
+            let (config, exchange, say) = (&config, &exchange, &say);
+            move || real_time(config, exchange, say, &ready_sender)
+        });
         ready.recv().unwrap_or(Ok(()))?;
         let end_robot = AtomicBool::new(false);
         std::thread::scope(|inner| {
@@ -71,16 +74,10 @@ pub fn run(args: &Args) -> ExitCode {
 }
 
 /// The real-time thread: its own node and subscriber, then the loop.
-fn real_time(
-    config: &Config,
-    exchange: &Exchange,
-    say: &dyn Fn(&str),
-    ready: &std::sync::mpsc::Sender<Result<(), shared::ipc::IpcError>>,
-) {
+fn real_time(config: &Config, exchange: &Exchange, say: &dyn Fn(&str), ready: &std::sync::mpsc::Sender<Result<(), shared::ipc::IpcError>>) {
     let opened = Cell::join(&config.cell.name).and_then(|cell| {
         let subscriber = cell.features()?.subscriber_builder().buffer_size(crate::core::MAX_FEATURES).create();
-        let subscriber =
-            subscriber.map_err(|e| shared::ipc::IpcError::Service { service: "feature".into(), what: format!("{e:?}") })?;
+        let subscriber = subscriber.map_err(|e| shared::ipc::IpcError::Service { service: "feature".into(), what: format!("{e:?}") })?;
         Ok((cell, subscriber))
     });
     match opened {
@@ -90,7 +87,8 @@ fn real_time(
             }
             let _ = ready.send(Ok(()));
             let place = Place { core: config.controller.core, priority: config.controller.priority };
-            control_loop::run(Settings::new(config), place, &subscriber, exchange, say);
+            let lost_ns = u64::from(config.controller.lost_robot_ms) * 1_000_000;
+            control_loop::run(Settings::new(config), place, lost_ns, &subscriber, exchange, say);
         }
         Err(e) => {
             let _ = ready.send(Err(e));

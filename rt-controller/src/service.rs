@@ -22,9 +22,10 @@ use shared::messages::{Phase, Telemetry};
 use shared::weights::Weights;
 
 use crate::client::MESSAGE_MAX;
-use crate::core::{Counters, Order, Refusal};
+use crate::core::{Counters, Order, Refusal, Settings};
 use crate::exchange::{Event, Exchange};
-use crate::link;
+use crate::journal::Writer;
+use crate::link::{self, LinkOptions};
 
 /// How often the ordinary side looks: far below a person's patience, and cheap.
 const BEAT: Duration = Duration::from_millis(20);
@@ -56,17 +57,26 @@ impl RobotNote {
 }
 
 /// Keeps a connected robot in the loop's hands; runs in a thread of its own until `stop`, because connecting blocks.
-pub fn keep_robot_connected(config: &Config, exchange: &Exchange, note: &RobotNote, connections: &std::sync::atomic::AtomicU64, stop: &AtomicBool, say: &dyn Fn(&str)) {
+pub fn keep_robot_connected(
+    config: &Config,
+    exchange: &Exchange,
+    note: &RobotNote,
+    connections: &std::sync::atomic::AtomicU64,
+    stop: &AtomicBool,
+    say: &dyn Fn(&str),
+) {
+    let options = LinkOptions::new(config);
     let mut connected = false;
     let mut next = Instant::now();
     while !stop.load(Relaxed) {
-        while let Some(dead) = exchange.old_sessions.pop() {
-            note.set(dead.obituary(), say);
+        while let Some((session, end)) = exchange.old_sessions.pop() {
+            drop(session);
+            note.set(format!("robot: {end}"), say);
             connected = false;
             next = Instant::now() + RECONNECT;
         }
         if !connected && Instant::now() >= next {
-            match link::connect(config) {
+            match link::connect(&options) {
                 Ok(session) => {
                     connected = exchange.sessions.push(Box::new(session)).is_ok();
                     connections.fetch_add(1, Relaxed);
@@ -91,14 +101,16 @@ struct WeightsWatch {
     /// Identity of the policy that waits in the queue for the end of a pour.
     waiting: String,
     refused: String,
+    /// Policies handed over so far.
+    number: u64,
 }
 
 impl WeightsWatch {
     fn new(path: &Path) -> Self {
-        Self { path: path.into(), seen: None, id: String::new(), waiting: String::new(), refused: String::new() }
+        Self { path: path.into(), seen: None, id: String::new(), waiting: String::new(), refused: String::new(), number: 0 }
     }
 
-    fn look(&mut self, exchange: &Exchange, say: &dyn Fn(&str)) {
+    fn look(&mut self, exchange: &Exchange, journal: &mut Journal, say: &dyn Fn(&str)) {
         use std::os::unix::fs::MetadataExt;
         if exchange.agents.is_empty() && !self.waiting.is_empty() {
             self.id = std::mem::take(&mut self.waiting);
@@ -119,13 +131,27 @@ impl WeightsWatch {
                 self.refused.clear();
                 self.waiting = weights.identity();
                 say(&format!("weights {} read from {}; the next pour uses them", self.waiting, self.path.display()));
+                self.number += 1;
+                journal.write(say, |j| j.weights(self.number, &weights));
                 // What was waiting and is displaced is dropped here, in an ordinary thread.
-                drop(exchange.agents.force_push(Box::new(Agent::new(&weights))));
+                drop(exchange.agents.force_push((self.number, Box::new(Agent::new(&weights)))));
             }
             Err(e) => {
                 self.refused = e.to_string();
                 say(&format!("weights refused, the old ones stay: {e}"));
             }
+        }
+    }
+}
+
+/// The journal, if one is kept; the first error ends it, not the controller.
+struct Journal(Option<Writer>);
+
+impl Journal {
+    fn write(&mut self, say: &dyn Fn(&str), what: impl FnOnce(&mut Writer) -> std::io::Result<()>) {
+        if let Some(Err(e)) = self.0.as_mut().map(what) {
+            say(&format!("journal: {e}; no more is written, the controller goes on"));
+            self.0 = None;
         }
     }
 }
@@ -139,6 +165,7 @@ pub struct Service<'a> {
     server: Server<Ipc, [u8], (), [u8], ()>,
     telemetry: Publisher<Ipc, Telemetry, ()>,
     weights: WeightsWatch,
+    journal: Journal,
     latest: Option<(Telemetry, Counters)>,
     outcomes: VecDeque<Outcome>,
     waiting: VecDeque<(Asked, u64)>,
@@ -156,13 +183,16 @@ impl<'a> Service<'a> {
         say: &'a dyn Fn(&str),
     ) -> Result<Self, IpcError> {
         let fail = |service: &str, e: String| IpcError::Service { service: service.into(), what: e };
-        let server = cell
-            .control()?
-            .server_builder()
-            .initial_max_slice_len(MESSAGE_MAX)
-            .create()
-            .map_err(|e| fail("control", format!("{e:?}")))?;
+        let server =
+            cell.control()?.server_builder().initial_max_slice_len(MESSAGE_MAX).create().map_err(|e| fail("control", format!("{e:?}")))?;
         let telemetry = cell.telemetry()?.publisher_builder().create().map_err(|e| fail("telemetry", format!("{e:?}")))?;
+        let mut journal = None;
+        if let Some(path) = &config.controller.journal {
+            match Writer::create(path, &Settings::new(config)) {
+                Ok(writer) => journal = Some(writer),
+                Err(e) => say(&format!("{}: no journal: {e}", path.display())),
+            }
+        }
         // Episode numbers grow over restarts, so that a recorder never takes two runs for one.
         let next_episode = std::time::SystemTime::now().duration_since(std::time::UNIX_EPOCH).map_or(1, |d| d.as_secs());
         Ok(Self {
@@ -173,6 +203,7 @@ impl<'a> Service<'a> {
             server,
             telemetry,
             weights: WeightsWatch::new(&config.controller.weights),
+            journal: Journal(journal),
             latest: None,
             outcomes: VecDeque::new(),
             waiting: VecDeque::new(),
@@ -188,37 +219,44 @@ impl<'a> Service<'a> {
                 stopping = self.exchange.orders.push(Order::Shutdown).is_ok();
             }
             while self.exchange.old_agents.pop().is_some() {}
-            self.weights.look(self.exchange, self.say);
+            self.weights.look(self.exchange, &mut self.journal, self.say);
             self.hear();
             self.answer();
             std::thread::sleep(BEAT);
         }
         self.hear();
+        self.journal.write(self.say, Writer::flush);
     }
 
     /// Takes what the loop told.
     fn hear(&mut self) {
         while let Some(event) = self.exchange.events.pop() {
             match event {
-                Event::Tick(telemetry, counters) => {
+                Event::Tick(tick, telemetry, counters) => {
+                    self.journal.write(self.say, |j| j.tick(Box::new(tick)));
                     self.latest = Some((telemetry, counters));
                     // Nobody listening is no error.
                     let _ = self.telemetry.send_copy(telemetry);
                 }
                 Event::Ordered(answer) => {
                     if let Some((asked, episode)) = self.waiting.pop_front() {
-                        reply(&asked, &match answer {
-                            Ok(()) if episode == 0 => Reply::Aborting,
-                            Ok(()) => Reply::Started { episode },
-                            Err(refusal) => Reply::Refused { reason: self.words(refusal) },
-                        });
+                        reply(
+                            &asked,
+                            &match answer {
+                                Ok(()) if episode == 0 => Reply::Aborting,
+                                Ok(()) => Reply::Started { episode },
+                                Err(refusal) => Reply::Refused { reason: self.words(refusal) },
+                            },
+                        );
                     }
                 }
                 Event::Ended(outcome) => {
                     (self.say)(&format!(
                         "episode {}: {}, {} after {:.1} s",
                         outcome.episode,
-                        outcome.goal_ml.map_or("curve".into(), |g| format!("goal {g:.1} ml, {:.1} ml poured (estimate)", outcome.poured_ml)),
+                        outcome
+                            .goal_ml
+                            .map_or("curve".into(), |g| format!("goal {g:.1} ml, {:.1} ml poured (estimate)", outcome.poured_ml)),
                         outcome.reason.words(),
                         outcome.seconds
                     ));
@@ -243,7 +281,10 @@ impl<'a> Service<'a> {
     fn answer(&mut self) {
         while let Ok(Some(asked)) = self.server.receive() {
             let Ok(request) = postcard::from_bytes::<Request>(asked.payload()) else {
-                reply(&asked, &Reply::Refused { reason: "the request is in another version's words: run the same build on both sides".into() });
+                reply(
+                    &asked,
+                    &Reply::Refused { reason: "the request is in another version's words: run the same build on both sides".into() },
+                );
                 continue;
             };
             let (order, episode) = match request {

@@ -49,8 +49,7 @@ impl Histogram {
 
     /// A snapshot for people, in microseconds. Allocates.
     pub fn snapshot(&self, name: &str) -> shared::control::Histogram {
-        let counts: Vec<(usize, u64)> =
-            self.bins.iter().map(|b| b.load(Ordering::Relaxed)).enumerate().filter(|(_, n)| *n > 0).collect();
+        let counts: Vec<(usize, u64)> = self.bins.iter().map(|b| b.load(Ordering::Relaxed)).enumerate().filter(|(_, n)| *n > 0).collect();
         let n: u64 = counts.iter().map(|(_, n)| n).sum();
         let max_ns = self.max_ns.load(Ordering::Relaxed);
         let us = |ns: u64| ns as f64 / 1e3;

@@ -6,16 +6,20 @@
 use serde::{Deserialize, Serialize};
 
 use crate::estimate::Hold;
+use crate::estimate::flow::Flow;
+use crate::estimate::fused::Fused;
 use crate::policy::{self, ACTIONS, STAY};
-use crate::weights::Weights;
+use crate::weights::{Estimator, Weights};
 
 /// What is known of one camera frame.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Frame {
     /// V_e in px^2; `None`: the frame was lost or its measurement is doubtful.
     pub area_px2: Option<f32>,
-    /// Commanded alpha when this frame was decided on, degrees from upright.
+    /// Commanded alpha in force when this frame was taken, degrees from upright.
     pub alpha_deg: f32,
+    /// Commanded alpha in force now, degrees; the same, unless the picture is older than the newest command.
+    pub alpha_now_deg: f32,
 }
 
 /// What the agent makes of one frame.
@@ -25,17 +29,43 @@ pub struct Decision {
     pub action: u8,
     /// Relative angle to request, degrees.
     pub dalpha_deg: f32,
-    /// Outflow attributed to this frame, ml.
+    /// Outflow that this frame shows, ml.
     pub v_ml: f32,
     /// d after this frame, ml; negative when too much was poured.
     pub d_ml: f32,
     /// Estimated volume poured since the goal was set, ml.
     pub poured_ml: f32,
-    /// d has reached 0 (what is still on its way counted): from here on every action tilts back. Stays true until the next
-    /// [`Agent::start`].
+    /// Standard deviation of `poured_ml` as far as the estimator knows, ml; 0: it does not.
+    pub poured_sd_ml: f32,
+    /// Volume that would still leave if the way back began now, ml; 0 with [`Estimator::Sum`](crate::weights::Estimator).
+    pub stop_ml: f32,
+    /// d has reached 0, what is still on its way counted, and nothing more comes over the lip: bring the container upright.
+    /// Stays true until the next [`Agent::start`].
     pub finished: bool,
     /// Liquid is seen leaving the container in this frame.
     pub flowing: bool,
+}
+
+impl Decision {
+    /// Stay, and nothing known.
+    pub const NOTHING: Self = Self {
+        action: STAY as u8,
+        dalpha_deg: 0.0,
+        v_ml: 0.0,
+        d_ml: 0.0,
+        poured_ml: 0.0,
+        poured_sd_ml: 0.0,
+        stop_ml: 0.0,
+        finished: false,
+        flowing: false,
+    };
+}
+
+/// What one frame says about the volume.
+struct View {
+    poured_ml: f32,
+    poured_sd_ml: f32,
+    stop_ml: f32,
 }
 
 /// How the network's 21 outputs become an action.
@@ -50,15 +80,27 @@ pub enum Selection {
     Sampled,
 }
 
+/// After the way back has begun, this much missing volume makes the agent pour on, ml.
+const RESUME_ML: f32 = 0.5;
+/// After flow was seen, this much of a way back without flow ends the pour, degrees.
+const BROUGHT_BACK_DEG: f32 = 10.0;
+/// Less than this still to come over the lip counts as nothing, ml.
+const NOTHING_ML: f64 = 0.05;
+
 /// Observation pipeline, estimator and policy of one pour.
 #[derive(Debug, Clone)]
 pub struct Agent {
     weights: Weights,
+    fused: Option<Fused>,
+    back_deg: f32,
     goal_ml: Option<f32>,
     hold: Hold,
     v_ml: [f32; 3],
-    poured_ml: f32,
+    summed_ml: f32,
+    returning: bool,
     finished: bool,
+    seen_flow: bool,
+    brought_back_deg: f32,
     carry_deg: f32,
     random: u64,
 }
@@ -66,13 +108,22 @@ pub struct Agent {
 impl Agent {
     /// An agent that follows `weights`, with d = 0.
     pub fn new(weights: &Weights) -> Self {
+        let (fused, back_deg) = match &weights.estimator {
+            Estimator::Sum => (None, -weights.actions_deg[weights.back_action()]),
+            Estimator::Fused { model, back } => (Some(Fused::new(Flow::new(model), *back)), back.rate_deg as f32),
+        };
         Self {
             weights: weights.clone(),
+            fused,
+            back_deg,
             goal_ml: None,
             hold: Hold::default(),
             v_ml: [0.0; 3],
-            poured_ml: 0.0,
+            summed_ml: 0.0,
+            returning: false,
             finished: false,
+            seen_flow: false,
+            brought_back_deg: 0.0,
             carry_deg: 0.0,
             random: weights.seed,
         }
@@ -83,39 +134,79 @@ impl Agent {
         self.goal_ml = Some(goal_ml).filter(|g| g.is_finite() && *g > 0.0);
         self.hold = Hold::default();
         self.v_ml = [0.0; 3];
-        self.poured_ml = 0.0;
+        self.summed_ml = 0.0;
+        self.returning = false;
         self.finished = false;
+        self.seen_flow = false;
+        self.brought_back_deg = 0.0;
         self.carry_deg = 0.0;
+        if let Some(fused) = &mut self.fused {
+            fused.restart();
+        }
     }
 
     /// One frame: d <- d - V_e (eq. 2), then the policy's action. Call it once for every frame, lost ones included, and
     /// after `finished` until the last drop was seen, so that the whole volume is counted.
     pub fn step(&mut self, frame: Frame) -> Decision {
         let Some(goal_ml) = self.goal_ml else {
-            return Decision { action: STAY as u8, dalpha_deg: 0.0, v_ml: 0.0, d_ml: 0.0, poured_ml: 0.0, finished: false, flowing: false };
+            return Decision::NOTHING;
         };
-        let calibration = &self.weights.calibration;
+        let view = self.observe(frame);
+        let d_ml = goal_ml - view.poured_ml;
+        // What is on its way counts as poured: the network is to stop in time.
+        let d_net_ml = d_ml - view.stop_ml;
+        if d_net_ml <= 0.0 {
+            self.returning = true;
+        } else if d_net_ml > RESUME_ML && self.fused.is_some() {
+            self.returning = false;
+        }
+        let over = match &self.fused {
+            Some(fused) => f64::from(view.stop_ml) - fused.flow_state().film_ml < NOTHING_ML,
+            None => true,
+        };
+        self.finished |= self.returning && over;
+
+        let (action, dalpha_deg) = if self.returning || self.finished {
+            (self.weights.back_action(), -self.back_deg)
+        } else {
+            let logits = self.weights.policy.forward(&self.weights.scale.apply(self.v_ml, d_net_ml));
+            let action = self.select(&logits);
+            (action, self.weights.actions_deg[action])
+        };
+        // A policy that stops a little early has come to its end too, although d is still above 0.
+        self.seen_flow |= self.v_ml[0] > 0.0;
+        self.brought_back_deg = if self.v_ml[0] > 0.0 || dalpha_deg > 0.0 { 0.0 } else { self.brought_back_deg - dalpha_deg };
+        self.finished |= self.seen_flow && self.brought_back_deg > BROUGHT_BACK_DEG;
+        Decision {
+            action: action as u8,
+            dalpha_deg,
+            v_ml: self.v_ml[0],
+            d_ml,
+            poured_ml: view.poured_ml,
+            poured_sd_ml: view.poured_sd_ml,
+            stop_ml: view.stop_ml,
+            finished: self.finished,
+            flowing: self.v_ml[0] > 0.0,
+        }
+    }
+
+    /// Takes the frame into the sum and, if there is one, the filter.
+    fn observe(&mut self, frame: Frame) -> View {
+        let calibration = self.weights.calibration;
         let area_px2 = self.hold.step(frame.area_px2, calibration.hold_above_px2);
         let v_ml = calibration.volume_ml(area_px2);
         self.v_ml = [v_ml, self.v_ml[0], self.v_ml[1]];
-        self.poured_ml += v_ml;
-        let d_ml = goal_ml - self.poured_ml;
-        self.finished |= d_ml <= 0.0;
-
-        let action = if self.finished {
-            self.weights.back_action()
-        } else {
-            let logits = self.weights.policy.forward(&self.weights.scale.apply(self.v_ml, d_ml));
-            self.select(&logits)
+        self.summed_ml += v_ml;
+        let Some(fused) = &mut self.fused else {
+            return View { poured_ml: self.summed_ml, poured_sd_ml: 0.0, stop_ml: 0.0 };
         };
-        Decision {
-            action: action as u8,
-            dalpha_deg: self.weights.actions_deg[action],
-            v_ml,
-            d_ml,
-            poured_ml: self.poured_ml,
-            finished: self.finished,
-            flowing: v_ml > 0.0,
+        // The filter judges dropouts itself.
+        let y_ml = frame.area_px2.map(|a| f64::from(calibration.volume_ml(a)));
+        fused.step(y_ml, f64::from(frame.alpha_deg));
+        View {
+            poured_ml: fused.poured_ml() as f32,
+            poured_sd_ml: fused.poured_sd_ml() as f32,
+            stop_ml: fused.stop_volume_ml(f64::from(frame.alpha_now_deg)) as f32,
         }
     }
 
@@ -159,7 +250,7 @@ mod tests {
     use proptest::prelude::*;
 
     fn frame(area: f32) -> Frame {
-        Frame { area_px2: Some(area), alpha_deg: 50.0 }
+        Frame { area_px2: Some(area), alpha_deg: 50.0, alpha_now_deg: 50.0 }
     }
 
     /// Protects the idle robot: with d = 0 the agent does nothing, whatever it sees.
@@ -253,7 +344,7 @@ mod tests {
             let mut agent = Agent::new(&weights);
             agent.start(goal);
             for (area_px2, alpha_deg) in frames {
-                let decision = agent.step(Frame { area_px2, alpha_deg });
+                let decision = agent.step(Frame { area_px2, alpha_deg, alpha_now_deg: alpha_deg });
                 prop_assert!(decision.dalpha_deg.is_finite() && decision.dalpha_deg.abs() <= 5.0);
                 prop_assert!(usize::from(decision.action) < ACTIONS);
             }

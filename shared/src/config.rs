@@ -125,9 +125,10 @@ pub struct ImageConfig {
     pub method: LiquidMethod,
     /// Region at the lip, px: x, y, width, height.
     pub region_px: [u32; 4],
-    /// x-axis of Fig. 4: two points on the glass's top edge, px: x0, y0, x1, y1.
+    /// x-axis of Fig. 4: two points on the glass's top edge, px: x0, y0, x1, y1, from the lip's side into the mouth. The
+    /// triangle lies between this direction and that of `y_axis_px`.
     pub x_axis_px: [f32; 4],
-    /// y-axis of Fig. 4: two points on the container's left side, px: x0, y0, x1, y1.
+    /// y-axis of Fig. 4: two points on the container's left side, px: x0, y0, x1, y1, from its foot towards its rim.
     pub y_axis_px: [f32; 4],
     /// Colour range of the liquid in OpenCV's HSV: h_min, s_min, v_min, h_max, s_max, v_max (h 0-179, s and v 0-255;
     /// h_min > h_max wraps around red).
@@ -193,6 +194,9 @@ pub struct ControllerConfig {
     pub priority: u8,
     /// The weight file; watched, and taken between pours when it changes.
     pub weights: PathBuf,
+    /// Where every tick's inputs are written, for `rt-controller replay`; without it there is no journal.
+    #[serde(default)]
+    pub journal: Option<PathBuf>,
     /// A pour ends when the newest feature is older than this, ms.
     pub stale_feature_ms: u32,
     /// The robot counts as lost when its newest state is older than this, ms.
@@ -250,8 +254,10 @@ impl Config {
     /// Parses and checks `text`; `file` is named in errors.
     pub fn parse(text: &str, file: &str) -> Result<Self, ConfigError> {
         let config: Self = toml::from_str(text).map_err(|e| {
-            let line = e.span().map_or(1, |s| text[..s.start].matches('\n').count() + 1);
-            ConfigError::Parse { file: file.into(), what: format!("line {line}: {}", e.message()) }
+            let start = e.span().map_or(0, |s| s.start);
+            let line = text[..start].matches('\n').count();
+            let key = text.lines().nth(line).and_then(|l| l.split_once('=')).map_or(String::new(), |(k, _)| format!(", {}", k.trim()));
+            ConfigError::Parse { file: file.into(), what: format!("line {}{key}: {}", line + 1, e.message().replace('\n', " ")) }
         })?;
         config.check(file)?;
         Ok(config)
@@ -350,5 +356,58 @@ impl Check<'_> {
 
     fn range(&self, key: &str, value: f64, low: f64, high: f64) -> Result<(), ConfigError> {
         self.rule(key, &value.to_string(), value >= low && value <= high, &format!("{low} to {high}"))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const SIM: &str = include_str!("../../config/sim.toml");
+    const CELL: &str = include_str!("../../config/cell.toml");
+
+    fn refusal(from: &str, to: &str) -> String {
+        assert!(CELL.contains(from), "{from}");
+        Config::parse(&CELL.replace(from, to), "cell.toml").expect_err("must be refused").to_string()
+    }
+
+    /// Protects the shipped files: both are valid, and only the simulated cell has a simulator.
+    #[test]
+    fn the_shipped_files_are_valid() {
+        assert!(Config::parse(SIM, "sim.toml").expect("valid").simulator.is_some());
+        assert!(Config::parse(CELL, "cell.toml").expect("valid").simulator.is_none());
+    }
+
+    /// Protects the operator from typing errors: each refusal names file, key and what is allowed.
+    #[test]
+    fn mistakes_are_refused_with_file_key_and_range() {
+        for (from, to, words) in [
+            ("rate_hz = 30.0", "rate_hz = 3.0", ["controller.rate_hz = 3", "10 to 125"]),
+            ("rate_hz = 30.0", "rate_hz = \"fast\"", ["rate_hz", "invalid type"]),
+            ("rate_hz = 30.0", "rate_hz = nan", ["controller.rate_hz", "10 to 125"]),
+            ("gain = 600.0", "gian = 600.0", ["gian", "expected one of"]),
+            ("gain = 600.0", "gain = 5000.0", ["robot.gain", "100 to 2000"]),
+            ("joint = \"wrist_3\"", "joint = \"wrist_4\"", ["wrist_4", "wrist_3"]),
+            ("direction = 1.0", "direction = 0.5", ["robot.direction", "1 or -1"]),
+            ("name = \"lab\"", "name = \"../x\"", ["cell.name", "letters"]),
+            ("path = \"/dev/video0\"", "path = \"\"", ["camera.path", "device"]),
+            ("width_px = 640", "width_px = 320", ["image.region_px", "inside 320"]),
+            ("register_base = 24", "register_base = 3", ["robot.register_base", "24 to 40"]),
+        ] {
+            let said = refusal(from, to);
+            for word in ["cell.toml"].iter().chain(&words) {
+                assert!(said.contains(word), "'{said}' does not say '{word}'");
+            }
+            assert_eq!(said.lines().count(), 1, "{said}");
+        }
+    }
+
+    /// Protects V_e: axes without a crossing give no triangle.
+    #[test]
+    fn parallel_axes_are_refused() {
+        let x_axis = CELL.lines().find_map(|l| l.strip_prefix("x_axis_px = ")).expect("there");
+        let y_axis = CELL.lines().find_map(|l| l.strip_prefix("y_axis_px = ")).expect("there");
+        let said = refusal(&format!("y_axis_px = {y_axis}"), &format!("y_axis_px = {x_axis}"));
+        assert!(said.contains("image.y_axis_px") && said.contains("parallel"), "{said}");
     }
 }

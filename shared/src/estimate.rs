@@ -5,6 +5,9 @@
 
 use serde::{Deserialize, Serialize};
 
+pub mod flow;
+pub mod fused;
+
 /// V_e in px^2 to ml a frame: `v = c area^q`, with the dropout hold that goes with it.
 ///
 /// Section 3.3.1's normalised contribution volumes are the case q = 1; c then is `w_E / sum V_e`, shared by all episodes.

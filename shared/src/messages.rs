@@ -111,7 +111,7 @@ impl Doubt {
 }
 
 /// What the feature worker measured in one frame (service `feature`): V_e of section 3.3.1.
-#[derive(Debug, Clone, Copy, PartialEq, Default, ZeroCopySend)]
+#[derive(Debug, Clone, Copy, PartialEq, Default, ZeroCopySend, serde::Serialize, serde::Deserialize)]
 #[repr(C)]
 pub struct Feature {
     /// [`LAYOUT_VERSION`].

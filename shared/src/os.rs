@@ -26,18 +26,24 @@ pub fn become_realtime(core: usize, priority: u8) -> Vec<String> {
     if !core_affinity::set_for_current(core_affinity::CoreId { id: core }) {
         missing.push(format!("could not pin to core {core} (does it exist?): running on any core"));
     }
-    if priority > 0 {
-        let param = libc::sched_param { sched_priority: i32::from(priority) };
-        // SAFETY: pid 0 is the calling thread and `param` is a valid, initialised structure that the call only reads.
-        let failed = unsafe { libc::sched_setscheduler(0, libc::SCHED_FIFO, &raw const param) } != 0;
-        if failed {
-            missing.push(format!(
-                "SCHED_FIFO {priority} is not permitted ({}): set LimitRTPRIO or CAP_SYS_NICE; running with ordinary scheduling",
-                std::io::Error::last_os_error()
-            ));
-        }
-    }
+    missing.extend(prioritise(priority).err());
     missing
+}
+
+/// Schedules the calling thread SCHED_FIFO with `priority` (1-99); 0 leaves it as it is.
+pub fn prioritise(priority: u8) -> Result<(), String> {
+    if priority == 0 {
+        return Ok(());
+    }
+    let param = libc::sched_param { sched_priority: i32::from(priority) };
+    // SAFETY: pid 0 is the calling thread and `param` is a valid, initialised structure that the call only reads.
+    if unsafe { libc::sched_setscheduler(0, libc::SCHED_FIFO, &raw const param) } == 0 {
+        return Ok(());
+    }
+    Err(format!(
+        "SCHED_FIFO {priority} is not permitted ({}): set LimitRTPRIO or CAP_SYS_NICE; running with ordinary scheduling",
+        std::io::Error::last_os_error()
+    ))
 }
 
 /// Locks all present and future pages of the process in memory; answers with the reason when it is not permitted.

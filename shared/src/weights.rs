@@ -22,6 +22,7 @@ use sha2::{Digest, Sha256};
 
 use crate::agent::Selection;
 use crate::estimate::Calibration;
+use crate::estimate::flow::{DELAY_MAX, FlowModel, FlowNoise, Return};
 use crate::policy::{ACTIONS, HIDDEN, INPUTS, InputScale, Mlp, nearest_action};
 
 /// Version of the file format; other versions are refused.
@@ -47,12 +48,60 @@ pub struct Weights {
     pub scale: InputScale,
     /// Area to ml.
     pub calibration: Calibration,
+    /// How the poured volume is estimated.
+    pub estimator: Estimator,
     /// Frames a second that it was trained for.
     pub rate_hz: f32,
     /// Where it came from.
     pub origin: Origin,
     /// Seed of the training, and of [`Selection::Sampled`].
     pub seed: u64,
+}
+
+/// How the poured volume is estimated.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum Estimator {
+    /// The paper's plain sum of the frames' volumes.
+    Sum,
+    /// Camera and container geometry, fused by a filter on the flow model.
+    Fused {
+        /// The fitted model.
+        model: FlowModel,
+        /// How the controller tilts back, to know what still flows then.
+        back: Return,
+    },
+}
+
+impl Estimator {
+    fn check(&self) -> Result<(), String> {
+        let Self::Fused { model, back } = self else { return Ok(()) };
+        let FlowModel { s, lk, p, k1, k2, tau, delay, eta, noise } = *model;
+        let FlowNoise { lambda, gamma, beta, delta, frame, v_min_ml } = noise;
+        let ranges = [
+            ("flow coefficient", lk, -20.0, 20.0),
+            ("flow exponent", p, 0.2, 5.0),
+            ("k1", k1, -20.0, 20.0),
+            ("k2", k2, -20.0, 20.0),
+            ("lag", tau, 0.0, 60.0),
+            ("delay", delay, 0.0, DELAY_MAX),
+            ("film share", eta, 0.0, 0.95),
+            ("sd of lambda", lambda, 1e-4, 5.0),
+            ("sd of gamma", gamma, 1e-4, 5.0),
+            ("sd of beta", beta, 1e-6, 5.0),
+            ("sd of the delay", delta, 1e-4, 20.0),
+            ("sd of a frame", frame, 1e-4, 5.0),
+            ("smallest outflow", v_min_ml, 0.0, 10.0),
+            ("rate back", back.rate_deg, 0.1, 10.0),
+            ("change of the rate back", back.change_deg, 0.01, 100.0),
+        ];
+        for (name, value, low, high) in ranges.into_iter().chain(s.map(|s| ("capacity a degree (log)", s, -10.0, 10.0))) {
+            if !(low..=high).contains(&value) {
+                return Err(format!("estimator: {name} is {value}, allowed is {low} to {high}"));
+            }
+        }
+        Ok(())
+    }
 }
 
 /// Where weights came from; the controller only shows it.
@@ -265,7 +314,7 @@ impl Weights {
         if hold_above_px2.is_nan() || hold_above_px2 < 0.0 {
             return Err(format!("dropout hold above {hold_above_px2} px^2 is not a number >= 0"));
         }
-        Ok(())
+        self.estimator.check()
     }
 }
 
@@ -287,6 +336,7 @@ pub(crate) mod tests {
             selection: Selection::Argmax,
             scale: InputScale::default(),
             calibration: Calibration { c: 0.002, q: 1.15, hold_above_px2: 60.0 },
+            estimator: Estimator::Sum,
             rate_hz: 30.0,
             origin: Origin { method: Method::Handmade, actions: 21, episodes: 0, data_sha256: [7; 32] },
             seed: 1,

@@ -1,6 +1,6 @@
 //! `simulator run`: the simulated cell in real time: UR5 controller, container on its wrist, camera, kitchen scale, operator.
 //!
-//! Threads, all ordinary: the UR controller's own (see [`crate::ur`]); "physics" moves the liquid every 4 ms with the tilt that
+//! Threads: the UR controller's own (see [`crate::ur`]); "physics" moves the liquid every 4 ms with the tilt that
 //! the simulated joint really has; "camera" renders and publishes frames; the main thread serves the operator's socket. The
 //! cell offers what a real one offers: RTDE and script ports, camera frames in shared memory. The truth leaves it only as
 //! pixels, joint angles and, after a pour, as the scale's reading. Errors at start are one line; afterwards a failing camera
@@ -28,13 +28,19 @@ use crate::physics::container::Container;
 use crate::physics::rig::Rig;
 use crate::ur;
 
+/// SCHED_FIFO priorities where permitted: a real robot, liquid and camera do not wait for this machine's other work. Below the
+/// programs under test.
+const LIQUID_PRIORITY: u8 = 60;
+const CAMERA_PRIORITY: u8 = 50;
 /// Step of the liquid, ns.
 const PHYSICS_NS: u64 = 4_000_000;
 
 /// Command-line arguments.
 #[derive(Debug, clap::Args)]
-#[command(after_help = "Example:\n  simulator run --config config/sim.toml\n\nThen start `feature-worker run` and `rt-controller run` with the same \
-configuration, and act as the operator with `simulator operator`.")]
+#[command(
+    after_help = "Example:\n  simulator run --config config/sim.toml\n\nThen start `feature-worker run` and `rt-controller run` with the same \
+configuration, and act as the operator with `simulator operator`."
+)]
 pub struct Args {
     /// The simulated cell's configuration.
     #[arg(long, default_value = "config/sim.toml")]
@@ -95,7 +101,10 @@ impl SimulatorConfig {
         }
         let size = (this.view.width_px, this.view.height_px);
         if size != (config.camera.width_px, config.camera.height_px) {
-            return Err(format!("simulator.view is {} x {} px, but [camera] {} x {}", size.0, size.1, config.camera.width_px, config.camera.height_px));
+            return Err(format!(
+                "simulator.view is {} x {} px, but [camera] {} x {}",
+                size.0, size.1, config.camera.width_px, config.camera.height_px
+            ));
         }
         Ok(this)
     }
@@ -158,7 +167,7 @@ fn simulate(config: Config, sim: SimulatorConfig) -> Result<(), Box<dyn std::err
     }
     let mut start_q_rad = [0.0, -1.571, 1.571, -1.571, -1.571, 0.0];
     start_q_rad[config.robot.joint.index()] = config.robot.start_joint_deg.to_radians();
-    let robot = ur::Controller::start(ur::Options { address: config.robot.address, series: sim.series, start_q_rad, ..ur::Options::default() })?;
+    let robot = ur::Controller::start(ur::Options { series: sim.series, start_q_rad, ..ur::Options::new(config.robot.address) })?;
     let rig = sim.rig();
     let world = World { container: Mutex::new(rig.container(sim.fill_ml)), rig, robot, config, sim, stop };
 
@@ -192,6 +201,9 @@ fn simulate(config: Config, sim: SimulatorConfig) -> Result<(), Box<dyn std::err
 
 /// Thread "physics".
 fn move_liquid(world: &World) {
+    if let Err(line) = os::prioritise(LIQUID_PRIORITY) {
+        eprintln!("simulator: {line}");
+    }
     let mut next_ns = os::now_ns();
     while !world.stop.load(Relaxed) {
         next_ns += PHYSICS_NS;
@@ -204,6 +216,7 @@ fn move_liquid(world: &World) {
 /// Thread "camera".
 fn film(world: &World) -> Result<(), String> {
     let words = |e: &dyn std::fmt::Debug| format!("camera: {e:?}");
+    let _ = os::prioritise(CAMERA_PRIORITY); // the liquid's thread has said if it is not permitted
     let cell = Cell::join(&world.config.cell.name).map_err(|e| e.to_string())?;
     let topic = cell.frames().map_err(|e| e.to_string())?;
     let view = &world.sim.view;
@@ -293,11 +306,6 @@ fn obey(world: &World, noise: &mut Pcg64Mcg, line: &str) -> Result<serde_json::V
             // A kitchen scale: half a gram of error, steps of one gram.
             let error_g = 0.5 * noise.sample::<f64, _>(rand_distr::StandardNormal);
             Ok(serde_json::json!({ "weight_g": (world.container().poured_ml() + error_g).round().max(0.0) }))
-        }
-        "fault" => {
-            let fault: ur::Fault = rest.parse().map_err(|e| format!("{e}"))?;
-            world.robot.inject(fault);
-            Ok(serde_json::json!({ "fault": rest }))
         }
         _ => Err(format!("'{verb}' is nothing that an operator can do here")),
     }

@@ -21,7 +21,8 @@ use crate::pour_plot;
 
 /// What the operator records: millilitres filled in, and the curve's height (degrees) and width (1/s^2).
 /// A fuller container spills earlier, so it is tilted less.
-const EPISODES: [(f64, f32, f32); 5] = [(430.0, 42.0, 0.35), (360.0, 56.0, 0.30), (300.0, 66.0, 0.22), (230.0, 76.0, 0.28), (160.0, 90.0, 0.24)];
+const EPISODES: [(f64, f32, f32); 5] =
+    [(430.0, 47.0, 0.25), (360.0, 60.0, 0.25), (300.0, 68.0, 0.20), (230.0, 77.0, 0.25), (160.0, 83.0, 0.25)];
 /// What is poured: millilitres filled in, and the goal. None of it was seen in training.
 const POURS: [(f64, f32); 3] = [(200.0, 35.0), (280.0, 110.0), (450.0, 180.0)];
 /// A pour further than this from its goal fails the demo, ml.
@@ -29,8 +30,10 @@ const TOLERANCE_ML: f64 = 10.0;
 
 /// Command-line arguments.
 #[derive(Debug, clap::Args)]
-#[command(after_help = "Example:\n  simulator demo --out out/demo --seed 3\n\nLeaves in the output directory: sim.toml, episodes/*.mcap, weights.bin, \
-pour-*.svg, summary.json and the processes' logs.")]
+#[command(
+    after_help = "Example:\n  simulator demo --out out/demo --seed 3\n\nLeaves in the output directory: sim.toml, episodes/*.mcap, weights.bin, \
+pour-*.svg, summary.json and the processes' logs."
+)]
 pub struct Args {
     /// The simulated cell's configuration; the demo gives its copy a name and an address of its own.
     #[arg(long, default_value = "config/sim.toml")]
@@ -73,7 +76,8 @@ pub fn run(args: &Args) -> ExitCode {
     }
     match Demo::prepare(args, stop).and_then(|mut demo| demo.perform()) {
         Ok(summary) => {
-            let far: Vec<String> = (1..).zip(&summary.pours).filter(|(_, p)| p.error_ml.abs() > TOLERANCE_ML).map(|(i, _)| i.to_string()).collect();
+            let far: Vec<String> =
+                (1..).zip(&summary.pours).filter(|(_, p)| p.error_ml.abs() > TOLERANCE_ML).map(|(i, _)| i.to_string()).collect();
             if args.json {
                 println!("{}", summary.json());
             } else {
@@ -128,7 +132,10 @@ impl Summary {
     }
 
     fn print(&self) {
-        println!("\n{:>9} {:>9} {:>9} {:>9} {:>7} {:>10} {:>14}", "filled", "goal", "poured", "error", "time", "late ticks", "stale features");
+        println!(
+            "\n{:>9} {:>9} {:>9} {:>9} {:>7} {:>10} {:>14}",
+            "filled", "goal", "poured", "error", "time", "late ticks", "stale features"
+        );
         println!("{:>9} {:>9} {:>9} {:>9} {:>7} {:>10} {:>14}", "ml", "ml", "ml", "ml", "s", "", "");
         for p in &self.pours {
             println!(
@@ -142,7 +149,11 @@ impl Summary {
                 p.outcome["stale_features"]
             );
         }
-        println!("\npoured is the scale's reading in g (= ml of water); everything is in {} after {:.0} s", self.out.display(), self.seconds);
+        println!(
+            "\npoured is the scale's reading in g (= ml of water); everything is in {} after {:.0} s",
+            self.out.display(),
+            self.seconds
+        );
     }
 }
 
@@ -188,7 +199,8 @@ struct Demo<'a> {
 impl<'a> Demo<'a> {
     /// Makes the output directory and the demo's own configuration.
     fn prepare(args: &'a Args, stop: Arc<AtomicBool>) -> Result<Self, DemoError> {
-        let text = std::fs::read_to_string(&args.config).map_err(|error| DemoError::File { what: args.config.display().to_string(), error })?;
+        let text =
+            std::fs::read_to_string(&args.config).map_err(|error| DemoError::File { what: args.config.display().to_string(), error })?;
         Config::parse(&text, &args.config.display().to_string()).map_err(|e| DemoError::Config(e.to_string()))?;
         let mut table: toml::Table = text.parse().map_err(|e| DemoError::Config(format!("{}: {e}", args.config.display())))?;
         let out = &args.out;
@@ -208,8 +220,13 @@ impl<'a> Demo<'a> {
         // A name and an address of its own, so that a cell that is already running is left alone.
         let number = std::process::id();
         set("cell", "name", toml::Value::String(format!("demo-{number}")));
-        set("robot", "address", toml::Value::String(format!("127.{}.{}.{}", 1 + number / 65_536 % 250, number / 256 % 256, 1 + number % 254)));
+        set(
+            "robot",
+            "address",
+            toml::Value::String(format!("127.{}.{}.{}", 1 + number / 65_536 % 250, number / 256 % 256, 1 + number % 254)),
+        );
         set("controller", "weights", text(&out.join("weights.bin")));
+        set("controller", "journal", text(&out.join("journal.bin")));
         set("recording", "directory", text(&out.join("episodes")));
         set("simulator", "seed", toml::Value::Integer(args.seed as i64));
         let config_file = out.join("sim.toml");
@@ -249,7 +266,8 @@ impl<'a> Demo<'a> {
         for (i, (fill_ml, lambda_deg, gamma)) in EPISODES.into_iter().enumerate() {
             self.note(&format!("episode {} of {}: {fill_ml} ml, lambda {lambda_deg} degrees, gamma {gamma}/s^2", i + 1, EPISODES.len()));
             self.command("simulator", &["operator", "fill", &fill_ml.to_string()])?;
-            let recorded = self.command("rt-controller", &["record", "--json", "--lambda", &lambda_deg.to_string(), "--gamma", &gamma.to_string()])?;
+            let recorded =
+                self.command("rt-controller", &["record", "--json", "--lambda", &lambda_deg.to_string(), "--gamma", &gamma.to_string()])?;
             let weight_g = self.scale()?;
             let file = recorded["episode_file"].as_str().unwrap_or_default().to_string();
             self.command("feature-worker", &["episodes", "weigh", &file, "--weight", &weight_g.to_string()])?;
@@ -349,7 +367,13 @@ impl<'a> Demo<'a> {
     }
 
     /// Tries until it works, a process dies, Ctrl-C comes or time is up.
-    fn until<T>(&self, what: &str, seconds: u64, processes: &mut Processes, attempt: impl Fn(&Self) -> Result<T, String>) -> Result<T, DemoError> {
+    fn until<T>(
+        &self,
+        what: &str,
+        seconds: u64,
+        processes: &mut Processes,
+        attempt: impl Fn(&Self) -> Result<T, String>,
+    ) -> Result<T, DemoError> {
         let until = Instant::now() + Duration::from_secs(seconds);
         loop {
             let why = match attempt(self) {

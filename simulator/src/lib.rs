@@ -3,10 +3,12 @@
 
 pub mod camera;
 pub mod cell;
+pub mod demo;
 pub mod evaluate;
 pub mod evaluate_camera;
 pub mod operator;
 pub mod physics;
+pub mod pour_plot;
 pub mod reproduce;
 pub mod ur;
 pub mod ur_command;

@@ -3,7 +3,7 @@
 use std::process::ExitCode;
 
 use clap::{Parser, Subcommand};
-use simulator::{cell, evaluate, evaluate_camera, operator, reproduce, ur_command};
+use simulator::{cell, demo, evaluate, evaluate_camera, operator, reproduce, ur_command};
 
 /// The simulated cell, and everything that needs it.
 #[derive(Parser)]
@@ -19,6 +19,8 @@ enum Command {
     Run(cell::Args),
     /// What an operator does at the cell: fill the container, read the scale.
     Operator(operator::Args),
+    /// The main job, end to end, with the real processes: record, train, pour, report.
+    Demo(demo::Args),
     /// Pours in closed loop over a held-out grid and reports the errors.
     Evaluate(evaluate::Args),
     /// Repeats section 4 of the paper.
@@ -33,6 +35,7 @@ fn main() -> ExitCode {
     match Cli::parse().command {
         Command::Run(args) => cell::run(&args),
         Command::Operator(args) => operator::run(&args),
+        Command::Demo(args) => demo::run(&args),
         Command::Evaluate(args) => evaluate::run(&args),
         Command::Reproduce(args) => reproduce::run(&args),
         Command::EvaluateCamera(args) => evaluate_camera::run(&args),

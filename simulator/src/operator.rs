@@ -12,7 +12,7 @@ use serde_json::Value;
 use shared::config::Config;
 use shared::exit;
 
-use crate::cell;
+use crate::{cell, ur};
 
 /// Command-line arguments.
 #[derive(Debug, clap::Args)]
@@ -36,7 +36,8 @@ enum Act {
         #[command(flatten)]
         common: Common,
     },
-    /// Causes a fault at the robot; see `simulator ur --help` for the names.
+    /// Causes a fault at the simulated robot.
+    #[command(after_help = ur::fault::HELP)]
     Fault {
         /// The fault.
         fault: String,
@@ -57,14 +58,15 @@ struct Common {
 
 /// Runs the command; the exit codes are those of [`shared::exit`].
 pub fn run(args: &Args) -> ExitCode {
-    let (line, common) = match &args.act {
-        Act::Fill { volume_ml, common } => (format!("fill {volume_ml}"), common),
-        Act::Scale { common } => ("scale".into(), common),
-        Act::Fault { fault, common } => (format!("fault {fault}"), common),
-    };
+    let (Act::Fill { common, .. } | Act::Scale { common } | Act::Fault { common, .. }) = &args.act;
     let config = match Config::read(&common.config) {
         Ok(config) => config,
         Err(e) => return exit::fail(exit::BAD_INPUT, e),
+    };
+    let line = match &args.act {
+        Act::Fill { volume_ml, .. } => format!("fill {volume_ml}"),
+        Act::Scale { .. } => "scale".into(),
+        Act::Fault { fault, .. } => return cause(&config, fault),
     };
     let answer = match ask(&config.cell.name, &line) {
         Ok(answer) => answer,
@@ -80,9 +82,20 @@ pub fn run(args: &Args) -> ExitCode {
         _ if common.json => println!("{answer}"),
         Act::Fill { volume_ml, .. } => println!("{volume_ml} ml in the container, the scale reads 0 g"),
         Act::Scale { .. } => println!("{} g", answer["weight_g"]),
-        Act::Fault { fault, .. } => println!("{fault}"),
+        Act::Fault { .. } => {}
     }
     ExitCode::SUCCESS
+}
+
+fn cause(config: &Config, fault: &str) -> ExitCode {
+    let parsed: ur::Fault = match fault.parse() {
+        Ok(fault) => fault,
+        Err(e) => return exit::fail(exit::BAD_INPUT, e),
+    };
+    match ur::send_fault(config.robot.address, &parsed) {
+        Ok(()) => ExitCode::SUCCESS,
+        Err(e) => exit::fail(exit::UNREACHABLE, e),
+    }
 }
 
 /// One line to the cell's operator socket, one answer back.

@@ -28,7 +28,11 @@ pub fn draw(file: &Path, ticks: &[Telemetry], goal_ml: f32, scale_g: f64) -> Res
     root.fill(&WHITE)?;
     let title = format!("Goal {goal_ml:.0} ml, {scale_g:.0} g on the scale, error {:+.1} ml", scale_g - f64::from(goal_ml));
     let panels = root.titled(&title, ("sans-serif", 22))?.split_evenly((3, 1));
-    panel(&panels[0], "alpha, degrees", &[("commanded", ALPHA, points(&|t| t.alpha_deg)), ("measured", MEASURED, points(&|t| t.alpha_measured_deg))])?;
+    panel(
+        &panels[0],
+        "alpha, degrees",
+        &[("commanded", ALPHA, points(&|t| t.alpha_deg)), ("measured", MEASURED, points(&|t| t.alpha_measured_deg))],
+    )?;
     panel(&panels[1], "V_e, px^2", &[("V_e", AREA, points(&|t| t.area_px2))])?;
     panel(&panels[2], "ml", &[("d", D, points(&|t| t.d_ml)), ("poured (estimate)", POURED, points(&|t| t.poured_ml))])?;
     root.present()?;

@@ -1,1 +1,220 @@
-//! Tests that cross processes.
+//! A whole cell of real processes for tests: simulator, feature worker, controller, each with its own shared memory, loopback
+//! address and directory, all stopped and removed when the [`CellUnderTest`] is dropped.
+//!
+//! Only tests use it: it panics when something does not start, and says what the process printed.
+#![forbid(unsafe_code)]
+
+use std::path::{Path, PathBuf};
+use std::process::{Child, Command, Output, Stdio};
+use std::sync::atomic::{AtomicU32, Ordering};
+use std::time::{Duration, Instant};
+
+use serde_json::Value;
+use shared::agent::Selection;
+use shared::estimate::Calibration;
+use shared::policy::{InputScale, Mlp, action_table};
+use shared::weights::{Estimator, Method, Origin, Weights};
+
+static NEXT: AtomicU32 = AtomicU32::new(0);
+
+/// Weights that tilt out by the same action every frame: they pour, though not well.
+pub fn steady_weights(action: usize) -> Weights {
+    let mut policy = Mlp::ZERO;
+    policy.b3[action] = 1.0;
+    Weights {
+        policy,
+        actions_deg: action_table(),
+        selection: Selection::Argmax,
+        scale: InputScale::default(),
+        calibration: Calibration { c: 0.0002, q: 1.0, hold_above_px2: f32::INFINITY },
+        estimator: Estimator::Sum,
+        rate_hz: 30.0,
+        origin: Origin { method: Method::Handmade, actions: 21, episodes: 0, data_sha256: [action as u8; 32] },
+        seed: 1,
+    }
+}
+
+/// Path of a program of the workspace, built beside the tests.
+pub fn program(name: &str) -> PathBuf {
+    let exe = std::env::current_exe().expect("tests have a path");
+    let dir = exe.parent().and_then(Path::parent).expect("tests are in target/PROFILE/deps");
+    let path = dir.join(name);
+    assert!(path.exists(), "{} is missing: build with `cargo build --release --workspace`", path.display());
+    path
+}
+
+/// A running cell.
+pub struct CellUnderTest {
+    /// Its directory: configuration, episodes, weights and logs; removed at the end.
+    pub dir: tempfile::TempDir,
+    /// Its name.
+    pub name: String,
+    /// Its robot's address.
+    pub address: std::net::IpAddr,
+    processes: Vec<(String, Child)>,
+}
+
+impl CellUnderTest {
+    /// A cell with nothing running. `adapt` may change the configuration, which is `config/sim.toml`'s.
+    pub fn prepare(adapt: impl FnOnce(&mut toml::Table)) -> Self {
+        let number = std::process::id() % 60_000 * 4 + NEXT.fetch_add(1, Ordering::Relaxed) % 4;
+        let name = format!("test-{}-{number}", std::process::id());
+        let address = std::net::IpAddr::from([127, 20 + (number / 62_500) as u8, (number / 250 % 250) as u8, 1 + (number % 250) as u8]);
+        let dir = tempfile::tempdir().expect("a directory for the test");
+        let text = include_str!("../../config/sim.toml");
+        let mut config: toml::Table = text.parse().expect("config/sim.toml is valid");
+        let mut set = |section: &str, key: &str, value: toml::Value| {
+            config[section].as_table_mut().expect("a table").insert(key.into(), value);
+        };
+        let path = |p: &str| toml::Value::String(dir.path().join(p).display().to_string());
+        set("cell", "name", toml::Value::String(name.clone()));
+        set("robot", "address", toml::Value::String(address.to_string()));
+        set("controller", "weights", path("weights.bin"));
+        set("controller", "journal", path("journal.bin"));
+        set("recording", "directory", path("episodes"));
+        adapt(&mut config);
+        std::fs::write(dir.path().join("cell.toml"), toml::to_string(&config).expect("still TOML")).expect("writable");
+        Self { dir, name, address, processes: Vec::new() }
+    }
+
+    /// A cell with simulator, feature worker and controller running, and a robot that is ready.
+    pub fn start(adapt: impl FnOnce(&mut toml::Table)) -> Self {
+        let mut cell = Self::prepare(adapt);
+        cell.spawn("simulator");
+        cell.spawn("feature-worker");
+        cell.spawn("rt-controller");
+        cell.wait_idle();
+        cell
+    }
+
+    /// The cell's configuration file.
+    pub fn config(&self) -> PathBuf {
+        self.dir.path().join("cell.toml")
+    }
+
+    /// The file that the controller watches for weights.
+    pub fn weights(&self) -> PathBuf {
+        self.dir.path().join("weights.bin")
+    }
+
+    /// Starts `program run`.
+    pub fn spawn(&mut self, name: &str) {
+        let log =
+            std::fs::OpenOptions::new().create(true).append(true).open(self.dir.path().join(format!("{name}.log"))).expect("writable");
+        let child = Command::new(program(name))
+            .args(["run", "--config"])
+            .arg(self.config())
+            .stdin(Stdio::null())
+            .stdout(Stdio::null())
+            .stderr(log)
+            .spawn()
+            .expect("the program starts");
+        self.processes.push((name.into(), child));
+    }
+
+    /// What a process printed so far.
+    pub fn log(&self, name: &str) -> String {
+        std::fs::read_to_string(self.dir.path().join(format!("{name}.log"))).unwrap_or_default()
+    }
+
+    /// Sends a signal to a process, and forgets it if that ends it at once (KILL).
+    pub fn signal(&mut self, name: &str, signal: rustix::process::Signal) {
+        let i = self.processes.iter().position(|(n, _)| n == name).expect("it runs");
+        rustix::process::kill_process(rustix::process::Pid::from_child(&self.processes[i].1), signal).expect("it is ours");
+        if signal == rustix::process::Signal::KILL {
+            let (_, mut child) = self.processes.remove(i);
+            child.wait().expect("it was ours");
+        }
+    }
+
+    /// Waits for a process to end by itself and gives its exit code.
+    pub fn exit_code(&mut self, name: &str, within: Duration) -> Option<i32> {
+        let i = self.processes.iter().position(|(n, _)| n == name).expect("it runs");
+        let until = Instant::now() + within;
+        while Instant::now() < until {
+            if let Some(status) = self.processes[i].1.try_wait().expect("it is ours") {
+                self.processes.remove(i);
+                return status.code();
+            }
+            std::thread::sleep(Duration::from_millis(20));
+        }
+        None
+    }
+
+    /// Runs a command of an operator to its end.
+    pub fn command(&self, name: &str, words: &[&str]) -> Output {
+        Command::new(program(name)).args(words).arg("--config").arg(self.config()).stdin(Stdio::null()).output().expect("it runs")
+    }
+
+    /// Starts a command of an operator in the background.
+    pub fn begin(&self, name: &str, words: &[&str]) -> Child {
+        let mut command = Command::new(program(name));
+        command.args(words).arg("--config").arg(self.config()).stdin(Stdio::null()).stdout(Stdio::piped()).stderr(Stdio::piped());
+        command.spawn().expect("it starts")
+    }
+
+    /// Runs a command that must succeed and print JSON.
+    pub fn json(&self, name: &str, words: &[&str]) -> Value {
+        let output = self.command(name, words);
+        assert!(output.status.success(), "{name} {words:?}: {}", String::from_utf8_lossy(&output.stderr));
+        serde_json::from_slice(&output.stdout).expect("JSON")
+    }
+
+    /// The controller's status, if it answers.
+    pub fn status(&self) -> Option<Value> {
+        let output = self.command("rt-controller", &["status", "--json"]);
+        serde_json::from_slice(&output.stdout).ok().filter(|_| output.status.success())
+    }
+
+    /// Waits until `good` holds for the controller's status; the newest status is in the panic otherwise.
+    pub fn wait(&self, what: &str, within: Duration, good: impl Fn(&Value) -> bool) -> Value {
+        let until = Instant::now() + within;
+        let mut newest = None;
+        while Instant::now() < until {
+            newest = self.status();
+            if let Some(status) = newest.as_ref().filter(|s| good(s)) {
+                return status.clone();
+            }
+            std::thread::sleep(Duration::from_millis(50));
+        }
+        let logs: Vec<String> = ["simulator", "feature-worker", "rt-controller"].map(|n| format!("{n}:\n{}", self.log(n))).into();
+        panic!("{what} did not happen; status {newest:#?}\n{}", logs.join("\n"));
+    }
+
+    /// Waits until the robot is ready, upright, and features arrive.
+    pub fn wait_idle(&self) -> Value {
+        self.wait("readiness", Duration::from_secs(30), |s| s["phase"] == "idle" && s["feature_sequence"].as_u64() > Some(0))
+    }
+
+    /// Writes weights where the controller watches, and waits until the loop took them.
+    pub fn take_weights(&self, weights: &Weights) {
+        let before = self.status().expect("a controller")["weights_taken"].as_u64();
+        weights.write(&self.weights()).expect("writable");
+        self.wait("the weight swap", Duration::from_secs(5), |s| s["weights_taken"].as_u64() > before);
+    }
+}
+
+impl Drop for CellUnderTest {
+    fn drop(&mut self) {
+        // The controller first, while the robot is still there.
+        while let Some((name, mut child)) = self.processes.pop() {
+            let pid = rustix::process::Pid::from_child(&child);
+            let _ = rustix::process::kill_process(pid, rustix::process::Signal::CONT);
+            let _ = rustix::process::kill_process(pid, rustix::process::Signal::TERM);
+            let until = Instant::now() + Duration::from_secs(10);
+            while matches!(child.try_wait(), Ok(None)) {
+                if Instant::now() > until {
+                    eprintln!("{name} did not end on SIGTERM");
+                    let _ = child.kill();
+                }
+                std::thread::sleep(Duration::from_millis(10));
+            }
+        }
+        let _ = std::fs::remove_dir_all(format!("/tmp/decant_{}", self.name));
+        for entry in std::fs::read_dir("/dev/shm").into_iter().flatten().flatten() {
+            if entry.file_name().to_string_lossy().starts_with(&format!("decant_{}_", self.name)) {
+                let _ = std::fs::remove_file(entry.path());
+            }
+        }
+    }
+}

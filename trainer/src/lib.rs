@@ -1,8 +1,15 @@
 //! The offline trainer: weighed episodes in, one weight file out. It knows nothing of the simulator.
 #![forbid(unsafe_code)]
 
+pub mod best;
+pub mod calibrate;
 pub mod check;
+pub mod data;
+pub mod distill;
+pub mod fit;
 pub mod inspect;
+pub mod law;
+pub mod net;
 pub mod refine;
 pub mod report;
 pub mod train;

@@ -27,8 +27,11 @@ pub fn check(state: &RobotState, now_ns: u64, lost_ns: u64) -> Result<(), EndRea
         return Err(EndReason::RobotStalled);
     }
     match state.program_state {
-        // The robot is well and hears us, yet its program ran out of patience: we were silent.
-        ProgramState::Returning | ProgramState::TimedOut => return Err(EndReason::ControllerOverrun),
+        // The program ran out of patience. If it has read all that was sent, we were silent; if not, it did not get through.
+        ProgramState::Returning | ProgramState::TimedOut if state.sequence_echo == state.sequence_sent => {
+            return Err(EndReason::ControllerOverrun);
+        }
+        ProgramState::Returning | ProgramState::TimedOut => return Err(EndReason::RobotLost),
         state if !state.takes_targets() => return Err(EndReason::ProgramStopped),
         _ => {}
     }

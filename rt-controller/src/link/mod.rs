@@ -120,6 +120,8 @@ pub struct RobotState {
     pub program_run: i32,
     /// Number of the newest target that the program has read.
     pub sequence_echo: i32,
+    /// Number of the newest target that was sent; 0 before the first.
+    pub sequence_sent: i32,
     /// When this was taken from the socket, CLOCK_MONOTONIC ns.
     pub received_at_ns: u64,
     /// When the robot's clock was last seen to advance, CLOCK_MONOTONIC ns.

@@ -40,7 +40,6 @@ pub struct Session {
     input_recipe: u8,
     version: [u32; 4],
     state: RobotState,
-    sequence: i32,
     texts: u64,
 }
 
@@ -55,7 +54,7 @@ impl Session {
         state: RobotState,
     ) -> std::io::Result<Self> {
         stream.set_nonblocking(true)?;
-        Ok(Self { stream, inbox, tilt, output_recipe, input_recipe, version, state, sequence: 0, texts: 0 })
+        Ok(Self { stream, inbox, tilt, output_recipe, input_recipe, version, state, texts: 0 })
     }
 
     /// PolyScope's version: major, minor, bugfix, build.
@@ -105,7 +104,8 @@ impl Session {
                     if self.state.timestamp_s > before.timestamp_s {
                         self.state.advanced_at_ns = now_ns;
                     }
-                    if self.state.sequence_echo == self.sequence || self.state.sequence_echo != before.sequence_echo || self.sequence == 0 {
+                    let (echo, sent) = (self.state.sequence_echo, self.state.sequence_sent);
+                    if echo == sent || echo != before.sequence_echo || sent == 0 {
                         self.state.answered_at_ns = now_ns;
                     }
                 }
@@ -122,7 +122,7 @@ impl Session {
     /// Either the whole frame goes to the kernel at once, or the session is over.
     pub fn send(&mut self, mode: Mode, alpha_deg: f32) -> Result<i32, Lost> {
         let (mode, alpha_deg) = if alpha_deg.is_finite() { (mode, alpha_deg) } else { (Mode::Hold, self.state.alpha_deg) };
-        let sequence = self.sequence.checked_add(1).unwrap_or(1);
+        let sequence = self.state.sequence_sent.checked_add(1).unwrap_or(1);
         let frame = wire::encode_target(self.input_recipe, sequence, mode as i32, self.tilt.joint_rad(alpha_deg));
         loop {
             match self.stream.write(&frame) {
@@ -134,7 +134,7 @@ impl Session {
                 Err(_) => return Err(Lost::Broken),
             }
         }
-        self.sequence = sequence;
+        self.state.sequence_sent = sequence;
         Ok(sequence)
     }
 }

@@ -57,7 +57,10 @@ impl Shape {
     /// Inner height, mm.
     pub fn height_mm(&self) -> f64 {
         match *self {
-            Self::Cylinder { height_mm, .. } | Self::Cone { height_mm, .. } | Self::Bottle { height_mm, .. } | Self::Jug { height_mm, .. } => height_mm,
+            Self::Cylinder { height_mm, .. }
+            | Self::Cone { height_mm, .. }
+            | Self::Bottle { height_mm, .. }
+            | Self::Jug { height_mm, .. } => height_mm,
         }
     }
 
@@ -177,8 +180,7 @@ impl Container {
         let steps = (180.0 / TABLE_STEP_DEG) as usize;
         let entry = |k: usize| (shape.retained_ml(k as f64 * TABLE_STEP_DEG), shape.surface_mm2(k as f64 * TABLE_STEP_DEG));
         let table: std::sync::Arc<[(f64, f64)]> = (0..=steps).map(entry).collect();
-        let mut container =
-            Self { shape, lip_width_mm, mu, table, volume_ml: 0.0, film_ml: 0.0, poured_ml: 0.0, lip: Lip::default() };
+        let mut container = Self { shape, lip_width_mm, mu, table, volume_ml: 0.0, film_ml: 0.0, poured_ml: 0.0, lip: Lip::default() };
         container.refill(volume_ml);
         container
     }
@@ -280,7 +282,8 @@ mod tests {
     fn a_cylinder_retains_what_its_integral_says() {
         for alpha in [5.0f64, 30.0, 55.0, 70.0, 85.0] {
             let tan = alpha.to_radians().tan();
-            let direct = midpoints(-38.0, 38.0, 4000, |x| 2.0 * (38.0f64 * 38.0 - x * x).sqrt() * (115.0 - (38.0 - x) * tan).max(0.0)) / 1000.0;
+            let direct =
+                midpoints(-38.0, 38.0, 4000, |x| 2.0 * (38.0f64 * 38.0 - x * x).sqrt() * (115.0 - (38.0 - x) * tan).max(0.0)) / 1000.0;
             assert!((BEAKER.retained_ml(alpha) - direct).abs() < 0.05, "{alpha}: {} {direct}", BEAKER.retained_ml(alpha));
         }
         let full = std::f64::consts::PI * 38.0 * 38.0 * 115.0 / 1000.0;

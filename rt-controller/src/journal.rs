@@ -1,0 +1,199 @@
+//! The journal: every tick's inputs and answer, so that a run can be replayed bit for bit.
+//!
+//! The loop hands each [`Tick`] to the ordinary thread through a queue; there it is written ([`Writer`]). Reading and replaying
+//! are for commands and tests. A file that was cut off reads up to its last whole entry. Layout: the 8 bytes [`MAGIC`], then
+//! entries, each a little-endian u32 length and that many bytes of postcard.
+
+use std::fs::File;
+use std::io::{BufReader, BufWriter, Read, Write};
+use std::path::Path;
+
+use serde::{Deserialize, Serialize};
+use shared::agent::Agent;
+use shared::messages::Feature;
+use shared::weights::Weights;
+
+use crate::core::{Core, Input, MAX_FEATURES, Order, Robot, Settings};
+
+/// First bytes of a journal, its version included.
+const MAGIC: &[u8; 8] = b"decantj1";
+/// Longest entry, bytes: a weight file and some.
+const ENTRY_MAX: usize = 128 * 1024;
+/// A journal stops growing here: about three days.
+const FILE_MAX: u64 = 2 << 30;
+
+/// One tick: everything that [`Core::step`] saw, and the target that it answered with.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Tick {
+    /// When it woke up, ns.
+    pub now_ns: u64,
+    /// The features of the tick.
+    pub features: heapless::Vec<Feature, MAX_FEATURES>,
+    /// The robot.
+    pub robot: Robot,
+    /// The order.
+    pub order: Option<Order>,
+    /// Number of the policy that was taken in this tick.
+    pub agent: Option<u64>,
+    /// The answer, degrees; `None`: nothing was commanded.
+    pub target_deg: Option<f32>,
+    /// d after the tick, ml.
+    pub d_ml: f32,
+}
+
+/// One entry of the file.
+#[derive(Debug, Serialize, Deserialize)]
+enum Entry {
+    Settings(Settings),
+    /// Weights with this number, as the bytes of a weight file; before the tick that takes them.
+    Weights(u64, Vec<u8>),
+    Tick(Box<Tick>),
+}
+
+/// Why a journal cannot be read.
+#[derive(Debug, thiserror::Error)]
+pub enum JournalError {
+    /// The file cannot be read.
+    #[error("{file}: {what}")]
+    Read {
+        /// The file.
+        file: String,
+        /// The system's words.
+        what: String,
+    },
+    /// Not a journal of this version.
+    #[error("{file}: not a journal of this version; it is written by `rt-controller run` where controller.journal is set")]
+    Foreign {
+        /// The file.
+        file: String,
+    },
+    /// An entry that makes no sense.
+    #[error("{file}: damaged at byte {at}; what comes before can be replayed from a copy cut there")]
+    Damaged {
+        /// The file.
+        file: String,
+        /// Where.
+        at: u64,
+    },
+}
+
+/// Writes a journal; ordinary thread.
+pub struct Writer {
+    file: BufWriter<File>,
+    written: u64,
+}
+
+impl Writer {
+    /// Starts a journal; one that is there already is replaced.
+    pub fn create(path: &Path, settings: &Settings) -> std::io::Result<Self> {
+        if let Some(parent) = path.parent() {
+            std::fs::create_dir_all(parent)?;
+        }
+        let mut this = Self { file: BufWriter::new(File::create(path)?), written: 0 };
+        this.file.write_all(MAGIC)?;
+        this.entry(&Entry::Settings(*settings))?;
+        Ok(this)
+    }
+
+    /// Weights that the loop may take from now on.
+    pub fn weights(&mut self, number: u64, weights: &Weights) -> std::io::Result<()> {
+        let bytes = weights.to_bytes().map_err(std::io::Error::other)?;
+        self.entry(&Entry::Weights(number, bytes))
+    }
+
+    /// One tick.
+    pub fn tick(&mut self, tick: Box<Tick>) -> std::io::Result<()> {
+        self.entry(&Entry::Tick(tick))
+    }
+
+    /// Passes everything on to the system.
+    pub fn flush(&mut self) -> std::io::Result<()> {
+        self.file.flush()
+    }
+
+    fn entry(&mut self, entry: &Entry) -> std::io::Result<()> {
+        if self.written > FILE_MAX {
+            return Err(std::io::Error::other("the journal is full (2 GiB)"));
+        }
+        let mut buffer = vec![0; ENTRY_MAX];
+        let bytes = postcard::to_slice(entry, &mut buffer).map_err(std::io::Error::other)?;
+        self.written += 4 + bytes.len() as u64;
+        self.file.write_all(&(bytes.len() as u32).to_le_bytes())?;
+        self.file.write_all(bytes)
+    }
+}
+
+/// What a replay found.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct Replay {
+    /// Ticks replayed.
+    pub ticks: u64,
+    /// Pours and recordings that ended in them.
+    pub ended: Vec<shared::control::Outcome>,
+    /// Ticks whose target or d differs in any bit.
+    pub different: u64,
+    /// The first of those.
+    pub first_different: Option<u64>,
+    /// The file ends in the middle of an entry.
+    pub cut_off: bool,
+}
+
+/// Replays a journal through a new [`Core`] and compares every answer bit by bit. `seen` gets each tick with the answer that
+/// the replay gave.
+pub fn replay(path: &Path, mut seen: impl FnMut(&Tick, &crate::core::Output)) -> Result<Replay, JournalError> {
+    let file = path.display().to_string();
+    let read = |e: std::io::Error| JournalError::Read { file: file.clone(), what: e.to_string() };
+    let mut reader = BufReader::new(File::open(path).map_err(read)?);
+    let mut magic = [0; 8];
+    if reader.read_exact(&mut magic).is_err() || &magic != MAGIC {
+        return Err(JournalError::Foreign { file });
+    }
+    let mut result = Replay { ticks: 0, ended: Vec::new(), different: 0, first_different: None, cut_off: false };
+    let mut core: Option<Core> = None;
+    let mut weights: Vec<(u64, Weights)> = Vec::new();
+    let mut at = MAGIC.len() as u64;
+    let mut buffer = Vec::new();
+    loop {
+        let mut length = [0; 4];
+        match reader.read(&mut length[..1]).map_err(read)? {
+            0 => return Ok(result),
+            _ if reader.read_exact(&mut length[1..]).is_err() => break,
+            _ => {}
+        }
+        let length = u32::from_le_bytes(length) as usize;
+        let damaged = || JournalError::Damaged { file: file.clone(), at };
+        if length > ENTRY_MAX {
+            return Err(damaged());
+        }
+        buffer.resize(length, 0);
+        if reader.read_exact(&mut buffer).is_err() {
+            break;
+        }
+        match (postcard::from_bytes(&buffer).map_err(|_| damaged())?, &mut core) {
+            (Entry::Settings(settings), _) => core = Some(Core::new(settings)),
+            (Entry::Weights(number, bytes), _) => weights.push((number, Weights::from_bytes(&bytes, &file).map_err(|_| damaged())?)),
+            (Entry::Tick(tick), Some(core)) => {
+                if let Some(number) = tick.agent {
+                    let (_, taken) = weights.iter().find(|(n, _)| *n == number).ok_or_else(damaged)?;
+                    core.exchange(Box::new(Agent::new(taken)));
+                    weights.retain(|(n, _)| *n >= number);
+                }
+                let Tick { now_ns, ref features, robot, order, .. } = *tick;
+                let output = core.step(&Input { now_ns, features, robot, order });
+                let same = output.target_deg.map(f32::to_bits) == tick.target_deg.map(f32::to_bits)
+                    && output.telemetry.d_ml.to_bits() == tick.d_ml.to_bits();
+                if !same {
+                    result.different += 1;
+                    result.first_different.get_or_insert(result.ticks);
+                }
+                result.ticks += 1;
+                result.ended.extend(output.ended);
+                seen(&tick, &output);
+            }
+            (Entry::Tick(_), None) => return Err(damaged()),
+        }
+        at += 4 + length as u64;
+    }
+    result.cut_off = true;
+    Ok(result)
+}

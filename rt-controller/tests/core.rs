@@ -1,0 +1,287 @@
+//! The controller core against a leaking toy container: phases, endings, limits, weights, bridging.
+
+use rt_controller::core::{Core, Input, Order, Output, Refusal, Robot, Settings, curve_alpha_deg};
+use shared::agent::{Agent, Selection};
+use shared::config::Config;
+use shared::control::{Curve, EndReason, Outcome};
+use shared::estimate::Calibration;
+use shared::messages::{Doubt, Feature, LAYOUT_VERSION, Phase};
+use shared::policy::{InputScale, Mlp, action_table};
+use shared::weights::{Estimator, Method, Origin, Weights};
+
+/// A policy that always gives the action `index`; 1 px^2 is 0.001 ml.
+fn always(index: usize) -> Box<Agent> {
+    let mut policy = Mlp::ZERO;
+    policy.b3[index] = 1.0;
+    Box::new(Agent::new(&Weights {
+        policy,
+        actions_deg: action_table(),
+        selection: Selection::Argmax,
+        scale: InputScale::default(),
+        calibration: Calibration { c: 0.001, q: 1.0, hold_above_px2: f32::INFINITY },
+        estimator: Estimator::Sum,
+        rate_hz: 30.0,
+        origin: Origin { method: Method::Handmade, actions: 21, episodes: 0, data_sha256: [0; 32] },
+        seed: 1,
+    }))
+}
+
+/// The cell around the core: a robot that follows at once, a container that leaks from 40 degrees on, a camera.
+struct World {
+    core: Core,
+    now_ns: u64,
+    sequence: u64,
+    epoch_ns: u64,
+    alpha_deg: f32,
+    hindrance: Option<EndReason>,
+    doubt: Doubt,
+    camera: bool,
+    dry: bool,
+    settings: Settings,
+    out_ml: f32,
+    largest_rate_deg_s: f32,
+}
+
+impl World {
+    fn new() -> Self {
+        let config = Config::parse(include_str!("../../config/sim.toml"), "config/sim.toml").expect("the shipped configuration is valid");
+        let settings = Settings::new(&config);
+        let mut core = Core::new(settings);
+        core.exchange(always(13));
+        let mut world = Self {
+            core,
+            now_ns: 1_000_000_000,
+            sequence: 0,
+            epoch_ns: 7,
+            alpha_deg: 0.0,
+            hindrance: None,
+            doubt: Doubt::None,
+            camera: true,
+            dry: false,
+            settings,
+            out_ml: 0.0,
+            largest_rate_deg_s: 0.0,
+        };
+        world.tick(None);
+        world
+    }
+
+    fn feature(&mut self) -> Feature {
+        self.sequence += 1;
+        let area_px2 = if self.dry { 0.0 } else { 40.0 * (self.alpha_deg - 40.0).max(0.0) };
+        self.out_ml += area_px2 * 0.001;
+        Feature {
+            version: LAYOUT_VERSION,
+            doubt: self.doubt as u32,
+            sequence: self.sequence,
+            worker_epoch_ns: self.epoch_ns,
+            captured_at_ns: self.now_ns - 20_000_000,
+            received_at_ns: self.now_ns - 1_000_000,
+            published_at_ns: self.now_ns - 500_000,
+            area_px2,
+            confidence: 1.0,
+            triangle_px: [0.0; 6],
+        }
+    }
+
+    fn tick(&mut self, order: Option<Order>) -> Output {
+        self.now_ns += self.settings.period_ns;
+        let fresh = if self.camera { vec![self.feature()] } else { vec![] };
+        self.step(&fresh, order)
+    }
+
+    fn step(&mut self, features: &[Feature], order: Option<Order>) -> Output {
+        let robot = Robot { hindrance: self.hindrance, alpha_deg: self.alpha_deg, at_ns: self.now_ns };
+        let output = self.core.step(&Input { now_ns: self.now_ns, features, robot, order });
+        if let Some(target_deg) = output.target_deg {
+            let rate = (target_deg - self.alpha_deg).abs() / (self.settings.period_ns as f32 / 1e9);
+            self.largest_rate_deg_s = self.largest_rate_deg_s.max(rate);
+            self.alpha_deg = target_deg;
+        }
+        output
+    }
+
+    fn pour(&mut self, goal_ml: f32) -> Result<(), Refusal> {
+        self.tick(Some(Order::Pour { episode: 5, goal_ml })).ordered.expect("an order is answered in its tick")
+    }
+
+    /// Ticks until the pour has ended.
+    fn finish(&mut self) -> Outcome {
+        for _ in 0..2000 {
+            if let Some(outcome) = self.tick(None).ended {
+                return outcome;
+            }
+        }
+        panic!("the pour never ended, phase {:?}", self.core.phase());
+    }
+
+    fn run_to_flow(&mut self) {
+        while self.alpha_deg < 45.0 {
+            self.tick(None);
+        }
+    }
+}
+
+/// Protects section 3.3.2's beginning: with d = 0 the controller does nothing and stays at the start.
+#[test]
+fn idle_it_stays_at_the_start() {
+    let mut world = World::new();
+    for _ in 0..100 {
+        assert_eq!(world.tick(None).target_deg, Some(0.0));
+    }
+    assert_eq!(world.core.phase(), Phase::Idle);
+}
+
+/// Protects the pour: it tilts, counts, returns to the start angle when d reaches 0, and reports what flowed.
+#[test]
+fn a_pour_ends_upright_with_its_volume() {
+    let mut world = World::new();
+    world.pour(8.0).expect("ready");
+    let outcome = world.finish();
+    assert_eq!((outcome.reason, outcome.episode, outcome.goal_ml), (EndReason::Done, 5, Some(8.0)));
+    assert_eq!((world.alpha_deg, world.core.phase()), (0.0, Phase::Idle));
+    assert!((outcome.poured_ml - world.out_ml).abs() < 0.05, "reported {}, really {}", outcome.poured_ml, world.out_ml);
+    assert!(outcome.poured_ml >= 8.0 && outcome.bridged_frames == 0);
+    assert!(world.largest_rate_deg_s <= 90.01);
+    world.pour(3.0).expect("the next pour starts");
+}
+
+/// Protects the operator: a second goal while pouring, nonsense goals and missing weights are refused, with the reason.
+#[test]
+fn orders_that_cannot_be_obeyed_are_refused() {
+    let mut world = World::new();
+    for goal_ml in [0.0, -4.0, f32::NAN, f32::INFINITY, 301.0] {
+        assert_eq!(world.pour(goal_ml), Err(Refusal::Goal(300.0)));
+    }
+    world.pour(50.0).expect("ready");
+    assert_eq!(world.pour(60.0), Err(Refusal::Busy));
+    let mut blank = World::new();
+    blank.core = Core::new(blank.settings);
+    blank.tick(None);
+    assert_eq!(blank.pour(50.0), Err(Refusal::NoWeights));
+    blank.hindrance = Some(EndReason::ProtectiveStop);
+    assert_eq!(blank.pour(50.0), Err(Refusal::Robot(EndReason::ProtectiveStop)));
+}
+
+/// Protects people: whatever goes wrong at full flow, the pour ends with its reason, and upright if the robot may still move.
+#[test]
+fn every_doubt_ends_the_pour_upright_with_its_reason() {
+    type Trouble = fn(&mut World);
+    let troubles: [(Trouble, EndReason); 6] = [
+        (|w| w.camera = false, EndReason::StaleFeature),
+        (|w| w.epoch_ns += 1, EndReason::WorkerRestarted),
+        (|w| w.dry = true, EndReason::ContainerEmpty),
+        (|w| w.now_ns += 150_000_000, EndReason::ControllerOverrun),
+        (|w| _ = w.tick(Some(Order::Abort)), EndReason::Aborted),
+        (|w| _ = w.tick(Some(Order::Shutdown)), EndReason::Shutdown),
+    ];
+    for (trouble, reason) in troubles {
+        let mut world = World::new();
+        world.pour(200.0).expect("ready");
+        world.run_to_flow();
+        trouble(&mut world);
+        assert_eq!(world.finish().reason, reason);
+        assert_eq!(world.alpha_deg, 0.0, "{reason:?}");
+        assert!(world.largest_rate_deg_s <= 90.01);
+    }
+}
+
+/// Protects people: when the robot may not move, nothing is commanded, the pour ends at once, and nothing resumes by itself.
+#[test]
+fn a_robot_that_may_not_move_gets_no_targets() {
+    for reason in [EndReason::ProtectiveStop, EndReason::EmergencyStop, EndReason::RobotLost, EndReason::ProgramStopped] {
+        let mut world = World::new();
+        world.pour(200.0).expect("ready");
+        world.run_to_flow();
+        world.hindrance = Some(reason);
+        let output = world.tick(None);
+        assert_eq!((output.target_deg, output.ended.map(|o| o.reason)), (None, Some(reason)));
+        assert!(output.ended.is_some_and(|o| o.poured_ml > 0.0), "the volume so far is reported");
+        world.hindrance = None;
+        for _ in 0..30 {
+            assert_eq!(world.tick(None).target_deg, None, "still tilted: waits for a person");
+        }
+        world.alpha_deg = 0.3;
+        world.tick(None);
+        assert_eq!(world.core.phase(), Phase::Idle);
+        world.pour(5.0).expect("a new pour works");
+    }
+}
+
+/// Protects the volume: frames that were lost are counted and bridged, doubtful ones are not believed.
+#[test]
+fn lost_and_doubtful_frames_are_bridged() {
+    let mut world = World::new();
+    world.pour(30.0).expect("ready");
+    world.run_to_flow();
+    world.feature();
+    world.feature();
+    world.doubt = Doubt::TooDark;
+    world.tick(None);
+    world.doubt = Doubt::None;
+    let outcome = world.finish();
+    assert_eq!((outcome.reason, outcome.bridged_frames), (EndReason::Done, 2));
+    // The three frames are taken as the one before them: the flow is rising, so a little is missing.
+    assert!((outcome.poured_ml - world.out_ml).abs() < 0.5, "reported {}, really {}", outcome.poured_ml, world.out_ml);
+}
+
+/// Protects d from being counted twice: repeated, older and foreign features are ignored and counted.
+#[test]
+fn repeated_features_count_once() {
+    let mut world = World::new();
+    world.pour(30.0).expect("ready");
+    world.run_to_flow();
+    world.now_ns += world.settings.period_ns;
+    let feature = world.feature();
+    let once_ml = world.step(&[feature], None).telemetry.d_ml;
+    world.now_ns += world.settings.period_ns;
+    let older = Feature { sequence: 1, ..feature };
+    let foreign = Feature { version: LAYOUT_VERSION + 1, sequence: 1_000_000, ..feature };
+    assert_eq!(world.step(&[feature, older, foreign], None).telemetry.d_ml, once_ml);
+    assert_eq!(world.core.counters().ignored_features, 3);
+}
+
+/// Protects a pour in progress: new weights wait for its end, and the old ones come back to be dropped elsewhere.
+#[test]
+fn weights_are_exchanged_between_pours_only() {
+    let mut world = World::new();
+    assert!(world.core.exchange(always(13)).is_some());
+    world.pour(8.0).expect("ready");
+    assert!(!world.core.may_exchange());
+    world.finish();
+    assert!(world.core.may_exchange());
+    // A policy that stays never pours: the largest number of frames ends it.
+    world.core.exchange(always(10));
+    world.pour(8.0).expect("ready");
+    let outcome = world.finish();
+    assert_eq!((outcome.reason, outcome.frames >= world.settings.max_frames), (EndReason::MaxFrames, true));
+}
+
+/// Protects eq. (1): the curve is run as given, to its end; one that leaves the limits is refused before it starts.
+#[test]
+fn a_recording_follows_the_curve() {
+    let mut world = World::new();
+    let curve = Curve { lambda_deg: 70.0, gamma_per_s2: 0.3, beta_s: 4.914 };
+    for bad in [
+        Curve { lambda_deg: 200.0, ..curve },
+        Curve { gamma_per_s2: 9.0, ..curve },
+        Curve { beta_s: 1.0, ..curve },
+        Curve { beta_s: f32::NAN, ..curve },
+    ] {
+        let answer = world.tick(Some(Order::Record { episode: 6, curve: bad })).ordered;
+        assert_eq!(answer, Some(Err(Refusal::Curve)), "{bad:?}");
+    }
+    world.tick(Some(Order::Record { episode: 6, curve })).ordered.expect("answered").expect("ready");
+    let start_ns = world.now_ns;
+    loop {
+        let output = world.tick(None);
+        let t = (world.now_ns - start_ns) as f32 / 1e9;
+        if t > 2.0 * curve.beta_s {
+            break;
+        }
+        assert!((world.alpha_deg - curve_alpha_deg(&curve, t)).abs() < 0.06, "at {t} s");
+        assert_eq!(output.telemetry.lambda_deg, 70.0);
+    }
+    let outcome = world.finish();
+    assert_eq!((outcome.reason, outcome.goal_ml, world.alpha_deg), (EndReason::Done, None, 0.0));
+}

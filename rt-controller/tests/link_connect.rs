@@ -1,0 +1,470 @@
+//! The robot link against a small scripted server on real sockets: connecting, every refusal, and the loop's side.
+//!
+//! Each test has its own loopback address, because the ports of a UR controller are fixed.
+
+use std::io::{ErrorKind, Read, Write};
+use std::net::{Ipv4Addr, TcpListener, TcpStream};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicUsize, Ordering};
+use std::thread;
+use std::time::Duration;
+
+use rt_controller::link::{LinkError, LinkOptions, Lost, Mode, ProgramState, Session, TiltJoint, connect};
+use shared::config::Joint;
+use shared::control::EndReason;
+use shared::limits::Limits;
+use shared::os::now_ns;
+
+const OUTPUT_TYPES: &str = "DOUBLE,VECTOR6D,VECTOR6D,VECTOR6D,INT32,INT32,UINT32,UINT32,INT32,INT32,INT32,DOUBLE";
+
+/// What the server says; the defaults are a robot that is well.
+#[derive(Clone)]
+struct Robot {
+    version_accepted: u8,
+    version: [u32; 4],
+    outputs: (u8, String),
+    inputs: (u8, String),
+    start_accepted: u8,
+    /// Sent before each answer.
+    chatter: Vec<u8>,
+    /// Bytes of one TCP segment.
+    piece: usize,
+    /// Closes the RTDE connection instead of answering this request.
+    closes_at: Option<u8>,
+    /// Never answers this request.
+    deaf_to: Option<u8>,
+    robot_mode: i32,
+    safety_mode: i32,
+    runtime_state: u32,
+    joint_rad: f64,
+    /// What the program does once it was uploaded.
+    program: ProgramState,
+    /// Whether an uploaded program starts.
+    starts: bool,
+}
+
+impl Default for Robot {
+    fn default() -> Self {
+        Self {
+            version_accepted: 1,
+            version: [3, 15, 8, 106339],
+            outputs: (1, OUTPUT_TYPES.into()),
+            inputs: (2, "INT32,INT32,DOUBLE".into()),
+            start_accepted: 1,
+            chatter: Vec::new(),
+            piece: usize::MAX,
+            closes_at: None,
+            deaf_to: None,
+            robot_mode: 7,
+            safety_mode: 1,
+            runtime_state: 1,
+            joint_rad: 0.01,
+            program: ProgramState::Ready,
+            starts: true,
+        }
+    }
+}
+
+/// The server while a test runs.
+struct Server {
+    options: LinkOptions,
+    robot: Robot,
+    rtde: TcpListener,
+    script: TcpListener,
+}
+
+/// What the server saw, and its end of the RTDE connection.
+struct Seen {
+    requests: Vec<u8>,
+    /// Payload of the output recipe's request.
+    outputs: Vec<u8>,
+    program: String,
+    rtde: TcpStream,
+}
+
+fn frame(kind: u8, payload: &[u8]) -> Vec<u8> {
+    let mut frame = ((payload.len() + 3) as u16).to_be_bytes().to_vec();
+    frame.push(kind);
+    frame.extend(payload);
+    frame
+}
+
+fn text(message: &str) -> Vec<u8> {
+    let mut payload = vec![message.len() as u8];
+    payload.extend(message.as_bytes());
+    payload.extend([0, 2]);
+    frame(b'M', &payload)
+}
+
+/// A DATA_PACKAGE: the clock, the joint, the program's registers.
+fn data(robot: &Robot, timestamp_s: f64, program: ProgramState, echo: i32, run: i32) -> Vec<u8> {
+    let mut payload = vec![robot.outputs.0];
+    payload.extend(timestamp_s.to_be_bytes());
+    for value in [robot.joint_rad, robot.joint_rad, 0.0] {
+        payload.extend([0.0, 0.0, 0.0, 0.0, 0.0, value].map(f64::to_be_bytes).concat());
+    }
+    payload.extend([robot.robot_mode, robot.safety_mode].map(i32::to_be_bytes).concat());
+    payload.extend([1, robot.runtime_state].map(u32::to_be_bytes).concat());
+    payload.extend([program as i32, echo, run].map(i32::to_be_bytes).concat());
+    payload.extend(robot.joint_rad.to_be_bytes());
+    frame(b'U', &payload)
+}
+
+impl Server {
+    fn new(last: u8, robot: Robot) -> Self {
+        let address = Ipv4Addr::new(127, 41, 0, last);
+        let options = LinkOptions {
+            address: address.into(),
+            tilt: TiltJoint { joint: Joint::Wrist3, start_deg: 0.0, direction: 1.0 },
+            start_tolerance_deg: 2.0,
+            register_base: 24,
+            lookahead_s: 0.05,
+            gain: 600.0,
+            limits: Limits::default(),
+            rate_hz: 30.0,
+        };
+        let rtde = TcpListener::bind((address, 30004)).unwrap();
+        let script = TcpListener::bind((address, 30003)).unwrap();
+        Self { options, robot, rtde, script }
+    }
+
+    /// Connects to the server and gives both ends.
+    fn meet(self) -> (Result<Session, LinkError>, Option<Seen>) {
+        let options = self.options.clone();
+        let served = thread::spawn(move || self.serve().ok());
+        let session = connect(&options);
+        // Frees a server that was never asked for its script port.
+        let _ = TcpStream::connect((options.address, 30003));
+        (session, served.join().unwrap())
+    }
+
+    fn serve(self) -> std::io::Result<Seen> {
+        let robot = self.robot;
+        let (mut rtde, _) = self.rtde.accept()?;
+        rtde.set_nodelay(true)?;
+        let (mut requests, mut outputs) = (Vec::new(), Vec::new());
+        while requests.last() != Some(&b'S') {
+            let mut head = [0; 3];
+            rtde.read_exact(&mut head)?;
+            let mut payload = vec![0; usize::from(u16::from_be_bytes([head[0], head[1]])) - 3];
+            rtde.read_exact(&mut payload)?;
+            requests.push(head[2]);
+            if head[2] == b'O' {
+                outputs.clone_from(&payload);
+            }
+            if robot.closes_at == Some(head[2]) {
+                return Err(ErrorKind::ConnectionAborted.into());
+            }
+            let recipe = |(id, types): &(u8, String)| [&[*id], types.as_bytes()].concat();
+            let answer = match head[2] {
+                b'V' => vec![robot.version_accepted],
+                b'v' => robot.version.map(u32::to_be_bytes).concat(),
+                b'O' => recipe(&robot.outputs),
+                b'I' => recipe(&robot.inputs),
+                _ => vec![robot.start_accepted],
+            };
+            let mut bytes = robot.chatter.clone();
+            if robot.deaf_to != Some(head[2]) {
+                bytes.extend(frame(head[2], &answer));
+            }
+            send_in_pieces(&mut rtde, &bytes, robot.piece)?;
+        }
+        send_in_pieces(&mut rtde, &data(&robot, 1.0, ProgramState::Following, 500, 1), robot.piece)?;
+        let (mut script, _) = self.script.accept()?;
+        script.write_all(&[0; 1108])?;
+        let mut program = Vec::new();
+        let mut buffer = [0; 4096];
+        while !program.ends_with(b"\nend\n") {
+            match script.read(&mut buffer)? {
+                0 => break,
+                n => program.extend(&buffer[..n]),
+            }
+        }
+        let program = String::from_utf8(program).unwrap();
+        let run = program.lines().find_map(|l| l.strip_prefix("  RUN = ")).map_or(0, |v| v.parse().unwrap());
+        // A few cycles in which the program plays but has written nothing: what old programs left stands in the registers.
+        let playing = Robot { runtime_state: if robot.starts { 2 } else { 1 }, ..robot.clone() };
+        for cycle in 1..4 {
+            send_in_pieces(&mut rtde, &data(&playing, 1.0 + 0.008 * f64::from(cycle), ProgramState::Ready, 500, 1), robot.piece)?;
+        }
+        if robot.starts {
+            send_in_pieces(&mut rtde, &data(&playing, 1.04, robot.program, 500, run), robot.piece)?;
+        }
+        Ok(Seen { requests, outputs, program, rtde })
+    }
+}
+
+fn send_in_pieces(stream: &mut TcpStream, bytes: &[u8], piece: usize) -> std::io::Result<()> {
+    bytes.chunks(piece.min(bytes.len().max(1))).try_for_each(|piece| stream.write_all(piece))
+}
+
+/// Protects the connection: the requests come in the protocol's order, the program is this cell's, and the session starts with
+/// the state of the program that was uploaded, not with what an old one left.
+#[test]
+fn connects_and_uploads_the_program() {
+    let (session, seen) = Server::new(1, Robot::default()).meet();
+    let (session, seen) = (session.unwrap(), seen.unwrap());
+    assert_eq!(seen.requests, b"VvOIS");
+    assert!(seen.outputs.starts_with(&125f64.to_be_bytes()) && seen.outputs.ends_with(b",output_double_register_24"));
+    assert!(seen.program.starts_with("def decant_pour():\n"));
+    assert_eq!(session.version(), [3, 15, 8, 106339]);
+    let state = session.state();
+    assert_eq!((state.program_state, state.runtime_state, state.timestamp_s), (ProgramState::Ready, 2, 1.04));
+    assert!((state.alpha_deg - 0.01f32.to_degrees()).abs() < 1e-4);
+}
+
+/// Protects the dispatch by type: text and data before every answer, in pieces of a byte or in one, change nothing.
+#[test]
+fn connects_through_chatter_and_pieces() {
+    for (last, piece) in [(2, 1), (3, 7), (4, usize::MAX)] {
+        let chatter = [text("SafetySetup has not been confirmed yet"), frame(b'Z', &[1, 2]), text("")].concat();
+        let (session, _seen) = Server::new(last, Robot { chatter, piece, ..Robot::default() }).meet();
+        assert_eq!(session.unwrap().state().program_state, ProgramState::Ready);
+    }
+}
+
+/// Protects the frequency: an e-Series is asked for 500 Hz, and gets a program for its cycle.
+#[test]
+fn an_e_series_gets_its_own_cycle() {
+    let (session, seen) = Server::new(5, Robot { version: [5, 11, 0, 1], ..Robot::default() }).meet();
+    let (_session, seen) = (session.unwrap(), seen.unwrap());
+    assert!(seen.program.contains("\n  LENGTH = 30\n"));
+    assert!(seen.outputs.starts_with(&500f64.to_be_bytes()));
+}
+
+/// Protects the operator: every refusal gives its own error, whose line says what to do.
+#[test]
+fn every_refusal_says_what_to_do() {
+    let with = |name: &str, at: usize| {
+        let mut types: Vec<_> = OUTPUT_TYPES.split(',').collect();
+        types[at] = name;
+        types.join(",")
+    };
+    let well = Robot::default;
+    let cases: Vec<(Robot, &str)> = vec![
+        (Robot { version_accepted: 0, ..well() }, "refuses RTDE protocol 2; update"),
+        (Robot { version: [3, 8, 0, 0], ..well() }, "PolyScope 3.8, which has no registers 24 to 47; update"),
+        (Robot { version: [5, 2, 0, 0], ..well() }, "PolyScope 5.2"),
+        (Robot { outputs: (0, with("NOT_FOUND", 6)), ..well() }, "does not know the RTDE variable safety_status_bits; update"),
+        (Robot { outputs: (1, with("INT32", 0)), ..well() }, "timestamp has type INT32 instead of DOUBLE"),
+        (Robot { outputs: (1, "DOUBLE".into()), ..well() }, "unexpected bytes in the answer to the output recipe"),
+        (
+            Robot { inputs: (0, "INT32,INT32,IN_USE".into()), ..well() },
+            "input_double_register_24 is in use by another RTDE client or a fieldbus",
+        ),
+        (Robot { inputs: (0, "INT32,INT32,DOUBLE".into()), ..well() }, "unexpected bytes in the answer to the input recipe"),
+        (
+            Robot { start_accepted: 0, chatter: text("no recipe"), ..well() },
+            "refuses to start sending its state; the robot said: no recipe",
+        ),
+        (Robot { closes_at: Some(b'O'), ..well() }, "connection lost while the output recipe"),
+        (Robot { deaf_to: Some(b'v'), ..well() }, "no answer to the controller's version within 2 s"),
+        (Robot { chatter: vec![0, 2, 0], ..well() }, "is this the RTDE port of a UR controller?"),
+        (Robot { safety_mode: 3, runtime_state: 4, ..well() }, "protective stop; find the cause, then release it"),
+        (Robot { safety_mode: 7, robot_mode: 3, ..well() }, "emergency stop; release"),
+        (Robot { robot_mode: 5, ..well() }, "not powered and released; switch it on"),
+        (Robot { runtime_state: 2, ..well() }, "a program is running; wait"),
+        (Robot { runtime_state: 4, ..well() }, "a program is paused; resume it"),
+        (Robot { joint_rad: 0.5, ..well() }, "28.6 degrees from its start angle, allowed are 2; bring the container upright"),
+        (Robot { joint_rad: f64::NAN, ..well() }, "degrees from its start angle"),
+        (Robot { program: ProgramState::TooFar, ..well() }, "bring the container upright"),
+        (Robot { starts: false, ..well() }, "the program did not start within 5 s; on an e-Series choose Remote Control"),
+    ];
+    // Side by side: some of them wait for what never comes.
+    let tests = cases.into_iter().zip(20..).map(|((robot, words), last)| {
+        thread::spawn(move || {
+            let (session, _seen) = Server::new(last, robot).meet();
+            let error = session.expect_err(words).to_string();
+            assert!(error.contains(words), "{error:?} lacks {words:?}");
+            assert!(!error.contains('\n'), "{error:?}");
+        })
+    });
+    for test in tests.collect::<Vec<_>>() {
+        test.join().unwrap();
+    }
+}
+
+/// Protects the operator from a wrong address: nobody there is an error that names address and port.
+#[test]
+fn nobody_there_is_named() {
+    let options = Server::new(6, Robot::default()).options;
+    let error = connect(&options).unwrap_err().to_string();
+    assert!(error.contains("127.41.0.6:30004: cannot connect: connection refused; check robot.address"), "{error}");
+}
+
+fn connected(last: u8) -> (Session, Seen, Robot) {
+    let robot = Robot { runtime_state: 1, ..Robot::default() };
+    let (session, seen) = Server::new(last, robot.clone()).meet();
+    (session.unwrap(), seen.unwrap(), Robot { runtime_state: 2, ..robot })
+}
+
+/// Polls until `done`, as ticks would.
+fn poll_until(session: &mut Session, mut done: impl FnMut(&Result<(), Lost>, &Session) -> bool) -> Result<(), Lost> {
+    for _ in 0..2000 {
+        let polled = session.poll(now_ns()).map(|_| ());
+        if done(&polled, session) || polled.is_err() {
+            return polled;
+        }
+        thread::sleep(Duration::from_millis(1));
+    }
+    panic!("nothing came");
+}
+
+/// Protects the tick: of everything that arrived, in whatever pieces, the newest state counts; nothing arrived leaves it.
+#[test]
+fn the_newest_state_counts() {
+    let (mut session, mut seen, robot) = connected(7);
+    assert_eq!(session.poll(now_ns()).unwrap().timestamp_s, 1.04);
+    let mut bytes = Vec::new();
+    for cycle in 0..50 {
+        bytes.extend(data(&robot, 2.0 + 0.008 * f64::from(cycle), ProgramState::Following, cycle, 9));
+        bytes.extend(text("a notice"));
+    }
+    let (most, rest) = bytes.split_at(bytes.len() - 30);
+    seen.rtde.write_all(most).unwrap();
+    poll_until(&mut session, |_, s| s.texts() == 49).unwrap();
+    let before = *session.state();
+    // The last frames are cut: 30 bytes before the end lies within the last package.
+    assert_eq!(before.sequence_echo, 48);
+    assert_eq!(session.poll(now_ns()).unwrap(), &before, "nothing new");
+    seen.rtde.write_all(rest).unwrap();
+    poll_until(&mut session, |_, s| s.texts() == 50).unwrap();
+    assert_eq!(session.state().sequence_echo, 49);
+    assert!(session.state().received_at_ns > before.received_at_ns);
+}
+
+/// Protects the stalled-clock check: only an advancing clock moves `advanced_at_ns`, only a program that keeps up `answered_at_ns`.
+#[test]
+fn standing_clocks_and_unread_targets_are_noticed() {
+    let (mut session, mut seen, robot) = connected(8);
+    session.send(Mode::Stream, 0.0).unwrap();
+    let mut echo_at = |session: &mut Session, timestamp_s: f64, echo: i32| {
+        seen.rtde.write_all(&data(&robot, timestamp_s, ProgramState::Following, echo, 9)).unwrap();
+        let before = session.state().received_at_ns;
+        poll_until(session, |_, s| s.state().received_at_ns > before).unwrap();
+        let state = *session.state();
+        (state.advanced_at_ns == state.received_at_ns, state.answered_at_ns == state.received_at_ns)
+    };
+    assert_eq!(echo_at(&mut session, 2.0, 0), (true, true), "advanced; 0 is new");
+    assert_eq!(echo_at(&mut session, 2.0, 0), (false, false), "stands still; target 1 unread");
+    assert_eq!(echo_at(&mut session, 2.008, 1), (true, true), "target 1 read");
+    assert_eq!(echo_at(&mut session, 2.008, 1), (false, true), "nothing unread");
+    assert_eq!(echo_at(&mut session, 1.0, 1), (false, true), "a clock that jumps back does not advance");
+}
+
+/// Protects the robot from half a target: what arrives are whole frames, numbered from 1, in the agreed recipe.
+#[test]
+fn targets_arrive_whole_and_numbered() {
+    let (mut session, mut seen, _) = connected(9);
+    assert_eq!(session.send(Mode::Stream, 90.0), Ok(1));
+    assert_eq!(session.send(Mode::Stop, 0.0), Ok(2));
+    assert_eq!(session.send(Mode::Stream, f32::NAN), Ok(3));
+    let mut received = [0; 60];
+    seen.rtde.read_exact(&mut received).unwrap();
+    let parts = |frame: &[u8]| {
+        let int = |at: usize| i32::from_be_bytes(frame[at..at + 4].try_into().unwrap());
+        (frame[..4].to_vec(), int(4), int(8), f64::from_be_bytes(frame[12..20].try_into().unwrap()))
+    };
+    let head = vec![0, 20, b'U', 2];
+    assert_eq!(parts(&received[..20]), (head.clone(), 1, 2, 90f64.to_radians()));
+    assert_eq!(parts(&received[20..40]), (head.clone(), 2, 3, 0.0));
+    let (_, number, mode, angle) = parts(&received[40..]);
+    assert!((number, mode) == (3, 1) && (angle - 0.01).abs() < 1e-6, "not a number: hold where it is, not {angle} in mode {mode}");
+}
+
+/// Protects the loop from a robot that is gone: FIN, RST and a torn protocol end the session, each by its name.
+#[test]
+fn a_lost_robot_ends_the_session() {
+    let (mut session, seen, _) = connected(10);
+    drop(seen);
+    assert_eq!(poll_until(&mut session, |_, _| false), Err(Lost::Closed));
+
+    let (mut session, seen, _) = connected(11);
+    // Unread bytes at the close make the kernel send RST.
+    session.send(Mode::Hold, 0.0).unwrap();
+    thread::sleep(Duration::from_millis(20));
+    drop(seen);
+    assert_eq!(poll_until(&mut session, |_, _| false), Err(Lost::Broken));
+
+    let (mut session, mut seen, robot) = connected(12);
+    let mut short = data(&robot, 2.0, ProgramState::Following, 0, 9);
+    short.truncate(100);
+    short[1] = 100;
+    seen.rtde.write_all(&short).unwrap();
+    assert_eq!(poll_until(&mut session, |_, _| false), Err(Lost::Protocol));
+
+    let (mut session, mut seen, _) = connected(13);
+    seen.rtde.write_all(&[0, 1, b'U']).unwrap();
+    assert_eq!(poll_until(&mut session, |_, _| false), Err(Lost::Protocol));
+}
+
+/// Protects the loop from a robot that does not read: a target that would have to wait ends the session, and `send` never blocks.
+#[test]
+fn a_robot_that_does_not_read_ends_the_session() {
+    let (mut session, _seen, _) = connected(14);
+    let lost = (0..10_000_000).find_map(|_| session.send(Mode::Hold, 0.0).err());
+    assert_eq!(lost, Some(Lost::WouldBlock));
+}
+
+/// Protects the tick from a flood: one poll takes a bounded share of what waits, and later ones the rest.
+#[test]
+fn a_flood_does_not_keep_the_loop() {
+    let (mut session, seen, robot) = connected(15);
+    let sent = Arc::new(AtomicUsize::new(0));
+    let flood = thread::spawn({
+        let (sent, mut stream) = (sent.clone(), seen.rtde.try_clone().unwrap());
+        move || {
+            for echo in 1..=50_000 {
+                stream.write_all(&data(&robot, 2.0, ProgramState::Following, echo, 9)).unwrap();
+                sent.fetch_add(1, Ordering::Relaxed);
+            }
+        }
+    });
+    // Until the sockets' buffers are full.
+    let mut before = usize::MAX;
+    while sent.load(Ordering::Relaxed) != before {
+        before = sent.load(Ordering::Relaxed);
+        thread::sleep(Duration::from_millis(200));
+    }
+    let most = (16 << 16) / 192 + 1;
+    assert!(before > 2 * most, "{before} frames wait, too few for this test");
+    let taken = session.poll(now_ns()).unwrap().sequence_echo as usize;
+    assert!((1..=most).contains(&taken), "{taken} of {before}");
+    poll_until(&mut session, |_, s| s.state().sequence_echo == 50_000).unwrap();
+    flood.join().unwrap();
+}
+
+/// Protects the loop from waiting: while nothing comes, polls come back at once.
+#[test]
+fn polling_does_not_wait() {
+    let (mut session, seen, robot) = connected(17);
+    let later = thread::spawn({
+        let mut stream = seen.rtde.try_clone().unwrap();
+        move || {
+            thread::sleep(Duration::from_millis(500));
+            stream.write_all(&data(&robot, 2.0, ProgramState::Following, 77, 9)).unwrap();
+        }
+    });
+    let mut polls = 0;
+    while session.poll(now_ns()).unwrap().sequence_echo != 77 {
+        polls += 1;
+    }
+    assert!(polls > 1000, "{polls} polls in half a second: each one waited");
+    later.join().unwrap();
+}
+
+/// Protects the names in results: a safety stop during the upload is that stop, not a program that did not start.
+#[test]
+fn a_stop_during_the_upload_is_named() {
+    let server = Server::new(16, Robot::default());
+    let options = server.options.clone();
+    let served = thread::spawn(move || {
+        let mut seen = Server { robot: Robot { starts: false, ..server.robot.clone() }, ..server }.serve().unwrap();
+        let stopped = Robot { safety_mode: 6, robot_mode: 3, ..Robot::default() };
+        seen.rtde.write_all(&data(&stopped, 3.0, ProgramState::Unknown, 0, 1)).unwrap();
+        seen
+    });
+    let error = connect(&options).unwrap_err();
+    assert_eq!(error, LinkError::NotWell { address: options.address, reason: EndReason::EmergencyStop });
+    drop(served.join());
+}

@@ -1,0 +1,296 @@
+//! The fused estimate: the stream's area and the container's geometry, combined frame by frame.
+//!
+//! How far the tilt must go to keep the flow alive tells how much has left, whatever the camera's gain. An extended Kalman
+//! filter on the [flow model](super::flow) weighs the two. Pure and in the controller's loop: fixed size, no allocation, no
+//! panic; about 1.5 kflop a frame.
+//!
+//! State: X (W used up, ml), lambda (flow coefficient of this pour), gamma (camera gain of this pour), beta (scale of the
+//! geometry), F (film, ml), V (poured, ml), delta (delay of this pour, frames). It starts with the first frame that shows
+//! flow; before that only the tilt is followed.
+
+use super::flow::{DRIP, Flow, FlowState, HISTORY, Return};
+
+const N: usize = 7;
+const X: usize = 0;
+const LAMBDA: usize = 1;
+const GAMMA: usize = 2;
+const BETA: usize = 3;
+const FILM: usize = 4;
+const POURED: usize = 5;
+const DELTA: usize = 6;
+
+/// Standard deviations of what the model does not know, in a frame: X in ml, and per ml of outflow; lambda, log.
+const SD_X: f64 = 0.05;
+const SD_LAMBDA: f64 = 0.02;
+/// Error of an area that does not shrink with it, ml a frame.
+const SD_FLOOR_ML: f64 = 0.012;
+/// Slopes are taken at no less than this excess, so that a filter that believes the flow has ceased can be told otherwise, ml.
+const EXCESS_MIN_ML: f64 = 0.05;
+/// A measurement further off than this many standard deviations counts less.
+const GATE: f64 = 4.0;
+
+/// The filter in one pour.
+#[derive(Debug, Clone)]
+pub struct Fused {
+    flow: Flow,
+    back: Return,
+    state: [f64; N],
+    covariance: [[f64; N]; N],
+    started: bool,
+    frames: u64,
+    zeros: u32,
+    a_deg: f64,
+    a_before_deg: f64,
+    history: [f64; HISTORY],
+}
+
+impl Fused {
+    /// A filter for a pour to come.
+    pub fn new(flow: Flow, back: Return) -> Self {
+        let mut filter = Self {
+            flow,
+            back,
+            state: [0.0; N],
+            covariance: [[0.0; N]; N],
+            started: false,
+            frames: 0,
+            zeros: 0,
+            a_deg: 0.0,
+            a_before_deg: 0.0,
+            history: [0.0; HISTORY],
+        };
+        filter.restart();
+        filter
+    }
+
+    /// Forgets the pour.
+    pub fn restart(&mut self) {
+        self.state = [0.0; N];
+        self.covariance = [[0.0; N]; N];
+        self.started = false;
+        self.frames = 0;
+        self.zeros = 0;
+    }
+
+    /// Volume that has left the lip as far as the pictures show, ml.
+    pub fn poured_ml(&self) -> f64 {
+        self.state[POURED]
+    }
+
+    /// Standard deviation of [`Fused::poured_ml`], ml.
+    pub fn poured_sd_ml(&self) -> f64 {
+        self.covariance[POURED][POURED].max(0.0).sqrt()
+    }
+
+    /// Whether flow has been seen.
+    pub fn started(&self) -> bool {
+        self.started
+    }
+
+    /// What the filter believes of the liquid.
+    pub fn flow_state(&self) -> FlowState {
+        let slope = self.a_deg - self.a_before_deg;
+        FlowState {
+            a_deg: self.a_deg - self.state[DELTA] * slope,
+            x_ml: self.state[X],
+            film_ml: self.state[FILM],
+            lambda: self.state[LAMBDA],
+            beta: self.state[BETA],
+        }
+    }
+
+    /// Volume that still leaves if the way back starts now, `now_deg` being the command in force, ml; 0 before any flow.
+    pub fn stop_volume_ml(&self, now_deg: f64) -> f64 {
+        if !self.started {
+            return 0.0;
+        }
+        self.flow.stop_volume_ml(&self.flow_state(), &self.history, now_deg, self.back)
+    }
+
+    /// Takes one frame: the measured outflow `y_ml` (`None`: lost), and the command in force when it was taken, degrees.
+    pub fn step(&mut self, y_ml: Option<f64>, alpha_deg: f64) {
+        self.follow_tilt(alpha_deg);
+        let y_ml = y_ml.filter(|y| y.is_finite() && *y >= 0.0);
+        if !self.started {
+            match y_ml {
+                Some(y) if y > 0.0 => self.start(y),
+                _ => return,
+            }
+        } else if let Some(y) = y_ml {
+            self.update(y);
+        }
+        self.propagate();
+        if !self.state.iter().all(|s| s.is_finite()) {
+            // Cannot happen with checked weights; if it does, the pour goes on as one that has not been seen yet.
+            self.restart();
+        }
+    }
+
+    fn follow_tilt(&mut self, alpha_deg: f64) {
+        let alpha = if alpha_deg.is_finite() { alpha_deg.clamp(-30.0, 200.0) } else { self.history[HISTORY - 1] };
+        if self.frames == 0 {
+            // Whatever was before is not known: the container stood at this angle.
+            self.history = [alpha; HISTORY];
+            self.a_deg = alpha;
+        }
+        self.frames += 1;
+        self.history.copy_within(1.., 0);
+        self.history[HISTORY - 1] = alpha;
+        self.a_before_deg = self.a_deg;
+        self.a_deg = self.flow.tilt(self.a_deg, self.flow.delayed(&self.history, 0));
+    }
+
+    /// The first sight of flow gives X: what must have left for the lip to be covered as high as the stream says.
+    fn start(&mut self, y_ml: f64) {
+        self.started = true;
+        let noise = self.flow.model.noise;
+        let slope = self.a_deg - self.a_before_deg;
+        let w = self.flow.over(self.a_deg, 0.0, 0.0).w;
+        let excess = self.flow.excess_for(self.a_deg, y_ml, 0.0);
+        let per_log = excess / self.flow.model.p;
+        self.state = [0.0; N];
+        self.state[X] = self.flow.capacity_ml(self.a_deg) - excess;
+        let variance = |sd: f64| sd * sd;
+        let mut c = [[0.0; N]; N];
+        let tilt_sd = w * slope * noise.delta;
+        c[X][X] = variance(per_log) * (variance(noise.lambda) + variance(noise.gamma) + variance(noise.frame)) + variance(tilt_sd) + 1.0;
+        c[LAMBDA][LAMBDA] = variance(noise.lambda);
+        c[GAMMA][GAMMA] = variance(noise.gamma);
+        c[BETA][BETA] = variance(noise.beta);
+        c[DELTA][DELTA] = variance(noise.delta);
+        for (other, cov) in [
+            (LAMBDA, per_log * variance(noise.lambda)),
+            (GAMMA, per_log * variance(noise.gamma)),
+            (DELTA, -w * slope * variance(noise.delta)),
+        ] {
+            c[X][other] = cov;
+            c[other][X] = cov;
+        }
+        self.covariance = c;
+    }
+
+    /// Outflow over the lip in this frame at `state`, and its slopes in X, lambda and delta.
+    fn outflow(&self, state: &[f64; N]) -> (f64, f64, f64, f64) {
+        let slope = self.a_deg - self.a_before_deg;
+        let a = self.a_deg - state[DELTA] * slope;
+        let over = self.flow.over(a, state[X], state[LAMBDA]);
+        let dv_de = if over.excess_ml < EXCESS_MIN_ML {
+            self.flow.over(a, self.flow.capacity_ml(a) - EXCESS_MIN_ML, state[LAMBDA]).dv_de
+        } else {
+            over.dv_de
+        };
+        (over.v_ml, -dv_de, over.dv_dlambda, -dv_de * over.w * slope)
+    }
+
+    fn update(&mut self, y_ml: f64) {
+        let noise = self.flow.model.noise;
+        let eta = self.flow.model.eta;
+        let prior = self.state;
+        let mut posterior = prior;
+        let mut gained = ([0.0; N], 1.0);
+        self.zeros = if y_ml == 0.0 { self.zeros + 1 } else { 0 };
+        for _ in 0..2 {
+            let (v, v_x, v_lambda, v_delta) = self.outflow(&posterior);
+            let gain = posterior[GAMMA].exp();
+            let out = (1.0 - eta) * v + DRIP * (posterior[FILM] + eta * v);
+            let h_ml = gain * out;
+            let mut y = y_ml;
+            if y_ml == 0.0 {
+                if h_ml <= noise.v_min_ml || (h_ml > 3.0 * noise.v_min_ml && self.zeros < 3) {
+                    // Too little to be seen, or a dropout of the extraction.
+                    return;
+                }
+                y = noise.v_min_ml;
+            }
+            let per_v = gain * (1.0 - eta + DRIP * eta);
+            let mut h = [0.0; N];
+            h[X] = per_v * v_x;
+            h[LAMBDA] = per_v * v_lambda;
+            h[GAMMA] = h_ml;
+            h[FILM] = gain * DRIP;
+            h[DELTA] = per_v * v_delta;
+            let ph = self.covariance.map(|row| dot(&row, &h));
+            let mut r = (noise.frame * h_ml).powi(2) + SD_FLOOR_ML * SD_FLOOR_ML;
+            let spread = dot(&h, &ph).max(0.0);
+            let mut innovation = y - h_ml;
+            for k in 0..N {
+                innovation -= h[k] * (prior[k] - posterior[k]);
+            }
+            let limit = GATE * GATE * (spread + r);
+            if innovation * innovation > limit {
+                r = innovation * innovation / (GATE * GATE) - spread;
+            }
+            let total = spread + r;
+            for k in 0..N {
+                posterior[k] = prior[k] + ph[k] / total * innovation;
+            }
+            gained = (ph, total);
+        }
+        self.state = posterior;
+        let (ph, total) = gained;
+        for i in 0..N {
+            for j in 0..N {
+                self.covariance[i][j] -= ph[i] * ph[j] / total;
+            }
+        }
+    }
+
+    fn propagate(&mut self) {
+        let eta = self.flow.model.eta;
+        let (v, v_x, v_lambda, v_delta) = self.outflow(&self.state);
+        let scale = self.state[BETA].exp();
+        // Rows of the transition that differ from the identity: X, F, V.
+        let mut dv = [0.0; N];
+        dv[X] = v_x;
+        dv[LAMBDA] = v_lambda;
+        dv[DELTA] = v_delta;
+        let (mut to_x, mut to_film, mut to_poured) = ([0.0; N], [0.0; N], [0.0; N]);
+        for k in 0..N {
+            to_x[k] = scale * dv[k];
+            to_film[k] = (1.0 - DRIP) * eta * dv[k];
+            to_poured[k] = (1.0 - eta + DRIP * eta) * dv[k];
+        }
+        to_x[X] += 1.0;
+        to_x[BETA] += scale * v;
+        to_film[FILM] += 1.0 - DRIP;
+        to_poured[POURED] += 1.0;
+        to_poured[FILM] += DRIP;
+
+        let drip = DRIP * (self.state[FILM] + eta * v);
+        self.state[X] += scale * v;
+        self.state[FILM] += eta * v - drip;
+        self.state[POURED] += (1.0 - eta) * v + drip;
+
+        // P <- A P A': A differs from the identity in three rows.
+        let c = &self.covariance;
+        let rows = [to_x, to_film, to_poured].map(|row| {
+            let mut ap = [0.0; N];
+            for (factor, c_row) in row.iter().zip(c) {
+                for (sum, c_kj) in ap.iter_mut().zip(c_row) {
+                    *sum += factor * c_kj;
+                }
+            }
+            ap
+        });
+        let mut next = *c;
+        for (index, ap) in [X, FILM, POURED].into_iter().zip(&rows) {
+            for k in [LAMBDA, GAMMA, BETA, DELTA] {
+                next[index][k] = ap[k];
+                next[k][index] = ap[k];
+            }
+        }
+        let columns = [(X, &to_x), (FILM, &to_film), (POURED, &to_poured)];
+        for (i, ap) in [X, FILM, POURED].into_iter().zip(&rows) {
+            for (j, row) in columns {
+                next[i][j] = dot(ap, row);
+            }
+        }
+        next[X][X] += SD_X * SD_X * (1.0 + v * v);
+        next[LAMBDA][LAMBDA] += SD_LAMBDA * SD_LAMBDA;
+        self.covariance = next;
+    }
+}
+
+fn dot(a: &[f64; N], b: &[f64; N]) -> f64 {
+    a.iter().zip(b).map(|(x, y)| x * y).sum()
+}

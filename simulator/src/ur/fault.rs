@@ -1,0 +1,167 @@
+//! What can go wrong with a controller, by name: `fin`, `stall=2`, `in-use=input_int_register_24`, ...
+//!
+//! Pure. The same words are used on the command line, on the operator port and in tests; [`Fault`] reads and writes them.
+
+use std::fmt;
+use std::str::FromStr;
+
+use super::variables::Input;
+
+/// A fault, or the end of one.
+#[derive(Debug, Clone, PartialEq)]
+pub enum Fault {
+    /// Closes all RTDE connections in order (FIN).
+    Fin,
+    /// Aborts all RTDE connections (RST).
+    Reset,
+    /// All sockets close, and nobody answers for this long, s: a controller that restarts, a pulled cable.
+    Offline(f64),
+    /// RTDE connections stay open but nothing is sent or read for this long, s: half open.
+    Stall(f64),
+    /// RTDE keeps sending, but always the same frame, for this long, s: a timestamp that stands still.
+    Freeze(f64),
+    /// What RTDE clients send is not read for this long, s, and then all at once.
+    SlowReader(f64),
+    /// RTDE outputs of this many cycles are skipped.
+    SkipOutputs(u32),
+    /// RTDE bytes arrive in pieces for this long, s.
+    Split(f64),
+    /// RTDE frames arrive four at a time for this long, s.
+    Coalesce(f64),
+    /// A fieldbus owns this input from now on.
+    InUse(String),
+    /// This variable is unknown from now on.
+    NotFound(String),
+    /// Protocol version 2 is refused from now on.
+    RefuseVersion2,
+    /// Sends an RTDE text message to every client now.
+    Text(String),
+    /// Sends an RTDE text message to every client that connects from now on, before anything else.
+    TextOnConnect(String),
+    /// The arm hit something.
+    ProtectiveStop,
+    /// The emergency stop button is pressed.
+    EmergencyStop,
+    /// The emergency stop button is released.
+    EmergencyRelease,
+    /// Programs start this much later from now on, s.
+    LateStart(f64),
+    /// The program is stopped on the pendant.
+    ProgramStop,
+    /// The program is paused on the pendant.
+    ProgramPause,
+    /// e-Series: the pendant is switched to local control.
+    LocalControl,
+    /// e-Series: the pendant is switched to remote control.
+    RemoteControl,
+    /// Ends every fault that lasts; does not heal the robot.
+    Clear,
+}
+
+/// The faults with the meaning of what follows the `=`, for `--help`.
+pub const HELP: &str = "\
+fin                   close the RTDE connections
+reset                 abort the RTDE connections (RST)
+offline=SECONDS       close everything and be unreachable
+stall=SECONDS         RTDE stays open but is silent and deaf (half open)
+freeze=SECONDS        RTDE repeats one frame: its timestamp stands still
+slow-reader=SECONDS   RTDE inputs are read late, then all at once
+skip-outputs=CYCLES   leave out RTDE outputs
+split=SECONDS         RTDE frames arrive in pieces
+coalesce=SECONDS      RTDE frames arrive four at a time
+in-use=INPUT          a fieldbus owns this input variable
+not-found=VARIABLE    this variable does not exist
+refuse-version-2      RTDE protocol version 2 is refused
+text=MESSAGE          send an RTDE text message now
+text-on-connect=MESSAGE  send an RTDE text message to whoever connects
+protective-stop       stop the arm; unlock on the dashboard after 5 s
+emergency-stop        press the emergency stop
+emergency-release     release it; then 'power on' and 'brake release' on the dashboard
+late-start=SECONDS    programs start this much later
+program-stop          stop the program on the pendant
+program-pause         pause the program on the pendant
+local-control         e-Series: programs are ignored
+remote-control        e-Series: programs are taken again
+clear                 end every fault that lasts";
+
+/// Text that names no fault.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+#[error("fault \"{0}\": {1}")]
+pub struct ParseError(String, String);
+
+impl FromStr for Fault {
+    type Err = ParseError;
+
+    fn from_str(text: &str) -> Result<Self, ParseError> {
+        let fail = |what: &str| ParseError(text.to_owned(), what.to_owned());
+        let (name, value) = match text.split_once('=') {
+            Some((name, value)) => (name.trim(), Some(value.trim())),
+            None => (text.trim(), None),
+        };
+        let given = || value.filter(|v| !v.is_empty()).ok_or_else(|| fail("needs a value, as in NAME=VALUE"));
+        let seconds = || {
+            let value = given()?.parse::<f64>().ok().filter(|s| (0.0..=3600.0).contains(s));
+            value.ok_or_else(|| fail("needs seconds, 0 to 3600"))
+        };
+        let plain = |fault: Fault| if value.is_some() { Err(fail("takes no value")) } else { Ok(fault) };
+        match name {
+            "fin" => plain(Fault::Fin),
+            "reset" => plain(Fault::Reset),
+            "offline" => seconds().map(Fault::Offline),
+            "stall" => seconds().map(Fault::Stall),
+            "freeze" => seconds().map(Fault::Freeze),
+            "slow-reader" => seconds().map(Fault::SlowReader),
+            "skip-outputs" => given()?.parse().map(Fault::SkipOutputs).map_err(|_| fail("needs a number of cycles")),
+            "split" => seconds().map(Fault::Split),
+            "coalesce" => seconds().map(Fault::Coalesce),
+            "in-use" => match given()? {
+                variable if Input::parse(variable).is_some() => Ok(Fault::InUse(variable.to_owned())),
+                _ => Err(fail("needs the name of an RTDE input variable")),
+            },
+            "not-found" => given().map(|v| Fault::NotFound(v.to_owned())),
+            "refuse-version-2" => plain(Fault::RefuseVersion2),
+            "text" => given().map(|v| Fault::Text(v.to_owned())),
+            "text-on-connect" => given().map(|v| Fault::TextOnConnect(v.to_owned())),
+            "protective-stop" => plain(Fault::ProtectiveStop),
+            "emergency-stop" => plain(Fault::EmergencyStop),
+            "emergency-release" => plain(Fault::EmergencyRelease),
+            "late-start" => seconds().map(Fault::LateStart),
+            "program-stop" => plain(Fault::ProgramStop),
+            "program-pause" => plain(Fault::ProgramPause),
+            "local-control" => plain(Fault::LocalControl),
+            "remote-control" => plain(Fault::RemoteControl),
+            "clear" => plain(Fault::Clear),
+            _ => Err(fail("no such fault; 'simulator ur --help' lists them")),
+        }
+    }
+}
+
+impl fmt::Display for Fault {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Fault::Fin => f.write_str("fin"),
+            Fault::Reset => f.write_str("reset"),
+            Fault::Offline(s) => write!(f, "offline={s}"),
+            Fault::Stall(s) => write!(f, "stall={s}"),
+            Fault::Freeze(s) => write!(f, "freeze={s}"),
+            Fault::SlowReader(s) => write!(f, "slow-reader={s}"),
+            Fault::SkipOutputs(n) => write!(f, "skip-outputs={n}"),
+            Fault::Split(s) => write!(f, "split={s}"),
+            Fault::Coalesce(s) => write!(f, "coalesce={s}"),
+            Fault::InUse(v) => write!(f, "in-use={v}"),
+            Fault::NotFound(v) => write!(f, "not-found={v}"),
+            Fault::RefuseVersion2 => f.write_str("refuse-version-2"),
+            Fault::Text(m) => write!(f, "text={m}"),
+            Fault::TextOnConnect(m) => write!(f, "text-on-connect={m}"),
+            Fault::ProtectiveStop => f.write_str("protective-stop"),
+            Fault::EmergencyStop => f.write_str("emergency-stop"),
+            Fault::EmergencyRelease => f.write_str("emergency-release"),
+            Fault::LateStart(s) => write!(f, "late-start={s}"),
+            Fault::ProgramStop => f.write_str("program-stop"),
+            Fault::ProgramPause => f.write_str("program-pause"),
+            Fault::LocalControl => f.write_str("local-control"),
+            Fault::RemoteControl => f.write_str("remote-control"),
+            Fault::Clear => f.write_str("clear"),
+        }
+    }
+}

@@ -1,0 +1,200 @@
+//! The arm: what servoj, stopj and movej do to the six joints. Pure; one step per control cycle; no allocation.
+//!
+//! servoj is modelled as UR's script manual describes its parameters: the position is projected forward by the lookahead time
+//! along the present velocity, and the gain acts like the P-term of a PID controller on what then remains. Per joint
+//!
+//! `target_qdd = gain * (q_commanded - (target_q + lookahead * target_qd))`
+//!
+//! so a ramp is followed `lookahead` seconds late. Speed is clipped at the UR5's 180 deg/s, acceleration at 40 rad/s^2 (UR
+//! publishes none; it is what ur_rtde allows). The joints follow target_q through a first-order lag, so that target_q,
+//! target_qd and actual_q are three different things, as on a robot. A demand that no arm could follow is a protective stop.
+
+/// Largest joint speed of a UR5, rad/s (180 deg/s).
+pub const MAX_SPEED_RAD_S: f64 = std::f64::consts::PI;
+/// Largest joint acceleration, rad/s^2.
+pub const MAX_ACCELERATION_RAD_S2: f64 = 40.0;
+/// Range of every joint of a UR5, rad (+-360 deg).
+pub const RANGE_RAD: f64 = 2.0 * std::f64::consts::PI;
+/// Largest difference between two servoj targets in a row, rad. UR publishes no figure; 33 ms at full speed are 0.105 rad.
+pub const MAX_STEP_RAD: f64 = 0.2;
+/// Largest distance of a servoj target from target_q, rad: the most that the largest lookahead leaves at full speed is 0.63.
+pub const MAX_LAG_RAD: f64 = 0.8;
+/// Deceleration when a program ends or is paused while the arm moves, rad/s^2.
+pub const STOP_RAD_S2: f64 = 10.0;
+/// Deceleration of a protective or emergency stop, rad/s^2.
+pub const FAST_STOP_RAD_S2: f64 = 40.0;
+/// Time constant of the joints' lag behind target_q, s.
+const LAG_S: f64 = 0.012;
+/// Steps of the servoj equation in a control cycle last at most this long, s.
+const SUBSTEP_S: f64 = 0.001;
+/// Joint names for messages.
+const NAMES: [&str; 6] = ["base", "shoulder", "elbow", "wrist 1", "wrist 2", "wrist 3"];
+
+#[derive(Debug, Clone, Copy, PartialEq)]
+enum Mode {
+    Hold,
+    Servoj { lookahead_s: f64, gain: f64 },
+    Stop { deceleration_rad_s2: f64 },
+    Speed { goal_qd: [f64; 6], acceleration_rad_s2: f64 },
+    Move { goal: [f64; 6], acceleration_rad_s2: f64, speed_rad_s: f64 },
+}
+
+/// The six joints; angles in rad, speeds in rad/s, accelerations in rad/s^2.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Servo {
+    /// What the last servoj or movej asked for.
+    pub commanded_q: [f64; 6],
+    /// Where the trajectory is.
+    pub target_q: [f64; 6],
+    /// Its speed.
+    pub target_qd: [f64; 6],
+    /// Its acceleration.
+    pub target_qdd: [f64; 6],
+    /// Where the joints are.
+    pub actual_q: [f64; 6],
+    /// Their speed.
+    pub actual_qd: [f64; 6],
+    mode: Mode,
+}
+
+impl Servo {
+    /// At rest at `q` (rad).
+    pub fn new(q: [f64; 6]) -> Self {
+        let zero = [0.0; 6];
+        Self { commanded_q: q, target_q: q, target_qd: zero, target_qdd: zero, actual_q: q, actual_qd: zero, mode: Mode::Hold }
+    }
+
+    /// Follows `q` (rad) from now on. Err: the reason for a protective stop.
+    pub fn servoj(&mut self, q: [f64; 6], lookahead_s: f64, gain: f64) -> Result<(), String> {
+        let before = if matches!(self.mode, Mode::Servoj { .. }) { self.commanded_q } else { self.target_q };
+        for (i, name) in NAMES.iter().enumerate() {
+            let (to, step, lag) = (q[i], (q[i] - before[i]).abs(), (q[i] - self.target_q[i]).abs());
+            if to.is_nan() || to.abs() > RANGE_RAD {
+                return Err(format!("servoj target of {name} is {to} rad, outside +-{RANGE_RAD:.4}"));
+            }
+            if step > MAX_STEP_RAD {
+                return Err(format!(
+                    "servoj target of {name} jumps by {step:.3} rad (from {:.3} to {to:.3}), more than {MAX_STEP_RAD}",
+                    before[i]
+                ));
+            }
+            if lag > MAX_LAG_RAD {
+                return Err(format!("servoj target of {name} is {lag:.3} rad away from the arm, more than {MAX_LAG_RAD}"));
+            }
+        }
+        self.commanded_q = q;
+        self.mode = Mode::Servoj { lookahead_s, gain };
+        Ok(())
+    }
+
+    /// Slows all joints down to rest.
+    pub fn stop(&mut self, deceleration_rad_s2: f64) {
+        self.mode = Mode::Stop { deceleration_rad_s2 };
+    }
+
+    /// Goes to `goal` (rad), joints in step. Err: the reason for a protective stop.
+    pub fn movej(&mut self, goal: [f64; 6], acceleration_rad_s2: f64, speed_rad_s: f64) -> Result<(), String> {
+        if let Some(i) = goal.iter().position(|q| q.is_nan() || q.abs() > RANGE_RAD) {
+            return Err(format!("movej target of {} is {} rad, outside +-{RANGE_RAD:.4}", NAMES[i], goal[i]));
+        }
+        self.commanded_q = goal;
+        self.mode = Mode::Move {
+            goal,
+            acceleration_rad_s2: acceleration_rad_s2.min(MAX_ACCELERATION_RAD_S2),
+            speed_rad_s: speed_rad_s.min(MAX_SPEED_RAD_S),
+        };
+        Ok(())
+    }
+
+    /// Goes to the joint speeds `goal_qd` (rad/s) and keeps them. Err: the reason for a protective stop.
+    pub fn speedj(&mut self, goal_qd: [f64; 6], acceleration_rad_s2: f64) -> Result<(), String> {
+        if let Some(i) = goal_qd.iter().position(|v| v.is_nan() || v.abs() > 2.0 * MAX_SPEED_RAD_S) {
+            return Err(format!("speedj of {} is {} rad/s, more than twice what it can do", NAMES[i], goal_qd[i]));
+        }
+        self.mode = Mode::Speed { goal_qd, acceleration_rad_s2: acceleration_rad_s2.min(MAX_ACCELERATION_RAD_S2) };
+        Ok(())
+    }
+
+    /// True when no trajectory moves the arm and it stands.
+    pub fn is_still(&self) -> bool {
+        !matches!(self.mode, Mode::Move { .. }) && self.target_qd.iter().all(|v| v.abs() < 1e-9)
+    }
+
+    /// Lets `dt_s` pass.
+    pub fn step(&mut self, dt_s: f64) {
+        let before_qd = self.target_qd;
+        match self.mode {
+            Mode::Hold => self.target_qd = [0.0; 6],
+            Mode::Servoj { lookahead_s, gain } => {
+                let substeps = (dt_s / SUBSTEP_S).ceil();
+                let h = dt_s / substeps;
+                for _ in 0..substeps as u32 {
+                    for i in 0..6 {
+                        // Implicit in the speed: stable for every allowed gain and lookahead.
+                        let (q, v) = (self.target_q[i], self.target_qd[i]);
+                        let wanted = (v + h * gain * (self.commanded_q[i] - q)) / (1.0 + h * gain * (lookahead_s + h));
+                        let most = MAX_ACCELERATION_RAD_S2 * h;
+                        let speed = (v + (wanted - v).clamp(-most, most)).clamp(-MAX_SPEED_RAD_S, MAX_SPEED_RAD_S);
+                        self.target_qd[i] = speed;
+                        self.target_q[i] += h * speed;
+                    }
+                }
+            }
+            Mode::Stop { deceleration_rad_s2 } => {
+                self.slow_down(deceleration_rad_s2, dt_s);
+                if self.target_qd == [0.0; 6] {
+                    self.mode = Mode::Hold;
+                }
+            }
+            Mode::Speed { goal_qd, acceleration_rad_s2 } => {
+                let most = acceleration_rad_s2 * dt_s;
+                for (i, goal) in goal_qd.iter().enumerate() {
+                    let goal = goal.clamp(-MAX_SPEED_RAD_S, MAX_SPEED_RAD_S);
+                    self.target_qd[i] += (goal - self.target_qd[i]).clamp(-most, most);
+                    self.target_q[i] = (self.target_q[i] + self.target_qd[i] * dt_s).clamp(-RANGE_RAD, RANGE_RAD);
+                }
+            }
+            Mode::Move { goal, acceleration_rad_s2, speed_rad_s } => self.step_move(goal, acceleration_rad_s2, speed_rad_s, dt_s),
+        }
+        let share = 1.0 - (-dt_s / LAG_S).exp();
+        for (i, before) in before_qd.iter().enumerate() {
+            self.target_qdd[i] = (self.target_qd[i] - before) / dt_s;
+            let way = (self.target_q[i] - self.actual_q[i]) * share;
+            self.actual_q[i] += way;
+            self.actual_qd[i] = way / dt_s;
+        }
+    }
+
+    /// All joints in proportion, so that the arm stays on its path.
+    fn slow_down(&mut self, deceleration_rad_s2: f64, dt_s: f64) {
+        let fastest = self.target_qd.iter().fold(0.0f64, |m, v| m.max(v.abs()));
+        let left = (fastest - deceleration_rad_s2 * dt_s).max(0.0);
+        let scale = if fastest > 0.0 { left / fastest } else { 0.0 };
+        for i in 0..6 {
+            let mean = self.target_qd[i] * (1.0 + scale) / 2.0;
+            self.target_qd[i] *= scale;
+            self.target_q[i] += mean * dt_s;
+        }
+    }
+
+    /// One cycle of a trapezoidal motion along the straight line in joint space.
+    fn step_move(&mut self, goal: [f64; 6], acceleration: f64, speed: f64, dt_s: f64) {
+        let way: [f64; 6] = std::array::from_fn(|i| goal[i] - self.target_q[i]);
+        let longest = way.iter().fold(0.0f64, |m, v| m.max(v.abs()));
+        let now = self.target_qd.iter().fold(0.0f64, |m, v| m.max(v.abs()));
+        // The speed from which the arm can still stop at the goal, one cycle further on.
+        let brake = acceleration * dt_s / 2.0;
+        let allowed = (brake * brake + 2.0 * acceleration * longest).sqrt() - brake;
+        let next = (now + acceleration * dt_s).min(speed).min(allowed.max(0.0));
+        if longest <= next * dt_s || longest < 1e-9 {
+            self.target_q = goal;
+            self.target_qd = [0.0; 6];
+            self.mode = Mode::Hold;
+            return;
+        }
+        for (i, way) in way.iter().enumerate() {
+            self.target_qd[i] = way / longest * next;
+            self.target_q[i] += self.target_qd[i] * dt_s;
+        }
+    }
+}

@@ -1,0 +1,108 @@
+//! The processes together in the simulated cell: orders, endings, weight swaps, faults of processes.
+
+use std::time::Duration;
+
+use rustix::process::Signal;
+use tests::{CellUnderTest, steady_weights};
+
+const TILT_OUT: usize = 13;
+
+/// Protects the operator: a pour tilts, pours, comes back upright, reports, and is recorded; a second goal meanwhile is refused.
+#[test]
+fn a_pour_is_followed_to_its_end_and_recorded() {
+    let cell = CellUnderTest::start(|_| {});
+    let refused = cell.command("rt-controller", &["pour", "20"]);
+    assert_eq!(refused.status.code(), Some(5), "without weights a pour is refused");
+    assert!(String::from_utf8_lossy(&refused.stderr).contains("no valid weight file"));
+
+    cell.take_weights(&steady_weights(TILT_OUT));
+    cell.json("simulator", &["operator", "fill", "300", "--json"]);
+    let pour = cell.begin("rt-controller", &["pour", "20", "--json"]);
+    cell.wait("the pour", Duration::from_secs(5), |s| s["phase"] == "pouring");
+    let second = cell.command("rt-controller", &["pour", "30"]);
+    assert_eq!(second.status.code(), Some(5));
+    assert!(String::from_utf8_lossy(&second.stderr).contains("under way"));
+    let output = pour.wait_with_output().expect("it ran");
+    assert_eq!(output.status.code(), Some(0), "{}", String::from_utf8_lossy(&output.stderr));
+    let result: serde_json::Value = serde_json::from_slice(&output.stdout).expect("JSON");
+    assert_eq!(result["outcome"]["reason"], "done");
+    let file = result["episode_file"].as_str().expect("the pour was recorded");
+    let episode = shared::episode::Episode::read(std::path::Path::new(file)).expect("readable");
+    assert!(episode.complete && episode.frames.len() > 60, "{} frames", episode.frames.len());
+    assert!(episode.frames.iter().any(|f| f.area_px2 > 0.0), "the stream was seen");
+    let scale = cell.json("simulator", &["operator", "scale", "--json"]);
+    assert!(scale["weight_g"].as_f64() > Some(5.0), "liquid really flowed: {scale}");
+    let status = cell.wait_idle();
+    assert_eq!(status["loop_allocations"], 0, "{status}");
+}
+
+/// Protects "what the robot gets": a recording follows eq. (1) at the robot, and its file holds curve, angles and images.
+#[test]
+fn a_recording_becomes_an_episode() {
+    let cell = CellUnderTest::start(|_| {});
+    cell.json("simulator", &["operator", "fill", "300", "--json"]);
+    let result = cell.json("rt-controller", &["record", "--lambda", "60", "--gamma", "0.8", "--weight", "33", "--json"]);
+    let file = result["episode_file"].as_str().expect("recorded");
+    let episode = shared::episode::Episode::read(std::path::Path::new(file)).expect("readable");
+    assert!(matches!(episode.kind, shared::episode::Kind::Recording(c) if c.lambda_deg == 60.0 && c.gamma_per_s2 == 0.8));
+    assert_eq!((episode.weight_g, episode.complete), (Some(33.0), true));
+    let top = episode.frames.iter().map(|f| f.alpha_measured_deg).filter(|a| a.is_finite()).fold(0.0, f32::max);
+    assert!((55.0..61.0).contains(&top), "the joint reached {top} degrees");
+    assert!(episode.info.images as usize >= episode.frames.len() * 9 / 10, "{} images", episode.info.images);
+}
+
+/// Protects a running lab: a new weight file is taken without restart, a bad one is refused and the old one stays.
+#[test]
+fn weights_are_swapped_while_running() {
+    let cell = CellUnderTest::start(|_| {});
+    cell.take_weights(&steady_weights(TILT_OUT));
+    let first = cell.status().expect("running")["weights"].clone();
+    std::fs::write(cell.weights(), b"decant-w but not really").expect("writable");
+    let status = cell.wait("the refusal", Duration::from_secs(5), |s| s["weights_refused"] != "");
+    assert_eq!(status["weights"], first);
+    cell.take_weights(&steady_weights(TILT_OUT + 1));
+    let status = cell.wait("the new identity", Duration::from_secs(5), |s| s["weights"] != first);
+    assert_eq!(status["weights_refused"], "");
+}
+
+/// Protects people: when a process dies or hangs at full tilt, the container comes upright, and the reason is named.
+#[test]
+fn a_dead_or_hanging_process_ends_upright() {
+    let mut cell = CellUnderTest::start(|_| {});
+    cell.take_weights(&steady_weights(TILT_OUT));
+    let tilted = |s: &serde_json::Value| s["alpha_measured_deg"].as_f64() > Some(30.0);
+
+    for (signal, reason) in [(Signal::KILL, "stale-feature"), (Signal::STOP, "stale-feature")] {
+        cell.json("simulator", &["operator", "fill", "300", "--json"]);
+        let pour = cell.begin("rt-controller", &["pour", "200", "--json"]);
+        cell.wait("tilt", Duration::from_secs(10), tilted);
+        cell.signal("feature-worker", signal);
+        let output = pour.wait_with_output().expect("it ran");
+        assert_eq!(output.status.code(), Some(4), "{}", String::from_utf8_lossy(&output.stderr));
+        let result: serde_json::Value = serde_json::from_slice(&output.stdout).expect("JSON");
+        assert_eq!(result["outcome"]["reason"], reason);
+        cell.wait("upright", Duration::from_secs(5), |s| s["alpha_measured_deg"].as_f64().is_some_and(|a| a.abs() < 1.0));
+        if signal == Signal::KILL {
+            cell.spawn("feature-worker");
+        } else {
+            cell.signal("feature-worker", Signal::CONT);
+        }
+        let before = cell.status().expect("running")["features"].as_u64();
+        cell.wait("features again", Duration::from_secs(10), |s| s["features"].as_u64() > before && s["phase"] == "idle");
+    }
+
+    // The controller itself hangs: the robot's program goes upright by itself; afterwards the controller says why, and recovers.
+    cell.json("simulator", &["operator", "fill", "300", "--json"]);
+    let pour = cell.begin("rt-controller", &["pour", "200", "--json"]);
+    cell.wait("tilt", Duration::from_secs(10), tilted);
+    cell.signal("rt-controller", Signal::STOP);
+    std::thread::sleep(Duration::from_millis(3000));
+    cell.signal("rt-controller", Signal::CONT);
+    let output = pour.wait_with_output().expect("it ran");
+    assert_ne!(output.status.code(), Some(0));
+    let status = cell.wait("recovery", Duration::from_secs(15), |s| s["phase"] == "idle");
+    assert!(status["alpha_measured_deg"].as_f64().is_some_and(|a| a.abs() < 1.0));
+    let outcomes = status["outcomes"].as_array().expect("a list");
+    let last = &outcomes[outcomes.len() - 1]["reason"];
+    assert!(["controller-overrun", "robot-lost", "program-stopped"].iter().any(|r| last == r), "{last}");
+}

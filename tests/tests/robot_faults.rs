@@ -1,0 +1,587 @@
+//! The fault matrix of the robot link: each fault at rest, while tilting out, at full flow and while returning.
+//!
+//! Real parts: the built `rt-controller run` as a process, the simulated UR5 controller with the program that was uploaded to
+//! it, shared memory. Only the liquid is a formula here: flow grows with the tilt that the joint really has. Every test prints
+//! its rows of the table (`cargo test -p tests --test robot_faults -- --show-output`); times are the robot's own clock.
+//!
+//! For each fault and moment: no command to servoj beyond the limits; upright and stopped within the bound, or stopped where
+//! the robot's own safety stops it; the reason named in the result; and a working next pour after recovery.
+
+use std::fmt::Write as _;
+use std::io::{BufRead, BufReader, Write};
+use std::net::{IpAddr, Ipv4Addr, TcpStream};
+use std::path::Path;
+use std::process::{Child, Command, Stdio};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering::Relaxed};
+use std::thread::{self, JoinHandle};
+use std::time::{Duration, Instant};
+
+use rt_controller::client::Client;
+use rt_controller::link::Lost;
+use shared::agent::Selection;
+use shared::config::Config;
+use shared::control::{EndReason, Outcome, Reply, Request};
+use shared::estimate::Calibration;
+use shared::ipc;
+use shared::messages::{Feature, LAYOUT_VERSION, Phase};
+use shared::os::now_ns;
+use shared::policy::{InputScale, Mlp, STAY, action_table};
+use shared::weights::{Estimator, Method, Origin, Weights};
+use simulator::ur::{Controller, Fault, Handle, Options, RobotMode, RuntimeState, TraceRow};
+
+/// Millilitres in a frame per px^2 of the feature.
+const ML_PER_PX2: f64 = 0.002;
+/// Detection, the program's patience, braking and settling; the way upright at the return rate comes on top.
+const UPRIGHT_BOUND_S: f64 = 1.0;
+/// A stop of the robot's own: program stop, protective stop, emergency stop.
+const STOP_BOUND_S: f64 = 0.5;
+const RETURN_RATE_DEG_S: f64 = 60.0;
+
+/// When the fault comes.
+#[derive(Debug, Clone, Copy, PartialEq)]
+enum Moment {
+    AtRest,
+    TiltingOut,
+    FullFlow,
+    Returning,
+}
+
+const MOMENTS: [Moment; 4] = [Moment::AtRest, Moment::TiltingOut, Moment::FullFlow, Moment::Returning];
+
+/// What a fault leads to.
+#[derive(Debug, Clone, Copy, PartialEq)]
+enum Expected {
+    /// The pour goes on to its end.
+    Nothing,
+    /// The pour ends for this reason, and the program brings the container upright by itself.
+    Upright(EndReason),
+    /// The pour ends for this reason, and the robot stops where it is until its operator has acted.
+    Stopped(EndReason),
+}
+
+/// A simulated cell with its own robot, controller process and liquid.
+struct Cell {
+    name: String,
+    address: IpAddr,
+    directory: tempfile::TempDir,
+    robot: Arc<Handle>,
+    process: Child,
+    client: Option<Client>,
+    stop: Arc<AtomicBool>,
+    liquid: Option<JoinHandle<()>>,
+    table: String,
+}
+
+impl Cell {
+    fn new(name: &str, last: u8) -> Self {
+        let address = IpAddr::V4(Ipv4Addr::new(127, 44, 0, last));
+        let directory = tempfile::tempdir().unwrap();
+        let sim = Path::new(env!("CARGO_MANIFEST_DIR")).join("../config/sim.toml");
+        let mut config = Config::read(&sim).unwrap();
+        config.cell.name = format!("fault-{name}");
+        config.robot.address = address;
+        config.controller.weights = directory.path().join("weights.bin");
+        config.simulator = None;
+        std::fs::write(directory.path().join("cell.toml"), toml::to_string(&config).unwrap()).unwrap();
+        tilt_until_it_flows().write(&config.controller.weights).unwrap();
+        let robot = Arc::new(Controller::start(Options::new(address)).unwrap());
+        let stop = Arc::new(AtomicBool::new(false));
+        let liquid = thread::spawn({
+            let (name, robot, stop) = (config.cell.name.clone(), robot.clone(), stop.clone());
+            move || publish_features(&name, &robot, &stop)
+        });
+        let process = start_controller(directory.path());
+        let mut cell = Self {
+            name: config.cell.name.clone(),
+            address,
+            directory,
+            robot,
+            process,
+            client: None,
+            stop,
+            liquid: Some(liquid),
+            table: String::new(),
+        };
+        cell.ready();
+        cell
+    }
+
+    /// What the controller has said.
+    fn said(&self) -> String {
+        std::fs::read_to_string(self.directory.path().join("log")).unwrap_or_default()
+    }
+
+    fn log(&self) -> String {
+        let theirs = self.said();
+        let robot: Vec<String> = self.robot.take_log().into_iter().map(|l| format!("{:.3} {}", l.timestamp_s, l.text)).collect();
+        format!("--- rt-controller\n{theirs}--- robot\n{}", robot.join("\n"))
+    }
+
+    /// Waits for what must come, however busy the machine is.
+    fn until<T>(&self, what: &str, mut found: impl FnMut(&Self) -> Option<T>) -> T {
+        let deadline = Instant::now() + Duration::from_secs(60);
+        loop {
+            if let Some(found) = found(self) {
+                return found;
+            }
+            if Instant::now() > deadline {
+                let status = self.client.as_ref().map(Client::status);
+                panic!("{}: never {what}; status {status:?}; joints {:?}\n{}", self.name, self.robot.joints(), self.log());
+            }
+            thread::sleep(Duration::from_millis(2));
+        }
+    }
+
+    /// Until the controller would pour.
+    fn ready(&mut self) {
+        if self.client.is_none() {
+            self.client = Some(Client::connect(&self.name).unwrap());
+        }
+        self.until("ready", |c| {
+            let status = c.client.as_ref()?.status().ok()?;
+            (status.phase == Phase::Idle && status.hindrance.is_empty()).then_some(())
+        });
+    }
+
+    fn pour(&self, goal_ml: f32) -> u64 {
+        self.until("pouring", |c| match c.client.as_ref()?.ask(&Request::Pour { goal_ml }) {
+            Ok(Reply::Started { episode }) => Some(episode),
+            _ => None,
+        })
+    }
+
+    fn outcome(&self, episode: u64) -> Outcome {
+        self.until("an outcome", |c| c.client.as_ref()?.status().ok()?.outcomes.into_iter().find(|o| o.episode == episode))
+    }
+
+    /// Alpha and its rate: degrees, degrees/s.
+    fn alpha(&self) -> (f64, f64) {
+        let joints = self.robot.joints();
+        (joints.actual_q[5].to_degrees(), joints.actual_qd[5].to_degrees())
+    }
+
+    /// Starts a pour (not at rest) and waits for `moment`.
+    fn reach(&self, moment: Moment) -> Option<u64> {
+        let reached = |what: &str, there: fn(f64, f64) -> bool| {
+            self.until(what, |c| {
+                let (alpha, rate) = c.alpha();
+                there(alpha, rate).then_some(())
+            });
+        };
+        let goal_ml = match moment {
+            Moment::AtRest => return None,
+            Moment::TiltingOut | Moment::FullFlow => 80.0,
+            Moment::Returning => 6.0,
+        };
+        let episode = self.pour(goal_ml);
+        match moment {
+            Moment::Returning => reached("returning", |alpha, rate| rate < -30.0 && alpha > 15.0),
+            Moment::FullFlow => reached("at full flow", |alpha, rate| flow_ml_s(alpha) > 5.0 && rate.abs() < 5.0),
+            _ => reached("tilting out", |alpha, rate| rate > 20.0 && alpha > 20.0),
+        }
+        Some(episode)
+    }
+
+    /// One cell of the matrix.
+    fn check(&mut self, fault: &str, moment: Moment, expected: Expected, strike: impl Fn(&mut Self), recover: impl Fn(&mut Self)) {
+        let connections = self.client.as_ref().unwrap().status().unwrap().robot_connections;
+        let said_before = self.said().len();
+        let episode = self.reach(moment);
+        self.robot.start_trace(24);
+        strike(self);
+        let outcome = episode.map(|episode| self.outcome(episode));
+        let upright = |c: &Self| {
+            let (alpha, rate) = c.alpha();
+            (alpha.abs() < 1.0 && rate.abs() < 1.0).then_some(())
+        };
+        let wanted = match expected {
+            Expected::Nothing => EndReason::Done,
+            Expected::Upright(reason) | Expected::Stopped(reason) => reason,
+        };
+        match expected {
+            Expected::Stopped(_) => self.until("stopped", |c| (c.alpha().1.abs() < 0.5).then_some(())),
+            _ => self.until("upright", upright),
+        }
+        // Some more cycles, so that a motion that goes on would be seen.
+        thread::sleep(Duration::from_millis(400));
+        let trace = self.robot.take_trace();
+        let motion = Motion::of(&trace);
+
+        self.robot.start_trace(24);
+        recover(self);
+        if expected != Expected::Nothing {
+            self.until("connected anew", |c| {
+                let status = c.client.as_ref()?.status().ok()?;
+                (status.robot_connections != connections).then_some(())
+            });
+        }
+        self.ready();
+        let next = self.outcome(self.pour(8.0));
+        let back = Motion::of(&self.robot.take_trace());
+
+        let reason = outcome.map_or("-", |o| o.reason.words());
+        let poured = outcome.map_or(String::from("-"), |o| format!("{:.1}", o.poured_ml));
+        let upright_s = motion.upright_s.map_or(String::from("after recovery"), |s| format!("{s:.2}"));
+        let row = format!(
+            "| {fault} | {moment:?} | {reason} | {poured} | {:.1} | {:.1} | {:.2} | {upright_s} | {:.0} | {:.0} | {:.1} |",
+            motion.start_deg, motion.peak_deg, motion.rest_s, motion.fastest_deg_s, motion.hardest_deg_s2, next.poured_ml
+        );
+        writeln!(self.table, "{row}").unwrap();
+
+        let context = || format!("{row}\n{}", self.log());
+        if let Some(outcome) = outcome {
+            assert_eq!(outcome.reason, wanted, "{}", context());
+            assert!(outcome.poured_ml > 0.0 || moment == Moment::TiltingOut, "what was poured is reported\n{}", context());
+        }
+        if moment == Moment::AtRest && expected != Expected::Nothing {
+            // Nothing was under way that could have a result: then the operator is told.
+            let said = self.said().split_off(said_before);
+            let words = [wanted.words(), &Lost::Closed.to_string(), &Lost::Broken.to_string()].map(str::to_owned);
+            assert!(words.iter().any(|w| said.contains(w)), "{words:?}\n{}", context());
+        }
+        match expected {
+            Expected::Nothing => {}
+            Expected::Upright(_) => {
+                let bound = UPRIGHT_BOUND_S + motion.peak_deg / RETURN_RATE_DEG_S;
+                assert!(motion.upright_s.is_some_and(|s| s <= bound), "upright within {bound:.2} s\n{}", context());
+            }
+            Expected::Stopped(_) => assert!(motion.rest_s <= STOP_BOUND_S, "stopped within {STOP_BOUND_S} s\n{}", context()),
+        }
+        for motion in [&motion, &back] {
+            assert!(motion.fastest_deg_s <= 90.0 + 1e-3, "{}", context());
+            assert!(motion.hardest_deg_s2 <= 1500.0 * 1.001, "{}", context());
+        }
+        assert_eq!(next.reason, EndReason::Done, "the next pour\n{}", context());
+    }
+
+    fn signal(&self, signal: rustix::process::Signal) {
+        let pid = rustix::process::Pid::from_child(&self.process);
+        rustix::process::kill_process(pid, signal).unwrap();
+    }
+
+    fn dashboard(&self, line: &str) {
+        let mut stream = TcpStream::connect((self.address, 29999)).unwrap();
+        let mut answers = BufReader::new(stream.try_clone().unwrap()).lines();
+        answers.next();
+        stream.write_all(format!("{line}\n").as_bytes()).unwrap();
+        answers.next();
+    }
+
+    fn jog_upright_if_tilted(&mut self) {
+        if self.alpha().0.abs() > 1.0 {
+            self.jog_upright();
+        }
+    }
+
+    /// The operator brings the container upright with the pendant's arrows.
+    fn jog_upright(&self) {
+        let mut q = self.robot.joints().actual_q;
+        q[5] = 0.0;
+        let mut stream = TcpStream::connect((self.address, 30002)).unwrap();
+        stream.write_all(format!("def jog():\n  movej({q:?}, 2.0, 1.0)\nend\n").as_bytes()).unwrap();
+        self.until("jogged upright", |c| (c.alpha().0.abs() < 0.2 && c.alpha().1.abs() < 0.1).then_some(()));
+        self.until("the jog's end", |c| (c.robot.state()?.runtime_state == RuntimeState::Stopped).then_some(()));
+        // What the jog commanded is not ours.
+        self.robot.start_trace(24);
+    }
+}
+
+impl Drop for Cell {
+    fn drop(&mut self) {
+        let _ = self.process.kill();
+        let _ = self.process.wait();
+        self.stop.store(true, Relaxed);
+        if let Some(liquid) = self.liquid.take() {
+            let _ = liquid.join();
+        }
+        println!("{HEAD}\n{}", self.table);
+    }
+}
+
+const HEAD: &str = "| fault | moment | reason | poured ml | alpha at fault | largest alpha | at rest s | upright s | \
+largest rate deg/s | largest acceleration deg/s^2 | next pour of 8 ml |\n|---|---|---|---|---|---|---|---|---|---|---|";
+
+fn start_controller(directory: &Path) -> Child {
+    let path = tests::program("rt-controller");
+    let log = std::fs::OpenOptions::new().create(true).append(true).open(directory.join("log")).unwrap();
+    let config = directory.join("cell.toml");
+    Command::new(path).arg("run").arg("--config").arg(config).stdin(Stdio::null()).stdout(Stdio::null()).stderr(log).spawn().unwrap()
+}
+
+/// A policy by hand: 2.45 degrees a frame until liquid flows well, then stay.
+fn tilt_until_it_flows() -> Weights {
+    let mut policy = Mlp::ZERO;
+    policy.w1[0][0] = 1.0;
+    policy.w2[0][0] = 1.0;
+    policy.w3[0][STAY] = 1.0;
+    policy.b3[STAY + 7] = 0.5;
+    Weights {
+        policy,
+        actions_deg: action_table(),
+        selection: Selection::Argmax,
+        scale: InputScale::default(),
+        calibration: Calibration { c: ML_PER_PX2 as f32, q: 1.0, hold_above_px2: 1e6 },
+        estimator: Estimator::Sum,
+        rate_hz: 30.0,
+        origin: Origin { method: Method::Handmade, actions: 21, episodes: 0, data_sha256: [0; 32] },
+        seed: 1,
+    }
+}
+
+fn flow_ml_s(alpha_deg: f64) -> f64 {
+    ((alpha_deg - 50.0) * 1.0).clamp(0.0, 25.0)
+}
+
+/// The camera, the feature worker and the liquid in one: V_e from the tilt of the joint.
+fn publish_features(name: &str, robot: &Handle, stop: &AtomicBool) {
+    let cell = ipc::Cell::join(name).unwrap();
+    let publisher = cell.features().unwrap().publisher_builder().create().unwrap();
+    let worker_epoch_ns = now_ns();
+    let mut sequence = 0;
+    let mut next = Instant::now();
+    while !stop.load(Relaxed) {
+        next += Duration::from_nanos(1_000_000_000 / 30);
+        thread::sleep(next.saturating_duration_since(Instant::now()));
+        sequence += 1;
+        let alpha_deg = robot.joints().actual_q[5].to_degrees();
+        let now = now_ns();
+        let feature = Feature {
+            version: LAYOUT_VERSION,
+            sequence,
+            worker_epoch_ns,
+            captured_at_ns: now,
+            received_at_ns: now,
+            published_at_ns: now,
+            area_px2: (flow_ml_s(alpha_deg) / 30.0 / ML_PER_PX2) as f32,
+            confidence: 1.0,
+            ..Feature::default()
+        };
+        publisher.send_copy(feature).unwrap();
+    }
+}
+
+/// What a trace shows, from its first row on.
+struct Motion {
+    start_deg: f64,
+    peak_deg: f64,
+    /// When the joint first came to rest.
+    rest_s: f64,
+    /// When it was upright and stayed so.
+    upright_s: Option<f64>,
+    /// Of the angles given to servoj.
+    fastest_deg_s: f64,
+    hardest_deg_s2: f64,
+}
+
+impl Motion {
+    fn of(trace: &[TraceRow]) -> Self {
+        let alpha = |r: &TraceRow| r.actual_q[5].to_degrees();
+        let rate = |r: &TraceRow| r.actual_qd[5].to_degrees();
+        let (first, last) = (trace.first().unwrap(), trace.last().unwrap());
+        let upright = |r: &TraceRow| alpha(r).abs() < 1.0 && rate(r).abs() < 1.0;
+        let upright_from = trace.iter().rposition(|r| !upright(r)).map_or(0, |i| i + 1);
+        let rest = trace.iter().find(|r| rate(r).abs() < 1.0).unwrap_or(last);
+        // Only cycles in which servoj moved the joint: what a stop or a jog does is the robot's own.
+        let cycle_s = 0.008;
+        let speed = |w: &[TraceRow]| (w[1].commanded_q[5] - w[0].commanded_q[5]).to_degrees() / cycle_s;
+        let commanded: Vec<f64> = trace.windows(2).map(speed).collect();
+        Self {
+            start_deg: alpha(first),
+            peak_deg: trace.iter().map(alpha).fold(f64::MIN, f64::max),
+            rest_s: rest.timestamp_s - first.timestamp_s,
+            upright_s: trace.get(upright_from).map(|r| r.timestamp_s - first.timestamp_s),
+            fastest_deg_s: commanded.iter().fold(0.0, |m, v| m.max(v.abs())),
+            hardest_deg_s2: commanded.windows(2).fold(0.0, |m, w| m.max((w[1] - w[0]).abs() / cycle_s)),
+        }
+    }
+}
+
+/// All four moments in one cell: each begins with the recovery from the one before.
+fn matrix(name: &str, last: u8, expected: Expected, strike: impl Fn(&mut Cell), recover: impl Fn(&mut Cell)) {
+    let mut cell = Cell::new(name, last);
+    for moment in MOMENTS {
+        cell.check(name, moment, expected, &strike, &recover);
+    }
+}
+
+/// A fault that passes or needs nobody.
+fn by_itself(name: &str, last: u8, expected: Expected, fault: Fault) {
+    matrix(name, last, expected, |c| c.robot.inject(fault.clone()), |_| {});
+}
+
+/// A fault that shows when connecting: the connection is closed with it, and it lasts until the operator has read about it.
+fn at_connecting(name: &str, last: u8, fault: Fault, words: &str) {
+    let strike = |c: &mut Cell| {
+        c.robot.inject(fault.clone());
+        c.robot.inject(Fault::Fin);
+    };
+    let recover = |c: &mut Cell| {
+        c.until(words, |c| c.client.as_ref()?.status().ok()?.hindrance.contains(words).then_some(()));
+        c.robot.inject(Fault::Clear);
+    };
+    matrix(name, last, Expected::Upright(EndReason::RobotLost), strike, recover);
+}
+
+/// Protects the pour from a robot that closes the connection.
+#[test]
+fn fin() {
+    by_itself("fin", 1, Expected::Upright(EndReason::RobotLost), Fault::Fin);
+}
+
+/// Protects the pour from a connection that is reset.
+#[test]
+fn reset() {
+    by_itself("reset", 2, Expected::Upright(EndReason::RobotLost), Fault::Reset);
+}
+
+/// Protects the pour from a controller that is gone for a while.
+#[test]
+fn offline() {
+    by_itself("offline", 3, Expected::Upright(EndReason::RobotLost), Fault::Offline(1.5));
+}
+
+/// Protects the pour from a half-open connection.
+#[test]
+fn stall() {
+    by_itself("stall", 4, Expected::Upright(EndReason::RobotLost), Fault::Stall(1.5));
+}
+
+/// Protects the pour from a robot whose clock stands still while frames keep coming.
+#[test]
+fn freeze() {
+    by_itself("freeze", 5, Expected::Upright(EndReason::RobotStalled), Fault::Freeze(1.5));
+}
+
+/// Protects the pour from a robot that talks but does not listen.
+#[test]
+fn slow_reader() {
+    by_itself("slow-reader", 6, Expected::Upright(EndReason::RobotLost), Fault::SlowReader(1.5));
+}
+
+/// Protects the pour from a longer gap in the robot's state.
+#[test]
+fn skipped_outputs() {
+    by_itself("skip-outputs", 7, Expected::Upright(EndReason::RobotLost), Fault::SkipOutputs(40));
+}
+
+/// Protects the pour from being ended by what is harmless: a short gap.
+#[test]
+fn few_skipped_outputs() {
+    by_itself("skip-few-outputs", 8, Expected::Nothing, Fault::SkipOutputs(4));
+}
+
+/// Protects the pour from being ended by what is harmless: a text message.
+#[test]
+fn text() {
+    by_itself("text", 9, Expected::Nothing, Fault::Text("SafetySetup has not been confirmed yet".into()));
+}
+
+/// Protects the pour from being ended by what is harmless: frames in pieces.
+#[test]
+fn split() {
+    by_itself("split", 10, Expected::Nothing, Fault::Split(1.5));
+}
+
+/// Protects the pour from being ended by what is harmless: frames four at a time.
+#[test]
+fn coalesced() {
+    by_itself("coalesce", 11, Expected::Nothing, Fault::Coalesce(1.5));
+}
+
+/// Protects the connection from a text message before the first answer.
+#[test]
+fn text_on_connect() {
+    let strike = |c: &mut Cell| {
+        c.robot.inject(Fault::TextOnConnect("SafetySetup has not been confirmed yet".into()));
+        c.robot.inject(Fault::Fin);
+    };
+    matrix("text-on-connect", 12, Expected::Upright(EndReason::RobotLost), strike, |_| {});
+}
+
+/// Protects the connection from a robot that takes its time to start a program.
+#[test]
+fn late_start() {
+    let strike = |c: &mut Cell| {
+        c.robot.inject(Fault::LateStart(2.0));
+        c.robot.inject(Fault::Fin);
+    };
+    matrix("late-start", 13, Expected::Upright(EndReason::RobotLost), strike, |_| {});
+}
+
+/// Protects the operator: a register that a fieldbus has taken is named, and when it is free again the controller is back.
+#[test]
+fn in_use() {
+    let words = "input_int_register_24 is in use by another RTDE client or a fieldbus";
+    at_connecting("in-use", 14, Fault::InUse("input_int_register_24".into()), words);
+}
+
+/// Protects the operator: an unknown variable is named.
+#[test]
+fn not_found() {
+    at_connecting("not-found", 15, Fault::NotFound("safety_status_bits".into()), "does not know the RTDE variable safety_status_bits");
+}
+
+/// Protects the operator: a refused protocol version is named.
+#[test]
+fn version_refused() {
+    at_connecting("refuse-version-2", 16, Fault::RefuseVersion2, "refuses RTDE protocol 2");
+}
+
+/// Protects people: a protective stop ends the pour; nothing moves until the operator lets the program go on, which then only
+/// comes upright.
+#[test]
+fn protective_stop() {
+    let recover = |c: &mut Cell| {
+        c.until("unlocked", |c| {
+            c.dashboard("unlock protective stop");
+            thread::sleep(Duration::from_millis(100));
+            (c.robot.state()?.safety_mode == simulator::ur::SafetyMode::Normal).then_some(())
+        });
+        c.dashboard("play");
+    };
+    let strike = |c: &mut Cell| c.robot.inject(Fault::ProtectiveStop);
+    matrix("protective-stop", 17, Expected::Stopped(EndReason::ProtectiveStop), strike, recover);
+}
+
+/// Protects people: an emergency stop ends the pour; nothing moves until the operator has powered and moved the robot.
+#[test]
+fn emergency_stop() {
+    let recover = |c: &mut Cell| {
+        c.robot.inject(Fault::EmergencyRelease);
+        c.dashboard("power on");
+        c.until("its brakes released", |c| {
+            c.dashboard("brake release");
+            thread::sleep(Duration::from_millis(50));
+            (c.robot.state()?.robot_mode == RobotMode::Running).then_some(())
+        });
+        c.jog_upright_if_tilted();
+    };
+    let strike = |c: &mut Cell| c.robot.inject(Fault::EmergencyStop);
+    matrix("emergency-stop", 18, Expected::Stopped(EndReason::EmergencyStop), strike, recover);
+}
+
+/// Protects the operator's word: a program stopped on the pendant stays stopped until the container is upright again.
+#[test]
+fn program_stop() {
+    let strike = |c: &mut Cell| c.robot.inject(Fault::ProgramStop);
+    matrix("program-stop", 19, Expected::Stopped(EndReason::ProgramStopped), strike, Cell::jog_upright_if_tilted);
+}
+
+/// Protects the operator's word: a paused program ends the pour; resumed, it only comes upright.
+#[test]
+fn program_pause() {
+    let strike = |c: &mut Cell| c.robot.inject(Fault::ProgramPause);
+    matrix("program-pause", 20, Expected::Stopped(EndReason::ProgramStopped), strike, |c| c.dashboard("play"));
+}
+
+/// Protects the pour from a controller that was stopped: the program comes upright, and the controller knows why.
+#[test]
+fn controller_stopped_for_a_while() {
+    let strike = |c: &mut Cell| {
+        c.signal(rustix::process::Signal::STOP);
+        thread::sleep(Duration::from_millis(400));
+        c.signal(rustix::process::Signal::CONT);
+    };
+    matrix("sigstop", 21, Expected::Upright(EndReason::ControllerOverrun), strike, |_| {});
+}

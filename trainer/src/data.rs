@@ -1,0 +1,215 @@
+//! What the trainer works on: weighed episodes as plain columns, read from MCAP files or CSV tables.
+//!
+//! Offline, ordinary thread, allocates. Bad data gets one clear line ([`DataError`]) that names the episode.
+
+use std::path::{Path, PathBuf};
+
+use sha2::{Digest, Sha256};
+use shared::episode::{self, Episode};
+
+/// One experimental episode E = (L_E, w_E), a row a camera frame; all columns have the same length.
+#[derive(Debug, Clone, PartialEq)]
+pub struct TrainingEpisode {
+    /// The episode's name: its file, or its name in a table.
+    pub name: String,
+    /// Frames a second.
+    pub rate_hz: f64,
+    /// Capture time, s, ascending.
+    pub t_s: Vec<f64>,
+    /// Commanded alpha at the capture time, degrees.
+    pub alpha_deg: Vec<f64>,
+    /// Measured alpha at the capture time, degrees; NaN where it is not known.
+    pub alpha_measured_deg: Vec<f64>,
+    /// V_e, px^2; NaN where the frame was lost or its measurement is doubtful.
+    pub area_px2: Vec<f64>,
+    /// w_E, g (1 g = 1 ml); NaN: nobody read the scale.
+    pub weight_g: f64,
+}
+
+/// Why data is refused.
+#[derive(Debug, thiserror::Error)]
+pub enum DataError {
+    /// A file cannot be read as an episode.
+    #[error(transparent)]
+    Episode(#[from] episode::EpisodeError),
+    /// A table cannot be read.
+    #[error(transparent)]
+    Table(#[from] episode::TableError),
+    /// No episodes at all.
+    #[error("no episodes found in {places}: record some with `rt-controller record`")]
+    None {
+        /// Where was looked.
+        places: String,
+    },
+    /// One episode cannot be trained on.
+    #[error("{name}: {what}")]
+    Unusable {
+        /// The episode.
+        name: String,
+        /// What is wrong and what to do.
+        what: String,
+    },
+    /// Too few for the method.
+    #[error("{found} usable episodes, method {method} needs {needed}: record more")]
+    TooFew {
+        /// Usable episodes.
+        found: usize,
+        /// The method.
+        method: String,
+        /// Its least number.
+        needed: usize,
+    },
+}
+
+impl TrainingEpisode {
+    /// An episode without frames and without weight.
+    pub fn empty(name: &str, rate_hz: f64) -> Self {
+        let column = Vec::new;
+        Self {
+            name: name.into(),
+            rate_hz,
+            t_s: column(),
+            alpha_deg: column(),
+            alpha_measured_deg: column(),
+            area_px2: column(),
+            weight_g: f64::NAN,
+        }
+    }
+
+    /// Adds a frame.
+    pub fn push(&mut self, t_s: f64, alpha_deg: f64, alpha_measured_deg: f64, area_px2: f64) {
+        self.t_s.push(t_s);
+        self.alpha_deg.push(alpha_deg);
+        self.alpha_measured_deg.push(alpha_measured_deg);
+        self.area_px2.push(area_px2);
+    }
+
+    /// Number of frames.
+    pub fn len(&self) -> usize {
+        self.t_s.len()
+    }
+
+    /// Whether there are no frames.
+    pub fn is_empty(&self) -> bool {
+        self.t_s.is_empty()
+    }
+
+    /// What makes this episode unusable, if anything does; `None`: it can be trained on.
+    pub fn fault(&self) -> Option<String> {
+        let n = self.len();
+        if [self.alpha_deg.len(), self.alpha_measured_deg.len(), self.area_px2.len()].iter().any(|l| *l != n) {
+            return Some(format!(
+                "columns of unequal lengths ({n} times, {} angles, {} areas): export the table again",
+                self.alpha_deg.len(),
+                self.area_px2.len()
+            ));
+        }
+        if n < 30 {
+            return Some(format!("only {n} frames: an episode needs a whole curve, at least 30"));
+        }
+        if let Some(k) = self.t_s.iter().chain(&self.alpha_deg).position(|v| !v.is_finite()) {
+            return Some(format!("frame {}: time or angle is not finite: export the table again", k % n));
+        }
+        if let Some(k) = self.t_s.windows(2).position(|t| t[1] <= t[0]) {
+            return Some(format!("frame {}: time does not go forward: sort the frames", k + 1));
+        }
+        if let Some(k) = self.area_px2.iter().position(|a| a.is_infinite() || *a < 0.0) {
+            return Some(format!("frame {k}: area {} is not a number >= 0: check the vision", self.area_px2[k]));
+        }
+        if self.weight_g.is_nan() {
+            return Some("no weight: read the scale and enter it with `feature-worker episodes --weight G FILE`, or in scale.csv".into());
+        }
+        if !self.weight_g.is_finite() || self.weight_g < 0.0 {
+            return Some(format!("weight {} g is not a number >= 0: correct it", self.weight_g));
+        }
+        if self.weight_g == 0.0 {
+            return Some("weight 0 g: nothing was poured, nothing can be learned from it; leave it out".into());
+        }
+        if !self.area_px2.iter().any(|a| *a > 0.0) {
+            return Some(format!("no stream was ever seen, but the scale shows {} g: check the vision or the weight", self.weight_g));
+        }
+        None
+    }
+
+    fn from_episode(e: &Episode) -> Self {
+        let mut own = Self::empty(&e.name, rate_hz(e));
+        for f in &e.frames {
+            own.push(f.t_s, f64::from(f.alpha_commanded_deg), f64::from(f.alpha_measured_deg), f64::from(f.area_px2));
+        }
+        own.weight_g = e.weight_g.unwrap_or(f64::NAN);
+        own
+    }
+}
+
+/// Frames a second, from the median interval.
+fn rate_hz(e: &Episode) -> f64 {
+    let mut steps: Vec<f64> = e.frames.windows(2).map(|w| w[1].t_s - w[0].t_s).filter(|s| *s > 0.0).collect();
+    steps.sort_by(f64::total_cmp);
+    let median = steps.get(steps.len() / 2).copied().unwrap_or(1.0 / 30.0);
+    (1.0 / median * 10.0).round() / 10.0
+}
+
+/// Reads episodes from MCAP files and directories (`paths`), or from a CSV pair if `scale` is given. Nothing is checked yet
+/// but that they can be read.
+pub fn read(paths: &[PathBuf], scale: Option<&Path>) -> Result<Vec<Episode>, DataError> {
+    let mut episodes = Vec::new();
+    if let Some(scale) = scale {
+        for features in paths {
+            episodes.extend(episode::read_table(features, scale)?);
+        }
+    } else {
+        for file in episode::find(paths)? {
+            episodes.push(Episode::read(&file)?);
+        }
+    }
+    if episodes.is_empty() {
+        let places: Vec<String> = paths.iter().map(|p| p.display().to_string()).collect();
+        return Err(DataError::None { places: places.join(", ") });
+    }
+    Ok(episodes)
+}
+
+/// What a data set is good for: the usable episodes, and a line for each one that was left out.
+#[derive(Debug, Clone, Default)]
+pub struct Usable {
+    /// Episodes to train on.
+    pub episodes: Vec<TrainingEpisode>,
+    /// Name and reason of each that was left out.
+    pub left_out: Vec<(String, String)>,
+}
+
+/// Keeps what can be trained on: complete, weighed, sound, and each measurement once.
+pub fn usable(episodes: &[Episode]) -> Usable {
+    let mut result = Usable::default();
+    let doubles = Episode::duplicates(episodes);
+    for (k, e) in episodes.iter().enumerate() {
+        let own = TrainingEpisode::from_episode(e);
+        let fault = if !e.complete {
+            Some("the recording is incomplete (the recorder was stopped): the areas do not add up to the weight; record it again".into())
+        } else if let Some((first, _)) = doubles.iter().find(|(_, later)| *later == k) {
+            Some(format!("the same measurement as {}: leave one of them out", episodes[*first].name))
+        } else {
+            own.fault()
+        };
+        match fault {
+            Some(what) => result.left_out.push((e.name.clone(), what)),
+            None => result.episodes.push(own),
+        }
+    }
+    result
+}
+
+/// SHA-256 of what is trained on: columns and weights of all episodes in order; names do not enter.
+pub fn hash(episodes: &[TrainingEpisode]) -> [u8; 32] {
+    let mut hash = Sha256::new();
+    for e in episodes {
+        hash.update((e.len() as u64).to_le_bytes());
+        for column in [&e.t_s, &e.alpha_deg, &e.area_px2] {
+            for v in column {
+                hash.update(if v.is_nan() { f64::NAN } else { *v }.to_le_bytes());
+            }
+        }
+        hash.update(e.weight_g.to_le_bytes());
+    }
+    hash.finalize().into()
+}

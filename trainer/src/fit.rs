@@ -1,0 +1,460 @@
+//! Fits the [flow model](shared::estimate::flow) to weighed episodes: Levenberg-Marquardt on frames and weights.
+//!
+//! Offline, pure, allocates; deterministic on any number of threads (episodes are worked on in parallel, summed in order).
+//!
+//! Unknowns: the model's parameters and the calibration (c, q) for all episodes; for each episode the angle at which flow
+//! starts, the flow coefficient lambda (viscosity) and the camera gain gamma. Residuals: frame by frame
+//! `(c area^q - out e^gamma)/sigma`, once per episode `(sum out - w_E)/0.6 g`, and the priors.
+
+use nalgebra::{DMatrix, DVector};
+use rayon::prelude::*;
+use shared::estimate::Calibration;
+use shared::estimate::flow::{DELAY_MAX, DRIP, Flow, FlowModel, FlowNoise, HISTORY, KNOTS_DEG};
+
+use crate::calibrate;
+use crate::data::TrainingEpisode;
+
+/// Global unknowns: s (8), lk, p, k1, k2, tau, delay, eta, log c, q.
+const GLOBAL: usize = 17;
+const LK: usize = 8;
+const P: usize = 9;
+const K1: usize = 10;
+const K2: usize = 11;
+const TAU: usize = 12;
+const DELAY: usize = 13;
+const ETA: usize = 14;
+const LOG_C: usize = 15;
+const Q: usize = 16;
+/// Unknowns of an episode: onset angle, lambda, gamma.
+const LOCAL: usize = 3;
+/// Weight of a scale that shows whole grams, and of the person reading it, g.
+const WEIGHT_SD_G: f64 = 0.6;
+/// Residuals beyond this grow only with the root.
+const HUBER: f64 = 3.0;
+
+/// What was found.
+#[derive(Debug, Clone)]
+pub struct Fit {
+    /// The model, with the uncertainties that the filter needs.
+    pub model: FlowModel,
+    /// Calibration found together with it.
+    pub calibration: Calibration,
+    /// Of each episode: onset angle in degrees, lambda, gamma.
+    pub episodes: Vec<[f64; LOCAL]>,
+    /// Of each episode: volume by the model minus weight, in standard deviations when the weight was not used for it.
+    pub cost: f64,
+    /// Covariance of the global unknowns.
+    pub covariance: DMatrix<f64>,
+    /// Share of zeros within the flow.
+    pub dropouts: f64,
+}
+
+/// One episode made ready: areas, their smoothed profile, masks.
+struct Prepared {
+    alpha: Vec<f64>,
+    area: Vec<f64>,
+    smooth: Vec<f64>,
+    smooth_max: f64,
+    used: Vec<bool>,
+    weight_g: f64,
+    first: usize,
+}
+
+#[derive(Clone, Copy)]
+struct Stage {
+    rel: f64,
+    floor: f64,
+    gamma_sd: f64,
+    /// Calibration held at (log c, q) with this sd.
+    held: Option<([f64; 2], f64)>,
+}
+
+impl Prepared {
+    fn new(e: &TrainingEpisode) -> Self {
+        let n = e.len();
+        let area = e.area_px2.clone();
+        let seen = |k: usize| area[k] > 0.0;
+        let mut used = vec![true; n];
+        let mut filled = area.clone();
+        for k in 0..n {
+            let before = (k.saturating_sub(3)..k).any(seen);
+            let after = (k + 1..(k + 4).min(n)).any(seen);
+            if area[k].is_nan() || (area[k] == 0.0 && before && after) {
+                used[k] = false;
+                // For the profile only: the neighbours' mean.
+                let near: Vec<f64> = (k.saturating_sub(3)..(k + 4).min(n)).filter(|j| seen(*j)).map(|j| area[j]).collect();
+                filled[k] = if near.is_empty() { 0.0 } else { near.iter().sum::<f64>() / near.len() as f64 };
+            }
+        }
+        let smooth: Vec<f64> = (0..n)
+            .map(|k| {
+                let (from, to) = (k.saturating_sub(2), (k + 3).min(n));
+                filled[from..to].iter().sum::<f64>() / (to - from) as f64
+            })
+            .collect();
+        let smooth_max = smooth.iter().copied().fold(1e-9, f64::max);
+        let first = (0..n).find(|k| seen(*k)).unwrap_or(0);
+        Self { alpha: e.alpha_deg.clone(), area, smooth, smooth_max, used, weight_g: e.weight_g, first }
+    }
+
+    /// Residuals of this episode for a model; appends to `out`.
+    fn residuals(&self, flow: &Flow, log_c: f64, q: f64, local: &[f64; LOCAL], stage: &Stage, area_min: f64, out: &mut Vec<f64>) {
+        let [onset, lambda, gamma] = *local;
+        let (c, gain) = (log_c.exp(), gamma.exp());
+        let v_min = c * area_min.powf(q);
+        let v_max = c * self.smooth_max.powf(q);
+        let mut x = flow.capacity_ml(onset.clamp(0.0, 115.0));
+        let (mut film, mut sum) = (0.0, 0.0);
+        let mut history = [self.alpha[0]; HISTORY];
+        let mut a = self.alpha[0];
+        let eta = flow.model.eta;
+        for k in 0..self.area.len() {
+            history.copy_within(1.., 0);
+            history[HISTORY - 1] = self.alpha[k];
+            a = flow.tilt(a, flow.delayed(&history, 0));
+            let v = flow.over(a, x, lambda).v_ml;
+            x += v;
+            film += eta * v;
+            let drip = DRIP * film;
+            film -= drip;
+            let leaves = (1.0 - eta) * v + drip;
+            sum += leaves;
+            if !self.used[k] {
+                continue;
+            }
+            let h = leaves * gain;
+            let sigma = stage.rel * c * self.smooth[k].powf(q) + stage.floor * v_max;
+            if self.area[k] > 0.0 {
+                out.push(soft((c * self.area[k].powf(q) - h) / sigma));
+            } else if h > v_min {
+                out.push(soft((v_min - h) / sigma));
+            } else {
+                out.push(0.0);
+            }
+        }
+        out.push((sum + film - self.weight_g) / WEIGHT_SD_G);
+        out.push(lambda / 0.08);
+        out.push(gamma / stage.gamma_sd);
+    }
+}
+
+/// A residual that counts with its root beyond [`HUBER`].
+fn soft(r: f64) -> f64 {
+    if r.abs() <= HUBER { r } else { r.signum() * (2.0 * HUBER * r.abs() - HUBER * HUBER).sqrt() }
+}
+
+fn model_of(g: &[f64]) -> FlowModel {
+    let mut s = [0.0; 8];
+    s.copy_from_slice(&g[..8]);
+    FlowModel {
+        s,
+        lk: g[LK],
+        p: g[P].clamp(0.3, 4.0),
+        k1: g[K1],
+        k2: g[K2],
+        tau: g[TAU].clamp(0.0, 30.0),
+        delay: g[DELAY].clamp(0.0, DELAY_MAX),
+        eta: g[ETA].clamp(0.0, 0.6),
+        noise: FlowNoise { lambda: 0.2, gamma: 0.02, beta: 0.01, delta: 0.5, frame: 0.1, v_min_ml: 0.0 },
+    }
+}
+
+/// Prior mean of s at a knot.
+fn s_prior(k: usize) -> f64 {
+    7f64.ln() - 0.5 * (1.0 - KNOTS_DEG[k] / 90.0).max(0.003).ln()
+}
+
+fn priors(g: &[f64], stage: &Stage) -> Vec<f64> {
+    let mut r = Vec::with_capacity(32);
+    for k in 0..7 {
+        r.push((g[k] - s_prior(k)) / 0.7);
+    }
+    r.push((g[7] - g[6]) / 0.3);
+    // Curvature of s: the slope changes little from knot to knot.
+    let slope = |k: usize| (g[k + 1] - g[k]) / (KNOTS_DEG[k + 1] - KNOTS_DEG[k]) * 10.0;
+    for k in 1..6 {
+        r.push((slope(k) - slope(k - 1)) / 0.15);
+    }
+    r.push((g[P] - 1.5) / 0.2);
+    r.push((g[LK] + 3.2) / 1.5);
+    r.push(g[K1] / 0.35);
+    r.push(g[K2] / 0.25);
+    r.push((g[TAU] - 2.0) / 0.8);
+    r.push((g[DELAY] - 2.0) / 1.2);
+    r.push((g[ETA] - 0.05) / 0.06);
+    match stage.held {
+        None => r.push((g[Q] - 1.15) / 0.2),
+        Some(([log_c, q], sd)) => {
+            r.push((g[LOG_C] - log_c) / sd);
+            r.push((g[Q] - q) / sd);
+        }
+    }
+    r
+}
+
+struct Problem<'a> {
+    episodes: &'a [Prepared],
+    area_min: f64,
+    stage: Stage,
+}
+
+#[derive(Clone)]
+struct Unknowns {
+    global: [f64; GLOBAL],
+    local: Vec<[f64; LOCAL]>,
+}
+
+struct Linear {
+    a: DMatrix<f64>,
+    b: DVector<f64>,
+}
+
+impl Problem<'_> {
+    fn episode_residuals(&self, k: usize, flow: &Flow, global: &[f64], local: &[f64; LOCAL]) -> Vec<f64> {
+        let mut out = Vec::with_capacity(self.episodes[k].area.len() + 4);
+        self.episodes[k].residuals(flow, global[LOG_C], global[Q], local, &self.stage, self.area_min, &mut out);
+        out
+    }
+
+    fn cost(&self, u: &Unknowns) -> f64 {
+        let flow = Flow::new(&model_of(&u.global));
+        let square = |r: Vec<f64>| r.iter().map(|v| v * v).sum::<f64>();
+        let parts: Vec<f64> =
+            (0..self.episodes.len()).into_par_iter().map(|k| square(self.episode_residuals(k, &flow, &u.global, &u.local[k]))).collect();
+        let total = square(priors(&u.global, &self.stage)) + parts.iter().sum::<f64>();
+        if total.is_finite() { total } else { f64::INFINITY }
+    }
+
+    fn linearise(&self, u: &Unknowns) -> Linear {
+        let n = GLOBAL + LOCAL * self.episodes.len();
+        let step = |k: usize| if k == Q || k == LOG_C { 1e-5 } else { 1e-4 };
+        let nudged: Vec<([f64; GLOBAL], Flow)> = (0..GLOBAL)
+            .map(|k| {
+                let mut g = u.global;
+                g[k] += step(k);
+                (g, Flow::new(&model_of(&g)))
+            })
+            .collect();
+        let flow = Flow::new(&model_of(&u.global));
+        let blocks: Vec<(DMatrix<f64>, DVector<f64>)> = (0..self.episodes.len())
+            .into_par_iter()
+            .map(|e| {
+                let base = self.episode_residuals(e, &flow, &u.global, &u.local[e]);
+                let mut j = DMatrix::zeros(base.len(), GLOBAL + LOCAL);
+                let mut set = |column: usize, moved: Vec<f64>, h: f64| {
+                    for (row, (m, b)) in moved.iter().zip(&base).enumerate() {
+                        j[(row, column)] = (m - b) / h;
+                    }
+                };
+                for (k, (g, f)) in nudged.iter().enumerate() {
+                    set(k, self.episode_residuals(e, f, g, &u.local[e]), step(k));
+                }
+                for k in 0..LOCAL {
+                    let mut local = u.local[e];
+                    local[k] += 1e-4;
+                    set(GLOBAL + k, self.episode_residuals(e, &flow, &u.global, &local), 1e-4);
+                }
+                (j.tr_mul(&j), j.tr_mul(&DVector::from_vec(base)))
+            })
+            .collect();
+        let mut a = DMatrix::zeros(n, n);
+        let mut b = DVector::zeros(n);
+        for (e, (jj, jr)) in blocks.iter().enumerate() {
+            let index = |k: usize| if k < GLOBAL { k } else { GLOBAL + LOCAL * e + k - GLOBAL };
+            for r in 0..GLOBAL + LOCAL {
+                b[index(r)] += jr[r];
+                for c in 0..GLOBAL + LOCAL {
+                    a[(index(r), index(c))] += jj[(r, c)];
+                }
+            }
+        }
+        let base = priors(&u.global, &self.stage);
+        let mut j = DMatrix::zeros(base.len(), GLOBAL);
+        for k in 0..GLOBAL {
+            let mut g = u.global;
+            g[k] += 1e-4;
+            for (row, (m, r)) in priors(&g, &self.stage).iter().zip(&base).enumerate() {
+                j[(row, k)] = (m - r) / 1e-4;
+            }
+        }
+        let (jj, jr) = (j.tr_mul(&j), j.tr_mul(&DVector::from_vec(base)));
+        for r in 0..GLOBAL {
+            b[r] += jr[r];
+            for c in 0..GLOBAL {
+                a[(r, c)] += jj[(r, c)];
+            }
+        }
+        Linear { a, b }
+    }
+
+    /// Levenberg-Marquardt from `u`; the cost reached.
+    fn solve(&self, u: &mut Unknowns, iterations: usize) -> f64 {
+        let mut cost = self.cost(u);
+        let mut damping = 1e-2;
+        for _ in 0..iterations {
+            let Linear { a, b } = self.linearise(u);
+            let before = cost;
+            for _ in 0..8 {
+                let mut damped = a.clone();
+                for k in 0..damped.nrows() {
+                    damped[(k, k)] += damping * a[(k, k)].max(1e-9);
+                }
+                let Some(cholesky) = damped.cholesky() else {
+                    damping *= 10.0;
+                    continue;
+                };
+                let step = cholesky.solve(&b);
+                let mut next = u.clone();
+                for (k, g) in next.global.iter_mut().enumerate() {
+                    *g -= step[k];
+                }
+                for (e, local) in next.local.iter_mut().enumerate() {
+                    for (k, l) in local.iter_mut().enumerate() {
+                        *l -= step[GLOBAL + LOCAL * e + k].clamp(-8.0, 8.0);
+                    }
+                }
+                let model = model_of(&next.global);
+                (next.global[P], next.global[TAU], next.global[DELAY], next.global[ETA]) = (model.p, model.tau, model.delay, model.eta);
+                let new = self.cost(&next);
+                if new < cost {
+                    *u = next;
+                    cost = new;
+                    damping = (damping * 0.3).max(1e-7);
+                    break;
+                }
+                damping *= 5.0;
+            }
+            if before - cost < 1e-4 * before.max(1.0) {
+                break;
+            }
+        }
+        cost
+    }
+}
+
+/// Fits model and calibration to `episodes`, all of which are usable.
+pub fn fit(episodes: &[TrainingEpisode]) -> Fit {
+    let prepared: Vec<Prepared> = episodes.iter().map(Prepared::new).collect();
+    let area_min = prepared.iter().flat_map(|p| &p.area).copied().filter(|a| *a > 0.0).fold(f64::INFINITY, f64::min);
+    let area_min = if area_min.is_finite() { area_min } else { 1.0 };
+    let q0 = 1.15;
+    let c0 = f64::from(calibrate::fit(episodes, Some(q0)).c);
+
+    let start = |lk: f64| {
+        let mut global = [0.0; GLOBAL];
+        for (k, s) in global[..7].iter_mut().enumerate() {
+            *s = s_prior(k);
+        }
+        global[7] = global[6];
+        (global[LK], global[P], global[TAU], global[DELAY], global[ETA]) = (lk, 1.5, 2.0, 2.0, 0.05);
+        (global[LOG_C], global[Q]) = (c0.ln(), q0);
+        let flow = Flow::new(&model_of(&global));
+        let local = prepared.iter().map(|p| [onset_guess(&flow, p), 0.0, 0.0]).collect();
+        Unknowns { global, local }
+    };
+    let wide = Stage { rel: 0.5, floor: 0.01, gamma_sd: 0.02, held: None };
+    let problem = Problem { episodes: &prepared, area_min, stage: wide };
+    let mut best: Option<(f64, Unknowns)> = None;
+    for lk in [-4.2, -3.2, -2.2] {
+        let mut u = start(lk);
+        let cost = problem.solve(&mut u, 12);
+        if best.as_ref().is_none_or(|(c, _)| cost < *c) {
+            best = Some((cost, u));
+        }
+    }
+    let mut u = best.map_or_else(|| start(-3.2), |(_, u)| u);
+    problem.solve(&mut u, 25);
+    let wide_covariance = invert(&problem.linearise(&u).a);
+
+    let held = Some(([u.global[LOG_C], u.global[Q]], 0.002));
+    let narrow = Problem { stage: Stage { rel: 0.15, floor: 0.005, gamma_sd: 0.03, held }, ..problem };
+    let cost = narrow.solve(&mut u, 30);
+    let covariance = invert(&narrow.linearise(&u).a);
+
+    let (log_c, q) = (u.global[LOG_C], u.global[Q]);
+    let mut model = model_of(&u.global);
+    let (frame_noise, dropouts) = frame_noise(&prepared);
+    // sd of log v at 300 px^2 from the wide stage: log v = log c + q log 300.
+    let l = 300f64.ln();
+    let log_v_var = wide_covariance[(LOG_C, LOG_C)] + 2.0 * l * wide_covariance[(LOG_C, Q)] + l * l * wide_covariance[(Q, Q)];
+    model.noise = FlowNoise {
+        lambda: 0.20,
+        gamma: (0.017 * q / 1.15).hypot(0.5 * log_v_var.max(0.0).sqrt()).min(0.5),
+        beta: (0.007f64.powi(2) + geometry_variance(&u, &covariance)).sqrt().min(0.5),
+        delta: 0.5,
+        frame: (frame_noise * q).clamp(0.02, 1.0),
+        v_min_ml: log_c.exp() * area_min.powf(q),
+    };
+    Fit {
+        model,
+        calibration: Calibration { c: log_c.exp() as f32, q: q as f32, hold_above_px2: calibrate::HOLD_ABOVE_PX2 },
+        episodes: u.local,
+        cost,
+        covariance: covariance.view((0, 0), (GLOBAL, GLOBAL)).into_owned(),
+        dropouts,
+    }
+}
+
+/// The tilt at the first sight of flow, a little back.
+fn onset_guess(flow: &Flow, p: &Prepared) -> f64 {
+    let mut history = [p.alpha[0]; HISTORY];
+    let mut a = p.alpha[0];
+    for alpha in &p.alpha[..=p.first] {
+        history.copy_within(1.., 0);
+        history[HISTORY - 1] = *alpha;
+        a = flow.tilt(a, flow.delayed(&history, 0));
+    }
+    a - 1.0
+}
+
+fn invert(a: &DMatrix<f64>) -> DMatrix<f64> {
+    let mut damped = a.clone();
+    for k in 0..damped.nrows() {
+        damped[(k, k)] += 1e-9;
+    }
+    damped.cholesky().map_or_else(|| DMatrix::identity(a.nrows(), a.ncols()) * 0.01, |c| c.inverse())
+}
+
+/// Posterior variance of log dW, averaged over five windows from the lowest onset to the highest + 12 degrees.
+fn geometry_variance(u: &Unknowns, covariance: &DMatrix<f64>) -> f64 {
+    let low = u.local.iter().map(|l| l[0]).fold(f64::INFINITY, f64::min).clamp(0.0, 110.0);
+    let high = u.local.iter().map(|l| l[0]).fold(f64::NEG_INFINITY, f64::max).clamp(0.0, 110.0) + 12.0;
+    let edges: Vec<f64> = (0..=5).map(|k| low + (high - low) * f64::from(k) / 5.0).collect();
+    let log_windows = |g: &[f64]| -> Vec<f64> {
+        let flow = Flow::new(&model_of(g));
+        edges.windows(2).map(|e| (flow.capacity_ml(e[1]) - flow.capacity_ml(e[0])).max(1e-6).ln()).collect()
+    };
+    let base = log_windows(&u.global);
+    let gradients: Vec<Vec<f64>> = (0..8)
+        .map(|k| {
+            let mut g = u.global;
+            g[k] += 1e-4;
+            log_windows(&g).iter().zip(&base).map(|(a, b)| (a - b) / 1e-4).collect()
+        })
+        .collect();
+    let variance =
+        |w: usize| -> f64 { (0..8).map(|i| (0..8).map(|j| gradients[i][w] * covariance[(i, j)] * gradients[j][w]).sum::<f64>()).sum() };
+    (0..5).map(variance).sum::<f64>() / 5.0
+}
+
+/// Relative noise of a frame's area from second differences of its logarithm, and the share of zeros within the flow.
+fn frame_noise(prepared: &[Prepared]) -> (f64, f64) {
+    let mut squares = Vec::new();
+    let (mut zeros, mut within) = (0.0, 0.0);
+    for p in prepared {
+        for k in 1..p.area.len() - 1 {
+            let three = &p.area[k - 1..=k + 1];
+            if three[0] > 0.0 && three[2] > 0.0 {
+                within += 1.0;
+                zeros += f64::from(three[1] == 0.0);
+            }
+            if three.iter().all(|a| *a > 0.2 * p.smooth_max) {
+                squares.push((three[0].ln() - 2.0 * three[1].ln() + three[2].ln()).powi(2) / 6.0);
+            }
+        }
+    }
+    // Robust: the median of a squared normal is 0.455 of its variance.
+    squares.sort_by(f64::total_cmp);
+    let variance = squares.get(squares.len() / 2).copied().unwrap_or(0.01) / 0.455;
+    (variance.sqrt(), if within > 0.0 { zeros / within } else { 0.0 })
+}
