@@ -27,7 +27,7 @@ fn write(directory: &Path, lambda_deg: f32) -> PathBuf {
         if n == 20 || n == 21 {
             continue;
         }
-        let picture = Mat::new_rows_cols_with_default(48, 64, opencv::core::CV_8UC3, Scalar::all(5.0 * n as f64)).unwrap();
+        let picture = Mat::new_rows_cols_with_default(48, 64, opencv::core::CV_8UC3, Scalar::all(6.0 * n as f64)).unwrap();
         let mut bytes = Vector::<u8>::new();
         opencv::imgcodecs::imencode_def(".jpg", &picture, &mut bytes).unwrap();
         let area_px2 = if n > 10 { 100.0 + n as f32 } else { 0.0 };
@@ -120,7 +120,7 @@ fn exports_hold_every_frame_and_overwrite_nothing() {
         assert_eq!(greys.len(), FRAMES as usize);
         for (n, grey) in greys.iter().enumerate() {
             let shown = if n == 20 || n == 21 { 19 } else { n };
-            assert!((grey - 5.0 * shown as f64).abs() < 8.0, "picture {n}: {grey}");
+            assert!((grey - 6.0 * shown as f64).abs() < 2.5, "picture {n}: {grey}");
         }
     }
 
