@@ -42,7 +42,7 @@ pub struct Args {
     /// Images, a video or a pattern of one pour; without any, the configured camera.
     input: Vec<PathBuf>,
     /// The cell's configuration.
-    #[arg(long, default_value = "config/cell.toml")]
+    #[arg(long, default_value = shared::config::DEFAULT_FILE)]
     config: PathBuf,
     /// How long to watch a live camera.
     #[arg(long, default_value_t = 15)]

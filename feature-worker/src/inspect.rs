@@ -31,7 +31,7 @@ pub struct Args {
     #[arg(required = true)]
     input: Vec<PathBuf>,
     /// The cell's configuration; its [image] table is what is tried.
-    #[arg(long, default_value = "config/cell.toml")]
+    #[arg(long, default_value = shared::config::DEFAULT_FILE)]
     config: PathBuf,
     /// Directory of the pictures and the CSV.
     #[arg(long, default_value = "out/inspect")]

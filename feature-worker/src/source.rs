@@ -6,6 +6,7 @@
 
 use std::time::Duration;
 
+use iceoryx2::port::listener::ListenerWaitError;
 use iceoryx2::port::subscriber::Subscriber;
 use iceoryx2::sample::Sample;
 use opencv::core::{CV_8UC1, CV_8UC3, Mat};
@@ -121,7 +122,11 @@ impl Shared {
         self.sample = None;
         self.sample = self.subscriber.receive().map_err(|e| broken(&e))?;
         if self.sample.is_none() {
-            self.listener.timed_wait(|_| {}, timeout).map_err(|e| broken(&e))?;
+            match self.listener.timed_wait(|_| {}, timeout) {
+                // A signal cuts the wait short, also one that only continues a stopped process: the caller looks whether to end.
+                Ok(_) | Err(ListenerWaitError::InterruptSignal) => {}
+                Err(e) => return Err(broken(&e)),
+            }
             self.sample = self.subscriber.receive().map_err(|e| broken(&e))?;
         }
         Ok(match &self.sample {

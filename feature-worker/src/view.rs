@@ -34,7 +34,7 @@ Open the address that it prints in a browser on this machine. Ctrl-C ends it."
 )]
 pub struct Args {
     /// The cell's configuration.
-    #[arg(long, default_value = "config/cell.toml")]
+    #[arg(long, default_value = shared::config::DEFAULT_FILE)]
     config: PathBuf,
     /// Port on 127.0.0.1; 0: any free one.
     #[arg(long, default_value_t = 8642)]

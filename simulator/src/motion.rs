@@ -25,7 +25,7 @@ pub struct Args {
     /// A recorded pour or curve
     episode: PathBuf,
     /// The cell's configuration: joint, limits, servoj parameters
-    #[arg(long, default_value = "config/sim.toml")]
+    #[arg(long, default_value = shared::config::DEFAULT_FILE)]
     config: PathBuf,
     /// Controller generation: 125 or 500 cycles a second
     #[arg(long, value_enum, default_value = "cb3")]
