@@ -119,7 +119,7 @@ impl Seen {
             return Err(format!("frame {} has another size than those before", self.count + 1));
         }
         imgproc::accumulate(&bgr, &mut self.sum, &core::no_array()).map_err(words)?;
-        if self.count % self.stride == 0 {
+        if self.count.is_multiple_of(self.stride) {
             self.frames.push(bgr);
         }
         if self.frames.len() > KEEP_FRAMES {

@@ -594,8 +594,8 @@ impl Extractor {
                 self.sums.push(sum);
             }
             let mean = |from: usize, to: usize| (self.sums[to] - self.sums[from]) / (to - from).max(1) as f32;
-            for r in 3..ray.samples.saturating_sub(3) {
-                let here = f32::from(row[r]).min(DETAIL_MOST);
+            for (r, value) in row.iter().enumerate().take(ray.samples.saturating_sub(3)).skip(3) {
+                let here = f32::from(*value).min(DETAIL_MOST);
                 let (inside, outside) = (mean(r.saturating_sub(14), r - 2), mean((r + 3).min(ray.samples), (r + 15).min(ray.samples)));
                 let score = here + 0.7 * (inside - outside) - 1.5 * noise;
                 let (mut best, mut from) = (0.0, r);

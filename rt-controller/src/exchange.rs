@@ -17,6 +17,7 @@ use crate::timing::Histogram;
 
 /// What the loop tells the ordinary thread.
 #[derive(Debug, Clone)]
+#[allow(clippy::large_enum_variant)] // a box would be an allocation in the loop
 pub enum Event {
     /// Every tick: what it saw and answered, its telemetry, the counters.
     Tick(Tick, Telemetry, Counters),

@@ -61,6 +61,7 @@ pub struct Weights {
 /// How the poured volume is estimated.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
+#[allow(clippy::large_enum_variant)] // a box would put the loop's policy on the heap twice
 pub enum Estimator {
     /// The paper's plain sum of the frames' volumes.
     Sum,

@@ -584,9 +584,9 @@ impl Renderer {
         let alpha = scene.alpha_deg.to_radians();
         let gravity = to_container([0.0, -G_MM_S2], alpha);
         for drop in &mut self.drops {
-            for k in 0..2 {
-                drop.at_mm[k] += drop.velocity_mm_s[k] * dt_s + 0.5 * gravity[k] * dt_s * dt_s;
-                drop.velocity_mm_s[k] += gravity[k] * dt_s;
+            for ((at, velocity), g) in drop.at_mm.iter_mut().zip(&mut drop.velocity_mm_s).zip(gravity) {
+                *at += *velocity * dt_s + 0.5 * g * dt_s * dt_s;
+                *velocity += g * dt_s;
             }
         }
         let reach = 120.0;

@@ -108,7 +108,8 @@ pub fn run(args: &Args) -> ExitCode {
 fn print(report: &Report) {
     println!("{} targets; picture {}", report.targets, report.picture);
     println!("{:44}{:>14}{:>14}", "", "pour.script", "raw servoj");
-    let rows: [(&str, fn(&Figures) -> f64); 6] = [
+    type Row = (&'static str, fn(&Figures) -> f64);
+    let rows: [Row; 6] = [
         ("command: largest rate, deg/s", |f| f.command_rate_deg_s),
         ("command: largest acceleration, deg/s^2", |f| f.command_acceleration_deg_s2),
         ("joint: largest acceleration, deg/s^2", |f| f.joint_acceleration_deg_s2),

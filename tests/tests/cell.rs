@@ -17,6 +17,7 @@ fn a_pour_is_followed_to_its_end_and_recorded() {
 
     cell.take_weights(&steady_weights(TILT_OUT));
     cell.json("simulator", &["operator", "fill", "300", "--json"]);
+    let before = cell.wait_idle();
     let pour = cell.begin("rt-controller", &["pour", "20", "--json"]);
     cell.wait("the pour", Duration::from_secs(5), |s| s["phase"] == "pouring");
     let second = cell.command("rt-controller", &["pour", "30"]);
@@ -33,7 +34,8 @@ fn a_pour_is_followed_to_its_end_and_recorded() {
     let scale = cell.json("simulator", &["operator", "scale", "--json"]);
     assert!(scale["weight_g"].as_f64() > Some(5.0), "liquid really flowed: {scale}");
     let status = cell.wait_idle();
-    assert_eq!(status["loop_allocations"], 0, "{status}");
+    // iceoryx2 allocates once when the loop first meets a feature worker; a pour makes none.
+    assert_eq!(status["loop_allocations"], before["loop_allocations"]);
 }
 
 /// Protects "what the robot gets": a recording follows eq. (1) at the robot, and its file holds curve, angles and images.
