@@ -1,10 +1,10 @@
-//! `feature-worker calibrate`: finds the container's axes and the liquid's colour, and writes the [image] section.
+//! `feature-worker calibrate`: finds the container's axes and the liquid's colour, and writes the `[image]` section.
 //!
 //! The container stands still in the image while the background turns and the liquid moves, so in the mean of many frames its
 //! edges stay sharp and all else fades. The longest nearly horizontal and nearly vertical line there that meet at a corner are
 //! the glass's top edge and its left side. A person checks the picture that is written, or corrects the corner and the
 //! axes: with coordinates on the command line or with three clicks in a local page. An ordinary command-line program;
-//! allocates; nothing is changed but the [image] table of the configuration, and that only with --write or a click.
+//! allocates; nothing is changed but the `[image]` table of the configuration, and that only with --write or a click.
 
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
@@ -242,7 +242,7 @@ pub fn find_corner(mean: &Mat) -> Result<Corner, CalibrateError> {
     best.map(|(_, corner)| corner).ok_or(CalibrateError::NoCorner)
 }
 
-/// The [image] table for a corner: region over the mouth, axes, colour learned from the frames.
+/// The `[image]` table for a corner: region over the mouth, axes, colour learned from the frames.
 pub fn propose(
     camera: &CameraConfig,
     corner: Corner,
@@ -272,7 +272,7 @@ pub fn propose(
     Ok(image)
 }
 
-/// The [image] table as text.
+/// The `[image]` table as text.
 fn section(image: &ImageConfig) -> String {
     let method = if image.method == LiquidMethod::Colour { "colour" } else { "clear" };
     let round = |a: [f32; 4]| a.map(|v| (v * 10.0).round() / 10.0);

@@ -52,7 +52,7 @@ enum Command {
 /// Which episodes.
 #[derive(Debug, clap::Args)]
 pub struct Which {
-    /// Episodes (.mcap) or directories of them; without any, the directory of [recording] in the configuration.
+    /// Episodes (.mcap) or directories of them; without any, the directory of `[recording]` in the configuration.
     pub paths: Vec<PathBuf>,
     /// The cell's configuration.
     #[arg(long, default_value = shared::config::DEFAULT_FILE)]

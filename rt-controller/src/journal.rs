@@ -1,7 +1,7 @@
 //! The journal: every tick's inputs and answer, so that a run can be replayed bit for bit.
 //!
 //! The loop hands each [`Tick`] to the ordinary thread through a queue; there it is written ([`Writer`]). Reading and replaying
-//! are for commands and tests. A file that was cut off reads up to its last whole entry. Layout: the 8 bytes [`MAGIC`], then
+//! are for commands and tests. A file that was cut off reads up to its last whole entry. Layout: the 8 bytes `decantj1`, then
 //! entries, each a little-endian u32 length and that many bytes of postcard.
 
 use std::fs::File;

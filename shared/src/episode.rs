@@ -1,6 +1,6 @@
 //! Experimental episodes `E = (L_E, w_E)` (section 3.1 of the paper): MCAP files and CSV tables, in and out.
 //!
-//! One self-describing MCAP file each ([`write`]); [`read`] gives the plain [`Episode`] that the trainer works on, and the
+//! One self-describing MCAP file each ([`mod@write`]); [`read`] gives the plain [`Episode`] that the trainer works on, and the
 //! images on demand; [`weigh`] adds the weight afterwards; [`table`] reads and writes the CSV pair for people who have their
 //! own vision. Used by ordinary threads only: allocates, reads and writes files. A damaged file is an error with one line
 //! that names the file; a file whose recorder was killed reads up to its last whole chunk and says `complete: false`.

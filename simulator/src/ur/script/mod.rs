@@ -1,6 +1,6 @@
 //! URScript: the part of the language that a streaming program needs, run one control cycle at a time.
 //!
-//! [`parse`] turns text into a tree, [`compile`] into code for a small stack machine, and [`Interpreter`] runs that code until
+//! [`parse`] turns text into a tree, `compile` into code for a small stack machine, and [`Interpreter`] runs that code until
 //! every thread of it waits for time to pass. What a robot would refuse is refused here: an unknown construct, function,
 //! keyword or parameter is an error that names line and cause, never ignored. Where UR's manual leaves a rule open, the
 //! stricter reading holds (a variable keeps its type, a condition is a bool, an index an int).
