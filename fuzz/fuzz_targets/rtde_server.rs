@@ -1,10 +1,7 @@
 //! The RTDE server's session: any bytes, cut in two ways, give the same answers.
-//!
-//! The controller's sources are taken in by path, so that no fuzz build needs OpenCV.
 #![no_main]
 #![allow(dead_code, unused_imports)]
 
-#[path = "../../simulator/src/ur/mod.rs"]
 mod ur;
 
 use libfuzzer_sys::fuzz_target;

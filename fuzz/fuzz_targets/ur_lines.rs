@@ -1,10 +1,7 @@
 //! The dashboard, the operator port's faults and the cutting of uploads into programs: any bytes.
-//!
-//! The controller's sources are taken in by path, so that no fuzz build needs OpenCV.
 #![no_main]
 #![allow(dead_code, unused_imports)]
 
-#[path = "../../simulator/src/ur/mod.rs"]
 mod ur;
 
 use libfuzzer_sys::fuzz_target;

@@ -1,10 +1,7 @@
 //! The URScript parser, compiler and interpreter: any text is uploaded and stepped for 50 control cycles.
-//!
-//! The controller's sources are taken in by path, so that no fuzz build needs OpenCV.
 #![no_main]
 #![allow(dead_code, unused_imports)]
 
-#[path = "../../simulator/src/ur/mod.rs"]
 mod ur;
 
 use libfuzzer_sys::fuzz_target;
