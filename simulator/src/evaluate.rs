@@ -28,7 +28,7 @@ pub mod baselines;
 pub mod pour;
 
 use baselines::{BangBang, ByLaw, HandPd, OpenLoop, Oracle, Sum};
-use pour::{Poured, by_controller, by_core, grid};
+use pour::{Poured, Trace, by_controller, by_core, grid};
 
 /// What pours.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum, Serialize)]
@@ -159,9 +159,9 @@ pub struct Summary {
     pub name: String,
     /// Pours.
     pub n: usize,
-    /// Mean absolute error and the half width of its 95 % interval over rigs and seeds.
+    /// Mean absolute error.
     pub mae_ml: f64,
-    #[allow(missing_docs)]
+    /// Half width of its 95 % interval over rigs and seeds.
     pub mae_ci_ml: f64,
     /// Median absolute error.
     pub median_ml: f64,
@@ -308,6 +308,19 @@ impl Setup {
         self.cells(repeats).into_iter().map(pour).collect()
     }
 
+    /// A small, a middle and a large pour frame by frame, for the report.
+    pub fn examples(&self, weights: &Weights) -> Vec<serde_json::Value> {
+        let agent = Agent::new(weights);
+        let example = |(init, goal): (f64, f64)| {
+            let mut trace = Trace::default();
+            by_core(&agent, &mut self.test.pour(init, self.pour_seed), self.limits, init, goal, Some(&mut trace));
+            let area_4_px2: Vec<f64> = trace.area_px2.iter().map(|a| a / 4.0).collect();
+            serde_json::json!({ "init_ml": init, "goal_ml": goal, "name": "policy", "t_s": trace.t_s, "alpha_deg": trace.alpha_deg,
+                "true_ml": trace.true_ml, "area_4_px2": area_4_px2 })
+        };
+        [(225.0, 40.0), (300.0, 100.0), (375.0, 200.0)].map(example).into()
+    }
+
     /// `k` pours with weights on the training's bench, recorded and weighed.
     pub fn weighed_pours(&self, weights: &Weights, k: u64) -> Vec<TrainingEpisode> {
         let agent = Agent::new(weights);
@@ -316,12 +329,11 @@ impl Setup {
             .map(|n| {
                 let init = rng.random_range(150.0..450.0f64);
                 let goal = rng.random_range(20.0..200.0f64).min(0.85 * init).min(0.9 * self.bench.reach_ml(init));
-                let mut episode = TrainingEpisode::empty(&format!("pour {}", n + 1), RATE_HZ);
+                let mut trace = Trace::default();
                 let mut world = self.bench.pour(init, rng.random());
-                by_core(&agent, &mut world, self.limits, init, goal, Some(&mut episode));
+                by_core(&agent, &mut world, self.limits, init, goal, Some(&mut trace));
                 let misread: f64 = rand_distr::Distribution::sample(&rand_distr::StandardNormal, &mut rng);
-                episode.weight_g = (world.poured_ml() + 0.5 * misread).round();
-                episode
+                trace.weighed(&format!("pour {}", n + 1), (world.poured_ml() + 0.5 * misread).round())
             })
             .filter(|e| e.fault().is_none())
             .collect()
@@ -447,13 +459,21 @@ pub fn run(args: &Args) -> ExitCode {
         let (mean, half) = mean_ci(&paired);
         println!("{} minus {}: {mean:+.2} +- {half:.2} ml MAE, paired over rigs and seeds", s.name, summaries[0].name);
     }
+    let traces = match (&args.json, files.first(), setups.first()) {
+        (Some(_), Some((_, weights)), Some(setup)) => setup.examples(weights),
+        (Some(_), None, Some(setup)) if args.method.contains(&Pourer::Best) => {
+            let options = setup.options(MethodName::Best, Estimate::Fused, args.actions);
+            setup.train(&options, args.episodes, args.weighed).map(|(t, _)| setup.examples(&t.weights)).unwrap_or_default()
+        }
+        _ => Vec::new(),
+    };
     let frames: u64 = all.iter().flat_map(|(_, g)| g.iter().flatten()).map(|p| u64::from(p.frames)).sum();
     eprintln!("{frames} frames, {seconds:.1} s with training");
     if let Some(file) = &args.json {
         let report = serde_json::json!({
             "kind": "evaluation", "sim": args.sim, "container": args.container, "change": args.change, "first_rig": args.first_rig,
             "rigs": args.rigs, "seeds": args.seeds, "episodes": args.episodes, "weighed": args.weighed, "actions": args.actions,
-            "summaries": summaries,
+            "summaries": summaries, "traces": traces,
             "pours": all.iter().map(|(name, groups)| serde_json::json!({"name": name, "groups": groups})).collect::<Vec<_>>(),
         });
         let text = serde_json::to_string(&report).unwrap_or_default();
@@ -462,4 +482,60 @@ pub fn run(args: &Args) -> ExitCode {
         }
     }
     ExitCode::SUCCESS
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn args(rigs: u64) -> Args {
+        #[derive(clap::Parser)]
+        struct Line {
+            #[command(flatten)]
+            args: Args,
+        }
+        let line = ["evaluate".to_owned(), "--rigs".into(), rigs.to_string(), "--repeats".into(), "1".into()];
+        <Line as clap::Parser>::parse_from(line).args
+    }
+
+    /// Protects the whole chain on the physical simulator: recorded, trained, poured through the controller's core, the policy
+    /// meets goals that it never saw; and the same seeds give the same pours.
+    #[test]
+    fn a_trained_policy_meets_its_goals() {
+        let setup = Setup::new("b", 1, 0, "cylinder", Change::None);
+        let pours = setup.run(Pourer::Best, &args(1));
+        let summary = Summary::new("best", std::slice::from_ref(&pours));
+        assert_eq!((summary.n, summary.never_poured, summary.never_stopped), (45, 0, 0));
+        assert!(summary.mae_ml < 3.5 && summary.control_ml < 0.5, "{}", summary.line());
+        assert_eq!(pours, setup.run(Pourer::Best, &args(1)));
+    }
+
+    /// Protects the comparison: the oracle meets every goal, so what the others miss is theirs and not the bench's.
+    #[test]
+    fn the_oracle_meets_every_goal() {
+        for sim in ["a", "b"] {
+            let pours = Setup::new(sim, 2, 0, "cylinder", Change::None).run(Pourer::Oracle, &args(1));
+            let summary = Summary::new("oracle", &[pours]);
+            assert!(summary.max_ml < 0.7, "{sim}: {}", summary.line());
+        }
+    }
+
+    /// Protects the report's numbers: mean, percentile, bias, failures and interval of known pours.
+    #[test]
+    fn summaries_count_right() {
+        let one = |error: f64, ended: bool| Poured {
+            init_ml: 300.0,
+            goal_ml: 100.0,
+            true_ml: 100.0 + error,
+            believed_ml: 100.0,
+            seconds: 5.0,
+            frames: 150,
+            ended,
+        };
+        let s = Summary::new("x", &[vec![one(1.0, true), one(-3.0, true)], vec![one(6.0, false), one(-100.0, true)]]);
+        assert_eq!((s.mae_ml, s.bias_ml, s.max_ml, s.median_ml), (27.5, -24.0, 100.0, 3.0));
+        assert_eq!((s.never_poured, s.never_stopped, s.within_5_ml, s.within_5_percent), (1, 1, 0.5, 0.5));
+        assert_eq!(s.groups_ml, [2.0, 53.0]);
+        assert!((s.mae_ci_ml - 1.96 * 25.5).abs() < 1e-9);
+    }
 }

@@ -139,12 +139,20 @@ pub fn run(args: &Args) -> ExitCode {
     let far = |top: usize| (poured(top) - args.weight).abs();
     let top = (50..=100).min_by(|a, b| far(*a).total_cmp(&far(*b))).unwrap_or(70);
     let weight = poured(top);
-    println!("section 4: simulator a, 300 ml, one triangle of +-1 degree up to {top} degrees pours {weight:.1} ml; delta {DELTA}, 2 actions, 4-40-40-2");
+    println!(
+        "section 4: simulator a, 300 ml, one triangle of +-1 degree up to {top} degrees pours {weight:.1} ml; delta {DELTA}, 2 actions, 4-40-40-2"
+    );
     let mut html = format!(
         "<h2>Section 4 of the paper</h2><p>Simulator a, two actions of +-1 degree, 4-40-40-2 (1922 parameters), one episode: a triangle up to {top} degrees that pours {weight:.1} ml; {KAPPAS} random kappas; {} seeds. Judged on 24 pours of 20 to 160 ml from 200, 300 and 400 ml.</p><div class=plots>",
         args.seeds
     );
-    let mut rows = vec![vec!["cross-entropy".to_owned(), "median MAE of the runs, ml".into(), "best".into(), "worst".into(), "runs below 10 ml".into()]];
+    let mut rows = vec![vec![
+        "cross-entropy".to_owned(),
+        "median MAE of the runs, ml".into(),
+        "best".into(),
+        "worst".into(),
+        "runs below 10 ml".into(),
+    ]];
     let mut verdicts = Vec::new();
     let mut json_runs = Vec::new();
     for (name, clip) in [("as printed", None), ("clipped to [1e-7, 1 - 1e-7]", Some(KERAS_CLIP))] {

@@ -41,15 +41,24 @@ pub fn run(args: &Args) -> ExitCode {
     println!("trained     method {:?}, {} actions, {} episodes, seed {}", w.origin.method, w.origin.actions, w.origin.episodes, w.seed);
     println!("data        sha256 {data}");
     println!("network     {INPUTS}-{HIDDEN}-{HIDDEN}-{ACTIONS}, ReLU, {PARAMETERS} parameters, action by {:?}", w.selection);
-    println!("inputs      asinh({} v) x {} for v_t, v_t-1, v_t-2 in ml a frame; asinh(d / {} ml) x {}", w.scale.v_per_ml, w.scale.gain, w.scale.d_ml, w.scale.gain);
+    println!(
+        "inputs      asinh({} v) x {} for v_t, v_t-1, v_t-2 in ml a frame; asinh(d / {} ml) x {}",
+        w.scale.v_per_ml, w.scale.gain, w.scale.d_ml, w.scale.gain
+    );
     println!("actions     {:?} degrees", w.actions_deg);
-    println!("calibration v = {:.6e} area^{:.4} ml, a lone zero after more than {} px^2 is held", w.calibration.c, w.calibration.q, w.calibration.hold_above_px2);
+    println!(
+        "calibration v = {:.6e} area^{:.4} ml, a lone zero after more than {} px^2 is held",
+        w.calibration.c, w.calibration.q, w.calibration.hold_above_px2
+    );
     println!("frame rate  {} Hz", w.rate_hz);
     match &w.estimator {
         Estimator::Sum => println!("estimate    plain sum of the frames' volumes"),
         Estimator::Fused { model: m, back } => {
             println!("estimate    camera and container geometry, fused");
-            println!("  vessel    R {:.1} mm, H {:.1} mm, bottom/top {:.2}, deviation (log) {:.3?}", m.radius_mm, m.height_mm, m.taper, m.s);
+            println!(
+                "  vessel    R {:.1} mm, H {:.1} mm, bottom/top {:.2}, deviation (log) {:.3?}",
+                m.radius_mm, m.height_mm, m.taper, m.s
+            );
             println!("  flow      ln k {:.3}, exponent {:.3}, k1 {:.3}, k2 {:.3}, film share {:.3}", m.lk, m.p, m.k1, m.k2, m.eta);
             println!("  motion    lag {:.2} frames, delay {:.2} frames, back at {:.2} degrees a frame", m.tau, m.delay, back.rate_deg);
             println!("  doubts    {:?}", m.noise);

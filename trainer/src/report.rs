@@ -90,7 +90,14 @@ fn draw(svg: &mut String, x_title: &str, y_title: &str, series: &[Series], from_
         .x_label_area_size(42)
         .y_label_area_size(58)
         .build_cartesian_2d(x0 - px..x1 + px, if from_zero && y0 == 0.0 { 0.0 } else { y0 - py }..y1 + py)?;
-    chart.configure_mesh().light_line_style(WHITE).bold_line_style(RGBColor(225, 225, 225)).x_desc(x_title).y_desc(y_title).label_style(("sans-serif", 13)).draw()?;
+    chart
+        .configure_mesh()
+        .light_line_style(WHITE)
+        .bold_line_style(RGBColor(225, 225, 225))
+        .x_desc(x_title)
+        .y_desc(y_title)
+        .label_style(("sans-serif", 13))
+        .draw()?;
     for (k, s) in series.iter().enumerate() {
         let colour = COLOURS[k % COLOURS.len()];
         let points = s.points.iter().copied().filter(|(x, y)| x.is_finite() && y.is_finite());
@@ -103,7 +110,13 @@ fn draw(svg: &mut String, x_title: &str, y_title: &str, series: &[Series], from_
     }
     if series.len() > 1 {
         let position = SeriesLabelPosition::UpperLeft;
-        chart.configure_series_labels().position(position).background_style(WHITE.mix(0.85)).border_style(RGBColor(200, 200, 200)).label_font(("sans-serif", 13)).draw()?;
+        chart
+            .configure_series_labels()
+            .position(position)
+            .background_style(WHITE.mix(0.85))
+            .border_style(RGBColor(200, 200, 200))
+            .label_font(("sans-serif", 13))
+            .draw()?;
     }
     root.present()?;
     Ok(())
@@ -199,15 +212,23 @@ fn training(v: &Value) -> String {
     html += &figure(&plot("Adam step", "loss", &[Series::line("loss", loss)], false), "Learning curve of the network.");
     let cost: Vec<(f64, f64)> = numbers(&v["search_cost"]).iter().enumerate().map(|(k, c)| ((k + 1) as f64, *c)).collect();
     if !cost.is_empty() {
-        html += &figure(&plot("iteration", "cost", &[Series::line("cost", cost)], true), "Search of the control law: mean cost of the elites.");
+        html +=
+            &figure(&plot("iteration", "cost", &[Series::line("cost", cost)], true), "Search of the control law: mean cost of the elites.");
     }
     let pours = v["extra"]["pours"].as_array().cloned().unwrap_or_default();
     if !pours.is_empty() {
         let get = |key: &str| -> Vec<(f64, f64)> {
             pours.iter().map(|p| (p["number"].as_f64().unwrap_or(f64::NAN), p[key].as_f64().unwrap_or(f64::NAN))).collect()
         };
-        let single =
-            pours.iter().map(|p| (p["number"].as_f64().unwrap_or(f64::NAN), (p["weight_g"].as_f64().unwrap_or(f64::NAN) - p["goal_ml"].as_f64().unwrap_or(f64::NAN)).abs())).collect();
+        let single = pours
+            .iter()
+            .map(|p| {
+                (
+                    p["number"].as_f64().unwrap_or(f64::NAN),
+                    (p["weight_g"].as_f64().unwrap_or(f64::NAN) - p["goal_ml"].as_f64().unwrap_or(f64::NAN)).abs(),
+                )
+            })
+            .collect();
         let series = [Series::dots("this pour", single), Series::line("mean so far", get("mae_so_far_ml"))];
         html += &figure(&plot("weighed pours", "|error| in ml", &series, true), "Error against the number of weighed pours.");
     }
@@ -217,19 +238,54 @@ fn training(v: &Value) -> String {
 fn evaluation(v: &Value) -> String {
     let mut html = format!(
         "<h2>Evaluation: simulator {}, container {}, change {}</h2><p>{} rigs from {}, {} data seeds, {} episodes and {} weighed pours. Errors in ml; the interval is 95 % over rigs and seeds.</p>",
-        text(&v["sim"]), text(&v["container"]), text(&v["change"]), v["rigs"], v["first_rig"], v["seeds"], v["episodes"], v["weighed"]
+        text(&v["sim"]),
+        text(&v["container"]),
+        text(&v["change"]),
+        v["rigs"],
+        v["first_rig"],
+        v["seeds"],
+        v["episodes"],
+        v["weighed"]
     );
     let mut rows = vec![
-        ["method", "n", "MAE", "+-", "median", "p95", "max", "bias", "<= 5 ml", "<= 5 %", "never poured", "never stopped", "measurement", "control", "s a pour"]
-            .map(String::from)
-            .to_vec(),
+        [
+            "method",
+            "n",
+            "MAE",
+            "+-",
+            "median",
+            "p95",
+            "max",
+            "bias",
+            "<= 5 ml",
+            "<= 5 %",
+            "never poured",
+            "never stopped",
+            "measurement",
+            "control",
+            "s a pour",
+        ]
+        .map(String::from)
+        .to_vec(),
     ];
     for s in v["summaries"].as_array().into_iter().flatten() {
         let percent = |key: &str| s[key].as_f64().map_or_else(String::new, |x| format!("{:.1} %", 100.0 * x));
         rows.push(vec![
-            text(&s["name"]), s["n"].to_string(), number(&s["mae_ml"], 2), number(&s["mae_ci_ml"], 2), number(&s["median_ml"], 2),
-            number(&s["p95_ml"], 2), number(&s["max_ml"], 1), number(&s["bias_ml"], 2), percent("within_5_ml"), percent("within_5_percent"),
-            s["never_poured"].to_string(), s["never_stopped"].to_string(), number(&s["measurement_ml"], 2), number(&s["control_ml"], 2), number(&s["seconds"], 1),
+            text(&s["name"]),
+            s["n"].to_string(),
+            number(&s["mae_ml"], 2),
+            number(&s["mae_ci_ml"], 2),
+            number(&s["median_ml"], 2),
+            number(&s["p95_ml"], 2),
+            number(&s["max_ml"], 1),
+            number(&s["bias_ml"], 2),
+            percent("within_5_ml"),
+            percent("within_5_percent"),
+            s["never_poured"].to_string(),
+            s["never_stopped"].to_string(),
+            number(&s["measurement_ml"], 2),
+            number(&s["control_ml"], 2),
+            number(&s["seconds"], 1),
         ]);
     }
     html += &table(&rows);
@@ -239,7 +295,12 @@ fn evaluation(v: &Value) -> String {
         let value = |p: &Value, key: &str| p[key].as_f64().unwrap_or(f64::NAN);
         // A page with every dot of a large evaluation would be tens of megabytes.
         let every = (pours.len() / 600).max(1);
-        let dots = pours.iter().step_by(every).enumerate().map(|(k, p)| (value(p, "goal_ml") + (k % 9) as f64 - 4.0, value(p, "true_ml"))).collect();
+        let dots = pours
+            .iter()
+            .step_by(every)
+            .enumerate()
+            .map(|(k, p)| (value(p, "goal_ml") + (k % 9) as f64 - 4.0, value(p, "true_ml")))
+            .collect();
         scatter.push(Series::dots(&text(&m["name"]), dots));
         let errors: Vec<f64> = pours.iter().map(|p| value(p, "true_ml") - value(p, "goal_ml")).collect();
         bars.push(histogram(&text(&m["name"]), &errors, 0.5, 12.0));
@@ -249,8 +310,15 @@ fn evaluation(v: &Value) -> String {
     html += &figure(&plot("error in ml (ends hold what is beyond)", "% of the pours", &bars, true), "Errors.");
     for trace in v["traces"].as_array().into_iter().flatten() {
         let column = |key: &str| -> Vec<(f64, f64)> { numbers(&trace["t_s"]).into_iter().zip(numbers(&trace[key])).collect() };
-        let series = [Series::line("alpha, degrees", column("alpha_deg")), Series::line("poured, ml", column("true_ml")), Series::line("area / 4, px^2", column("area_4_px2"))];
-        html += &figure(&plot("s", "", &series, true), &format!("A pour of {} ml from {} ml, {}.", trace["goal_ml"], trace["init_ml"], text(&trace["name"])));
+        let series = [
+            Series::line("alpha, degrees", column("alpha_deg")),
+            Series::line("poured, ml", column("true_ml")),
+            Series::line("area / 4, px^2", column("area_4_px2")),
+        ];
+        html += &figure(
+            &plot("s", "", &series, true),
+            &format!("A pour of {} ml from {} ml, {}.", trace["goal_ml"], trace["init_ml"], text(&trace["name"])),
+        );
     }
     html + "</div>"
 }
@@ -276,7 +344,10 @@ fn against_episodes(files: &[Value]) -> String {
         return String::new();
     }
     let svg = plot("episodes and weighed pours", "mean absolute error in ml", &series, true);
-    format!("<h2>Error against number of episodes</h2><div class=plots>{}</div>", figure(&svg, "Mean absolute error over all rigs and seeds."))
+    format!(
+        "<h2>Error against number of episodes</h2><div class=plots>{}</div>",
+        figure(&svg, "Mean absolute error over all rigs and seeds.")
+    )
 }
 
 /// The page of some JSON values; an error names the value that is of no known kind.
@@ -300,7 +371,8 @@ pub fn run(args: &Args) -> ExitCode {
     let mut files = Vec::new();
     for file in &args.files {
         let name = file.display().to_string();
-        let value = std::fs::read_to_string(file).map_err(|e| e.to_string()).and_then(|t| serde_json::from_str(&t).map_err(|e| e.to_string()));
+        let value =
+            std::fs::read_to_string(file).map_err(|e| e.to_string()).and_then(|t| serde_json::from_str(&t).map_err(|e| e.to_string()));
         match value {
             Ok(value) => files.push((name, value)),
             Err(e) => return exit::fail(exit::BAD_INPUT, format!("{name}: {e}")),

@@ -62,6 +62,35 @@ impl Poured {
     }
 }
 
+/// A pour frame by frame, all columns of the same length.
+#[derive(Debug, Clone, Default, Serialize)]
+pub struct Trace {
+    /// Time, s.
+    pub t_s: Vec<f64>,
+    /// Commanded alpha, degrees.
+    pub alpha_deg: Vec<f64>,
+    /// V_e, px^2.
+    pub area_px2: Vec<f64>,
+    /// What has really left, ml.
+    pub true_ml: Vec<f64>,
+}
+
+impl Trace {
+    fn push(&mut self, alpha_deg: f64, area_px2: f32, world: &World) {
+        self.t_s.push((self.t_s.len() + 1) as f64 / RATE_HZ);
+        self.alpha_deg.push(alpha_deg);
+        self.area_px2.push(f64::from(area_px2));
+        self.true_ml.push(world.poured_ml());
+    }
+
+    /// The same as an episode, weighed.
+    pub fn weighed(self, name: &str, weight_g: f64) -> TrainingEpisode {
+        let alpha_measured_deg = vec![f64::NAN; self.t_s.len()];
+        let Self { t_s, alpha_deg, area_px2, .. } = self;
+        TrainingEpisode { name: name.into(), rate_hz: RATE_HZ, t_s, alpha_deg, alpha_measured_deg, area_px2, weight_g }
+    }
+}
+
 /// The settings that the core runs with: the defaults of the configuration, no goal limit.
 fn settings(limits: Limits) -> Settings {
     Settings { period_ns: PERIOD_NS, limits, stale_ns: 200_000_000, max_frames: MAX_FRAMES, empty_frames: 60, goal_max_ml: 1e6 }
@@ -104,7 +133,7 @@ pub fn by_core(
         alpha_deg = output.target_deg.unwrap_or(alpha_deg);
         area_px2 = world.frame(f64::from(alpha_deg));
         if let Some(trace) = trace.as_deref_mut() {
-            trace.push(f64::from(frames) / RATE_HZ, f64::from(alpha_deg), f64::NAN, f64::from(area_px2));
+            trace.push(f64::from(alpha_deg), area_px2, world);
         }
         if let Some(outcome) = output.ended {
             poured.believed_ml = f64::from(outcome.poured_ml);
@@ -113,10 +142,10 @@ pub fn by_core(
             break;
         }
     }
-    for k in 0..SETTLE_FRAMES {
+    for _ in 0..SETTLE_FRAMES {
         let area = world.frame(0.0);
         if let Some(trace) = trace.as_deref_mut() {
-            trace.push(f64::from(frames + k + 1) / RATE_HZ, 0.0, f64::NAN, f64::from(area));
+            trace.push(0.0, area, world);
         }
     }
     poured.true_ml = world.poured_ml();
