@@ -55,7 +55,7 @@ pub struct Which {
     /// Episodes (.mcap) or directories of them; without any, the directory of [recording] in the configuration.
     pub paths: Vec<PathBuf>,
     /// The cell's configuration.
-    #[arg(long, default_value = "config/cell.toml")]
+    #[arg(long, default_value = shared::config::DEFAULT_FILE)]
     pub config: PathBuf,
     /// Print JSON.
     #[arg(long)]

@@ -6,6 +6,7 @@
 
 use std::time::Duration;
 
+use iceoryx2::port::listener::ListenerWaitError;
 use iceoryx2::port::subscriber::Subscriber;
 use iceoryx2::sample::Sample;
 use opencv::core::{CV_8UC1, CV_8UC3, Mat};
@@ -121,7 +122,11 @@ impl Shared {
         self.sample = None;
         self.sample = self.subscriber.receive().map_err(|e| broken(&e))?;
         if self.sample.is_none() {
-            self.listener.timed_wait(|_| {}, timeout).map_err(|e| broken(&e))?;
+            match self.listener.timed_wait(|_| {}, timeout) {
+                // A signal cuts the wait short, also one that only continues a stopped process: the caller looks whether to end.
+                Ok(_) | Err(ListenerWaitError::InterruptSignal) => {}
+                Err(e) => return Err(broken(&e)),
+            }
             self.sample = self.subscriber.receive().map_err(|e| broken(&e))?;
         }
         Ok(match &self.sample {
@@ -170,7 +175,8 @@ impl Capture {
         Ok(Self { capture, camera: camera.clone(), image: Mat::default(), sequence: 0, due_ns, period_ns: (1e9 / fps) as u64 })
     }
 
-    fn next(&mut self, timeout: Duration) -> Result<Next<'_>, SourceError> {
+    /// The next frame; waits up to `timeout` (a device: as long as its driver does).
+    pub fn next(&mut self, timeout: Duration) -> Result<Next<'_>, SourceError> {
         if let Some(due_ns) = self.due_ns {
             let now_ns = os::now_ns();
             let latest_ns = now_ns + timeout.as_nanos() as u64;

@@ -1,21 +1,170 @@
-//! Shows the live stream with what is measured, in a local web page.
+//! `feature-worker view`: the live stream with region, axes, outline, line, triangle, V_e and its history, in a local web page.
+//!
+//! A process of its own, so it never slows the worker: it reads the cell's frames as a further subscriber (a device or file is
+//! opened by itself, if nobody else holds it), measures them again with the same configuration and keeps the newest picture.
+//! Threads: this one measures; one answers the browser and compresses a picture only when it is asked for. Allocates.
 
+use std::path::PathBuf;
 use std::process::ExitCode;
+use std::sync::atomic::{AtomicBool, Ordering::Relaxed};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::time::Duration;
 
 use opencv::core::{Mat, Point, Rect, Scalar, Vector};
-use opencv::imgproc;
+use opencv::prelude::*;
+use opencv::{imgcodecs, imgproc};
+use shared::config::Config;
+use shared::exit;
+use shared::ipc::Cell;
+use shared::messages::{Doubt, PixelFormat};
+use tiny_http::{Header, Response, Server};
 
-use crate::extract::{Extractor, Measurement};
-use shared::messages::Doubt;
+use crate::extract::{Extractor, Image, Measurement};
+use crate::inspect::to_bgr;
+use crate::source::{Next, Source};
+
+/// Values of V_e that the page shows.
+const HISTORY: usize = 300;
 
 /// Command-line arguments.
 #[derive(Debug, clap::Args)]
-pub struct Args {}
+#[command(
+    after_help = "Examples:\n  feature-worker view --config config/sim.toml\n  feature-worker view --config config/cell.toml --port 9000\n\n\
+Open the address that it prints in a browser on this machine. Ctrl-C ends it."
+)]
+pub struct Args {
+    /// The cell's configuration.
+    #[arg(long, default_value = shared::config::DEFAULT_FILE)]
+    config: PathBuf,
+    /// Port on 127.0.0.1; 0: any free one.
+    #[arg(long, default_value_t = 8642)]
+    port: u16,
+}
+
+/// What the browser may ask for.
+#[derive(Default)]
+struct Shown {
+    picture: Mat,
+    /// sequence, V_e, confidence, doubt.
+    newest: (u64, f32, f32, &'static str),
+    history: std::collections::VecDeque<f32>,
+}
 
 /// Runs the command; the exit codes are those of [`shared::exit`].
-pub fn run(_args: &Args) -> ExitCode {
-    shared::exit::fail(shared::exit::FAILED, "not built yet")
+pub fn run(args: &Args) -> ExitCode {
+    let config = match Config::read(&args.config) {
+        Ok(config) => config,
+        Err(e) => return exit::fail(exit::BAD_INPUT, e),
+    };
+    match show(args, &config) {
+        Ok(()) => ExitCode::SUCCESS,
+        Err((code, what)) => exit::fail(code, what),
+    }
 }
+
+fn lock(shown: &Mutex<Shown>) -> MutexGuard<'_, Shown> {
+    shown.lock().unwrap_or_else(PoisonError::into_inner)
+}
+
+fn show(args: &Args, config: &Config) -> Result<(), (u8, String)> {
+    let failed = |e: &dyn std::fmt::Display| (exit::FAILED, e.to_string());
+    let reach = |e: &dyn std::fmt::Display| (exit::UNREACHABLE, e.to_string());
+    let stop = Arc::new(AtomicBool::new(false));
+    for signal in [signal_hook::consts::SIGINT, signal_hook::consts::SIGTERM] {
+        signal_hook::flag::register(signal, Arc::clone(&stop)).map_err(|e| failed(&e))?;
+    }
+    opencv::core::set_num_threads(1).map_err(|e| failed(&e))?;
+    let mut extractor = Extractor::new(&config.camera, &config.image).map_err(|e| (exit::BAD_INPUT, e.to_string()))?;
+    let cell = Cell::join(&config.cell.name).map_err(|e| reach(&e))?;
+    let mut source = Source::open(&config.camera, &cell, true).map_err(|e| reach(&e))?;
+    let server = Server::http(("127.0.0.1", args.port))
+        .map_err(|e| (exit::FAILED, format!("port {} on 127.0.0.1: {e}; give another --port", args.port)))?;
+    println!("http://{}", server.server_addr());
+    let shown = Mutex::new(Shown::default());
+    std::thread::scope(|scope| {
+        scope.spawn(|| serve(&server, &shown, &stop));
+        let result = loop {
+            if stop.load(Relaxed) {
+                break Ok(());
+            }
+            let frame = match source.next(Duration::from_millis(100)) {
+                Ok(Next::Frame(frame)) => frame,
+                Ok(Next::Nothing) => continue,
+                Ok(Next::End) => break Ok(()),
+                Err(e) => break Err(reach(&e)),
+            };
+            let Some(format) = PixelFormat::from_code(frame.header.format) else { continue };
+            let (width_px, height_px) = (frame.header.width_px, frame.header.height_px);
+            if frame.pixels.len() != width_px as usize * height_px as usize * format.bytes_per_pixel() {
+                continue;
+            }
+            let image = Image { width_px, height_px, format, pixels: frame.pixels };
+            let drawn = extractor.measure(image).map_err(|e| (exit::BAD_INPUT, e.to_string())).and_then(|measured| {
+                let mut picture = to_bgr(&frame).map_err(|e| failed(&e))?;
+                draw(&mut picture, &extractor, &measured).map_err(|e| failed(&e))?;
+                Ok((picture, measured))
+            });
+            match drawn {
+                Ok((picture, measured)) => {
+                    let mut shown = lock(&shown);
+                    shown.picture = picture;
+                    shown.newest = (frame.header.sequence, measured.area_px2, measured.confidence, measured.doubt.words());
+                    if shown.history.len() >= HISTORY {
+                        shown.history.pop_front();
+                    }
+                    shown.history.push_back(measured.area_px2);
+                }
+                Err(e) => break Err(e),
+            }
+        };
+        stop.store(true, Relaxed);
+        result
+    })
+}
+
+/// Thread that answers the browser.
+fn serve(server: &Server, shown: &Mutex<Shown>, stop: &AtomicBool) {
+    while !stop.load(Relaxed) {
+        let Ok(Some(request)) = server.recv_timeout(Duration::from_millis(100)) else { continue };
+        let path = request.url().split('?').next().unwrap_or("/").to_string();
+        // A browser that went away is no fault of ours.
+        let _ = match path.as_str() {
+            "/" => request.respond(answer(PAGE.as_bytes().to_vec(), "text/html; charset=utf-8")),
+            "/picture.jpg" => {
+                let picture = lock(shown).picture.clone();
+                request.respond(answer(jpeg(&picture), "image/jpeg"))
+            }
+            "/state.json" => {
+                let shown = lock(shown);
+                let (sequence, area_px2, confidence, doubt) = shown.newest;
+                let state = serde_json::json!({ "sequence": sequence, "area_px2": area_px2, "confidence": confidence, "doubt": doubt,
+                    "history": shown.history });
+                drop(shown);
+                request.respond(answer(state.to_string().into_bytes(), "application/json"))
+            }
+            _ => request.respond(Response::from_data("not here").with_status_code(404)),
+        };
+    }
+}
+
+/// An answer with its content type.
+pub fn answer(body: Vec<u8>, kind: &str) -> Response<std::io::Cursor<Vec<u8>>> {
+    let response = Response::from_data(body);
+    match Header::from_bytes("Content-Type", kind) {
+        Ok(header) => response.with_header(header),
+        Err(()) => response,
+    }
+}
+
+/// A picture as JPEG; empty if there is none.
+pub fn jpeg(picture: &Mat) -> Vec<u8> {
+    let mut bytes = Vector::new();
+    let ok = !picture.empty()
+        && imgcodecs::imencode(".jpg", picture, &mut bytes, &Vector::from_slice(&[imgcodecs::IMWRITE_JPEG_QUALITY, 80])).unwrap_or(false);
+    if ok { bytes.to_vec() } else { Vec::new() }
+}
+
+const PAGE: &str = include_str!("view.html");
 
 fn colour(blue: u8, green: u8, red: u8) -> Scalar {
     Scalar::new(blue.into(), green.into(), red.into(), 0.0)
@@ -60,7 +209,6 @@ pub fn draw(image: &mut Mat, extractor: &Extractor, measured: &Measurement) -> R
 
 /// One line of text over a dark bar at the picture's foot, `line` lines above the lowest.
 pub fn caption(image: &mut Mat, text: &str, line: i32) -> Result<(), opencv::Error> {
-    use opencv::prelude::MatTraitConst;
     let (width, height) = (image.cols(), image.rows());
     let top = height - 20 * (line + 1);
     imgproc::rectangle(image, Rect::new(0, top, width, 20), colour(20, 20, 20), imgproc::FILLED, imgproc::LINE_8, 0)?;

@@ -16,7 +16,7 @@ use crate::client::Client;
 #[command(after_help = "Example:\n  rt-controller abort")]
 pub struct Args {
     /// The cell's configuration.
-    #[arg(long, default_value = "config/sim.toml")]
+    #[arg(long, default_value = shared::config::DEFAULT_FILE)]
     config: PathBuf,
 }
 

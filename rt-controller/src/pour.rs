@@ -18,7 +18,7 @@ pub struct Args {
     /// Goal volume V_G in ml.
     goal_ml: f32,
     /// The cell's configuration.
-    #[arg(long, default_value = "config/sim.toml")]
+    #[arg(long, default_value = shared::config::DEFAULT_FILE)]
     config: PathBuf,
     /// Print the result as JSON.
     #[arg(long)]

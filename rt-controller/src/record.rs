@@ -34,7 +34,7 @@ pub struct Args {
     #[arg(long)]
     weight: Option<f64>,
     /// The cell's configuration.
-    #[arg(long, default_value = "config/sim.toml")]
+    #[arg(long, default_value = shared::config::DEFAULT_FILE)]
     config: PathBuf,
     /// Print the result as JSON.
     #[arg(long)]

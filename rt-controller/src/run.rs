@@ -23,7 +23,7 @@ use crate::service::{self, RobotNote, Service};
 Stops upright on Ctrl-C or SIGTERM.")]
 pub struct Args {
     /// The cell's configuration.
-    #[arg(long, default_value = "config/sim.toml")]
+    #[arg(long, default_value = shared::config::DEFAULT_FILE)]
     config: PathBuf,
 }
 

@@ -14,7 +14,7 @@ use crate::client::Client;
 #[command(after_help = "Examples:\n  rt-controller status\n  rt-controller status --json")]
 pub struct Args {
     /// The cell's configuration.
-    #[arg(long, default_value = "config/sim.toml")]
+    #[arg(long, default_value = shared::config::DEFAULT_FILE)]
     config: PathBuf,
     /// Print everything as JSON, histograms included.
     #[arg(long)]

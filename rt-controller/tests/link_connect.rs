@@ -372,6 +372,20 @@ fn targets_arrive_whole_and_numbered() {
     assert!((number, mode) == (3, 1) && (angle - 0.01).abs() < 1e-6, "not a number: hold where it is, not {angle} in mode {mode}");
 }
 
+/// Protects the cup when a session ends for any reason: the program is asked to come upright, even with states unread.
+#[test]
+fn a_dropped_session_asks_the_program_to_stop() {
+    let (mut session, mut seen, robot) = connected(18);
+    session.send(Mode::Stream, 30.0).unwrap();
+    seen.rtde.write_all(&data(&robot, 2.0, ProgramState::Following, 1, 9)).unwrap();
+    thread::sleep(Duration::from_millis(20));
+    drop(session);
+    let mut received = Vec::new();
+    seen.rtde.read_to_end(&mut received).unwrap();
+    assert_eq!(received.len(), 40);
+    assert_eq!(received[20..32], [0, 20, b'U', 2, 0, 0, 0, 2, 0, 0, 0, 3]);
+}
+
 /// Protects the loop from a robot that is gone: FIN, RST and a torn protocol end the session, each by its name.
 #[test]
 fn a_lost_robot_ends_the_session() {

@@ -10,6 +10,9 @@ use serde::{Deserialize, Serialize};
 
 use crate::limits::Limits;
 
+/// What `--config` is if it is not given: the simulated cell, so that a real robot moves only when it is named.
+pub const DEFAULT_FILE: &str = "config/sim.toml";
+
 /// Why a configuration is refused.
 #[derive(Debug, thiserror::Error)]
 pub enum ConfigError {

@@ -68,7 +68,12 @@ impl Cell {
         config.global.prefix = FileName::new(format!("decant_{name}_").as_bytes()).map_err(|e| fail(format!("{e:?}")))?;
         let root = Path::new(format!("/tmp/decant_{name}").as_bytes()).map_err(|e| fail(format!("{e:?}")))?;
         config.global.set_root_path(&root);
-        let node = NodeBuilder::new().config(&config).create::<Ipc>().map_err(|e| fail(format!("{e:?}")))?;
+        // Each program handles its own signals; iceoryx2 shall not end a wait for good because of one.
+        let node = NodeBuilder::new()
+            .config(&config)
+            .signal_handling_mode(SignalHandlingMode::Disabled)
+            .create::<Ipc>()
+            .map_err(|e| fail(format!("{e:?}")))?;
         Ok(Self { node })
     }
 

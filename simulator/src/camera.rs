@@ -786,47 +786,4 @@ mod tests {
         assert!(draw()? == draw()?);
         Ok(())
     }
-
-    /// Development aid kept as a test: pictures for the eye, when a directory is given.
-    #[test]
-    fn pictures() -> Result<(), Box<dyn std::error::Error>> {
-        let Ok(directory) = std::env::var("DECANT_PICTURES") else { return Ok(()) };
-        for (name, liquid, background) in [
-            ("blue", View::default().liquid_bgr, Background::Chess),
-            ("clear", None, Background::Chess),
-            ("wood", Some([40, 60, 190]), Background::Wood),
-            ("clutter", None, Background::Clutter),
-        ] {
-            let mut renderer = Renderer::new(&View { liquid_bgr: liquid, background, ..View::default() }, 3)?;
-            let mut out = vec![0; 640 * 480 * 3];
-            for (i, (alpha, flow)) in
-                [(0.0, 0.0), (30.0, 3.0), (50.0, 10.0), (70.0, 20.0), (90.0, 10.0), (105.0, 2.0), (60.0, 0.0)].into_iter().enumerate()
-            {
-                let mut truth = Truth::default();
-                let start = std::time::Instant::now();
-                for k in 0..5 {
-                    truth = renderer.render(
-                        &Scene {
-                            at_s: i as f64 + f64::from(k) / 30.0,
-                            alpha_deg: alpha,
-                            rate_deg_s: 10.0,
-                            flow_ml_s: flow,
-                            level_mm: -20.0 + 0.2 * alpha,
-                        },
-                        &mut out,
-                    )?;
-                }
-                println!("{name} {alpha} {flow} {:.0} px^2 {:?}", truth.area_px2, start.elapsed() / 5);
-                let mut image = Mat::new_rows_cols_with_bytes::<core::Vec3b>(480, 640, &out)?.try_clone()?;
-                if i % 2 == 1 {
-                    for k in 0..3 {
-                        let p = |k: usize| Point::new(truth.triangle_px[k % 3][0] as i32, truth.triangle_px[k % 3][1] as i32);
-                        imgproc::line(&mut image, p(k), p(k + 1), Scalar::new(0.0, 255.0, 255.0, 0.0), 1, imgproc::LINE_AA, 0)?;
-                    }
-                }
-                opencv::imgcodecs::imwrite(&format!("{directory}/{name}_{i}.png"), &image, &Vector::new())?;
-            }
-        }
-        Ok(())
-    }
 }

@@ -43,7 +43,7 @@ configuration, and act as the operator with `simulator operator`."
 )]
 pub struct Args {
     /// The simulated cell's configuration.
-    #[arg(long, default_value = "config/sim.toml")]
+    #[arg(long, default_value = shared::config::DEFAULT_FILE)]
     config: PathBuf,
 }
 

@@ -36,7 +36,7 @@ pour-*.svg, summary.json and the processes' logs."
 )]
 pub struct Args {
     /// The simulated cell's configuration; the demo gives its copy a name and an address of its own.
-    #[arg(long, default_value = "config/sim.toml")]
+    #[arg(long, default_value = shared::config::DEFAULT_FILE)]
     config: PathBuf,
     /// Directory of the results; what an earlier demo left there is replaced.
     #[arg(long, default_value = "out/demo")]

@@ -6,6 +6,7 @@ pub mod cell;
 pub mod demo;
 pub mod evaluate;
 pub mod evaluate_camera;
+pub mod motion;
 pub mod operator;
 pub mod physics;
 pub mod pour_plot;

@@ -49,7 +49,7 @@ enum Act {
 #[derive(Debug, clap::Args)]
 struct Common {
     /// The simulated cell's configuration.
-    #[arg(long, default_value = "config/sim.toml")]
+    #[arg(long, default_value = shared::config::DEFAULT_FILE)]
     config: PathBuf,
     /// Print the answer as JSON.
     #[arg(long)]

@@ -643,6 +643,97 @@ mod fuzz {
         prop::collection::vec(word, 0..120).prop_map(|w| w.concat())
     }
 
+    /// Expressions that parse; most are wrong in type or value.
+    fn expression() -> impl Strategy<Value = String> {
+        let leaf = prop::sample::select(vec![
+            "x",
+            "q",
+            "n",
+            "True",
+            "None",
+            "0",
+            "1",
+            "-1",
+            "7",
+            "2147483647",
+            "-2147483647",
+            "0.5",
+            "1e300",
+            "\"t\"",
+            "[1, 2, 3]",
+            "[]",
+            "p[1, 2, 3, 4, 5, 6]",
+            "get_steptime()",
+            "f(1)",
+            "read_input_integer_register(24)",
+            "get_actual_joint_positions()",
+        ]);
+        leaf.prop_map(str::to_owned).prop_recursive(4, 24, 3, |inner| {
+            let operator = prop::sample::select(vec!["+", "-", "*", "/", "%", "==", "!=", "<", "<=", ">", ">=", "and", "or", "xor"]);
+            let function = prop::sample::select(vec![
+                "norm",
+                "floor",
+                "ceil",
+                "sqrt",
+                "length",
+                "to_str",
+                "d2r",
+                "f",
+                "str_len",
+                "read_output_float_register",
+                "sin",
+                "acos",
+            ]);
+            prop_oneof![
+                (inner.clone(), operator, inner.clone()).prop_map(|(a, o, b)| format!("({a} {o} {b})")),
+                (inner.clone(), inner.clone()).prop_map(|(a, b)| format!("{a}[{b}]")),
+                (function, inner.clone()).prop_map(|(f, a)| format!("{f}({a})")),
+                (inner.clone(), inner.clone()).prop_map(|(a, b)| format!("[{a}, {b}, 0]")),
+                (inner.clone(), inner.clone()).prop_map(|(a, b)| format!("str_cat({a}, {b})")),
+                inner.clone().prop_map(|a| format!("(not {a})")),
+                inner.prop_map(|a| format!("-{a}")),
+            ]
+        })
+    }
+
+    /// Programs that parse and run until their first mistake.
+    fn program() -> impl Strategy<Value = String> {
+        let simple = prop_oneof![
+            expression().prop_map(|e| format!("x = {e}")),
+            expression().prop_map(|e| format!("textmsg({e})")),
+            (expression(), expression()).prop_map(|(i, e)| format!("q[{i}] = {e}")),
+            expression().prop_map(|e| format!("q = q + {e}")),
+            expression().prop_map(|e| format!("write_output_integer_register(24, {e})")),
+            expression().prop_map(|e| format!("stopj({e})")),
+            expression().prop_map(|e| format!("sleep({e})")),
+            prop::sample::select(vec![
+                "sync()",
+                "servoj(q)",
+                "n = n + 1",
+                "x = run t()",
+                "join x",
+                "kill x",
+                "halt",
+                "x = None",
+                "x = [x, x]"
+            ])
+            .prop_map(str::to_owned),
+        ];
+        let statement = simple.prop_recursive(3, 24, 5, |inner| {
+            let block = prop::collection::vec(inner, 0..5).prop_map(|lines| lines.join("\n"));
+            prop_oneof![
+                (expression(), block.clone(), block.clone()).prop_map(|(c, a, b)| format!("if {c}:\n{a}\nelse:\n{b}\nend")),
+                (prop_oneof![expression(), Just("n < 100".to_owned()), Just("True".to_owned())], block)
+                    .prop_map(|(c, a)| format!("while {c}:\n{a}\nend")),
+            ]
+        });
+        prop::collection::vec(statement, 1..12).prop_map(|lines| {
+            let head = "def a():\nx = None\nn = 0\nq = get_actual_joint_positions()\ndef f(v):\nn = n + 1\nif n < 9:\nreturn f(v)\nend\n\
+                        return v\nend\nthread t():\nwhile True:\nsync()\nend\nreturn None\nend\n";
+            format!("{head}{}\nend\n", lines.join("\n"))
+        })
+    }
+
     fn run_program(source: &str) {
         let mut machine = Machine::new(Series::Cb3, Series::Cb3.default_version(), [0.0; 6]);
         machine.upload(source);
@@ -691,6 +782,12 @@ mod fuzz {
         fn programs_of_random_words_do_not_panic(source in words()) {
             run_program(&source);
             run_program(&format!("def a():\n{source}\nend\n"));
+        }
+
+        // Protects the same from programs that get past the parser.
+        #[test]
+        fn random_programs_do_not_panic(source in program()) {
+            run_program(&source);
         }
 
         // Protects the same from random characters.

@@ -19,15 +19,14 @@ use std::time::{Duration, Instant};
 
 use rt_controller::client::Client;
 use rt_controller::link::Lost;
-use shared::agent::Selection;
 use shared::config::Config;
 use shared::control::{EndReason, Outcome, Reply, Request};
 use shared::estimate::Calibration;
 use shared::ipc;
 use shared::messages::{Feature, LAYOUT_VERSION, Phase};
 use shared::os::now_ns;
-use shared::policy::{InputScale, Mlp, STAY, action_table};
-use shared::weights::{Estimator, Method, Origin, Weights};
+use shared::policy::{Mlp, STAY};
+use shared::weights::Weights;
 use simulator::ur::{Controller, Fault, Handle, Options, RobotMode, RuntimeState, TraceRow};
 
 /// Millilitres in a frame per px^2 of the feature.
@@ -176,7 +175,7 @@ impl Cell {
         };
         let episode = self.pour(goal_ml);
         match moment {
-            Moment::Returning => reached("returning", |alpha, rate| rate < -30.0 && alpha > 15.0),
+            Moment::Returning => reached("returning", |alpha, rate| rate < -30.0 && (15.0..45.0).contains(&alpha)),
             Moment::FullFlow => reached("at full flow", |alpha, rate| flow_ml_s(alpha) > 5.0 && rate.abs() < 5.0),
             _ => reached("tilting out", |alpha, rate| rate > 20.0 && alpha > 20.0),
         }
@@ -248,10 +247,11 @@ impl Cell {
             }
             Expected::Stopped(_) => assert!(motion.rest_s <= STOP_BOUND_S, "stopped within {STOP_BOUND_S} s\n{}", context()),
         }
-        for motion in [&motion, &back] {
-            assert!(motion.fastest_deg_s <= 90.0 + 1e-3, "{}", context());
-            assert!(motion.hardest_deg_s2 <= 1500.0 * 1.001, "{}", context());
-        }
+        assert!(motion.fastest_deg_s <= 90.0 + 1e-3 && back.fastest_deg_s <= 90.0 + 1e-3, "{}", context());
+        assert!(motion.hardest_deg_s2 <= 1500.0 * 1.001, "{}", context());
+        // A program that was paused in mid-motion and is resumed goes on from there: that first step is the pendant's.
+        let resumed = matches!(expected, Expected::Stopped(_));
+        assert!(resumed || back.hardest_deg_s2 <= 1500.0 * 1.001, "{:.0} deg/s^2\n{}", back.hardest_deg_s2, context());
         assert_eq!(next.reason, EndReason::Done, "the next pour\n{}", context());
     }
 
@@ -316,17 +316,8 @@ fn tilt_until_it_flows() -> Weights {
     policy.w2[0][0] = 1.0;
     policy.w3[0][STAY] = 1.0;
     policy.b3[STAY + 7] = 0.5;
-    Weights {
-        policy,
-        actions_deg: action_table(),
-        selection: Selection::Argmax,
-        scale: InputScale::default(),
-        calibration: Calibration { c: ML_PER_PX2 as f32, q: 1.0, hold_above_px2: 1e6 },
-        estimator: Estimator::Sum,
-        rate_hz: 30.0,
-        origin: Origin { method: Method::Handmade, actions: 21, episodes: 0, data_sha256: [0; 32] },
-        seed: 1,
-    }
+    let calibration = Calibration { c: ML_PER_PX2 as f32, q: 1.0, hold_above_px2: f32::INFINITY };
+    Weights { policy, calibration, ..tests::steady_weights(STAY + 7) }
 }
 
 fn flow_ml_s(alpha_deg: f64) -> f64 {
@@ -552,7 +543,7 @@ fn emergency_stop() {
         c.dashboard("power on");
         c.until("its brakes released", |c| {
             c.dashboard("brake release");
-            thread::sleep(Duration::from_millis(50));
+            thread::sleep(Duration::from_millis(700));
             (c.robot.state()?.robot_mode == RobotMode::Running).then_some(())
         });
         c.jog_upright_if_tilted();

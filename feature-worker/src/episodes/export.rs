@@ -27,7 +27,7 @@ pub struct Args {
     #[arg(long, value_name = "DIR")]
     to: PathBuf,
     /// The cell's configuration.
-    #[arg(long, default_value = "config/cell.toml")]
+    #[arg(long, default_value = shared::config::DEFAULT_FILE)]
     config: PathBuf,
     /// Print JSON.
     #[arg(long)]

@@ -8,8 +8,9 @@
 //! | dropping a [`Session`] | an ordinary thread | frees |
 //!
 //! The loop owns a [`Session`] from the moment an ordinary thread hands it over until [`health::check`] names a reason or
-//! `poll` or `send` fails; then it stops sending and hands the session back to be dropped. Silence is the universal stop: the
-//! program on the robot (`robot/pour.script`) brings the container upright by itself 100 ms after the last target.
+//! `poll` or `send` fails; then it stops sending and hands the session back to be dropped, which sends a last
+//! [`Mode::Stop`]. Silence is the universal stop: the program on the robot (`robot/pour.script`) brings the container upright
+//! by itself 100 ms after the last target.
 //!
 //! Registers, counted from `robot.register_base` (b); all are RTDE general purpose registers:
 //!

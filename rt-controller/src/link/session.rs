@@ -2,10 +2,13 @@
 //!
 //! Made by [`connect`](super::connect()) on an ordinary thread, which also drops it. `poll` and `send` never block, never
 //! allocate and never panic: the one buffer holds the protocol's largest frame. Whatever goes wrong on the socket ends the
-//! session with a [`Lost`]; there is no repair in place.
+//! session with a [`Lost`]; there is no repair in place. Dropping it asks the program to come upright and end, in case it can
+//! still hear; if it cannot, it does so by itself 100 ms after the last target.
 
 use std::io::{ErrorKind, Read, Write};
-use std::net::TcpStream;
+use std::net::{Shutdown, TcpStream};
+
+use shared::os::now_ns;
 
 use super::wire::{self, Inbox, Outputs};
 use super::{Mode, RobotState, TiltJoint};
@@ -136,5 +139,14 @@ impl Session {
         }
         self.state.sequence_sent = sequence;
         Ok(sequence)
+    }
+}
+
+impl Drop for Session {
+    fn drop(&mut self) {
+        // Unread bytes at the close would make the kernel abort the connection, and this last target with it.
+        let _ = self.poll(now_ns());
+        let _ = self.send(Mode::Stop, 0.0);
+        let _ = self.stream.shutdown(Shutdown::Write);
     }
 }
