@@ -206,7 +206,7 @@ impl Agent {
         View {
             poured_ml: fused.poured_ml() as f32,
             poured_sd_ml: fused.poured_sd_ml() as f32,
-            stop_ml: fused.stop_volume_ml(f64::from(frame.alpha_now_deg)) as f32,
+            stop_ml: fused.stop_volume_ml(f64::from(frame.alpha_now_deg).clamp(-30.0, 200.0)) as f32,
         }
     }
 
@@ -337,9 +337,10 @@ mod tests {
         fn any_input_gives_a_finite_action(
             goal in any::<f32>(),
             frames in prop::collection::vec((prop::option::of(prop_oneof![any::<f32>(), 0f32..500.0]), prop_oneof![any::<f32>(), 0f32..110.0]), 0..60),
+            fused in any::<bool>(),
             selection in prop::sample::select(vec![Selection::Argmax, Selection::Expected, Selection::Sampled]),
         ) {
-            let mut weights = example();
+            let mut weights = if fused { crate::weights::tests::fused_example() } else { example() };
             weights.selection = selection;
             let mut agent = Agent::new(&weights);
             agent.start(goal);

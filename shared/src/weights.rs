@@ -349,6 +349,26 @@ pub(crate) mod tests {
         }
     }
 
+    /// The same with the fused estimate.
+    pub(crate) fn fused_example() -> Weights {
+        let noise = FlowNoise { lambda: 0.2, gamma: 0.025, beta: 0.015, delta: 0.3, frame: 0.08, v_min_ml: 0.01 };
+        let model = FlowModel {
+            radius_mm: 38.0,
+            height_mm: 115.0,
+            taper: 1.0,
+            s: [0.0; crate::estimate::flow::KNOTS],
+            lk: -3.0,
+            p: 1.5,
+            k1: 0.2,
+            k2: -0.1,
+            tau: 2.0,
+            delay: 2.3,
+            eta: 0.1,
+            noise,
+        };
+        Weights { estimator: Estimator::Fused { model, back: Return { rate_deg: 2.0, change_deg: 1.67 } }, ..example() }
+    }
+
     /// Protects the swap: what is written is what is read, with the same identity, and no temporary file is left.
     #[test]
     fn a_written_file_reads_back_the_same() {
@@ -422,6 +442,18 @@ pub(crate) mod tests {
             ("exponent", |w| w.calibration.q = f32::NAN),
             ("frame rate", |w| w.rate_hz = 0.0),
             ("hold", |w| w.calibration.hold_above_px2 = f32::NAN),
+            ("estimator: delay", |w| {
+                *w = fused_example();
+                if let Estimator::Fused { model, .. } = &mut w.estimator {
+                    model.delay = f64::NAN;
+                }
+            }),
+            ("estimator: sd of gamma", |w| {
+                *w = fused_example();
+                if let Estimator::Fused { model, .. } = &mut w.estimator {
+                    model.noise.gamma = 0.0;
+                }
+            }),
         ] {
             let mut weights = example();
             change(&mut weights);

@@ -16,7 +16,8 @@ use crate::law::{self, Law, Search, Worlds};
 use crate::train::{Estimate, Options, Progress, Trained, actions_table};
 
 /// The size of the search that is used, chosen so that a training takes seconds.
-const SEARCH: Search = Search { population: 16, pours: 32, iterations: 6, elites: 4 };
+/// Also used for the PD that the policy is compared with.
+pub const SEARCH: Search = Search { population: 16, pours: 32, iterations: 6, elites: 4 };
 const DISTIL: distill::Size = distill::Size { rounds: 3, pours: 96, steps: 500, batch: 256 };
 
 /// Fewer episodes than this say nothing of the geometry that the camera does not say better.
@@ -45,8 +46,9 @@ pub fn train(episodes: &[TrainingEpisode], options: &Options, progress: &dyn Pro
     let rate_hz = episodes.first().map_or(30.0, |e| e.rate_hz);
     let worlds = Worlds::new(&fit, options.limits, rate_hz, options.estimate == Estimate::Fused);
     progress.stage("searching the control law", SEARCH.iterations as u64);
-    let (law, search_curve): (Law, Vec<f64>) =
-        law::search(&worlds, SEARCH, options.seed, |k, cost| progress.at(k as u64 + 1, &format!("cost {cost:.3}")));
+    let (law, search_curve): (Law, Vec<f64>) = law::search(&worlds, Law::start(worlds.fused), SEARCH, options.seed, |k, cost| {
+        progress.at(k as u64 + 1, &format!("cost {cost:.3}"))
+    });
     let scale = InputScale::default();
     let table = actions_table(options.actions);
     progress.stage("teaching the network", (DISTIL.steps * (DISTIL.rounds + 1)) as u64);

@@ -1,12 +1,69 @@
-//! Prints everything in a weight file.
+//! `trainer inspect`: everything in a weight file, so that others can rebuild the policy.
+//!
+//! Offline, ordinary thread, allocates.
 
+use std::path::PathBuf;
 use std::process::ExitCode;
 
-/// Command-line arguments of `trainer`.
+use shared::exit;
+use shared::policy::{ACTIONS, HIDDEN, INPUTS, PARAMETERS};
+use shared::weights::{Estimator, FORMAT_VERSION, Weights};
+
+/// Command-line arguments of `trainer inspect`.
 #[derive(Debug, clap::Args)]
-pub struct Args {}
+#[command(after_help = "Examples:
+  trainer inspect out/weights.bin
+  trainer inspect out/weights.bin --json > weights.json")]
+pub struct Args {
+    /// The weight file.
+    weights: PathBuf,
+    /// Print JSON, all 1909 parameters included.
+    #[arg(long)]
+    json: bool,
+}
 
 /// Runs the command; the exit codes are those of [`shared::exit`].
-pub fn run(_args: &Args) -> ExitCode {
-    shared::exit::fail(shared::exit::FAILED, "not built yet")
+pub fn run(args: &Args) -> ExitCode {
+    let w = match Weights::read(&args.weights) {
+        Ok(w) => w,
+        Err(e) => return exit::fail(exit::BAD_INPUT, e),
+    };
+    let data: String = w.origin.data_sha256.iter().map(|b| format!("{b:02x}")).collect();
+    if args.json {
+        let all = serde_json::json!({
+            "format_version": FORMAT_VERSION, "shape": [INPUTS, HIDDEN, HIDDEN, ACTIONS], "parameters": PARAMETERS,
+            "identity": w.identity(), "data_sha256": data, "weights": w,
+        });
+        println!("{}", serde_json::to_string_pretty(&all).unwrap_or_default());
+        return ExitCode::SUCCESS;
+    }
+    println!("{}: identity {}, format version {FORMAT_VERSION}", args.weights.display(), w.identity());
+    println!("trained     method {:?}, {} actions, {} episodes, seed {}", w.origin.method, w.origin.actions, w.origin.episodes, w.seed);
+    println!("data        sha256 {data}");
+    println!("network     {INPUTS}-{HIDDEN}-{HIDDEN}-{ACTIONS}, ReLU, {PARAMETERS} parameters, action by {:?}", w.selection);
+    println!(
+        "inputs      asinh({} v) x {} for v_t, v_t-1, v_t-2 in ml a frame; asinh(d / {} ml) x {}",
+        w.scale.v_per_ml, w.scale.gain, w.scale.d_ml, w.scale.gain
+    );
+    println!("actions     {:?} degrees", w.actions_deg);
+    println!(
+        "calibration v = {:.6e} area^{:.4} ml, a lone zero after more than {} px^2 is held",
+        w.calibration.c, w.calibration.q, w.calibration.hold_above_px2
+    );
+    println!("frame rate  {} Hz", w.rate_hz);
+    match &w.estimator {
+        Estimator::Sum => println!("estimate    plain sum of the frames' volumes"),
+        Estimator::Fused { model: m, back } => {
+            println!("estimate    camera and container geometry, fused");
+            println!(
+                "  vessel    R {:.1} mm, H {:.1} mm, bottom/top {:.2}, deviation (log) {:.3?}",
+                m.radius_mm, m.height_mm, m.taper, m.s
+            );
+            println!("  flow      ln k {:.3}, exponent {:.3}, k1 {:.3}, k2 {:.3}, film share {:.3}", m.lk, m.p, m.k1, m.k2, m.eta);
+            println!("  motion    lag {:.2} frames, delay {:.2} frames, back at {:.2} degrees a frame", m.tau, m.delay, back.rate_deg);
+            println!("  doubts    {:?}", m.noise);
+        }
+    }
+    println!("all 1909 parameters: --json");
+    ExitCode::SUCCESS
 }

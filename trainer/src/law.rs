@@ -58,13 +58,18 @@ impl Law {
         Self { c: 0.03, d0, vmax: 1.0, kd: 2.0, k: 1.0, um: 0.5, s: 0.5, kf, u0: 0.7 }
     }
 
+    /// A PD on d is the law without damping, smoothing and volume in flight: dalpha = K c d - K v.
+    pub fn start_pd(fused: bool) -> Self {
+        Self { vmax: 1e3, kd: 1e-6, s: 1e-6, kf: 1e-6, ..Self::start(fused) }
+    }
+
     fn logs(&self) -> [f64; PARAMETERS] {
         [self.c, self.d0, self.vmax, self.kd, self.k, self.um, self.s, self.kf, self.u0].map(f64::ln)
     }
 
     fn from_logs(l: &[f64; PARAMETERS]) -> Self {
         let [c, d0, vmax, kd, k, um, s, kf, u0] = l.map(f64::exp);
-        Self { c, d0, vmax: vmax.min(1.6), kd, k, um: um.min(3.0), s, kf, u0: u0.min(3.0) }
+        Self { c, d0, vmax: if vmax < 100.0 { vmax.min(1.6) } else { vmax }, kd, k, um: um.min(3.0), s, kf, u0: u0.min(3.0) }
     }
 
     /// The angle that the law asks for, degrees; `None`: back.
@@ -264,11 +269,13 @@ pub struct Search {
     pub elites: usize,
 }
 
-/// The cross-entropy method over the law's log-parameters; the best mean found, and the elites' cost after each iteration.
-pub fn search(worlds: &Worlds, size: Search, seed: u64, mut progress: impl FnMut(usize, f64)) -> (Law, Vec<f64>) {
+/// The cross-entropy method over the law's log-parameters, around `start`; the best mean found, and the elites' cost after each iteration.
+pub fn search(worlds: &Worlds, start: Law, size: Search, seed: u64, mut progress: impl FnMut(usize, f64)) -> (Law, Vec<f64>) {
     let mut rng = Pcg64Mcg::seed_from_u64(seed ^ 0x1a77);
-    let mut mean = Law::start(worlds.fused).logs();
-    let mut sd = [0.4f64; PARAMETERS];
+    let mut mean = start.logs();
+    // What a PD does not have stays where it is.
+    let free = mean.map(|l| l > -10.0 && l < 4.0);
+    let mut sd = free.map(|f| if f { 0.4f64 } else { 0.0 });
     let mut curve = Vec::new();
     for iteration in 0..size.iterations {
         let mut laws: Vec<[f64; PARAMETERS]> = vec![mean];
@@ -296,7 +303,7 @@ pub fn search(worlds: &Worlds, size: Search, seed: u64, mut progress: impl FnMut
             let new_mean = values.iter().sum::<f64>() / values.len() as f64;
             let var = values.iter().map(|v| (v - new_mean).powi(2)).sum::<f64>() / values.len() as f64;
             mean[k] = new_mean;
-            sd[k] = (0.3 * sd[k] + 0.7 * var.sqrt()).max(0.03);
+            sd[k] = if free[k] { (0.3 * sd[k] + 0.7 * var.sqrt()).max(0.03) } else { 0.0 };
         }
         let best = elites.iter().map(|e| costs[*e]).sum::<f64>() / elites.len() as f64;
         curve.push(best);

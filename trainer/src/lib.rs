@@ -4,6 +4,7 @@
 pub mod best;
 pub mod calibrate;
 pub mod check;
+pub mod consistency;
 pub mod data;
 pub mod distill;
 pub mod eq8;

@@ -1,12 +1,123 @@
-//! Refits calibration, model and policy from all weighed episodes.
+//! `trainer refine`: every pour teaches. Refits calibration, model and policy from all weighed episodes so far, pours
+//! included, and writes a new weight file that the running controller takes live.
+//!
+//! Offline, ordinary threads, allocates. A weight that does not fit the others is asked about; without a terminal the
+//! command stops and says how to answer.
 
+use std::io::{BufRead, IsTerminal, Write};
+use std::path::PathBuf;
 use std::process::ExitCode;
 
-/// Command-line arguments of `trainer`.
+use shared::episode::{Episode, Kind};
+use shared::exit;
+
+use crate::consistency;
+use crate::data;
+use crate::train::{self, Estimate, MethodName, Options};
+
+/// Command-line arguments of `trainer refine`.
 #[derive(Debug, clap::Args)]
-pub struct Args {}
+#[command(after_help = "Examples:
+  trainer refine out/episodes --out out/weights.bin
+  trainer refine out/episodes --leave-out out/episodes/0007.mcap --out out/weights.bin
+  trainer refine out/episodes --accept out/episodes/0007.mcap --out out/weights.bin")]
+pub struct Args {
+    /// MCAP episodes, or directories of them: recordings and pours; with --scale: the table of features.
+    #[arg(required = true)]
+    episodes: Vec<PathBuf>,
+    /// Table of weights (`episode, weight_g`).
+    #[arg(long)]
+    scale: Option<PathBuf>,
+    /// Episodes whose weight is right although it does not fit the others.
+    #[arg(long)]
+    accept: Vec<String>,
+    /// Episodes to leave out.
+    #[arg(long)]
+    leave_out: Vec<String>,
+    /// Seed: the same seed and data give the same bytes.
+    #[arg(long, default_value_t = 1)]
+    seed: u64,
+    /// Configuration of the cell, for the limits; without it the default limits.
+    #[arg(long)]
+    config: Option<PathBuf>,
+    /// Where the weight file goes; replaced atomically.
+    #[arg(long)]
+    out: PathBuf,
+    /// Print a report as JSON.
+    #[arg(long)]
+    json: bool,
+}
+
+/// What the weighed pours among `episodes` show, in order: number, goal, weight (both ml), running mean absolute error.
+pub fn pours(episodes: &[Episode]) -> Vec<(usize, f64, f64, f64)> {
+    let mut sum = 0.0;
+    let mut ordered: Vec<&Episode> = episodes.iter().collect();
+    ordered.sort_by(|a, b| (a.info.started_at_utc.as_str(), a.name.as_str()).cmp(&(b.info.started_at_utc.as_str(), b.name.as_str())));
+    let weighed = ordered.into_iter().filter_map(|e| match (e.kind, e.weight_g) {
+        (Kind::Pour { goal_ml }, Some(weight)) => Some((f64::from(goal_ml), weight)),
+        _ => None,
+    });
+    weighed
+        .enumerate()
+        .map(|(k, (goal, weight))| {
+            sum += (weight - goal).abs();
+            (k + 1, goal, weight, sum / (k + 1) as f64)
+        })
+        .collect()
+}
 
 /// Runs the command; the exit codes are those of [`shared::exit`].
-pub fn run(_args: &Args) -> ExitCode {
-    shared::exit::fail(shared::exit::FAILED, "not built yet")
+pub fn run(args: &Args) -> ExitCode {
+    let read = match data::read(&args.episodes, args.scale.as_deref()) {
+        Ok(read) => read,
+        Err(e) => return exit::fail(exit::BAD_INPUT, e),
+    };
+    let limits = match train::limits(args.config.as_deref()) {
+        Ok(limits) => limits,
+        Err(e) => return exit::fail(exit::BAD_INPUT, e),
+    };
+    let mut usable = data::usable(&read);
+    usable.episodes.retain(|e| !args.leave_out.contains(&e.name));
+    for doubt in consistency::doubtful(&usable.episodes) {
+        if args.accept.contains(&doubt.name) {
+            continue;
+        }
+        match ask(&doubt) {
+            Some(true) => {}
+            Some(false) => {
+                usable.episodes.retain(|e| e.name != doubt.name);
+                usable.left_out.push((doubt.name.clone(), "its weight does not fit the others".into()));
+            }
+            None => {
+                let name = &doubt.name;
+                return exit::fail(
+                    exit::BAD_INPUT,
+                    format!("{doubt} Correct it with `feature-worker episodes`, or give --leave-out {name} or --accept {name}"),
+                );
+            }
+        }
+    }
+    let history = pours(&read);
+    let options = Options { method: MethodName::Best, actions: 21, estimate: Estimate::Fused, seed: args.seed, limits };
+    let extra = serde_json::json!({ "pours": history.iter().map(|(n, goal, weight, mean)| serde_json::json!({"number": n, "goal_ml": goal, "weight_g": weight, "mae_so_far_ml": mean})).collect::<Vec<_>>() });
+    let code = train::train_and_write(&usable, &options, &args.out, args.json, extra);
+    if code == ExitCode::SUCCESS && !args.json && !history.is_empty() {
+        println!("pour   goal ml  scale g  error ml  mean |error| so far");
+        for (n, goal, weight, mean) in history {
+            println!("{n:>4} {goal:>9.1} {weight:>8.0} {:>9.1} {mean:>10.2}", weight - goal);
+        }
+    }
+    code
+}
+
+/// Whether to use a doubtful weight; `None`: there is nobody to ask.
+fn ask(doubt: &consistency::Doubtful) -> Option<bool> {
+    if !std::io::stdin().is_terminal() {
+        return None;
+    }
+    eprint!("{doubt}\nUse it all the same? [y/N] ");
+    std::io::stderr().flush().ok()?;
+    let mut answer = String::new();
+    std::io::stdin().lock().read_line(&mut answer).ok()?;
+    Some(answer.trim().eq_ignore_ascii_case("y"))
 }

@@ -3,16 +3,18 @@
 //! Offline, ordinary threads, allocates. The whole configuration, seed, data hash and learning curve are kept beside the
 //! blob (`W.json`); the same seed and data give the same bytes on any number of threads.
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 
 use indicatif::{ProgressBar, ProgressStyle};
+use shared::exit;
 use shared::limits::Limits;
 use shared::policy::{ACTIONS, action_table, nearest_action};
 use shared::weights::Weights;
 
 use crate::best;
-use crate::data::{self, DataError, TrainingEpisode};
+use crate::consistency;
+use crate::data::{self, DataError, TrainingEpisode, Usable};
 use crate::eq8;
 use crate::fit::Fit;
 use crate::law::Law;
@@ -181,46 +183,53 @@ impl Progress for Bar {
     }
 }
 
+/// The limits of a configuration, or the default ones.
+pub fn limits(config: Option<&Path>) -> Result<Limits, shared::config::ConfigError> {
+    config.map_or_else(|| Ok(Limits::default()), |file| shared::config::Config::read(file).map(|c| c.limits))
+}
+
 /// Runs the command; the exit codes are those of [`shared::exit`].
 pub fn run(args: &Args) -> ExitCode {
     let read = match data::read(&args.episodes, args.scale.as_deref()) {
         Ok(read) => read,
-        Err(e) => return shared::exit::fail(shared::exit::BAD_INPUT, e),
+        Err(e) => return exit::fail(exit::BAD_INPUT, e),
     };
-    let limits = match &args.config {
-        None => Limits::default(),
-        Some(file) => match shared::config::Config::read(file) {
-            Ok(config) => config.limits,
-            Err(e) => return shared::exit::fail(shared::exit::BAD_INPUT, e),
-        },
+    let limits = match limits(args.config.as_deref()) {
+        Ok(limits) => limits,
+        Err(e) => return exit::fail(exit::BAD_INPUT, e),
     };
+    let estimate = args.estimate.unwrap_or(if args.method == MethodName::Best { Estimate::Fused } else { Estimate::Sum });
+    if estimate == Estimate::Fused && args.method != MethodName::Best {
+        return exit::fail(exit::BAD_INPUT, "--estimate fused goes with --method best: the others learn on the paper's own sum");
+    }
     let usable = data::usable(&read);
+    for doubt in consistency::doubtful(&usable.episodes) {
+        eprintln!("doubtful: {doubt}");
+    }
+    let options = Options { method: args.method, actions: args.actions, estimate, seed: args.seed, limits };
+    train_and_write(&usable, &options, &args.out, args.json, serde_json::Value::Null)
+}
+
+/// Trains with a progress bar, writes the weight file and, beside it, everything that it came from (`W.json`).
+pub fn train_and_write(usable: &Usable, options: &Options, out: &Path, json: bool, extra: serde_json::Value) -> ExitCode {
     for (name, what) in &usable.left_out {
         eprintln!("left out: {name}: {what}");
     }
-    let estimate = args.estimate.unwrap_or(if args.method == MethodName::Best { Estimate::Fused } else { Estimate::Sum });
-    if estimate == Estimate::Fused && args.method != MethodName::Best {
-        return shared::exit::fail(
-            shared::exit::BAD_INPUT,
-            "--estimate fused goes with --method best: the others learn on the paper's own sum",
-        );
-    }
-    let options = Options { method: args.method, actions: args.actions, estimate, seed: args.seed, limits };
-    let style = ProgressStyle::with_template("{prefix} [{wide_bar}] {pos}/{len} {msg} ({eta} left)")
-        .unwrap_or_else(|_| ProgressStyle::default_bar());
-    let bar = Bar(ProgressBar::new(1).with_style(style));
+    let style = ProgressStyle::with_template("{prefix} [{wide_bar}] {pos}/{len} {msg} ({eta} left)");
+    let bar = Bar(ProgressBar::new(1).with_style(style.unwrap_or_else(|_| ProgressStyle::default_bar())));
     let begin = std::time::Instant::now();
-    let trained = match train(&usable.episodes, &options, &bar) {
+    let trained = match train(&usable.episodes, options, &bar) {
         Ok(trained) => trained,
-        Err(e) => return shared::exit::fail(shared::exit::BAD_INPUT, e),
+        Err(e) => return exit::fail(exit::BAD_INPUT, e),
     };
     bar.0.finish_and_clear();
     let seconds = begin.elapsed().as_secs_f64();
-    if let Err(e) = trained.weights.write(&args.out) {
-        return shared::exit::fail(shared::exit::FAILED, e);
+    if let Err(e) = trained.weights.write(out) {
+        return exit::fail(exit::FAILED, e);
     }
     let summary = serde_json::json!({
-        "weights": args.out,
+        "kind": "training",
+        "weights": out,
         "identity": trained.weights.identity(),
         "options": options,
         "episodes": usable.episodes.iter().map(|e| serde_json::json!({"name": e.name, "weight_g": e.weight_g})).collect::<Vec<_>>(),
@@ -231,22 +240,19 @@ pub fn run(args: &Args) -> ExitCode {
         "law": trained.law,
         "search_cost": trained.search_curve,
         "loss": trained.loss,
+        "extra": extra,
     });
-    let mut beside = args.out.clone().into_os_string();
+    let mut beside = out.to_path_buf().into_os_string();
     beside.push(".json");
     let text = serde_json::to_string_pretty(&summary).unwrap_or_default();
     if let Err(e) = std::fs::write(&beside, format!("{text}\n")) {
-        return shared::exit::fail(shared::exit::FAILED, format!("{}: {e}", PathBuf::from(&beside).display()));
+        return exit::fail(exit::FAILED, format!("{}: {e}", PathBuf::from(&beside).display()));
     }
-    if args.json {
+    if json {
         println!("{text}");
     } else {
-        println!(
-            "{}: trained on {} episodes in {seconds:.1} s, identity {}",
-            args.out.display(),
-            usable.episodes.len(),
-            trained.weights.identity()
-        );
+        let n = usable.episodes.len();
+        println!("{}: trained on {n} episodes in {seconds:.1} s, identity {}", out.display(), trained.weights.identity());
     }
     ExitCode::SUCCESS
 }

@@ -199,7 +199,7 @@ impl Flow {
         let mut commands = [0.0; HISTORY + STOP_FRAMES];
         commands[..HISTORY].copy_from_slice(history);
         let mut filled = HISTORY;
-        if now_deg != commands[HISTORY - 1] {
+        if now_deg.is_finite() && now_deg != commands[HISTORY - 1] {
             commands[HISTORY] = now_deg;
             filled += 1;
         }

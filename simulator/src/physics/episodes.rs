@@ -53,6 +53,18 @@ impl Bench {
         }
     }
 
+    /// What leaves `volume_ml` at the largest tilt if one waits for ever, ml.
+    pub fn reach_ml(&self, volume_ml: f64) -> f64 {
+        match self {
+            Self::A => volume_ml,
+            Self::B(bench) => {
+                let mut container = bench.1.clone();
+                container.refill(volume_ml);
+                container.volume_ml() - bench.0.shape.retained_ml(super::ALPHA_MAX_DEG)
+            }
+        }
+    }
+
     /// Records `n` episodes: volumes stratified over 140 to 460 ml, lambda = spill angle + U(6, 30) degrees, width U(0.7, 2.2) s.
     /// A single episode is the middle one: 300 ml, + 18 degrees, 1.3 s.
     pub fn record(&self, n: usize, seed: u64) -> Vec<TrainingEpisode> {

@@ -1,0 +1,102 @@
+//! Tests of the command line, with the real program and real files.
+
+mod common;
+
+use std::path::Path;
+use std::process::{Command, Output};
+
+fn trainer(dir: &Path, args: &[&str]) -> Output {
+    Command::new(env!("CARGO_BIN_EXE_trainer")).current_dir(dir).args(args).output().unwrap()
+}
+
+fn text(bytes: &[u8]) -> String {
+    String::from_utf8_lossy(bytes).into_owned()
+}
+
+/// Writes the CSV pair of `n` episodes; weights pass through `weight`.
+fn tables(dir: &Path, n: usize, weight: impl Fn(usize, f64) -> f64) {
+    let mut features = String::from("episode,frame,t_s,alpha_deg,area_px2\n");
+    let mut scale = String::from("episode,weight_g\n");
+    for (k, e) in common::episodes(n, 1).iter().enumerate() {
+        for i in 0..e.len() {
+            features += &format!("{},{i},{:.4},{:.4},{:.2}\n", e.name, e.t_s[i], e.alpha_deg[i], e.area_px2[i]);
+        }
+        scale += &format!("{},{}\n", e.name, weight(k, e.weight_g));
+    }
+    std::fs::write(dir.join("f.csv"), features).unwrap();
+    std::fs::write(dir.join("s.csv"), scale).unwrap();
+}
+
+/// Protects the way of people with their own vision: tables in, a weight file and its origin out, inspected and reported.
+#[test]
+fn tables_become_weights() {
+    let dir = tempfile::tempdir().unwrap();
+    tables(dir.path(), 4, |_, w| w);
+    let run = |args: &[&str]| {
+        let out = trainer(dir.path(), args);
+        assert!(out.status.success(), "{args:?}: {}{}", text(&out.stdout), text(&out.stderr));
+        text(&out.stdout)
+    };
+    run(&["train", "f.csv", "--scale", "s.csv", "--out", "w.bin"]);
+    let all: serde_json::Value = serde_json::from_str(&run(&["inspect", "w.bin", "--json"])).unwrap();
+    let beside: serde_json::Value = serde_json::from_str(&std::fs::read_to_string(dir.path().join("w.bin.json")).unwrap()).unwrap();
+    assert_eq!(all["identity"], beside["identity"]);
+    assert_eq!(all["data_sha256"], beside["data_sha256"]);
+    assert_eq!(all["weights"]["policy"]["w2"].as_array().unwrap().len(), 32);
+    assert!(run(&["inspect", "w.bin"]).contains("4-32-32-21"));
+    run(&["report", "w.bin.json", "--out", "r.html"]);
+    let page = std::fs::read_to_string(dir.path().join("r.html")).unwrap();
+    assert!(page.contains("<svg") && !page.contains("http://www.") | page.contains("xmlns") && !page.contains("<script"));
+    run(&["refine", "f.csv", "--scale", "s.csv", "--out", "w2.bin"]);
+    let same = std::fs::read(dir.path().join("w.bin")).unwrap() == std::fs::read(dir.path().join("w2.bin")).unwrap();
+    assert!(same, "the same data and seed give the same bytes, whichever command trains");
+}
+
+/// Protects learning from every pour: a weight that does not fit is not swallowed; nothing is written until it is answered.
+#[test]
+fn refine_asks_about_a_wrong_weight() {
+    let dir = tempfile::tempdir().unwrap();
+    tables(dir.path(), 6, |k, w| if k == 2 { 2.0 * w + 30.0 } else { w });
+    let out = trainer(dir.path(), &["refine", "f.csv", "--scale", "s.csv", "--out", "w.bin"]);
+    let said = text(&out.stderr);
+    assert_eq!(out.status.code(), Some(2));
+    assert!(said.contains("the other episodes say") && said.contains("--leave-out 3") && !dir.path().join("w.bin").exists(), "{said}");
+    let out = trainer(dir.path(), &["refine", "f.csv", "--scale", "s.csv", "--leave-out", "3", "--out", "w.bin"]);
+    assert!(out.status.success() && dir.path().join("w.bin").exists(), "{}", text(&out.stderr));
+    let out = trainer(dir.path(), &["check", "f.csv", "--scale", "s.csv"]);
+    assert_eq!(out.status.code(), Some(1));
+    assert!(text(&out.stdout).contains("doubtful: 3: weight"), "{}", text(&out.stdout));
+}
+
+/// Protects the operator from a wrong file: one line, exit code 2, no panic.
+#[test]
+fn wrong_files_are_refused_in_one_line() {
+    let dir = tempfile::tempdir().unwrap();
+    std::fs::write(dir.path().join("x.bin"), b"no weights").unwrap();
+    std::fs::write(dir.path().join("x.json"), b"{}").unwrap();
+    for args in [
+        &["inspect", "x.bin"][..],
+        &["inspect", "missing.bin"],
+        &["report", "x.json", "--out", "r.html"],
+        &["train", "missing", "--out", "w.bin"],
+        &["check", "missing.csv", "--scale", "missing.csv"],
+    ] {
+        let out = trainer(dir.path(), args);
+        let said = text(&out.stderr);
+        assert_eq!(out.status.code(), Some(2), "{args:?}: {said}");
+        assert!(said.starts_with("error: ") && said.trim_end().lines().count() == 1, "{args:?}: {said}");
+    }
+}
+
+/// Protects "offline means offline": nothing of the simulator is in the trainer.
+#[test]
+fn the_trainer_knows_no_simulator() {
+    let out = Command::new(env!("CARGO"))
+        .args(["tree", "-p", "trainer", "--edges", "normal,build", "--prefix", "none", "--offline"])
+        .current_dir(env!("CARGO_MANIFEST_DIR"))
+        .output()
+        .unwrap();
+    let tree = text(&out.stdout);
+    assert!(out.status.success() && tree.contains("shared v"), "{}", text(&out.stderr));
+    assert!(!tree.contains("simulator") && !tree.contains("rt-controller"), "{tree}");
+}

@@ -1,0 +1,65 @@
+//! Episodes made by the flow model itself, so that the trainer can be tested without any simulator.
+
+use rand::{RngExt, SeedableRng};
+use rand_distr::{Distribution, StandardNormal};
+use rand_pcg::Pcg64Mcg;
+use shared::estimate::flow::{DRIP, Flow, FlowModel, FlowNoise, HISTORY, KNOTS};
+use trainer::data::TrainingEpisode;
+
+/// A beaker of 38 x 115 mm, a camera with exponent 1.2.
+pub fn model() -> FlowModel {
+    FlowModel {
+        radius_mm: 38.0,
+        height_mm: 115.0,
+        taper: 1.0,
+        s: [0.0; KNOTS],
+        lk: -3.0,
+        p: 1.5,
+        k1: 0.2,
+        k2: -0.1,
+        tau: 2.0,
+        delay: 2.3,
+        eta: 0.1,
+        noise: FlowNoise { lambda: 0.2, gamma: 0.02, beta: 0.01, delta: 0.3, frame: 0.08, v_min_ml: 0.02 },
+    }
+}
+
+/// c and q of the camera.
+pub const CAMERA: (f64, f64) = (0.0012, 1.2);
+
+/// `n` curves of eq. (1) from different volumes, weighed to the gram.
+pub fn episodes(n: usize, seed: u64) -> Vec<TrainingEpisode> {
+    let flow = Flow::new(&model());
+    let mut rng = Pcg64Mcg::seed_from_u64(seed);
+    (0..n)
+        .map(|k| {
+            let onset = 30.0 + 45.0 * (k as f64 + 0.5) / n as f64;
+            let top = onset + rng.random_range(8.0..22.0);
+            let sigma_s = rng.random_range(0.8..2.0);
+            let beta_s = sigma_s * (2.0 * (top / 0.05f64).ln()).sqrt();
+            let frames = (60.0 * beta_s) as usize + 45;
+            let mut e = TrainingEpisode::empty(&format!("{}", k + 1), 30.0);
+            let (mut a, mut x, mut film, mut sum) = (0.0, flow.capacity_ml(onset), 0.0, 0.0);
+            let mut history = [0.0; HISTORY];
+            for i in 0..frames {
+                let t_s = i as f64 / 30.0;
+                let alpha = if t_s < 2.0 * beta_s { top * (-((t_s - beta_s) / sigma_s).powi(2) / 2.0).exp() } else { 0.0 };
+                history.copy_within(1.., 0);
+                history[HISTORY - 1] = alpha;
+                a = flow.tilt(a, flow.delayed(&history, 0));
+                let v = flow.over(a, x, 0.0).v_ml;
+                x += v;
+                film += 0.1 * v;
+                let drip = DRIP * film;
+                film -= drip;
+                let out = 0.9 * v + drip;
+                sum += out;
+                let z: f64 = StandardNormal.sample(&mut rng);
+                let area = (out / CAMERA.0).powf(1.0 / CAMERA.1) * (0.06 * z).exp();
+                e.push(t_s, alpha, f64::NAN, if area < 8.0 { 0.0 } else { area });
+            }
+            e.weight_g = (sum + film).round();
+            e
+        })
+        .collect()
+}

@@ -1,0 +1,194 @@
+//! Tests of the learning, on episodes that the flow model made itself.
+
+mod common;
+
+use common::{CAMERA, episodes, model};
+use rand::SeedableRng;
+use rand_pcg::Pcg64Mcg;
+use shared::agent::{Agent, Frame};
+use shared::estimate::Calibration;
+use shared::estimate::flow::Flow;
+use trainer::consistency;
+use trainer::data::{self, TrainingEpisode};
+use trainer::eq8;
+use trainer::fit;
+use trainer::net::{Adam, Net, Sample};
+use trainer::train::{Estimate, MethodName, Options, Silent, actions_table, discretise, train};
+
+/// Protects the fit: from five noisy episodes it finds the vessel, the delay and the camera that made them.
+#[test]
+fn the_fit_finds_what_made_the_episodes() {
+    let fit = fit::fit(&episodes(5, 1));
+    let (found, made) = (Flow::new(&fit.model), Flow::new(&model()));
+    for (from, to) in [(40.0, 55.0), (50.0, 65.0), (60.0, 75.0)] {
+        let d = |f: &Flow| f.capacity_ml(to) - f.capacity_ml(from);
+        assert!((d(&found) / d(&made) - 1.0).abs() < 0.06, "{from} to {to}: {} {}", d(&found), d(&made));
+    }
+    let lag = |m: &shared::estimate::flow::FlowModel| m.delay + m.tau;
+    assert!((lag(&fit.model) - lag(&model())).abs() < 0.6, "{}", lag(&fit.model));
+    let v = |c: f64, q: f64| c * 300f64.powf(q);
+    let (c, q) = (f64::from(fit.calibration.c), f64::from(fit.calibration.q));
+    assert!((v(c, q) / v(CAMERA.0, CAMERA.1) - 1.0).abs() < 0.05, "{c} {q}");
+}
+
+/// Protects reproducibility: the same seed and data give the same bytes, on one thread and on many; another seed does not.
+#[test]
+fn training_is_deterministic_on_any_number_of_threads() {
+    let data = episodes(4, 2);
+    let run = |threads: usize, seed: u64| {
+        let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
+        let options = Options { seed, ..Options::default() };
+        pool.install(|| train(&data, &options, &Silent).unwrap().weights.to_bytes().unwrap())
+    };
+    let one = run(1, 7);
+    assert_eq!(one, run(3, 7));
+    assert_ne!(one, run(3, 8));
+}
+
+/// Protects the trained policy: poured in the model that made the episodes, it meets its goals.
+#[test]
+fn the_trained_policy_pours() {
+    let trained = train(&episodes(5, 3), &Options::default(), &Silent).unwrap();
+    let flow = Flow::new(&model());
+    for (onset, goal) in [(40.0, 120.0f64), (55.0, 60.0), (65.0, 25.0)] {
+        let mut agent = Agent::new(&trained.weights);
+        agent.start(goal as f32);
+        let (mut a, mut x, mut film, mut poured) = (0.0, flow.capacity_ml(onset), 0.0, 0.0);
+        let mut history = [0.0; shared::estimate::flow::HISTORY];
+        let mut alpha = 0.0f32;
+        let mut finished = false;
+        for _ in 0..900 {
+            history.copy_within(1.., 0);
+            history[history.len() - 1] = f64::from(alpha);
+            a = flow.tilt(a, flow.delayed(&history, 0));
+            let v = flow.over(a, x, 0.0).v_ml;
+            x += v;
+            film += 0.1 * v;
+            let out = 0.9 * v + film / 9.0;
+            film -= film / 9.0;
+            poured += out;
+            let area = (out / CAMERA.0).powf(1.0 / CAMERA.1);
+            let area_px2 = Some(if area < 8.0 { 0.0 } else { area as f32 });
+            let decision = agent.step(Frame { area_px2, alpha_deg: alpha, alpha_now_deg: alpha });
+            finished |= decision.finished;
+            alpha = if finished { (alpha - 2.0).max(0.0) } else { (alpha + decision.dalpha_deg).clamp(0.0, 110.0) };
+        }
+        assert!(finished && (poured - goal).abs() < 0.06 * goal + 1.0, "goal {goal}, poured {poured}, finished {finished}");
+    }
+}
+
+/// Protects section 3.3.1: contribution volumes add up to the weight.
+#[test]
+fn contributions_add_up_to_the_weight() {
+    let e = &episodes(1, 4)[0];
+    for (q, hold_above_px2) in [(1.0, f32::INFINITY), (1.2, 60.0)] {
+        let sum: f64 = eq8::contributions(e, &Calibration { c: 1.0, q, hold_above_px2 }).iter().sum();
+        assert!((sum - e.weight_g).abs() < 1e-6);
+    }
+}
+
+/// Protects eq. (5) and Fig. 5's discretisation, and that two actions are a sign.
+#[test]
+fn rewards_and_actions_are_the_papers() {
+    assert_eq!(eq8::reward(0.0), 1.0);
+    assert!((eq8::reward(10.0) - (-1.0f64).exp()).abs() < 1e-12);
+    assert_eq!(eq8::reward(10.0), eq8::reward(-10.0));
+    let (many, two) = (actions_table(21), actions_table(2));
+    assert_eq!([-9.0, -0.06, 0.0, 0.06, 1.3].map(|a| discretise(&many, 21, a)), [0, 9, 10, 11, 15]);
+    assert_eq!([-2.0, 0.0, 0.3].map(|a| two[usize::from(discretise(&two, 2, a))]), [-1.0, -1.0, 1.0]);
+}
+
+/// Protects eq. (8)'s gradient: Adam's first step goes against the finite differences of weight x cross-entropy.
+#[test]
+fn the_gradient_is_that_of_the_cross_entropy() {
+    let mut rng = Pcg64Mcg::seed_from_u64(5);
+    let net = Net::standard(&mut rng);
+    let samples =
+        [Sample { x: [0.3, 0.2, 0.1, 0.8], action: 13, weight: 0.7 }, Sample { x: [0.0, 0.4, 0.5, -0.3], action: 2, weight: -0.4 }];
+    let loss = |net: &Net| -> f64 {
+        let one = |s: &Sample| {
+            let logits = net.logits(&s.x);
+            let top = logits.iter().copied().fold(f32::MIN, f32::max);
+            let sum: f64 = logits.iter().map(|l| f64::from(l - top).exp()).sum();
+            -f64::from(s.weight) * (f64::from(logits[usize::from(s.action)] - top) - sum.ln())
+        };
+        samples.iter().map(one).sum::<f64>() / 2.0
+    };
+    let before = loss(&net);
+    let mut moved = net.clone();
+    let mut adam = Adam::new(&net);
+    let told = moved.learn(&samples, None, 1e-4, &mut adam);
+    assert!((f64::from(told) - before).abs() < 1e-5, "{told} {before}");
+    // Adam's first step is -rate x sign(gradient): the loss falls by about rate x the sum of the gradient's sizes.
+    assert!(loss(&moved) < before - 1e-4, "{} {before}", loss(&moved));
+}
+
+/// Protects every pour's lesson from a typo: one wrong weight is found, named, and accuses nobody else.
+#[test]
+fn a_wrong_weight_is_found() {
+    let mut data = episodes(8, 6);
+    assert_eq!(consistency::doubtful(&data), []);
+    let k = (0..8).max_by(|a, b| data[*a].weight_g.total_cmp(&data[*b].weight_g)).unwrap();
+    let right = data[k].weight_g;
+    data[k].weight_g += 100.0;
+    let doubts = consistency::doubtful(&data);
+    assert_eq!(doubts.len(), 1, "{doubts:?}");
+    assert_eq!(doubts[0].name, data[k].name);
+    assert!((doubts[0].expected_g - right).abs() < 0.15 * right, "{doubts:?}");
+}
+
+/// Protects the trainer from bad data: each fault is named in words, before any training.
+#[test]
+fn faults_are_named() {
+    let good = episodes(1, 8).remove(0);
+    assert_eq!(good.fault(), None);
+    let cases: [(&str, fn(&mut TrainingEpisode)); 9] = [
+        ("no weight", |e| e.weight_g = f64::NAN),
+        ("not a number >= 0", |e| e.weight_g = -3.0),
+        ("nothing was poured", |e| e.weight_g = 0.0),
+        ("no stream was ever seen", |e| e.area_px2.fill(0.0)),
+        ("unequal lengths", |e| drop(e.alpha_deg.pop())),
+        ("time does not go forward", |e| e.t_s[5] = e.t_s[4]),
+        ("not finite", |e| e.alpha_deg[3] = f64::INFINITY),
+        ("is not a number >= 0", |e| e.area_px2[9] = -1.0),
+        ("at least 30", |e| *e = TrainingEpisode::empty("x", 30.0)),
+    ];
+    for (words, spoil) in cases {
+        let mut bad = good.clone();
+        spoil(&mut bad);
+        let fault = bad.fault().unwrap_or_default();
+        assert!(fault.contains(words), "{words}: {fault}");
+    }
+    assert!(train(&[], &Options::default(), &Silent).unwrap_err().to_string().contains("record more"));
+}
+
+/// Protects every method's contract: it trains, its weights pass the file's own checks, and 2 actions use only 2.
+#[test]
+fn every_method_gives_valid_weights() {
+    let data = episodes(2, 9);
+    for method in [MethodName::Literal, MethodName::LiteralClipped, MethodName::Paper, MethodName::Cloning] {
+        for actions in [2, 21] {
+            let options = Options { method, actions, estimate: Estimate::Sum, ..Options::default() };
+            let weights = train(&data, &options, &Silent).unwrap().weights;
+            let back = shared::weights::Weights::from_bytes(&weights.to_bytes().unwrap(), "w").unwrap();
+            assert_eq!(back, weights);
+            if actions == 2 {
+                let mut agent = Agent::new(&weights);
+                agent.start(50.0);
+                let decision = agent.step(Frame { area_px2: Some(0.0), alpha_deg: 0.0, alpha_now_deg: 0.0 });
+                assert_eq!(decision.dalpha_deg.abs(), 1.0, "{method:?}");
+            }
+        }
+    }
+}
+
+/// Protects the data's identity: any change of a column or weight changes the hash, a new name does not.
+#[test]
+fn the_hash_is_of_the_data() {
+    let data = episodes(2, 10);
+    let mut other = data.clone();
+    other[1].name = "renamed".into();
+    assert_eq!(data::hash(&data), data::hash(&other));
+    other[1].weight_g += 1.0;
+    assert_ne!(data::hash(&data), data::hash(&other));
+}
