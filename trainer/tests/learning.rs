@@ -142,12 +142,13 @@ fn a_wrong_weight_is_found() {
 fn faults_are_named() {
     let good = episodes(1, 8).remove(0);
     assert_eq!(good.fault(), None);
-    let cases: [(&str, fn(&mut TrainingEpisode)); 9] = [
+    type Case = (&'static str, fn(&mut TrainingEpisode));
+    let cases: [Case; 9] = [
         ("no weight", |e| e.weight_g = f64::NAN),
         ("not a number >= 0", |e| e.weight_g = -3.0),
         ("nothing was poured", |e| e.weight_g = 0.0),
         ("no stream was ever seen", |e| e.area_px2.fill(0.0)),
-        ("unequal lengths", |e| drop(e.alpha_deg.pop())),
+        ("unequal lengths", |e| _ = e.alpha_deg.pop()),
         ("time does not go forward", |e| e.t_s[5] = e.t_s[4]),
         ("not finite", |e| e.alpha_deg[3] = f64::INFINITY),
         ("is not a number >= 0", |e| e.area_px2[9] = -1.0),

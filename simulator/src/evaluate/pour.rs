@@ -97,14 +97,7 @@ fn settings(limits: Limits) -> Settings {
 }
 
 /// Pours `goal_ml` with the running controller's core and `agent`; the frames are added to `trace` if there is one.
-pub fn by_core(
-    agent: &Agent,
-    world: &mut World,
-    limits: Limits,
-    init_ml: f64,
-    goal_ml: f64,
-    mut trace: Option<&mut TrainingEpisode>,
-) -> Poured {
+pub fn by_core(agent: &Agent, world: &mut World, limits: Limits, init_ml: f64, goal_ml: f64, mut trace: Option<&mut Trace>) -> Poured {
     let mut core = Core::new(settings(limits));
     core.exchange(Box::new(agent.clone()));
     let mut alpha_deg = 0.0f32;
