@@ -81,6 +81,7 @@ impl Cell {
         config.cell.name = format!("fault-{name}");
         config.robot.address = address;
         config.controller.weights = directory.path().join("weights.bin");
+        config.controller.journal = None;
         config.simulator = None;
         std::fs::write(directory.path().join("cell.toml"), toml::to_string(&config).unwrap()).unwrap();
         tilt_until_it_flows().write(&config.controller.weights).unwrap();
