@@ -116,7 +116,7 @@ pub struct CameraConfig {
 pub enum LiquidMethod {
     /// By its colour (`[image] colour`).
     Colour,
-    /// Clear water: by edges, texture and change.
+    /// Clear water, by edges: an experiment that is not fit for pouring yet (docs/VISION.md).
     Clear,
 }
 
