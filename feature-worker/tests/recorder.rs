@@ -54,7 +54,7 @@ struct Cleanup(String);
 
 impl Drop for Cleanup {
     fn drop(&mut self) {
-        remove_cell(&self.0);
+        shared::ipc::remove_files(&self.0);
     }
 }
 
@@ -370,16 +370,6 @@ fn child() {
     }
 }
 
-/// Removes what a killed process left in shared memory.
-fn remove_cell(cell: &str) {
-    for entry in std::fs::read_dir("/dev/shm").unwrap().flatten() {
-        if entry.file_name().to_string_lossy().starts_with(&format!("decant_{cell}_")) {
-            let _ = std::fs::remove_file(entry.path());
-        }
-    }
-    let _ = std::fs::remove_dir_all(format!("/tmp/decant_{cell}"));
-}
-
 /// Protects recordings from the out-of-memory killer, a pulled plug and an impatient person: what was written reads, and
 /// says that it is not all.
 #[test]
@@ -395,7 +385,7 @@ fn a_killed_recorder_leaves_a_file_that_reads_and_says_so() {
     }
     child.kill().unwrap();
     child.wait().unwrap();
-    remove_cell(&cell);
+    shared::ipc::remove_files(&cell);
     let episode = Episode::read(&file).unwrap();
     assert!(!episode.complete);
     assert_eq!(episode.info.ended, "");
@@ -411,7 +401,7 @@ fn a_full_disk_is_reported_and_what_fits_is_kept() {
     let cell = format!("full-{}", std::process::id());
     // Largest file 8192 * 512 bytes (the shared memory must fit too), and no signal for it: writing fails as on a full disk.
     let status = start_child("trap '' XFSZ; ulimit -f 8192;", &cell, dir.path()).wait().unwrap();
-    remove_cell(&cell);
+    shared::ipc::remove_files(&cell);
     assert!(status.success());
     let failed = std::fs::read_to_string(dir.path().join("failed.txt")).unwrap();
     assert!(failed.contains("episode-0001.mcap") && failed.contains("check free space"), "{failed}");

@@ -132,10 +132,8 @@ pub fn run(settings: Settings, place: Place, lost_ns: u64, features: &Features, 
             exchange.skipped_ticks.fetch_add(1, Relaxed);
         }
     }
-    if let Some(mut session) = session {
-        // Upright already: this only ends the robot's program at once instead of after its patience.
-        let _ = session.send(Mode::Stop, 0.0);
-    }
+    // Upright already: the session's end only stops the robot's program at once instead of after its patience.
+    drop(session);
     exchange.ended.store(true, Relaxed);
 }
 

@@ -4,6 +4,8 @@
 //! meet. The layouts' version is part of each service's name. Opening allocates; receiving and sending a loan do not.
 //! All processes of a cell run under one user, because the shared memory is private to it.
 
+use std::path::PathBuf;
+
 use iceoryx2::node::NodeBuilder;
 use iceoryx2::port::listener::Listener;
 use iceoryx2::port::notifier::Notifier;
@@ -50,6 +52,23 @@ pub type FrameListener = Listener<Ipc>;
 /// Tells the feature worker that a frame is there.
 pub type FrameNotifier = Notifier<Ipc>;
 
+/// Directory of the cell `name` for what is not shared memory.
+pub fn directory(name: &str) -> PathBuf {
+    PathBuf::from(format!("/tmp/decant_{name}"))
+}
+
+/// Removes every file of the cell `name`, also what a killed process left. For whoever started the cell, when all of its
+/// processes have ended; a cell that still runs would be torn apart. What cannot be removed stays.
+pub fn remove_files(name: &str) {
+    let prefix = format!("decant_{name}_");
+    for entry in std::fs::read_dir("/dev/shm").into_iter().flatten().flatten() {
+        if entry.file_name().to_string_lossy().starts_with(&prefix) {
+            let _ = std::fs::remove_file(entry.path());
+        }
+    }
+    let _ = std::fs::remove_dir_all(directory(name));
+}
+
 /// One cell's services.
 pub struct Cell {
     node: CellNode,
@@ -66,7 +85,7 @@ impl Cell {
         let fail = |what: String| IpcError::Node { cell: name.into(), what };
         let mut config = Config::default();
         config.global.prefix = FileName::new(format!("decant_{name}_").as_bytes()).map_err(|e| fail(format!("{e:?}")))?;
-        let root = Path::new(format!("/tmp/decant_{name}").as_bytes()).map_err(|e| fail(format!("{e:?}")))?;
+        let root = Path::new(directory(name).as_os_str().as_encoded_bytes()).map_err(|e| fail(format!("{e:?}")))?;
         config.global.set_root_path(&root);
         // Each program handles its own signals; iceoryx2 shall not end a wait for good because of one.
         let node = NodeBuilder::new()

@@ -117,7 +117,7 @@ impl SimulatorConfig {
 
 /// Path of the operator's socket of the cell `name`.
 pub fn operator_socket(name: &str) -> PathBuf {
-    PathBuf::from(format!("/tmp/decant_{name}/operator"))
+    shared::ipc::directory(name).join("operator")
 }
 
 /// What the threads share.

@@ -400,13 +400,7 @@ struct Cleanup(String);
 
 impl Drop for Cleanup {
     fn drop(&mut self) {
-        let prefix = format!("decant_{}_", self.0);
-        for entry in std::fs::read_dir("/dev/shm").into_iter().flatten().flatten() {
-            if entry.file_name().to_string_lossy().starts_with(&prefix) {
-                let _ = std::fs::remove_file(entry.path());
-            }
-        }
-        let _ = std::fs::remove_dir_all(format!("/tmp/decant_{}", self.0));
+        shared::ipc::remove_files(&self.0);
     }
 }
 

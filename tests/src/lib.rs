@@ -210,11 +210,6 @@ impl Drop for CellUnderTest {
                 std::thread::sleep(Duration::from_millis(10));
             }
         }
-        let _ = std::fs::remove_dir_all(format!("/tmp/decant_{}", self.name));
-        for entry in std::fs::read_dir("/dev/shm").into_iter().flatten().flatten() {
-            if entry.file_name().to_string_lossy().starts_with(&format!("decant_{}_", self.name)) {
-                let _ = std::fs::remove_file(entry.path());
-            }
-        }
+        shared::ipc::remove_files(&self.name);
     }
 }

@@ -296,6 +296,7 @@ impl Drop for Cell {
         if let Some(liquid) = self.liquid.take() {
             let _ = liquid.join();
         }
+        ipc::remove_files(&self.name);
         println!("{HEAD}\n{}", self.table);
     }
 }
