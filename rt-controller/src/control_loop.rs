@@ -6,6 +6,7 @@
 
 use std::sync::atomic::Ordering::Relaxed;
 
+use iceoryx2::port::update_connections::UpdateConnections;
 use shared::messages::{Feature, Phase};
 use shared::os;
 
@@ -13,8 +14,9 @@ use shared::control::EndReason;
 
 use crate::core::{Core, Input, MAX_FEATURES, Order, Robot, Settings};
 use crate::exchange::{Event, Exchange, SessionEnd};
-use crate::journal::Tick;
+use crate::journal::{Tick, Times};
 use crate::link::{Mode, Session, health};
+use crate::pacing::Pacer;
 
 /// Receives features from shared memory.
 pub type Features = iceoryx2::port::subscriber::Subscriber<iceoryx2::service::ipc::Service, Feature, ()>;
@@ -32,57 +34,113 @@ pub struct Place {
 ///
 /// `lost_ns` is how long the robot may be silent (`controller.lost_robot_ms`). `say` gets what the operating system did not permit, before the loop starts.
 pub fn run(settings: Settings, place: Place, lost_ns: u64, features: &Features, exchange: &Exchange, say: &dyn Fn(&str)) {
-    let mut core = Box::new(Core::new(settings));
-    let mut fresh: heapless::Vec<Feature, MAX_FEATURES> = heapless::Vec::new();
-    let mut session: Option<Box<Session>> = None;
-    let period_ns = settings.period_ns;
     for line in os::become_realtime(place.core, place.priority) {
         say(&line);
     }
-
-    let mut shutdown = false;
-    let (allocations_before, faults_before) = (os::allocations(), os::page_faults());
-    let mut deadline_ns = os::now_ns() + period_ns;
+    let mut ticks = Ticks::new(settings, lost_ns, features, exchange);
+    let mut deadline_ns = os::now_ns() + settings.period_ns;
     loop {
         os::sleep_until_ns(deadline_ns);
+        if ticks.tick(deadline_ns) == Next::Ended {
+            break;
+        }
+        ticks.meet_feature_worker();
+        let (next_ns, skipped) = ticks.pacer.next_deadline_ns(deadline_ns, os::now_ns());
+        exchange.skipped_ticks.fetch_add(skipped, Relaxed);
+        deadline_ns = next_ns;
+    }
+    // Upright already: the session's end only stops the robot's program at once instead of after its patience.
+    drop(ticks);
+    exchange.ended.store(true, Relaxed);
+}
+
+/// Whether there is another tick.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Next {
+    /// There is.
+    Tick,
+    /// The shutdown was obeyed and the container is upright.
+    Ended,
+}
+
+/// What the loop keeps from tick to tick.
+pub struct Ticks<'a> {
+    core: Box<Core>,
+    fresh: heapless::Vec<Feature, MAX_FEATURES>,
+    session: Option<Box<Session>>,
+    features: &'a Features,
+    exchange: &'a Exchange,
+    pacer: Pacer,
+    period_ns: u64,
+    lost_ns: u64,
+    shutdown: bool,
+    /// Allocations and page faults of this thread that no tick made.
+    elsewhere: (u64, u64),
+}
+
+impl<'a> Ticks<'a> {
+    /// Allocates all that the ticks use; call in the thread that makes them.
+    pub fn new(settings: Settings, lost_ns: u64, features: &'a Features, exchange: &'a Exchange) -> Self {
+        Self {
+            core: Box::new(Core::new(settings)),
+            fresh: heapless::Vec::new(),
+            session: None,
+            features,
+            exchange,
+            pacer: Pacer::new(settings.period_ns),
+            period_ns: settings.period_ns,
+            lost_ns,
+            shutdown: false,
+            elsewhere: spent(),
+        }
+    }
+
+    /// One tick, just after waking up for `deadline_ns`.
+    pub fn tick(&mut self, deadline_ns: u64) -> Next {
+        let exchange = self.exchange;
         let woke_ns = os::now_ns();
         let lateness_ns = woke_ns.saturating_sub(deadline_ns);
         exchange.timing.lateness.record(lateness_ns);
-        if lateness_ns > period_ns / 2 {
+        if lateness_ns > self.period_ns / 2 {
             exchange.late_ticks.fetch_add(1, Relaxed);
         }
 
-        fresh.clear();
+        self.fresh.clear();
         // Older ones than fit would be stale; `receive` gives the oldest first.
-        while let Ok(Some(sample)) = features.receive() {
-            if fresh.is_full() {
-                fresh.remove(0);
+        while let Ok(Some(sample)) = self.features.receive() {
+            if self.fresh.is_full() {
+                self.fresh.remove(0);
             }
-            let _ = fresh.push(*sample);
+            let _ = self.fresh.push(*sample);
         }
         let mut taken = None;
-        if core.may_exchange()
+        if self.core.may_exchange()
             && !exchange.old_agents.is_full()
             && let Some((number, agent)) = exchange.agents.pop()
         {
             taken = Some(number);
             exchange.agents_taken.fetch_add(1, Relaxed);
-            if let Some(old) = core.exchange(agent) {
+            if let Some(old) = self.core.exchange(agent) {
                 let _ = exchange.old_agents.push(old);
             }
         }
-        if session.is_none() {
-            session = exchange.sessions.pop();
+        if self.session.is_none() {
+            self.session = exchange.sessions.pop();
         }
-        let (robot, mut end) = look(session.as_deref_mut(), woke_ns, lost_ns);
+        let (robot, mut end) = look(self.session.as_deref_mut(), woke_ns, self.lost_ns);
         let order = exchange.orders.pop();
-        shutdown |= order == Some(Order::Shutdown);
+        self.shutdown |= order == Some(Order::Shutdown);
 
-        let output = core.step(&Input { now_ns: woke_ns, features: &fresh, robot, order });
-        if let (Some(session), Some(target_deg)) = (session.as_mut(), output.target_deg) {
+        let output = self.core.step(&Input { now_ns: woke_ns, features: &self.fresh, robot, order });
+        let mut written_at_ns = 0;
+        if let (Some(session), Some(target_deg)) = (self.session.as_mut(), output.target_deg) {
             end = session.send(Mode::Stream, target_deg).err().map(SessionEnd::Lost).or(end);
-            if let Some(newest) = fresh.last() {
-                exchange.timing.wake_to_written.record(os::now_ns().saturating_sub(woke_ns));
+            written_at_ns = os::now_ns();
+        }
+        if let Some(newest) = self.fresh.last() {
+            self.pacer.used(woke_ns, newest.published_at_ns);
+            if written_at_ns != 0 {
+                exchange.timing.wake_to_written.record(written_at_ns.saturating_sub(woke_ns));
                 exchange.timing.feature_age.record(woke_ns.saturating_sub(newest.captured_at_ns));
                 exchange.timing.feature_wait.record(woke_ns.saturating_sub(newest.published_at_ns));
             }
@@ -90,7 +148,7 @@ pub fn run(settings: Settings, place: Place, lost_ns: u64, features: &Features, 
         // A robot that may not move any more is never taken back as it is: it is handed over, and connected anew when it is well.
         if let Some(end) = end
             && !exchange.old_sessions.is_full()
-            && let Some(dead) = session.take()
+            && let Some(dead) = self.session.take()
         {
             let _ = exchange.old_sessions.push((dead, end));
         }
@@ -106,35 +164,45 @@ pub fn run(settings: Settings, place: Place, lost_ns: u64, features: &Features, 
         if let Some(outcome) = output.ended {
             tell(Event::Ended(outcome));
         }
+        let (allocations, faults) = spent();
+        exchange.loop_allocations.store(allocations - self.elsewhere.0, Relaxed);
+        exchange.loop_page_faults.store(faults - self.elsewhere.1, Relaxed);
+        let done_ns = os::now_ns();
+        exchange.timing.execution.record(done_ns.saturating_sub(woke_ns));
         let telemetry = output.telemetry;
         let tick = Tick {
             now_ns: woke_ns,
-            features: fresh.clone(),
+            features: self.fresh.clone(),
             robot,
             order,
             agent: taken,
             target_deg: output.target_deg,
             d_ml: telemetry.d_ml,
+            times: Times { deadline_ns, written_at_ns, done_ns },
         };
-        tell(Event::Tick(tick, telemetry, core.counters()));
+        tell(Event::Tick(tick, telemetry, self.core.counters()));
+        let upright = matches!(self.core.phase(), Phase::Idle | Phase::NoRobot);
+        if self.shutdown && upright { Next::Ended } else { Next::Tick }
+    }
 
-        exchange.loop_allocations.store(os::allocations() - allocations_before, Relaxed);
-        let faults = os::page_faults();
-        exchange.loop_page_faults.store(faults.0 + faults.1 - faults_before.0 - faults_before.1, Relaxed);
-        let done_ns = os::now_ns();
-        exchange.timing.execution.record(done_ns.saturating_sub(woke_ns));
-        if shutdown && matches!(core.phase(), Phase::Idle | Phase::NoRobot) {
-            break;
-        }
-        deadline_ns += period_ns;
-        while deadline_ns <= done_ns {
-            deadline_ns += period_ns;
-            exchange.skipped_ticks.fetch_add(1, Relaxed);
+    /// Opens the shared memory of a feature worker that has come (again): iceoryx2 allocates for it, so it is done between the
+    /// ticks, and not during a pour. A worker that comes during a pour is met by that tick; the pour ends stale anyway.
+    pub fn meet_feature_worker(&mut self) {
+        if self.core.may_exchange() {
+            let before = spent();
+            // What fails here fails in `receive` too, and shows as stale features.
+            let _ = self.features.update_connections();
+            let after = spent();
+            self.elsewhere.0 += after.0 - before.0;
+            self.elsewhere.1 += after.1 - before.1;
         }
     }
-    // Upright already: the session's end only stops the robot's program at once instead of after its patience.
-    drop(session);
-    exchange.ended.store(true, Relaxed);
+}
+
+/// Allocations and page faults of this thread since it started.
+fn spent() -> (u64, u64) {
+    let (minor, major) = os::page_faults();
+    (os::allocations(), minor + major)
 }
 
 /// The robot as the core sees it, and why its session is over, if it is.

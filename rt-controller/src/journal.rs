@@ -1,7 +1,7 @@
 //! The journal: every tick's inputs and answer, so that a run can be replayed bit for bit.
 //!
 //! The loop hands each [`Tick`] to the ordinary thread through a queue; there it is written ([`Writer`]). Reading and replaying
-//! are for commands and tests. A file that was cut off reads up to its last whole entry. Layout: the 8 bytes `decantj1`, then
+//! are for commands and tests. A file that was cut off reads up to its last whole entry. Layout: the 8 bytes `decantj2`, then
 //! entries, each a little-endian u32 length and that many bytes of postcard.
 
 use std::fs::File;
@@ -16,7 +16,7 @@ use shared::weights::Weights;
 use crate::core::{Core, Input, MAX_FEATURES, Order, Robot, Settings};
 
 /// First bytes of a journal, its version included.
-const MAGIC: &[u8; 8] = b"decantj1";
+const MAGIC: &[u8; 8] = b"decantj2";
 /// Longest entry, bytes: a weight file and some.
 const ENTRY_MAX: usize = 128 * 1024;
 /// A journal stops growing here: about three days.
@@ -39,6 +39,19 @@ pub struct Tick {
     pub target_deg: Option<f32>,
     /// d after the tick, ml.
     pub d_ml: f32,
+    /// When what happened; measured, so not replayed.
+    pub times: Times,
+}
+
+/// The times of a tick besides its wake-up, CLOCK_MONOTONIC ns.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+pub struct Times {
+    /// When it was to wake up.
+    pub deadline_ns: u64,
+    /// When the target's bytes were with the kernel; 0: none were.
+    pub written_at_ns: u64,
+    /// When all was done but the telling.
+    pub done_ns: u64,
 }
 
 /// One entry of the file.

@@ -5,6 +5,7 @@
 //! | [`core`] | what decides: a pure step | the loop's, and evaluation's |
 //! | [`control_loop`] | the 30 Hz loop | real-time |
 //! | [`exchange`] | queues between the loop and the rest | all |
+//! | [`pacing`] | when the next tick is due | the loop's |
 //! | [`timing`] | the loop's histograms | all |
 //! | [`journal`] | every tick's inputs, and their replay | ordinary |
 //! | [`link`] | RTDE client and the robot's program | connects in an ordinary thread, then the loop's |
@@ -20,6 +21,7 @@ pub mod core;
 pub mod exchange;
 pub mod journal;
 pub mod link;
+pub mod pacing;
 pub mod pour;
 pub mod record;
 pub mod replay;

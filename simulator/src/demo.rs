@@ -1,22 +1,19 @@
 //! `simulator demo`: the main job, end to end, with the real processes: record, train, swap the weights, pour, report.
 //!
-//! An ordinary process that does what an operator does: it starts the cell's processes, gives orders by their command lines,
-//! fills the container, and reads the scale. It takes no decision of the controller. Ctrl-C, an error or the end: every process
-//! that it started is stopped and the cell's shared memory is removed.
+//! An ordinary process that does what an operator does, in a cell of its own ([`crate::own_cell`]).
 
-use std::path::{Path, PathBuf};
-use std::process::{Child, Command, ExitCode, Stdio};
+use std::path::PathBuf;
+use std::process::{Command, ExitCode};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
-use rt_controller::client::Client;
 use serde_json::{Value, json};
-use shared::config::Config;
 use shared::exit;
 use shared::ipc::Cell;
-use shared::messages::{Phase, Telemetry};
+use shared::messages::Telemetry;
 
+use crate::own_cell::{OwnCell, OwnCellError};
 use crate::pour_plot;
 
 /// What the operator records: millilitres filled in, and the curve's height (degrees) and width (1/s^2).
@@ -49,23 +46,6 @@ pub struct Args {
     json: bool,
 }
 
-/// Why the demo stopped.
-#[derive(Debug, thiserror::Error)]
-enum DemoError {
-    #[error("interrupted")]
-    Interrupted,
-    #[error("{0}")]
-    Config(String),
-    #[error("{what}: {error}")]
-    File { what: String, error: std::io::Error },
-    #[error("{what} failed ({code}); {hint}")]
-    Step { what: String, code: String, hint: String },
-    #[error("{what} did not happen within {seconds} s: {why}; see the logs in {logs}")]
-    Late { what: String, seconds: u64, why: String, logs: String },
-    #[error("{0}")]
-    Other(String),
-}
-
 /// Runs the command; the exit codes are those of [`shared::exit`].
 pub fn run(args: &Args) -> ExitCode {
     let stop = Arc::new(AtomicBool::new(false));
@@ -74,7 +54,11 @@ pub fn run(args: &Args) -> ExitCode {
             return exit::fail(exit::FAILED, e);
         }
     }
-    match Demo::prepare(args, stop).and_then(|mut demo| demo.perform()) {
+    for old in ["episodes", "summary.json"] {
+        let old = args.out.join(old);
+        let _ = if old.is_dir() { std::fs::remove_dir_all(old) } else { std::fs::remove_file(old) };
+    }
+    match OwnCell::prepare("demo", &args.config, &args.out, args.seed, stop).and_then(|mut cell| perform(args, &mut cell)) {
         Ok(summary) => {
             let far: Vec<String> =
                 (1..).zip(&summary.pours).filter(|(_, p)| p.error_ml.abs() > TOLERANCE_ML).map(|(i, _)| i.to_string()).collect();
@@ -88,9 +72,7 @@ pub fn run(args: &Args) -> ExitCode {
             }
             exit::fail(exit::FAILED, format!("pour {} is further than {TOLERANCE_ML} ml from its goal", far.join(" and ")))
         }
-        Err(DemoError::Interrupted) => exit::fail(exit::INTERRUPTED, "interrupted; every process that was started is stopped"),
-        Err(e @ DemoError::Config(_)) => exit::fail(exit::BAD_INPUT, e),
-        Err(e) => exit::fail(exit::FAILED, e),
+        Err(e) => e.exit(),
     }
 }
 
@@ -145,8 +127,8 @@ impl Summary {
                 p.poured_ml,
                 p.error_ml,
                 p.outcome["seconds"].as_f64().unwrap_or(f64::NAN),
-                p.outcome["late_ticks"],
-                p.outcome["stale_features"]
+                p.outcome["late_ticks"].to_string(),
+                p.outcome["stale_features"].to_string()
             );
         }
         println!(
@@ -157,251 +139,69 @@ impl Summary {
     }
 }
 
-/// The cell's processes; dropped: stopped in order and waited for.
-struct Processes(Vec<(String, Child)>);
+/// Records, trains, pours; writes summary.json.
+fn perform(args: &Args, cell: &mut OwnCell) -> Result<Summary, OwnCellError> {
+    cell.note("starting the simulated cell, the feature worker and the controller");
+    let client = cell.start()?;
 
-impl Processes {
-    fn dead(&mut self) -> Option<String> {
-        self.0.iter_mut().find_map(|(name, child)| match child.try_wait() {
-            Ok(None) => None,
-            Ok(Some(status)) => Some(format!("{name} ended ({status})")),
-            Err(e) => Some(format!("{name}: {e}")),
-        })
-    }
-}
-
-impl Drop for Processes {
-    fn drop(&mut self) {
-        // The controller first: it brings the container upright while the robot is still there.
-        for (_, child) in self.0.iter_mut().rev() {
-            let pid = rustix::process::Pid::from_child(child);
-            let _ = rustix::process::kill_process(pid, rustix::process::Signal::TERM);
-            let until = Instant::now() + Duration::from_secs(5);
-            while matches!(child.try_wait(), Ok(None)) {
-                if Instant::now() > until {
-                    let _ = child.kill();
-                }
-                std::thread::sleep(Duration::from_millis(20));
-            }
-        }
-    }
-}
-
-struct Demo<'a> {
-    args: &'a Args,
-    stop: Arc<AtomicBool>,
-    config_file: PathBuf,
-    config: Config,
-    bin: PathBuf,
-    started: Instant,
-}
-
-impl<'a> Demo<'a> {
-    /// Makes the output directory and the demo's own configuration.
-    fn prepare(args: &'a Args, stop: Arc<AtomicBool>) -> Result<Self, DemoError> {
-        let text =
-            std::fs::read_to_string(&args.config).map_err(|error| DemoError::File { what: args.config.display().to_string(), error })?;
-        Config::parse(&text, &args.config.display().to_string()).map_err(|e| DemoError::Config(e.to_string()))?;
-        let mut table: toml::Table = text.parse().map_err(|e| DemoError::Config(format!("{}: {e}", args.config.display())))?;
-        let out = &args.out;
-        for old in ["episodes", "logs"] {
-            let _ = std::fs::remove_dir_all(out.join(old));
-        }
-        for old in ["weights.bin", "summary.json", "sim.toml"] {
-            let _ = std::fs::remove_file(out.join(old));
-        }
-        std::fs::create_dir_all(out.join("logs")).map_err(|error| DemoError::File { what: out.display().to_string(), error })?;
-        let mut set = |section: &str, key: &str, value: toml::Value| {
-            if let Some(toml::Value::Table(t)) = table.get_mut(section) {
-                t.insert(key.into(), value);
-            }
-        };
-        let text = |path: &Path| toml::Value::String(path.display().to_string());
-        // A name and an address of its own, so that a cell that is already running is left alone.
-        let number = std::process::id();
-        set("cell", "name", toml::Value::String(format!("demo-{number}")));
-        set(
-            "robot",
-            "address",
-            toml::Value::String(format!("127.{}.{}.{}", 1 + number / 65_536 % 250, number / 256 % 256, 1 + number % 254)),
-        );
-        set("controller", "weights", text(&out.join("weights.bin")));
-        set("controller", "journal", text(&out.join("journal.bin")));
-        set("recording", "directory", text(&out.join("episodes")));
-        set("simulator", "seed", toml::Value::Integer(args.seed as i64));
-        let config_file = out.join("sim.toml");
-        let text = toml::to_string_pretty(&table).map_err(|e| DemoError::Config(e.to_string()))?;
-        std::fs::write(&config_file, &text).map_err(|error| DemoError::File { what: config_file.display().to_string(), error })?;
-        let config = Config::parse(&text, &config_file.display().to_string()).map_err(|e| DemoError::Config(e.to_string()))?;
-        let exe = std::env::current_exe().map_err(|error| DemoError::File { what: "own program".into(), error })?;
-        let bin = exe.parent().unwrap_or(Path::new(".")).to_path_buf();
-        Ok(Self { args, stop, config_file, config, bin, started: Instant::now() })
+    let mut episodes = Vec::new();
+    for (i, (fill_ml, lambda_deg, gamma)) in EPISODES.into_iter().enumerate() {
+        cell.note(&format!("episode {} of {}: {fill_ml} ml, lambda {lambda_deg} degrees, gamma {gamma}/s^2", i + 1, EPISODES.len()));
+        cell.command("simulator", &["operator", "fill", &fill_ml.to_string()])?;
+        let recorded =
+            cell.command("rt-controller", &["record", "--json", "--lambda", &lambda_deg.to_string(), "--gamma", &gamma.to_string()])?;
+        let weight_g = cell.scale()?;
+        let file = recorded["episode_file"].as_str().unwrap_or_default().to_string();
+        cell.command("feature-worker", &["episodes", "weigh", &file, "--weight", &weight_g.to_string()])?;
+        cell.note(&format!("  weighed {weight_g} g"));
+        episodes.push(json!({ "file": file, "weight_g": weight_g, "v_init_ml": fill_ml }));
     }
 
-    fn perform(&mut self) -> Result<Summary, DemoError> {
-        let cleanup = Cleanup(self.config.cell.name.clone());
-        let result = self.perform_with_processes();
-        drop(cleanup);
-        let summary = result?;
-        let file = self.args.out.join("summary.json");
-        std::fs::write(&file, summary.json() + "\n").map_err(|error| DemoError::File { what: file.display().to_string(), error })?;
-        Ok(summary)
+    cell.note("training from the episodes");
+    let weights = args.out.join("weights.bin");
+    let before = client.status().map_err(|e| OwnCellError::Other(e.to_string()))?.weights_taken;
+    let log = args.out.join("logs/trainer.log");
+    let output = Command::new(cell.bin.join("trainer"))
+        .arg("train")
+        .arg(&cell.config.recording.directory)
+        .args(["--seed", &args.seed.to_string(), "--out"])
+        .arg(&weights)
+        .output()
+        .map_err(|error| OwnCellError::File { what: "trainer".into(), error })?;
+    let _ = std::fs::write(&log, [output.stdout.as_slice(), output.stderr.as_slice()].concat());
+    cell.succeeded("trainer train", output.status, &String::from_utf8_lossy(&output.stderr))?;
+    let taken = cell.until("the weight swap", 10, || match client.status() {
+        Ok(s) if s.weights_taken > before => Ok(s.weights.clone()),
+        Ok(s) => Err(s.weights_refused.clone()),
+        Err(e) => Err(e.to_string()),
+    })?;
+    cell.note(&format!("the running controller took weights {taken}"));
+
+    let mut pours = Vec::new();
+    for (i, (fill_ml, goal_ml)) in POURS.into_iter().enumerate() {
+        cell.note(&format!("pour {} of {}: {goal_ml} ml from {fill_ml} ml", i + 1, POURS.len()));
+        cell.command("simulator", &["operator", "fill", &fill_ml.to_string()])?;
+        let listener = Listener::start(&cell.config.cell.name)?;
+        let result = cell.command("rt-controller", &["pour", "--json", &goal_ml.to_string()])?;
+        let ticks = listener.finish();
+        let poured_ml = cell.scale()?;
+        let plot = args.out.join(format!("pour-{}-{goal_ml:.0}ml.svg", i + 1));
+        pour_plot::draw(&plot, &ticks, goal_ml, poured_ml).map_err(|e| OwnCellError::Other(format!("{}: {e}", plot.display())))?;
+        cell.note(&format!("  poured {poured_ml} g on the scale"));
+        pours.push(Pour {
+            filled_ml: fill_ml,
+            goal_ml,
+            poured_ml,
+            error_ml: poured_ml - f64::from(goal_ml),
+            outcome: result["outcome"].clone(),
+            episode_file: result["episode_file"].clone(),
+            plot,
+        });
     }
-
-    fn perform_with_processes(&mut self) -> Result<Summary, DemoError> {
-        let mut processes = Processes(Vec::new());
-        self.note("starting the simulated cell, the feature worker and the controller");
-        for name in ["simulator", "feature-worker", "rt-controller"] {
-            processes.0.push((name.into(), self.spawn(name)?));
-        }
-        let client = self.until("the cell", 20, &mut processes, |me| Client::connect(&me.config.cell.name).map_err(|e| e.to_string()))?;
-        self.until("readiness of robot and camera", 30, &mut processes, |_| match client.status() {
-            Ok(s) if s.phase == Phase::Idle && s.feature_sequence > 0 => Ok(()),
-            Ok(s) if s.feature_sequence == 0 => Err("no camera frames".into()),
-            Ok(s) => Err(s.hindrance.clone()),
-            Err(e) => Err(e.to_string()),
-        })?;
-
-        let mut episodes = Vec::new();
-        for (i, (fill_ml, lambda_deg, gamma)) in EPISODES.into_iter().enumerate() {
-            self.note(&format!("episode {} of {}: {fill_ml} ml, lambda {lambda_deg} degrees, gamma {gamma}/s^2", i + 1, EPISODES.len()));
-            self.command("simulator", &["operator", "fill", &fill_ml.to_string()])?;
-            let recorded =
-                self.command("rt-controller", &["record", "--json", "--lambda", &lambda_deg.to_string(), "--gamma", &gamma.to_string()])?;
-            let weight_g = self.scale()?;
-            let file = recorded["episode_file"].as_str().unwrap_or_default().to_string();
-            self.command("feature-worker", &["episodes", "weigh", &file, "--weight", &weight_g.to_string()])?;
-            self.note(&format!("  weighed {weight_g} g"));
-            episodes.push(json!({ "file": file, "weight_g": weight_g, "v_init_ml": fill_ml }));
-        }
-
-        self.note("training from the episodes");
-        let weights = self.args.out.join("weights.bin");
-        let before = client.status().map_err(|e| DemoError::Other(e.to_string()))?.weights_taken;
-        let log = self.args.out.join("logs/trainer.log");
-        let output = Command::new(self.bin.join("trainer"))
-            .arg("train")
-            .arg(&self.config.recording.directory)
-            .args(["--seed", &self.args.seed.to_string(), "--out"])
-            .arg(&weights)
-            .output()
-            .map_err(|error| DemoError::File { what: "trainer".into(), error })?;
-        let _ = std::fs::write(&log, [output.stdout.as_slice(), output.stderr.as_slice()].concat());
-        self.succeeded("trainer train", output.status, &String::from_utf8_lossy(&output.stderr))?;
-        let taken = self.until("the weight swap", 10, &mut processes, |_| match client.status() {
-            Ok(s) if s.weights_taken > before => Ok(s.weights.clone()),
-            Ok(s) => Err(s.weights_refused.clone()),
-            Err(e) => Err(e.to_string()),
-        })?;
-        self.note(&format!("the running controller took weights {taken}"));
-
-        let mut pours = Vec::new();
-        for (i, (fill_ml, goal_ml)) in POURS.into_iter().enumerate() {
-            self.note(&format!("pour {} of {}: {goal_ml} ml from {fill_ml} ml", i + 1, POURS.len()));
-            self.command("simulator", &["operator", "fill", &fill_ml.to_string()])?;
-            let listener = Listener::start(&self.config.cell.name)?;
-            let result = self.command("rt-controller", &["pour", "--json", &goal_ml.to_string()])?;
-            let ticks = listener.finish();
-            let poured_ml = self.scale()?;
-            let plot = self.args.out.join(format!("pour-{}-{goal_ml:.0}ml.svg", i + 1));
-            pour_plot::draw(&plot, &ticks, goal_ml, poured_ml).map_err(|e| DemoError::Other(format!("{}: {e}", plot.display())))?;
-            self.note(&format!("  poured {poured_ml} g on the scale"));
-            pours.push(Pour {
-                filled_ml: fill_ml,
-                goal_ml,
-                poured_ml,
-                error_ml: poured_ml - f64::from(goal_ml),
-                outcome: result["outcome"].clone(),
-                episode_file: result["episode_file"].clone(),
-                plot,
-            });
-        }
-        Ok(Summary { pours, episodes, weights: taken, seconds: self.started.elapsed().as_secs_f64(), out: self.args.out.clone() })
-    }
-
-    fn note(&self, text: &str) {
-        eprintln!("[{:5.1} s] {text}", self.started.elapsed().as_secs_f64());
-    }
-
-    fn spawn(&self, name: &str) -> Result<Child, DemoError> {
-        let log = self.args.out.join(format!("logs/{name}.log"));
-        let file = || std::fs::File::create(&log).map_err(|error| DemoError::File { what: log.display().to_string(), error });
-        Command::new(self.bin.join(name))
-            .args(["run", "--config"])
-            .arg(&self.config_file)
-            .stdin(Stdio::null())
-            .stdout(Stdio::null())
-            .stderr(file()?)
-            .spawn()
-            .map_err(|error| DemoError::File { what: name.into(), error })
-    }
-
-    /// Runs one command of an operator to its end and reads its JSON.
-    fn command(&self, program: &str, words: &[&str]) -> Result<Value, DemoError> {
-        let what = format!("{program} {}", words.join(" "));
-        let mut child = Command::new(self.bin.join(program));
-        child.args(words).stdin(Stdio::null()).stdout(Stdio::piped()).stderr(Stdio::piped());
-        if words.first() != Some(&"episodes") {
-            child.arg("--config").arg(&self.config_file);
-        }
-        let output = child.output().map_err(|error| DemoError::File { what: what.clone(), error })?;
-        self.succeeded(&what, output.status, &String::from_utf8_lossy(&output.stderr))?;
-        Ok(serde_json::from_slice(&output.stdout).unwrap_or(Value::Null))
-    }
-
-    fn succeeded(&self, what: &str, status: std::process::ExitStatus, said: &str) -> Result<(), DemoError> {
-        if self.stop.load(Ordering::Relaxed) {
-            return Err(DemoError::Interrupted);
-        }
-        if status.success() {
-            return Ok(());
-        }
-        let last = said.lines().last().unwrap_or_default();
-        let hint = format!("{last}; see the logs in {}", self.args.out.join("logs").display());
-        Err(DemoError::Step { what: what.into(), code: status.to_string(), hint })
-    }
-
-    fn scale(&self) -> Result<f64, DemoError> {
-        let reading = self.command("simulator", &["operator", "scale", "--json"])?;
-        reading["weight_g"].as_f64().ok_or_else(|| DemoError::Other(format!("the scale reads {reading}")))
-    }
-
-    /// Tries until it works, a process dies, Ctrl-C comes or time is up.
-    fn until<T>(
-        &self,
-        what: &str,
-        seconds: u64,
-        processes: &mut Processes,
-        attempt: impl Fn(&Self) -> Result<T, String>,
-    ) -> Result<T, DemoError> {
-        let until = Instant::now() + Duration::from_secs(seconds);
-        loop {
-            let why = match attempt(self) {
-                Ok(value) => return Ok(value),
-                Err(why) => why,
-            };
-            if self.stop.load(Ordering::Relaxed) {
-                return Err(DemoError::Interrupted);
-            }
-            let logs = self.args.out.join("logs").display().to_string();
-            if let Some(dead) = processes.dead() {
-                return Err(DemoError::Other(format!("{dead} while waiting for {what}; see the logs in {logs}")));
-            }
-            if Instant::now() > until {
-                return Err(DemoError::Late { what: what.into(), seconds, why, logs });
-            }
-            std::thread::sleep(Duration::from_millis(100));
-        }
-    }
-}
-
-/// Removes the cell's shared memory at the end, also what a killed process left.
-struct Cleanup(String);
-
-impl Drop for Cleanup {
-    fn drop(&mut self) {
-        shared::ipc::remove_files(&self.0);
-    }
+    let summary = Summary { pours, episodes, weights: taken, seconds: cell.started.elapsed().as_secs_f64(), out: args.out.clone() };
+    let file = args.out.join("summary.json");
+    std::fs::write(&file, summary.json() + "\n").map_err(|error| OwnCellError::File { what: file.display().to_string(), error })?;
+    Ok(summary)
 }
 
 /// Collects the controller's telemetry in a thread while a pour runs.
@@ -411,7 +211,7 @@ struct Listener {
 }
 
 impl Listener {
-    fn start(cell: &str) -> Result<Self, DemoError> {
+    fn start(cell: &str) -> Result<Self, OwnCellError> {
         let stop = Arc::new(AtomicBool::new(false));
         let (cell, stopped) = (cell.to_string(), Arc::clone(&stop));
         let (sender, ready) = std::sync::mpsc::channel();
@@ -442,8 +242,8 @@ impl Listener {
         });
         match ready.recv() {
             Ok(Ok(())) => Ok(Self { stop, thread }),
-            Ok(Err(e)) => Err(DemoError::Other(e)),
-            Err(e) => Err(DemoError::Other(e.to_string())),
+            Ok(Err(e)) => Err(OwnCellError::Other(e)),
+            Err(e) => Err(OwnCellError::Other(e.to_string())),
         }
     }
 

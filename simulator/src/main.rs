@@ -3,7 +3,7 @@
 use std::process::ExitCode;
 
 use clap::{Parser, Subcommand};
-use simulator::{cell, demo, evaluate, evaluate_camera, motion, operator, reproduce, ur_command};
+use simulator::{cell, demo, evaluate, evaluate_camera, jitter, motion, operator, reproduce, ur_command};
 
 /// The simulated cell, and everything that needs it.
 #[derive(Parser)]
@@ -27,6 +27,8 @@ enum Command {
     Reproduce(reproduce::Args),
     /// Measures the feature extraction against rendered truth.
     EvaluateCamera(evaluate_camera::Args),
+    /// Measures latency and jitter of the real processes on this machine, beside cyclictest.
+    Jitter(jitter::Args),
     /// What the robot makes of a recorded pour's targets, with its program and without.
     Motion(motion::Args),
     /// Runs only the simulated UR5 controller.
@@ -41,6 +43,7 @@ fn main() -> ExitCode {
         Command::Evaluate(args) => evaluate::run(&args),
         Command::Reproduce(args) => reproduce::run(&args),
         Command::EvaluateCamera(args) => evaluate_camera::run(&args),
+        Command::Jitter(args) => jitter::run(&args),
         Command::Motion(args) => motion::run(&args),
         Command::Ur(args) => ur_command::run(&args),
     }

@@ -1,0 +1,245 @@
+//! A simulated cell with a name, an address and a directory of its own, as processes: for commands that work with the real programs.
+//!
+//! Ordinary process; allocates and blocks. It does what an operator does, by the programs' command lines, and takes no decision of
+//! the controller. When it is dropped, every process that it started is stopped and the cell's shared memory is removed.
+
+use std::path::{Path, PathBuf};
+use std::process::{Child, Command, ExitCode, ExitStatus, Stdio};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::{Duration, Instant};
+
+use rt_controller::client::Client;
+use serde_json::Value;
+use shared::config::Config;
+use shared::exit;
+use shared::messages::Phase;
+
+/// Why it stopped.
+#[derive(Debug, thiserror::Error)]
+pub enum OwnCellError {
+    /// Ctrl-C.
+    #[error("interrupted; every process that was started is stopped")]
+    Interrupted,
+    /// The configuration is bad.
+    #[error("{0}")]
+    Config(String),
+    /// A file or program cannot be used.
+    #[error("{what}: {error}")]
+    File {
+        /// Which.
+        what: String,
+        /// The system's words.
+        error: std::io::Error,
+    },
+    /// A command failed.
+    #[error("{what} failed ({code}); {hint}")]
+    Step {
+        /// The command.
+        what: String,
+        /// Its exit code.
+        code: String,
+        /// Its last line, and where to look.
+        hint: String,
+    },
+    /// Something took too long.
+    #[error("{what} did not happen within {seconds} s: {why}; see the logs in {logs}")]
+    Late {
+        /// What was waited for.
+        what: String,
+        /// How long.
+        seconds: u64,
+        /// What was the case instead.
+        why: String,
+        /// Directory of the logs.
+        logs: String,
+    },
+    /// Anything else.
+    #[error("{0}")]
+    Other(String),
+}
+
+impl OwnCellError {
+    /// Says it, and gives the command's exit code.
+    pub fn exit(&self) -> ExitCode {
+        let code = match self {
+            Self::Interrupted => exit::INTERRUPTED,
+            Self::Config(_) => exit::BAD_INPUT,
+            _ => exit::FAILED,
+        };
+        exit::fail(code, self)
+    }
+}
+
+/// The cell.
+pub struct OwnCell {
+    /// Its configuration: the given one with its own name, address and files.
+    pub config: Config,
+    /// Directory of all its files.
+    pub out: PathBuf,
+    /// Directory of the programs.
+    pub bin: PathBuf,
+    /// When it was prepared.
+    pub started: Instant,
+    config_file: PathBuf,
+    stop: Arc<AtomicBool>,
+    processes: Vec<(&'static str, Child)>,
+}
+
+impl OwnCell {
+    /// Makes the directory and the configuration; nothing runs yet. Weights of an earlier cell there are removed. `kind` becomes
+    /// part of the cell's name; `stop` ends what waits.
+    pub fn prepare(kind: &str, config: &Path, out: &Path, seed: u64, stop: Arc<AtomicBool>) -> Result<Self, OwnCellError> {
+        let file = |what: &Path, error| OwnCellError::File { what: what.display().to_string(), error };
+        let bad = |e: &dyn std::fmt::Display| OwnCellError::Config(e.to_string());
+        let text = std::fs::read_to_string(config).map_err(|e| file(config, e))?;
+        Config::parse(&text, &config.display().to_string()).map_err(|e| bad(&e))?;
+        let mut table: toml::Table = text.parse().map_err(|e| bad(&format!("{}: {e}", config.display())))?;
+        let _ = std::fs::remove_dir_all(out.join("logs"));
+        let _ = std::fs::remove_file(out.join("weights.bin"));
+        std::fs::create_dir_all(out.join("logs")).map_err(|e| file(out, e))?;
+        let mut set = |section: &str, key: &str, value: toml::Value| {
+            if let Some(toml::Value::Table(t)) = table.get_mut(section) {
+                t.insert(key.into(), value);
+            }
+        };
+        let path = |name: &str| toml::Value::String(out.join(name).display().to_string());
+        // A name and an address of its own, so that a cell that is already running is left alone.
+        let number = std::process::id();
+        let address = format!("127.{}.{}.{}", 1 + number / 65_536 % 250, number / 256 % 256, 1 + number % 254);
+        set("cell", "name", toml::Value::String(format!("{kind}-{number}")));
+        set("robot", "address", toml::Value::String(address));
+        set("controller", "weights", path("weights.bin"));
+        set("controller", "journal", path("journal.bin"));
+        set("recording", "directory", path("episodes"));
+        set("simulator", "seed", toml::Value::Integer(seed as i64));
+        let config_file = out.join("sim.toml");
+        let text = toml::to_string_pretty(&table).map_err(|e| bad(&e))?;
+        std::fs::write(&config_file, &text).map_err(|e| file(&config_file, e))?;
+        let config = Config::parse(&text, &config_file.display().to_string()).map_err(|e| bad(&e))?;
+        let exe = std::env::current_exe().map_err(|e| file(Path::new("own program"), e))?;
+        let bin = exe.parent().unwrap_or(Path::new(".")).to_path_buf();
+        Ok(Self { config, out: out.into(), bin, started: Instant::now(), config_file, stop, processes: Vec::new() })
+    }
+
+    /// Starts simulator, feature worker and controller, and waits until they are ready to pour.
+    pub fn start(&mut self) -> Result<Client, OwnCellError> {
+        for name in ["simulator", "feature-worker", "rt-controller"] {
+            let child = self.spawn(name)?;
+            self.processes.push((name, child));
+        }
+        let name = self.config.cell.name.clone();
+        let client = self.until("the cell", 20, || Client::connect(&name).map_err(|e| e.to_string()))?;
+        self.until("readiness of robot and camera", 30, || match client.status() {
+            Ok(s) if s.phase == Phase::Idle && s.feature_sequence > 0 => Ok(()),
+            Ok(s) if s.feature_sequence == 0 => Err("no camera frames".into()),
+            Ok(s) => Err(s.hindrance.clone()),
+            Err(e) => Err(e.to_string()),
+        })?;
+        Ok(client)
+    }
+
+    /// Stops the processes in order and waits for them.
+    pub fn stop(&mut self) {
+        // The controller first: it brings the container upright while the robot is still there.
+        while let Some((_, mut child)) = self.processes.pop() {
+            let pid = rustix::process::Pid::from_child(&child);
+            let _ = rustix::process::kill_process(pid, rustix::process::Signal::TERM);
+            let until = Instant::now() + Duration::from_secs(5);
+            while matches!(child.try_wait(), Ok(None)) {
+                if Instant::now() > until {
+                    let _ = child.kill();
+                }
+                std::thread::sleep(Duration::from_millis(20));
+            }
+        }
+    }
+
+    /// Process id of one of its processes.
+    pub fn pid(&self, name: &str) -> Option<u32> {
+        self.processes.iter().find(|(n, _)| *n == name).map(|(_, child)| child.id())
+    }
+
+    /// One line of progress.
+    pub fn note(&self, text: &str) {
+        eprintln!("[{:5.1} s] {text}", self.started.elapsed().as_secs_f64());
+    }
+
+    /// An error once Ctrl-C was pressed.
+    pub fn interrupted(&self) -> Result<(), OwnCellError> {
+        if self.stop.load(Ordering::Relaxed) { Err(OwnCellError::Interrupted) } else { Ok(()) }
+    }
+
+    fn spawn(&self, name: &str) -> Result<Child, OwnCellError> {
+        let log = self.out.join(format!("logs/{name}.log"));
+        let log = std::fs::File::create(&log).map_err(|error| OwnCellError::File { what: log.display().to_string(), error })?;
+        Command::new(self.bin.join(name))
+            .args(["run", "--config"])
+            .arg(&self.config_file)
+            .stdin(Stdio::null())
+            .stdout(Stdio::null())
+            .stderr(log)
+            .spawn()
+            .map_err(|error| OwnCellError::File { what: name.into(), error })
+    }
+
+    /// Runs one command of an operator to its end and reads its JSON.
+    pub fn command(&self, program: &str, words: &[&str]) -> Result<Value, OwnCellError> {
+        let what = format!("{program} {}", words.join(" "));
+        let mut child = Command::new(self.bin.join(program));
+        child.args(words).stdin(Stdio::null()).stdout(Stdio::piped()).stderr(Stdio::piped());
+        if words.first() != Some(&"episodes") {
+            child.arg("--config").arg(&self.config_file);
+        }
+        let output = child.output().map_err(|error| OwnCellError::File { what: what.clone(), error })?;
+        self.succeeded(&what, output.status, &String::from_utf8_lossy(&output.stderr))?;
+        Ok(serde_json::from_slice(&output.stdout).unwrap_or(Value::Null))
+    }
+
+    /// An error, with the last line that was said, unless a command succeeded.
+    pub fn succeeded(&self, what: &str, status: ExitStatus, said: &str) -> Result<(), OwnCellError> {
+        self.interrupted()?;
+        if status.success() {
+            return Ok(());
+        }
+        let last = said.lines().last().unwrap_or_default();
+        let hint = format!("{last}; see the logs in {}", self.out.join("logs").display());
+        Err(OwnCellError::Step { what: what.into(), code: status.to_string(), hint })
+    }
+
+    /// What the kitchen scale shows, g.
+    pub fn scale(&self) -> Result<f64, OwnCellError> {
+        let reading = self.command("simulator", &["operator", "scale", "--json"])?;
+        reading["weight_g"].as_f64().ok_or_else(|| OwnCellError::Other(format!("the scale reads {reading}")))
+    }
+
+    /// Tries until it works, a process dies, Ctrl-C comes or time is up.
+    pub fn until<T>(&mut self, what: &str, seconds: u64, attempt: impl Fn() -> Result<T, String>) -> Result<T, OwnCellError> {
+        let until = Instant::now() + Duration::from_secs(seconds);
+        loop {
+            let why = match attempt() {
+                Ok(value) => return Ok(value),
+                Err(why) => why,
+            };
+            self.interrupted()?;
+            let logs = self.out.join("logs").display().to_string();
+            for (name, child) in &mut self.processes {
+                if let Ok(Some(status)) = child.try_wait() {
+                    return Err(OwnCellError::Other(format!("{name} ended ({status}) while waiting for {what}; see the logs in {logs}")));
+                }
+            }
+            if Instant::now() > until {
+                return Err(OwnCellError::Late { what: what.into(), seconds, why, logs });
+            }
+            std::thread::sleep(Duration::from_millis(100));
+        }
+    }
+}
+
+impl Drop for OwnCell {
+    fn drop(&mut self) {
+        self.stop();
+        // Also what a killed process left.
+        shared::ipc::remove_files(&self.config.cell.name);
+    }
+}
