@@ -4,7 +4,7 @@
 //! itself; the count of its allocations is part of `status`. Nothing in it fails: a lost robot is handed back and the core
 //! ends the pour, a lost feature worker shows as stale features.
 
-use std::sync::atomic::Ordering::Relaxed;
+use std::sync::atomic::{AtomicU64, Ordering::Relaxed};
 
 use iceoryx2::port::update_connections::UpdateConnections;
 use shared::messages::{Feature, Phase};
@@ -41,10 +41,10 @@ pub fn run(settings: Settings, place: Place, lost_ns: u64, features: &Features, 
     let mut deadline_ns = os::now_ns() + settings.period_ns;
     loop {
         os::sleep_until_ns(deadline_ns);
+        ticks.meet_feature_worker();
         if ticks.tick(deadline_ns) == Next::Ended {
             break;
         }
-        ticks.meet_feature_worker();
         let (next_ns, skipped) = ticks.pacer.next_deadline_ns(deadline_ns, os::now_ns());
         exchange.skipped_ticks.fetch_add(skipped, Relaxed);
         deadline_ns = next_ns;
@@ -74,7 +74,7 @@ pub struct Ticks<'a> {
     period_ns: u64,
     lost_ns: u64,
     shutdown: bool,
-    /// Allocations and page faults of this thread that no tick made.
+    /// Allocations and page faults of this thread before its first tick and when it met feature workers.
     elsewhere: (u64, u64),
 }
 
@@ -132,6 +132,7 @@ impl<'a> Ticks<'a> {
         self.shutdown |= order == Some(Order::Shutdown);
 
         let output = self.core.step(&Input { now_ns: woke_ns, features: &self.fresh, robot, order });
+        let decided_at_ns = os::now_ns();
         let mut written_at_ns = 0;
         if let (Some(session), Some(target_deg)) = (self.session.as_mut(), output.target_deg) {
             end = session.send(Mode::Stream, target_deg).err().map(SessionEnd::Lost).or(end);
@@ -178,23 +179,27 @@ impl<'a> Ticks<'a> {
             agent: taken,
             target_deg: output.target_deg,
             d_ml: telemetry.d_ml,
-            times: Times { deadline_ns, written_at_ns, done_ns },
+            times: Times { deadline_ns, decided_at_ns, written_at_ns, done_ns },
         };
         tell(Event::Tick(tick, telemetry, self.core.counters()));
         let upright = matches!(self.core.phase(), Phase::Idle | Phase::NoRobot);
         if self.shutdown && upright { Next::Ended } else { Next::Tick }
     }
 
-    /// Opens the shared memory of a feature worker that has come (again): iceoryx2 allocates for it, so it is done between the
-    /// ticks, and not during a pour. A worker that comes during a pour is met by that tick; the pour ends stale anyway.
+    /// Opens the shared memory of a feature worker that has come (again). iceoryx2 allocates for it, so it is done
+    /// before a tick, and not in a pour; and counted apart. A worker that comes during a pour is met by `receive`: the pour ends stale anyway.
     pub fn meet_feature_worker(&mut self) {
-        if self.core.may_exchange() {
-            let before = spent();
-            // What fails here fails in `receive` too, and shows as stale features.
-            let _ = self.features.update_connections();
-            let after = spent();
-            self.elsewhere.0 += after.0 - before.0;
-            self.elsewhere.1 += after.1 - before.1;
+        if !self.core.may_exchange() {
+            return;
+        }
+        let before = os::allocations();
+        // What fails here fails in `receive` too, and shows as stale features.
+        let _ = self.features.update_connections();
+        if os::allocations() != before {
+            let (allocations, faults) = spent();
+            let of_ticks = |counter: &AtomicU64| counter.load(Relaxed);
+            self.elsewhere.0 = allocations - of_ticks(&self.exchange.loop_allocations);
+            self.elsewhere.1 = faults - of_ticks(&self.exchange.loop_page_faults);
         }
     }
 }

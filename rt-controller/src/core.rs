@@ -202,6 +202,8 @@ pub struct Core {
     settings: Settings,
     agent: Option<Box<Agent>>,
     limiter: Limiter,
+    /// Where the last action leads, degrees: a loop faster than the camera needs several ticks to get there.
+    request_deg: f32,
     phase: Phase,
     run: Option<Run>,
     decision: Decision,
@@ -243,6 +245,7 @@ impl Core {
             settings,
             agent: None,
             limiter: Limiter::new(settings.limits, period_s, 0.0),
+            request_deg: 0.0,
             phase: Phase::NoRobot,
             run: None,
             decision: Decision::NOTHING,
@@ -290,11 +293,11 @@ impl Core {
             self.give_up(EndReason::ControllerOverrun);
         }
         let ordered = input.order.map(|order| self.obey(order, input));
-        let (request, asked, area) = self.take_features(input);
+        let (asked, area) = self.take_features(input);
         if ended.is_none() {
             ended = self.advance(input);
         }
-        let target_deg = self.command(input, request);
+        let target_deg = self.command(input);
         self.commanded.push(input.now_ns, self.limiter.alpha_deg());
         Output { target_deg, ordered, ended, telemetry: self.telemetry(input, asked, area) }
     }
@@ -408,6 +411,7 @@ impl Core {
             counters_before: self.counters(),
             late_ticks: 0,
         });
+        self.request_deg = self.limiter.alpha_deg();
         self.phase = phase;
     }
 
@@ -425,10 +429,9 @@ impl Core {
         }
     }
 
-    /// Takes the new features in order and steps the agent once a frame. Answers with the policy's requested alpha, the sum
-    /// of the actions taken (NaN: none), and the newest area (NaN: none).
-    fn take_features(&mut self, input: &Input) -> (f32, f32, f32) {
-        let mut request = self.limiter.alpha_deg();
+    /// Takes the new features in order and steps the agent once a frame. Answers with the sum of the actions taken (NaN: none)
+    /// and the newest area (NaN: none).
+    fn take_features(&mut self, input: &Input) -> (f32, f32) {
         let (mut asked, mut area) = (f32::NAN, f32::NAN);
         for feature in input.features {
             let previous = self.newest;
@@ -467,11 +470,11 @@ impl Core {
             let at_largest_tilt = alpha_now_deg >= self.settings.limits.alpha_max_deg - 0.5;
             run.empty_frames = if at_largest_tilt && !flowing { run.empty_frames + lost + 1 } else { 0 };
             if self.phase == Phase::Pouring && !self.decision.finished {
-                request += self.decision.dalpha_deg;
                 asked = if asked.is_nan() { 0.0 } else { asked } + self.decision.dalpha_deg;
+                self.request_deg = alpha_now_deg + asked;
             }
         }
-        (request, asked, area)
+        (asked, area)
     }
 
     /// Moves on to the next phase when this one is over.
@@ -514,10 +517,10 @@ impl Core {
     }
 
     /// The angle to command: every one passes the limiter.
-    fn command(&mut self, input: &Input, request_deg: f32) -> Option<f32> {
+    fn command(&mut self, input: &Input) -> Option<f32> {
         match self.phase {
             Phase::NoRobot => None,
-            Phase::Pouring => Some(self.limiter.step(request_deg)),
+            Phase::Pouring => Some(self.limiter.step(self.request_deg)),
             Phase::Recording => {
                 let run = self.run?;
                 let t = input.now_ns.saturating_sub(run.started_at_ns) as f32 / 1e9;

@@ -48,6 +48,8 @@ pub struct Tick {
 pub struct Times {
     /// When it was to wake up.
     pub deadline_ns: u64,
+    /// When the target was decided; writing it is the kernel's time.
+    pub decided_at_ns: u64,
     /// When the target's bytes were with the kernel; 0: none were.
     pub written_at_ns: u64,
     /// When all was done but the telling.

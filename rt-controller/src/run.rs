@@ -10,12 +10,19 @@ use std::sync::atomic::{AtomicBool, AtomicU64, Ordering::Relaxed};
 
 use shared::config::Config;
 use shared::exit;
-use shared::ipc::Cell;
+use shared::ipc::{Cell, IpcError};
 
 use crate::control_loop::{self, Place};
 use crate::core::Settings;
 use crate::exchange::Exchange;
 use crate::service::{self, RobotNote, Service};
+
+/// Stack of each thread beside the main one, bytes: all of it is locked in memory.
+const STACK: usize = 512 * 1024;
+
+fn no_thread(e: std::io::Error) -> IpcError {
+    IpcError::Service { service: "thread".into(), what: format!("the system gives no thread: {e}") }
+}
 
 /// Command-line arguments.
 #[derive(Debug, clap::Args)]
@@ -44,25 +51,35 @@ pub fn run(args: &Args) -> ExitCode {
         }
     }
 
+    // First of all, so that what is made from here on is in memory before the loop starts.
+    if let Err(line) = shared::os::lock_memory() {
+        say(&line);
+    }
     let exchange = Exchange::default();
     let (note, connections) = (RobotNote::default(), AtomicU64::new(0));
     let outcome = std::thread::scope(|scope| {
         let cell = Cell::join(&config.cell.name)?;
         let mut service = Service::open(&cell, &config, &exchange, &note, &connections, &say)?;
         let (ready_sender, ready) = std::sync::mpsc::channel();
-        scope.spawn({
+        let loop_thread = std::thread::Builder::new().name("loop".into()).stack_size(STACK);
+        let spawned = loop_thread.spawn_scoped(scope, {
             let (config, exchange, say) = (&config, &exchange, &say);
             move || real_time(config, exchange, say, &ready_sender)
         });
+        spawned.map_err(no_thread)?;
         ready.recv().unwrap_or(Ok(()))?;
         let end_robot = AtomicBool::new(false);
         std::thread::scope(|inner| {
-            inner.spawn(|| service::keep_robot_connected(&config, &exchange, &note, &connections, &end_robot, &say));
+            let robot_thread = std::thread::Builder::new().name("robot".into()).stack_size(STACK);
+            let spawned = robot_thread
+                .spawn_scoped(inner, || service::keep_robot_connected(&config, &exchange, &note, &connections, &end_robot, &say));
             say(&format!("running in cell '{}' at {} Hz", config.cell.name, config.controller.rate_hz));
+            // Without a robot's thread there is no robot: the loop ends at once.
+            stop.fetch_or(spawned.is_err(), Relaxed);
             service.run(&stop);
             end_robot.store(true, Relaxed);
-        });
-        Ok::<(), shared::ipc::IpcError>(())
+            spawned.map(|_| ()).map_err(no_thread)
+        })
     });
     match outcome {
         Ok(()) => {
@@ -74,17 +91,14 @@ pub fn run(args: &Args) -> ExitCode {
 }
 
 /// The real-time thread: its own node and subscriber, then the loop.
-fn real_time(config: &Config, exchange: &Exchange, say: &dyn Fn(&str), ready: &std::sync::mpsc::Sender<Result<(), shared::ipc::IpcError>>) {
+fn real_time(config: &Config, exchange: &Exchange, say: &dyn Fn(&str), ready: &std::sync::mpsc::Sender<Result<(), IpcError>>) {
     let opened = Cell::join(&config.cell.name).and_then(|cell| {
         let subscriber = cell.features()?.subscriber_builder().buffer_size(crate::core::MAX_FEATURES).create();
-        let subscriber = subscriber.map_err(|e| shared::ipc::IpcError::Service { service: "feature".into(), what: format!("{e:?}") })?;
+        let subscriber = subscriber.map_err(|e| IpcError::Service { service: "feature".into(), what: format!("{e:?}") })?;
         Ok((cell, subscriber))
     });
     match opened {
         Ok((_cell, subscriber)) => {
-            if let Err(line) = shared::os::lock_memory() {
-                say(&line);
-            }
             let _ = ready.send(Ok(()));
             let place = Place { core: config.controller.core, priority: config.controller.priority };
             let lost_ns = u64::from(config.controller.lost_robot_ms) * 1_000_000;

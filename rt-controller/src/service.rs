@@ -28,7 +28,9 @@ use crate::journal::Writer;
 use crate::link::{self, LinkOptions};
 
 /// How often the ordinary side looks: far below a person's patience, and cheap.
-const BEAT: Duration = Duration::from_millis(20);
+const BEAT: Duration = Duration::from_millis(40);
+/// How often the robot's keeper looks whether the loop has given it back.
+const ROBOT_BEAT: Duration = Duration::from_millis(100);
 /// Results kept for `status`.
 const OUTCOMES: usize = 32;
 /// Wait between attempts to reach the robot.
@@ -89,7 +91,7 @@ pub fn keep_robot_connected(
                 }
             }
         }
-        std::thread::sleep(BEAT);
+        std::thread::sleep(ROBOT_BEAT);
     }
 }
 
@@ -183,8 +185,13 @@ impl<'a> Service<'a> {
         say: &'a dyn Fn(&str),
     ) -> Result<Self, IpcError> {
         let fail = |service: &str, e: String| IpcError::Service { service: service.into(), what: e };
-        let server =
-            cell.control()?.server_builder().initial_max_slice_len(MESSAGE_MAX).create().map_err(|e| fail("control", format!("{e:?}")))?;
+        let server = cell
+            .control()?
+            .server_builder()
+            .initial_max_slice_len(MESSAGE_MAX)
+            .max_loaned_responses_per_request(1)
+            .create()
+            .map_err(|e| fail("control", format!("{e:?}")))?;
         let telemetry = cell.telemetry()?.publisher_builder().create().map_err(|e| fail("telemetry", format!("{e:?}")))?;
         let mut journal = None;
         if let Some(path) = &config.controller.journal {

@@ -181,6 +181,11 @@ impl Cell {
             .request_response::<[u8], [u8]>()
             .max_servers(1)
             .max_clients(8)
+            // One question at a time: what is not used would be locked in the controller's memory (64 KiB an answer).
+            .max_active_requests_per_client(1)
+            .max_loaned_requests(1)
+            .max_response_buffer_size(1)
+            .max_borrowed_responses_per_pending_response(1)
             .open_or_create()
             .map_err(|e| IpcError::Service { service: full, what: format!("{e:?}") })
     }

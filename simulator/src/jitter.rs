@@ -231,7 +231,8 @@ struct Ticks {
     capture_to_received: Vec<f64>,
     received_to_published: Vec<f64>,
     published_to_wake: Vec<f64>,
-    wake_to_written: Vec<f64>,
+    wake_to_decided: Vec<f64>,
+    decided_to_written: Vec<f64>,
     capture_to_written: Vec<f64>,
     pouring_execution: Vec<f64>,
     /// Periods without a tick, and ticks later than half a period.
@@ -266,7 +267,8 @@ impl Ticks {
                 ticks.capture_to_received.push(us(feature.captured_at_ns, feature.received_at_ns));
                 ticks.received_to_published.push(us(feature.received_at_ns, feature.published_at_ns));
                 ticks.published_to_wake.push(us(feature.published_at_ns, woke_ns));
-                ticks.wake_to_written.push(us(woke_ns, times.written_at_ns));
+                ticks.wake_to_decided.push(us(woke_ns, times.decided_at_ns));
+                ticks.decided_to_written.push(us(times.decided_at_ns, times.written_at_ns));
                 ticks.capture_to_written.push(us(feature.captured_at_ns, times.written_at_ns));
             }
         });
@@ -277,7 +279,7 @@ impl Ticks {
         Ok(ticks)
     }
 
-    fn columns(&self) -> [(&'static str, &Vec<f64>); 8] {
+    fn columns(&self) -> [(&'static str, &Vec<f64>); 9] {
         [
             ("wake-up lateness", &self.lateness),
             ("tick execution", &self.execution),
@@ -285,7 +287,8 @@ impl Ticks {
             ("capture to worker", &self.capture_to_received),
             ("worker to V_e published", &self.received_to_published),
             ("V_e published to wake-up", &self.published_to_wake),
-            ("wake-up to bytes on the socket", &self.wake_to_written),
+            ("wake-up to target decided", &self.wake_to_decided),
+            ("decided to bytes on the socket", &self.decided_to_written),
             ("capture to bytes on the socket", &self.capture_to_written),
         ]
     }
@@ -448,7 +451,8 @@ fn rounds(cell: &mut OwnCell, args: &Args) -> Result<Measured, OwnCellError> {
                 (&mut all.capture_to_received, &t.capture_to_received),
                 (&mut all.received_to_published, &t.received_to_published),
                 (&mut all.published_to_wake, &t.published_to_wake),
-                (&mut all.wake_to_written, &t.wake_to_written),
+                (&mut all.wake_to_decided, &t.wake_to_decided),
+                (&mut all.decided_to_written, &t.decided_to_written),
                 (&mut all.capture_to_written, &t.capture_to_written),
             ] {
                 sum.extend_from_slice(part);
@@ -509,7 +513,11 @@ fn rounds(cell: &mut OwnCell, args: &Args) -> Result<Measured, OwnCellError> {
         );
         html += &histograms("us", "Tick execution.", &[("all ticks", &all.execution), ("in pours", &all.pouring_execution)]);
         html += &histograms("us", "From the worker's receipt of a frame to its V_e.", &[("extraction", &all.received_to_published)]);
-        html += &histograms("us", "From the wake-up to the target's bytes on the socket.", &[("send", &all.wake_to_written)]);
+        html += &histograms(
+            "us",
+            "From the wake-up to the target's bytes on the socket.",
+            &[("deciding", &all.wake_to_decided), ("the kernel's send", &all.decided_to_written)],
+        );
         html += &histograms(
             "us",
             "The way of a frame: exposure to its V_e's use.",

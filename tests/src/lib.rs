@@ -127,6 +127,17 @@ impl CellUnderTest {
         }
     }
 
+    /// Process id of a running process.
+    pub fn pid(&self, name: &str) -> u32 {
+        self.processes.iter().find(|(n, _)| n == name).expect("it runs").1.id()
+    }
+
+    /// Asks a process to end and gives its exit code.
+    pub fn stop(&mut self, name: &str) -> Option<i32> {
+        self.signal(name, rustix::process::Signal::TERM);
+        self.exit_code(name, Duration::from_secs(10))
+    }
+
     /// Waits for a process to end by itself and gives its exit code.
     pub fn exit_code(&mut self, name: &str, within: Duration) -> Option<i32> {
         let i = self.processes.iter().position(|(n, _)| n == name).expect("it runs");

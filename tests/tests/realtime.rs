@@ -1,0 +1,196 @@
+//! The loop's promises over more than 10,000 ticks of the real processes, at 125 Hz instead of 30 so that it takes 90 s: no
+//! allocation, no page fault, no system call that docs/REALTIME.md does not list, weights swapped 100 times a second without
+//! a trace in the pour in progress, and the same inputs giving the same bits again. Each check is shown a violation, too.
+//!
+//! Needs `strace` (scripts/test installs it) and leave to trace its own children.
+
+use std::collections::BTreeSet;
+use std::path::Path;
+use std::process::{Child, Command, Stdio};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering::Relaxed};
+use std::time::{Duration, Instant};
+
+use rt_controller::core::Order;
+use rt_controller::journal;
+use rustix::process::Signal;
+use serde_json::Value;
+use tests::{CellUnderTest, steady_weights};
+
+const TILT_OUT: usize = 13;
+
+/// The system calls that the loop makes in steady state, as docs/REALTIME.md lists them.
+fn documented_calls() -> BTreeSet<String> {
+    let text = include_str!("../../docs/REALTIME.md");
+    let section = text.split("## System calls").nth(1).expect("the section is there").split("\n## ").next().expect("a part");
+    section.lines().filter_map(|l| l.strip_prefix("| `")?.split('`').next().map(str::to_owned)).collect()
+}
+
+/// A running strace of one thread.
+struct Trace(Child, tempfile::NamedTempFile);
+
+impl Trace {
+    fn of(thread: u32) -> Self {
+        let file = tempfile::NamedTempFile::new().expect("a file");
+        let mut strace = Command::new("strace");
+        strace.args(["-q", "-p", &thread.to_string(), "-o"]).arg(file.path()).stdin(Stdio::null()).stderr(Stdio::null());
+        let child = strace.spawn().expect("strace is installed (scripts/install strace)");
+        std::thread::sleep(Duration::from_millis(500));
+        Self(child, file)
+    }
+
+    /// Ends it and gives the names of the calls seen.
+    fn calls(mut self) -> BTreeSet<String> {
+        let _ = rustix::process::kill_process(rustix::process::Pid::from_child(&self.0), Signal::INT);
+        self.0.wait().expect("it was ours");
+        let text = std::fs::read_to_string(self.1.path()).expect("readable");
+        // `<... clock_nanosleep resumed>` and `--- SIGSTOP ---` are no calls.
+        let name = |l: &str| {
+            l.split_once('(').map(|(name, _)| name.trim().to_owned()).filter(|n| n.chars().all(|c| c.is_alphanumeric() || c == '_'))
+        };
+        text.lines().filter_map(name).collect()
+    }
+}
+
+/// The thread `name` of a process.
+fn thread(pid: u32, name: &str) -> u32 {
+    let tasks = std::fs::read_dir(format!("/proc/{pid}/task")).expect("it runs");
+    let named = |t: &std::fs::DirEntry| std::fs::read_to_string(t.path().join("comm")).is_ok_and(|c| c.trim() == name);
+    let found = tasks.flatten().find(named).expect("the thread is there");
+    found.file_name().to_string_lossy().parse().expect("a number")
+}
+
+/// Writes weights 100 times a second, two policies in turn, until told to stop; gives how many, and the last one's identity.
+fn hammer(file: &Path, stop: &AtomicBool) -> (u64, String) {
+    let variants = [steady_weights(TILT_OUT), steady_weights(TILT_OUT + 1)];
+    let bytes = variants.each_ref().map(|w| w.to_bytes().expect("valid"));
+    let mut written = 0;
+    let mut next = Instant::now();
+    while !stop.load(Relaxed) {
+        let temporary = file.with_extension("new");
+        std::fs::write(&temporary, &bytes[written as usize % 2]).expect("writable");
+        std::fs::rename(&temporary, file).expect("writable");
+        written += 1;
+        next += Duration::from_millis(10);
+        std::thread::sleep(next.saturating_duration_since(Instant::now()));
+    }
+    (written, variants[(written as usize + 1) % 2].identity())
+}
+
+fn pour(cell: &CellUnderTest, goal: &str) -> Value {
+    cell.json("simulator", &["operator", "fill", "400", "--json"]);
+    let output = cell.command("rt-controller", &["pour", goal, "--json"]);
+    serde_json::from_slice::<Value>(&output.stdout).map_or(Value::Null, |v| v["outcome"]["reason"].clone())
+}
+
+/// Protects the loop's deadline, and whoever replays a journal.
+#[test]
+fn ten_thousand_ticks_keep_the_promises() {
+    let mut cell = CellUnderTest::start(|config| {
+        config["controller"].as_table_mut().expect("a table").insert("rate_hz".into(), 125.0.into());
+    });
+    cell.take_weights(&steady_weights(TILT_OUT));
+    let trace = Trace::of(thread(cell.pid("rt-controller"), "loop"));
+
+    let stop = Arc::new(AtomicBool::new(false));
+    let hammering = std::thread::spawn({
+        let (file, stop) = (cell.weights(), Arc::clone(&stop));
+        move || hammer(&file, &stop)
+    });
+    let hammered_from = Instant::now();
+    let ready = |cell: &CellUnderTest| cell.wait("readiness", Duration::from_secs(20), |s| s["phase"] == "idle" && s["hindrance"] == "");
+    assert_eq!(pour(&cell, "40"), "done");
+
+    // A frame is late: the worker hangs, is not restarted, and goes on.
+    let hung = {
+        cell.json("simulator", &["operator", "fill", "400", "--json"]);
+        let pour = cell.begin("rt-controller", &["pour", "200", "--json"]);
+        cell.wait("tilt", Duration::from_secs(10), |s| s["alpha_measured_deg"].as_f64() > Some(30.0));
+        cell.signal("feature-worker", Signal::STOP);
+        pour.wait_with_output().expect("it ran")
+    };
+    assert!(String::from_utf8_lossy(&hung.stdout).contains("stale-feature"));
+    cell.signal("feature-worker", Signal::CONT);
+    ready(&cell);
+
+    // The robot is lost at full tilt and comes back.
+    let connections = cell.status().expect("running")["robot_connections"].as_u64();
+    let lost = {
+        cell.json("simulator", &["operator", "fill", "400", "--json"]);
+        let pour = cell.begin("rt-controller", &["pour", "200", "--json"]);
+        cell.wait("tilt", Duration::from_secs(10), |s| s["alpha_measured_deg"].as_f64() > Some(30.0));
+        assert!(cell.command("simulator", &["operator", "fault", "reset"]).status.success());
+        pour.wait_with_output().expect("it ran")
+    };
+    assert!(String::from_utf8_lossy(&lost.stdout).contains("robot-lost"), "{}", String::from_utf8_lossy(&lost.stdout));
+    cell.wait("reconnection", Duration::from_secs(20), |s| s["robot_connections"].as_u64() > connections && s["phase"] == "idle");
+
+    while hammered_from.elapsed() < Duration::from_secs(60) {
+        assert_eq!(pour(&cell, "40"), "done");
+    }
+    stop.store(true, Relaxed);
+    let (written, last) = hammering.join().expect("it ran");
+    let calls = trace.calls();
+
+    // The worker dies and is replaced: the loop opens new shared memory, outside of pours, and that is counted apart.
+    cell.signal("feature-worker", Signal::KILL);
+    cell.spawn("feature-worker");
+    let before = cell.status().expect("running")["features"].as_u64();
+    cell.wait("the new worker", Duration::from_secs(10), |s| s["features"].as_u64() > before);
+    ready(&cell);
+    assert_eq!(pour(&cell, "40"), "done");
+    let status = cell.wait("10,000 ticks", Duration::from_secs(60), |s| s["ticks"].as_u64() > Some(10_000));
+
+    assert_eq!(calls, documented_calls(), "the loop's system calls, and those that docs/REALTIME.md lists");
+    assert_eq!(status["loop_allocations"], 0);
+    if !cell.log("rt-controller").contains("mlockall is not permitted") {
+        assert_eq!(status["loop_page_faults"], 0);
+    }
+    assert_eq!(status["events_lost"], 0);
+    assert!(written > 3000, "{written} weight files in a minute");
+    assert_eq!((&status["weights"], &status["weights_refused"]), (&Value::from(last), &Value::from("")));
+    let taken = status["weights_taken"].as_u64().expect("a number");
+    assert!(taken > 20, "{taken} policies taken");
+
+    assert_eq!(cell.stop("rt-controller"), Some(0));
+    let (mut under_way, mut swapped_in_pour, mut agents) = (false, 0, 0);
+    let replay = journal::replay(&cell.dir.path().join("journal.bin"), |tick, output| {
+        swapped_in_pour += u64::from(under_way && tick.agent.is_some());
+        agents += u64::from(tick.agent.is_some());
+        under_way |= matches!((tick.order, output.ordered), (Some(Order::Pour { .. }), Some(Ok(()))));
+        under_way &= output.ended.is_none();
+    });
+    let replay = replay.expect("a journal");
+    assert!(replay.ticks > 10_000 && replay.ended.len() >= 6, "{} ticks, {} pours", replay.ticks, replay.ended.len());
+    assert_eq!((replay.different, replay.cut_off), (0, false), "the same inputs give the same bits");
+    assert_eq!((agents, swapped_in_pour), (taken, 0), "policies are taken between pours");
+}
+
+/// Protects the checks themselves: an ordinary thread makes calls that the list does not have, and a journal whose answer was
+/// changed in one bit is found out.
+#[test]
+fn the_checks_see_violations() {
+    let mut cell = CellUnderTest::start(|_| {});
+    let trace = Trace::of(cell.pid("rt-controller"));
+    cell.take_weights(&steady_weights(TILT_OUT));
+    let calls = trace.calls();
+    assert!(calls.difference(&documented_calls()).next().is_some(), "the ordinary thread reads files: {calls:?}");
+
+    assert_eq!(cell.stop("rt-controller"), Some(0));
+    let path = cell.dir.path().join("journal.bin");
+    let mut bytes = std::fs::read(&path).expect("readable");
+    let last = bytes.len() - 1;
+    let untouched = journal::replay(&path, |_, _| {}).expect("a journal");
+    assert_eq!(untouched.different, 0);
+    // d_ml of the last tick, before its four times of up to ten bytes each: any bit of the entry but those of the times.
+    let tick = (last - 80..last - 44).rev().find(|k| {
+        let mut changed = bytes.clone();
+        changed[*k] ^= 1;
+        std::fs::write(&path, &changed).expect("writable");
+        journal::replay(&path, |_, _| {}).is_ok_and(|r| r.different == 1)
+    });
+    assert!(tick.is_some(), "no changed bit was found out");
+    bytes.truncate(last);
+    std::fs::write(&path, &bytes).expect("writable");
+    assert!(journal::replay(&path, |_, _| {}).expect("a journal").cut_off);
+}
