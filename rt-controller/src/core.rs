@@ -297,7 +297,7 @@ impl Core {
         if ended.is_none() {
             ended = self.advance(input);
         }
-        let target_deg = self.command(input);
+        let target_deg = self.command(input, asked);
         self.commanded.push(input.now_ns, self.limiter.alpha_deg());
         Output { target_deg, ordered, ended, telemetry: self.telemetry(input, asked, area) }
     }
@@ -517,9 +517,11 @@ impl Core {
     }
 
     /// The angle to command: every one passes the limiter.
-    fn command(&mut self, input: &Input) -> Option<f32> {
+    fn command(&mut self, input: &Input, asked_deg: f32) -> Option<f32> {
         match self.phase {
             Phase::NoRobot => None,
+            // Without a new action, what is left of the last one.
+            Phase::Pouring if asked_deg.is_nan() => Some(self.limiter.step_towards(self.request_deg)),
             Phase::Pouring => Some(self.limiter.step(self.request_deg)),
             Phase::Recording => {
                 let run = self.run?;

@@ -146,6 +146,24 @@ fn a_pour_ends_upright_with_its_volume() {
     world.pour(3.0).expect("the next pour starts");
 }
 
+/// Protects the policy's word where the loop is faster than the camera: an action takes several ticks under the limits, and no more.
+#[test]
+fn an_action_is_finished_between_frames() {
+    let mut world = World::new();
+    world.settings.period_ns = 8_000_000;
+    world.core = Core::new(world.settings);
+    world.core.exchange(always(17));
+    world.tick(None);
+    world.pour(50.0).expect("ready");
+    let (first_deg, action_deg) = (world.alpha_deg, action_table()[17]);
+    world.camera = false;
+    for _ in 0..12 {
+        world.tick(None);
+    }
+    assert!(first_deg < action_deg / 2.0, "the limits allow {first_deg} degrees in one tick");
+    assert!((world.alpha_deg - action_deg).abs() < 0.01, "{} degrees after an action of {action_deg}", world.alpha_deg);
+}
+
 /// Protects the operator: a second goal while pouring, nonsense goals and missing weights are refused, with the reason.
 #[test]
 fn orders_that_cannot_be_obeyed_are_refused() {

@@ -55,6 +55,8 @@ enum Expected {
     Nothing,
     /// The pour ends for this reason, and the program brings the container upright by itself.
     Upright(EndReason),
+    /// Nobody is left who could say anything; the program brings the container upright by itself.
+    Orphaned,
     /// The pour ends for this reason, and the robot stops where it is until its operator has acted.
     Stopped(EndReason),
 }
@@ -185,18 +187,19 @@ impl Cell {
 
     /// One cell of the matrix.
     fn check(&mut self, fault: &str, moment: Moment, expected: Expected, strike: impl Fn(&mut Self), recover: impl Fn(&mut Self)) {
+        let orphaned = expected == Expected::Orphaned;
         let connections = self.client.as_ref().unwrap().status().unwrap().robot_connections;
         let said_before = self.said().len();
         let episode = self.reach(moment);
         self.robot.start_trace(24);
         strike(self);
-        let outcome = episode.map(|episode| self.outcome(episode));
+        let outcome = episode.filter(|_| !orphaned).map(|episode| self.outcome(episode));
         let upright = |c: &Self| {
             let (alpha, rate) = c.alpha();
             (alpha.abs() < 1.0 && rate.abs() < 1.0).then_some(())
         };
         let wanted = match expected {
-            Expected::Nothing => EndReason::Done,
+            Expected::Nothing | Expected::Orphaned => EndReason::Done,
             Expected::Upright(reason) | Expected::Stopped(reason) => reason,
         };
         match expected {
@@ -210,7 +213,7 @@ impl Cell {
 
         self.robot.start_trace(24);
         recover(self);
-        if expected != Expected::Nothing {
+        if expected != Expected::Nothing && !orphaned {
             self.until("connected anew", |c| {
                 let status = c.client.as_ref()?.status().ok()?;
                 (status.robot_connections != connections).then_some(())
@@ -234,7 +237,7 @@ impl Cell {
             assert_eq!(outcome.reason, wanted, "{}", context());
             assert!(outcome.poured_ml > 0.0 || moment == Moment::TiltingOut, "what was poured is reported\n{}", context());
         }
-        if moment == Moment::AtRest && expected != Expected::Nothing {
+        if moment == Moment::AtRest && expected != Expected::Nothing && !orphaned {
             // Nothing was under way that could have a result: then the operator is told.
             let said = self.said().split_off(said_before);
             let words = [wanted.words(), &Lost::Closed.to_string(), &Lost::Broken.to_string()].map(str::to_owned);
@@ -242,7 +245,7 @@ impl Cell {
         }
         match expected {
             Expected::Nothing => {}
-            Expected::Upright(_) => {
+            Expected::Upright(_) | Expected::Orphaned => {
                 let bound = UPRIGHT_BOUND_S + motion.peak_deg / RETURN_RATE_DEG_S;
                 assert!(motion.upright_s.is_some_and(|s| s <= bound), "upright within {bound:.2} s\n{}", context());
             }
@@ -566,6 +569,18 @@ fn program_stop() {
 fn program_pause() {
     let strike = |c: &mut Cell| c.robot.inject(Fault::ProgramPause);
     matrix("program-pause", 20, Expected::Stopped(EndReason::ProgramStopped), strike, |c| c.dashboard("play"));
+}
+
+/// Protects people: a controller that dies in mid-pour leaves a robot that comes upright, and a new one takes over.
+#[test]
+fn controller_killed() {
+    let strike = |c: &mut Cell| {
+        c.process.kill().unwrap();
+        c.process.wait().unwrap();
+        c.client = None;
+    };
+    let recover = |c: &mut Cell| c.process = start_controller(c.directory.path());
+    matrix("sigkill", 22, Expected::Orphaned, strike, recover);
 }
 
 /// Protects the pour from a controller that was stopped: the program comes upright, and the controller knows why.
