@@ -110,7 +110,7 @@ fn work(config: &Config, json: bool) -> Result<(), (u8, String)> {
         eprintln!("feature-worker: {missing}");
     }
 
-    let epoch_ns = os::now_ns();
+    let mut epoch_ns = os::now_ns();
     let mut status = Status { doubt: Doubt::None.words(), ..Status::default() };
     let mut newest = (0, 0); // sequence, captured_at_ns
     let mut last_frame_ns = epoch_ns;
@@ -138,6 +138,10 @@ fn work(config: &Config, json: bool) -> Result<(), (u8, String)> {
             // at 1 again, but its frames are younger.)
             status.repeated += 1;
             continue;
+        }
+        if header.sequence <= newest.0 {
+            // To the controller, who counts frames by their numbers, this is a new camera.
+            epoch_ns = received_at_ns;
         }
         if newest.0 > 0 && header.sequence > newest.0 + 1 {
             status.lost += header.sequence - newest.0 - 1;

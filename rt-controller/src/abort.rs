@@ -36,10 +36,11 @@ pub fn run(args: &Args) -> ExitCode {
         Ok(_) => return exit::fail(exit::UNREACHABLE, crate::client::ClientError::Version),
         Err(e) => return exit::fail(exit::UNREACHABLE, e),
     }
+    let tolerance_deg = config.robot.start_tolerance_deg;
     let until = Instant::now() + Duration::from_secs(20);
     while Instant::now() < until {
         match client.status() {
-            Ok(s) if matches!(s.phase, Phase::Idle | Phase::Settling) => {
+            Ok(s) if matches!(s.phase, Phase::Idle | Phase::Settling) && f64::from(s.alpha_measured_deg.abs()) <= tolerance_deg => {
                 println!("upright");
                 return ExitCode::SUCCESS;
             }

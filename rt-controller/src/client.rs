@@ -76,9 +76,9 @@ impl Client {
 /// Why a pour could not be followed to its end.
 #[derive(Debug, thiserror::Error)]
 pub enum FollowError {
-    /// The person pressed Ctrl-C; the container was brought upright.
-    #[error("interrupted")]
-    Interrupted,
+    /// The person pressed Ctrl-C; how it ended then.
+    #[error("interrupted: {}", .0.reason.words())]
+    Interrupted(Outcome),
     /// The controller is gone.
     #[error(transparent)]
     Client(#[from] ClientError),
@@ -102,7 +102,7 @@ impl Client {
             let status = self.status()?;
             if let Some(outcome) = status.outcomes.iter().find(|o| o.episode == episode) {
                 bar.finish_and_clear();
-                return if aborted { Err(FollowError::Interrupted) } else { Ok(*outcome) };
+                return if aborted { Err(FollowError::Interrupted(*outcome)) } else { Ok(*outcome) };
             }
             if status.episode != episode && status.episode != 0 {
                 return Err(ClientError::Version.into());

@@ -1,7 +1,7 @@
 //! The fixed-rate loop: absolute deadlines on CLOCK_MONOTONIC; a missed period is skipped and counted, never bursted.
 //!
-//! Runs in the real-time thread. After its set-up it does not allocate, lock, log, or call anything that blocks but the sleep
-//! itself; the count of its allocations is part of `status`. Nothing in it fails: a lost robot is handed back and the core
+//! Runs in the real-time thread. Its ticks do not allocate, lock, log, or call anything that blocks but the sleep itself; the count
+//! of their allocations is part of `status`. The exception is [`Ticks::meet_feature_worker`]. Nothing in it fails: a lost robot is handed back and the core
 //! ends the pour, a lost feature worker shows as stale features.
 
 use std::sync::atomic::{AtomicU64, Ordering::Relaxed};
@@ -107,7 +107,8 @@ impl<'a> Ticks<'a> {
 
         self.fresh.clear();
         // Older ones than fit would be stale; `receive` gives the oldest first.
-        while let Ok(Some(sample)) = self.features.receive() {
+        for _ in 0..2 * MAX_FEATURES {
+            let Ok(Some(sample)) = self.features.receive() else { break };
             if self.fresh.is_full() {
                 self.fresh.remove(0);
             }

@@ -17,10 +17,10 @@ use shared::control::{Curve, EndReason, Outcome};
 use shared::limits::{Clipped, Limiter, Limits};
 use shared::messages::{Doubt, Feature, LAYOUT_VERSION, Phase, Telemetry};
 
+use crate::link::program::patience_s;
+
 /// Most features that one tick takes, the newest ones: the loop would have to be late by a quarter of a second for more.
 pub const MAX_FEATURES: usize = 8;
-/// A measured alpha within this of upright counts as upright, degrees.
-const UPRIGHT_DEG: f32 = 2.0;
 /// Most lost frames that are bridged at once: what is longer is stale.
 const MAX_BRIDGED: u64 = 30;
 /// Frames without flow after which the last drops are counted.
@@ -29,8 +29,6 @@ const SETTLE_QUIET_FRAMES: u32 = 15;
 const SETTLE_MAX_S: f64 = 3.0;
 /// A feature older than this many periods counts its tick as stale.
 const STALE_TICK_PERIODS: u64 = 3;
-/// The robot's program goes upright by itself after 100 ms without us; then so do we.
-pub const PATIENCE_NS: u64 = 100_000_000;
 
 /// The part of the configuration that decisions depend on.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
@@ -47,6 +45,10 @@ pub struct Settings {
     pub empty_frames: u32,
     /// Largest goal, ml.
     pub goal_max_ml: f32,
+    /// A measured alpha within this of upright counts as upright, degrees.
+    pub upright_deg: f32,
+    /// After this long without us the robot's program goes upright by itself, ns; then so do we.
+    pub patience_ns: u64,
 }
 
 impl Settings {
@@ -60,6 +62,8 @@ impl Settings {
             max_frames: controller.max_frames,
             empty_frames: controller.empty_frames,
             goal_max_ml: controller.goal_max_ml,
+            upright_deg: config.robot.start_tolerance_deg as f32,
+            patience_ns: (patience_s(controller.rate_hz) * 1e9) as u64,
         }
     }
 }
@@ -115,7 +119,10 @@ impl std::fmt::Display for Refusal {
             Self::Robot(reason) => write!(f, "the robot may not move: {}", reason.words()),
             Self::NotUpright(deg) => write!(f, "the container is tilted by {deg:.0} degrees: bring it upright at the robot's pendant"),
             Self::NoFeature => {
-                write!(f, "no fresh measurement from the feature worker: is `feature-worker run` running, does the camera deliver?")
+                write!(
+                    f,
+                    "no fresh, usable measurement: is `feature-worker run` running, does the camera deliver, what does the worker say?"
+                )
             }
             Self::NoWeights => write!(f, "no valid weight file is loaded: train one, or see `rt-controller status`"),
             Self::Goal(max) => write!(f, "the goal must be above 0 and at most {max} ml (controller.goal_max_ml)"),
@@ -208,6 +215,8 @@ pub struct Core {
     run: Option<Run>,
     decision: Decision,
     newest: Option<Feature>,
+    /// When the newest picture was taken in which V_e could be measured; a camera that only shows darkness is no camera.
+    usable_at_ns: u64,
     shutdown: bool,
     last_tick_ns: u64,
     commanded: Commanded,
@@ -250,6 +259,7 @@ impl Core {
             run: None,
             decision: Decision::NOTHING,
             newest: None,
+            usable_at_ns: 0,
             shutdown: false,
             last_tick_ns: 0,
             commanded: Commanded([(0, 0.0); COMMANDS]),
@@ -281,7 +291,7 @@ impl Core {
     /// One tick.
     pub fn step(&mut self, input: &Input) -> Output {
         self.counters.ticks += 1;
-        let overslept = self.last_tick_ns != 0 && input.now_ns.saturating_sub(self.last_tick_ns) > PATIENCE_NS;
+        let overslept = self.last_tick_ns != 0 && input.now_ns.saturating_sub(self.last_tick_ns) > self.settings.patience_ns;
         let late = self.last_tick_ns != 0 && input.now_ns.saturating_sub(self.last_tick_ns) > self.settings.period_ns * 3 / 2;
         self.last_tick_ns = input.now_ns;
         if let Some(run) = &mut self.run {
@@ -310,7 +320,7 @@ impl Core {
                 let run = self.run.take()?;
                 Some(self.outcome(&Run { reason: worse(run.reason, reason), ..run }, input.now_ns))
             }
-            None if self.phase == Phase::NoRobot && input.robot.alpha_deg.abs() <= UPRIGHT_DEG => {
+            None if self.phase == Phase::NoRobot && input.robot.alpha_deg.abs() <= self.settings.upright_deg => {
                 self.limiter.rest_at(input.robot.alpha_deg.clamp(self.settings.limits.alpha_min_deg, self.settings.limits.alpha_max_deg));
                 self.phase = Phase::Idle;
                 None
@@ -371,11 +381,9 @@ impl Core {
             Phase::NoRobot => return Err(Refusal::NotUpright(input.robot.alpha_deg)),
             _ => return Err(Refusal::Busy),
         }
-        let newest = input.features.last().or(self.newest.as_ref());
-        match newest {
-            Some(f) if input.now_ns.saturating_sub(f.captured_at_ns) <= self.settings.stale_ns => Ok(()),
-            _ => Err(Refusal::NoFeature),
-        }
+        let usable = input.features.iter().filter(|f| !foreign(f, input.now_ns) && measured(f).is_some());
+        let newest_ns = usable.map(|f| f.captured_at_ns).fold(self.usable_at_ns, u64::max);
+        if input.now_ns.saturating_sub(newest_ns) <= self.settings.stale_ns { Ok(()) } else { Err(Refusal::NoFeature) }
     }
 
     /// The curve's height, rate and acceleration (their maxima over time) must fit the limits, so that it is run as given.
@@ -436,12 +444,16 @@ impl Core {
         for feature in input.features {
             let previous = self.newest;
             let same_worker = previous.is_some_and(|p| p.worker_epoch_ns == feature.worker_epoch_ns);
-            if feature.version != LAYOUT_VERSION || (same_worker && previous.is_some_and(|p| feature.sequence <= p.sequence)) {
+            if foreign(feature, input.now_ns) || (same_worker && previous.is_some_and(|p| feature.sequence <= p.sequence)) {
                 self.counters.ignored_features += 1;
                 continue;
             }
             self.newest = Some(*feature);
             self.counters.features += 1;
+            let measured = measured(feature);
+            if measured.is_some() {
+                self.usable_at_ns = feature.captured_at_ns;
+            }
             let Some(run) = &mut self.run else { continue };
             if feature.worker_epoch_ns != run.worker_epoch_ns {
                 self.give_up(EndReason::WorkerRestarted);
@@ -453,8 +465,6 @@ impl Core {
                 _ => 0,
             };
             self.counters.bridged_frames += u64::from(lost);
-            let fine = feature.area_px2.is_finite() && feature.area_px2 >= 0.0 && Doubt::from_code(feature.doubt).usable();
-            let measured = fine.then_some(feature.area_px2);
             area = measured.unwrap_or(f32::NAN);
             run.frames += lost + 1;
             let (Some(agent), Some(_)) = (&mut self.agent, run.goal_ml) else { continue };
@@ -479,7 +489,7 @@ impl Core {
 
     /// Moves on to the next phase when this one is over.
     fn advance(&mut self, input: &Input) -> Option<Outcome> {
-        let age_ns = self.newest.map_or(u64::MAX, |f| input.now_ns.saturating_sub(f.captured_at_ns));
+        let age_ns = input.now_ns.saturating_sub(self.usable_at_ns);
         let settings = self.settings;
         let run = self.run.as_mut()?;
         let seconds = |since_ns: u64| input.now_ns.saturating_sub(since_ns) as f64 / 1e9;
@@ -497,15 +507,19 @@ impl Core {
             Phase::Recording if run.curve.is_none_or(|c| seconds(run.started_at_ns) >= 2.0 * f64::from(c.beta_s)) => {
                 self.phase = Phase::Returning;
             }
-            Phase::Returning if self.limiter.alpha_deg() <= 0.0 => {
+            Phase::Returning if self.limiter.alpha_deg().abs() < 0.01 => {
                 self.phase = Phase::Settling;
                 run.settling_since_ns = input.now_ns;
                 run.quiet_frames = 0;
             }
             Phase::Settling => {
+                // Upright is what the joint is, not what it was told.
+                let upright = input.robot.alpha_deg.abs() <= settings.upright_deg;
                 let quiet = run.quiet_frames >= SETTLE_QUIET_FRAMES && run.goal_ml.is_some();
-                if quiet || seconds(run.settling_since_ns) >= SETTLE_MAX_S || self.shutdown {
-                    let run = *run;
+                let over = seconds(run.settling_since_ns) >= SETTLE_MAX_S;
+                if over || (upright && (quiet || self.shutdown)) {
+                    let reason = if upright { run.reason } else { EndReason::NotUpright };
+                    let run = Run { reason, ..*run };
                     self.run = None;
                     self.phase = Phase::Idle;
                     return Some(self.outcome(&run, input.now_ns));
@@ -530,7 +544,7 @@ impl Core {
             }
             Phase::Idle | Phase::Returning | Phase::Settling => {
                 let target = self.limiter.step_upright();
-                if self.phase == Phase::Returning && self.run.is_none() && target <= 0.0 {
+                if self.phase == Phase::Returning && self.run.is_none() && target.abs() < 0.01 {
                     self.phase = Phase::Idle;
                 }
                 Some(target)
@@ -591,10 +605,21 @@ pub fn curve_alpha_deg(curve: &Curve, t_s: f32) -> f32 {
     curve.lambda_deg * (-curve.gamma_per_s2 * (t_s - curve.beta_s).powi(2)).exp()
 }
 
+/// Of another layout, or of another clock: the age of a picture from the future, on which so much rests, would mean nothing.
+fn foreign(feature: &Feature, now_ns: u64) -> bool {
+    feature.version != LAYOUT_VERSION || feature.captured_at_ns > now_ns
+}
+
+/// V_e, if it could be measured, px^2.
+fn measured(feature: &Feature) -> Option<f32> {
+    let fine = feature.area_px2.is_finite() && feature.area_px2 >= 0.0 && Doubt::from_code(feature.doubt).usable();
+    fine.then_some(feature.area_px2)
+}
+
 /// When the `nth` of `lost` frames before `feature` was taken: they lie evenly after the previous one.
 fn between_ns(previous: Option<Feature>, feature: &Feature, nth: u32, lost: u32) -> u64 {
     let from_ns = previous.map_or(feature.captured_at_ns, |p| p.captured_at_ns);
-    from_ns + feature.captured_at_ns.saturating_sub(from_ns) * u64::from(nth) / u64::from(lost + 1)
+    from_ns.saturating_add(feature.captured_at_ns.saturating_sub(from_ns) / u64::from(lost + 1) * u64::from(nth))
 }
 
 /// A run that was already ending keeps its first reason, unless that was no fault.

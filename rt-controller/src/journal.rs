@@ -99,11 +99,13 @@ pub struct Writer {
 }
 
 impl Writer {
-    /// Starts a journal; one that is there already is replaced.
+    /// Starts a journal; one that is there already is kept beside it as `NAME.before.bin`.
     pub fn create(path: &Path, settings: &Settings) -> std::io::Result<Self> {
         if let Some(parent) = path.parent() {
             std::fs::create_dir_all(parent)?;
         }
+        // What the run before this one did is wanted most after it crashed.
+        let _ = std::fs::rename(path, path.with_extension("before.bin"));
         let mut this = Self { file: BufWriter::new(File::create(path)?), written: 0 };
         this.file.write_all(MAGIC)?;
         this.entry(&Entry::Settings(*settings))?;

@@ -36,7 +36,11 @@ enum Command {
 }
 
 fn main() -> ExitCode {
-    match Cli::parse().command {
+    let command = Cli::parse().command;
+    if matches!(command, Command::Status(_) | Command::Replay(_)) {
+        shared::os::end_when_nobody_reads();
+    }
+    match command {
         Command::Run(args) => run::run(&args),
         Command::Pour(args) => pour::run(&args),
         Command::Record(args) => record::run(&args),

@@ -48,7 +48,10 @@ pub(crate) fn order(cell: &str, request: &Request) -> Result<(Outcome, Option<cl
         Err(e) => return Err(exit::fail(exit::UNREACHABLE, e)),
     };
     let outcome = client.follow(episode).map_err(|e| match e {
-        FollowError::Interrupted => exit::fail(exit::INTERRUPTED, "interrupted: the container was brought upright"),
+        FollowError::Interrupted(o) if matches!(o.reason, EndReason::Aborted | EndReason::Done) => {
+            exit::fail(exit::INTERRUPTED, format!("interrupted: {}, the container is upright", o.reason.words()))
+        }
+        e @ FollowError::Interrupted(_) => exit::fail(exit::INTERRUPTED, format!("{e}; look at the robot")),
         FollowError::Client(e) => exit::fail(exit::UNREACHABLE, e),
     })?;
     Ok((outcome, recorder.and_then(|r| r.wait(episode))))

@@ -3,6 +3,7 @@
 //! Main thread: clients, telemetry, weights (ordinary). Thread "loop": real-time. Thread "robot": connects. A signal brings the
 //! container upright and ends the process; a second one ends it at once (the robot's program then goes upright by itself).
 
+use std::io::Write;
 use std::path::PathBuf;
 use std::process::ExitCode;
 use std::sync::Arc;
@@ -40,7 +41,13 @@ pub fn run(args: &Args) -> ExitCode {
         Ok(config) => config,
         Err(e) => return exit::fail(exit::BAD_INPUT, e),
     };
-    let say = |text: &str| eprintln!("rt-controller: {text}");
+    // A terminal that has gone away is no reason to stop.
+    let say = |text: &str| _ = writeln!(std::io::stderr(), "rt-controller: {text}");
+    // Half a controller would be worse than none: without targets the robot's program comes upright by itself.
+    std::panic::set_hook(Box::new(|panic| {
+        let _ = writeln!(std::io::stderr(), "rt-controller: a defect, please report it: {panic}");
+        std::process::abort();
+    }));
     let stop = Arc::new(AtomicBool::new(false));
     for signal in [signal_hook::consts::SIGINT, signal_hook::consts::SIGTERM] {
         // Armed by the first signal, so that only a second one ends the process at once.
@@ -55,6 +62,7 @@ pub fn run(args: &Args) -> ExitCode {
     if let Err(line) = shared::os::lock_memory() {
         say(&line);
     }
+    let _awake = shared::os::stay_awake().map_err(|line| say(&line));
     let exchange = Exchange::default();
     let (note, connections) = (RobotNote::default(), AtomicU64::new(0));
     let outcome = std::thread::scope(|scope| {

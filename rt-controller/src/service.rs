@@ -98,6 +98,8 @@ pub fn keep_robot_connected(
 /// Notices a new weight file, reads and checks it, and hands it to the loop.
 struct WeightsWatch {
     path: PathBuf,
+    /// Frames a second of the camera: calibration and policy are for one rate only.
+    fps: f64,
     seen: Option<(std::time::SystemTime, u64, u64)>,
     id: String,
     /// Identity of the policy that waits in the queue for the end of a pour.
@@ -108,8 +110,8 @@ struct WeightsWatch {
 }
 
 impl WeightsWatch {
-    fn new(path: &Path) -> Self {
-        Self { path: path.into(), seen: None, id: String::new(), waiting: String::new(), refused: String::new(), number: 0 }
+    fn new(path: &Path, fps: f64) -> Self {
+        Self { path: path.into(), fps, seen: None, id: String::new(), waiting: String::new(), refused: String::new(), number: 0 }
     }
 
     fn look(&mut self, exchange: &Exchange, journal: &mut Journal, say: &dyn Fn(&str)) {
@@ -128,7 +130,14 @@ impl WeightsWatch {
             return;
         }
         self.seen = stamp;
-        match Weights::read(&self.path) {
+        let fps = self.fps;
+        let fit = |weights: Weights| {
+            let trained = weights.rate_hz;
+            let fits = (f64::from(trained) / fps - 1.0).abs() < 0.02;
+            let why = "train with episodes of this camera";
+            if fits { Ok(weights) } else { Err(format!("trained at {trained} frames/s, camera.fps is {fps}: {why}")) }
+        };
+        match Weights::read(&self.path).map_err(|e| e.to_string()).and_then(fit) {
             Ok(weights) => {
                 self.refused.clear();
                 self.waiting = weights.identity();
@@ -139,7 +148,7 @@ impl WeightsWatch {
                 drop(exchange.agents.force_push((self.number, Box::new(Agent::new(&weights)))));
             }
             Err(e) => {
-                self.refused = e.to_string();
+                self.refused.clone_from(&e);
                 say(&format!("weights refused, the old ones stay: {e}"));
             }
         }
@@ -170,7 +179,8 @@ pub struct Service<'a> {
     journal: Journal,
     latest: Option<(Telemetry, Counters)>,
     outcomes: VecDeque<Outcome>,
-    waiting: VecDeque<(Asked, u64)>,
+    /// Who waits for the answers to the orders in the queue; `None`: our own order.
+    waiting: VecDeque<Option<(Asked, u64)>>,
     next_episode: u64,
 }
 
@@ -209,7 +219,7 @@ impl<'a> Service<'a> {
             say,
             server,
             telemetry,
-            weights: WeightsWatch::new(&config.controller.weights),
+            weights: WeightsWatch::new(&config.controller.weights, config.camera.fps),
             journal: Journal(journal),
             latest: None,
             outcomes: VecDeque::new(),
@@ -224,6 +234,9 @@ impl<'a> Service<'a> {
         while !self.exchange.ended.load(Relaxed) {
             if stop.load(Relaxed) && !stopping {
                 stopping = self.exchange.orders.push(Order::Shutdown).is_ok();
+                if stopping {
+                    self.waiting.push_back(None);
+                }
             }
             while self.exchange.old_agents.pop().is_some() {}
             self.weights.look(self.exchange, &mut self.journal, self.say);
@@ -246,7 +259,7 @@ impl<'a> Service<'a> {
                     let _ = self.telemetry.send_copy(telemetry);
                 }
                 Event::Ordered(answer) => {
-                    if let Some((asked, episode)) = self.waiting.pop_front() {
+                    if let Some(Some((asked, episode))) = self.waiting.pop_front() {
                         reply(
                             &asked,
                             &match answer {
@@ -305,7 +318,7 @@ impl<'a> Service<'a> {
             };
             self.next_episode += u64::from(episode != 0);
             match self.exchange.orders.push(order) {
-                Ok(()) => self.waiting.push_back((asked, episode)),
+                Ok(()) => self.waiting.push_back(Some((asked, episode))),
                 Err(_) => reply(&asked, &Reply::Refused { reason: "too many orders at once: try again".into() }),
             }
         }

@@ -40,6 +40,9 @@ struct World {
     settings: Settings,
     out_ml: f32,
     largest_rate_deg_s: f32,
+    /// The camera driver's clock is ahead of ours.
+    clock_ahead_ns: u64,
+    last_ended: Option<Outcome>,
 }
 
 impl World {
@@ -61,6 +64,8 @@ impl World {
             settings,
             out_ml: 0.0,
             largest_rate_deg_s: 0.0,
+            clock_ahead_ns: 0,
+            last_ended: None,
         };
         world.tick(None);
         world
@@ -75,7 +80,7 @@ impl World {
             doubt: self.doubt as u32,
             sequence: self.sequence,
             worker_epoch_ns: self.epoch_ns,
-            captured_at_ns: self.now_ns - 20_000_000,
+            captured_at_ns: self.now_ns - 20_000_000 + self.clock_ahead_ns,
             received_at_ns: self.now_ns - 1_000_000,
             published_at_ns: self.now_ns - 500_000,
             area_px2,
@@ -99,6 +104,13 @@ impl World {
             self.alpha_deg = target_deg;
         }
         output
+    }
+
+    /// A tick in which the joint is elsewhere than it was commanded.
+    fn tick_with_joint_at(&mut self, alpha_deg: f32) {
+        self.alpha_deg = alpha_deg;
+        let output = self.tick(None);
+        self.last_ended = output.ended.or(self.last_ended);
     }
 
     fn pour(&mut self, goal_ml: f32) -> Result<(), Refusal> {
@@ -177,6 +189,10 @@ fn orders_that_cannot_be_obeyed_are_refused() {
     blank.core = Core::new(blank.settings);
     blank.tick(None);
     assert_eq!(blank.pour(50.0), Err(Refusal::NoWeights));
+    let mut dark = World::new();
+    dark.doubt = Doubt::TooDark;
+    (0..10).for_each(|_| _ = dark.tick(None));
+    assert_eq!(dark.pour(50.0), Err(Refusal::NoFeature), "nothing can be seen");
     blank.hindrance = Some(EndReason::ProtectiveStop);
     assert_eq!(blank.pour(50.0), Err(Refusal::Robot(EndReason::ProtectiveStop)));
 }
@@ -185,8 +201,10 @@ fn orders_that_cannot_be_obeyed_are_refused() {
 #[test]
 fn every_doubt_ends_the_pour_upright_with_its_reason() {
     type Trouble = fn(&mut World);
-    let troubles: [(Trouble, EndReason); 6] = [
+    let troubles: [(Trouble, EndReason); 8] = [
         (|w| w.camera = false, EndReason::StaleFeature),
+        (|w| w.doubt = Doubt::TooDark, EndReason::StaleFeature),
+        (|w| w.clock_ahead_ns = 1_000_000_000_000, EndReason::StaleFeature),
         (|w| w.epoch_ns += 1, EndReason::WorkerRestarted),
         (|w| w.dry = true, EndReason::ContainerEmpty),
         (|w| w.now_ns += 150_000_000, EndReason::ControllerOverrun),
@@ -241,6 +259,19 @@ fn lost_and_doubtful_frames_are_bridged() {
     assert_eq!((outcome.reason, outcome.bridged_frames), (EndReason::Done, 2));
     // The three frames are taken as the one before them: the flow is rising, so a little is missing.
     assert!((outcome.poured_ml - world.out_ml).abs() < 0.5, "reported {}, really {}", outcome.poured_ml, world.out_ml);
+}
+
+/// Protects people: a joint that stays tilted although nothing hinders it is not called upright.
+#[test]
+fn a_joint_that_stays_tilted_is_reported() {
+    let mut world = World::new();
+    world.pour(8.0).expect("ready");
+    world.run_to_flow();
+    world.tick(Some(Order::Abort));
+    for _ in 0..300 {
+        world.tick_with_joint_at(30.0);
+    }
+    assert_eq!(world.last_ended.map(|o| o.reason), Some(EndReason::NotUpright));
 }
 
 /// Protects d from being counted twice: repeated, older and foreign features are ignored and counted.

@@ -330,6 +330,14 @@ impl Config {
         check.range("limits.acceleration_deg_s2", limits.acceleration_deg_s2.into(), 10.0, 2290.0)?;
         check.range("limits.return_rate_deg_s", limits.return_rate_deg_s.into(), 1.0, 180.0)?;
 
+        let ends = [limits.alpha_min_deg, limits.alpha_max_deg].map(|a| robot.start_joint_deg + robot.direction * f64::from(a));
+        check.rule(
+            "robot.start_joint_deg",
+            &robot.start_joint_deg.to_string(),
+            ends.iter().all(|e| e.abs() <= 360.0),
+            "an angle from which limits.alpha_min_deg and limits.alpha_max_deg stay within the joint's -360 to 360",
+        )?;
+
         check.range("controller.rate_hz", controller.rate_hz, 10.0, 125.0)?;
         check.range("controller.core", controller.core as f64, 0.0, 1023.0)?;
         check.range("controller.priority", controller.priority.into(), 0.0, 99.0)?;
@@ -386,6 +394,7 @@ mod tests {
     fn mistakes_are_refused_with_file_key_and_range() {
         for (from, to, words) in [
             ("rate_hz = 30.0", "rate_hz = 3.0", ["controller.rate_hz = 3", "10 to 125"]),
+            ("start_joint_deg = 0.0", "start_joint_deg = 300.0", ["robot.start_joint_deg = 300", "limits.alpha_max_deg"]),
             ("rate_hz = 30.0", "rate_hz = \"fast\"", ["rate_hz", "invalid type"]),
             ("rate_hz = 30.0", "rate_hz = nan", ["controller.rate_hz", "10 to 125"]),
             ("gain = 600.0", "gian = 600.0", ["gian", "expected one of"]),

@@ -90,7 +90,7 @@ pub enum EndReason {
     MaxFrames,
     /// Largest tilt, no more flow.
     ContainerEmpty,
-    /// No feature for longer than `controller.stale_feature_ms`.
+    /// No feature, or none that is beyond doubt, for longer than `controller.stale_feature_ms`.
     StaleFeature,
     /// The feature worker was restarted.
     WorkerRestarted,
@@ -112,6 +112,8 @@ pub enum EndReason {
     ControllerOverrun,
     /// The controller is shutting down.
     Shutdown,
+    /// The joint did not come upright although nothing hindered it.
+    NotUpright,
 }
 
 impl EndReason {
@@ -122,7 +124,7 @@ impl EndReason {
             Self::Aborted => "aborted by the operator",
             Self::MaxFrames => "the largest number of frames was reached",
             Self::ContainerEmpty => "the container is empty",
-            Self::StaleFeature => "no fresh measurement from the feature worker",
+            Self::StaleFeature => "no fresh, usable measurement from the feature worker",
             Self::WorkerRestarted => "the feature worker was restarted",
             Self::RobotLost => "connection to the robot lost",
             Self::RobotStalled => "the robot's clock stands still",
@@ -133,6 +135,7 @@ impl EndReason {
             Self::RobotNotRunning => "the robot is not powered and released",
             Self::ControllerOverrun => "the controller was stopped too long",
             Self::Shutdown => "the controller is shutting down",
+            Self::NotUpright => "the container did not come upright: look at the robot",
         }
     }
 }

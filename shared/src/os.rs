@@ -59,6 +59,25 @@ pub fn lock_memory() -> Result<(), String> {
         .map_err(|e| format!("mlockall is not permitted ({e}): set LimitMEMLOCK=infinity or CAP_IPC_LOCK; page faults may delay the loop"))
 }
 
+/// Keeps the processor out of sleep states from which it wakes up slowly, until what it gives back is dropped; answers with the
+/// reason when that is not permitted. `None` where the kernel has no such thing, as in most virtual machines.
+pub fn stay_awake() -> Result<Option<std::fs::File>, String> {
+    use std::io::Write;
+    let path = "/dev/cpu_dma_latency";
+    let held = std::fs::OpenOptions::new().write(true).open(path).and_then(|mut file| file.write_all(&0i32.to_ne_bytes()).map(|()| file));
+    match held {
+        Ok(file) => Ok(Some(file)),
+        Err(e) if e.kind() == std::io::ErrorKind::NotFound => Ok(None),
+        Err(e) => Err(format!("{path}: {e}: the processor may wake up late from deep sleep; run as root or permit it by a udev rule")),
+    }
+}
+
+/// Lets the process end quietly when nobody reads its output any more (`rt-controller status | head`). For commands that only print.
+pub fn end_when_nobody_reads() {
+    // SAFETY: the default action of a signal is no function of ours, so there is nothing that could be called unsafely.
+    unsafe { libc::signal(libc::SIGPIPE, libc::SIG_DFL) };
+}
+
 /// Page faults of the calling thread so far: (minor, major).
 pub fn page_faults() -> (u64, u64) {
     // SAFETY: `rusage` is plain data for which all zeroes is a valid value.

@@ -240,7 +240,10 @@ impl Cell {
         if moment == Moment::AtRest && expected != Expected::Nothing && !orphaned {
             // Nothing was under way that could have a result: then the operator is told.
             let said = self.said().split_off(said_before);
-            let words = [wanted.words(), &Lost::Closed.to_string(), &Lost::Broken.to_string()].map(str::to_owned);
+            let mut words = vec![wanted.words().to_owned()];
+            if wanted == EndReason::RobotLost {
+                words.extend([Lost::Closed, Lost::Broken].map(|l| l.to_string()));
+            }
             assert!(words.iter().any(|w| said.contains(w)), "{words:?}\n{}", context());
         }
         match expected {

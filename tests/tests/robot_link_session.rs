@@ -158,6 +158,13 @@ fn latency_is_measured() {
         };
         println!("{series:?}: target written -> its number read back: {}", percentiles(&mut echoes));
         println!("{series:?}: target written -> joint moved by 0.02 degrees: {}", percentiles(&mut motions));
-        assert!(!echoes.is_empty() && !motions.is_empty());
+        println!("{series:?}: published for a real UR: 35 ms to the first motion");
+        // One that is later than 80 ms is missing in the lists: a busy machine may lose a few, a slow link would lose most.
+        assert!(
+            echoes.len() >= 50 && motions.len() >= 50,
+            "of 60 steps {} were echoed and {} moved the joint",
+            echoes.len(),
+            motions.len()
+        );
     }
 }

@@ -93,7 +93,16 @@ impl Trace {
 
 /// The settings that the core runs with: the defaults of the configuration, no goal limit.
 fn settings(limits: Limits) -> Settings {
-    Settings { period_ns: PERIOD_NS, limits, stale_ns: 200_000_000, max_frames: MAX_FRAMES, empty_frames: 60, goal_max_ml: 1e6 }
+    Settings {
+        period_ns: PERIOD_NS,
+        limits,
+        stale_ns: 200_000_000,
+        max_frames: MAX_FRAMES,
+        empty_frames: 60,
+        goal_max_ml: 1e6,
+        upright_deg: 2.0,
+        patience_ns: 100_000_000,
+    }
 }
 
 /// Pours `goal_ml` with the running controller's core and `agent`; the frames are added to `trace` if there is one.
