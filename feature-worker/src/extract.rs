@@ -54,6 +54,18 @@ const DARK_LEVEL: f32 = 14.0;
 const BLOWN_SHARE: f32 = 0.5;
 /// An edge that takes longer than this from 20 to 80 % is blurred, px.
 const BLURRED_PX: f32 = 4.5;
+/// Without a stream the glass's own edges tell about focus: bundles of profiles across each axis, lines in a bundle (their mean has
+/// less noise), distance of the bundles and of the lines, and reach on either side, px.
+const RIM_BUNDLES: usize = 12;
+const RIM_LINES: usize = 8;
+const RIM_BUNDLE_PX: f32 = 14.0;
+const RIM_LINE_PX: f32 = 1.5;
+const RIM_REACH: usize = 9;
+/// Least change of brightness across the rim that tells anything, grey levels, and least number of bundles that have it.
+const RIM_CONTRAST: f32 = 14.0;
+const RIM_SEEN: usize = 5;
+/// The change across the rim over its steepest step is its width, px: from here on it is blurred.
+const RIM_BLURRED_PX: f32 = 5.0;
 
 /// Why an extractor cannot be made.
 #[derive(Debug, thiserror::Error)]
@@ -476,6 +488,8 @@ impl Extractor {
                 }
             },
         };
+        let dry = result.area_px2 == 0.0 && result.doubt == Doubt::None;
+        let result = if dry && self.rim_is_blurred(colours) { Measurement::nothing(0.0, Doubt::Blurred) } else { result };
         let done = Instant::now();
         self.converted = converted;
         let ns = |from: Instant, to: Instant| to.duration_since(from).as_nanos() as u64;
@@ -523,6 +537,40 @@ impl Extractor {
         } else {
             None
         })
+    }
+
+    /// Whether the glass's top edge and left side, which are always in the same place, have lost their sharp edges. False when
+    /// they are not seen well enough to tell: glass that is as bright as what is behind, or axes that lie beside them.
+    fn rim_is_blurred(&mut self, colours: Colours) -> bool {
+        self.widths.clear();
+        let axes = self.axes;
+        for (along, across) in [(axes.x, axes.y), ([-axes.y[0], -axes.y[1]], axes.x)] {
+            // Square to the axis, so that an oblique container does not look soft.
+            let skew = across[0] * along[0] + across[1] * along[1];
+            let across = [across[0] - skew * along[0], across[1] - skew * along[1]];
+            let length = across[0].hypot(across[1]);
+            for bundle in 0..RIM_BUNDLES {
+                let mut profile = [0.0f32; 2 * RIM_REACH + 1];
+                let inside = profile.iter_mut().enumerate().all(|(j, level)| {
+                    let d = (j as f32 - RIM_REACH as f32) / length;
+                    (0..RIM_LINES).all(|line| {
+                        let s = RIM_BUNDLE_PX * (1 + bundle) as f32 + RIM_LINE_PX * line as f32;
+                        let [x, y] = axes.at(s, along);
+                        let colour = colours.at(x + d * across[0], y + d * across[1]);
+                        *level += colour.map_or(0.0, |c| c.iter().sum::<f32>()) / (3 * RIM_LINES) as f32;
+                        colour.is_some()
+                    })
+                });
+                let (low, high) = profile.iter().fold((f32::MAX, f32::MIN), |(l, h), v| (l.min(*v), h.max(*v)));
+                if inside && high - low >= RIM_CONTRAST {
+                    let steepest = profile.windows(4).map(|w| (w[3] - w[0]).abs() / 3.0).fold(0.0, f32::max);
+                    self.widths.push((high - low) / steepest);
+                }
+            }
+        }
+        // What stands behind is out of focus too, so the sharper bundles decide.
+        let sharper = self.widths.len() / 4;
+        self.widths.len() >= RIM_SEEN && *self.widths.select_nth_unstable_by(sharper, f32::total_cmp).1 > RIM_BLURRED_PX
     }
 
     /// Liquid by its colour range, into `self.mask`.
