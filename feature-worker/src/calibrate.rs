@@ -295,17 +295,25 @@ fn write(path: &Path, config: &Config) -> Result<(), (u8, String)> {
     let fail = |e: String| (exit::FAILED, format!("{}: {e}", path.display()));
     let text = std::fs::read_to_string(path).map_err(|e| fail(e.to_string()))?;
     let mut written = String::new();
+    // What stands between the table's last key and the next table belongs to that one.
+    let mut between = String::new();
     let mut inside = false;
     for line in text.lines() {
-        let table = line.trim_start().starts_with('[') && !line.trim_start().starts_with("[[");
-        if table && line.trim_start().starts_with("[image]") {
+        let trimmed = line.trim_start();
+        if trimmed.starts_with("[image]") {
             inside = true;
             written.push_str(&section(&config.image));
-            written.push('\n');
-            continue;
-        }
-        inside &= !table;
-        if !inside {
+        } else if inside && !trimmed.starts_with('[') {
+            if !trimmed.is_empty() && !trimmed.starts_with('#') {
+                between.clear();
+            } else {
+                between.push_str(line);
+                between.push('\n');
+            }
+        } else {
+            if std::mem::take(&mut inside) {
+                written.push_str(if between.is_empty() { "\n" } else { &between });
+            }
             written.push_str(line);
             written.push('\n');
         }

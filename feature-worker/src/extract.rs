@@ -22,6 +22,8 @@ use opencv::prelude::*;
 use shared::config::{CameraConfig, ImageConfig, LiquidMethod};
 use shared::messages::{Doubt, PixelFormat};
 
+use crate::clear::{Background, Seen};
+
 /// Rays between the axes.
 const RAYS: usize = 72;
 /// Distance from the lip at which rays begin, px: bead, rim and corner mix before it.
@@ -34,6 +36,8 @@ const STEP_MOST_PX: f32 = 4.0;
 const PICKS: usize = 13;
 /// Profiles across the line.
 const PROFILES: usize = 48;
+/// Least share of them that show an edge.
+const PROFILES_LEAST: f32 = 0.4;
 /// Samples of a profile on either side of its centre; the outer [`FLANK`] of them tell liquid and background.
 const REACH: usize = 7;
 const FLANK: usize = 3;
@@ -41,11 +45,6 @@ const FLANK: usize = 3;
 const STREAM_RAYS: f32 = 0.8;
 /// More background than this before the first liquid ends a ray, px.
 const GAP_MOST_PX: f32 = 24.0;
-/// Clear water: detail counts up to this many grey levels, so that one glint does not outweigh a line.
-const DETAIL_MOST: f32 = 40.0;
-/// Clear water: least mean score of the path, in units of the noise, and least share of rays on which it is seen.
-const CLEAR_STRENGTH: f32 = 2.0;
-const CLEAR_SHARE: f32 = 0.6;
 /// Least share of liquid between lip and edge on a ray that counts as filled.
 const FILLED: f32 = 0.55;
 /// Mean grey level below which the region counts as dark.
@@ -253,10 +252,7 @@ pub struct Extractor {
     mask: Mat,
     mask_b: Mat,
     grey: Mat,
-    detail: Mat,
-    path_score: Vec<f32>,
-    path_from: Vec<u16>,
-    sums: Vec<f32>,
+    background: Background,
     edges: Vec<[f32; 2]>,
     edge_weights: Vec<f32>,
     fine: Vec<[f32; 2]>,
@@ -381,10 +377,7 @@ impl Extractor {
             mask: Mat::default(),
             mask_b: Mat::default(),
             grey: Mat::default(),
-            detail: Mat::default(),
-            path_score: Vec::new(),
-            path_from: Vec::new(),
-            sums: Vec::new(),
+            background: Background::new(&axes, [region.width, region.height], camera.width_px)?,
             edges: Vec::with_capacity(RAYS),
             edge_weights: Vec::with_capacity(RAYS),
             fine: Vec::with_capacity(PROFILES),
@@ -482,9 +475,9 @@ impl Extractor {
                     (self.find_triangle(colours)?, segmented)
                 }
                 LiquidMethod::Clear => {
-                    self.find_detail()?;
+                    let seen = self.background.look(&self.grey)?;
                     let segmented = Instant::now();
-                    (self.follow_edge(colours)?, segmented)
+                    (self.follow_water(seen, colours)?, segmented)
                 }
             },
         };
@@ -594,93 +587,17 @@ impl Extractor {
         Ok(())
     }
 
-    /// Clear water: fine detail of the region on the rays, into `self.mask`. Water's edge is a fine line, dark or bright
-    /// depending on what it bends into sight; what stands behind is out of focus and has little detail of that size.
-    fn find_detail(&mut self) -> Result<(), ExtractError> {
-        let (size, wide) = (core::Size::new(3, 3), core::Size::new(9, 9));
-        let (anchor, border) = (core::Point::new(-1, -1), core::BORDER_REPLICATE);
-        imgproc::blur(&self.grey, &mut self.smooth, size, anchor, border)?;
-        imgproc::blur(&self.smooth, &mut self.hsv, wide, anchor, border)?;
-        core::absdiff(&self.smooth, &self.hsv, &mut self.mask_b)?;
-        imgproc::dilate(&self.mask_b, &mut self.detail, &core::no_array(), anchor, 1, border, Scalar::all(0.0))?;
-        imgproc::remap(&self.detail, &mut self.mask, &self.map_a, &self.map_b, imgproc::INTER_NEAREST, border, Scalar::default())?;
-        Ok(())
-    }
-
-    /// Clear water, step 1: the path over all rays, from axis to axis, along which there is most detail on it, some inside and
-    /// little outside (dynamic programming over the rays; no OpenCV call does this).
-    fn follow_edge(&mut self, colours: Colours) -> Result<Measurement, ExtractError> {
+    /// The triangle of what [`Background`] saw.
+    fn follow_water(&mut self, seen: Seen, colours: Colours) -> Result<Measurement, ExtractError> {
         self.edges.clear();
-        let samples = self.radii_px.len();
-        // Noise: the median detail of everything between the axes.
-        let mut histogram = [0u32; 256];
-        let mut total = 0u32;
-        for (i, ray) in self.rays.iter().enumerate() {
-            for value in &self.mask.at_row::<u8>(i as i32)?[..ray.samples] {
-                histogram[usize::from(*value)] += 1;
-                total += 1;
+        match seen {
+            Seen::Dry => Ok(Measurement::nothing(1.0, Doubt::None)),
+            Seen::Unsure => Ok(Measurement::nothing(0.0, Doubt::EdgeNotFound)),
+            Seen::Stream(share) => {
+                self.edges.extend_from_slice(self.background.edges_px());
+                self.line_through_edges(share, 0, colours)
             }
         }
-        let mut below = 0;
-        let noise = (0..256).find(|v| {
-            below += histogram[*v];
-            below * 2 >= total
-        });
-        let noise = noise.unwrap_or(0) as f32 + 1.0;
-
-        self.path_score.clear();
-        self.path_score.resize(RAYS * samples, f32::MIN);
-        self.path_from.clear();
-        self.path_from.resize(RAYS * samples, 0);
-        for (i, ray) in self.rays.iter().enumerate() {
-            let row = &self.mask.at_row::<u8>(i as i32)?[..ray.samples];
-            self.sums.clear();
-            self.sums.push(0.0);
-            let mut sum = 0.0;
-            for value in row {
-                sum += f32::from(*value).min(DETAIL_MOST);
-                self.sums.push(sum);
-            }
-            let mean = |from: usize, to: usize| (self.sums[to] - self.sums[from]) / (to - from).max(1) as f32;
-            for (r, value) in row.iter().enumerate().take(ray.samples.saturating_sub(3)).skip(3) {
-                let here = f32::from(*value).min(DETAIL_MOST);
-                let (inside, outside) = (mean(r.saturating_sub(14), r - 2), mean((r + 3).min(ray.samples), (r + 15).min(ray.samples)));
-                let score = here + 0.7 * (inside - outside) - 1.5 * noise;
-                let (mut best, mut from) = (0.0, r);
-                if i > 0 {
-                    best = f32::MIN;
-                    for q in r.saturating_sub(3)..=(r + 3).min(samples - 1) {
-                        let before = self.path_score[(i - 1) * samples + q] - 0.6 * (q as f32 - r as f32).abs();
-                        if before > best {
-                            (best, from) = (before, q);
-                        }
-                    }
-                }
-                self.path_score[i * samples + r] = if best == f32::MIN { f32::MIN } else { best + score };
-                self.path_from[i * samples + r] = from as u16;
-            }
-        }
-        let last = &self.path_score[(RAYS - 1) * samples..];
-        let Some(end) = (0..samples).max_by(|a, b| last[*a].total_cmp(&last[*b])) else {
-            return Ok(Measurement::nothing(0.0, Doubt::EdgeNotFound));
-        };
-        let strength = last[end] / RAYS as f32 / noise;
-        let mut r = end;
-        let mut supported = 0;
-        for i in (0..RAYS).rev() {
-            let row = self.mask.at_row::<u8>(i as i32)?;
-            supported += usize::from(f32::from(row[r]) > 2.5 * noise + 1.0);
-            let r_px = self.radii_px[r];
-            self.edges.push(self.axes.at(r_px, self.rays[i].along));
-            r = usize::from(self.path_from[i * samples + r]);
-        }
-        self.edges.reverse();
-        let share = supported as f32 / RAYS as f32;
-        if strength < CLEAR_STRENGTH || share < CLEAR_SHARE {
-            self.edges.clear();
-            return Ok(Measurement::nothing((1.0 - share).clamp(0.0, 1.0), Doubt::None));
-        }
-        self.line_through_edges(share, 0, colours)
     }
 
     fn find_triangle(&mut self, colours: Colours) -> Result<Measurement, ExtractError> {
@@ -775,6 +692,10 @@ impl Extractor {
 
         // 3. Profiles across it.
         let (line, contrast, width, used) = self.refine(line, a, b, colours);
+        if self.method == LiquidMethod::Clear && used < PROFILES_LEAST {
+            // What the memory of the background took for water has no edge in the picture itself.
+            return Ok(Measurement::nothing(0.0, Doubt::EdgeNotFound));
+        }
         let (a, b) = (line.cut(self.axes.lip_px, self.axes.x), line.cut(self.axes.lip_px, self.axes.y));
         if !(a > 0.0 && b > 0.0 && a < longest && b < longest) {
             return Ok(Measurement::nothing(0.0, Doubt::EdgeNotFound));
@@ -907,7 +828,7 @@ impl Extractor {
             self.scratch.push(square.sqrt());
         }
         let used = self.fine.len() as f32 / PROFILES as f32;
-        if used < 0.4 {
+        if used < PROFILES_LEAST {
             // Too little contrast for profiles: the coarse edges are what there is.
             return (line, 12.0, 1.0, used);
         }
