@@ -90,8 +90,9 @@ pub struct Background {
     right: Vec<f32>,
     map_a: Mat,
     map_b: Mat,
-    /// Each line's legs on the x- and y-axis, px; its sample and its weight on each ray.
+    /// Each line's legs on the x- and y-axis, px, and their logarithms; its sample and its weight on each ray.
     legs: Vec<[f32; 2]>,
+    log_legs: Vec<[f32; 2]>,
     cells: Vec<u16>,
     weights: Vec<f32>,
     // The memory: grey levels, share of unknown sources (0 to 1), frames since last seen.
@@ -245,6 +246,7 @@ impl Background {
             right,
             map_a,
             map_b,
+            log_legs: legs.iter().map(|l: &[f32; 2]| l.map(f32::ln)).collect(),
             legs,
             cells,
             weights,
@@ -607,17 +609,20 @@ impl Background {
         self.cells[range.clone()].iter().enumerate().map(at).zip(&self.weights[range]).map(|(k, w)| k * w).sum()
     }
 
+    /// Square of the distance of a line's legs from others, all as logarithms.
     fn distance(&self, line: usize, [a, b]: [f32; 2]) -> f32 {
-        let ([p, q], square) = (self.legs[line], |v: f32| v * v);
-        square((p / a).ln()) + square((q / b).ln())
+        let ([p, q], square) = (self.log_legs[line], |v: f32| v * v);
+        square(p - a) + square(q - b)
     }
 
     fn nearest(&self, legs: [f32; 2]) -> usize {
-        (0..self.legs.len()).min_by(|i, j| self.distance(*i, legs).total_cmp(&self.distance(*j, legs))).unwrap_or(0)
+        let logs = legs.map(f32::ln);
+        (0..self.legs.len()).min_by(|i, j| self.distance(*i, logs).total_cmp(&self.distance(*j, logs))).unwrap_or(0)
     }
 
     /// The best line: its number, score, share of its length with an edge, share of known background inside it.
     fn best_line(&self) -> Option<(usize, f32, f32, f32)> {
+        let before = self.line.map(|legs| legs.map(f32::ln));
         let mut best: Option<(usize, f32, f32, f32)> = None;
         for line in 0..self.legs.len() {
             let range = line * RAYS..(line + 1) * RAYS;
@@ -627,8 +632,8 @@ impl Background {
                 score += weight * value;
                 share += if value > PIECE { *weight } else { 0.0 };
             }
-            let stay = match self.line {
-                Some(legs) => STAY * (-0.5 * self.distance(line, legs) / (STAY_WIDTH * STAY_WIDTH)).exp(),
+            let stay = match before {
+                Some(logs) => STAY * (-0.5 * self.distance(line, logs) / (STAY_WIDTH * STAY_WIDTH)).exp(),
                 None => 0.0,
             };
             let total = score + 0.7 * share + stay;

@@ -25,13 +25,13 @@ use shared::messages::{Doubt, PixelFormat};
 use crate::clear::{Background, Seen};
 
 /// Rays between the axes.
-const RAYS: usize = 72;
+const RAYS: usize = 48;
 /// Distance from the lip at which rays begin, px: bead, rim and corner mix before it.
 const NEAR_PX: f32 = 3.0;
 /// Samples along a ray are 1 px apart up to this distance from the lip, then further, up to [`STEP_MOST_PX`]: the rays only
 /// have to find the edge to within a profile's reach.
-const DENSE_PX: f32 = 48.0;
-const STEP_MOST_PX: f32 = 4.0;
+const DENSE_PX: f32 = 36.0;
+const STEP_MOST_PX: f32 = 5.0;
 /// Edges that are tried in pairs for the first line.
 const PICKS: usize = 13;
 /// Profiles across the line.
@@ -806,12 +806,15 @@ impl Extractor {
                 continue;
             }
             // 1 in the liquid, 0 in the background.
-            let level = |j: usize| -> f32 { (0..3).map(|c| (profile[j][c] - outside[c]) * difference[c]).sum::<f32>() / square };
+            let scale: [f32; 3] = difference.map(|v| v / square);
+            let levels = profile.map(|p| (0..3).map(|c| (p[c] - outside[c]) * scale[c]).sum::<f32>());
             // The falling crossing nearest to the coarse edge.
             let crossing = |height: f32| {
-                (0..2 * REACH)
-                    .filter(|&j| level(j) >= height && level(j + 1) < height)
-                    .map(|j| j as f32 + (level(j) - height) / (level(j) - level(j + 1)))
+                levels
+                    .windows(2)
+                    .enumerate()
+                    .filter(|(_, w)| w[0] >= height && w[1] < height)
+                    .map(|(j, w)| j as f32 + (w[0] - height) / (w[0] - w[1]))
                     .min_by(|p, q| (p - REACH as f32).abs().total_cmp(&(q - REACH as f32).abs()))
             };
             let Some(half) = crossing(0.5) else { continue };

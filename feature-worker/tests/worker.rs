@@ -39,7 +39,9 @@ impl Program {
         }
         let code = self.0.try_wait()?.and_then(|s| s.code());
         let mut said = String::new();
-        if code.is_some() && let Some(errors) = &mut self.0.stderr {
+        if code.is_some()
+            && let Some(errors) = &mut self.0.stderr
+        {
             errors.read_to_string(&mut said)?;
         }
         Ok((code, said))

@@ -385,7 +385,7 @@ fn doubts(seed: u64) -> Result<BTreeMap<&'static str, f64>, Failure> {
             false,
         ),
         (Doubt::Blurred, View { blur_px: 4.5, ..base.clone() }, 12.0, false),
-        (Doubt::LeavesRegion, base.clone(), 25.0, true),
+        (Doubt::LeavesRegion, base.clone(), 12.0, true),
     ];
     let mut raised = BTreeMap::new();
     for (doubt, view, flow_ml_s, cut_short) in bad {

@@ -22,13 +22,7 @@ pub fn sim_config() -> &'static str {
 }
 
 pub fn camera() -> CameraConfig {
-    CameraConfig {
-        source: CameraSource::SharedMemory,
-        path: String::new(),
-        width_px: WIDTH as u32,
-        height_px: HEIGHT as u32,
-        fps: 30.0,
-    }
+    CameraConfig { source: CameraSource::SharedMemory, path: String::new(), width_px: WIDTH as u32, height_px: HEIGHT as u32, fps: 30.0 }
 }
 
 pub fn image_config(method: LiquidMethod) -> ImageConfig {
@@ -43,7 +37,11 @@ pub fn image_config(method: LiquidMethod) -> ImageConfig {
 }
 
 /// The simulated cell's configuration for another cell's name, written to `directory`.
-pub fn write_config(directory: &std::path::Path, cell: &str, change: impl Fn(&mut Config)) -> std::io::Result<(std::path::PathBuf, Config)> {
+pub fn write_config(
+    directory: &std::path::Path,
+    cell: &str,
+    change: impl Fn(&mut Config),
+) -> std::io::Result<(std::path::PathBuf, Config)> {
     let text = std::fs::read_to_string(sim_config())?;
     let mut config = Config::parse(&text, "sim.toml").map_err(std::io::Error::other)?;
     config.cell.name = format!("{cell}-{}", std::process::id());
@@ -160,6 +158,29 @@ pub fn pour(i: i32) -> Result<Mat, opencv::Error> {
 /// A dry glass before the board.
 pub fn dry(turn_deg: f32, seed: i32) -> Result<Mat, opencv::Error> {
     let mut picture = board(turn_deg)?;
+    glass(&mut picture)?;
+    noisy(&picture, seed)
+}
+
+/// A frame of clear water before a board that turns, or before an even wall: water takes a little light, and much along its edge.
+/// `share` of a triangle of 90 x 80 px; 0: dry.
+pub fn water(share: f32, turn_deg: Option<f32>, seed: i32) -> Result<Mat, opencv::Error> {
+    let mut picture = match turn_deg {
+        Some(turn_deg) => board(turn_deg)?,
+        None => Mat::new_rows_cols_with_default(HEIGHT, WIDTH, CV_8UC3, Scalar::all(165.0))?,
+    };
+    if share > 0.0 {
+        let cover = cover(&[stream(90.0 * share, 80.0 * share)])?;
+        let mut deep = Mat::default();
+        imgproc::blur(&cover, &mut deep, Size::new(7, 7), Point::new(-1, -1), core::BORDER_REFLECT_101)?;
+        let (cover, deep) = (cover.data_bytes()?, deep.data_bytes()?);
+        for (pixel, (cover, deep)) in picture.data_typed_mut::<core::Vec3b>()?.iter_mut().zip(cover.iter().zip(deep)) {
+            let through = 0.93 - 0.9 * (255.0 - f64::from(*deep)) / 255.0;
+            for c in 0..3 {
+                pixel[c] = (f64::from(pixel[c]) * (1.0 - f64::from(*cover) / 255.0 * (1.0 - through))) as u8;
+            }
+        }
+    }
     glass(&mut picture)?;
     noisy(&picture, seed)
 }
