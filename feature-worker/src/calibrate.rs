@@ -239,7 +239,23 @@ pub fn find_corner(mean: &Mat) -> Result<Corner, CalibrateError> {
             }
         }
     }
-    best.map(|(_, corner)| corner).ok_or(CalibrateError::NoCorner)
+    let (_, Corner { lip, rim, foot }) = best.ok_or(CalibrateError::NoCorner)?;
+    // A bright rim or wall has an edge on either side: the axes go through their middle.
+    let near = 0.012 * height;
+    let (rim_shift, side_shift) = (middle(lip, rim, &level, near), middle(lip, foot, &upright, near));
+    let moved = |p: [f32; 2], shifts: &[[f32; 2]]| shifts.iter().fold(p, |p, s| [p[0] + s[0], p[1] + s[1]]);
+    Ok(Corner { lip: moved(lip, &[rim_shift, side_shift]), rim: moved(rim, &[rim_shift]), foot: moved(foot, &[side_shift]) })
+}
+
+/// The shift, square to it, from the line through `from` and `to` to the middle of the outermost of all `lines` within `near` px.
+fn middle(from: [f32; 2], to: [f32; 2], lines: &[([f32; 2], [f32; 2], f32)], near: f32) -> [f32; 2] {
+    let length = (to[0] - from[0]).hypot(to[1] - from[1]);
+    let normal = [-(to[1] - from[1]) / length, (to[0] - from[0]) / length];
+    let offset = |p: [f32; 2]| normal[0] * (p[0] - from[0]) + normal[1] * (p[1] - from[1]);
+    // Several pieces of one edge count once: the outermost on either side.
+    let offsets = lines.iter().map(|(a, b, _)| (offset(*a), offset(*b))).filter(|(a, b)| a.abs() < near && b.abs() < near);
+    let (low, high) = offsets.map(|(a, b)| (a + b) / 2.0).fold((0.0f32, 0.0f32), |(low, high), v| (low.min(v), high.max(v)));
+    normal.map(|n| n * (low + high) / 2.0)
 }
 
 /// The `[image]` table for a corner: region over the mouth, axes, colour learned from the frames.
@@ -295,17 +311,25 @@ fn write(path: &Path, config: &Config) -> Result<(), (u8, String)> {
     let fail = |e: String| (exit::FAILED, format!("{}: {e}", path.display()));
     let text = std::fs::read_to_string(path).map_err(|e| fail(e.to_string()))?;
     let mut written = String::new();
+    // What stands between the table's last key and the next table belongs to that one.
+    let mut between = String::new();
     let mut inside = false;
     for line in text.lines() {
-        let table = line.trim_start().starts_with('[') && !line.trim_start().starts_with("[[");
-        if table && line.trim_start().starts_with("[image]") {
+        let trimmed = line.trim_start();
+        if trimmed.starts_with("[image]") {
             inside = true;
             written.push_str(&section(&config.image));
-            written.push('\n');
-            continue;
-        }
-        inside &= !table;
-        if !inside {
+        } else if inside && !trimmed.starts_with('[') {
+            if !trimmed.is_empty() && !trimmed.starts_with('#') {
+                between.clear();
+            } else {
+                between.push_str(line);
+                between.push('\n');
+            }
+        } else {
+            if std::mem::take(&mut inside) {
+                written.push_str(if between.is_empty() { "\n" } else { &between });
+            }
             written.push_str(line);
             written.push('\n');
         }
@@ -462,8 +486,9 @@ impl ColourLearner {
             for x in ((lip_x - reach).max(0.0) as i32)..((lip_x + reach) as i32).min(columns) {
                 let at = [x as f32, y as f32];
                 let distance = (at[0] - lip_x).hypot(at[1] - lip_y);
-                let (near, far) = (distance < 16.0 * scale, distance > 110.0 * scale && (x + y) % 5 == 0);
-                if !(near || far) || self.axes.between(at) < 1.5 {
+                let (near, far) = (distance < 20.0 * scale, distance > 110.0 * scale && (x + y) % 5 == 0);
+                // The rim's own light is near the lip in every frame; axes that are off by a few px shall not make it liquid.
+                if !(near || far) || self.axes.between(at) < 4.0 * scale {
                     continue;
                 }
                 let hsv = pixels[(y * columns + x) as usize].0;

@@ -22,18 +22,22 @@ use opencv::prelude::*;
 use shared::config::{CameraConfig, ImageConfig, LiquidMethod};
 use shared::messages::{Doubt, PixelFormat};
 
+use crate::clear::{Background, Seen};
+
 /// Rays between the axes.
-const RAYS: usize = 72;
+const RAYS: usize = 48;
 /// Distance from the lip at which rays begin, px: bead, rim and corner mix before it.
 const NEAR_PX: f32 = 3.0;
 /// Samples along a ray are 1 px apart up to this distance from the lip, then further, up to [`STEP_MOST_PX`]: the rays only
 /// have to find the edge to within a profile's reach.
-const DENSE_PX: f32 = 48.0;
-const STEP_MOST_PX: f32 = 4.0;
+const DENSE_PX: f32 = 36.0;
+const STEP_MOST_PX: f32 = 5.0;
 /// Edges that are tried in pairs for the first line.
 const PICKS: usize = 13;
 /// Profiles across the line.
 const PROFILES: usize = 48;
+/// Least share of them that show an edge.
+const PROFILES_LEAST: f32 = 0.4;
 /// Samples of a profile on either side of its centre; the outer [`FLANK`] of them tell liquid and background.
 const REACH: usize = 7;
 const FLANK: usize = 3;
@@ -41,11 +45,6 @@ const FLANK: usize = 3;
 const STREAM_RAYS: f32 = 0.8;
 /// More background than this before the first liquid ends a ray, px.
 const GAP_MOST_PX: f32 = 24.0;
-/// Clear water: detail counts up to this many grey levels, so that one glint does not outweigh a line.
-const DETAIL_MOST: f32 = 40.0;
-/// Clear water: least mean score of the path, in units of the noise, and least share of rays on which it is seen.
-const CLEAR_STRENGTH: f32 = 2.0;
-const CLEAR_SHARE: f32 = 0.6;
 /// Least share of liquid between lip and edge on a ray that counts as filled.
 const FILLED: f32 = 0.55;
 /// Mean grey level below which the region counts as dark.
@@ -54,6 +53,18 @@ const DARK_LEVEL: f32 = 14.0;
 const BLOWN_SHARE: f32 = 0.5;
 /// An edge that takes longer than this from 20 to 80 % is blurred, px.
 const BLURRED_PX: f32 = 4.5;
+/// Without a stream the glass's own edges tell about focus: bundles of profiles across each axis, lines in a bundle (their mean has
+/// less noise), distance of the bundles and of the lines, and reach on either side, px.
+const RIM_BUNDLES: usize = 12;
+const RIM_LINES: usize = 8;
+const RIM_BUNDLE_PX: f32 = 14.0;
+const RIM_LINE_PX: f32 = 1.5;
+const RIM_REACH: usize = 9;
+/// Least change of brightness across the rim that tells anything, grey levels, and least number of bundles that have it.
+const RIM_CONTRAST: f32 = 14.0;
+const RIM_SEEN: usize = 5;
+/// The change across the rim over its steepest step is its width, px: from here on it is blurred.
+const RIM_BLURRED_PX: f32 = 5.0;
 
 /// Why an extractor cannot be made.
 #[derive(Debug, thiserror::Error)]
@@ -241,10 +252,7 @@ pub struct Extractor {
     mask: Mat,
     mask_b: Mat,
     grey: Mat,
-    detail: Mat,
-    path_score: Vec<f32>,
-    path_from: Vec<u16>,
-    sums: Vec<f32>,
+    background: Background,
     edges: Vec<[f32; 2]>,
     edge_weights: Vec<f32>,
     fine: Vec<[f32; 2]>,
@@ -369,10 +377,7 @@ impl Extractor {
             mask: Mat::default(),
             mask_b: Mat::default(),
             grey: Mat::default(),
-            detail: Mat::default(),
-            path_score: Vec::new(),
-            path_from: Vec::new(),
-            sums: Vec::new(),
+            background: Background::new(&axes, [region.width, region.height], camera.width_px)?,
             edges: Vec::with_capacity(RAYS),
             edge_weights: Vec::with_capacity(RAYS),
             fine: Vec::with_capacity(PROFILES),
@@ -470,12 +475,14 @@ impl Extractor {
                     (self.find_triangle(colours)?, segmented)
                 }
                 LiquidMethod::Clear => {
-                    self.find_detail()?;
+                    let seen = self.background.look(&self.grey)?;
                     let segmented = Instant::now();
-                    (self.follow_edge(colours)?, segmented)
+                    (self.follow_water(seen, colours)?, segmented)
                 }
             },
         };
+        let dry = result.area_px2 == 0.0 && result.doubt == Doubt::None;
+        let result = if dry && self.rim_is_blurred(colours) { Measurement::nothing(0.0, Doubt::Blurred) } else { result };
         let done = Instant::now();
         self.converted = converted;
         let ns = |from: Instant, to: Instant| to.duration_since(from).as_nanos() as u64;
@@ -525,6 +532,40 @@ impl Extractor {
         })
     }
 
+    /// Whether the glass's top edge and left side, which are always in the same place, have lost their sharp edges. False when
+    /// they are not seen well enough to tell: glass that is as bright as what is behind, or axes that lie beside them.
+    fn rim_is_blurred(&mut self, colours: Colours) -> bool {
+        self.widths.clear();
+        let axes = self.axes;
+        for (along, across) in [(axes.x, axes.y), ([-axes.y[0], -axes.y[1]], axes.x)] {
+            // Square to the axis, so that an oblique container does not look soft.
+            let skew = across[0] * along[0] + across[1] * along[1];
+            let across = [across[0] - skew * along[0], across[1] - skew * along[1]];
+            let length = across[0].hypot(across[1]);
+            for bundle in 0..RIM_BUNDLES {
+                let mut profile = [0.0f32; 2 * RIM_REACH + 1];
+                let inside = profile.iter_mut().enumerate().all(|(j, level)| {
+                    let d = (j as f32 - RIM_REACH as f32) / length;
+                    (0..RIM_LINES).all(|line| {
+                        let s = RIM_BUNDLE_PX * (1 + bundle) as f32 + RIM_LINE_PX * line as f32;
+                        let [x, y] = axes.at(s, along);
+                        let colour = colours.at(x + d * across[0], y + d * across[1]);
+                        *level += colour.map_or(0.0, |c| c.iter().sum::<f32>()) / (3 * RIM_LINES) as f32;
+                        colour.is_some()
+                    })
+                });
+                let (low, high) = profile.iter().fold((f32::MAX, f32::MIN), |(l, h), v| (l.min(*v), h.max(*v)));
+                if inside && high - low >= RIM_CONTRAST {
+                    let steepest = profile.windows(4).map(|w| (w[3] - w[0]).abs() / 3.0).fold(0.0, f32::max);
+                    self.widths.push((high - low) / steepest);
+                }
+            }
+        }
+        // What stands behind is out of focus too, so the sharper bundles decide.
+        let sharper = self.widths.len() / 4;
+        self.widths.len() >= RIM_SEEN && *self.widths.select_nth_unstable_by(sharper, f32::total_cmp).1 > RIM_BLURRED_PX
+    }
+
     /// Liquid by its colour range, into `self.mask`.
     fn segment_colour(&mut self) -> Result<(), ExtractError> {
         // Neighbouring samples together: a third of the noise, for a tenth of what smoothing the region would cost.
@@ -546,93 +587,17 @@ impl Extractor {
         Ok(())
     }
 
-    /// Clear water: fine detail of the region on the rays, into `self.mask`. Water's edge is a fine line, dark or bright
-    /// depending on what it bends into sight; what stands behind is out of focus and has little detail of that size.
-    fn find_detail(&mut self) -> Result<(), ExtractError> {
-        let (size, wide) = (core::Size::new(3, 3), core::Size::new(9, 9));
-        let (anchor, border) = (core::Point::new(-1, -1), core::BORDER_REPLICATE);
-        imgproc::blur(&self.grey, &mut self.smooth, size, anchor, border)?;
-        imgproc::blur(&self.smooth, &mut self.hsv, wide, anchor, border)?;
-        core::absdiff(&self.smooth, &self.hsv, &mut self.mask_b)?;
-        imgproc::dilate(&self.mask_b, &mut self.detail, &core::no_array(), anchor, 1, border, Scalar::all(0.0))?;
-        imgproc::remap(&self.detail, &mut self.mask, &self.map_a, &self.map_b, imgproc::INTER_NEAREST, border, Scalar::default())?;
-        Ok(())
-    }
-
-    /// Clear water, step 1: the path over all rays, from axis to axis, along which there is most detail on it, some inside and
-    /// little outside (dynamic programming over the rays; no OpenCV call does this).
-    fn follow_edge(&mut self, colours: Colours) -> Result<Measurement, ExtractError> {
+    /// The triangle of what [`Background`] saw.
+    fn follow_water(&mut self, seen: Seen, colours: Colours) -> Result<Measurement, ExtractError> {
         self.edges.clear();
-        let samples = self.radii_px.len();
-        // Noise: the median detail of everything between the axes.
-        let mut histogram = [0u32; 256];
-        let mut total = 0u32;
-        for (i, ray) in self.rays.iter().enumerate() {
-            for value in &self.mask.at_row::<u8>(i as i32)?[..ray.samples] {
-                histogram[usize::from(*value)] += 1;
-                total += 1;
+        match seen {
+            Seen::Dry => Ok(Measurement::nothing(1.0, Doubt::None)),
+            Seen::Unsure => Ok(Measurement::nothing(0.0, Doubt::EdgeNotFound)),
+            Seen::Stream(share) => {
+                self.edges.extend_from_slice(self.background.edges_px());
+                self.line_through_edges(share, 0, colours)
             }
         }
-        let mut below = 0;
-        let noise = (0..256).find(|v| {
-            below += histogram[*v];
-            below * 2 >= total
-        });
-        let noise = noise.unwrap_or(0) as f32 + 1.0;
-
-        self.path_score.clear();
-        self.path_score.resize(RAYS * samples, f32::MIN);
-        self.path_from.clear();
-        self.path_from.resize(RAYS * samples, 0);
-        for (i, ray) in self.rays.iter().enumerate() {
-            let row = &self.mask.at_row::<u8>(i as i32)?[..ray.samples];
-            self.sums.clear();
-            self.sums.push(0.0);
-            let mut sum = 0.0;
-            for value in row {
-                sum += f32::from(*value).min(DETAIL_MOST);
-                self.sums.push(sum);
-            }
-            let mean = |from: usize, to: usize| (self.sums[to] - self.sums[from]) / (to - from).max(1) as f32;
-            for (r, value) in row.iter().enumerate().take(ray.samples.saturating_sub(3)).skip(3) {
-                let here = f32::from(*value).min(DETAIL_MOST);
-                let (inside, outside) = (mean(r.saturating_sub(14), r - 2), mean((r + 3).min(ray.samples), (r + 15).min(ray.samples)));
-                let score = here + 0.7 * (inside - outside) - 1.5 * noise;
-                let (mut best, mut from) = (0.0, r);
-                if i > 0 {
-                    best = f32::MIN;
-                    for q in r.saturating_sub(3)..=(r + 3).min(samples - 1) {
-                        let before = self.path_score[(i - 1) * samples + q] - 0.6 * (q as f32 - r as f32).abs();
-                        if before > best {
-                            (best, from) = (before, q);
-                        }
-                    }
-                }
-                self.path_score[i * samples + r] = if best == f32::MIN { f32::MIN } else { best + score };
-                self.path_from[i * samples + r] = from as u16;
-            }
-        }
-        let last = &self.path_score[(RAYS - 1) * samples..];
-        let Some(end) = (0..samples).max_by(|a, b| last[*a].total_cmp(&last[*b])) else {
-            return Ok(Measurement::nothing(0.0, Doubt::EdgeNotFound));
-        };
-        let strength = last[end] / RAYS as f32 / noise;
-        let mut r = end;
-        let mut supported = 0;
-        for i in (0..RAYS).rev() {
-            let row = self.mask.at_row::<u8>(i as i32)?;
-            supported += usize::from(f32::from(row[r]) > 2.5 * noise + 1.0);
-            let r_px = self.radii_px[r];
-            self.edges.push(self.axes.at(r_px, self.rays[i].along));
-            r = usize::from(self.path_from[i * samples + r]);
-        }
-        self.edges.reverse();
-        let share = supported as f32 / RAYS as f32;
-        if strength < CLEAR_STRENGTH || share < CLEAR_SHARE {
-            self.edges.clear();
-            return Ok(Measurement::nothing((1.0 - share).clamp(0.0, 1.0), Doubt::None));
-        }
-        self.line_through_edges(share, 0, colours)
     }
 
     fn find_triangle(&mut self, colours: Colours) -> Result<Measurement, ExtractError> {
@@ -727,6 +692,10 @@ impl Extractor {
 
         // 3. Profiles across it.
         let (line, contrast, width, used) = self.refine(line, a, b, colours);
+        if self.method == LiquidMethod::Clear && used < PROFILES_LEAST {
+            // What the memory of the background took for water has no edge in the picture itself.
+            return Ok(Measurement::nothing(0.0, Doubt::EdgeNotFound));
+        }
         let (a, b) = (line.cut(self.axes.lip_px, self.axes.x), line.cut(self.axes.lip_px, self.axes.y));
         if !(a > 0.0 && b > 0.0 && a < longest && b < longest) {
             return Ok(Measurement::nothing(0.0, Doubt::EdgeNotFound));
@@ -837,12 +806,15 @@ impl Extractor {
                 continue;
             }
             // 1 in the liquid, 0 in the background.
-            let level = |j: usize| -> f32 { (0..3).map(|c| (profile[j][c] - outside[c]) * difference[c]).sum::<f32>() / square };
+            let scale: [f32; 3] = difference.map(|v| v / square);
+            let levels = profile.map(|p| (0..3).map(|c| (p[c] - outside[c]) * scale[c]).sum::<f32>());
             // The falling crossing nearest to the coarse edge.
             let crossing = |height: f32| {
-                (0..2 * REACH)
-                    .filter(|&j| level(j) >= height && level(j + 1) < height)
-                    .map(|j| j as f32 + (level(j) - height) / (level(j) - level(j + 1)))
+                levels
+                    .windows(2)
+                    .enumerate()
+                    .filter(|(_, w)| w[0] >= height && w[1] < height)
+                    .map(|(j, w)| j as f32 + (w[0] - height) / (w[0] - w[1]))
                     .min_by(|p, q| (p - REACH as f32).abs().total_cmp(&(q - REACH as f32).abs()))
             };
             let Some(half) = crossing(0.5) else { continue };
@@ -859,7 +831,7 @@ impl Extractor {
             self.scratch.push(square.sqrt());
         }
         let used = self.fine.len() as f32 / PROFILES as f32;
-        if used < 0.4 {
+        if used < PROFILES_LEAST {
             // Too little contrast for profiles: the coarse edges are what there is.
             return (line, 12.0, 1.0, used);
         }

@@ -3,6 +3,7 @@
 
 pub mod bench;
 pub mod calibrate;
+pub mod clear;
 pub mod episodes;
 pub mod extract;
 pub mod inspect;

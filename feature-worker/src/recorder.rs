@@ -192,6 +192,8 @@ struct Worker {
     /// Episode of the newest tick; `None` before the first.
     seen: Option<u64>,
     newest_tick: u64,
+    /// Ticks of the next episode, while frames of the one before are still under way.
+    pending: VecDeque<Telemetry>,
     current: Option<Current>,
     // Ports are used until here, so the cell is dropped last.
     _cell: Cell,
@@ -245,6 +247,7 @@ impl Worker {
             encoder,
             seen: None,
             newest_tick: 0,
+            pending: VecDeque::new(),
             current: None,
             _cell: cell,
         })
@@ -267,6 +270,7 @@ impl Worker {
             }
             self.settle(false);
             self.close_if_over();
+            self.follow();
             if stop {
                 break;
             }
@@ -277,44 +281,55 @@ impl Worker {
         while let Some(item) = self.handover.queue.pop() {
             self.frame(item);
         }
-        if let Some(current) = &self.current {
+        while let Some(current) = &self.current {
             let complete = current.ended.is_some();
             self.close(complete, if complete { "over" } else { "the feature worker was stopped" });
+            self.follow();
         }
     }
 
     fn tick(&mut self, tick: &Telemetry) {
         self.track.push(tick.at_ns, tick.alpha_deg, tick.robot_at_ns, tick.alpha_measured_deg);
         if tick.tick <= self.newest_tick {
+            self.pending.clear();
             self.close(false, "the controller was restarted");
             self.seen = None;
         }
         self.newest_tick = tick.tick;
-        let is_new = self.seen != Some(tick.episode);
-        let joined_late = self.seen.is_none();
-        self.seen = Some(tick.episode);
-        if let Some(current) = &mut self.current {
-            current.heard_at_ns = now_ns();
-            if tick.episode != current.episode && current.ended.is_none() {
-                current.ended = Some(Ended { at_ns: tick.at_ns, seen_at_ns: now_ns(), frames_passed: false });
+        self.pending.push_back(*tick);
+        self.follow();
+    }
+
+    /// Takes the ticks that are due: those of the next episode wait until the last frames of the one before have come.
+    fn follow(&mut self) {
+        while let Some(tick) = self.pending.front().copied() {
+            if let Some(current) = &mut self.current {
+                current.heard_at_ns = now_ns();
+                if tick.episode != current.episode && current.ended.is_none() {
+                    current.ended = Some(Ended { at_ns: tick.at_ns, seen_at_ns: now_ns(), frames_passed: false });
+                }
+                if tick.episode != 0 && tick.episode != current.episode {
+                    return;
+                }
             }
-        }
-        if tick.episode == 0 {
-            return;
-        }
-        if is_new {
-            if self.current.is_some() {
-                self.close(true, "over; the next one began at once");
+            self.pending.pop_front();
+            let is_new = self.seen != Some(tick.episode);
+            let joined_late = self.seen.is_none();
+            self.seen = Some(tick.episode);
+            if tick.episode == 0 {
+                continue;
             }
-            if joined_late {
-                let what = format!("episode {} was under way when the recorder started; it is not recorded", tick.episode);
-                self.report(RecorderState::Failed, tick.episode, 0, 0, &what);
-                return;
+            if is_new {
+                if joined_late {
+                    let what = format!("episode {} was under way when the recorder started; it is not recorded", tick.episode);
+                    self.report(RecorderState::Failed, tick.episode, 0, 0, &what);
+                    continue;
+                }
+                self.open(&tick);
             }
-            self.open(tick);
+            let write = |c: &mut Current| if tick.episode == c.episode { c.writer.telemetry(&tick) } else { Ok(()) };
+            self.writing(write);
         }
-        let write = |c: &mut Current| if tick.episode == c.episode { c.writer.telemetry(tick) } else { Ok(()) };
-        self.writing(write);
     }
 
     fn open(&mut self, tick: &Telemetry) {

@@ -243,6 +243,38 @@ fn formats_and_compressions_are_recorded_and_nothing_is_overwritten() {
     assert_eq!(std::fs::read_to_string(dir.path().join("episode-0001.mcap")).unwrap(), "older");
 }
 
+/// Protects the end of a pour when the next one begins at once: frames that were still under way belong to the first episode, and
+/// the second has its own from the first tick on.
+#[test]
+fn back_to_back_episodes_lose_no_frame() {
+    let dir = tempfile::tempdir().unwrap();
+    let mut scene = Scene::new(&config("touching", dir.path()));
+    for _ in 0..12 {
+        scene.period(0, Phase::Idle);
+    }
+    for _ in 0..20 {
+        scene.period(1, Phase::Recording);
+    }
+    // Two ticks of the next one are known before the last frame of the first comes.
+    let last = scene.feature();
+    scene.tick(2, Phase::Recording);
+    let next = scene.feature();
+    scene.tick(2, Phase::Recording);
+    scene.offer(&last, 1);
+    scene.offer(&next, 1);
+    scene.run(2, Phase::Recording, 0);
+    for _ in 0..30 {
+        scene.period(0, Phase::Idle);
+    }
+    let (first, _) = scene.complete();
+    let (second, _) = scene.complete();
+    let (first, second) = (Episode::read(&first).unwrap(), Episode::read(&second).unwrap());
+    assert!(first.complete && second.complete);
+    assert_eq!((first.info.ticks, second.info.ticks), (20, 2));
+    assert_eq!(first.frames.last().unwrap().sequence, last.sequence);
+    assert!(second.frames.iter().any(|f| f.sequence == next.sequence));
+}
+
 /// Protects V_e from the recorder's limits: without a free buffer the image is lost and counted, the measurement is kept;
 /// frames that come twice or late are left out, frames that never came are shown as lost.
 #[test]

@@ -1,0 +1,186 @@
+//! Pictures for the tests, drawn by a few OpenCV calls: a turning chess board, a glass whose lip is at (215, 250), a stream whose
+//! outer edge cuts the axes at known distances. Knows nothing of how the extraction works.
+#![allow(dead_code)]
+
+use opencv::core::{self, CV_8UC3, Mat, Point, Point2f, Rect, Scalar, Size, Vector};
+use opencv::imgproc;
+use opencv::prelude::*;
+use shared::config::{CameraConfig, CameraSource, Config, ImageConfig, LiquidMethod};
+
+pub const WIDTH: i32 = 640;
+pub const HEIGHT: i32 = 480;
+const BLUE: Scalar = Scalar::new(150.0, 62.0, 20.0, 0.0);
+/// The glass's lip, px.
+const LIP: [f32; 2] = [215.0, 250.0];
+/// How many times larger the shapes are drawn, for smooth edges.
+const FINE: i32 = 4;
+
+pub type Outcome = Result<(), Box<dyn std::error::Error>>;
+
+pub fn sim_config() -> &'static str {
+    concat!(env!("CARGO_MANIFEST_DIR"), "/../config/sim.toml")
+}
+
+pub fn camera() -> CameraConfig {
+    CameraConfig { source: CameraSource::SharedMemory, path: String::new(), width_px: WIDTH as u32, height_px: HEIGHT as u32, fps: 30.0 }
+}
+
+pub fn image_config(method: LiquidMethod) -> ImageConfig {
+    ImageConfig {
+        method,
+        region_px: [191, 16, 420, 270],
+        x_axis_px: [215.0, 250.0, 600.0, 250.0],
+        y_axis_px: [215.0, 470.0, 215.0, 250.0],
+        colour_hsv: [98, 90, 25, 124, 255, 255],
+        area_min_px2: 30.0,
+    }
+}
+
+/// The simulated cell's configuration for another cell's name, written to `directory`.
+pub fn write_config(
+    directory: &std::path::Path,
+    cell: &str,
+    change: impl Fn(&mut Config),
+) -> std::io::Result<(std::path::PathBuf, Config)> {
+    let text = std::fs::read_to_string(sim_config())?;
+    let mut config = Config::parse(&text, "sim.toml").map_err(std::io::Error::other)?;
+    config.cell.name = format!("{cell}-{}", std::process::id());
+    config.image = image_config(LiquidMethod::Colour);
+    config.recording.directory = directory.join("episodes");
+    config.worker.priority = 0;
+    change(&mut config);
+    let path = directory.join("cell.toml");
+    std::fs::write(&path, toml::to_string(&config).map_err(std::io::Error::other)?)?;
+    Ok((path, config))
+}
+
+fn polygon(shape: &[[f32; 2]], scale: f32) -> Vector<Point> {
+    // Whole numbers are the pixels' middles.
+    let at = |v: f32| (v * scale + (scale - 1.0) / 2.0).round() as i32;
+    shape.iter().map(|p| Point::new(at(p[0]), at(p[1]))).collect()
+}
+
+/// Liquid in the glass and over the lip whose outer edge cuts the axes at `a` and `b` px from the lip.
+pub fn stream(a: f32, b: f32) -> Vec<[f32; 2]> {
+    let [x, y] = LIP;
+    let beyond = y - b - 95.0 * b / a;
+    let right = x + 1.5 * a;
+    vec![[x, 479.0], [x, y], [x - 95.0, y], [x - 95.0, beyond], [x + a, y], [right, y + 0.5 * b], [right, 479.0]]
+}
+
+/// A round shape.
+pub fn disc(x: f32, y: f32, radius: f32) -> Vec<[f32; 2]> {
+    (0..24).map(|k| (k as f32 * std::f32::consts::TAU / 24.0).sin_cos()).map(|(s, c)| [x + radius * c, y + radius * s]).collect()
+}
+
+/// A chess board, turned by `turn_deg` about a point outside the picture and out of focus.
+pub fn board(turn_deg: f32) -> Result<Mat, opencv::Error> {
+    let side = 1600;
+    let mut large = Mat::new_rows_cols_with_default(side, side, CV_8UC3, Scalar::all(185.0))?;
+    for row in 0..20 {
+        for column in (row % 2..20).step_by(2) {
+            imgproc::rectangle(&mut large, Rect::new(column * 80, row * 80, 80, 80), Scalar::all(75.0), imgproc::FILLED, 8, 0)?;
+        }
+    }
+    let turn = imgproc::get_rotation_matrix_2d(Point2f::new(700.0, 520.0), f64::from(turn_deg), 1.0)?;
+    let (mut turned, mut soft) = (Mat::default(), Mat::default());
+    imgproc::warp_affine(&large, &mut turned, &turn, Size::new(WIDTH, HEIGHT), imgproc::INTER_LINEAR, 0, Scalar::default())?;
+    imgproc::gaussian_blur(&turned, &mut soft, Size::new(0, 0), 1.8, 1.8, core::BORDER_REFLECT_101)?;
+    Ok(soft)
+}
+
+/// Light noise, another for each `seed`.
+pub fn noisy(picture: &Mat, seed: i32) -> Result<Mat, opencv::Error> {
+    core::set_rng_seed(seed)?;
+    let mut noise = picture.clone();
+    core::randn(&mut noise, &Scalar::all(4.0), &Scalar::all(2.0))?;
+    let mut sum = Mat::default();
+    core::add(picture, &noise, &mut sum, &core::no_array(), -1)?;
+    Ok(sum)
+}
+
+/// Share of each pixel that `shapes` cover, 0 to 255.
+fn cover(shapes: &[Vec<[f32; 2]>]) -> Result<Mat, opencv::Error> {
+    let mut large = Mat::new_rows_cols_with_default(HEIGHT * FINE, WIDTH * FINE, core::CV_8UC1, Scalar::all(0.0))?;
+    for shape in shapes {
+        imgproc::fill_poly(&mut large, &polygon(shape, FINE as f32), Scalar::all(255.0), imgproc::LINE_8, 0, Point::default())?;
+    }
+    let mut small = Mat::default();
+    imgproc::resize(&large, &mut small, Size::new(WIDTH, HEIGHT), 0.0, 0.0, imgproc::INTER_AREA)?;
+    Ok(small)
+}
+
+/// `picture` with `shapes` of blue liquid over it.
+fn pour_over(picture: &mut Mat, shapes: &[Vec<[f32; 2]>]) -> Result<(), opencv::Error> {
+    let cover = cover(shapes)?;
+    let cover = cover.data_bytes()?;
+    for (pixel, share) in picture.data_typed_mut::<core::Vec3b>()?.iter_mut().zip(cover) {
+        for c in 0..3 {
+            let share = f64::from(*share) / 255.0;
+            pixel[c] = (f64::from(pixel[c]) * (1.0 - share) + BLUE[c] * share).round() as u8;
+        }
+    }
+    Ok(())
+}
+
+/// The glass over everything: a little darker inside, bright lines along top edge and left side.
+fn glass(picture: &mut Mat) -> Result<(), opencv::Error> {
+    let [x, y] = LIP.map(|v| v as i32);
+    let mut inside = Mat::roi_mut(picture, Rect::new(x, y, WIDTH - x, HEIGHT - y))?;
+    let mut dark = Mat::default();
+    inside.convert_to(&mut dark, -1, 0.85, 8.0)?;
+    dark.copy_to(&mut inside)?;
+    for (to, width) in [(Point::new(WIDTH, y), 2), (Point::new(x, HEIGHT), 2)] {
+        imgproc::line(picture, Point::new(x, y), to, Scalar::all(250.0), width, imgproc::LINE_AA, 0)?;
+    }
+    Ok(())
+}
+
+/// Blue liquid over a board, without glass; `seed` gives each picture its own noise.
+pub fn blue(shapes: &[Vec<[f32; 2]>], seed: i32) -> Result<Mat, opencv::Error> {
+    let mut picture = board(seed as f32)?;
+    pour_over(&mut picture, shapes)?;
+    noisy(&picture, seed)
+}
+
+/// Frame `i` of a pour of blue liquid from a glass that turns by one degree a frame: dry up to frame 7, the largest triangle
+/// (90 x 80 px) at frame 20, dry from 33 on.
+pub fn pour(i: i32) -> Result<Mat, opencv::Error> {
+    let mut picture = board(i as f32)?;
+    let share = (1.0 - (i - 20) as f32 / 13.0 * if i < 20 { -1.0 } else { 1.0 }).max(0.0);
+    if share > 0.08 {
+        pour_over(&mut picture, &[stream(90.0 * share, 80.0 * share)])?;
+    }
+    glass(&mut picture)?;
+    noisy(&picture, i)
+}
+
+/// A dry glass before the board.
+pub fn dry(turn_deg: f32, seed: i32) -> Result<Mat, opencv::Error> {
+    let mut picture = board(turn_deg)?;
+    glass(&mut picture)?;
+    noisy(&picture, seed)
+}
+
+/// A frame of clear water before a board that turns, or before an even wall: water takes a little light, and much along its edge.
+/// `share` of a triangle of 90 x 80 px; 0: dry.
+pub fn water(share: f32, turn_deg: Option<f32>, seed: i32) -> Result<Mat, opencv::Error> {
+    let mut picture = match turn_deg {
+        Some(turn_deg) => board(turn_deg)?,
+        None => Mat::new_rows_cols_with_default(HEIGHT, WIDTH, CV_8UC3, Scalar::all(165.0))?,
+    };
+    if share > 0.0 {
+        let cover = cover(&[stream(90.0 * share, 80.0 * share)])?;
+        let mut deep = Mat::default();
+        imgproc::blur(&cover, &mut deep, Size::new(7, 7), Point::new(-1, -1), core::BORDER_REFLECT_101)?;
+        let (cover, deep) = (cover.data_bytes()?, deep.data_bytes()?);
+        for (pixel, (cover, deep)) in picture.data_typed_mut::<core::Vec3b>()?.iter_mut().zip(cover.iter().zip(deep)) {
+            let through = 0.93 - 0.9 * (255.0 - f64::from(*deep)) / 255.0;
+            for c in 0..3 {
+                pixel[c] = (f64::from(pixel[c]) * (1.0 - f64::from(*cover) / 255.0 * (1.0 - through))) as u8;
+            }
+        }
+    }
+    glass(&mut picture)?;
+    noisy(&picture, seed)
+}

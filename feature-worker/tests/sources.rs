@@ -1,0 +1,131 @@
+//! Real videos and image sequences through `feature-worker inspect`, as a process: good ones, and the ways in which they break.
+
+mod drawn;
+
+use std::path::Path;
+use std::process::{Command, Output};
+
+use drawn::{HEIGHT, Outcome, WIDTH, pour, write_config};
+use opencv::core::{Mat, Size, Vector};
+use opencv::prelude::*;
+use opencv::{imgcodecs, imgproc, videoio};
+
+fn inspect(config: &Path, input: &Path, out: &Path, every: &str) -> std::io::Result<Output> {
+    let mut command = Command::new(env!("CARGO_BIN_EXE_feature-worker"));
+    command.args(["inspect", "--json", "--every", every, "--config"]).arg(config).arg("--out").arg(out).arg(input).output()
+}
+
+fn text(output: &Output) -> String {
+    format!("{}{}", String::from_utf8_lossy(&output.stdout), String::from_utf8_lossy(&output.stderr))
+}
+
+/// One clear line that holds all `words`, and the exit code of bad input.
+fn refused(output: &Output, words: &[&str]) {
+    let said = text(output);
+    assert_eq!(output.status.code(), Some(2), "{said}");
+    assert!(said.lines().filter(|l| l.starts_with("error:")).count() == 1, "{said}");
+    assert!(words.iter().all(|w| said.contains(w)), "{words:?} in {said}");
+}
+
+/// Protects people with their own recordings: an MJPEG video of a pour is read to its end, with the flow where it is, in a CSV and
+/// pictures; a truncated video gives what is left of it or a clear line; what is no video at all is refused by name.
+#[test]
+fn videos_whole_truncated_and_wrong() -> Outcome {
+    let directory = tempfile::tempdir()?;
+    let (config, _) = write_config(directory.path(), "sources", |_| {})?;
+    let path = directory.path().join("pour.avi");
+    let mut writer =
+        videoio::VideoWriter::new(&path, videoio::VideoWriter::fourcc('M', 'J', 'P', 'G')?, 30.0, Size::new(WIDTH, HEIGHT), true)?;
+    for i in 0..36 {
+        writer.write(&pour(i)?)?;
+    }
+    writer.release()?;
+    let out = directory.path().join("out");
+    let whole = inspect(&config, &path, &out, "12")?;
+    assert!(whole.status.success(), "{}", text(&whole));
+    let report: serde_json::Value = serde_json::from_slice(&whole.stdout)?;
+    assert_eq!(report["frames"], 36);
+    let mut rows = csv::Reader::from_path(out.join("features.csv"))?;
+    let areas: Vec<f64> = rows.records().map(|r| Ok(r?[2].parse()?)).collect::<Result<_, Box<dyn std::error::Error>>>()?;
+    assert_eq!(areas.len(), 36);
+    assert!(areas[..7].iter().chain(&areas[33..]).all(|a| *a == 0.0), "{areas:?}");
+    assert!((areas[20] / 3600.0 - 1.0).abs() < 0.04, "{}", areas[20]);
+    assert!(areas[10] > 0.0 && areas[10] < areas[14] && areas[14] < areas[18], "{areas:?}");
+    let picture = imgcodecs::imread(out.join("frame_000013.png"), imgcodecs::IMREAD_COLOR)?;
+    assert_eq!((picture.cols(), picture.rows()), (WIDTH, HEIGHT));
+    assert_eq!(std::fs::read_dir(&out)?.count(), 4, "three pictures and the table");
+
+    let bytes = std::fs::read(&path)?;
+    for share in [2, 3, 50] {
+        let cut = directory.path().join(format!("cut{share}.avi"));
+        std::fs::write(&cut, &bytes[..bytes.len() / share])?;
+        let output = inspect(&config, &cut, &out, "0")?;
+        if output.status.success() {
+            let report: serde_json::Value = serde_json::from_slice(&output.stdout)?;
+            assert!(report["frames"].as_u64().is_some_and(|f| f > 0 && f < 36), "{}", text(&output));
+        } else {
+            refused(&output, &["truncated", "cut"]);
+        }
+    }
+    let wrong = directory.path().join("wrong.mp4");
+    std::fs::write(&wrong, "this is no video")?;
+    refused(&inspect(&config, &wrong, &out, "0")?, &["wrong.mp4"]);
+    refused(&inspect(&config, &directory.path().join("missing.mp4"), &out, "0")?, &["missing.mp4", "no such file"]);
+    let broken = directory.path().join("broken.png");
+    std::fs::write(&broken, &std::fs::read(out.join("frame_000013.png"))?[..30])?;
+    refused(&inspect(&config, &broken, &out, "0")?, &["broken.png"]);
+    Ok(())
+}
+
+/// Protects against a camera that changes its size in mid-stream, and against a grey camera with the colour method: both end
+/// with a line that says what to do.
+#[test]
+fn changed_size_and_grey_pictures_say_what_to_do() -> Outcome {
+    let directory = tempfile::tempdir()?;
+    let (config, _) = write_config(directory.path(), "sizes", |_| {})?;
+    for i in 0..4 {
+        let mut picture = pour(i)?;
+        if i == 3 {
+            let mut small = Mat::default();
+            imgproc::resize(&picture, &mut small, Size::new(320, 240), 0.0, 0.0, imgproc::INTER_AREA)?;
+            picture = small;
+        }
+        imgcodecs::imwrite(directory.path().join(format!("f_{i:03}.png")), &picture, &Vector::new())?;
+    }
+    let out = directory.path().join("out");
+    let output = inspect(&config, &directory.path().join("f_%03d.png"), &out, "0")?;
+    refused(&output, &["frame 4", "320 x 240", "640 x 480", "width_px"]);
+    let mut grey = Mat::default();
+    imgproc::cvt_color_def(&pour(20)?, &mut grey, imgproc::COLOR_BGR2GRAY)?;
+    let path = directory.path().join("mono.png");
+    imgcodecs::imwrite(&path, &grey, &Vector::new())?;
+    refused(&inspect(&config, &path, &out, "0")?, &["image.method", "clear"]);
+    let (config, _) = write_config(directory.path(), "sizes", |c| c.image.method = shared::config::LiquidMethod::Clear)?;
+    assert!(inspect(&config, &path, &out, "0")?.status.success());
+    Ok(())
+}
+
+/// Protects the start: a configuration that cannot work ends every command at once with the file, the key and a hint.
+#[test]
+fn bad_configurations_are_refused_with_key_and_hint() -> Outcome {
+    let directory = tempfile::tempdir()?;
+    let good = std::fs::read_to_string(drawn::sim_config())?;
+    for (from, to, words) in [
+        ("y_axis_px = [215.0, 470.0, 215.0, 250.0]", "y_axis_px = [600.0, 252.0, 215.0, 250.0]", ["image.y_axis_px", "10 degrees"]),
+        ("region_px = [190, 16, 420, 256]", "region_px = [190, 16, 520, 256]", ["image.region_px", "inside 640 x 480"]),
+        ("region_px = [190, 16, 420, 256]", "region_px = [300, 16, 300, 256]", ["image.region_px", "axes cross"]),
+        ("colour_hsv = [98, 90, 25, 124, 255, 255]", "colour_hsv = [98, 200, 25, 124, 90, 255]", ["image.colour_hsv", "s_min < s_max"]),
+        ("source = \"shared-memory\"", "source = \"device\"\npath = \"/dev/no-such-camera\"", ["/dev/no-such-camera", "by-id"]),
+        ("source = \"shared-memory\"", "source = \"video\"\npath = \"no-such.mp4\"", ["no-such.mp4", "no such file"]),
+        ("source = \"shared-memory\"", "source = \"images\"\npath = \"no/f_%03d.png\"", ["no/f_%03d.png", "pattern"]),
+    ] {
+        assert!(good.contains(from), "{from}");
+        let path = directory.path().join("bad.toml");
+        let text = good.replace(from, to).replace("name = \"sim\"", &format!("name = \"bad-{}\"", std::process::id()));
+        std::fs::write(&path, text)?;
+        let output = Command::new(env!("CARGO_BIN_EXE_feature-worker")).args(["run", "--config"]).arg(&path).output()?;
+        refused(&output, &words);
+    }
+    shared::ipc::remove_files(&format!("bad-{}", std::process::id()));
+    Ok(())
+}

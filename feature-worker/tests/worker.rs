@@ -1,0 +1,287 @@
+//! `feature-worker run` and `view` as processes on a real cell's shared memory, with this test as the camera driver.
+
+mod drawn;
+
+use std::io::{BufRead, BufReader, Read, Write};
+use std::path::Path;
+use std::process::{Child, Command, Stdio};
+use std::time::{Duration, Instant};
+
+use drawn::{HEIGHT, Outcome, WIDTH, pour, write_config};
+use iceoryx2::port::publisher::Publisher;
+use iceoryx2::port::subscriber::Subscriber;
+use opencv::prelude::*;
+use shared::ipc::{Cell, FrameNotifier};
+use shared::messages::{Doubt, Feature, FrameHeader, LAYOUT_VERSION, PixelFormat};
+use shared::os::now_ns;
+
+type Ipc = iceoryx2::service::ipc::Service;
+
+/// A child process that does not outlive the test.
+struct Program(Child);
+
+impl Program {
+    fn start(command: &str, config: &Path, more: &[&str]) -> std::io::Result<Self> {
+        let mut program = Command::new(env!("CARGO_BIN_EXE_feature-worker"));
+        program.arg(command).arg("--config").arg(config).args(more).stdout(Stdio::piped()).stderr(Stdio::piped());
+        Ok(Self(program.spawn()?))
+    }
+
+    fn signal(&self, signal: &str) -> std::io::Result<()> {
+        Command::new("kill").args([signal, &self.0.id().to_string()]).status().map(|_| ())
+    }
+
+    /// Exit code and standard error, after a generous minute at most.
+    fn end(&mut self) -> std::io::Result<(Option<i32>, String)> {
+        let begin = Instant::now();
+        while self.0.try_wait()?.is_none() && begin.elapsed() < Duration::from_secs(60) {
+            std::thread::sleep(Duration::from_millis(10));
+        }
+        let code = self.0.try_wait()?.and_then(|s| s.code());
+        let mut said = String::new();
+        if code.is_some()
+            && let Some(errors) = &mut self.0.stderr
+        {
+            errors.read_to_string(&mut said)?;
+        }
+        Ok((code, said))
+    }
+}
+
+impl Drop for Program {
+    fn drop(&mut self) {
+        let _ = self.0.kill();
+        let _ = self.0.wait();
+    }
+}
+
+/// Removes what the cell leaves in shared memory, last.
+struct Cleanup(String);
+
+impl Drop for Cleanup {
+    fn drop(&mut self) {
+        shared::ipc::remove_files(&self.0);
+    }
+}
+
+/// A camera driver in this process.
+struct Driver {
+    publisher: Publisher<Ipc, [u8], FrameHeader>,
+    notifier: FrameNotifier,
+    features: Subscriber<Ipc, Feature, ()>,
+    _cell: Cell,
+    _cleanup: Cleanup,
+}
+
+type Failure = Box<dyn std::error::Error>;
+
+impl Driver {
+    fn new(cell: &str) -> Result<Self, Failure> {
+        let cleanup = Cleanup(cell.into());
+        let cell = Cell::join(cell)?;
+        let publisher = cell.frames()?.publisher_builder().initial_max_slice_len((WIDTH * HEIGHT * 3) as usize).create()?;
+        let features = cell.features()?.subscriber_builder().create()?;
+        Ok(Self { publisher, notifier: cell.frame_notifier()?, features, _cell: cell, _cleanup: cleanup })
+    }
+
+    fn publish(&self, sequence: u64, captured_at_ns: u64, format: u32, size: [u32; 2], pixels: &[u8]) -> Result<(), Failure> {
+        let mut sample = self.publisher.loan_slice_uninit(pixels.len())?;
+        *sample.user_header_mut() = FrameHeader {
+            version: LAYOUT_VERSION,
+            format,
+            width_px: size[0],
+            height_px: size[1],
+            sequence,
+            captured_at_ns,
+            published_at_ns: now_ns(),
+        };
+        sample.write_from_slice(pixels).send()?;
+        self.notifier.notify()?;
+        Ok(())
+    }
+
+    /// Frame `i` of the drawn pour with this sequence number.
+    fn pour(&self, sequence: u64, i: i32) -> Result<u64, Failure> {
+        let at_ns = now_ns();
+        self.publish(sequence, at_ns, PixelFormat::Bgr8 as u32, [WIDTH as u32, HEIGHT as u32], pour(i)?.data_bytes()?)?;
+        Ok(at_ns)
+    }
+
+    /// The next feature; none after a generous while.
+    fn feature(&self, patience: Duration) -> Result<Option<Feature>, Failure> {
+        let begin = Instant::now();
+        while begin.elapsed() < patience {
+            if let Some(feature) = self.features.receive()? {
+                return Ok(Some(*feature));
+            }
+            std::thread::sleep(Duration::from_millis(2));
+        }
+        Ok(None)
+    }
+
+    /// Publishes until the worker answers: it may still be starting.
+    fn wake(&self) -> Result<Feature, Failure> {
+        for sequence in 1..600 {
+            self.pour(sequence, 0)?;
+            if let Some(feature) = self.feature(Duration::from_millis(200))? {
+                return Ok(feature);
+            }
+        }
+        Err("the worker measures nothing".into())
+    }
+}
+
+const PATIENCE: Duration = Duration::from_secs(30);
+
+/// Protects the controller's only eye: every frame gives one feature with its sequence and times and the right area; frames
+/// that come twice or out of order give none; frames of another size, format or layout give a doubt and no crash; a driver that
+/// restarts is taken up; SIGTERM ends it with success.
+#[test]
+fn every_frame_becomes_one_feature() -> Outcome {
+    let directory = tempfile::tempdir()?;
+    let (path, config) = write_config(directory.path(), "worker", |_| {})?;
+    let driver = Driver::new(&config.cell.name)?;
+    let mut worker = Program::start("run", &path, &[])?;
+    let first = driver.wake()?;
+    assert!(first.sequence > 0 && first.worker_epoch_ns > 0);
+    while driver.feature(Duration::from_millis(300))?.is_some() {}
+
+    let mut sequence = 1000;
+    for i in 12..=20 {
+        sequence += 1;
+        let at_ns = driver.pour(sequence, i)?;
+        let feature = driver.feature(PATIENCE)?.ok_or("no feature")?;
+        assert_eq!((feature.sequence, feature.captured_at_ns, feature.version), (sequence, at_ns, LAYOUT_VERSION));
+        assert_eq!(feature.worker_epoch_ns, first.worker_epoch_ns);
+        assert!(at_ns <= feature.received_at_ns && feature.received_at_ns <= feature.published_at_ns);
+        let truth = 3600.0 * (1.0 - (20 - i) as f32 / 13.0).powi(2);
+        assert!((feature.area_px2 / truth - 1.0).abs() < 0.06, "frame {i}: {feature:?} instead of {truth}");
+    }
+    // Again, and one that is late.
+    driver.publish(sequence, now_ns() - 1_000_000_000, 0, [WIDTH as u32, HEIGHT as u32], pour(20)?.data_bytes()?)?;
+    assert_eq!(driver.feature(Duration::from_millis(500))?, None);
+    let bgr = PixelFormat::Bgr8 as u32;
+    for (format, size, bytes) in [(bgr, [320, 240], 320 * 240 * 3), (99, [WIDTH as u32, HEIGHT as u32], 100), (bgr, [640, 480], 7)] {
+        sequence += 1;
+        driver.publish(sequence, now_ns(), format, size, &vec![90; bytes])?;
+        let feature = driver.feature(PATIENCE)?.ok_or("no feature")?;
+        assert_eq!((Doubt::from_code(feature.doubt), feature.area_px2), (Doubt::WrongFormat, 0.0));
+    }
+    // A driver that begins at 1 again: younger frames with smaller numbers.
+    for restarted in 1..4 {
+        driver.pour(restarted, 20 + restarted as i32)?;
+        let feature = driver.feature(PATIENCE)?.ok_or("no feature")?;
+        assert!(feature.sequence == restarted && feature.area_px2 > 0.0, "{feature:?}");
+    }
+    worker.signal("-TERM")?;
+    let (code, said) = worker.end()?;
+    assert_eq!(code, Some(0), "{said}");
+    Ok(())
+}
+
+/// Protects the cell from two eyes that disagree: a second worker is refused with a reason while the first goes on.
+#[test]
+fn a_second_worker_is_refused() -> Outcome {
+    let directory = tempfile::tempdir()?;
+    let (path, config) = write_config(directory.path(), "second", |_| {})?;
+    let driver = Driver::new(&config.cell.name)?;
+    let _first = Program::start("run", &path, &[])?;
+    driver.wake()?;
+    let mut second = Program::start("run", &path, &[])?;
+    let (code, said) = second.end()?;
+    assert_eq!(code, Some(3), "{said}");
+    assert!(said.contains("another feature worker"), "{said}");
+    while driver.feature(Duration::from_millis(300))?.is_some() {}
+    driver.pour(5000, 20)?;
+    assert!(driver.feature(PATIENCE)?.is_some());
+    Ok(())
+}
+
+/// GET or POST over a plain socket: status line, head and body.
+fn http(address: &str, request: &str, path: &str, body: &str) -> Result<(String, Vec<u8>), Failure> {
+    let mut stream = std::net::TcpStream::connect(address)?;
+    stream.set_read_timeout(Some(PATIENCE))?;
+    write!(stream, "{request} {path} HTTP/1.1\r\nHost: x\r\nConnection: close\r\nContent-Length: {}\r\n\r\n{body}", body.len())?;
+    let mut answer = Vec::new();
+    stream.read_to_end(&mut answer)?;
+    let split = answer.windows(4).position(|w| w == b"\r\n\r\n").ok_or("no head")?;
+    Ok((String::from_utf8_lossy(&answer[..split]).into_owned(), answer[split + 4..].to_vec()))
+}
+
+/// Protects the people who look: the view serves its page, the newest picture as JPEG of the camera's size, and the state as JSON
+/// with a history that follows the flow; what it does not have is 404; it reads beside a running worker and takes nothing from it.
+#[test]
+fn the_view_shows_what_the_worker_measures() -> Outcome {
+    let directory = tempfile::tempdir()?;
+    let (path, config) = write_config(directory.path(), "view", |_| {})?;
+    let driver = Driver::new(&config.cell.name)?;
+    let _worker = Program::start("run", &path, &[])?;
+    driver.wake()?;
+    let mut view = Program::start("view", &path, &["--port", "0"])?;
+    let mut line = String::new();
+    BufReader::new(view.0.stdout.take().ok_or("no output")?).read_line(&mut line)?;
+    let address = line.trim().strip_prefix("http://").ok_or("no address")?.to_string();
+    let state = || -> Result<serde_json::Value, Failure> { Ok(serde_json::from_slice(&http(&address, "GET", "/state.json", "")?.1)?) };
+    while driver.feature(Duration::from_millis(300))?.is_some() {}
+    for i in 8..=20 {
+        driver.pour(2000 + i as u64, i)?;
+        let feature = driver.feature(PATIENCE)?.ok_or("no feature")?;
+        assert_eq!(feature.sequence, 2000 + i as u64, "the worker misses no frame");
+        let begin = Instant::now();
+        while state()?["sequence"] != 2000 + i && begin.elapsed() < PATIENCE {
+            std::thread::sleep(Duration::from_millis(5));
+        }
+        let shown = state()?;
+        assert_eq!(shown["area_px2"].as_f64().map(|a| a as f32), Some(feature.area_px2), "{shown}");
+    }
+    let history = state()?["history"].as_array().cloned().unwrap_or_default();
+    assert!(history.len() >= 13 && history.last().and_then(|v| v.as_f64()) > history.first().and_then(|v| v.as_f64()), "{history:?}");
+    let (head, body) = http(&address, "GET", "/picture.jpg?7", "")?;
+    assert!(head.contains("200") && head.contains("image/jpeg"), "{head}");
+    let picture = opencv::imgcodecs::imdecode(&opencv::core::Vector::<u8>::from_slice(&body), opencv::imgcodecs::IMREAD_COLOR)?;
+    assert_eq!((picture.cols(), picture.rows()), (WIDTH, HEIGHT));
+    let (head, body) = http(&address, "GET", "/", "")?;
+    assert!(head.contains("text/html") && String::from_utf8_lossy(&body).contains("state.json"), "{head}");
+    assert!(http(&address, "GET", "/etc/passwd", "")?.0.contains("404"));
+    view.signal("-INT")?;
+    assert_eq!(view.end()?.0, Some(0));
+    Ok(())
+}
+
+/// Protects calibration in the page: it shows what was found, takes clicks, refuses what cannot be, and writes the file.
+#[test]
+fn the_calibration_page_takes_clicks_and_writes() -> Outcome {
+    let directory = tempfile::tempdir()?;
+    let (path, _) = write_config(directory.path(), "clicks", |c| c.image.colour_hsv = [0, 0, 0, 10, 20, 20])?;
+    for i in 0..40 {
+        let file = directory.path().join(format!("f_{i:03}.png"));
+        opencv::imgcodecs::imwrite(file, &pour(i)?, &opencv::core::Vector::new())?;
+    }
+    let pattern = directory.path().join("f_%03d.png");
+    let picture = directory.path().join("look.png");
+    let (pattern, picture) = (pattern.display().to_string(), picture.display().to_string());
+    let mut page = Program::start("calibrate", &path, &["--page", "--port", "0", "--picture", &picture, &pattern])?;
+    let mut errors = BufReader::new(page.0.stderr.take().ok_or("no output")?);
+    let address = loop {
+        let mut line = String::new();
+        assert!(errors.read_line(&mut line)? > 0, "it ended");
+        if let Some((_, rest)) = line.split_once("open http://") {
+            break rest.split_whitespace().next().unwrap_or("").to_string();
+        }
+    };
+    assert!(http(&address, "GET", "/", "")?.0.contains("text/html"));
+    assert!(http(&address, "GET", "/picture.jpg", "")?.0.contains("image/jpeg"));
+    let state: serde_json::Value = serde_json::from_slice(&http(&address, "GET", "/state.json", "")?.1)?;
+    assert!((state["lip"][0].as_f64().unwrap_or(0.0) - 215.0).abs() < 4.0, "found by itself: {state}");
+    let click = |body: &str| -> Result<String, Failure> { Ok(String::from_utf8(http(&address, "POST", "/corner", body)?.1)?) };
+    assert!(click("nonsense")?.contains("expected"));
+    assert_ne!(click(r#"{"lip":[639,2],"rim":[639,479],"foot":[0,0]}"#)?, "measured again");
+    assert_eq!(click(r#"{"lip":[215,250],"rim":[600,250],"foot":[215,470]}"#)?, "measured again");
+    assert!(String::from_utf8(http(&address, "POST", "/write", "")?.1)?.contains("written"));
+    assert_eq!(page.end()?.0, Some(0));
+    let written = shared::config::Config::read(&path)?;
+    assert_eq!(written.image.x_axis_px, [215.0, 250.0, 600.0, 250.0]);
+    let [h0, .., h1, _, _] = written.image.colour_hsv;
+    assert!(h0 < 110 && h1 > 110, "the liquid's hue is 110: {:?}", written.image.colour_hsv);
+    Ok(())
+}
