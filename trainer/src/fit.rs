@@ -38,8 +38,10 @@ const LOCAL: usize = 3;
 const WEIGHT_SD_G: f64 = 0.6;
 /// A model whose outflow over five frames is nearer than this to the areas is exact: no real rig is, a simulation may be.
 const EXACT: f64 = 0.02;
-/// Noise of an episode's sum of areas, relative.
-const SUM_SD: f64 = 0.012;
+/// Noise of an episode's sum of areas over that of one frame, for some fifty frames of flow.
+const SUM_NOISE: f64 = 0.15;
+/// How much a camera's gain is expected to change from pour to pour (log); less where the model turns out to be exact.
+const GAIN_EXPECTED: f64 = 0.017;
 /// How much a camera's gain changes from pour to pour at least (log).
 const GAIN_SD: f64 = 0.012;
 /// Residuals beyond this grow only with the root.
@@ -81,6 +83,8 @@ struct Stage {
     rel: f64,
     floor: f64,
     gamma_sd: f64,
+    /// Noise of an episode's sum of areas, relative.
+    sum_sd: f64,
     /// Calibration held at (log c, q, tilt) with this sd.
     held: Option<([f64; 3], f64)>,
 }
@@ -169,7 +173,7 @@ impl Prepared {
         }
         out.push((sum + film - self.weight_g) / WEIGHT_SD_G);
         let camera: f64 = self.held.iter().map(|(a, z)| c * (tilt * z).exp() * a.powf(q)).sum();
-        out.push((camera / gain - self.weight_g) / WEIGHT_SD_G.hypot(SUM_SD * self.weight_g));
+        out.push((camera / gain - self.weight_g) / WEIGHT_SD_G.hypot(stage.sum_sd * self.weight_g));
         out.push(lambda / 0.08);
         out.push(gamma / stage.gamma_sd);
     }
@@ -350,8 +354,8 @@ impl Problem<'_> {
         Linear { a, b }
     }
 
-    /// Levenberg-Marquardt from `u`; the cost reached.
-    fn solve(&self, u: &mut Unknowns, iterations: usize) -> f64 {
+    /// Levenberg-Marquardt from `u`, until a step gains less than `tolerance` of the cost; the cost reached.
+    fn solve(&self, u: &mut Unknowns, iterations: usize, tolerance: f64) -> f64 {
         let mut cost = self.cost(u);
         let mut damping = 1e-2;
         for _ in 0..iterations {
@@ -388,7 +392,7 @@ impl Problem<'_> {
                 }
                 damping *= 5.0;
             }
-            if before - cost < 1e-4 * before.max(1.0) {
+            if before - cost < tolerance * before.max(1.0) {
                 break;
             }
         }
@@ -415,28 +419,30 @@ pub fn fit(episodes: &[TrainingEpisode]) -> Fit {
     };
     let (frame_sd, dropouts) = frame_noise(&prepared);
     let temper = |times: f64, most: f64| (times * frame_sd * q0).clamp(0.02 * times, most);
-    let wide = Stage { rel: temper(5.0, 1.0), floor: 0.01, gamma_sd: 0.02, held: None };
+    let wide = Stage { rel: temper(5.0, 1.0), floor: 0.01, gamma_sd: 0.02, sum_sd: SUM_NOISE * frame_sd.max(0.015), held: None };
     let problem = Problem { episodes: &prepared, area_min, stage: wide };
     let mut best: Option<(f64, Unknowns)> = None;
     for (q, flat) in [(1.15, 0.0), (1.15, 0.7), (1.0, 0.7)] {
         for lk in [-3.2, -2.2] {
             let mut u = start(lk, q, flat);
-            let cost = problem.solve(&mut u, 12);
+            let cost = problem.solve(&mut u, 12, 1e-4);
             if best.as_ref().is_none_or(|(c, _)| cost < *c) {
                 best = Some((cost, u));
             }
         }
     }
     let mut u = best.map_or_else(|| start(-3.2, q0, 0.0), |(_, u)| u);
-    problem.solve(&mut u, 25);
+    problem.solve(&mut u, 25, 1e-4);
     let wide_covariance = invert(&problem.linearise(&u).a);
 
     let held = Some(([u.global[LOG_C], u.global[Q], u.global[TILT]], 0.002));
-    let narrow = Problem { stage: Stage { rel: temper(1.5, 0.15), floor: 0.005, gamma_sd: 0.03, held }, ..problem };
-    let mut cost = narrow.solve(&mut u, 30);
+    let narrow = Problem { stage: Stage { rel: temper(1.5, 0.15), floor: 0.005, gamma_sd: 0.03, held, ..wide }, ..problem };
+    let mut cost = narrow.solve(&mut u, 30, 1e-4);
+    let mut gain_expected = GAIN_EXPECTED;
     if misfit(&prepared, &model_of(&u.global), &u) < EXACT {
         // The model is all but exact, so the frames may speak about the calibration too.
-        cost = Problem { stage: Stage { held: None, ..narrow.stage }, ..narrow }.solve(&mut u, 40);
+        cost = Problem { stage: Stage { held: None, ..narrow.stage }, ..narrow }.solve(&mut u, 150, 1e-6);
+        gain_expected = 0.005;
     }
     let covariance = invert(&narrow.linearise(&u).a);
 
@@ -448,7 +454,7 @@ pub fn fit(episodes: &[TrainingEpisode]) -> Fit {
     let log_v_var = wide_covariance[(LOG_C, LOG_C)] + 2.0 * l * wide_covariance[(LOG_C, Q)] + l * l * wide_covariance[(Q, Q)];
     model.noise = FlowNoise {
         lambda: 0.20,
-        gamma: (1.5 * (gain_sd(&gammas) * q / 1.15).hypot(0.5 * log_v_var.max(0.0).sqrt())).min(0.5),
+        gamma: (1.5 * (gain_sd(&gammas, gain_expected) * q / 1.15).hypot(0.5 * log_v_var.max(0.0).sqrt())).min(0.5),
         beta: trusted(0.007f64.hypot(geometry_variance(&u, &covariance).sqrt())),
         delta: 0.3,
         frame: (frame_sd * q).clamp(0.02, 1.0),
@@ -496,10 +502,10 @@ fn trusted(sd: f64) -> f64 {
     (0.5 * sd * (sd / 0.05).max(1.0)).min(0.5)
 }
 
-/// How much the camera's gain changes from pour to pour: 0.017 is expected, and counts as three episodes beside those fitted.
-fn gain_sd(gammas: &[f64]) -> f64 {
+/// How much the camera's gain changes from pour to pour: what is expected counts as three episodes beside those fitted.
+fn gain_sd(gammas: &[f64], expected: f64) -> f64 {
     let sum: f64 = gammas.iter().map(|g| g * g).sum();
-    ((3.0 * 0.017f64.powi(2) + sum) / (3.0 + gammas.len() as f64)).sqrt()
+    ((3.0 * expected * expected + sum) / (3.0 + gammas.len() as f64)).sqrt()
 }
 
 /// Mean gamma of the newest episodes if the camera's gain has changed since the ones before (beyond 3.5 standard errors, three
