@@ -18,7 +18,7 @@ fn always(index: usize) -> Box<Agent> {
         actions_deg: action_table(),
         selection: Selection::Argmax,
         scale: InputScale::default(),
-        calibration: Calibration { c: 0.001, q: 1.0, hold_above_px2: f32::INFINITY },
+        calibration: Calibration { c: 0.001, q: 1.0, tilt: 0.0, hold_above_px2: f32::INFINITY },
         estimator: Estimator::Sum,
         rate_hz: 30.0,
         origin: Origin { method: Method::Handmade, actions: 21, episodes: 0, data_sha256: [0; 32] },

@@ -194,14 +194,14 @@ impl Agent {
     fn observe(&mut self, frame: Frame) -> View {
         let calibration = self.weights.calibration;
         let area_px2 = self.hold.step(frame.area_px2, calibration.hold_above_px2);
-        let v_ml = calibration.volume_ml(area_px2);
+        let v_ml = calibration.volume_ml(area_px2, frame.alpha_deg);
         self.v_ml = [v_ml, self.v_ml[0], self.v_ml[1]];
         self.summed_ml += v_ml;
         let Some(fused) = &mut self.fused else {
             return View { poured_ml: self.summed_ml, poured_sd_ml: 0.0, stop_ml: 0.0 };
         };
         // The filter judges dropouts itself.
-        let y_ml = frame.area_px2.map(|a| f64::from(calibration.volume_ml(a)));
+        let y_ml = frame.area_px2.map(|a| f64::from(calibration.volume_ml(a, frame.alpha_deg)));
         fused.step(y_ml, f64::from(frame.alpha_deg));
         View {
             poured_ml: fused.poured_ml() as f32,
@@ -271,7 +271,7 @@ mod tests {
     fn d_counts_down_and_ends_the_pour() {
         let weights = example();
         let mut agent = Agent::new(&weights);
-        let v = weights.calibration.volume_ml(200.0);
+        let v = weights.calibration.volume_ml(200.0, 50.0);
         agent.start(3.5 * v);
         let seen: Vec<Decision> = (0..5).map(|_| agent.step(frame(200.0))).collect();
         for (k, decision) in seen.iter().enumerate() {
@@ -292,7 +292,7 @@ mod tests {
         agent.start(50.0);
         let areas = [100.0, 200.0, 150.0];
         let decision = areas.map(|a| agent.step(frame(a)))[2];
-        let v = areas.map(|a| weights.calibration.volume_ml(a));
+        let v = areas.map(|a| weights.calibration.volume_ml(a, 50.0));
         let x = weights.scale.apply([v[2], v[1], v[0]], 50.0 - v.iter().sum::<f32>());
         assert_eq!(usize::from(decision.action), policy::argmax(&weights.policy.forward(&x)));
     }

@@ -8,24 +8,34 @@ use serde::{Deserialize, Serialize};
 pub mod flow;
 pub mod fused;
 
-/// V_e in px^2 to ml a frame: `v = c area^q`, with the dropout hold that goes with it.
+/// V_e in px^2 to ml a frame: `v = c area^q exp(tilt z)`, z = (alpha - 60)/30 within +-1.5, with the dropout hold that goes with it.
 ///
-/// Section 3.3.1's normalised contribution volumes are the case q = 1; c then is `w_E / sum V_e`, shared by all episodes.
+/// The picture of the same flow changes a little with the tilt, because the lip's wall turns into the stream.
+///
+/// Section 3.3.1's normalised contribution volumes are the case q = 1, tilt = 0; c then is `w_E / sum V_e`, shared by all episodes.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct Calibration {
     /// c, ml a frame at 1 px^2.
     pub c: f32,
     /// Exponent q.
     pub q: f32,
+    /// Change of log v for 30 degrees more tilt.
+    pub tilt: f32,
     /// A single area of 0 right after an area above this repeats that area, px^2; infinite: never.
     pub hold_above_px2: f32,
 }
 
 impl Calibration {
-    /// Outflow of a frame with `area_px2`, ml.
-    pub fn volume_ml(&self, area_px2: f32) -> f32 {
-        if area_px2 > 0.0 { self.c * area_px2.powf(self.q) } else { 0.0 }
+    /// Outflow of a frame with `area_px2`, taken at the commanded tilt `alpha_deg`, ml.
+    pub fn volume_ml(&self, area_px2: f32, alpha_deg: f32) -> f32 {
+        if area_px2 > 0.0 { self.c * area_px2.powf(self.q) * (self.tilt * tilt_z(f64::from(alpha_deg)) as f32).exp() } else { 0.0 }
     }
+}
+
+/// z of [`Calibration`] at a tilt; 0 for what is not a number.
+pub fn tilt_z(alpha_deg: f64) -> f64 {
+    let z = (alpha_deg - 60.0) / 30.0;
+    if z.is_nan() { 0.0 } else { z.clamp(-1.5, 1.5) }
 }
 
 /// The dropout hold: turns the frames' areas, as they come, into areas that can be summed.
@@ -77,9 +87,13 @@ mod tests {
     /// Protects the calibration's formula, and 0 for no stream even with an odd exponent.
     #[test]
     fn volume_is_a_power_of_the_area() {
-        let cal = Calibration { c: 0.002, q: 1.2, hold_above_px2: 60.0 };
-        assert!((cal.volume_ml(300.0) - 0.002 * 300f32.powf(1.2)).abs() < 1e-6);
-        assert_eq!(cal.volume_ml(0.0), 0.0);
-        assert_eq!(Calibration { q: 0.0, ..cal }.volume_ml(0.0), 0.0);
+        let cal = Calibration { c: 0.002, q: 1.2, tilt: 0.1, hold_above_px2: 60.0 };
+        let at_60 = 0.002 * 300f32.powf(1.2);
+        assert!((cal.volume_ml(300.0, 60.0) - at_60).abs() < 1e-6);
+        assert!((cal.volume_ml(300.0, 90.0) / at_60 - 0.1f32.exp()).abs() < 1e-5);
+        assert_eq!(cal.volume_ml(300.0, 105.0), cal.volume_ml(300.0, f32::INFINITY));
+        assert_eq!(cal.volume_ml(300.0, 60.0), cal.volume_ml(300.0, f32::NAN));
+        assert_eq!(cal.volume_ml(0.0, 60.0), 0.0);
+        assert_eq!(Calibration { q: 0.0, ..cal }.volume_ml(0.0, 60.0), 0.0);
     }
 }

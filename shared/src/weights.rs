@@ -26,7 +26,7 @@ use crate::estimate::flow::{DELAY_MAX, FlowModel, FlowNoise, Return};
 use crate::policy::{ACTIONS, HIDDEN, INPUTS, InputScale, Mlp, nearest_action};
 
 /// Version of the file format; other versions are refused.
-pub const FORMAT_VERSION: u32 = 1;
+pub const FORMAT_VERSION: u32 = 2;
 
 const MAGIC: &[u8; 8] = b"decant-w";
 const HEADER: usize = 24;
@@ -77,12 +77,13 @@ pub enum Estimator {
 impl Estimator {
     fn check(&self) -> Result<(), String> {
         let Self::Fused { model, back } = self else { return Ok(()) };
-        let FlowModel { radius_mm, height_mm, taper, s, lk, p, k1, k2, tau, delay, eta, noise } = *model;
+        let FlowModel { radius_mm, height_mm, taper, flat, s, lk, p, k1, k2, tau, delay, eta, noise } = *model;
         let FlowNoise { lambda, gamma, beta, delta, frame, v_min_ml } = noise;
         let ranges = [
             ("radius", radius_mm, 1.0, 1000.0),
             ("height", height_mm, 1.0, 5000.0),
             ("taper", taper, 0.05, 20.0),
+            ("share of flat shape", flat, 0.0, 1.0),
             ("flow coefficient", lk, -20.0, 20.0),
             ("flow exponent", p, 0.2, 5.0),
             ("k1", k1, -20.0, 20.0),
@@ -301,7 +302,7 @@ impl Weights {
             return Err("the action table is not ascending within +-10 degrees".into());
         }
         let InputScale { v_per_ml, d_ml, gain } = self.scale;
-        let Calibration { c, q, hold_above_px2 } = self.calibration;
+        let Calibration { c, q, tilt, hold_above_px2 } = self.calibration;
         let positive = [
             ("input scale of v", v_per_ml),
             ("input scale of d", d_ml),
@@ -316,6 +317,9 @@ impl Weights {
         }
         if !(0.1..=10.0).contains(&q) {
             return Err(format!("calibration exponent {q} is outside 0.1 to 10"));
+        }
+        if !(-1.0..=1.0).contains(&tilt) {
+            return Err(format!("calibration's change with the tilt {tilt} is outside -1 to 1"));
         }
         if hold_above_px2.is_nan() || hold_above_px2 < 0.0 {
             return Err(format!("dropout hold above {hold_above_px2} px^2 is not a number >= 0"));
@@ -341,7 +345,7 @@ pub(crate) mod tests {
             actions_deg: action_table(),
             selection: Selection::Argmax,
             scale: InputScale::default(),
-            calibration: Calibration { c: 0.002, q: 1.15, hold_above_px2: 60.0 },
+            calibration: Calibration { c: 0.002, q: 1.15, tilt: 0.05, hold_above_px2: 60.0 },
             estimator: Estimator::Sum,
             rate_hz: 30.0,
             origin: Origin { method: Method::Handmade, actions: 21, episodes: 0, data_sha256: [7; 32] },
@@ -356,6 +360,7 @@ pub(crate) mod tests {
             radius_mm: 38.0,
             height_mm: 115.0,
             taper: 1.0,
+            flat: 0.0,
             s: [0.0; crate::estimate::flow::KNOTS],
             lk: -3.0,
             p: 1.5,
@@ -440,6 +445,7 @@ pub(crate) mod tests {
             ("action table", |w| w.actions_deg[3] = 7.0),
             ("calibration c", |w| w.calibration.c = f32::INFINITY),
             ("exponent", |w| w.calibration.q = f32::NAN),
+            ("change with the tilt", |w| w.calibration.tilt = f32::NAN),
             ("frame rate", |w| w.rate_hz = 0.0),
             ("hold", |w| w.calibration.hold_above_px2 = f32::NAN),
             ("estimator: delay", |w| {

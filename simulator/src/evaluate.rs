@@ -23,6 +23,7 @@ use trainer::{best, calibrate};
 use crate::physics::RATE_HZ;
 use crate::physics::episodes::Bench;
 use crate::physics::rig::Rig;
+use crate::physics::seen::Eye;
 
 pub mod baselines;
 pub mod pour;
@@ -109,7 +110,8 @@ impl Change {
   simulator evaluate --method best,pd-tuned,pd-hand,oracle --json out/evaluation.json
   simulator evaluate --weights out/weights.bin --rigs 1
   simulator evaluate --weighed 5 --episodes 5
-  simulator evaluate --container bottle --change noise")]
+  simulator evaluate --container bottle --change noise
+  simulator evaluate --through-camera --rigs 5 --repeats 1")]
 pub struct Args {
     /// Simulator: a (the paper's) or b (physical).
     #[arg(long, default_value = "b", value_parser = ["a", "b"])]
@@ -147,6 +149,9 @@ pub struct Args {
     /// What is different at the test from what the training saw.
     #[arg(long, value_enum, default_value = "none")]
     change: Change,
+    /// Renders each frame and runs the feature worker's extraction, instead of the area formula (simulator b).
+    #[arg(long, conflicts_with = "change")]
+    through_camera: bool,
     /// Writes everything, every pour included, to this file.
     #[arg(long)]
     json: Option<PathBuf>,
@@ -288,6 +293,14 @@ impl Setup {
         Self { bench: benches.0, test: benches.1, data_seed, pour_seed, limits: Limits::default() }
     }
 
+    /// The same rig with a rendered camera over it.
+    pub fn through_camera(mut self, rig: u64, container: &str) -> Result<Self, String> {
+        let Some(physics) = Rig::seeded(rig).with_container(container) else { return Ok(self) };
+        self.bench = Bench::seen(&physics, Eye::seeded(rig)?);
+        self.test = self.bench.clone();
+        Ok(self)
+    }
+
     /// Goals of the grid that the container can pour at all within the tilt range.
     fn cells(&self, repeats: u64) -> Vec<(f64, f64, u64)> {
         let cells: Vec<(f64, f64)> = grid().into_iter().filter(|(init, goal)| *goal <= 0.95 * self.test.reach_ml(*init)).collect();
@@ -321,16 +334,16 @@ impl Setup {
         [(225.0, 40.0), (300.0, 100.0), (375.0, 200.0)].map(example).into()
     }
 
-    /// `k` pours with weights on the training's bench, recorded and weighed.
+    /// `k` pours with weights on the test's bench, recorded and weighed: what has changed is learned too.
     pub fn weighed_pours(&self, weights: &Weights, k: u64) -> Vec<TrainingEpisode> {
         let agent = Agent::new(weights);
         let mut rng = Pcg64Mcg::seed_from_u64(self.data_seed ^ 0x9_0000_0000);
         (0..k)
             .map(|n| {
                 let init = rng.random_range(150.0..450.0f64);
-                let goal = rng.random_range(20.0..200.0f64).min(0.85 * init).min(0.9 * self.bench.reach_ml(init));
+                let goal = rng.random_range(20.0..200.0f64).min(0.85 * init).min(0.9 * self.test.reach_ml(init));
                 let mut trace = Trace::default();
-                let mut world = self.bench.pour(init, rng.random());
+                let mut world = self.test.pour(init, rng.random());
                 by_core(&agent, &mut world, self.limits, init, goal, Some(&mut trace));
                 let misread: f64 = rand_distr::Distribution::sample(&rand_distr::StandardNormal, &mut rng);
                 trace.weighed(&format!("pour {}", n + 1), (world.poured_ml() + 0.5 * misread).round())
@@ -409,6 +422,9 @@ impl Setup {
 
 /// Runs the command; the exit codes are those of [`shared::exit`].
 pub fn run(args: &Args) -> ExitCode {
+    if args.through_camera && args.sim == "a" {
+        return exit::fail(exit::BAD_INPUT, "--through-camera goes with --sim b: simulator a has nothing to look at");
+    }
     if args.actions != 2 && args.actions != 21 {
         return exit::fail(exit::BAD_INPUT, "--actions is 2 or 21");
     }
@@ -420,10 +436,17 @@ pub fn run(args: &Args) -> ExitCode {
         }
     }
     let rigs = if args.sim == "a" { 0..1 } else { args.first_rig..args.first_rig + args.rigs };
-    let setups: Vec<Setup> = rigs
+    let setups: Result<Vec<Setup>, String> = rigs
         .flat_map(|rig| (0..args.seeds).map(move |seed| (rig, seed)))
-        .map(|(rig, seed)| Setup::new(&args.sim, rig, seed, &args.container, args.change))
+        .map(|(rig, seed)| {
+            let setup = Setup::new(&args.sim, rig, seed, &args.container, args.change);
+            if args.through_camera { setup.through_camera(rig, &args.container) } else { Ok(setup) }
+        })
         .collect();
+    let setups = match setups {
+        Ok(setups) => setups,
+        Err(e) => return exit::fail(exit::FAILED, e),
+    };
     let begin = std::time::Instant::now();
     let mut summaries = Vec::new();
     let mut all = Vec::new();

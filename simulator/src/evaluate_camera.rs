@@ -123,12 +123,13 @@ pub fn run(args: &Args) -> ExitCode {
     }
 }
 
-fn camera(view: &View) -> CameraConfig {
+/// The `[camera]` table of a view.
+pub(crate) fn camera_config(view: &View) -> CameraConfig {
     CameraConfig { source: CameraSource::SharedMemory, path: String::new(), width_px: view.width_px, height_px: view.height_px, fps: 30.0 }
 }
 
 /// The configuration that a careful person would write for this view: axes as they are, the region over the mouth.
-fn image_config(view: &View) -> ImageConfig {
+pub(crate) fn image_config(view: &View) -> ImageConfig {
     let (width, height) = (f64::from(view.width_px), f64::from(view.height_px));
     let [x, y] = view.lip_px;
     let (sin, cos) = view.roll_deg.to_radians().sin_cos();
@@ -193,7 +194,8 @@ fn draw_case(random: &mut Pcg64Mcg, clear: bool, seed: u64) -> Result<Case, Fail
     Ok(Case { view, image, labels, seed, dry: random.random::<f64>() < 0.25 })
 }
 
-fn learn_colour(view: &View, image: &ImageConfig, seed: u64) -> Result<[u8; 6], Failure> {
+/// The liquid's colour in one rendered pour.
+pub(crate) fn learn_colour(view: &View, image: &ImageConfig, seed: u64) -> Result<[u8; 6], Failure> {
     let mut renderer = Renderer::new(view, seed)?;
     let mut learner = ColourLearner::new(Axes::new(image));
     let mut pixels = vec![0; (view.width_px * view.height_px * 3) as usize];
@@ -251,7 +253,7 @@ fn evaluate(args: &Args) -> Result<(), Failure> {
         let mut random = Pcg64Mcg::seed_from_u64(seed);
         let case = draw_case(&mut random, clear, seed)?;
         let mut renderer = Renderer::new(&case.view, seed)?;
-        let mut extractor = Extractor::new(&camera(&case.view), &case.image)?;
+        let mut extractor = Extractor::new(&camera_config(&case.view), &case.image)?;
         let mut pixels = vec![0; (case.view.width_px * case.view.height_px * 3) as usize];
         let method = if clear { "clear" } else { "colour" };
         if args.method.as_deref().is_some_and(|m| m != method) {
@@ -395,7 +397,7 @@ fn doubts(seed: u64) -> Result<BTreeMap<&'static str, f64>, Failure> {
             image.region_px = [x - 20, y - 50, 120, 60];
         }
         let mut renderer = Renderer::new(&view, seed)?;
-        let mut extractor = Extractor::new(&camera(&view), &image)?;
+        let mut extractor = Extractor::new(&camera_config(&view), &image)?;
         let mut pixels = vec![0; (view.width_px * view.height_px * 3) as usize];
         let mut hits = 0;
         for i in 0..30 {
@@ -409,7 +411,7 @@ fn doubts(seed: u64) -> Result<BTreeMap<&'static str, f64>, Failure> {
     // The same picture twice.
     let image = ImageConfig { colour_hsv: learn_colour(&base, &image_config(&base), seed)?, ..image_config(&base) };
     let mut renderer = Renderer::new(&base, seed)?;
-    let mut extractor = Extractor::new(&camera(&base), &image)?;
+    let mut extractor = Extractor::new(&camera_config(&base), &image)?;
     let mut pixels = vec![0; (base.width_px * base.height_px * 3) as usize];
     let mut hits = 0;
     for i in 0..30 {

@@ -8,12 +8,14 @@
 //! | [`container`] | vessels, what they retain at a tilt, the flow over the lip, the film, step by step |
 //! | [`rig`] | a seeded rig of simulator b: container, liquid, servo, camera; one pour of it frame by frame |
 //! | [`paper`] | simulator a |
+//! | [`seen`] | the same pour through a rendered camera and the feature worker's extraction |
 //! | [`episodes`] | what a person would record on either: curves of eq. (1), weighed |
 
 pub mod container;
 pub mod episodes;
 pub mod paper;
 pub mod rig;
+pub mod seen;
 
 /// Frames a second of both simulators.
 pub const RATE_HZ: f64 = 30.0;
@@ -27,14 +29,17 @@ pub enum World {
     A(paper::Pour),
     /// Simulator b.
     B(Box<rig::Pour>),
+    /// Simulator b through a rendered camera.
+    Seen(Box<seen::Seen>),
 }
 
 impl World {
-    /// One frame with `alpha_deg` commanded; the area that the camera reports at its end, px^2.
+    /// One frame with `alpha_deg` commanded; the area that the camera reports at its end, px^2; NaN: not usable.
     pub fn frame(&mut self, alpha_deg: f64) -> f32 {
         match self {
             Self::A(pour) => pour.frame(alpha_deg),
             Self::B(pour) => pour.frame(alpha_deg),
+            Self::Seen(seen) => seen.frame(alpha_deg),
         }
     }
 
@@ -43,6 +48,7 @@ impl World {
         match self {
             Self::A(pour) => pour.poured_ml(),
             Self::B(pour) => pour.poured_ml(),
+            Self::Seen(seen) => seen.pour.poured_ml(),
         }
     }
 }

@@ -100,8 +100,9 @@ fn run_once(top: usize, clip: Option<f32>, steps: usize, seed: u64) -> Run {
         let mut states = Vec::new();
         for i in 1..volumes.len() {
             let at = |k: usize| i.checked_sub(k).map_or(0.0, |j| volumes[j]) as f32;
-            d -= volumes[i];
+            // As printed: state i holds d_i, from which v_i has yet to be taken.
             states.push((scale.apply([at(0), at(1), at(2)], d as f32), u8::from(alphas[i] > alphas[i - 1])));
+            d -= volumes[i];
         }
         sequences.push((states, reward(d)));
     }

@@ -324,7 +324,7 @@ fn tilt_until_it_flows() -> Weights {
     policy.w2[0][0] = 1.0;
     policy.w3[0][STAY] = 1.0;
     policy.b3[STAY + 7] = 0.5;
-    let calibration = Calibration { c: ML_PER_PX2 as f32, q: 1.0, hold_above_px2: f32::INFINITY };
+    let calibration = Calibration { c: ML_PER_PX2 as f32, q: 1.0, tilt: 0.0, hold_above_px2: f32::INFINITY };
     Weights { policy, calibration, ..tests::steady_weights(STAY + 7) }
 }
 

@@ -46,5 +46,5 @@ pub fn fit(episodes: &[TrainingEpisode], exponent: Option<f64>) -> Calibration {
         let grid = (0..=90).map(|k| 0.8 + 0.01 * f64::from(k));
         grid.min_by(|a, b| fit_c(*a).1.total_cmp(&fit_c(*b).1)).unwrap_or(1.0)
     });
-    Calibration { c: fit_c(q).0.max(1e-12) as f32, q: q as f32, hold_above_px2: HOLD_ABOVE_PX2 }
+    Calibration { c: fit_c(q).0.max(1e-12) as f32, q: q as f32, tilt: 0.0, hold_above_px2: HOLD_ABOVE_PX2 }
 }

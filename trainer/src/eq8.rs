@@ -7,6 +7,7 @@
 //! |---|---|---|
 //! | volumes | normalised contribution volumes, V_e summed as it is | the same of c area^q, with the dropout hold |
 //! | action of state i | alpha(i) - alpha(i-1), the one *before* the image | alpha(i+1) - alpha(i), the one taken in that state |
+//! | d of state i | d_i, from which v_i has yet to be taken | d_{i+1}, as eq. (2) gives it at run time |
 //! | goals, eq. (6) | kappa = 0.5, 0.6 .. 1.5 | kappa = 1: the volume that was poured is the goal that was met |
 //! | weights, eq. (5), (7), (8) | normalised rewards of either sign | R of eq. (5), never negative |
 //! | frames without flow and without motion | all | dropped: they teach to wait for ever |
@@ -48,7 +49,11 @@ pub fn contributions(episode: &TrainingEpisode, calibration: &Calibration) -> Ve
     let seen: Vec<f64> = episode
         .area_px2
         .iter()
-        .map(|a| f64::from(calibration.volume_ml(hold.step(Some(*a as f32).filter(|a| !a.is_nan()), calibration.hold_above_px2))))
+        .zip(&episode.alpha_deg)
+        .map(|(area, alpha)| {
+            let held = hold.step(Some(*area as f32).filter(|a| !a.is_nan()), calibration.hold_above_px2);
+            f64::from(calibration.volume_ml(held, *alpha as f32))
+        })
         .collect();
     let sum: f64 = seen.iter().sum();
     seen.iter().map(|v| episode.weight_g * v / sum.max(1e-12)).collect()
@@ -74,6 +79,7 @@ fn sequence(
     let mut d = kappa * episode.weight_g;
     let mut states = Vec::with_capacity(volumes.len());
     for i in 0..volumes.len() {
+        let before = d;
         d -= volumes[i];
         let (from, to) = if next { (i, i + 1) } else { (i.max(1) - 1, i) };
         let Some(moved) = episode.alpha_deg.get(to).map(|a| a - episode.alpha_deg[from]) else { continue };
@@ -81,7 +87,7 @@ fn sequence(
         if !keep_still && v[0] == 0.0 && moved.abs() < 0.025 {
             continue;
         }
-        states.push((scale.apply(v, d as f32), act(moved)));
+        states.push((scale.apply(v, if next { d } else { before } as f32), act(moved)));
     }
     Sequence { states, reward: reward(d) }
 }

@@ -8,32 +8,42 @@
 
 use nalgebra::{DMatrix, DVector};
 use rayon::prelude::*;
-use shared::estimate::Calibration;
 use shared::estimate::flow::{DELAY_MAX, DRIP, Flow, FlowModel, FlowNoise, HISTORY, KNOTS, KNOTS_DEG};
+use shared::estimate::{Calibration, Hold, tilt_z};
 
 use crate::calibrate;
 use crate::data::TrainingEpisode;
 
-/// Global unknowns: s (one a knot), log R, log H/R, taper, lk, p, k1, k2, tau, delay, eta, log c, q.
-const GLOBAL: usize = KNOTS + 12;
+/// Global unknowns: s (one a knot), log R, log H/R, taper, flat, lk, p, k1, k2, tau, delay, eta, log c, q, tilt.
+const GLOBAL: usize = KNOTS + 14;
 const LOG_R: usize = KNOTS;
 const LOG_SLIM: usize = KNOTS + 1;
 const TAPER: usize = KNOTS + 2;
-const LK: usize = KNOTS + 3;
-const P: usize = KNOTS + 4;
-const K1: usize = KNOTS + 5;
-const K2: usize = KNOTS + 6;
-const TAU: usize = KNOTS + 7;
-const DELAY: usize = KNOTS + 8;
-const ETA: usize = KNOTS + 9;
-const LOG_C: usize = KNOTS + 10;
-const Q: usize = KNOTS + 11;
+const FLAT: usize = KNOTS + 3;
+const LK: usize = KNOTS + 4;
+const P: usize = KNOTS + 5;
+const K1: usize = KNOTS + 6;
+const K2: usize = KNOTS + 7;
+const TAU: usize = KNOTS + 8;
+const DELAY: usize = KNOTS + 9;
+const ETA: usize = KNOTS + 10;
+const LOG_C: usize = KNOTS + 11;
+const Q: usize = KNOTS + 12;
+const TILT: usize = KNOTS + 13;
 /// Global unknowns that make the geometry.
-const GEOMETRY: usize = KNOTS + 3;
+const GEOMETRY: usize = KNOTS + 4;
 /// Unknowns of an episode: onset angle, lambda, gamma.
 const LOCAL: usize = 3;
 /// Weight of a scale that shows whole grams, and of the person reading it, g.
 const WEIGHT_SD_G: f64 = 0.6;
+/// A model whose outflow over five frames is nearer than this to the areas is exact: no real rig is, a simulation may be.
+const EXACT: f64 = 0.02;
+/// Noise of an episode's sum of areas over that of one frame, for some fifty frames of flow.
+const SUM_NOISE: f64 = 0.15;
+/// How much a camera's gain is expected to change from pour to pour (log); less where the model turns out to be exact.
+const GAIN_EXPECTED: f64 = 0.017;
+/// How much a camera's gain changes from pour to pour at least (log).
+const GAIN_SD: f64 = 0.012;
 /// Residuals beyond this grow only with the root.
 const HUBER: f64 = 3.0;
 
@@ -57,7 +67,10 @@ pub struct Fit {
 /// One episode made ready: areas, their smoothed profile, masks.
 struct Prepared {
     alpha: Vec<f64>,
+    tilt_z: Vec<f64>,
     area: Vec<f64>,
+    /// Areas with the dropout hold, as they are summed: those above 0, with their z.
+    held: Vec<(f64, f64)>,
     smooth: Vec<f64>,
     smooth_max: f64,
     used: Vec<bool>,
@@ -70,8 +83,10 @@ struct Stage {
     rel: f64,
     floor: f64,
     gamma_sd: f64,
-    /// Calibration held at (log c, q) with this sd.
-    held: Option<([f64; 2], f64)>,
+    /// Noise of an episode's sum of areas, relative.
+    sum_sd: f64,
+    /// Calibration held at (log c, q, tilt) with this sd.
+    held: Option<([f64; 3], f64)>,
 }
 
 impl Prepared {
@@ -99,38 +114,57 @@ impl Prepared {
             .collect();
         let smooth_max = smooth.iter().copied().fold(1e-9, f64::max);
         let first = (0..n).find(|k| seen(*k)).unwrap_or(0);
-        Self { alpha: e.alpha_deg.clone(), area, smooth, smooth_max, used, weight_g: e.weight_g, first }
+        let tilt_z_of: Vec<f64> = e.alpha_deg.iter().map(|a| tilt_z(*a)).collect();
+        let mut hold = Hold::default();
+        let held = e
+            .area_px2
+            .iter()
+            .zip(&e.alpha_deg)
+            .map(|(a, alpha)| (f64::from(hold.step(Some(*a as f32), calibrate::HOLD_ABOVE_PX2)), tilt_z(*alpha)))
+            .filter(|(a, _)| *a > 0.0)
+            .collect();
+        Self { alpha: e.alpha_deg.clone(), held, tilt_z: tilt_z_of, area, smooth, smooth_max, used, weight_g: e.weight_g, first }
     }
 
-    /// Residuals of this episode for a model; appends to `out`.
-    fn residuals(&self, flow: &Flow, log_c: f64, q: f64, local: &[f64; LOCAL], stage: &Stage, area_min: f64, out: &mut Vec<f64>) {
-        let [onset, lambda, gamma] = *local;
-        let (c, gain) = (log_c.exp(), gamma.exp());
-        let v_min = c * area_min.powf(q);
-        let v_max = c * self.smooth_max.powf(q);
+    /// What the model says left the lip in each frame, and the film after it, ml.
+    fn outflow<'a>(&'a self, flow: &'a Flow, onset: f64, lambda: f64) -> impl Iterator<Item = (f64, f64)> + 'a {
         let mut x = flow.capacity_ml(onset.clamp(0.0, 115.0));
-        let (mut film, mut sum) = (0.0, 0.0);
+        let mut film = 0.0;
         let mut history = [self.alpha[0]; HISTORY];
         let mut a = self.alpha[0];
         let eta = flow.model.eta;
-        for k in 0..self.area.len() {
+        self.alpha.iter().map(move |alpha| {
             history.copy_within(1.., 0);
-            history[HISTORY - 1] = self.alpha[k];
+            history[HISTORY - 1] = *alpha;
             a = flow.tilt(a, flow.delayed(&history, 0));
             let v = flow.over(a, x, lambda).v_ml;
             x += v;
             film += eta * v;
             let drip = DRIP * film;
             film -= drip;
-            let leaves = (1.0 - eta) * v + drip;
+            ((1.0 - eta) * v + drip, film)
+        })
+    }
+
+    /// Residuals of this episode for a model; appends to `out`.
+    fn residuals(&self, flow: &Flow, [log_c, q, tilt]: [f64; 3], local: &[f64; LOCAL], stage: &Stage, area_min: f64, out: &mut Vec<f64>) {
+        let [onset, lambda, gamma] = *local;
+        let (c, gain) = (log_c.exp(), gamma.exp());
+        let v_min = c * area_min.powf(q);
+        let v_max = c * self.smooth_max.powf(q);
+        let mut sum = 0.0;
+        let mut film = 0.0;
+        for (k, (leaves, left)) in self.outflow(flow, onset, lambda).enumerate() {
             sum += leaves;
+            film = left;
             if !self.used[k] {
                 continue;
             }
             let h = leaves * gain;
-            let sigma = stage.rel * c * self.smooth[k].powf(q) + stage.floor * v_max;
+            let c_k = c * (tilt * self.tilt_z[k]).exp();
+            let sigma = stage.rel * c_k * self.smooth[k].powf(q) + stage.floor * v_max;
             if self.area[k] > 0.0 {
-                out.push(soft((c * self.area[k].powf(q) - h) / sigma));
+                out.push(soft((c_k * self.area[k].powf(q) - h) / sigma));
             } else if h > v_min {
                 out.push(soft((v_min - h) / sigma));
             } else {
@@ -138,6 +172,8 @@ impl Prepared {
             }
         }
         out.push((sum + film - self.weight_g) / WEIGHT_SD_G);
+        let camera: f64 = self.held.iter().map(|(a, z)| c * (tilt * z).exp() * a.powf(q)).sum();
+        out.push((camera / gain - self.weight_g) / WEIGHT_SD_G.hypot(stage.sum_sd * self.weight_g));
         out.push(lambda / 0.08);
         out.push(gamma / stage.gamma_sd);
     }
@@ -156,6 +192,7 @@ fn model_of(g: &[f64]) -> FlowModel {
         radius_mm,
         height_mm: radius_mm * g[LOG_SLIM].clamp(-1.0, 3.0).exp(),
         taper: g[TAPER].clamp(0.2, 3.0),
+        flat: g[FLAT].clamp(0.0, 1.0),
         s,
         lk: g[LK],
         p: g[P].clamp(0.3, 4.0),
@@ -173,6 +210,7 @@ pub fn moved(model: &FlowModel, by: &[f64]) -> FlowModel {
     let mut g = [0.0; GLOBAL];
     g[..KNOTS].copy_from_slice(&model.s);
     (g[LOG_R], g[LOG_SLIM], g[TAPER]) = (model.radius_mm.ln(), (model.height_mm / model.radius_mm).ln(), model.taper);
+    g[FLAT] = model.flat;
     (g[LK], g[P], g[K1], g[K2]) = (model.lk, model.p, model.k1, model.k2);
     (g[TAU], g[DELAY], g[ETA]) = (model.tau, model.delay, model.eta);
     for (g, b) in g.iter_mut().zip(by) {
@@ -201,6 +239,8 @@ fn priors(g: &[f64], stage: &Stage) -> Vec<f64> {
     r.push((g[LOG_R] - 37f64.ln()) / 0.25);
     r.push((g[LOG_SLIM] - 3f64.ln()) / 0.3);
     r.push((g[TAPER] - 1.0) / 0.15);
+    r.push(far(g[FLAT] / 0.05));
+    r.push(g[TILT] / 0.03);
     r.push((g[P] - 1.5) / 0.15);
     r.push((g[LK] + 3.2) / 1.5);
     r.push(g[K1] / 0.35);
@@ -210,9 +250,10 @@ fn priors(g: &[f64], stage: &Stage) -> Vec<f64> {
     r.push((g[ETA] - 0.05) / 0.06);
     match stage.held {
         None => r.push((g[Q] - 1.15) / 0.2),
-        Some(([log_c, q], sd)) => {
+        Some(([log_c, q, tilt], sd)) => {
             r.push((g[LOG_C] - log_c) / sd);
             r.push((g[Q] - q) / sd);
+            r.push((g[TILT] - tilt) / sd);
         }
     }
     r
@@ -238,7 +279,7 @@ struct Linear {
 impl Problem<'_> {
     fn episode_residuals(&self, k: usize, flow: &Flow, global: &[f64], local: &[f64; LOCAL]) -> Vec<f64> {
         let mut out = Vec::with_capacity(self.episodes[k].area.len() + 4);
-        self.episodes[k].residuals(flow, global[LOG_C], global[Q], local, &self.stage, self.area_min, &mut out);
+        self.episodes[k].residuals(flow, [global[LOG_C], global[Q], global[TILT]], local, &self.stage, self.area_min, &mut out);
         out
     }
 
@@ -313,8 +354,8 @@ impl Problem<'_> {
         Linear { a, b }
     }
 
-    /// Levenberg-Marquardt from `u`; the cost reached.
-    fn solve(&self, u: &mut Unknowns, iterations: usize) -> f64 {
+    /// Levenberg-Marquardt from `u`, until a step gains less than `tolerance` of the cost; the cost reached.
+    fn solve(&self, u: &mut Unknowns, iterations: usize, tolerance: f64) -> f64 {
         let mut cost = self.cost(u);
         let mut damping = 1e-2;
         for _ in 0..iterations {
@@ -340,6 +381,7 @@ impl Problem<'_> {
                     }
                 }
                 let model = model_of(&next.global);
+                next.global[FLAT] = model.flat;
                 (next.global[P], next.global[TAU], next.global[DELAY], next.global[ETA]) = (model.p, model.tau, model.delay, model.eta);
                 let new = self.cost(&next);
                 if new < cost {
@@ -350,7 +392,7 @@ impl Problem<'_> {
                 }
                 damping *= 5.0;
             }
-            if before - cost < 1e-4 * before.max(1.0) {
+            if before - cost < tolerance * before.max(1.0) {
                 break;
             }
         }
@@ -364,59 +406,124 @@ pub fn fit(episodes: &[TrainingEpisode]) -> Fit {
     let area_min = prepared.iter().flat_map(|p| &p.area).copied().filter(|a| *a > 0.0).fold(f64::INFINITY, f64::min);
     let area_min = if area_min.is_finite() { area_min } else { 1.0 };
     let q0 = 1.15;
-    let c0 = f64::from(calibrate::fit(episodes, Some(q0)).c);
 
-    let start = |lk: f64| {
+    // A cup or something else, a thin or a thick stream: the best of these beginnings is followed.
+    let start = |lk: f64, q: f64, flat: f64| {
         let mut global = [0.0; GLOBAL];
-        (global[LOG_R], global[LOG_SLIM], global[TAPER]) = (37f64.ln(), 3f64.ln(), 1.0);
+        (global[LOG_R], global[LOG_SLIM], global[TAPER], global[FLAT]) = (37f64.ln(), 3f64.ln(), 1.0, flat);
         (global[LK], global[P], global[TAU], global[DELAY], global[ETA]) = (lk, 1.5, 2.0, 2.0, 0.05);
-        (global[LOG_C], global[Q]) = (c0.ln(), q0);
+        (global[LOG_C], global[Q]) = (f64::from(calibrate::fit(episodes, Some(q)).c).ln(), q);
         let flow = Flow::new(&model_of(&global));
         let local = prepared.iter().map(|p| [onset_guess(&flow, p), 0.0, 0.0]).collect();
         Unknowns { global, local }
     };
-    let wide = Stage { rel: 0.25, floor: 0.01, gamma_sd: 0.02, held: None };
+    let (frame_sd, dropouts) = frame_noise(&prepared);
+    let temper = |times: f64, most: f64| (times * frame_sd * q0).clamp(0.02 * times, most);
+    let wide = Stage { rel: temper(5.0, 1.0), floor: 0.01, gamma_sd: 0.02, sum_sd: SUM_NOISE * frame_sd.max(0.015), held: None };
     let problem = Problem { episodes: &prepared, area_min, stage: wide };
     let mut best: Option<(f64, Unknowns)> = None;
-    for lk in [-4.2, -3.2, -2.2] {
-        let mut u = start(lk);
-        let cost = problem.solve(&mut u, 12);
-        if best.as_ref().is_none_or(|(c, _)| cost < *c) {
-            best = Some((cost, u));
+    for (q, flat) in [(1.15, 0.0), (1.15, 0.7), (1.0, 0.7)] {
+        for lk in [-3.2, -2.2] {
+            let mut u = start(lk, q, flat);
+            let cost = problem.solve(&mut u, 12, 1e-4);
+            if best.as_ref().is_none_or(|(c, _)| cost < *c) {
+                best = Some((cost, u));
+            }
         }
     }
-    let mut u = best.map_or_else(|| start(-3.2), |(_, u)| u);
-    problem.solve(&mut u, 25);
+    let mut u = best.map_or_else(|| start(-3.2, q0, 0.0), |(_, u)| u);
+    problem.solve(&mut u, 25, 1e-4);
     let wide_covariance = invert(&problem.linearise(&u).a);
 
-    let held = Some(([u.global[LOG_C], u.global[Q]], 0.002));
-    let narrow = Problem { stage: Stage { rel: 0.15, floor: 0.005, gamma_sd: 0.03, held }, ..problem };
-    let cost = narrow.solve(&mut u, 30);
+    let held = Some(([u.global[LOG_C], u.global[Q], u.global[TILT]], 0.002));
+    let narrow = Problem { stage: Stage { rel: temper(1.5, 0.15), floor: 0.005, gamma_sd: 0.03, held, ..wide }, ..problem };
+    let mut cost = narrow.solve(&mut u, 30, 1e-4);
+    let mut gain_expected = GAIN_EXPECTED;
+    if misfit(&prepared, &model_of(&u.global), &u) < EXACT {
+        // The model is all but exact, so the frames may speak about the calibration too.
+        cost = Problem { stage: Stage { held: None, ..narrow.stage }, ..narrow }.solve(&mut u, 150, 1e-6);
+        gain_expected = 0.005;
+    }
     let covariance = invert(&narrow.linearise(&u).a);
 
-    let (log_c, q) = (u.global[LOG_C], u.global[Q]);
+    let gammas: Vec<f64> = u.local.iter().map(|l| l[2]).collect();
+    let (log_c, q) = (u.global[LOG_C] - newest_gain(&gammas), u.global[Q]);
     let mut model = model_of(&u.global);
-    let (frame_noise, dropouts) = frame_noise(&prepared);
     // sd of log v at 300 px^2 from the wide stage: log v = log c + q log 300.
     let l = 300f64.ln();
     let log_v_var = wide_covariance[(LOG_C, LOG_C)] + 2.0 * l * wide_covariance[(LOG_C, Q)] + l * l * wide_covariance[(Q, Q)];
     model.noise = FlowNoise {
         lambda: 0.20,
-        gamma: (0.017 * q / 1.15).hypot(0.5 * log_v_var.max(0.0).sqrt()).min(0.5),
-        // The narrow stage tempers the frames' residuals, so its covariance is too wide; half of it pours best on other rigs.
-        beta: (0.5 * (0.007f64.powi(2) + geometry_variance(&u, &covariance)).sqrt()).min(0.5),
+        gamma: (1.5 * (gain_sd(&gammas, gain_expected) * q / 1.15).hypot(0.5 * log_v_var.max(0.0).sqrt())).min(0.5),
+        beta: trusted(0.007f64.hypot(geometry_variance(&u, &covariance).sqrt())),
         delta: 0.3,
-        frame: (frame_noise * q).clamp(0.02, 1.0),
+        frame: (frame_sd * q).clamp(0.02, 1.0),
         v_min_ml: log_c.exp() * area_min.powf(q),
     };
     Fit {
         model,
-        calibration: Calibration { c: log_c.exp() as f32, q: q as f32, hold_above_px2: calibrate::HOLD_ABOVE_PX2 },
+        calibration: Calibration {
+            c: log_c.exp() as f32,
+            q: q as f32,
+            tilt: u.global[TILT] as f32,
+            hold_above_px2: calibrate::HOLD_ABOVE_PX2,
+        },
         episodes: u.local,
         cost,
         covariance: covariance.view((0, 0), (GLOBAL, GLOBAL)).into_owned(),
         dropouts,
     }
+}
+
+/// Relative difference of the fitted outflow and the areas over five frames (rms over the strong flow).
+fn misfit(prepared: &[Prepared], model: &FlowModel, u: &Unknowns) -> f64 {
+    let flow = Flow::new(model);
+    let [c, q, tilt] = [u.global[LOG_C].exp(), u.global[Q], u.global[TILT]];
+    let mut squares = (0.0, 0.0);
+    for (p, [onset, lambda, gamma]) in prepared.iter().zip(&u.local) {
+        let seen: Vec<f64> = (0..p.area.len()).map(|k| c * (tilt * p.tilt_z[k]).exp() * p.area[k].max(0.0).powf(q)).collect();
+        let most = seen.iter().copied().fold(0.0, f64::max);
+        let said: Vec<f64> = p.outflow(&flow, *onset, *lambda).map(|(leaves, _)| leaves * gamma.exp()).collect();
+        for k in 5..seen.len() {
+            if (k - 5..k).all(|j| p.used[j] && seen[j] > 0.1 * most) {
+                let mean = |v: &[f64]| v[k - 5..k].iter().sum::<f64>();
+                squares.0 += (mean(&said).max(1e-9) / mean(&seen)).ln().powi(2);
+                squares.1 += 1.0;
+            }
+        }
+    }
+    if squares.1 > 0.0 { (squares.0 / squares.1).sqrt() } else { f64::INFINITY }
+}
+
+/// The sd of the geometry's scale that the filter gets. The narrow stage tempers the frames' residuals, so its covariance is
+/// too wide where the frames decide, and half of it pours best on other rigs; where little was poured the priors decide,
+/// and nothing may be taken off.
+fn trusted(sd: f64) -> f64 {
+    (0.5 * sd * (sd / 0.05).max(1.0)).min(0.5)
+}
+
+/// How much the camera's gain changes from pour to pour: what is expected counts as three episodes beside those fitted.
+fn gain_sd(gammas: &[f64], expected: f64) -> f64 {
+    let sum: f64 = gammas.iter().map(|g| g * g).sum();
+    ((3.0 * expected * expected + sum) / (3.0 + gammas.len() as f64)).sqrt()
+}
+
+/// Mean gamma of the newest episodes if the camera's gain has changed since the ones before (beyond 3.5 standard errors, three
+/// episodes at least on either side), else 0. Episodes are in the order in which they were poured.
+fn newest_gain(gammas: &[f64]) -> f64 {
+    let n = gammas.len();
+    let mut found = (3.5, 0.0);
+    for k in 3..n.saturating_sub(2) {
+        let (before, after) = gammas.split_at(k);
+        let mean = |g: &[f64]| g.iter().sum::<f64>() / g.len() as f64;
+        let spread = |g: &[f64]| g.iter().map(|x| (x - mean(g)).powi(2)).sum::<f64>();
+        let sd = ((spread(before) + spread(after)) / (n - 2) as f64).sqrt().max(GAIN_SD);
+        let z = (mean(after) - mean(before)).abs() / (sd * (1.0 / before.len() as f64 + 1.0 / after.len() as f64).sqrt());
+        if z > found.0 {
+            found = (z, mean(after));
+        }
+    }
+    found.1
 }
 
 /// The tilt at the first sight of flow, a little back.

@@ -213,8 +213,9 @@ impl ModelPour<'_> {
         let seen = if dropped || seen < self.worlds.nominal.noise.v_min_ml { 0.0 } else { seen };
         // Through the area and the hold, as at run time.
         let cal = &self.worlds.calibration;
-        let area = if seen > 0.0 { (seen / f64::from(cal.c)).powf(1.0 / f64::from(cal.q)) as f32 } else { 0.0 };
-        let v = f64::from(cal.volume_ml(self.hold.step(Some(area), cal.hold_above_px2)));
+        let at_1_px2 = f64::from(cal.volume_ml(1.0, alpha as f32));
+        let area = if seen > 0.0 { (seen / at_1_px2).powf(1.0 / f64::from(cal.q)) as f32 } else { 0.0 };
+        let v = f64::from(cal.volume_ml(self.hold.step(Some(area), cal.hold_above_px2), alpha as f32));
         self.v_ml = [v, self.v_ml[0], self.v_ml[1]];
         self.summed_ml += v;
         if self.worlds.fused {

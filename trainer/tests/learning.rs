@@ -82,7 +82,7 @@ fn the_trained_policy_pours() {
 fn contributions_add_up_to_the_weight() {
     let e = &episodes(1, 4)[0];
     for (q, hold_above_px2) in [(1.0, f32::INFINITY), (1.2, 60.0)] {
-        let sum: f64 = eq8::contributions(e, &Calibration { c: 1.0, q, hold_above_px2 }).iter().sum();
+        let sum: f64 = eq8::contributions(e, &Calibration { c: 1.0, q, tilt: 0.0, hold_above_px2 }).iter().sum();
         assert!((sum - e.weight_g).abs() < 1e-6);
     }
 }

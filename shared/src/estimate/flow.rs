@@ -15,7 +15,9 @@
 //! ```
 //!
 //! w_0 is that of a round vessel with straight walls: the plane of the liquid turns about the lip, so
-//! `w_0 = integral of (distance from the lip) dA` over the free surface, a degree. What the vessel really is, s says.
+//! `w_0 = integral of (distance from the lip) dA` over the free surface, a degree. A share `flat` of it is replaced by the
+//! same capacity spread evenly over all tilts, for vessels that are anything but straight: beyond the horizontal a beaker is
+//! empty, a bottle is not. What the vessel really is, s says.
 
 use serde::{Deserialize, Serialize};
 
@@ -47,6 +49,8 @@ pub struct FlowModel {
     pub height_mm: f64,
     /// Radius at its bottom over R.
     pub taper: f64,
+    /// Share of the capacity that is spread evenly over all tilts, 0 to 1.
+    pub flat: f64,
     /// s at [`KNOTS_DEG`]: logarithm of the real vessel's w over w_0.
     pub s: [f64; KNOTS],
     /// Logarithm of the flow at an excess worth one degree, at 60 degrees, ml a frame.
@@ -275,7 +279,10 @@ impl FlowModel {
             let f = (a_deg - KNOTS_DEG[k - 1]) / (KNOTS_DEG[k] - KNOTS_DEG[k - 1]);
             self.s[k - 1] + f * (self.s[k] - self.s[k - 1])
         };
-        s.exp() * self.straight(a_deg).0.max(W_MIN)
+        // The volume of the straight vessel over its 90 degrees.
+        let t = self.taper;
+        let even = std::f64::consts::PI * self.radius_mm * self.radius_mm * self.height_mm * (1.0 + t + t * t) / 3.0 / 90.0 / 1000.0;
+        s.exp() * ((1.0 - self.flat) * self.straight(a_deg).0 + self.flat * even).max(W_MIN)
     }
 
     /// (w_0 in ml a degree, free surface in mm^2) of the straight-walled vessel.

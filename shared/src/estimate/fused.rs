@@ -2,13 +2,17 @@
 //!
 //! How far the tilt must go to keep the flow alive tells how much has left, whatever the camera's gain. An extended Kalman
 //! filter on the [flow model](super::flow) weighs the two. Pure and in the controller's loop: fixed size, no allocation, no
-//! panic; about 1.5 kflop a frame.
+//! panic; about 5 kflop a frame.
 //!
 //! State: X (W used up, ml), lambda (flow coefficient of this pour), gamma (camera gain of this pour), beta (scale of the
 //! geometry), F (film, ml), V (poured, ml), delta (delay of this pour, frames). It starts with the first frame that shows
 //! flow; before that only the tilt is followed.
+//!
+//! What is off may be off by more than the episodes showed. So there are three such filters, each with its own explanation:
+//! all as the episodes showed; camera or liquid changed; geometry or delay not to be trusted. Each frame's likelihood moves
+//! weight to the explanations that foresaw it (a Gaussian sum), and the estimate is their mean.
 
-use super::flow::{DRIP, Flow, FlowState, HISTORY, Return};
+use super::flow::{DRIP, Flow, FlowNoise, FlowState, HISTORY, Return};
 
 const N: usize = 7;
 const X: usize = 0;
@@ -19,9 +23,17 @@ const FILM: usize = 4;
 const POURED: usize = 5;
 const DELTA: usize = 6;
 
-/// Standard deviations of what the model does not know, in a frame: X in ml, and per ml of outflow; lambda, log.
-const SD_X: f64 = 0.05;
-const SD_LAMBDA: f64 = 0.02;
+/// Number of explanations.
+const EXPLANATIONS: usize = 3;
+/// How likely each is before anything was seen.
+const PRIOR: [f64; EXPLANATIONS] = [0.7, 0.2, 0.1];
+/// Share of a frame's log-likelihood that counts: frames are less independent than the filters believe.
+const TEMPER: f64 = 0.5;
+
+/// The estimate stays this near to the camera's own sum: standard deviations of its gain, and ml.
+const CAMERA_SDS: f64 = 2.0;
+const CAMERA_ML: f64 = 1.5;
+
 /// Error of an area that does not shrink with it, ml a frame.
 const SD_FLOOR_ML: f64 = 0.012;
 /// Slopes are taken at no less than this excess, so that a filter that believes the flow has ceased can be told otherwise, ml.
@@ -31,16 +43,36 @@ const Y_MAX_ML: f64 = 50.0;
 /// A measurement further off than this many standard deviations counts less.
 const GATE: f64 = 4.0;
 
+/// The tilt that a picture shows, and its change in a frame, degrees.
+#[derive(Debug, Clone, Copy)]
+struct Tilt {
+    a_deg: f64,
+    slope_deg: f64,
+}
+
+/// One explanation: a filter with its own idea of how far what may be off.
+#[derive(Debug, Clone)]
+struct Filter {
+    noise: FlowNoise,
+    /// What the model does not know in a frame (standard deviations): X in ml, and per ml of outflow; lambda, log.
+    sd_x_ml: f64,
+    sd_lambda: f64,
+    state: [f64; N],
+    covariance: [[f64; N]; N],
+    zeros: u32,
+    weight: f64,
+}
+
 /// The filter in one pour.
 #[derive(Debug, Clone)]
 pub struct Fused {
     flow: Flow,
     back: Return,
-    state: [f64; N],
-    covariance: [[f64; N]; N],
+    filters: [Filter; EXPLANATIONS],
+    /// The camera's own sum, ml, with lone zeros bridged; the newest outflow in it; whether that bridges a zero.
+    camera_ml: (f64, f64, bool),
     started: bool,
     frames: u64,
-    zeros: u32,
     a_deg: f64,
     a_before_deg: f64,
     history: [f64; HISTORY],
@@ -49,14 +81,22 @@ pub struct Fused {
 impl Fused {
     /// A filter for a pour to come.
     pub fn new(flow: Flow, back: Return) -> Self {
+        let noise = flow.model.noise;
+        let usual = Filter { noise, sd_x_ml: 0.05, sd_lambda: 0.007, state: [0.0; N], covariance: [[0.0; N]; N], zeros: 0, weight: 0.0 };
+        let changed = FlowNoise { gamma: (3.0 * noise.gamma).max(0.1), lambda: 2.0 * noise.lambda, ..noise };
+        let distrusted = FlowNoise { beta: (5.0 * noise.beta).max(0.1), delta: 1.5, ..noise };
+        let filters = [
+            usual.clone(),
+            Filter { noise: changed, ..usual.clone() },
+            Filter { noise: distrusted, sd_x_ml: 0.2, sd_lambda: 0.02, ..usual },
+        ];
         let mut filter = Self {
             flow,
             back,
-            state: [0.0; N],
-            covariance: [[0.0; N]; N],
+            filters,
+            camera_ml: (0.0, 0.0, false),
             started: false,
             frames: 0,
-            zeros: 0,
             a_deg: 0.0,
             a_before_deg: 0.0,
             history: [0.0; HISTORY],
@@ -67,21 +107,44 @@ impl Fused {
 
     /// Forgets the pour.
     pub fn restart(&mut self) {
-        self.state = [0.0; N];
-        self.covariance = [[0.0; N]; N];
+        for (filter, prior) in self.filters.iter_mut().zip(PRIOR) {
+            filter.state = [0.0; N];
+            filter.covariance = [[0.0; N]; N];
+            filter.zeros = 0;
+            filter.weight = prior;
+        }
+        self.camera_ml = (0.0, 0.0, false);
         self.started = false;
         self.frames = 0;
-        self.zeros = 0;
+    }
+
+    /// Mean of one of the states over the explanations.
+    fn mean(&self, of: usize) -> f64 {
+        self.filters.iter().map(|f| f.weight * f.state[of]).sum()
     }
 
     /// Volume that has left the lip as far as the pictures show, ml.
     pub fn poured_ml(&self) -> f64 {
-        self.state[POURED]
+        // However sure the filters are: the camera cannot be that far off.
+        let (sum, ..) = self.camera_ml;
+        let most = CAMERA_SDS * self.flow.model.noise.gamma * sum + CAMERA_ML;
+        self.mean(POURED).clamp(sum - most, sum + most)
     }
 
     /// Standard deviation of [`Fused::poured_ml`], ml.
     pub fn poured_sd_ml(&self) -> f64 {
-        self.covariance[POURED][POURED].max(0.0).sqrt()
+        let mean = self.poured_ml();
+        self.filters
+            .iter()
+            .map(|f| f.weight * (f.covariance[POURED][POURED] + (f.state[POURED] - mean).powi(2)))
+            .sum::<f64>()
+            .max(0.0)
+            .sqrt()
+    }
+
+    /// Weights of the explanations: as the episodes showed, camera or liquid changed, geometry or delay not to be trusted.
+    pub fn explanations(&self) -> [f64; EXPLANATIONS] {
+        [0, 1, 2].map(|k| self.filters[k].weight)
     }
 
     /// Whether flow has been seen.
@@ -89,15 +152,18 @@ impl Fused {
         self.started
     }
 
+    fn tilt(&self) -> Tilt {
+        Tilt { a_deg: self.a_deg, slope_deg: self.a_deg - self.a_before_deg }
+    }
+
     /// What the filter believes of the liquid.
     pub fn flow_state(&self) -> FlowState {
-        let slope = self.a_deg - self.a_before_deg;
         FlowState {
-            a_deg: self.a_deg - self.state[DELTA] * slope,
-            x_ml: self.state[X],
-            film_ml: self.state[FILM],
-            lambda: self.state[LAMBDA],
-            beta: self.state[BETA],
+            a_deg: self.a_deg - self.mean(DELTA) * self.tilt().slope_deg,
+            x_ml: self.mean(X),
+            film_ml: self.mean(FILM),
+            lambda: self.mean(LAMBDA),
+            beta: self.mean(BETA),
         }
     }
 
@@ -112,20 +178,52 @@ impl Fused {
     /// Takes one frame: the measured outflow `y_ml` (`None`: lost), and the command in force when it was taken, degrees.
     pub fn step(&mut self, y_ml: Option<f64>, alpha_deg: f64) {
         self.follow_tilt(alpha_deg);
+        let tilt = self.tilt();
         let y_ml = y_ml.filter(|y| (0.0..=Y_MAX_ML).contains(y));
+        self.add_up(y_ml);
         if !self.started {
             match y_ml {
-                Some(y) if y > 0.0 => self.start(y),
+                Some(y) if y > 0.0 => {
+                    self.started = true;
+                    for filter in &mut self.filters {
+                        filter.start(&self.flow, tilt, y);
+                    }
+                }
                 _ => return,
             }
         } else if let Some(y) = y_ml {
-            self.update(y);
+            // A zero may be a dropout: it tells the filters what to believe, but not which of them to believe.
+            let said = self.filters.each_mut().map(|f| f.update(&self.flow, tilt, y));
+            let said = if y > 0.0 { said } else { [0.0; EXPLANATIONS] };
+            let most = said.iter().copied().fold(f64::NEG_INFINITY, f64::max);
+            let mut total = 0.0;
+            for (filter, said) in self.filters.iter_mut().zip(said) {
+                filter.weight = (filter.weight * (TEMPER * (said - most)).exp()).max(1e-6);
+                total += filter.weight;
+            }
+            for filter in &mut self.filters {
+                filter.weight /= total;
+            }
         }
-        self.propagate();
-        if !self.state.iter().chain(self.covariance.iter().flatten()).all(|s| s.is_finite()) {
+        for filter in &mut self.filters {
+            filter.propagate(&self.flow, tilt);
+        }
+        if !self.filters.iter().all(Filter::is_finite) {
             // Cannot happen with checked weights; if it does, the pour goes on as one that has not been seen yet.
             self.restart();
         }
+    }
+
+    /// The camera's own sum: a lost frame, or a single zero after a frame with flow, repeats the newest outflow.
+    fn add_up(&mut self, y_ml: Option<f64>) {
+        let (sum, newest, bridged) = &mut self.camera_ml;
+        if let Some(y) = y_ml {
+            *bridged = y == 0.0 && *newest > 0.0 && !*bridged;
+            if !*bridged {
+                *newest = y;
+            }
+        }
+        *sum += *newest;
     }
 
     fn follow_tilt(&mut self, alpha_deg: f64) {
@@ -141,17 +239,22 @@ impl Fused {
         self.a_before_deg = self.a_deg;
         self.a_deg = self.flow.tilt(self.a_deg, self.flow.delayed(&self.history, 0));
     }
+}
+
+impl Filter {
+    fn is_finite(&self) -> bool {
+        self.weight.is_finite() && self.state.iter().chain(self.covariance.iter().flatten()).all(|s| s.is_finite())
+    }
 
     /// The first sight of flow gives X: what must have left for the lip to be covered as high as the stream says.
-    fn start(&mut self, y_ml: f64) {
-        self.started = true;
-        let noise = self.flow.model.noise;
-        let slope = self.a_deg - self.a_before_deg;
-        let w = self.flow.over(self.a_deg, 0.0, 0.0).w;
-        let excess = self.flow.excess_for(self.a_deg, y_ml, 0.0);
-        let per_log = excess / self.flow.model.p;
+    fn start(&mut self, flow: &Flow, tilt: Tilt, y_ml: f64) {
+        let noise = self.noise;
+        let slope = tilt.slope_deg;
+        let w = flow.over(tilt.a_deg, 0.0, 0.0).w;
+        let excess = flow.excess_for(tilt.a_deg, y_ml, 0.0);
+        let per_log = excess / flow.model.p;
         self.state = [0.0; N];
-        self.state[X] = self.flow.capacity_ml(self.a_deg) - excess;
+        self.state[X] = flow.capacity_ml(tilt.a_deg) - excess;
         let variance = |sd: f64| sd * sd;
         let mut c = [[0.0; N]; N];
         let tilt_sd = w * slope * noise.delta;
@@ -172,27 +275,28 @@ impl Fused {
     }
 
     /// Outflow over the lip in this frame at `state`, and its slopes in X, lambda and delta.
-    fn outflow(&self, state: &[f64; N]) -> (f64, f64, f64, f64) {
-        let slope = self.a_deg - self.a_before_deg;
-        let a = self.a_deg - state[DELTA] * slope;
-        let over = self.flow.over(a, state[X], state[LAMBDA]);
+    fn outflow(&self, flow: &Flow, tilt: Tilt, state: &[f64; N]) -> (f64, f64, f64, f64) {
+        let a = tilt.a_deg - state[DELTA] * tilt.slope_deg;
+        let over = flow.over(a, state[X], state[LAMBDA]);
         let dv_de = if over.excess_ml < EXCESS_MIN_ML {
-            self.flow.over(a, self.flow.capacity_ml(a) - EXCESS_MIN_ML, state[LAMBDA]).dv_de
+            flow.over(a, flow.capacity_ml(a) - EXCESS_MIN_ML, state[LAMBDA]).dv_de
         } else {
             over.dv_de
         };
-        (over.v_ml, -dv_de, over.dv_dlambda, -dv_de * over.w * slope)
+        (over.v_ml, -dv_de, over.dv_dlambda, -dv_de * over.w * tilt.slope_deg)
     }
 
-    fn update(&mut self, y_ml: f64) {
-        let noise = self.flow.model.noise;
-        let eta = self.flow.model.eta;
+    /// Takes a measurement; answers with its log-likelihood.
+    fn update(&mut self, flow: &Flow, tilt: Tilt, y_ml: f64) -> f64 {
+        let noise = self.noise;
+        let eta = flow.model.eta;
         let prior = self.state;
         let mut posterior = prior;
         let mut gained = ([0.0; N], 1.0);
+        let mut likelihood = 0.0;
         self.zeros = if y_ml == 0.0 { self.zeros + 1 } else { 0 };
-        for _ in 0..2 {
-            let (v, v_x, v_lambda, v_delta) = self.outflow(&posterior);
+        for pass in 0..2 {
+            let (v, v_x, v_lambda, v_delta) = self.outflow(flow, tilt, &posterior);
             let gain = posterior[GAMMA].exp();
             let out = (1.0 - eta) * v + DRIP * (posterior[FILM] + eta * v);
             let h_ml = gain * out;
@@ -200,7 +304,7 @@ impl Fused {
             if y_ml == 0.0 {
                 if h_ml <= noise.v_min_ml || (h_ml > 3.0 * noise.v_min_ml && self.zeros < 3) {
                     // Too little to be seen, or a dropout of the extraction.
-                    return;
+                    return 0.0;
                 }
                 y = noise.v_min_ml;
             }
@@ -217,6 +321,10 @@ impl Fused {
             let mut innovation = y - h_ml;
             for k in 0..N {
                 innovation -= h[k] * (prior[k] - posterior[k]);
+            }
+            if pass == 0 {
+                let square = innovation * innovation / (spread + r);
+                likelihood = -0.5 * (square.min(GATE * GATE) + (spread + r).ln());
             }
             let limit = GATE * GATE * (spread + r);
             if innovation * innovation > limit {
@@ -235,11 +343,12 @@ impl Fused {
                 self.covariance[i][j] -= ph[i] * ph[j] / total;
             }
         }
+        likelihood
     }
 
-    fn propagate(&mut self) {
-        let eta = self.flow.model.eta;
-        let (v, v_x, v_lambda, v_delta) = self.outflow(&self.state);
+    fn propagate(&mut self, flow: &Flow, tilt: Tilt) {
+        let eta = flow.model.eta;
+        let (v, v_x, v_lambda, v_delta) = self.outflow(flow, tilt, &self.state);
         let scale = self.state[BETA].exp();
         // Rows of the transition that differ from the identity: X, F, V.
         let mut dv = [0.0; N];
@@ -287,8 +396,8 @@ impl Fused {
                 next[i][j] = dot(ap, row);
             }
         }
-        next[X][X] += SD_X * SD_X * (1.0 + v * v);
-        next[LAMBDA][LAMBDA] += SD_LAMBDA * SD_LAMBDA;
+        next[X][X] += self.sd_x_ml * self.sd_x_ml * (1.0 + v * v);
+        next[LAMBDA][LAMBDA] += self.sd_lambda * self.sd_lambda;
         self.covariance = next;
     }
 }
@@ -310,6 +419,7 @@ mod tests {
             radius_mm: 38.0,
             height_mm: 115.0,
             taper: 1.0,
+            flat: 0.0,
             s: [0.0; KNOTS],
             lk: -3.0,
             p: 1.5,

@@ -31,7 +31,7 @@ impl Sum {
     }
 
     fn see(&mut self, area_px2: f32) -> f64 {
-        let v = self.c * f64::from(area_px2);
+        let v = if area_px2.is_nan() { self.v_ml[0] } else { self.c * f64::from(area_px2) };
         self.v_ml = [v, self.v_ml[0], self.v_ml[1]];
         self.poured_ml += v;
         self.goal_ml - self.poured_ml
@@ -122,13 +122,16 @@ impl ByLaw {
 
 impl Controller for ByLaw {
     fn decide(&mut self, area_px2: f32, alpha_deg: f32, _: &World) -> Option<f32> {
-        let v = f64::from(self.calibration.volume_ml(self.hold.step(Some(area_px2), self.calibration.hold_above_px2)));
+        let v = f64::from(self.calibration.volume_ml(self.hold.step(Some(area_px2), self.calibration.hold_above_px2), alpha_deg));
         self.v_ml = [v, self.v_ml[0], self.v_ml[1]];
         self.summed_ml += v;
         let d = match &mut self.fused {
             None => self.goal_ml - self.summed_ml,
             Some(fused) => {
-                fused.step(Some(f64::from(self.calibration.volume_ml(area_px2))), f64::from(alpha_deg));
+                fused.step(
+                    Some(area_px2).filter(|a| !a.is_nan()).map(|a| f64::from(self.calibration.volume_ml(a, alpha_deg))),
+                    f64::from(alpha_deg),
+                );
                 self.goal_ml - fused.poured_ml() - fused.stop_volume_ml(f64::from(alpha_deg))
             }
         };

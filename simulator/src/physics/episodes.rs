@@ -9,6 +9,7 @@ use rand_pcg::Pcg64Mcg;
 use trainer::data::TrainingEpisode;
 
 use super::rig::{Pour, Rig};
+use super::seen::{Eye, Seen};
 use super::{RATE_HZ, World, paper};
 
 /// Frames recorded after the curve has come back, while the last drops fall.
@@ -21,6 +22,8 @@ pub enum Bench {
     A,
     /// Simulator b, one rig; the container is built once.
     B(Box<(Rig, super::container::Container)>),
+    /// The same through a rendered camera.
+    Seen(Box<(Rig, super::container::Container, Eye)>),
 }
 
 impl Bench {
@@ -29,40 +32,46 @@ impl Bench {
         Self::B(Box::new((rig.clone(), rig.container(0.0))))
     }
 
+    /// A bench with `rig` on it and a rendered camera over it.
+    pub fn seen(rig: &Rig, eye: Eye) -> Self {
+        Self::Seen(Box::new((rig.clone(), rig.container(0.0), eye)))
+    }
+
+    /// Rig and container of simulator b.
+    fn rig(&self) -> Option<(&Rig, &super::container::Container)> {
+        match self {
+            Self::A => None,
+            Self::B(bench) => Some((&bench.0, &bench.1)),
+            Self::Seen(bench) => Some((&bench.0, &bench.1)),
+        }
+    }
+
     /// A pour from `volume_ml`.
     pub fn pour(&self, volume_ml: f64, seed: u64) -> World {
+        let Some((rig, container)) = self.rig() else { return World::A(paper::Pour::new(volume_ml)) };
+        let mut container = container.clone();
+        container.refill(volume_ml);
+        let pour = Pour::new(rig, container, seed);
         match self {
-            Self::A => World::A(paper::Pour::new(volume_ml)),
-            Self::B(bench) => {
-                let mut container = bench.1.clone();
-                container.refill(volume_ml);
-                World::B(Box::new(Pour::new(&bench.0, container, seed)))
-            }
+            Self::Seen(bench) => World::Seen(Box::new(Seen::new(pour, &bench.2, rig.delay_frames, seed))),
+            _ => World::B(Box::new(pour)),
         }
     }
 
     /// The tilt at which `volume_ml` starts to flow, degrees.
     pub fn spill_angle_deg(&self, volume_ml: f64) -> f64 {
-        match self {
-            Self::A => paper::Pour::new(volume_ml).spill_angle_deg(),
-            Self::B(bench) => {
-                let mut container = bench.1.clone();
-                container.refill(volume_ml);
-                container.spill_angle_deg()
-            }
-        }
+        let Some((_, container)) = self.rig() else { return paper::Pour::new(volume_ml).spill_angle_deg() };
+        let mut container = container.clone();
+        container.refill(volume_ml);
+        container.spill_angle_deg()
     }
 
     /// What leaves `volume_ml` at the largest tilt if one waits for ever, ml.
     pub fn reach_ml(&self, volume_ml: f64) -> f64 {
-        match self {
-            Self::A => volume_ml,
-            Self::B(bench) => {
-                let mut container = bench.1.clone();
-                container.refill(volume_ml);
-                container.volume_ml() - bench.0.shape.retained_ml(super::ALPHA_MAX_DEG)
-            }
-        }
+        let Some((rig, container)) = self.rig() else { return volume_ml };
+        let mut container = container.clone();
+        container.refill(volume_ml);
+        container.volume_ml() - rig.shape.retained_ml(super::ALPHA_MAX_DEG)
     }
 
     /// Records `n` episodes: volumes stratified over 140 to 460 ml, lambda = spill angle + U(6, 30) degrees, width U(0.7, 2.2) s.

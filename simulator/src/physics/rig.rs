@@ -118,13 +118,8 @@ impl Pour {
 
     /// One frame with `alpha_deg` commanded; the area that the camera reports at its end, px^2.
     pub fn frame(&mut self, alpha_deg: f64) -> f32 {
-        let dt_s = 1.0 / RATE_HZ / SUBSTEPS as f64;
         let before_ml = self.container.poured_ml();
-        for _ in 0..SUBSTEPS {
-            let rate = ((alpha_deg - self.tilt_deg) / self.rig.servo_tau_s).clamp(-self.rig.servo_rate_deg_s, self.rig.servo_rate_deg_s);
-            self.tilt_deg += rate * dt_s;
-            self.container.step(dt_s, self.tilt_deg);
-        }
+        self.advance(alpha_deg);
         let slots = self.flows_ml.len();
         self.flows_ml[self.frame % slots] = self.container.poured_ml() - before_ml;
         let delay = self.rig.delay_frames.min(DELAY_MAX);
@@ -135,6 +130,21 @@ impl Pour {
         let dropped = self.rng.random_bool(self.rig.dropouts);
         let area = 400.0 * seen_ml.powf(self.rig.area_exponent) * self.gain * (self.rig.frame_noise * noise).exp();
         if dropped || area < AREA_MIN_PX2 { 0.0 } else { area as f32 }
+    }
+
+    /// Lets a frame's time pass with `alpha_deg` commanded, without looking.
+    pub fn advance(&mut self, alpha_deg: f64) {
+        let dt_s = 1.0 / RATE_HZ / SUBSTEPS as f64;
+        for _ in 0..SUBSTEPS {
+            let rate = ((alpha_deg - self.tilt_deg) / self.rig.servo_tau_s).clamp(-self.rig.servo_rate_deg_s, self.rig.servo_rate_deg_s);
+            self.tilt_deg += rate * dt_s;
+            self.container.step(dt_s, self.tilt_deg);
+        }
+    }
+
+    /// The container as it is now.
+    pub fn container(&self) -> &Container {
+        &self.container
     }
 
     /// What has left the lip, ml.

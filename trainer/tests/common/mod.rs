@@ -12,6 +12,7 @@ pub fn model() -> FlowModel {
         radius_mm: 38.0,
         height_mm: 115.0,
         taper: 1.0,
+        flat: 0.0,
         s: [0.0; KNOTS],
         lk: -3.0,
         p: 1.5,

@@ -1,0 +1,115 @@
+//! Simulator b through a rendered camera: each frame of a pour is drawn, and V_e is what the feature worker's own extraction
+//! finds in the picture, doubts included.
+//!
+//! Any thread; the same seeds give the same pour. Allocates when a pour begins. A frame that cannot be drawn or measured
+//! counts as lost (NaN).
+
+use std::sync::{Arc, Mutex, PoisonError};
+
+use feature_worker::extract::{Extractor, Image};
+use rand::seq::IndexedRandom;
+use rand::{RngExt, SeedableRng};
+use rand_pcg::Pcg64Mcg;
+use shared::config::ImageConfig;
+use shared::messages::PixelFormat;
+
+use super::RATE_HZ;
+use super::rig::Pour;
+use crate::camera::{Background, Renderer, Scene, View};
+use crate::evaluate_camera::{camera_config, image_config, learn_colour};
+
+/// A camera on a rig, set up by a careful person: its view, and the feature worker's configuration for it.
+#[derive(Debug, Clone)]
+pub struct Eye {
+    view: View,
+    image: ImageConfig,
+}
+
+impl Eye {
+    /// Draws scale, lip, spout, background, light, noise and blur from `seed`, and learns the liquid's colour from one pour.
+    pub fn seeded(seed: u64) -> Result<Self, String> {
+        let mut random = Pcg64Mcg::seed_from_u64(seed ^ 0xe7e);
+        let colour = *[[150, 62, 20], [40, 36, 180], [60, 150, 40], [140, 40, 110]].choose(&mut random).unwrap_or(&[150, 62, 20]);
+        let view = View {
+            px_per_mm: random.random_range(5.5..8.5),
+            lip_px: [random.random_range(150.0..240.0), random.random_range(236.0..290.0)],
+            roll_deg: random.random_range(-8.0..8.0),
+            spout_deg: random.random_range(45.0..90.0),
+            flat_wall_loss: random.random_range(0.3..0.6),
+            liquid_bgr: Some(colour),
+            background: *Background::ALL.choose(&mut random).unwrap_or(&Background::Chess),
+            light: random.random_range(0.7..1.2),
+            noise: random.random_range(1.5..5.0),
+            blur_px: random.random_range(0.0..1.0),
+            ..View::default()
+        };
+        let mut image = image_config(&view);
+        image.colour_hsv = learn_colour(&View { light: 1.0, ..view.clone() }, &image, seed).map_err(|e| e.to_string())?;
+        Ok(Self { view, image })
+    }
+}
+
+struct Camera {
+    renderer: Renderer,
+    extractor: Extractor,
+    pixels: Vec<u8>,
+}
+
+/// A pour that is looked at.
+#[derive(Clone)]
+pub struct Seen {
+    /// The physics.
+    pub pour: Pour,
+    /// None: OpenCV refused; every frame is lost.
+    camera: Option<Arc<Mutex<Camera>>>,
+    size_px: (u32, u32),
+    late: Vec<Scene>,
+    delay: usize,
+    frame: usize,
+}
+
+impl std::fmt::Debug for Seen {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.debug_struct("Seen").field("pour", &self.pour).field("frame", &self.frame).finish_non_exhaustive()
+    }
+}
+
+impl Seen {
+    /// Looks at `pour` with `eye`; the picture shows what was `delay` frames ago.
+    pub fn new(pour: Pour, eye: &Eye, delay: usize, seed: u64) -> Self {
+        let size_px = (eye.view.width_px, eye.view.height_px);
+        let camera = Renderer::new(&eye.view, seed).ok().zip(Extractor::new(&camera_config(&eye.view), &eye.image).ok()).map(
+            |(renderer, extractor)| {
+                Arc::new(Mutex::new(Camera { renderer, extractor, pixels: vec![0; (size_px.0 * size_px.1 * 3) as usize] }))
+            },
+        );
+        Self { pour, camera, size_px, late: vec![Scene::default(); delay + 1], delay, frame: 0 }
+    }
+
+    /// One frame with `alpha_deg` commanded; V_e of its picture, px^2, or NaN.
+    pub fn frame(&mut self, alpha_deg: f64) -> f32 {
+        let before_deg = self.pour.tilt_deg();
+        self.pour.advance(alpha_deg);
+        let (container, tilt_deg) = (self.pour.container(), self.pour.tilt_deg());
+        let excess_ml = container.volume_ml() - container.shape().retained_ml(tilt_deg);
+        let slots = self.late.len();
+        self.late[self.frame % slots] = Scene {
+            at_s: 0.0,
+            alpha_deg: tilt_deg,
+            rate_deg_s: (tilt_deg - before_deg) * RATE_HZ,
+            flow_ml_s: container.lip().flow_ml_s,
+            level_mm: 1000.0 * excess_ml / container.shape().surface_mm2(tilt_deg),
+        };
+        let shown = Scene { at_s: self.frame as f64 / RATE_HZ, ..self.late[self.frame.saturating_sub(self.delay) % slots] };
+        self.frame += 1;
+        self.camera.as_ref().and_then(|camera| look(camera, &shown, self.size_px)).unwrap_or(f32::NAN)
+    }
+}
+
+fn look(camera: &Mutex<Camera>, scene: &Scene, (width_px, height_px): (u32, u32)) -> Option<f32> {
+    let mut camera = camera.lock().unwrap_or_else(PoisonError::into_inner);
+    let Camera { renderer, extractor, pixels } = &mut *camera;
+    renderer.render(scene, pixels).ok()?;
+    let measured = extractor.measure(Image { width_px, height_px, format: PixelFormat::Bgr8, pixels }).ok()?;
+    measured.doubt.usable().then_some(measured.area_px2)
+}
