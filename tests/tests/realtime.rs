@@ -52,6 +52,25 @@ impl Trace {
     }
 }
 
+/// Page faults of a thread (minor, major), as the kernel shows them to others.
+fn page_faults(pid: u32, thread: u32) -> (u64, u64) {
+    let stat = std::fs::read_to_string(format!("/proc/{pid}/task/{thread}/stat")).expect("it runs");
+    let fields: Vec<&str> = stat.rsplit(')').next().expect("a name").split_whitespace().collect();
+    (fields[7].parse().expect("a number"), fields[9].parse().expect("a number"))
+}
+
+/// The system calls that a thread is found in, looked at `times` times, a millisecond apart.
+fn found_in(pid: u32, thread: u32, times: u32) -> BTreeSet<i64> {
+    let path = format!("/proc/{pid}/task/{thread}/syscall");
+    let mut found = BTreeSet::new();
+    for _ in 0..times {
+        let now = std::fs::read_to_string(&path).expect("it runs");
+        found.extend(now.split_whitespace().next().and_then(|n| n.parse::<i64>().ok()));
+        std::thread::sleep(Duration::from_millis(1));
+    }
+    found
+}
+
 /// The thread `name` of a process.
 fn thread(pid: u32, name: &str) -> u32 {
     let tasks = std::fs::read_dir(format!("/proc/{pid}/task")).expect("it runs");
@@ -90,7 +109,10 @@ fn ten_thousand_ticks_keep_the_promises() {
         config["controller"].as_table_mut().expect("a table").insert("rate_hz".into(), 125.0.into());
     });
     cell.take_weights(&steady_weights(TILT_OUT));
-    let trace = Trace::of(thread(cell.pid("rt-controller"), "loop"));
+    let pid = cell.pid("rt-controller");
+    let loop_thread = thread(pid, "loop");
+    let faults_before = page_faults(pid, loop_thread);
+    let trace = Trace::of(loop_thread);
 
     let stop = Arc::new(AtomicBool::new(false));
     let hammering = std::thread::spawn({
@@ -131,6 +153,9 @@ fn ten_thousand_ticks_keep_the_promises() {
     stop.store(true, Relaxed);
     let (written, last) = hammering.join().expect("it ran");
     let calls = trace.calls();
+    // The second means, both the kernel's own books: what it shows of the thread to others.
+    let faults = page_faults(pid, loop_thread);
+    let found = found_in(pid, loop_thread, 2000);
 
     // The worker dies and is replaced: the loop opens new shared memory, outside of pours, and that is counted apart.
     cell.signal("feature-worker", Signal::KILL);
@@ -142,9 +167,16 @@ fn ten_thousand_ticks_keep_the_promises() {
     let status = cell.wait("10,000 ticks", Duration::from_secs(60), |s| s["ticks"].as_u64() > Some(10_000));
 
     assert_eq!(calls, documented_calls(), "the loop's system calls, and those that docs/REALTIME.md lists");
+    #[cfg(target_arch = "x86_64")]
+    {
+        // Numbers of clock_nanosleep, recvfrom, sendto, getrusage; -1: between calls.
+        let numbers = BTreeSet::from([230, 45, 44, 98, -1]);
+        assert!(found.is_subset(&numbers) && found.contains(&230), "{found:?}");
+    }
     assert_eq!(status["loop_allocations"], 0);
     if !cell.log("rt-controller").contains("mlockall is not permitted") {
         assert_eq!(status["loop_page_faults"], 0);
+        assert_eq!(faults, faults_before, "page faults in the kernel's books");
     }
     assert_eq!(status["events_lost"], 0);
     assert!(written > 3000, "{written} weight files in a minute");
@@ -154,13 +186,20 @@ fn ten_thousand_ticks_keep_the_promises() {
 
     assert_eq!(cell.stop("rt-controller"), Some(0));
     let (mut under_way, mut swapped_in_pour, mut agents) = (false, 0, 0);
+    let mut execution_ns = [const { Vec::new() }; 2];
     let replay = journal::replay(&cell.dir.path().join("journal.bin"), |tick, output| {
         swapped_in_pour += u64::from(under_way && tick.agent.is_some());
         agents += u64::from(tick.agent.is_some());
+        execution_ns[usize::from(tick.agent.is_some())].push(tick.times.done_ns - tick.now_ns);
         under_way |= matches!((tick.order, output.ordered), (Some(Order::Pour { .. }), Some(Ok(()))));
         under_way &= output.ended.is_none();
     });
     let replay = replay.expect("a journal");
+    for (of, times) in ["without a weight swap", "with one"].iter().zip(&mut execution_ns) {
+        times.sort_unstable();
+        let at_us = |share: f64| times[((times.len() - 1) as f64 * share) as usize] as f64 / 1e3;
+        println!("tick execution {of}, traced: p50 {:.0} us, p90 {:.0} us, n {}", at_us(0.5), at_us(0.9), times.len());
+    }
     assert!(replay.ticks > 10_000 && replay.ended.len() >= 6, "{} ticks, {} pours", replay.ticks, replay.ended.len());
     assert_eq!((replay.different, replay.cut_off), (0, false), "the same inputs give the same bits");
     assert_eq!((agents, swapped_in_pour), (taken, 0), "policies are taken between pours");
