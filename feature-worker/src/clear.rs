@@ -10,8 +10,8 @@
 //! the edge lies on such ground the answer is [`Seen::Unsure`]. That happens when a patterned background moves out from behind the
 //! stream; an even one looks the same everywhere. The first frame must be dry.
 //!
-//! Works on the region at a width of about 320 px for the whole picture. Runs on the extraction thread; its pictures are kept from
-//! frame to frame. No failures but OpenCV's.
+//! Works on the region at a width of about 320 px for the whole picture. Runs on the extraction thread; some of its pictures are
+//! allocated anew in each frame. No failures but OpenCV's.
 
 use opencv::core::{self, CV_8UC1, CV_16SC2, CV_32F, CV_32FC1, Mat, Point, Scalar, Size, Vector};
 use opencv::imgproc;
@@ -361,11 +361,8 @@ impl Background {
                     }
                 }
             }
-            for k in 0..4 {
-                for j in k + 1..4 {
-                    normal[k][j] = normal[j][k];
-                }
-            }
+            let mut normal: [[f64; 4]; 4] =
+                std::array::from_fn(|k| std::array::from_fn(|j| if j <= k { normal[k][j] } else { normal[j][k] }));
             // Along a line, or before an even wall, the picture does not tell the motion: then it stays what it was, and fades.
             let hold = 0.03 * count as f64 * noise * noise;
             for (k, size) in [1.0, 1.0, 2500.0].into_iter().enumerate() {

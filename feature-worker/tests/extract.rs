@@ -69,6 +69,7 @@ fn drops_and_splashes_are_no_stream() -> Result<(), ExtractError> {
         vec![inside.clone()],
         vec![inside.clone(), disc(211.0, 255.0, 8.0)],
         vec![inside.clone(), disc(240.0, 225.0, 9.0), disc(300.0, 120.0, 14.0)],
+        vec![inside.clone(), disc(228.0, 247.0, 11.0)],
         vec![inside, disc(260.0, 200.0, 16.0), disc(226.0, 180.0, 7.0), disc(330.0, 235.0, 9.0)],
     ];
     for (i, shapes) in cases.iter().enumerate() {

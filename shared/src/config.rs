@@ -116,7 +116,7 @@ pub struct CameraConfig {
 pub enum LiquidMethod {
     /// By its colour (`[image] colour`).
     Colour,
-    /// Clear water, by edges: an experiment that is not fit for pouring yet (docs/VISION.md).
+    /// Clear water, by what differs from the dry background: less exact, wants an even wall behind the lip (docs/VISION.md).
     Clear,
 }
 
