@@ -37,13 +37,15 @@ const LOCAL: usize = 3;
 /// Weight of a scale that shows whole grams, and of the person reading it, g.
 const WEIGHT_SD_G: f64 = 0.6;
 /// A model whose outflow over five frames is nearer than this to the areas is exact: no real rig is, a simulation may be.
-const EXACT: f64 = 0.02;
+const EXACT: f64 = 0.04;
 /// Noise of an episode's sum of areas over that of one frame, for some fifty frames of flow.
 const SUM_NOISE: f64 = 0.15;
 /// How much a camera's gain is expected to change from pour to pour (log); less where the model turns out to be exact.
 const GAIN_EXPECTED: f64 = 0.017;
 /// How much a camera's gain changes from pour to pour at least (log).
 const GAIN_SD: f64 = 0.012;
+/// Noise of a frame's area below which a model can turn out to be exact.
+const CLEAN: f64 = 0.03;
 /// Residuals beyond this grow only with the root.
 const HUBER: f64 = 3.0;
 
@@ -422,27 +424,35 @@ pub fn fit(episodes: &[TrainingEpisode]) -> Fit {
     let wide = Stage { rel: temper(5.0, 1.0), floor: 0.01, gamma_sd: 0.02, sum_sd: SUM_NOISE * frame_sd.max(0.015), held: None };
     let problem = Problem { episodes: &prepared, area_min, stage: wide };
     let mut best: Option<(f64, Unknowns)> = None;
-    for (q, flat) in [(1.15, 0.0), (1.15, 0.7), (1.0, 0.7)] {
+    // Without noise the valleys are narrow: more beginnings, and a longer way.
+    let clean = frame_sd < CLEAN;
+    let longer = if clean { 3 } else { 1 };
+    let beginnings = [(1.15, 0.0), (1.15, 0.7), (1.0, 0.7), (1.0, 0.0), (1.3, 0.0), (1.3, 0.7)];
+    for (q, flat) in beginnings.into_iter().take(3 * longer) {
         for lk in [-3.2, -2.2] {
             let mut u = start(lk, q, flat);
-            let cost = problem.solve(&mut u, 12, 1e-4);
+            let cost = problem.solve(&mut u, 12 * longer, 1e-4);
             if best.as_ref().is_none_or(|(c, _)| cost < *c) {
                 best = Some((cost, u));
             }
         }
     }
     let mut u = best.map_or_else(|| start(-3.2, q0, 0.0), |(_, u)| u);
-    problem.solve(&mut u, 25, 1e-4);
+    problem.solve(&mut u, 25 * longer, 1e-4);
     let wide_covariance = invert(&problem.linearise(&u).a);
 
     let held = Some(([u.global[LOG_C], u.global[Q], u.global[TILT]], 0.002));
     let narrow = Problem { stage: Stage { rel: temper(1.5, 0.15), floor: 0.005, gamma_sd: 0.03, held, ..wide }, ..problem };
-    let mut cost = narrow.solve(&mut u, 30, 1e-4);
+    let mut cost = narrow.solve(&mut u, 30 * longer, 1e-4);
     let mut gain_expected = GAIN_EXPECTED;
-    if misfit(&prepared, &model_of(&u.global), &u) < EXACT {
-        // The model is all but exact, so the frames may speak about the calibration too.
-        cost = Problem { stage: Stage { held: None, ..narrow.stage }, ..narrow }.solve(&mut u, 150, 1e-6);
-        gain_expected = 0.005;
+    if clean {
+        let mut freed = u.clone();
+        let free = Problem { stage: Stage { held: None, ..narrow.stage }, ..narrow };
+        let freed_cost = free.solve(&mut freed, 150, 1e-6);
+        if misfit(&prepared, &model_of(&freed.global), &freed) < EXACT {
+            // The model is all but exact, so the frames may speak about the calibration too.
+            (u, cost, gain_expected) = (freed, freed_cost, GAIN_EXPECTED / 3.0);
+        }
     }
     let covariance = invert(&narrow.linearise(&u).a);
 
@@ -454,7 +464,7 @@ pub fn fit(episodes: &[TrainingEpisode]) -> Fit {
     let log_v_var = wide_covariance[(LOG_C, LOG_C)] + 2.0 * l * wide_covariance[(LOG_C, Q)] + l * l * wide_covariance[(Q, Q)];
     model.noise = FlowNoise {
         lambda: 0.20,
-        gamma: (1.5 * (gain_sd(&gammas, gain_expected) * q / 1.15).hypot(0.5 * log_v_var.max(0.0).sqrt())).min(0.5),
+        gamma: (1.15 * (gain_sd(&gammas, gain_expected) * q / 1.15).hypot(0.5 * log_v_var.max(0.0).sqrt())).min(0.5),
         beta: trusted(0.007f64.hypot(geometry_variance(&u, &covariance).sqrt())),
         delta: 0.3,
         frame: (frame_sd * q).clamp(0.02, 1.0),

@@ -31,7 +31,7 @@ const PRIOR: [f64; EXPLANATIONS] = [0.7, 0.2, 0.1];
 const TEMPER: f64 = 0.5;
 
 /// The estimate stays this near to the camera's own sum: standard deviations of its gain, and ml.
-const CAMERA_SDS: f64 = 2.0;
+const CAMERA_SDS: f64 = 2.5;
 const CAMERA_ML: f64 = 1.5;
 
 /// Error of an area that does not shrink with it, ml a frame.
