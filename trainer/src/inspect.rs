@@ -47,8 +47,8 @@ pub fn run(args: &Args) -> ExitCode {
     );
     println!("actions     {:?} degrees", w.actions_deg);
     println!(
-        "calibration v = {:.6e} area^{:.4} ml, a lone zero after more than {} px^2 is held",
-        w.calibration.c, w.calibration.q, w.calibration.hold_above_px2
+        "calibration v = {:.6e} area^{:.4} exp({:.4} (alpha - 60)/30) ml, a lone zero after more than {} px^2 is held",
+        w.calibration.c, w.calibration.q, w.calibration.tilt, w.calibration.hold_above_px2
     );
     println!("frame rate  {} Hz", w.rate_hz);
     match &w.estimator {
