@@ -339,16 +339,33 @@ fn processor_ns(pid: Option<u32>) -> u64 {
     threads.into_iter().flatten().flatten().filter_map(spent).sum()
 }
 
-/// Memory of a process (resident, locked, MiB) and its open files.
-fn memory(pid: Option<u32>) -> (f64, f64, usize) {
-    let Some(pid) = pid else { return (f64::NAN, f64::NAN, 0) };
-    let status = std::fs::read_to_string(format!("/proc/{pid}/status")).unwrap_or_default();
-    let mib = |key: &str| {
-        let line = status.lines().find_map(|l| l.strip_prefix(key)).unwrap_or_default();
-        line.trim().trim_end_matches(" kB").parse::<f64>().map_or(f64::NAN, |kb| kb / 1024.0)
-    };
-    let files = std::fs::read_dir(format!("/proc/{pid}/fd")).map_or(0, |d| d.count());
-    (mib("VmRSS:"), mib("VmLck:"), files)
+/// What a process holds.
+#[derive(Debug, Clone, Copy)]
+struct Holding {
+    resident_mib: f64,
+    locked_mib: f64,
+    files: usize,
+}
+
+impl Holding {
+    /// Of a running process; not a number for none.
+    fn of(pid: Option<u32>) -> Self {
+        let Some(pid) = pid else { return Self { resident_mib: f64::NAN, locked_mib: f64::NAN, files: 0 } };
+        let status = std::fs::read_to_string(format!("/proc/{pid}/status")).unwrap_or_default();
+        let mib = |key: &str| {
+            let line = status.lines().find_map(|l| l.strip_prefix(key)).unwrap_or_default();
+            line.trim().trim_end_matches(" kB").parse::<f64>().map_or(f64::NAN, |kb| kb / 1024.0)
+        };
+        let files = std::fs::read_dir(format!("/proc/{pid}/fd")).map_or(0, |d| d.count());
+        Self { resident_mib: mib("VmRSS:"), locked_mib: mib("VmLck:"), files }
+    }
+}
+
+/// A look at both processes during a soak.
+struct Sample {
+    minutes: f64,
+    controller: Holding,
+    worker: Holding,
 }
 
 /// Pours until `until`, one after the other, each into an empty cup.
@@ -380,8 +397,8 @@ fn sleep_until(cell: &OwnCell, until: Instant) -> Result<(), OwnCellError> {
 struct CellRun {
     ticks: Ticks,
     idle_percent: f64,
-    controller_mib: (f64, f64, usize),
-    worker_mib: (f64, f64, usize),
+    controller: Holding,
+    worker: Holding,
     allocations: u64,
     page_faults: u64,
 }
@@ -401,7 +418,7 @@ fn run_cell(cell: &mut OwnCell, seconds: u64) -> Result<CellRun, OwnCellError> {
     let idle_percent = 100.0 * (processor_ns(pid) - spent_ns) as f64 / from.elapsed().as_nanos() as f64;
     pour_until(cell, from + Duration::from_secs(seconds))?;
     let to_ns = now_ns();
-    let (controller_mib, worker_mib) = (memory(pid), memory(cell.pid("feature-worker")));
+    let (controller, worker) = (Holding::of(pid), Holding::of(cell.pid("feature-worker")));
     let client = rt_controller::client::Client::connect(&cell.config.cell.name).map_err(weighed)?;
     let after = client.status().map_err(weighed)?;
     drop(client);
@@ -409,8 +426,8 @@ fn run_cell(cell: &mut OwnCell, seconds: u64) -> Result<CellRun, OwnCellError> {
     Ok(CellRun {
         ticks: Ticks::read(cell, from_ns, to_ns)?,
         idle_percent,
-        controller_mib,
-        worker_mib,
+        controller,
+        worker,
         allocations: after.loop_allocations - before.loop_allocations,
         page_faults: after.loop_page_faults - before.loop_page_faults,
     })
@@ -484,7 +501,7 @@ fn rounds(cell: &mut OwnCell, args: &Args) -> Result<Measured, OwnCellError> {
         row("cyclictest: wake-up lateness", &yard_all);
 
         let idle = median(runs.iter().map(|r| r.idle_percent));
-        let (controller, worker) = (runs[runs.len() - 1].controller_mib, runs[runs.len() - 1].worker_mib);
+        let (controller, worker) = (runs[runs.len() - 1].controller, runs[runs.len() - 1].worker);
         let allocations: u64 = runs.iter().map(|r| r.allocations).sum();
         let faults: u64 = runs.iter().map(|r| r.page_faults).sum();
         let facts = [
@@ -497,7 +514,7 @@ fn rounds(cell: &mut OwnCell, args: &Args) -> Result<Measured, OwnCellError> {
                 "rt-controller without a pour: {idle:.2} % of a core; resident {:.1} MiB, locked {:.1} MiB",
                 controller.0, controller.1
             ),
-            format!("feature-worker: resident {:.1} MiB, locked {:.1} MiB", worker.0, worker.1),
+            format!("feature-worker: resident {:.1} MiB, locked {:.1} MiB", worker.resident_mib, worker.locked_mib),
         ];
         text += &format!("\n{name}\n");
         for row in &rows {
@@ -535,7 +552,7 @@ fn rounds(cell: &mut OwnCell, args: &Args) -> Result<Measured, OwnCellError> {
             (*name).into(),
             json!({
                 "table": table, "lateness_ratio_p50": p50, "lateness_ratio_p99": p99, "lost_ticks": all.lost, "late_ticks": all.late,
-                "idle_percent": idle, "controller_mib": controller.0, "controller_locked_mib": controller.1, "worker_mib": worker.0,
+                "idle_percent": idle, "controller_mib": controller.resident_mib, "controller_locked_mib": controller.locked_mib, "worker_mib": worker.resident_mib,
                 "loop_allocations": allocations, "loop_page_faults": faults, "rounds": rounds,
             }),
         );
@@ -564,10 +581,17 @@ fn soak(cell: &mut OwnCell, hours: f64) -> Result<Measured, OwnCellError> {
     let end = from + Duration::from_secs(seconds);
     while Instant::now() < end {
         pour_until(cell, (Instant::now() + Duration::from_secs(60)).min(end))?;
-        let (c, w) = (memory(cell.pid("rt-controller")), memory(cell.pid("feature-worker")));
-        let minutes = from.elapsed().as_secs_f64() / 60.0;
-        cell.note(&format!("{minutes:.0} min: rt-controller {:.1} MiB, {} files; feature-worker {:.1} MiB, {} files", c.0, c.2, w.0, w.2));
-        samples.push((minutes, c, w));
+        let sample = Sample {
+            minutes: from.elapsed().as_secs_f64() / 60.0,
+            controller: Holding::of(cell.pid("rt-controller")),
+            worker: Holding::of(cell.pid("feature-worker")),
+        };
+        let (c, w) = (sample.controller, sample.worker);
+        cell.note(&format!(
+            "{:.0} min: rt-controller {:.1} MiB, {} files; feature-worker {:.1} MiB, {} files",
+            sample.minutes, c.resident_mib, c.files, w.resident_mib, w.files
+        ));
+        samples.push(sample);
     }
     let to_ns = now_ns();
     drop(yardstick.take());
@@ -589,25 +613,38 @@ fn soak(cell: &mut OwnCell, hours: f64) -> Result<Measured, OwnCellError> {
         format!("wake-up lateness in us: rt-controller p50 {:.1}, p99 {:.1}, p99.9 {:.1}, max {:.1}", late[1], late[2], late[3], late[4]),
         format!("                        cyclictest    p50 {:.1}, p99 {:.1}, p99.9 {:.1}, max {:.1}", yard[1], yard[2], yard[3], yard[4]),
     ];
-    let line = |name: &str, pick: fn(&(f64, (f64, f64, usize), (f64, f64, usize))) -> f64| {
-        Series::line(name, samples.iter().map(|s| (s.0, pick(s))).collect())
-    };
+    let line = |name: &str, pick: fn(&Sample) -> f64| Series::line(name, samples.iter().map(|s| (s.minutes, pick(s))).collect());
     let mut html = String::from("<h2>Soak</h2><ul>");
     for fact in &facts {
         html += &format!("<li>{}</li>", report::escape(fact));
     }
     html += "</ul><div class=plots>";
     html += &report::figure(
-        &report::plot("minutes", "resident MiB", &[line("rt-controller", |s| s.1.0), line("feature-worker", |s| s.2.0)], true),
+        &report::plot(
+            "minutes",
+            "resident MiB",
+            &[line("rt-controller", |s| s.controller.resident_mib), line("feature-worker", |s| s.worker.resident_mib)],
+            true,
+        ),
         "Memory.",
     );
     html += &report::figure(
-        &report::plot("minutes", "open files", &[line("rt-controller", |s| s.1.2 as f64), line("feature-worker", |s| s.2.2 as f64)], true),
+        &report::plot(
+            "minutes",
+            "open files",
+            &[line("rt-controller", |s| s.controller.files as f64), line("feature-worker", |s| s.worker.files as f64)],
+            true,
+        ),
         "Open files.",
     );
     html += &histograms("us", "Wake-up lateness.", &[("rt-controller", &ticks.lateness), ("cyclictest", &latencies)]);
     html += "</div>";
-    let sample = |s: &(f64, (f64, f64, usize), (f64, f64, usize))| json!({ "minutes": s.0, "controller_mib": s.1.0, "controller_files": s.1.2, "worker_mib": s.2.0, "worker_files": s.2.2 });
+    let sample = |s: &Sample| {
+        json!({
+            "minutes": s.minutes, "controller_mib": s.controller.resident_mib, "controller_files": s.controller.files,
+            "worker_mib": s.worker.resident_mib, "worker_files": s.worker.files,
+        })
+    };
     let numbers = json!({
         "seconds": seconds, "ticks": ticks.lateness.len(), "lost_ticks": ticks.lost, "late_ticks": ticks.late,
         "lost_by_cyclictest": lost_by_cyclictest, "lateness_us": late, "cyclictest_us": yard,
