@@ -512,7 +512,7 @@ fn rounds(cell: &mut OwnCell, args: &Args) -> Result<Measured, OwnCellError> {
             ),
             format!(
                 "rt-controller without a pour: {idle:.2} % of a core; resident {:.1} MiB, locked {:.1} MiB",
-                controller.0, controller.1
+                controller.resident_mib, controller.locked_mib
             ),
             format!("feature-worker: resident {:.1} MiB, locked {:.1} MiB", worker.resident_mib, worker.locked_mib),
         ];
