@@ -105,7 +105,7 @@ fn the_state_is_read_from_the_recipe() {
     payload.extend([7, 1].map(i32::to_be_bytes).concat());
     payload.extend([5, 2].map(u32::to_be_bytes).concat());
     payload.extend([2, 41, 99].map(i32::to_be_bytes).concat());
-    payload.extend(0.25f64.to_be_bytes());
+    payload.extend([0.25, 0.75].map(f64::to_be_bytes).concat());
     let mut state = RobotState::default();
     Outputs::new_checked(&payload, 3).unwrap().fill(&tilt(), &mut state);
     let alpha = |rad: f64| (10.0 - rad.to_degrees()) as f32;
@@ -122,6 +122,7 @@ fn the_state_is_read_from_the_recipe() {
         program_state: ProgramState::Following,
         program_run: 99,
         sequence_echo: 41,
+        speed_fraction: 0.75,
         ..RobotState::default()
     };
     assert_eq!(state, expected);
@@ -147,6 +148,7 @@ fn well() -> RobotState {
         safety_mode: 1,
         safety_bits: 1,
         runtime_state: 2,
+        speed_fraction: 1.0,
         program_state: ProgramState::Following,
         received_at_ns: NOW,
         advanced_at_ns: NOW,
@@ -161,7 +163,7 @@ fn every_hindrance_has_its_reason() {
     use EndReason::*;
     type Change = fn(&mut RobotState, u64);
     let long_ago = NOW - LOST - 1;
-    let cases: [(&str, EndReason, Change); 17] = [
+    let cases: [(&str, EndReason, Change); 19] = [
         ("silence", RobotLost, |s, ago| s.received_at_ns = ago),
         ("silence, whatever it last said", RobotLost, |s, ago| (s.received_at_ns, s.safety_mode) = (ago, 3)),
         ("clock stands still", RobotStalled, |s, ago| s.advanced_at_ns = ago),
@@ -173,6 +175,8 @@ fn every_hindrance_has_its_reason() {
         ("safeguard stop", SafetyStop, |s, _| s.safety_mode = 5),
         ("unknown safety mode", SafetyStop, |s, _| s.safety_mode = 0),
         ("brakes on", RobotNotRunning, |s, _| (s.robot_mode, s.runtime_state) = (5, 1)),
+        ("speed slider", SpeedReduced, |s, _| s.speed_fraction = 0.99),
+        ("speed slider unknown", SpeedReduced, |s, _| s.speed_fraction = f64::NAN),
         ("program paused", ProgramStopped, |s, _| s.runtime_state = 4),
         ("program ended on command", ProgramStopped, |s, _| s.program_state = ProgramState::Stopped),
         ("program hangs", ProgramStopped, |s, ago| s.answered_at_ns = ago),

@@ -114,6 +114,8 @@ pub enum EndReason {
     Shutdown,
     /// The joint did not come upright although nothing hindered it.
     NotUpright,
+    /// The pendant's speed slider is below 100 %.
+    SpeedReduced,
 }
 
 impl EndReason {
@@ -136,6 +138,7 @@ impl EndReason {
             Self::ControllerOverrun => "the controller was stopped too long",
             Self::Shutdown => "the controller is shutting down",
             Self::NotUpright => "the container did not come upright: look at the robot",
+            Self::SpeedReduced => "the speed slider is below 100 %",
         }
     }
 }

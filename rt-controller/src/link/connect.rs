@@ -13,7 +13,7 @@ use shared::control::EndReason;
 use shared::limits::Limits;
 use shared::os::now_ns;
 
-use super::health::{self, ROBOT_MODE_RUNNING, RUNTIME_PLAYING};
+use super::health::{self, RUNTIME_PLAYING};
 use super::wire::{self, Inbox, Outputs};
 use super::{ProgramState, RobotState, Session, TiltJoint, program};
 
@@ -225,6 +225,7 @@ fn remedy(reason: EndReason) -> &'static str {
         EndReason::ProtectiveStop => "find the cause, then release it on the pendant",
         EndReason::EmergencyStop => "release the emergency stop, then switch the robot on and release its brakes",
         EndReason::SafetyStop => "clear it on the pendant",
+        EndReason::SpeedReduced => "set it to 100 % on the pendant: it also stretches the times after which the robot acts by itself",
         _ => "switch it on and release its brakes",
     }
 }
@@ -269,7 +270,7 @@ pub fn connect(options: &LinkOptions) -> Result<Session, LinkError> {
         let left = deadline.saturating_duration_since(Instant::now());
         // Short waits, so that the other socket is read too.
         setup.next_state(output_recipe, &options.tilt, &mut state, left.min(Duration::from_millis(20)))?;
-        if let Some(reason) = health::stopped_for_safety(&state) {
+        if let Some(reason) = health::hindrance(&state) {
             return Err(LinkError::NotWell { address, reason });
         }
         if state.program_run == run && state.program_state == ProgramState::TooFar {
@@ -291,11 +292,8 @@ pub fn connect(options: &LinkOptions) -> Result<Session, LinkError> {
 
 fn ready_for_program(options: &LinkOptions, state: &RobotState) -> Result<(), LinkError> {
     let address = options.address;
-    if let Some(reason) = health::stopped_for_safety(state) {
+    if let Some(reason) = health::hindrance(state) {
         return Err(LinkError::NotWell { address, reason });
-    }
-    if state.robot_mode != ROBOT_MODE_RUNNING {
-        return Err(LinkError::NotWell { address, reason: EndReason::RobotNotRunning });
     }
     match state.runtime_state {
         // Stopping, stopped.

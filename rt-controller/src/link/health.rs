@@ -17,11 +17,8 @@ pub fn check(state: &RobotState, now_ns: u64, lost_ns: u64) -> Result<(), EndRea
     if older(state.received_at_ns) {
         return Err(EndReason::RobotLost);
     }
-    if let Some(reason) = stopped_for_safety(state) {
+    if let Some(reason) = hindrance(state) {
         return Err(reason);
-    }
-    if state.robot_mode != ROBOT_MODE_RUNNING {
-        return Err(EndReason::RobotNotRunning);
     }
     if older(state.advanced_at_ns) {
         return Err(EndReason::RobotStalled);
@@ -41,6 +38,19 @@ pub fn check(state: &RobotState, now_ns: u64, lost_ns: u64) -> Result<(), EndRea
     Ok(())
 }
 
+/// Why the robot must not be moved, whatever runs on it.
+pub(crate) fn hindrance(state: &RobotState) -> Option<EndReason> {
+    if let Some(reason) = stopped_for_safety(state) {
+        return Some(reason);
+    }
+    if state.robot_mode != ROBOT_MODE_RUNNING {
+        return Some(EndReason::RobotNotRunning);
+    }
+    // A slower robot stretches the time of servoj: the program's patience, and each target's period with it.
+    // Written so that a share that is not a number is too small.
+    if state.speed_fraction >= FULL_SPEED { None } else { Some(EndReason::SpeedReduced) }
+}
+
 /// Why the robot's safety system keeps it from moving, if it does.
 pub(crate) fn stopped_for_safety(state: &RobotState) -> Option<EndReason> {
     // safety_status_bits: 2 protective stop, 5 to 7 emergency stops.
@@ -55,6 +65,8 @@ pub(crate) fn stopped_for_safety(state: &RobotState) -> Option<EndReason> {
     }
 }
 
+/// Least `target_speed_fraction` that counts as full speed; the pendant's slider has steps of 0.01.
+const FULL_SPEED: f64 = 0.995;
 /// robot_mode while the robot is powered and its brakes are released.
 pub(crate) const ROBOT_MODE_RUNNING: i32 = 7;
 /// runtime_state while a program plays.

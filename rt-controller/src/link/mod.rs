@@ -9,7 +9,7 @@
 //!
 //! The loop owns a [`Session`] from the moment an ordinary thread hands it over until [`health::check`] names a reason or
 //! `poll` or `send` fails; then it stops sending and hands the session back to be dropped, which sends a last
-//! [`Mode::Stop`]. Silence is the universal stop: the program on the robot (`robot/pour.script`) brings the container upright
+//! [`Mode::Stop`] or [`Mode::Abandon`]. Silence is the universal stop: the program on the robot (`robot/pour.script`) brings the container upright
 //! by itself 100 ms after the last target.
 //!
 //! Registers, counted from `robot.register_base` (b); all are RTDE general purpose registers:
@@ -45,6 +45,9 @@ pub enum Mode {
     Stream = 2,
     /// Come upright at the return rate, then end the program.
     Stop = 3,
+    /// Like [`Mode::Stop`], for a robot that stopped by itself in mid-motion: when its program is resumed, it begins from
+    /// where the joint then is, and from rest.
+    Abandon = 4,
 }
 
 /// What the program on the robot says it is doing; the code in `output_int_register_b`.
@@ -115,6 +118,8 @@ pub struct RobotState {
     pub safety_bits: u32,
     /// `runtime_state`; 2 = playing.
     pub runtime_state: u32,
+    /// `target_speed_fraction`: the pendant's speed slider, 0 to 1.
+    pub speed_fraction: f64,
     /// What the program says it is doing.
     pub program_state: ProgramState,
     /// Run number of the program that wrote the registers.

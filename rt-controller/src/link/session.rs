@@ -10,6 +10,7 @@ use std::net::{Shutdown, TcpStream};
 
 use shared::os::now_ns;
 
+use super::health::{self, RUNTIME_PLAYING};
 use super::wire::{self, Inbox, Outputs};
 use super::{Mode, RobotState, TiltJoint};
 
@@ -146,7 +147,8 @@ impl Drop for Session {
     fn drop(&mut self) {
         // Unread bytes at the close would make the kernel abort the connection, and this last target with it.
         let _ = self.poll(now_ns());
-        let _ = self.send(Mode::Stop, 0.0);
+        let stopped = self.state.runtime_state != RUNTIME_PLAYING || health::stopped_for_safety(&self.state).is_some();
+        let _ = self.send(if stopped { Mode::Abandon } else { Mode::Stop }, 0.0);
         let _ = self.stream.shutdown(Shutdown::Write);
     }
 }

@@ -146,7 +146,7 @@ pub fn text(payload: &[u8]) -> Option<(u8, &[u8])> {
 }
 
 /// Names and types of the outputs that we ask for, with registers from `base`; [`Outputs`] reads them.
-pub fn output_names(base: u8) -> [(String, &'static str); 12] {
+pub fn output_names(base: u8) -> [(String, &'static str); 13] {
     let plain = |name: &str, kind| (name.to_owned(), kind);
     [
         plain("timestamp", "DOUBLE"),
@@ -161,6 +161,7 @@ pub fn output_names(base: u8) -> [(String, &'static str); 12] {
         (format!("output_int_register_{}", u32::from(base) + 1), "INT32"),
         (format!("output_int_register_{}", u32::from(base) + 2), "INT32"),
         (format!("output_double_register_{base}"), "DOUBLE"),
+        plain("target_speed_fraction", "DOUBLE"),
     ]
 }
 
@@ -178,7 +179,7 @@ pub fn input_names(base: u8) -> [(String, &'static str); 3] {
 pub struct Outputs<'a>(&'a [u8; OUTPUTS_LEN]);
 
 /// Bytes of the values of [`output_names`].
-const OUTPUTS_LEN: usize = 8 + 3 * 48 + 4 * 4 + 3 * 4 + 8;
+const OUTPUTS_LEN: usize = 8 + 3 * 48 + 4 * 4 + 3 * 4 + 2 * 8;
 
 impl<'a> Outputs<'a> {
     /// A view of `payload` if it has our recipe id and length.
@@ -224,6 +225,7 @@ impl<'a> Outputs<'a> {
         state.sequence_echo = i32::from_be_bytes(self.four(172));
         state.program_run = i32::from_be_bytes(self.four(176));
         state.alpha_command_deg = tilt.alpha_deg(self.real(180));
+        state.speed_fraction = self.real(188);
     }
 }
 

@@ -50,6 +50,8 @@ pub enum Fault {
     ProgramStop,
     /// The program is paused on the pendant.
     ProgramPause,
+    /// The pendant's speed slider is moved to this share of full speed.
+    SpeedSlider(f64),
     /// e-Series: the pendant is switched to local control.
     LocalControl,
     /// e-Series: the pendant is switched to remote control.
@@ -80,6 +82,7 @@ emergency-release     release it; then 'power on' and 'brake release' on the das
 late-start=SECONDS    programs start this much later
 program-stop          stop the program on the pendant
 program-pause         pause the program on the pendant
+speed-slider=SHARE    move the pendant's speed slider, 0.01 to 1
 local-control         e-Series: programs are ignored
 remote-control        e-Series: programs are taken again
 clear                 end every fault that lasts";
@@ -128,6 +131,10 @@ impl FromStr for Fault {
             "late-start" => seconds().map(Fault::LateStart),
             "program-stop" => plain(Fault::ProgramStop),
             "program-pause" => plain(Fault::ProgramPause),
+            "speed-slider" => {
+                let share = given()?.parse::<f64>().ok().filter(|s| (0.01..=1.0).contains(s));
+                share.map(Fault::SpeedSlider).ok_or_else(|| fail("needs a share, 0.01 to 1"))
+            }
             "local-control" => plain(Fault::LocalControl),
             "remote-control" => plain(Fault::RemoteControl),
             "clear" => plain(Fault::Clear),
@@ -159,6 +166,7 @@ impl fmt::Display for Fault {
             Fault::LateStart(s) => write!(f, "late-start={s}"),
             Fault::ProgramStop => f.write_str("program-stop"),
             Fault::ProgramPause => f.write_str("program-pause"),
+            Fault::SpeedSlider(share) => write!(f, "speed-slider={share}"),
             Fault::LocalControl => f.write_str("local-control"),
             Fault::RemoteControl => f.write_str("remote-control"),
             Fault::Clear => f.write_str("clear"),

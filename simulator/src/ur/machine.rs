@@ -180,6 +180,11 @@ impl Robot {
         self.speed_slider
     }
 
+    /// Moves the speed slider to `share` of full speed, 0 to 1.
+    pub fn set_speed_slider(&mut self, share: f64) {
+        self.speed_slider = share;
+    }
+
     /// servoj; a demand that cannot be followed becomes a protective stop.
     pub fn servoj(&mut self, q: [f64; 6], lookahead_s: f64, gain: f64) {
         let result = self.servo.servoj(q, lookahead_s, gain);
@@ -600,7 +605,7 @@ impl Machine {
         if !self.power_on() {
             return false;
         }
-        if self.mode == RobotMode::Idle {
+        if self.mode == RobotMode::Idle && self.power_step.is_none() {
             self.power_step = Some((self.robot.cycle + self.cycles(POWER_STEP_S), RobotMode::Running));
         }
         true

@@ -121,6 +121,10 @@ pub struct TraceRow {
     /// The watched input register: the client's target, as it arrived.
     pub register: f64,
     pub commanded_q: [f64; 6],
+    /// Calls of servoj so far.
+    pub servoj_calls: u64,
+    /// servoj moves the joints; false while they are stopped, or moved by something else.
+    pub servoing: bool,
     pub target_q: [f64; 6],
     pub target_qd: [f64; 6],
     pub actual_q: [f64; 6],

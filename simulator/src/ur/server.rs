@@ -197,6 +197,8 @@ impl Server {
             timestamp_s: self.machine.robot.timestamp_s(),
             register: self.machine.robot.inputs.double[trace.double_register],
             commanded_q: servo.commanded_q,
+            servoj_calls: servo.servoj_calls,
+            servoing: servo.is_servoing(),
             target_q: servo.target_q,
             target_qd: servo.target_qd,
             actual_q: servo.actual_q,
@@ -520,6 +522,7 @@ impl Server {
             Fault::LateStart(s) => self.machine.set_late_start(*s),
             Fault::ProgramStop => drop(self.machine.stop_program()),
             Fault::ProgramPause => drop(self.machine.pause()),
+            Fault::SpeedSlider(share) => self.machine.robot.set_speed_slider(*share),
             Fault::LocalControl => self.machine.set_remote_control(false),
             Fault::RemoteControl => self.machine.set_remote_control(true),
             Fault::Clear => {

@@ -44,6 +44,8 @@ enum Mode {
 pub struct Servo {
     /// What the last servoj or movej asked for.
     pub commanded_q: [f64; 6],
+    /// Calls of servoj so far.
+    pub servoj_calls: u64,
     /// Where the trajectory is.
     pub target_q: [f64; 6],
     /// Its speed.
@@ -61,12 +63,12 @@ impl Servo {
     /// At rest at `q` (rad).
     pub fn new(q: [f64; 6]) -> Self {
         let zero = [0.0; 6];
-        Self { commanded_q: q, target_q: q, target_qd: zero, target_qdd: zero, actual_q: q, actual_qd: zero, mode: Mode::Hold }
+        Self { commanded_q: q, servoj_calls: 0, target_q: q, target_qd: zero, target_qdd: zero, actual_q: q, actual_qd: zero, mode: Mode::Hold }
     }
 
     /// Follows `q` (rad) from now on. Err: the reason for a protective stop.
     pub fn servoj(&mut self, q: [f64; 6], lookahead_s: f64, gain: f64) -> Result<(), String> {
-        let before = if matches!(self.mode, Mode::Servoj { .. }) { self.commanded_q } else { self.target_q };
+        let before = if self.is_servoing() { self.commanded_q } else { self.target_q };
         for (i, name) in NAMES.iter().enumerate() {
             let (to, step, lag) = (q[i], (q[i] - before[i]).abs(), (q[i] - self.target_q[i]).abs());
             if to.is_nan() || to.abs() > RANGE_RAD {
@@ -83,6 +85,7 @@ impl Servo {
             }
         }
         self.commanded_q = q;
+        self.servoj_calls += 1;
         self.mode = Mode::Servoj { lookahead_s, gain };
         Ok(())
     }
@@ -113,6 +116,11 @@ impl Servo {
         }
         self.mode = Mode::Speed { goal_qd, acceleration_rad_s2: acceleration_rad_s2.min(MAX_ACCELERATION_RAD_S2) };
         Ok(())
+    }
+
+    /// True while servoj moves the arm.
+    pub fn is_servoing(&self) -> bool {
+        matches!(self.mode, Mode::Servoj { .. })
     }
 
     /// True when no trajectory moves the arm and it stands.

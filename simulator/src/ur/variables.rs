@@ -239,10 +239,19 @@ impl Output {
             "payload_inertia" if version.has(Some((3, 15)), Some((5, 11))) => PayloadInertia,
             "script_control_line" if version.has(Some((3, 14)), Some((5, 9))) => ScriptControlLine,
             "ft_raw_wrench" if version.has(None, Some((5, 9))) => FtRawWrench,
-            "analog_io_types" | "tool_mode" | "tool_analog_input_types" => Zero(Type::Uint32),
-            "tool_analog_input0" | "tool_analog_input1" | "tool_output_current" | "tool_temperature" => Zero(Type::Double),
-            "tool_output_voltage" => Zero(Type::Int32),
-            "tcp_offset" => Zero(Type::Vector6d),
+            "analog_io_types" | "tool_mode" | "tool_analog_input_types" | "euromap67_input_bits" | "euromap67_output_bits" => {
+                Zero(Type::Uint32)
+            }
+            "tool_analog_input0" | "tool_analog_input1" | "tool_output_current" | "tool_temperature" | "io_current"
+            | "tcp_force_scalar" | "joint_position_deviation_ratio" | "euromap67_24V_voltage" | "euromap67_24V_current" => {
+                Zero(Type::Double)
+            }
+            "tool_output_voltage" | "encoder0_raw" | "encoder1_raw" => Zero(Type::Int32),
+            "tool_output_mode" | "tool_digital_output0_mode" | "tool_digital_output1_mode" if version.has(None, Some((5, 2))) => {
+                Zero(Type::Uint8)
+            }
+            "actual_configurable_digital_input_bits" | "actual_configurable_digital_output_bits" => Zero(Type::Uint64),
+            "tcp_offset" | "actual_current_window" => Zero(Type::Vector6d),
             "elbow_position" | "elbow_velocity" => Zero(Type::Vector3d),
             "output_bit_registers0_to_31" => BitRegisters(0),
             "output_bit_registers32_to_63" => BitRegisters(32),
