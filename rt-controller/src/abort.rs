@@ -1,12 +1,11 @@
 //! `rt-controller abort`: upright at once. Ordinary process.
 
 use std::path::PathBuf;
-use std::process::ExitCode;
 use std::time::{Duration, Instant};
 
 use shared::config::Config;
 use shared::control::{Reply, Request};
-use shared::exit;
+use shared::exit::{self, Failure, OrExit as _, failure};
 use shared::messages::Phase;
 
 use crate::client::Client;
@@ -20,34 +19,27 @@ pub struct Args {
     config: PathBuf,
 }
 
-/// Runs the command; the exit codes are those of [`shared::exit`].
-pub fn run(args: &Args) -> ExitCode {
-    let config = match Config::read(&args.config) {
-        Ok(config) => config,
-        Err(e) => return exit::fail(exit::BAD_INPUT, e),
-    };
-    let client = match Client::connect(&config.cell.name) {
-        Ok(client) => client,
-        Err(e) => return exit::fail(exit::UNREACHABLE, e),
-    };
-    match client.ask(&Request::Abort) {
-        Ok(Reply::Aborting) => {}
-        Ok(Reply::Refused { reason }) => return exit::fail(exit::REFUSED, reason),
-        Ok(_) => return exit::fail(exit::UNREACHABLE, crate::client::ClientError::Version),
-        Err(e) => return exit::fail(exit::UNREACHABLE, e),
+/// Runs the command.
+pub fn run(args: &Args) -> Result<(), Failure> {
+    let config = Config::read(&args.config).or_exit(exit::BAD_INPUT)?;
+    let client = Client::connect(&config.cell.name).or_exit(exit::UNREACHABLE)?;
+    match client.ask(&Request::Abort).or_exit(exit::UNREACHABLE)? {
+        Reply::Aborting => {}
+        Reply::Refused { reason } => return Err(failure(exit::REFUSED, reason)),
+        _ => return Err(failure(exit::UNREACHABLE, crate::client::ClientError::Version)),
     }
     let tolerance_deg = config.robot.start_tolerance_deg;
     let until = Instant::now() + Duration::from_secs(20);
     while Instant::now() < until {
-        match client.status() {
-            Ok(s) if matches!(s.phase, Phase::Idle | Phase::Settling) && f64::from(s.alpha_measured_deg.abs()) <= tolerance_deg => {
+        let status = client.status().or_exit(exit::UNREACHABLE)?;
+        match status.phase {
+            Phase::Idle | Phase::Settling if f64::from(status.alpha_measured_deg.abs()) <= tolerance_deg => {
                 println!("upright");
-                return ExitCode::SUCCESS;
+                return Ok(());
             }
-            Ok(s) if s.phase == Phase::NoRobot => return exit::fail(exit::FAILED, s.hindrance),
-            Ok(_) => std::thread::sleep(Duration::from_millis(50)),
-            Err(e) => return exit::fail(exit::UNREACHABLE, e),
+            Phase::NoRobot => return Err(failure(exit::FAILED, status.hindrance)),
+            _ => std::thread::sleep(Duration::from_millis(50)),
         }
     }
-    exit::fail(exit::FAILED, "not upright after 20 s: look at the robot")
+    Err(failure(exit::FAILED, "not upright after 20 s: look at the robot"))
 }

@@ -9,7 +9,8 @@
 //! | [`timing`] | the loop's histograms | all |
 //! | [`journal`] | every tick's inputs, and their replay | ordinary |
 //! | [`link`] | RTDE client and the robot's program | connects in an ordinary thread, then the loop's |
-//! | [`service`] | clients, telemetry, weight file | ordinary |
+//! | [`service`] | clients, telemetry | ordinary |
+//! | [`disk`] | journal, weight file | ordinary, a thread of its own |
 //! | [`client`] | the clients' side | their own process |
 //! | [`run`], [`pour`], [`record`], [`abort`], [`status`], [`step`], [`replay`] | the commands | their own process |
 #![forbid(unsafe_code)]
@@ -18,6 +19,7 @@ pub mod abort;
 pub mod client;
 pub mod control_loop;
 pub mod core;
+pub mod disk;
 pub mod exchange;
 pub mod journal;
 pub mod link;

@@ -40,7 +40,7 @@ fn main() -> ExitCode {
     if matches!(command, Command::Status(_) | Command::Replay(_)) {
         shared::os::end_when_nobody_reads();
     }
-    match command {
+    shared::exit::end(match command {
         Command::Run(args) => run::run(&args),
         Command::Pour(args) => pour::run(&args),
         Command::Record(args) => record::run(&args),
@@ -48,5 +48,5 @@ fn main() -> ExitCode {
         Command::Status(args) => status::run(&args),
         Command::Step(args) => step::run(&args),
         Command::Replay(args) => replay::run(&args),
-    }
+    })
 }

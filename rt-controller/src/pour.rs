@@ -1,11 +1,10 @@
 //! `rt-controller pour ML`: asks the running controller for a pour, shows it, ends with its result. Ordinary process.
 
 use std::path::PathBuf;
-use std::process::ExitCode;
 
 use shared::config::Config;
 use shared::control::{EndReason, Outcome, Reply, Request};
-use shared::exit;
+use shared::exit::{self, Failure, OrExit as _, failure};
 
 use crate::client::{self, Client, FollowError};
 
@@ -25,40 +24,43 @@ pub struct Args {
     json: bool,
 }
 
-/// Runs the command; the exit codes are those of [`shared::exit`].
-pub fn run(args: &Args) -> ExitCode {
-    let config = match Config::read(&args.config) {
-        Ok(config) => config,
-        Err(e) => return exit::fail(exit::BAD_INPUT, e),
-    };
-    match order(&config.cell.name, &Request::Pour { goal_ml: args.goal_ml }) {
-        Ok((outcome, episode)) => report(&outcome, episode, args.json),
-        Err(code) => code,
+/// Runs the command.
+pub fn run(args: &Args) -> Result<(), Failure> {
+    let config = Config::read(&args.config).or_exit(exit::BAD_INPUT)?;
+    let (outcome, recorded) = order(&config.cell.name, &Request::Pour { goal_ml: args.goal_ml })?;
+    report(&outcome, recorded, args.json);
+    ended(&outcome)
+}
+
+/// Fails unless the order reached its own end.
+pub(crate) fn ended(outcome: &Outcome) -> Result<(), Failure> {
+    match outcome.reason {
+        EndReason::Done => Ok(()),
+        reason => Err(failure(exit::ENDED_EARLY, format!("ended early: {}", reason.words()))),
     }
 }
 
-/// Gives an order that moves the container and follows it to its end; what went wrong is printed.
-pub(crate) fn order(cell: &str, request: &Request) -> Result<(Outcome, Option<client::Recorded>), ExitCode> {
-    let client = Client::connect(cell).map_err(|e| exit::fail(exit::UNREACHABLE, e))?;
+/// Gives an order that moves the container and follows it to its end.
+pub(crate) fn order(cell: &str, request: &Request) -> Result<(Outcome, Option<client::Recorded>), Failure> {
+    let client = Client::connect(cell).or_exit(exit::UNREACHABLE)?;
     let recorder = client::RecorderEar::open(cell).ok();
-    let episode = match client.ask(request) {
-        Ok(Reply::Started { episode }) => episode,
-        Ok(Reply::Refused { reason }) => return Err(exit::fail(exit::REFUSED, reason)),
-        Ok(_) => return Err(exit::fail(exit::UNREACHABLE, client::ClientError::Version)),
-        Err(e) => return Err(exit::fail(exit::UNREACHABLE, e)),
+    let episode = match client.ask(request).or_exit(exit::UNREACHABLE)? {
+        Reply::Started { episode } => episode,
+        Reply::Refused { reason } => return Err(failure(exit::REFUSED, reason)),
+        _ => return Err(failure(exit::UNREACHABLE, client::ClientError::Version)),
     };
     let outcome = client.follow(episode).map_err(|e| match e {
         FollowError::Interrupted(o) if matches!(o.reason, EndReason::Aborted | EndReason::Done) => {
-            exit::fail(exit::INTERRUPTED, format!("interrupted: {}, the container is upright", o.reason.words()))
+            failure(exit::INTERRUPTED, format!("interrupted: {}, the container is upright", o.reason.words()))
         }
-        e @ FollowError::Interrupted(_) => exit::fail(exit::INTERRUPTED, format!("{e}; look at the robot")),
-        FollowError::Client(e) => exit::fail(exit::UNREACHABLE, e),
+        e @ FollowError::Interrupted(_) => failure(exit::INTERRUPTED, format!("{e}; look at the robot")),
+        FollowError::Client(e) => failure(exit::UNREACHABLE, e),
     })?;
     Ok((outcome, recorder.and_then(|r| r.wait(episode))))
 }
 
 /// Prints how it ended.
-fn report(outcome: &Outcome, recorded: Option<client::Recorded>, json: bool) -> ExitCode {
+fn report(outcome: &Outcome, recorded: Option<client::Recorded>, json: bool) {
     if json {
         let file = recorded.as_ref().and_then(|r| r.file.as_ref().ok());
         println!("{}", serde_json::json!({ "outcome": outcome, "episode_file": file }));
@@ -79,9 +81,5 @@ fn report(outcome: &Outcome, recorded: Option<client::Recorded>, json: bool) -> 
             Some(Err(e)) => println!("not recorded: {e}"),
             None => println!("not recorded: no recorder answered"),
         }
-    }
-    match outcome.reason {
-        EndReason::Done => ExitCode::SUCCESS,
-        _ => ExitCode::from(exit::ENDED_EARLY),
     }
 }

@@ -2,11 +2,10 @@
 
 use std::io::{BufRead, IsTerminal, Write};
 use std::path::{Path, PathBuf};
-use std::process::ExitCode;
 
 use shared::config::Config;
-use shared::control::{Curve, EndReason, Request};
-use shared::exit;
+use shared::control::{Curve, Request};
+use shared::exit::{self, Failure, OrExit as _, failure};
 
 use crate::pour;
 
@@ -41,31 +40,24 @@ pub struct Args {
     json: bool,
 }
 
-/// Runs the command; the exit codes are those of [`shared::exit`].
-pub fn run(args: &Args) -> ExitCode {
-    let config = match Config::read(&args.config) {
-        Ok(config) => config,
-        Err(e) => return exit::fail(exit::BAD_INPUT, e),
-    };
+/// Runs the command.
+pub fn run(args: &Args) -> Result<(), Failure> {
+    let config = Config::read(&args.config).or_exit(exit::BAD_INPUT)?;
     let beta_s = args.beta.unwrap_or_else(|| ((args.lambda / END_DEG).ln() / args.gamma).sqrt());
     let curve = Curve { lambda_deg: args.lambda, gamma_per_s2: args.gamma, beta_s };
-    let (outcome, recorded) = match pour::order(&config.cell.name, &Request::Record(curve)) {
-        Ok(done) => done,
-        Err(code) => return code,
-    };
-    if outcome.reason != EndReason::Done {
-        return exit::fail(exit::ENDED_EARLY, format!("the recording ended early: {}", outcome.reason.words()));
-    }
+    let (outcome, recorded) = pour::order(&config.cell.name, &Request::Record(curve))?;
+    pour::ended(&outcome)?;
     let file = match recorded.map(|r| r.file) {
         Some(Ok(file)) => file,
-        Some(Err(e)) => return exit::fail(exit::FAILED, format!("the curve was run, but not recorded: {e}")),
-        None => return exit::fail(exit::UNREACHABLE, "the curve was run, but no recorder answered: is `feature-worker run` running?"),
+        Some(Err(e)) => return Err(failure(exit::FAILED, format!("the curve was run, but not recorded: {e}"))),
+        None => {
+            let what = "the curve was run, but no recorder answered: is `feature-worker run` running?";
+            return Err(failure(exit::UNREACHABLE, what));
+        }
     };
     let weight_g = args.weight.or_else(ask_weight);
-    if let Some(weight_g) = weight_g
-        && let Err(e) = shared::episode::set_weight(Path::new(&file), weight_g)
-    {
-        return exit::fail(exit::FAILED, e);
+    if let Some(weight_g) = weight_g {
+        shared::episode::set_weight(Path::new(&file), weight_g).or_exit(exit::FAILED)?;
     }
     if args.json {
         println!("{}", serde_json::json!({ "outcome": outcome, "curve": curve, "episode_file": file, "weight_g": weight_g }));
@@ -76,7 +68,7 @@ pub fn run(args: &Args) -> ExitCode {
             None => println!("read the scale, then: feature-worker episodes weigh {file} --weight GRAMS"),
         }
     }
-    ExitCode::SUCCESS
+    Ok(())
 }
 
 /// Asks a person, if one is there; an empty line means later.

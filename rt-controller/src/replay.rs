@@ -1,9 +1,8 @@
 //! `rt-controller replay FILE`: runs a journal through the same core again and compares every answer. Ordinary process.
 
 use std::path::PathBuf;
-use std::process::ExitCode;
 
-use shared::exit;
+use shared::exit::{self, Failure, OrExit as _, failure};
 
 use crate::journal;
 
@@ -22,8 +21,8 @@ pub struct Args {
     json: bool,
 }
 
-/// Runs the command; the exit codes are those of [`shared::exit`].
-pub fn run(args: &Args) -> ExitCode {
+/// Runs the command.
+pub fn run(args: &Args) -> Result<(), Failure> {
     if args.table {
         println!("tick,at_ns,phase,area_px2,alpha_deg,alpha_measured_deg,v_ml,d_ml,poured_ml");
     }
@@ -34,10 +33,7 @@ pub fn run(args: &Args) -> ExitCode {
             println!("{},{},{},{values}", t.tick, t.at_ns, t.phase);
         }
     });
-    let replay = match replay {
-        Ok(replay) => replay,
-        Err(e) => return exit::fail(exit::BAD_INPUT, e),
-    };
+    let replay = replay.or_exit(exit::BAD_INPUT)?;
     if args.json {
         println!("{}", serde_json::json!(replay));
     } else if !args.table {
@@ -47,10 +43,8 @@ pub fn run(args: &Args) -> ExitCode {
         }
     }
     if let Some(tick) = replay.first_different {
-        return exit::fail(
-            exit::FAILED,
-            format!("{}: the replay differs from tick {tick} on: another version of the code?", args.file.display()),
-        );
+        let what = format!("{}: the replay differs from tick {tick} on: another version of the code?", args.file.display());
+        return Err(failure(exit::FAILED, what));
     }
-    ExitCode::SUCCESS
+    Ok(())
 }

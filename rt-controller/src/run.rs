@@ -5,16 +5,16 @@
 
 use std::io::Write;
 use std::path::PathBuf;
-use std::process::ExitCode;
-use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering::Relaxed};
+use std::sync::{Arc, Mutex};
 
 use shared::config::Config;
-use shared::exit;
+use shared::exit::{self, Failure, OrExit as _};
 use shared::ipc::{Cell, IpcError};
 
 use crate::control_loop::{self, Place};
 use crate::core::Settings;
+use crate::disk::Disk;
 use crate::exchange::Exchange;
 use crate::service::{self, RobotNote, Service};
 
@@ -35,12 +35,9 @@ pub struct Args {
     config: PathBuf,
 }
 
-/// Runs the command; the exit codes are those of [`shared::exit`].
-pub fn run(args: &Args) -> ExitCode {
-    let config = match Config::read(&args.config) {
-        Ok(config) => config,
-        Err(e) => return exit::fail(exit::BAD_INPUT, e),
-    };
+/// Runs the command.
+pub fn run(args: &Args) -> Result<(), Failure> {
+    let config = Config::read(&args.config).or_exit(exit::BAD_INPUT)?;
     // A terminal that has gone away is no reason to stop.
     let say = |text: &str| _ = writeln!(std::io::stderr(), "rt-controller: {text}");
     // Half a controller would be worse than none: without targets the robot's program comes upright by itself.
@@ -53,9 +50,7 @@ pub fn run(args: &Args) -> ExitCode {
         // Armed by the first signal, so that only a second one ends the process at once.
         let second = signal_hook::flag::register_conditional_shutdown(signal, exit::INTERRUPTED.into(), Arc::clone(&stop));
         let first = signal_hook::flag::register(signal, Arc::clone(&stop));
-        if let Err(e) = second.and(first) {
-            return exit::fail(exit::FAILED, format!("cannot handle signals: {e}"));
-        }
+        second.and(first).map_err(|e| format!("cannot handle signals: {e}")).or_exit(exit::FAILED)?;
     }
 
     // First of all, so that what is made from here on is in memory before the loop starts.
@@ -64,10 +59,11 @@ pub fn run(args: &Args) -> ExitCode {
     }
     let _awake = shared::os::stay_awake().map_err(|line| say(&line));
     let exchange = Exchange::default();
-    let (note, connections) = (RobotNote::default(), AtomicU64::new(0));
+    let (note, connections, weights) = (RobotNote::default(), AtomicU64::new(0), Mutex::default());
     let outcome = std::thread::scope(|scope| {
         let cell = Cell::join(&config.cell.name)?;
-        let mut service = Service::open(&cell, &config, &exchange, &note, &connections, &say)?;
+        let (disk, journal) = Disk::open(&config, &exchange, &weights, &say);
+        let service = Service::open(&cell, &exchange, (&note, &connections), (&weights, journal), &say)?;
         let (ready_sender, ready) = std::sync::mpsc::channel();
         let loop_thread = std::thread::Builder::new().name("loop".into()).stack_size(STACK);
         let spawned = loop_thread.spawn_scoped(scope, {
@@ -76,26 +72,24 @@ pub fn run(args: &Args) -> ExitCode {
         });
         spawned.map_err(no_thread)?;
         ready.recv().unwrap_or(Ok(()))?;
-        let end_robot = AtomicBool::new(false);
+        let end = AtomicBool::new(false);
         std::thread::scope(|inner| {
             let robot_thread = std::thread::Builder::new().name("robot".into()).stack_size(STACK);
-            let spawned = robot_thread
-                .spawn_scoped(inner, || service::keep_robot_connected(&config, &exchange, &note, &connections, &end_robot, &say));
+            let spawned =
+                robot_thread.spawn_scoped(inner, || service::keep_robot_connected(&config, &exchange, &note, &connections, &end, &say));
+            let disk_thread = std::thread::Builder::new().name("disk".into()).stack_size(STACK);
+            let spawned = spawned.and(disk_thread.spawn_scoped(inner, || disk.run(&end)));
             say(&format!("running in cell '{}' at {} Hz", config.cell.name, config.controller.rate_hz));
-            // Without a robot's thread there is no robot: the loop ends at once.
+            // Without these threads there is no robot and no policy: the loop ends at once.
             stop.fetch_or(spawned.is_err(), Relaxed);
             service.run(&stop);
-            end_robot.store(true, Relaxed);
+            end.store(true, Relaxed);
             spawned.map(|_| ()).map_err(no_thread)
         })
     });
-    match outcome {
-        Ok(()) => {
-            say("stopped");
-            ExitCode::SUCCESS
-        }
-        Err(e) => exit::fail(exit::FAILED, e),
-    }
+    outcome.or_exit(exit::FAILED)?;
+    say("stopped");
+    Ok(())
 }
 
 /// The real-time thread: its own node and subscriber, then the loop.

@@ -1,30 +1,29 @@
-//! The controller's ordinary side: answers clients, publishes telemetry, watches the weight file, and drops what the loop is
-//! done with.
+//! The controller's ordinary side: answers clients, publishes telemetry, passes ticks on to the journal, and drops what the loop
+//! is done with.
 //!
-//! Runs in the process's main thread with ordinary scheduling; may allocate and block. If it falls behind, the loop goes on and
-//! counts what it could not tell. Nothing here ends the process but a signal or another controller in the same cell.
+//! Runs in the process's main thread with ordinary scheduling; allocates, but waits for no disk ([`crate::disk`] does). If it
+//! falls behind, the loop goes on and counts what it could not tell. Nothing here ends the process but a signal or another controller in the same cell.
 
 use std::collections::VecDeque;
-use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, Ordering::Relaxed};
 use std::sync::{Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
+use crossbeam::channel::Sender;
 use iceoryx2::active_request::ActiveRequest;
 use iceoryx2::port::publisher::Publisher;
 use iceoryx2::port::server::Server;
 use iceoryx2::service::ipc::Service as Ipc;
-use shared::agent::Agent;
 use shared::config::Config;
 use shared::control::{Outcome, Reply, Request, Status};
 use shared::ipc::{Cell, IpcError};
 use shared::messages::{Phase, Telemetry};
-use shared::weights::Weights;
 
 use crate::client::MESSAGE_MAX;
-use crate::core::{Counters, Order, Refusal, Settings};
+use crate::core::{Counters, Order, Refusal};
+use crate::disk::WeightsNote;
 use crate::exchange::{Event, Exchange};
-use crate::journal::Writer;
+use crate::journal::Tick;
 use crate::link::{self, LinkOptions};
 
 /// How often the ordinary side looks: far below a person's patience, and cheap.
@@ -95,78 +94,6 @@ pub fn keep_robot_connected(
     }
 }
 
-/// Notices a new weight file, reads and checks it, and hands it to the loop.
-struct WeightsWatch {
-    path: PathBuf,
-    /// Frames a second of the camera: calibration and policy are for one rate only.
-    fps: f64,
-    seen: Option<(std::time::SystemTime, u64, u64)>,
-    id: String,
-    /// Identity of the policy that waits in the queue for the end of a pour.
-    waiting: String,
-    refused: String,
-    /// Policies handed over so far.
-    number: u64,
-}
-
-impl WeightsWatch {
-    fn new(path: &Path, fps: f64) -> Self {
-        Self { path: path.into(), fps, seen: None, id: String::new(), waiting: String::new(), refused: String::new(), number: 0 }
-    }
-
-    fn look(&mut self, exchange: &Exchange, journal: &mut Journal, say: &dyn Fn(&str)) {
-        use std::os::unix::fs::MetadataExt;
-        if exchange.agents.is_empty() && !self.waiting.is_empty() {
-            self.id = std::mem::take(&mut self.waiting);
-        }
-        let Ok(meta) = std::fs::metadata(&self.path) else {
-            if self.id.is_empty() && self.refused.is_empty() {
-                self.refused = format!("{}: not there yet", self.path.display());
-            }
-            return;
-        };
-        let stamp = meta.modified().ok().map(|m| (m, meta.ino(), meta.len()));
-        if stamp == self.seen {
-            return;
-        }
-        self.seen = stamp;
-        let fps = self.fps;
-        let fit = |weights: Weights| {
-            let trained = weights.rate_hz;
-            let fits = (f64::from(trained) / fps - 1.0).abs() < 0.02;
-            let why = "train with episodes of this camera";
-            if fits { Ok(weights) } else { Err(format!("trained at {trained} frames/s, camera.fps is {fps}: {why}")) }
-        };
-        match Weights::read(&self.path).map_err(|e| e.to_string()).and_then(fit) {
-            Ok(weights) => {
-                self.refused.clear();
-                self.waiting = weights.identity();
-                say(&format!("weights {} read from {}; the next pour uses them", self.waiting, self.path.display()));
-                self.number += 1;
-                journal.write(say, |j| j.weights(self.number, &weights));
-                // What was waiting and is displaced is dropped here, in an ordinary thread.
-                drop(exchange.agents.force_push((self.number, Box::new(Agent::new(&weights)))));
-            }
-            Err(e) => {
-                self.refused.clone_from(&e);
-                say(&format!("weights refused, the old ones stay: {e}"));
-            }
-        }
-    }
-}
-
-/// The journal, if one is kept; the first error ends it, not the controller.
-struct Journal(Option<Writer>);
-
-impl Journal {
-    fn write(&mut self, say: &dyn Fn(&str), what: impl FnOnce(&mut Writer) -> std::io::Result<()>) {
-        if let Some(Err(e)) = self.0.as_mut().map(what) {
-            say(&format!("journal: {e}; no more is written, the controller goes on"));
-            self.0 = None;
-        }
-    }
-}
-
 /// Everything the ordinary side keeps.
 pub struct Service<'a> {
     exchange: &'a Exchange,
@@ -175,8 +102,9 @@ pub struct Service<'a> {
     say: &'a dyn Fn(&str),
     server: Server<Ipc, [u8], (), [u8], ()>,
     telemetry: Publisher<Ipc, Telemetry, ()>,
-    weights: WeightsWatch,
-    journal: Journal,
+    weights: &'a Mutex<WeightsNote>,
+    /// To the journal; `None` after it could not keep up.
+    journal: Option<Sender<Box<Tick>>>,
     latest: Option<(Telemetry, Counters)>,
     outcomes: VecDeque<Outcome>,
     /// Who waits for the answers to the orders in the queue; `None`: our own order.
@@ -185,13 +113,12 @@ pub struct Service<'a> {
 }
 
 impl<'a> Service<'a> {
-    /// Opens the services; fails when another controller has them.
+    /// Opens the services; fails when another controller has them. `journal` takes the ticks.
     pub fn open(
         cell: &Cell,
-        config: &Config,
         exchange: &'a Exchange,
-        robot_note: &'a RobotNote,
-        robot_connections: &'a std::sync::atomic::AtomicU64,
+        (robot_note, robot_connections): (&'a RobotNote, &'a std::sync::atomic::AtomicU64),
+        (weights, journal): (&'a Mutex<WeightsNote>, Sender<Box<Tick>>),
         say: &'a dyn Fn(&str),
     ) -> Result<Self, IpcError> {
         let fail = |service: &str, e: String| IpcError::Service { service: service.into(), what: e };
@@ -203,13 +130,6 @@ impl<'a> Service<'a> {
             .create()
             .map_err(|e| fail("control", format!("{e:?}")))?;
         let telemetry = cell.telemetry()?.publisher_builder().create().map_err(|e| fail("telemetry", format!("{e:?}")))?;
-        let mut journal = None;
-        if let Some(path) = &config.controller.journal {
-            match Writer::create(path, &Settings::new(config)) {
-                Ok(writer) => journal = Some(writer),
-                Err(e) => say(&format!("{}: no journal: {e}", path.display())),
-            }
-        }
         // Episode numbers grow over restarts, so that a recorder never takes two runs for one.
         let next_episode = std::time::SystemTime::now().duration_since(std::time::UNIX_EPOCH).map_or(1, |d| d.as_secs());
         Ok(Self {
@@ -219,8 +139,8 @@ impl<'a> Service<'a> {
             say,
             server,
             telemetry,
-            weights: WeightsWatch::new(&config.controller.weights, config.camera.fps),
-            journal: Journal(journal),
+            weights,
+            journal: Some(journal),
             latest: None,
             outcomes: VecDeque::new(),
             waiting: VecDeque::new(),
@@ -229,7 +149,7 @@ impl<'a> Service<'a> {
     }
 
     /// Works until the loop has ended.
-    pub fn run(&mut self, stop: &AtomicBool) {
+    pub fn run(mut self, stop: &AtomicBool) {
         let mut stopping = false;
         while !self.exchange.ended.load(Relaxed) {
             if stop.load(Relaxed) && !stopping {
@@ -239,13 +159,11 @@ impl<'a> Service<'a> {
                 }
             }
             while self.exchange.old_agents.pop().is_some() {}
-            self.weights.look(self.exchange, &mut self.journal, self.say);
             self.hear();
             self.answer();
             std::thread::sleep(BEAT);
         }
         self.hear();
-        self.journal.write(self.say, Writer::flush);
     }
 
     /// Takes what the loop told.
@@ -253,7 +171,10 @@ impl<'a> Service<'a> {
         while let Some(event) = self.exchange.events.pop() {
             match event {
                 Event::Tick(tick, telemetry, counters) => {
-                    self.journal.write(self.say, |j| j.tick(Box::new(tick)));
+                    if self.journal.as_ref().is_some_and(|j| j.try_send(Box::new(tick)).is_err()) {
+                        (self.say)("journal: the disk does not keep up; no more is written, the controller goes on");
+                        self.journal = None;
+                    }
                     self.latest = Some((telemetry, counters));
                     // Nobody listening is no error.
                     let _ = self.telemetry.send_copy(telemetry);
@@ -289,10 +210,14 @@ impl<'a> Service<'a> {
         }
     }
 
+    fn weights(&self) -> WeightsNote {
+        self.weights.lock().unwrap_or_else(PoisonError::into_inner).clone()
+    }
+
     fn words(&self, refusal: Refusal) -> String {
         match refusal {
             Refusal::Robot(_) if !self.robot_note.get().is_empty() => self.robot_note.get(),
-            Refusal::NoWeights => format!("{refusal} ({})", self.weights.refused),
+            Refusal::NoWeights => format!("{refusal} ({})", self.weights().refused),
             _ => refusal.to_string(),
         }
     }
@@ -328,12 +253,13 @@ impl<'a> Service<'a> {
         let (t, c) = self.latest.unwrap_or_default();
         let x = self.exchange;
         let timing = &x.timing;
+        let weights = self.weights();
         let phase = Phase::from_code(t.phase);
         let hindrance = match phase {
             Phase::NoRobot if !self.robot_note.get().is_empty() => self.robot_note.get(),
             Phase::NoRobot if t.alpha_measured_deg.is_finite() => Refusal::NotUpright(t.alpha_measured_deg).to_string(),
             Phase::NoRobot => "waiting for the robot".into(),
-            _ if self.weights.id.is_empty() => format!("no weights: {}", self.weights.refused),
+            _ if weights.id.is_empty() => format!("no weights: {}", weights.refused),
             _ => String::new(),
         };
         Status {
@@ -359,9 +285,9 @@ impl<'a> Service<'a> {
             loop_allocations: x.loop_allocations.load(Relaxed),
             loop_page_faults: x.loop_page_faults.load(Relaxed),
             events_lost: x.events_lost.load(Relaxed),
-            weights: self.weights.id.clone(),
+            weights_refused: if weights.id.is_empty() { String::new() } else { weights.refused },
+            weights: weights.id,
             weights_taken: x.agents_taken.load(Relaxed),
-            weights_refused: if self.weights.id.is_empty() { String::new() } else { self.weights.refused.clone() },
             timing: vec![
                 timing.lateness.snapshot("wake-up lateness"),
                 timing.execution.snapshot("tick execution"),

@@ -1,11 +1,10 @@
 //! `rt-controller status`: the running controller's state, counters and histograms. Ordinary process.
 
 use std::path::PathBuf;
-use std::process::ExitCode;
 
 use shared::config::Config;
 use shared::control::Status;
-use shared::exit;
+use shared::exit::{self, Failure, OrExit as _};
 
 use crate::client::Client;
 
@@ -21,21 +20,16 @@ pub struct Args {
     json: bool,
 }
 
-/// Runs the command; the exit codes are those of [`shared::exit`].
-pub fn run(args: &Args) -> ExitCode {
-    let config = match Config::read(&args.config) {
-        Ok(config) => config,
-        Err(e) => return exit::fail(exit::BAD_INPUT, e),
-    };
-    match Client::connect(&config.cell.name).and_then(|c| c.status()) {
-        Ok(status) if args.json => match serde_json::to_string_pretty(&status) {
-            Ok(text) => println!("{text}"),
-            Err(e) => return exit::fail(exit::FAILED, e),
-        },
-        Ok(status) => print(&status),
-        Err(e) => return exit::fail(exit::UNREACHABLE, e),
+/// Runs the command.
+pub fn run(args: &Args) -> Result<(), Failure> {
+    let config = Config::read(&args.config).or_exit(exit::BAD_INPUT)?;
+    let status = Client::connect(&config.cell.name).and_then(|c| c.status()).or_exit(exit::UNREACHABLE)?;
+    if args.json {
+        println!("{}", serde_json::to_string_pretty(&status).or_exit(exit::FAILED)?);
+    } else {
+        print(&status);
     }
-    ExitCode::SUCCESS
+    Ok(())
 }
 
 fn print(s: &Status) {

@@ -2,11 +2,10 @@
 
 use std::io::{BufRead, Write};
 use std::path::PathBuf;
-use std::process::ExitCode;
 
 use shared::agent::Agent;
 use shared::config::Config;
-use shared::exit;
+use shared::exit::{self, Failure, OrExit as _, failure};
 use shared::messages::{Doubt, Feature, LAYOUT_VERSION};
 use shared::weights::Weights;
 
@@ -29,16 +28,10 @@ pub struct Args {
     config: PathBuf,
 }
 
-/// Runs the command; the exit codes are those of [`shared::exit`].
-pub fn run(args: &Args) -> ExitCode {
-    let config = match Config::read(&args.config) {
-        Ok(config) => config,
-        Err(e) => return exit::fail(exit::BAD_INPUT, e),
-    };
-    let weights = match Weights::read(&args.weights) {
-        Ok(weights) => weights,
-        Err(e) => return exit::fail(exit::BAD_INPUT, e),
-    };
+/// Runs the command.
+pub fn run(args: &Args) -> Result<(), Failure> {
+    let config = Config::read(&args.config).or_exit(exit::BAD_INPUT)?;
+    let weights = Weights::read(&args.weights).or_exit(exit::BAD_INPUT)?;
     let settings = Settings::new(&config);
     let mut core = Core::new(settings);
     core.exchange(Box::new(Agent::new(&weights)));
@@ -69,19 +62,22 @@ pub fn run(args: &Args) -> ExitCode {
     frame(0.0, None);
     let (started, _) = frame(0.0, Some(Order::Pour { episode: 1, goal_ml: args.goal }));
     if let Some(Err(refusal)) = started.ordered {
-        return exit::fail(exit::REFUSED, refusal);
+        return Err(failure(exit::REFUSED, refusal));
     }
     let mut out = std::io::stdout().lock();
     for (number, line) in std::io::stdin().lock().lines().enumerate() {
         let area_px2 = match line.as_deref().map(str::trim).map(str::parse::<f32>) {
             Ok(Ok(area_px2)) => area_px2,
-            _ => return exit::fail(exit::BAD_INPUT, format!("line {}: not a number: give one V_e in px^2, or nan, a line", number + 1)),
+            _ => {
+                let what = format!("line {}: not a number: give one V_e in px^2, or nan, a line", number + 1);
+                return Err(failure(exit::BAD_INPUT, what));
+            }
         };
         let (output, dalpha_deg) = frame(area_px2, None);
         let t = output.telemetry;
         if writeln!(out, "{dalpha_deg:.4} {:.4} {:.4}", t.alpha_deg, t.d_ml).and_then(|()| out.flush()).is_err() {
-            return ExitCode::SUCCESS; // the reader has gone
+            return Ok(()); // the reader has gone
         }
     }
-    ExitCode::SUCCESS
+    Ok(())
 }

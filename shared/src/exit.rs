@@ -25,3 +25,37 @@ pub fn fail(code: u8, what: impl Display) -> ExitCode {
     eprintln!("error: {what}");
     ExitCode::from(code)
 }
+
+/// Why a command ends without success: its exit code and its one line.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Failure {
+    /// One of this module's exit codes.
+    pub code: u8,
+    /// What, where, what to do.
+    pub what: String,
+}
+
+/// A failure to return; `Err(failure(..))` or with `?`.
+pub fn failure(code: u8, what: impl Display) -> Failure {
+    Failure { code, what: what.to_string() }
+}
+
+/// Turns an operation's error into the command's failure: `Config::read(file).or_exit(BAD_INPUT)?`.
+pub trait OrExit<T> {
+    /// The value, or the error's line with `code`.
+    fn or_exit(self, code: u8) -> Result<T, Failure>;
+}
+
+impl<T, E: Display> OrExit<T> for Result<T, E> {
+    fn or_exit(self, code: u8) -> Result<T, Failure> {
+        self.map_err(|e| failure(code, e))
+    }
+}
+
+/// Ends a command: prints its failure, if it failed, and gives the process's exit code.
+pub fn end(result: Result<(), Failure>) -> ExitCode {
+    match result {
+        Ok(()) => ExitCode::SUCCESS,
+        Err(Failure { code, what }) => fail(code, what),
+    }
+}

@@ -9,7 +9,6 @@
 use std::io::{BufRead, BufReader, Write};
 use std::os::unix::net::{UnixListener, UnixStream};
 use std::path::PathBuf;
-use std::process::ExitCode;
 use std::sync::atomic::{AtomicBool, Ordering::Relaxed};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
@@ -18,7 +17,7 @@ use rand::{RngExt, SeedableRng};
 use rand_pcg::Pcg64Mcg;
 use serde::{Deserialize, Serialize};
 use shared::config::Config;
-use shared::exit;
+use shared::exit::{self, Failure, OrExit as _};
 use shared::ipc::Cell;
 use shared::messages::{FrameHeader, LAYOUT_VERSION, PixelFormat};
 use shared::os;
@@ -26,6 +25,7 @@ use shared::os;
 use crate::camera::{Renderer, Scene, View};
 use crate::physics::container::Container;
 use crate::physics::rig::Rig;
+use crate::stop_at_signals;
 use crate::ur;
 
 /// SCHED_FIFO priorities where permitted: a real robot, liquid and camera do not wait for this machine's other work. Below the
@@ -144,27 +144,15 @@ impl World {
     }
 }
 
-/// Runs the command; the exit codes are those of [`shared::exit`].
-pub fn run(args: &Args) -> ExitCode {
-    let config = match Config::read(&args.config) {
-        Ok(config) => config,
-        Err(e) => return exit::fail(exit::BAD_INPUT, e),
-    };
-    let sim = match SimulatorConfig::new(&config) {
-        Ok(sim) => sim,
-        Err(e) => return exit::fail(exit::BAD_INPUT, format!("{}: {e}", args.config.display())),
-    };
-    match simulate(config, sim) {
-        Ok(()) => ExitCode::SUCCESS,
-        Err(e) => exit::fail(exit::FAILED, e),
-    }
+/// Runs the command.
+pub fn run(args: &Args) -> Result<(), Failure> {
+    let config = Config::read(&args.config).or_exit(exit::BAD_INPUT)?;
+    let sim = SimulatorConfig::new(&config).map_err(|e| format!("{}: {e}", args.config.display())).or_exit(exit::BAD_INPUT)?;
+    simulate(config, sim).or_exit(exit::FAILED)
 }
 
 fn simulate(config: Config, sim: SimulatorConfig) -> Result<(), Box<dyn std::error::Error>> {
-    let stop = Arc::new(AtomicBool::new(false));
-    for signal in [signal_hook::consts::SIGINT, signal_hook::consts::SIGTERM] {
-        signal_hook::flag::register(signal, Arc::clone(&stop))?;
-    }
+    let stop = stop_at_signals()?;
     let mut start_q_rad = [0.0, -1.571, 1.571, -1.571, -1.571, 0.0];
     start_q_rad[config.robot.joint.index()] = config.robot.start_joint_deg.to_radians();
     let robot = ur::Controller::start(ur::Options { series: sim.series, start_q_rad, ..ur::Options::new(config.robot.address) })?;

@@ -3,13 +3,13 @@
 //! An ordinary process that does what an operator does, in a cell of its own ([`crate::own_cell`]).
 
 use std::path::PathBuf;
-use std::process::{Command, ExitCode};
+use std::process::Command;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
 use serde_json::{Value, json};
-use shared::exit;
+use shared::exit::{self, Failure, failure};
 use shared::ipc::Cell;
 use shared::messages::Telemetry;
 
@@ -46,34 +46,24 @@ pub struct Args {
     json: bool,
 }
 
-/// Runs the command; the exit codes are those of [`shared::exit`].
-pub fn run(args: &Args) -> ExitCode {
-    let stop = Arc::new(AtomicBool::new(false));
-    for signal in [signal_hook::consts::SIGINT, signal_hook::consts::SIGTERM] {
-        if let Err(e) = signal_hook::flag::register(signal, Arc::clone(&stop)) {
-            return exit::fail(exit::FAILED, e);
-        }
-    }
+/// Runs the command.
+pub fn run(args: &Args) -> Result<(), Failure> {
     for old in ["episodes", "summary.json"] {
         let old = args.out.join(old);
         let _ = if old.is_dir() { std::fs::remove_dir_all(old) } else { std::fs::remove_file(old) };
     }
-    match OwnCell::prepare("demo", &args.config, &args.out, args.seed, stop).and_then(|mut cell| perform(args, &mut cell)) {
-        Ok(summary) => {
-            let far: Vec<String> =
-                (1..).zip(&summary.pours).filter(|(_, p)| p.error_ml.abs() > TOLERANCE_ML).map(|(i, _)| i.to_string()).collect();
-            if args.json {
-                println!("{}", summary.json());
-            } else {
-                summary.print();
-            }
-            if far.is_empty() {
-                return ExitCode::SUCCESS;
-            }
-            exit::fail(exit::FAILED, format!("pour {} is further than {TOLERANCE_ML} ml from its goal", far.join(" and ")))
-        }
-        Err(e) => e.exit(),
+    let mut cell = OwnCell::prepare("demo", &args.config, &args.out, args.seed)?;
+    let summary = perform(args, &mut cell)?;
+    if args.json {
+        println!("{}", summary.json());
+    } else {
+        summary.print();
     }
+    let far: Vec<String> = (1..).zip(&summary.pours).filter(|(_, p)| p.error_ml.abs() > TOLERANCE_ML).map(|(i, _)| i.to_string()).collect();
+    if far.is_empty() {
+        return Ok(());
+    }
+    Err(failure(exit::FAILED, format!("pour {} is further than {TOLERANCE_ML} ml from its goal", far.join(" and "))))
 }
 
 /// One pour's line in the table.

@@ -6,14 +6,12 @@
 //! until then is lost. `scripts/jitter` installs what is needed.
 
 use std::path::PathBuf;
-use std::process::{Child, Command, ExitCode, Stdio};
-use std::sync::Arc;
-use std::sync::atomic::AtomicBool;
+use std::process::{Child, Command, Stdio};
 use std::time::{Duration, Instant};
 
 use rt_controller::journal;
 use serde_json::{Value, json};
-use shared::exit;
+use shared::exit::Failure;
 use shared::os::now_ns;
 use trainer::report::{self, Series};
 
@@ -50,26 +48,17 @@ pub struct Args {
     json: bool,
 }
 
-/// Runs the command; the exit codes are those of [`shared::exit`].
-pub fn run(args: &Args) -> ExitCode {
-    let stop = Arc::new(AtomicBool::new(false));
-    for signal in [signal_hook::consts::SIGINT, signal_hook::consts::SIGTERM] {
-        if let Err(e) = signal_hook::flag::register(signal, Arc::clone(&stop)) {
-            return exit::fail(exit::FAILED, e);
-        }
-    }
-    match measure(args, stop) {
-        Ok(()) => ExitCode::SUCCESS,
-        Err(e) => e.exit(),
-    }
+/// Runs the command.
+pub fn run(args: &Args) -> Result<(), Failure> {
+    Ok(measure(args)?)
 }
 
 fn file_error(what: impl std::fmt::Display) -> impl FnOnce(std::io::Error) -> OwnCellError {
     move |error| OwnCellError::File { what: what.to_string(), error }
 }
 
-fn measure(args: &Args, stop: Arc<AtomicBool>) -> Result<(), OwnCellError> {
-    let mut cell = OwnCell::prepare("jitter", &args.config, &args.out, 1, stop)?;
+fn measure(args: &Args) -> Result<(), OwnCellError> {
+    let mut cell = OwnCell::prepare("jitter", &args.config, &args.out, 1)?;
     std::fs::copy(&args.weights, args.out.join("weights.bin")).map_err(file_error(args.weights.display()))?;
     let machine = Machine::look(&cell);
     let result = match args.hours {
@@ -223,18 +212,38 @@ fn latencies_us(output: &[u8]) -> Vec<f64> {
     text.lines().filter_map(sample).collect()
 }
 
-/// Everything measured of one tick that used a new V_e, or of every tick (lateness, execution), us.
+/// What is measured of every tick (lateness, execution), or of those that used a new V_e.
+#[derive(Debug, Clone, Copy)]
+enum Column {
+    Lateness,
+    Execution,
+    PouringExecution,
+    CaptureToReceived,
+    ReceivedToPublished,
+    PublishedToWake,
+    WakeToDecided,
+    DecidedToWritten,
+    CaptureToWritten,
+}
+
+/// Their names, in the same order.
+const COLUMNS: [&str; 9] = [
+    "wake-up lateness",
+    "tick execution",
+    "tick execution in pours",
+    "capture to worker",
+    "worker to V_e published",
+    "V_e published to wake-up",
+    "wake-up to target decided",
+    "decided to bytes on the socket",
+    "capture to bytes on the socket",
+];
+
+/// Everything measured of the ticks of a run, us.
 #[derive(Debug, Default, Clone)]
 struct Ticks {
-    lateness: Vec<f64>,
-    execution: Vec<f64>,
-    capture_to_received: Vec<f64>,
-    received_to_published: Vec<f64>,
-    published_to_wake: Vec<f64>,
-    wake_to_decided: Vec<f64>,
-    decided_to_written: Vec<f64>,
-    capture_to_written: Vec<f64>,
-    pouring_execution: Vec<f64>,
+    /// In the order of [`Column`].
+    columns: [Vec<f64>; COLUMNS.len()],
     /// Periods without a tick, and ticks later than half a period.
     lost: u64,
     late: u64,
@@ -258,18 +267,19 @@ impl Ticks {
             }
             let lateness = us(times.deadline_ns, woke_ns);
             ticks.late += u64::from(lateness > period_ns / 2e3);
-            ticks.lateness.push(lateness);
-            ticks.execution.push(us(woke_ns, times.done_ns));
+            let mut push = |column: Column, us: f64| ticks.columns[column as usize].push(us);
+            push(Column::Lateness, lateness);
+            push(Column::Execution, us(woke_ns, times.done_ns));
             if output.telemetry.goal_ml.is_finite() && output.telemetry.episode != 0 {
-                ticks.pouring_execution.push(us(woke_ns, times.done_ns));
+                push(Column::PouringExecution, us(woke_ns, times.done_ns));
             }
             if let Some(feature) = tick.features.last().filter(|_| times.written_at_ns != 0) {
-                ticks.capture_to_received.push(us(feature.captured_at_ns, feature.received_at_ns));
-                ticks.received_to_published.push(us(feature.received_at_ns, feature.published_at_ns));
-                ticks.published_to_wake.push(us(feature.published_at_ns, woke_ns));
-                ticks.wake_to_decided.push(us(woke_ns, times.decided_at_ns));
-                ticks.decided_to_written.push(us(times.decided_at_ns, times.written_at_ns));
-                ticks.capture_to_written.push(us(feature.captured_at_ns, times.written_at_ns));
+                push(Column::CaptureToReceived, us(feature.captured_at_ns, feature.received_at_ns));
+                push(Column::ReceivedToPublished, us(feature.received_at_ns, feature.published_at_ns));
+                push(Column::PublishedToWake, us(feature.published_at_ns, woke_ns));
+                push(Column::WakeToDecided, us(woke_ns, times.decided_at_ns));
+                push(Column::DecidedToWritten, us(times.decided_at_ns, times.written_at_ns));
+                push(Column::CaptureToWritten, us(feature.captured_at_ns, times.written_at_ns));
             }
         });
         let replay = replay.map_err(|e| OwnCellError::Other(e.to_string()))?;
@@ -279,18 +289,8 @@ impl Ticks {
         Ok(ticks)
     }
 
-    fn columns(&self) -> [(&'static str, &Vec<f64>); 9] {
-        [
-            ("wake-up lateness", &self.lateness),
-            ("tick execution", &self.execution),
-            ("tick execution in pours", &self.pouring_execution),
-            ("capture to worker", &self.capture_to_received),
-            ("worker to V_e published", &self.received_to_published),
-            ("V_e published to wake-up", &self.published_to_wake),
-            ("wake-up to target decided", &self.wake_to_decided),
-            ("decided to bytes on the socket", &self.decided_to_written),
-            ("capture to bytes on the socket", &self.capture_to_written),
-        ]
+    fn of(&self, column: Column) -> &Vec<f64> {
+        &self.columns[column as usize]
     }
 }
 
@@ -466,24 +466,15 @@ fn rounds(cell: &mut OwnCell, args: &Args) -> Result<Measured, OwnCellError> {
         let mut all = Ticks::default();
         for run in runs {
             let t = &run.ticks;
-            for (sum, part) in [
-                (&mut all.lateness, &t.lateness),
-                (&mut all.execution, &t.execution),
-                (&mut all.pouring_execution, &t.pouring_execution),
-                (&mut all.capture_to_received, &t.capture_to_received),
-                (&mut all.received_to_published, &t.received_to_published),
-                (&mut all.published_to_wake, &t.published_to_wake),
-                (&mut all.wake_to_decided, &t.wake_to_decided),
-                (&mut all.decided_to_written, &t.decided_to_written),
-                (&mut all.capture_to_written, &t.capture_to_written),
-            ] {
+            for (sum, part) in all.columns.iter_mut().zip(&t.columns) {
                 sum.extend_from_slice(part);
             }
             all.lost += t.lost;
             all.late += t.late;
         }
         let yard_all: Vec<f64> = yard.concat();
-        let ratio = |k: usize| median(runs.iter().map(|r| summary(&r.ticks.lateness)[k])) / median(yard.iter().map(|y| summary(y)[k]));
+        let ratio =
+            |k: usize| median(runs.iter().map(|r| summary(r.ticks.of(Column::Lateness))[k])) / median(yard.iter().map(|y| summary(y)[k]));
         let (p50, p99) = (ratio(1), ratio(2));
 
         let mut rows = vec![["us", "n", "p50", "p99", "p99.9", "max"].map(String::from).to_vec()];
@@ -495,7 +486,7 @@ fn rounds(cell: &mut OwnCell, args: &Args) -> Result<Measured, OwnCellError> {
             );
             table.insert(label.into(), json!({ "n": s[0], "p50_us": s[1], "p99_us": s[2], "p999_us": s[3], "max_us": s[4] }));
         };
-        for (label, values) in all.columns() {
+        for (label, values) in COLUMNS.iter().zip(&all.columns) {
             row(label, values);
         }
         row("cyclictest: wake-up lateness", &yard_all);
@@ -531,23 +522,34 @@ fn rounds(cell: &mut OwnCell, args: &Args) -> Result<Measured, OwnCellError> {
         html += &histograms(
             "us",
             "Wake-up lateness; the last step holds what is beyond.",
-            &[("rt-controller", &all.lateness), ("cyclictest", &yard_all)],
+            &[("rt-controller", all.of(Column::Lateness)), ("cyclictest", &yard_all)],
         );
-        html += &histograms("us", "Tick execution.", &[("all ticks", &all.execution), ("in pours", &all.pouring_execution)]);
-        html += &histograms("us", "From the worker's receipt of a frame to its V_e.", &[("extraction", &all.received_to_published)]);
+        html += &histograms(
+            "us",
+            "Tick execution.",
+            &[("all ticks", all.of(Column::Execution)), ("in pours", all.of(Column::PouringExecution))],
+        );
+        html +=
+            &histograms("us", "From the worker's receipt of a frame to its V_e.", &[("extraction", all.of(Column::ReceivedToPublished))]);
         html += &histograms(
             "us",
             "From the wake-up to the target's bytes on the socket.",
-            &[("deciding", &all.wake_to_decided), ("the kernel's send", &all.decided_to_written)],
+            &[("deciding", all.of(Column::WakeToDecided)), ("the kernel's send", all.of(Column::DecidedToWritten))],
         );
         html += &histograms(
             "us",
             "The way of a frame: exposure to its V_e's use.",
-            &[("V_e waits for its tick", &all.published_to_wake), ("exposure to bytes on the socket", &all.capture_to_written)],
+            &[
+                ("V_e waits for its tick", all.of(Column::PublishedToWake)),
+                ("exposure to bytes on the socket", all.of(Column::CaptureToWritten)),
+            ],
         );
         html += "</div>";
-        let rounds: Vec<Value> =
-            runs.iter().zip(yard).map(|(r, y)| json!({ "rt_controller": summary(&r.ticks.lateness), "cyclictest": summary(y) })).collect();
+        let rounds: Vec<Value> = runs
+            .iter()
+            .zip(yard)
+            .map(|(r, y)| json!({ "rt_controller": summary(r.ticks.of(Column::Lateness)), "cyclictest": summary(y) }))
+            .collect();
         numbers.insert(
             (*name).into(),
             json!({
@@ -600,12 +602,12 @@ fn soak(cell: &mut OwnCell, hours: f64) -> Result<Measured, OwnCellError> {
     let ticks = Ticks::read(cell, from_ns, to_ns)?;
     let period_us = 1e6 / cell.config.controller.rate_hz;
     let lost_by_cyclictest = latencies.iter().filter(|l| **l > period_us).count();
-    let (late, yard) = (summary(&ticks.lateness), summary(&latencies));
+    let (late, yard) = (summary(ticks.of(Column::Lateness)), summary(&latencies));
     let facts = [
         format!(
             "{:.0} s under load, {} ticks, {} lost, {} later than half a period",
             from.elapsed().as_secs_f64(),
-            ticks.lateness.len(),
+            ticks.of(Column::Lateness).len(),
             ticks.lost,
             ticks.late
         ),
@@ -637,7 +639,7 @@ fn soak(cell: &mut OwnCell, hours: f64) -> Result<Measured, OwnCellError> {
         ),
         "Open files.",
     );
-    html += &histograms("us", "Wake-up lateness.", &[("rt-controller", &ticks.lateness), ("cyclictest", &latencies)]);
+    html += &histograms("us", "Wake-up lateness.", &[("rt-controller", ticks.of(Column::Lateness)), ("cyclictest", &latencies)]);
     html += "</div>";
     let sample = |s: &Sample| {
         json!({
@@ -646,7 +648,7 @@ fn soak(cell: &mut OwnCell, hours: f64) -> Result<Measured, OwnCellError> {
         })
     };
     let numbers = json!({
-        "seconds": seconds, "ticks": ticks.lateness.len(), "lost_ticks": ticks.lost, "late_ticks": ticks.late,
+        "seconds": seconds, "ticks": ticks.of(Column::Lateness).len(), "lost_ticks": ticks.lost, "late_ticks": ticks.late,
         "lost_by_cyclictest": lost_by_cyclictest, "lateness_us": late, "cyclictest_us": yard,
         "samples": samples.iter().map(sample).collect::<Vec<_>>(),
     });

@@ -5,14 +5,13 @@
 //! the same episode gives the same picture. Ordinary thread; allocates; errors are one line.
 
 use std::path::{Path, PathBuf};
-use std::process::ExitCode;
 
 use plotters::prelude::*;
 use rt_controller::link::{LinkOptions, Mode, program};
 use serde::Serialize;
 use shared::config::Config;
 use shared::episode::Episode;
-use shared::exit;
+use shared::exit::{self, Failure, OrExit as _};
 
 use crate::ur::machine::{Machine, RuntimeState};
 use crate::ur::variables::{Input, Series};
@@ -84,25 +83,17 @@ struct Report {
     picture: String,
 }
 
-/// Runs the command; the exit codes are those of [`shared::exit`].
-pub fn run(args: &Args) -> ExitCode {
-    let config = match Config::read(&args.config) {
-        Ok(config) => config,
-        Err(e) => return exit::fail(exit::BAD_INPUT, e),
-    };
-    let episode = match Episode::read(&args.episode) {
-        Ok(episode) => episode,
-        Err(e) => return exit::fail(exit::BAD_INPUT, e),
-    };
-    match compare(args, &config, &episode) {
-        Ok(report) if args.json => match serde_json::to_string_pretty(&report) {
-            Ok(text) => println!("{text}"),
-            Err(e) => return exit::fail(exit::FAILED, e),
-        },
-        Ok(report) => print(&report),
-        Err(e) => return exit::fail(exit::FAILED, format!("{}: {e}", args.episode.display())),
+/// Runs the command.
+pub fn run(args: &Args) -> Result<(), Failure> {
+    let config = Config::read(&args.config).or_exit(exit::BAD_INPUT)?;
+    let episode = Episode::read(&args.episode).or_exit(exit::BAD_INPUT)?;
+    let report = compare(args, &config, &episode).map_err(|e| format!("{}: {e}", args.episode.display())).or_exit(exit::FAILED)?;
+    if args.json {
+        println!("{}", serde_json::to_string_pretty(&report).or_exit(exit::FAILED)?);
+    } else {
+        print(&report);
     }
-    ExitCode::SUCCESS
+    Ok(())
 }
 
 fn print(report: &Report) {

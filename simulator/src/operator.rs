@@ -5,12 +5,11 @@
 use std::io::{BufRead, BufReader, Write};
 use std::os::unix::net::UnixStream;
 use std::path::PathBuf;
-use std::process::ExitCode;
 
 use clap::Subcommand;
 use serde_json::Value;
 use shared::config::Config;
-use shared::exit;
+use shared::exit::{self, Failure, OrExit as _, failure};
 
 use crate::{cell, ur};
 
@@ -56,27 +55,20 @@ struct Common {
     json: bool,
 }
 
-/// Runs the command; the exit codes are those of [`shared::exit`].
-pub fn run(args: &Args) -> ExitCode {
+/// Runs the command.
+pub fn run(args: &Args) -> Result<(), Failure> {
     let (Act::Fill { common, .. } | Act::Scale { common } | Act::Fault { common, .. }) = &args.act;
-    let config = match Config::read(&common.config) {
-        Ok(config) => config,
-        Err(e) => return exit::fail(exit::BAD_INPUT, e),
-    };
+    let config = Config::read(&common.config).or_exit(exit::BAD_INPUT)?;
     let line = match &args.act {
         Act::Fill { volume_ml, .. } => format!("fill {volume_ml}"),
         Act::Scale { .. } => "scale".into(),
         Act::Fault { fault, .. } => return cause(&config, fault),
     };
-    let answer = match ask(&config.cell.name, &line) {
-        Ok(answer) => answer,
-        Err(e) => {
-            let what = format!("no simulated cell '{}' ({e}): is `simulator run` running with the same --config?", config.cell.name);
-            return exit::fail(exit::UNREACHABLE, what);
-        }
-    };
+    let name = &config.cell.name;
+    let absent = |e| format!("no simulated cell '{name}' ({e}): is `simulator run` running with the same --config?");
+    let answer = ask(name, &line).map_err(absent).or_exit(exit::UNREACHABLE)?;
     if let Some(error) = answer["error"].as_str() {
-        return exit::fail(exit::REFUSED, error);
+        return Err(failure(exit::REFUSED, error));
     }
     match &args.act {
         _ if common.json => println!("{answer}"),
@@ -84,18 +76,12 @@ pub fn run(args: &Args) -> ExitCode {
         Act::Scale { .. } => println!("{} g", answer["weight_g"]),
         Act::Fault { .. } => {}
     }
-    ExitCode::SUCCESS
+    Ok(())
 }
 
-fn cause(config: &Config, fault: &str) -> ExitCode {
-    let parsed: ur::Fault = match fault.parse() {
-        Ok(fault) => fault,
-        Err(e) => return exit::fail(exit::BAD_INPUT, e),
-    };
-    match ur::send_fault(config.robot.address, &parsed) {
-        Ok(()) => ExitCode::SUCCESS,
-        Err(e) => exit::fail(exit::UNREACHABLE, e),
-    }
+fn cause(config: &Config, fault: &str) -> Result<(), Failure> {
+    let fault: ur::Fault = fault.parse().or_exit(exit::BAD_INPUT)?;
+    ur::send_fault(config.robot.address, &fault).or_exit(exit::UNREACHABLE)
 }
 
 /// One line to the cell's operator socket, one answer back.

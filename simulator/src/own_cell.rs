@@ -4,7 +4,7 @@
 //! the controller. When it is dropped, every process that it started is stopped and the cell's shared memory is removed.
 
 use std::path::{Path, PathBuf};
-use std::process::{Child, Command, ExitCode, ExitStatus, Stdio};
+use std::process::{Child, Command, ExitStatus, Stdio};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
@@ -12,8 +12,10 @@ use std::time::{Duration, Instant};
 use rt_controller::client::Client;
 use serde_json::Value;
 use shared::config::Config;
-use shared::exit;
+use shared::exit::{self, Failure, failure};
 use shared::messages::Phase;
+
+use crate::stop_at_signals;
 
 /// Why it stopped.
 #[derive(Debug, thiserror::Error)]
@@ -59,15 +61,14 @@ pub enum OwnCellError {
     Other(String),
 }
 
-impl OwnCellError {
-    /// Says it, and gives the command's exit code.
-    pub fn exit(&self) -> ExitCode {
-        let code = match self {
-            Self::Interrupted => exit::INTERRUPTED,
-            Self::Config(_) => exit::BAD_INPUT,
+impl From<OwnCellError> for Failure {
+    fn from(error: OwnCellError) -> Self {
+        let code = match error {
+            OwnCellError::Interrupted => exit::INTERRUPTED,
+            OwnCellError::Config(_) => exit::BAD_INPUT,
             _ => exit::FAILED,
         };
-        exit::fail(code, self)
+        failure(code, error)
     }
 }
 
@@ -88,8 +89,8 @@ pub struct OwnCell {
 
 impl OwnCell {
     /// Makes the directory and the configuration; nothing runs yet. Weights of an earlier cell there are removed. `kind` becomes
-    /// part of the cell's name; `stop` ends what waits.
-    pub fn prepare(kind: &str, config: &Path, out: &Path, seed: u64, stop: Arc<AtomicBool>) -> Result<Self, OwnCellError> {
+    /// part of the cell's name. From here on Ctrl-C ends what waits.
+    pub fn prepare(kind: &str, config: &Path, out: &Path, seed: u64) -> Result<Self, OwnCellError> {
         let file = |what: &Path, error| OwnCellError::File { what: what.display().to_string(), error };
         let bad = |e: &dyn std::fmt::Display| OwnCellError::Config(e.to_string());
         let text = std::fs::read_to_string(config).map_err(|e| file(config, e))?;
@@ -117,6 +118,7 @@ impl OwnCell {
         let text = toml::to_string_pretty(&table).map_err(|e| bad(&e))?;
         std::fs::write(&config_file, &text).map_err(|e| file(&config_file, e))?;
         let config = Config::parse(&text, &config_file.display().to_string()).map_err(|e| bad(&e))?;
+        let stop = stop_at_signals().map_err(|e| OwnCellError::Other(e.to_string()))?;
         let exe = std::env::current_exe().map_err(|e| file(Path::new("own program"), e))?;
         let bin = exe.parent().unwrap_or(Path::new(".")).to_path_buf();
         Ok(Self { config, out: out.into(), bin, started: Instant::now(), config_file, stop, processes: Vec::new() })

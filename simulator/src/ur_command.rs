@@ -5,14 +5,13 @@
 
 use std::io::{BufRead, Write};
 use std::net::{IpAddr, Ipv4Addr};
-use std::process::ExitCode;
-use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::atomic::Ordering;
 use std::sync::mpsc;
 use std::time::{Duration, Instant};
 
-use shared::exit;
+use shared::exit::{self, Failure, OrExit as _, failure};
 
+use crate::stop_at_signals;
 use crate::ur::{Controller, Fault, LogKind, LogLine, Options, Series, fault};
 
 /// Command-line arguments.
@@ -54,8 +53,8 @@ fn help() -> String {
     )
 }
 
-/// Runs the command; the exit codes are those of [`shared::exit`].
-pub fn run(args: &Args) -> ExitCode {
+/// Runs the command.
+pub fn run(args: &Args) -> Result<(), Failure> {
     let mut options = Options::new(args.address);
     options.series = match args.series {
         SeriesArg::Cb3 => Series::Cb3,
@@ -63,20 +62,12 @@ pub fn run(args: &Args) -> ExitCode {
     };
     for (to, from) in options.start_q_rad.iter_mut().zip(&args.joints_deg) {
         if !(-360.0..=360.0).contains(from) {
-            return exit::fail(exit::BAD_INPUT, format!("--joints-deg: {from} is outside -360 to 360"));
+            return Err(failure(exit::BAD_INPUT, format!("--joints-deg: {from} is outside -360 to 360")));
         }
         *to = from.to_radians();
     }
-    let stop = Arc::new(AtomicBool::new(false));
-    for signal in [signal_hook::consts::SIGINT, signal_hook::consts::SIGTERM] {
-        if let Err(error) = signal_hook::flag::register(signal, stop.clone()) {
-            return exit::fail(exit::FAILED, format!("cannot listen for Ctrl-C: {error}"));
-        }
-    }
-    let controller = match Controller::start(options) {
-        Ok(controller) => controller,
-        Err(error) => return exit::fail(exit::FAILED, error),
-    };
+    let stop = stop_at_signals().or_exit(exit::FAILED)?;
+    let controller = Controller::start(options).or_exit(exit::FAILED)?;
     args.fault.iter().for_each(|f| controller.inject(f.clone()));
     if !args.json {
         println!("UR5 controller ({:?}) on {}: ports 29999, 30001 to 30004; lines on standard input are faults", args.series, args.address);
@@ -87,7 +78,7 @@ pub fn run(args: &Args) -> ExitCode {
     let start = Instant::now();
     while !stop.load(Ordering::Relaxed) {
         if args.seconds.is_some_and(|s| start.elapsed().as_secs_f64() >= s) {
-            return ExitCode::SUCCESS;
+            return Ok(());
         }
         for line in typed.try_iter().filter(|l| !l.trim().is_empty()) {
             match line.parse::<Fault>() {
@@ -96,12 +87,11 @@ pub fn run(args: &Args) -> ExitCode {
             }
         }
         if controller.take_log().iter().try_for_each(|l| print(l, args.json)).is_err() {
-            // Nobody reads any more.
-            return ExitCode::from(exit::INTERRUPTED);
+            break; // nobody reads any more
         }
         std::thread::sleep(Duration::from_millis(50));
     }
-    ExitCode::from(exit::INTERRUPTED)
+    Err(failure(exit::INTERRUPTED, "interrupted"))
 }
 
 fn print(line: &LogLine, json: bool) -> std::io::Result<()> {

@@ -492,7 +492,8 @@ fn slow_reader() {
 /// Protects the pour from a longer gap in the robot's state.
 #[test]
 fn skipped_outputs() {
-    by_itself("skip-outputs", 7, Expected::Upright(EndReason::RobotLost), Fault::SkipOutputs(40));
+    let strike = |c: &mut Cell| c.robot.inject(Fault::SkipOutputs((0.32 * c.series.rate_hz()) as u32));
+    matrix("skip-outputs", 7, Expected::Upright(EndReason::RobotLost), strike, |_| {});
 }
 
 /// Protects the pour from being ended by what is harmless: a short gap.

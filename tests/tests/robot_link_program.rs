@@ -317,6 +317,38 @@ fn start_angle_and_direction_are_kept() {
     assert!((robot.machine.robot.outputs.double[40].to_degrees() - (91.673 - 45.0)).abs() < 0.1);
 }
 
+/// Protects the first motion: a joint that starts beside its start angle, inside the tolerance, is taken from where it is.
+#[test]
+fn the_first_command_is_where_the_joint_is() {
+    for direction in [1.0, -1.0] {
+        let tilt = TiltJoint { joint: Joint::Wrist3, start_deg: 30.0, direction };
+        let mut robot = Robot::new(Series::Cb3, LinkOptions { tilt, ..options() }, (30.0 + direction * 0.5f64).to_radians());
+        robot.stream(0.05, &mut limiter(), |_| 0.0);
+        let commands: Vec<f64> = robot.cycles.iter().map(|c| c.command_deg).collect();
+        assert!(commands.iter().all(|c| (-0.01..=0.51).contains(c)), "{commands:?}");
+        assert_eq!(robot.state(), ProgramState::Following);
+    }
+}
+
+/// Protects the way back: a target beyond the range counts as the range's end, so that the next one is followed at once.
+#[test]
+fn a_target_beyond_the_range_is_its_end() {
+    let mut robot = Robot::ready(Series::Cb3);
+    for (target_deg, seconds) in [(170.0, 3.0), (60.0, 0.3)] {
+        for _ in 0..(seconds * 30.0) as usize {
+            robot.send(Mode::Stream, target_deg);
+            robot.pass(1.0 / 30.0);
+        }
+        if target_deg > 110.0 {
+            let command_deg = robot.cycles.last().unwrap().command_deg;
+            assert!((command_deg - 110.0).abs() < 0.01, "{command_deg}");
+        }
+    }
+    let command_deg = robot.cycles.last().unwrap().command_deg;
+    assert!(command_deg < 100.0, "{command_deg}: on its way to 60");
+    robot.assert_within_limits();
+}
+
 /// Protects the next controller: a program that nobody uses ends by itself, without moving.
 #[test]
 fn an_unused_program_ends() {
@@ -345,6 +377,35 @@ fn resumed_after_a_protective_stop_it_comes_upright() {
     robot.pass(3.0);
     assert_eq!((robot.state(), robot.machine.safety_mode()), (ProgramState::TimedOut, SafetyMode::Normal));
     assert!(robot.cycles.last().unwrap().actual_deg.abs() < 0.2);
+}
+
+/// Protects the limit on acceleration: resumed after a pause in mid-motion, and told of it, it begins from rest.
+#[test]
+fn resumed_in_mid_motion_it_begins_from_rest() {
+    for series in BOTH {
+        let mut robot = Robot::ready(series);
+        robot.stream(0.4, &mut limiter(), |_| 90.0);
+        let moving = robot.cycles[robot.cycles.len() - 2..].iter().map(|c| c.command_deg).collect::<Vec<_>>();
+        assert!((moving[1] - moving[0]) / robot.cycle_s > 60.0, "in motion: {moving:?}");
+        robot.machine.pause();
+        robot.pass(1.0);
+        robot.send(Mode::Abandon, 0.0);
+        robot.cycles.clear();
+        assert!(robot.machine.resume());
+        let mut at_deg = robot.machine.robot.servo.target_q[5].to_degrees();
+        let (mut rate, calls) = (0.0, robot.machine.robot.servo.servoj_calls);
+        while robot.state() != ProgramState::Stopped {
+            robot.step();
+            assert!(robot.cycles.len() < 2000, "{:?}", robot.state());
+            if robot.machine.robot.servo.servoj_calls > calls {
+                let command_deg = robot.cycles.last().unwrap().command_deg;
+                let next = (command_deg - at_deg) / robot.cycle_s;
+                assert!((next - rate).abs() / robot.cycle_s <= 1500.1, "{rate} to {next} deg/s in a cycle");
+                (at_deg, rate) = (command_deg, next);
+            }
+        }
+        assert!(robot.cycles.last().unwrap().actual_deg.abs() < 0.2);
+    }
 }
 
 /// Protects against a jump: moved by somebody else during a pause, the joint is taken from where it is, and upright.

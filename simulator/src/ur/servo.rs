@@ -63,7 +63,16 @@ impl Servo {
     /// At rest at `q` (rad).
     pub fn new(q: [f64; 6]) -> Self {
         let zero = [0.0; 6];
-        Self { commanded_q: q, servoj_calls: 0, target_q: q, target_qd: zero, target_qdd: zero, actual_q: q, actual_qd: zero, mode: Mode::Hold }
+        Self {
+            commanded_q: q,
+            servoj_calls: 0,
+            target_q: q,
+            target_qd: zero,
+            target_qdd: zero,
+            actual_q: q,
+            actual_qd: zero,
+            mode: Mode::Hold,
+        }
     }
 
     /// Follows `q` (rad) from now on. Err: the reason for a protective stop.

@@ -242,10 +242,15 @@ impl Output {
             "analog_io_types" | "tool_mode" | "tool_analog_input_types" | "euromap67_input_bits" | "euromap67_output_bits" => {
                 Zero(Type::Uint32)
             }
-            "tool_analog_input0" | "tool_analog_input1" | "tool_output_current" | "tool_temperature" | "io_current"
-            | "tcp_force_scalar" | "joint_position_deviation_ratio" | "euromap67_24V_voltage" | "euromap67_24V_current" => {
-                Zero(Type::Double)
-            }
+            "tool_analog_input0"
+            | "tool_analog_input1"
+            | "tool_output_current"
+            | "tool_temperature"
+            | "io_current"
+            | "tcp_force_scalar"
+            | "joint_position_deviation_ratio"
+            | "euromap67_24V_voltage"
+            | "euromap67_24V_current" => Zero(Type::Double),
             "tool_output_voltage" | "encoder0_raw" | "encoder1_raw" => Zero(Type::Int32),
             "tool_output_mode" | "tool_digital_output0_mode" | "tool_digital_output1_mode" if version.has(None, Some((5, 2))) => {
                 Zero(Type::Uint8)

@@ -1,0 +1,154 @@
+//! The controller's work with files: writes the journal, watches the weight file.
+//!
+//! Runs in a thread of its own with ordinary scheduling; allocates, and blocks for as long as the disk does: clients are answered, an
+//! abort among them, by another thread ([`crate::service`]). Nothing here ends the controller: a journal that cannot be written
+//! ends, weights that cannot be read are refused and the old ones stay.
+
+use std::path::{Path, PathBuf};
+use std::sync::atomic::{AtomicBool, Ordering::Relaxed};
+use std::sync::{Mutex, PoisonError};
+use std::time::Duration;
+
+use crossbeam::channel::{Receiver, Sender, bounded};
+use shared::agent::Agent;
+use shared::config::Config;
+use shared::weights::Weights;
+
+use crate::core::Settings;
+use crate::exchange::Exchange;
+use crate::journal::{Tick, Writer};
+
+/// How often it looks.
+const BEAT: Duration = Duration::from_millis(40);
+/// Ticks that wait for a slow disk: half a minute at 30 Hz. A journal with a gap cannot be replayed, so a longer wait ends it.
+const WAITING_TICKS: usize = 1024;
+
+/// What is known of the weights, for `status`.
+#[derive(Debug, Clone, Default)]
+pub struct WeightsNote {
+    /// Identity of the policy in use; empty: none.
+    pub id: String,
+    /// Why there is none, or why the newest file is not used; empty: it is.
+    pub refused: String,
+}
+
+/// The file thread.
+pub struct Disk<'a> {
+    exchange: &'a Exchange,
+    say: &'a (dyn Fn(&str) + Sync),
+    note: &'a Mutex<WeightsNote>,
+    path: PathBuf,
+    /// Frames a second of the camera: calibration and policy are for one rate only.
+    fps: f64,
+    /// Of the weight file as it was read last: time of change, inode, length.
+    seen: Option<(std::time::SystemTime, u64, u64)>,
+    /// Identity of the policy that waits in the queue for the end of a pour.
+    waiting: String,
+    /// Policies handed over so far.
+    number: u64,
+    /// `None`: none is kept, or it has ended.
+    journal: Option<Writer>,
+    ticks: Receiver<Box<Tick>>,
+}
+
+impl<'a> Disk<'a> {
+    /// Begins the journal, if one is configured, and gives the way to it.
+    pub fn open(
+        config: &Config,
+        exchange: &'a Exchange,
+        note: &'a Mutex<WeightsNote>,
+        say: &'a (dyn Fn(&str) + Sync),
+    ) -> (Self, Sender<Box<Tick>>) {
+        let journal = config.controller.journal.as_ref().and_then(|path| {
+            Writer::create(path, &Settings::new(config)).map_err(|e| say(&format!("{}: no journal: {e}", path.display()))).ok()
+        });
+        let (sender, ticks) = bounded(WAITING_TICKS);
+        let disk = Self {
+            exchange,
+            say,
+            note,
+            path: config.controller.weights.clone(),
+            fps: config.camera.fps,
+            seen: None,
+            waiting: String::new(),
+            number: 0,
+            journal,
+            ticks,
+        };
+        (disk, sender)
+    }
+
+    /// Works until `end`, and then writes what is left.
+    pub fn run(mut self, end: &AtomicBool) {
+        while !end.load(Relaxed) {
+            self.write_ticks();
+            self.look_at_weights();
+            std::thread::sleep(BEAT);
+        }
+        self.write_ticks();
+        self.write(Writer::flush);
+    }
+
+    fn write_ticks(&mut self) {
+        while let Ok(tick) = self.ticks.try_recv() {
+            self.write(|journal| journal.tick(tick));
+        }
+    }
+
+    /// The first error ends the journal, not the controller.
+    fn write(&mut self, what: impl FnOnce(&mut Writer) -> std::io::Result<()>) {
+        if let Some(Err(e)) = self.journal.as_mut().map(what) {
+            (self.say)(&format!("journal: {e}; no more is written, the controller goes on"));
+            self.journal = None;
+        }
+    }
+
+    /// Notices a new weight file, reads and checks it, and hands it to the loop.
+    fn look_at_weights(&mut self) {
+        use std::os::unix::fs::MetadataExt;
+        let note = self.note;
+        let note = || note.lock().unwrap_or_else(PoisonError::into_inner);
+        if self.exchange.agents.is_empty() && !self.waiting.is_empty() {
+            note().id = std::mem::take(&mut self.waiting);
+        }
+        let Ok(meta) = std::fs::metadata(&self.path) else {
+            let mut note = note();
+            if note.id.is_empty() && note.refused.is_empty() {
+                note.refused = format!("{}: not there yet", self.path.display());
+            }
+            return;
+        };
+        let stamp = meta.modified().ok().map(|m| (m, meta.ino(), meta.len()));
+        if stamp == self.seen {
+            return;
+        }
+        self.seen = stamp;
+        match read_weights(&self.path, self.fps) {
+            Ok(weights) => {
+                note().refused.clear();
+                self.waiting = weights.identity();
+                (self.say)(&format!("weights {} read from {}; the next pour uses them", self.waiting, self.path.display()));
+                self.number += 1;
+                let number = self.number;
+                self.write(|journal| journal.weights(number, &weights));
+                // What was waiting and is displaced is dropped here, in an ordinary thread.
+                drop(self.exchange.agents.force_push((number, Box::new(Agent::new(&weights)))));
+            }
+            Err(e) => {
+                (self.say)(&format!("weights refused, the old ones stay: {e}"));
+                note().refused = e;
+            }
+        }
+    }
+}
+
+/// Weights that fit a camera of `fps`, or why not.
+fn read_weights(path: &Path, fps: f64) -> Result<Weights, String> {
+    let weights = Weights::read(path).map_err(|e| e.to_string())?;
+    let trained = weights.rate_hz;
+    if (f64::from(trained) / fps - 1.0).abs() < 0.02 {
+        Ok(weights)
+    } else {
+        Err(format!("trained at {trained} frames/s, camera.fps is {fps}: train with episodes of this camera"))
+    }
+}
