@@ -15,7 +15,7 @@ use shared::control::EndReason;
 use shared::limits::Limits;
 use shared::os::now_ns;
 
-const OUTPUT_TYPES: &str = "DOUBLE,VECTOR6D,VECTOR6D,VECTOR6D,INT32,INT32,UINT32,UINT32,INT32,INT32,INT32,DOUBLE";
+const OUTPUT_TYPES: &str = "DOUBLE,VECTOR6D,VECTOR6D,VECTOR6D,INT32,INT32,UINT32,UINT32,INT32,INT32,INT32,DOUBLE,DOUBLE";
 
 /// What the server says; the defaults are a robot that is well.
 #[derive(Clone)]
@@ -37,6 +37,7 @@ struct Robot {
     safety_mode: i32,
     runtime_state: u32,
     joint_rad: f64,
+    speed_fraction: f64,
     /// What the program does once it was uploaded.
     program: ProgramState,
     /// Whether an uploaded program starts.
@@ -59,6 +60,7 @@ impl Default for Robot {
             safety_mode: 1,
             runtime_state: 1,
             joint_rad: 0.01,
+            speed_fraction: 1.0,
             program: ProgramState::Ready,
             starts: true,
         }
@@ -106,7 +108,7 @@ fn data(robot: &Robot, timestamp_s: f64, program: ProgramState, echo: i32, run: 
     payload.extend([robot.robot_mode, robot.safety_mode].map(i32::to_be_bytes).concat());
     payload.extend([1, robot.runtime_state].map(u32::to_be_bytes).concat());
     payload.extend([program as i32, echo, run].map(i32::to_be_bytes).concat());
-    payload.extend(robot.joint_rad.to_be_bytes());
+    payload.extend([robot.joint_rad, robot.speed_fraction].map(f64::to_be_bytes).concat());
     frame(b'U', &payload)
 }
 
@@ -205,7 +207,7 @@ fn connects_and_uploads_the_program() {
     let (session, seen) = Server::new(1, Robot::default()).meet();
     let (session, seen) = (session.unwrap(), seen.unwrap());
     assert_eq!(seen.requests, b"VvOIS");
-    assert!(seen.outputs.starts_with(&125f64.to_be_bytes()) && seen.outputs.ends_with(b",output_double_register_24"));
+    assert!(seen.outputs.starts_with(&125f64.to_be_bytes()) && seen.outputs.ends_with(b",output_double_register_24,target_speed_fraction"));
     assert!(seen.program.starts_with("def decant_pour():\n"));
     assert_eq!(session.version(), [3, 15, 8, 106339]);
     let state = session.state();
@@ -263,6 +265,7 @@ fn every_refusal_says_what_to_do() {
         (Robot { safety_mode: 3, runtime_state: 4, ..well() }, "protective stop; find the cause, then release it"),
         (Robot { safety_mode: 7, robot_mode: 3, ..well() }, "emergency stop; release"),
         (Robot { robot_mode: 5, ..well() }, "not powered and released; switch it on"),
+        (Robot { speed_fraction: 0.5, ..well() }, "the speed slider is below 100 %; set it to 100 %"),
         (Robot { runtime_state: 2, ..well() }, "a program is running; wait"),
         (Robot { runtime_state: 4, ..well() }, "a program is paused; resume it"),
         (Robot { joint_rad: 0.5, ..well() }, "28.6 degrees from its start angle, allowed are 2; bring the container upright"),

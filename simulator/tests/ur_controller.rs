@@ -625,6 +625,7 @@ fn faults_have_names_and_arrive_over_the_operator_port() {
         let text = match name.split_once('=') {
             None => name.to_owned(),
             Some((name, "SECONDS")) => format!("{name}={}", examples[0]),
+            Some((name, "SHARE")) => format!("{name}=0.5"),
             Some((name, "CYCLES")) => format!("{name}={}", examples[1]),
             Some((name, "INPUT" | "VARIABLE")) => format!("{name}={}", examples[2]),
             Some((name, _)) => format!("{name}={}", examples[3]),
@@ -633,12 +634,13 @@ fn faults_have_names_and_arrive_over_the_operator_port() {
         assert_eq!(fault.to_string(), text);
         seen += 1;
     }
-    assert_eq!(seen, 23);
+    assert_eq!(seen, 24);
     for (text, error) in [
         ("explode", "no such fault"),
         ("stall", "needs a value"),
         ("stall=-1", "needs seconds"),
         ("fin=1", "takes no value"),
+        ("speed-slider=0", "needs a share"),
         ("in-use=target_q", "needs the name of an RTDE input"),
     ] {
         assert!(text.parse::<Fault>().unwrap_err().to_string().contains(error), "{text}");
