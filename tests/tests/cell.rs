@@ -67,6 +67,33 @@ fn weights_are_swapped_while_running() {
     assert_eq!(status["weights_refused"], "");
 }
 
+/// Protects people from a slow disk: while the weight file cannot be read to its end, an abort is obeyed and status answers.
+#[test]
+fn a_stalled_disk_does_not_delay_an_abort() {
+    let cell = CellUnderTest::start(|_| {});
+    cell.take_weights(&steady_weights(TILT_OUT));
+    cell.json("simulator", &["operator", "fill", "300", "--json"]);
+    let pour = cell.begin("rt-controller", &["pour", "200", "--json"]);
+    cell.wait("tilt", Duration::from_secs(10), |s| s["alpha_measured_deg"].as_f64() > Some(30.0));
+    // A pipe without a writer: who reads it waits.
+    let pipe = cell.weights().with_extension("pipe");
+    assert!(std::process::Command::new("mkfifo").arg(&pipe).status().expect("coreutils").success());
+    std::fs::rename(&pipe, cell.weights()).expect("same directory");
+    let ticks = |s: &serde_json::Value| s["ticks"].as_u64();
+    let before = cell.status();
+    cell.wait("ten more ticks", Duration::from_secs(5), |s| ticks(s) > before.as_ref().and_then(ticks).map(|t| t + 10));
+    let abort = cell.command("rt-controller", &["abort"]);
+    assert_eq!(abort.status.code(), Some(0), "{}", String::from_utf8_lossy(&abort.stderr));
+    let output = pour.wait_with_output().expect("it ran");
+    let result: serde_json::Value = serde_json::from_slice(&output.stdout).expect("JSON");
+    assert_eq!((output.status.code(), &result["outcome"]["reason"]), (Some(4), &"aborted".into()));
+    // The disk comes back: what it gives is no weight file, and the next one is taken.
+    std::fs::rename(cell.weights(), &pipe).expect("same directory");
+    std::fs::write(&pipe, b"none").expect("somebody reads");
+    cell.wait("the refusal", Duration::from_secs(5), |s| s["weights_refused"] != "");
+    cell.take_weights(&steady_weights(TILT_OUT + 1));
+}
+
 /// Protects people: when a process dies or hangs at full tilt, the container comes upright, and the reason is named.
 #[test]
 fn a_dead_or_hanging_process_ends_upright() {
