@@ -4,9 +4,7 @@
 //! it, shared memory. Only the liquid is a formula here: flow grows with the tilt that the joint really has. Every test prints
 //! its rows of the table (`cargo test -p tests --test robot_faults -- --show-output`); times are the robot's own clock.
 //!
-//! Half of the faults run on a CB3, the other half on an e-Series; `DECANT_TEST_SERIES=cb3` or `=e-series` runs all on one.
-//!
-//! For each fault and moment: no command to servoj beyond the limits; upright and stopped within the bound, or stopped where
+//! For each fault and moment, on a CB3 and on an e-Series: no command to servoj beyond the limits; upright and stopped within the bound, or stopped where
 //! the robot's own safety stops it; the reason named in the result; and a working next pour after recovery.
 
 use std::fmt::Write as _;
@@ -48,8 +46,6 @@ enum Moment {
     Returning,
 }
 
-const MOMENTS: [Moment; 4] = [Moment::AtRest, Moment::TiltingOut, Moment::FullFlow, Moment::Returning];
-
 /// What a fault leads to.
 #[derive(Debug, Clone, Copy, PartialEq)]
 enum Expected {
@@ -80,25 +76,18 @@ struct Cell {
 }
 
 impl Cell {
-    fn new(name: &str, last: u8) -> Self {
-        let address = IpAddr::V4(Ipv4Addr::new(127, 44, 0, last));
+    fn new(name: &str, address: Ipv4Addr, series: Series) -> Self {
         let directory = tempfile::tempdir().unwrap();
         let sim = Path::new(env!("CARGO_MANIFEST_DIR")).join("../config/sim.toml");
         let mut config = Config::read(&sim).unwrap();
-        config.cell.name = format!("fault-{name}");
+        config.cell.name = format!("fault-{name}-{}", address.octets()[2]);
+        let address = IpAddr::V4(address);
         config.robot.address = address;
         config.controller.weights = directory.path().join("weights.bin");
         config.controller.journal = None;
         config.simulator = None;
         std::fs::write(directory.path().join("cell.toml"), toml::to_string(&config).unwrap()).unwrap();
         tilt_until_it_flows().write(&config.controller.weights).unwrap();
-        let series = match std::env::var("DECANT_TEST_SERIES").as_deref() {
-            Ok("cb3") => Series::Cb3,
-            Ok("e-series") => Series::ESeries,
-            Ok(other) => panic!("DECANT_TEST_SERIES is {other}, neither cb3 nor e-series"),
-            Err(_) if last.is_multiple_of(2) => Series::ESeries,
-            Err(_) => Series::Cb3,
-        };
         let robot = Arc::new(Controller::start(Options { series, ..Options::new(address) }).unwrap());
         let stop = Arc::new(AtomicBool::new(false));
         let liquid = thread::spawn({
@@ -427,12 +416,21 @@ impl Motion {
     }
 }
 
-/// All four moments in one cell: each begins with the recovery from the one before.
-fn matrix(name: &str, last: u8, expected: Expected, strike: impl Fn(&mut Cell), recover: impl Fn(&mut Cell)) {
-    let mut cell = Cell::new(name, last);
-    for moment in MOMENTS {
-        cell.check(name, moment, expected, &strike, &recover);
-    }
+/// Four cells side by side, because a pour is mostly waiting: in each, the second moment begins with the recovery from the first.
+fn matrix(name: &str, last: u8, expected: Expected, strike: impl Fn(&mut Cell) + Sync, recover: impl Fn(&mut Cell) + Sync) {
+    let (strike, recover) = (&strike, &recover);
+    let halves = [[Moment::AtRest, Moment::FullFlow], [Moment::TiltingOut, Moment::Returning]];
+    let cells = [(Series::Cb3, halves[0]), (Series::Cb3, halves[1]), (Series::ESeries, halves[0]), (Series::ESeries, halves[1])];
+    thread::scope(|scope| {
+        for (k, (series, moments)) in (0..).zip(cells) {
+            scope.spawn(move || {
+                let mut cell = Cell::new(name, Ipv4Addr::new(127, 44, k, last), series);
+                for moment in moments {
+                    cell.check(name, moment, expected, strike, recover);
+                }
+            });
+        }
+    });
 }
 
 /// A fault that passes or needs nobody.
