@@ -6,7 +6,7 @@
 
 use std::io::Write;
 use std::path::{Path, PathBuf};
-use std::process::{Command, ExitCode};
+use std::process::Command;
 use std::time::Instant;
 
 use opencv::core::{self, CV_8UC3, Mat, Point, Point2f, Scalar, Size, Vector};
@@ -14,7 +14,7 @@ use opencv::imgproc;
 use opencv::prelude::*;
 use serde::Serialize;
 use shared::config::{CameraConfig, CameraSource, Config, ImageConfig, LiquidMethod};
-use shared::exit;
+use shared::exit::{self, Failure, OrExit as _};
 use shared::messages::PixelFormat;
 
 use crate::extract::{Extractor, Image};
@@ -77,12 +77,9 @@ struct Line {
     times_as_fast: Option<f64>,
 }
 
-/// Runs the command; the exit codes are those of [`shared::exit`].
-pub fn run(args: &Args) -> ExitCode {
-    match bench(args) {
-        Ok(()) => ExitCode::SUCCESS,
-        Err(e) => exit::fail(exit::FAILED, e),
-    }
+/// Runs the command.
+pub fn run(args: &Args) -> Result<(), Failure> {
+    bench(args).or_exit(exit::FAILED)
 }
 
 fn drawn_config(scale: f32, method: LiquidMethod) -> (CameraConfig, ImageConfig) {

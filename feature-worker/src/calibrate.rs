@@ -7,7 +7,6 @@
 //! allocates; nothing is changed but the `[image]` table of the configuration, and that only with --write or a click.
 
 use std::path::{Path, PathBuf};
-use std::process::ExitCode;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering::Relaxed};
 use std::time::Duration;
@@ -17,7 +16,7 @@ use opencv::prelude::*;
 use opencv::{imgcodecs, imgproc};
 use serde::Deserialize;
 use shared::config::{CameraConfig, Config, ImageConfig, LiquidMethod};
-use shared::exit;
+use shared::exit::{self, Failure, OrExit as _, failure};
 use shared::ipc::Cell;
 use shared::messages::PixelFormat;
 use tiny_http::{Response, Server};
@@ -89,16 +88,10 @@ pub struct Corner {
     pub foot: [f32; 2],
 }
 
-/// Runs the command; the exit codes are those of [`shared::exit`].
-pub fn run(args: &Args) -> ExitCode {
-    let config = match Config::read(&args.config) {
-        Ok(config) => config,
-        Err(e) => return exit::fail(exit::BAD_INPUT, e),
-    };
-    match calibrate(args, config) {
-        Ok(()) => ExitCode::SUCCESS,
-        Err((code, what)) => exit::fail(code, what),
-    }
+/// Runs the command.
+pub fn run(args: &Args) -> Result<(), Failure> {
+    let config = Config::read(&args.config).or_exit(exit::BAD_INPUT)?;
+    calibrate(args, config)
 }
 
 /// What was seen of one pour: evenly spread frames and the mean of all.
@@ -136,8 +129,8 @@ impl Seen {
     }
 }
 
-fn calibrate(args: &Args, mut config: Config) -> Result<(), (u8, String)> {
-    let bad = |e: String| (exit::BAD_INPUT, e);
+fn calibrate(args: &Args, mut config: Config) -> Result<(), Failure> {
+    let bad = |e: String| failure(exit::BAD_INPUT, e);
     let mut seen = Seen { frames: Vec::new(), sum: Mat::default(), count: 0, stride: 1 };
     if args.input.is_empty() {
         watch(args, &config, &mut seen)?;
@@ -164,7 +157,7 @@ fn calibrate(args: &Args, mut config: Config) -> Result<(), (u8, String)> {
                     let (w, h) = (first.cols() as f32, first.rows() as f32);
                     Corner { lip: [0.35 * w, 0.5 * h], rim: [0.9 * w, 0.5 * h], foot: [0.35 * w, 0.9 * h] }
                 }
-                Err(e) => return Err((exit::FAILED, e.to_string())),
+                Err(e) => return Err(failure(exit::FAILED, e)),
             }
         }
     };
@@ -173,7 +166,7 @@ fn calibrate(args: &Args, mut config: Config) -> Result<(), (u8, String)> {
         Ok(image) => config.image = image,
         // In the page the corner can still be corrected.
         Err(e) if args.page => eprintln!("calibrate: {e}"),
-        Err(e) => return Err((exit::FAILED, e.to_string())),
+        Err(e) => return Err(failure(exit::FAILED, e)),
     }
     save_picture(args, &config, &seen.frames)?;
     println!("{}", section(&config.image));
@@ -185,8 +178,8 @@ fn calibrate(args: &Args, mut config: Config) -> Result<(), (u8, String)> {
 }
 
 /// Watches the configured camera for a while.
-fn watch(args: &Args, config: &Config, seen: &mut Seen) -> Result<(), (u8, String)> {
-    let reach = |e: String| (exit::UNREACHABLE, e);
+fn watch(args: &Args, config: &Config, seen: &mut Seen) -> Result<(), Failure> {
+    let reach = |e: String| failure(exit::UNREACHABLE, e);
     let cell = Cell::join(&config.cell.name).map_err(|e| reach(e.to_string()))?;
     let mut source = Source::open(&config.camera, &cell, true).map_err(|e| reach(e.to_string()))?;
     eprintln!("calibrate: watching the camera for {} s; pour once now", args.seconds);
@@ -307,8 +300,8 @@ fn section(image: &ImageConfig) -> String {
 }
 
 /// Puts the table into the configuration in one step; the rest of the file stays as it is.
-fn write(path: &Path, config: &Config) -> Result<(), (u8, String)> {
-    let fail = |e: String| (exit::FAILED, format!("{}: {e}", path.display()));
+fn write(path: &Path, config: &Config) -> Result<(), Failure> {
+    let fail = |e: String| failure(exit::FAILED, format!("{}: {e}", path.display()));
     let text = std::fs::read_to_string(path).map_err(|e| fail(e.to_string()))?;
     let mut written = String::new();
     // What stands between the table's last key and the next table belongs to that one.
@@ -335,7 +328,7 @@ fn write(path: &Path, config: &Config) -> Result<(), (u8, String)> {
         }
     }
     // A configuration that is refused is not written.
-    let checked = Config::parse(&written, &path.display().to_string()).map_err(|e| (exit::FAILED, e.to_string()))?;
+    let checked = Config::parse(&written, &path.display().to_string()).or_exit(exit::FAILED)?;
     let size = (checked.camera.width_px, checked.camera.height_px);
     if size != (config.camera.width_px, config.camera.height_px) {
         let (w, h) = (config.camera.width_px, config.camera.height_px);
@@ -367,8 +360,8 @@ fn best_picture(config: &Config, frames: &[Mat]) -> Result<Mat, String> {
     best.map(|(_, picture)| picture).ok_or_else(|| "no frame".into())
 }
 
-fn save_picture(args: &Args, config: &Config, frames: &[Mat]) -> Result<(), (u8, String)> {
-    let fail = |e: String| (exit::FAILED, format!("{}: {e}", args.picture.display()));
+fn save_picture(args: &Args, config: &Config, frames: &[Mat]) -> Result<(), Failure> {
+    let fail = |e: String| failure(exit::FAILED, format!("{}: {e}", args.picture.display()));
     let picture = best_picture(config, frames).map_err(fail)?;
     if let Some(parent) = args.picture.parent() {
         std::fs::create_dir_all(parent).map_err(|e| fail(e.to_string()))?;
@@ -378,14 +371,13 @@ fn save_picture(args: &Args, config: &Config, frames: &[Mat]) -> Result<(), (u8,
 }
 
 /// Serves the page until "Write" or Ctrl-C.
-fn page(args: &Args, mut config: Config, mut corner: Corner, frames: &[Mat]) -> Result<(), (u8, String)> {
-    let failed = |e: &dyn std::fmt::Display| (exit::FAILED, e.to_string());
+fn page(args: &Args, mut config: Config, mut corner: Corner, frames: &[Mat]) -> Result<(), Failure> {
     let stop = Arc::new(AtomicBool::new(false));
     for signal in [signal_hook::consts::SIGINT, signal_hook::consts::SIGTERM] {
-        signal_hook::flag::register(signal, Arc::clone(&stop)).map_err(|e| failed(&e))?;
+        signal_hook::flag::register(signal, Arc::clone(&stop)).or_exit(exit::FAILED)?;
     }
     let server = Server::http(("127.0.0.1", args.port))
-        .map_err(|e| (exit::FAILED, format!("port {} on 127.0.0.1: {e}; give another --port", args.port)))?;
+        .map_err(|e| failure(exit::FAILED, format!("port {} on 127.0.0.1: {e}; give another --port", args.port)))?;
     eprintln!("calibrate: open http://{} on this machine, click lip, top edge and left side, then Write", server.server_addr());
     while !stop.load(Relaxed) {
         let Ok(Some(mut request)) = server.recv_timeout(Duration::from_millis(100)) else { continue };
@@ -421,7 +413,7 @@ fn page(args: &Args, mut config: Config, mut corner: Corner, frames: &[Mat]) -> 
             "/write" => {
                 let result = save_picture(args, &config, frames).and_then(|()| write(&args.config, &config));
                 stop.store(result.is_ok(), Relaxed);
-                let text = result.err().map_or_else(|| format!("written to {}", args.config.display()), |(_, e)| e);
+                let text = result.err().map_or_else(|| format!("written to {}", args.config.display()), |failed| failed.what);
                 request.respond(answer(text.into_bytes(), "text/plain; charset=utf-8"))
             }
             _ => request.respond(Response::from_data("not here").with_status_code(404)),

@@ -4,13 +4,12 @@
 //! and by that in one step (see [`shared::episode::set_weight`]); nothing is ever overwritten by an export.
 
 use std::path::{Path, PathBuf};
-use std::process::ExitCode;
 
 use clap::Subcommand;
 use serde_json::{Value, json};
 use shared::config::Config;
-use shared::episode::{Episode, EpisodeError, Frame, Kind, find, set_weight};
-use shared::exit;
+use shared::episode::{Episode, EpisodeError, Frame, Kind, WeighError, find, set_weight};
+use shared::exit::{self, Failure, OrExit as _, failure};
 use shared::messages::Doubt;
 
 pub mod export;
@@ -74,8 +73,8 @@ struct Weigh {
     json: bool,
 }
 
-/// Runs the command; the exit codes are those of [`shared::exit`].
-pub fn run(args: &Args) -> ExitCode {
+/// Runs the command.
+pub fn run(args: &Args) -> Result<(), Failure> {
     match &args.command {
         Command::List(which) => with_files(which, list),
         Command::Show(which) => with_files(which, show),
@@ -85,21 +84,17 @@ pub fn run(args: &Args) -> ExitCode {
     }
 }
 
-/// The files meant, or the exit code of the error that was printed.
-pub(crate) fn files(paths: &[PathBuf], config: &Path) -> Result<Vec<PathBuf>, ExitCode> {
-    let bad = |e: &dyn std::fmt::Display| exit::fail(exit::BAD_INPUT, e);
+/// The files meant.
+pub(crate) fn files(paths: &[PathBuf], config: &Path) -> Result<Vec<PathBuf>, Failure> {
     let paths = match paths {
-        [] => vec![Config::read(config).map_err(|e| bad(&e))?.recording.directory],
+        [] => vec![Config::read(config).or_exit(exit::BAD_INPUT)?.recording.directory],
         given => given.to_vec(),
     };
-    find(&paths).map_err(|e| bad(&e))
+    find(&paths).or_exit(exit::BAD_INPUT)
 }
 
-fn with_files(which: &Which, command: fn(&[PathBuf], bool) -> ExitCode) -> ExitCode {
-    match files(&which.paths, &which.config) {
-        Ok(files) => command(&files, which.json),
-        Err(code) => code,
-    }
+fn with_files(which: &Which, command: fn(&[PathBuf], bool) -> Result<(), Failure>) -> Result<(), Failure> {
+    command(&files(&which.paths, &which.config)?, which.json)
 }
 
 fn kind_words(kind: Kind) -> String {
@@ -166,7 +161,7 @@ fn print_json(value: &Value) {
     println!("{value:#}");
 }
 
-fn list(files: &[PathBuf], as_json: bool) -> ExitCode {
+fn list(files: &[PathBuf], as_json: bool) -> Result<(), Failure> {
     let read: Vec<Result<Episode, EpisodeError>> = files.iter().map(|f| Episode::read(f)).collect();
     if as_json {
         let rows: Vec<Value> = files
@@ -197,21 +192,21 @@ fn list(files: &[PathBuf], as_json: bool) -> ExitCode {
         }
         println!("{} episodes", files.len());
     }
-    if read.iter().all(Result::is_ok) { ExitCode::SUCCESS } else { ExitCode::from(exit::FAILED) }
+    match read.iter().filter(|r| r.is_err()).count() {
+        0 => Ok(()),
+        bad => Err(failure(exit::FAILED, format!("{bad} of {} episodes cannot be read", files.len()))),
+    }
 }
 
-fn show(files: &[PathBuf], as_json: bool) -> ExitCode {
+fn show(files: &[PathBuf], as_json: bool) -> Result<(), Failure> {
     let [file] = files else {
-        return exit::fail(exit::BAD_INPUT, format!("{} episodes; name one file to show", files.len()));
+        return Err(failure(exit::BAD_INPUT, format!("{} episodes; name one file to show", files.len())));
     };
-    let episode = match Episode::read(file) {
-        Ok(episode) => episode,
-        Err(e) => return exit::fail(exit::BAD_INPUT, e),
-    };
+    let episode = Episode::read(file).or_exit(exit::BAD_INPUT)?;
     let value = summary(&episode);
     if as_json {
         print_json(&value);
-        return ExitCode::SUCCESS;
+        return Ok(());
     }
     println!("{}", file.display());
     println!("  run        {}", kind_words(episode.kind));
@@ -232,7 +227,7 @@ fn show(files: &[PathBuf], as_json: bool) -> ExitCode {
     for (bad, words) in remarks(&episode) {
         println!("  {} {words}", if bad { "WRONG     " } else { "note      " });
     }
-    ExitCode::SUCCESS
+    Ok(())
 }
 
 /// What is wrong with an episode, in words; true: it cannot be trained on.
@@ -276,7 +271,7 @@ fn remarks(episode: &Episode) -> Vec<(bool, String)> {
     all
 }
 
-fn check(files: &[PathBuf], as_json: bool) -> ExitCode {
+fn check(files: &[PathBuf], as_json: bool) -> Result<(), Failure> {
     let mut rows: Vec<(String, Vec<(bool, String)>)> = Vec::new();
     let mut episodes = Vec::new();
     for file in files {
@@ -309,21 +304,20 @@ fn check(files: &[PathBuf], as_json: bool) -> ExitCode {
         }
         println!("{} of {} episodes can be trained on", rows.len() - wrong, rows.len());
     }
-    if wrong == 0 { ExitCode::SUCCESS } else { ExitCode::from(exit::FAILED) }
+    match wrong {
+        0 => Ok(()),
+        wrong => Err(failure(exit::FAILED, format!("{wrong} of {} episodes cannot be trained on", rows.len()))),
+    }
 }
 
-fn run_weigh(args: &Weigh) -> ExitCode {
-    match set_weight(&args.file, args.weight) {
-        Ok(before) => {
-            if args.json {
-                print_json(&json!({ "file": args.file.display().to_string(), "weight_g": args.weight, "before_g": before }));
-            } else {
-                let before = before.map_or("had none before".into(), |b| format!("was {b} g"));
-                println!("{}: {} g ({before})", args.file.display(), args.weight);
-            }
-            ExitCode::SUCCESS
-        }
-        Err(e @ shared::episode::WeighError::Write { .. }) => exit::fail(exit::FAILED, e),
-        Err(e) => exit::fail(exit::BAD_INPUT, e),
+fn run_weigh(args: &Weigh) -> Result<(), Failure> {
+    let code = |e: &WeighError| if matches!(e, WeighError::Write { .. }) { exit::FAILED } else { exit::BAD_INPUT };
+    let before = set_weight(&args.file, args.weight).map_err(|e| failure(code(&e), e))?;
+    if args.json {
+        print_json(&json!({ "file": args.file.display().to_string(), "weight_g": args.weight, "before_g": before }));
+    } else {
+        let before = before.map_or("had none before".into(), |b| format!("was {b} g"));
+        println!("{}: {} g ({before})", args.file.display(), args.weight);
     }
+    Ok(())
 }

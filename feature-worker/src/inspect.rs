@@ -4,7 +4,6 @@
 //! one line.
 
 use std::path::PathBuf;
-use std::process::ExitCode;
 use std::time::Duration;
 
 use indicatif::ProgressBar;
@@ -12,7 +11,7 @@ use opencv::core::{Mat, Vec3b, Vector};
 use opencv::prelude::*;
 use opencv::{imgcodecs, imgproc};
 use shared::config::{CameraConfig, CameraSource, Config};
-use shared::exit;
+use shared::exit::{self, Failure, OrExit as _};
 use shared::messages::{Doubt, PixelFormat};
 
 use crate::extract::{Extractor, Image};
@@ -103,16 +102,10 @@ pub fn to_bgr(frame: &Frame) -> Result<Mat, opencv::Error> {
     Ok(bgr)
 }
 
-/// Runs the command; the exit codes are those of [`shared::exit`].
-pub fn run(args: &Args) -> ExitCode {
-    let config = match Config::read(&args.config) {
-        Ok(config) => config,
-        Err(e) => return exit::fail(exit::BAD_INPUT, e),
-    };
-    match inspect(args, &config) {
-        Ok(()) => ExitCode::SUCCESS,
-        Err(e) => exit::fail(exit::BAD_INPUT, e),
-    }
+/// Runs the command.
+pub fn run(args: &Args) -> Result<(), Failure> {
+    let config = Config::read(&args.config).or_exit(exit::BAD_INPUT)?;
+    inspect(args, &config).or_exit(exit::BAD_INPUT)
 }
 
 fn inspect(args: &Args, config: &Config) -> Result<(), String> {

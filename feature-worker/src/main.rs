@@ -30,12 +30,12 @@ enum Command {
 }
 
 fn main() -> ExitCode {
-    match Cli::parse().command {
+    shared::exit::end(match Cli::parse().command {
         Command::Run(args) => worker::run(&args),
         Command::Calibrate(args) => calibrate::run(&args),
         Command::View(args) => view::run(&args),
         Command::Inspect(args) => inspect::run(&args),
         Command::Episodes(args) => episodes::run(&args),
         Command::Bench(args) => bench::run(&args),
-    }
+    })
 }

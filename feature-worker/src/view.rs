@@ -5,7 +5,6 @@
 //! Threads: this one measures; one answers the browser and compresses a picture only when it is asked for. Allocates.
 
 use std::path::PathBuf;
-use std::process::ExitCode;
 use std::sync::atomic::{AtomicBool, Ordering::Relaxed};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
@@ -14,7 +13,7 @@ use opencv::core::{Mat, Point, Rect, Scalar, Vector};
 use opencv::prelude::*;
 use opencv::{imgcodecs, imgproc};
 use shared::config::Config;
-use shared::exit;
+use shared::exit::{self, Failure, OrExit as _, failure};
 use shared::ipc::Cell;
 use shared::messages::{Doubt, PixelFormat};
 use tiny_http::{Header, Response, Server};
@@ -50,35 +49,27 @@ struct Shown {
     history: std::collections::VecDeque<f32>,
 }
 
-/// Runs the command; the exit codes are those of [`shared::exit`].
-pub fn run(args: &Args) -> ExitCode {
-    let config = match Config::read(&args.config) {
-        Ok(config) => config,
-        Err(e) => return exit::fail(exit::BAD_INPUT, e),
-    };
-    match show(args, &config) {
-        Ok(()) => ExitCode::SUCCESS,
-        Err((code, what)) => exit::fail(code, what),
-    }
+/// Runs the command.
+pub fn run(args: &Args) -> Result<(), Failure> {
+    let config = Config::read(&args.config).or_exit(exit::BAD_INPUT)?;
+    show(args, &config)
 }
 
 fn lock(shown: &Mutex<Shown>) -> MutexGuard<'_, Shown> {
     shown.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
-fn show(args: &Args, config: &Config) -> Result<(), (u8, String)> {
-    let failed = |e: &dyn std::fmt::Display| (exit::FAILED, e.to_string());
-    let reach = |e: &dyn std::fmt::Display| (exit::UNREACHABLE, e.to_string());
+fn show(args: &Args, config: &Config) -> Result<(), Failure> {
     let stop = Arc::new(AtomicBool::new(false));
     for signal in [signal_hook::consts::SIGINT, signal_hook::consts::SIGTERM] {
-        signal_hook::flag::register(signal, Arc::clone(&stop)).map_err(|e| failed(&e))?;
+        signal_hook::flag::register(signal, Arc::clone(&stop)).or_exit(exit::FAILED)?;
     }
-    opencv::core::set_num_threads(1).map_err(|e| failed(&e))?;
-    let mut extractor = Extractor::new(&config.camera, &config.image).map_err(|e| (exit::BAD_INPUT, e.to_string()))?;
-    let cell = Cell::join(&config.cell.name).map_err(|e| reach(&e))?;
-    let mut source = Source::open(&config.camera, &cell, true).map_err(|e| reach(&e))?;
+    opencv::core::set_num_threads(1).or_exit(exit::FAILED)?;
+    let mut extractor = Extractor::new(&config.camera, &config.image).or_exit(exit::BAD_INPUT)?;
+    let cell = Cell::join(&config.cell.name).or_exit(exit::UNREACHABLE)?;
+    let mut source = Source::open(&config.camera, &cell, true).or_exit(exit::UNREACHABLE)?;
     let server = Server::http(("127.0.0.1", args.port))
-        .map_err(|e| (exit::FAILED, format!("port {} on 127.0.0.1: {e}; give another --port", args.port)))?;
+        .map_err(|e| failure(exit::FAILED, format!("port {} on 127.0.0.1: {e}; give another --port", args.port)))?;
     println!("http://{}", server.server_addr());
     let shown = Mutex::new(Shown::default());
     std::thread::scope(|scope| {
@@ -91,7 +82,7 @@ fn show(args: &Args, config: &Config) -> Result<(), (u8, String)> {
                 Ok(Next::Frame(frame)) => frame,
                 Ok(Next::Nothing) => continue,
                 Ok(Next::End) => break Ok(()),
-                Err(e) => break Err(reach(&e)),
+                Err(e) => break Err(failure(exit::UNREACHABLE, e)),
             };
             let Some(format) = PixelFormat::from_code(frame.header.format) else { continue };
             let (width_px, height_px) = (frame.header.width_px, frame.header.height_px);
@@ -99,9 +90,9 @@ fn show(args: &Args, config: &Config) -> Result<(), (u8, String)> {
                 continue;
             }
             let image = Image { width_px, height_px, format, pixels: frame.pixels };
-            let drawn = extractor.measure(image).map_err(|e| (exit::BAD_INPUT, e.to_string())).and_then(|measured| {
-                let mut picture = to_bgr(&frame).map_err(|e| failed(&e))?;
-                draw(&mut picture, &extractor, &measured).map_err(|e| failed(&e))?;
+            let drawn = extractor.measure(image).or_exit(exit::BAD_INPUT).and_then(|measured| {
+                let mut picture = to_bgr(&frame).or_exit(exit::FAILED)?;
+                draw(&mut picture, &extractor, &measured).or_exit(exit::FAILED)?;
                 Ok((picture, measured))
             });
             match drawn {

@@ -6,7 +6,6 @@
 //! the start. A driver that stops or restarts is waited for; a lost device ends the process with its reason.
 
 use std::path::PathBuf;
-use std::process::ExitCode;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering::Relaxed};
 use std::time::Duration;
@@ -14,7 +13,7 @@ use std::time::Duration;
 use crossbeam::queue::ArrayQueue;
 use serde::Serialize;
 use shared::config::{CameraSource, Config};
-use shared::exit;
+use shared::exit::{self, Failure, OrExit as _, failure};
 use shared::ipc::Cell;
 use shared::messages::{Doubt, Feature, LAYOUT_VERSION, PixelFormat};
 use shared::os;
@@ -67,45 +66,40 @@ struct Status {
     silent: bool,
 }
 
-/// Runs the command; the exit codes are those of [`shared::exit`].
-pub fn run(args: &Args) -> ExitCode {
-    let config = match Config::read(&args.config) {
-        Ok(config) => config,
-        Err(e) => return exit::fail(exit::BAD_INPUT, e),
-    };
-    match work(&config, args.json) {
-        Ok(()) => ExitCode::SUCCESS,
-        Err((code, what)) => exit::fail(code, what),
-    }
+/// Runs the command.
+pub fn run(args: &Args) -> Result<(), Failure> {
+    let config = Config::read(&args.config).or_exit(exit::BAD_INPUT)?;
+    work(&config, args.json)
 }
 
-fn work(config: &Config, json: bool) -> Result<(), (u8, String)> {
-    let input = |e: &dyn std::fmt::Display| (exit::BAD_INPUT, e.to_string());
-    let reach = |e: &dyn std::fmt::Display| (exit::UNREACHABLE, e.to_string());
+fn work(config: &Config, json: bool) -> Result<(), Failure> {
     let stop = Arc::new(AtomicBool::new(false));
     for signal in [signal_hook::consts::SIGINT, signal_hook::consts::SIGTERM] {
-        signal_hook::flag::register(signal, Arc::clone(&stop)).map_err(|e| (exit::FAILED, format!("signal handler: {e}")))?;
+        signal_hook::flag::register(signal, Arc::clone(&stop)).map_err(|e| failure(exit::FAILED, format!("signal handler: {e}")))?;
     }
     // OpenCV's own threads would run on the controller's core and wait for each other.
-    opencv::core::set_num_threads(1).map_err(|e| input(&e))?;
-    let mut extractor = Extractor::new(&config.camera, &config.image).map_err(|e| input(&e))?;
-    let cell = Cell::join(&config.cell.name).map_err(|e| reach(&e))?;
-    let topic = cell.features().map_err(|e| reach(&e))?;
+    opencv::core::set_num_threads(1).or_exit(exit::BAD_INPUT)?;
+    let mut extractor = Extractor::new(&config.camera, &config.image).or_exit(exit::BAD_INPUT)?;
+    let cell = Cell::join(&config.cell.name).or_exit(exit::UNREACHABLE)?;
+    let topic = cell.features().or_exit(exit::UNREACHABLE)?;
     let publisher = topic.publisher_builder().create().map_err(|e| {
-        reach(&format!("cell '{}': service 'feature': {e:?}; is another feature worker running? Stop it first", config.cell.name))
+        failure(
+            exit::UNREACHABLE,
+            format!("cell '{}': service 'feature': {e:?}; is another feature worker running? Stop it first", config.cell.name),
+        )
     })?;
     let mut source = Source::open(&config.camera, &cell, true).map_err(|e| match config.camera.source {
-        CameraSource::SharedMemory => reach(&e),
-        _ => input(&e),
+        CameraSource::SharedMemory => failure(exit::UNREACHABLE, e),
+        _ => failure(exit::BAD_INPUT, e),
     })?;
     // Threads inherit the core and the priority, so the others start first.
-    let recorder = Recorder::start(config).map_err(|e| (exit::FAILED, e.to_string()))?;
+    let recorder = Recorder::start(config).or_exit(exit::FAILED)?;
     let latest = Arc::new(ArrayQueue::new(1));
     let printer = {
         let (latest, stop) = (Arc::clone(&latest), Arc::clone(&stop));
         std::thread::Builder::new().name("status".into()).spawn(move || print_status(&latest, &stop, json))
     }
-    .map_err(|e| (exit::FAILED, format!("status thread: {e}")))?;
+    .map_err(|e| failure(exit::FAILED, format!("status thread: {e}")))?;
     for missing in os::become_realtime(config.worker.core, config.worker.priority) {
         eprintln!("feature-worker: {missing}");
     }
@@ -128,7 +122,7 @@ fn work(config: &Config, json: bool) -> Result<(), (u8, String)> {
                 continue;
             }
             Ok(Next::End) => break Ok(()),
-            Err(e) => break Err(reach(&e)),
+            Err(e) => break Err(failure(exit::UNREACHABLE, e)),
         };
         let received_at_ns = os::now_ns();
         last_frame_ns = received_at_ns;
@@ -156,7 +150,7 @@ fn work(config: &Config, json: bool) -> Result<(), (u8, String)> {
         };
         let measured = match measured {
             Ok(measured) => measured,
-            Err(e) => break Err(input(&e)),
+            Err(e) => break Err(failure(exit::BAD_INPUT, e)),
         };
         let feature = Feature {
             version: LAYOUT_VERSION,
@@ -171,7 +165,7 @@ fn work(config: &Config, json: bool) -> Result<(), (u8, String)> {
             triangle_px: measured.triangle_px,
         };
         if let Err(e) = publisher.send_copy(feature) {
-            break Err((exit::FAILED, format!("service 'feature': {e:?}; is /dev/shm full?")));
+            break Err(failure(exit::FAILED, format!("service 'feature': {e:?}; is /dev/shm full?")));
         }
         recorder.offer(&header, frame.pixels, &feature);
         status = Status {

@@ -2,7 +2,6 @@
 
 use std::fs;
 use std::path::{Path, PathBuf};
-use std::process::ExitCode;
 
 use clap::ValueEnum;
 use indicatif::{ProgressBar, ProgressStyle};
@@ -11,7 +10,7 @@ use opencv::imgcodecs;
 use opencv::videoio::{VideoWriter, VideoWriterTrait, VideoWriterTraitConst};
 use serde_json::json;
 use shared::episode::{Episode, EpisodeError, Image, Images, TableError, write_table};
-use shared::exit;
+use shared::exit::{self, Failure, failure};
 
 use super::lerobot;
 
@@ -69,25 +68,19 @@ pub(crate) fn write_error(path: &Path, what: impl std::fmt::Display) -> ExportEr
 }
 
 /// Runs the command.
-pub fn run(args: &Args) -> ExitCode {
-    let files = match super::files(&args.paths, &args.config) {
-        Ok(files) => files,
-        Err(code) => return code,
-    };
-    match export(args, &files) {
-        Ok(written) => {
-            if args.json {
-                println!("{:#}", json!({ "written": written.iter().map(|p| p.display().to_string()).collect::<Vec<_>>() }));
-            } else {
-                for path in written {
-                    println!("{}", path.display());
-                }
-            }
-            ExitCode::SUCCESS
+pub fn run(args: &Args) -> Result<(), Failure> {
+    let files = super::files(&args.paths, &args.config)?;
+    let input = |e: &ExportError| matches!(e, ExportError::Episode(_) | ExportError::Nothing(_));
+    let code = |e: &ExportError| if input(e) { exit::BAD_INPUT } else { exit::FAILED };
+    let written = export(args, &files).map_err(|e| failure(code(&e), e))?;
+    if args.json {
+        println!("{:#}", json!({ "written": written.iter().map(|p| p.display().to_string()).collect::<Vec<_>>() }));
+    } else {
+        for path in written {
+            println!("{}", path.display());
         }
-        Err(e @ (ExportError::Episode(_) | ExportError::Nothing(_))) => exit::fail(exit::BAD_INPUT, e),
-        Err(e) => exit::fail(exit::FAILED, e),
     }
+    Ok(())
 }
 
 fn export(args: &Args, files: &[PathBuf]) -> Result<Vec<PathBuf>, ExportError> {
