@@ -252,7 +252,6 @@ pub struct Extractor {
     hsv: Mat,
     mask: Mat,
     mask_b: Mat,
-    grey: Mat,
     background: Background,
     edges: Vec<[f32; 2]>,
     edge_weights: Vec<f32>,
@@ -377,7 +376,6 @@ impl Extractor {
             hsv: Mat::default(),
             mask: Mat::default(),
             mask_b: Mat::default(),
-            grey: Mat::default(),
             background: Background::new(&axes, [region.width, region.height], camera.width_px)?,
             edges: Vec::with_capacity(RAYS),
             edge_weights: Vec::with_capacity(RAYS),
@@ -476,7 +474,7 @@ impl Extractor {
                     (self.find_triangle(colours)?, segmented)
                 }
                 LiquidMethod::Clear => {
-                    let seen = self.background.look(&self.grey)?;
+                    let seen = self.background.look()?;
                     let segmented = Instant::now();
                     (self.follow_water(seen, colours)?, segmented)
                 }
@@ -497,18 +495,19 @@ impl Extractor {
     }
 
     fn resample(&mut self, region: &impl core::ToInputArray) -> Result<(), ExtractError> {
+        if self.method == LiquidMethod::Clear {
+            return Ok(self.background.take(region)?);
+        }
         let (nearest, border) = (imgproc::INTER_NEAREST, core::BORDER_REPLICATE);
         imgproc::remap(region, &mut self.polar, &self.map_a, &self.map_b, nearest, border, Scalar::default())?;
-        if self.method == LiquidMethod::Clear {
-            imgproc::cvt_color_def(region, &mut self.grey, imgproc::COLOR_BGR2GRAY)?;
-        }
         Ok(())
     }
 
     /// Too dark, blown out or the same picture as before. One pass over the rays (every fourth pixel for light), because
     /// three OpenCV reductions over the same bytes took longer than this.
     fn check_light(&mut self) -> Result<Option<Doubt>, ExtractError> {
-        let bytes = self.polar.data_bytes()?;
+        let picture = if self.method == LiquidMethod::Clear { self.background.small() } else { &self.polar };
+        let bytes = picture.data_bytes()?;
         let mut hash = 0xcbf2_9ce4_8422_2325u64;
         for chunk in bytes.chunks_exact(8) {
             let word = u64::from_le_bytes([chunk[0], chunk[1], chunk[2], chunk[3], chunk[4], chunk[5], chunk[6], chunk[7]]);
