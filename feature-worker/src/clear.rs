@@ -38,6 +38,8 @@ const LEG_RATIO: f32 = 4.5;
 /// Points for the motion: one, the one with the steepest slope, in each square of this many px at half the working size.
 const POINT_EVERY: usize = 5;
 const POINTS_LEAST: usize = 30;
+/// The motion is looked for from rest too when it leaves this much more unexplained than the last one did.
+const LEFT_GROWS: f32 = 1.2;
 /// Least noise, grey levels (rounding), and as a share of the background's brightness (the exposure is not known better).
 const NOISE_LEAST: f32 = 0.8;
 const NOISE_SHARE: f32 = 0.012;
@@ -66,16 +68,23 @@ const GO_ON: [f32; 3] = [0.45, 0.75, 0.6];
 /// What the moved last picture says of a line, -1 (it explains it) to 1: below, it is background; above, a stream goes on.
 const EXPLAINED: f32 = -0.4;
 const UNEXPLAINED: f32 = 0.3;
+/// From this motion across the line on, px a frame; and with at least this score.
+const TELLS_PX: f32 = 0.6;
+const HELD: f32 = 0.25;
 /// Least score of a piece of the line that counts as edge.
 const PIECE: f32 = 0.35;
 /// Weight of lying further out (as a logarithm): within the water there are edges too.
-const OUTERMOST: f32 = 0.15;
+const OUTERMOST: f32 = 0.3;
+/// Weight of what the moved last picture does not explain further out.
+const BEYOND: f32 = 0.4;
 /// Weight of the last line's neighbourhood (as a Gaussian of this width in the logarithm of its legs), and how far it may jump.
 const STAY: f32 = 0.4;
 const STAY_WIDTH: f32 = 0.3;
 const JUMP_MOST: f32 = 0.9;
 /// Weight of an even band along the line, and of the same band as before.
 const BAND: f32 = 0.5;
+/// Far from the lip, no more of the background than this differs from the memory, or it is another picture.
+const STRANGE: f32 = 0.3;
 /// How fast the memory follows what is seen: where it fits and where it does not.
 const FOLLOW: f32 = 0.5;
 const FOLLOW_SLOWLY: f32 = 0.3;
@@ -124,6 +133,8 @@ struct Stream {
 struct Found {
     line: usize,
     total: f32,
+    /// What its samples say, and that with the band along it.
+    evidence: f32,
     score: f32,
     share: f32,
     known: f32,
@@ -168,12 +179,13 @@ pub struct Background {
     last: Mat,
     now_half: Mat,
     memory_half: Mat,
-    /// Grey level and sureness of the dry background; as it was left, and moved to where it should be now.
+    /// Grey level and sureness of the dry background; as it was left, and the one being made.
     memory: Mat,
     moved: Mat,
-    map: Mat,
     started: bool,
     motion: Motion,
+    /// Mean size of what the last motion left unexplained, grey levels.
+    left: f32,
     marks: Vec<Mark>,
     table: Vec<Cell>,
     // Along all rays: brightness; difference from the memory and from the last picture in units of the noise; slope; sureness.
@@ -184,6 +196,8 @@ pub struct Background {
     sureness: Vec<f32>,
     shown: Vec<f32>,
     noise: f32,
+    /// Share of the known background far from the lip that differs from the memory.
+    strange: f32,
     stream: Option<Stream>,
     /// Where it last was, and for how many frames it has not been seen.
     last_legs: [f32; 2],
@@ -368,9 +382,9 @@ impl Background {
             memory_half: Mat::default(),
             memory: Mat::new_size_with_default(size, CV_8UC2, Scalar::all(0.0))?,
             moved: Mat::new_size_with_default(size, CV_8UC2, Scalar::all(0.0))?,
-            map: Mat::new_rows_cols_with_default(2, 3, core::CV_32F, Scalar::all(0.0))?,
             started: false,
             motion: Motion::default(),
+            left: 0.0,
             marks: Vec::with_capacity(size.area() as usize / (4 * POINT_EVERY * POINT_EVERY) + 1),
             table: vec![Cell::default(); CELLS],
             levels: rows(),
@@ -380,6 +394,7 @@ impl Background {
             sureness: rows(),
             shown: rows(),
             noise: NOISE_LEAST,
+            strange: 0.0,
             stream: None,
             last_legs: [0.0; 2],
             dry_frames: AFTERWARDS + 1,
@@ -479,12 +494,13 @@ impl Background {
         let before = self.motion;
         // From the last motion and from rest: a joint starts and stops within a frame.
         let (mut motion, mut left) = self.improve(Motion { exposure: 0.0, ..before }, before)?;
-        if before.shift != [0.0; 2] {
+        if before.shift != [0.0; 2] && left > LEFT_GROWS * self.left {
             let (other, its_left) = self.improve(Motion::default(), before)?;
             if its_left < 0.97 * left {
                 (motion, left) = (other, its_left);
             }
         }
+        self.left = left;
         self.motion = if left < f32::MAX { motion } else { Motion::default() };
         Ok(())
     }
@@ -550,50 +566,45 @@ impl Background {
         Ok((motion, left))
     }
 
-    /// Moves the memory, and compares it and the moved last picture with what is seen now, along the rays.
+    /// Compares the memory and the last picture, both moved, with what is seen now, along the rays.
     fn compare(&mut self) -> opencv::Result<()> {
         let turn = Turn::new(&self.motion, self.size, 1.0);
-        let [tx, ty] = turn.forth([0.0, 0.0]);
-        self.map.data_typed_mut::<f32>()?.copy_from_slice(&[turn.cos, -turn.sin, tx, turn.sin, turn.cos, ty]);
-        // Beyond the border nothing is known.
-        imgproc::warp_affine(
-            &self.memory,
-            &mut self.moved,
-            &self.map,
-            self.size,
-            imgproc::INTER_LINEAR,
-            core::BORDER_CONSTANT,
-            Scalar::all(0.0),
-        )?;
         let gain = 1.0 + self.motion.exposure;
         let (now, last) = (Grey::new(&self.now)?, Grey::new(&self.last)?);
-        let moved = self.moved.data_typed::<Vec2b>()?;
-        let width = self.size.width as usize;
+        let memory = self.memory.data_typed::<Vec2b>()?;
+        let (width, height) = (self.size.width as usize, self.size.height as usize);
         let [above, ..] = self.planes([1.0, 1.0]);
         let (mut level_sum, mut level_count) = (0.0, 0.0f32);
         for i in 0..CELLS {
             let [x, y] = self.places[i];
-            let at = (y + 0.5) as usize * width + (x + 0.5) as usize;
-            let level = |i: usize| f32::from(moved[i][0]) * gain;
             let seen = now.at(x, y).unwrap_or(0.0);
             self.levels[i] = seen;
-            self.slopes[i] = 0.5 * (level(at + 1) - level(at - 1)).abs().max((level(at + width) - level(at - width)).abs());
-            self.sureness[i] = if self.air[i] && moved[at][1] >= KNOWN { f32::from(moved[at][1]) / 255.0 } else { 0.0 };
-            // The memory between its pixels.
-            let (column, row) = (x as usize, y as usize);
-            let (fx, fy) = (x - column as f32, y - row as f32);
+            let from = turn.back([x, y]);
+            let inside = from[0] >= 1.0 && from[1] >= 1.0 && from[0] < width as f32 - 2.5 && from[1] < height as f32 - 2.5;
+            if !(inside && self.air[i]) {
+                (self.sureness[i], self.shown[i], self.slopes[i], self.away[i], self.away_last[i]) = (0.0, 0.0, 0.0, 0.0, 0.0);
+                continue;
+            }
+            let (column, row) = (from[0] as usize, from[1] as usize);
             let corner = row * width + column;
+            let level = |at: usize| f32::from(memory[at][0]) * gain;
+            // The memory between its pixels, and its slope.
+            let (fx, fy) = (from[0] - column as f32, from[1] - row as f32);
+            let nearest = corner + usize::from(fx >= 0.5) + if fy >= 0.5 { width } else { 0 };
             let top = level(corner) + (level(corner + 1) - level(corner)) * fx;
             let bottom = level(corner + width) + (level(corner + width + 1) - level(corner + width)) * fx;
-            let memory = top + (bottom - top) * fy;
-            self.away[i] = seen - memory;
-            let from = turn.back([x, y]);
+            let remembered = top + (bottom - top) * fy;
+            self.away[i] = seen - remembered;
+            self.slopes[i] =
+                0.5 * (level(nearest + 1) - level(nearest - 1)).abs().max((level(nearest + width) - level(nearest - width)).abs());
+            let sure = memory[nearest][1];
+            self.sureness[i] = if sure >= KNOWN { f32::from(sure) / 255.0 } else { 0.0 };
             let was_air = above[0] + above[1] * from[0] + above[2] * from[1] >= RIM_PX;
-            let before = if was_air && self.air[i] { last.at(from[0], from[1]) } else { None };
+            let before = if was_air { last.at(from[0], from[1]) } else { None };
             self.shown[i] = if before.is_some() { 1.0 } else { 0.0 };
             self.away_last[i] = before.map_or(0.0, |b| seen - gain * b);
             if self.sureness[i] > 0.0 {
-                level_sum += memory;
+                level_sum += remembered;
                 level_count += 1.0;
             }
         }
@@ -618,6 +629,8 @@ impl Background {
             self.away[i] = (self.away[i] - place).max(0.0) / self.noise;
             self.away_last[i] = (self.away_last[i] - 0.25 * slope).max(0.0) / self.noise;
         }
+        let far = || (0..CELLS).filter(|i| i % SAMPLES >= SAMPLES / 2 && self.sureness[*i] > 0.0);
+        self.strange = far().filter(|i| self.away[*i] > CALM).count() as f32 / far().count().max(1) as f32;
         self.fill_table(&turn);
         Ok(())
     }
@@ -644,8 +657,7 @@ impl Background {
         let even = self.is_even();
         let stream = self.stream;
         let step_size = stream.map_or(6.0 * self.noise, |s| s.step);
-        let (mut wet, mut far, mut sure, mut level, mut last, mut shown): (Sums, Sums, Sums, Sums, Sums, Sums) =
-            ([0.0; SAMPLES + 1], [0.0; SAMPLES + 1], [0.0; SAMPLES + 1], [0.0; SAMPLES + 1], [0.0; SAMPLES + 1], [0.0; SAMPLES + 1]);
+        let [mut wet, mut far, mut sure, mut level, mut last, mut beyond, mut shown]: [Sums; 7] = [[0.0; SAMPLES + 1]; 7];
         let mean = |sums: &Sums, from: i32, to: i32| {
             let (from, to) = (from.clamp(0, SAMPLES as i32) as usize, to.clamp(0, SAMPLES as i32) as usize);
             (sums[to] - sums[from]) / (to - from).max(1) as f32
@@ -653,6 +665,7 @@ impl Background {
         // Evidence of the memory, of the step, of the moved last picture; how much each counts.
         let mut known_says = [0.0f32; SAMPLES];
         let mut step_says = [0.0f32; SAMPLES];
+        let mut last_says = [0.0f32; SAMPLES];
         let mut moving = [0.0f32; SAMPLES];
         for ray in 0..RAYS {
             let start = ray * SAMPLES;
@@ -664,7 +677,9 @@ impl Background {
                 far[r + 1] = far[r] + how_wet.max(0.0);
                 sure[r + 1] = sure[r] + if known { 1.0 } else { 0.0 };
                 level[r + 1] = level[r] + self.levels[i];
-                last[r + 1] = last[r] + self.shown[i] * ((self.away_last[i] - 2.0) / 2.0).clamp(-1.0, 1.0);
+                let unexplained = self.shown[i] * ((self.away_last[i] - 2.0) / 2.0).clamp(-1.0, 1.0);
+                last[r + 1] = last[r] + unexplained;
+                beyond[r + 1] = beyond[r] + unexplained.max(0.0);
                 shown[r + 1] = shown[r] + self.shown[i];
             }
             for r in 0..SAMPLES {
@@ -681,6 +696,7 @@ impl Background {
                 let place = self.places[i];
                 let to = turn.forth(place);
                 let speed = (to[0] - place[0]).hypot(to[1] - place[1]);
+                last_says[r] = 0.65 * cell.unexplained - BEYOND * mean(&beyond, at + 3, at + 12);
                 moving[r] = ((speed - MOVES_PX) / MOVES_PX).clamp(0.0, 1.0) * cell.shown;
             }
             // The outline is a little curved: a neighbour counts too.
@@ -693,7 +709,7 @@ impl Background {
                 if even {
                     cell.known = 1.0;
                 }
-                let by_last = (1.0 - 0.5 * moving[r]) * 0.9 * step + moving[r] * 0.65 * cell.unexplained;
+                let by_last = (1.0 - 0.5 * moving[r]) * 0.9 * step + moving[r] * last_says[r];
                 cell.value = if stream.is_some() {
                     cell.known * by_memory + (1.0 - cell.known) * by_last
                 } else {
@@ -749,6 +765,7 @@ impl Background {
                     let unit = 0.5 * found.step + 2.0 * self.noise;
                     let change = (found.band - stream.band) / unit;
                     let alike = BAND * ((-spread / (unit * unit)).exp() - 1.0) + BAND * ((-change * change).exp() - 1.0);
+                    found.evidence = found.score;
                     found.score += (1.0 - found.known) * alike;
                     found.share = shares;
                     let stay = STAY * (-0.5 * apart / (STAY_WIDTH * STAY_WIDTH)).exp();
@@ -784,19 +801,22 @@ impl Background {
     /// Whether a stream is seen, and where.
     fn decide(&mut self) -> Seen {
         let mut seen = Seen::Dry;
-        let mut background = false;
+        let (mut background, mut surely_dry) = (false, false);
         if let Some(found) = self.best_line() {
             let [moves, shown, unexplained] = self.across(found.line);
-            let tells = moves > MOVES_PX && shown > 0.5;
+            let tells = moves > TELLS_PX && shown > 0.5;
             background = tells && unexplained < EXPLAINED;
+            surely_dry = found.known > GO_ON[1] && found.score < HELD;
             let enough = match self.stream {
                 Some(_) => {
                     let least = GO_ON[0] * (1.0 - found.known) + GO_ON[1] * found.known;
-                    (tells && unexplained > UNEXPLAINED) || (found.score > least && found.share > GO_ON[2])
+                    (tells && unexplained > UNEXPLAINED && found.evidence > HELD) || (found.score > least && found.share > GO_ON[2])
                 }
                 None => found.score > BEGIN[0] && found.share > BEGIN[1],
             };
-            if enough && !background {
+            if self.stream.is_none() && self.strange > STRANGE {
+                seen = Seen::Unsure;
+            } else if enough && !background {
                 let mix = |before: f32, now: f32, share: f32| before + share * (now - before);
                 let (band, step) =
                     self.stream.map_or((found.band, found.step), |s| (mix(s.band, found.band, 0.5), mix(s.step, found.step, 0.4)));
@@ -810,8 +830,11 @@ impl Background {
             Seen::Stream(_) => self.dry_frames = 0,
             _ => {
                 self.dry_frames = self.dry_frames.saturating_add(1);
+                if seen == Seen::Unsure {
+                    return seen;
+                }
                 // One frame of grace: a stream that is lost once may be there again, and is not taken for background.
-                if self.stream.is_some() && self.dry_frames == 1 && !background {
+                if self.stream.is_some() && self.dry_frames == 1 && !(background || surely_dry) {
                     seen = Seen::Unsure;
                 } else {
                     self.stream = None;
@@ -830,34 +853,54 @@ impl Background {
         let [above, right, inner] = self.planes([a + 1.4 * bulge, b + 1.4 * bulge]);
         let [.., outer] = self.planes([1.35 * a + 8.0, 1.35 * b + 8.0]);
         let gain = 1.0 + self.motion.exposure;
+        let turn = Turn::new(&self.motion, self.size, 1.0);
         let now = self.now.data_bytes()?;
-        let (width, calm) = (self.size.width as usize, CALM * self.noise);
-        std::mem::swap(&mut self.memory, &mut self.moved);
-        for (y, row) in self.memory.data_typed_mut::<Vec2b>()?.chunks_exact_mut(width).enumerate() {
-            let value = |plane: [f32; 3], x: usize| plane[0] + plane[2] * y as f32 + plane[1] * x as f32;
-            for (x, pixel) in row.iter_mut().enumerate() {
-                let seen = now[y * width + x];
-                let air = value(above, x) >= RIM_PX;
-                let [level, sure] = **pixel;
-                let level = f32::from(level) * gain;
-                if !air {
-                    *pixel = Vec2b::from([seen, 0]);
+        let (width, height, calm) = (self.size.width as usize, self.size.height as usize, CALM * self.noise);
+        let memory = self.memory.data_bytes()?;
+        let (x_most, y_most) = (width as f32 - 1.01, height as f32 - 1.01);
+        // One pass that moves and updates: OpenCV's warp of two channels alone takes longer.
+        for (y, row) in self.moved.data_bytes_mut()?.chunks_exact_mut(2 * width).enumerate() {
+            let value = |plane: [f32; 3]| plane[0] + plane[2] * y as f32;
+            let (mut above_at, mut right_at, mut inner_at, mut outer_at) = (value(above), value(right), value(inner), value(outer));
+            let mut from = turn.back([0.0, y as f32]);
+            for (pixel, seen) in row.chunks_exact_mut(2).zip(&now[y * width..(y + 1) * width]) {
+                let ([x, y], is_air) = (from, above_at >= RIM_PX);
+                let left = right_at < 1.0;
+                let (inside, close) = (near && (left || inner_at < 1.0), near && (left || outer_at < 1.0));
+                from = [from[0] + turn.cos, from[1] - turn.sin];
+                (above_at, right_at) = (above_at + above[1], right_at + right[1]);
+                (inner_at, outer_at) = (inner_at + inner[1], outer_at + outer[1]);
+                if !is_air {
+                    pixel.copy_from_slice(&[*seen, 0]);
                     continue;
                 }
-                let left = value(right, x) < 1.0;
-                let (inside, close) = (near && (left || value(inner, x) < 1.0), near && (left || value(outer, x) < 1.0));
-                let known = sure >= KNOWN;
-                let away = f32::from(seen) - level;
-                *pixel = if known && ((away.abs() < calm && !(inside && flows)) || !close) {
-                    let follow = if away.abs() < calm { FOLLOW } else { FOLLOW_SLOWLY };
-                    Vec2b::from([(level + follow * away + 0.5) as u8, 255])
+                let (mut level, mut sure) = (0.0, 0.0);
+                if x >= 0.0 && y >= 0.0 && x < x_most && y < y_most {
+                    let (column, row) = (x as u32, y as u32);
+                    let (fx, fy) = (x - column as f32, y - row as f32);
+                    let corner = 2 * (row as usize).wrapping_mul(width).wrapping_add(column as usize);
+                    let (upper, lower) = (&memory[corner..][..4], &memory[corner.wrapping_add(2 * width)..][..4]);
+                    let mix = |k: usize| {
+                        let (a, b, c, d) = (f32::from(upper[k]), f32::from(upper[k + 2]), f32::from(lower[k]), f32::from(lower[k + 2]));
+                        let (top, bottom) = (a + (b - a) * fx, c + (d - c) * fx);
+                        top + (bottom - top) * fy
+                    };
+                    (level, sure) = (mix(0) * gain, mix(1));
+                }
+                let known = sure >= f32::from(KNOWN);
+                let away = f32::from(*seen) - level;
+                let fits = away.abs() < calm;
+                let kept = if known && ((fits && !(inside && flows)) || !close) {
+                    [level + if fits { FOLLOW } else { FOLLOW_SLOWLY } * away + 0.5, 255.0]
                 } else if !known && !(flows && close) {
-                    Vec2b::from([seen, 255])
+                    [f32::from(*seen), 255.0]
                 } else {
-                    Vec2b::from([(level + 0.5) as u8, (FADE * f32::from(sure)) as u8])
+                    [level + 0.5, FADE * sure]
                 };
+                pixel.copy_from_slice(&kept.map(|v| v as u8));
             }
         }
+        std::mem::swap(&mut self.memory, &mut self.moved);
         Ok(())
     }
 

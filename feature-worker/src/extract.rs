@@ -61,11 +61,13 @@ const RIM_LINES: usize = 8;
 const RIM_BUNDLE_PX: f32 = 14.0;
 const RIM_LINE_PX: f32 = 1.5;
 const RIM_REACH: usize = 9;
+/// Samples on either side of the steepest step (3 px) within which the change is taken.
+const RIM_AROUND: usize = 3;
 /// Least change of brightness across the rim that tells anything, grey levels, and least number of bundles that have it.
 const RIM_CONTRAST: f32 = 14.0;
 const RIM_SEEN: usize = 5;
 /// The change across the rim over its steepest step is its width, px: from here on it is blurred.
-const RIM_BLURRED_PX: f32 = 5.0;
+const RIM_BLURRED_PX: f32 = 5.6;
 
 /// Why an extractor cannot be made.
 #[derive(Debug, thiserror::Error)]
@@ -480,8 +482,9 @@ impl Extractor {
                 }
             },
         };
-        let dry = result.area_px2 == 0.0 && result.doubt == Doubt::None;
-        let result = if dry && self.rim_is_blurred(colours) { Measurement::nothing(0.0, Doubt::Blurred) } else { result };
+        // Clear water's own edge tells nothing of focus.
+        let untold = (result.area_px2 == 0.0 || self.method == LiquidMethod::Clear) && result.doubt == Doubt::None;
+        let result = if untold && self.rim_is_blurred(colours) { Measurement::nothing(0.0, Doubt::Blurred) } else { result };
         let done = Instant::now();
         self.converted = converted;
         let ns = |from: Instant, to: Instant| to.duration_since(from).as_nanos() as u64;
@@ -554,10 +557,15 @@ impl Extractor {
                         colour.is_some()
                     })
                 });
-                let (low, high) = profile.iter().fold((f32::MAX, f32::MIN), |(l, h), v| (l.min(*v), h.max(*v)));
+                // The steepest step, and the whole change close around it: a soft edge of the background beside the rim does not count.
+                let steepness = |i: usize| (profile[i + 3] - profile[i]).abs() / 3.0;
+                let at = (RIM_AROUND..2 * RIM_REACH - 2 - RIM_AROUND)
+                    .max_by(|i, j| steepness(*i).total_cmp(&steepness(*j)))
+                    .unwrap_or(RIM_REACH);
+                let around = &profile[at - RIM_AROUND..at + 4 + RIM_AROUND];
+                let (low, high) = around.iter().fold((f32::MAX, f32::MIN), |(l, h), v| (l.min(*v), h.max(*v)));
                 if inside && high - low >= RIM_CONTRAST {
-                    let steepest = profile.windows(4).map(|w| (w[3] - w[0]).abs() / 3.0).fold(0.0, f32::max);
-                    self.widths.push((high - low) / steepest);
+                    self.widths.push((high - low) / steepness(at));
                 }
             }
         }

@@ -86,7 +86,8 @@ pub struct View {
     pub spout_deg: f64,
     /// Share of the discharge coefficient that is lost when the wall lies flat (alpha = 90 degrees).
     pub flat_wall_loss: f64,
-    /// Colour of the liquid, blue green red; none: clear water.
+    /// Colour of the liquid, blue green red; none (in a file, `[]`): clear water.
+    #[serde(deserialize_with = "colour_or_clear")]
     pub liquid_bgr: Option<[u8; 3]>,
     /// How much of the background a thick layer of coloured liquid hides, 0 to 1.
     pub opacity: f64,
@@ -123,6 +124,15 @@ impl Default for View {
             blur_px: 0.0,
             shutter_s: 0.008,
         }
+    }
+}
+
+/// TOML has no word for nothing.
+fn colour_or_clear<'de, D: serde::Deserializer<'de>>(deserializer: D) -> Result<Option<[u8; 3]>, D::Error> {
+    let levels = Vec::<u8>::deserialize(deserializer)?;
+    match levels.len() {
+        0 => Ok(None),
+        _ => levels.try_into().map(Some).map_err(|_| serde::de::Error::custom("blue, green, red, or [] for clear water")),
     }
 }
 
