@@ -41,6 +41,8 @@ const BEHIND_MM: f32 = 200.0;
 const BOARD_ENDS_DEG: f32 = 35.0;
 const ROOM_LEVELS: std::ops::Range<f32> = 25.0..130.0;
 const ROOM_SLOPE: f32 = 0.4;
+/// Places from the axis of a body of water to its outline at which its optics are tabulated.
+const OFF_AXIS: usize = 1024;
 /// Water bodies bulge as cylinders of their own thickness up to this radius, mm.
 const BULGE_MM: f64 = 12.0;
 
@@ -192,6 +194,8 @@ pub struct Renderer {
     depth: Mat,
     radius: Mat,
     room_level: f32,
+    /// What [`through_cylinder`] says at [`OFF_AXIS`] + 1 places from the axis to the outline.
+    lens: Vec<Lens>,
     crossings: Vec<f64>,
     sides: Vec<([f64; 2], [f64; 2])>,
     polygon: Vec<[f64; 2]>,
@@ -312,6 +316,7 @@ impl Renderer {
             radius: Mat::default(),
             // Its own dice: coloured liquid does not need them.
             room_level: Pcg64Mcg::seed_from_u64(!seed).random_range(ROOM_LEVELS),
+            lens: (0..=OFF_AXIS).map(|i| through_cylinder(i as f32 / OFF_AXIS as f32)).collect(),
             crossings: Vec::with_capacity(16),
             sides: Vec::with_capacity(64),
             polygon: Vec::with_capacity(512),
@@ -616,22 +621,22 @@ impl Renderer {
                         let length = inwards_x.hypot(inwards_y).max(0.5);
                         let wave = 1.0 + 0.06 * ((x as f32 * 0.11 + y as f32 * 0.07) - phase as f32).sin();
                         let off_axis = 1.0 - at(x, y) * wave / radius[y * columns + x].max(1.0);
-                        let (through, reflected, bent) = through_cylinder(off_axis);
+                        let lens = self.lens[(off_axis.clamp(0.0, 1.0) * OFF_AXIS as f32) as usize];
                         // Where the light comes from, by its angle from straight ahead: what stands behind, or the room beyond it.
-                        let seen = |angle: f32, c: usize| {
-                            let shift = distance_px * angle.clamp(-1.4, 1.4).tan() / length;
+                        let seen = |way: Way| -> [f32; 3] {
+                            let shift = distance_px * way.tangent / length;
                             let from_x = mirror((area.x as usize + x) as f32 + shift * inwards_x, full_width);
                             let from_y = mirror((area.y as usize + y) as f32 + shift * inwards_y, full_height);
-                            let board = ((BOARD_ENDS_DEG + 4.0 - angle.abs().to_degrees()) / 8.0).clamp(0.0, 1.0);
-                            f32::from(gathered[from_y * full_width + from_x][c]) * board
-                                + room(shift.signum() * inwards_y / length) * (1.0 - board)
+                            let behind = &gathered[from_y * full_width + from_x];
+                            let beyond = room(shift.signum() * inwards_y / length) * (1.0 - way.board);
+                            std::array::from_fn(|c| (f32::from(behind[c]) * way.board + beyond) * way.share)
                         };
-                        let mirrored = -2.0 * off_axis.clamp(0.0, 1.0).acos();
+                        let (passed, reflected) = (seen(lens.passed), seen(lens.reflected));
                         let wander = (y as f32 * 0.05 + glitter as f32).sin() * 2.0;
                         let shimmer = ((x as f32 * 0.13 - y as f32 * 0.11) + wander + glitter as f32).sin()
                             * (y as f32 * 0.09 + x as f32 * 0.06 + wander - phase as f32).sin();
                         let glint = if lamp > 0.35 { 190.0 * (lamp - 0.35) } else { 0.0 } + (shimmer - 0.82).max(0.0) * 260.0;
-                        std::array::from_fn(|c| seen(bent, c) * through + seen(mirrored, c) * reflected + glint)
+                        std::array::from_fn(|c| passed[c] + reflected[c] + glint)
                     }
                 };
                 for c in 0..3 {
@@ -654,7 +659,7 @@ impl Renderer {
         let quarter = Size::new((area.width / 4).max(1), (area.height / 4).max(1));
         imgproc::resize(&self.depth, &mut small, quarter, 0.0, 0.0, imgproc::INTER_AREA)?;
         let reach = (BULGE_MM * self.view.px_per_mm / 4.0) as i32;
-        let around = imgproc::get_structuring_element_def(imgproc::MORPH_ELLIPSE, Size::new(2 * reach + 1, 2 * reach + 1))?;
+        let around = imgproc::get_structuring_element_def(imgproc::MORPH_RECT, Size::new(2 * reach + 1, 2 * reach + 1))?;
         imgproc::dilate_def(&small, &mut largest, &around)?;
         imgproc::blur_def(&largest, &mut small, Size::new(9, 9))?;
         imgproc::resize(&small, &mut self.radius, area.size(), 0.0, 0.0, imgproc::INTER_LINEAR)?;
@@ -815,16 +820,38 @@ impl Renderer {
     }
 }
 
-/// Light straight ahead through a cylinder of water, `off_axis` (0 to 1) radii from its axis: the share that passes, the share
-/// that the outside reflects (Fresnel, unpolarised), and the angle by which what passes is bent towards the axis, radians (Snell).
-fn through_cylinder(off_axis: f32) -> (f32, f32, f32) {
+/// Light from one direction: its share, the tangent of its angle from straight ahead (towards the body's axis), and the share of what
+/// stands behind (rather than the room beyond it) that is seen there.
+#[derive(Debug, Clone, Copy)]
+struct Way {
+    share: f32,
+    tangent: f32,
+    board: f32,
+}
+
+/// What is seen at one place of a body of water.
+#[derive(Debug, Clone, Copy)]
+struct Lens {
+    passed: Way,
+    reflected: Way,
+}
+
+/// Light straight ahead through a cylinder of water, `off_axis` (0 to 1) radii from its axis: what passes is bent twice (Snell), what the
+/// outside reflects comes from its own side (Fresnel, unpolarised).
+fn through_cylinder(off_axis: f32) -> Lens {
     let sine = off_axis.clamp(0.0, 0.999);
     let (incident, refracted) = (sine.asin(), (sine / WATER_INDEX).asin());
     let (cos_i, cos_r) = (incident.cos(), refracted.cos());
     let across = (cos_i - WATER_INDEX * cos_r) / (cos_i + WATER_INDEX * cos_r);
     let along = (WATER_INDEX * cos_i - cos_r) / (WATER_INDEX * cos_i + cos_r);
     let reflected = 0.5 * (across * across + along * along);
-    ((1.0 - reflected) * (1.0 - reflected), reflected, 2.0 * (incident - refracted))
+    let way = |share: f32, angle: f32| Way {
+        share,
+        tangent: angle.clamp(-1.4, 1.4).tan(),
+        board: ((BOARD_ENDS_DEG + 4.0 - angle.abs().to_degrees()) / 8.0).clamp(0.0, 1.0),
+    };
+    let bent = 2.0 * (incident - refracted);
+    Lens { passed: way((1.0 - reflected) * (1.0 - reflected), bent), reflected: way(reflected, -2.0 * off_axis.clamp(0.0, 1.0).acos()) }
 }
 
 fn join(a: Rect, b: Rect) -> Rect {
