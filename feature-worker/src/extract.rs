@@ -61,11 +61,13 @@ const RIM_LINES: usize = 8;
 const RIM_BUNDLE_PX: f32 = 14.0;
 const RIM_LINE_PX: f32 = 1.5;
 const RIM_REACH: usize = 9;
+/// Samples on either side of the steepest step (3 px) within which the change is taken.
+const RIM_AROUND: usize = 3;
 /// Least change of brightness across the rim that tells anything, grey levels, and least number of bundles that have it.
 const RIM_CONTRAST: f32 = 14.0;
 const RIM_SEEN: usize = 5;
 /// The change across the rim over its steepest step is its width, px: from here on it is blurred.
-const RIM_BLURRED_PX: f32 = 5.0;
+const RIM_BLURRED_PX: f32 = 5.6;
 
 /// Why an extractor cannot be made.
 #[derive(Debug, thiserror::Error)]
@@ -252,7 +254,6 @@ pub struct Extractor {
     hsv: Mat,
     mask: Mat,
     mask_b: Mat,
-    grey: Mat,
     background: Background,
     edges: Vec<[f32; 2]>,
     edge_weights: Vec<f32>,
@@ -377,7 +378,6 @@ impl Extractor {
             hsv: Mat::default(),
             mask: Mat::default(),
             mask_b: Mat::default(),
-            grey: Mat::default(),
             background: Background::new(&axes, [region.width, region.height], camera.width_px)?,
             edges: Vec::with_capacity(RAYS),
             edge_weights: Vec::with_capacity(RAYS),
@@ -476,14 +476,15 @@ impl Extractor {
                     (self.find_triangle(colours)?, segmented)
                 }
                 LiquidMethod::Clear => {
-                    let seen = self.background.look(&self.grey)?;
+                    let seen = self.background.look()?;
                     let segmented = Instant::now();
                     (self.follow_water(seen, colours)?, segmented)
                 }
             },
         };
-        let dry = result.area_px2 == 0.0 && result.doubt == Doubt::None;
-        let result = if dry && self.rim_is_blurred(colours) { Measurement::nothing(0.0, Doubt::Blurred) } else { result };
+        // Clear water's own edge tells nothing of focus.
+        let untold = (result.area_px2 == 0.0 || self.method == LiquidMethod::Clear) && result.doubt == Doubt::None;
+        let result = if untold && self.rim_is_blurred(colours) { Measurement::nothing(0.0, Doubt::Blurred) } else { result };
         let done = Instant::now();
         self.converted = converted;
         let ns = |from: Instant, to: Instant| to.duration_since(from).as_nanos() as u64;
@@ -497,18 +498,19 @@ impl Extractor {
     }
 
     fn resample(&mut self, region: &impl core::ToInputArray) -> Result<(), ExtractError> {
+        if self.method == LiquidMethod::Clear {
+            return Ok(self.background.take(region)?);
+        }
         let (nearest, border) = (imgproc::INTER_NEAREST, core::BORDER_REPLICATE);
         imgproc::remap(region, &mut self.polar, &self.map_a, &self.map_b, nearest, border, Scalar::default())?;
-        if self.method == LiquidMethod::Clear {
-            imgproc::cvt_color_def(region, &mut self.grey, imgproc::COLOR_BGR2GRAY)?;
-        }
         Ok(())
     }
 
     /// Too dark, blown out or the same picture as before. One pass over the rays (every fourth pixel for light), because
     /// three OpenCV reductions over the same bytes took longer than this.
     fn check_light(&mut self) -> Result<Option<Doubt>, ExtractError> {
-        let bytes = self.polar.data_bytes()?;
+        let picture = if self.method == LiquidMethod::Clear { self.background.small() } else { &self.polar };
+        let bytes = picture.data_bytes()?;
         let mut hash = 0xcbf2_9ce4_8422_2325u64;
         for chunk in bytes.chunks_exact(8) {
             let word = u64::from_le_bytes([chunk[0], chunk[1], chunk[2], chunk[3], chunk[4], chunk[5], chunk[6], chunk[7]]);
@@ -555,10 +557,15 @@ impl Extractor {
                         colour.is_some()
                     })
                 });
-                let (low, high) = profile.iter().fold((f32::MAX, f32::MIN), |(l, h), v| (l.min(*v), h.max(*v)));
+                // The steepest step, and the whole change close around it: a soft edge of the background beside the rim does not count.
+                let steepness = |i: usize| (profile[i + 3] - profile[i]).abs() / 3.0;
+                let at = (RIM_AROUND..2 * RIM_REACH - 2 - RIM_AROUND)
+                    .max_by(|i, j| steepness(*i).total_cmp(&steepness(*j)))
+                    .unwrap_or(RIM_REACH);
+                let around = &profile[at - RIM_AROUND..at + 4 + RIM_AROUND];
+                let (low, high) = around.iter().fold((f32::MAX, f32::MIN), |(l, h), v| (l.min(*v), h.max(*v)));
                 if inside && high - low >= RIM_CONTRAST {
-                    let steepest = profile.windows(4).map(|w| (w[3] - w[0]).abs() / 3.0).fold(0.0, f32::max);
-                    self.widths.push((high - low) / steepest);
+                    self.widths.push((high - low) / steepness(at));
                 }
             }
         }

@@ -28,6 +28,17 @@ pub enum SourceError {
         /// What is wrong and what to do.
         what: String,
     },
+    /// The device gives another rate than configured.
+    #[error(
+        "camera.fps = {configured}: the camera gives {device} frames a second at this size; write camera.fps = {device}, or choose a size \
+         and rate of `v4l2-ctl --list-formats-ext`"
+    )]
+    Rate {
+        /// `[camera] fps`.
+        configured: f64,
+        /// What the device says.
+        device: f64,
+    },
     /// The camera gave no picture any more.
     #[error("camera \"{0}\" gives no more frames; is it unplugged? Plug it in and start again")]
     Lost(String),
@@ -81,12 +92,47 @@ pub struct Shared {
     _topic: FrameTopic,
 }
 
+/// Numbers frames by the time between them, so that a lost one leaves a gap.
+#[derive(Debug, Clone, Copy)]
+pub struct Numbering {
+    sequence: u64,
+    last_ms: Option<f64>,
+    period_ms: f64,
+}
+
+impl Numbering {
+    /// For a camera with `fps` frames a second.
+    pub fn new(fps: f64) -> Self {
+        Self { sequence: 0, last_ms: None, period_ms: 1e3 / fps }
+    }
+
+    /// The number of the frame with the device's timestamp `at_ms`; none: the one after the last.
+    pub fn next(&mut self, at_ms: Option<f64>) -> u64 {
+        let periods = match (self.last_ms, at_ms) {
+            (Some(last), Some(at)) => ((at - last) / self.period_ms).round().clamp(1.0, 1e6) as u64,
+            _ => 1,
+        };
+        self.last_ms = at_ms;
+        self.sequence += periods;
+        self.sequence
+    }
+}
+
+/// A device that gives another rate than configured would make every gap between frames look like loss. `device`: 0 when it does not
+/// tell.
+pub fn check_rate(configured: f64, device: f64) -> Result<(), SourceError> {
+    if device > 0.0 && (device / configured - 1.0).abs() > 0.02 {
+        return Err(SourceError::Rate { configured, device });
+    }
+    Ok(())
+}
+
 /// Frames through OpenCV.
 pub struct Capture {
     capture: VideoCapture,
     camera: CameraConfig,
     image: Mat,
-    sequence: u64,
+    numbering: Numbering,
     /// Files: when the next frame is due, if they are played at their own speed.
     due_ns: Option<u64>,
     period_ns: u64,
@@ -170,9 +216,13 @@ impl Capture {
             }
         }
         let own_fps = capture.get(videoio::CAP_PROP_FPS)?;
+        if device {
+            check_rate(camera.fps, own_fps)?;
+        }
         let fps = if camera.source == CameraSource::Video && own_fps > 0.0 { own_fps } else { camera.fps };
+        let numbering = Numbering::new(fps);
         let due_ns = (!device && real_time).then(os::now_ns);
-        Ok(Self { capture, camera: camera.clone(), image: Mat::default(), sequence: 0, due_ns, period_ns: (1e9 / fps) as u64 })
+        Ok(Self { capture, camera: camera.clone(), image: Mat::default(), numbering, due_ns, period_ns: (1e9 / fps) as u64 })
     }
 
     /// The next frame; waits up to `timeout` (a device: as long as its driver does).
@@ -194,14 +244,19 @@ impl Capture {
         if !read || self.image.empty() {
             return match self.camera.source {
                 CameraSource::Device => Err(SourceError::Lost(self.camera.path.clone())),
-                _ if self.sequence == 0 => Err(SourceError::Open {
+                _ if self.numbering.sequence == 0 => Err(SourceError::Open {
                     path: self.camera.path.clone(),
                     what: "holds no frame that can be decoded; is it truncated?".into(),
                 }),
                 _ => Ok(Next::End),
             };
         }
-        self.sequence += 1;
+        // The driver stamps each buffer when it is filled, so also one that is read late has its own time.
+        let stamp_ms = match self.camera.source {
+            CameraSource::Device => Some(self.capture.get(videoio::CAP_PROP_POS_MSEC)?).filter(|ms| *ms > 0.0),
+            _ => None,
+        };
+        let sequence = self.numbering.next(stamp_ms);
         let format = match self.image.typ() {
             CV_8UC3 => PixelFormat::Bgr8,
             CV_8UC1 => PixelFormat::Mono8,
@@ -215,7 +270,7 @@ impl Capture {
             format: format as u32,
             width_px: self.image.cols() as u32,
             height_px: self.image.rows() as u32,
-            sequence: self.sequence,
+            sequence,
             captured_at_ns,
             published_at_ns: captured_at_ns,
         };

@@ -6,6 +6,7 @@ use std::path::Path;
 use std::process::{Command, Output};
 
 use drawn::{HEIGHT, Outcome, WIDTH, pour, write_config};
+use feature_worker::source::{Numbering, check_rate};
 use opencv::core::{Mat, Size, Vector};
 use opencv::prelude::*;
 use opencv::{imgcodecs, imgproc, videoio};
@@ -128,4 +129,23 @@ fn bad_configurations_are_refused_with_key_and_hint() -> Outcome {
     }
     shared::ipc::remove_files(&format!("bad-{}", std::process::id()));
     Ok(())
+}
+
+/// Protects the count of lost frames of a V4L2 device: a frame that the driver dropped leaves a gap in the numbers, jitter does not, and
+/// a device without timestamps is counted by its frames.
+#[test]
+fn a_lost_frame_leaves_a_gap() {
+    let mut numbering = Numbering::new(30.0);
+    let stamps = [1000.0, 1033.0, 1068.0, 1099.0, 1166.5, 1200.0, 1333.3];
+    assert_eq!(stamps.map(|ms| numbering.next(Some(ms))), [1, 2, 3, 4, 6, 7, 11]);
+    assert_eq!(numbering.next(None), 12);
+}
+
+/// Protects the count of frames from a camera that runs at another rate than configured: refused with key and hint; a device that
+/// does not tell is taken.
+#[test]
+fn another_rate_is_refused() {
+    assert!(check_rate(30.0, 0.0).is_ok() && check_rate(30.0, 30.0).is_ok() && check_rate(30.0, 29.97).is_ok());
+    let said = check_rate(30.0, 15.0).expect_err("accepted").to_string();
+    assert!(said.contains("camera.fps = 30") && said.contains("camera.fps = 15") && said.lines().count() == 1, "{said}");
 }

@@ -32,6 +32,19 @@ const CRITICAL_BEFORE_LIP: f64 = 0.15;
 const DRIP_FLOW_ML_S: f64 = 0.15;
 /// Volume of one drop, ml.
 const DROP_ML: f64 = 0.05;
+/// Refractive index of water.
+const WATER_INDEX: f32 = 1.333;
+/// From the stream to what stands behind it, mm.
+const BEHIND_MM: f32 = 200.0;
+/// What stands behind ends at this angle from straight ahead, degrees; beyond it is the room, lit to a grey level in this range, with
+/// more light from above than from below by this share.
+const BOARD_ENDS_DEG: f32 = 35.0;
+const ROOM_LEVELS: std::ops::Range<f32> = 25.0..130.0;
+const ROOM_SLOPE: f32 = 0.4;
+/// Places from the axis of a body of water to its outline at which its optics are tabulated.
+const OFF_AXIS: usize = 1024;
+/// Water bodies bulge as cylinders of their own thickness up to this radius, mm.
+const BULGE_MM: f64 = 12.0;
 
 /// OpenCV could not draw.
 #[derive(Debug, thiserror::Error)]
@@ -75,7 +88,8 @@ pub struct View {
     pub spout_deg: f64,
     /// Share of the discharge coefficient that is lost when the wall lies flat (alpha = 90 degrees).
     pub flat_wall_loss: f64,
-    /// Colour of the liquid, blue green red; none: clear water.
+    /// Colour of the liquid, blue green red; none (in a file, `[]`): clear water.
+    #[serde(deserialize_with = "colour_or_clear")]
     pub liquid_bgr: Option<[u8; 3]>,
     /// How much of the background a thick layer of coloured liquid hides, 0 to 1.
     pub opacity: f64,
@@ -112,6 +126,15 @@ impl Default for View {
             blur_px: 0.0,
             shutter_s: 0.008,
         }
+    }
+}
+
+/// TOML has no word for nothing.
+fn colour_or_clear<'de, D: serde::Deserializer<'de>>(deserializer: D) -> Result<Option<[u8; 3]>, D::Error> {
+    let levels = Vec::<u8>::deserialize(deserializer)?;
+    match levels.len() {
+        0 => Ok(None),
+        _ => levels.try_into().map(Some).map_err(|_| serde::de::Error::custom("blue, green, red, or [] for clear water")),
     }
 }
 
@@ -165,6 +188,14 @@ pub struct Renderer {
     /// Share of each pixel that is covered by liquid, 0 to 255, and the same softened (a stand-in for thickness).
     cover: Mat,
     thickness: Mat,
+    /// Clear water: the picture behind as a pixel of the water gathers it, each pixel's depth below the outline, and the radius of
+    /// the body that it belongs to, px.
+    gathered: Mat,
+    depth: Mat,
+    radius: Mat,
+    room_level: f32,
+    /// What [`through_cylinder`] says at [`OFF_AXIS`] + 1 places from the axis to the outline.
+    lens: Vec<Lens>,
     crossings: Vec<f64>,
     sides: Vec<([f64; 2], [f64; 2])>,
     polygon: Vec<[f64; 2]>,
@@ -280,6 +311,12 @@ impl Renderer {
             glass_light,
             cover: new(CV_8UC1, 0.0)?,
             thickness: new(CV_8UC1, 0.0)?,
+            gathered: Mat::default(),
+            depth: Mat::default(),
+            radius: Mat::default(),
+            // Its own dice: coloured liquid does not need them.
+            room_level: Pcg64Mcg::seed_from_u64(!seed).random_range(ROOM_LEVELS),
+            lens: (0..=OFF_AXIS).map(|i| through_cylinder(i as f32 / OFF_AXIS as f32)).collect(),
             crossings: Vec::with_capacity(16),
             sides: Vec::with_capacity(64),
             polygon: Vec::with_capacity(512),
@@ -525,12 +562,31 @@ impl Renderer {
             BORDER_REFLECT_101,
         )?;
         Mat::roi(&self.frame, area)?.copy_to(&mut self.behind)?;
+        let clear = self.view.liquid_bgr.is_none();
+        if clear {
+            self.measure_bodies(area)?;
+        }
         let (rows, columns) = (area.height as usize, area.width as usize);
         // Continuous copies, indexed directly: this loop reads around each pixel, which no OpenCV call does.
         let behind = self.behind.data_typed::<core::Vec3b>()?;
         let thickness = self.thickness.data_bytes()?;
         let step = (around / 2).max(1) as usize;
         let [phase, _, glitter, _] = self.ripple;
+        let water = if clear {
+            Some((self.gathered.data_typed::<core::Vec3b>()?, self.depth.data_typed::<f32>()?, self.radius.data_typed::<f32>()?))
+        } else {
+            None
+        };
+        let (full_width, full_height) = (self.view.width_px as usize, self.view.height_px as usize);
+        let distance_px = BEHIND_MM * self.view.px_per_mm as f32;
+        // Upright in the picture; the real direction turns with the wrist, which matters little.
+        let room = |down: f32| self.room_level * (1.0 - ROOM_SLOPE * down.clamp(-1.0, 1.0));
+        // The board goes on beyond the picture.
+        let mirror = |v: f32, most: usize| {
+            let period = 2 * (most as i32 - 1);
+            let v = (v as i32).rem_euclid(period);
+            v.min(period - v) as usize
+        };
         for y in 0..rows {
             let cover = &mut self.cover.at_row_mut::<u8>(area.y + y as i32)?[area.x as usize..area.x as usize + columns];
             let frame = &mut self.frame.at_row_mut::<core::Vec3b>(area.y + y as i32)?[area.x as usize..area.x as usize + columns];
@@ -556,18 +612,31 @@ impl Renderer {
                         std::array::from_fn(|c| f32::from(behind[c]) * (1.0 - hidden) + f32::from(colour[c]) * hidden * light + glint)
                     }
                     None => {
-                        // A rounded body of water shows what lies to the side, upside down near its edge, and darkens there.
-                        let bend = 14.0 + 3.0 * ((x as f32 * 0.11 + y as f32 * 0.07) - phase as f32).sin();
-                        let from_x = (x as f32 + bend * slope_x * 2.0).clamp(0.0, columns as f32 - 1.0) as usize;
-                        let from_y = (y as f32 + bend * slope_y * 2.0).clamp(0.0, rows as f32 - 1.0) as usize;
-                        let behind = &behind[from_y * columns + from_x];
-                        let edge = (2.0 * (1.0 - thick)).clamp(0.0, 1.0);
-                        let through = 0.94 - 0.5 * edge * edge;
+                        let Some((gathered, depth, radius)) = water else { continue };
+                        let at = |x: usize, y: usize| depth[y * columns + x];
+                        // Towards the body's axis, away from its outline.
+                        let (left, right) = (at(x.saturating_sub(2), y), at((x + 2).min(columns - 1), y));
+                        let (over, under) = (at(x, y.saturating_sub(2)), at(x, (y + 2).min(rows - 1)));
+                        let (inwards_x, inwards_y) = (right - left, under - over);
+                        let length = inwards_x.hypot(inwards_y).max(0.5);
+                        let wave = 1.0 + 0.06 * ((x as f32 * 0.11 + y as f32 * 0.07) - phase as f32).sin();
+                        let off_axis = 1.0 - at(x, y) * wave / radius[y * columns + x].max(1.0);
+                        let lens = self.lens[(off_axis.clamp(0.0, 1.0) * OFF_AXIS as f32) as usize];
+                        // Where the light comes from, by its angle from straight ahead: what stands behind, or the room beyond it.
+                        let seen = |way: Way| -> [f32; 3] {
+                            let shift = distance_px * way.tangent / length;
+                            let from_x = mirror((area.x as usize + x) as f32 + shift * inwards_x, full_width);
+                            let from_y = mirror((area.y as usize + y) as f32 + shift * inwards_y, full_height);
+                            let behind = &gathered[from_y * full_width + from_x];
+                            let beyond = room(shift.signum() * inwards_y / length) * (1.0 - way.board);
+                            std::array::from_fn(|c| (f32::from(behind[c]) * way.board + beyond) * way.share)
+                        };
+                        let (passed, reflected) = (seen(lens.passed), seen(lens.reflected));
                         let wander = (y as f32 * 0.05 + glitter as f32).sin() * 2.0;
                         let shimmer = ((x as f32 * 0.13 - y as f32 * 0.11) + wander + glitter as f32).sin()
                             * (y as f32 * 0.09 + x as f32 * 0.06 + wander - phase as f32).sin();
                         let glint = if lamp > 0.35 { 190.0 * (lamp - 0.35) } else { 0.0 } + (shimmer - 0.82).max(0.0) * 260.0;
-                        std::array::from_fn(|c| f32::from(behind[c]) * through + glint)
+                        std::array::from_fn(|c| passed[c] + reflected[c] + glint)
                     }
                 };
                 for c in 0..3 {
@@ -576,6 +645,26 @@ impl Renderer {
             }
             cover.fill(0);
         }
+        Ok(())
+    }
+
+    /// For clear water: how deep each pixel of the cover lies below its outline, how thick the body there is, and what its strong
+    /// lens gathers into one pixel.
+    fn measure_bodies(&mut self, area: Rect) -> Result<(), RenderError> {
+        let mut solid = Mat::default();
+        imgproc::threshold(&Mat::roi(&self.cover, area)?, &mut solid, 127.0, 255.0, imgproc::THRESH_BINARY)?;
+        imgproc::distance_transform(&solid, &mut self.depth, imgproc::DIST_L2, imgproc::DIST_MASK_PRECISE, core::CV_32F)?;
+        // The largest depth around, at a quarter of the size: it changes slowly.
+        let (mut small, mut largest) = (Mat::default(), Mat::default());
+        let quarter = Size::new((area.width / 4).max(1), (area.height / 4).max(1));
+        imgproc::resize(&self.depth, &mut small, quarter, 0.0, 0.0, imgproc::INTER_AREA)?;
+        let reach = (BULGE_MM * self.view.px_per_mm / 4.0) as i32;
+        let around = imgproc::get_structuring_element_def(imgproc::MORPH_RECT, Size::new(2 * reach + 1, 2 * reach + 1))?;
+        imgproc::dilate_def(&small, &mut largest, &around)?;
+        imgproc::blur_def(&largest, &mut small, Size::new(9, 9))?;
+        imgproc::resize(&small, &mut self.radius, area.size(), 0.0, 0.0, imgproc::INTER_LINEAR)?;
+        let gather = (2.0 * self.view.px_per_mm) as i32 | 1;
+        imgproc::blur_def(&self.frame, &mut self.gathered, Size::new(gather, gather))?;
         Ok(())
     }
 
@@ -729,6 +818,40 @@ impl Renderer {
         }
         Ok(())
     }
+}
+
+/// Light from one direction: its share, the tangent of its angle from straight ahead (towards the body's axis), and the share of what
+/// stands behind (rather than the room beyond it) that is seen there.
+#[derive(Debug, Clone, Copy)]
+struct Way {
+    share: f32,
+    tangent: f32,
+    board: f32,
+}
+
+/// What is seen at one place of a body of water.
+#[derive(Debug, Clone, Copy)]
+struct Lens {
+    passed: Way,
+    reflected: Way,
+}
+
+/// Light straight ahead through a cylinder of water, `off_axis` (0 to 1) radii from its axis: what passes is bent twice (Snell), what the
+/// outside reflects comes from its own side (Fresnel, unpolarised).
+fn through_cylinder(off_axis: f32) -> Lens {
+    let sine = off_axis.clamp(0.0, 0.999);
+    let (incident, refracted) = (sine.asin(), (sine / WATER_INDEX).asin());
+    let (cos_i, cos_r) = (incident.cos(), refracted.cos());
+    let across = (cos_i - WATER_INDEX * cos_r) / (cos_i + WATER_INDEX * cos_r);
+    let along = (WATER_INDEX * cos_i - cos_r) / (WATER_INDEX * cos_i + cos_r);
+    let reflected = 0.5 * (across * across + along * along);
+    let way = |share: f32, angle: f32| Way {
+        share,
+        tangent: angle.clamp(-1.4, 1.4).tan(),
+        board: ((BOARD_ENDS_DEG + 4.0 - angle.abs().to_degrees()) / 8.0).clamp(0.0, 1.0),
+    };
+    let bent = 2.0 * (incident - refracted);
+    Lens { passed: way((1.0 - reflected) * (1.0 - reflected), bent), reflected: way(reflected, -2.0 * off_axis.clamp(0.0, 1.0).acos()) }
 }
 
 fn join(a: Rect, b: Rect) -> Rect {
