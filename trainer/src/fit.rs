@@ -4,7 +4,9 @@
 //!
 //! Unknowns: the model's parameters and the calibration (c, q) for all episodes; for each episode the angle at which flow
 //! starts, the flow coefficient lambda (viscosity) and the camera gain gamma. Residuals: frame by frame
-//! `(c area^q - out e^gamma)/sigma`, once per episode `(sum out - w_E)/0.6 g`, and the priors.
+//! `ln((c area^q + f)/(out e^gamma + f))/(rel q)`, once per episode `(sum out - w_E)/0.6 g`, and the priors. The logarithm
+//! keeps c from gaining by being large; the division by q makes it the area that is noisy, or else q would gain by being
+//! small. f is a small share of the strongest flow.
 
 use nalgebra::{DMatrix, DVector};
 use rayon::prelude::*;
@@ -66,14 +68,13 @@ pub struct Fit {
     pub dropouts: f64,
 }
 
-/// One episode made ready: areas, their smoothed profile, masks.
+/// One episode made ready: areas, their largest mean over five frames, masks.
 struct Prepared {
     alpha: Vec<f64>,
     tilt_z: Vec<f64>,
     area: Vec<f64>,
     /// Areas with the dropout hold, as they are summed: those above 0, with their z.
     held: Vec<(f64, f64)>,
-    smooth: Vec<f64>,
     smooth_max: f64,
     used: Vec<bool>,
     weight_g: f64,
@@ -82,6 +83,7 @@ struct Prepared {
 
 #[derive(Clone, Copy)]
 struct Stage {
+    /// Noise of a frame's area, relative; and what is added to flows before their logarithm is taken, over the strongest.
     rel: f64,
     floor: f64,
     gamma_sd: f64,
@@ -108,13 +110,11 @@ impl Prepared {
                 filled[k] = if near.is_empty() { 0.0 } else { near.iter().sum::<f64>() / near.len() as f64 };
             }
         }
-        let smooth: Vec<f64> = (0..n)
-            .map(|k| {
-                let (from, to) = (k.saturating_sub(2), (k + 3).min(n));
-                filled[from..to].iter().sum::<f64>() / (to - from) as f64
-            })
-            .collect();
-        let smooth_max = smooth.iter().copied().fold(1e-9, f64::max);
+        let mean_of_five = |k: usize| {
+            let (from, to) = (k.saturating_sub(2), (k + 3).min(n));
+            filled[from..to].iter().sum::<f64>() / (to - from) as f64
+        };
+        let smooth_max = (0..n).map(mean_of_five).fold(1e-9, f64::max);
         let first = (0..n).find(|k| seen(*k)).unwrap_or(0);
         let tilt_z_of: Vec<f64> = e.alpha_deg.iter().map(|a| tilt_z(*a)).collect();
         let mut hold = Hold::default();
@@ -125,7 +125,7 @@ impl Prepared {
             .map(|(a, alpha)| (f64::from(hold.step(Some(*a as f32), calibrate::HOLD_ABOVE_PX2)), tilt_z(*alpha)))
             .filter(|(a, _)| *a > 0.0)
             .collect();
-        Self { alpha: e.alpha_deg.clone(), held, tilt_z: tilt_z_of, area, smooth, smooth_max, used, weight_g: e.weight_g, first }
+        Self { alpha: e.alpha_deg.clone(), held, tilt_z: tilt_z_of, area, smooth_max, used, weight_g: e.weight_g, first }
     }
 
     /// What the model says left the lip in each frame, and the film after it, ml.
@@ -153,7 +153,7 @@ impl Prepared {
         let [onset, lambda, gamma] = *local;
         let (c, gain) = (log_c.exp(), gamma.exp());
         let v_min = c * area_min.powf(q);
-        let v_max = c * self.smooth_max.powf(q);
+        let floor = stage.floor * c * self.smooth_max.powf(q);
         let mut sum = 0.0;
         let mut film = 0.0;
         for (k, (leaves, left)) in self.outflow(flow, onset, lambda).enumerate() {
@@ -164,14 +164,9 @@ impl Prepared {
             }
             let h = leaves * gain;
             let c_k = c * (tilt * self.tilt_z[k]).exp();
-            let sigma = stage.rel * c_k * self.smooth[k].powf(q) + stage.floor * v_max;
-            if self.area[k] > 0.0 {
-                out.push(soft((c_k * self.area[k].powf(q) - h) / sigma));
-            } else if h > v_min {
-                out.push(soft((v_min - h) / sigma));
-            } else {
-                out.push(0.0);
-            }
+            // A zero says that no more than v_min flows.
+            let y = if self.area[k] > 0.0 { c_k * self.area[k].powf(q) } else { h.min(v_min) };
+            out.push(soft(((y + floor) / (h + floor)).ln() / (stage.rel * q)));
         }
         out.push((sum + film - self.weight_g) / WEIGHT_SD_G);
         let camera: f64 = self.held.iter().map(|(a, z)| c * (tilt * z).exp() * a.powf(q)).sum();
@@ -226,7 +221,7 @@ const S_SD: [f64; KNOTS] = [0.06, 0.06, 0.06, 0.06, 0.06, 0.08, 0.18, 0.6, 0.6];
 
 /// The priors. Vessels that a gripper holds: R about 37 mm, H about 3 R, nearly straight walls; what deviates from that in
 /// shape pays little more the further it goes (Cauchy), so that bottles and jugs are not bent into cups. The flow follows a
-/// weir: exponent 1.5, and a coefficient that changes with the angle as the head does.
+/// weir: exponent 1.5, and a coefficient that hardly changes with the angle.
 fn priors(g: &[f64], stage: &Stage) -> Vec<f64> {
     let mut r = Vec::with_capacity(40);
     let far = |r: f64| r.signum() * 2.0 * (1.0 + r * r / 4.0).ln().sqrt();
@@ -243,13 +238,13 @@ fn priors(g: &[f64], stage: &Stage) -> Vec<f64> {
     r.push((g[TAPER] - 1.0) / 0.15);
     r.push(far(g[FLAT] / 0.05));
     r.push(g[TILT] / 0.03);
-    r.push((g[P] - 1.5) / 0.15);
+    r.push(far((g[P] - 1.5) / 0.1));
     r.push((g[LK] + 3.2) / 1.5);
-    r.push(g[K1] / 0.35);
-    r.push(g[K2] / 0.25);
+    r.push(far(g[K1] / 0.15));
+    r.push(far(g[K2] / 0.1));
     r.push((g[TAU] - 2.0) / 0.8);
     r.push((g[DELAY] - 2.0) / 1.2);
-    r.push((g[ETA] - 0.05) / 0.06);
+    r.push((g[ETA] - 0.1) / 0.1);
     match stage.held {
         None => r.push((g[Q] - 1.15) / 0.2),
         Some(([log_c, q, tilt], sd)) => {
@@ -420,8 +415,8 @@ pub fn fit(episodes: &[TrainingEpisode]) -> Fit {
         Unknowns { global, local }
     };
     let (frame_sd, dropouts) = frame_noise(&prepared);
-    let temper = |times: f64, most: f64| (times * frame_sd * q0).clamp(0.02 * times, most);
-    let wide = Stage { rel: temper(5.0, 1.0), floor: 0.01, gamma_sd: 0.02, sum_sd: SUM_NOISE * frame_sd.max(0.015), held: None };
+    let temper = |times: f64, most: f64| (times * frame_sd).clamp(0.02 * times, most);
+    let wide = Stage { rel: temper(3.0, 1.0), floor: 0.036, gamma_sd: 0.02, sum_sd: SUM_NOISE * frame_sd.max(0.015), held: None };
     let problem = Problem { episodes: &prepared, area_min, stage: wide };
     let mut best: Option<(f64, Unknowns)> = None;
     // Without noise the valleys are narrow: more beginnings, and a longer way.
@@ -442,7 +437,7 @@ pub fn fit(episodes: &[TrainingEpisode]) -> Fit {
     let wide_covariance = invert(&problem.linearise(&u).a);
 
     let held = Some(([u.global[LOG_C], u.global[Q], u.global[TILT]], 0.002));
-    let narrow = Problem { stage: Stage { rel: temper(1.5, 0.15), floor: 0.005, gamma_sd: 0.03, held, ..wide }, ..problem };
+    let narrow = Problem { stage: Stage { rel: temper(1.5, 0.15), floor: 0.036, gamma_sd: 0.03, held, ..wide }, ..problem };
     let mut cost = narrow.solve(&mut u, 30 * longer, 1e-4);
     let mut gain_expected = GAIN_EXPECTED;
     if clean {
