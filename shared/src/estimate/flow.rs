@@ -75,6 +75,27 @@ pub struct FlowModel {
     pub noise: FlowNoise,
 }
 
+impl Default for FlowModel {
+    /// A beaker of 38 x 115 mm filled with water.
+    fn default() -> Self {
+        Self {
+            radius_mm: 38.0,
+            height_mm: 115.0,
+            taper: 1.0,
+            flat: 0.0,
+            s: [0.0; KNOTS],
+            lk: -3.0,
+            p: 1.5,
+            k1: 0.1,
+            k2: -0.05,
+            tau: 2.0,
+            delay: 2.3,
+            eta: 0.1,
+            noise: FlowNoise { lambda: 0.15, gamma: 0.025, beta: 0.015, delta: 0.3, frame: 0.08, v_min_ml: 0.01 },
+        }
+    }
+}
+
 /// How far the model can be off in one pour and one frame (standard deviations).
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct FlowNoise {
