@@ -84,6 +84,11 @@ pub enum Selection {
 const RESUME_ML: f32 = 0.5;
 /// After flow was seen, this much of a way back without flow ends the pour, degrees.
 const BROUGHT_BACK_DEG: f32 = 10.0;
+/// After flow was seen, this many frames without flow and without getting on by [`PROGRESS_DEG`] end the pour: the policy stands
+/// still short of its goal.
+const STALLED_FRAMES: u32 = 90;
+/// Forward tilt that counts as getting on, degrees.
+const PROGRESS_DEG: f32 = 1.0;
 /// Less than this still to come over the lip counts as nothing, ml.
 const NOTHING_ML: f64 = 0.05;
 
@@ -101,6 +106,8 @@ pub struct Agent {
     finished: bool,
     seen_flow: bool,
     brought_back_deg: f32,
+    stalled_frames: u32,
+    advanced_deg: f32,
     carry_deg: f32,
     random: u64,
 }
@@ -124,6 +131,8 @@ impl Agent {
             finished: false,
             seen_flow: false,
             brought_back_deg: 0.0,
+            stalled_frames: 0,
+            advanced_deg: 0.0,
             carry_deg: 0.0,
             random: weights.seed,
         }
@@ -139,6 +148,8 @@ impl Agent {
         self.finished = false;
         self.seen_flow = false;
         self.brought_back_deg = 0.0;
+        self.stalled_frames = 0;
+        self.advanced_deg = 0.0;
         self.carry_deg = 0.0;
         if let Some(fused) = &mut self.fused {
             fused.restart();
@@ -177,6 +188,14 @@ impl Agent {
         self.seen_flow |= self.v_ml[0] > 0.0;
         self.brought_back_deg = if self.v_ml[0] > 0.0 || dalpha_deg > 0.0 { 0.0 } else { self.brought_back_deg - dalpha_deg };
         self.finished |= self.seen_flow && self.brought_back_deg > BROUGHT_BACK_DEG;
+        // And so has one that stands still without flow, or it would stand there for ever.
+        self.advanced_deg += dalpha_deg;
+        if self.v_ml[0] > 0.0 || self.advanced_deg >= PROGRESS_DEG {
+            (self.stalled_frames, self.advanced_deg) = (0, 0.0);
+        } else {
+            self.stalled_frames = self.stalled_frames.saturating_add(1);
+        }
+        self.finished |= self.seen_flow && self.stalled_frames >= STALLED_FRAMES;
         Decision {
             action: action as u8,
             dalpha_deg,
@@ -312,6 +331,25 @@ mod tests {
         agent.start(50.0);
         let sum: f32 = (0..100).map(|_| agent.step(frame(0.0)).dalpha_deg).sum();
         assert!((sum - 2.5).abs() < 0.06, "{sum}");
+    }
+
+    /// Protects the end of every pour: a policy that stands still short of its goal, without flow, has come to its end; one
+    /// that creeps on, still waits for its first flow, or pours has not.
+    #[test]
+    fn a_policy_that_stands_still_comes_to_its_end() {
+        let mut weights = example();
+        weights.policy = crate::policy::Mlp::ZERO;
+        for (action, flow_at_first, flow_later, ends) in
+            [(10, 100.0, 0.0, true), (12, 100.0, 0.0, false), (10, 0.0, 0.0, false), (10, 100.0, 1.0, false)]
+        {
+            weights.policy.b3 = [0.0; ACTIONS];
+            weights.policy.b3[action] = 1.0;
+            let mut agent = Agent::new(&weights);
+            agent.start(5000.0);
+            let first = agent.step(frame(flow_at_first));
+            let ended = (0..200).map(|_| agent.step(frame(flow_later))).filter(|d| d.finished).count();
+            assert_eq!((first.finished, ended > 0), (false, ends), "action {action}, then {flow_later} px^2");
+        }
     }
 
     /// Protects reproducibility of the sampling policy.

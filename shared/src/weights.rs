@@ -26,7 +26,7 @@ use crate::estimate::flow::{DELAY_MAX, FlowModel, FlowNoise, Return};
 use crate::policy::{ACTIONS, HIDDEN, INPUTS, InputScale, Mlp, nearest_action};
 
 /// Version of the file format; other versions are refused.
-pub const FORMAT_VERSION: u32 = 2;
+pub const FORMAT_VERSION: u32 = 3;
 
 const MAGIC: &[u8; 8] = b"decant-w";
 const HEADER: usize = 24;
@@ -355,23 +355,10 @@ pub(crate) mod tests {
 
     /// The same with the fused estimate.
     pub(crate) fn fused_example() -> Weights {
-        let noise = FlowNoise { lambda: 0.2, gamma: 0.025, beta: 0.015, delta: 0.3, frame: 0.08, v_min_ml: 0.01 };
-        let model = FlowModel {
-            radius_mm: 38.0,
-            height_mm: 115.0,
-            taper: 1.0,
-            flat: 0.0,
-            s: [0.0; crate::estimate::flow::KNOTS],
-            lk: -3.0,
-            p: 1.5,
-            k1: 0.2,
-            k2: -0.1,
-            tau: 2.0,
-            delay: 2.3,
-            eta: 0.1,
-            noise,
-        };
-        Weights { estimator: Estimator::Fused { model, back: Return { rate_deg: 2.0, change_deg: 1.67 } }, ..example() }
+        Weights {
+            estimator: Estimator::Fused { model: FlowModel::default(), back: Return { rate_deg: 2.0, change_deg: 1.67 } },
+            ..example()
+        }
     }
 
     /// Protects the swap: what is written is what is read, with the same identity, and no temporary file is left.

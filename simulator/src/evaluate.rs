@@ -533,6 +533,23 @@ mod tests {
         assert_eq!(pours, setup.run(Pourer::Best, &args(1)));
     }
 
+    /// Protects `--through-camera`: what is recorded and poured is seen in rendered pictures, by the feature worker's extraction,
+    /// and the policy trained on that meets its goal.
+    #[test]
+    fn a_pour_is_seen_through_the_rendered_camera() {
+        let plain = Setup::new("b", 101, 0, "cylinder", Change::None);
+        let seen = plain.clone().through_camera(101, "cylinder").unwrap();
+        let options = seen.options(MethodName::Best, Estimate::Fused, 21);
+        let (trained, data) = seen.train(&options, 3, 0).unwrap();
+        for (by_picture, by_formula) in data.iter().zip(plain.bench.record(3, plain.data_seed)) {
+            assert_eq!(by_picture.alpha_deg, by_formula.alpha_deg);
+            assert_ne!(by_picture.area_px2, by_formula.area_px2);
+        }
+        let agent = Agent::new(&trained.weights);
+        let poured = by_core(&agent, &mut seen.test.pour(300.0, seen.pour_seed), seen.limits, 300.0, 60.0, None);
+        assert!(poured.ended && poured.error_ml().abs() < 8.0, "{poured:?}");
+    }
+
     /// Protects the comparison: the oracle meets every goal, so what the others miss is theirs and not the bench's.
     #[test]
     fn the_oracle_meets_every_goal() {

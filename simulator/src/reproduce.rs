@@ -171,7 +171,7 @@ pub fn run(args: &Args) -> ExitCode {
         ]);
         let curves: Vec<Series> = runs.iter().enumerate().map(|(k, r)| Series::line(&format!("seed {}", k + 1), r.curve.clone())).collect();
         html += &figure(&plot("Adam step", "mean absolute error, ml", &curves, true), &format!("Convergence, cross-entropy {name}."));
-        let mut dots = vec![Series::line("poured = goal", vec![(0.0, 0.0), (160.0, 160.0)])];
+        let mut dots = vec![Series::reference("poured = goal", vec![(0.0, 0.0), (160.0, 160.0)])];
         dots.extend(runs.iter().enumerate().map(|(k, r)| Series::dots(&format!("seed {}", k + 1), r.pours.clone())));
         html += &figure(&plot("goal, ml", "poured, ml", &dots, true), &format!("Goal against poured, cross-entropy {name}."));
         verdicts.push((name, good, last.len()));

@@ -96,6 +96,8 @@ pub struct Worlds {
     root: DMatrix<f64>,
     onset_deg: (f64, f64),
     calibration: Calibration,
+    /// Lower root of the covariance of its log c and q: (1,1), (2,1), (2,2).
+    calibration_root: [f64; 3],
     dropouts: f64,
     /// The controller's limits.
     pub limits: Limits,
@@ -116,6 +118,9 @@ impl Worlds {
             covariance[(k, k)] += 1e-10;
         }
         let root = covariance.cholesky().map_or_else(|| DMatrix::zeros(n, n), |c| c.l());
+        let [[cc, cq], [_, qq]] = fit.calibration_covariance;
+        let c_sd = cc.max(1e-12).sqrt();
+        let calibration_root = [c_sd, cq / c_sd, (qq - cq * cq / (c_sd * c_sd)).max(0.0).sqrt()];
         let onsets = fit.episodes.iter().map(|e| e[0]);
         let low = onsets.clone().fold(f64::INFINITY, f64::min).clamp(5.0, 85.0);
         let high = onsets.fold(f64::NEG_INFINITY, f64::max).clamp(5.0, 85.0);
@@ -124,6 +129,7 @@ impl Worlds {
             root,
             onset_deg: ((low - 8.0).max(3.0), (high + 5.0).min(88.0)),
             calibration: fit.calibration,
+            calibration_root,
             dropouts: fit.dropouts.min(0.2),
             limits,
             back: Return::new(&limits, rate_hz),
@@ -146,6 +152,9 @@ impl Worlds {
         model.delay = (model.delay + 0.3 * normal()).clamp(0.0, 12.0);
         model.eta = (model.eta + 0.02 * normal()).clamp(0.0, 0.4);
         let gain = 1.0 + 0.015 * normal();
+        let [l11, l21, l22] = self.calibration_root;
+        let (z_c, z_q) = (normal(), normal());
+        let miscalibrated = (l11 * z_c, l21 * z_c + l22 * z_q);
         let flow = Flow::new(&model);
         let onset = rng.random_range(self.onset_deg.0..self.onset_deg.1);
         let x_ml = flow.capacity_ml(onset);
@@ -155,9 +164,11 @@ impl Worlds {
             worlds: self,
             flow,
             gain,
+            miscalibrated,
             goal_ml,
             state: FlowState { x_ml, ..FlowState::default() },
             poured_ml: 0.0,
+            believed_ml: 0.0,
             summed_ml: 0.0,
             history: [0.0; HISTORY],
             limiter: Limiter::new(self.limits, (1.0 / self.rate_hz) as f32, 0.0),
@@ -174,10 +185,14 @@ pub struct ModelPour<'a> {
     worlds: &'a Worlds,
     flow: Flow,
     gain: f64,
+    /// How far the calibration's log c and q are off.
+    miscalibrated: (f64, f64),
     /// V_G, ml.
     pub goal_ml: f64,
     state: FlowState,
     poured_ml: f64,
+    /// What a fused estimate takes `poured_ml` for.
+    believed_ml: f64,
     summed_ml: f64,
     history: [f64; HISTORY],
     limiter: Limiter,
@@ -214,6 +229,9 @@ impl ModelPour<'_> {
         // Through the area and the hold, as at run time.
         let cal = &self.worlds.calibration;
         let at_1_px2 = f64::from(cal.volume_ml(1.0, alpha as f32));
+        // The calibration is surest at the flows that the episodes showed; a law that pours at those meets its goal better.
+        let log_area = (out.max(1e-6) / at_1_px2).ln() / f64::from(cal.q);
+        self.believed_ml += out * (self.miscalibrated.0 + self.miscalibrated.1 * log_area).clamp(-0.7, 0.7).exp();
         let area = if seen > 0.0 { (seen / at_1_px2).powf(1.0 / f64::from(cal.q)) as f32 } else { 0.0 };
         let v = f64::from(cal.volume_ml(self.hold.step(Some(area), cal.hold_above_px2), alpha as f32));
         self.v_ml = [v, self.v_ml[0], self.v_ml[1]];
@@ -221,7 +239,7 @@ impl ModelPour<'_> {
         if self.worlds.fused {
             let stop =
                 if self.poured_ml > 0.0 { self.flow.stop_volume_ml(&self.state, &self.history, alpha, self.worlds.back) } else { 0.0 };
-            self.goal_ml - self.poured_ml - stop
+            self.goal_ml - self.believed_ml - stop
         } else {
             self.goal_ml - self.summed_ml
         }
@@ -232,8 +250,7 @@ impl ModelPour<'_> {
         self.state.x_ml >= self.flow.capacity_ml(self.state.a_deg) && self.limiter.rate_deg_s() < 0.0
     }
 
-    /// What will be on the scale minus what is to be there, as far as control can know (measured volume without the plain
-    /// sum's gain error), ml.
+    /// What will be on the scale minus what is to be there, ml.
     pub fn error_ml(&self) -> f64 {
         self.poured_ml + self.state.film_ml - self.goal_ml
     }

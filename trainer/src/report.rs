@@ -25,6 +25,17 @@ pub struct Args {
     out: PathBuf,
 }
 
+/// How a series is drawn.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Look {
+    /// Joined by a line.
+    Line,
+    /// Dots.
+    Dots,
+    /// A thin dark line that the others are compared with; it takes none of their colours.
+    Reference,
+}
+
 /// A line or a cloud of points.
 #[derive(Debug, Clone)]
 pub struct Series {
@@ -32,18 +43,22 @@ pub struct Series {
     pub name: String,
     /// Points.
     pub points: Vec<(f64, f64)>,
-    /// Joined by a line, or only dots.
-    pub line: bool,
+    /// How it is drawn.
+    pub look: Look,
 }
 
 impl Series {
     /// Joined points.
     pub fn line(name: &str, points: Vec<(f64, f64)>) -> Self {
-        Self { name: name.into(), points, line: true }
+        Self { name: name.into(), points, look: Look::Line }
     }
     /// Dots.
     pub fn dots(name: &str, points: Vec<(f64, f64)>) -> Self {
-        Self { name: name.into(), points, line: false }
+        Self { name: name.into(), points, look: Look::Dots }
+    }
+    /// What the others are compared with.
+    pub fn reference(name: &str, points: Vec<(f64, f64)>) -> Self {
+        Self { name: name.into(), points, look: Look::Reference }
     }
 }
 
@@ -59,14 +74,33 @@ const COLOURS: [RGBColor; 8] = [
     RGBColor(160, 110, 60),
 ];
 
-/// A plot as an SVG element. Axes include all points, and 0 on the y-axis if `from_zero`.
+/// Of a reference.
+const DARK: RGBColor = RGBColor(20, 20, 20);
+
+/// The colour of each series.
+fn colours(series: &[Series]) -> Vec<RGBColor> {
+    let mut free = COLOURS.iter().cycle();
+    series.iter().map(|s| if s.look == Look::Reference { DARK } else { *free.next().unwrap_or(&DARK) }).collect()
+}
+
+/// A plot as an SVG element, its legend below it. Axes include all points, and 0 on the y-axis if `from_zero`.
 pub fn plot(x_title: &str, y_title: &str, series: &[Series], from_zero: bool) -> String {
     let mut svg = String::new();
     if draw(&mut svg, x_title, y_title, series, from_zero).is_err() {
         return "<p>(this plot could not be drawn)</p>".into();
     }
     // Inline in HTML the XML prologue is not allowed.
-    svg.find("<svg").map_or(svg.clone(), |at| svg[at..].to_owned())
+    let svg = svg.find("<svg").map_or(svg.clone(), |at| svg[at..].to_owned());
+    if series.len() < 2 {
+        return svg;
+    }
+    // Below, where it hides no curve; characters, because browsers print no backgrounds.
+    let entry = |(s, RGBColor(r, g, b)): (&Series, RGBColor)| {
+        let mark = if s.look == Look::Dots { '\u{25cf}' } else { '\u{25ac}' };
+        format!("<span><b style=\"color:#{r:02x}{g:02x}{b:02x}\">{mark}</b> {}</span> ", escape(&s.name))
+    };
+    let entries: String = series.iter().zip(colours(series)).map(entry).collect();
+    format!("{svg}<div class=legend>{entries}</div>")
 }
 
 fn draw(svg: &mut String, x_title: &str, y_title: &str, series: &[Series], from_zero: bool) -> Result<(), Box<dyn std::error::Error>> {
@@ -98,25 +132,13 @@ fn draw(svg: &mut String, x_title: &str, y_title: &str, series: &[Series], from_
         .y_desc(y_title)
         .label_style(("sans-serif", 13))
         .draw()?;
-    for (k, s) in series.iter().enumerate() {
-        let colour = COLOURS[k % COLOURS.len()];
+    for (s, colour) in series.iter().zip(colours(series)) {
         let points = s.points.iter().copied().filter(|(x, y)| x.is_finite() && y.is_finite());
-        let drawn = if s.line {
-            chart.draw_series(LineSeries::new(points, colour.stroke_width(2)))?
-        } else {
-            chart.draw_series(points.map(|p| Circle::new(p, 2, colour.mix(0.55).filled())))?
+        match s.look {
+            Look::Line => chart.draw_series(LineSeries::new(points, colour.stroke_width(2)))?,
+            Look::Reference => chart.draw_series(LineSeries::new(points, colour.stroke_width(1)))?,
+            Look::Dots => chart.draw_series(points.map(|p| Circle::new(p, 2, colour.mix(0.55).filled())))?,
         };
-        drawn.label(s.name.clone()).legend(move |(x, y)| Rectangle::new([(x, y - 4), (x + 12, y + 4)], colour.filled()));
-    }
-    if series.len() > 1 {
-        let position = SeriesLabelPosition::UpperLeft;
-        chart
-            .configure_series_labels()
-            .position(position)
-            .background_style(WHITE.mix(0.85))
-            .border_style(RGBColor(200, 200, 200))
-            .label_font(("sans-serif", 13))
-            .draw()?;
     }
     root.present()?;
     Ok(())
@@ -164,7 +186,7 @@ h1{{font-size:1.6rem}}h2{{font-size:1.25rem;margin-top:2.2rem;border-bottom:1px 
 table{{border-collapse:collapse;margin:1rem 0;font-size:.92rem}}th,td{{padding:.25rem .6rem;border-bottom:1px solid #ddd;text-align:right}}\
 th:first-child,td:first-child{{text-align:left}}th{{background:#f2f4f7}}\
 .plots{{display:flex;flex-wrap:wrap;gap:1rem}}figure{{margin:0;flex:1 1 30rem;max-width:40rem;break-inside:avoid}}\
-figure svg{{width:100%;height:auto}}figcaption{{font-size:.9rem;color:#444}}code{{font-size:.85em}}\
+figure svg{{width:100%;height:auto}}figcaption{{font-size:.9rem;color:#444}}.legend{{font-size:.85rem}}.legend span{{margin-right:.9em;white-space:nowrap}}code{{font-size:.85em}}\
 @media print{{body{{max-width:none;margin:0}}h2{{break-after:avoid}}figure{{flex-basis:45%}}}}\
 </style></head><body><h1>{title}</h1>{body}</body></html>\n",
         title = escape(title)
@@ -289,7 +311,8 @@ fn evaluation(v: &Value) -> String {
         ]);
     }
     html += &table(&rows);
-    let (mut scatter, mut bars) = (Vec::new(), Vec::new());
+    let mut scatter = vec![Series::reference("poured = goal", vec![(0.0, 0.0), (200.0, 200.0)])];
+    let mut bars = Vec::new();
     for m in v["pours"].as_array().into_iter().flatten() {
         let pours: Vec<&Value> = m["groups"].as_array().into_iter().flatten().flat_map(|g| g.as_array().into_iter().flatten()).collect();
         let value = |p: &Value, key: &str| p[key].as_f64().unwrap_or(f64::NAN);

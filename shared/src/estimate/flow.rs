@@ -8,7 +8,8 @@
 //! w(a)  = exp(s(a)) w_0(a; R, H, taper)                                  ml of capacity lost a degree, s linear between knots
 //! W(a)  = integral of w from 0 to a
 //! e     = max(0, W(a) - X)                                               liquid above the lip; W(a) = X where flow starts
-//! v     = min(e/2, exp(lk + lambda + k1 z + k2 z^2) (e / max(w, 1))^p)   over the lip, z = clip((a - 60)/30, -1.8, 1.5)
+//! A(a)  = max(exp(2/3 s(a)) A_0(a; R, H, taper), A_MIN)                  free surface at the brim
+//! v     = min(e/2, exp(lk + lambda + k1 z + k2 z^2) (e / A)^p)           a weir under the head e/A, z = clip((a - 60)/30, -1.8, 1.5)
 //! X    += e^beta v
 //! F    += eta v;  drip = F/9;  F -= drip                                 film
 //! out   = (1 - eta) v + drip                                             leaves the lip
@@ -17,7 +18,8 @@
 //! w_0 is that of a round vessel with straight walls: the plane of the liquid turns about the lip, so
 //! `w_0 = integral of (distance from the lip) dA` over the free surface, a degree. A share `flat` of it is replaced by the
 //! same capacity spread evenly over all tilts, for vessels that are anything but straight: beyond the horizontal a beaker is
-//! empty, a bottle is not. What the vessel really is, s says.
+//! empty, a bottle is not. What the vessel really is, s says. A_0 is the free surface of the same straight vessel, mixed
+//! likewise; where a vessel holds more than that, its surface is larger too, as an area is to a volume.
 
 use serde::{Deserialize, Serialize};
 
@@ -27,6 +29,8 @@ pub const KNOTS_DEG: [f64; KNOTS] = [20.0, 35.0, 45.0, 55.0, 65.0, 75.0, 85.0, 9
 pub const KNOTS: usize = 9;
 /// Least w_0, ml a degree: beyond the horizontal a straight cup is empty, other vessels are not.
 const W_MIN: f64 = 0.2;
+/// Least free surface A, mm^2: a lip is some 15 mm wide, and the liquid reaches a little way back from it.
+const A_MIN_MM2: f64 = 300.0;
 /// Nodes of the integral over the free surface.
 const NODES: usize = 64;
 /// Largest change of the tilt in a frame, degrees: no robot turns a full container faster.
@@ -53,9 +57,9 @@ pub struct FlowModel {
     pub flat: f64,
     /// s at [`KNOTS_DEG`]: logarithm of the real vessel's w over w_0.
     pub s: [f64; KNOTS],
-    /// Logarithm of the flow at an excess worth one degree, at 60 degrees, ml a frame.
+    /// Logarithm of the flow under a head of 1 mm, at 60 degrees, ml a frame.
     pub lk: f64,
-    /// Exponent of the flow.
+    /// Exponent of the head; 1.5 for a weir.
     pub p: f64,
     /// Change of lk with the angle, linear.
     pub k1: f64,
@@ -69,6 +73,27 @@ pub struct FlowModel {
     pub eta: f64,
     /// Uncertainties.
     pub noise: FlowNoise,
+}
+
+impl Default for FlowModel {
+    /// A beaker of 38 x 115 mm filled with water.
+    fn default() -> Self {
+        Self {
+            radius_mm: 38.0,
+            height_mm: 115.0,
+            taper: 1.0,
+            flat: 0.0,
+            s: [0.0; KNOTS],
+            lk: -3.0,
+            p: 1.5,
+            k1: 0.1,
+            k2: -0.05,
+            tau: 2.0,
+            delay: 2.3,
+            eta: 0.1,
+            noise: FlowNoise { lambda: 0.15, gamma: 0.025, beta: 0.015, delta: 0.3, frame: 0.08, v_min_ml: 0.01 },
+        }
+    }
 }
 
 /// How far the model can be off in one pour and one frame (standard deviations).
@@ -123,9 +148,11 @@ impl Flow {
         let mut flow = Self { model: *model, w: [0.0; ENTRIES], capacity: [0.0; ENTRIES], log_k: [0.0; ENTRIES] };
         for k in 0..ENTRIES {
             let a = k as f64 * STEP_DEG;
-            flow.w[k] = model.w(a);
+            let (w, surface_mm2) = model.vessel(a);
+            flow.w[k] = w;
             let z = ((a - 60.0) / 30.0).clamp(-1.8, 1.5);
-            flow.log_k[k] = model.lk + model.k1 * z + model.k2 * z * z - model.p * flow.w[k].max(1.0).ln();
+            // e/A in mm, e in ml.
+            flow.log_k[k] = model.lk + model.k1 * z + model.k2 * z * z - model.p * (surface_mm2 / 1000.0).ln();
             if k > 0 {
                 flow.capacity[k] = flow.capacity[k - 1] + 0.5 * STEP_DEG * (flow.w[k - 1] + flow.w[k]);
             }
@@ -268,8 +295,8 @@ impl Return {
 }
 
 impl FlowModel {
-    /// w(a), ml a degree.
-    pub fn w(&self, a_deg: f64) -> f64 {
+    /// (w(a) in ml a degree, A(a) in mm^2).
+    pub fn vessel(&self, a_deg: f64) -> (f64, f64) {
         let k = KNOTS_DEG.partition_point(|knot| *knot <= a_deg);
         let s = if k == 0 {
             self.s[0]
@@ -279,10 +306,13 @@ impl FlowModel {
             let f = (a_deg - KNOTS_DEG[k - 1]) / (KNOTS_DEG[k] - KNOTS_DEG[k - 1]);
             self.s[k - 1] + f * (self.s[k] - self.s[k - 1])
         };
-        // The volume of the straight vessel over its 90 degrees.
+        // The volume of the straight vessel over its 90 degrees; the surface that this is when it turns about R.
         let t = self.taper;
         let even = std::f64::consts::PI * self.radius_mm * self.radius_mm * self.height_mm * (1.0 + t + t * t) / 3.0 / 90.0 / 1000.0;
-        s.exp() * ((1.0 - self.flat) * self.straight(a_deg).0 + self.flat * even).max(W_MIN)
+        let even_mm2 = even * 1000.0 / (self.radius_mm * 1f64.to_radians());
+        let (w, surface_mm2) = self.straight(a_deg);
+        let mixed = |straight: f64, even: f64| (1.0 - self.flat) * straight + self.flat * even;
+        (s.exp() * mixed(w, even).max(W_MIN), ((2.0 / 3.0 * s).exp() * mixed(surface_mm2, even_mm2)).max(A_MIN_MM2))
     }
 
     /// (w_0 in ml a degree, free surface in mm^2) of the straight-walled vessel.

@@ -409,28 +409,10 @@ fn dot(a: &[f64; N], b: &[f64; N]) -> f64 {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::estimate::flow::{FlowModel, FlowNoise, KNOTS};
+    use crate::estimate::flow::FlowModel;
     use proptest::prelude::*;
 
     const BACK: Return = Return { rate_deg: 2.0, change_deg: 1.67 };
-
-    fn model() -> FlowModel {
-        FlowModel {
-            radius_mm: 38.0,
-            height_mm: 115.0,
-            taper: 1.0,
-            flat: 0.0,
-            s: [0.0; KNOTS],
-            lk: -3.0,
-            p: 1.5,
-            k1: 0.2,
-            k2: -0.1,
-            tau: 2.0,
-            delay: 2.3,
-            eta: 0.1,
-            noise: FlowNoise { lambda: 0.2, gamma: 0.025, beta: 0.015, delta: 0.3, frame: 0.08, v_min_ml: 0.01 },
-        }
-    }
 
     /// The model itself, poured: commands in, outflow a frame out.
     struct Vessel {
@@ -444,7 +426,7 @@ mod tests {
 
     impl Vessel {
         fn new(onset_deg: f64) -> Self {
-            let flow = Flow::new(&model());
+            let flow = Flow::new(&FlowModel::default());
             let x = flow.capacity_ml(onset_deg);
             Self { flow, a: 0.0, x, film: 0.0, poured: 0.0, history: [0.0; HISTORY] }
         }
@@ -463,19 +445,53 @@ mod tests {
         }
     }
 
-    /// A pour that rises, holds, and returns; the camera's gain is off by `gain`. (true, camera's sum, fused), ml.
-    fn pour(gain: f64) -> (f64, f64, f64) {
+    /// A pour that rises, holds, and returns; the camera's gain is off by `gain`, the picture `late` frames later than the model
+    /// knows. (true, camera's sum, filter), ml.
+    fn pour_into(mut filter: Fused, gain: f64, late: usize) -> (f64, f64, Fused) {
         let mut vessel = Vessel::new(50.0);
-        let mut filter = Fused::new(Flow::new(&model()), BACK);
+        let mut seen = std::collections::VecDeque::from(vec![0.0; late]);
         let mut alpha: f64 = 0.0;
         let mut summed = 0.0;
         for k in 0..400 {
             alpha = if k < 220 { (alpha + if vessel.poured < 1.0 { 0.6 } else { 0.12 }).min(72.0) } else { (alpha - 2.0).max(0.0) };
-            let y = gain * vessel.frame(alpha);
+            seen.push_back(gain * vessel.frame(alpha));
+            let y = seen.pop_front().unwrap();
             summed += y;
             filter.step(Some(if y < 0.01 { 0.0 } else { y }), alpha);
         }
-        (vessel.poured, summed, filter.poured_ml())
+        (vessel.poured, summed, filter)
+    }
+
+    fn pour(gain: f64) -> (f64, f64, f64) {
+        let (truth, summed, filter) = pour_into(Fused::new(Flow::new(&FlowModel::default()), BACK), gain, 0);
+        (truth, summed, filter.poured_ml())
+    }
+
+    /// Protects the three explanations: each pour makes the one that fits it more likely than the pour before did: nothing changed,
+    /// the camera's gain changed, the picture comes late.
+    #[test]
+    fn a_pour_moves_weight_to_what_explains_it() {
+        let of = |gain: f64, late: usize| pour_into(Fused::new(Flow::new(&FlowModel::default()), BACK), gain, late).2.explanations();
+        let (usual, gain, late) = (of(1.0, 0), of(1.25, 0), of(1.0, 3));
+        assert!(usual[0] > PRIOR[0] && usual[0] > gain[0] && usual[0] > late[0], "{usual:?}");
+        assert!(gain[1] > 2.0 * usual[1] && gain[1] > late[1], "{usual:?} {gain:?} {late:?}");
+        assert!(late[2] > 2.0 * usual[2] && late[2] > gain[2], "{usual:?} {gain:?} {late:?}");
+        for weights in [usual, gain, late] {
+            assert!((weights.iter().sum::<f64>() - 1.0).abs() < 1e-9);
+        }
+    }
+
+    /// Protects the volume from a geometry that is wrong and sure of itself: the estimate stays near the camera's own sum.
+    #[test]
+    fn the_estimate_stays_near_the_cameras_sum() {
+        let mut wrong = FlowModel { radius_mm: 24.0, ..FlowModel::default() };
+        wrong.noise.beta = 1e-3;
+        let mut filter = Fused::new(Flow::new(&wrong), BACK);
+        (filter.filters[1].noise.gamma, filter.filters[2].noise.beta) = (wrong.noise.gamma, wrong.noise.beta);
+        let (_, summed, filter) = pour_into(filter, 1.0, 0);
+        let most = CAMERA_SDS * wrong.noise.gamma * summed + CAMERA_ML;
+        assert!((filter.mean(POURED) - summed).abs() > 1.2 * most, "not wrong enough: {} {summed}", filter.mean(POURED));
+        assert!((filter.poured_ml() - summed).abs() < most + 0.1, "{} {summed} {most}", filter.poured_ml());
     }
 
     /// Protects the point of fusing: geometry corrects a camera whose gain is off, which the sum cannot.
@@ -493,7 +509,7 @@ mod tests {
     #[test]
     fn the_stop_volume_is_what_still_flows() {
         let mut vessel = Vessel::new(50.0);
-        let mut filter = Fused::new(Flow::new(&model()), BACK);
+        let mut filter = Fused::new(Flow::new(&FlowModel::default()), BACK);
         let mut alpha = 0.0;
         for _ in 0..118 {
             alpha += 0.5;
@@ -516,7 +532,7 @@ mod tests {
     fn lost_frames_are_bridged() {
         let run = |lose: bool| {
             let mut vessel = Vessel::new(50.0);
-            let mut filter = Fused::new(Flow::new(&model()), BACK);
+            let mut filter = Fused::new(Flow::new(&FlowModel::default()), BACK);
             for k in 0..170 {
                 let alpha = (0.6 * f64::from(k)).min(60.0);
                 let y = vessel.frame(alpha);
@@ -533,7 +549,7 @@ mod tests {
         /// Protects the loop: no measurement or angle, however wild, makes the filter panic or lose its numbers.
         #[test]
         fn any_input_leaves_finite_numbers(frames in prop::collection::vec((prop::option::of(prop_oneof![any::<f64>(), 0.0f64..3.0]), prop_oneof![any::<f64>(), 0.0f64..110.0]), 1..200)) {
-            let mut filter = Fused::new(Flow::new(&model()), BACK);
+            let mut filter = Fused::new(Flow::new(&FlowModel::default()), BACK);
             for (y, alpha) in frames {
                 filter.step(y, alpha);
                 prop_assert!(filter.poured_ml().is_finite() && filter.poured_sd_ml().is_finite());

@@ -3,34 +3,15 @@
 use rand::{RngExt, SeedableRng};
 use rand_distr::{Distribution, StandardNormal};
 use rand_pcg::Pcg64Mcg;
-use shared::estimate::flow::{DRIP, Flow, FlowModel, FlowNoise, HISTORY, KNOTS};
+use shared::estimate::flow::{DRIP, Flow, FlowModel, HISTORY};
 use trainer::data::TrainingEpisode;
-
-/// A beaker of 38 x 115 mm, a camera with exponent 1.2.
-pub fn model() -> FlowModel {
-    FlowModel {
-        radius_mm: 38.0,
-        height_mm: 115.0,
-        taper: 1.0,
-        flat: 0.0,
-        s: [0.0; KNOTS],
-        lk: -3.0,
-        p: 1.5,
-        k1: 0.2,
-        k2: -0.1,
-        tau: 2.0,
-        delay: 2.3,
-        eta: 0.1,
-        noise: FlowNoise { lambda: 0.2, gamma: 0.02, beta: 0.01, delta: 0.3, frame: 0.08, v_min_ml: 0.02 },
-    }
-}
 
 /// c and q of the camera.
 pub const CAMERA: (f64, f64) = (0.0012, 1.2);
 
 /// `n` curves of eq. (1) from different volumes, weighed to the gram.
 pub fn episodes(n: usize, seed: u64) -> Vec<TrainingEpisode> {
-    let flow = Flow::new(&model());
+    let flow = Flow::new(&FlowModel::default());
     let mut rng = Pcg64Mcg::seed_from_u64(seed);
     (0..n)
         .map(|k| {
