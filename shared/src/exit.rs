@@ -20,12 +20,6 @@ pub const INTERRUPTED: u8 = 130;
 pub const HELP: &str = "Exit codes: 0 done, 1 failed, 2 bad command line, configuration or input file, 3 another part of the cell \
 cannot be reached, 4 the pour ended early, 5 refused, 130 interrupted.";
 
-/// Prints one line to standard error and gives the exit code.
-pub fn fail(code: u8, what: impl Display) -> ExitCode {
-    eprintln!("error: {what}");
-    ExitCode::from(code)
-}
-
 /// Why a command ends without success: its exit code and its one line.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Failure {
@@ -56,6 +50,9 @@ impl<T, E: Display> OrExit<T> for Result<T, E> {
 pub fn end(result: Result<(), Failure>) -> ExitCode {
     match result {
         Ok(()) => ExitCode::SUCCESS,
-        Err(Failure { code, what }) => fail(code, what),
+        Err(Failure { code, what }) => {
+            eprintln!("error: {what}");
+            ExitCode::from(code)
+        }
     }
 }

@@ -4,7 +4,6 @@
 //! Training sees only the episodes; the truth is used for nothing but the error.
 
 use std::path::PathBuf;
-use std::process::ExitCode;
 
 use indicatif::{ParallelProgressIterator, ProgressBar, ProgressStyle};
 use rand::{RngExt, SeedableRng};
@@ -12,7 +11,7 @@ use rand_pcg::Pcg64Mcg;
 use rayon::prelude::*;
 use serde::Serialize;
 use shared::agent::Agent;
-use shared::exit;
+use shared::exit::{self, Failure, OrExit as _, failure};
 use shared::limits::Limits;
 use shared::weights::Weights;
 use trainer::data::TrainingEpisode;
@@ -420,20 +419,17 @@ impl Setup {
     }
 }
 
-/// Runs the command; the exit codes are those of [`shared::exit`].
-pub fn run(args: &Args) -> ExitCode {
+/// Runs the command.
+pub fn run(args: &Args) -> Result<(), Failure> {
     if args.through_camera && args.sim == "a" {
-        return exit::fail(exit::BAD_INPUT, "--through-camera goes with --sim b: simulator a has nothing to look at");
+        return Err(failure(exit::BAD_INPUT, "--through-camera goes with --sim b: simulator a has nothing to look at"));
     }
     if args.actions != 2 && args.actions != 21 {
-        return exit::fail(exit::BAD_INPUT, "--actions is 2 or 21");
+        return Err(failure(exit::BAD_INPUT, "--actions is 2 or 21"));
     }
     let mut files = Vec::new();
     for file in &args.weights {
-        match Weights::read(file) {
-            Ok(weights) => files.push((file.display().to_string(), weights)),
-            Err(e) => return exit::fail(exit::BAD_INPUT, e),
-        }
+        files.push((file.display().to_string(), Weights::read(file).or_exit(exit::BAD_INPUT)?));
     }
     let rigs = if args.sim == "a" { 0..1 } else { args.first_rig..args.first_rig + args.rigs };
     let setups: Result<Vec<Setup>, String> = rigs
@@ -443,10 +439,7 @@ pub fn run(args: &Args) -> ExitCode {
             if args.through_camera { setup.through_camera(rig, &args.container) } else { Ok(setup) }
         })
         .collect();
-    let setups = match setups {
-        Ok(setups) => setups,
-        Err(e) => return exit::fail(exit::FAILED, e),
-    };
+    let setups = setups.or_exit(exit::FAILED)?;
     let begin = std::time::Instant::now();
     let mut summaries = Vec::new();
     let mut all = Vec::new();
@@ -500,11 +493,9 @@ pub fn run(args: &Args) -> ExitCode {
             "pours": all.iter().map(|(name, groups)| serde_json::json!({"name": name, "groups": groups})).collect::<Vec<_>>(),
         });
         let text = serde_json::to_string(&report).unwrap_or_default();
-        if let Err(e) = std::fs::write(file, text) {
-            return exit::fail(exit::FAILED, format!("{}: {e}", file.display()));
-        }
+        std::fs::write(file, text).map_err(|e| format!("{}: {e}", file.display())).or_exit(exit::FAILED)?;
     }
-    ExitCode::SUCCESS
+    Ok(())
 }
 
 #[cfg(test)]

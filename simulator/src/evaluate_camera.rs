@@ -8,7 +8,6 @@
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
-use std::process::ExitCode;
 
 use feature_worker::calibrate::ColourLearner;
 use feature_worker::extract::{Axes, Extractor, Image, Measurement};
@@ -22,7 +21,7 @@ use rand::{RngExt, SeedableRng};
 use rand_pcg::Pcg64Mcg;
 use serde::Serialize;
 use shared::config::{CameraConfig, CameraSource, ImageConfig, LiquidMethod};
-use shared::exit;
+use shared::exit::{self, OrExit as _};
 use shared::messages::{Doubt, PixelFormat};
 
 use crate::camera::{Background, Renderer, Scene, Truth, View};
@@ -115,12 +114,9 @@ struct Case {
 
 type Failure = Box<dyn std::error::Error>;
 
-/// Runs the command; the exit codes are those of [`shared::exit`].
-pub fn run(args: &Args) -> ExitCode {
-    match evaluate(args) {
-        Ok(()) => ExitCode::SUCCESS,
-        Err(e) => exit::fail(exit::FAILED, e),
-    }
+/// Runs the command.
+pub fn run(args: &Args) -> Result<(), exit::Failure> {
+    evaluate(args).or_exit(exit::FAILED)
 }
 
 /// The `[camera]` table of a view.

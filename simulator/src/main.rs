@@ -36,15 +36,15 @@ enum Command {
 }
 
 fn main() -> ExitCode {
-    match Cli::parse().command {
-        Command::Run(args) => shared::exit::end(cell::run(&args)),
-        Command::Operator(args) => shared::exit::end(operator::run(&args)),
-        Command::Demo(args) => shared::exit::end(demo::run(&args)),
+    shared::exit::end(match Cli::parse().command {
+        Command::Run(args) => cell::run(&args),
+        Command::Operator(args) => operator::run(&args),
+        Command::Demo(args) => demo::run(&args),
         Command::Evaluate(args) => evaluate::run(&args),
         Command::Reproduce(args) => reproduce::run(&args),
         Command::EvaluateCamera(args) => evaluate_camera::run(&args),
-        Command::Jitter(args) => shared::exit::end(jitter::run(&args)),
-        Command::Motion(args) => shared::exit::end(motion::run(&args)),
-        Command::Ur(args) => shared::exit::end(ur_command::run(&args)),
-    }
+        Command::Jitter(args) => jitter::run(&args),
+        Command::Motion(args) => motion::run(&args),
+        Command::Ur(args) => ur_command::run(&args),
+    })
 }

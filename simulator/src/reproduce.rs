@@ -6,12 +6,11 @@
 //! The same arguments give the same numbers.
 
 use std::path::PathBuf;
-use std::process::ExitCode;
 
 use rand::{RngExt, SeedableRng};
 use rand_pcg::Pcg64Mcg;
 use rayon::prelude::*;
-use shared::exit;
+use shared::exit::{self, Failure, OrExit as _};
 use shared::policy::InputScale;
 use trainer::eq8::{DELTA, KERAS_CLIP, LAMBDA, reward};
 use trainer::net::{Adam, Net, Sample};
@@ -134,8 +133,8 @@ fn run_once(top: usize, clip: Option<f32>, steps: usize, seed: u64) -> Run {
     Run { curve, pours }
 }
 
-/// Runs the command; the exit codes are those of [`shared::exit`].
-pub fn run(args: &Args) -> ExitCode {
+/// Runs the command.
+pub fn run(args: &Args) -> Result<(), Failure> {
     let poured = |top: usize| triangle(top).1.iter().sum::<f64>();
     let far = |top: usize| (poured(top) - args.weight).abs();
     let top = (50..=100).min_by(|a, b| far(*a).total_cmp(&far(*b))).unwrap_or(70);
@@ -197,9 +196,7 @@ pub fn run(args: &Args) -> ExitCode {
     let page = || trainer::report::page("Decant: section 4 of the paper", &html);
     let files = [(args.html.as_ref(), page()), (args.json.as_ref(), report.to_string())];
     for (file, text) in files.iter().filter_map(|(f, t)| f.map(|f| (f, t))) {
-        if let Err(e) = std::fs::write(file, text) {
-            return exit::fail(exit::FAILED, format!("{}: {e}", file.display()));
-        }
+        std::fs::write(file, text).map_err(|e| format!("{}: {e}", file.display())).or_exit(exit::FAILED)?;
     }
-    ExitCode::SUCCESS
+    Ok(())
 }

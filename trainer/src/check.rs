@@ -3,11 +3,10 @@
 //! Offline, ordinary thread, allocates.
 
 use std::path::PathBuf;
-use std::process::ExitCode;
 
 use serde::Serialize;
 use shared::episode::Episode;
-use shared::exit;
+use shared::exit::{self, Failure, OrExit as _, failure};
 use shared::messages::Doubt;
 
 use crate::consistency;
@@ -108,12 +107,9 @@ fn set_doubts(episodes: &[TrainingEpisode]) -> Vec<(String, String)> {
     doubts
 }
 
-/// Runs the command; the exit codes are those of [`shared::exit`]: 0 nothing found, 1 something found, 2 cannot be read.
-pub fn run(args: &Args) -> ExitCode {
-    let episodes = match data::read(&args.episodes, args.scale.as_deref()) {
-        Ok(episodes) => episodes,
-        Err(e) => return exit::fail(exit::BAD_INPUT, e),
-    };
+/// Runs the command: fails when something was found (exit code 1), or nothing can be read (2).
+pub fn run(args: &Args) -> Result<(), Failure> {
+    let episodes = data::read(&args.episodes, args.scale.as_deref()).or_exit(exit::BAD_INPUT)?;
     let findings = check(&episodes);
     if args.json {
         println!("{}", serde_json::to_string_pretty(&findings).unwrap_or_default());
@@ -127,5 +123,5 @@ pub fn run(args: &Args) -> ExitCode {
         }
     }
     let wrong = !findings.left_out.is_empty() || findings.doubts.iter().any(|(name, _)| name != "data set") || findings.usable == 0;
-    if wrong { ExitCode::from(exit::FAILED) } else { ExitCode::SUCCESS }
+    if wrong { Err(failure(exit::FAILED, "the data set is not as it should be")) } else { Ok(()) }
 }

@@ -3,9 +3,8 @@
 //! Offline, ordinary thread, allocates.
 
 use std::path::PathBuf;
-use std::process::ExitCode;
 
-use shared::exit;
+use shared::exit::{self, Failure, OrExit as _};
 use shared::policy::{ACTIONS, HIDDEN, INPUTS, PARAMETERS};
 use shared::weights::{Estimator, FORMAT_VERSION, Weights};
 
@@ -22,12 +21,9 @@ pub struct Args {
     json: bool,
 }
 
-/// Runs the command; the exit codes are those of [`shared::exit`].
-pub fn run(args: &Args) -> ExitCode {
-    let w = match Weights::read(&args.weights) {
-        Ok(w) => w,
-        Err(e) => return exit::fail(exit::BAD_INPUT, e),
-    };
+/// Runs the command.
+pub fn run(args: &Args) -> Result<(), Failure> {
+    let w = Weights::read(&args.weights).or_exit(exit::BAD_INPUT)?;
     let data: String = w.origin.data_sha256.iter().map(|b| format!("{b:02x}")).collect();
     if args.json {
         let all = serde_json::json!({
@@ -35,7 +31,7 @@ pub fn run(args: &Args) -> ExitCode {
             "identity": w.identity(), "data_sha256": data, "weights": w,
         });
         println!("{}", serde_json::to_string_pretty(&all).unwrap_or_default());
-        return ExitCode::SUCCESS;
+        return Ok(());
     }
     println!("{}: identity {}, format version {FORMAT_VERSION}", args.weights.display(), w.identity());
     println!("trained     method {:?}, {} actions, {} episodes, seed {}", w.origin.method, w.origin.actions, w.origin.episodes, w.seed);
@@ -65,5 +61,5 @@ pub fn run(args: &Args) -> ExitCode {
         }
     }
     println!("all 1909 parameters: --json");
-    ExitCode::SUCCESS
+    Ok(())
 }

@@ -28,11 +28,11 @@ enum Command {
 }
 
 fn main() -> ExitCode {
-    match Cli::parse().command {
+    shared::exit::end(match Cli::parse().command {
         Command::Train(args) => train::run(&args),
         Command::Refine(args) => refine::run(&args),
         Command::Inspect(args) => inspect::run(&args),
         Command::Check(args) => check::run(&args),
         Command::Report(args) => report::run(&args),
-    }
+    })
 }

@@ -6,10 +6,9 @@
 
 use std::io::{BufRead, IsTerminal, Write};
 use std::path::PathBuf;
-use std::process::ExitCode;
 
 use shared::episode::{Episode, Kind};
-use shared::exit;
+use shared::exit::{self, Failure, OrExit as _, failure};
 
 use crate::consistency;
 use crate::data;
@@ -66,16 +65,10 @@ pub fn pours(episodes: &[Episode]) -> Vec<(usize, f64, f64, f64)> {
         .collect()
 }
 
-/// Runs the command; the exit codes are those of [`shared::exit`].
-pub fn run(args: &Args) -> ExitCode {
-    let read = match data::read(&args.episodes, args.scale.as_deref()) {
-        Ok(read) => read,
-        Err(e) => return exit::fail(exit::BAD_INPUT, e),
-    };
-    let limits = match train::limits(args.config.as_deref()) {
-        Ok(limits) => limits,
-        Err(e) => return exit::fail(exit::BAD_INPUT, e),
-    };
+/// Runs the command.
+pub fn run(args: &Args) -> Result<(), Failure> {
+    let read = data::read(&args.episodes, args.scale.as_deref()).or_exit(exit::BAD_INPUT)?;
+    let limits = train::limits(args.config.as_deref()).or_exit(exit::BAD_INPUT)?;
     let mut usable = data::usable(&read);
     usable.episodes.retain(|e| !args.leave_out.contains(&e.name));
     for doubt in consistency::doubtful(&usable.episodes) {
@@ -90,24 +83,22 @@ pub fn run(args: &Args) -> ExitCode {
             }
             None => {
                 let name = &doubt.name;
-                return exit::fail(
-                    exit::BAD_INPUT,
-                    format!("{doubt} Correct it with `feature-worker episodes`, or give --leave-out {name} or --accept {name}"),
-                );
+                let what = format!("{doubt} Correct it with `feature-worker episodes`, or give --leave-out {name} or --accept {name}");
+                return Err(failure(exit::BAD_INPUT, what));
             }
         }
     }
     let history = pours(&read);
     let options = Options { method: MethodName::Best, actions: 21, estimate: Estimate::Fused, seed: args.seed, limits };
     let extra = serde_json::json!({ "pours": history.iter().map(|(n, goal, weight, mean)| serde_json::json!({"number": n, "goal_ml": goal, "weight_g": weight, "mae_so_far_ml": mean})).collect::<Vec<_>>() });
-    let code = train::train_and_write(&usable, &options, &args.out, args.json, extra);
-    if code == ExitCode::SUCCESS && !args.json && !history.is_empty() {
+    train::train_and_write(&usable, &options, &args.out, args.json, extra)?;
+    if !args.json && !history.is_empty() {
         println!("pour   goal ml  scale g  error ml  mean |error| so far");
         for (n, goal, weight, mean) in history {
             println!("{n:>4} {goal:>9.1} {weight:>8.0} {:>9.1} {mean:>10.2}", weight - goal);
         }
     }
-    code
+    Ok(())
 }
 
 /// Whether to use a doubtful weight; `None`: there is nobody to ask.

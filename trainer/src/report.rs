@@ -4,11 +4,10 @@
 //! and `simulator reproduce` write; a file of another kind is refused by name.
 
 use std::path::PathBuf;
-use std::process::ExitCode;
 
 use plotters::prelude::*;
 use serde_json::Value;
-use shared::exit;
+use shared::exit::{self, Failure, OrExit as _};
 
 /// Command-line arguments of `trainer report`.
 #[derive(Debug, clap::Args)]
@@ -389,23 +388,16 @@ pub fn build(files: &[(String, Value)]) -> Result<String, String> {
     Ok(page("Decant: report", &body))
 }
 
-/// Runs the command; the exit codes are those of [`shared::exit`].
-pub fn run(args: &Args) -> ExitCode {
+/// Runs the command.
+pub fn run(args: &Args) -> Result<(), Failure> {
     let mut files = Vec::new();
     for file in &args.files {
         let name = file.display().to_string();
-        let value =
-            std::fs::read_to_string(file).map_err(|e| e.to_string()).and_then(|t| serde_json::from_str(&t).map_err(|e| e.to_string()));
-        match value {
-            Ok(value) => files.push((name, value)),
-            Err(e) => return exit::fail(exit::BAD_INPUT, format!("{name}: {e}")),
-        }
+        let text = std::fs::read_to_string(file).map_err(|e| e.to_string());
+        let value = text.and_then(|t| serde_json::from_str(&t).map_err(|e| e.to_string()));
+        let value = value.map_err(|e| format!("{name}: {e}")).or_exit(exit::BAD_INPUT)?;
+        files.push((name, value));
     }
-    match build(&files) {
-        Err(e) => exit::fail(exit::BAD_INPUT, e),
-        Ok(html) => match std::fs::write(&args.out, html) {
-            Ok(()) => ExitCode::SUCCESS,
-            Err(e) => exit::fail(exit::FAILED, format!("{}: {e}", args.out.display())),
-        },
-    }
+    let html = build(&files).or_exit(exit::BAD_INPUT)?;
+    std::fs::write(&args.out, html).map_err(|e| format!("{}: {e}", args.out.display())).or_exit(exit::FAILED)
 }

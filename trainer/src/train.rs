@@ -4,10 +4,9 @@
 //! blob (`W.json`); the same seed and data give the same bytes on any number of threads.
 
 use std::path::{Path, PathBuf};
-use std::process::ExitCode;
 
 use indicatif::{ProgressBar, ProgressStyle};
-use shared::exit;
+use shared::exit::{self, Failure, OrExit as _, failure};
 use shared::limits::Limits;
 use shared::policy::{ACTIONS, action_table, nearest_action};
 use shared::weights::Weights;
@@ -188,19 +187,14 @@ pub fn limits(config: Option<&Path>) -> Result<Limits, shared::config::ConfigErr
     config.map_or_else(|| Ok(Limits::default()), |file| shared::config::Config::read(file).map(|c| c.limits))
 }
 
-/// Runs the command; the exit codes are those of [`shared::exit`].
-pub fn run(args: &Args) -> ExitCode {
-    let read = match data::read(&args.episodes, args.scale.as_deref()) {
-        Ok(read) => read,
-        Err(e) => return exit::fail(exit::BAD_INPUT, e),
-    };
-    let limits = match limits(args.config.as_deref()) {
-        Ok(limits) => limits,
-        Err(e) => return exit::fail(exit::BAD_INPUT, e),
-    };
+/// Runs the command.
+pub fn run(args: &Args) -> Result<(), Failure> {
+    let read = data::read(&args.episodes, args.scale.as_deref()).or_exit(exit::BAD_INPUT)?;
+    let limits = limits(args.config.as_deref()).or_exit(exit::BAD_INPUT)?;
     let estimate = args.estimate.unwrap_or(if args.method == MethodName::Best { Estimate::Fused } else { Estimate::Sum });
     if estimate == Estimate::Fused && args.method != MethodName::Best {
-        return exit::fail(exit::BAD_INPUT, "--estimate fused goes with --method best: the others learn on the paper's own sum");
+        let what = "--estimate fused goes with --method best: the others learn on the paper's own sum";
+        return Err(failure(exit::BAD_INPUT, what));
     }
     let usable = data::usable(&read);
     for doubt in consistency::doubtful(&usable.episodes) {
@@ -211,22 +205,23 @@ pub fn run(args: &Args) -> ExitCode {
 }
 
 /// Trains with a progress bar, writes the weight file and, beside it, everything that it came from (`W.json`).
-pub fn train_and_write(usable: &Usable, options: &Options, out: &Path, json: bool, extra: serde_json::Value) -> ExitCode {
+pub fn train_and_write(
+    usable: &Usable,
+    options: &Options,
+    out: &Path,
+    json: bool,
+    extra: serde_json::Value,
+) -> Result<(), Failure> {
     for (name, what) in &usable.left_out {
         eprintln!("left out: {name}: {what}");
     }
     let style = ProgressStyle::with_template("{prefix} [{wide_bar}] {pos}/{len} {msg} ({eta} left)");
     let bar = Bar(ProgressBar::new(1).with_style(style.unwrap_or_else(|_| ProgressStyle::default_bar())));
     let begin = std::time::Instant::now();
-    let trained = match train(&usable.episodes, options, &bar) {
-        Ok(trained) => trained,
-        Err(e) => return exit::fail(exit::BAD_INPUT, e),
-    };
+    let trained = train(&usable.episodes, options, &bar).or_exit(exit::BAD_INPUT)?;
     bar.0.finish_and_clear();
     let seconds = begin.elapsed().as_secs_f64();
-    if let Err(e) = trained.weights.write(out) {
-        return exit::fail(exit::FAILED, e);
-    }
+    trained.weights.write(out).or_exit(exit::FAILED)?;
     let summary = serde_json::json!({
         "kind": "training",
         "weights": out,
@@ -245,14 +240,13 @@ pub fn train_and_write(usable: &Usable, options: &Options, out: &Path, json: boo
     let mut beside = out.to_path_buf().into_os_string();
     beside.push(".json");
     let text = serde_json::to_string_pretty(&summary).unwrap_or_default();
-    if let Err(e) = std::fs::write(&beside, format!("{text}\n")) {
-        return exit::fail(exit::FAILED, format!("{}: {e}", PathBuf::from(&beside).display()));
-    }
+    let beside = PathBuf::from(beside);
+    std::fs::write(&beside, format!("{text}\n")).map_err(|e| format!("{}: {e}", beside.display())).or_exit(exit::FAILED)?;
     if json {
         println!("{text}");
     } else {
         let n = usable.episodes.len();
         println!("{}: trained on {n} episodes in {seconds:.1} s, identity {}", out.display(), trained.weights.identity());
     }
-    ExitCode::SUCCESS
+    Ok(())
 }
