@@ -892,7 +892,7 @@ impl Background {
                 let fits = away.abs() < calm;
                 let kept = if known && ((fits && !(inside && flows)) || !close) {
                     [level + if fits { FOLLOW } else { FOLLOW_SLOWLY } * away + 0.5, 255.0]
-                } else if !known && !(flows && close) {
+                } else if !(known || flows && close) {
                     [f32::from(*seen), 255.0]
                 } else {
                     [level + 0.5, FADE * sure]

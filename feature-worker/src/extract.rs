@@ -12,7 +12,7 @@
 //!
 //! A stream fills nearly every ray from the lip on; drops and splashes do not, so they are no stream, and no stream is
 //! exactly 0. Runs on the worker's extraction thread; all buffers are kept, so after the first frame nothing is allocated
-//! but OpenCV's matrix headers (and, for clear water, what [`crate::clear`] needs). A frame that cannot be measured is no error:
+//! but OpenCV's matrix headers. A frame that cannot be measured is no error:
 //! it gets a [`Doubt`].
 
 use std::time::Instant;

@@ -116,7 +116,7 @@ pub struct CameraConfig {
 pub enum LiquidMethod {
     /// By its colour (`[image] colour`).
     Colour,
-    /// Clear water, by what differs from the dry background: less exact, wants an even wall behind the lip (docs/VISION.md).
+    /// Clear water, by what does not move with the background: wants an even wall behind the lip (docs/VISION.md).
     Clear,
 }
 
