@@ -84,11 +84,13 @@ pub enum Selection {
 const RESUME_ML: f32 = 0.5;
 /// After flow was seen, this much of a way back without flow ends the pour, degrees.
 const BROUGHT_BACK_DEG: f32 = 10.0;
-/// After flow was seen, this many frames without flow and without getting on by [`PROGRESS_DEG`] end the pour: the policy stands
-/// still short of its goal.
+/// After flow was seen, this many frames without getting on by [`PROGRESS_DEG`] or [`PROGRESS_ML`] end the pour: the policy stands
+/// still short of its goal, while what trickles is too little to be seen, or flickers about what can be seen.
 const STALLED_FRAMES: u32 = 90;
 /// Forward tilt that counts as getting on, degrees.
 const PROGRESS_DEG: f32 = 1.0;
+/// Poured volume that counts as getting on, ml.
+const PROGRESS_ML: f32 = 0.5;
 /// Less than this still to come over the lip counts as nothing, ml.
 const NOTHING_ML: f64 = 0.05;
 
@@ -108,6 +110,7 @@ pub struct Agent {
     brought_back_deg: f32,
     stalled_frames: u32,
     advanced_deg: f32,
+    advanced_from_ml: f32,
     carry_deg: f32,
     random: u64,
 }
@@ -133,6 +136,7 @@ impl Agent {
             brought_back_deg: 0.0,
             stalled_frames: 0,
             advanced_deg: 0.0,
+            advanced_from_ml: 0.0,
             carry_deg: 0.0,
             random: weights.seed,
         }
@@ -150,6 +154,7 @@ impl Agent {
         self.brought_back_deg = 0.0;
         self.stalled_frames = 0;
         self.advanced_deg = 0.0;
+        self.advanced_from_ml = 0.0;
         self.carry_deg = 0.0;
         if let Some(fused) = &mut self.fused {
             fused.restart();
@@ -188,10 +193,10 @@ impl Agent {
         self.seen_flow |= self.v_ml[0] > 0.0;
         self.brought_back_deg = if self.v_ml[0] > 0.0 || dalpha_deg > 0.0 { 0.0 } else { self.brought_back_deg - dalpha_deg };
         self.finished |= self.seen_flow && self.brought_back_deg > BROUGHT_BACK_DEG;
-        // And so has one that stands still without flow, or it would stand there for ever.
+        // And so has one that stands still, or it would stand there for ever.
         self.advanced_deg += dalpha_deg;
-        if self.v_ml[0] > 0.0 || self.advanced_deg >= PROGRESS_DEG {
-            (self.stalled_frames, self.advanced_deg) = (0, 0.0);
+        if self.advanced_deg >= PROGRESS_DEG || view.poured_ml - self.advanced_from_ml >= PROGRESS_ML {
+            (self.stalled_frames, self.advanced_deg, self.advanced_from_ml) = (0, 0.0, view.poured_ml);
         } else {
             self.stalled_frames = self.stalled_frames.saturating_add(1);
         }
@@ -333,14 +338,14 @@ mod tests {
         assert!((sum - 2.5).abs() < 0.06, "{sum}");
     }
 
-    /// Protects the end of every pour: a policy that stands still short of its goal, without flow, has come to its end; one
-    /// that creeps on, still waits for its first flow, or pours has not.
+    /// Protects the end of every pour: a policy that stands still short of its goal has come to its end, also while a trickle
+    /// flickers in and out of sight; one that creeps on, still waits for its first flow, or pours has not.
     #[test]
     fn a_policy_that_stands_still_comes_to_its_end() {
         let mut weights = example();
         weights.policy = crate::policy::Mlp::ZERO;
         for (action, flow_at_first, flow_later, ends) in
-            [(10, 100.0, 0.0, true), (12, 100.0, 0.0, false), (10, 0.0, 0.0, false), (10, 100.0, 1.0, false)]
+            [(10, 100.0, 0.0, true), (10, 100.0, 0.1, true), (12, 100.0, 0.0, false), (10, 0.0, 0.0, false), (10, 100.0, 90.0, false)]
         {
             weights.policy.b3 = [0.0; ACTIONS];
             weights.policy.b3[action] = 1.0;
