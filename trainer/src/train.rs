@@ -205,13 +205,7 @@ pub fn run(args: &Args) -> Result<(), Failure> {
 }
 
 /// Trains with a progress bar, writes the weight file and, beside it, everything that it came from (`W.json`).
-pub fn train_and_write(
-    usable: &Usable,
-    options: &Options,
-    out: &Path,
-    json: bool,
-    extra: serde_json::Value,
-) -> Result<(), Failure> {
+pub fn train_and_write(usable: &Usable, options: &Options, out: &Path, json: bool, extra: serde_json::Value) -> Result<(), Failure> {
     for (name, what) in &usable.left_out {
         eprintln!("left out: {name}: {what}");
     }
