@@ -57,7 +57,7 @@ pub struct CellUnderTest {
 impl CellUnderTest {
     /// A cell with nothing running. `adapt` may change the configuration, which is `config/sim.toml`'s.
     pub fn prepare(adapt: impl FnOnce(&mut toml::Table)) -> Self {
-        let number = std::process::id() % 60_000 * 4 + NEXT.fetch_add(1, Ordering::Relaxed) % 4;
+        let number = std::process::id() % 15_000 * 16 + NEXT.fetch_add(1, Ordering::Relaxed) % 16;
         let name = format!("test-{}-{number}", std::process::id());
         let address = std::net::IpAddr::from([127, 20 + (number / 62_500) as u8, (number / 250 % 250) as u8, 1 + (number % 250) as u8]);
         let dir = tempfile::tempdir().expect("a directory for the test");
