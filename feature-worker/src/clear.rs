@@ -19,7 +19,7 @@ use opencv::core::{self, CV_8UC2, Mat, Scalar, Size, Vec2b};
 use opencv::imgproc;
 use opencv::prelude::*;
 
-use crate::extract::Axes;
+use crate::extract::{Axes, between};
 
 /// Width of the whole picture at which this works, px; all lengths below are px at that size.
 const WIDTH_PX: f32 = 320.0;
@@ -253,14 +253,7 @@ impl<'a> Grey<'a> {
     /// Bilinear sample; none outside.
     #[inline]
     fn at(&self, x: f32, y: f32) -> Option<f32> {
-        if !(x >= 0.0 && y >= 0.0) {
-            return None;
-        }
-        let (column, row) = (x as usize, y as usize);
-        if column + 1 >= self.width || row + 1 >= self.height {
-            return None;
-        }
-        let (fx, fy) = (x - column as f32, y - row as f32);
+        let (column, row, fx, fy) = between(x, y, self.width, self.height)?;
         let upper = self.bytes.get(row * self.width + column..)?;
         let lower = upper.get(self.width..self.width + 2)?;
         let mix = |a: u8, b: u8| f32::from(a) + (f32::from(b) - f32::from(a)) * fx;

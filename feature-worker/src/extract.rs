@@ -274,17 +274,24 @@ struct Colours<'a> {
     height: usize,
 }
 
+/// The pixel above and to the left of a place, and how far the place lies to the right of it and below it (0 to 1); none if one of
+/// the four pixels around the place is outside.
+#[inline]
+pub(crate) fn between(x: f32, y: f32, width: usize, height: usize) -> Option<(usize, usize, f32, f32)> {
+    if !(x >= 0.0 && y >= 0.0) {
+        return None;
+    }
+    let (column, row) = (x as usize, y as usize);
+    if column + 1 >= width || row + 1 >= height {
+        return None;
+    }
+    Some((column, row, x - column as f32, y - row as f32))
+}
+
 impl Colours<'_> {
     /// Bilinear sample; none outside.
     fn at(&self, x: f32, y: f32) -> Option<[f32; 3]> {
-        if !(x >= 0.0 && y >= 0.0) {
-            return None;
-        }
-        let (column, row) = (x as usize, y as usize);
-        if column + 1 >= self.width || row + 1 >= self.height {
-            return None;
-        }
-        let (fx, fy) = (x - column as f32, y - row as f32);
+        let (column, row, fx, fy) = between(x, y, self.width, self.height)?;
         let start = row * self.stride + column * 3;
         let upper = self.bytes.get(start..start + 6)?;
         let lower = self.bytes.get(start + self.stride..start + self.stride + 6)?;

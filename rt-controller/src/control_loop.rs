@@ -1,8 +1,8 @@
 //! The fixed-rate loop: absolute deadlines on CLOCK_MONOTONIC; a missed period is skipped and counted, never bursted.
 //!
 //! Runs in the real-time thread. Its ticks do not allocate, lock, log, or call anything that blocks but the sleep itself; the count
-//! of their allocations is part of `status`. The exception is [`Ticks::meet_feature_worker`]. Nothing in it fails: a lost robot is handed back and the core
-//! ends the pour, a lost feature worker shows as stale features.
+//! of their allocations is part of `status`. The exception is [`Ticks::meet_feature_worker`]. Nothing in it fails: a lost robot is handed
+//! back and the core ends the pour, a lost feature worker shows as stale features.
 
 use std::sync::atomic::{AtomicU64, Ordering::Relaxed};
 

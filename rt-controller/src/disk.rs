@@ -52,17 +52,18 @@ pub struct Disk<'a> {
 }
 
 impl<'a> Disk<'a> {
-    /// Begins the journal, if one is configured, and gives the way to it.
+    /// Begins the journal, if one is configured, and gives the way to it; none where none is kept.
     pub fn open(
         config: &Config,
         exchange: &'a Exchange,
         note: &'a Mutex<WeightsNote>,
         say: &'a (dyn Fn(&str) + Sync),
-    ) -> (Self, Sender<Box<Tick>>) {
+    ) -> (Self, Option<Sender<Box<Tick>>>) {
         let journal = config.controller.journal.as_ref().and_then(|path| {
             Writer::create(path, &Settings::new(config)).map_err(|e| say(&format!("{}: no journal: {e}", path.display()))).ok()
         });
         let (sender, ticks) = bounded(WAITING_TICKS);
+        let sender = journal.is_some().then_some(sender);
         let disk = Self {
             exchange,
             say,

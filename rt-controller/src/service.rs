@@ -2,7 +2,8 @@
 //! is done with.
 //!
 //! Runs in the process's main thread with ordinary scheduling; allocates, but waits for no disk ([`crate::disk`] does). If it
-//! falls behind, the loop goes on and counts what it could not tell. Nothing here ends the process but a signal or another controller in the same cell.
+//! falls behind, the loop goes on and counts what it could not tell. Nothing here ends the process but a signal or another controller
+//! in the same cell.
 
 use std::collections::VecDeque;
 use std::sync::atomic::{AtomicBool, Ordering::Relaxed};
@@ -103,7 +104,7 @@ pub struct Service<'a> {
     server: Server<Ipc, [u8], (), [u8], ()>,
     telemetry: Publisher<Ipc, Telemetry, ()>,
     weights: &'a Mutex<WeightsNote>,
-    /// To the journal; `None` after it could not keep up.
+    /// To the journal; `None` where none is kept, and after it could not keep up.
     journal: Option<Sender<Box<Tick>>>,
     latest: Option<(Telemetry, Counters)>,
     outcomes: VecDeque<Outcome>,
@@ -113,12 +114,12 @@ pub struct Service<'a> {
 }
 
 impl<'a> Service<'a> {
-    /// Opens the services; fails when another controller has them. `journal` takes the ticks.
+    /// Opens the services; fails when another controller has them. `journal` takes the ticks, where one is kept.
     pub fn open(
         cell: &Cell,
         exchange: &'a Exchange,
         (robot_note, robot_connections): (&'a RobotNote, &'a std::sync::atomic::AtomicU64),
-        (weights, journal): (&'a Mutex<WeightsNote>, Sender<Box<Tick>>),
+        (weights, journal): (&'a Mutex<WeightsNote>, Option<Sender<Box<Tick>>>),
         say: &'a dyn Fn(&str),
     ) -> Result<Self, IpcError> {
         let fail = |service: &str, e: String| IpcError::Service { service: service.into(), what: e };
@@ -140,7 +141,7 @@ impl<'a> Service<'a> {
             server,
             telemetry,
             weights,
-            journal: Some(journal),
+            journal,
             latest: None,
             outcomes: VecDeque::new(),
             waiting: VecDeque::new(),

@@ -107,6 +107,20 @@ pub struct View {
     pub shutter_s: f64,
 }
 
+impl View {
+    /// A camera as people mount it, before a lip as they differ: scale, place, roll and the lip's shape drawn by `random`.
+    pub fn placed(random: &mut Pcg64Mcg) -> Self {
+        Self {
+            px_per_mm: random.random_range(5.5..8.5),
+            lip_px: [random.random_range(150.0..240.0), random.random_range(236.0..290.0)],
+            roll_deg: random.random_range(-8.0..8.0),
+            spout_deg: random.random_range(45.0..90.0),
+            flat_wall_loss: random.random_range(0.3..0.6),
+            ..Self::default()
+        }
+    }
+}
+
 impl Default for View {
     fn default() -> Self {
         Self {

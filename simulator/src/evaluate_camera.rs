@@ -159,19 +159,15 @@ fn draw_case(random: &mut Pcg64Mcg, clear: bool, seed: u64) -> Result<Case, Fail
     let (blur_name, blur_px) = pick(&[("none", 0.0), ("slight", 0.8), ("strong", 1.6)]);
     let background = *Background::ALL.choose(random).unwrap_or(&Background::Chess);
     let (liquid_name, colour) = *LIQUIDS.choose(random).unwrap_or(&LIQUIDS[0]);
+    let placed = View::placed(random);
     let view = View {
-        px_per_mm: random.random_range(5.5..8.5),
-        lip_px: [random.random_range(150.0..240.0), random.random_range(236.0..290.0)],
-        roll_deg: random.random_range(-8.0..8.0),
-        spout_deg: random.random_range(45.0..90.0),
-        flat_wall_loss: random.random_range(0.3..0.6),
         liquid_bgr: (!clear).then_some(colour),
         opacity: random.random_range(0.8..0.97),
         background,
         light,
         noise,
         blur_px,
-        ..View::default()
+        ..placed
     };
     let mut image = image_config(&view);
     if !clear {

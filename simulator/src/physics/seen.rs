@@ -30,18 +30,14 @@ impl Eye {
     pub fn seeded(seed: u64) -> Result<Self, String> {
         let mut random = Pcg64Mcg::seed_from_u64(seed ^ 0xe7e);
         let colour = *[[150, 62, 20], [40, 36, 180], [60, 150, 40], [140, 40, 110]].choose(&mut random).unwrap_or(&[150, 62, 20]);
+        let placed = View::placed(&mut random);
         let view = View {
-            px_per_mm: random.random_range(5.5..8.5),
-            lip_px: [random.random_range(150.0..240.0), random.random_range(236.0..290.0)],
-            roll_deg: random.random_range(-8.0..8.0),
-            spout_deg: random.random_range(45.0..90.0),
-            flat_wall_loss: random.random_range(0.3..0.6),
             liquid_bgr: Some(colour),
             background: *Background::ALL.choose(&mut random).unwrap_or(&Background::Chess),
             light: random.random_range(0.7..1.2),
             noise: random.random_range(1.5..5.0),
             blur_px: random.random_range(0.0..1.0),
-            ..View::default()
+            ..placed
         };
         let mut image = image_config(&view);
         image.colour_hsv = learn_colour(&View { light: 1.0, ..view.clone() }, &image, seed).map_err(|e| e.to_string())?;
