@@ -38,8 +38,10 @@ pub enum Pourer {
     Best,
     /// Method best with the plain sum.
     BestSum,
-    /// Eq. (8) repaired.
+    /// Eq. (8) repaired, with the fused estimate.
     Paper,
+    /// Eq. (8) repaired, with the plain sum.
+    PaperSum,
     /// Eq. (8) as printed.
     Literal,
     /// Eq. (8) as printed, with Keras' clip.
@@ -372,7 +374,8 @@ impl Setup {
         let options = match pourer {
             Pourer::Best | Pourer::PdTuned | Pourer::Law => self.options(MethodName::Best, Estimate::Fused, args.actions),
             Pourer::BestSum => self.options(MethodName::Best, Estimate::Sum, args.actions),
-            Pourer::Paper => self.options(MethodName::Paper, Estimate::Sum, args.actions),
+            Pourer::Paper => self.options(MethodName::Paper, Estimate::Fused, args.actions),
+            Pourer::PaperSum => self.options(MethodName::Paper, Estimate::Sum, args.actions),
             Pourer::Literal => self.options(MethodName::Literal, Estimate::Sum, args.actions),
             Pourer::LiteralClipped => self.options(MethodName::LiteralClipped, Estimate::Sum, args.actions),
             Pourer::Cloning => self.options(MethodName::Cloning, Estimate::Sum, args.actions),

@@ -7,7 +7,7 @@
 //! |---|---|---|
 //! | volumes | normalised contribution volumes, V_e summed as it is | the same of c area^q, with the dropout hold |
 //! | action of state i | alpha(i) - alpha(i-1), the one *before* the image | alpha(i+1) - alpha(i), the one taken in that state |
-//! | d of state i | d_i, from which v_i has yet to be taken | d_{i+1}, as eq. (2) gives it at run time |
+//! | d of state i | d_i, from which v_i has yet to be taken | d_{i+1}, as eq. (2) gives it at run time, or the fused estimate does |
 //! | goals, eq. (6) | kappa = 0.5, 0.6 .. 1.5 | kappa = 1: the volume that was poured is the goal that was met |
 //! | weights, eq. (5), (7), (8) | normalised rewards of either sign | R of eq. (5), never negative |
 //! | frames without flow and without motion | all | dropped: they teach to wait for ever |
@@ -19,14 +19,16 @@
 use rand::{RngExt, SeedableRng};
 use rand_pcg::Pcg64Mcg;
 use shared::agent::Selection;
+use shared::estimate::flow::Flow;
+use shared::estimate::fused::Fused;
 use shared::estimate::{Calibration, Hold};
 use shared::policy::{ACTIONS, InputScale, Mlp};
 use shared::weights::{Estimator, Method, Origin, Weights};
 
-use crate::calibrate;
 use crate::data::{self, TrainingEpisode};
 use crate::net::{Adam, Net, Sample};
-use crate::train::{MethodName, Options, Progress, Trained, actions_table, discretise};
+use crate::train::{Estimate, MethodName, Options, Progress, Trained, actions_table, discretise};
+use crate::{best, calibrate};
 
 /// delta of eq. (5), 1/ml^2.
 pub const DELTA: f64 = 0.01;
@@ -59,16 +61,35 @@ pub fn contributions(episode: &TrainingEpisode, calibration: &Calibration) -> Ve
     seen.iter().map(|v| episode.weight_g * v / sum.max(1e-12)).collect()
 }
 
+/// What the estimator of `weights` takes for poured or on its way after each frame of an episode, in proportion so that it adds
+/// up to w_E: the fused estimate's counterpart of the sum of the contribution volumes.
+fn fused_sums(episode: &TrainingEpisode, calibration: &Calibration, mut filter: Fused) -> Vec<f64> {
+    let sums: Vec<f64> = episode
+        .area_px2
+        .iter()
+        .zip(&episode.alpha_deg)
+        .map(|(area, alpha)| {
+            let y_ml = (!area.is_nan()).then(|| f64::from(calibration.volume_ml(*area as f32, *alpha as f32)));
+            filter.step(y_ml, *alpha);
+            filter.poured_ml() + filter.stop_volume_ml(*alpha)
+        })
+        .collect();
+    let end = sums.last().copied().unwrap_or(0.0).max(1e-12);
+    sums.iter().map(|s| episode.weight_g * s / end).collect()
+}
+
 /// One training sequence (steps 1 to 5 of the paper): its states and actions, and its reward.
 struct Sequence {
     states: Vec<([f32; 4], u8)>,
     reward: f64,
 }
 
-/// The sequence of `episode` for goal kappa w_E. `next`: state i is paired with the action taken in it.
+/// The sequence of `episode` for goal kappa w_E. `poured` is what has been after each frame. `next`: state i is paired with the
+/// action taken in it.
 fn sequence(
     episode: &TrainingEpisode,
     volumes: &[f64],
+    poured: &[f64],
     kappa: f64,
     next: bool,
     keep_still: bool,
@@ -76,11 +97,12 @@ fn sequence(
     scale: &InputScale,
 ) -> Sequence {
     // Eq. (6), then d_{i+1} = d_i - v_i.
-    let mut d = kappa * episode.weight_g;
+    let goal = kappa * episode.weight_g;
+    let mut d = goal;
     let mut states = Vec::with_capacity(volumes.len());
     for i in 0..volumes.len() {
         let before = d;
-        d -= volumes[i];
+        d = goal - poured[i];
         let (from, to) = if next { (i, i + 1) } else { (i.max(1) - 1, i) };
         let Some(moved) = episode.alpha_deg.get(to).map(|a| a - episode.alpha_deg[from]) else { continue };
         let v = [i, i.wrapping_sub(1), i.wrapping_sub(2)].map(|k| volumes.get(k).copied().unwrap_or(0.0) as f32);
@@ -95,10 +117,15 @@ fn sequence(
 /// Trains on usable episodes.
 pub fn train(episodes: &[TrainingEpisode], options: &Options, progress: &dyn Progress) -> Trained {
     let literal = matches!(options.method, MethodName::Literal | MethodName::LiteralClipped);
-    let calibration = if literal {
-        Calibration { hold_above_px2: f32::INFINITY, ..calibrate::fit(episodes, Some(1.0)) }
+    let fused = options.method == MethodName::Paper && options.estimate == Estimate::Fused;
+    let (calibration, estimator, fit) = if literal {
+        (Calibration { hold_above_px2: f32::INFINITY, ..calibrate::fit(episodes, Some(1.0)) }, Estimator::Sum, None)
+    } else if fused {
+        progress.stage("fitting the flow model", 1);
+        let (fit, estimator) = best::estimator(episodes, Estimate::Fused, &options.limits);
+        (fit.calibration, estimator, Some(fit))
     } else {
-        calibrate::fit(episodes, None)
+        (calibrate::fit(episodes, None), Estimator::Sum, None)
     };
     let scale = InputScale::default();
     let table = actions_table(options.actions);
@@ -107,8 +134,18 @@ pub fn train(episodes: &[TrainingEpisode], options: &Options, progress: &dyn Pro
     let mut sequences = Vec::new();
     for e in episodes {
         let volumes = contributions(e, &calibration);
+        let poured = match &estimator {
+            Estimator::Sum => volumes
+                .iter()
+                .scan(0.0, |sum, v| {
+                    *sum += v;
+                    Some(*sum)
+                })
+                .collect(),
+            Estimator::Fused { model, back } => fused_sums(e, &calibration, Fused::new(Flow::new(model), *back)),
+        };
         for kappa in &kappas {
-            sequences.push(sequence(e, &volumes, *kappa, !literal, literal, act, &scale));
+            sequences.push(sequence(e, &volumes, &poured, *kappa, !literal, literal, act, &scale));
         }
     }
     // Eq. (7): rewards minus their mean, over their variance's root.
@@ -152,7 +189,7 @@ pub fn train(episodes: &[TrainingEpisode], options: &Options, progress: &dyn Pro
         selection: if options.method == MethodName::Paper { Selection::Expected } else { Selection::Argmax },
         scale,
         calibration,
-        estimator: Estimator::Sum,
+        estimator,
         rate_hz: episodes.first().map_or(30.0, |e| e.rate_hz) as f32,
         origin: Origin {
             method: match options.method {
@@ -166,5 +203,5 @@ pub fn train(episodes: &[TrainingEpisode], options: &Options, progress: &dyn Pro
         },
         seed: options.seed,
     };
-    Trained { weights, fit: None, law: None, search_curve: Vec::new(), loss }
+    Trained { weights, fit, law: None, search_curve: Vec::new(), loss }
 }

@@ -34,8 +34,10 @@ const Q: usize = KNOTS + 12;
 const TILT: usize = KNOTS + 13;
 /// Global unknowns that make the geometry.
 const GEOMETRY: usize = KNOTS + 4;
-/// Unknowns of an episode: onset angle, lambda, gamma.
-const LOCAL: usize = 3;
+/// Unknowns of an episode: onset angle, lambda, gamma, delay above the model's.
+const LOCAL: usize = 4;
+/// Which of them the delay is.
+const LATE: usize = 3;
 /// Weight of a scale that shows whole grams, and of the person reading it, g.
 const WEIGHT_SD_G: f64 = 0.6;
 /// A calibration v = c area that meets the weights this well (rms, g) is right: the scale cannot tell it from a perfect one.
@@ -52,6 +54,14 @@ const GAIN_NARROW: f64 = 0.03;
 const GAIN_CLEAN: f64 = 0.004;
 /// How much a camera's gain changes from pour to pour at least (log).
 const GAIN_SD: f64 = 0.012;
+/// Episodes before and after a change of gain or delay, for it to be noticed.
+const CHANGE_NEEDS: usize = 3;
+/// How far the delays of two episodes are apart (frames): as a rule; when a change is looked for; and after one was found.
+const LATE_KNOWN: f64 = 0.02;
+const LATE_FREE: f64 = 1.0;
+const LATE_CHANGED: f64 = 0.3;
+/// How much an episode's delay scatters at least when it is looked for, frames.
+const LATE_SD: f64 = 0.2;
 /// Noise of a frame's area below which a model can turn out to be exact.
 const CLEAN: f64 = 0.03;
 /// Residuals beyond this grow only with the root.
@@ -64,10 +74,8 @@ pub struct Fit {
     pub model: FlowModel,
     /// Calibration found together with it.
     pub calibration: Calibration,
-    /// Of each episode: onset angle in degrees, lambda, gamma.
+    /// Of each episode: onset angle in degrees, lambda, gamma, delay above the model's in frames.
     pub episodes: Vec<[f64; LOCAL]>,
-    /// Of each episode: volume by the model minus weight, in standard deviations when the weight was not used for it.
-    pub cost: f64,
     /// Covariance of the global unknowns.
     pub covariance: DMatrix<f64>,
     /// Covariance of the calibration's log c and q.
@@ -87,6 +95,8 @@ struct Prepared {
     used: Vec<bool>,
     weight_g: f64,
     first: usize,
+    /// Delay above the others', as far as known, frames.
+    late: f64,
 }
 
 #[derive(Clone, Copy)]
@@ -95,6 +105,8 @@ struct Stage {
     rel: f64,
     floor: f64,
     gamma_sd: f64,
+    /// How far an episode's delay is from what is known of it, frames.
+    late_sd: f64,
     /// Noise of an episode's sum of areas, relative.
     sum_sd: f64,
     /// Calibration held at (log c, q, tilt) with this sd.
@@ -133,11 +145,11 @@ impl Prepared {
             .map(|(a, alpha)| (f64::from(hold.step(Some(*a as f32), calibrate::HOLD_ABOVE_PX2)), tilt_z(*alpha)))
             .filter(|(a, _)| *a > 0.0)
             .collect();
-        Self { alpha: e.alpha_deg.clone(), held, tilt_z: tilt_z_of, area, smooth_max, used, weight_g: e.weight_g, first }
+        Self { alpha: e.alpha_deg.clone(), held, tilt_z: tilt_z_of, area, smooth_max, used, weight_g: e.weight_g, first, late: 0.0 }
     }
 
     /// What the model says left the lip in each frame, and the film after it, ml.
-    fn outflow<'a>(&'a self, flow: &'a Flow, onset: f64, lambda: f64) -> impl Iterator<Item = (f64, f64)> + 'a {
+    fn outflow<'a>(&'a self, flow: &'a Flow, onset: f64, lambda: f64, late: f64) -> impl Iterator<Item = (f64, f64)> + 'a {
         let mut x = flow.capacity_ml(onset.clamp(0.0, 115.0));
         let mut film = 0.0;
         let mut history = [self.alpha[0]; HISTORY];
@@ -146,7 +158,7 @@ impl Prepared {
         self.alpha.iter().map(move |alpha| {
             history.copy_within(1.., 0);
             history[HISTORY - 1] = *alpha;
-            a = flow.tilt(a, flow.delayed(&history, 0));
+            a = flow.tilt(a, flow.delayed(&history, 0, late));
             let v = flow.over(a, x, lambda).v_ml;
             x += v;
             film += eta * v;
@@ -158,13 +170,13 @@ impl Prepared {
 
     /// Residuals of this episode for a model; appends to `out`.
     fn residuals(&self, flow: &Flow, [log_c, q, tilt]: [f64; 3], local: &[f64; LOCAL], stage: &Stage, area_min: f64, out: &mut Vec<f64>) {
-        let [onset, lambda, gamma] = *local;
+        let [onset, lambda, gamma, late] = *local;
         let (c, gain) = (log_c.exp(), gamma.exp());
         let v_min = c * area_min.powf(q);
         let floor = stage.floor * c * self.smooth_max.powf(q);
         let mut sum = 0.0;
         let mut film = 0.0;
-        for (k, (leaves, left)) in self.outflow(flow, onset, lambda).enumerate() {
+        for (k, (leaves, left)) in self.outflow(flow, onset, lambda, late).enumerate() {
             sum += leaves;
             film = left;
             if !self.used[k] {
@@ -181,6 +193,7 @@ impl Prepared {
         out.push((camera / gain - self.weight_g) / WEIGHT_SD_G.hypot(stage.sum_sd * self.weight_g));
         out.push(lambda / 0.08);
         out.push(gamma / stage.gamma_sd);
+        out.push((late - self.late) / stage.late_sd);
     }
 }
 
@@ -227,12 +240,16 @@ pub fn moved(model: &FlowModel, by: &[f64]) -> FlowModel {
 /// How far a vessel is from straight walls, at each knot (log).
 const S_SD: [f64; KNOTS] = [0.06, 0.06, 0.06, 0.06, 0.06, 0.08, 0.18, 0.6, 0.6];
 
+/// A residual that pays little more the further it goes (Cauchy).
+fn far(r: f64) -> f64 {
+    r.signum() * 2.0 * (1.0 + r * r / 4.0).ln().sqrt()
+}
+
 /// The priors. Vessels that a gripper holds: R about 37 mm, H about 3 R, nearly straight walls; what deviates from that in
 /// shape pays little more the further it goes (Cauchy), so that bottles and jugs are not bent into cups. The flow follows a
 /// weir: exponent 1.5, and a coefficient that hardly changes with the angle.
 fn priors(g: &[f64], stage: &Stage) -> Vec<f64> {
     let mut r = Vec::with_capacity(40);
-    let far = |r: f64| r.signum() * 2.0 * (1.0 + r * r / 4.0).ln().sqrt();
     for k in 0..KNOTS {
         r.push(far(g[k] / S_SD[k]));
     }
@@ -407,7 +424,7 @@ impl Problem<'_> {
 
 /// Fits model and calibration to `episodes`, all of which are usable.
 pub fn fit(episodes: &[TrainingEpisode]) -> Fit {
-    let prepared: Vec<Prepared> = episodes.iter().map(Prepared::new).collect();
+    let mut prepared: Vec<Prepared> = episodes.iter().map(Prepared::new).collect();
     let area_min = prepared.iter().flat_map(|p| &p.area).copied().filter(|a| *a > 0.0).fold(f64::INFINITY, f64::min);
     let area_min = if area_min.is_finite() { area_min } else { 1.0 };
     let q0 = 1.15;
@@ -419,7 +436,7 @@ pub fn fit(episodes: &[TrainingEpisode]) -> Fit {
         (global[LK], global[P], global[TAU], global[DELAY], global[ETA]) = (lk, 1.5, 2.0, 2.0, 0.05);
         (global[LOG_C], global[Q]) = (f64::from(calibrate::fit(episodes, Some(q)).c).ln(), q);
         let flow = Flow::new(&model_of(&global));
-        let local = prepared.iter().map(|p| [onset_guess(&flow, p), 0.0, 0.0]).collect();
+        let local = prepared.iter().map(|p| [onset_guess(&flow, p), 0.0, 0.0, 0.0]).collect();
         Unknowns { global, local }
     };
     let (frame_sd, dropouts) = frame_noise(&prepared);
@@ -430,7 +447,7 @@ pub fn fit(episodes: &[TrainingEpisode]) -> Fit {
     let gain = |usual: f64| if clean { GAIN_CLEAN } else { usual };
     let linear = linear(episodes).filter(|_| clean).map(|log_c| ([log_c, 1.0, 0.0], 0.002));
     let sum_sd = SUM_NOISE * frame_sd.max(if clean { 0.0 } else { 0.015 });
-    let wide = Stage { rel: temper(3.0, 1.0), floor: 0.036, gamma_sd: gain(GAIN_WIDE), sum_sd, held: linear };
+    let mut wide = Stage { rel: temper(3.0, 1.0), floor: 0.036, gamma_sd: gain(GAIN_WIDE), late_sd: LATE_KNOWN, sum_sd, held: linear };
     let problem = Problem { episodes: &prepared, area_min, stage: wide };
     let mut best: Option<(f64, Unknowns)> = None;
     let beginnings = [(1.15, 0.0), (1.15, 0.7), (1.0, 0.7), (1.0, 0.0), (1.3, 0.0), (1.3, 0.7)];
@@ -444,17 +461,25 @@ pub fn fit(episodes: &[TrainingEpisode]) -> Fit {
         }
     }
     let mut u = best.map_or_else(|| start(-3.2, q0, 0.0), |(_, u)| u);
+    if let Some(late) = changed_delay(&problem, &u) {
+        prepared.iter_mut().zip(&late).for_each(|(p, late)| p.late = *late);
+        u.local.iter_mut().zip(&late).for_each(|(l, late)| l[LATE] = *late);
+        wide.late_sd = LATE_CHANGED;
+    }
+    let problem = Problem { episodes: &prepared, area_min, stage: wide };
     problem.solve(&mut u, 25 * longer, 1e-4);
     let wide_covariance = invert(&problem.linearise(&u).a);
 
     let held = Some(([u.global[LOG_C], u.global[Q], u.global[TILT]], 0.002));
     let narrow = Problem { stage: Stage { rel: temper(1.5, 0.15), floor: 0.036, gamma_sd: gain(GAIN_NARROW), held, ..wide }, ..problem };
-    let cost = narrow.solve(&mut u, 30 * longer, 1e-4);
+    narrow.solve(&mut u, 30 * longer, 1e-4);
     let covariance = invert(&narrow.linearise(&u).a);
 
     let gammas: Vec<f64> = u.local.iter().map(|l| l[2]).collect();
-    let (log_c, q) = (u.global[LOG_C] - newest_gain(&gammas), u.global[Q]);
+    let (log_c, q) = (u.global[LOG_C] - newest(&gammas, GAIN_SD), u.global[Q]);
     let mut model = model_of(&u.global);
+    let late: Vec<f64> = u.local.iter().map(|l| l[LATE]).collect();
+    model.delay = (model.delay + newest(&late, LATE_SD)).clamp(0.0, DELAY_MAX);
     // sd of log v at 300 px^2 from the wide stage: log v = log c + q log 300.
     let l = 300f64.ln();
     let log_v_var = wide_covariance[(LOG_C, LOG_C)] + 2.0 * l * wide_covariance[(LOG_C, Q)] + l * l * wide_covariance[(Q, Q)];
@@ -478,11 +503,22 @@ pub fn fit(episodes: &[TrainingEpisode]) -> Fit {
             hold_above_px2: calibrate::HOLD_ABOVE_PX2,
         },
         episodes: u.local,
-        cost,
         covariance: covariance.view((0, 0), (GLOBAL, GLOBAL)).into_owned(),
         calibration_covariance: [LOG_C, Q].map(|i| [LOG_C, Q].map(|j| wide_covariance[(i, j)])),
         dropouts,
     }
+}
+
+/// Each episode's delay above the model's, if it has changed on the way (as [`newest`] judges).
+fn changed_delay(problem: &Problem<'_>, u: &Unknowns) -> Option<Vec<f64>> {
+    if u.local.len() < 2 * CHANGE_NEEDS {
+        return None;
+    }
+    let mut free = u.clone();
+    let stage = Stage { late_sd: LATE_FREE, ..problem.stage };
+    Problem { stage, ..*problem }.solve(&mut free, 12, 1e-3);
+    let late: Vec<f64> = free.local.iter().map(|l| l[LATE]).collect();
+    (newest(&late, LATE_SD) != 0.0).then_some(late)
 }
 
 /// log c of the paper's own calibration, if it meets the weights as well as they can be read.
@@ -507,16 +543,17 @@ fn gain_sd(gammas: &[f64], expected: f64) -> f64 {
     ((3.0 * expected * expected + sum) / (3.0 + gammas.len() as f64)).sqrt()
 }
 
-/// Mean gamma of the newest episodes if the camera's gain has changed since the ones before (beyond 3.5 standard errors, three
-/// episodes at least on either side), else 0. Episodes are in the order in which they were poured.
-fn newest_gain(gammas: &[f64]) -> f64 {
-    let n = gammas.len();
+/// Mean of the newest episodes' values if they have changed since the ones before (beyond 3.5 standard errors,
+/// [`CHANGE_NEEDS`] episodes at least on either side, scatter `sd_min` at least), else 0. Episodes are in the order in which
+/// they were poured.
+fn newest(values: &[f64], sd_min: f64) -> f64 {
+    let n = values.len();
     let mut found = (3.5, 0.0);
-    for k in 3..n.saturating_sub(2) {
-        let (before, after) = gammas.split_at(k);
+    for k in CHANGE_NEEDS..(n + 1).saturating_sub(CHANGE_NEEDS) {
+        let (before, after) = values.split_at(k);
         let mean = |g: &[f64]| g.iter().sum::<f64>() / g.len() as f64;
         let spread = |g: &[f64]| g.iter().map(|x| (x - mean(g)).powi(2)).sum::<f64>();
-        let sd = ((spread(before) + spread(after)) / (n - 2) as f64).sqrt().max(GAIN_SD);
+        let sd = ((spread(before) + spread(after)) / (n - 2) as f64).sqrt().max(sd_min);
         let z = (mean(after) - mean(before)).abs() / (sd * (1.0 / before.len() as f64 + 1.0 / after.len() as f64).sqrt());
         if z > found.0 {
             found = (z, mean(after));
@@ -532,7 +569,7 @@ fn onset_guess(flow: &Flow, p: &Prepared) -> f64 {
     for alpha in &p.alpha[..=p.first] {
         history.copy_within(1.., 0);
         history[HISTORY - 1] = *alpha;
-        a = flow.tilt(a, flow.delayed(&history, 0));
+        a = flow.tilt(a, flow.delayed(&history, 0, 0.0));
     }
     a - 1.0
 }
@@ -600,11 +637,11 @@ mod tests {
         let scatter = [0.01, -0.012, 0.004, -0.008, 0.011, -0.003, 0.006];
         let changed =
             |from: usize, by: f64| -> Vec<f64> { scatter.iter().enumerate().map(|(k, g)| g + if k >= from { by } else { 0.0 }).collect() };
-        assert_eq!(newest_gain(&scatter), 0.0);
-        assert!((newest_gain(&changed(4, 0.06)) - 0.06).abs() < 0.01);
-        assert!((newest_gain(&changed(3, -0.06)) + 0.06).abs() < 0.01);
-        assert_eq!(newest_gain(&changed(5, 0.06)), 0.0, "two episodes say nothing");
-        assert_eq!(newest_gain(&changed(4, 0.02)), 0.0, "within the scatter");
+        assert_eq!(newest(&scatter, GAIN_SD), 0.0);
+        assert!((newest(&changed(4, 0.06), GAIN_SD) - 0.06).abs() < 0.01);
+        assert!((newest(&changed(3, -0.06), GAIN_SD) + 0.06).abs() < 0.01);
+        assert_eq!(newest(&changed(5, 0.06), GAIN_SD), 0.0, "two episodes say nothing");
+        assert_eq!(newest(&changed(4, 0.02), GAIN_SD), 0.0, "within the scatter");
     }
 
     /// Protects the paper's own calibration where it is right: areas in proportion to the weights give its c, others none.

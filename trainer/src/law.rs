@@ -212,7 +212,7 @@ impl ModelPour<'_> {
         });
         self.history.copy_within(1.., 0);
         self.history[HISTORY - 1] = alpha;
-        self.state.a_deg = self.flow.tilt(self.state.a_deg, self.flow.delayed(&self.history, 0));
+        self.state.a_deg = self.flow.tilt(self.state.a_deg, self.flow.delayed(&self.history, 0, 0.0));
         let v = self.flow.over(self.state.a_deg, self.state.x_ml, 0.0).v_ml;
         self.state.x_ml += v;
         let eta = self.flow.model.eta;

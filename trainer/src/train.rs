@@ -142,7 +142,7 @@ pub struct Args {
     /// Number of actions: 2 (+-1 degree) or 21 (Fig. 5).
     #[arg(long, default_value_t = 21, value_parser = parse_actions)]
     actions: u8,
-    /// How d is estimated; fused with method best, sum with the others, if not given.
+    /// How d is estimated; fused with methods best and paper, sum with the others, if not given.
     #[arg(long, value_enum)]
     estimate: Option<Estimate>,
     /// Seed: the same seed and data give the same bytes.
@@ -191,9 +191,10 @@ pub fn limits(config: Option<&Path>) -> Result<Limits, shared::config::ConfigErr
 pub fn run(args: &Args) -> Result<(), Failure> {
     let read = data::read(&args.episodes, args.scale.as_deref()).or_exit(exit::BAD_INPUT)?;
     let limits = limits(args.config.as_deref()).or_exit(exit::BAD_INPUT)?;
-    let estimate = args.estimate.unwrap_or(if args.method == MethodName::Best { Estimate::Fused } else { Estimate::Sum });
-    if estimate == Estimate::Fused && args.method != MethodName::Best {
-        let what = "--estimate fused goes with --method best: the others learn on the paper's own sum";
+    let can_fuse = matches!(args.method, MethodName::Best | MethodName::Paper);
+    let estimate = args.estimate.unwrap_or(if can_fuse { Estimate::Fused } else { Estimate::Sum });
+    if estimate == Estimate::Fused && !can_fuse {
+        let what = "--estimate fused goes with --method best or paper: the others learn on the paper's own sum";
         return Err(failure(exit::BAD_INPUT, what));
     }
     let usable = data::usable(&read);

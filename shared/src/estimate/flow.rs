@@ -211,10 +211,11 @@ impl Flow {
         a_deg + ((u_deg - a_deg) / (1.0 + self.model.tau)).clamp(-TILT_STEP_DEG, TILT_STEP_DEG)
     }
 
-    /// The delayed command alpha(t + ahead - D), `commands` holding alpha(t - HISTORY + 1), ..., alpha(t), ... in order.
+    /// The delayed command alpha(t + ahead - D - late), `commands` holding alpha(t - HISTORY + 1), ..., alpha(t), ... in
+    /// order; `late` is what a pour's delay is above D, frames.
     #[inline]
-    pub fn delayed(&self, commands: &[f64], ahead: usize) -> f64 {
-        let delay = self.model.delay.clamp(0.0, DELAY_MAX);
+    pub fn delayed(&self, commands: &[f64], ahead: usize, late: f64) -> f64 {
+        let delay = (self.model.delay + late).clamp(0.0, DELAY_MAX);
         let whole = delay as usize;
         let part = delay - whole as f64;
         let at = (HISTORY - 1 + ahead).saturating_sub(whole).min(commands.len() - 1);
@@ -242,11 +243,11 @@ impl Flow {
             *command = alpha;
         }
         let scale = state.beta.exp();
-        let FlowState { mut a_deg, mut x_ml, film_ml, lambda, .. } = *state;
+        let FlowState { mut a_deg, mut x_ml, film_ml, lambda, late, .. } = *state;
         let mut over_ml = 0.0;
-        let upright_after = self.model.delay as usize + 4;
+        let upright_after = (self.model.delay + late).max(0.0) as usize + 4;
         for j in 1..STOP_FRAMES {
-            let next = self.tilt(a_deg, self.delayed(&commands, j));
+            let next = self.tilt(a_deg, self.delayed(&commands, j, late));
             let over = self.over(next, x_ml, lambda);
             over_ml += over.v_ml;
             x_ml += scale * over.v_ml;
@@ -273,6 +274,8 @@ pub struct FlowState {
     pub lambda: f64,
     /// Scale of the geometry, log.
     pub beta: f64,
+    /// Delay of this pour above the model's D, frames.
+    pub late: f64,
 }
 
 /// How the controller brings the container upright.

@@ -26,7 +26,7 @@ const DELTA: usize = 6;
 /// Number of explanations.
 const EXPLANATIONS: usize = 3;
 /// How likely each is before anything was seen.
-const PRIOR: [f64; EXPLANATIONS] = [0.7, 0.2, 0.1];
+const PRIOR: [f64; EXPLANATIONS] = [0.6, 0.18, 0.22];
 /// Share of a frame's log-likelihood that counts: frames are less independent than the filters believe.
 const TEMPER: f64 = 0.5;
 
@@ -164,6 +164,7 @@ impl Fused {
             film_ml: self.mean(FILM),
             lambda: self.mean(LAMBDA),
             beta: self.mean(BETA),
+            late: self.mean(DELTA),
         }
     }
 
@@ -237,7 +238,7 @@ impl Fused {
         self.history.copy_within(1.., 0);
         self.history[HISTORY - 1] = alpha;
         self.a_before_deg = self.a_deg;
-        self.a_deg = self.flow.tilt(self.a_deg, self.flow.delayed(&self.history, 0));
+        self.a_deg = self.flow.tilt(self.a_deg, self.flow.delayed(&self.history, 0, 0.0));
     }
 }
 
@@ -434,7 +435,7 @@ mod tests {
         fn frame(&mut self, alpha_deg: f64) -> f64 {
             self.history.copy_within(1.., 0);
             self.history[HISTORY - 1] = alpha_deg;
-            self.a = self.flow.tilt(self.a, self.flow.delayed(&self.history, 0));
+            self.a = self.flow.tilt(self.a, self.flow.delayed(&self.history, 0, 0.0));
             let v = self.flow.over(self.a, self.x, 0.0).v_ml;
             self.x += v;
             self.film += 0.1 * v;
@@ -525,6 +526,19 @@ mod tests {
         }
         let flowed = vessel.poured - before;
         assert!(flowed > 3.0 && (said - flowed).abs() < 0.05 * flowed + 0.1, "{said} {flowed}");
+    }
+
+    /// Protects control with a picture that comes later than the model knows: what flows until then is counted too.
+    #[test]
+    fn a_late_picture_means_more_is_on_its_way() {
+        let flow = Flow::new(&FlowModel::default());
+        let later = Flow::new(&FlowModel { delay: flow.model.delay + 2.0, ..flow.model });
+        let history: [f64; HISTORY] = std::array::from_fn(|k| 50.0 + 0.5 * k as f64);
+        let state = FlowState { a_deg: 54.0, x_ml: flow.capacity_ml(52.0), ..FlowState::default() };
+        let volume = |flow: &Flow, late: f64| flow.stop_volume_ml(&FlowState { late, ..state }, &history, 57.5, BACK);
+        let (usual, late) = (volume(&flow, 0.0), volume(&flow, 2.0));
+        assert!(late > 1.1 * usual, "{usual} {late}");
+        assert!((late - volume(&later, 0.0)).abs() < 1e-9);
     }
 
     /// Protects the volume from lost frames: the model bridges them.

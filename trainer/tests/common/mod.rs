@@ -11,7 +11,12 @@ pub const CAMERA: (f64, f64) = (0.0012, 1.2);
 
 /// `n` curves of eq. (1) from different volumes, weighed to the gram.
 pub fn episodes(n: usize, seed: u64) -> Vec<TrainingEpisode> {
-    let flow = Flow::new(&FlowModel::default());
+    episodes_of(&FlowModel::default(), n, seed)
+}
+
+/// The same, made by another model.
+pub fn episodes_of(model: &FlowModel, n: usize, seed: u64) -> Vec<TrainingEpisode> {
+    let flow = Flow::new(model);
     let mut rng = Pcg64Mcg::seed_from_u64(seed);
     (0..n)
         .map(|k| {
@@ -28,7 +33,7 @@ pub fn episodes(n: usize, seed: u64) -> Vec<TrainingEpisode> {
                 let alpha = if t_s < 2.0 * beta_s { top * (-((t_s - beta_s) / sigma_s).powi(2) / 2.0).exp() } else { 0.0 };
                 history.copy_within(1.., 0);
                 history[HISTORY - 1] = alpha;
-                a = flow.tilt(a, flow.delayed(&history, 0));
+                a = flow.tilt(a, flow.delayed(&history, 0, 0.0));
                 let v = flow.over(a, x, 0.0).v_ml;
                 x += v;
                 film += 0.1 * v;
