@@ -61,8 +61,8 @@ pub fn contributions(episode: &TrainingEpisode, calibration: &Calibration) -> Ve
     seen.iter().map(|v| episode.weight_g * v / sum.max(1e-12)).collect()
 }
 
-/// What the estimator of `weights` takes for poured or on its way after each frame of an episode, in proportion so that it adds
-/// up to w_E: the fused estimate's counterpart of the sum of the contribution volumes.
+/// The fused estimate's counterpart of the sum of the contribution volumes: what it takes for poured or on its way after each
+/// frame of an episode, in proportion so that it ends at w_E.
 fn fused_sums(episode: &TrainingEpisode, calibration: &Calibration, mut filter: Fused) -> Vec<f64> {
     let sums: Vec<f64> = episode
         .area_px2

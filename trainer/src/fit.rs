@@ -13,8 +13,8 @@ use rayon::prelude::*;
 use shared::estimate::flow::{DELAY_MAX, DRIP, Flow, FlowModel, FlowNoise, HISTORY, KNOTS, KNOTS_DEG};
 use shared::estimate::{Calibration, Hold, tilt_z};
 
-use crate::calibrate;
 use crate::data::TrainingEpisode;
+use crate::{best, calibrate};
 
 /// Global unknowns: s (one a knot), log R, log H/R, taper, flat, lk, p, k1, k2, tau, delay, eta, log c, q, tilt.
 const GLOBAL: usize = KNOTS + 14;
@@ -483,13 +483,15 @@ pub fn fit(episodes: &[TrainingEpisode]) -> Fit {
     // sd of log v at 300 px^2 from the wide stage: log v = log c + q log 300.
     let l = 300f64.ln();
     let log_v_var = wide_covariance[(LOG_C, LOG_C)] + 2.0 * l * wide_covariance[(LOG_C, Q)] + l * l * wide_covariance[(Q, Q)];
+    // Below this many episodes the sds are mostly those of the priors, and half of them pours best on other rigs.
+    let share = if episodes.len() < best::GEOMETRY_NEEDS { 0.5 } else { 1.0 };
     model.noise = FlowNoise {
         lambda: 0.15,
         gamma: (1.6
             * (gain_sd(&gammas, if linear.is_some() { GAIN_LINEAR } else { GAIN_EXPECTED }) * q / 1.15)
-                .hypot(0.5 * log_v_var.max(0.0).sqrt()))
+                .hypot(0.5 * share * log_v_var.max(0.0).sqrt()))
         .min(0.5),
-        beta: trusted(0.007f64.hypot(geometry_variance(&u, &covariance).sqrt())),
+        beta: share * trusted(0.007f64.hypot(geometry_variance(&u, &covariance).sqrt())),
         delta: 0.3,
         frame: (frame_sd * q).clamp(0.02, 1.0),
         v_min_ml: log_c.exp() * area_min.powf(q),
@@ -531,10 +533,10 @@ fn linear(episodes: &[TrainingEpisode]) -> Option<f64> {
 }
 
 /// The sd of the geometry's scale that the filter gets. The narrow stage tempers the frames' residuals, so its covariance is
-/// too wide where the frames decide, and 0.4 of it pours best on other rigs; where little was poured the priors decide,
+/// too wide where the frames decide, and a third of it pours best on other rigs; where little was poured the priors decide,
 /// and nothing may be taken off.
 fn trusted(sd: f64) -> f64 {
-    (0.4 * sd * (sd / 0.05).max(1.0)).min(0.5)
+    (0.34 * sd * (sd / 0.05).max(1.0)).min(0.5)
 }
 
 /// How much the camera's gain changes from pour to pour: what is expected counts as three episodes beside those fitted.
