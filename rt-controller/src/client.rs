@@ -1,7 +1,7 @@
 //! The clients' side of the controller's service `control`: one request, one answer. Ordinary threads; allocates.
 
-use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, Ordering};
+use std::path::PathBuf;
+use std::sync::atomic::Ordering;
 use std::time::{Duration, Instant};
 
 use iceoryx2::port::client::Client as Port;
@@ -10,9 +10,21 @@ use indicatif::ProgressStyle;
 use shared::control::{Outcome, Reply, Request, Status};
 use shared::ipc::{Cell, IpcError};
 use shared::messages::{RecorderReport, RecorderState};
+use shared::os;
 
 /// Largest request or answer, bytes.
 pub const MESSAGE_MAX: usize = 64 * 1024;
+
+/// What the commands that ask the running controller have in common on the command line.
+#[derive(Debug, clap::Args)]
+pub struct Common {
+    /// The cell's configuration.
+    #[arg(long, default_value = shared::config::DEFAULT_FILE)]
+    pub config: PathBuf,
+    /// Print the result as JSON.
+    #[arg(long)]
+    pub json: bool,
+}
 
 /// Why the controller did not answer.
 #[derive(Debug, thiserror::Error)]
@@ -87,10 +99,8 @@ pub enum FollowError {
 impl Client {
     /// Shows the progress of `episode` on standard error until it has ended. Ctrl-C aborts it.
     pub fn follow(&self, episode: u64) -> Result<Outcome, FollowError> {
-        let interrupted = Arc::new(AtomicBool::new(false));
-        for signal in [signal_hook::consts::SIGINT, signal_hook::consts::SIGTERM] {
-            let _ = signal_hook::flag::register(signal, Arc::clone(&interrupted));
-        }
+        // Without it Ctrl-C ends this command, and the pour goes on.
+        let interrupted = os::stop_at_signals().unwrap_or_default();
         let bar = indicatif::ProgressBar::new(1000);
         bar.set_style(ProgressStyle::with_template("{bar:30} {msg}").unwrap_or_else(|_| ProgressStyle::default_bar()));
         let mut aborted = false;

@@ -25,7 +25,6 @@ use shared::os;
 use crate::camera::{Renderer, Scene, View};
 use crate::physics::container::Container;
 use crate::physics::rig::Rig;
-use crate::stop_at_signals;
 use crate::ur;
 
 /// SCHED_FIFO priorities where permitted: a real robot, liquid and camera do not wait for this machine's other work. Below the
@@ -152,7 +151,7 @@ pub fn run(args: &Args) -> Result<(), Failure> {
 }
 
 fn simulate(config: Config, sim: SimulatorConfig) -> Result<(), Box<dyn std::error::Error>> {
-    let stop = stop_at_signals()?;
+    let stop = os::stop_at_signals()?;
     let mut start_q_rad = [0.0, -1.571, 1.571, -1.571, -1.571, 0.0];
     start_q_rad[config.robot.joint.index()] = config.robot.start_joint_deg.to_radians();
     let robot = ur::Controller::start(ur::Options { series: sim.series, start_q_rad, ..ur::Options::new(config.robot.address) })?;
