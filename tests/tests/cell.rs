@@ -53,7 +53,8 @@ fn a_recording_becomes_an_episode() {
     assert!(episode.info.images as usize >= episode.frames.len() * 9 / 10, "{} images", episode.info.images);
 }
 
-/// Protects a running lab: a new weight file is taken without restart, a bad one is refused and the old one stays.
+/// Protects a running lab: a new weight file is taken without restart, a bad one is refused and the old one stays; and an episode
+/// names the weights that poured it, not those on the disk.
 #[test]
 fn weights_are_swapped_while_running() {
     let cell = CellUnderTest::start(|_| {});
@@ -62,6 +63,12 @@ fn weights_are_swapped_while_running() {
     std::fs::write(cell.weights(), b"decant-w but not really").expect("writable");
     let status = cell.wait("the refusal", Duration::from_secs(5), |s| s["weights_refused"] != "");
     assert_eq!(status["weights"], first);
+    cell.json("simulator", &["operator", "fill", "300", "--json"]);
+    let pour = cell.json("rt-controller", &["pour", "20", "--json"]);
+    let file = pour["episode_file"].as_str().expect("the pour was recorded");
+    let episode = shared::episode::Episode::read(std::path::Path::new(file)).expect("readable");
+    assert_eq!(episode.info.weights.as_str(), first);
+    assert_eq!(episode.info.weights, steady_weights(TILT_OUT).identity());
     cell.take_weights(&steady_weights(TILT_OUT + 1));
     let status = cell.wait("the new identity", Duration::from_secs(5), |s| s["weights"] != first);
     assert_eq!(status["weights_refused"], "");
