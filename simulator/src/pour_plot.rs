@@ -36,7 +36,7 @@ pub fn draw(file: &Path, ticks: &[Telemetry], goal_ml: f32, scale_g: f64) -> Res
         "alpha, degrees",
         &[("commanded", ALPHA, points(&|t| t.alpha_deg)), ("measured", MEASURED, points(&|t| t.alpha_measured_deg))],
     )?;
-    panel(&panels[1], "V_e, px^2", &[("V_e", AREA, points(&|t| t.area_px2))])?;
+    panel(&panels[1], "V_e, px²", &[("V_e", AREA, points(&|t| t.area_px2))])?;
     panel(&panels[2], "ml", &[("d", D, points(&|t| t.d_ml)), ("poured (estimate)", POURED, points(&|t| t.poured_ml))])?;
     root.present()?;
     Ok(())
@@ -58,7 +58,16 @@ fn panel(area: &Drawing, unit: &str, lines: &[Line]) -> Result<(), Box<dyn std::
         .x_label_area_size(36)
         .y_label_area_size(60)
         .build_cartesian_2d(0.0..end_s, low - if low < 0.0 { margin } else { 0.0 }..high + margin)?;
-    chart.configure_mesh().x_desc("s").y_desc(unit).light_line_style(TRANSPARENT).label_style(("sans-serif", 13)).draw()?;
+    let tick = |v: &f64| ((v * 1e6).round() / 1e6).to_string();
+    chart
+        .configure_mesh()
+        .x_desc("s")
+        .y_desc(unit)
+        .x_label_formatter(&tick)
+        .y_label_formatter(&tick)
+        .light_line_style(TRANSPARENT)
+        .label_style(("sans-serif", 13))
+        .draw()?;
     for (_, colour, points) in lines {
         chart.draw_series(LineSeries::new(points.iter().copied(), colour.stroke_width(2)))?;
     }
