@@ -1,7 +1,7 @@
 //! `rt-controller run`: the resident process.
 //!
-//! Main thread: clients, telemetry, weights (ordinary). Thread "loop": real-time. Thread "robot": connects. A signal brings the
-//! container upright and ends the process; a second one ends it at once (the robot's program then goes upright by itself).
+//! Main thread: clients, telemetry (ordinary). Thread "loop": real-time. Thread "robot": connects. Thread "disk": journal, weights. A
+//! signal brings the container upright and ends the process; a second one ends it at once (the robot's program then goes upright by itself).
 
 use std::io::Write;
 use std::path::PathBuf;

@@ -174,9 +174,11 @@ pub fn escape(text: &str) -> String {
 /// A table; the first row is the heading. A screen that is narrower scrolls it.
 pub fn table(rows: &[Vec<String>]) -> String {
     let mut html = String::from("<div class=scroll><table>");
+    let words = |column: usize| rows.iter().skip(1).any(|r| r.get(column).is_some_and(|c| c.contains(char::is_alphabetic)));
     for (k, row) in rows.iter().enumerate() {
         let tag = if k == 0 { "th" } else { "td" };
-        let cells: String = row.iter().map(|c| format!("<{tag}>{}</{tag}>", escape(c))).collect();
+        let class = |column: usize| if words(column) { " class=words" } else { "" };
+        let cells: String = row.iter().enumerate().map(|(i, c)| format!("<{tag}{}>{}</{tag}>", class(i), escape(c))).collect();
         html += &format!("<tr>{cells}</tr>");
     }
     html + "</table></div>"
@@ -196,7 +198,8 @@ body{{font:15px/1.5 system-ui,sans-serif;max-width:72rem;margin:2rem auto;paddin
 h1{{font-size:1.6rem}}h2{{font-size:1.25rem;margin-top:2.2rem;border-bottom:1px solid #ccc}}\
 .scroll{{overflow-x:auto}}table{{border-collapse:collapse;margin:1rem 0;font-size:.92rem;break-inside:avoid}}\
 th,td{{padding:.25rem .6rem;border-bottom:1px solid #ddd;text-align:right;white-space:nowrap}}th{{background:#f2f4f7;vertical-align:bottom;white-space:normal}}\
-th:first-child,td:first-child,.facts td{{text-align:left}}.facts th{{vertical-align:top;white-space:nowrap}}.facts td{{white-space:normal;overflow-wrap:anywhere}}\
+td.words{{white-space:normal}}td:first-child{{white-space:nowrap}}\
+th:first-child,td:first-child,.words,.facts td{{text-align:left}}.facts th{{vertical-align:top;white-space:nowrap}}.facts td{{white-space:normal;overflow-wrap:anywhere}}\
 .plots{{display:grid;grid-template-columns:repeat(2,1fr);gap:1rem}}figure{{margin:0;break-inside:avoid}}\
 figure svg{{width:100%;height:auto}}figcaption{{font-size:.9rem;color:#444}}.legend{{font-size:.85rem}}.legend span{{margin-right:.9em;white-space:nowrap}}code{{font-size:.85em}}\
 @media screen and (max-width:45rem){{.plots{{grid-template-columns:1fr}}}}\
