@@ -174,7 +174,8 @@ pub fn escape(text: &str) -> String {
 /// A table; the first row is the heading. A screen that is narrower scrolls it.
 pub fn table(rows: &[Vec<String>]) -> String {
     let mut html = String::from("<div class=scroll><table>");
-    let words = |column: usize| rows.iter().skip(1).any(|r| r.get(column).is_some_and(|c| c.contains(char::is_alphabetic)));
+    let words =
+        |column: usize| rows.iter().skip(1).any(|r| r.get(column).is_some_and(|c| c.starts_with(char::is_alphabetic) && c != "NaN"));
     for (k, row) in rows.iter().enumerate() {
         let tag = if k == 0 { "th" } else { "td" };
         let class = |column: usize| if words(column) { " class=words" } else { "" };
