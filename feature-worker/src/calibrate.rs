@@ -7,8 +7,7 @@
 //! allocates; nothing is changed but the `[image]` table of the configuration, and that only with --write or a click.
 
 use std::path::{Path, PathBuf};
-use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, Ordering::Relaxed};
+use std::sync::atomic::Ordering::Relaxed;
 use std::time::Duration;
 
 use opencv::core::{self, CV_8U, CV_32FC3, Mat, Scalar, Vec4i, Vector};
@@ -19,6 +18,7 @@ use shared::config::{CameraConfig, Config, ImageConfig, LiquidMethod};
 use shared::exit::{self, Failure, OrExit as _, failure};
 use shared::ipc::Cell;
 use shared::messages::PixelFormat;
+use shared::os;
 use tiny_http::{Response, Server};
 
 use crate::extract::{Axes, Extractor, Image};
@@ -372,10 +372,7 @@ fn save_picture(args: &Args, config: &Config, frames: &[Mat]) -> Result<(), Fail
 
 /// Serves the page until "Write" or Ctrl-C.
 fn page(args: &Args, mut config: Config, mut corner: Corner, frames: &[Mat]) -> Result<(), Failure> {
-    let stop = Arc::new(AtomicBool::new(false));
-    for signal in [signal_hook::consts::SIGINT, signal_hook::consts::SIGTERM] {
-        signal_hook::flag::register(signal, Arc::clone(&stop)).or_exit(exit::FAILED)?;
-    }
+    let stop = os::stop_at_signals().or_exit(exit::FAILED)?;
     let server = Server::http(("127.0.0.1", args.port))
         .map_err(|e| failure(exit::FAILED, format!("port {} on 127.0.0.1: {e}; give another --port", args.port)))?;
     eprintln!("calibrate: open http://{} on this machine, click lip, top edge and left side, then Write", server.server_addr());

@@ -27,7 +27,6 @@ use shared::episode::{AlphaTrack, End, EpisodeWriter, Kind, Sample, Start, Write
 use shared::ipc::{Cell, IpcError};
 use shared::messages::{Feature, FrameHeader, PixelFormat, RecorderReport, RecorderState, Telemetry};
 use shared::os::now_ns;
-use shared::weights::Weights;
 
 /// Frames kept from before an episode: telemetry and frames arrive with different delays.
 const RING_FRAMES: usize = 8;
@@ -338,14 +337,13 @@ impl Worker {
         } else {
             Kind::Pour { goal_ml: tick.goal_ml }
         };
-        let weights = Weights::read(&self.config.controller.weights).map(|w| w.identity()).unwrap_or_default();
         let start = Start {
             episode: tick.episode,
             kind,
             started_at_ns: tick.at_ns,
             wall_clock: SystemTime::now(),
             config: &self.config,
-            weights: &weights,
+            weights: &tick.weights(),
         };
         match EpisodeWriter::create(&self.directory, &start) {
             Ok(writer) => {

@@ -6,7 +6,7 @@
 
 use std::path::PathBuf;
 use std::sync::atomic::{AtomicBool, Ordering::Relaxed};
-use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::sync::{Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
 use opencv::core::{Mat, Point, Rect, Scalar, Vector};
@@ -16,6 +16,7 @@ use shared::config::Config;
 use shared::exit::{self, Failure, OrExit as _, failure};
 use shared::ipc::Cell;
 use shared::messages::{Doubt, PixelFormat};
+use shared::os;
 use tiny_http::{Header, Response, Server};
 
 use crate::extract::{Extractor, Image, Measurement};
@@ -60,10 +61,7 @@ fn lock(shown: &Mutex<Shown>) -> MutexGuard<'_, Shown> {
 }
 
 fn show(args: &Args, config: &Config) -> Result<(), Failure> {
-    let stop = Arc::new(AtomicBool::new(false));
-    for signal in [signal_hook::consts::SIGINT, signal_hook::consts::SIGTERM] {
-        signal_hook::flag::register(signal, Arc::clone(&stop)).or_exit(exit::FAILED)?;
-    }
+    let stop = os::stop_at_signals().or_exit(exit::FAILED)?;
     opencv::core::set_num_threads(1).or_exit(exit::FAILED)?;
     let mut extractor = Extractor::new(&config.camera, &config.image).or_exit(exit::BAD_INPUT)?;
     let cell = Cell::join(&config.cell.name).or_exit(exit::UNREACHABLE)?;

@@ -73,10 +73,7 @@ pub fn run(args: &Args) -> Result<(), Failure> {
 }
 
 fn work(config: &Config, json: bool) -> Result<(), Failure> {
-    let stop = Arc::new(AtomicBool::new(false));
-    for signal in [signal_hook::consts::SIGINT, signal_hook::consts::SIGTERM] {
-        signal_hook::flag::register(signal, Arc::clone(&stop)).map_err(|e| failure(exit::FAILED, format!("signal handler: {e}")))?;
-    }
+    let stop = os::stop_at_signals().or_exit(exit::FAILED)?;
     // OpenCV's own threads would run on the controller's core and wait for each other.
     opencv::core::set_num_threads(1).or_exit(exit::BAD_INPUT)?;
     let mut extractor = Extractor::new(&config.camera, &config.image).or_exit(exit::BAD_INPUT)?;

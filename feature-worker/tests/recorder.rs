@@ -30,7 +30,6 @@ fn config(cell: &str, directory: &Path) -> Config {
     config.camera.height_px = HEIGHT;
     config.recording.directory = directory.into();
     config.recording.queue_frames = 300;
-    config.controller.weights = directory.join("none.bin");
     config
 }
 
@@ -98,6 +97,7 @@ impl Scene {
                 at_ns,
                 robot_at_ns: at_ns,
                 episode,
+                policy: 0xabc,
                 alpha_deg,
                 alpha_measured_deg: alpha_deg - 2.0,
                 goal_ml: if phase == Phase::Pouring { 75.0 } else { f32::NAN },
@@ -191,6 +191,7 @@ fn a_recording_becomes_a_complete_episode() {
     assert!(episode.complete);
     assert_eq!(episode.kind, Kind::Recording(CURVE));
     assert_eq!((episode.info.ticks, episode.info.lost_ticks, episode.info.lost_frames), (45, 0, 0));
+    assert_eq!(episode.info.weights, "0000000000000abc", "the policy that the controller runs");
     assert_eq!(episode.info.images, report.images);
     assert_eq!(episode.info.images as usize, episode.frames.len());
     // Ticks 13 to 57 are the episode, tick 58 ends it: frames 13 to 58 were captured in between, 14 is the first after the start.

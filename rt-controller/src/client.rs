@@ -1,7 +1,7 @@
 //! The clients' side of the controller's service `control`: one request, one answer. Ordinary threads; allocates.
 
-use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, Ordering};
+use std::path::PathBuf;
+use std::sync::atomic::Ordering;
 use std::time::{Duration, Instant};
 
 use iceoryx2::port::client::Client as Port;
@@ -10,9 +10,24 @@ use indicatif::ProgressStyle;
 use shared::control::{Outcome, Reply, Request, Status};
 use shared::ipc::{Cell, IpcError};
 use shared::messages::{RecorderReport, RecorderState};
+use shared::os;
 
 /// Largest request or answer, bytes.
 pub const MESSAGE_MAX: usize = 64 * 1024;
+
+/// How often a controller may say that it does other things than the episode that it has started: for a second.
+const UNKNOWN_MAX: u32 = 10;
+
+/// What the commands that ask the running controller have in common on the command line.
+#[derive(Debug, clap::Args)]
+pub struct Common {
+    /// The cell's configuration.
+    #[arg(long, default_value = shared::config::DEFAULT_FILE)]
+    pub config: PathBuf,
+    /// Print the result as JSON.
+    #[arg(long)]
+    pub json: bool,
+}
 
 /// Why the controller did not answer.
 #[derive(Debug, thiserror::Error)]
@@ -26,6 +41,9 @@ pub enum ClientError {
         /// The cell's name.
         cell: String,
     },
+    /// It knows nothing of an episode that it had started.
+    #[error("rt-controller knows nothing of episode {0} any more: it was restarted; the robot's program brings the container upright")]
+    Forgotten(u64),
     /// The answer cannot be read.
     #[error("rt-controller answered in another version's words: run the same build on both sides")]
     Version,
@@ -87,13 +105,11 @@ pub enum FollowError {
 impl Client {
     /// Shows the progress of `episode` on standard error until it has ended. Ctrl-C aborts it.
     pub fn follow(&self, episode: u64) -> Result<Outcome, FollowError> {
-        let interrupted = Arc::new(AtomicBool::new(false));
-        for signal in [signal_hook::consts::SIGINT, signal_hook::consts::SIGTERM] {
-            let _ = signal_hook::flag::register(signal, Arc::clone(&interrupted));
-        }
+        // Without it Ctrl-C ends this command, and the pour goes on.
+        let interrupted = os::stop_at_signals().unwrap_or_default();
         let bar = indicatif::ProgressBar::new(1000);
         bar.set_style(ProgressStyle::with_template("{bar:30} {msg}").unwrap_or_else(|_| ProgressStyle::default_bar()));
-        let mut aborted = false;
+        let (mut aborted, mut unknown) = (false, 0);
         loop {
             if interrupted.load(Ordering::Relaxed) && !aborted {
                 self.ask(&Request::Abort)?;
@@ -104,8 +120,10 @@ impl Client {
                 bar.finish_and_clear();
                 return if aborted { Err(FollowError::Interrupted(*outcome)) } else { Ok(*outcome) };
             }
-            if status.episode != episode && status.episode != 0 {
-                return Err(ClientError::Version.into());
+            // The tick that starts an episode may be heard of a little after the answer that it started.
+            unknown = if status.episode == episode { 0 } else { unknown + 1 };
+            if unknown > UNKNOWN_MAX {
+                return Err(ClientError::Forgotten(episode).into());
             }
             bar.set_position((1000.0 * (status.poured_ml / status.goal_ml).clamp(0.0, 1.0)) as u64);
             bar.set_message(format!("alpha {:5.1} deg  poured {:5.1} ml  d {:5.1} ml", status.alpha_deg, status.poured_ml, status.d_ml));

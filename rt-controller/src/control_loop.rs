@@ -7,7 +7,7 @@
 use std::sync::atomic::{AtomicU64, Ordering::Relaxed};
 
 use iceoryx2::port::update_connections::UpdateConnections;
-use shared::messages::{Feature, Phase};
+use shared::messages::{Feature, Phase, Telemetry};
 use shared::os;
 
 use shared::control::EndReason;
@@ -68,6 +68,8 @@ pub struct Ticks<'a> {
     core: Box<Core>,
     fresh: heapless::Vec<Feature, MAX_FEATURES>,
     session: Option<Box<Session>>,
+    /// Identity of the core's policy; 0: it has none.
+    policy: u64,
     features: &'a Features,
     exchange: &'a Exchange,
     pacer: Pacer,
@@ -85,6 +87,7 @@ impl<'a> Ticks<'a> {
             core: Box::new(Core::new(settings)),
             fresh: heapless::Vec::new(),
             session: None,
+            policy: 0,
             features,
             exchange,
             pacer: Pacer::new(settings.period_ns),
@@ -117,9 +120,10 @@ impl<'a> Ticks<'a> {
         let mut taken = None;
         if self.core.may_exchange()
             && !exchange.old_agents.is_full()
-            && let Some((number, agent)) = exchange.agents.pop()
+            && let Some((identity, agent)) = exchange.agents.pop()
         {
-            taken = Some(number);
+            taken = Some(identity);
+            self.policy = identity;
             exchange.agents_taken.fetch_add(1, Relaxed);
             if let Some(old) = self.core.exchange(agent) {
                 let _ = exchange.old_agents.push(old);
@@ -171,7 +175,7 @@ impl<'a> Ticks<'a> {
         exchange.loop_page_faults.store(faults - self.elsewhere.1, Relaxed);
         let done_ns = os::now_ns();
         exchange.timing.execution.record(done_ns.saturating_sub(woke_ns));
-        let telemetry = output.telemetry;
+        let telemetry = Telemetry { policy: self.policy, ..output.telemetry };
         let tick = Tick {
             now_ns: woke_ns,
             features: self.fresh.clone(),

@@ -165,7 +165,7 @@ pub struct Output {
     pub ordered: Option<Result<(), Refusal>>,
     /// The pour or recording that ended in this tick.
     pub ended: Option<Outcome>,
-    /// What an episode records of this tick.
+    /// What an episode records of this tick; whoever brought the agent knows its [`Telemetry::policy`].
     pub telemetry: Telemetry,
 }
 
@@ -584,6 +584,7 @@ impl Core {
             robot_at_ns: input.robot.at_ns,
             episode: run.map_or(0, |r| r.episode),
             feature_sequence: self.newest.map_or(0, |f| f.sequence),
+            policy: 0,
             alpha_deg: self.limiter.alpha_deg(),
             alpha_measured_deg: input.robot.alpha_deg,
             dalpha_deg: asked_deg,

@@ -23,29 +23,17 @@ const BEAT: Duration = Duration::from_millis(40);
 /// Ticks that wait for a slow disk: half a minute at 30 Hz. A journal with a gap cannot be replayed, so a longer wait ends it.
 const WAITING_TICKS: usize = 1024;
 
-/// What is known of the weights, for `status`.
-#[derive(Debug, Clone, Default)]
-pub struct WeightsNote {
-    /// Identity of the policy in use; empty: none.
-    pub id: String,
-    /// Why there is none, or why the newest file is not used; empty: it is.
-    pub refused: String,
-}
-
 /// The file thread.
 pub struct Disk<'a> {
     exchange: &'a Exchange,
     say: &'a (dyn Fn(&str) + Sync),
-    note: &'a Mutex<WeightsNote>,
+    /// For `status`: why the newest weight file is not used; empty: it is.
+    refused: &'a Mutex<String>,
     path: PathBuf,
     /// Frames a second of the camera: calibration and policy are for one rate only.
     fps: f64,
     /// Of the weight file as it was read last: time of change, inode, length.
     seen: Option<(std::time::SystemTime, u64, u64)>,
-    /// Identity of the policy that waits in the queue for the end of a pour.
-    waiting: String,
-    /// Policies handed over so far.
-    number: u64,
     /// `None`: none is kept, or it has ended.
     journal: Option<Writer>,
     ticks: Receiver<Box<Tick>>,
@@ -56,7 +44,7 @@ impl<'a> Disk<'a> {
     pub fn open(
         config: &Config,
         exchange: &'a Exchange,
-        note: &'a Mutex<WeightsNote>,
+        refused: &'a Mutex<String>,
         say: &'a (dyn Fn(&str) + Sync),
     ) -> (Self, Option<Sender<Box<Tick>>>) {
         let journal = config.controller.journal.as_ref().and_then(|path| {
@@ -64,18 +52,8 @@ impl<'a> Disk<'a> {
         });
         let (sender, ticks) = bounded(WAITING_TICKS);
         let sender = journal.is_some().then_some(sender);
-        let disk = Self {
-            exchange,
-            say,
-            note,
-            path: config.controller.weights.clone(),
-            fps: config.camera.fps,
-            seen: None,
-            waiting: String::new(),
-            number: 0,
-            journal,
-            ticks,
-        };
+        let disk =
+            Self { exchange, say, refused, path: config.controller.weights.clone(), fps: config.camera.fps, seen: None, journal, ticks };
         (disk, sender)
     }
 
@@ -107,15 +85,11 @@ impl<'a> Disk<'a> {
     /// Notices a new weight file, reads and checks it, and hands it to the loop.
     fn look_at_weights(&mut self) {
         use std::os::unix::fs::MetadataExt;
-        let note = self.note;
-        let note = || note.lock().unwrap_or_else(PoisonError::into_inner);
-        if self.exchange.agents.is_empty() && !self.waiting.is_empty() {
-            note().id = std::mem::take(&mut self.waiting);
-        }
+        let refused = self.refused;
+        let refuse = |why: String| *refused.lock().unwrap_or_else(PoisonError::into_inner) = why;
         let Ok(meta) = std::fs::metadata(&self.path) else {
-            let mut note = note();
-            if note.id.is_empty() && note.refused.is_empty() {
-                note.refused = format!("{}: not there yet", self.path.display());
+            if self.seen.is_none() {
+                refuse(format!("{}: not there yet", self.path.display()));
             }
             return;
         };
@@ -126,18 +100,16 @@ impl<'a> Disk<'a> {
         self.seen = stamp;
         match read_weights(&self.path, self.fps) {
             Ok(weights) => {
-                note().refused.clear();
-                self.waiting = weights.identity();
-                (self.say)(&format!("weights {} read from {}; the next pour uses them", self.waiting, self.path.display()));
-                self.number += 1;
-                let number = self.number;
-                self.write(|journal| journal.weights(number, &weights));
+                refuse(String::new());
+                (self.say)(&format!("weights {} read from {}; the next pour uses them", weights.identity(), self.path.display()));
+                let identity = u64::from_str_radix(&weights.identity(), 16).unwrap_or_default();
+                self.write(|journal| journal.weights(identity, &weights));
                 // What was waiting and is displaced is dropped here, in an ordinary thread.
-                drop(self.exchange.agents.force_push((number, Box::new(Agent::new(&weights)))));
+                drop(self.exchange.agents.force_push((identity, Box::new(Agent::new(&weights)))));
             }
             Err(e) => {
                 (self.say)(&format!("weights refused, the old ones stay: {e}"));
-                note().refused = e;
+                refuse(e);
             }
         }
     }

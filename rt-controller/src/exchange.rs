@@ -66,7 +66,7 @@ pub struct Exchange {
     pub orders: ArrayQueue<Order>,
     /// From the loop: events.
     pub events: ArrayQueue<Event>,
-    /// To the loop: the newest policy and its number.
+    /// To the loop: the newest policy and its identity.
     pub agents: ArrayQueue<(u64, Box<Agent>)>,
     /// From the loop: policies to drop.
     pub old_agents: ArrayQueue<Box<Agent>>,

@@ -4,6 +4,7 @@
 //! are for commands and tests. A file that was cut off reads up to its last whole entry. Layout: the 8 bytes `decantj2`, then
 //! entries, each a little-endian u32 length and that many bytes of postcard.
 
+use std::collections::BTreeMap;
 use std::fs::File;
 use std::io::{BufReader, BufWriter, Read, Write};
 use std::path::Path;
@@ -33,7 +34,7 @@ pub struct Tick {
     pub robot: Robot,
     /// The order.
     pub order: Option<Order>,
-    /// Number of the policy that was taken in this tick.
+    /// Identity of the policy that was taken in this tick.
     pub agent: Option<u64>,
     /// The answer, degrees; `None`: nothing was commanded.
     pub target_deg: Option<f32>,
@@ -60,7 +61,7 @@ pub struct Times {
 #[derive(Debug, Serialize, Deserialize)]
 enum Entry {
     Settings(Settings),
-    /// Weights with this number, as the bytes of a weight file; before the tick that takes them.
+    /// Weights with this identity, as the bytes of a weight file; before the tick that takes them.
     Weights(u64, Vec<u8>),
     Tick(Box<Tick>),
 }
@@ -113,9 +114,9 @@ impl Writer {
     }
 
     /// Weights that the loop may take from now on.
-    pub fn weights(&mut self, number: u64, weights: &Weights) -> std::io::Result<()> {
+    pub fn weights(&mut self, identity: u64, weights: &Weights) -> std::io::Result<()> {
         let bytes = weights.to_bytes().map_err(std::io::Error::other)?;
-        self.entry(&Entry::Weights(number, bytes))
+        self.entry(&Entry::Weights(identity, bytes))
     }
 
     /// One tick.
@@ -167,7 +168,7 @@ pub fn replay(path: &Path, mut seen: impl FnMut(&Tick, &crate::core::Output)) ->
     }
     let mut result = Replay { ticks: 0, ended: Vec::new(), different: 0, first_different: None, cut_off: false };
     let mut core: Option<Core> = None;
-    let mut weights: Vec<(u64, Weights)> = Vec::new();
+    let mut weights = BTreeMap::new();
     let mut at = MAGIC.len() as u64;
     let mut buffer = Vec::new();
     loop {
@@ -188,12 +189,12 @@ pub fn replay(path: &Path, mut seen: impl FnMut(&Tick, &crate::core::Output)) ->
         }
         match (postcard::from_bytes(&buffer).map_err(|_| damaged())?, &mut core) {
             (Entry::Settings(settings), _) => core = Some(Core::new(settings)),
-            (Entry::Weights(number, bytes), _) => weights.push((number, Weights::from_bytes(&bytes, &file).map_err(|_| damaged())?)),
+            (Entry::Weights(identity, bytes), _) => {
+                weights.insert(identity, Weights::from_bytes(&bytes, &file).map_err(|_| damaged())?);
+            }
             (Entry::Tick(tick), Some(core)) => {
-                if let Some(number) = tick.agent {
-                    let (_, taken) = weights.iter().find(|(n, _)| *n == number).ok_or_else(damaged)?;
-                    core.exchange(Box::new(Agent::new(taken)));
-                    weights.retain(|(n, _)| *n >= number);
+                if let Some(identity) = tick.agent {
+                    core.exchange(Box::new(Agent::new(weights.get(&identity).ok_or_else(damaged)?)));
                 }
                 let Tick { now_ns, ref features, robot, order, .. } = *tick;
                 let output = core.step(&Input { now_ns, features, robot, order });

@@ -1,12 +1,10 @@
 //! `rt-controller pour ML`: asks the running controller for a pour, shows it, ends with its result. Ordinary process.
 
-use std::path::PathBuf;
-
 use shared::config::Config;
 use shared::control::{EndReason, Outcome, Reply, Request};
 use shared::exit::{self, Failure, OrExit as _, failure};
 
-use crate::client::{self, Client, FollowError};
+use crate::client::{self, Client, Common, FollowError};
 
 /// Command-line arguments.
 #[derive(Debug, clap::Args)]
@@ -16,19 +14,15 @@ Exit codes: 0 poured, 3 no controller, 4 ended early (the reason is printed), 5 
 pub struct Args {
     /// Goal volume V_G in ml.
     goal_ml: f32,
-    /// The cell's configuration.
-    #[arg(long, default_value = shared::config::DEFAULT_FILE)]
-    config: PathBuf,
-    /// Print the result as JSON.
-    #[arg(long)]
-    json: bool,
+    #[command(flatten)]
+    common: Common,
 }
 
 /// Runs the command.
 pub fn run(args: &Args) -> Result<(), Failure> {
-    let config = Config::read(&args.config).or_exit(exit::BAD_INPUT)?;
+    let config = Config::read(&args.common.config).or_exit(exit::BAD_INPUT)?;
     let (outcome, recorded) = order(&config.cell.name, &Request::Pour { goal_ml: args.goal_ml })?;
-    report(&outcome, recorded, args.json);
+    report(&outcome, recorded, args.common.json);
     ended(&outcome)
 }
 

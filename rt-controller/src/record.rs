@@ -1,12 +1,13 @@
 //! `rt-controller record`: runs the Gaussian curve of eq. (1) and produces one episode. Ordinary process.
 
 use std::io::{BufRead, IsTerminal, Write};
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
 use shared::config::Config;
 use shared::control::{Curve, Request};
 use shared::exit::{self, Failure, OrExit as _, failure};
 
+use crate::client::Common;
 use crate::pour;
 
 /// Alpha at the curve's first and last moment, degrees: a start without a jump.
@@ -32,17 +33,13 @@ pub struct Args {
     /// Weight on the scale in g, where it is known without asking.
     #[arg(long)]
     weight: Option<f64>,
-    /// The cell's configuration.
-    #[arg(long, default_value = shared::config::DEFAULT_FILE)]
-    config: PathBuf,
-    /// Print the result as JSON.
-    #[arg(long)]
-    json: bool,
+    #[command(flatten)]
+    common: Common,
 }
 
 /// Runs the command.
 pub fn run(args: &Args) -> Result<(), Failure> {
-    let config = Config::read(&args.config).or_exit(exit::BAD_INPUT)?;
+    let config = Config::read(&args.common.config).or_exit(exit::BAD_INPUT)?;
     let beta_s = args.beta.unwrap_or_else(|| ((args.lambda / END_DEG).ln() / args.gamma).sqrt());
     let curve = Curve { lambda_deg: args.lambda, gamma_per_s2: args.gamma, beta_s };
     let (outcome, recorded) = pour::order(&config.cell.name, &Request::Record(curve))?;
@@ -59,7 +56,7 @@ pub fn run(args: &Args) -> Result<(), Failure> {
     if let Some(weight_g) = weight_g {
         shared::episode::set_weight(Path::new(&file), weight_g).or_exit(exit::FAILED)?;
     }
-    if args.json {
+    if args.common.json {
         println!("{}", serde_json::json!({ "outcome": outcome, "curve": curve, "episode_file": file, "weight_g": weight_g }));
     } else {
         println!("recorded: {file}");

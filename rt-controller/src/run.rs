@@ -1,7 +1,7 @@
 //! `rt-controller run`: the resident process.
 //!
-//! Main thread: clients, telemetry, weights (ordinary). Thread "loop": real-time. Thread "robot": connects. A signal brings the
-//! container upright and ends the process; a second one ends it at once (the robot's program then goes upright by itself).
+//! Main thread: clients, telemetry (ordinary). Thread "loop": real-time. Thread "robot": connects. Thread "disk": journal, weights. A
+//! signal brings the container upright and ends the process; a second one ends it at once (the robot's program then goes upright by itself).
 
 use std::io::Write;
 use std::path::PathBuf;
@@ -59,11 +59,11 @@ pub fn run(args: &Args) -> Result<(), Failure> {
     }
     let _awake = shared::os::stay_awake().map_err(|line| say(&line));
     let exchange = Exchange::default();
-    let (note, connections, weights) = (RobotNote::default(), AtomicU64::new(0), Mutex::default());
+    let (note, connections, refused) = (RobotNote::default(), AtomicU64::new(0), Mutex::default());
     let outcome = std::thread::scope(|scope| {
         let cell = Cell::join(&config.cell.name)?;
-        let (disk, journal) = Disk::open(&config, &exchange, &weights, &say);
-        let service = Service::open(&cell, &exchange, (&note, &connections), (&weights, journal), &say)?;
+        let (disk, journal) = Disk::open(&config, &exchange, &refused, &say);
+        let service = Service::open(&cell, &exchange, (&note, &connections), (&refused, journal), &say)?;
         let (ready_sender, ready) = std::sync::mpsc::channel();
         let loop_thread = std::thread::Builder::new().name("loop".into()).stack_size(STACK);
         let spawned = loop_thread.spawn_scoped(scope, {

@@ -22,7 +22,6 @@ use shared::messages::{Phase, Telemetry};
 
 use crate::client::MESSAGE_MAX;
 use crate::core::{Counters, Order, Refusal};
-use crate::disk::WeightsNote;
 use crate::exchange::{Event, Exchange};
 use crate::journal::Tick;
 use crate::link::{self, LinkOptions};
@@ -103,7 +102,8 @@ pub struct Service<'a> {
     say: &'a dyn Fn(&str),
     server: Server<Ipc, [u8], (), [u8], ()>,
     telemetry: Publisher<Ipc, Telemetry, ()>,
-    weights: &'a Mutex<WeightsNote>,
+    /// Why the newest weight file is not used; empty: it is.
+    refused: &'a Mutex<String>,
     /// To the journal; `None` where none is kept, and after it could not keep up.
     journal: Option<Sender<Box<Tick>>>,
     latest: Option<(Telemetry, Counters)>,
@@ -119,7 +119,7 @@ impl<'a> Service<'a> {
         cell: &Cell,
         exchange: &'a Exchange,
         (robot_note, robot_connections): (&'a RobotNote, &'a std::sync::atomic::AtomicU64),
-        (weights, journal): (&'a Mutex<WeightsNote>, Option<Sender<Box<Tick>>>),
+        (refused, journal): (&'a Mutex<String>, Option<Sender<Box<Tick>>>),
         say: &'a dyn Fn(&str),
     ) -> Result<Self, IpcError> {
         let fail = |service: &str, e: String| IpcError::Service { service: service.into(), what: e };
@@ -140,7 +140,7 @@ impl<'a> Service<'a> {
             say,
             server,
             telemetry,
-            weights,
+            refused,
             journal,
             latest: None,
             outcomes: VecDeque::new(),
@@ -211,14 +211,14 @@ impl<'a> Service<'a> {
         }
     }
 
-    fn weights(&self) -> WeightsNote {
-        self.weights.lock().unwrap_or_else(PoisonError::into_inner).clone()
+    fn refused(&self) -> String {
+        self.refused.lock().unwrap_or_else(PoisonError::into_inner).clone()
     }
 
     fn words(&self, refusal: Refusal) -> String {
         match refusal {
             Refusal::Robot(_) if !self.robot_note.get().is_empty() => self.robot_note.get(),
-            Refusal::NoWeights => format!("{refusal} ({})", self.weights().refused),
+            Refusal::NoWeights => format!("{refusal} ({})", self.refused()),
             _ => refusal.to_string(),
         }
     }
@@ -254,13 +254,12 @@ impl<'a> Service<'a> {
         let (t, c) = self.latest.unwrap_or_default();
         let x = self.exchange;
         let timing = &x.timing;
-        let weights = self.weights();
         let phase = Phase::from_code(t.phase);
         let hindrance = match phase {
             Phase::NoRobot if !self.robot_note.get().is_empty() => self.robot_note.get(),
             Phase::NoRobot if t.alpha_measured_deg.is_finite() => Refusal::NotUpright(t.alpha_measured_deg).to_string(),
             Phase::NoRobot => "waiting for the robot".into(),
-            _ if weights.id.is_empty() => format!("no weights: {}", weights.refused),
+            _ if t.policy == 0 => format!("no weights: {}", self.refused()),
             _ => String::new(),
         };
         Status {
@@ -286,8 +285,8 @@ impl<'a> Service<'a> {
             loop_allocations: x.loop_allocations.load(Relaxed),
             loop_page_faults: x.loop_page_faults.load(Relaxed),
             events_lost: x.events_lost.load(Relaxed),
-            weights_refused: if weights.id.is_empty() { String::new() } else { weights.refused },
-            weights: weights.id,
+            weights_refused: if t.policy == 0 { String::new() } else { self.refused() },
+            weights: t.weights(),
             weights_taken: x.agents_taken.load(Relaxed),
             timing: vec![
                 timing.lateness.snapshot("wake-up lateness"),

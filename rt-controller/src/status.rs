@@ -1,30 +1,24 @@
 //! `rt-controller status`: the running controller's state, counters and histograms. Ordinary process.
 
-use std::path::PathBuf;
-
 use shared::config::Config;
 use shared::control::Status;
 use shared::exit::{self, Failure, OrExit as _};
 
-use crate::client::Client;
+use crate::client::{Client, Common};
 
 /// Command-line arguments.
 #[derive(Debug, clap::Args)]
 #[command(after_help = "Examples:\n  rt-controller status\n  rt-controller status --json")]
 pub struct Args {
-    /// The cell's configuration.
-    #[arg(long, default_value = shared::config::DEFAULT_FILE)]
-    config: PathBuf,
-    /// Print everything as JSON, histograms included.
-    #[arg(long)]
-    json: bool,
+    #[command(flatten)]
+    common: Common,
 }
 
 /// Runs the command.
 pub fn run(args: &Args) -> Result<(), Failure> {
-    let config = Config::read(&args.config).or_exit(exit::BAD_INPUT)?;
+    let config = Config::read(&args.common.config).or_exit(exit::BAD_INPUT)?;
     let status = Client::connect(&config.cell.name).and_then(|c| c.status()).or_exit(exit::UNREACHABLE)?;
-    if args.json {
+    if args.common.json {
         println!("{}", serde_json::to_string_pretty(&status).or_exit(exit::FAILED)?);
     } else {
         print(&status);

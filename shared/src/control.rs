@@ -66,7 +66,7 @@ pub struct Outcome {
     pub poured_ml: f32,
     /// From the start to upright and settled, s.
     pub seconds: f32,
-    /// Frames used.
+    /// Frames, the bridged ones included.
     pub frames: u32,
     /// Frames that were lost and bridged.
     pub bridged_frames: u32,

@@ -100,7 +100,7 @@ pub struct Info {
     pub cell: String,
     /// SHA-256 of the configuration, hexadecimal.
     pub config_sha256: String,
-    /// Identity of the weight file; empty if there was none.
+    /// Identity of the weights that the controller ran; empty if there were none.
     pub weights: String,
     /// How it ended, in words; empty if the recorder was killed.
     pub ended: String,

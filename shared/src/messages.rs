@@ -7,7 +7,7 @@
 use iceoryx2::prelude::ZeroCopySend;
 
 /// Version of all layouts in this file; part of every service's name, so that other versions never connect.
-pub const LAYOUT_VERSION: u32 = 1;
+pub const LAYOUT_VERSION: u32 = 2;
 
 /// Pixel layout of a camera frame.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -184,6 +184,8 @@ pub struct Telemetry {
     pub episode: u64,
     /// [`Feature::sequence`] of the newest feature used; 0 before the first.
     pub feature_sequence: u64,
+    /// Identity of the policy in use ([`Telemetry::weights`]); 0: there is none.
+    pub policy: u64,
     /// Commanded alpha after all limits, degrees from upright.
     pub alpha_deg: f32,
     /// Measured alpha, degrees from upright; NaN before the first robot state.
@@ -208,6 +210,13 @@ pub struct Telemetry {
     pub beta_s: f32,
     /// Reserved, 0.
     pub reserved: f32,
+}
+
+impl Telemetry {
+    /// Identity of the weights in use as `Weights::identity` gives it: 16 hexadecimal digits; empty: there are none.
+    pub fn weights(&self) -> String {
+        if self.policy == 0 { String::new() } else { format!("{:016x}", self.policy) }
+    }
 }
 
 /// What the recorder did with an episode (service `recorder`, the newest is kept for late readers).
@@ -284,8 +293,9 @@ mod tests {
         assert_eq!(size_of::<Feature>(), 80);
         assert_eq!(std::mem::offset_of!(Feature, area_px2), 48);
         assert_eq!(std::mem::offset_of!(Feature, triangle_px), 56);
-        assert_eq!(size_of::<Telemetry>(), 96);
-        assert_eq!(std::mem::offset_of!(Telemetry, alpha_deg), 48);
+        assert_eq!(size_of::<Telemetry>(), 104);
+        assert_eq!(std::mem::offset_of!(Telemetry, policy), 48);
+        assert_eq!(std::mem::offset_of!(Telemetry, alpha_deg), 56);
         assert_eq!(size_of::<RecorderReport>(), 552);
     }
 

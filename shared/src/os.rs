@@ -1,10 +1,12 @@
-//! The operating system's part: the clock, what a real-time process asks of the kernel, and the count of allocations.
+//! The operating system's part: the clock, signals, what a real-time process asks of the kernel, and the count of allocations.
 //!
-//! The one module of the project with `unsafe`. Called from any thread; nothing here allocates, except the error texts of
-//! [`become_realtime`]. On failure the caller gets a line for the operator and goes on without the privilege.
+//! The one module of the project with `unsafe`. Called from any thread; nothing here allocates, except [`stop_at_signals`] and the
+//! error texts of [`become_realtime`]. On failure the caller gets a line for the operator and goes on without the privilege.
 
 use std::alloc::{GlobalAlloc, Layout, System};
 use std::cell::Cell;
+use std::sync::Arc;
+use std::sync::atomic::AtomicBool;
 
 /// Now, CLOCK_MONOTONIC in nanoseconds.
 pub fn now_ns() -> u64 {
@@ -76,6 +78,15 @@ pub fn stay_awake() -> Result<Option<std::fs::File>, String> {
 pub fn end_when_nobody_reads() {
     // SAFETY: the default action of a signal is no function of ours, so there is nothing that could be called unsafely.
     unsafe { libc::signal(libc::SIGPIPE, libc::SIG_DFL) };
+}
+
+/// Becomes true when the process is asked to end (Ctrl-C, SIGTERM), which then does not end it any more.
+pub fn stop_at_signals() -> std::io::Result<Arc<AtomicBool>> {
+    let stop = Arc::new(AtomicBool::new(false));
+    for signal in [signal_hook::consts::SIGINT, signal_hook::consts::SIGTERM] {
+        signal_hook::flag::register(signal, Arc::clone(&stop))?;
+    }
+    Ok(stop)
 }
 
 /// Page faults of the calling thread so far: (minor, major).

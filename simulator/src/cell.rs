@@ -25,7 +25,6 @@ use shared::os;
 use crate::camera::{Renderer, Scene, View};
 use crate::physics::container::Container;
 use crate::physics::rig::Rig;
-use crate::stop_at_signals;
 use crate::ur;
 
 /// SCHED_FIFO priorities where permitted: a real robot, liquid and camera do not wait for this machine's other work. Below the
@@ -152,7 +151,7 @@ pub fn run(args: &Args) -> Result<(), Failure> {
 }
 
 fn simulate(config: Config, sim: SimulatorConfig) -> Result<(), Box<dyn std::error::Error>> {
-    let stop = stop_at_signals()?;
+    let stop = os::stop_at_signals()?;
     let mut start_q_rad = [0.0, -1.571, 1.571, -1.571, -1.571, 0.0];
     start_q_rad[config.robot.joint.index()] = config.robot.start_joint_deg.to_radians();
     let robot = ur::Controller::start(ur::Options { series: sim.series, start_q_rad, ..ur::Options::new(config.robot.address) })?;
@@ -187,6 +186,13 @@ fn simulate(config: Config, sim: SimulatorConfig) -> Result<(), Box<dyn std::err
     result.map_err(Into::into)
 }
 
+/// A period after `at_ns`; now, if that was long ago: the process was suspended, and no time passed in the cell.
+fn after(at_ns: u64, period_ns: u64) -> u64 {
+    let next_ns = at_ns + period_ns;
+    let now_ns = os::now_ns();
+    if now_ns > next_ns + 1_000_000_000 { now_ns } else { next_ns }
+}
+
 /// Thread "physics".
 fn move_liquid(world: &World) {
     if let Err(line) = os::prioritise(LIQUID_PRIORITY) {
@@ -194,7 +200,7 @@ fn move_liquid(world: &World) {
     }
     let mut next_ns = os::now_ns();
     while !world.stop.load(Relaxed) {
-        next_ns += PHYSICS_NS;
+        next_ns = after(next_ns, PHYSICS_NS);
         os::sleep_until_ns(next_ns);
         let (alpha_deg, _) = world.tilt();
         world.container().step(PHYSICS_NS as f64 / 1e9, alpha_deg);
@@ -217,7 +223,7 @@ fn film(world: &World) -> Result<(), String> {
     let period_ns = (1e9 / world.config.camera.fps) as u64;
     let (mut sequence, mut captured_at_ns) = (0, os::now_ns());
     while !world.stop.load(Relaxed) {
-        captured_at_ns += period_ns;
+        captured_at_ns = after(captured_at_ns, period_ns);
         os::sleep_until_ns(captured_at_ns);
         sequence += 1;
         let (alpha_deg, rate_deg_s) = world.tilt();
@@ -296,5 +302,19 @@ fn obey(world: &World, noise: &mut Pcg64Mcg, line: &str) -> Result<serde_json::V
             Ok(serde_json::json!({ "weight_g": (world.container().poured_ml() + error_g).round().max(0.0) }))
         }
         _ => Err(format!("'{verb}' is nothing that an operator can do here")),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Protects a cell that was suspended from catching up: the camera shows the present, and nothing pours in time that nobody saw.
+    #[test]
+    fn a_suspended_cell_goes_on_from_now() {
+        let now_ns = os::now_ns();
+        assert_eq!(after(now_ns, 33), now_ns + 33);
+        assert_eq!(after(now_ns - 500_000_000, 33), now_ns - 500_000_000 + 33, "a late wake-up is caught up");
+        assert!(after(now_ns - 5_000_000_000, 33) >= now_ns);
     }
 }

@@ -15,15 +15,3 @@ pub mod pour_plot;
 pub mod reproduce;
 pub mod ur;
 pub mod ur_command;
-
-use std::sync::Arc;
-use std::sync::atomic::AtomicBool;
-
-/// Becomes true when the process is asked to end (Ctrl-C, SIGTERM).
-pub(crate) fn stop_at_signals() -> std::io::Result<Arc<AtomicBool>> {
-    let stop = Arc::new(AtomicBool::new(false));
-    for signal in [signal_hook::consts::SIGINT, signal_hook::consts::SIGTERM] {
-        signal_hook::flag::register(signal, Arc::clone(&stop))?;
-    }
-    Ok(stop)
-}

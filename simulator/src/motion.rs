@@ -121,7 +121,7 @@ fn compare(args: &Args, config: &Config, episode: &Episode) -> Result<Report, Bo
     };
     let mut targets: Vec<(f64, f32)> =
         episode.frames.iter().filter(|f| f.alpha_commanded_deg.is_finite()).map(|f| (f.t_s, f.alpha_commanded_deg)).collect();
-    // A frame that the camera lost is missing from the recording; the tick beside it was not.
+    // An episode has one row a camera frame; a loop that is faster had targets in between.
     let period_s = 1.0 / options.rate_hz;
     let mut i = 1;
     while i < targets.len() {

@@ -14,8 +14,7 @@ use serde_json::Value;
 use shared::config::Config;
 use shared::exit::{self, Failure, failure};
 use shared::messages::Phase;
-
-use crate::stop_at_signals;
+use shared::os;
 
 /// Why it stopped.
 #[derive(Debug, thiserror::Error)]
@@ -118,7 +117,7 @@ impl OwnCell {
         let text = toml::to_string_pretty(&table).map_err(|e| bad(&e))?;
         std::fs::write(&config_file, &text).map_err(|e| file(&config_file, e))?;
         let config = Config::parse(&text, &config_file.display().to_string()).map_err(|e| bad(&e))?;
-        let stop = stop_at_signals().map_err(|e| OwnCellError::Other(e.to_string()))?;
+        let stop = os::stop_at_signals().map_err(|e| OwnCellError::Other(e.to_string()))?;
         let exe = std::env::current_exe().map_err(|e| file(Path::new("own program"), e))?;
         let bin = exe.parent().unwrap_or(Path::new(".")).to_path_buf();
         Ok(Self { config, out: out.into(), bin, started: Instant::now(), config_file, stop, processes: Vec::new() })

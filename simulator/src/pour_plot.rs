@@ -11,6 +11,9 @@ type Drawing<'a> = DrawingArea<SVGBackend<'a>, plotters::coord::Shift>;
 /// One line of a panel: its name, its colour and its points.
 type Line<'a> = (&'a str, RGBColor, Vec<(f64, f64)>);
 
+/// Where the names of the curves begin, px from the left.
+const KEY_FROM_PX: i32 = 760;
+
 const ALPHA: RGBColor = RGBColor(31, 119, 180);
 const MEASURED: RGBColor = RGBColor(255, 127, 14);
 const AREA: RGBColor = RGBColor(44, 160, 44);
@@ -33,7 +36,7 @@ pub fn draw(file: &Path, ticks: &[Telemetry], goal_ml: f32, scale_g: f64) -> Res
         "alpha, degrees",
         &[("commanded", ALPHA, points(&|t| t.alpha_deg)), ("measured", MEASURED, points(&|t| t.alpha_measured_deg))],
     )?;
-    panel(&panels[1], "V_e, px^2", &[("V_e", AREA, points(&|t| t.area_px2))])?;
+    panel(&panels[1], "V_e, px²", &[("V_e", AREA, points(&|t| t.area_px2))])?;
     panel(&panels[2], "ml", &[("d", D, points(&|t| t.d_ml)), ("poured (estimate)", POURED, points(&|t| t.poured_ml))])?;
     root.present()?;
     Ok(())
@@ -44,26 +47,29 @@ fn panel(area: &Drawing, unit: &str, lines: &[Line]) -> Result<(), Box<dyn std::
     let end_s = all().map(|p| p.0).fold(1.0, f64::max);
     let (low, high) = all().fold((0.0f64, 1.0f64), |(l, h), p| (l.min(p.1), h.max(p.1)));
     let margin = 0.05 * (high - low);
-    let mut chart = ChartBuilder::on(area)
+    // Beside the plot, where it hides no curve.
+    let (plot, key) = area.split_horizontally(KEY_FROM_PX);
+    for (y, (name, colour, _)) in (20..).step_by(20).zip(lines) {
+        key.draw(&PathElement::new([(0, y), (18, y)], colour.stroke_width(2)))?;
+        key.draw(&Text::new(*name, (24, y - 7), ("sans-serif", 13)))?;
+    }
+    let mut chart = ChartBuilder::on(&plot)
         .margin(8)
         .x_label_area_size(36)
         .y_label_area_size(60)
         .build_cartesian_2d(0.0..end_s, low - if low < 0.0 { margin } else { 0.0 }..high + margin)?;
-    chart.configure_mesh().x_desc("s").y_desc(unit).light_line_style(TRANSPARENT).label_style(("sans-serif", 13)).draw()?;
-    for (name, colour, points) in lines {
-        chart
-            .draw_series(LineSeries::new(points.iter().copied(), colour.stroke_width(2)))?
-            .label(*name)
-            .legend(|(x, y)| PathElement::new([(x, y), (x + 18, y)], colour.stroke_width(2)));
-    }
-    if lines.len() > 1 {
-        chart
-            .configure_series_labels()
-            .position(SeriesLabelPosition::UpperLeft)
-            .background_style(WHITE.mix(0.8))
-            .border_style(BLACK.mix(0.3))
-            .label_font(("sans-serif", 13))
-            .draw()?;
+    let tick = |v: &f64| ((v * 1e6).round() / 1e6).to_string();
+    chart
+        .configure_mesh()
+        .x_desc("s")
+        .y_desc(unit)
+        .x_label_formatter(&tick)
+        .y_label_formatter(&tick)
+        .light_line_style(TRANSPARENT)
+        .label_style(("sans-serif", 13))
+        .draw()?;
+    for (_, colour, points) in lines {
+        chart.draw_series(LineSeries::new(points.iter().copied(), colour.stroke_width(2)))?;
     }
     Ok(())
 }

@@ -142,17 +142,18 @@ pub fn run(args: &Args) -> Result<(), Failure> {
     println!(
         "section 4: simulator a, 300 ml, one triangle of +-1 degree up to {top} degrees pours {weight:.1} ml; delta {DELTA}, 2 actions, 4-40-40-2"
     );
-    let mut html = format!(
-        "<h2>Section 4 of the paper</h2><p>Simulator a, two actions of +-1 degree, 4-40-40-2 (1922 parameters), one episode: a triangle up to {top} degrees that pours {weight:.1} ml; {KAPPAS} random kappas; {} seeds. Judged on 24 pours of 20 to 160 ml from 200, 300 and 400 ml.</p><div class=plots>",
+    let intro = format!(
+        "<h2>Section 4 of the paper</h2><p>Simulator a, two actions of ±1 degree, 4-40-40-2 (1922 parameters), one episode: a triangle up to {top} degrees that pours {weight:.1} ml; {KAPPAS} random kappas; {} seeds. Judged on 24 pours of 20 to 160 ml from 200, 300 and 400 ml.</p>",
         args.seeds
     );
     let mut rows = vec![vec![
         "cross-entropy".to_owned(),
-        "median MAE of the runs, ml".into(),
-        "best".into(),
-        "worst".into(),
+        "median MAE of the runs in ml".into(),
+        "best in ml".into(),
+        "worst in ml".into(),
         "runs below 10 ml".into(),
     ]];
+    let mut plots = String::new();
     let mut verdicts = Vec::new();
     let mut json_runs = Vec::new();
     for (name, clip) in [("as printed", None), ("clipped to [1e-7, 1 - 1e-7]", Some(KERAS_CLIP))] {
@@ -169,15 +170,18 @@ pub fn run(args: &Args) -> Result<(), Failure> {
             format!("{good} of {}", last.len()),
         ]);
         let curves: Vec<Series> = runs.iter().enumerate().map(|(k, r)| Series::line(&format!("seed {}", k + 1), r.curve.clone())).collect();
-        html += &figure(&plot("Adam step", "mean absolute error, ml", &curves, true), &format!("Convergence, cross-entropy {name}."));
+        plots += &figure(&plot("Adam step", "mean absolute error in ml", &curves, true), &format!("Convergence, cross-entropy {name}."));
         let mut dots = vec![Series::reference("poured = goal", vec![(0.0, 0.0), (160.0, 160.0)])];
-        dots.extend(runs.iter().enumerate().map(|(k, r)| Series::dots(&format!("seed {}", k + 1), r.pours.clone())));
-        html += &figure(&plot("goal, ml", "poured, ml", &dots, true), &format!("Goal against poured, cross-entropy {name}."));
+        let beside =
+            |k: usize, r: &Run| r.pours.iter().map(|(goal, poured)| (goal + (k as f64 - (runs.len() - 1) as f64 / 2.0), *poured)).collect();
+        dots.extend(runs.iter().enumerate().map(|(k, r)| Series::dots(&format!("seed {}", k + 1), beside(k, r))));
+        plots += &figure(
+            &plot("goal in ml (seeds side by side)", "poured in ml", &dots, true),
+            &format!("Goal against poured, cross-entropy {name}."),
+        );
         verdicts.push((name, good, last.len()));
         json_runs.push(serde_json::json!({ "name": name, "mae_ml": last }));
     }
-    html += "</div>";
-    html += &table(&rows);
     let say = |(name, good, n): &(&str, usize, usize)| {
         let words = if *good == 0 {
             "does not learn to pour in any run: the claim of a converging policy does not hold"
@@ -188,10 +192,9 @@ pub fn run(args: &Args) -> Result<(), Failure> {
         };
         format!("Cross-entropy {name}: {words} ({good} of {n}).")
     };
-    for v in &verdicts {
-        println!("{}", say(v));
-        html += &format!("<p>{}</p>", say(v));
-    }
+    let verdicts: Vec<String> = verdicts.iter().map(say).collect();
+    println!("{}", verdicts.join("\n"));
+    let html = format!("{intro}<p>{}</p>{}<div class=plots>{plots}</div>", verdicts.join("<br>"), table(&rows));
     let report = serde_json::json!({ "kind": "reproduction", "html": html, "weight_ml": weight, "runs": json_runs });
     let page = || trainer::report::page("Decant: section 4 of the paper", &html);
     let files = [(args.html.as_ref(), page()), (args.json.as_ref(), report.to_string())];

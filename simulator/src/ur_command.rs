@@ -10,8 +10,8 @@ use std::sync::mpsc;
 use std::time::{Duration, Instant};
 
 use shared::exit::{self, Failure, OrExit as _, failure};
+use shared::os;
 
-use crate::stop_at_signals;
 use crate::ur::{Controller, Fault, LogKind, LogLine, Options, Series, fault};
 
 /// Command-line arguments.
@@ -66,7 +66,7 @@ pub fn run(args: &Args) -> Result<(), Failure> {
         }
         *to = from.to_radians();
     }
-    let stop = stop_at_signals().or_exit(exit::FAILED)?;
+    let stop = os::stop_at_signals().or_exit(exit::FAILED)?;
     let controller = Controller::start(options).or_exit(exit::FAILED)?;
     args.fault.iter().for_each(|f| controller.inject(f.clone()));
     if !args.json {

@@ -1,6 +1,6 @@
 //! The processes together in the simulated cell: orders, endings, weight swaps, faults of processes.
 
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use rustix::process::Signal;
 use tests::{CellUnderTest, steady_weights};
@@ -53,7 +53,8 @@ fn a_recording_becomes_an_episode() {
     assert!(episode.info.images as usize >= episode.frames.len() * 9 / 10, "{} images", episode.info.images);
 }
 
-/// Protects a running lab: a new weight file is taken without restart, a bad one is refused and the old one stays.
+/// Protects a running lab: a new weight file is taken without restart, a bad one is refused and the old one stays; and an episode
+/// names the weights that poured it, not those on the disk.
 #[test]
 fn weights_are_swapped_while_running() {
     let cell = CellUnderTest::start(|_| {});
@@ -62,6 +63,12 @@ fn weights_are_swapped_while_running() {
     std::fs::write(cell.weights(), b"decant-w but not really").expect("writable");
     let status = cell.wait("the refusal", Duration::from_secs(5), |s| s["weights_refused"] != "");
     assert_eq!(status["weights"], first);
+    cell.json("simulator", &["operator", "fill", "300", "--json"]);
+    let pour = cell.json("rt-controller", &["pour", "20", "--json"]);
+    let file = pour["episode_file"].as_str().expect("the pour was recorded");
+    let episode = shared::episode::Episode::read(std::path::Path::new(file)).expect("readable");
+    assert_eq!(episode.info.weights.as_str(), first);
+    assert_eq!(episode.info.weights, steady_weights(TILT_OUT).identity());
     cell.take_weights(&steady_weights(TILT_OUT + 1));
     let status = cell.wait("the new identity", Duration::from_secs(5), |s| s["weights"] != first);
     assert_eq!(status["weights_refused"], "");
@@ -119,6 +126,21 @@ fn a_dead_or_hanging_process_ends_upright() {
         let before = cell.status().expect("running")["features"].as_u64();
         cell.wait("features again", Duration::from_secs(10), |s| s["features"].as_u64() > before && s["phase"] == "idle");
     }
+
+    // The controller dies and is started again at once: whoever waits for the pour is told.
+    cell.json("simulator", &["operator", "fill", "300", "--json"]);
+    let mut pour = cell.begin("rt-controller", &["pour", "200", "--json"]);
+    cell.wait("tilt", Duration::from_secs(10), tilted);
+    cell.signal("rt-controller", Signal::KILL);
+    cell.spawn("rt-controller");
+    let until = Instant::now() + Duration::from_secs(20);
+    while Instant::now() < until && matches!(pour.try_wait(), Ok(None)) {
+        std::thread::sleep(Duration::from_millis(50));
+    }
+    let _ = pour.kill();
+    let output = pour.wait_with_output().expect("it ran");
+    assert_eq!(output.status.code(), Some(3), "{}", String::from_utf8_lossy(&output.stderr));
+    cell.wait("weights and robot again", Duration::from_secs(20), |s| s["phase"] == "idle" && s["weights"] != "");
 
     // The controller itself hangs: the robot's program goes upright by itself; afterwards the controller says why, and recovers.
     cell.json("simulator", &["operator", "fill", "300", "--json"]);

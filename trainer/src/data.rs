@@ -117,7 +117,9 @@ impl TrainingEpisode {
             return Some(format!("frame {k}: area {} is not a number >= 0: check the vision", self.area_px2[k]));
         }
         if self.weight_g.is_nan() {
-            return Some("no weight: read the scale and enter it with `feature-worker episodes --weight G FILE`, or in scale.csv".into());
+            return Some(
+                "no weight: read the scale and enter it with `feature-worker episodes weigh FILE --weight G`, or in scale.csv".into(),
+            );
         }
         if !self.weight_g.is_finite() || self.weight_g < 0.0 {
             return Some(format!("weight {} g is not a number >= 0: correct it", self.weight_g));

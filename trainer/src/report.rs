@@ -116,11 +116,14 @@ fn draw(svg: &mut String, x_title: &str, y_title: &str, series: &[Series], from_
     }
     let pad = |a: f64, b: f64| ((b - a) * 0.04).max(1e-6 * b.abs().max(1.0));
     let (px, py) = (pad(x0, x1), pad(y0, y1));
-    let root = SVGBackend::with_string(svg, (640, 400)).into_drawing_area();
+    // Whole numbers, such as those of episodes, have nothing in between.
+    let whole = all().all(|(x, _)| x.fract() == 0.0);
+    let tick = |v: f64| ((v * 1e6).round() / 1e6).to_string();
+    let root = SVGBackend::with_string(svg, (480, 320)).into_drawing_area();
     root.fill(&WHITE)?;
     let mut chart = ChartBuilder::on(&root)
-        .margin(12)
-        .x_label_area_size(42)
+        .margin(10)
+        .x_label_area_size(44)
         .y_label_area_size(58)
         .build_cartesian_2d(x0 - px..x1 + px, if from_zero && y0 == 0.0 { 0.0 } else { y0 - py }..y1 + py)?;
     chart
@@ -129,7 +132,10 @@ fn draw(svg: &mut String, x_title: &str, y_title: &str, series: &[Series], from_
         .bold_line_style(RGBColor(225, 225, 225))
         .x_desc(x_title)
         .y_desc(y_title)
+        .x_label_formatter(&|x| if whole && (x - x.round()).abs() > 1e-6 { String::new() } else { tick(*x) })
+        .y_label_formatter(&|y| tick(*y))
         .label_style(("sans-serif", 13))
+        .axis_desc_style(("sans-serif", 14))
         .draw()?;
     for (s, colour) in series.iter().zip(colours(series)) {
         let points = s.points.iter().copied().filter(|(x, y)| x.is_finite() && y.is_finite());
@@ -165,28 +171,41 @@ pub fn escape(text: &str) -> String {
     text.replace('&', "&amp;").replace('<', "&lt;").replace('>', "&gt;").replace('"', "&quot;")
 }
 
-/// A table; the first row is the heading.
+/// A table; the first row is the heading. A screen that is narrower scrolls it.
 pub fn table(rows: &[Vec<String>]) -> String {
-    let mut html = String::from("<table>");
+    let mut html = String::from("<div class=scroll><table>");
+    let words =
+        |column: usize| rows.iter().skip(1).any(|r| r.get(column).is_some_and(|c| c.starts_with(char::is_alphabetic) && c != "NaN"));
     for (k, row) in rows.iter().enumerate() {
         let tag = if k == 0 { "th" } else { "td" };
-        let cells: String = row.iter().map(|c| format!("<{tag}>{}</{tag}>", escape(c))).collect();
+        let class = |column: usize| if words(column) { " class=words" } else { "" };
+        let cells: String = row.iter().enumerate().map(|(i, c)| format!("<{tag}{}>{}</{tag}>", class(i), escape(c))).collect();
         html += &format!("<tr>{cells}</tr>");
     }
-    html + "</table>"
+    html + "</table></div>"
+}
+
+/// Names and what they stand for, in words.
+fn facts(rows: &[(String, String)]) -> String {
+    let row = |(name, what): &(String, String)| format!("<tr><th>{}</th><td>{}</td></tr>", escape(name), escape(what));
+    format!("<table class=facts>{}</table>", rows.iter().map(row).collect::<String>())
 }
 
 /// The page around `body`.
 pub fn page(title: &str, body: &str) -> String {
     format!(
-        "<!doctype html><html lang=\"en\"><head><meta charset=\"utf-8\"><title>{title}</title><style>\
+        "<!doctype html><html lang=\"en\"><head><meta charset=\"utf-8\"><meta name=\"viewport\" content=\"width=device-width\"><title>{title}</title><style>\
 body{{font:15px/1.5 system-ui,sans-serif;max-width:72rem;margin:2rem auto;padding:0 1rem;color:#222}}\
 h1{{font-size:1.6rem}}h2{{font-size:1.25rem;margin-top:2.2rem;border-bottom:1px solid #ccc}}\
-table{{border-collapse:collapse;margin:1rem 0;font-size:.92rem}}th,td{{padding:.25rem .6rem;border-bottom:1px solid #ddd;text-align:right}}\
-th:first-child,td:first-child{{text-align:left}}th{{background:#f2f4f7}}\
-.plots{{display:flex;flex-wrap:wrap;gap:1rem}}figure{{margin:0;flex:1 1 30rem;max-width:40rem;break-inside:avoid}}\
+.scroll{{overflow-x:auto}}table{{border-collapse:collapse;margin:1rem 0;font-size:.92rem;break-inside:avoid}}\
+th,td{{padding:.25rem .6rem;border-bottom:1px solid #ddd;text-align:right;white-space:nowrap}}th{{background:#f2f4f7;vertical-align:bottom;white-space:normal}}\
+td.words{{white-space:normal}}td:first-child{{white-space:nowrap}}\
+th:first-child,td:first-child,.words,.facts td{{text-align:left}}.facts th{{vertical-align:top;white-space:nowrap}}.facts td{{white-space:normal;overflow-wrap:anywhere}}\
+.plots{{display:grid;grid-template-columns:repeat(2,1fr);gap:1rem}}figure{{margin:0;break-inside:avoid}}\
 figure svg{{width:100%;height:auto}}figcaption{{font-size:.9rem;color:#444}}.legend{{font-size:.85rem}}.legend span{{margin-right:.9em;white-space:nowrap}}code{{font-size:.85em}}\
-@media print{{body{{max-width:none;margin:0}}h2{{break-after:avoid}}figure{{flex-basis:45%}}}}\
+@media screen and (max-width:45rem){{.plots{{grid-template-columns:1fr}}}}\
+@media print{{html{{font-size:9pt}}body{{max-width:none;margin:0;padding:0;font-size:1rem}}h2,p,.scroll{{break-after:avoid}}.scroll{{overflow:visible}}\
+table{{font-size:7.5pt}}th,td{{padding:.15rem .35rem}}figure{{margin-bottom:.5rem}}}}\
 </style></head><body><h1>{title}</h1>{body}</body></html>\n",
         title = escape(title)
     )
@@ -212,9 +231,8 @@ fn number(v: &Value, digits: usize) -> String {
 fn training(v: &Value) -> String {
     let mut html = format!("<h2>Training {}</h2>", escape(&text(&v["weights"])));
     let options = &v["options"];
-    let row = |a: &str, b: String| vec![a.to_owned(), b];
+    let row = |a: &str, b: String| (a.to_owned(), b);
     let mut rows = vec![
-        row("what", "value".into()),
         row("identity", text(&v["identity"])),
         row("method", text(&options["method"])),
         row("actions", options["actions"].to_string()),
@@ -222,12 +240,20 @@ fn training(v: &Value) -> String {
         row("seed", options["seed"].to_string()),
         row("episodes", v["episodes"].as_array().map_or(0, Vec::len).to_string()),
         row("data (SHA-256)", text(&v["data_sha256"])),
-        row("calibration", format!("v = {} area^{} ml", v["calibration"]["c"], number(&v["calibration"]["q"], 3))),
+        row(
+            "calibration",
+            format!(
+                "v = c area^q exp(tilt z) ml, z = (alpha - 60 degrees) / 30 degrees; c {:.3e}, q {}, tilt {}",
+                v["calibration"]["c"].as_f64().unwrap_or(f64::NAN),
+                number(&v["calibration"]["q"], 3),
+                number(&v["calibration"]["tilt"], 3)
+            ),
+        ),
     ];
     for (name, what) in v["left_out"].as_array().into_iter().flatten().map(|l| (text(&l[0]), text(&l[1]))) {
         rows.push(row(&format!("left out: {name}"), what));
     }
-    html += &table(&rows);
+    html += &facts(&rows);
     html += "<div class=plots>";
     let loss: Vec<(f64, f64)> = numbers(&v["loss"]).iter().enumerate().map(|(k, l)| ((k + 1) as f64 * 50.0, *l)).collect();
     html += &figure(&plot("Adam step", "loss", &[Series::line("loss", loss)], false), "Learning curve of the network.");
@@ -273,13 +299,13 @@ fn evaluation(v: &Value) -> String {
             "method",
             "n",
             "MAE",
-            "+-",
+            "±",
             "median",
             "p95",
             "max",
             "bias",
-            "<= 5 ml",
-            "<= 5 %",
+            "≤ 5 ml",
+            "≤ 5 %",
             "never poured",
             "never stopped",
             "measurement",
@@ -290,7 +316,7 @@ fn evaluation(v: &Value) -> String {
         .to_vec(),
     ];
     for s in v["summaries"].as_array().into_iter().flatten() {
-        let percent = |key: &str| s[key].as_f64().map_or_else(String::new, |x| format!("{:.1} %", 100.0 * x));
+        let percent = |key: &str| s[key].as_f64().map_or_else(String::new, |x| format!("{:.1}\u{a0}%", 100.0 * x));
         rows.push(vec![
             text(&s["name"]),
             s["n"].to_string(),
@@ -328,17 +354,17 @@ fn evaluation(v: &Value) -> String {
         bars.push(histogram(&text(&m["name"]), &errors, 0.5, 12.0));
     }
     html += "<div class=plots>";
-    html += &figure(&plot("goal in ml (spread by +-4 for sight)", "poured in ml", &scatter, true), "Goal against poured.");
+    html += &figure(&plot("goal in ml (spread by ±4 for sight)", "poured in ml", &scatter, true), "Goal against poured.");
     html += &figure(&plot("error in ml (ends hold what is beyond)", "% of the pours", &bars, true), "Errors.");
     for trace in v["traces"].as_array().into_iter().flatten() {
         let column = |key: &str| -> Vec<(f64, f64)> { numbers(&trace["t_s"]).into_iter().zip(numbers(&trace[key])).collect() };
         let series = [
             Series::line("alpha, degrees", column("alpha_deg")),
             Series::line("poured, ml", column("true_ml")),
-            Series::line("area / 4, px^2", column("area_4_px2")),
+            Series::line("area / 4, px²", column("area_4_px2")),
         ];
         html += &figure(
-            &plot("s", "", &series, true),
+            &plot("time in s", "degrees, ml, px² / 4", &series, true),
             &format!("A pour of {} ml from {} ml, {}.", trace["goal_ml"], trace["init_ml"], text(&trace["name"])),
         );
     }
@@ -374,7 +400,8 @@ fn against_episodes(files: &[Value]) -> String {
 
 /// The page of some JSON values; an error names the value that is of no known kind.
 pub fn build(files: &[(String, Value)]) -> Result<String, String> {
-    let mut body = String::new();
+    let values: Vec<Value> = files.iter().map(|(_, v)| v.clone()).collect();
+    let mut body = against_episodes(&values);
     for (name, v) in files {
         match v["kind"].as_str() {
             Some("training") => body += &training(v),
@@ -383,8 +410,6 @@ pub fn build(files: &[(String, Value)]) -> Result<String, String> {
             _ => return Err(format!("{name}: not a JSON report of `train`, `refine`, `evaluate` or `reproduce`")),
         }
     }
-    let values: Vec<Value> = files.iter().map(|(_, v)| v.clone()).collect();
-    body += &against_episodes(&values);
     Ok(page("Decant: report", &body))
 }
 

@@ -58,7 +58,7 @@ pub struct Start<'a> {
     pub wall_clock: SystemTime,
     /// The cell's configuration; the file gets all of it.
     pub config: &'a Config,
-    /// Identity of the weight file; empty without one.
+    /// Identity of the weights that the controller runs; empty without any.
     pub weights: &'a str,
 }
 

@@ -22,7 +22,7 @@ const UNLOCK_S: f64 = 5.0;
 /// Powering on and releasing the brakes take this long here, s; a UR5 needs several.
 const POWER_STEP_S: f64 = 0.5;
 /// Log lines kept until somebody takes them.
-const LOG_LINES: usize = 1000;
+pub(super) const LOG_LINES: usize = 1000;
 /// Longest log line, bytes.
 const LOG_LINE_BYTES: usize = 1024;
 

@@ -16,7 +16,7 @@ use shared::os::now_ns;
 
 use super::client_interface::{self, Assembler};
 use super::fault::Fault;
-use super::machine::{LogLine, Machine};
+use super::machine::{LOG_LINES, LogLine, Machine};
 use super::rtde::{Context, Owners, Session};
 use super::variables::Input;
 use super::{Joints, OPERATOR_PORT, StartError, State, Trace, TraceRow, dashboard};
@@ -272,7 +272,13 @@ impl Server {
                 Role::Lines { .. } => client.flush(),
             }
         }
-        lock(&self.shared.log).extend(lines);
+        {
+            // Not every owner of a handle takes them.
+            let mut log = lock(&self.shared.log);
+            log.extend(lines);
+            let over = log.len().saturating_sub(LOG_LINES);
+            log.drain(..over);
+        }
         self.drop_closed();
     }
 

@@ -9,13 +9,13 @@ use trainer::data::TrainingEpisode;
 /// c and q of the camera.
 pub const CAMERA: (f64, f64) = (0.0012, 1.2);
 
-/// `n` curves of eq. (1) from different volumes, weighed to the gram.
+/// `n` curves of eq. (1) from different volumes, weighed to the gram, seen by [`CAMERA`] with a noise of 6 %.
 pub fn episodes(n: usize, seed: u64) -> Vec<TrainingEpisode> {
-    episodes_of(&FlowModel::default(), n, seed)
+    episodes_of(&FlowModel::default(), n, seed, |_| (CAMERA, 0.06))
 }
 
-/// The same, made by another model.
-pub fn episodes_of(model: &FlowModel, n: usize, seed: u64) -> Vec<TrainingEpisode> {
+/// The same, made by `model`, seen by the camera (c and q) and with the noise (sd of the logarithm) that `seen` gives for each episode.
+pub fn episodes_of(model: &FlowModel, n: usize, seed: u64, seen: impl Fn(usize) -> ((f64, f64), f64)) -> Vec<TrainingEpisode> {
     let flow = Flow::new(model);
     let mut rng = Pcg64Mcg::seed_from_u64(seed);
     (0..n)
@@ -28,6 +28,7 @@ pub fn episodes_of(model: &FlowModel, n: usize, seed: u64) -> Vec<TrainingEpisod
             let mut e = TrainingEpisode::empty(&format!("{}", k + 1), 30.0);
             let (mut a, mut x, mut film, mut sum) = (0.0, flow.capacity_ml(onset), 0.0, 0.0);
             let mut history = [0.0; HISTORY];
+            let ((c, q), noise) = seen(k);
             for i in 0..frames {
                 let t_s = i as f64 / 30.0;
                 let alpha = if t_s < 2.0 * beta_s { top * (-((t_s - beta_s) / sigma_s).powi(2) / 2.0).exp() } else { 0.0 };
@@ -42,7 +43,7 @@ pub fn episodes_of(model: &FlowModel, n: usize, seed: u64) -> Vec<TrainingEpisod
                 let out = 0.9 * v + drip;
                 sum += out;
                 let z: f64 = StandardNormal.sample(&mut rng);
-                let area = (out / CAMERA.0).powf(1.0 / CAMERA.1) * (0.06 * z).exp();
+                let area = (out / c).powf(1.0 / q) * (noise * z).exp();
                 e.push(t_s, alpha, f64::NAN, if area < 8.0 { 0.0 } else { area });
             }
             e.weight_g = (sum + film).round();

@@ -1,0 +1,178 @@
+//! What `trainer check` finds in recordings, with the real program and real files: each fault has its own line.
+
+mod common;
+
+use std::path::{Path, PathBuf};
+use std::process::{Command, Output};
+use std::time::UNIX_EPOCH;
+
+use shared::config::Config;
+use shared::control::Curve;
+use shared::episode::{End, EpisodeWriter, Kind, Sample, Start, set_weight};
+use shared::messages::{Doubt, Feature, LAYOUT_VERSION, Telemetry};
+
+const FRAME_NS: u64 = 33_333_333;
+
+/// One camera frame of a recording.
+#[derive(Clone, Copy)]
+struct Row {
+    number: u64,
+    at_ns: u64,
+    alpha_deg: f32,
+    area_px2: f32,
+    doubt: Doubt,
+}
+
+/// A recording on its way into a file.
+struct Recording {
+    rows: Vec<Row>,
+    weight_g: Option<f64>,
+    finished: bool,
+    copies: usize,
+}
+
+/// Recordings as they should be.
+fn recordings(n: usize) -> Vec<Recording> {
+    let recording = |e: &trainer::data::TrainingEpisode| {
+        let row = |k: usize| Row {
+            number: k as u64 + 1,
+            at_ns: (k as u64 + 1) * FRAME_NS,
+            alpha_deg: e.alpha_deg[k] as f32,
+            area_px2: e.area_px2[k] as f32,
+            doubt: Doubt::None,
+        };
+        Recording { rows: (0..e.len()).map(row).collect(), weight_g: Some(e.weight_g), finished: true, copies: 1 }
+    };
+    common::episodes(n, 1).iter().map(recording).collect()
+}
+
+fn write(directory: &Path, recording: &Recording) -> PathBuf {
+    let config = Config::read(&Path::new(env!("CARGO_MANIFEST_DIR")).join("../config/sim.toml")).unwrap();
+    let kind = Kind::Recording(Curve { lambda_deg: 60.0, gamma_per_s2: 0.3, beta_s: 5.0 });
+    let start = Start { episode: 1, kind, started_at_ns: FRAME_NS, wall_clock: UNIX_EPOCH, config: &config, weights: "" };
+    let mut writer = EpisodeWriter::create(directory, &start).unwrap();
+    for (k, row) in recording.rows.iter().enumerate() {
+        let tick =
+            Telemetry { version: LAYOUT_VERSION, tick: k as u64 + 1, at_ns: row.at_ns, alpha_deg: row.alpha_deg, ..Default::default() };
+        writer.telemetry(&tick).unwrap();
+        let feature = Feature {
+            version: LAYOUT_VERSION,
+            sequence: row.number,
+            captured_at_ns: row.at_ns,
+            area_px2: row.area_px2,
+            doubt: row.doubt as u32,
+            ..Default::default()
+        };
+        let sample = Sample { feature: &feature, alpha_commanded_deg: row.alpha_deg, alpha_measured_deg: f32::NAN, image: None };
+        writer.frame(&sample).unwrap();
+    }
+    let path = writer.path().to_path_buf();
+    if !recording.finished {
+        writer.flush().unwrap();
+        return path;
+    }
+    writer.finish(&End { complete: true, reason: "over", disordered_frames: 0 }).unwrap();
+    if let Some(weight_g) = recording.weight_g {
+        // A damaged file takes no weight.
+        let _ = set_weight(&path, weight_g);
+    }
+    path
+}
+
+fn check(recordings: &[Recording]) -> Output {
+    let dir = tempfile::tempdir().unwrap();
+    for recording in recordings {
+        let path = write(dir.path(), recording);
+        for copy in 1..recording.copies {
+            std::fs::copy(&path, path.with_extension(format!("{copy}.mcap"))).unwrap();
+        }
+    }
+    Command::new(env!("CARGO_BIN_EXE_trainer")).arg("check").arg(dir.path()).output().unwrap()
+}
+
+fn said(out: &Output) -> String {
+    format!("{}{}", String::from_utf8_lossy(&out.stdout), String::from_utf8_lossy(&out.stderr))
+}
+
+/// Protects the trainer from bad recordings, and people from guessing: each fault of the last of six recordings is named, and it alone.
+#[test]
+fn each_fault_of_a_recording_is_named() {
+    type Case = (&'static str, i32, fn(&mut Recording));
+    let cases: [Case; 14] = [
+        ("cannot be used: FILE: no weight", 1, |r| r.weight_g = None),
+        ("cannot be used: FILE: weight 0 g: nothing was poured", 1, |r| r.weight_g = Some(0.0)),
+        ("cannot be used: FILE: no stream was ever seen, but the scale shows", 1, |r| r.rows.iter_mut().for_each(|f| f.area_px2 = 0.0)),
+        ("cannot be used: FILE: only 20 frames", 1, |r| r.rows.truncate(20)),
+        ("cannot be used: FILE: the recording is incomplete", 1, |r| r.finished = false),
+        ("cannot be used: FILE: the same measurement as", 1, |r| r.copies = 2),
+        ("error: FILE: damaged: frame 10: commanded alpha NaN", 2, |r| r.rows[9].alpha_deg = f32::NAN),
+        ("error: FILE: damaged: frame 10: commanded alpha 0", 2, |r| r.rows[9].area_px2 = -1.0),
+        ("error: FILE: damaged: frame 10 comes after frame 11", 2, |r| r.rows.swap(9, 10)),
+        ("doubtful: FILE: 10 % of the frames were lost", 1, |r| {
+            let mut k = 0;
+            r.rows.retain(|_| (k += 1, k % 10 != 5).1);
+        }),
+        ("% of the images are clipped, too dark or blown out", 1, |r| {
+            for (k, row) in r.rows.iter_mut().enumerate() {
+                row.doubt = if k % 10 == 5 { Doubt::LeavesRegion } else { row.doubt };
+            }
+        }),
+        ("doubtful: FILE: the angle never returns", 1, |r| {
+            let stays = r.rows.iter().map(|f| f.alpha_deg).fold(0.0, f32::max);
+            let top = r.rows.iter().position(|f| f.alpha_deg == stays).unwrap();
+            r.rows[top..].iter_mut().for_each(|f| f.alpha_deg = stays);
+        }),
+        ("doubtful: FILE: starts at", 1, |r| r.rows[..20].iter_mut().for_each(|f| f.alpha_deg = 30.0)),
+        ("doubtful: FILE: still flowing in the last frames", 1, |r| r.rows.iter_mut().rev().take(3).for_each(|f| f.area_px2 = 40.0)),
+    ];
+    let mut wrong = Vec::new();
+    for (expected, code, spoil) in cases {
+        let mut all = recordings(6);
+        spoil(&mut all[5]);
+        let out = check(&all);
+        let said = said(&out);
+        let names_it = said.lines().any(|l| {
+            let mut parts = expected.split("FILE");
+            let (before, after) = (parts.next().unwrap_or(""), parts.next());
+            match after {
+                Some(after) => l.starts_with(before) && l.contains("episode-0006") && l.contains(after),
+                None => l.contains("episode-0006") && l.contains(before),
+            }
+        });
+        let others = (1..6).any(|k| said.contains(&format!("episode-000{k}.mcap:")));
+        if !names_it || others || out.status.code() != Some(code) {
+            wrong.push(format!("{expected} (exit {code}):\n{said}{:?}\n", out.status.code()));
+        }
+    }
+    assert!(wrong.is_empty(), "{}", wrong.join("\n"));
+}
+
+/// Protects people from training on too little: the set itself is judged, and a good set passes.
+#[test]
+fn the_size_of_the_set_is_judged() {
+    let mut wrong = Vec::new();
+    for (n, code, expected) in [
+        (10, 0, None),
+        (5, 0, Some("too few for method paper")),
+        (3, 0, Some("below 4 the camera's exponent cannot be told")),
+        (0, 1, Some("no episode can be trained on")),
+    ] {
+        let mut all = recordings(n.max(1));
+        if n == 0 {
+            all[0].weight_g = None;
+        }
+        let out = check(&all);
+        let said = said(&out);
+        let doubts = said.lines().any(|l| l.starts_with("doubtful: data set"));
+        if out.status.code() != Some(code) || doubts != expected.is_some() || !said.contains(expected.unwrap_or_default()) {
+            wrong.push(format!("{n} episodes, {expected:?}:\n{said}"));
+        }
+    }
+    let mut all = recordings(6);
+    all[5].rows.iter_mut().for_each(|row| row.at_ns *= 2);
+    let said = said(&check(&all));
+    if !said.contains("doubtful: data set: the episodes have different frame rates") {
+        wrong.push(said);
+    }
+    assert!(wrong.is_empty(), "{}", wrong.join("\n"));
+}
