@@ -102,7 +102,7 @@ impl<'a> Disk<'a> {
             Ok(weights) => {
                 refuse(String::new());
                 (self.say)(&format!("weights {} read from {}; the next pour uses them", weights.identity(), self.path.display()));
-                let identity = u64::from_str_radix(&weights.identity(), 16).unwrap_or_default();
+                let identity = weights.id();
                 self.write(|journal| journal.weights(identity, &weights));
                 // What was waiting and is displaced is dropped here, in an ordinary thread.
                 drop(self.exchange.agents.force_push((identity, Box::new(Agent::new(&weights)))));

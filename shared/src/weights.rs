@@ -287,9 +287,14 @@ impl Weights {
         })
     }
 
-    /// Identity: the first 8 bytes of the SHA-256 of the file's bytes, hexadecimal.
+    /// Identity: the first 8 bytes of the SHA-256 of the file's bytes, big-endian; 0: they cannot be written.
+    pub fn id(&self) -> u64 {
+        self.to_bytes().map_or(0, |bytes| Sha256::digest(&bytes)[..8].iter().fold(0, |id, b| id << 8 | u64::from(*b)))
+    }
+
+    /// [`Weights::id`] as people and files name it: 16 hexadecimal digits.
     pub fn identity(&self) -> String {
-        self.to_bytes().map(|bytes| Sha256::digest(&bytes)[..8].iter().map(|b| format!("{b:02x}")).collect()).unwrap_or_default()
+        format!("{:016x}", self.id())
     }
 
     /// Which value must not go to the robot, if any.

@@ -2,15 +2,13 @@
 //!
 //! Offline, ordinary thread, allocates.
 
-use std::path::PathBuf;
-
 use serde::Serialize;
 use shared::episode::Episode;
 use shared::exit::{self, Failure, OrExit as _, failure};
 use shared::messages::Doubt;
 
 use crate::consistency;
-use crate::data::{self, TrainingEpisode};
+use crate::data::{self, Source, TrainingEpisode};
 
 /// Tilt at the end below which an episode counts as returned, degrees.
 const RETURNED_DEG: f64 = 5.0;
@@ -23,12 +21,8 @@ const GAPS: f64 = 0.05;
   trainer check out/episodes
   trainer check features.csv --scale scale.csv --json")]
 pub struct Args {
-    /// MCAP episodes, or directories of them; with --scale: the table of features.
-    #[arg(required = true)]
-    episodes: Vec<PathBuf>,
-    /// Table of weights (`episode, weight_g`).
-    #[arg(long)]
-    scale: Option<PathBuf>,
+    #[command(flatten)]
+    source: Source,
     /// Print JSON.
     #[arg(long)]
     json: bool,
@@ -109,7 +103,7 @@ fn set_doubts(episodes: &[TrainingEpisode]) -> Vec<(String, String)> {
 
 /// Runs the command: fails when something was found (exit code 1), or nothing can be read (2).
 pub fn run(args: &Args) -> Result<(), Failure> {
-    let episodes = data::read(&args.episodes, args.scale.as_deref()).or_exit(exit::BAD_INPUT)?;
+    let episodes = args.source.read().or_exit(exit::BAD_INPUT)?;
     let findings = check(&episodes);
     if args.json {
         println!("{}", serde_json::to_string_pretty(&findings).unwrap_or_default());

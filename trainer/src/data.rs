@@ -2,7 +2,7 @@
 //!
 //! Offline, ordinary thread, allocates. Bad data gets one clear line ([`DataError`]) that names the episode.
 
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 
 use sha2::{Digest, Sha256};
 use shared::episode::{self, Episode};
@@ -151,26 +151,37 @@ fn rate_hz(e: &Episode) -> f64 {
     (1.0 / median * 10.0).round() / 10.0
 }
 
-/// Reads episodes from MCAP files and directories (`paths`), or from a CSV pair if `scale` is given. Nothing is checked yet
-/// but that they can be read.
-pub fn read(paths: &[PathBuf], scale: Option<&Path>) -> Result<Vec<Episode>, DataError> {
-    let mut episodes = Vec::new();
-    if let Some(scale) = scale {
-        for features in paths {
-            episodes.extend(episode::read_table(features, scale)?);
-        }
-    } else {
-        for file in episode::find(paths)? {
-            episodes.push(Episode::read(&file)?);
-        }
-    }
-    if episodes.is_empty() {
-        let places: Vec<String> = paths.iter().map(|p| p.display().to_string()).collect();
-        return Err(DataError::None { places: places.join(", ") });
-    }
-    Ok(episodes)
+/// Where a command's episodes are.
+#[derive(Debug, clap::Args)]
+pub struct Source {
+    /// MCAP episodes, or directories of them, recordings and pours; with --scale: the table of features.
+    #[arg(required = true)]
+    episodes: Vec<PathBuf>,
+    /// Table of weights (`episode, weight_g`); the episodes are then read from a table too.
+    #[arg(long)]
+    scale: Option<PathBuf>,
 }
 
+impl Source {
+    /// Reads the episodes. Nothing is checked yet but that they can be read.
+    pub fn read(&self) -> Result<Vec<Episode>, DataError> {
+        let mut episodes = Vec::new();
+        if let Some(scale) = &self.scale {
+            for features in &self.episodes {
+                episodes.extend(episode::read_table(features, scale)?);
+            }
+        } else {
+            for file in episode::find(&self.episodes)? {
+                episodes.push(Episode::read(&file)?);
+            }
+        }
+        if episodes.is_empty() {
+            let places: Vec<String> = self.episodes.iter().map(|p| p.display().to_string()).collect();
+            return Err(DataError::None { places: places.join(", ") });
+        }
+        Ok(episodes)
+    }
+}
 /// What a data set is good for: the usable episodes, and a line for each one that was left out.
 #[derive(Debug, Clone, Default)]
 pub struct Usable {

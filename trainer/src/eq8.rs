@@ -100,9 +100,9 @@ fn sequence(
     let goal = kappa * episode.weight_g;
     let mut d = goal;
     let mut states = Vec::with_capacity(volumes.len());
-    for i in 0..volumes.len() {
+    for (i, sum) in poured.iter().enumerate() {
         let before = d;
-        d = goal - poured[i];
+        d = goal - sum;
         let (from, to) = if next { (i, i + 1) } else { (i.max(1) - 1, i) };
         let Some(moved) = episode.alpha_deg.get(to).map(|a| a - episode.alpha_deg[from]) else { continue };
         let v = [i, i.wrapping_sub(1), i.wrapping_sub(2)].map(|k| volumes.get(k).copied().unwrap_or(0.0) as f32);

@@ -11,7 +11,7 @@ use shared::episode::{Episode, Kind};
 use shared::exit::{self, Failure, OrExit as _, failure};
 
 use crate::consistency;
-use crate::data;
+use crate::data::{self, Source};
 use crate::train::{self, Estimate, MethodName, Options};
 
 /// Command-line arguments of `trainer refine`.
@@ -21,12 +21,8 @@ use crate::train::{self, Estimate, MethodName, Options};
   trainer refine out/episodes --leave-out out/episodes/0007.mcap --out out/weights.bin
   trainer refine out/episodes --accept out/episodes/0007.mcap --out out/weights.bin")]
 pub struct Args {
-    /// MCAP episodes, or directories of them: recordings and pours; with --scale: the table of features.
-    #[arg(required = true)]
-    episodes: Vec<PathBuf>,
-    /// Table of weights (`episode, weight_g`).
-    #[arg(long)]
-    scale: Option<PathBuf>,
+    #[command(flatten)]
+    source: Source,
     /// Episodes whose weight is right although it does not fit the others.
     #[arg(long)]
     accept: Vec<String>,
@@ -67,7 +63,7 @@ pub fn pours(episodes: &[Episode]) -> Vec<(usize, f64, f64, f64)> {
 
 /// Runs the command.
 pub fn run(args: &Args) -> Result<(), Failure> {
-    let read = data::read(&args.episodes, args.scale.as_deref()).or_exit(exit::BAD_INPUT)?;
+    let read = args.source.read().or_exit(exit::BAD_INPUT)?;
     let limits = train::limits(args.config.as_deref()).or_exit(exit::BAD_INPUT)?;
     let mut usable = data::usable(&read);
     usable.episodes.retain(|e| !args.leave_out.contains(&e.name));

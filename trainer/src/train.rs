@@ -13,7 +13,7 @@ use shared::weights::Weights;
 
 use crate::best;
 use crate::consistency;
-use crate::data::{self, DataError, TrainingEpisode, Usable};
+use crate::data::{self, DataError, Source, TrainingEpisode, Usable};
 use crate::eq8;
 use crate::fit::Fit;
 use crate::law::Law;
@@ -130,12 +130,8 @@ pub fn train(episodes: &[TrainingEpisode], options: &Options, progress: &dyn Pro
   trainer train features.csv --scale scale.csv --out out/weights.bin
   trainer train out/episodes --estimate sum --seed 7 --out w.bin")]
 pub struct Args {
-    /// MCAP episodes, or directories of them; with --scale: the table of features.
-    #[arg(required = true)]
-    episodes: Vec<PathBuf>,
-    /// Table of weights (`episode, weight_g`); the episodes are then read from a table too.
-    #[arg(long)]
-    scale: Option<PathBuf>,
+    #[command(flatten)]
+    source: Source,
     /// Training method.
     #[arg(long, value_enum, default_value = "best")]
     method: MethodName,
@@ -189,7 +185,7 @@ pub fn limits(config: Option<&Path>) -> Result<Limits, shared::config::ConfigErr
 
 /// Runs the command.
 pub fn run(args: &Args) -> Result<(), Failure> {
-    let read = data::read(&args.episodes, args.scale.as_deref()).or_exit(exit::BAD_INPUT)?;
+    let read = args.source.read().or_exit(exit::BAD_INPUT)?;
     let limits = limits(args.config.as_deref()).or_exit(exit::BAD_INPUT)?;
     let can_fuse = matches!(args.method, MethodName::Best | MethodName::Paper);
     let estimate = args.estimate.unwrap_or(if can_fuse { Estimate::Fused } else { Estimate::Sum });
