@@ -4,18 +4,19 @@
 //! background is displaced. The container turns, so the background moves in the picture as one rigid piece, while the stream's
 //! outline stays. Hence, at 320 px for the whole width:
 //!
-//! 1. The background's **motion** since the last frame (shift, turn, exposure) from a few hundred points that are dry
-//!    (Gauss-Newton with robust weights).
-//! 2. The **remembered** dry background and the last picture, both moved by it, are compared with the picture along rays from the lip.
-//!    What differs from the memory is wet. Where the background was hidden until now, a step in brightness counts that the last picture,
-//!    moved, does not explain.
-//! 3. Of about 1,500 **lines** from axis to axis the best has most of this just inside and none outside. A line goes on where it was,
-//!    with the same band along it; one that moves with the background is none. Beginning a stream takes more than going on.
+//! 1. The dry background is **remembered** in colour as one picture that is fixed in the world. How the world lies in the camera's picture
+//!    now (shift, turn, exposure) follows from a few hundred dry points of it (Gauss-Newton with robust weights, coarse then fine).
+//! 2. The memory and the last picture, both moved, are compared with the picture along rays from the lip. What differs from the memory
+//!    is wet. Where the ground was hidden until now, or is as bright as the water's rim, a step counts that the last picture, moved,
+//!    does not explain.
+//! 3. Of about 1,000 **lines** from axis to axis the best has most of this just inside and none outside. A line goes on near where it was,
+//!    in the same shape and with the same band along it; one that moves with the background is none. Beginning a stream takes more than
+//!    going on. The full picture's profiles across it must confirm it ([`Background::confirm`]).
 //!
 //! The first frame must be dry. Runs on the extraction thread; all pictures and tables are kept, nothing is allocated after the second
 //! frame. No failures but OpenCV's.
 
-use opencv::core::{self, CV_8UC2, Mat, Scalar, Size, Vec2b};
+use opencv::core::{self, Mat, Size};
 use opencv::imgproc;
 use opencv::prelude::*;
 
@@ -30,30 +31,39 @@ const RAYS: usize = 32;
 const SAMPLES: usize = 130;
 const CELLS: usize = RAYS * SAMPLES;
 const NEAR_PX: f32 = 1.0;
-/// Lines that are tried: distances on either axis in geometric steps, and the largest ratio of the two.
+/// Lines that are tried: distances on either axis in geometric steps, and the largest ratios of the two.
 const LEGS: usize = 46;
 const LEG_FIRST_PX: f32 = 6.5;
 const LEG_FACTOR: f32 = 1.07;
-const LEG_RATIO: f32 = 4.5;
-/// Points for the motion: one, the one with the steepest slope, in each square of this many px at half the working size.
-const POINT_EVERY: usize = 5;
+const LEGS_FLAT: f32 = 4.0;
+const LEGS_STEEP: f32 = 2.0;
+/// Points for the motion: one, the one with the steepest slope, in each square of this many px.
+const SQUARE: usize = 10;
+/// Room in the memory around the region, squares.
+const ROOM_SQUARES: usize = 4;
+/// Of the memory every so many rows, and of its squares every so many rows, are looked at in a frame.
+const REFRESH: usize = 4;
+const MARK_EVERY: usize = 4;
+/// Fewer points tell no motion.
 const POINTS_LEAST: usize = 30;
 /// The motion is looked for from rest too when it leaves this much more unexplained than the last one did.
 const LEFT_GROWS: f32 = 1.2;
 /// Least noise, grey levels (rounding), and as a share of the background's brightness (the exposure is not known better).
 const NOISE_LEAST: f32 = 0.8;
 const NOISE_SHARE: f32 = 0.012;
+/// Noise in units of the median difference.
+const NOISE_MEDIANS: f32 = 1.1;
 /// Share of the background's slope that counts as error of its place: fresh, and more as the memory fades.
 const SLOPE_FRESH: f32 = 0.2;
 const SLOPE_FADED: f32 = 0.5;
 /// Difference in units of the noise: from here on it is wet, and fully so this much further on; dry as much before.
-const WET_FROM: f32 = 3.0;
-const WET_SPAN: f32 = 3.0;
+const WET_FROM: f32 = 2.2;
+const WET_SPAN: f32 = 2.0;
 /// A difference up to this, in units of the noise, is still background.
 const CALM: f32 = 5.0;
-/// Sureness of the memory, 0 to 255: known from here on; left after each frame that does not show it.
-const KNOWN: u8 = 50;
-const FADE: f32 = 0.95;
+/// Sureness of the memory, 0 to 255: known from here on; left when a row's turn comes and the place is hidden.
+const KNOWN: f32 = 50.0;
+const FADE: f32 = 0.94;
 /// Background that moves by more than this is told from what stands still, px a frame.
 const MOVES_PX: f32 = 1.2;
 /// A step in brightness counts from this share of the stream's usual one on, fully this much further on.
@@ -62,9 +72,11 @@ const STEP_SPAN: f32 = 0.3;
 /// Weight of a moved picture's evidence where the memory knows nothing, to begin a stream.
 const UNKNOWN_WEIGHT: f32 = 0.5;
 /// Least score, share of the line's length with an edge, and share of it on known ground to begin a stream.
-const BEGIN: [f32; 3] = [0.6, 0.7, 0.45];
+const BEGIN: [f32; 3] = [0.7, 0.6, 0.45];
+/// On known ground the least score to begin is less by this.
+const BEGIN_KNOWN: f32 = 0.25;
 /// Least score to go on: on unknown ground and on known ground; least share of the line's length.
-const GO_ON: [f32; 3] = [0.45, 0.75, 0.6];
+const GO_ON: [f32; 3] = [0.45, 0.5, 0.6];
 /// What the moved last picture says of a line, -1 (it explains it) to 1: below, it is background; above, a stream goes on.
 const EXPLAINED: f32 = -0.4;
 const UNEXPLAINED: f32 = 0.3;
@@ -77,17 +89,30 @@ const PIECE: f32 = 0.35;
 const OUTERMOST: f32 = 0.3;
 /// Weight of what the moved last picture does not explain further out.
 const BEYOND: f32 = 0.4;
-/// Weight of the last line's neighbourhood (as a Gaussian of this width in the logarithm of its legs), and how far it may jump.
+/// Weight of being like the last line: as Gaussians of the logarithms of its size (root of the legs' product; with a limit) and of its
+/// shape (their ratio: wider for a stream that was seen once; the limit is 2.5 of it).
 const STAY: f32 = 0.4;
-const STAY_WIDTH: f32 = 0.3;
-const JUMP_MOST: f32 = 0.9;
+const GROWS: f32 = 0.25;
+const GROWS_MOST: f32 = 0.7;
+const TURNS: f32 = 0.2;
+const TURNS_YOUNG: f32 = 0.3;
 /// Weight of an even band along the line, and of the same band as before.
 const BAND: f32 = 0.5;
 /// Far from the lip, no more of the background than this differs from the memory, or it is another picture.
 const STRANGE: f32 = 0.3;
+/// Frames of another picture after which it is the background.
+const STRANGE_FRAMES: u32 = 15;
+/// Weight of what is wet just inside a line, and just outside.
+const WET_INSIDE: f32 = 1.3;
+const WET_OUTSIDE: f32 = 0.5;
 /// How fast the memory follows what is seen: where it fits and where it does not.
-const FOLLOW: f32 = 0.5;
-const FOLLOW_SLOWLY: f32 = 0.3;
+const FOLLOW: f32 = 0.35;
+const FOLLOW_SLOWLY: f32 = 0.1;
+/// The full picture's line is the same when ratio and product of its legs differ by no more than this (as logarithms), and its step
+/// has at least this share of the usual height.
+const SHAPE_MOST: f32 = 0.7;
+const SIZE_MOST: f32 = 1.0;
+const HEIGHT_LEAST: f32 = 0.3;
 /// Frames after a stream during which the place where it was is not taken for background at once.
 const AFTERWARDS: u32 = 3;
 
@@ -102,30 +127,31 @@ pub enum Seen {
     Stream(f32),
 }
 
-/// Motion of the background from frame to frame: shift in px, turn in radians about the region's middle, change of exposure.
+/// Motion of the background from frame to frame: shift in px, turn in radians about the region's middle.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
 struct Motion {
     shift: [f32; 2],
     turn: f32,
-    exposure: f32,
 }
 
-/// A point of the background for the motion: place and grey level at half the working size, and the slope there.
+/// A point of the memory for the motion: place, and level and slope (per px) at half the working size and at the working size.
 #[derive(Debug, Clone, Copy)]
 struct Mark {
-    x: f32,
-    y: f32,
-    level: f32,
-    slope: [f32; 2],
+    at: [f32; 2],
+    levels: [f32; 2],
+    slopes: [[f32; 2]; 2],
 }
 
 /// The stream as it was last seen.
 #[derive(Debug, Clone, Copy)]
 struct Stream {
     legs: [f32; 2],
-    /// Mean brightness of the band along its outline, and mean step there, grey levels.
-    band: f32,
-    step: f32,
+    /// Frames for which it has been seen.
+    age: f32,
+    /// Height of the step along it in the full picture, grey levels.
+    height: f32,
+    /// Mean colour of the band along its outline, and last the mean step there, grey levels.
+    band: Colour,
 }
 
 /// A candidate line with what was found along it.
@@ -138,8 +164,7 @@ struct Found {
     score: f32,
     share: f32,
     known: f32,
-    band: f32,
-    step: f32,
+    band: Colour,
 }
 
 /// What is known of one sample of one ray.
@@ -148,9 +173,8 @@ struct Cell {
     /// What it adds to a line through it, and the share of that which rests on known ground.
     value: f32,
     known: f32,
-    /// Brightness just inside, and the step to just outside.
-    band: f32,
-    step: f32,
+    /// Colour just inside, and last the size of the step to just outside.
+    band: Colour,
     /// What the moved last picture says, -1 to 1, and the share of the surroundings that it shows.
     unexplained: f32,
     shown: f32,
@@ -175,21 +199,34 @@ pub struct Background {
     weights: Vec<f32>,
     // Pictures: small in colour, now, the last one, and at half the size.
     small: Mat,
-    now: Mat,
-    last: Mat,
+    now: Vec<Colour>,
+    last: Vec<Colour>,
+    grey: Mat,
     now_half: Mat,
-    memory_half: Mat,
-    /// Grey level and sureness of the dry background; as it was left, and the one being made.
-    memory: Mat,
-    moved: Mat,
-    started: bool,
+    /// The dry background, a square fixed in the world: colour at the first picture's exposure, and last its sureness, 0 to 255.
+    side: usize,
+    memory: Vec<Colour>,
+    /// Where it is built anew when the picture comes near its border.
+    spare: Vec<Colour>,
+    /// Its points for the motion by squares, and as they lay in the last picture.
+    corners: Vec<Option<Mark>>,
+    marks: Vec<Mark>,
+    /// From the memory to the picture, now and before; exposure against the memory; the last motion.
+    pose: Turn,
+    last_pose: Turn,
+    /// The picture in the memory's middle.
+    home: Turn,
+    gain: f32,
+    last_gain: f32,
     motion: Motion,
+    frame: usize,
     /// Mean size of what the last motion left unexplained, grey levels.
     left: f32,
-    marks: Vec<Mark>,
     table: Vec<Cell>,
     // Along all rays: brightness; difference from the memory and from the last picture in units of the noise; slope; sureness.
-    levels: Vec<f32>,
+    levels: Vec<Colour>,
+    differs: Vec<Colour>,
+    differs_last: Vec<Colour>,
     away: Vec<f32>,
     away_last: Vec<f32>,
     slopes: Vec<f32>,
@@ -198,10 +235,14 @@ pub struct Background {
     noise: f32,
     /// Share of the known background far from the lip that differs from the memory.
     strange: f32,
+    /// Frames in a row with too much of that.
+    strange_frames: u32,
     stream: Option<Stream>,
     /// Where it last was, and for how many frames it has not been seen.
     last_legs: [f32; 2],
     dry_frames: u32,
+    /// Lines in a row that the full picture did not confirm.
+    refuted: u32,
     edges: Vec<[f32; 2]>,
     scratch: Vec<f32>,
 }
@@ -237,57 +278,101 @@ fn solve(mut matrix: [[f32; 4]; 4], mut right: [f32; 4]) -> [f32; 4] {
     x
 }
 
-/// Grey levels with their width.
+/// Blue, green, red, and one more: four for the processor's sake.
+type Colour = [f32; 4];
+
+#[inline(always)]
+fn each(f: impl Fn(usize) -> f32) -> Colour {
+    [f(0), f(1), f(2), f(3)]
+}
+
+/// Size of a difference of colours, grey levels: that of an equal difference of all three.
+#[inline(always)]
+fn size_of(c: &Colour) -> f32 {
+    ((c[0] * c[0] + c[1] * c[1] + c[2] * c[2]) / 3.0).sqrt()
+}
+
+/// Between four neighbours.
+#[inline(always)]
+fn mix([a, b, c, d]: [Colour; 4], fx: f32, fy: f32) -> Colour {
+    let top = each(|k| a[k] + (b[k] - a[k]) * fx);
+    let bottom = each(|k| c[k] + (d[k] - c[k]) * fx);
+    each(|k| top[k] + (bottom[k] - top[k]) * fy)
+}
+
+/// A picture with its size.
 #[derive(Clone, Copy)]
-struct Grey<'a> {
-    bytes: &'a [u8],
+struct Picture<'a> {
+    pixels: &'a [Colour],
     width: usize,
     height: usize,
 }
 
-impl<'a> Grey<'a> {
-    fn new(picture: &'a Mat) -> opencv::Result<Self> {
-        Ok(Self { bytes: picture.data_bytes()?, width: picture.cols() as usize, height: picture.rows() as usize })
-    }
-
+impl Picture<'_> {
     /// Bilinear sample; none outside.
-    #[inline]
-    fn at(&self, x: f32, y: f32) -> Option<f32> {
+    #[inline(always)]
+    fn at(&self, x: f32, y: f32) -> Option<Colour> {
         let (column, row, fx, fy) = between(x, y, self.width, self.height)?;
-        let upper = self.bytes.get(row * self.width + column..)?;
+        let upper = self.pixels.get(row * self.width + column..)?;
         let lower = upper.get(self.width..self.width + 2)?;
-        let mix = |a: u8, b: u8| f32::from(a) + (f32::from(b) - f32::from(a)) * fx;
-        let (top, bottom) = (mix(upper[0], upper[1]), mix(lower[0], lower[1]));
-        Some(top + (bottom - top) * fy)
+        Some(mix([upper[0], upper[1], lower[0], lower[1]], fx, fy))
     }
 }
 
-/// The rigid map of a motion at `factor` of the working size: a point's new place.
-#[derive(Clone, Copy)]
+/// A rigid map.
+#[derive(Debug, Clone, Copy)]
 struct Turn {
     cos: f32,
     sin: f32,
     shift: [f32; 2],
-    middle: [f32; 2],
 }
 
 impl Turn {
-    fn new(motion: &Motion, size: Size, factor: f32) -> Self {
-        let (sin, cos) = motion.turn.sin_cos();
-        Self { cos, sin, shift: motion.shift.map(|v| v * factor), middle: [size.width, size.height].map(|v| v as f32 / 2.0 * factor) }
+    /// Turns about `middle`, then shifts.
+    fn new(turn: f32, shift: [f32; 2], middle: [f32; 2]) -> Self {
+        let (sin, cos) = turn.sin_cos();
+        let [x, y] = middle;
+        Self { cos, sin, shift: [x - cos * x + sin * y + shift[0], y - sin * x - cos * y + shift[1]] }
     }
 
     #[inline]
-    fn forth(&self, [x, y]: [f32; 2]) -> [f32; 2] {
-        let (x, y) = (x - self.middle[0], y - self.middle[1]);
-        [self.cos * x - self.sin * y + self.middle[0] + self.shift[0], self.sin * x + self.cos * y + self.middle[1] + self.shift[1]]
+    fn along(&self, [x, y]: [f32; 2]) -> [f32; 2] {
+        [self.cos * x - self.sin * y, self.sin * x + self.cos * y]
+    }
+
+    #[inline]
+    fn forth(&self, at: [f32; 2]) -> [f32; 2] {
+        let [x, y] = self.along(at);
+        [x + self.shift[0], y + self.shift[1]]
     }
 
     #[inline]
     fn back(&self, [x, y]: [f32; 2]) -> [f32; 2] {
-        let (x, y) = (x - self.middle[0] - self.shift[0], y - self.middle[1] - self.shift[1]);
-        [self.cos * x + self.sin * y + self.middle[0], -self.sin * x + self.cos * y + self.middle[1]]
+        let (x, y) = (x - self.shift[0], y - self.shift[1]);
+        [self.cos * x + self.sin * y, -self.sin * x + self.cos * y]
     }
+
+    fn inverse(&self) -> Self {
+        let [x, y] = self.back([0.0, 0.0]);
+        Self { cos: self.cos, sin: -self.sin, shift: [x, y] }
+    }
+
+    /// This one after `first`.
+    fn after(&self, first: &Turn) -> Self {
+        let (cos, sin) = (self.cos * first.cos - self.sin * first.sin, self.sin * first.cos + self.cos * first.sin);
+        // Stays a turn over many frames.
+        let length = cos.hypot(sin);
+        Self { cos: cos / length, sin: sin / length, shift: self.forth(first.shift) }
+    }
+}
+
+/// Where a linear function that is `value` at 0 and changes by `slope` a step is at least `least`, cut out of `from..to`.
+fn at_least(value: f32, slope: f32, least: f32, [from, to]: [f32; 2]) -> [f32; 2] {
+    if slope.abs() < 1e-6 {
+        return if value >= least { [from, to] } else { [0.0, 0.0] };
+    }
+    let cut = (least - value) / slope;
+    if slope > 0.0 { [from.max(cut), to] } else { [from, to.min(cut)] }
 }
 
 impl Background {
@@ -325,7 +410,7 @@ impl Background {
         for i in 0..LEGS * LEGS {
             let leg = |k: usize| LEG_FIRST_PX * LEG_FACTOR.powi(k as i32);
             let (a, b) = (leg(i / LEGS), leg(i % LEGS));
-            if a / b > LEG_RATIO || b / a > LEG_RATIO {
+            if a / b > LEGS_FLAT || b / a > LEGS_STEEP {
                 continue;
             }
             // Where each ray meets the line: along = u x + v y, and u / a + v / b = 1 on it.
@@ -357,6 +442,10 @@ impl Background {
             weights.extend((0..RAYS).map(|k| weight(k) / total));
         }
         let rows = || vec![0.0; CELLS];
+        // Room for the region turned by any angle, and moved a little.
+        let squares = ((size.width as f32).hypot(size.height as f32) / SQUARE as f32).ceil() as usize + 2 * ROOM_SQUARES;
+        let side = squares * SQUARE;
+        let home = Turn { cos: 1.0, sin: 0.0, shift: [size.width, size.height].map(|v| 0.5 * (v as f32 - side as f32)) };
         Ok(Self {
             scale,
             size,
@@ -369,18 +458,27 @@ impl Background {
             cells,
             weights,
             small: Mat::default(),
-            now: Mat::default(),
-            last: Mat::default(),
+            now: vec![[0.0; 4]; size.area() as usize],
+            last: vec![[0.0; 4]; size.area() as usize],
+            grey: Mat::default(),
             now_half: Mat::default(),
-            memory_half: Mat::default(),
-            memory: Mat::new_size_with_default(size, CV_8UC2, Scalar::all(0.0))?,
-            moved: Mat::new_size_with_default(size, CV_8UC2, Scalar::all(0.0))?,
-            started: false,
+            side,
+            memory: vec![[0.0; 4]; side * side],
+            spare: vec![[0.0; 4]; side * side],
+            corners: vec![None; squares * squares],
+            marks: Vec::with_capacity(squares * squares),
+            pose: home,
+            last_pose: home,
+            home,
+            gain: 1.0,
+            last_gain: 1.0,
             motion: Motion::default(),
+            frame: 0,
             left: 0.0,
-            marks: Vec::with_capacity(size.area() as usize / (4 * POINT_EVERY * POINT_EVERY) + 1),
             table: vec![Cell::default(); CELLS],
-            levels: rows(),
+            levels: vec![[0.0; 4]; CELLS],
+            differs: vec![[0.0; 4]; CELLS],
+            differs_last: vec![[0.0; 4]; CELLS],
             away: rows(),
             away_last: rows(),
             slopes: rows(),
@@ -388,9 +486,11 @@ impl Background {
             shown: rows(),
             noise: NOISE_LEAST,
             strange: 0.0,
+            strange_frames: 0,
             stream: None,
             last_legs: [0.0; 2],
             dry_frames: AFTERWARDS + 1,
+            refuted: 0,
             edges: Vec::with_capacity(RAYS),
             scratch: Vec::with_capacity(CELLS),
         })
@@ -415,12 +515,67 @@ impl Background {
         ]
     }
 
+    /// The colour of the dry background at a place of the region, px, where it is known; and the noise, grey levels.
+    pub fn dry_at(&self, [x, y]: [f32; 2]) -> Option<[f32; 3]> {
+        let small = |v: f32| (v + 0.5) / self.scale - 0.5;
+        let [x, y] = self.pose.back([small(x), small(y)]);
+        let (column, row, fx, fy) = between(x, y, self.side, self.side)?;
+        let corner = row * self.side + column;
+        let four = [corner, corner + 1, corner + self.side, corner + self.side + 1].map(|i| self.memory[i]);
+        let [b, g, r, _] = mix(four, fx, fy);
+        four.iter().all(|c| c[3] >= KNOWN).then(|| [b, g, r].map(|v| v * self.gain))
+    }
+
+    /// The colour of the stream's rim as it was last seen.
+    pub fn rim(&self) -> Option<[f32; 3]> {
+        self.stream.map(|s| [s.band[0], s.band[1], s.band[2]])
+    }
+
+    /// The noise of small pixels, grey levels.
+    pub fn noise(&self) -> f32 {
+        self.noise
+    }
+
+    /// Whether the stream was not there before the last picture.
+    pub fn begins(&self) -> bool {
+        self.stream.is_some_and(|s| s.age <= 1.0)
+    }
+
+    /// What the full picture says of the line: its legs, px, and the height of the step along it, grey levels; none without a step.
+    /// Whether it is the stream that was seen: one does not lose its contrast, nor change its shape.
+    pub fn confirm(&mut self, fine: Option<([f32; 2], f32)>) -> bool {
+        let Some(stream) = &mut self.stream else { return false };
+        let young = stream.age <= 1.0;
+        let good = fine.is_some_and(|(legs_px, height)| {
+            let [a, b] = [0, 1].map(|k| (legs_px[k] / self.scale / stream.legs[k]).ln());
+            (a - b).abs() < SHAPE_MOST && (a + b).abs() < SIZE_MOST && (young || height > HEIGHT_LEAST * stream.height)
+        });
+        match fine {
+            Some((legs_px, height)) if good => {
+                stream.legs = legs_px.map(|v| v / self.scale);
+                stream.height = if young { height } else { stream.height + 0.3 * (height - stream.height) };
+                self.refuted = 0;
+            }
+            _ => {
+                self.refuted += 1;
+                if young || self.refuted > 1 {
+                    self.stream = None;
+                    self.dry_frames = 1;
+                }
+            }
+        }
+        good
+    }
+
     /// Takes the next picture: the region in colour, at full size.
     pub fn take(&mut self, region: &impl core::ToInputArray) -> opencv::Result<()> {
         std::mem::swap(&mut self.now, &mut self.last);
         // The middle four of each block's pixels: half of the memory of a large picture is never read.
         imgproc::resize(region, &mut self.small, self.size, 0.0, 0.0, imgproc::INTER_LINEAR)?;
-        imgproc::cvt_color_def(&self.small, &mut self.now, imgproc::COLOR_BGR2GRAY)
+        for (pixel, bytes) in self.now.iter_mut().zip(self.small.data_bytes()?.chunks_exact(3)) {
+            *pixel = [f32::from(bytes[0]), f32::from(bytes[1]), f32::from(bytes[2]), 0.0];
+        }
+        Ok(())
     }
 
     /// The picture that was taken, small, in colour.
@@ -431,85 +586,123 @@ impl Background {
     /// Looks at the picture that was taken.
     pub fn look(&mut self) -> opencv::Result<Seen> {
         self.edges.clear();
-        if !self.started {
-            self.started = true;
-            let [above, ..] = self.planes([1.0, 1.0]);
-            let width = self.size.width as usize;
-            let now = self.now.data_bytes()?;
-            for (i, pixel) in self.memory.data_typed_mut::<Vec2b>()?.iter_mut().enumerate() {
-                let air = above[0] + above[1] * (i % width) as f32 + above[2] * (i / width) as f32 >= RIM_PX;
-                *pixel = Vec2b::from([now[i], if air { 255 } else { 0 }]);
+        let mut seen = Seen::Dry;
+        if self.frame > 0 {
+            self.register()?;
+            self.compare();
+            self.fill_table();
+            seen = self.decide();
+            self.strange_frames = if self.strange > STRANGE { self.strange_frames + 1 } else { 0 };
+            if self.strange_frames > STRANGE_FRAMES {
+                // It stays another picture: what stands there now is the background.
+                self.forget();
             }
-            return Ok(Seen::Dry);
+            self.keep_inside();
         }
-        self.register()?;
-        self.compare()?;
-        let seen = self.decide();
-        self.remember()?;
+        self.remember();
+        self.frame += 1;
         Ok(seen)
     }
 
-    /// The background's motion from the memory to now, into `self.motion`.
+    /// Starts anew, as from a first picture.
+    fn forget(&mut self) {
+        self.memory.fill([0.0; 4]);
+        self.corners.fill(None);
+        (self.pose, self.gain, self.motion) = (self.home, 1.0, Motion::default());
+        (self.frame, self.strange_frames, self.stream, self.dry_frames) = (0, 0, None, AFTERWARDS + 1);
+    }
+
+    /// Copies the memory to its own middle when the picture comes near its border.
+    fn keep_inside(&mut self) {
+        let [x, y] = self.pose.back(self.middle());
+        let middle = 0.5 * self.side as f32;
+        let most = ((ROOM_SQUARES - 1) * SQUARE) as f32;
+        if (x - middle).abs().max((y - middle).abs()) < most {
+            return;
+        }
+        let old = Picture { pixels: &self.memory, width: self.side, height: self.side };
+        for (i, pixel) in self.spare.iter_mut().enumerate() {
+            let from = self.pose.back(self.home.forth([(i % self.side) as f32, (i / self.side) as f32]));
+            *pixel = old.at(from[0], from[1]).unwrap_or_default();
+        }
+        std::mem::swap(&mut self.memory, &mut self.spare);
+        // What the last picture saw there is found with the same change.
+        let change = self.pose.inverse().after(&self.home);
+        (self.last_pose, self.pose) = (self.last_pose.after(&change), self.home);
+        self.corners.fill(None);
+        for row in 0..MARK_EVERY {
+            self.mark_corners(row);
+        }
+    }
+
+    fn middle(&self) -> [f32; 2] {
+        [self.size.width, self.size.height].map(|v| v as f32 / 2.0)
+    }
+
+    /// The background's motion since the last picture, into `self.motion`, `self.pose` and `self.gain`.
     fn register(&mut self) -> opencv::Result<()> {
         let half = Size::new(self.size.width / 2, self.size.height / 2);
-        imgproc::resize(&self.now, &mut self.now_half, half, 0.0, 0.0, imgproc::INTER_AREA)?;
-        imgproc::resize(&self.memory, &mut self.memory_half, half, 0.0, 0.0, imgproc::INTER_AREA)?;
-        let [_, right, inside] = self.planes(self.stream.map_or([1.0, 1.0], |s| s.legs.map(|v| v + 5.0)));
+        imgproc::cvt_color_def(&self.small, &mut self.grey, imgproc::COLOR_BGR2GRAY)?;
+        imgproc::resize(&self.grey, &mut self.now_half, half, 0.0, 0.0, imgproc::INTER_AREA)?;
         let flows = self.stream.is_some();
-        let memory = self.memory_half.data_typed::<Vec2b>()?;
-        let (width, height) = (half.width as usize, half.height as usize);
+        let [above, right, inside] = self.planes(self.stream.map_or([1.0, 1.0], |s| s.legs.map(|v| v + 5.0)));
+        (self.last_pose, self.last_gain) = (self.pose, self.gain);
         self.marks.clear();
-        for top in (1..height.saturating_sub(POINT_EVERY)).step_by(POINT_EVERY) {
-            for left in (1..width.saturating_sub(POINT_EVERY)).step_by(POINT_EVERY) {
-                let mut best: Option<(f32, Mark)> = None;
-                for y in top..top + POINT_EVERY {
-                    for x in left..left + POINT_EVERY {
-                        let i = y * width + x;
-                        if memory[i][1] < 250 && (flows || memory[i][1] < KNOWN) {
-                            continue;
-                        }
-                        let level = |i: usize| f32::from(memory[i][0]);
-                        let slope = [0.5 * (level(i + 1) - level(i - 1)), 0.5 * (level(i + width) - level(i - width))];
-                        let steep = slope[0] * slope[0] + slope[1] * slope[1];
-                        if best.as_ref().is_none_or(|(most, _)| steep > *most) {
-                            best = Some((steep, Mark { x: x as f32, y: y as f32, level: level(i), slope }));
-                        }
-                    }
-                }
-                let Some((_, mark)) = best else { continue };
-                let (x, y) = (2.0 * mark.x + 0.5, 2.0 * mark.y + 0.5);
-                let value = |plane: [f32; 3]| plane[0] + plane[1] * x + plane[2] * y;
-                if !flows || (value(inside) > 1.0 && value(right) >= 1.0) {
-                    self.marks.push(mark);
-                }
+        for mark in self.corners.iter().flatten() {
+            let [x, y] = self.pose.forth(mark.at);
+            let value = |plane: [f32; 3]| plane[0] + plane[1] * x + plane[2] * y;
+            let water = flows && (value(inside) <= 1.0 || value(right) < 1.0);
+            if value(above) >= RIM_PX + 2.0
+                && !water
+                && x >= 2.0
+                && y >= 2.0
+                && x < self.size.width as f32 - 3.0
+                && y < self.size.height as f32 - 3.0
+            {
+                self.marks.push(Mark { at: [x, y], slopes: mark.slopes.map(|s| self.pose.along(s)), ..*mark });
             }
         }
         let before = self.motion;
         // From the last motion and from rest: a joint starts and stops within a frame.
-        let (mut motion, mut left) = self.improve(Motion { exposure: 0.0, ..before }, before)?;
+        let (mut motion, mut gain, mut left) = self.improve(0, before, before)?;
         if before.shift != [0.0; 2] && left > LEFT_GROWS * self.left {
-            let (other, its_left) = self.improve(Motion::default(), before)?;
+            let (other, its_gain, its_left) = self.improve(0, Motion::default(), before)?;
             if its_left < 0.97 * left {
-                (motion, left) = (other, its_left);
+                (motion, gain, left) = (other, its_gain, its_left);
             }
+        }
+        if left < f32::MAX {
+            (motion, gain, _) = self.improve(1, motion, before)?;
         }
         self.left = left;
         self.motion = if left < f32::MAX { motion } else { Motion::default() };
+        self.gain = if left < f32::MAX { gain } else { self.gain };
+        self.pose = Turn::new(self.motion.turn, self.motion.shift, self.middle()).after(&self.last_pose);
         Ok(())
     }
 
-    /// Improves `motion` so that the memory, moved, becomes what is seen now. Returns it and the mean size of what is left,
-    /// grey levels.
-    fn improve(&mut self, mut motion: Motion, before: Motion) -> opencv::Result<(Motion, f32)> {
-        let now = Grey::new(&self.now_half)?;
+    /// At half the working size (`fine` 0) or at the working size (1): improves `motion` so that the memory, moved, becomes what is
+    /// seen now. Returns it, the exposure and the mean size of what is left, grey levels.
+    fn improve(&mut self, fine: usize, mut motion: Motion, before: Motion) -> opencv::Result<(Motion, f32, f32)> {
+        let picture = [&self.now_half, &self.grey][fine];
+        let (now, width, height) = (picture.data_bytes()?, picture.cols() as usize, picture.rows() as usize);
+        let (scale, corner) = [(0.5, -0.25), (1.0, 0.0)][fine];
+        let now_at = |x: f32, y: f32| {
+            let (column, row, fx, fy) = between(x, y, width, height)?;
+            let (upper, lower) = (now.get(row * width + column..)?, now.get((row + 1) * width + column..)?);
+            let mix = |a: u8, b: u8| f32::from(a) + (f32::from(b) - f32::from(a)) * fx;
+            let (top, bottom) = (mix(*upper.first()?, *upper.get(1)?), mix(*lower.first()?, *lower.get(1)?));
+            Some(top + (bottom - top) * fy)
+        };
+        let middle = self.middle();
         let mut left = f32::MAX;
+        let mut gain = self.gain;
         for _ in 0..8 {
-            let turn = Turn::new(&motion, self.size, 0.5);
-            let gain = 1.0 + motion.exposure;
+            let turn = Turn::new(motion.turn, motion.shift, middle);
             self.scratch.clear();
             self.scratch.extend(self.marks.iter().map(|m| {
-                let [x, y] = turn.forth([m.x, m.y]);
-                now.at(x, y).map_or(f32::NAN, |v| v - gain * m.level)
+                let [x, y] = turn.forth(m.at);
+                now_at(scale * x + corner, scale * y + corner).map_or(f32::NAN, |v| v - gain * m.levels[fine])
             }));
             let errors = self.scratch.len();
             self.scratch.extend_from_within(..);
@@ -522,16 +715,16 @@ impl Background {
                 }
             }
             if count < POINTS_LEAST {
-                return Ok((motion, f32::MAX));
+                return Ok((motion, gain, f32::MAX));
             }
             let noise = median(&mut sizes[..count]) * 1.5 + 0.7;
             left = sizes[..count].iter().map(|v| v.min(3.0 * noise)).sum::<f32>() / count as f32;
             let (mut normal, mut right) = ([[0.0f32; 4]; 4], [0.0f32; 4]);
             for (mark, error) in self.marks.iter().zip(&self.scratch[..errors]).filter(|(_, e)| !e.is_nan()) {
                 let weight = (2.0 * noise / error.abs().max(1e-6)).min(1.0);
-                let [gx, gy] = mark.slope;
-                let lever = -gx * (mark.y - turn.middle[1]) + gy * (mark.x - turn.middle[0]);
-                let row = [0.5 * gx, 0.5 * gy, lever, -mark.level];
+                let [gx, gy] = mark.slopes[fine].map(|v| v * gain);
+                let lever = -gx * (mark.at[1] - middle[1]) + gy * (mark.at[0] - middle[0]);
+                let row = [gx, gy, lever, -mark.levels[fine]];
                 for k in 0..4 {
                     right[k] += weight * row[k] * error;
                     for j in 0..4 {
@@ -541,70 +734,71 @@ impl Background {
             }
             // Along boards, or before an even wall, the picture does not tell the motion: then it stays what it was, and fades.
             let hold = 0.0075 * count as f32 * noise * noise;
-            let now_at = [motion.shift[0], motion.shift[1], motion.turn];
+            let is_at = [motion.shift[0], motion.shift[1], motion.turn];
             let was_at = [before.shift[0], before.shift[1], before.turn];
             for (k, size) in [1.0, 1.0, 2500.0].into_iter().enumerate() {
                 normal[k][k] += 1.15 * hold * size;
-                right[k] += hold * size * (now_at[k] - was_at[k]) + 0.15 * hold * size * now_at[k];
+                right[k] += hold * size * (is_at[k] - was_at[k]) + 0.15 * hold * size * is_at[k];
             }
             normal[3][3] += 1.0;
             let change = solve(normal, right);
             motion.shift = [motion.shift[0] - change[0], motion.shift[1] - change[1]];
             motion.turn -= change[2];
-            motion.exposure -= change[3];
+            gain -= change[3];
             if change[0].abs() + change[1].abs() < 0.05 && change[2].abs() < 0.0005 {
                 break;
             }
         }
-        Ok((motion, left))
+        Ok((motion, gain, left))
     }
 
     /// Compares the memory and the last picture, both moved, with what is seen now, along the rays.
-    fn compare(&mut self) -> opencv::Result<()> {
-        let turn = Turn::new(&self.motion, self.size, 1.0);
-        let gain = 1.0 + self.motion.exposure;
-        let (now, last) = (Grey::new(&self.now)?, Grey::new(&self.last)?);
-        let memory = self.memory.data_typed::<Vec2b>()?;
+    fn compare(&mut self) {
         let (width, height) = (self.size.width as usize, self.size.height as usize);
+        let (now, last) = (Picture { pixels: &self.now, width, height }, Picture { pixels: &self.last, width, height });
         let [above, ..] = self.planes([1.0, 1.0]);
+        let (pose, gain, side) = (self.pose, self.gain, self.side);
         let (mut level_sum, mut level_count) = (0.0, 0.0f32);
+        let most = side as f32 - 2.5;
         for i in 0..CELLS {
             let [x, y] = self.places[i];
-            let seen = now.at(x, y).unwrap_or(0.0);
+            let seen = now.at(x, y).unwrap_or_default();
             self.levels[i] = seen;
-            let from = turn.back([x, y]);
-            let inside = from[0] >= 1.0 && from[1] >= 1.0 && from[0] < width as f32 - 2.5 && from[1] < height as f32 - 2.5;
-            if !(inside && self.air[i]) {
-                (self.sureness[i], self.shown[i], self.slopes[i], self.away[i], self.away_last[i]) = (0.0, 0.0, 0.0, 0.0, 0.0);
+            (self.sureness[i], self.shown[i], self.slopes[i], self.differs[i], self.differs_last[i]) = (0.0, 0.0, 0.0, [0.0; 4], [0.0; 4]);
+            let from = pose.back([x, y]);
+            if !(self.air[i] && from[0] >= 1.0 && from[1] >= 1.0 && from[0] < most && from[1] < most) {
                 continue;
             }
             let (column, row) = (from[0] as usize, from[1] as usize);
-            let corner = row * width + column;
-            let level = |at: usize| f32::from(memory[at][0]) * gain;
+            let corner = row * side + column;
             // The memory between its pixels, and its slope.
             let (fx, fy) = (from[0] - column as f32, from[1] - row as f32);
-            let nearest = corner + usize::from(fx >= 0.5) + if fy >= 0.5 { width } else { 0 };
-            let top = level(corner) + (level(corner + 1) - level(corner)) * fx;
-            let bottom = level(corner + width) + (level(corner + width + 1) - level(corner + width)) * fx;
-            let remembered = top + (bottom - top) * fy;
-            self.away[i] = seen - remembered;
-            self.slopes[i] =
-                0.5 * (level(nearest + 1) - level(nearest - 1)).abs().max((level(nearest + width) - level(nearest - width)).abs());
-            let sure = memory[nearest][1];
-            self.sureness[i] = if sure >= KNOWN { f32::from(sure) / 255.0 } else { 0.0 };
-            let was_air = above[0] + above[1] * from[0] + above[2] * from[1] >= RIM_PX;
-            let before = if was_air { last.at(from[0], from[1]) } else { None };
-            self.shown[i] = if before.is_some() { 1.0 } else { 0.0 };
-            self.away_last[i] = before.map_or(0.0, |b| seen - gain * b);
+            let (upper, lower) = (&self.memory[corner..corner + 2], &self.memory[corner + side..corner + side + 2]);
+            let remembered = mix([upper[0], upper[1], lower[0], lower[1]], fx, fy);
+            self.differs[i] = each(|k| seen[k] - gain * remembered[k]);
+            let (across, down) = (
+                each(|k| upper[1][k] - upper[0][k] + lower[1][k] - lower[0][k]),
+                each(|k| lower[0][k] - upper[0][k] + lower[1][k] - upper[1][k]),
+            );
+            self.slopes[i] = 0.5 * gain * size_of(&across).max(size_of(&down));
+            let sure = upper[0][3].min(upper[1][3]).min(lower[0][3]).min(lower[1][3]);
+            self.sureness[i] = if sure >= KNOWN { sure / 255.0 } else { 0.0 };
+            let [x, y] = self.last_pose.forth(from);
+            let was_air = above[0] + above[1] * x + above[2] * y >= RIM_PX;
+            if let Some(before) = if was_air { last.at(x, y) } else { None } {
+                self.shown[i] = 1.0;
+                let factor = gain / self.last_gain;
+                self.differs_last[i] = each(|k| seen[k] - factor * before[k]);
+            }
             if self.sureness[i] > 0.0 {
-                level_sum += remembered;
+                level_sum += gain * (remembered[0] + remembered[1] + remembered[2]) / 3.0;
                 level_count += 1.0;
             }
         }
         // Neighbours along a ray together.
-        for values in [&mut self.away, &mut self.away_last] {
-            for i in 0..CELLS - 1 {
-                values[i] = 0.5 * (values[i] + values[i + 1]).abs();
+        for (values, sizes) in [(&self.differs, &mut self.away), (&self.differs_last, &mut self.away_last)] {
+            for (pair, size) in values.windows(2).zip(sizes) {
+                *size = size_of(&each(|k| 0.5 * (pair[0][k] + pair[1][k])));
             }
         }
         // Noise: where the known background is even.
@@ -614,7 +808,7 @@ impl Background {
         self.scratch.clear();
         let known = (0..CELLS).step_by(3).filter(|i| self.sureness[*i] > 0.0 && self.slopes[*i] <= even);
         self.scratch.extend(known.map(|i| self.away[i]));
-        let noise = if self.scratch.len() > 25 { 1.5 * median(&mut self.scratch) } else { 2.0 };
+        let noise = if self.scratch.len() > 25 { NOISE_MEDIANS * median(&mut self.scratch) } else { 2.0 };
         self.noise = noise.max(NOISE_LEAST).max(NOISE_SHARE * level_sum / level_count.max(1.0));
         for i in 0..CELLS {
             let slope = self.slopes[i];
@@ -624,8 +818,6 @@ impl Background {
         }
         let far = || (0..CELLS).filter(|i| i % SAMPLES >= SAMPLES / 2 && self.sureness[*i] > 0.0);
         self.strange = far().filter(|i| self.away[*i] > CALM).count() as f32 / far().count().max(1) as f32;
-        self.fill_table(&turn);
-        Ok(())
     }
 
     /// Whether what is known near the lip has no pattern: then what is not known has none either.
@@ -646,11 +838,13 @@ impl Background {
     }
 
     /// What each sample of each ray would add to a line through it, into `self.table`.
-    fn fill_table(&mut self, turn: &Turn) {
+    fn fill_table(&mut self) {
+        let turn = Turn::new(self.motion.turn, self.motion.shift, self.middle());
         let even = self.is_even();
         let stream = self.stream;
-        let step_size = stream.map_or(6.0 * self.noise, |s| s.step);
-        let [mut wet, mut far, mut sure, mut level, mut last, mut beyond, mut shown]: [Sums; 7] = [[0.0; SAMPLES + 1]; 7];
+        let step_size = stream.map_or(6.0 * self.noise, |s| s.band[3]);
+        let [mut wet, mut far, mut sure, mut last, mut beyond, mut shown]: [Sums; 6] = [[0.0; SAMPLES + 1]; 6];
+        let mut level = [[0.0f32; 4]; SAMPLES + 1];
         let mean = |sums: &Sums, from: i32, to: i32| {
             let (from, to) = (from.clamp(0, SAMPLES as i32) as usize, to.clamp(0, SAMPLES as i32) as usize);
             (sums[to] - sums[from]) / (to - from).max(1) as f32
@@ -665,11 +859,18 @@ impl Background {
             for r in 0..SAMPLES {
                 let i = start + r;
                 let known = self.sureness[i] > 0.0;
-                let how_wet = if known { ((self.away[i] - WET_FROM) / WET_SPAN).clamp(-1.0, 1.0) } else { 0.0 };
+                let mut how_wet = if known { ((self.away[i] - WET_FROM) / WET_SPAN).clamp(-1.0, 1.0) } else { 0.0 };
+                let mut tells = if known { 1.0 } else { 0.0 };
+                if let Some(stream) = stream.filter(|_| known && how_wet < 0.0) {
+                    // Where the ground is as bright as the water's rim, not to differ from it means nothing.
+                    let apart = size_of(&each(|k| self.levels[i][k] - stream.band[k])) / self.noise;
+                    tells = ((apart - WET_FROM) / WET_SPAN).clamp(0.0, 1.0);
+                    how_wet *= tells;
+                }
                 wet[r + 1] = wet[r] + how_wet;
                 far[r + 1] = far[r] + how_wet.max(0.0);
-                sure[r + 1] = sure[r] + if known { 1.0 } else { 0.0 };
-                level[r + 1] = level[r] + self.levels[i];
+                sure[r + 1] = sure[r] + tells;
+                level[r + 1] = each(|k| level[r][k] + self.levels[i][k]);
                 let unexplained = self.shown[i] * ((self.away_last[i] - 2.0) / 2.0).clamp(-1.0, 1.0);
                 last[r + 1] = last[r] + unexplained;
                 beyond[r + 1] = beyond[r] + unexplained.max(0.0);
@@ -678,17 +879,25 @@ impl Background {
             for r in 0..SAMPLES {
                 let (i, at) = (start + r, r as i32);
                 let cell = &mut self.table[i];
-                cell.band = mean(&level, at - 2, at);
-                cell.step = mean(&level, at + 1, at + 3) - cell.band;
+                let colour = |from: i32, to: i32| {
+                    let (from, to) = (from.clamp(0, SAMPLES as i32) as usize, to.clamp(0, SAMPLES as i32) as usize);
+                    let share = 1.0 / (to - from).max(1) as f32;
+                    each(|k| share * (level[to][k] - level[from][k]))
+                };
+                let (inner, outer) = (colour(at - 2, at), colour(at + 1, at + 3));
+                let step = size_of(&each(|k| outer[k] - inner[k]));
+                cell.band = [inner[0], inner[1], inner[2], step];
                 cell.unexplained = mean(&last, at - 3, at + 3);
                 cell.shown = mean(&shown, at - 3, at + 3);
                 cell.known = (mean(&sure, at - 4, at) + mean(&sure, at + 1, at + 7)) / 2.0;
-                step_says[r] = ((cell.step.abs() - STEP_FROM * step_size) / (STEP_SPAN * step_size)).clamp(-1.0, 1.0);
+                step_says[r] = ((step - STEP_FROM * step_size) / (STEP_SPAN * step_size)).clamp(-1.0, 1.0);
                 known_says[r] =
-                    (1.3 * mean(&wet, at - 4, at) - 0.5 * mean(&wet, at + 1, at + 7) - mean(&far, at + 2, at + 25)).clamp(-1.0, 1.5);
+                    (WET_INSIDE * mean(&wet, at - 4, at) - WET_OUTSIDE * mean(&wet, at + 1, at + 7) - mean(&far, at + 2, at + 25))
+                        .clamp(-1.0, 1.5);
                 let place = self.places[i];
                 let to = turn.forth(place);
-                let speed = (to[0] - place[0]).hypot(to[1] - place[1]);
+                let (dx, dy) = (to[0] - place[0], to[1] - place[1]);
+                let speed = (dx * dx + dy * dy).sqrt();
                 last_says[r] = 0.65 * cell.unexplained - BEYOND * mean(&beyond, at + 3, at + 12);
                 moving[r] = ((speed - MOVES_PX) / MOVES_PX).clamp(0.0, 1.0) * cell.shown;
             }
@@ -719,11 +928,13 @@ impl Background {
     /// The best line and its figures.
     fn best_line(&self) -> Option<Found> {
         let before = self.stream.map(|s| s.legs.map(f32::ln));
+        let turns = self.stream.map_or(0.0, |s| TURNS + TURNS_YOUNG / s.age);
         let mut best: Option<Found> = None;
         for line in 0..self.legs.len() {
             let [p, q] = self.log_legs[line];
-            let apart = before.map_or(0.0, |[a, b]| (p - a) * (p - a) + (q - b) * (q - b));
-            if apart > JUMP_MOST * JUMP_MOST {
+            // A stream grows and shrinks fast, but hardly changes its shape from frame to frame.
+            let (grown, turned) = before.map_or((0.0, 0.0), |[a, b]| (0.5 * (p + q - a - b), p - q - a + b));
+            if grown.abs() > GROWS_MOST || turned.abs() > 2.5 * turns {
                 continue;
             }
             let range = line * RAYS..(line + 1) * RAYS;
@@ -733,9 +944,9 @@ impl Background {
                 let cell = &self.table[usize::from(*at)];
                 found.score += weight * cell.value;
                 found.known += weight * cell.known;
-                found.band += weight * cell.band;
-                found.step += weight * cell.step.abs();
-                band_square += weight * cell.band * cell.band;
+                found.band = each(|k| found.band[k] + weight * cell.band[k]);
+                let size = size_of(&cell.band);
+                band_square += weight * size * size;
                 shares += match self.stream {
                     Some(_) if cell.value > PIECE => *weight,
                     None if cell.value > PIECE * cell.known => weight * cell.known,
@@ -754,14 +965,16 @@ impl Background {
                 }
                 Some(stream) => {
                     // Along the outline the same room is seen, whatever stands behind.
-                    let spread = (band_square - found.band * found.band).max(0.0);
-                    let unit = 0.5 * found.step + 2.0 * self.noise;
-                    let change = (found.band - stream.band) / unit;
+                    let size = size_of(&found.band);
+                    let spread = (band_square - size * size).max(0.0);
+                    let unit = 0.5 * found.band[3] + 2.0 * self.noise;
+                    let change = size_of(&each(|k| found.band[k] - stream.band[k])) / unit;
                     let alike = BAND * ((-spread / (unit * unit)).exp() - 1.0) + BAND * ((-change * change).exp() - 1.0);
                     found.evidence = found.score;
                     found.score += (1.0 - found.known) * alike;
                     found.share = shares;
-                    let stay = STAY * (-0.5 * apart / (STAY_WIDTH * STAY_WIDTH)).exp();
+                    let square = |v: f32| v * v;
+                    let stay = STAY * (-0.5 * (square(grown / GROWS) + square(turned / turns))).exp();
                     found.total = outer + found.score + 0.7 * found.share + stay;
                 }
             }
@@ -775,7 +988,7 @@ impl Background {
     /// What the moved last picture says of a line: how far the background moves across it, px a frame, the share of it that the
     /// picture shows, and how little it explains, -1 to 1.
     fn across(&self, line: usize) -> [f32; 3] {
-        let turn = Turn::new(&self.motion, self.size, 1.0);
+        let turn = Turn::new(self.motion.turn, self.motion.shift, self.middle());
         let [a, b] = self.legs[line];
         let along = [0, 1].map(|k| b * self.axes.y[k] - a * self.axes.x[k]);
         let length = along[0].hypot(along[1]);
@@ -805,15 +1018,16 @@ impl Background {
                     let least = GO_ON[0] * (1.0 - found.known) + GO_ON[1] * found.known;
                     (tells && unexplained > UNEXPLAINED && found.evidence > HELD) || (found.score > least && found.share > GO_ON[2])
                 }
-                None => found.score > BEGIN[0] && found.share > BEGIN[1],
+                None => found.score > BEGIN[0] - BEGIN_KNOWN * found.known && found.share > BEGIN[1],
             };
             if self.stream.is_none() && self.strange > STRANGE {
                 seen = Seen::Unsure;
             } else if enough && !background {
                 let mix = |before: f32, now: f32, share: f32| before + share * (now - before);
-                let (band, step) =
-                    self.stream.map_or((found.band, found.step), |s| (mix(s.band, found.band, 0.5), mix(s.step, found.step, 0.4)));
-                self.stream = Some(Stream { legs: self.legs[found.line], band, step });
+                let band = self.stream.map_or(found.band, |s| each(|k| mix(s.band[k], found.band[k], if k < 3 { 0.5 } else { 0.4 })));
+                let height = self.stream.map_or(0.0, |s| s.height);
+                let age = self.stream.map_or(1.0, |s| s.age + 1.0);
+                self.stream = Some(Stream { legs: self.legs[found.line], age, band, height });
                 self.last_legs = self.legs[found.line];
                 self.find_edges(found.line);
                 seen = Seen::Stream(found.share.min(1.0));
@@ -838,63 +1052,107 @@ impl Background {
     }
 
     /// Takes what is dry now over into the memory.
-    fn remember(&mut self) -> opencv::Result<()> {
+    fn remember(&mut self) {
         let flows = self.stream.is_some();
         let near = self.dry_frames <= AFTERWARDS;
         let [a, b] = self.last_legs.map(|v| v.max(1.0));
         let bulge = 2.0 + 0.1 * (a * b).sqrt();
         let [above, right, inner] = self.planes([a + 1.4 * bulge, b + 1.4 * bulge]);
         let [.., outer] = self.planes([1.35 * a + 8.0, 1.35 * b + 8.0]);
-        let gain = 1.0 + self.motion.exposure;
-        let turn = Turn::new(&self.motion, self.size, 1.0);
-        let now = self.now.data_bytes()?;
-        let (width, height, calm) = (self.size.width as usize, self.size.height as usize, CALM * self.noise);
-        let memory = self.memory.data_bytes()?;
-        let (x_most, y_most) = (width as f32 - 1.01, height as f32 - 1.01);
-        // One pass that moves and updates: OpenCV's warp of two channels alone takes longer.
-        for (y, row) in self.moved.data_bytes_mut()?.chunks_exact_mut(2 * width).enumerate() {
-            let value = |plane: [f32; 3]| plane[0] + plane[2] * y as f32;
-            let (mut above_at, mut right_at, mut inner_at, mut outer_at) = (value(above), value(right), value(inner), value(outer));
-            let mut from = turn.back([0.0, y as f32]);
-            for (pixel, seen) in row.chunks_exact_mut(2).zip(&now[y * width..(y + 1) * width]) {
-                let ([x, y], is_air) = (from, above_at >= RIM_PX);
+        let (pose, gain, side) = (self.pose, self.gain, self.side);
+        let (width, height, calm) = (self.size.width as usize, self.size.height as usize, CALM * self.noise / gain);
+        let now = Picture { pixels: &self.now, width, height };
+        for y in 0..side {
+            let fresh = self.frame == 0 || y % REFRESH == self.frame % REFRESH;
+            let from = pose.forth([0.0, y as f32]);
+            let (value, slope) = (
+                |plane: [f32; 3]| plane[0] + plane[1] * from[0] + plane[2] * from[1],
+                |plane: [f32; 3]| plane[1] * pose.cos + plane[2] * pose.sin,
+            );
+            let span = at_least(value(above), slope(above), RIM_PX, [0.0, side as f32]);
+            let span = at_least(from[0], pose.cos, 0.0, span);
+            let span = at_least(-from[0], -pose.cos, 1.01 - width as f32, span);
+            let span = at_least(from[1], pose.sin, 0.0, span);
+            let [x0, x1] = at_least(-from[1], -pose.sin, 1.01 - height as f32, span);
+            let (x0, x1) = (x0.ceil().max(0.0), x1.floor().min(side as f32));
+            if x1 <= x0 {
+                continue;
+            }
+            let at = |v: f32, slope: f32| v + slope * x0;
+            let (mut right_at, mut inner_at, mut outer_at) =
+                (at(value(right), slope(right)), at(value(inner), slope(inner)), at(value(outer), slope(outer)));
+            let mut from = [at(from[0], pose.cos), at(from[1], pose.sin)];
+            let cells = y * side + x0 as usize..y * side + x1 as usize;
+            for kept in &mut self.memory[cells] {
                 let left = right_at < 1.0;
                 let (inside, close) = (near && (left || inner_at < 1.0), near && (left || outer_at < 1.0));
-                from = [from[0] + turn.cos, from[1] - turn.sin];
-                (above_at, right_at) = (above_at + above[1], right_at + right[1]);
-                (inner_at, outer_at) = (inner_at + inner[1], outer_at + outer[1]);
-                if !is_air {
-                    pixel.copy_from_slice(&[*seen, 0]);
+                let [x, y] = from;
+                from = [x + pose.cos, y + pose.sin];
+                (right_at, inner_at, outer_at) = (right_at + slope(right), inner_at + slope(inner), outer_at + slope(outer));
+                if !fresh && kept[3] >= KNOWN {
                     continue;
                 }
-                let (mut level, mut sure) = (0.0, 0.0);
-                if x >= 0.0 && y >= 0.0 && x < x_most && y < y_most {
-                    let (column, row) = (x as u32, y as u32);
-                    let (fx, fy) = (x - column as f32, y - row as f32);
-                    let corner = 2 * (row as usize).wrapping_mul(width).wrapping_add(column as usize);
-                    let (upper, lower) = (&memory[corner..][..4], &memory[corner.wrapping_add(2 * width)..][..4]);
-                    let mix = |k: usize| {
-                        let (a, b, c, d) = (f32::from(upper[k]), f32::from(upper[k + 2]), f32::from(lower[k]), f32::from(lower[k + 2]));
-                        let (top, bottom) = (a + (b - a) * fx, c + (d - c) * fx);
-                        top + (bottom - top) * fy
-                    };
-                    (level, sure) = (mix(0) * gain, mix(1));
-                }
-                let known = sure >= f32::from(KNOWN);
-                let away = f32::from(*seen) - level;
-                let fits = away.abs() < calm;
-                let kept = if known && ((fits && !(inside && flows)) || !close) {
-                    [level + if fits { FOLLOW } else { FOLLOW_SLOWLY } * away + 0.5, 255.0]
+                let Some(seen) = now.at(x, y) else { continue };
+                let known = kept[3] >= KNOWN;
+                let away = each(|k| seen[k] / gain - kept[k]);
+                let fits = size_of(&away) < calm;
+                if known && ((fits && !(inside && flows)) || !close) {
+                    let share = if fits { FOLLOW } else { FOLLOW_SLOWLY };
+                    *kept = each(|k| kept[k] + share * away[k]);
+                    kept[3] = 255.0;
                 } else if !(known || flows && close) {
-                    [f32::from(*seen), 255.0]
+                    *kept = each(|k| kept[k] + away[k]);
+                    kept[3] = 255.0;
                 } else {
-                    [level + 0.5, FADE * sure]
-                };
-                pixel.copy_from_slice(&kept.map(|v| v as u8));
+                    kept[3] *= FADE;
+                }
             }
         }
-        std::mem::swap(&mut self.memory, &mut self.moved);
-        Ok(())
+        if self.frame == 0 {
+            for row in 0..MARK_EVERY {
+                self.mark_corners(row);
+            }
+        } else {
+            self.mark_corners(self.frame % MARK_EVERY);
+        }
+    }
+
+    /// Chooses the points for the motion anew in a part of the memory's squares: in each the one with the steepest slope.
+    fn mark_corners(&mut self, part: usize) {
+        let (side, squares) = (self.side, self.side / SQUARE);
+        for row in (1..squares - 1).filter(|r| r % MARK_EVERY == part) {
+            for column in 1..squares - 1 {
+                let mut best: Option<(f32, [usize; 2])> = None;
+                let grey = |x: usize, y: usize| {
+                    let [b, g, r, _] = self.memory[y * side + x];
+                    0.114 * b + 0.587 * g + 0.299 * r
+                };
+                for y in (row * SQUARE..(row + 1) * SQUARE).step_by(2) {
+                    for x in (column * SQUARE..(column + 1) * SQUARE).step_by(2) {
+                        let i = y * side + x;
+                        if [i - 2 * side, i - 2, i + 2 * side, i + 2].iter().any(|i| self.memory[*i][3] < 200.0) {
+                            continue;
+                        }
+                        let (across, down) = (grey(x + 1, y) - grey(x - 1, y), grey(x, y + 1) - grey(x, y - 1));
+                        let steep = across * across + down * down;
+                        if best.is_none_or(|(most, _)| steep > most) {
+                            best = Some((steep, [x, y]));
+                        }
+                    }
+                }
+                let best = best.map(|(_, [x, y])| {
+                    // Around it: rows of three.
+                    let sum = |x: usize, y: usize, across: usize, down: usize| {
+                        0.25 * grey(x - across, y - down) + 0.5 * grey(x, y) + 0.25 * grey(x + across, y + down)
+                    };
+                    let level = |x: usize, y: usize| 0.25 * sum(x, y - 1, 1, 0) + 0.5 * sum(x, y, 1, 0) + 0.25 * sum(x, y + 1, 1, 0);
+                    let fine = [0.5 * (sum(x + 1, y, 0, 1) - sum(x - 1, y, 0, 1)), 0.5 * (sum(x, y + 1, 1, 0) - sum(x, y - 1, 1, 0))];
+                    let coarse = [0.25 * (sum(x + 2, y, 0, 1) - sum(x - 2, y, 0, 1)), 0.25 * (sum(x, y + 2, 1, 0) - sum(x, y - 2, 1, 0))];
+                    Mark { at: [x as f32, y as f32], levels: [level(x, y), grey(x, y)], slopes: [coarse, fine] }
+                });
+                self.corners[row * squares + column] = best;
+            }
+        }
     }
 
     /// The edge on each ray near `line`, into `self.edges`.

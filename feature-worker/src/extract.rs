@@ -39,9 +39,18 @@ const PICKS: usize = 13;
 const PROFILES: usize = 48;
 /// Least share of them that show an edge.
 const PROFILES_LEAST: f32 = 0.4;
+/// The same before clear water, and the least confidence to begin a stream and to go on: fainter edges are none.
+const PROFILES_FEW: f32 = 0.2;
+const BEGIN_CONFIDENCE: f32 = 0.16;
+const GO_ON_CONFIDENCE: f32 = 0.1;
+/// Weight of an edge point before ground as bright as the water's rim.
+const HIDDEN_TRUST: f32 = 0.3;
 /// Samples of a profile on either side of its centre; the outer [`FLANK`] of them tell liquid and background.
 const REACH: usize = 7;
 const FLANK: usize = 3;
+/// Water differs from the dry background by at least this much: in units of the small picture's noise, and grey levels.
+const WET_NOISES: f32 = 5.0;
+const WET_LEAST: f32 = 6.0;
 /// Share of rays that a stream fills.
 const STREAM_RAYS: f32 = 0.8;
 /// More background than this before the first liquid ends a ray, px.
@@ -259,6 +268,8 @@ pub struct Extractor {
     edge_weights: Vec<f32>,
     fine: Vec<[f32; 2]>,
     fine_weights: Vec<f32>,
+    /// How much each edge point is trusted, 0 to 1.
+    trusts: Vec<f32>,
     widths: Vec<f32>,
     scratch: Vec<f32>,
     last_hash: Option<u64>,
@@ -390,6 +401,7 @@ impl Extractor {
             edge_weights: Vec::with_capacity(RAYS),
             fine: Vec::with_capacity(PROFILES),
             fine_weights: Vec::with_capacity(PROFILES),
+            trusts: Vec::with_capacity(PROFILES),
             widths: Vec::with_capacity(PROFILES),
             scratch: Vec::with_capacity(RAYS.max(PROFILES)),
             last_hash: None,
@@ -707,12 +719,20 @@ impl Extractor {
 
         // 3. Profiles across it.
         let (line, contrast, width, used) = self.refine(line, a, b, colours);
-        if self.method == LiquidMethod::Clear && used < PROFILES_LEAST {
-            // What the memory of the background took for water has no edge in the picture itself.
-            return Ok(Measurement::nothing(0.0, Doubt::EdgeNotFound));
-        }
         let (a, b) = (line.cut(self.axes.lip_px, self.axes.x), line.cut(self.axes.lip_px, self.axes.y));
-        if !(a > 0.0 && b > 0.0 && a < longest && b < longest) {
+        let sane = a > 0.0 && b > 0.0 && a < longest && b < longest;
+        let sharp = (BLURRED_PX / width.max(0.5)).min(1.0);
+        let confidence = inliers.min(1.0) * share.min(1.0) * used * (contrast / 40.0).min(1.0) * sharp;
+        if self.method == LiquidMethod::Clear {
+            // What the memory of the background took for water must have its edge in the picture itself.
+            let begins = self.background.begins();
+            let least = if begins { BEGIN_CONFIDENCE } else { GO_ON_CONFIDENCE };
+            let fine = (sane && used >= PROFILES_FEW && confidence >= least).then_some(([a, b], contrast));
+            if !self.background.confirm(fine) {
+                let doubt = if begins { Doubt::None } else { Doubt::EdgeNotFound };
+                return Ok(Measurement::nothing(0.0, doubt));
+            }
+        } else if !sane {
             return Ok(Measurement::nothing(0.0, Doubt::EdgeNotFound));
         }
         let area_px2 = 0.5 * a * b * self.axes.sine().abs();
@@ -731,9 +751,49 @@ impl Extractor {
         } else {
             Doubt::None
         };
-        let sharp = (BLURRED_PX / width.max(0.5)).min(1.0);
-        let confidence = inliers.min(1.0) * share.min(1.0) * used * (contrast / 40.0).min(1.0) * sharp;
         Ok(Measurement { area_px2, confidence, doubt, triangle_px: [x0, y0, x1, y1, x2, y2] })
+    }
+
+    /// Where on a profile from within the water outwards it begins, samples; the height of the step there, grey levels; and how much
+    /// it is to be trusted, 0 to 1.
+    fn water_begins(&self, profile: &[[f32; 3]; 2 * REACH + 1], place: impl Fn(usize) -> [f32; 2]) -> Option<(f32, f32, f32)> {
+        let mut differs = [[0.0f32; 3]; 2 * REACH + 1];
+        let known = differs.iter_mut().zip(profile).enumerate().all(|(j, (differs, seen))| match self.background.dry_at(place(j)) {
+            Some(dry) => {
+                *differs = std::array::from_fn(|c| seen[c] - dry[c]);
+                true
+            }
+            None => false,
+        });
+        if known {
+            // The outermost place that differs from the dry background, where half of the difference is reached.
+            let size = |d: &[f32; 3]| (d.iter().map(|v| v * v).sum::<f32>() / 3.0).sqrt();
+            let least = (WET_NOISES * self.background.noise()).max(WET_LEAST);
+            let j = (1..2 * REACH).rev().find(|&j| size(&differs[j]) >= least && size(&differs[j - 1]) >= least)?;
+            let full = (j.saturating_sub(4)..=j).max_by(|a, b| size(&differs[*a]).total_cmp(&size(&differs[*b])))?;
+            let (full, height) = (differs[full], size(&differs[full]));
+            let share = |d: &[f32; 3]| d.iter().zip(full).map(|(a, b)| a * b).sum::<f32>() / (3.0 * height * height);
+            let i = (0..2 * REACH).rev().find(|&i| share(&differs[i]) >= 0.5)?;
+            let (inner, outer) = (share(&differs[i]), share(&differs[i + 1]));
+            // Ground as bright as the water's rim hides where it begins.
+            let dry: [f32; 3] = std::array::from_fn(|c| profile[i + 1][c] - differs[i + 1][c]);
+            let hidden = self.background.rim().is_some_and(|rim| size(&std::array::from_fn(|c| dry[c] - rim[c])) < 2.0 * least);
+            return (outer < 0.5).then(|| (i as f32 + (inner - 0.5) / (inner - outer), height, if hidden { HIDDEN_TRUST } else { 1.0 }));
+        }
+        // The outermost of the steep steps of brightness.
+        let grey = |j: usize| profile[j].iter().sum::<f32>() / 3.0;
+        let step = |j: usize| (grey(j + 1) - grey(j)).abs();
+        let steepest = (0..2 * REACH).map(step).fold(0.0, f32::max);
+        let j = (1..2 * REACH - 1).rev().find(|&j| step(j) >= 0.6 * steepest && step(j) >= step(j - 1) && step(j) >= step(j + 1))?;
+        if steepest < 4.0 {
+            return None;
+        }
+        // The top of the parabola through the three steps.
+        let (left, middle, right) = (step(j - 1), step(j), step(j + 1));
+        let curvature = left - 2.0 * middle + right;
+        let shift = if curvature < -1e-3 { (0.5 * (left - right) / curvature).clamp(-0.5, 0.5) } else { 0.0 };
+        let height = (grey((j + 3).min(2 * REACH)) - grey(j.saturating_sub(2))).abs().max(steepest);
+        Some((j as f32 + 0.5 + shift, height, 1.0))
     }
 
     /// Sub-pixel edge points on normals of `line` between the axes, and a Huber line through them. Returns the line, the
@@ -750,6 +810,7 @@ impl Extractor {
         let margin = (0.04 * line.offset(self.axes.lip_px).abs()).clamp(1.0, 1.5);
         self.fine.clear();
         self.fine_weights.clear();
+        self.trusts.clear();
         self.widths.clear();
         self.scratch.clear();
         let mut next = 0;
@@ -787,27 +848,17 @@ impl Extractor {
                 continue;
             }
             if self.method == LiquidMethod::Clear {
-                // The outermost of the steep steps of brightness: there the water begins.
-                let grey = |j: usize| profile[j].iter().sum::<f32>() / 3.0;
-                let step = |j: usize| (grey(j + 1) - grey(j)).abs();
-                let steepest = (0..2 * REACH).map(step).fold(0.0, f32::max);
-                let Some(j) =
-                    (1..2 * REACH - 1).rev().find(|&j| step(j) >= 0.6 * steepest && step(j) >= step(j - 1) && step(j) >= step(j + 1))
-                else {
-                    continue;
-                };
-                if steepest < 4.0 {
-                    continue;
-                }
-                // The top of the parabola through the three steps.
-                let (left, middle, right) = (step(j - 1), step(j), step(j + 1));
-                let curvature = left - 2.0 * middle + right;
-                let shift = if curvature < -1e-3 { (0.5 * (left - right) / curvature).clamp(-0.5, 0.5) } else { 0.0 };
-                let d = (j as f32 + 0.5 + shift - REACH as f32) * spacing;
+                let found = self.water_begins(&profile, |j| {
+                    let d = (j as f32 - REACH as f32) * spacing;
+                    [centre[0] + d * normal[0], centre[1] + d * normal[1]]
+                });
+                let Some((j, height, trust)) = found else { continue };
+                let d = (j - REACH as f32) * spacing;
                 let point = [centre[0] + d * normal[0], centre[1] + d * normal[1]];
                 if self.axes.between(point) >= margin {
                     self.fine.push(point);
-                    self.scratch.push(steepest);
+                    self.scratch.push(height);
+                    self.trusts.push(trust);
                 }
                 continue;
             }
@@ -843,16 +894,17 @@ impl Extractor {
                 continue;
             }
             self.fine.push(point);
+            self.trusts.push(1.0);
             self.scratch.push(square.sqrt());
         }
         let used = self.fine.len() as f32 / PROFILES as f32;
-        if used < PROFILES_LEAST {
+        if used < if self.method == LiquidMethod::Clear { PROFILES_FEW } else { PROFILES_LEAST } {
             // Too little contrast for profiles: the coarse edges are what there is.
             return (line, 12.0, 1.0, used);
         }
         let contrast = median(&mut self.scratch);
         let width = if self.widths.is_empty() { 1.0 } else { median(&mut self.widths) };
-        self.fine_weights.resize(self.fine.len(), 1.0);
+        self.fine_weights.extend_from_slice(&self.trusts);
         let mut fitted = line;
         for _ in 0..4 {
             let Some(next) = Line::fit(self.fine.iter().copied().zip(self.fine_weights.iter().copied())) else { break };
@@ -861,8 +913,8 @@ impl Extractor {
             self.scratch.extend(self.fine.iter().map(|p| fitted.offset(*p).abs()));
             // The outline is a little curved: residuals up to a few per cent of its length are no outliers.
             let limit = (3.0 * median(&mut self.scratch)).max(1.0);
-            for (weight, p) in self.fine_weights.iter_mut().zip(&self.fine) {
-                *weight = (limit / fitted.offset(*p).abs().max(1e-6)).min(1.0);
+            for ((weight, p), trust) in self.fine_weights.iter_mut().zip(&self.fine).zip(&self.trusts) {
+                *weight = trust * (limit / fitted.offset(*p).abs().max(1e-6)).min(1.0);
             }
         }
         (fitted, contrast, width, used)

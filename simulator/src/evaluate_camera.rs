@@ -120,12 +120,12 @@ pub fn run(args: &Args) -> Result<(), exit::Failure> {
 }
 
 /// The `[camera]` table of a view.
-pub(crate) fn camera_config(view: &View) -> CameraConfig {
+pub fn camera_config(view: &View) -> CameraConfig {
     CameraConfig { source: CameraSource::SharedMemory, path: String::new(), width_px: view.width_px, height_px: view.height_px, fps: 30.0 }
 }
 
 /// The configuration that a careful person would write for this view: axes as they are, the region over the mouth.
-pub(crate) fn image_config(view: &View) -> ImageConfig {
+pub fn image_config(view: &View) -> ImageConfig {
     let (width, height) = (f64::from(view.width_px), f64::from(view.height_px));
     let [x, y] = view.lip_px;
     let (sin, cos) = view.roll_deg.to_radians().sin_cos();

@@ -124,7 +124,7 @@ fn pour_over(picture: &mut Mat, shapes: &[Vec<[f32; 2]>]) -> Result<(), opencv::
 }
 
 /// The glass over everything: a little darker inside, bright lines along top edge and left side.
-fn glass(picture: &mut Mat) -> Result<(), opencv::Error> {
+pub fn glass(picture: &mut Mat) -> Result<(), opencv::Error> {
     let [x, y] = LIP.map(|v| v as i32);
     let mut inside = Mat::roi_mut(picture, Rect::new(x, y, WIDTH - x, HEIGHT - y))?;
     let mut dark = Mat::default();

@@ -1,0 +1,35 @@
+//! Clear water as a cell's file writes it: rendered from its `[view]`, measured by the feature worker's extraction.
+
+use feature_worker::extract::{Extractor, Image};
+use shared::messages::PixelFormat;
+use simulator::camera::{Renderer, Scene, View};
+use simulator::evaluate_camera::{camera_config, image_config};
+
+/// Protects the cell with clear water before a plain wall: `liquid_bgr = []` is clear water, dry frames are exactly 0, and the stream is
+/// measured to 15 % on every frame once it stands, while the wrist turns.
+#[test]
+fn clear_water_before_a_plain_wall_is_measured() -> Result<(), Box<dyn std::error::Error>> {
+    let view: View = toml::from_str("liquid_bgr = []\nbackground = \"plain\"")?;
+    assert_eq!(view.liquid_bgr, None);
+    let mut renderer = Renderer::new(&view, 5)?;
+    let mut extractor = Extractor::new(&camera_config(&view), &image_config(&view))?;
+    let mut pixels = vec![0; (view.width_px * view.height_px * 3) as usize];
+    for i in 0..60 {
+        let flow_ml_s = match i {
+            10..18 => f64::from(i - 9),
+            18..50 => 8.0,
+            _ => 0.0,
+        };
+        let at_s = f64::from(i) / 30.0;
+        let scene = Scene { at_s, alpha_deg: 45.0 + 15.0 * at_s, rate_deg_s: 15.0, flow_ml_s, level_mm: -5.0 };
+        let truth = renderer.render(&scene, &mut pixels)?.area_px2;
+        let image = Image { width_px: view.width_px, height_px: view.height_px, format: PixelFormat::Bgr8, pixels: &pixels };
+        let area = f64::from(extractor.measure(image)?.area_px2);
+        if truth == 0.0 {
+            assert_eq!(area, 0.0, "frame {i}");
+        } else if i >= 18 {
+            assert!((area / truth - 1.0).abs() < 0.15, "frame {i}: {area} instead of {truth}");
+        }
+    }
+    Ok(())
+}
