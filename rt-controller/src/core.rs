@@ -404,7 +404,7 @@ impl Core {
     }
 
     fn begin(&mut self, episode: u64, goal_ml: Option<f32>, curve: Option<Curve>, phase: Phase, input: &Input) {
-        let newest = input.features.last().or(self.newest.as_ref());
+        let newest = input.features.iter().rfind(|f| !foreign(f, input.now_ns)).or(self.newest.as_ref());
         self.run = Some(Run {
             episode,
             started_at_ns: input.now_ns,
