@@ -249,7 +249,8 @@ impl Cell {
             // Nothing was under way that could have a result: then the operator is told.
             let said = self.said().split_off(said_before);
             let mut words = vec![wanted.words().to_owned()];
-            if wanted == EndReason::RobotLost {
+            // A controller that was stopped may first find that the robot has meanwhile given it up.
+            if matches!(wanted, EndReason::RobotLost | EndReason::ControllerOverrun) {
                 words.extend([Lost::Closed, Lost::Broken].map(|l| l.to_string()));
             }
             assert!(words.iter().any(|w| said.contains(w)), "{words:?}\n{}", context());
