@@ -32,7 +32,9 @@ pub fn check(state: &RobotState, now_ns: u64, lost_ns: u64) -> Result<(), EndRea
         state if !state.takes_targets() => return Err(EndReason::ProgramStopped),
         _ => {}
     }
-    if state.runtime_state != RUNTIME_PLAYING || older(state.answered_at_ns) {
+    // By the robot's clock: while that stands still, no program can answer, and it is not the program that has stopped.
+    let unread = state.advanced_at_ns.saturating_sub(state.answered_at_ns) > lost_ns;
+    if state.runtime_state != RUNTIME_PLAYING || unread {
         return Err(EndReason::ProgramStopped);
     }
     Ok(())
