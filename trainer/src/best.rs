@@ -20,9 +20,6 @@ use crate::train::{Estimate, Options, Progress, Trained, actions_table};
 pub const SEARCH: Search = Search { population: 16, pours: 32, iterations: 6, elites: 4 };
 const DISTIL: distill::Size = distill::Size { rounds: 3, pours: 96, steps: 500, batch: 256 };
 
-/// Fewer episodes than this say nothing of the geometry that the camera does not say better.
-pub const GEOMETRY_NEEDS: usize = 4;
-
 /// Fit, calibration and estimator of `episodes`, the part that `refine` and evaluation share.
 pub fn estimator(episodes: &[TrainingEpisode], estimate: Estimate, limits: &Limits) -> (Fit, Estimator) {
     let mut fit = fit::fit(episodes);

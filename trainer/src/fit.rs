@@ -13,8 +13,8 @@ use rayon::prelude::*;
 use shared::estimate::flow::{DELAY_MAX, DRIP, Flow, FlowModel, FlowNoise, HISTORY, KNOTS, KNOTS_DEG};
 use shared::estimate::{Calibration, Hold, tilt_z};
 
+use crate::calibrate;
 use crate::data::TrainingEpisode;
-use crate::{best, calibrate};
 
 /// Global unknowns: s (one a knot), log R, log H/R, taper, flat, lk, p, k1, k2, tau, delay, eta, log c, q, tilt.
 const GLOBAL: usize = KNOTS + 14;
@@ -62,6 +62,8 @@ const LATE_FREE: f64 = 1.0;
 const LATE_CHANGED: f64 = 0.3;
 /// How much an episode's delay scatters at least when it is looked for, frames.
 const LATE_SD: f64 = 0.2;
+/// Below this many episodes the filter's sds are mostly those of the priors, and half of them pours best on other rigs.
+const PRIORS_BELOW: usize = 4;
 /// Noise of a frame's area below which a model can turn out to be exact.
 const CLEAN: f64 = 0.03;
 /// Residuals beyond this grow only with the root.
@@ -483,8 +485,7 @@ pub fn fit(episodes: &[TrainingEpisode]) -> Fit {
     // sd of log v at 300 px^2 from the wide stage: log v = log c + q log 300.
     let l = 300f64.ln();
     let log_v_var = wide_covariance[(LOG_C, LOG_C)] + 2.0 * l * wide_covariance[(LOG_C, Q)] + l * l * wide_covariance[(Q, Q)];
-    // Below this many episodes the sds are mostly those of the priors, and half of them pours best on other rigs.
-    let share = if episodes.len() < best::GEOMETRY_NEEDS { 0.5 } else { 1.0 };
+    let share = if episodes.len() < PRIORS_BELOW { 0.5 } else { 1.0 };
     model.noise = FlowNoise {
         lambda: 0.15,
         gamma: (1.6
