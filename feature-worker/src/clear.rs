@@ -4,23 +4,23 @@
 //! background is displaced. The container turns, so the background moves in the picture as one rigid piece, while the stream's
 //! outline stays. Hence, at 320 px for the whole width:
 //!
-//! 1. The dry background is **remembered** in colour as one picture that is fixed in the world. How the world lies in the camera's picture
-//!    now (shift, turn, exposure) follows from a few hundred dry points of it (Gauss-Newton with robust weights, coarse then fine).
+//! 1. The dry background is **remembered** in colour as one picture that is fixed in the world ([`Ground`]).
 //! 2. The memory and the last picture, both moved, are compared with the picture along rays from the lip. What differs from the memory
 //!    is wet. Where the ground was hidden until now, or is as bright as the water's rim, a step counts that the last picture, moved,
 //!    does not explain.
 //! 3. Of about 1,000 **lines** from axis to axis the best has most of this just inside and none outside. A line goes on near where it was,
 //!    in the same shape and with the same band along it; one that moves with the background is none. Beginning a stream takes more than
-//!    going on. The full picture's profiles across it must confirm it ([`Background::confirm`]).
+//!    going on. The full picture's profiles across it must confirm it ([`ClearWater::confirm`]).
 //!
 //! The first frame must be dry. Runs on the extraction thread; all pictures and tables are kept, nothing is allocated after the second
 //! frame. No failures but OpenCV's.
 
-use opencv::core::{self, Mat, Size};
+use opencv::core::{self, CV_16SC2, CV_32FC1, Mat, Scalar, Size, Vec4b};
 use opencv::imgproc;
 use opencv::prelude::*;
 
-use crate::extract::{Axes, between};
+use crate::extract::Axes;
+use crate::ground::{Dry, Ground, Plane, Wet, median};
 
 /// Width of the whole picture at which this works, px; all lengths below are px at that size.
 const WIDTH_PX: f32 = 320.0;
@@ -37,33 +37,18 @@ const LEG_FIRST_PX: f32 = 6.5;
 const LEG_FACTOR: f32 = 1.07;
 const LEGS_FLAT: f32 = 4.0;
 const LEGS_STEEP: f32 = 2.0;
-/// Points for the motion: one, the one with the steepest slope, in each square of this many px.
-const SQUARE: usize = 10;
-/// Room in the memory around the region, squares.
-const ROOM_SQUARES: usize = 4;
-/// Of the memory every so many rows, and of its squares every so many rows, are looked at in a frame.
-const REFRESH: usize = 4;
-const MARK_EVERY: usize = 4;
-/// Fewer points tell no motion.
-const POINTS_LEAST: usize = 30;
-/// The motion is looked for from rest too when it leaves this much more unexplained than the last one did.
-const LEFT_GROWS: f32 = 1.2;
 /// Least noise, grey levels (rounding), and as a share of the background's brightness (the exposure is not known better).
 const NOISE_LEAST: f32 = 0.8;
 const NOISE_SHARE: f32 = 0.012;
 /// Noise in units of the median difference.
 const NOISE_MEDIANS: f32 = 1.1;
-/// Share of the background's slope that counts as error of its place: fresh, and more as the memory fades.
-const SLOPE_FRESH: f32 = 0.2;
-const SLOPE_FADED: f32 = 0.5;
+/// Share of the background's slope that counts as error of its place.
+const SLOPE_SHARE: f32 = 0.25;
 /// Difference in units of the noise: from here on it is wet, and fully so this much further on; dry as much before.
 const WET_FROM: f32 = 2.2;
 const WET_SPAN: f32 = 2.0;
 /// A difference up to this, in units of the noise, is still background.
 const CALM: f32 = 5.0;
-/// Sureness of the memory, 0 to 255: known from here on; left when a row's turn comes and the place is hidden.
-const KNOWN: f32 = 50.0;
-const FADE: f32 = 0.94;
 /// Background that moves by more than this is told from what stands still, px a frame.
 const MOVES_PX: f32 = 1.2;
 /// A step in brightness counts from this share of the stream's usual one on, fully this much further on.
@@ -105,9 +90,6 @@ const STRANGE_FRAMES: u32 = 15;
 /// Weight of what is wet just inside a line, and just outside.
 const WET_INSIDE: f32 = 1.3;
 const WET_OUTSIDE: f32 = 0.5;
-/// How fast the memory follows what is seen: where it fits and where it does not.
-const FOLLOW: f32 = 0.35;
-const FOLLOW_SLOWLY: f32 = 0.1;
 /// The full picture's line is the same when ratio and product of its legs differ by no more than this (as logarithms), and its step
 /// has at least this share of the usual height.
 const SHAPE_MOST: f32 = 0.7;
@@ -125,21 +107,6 @@ pub enum Seen {
     Unsure,
     /// A stream; the share of its edge that is seen.
     Stream(f32),
-}
-
-/// Motion of the background from frame to frame: shift in px, turn in radians about the region's middle.
-#[derive(Debug, Clone, Copy, Default, PartialEq)]
-struct Motion {
-    shift: [f32; 2],
-    turn: f32,
-}
-
-/// A point of the memory for the motion: place, and level and slope (per px) at half the working size and at the working size.
-#[derive(Debug, Clone, Copy)]
-struct Mark {
-    at: [f32; 2],
-    levels: [f32; 2],
-    slopes: [[f32; 2]; 2],
 }
 
 /// The stream as it was last seen.
@@ -167,75 +134,196 @@ struct Found {
     band: Colour,
 }
 
-/// What is known of one sample of one ray.
-#[derive(Debug, Clone, Copy, Default)]
-struct Cell {
-    /// What it adds to a line through it, and the share of that which rests on known ground.
-    value: f32,
-    known: f32,
-    /// Colour just inside, and last the size of the step to just outside.
-    band: Colour,
-    /// What the moved last picture says, -1 to 1, and the share of the surroundings that it shows.
-    unexplained: f32,
-    shown: f32,
+/// A colour's three parts, and one more: four for the processor's sake.
+type Colour = [f32; 4];
+
+#[inline(always)]
+fn each(f: impl Fn(usize) -> f32) -> Colour {
+    [f(0), f(1), f(2), f(3)]
 }
 
-/// Sums along a ray, one more than its samples.
-type Sums = [f32; SAMPLES + 1];
+/// Size of a difference of colours, grey levels: that of an equal difference of all three.
+#[inline(always)]
+fn size_of(c: &Colour) -> f32 {
+    ((c[0] * c[0] + c[1] * c[1] + c[2] * c[2]) * (1.0 / 3.0)).sqrt()
+}
 
-/// Remembers the dry background of one camera and the stream before it.
-pub struct Background {
+/// The colours along a ray, each part by itself, and 0 at the end.
+type Colours = [[f32; SAMPLES + 1]; 3];
+
+/// The colours of a row of samples, times `factors`.
+#[inline(always)]
+fn colours(row: &[Vec4b], factors: &Row) -> Colours {
+    let mut colours = [[0.0; SAMPLES + 1]; 3];
+    for (r, (pixel, factor)) in row.iter().zip(factors).enumerate() {
+        for k in 0..3 {
+            colours[k][r] = factor * f32::from(pixel[k]);
+        }
+    }
+    colours
+}
+
+/// Size of the colours at each place.
+#[inline(always)]
+fn sizes(c: &Colours) -> Row {
+    row(|r| ((c[0][r] * c[0][r] + c[1][r] * c[1][r] + c[2][r] * c[2][r]) * (1.0 / 3.0)).sqrt())
+}
+
+/// What makes colours mixed with nothing whole again: `gain` over how known they are, 0 where that is less than a half; and where it is more.
+#[inline(always)]
+fn whole(row: &[Vec4b], gain: f32) -> (Row, [f32; SAMPLES + 1]) {
+    let (mut factors, mut known) = ([0.0; SAMPLES], [0.0; SAMPLES + 1]);
+    for (r, pixel) in row.iter().take(SAMPLES).enumerate() {
+        let share = f32::from(pixel[3]) * (1.0 / 255.0);
+        known[r] = if share >= 0.5 { 1.0 } else { 0.0 };
+        factors[r] = known[r] * gain / share.max(0.5);
+    }
+    (factors, known)
+}
+
+/// How far colours lie from each other, each with its neighbour along the ray, where both are `shown`.
+#[inline(always)]
+fn apart(a: &Colours, b: &Colours, shown: &[f32; SAMPLES + 1]) -> Row {
+    let mut away = [[0.0; SAMPLES + 1]; 3];
+    for k in 0..3 {
+        for r in 0..SAMPLES {
+            away[k][r] = shown[r] * (a[k][r] - b[k][r]);
+        }
+    }
+    let mut pairs = [[0.0; SAMPLES + 1]; 3];
+    for k in 0..3 {
+        for r in 0..SAMPLES {
+            pairs[k][r] = (away[k][r] + away[k][r + 1]) / (shown[r] + shown[r + 1]).max(1.0);
+        }
+    }
+    let size = sizes(&pairs);
+    row(|r| shown[r] * size[r])
+}
+
+/// A value for each sample of a ray. (`std::array::from_fn` calls `f` out of line for as many.)
+#[inline(always)]
+fn row(f: impl Fn(usize) -> f32) -> Row {
+    let mut row = [0.0; SAMPLES];
+    for (r, value) in row.iter_mut().enumerate() {
+        *value = f(r);
+    }
+    row
+}
+
+/// Sums along a ray, with what windows reach beyond its ends.
+const LEAD: usize = 4;
+const TAIL: usize = 25;
+type Sums = [f32; LEAD + SAMPLES + 1 + TAIL];
+type Row = [f32; SAMPLES];
+
+/// The samples from `from` to before `to` of each sample of a ray, as far as they lie on it.
+struct Window {
+    from: isize,
+    to: isize,
+    per_length: Row,
+}
+
+const fn window(from: isize, to: isize) -> Window {
+    let mut per_length = [1.0; SAMPLES];
+    let mut at = 0;
+    while at < SAMPLES {
+        let (mut first, mut last) = (at as isize + from, at as isize + to);
+        if first < 0 {
+            first = 0;
+        }
+        if last > SAMPLES as isize {
+            last = SAMPLES as isize;
+        }
+        if last > first + 1 {
+            per_length[at] = 1.0 / (last - first) as f32;
+        }
+        at += 1;
+    }
+    Window { from, to, per_length }
+}
+
+static INSIDE: Window = window(-4, 0);
+static OUTSIDE: Window = window(1, 7);
+static ACROSS: Window = window(-3, 3);
+static FURTHER: Window = window(3, 12);
+static FAR: Window = window(2, 25);
+
+impl Window {
+    /// Mean over it at each sample.
+    #[inline(always)]
+    fn mean(&self, sums: &Sums) -> Row {
+        let (from, to) = (LEAD.wrapping_add_signed(self.from), LEAD.wrapping_add_signed(self.to));
+        let (first, last) = (&sums[from..from + SAMPLES], &sums[to..to + SAMPLES]);
+        row(|r| (last[r] - first[r]) * self.per_length[r])
+    }
+}
+
+#[inline(always)]
+fn sums(row: &Row) -> Sums {
+    let mut sums = [0.0; LEAD + SAMPLES + 1 + TAIL];
+    let mut sum = 0.0;
+    for (total, value) in sums[LEAD + 1..].iter_mut().zip(row) {
+        sum += value;
+        *total = sum;
+    }
+    sums[LEAD + SAMPLES + 1..].fill(sum);
+    sums
+}
+
+/// The outline is a little curved: a neighbour counts too.
+#[inline(always)]
+fn around(row: &Row) -> Row {
+    let mut largest = *row;
+    for r in 1..SAMPLES {
+        largest[r] = largest[r].max(row[r - 1]);
+        largest[r - 1] = largest[r - 1].max(row[r]);
+    }
+    largest
+}
+
+/// Finds the stream of clear water in the pictures of one camera.
+pub struct ClearWater {
     scale: f32,
     size: Size,
     axes: Axes,
     directions: Vec<[f32; 2]>,
-    /// Each ray sample's place, px, and whether it is air.
+    /// Each ray sample's place, px, then 1 px beside each; whether it is air, 1 or 0.
     places: Vec<[f32; 2]>,
-    air: Vec<bool>,
+    air: Vec<f32>,
     /// Each line's legs on the x- and y-axis, px, and their logarithms; its sample and its weight on each ray.
     legs: Vec<[f32; 2]>,
     log_legs: Vec<[f32; 2]>,
-    cells: Vec<u16>,
-    weights: Vec<f32>,
-    // Pictures: small in colour, now, the last one, and at half the size.
+    cells: Vec<[u16; RAYS]>,
+    weights: Vec<[f32; RAYS]>,
+    // Pictures: small; the same with four bytes a pixel; the last one of these.
     small: Mat,
-    now: Vec<Colour>,
-    last: Vec<Colour>,
-    grey: Mat,
-    now_half: Mat,
-    /// The dry background, a square fixed in the world: colour at the first picture's exposure, and last its sureness, 0 to 255.
-    side: usize,
-    memory: Vec<Colour>,
-    /// Where it is built anew when the picture comes near its border.
-    spare: Vec<Colour>,
-    /// Its points for the motion by squares, and as they lay in the last picture.
-    corners: Vec<Option<Mark>>,
-    marks: Vec<Mark>,
-    /// From the memory to the picture, now and before; exposure against the memory; the last motion.
-    pose: Turn,
-    last_pose: Turn,
-    /// The picture in the memory's middle.
-    home: Turn,
-    gain: f32,
-    last_gain: f32,
-    motion: Motion,
-    frame: usize,
-    /// Mean size of what the last motion left unexplained, grey levels.
-    left: f32,
-    table: Vec<Cell>,
-    // Along all rays: brightness; difference from the memory and from the last picture in units of the noise; slope; sureness.
-    levels: Vec<Colour>,
-    differs: Vec<Colour>,
-    differs_last: Vec<Colour>,
+    now: Mat,
+    last: Mat,
+    ground: Ground,
+    // Along all rays: maps from now, to the memory, to the last picture; what these show there.
+    fixed_maps: [Mat; 2],
+    maps: [Mat; 2],
+    last_maps: [Mat; 2],
+    ray_now: Mat,
+    ray_ground: Mat,
+    ray_last: Mat,
+    // Along all rays: difference from the memory and from the last picture, in units of the noise; the memory's slope; whether
+    // it is known; whether the last picture shows the place.
     away: Vec<f32>,
     away_last: Vec<f32>,
     slopes: Vec<f32>,
-    sureness: Vec<f32>,
+    remembered: Vec<f32>,
     shown: Vec<f32>,
+    // Of each sample: what it adds to a line through it, and the share of that which rests on known ground; what the moved last picture
+    // says, -1 to 1, and the share of the surroundings that it shows; the step in colour there.
+    value: Vec<f32>,
+    known: Vec<f32>,
+    unexplained: Vec<f32>,
+    shown_around: Vec<f32>,
+    steps: Vec<f32>,
     noise: f32,
-    /// Share of the known background far from the lip that differs from the memory.
+    /// Share of the known background far from the lip that differs from the memory, and frames in a row with too much of that.
     strange: f32,
-    /// Frames in a row with too much of that.
     strange_frames: u32,
     stream: Option<Stream>,
     /// Where it last was, and for how many frames it has not been seen.
@@ -247,135 +335,7 @@ pub struct Background {
     scratch: Vec<f32>,
 }
 
-/// The median, upper one of two; reorders.
-fn median(values: &mut [f32]) -> f32 {
-    let middle = values.len() / 2;
-    if values.is_empty() { 0.0 } else { *values.select_nth_unstable_by(middle, f32::total_cmp).1 }
-}
-
-/// Solves `matrix x = right` by elimination with pivots; zeros where it is singular.
-fn solve(mut matrix: [[f32; 4]; 4], mut right: [f32; 4]) -> [f32; 4] {
-    for k in 0..4 {
-        let pivot = (k..4).max_by(|a, b| matrix[*a][k].abs().total_cmp(&matrix[*b][k].abs())).unwrap_or(k);
-        matrix.swap(k, pivot);
-        right.swap(k, pivot);
-        if matrix[k][k].abs() < 1e-6 {
-            return [0.0; 4];
-        }
-        for i in k + 1..4 {
-            let factor = matrix[i][k] / matrix[k][k];
-            let row = matrix[k];
-            for (value, above) in matrix[i].iter_mut().zip(row).skip(k) {
-                *value -= factor * above;
-            }
-            right[i] -= factor * right[k];
-        }
-    }
-    let mut x = [0.0; 4];
-    for k in (0..4).rev() {
-        x[k] = (right[k] - (k + 1..4).map(|j| matrix[k][j] * x[j]).sum::<f32>()) / matrix[k][k];
-    }
-    x
-}
-
-/// Blue, green, red, and one more: four for the processor's sake.
-type Colour = [f32; 4];
-
-#[inline(always)]
-fn each(f: impl Fn(usize) -> f32) -> Colour {
-    [f(0), f(1), f(2), f(3)]
-}
-
-/// Size of a difference of colours, grey levels: that of an equal difference of all three.
-#[inline(always)]
-fn size_of(c: &Colour) -> f32 {
-    ((c[0] * c[0] + c[1] * c[1] + c[2] * c[2]) / 3.0).sqrt()
-}
-
-/// Between four neighbours.
-#[inline(always)]
-fn mix([a, b, c, d]: [Colour; 4], fx: f32, fy: f32) -> Colour {
-    let top = each(|k| a[k] + (b[k] - a[k]) * fx);
-    let bottom = each(|k| c[k] + (d[k] - c[k]) * fx);
-    each(|k| top[k] + (bottom[k] - top[k]) * fy)
-}
-
-/// A picture with its size.
-#[derive(Clone, Copy)]
-struct Picture<'a> {
-    pixels: &'a [Colour],
-    width: usize,
-    height: usize,
-}
-
-impl Picture<'_> {
-    /// Bilinear sample; none outside.
-    #[inline(always)]
-    fn at(&self, x: f32, y: f32) -> Option<Colour> {
-        let (column, row, fx, fy) = between(x, y, self.width, self.height)?;
-        let upper = self.pixels.get(row * self.width + column..)?;
-        let lower = upper.get(self.width..self.width + 2)?;
-        Some(mix([upper[0], upper[1], lower[0], lower[1]], fx, fy))
-    }
-}
-
-/// A rigid map.
-#[derive(Debug, Clone, Copy)]
-struct Turn {
-    cos: f32,
-    sin: f32,
-    shift: [f32; 2],
-}
-
-impl Turn {
-    /// Turns about `middle`, then shifts.
-    fn new(turn: f32, shift: [f32; 2], middle: [f32; 2]) -> Self {
-        let (sin, cos) = turn.sin_cos();
-        let [x, y] = middle;
-        Self { cos, sin, shift: [x - cos * x + sin * y + shift[0], y - sin * x - cos * y + shift[1]] }
-    }
-
-    #[inline]
-    fn along(&self, [x, y]: [f32; 2]) -> [f32; 2] {
-        [self.cos * x - self.sin * y, self.sin * x + self.cos * y]
-    }
-
-    #[inline]
-    fn forth(&self, at: [f32; 2]) -> [f32; 2] {
-        let [x, y] = self.along(at);
-        [x + self.shift[0], y + self.shift[1]]
-    }
-
-    #[inline]
-    fn back(&self, [x, y]: [f32; 2]) -> [f32; 2] {
-        let (x, y) = (x - self.shift[0], y - self.shift[1]);
-        [self.cos * x + self.sin * y, -self.sin * x + self.cos * y]
-    }
-
-    fn inverse(&self) -> Self {
-        let [x, y] = self.back([0.0, 0.0]);
-        Self { cos: self.cos, sin: -self.sin, shift: [x, y] }
-    }
-
-    /// This one after `first`.
-    fn after(&self, first: &Turn) -> Self {
-        let (cos, sin) = (self.cos * first.cos - self.sin * first.sin, self.sin * first.cos + self.cos * first.sin);
-        // Stays a turn over many frames.
-        let length = cos.hypot(sin);
-        Self { cos: cos / length, sin: sin / length, shift: self.forth(first.shift) }
-    }
-}
-
-/// Where a linear function that is `value` at 0 and changes by `slope` a step is at least `least`, cut out of `from..to`.
-fn at_least(value: f32, slope: f32, least: f32, [from, to]: [f32; 2]) -> [f32; 2] {
-    if slope.abs() < 1e-6 {
-        return if value >= least { [from, to] } else { [0.0, 0.0] };
-    }
-    let cut = (least - value) / slope;
-    if slope > 0.0 { [from.max(cut), to] } else { [from, to.min(cut)] }
-}
-
-impl Background {
+impl ClearWater {
     /// For a region of `region_px` (width, height) of a picture `width_px` wide; `axes` relative to the region, px.
     pub fn new(axes: &Axes, region_px: [i32; 2], width_px: u32) -> opencv::Result<Self> {
         let scale = (width_px as f32 / WIDTH_PX).round().max(1.0);
@@ -392,7 +352,7 @@ impl Background {
                 [x[0] * cos - x[1] * sin, x[0] * sin + x[1] * cos]
             })
             .collect();
-        let (mut places, mut air) = (Vec::with_capacity(CELLS), Vec::with_capacity(CELLS));
+        let (mut places, mut air) = (Vec::with_capacity(2 * CELLS), Vec::with_capacity(CELLS));
         for along in &directions {
             for r in 0..SAMPLES {
                 let r = NEAR_PX + r as f32;
@@ -403,7 +363,7 @@ impl Background {
                     (lip_y + r * along[1]).clamp(1.0, size.height as f32 - 2.01),
                 ];
                 places.push(place);
-                air.push(above >= RIM_PX && place == [lip_x + r * along[0], lip_y + r * along[1]]);
+                air.push(if above >= RIM_PX && place == [lip_x + r * along[0], lip_y + r * along[1]] { 1.0 } else { 0.0 });
             }
         }
         let (mut legs, mut cells, mut weights) = (Vec::new(), Vec::new(), Vec::new());
@@ -438,14 +398,22 @@ impl Background {
             let weight = |k: usize| if k == 0 || k == RAYS - 1 { 0.0 } else { apart(k - 1) + apart(k) };
             let total: f32 = (0..RAYS).map(weight).sum();
             legs.push([a, b]);
-            cells.extend(radii.iter().enumerate().map(|(k, r)| (k * SAMPLES) as u16 + (r - NEAR_PX).round().max(0.0) as u16));
-            weights.extend((0..RAYS).map(|k| weight(k) / total));
+            cells.push(std::array::from_fn(|k| (k * SAMPLES) as u16 + (radii[k] - NEAR_PX).round().max(0.0) as u16));
+            weights.push(std::array::from_fn(|k| weight(k) / total));
         }
         let rows = || vec![0.0; CELLS];
-        // Room for the region turned by any angle, and moved a little.
-        let squares = ((size.width as f32).hypot(size.height as f32) / SQUARE as f32).ceil() as usize + 2 * ROOM_SQUARES;
-        let side = squares * SQUARE;
-        let home = Turn { cos: 1.0, sin: 0.0, shift: [size.width, size.height].map(|v| 0.5 * (v as f32 - side as f32)) };
+        let map = |times: usize| Mat::new_rows_cols_with_default((times * RAYS) as i32, SAMPLES as i32, CV_32FC1, Scalar::default());
+        let (mut map_x, mut map_y) = (map(1)?, map(1)?);
+        for (k, at) in [&mut map_x, &mut map_y].into_iter().enumerate() {
+            at.data_typed_mut::<f32>()?.iter_mut().zip(&places).for_each(|(v, place)| *v = place[k]);
+        }
+        let mut fixed_maps = [Mat::default(), Mat::default()];
+        let [first, second] = &mut fixed_maps;
+        imgproc::convert_maps(&map_x, &map_y, first, second, CV_16SC2, false)?;
+        for i in 0..CELLS {
+            let ([x, y], along) = (places[i], directions[i / SAMPLES]);
+            places.push([x - along[1], y + along[0]]);
+        }
         Ok(Self {
             scale,
             size,
@@ -458,32 +426,25 @@ impl Background {
             cells,
             weights,
             small: Mat::default(),
-            now: vec![[0.0; 4]; size.area() as usize],
-            last: vec![[0.0; 4]; size.area() as usize],
-            grey: Mat::default(),
-            now_half: Mat::default(),
-            side,
-            memory: vec![[0.0; 4]; side * side],
-            spare: vec![[0.0; 4]; side * side],
-            corners: vec![None; squares * squares],
-            marks: Vec::with_capacity(squares * squares),
-            pose: home,
-            last_pose: home,
-            home,
-            gain: 1.0,
-            last_gain: 1.0,
-            motion: Motion::default(),
-            frame: 0,
-            left: 0.0,
-            table: vec![Cell::default(); CELLS],
-            levels: vec![[0.0; 4]; CELLS],
-            differs: vec![[0.0; 4]; CELLS],
-            differs_last: vec![[0.0; 4]; CELLS],
+            now: Mat::default(),
+            last: Mat::default(),
+            ground: Ground::new(size)?,
+            fixed_maps,
+            maps: [map(2)?, map(2)?],
+            last_maps: [map(1)?, map(1)?],
+            ray_now: Mat::default(),
+            ray_ground: Mat::default(),
+            ray_last: Mat::default(),
             away: rows(),
             away_last: rows(),
             slopes: rows(),
-            sureness: rows(),
+            remembered: rows(),
             shown: rows(),
+            value: rows(),
+            known: rows(),
+            unexplained: rows(),
+            shown_around: rows(),
+            steps: rows(),
             noise: NOISE_LEAST,
             strange: 0.0,
             strange_frames: 0,
@@ -515,15 +476,10 @@ impl Background {
         ]
     }
 
-    /// The colour of the dry background at a place of the region, px, where it is known; and the noise, grey levels.
+    /// The colour of the dry background at a place of the region, px, where it is known.
     pub fn dry_at(&self, [x, y]: [f32; 2]) -> Option<[f32; 3]> {
         let small = |v: f32| (v + 0.5) / self.scale - 0.5;
-        let [x, y] = self.pose.back([small(x), small(y)]);
-        let (column, row, fx, fy) = between(x, y, self.side, self.side)?;
-        let corner = row * self.side + column;
-        let four = [corner, corner + 1, corner + self.side, corner + self.side + 1].map(|i| self.memory[i]);
-        let [b, g, r, _] = mix(four, fx, fy);
-        four.iter().all(|c| c[3] >= KNOWN).then(|| [b, g, r].map(|v| v * self.gain))
+        self.ground.dry_at([small(x), small(y)])
     }
 
     /// The colour of the stream's rim as it was last seen.
@@ -572,10 +528,7 @@ impl Background {
         std::mem::swap(&mut self.now, &mut self.last);
         // The middle four of each block's pixels: half of the memory of a large picture is never read.
         imgproc::resize(region, &mut self.small, self.size, 0.0, 0.0, imgproc::INTER_LINEAR)?;
-        for (pixel, bytes) in self.now.iter_mut().zip(self.small.data_bytes()?.chunks_exact(3)) {
-            *pixel = [f32::from(bytes[0]), f32::from(bytes[1]), f32::from(bytes[2]), 0.0];
-        }
-        Ok(())
+        imgproc::cvt_color_def(&self.small, &mut self.now, imgproc::COLOR_BGR2BGRA)
     }
 
     /// The picture that was taken, small, in colour.
@@ -585,250 +538,119 @@ impl Background {
 
     /// Looks at the picture that was taken.
     pub fn look(&mut self) -> opencv::Result<Seen> {
+        // With the processor's widest registers.
+        pulp::Arch::new().dispatch(|| self.look_at_it())
+    }
+
+    #[inline(always)]
+    fn look_at_it(&mut self) -> opencv::Result<Seen> {
         self.edges.clear();
         let mut seen = Seen::Dry;
-        if self.frame > 0 {
-            self.register()?;
-            self.compare();
-            self.fill_table();
-            seen = self.decide();
+        let [air, right, _] = self.planes([1.0, 1.0]);
+        let air = [air[0] - RIM_PX, air[1], air[2]];
+        if !self.ground.is_new() {
+            let wet = self.stream.map(|s| Wet { line: self.planes(s.legs.map(|v| v + 5.0))[2], right });
+            self.ground.register(&self.now, air, wet)?;
+            self.compare(air)?;
+            self.fill_table()?;
+            seen = self.decide()?;
             self.strange_frames = if self.strange > STRANGE { self.strange_frames + 1 } else { 0 };
             if self.strange_frames > STRANGE_FRAMES {
                 // It stays another picture: what stands there now is the background.
-                self.forget();
+                self.ground.forget()?;
+                (self.strange_frames, self.stream, self.dry_frames) = (0, None, AFTERWARDS + 1);
             }
-            self.keep_inside();
         }
-        self.remember();
-        self.frame += 1;
+        let [a, b] = self.last_legs.map(|v| v.max(1.0));
+        let bulge = 2.0 + 0.1 * (a * b).sqrt();
+        let [inner, outer] = [[a + 1.4 * bulge, b + 1.4 * bulge], [1.35 * a + 8.0, 1.35 * b + 8.0]].map(|legs| self.planes(legs)[2]);
+        let near = (self.dry_frames <= AFTERWARDS).then_some((Wet { line: inner, right }, outer));
+        let dry = Dry { air, flows: self.stream.is_some(), near, calm: CALM * self.noise };
+        self.ground.remember(&self.now, dry)?;
         Ok(seen)
     }
 
-    /// Starts anew, as from a first picture.
-    fn forget(&mut self) {
-        self.memory.fill([0.0; 4]);
-        self.corners.fill(None);
-        (self.pose, self.gain, self.motion) = (self.home, 1.0, Motion::default());
-        (self.frame, self.strange_frames, self.stream, self.dry_frames) = (0, 0, None, AFTERWARDS + 1);
-    }
-
-    /// Copies the memory to its own middle when the picture comes near its border.
-    fn keep_inside(&mut self) {
-        let [x, y] = self.pose.back(self.middle());
-        let middle = 0.5 * self.side as f32;
-        let most = ((ROOM_SQUARES - 1) * SQUARE) as f32;
-        if (x - middle).abs().max((y - middle).abs()) < most {
-            return;
-        }
-        let old = Picture { pixels: &self.memory, width: self.side, height: self.side };
-        for (i, pixel) in self.spare.iter_mut().enumerate() {
-            let from = self.pose.back(self.home.forth([(i % self.side) as f32, (i / self.side) as f32]));
-            *pixel = old.at(from[0], from[1]).unwrap_or_default();
-        }
-        std::mem::swap(&mut self.memory, &mut self.spare);
-        // What the last picture saw there is found with the same change.
-        let change = self.pose.inverse().after(&self.home);
-        (self.last_pose, self.pose) = (self.last_pose.after(&change), self.home);
-        self.corners.fill(None);
-        for row in 0..MARK_EVERY {
-            self.mark_corners(row);
-        }
-    }
-
-    fn middle(&self) -> [f32; 2] {
-        [self.size.width, self.size.height].map(|v| v as f32 / 2.0)
-    }
-
-    /// The background's motion since the last picture, into `self.motion`, `self.pose` and `self.gain`.
-    fn register(&mut self) -> opencv::Result<()> {
-        let half = Size::new(self.size.width / 2, self.size.height / 2);
-        imgproc::cvt_color_def(&self.small, &mut self.grey, imgproc::COLOR_BGR2GRAY)?;
-        imgproc::resize(&self.grey, &mut self.now_half, half, 0.0, 0.0, imgproc::INTER_AREA)?;
-        let flows = self.stream.is_some();
-        let [above, right, inside] = self.planes(self.stream.map_or([1.0, 1.0], |s| s.legs.map(|v| v + 5.0)));
-        (self.last_pose, self.last_gain) = (self.pose, self.gain);
-        self.marks.clear();
-        for mark in self.corners.iter().flatten() {
-            let [x, y] = self.pose.forth(mark.at);
-            let value = |plane: [f32; 3]| plane[0] + plane[1] * x + plane[2] * y;
-            let water = flows && (value(inside) <= 1.0 || value(right) < 1.0);
-            if value(above) >= RIM_PX + 2.0
-                && !water
-                && x >= 2.0
-                && y >= 2.0
-                && x < self.size.width as f32 - 3.0
-                && y < self.size.height as f32 - 3.0
-            {
-                self.marks.push(Mark { at: [x, y], slopes: mark.slopes.map(|s| self.pose.along(s)), ..*mark });
-            }
-        }
-        let before = self.motion;
-        // From the last motion and from rest: a joint starts and stops within a frame.
-        let (mut motion, mut gain, mut left) = self.improve(0, before, before)?;
-        if before.shift != [0.0; 2] && left > LEFT_GROWS * self.left {
-            let (other, its_gain, its_left) = self.improve(0, Motion::default(), before)?;
-            if its_left < 0.97 * left {
-                (motion, gain, left) = (other, its_gain, its_left);
-            }
-        }
-        if left < f32::MAX {
-            (motion, gain, _) = self.improve(1, motion, before)?;
-        }
-        self.left = left;
-        self.motion = if left < f32::MAX { motion } else { Motion::default() };
-        self.gain = if left < f32::MAX { gain } else { self.gain };
-        self.pose = Turn::new(self.motion.turn, self.motion.shift, self.middle()).after(&self.last_pose);
-        Ok(())
-    }
-
-    /// At half the working size (`fine` 0) or at the working size (1): improves `motion` so that the memory, moved, becomes what is
-    /// seen now. Returns it, the exposure and the mean size of what is left, grey levels.
-    fn improve(&mut self, fine: usize, mut motion: Motion, before: Motion) -> opencv::Result<(Motion, f32, f32)> {
-        let picture = [&self.now_half, &self.grey][fine];
-        let (now, width, height) = (picture.data_bytes()?, picture.cols() as usize, picture.rows() as usize);
-        let (scale, corner) = [(0.5, -0.25), (1.0, 0.0)][fine];
-        let now_at = |x: f32, y: f32| {
-            let (column, row, fx, fy) = between(x, y, width, height)?;
-            let (upper, lower) = (now.get(row * width + column..)?, now.get((row + 1) * width + column..)?);
-            let mix = |a: u8, b: u8| f32::from(a) + (f32::from(b) - f32::from(a)) * fx;
-            let (top, bottom) = (mix(*upper.first()?, *upper.get(1)?), mix(*lower.first()?, *lower.get(1)?));
-            Some(top + (bottom - top) * fy)
-        };
-        let middle = self.middle();
-        let mut left = f32::MAX;
-        let mut gain = self.gain;
-        for _ in 0..8 {
-            let turn = Turn::new(motion.turn, motion.shift, middle);
-            self.scratch.clear();
-            self.scratch.extend(self.marks.iter().map(|m| {
-                let [x, y] = turn.forth(m.at);
-                now_at(scale * x + corner, scale * y + corner).map_or(f32::NAN, |v| v - gain * m.levels[fine])
-            }));
-            let errors = self.scratch.len();
-            self.scratch.extend_from_within(..);
-            let sizes = &mut self.scratch[errors..];
-            let mut count = 0;
-            for i in 0..errors {
-                if !sizes[i].is_nan() {
-                    sizes[count] = sizes[i].abs();
-                    count += 1;
-                }
-            }
-            if count < POINTS_LEAST {
-                return Ok((motion, gain, f32::MAX));
-            }
-            let noise = median(&mut sizes[..count]) * 1.5 + 0.7;
-            left = sizes[..count].iter().map(|v| v.min(3.0 * noise)).sum::<f32>() / count as f32;
-            let (mut normal, mut right) = ([[0.0f32; 4]; 4], [0.0f32; 4]);
-            for (mark, error) in self.marks.iter().zip(&self.scratch[..errors]).filter(|(_, e)| !e.is_nan()) {
-                let weight = (2.0 * noise / error.abs().max(1e-6)).min(1.0);
-                let [gx, gy] = mark.slopes[fine].map(|v| v * gain);
-                let lever = -gx * (mark.at[1] - middle[1]) + gy * (mark.at[0] - middle[0]);
-                let row = [gx, gy, lever, -mark.levels[fine]];
-                for k in 0..4 {
-                    right[k] += weight * row[k] * error;
-                    for j in 0..4 {
-                        normal[k][j] += weight * row[k] * row[j];
-                    }
-                }
-            }
-            // Along boards, or before an even wall, the picture does not tell the motion: then it stays what it was, and fades.
-            let hold = 0.0075 * count as f32 * noise * noise;
-            let is_at = [motion.shift[0], motion.shift[1], motion.turn];
-            let was_at = [before.shift[0], before.shift[1], before.turn];
-            for (k, size) in [1.0, 1.0, 2500.0].into_iter().enumerate() {
-                normal[k][k] += 1.15 * hold * size;
-                right[k] += hold * size * (is_at[k] - was_at[k]) + 0.15 * hold * size * is_at[k];
-            }
-            normal[3][3] += 1.0;
-            let change = solve(normal, right);
-            motion.shift = [motion.shift[0] - change[0], motion.shift[1] - change[1]];
-            motion.turn -= change[2];
-            gain -= change[3];
-            if change[0].abs() + change[1].abs() < 0.05 && change[2].abs() < 0.0005 {
-                break;
-            }
-        }
-        Ok((motion, gain, left))
-    }
-
     /// Compares the memory and the last picture, both moved, with what is seen now, along the rays.
-    fn compare(&mut self) {
-        let (width, height) = (self.size.width as usize, self.size.height as usize);
-        let (now, last) = (Picture { pixels: &self.now, width, height }, Picture { pixels: &self.last, width, height });
-        let [above, ..] = self.planes([1.0, 1.0]);
-        let (pose, gain, side) = (self.pose, self.gain, self.side);
-        let (mut level_sum, mut level_count) = (0.0, 0.0f32);
-        let most = side as f32 - 2.5;
-        for i in 0..CELLS {
-            let [x, y] = self.places[i];
-            let seen = now.at(x, y).unwrap_or_default();
-            self.levels[i] = seen;
-            (self.sureness[i], self.shown[i], self.slopes[i], self.differs[i], self.differs_last[i]) = (0.0, 0.0, 0.0, [0.0; 4], [0.0; 4]);
-            let from = pose.back([x, y]);
-            if !(self.air[i] && from[0] >= 1.0 && from[1] >= 1.0 && from[0] < most && from[1] < most) {
-                continue;
-            }
-            let (column, row) = (from[0] as usize, from[1] as usize);
-            let corner = row * side + column;
-            // The memory between its pixels, and its slope.
-            let (fx, fy) = (from[0] - column as f32, from[1] - row as f32);
-            let (upper, lower) = (&self.memory[corner..corner + 2], &self.memory[corner + side..corner + side + 2]);
-            let remembered = mix([upper[0], upper[1], lower[0], lower[1]], fx, fy);
-            self.differs[i] = each(|k| seen[k] - gain * remembered[k]);
-            let (across, down) = (
-                each(|k| upper[1][k] - upper[0][k] + lower[1][k] - lower[0][k]),
-                each(|k| lower[0][k] - upper[0][k] + lower[1][k] - upper[1][k]),
-            );
-            self.slopes[i] = 0.5 * gain * size_of(&across).max(size_of(&down));
-            let sure = upper[0][3].min(upper[1][3]).min(lower[0][3]).min(lower[1][3]);
-            self.sureness[i] = if sure >= KNOWN { sure / 255.0 } else { 0.0 };
-            let [x, y] = self.last_pose.forth(from);
-            let was_air = above[0] + above[1] * x + above[2] * y >= RIM_PX;
-            if let Some(before) = if was_air { last.at(x, y) } else { None } {
-                self.shown[i] = 1.0;
-                let factor = gain / self.last_gain;
-                self.differs_last[i] = each(|k| seen[k] - factor * before[k]);
-            }
-            if self.sureness[i] > 0.0 {
-                level_sum += gain * (remembered[0] + remembered[1] + remembered[2]) / 3.0;
-                level_count += 1.0;
-            }
+    #[inline(always)]
+    fn compare(&mut self, air: Plane) -> opencv::Result<()> {
+        let (linear, replicate) = (imgproc::INTER_LINEAR, core::BORDER_REPLICATE);
+        let [first, second] = &self.fixed_maps;
+        imgproc::remap(&self.now, &mut self.ray_now, first, second, linear, replicate, Scalar::default())?;
+        self.ground.recall(&self.places, &mut self.maps, &mut self.ray_ground)?;
+        let [map_x, map_y] = &mut self.last_maps;
+        let back = self.ground.moved().inverse();
+        let most = [self.size.width as f32 - 1.0, self.size.height as f32 - 1.0];
+        let (columns, rows) = (map_x.data_typed_mut::<f32>()?, map_y.data_typed_mut::<f32>()?);
+        for (i, (at_x, at_y)) in columns.iter_mut().zip(rows).enumerate() {
+            let [x, y] = back.forth(self.places[i]);
+            let inside = x >= 0.0 && y >= 0.0 && x < most[0] && y < most[1] && air[0] + air[1] * x + air[2] * y >= 0.0;
+            self.shown[i] = if inside { self.air[i] } else { 0.0 };
+            (*at_x, *at_y) = (x, y);
         }
-        // Neighbours along a ray together.
-        for (values, sizes) in [(&self.differs, &mut self.away), (&self.differs_last, &mut self.away_last)] {
-            for (pair, size) in values.windows(2).zip(sizes) {
-                *size = size_of(&each(|k| 0.5 * (pair[0][k] + pair[1][k])));
+        imgproc::remap(&self.last, &mut self.ray_last, map_x, map_y, linear, replicate, Scalar::default())?;
+        let [gain, last_gain] = self.ground.gains();
+        let (mut level_sum, mut level_count) = (0.0, 0.0f32);
+        let (ones, factor) = ([1.0; SAMPLES], [gain / last_gain; SAMPLES]);
+        for ray in 0..RAYS {
+            let range = ray * SAMPLES..(ray + 1) * SAMPLES;
+            let now = colours(self.ray_now.at_row(ray as i32)?, &ones);
+            let (ground, beside) = (self.ray_ground.at_row::<Vec4b>(ray as i32)?, self.ray_ground.at_row::<Vec4b>((RAYS + ray) as i32)?);
+            let ((factors, mut known), (factors_beside, known_beside)) = (whole(ground, gain), whole(beside, gain));
+            known.iter_mut().zip(&self.air[range.clone()]).for_each(|(known, air)| *known *= air);
+            let (ground, beside) = (colours(ground, &factors), colours(beside, &factors_beside));
+            let mut shown = [0.0; SAMPLES + 1];
+            shown[..SAMPLES].copy_from_slice(&self.shown[range.clone()]);
+            self.away[range.clone()].copy_from_slice(&apart(&now, &ground, &known));
+            self.away_last[range.clone()].copy_from_slice(&apart(&now, &colours(self.ray_last.at_row(ray as i32)?, &factor), &shown));
+            let (mut across, mut along) = ([[0.0; SAMPLES + 1]; 3], [[0.0; SAMPLES + 1]; 3]);
+            for k in 0..3 {
+                for r in 0..SAMPLES {
+                    across[k][r] = known_beside[r] * (beside[k][r] - ground[k][r]);
+                    along[k][r] = known[r + 1] * (ground[k][r + 1] - ground[k][r]);
+                }
+            }
+            let (across, along) = (sizes(&across), sizes(&along));
+            for (r, (slope, remembered)) in self.slopes[range.clone()].iter_mut().zip(&mut self.remembered[range]).enumerate() {
+                (*slope, *remembered) = (known[r] * across[r].max(along[r]), known[r]);
+                level_sum += known[r] * (ground[0][r] + ground[1][r] + ground[2][r]) / 3.0;
+                level_count += known[r];
             }
         }
         // Noise: where the known background is even.
         self.scratch.clear();
-        self.scratch.extend((0..CELLS).step_by(3).filter(|i| self.sureness[*i] > 0.0).map(|i| self.slopes[i]));
+        self.scratch.extend((0..CELLS).step_by(3).filter(|i| self.remembered[*i] > 0.0).map(|i| self.slopes[i]));
         let even = median(&mut self.scratch);
         self.scratch.clear();
-        let known = (0..CELLS).step_by(3).filter(|i| self.sureness[*i] > 0.0 && self.slopes[*i] <= even);
+        let known = (0..CELLS).step_by(3).filter(|i| self.remembered[*i] > 0.0 && self.slopes[*i] <= even);
         self.scratch.extend(known.map(|i| self.away[i]));
         let noise = if self.scratch.len() > 25 { NOISE_MEDIANS * median(&mut self.scratch) } else { 2.0 };
         self.noise = noise.max(NOISE_LEAST).max(NOISE_SHARE * level_sum / level_count.max(1.0));
-        for i in 0..CELLS {
-            let slope = self.slopes[i];
-            let place = (SLOPE_FRESH + SLOPE_FADED * (1.0 - self.sureness[i])) * slope;
-            self.away[i] = (self.away[i] - place).max(0.0) / self.noise;
-            self.away_last[i] = (self.away_last[i] - 0.25 * slope).max(0.0) / self.noise;
+        let per_noise = 1.0 / self.noise;
+        for ((away, away_last), slope) in self.away.iter_mut().zip(&mut self.away_last).zip(&self.slopes) {
+            *away = (*away - SLOPE_SHARE * slope).max(0.0) * per_noise;
+            *away_last = (*away_last - SLOPE_SHARE * slope).max(0.0) * per_noise;
         }
-        let far = || (0..CELLS).filter(|i| i % SAMPLES >= SAMPLES / 2 && self.sureness[*i] > 0.0);
-        self.strange = far().filter(|i| self.away[*i] > CALM).count() as f32 / far().count().max(1) as f32;
+        let (mut strange, mut far) = (0usize, 0usize);
+        for (away, remembered) in self.away.chunks_exact(SAMPLES).zip(self.remembered.chunks_exact(SAMPLES)) {
+            for (away, remembered) in away.iter().zip(remembered).skip(SAMPLES / 2) {
+                far += usize::from(*remembered > 0.0);
+                strange += usize::from(*remembered > 0.0 && *away > CALM);
+            }
+        }
+        self.strange = strange as f32 / far.max(1) as f32;
+        Ok(())
     }
 
     /// Whether what is known near the lip has no pattern: then what is not known has none either.
+    #[inline(always)]
     fn is_even(&mut self) -> bool {
         let near = 60usize;
         self.scratch.clear();
         let mut air = 0;
         for ray in 0..RAYS {
             for i in (ray * SAMPLES..ray * SAMPLES + near).step_by(2) {
-                air += usize::from(self.air[i]);
-                if self.sureness[i] > 0.0 {
+                air += usize::from(self.air[i] > 0.0);
+                if self.remembered[i] > 0.0 {
                     self.scratch.push(self.slopes[i]);
                 }
             }
@@ -837,96 +659,95 @@ impl Background {
         count > air * 3 / 5 && *self.scratch.select_nth_unstable_by(count * 9 / 10, f32::total_cmp).1 < 1.2 * self.noise + 0.6
     }
 
-    /// What each sample of each ray would add to a line through it, into `self.table`.
-    fn fill_table(&mut self) {
-        let turn = Turn::new(self.motion.turn, self.motion.shift, self.middle());
+    /// What each sample of each ray would add to a line through it.
+    #[inline(always)]
+    fn fill_table(&mut self) -> opencv::Result<()> {
+        let turn = self.ground.moved();
         let even = self.is_even();
         let stream = self.stream;
         let step_size = stream.map_or(6.0 * self.noise, |s| s.band[3]);
-        let [mut wet, mut far, mut sure, mut last, mut beyond, mut shown]: [Sums; 6] = [[0.0; SAMPLES + 1]; 6];
-        let mut level = [[0.0f32; 4]; SAMPLES + 1];
-        let mean = |sums: &Sums, from: i32, to: i32| {
-            let (from, to) = (from.clamp(0, SAMPLES as i32) as usize, to.clamp(0, SAMPLES as i32) as usize);
-            (sums[to] - sums[from]) / (to - from).max(1) as f32
-        };
-        // Evidence of the memory, of the step, of the moved last picture; how much each counts.
-        let mut known_says = [0.0f32; SAMPLES];
-        let mut step_says = [0.0f32; SAMPLES];
-        let mut last_says = [0.0f32; SAMPLES];
-        let mut moving = [0.0f32; SAMPLES];
+        let per_noise = 1.0 / self.noise;
+        let empty = [0.0; SAMPLES];
         for ray in 0..RAYS {
             let start = ray * SAMPLES;
-            for r in 0..SAMPLES {
-                let i = start + r;
-                let known = self.sureness[i] > 0.0;
-                let mut how_wet = if known { ((self.away[i] - WET_FROM) / WET_SPAN).clamp(-1.0, 1.0) } else { 0.0 };
-                let mut tells = if known { 1.0 } else { 0.0 };
-                if let Some(stream) = stream.filter(|_| known && how_wet < 0.0) {
-                    // Where the ground is as bright as the water's rim, not to differ from it means nothing.
-                    let apart = size_of(&each(|k| self.levels[i][k] - stream.band[k])) / self.noise;
-                    tells = ((apart - WET_FROM) / WET_SPAN).clamp(0.0, 1.0);
-                    how_wet *= tells;
+            let range = start..start + SAMPLES;
+            let (away, away_last) = (&self.away[range.clone()], &self.away_last[range.clone()]);
+            let (remembered, shown) = (&self.remembered[range.clone()], &self.shown[range.clone()]);
+            let (levels, places) = (colours(self.ray_now.at_row(ray as i32)?, &[1.0; SAMPLES]), &self.places[range.clone()]);
+            let [mut wet, mut far, mut sure, mut last, mut beyond, mut seen]: [Row; 6] = [empty; 6];
+            // Where the ground is as bright as the water's rim, not to differ from it means nothing.
+            let mut differs_from_rim = [1.0; SAMPLES];
+            if let Some(stream) = stream {
+                let mut from_rim = levels;
+                for k in 0..3 {
+                    from_rim[k].iter_mut().for_each(|level| *level -= stream.band[k]);
                 }
-                wet[r + 1] = wet[r] + how_wet;
-                far[r + 1] = far[r] + how_wet.max(0.0);
-                sure[r + 1] = sure[r] + tells;
-                level[r + 1] = each(|k| level[r][k] + self.levels[i][k]);
-                let unexplained = self.shown[i] * ((self.away_last[i] - 2.0) / 2.0).clamp(-1.0, 1.0);
-                last[r + 1] = last[r] + unexplained;
-                beyond[r + 1] = beyond[r] + unexplained.max(0.0);
-                shown[r + 1] = shown[r] + self.shown[i];
+                let apart = sizes(&from_rim);
+                differs_from_rim = row(|r| ((apart[r] * per_noise - WET_FROM) / WET_SPAN).clamp(0.0, 1.0));
             }
             for r in 0..SAMPLES {
-                let (i, at) = (start + r, r as i32);
-                let cell = &mut self.table[i];
-                let colour = |from: i32, to: i32| {
-                    let (from, to) = (from.clamp(0, SAMPLES as i32) as usize, to.clamp(0, SAMPLES as i32) as usize);
-                    let share = 1.0 / (to - from).max(1) as f32;
-                    each(|k| share * (level[to][k] - level[from][k]))
-                };
-                let (inner, outer) = (colour(at - 2, at), colour(at + 1, at + 3));
-                let step = size_of(&each(|k| outer[k] - inner[k]));
-                cell.band = [inner[0], inner[1], inner[2], step];
-                cell.unexplained = mean(&last, at - 3, at + 3);
-                cell.shown = mean(&shown, at - 3, at + 3);
-                cell.known = (mean(&sure, at - 4, at) + mean(&sure, at + 1, at + 7)) / 2.0;
-                step_says[r] = ((step - STEP_FROM * step_size) / (STEP_SPAN * step_size)).clamp(-1.0, 1.0);
-                known_says[r] =
-                    (WET_INSIDE * mean(&wet, at - 4, at) - WET_OUTSIDE * mean(&wet, at + 1, at + 7) - mean(&far, at + 2, at + 25))
-                        .clamp(-1.0, 1.5);
-                let place = self.places[i];
-                let to = turn.forth(place);
-                let (dx, dy) = (to[0] - place[0], to[1] - place[1]);
-                let speed = (dx * dx + dy * dy).sqrt();
-                last_says[r] = 0.65 * cell.unexplained - BEYOND * mean(&beyond, at + 3, at + 12);
-                moving[r] = ((speed - MOVES_PX) / MOVES_PX).clamp(0.0, 1.0) * cell.shown;
+                let how_wet = remembered[r] * ((away[r] - WET_FROM) / WET_SPAN).clamp(-1.0, 1.0);
+                let tells = if how_wet < 0.0 { differs_from_rim[r] } else { remembered[r] };
+                let how_wet = how_wet * tells;
+                (wet[r], far[r], sure[r]) = (how_wet, how_wet.max(0.0), tells);
+                let unexplained = shown[r] * ((away_last[r] - 2.0) / 2.0).clamp(-1.0, 1.0);
+                (last[r], beyond[r], seen[r]) = (unexplained, unexplained.max(0.0), shown[r]);
             }
-            // The outline is a little curved: a neighbour counts too.
-            let around =
-                |values: &[f32; SAMPLES], r: usize| values[r.saturating_sub(1)].max(values[r]).max(values[(r + 1).min(SAMPLES - 1)]);
-            for r in 0..SAMPLES {
-                let step = around(&step_says, r);
-                let cell = &mut self.table[start + r];
-                let by_memory = if even && cell.known < 0.5 { step } else { around(&known_says, r) };
-                if even {
-                    cell.known = 1.0;
+            let (wet, sure, last) = (sums(&wet), sums(&sure), sums(&last));
+            let (wet_inside, wet_outside, wet_far) = (INSIDE.mean(&wet), OUTSIDE.mean(&wet), FAR.mean(&sums(&far)));
+            let (sure_inside, sure_outside) = (INSIDE.mean(&sure), OUTSIDE.mean(&sure));
+            let (unexplained, shown_around) = (ACROSS.mean(&last), ACROSS.mean(&sums(&seen)));
+            let beyond = FURTHER.mean(&sums(&beyond));
+            // Evidence of the memory, of the step, of the moved last picture; how much that counts.
+            let [mut known_says, mut step_says, mut last_says, mut moving]: [Row; 4] = [empty; 4];
+            let mut across = [[0.0; SAMPLES + 1]; 3];
+            for k in 0..3 {
+                for r in 2..SAMPLES - 2 {
+                    across[k][r] = 0.5 * (levels[k][r + 1] + levels[k][r + 2] - levels[k][r - 2] - levels[k][r - 1]);
                 }
-                let by_last = (1.0 - 0.5 * moving[r]) * 0.9 * step + moving[r] * last_says[r];
-                cell.value = if stream.is_some() {
-                    cell.known * by_memory + (1.0 - cell.known) * by_last
-                } else {
-                    // To begin, only what the moved last picture shows counts beside the memory.
-                    let weight = (1.0 - cell.known) * moving[r] * UNKNOWN_WEIGHT;
-                    let value = cell.known * by_memory + weight * by_last;
-                    cell.known += weight;
-                    value
-                };
             }
+            let steps = sizes(&across);
+            for r in 0..SAMPLES {
+                step_says[r] = ((steps[r] - STEP_FROM * step_size) / (STEP_SPAN * step_size)).clamp(-1.0, 1.0);
+            }
+            self.steps[range.clone()].copy_from_slice(&steps);
+            for r in 0..SAMPLES {
+                known_says[r] = (WET_INSIDE * wet_inside[r] - WET_OUTSIDE * wet_outside[r] - wet_far[r]).clamp(-1.0, 1.5);
+                last_says[r] = 0.65 * unexplained[r] - BEYOND * beyond[r];
+                let to = turn.forth(places[r]);
+                let (dx, dy) = (to[0] - places[r][0], to[1] - places[r][1]);
+                moving[r] = (((dx * dx + dy * dy).sqrt() - MOVES_PX) / MOVES_PX).clamp(0.0, 1.0) * shown_around[r];
+            }
+            let (step_says, known_says) = (around(&step_says), around(&known_says));
+            let (value, known) = (&mut self.value[range.clone()], &mut self.known[range.clone()]);
+            for r in 0..SAMPLES {
+                let sure = 0.5 * (sure_inside[r] + sure_outside[r]);
+                let by_memory = if even && sure < 0.5 { step_says[r] } else { known_says[r] };
+                let sure = if even { 1.0 } else { sure };
+                let by_last = (1.0 - 0.5 * moving[r]) * 0.9 * step_says[r] + moving[r] * last_says[r];
+                // To begin, only what the moved last picture shows counts beside the memory.
+                let weight = (1.0 - sure) * if stream.is_some() { 1.0 } else { moving[r] * UNKNOWN_WEIGHT };
+                value[r] = sure * by_memory + weight * by_last;
+                known[r] = if stream.is_some() { sure } else { sure + weight };
+            }
+            self.unexplained[range.clone()].copy_from_slice(&unexplained);
+            self.shown_around[range].copy_from_slice(&shown_around);
         }
+        Ok(())
+    }
+
+    /// The colour just inside a sample, and last the step there.
+    #[inline(always)]
+    fn band(&self, inside: &[Vec4b], at: usize) -> Colour {
+        let (Some(a), Some(b)) = (inside.get(at.wrapping_sub(2)), inside.get(at.wrapping_sub(1))) else { return [0.0; 4] };
+        let mean = |k: usize| 0.5 * (f32::from(a[k]) + f32::from(b[k]));
+        [mean(0), mean(1), mean(2), self.steps[at]]
     }
 
     /// The best line and its figures.
-    fn best_line(&self) -> Option<Found> {
+    #[inline(always)]
+    fn best_line(&self) -> opencv::Result<Option<Found>> {
+        let inside: &[Vec4b] = self.ray_now.data_typed()?;
         let before = self.stream.map(|s| s.legs.map(f32::ln));
         let turns = self.stream.map_or(0.0, |s| TURNS + TURNS_YOUNG / s.age);
         let mut best: Option<Found> = None;
@@ -937,78 +758,91 @@ impl Background {
             if grown.abs() > GROWS_MOST || turned.abs() > 2.5 * turns {
                 continue;
             }
-            let range = line * RAYS..(line + 1) * RAYS;
             let mut found = Found { line, ..Found::default() };
-            let (mut band_square, mut shares) = (0.0, 0.0);
-            for (at, weight) in self.cells[range.clone()].iter().zip(&self.weights[range]) {
-                let cell = &self.table[usize::from(*at)];
-                found.score += weight * cell.value;
-                found.known += weight * cell.known;
-                found.band = each(|k| found.band[k] + weight * cell.band[k]);
-                let size = size_of(&cell.band);
-                band_square += weight * size * size;
-                shares += match self.stream {
-                    Some(_) if cell.value > PIECE => *weight,
-                    None if cell.value > PIECE * cell.known => weight * cell.known,
-                    _ => 0.0,
-                };
+            let along = || self.cells[line].iter().map(|at| usize::from(*at)).zip(self.weights[line]);
+            let flows = self.stream.is_some();
+            for (at, weight) in along() {
+                let (value, known) = (self.value[at], self.known[at]);
+                found.score += weight * value;
+                found.known += weight * known;
+                let (least, share) = if flows { (PIECE, 1.0) } else { (PIECE * known, known) };
+                found.share += if value > least { weight * share } else { 0.0 };
             }
             let outer = OUTERMOST * 0.5 * (p + q);
-            match self.stream {
-                None => {
-                    if found.known < BEGIN[2] {
-                        continue;
-                    }
-                    found.score /= found.known;
-                    found.share = shares / found.known;
-                    found.total = outer + found.score + 0.7 * found.share;
+            let beats = |total: f32| best.is_none_or(|b| total > b.total);
+            if !flows {
+                if found.known < BEGIN[2] {
+                    continue;
                 }
-                Some(stream) => {
-                    // Along the outline the same room is seen, whatever stands behind.
-                    let size = size_of(&found.band);
-                    let spread = (band_square - size * size).max(0.0);
-                    let unit = 0.5 * found.band[3] + 2.0 * self.noise;
-                    let change = size_of(&each(|k| found.band[k] - stream.band[k])) / unit;
-                    let alike = BAND * ((-spread / (unit * unit)).exp() - 1.0) + BAND * ((-change * change).exp() - 1.0);
-                    found.evidence = found.score;
-                    found.score += (1.0 - found.known) * alike;
-                    found.share = shares;
-                    let square = |v: f32| v * v;
-                    let stay = STAY * (-0.5 * (square(grown / GROWS) + square(turned / turns))).exp();
-                    found.total = outer + found.score + 0.7 * found.share + stay;
+                found.score /= found.known;
+                found.share /= found.known;
+                found.total = outer + found.score + 0.7 * found.share;
+                if beats(found.total) {
+                    best = Some(found);
                 }
+                continue;
             }
-            if best.is_none_or(|b| found.total > b.total) {
+            let square = |v: f32| v * v;
+            let stay = STAY * (-0.5 * (square(grown / GROWS) + square(turned / turns))).exp();
+            found.evidence = found.score;
+            // The band along it can only cost.
+            if !beats(outer + found.score + 0.7 * found.share + stay) {
+                continue;
+            }
+            let mut spread = 0.0;
+            for (at, weight) in along() {
+                let band = self.band(inside, at);
+                found.band = each(|k| found.band[k] + weight * band[k]);
+                spread += weight * square(size_of(&band));
+            }
+            if let Some(stream) = self.stream {
+                // Along the outline the same room is seen, whatever stands behind.
+                let spread = (spread - square(size_of(&found.band))).max(0.0);
+                let unit = 0.5 * found.band[3] + 2.0 * self.noise;
+                let change = size_of(&each(|k| found.band[k] - stream.band[k])) / unit;
+                let alike = BAND * ((-spread / (unit * unit)).exp() - 1.0) + BAND * ((-change * change).exp() - 1.0);
+                found.score += (1.0 - found.known) * alike;
+            }
+            found.total = outer + found.score + 0.7 * found.share + stay;
+            if beats(found.total) {
                 best = Some(found);
             }
         }
-        best
+        if self.stream.is_none()
+            && let Some(found) = &mut best
+        {
+            for (at, weight) in self.cells[found.line].iter().zip(self.weights[found.line]) {
+                let band = self.band(inside, usize::from(*at));
+                found.band = each(|k| found.band[k] + weight * band[k]);
+            }
+        }
+        Ok(best)
     }
 
     /// What the moved last picture says of a line: how far the background moves across it, px a frame, the share of it that the
     /// picture shows, and how little it explains, -1 to 1.
     fn across(&self, line: usize) -> [f32; 3] {
-        let turn = Turn::new(self.motion.turn, self.motion.shift, self.middle());
+        let turn = self.ground.moved();
         let [a, b] = self.legs[line];
         let along = [0, 1].map(|k| b * self.axes.y[k] - a * self.axes.x[k]);
         let length = along[0].hypot(along[1]);
-        let range = line * RAYS..(line + 1) * RAYS;
         let (mut moves, mut shown, mut unexplained) = (0.0, 0.0, 0.0);
-        for (at, weight) in self.cells[range.clone()].iter().zip(&self.weights[range]) {
-            let (place, cell) = (self.places[usize::from(*at)], &self.table[usize::from(*at)]);
+        for (at, weight) in self.cells[line].iter().map(|at| usize::from(*at)).zip(self.weights[line]) {
+            let place = self.places[at];
             let to = turn.forth(place);
             moves += weight * ((to[1] - place[1]) * along[0] - (to[0] - place[0]) * along[1]).abs() / length;
-            shown += weight * cell.shown;
-            unexplained += weight * cell.unexplained;
+            shown += weight * self.shown_around[at];
+            unexplained += weight * self.unexplained[at];
         }
         [moves, shown, unexplained / shown.max(0.05)]
     }
 
     /// Whether a stream is seen, and where.
-    fn decide(&mut self) -> Seen {
+    #[inline(always)]
+    fn decide(&mut self) -> opencv::Result<Seen> {
         let mut seen = Seen::Dry;
         let (mut background, mut surely_dry) = (false, false);
-        if let Some(found) = self.best_line() {
+        if let Some(found) = self.best_line()? {
             let [moves, shown, unexplained] = self.across(found.line);
             let tells = moves > TELLS_PX && shown > 0.5;
             background = tells && unexplained < EXPLAINED;
@@ -1038,7 +872,7 @@ impl Background {
             _ => {
                 self.dry_frames = self.dry_frames.saturating_add(1);
                 if seen == Seen::Unsure {
-                    return seen;
+                    return Ok(seen);
                 }
                 // One frame of grace: a stream that is lost once may be there again, and is not taken for background.
                 if self.stream.is_some() && self.dry_frames == 1 && !(background || surely_dry) {
@@ -1048,124 +882,21 @@ impl Background {
                 }
             }
         }
-        seen
-    }
-
-    /// Takes what is dry now over into the memory.
-    fn remember(&mut self) {
-        let flows = self.stream.is_some();
-        let near = self.dry_frames <= AFTERWARDS;
-        let [a, b] = self.last_legs.map(|v| v.max(1.0));
-        let bulge = 2.0 + 0.1 * (a * b).sqrt();
-        let [above, right, inner] = self.planes([a + 1.4 * bulge, b + 1.4 * bulge]);
-        let [.., outer] = self.planes([1.35 * a + 8.0, 1.35 * b + 8.0]);
-        let (pose, gain, side) = (self.pose, self.gain, self.side);
-        let (width, height, calm) = (self.size.width as usize, self.size.height as usize, CALM * self.noise / gain);
-        let now = Picture { pixels: &self.now, width, height };
-        for y in 0..side {
-            let fresh = self.frame == 0 || y % REFRESH == self.frame % REFRESH;
-            let from = pose.forth([0.0, y as f32]);
-            let (value, slope) = (
-                |plane: [f32; 3]| plane[0] + plane[1] * from[0] + plane[2] * from[1],
-                |plane: [f32; 3]| plane[1] * pose.cos + plane[2] * pose.sin,
-            );
-            let span = at_least(value(above), slope(above), RIM_PX, [0.0, side as f32]);
-            let span = at_least(from[0], pose.cos, 0.0, span);
-            let span = at_least(-from[0], -pose.cos, 1.01 - width as f32, span);
-            let span = at_least(from[1], pose.sin, 0.0, span);
-            let [x0, x1] = at_least(-from[1], -pose.sin, 1.01 - height as f32, span);
-            let (x0, x1) = (x0.ceil().max(0.0), x1.floor().min(side as f32));
-            if x1 <= x0 {
-                continue;
-            }
-            let at = |v: f32, slope: f32| v + slope * x0;
-            let (mut right_at, mut inner_at, mut outer_at) =
-                (at(value(right), slope(right)), at(value(inner), slope(inner)), at(value(outer), slope(outer)));
-            let mut from = [at(from[0], pose.cos), at(from[1], pose.sin)];
-            let cells = y * side + x0 as usize..y * side + x1 as usize;
-            for kept in &mut self.memory[cells] {
-                let left = right_at < 1.0;
-                let (inside, close) = (near && (left || inner_at < 1.0), near && (left || outer_at < 1.0));
-                let [x, y] = from;
-                from = [x + pose.cos, y + pose.sin];
-                (right_at, inner_at, outer_at) = (right_at + slope(right), inner_at + slope(inner), outer_at + slope(outer));
-                if !fresh && kept[3] >= KNOWN {
-                    continue;
-                }
-                let Some(seen) = now.at(x, y) else { continue };
-                let known = kept[3] >= KNOWN;
-                let away = each(|k| seen[k] / gain - kept[k]);
-                let fits = size_of(&away) < calm;
-                if known && ((fits && !(inside && flows)) || !close) {
-                    let share = if fits { FOLLOW } else { FOLLOW_SLOWLY };
-                    *kept = each(|k| kept[k] + share * away[k]);
-                    kept[3] = 255.0;
-                } else if !(known || flows && close) {
-                    *kept = each(|k| kept[k] + away[k]);
-                    kept[3] = 255.0;
-                } else {
-                    kept[3] *= FADE;
-                }
-            }
-        }
-        if self.frame == 0 {
-            for row in 0..MARK_EVERY {
-                self.mark_corners(row);
-            }
-        } else {
-            self.mark_corners(self.frame % MARK_EVERY);
-        }
-    }
-
-    /// Chooses the points for the motion anew in a part of the memory's squares: in each the one with the steepest slope.
-    fn mark_corners(&mut self, part: usize) {
-        let (side, squares) = (self.side, self.side / SQUARE);
-        for row in (1..squares - 1).filter(|r| r % MARK_EVERY == part) {
-            for column in 1..squares - 1 {
-                let mut best: Option<(f32, [usize; 2])> = None;
-                let grey = |x: usize, y: usize| {
-                    let [b, g, r, _] = self.memory[y * side + x];
-                    0.114 * b + 0.587 * g + 0.299 * r
-                };
-                for y in (row * SQUARE..(row + 1) * SQUARE).step_by(2) {
-                    for x in (column * SQUARE..(column + 1) * SQUARE).step_by(2) {
-                        let i = y * side + x;
-                        if [i - 2 * side, i - 2, i + 2 * side, i + 2].iter().any(|i| self.memory[*i][3] < 200.0) {
-                            continue;
-                        }
-                        let (across, down) = (grey(x + 1, y) - grey(x - 1, y), grey(x, y + 1) - grey(x, y - 1));
-                        let steep = across * across + down * down;
-                        if best.is_none_or(|(most, _)| steep > most) {
-                            best = Some((steep, [x, y]));
-                        }
-                    }
-                }
-                let best = best.map(|(_, [x, y])| {
-                    // Around it: rows of three.
-                    let sum = |x: usize, y: usize, across: usize, down: usize| {
-                        0.25 * grey(x - across, y - down) + 0.5 * grey(x, y) + 0.25 * grey(x + across, y + down)
-                    };
-                    let level = |x: usize, y: usize| 0.25 * sum(x, y - 1, 1, 0) + 0.5 * sum(x, y, 1, 0) + 0.25 * sum(x, y + 1, 1, 0);
-                    let fine = [0.5 * (sum(x + 1, y, 0, 1) - sum(x - 1, y, 0, 1)), 0.5 * (sum(x, y + 1, 1, 0) - sum(x, y - 1, 1, 0))];
-                    let coarse = [0.25 * (sum(x + 2, y, 0, 1) - sum(x - 2, y, 0, 1)), 0.25 * (sum(x, y + 2, 1, 0) - sum(x, y - 2, 1, 0))];
-                    Mark { at: [x as f32, y as f32], levels: [level(x, y), grey(x, y)], slopes: [coarse, fine] }
-                });
-                self.corners[row * squares + column] = best;
-            }
-        }
+        Ok(seen)
     }
 
     /// The edge on each ray near `line`, into `self.edges`.
+    #[inline(always)]
     fn find_edges(&mut self, line: usize) {
         for ray in 1..RAYS - 1 {
-            let middle = usize::from(self.cells[line * RAYS + ray]) - ray * SAMPLES;
+            let middle = usize::from(self.cells[line][ray]) - ray * SAMPLES;
             let reach = 2.max((0.08 * middle as f32) as usize);
-            let row = &self.table[ray * SAMPLES..][..SAMPLES];
+            let row = &self.value[ray * SAMPLES..][..SAMPLES];
             let range = middle.saturating_sub(reach)..(middle + reach + 1).min(SAMPLES);
-            let best = range.clone().map(|i| row[i].value).fold(f32::MIN, f32::max);
+            let best = range.clone().map(|i| row[i]).fold(f32::MIN, f32::max);
             // Equal neighbours: the middle of them. Without an edge here, the line itself.
             let (mut sum, mut count) = (0usize, 0usize);
-            for i in range.filter(|i| best > PIECE && row[*i].value >= best - 1e-6) {
+            for i in range.filter(|i| best > PIECE && row[*i] >= best - 1e-6) {
                 (sum, count) = (sum + i, count + 1);
             }
             let sample = if count == 0 { middle as f32 } else { sum as f32 / count as f32 };

@@ -23,7 +23,7 @@ use opencv::prelude::*;
 use shared::config::{CameraConfig, ImageConfig, LiquidMethod};
 use shared::messages::{Doubt, PixelFormat};
 
-use crate::clear::{Background, Seen};
+use crate::clear::{ClearWater, Seen};
 
 /// Rays between the axes.
 const RAYS: usize = 48;
@@ -263,7 +263,7 @@ pub struct Extractor {
     hsv: Mat,
     mask: Mat,
     mask_b: Mat,
-    background: Background,
+    water: ClearWater,
     edges: Vec<[f32; 2]>,
     edge_weights: Vec<f32>,
     fine: Vec<[f32; 2]>,
@@ -396,7 +396,7 @@ impl Extractor {
             hsv: Mat::default(),
             mask: Mat::default(),
             mask_b: Mat::default(),
-            background: Background::new(&axes, [region.width, region.height], camera.width_px)?,
+            water: ClearWater::new(&axes, [region.width, region.height], camera.width_px)?,
             edges: Vec::with_capacity(RAYS),
             edge_weights: Vec::with_capacity(RAYS),
             fine: Vec::with_capacity(PROFILES),
@@ -495,7 +495,7 @@ impl Extractor {
                     (self.find_triangle(colours)?, segmented)
                 }
                 LiquidMethod::Clear => {
-                    let seen = self.background.look()?;
+                    let seen = self.water.look()?;
                     let segmented = Instant::now();
                     (self.follow_water(seen, colours)?, segmented)
                 }
@@ -518,7 +518,7 @@ impl Extractor {
 
     fn resample(&mut self, region: &impl core::ToInputArray) -> Result<(), ExtractError> {
         if self.method == LiquidMethod::Clear {
-            return Ok(self.background.take(region)?);
+            return Ok(self.water.take(region)?);
         }
         let (nearest, border) = (imgproc::INTER_NEAREST, core::BORDER_REPLICATE);
         imgproc::remap(region, &mut self.polar, &self.map_a, &self.map_b, nearest, border, Scalar::default())?;
@@ -528,7 +528,7 @@ impl Extractor {
     /// Too dark, blown out or the same picture as before. One pass over the rays (every fourth pixel for light), because
     /// three OpenCV reductions over the same bytes took longer than this.
     fn check_light(&mut self) -> Result<Option<Doubt>, ExtractError> {
-        let picture = if self.method == LiquidMethod::Clear { self.background.small() } else { &self.polar };
+        let picture = if self.method == LiquidMethod::Clear { self.water.small() } else { &self.polar };
         let bytes = picture.data_bytes()?;
         let mut hash = 0xcbf2_9ce4_8422_2325u64;
         for chunk in bytes.chunks_exact(8) {
@@ -614,14 +614,14 @@ impl Extractor {
         Ok(())
     }
 
-    /// The triangle of what [`Background`] saw.
+    /// The triangle of what [`ClearWater`] saw.
     fn follow_water(&mut self, seen: Seen, colours: Colours) -> Result<Measurement, ExtractError> {
         self.edges.clear();
         match seen {
             Seen::Dry => Ok(Measurement::nothing(1.0, Doubt::None)),
             Seen::Unsure => Ok(Measurement::nothing(0.0, Doubt::EdgeNotFound)),
             Seen::Stream(share) => {
-                self.edges.extend_from_slice(self.background.edges_px());
+                self.edges.extend_from_slice(self.water.edges_px());
                 self.line_through_edges(share, 0, colours)
             }
         }
@@ -725,10 +725,10 @@ impl Extractor {
         let confidence = inliers.min(1.0) * share.min(1.0) * used * (contrast / 40.0).min(1.0) * sharp;
         if self.method == LiquidMethod::Clear {
             // What the memory of the background took for water must have its edge in the picture itself.
-            let begins = self.background.begins();
+            let begins = self.water.begins();
             let least = if begins { BEGIN_CONFIDENCE } else { GO_ON_CONFIDENCE };
             let fine = (sane && used >= PROFILES_FEW && confidence >= least).then_some(([a, b], contrast));
-            if !self.background.confirm(fine) {
+            if !self.water.confirm(fine) {
                 let doubt = if begins { Doubt::None } else { Doubt::EdgeNotFound };
                 return Ok(Measurement::nothing(0.0, doubt));
             }
@@ -758,7 +758,7 @@ impl Extractor {
     /// it is to be trusted, 0 to 1.
     fn water_begins(&self, profile: &[[f32; 3]; 2 * REACH + 1], place: impl Fn(usize) -> [f32; 2]) -> Option<(f32, f32, f32)> {
         let mut differs = [[0.0f32; 3]; 2 * REACH + 1];
-        let known = differs.iter_mut().zip(profile).enumerate().all(|(j, (differs, seen))| match self.background.dry_at(place(j)) {
+        let known = differs.iter_mut().zip(profile).enumerate().all(|(j, (differs, seen))| match self.water.dry_at(place(j)) {
             Some(dry) => {
                 *differs = std::array::from_fn(|c| seen[c] - dry[c]);
                 true
@@ -768,7 +768,7 @@ impl Extractor {
         if known {
             // The outermost place that differs from the dry background, where half of the difference is reached.
             let size = |d: &[f32; 3]| (d.iter().map(|v| v * v).sum::<f32>() / 3.0).sqrt();
-            let least = (WET_NOISES * self.background.noise()).max(WET_LEAST);
+            let least = (WET_NOISES * self.water.noise()).max(WET_LEAST);
             let j = (1..2 * REACH).rev().find(|&j| size(&differs[j]) >= least && size(&differs[j - 1]) >= least)?;
             let full = (j.saturating_sub(4)..=j).max_by(|a, b| size(&differs[*a]).total_cmp(&size(&differs[*b])))?;
             let (full, height) = (differs[full], size(&differs[full]));
@@ -777,7 +777,7 @@ impl Extractor {
             let (inner, outer) = (share(&differs[i]), share(&differs[i + 1]));
             // Ground as bright as the water's rim hides where it begins.
             let dry: [f32; 3] = std::array::from_fn(|c| profile[i + 1][c] - differs[i + 1][c]);
-            let hidden = self.background.rim().is_some_and(|rim| size(&std::array::from_fn(|c| dry[c] - rim[c])) < 2.0 * least);
+            let hidden = self.water.rim().is_some_and(|rim| size(&std::array::from_fn(|c| dry[c] - rim[c])) < 2.0 * least);
             return (outer < 0.5).then(|| (i as f32 + (inner - 0.5) / (inner - outer), height, if hidden { HIDDEN_TRUST } else { 1.0 }));
         }
         // The outermost of the steep steps of brightness.

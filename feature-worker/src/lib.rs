@@ -6,6 +6,7 @@ pub mod calibrate;
 pub mod clear;
 pub mod episodes;
 pub mod extract;
+mod ground;
 pub mod inspect;
 pub mod recorder;
 pub mod source;
