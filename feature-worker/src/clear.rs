@@ -26,11 +26,14 @@ use crate::ground::{Dry, Ground, Plane, Wet, median};
 const WIDTH_PX: f32 = 320.0;
 /// Air begins this far above the top edge: the rim's light spreads.
 const RIM_PX: f32 = 1.5;
-/// Rays between the axes, and samples 1 px apart on each, from [`NEAR_PX`] on.
-const RAYS: usize = 32;
-const SAMPLES: usize = 130;
+/// Rays between the axes, and samples on each, from [`NEAR_PX`] on: 1 px apart up to [`DENSE_PX`], then in proportion to their distance.
+const RAYS: usize = 24;
+const SAMPLES: usize = 96;
 const CELLS: usize = RAYS * SAMPLES;
 const NEAR_PX: f32 = 1.0;
+const DENSE_PX: f32 = 48.0;
+/// Within this distance from the lip the ground tells whether it is even; beyond it, whether it is another picture.
+const MIDDLE_PX: f32 = 60.0;
 /// Lines that are tried: distances on either axis in geometric steps, and the largest ratios of the two.
 const LEGS: usize = 46;
 const LEG_FIRST_PX: f32 = 6.5;
@@ -287,6 +290,8 @@ pub struct ClearWater {
     size: Size,
     axes: Axes,
     directions: Vec<[f32; 2]>,
+    /// Distance of each of a ray's samples from the lip, px.
+    radii: Row,
     /// Each ray sample's place, px, then 1 px beside each; whether it is air, 1 or 0.
     places: Vec<[f32; 2]>,
     air: Vec<f32>,
@@ -352,10 +357,13 @@ impl ClearWater {
                 [x[0] * cos - x[1] * sin, x[0] * sin + x[1] * cos]
             })
             .collect();
+        let mut radii = [NEAR_PX; SAMPLES];
+        for r in 1..SAMPLES {
+            radii[r] = radii[r - 1] + (radii[r - 1] / DENSE_PX).max(1.0);
+        }
         let (mut places, mut air) = (Vec::with_capacity(2 * CELLS), Vec::with_capacity(CELLS));
         for along in &directions {
-            for r in 0..SAMPLES {
-                let r = NEAR_PX + r as f32;
+            for r in &radii {
                 let above = (x[0] * along[1] - x[1] * along[0]) * turn * r;
                 // Samples beyond the region repeat its border and belong to no line.
                 let place = [
@@ -374,21 +382,17 @@ impl ClearWater {
                 continue;
             }
             // Where each ray meets the line: along = u x + v y, and u / a + v / b = 1 on it.
-            let radii: Vec<f32> = directions
+            let crossings: Vec<f32> = directions
                 .iter()
                 .map(|d| {
                     let (u, v) = ((d[0] * y[1] - d[1] * y[0]) / sine, (x[0] * d[1] - x[1] * d[0]) / sine);
                     1.0 / (u / a + v / b)
                 })
                 .collect();
-            let point = |k: usize| [lip_x + radii[k] * directions[k][0], lip_y + radii[k] * directions[k][1]];
+            let point = |k: usize| [lip_x + crossings[k] * directions[k][0], lip_y + crossings[k] * directions[k][1]];
             let fits = (0..RAYS).all(|k| {
                 let [px, py] = point(k);
-                radii[k] < NEAR_PX + SAMPLES as f32 - 10.0
-                    && px >= 1.0
-                    && py >= 1.0
-                    && px < size.width as f32 - 2.0
-                    && py < size.height as f32 - 2.0
+                crossings[k] < radii[SAMPLES - 3] && px >= 1.0 && py >= 1.0 && px < size.width as f32 - 2.0 && py < size.height as f32 - 2.0
             });
             if !fits {
                 continue;
@@ -398,7 +402,8 @@ impl ClearWater {
             let weight = |k: usize| if k == 0 || k == RAYS - 1 { 0.0 } else { apart(k - 1) + apart(k) };
             let total: f32 = (0..RAYS).map(weight).sum();
             legs.push([a, b]);
-            cells.push(std::array::from_fn(|k| (k * SAMPLES) as u16 + (radii[k] - NEAR_PX).round().max(0.0) as u16));
+            let nearest = |r: f32| radii.partition_point(|at| 0.5 * (at + (at + (at / DENSE_PX).max(1.0))) < r);
+            cells.push(std::array::from_fn(|k| (k * SAMPLES + nearest(crossings[k])) as u16));
             weights.push(std::array::from_fn(|k| weight(k) / total));
         }
         let rows = || vec![0.0; CELLS];
@@ -419,6 +424,7 @@ impl ClearWater {
             size,
             axes,
             directions,
+            radii,
             places,
             air,
             log_legs: legs.iter().map(|l: &[f32; 2]| l.map(f32::ln)).collect(),
@@ -631,8 +637,9 @@ impl ClearWater {
             *away_last = (*away_last - SLOPE_SHARE * slope).max(0.0) * per_noise;
         }
         let (mut strange, mut far) = (0usize, 0usize);
+        let far_from = self.radii.partition_point(|r| *r < MIDDLE_PX);
         for (away, remembered) in self.away.chunks_exact(SAMPLES).zip(self.remembered.chunks_exact(SAMPLES)) {
-            for (away, remembered) in away.iter().zip(remembered).skip(SAMPLES / 2) {
+            for (away, remembered) in away.iter().zip(remembered).skip(far_from) {
                 far += usize::from(*remembered > 0.0);
                 strange += usize::from(*remembered > 0.0 && *away > CALM);
             }
@@ -644,7 +651,7 @@ impl ClearWater {
     /// Whether what is known near the lip has no pattern: then what is not known has none either.
     #[inline(always)]
     fn is_even(&mut self) -> bool {
-        let near = 60usize;
+        let near = self.radii.partition_point(|r| *r < MIDDLE_PX);
         self.scratch.clear();
         let mut air = 0;
         for ray in 0..RAYS {
@@ -890,7 +897,7 @@ impl ClearWater {
     fn find_edges(&mut self, line: usize) {
         for ray in 1..RAYS - 1 {
             let middle = usize::from(self.cells[line][ray]) - ray * SAMPLES;
-            let reach = 2.max((0.08 * middle as f32) as usize);
+            let reach = 2;
             let row = &self.value[ray * SAMPLES..][..SAMPLES];
             let range = middle.saturating_sub(reach)..(middle + reach + 1).min(SAMPLES);
             let best = range.clone().map(|i| row[i]).fold(f32::MIN, f32::max);
@@ -900,7 +907,10 @@ impl ClearWater {
                 (sum, count) = (sum + i, count + 1);
             }
             let sample = if count == 0 { middle as f32 } else { sum as f32 / count as f32 };
-            let radius = NEAR_PX + sample + 0.5;
+            // Half a step further out is the edge.
+            let (at, part) = ((sample + 0.5) as usize, (sample + 0.5).fract());
+            let [before, after] = [at, at + 1].map(|r| self.radii[r.min(SAMPLES - 1)]);
+            let radius = before + part * (after - before);
             let full = |k: usize| (self.axes.lip_px[k] + radius * self.directions[ray][k] + 0.5) * self.scale - 0.5;
             self.edges.push([full(0), full(1)]);
         }

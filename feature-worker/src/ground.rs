@@ -57,6 +57,77 @@ fn spread(pixel: Pixel) -> u64 {
     (x | (x << 8)) & 0x00ff_00ff_00ff_00ff
 }
 
+/// Pixels of a row of the memory that are looked at together.
+const RUN: usize = 32;
+
+/// A small picture in colour.
+struct Picture<'a> {
+    pixels: &'a [Vec4b],
+    width: usize,
+}
+
+impl Picture<'_> {
+    /// Bilinear samples at the first `count` places from `place` on, a `step` apart; black outside.
+    #[inline(always)]
+    fn along(&self, place: [f32; 2], step: [f32; 2], count: usize) -> [u64; RUN] {
+        let fixed = |v: f32| (65536.0 * v) as i32;
+        let ([mut x, mut y], [dx, dy]) = (place.map(fixed), step.map(fixed));
+        let mut samples = [0; RUN];
+        for sample in &mut samples[..count] {
+            let corner = (y >> 16) as usize * self.width + (x >> 16) as usize;
+            let rows = (self.pixels.get(corner..corner + 2), self.pixels.get(corner + self.width..corner + self.width + 2));
+            if let (Some(upper), Some(lower)) = rows {
+                let (wx, wy) = (u64::from(x as u32 >> 8 & 255), u64::from(y as u32 >> 8 & 255));
+                let top = mix(spread(upper[0].0), spread(upper[1].0), wx);
+                *sample = mix(top, mix(spread(lower[0].0), spread(lower[1].0), wx), wy);
+            }
+            (x, y) = (x + dx, y + dy);
+        }
+        samples
+    }
+}
+
+/// How a run of the memory follows what is seen.
+struct Following {
+    /// The run's first column, and from where to where it is dry: to the right of the left side, beyond the inner line, beyond the outer.
+    x: i32,
+    dry_spans: [[i32; 2]; 3],
+    flows: bool,
+    /// Of 256.
+    exposure: i32,
+    /// Three times the square of a calm difference.
+    calm: i32,
+}
+
+/// New ground is taken over, known ground follows, and what is hidden grows older until it is forgotten. Without branches, for the
+/// processor's vector registers.
+#[inline(always)]
+fn follow(seen: &[u64; RUN], kept: &mut [Vec4b], ages: &mut [u8], f: Following) {
+    let [right, inner, outer] = f.dry_spans;
+    let outside = |[from, to]: [i32; 2], x: i32| i32::from(x < from) | i32::from(x >= to);
+    let flows = i32::from(f.flows);
+    for (i, ((sample, kept), age)) in seen.iter().zip(kept).zip(ages).enumerate() {
+        let x = f.x + i as i32;
+        let kept = &mut kept.0;
+        let level = |k: u32| ((((sample >> (16 * k)) & 255) as i32 * f.exposure + 128) >> 8).min(255);
+        let was = [0, 1, 2].map(|k| i32::from(kept[k]));
+        let away = [level(0) - was[0], level(1) - was[1], level(2) - was[2]];
+        let fits = i32::from(away[0] * away[0] + away[1] * away[1] + away[2] * away[2] < f.calm);
+        let known = i32::from(kept[3] > 0);
+        let inside = outside(right, x) | outside(inner, x);
+        let close = outside(right, x) | outside(outer, x);
+        let hidden = close & ((1 - fits) | (flows & inside));
+        let of_known = (1 - hidden) * (fits * FOLLOW + (1 - fits) * FOLLOW_SLOWLY);
+        let of_new = (1 - (flows & close)) * 256;
+        let share = known * of_known + (1 - known) * of_new;
+        let older = if share > 0 { 0 } else { i32::from(*age) + 1 };
+        let stays = i32::from(share > 0) | (known & i32::from(older < i32::from(FORGOTTEN)));
+        let new = |k: usize| (stays * (was[k] + ((share * away[k] + 128) >> 8))) as u8;
+        *kept = [new(0), new(1), new(2), (255 * stays) as u8];
+        *age = (stays * older) as u8;
+    }
+}
+
 /// A rigid map.
 #[derive(Debug, Clone, Copy)]
 pub struct Turn {
@@ -427,10 +498,9 @@ impl Ground {
         self.keep_inside()?;
         let (pose, side) = (self.pose, self.side);
         let (width, height) = (self.size.width as f32, self.size.height as f32);
-        let seen: &[Vec4b] = now.data_typed()?;
-        let stride = self.size.width as usize;
+        let picture = Picture { pixels: now.data_typed()?, width: self.size.width as usize };
         let memory: &mut [Vec4b] = self.memory.data_typed_mut()?;
-        // The exposure of 256, and what is three times the square of a calm difference.
+        // Of 256; and three times the square of a calm difference.
         let exposure = (256.0 / self.gain) as i32;
         let calm = (3.0 * (dry.calm / self.gain) * (dry.calm / self.gain)) as i32;
         let everywhere = [2.0, 0.0, 0.0];
@@ -449,57 +519,36 @@ impl Ground {
             if x1 <= x0 {
                 continue;
             }
+            let (x0, x1) = (x0 as usize, x1 as usize);
             // Where water is not far: to the left of the left side, or within the lines.
-            let reach = [0.0, side as f32];
-            let dry_from = |plane: Plane| at_least(value(plane), slope(plane), 1.0, reach);
-            let (right, inner, outer) = (dry_from(right), dry_from(inner), dry_from(outer));
-            let lies = |[from, to]: [f32; 2], x: f32| x >= from && x < to;
-            let fixed = |v: f32| (65536.0 * v) as i32;
-            let mut place = [fixed(from[0] + x0 * pose.cos), fixed(from[1] + x0 * pose.sin)];
-            let step = [fixed(pose.cos), fixed(pose.sin)];
+            let dry_from = |plane: Plane| at_least(value(plane), slope(plane), 1.0, [0.0, side as f32]).map(|x| x as i32);
+            let dry_spans = [dry_from(right), dry_from(inner), dry_from(outer)];
             let start = wrapped(y + self.origin[1], side) * side;
             let (row, ages) = (&mut memory[start..start + side], &mut self.ages[start..start + side]);
-            let mut column = wrapped(x0 as usize + self.origin[0], side);
-            for x in x0 as usize..x1 as usize {
-                let [px, py] = place;
-                place = [px + step[0], py + step[1]];
-                let (kept, age) = (&mut row[column].0, &mut ages[column]);
-                column = wrapped(column + 1, side);
-                let known = kept[3] > 0;
-                if known && !fresh {
+            // Known ground when its row's turn has come, unknown ground always; up to where the window wraps around.
+            let mut x = x0;
+            while x < x1 {
+                let column = wrapped(x + self.origin[0], side);
+                let most = RUN.min(x1 - x).min(side - column);
+                let run = &row[column..column + most];
+                let length = if fresh {
+                    most
+                } else if run[0][3] > 0 {
+                    x += run.iter().position(|p| p[3] == 0).unwrap_or(most);
                     continue;
-                }
-                let x = x as f32;
-                let (beside, inside) = (!lies(right, x), !lies(inner, x));
-                let close = beside || !lies(outer, x);
-                if !known && dry.flows && close {
-                    continue;
-                }
-                let corner = (py >> 16) as usize * stride + (px >> 16) as usize;
-                let (Some(upper), Some(lower)) = (seen.get(corner..corner + 2), seen.get(corner + stride..corner + stride + 2)) else {
-                    continue;
-                };
-                let (wx, wy) = (((px >> 8) & 255) as u64, ((py >> 8) & 255) as u64);
-                let top = mix(spread(upper[0].0), spread(upper[1].0), wx);
-                let colour = mix(top, mix(spread(lower[0].0), spread(lower[1].0), wx), wy);
-                let level = |k: usize| (((colour >> (16 * k)) & 0xff) as i32 * exposure + 128) >> 8;
-                let away = [0, 1, 2].map(|k| level(k) - i32::from(kept[k]));
-                let fits = away[0] * away[0] + away[1] * away[1] + away[2] * away[2] < calm;
-                let share = if !known {
-                    256
-                } else if close && (!fits || dry.flows && (beside || inside)) {
-                    *age += 1;
-                    if *age >= FORGOTTEN {
-                        (*kept, *age) = ([0; 4], 0);
-                    }
-                    continue;
-                } else if fits {
-                    FOLLOW
                 } else {
-                    FOLLOW_SLOWLY
+                    run.iter().position(|p| p[3] > 0).unwrap_or(most)
                 };
-                let [b, g, r] = [0, 1, 2].map(|k| (i32::from(kept[k]) + ((share * away[k] + 128) >> 8)).clamp(0, 255) as u8);
-                (*kept, *age) = ([b, g, r, 255], 0);
+                let place = [from[0] + x as f32 * pose.cos, from[1] + x as f32 * pose.sin];
+                let seen = picture.along(place, [pose.cos, pose.sin], length);
+                let range = column..column + length;
+                follow(
+                    &seen,
+                    &mut row[range.clone()],
+                    &mut ages[range],
+                    Following { x: x as i32, dry_spans, flows: dry.flows, exposure, calm },
+                );
+                x += length;
             }
         }
         let (first, every) = if self.frame == 0 { (0, 1) } else { (self.frame % MARK_EVERY, MARK_EVERY) };
