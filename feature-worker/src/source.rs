@@ -108,7 +108,8 @@ pub struct Shared {
 #[derive(Debug, Clone, Copy)]
 pub struct Numbering {
     sequence: u64,
-    last_ms: Option<f64>,
+    /// When the last frame was due by the frames before it.
+    due_ms: Option<f64>,
     last_ns: u64,
     period_ms: f64,
 }
@@ -116,17 +117,23 @@ pub struct Numbering {
 impl Numbering {
     /// For a camera with `fps` frames a second that was opened at `opened_ns`.
     pub fn new(fps: f64, opened_ns: u64) -> Self {
-        Self { sequence: 0, last_ms: None, last_ns: opened_ns, period_ms: 1e3 / fps }
+        Self { sequence: 0, due_ms: None, last_ns: opened_ns, period_ms: 1e3 / fps }
     }
 
     /// Number and time, CLOCK_MONOTONIC ns, of a frame that was read at `now_ns`, with the device's timestamp `at_ms`. Without a
     /// timestamp it is the one after the last, of now.
     pub fn next(&mut self, at_ms: Option<f64>, now_ns: u64) -> (u64, u64) {
-        let periods = match (self.last_ms, at_ms) {
-            (Some(last), Some(at)) => ((at - last) / self.period_ms).round().clamp(1.0, 1e6) as u64,
-            _ => 1,
+        let mut periods = 1;
+        self.due_ms = match (self.due_ms, at_ms) {
+            (Some(last), Some(at)) => {
+                // A busy kernel stamps a frame late, never early. So three quarters of a period count as late, not as a lost frame, and
+                // when the next ones are due follows early ones at once, late ones slowly (the camera may be a little slow itself).
+                periods = ((at - last) / self.period_ms - 0.25).round().clamp(1.0, 1e6) as u64;
+                let due = last + periods as f64 * self.period_ms;
+                Some(due + (at - due).min((at - due) * 0.05))
+            }
+            _ => at_ms,
         };
-        self.last_ms = at_ms;
         self.sequence += periods;
         // Drivers stamp with CLOCK_MONOTONIC; one with another clock is after now, or before the last frame or the opening.
         let at_ns = at_ms.map(|ms| (ms * 1e6) as u64);

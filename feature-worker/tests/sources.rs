@@ -131,14 +131,23 @@ fn bad_configurations_are_refused_with_key_and_hint() -> Outcome {
     Ok(())
 }
 
-/// Protects the count of lost frames of a V4L2 device: a frame that the driver dropped leaves a gap in the numbers, jitter does not, and
-/// a device without timestamps is counted by its frames.
+/// Protects the count of lost frames of a V4L2 device: a frame that the driver dropped leaves a gap in the numbers; jitter, a busy kernel
+/// that stamps late and a camera that is 1 % slow or fast do not; a device without timestamps is counted by its frames.
 #[test]
 fn a_lost_frame_leaves_a_gap() {
     let mut numbering = Numbering::new(30.0, 0);
     let stamps = [1000.0, 1033.0, 1068.0, 1099.0, 1166.5, 1200.0, 1333.3];
     assert_eq!(stamps.map(|ms| numbering.next(Some(ms), u64::MAX).0), [1, 2, 3, 4, 6, 7, 11]);
     assert_eq!(numbering.next(None, u64::MAX).0, 12);
+    for rate in [0.99, 1.0, 1.01] {
+        let mut numbering = Numbering::new(25.0, 0);
+        let late_ms = |i: u64| [0.0, 25.0, 0.0, 0.0, 20.0, 5.0, 25.0][i as usize % 7];
+        let lost = |i: u64| i % 100 == 50;
+        for i in (0..2000).filter(|i| !lost(*i)) {
+            let at_ms = 1000.0 + i as f64 * 40.0 * rate + late_ms(i);
+            assert_eq!(numbering.next(Some(at_ms), u64::MAX).0, i + 1, "rate {rate}");
+        }
+    }
 }
 
 /// Protects the age of a frame, on which "stale" and the angle it belongs to rest: one that waited in the driver keeps the driver's time;
