@@ -1,7 +1,7 @@
 //! Frames from a V4L2 device, a video file, an image sequence (all through OpenCV) or the cell's shared memory.
 //!
-//! Called from the extraction thread only; [`Source::next`] waits at most the given time (a device: as long as its driver
-//! does). Shared memory is read where it lies; OpenCV's captures reuse one matrix. Every failure is a [`SourceError`] that
+//! Called from the extraction thread only; [`Source::next`] waits at most the given time (a device: until a frame, a signal or
+//! OpenCV's 10 s). Shared memory is read where it lies; OpenCV's captures reuse one matrix. Every failure is a [`SourceError`] that
 //! says what to do, also for a camera that is unplugged, a truncated file and frames that change their size.
 
 use std::time::Duration;
@@ -261,7 +261,7 @@ impl Capture {
         Ok(Self { capture, camera: camera.clone(), image: Mat::default(), numbering, due_ns, period_ns: (1e9 / fps) as u64 })
     }
 
-    /// The next frame; waits up to `timeout` (a device: as long as its driver does).
+    /// The next frame; waits up to `timeout` (a device: until a frame, a signal or OpenCV's 10 s).
     pub fn next(&mut self, timeout: Duration) -> Result<Next<'_>, SourceError> {
         if let Some(due_ns) = self.due_ns {
             let now_ns = os::now_ns();
@@ -280,7 +280,7 @@ impl Capture {
         let now_ns = os::now_ns();
         if !read || self.image.empty() {
             return match self.camera.source {
-                // A damaged MJPEG picture: the next one's number shows the gap.
+                // A damaged MJPEG picture: the next one's number shows the gap. (OpenCV 4.6 repeats the last picture instead.)
                 CameraSource::Device if grabbed => Ok(Next::Nothing),
                 CameraSource::Device => Err(SourceError::Lost(self.camera.path.clone())),
                 _ if self.numbering.sequence == 0 => Err(SourceError::Open {
