@@ -1,7 +1,7 @@
 //! Frames from a V4L2 device, a video file, an image sequence (all through OpenCV) or the cell's shared memory.
 //!
-//! Called from the extraction thread only; [`Source::next`] waits at most the given time (a device: as long as its driver
-//! does). Shared memory is read where it lies; OpenCV's captures reuse one matrix. Every failure is a [`SourceError`] that
+//! Called from the extraction thread only; [`Source::next`] waits at most the given time (a device: until a frame, a signal or
+//! OpenCV's 10 s). Shared memory is read where it lies; OpenCV's captures reuse one matrix. Every failure is a [`SourceError`] that
 //! says what to do, also for a camera that is unplugged, a truncated file and frames that change their size.
 
 use std::time::Duration;
@@ -27,6 +27,18 @@ pub enum SourceError {
         path: String,
         /// What is wrong and what to do.
         what: String,
+    },
+    /// The device does not have the size configured.
+    #[error(
+        "camera.width_px, camera.height_px = {} x {}: the camera gives {} x {} instead; write these and calibrate, or choose a size of \
+         `v4l2-ctl --list-formats-ext`",
+        configured.0, configured.1, device.0, device.1
+    )]
+    Size {
+        /// `[camera] width_px` and `height_px`.
+        configured: (u32, u32),
+        /// What the device says.
+        device: (u32, u32),
     },
     /// The device gives another rate than configured.
     #[error(
@@ -92,39 +104,72 @@ pub struct Shared {
     _topic: FrameTopic,
 }
 
-/// Numbers frames by the time between them, so that a lost one leaves a gap.
+/// Numbers and dates frames by the device's timestamps, so that a lost one leaves a gap and one that waited in the driver is old.
 #[derive(Debug, Clone, Copy)]
 pub struct Numbering {
     sequence: u64,
-    last_ms: Option<f64>,
+    /// When the last frame was due by the frames before it.
+    due_ms: Option<f64>,
+    last_ns: u64,
     period_ms: f64,
 }
 
 impl Numbering {
-    /// For a camera with `fps` frames a second.
-    pub fn new(fps: f64) -> Self {
-        Self { sequence: 0, last_ms: None, period_ms: 1e3 / fps }
+    /// For a camera with `fps` frames a second that was opened at `opened_ns`.
+    pub fn new(fps: f64, opened_ns: u64) -> Self {
+        Self { sequence: 0, due_ms: None, last_ns: opened_ns, period_ms: 1e3 / fps }
     }
 
-    /// The number of the frame with the device's timestamp `at_ms`; none: the one after the last.
-    pub fn next(&mut self, at_ms: Option<f64>) -> u64 {
-        let periods = match (self.last_ms, at_ms) {
-            (Some(last), Some(at)) => ((at - last) / self.period_ms).round().clamp(1.0, 1e6) as u64,
-            _ => 1,
+    /// Number and time, CLOCK_MONOTONIC ns, of a frame that was read at `now_ns`, with the device's timestamp `at_ms`. Without a
+    /// timestamp it is the one after the last, of now.
+    pub fn next(&mut self, at_ms: Option<f64>, now_ns: u64) -> (u64, u64) {
+        let mut periods = 1;
+        self.due_ms = match (self.due_ms, at_ms) {
+            (Some(last), Some(at)) => {
+                // A busy kernel stamps a frame late, never early. So three quarters of a period count as late, not as a lost frame, and
+                // when the next ones are due follows early ones at once, late ones slowly (the camera may be a little slow itself).
+                periods = ((at - last) / self.period_ms - 0.25).round().clamp(1.0, 1e6) as u64;
+                let due = last + periods as f64 * self.period_ms;
+                Some(due + (at - due).min((at - due) * 0.05))
+            }
+            _ => at_ms,
         };
-        self.last_ms = at_ms;
         self.sequence += periods;
-        self.sequence
+        // Drivers stamp with CLOCK_MONOTONIC; one with another clock is after now, or before the last frame or the opening.
+        let at_ns = at_ms.map(|ms| (ms * 1e6) as u64);
+        self.last_ns = at_ns.filter(|at| (self.last_ns + 1..=now_ns).contains(at)).unwrap_or(now_ns);
+        (self.sequence, self.last_ns)
     }
 }
 
-/// A device that gives another rate than configured would make every gap between frames look like loss. `device`: 0 when it does not
-/// tell.
+/// A device that gives another rate than configured would make every gap between frames look like loss. `device`: 0 or less when
+/// it does not tell.
 pub fn check_rate(configured: f64, device: f64) -> Result<(), SourceError> {
     if device > 0.0 && (device / configured - 1.0).abs() > 0.02 {
         return Err(SourceError::Rate { configured, device });
     }
     Ok(())
+}
+
+/// Sets a device's size and rate; refuses it if it took others.
+fn set_mode(capture: &mut VideoCapture, camera: &CameraConfig) -> Result<(), SourceError> {
+    for (property, value) in [
+        (videoio::CAP_PROP_FRAME_WIDTH, f64::from(camera.width_px)),
+        (videoio::CAP_PROP_FRAME_HEIGHT, f64::from(camera.height_px)),
+        // The newest frame, not the oldest.
+        (videoio::CAP_PROP_BUFFERSIZE, 2.0),
+        // Last: with each of the others OpenCV starts the device anew and spoils a rate that is no whole number.
+        (videoio::CAP_PROP_FPS, camera.fps),
+    ] {
+        // A driver may refuse a property; what counts is what it then gives.
+        let _ = capture.set(property, value)?;
+    }
+    let configured = (camera.width_px, camera.height_px);
+    let device = (capture.get(videoio::CAP_PROP_FRAME_WIDTH)? as u32, capture.get(videoio::CAP_PROP_FRAME_HEIGHT)? as u32);
+    if device != configured {
+        return Err(SourceError::Size { configured, device });
+    }
+    check_rate(camera.fps, capture.get(videoio::CAP_PROP_FPS)?)
 }
 
 /// Frames through OpenCV.
@@ -203,29 +248,20 @@ impl Capture {
                 _ => "is no video that OpenCV can read, or it is truncated",
             }));
         }
-        if device {
-            for (property, value) in [
-                (videoio::CAP_PROP_FRAME_WIDTH, f64::from(camera.width_px)),
-                (videoio::CAP_PROP_FRAME_HEIGHT, f64::from(camera.height_px)),
-                (videoio::CAP_PROP_FPS, camera.fps),
-                // The newest frame, not the oldest.
-                (videoio::CAP_PROP_BUFFERSIZE, 2.0),
-            ] {
-                // A driver may refuse a property; what counts is the frame's size, which is checked.
-                let _ = capture.set(property, value)?;
-            }
+        // OpenCV takes raw pictures where it can. Many cameras give a large size at full rate only as MJPEG.
+        if device && let Err(raw) = set_mode(&mut capture, camera) {
+            let mjpeg = videoio::VideoWriter::fourcc('M', 'J', 'P', 'G')?;
+            let _ = capture.set(videoio::CAP_PROP_FOURCC, f64::from(mjpeg))?;
+            set_mode(&mut capture, camera).map_err(|_| raw)?;
         }
         let own_fps = capture.get(videoio::CAP_PROP_FPS)?;
-        if device {
-            check_rate(camera.fps, own_fps)?;
-        }
         let fps = if camera.source == CameraSource::Video && own_fps > 0.0 { own_fps } else { camera.fps };
-        let numbering = Numbering::new(fps);
+        let numbering = Numbering::new(fps, os::now_ns());
         let due_ns = (!device && real_time).then(os::now_ns);
         Ok(Self { capture, camera: camera.clone(), image: Mat::default(), numbering, due_ns, period_ns: (1e9 / fps) as u64 })
     }
 
-    /// The next frame; waits up to `timeout` (a device: as long as its driver does).
+    /// The next frame; waits up to `timeout` (a device: until a frame, a signal or OpenCV's 10 s).
     pub fn next(&mut self, timeout: Duration) -> Result<Next<'_>, SourceError> {
         if let Some(due_ns) = self.due_ns {
             let now_ns = os::now_ns();
@@ -239,10 +275,13 @@ impl Capture {
             self.due_ns = Some(due_ns.max(now_ns.saturating_sub(self.period_ns)) + self.period_ns);
         }
         // A damaged picture in the middle is an error of the decoder; the end of a file is not.
-        let read = self.capture.read(&mut self.image).unwrap_or(false);
-        let captured_at_ns = os::now_ns();
+        let grabbed = self.capture.grab().unwrap_or(false);
+        let read = grabbed && self.capture.retrieve_def(&mut self.image).unwrap_or(false);
+        let now_ns = os::now_ns();
         if !read || self.image.empty() {
             return match self.camera.source {
+                // A damaged MJPEG picture: the next one's number shows the gap. (OpenCV 4.6 repeats the last picture instead.)
+                CameraSource::Device if grabbed => Ok(Next::Nothing),
                 CameraSource::Device => Err(SourceError::Lost(self.camera.path.clone())),
                 _ if self.numbering.sequence == 0 => Err(SourceError::Open {
                     path: self.camera.path.clone(),
@@ -251,12 +290,12 @@ impl Capture {
                 _ => Ok(Next::End),
             };
         }
-        // The driver stamps each buffer when it is filled, so also one that is read late has its own time.
+        // The driver stamps each buffer when it is filled, so also one that is read late, or decoded slowly, has its own time.
         let stamp_ms = match self.camera.source {
             CameraSource::Device => Some(self.capture.get(videoio::CAP_PROP_POS_MSEC)?).filter(|ms| *ms > 0.0),
             _ => None,
         };
-        let sequence = self.numbering.next(stamp_ms);
+        let (sequence, captured_at_ns) = self.numbering.next(stamp_ms, now_ns);
         let format = match self.image.typ() {
             CV_8UC3 => PixelFormat::Bgr8,
             CV_8UC1 => PixelFormat::Mono8,
@@ -272,7 +311,7 @@ impl Capture {
             height_px: self.image.rows() as u32,
             sequence,
             captured_at_ns,
-            published_at_ns: captured_at_ns,
+            published_at_ns: now_ns,
         };
         Ok(Next::Frame(Frame { header, pixels: self.image.data_bytes()? }))
     }

@@ -80,6 +80,8 @@ fn show(args: &Args, config: &Config) -> Result<(), Failure> {
                 Ok(Next::Frame(frame)) => frame,
                 Ok(Next::Nothing) => continue,
                 Ok(Next::End) => break Ok(()),
+                // The signal also cut short the wait for a device, which then looks lost.
+                Err(_) if stop.load(Relaxed) => break Ok(()),
                 Err(e) => break Err(failure(exit::UNREACHABLE, e)),
             };
             let Some(format) = PixelFormat::from_code(frame.header.format) else { continue };

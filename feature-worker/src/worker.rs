@@ -119,6 +119,8 @@ fn work(config: &Config, json: bool) -> Result<(), Failure> {
                 continue;
             }
             Ok(Next::End) => break Ok(()),
+            // The signal also cut short the wait for a device, which then looks lost.
+            Err(_) if stop.load(Relaxed) => break Ok(()),
             Err(e) => break Err(failure(exit::UNREACHABLE, e)),
         };
         let received_at_ns = os::now_ns();

@@ -131,14 +131,44 @@ fn bad_configurations_are_refused_with_key_and_hint() -> Outcome {
     Ok(())
 }
 
-/// Protects the count of lost frames of a V4L2 device: a frame that the driver dropped leaves a gap in the numbers, jitter does not, and
-/// a device without timestamps is counted by its frames.
+/// Protects the count of lost frames of a V4L2 device: a frame that the driver dropped leaves a gap in the numbers; jitter, a busy kernel
+/// that stamps late and a camera that is 1 % slow or fast do not; a device without timestamps is counted by its frames.
 #[test]
 fn a_lost_frame_leaves_a_gap() {
-    let mut numbering = Numbering::new(30.0);
+    let mut numbering = Numbering::new(30.0, 0);
     let stamps = [1000.0, 1033.0, 1068.0, 1099.0, 1166.5, 1200.0, 1333.3];
-    assert_eq!(stamps.map(|ms| numbering.next(Some(ms))), [1, 2, 3, 4, 6, 7, 11]);
-    assert_eq!(numbering.next(None), 12);
+    assert_eq!(stamps.map(|ms| numbering.next(Some(ms), u64::MAX).0), [1, 2, 3, 4, 6, 7, 11]);
+    assert_eq!(numbering.next(None, u64::MAX).0, 12);
+    for rate in [0.99, 1.0, 1.01] {
+        let mut numbering = Numbering::new(25.0, 0);
+        let late_ms = |i: u64| [0.0, 25.0, 0.0, 0.0, 20.0, 5.0, 25.0][i as usize % 7];
+        let lost = |i: u64| i % 100 == 50;
+        for i in (0..2000).filter(|i| !lost(*i)) {
+            let at_ms = 1000.0 + i as f64 * 40.0 * rate + late_ms(i);
+            assert_eq!(numbering.next(Some(at_ms), u64::MAX).0, i + 1, "rate {rate}");
+        }
+    }
+}
+
+/// Protects the age of a frame, on which "stale" and the angle it belongs to rest: one that waited in the driver keeps the driver's time;
+/// timestamps of another clock (wall clock, counted from the device's start, jumping back) are not believed, and no two frames are
+/// of one time.
+#[test]
+fn a_frame_is_as_old_as_its_driver_says() {
+    let ns = |ms: u64| ms * 1_000_000;
+    let mut monotonic = Numbering::new(30.0, ns(50_000));
+    let frames = [(50_100.5, 50_102), (50_134.0, 50_140), (50_167.0, 50_900), (50_200.0, 50_901), (50_934.0, 50_936)];
+    let dated = frames.map(|(at_ms, now)| monotonic.next(Some(at_ms), ns(now)).1);
+    assert_eq!(dated, [50_100_500_000, 50_134_000_000, 50_167_000_000, 50_200_000_000, 50_934_000_000]);
+    assert_eq!(monotonic.next(Some(50_900.0), ns(50_970)).1, ns(50_970), "a jump back");
+    assert_eq!(monotonic.next(None, ns(51_000)).1, ns(51_000), "no timestamp");
+    for from_ms in [0.0, 49_000.0, 1.7e12] {
+        let mut other = Numbering::new(30.0, ns(50_000));
+        for now in (50_100..53_000).step_by(33) {
+            let at_ms = from_ms + (now - 50_000) as f64;
+            assert_eq!(other.next(Some(at_ms), ns(now)).1, ns(now), "clock from {from_ms} ms");
+        }
+    }
 }
 
 /// Protects the count of frames from a camera that runs at another rate than configured: refused with key and hint; a device that
