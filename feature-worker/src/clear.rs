@@ -35,9 +35,9 @@ const DENSE_PX: f32 = 48.0;
 /// Within this distance from the lip the ground tells whether it is even; beyond it, whether it is another picture.
 const MIDDLE_PX: f32 = 60.0;
 /// Lines that are tried: distances on either axis in geometric steps, and the largest ratios of the two.
-const LEGS: usize = 46;
+const LEGS: usize = 41;
 const LEG_FIRST_PX: f32 = 6.5;
-const LEG_FACTOR: f32 = 1.07;
+const LEG_FACTOR: f32 = 1.08;
 const LEGS_FLAT: f32 = 4.0;
 const LEGS_STEEP: f32 = 2.0;
 /// Least noise, grey levels (rounding), and as a share of the background's brightness (the exposure is not known better).

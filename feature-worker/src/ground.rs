@@ -426,7 +426,7 @@ impl Ground {
     fn improve(&mut self, fine: usize, mut motion: Motion, before: Motion) -> opencv::Result<(Motion, f32, f32)> {
         let picture = [&self.half, &self.grey][fine];
         let (now, width, height) = (picture.data_bytes()?, picture.cols() as usize, picture.rows() as usize);
-        let (scale, corner) = [(0.5, -0.25), (1.0, 0.0)][fine];
+        let (scale, corner, close) = [(0.5, -0.25, 0.2), (1.0, 0.0, 0.05)][fine];
         let now_at = |x: f32, y: f32| {
             let (column, row, fx, fy) = between(x, y, width, height)?;
             let (upper, lower) = (now.get(row * width + column..)?, now.get((row + 1) * width + column..)?);
@@ -485,7 +485,7 @@ impl Ground {
             motion.shift = [motion.shift[0] - change[0], motion.shift[1] - change[1]];
             motion.turn -= change[2];
             gain -= change[3];
-            if change[0].abs() + change[1].abs() < 0.05 && change[2].abs() < 0.0005 {
+            if change[0].abs() + change[1].abs() < close && change[2].abs() < 0.01 * close {
                 break;
             }
         }
