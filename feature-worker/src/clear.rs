@@ -98,6 +98,8 @@ const WET_OUTSIDE: f32 = 0.5;
 const SHAPE_MOST: f32 = 0.7;
 const SIZE_MOST: f32 = 1.0;
 const HEIGHT_LEAST: f32 = 0.3;
+/// A smaller triangle is a bead that hangs at the lip, px^2.
+const BEAD_PX2: f32 = 24.0;
 /// Frames after a stream during which the place where it was is not taken for background at once.
 const AFTERWARDS: u32 = 3;
 
@@ -508,9 +510,14 @@ impl ClearWater {
     pub fn confirm(&mut self, fine: Option<([f32; 2], f32)>) -> bool {
         let Some(stream) = &mut self.stream else { return false };
         let young = stream.age <= 1.0;
+        let sine = (self.axes.x[0] * self.axes.y[1] - self.axes.x[1] * self.axes.y[0]).abs();
         let good = fine.is_some_and(|(legs_px, height)| {
-            let [a, b] = [0, 1].map(|k| (legs_px[k] / self.scale / stream.legs[k]).ln());
-            (a - b).abs() < SHAPE_MOST && (a + b).abs() < SIZE_MOST && (young || height > HEIGHT_LEAST * stream.height)
+            let legs = legs_px.map(|v| v / self.scale);
+            let [a, b] = [0, 1].map(|k| (legs[k] / stream.legs[k]).ln());
+            0.5 * legs[0] * legs[1] * sine > BEAD_PX2
+                && (a - b).abs() < SHAPE_MOST
+                && (a + b).abs() < SIZE_MOST
+                && (young || height > HEIGHT_LEAST * stream.height)
         });
         match fine {
             Some((legs_px, height)) if good => {
