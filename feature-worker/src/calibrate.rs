@@ -23,7 +23,7 @@ use tiny_http::{Response, Server};
 
 use crate::extract::{Axes, Extractor, Image};
 use crate::inspect::{for_each_frame, to_bgr};
-use crate::source::{Frame, Next, Source};
+use crate::source::{Frame, Next, Onlooker};
 use crate::view::{answer, draw, jpeg};
 
 /// Frames kept for learning and for the picture.
@@ -38,7 +38,7 @@ Show one whole pour: dry, tilting, flowing, back. The section is printed; --writ
 it names before you trust it: red must lie on the glass's top edge, green on its left side, white on the liquid's outline."
 )]
 pub struct Args {
-    /// Images, a video or a pattern of one pour; without any, the configured camera.
+    /// Images, a video or a pattern of one pour; without any, the configured camera (of a running worker: its frames).
     input: Vec<PathBuf>,
     /// The cell's configuration.
     #[arg(long, default_value = shared::config::DEFAULT_FILE)]
@@ -181,7 +181,7 @@ fn calibrate(args: &Args, mut config: Config) -> Result<(), Failure> {
 fn watch(args: &Args, config: &Config, seen: &mut Seen) -> Result<(), Failure> {
     let reach = |e: String| failure(exit::UNREACHABLE, e);
     let cell = Cell::join(&config.cell.name).map_err(|e| reach(e.to_string()))?;
-    let mut source = Source::open(&config.camera, &cell, true).map_err(|e| reach(e.to_string()))?;
+    let mut source = Onlooker::open(&config.camera, &cell).map_err(|e| reach(e.to_string()))?;
     eprintln!("calibrate: watching the camera for {} s; pour once now", args.seconds);
     let end = std::time::Instant::now() + Duration::from_secs(args.seconds);
     while std::time::Instant::now() < end {

@@ -2,13 +2,15 @@
 //!
 //! Called from the extraction thread only; [`Source::next`] waits at most the given time (a device: until a frame, a signal or
 //! OpenCV's 10 s). Shared memory is read where it lies; OpenCV's captures reuse one matrix. Every failure is a [`SourceError`] that
-//! says what to do, also for a camera that is unplugged, a truncated file and frames that change their size.
+//! says what to do, also for a camera that is unplugged, a truncated file and frames that change their size. Only one process can stream
+//! from a device, so who looks on beside the worker ([`Onlooker`]) takes the worker's frames.
 
 use std::time::Duration;
 
 use iceoryx2::port::listener::ListenerWaitError;
 use iceoryx2::port::subscriber::Subscriber;
 use iceoryx2::sample::Sample;
+use iceoryx2::service::port_factory::PortFactory as _;
 use opencv::core::{CV_8UC1, CV_8UC3, Mat};
 use opencv::prelude::*;
 use opencv::videoio::{self, VideoCapture};
@@ -28,6 +30,9 @@ pub enum SourceError {
         /// What is wrong and what to do.
         what: String,
     },
+    /// The device is there and cannot be used.
+    #[error("camera.path = \"{0}\": cannot be opened; does another program use it, and may this user read it (group 'video')?")]
+    Busy(String),
     /// The device does not have the size configured.
     #[error(
         "camera.width_px, camera.height_px = {} x {}: the camera gives {} x {} instead; write these and calibrate, or choose a size of \
@@ -184,18 +189,21 @@ pub struct Capture {
 }
 
 impl Source {
-    /// Opens the source of `camera`; shared memory is that of `cell`. A video or sequence is played at its own speed when
-    /// `real_time`, else as fast as it is read.
-    pub fn open(camera: &CameraConfig, cell: &Cell, real_time: bool) -> Result<Self, SourceError> {
-        if camera.source == CameraSource::SharedMemory {
-            let topic = cell.frames()?;
-            let subscriber = topic
-                .subscriber_builder()
-                .create()
-                .map_err(|e| SourceError::Broken(format!("{e:?} (at most 4 readers: is a second feature worker or view running?)")))?;
-            return Ok(Self::Shared(Box::new(Shared { sample: None, subscriber, listener: cell.frame_listener()?, _topic: topic })));
+    /// Opens the source of `camera`; shared memory is that of `cell`. A video or sequence is played at its own speed.
+    pub fn open(camera: &CameraConfig, cell: &Cell) -> Result<Self, SourceError> {
+        match camera.source {
+            CameraSource::SharedMemory => Self::shared(cell),
+            _ => Ok(Self::Capture(Box::new(Capture::open(camera, true)?))),
         }
-        Ok(Self::Capture(Box::new(Capture::open(camera, real_time)?)))
+    }
+
+    fn shared(cell: &Cell) -> Result<Self, SourceError> {
+        let topic = cell.frames()?;
+        let subscriber = topic
+            .subscriber_builder()
+            .create()
+            .map_err(|e| SourceError::Broken(format!("{e:?} (at most 4 readers: is a second feature worker or view running?)")))?;
+        Ok(Self::Shared(Box::new(Shared { sample: None, subscriber, listener: cell.frame_listener()?, _topic: topic })))
     }
 
     /// The next frame; waits up to `timeout`.
@@ -205,6 +213,37 @@ impl Source {
             Self::Capture(capture) => capture.next(timeout),
         }
     }
+}
+
+/// The camera for who looks on: the frames of the cell's worker when one runs, or else the camera itself. A worker that starts gets the
+/// camera, and its frames are taken from then on. One that ends is waited for: a worker that starts again never finds its camera taken.
+pub struct Onlooker<'a> {
+    source: Source,
+    cell: &'a Cell,
+    topic: FrameTopic,
+}
+
+impl<'a> Onlooker<'a> {
+    /// Opens whichever there is.
+    pub fn open(camera: &CameraConfig, cell: &'a Cell) -> Result<Self, SourceError> {
+        let topic = cell.frames()?;
+        let source = if published(&topic) { Source::shared(cell)? } else { Source::open(camera, cell)? };
+        Ok(Self { source, cell, topic })
+    }
+
+    /// The next frame; waits as [`Source::next`] does.
+    pub fn next(&mut self, timeout: Duration) -> Result<Next<'_>, SourceError> {
+        if matches!(self.source, Source::Capture(_)) && published(&self.topic) {
+            eprintln!("feature-worker: a worker starts in this cell; it gets the camera, and its frames are taken from now on");
+            self.source = Source::shared(self.cell)?;
+        }
+        self.source.next(timeout)
+    }
+}
+
+/// Whether a process publishes frames. One that was killed counts until the next process joins the cell.
+fn published(topic: &FrameTopic) -> bool {
+    topic.dynamic_config().number_of_publishers() > 0
 }
 
 impl Shared {
@@ -228,7 +267,8 @@ impl Shared {
 }
 
 impl Capture {
-    /// Opens a device, video or image sequence.
+    /// Opens a device, video or image sequence. A video or sequence is played at its own speed when `real_time`, else as fast as it
+    /// is read.
     pub fn open(camera: &CameraConfig, real_time: bool) -> Result<Self, SourceError> {
         let fail = |what: &str| SourceError::Open { path: camera.path.clone(), what: what.into() };
         let device = camera.source == CameraSource::Device;
@@ -242,11 +282,11 @@ impl Capture {
         };
         let mut capture = VideoCapture::from_file(&camera.path, backend).map_err(|e| fail(&format!("cannot be opened: {}", e.message)))?;
         if !capture.is_opened()? {
-            return Err(fail(match camera.source {
-                CameraSource::Device => "cannot be opened; does another program use it, and may this user read it (group 'video')?",
-                CameraSource::Images => "no first image; give a pattern such as frames/frame_%04d.png that starts at 0 or 1",
-                _ => "is no video that OpenCV can read, or it is truncated",
-            }));
+            return Err(match camera.source {
+                CameraSource::Device => SourceError::Busy(camera.path.clone()),
+                CameraSource::Images => fail("no first image; give a pattern such as frames/frame_%04d.png that starts at 0 or 1"),
+                _ => fail("is no video that OpenCV can read, or it is truncated"),
+            });
         }
         // OpenCV takes raw pictures where it can. Many cameras give a large size at full rate only as MJPEG.
         if device && let Err(raw) = set_mode(&mut capture, camera) {

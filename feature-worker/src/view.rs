@@ -1,7 +1,8 @@
 //! `feature-worker view`: the live stream with region, axes, outline, line, triangle, V_e and its history, in a local web page.
 //!
-//! A process of its own, so it never slows the worker: it reads the cell's frames as a further subscriber (a device or file is
-//! opened by itself, if nobody else holds it), measures them again with the same configuration and keeps the newest picture.
+//! A process of its own, so it never slows the worker: it reads the cell's frames as a further subscriber ([`Onlooker`]: a device or
+//! file is opened only while no worker runs), measures them again with the same configuration and keeps the newest picture. When no
+//! frames come any more it says so and goes on when they come again.
 //! Threads: this one measures; one answers the browser and compresses a picture only when it is asked for. Allocates.
 
 use std::path::PathBuf;
@@ -21,16 +22,21 @@ use tiny_http::{Header, Response, Server};
 
 use crate::extract::{Extractor, Image, Measurement};
 use crate::inspect::to_bgr;
-use crate::source::{Next, Source};
+use crate::source::{Next, Onlooker};
 
 /// Values of V_e that the page shows.
 const HISTORY: usize = 300;
+/// Without a frame for this long the page says so, ns.
+const SILENT_NS: u64 = 1_000_000_000;
 
 /// Command-line arguments.
 #[derive(Debug, clap::Args)]
 #[command(
     after_help = "Examples:\n  feature-worker view --config config/sim.toml\n  feature-worker view --config config/cell.toml --port 9000\n\n\
-Open the address that it prints in a browser on this machine. Ctrl-C ends it."
+Open the address that it prints in a browser on this machine. Ctrl-C ends it.
+
+Beside `feature-worker run` it shows the worker's frames. Without a worker it opens the camera itself, and leaves it to a worker that \
+starts. When the worker ends it waits for the next one."
 )]
 pub struct Args {
     /// The cell's configuration.
@@ -48,6 +54,8 @@ struct Shown {
     /// sequence, V_e, confidence, doubt.
     newest: (u64, f32, f32, &'static str),
     history: std::collections::VecDeque<f32>,
+    /// No frame for a second.
+    silent: bool,
 }
 
 /// Runs the command.
@@ -65,25 +73,34 @@ fn show(args: &Args, config: &Config) -> Result<(), Failure> {
     opencv::core::set_num_threads(1).or_exit(exit::FAILED)?;
     let mut extractor = Extractor::new(&config.camera, &config.image).or_exit(exit::BAD_INPUT)?;
     let cell = Cell::join(&config.cell.name).or_exit(exit::UNREACHABLE)?;
-    let mut source = Source::open(&config.camera, &cell, true).or_exit(exit::UNREACHABLE)?;
+    let mut source = Onlooker::open(&config.camera, &cell).or_exit(exit::UNREACHABLE)?;
     let server = Server::http(("127.0.0.1", args.port))
         .map_err(|e| failure(exit::FAILED, format!("port {} on 127.0.0.1: {e}; give another --port", args.port)))?;
     println!("http://{}", server.server_addr());
     let shown = Mutex::new(Shown::default());
     std::thread::scope(|scope| {
         scope.spawn(|| serve(&server, &shown, &stop));
+        let mut last_frame_ns = os::now_ns();
         let result = loop {
             if stop.load(Relaxed) {
                 break Ok(());
             }
             let frame = match source.next(Duration::from_millis(100)) {
                 Ok(Next::Frame(frame)) => frame,
-                Ok(Next::Nothing) => continue,
+                Ok(Next::Nothing) => {
+                    let mut shown = lock(&shown);
+                    if !shown.silent && os::now_ns() > last_frame_ns + SILENT_NS {
+                        shown.silent = true;
+                        eprintln!("feature-worker: no frames for a second; waiting for the worker or the camera driver to go on");
+                    }
+                    continue;
+                }
                 Ok(Next::End) => break Ok(()),
                 // The signal also cut short the wait for a device, which then looks lost.
                 Err(_) if stop.load(Relaxed) => break Ok(()),
                 Err(e) => break Err(failure(exit::UNREACHABLE, e)),
             };
+            last_frame_ns = os::now_ns();
             let Some(format) = PixelFormat::from_code(frame.header.format) else { continue };
             let (width_px, height_px) = (frame.header.width_px, frame.header.height_px);
             if frame.pixels.len() != width_px as usize * height_px as usize * format.bytes_per_pixel() {
@@ -99,6 +116,7 @@ fn show(args: &Args, config: &Config) -> Result<(), Failure> {
                 Ok((picture, measured)) => {
                     let mut shown = lock(&shown);
                     shown.picture = picture;
+                    shown.silent = false;
                     shown.newest = (frame.header.sequence, measured.area_px2, measured.confidence, measured.doubt.words());
                     if shown.history.len() >= HISTORY {
                         shown.history.pop_front();
@@ -129,7 +147,7 @@ fn serve(server: &Server, shown: &Mutex<Shown>, stop: &AtomicBool) {
                 let shown = lock(shown);
                 let (sequence, area_px2, confidence, doubt) = shown.newest;
                 let state = serde_json::json!({ "sequence": sequence, "area_px2": area_px2, "confidence": confidence, "doubt": doubt,
-                    "history": shown.history });
+                    "silent": shown.silent, "history": shown.history });
                 drop(shown);
                 request.respond(answer(state.to_string().into_bytes(), "application/json"))
             }

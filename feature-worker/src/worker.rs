@@ -1,9 +1,10 @@
 //! `feature-worker run`: measures V_e in every frame, publishes it and hands the frame to the recorder.
 //!
 //! Threads: the extraction thread (this one; pinned and prioritised as `[worker]` says) takes a frame, measures, publishes,
-//! then offers the frame to the recorder, which never blocks; the status thread prints once a second what the extraction
-//! thread left in a queue of one. The recorder's thread is its own. The extraction thread does no file or terminal I/O after
-//! the start. A driver that stops or restarts is waited for; a lost device ends the process with its reason.
+//! then offers the frame to the recorder and, if it comes from a device or file, to who looks on; neither ever blocks. The status
+//! thread prints once a second what the extraction thread left in a queue of one. The recorder's thread is its own. The extraction
+//! thread does no file or terminal I/O after the start. A driver that stops or restarts is waited for; a lost device ends the process
+//! with its reason.
 
 use std::path::PathBuf;
 use std::sync::Arc;
@@ -11,21 +12,25 @@ use std::sync::atomic::{AtomicBool, Ordering::Relaxed};
 use std::time::Duration;
 
 use crossbeam::queue::ArrayQueue;
+use iceoryx2::port::publisher::Publisher;
+use iceoryx2::service::port_factory::PortFactory as _;
 use serde::Serialize;
 use shared::config::{CameraSource, Config};
 use shared::exit::{self, Failure, OrExit as _, failure};
-use shared::ipc::Cell;
-use shared::messages::{Doubt, Feature, LAYOUT_VERSION, PixelFormat};
+use shared::ipc::{Cell, FrameNotifier, FrameTopic};
+use shared::messages::{Doubt, Feature, FrameHeader, LAYOUT_VERSION, PixelFormat};
 use shared::os;
 
 use crate::extract::{Extractor, Image, Measurement};
 use crate::recorder::Recorder;
-use crate::source::{Next, Source};
+use crate::source::{Frame, Next, Source, SourceError};
 
 /// How long a wait for a frame lasts before signals and silence are looked at.
 const WAIT: Duration = Duration::from_millis(100);
 /// A camera without a frame for this long is reported as silent, ns.
 const SILENT_NS: u64 = 1_000_000_000;
+/// How long a view that holds the camera may take to let go of it, ns.
+const LET_GO_NS: u64 = 3_000_000_000;
 
 /// Command-line arguments.
 #[derive(Debug, clap::Args)]
@@ -85,10 +90,20 @@ fn work(config: &Config, json: bool) -> Result<(), Failure> {
             format!("cell '{}': service 'feature': {e:?}; is another feature worker running? Stop it first", config.cell.name),
         )
     })?;
-    let mut source = Source::open(&config.camera, &cell, true).map_err(|e| match config.camera.source {
-        CameraSource::SharedMemory => failure(exit::UNREACHABLE, e),
-        _ => failure(exit::BAD_INPUT, e),
-    })?;
+    // Before the camera is opened: by this a view that holds it sees the worker, and lets go.
+    let onlookers = match config.camera.source {
+        CameraSource::SharedMemory => None,
+        _ => Some(Onlookers::new(&cell, config)?),
+    };
+    let begin_ns = os::now_ns();
+    let mut source = loop {
+        match Source::open(&config.camera, &cell) {
+            Ok(source) => break source,
+            Err(SourceError::Busy(_)) if os::now_ns() < begin_ns + LET_GO_NS && !stop.load(Relaxed) => std::thread::sleep(WAIT),
+            Err(e) if onlookers.is_none() => return Err(failure(exit::UNREACHABLE, e)),
+            Err(e) => return Err(failure(exit::BAD_INPUT, e)),
+        }
+    };
     // Threads inherit the core and the priority, so the others start first.
     let recorder = Recorder::start(config).or_exit(exit::FAILED)?;
     let latest = Arc::new(ArrayQueue::new(1));
@@ -167,6 +182,9 @@ fn work(config: &Config, json: bool) -> Result<(), Failure> {
             break Err(failure(exit::FAILED, format!("service 'feature': {e:?}; is /dev/shm full?")));
         }
         recorder.offer(&header, frame.pixels, &feature);
+        if let Some(onlookers) = &onlookers {
+            onlookers.offer(&frame);
+        }
         status = Status {
             frames: status.frames + 1,
             doubtful: status.doubtful + u64::from(measured.doubt != Doubt::None),
@@ -185,6 +203,40 @@ fn work(config: &Config, json: bool) -> Result<(), Failure> {
     recorder.stop();
     let _ = printer.join();
     result
+}
+
+/// Publishes the frames of a device or file for who looks on (`view`, `calibrate`), who could not open a device beside the worker.
+struct Onlookers {
+    publisher: Publisher<iceoryx2::service::ipc::Service, [u8], FrameHeader>,
+    notifier: FrameNotifier,
+    topic: FrameTopic,
+}
+
+impl Onlookers {
+    fn new(cell: &Cell, config: &Config) -> Result<Self, Failure> {
+        let topic = cell.frames().or_exit(exit::UNREACHABLE)?;
+        let bytes = config.camera.width_px as usize * config.camera.height_px as usize * PixelFormat::Bgr8.bytes_per_pixel();
+        let publisher = topic.publisher_builder().initial_max_slice_len(bytes).create().map_err(|e| {
+            failure(
+                exit::UNREACHABLE,
+                format!("cell '{}': service 'frame': {e:?}; is a camera driver running? Stop it first", config.cell.name),
+            )
+        })?;
+        Ok(Self { publisher, notifier: cell.frame_notifier().or_exit(exit::UNREACHABLE)?, topic })
+    }
+
+    /// Publishes a frame if somebody subscribes: one copy, into shared memory that was made at the start. Never waits: who is slow
+    /// loses the oldest. Allocates only when somebody comes or goes.
+    fn offer(&self, frame: &Frame) {
+        if self.topic.dynamic_config().number_of_subscribers() == 0 {
+            return;
+        }
+        // A frame larger than configured has no room, and whatever goes wrong here is no reason to end a pour.
+        let Ok(mut sample) = self.publisher.loan_slice_uninit(frame.pixels.len()) else { return };
+        *sample.user_header_mut() = FrameHeader { published_at_ns: os::now_ns(), ..frame.header };
+        let _ = sample.write_from_slice(frame.pixels).send();
+        let _ = self.notifier.notify();
+    }
 }
 
 /// Thread "status": one line a second while frames come, one when they stop.

@@ -1,4 +1,5 @@
-//! `feature-worker run` and `view` as processes on a real cell's shared memory, with this test as the camera driver.
+//! `feature-worker run` and `view` as processes on a real cell's shared memory, with this test as the camera driver, or with pictures that
+//! the worker reads itself, as it does a device.
 
 mod drawn;
 
@@ -11,6 +12,7 @@ use drawn::{HEIGHT, Outcome, WIDTH, pour, write_config};
 use iceoryx2::port::publisher::Publisher;
 use iceoryx2::port::subscriber::Subscriber;
 use opencv::prelude::*;
+use shared::config::CameraSource;
 use shared::ipc::{Cell, FrameNotifier};
 use shared::messages::{Doubt, Feature, FrameHeader, LAYOUT_VERSION, PixelFormat};
 use shared::os::now_ns;
@@ -206,6 +208,169 @@ fn http(address: &str, request: &str, path: &str, body: &str) -> Result<(String,
     stream.read_to_end(&mut answer)?;
     let split = answer.windows(4).position(|w| w == b"\r\n\r\n").ok_or("no head")?;
     Ok((String::from_utf8_lossy(&answer[..split]).into_owned(), answer[split + 4..].to_vec()))
+}
+
+/// A pour of `PICTURES` frames again and again for five minutes, as a camera that the worker reads itself. Gives the pattern.
+fn write_pictures(directory: &Path) -> Result<String, Failure> {
+    for i in 0..9000 {
+        let file = |i: u64| directory.join(format!("f_{i:05}.png"));
+        if i < PICTURES {
+            let fast = opencv::core::Vector::from_slice(&[opencv::imgcodecs::IMWRITE_PNG_COMPRESSION, 1]);
+            opencv::imgcodecs::imwrite(file(i), &pour(i as i32)?, &fast)?;
+        } else {
+            std::fs::hard_link(file(i % PICTURES), file(i))?;
+        }
+    }
+    Ok(directory.join("f_%05d.png").display().to_string())
+}
+
+const PICTURES: u64 = 36;
+
+/// KiB that the cell holds in shared memory; what was never written is not counted.
+fn held_kib(cell: &str) -> std::io::Result<u64> {
+    use std::os::unix::fs::MetadataExt as _;
+    let prefix = format!("decant_{cell}_");
+    let files = std::fs::read_dir("/dev/shm")?.flatten().filter(|f| f.file_name().to_string_lossy().starts_with(&prefix));
+    Ok(files.map(|f| f.metadata().map_or(0, |m| m.blocks() / 2)).sum())
+}
+
+/// Protects who looks on beside a worker that reads the camera itself (only one process can stream from a device): each frame comes with
+/// the camera's number and time and the very pixels that were measured, after its feature. And protects the pour from them: without a
+/// subscriber no frame is copied, and one that does not read costs no feature and has the newest frames when it reads again.
+#[test]
+fn a_worker_with_its_own_camera_shares_its_frames() -> Outcome {
+    let directory = tempfile::tempdir()?;
+    let pattern = write_pictures(directory.path())?;
+    let (path, config) = write_config(directory.path(), "shares", |c| {
+        (c.camera.source, c.camera.path) = (CameraSource::Images, pattern.clone());
+    })?;
+    let _cleanup = Cleanup(config.cell.name.clone());
+    let cell = Cell::join(&config.cell.name)?;
+    let features = cell.features()?.subscriber_builder().buffer_size(64).create()?;
+    let _worker = Program::start("run", &path, &[])?;
+    let feature = || -> Result<Feature, Failure> {
+        let begin = Instant::now();
+        while begin.elapsed() < PATIENCE {
+            if let Some(feature) = features.receive()? {
+                return Ok(*feature);
+            }
+            std::thread::sleep(Duration::from_millis(2));
+        }
+        Err("no feature".into())
+    };
+    let mut newest = feature()?;
+    let mut follow = |count: usize| -> Result<Vec<Feature>, Failure> {
+        let mut seen = Vec::new();
+        while seen.len() < count {
+            let feature = feature()?;
+            assert_eq!(feature.sequence, newest.sequence + 1, "no frame is lost");
+            newest = feature;
+            seen.push(feature);
+        }
+        Ok(seen)
+    };
+    let mut known = follow(30)?;
+    let alone_kib = held_kib(&config.cell.name)?;
+    let frame_kib = (WIDTH * HEIGHT * 3 / 1024) as u64;
+    assert!(alone_kib < frame_kib, "{alone_kib} KiB in shared memory: frames are copied for nobody");
+
+    let frames = cell.frames()?.subscriber_builder().create()?;
+    let mut compared = 0;
+    while compared < 20 {
+        known.extend(follow(1)?);
+        while let Some(frame) = frames.receive()? {
+            let header = *frame.user_header();
+            // Frames come after their features, so this one's has come, or comes at once.
+            while known.last().is_none_or(|f| f.sequence < header.sequence) {
+                known.extend(follow(1)?);
+            }
+            let feature = known.iter().find(|f| f.sequence == header.sequence).ok_or("a frame that was not measured")?;
+            let bgr = PixelFormat::Bgr8 as u32;
+            assert_eq!((header.version, header.format, header.width_px, header.height_px), (LAYOUT_VERSION, bgr, 640, 480));
+            assert_eq!(header.captured_at_ns, feature.captured_at_ns);
+            assert!(header.published_at_ns >= feature.published_at_ns, "the feature first");
+            let drawn = pour(((header.sequence - 1) % PICTURES) as i32)?;
+            assert!(frame.payload() == drawn.data_bytes()?, "other pixels in frame {}", header.sequence);
+            compared += 1;
+        }
+    }
+    let listener = cell.frame_listener()?;
+    let mut woken = 0;
+    listener.timed_wait(|_| woken += 1, PATIENCE)?;
+    assert!(woken > 0, "a reader is woken by a frame");
+    // It stops reading frames and events, and holds one frame.
+    let _held = frames.receive()?;
+    while frames.receive()?.is_some() {}
+    let last = follow(40)?.last().map_or(0, |f| f.sequence);
+    let waiting = std::iter::from_fn(|| frames.receive().ok().flatten()).next().ok_or("no frame waits")?;
+    assert!(waiting.user_header().sequence + 4 >= last, "the oldest were lost: {} of {last}", waiting.user_header().sequence);
+    Ok(())
+}
+
+/// Protects the people who look on a real cell: the view opens the camera itself while there is no worker, leaves it to a worker that
+/// starts and shows that one's frames, says so when they end (here the worker is killed), and goes on with the next worker.
+#[test]
+fn the_view_follows_a_worker_with_its_own_camera() -> Outcome {
+    let directory = tempfile::tempdir()?;
+    let pattern = write_pictures(directory.path())?;
+    let (path, config) = write_config(directory.path(), "follows", |c| {
+        (c.camera.source, c.camera.path) = (CameraSource::Images, pattern.clone());
+    })?;
+    let _cleanup = Cleanup(config.cell.name.clone());
+    let cell = Cell::join(&config.cell.name)?;
+    let features = cell.features()?.subscriber_builder().buffer_size(64).create()?;
+    let view_at = |path: &Path| -> Result<(Program, String), Failure> {
+        let mut view = Program::start("view", path, &["--port", "0"])?;
+        let mut line = String::new();
+        BufReader::new(view.0.stdout.take().ok_or("no output")?).read_line(&mut line)?;
+        let address = line.trim().strip_prefix("http://").ok_or("no address")?.to_string();
+        Ok((view, address))
+    };
+    let until = |address: &str, what: &str, seen: &dyn Fn(&serde_json::Value) -> Result<bool, Failure>| -> Outcome {
+        let begin = Instant::now();
+        loop {
+            let state: serde_json::Value = serde_json::from_slice(&http(address, "GET", "/state.json", "")?.1)?;
+            if seen(&state)? {
+                return Ok(());
+            }
+            if begin.elapsed() > PATIENCE {
+                return Err(format!("not seen: {what}; frame {}, silent {}", state["sequence"], state["silent"]).into());
+            }
+            std::thread::sleep(Duration::from_millis(5));
+        }
+    };
+    // Numbers tell whose frames they are: each process counts the pictures from its own start.
+    let measured = std::cell::RefCell::new(Vec::<Feature>::new());
+    let is_the_workers = |state: &serde_json::Value| -> Result<bool, Failure> {
+        while let Some(feature) = features.receive()? {
+            measured.borrow_mut().push(*feature);
+        }
+        let measured = measured.borrow();
+        let newest = measured.last().map_or(0, |f| f.sequence);
+        let shown = state["sequence"].as_u64().unwrap_or(0);
+        let near = measured.iter().rev().take(60).find(|f| f.sequence == shown && newest < shown + 15);
+        Ok(near.is_some_and(|f| f.area_px2 > 0.0 && state["area_px2"].as_f64().map(|a| a as f32) == Some(f.area_px2)))
+    };
+    let (mut view, address) = view_at(&path)?;
+    until(&address, "the view's own frames", &|s| Ok(s["sequence"].as_u64() > Some(60)))?;
+    let mut worker = Program::start("run", &path, &[])?;
+    until(&address, "the worker's frames", &is_the_workers)?;
+    worker.0.kill()?;
+    worker.0.wait()?;
+    until(&address, "that no frames come", &|s| Ok(s["silent"] == true))?;
+    measured.borrow_mut().clear();
+    let second = Program::start("run", &path, &[])?;
+    until(&address, "the second worker's frames", &|s| Ok(is_the_workers(s)? && s["silent"] == false))?;
+    // One that comes later takes the worker's frames at once.
+    let (_later, address_of_later) = view_at(&path)?;
+    until(&address_of_later, "the worker's frames in a second view", &is_the_workers)?;
+    second.signal("-TERM")?;
+    until(&address, "that no frames come", &|s| Ok(s["silent"] == true))?;
+    view.signal("-INT")?;
+    let (code, said) = view.end()?;
+    assert_eq!(code, Some(0), "{said}");
+    assert!(said.contains("a worker starts in this cell") && said.matches("no frames for a second").count() == 2, "{said}");
+    Ok(())
 }
 
 /// Protects the people who look: the view serves its page, the newest picture as JPEG of the camera's size, and the state as JSON

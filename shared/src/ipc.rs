@@ -47,9 +47,9 @@ pub type Topic<T> = publish_subscribe::PortFactory<Ipc, T, ()>;
 pub type FrameTopic = publish_subscribe::PortFactory<Ipc, [u8], FrameHeader>;
 /// Requests and answers as postcard bytes, see [`crate::control`].
 pub type ControlService = request_response::PortFactory<Ipc, [u8], (), [u8], ()>;
-/// Wakes the feature worker when a frame is there.
+/// Wakes a reader of frames when one is there.
 pub type FrameListener = Listener<Ipc>;
-/// Tells the feature worker that a frame is there.
+/// Tells the readers that a frame is there.
 pub type FrameNotifier = Notifier<Ipc>;
 
 /// Directory of the cell `name` for what is not shared memory.
@@ -121,7 +121,7 @@ impl Cell {
             .map_err(|e| IpcError::Service { service: full, what: format!("{e:?}") })
     }
 
-    /// Camera frames, from one driver; a reader that is late loses the oldest.
+    /// Camera frames, from one driver, or from the feature worker that reads the camera itself; a reader that is late loses the oldest.
     pub fn frames(&self) -> Result<FrameTopic, IpcError> {
         let (name, full) = self.name("frame")?;
         self.node
@@ -142,7 +142,7 @@ impl Cell {
         self.node.service_builder(&name).event().open_or_create().map_err(|e| IpcError::Service { service: full, what: format!("{e:?}") })
     }
 
-    /// Wakes up when the camera driver has published a frame.
+    /// Wakes up when a frame was published.
     pub fn frame_listener(&self) -> Result<FrameListener, IpcError> {
         self.frame_event()?
             .listener_builder()
@@ -150,7 +150,7 @@ impl Cell {
             .map_err(|e| IpcError::Service { service: "frame-event".into(), what: format!("{e:?}") })
     }
 
-    /// For the camera driver: call `notify()` after each frame.
+    /// For who publishes frames: call `notify()` after each.
     pub fn frame_notifier(&self) -> Result<FrameNotifier, IpcError> {
         self.frame_event()?
             .notifier_builder()

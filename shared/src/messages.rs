@@ -53,7 +53,7 @@ pub struct FrameHeader {
     pub sequence: u64,
     /// Middle of the exposure, CLOCK_MONOTONIC ns.
     pub captured_at_ns: u64,
-    /// When the driver published it, CLOCK_MONOTONIC ns.
+    /// When it was published, CLOCK_MONOTONIC ns.
     pub published_at_ns: u64,
 }
 
