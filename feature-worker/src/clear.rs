@@ -19,7 +19,7 @@ use opencv::core::{self, CV_16SC2, CV_32FC1, Mat, Scalar, Size, Vec4b};
 use opencv::imgproc;
 use opencv::prelude::*;
 
-use crate::extract::Axes;
+use crate::extract::{Axes, REACH};
 use crate::ground::{Dry, Ground, Plane, Wet, median};
 
 /// Width of the whole picture at which this works, px; all lengths below are px at that size.
@@ -100,6 +100,11 @@ const SIZE_MOST: f32 = 1.0;
 const HEIGHT_LEAST: f32 = 0.3;
 /// A smaller triangle is a bead that hangs at the lip, px^2.
 const BEAD_PX2: f32 = 24.0;
+/// Weight of an edge point before ground as bright as the water's rim.
+const HIDDEN_TRUST: f32 = 0.3;
+/// Water differs from the dry background by at least this much: in units of the small picture's noise, and grey levels.
+const WET_NOISES: f32 = 5.0;
+const WET_LEAST: f32 = 6.0;
 /// Frames after a stream during which the place where it was is not taken for background at once.
 const AFTERWARDS: u32 = 3;
 
@@ -485,19 +490,51 @@ impl ClearWater {
     }
 
     /// The colour of the dry background at a place of the region, px, where it is known.
-    pub fn dry_at(&self, [x, y]: [f32; 2]) -> Option<[f32; 3]> {
+    fn dry_at(&self, [x, y]: [f32; 2]) -> Option<[f32; 3]> {
         let small = |v: f32| (v + 0.5) / self.scale - 0.5;
         self.ground.dry_at([small(x), small(y)])
     }
 
-    /// The colour of the stream's rim as it was last seen.
-    pub fn rim(&self) -> Option<[f32; 3]> {
-        self.stream.map(|s| [s.band[0], s.band[1], s.band[2]])
-    }
-
-    /// The noise of small pixels, grey levels.
-    pub fn noise(&self) -> f32 {
-        self.noise
+    /// Where on a profile from within the water outwards it begins, samples; the height of the step there, grey levels; and how much
+    /// it is to be trusted, 0 to 1.
+    pub fn begins_at(&self, profile: &[[f32; 3]; 2 * REACH + 1], place: impl Fn(usize) -> [f32; 2]) -> Option<(f32, f32, f32)> {
+        let mut differs = [[0.0f32; 3]; 2 * REACH + 1];
+        let known = differs.iter_mut().zip(profile).enumerate().all(|(j, (differs, seen))| match self.dry_at(place(j)) {
+            Some(dry) => {
+                *differs = std::array::from_fn(|c| seen[c] - dry[c]);
+                true
+            }
+            None => false,
+        });
+        if known {
+            // The outermost place that differs from the dry background, where half of the difference is reached.
+            let size = |d: &[f32; 3]| (d.iter().map(|v| v * v).sum::<f32>() / 3.0).sqrt();
+            let least = (WET_NOISES * self.noise).max(WET_LEAST);
+            let j = (1..2 * REACH).rev().find(|&j| size(&differs[j]) >= least && size(&differs[j - 1]) >= least)?;
+            let full = (j.saturating_sub(4)..=j).max_by(|a, b| size(&differs[*a]).total_cmp(&size(&differs[*b])))?;
+            let (full, height) = (differs[full], size(&differs[full]));
+            let share = |d: &[f32; 3]| d.iter().zip(full).map(|(a, b)| a * b).sum::<f32>() / (3.0 * height * height);
+            let i = (0..2 * REACH).rev().find(|&i| share(&differs[i]) >= 0.5)?;
+            let (inner, outer) = (share(&differs[i]), share(&differs[i + 1]));
+            // Ground as bright as the water's rim hides where it begins.
+            let dry: [f32; 3] = std::array::from_fn(|c| profile[i + 1][c] - differs[i + 1][c]);
+            let hidden = self.stream.is_some_and(|s| size(&std::array::from_fn(|c| dry[c] - s.band[c])) < 2.0 * least);
+            return (outer < 0.5).then(|| (i as f32 + (inner - 0.5) / (inner - outer), height, if hidden { HIDDEN_TRUST } else { 1.0 }));
+        }
+        // The outermost of the steep steps of brightness.
+        let grey = |j: usize| profile[j].iter().sum::<f32>() / 3.0;
+        let step = |j: usize| (grey(j + 1) - grey(j)).abs();
+        let steepest = (0..2 * REACH).map(step).fold(0.0, f32::max);
+        let j = (1..2 * REACH - 1).rev().find(|&j| step(j) >= 0.6 * steepest && step(j) >= step(j - 1) && step(j) >= step(j + 1))?;
+        if steepest < 4.0 {
+            return None;
+        }
+        // The top of the parabola through the three steps.
+        let (left, middle, right) = (step(j - 1), step(j), step(j + 1));
+        let curvature = left - 2.0 * middle + right;
+        let shift = if curvature < -1e-3 { (0.5 * (left - right) / curvature).clamp(-0.5, 0.5) } else { 0.0 };
+        let height = (grey((j + 3).min(2 * REACH)) - grey(j.saturating_sub(2))).abs().max(steepest);
+        Some((j as f32 + 0.5 + shift, height, 1.0))
     }
 
     /// Whether the stream was not there before the last picture.
@@ -693,8 +730,8 @@ impl ClearWater {
             let mut differs_from_rim = [1.0; SAMPLES];
             if let Some(stream) = stream {
                 let mut from_rim = levels;
-                for k in 0..3 {
-                    from_rim[k].iter_mut().for_each(|level| *level -= stream.band[k]);
+                for (levels, rim) in from_rim.iter_mut().zip(stream.band) {
+                    levels.iter_mut().for_each(|level| *level -= rim);
                 }
                 let apart = sizes(&from_rim);
                 differs_from_rim = row(|r| ((apart[r] * per_noise - WET_FROM) / WET_SPAN).clamp(0.0, 1.0));

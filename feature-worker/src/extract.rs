@@ -24,6 +24,7 @@ use shared::config::{CameraConfig, ImageConfig, LiquidMethod};
 use shared::messages::{Doubt, PixelFormat};
 
 use crate::clear::{ClearWater, Seen};
+use crate::ground::median;
 
 /// Rays between the axes.
 const RAYS: usize = 48;
@@ -43,14 +44,9 @@ const PROFILES_LEAST: f32 = 0.4;
 const PROFILES_FEW: f32 = 0.2;
 const BEGIN_CONFIDENCE: f32 = 0.16;
 const GO_ON_CONFIDENCE: f32 = 0.1;
-/// Weight of an edge point before ground as bright as the water's rim.
-const HIDDEN_TRUST: f32 = 0.3;
 /// Samples of a profile on either side of its centre; the outer [`FLANK`] of them tell liquid and background.
-const REACH: usize = 7;
+pub(crate) const REACH: usize = 7;
 const FLANK: usize = 3;
-/// Water differs from the dry background by at least this much: in units of the small picture's noise, and grey levels.
-const WET_NOISES: f32 = 5.0;
-const WET_LEAST: f32 = 6.0;
 /// Share of rays that a stream fills.
 const STREAM_RAYS: f32 = 0.8;
 /// More background than this before the first liquid ends a ray, px.
@@ -754,48 +750,6 @@ impl Extractor {
         Ok(Measurement { area_px2, confidence, doubt, triangle_px: [x0, y0, x1, y1, x2, y2] })
     }
 
-    /// Where on a profile from within the water outwards it begins, samples; the height of the step there, grey levels; and how much
-    /// it is to be trusted, 0 to 1.
-    fn water_begins(&self, profile: &[[f32; 3]; 2 * REACH + 1], place: impl Fn(usize) -> [f32; 2]) -> Option<(f32, f32, f32)> {
-        let mut differs = [[0.0f32; 3]; 2 * REACH + 1];
-        let known = differs.iter_mut().zip(profile).enumerate().all(|(j, (differs, seen))| match self.water.dry_at(place(j)) {
-            Some(dry) => {
-                *differs = std::array::from_fn(|c| seen[c] - dry[c]);
-                true
-            }
-            None => false,
-        });
-        if known {
-            // The outermost place that differs from the dry background, where half of the difference is reached.
-            let size = |d: &[f32; 3]| (d.iter().map(|v| v * v).sum::<f32>() / 3.0).sqrt();
-            let least = (WET_NOISES * self.water.noise()).max(WET_LEAST);
-            let j = (1..2 * REACH).rev().find(|&j| size(&differs[j]) >= least && size(&differs[j - 1]) >= least)?;
-            let full = (j.saturating_sub(4)..=j).max_by(|a, b| size(&differs[*a]).total_cmp(&size(&differs[*b])))?;
-            let (full, height) = (differs[full], size(&differs[full]));
-            let share = |d: &[f32; 3]| d.iter().zip(full).map(|(a, b)| a * b).sum::<f32>() / (3.0 * height * height);
-            let i = (0..2 * REACH).rev().find(|&i| share(&differs[i]) >= 0.5)?;
-            let (inner, outer) = (share(&differs[i]), share(&differs[i + 1]));
-            // Ground as bright as the water's rim hides where it begins.
-            let dry: [f32; 3] = std::array::from_fn(|c| profile[i + 1][c] - differs[i + 1][c]);
-            let hidden = self.water.rim().is_some_and(|rim| size(&std::array::from_fn(|c| dry[c] - rim[c])) < 2.0 * least);
-            return (outer < 0.5).then(|| (i as f32 + (inner - 0.5) / (inner - outer), height, if hidden { HIDDEN_TRUST } else { 1.0 }));
-        }
-        // The outermost of the steep steps of brightness.
-        let grey = |j: usize| profile[j].iter().sum::<f32>() / 3.0;
-        let step = |j: usize| (grey(j + 1) - grey(j)).abs();
-        let steepest = (0..2 * REACH).map(step).fold(0.0, f32::max);
-        let j = (1..2 * REACH - 1).rev().find(|&j| step(j) >= 0.6 * steepest && step(j) >= step(j - 1) && step(j) >= step(j + 1))?;
-        if steepest < 4.0 {
-            return None;
-        }
-        // The top of the parabola through the three steps.
-        let (left, middle, right) = (step(j - 1), step(j), step(j + 1));
-        let curvature = left - 2.0 * middle + right;
-        let shift = if curvature < -1e-3 { (0.5 * (left - right) / curvature).clamp(-0.5, 0.5) } else { 0.0 };
-        let height = (grey((j + 3).min(2 * REACH)) - grey(j.saturating_sub(2))).abs().max(steepest);
-        Some((j as f32 + 0.5 + shift, height, 1.0))
-    }
-
     /// Sub-pixel edge points on normals of `line` between the axes, and a Huber line through them. Returns the line, the
     /// median contrast in grey levels, the median edge width in px and the share of profiles that showed an edge.
     fn refine(&mut self, line: Line, a: f32, b: f32, colours: Colours) -> (Line, f32, f32, f32) {
@@ -848,7 +802,7 @@ impl Extractor {
                 continue;
             }
             if self.method == LiquidMethod::Clear {
-                let found = self.water_begins(&profile, |j| {
+                let found = self.water.begins_at(&profile, |j| {
                     let d = (j as f32 - REACH as f32) * spacing;
                     [centre[0] + d * normal[0], centre[1] + d * normal[1]]
                 });
@@ -919,10 +873,4 @@ impl Extractor {
         }
         (fitted, contrast, width, used)
     }
-}
-
-/// Median, upper one of two; reorders.
-fn median(values: &mut [f32]) -> f32 {
-    let middle = values.len() / 2;
-    if values.is_empty() { 0.0 } else { *values.select_nth_unstable_by(middle, f32::total_cmp).1 }
 }
