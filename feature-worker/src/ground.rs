@@ -29,6 +29,8 @@ const LEFT_GROWS: f32 = 1.2;
 const FORGOTTEN: u8 = 26;
 /// Points for the motion have been seen within so many turns.
 const MARK_AGE: u8 = 4;
+/// Least change over 2 px at such a point, in units of a calm difference.
+const STEEP_LEAST: f32 = 0.6;
 /// How fast the memory follows what is seen, of 256: where it fits and where it does not.
 const FOLLOW: i32 = 90;
 const FOLLOW_SLOWLY: i32 = 26;
@@ -553,7 +555,7 @@ impl Ground {
         }
         let (first, every) = if self.frame == 0 { (0, 1) } else { (self.frame % MARK_EVERY, MARK_EVERY) };
         for row in (first..side / SQUARE).step_by(every) {
-            self.mark_corners(row)?;
+            self.mark_corners(row, STEEP_LEAST * dry.calm)?;
         }
         self.frame += 1;
         Ok(())
@@ -594,9 +596,9 @@ impl Ground {
     }
 
     /// Chooses the points for the motion anew in one row of the memory's squares: in each that the picture shows, the one with the steepest
-    /// slope.
+    /// slope. A change below `least` over 2 px may be noise, and then tells the exposure only.
     #[inline(always)]
-    fn mark_corners(&mut self, row: usize) -> opencv::Result<()> {
+    fn mark_corners(&mut self, row: usize, least: f32) -> opencv::Result<()> {
         const ROOM: usize = 2;
         const NEAR: usize = SQUARE + 2 * ROOM;
         let (side, squares) = (self.side, self.side / SQUARE);
@@ -632,7 +634,7 @@ impl Ground {
                     }
                 }
             }
-            self.corners[row * squares + column] = best.map(|(_, [x, y])| {
+            self.corners[row * squares + column] = best.map(|(steep, [x, y])| {
                 let grey = |x: usize, y: usize| near[y][x] as f32;
                 // Three in a row or column about a place, the middle one twice.
                 let row_of = |x: usize, y: usize| 0.25 * (grey(x - 1, y) + 2.0 * grey(x, y) + grey(x + 1, y));
@@ -641,7 +643,8 @@ impl Ground {
                 let fine = [0.5 * (column_of(x + 1, y) - column_of(x - 1, y)), 0.5 * (row_of(x, y + 1) - row_of(x, y - 1))];
                 let coarse = [0.25 * (column_of(x + 2, y) - column_of(x - 2, y)), 0.25 * (row_of(x, y + 2) - row_of(x, y - 2))];
                 let at = [column * SQUARE + x - ROOM, row * SQUARE + y - ROOM].map(|v| v as f32);
-                Mark { at, levels: [level, grey(x, y)], slopes: [coarse, fine] }
+                let slopes = if steep as f32 > least * least { [coarse, fine] } else { [[0.0; 2]; 2] };
+                Mark { at, levels: [level, grey(x, y)], slopes }
             });
         }
         Ok(())
