@@ -615,7 +615,7 @@ impl ClearWater {
         let bulge = 2.0 + 0.1 * (a * b).sqrt();
         let [inner, outer] = [[a + 1.4 * bulge, b + 1.4 * bulge], [1.35 * a + 8.0, 1.35 * b + 8.0]].map(|legs| self.planes(legs)[2]);
         let near = (self.dry_frames <= AFTERWARDS).then_some((Wet { line: inner, right }, outer));
-        let dry = Dry { air, flows: self.stream.is_some(), near, calm: CALM * self.noise };
+        let dry = Dry { air, flows: self.stream.is_some() || self.dry_frames <= 1, near, calm: CALM * self.noise };
         self.ground.remember(&self.now, dry)?;
         Ok(seen)
     }
