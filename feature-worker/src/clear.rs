@@ -60,7 +60,7 @@ const STEP_SPAN: f32 = 0.3;
 /// Weight of a moved picture's evidence where the memory knows nothing, to begin a stream.
 const UNKNOWN_WEIGHT: f32 = 0.5;
 /// Least score, share of the line's length with an edge, and share of it on known ground to begin a stream.
-const BEGIN: [f32; 3] = [0.7, 0.6, 0.45];
+const BEGIN: [f32; 3] = [0.6, 0.5, 0.35];
 /// On known ground the least score to begin is less by this.
 const BEGIN_KNOWN: f32 = 0.25;
 /// Least score to go on: on unknown ground and on known ground; least share of the line's length.
