@@ -8,7 +8,7 @@
 //! 2. The memory and the last picture, both moved, are compared with the picture along rays from the lip. What differs from the memory
 //!    is wet. Where the ground was hidden until now, or is as bright as the water's rim, a step counts that the last picture, moved,
 //!    does not explain.
-//! 3. Of about 1,000 **lines** from axis to axis the best has most of this just inside and none outside. A line goes on near where it was,
+//! 3. Of about 800 **lines** from axis to axis the best has most of this just inside and none outside. A line goes on near where it was,
 //!    in the same shape and with the same band along it; one that moves with the background is none. Beginning a stream takes more than
 //!    going on. The full picture's profiles across it must confirm it ([`ClearWater::confirm`]).
 //!
