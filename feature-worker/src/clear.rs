@@ -4,7 +4,7 @@
 //! background is displaced. The container turns, so the background moves in the picture as one rigid piece, while the stream's
 //! outline stays. Hence, at 320 px for the whole width:
 //!
-//! 1. The dry background is **remembered** in colour as one picture that is fixed in the world ([`Ground`]).
+//! 1. The dry background is **remembered** in colour as one picture that is fixed in the world (`ground.rs`).
 //! 2. The memory and the last picture, both moved, are compared with the picture along rays from the lip. What differs from the memory
 //!    is wet. Where the ground was hidden until now, or is as bright as the water's rim, a step counts that the last picture, moved,
 //!    does not explain.
