@@ -355,7 +355,7 @@ impl ClearWater {
         let small = |v: f32| (v + 0.5) / scale - 0.5;
         let axes = Axes { lip_px: axes.lip_px.map(small), ..*axes };
         let ([lip_x, lip_y], x, y) = (axes.lip_px, axes.x, axes.y);
-        let sine = x[0] * y[1] - x[1] * y[0];
+        let sine = axes.sine();
         let turn = sine.signum();
         let between = sine.abs().atan2(x[0] * y[0] + x[1] * y[1]);
         let directions: Vec<[f32; 2]> = (0..RAYS)
@@ -479,7 +479,7 @@ impl ClearWater {
     /// `u / a + v / b` of the way to the line with these legs; as `[at origin, per x, per y]`.
     fn planes(&self, [a, b]: [f32; 2]) -> [[f32; 3]; 3] {
         let (x, y, [lip_x, lip_y]) = (self.axes.x, self.axes.y, self.axes.lip_px);
-        let sine = x[0] * y[1] - x[1] * y[0];
+        let sine = self.axes.sine();
         let turn = sine.signum();
         let plane = |px: f32, py: f32| [-px * lip_x - py * lip_y, px, py];
         [
@@ -547,7 +547,7 @@ impl ClearWater {
     pub fn confirm(&mut self, fine: Option<([f32; 2], f32)>) -> bool {
         let Some(stream) = &mut self.stream else { return false };
         let young = stream.age <= 1.0;
-        let sine = (self.axes.x[0] * self.axes.y[1] - self.axes.x[1] * self.axes.y[0]).abs();
+        let sine = self.axes.sine().abs();
         let good = fine.is_some_and(|(legs_px, height)| {
             let legs = legs_px.map(|v| v / self.scale);
             let [a, b] = [0, 1].map(|k| (legs[k] / stream.legs[k]).ln());

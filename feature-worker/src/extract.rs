@@ -208,7 +208,7 @@ impl Axes {
     }
 
     /// Sine of the angle from x to y; its sign is the sense of turning.
-    fn sine(&self) -> f32 {
+    pub(crate) fn sine(&self) -> f32 {
         self.x[0] * self.y[1] - self.x[1] * self.y[0]
     }
 
