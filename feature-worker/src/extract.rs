@@ -38,9 +38,9 @@ const STEP_MOST_PX: f32 = 5.0;
 const PICKS: usize = 13;
 /// Profiles across the line.
 const PROFILES: usize = 48;
-/// Least share of them that show an edge.
-const PROFILES_LEAST: f32 = 0.4;
-/// The same before clear water, and the least confidence to begin a stream and to go on: fainter edges are none.
+/// With a smaller share of them that show an edge there is none.
+const PROFILES_LEAST: f32 = 0.3;
+/// The same for clear water, and its least confidence to begin a stream and to go on: fainter edges are none.
 const PROFILES_FEW: f32 = 0.2;
 const BEGIN_CONFIDENCE: f32 = 0.12;
 const GO_ON_CONFIDENCE: f32 = 0.1;
@@ -591,8 +591,9 @@ impl Extractor {
 
     /// Liquid by its colour range, into `self.mask`.
     fn segment_colour(&mut self) -> Result<(), ExtractError> {
-        // Neighbouring samples together: a third of the noise, for a tenth of what smoothing the region would cost.
-        let size = core::Size::new(3, 3);
+        // Neighbouring samples together: a fifth of the noise, for a tenth of what smoothing the region would cost. A dark liquid in dim
+        // light is only noise and a little colour.
+        let size = core::Size::new(5, 5);
         imgproc::blur(&self.polar, &mut self.smooth, size, core::Point::new(-1, -1), core::BORDER_REPLICATE)?;
         imgproc::cvt_color_def(&self.smooth, &mut self.hsv, imgproc::COLOR_BGR2HSV)?;
         if self.wraps {
@@ -714,23 +715,23 @@ impl Extractor {
         }
 
         // 3. Profiles across it.
-        let (line, contrast, width, used) = self.refine(line, a, b, colours);
-        let (a, b) = (line.cut(self.axes.lip_px, self.axes.x), line.cut(self.axes.lip_px, self.axes.y));
-        let sane = a > 0.0 && b > 0.0 && a < longest && b < longest;
-        let sharp = (BLURRED_PX / width.max(0.5)).min(1.0);
-        let confidence = inliers.min(1.0) * share.min(1.0) * used * (contrast / 40.0).min(1.0) * sharp;
-        if self.method == LiquidMethod::Clear {
+        let found = self.refine(line, a, b, colours).and_then(|(line, contrast, width, used)| {
+            let (a, b) = (line.cut(self.axes.lip_px, self.axes.x), line.cut(self.axes.lip_px, self.axes.y));
+            let sharp = (BLURRED_PX / width.max(0.5)).min(1.0);
+            let confidence = inliers.min(1.0) * share.min(1.0) * used * (contrast / 40.0).min(1.0) * sharp;
+            (a > 0.0 && b > 0.0 && a < longest && b < longest).then_some(([a, b], contrast, width, confidence))
+        });
+        let mut doubt = Doubt::EdgeNotFound;
+        let confirmed = self.method == LiquidMethod::Colour || {
             // What the memory of the background took for water must have its edge in the picture itself.
             let begins = self.water.begins();
             let least = if begins { BEGIN_CONFIDENCE } else { GO_ON_CONFIDENCE };
-            let fine = (sane && used >= PROFILES_FEW && confidence >= least).then_some(([a, b], contrast));
-            if !self.water.confirm(fine) {
-                let doubt = if begins { Doubt::None } else { Doubt::EdgeNotFound };
-                return Ok(Measurement::nothing(0.0, doubt));
-            }
-        } else if !sane {
-            return Ok(Measurement::nothing(0.0, Doubt::EdgeNotFound));
-        }
+            doubt = if begins { Doubt::None } else { doubt };
+            self.water.confirm(found.filter(|(.., confidence)| *confidence >= least).map(|(legs, contrast, ..)| (legs, contrast)))
+        };
+        let Some(([a, b], _, width, confidence)) = found.filter(|_| confirmed) else {
+            return Ok(Measurement::nothing(0.0, doubt));
+        };
         let area_px2 = 0.5 * a * b * self.axes.sine().abs();
         if area_px2 < self.area_min_px2 {
             return Ok(Measurement::nothing(share, Doubt::None));
@@ -751,8 +752,8 @@ impl Extractor {
     }
 
     /// Sub-pixel edge points on normals of `line` between the axes, and a Huber line through them. Returns the line, the
-    /// median contrast in grey levels, the median edge width in px and the share of profiles that showed an edge.
-    fn refine(&mut self, line: Line, a: f32, b: f32, colours: Colours) -> (Line, f32, f32, f32) {
+    /// median contrast in grey levels, the median edge width in px and the share of profiles that showed an edge; none if too few did.
+    fn refine(&mut self, line: Line, a: f32, b: f32, colours: Colours) -> Option<(Line, f32, f32, f32)> {
         let (from, to) = (self.axes.at(a, self.axes.x), self.axes.at(b, self.axes.y));
         let length = (to[0] - from[0]).hypot(to[1] - from[1]);
         let along = [(to[0] - from[0]) / length, (to[1] - from[1]) / length];
@@ -852,9 +853,9 @@ impl Extractor {
             self.scratch.push(square.sqrt());
         }
         let used = self.fine.len() as f32 / PROFILES as f32;
-        if used < if self.method == LiquidMethod::Clear { PROFILES_FEW } else { PROFILES_LEAST } {
-            // Too little contrast for profiles: the coarse edges are what there is.
-            return (line, 12.0, 1.0, used);
+        let least = if self.method == LiquidMethod::Clear { PROFILES_FEW } else { PROFILES_LEAST };
+        if used < least {
+            return None;
         }
         let contrast = median(&mut self.scratch);
         let width = if self.widths.is_empty() { 1.0 } else { median(&mut self.widths) };
@@ -871,6 +872,6 @@ impl Extractor {
                 *weight = trust * (limit / fitted.offset(*p).abs().max(1e-6)).min(1.0);
             }
         }
-        (fitted, contrast, width, used)
+        Some((fitted, contrast, width, used))
     }
 }

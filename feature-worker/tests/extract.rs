@@ -2,9 +2,9 @@
 
 mod drawn;
 
-use drawn::{HEIGHT, WIDTH, blue, camera, disc, dry, image_config, pour, stream, water};
+use drawn::{HEIGHT, WIDTH, blue, camera, disc, dry, image_config, noisy, pour, stream, water};
 use feature_worker::extract::{ExtractError, Extractor, Image, Measurement};
-use opencv::core::{self, CV_8UC3, Mat, Scalar, Size};
+use opencv::core::{self, CV_8UC3, CV_16SC3, Mat, Point, Scalar, Size, Vector};
 use opencv::imgproc;
 use opencv::prelude::*;
 use shared::config::{ImageConfig, LiquidMethod};
@@ -101,6 +101,43 @@ fn each_cause_raises_its_doubt() -> Result<(), ExtractError> {
     assert_eq!(extractor.measure(half)?.doubt, Doubt::WrongFormat);
     let short = Image { width_px: 640, height_px: 480, format: PixelFormat::Bgr8, pixels: &[0; 100] };
     assert_eq!(extractor.measure(short)?.doubt, Doubt::WrongFormat);
+    Ok(())
+}
+
+/// Protects against a stream out of nothing: where the colour only fades, over half of the region, there is no edge and no stream.
+#[test]
+fn a_fade_without_an_edge_is_no_stream() -> Result<(), ExtractError> {
+    let mut picture = Mat::new_rows_cols_with_default(HEIGHT, WIDTH, CV_8UC3, Scalar::all(185.0))?;
+    for y in 0..HEIGHT {
+        for (x, pixel) in picture.at_row_mut::<core::Vec3b>(y)?.iter_mut().enumerate() {
+            let share = (1.0 - (x as f32 - 215.0).hypot(y as f32 - 250.0) / 270.0).max(0.0);
+            *pixel = core::Vec3b::from([150.0, 62.0, 20.0].map(|blue: f32| (185.0 + (blue - 185.0) * share) as u8));
+        }
+    }
+    let measured = measure(&mut colour()?, &noisy(&picture, 1)?)?;
+    assert_eq!((measured.area_px2, measured.doubt), (0.0, Doubt::EdgeNotFound));
+    Ok(())
+}
+
+/// Protects pours of dark liquids in dim light, whose colour is less than the noise of a pixel: every frame is measured.
+#[test]
+fn a_dark_liquid_in_noise_is_measured() -> Result<(), ExtractError> {
+    let config = ImageConfig { colour_hsv: [175, 70, 5, 30, 255, 45], ..image_config(LiquidMethod::Colour) };
+    let mut extractor = Extractor::new(&camera(), &config)?;
+    for i in 0..10 {
+        let mut picture = Mat::new_rows_cols_with_default(HEIGHT, WIDTH, CV_8UC3, Scalar::all(50.0))?;
+        let shape: Vector<Point> = stream(60.0, 40.0).into_iter().map(|[x, y]| Point::new(x as i32, y as i32)).collect();
+        imgproc::fill_poly(&mut picture, &shape, Scalar::new(9.0, 13.0, 28.0, 0.0), imgproc::LINE_AA, 0, Point::default())?;
+        let (mut noise, mut signed) = (Mat::new_rows_cols_with_default(HEIGHT, WIDTH, CV_16SC3, Scalar::default())?, Mat::default());
+        core::set_rng_seed(i)?;
+        core::randn(&mut noise, &Scalar::default(), &Scalar::all(17.0))?;
+        picture.convert_to(&mut signed, CV_16SC3, 1.0, 0.0)?;
+        let mut sum = Mat::default();
+        core::add(&signed, &noise, &mut sum, &core::no_array(), -1)?;
+        sum.convert_to(&mut picture, CV_8UC3, 1.0, 0.0)?;
+        let measured = measure(&mut extractor, &picture)?;
+        assert!((measured.area_px2 / 1200.0 - 1.0).abs() < 0.1, "frame {i}: {measured:?}");
+    }
     Ok(())
 }
 
