@@ -41,6 +41,8 @@ const BEHIND_MM: f32 = 200.0;
 const BOARD_ENDS_DEG: f32 = 35.0;
 const ROOM_LEVELS: std::ops::Range<f32> = 25.0..130.0;
 const ROOM_SLOPE: f32 = 0.4;
+/// Light is bent by at most this, rad.
+const MOST_BENT: f32 = 1.4;
 /// Places from the axis of a body of water to its outline at which its optics are tabulated.
 const OFF_AXIS: usize = 1024;
 /// Water bodies bulge as cylinders of their own thickness up to this radius, mm.
@@ -210,6 +212,10 @@ pub struct Renderer {
     room_level: f32,
     /// What [`through_cylinder`] says at [`OFF_AXIS`] + 1 places from the axis to the outline.
     lens: Vec<Lens>,
+    /// Where a place left of, right of, above or below the picture is found in it: columns and rows.
+    mirrored: [Mirror; 2],
+    /// Waves along the picture's columns: of the water's surface, and the two whose product is its shimmer.
+    waves: [Wave; 3],
     crossings: Vec<f64>,
     sides: Vec<([f64; 2], [f64; 2])>,
     polygon: Vec<[f64; 2]>,
@@ -331,6 +337,8 @@ impl Renderer {
             // Its own dice: coloured liquid does not need them.
             room_level: Pcg64Mcg::seed_from_u64(!seed).random_range(ROOM_LEVELS),
             lens: (0..=OFF_AXIS).map(|i| through_cylinder(i as f32 / OFF_AXIS as f32)).collect(),
+            mirrored: [width, height].map(|size| Mirror::new(size, BEHIND_MM * view.px_per_mm as f32 * MOST_BENT.tan())),
+            waves: [0.11, 0.13, 0.06].map(|per_px| Wave::new(per_px, width)),
             crossings: Vec::with_capacity(16),
             sides: Vec::with_capacity(64),
             polygon: Vec::with_capacity(512),
@@ -591,21 +599,23 @@ impl Renderer {
         } else {
             None
         };
-        let (full_width, full_height) = (self.view.width_px as usize, self.view.height_px as usize);
+        let full_width = self.view.width_px as usize;
         let distance_px = BEHIND_MM * self.view.px_per_mm as f32;
         // Upright in the picture; the real direction turns with the wrist, which matters little.
         let room = |down: f32| self.room_level * (1.0 - ROOM_SLOPE * down.clamp(-1.0, 1.0));
-        // The board goes on beyond the picture.
-        let mirror = |v: f32, most: usize| {
-            let period = 2 * (most as i32 - 1);
-            let v = (v as i32).rem_euclid(period);
-            v.min(period - v) as usize
-        };
+        let [mirrored_x, mirrored_y] = &self.mirrored;
+        let [surface, shimmer_down, shimmer_up] = &self.waves;
         for y in 0..rows {
             let cover = &mut self.cover.at_row_mut::<u8>(area.y + y as i32)?[area.x as usize..area.x as usize + columns];
             let frame = &mut self.frame.at_row_mut::<core::Vec3b>(area.y + y as i32)?[area.x as usize..area.x as usize + columns];
             let row = |y: usize| &thickness[y * columns..(y + 1) * columns];
             let (above, here, below) = (row(y.saturating_sub(step)), row(y), row((y + step).min(rows - 1)));
+            let deep = |y: usize| water.map_or(&[][..], |(_, depth, _)| &depth[y * columns..(y + 1) * columns]);
+            let (depth_over, depth, depth_under) = (deep(y.saturating_sub(2)), deep(y), deep((y + 2).min(rows - 1)));
+            let row_y = f64::from(y as u32);
+            let surface = surface.row(row_y * 0.07 - phase);
+            let wander = (row_y * 0.05 + glitter).sin() * 2.0;
+            let (shimmer_down, shimmer_up) = (shimmer_down.row(wander + glitter - row_y * 0.11), shimmer_up.row(row_y * 0.09 + wander - phase));
             for x in 0..columns {
                 if cover[x] == 0 {
                     continue;
@@ -626,29 +636,28 @@ impl Renderer {
                         std::array::from_fn(|c| f32::from(behind[c]) * (1.0 - hidden) + f32::from(colour[c]) * hidden * light + glint)
                     }
                     None => {
-                        let Some((gathered, depth, radius)) = water else { continue };
-                        let at = |x: usize, y: usize| depth[y * columns + x];
+                        let Some((gathered, _, radius)) = water else { continue };
                         // Towards the body's axis, away from its outline.
-                        let (left, right) = (at(x.saturating_sub(2), y), at((x + 2).min(columns - 1), y));
-                        let (over, under) = (at(x, y.saturating_sub(2)), at(x, (y + 2).min(rows - 1)));
-                        let (inwards_x, inwards_y) = (right - left, under - over);
-                        let length = inwards_x.hypot(inwards_y).max(0.5);
-                        let wave = 1.0 + 0.06 * ((x as f32 * 0.11 + y as f32 * 0.07) - phase as f32).sin();
-                        let off_axis = 1.0 - at(x, y) * wave / radius[y * columns + x].max(1.0);
+                        let inwards_x = depth[(x + 2).min(columns - 1)] - depth[x.saturating_sub(2)];
+                        let inwards_y = depth_under[x] - depth_over[x];
+                        let per_length = 1.0 / (inwards_x * inwards_x + inwards_y * inwards_y).sqrt().max(0.5);
+                        let wave = 1.0 + 0.06 * surface(x);
+                        let off_axis = 1.0 - depth[x] * wave / radius[y * columns + x].max(1.0);
                         let lens = self.lens[(off_axis.clamp(0.0, 1.0) * OFF_AXIS as f32) as usize];
                         // Where the light comes from, by its angle from straight ahead: what stands behind, or the room beyond it.
                         let seen = |way: Way| -> [f32; 3] {
-                            let shift = distance_px * way.tangent / length;
-                            let from_x = mirror((area.x as usize + x) as f32 + shift * inwards_x, full_width);
-                            let from_y = mirror((area.y as usize + y) as f32 + shift * inwards_y, full_height);
+                            let shift = distance_px * way.tangent * per_length;
+                            let beyond = room(shift.signum() * inwards_y * per_length) * (1.0 - way.board);
+                            if way.board == 0.0 {
+                                return [beyond * way.share; 3];
+                            }
+                            let from_x = mirrored_x.at((area.x as usize + x) as f32 + shift * inwards_x);
+                            let from_y = mirrored_y.at((area.y as usize + y) as f32 + shift * inwards_y);
                             let behind = &gathered[from_y * full_width + from_x];
-                            let beyond = room(shift.signum() * inwards_y / length) * (1.0 - way.board);
                             std::array::from_fn(|c| (f32::from(behind[c]) * way.board + beyond) * way.share)
                         };
                         let (passed, reflected) = (seen(lens.passed), seen(lens.reflected));
-                        let wander = (y as f32 * 0.05 + glitter as f32).sin() * 2.0;
-                        let shimmer = ((x as f32 * 0.13 - y as f32 * 0.11) + wander + glitter as f32).sin()
-                            * (y as f32 * 0.09 + x as f32 * 0.06 + wander - phase as f32).sin();
+                        let shimmer = shimmer_down(x) * shimmer_up(x);
                         let glint = if lamp > 0.35 { 190.0 * (lamp - 0.35) } else { 0.0 } + (shimmer - 0.82).max(0.0) * 260.0;
                         std::array::from_fn(|c| passed[c] + reflected[c] + glint)
                     }
@@ -667,7 +676,7 @@ impl Renderer {
     fn measure_bodies(&mut self, area: Rect) -> Result<(), RenderError> {
         let mut solid = Mat::default();
         imgproc::threshold(&Mat::roi(&self.cover, area)?, &mut solid, 127.0, 255.0, imgproc::THRESH_BINARY)?;
-        imgproc::distance_transform(&solid, &mut self.depth, imgproc::DIST_L2, imgproc::DIST_MASK_PRECISE, core::CV_32F)?;
+        imgproc::distance_transform(&solid, &mut self.depth, imgproc::DIST_L2, imgproc::DIST_MASK_5, core::CV_32F)?;
         // The largest depth around, at a quarter of the size: it changes slowly.
         let (mut small, mut largest) = (Mat::default(), Mat::default());
         let quarter = Size::new((area.width / 4).max(1), (area.height / 4).max(1));
@@ -861,11 +870,45 @@ fn through_cylinder(off_axis: f32) -> Lens {
     let reflected = 0.5 * (across * across + along * along);
     let way = |share: f32, angle: f32| Way {
         share,
-        tangent: angle.clamp(-1.4, 1.4).tan(),
+        tangent: angle.clamp(-MOST_BENT, MOST_BENT).tan(),
         board: ((BOARD_ENDS_DEG + 4.0 - angle.abs().to_degrees()) / 8.0).clamp(0.0, 1.0),
     };
     let bent = 2.0 * (incident - refracted);
     Lens { passed: way((1.0 - reflected) * (1.0 - reflected), bent), reflected: way(reflected, -2.0 * off_axis.clamp(0.0, 1.0).acos()) }
+}
+
+/// The background goes on beyond the picture, mirrored.
+struct Mirror {
+    reach: i32,
+    places: Vec<u16>,
+}
+
+impl Mirror {
+    /// For a picture of `size` px and places up to `reach_px` outside of it.
+    fn new(size: i32, reach_px: f32) -> Self {
+        let (reach, period) = (reach_px.ceil() as i32 + 1, 2 * (size - 1));
+        let place = |at: i32| at.rem_euclid(period).min(period - at.rem_euclid(period)) as u16;
+        Self { reach, places: (-reach..size + reach).map(place).collect() }
+    }
+
+    fn at(&self, place: f32) -> usize {
+        usize::from(self.places[(place as i32 + self.reach) as usize])
+    }
+}
+
+/// `sin(a x + b)` for whole x, by the sum of angles: two multiplications a pixel.
+struct Wave(Vec<(f32, f32)>);
+
+impl Wave {
+    fn new(rad_per_px: f64, width: i32) -> Self {
+        Self((0..width).map(|x| (f64::from(x) * rad_per_px).sin_cos()).map(|(sin, cos)| (sin as f32, cos as f32)).collect())
+    }
+
+    fn row(&self, offset_rad: f64) -> impl Fn(usize) -> f32 {
+        let (sin, cos) = offset_rad.sin_cos();
+        let (sin, cos) = (sin as f32, cos as f32);
+        move |x| self.0[x].0 * cos + self.0[x].1 * sin
+    }
 }
 
 fn join(a: Rect, b: Rect) -> Rect {
