@@ -71,6 +71,10 @@ const UNEXPLAINED: f32 = 0.3;
 /// From this motion across the line on, px a frame; and with at least this score.
 const TELLS_PX: f32 = 0.6;
 const HELD: f32 = 0.25;
+/// Background that moves by less is at rest, px a frame: then what changes is a stream, and a stream in which nothing changes for so many
+/// frames is none.
+const REST_PX: f32 = 0.2;
+const STILL_FRAMES: u32 = 12;
 /// Least score of a piece of the line that counts as edge.
 const PIECE: f32 = 0.35;
 /// Weight of lying further out (as a logarithm): within the water there are edges too.
@@ -341,6 +345,8 @@ pub struct ClearWater {
     /// Where it last was, and for how many frames it has not been seen.
     last_legs: [f32; 2],
     dry_frames: u32,
+    /// Frames in a row in which neither the background nor the stream moved.
+    still_frames: u32,
     /// Lines in a row that the full picture did not confirm.
     refuted: u32,
     edges: Vec<[f32; 2]>,
@@ -464,6 +470,7 @@ impl ClearWater {
             stream: None,
             last_legs: [0.0; 2],
             dry_frames: AFTERWARDS + 1,
+            still_frames: 0,
             refuted: 0,
             edges: Vec::with_capacity(RAYS),
             scratch: Vec::with_capacity(CELLS),
@@ -855,7 +862,7 @@ impl ClearWater {
                 found.score += (1.0 - found.known) * alike;
             }
             found.total = outer + found.score + 0.7 * found.share + stay;
-            if beats(found.total) {
+            if beats(found.total) && !self.is_background(line) {
                 best = Some(found);
             }
         }
@@ -870,22 +877,30 @@ impl ClearWater {
         Ok(best)
     }
 
-    /// What the moved last picture says of a line: how far the background moves across it, px a frame, the share of it that the
-    /// picture shows, and how little it explains, -1 to 1.
-    fn across(&self, line: usize) -> [f32; 3] {
+    /// What the moved last picture says of a line: how far the background moves there, and across it, px a frame; the share of it that
+    /// the picture shows, and how little it explains, -1 to 1.
+    fn across(&self, line: usize) -> [f32; 4] {
         let turn = self.ground.moved();
         let [a, b] = self.legs[line];
         let along = [0, 1].map(|k| b * self.axes.y[k] - a * self.axes.x[k]);
         let length = along[0].hypot(along[1]);
-        let (mut moves, mut shown, mut unexplained) = (0.0, 0.0, 0.0);
+        let [mut travels, mut moves, mut shown, mut unexplained] = [0.0; 4];
         for (at, weight) in self.cells[line].iter().map(|at| usize::from(*at)).zip(self.weights[line]) {
             let place = self.places[at];
             let to = turn.forth(place);
-            moves += weight * ((to[1] - place[1]) * along[0] - (to[0] - place[0]) * along[1]).abs() / length;
+            let [dx, dy] = [to[0] - place[0], to[1] - place[1]];
+            travels += weight * dx.hypot(dy);
+            moves += weight * (dy * along[0] - dx * along[1]).abs() / length;
             shown += weight * self.shown_around[at];
             unexplained += weight * self.unexplained[at];
         }
-        [moves, shown, unexplained / shown.max(0.05)]
+        [travels, moves, shown, unexplained / shown.max(0.05)]
+    }
+
+    /// Whether the last picture, moved, shows the line too.
+    fn is_background(&self, line: usize) -> bool {
+        let [_, moves, shown, unexplained] = self.across(line);
+        moves > TELLS_PX && shown > 0.5 && unexplained < EXPLAINED
     }
 
     /// Whether a stream is seen, and where.
@@ -894,14 +909,16 @@ impl ClearWater {
         let mut seen = Seen::Dry;
         let (mut background, mut surely_dry) = (false, false);
         if let Some(found) = self.best_line()? {
-            let [moves, shown, unexplained] = self.across(found.line);
-            let tells = moves > TELLS_PX && shown > 0.5;
-            background = tells && unexplained < EXPLAINED;
+            let [travels, moves, shown, unexplained] = self.across(found.line);
+            let (tells, rests) = (moves > TELLS_PX && shown > 0.5, travels < REST_PX && shown > 0.5);
+            self.still_frames = if rests && unexplained < EXPLAINED { self.still_frames + 1 } else { 0 };
+            background = (tells && unexplained < EXPLAINED) || self.still_frames > if self.stream.is_some() { STILL_FRAMES } else { 0 };
             surely_dry = found.known > GO_ON[1] && found.score < HELD;
             let enough = match self.stream {
                 Some(_) => {
                     let least = GO_ON[0] * (1.0 - found.known) + GO_ON[1] * found.known;
-                    (tells && unexplained > UNEXPLAINED && found.evidence > HELD) || (found.score > least && found.share > GO_ON[2])
+                    ((tells || rests) && unexplained > UNEXPLAINED && found.evidence > HELD)
+                        || (found.score > least && found.share > GO_ON[2])
                 }
                 None => found.score > BEGIN[0] - BEGIN_KNOWN * found.known && found.share > BEGIN[1],
             };
