@@ -780,7 +780,12 @@ impl ClearWater {
             let (value, known) = (&mut self.value[range.clone()], &mut self.known[range.clone()]);
             for r in 0..SAMPLES {
                 let sure = 0.5 * (sure_inside[r] + sure_outside[r]);
-                let by_memory = if even && sure < 0.5 { step_says[r] } else { known_says[r] };
+                let by_memory = match (even, sure < 0.5, stream.is_some()) {
+                    (true, true, _) => step_says[r],
+                    // The exposure is not known better than a weak difference, and the stream's rim is a strong one.
+                    (true, false, true) => 0.5 * (step_says[r] + known_says[r]),
+                    _ => known_says[r],
+                };
                 let sure = if even { 1.0 } else { sure };
                 let by_last = (1.0 - 0.5 * moving[r]) * 0.9 * step_says[r] + moving[r] * last_says[r];
                 // To begin, only what the moved last picture shows counts beside the memory.

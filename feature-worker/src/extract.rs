@@ -42,7 +42,7 @@ const PROFILES: usize = 48;
 const PROFILES_LEAST: f32 = 0.3;
 /// The same for clear water, and its least confidence to begin a stream and to go on: fainter edges are none.
 const PROFILES_FEW: f32 = 0.2;
-const BEGIN_CONFIDENCE: f32 = 0.12;
+const BEGIN_CONFIDENCE: f32 = 0.2;
 const GO_ON_CONFIDENCE: f32 = 0.1;
 /// Samples of a profile on either side of its centre; the outer [`FLANK`] of them tell liquid and background.
 pub(crate) const REACH: usize = 7;

@@ -31,6 +31,8 @@ const FORGOTTEN: u8 = 26;
 const MARK_AGE: u8 = 4;
 /// Least change over 2 px at such a point, in units of a calm difference.
 const STEEP_LEAST: f32 = 0.6;
+/// With fewer steep points the background is an even wall, and these are drops or the stream: they do not tell its motion.
+const STEEP_MARKS: usize = 24;
 /// How fast the memory follows what is seen, of 256: where it fits and where it does not.
 const FOLLOW: i32 = 90;
 const FOLLOW_SLOWLY: i32 = 26;
@@ -402,6 +404,9 @@ impl Ground {
             if value(air) >= 2.0 && !water && x >= 2.0 && y >= 2.0 && x < width && y < height {
                 self.marks.push(Mark { at: [x, y], slopes: mark.slopes.map(|s| self.pose.along(s)), ..*mark });
             }
+        }
+        if self.marks.iter().filter(|m| m.slopes != [[0.0; 2]; 2]).count() < STEEP_MARKS {
+            self.marks.iter_mut().for_each(|m| m.slopes = [[0.0; 2]; 2]);
         }
         let before = self.motion;
         // From the last motion and from rest: a joint starts and stops within a frame.
