@@ -615,7 +615,8 @@ impl Renderer {
             let row_y = f64::from(y as u32);
             let surface = surface.row(row_y * 0.07 - phase);
             let wander = (row_y * 0.05 + glitter).sin() * 2.0;
-            let (shimmer_down, shimmer_up) = (shimmer_down.row(wander + glitter - row_y * 0.11), shimmer_up.row(row_y * 0.09 + wander - phase));
+            let (shimmer_down, shimmer_up) =
+                (shimmer_down.row(wander + glitter - row_y * 0.11), shimmer_up.row(row_y * 0.09 + wander - phase));
             for x in 0..columns {
                 if cover[x] == 0 {
                     continue;

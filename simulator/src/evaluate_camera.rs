@@ -3,8 +3,9 @@
 //! Each scene is another cell: container, lip, camera pose, liquid, background, light, noise and blur drawn from a seed; its
 //! liquid's colour is learned from one rendered pour as `feature-worker calibrate` does. Then 24 frames of a pour (or of a dry
 //! container that tilts) are rendered and measured. The renderer's truth is the line along the outline that it drew; it shares
-//! nothing with the extraction. One thread; allocates freely. Further down, frames that nobody should trust show whether each
-//! doubt is raised.
+//! nothing with the extraction. Whole pours, one after the other as in a cell, show what a short scene cannot: whether a stream is
+//! seen at a glass at rest, and whether the extraction stays right for minutes. One thread; allocates freely. Further down, frames
+//! that nobody should trust show whether each doubt is raised.
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -25,11 +26,14 @@ use shared::exit::{self, OrExit as _};
 use shared::messages::{Doubt, PixelFormat};
 
 use crate::camera::{Background, Renderer, Scene, Truth, View};
+use crate::physics::rig::Rig;
 
 /// Areas from here on count for error and missed flow, px^2.
 const MEASURED_PX2: f64 = 200.0;
 /// Frames of a scene.
 const FRAMES: usize = 24;
+/// Pours in a row of a run of whole pours.
+const POURS: usize = 3;
 /// Worst frames that are saved.
 const WORST: usize = 20;
 
@@ -38,12 +42,15 @@ const WORST: usize = 20;
 #[command(
     after_help = "Examples:\n  simulator evaluate-camera\n  simulator evaluate-camera --frames 9600 --seed 2 --json out/camera.json\n\n\
 Prints the error of V_e for areas above 200 px^2 (median and 95th percentile of its size, bias), false flow on dry frames, missed flow \
-(unnoticed: without a doubt) and the share of frames with a doubt, all by condition, and saves the worst 20 frames."
+(unnoticed: without a doubt) and the share of frames with a doubt, all by condition and over whole pours, and saves the worst 20 frames."
 )]
 pub struct Args {
     /// Frames to render, half of them with coloured liquid and half with clear water.
     #[arg(long, default_value_t = 4800)]
     frames: usize,
+    /// Runs of three whole pours, half of them with clear water, the backgrounds in turn (about 900 frames each).
+    #[arg(long, default_value_t = 8)]
+    pours: usize,
     /// Seed of everything that is drawn.
     #[arg(long, default_value_t = 1)]
     seed: u64,
@@ -60,7 +67,7 @@ pub struct Args {
 
 /// Figures of one condition.
 #[derive(Debug, Default, Serialize)]
-struct Figures {
+pub struct Figures {
     frames: usize,
     /// Frames with a truth above [`MEASURED_PX2`] that were measured.
     measured: usize,
@@ -68,9 +75,11 @@ struct Figures {
     p95_error_percent: f64,
     bias_percent: f64,
     dry: usize,
-    false_flow_percent: f64,
+    /// Of the frames without a stream, those on which one was seen.
+    pub false_flow_percent: f64,
     wet: usize,
-    missed_flow_percent: f64,
+    /// Of the frames with a truth above 200 px^2, those on which no stream was seen.
+    pub missed_flow_percent: f64,
     /// Of the frames with a stream, those on which none was seen and no doubt was raised.
     unnoticed_percent: f64,
     doubt_percent: f64,
@@ -152,12 +161,13 @@ const LIQUIDS: [(&str, [u8; 3]); 6] = [
     ("cola", [18, 30, 62]),
 ];
 
-fn draw_case(random: &mut Pcg64Mcg, clear: bool, seed: u64) -> Result<Case, Failure> {
+fn draw_case(random: &mut Pcg64Mcg, clear: bool, before: Option<Background>, seed: u64) -> Result<Case, Failure> {
     let mut pick = |levels: &[(&'static str, f64)]| levels.choose(random).copied().unwrap_or(levels[0]);
     let (light_name, light) = pick(&[("dim", 0.45), ("normal", 1.0), ("bright", 1.4)]);
     let (noise_name, noise) = pick(&[("low", 1.5), ("middle", 4.0), ("high", 8.0)]);
     let (blur_name, blur_px) = pick(&[("none", 0.0), ("slight", 0.8), ("strong", 1.6)]);
-    let background = *Background::ALL.choose(random).unwrap_or(&Background::Chess);
+    let drawn = *Background::ALL.choose(random).unwrap_or(&Background::Chess);
+    let background = before.unwrap_or(drawn);
     let (liquid_name, colour) = *LIQUIDS.choose(random).unwrap_or(&LIQUIDS[0]);
     let placed = View::placed(random);
     let view = View {
@@ -227,6 +237,86 @@ fn scenes(random: &mut Pcg64Mcg, dry: bool) -> Vec<Scene> {
         .collect()
 }
 
+/// Scenes of `pours` pours in a row at 30 fps, each as an operator sees it: a filled glass upright, tilted to its spill angle, poured
+/// from, turned back, at rest. The liquid follows the container's physics.
+fn whole_pours(random: &mut Pcg64Mcg, seed: u64, pours: usize) -> Vec<Scene> {
+    const STEPS: usize = 8;
+    let mut container = Rig::seeded(seed).container(300.0);
+    let spill_deg = container.spill_angle_deg();
+    let (mut scenes, mut alpha_deg) = (Vec::new(), 0.0f64);
+    for _ in 0..pours {
+        container.refill(300.0);
+        let before_deg = spill_deg - 3.0;
+        let top_deg = spill_deg + random.random_range(6.0..14.0);
+        let [fast, slow, back] = [(13.5, 40.0), (5.0, 14.0), (2.0, 8.0)].map(|(from, to)| random.random_range(from..to));
+        let hold_s = random.random_range(0.2..0.8);
+        // Seconds, and the tilt's rate, degrees/s.
+        let legs = [
+            (1.5, 0.0),
+            (before_deg / fast, fast),
+            ((top_deg - before_deg) / slow, slow),
+            (hold_s, 0.0),
+            (1.0, -back),
+            ((top_deg - back) / 60.0, -60.0),
+            (2.5, 0.0),
+        ];
+        for (seconds, rate_deg_s) in legs {
+            for _ in 0..(seconds * 30.0f64).round() as usize {
+                for _ in 0..STEPS {
+                    let dt_s = 1.0 / (30.0 * STEPS as f64);
+                    alpha_deg = (alpha_deg + rate_deg_s * dt_s).max(0.0);
+                    container.step(dt_s, alpha_deg);
+                }
+                let shape = container.shape();
+                let excess_ml = container.volume_ml() - shape.retained_ml(alpha_deg);
+                scenes.push(Scene {
+                    at_s: scenes.len() as f64 / 30.0,
+                    alpha_deg,
+                    rate_deg_s,
+                    flow_ml_s: container.lip().flow_ml_s,
+                    level_mm: 1000.0 * excess_ml / shape.surface_mm2(alpha_deg),
+                });
+            }
+        }
+    }
+    scenes
+}
+
+/// Figures of `pours` whole pours in a row before one camera.
+pub fn measure_pours(view: &View, seed: u64, pours: usize) -> Result<Figures, Failure> {
+    let mut samples = Vec::new();
+    let scenes = whole_pours(&mut Pcg64Mcg::seed_from_u64(seed), seed, pours);
+    measure(view, &image_config(view), seed, &scenes, |sample, _| {
+        samples.push(sample);
+        Ok(())
+    })?;
+    Ok(figures(&samples))
+}
+
+/// What is done with a measured frame: its number, pixels, the extractor, what it measured, and the truth.
+type Frame<'a> = (usize, &'a [u8], &'a Extractor, &'a Measurement, &'a Truth);
+
+/// Renders and measures `scenes` one after the other.
+fn measure(
+    view: &View,
+    image: &ImageConfig,
+    seed: u64,
+    scenes: &[Scene],
+    mut done: impl FnMut(Sample, Frame) -> Result<(), Failure>,
+) -> Result<(), Failure> {
+    let mut renderer = Renderer::new(view, seed)?;
+    let mut extractor = Extractor::new(&camera_config(view), image)?;
+    let mut pixels = vec![0; (view.width_px * view.height_px * 3) as usize];
+    for (k, scene) in scenes.iter().enumerate() {
+        let truth = renderer.render(scene, &mut pixels)?;
+        let frame = Image { width_px: view.width_px, height_px: view.height_px, format: PixelFormat::Bgr8, pixels: &pixels };
+        let measured = extractor.measure(frame)?;
+        let sample = Sample { truth_px2: truth.area_px2, area_px2: measured.area_px2.into(), doubt: measured.doubt };
+        done(sample, (k, &pixels, &extractor, &measured, &truth))?;
+    }
+    Ok(())
+}
+
 /// A frame kept because it was among the worst.
 struct Kept {
     badness: f64,
@@ -235,39 +325,42 @@ struct Kept {
 }
 
 fn evaluate(args: &Args) -> Result<(), Failure> {
-    let cases = args.frames.div_ceil(FRAMES).max(2);
-    let bar = ProgressBar::new(cases as u64).with_message("scenes");
+    let short = args.frames.div_ceil(FRAMES).max(2);
+    let bar = ProgressBar::new((short + args.pours) as u64).with_message("scenes");
     let mut groups: BTreeMap<String, Vec<Sample>> = BTreeMap::new();
     let mut worst: Vec<Kept> = Vec::new();
-    for i in 0..cases {
+    let mut frames = 0;
+    for i in 0..short + args.pours {
+        bar.inc(1);
         let clear = i % 2 == 1;
-        let seed = args.seed.wrapping_mul(1_000_003).wrapping_add(i as u64);
-        let mut random = Pcg64Mcg::seed_from_u64(seed);
-        let case = draw_case(&mut random, clear, seed)?;
-        let mut renderer = Renderer::new(&case.view, seed)?;
-        let mut extractor = Extractor::new(&camera_config(&case.view), &case.image)?;
-        let mut pixels = vec![0; (case.view.width_px * case.view.height_px * 3) as usize];
         let method = if clear { "clear" } else { "colour" };
         if args.method.as_deref().is_some_and(|m| m != method) {
             continue;
         }
-        for (k, scene) in scenes(&mut random, case.dry).iter().enumerate() {
-            let truth = renderer.render(scene, &mut pixels)?;
-            let image = Image { width_px: case.view.width_px, height_px: case.view.height_px, format: PixelFormat::Bgr8, pixels: &pixels };
-            let measured = extractor.measure(image)?;
-            let sample = Sample { truth_px2: truth.area_px2, area_px2: measured.area_px2.into(), doubt: measured.doubt };
-            for label in std::iter::once("all").chain(case.labels.iter().map(String::as_str)) {
+        let seed = args.seed.wrapping_mul(1_000_003).wrapping_add(i as u64);
+        let mut random = Pcg64Mcg::seed_from_u64(seed);
+        let run = i.checked_sub(short);
+        let mut case = draw_case(&mut random, clear, run.map(|run| Background::ALL[run / 2 % Background::ALL.len()]), seed)?;
+        let scenes = if run.is_some() { whole_pours(&mut random, seed, POURS) } else { scenes(&mut random, case.dry) };
+        if run.is_some() {
+            case.labels = vec!["whole pours".into(), format!("whole pours, {}", format!("{:?}", case.view.background).to_lowercase())];
+        } else {
+            case.labels.push("all".into());
+        }
+        frames += scenes.len();
+        measure(&case.view, &case.image, seed, &scenes, |sample, (k, pixels, extractor, measured, truth)| {
+            for label in &case.labels {
                 groups.entry(format!("{method}: {label}")).or_default().push(sample);
             }
             let least = if worst.len() < WORST { 0.0 } else { worst.last().map_or(0.0, |w| w.badness) };
             if sample.badness() > least {
-                let picture = explain(&pixels, &case, &extractor, &measured, &truth, scene)?;
+                let picture = explain(pixels, &case, extractor, measured, truth, &scenes[k])?;
                 worst.push(Kept { badness: sample.badness(), name: format!("{method}-{}-{k:02}", case.seed), picture });
                 worst.sort_by(|a, b| b.badness.total_cmp(&a.badness));
                 worst.truncate(WORST);
             }
-        }
-        bar.inc(1);
+            Ok(())
+        })?;
     }
     bar.finish_and_clear();
     save_worst(&args.out, &worst)?;
@@ -297,8 +390,7 @@ fn evaluate(args: &Args) -> Result<(), Failure> {
     }
     println!("\nworst frames: {}", args.out.display());
     if let Some(path) = &args.json {
-        let report =
-            serde_json::json!({ "frames": cases * FRAMES, "seed": args.seed, "conditions": figures, "doubts_raised_percent": doubts });
+        let report = serde_json::json!({ "frames": frames, "seed": args.seed, "conditions": figures, "doubts_raised_percent": doubts });
         std::fs::write(path, serde_json::to_string_pretty(&report)?).map_err(|e| format!("{}: {e}", path.display()))?;
     }
     Ok(())

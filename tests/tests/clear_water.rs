@@ -2,8 +2,8 @@
 
 use feature_worker::extract::{Extractor, Image};
 use shared::messages::PixelFormat;
-use simulator::camera::{Renderer, Scene, View};
-use simulator::evaluate_camera::{camera_config, image_config};
+use simulator::camera::{Background, Renderer, Scene, View};
+use simulator::evaluate_camera::{camera_config, image_config, measure_pours};
 
 /// Protects the cell with clear water before a plain wall: `liquid_bgr = []` is clear water, dry frames are exactly 0, and the stream is
 /// measured to 15 % on every frame once it stands, while the wrist turns.
@@ -30,6 +30,19 @@ fn clear_water_before_a_plain_wall_is_measured() -> Result<(), Box<dyn std::erro
         } else if i >= 18 {
             assert!((area / truth - 1.0).abs() < 0.15, "frame {i}: {area} instead of {truth}");
         }
+    }
+    Ok(())
+}
+
+/// Protects the cell between and during pours: over two whole pours, with the glass at rest before and after, a stream is seen while it
+/// flows and not otherwise; before a chess board nearly so.
+#[test]
+fn whole_pours_are_seen_from_begin_to_end() -> Result<(), Box<dyn std::error::Error>> {
+    for (background, false_percent, missed_percent) in [(Background::Plain, 0.5, 2.0), (Background::Chess, 8.0, 8.0)] {
+        let view = View { liquid_bgr: None, background, ..View::default() };
+        let figures = measure_pours(&view, 2, 2)?;
+        assert!(figures.false_flow_percent <= false_percent, "{background:?}: {figures:?}");
+        assert!(figures.missed_flow_percent <= missed_percent, "{background:?}: {figures:?}");
     }
     Ok(())
 }
