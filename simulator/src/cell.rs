@@ -224,8 +224,13 @@ fn film(world: &World) -> Result<(), String> {
     let (mut sequence, mut captured_at_ns) = (0, os::now_ns());
     while !world.stop.load(Relaxed) {
         captured_at_ns = after(captured_at_ns, period_ns);
-        os::sleep_until_ns(captured_at_ns);
         sequence += 1;
+        // A camera that is not done in time loses frames; it does not send them ever later.
+        while captured_at_ns + period_ns < os::now_ns() {
+            captured_at_ns += period_ns;
+            sequence += 1;
+        }
+        os::sleep_until_ns(captured_at_ns);
         let (alpha_deg, rate_deg_s) = world.tilt();
         let scene = {
             let container = world.container();
