@@ -30,6 +30,12 @@ const SETTLE_MAX_S: f64 = 3.0;
 /// A feature older than this many periods counts its tick as stale.
 const STALE_TICK_PERIODS: u64 = 3;
 
+/// What has flowed flows the more the further it is tilted: after this many frames of a stream, so many frames without one at a tilt so
+/// much larger than the stream's largest are an empty container or a blind feature. A bottle's gurgling is shorter.
+const STREAM_FRAMES: u32 = 5;
+const STREAM_LOST_FRAMES: u32 = 10;
+const STREAM_LOST_DEG: f32 = 10.0;
+
 /// The part of the configuration that decisions depend on.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct Settings {
@@ -197,6 +203,10 @@ struct Run {
     reason: EndReason,
     quiet_frames: u32,
     empty_frames: u32,
+    /// Frames in a row with and without a stream, and the largest tilt at which one was seen, degrees.
+    stream_frames: u32,
+    no_stream_frames: u32,
+    stream_deg: f32,
     settling_since_ns: u64,
     worker_epoch_ns: u64,
     counters_before: Counters,
@@ -414,6 +424,9 @@ impl Core {
             reason: EndReason::Done,
             quiet_frames: 0,
             empty_frames: 0,
+            stream_frames: 0,
+            no_stream_frames: 0,
+            stream_deg: f32::MAX,
             settling_since_ns: 0,
             worker_epoch_ns: newest.map_or(0, |f| f.worker_epoch_ns),
             counters_before: self.counters(),
@@ -477,6 +490,16 @@ impl Core {
             self.decision = agent.step(Frame { area_px2: measured, alpha_deg, alpha_now_deg });
             let flowing = self.decision.flowing;
             run.quiet_frames = if flowing { 0 } else { run.quiet_frames + lost + 1 };
+            if measured.is_some_and(|area_px2| area_px2 > 0.0) {
+                (run.stream_frames, run.no_stream_frames) = (run.stream_frames + 1, 0);
+                if run.stream_frames == STREAM_FRAMES && run.stream_deg == f32::MAX {
+                    run.stream_deg = alpha_deg;
+                } else if run.stream_deg < f32::MAX {
+                    run.stream_deg = run.stream_deg.max(alpha_deg);
+                }
+            } else {
+                (run.stream_frames, run.no_stream_frames) = (0, run.no_stream_frames + lost + 1);
+            }
             let at_largest_tilt = alpha_now_deg >= self.settings.limits.alpha_max_deg - 0.5;
             run.empty_frames = if at_largest_tilt && !flowing { run.empty_frames + lost + 1 } else { 0 };
             if self.phase == Phase::Pouring && !self.decision.finished {
@@ -504,6 +527,9 @@ impl Core {
             Phase::Pouring if self.decision.finished => self.phase = Phase::Returning,
             Phase::Pouring if run.frames >= settings.max_frames => self.give_up(EndReason::MaxFrames),
             Phase::Pouring if run.empty_frames >= settings.empty_frames => self.give_up(EndReason::ContainerEmpty),
+            Phase::Pouring if run.no_stream_frames >= STREAM_LOST_FRAMES && self.limiter.alpha_deg() > run.stream_deg + STREAM_LOST_DEG => {
+                self.give_up(EndReason::StreamLost);
+            }
             Phase::Recording if run.curve.is_none_or(|c| seconds(run.started_at_ns) >= 2.0 * f64::from(c.beta_s)) => {
                 self.phase = Phase::Returning;
             }

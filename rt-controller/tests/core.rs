@@ -206,7 +206,7 @@ fn every_doubt_ends_the_pour_upright_with_its_reason() {
         (|w| w.doubt = Doubt::TooDark, EndReason::StaleFeature),
         (|w| w.clock_ahead_ns = 1_000_000_000_000, EndReason::StaleFeature),
         (|w| w.epoch_ns += 1, EndReason::WorkerRestarted),
-        (|w| w.dry = true, EndReason::ContainerEmpty),
+        (|w| w.dry = true, EndReason::StreamLost),
         (|w| w.now_ns += 150_000_000, EndReason::ControllerOverrun),
         (|w| _ = w.tick(Some(Order::Abort)), EndReason::Aborted),
         (|w| _ = w.tick(Some(Order::Shutdown)), EndReason::Shutdown),
@@ -220,6 +220,28 @@ fn every_doubt_ends_the_pour_upright_with_its_reason() {
         assert_eq!(world.alpha_deg, 0.0, "{reason:?}");
         assert!(world.largest_rate_deg_s <= 90.01);
     }
+}
+
+/// Protects the cup: a stream that is no longer seen while the container is tilted further is not waited for until the glass is empty;
+/// a container without liquid is, up to the largest tilt.
+#[test]
+fn a_lost_stream_ends_the_pour_early_and_an_empty_container_late() {
+    let mut lost = World::new();
+    lost.pour(200.0).expect("ready");
+    lost.run_to_flow();
+    lost.dry = true;
+    let mut largest_deg = 0.0f32;
+    while lost.core.phase() == Phase::Pouring {
+        lost.tick(None);
+        largest_deg = largest_deg.max(lost.alpha_deg);
+    }
+    assert!((53.0..62.0).contains(&largest_deg), "{largest_deg}");
+    assert_eq!(lost.finish().reason, EndReason::StreamLost);
+
+    let mut empty = World::new();
+    empty.dry = true;
+    empty.pour(200.0).expect("ready");
+    assert_eq!(empty.finish().reason, EndReason::ContainerEmpty);
 }
 
 /// Protects people: when the robot may not move, nothing is commanded, the pour ends at once, and nothing resumes by itself.

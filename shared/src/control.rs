@@ -116,6 +116,8 @@ pub enum EndReason {
     NotUpright,
     /// The pendant's speed slider is below 100 %.
     SpeedReduced,
+    /// A stream was seen, and none any more although the container is tilted further.
+    StreamLost,
 }
 
 impl EndReason {
@@ -139,6 +141,7 @@ impl EndReason {
             Self::Shutdown => "the controller is shutting down",
             Self::NotUpright => "the container did not come upright: look at the robot",
             Self::SpeedReduced => "the speed slider is below 100 %",
+            Self::StreamLost => "the container is empty, or its stream is no longer seen: tilted further than when it flowed",
         }
     }
 }
