@@ -42,8 +42,10 @@ const PROFILES: usize = 48;
 const PROFILES_LEAST: f32 = 0.3;
 /// The same for clear water, and its least confidence to begin a stream and to go on: fainter edges are none.
 const PROFILES_FEW: f32 = 0.2;
-const BEGIN_CONFIDENCE: f32 = 0.2;
+const BEGIN_CONFIDENCE: f32 = 0.25;
 const GO_ON_CONFIDENCE: f32 = 0.1;
+/// Less where the mean grey level is below this: in dim light all contrast is.
+const LIT_LEVEL: f32 = 130.0;
 /// Samples of a profile on either side of its centre; the outer [`FLANK`] of them tell liquid and background.
 pub(crate) const REACH: usize = 7;
 const FLANK: usize = 3;
@@ -269,6 +271,8 @@ pub struct Extractor {
     widths: Vec<f32>,
     scratch: Vec<f32>,
     last_hash: Option<u64>,
+    /// Mean grey level of what was last looked at.
+    level: f32,
     stages: Stages,
 }
 
@@ -401,6 +405,7 @@ impl Extractor {
             widths: Vec::with_capacity(PROFILES),
             scratch: Vec::with_capacity(RAYS.max(PROFILES)),
             last_hash: None,
+            level: 0.0,
             stages: Stages::default(),
         })
     }
@@ -539,6 +544,7 @@ impl Extractor {
             count += 1;
         }
         let level = sum as f32 / (3.0 * count.max(1) as f32);
+        self.level = level;
         Ok(if level < DARK_LEVEL {
             Some(Doubt::TooDark)
         } else if saturated as f32 > BLOWN_SHARE * count as f32 {
@@ -725,7 +731,8 @@ impl Extractor {
         let confirmed = self.method == LiquidMethod::Colour || {
             // What the memory of the background took for water must have its edge in the picture itself.
             let begins = self.water.begins();
-            let least = if begins { BEGIN_CONFIDENCE } else { GO_ON_CONFIDENCE };
+            let lit = (self.level / LIT_LEVEL).min(1.0);
+            let least = lit * if begins { BEGIN_CONFIDENCE } else { GO_ON_CONFIDENCE };
             doubt = if begins { Doubt::None } else { doubt };
             self.water.confirm(found.filter(|(.., confidence)| *confidence >= least).map(|(legs, contrast, ..)| (legs, contrast)))
         };
