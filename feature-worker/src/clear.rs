@@ -9,7 +9,7 @@
 //!    is wet. Where the ground was hidden until now, or is as bright as the water's rim, a step counts that the last picture, moved,
 //!    does not explain.
 //! 3. Of about 800 **lines** from axis to axis the best has most of this just inside and none outside. A line goes on near where it was,
-//!    in the same shape and with the same band along it; one that moves with the background is none. Beginning a stream takes more than
+//!    in the same shape and with the same band along it; one that moves with the background, or is at rest with it, is none. Beginning a stream takes more than
 //!    going on. The full picture's profiles across it must confirm it ([`ClearWater::confirm`]).
 //!
 //! The first frame must be dry. Runs on the extraction thread; all pictures and tables are kept, nothing is allocated after the second
@@ -345,7 +345,7 @@ pub struct ClearWater {
     /// Where it last was, and for how many frames it has not been seen.
     last_legs: [f32; 2],
     dry_frames: u32,
-    /// Frames in a row in which neither the background nor the stream moved.
+    /// Frames in a row in which neither the background nor the best line moved.
     still_frames: u32,
     /// Lines in a row that the full picture did not confirm.
     refuted: u32,
@@ -917,7 +917,12 @@ impl ClearWater {
             let [travels, moves, shown, unexplained] = self.across(found.line);
             let (tells, rests) = (moves > TELLS_PX && shown > 0.5, travels < REST_PX && shown > 0.5);
             self.still_frames = if rests && unexplained < EXPLAINED { self.still_frames + 1 } else { 0 };
-            background = (tells && unexplained < EXPLAINED) || self.still_frames > if self.stream.is_some() { STILL_FRAMES } else { 0 };
+            background = match self.stream {
+                // The best line is not one of the background.
+                Some(_) => self.still_frames > STILL_FRAMES,
+                // At rest nothing begins without a change.
+                None => (tells && unexplained < EXPLAINED) || self.still_frames > 0,
+            };
             surely_dry = found.known > GO_ON[1] && found.score < HELD;
             let enough = match self.stream {
                 Some(_) => {

@@ -7,7 +7,7 @@
 //! 1. On each ray the outer edge is where the count of liquid minus background pixels is largest.
 //! 2. A line through these edges is found robustly (most inliers of fixed pairs, then least squares).
 //! 3. Across that line the image is read again along short normals; where each profile passes half way from liquid to
-//!    background is an edge point of sub-pixel accuracy. A Huber line through them cuts the axes at a and b.
+//!    background is an edge point of sub-pixel accuracy. A Huber line through them cuts the axes at a and b; too few, and there is none.
 //! 4. `V_e = a b sin(phi) / 2`, phi between the axes.
 //!
 //! A stream fills nearly every ray from the lip on; drops and splashes do not, so they are no stream, and no stream is
@@ -44,7 +44,8 @@ const PROFILES_LEAST: f32 = 0.3;
 const PROFILES_FEW: f32 = 0.2;
 const BEGIN_CONFIDENCE: f32 = 0.25;
 const GO_ON_CONFIDENCE: f32 = 0.1;
-/// Less where the mean grey level is below this: in dim light all contrast is.
+/// Less, down to this share, where the mean grey level is below this: in dim light all contrast is (before a dark wall it need not be).
+const LIT_LEAST: f32 = 0.4;
 const LIT_LEVEL: f32 = 130.0;
 /// Samples of a profile on either side of its centre; the outer [`FLANK`] of them tell liquid and background.
 pub(crate) const REACH: usize = 7;
@@ -720,6 +721,10 @@ impl Extractor {
             return Ok(Measurement::nothing(0.0, Doubt::EdgeNotFound));
         }
 
+        if self.method == LiquidMethod::Colour && 0.5 * a * b * self.axes.sine().abs() < self.area_min_px2 {
+            return Ok(Measurement::nothing(share, Doubt::None));
+        }
+
         // 3. Profiles across it.
         let found = self.refine(line, a, b, colours).and_then(|(line, contrast, width, used)| {
             let (a, b) = (line.cut(self.axes.lip_px, self.axes.x), line.cut(self.axes.lip_px, self.axes.y));
@@ -731,7 +736,7 @@ impl Extractor {
         let confirmed = self.method == LiquidMethod::Colour || {
             // What the memory of the background took for water must have its edge in the picture itself.
             let begins = self.water.begins();
-            let lit = (self.level / LIT_LEVEL).min(1.0);
+            let lit = (self.level / LIT_LEVEL).clamp(LIT_LEAST, 1.0);
             let least = lit * if begins { BEGIN_CONFIDENCE } else { GO_ON_CONFIDENCE };
             doubt = if begins { Doubt::None } else { doubt };
             self.water.confirm(found.filter(|(.., confidence)| *confidence >= least).map(|(legs, contrast, ..)| (legs, contrast)))

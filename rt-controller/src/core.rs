@@ -30,10 +30,13 @@ const SETTLE_MAX_S: f64 = 3.0;
 /// A feature older than this many periods counts its tick as stale.
 const STALE_TICK_PERIODS: u64 = 3;
 
-/// What has flowed flows the more the further it is tilted: after this many frames of a stream, so many frames without one at a tilt so
-/// much larger than the stream's largest are an empty container or a blind feature. A bottle's gurgling is shorter.
+/// What flows flows the more the further it is tilted. Frames in a row with a stream from which on its tilt is remembered.
 const STREAM_FRAMES: u32 = 5;
+/// After this volume, ml (a bead is less),
+const STREAM_ML: f32 = 1.0;
+/// this many frames in a row without a stream (a bottle's gurgling is shorter),
 const STREAM_LOST_FRAMES: u32 = 10;
+/// at a tilt larger by this than the stream's largest, degrees: the container is empty, or the camera no longer sees its stream.
 const STREAM_LOST_DEG: f32 = 10.0;
 
 /// The part of the configuration that decisions depend on.
@@ -47,7 +50,7 @@ pub struct Settings {
     pub stale_ns: u64,
     /// A pour ends after this many frames.
     pub max_frames: u32,
-    /// Frames without flow at the largest tilt after which the container is empty.
+    /// Frames without flow at the largest tilt after which the container is empty (one that has poured is found out before).
     pub empty_frames: u32,
     /// Largest goal, ml.
     pub goal_max_ml: f32,
@@ -203,10 +206,10 @@ struct Run {
     reason: EndReason,
     quiet_frames: u32,
     empty_frames: u32,
-    /// Frames in a row with and without a stream, and the largest tilt at which one was seen, degrees.
+    /// Frames in a row with and without a stream, and the largest tilt at which one was there, degrees.
     stream_frames: u32,
     no_stream_frames: u32,
-    stream_deg: f32,
+    stream_deg: Option<f32>,
     settling_since_ns: u64,
     worker_epoch_ns: u64,
     counters_before: Counters,
@@ -426,7 +429,7 @@ impl Core {
             empty_frames: 0,
             stream_frames: 0,
             no_stream_frames: 0,
-            stream_deg: f32::MAX,
+            stream_deg: None,
             settling_since_ns: 0,
             worker_epoch_ns: newest.map_or(0, |f| f.worker_epoch_ns),
             counters_before: self.counters(),
@@ -492,10 +495,8 @@ impl Core {
             run.quiet_frames = if flowing { 0 } else { run.quiet_frames + lost + 1 };
             if measured.is_some_and(|area_px2| area_px2 > 0.0) {
                 (run.stream_frames, run.no_stream_frames) = (run.stream_frames + 1, 0);
-                if run.stream_frames == STREAM_FRAMES && run.stream_deg == f32::MAX {
-                    run.stream_deg = alpha_deg;
-                } else if run.stream_deg < f32::MAX {
-                    run.stream_deg = run.stream_deg.max(alpha_deg);
+                if run.stream_frames >= STREAM_FRAMES {
+                    run.stream_deg = Some(run.stream_deg.map_or(alpha_deg, |deg| deg.max(alpha_deg)));
                 }
             } else {
                 (run.stream_frames, run.no_stream_frames) = (0, run.no_stream_frames + lost + 1);
@@ -527,7 +528,11 @@ impl Core {
             Phase::Pouring if self.decision.finished => self.phase = Phase::Returning,
             Phase::Pouring if run.frames >= settings.max_frames => self.give_up(EndReason::MaxFrames),
             Phase::Pouring if run.empty_frames >= settings.empty_frames => self.give_up(EndReason::ContainerEmpty),
-            Phase::Pouring if run.no_stream_frames >= STREAM_LOST_FRAMES && self.limiter.alpha_deg() > run.stream_deg + STREAM_LOST_DEG => {
+            Phase::Pouring
+                if self.decision.poured_ml >= STREAM_ML
+                    && run.no_stream_frames >= STREAM_LOST_FRAMES
+                    && run.stream_deg.is_some_and(|deg| self.limiter.alpha_deg() > deg + STREAM_LOST_DEG) =>
+            {
                 self.give_up(EndReason::StreamLost);
             }
             Phase::Recording if run.curve.is_none_or(|c| seconds(run.started_at_ns) >= 2.0 * f64::from(c.beta_s)) => {

@@ -88,7 +88,7 @@ pub enum EndReason {
     Aborted,
     /// The configured number of frames was reached.
     MaxFrames,
-    /// Largest tilt, no more flow.
+    /// Largest tilt, and nothing has flowed.
     ContainerEmpty,
     /// No feature, or none that is beyond doubt, for longer than `controller.stale_feature_ms`.
     StaleFeature,

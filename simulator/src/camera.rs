@@ -677,6 +677,7 @@ impl Renderer {
     fn measure_bodies(&mut self, area: Rect) -> Result<(), RenderError> {
         let mut solid = Mat::default();
         imgproc::threshold(&Mat::roi(&self.cover, area)?, &mut solid, 127.0, 255.0, imgproc::THRESH_BINARY)?;
+        // 5 x 5: near enough for optics, and faster than the precise one.
         imgproc::distance_transform(&solid, &mut self.depth, imgproc::DIST_L2, imgproc::DIST_MASK_5, core::CV_32F)?;
         // The largest depth around, at a quarter of the size: it changes slowly.
         let (mut small, mut largest) = (Mat::default(), Mat::default());
@@ -880,7 +881,9 @@ fn through_cylinder(off_axis: f32) -> Lens {
 
 /// The background goes on beyond the picture, mirrored.
 struct Mirror {
+    /// How far outside places may lie, px.
     reach: i32,
+    /// Of the place `index - reach`.
     places: Vec<u16>,
 }
 

@@ -89,6 +89,7 @@ impl SimulatorConfig {
             ("fill_ml", this.fill_ml, 0.0, 2000.0),
             ("camera_delay_ms", this.camera_delay_ms.into(), 0.0, 200.0),
             ("camera_loss", this.camera_loss, 0.0, 0.5),
+            ("view.px_per_mm", this.view.px_per_mm, 1.0, 50.0),
         ];
         for (key, value, low, high) in rules {
             if !(value >= low && value <= high) {
@@ -221,12 +222,13 @@ fn film(world: &World) -> Result<(), String> {
     let mut random = Pcg64Mcg::seed_from_u64(world.sim.seed ^ 0xCA_3E_2A);
     let mut pixels = vec![0; bytes];
     let period_ns = (1e9 / world.config.camera.fps) as u64;
+    let delay_ns = u64::from(world.sim.camera_delay_ms) * 1_000_000;
     let (mut sequence, mut captured_at_ns) = (0, os::now_ns());
     while !world.stop.load(Relaxed) {
         captured_at_ns = after(captured_at_ns, period_ns);
         sequence += 1;
-        // A camera that is not done in time loses frames; it does not send them ever later.
-        while captured_at_ns + period_ns < os::now_ns() {
+        // A camera that is not done in time loses frames; it does not send them ever later. (After a suspension no time has passed.)
+        while captured_at_ns + delay_ns + period_ns < os::now_ns() {
             captured_at_ns += period_ns;
             sequence += 1;
         }
@@ -247,7 +249,7 @@ fn film(world: &World) -> Result<(), String> {
         if random.random::<f64>() < world.sim.camera_loss {
             continue;
         }
-        os::sleep_until_ns(captured_at_ns + u64::from(world.sim.camera_delay_ms) * 1_000_000);
+        os::sleep_until_ns(captured_at_ns + delay_ns);
         let mut sample = publisher.loan_slice_uninit(bytes).map_err(|e| words(&e))?;
         *sample.user_header_mut() = FrameHeader {
             version: LAYOUT_VERSION,

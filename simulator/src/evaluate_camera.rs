@@ -4,7 +4,7 @@
 //! liquid's colour is learned from one rendered pour as `feature-worker calibrate` does. Then 24 frames of a pour (or of a dry
 //! container that tilts) are rendered and measured. The renderer's truth is the line along the outline that it drew; it shares
 //! nothing with the extraction. Whole pours, one after the other as in a cell, show what a short scene cannot: whether a stream is
-//! seen at a glass at rest, and whether the extraction stays right for minutes. One thread; allocates freely. Further down, frames
+//! seen at a glass at rest, and whether the extraction stays right for half a minute. One thread; allocates freely. Further down, frames
 //! that nobody should trust show whether each doubt is raised.
 
 use std::collections::BTreeMap;
@@ -40,17 +40,18 @@ const WORST: usize = 20;
 /// Command-line arguments.
 #[derive(Debug, clap::Args)]
 #[command(
-    after_help = "Examples:\n  simulator evaluate-camera\n  simulator evaluate-camera --frames 9600 --seed 2 --json out/camera.json\n\n\
+    after_help = "Examples:\n  simulator evaluate-camera\n  simulator evaluate-camera --frames 9600 --seed 2 --json out/camera.json\n  \
+simulator evaluate-camera --frames 48 --runs 16 --method clear\n\n\
 Prints the error of V_e for areas above 200 px^2 (median and 95th percentile of its size, bias), false flow on dry frames, missed flow \
 (unnoticed: without a doubt) and the share of frames with a doubt, all by condition and over whole pours, and saves the worst 20 frames."
 )]
 pub struct Args {
-    /// Frames to render, half of them with coloured liquid and half with clear water.
+    /// Frames of short scenes, half of them with coloured liquid and half with clear water.
     #[arg(long, default_value_t = 4800)]
     frames: usize,
     /// Runs of three whole pours, half of them with clear water, the backgrounds in turn (about 900 frames each).
     #[arg(long, default_value_t = 8)]
-    pours: usize,
+    runs: usize,
     /// Seed of everything that is drawn.
     #[arg(long, default_value_t = 1)]
     seed: u64,
@@ -161,13 +162,14 @@ const LIQUIDS: [(&str, [u8; 3]); 6] = [
     ("cola", [18, 30, 62]),
 ];
 
-fn draw_case(random: &mut Pcg64Mcg, clear: bool, before: Option<Background>, seed: u64) -> Result<Case, Failure> {
+/// A cell drawn by `random`, also before a given `background`: the dice are thrown anyway.
+fn draw_case(random: &mut Pcg64Mcg, clear: bool, background: Option<Background>, seed: u64) -> Result<Case, Failure> {
     let mut pick = |levels: &[(&'static str, f64)]| levels.choose(random).copied().unwrap_or(levels[0]);
     let (light_name, light) = pick(&[("dim", 0.45), ("normal", 1.0), ("bright", 1.4)]);
     let (noise_name, noise) = pick(&[("low", 1.5), ("middle", 4.0), ("high", 8.0)]);
     let (blur_name, blur_px) = pick(&[("none", 0.0), ("slight", 0.8), ("strong", 1.6)]);
     let drawn = *Background::ALL.choose(random).unwrap_or(&Background::Chess);
-    let background = before.unwrap_or(drawn);
+    let background = background.unwrap_or(drawn);
     let (liquid_name, colour) = *LIQUIDS.choose(random).unwrap_or(&LIQUIDS[0]);
     let placed = View::placed(random);
     let view = View {
@@ -293,7 +295,7 @@ pub fn measure_pours(view: &View, seed: u64, pours: usize) -> Result<Figures, Fa
     Ok(figures(&samples))
 }
 
-/// What is done with a measured frame: its number, pixels, the extractor, what it measured, and the truth.
+/// A measured frame: its number, pixels, the extractor, what it measured, and the truth.
 type Frame<'a> = (usize, &'a [u8], &'a Extractor, &'a Measurement, &'a Truth);
 
 /// Renders and measures `scenes` one after the other.
@@ -326,15 +328,15 @@ struct Kept {
 
 fn evaluate(args: &Args) -> Result<(), Failure> {
     let short = args.frames.div_ceil(FRAMES).max(2);
-    let bar = ProgressBar::new((short + args.pours) as u64).with_message("scenes");
+    let bar = ProgressBar::new((short + args.runs) as u64).with_message("scenes");
     let mut groups: BTreeMap<String, Vec<Sample>> = BTreeMap::new();
     let mut worst: Vec<Kept> = Vec::new();
     let mut frames = 0;
-    for i in 0..short + args.pours {
-        bar.inc(1);
+    for i in 0..short + args.runs {
         let clear = i % 2 == 1;
         let method = if clear { "clear" } else { "colour" };
         if args.method.as_deref().is_some_and(|m| m != method) {
+            bar.inc(1);
             continue;
         }
         let seed = args.seed.wrapping_mul(1_000_003).wrapping_add(i as u64);
@@ -361,6 +363,7 @@ fn evaluate(args: &Args) -> Result<(), Failure> {
             }
             Ok(())
         })?;
+        bar.inc(1);
     }
     bar.finish_and_clear();
     save_worst(&args.out, &worst)?;

@@ -140,7 +140,7 @@ pub fn by_core(agent: &Agent, world: &mut World, limits: Limits, init_ml: f64, g
         if let Some(outcome) = output.ended {
             poured.believed_ml = f64::from(outcome.poured_ml);
             poured.seconds = f64::from(outcome.seconds);
-            poured.ended = matches!(outcome.reason, EndReason::Done | EndReason::ContainerEmpty);
+            poured.ended = matches!(outcome.reason, EndReason::Done | EndReason::ContainerEmpty | EndReason::StreamLost);
             break;
         }
     }
