@@ -342,16 +342,17 @@ fn evaluate(args: &Args) -> Result<(), Failure> {
         let seed = args.seed.wrapping_mul(1_000_003).wrapping_add(i as u64);
         let mut random = Pcg64Mcg::seed_from_u64(seed);
         let run = i.checked_sub(short);
-        let mut case = draw_case(&mut random, clear, run.map(|run| Background::ALL[run / 2 % Background::ALL.len()]), seed)?;
-        let scenes = if run.is_some() { whole_pours(&mut random, seed, POURS) } else { scenes(&mut random, case.dry) };
-        if run.is_some() {
-            case.labels = vec!["whole pours".into(), format!("whole pours, {}", format!("{:?}", case.view.background).to_lowercase())];
-        } else {
-            case.labels.push("all".into());
-        }
+        let case = draw_case(&mut random, clear, run.map(|run| Background::ALL[run / 2 % Background::ALL.len()]), seed)?;
+        let (scenes, labels) = match run {
+            Some(_) => {
+                let background = format!("{:?}", case.view.background).to_lowercase();
+                (whole_pours(&mut random, seed, POURS), vec!["whole pours".into(), format!("whole pours, {background}")])
+            }
+            None => (scenes(&mut random, case.dry), [case.labels.clone(), vec!["all".into()]].concat()),
+        };
         frames += scenes.len();
         measure(&case.view, &case.image, seed, &scenes, |sample, (k, pixels, extractor, measured, truth)| {
-            for label in &case.labels {
+            for label in &labels {
                 groups.entry(format!("{method}: {label}")).or_default().push(sample);
             }
             let least = if worst.len() < WORST { 0.0 } else { worst.last().map_or(0.0, |w| w.badness) };
