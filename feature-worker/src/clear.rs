@@ -5,8 +5,8 @@
 //! outline stays. Hence, at 320 px for the whole width:
 //!
 //! 1. The dry background is **remembered** in colour as one picture that is fixed in the world (`ground.rs`).
-//! 2. The memory and the last picture, both moved, are compared with the picture along rays from the lip. What differs from the memory
-//!    is wet. Where the ground was hidden until now, or is as bright as the water's rim, a step counts that the last picture, moved,
+//! 2. The memory and an earlier picture, both moved, are compared with the picture along rays from the lip. What differs from the memory
+//!    is wet. Where the ground was hidden until now, or is as bright as the water's rim, a step counts that the earlier picture, moved,
 //!    does not explain.
 //! 3. Of about 800 **lines** from axis to axis the best has most of this just inside and none outside. A line goes on near where it was,
 //!    in the same shape and with the same band along it; one that moves with the background, or is at rest with it, is none. Beginning a stream takes more than
@@ -52,7 +52,7 @@ const WET_FROM: f32 = 2.2;
 const WET_SPAN: f32 = 2.0;
 /// A difference up to this, in units of the noise, is still background.
 const CALM: f32 = 5.0;
-/// Background that moves by more than this is told from what stands still, px a frame.
+/// Background that has moved by more than this since the earlier picture is told from what stands still, px.
 const MOVES_PX: f32 = 1.2;
 /// A step in brightness counts from this share of the stream's usual one on, fully this much further on.
 const STEP_FROM: f32 = 0.35;
@@ -65,21 +65,25 @@ const BEGIN: [f32; 3] = [0.6, 0.5, 0.35];
 const BEGIN_KNOWN: f32 = 0.25;
 /// Least score to go on: on unknown ground and on known ground; least share of the line's length.
 const GO_ON: [f32; 3] = [0.45, 0.5, 0.6];
-/// What the moved last picture says of a line, -1 (it explains it) to 1: below, it is background; above, a stream goes on.
+/// What the moved earlier picture says of a line, -1 (it explains it) to 1: below, it is background; above, a stream goes on.
 const EXPLAINED: f32 = -0.4;
 const UNEXPLAINED: f32 = 0.3;
-/// From this motion across the line on, px a frame; and with at least this score.
+/// From this motion across the line since the earlier picture on, px; and with at least this score.
 const TELLS_PX: f32 = 0.6;
 const HELD: f32 = 0.25;
-/// Background that moves by less is at rest, px a frame: then what changes is a stream, and a stream in which nothing changes for so many
+/// Background that has moved by less since then is at rest, px: then what changes is a stream, and a stream in which nothing changes for so many
 /// frames is none.
 const REST_PX: f32 = 0.2;
 const STILL_FRAMES: u32 = 12;
+/// Pictures are compared with an earlier one until the background has moved so far, px, or for so many frames: slow motion tells little
+/// from frame to frame.
+const REFER_PX: f32 = 1.5;
+const REFER_FRAMES: u32 = 4;
 /// Least score of a piece of the line that counts as edge.
 const PIECE: f32 = 0.35;
 /// Weight of lying further out (as a logarithm): within the water there are edges too.
 const OUTERMOST: f32 = 0.3;
-/// Weight of what the moved last picture does not explain further out.
+/// Weight of what the moved earlier picture does not explain further out.
 const BEYOND: f32 = 0.4;
 /// Weight of being like the last line: as Gaussians of the logarithms of its size (root of the legs' product; with a limit) and of its
 /// shape (their ratio: wider for a stream that was seen once; the limit is 2.5 of it).
@@ -311,26 +315,27 @@ pub struct ClearWater {
     log_legs: Vec<[f32; 2]>,
     cells: Vec<[u16; RAYS]>,
     weights: Vec<[f32; RAYS]>,
-    // Pictures: small; the same with four bytes a pixel; the last one of these.
+    // Pictures: small; the same with four bytes a pixel; the one of these that is compared with: of the last frame, or one from which the
+    // background has not moved far.
     small: Mat,
     now: Mat,
     last: Mat,
     ground: Ground,
-    // Along all rays: maps from now, to the memory, to the last picture; what these show there.
+    // Along all rays: maps from now, to the memory, to the earlier picture; what these show there.
     fixed_maps: [Mat; 2],
     maps: [Mat; 2],
     last_maps: [Mat; 2],
     ray_now: Mat,
     ray_ground: Mat,
     ray_last: Mat,
-    // Along all rays: difference from the memory and from the last picture, in units of the noise; the memory's slope; whether
-    // it is known; whether the last picture shows the place.
+    // Along all rays: difference from the memory and from the earlier picture, in units of the noise; the memory's slope; whether
+    // it is known; whether the earlier picture shows the place.
     away: Vec<f32>,
     away_last: Vec<f32>,
     slopes: Vec<f32>,
     remembered: Vec<f32>,
     shown: Vec<f32>,
-    // Of each sample: what it adds to a line through it, and the share of that which rests on known ground; what the moved last picture
+    // Of each sample: what it adds to a line through it, and the share of that which rests on known ground; what the moved earlier picture
     // says, -1 to 1, and the share of the surroundings that it shows; the step in colour there.
     value: Vec<f32>,
     known: Vec<f32>,
@@ -345,6 +350,8 @@ pub struct ClearWater {
     /// Where it last was, and for how many frames it has not been seen.
     last_legs: [f32; 2],
     dry_frames: u32,
+    /// Frames that were compared with the same picture.
+    compared: u32,
     /// Frames in a row in which neither the background nor the best line moved.
     still_frames: u32,
     /// Lines in a row that the full picture did not confirm.
@@ -470,6 +477,7 @@ impl ClearWater {
             stream: None,
             last_legs: [0.0; 2],
             dry_frames: AFTERWARDS + 1,
+            compared: 0,
             still_frames: 0,
             refuted: 0,
             edges: Vec::with_capacity(RAYS),
@@ -582,7 +590,6 @@ impl ClearWater {
 
     /// Takes the next picture: the region in colour, at full size.
     pub fn take(&mut self, region: &impl core::ToInputArray) -> opencv::Result<()> {
-        std::mem::swap(&mut self.now, &mut self.last);
         // The middle four of each block's pixels: half of the memory of a large picture is never read.
         imgproc::resize(region, &mut self.small, self.size, 0.0, 0.0, imgproc::INTER_LINEAR)?;
         imgproc::cvt_color_def(&self.small, &mut self.now, imgproc::COLOR_BGR2BGRA)
@@ -623,11 +630,18 @@ impl ClearWater {
         let [inner, outer] = [[a + 1.4 * bulge, b + 1.4 * bulge], [1.35 * a + 8.0, 1.35 * b + 8.0]].map(|legs| self.planes(legs)[2]);
         let near = (self.dry_frames <= AFTERWARDS).then_some((Wet { line: inner, right }, outer));
         let dry = Dry { air, flows: self.stream.is_some() || self.dry_frames <= 1, near, calm: CALM * self.noise };
+        let is_new = self.ground.is_new();
         self.ground.remember(&self.now, dry)?;
+        self.compared += 1;
+        if is_new || self.compared >= REFER_FRAMES || self.ground.travelled() >= REFER_PX {
+            std::mem::swap(&mut self.now, &mut self.last);
+            self.ground.refer();
+            self.compared = 0;
+        }
         Ok(seen)
     }
 
-    /// Compares the memory and the last picture, both moved, with what is seen now, along the rays.
+    /// Compares the memory and the earlier picture, both moved, with what is seen now, along the rays.
     #[inline(always)]
     fn compare(&mut self, air: Plane) -> opencv::Result<()> {
         let (linear, replicate) = (imgproc::INTER_LINEAR, core::BORDER_REPLICATE);
@@ -756,7 +770,7 @@ impl ClearWater {
             let (sure_inside, sure_outside) = (INSIDE.mean(&sure), OUTSIDE.mean(&sure));
             let (unexplained, shown_around) = (ACROSS.mean(&last), ACROSS.mean(&sums(&seen)));
             let beyond = FURTHER.mean(&sums(&beyond));
-            // Evidence of the memory, of the step, of the moved last picture; how much that counts.
+            // Evidence of the memory, of the step, of the moved earlier picture; how much that counts.
             let [mut known_says, mut step_says, mut last_says, mut moving]: [Row; 4] = [empty; 4];
             let mut across = [[0.0; SAMPLES + 1]; 3];
             for k in 0..3 {
@@ -788,7 +802,7 @@ impl ClearWater {
                 };
                 let sure = if even { 1.0 } else { sure };
                 let by_last = (1.0 - 0.5 * moving[r]) * 0.9 * step_says[r] + moving[r] * last_says[r];
-                // To begin, only what the moved last picture shows counts beside the memory.
+                // To begin, only what the moved earlier picture shows counts beside the memory.
                 let weight = (1.0 - sure) * if stream.is_some() { 1.0 } else { moving[r] * UNKNOWN_WEIGHT };
                 value[r] = sure * by_memory + weight * by_last;
                 known[r] = if stream.is_some() { sure } else { sure + weight };
@@ -882,7 +896,7 @@ impl ClearWater {
         Ok(best)
     }
 
-    /// What the moved last picture says of a line: how far the background moves there, and across it, px a frame; the share of it that
+    /// What the moved earlier picture says of a line: how far the background has moved there, and across it, px; the share of it that
     /// the picture shows, and how little it explains, -1 to 1.
     fn across(&self, line: usize) -> [f32; 4] {
         let turn = self.ground.moved();
@@ -902,7 +916,7 @@ impl ClearWater {
         [travels, moves, shown, unexplained / shown.max(0.05)]
     }
 
-    /// Whether the last picture, moved, shows the line too.
+    /// Whether the earlier picture, moved, shows the line too.
     fn is_background(&self, line: usize) -> bool {
         let [_, moves, shown, unexplained] = self.across(line);
         moves > TELLS_PX && shown > 0.5 && unexplained < EXPLAINED

@@ -238,8 +238,10 @@ pub struct Ground {
     /// From the window to the picture, now and before; exposure against the memory; the last motion.
     pose: Turn,
     last_pose: Turn,
+    /// The same for the picture that pictures are compared with.
+    reference: Turn,
+    reference_gain: f32,
     gain: f32,
-    last_gain: f32,
     motion: Motion,
     frame: usize,
     /// Mean size of what the last motion left unexplained, grey levels.
@@ -307,8 +309,9 @@ impl Ground {
             marks: Vec::with_capacity(squares * squares),
             pose: home,
             last_pose: home,
+            reference: home,
+            reference_gain: 1.0,
             gain: 1.0,
-            last_gain: 1.0,
             motion: Motion::default(),
             frame: 0,
             left: 0.0,
@@ -336,14 +339,26 @@ impl Ground {
         self.frame == 0
     }
 
-    /// Exposure against the memory, now and in the last picture.
+    /// Exposure against the memory, now and in the picture that is compared with.
     pub fn gains(&self) -> [f32; 2] {
-        [self.gain, self.last_gain]
+        [self.gain, self.reference_gain]
     }
 
-    /// The background's motion since the last picture.
+    /// The background's motion since the picture that pictures are compared with.
     pub fn moved(&self) -> Turn {
-        Turn::new(self.motion.turn, self.motion.shift, self.middle())
+        self.pose.after(&self.reference.inverse())
+    }
+
+    /// How far the picture's middle has moved since then, and its border against that by turning; px.
+    pub fn travelled(&self) -> f32 {
+        let (moved, middle) = (self.moved(), self.middle());
+        let to = moved.forth(middle);
+        (to[0] - middle[0]).hypot(to[1] - middle[1]) + 0.5 * moved.sin.abs() * middle[0].min(middle[1])
+    }
+
+    /// The next pictures are compared with the one that was last remembered.
+    pub fn refer(&mut self) {
+        (self.reference, self.reference_gain) = (self.pose, self.gain);
     }
 
     fn middle(&self) -> [f32; 2] {
@@ -391,7 +406,7 @@ impl Ground {
         let half = Size::new(self.size.width / 2, self.size.height / 2);
         imgproc::cvt_color_def(now, &mut self.grey, imgproc::COLOR_BGRA2GRAY)?;
         imgproc::resize(&self.grey, &mut self.half, half, 0.0, 0.0, imgproc::INTER_AREA)?;
-        (self.last_pose, self.last_gain) = (self.pose, self.gain);
+        self.last_pose = self.pose;
         let (width, height) = (self.size.width as f32 - 3.0, self.size.height as f32 - 3.0);
         self.marks.clear();
         for mark in self.corners.iter().flatten() {
@@ -423,7 +438,7 @@ impl Ground {
         self.left = left;
         self.motion = if left < f32::MAX { motion } else { Motion::default() };
         self.gain = if left < f32::MAX { gain } else { self.gain };
-        self.pose = self.moved().after(&self.last_pose);
+        self.pose = Turn::new(self.motion.turn, self.motion.shift, self.middle()).after(&self.last_pose);
         Ok(())
     }
 
@@ -591,7 +606,7 @@ impl Ground {
                     self.corners[if k == 0 { other * squares + i } else { i * squares + other }] = None;
                 }
                 let step = if forward { SQUARE as f32 } else { -(SQUARE as f32) };
-                for pose in [&mut self.pose, &mut self.last_pose] {
+                for pose in [&mut self.pose, &mut self.last_pose, &mut self.reference] {
                     let along = pose.along(if k == 0 { [step, 0.0] } else { [0.0, step] });
                     pose.shift = [pose.shift[0] + along[0], pose.shift[1] + along[1]];
                 }
