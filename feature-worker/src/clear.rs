@@ -9,8 +9,8 @@
 //!    is wet. Where the ground was hidden until now, or is as bright as the water's rim, a step counts that the earlier picture, moved,
 //!    does not explain.
 //! 3. Of about 800 **lines** from axis to axis the best has most of this just inside and none outside. A line goes on near where it was,
-//!    in the same shape and with the same band along it; one that moves with the background, or is at rest with it, is none. Beginning a stream takes more than
-//!    going on. The full picture's profiles across it must confirm it ([`ClearWater::confirm`]).
+//!    in the same shape and with the same band along it; one that moves with the background, or is at rest with it, is none. Beginning
+//!    a stream takes more than going on. The full picture's profiles across it must confirm it ([`ClearWater::confirm`]).
 //!
 //! The first frame must be dry. Runs on the extraction thread; all pictures and tables are kept, nothing is allocated after the second
 //! frame. No failures but OpenCV's.
@@ -71,8 +71,8 @@ const UNEXPLAINED: f32 = 0.3;
 /// From this motion across the line since the earlier picture on, px; and with at least this score.
 const TELLS_PX: f32 = 0.6;
 const HELD: f32 = 0.25;
-/// Background that has moved by less since then is at rest, px: then what changes is a stream, and a stream in which nothing changes for so many
-/// frames is none.
+/// Background that has moved by less since then is at rest, px: then what changes is a stream, and a stream in which nothing changes for
+/// so many frames is none.
 const REST_PX: f32 = 0.2;
 const STILL_FRAMES: u32 = 12;
 /// Pictures are compared with an earlier one until the background has moved so far, px, or for so many frames: slow motion tells little
