@@ -152,6 +152,31 @@ struct Found {
     band: Colour,
 }
 
+/// What the moved earlier picture says of a line.
+struct Against {
+    /// How far the background has moved there, and across the line, px.
+    travels: f32,
+    moves: f32,
+    /// Share of it that the picture shows, and how little it explains, -1 to 1.
+    shown: f32,
+    unexplained: f32,
+}
+
+impl Against {
+    fn tells(&self) -> bool {
+        self.moves > TELLS_PX && self.shown > 0.5
+    }
+
+    fn rests(&self) -> bool {
+        self.travels < REST_PX && self.shown > 0.5
+    }
+
+    /// Whether the earlier picture, moved, shows the line too.
+    fn is_background(&self) -> bool {
+        self.tells() && self.unexplained < EXPLAINED
+    }
+}
+
 /// A colour's three parts, and one more: four for the processor's sake.
 type Colour = [f32; 4];
 
@@ -881,7 +906,7 @@ impl ClearWater {
                 found.score += (1.0 - found.known) * alike;
             }
             found.total = outer + found.score + 0.7 * found.share + stay;
-            if beats(found.total) && !self.is_background(line) {
+            if beats(found.total) && !self.against(line).is_background() {
                 best = Some(found);
             }
         }
@@ -896,9 +921,8 @@ impl ClearWater {
         Ok(best)
     }
 
-    /// What the moved earlier picture says of a line: how far the background has moved there, and across it, px; the share of it that
-    /// the picture shows, and how little it explains, -1 to 1.
-    fn across(&self, line: usize) -> [f32; 4] {
+    /// What the moved earlier picture says of a line.
+    fn against(&self, line: usize) -> Against {
         let turn = self.ground.moved();
         let [a, b] = self.legs[line];
         let along = [0, 1].map(|k| b * self.axes.y[k] - a * self.axes.x[k]);
@@ -913,13 +937,7 @@ impl ClearWater {
             shown += weight * self.shown_around[at];
             unexplained += weight * self.unexplained[at];
         }
-        [travels, moves, shown, unexplained / shown.max(0.05)]
-    }
-
-    /// Whether the earlier picture, moved, shows the line too.
-    fn is_background(&self, line: usize) -> bool {
-        let [_, moves, shown, unexplained] = self.across(line);
-        moves > TELLS_PX && shown > 0.5 && unexplained < EXPLAINED
+        Against { travels, moves, shown, unexplained: unexplained / shown.max(0.05) }
     }
 
     /// Whether a stream is seen, and where.
@@ -928,20 +946,19 @@ impl ClearWater {
         let mut seen = Seen::Dry;
         let (mut background, mut surely_dry) = (false, false);
         if let Some(found) = self.best_line()? {
-            let [travels, moves, shown, unexplained] = self.across(found.line);
-            let (tells, rests) = (moves > TELLS_PX && shown > 0.5, travels < REST_PX && shown > 0.5);
-            self.still_frames = if rests && unexplained < EXPLAINED { self.still_frames + 1 } else { 0 };
+            let against = self.against(found.line);
+            self.still_frames = if against.rests() && against.unexplained < EXPLAINED { self.still_frames + 1 } else { 0 };
             background = match self.stream {
                 // The best line is not one of the background.
                 Some(_) => self.still_frames > STILL_FRAMES,
                 // At rest nothing begins without a change.
-                None => (tells && unexplained < EXPLAINED) || self.still_frames > 0,
+                None => against.is_background() || self.still_frames > 0,
             };
             surely_dry = found.known > GO_ON[1] && found.score < HELD;
             let enough = match self.stream {
                 Some(_) => {
                     let least = GO_ON[0] * (1.0 - found.known) + GO_ON[1] * found.known;
-                    ((tells || rests) && unexplained > UNEXPLAINED && found.evidence > HELD)
+                    ((against.tells() || against.rests()) && against.unexplained > UNEXPLAINED && found.evidence > HELD)
                         || (found.score > least && found.share > GO_ON[2])
                 }
                 None => found.score > BEGIN[0] - BEGIN_KNOWN * found.known && found.share > BEGIN[1],

@@ -235,13 +235,11 @@ pub struct Ground {
     /// Its points for the motion, by squares as they lie in the memory; and as they lay in the last picture.
     corners: Vec<Option<Mark>>,
     marks: Vec<Mark>,
-    /// From the window to the picture, now and before; exposure against the memory; the last motion.
+    /// From the window to the picture, and exposure against the memory: now, and of the picture that is compared with; the last motion.
     pose: Turn,
-    last_pose: Turn,
-    /// The same for the picture that pictures are compared with.
+    gain: f32,
     reference: Turn,
     reference_gain: f32,
-    gain: f32,
     motion: Motion,
     frame: usize,
     /// Mean size of what the last motion left unexplained, grey levels.
@@ -308,10 +306,9 @@ impl Ground {
             corners: vec![None; squares * squares],
             marks: Vec::with_capacity(squares * squares),
             pose: home,
-            last_pose: home,
+            gain: 1.0,
             reference: home,
             reference_gain: 1.0,
-            gain: 1.0,
             motion: Motion::default(),
             frame: 0,
             left: 0.0,
@@ -406,7 +403,6 @@ impl Ground {
         let half = Size::new(self.size.width / 2, self.size.height / 2);
         imgproc::cvt_color_def(now, &mut self.grey, imgproc::COLOR_BGRA2GRAY)?;
         imgproc::resize(&self.grey, &mut self.half, half, 0.0, 0.0, imgproc::INTER_AREA)?;
-        self.last_pose = self.pose;
         let (width, height) = (self.size.width as f32 - 3.0, self.size.height as f32 - 3.0);
         self.marks.clear();
         for mark in self.corners.iter().flatten() {
@@ -438,7 +434,7 @@ impl Ground {
         self.left = left;
         self.motion = if left < f32::MAX { motion } else { Motion::default() };
         self.gain = if left < f32::MAX { gain } else { self.gain };
-        self.pose = Turn::new(self.motion.turn, self.motion.shift, self.middle()).after(&self.last_pose);
+        self.pose = Turn::new(self.motion.turn, self.motion.shift, self.middle()).after(&self.pose);
         Ok(())
     }
 
@@ -606,7 +602,7 @@ impl Ground {
                     self.corners[if k == 0 { other * squares + i } else { i * squares + other }] = None;
                 }
                 let step = if forward { SQUARE as f32 } else { -(SQUARE as f32) };
-                for pose in [&mut self.pose, &mut self.last_pose, &mut self.reference] {
+                for pose in [&mut self.pose, &mut self.reference] {
                     let along = pose.along(if k == 0 { [step, 0.0] } else { [0.0, step] });
                     pose.shift = [pose.shift[0] + along[0], pose.shift[1] + along[1]];
                 }

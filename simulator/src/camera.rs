@@ -20,6 +20,8 @@ use rand::{RngExt, SeedableRng};
 use rand_pcg::Pcg64Mcg;
 use serde::{Deserialize, Serialize};
 
+use crate::physics::container::Container;
+
 /// Gravity, mm/s^2.
 const G_MM_S2: f64 = 9810.0;
 /// Discharge coefficient of a sharp-crested V notch.
@@ -167,6 +169,16 @@ pub struct Scene {
     pub flow_ml_s: f64,
     /// Height of the liquid's surface over the lip when nothing flows, mm; negative: below the lip.
     pub level_mm: f64,
+}
+
+impl Scene {
+    /// `container` at this tilt.
+    pub fn of(container: &Container, at_s: f64, alpha_deg: f64, rate_deg_s: f64) -> Self {
+        let shape = container.shape();
+        let excess_ml = container.volume_ml() - shape.retained_ml(alpha_deg);
+        let level_mm = 1000.0 * excess_ml / shape.surface_mm2(alpha_deg);
+        Self { at_s, alpha_deg, rate_deg_s, flow_ml_s: container.lip().flow_ml_s, level_mm }
+    }
 }
 
 /// What was really drawn.
@@ -891,8 +903,8 @@ impl Mirror {
     /// For a picture of `size` px and places up to `reach_px` outside of it.
     fn new(size: i32, reach_px: f32) -> Self {
         let (reach, period) = (reach_px.ceil() as i32 + 1, 2 * (size - 1));
-        let place = |at: i32| at.rem_euclid(period).min(period - at.rem_euclid(period)) as u16;
-        Self { reach, places: (-reach..size + reach).map(place).collect() }
+        let folded = (-reach..size + reach).map(|at| at.rem_euclid(period));
+        Self { reach, places: folded.map(|at| at.min(period - at) as u16).collect() }
     }
 
     fn at(&self, place: f32) -> usize {

@@ -234,17 +234,7 @@ fn film(world: &World) -> Result<(), String> {
         }
         os::sleep_until_ns(captured_at_ns);
         let (alpha_deg, rate_deg_s) = world.tilt();
-        let scene = {
-            let container = world.container();
-            let excess_ml = container.volume_ml() - container.shape().retained_ml(alpha_deg);
-            Scene {
-                at_s: captured_at_ns as f64 / 1e9,
-                alpha_deg,
-                rate_deg_s,
-                flow_ml_s: container.lip().flow_ml_s,
-                level_mm: 1000.0 * excess_ml / container.shape().surface_mm2(alpha_deg),
-            }
-        };
+        let scene = Scene::of(&world.container(), captured_at_ns as f64 / 1e9, alpha_deg, rate_deg_s);
         renderer.render(&scene, &mut pixels).map_err(|e| e.to_string())?;
         if random.random::<f64>() < world.sim.camera_loss {
             continue;

@@ -162,6 +162,10 @@ const LIQUIDS: [(&str, [u8; 3]); 6] = [
     ("cola", [18, 30, 62]),
 ];
 
+fn name(background: Background) -> String {
+    format!("{background:?}").to_lowercase()
+}
+
 /// A cell drawn by `random`, also before a given `background`: the dice are thrown anyway.
 fn draw_case(random: &mut Pcg64Mcg, clear: bool, background: Option<Background>, seed: u64) -> Result<Case, Failure> {
     let mut pick = |levels: &[(&'static str, f64)]| levels.choose(random).copied().unwrap_or(levels[0]);
@@ -186,7 +190,7 @@ fn draw_case(random: &mut Pcg64Mcg, clear: bool, background: Option<Background>,
         // The person calibrates under good light, with the same background.
         image.colour_hsv = learn_colour(&View { light: 1.0, noise: 3.0, blur_px: 0.3, ..view.clone() }, &image, seed)?;
     }
-    let background_name = format!("{background:?}").to_lowercase();
+    let background_name = name(background);
     let labels = vec![
         format!("liquid {}", if clear { "clear water" } else { liquid_name }),
         format!("background {background_name}"),
@@ -269,15 +273,7 @@ fn whole_pours(random: &mut Pcg64Mcg, seed: u64, pours: usize) -> Vec<Scene> {
                     alpha_deg = (alpha_deg + rate_deg_s * dt_s).max(0.0);
                     container.step(dt_s, alpha_deg);
                 }
-                let shape = container.shape();
-                let excess_ml = container.volume_ml() - shape.retained_ml(alpha_deg);
-                scenes.push(Scene {
-                    at_s: scenes.len() as f64 / 30.0,
-                    alpha_deg,
-                    rate_deg_s,
-                    flow_ml_s: container.lip().flow_ml_s,
-                    level_mm: 1000.0 * excess_ml / shape.surface_mm2(alpha_deg),
-                });
+                scenes.push(Scene::of(&container, scenes.len() as f64 / 30.0, alpha_deg, rate_deg_s));
             }
         }
     }
@@ -345,8 +341,8 @@ fn evaluate(args: &Args) -> Result<(), Failure> {
         let case = draw_case(&mut random, clear, run.map(|run| Background::ALL[run / 2 % Background::ALL.len()]), seed)?;
         let (scenes, labels) = match run {
             Some(_) => {
-                let background = format!("{:?}", case.view.background).to_lowercase();
-                (whole_pours(&mut random, seed, POURS), vec!["whole pours".into(), format!("whole pours, {background}")])
+                let labels = vec!["whole pours".into(), format!("whole pours, {}", name(case.view.background))];
+                (whole_pours(&mut random, seed, POURS), labels)
             }
             None => (scenes(&mut random, case.dry), [case.labels.clone(), vec!["all".into()]].concat()),
         };
@@ -484,16 +480,15 @@ fn doubts(seed: u64) -> Result<BTreeMap<&'static str, f64>, Failure> {
             let [x, y] = base.lip_px.map(|v| v as u32);
             image.region_px = [x - 20, y - 50, 120, 60];
         }
-        let mut renderer = Renderer::new(&view, seed)?;
-        let mut extractor = Extractor::new(&camera_config(&view), &image)?;
-        let mut pixels = vec![0; (view.width_px * view.height_px * 3) as usize];
+        let scenes: Vec<Scene> = (0..30)
+            .map(f64::from)
+            .map(|i| Scene { at_s: i / 30.0, alpha_deg: 40.0 + i, rate_deg_s: 30.0, flow_ml_s, level_mm: 0.0 })
+            .collect();
         let mut hits = 0;
-        for i in 0..30 {
-            let scene = Scene { at_s: f64::from(i) / 30.0, alpha_deg: 40.0 + f64::from(i), rate_deg_s: 30.0, flow_ml_s, level_mm: 0.0 };
-            renderer.render(&scene, &mut pixels)?;
-            let frame = Image { width_px: view.width_px, height_px: view.height_px, format: PixelFormat::Bgr8, pixels: &pixels };
-            hits += u32::from(extractor.measure(frame)?.doubt == doubt);
-        }
+        measure(&view, &image, seed, &scenes, |sample, _| {
+            hits += u32::from(sample.doubt == doubt);
+            Ok(())
+        })?;
         raised.insert(doubt.words(), f64::from(hits) / 0.3);
     }
     // The same picture twice.

@@ -86,16 +86,8 @@ impl Seen {
     pub fn frame(&mut self, alpha_deg: f64) -> f32 {
         let before_deg = self.pour.tilt_deg();
         self.pour.advance(alpha_deg);
-        let (container, tilt_deg) = (self.pour.container(), self.pour.tilt_deg());
-        let excess_ml = container.volume_ml() - container.shape().retained_ml(tilt_deg);
-        let slots = self.late.len();
-        self.late[self.frame % slots] = Scene {
-            at_s: 0.0,
-            alpha_deg: tilt_deg,
-            rate_deg_s: (tilt_deg - before_deg) * RATE_HZ,
-            flow_ml_s: container.lip().flow_ml_s,
-            level_mm: 1000.0 * excess_ml / container.shape().surface_mm2(tilt_deg),
-        };
+        let (tilt_deg, slots) = (self.pour.tilt_deg(), self.late.len());
+        self.late[self.frame % slots] = Scene::of(self.pour.container(), 0.0, tilt_deg, (tilt_deg - before_deg) * RATE_HZ);
         let shown = Scene { at_s: self.frame as f64 / RATE_HZ, ..self.late[self.frame.saturating_sub(self.delay) % slots] };
         self.frame += 1;
         self.camera.as_ref().and_then(|camera| look(camera, &shown, self.size_px)).unwrap_or(f32::NAN)
