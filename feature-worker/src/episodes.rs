@@ -8,7 +8,7 @@ use std::path::{Path, PathBuf};
 use clap::Subcommand;
 use serde_json::{Value, json};
 use shared::config::Config;
-use shared::episode::{Episode, EpisodeError, Frame, Kind, WeighError, find, set_weight};
+use shared::episode::{Episode, EpisodeError, EpisodeKind, EpisodeRow, WeighError, find_episodes, set_weight};
 use shared::exit::{self, Failure, OrExit as _, failure};
 use shared::messages::Doubt;
 
@@ -90,39 +90,39 @@ pub(crate) fn files(paths: &[PathBuf], config: &Path) -> Result<Vec<PathBuf>, Fa
         [] => vec![Config::read(config).or_exit(exit::BAD_INPUT)?.recording.directory],
         given => given.to_vec(),
     };
-    find(&paths).or_exit(exit::BAD_INPUT)
+    find_episodes(&paths).or_exit(exit::BAD_INPUT)
 }
 
 fn with_files(which: &Which, command: fn(&[PathBuf], bool) -> Result<(), Failure>) -> Result<(), Failure> {
     command(&files(&which.paths, &which.config)?, which.json)
 }
 
-fn kind_words(kind: Kind) -> String {
+fn kind_words(kind: EpisodeKind) -> String {
     match kind {
-        Kind::Recording(c) => format!("curve lambda {} deg, gamma {} /s2, beta {} s", c.lambda_deg, c.gamma_per_s2, c.beta_s),
-        Kind::Pour { goal_ml } => format!("pour of {goal_ml} ml"),
-        Kind::Table => "table".into(),
+        EpisodeKind::Recording(c) => format!("curve lambda {} deg, gamma {} /s2, beta {} s", c.lambda_deg, c.gamma_per_s2, c.beta_s),
+        EpisodeKind::Pour { goal_ml } => format!("pour of {goal_ml} ml"),
+        EpisodeKind::Table => "table".into(),
     }
 }
 
-fn kind_json(kind: Kind) -> Value {
+fn kind_json(kind: EpisodeKind) -> Value {
     match kind {
-        Kind::Recording(c) => {
+        EpisodeKind::Recording(c) => {
             json!({ "kind": "recording", "lambda_deg": c.lambda_deg, "gamma_per_s2": c.gamma_per_s2, "beta_s": c.beta_s })
         }
-        Kind::Pour { goal_ml } => json!({ "kind": "pour", "goal_ml": goal_ml }),
-        Kind::Table => json!({ "kind": "table" }),
+        EpisodeKind::Pour { goal_ml } => json!({ "kind": "pour", "goal_ml": goal_ml }),
+        EpisodeKind::Table => json!({ "kind": "table" }),
     }
 }
 
-fn usable(frame: &&Frame) -> bool {
+fn usable(frame: &&EpisodeRow) -> bool {
     !frame.area_px2.is_nan()
 }
 
 /// Everything about an episode but its frames.
 fn summary(episode: &Episode) -> Value {
     let largest = |values: &mut dyn Iterator<Item = f32>| values.filter(|v| v.is_finite()).fold(0.0, f32::max);
-    let area: f64 = episode.frames.iter().filter(usable).map(|f| f64::from(f.area_px2)).sum();
+    let area: f64 = episode.rows.iter().filter(usable).map(|f| f64::from(f.area_px2)).sum();
     let info = &episode.info;
     json!({
         "file": episode.name,
@@ -130,13 +130,13 @@ fn summary(episode: &Episode) -> Value {
         "run": kind_json(episode.kind),
         "weight_g": episode.weight_g,
         "seconds": episode.seconds(),
-        "frames": episode.frames.len(),
-        "flow_frames": episode.frames.iter().filter(|f| f.area_px2 > 0.0).count(),
+        "frames": episode.rows.len(),
+        "flow_frames": episode.rows.iter().filter(|f| f.area_px2 > 0.0).count(),
         "lost_frames": info.lost_frames,
         "doubtful_frames": doubts(episode).into_iter().map(|(doubt, n)| (doubt.words().to_string(), json!(n))).collect::<serde_json::Map<_, _>>(),
         "area_sum_px2": area,
-        "area_max_px2": largest(&mut episode.frames.iter().map(|f| f.area_px2)),
-        "alpha_max_deg": largest(&mut episode.frames.iter().map(|f| f.alpha_commanded_deg)),
+        "area_max_px2": largest(&mut episode.rows.iter().map(|f| f.area_px2)),
+        "alpha_max_deg": largest(&mut episode.rows.iter().map(|f| f.alpha_commanded_deg)),
         "images": info.images,
         "dropped_images": info.dropped_images,
         "ticks": info.ticks,
@@ -153,7 +153,7 @@ fn summary(episode: &Episode) -> Value {
 
 /// How many frames have each doubt.
 fn doubts(episode: &Episode) -> Vec<(Doubt, usize)> {
-    let count = |doubt: Doubt| episode.frames.iter().filter(|f| f.doubt == doubt).count();
+    let count = |doubt: Doubt| episode.rows.iter().filter(|f| f.doubt == doubt).count();
     Doubt::ALL.into_iter().filter(|d| *d != Doubt::None).map(|d| (d, count(d))).filter(|(_, n)| *n > 0).collect()
 }
 
@@ -182,7 +182,7 @@ fn list(files: &[PathBuf], as_json: bool) -> Result<(), Failure> {
                     "{name:<24} {:<20} {:>7.1} {:>6} {:>8}  {:<10} {}",
                     e.info.started_at_utc,
                     e.seconds(),
-                    e.frames.len(),
+                    e.rows.len(),
                     e.weight_g.map_or("-".into(), |w| w.to_string()),
                     if e.complete { "complete" } else { "INCOMPLETE" },
                     kind_words(e.kind)
@@ -234,11 +234,11 @@ fn show(files: &[PathBuf], as_json: bool) -> Result<(), Failure> {
 fn remarks(episode: &Episode) -> Vec<(bool, String)> {
     let info = &episode.info;
     let mut all = Vec::new();
-    let flow = episode.frames.iter().filter(|f| f.area_px2 > 0.0).count();
+    let flow = episode.rows.iter().filter(|f| f.area_px2 > 0.0).count();
     if info.ended.is_empty() {
         all.push((true, "the recorder was killed before the end; record it again".to_string()));
     } else if !episode.complete {
-        let last_s = episode.frames.last().map_or(0.0, |f| f.t_s);
+        let last_s = episode.rows.last().map_or(0.0, |f| f.t_s);
         all.push((true, format!("incomplete: {}; the last frame is from {last_s:.1} s; record it again", info.ended)));
     }
     match episode.weight_g {
@@ -251,7 +251,7 @@ fn remarks(episode: &Episode) -> Vec<(bool, String)> {
         Some(_) => {}
     }
     if info.lost_frames > 0 {
-        let longest = episode.frames.chunk_by(|a, b| a.lost == b.lost).filter(|c| c[0].lost).map(<[Frame]>::len).max().unwrap_or(0);
+        let longest = episode.rows.chunk_by(|a, b| a.lost == b.lost).filter(|c| c[0].lost).map(<[EpisodeRow]>::len).max().unwrap_or(0);
         all.push((false, format!("{} frames were lost, at most {longest} in a row", info.lost_frames)));
     }
     for (doubt, n) in doubts(episode) {
@@ -264,7 +264,7 @@ fn remarks(episode: &Episode) -> Vec<(bool, String)> {
     if info.lost_ticks > 0 {
         all.push((false, format!("{} ticks of the controller are missing", info.lost_ticks)));
     }
-    let unknown = episode.frames.iter().filter(|f| f.alpha_measured_deg.is_nan()).count();
+    let unknown = episode.rows.iter().filter(|f| f.alpha_measured_deg.is_nan()).count();
     if unknown > 0 {
         all.push((false, format!("the robot's measured alpha is unknown in {unknown} frames")));
     }

@@ -23,7 +23,7 @@ use opencv::core::{Mat, MatTraitConst, Vector, VectorToVec};
 use opencv::{imgcodecs, imgproc};
 use shared::config::{Config, ImageFormat};
 use shared::control::Curve;
-use shared::episode::{AlphaTrack, End, EpisodeWriter, Kind, Sample, Start, WriteError};
+use shared::episode::{AlphaTrack, EpisodeEnd, EpisodeKind, EpisodeStart, EpisodeWriter, FrameRow, WriteError};
 use shared::ipc::{Cell, IpcError};
 use shared::messages::{Feature, FrameHeader, PixelFormat, RecorderReport, RecorderState, Telemetry};
 use shared::os::now_ns;
@@ -333,11 +333,11 @@ impl Worker {
 
     fn open(&mut self, tick: &Telemetry) {
         let kind = if tick.goal_ml.is_nan() {
-            Kind::Recording(Curve { lambda_deg: tick.lambda_deg, gamma_per_s2: tick.gamma_per_s2, beta_s: tick.beta_s })
+            EpisodeKind::Recording(Curve { lambda_deg: tick.lambda_deg, gamma_per_s2: tick.gamma_per_s2, beta_s: tick.beta_s })
         } else {
-            Kind::Pour { goal_ml: tick.goal_ml }
+            EpisodeKind::Pour { goal_ml: tick.goal_ml }
         };
-        let start = Start {
+        let start = EpisodeStart {
             episode: tick.episode,
             kind,
             started_at_ns: tick.at_ns,
@@ -419,7 +419,7 @@ impl Worker {
             }
             // The end was not known yet when the frame came.
             if current.ended.is_none_or(|e| at_ns < e.at_ns) {
-                let sample = Sample {
+                let sample = FrameRow {
                     feature: &first.feature,
                     alpha_commanded_deg: track.commanded_deg(at_ns),
                     alpha_measured_deg: track.measured_deg(at_ns),
@@ -462,7 +462,7 @@ impl Worker {
     fn close(&mut self, complete: bool, reason: &str) {
         self.settle(true);
         let Some(current) = self.current.take() else { return };
-        let end = End { complete, reason, disordered_frames: current.disordered };
+        let end = EpisodeEnd { complete, reason, disordered_frames: current.disordered };
         let (episode, images, dropped) = (current.episode, current.images, current.dropped);
         match current.writer.finish(&end) {
             Ok(path) if complete => self.report_path(RecorderState::Complete, episode, images, dropped, &path),

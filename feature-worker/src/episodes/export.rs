@@ -9,7 +9,7 @@ use opencv::core::{Mat, MatTraitConst, Size, Vector};
 use opencv::imgcodecs;
 use opencv::videoio::{VideoWriter, VideoWriterTrait, VideoWriterTraitConst};
 use serde_json::json;
-use shared::episode::{Episode, EpisodeError, Image, Images, TableError, write_table};
+use shared::episode::{Episode, EpisodeError, EpisodeImage, EpisodeImages, TableError, write_table};
 use shared::exit::{self, Failure, failure};
 
 use super::lerobot;
@@ -21,7 +21,7 @@ pub struct Args {
     paths: Vec<PathBuf>,
     /// What to write.
     #[arg(long = "as", value_enum)]
-    format: Format,
+    format: ExportFormat,
     /// The directory for it; made if missing.
     #[arg(long, value_name = "DIR")]
     to: PathBuf,
@@ -34,7 +34,7 @@ pub struct Args {
 }
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
-enum Format {
+enum ExportFormat {
     Csv,
     Images,
     Video,
@@ -89,14 +89,14 @@ fn export(args: &Args, files: &[PathBuf]) -> Result<Vec<PathBuf>, ExportError> {
     }
     fs::create_dir_all(&args.to).map_err(|e| write_error(&args.to, e))?;
     let episodes = files.iter().map(|f| Episode::read(f)).collect::<Result<Vec<_>, _>>()?;
-    if args.format == Format::Csv {
+    if args.format == ExportFormat::Csv {
         let pair = [args.to.join("features.csv"), args.to.join("scale.csv")];
         write_table(&episodes, &pair[0], &pair[1])?;
         return Ok(pair.into());
     }
-    let frames: usize = episodes.iter().map(|e| e.frames.len()).sum();
+    let frames: usize = episodes.iter().map(|e| e.rows.len()).sum();
     let bar = progress(frames as u64);
-    if args.format == Format::Lerobot {
+    if args.format == ExportFormat::Lerobot {
         lerobot::write(files, &episodes, &args.to, &bar)?;
         bar.finish_and_clear();
         return Ok(vec![args.to.clone()]);
@@ -106,9 +106,9 @@ fn export(args: &Args, files: &[PathBuf]) -> Result<Vec<PathBuf>, ExportError> {
         let stem = file.file_stem().unwrap_or(file.as_os_str());
         let target = args.to.join(stem);
         written.push(match args.format {
-            Format::Csv | Format::Lerobot => continue,
-            Format::Images => images(file, &target, &bar)?,
-            Format::Video => {
+            ExportFormat::Csv | ExportFormat::Lerobot => continue,
+            ExportFormat::Images => images(file, &target, &bar)?,
+            ExportFormat::Video => {
                 let target = target.with_extension("mp4");
                 if target.exists() {
                     return Err(write_error(&target, "is there already; name another directory"));
@@ -138,7 +138,7 @@ pub(crate) fn progress(total: u64) -> ProgressBar {
 
 fn images(file: &Path, target: &Path, bar: &ProgressBar) -> Result<PathBuf, ExportError> {
     fs::create_dir(target).map_err(|e| write_error(target, e))?;
-    for image in Images::open(file)? {
+    for image in EpisodeImages::open(file)? {
         let image = image?;
         let extension = if image.format == "png" { "png" } else { "jpg" };
         let path = target.join(format!("frame-{:08}.{extension}", image.sequence));
@@ -150,7 +150,7 @@ fn images(file: &Path, target: &Path, bar: &ProgressBar) -> Result<PathBuf, Expo
 
 /// Frames a second; the lost ones count, because they are shown too.
 pub(crate) fn rate_hz(episode: &Episode) -> f64 {
-    let rate_hz = (episode.frames.len().saturating_sub(1)) as f64 / episode.seconds();
+    let rate_hz = (episode.rows.len().saturating_sub(1)) as f64 / episode.seconds();
     if rate_hz.is_finite() { rate_hz.clamp(1.0, 240.0) } else { 30.0 }
 }
 
@@ -159,12 +159,12 @@ pub(crate) fn rate_hz(episode: &Episode) -> f64 {
 pub(crate) fn frames_with_images(
     file: &Path,
     episode: &Episode,
-    mut take: impl FnMut(&Image) -> Result<(), ExportError>,
+    mut take: impl FnMut(&EpisodeImage) -> Result<(), ExportError>,
 ) -> Result<(), ExportError> {
-    let mut images = Images::open(file)?.peekable();
-    let mut shown: Option<Image> = None;
-    for frame in &episode.frames {
-        let due = |next: Option<&Result<Image, EpisodeError>>| match next {
+    let mut images = EpisodeImages::open(file)?.peekable();
+    let mut shown: Option<EpisodeImage> = None;
+    for frame in &episode.rows {
+        let due = |next: Option<&Result<EpisodeImage, EpisodeError>>| match next {
             Some(Ok(image)) => image.captured_at_ns <= frame.captured_at_ns,
             Some(Err(_)) => true,
             None => false,
@@ -194,7 +194,7 @@ impl Video {
         Self { path: path.into(), fps, writer: None }
     }
 
-    pub(crate) fn push(&mut self, image: &Image) -> Result<(), ExportError> {
+    pub(crate) fn push(&mut self, image: &EpisodeImage) -> Result<(), ExportError> {
         let fail = |e: opencv::Error| write_error(&self.path, e.message);
         let bytes: Vector<u8> = Vector::from_slice(&image.data);
         let picture: Mat = imgcodecs::imdecode(&bytes, imgcodecs::IMREAD_COLOR).map_err(fail)?;

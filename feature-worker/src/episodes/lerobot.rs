@@ -19,7 +19,7 @@ use parquet::file::properties::WriterProperties;
 use parquet::file::writer::SerializedFileWriter;
 use parquet::schema::parser::parse_message_type;
 use serde_json::{Value, json};
-use shared::episode::{Episode, Image, Kind};
+use shared::episode::{Episode, EpisodeImage, EpisodeKind};
 
 use super::export::{ExportError, Video, frames_with_images, rate_hz, write_error};
 
@@ -56,8 +56,8 @@ pub(super) fn write(files: &[PathBuf], episodes: &[Episode], root: &Path, bar: &
     let mut pictures = Pictures::default();
     for (number, (file, episode)) in files.iter().zip(episodes).enumerate() {
         let task = match episode.kind {
-            Kind::Pour { goal_ml } => format!("pour {goal_ml} ml"),
-            Kind::Recording(_) | Kind::Table => "tilt along a curve and back".into(),
+            EpisodeKind::Pour { goal_ml } => format!("pour {goal_ml} ml"),
+            EpisodeKind::Recording(_) | EpisodeKind::Table => "tilt along a curve and back".into(),
         };
         let task_index = tasks.iter().position(|t| *t == task).unwrap_or_else(|| {
             tasks.push(task.clone());
@@ -154,7 +154,7 @@ struct Rows {
 
 impl Rows {
     fn add(&mut self, episode: &Episode, number: usize, task: usize, fps: f64) {
-        for (n, frame) in episode.frames.iter().enumerate() {
+        for (n, frame) in episode.rows.iter().enumerate() {
             self.state.extend([frame.alpha_measured_deg, frame.area_px2]);
             self.action.push(frame.alpha_commanded_deg);
             self.timestamp.push((n as f64 / fps) as f32);
@@ -302,7 +302,7 @@ impl Default for Pictures {
 }
 
 impl Pictures {
-    fn add(&mut self, image: &Image) -> opencv::Result<()> {
+    fn add(&mut self, image: &EpisodeImage) -> opencv::Result<()> {
         let bytes: Vector<u8> = Vector::from_slice(&image.data);
         let picture: Mat = imgcodecs::imdecode(&bytes, imgcodecs::IMREAD_COLOR)?;
         (self.width, self.height) = (picture.cols(), picture.rows());
