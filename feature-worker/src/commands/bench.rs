@@ -221,7 +221,7 @@ fn python(camera: &CameraConfig, image: &ImageConfig, frames: &[Mat], args: &Arg
     let directory = args.venv.join("bench");
     let io = |e: std::io::Error| format!("{}: {e}", directory.display());
     std::fs::create_dir_all(&directory).map_err(io)?;
-    std::fs::write(directory.join("bench.py"), include_str!("bench.py")).map_err(io)?;
+    std::fs::write(directory.join("bench.py"), include_str!("bench/bench.py")).map_err(io)?;
     let mut raw = std::fs::File::create(directory.join("frames.bgr")).map_err(io)?;
     for frame in frames {
         raw.write_all(frame.data_bytes().map_err(|e| e.message)?).map_err(io)?;
