@@ -185,7 +185,7 @@ fn watch(args: &Args, config: &Config, seen: &mut Seen) -> Result<(), Failure> {
     eprintln!("calibrate: watching the camera for {} s; pour once now", args.seconds);
     let end = std::time::Instant::now() + Duration::from_secs(args.seconds);
     while std::time::Instant::now() < end {
-        match source.next(Duration::from_millis(200)).map_err(|e| reach(e.to_string()))? {
+        match source.next_frame(Duration::from_millis(200)).map_err(|e| reach(e.to_string()))? {
             NextFrame::Frame(frame) => seen.add(&frame).map_err(reach)?,
             NextFrame::Nothing => {}
             NextFrame::End => break,

@@ -42,10 +42,10 @@ impl Source {
 }
 
 impl FrameSource for Source {
-    fn next(&mut self, timeout: Duration) -> Result<NextFrame<'_>, SourceError> {
+    fn next_frame(&mut self, timeout: Duration) -> Result<NextFrame<'_>, SourceError> {
         match self {
-            Self::SharedMemory(shared) => shared.next(timeout),
-            Self::Capture(capture) => capture.next(timeout),
+            Self::SharedMemory(shared) => shared.next_frame(timeout),
+            Self::Capture(capture) => capture.next_frame(timeout),
         }
     }
 }
@@ -71,12 +71,12 @@ impl<'a> ObserverSource<'a> {
 }
 
 impl FrameSource for ObserverSource<'_> {
-    fn next(&mut self, timeout: Duration) -> Result<NextFrame<'_>, SourceError> {
+    fn next_frame(&mut self, timeout: Duration) -> Result<NextFrame<'_>, SourceError> {
         if matches!(self.source, Source::Capture(_)) && has_publisher(&self.topic) {
             eprintln!("feature-worker: a worker starts in this cell; it gets the camera, and its frames are taken from now on");
             self.source = Source::shared_memory(self.cell)?;
         }
-        self.source.next(timeout)
+        self.source.next_frame(timeout)
     }
 }
 

@@ -85,7 +85,7 @@ fn show(args: &Args, config: &Config) -> Result<(), Failure> {
             if stop.load(Relaxed) {
                 break Ok(());
             }
-            let frame = match source.next(Duration::from_millis(100)) {
+            let frame = match source.next_frame(Duration::from_millis(100)) {
                 Ok(NextFrame::Frame(frame)) => frame,
                 Ok(NextFrame::Nothing) => {
                     let mut shown = lock(&shown);

@@ -172,7 +172,7 @@ impl Capture {
 }
 
 impl FrameSource for Capture {
-    fn next(&mut self, timeout: Duration) -> Result<NextFrame<'_>, SourceError> {
+    fn next_frame(&mut self, timeout: Duration) -> Result<NextFrame<'_>, SourceError> {
         if !self.wait_until_due(timeout) {
             return Ok(NextFrame::Nothing);
         }

@@ -89,7 +89,7 @@ pub enum NextFrame<'a> {
 /// Anything that gives one frame after the other.
 pub trait FrameSource {
     /// The next frame. Waits up to `timeout`; a device waits until a frame, a signal or OpenCV's own limit of 10 s.
-    fn next(&mut self, timeout: Duration) -> Result<NextFrame<'_>, SourceError>;
+    fn next_frame(&mut self, timeout: Duration) -> Result<NextFrame<'_>, SourceError>;
 }
 
 /// What a [`FrameStream`] reports after one wait.
@@ -120,11 +120,11 @@ impl<'a, S: FrameSource> FrameStream<'a, S> {
     }
 
     /// Waits for the next frame, at most for [`WAIT`].
-    pub fn next(&mut self) -> Result<StreamEvent<'_>, SourceError> {
+    pub fn wait(&mut self) -> Result<StreamEvent<'_>, SourceError> {
         if self.stop.load(Relaxed) {
             return Ok(StreamEvent::End);
         }
-        match self.source.next(WAIT) {
+        match self.source.next_frame(WAIT) {
             Ok(NextFrame::Frame(frame)) => {
                 self.last_frame_ns = os::now_ns();
                 self.silent = false;

@@ -38,7 +38,7 @@ impl SharedMemory {
 }
 
 impl FrameSource for SharedMemory {
-    fn next(&mut self, timeout: Duration) -> Result<NextFrame<'_>, SourceError> {
+    fn next_frame(&mut self, timeout: Duration) -> Result<NextFrame<'_>, SourceError> {
         let broken = |e: &dyn std::fmt::Debug| SourceError::Broken(format!("{e:?}"));
         self.held = None;
         self.held = self.subscriber.receive().map_err(|e| broken(&e))?;
