@@ -21,9 +21,10 @@ use iceoryx2::port::publisher::Publisher;
 use iceoryx2::port::subscriber::Subscriber;
 use opencv::core::{Mat, MatTraitConst, Vector, VectorToVec};
 use opencv::{imgcodecs, imgproc};
+use shared::alpha_track::AlphaTrack;
 use shared::config::{Config, ImageFormat};
-use shared::control::Curve;
-use shared::episode::{AlphaTrack, End, EpisodeWriter, Kind, Sample, Start, WriteError};
+use shared::episode::{End, EpisodeWriter, Kind, Sample, Start, WriteError};
+use shared::gaussian_curve::Curve;
 use shared::ipc::{Cell, IpcError};
 use shared::messages::{Feature, FrameHeader, PixelFormat, RecorderReport, RecorderState, Telemetry};
 use shared::os::now_ns;
@@ -185,7 +186,7 @@ struct Worker {
     handover: Arc<Handover>,
     telemetry: Subscriber<Ipc, Telemetry, ()>,
     reports: Publisher<Ipc, RecorderReport, ()>,
-    track: AlphaTrack,
+    track: AlphaTrack<256>,
     ring: VecDeque<Item>,
     encoder: Encoder,
     /// Episode of the newest tick; `None` before the first.
@@ -241,7 +242,7 @@ impl Worker {
             handover,
             telemetry,
             reports,
-            track: AlphaTrack::new(256),
+            track: AlphaTrack::new(),
             ring: VecDeque::with_capacity(RING_FRAMES + 1),
             encoder,
             seen: None,

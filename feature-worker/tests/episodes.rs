@@ -7,8 +7,8 @@ use std::time::UNIX_EPOCH;
 use opencv::core::{Mat, Scalar, Vector, VectorToVec};
 use opencv::prelude::*;
 use shared::config::Config;
-use shared::control::Curve;
 use shared::episode::{End, Episode, EpisodeWriter, Kind, Sample, Start, read_table};
+use shared::gaussian_curve::Curve;
 use shared::messages::{Feature, LAYOUT_VERSION, Telemetry};
 
 const FRAMES: u64 = 40;

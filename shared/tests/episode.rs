@@ -5,10 +5,10 @@ use std::time::{Duration, UNIX_EPOCH};
 
 use proptest::prelude::*;
 use shared::config::Config;
-use shared::control::Curve;
 use shared::episode::{
     End, Episode, EpisodeError, EpisodeWriter, Images, Kind, Sample, Start, WeighError, find, read_table, set_weight, write_table,
 };
+use shared::gaussian_curve::Curve;
 use shared::messages::{Doubt, Feature, LAYOUT_VERSION, Phase, Telemetry};
 
 const START_NS: u64 = 5_000_000_000;

@@ -7,8 +7,8 @@ use std::process::{Command, Output};
 use std::time::UNIX_EPOCH;
 
 use shared::config::Config;
-use shared::control::Curve;
 use shared::episode::{End, EpisodeWriter, Kind, Sample, Start, set_weight};
+use shared::gaussian_curve::Curve;
 use shared::messages::{Doubt, Feature, LAYOUT_VERSION, Telemetry};
 
 const FRAME_NS: u64 = 33_333_333;
