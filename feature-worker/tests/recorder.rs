@@ -1,4 +1,5 @@
 //! The recorder on real shared memory, real images and real files; killed and starved in real processes of its own.
+#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::too_many_lines)]
 
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};

@@ -1,4 +1,5 @@
 //! The simulated controller without sockets: programs, servo model, safety and power, stepped cycle by cycle.
+#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::too_many_lines)]
 
 use simulator::ur::machine::{Machine, check_program};
 use simulator::ur::rtde::{Context, Owners, Session};

@@ -2,6 +2,7 @@
 //! address and directory, all stopped and removed when the [`CellUnderTest`] is dropped.
 //!
 //! Only tests use it: it panics when something does not start, and says what the process printed.
+#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::too_many_lines)]
 #![forbid(unsafe_code)]
 
 use std::path::{Path, PathBuf};

@@ -1,4 +1,5 @@
 //! The processes together in the simulated cell: orders, endings, weight swaps, faults of processes.
+#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::too_many_lines)]
 
 use std::time::{Duration, Instant};
 

@@ -1,6 +1,7 @@
 //! The program on the robot (`rt-controller/robot/pour.script`) on the simulated controller, control cycle by control cycle.
 //!
 //! No sockets and no clock: what is asserted here is exact and holds on every machine.
+#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::too_many_lines)]
 
 use rand::{RngExt, SeedableRng};
 use rt_controller::link::{LinkOptions, Mode, ProgramState, TiltJoint, program};

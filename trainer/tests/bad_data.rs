@@ -1,4 +1,5 @@
 //! What `trainer check` finds in recordings, with the real program and real files: each fault has its own line.
+#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::too_many_lines)]
 
 mod common;
 

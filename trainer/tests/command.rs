@@ -1,4 +1,5 @@
 //! Tests of the command line, with the real program and real files.
+#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::too_many_lines)]
 
 mod common;
 

@@ -1,11 +1,6 @@
-//! The fault matrix of the robot link: each fault at rest, while tilting out, at full flow and while returning.
+//! One cell of the fault matrix: its own simulated robot, the controller as a process, and liquid by a formula.
 //!
-//! Real parts: the built `rt-controller run` as a process, the simulated UR5 controller with the program that was uploaded to
-//! it, shared memory. Only the liquid is a formula here: flow grows with the tilt that the joint really has. Every test prints
-//! its rows of the table (`cargo test -p tests --test robot_faults -- --show-output`); times are the robot's own clock.
-//!
-//! For each fault and moment, on a CB3 and on an e-Series: no command to servoj beyond the limits; upright and stopped within the bound, or stopped where
-//! the robot's own safety stops it; the reason named in the result; and a working next pour after recovery.
+//! A cell reaches a moment of a pour, is struck by a fault, and is judged by the robot's own trace; see `main.rs`.
 
 use std::fmt::Write as _;
 use std::io::{BufRead, BufReader, Write};
@@ -28,7 +23,9 @@ use shared::messages::{Feature, LAYOUT_VERSION, Phase};
 use shared::mlp::Mlp;
 use shared::os::now_ns;
 use shared::weights::Weights;
-use simulator::ur::{Controller, Fault, Handle, Options, RobotMode, RuntimeState, Series, TraceRow};
+use simulator::ur::{Controller, Handle, Options, RuntimeState, Series};
+
+use crate::motion::Motion;
 
 /// Millilitres in a frame per px^2 of the feature.
 const ML_PER_PX2: f64 = 0.002;
@@ -36,11 +33,12 @@ const ML_PER_PX2: f64 = 0.002;
 const UPRIGHT_BOUND_S: f64 = 1.0;
 /// A stop of the robot's own: program stop, protective stop, emergency stop.
 const STOP_BOUND_S: f64 = 0.5;
+/// Rate of the way upright in `config/sim.toml`, degrees/s.
 const RETURN_RATE_DEG_S: f64 = 60.0;
 
 /// When the fault comes.
 #[derive(Debug, Clone, Copy, PartialEq)]
-enum Moment {
+pub enum Moment {
     AtRest,
     TiltingOut,
     FullFlow,
@@ -49,7 +47,7 @@ enum Moment {
 
 /// What a fault leads to.
 #[derive(Debug, Clone, Copy, PartialEq)]
-enum Expected {
+pub enum Expected {
     /// The pour goes on to its end.
     Nothing,
     /// The pour ends for this reason, and the program brings the container upright by itself.
@@ -63,21 +61,21 @@ enum Expected {
 }
 
 /// A simulated cell with its own robot, controller process and liquid.
-struct Cell {
+pub struct Cell {
     name: String,
     address: IpAddr,
-    series: Series,
-    directory: tempfile::TempDir,
-    robot: Arc<Handle>,
-    process: Child,
-    client: Option<Client>,
+    pub series: Series,
+    pub directory: tempfile::TempDir,
+    pub robot: Arc<Handle>,
+    pub process: Child,
+    pub client: Option<Client>,
     stop: Arc<AtomicBool>,
     liquid: Option<JoinHandle<()>>,
     table: String,
 }
 
 impl Cell {
-    fn new(name: &str, address: Ipv4Addr, series: Series) -> Self {
+    pub fn new(name: &str, address: Ipv4Addr, series: Series) -> Self {
         let directory = tempfile::tempdir().unwrap();
         let sim = Path::new(env!("CARGO_MANIFEST_DIR")).join("../config/sim.toml");
         let mut config = Config::read(&sim).unwrap();
@@ -124,7 +122,7 @@ impl Cell {
     }
 
     /// Waits for what must come, however busy the machine is.
-    fn until<T>(&self, what: &str, mut found: impl FnMut(&Self) -> Option<T>) -> T {
+    pub fn until<T>(&self, what: &str, mut found: impl FnMut(&Self) -> Option<T>) -> T {
         let deadline = Instant::now() + Duration::from_secs(60);
         loop {
             if let Some(found) = found(self) {
@@ -189,7 +187,7 @@ impl Cell {
     }
 
     /// One cell of the matrix.
-    fn check(&mut self, fault: &str, moment: Moment, expected: Expected, strike: impl Fn(&mut Self), recover: impl Fn(&mut Self)) {
+    pub fn check(&mut self, fault: &str, moment: Moment, expected: Expected, strike: impl Fn(&mut Self), recover: impl Fn(&mut Self)) {
         let orphaned = expected == Expected::Orphaned;
         let connections = self.client.as_ref().unwrap().status().unwrap().robot_connections;
         let said_before = self.said().len();
@@ -270,12 +268,12 @@ impl Cell {
         assert_eq!(next.reason, EndReason::Done, "the next pour\n{}", context());
     }
 
-    fn signal(&self, signal: rustix::process::Signal) {
+    pub fn signal(&self, signal: rustix::process::Signal) {
         let pid = rustix::process::Pid::from_child(&self.process);
         rustix::process::kill_process(pid, signal).unwrap();
     }
 
-    fn dashboard(&self, line: &str) {
+    pub fn dashboard(&self, line: &str) {
         let mut stream = TcpStream::connect((self.address, 29999)).unwrap();
         let mut answers = BufReader::new(stream.try_clone().unwrap()).lines();
         answers.next();
@@ -283,7 +281,7 @@ impl Cell {
         answers.next();
     }
 
-    fn jog_upright_if_tilted(&mut self) {
+    pub fn jog_upright_if_tilted(&mut self) {
         if self.alpha().0.abs() > 1.0 {
             self.jog_upright();
         }
@@ -315,10 +313,12 @@ impl Drop for Cell {
     }
 }
 
+/// Head of the table that each cell prints.
 const HEAD: &str = "| fault | robot | moment | reason | poured ml | alpha at fault | largest alpha | at rest s | upright s | \
 largest rate deg/s | largest acceleration deg/s^2 | next pour of 8 ml |\n|---|---|---|---|---|---|---|---|---|---|---|---|";
 
-fn start_controller(directory: &Path) -> Child {
+/// Starts the controller of the cell in `directory`, which says what it has to say to a file there.
+pub fn start_controller(directory: &Path) -> Child {
     let path = tests::program("rt-controller");
     let log = std::fs::OpenOptions::new().create(true).append(true).open(directory.join("log")).unwrap();
     let config = directory.join("cell.toml");
@@ -366,277 +366,4 @@ fn publish_features(name: &str, robot: &Handle, stop: &AtomicBool) {
         };
         publisher.send_copy(feature).unwrap();
     }
-}
-
-/// What a trace shows, from its first row on.
-struct Motion {
-    start_deg: f64,
-    peak_deg: f64,
-    /// When the joint first came to rest.
-    rest_s: f64,
-    /// When it was upright and stayed so.
-    upright_s: Option<f64>,
-    /// Of the angles given to servoj, by the time of the program's cycles.
-    fastest_deg_s: f64,
-    hardest_deg_s2: f64,
-}
-
-impl Motion {
-    fn of(trace: &[TraceRow], series: Series) -> Self {
-        let alpha = |r: &TraceRow| r.actual_q[5].to_degrees();
-        let rate = |r: &TraceRow| r.actual_qd[5].to_degrees();
-        let (first, last) = (trace.first().unwrap(), trace.last().unwrap());
-        let upright = |r: &TraceRow| alpha(r).abs() < 1.0 && rate(r).abs() < 1.0;
-        let upright_from = trace.iter().rposition(|r| !upright(r)).map_or(0, |i| i + 1);
-        let rest = trace.iter().find(|r| rate(r).abs() < 1.0).unwrap_or(last);
-        // Only cycles in which servoj moves the joint: what a stop or a jog does is the robot's own. After those, what counts is
-        // where the joint then is and how fast.
-        let cycle_s = 1.0 / series.rate_hz();
-        let (mut at, mut speed) = (f64::NAN, f64::NAN);
-        let (mut fastest_deg_s, mut hardest_deg_s2) = (0.0f64, 0.0f64);
-        for pair in trace.windows(2) {
-            let (before, now) = (&pair[0], &pair[1]);
-            if !before.servoing {
-                (at, speed) = (before.target_q[5], before.target_qd[5]);
-            }
-            if now.servoing && now.servoj_calls != before.servoj_calls {
-                let new_speed = (now.commanded_q[5] - at) / cycle_s;
-                // A trace that begins in the middle of a motion tells neither at first; maxima leave NaN out.
-                fastest_deg_s = fastest_deg_s.max(new_speed.abs().to_degrees());
-                hardest_deg_s2 = hardest_deg_s2.max(((new_speed - speed).abs() / cycle_s).to_degrees());
-                (at, speed) = (now.commanded_q[5], new_speed);
-            }
-        }
-        Self {
-            start_deg: alpha(first),
-            peak_deg: trace.iter().map(alpha).fold(f64::MIN, f64::max),
-            rest_s: rest.timestamp_s - first.timestamp_s,
-            upright_s: trace.get(upright_from).map(|r| r.timestamp_s - first.timestamp_s),
-            fastest_deg_s,
-            hardest_deg_s2,
-        }
-    }
-}
-
-/// Four cells side by side, because a pour is mostly waiting: in each, the second moment begins with the recovery from the first.
-fn matrix(name: &str, last: u8, expected: Expected, strike: impl Fn(&mut Cell) + Sync, recover: impl Fn(&mut Cell) + Sync) {
-    let (strike, recover) = (&strike, &recover);
-    let halves = [[Moment::AtRest, Moment::FullFlow], [Moment::TiltingOut, Moment::Returning]];
-    let cells = [(Series::Cb3, halves[0]), (Series::Cb3, halves[1]), (Series::ESeries, halves[0]), (Series::ESeries, halves[1])];
-    thread::scope(|scope| {
-        for (k, (series, moments)) in (0..).zip(cells) {
-            scope.spawn(move || {
-                let mut cell = Cell::new(name, Ipv4Addr::new(127, 44, k, last), series);
-                for moment in moments {
-                    cell.check(name, moment, expected, strike, recover);
-                }
-            });
-        }
-    });
-}
-
-/// A fault that passes or needs nobody.
-fn by_itself(name: &str, last: u8, expected: Expected, fault: Fault) {
-    matrix(name, last, expected, |c| c.robot.inject(fault.clone()), |_| {});
-}
-
-/// A fault that shows when connecting: the connection is closed with it, and it lasts until the operator has read about it.
-fn at_connecting(name: &str, last: u8, fault: Fault, words: &str) {
-    let strike = |c: &mut Cell| {
-        c.robot.inject(fault.clone());
-        c.robot.inject(Fault::Fin);
-    };
-    let recover = |c: &mut Cell| {
-        c.until(words, |c| c.client.as_ref()?.status().ok()?.hindrance.contains(words).then_some(()));
-        c.robot.inject(Fault::Clear);
-    };
-    matrix(name, last, Expected::Upright(EndReason::RobotLost), strike, recover);
-}
-
-/// Protects the pour from a robot that closes the connection.
-#[test]
-fn fin() {
-    by_itself("fin", 1, Expected::Upright(EndReason::RobotLost), Fault::Fin);
-}
-
-/// Protects the pour from a connection that is reset.
-#[test]
-fn reset() {
-    by_itself("reset", 2, Expected::Upright(EndReason::RobotLost), Fault::Reset);
-}
-
-/// Protects the pour from a controller that is gone for a while.
-#[test]
-fn offline() {
-    by_itself("offline", 3, Expected::Upright(EndReason::RobotLost), Fault::Offline(1.5));
-}
-
-/// Protects the pour from a half-open connection.
-#[test]
-fn stall() {
-    by_itself("stall", 4, Expected::Upright(EndReason::RobotLost), Fault::Stall(1.5));
-}
-
-/// Protects the pour from a robot whose clock stands still while frames keep coming.
-#[test]
-fn freeze() {
-    by_itself("freeze", 5, Expected::Upright(EndReason::RobotStalled), Fault::Freeze(1.5));
-}
-
-/// Protects the pour from a robot that talks but does not listen.
-#[test]
-fn slow_reader() {
-    by_itself("slow-reader", 6, Expected::Upright(EndReason::RobotLost), Fault::SlowReader(1.5));
-}
-
-/// Protects the pour from a longer gap in the robot's state.
-#[test]
-fn skipped_outputs() {
-    let strike = |c: &mut Cell| c.robot.inject(Fault::SkipOutputs((0.32 * c.series.rate_hz()) as u32));
-    matrix("skip-outputs", 7, Expected::Upright(EndReason::RobotLost), strike, |_| {});
-}
-
-/// Protects the pour from being ended by what is harmless: a short gap.
-#[test]
-fn few_skipped_outputs() {
-    by_itself("skip-few-outputs", 8, Expected::Nothing, Fault::SkipOutputs(4));
-}
-
-/// Protects the pour from being ended by what is harmless: a text message.
-#[test]
-fn text() {
-    by_itself("text", 9, Expected::Nothing, Fault::Text("SafetySetup has not been confirmed yet".into()));
-}
-
-/// Protects the pour from being ended by what is harmless: frames in pieces.
-#[test]
-fn split() {
-    by_itself("split", 10, Expected::Nothing, Fault::Split(1.5));
-}
-
-/// Protects the pour from being ended by what is harmless: frames four at a time.
-#[test]
-fn coalesced() {
-    by_itself("coalesce", 11, Expected::Nothing, Fault::Coalesce(1.5));
-}
-
-/// Protects the connection from a text message before the first answer.
-#[test]
-fn text_on_connect() {
-    let strike = |c: &mut Cell| {
-        c.robot.inject(Fault::TextOnConnect("SafetySetup has not been confirmed yet".into()));
-        c.robot.inject(Fault::Fin);
-    };
-    matrix("text-on-connect", 12, Expected::Upright(EndReason::RobotLost), strike, |_| {});
-}
-
-/// Protects the connection from a robot that takes its time to start a program.
-#[test]
-fn late_start() {
-    let strike = |c: &mut Cell| {
-        c.robot.inject(Fault::LateStart(2.0));
-        c.robot.inject(Fault::Fin);
-    };
-    matrix("late-start", 13, Expected::Upright(EndReason::RobotLost), strike, |_| {});
-}
-
-/// Protects the operator: a register that a fieldbus has taken is named, and when it is free again the controller is back.
-#[test]
-fn in_use() {
-    let words = "input_int_register_24 is in use by another RTDE client or a fieldbus";
-    at_connecting("in-use", 14, Fault::InUse("input_int_register_24".into()), words);
-}
-
-/// Protects the operator: an unknown variable is named.
-#[test]
-fn not_found() {
-    at_connecting("not-found", 15, Fault::NotFound("safety_status_bits".into()), "does not know the RTDE variable safety_status_bits");
-}
-
-/// Protects the operator: a refused protocol version is named.
-#[test]
-fn version_refused() {
-    at_connecting("refuse-version-2", 16, Fault::RefuseVersion2, "refuses RTDE protocol 2");
-}
-
-/// Protects people: a protective stop ends the pour; nothing moves until the operator lets the program go on, which then only
-/// comes upright.
-#[test]
-fn protective_stop() {
-    let recover = |c: &mut Cell| {
-        c.until("unlocked", |c| {
-            c.dashboard("unlock protective stop");
-            thread::sleep(Duration::from_millis(100));
-            (c.robot.state()?.safety_mode == simulator::ur::SafetyMode::Normal).then_some(())
-        });
-        c.dashboard("play");
-    };
-    let strike = |c: &mut Cell| c.robot.inject(Fault::ProtectiveStop);
-    matrix("protective-stop", 17, Expected::Stopped(EndReason::ProtectiveStop), strike, recover);
-}
-
-/// Protects people: an emergency stop ends the pour; nothing moves until the operator has powered and moved the robot.
-#[test]
-fn emergency_stop() {
-    let recover = |c: &mut Cell| {
-        c.robot.inject(Fault::EmergencyRelease);
-        c.dashboard("power on");
-        c.until("its brakes released", |c| {
-            c.dashboard("brake release");
-            thread::sleep(Duration::from_millis(100));
-            (c.robot.state()?.robot_mode == RobotMode::Running).then_some(())
-        });
-        c.jog_upright_if_tilted();
-    };
-    let strike = |c: &mut Cell| c.robot.inject(Fault::EmergencyStop);
-    matrix("emergency-stop", 18, Expected::Stopped(EndReason::EmergencyStop), strike, recover);
-}
-
-/// Protects the operator's word: a program stopped on the pendant stays stopped until the container is upright again.
-#[test]
-fn program_stop() {
-    let strike = |c: &mut Cell| c.robot.inject(Fault::ProgramStop);
-    matrix("program-stop", 19, Expected::Stopped(EndReason::ProgramStopped), strike, Cell::jog_upright_if_tilted);
-}
-
-/// Protects the operator's word: a paused program ends the pour; resumed, it only comes upright.
-#[test]
-fn program_pause() {
-    let strike = |c: &mut Cell| c.robot.inject(Fault::ProgramPause);
-    matrix("program-pause", 20, Expected::Stopped(EndReason::ProgramStopped), strike, |c| c.dashboard("play"));
-}
-
-/// Protects the dose and the program's patience: a robot that is slowed down at the pendant does not pour.
-#[test]
-fn speed_slider() {
-    let strike = |c: &mut Cell| c.robot.inject(Fault::SpeedSlider(0.5));
-    let recover = |c: &mut Cell| {
-        let words = EndReason::SpeedReduced.words();
-        c.until(words, |c| c.client.as_ref()?.status().ok()?.hindrance.contains(words).then_some(()));
-        c.robot.inject(Fault::SpeedSlider(1.0));
-    };
-    matrix("speed-slider", 23, Expected::Slowed(EndReason::SpeedReduced, 0.5), strike, recover);
-}
-
-/// Protects people: a controller that dies in mid-pour leaves a robot that comes upright, and a new one takes over.
-#[test]
-fn controller_killed() {
-    let strike = |c: &mut Cell| {
-        c.process.kill().unwrap();
-        c.process.wait().unwrap();
-        c.client = None;
-    };
-    let recover = |c: &mut Cell| c.process = start_controller(c.directory.path());
-    matrix("sigkill", 22, Expected::Orphaned, strike, recover);
-}
-
-/// Protects the pour from a controller that was stopped: the program comes upright, and the controller knows why.
-#[test]
-fn controller_stopped_for_a_while() {
-    let strike = |c: &mut Cell| {
-        c.signal(rustix::process::Signal::STOP);
-        thread::sleep(Duration::from_millis(400));
-        c.signal(rustix::process::Signal::CONT);
-    };
-    matrix("sigstop", 21, Expected::Upright(EndReason::ControllerOverrun), strike, |_| {});
 }
