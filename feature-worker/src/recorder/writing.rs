@@ -12,8 +12,8 @@ use std::time::{Duration, SystemTime};
 use iceoryx2::port::publisher::Publisher;
 use iceoryx2::port::subscriber::Subscriber;
 use shared::config::Config;
-use shared::control::Curve;
-use shared::episode::{AlphaTrack, EpisodeEnd, EpisodeKind, EpisodeStart, EpisodeWriter, FrameRow, WriteError};
+use shared::gaussian_curve::Curve;
+use shared::episode::{EpisodeEnd, EpisodeKind, EpisodeStart, EpisodeTrack, EpisodeWriter, FrameRow, WriteError};
 use shared::ipc::{Cell, IpcError};
 use shared::messages::{Feature, RecorderReport, RecorderState, Telemetry};
 use shared::os::now_ns;
@@ -29,9 +29,6 @@ const AFTER_NS: u64 = 500_000_000;
 const SILENCE_NS: u64 = 2_000_000_000;
 /// How often the thread looks for work. Chosen by hand: much shorter than a frame of a 30 Hz camera.
 const PAUSE: Duration = Duration::from_millis(5);
-/// Ticks of the controller of which alpha is remembered: more than 8 s at the camera's rate of 30 Hz.
-const TRACK_TICKS: usize = 256;
-
 type Ipc = iceoryx2::service::ipc::Service;
 
 /// The recorder's thread.
@@ -41,7 +38,7 @@ pub struct RecorderThread {
     handover: Arc<Handover>,
     telemetry: Subscriber<Ipc, Telemetry, ()>,
     reports: Publisher<Ipc, RecorderReport, ()>,
-    track: AlphaTrack,
+    track: EpisodeTrack,
     kept: VecDeque<OfferedFrame>,
     encoder: Encoder,
     /// Episode of the newest tick; `None` before the first.
@@ -98,7 +95,7 @@ impl RecorderThread {
             handover,
             telemetry,
             reports,
-            track: AlphaTrack::new(TRACK_TICKS),
+            track: EpisodeTrack::new(),
             kept: VecDeque::with_capacity(KEPT_FRAMES + 1),
             encoder,
             newest_episode: None,
