@@ -12,8 +12,8 @@ use opencv::core::{MatTraitConst, MatTraitConstManual, Vector};
 use rand::Rng;
 use rand_pcg::Pcg32;
 use shared::config::{Config, ImageFormat};
-use shared::gaussian_curve::Curve;
 use shared::episode::{Episode, EpisodeImages, EpisodeKind};
+use shared::gaussian_curve::Curve;
 use shared::ipc::Cell;
 use shared::messages::{Feature, FrameHeader, LAYOUT_VERSION, Phase, PixelFormat, RecorderReport, RecorderState, Telemetry};
 
