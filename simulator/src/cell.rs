@@ -111,7 +111,7 @@ pub fn operator_socket(name: &str) -> PathBuf {
 struct World {
     container: Mutex<Container>,
     rig: Rig,
-    robot: ur::Handle,
+    robot: ur::Controller,
     config: Config,
     sim: SimulatorConfig,
     stop: Arc<AtomicBool>,
@@ -139,7 +139,11 @@ pub fn simulate(config: Config, sim: SimulatorConfig) -> Result<(), Box<dyn std:
     let stop = os::stop_at_signals()?;
     let mut start_q_rad = [0.0, -1.571, 1.571, -1.571, -1.571, 0.0];
     start_q_rad[config.robot.joint.index()] = config.robot.start_joint_deg.to_radians();
-    let robot = ur::Controller::start(ur::Options { series: sim.series, start_q_rad, ..ur::Options::new(config.robot.address) })?;
+    let robot = ur::Controller::start(ur::ControllerOptions {
+        series: sim.series,
+        start_q_rad,
+        ..ur::ControllerOptions::new(config.robot.address)
+    })?;
     let rig = sim.rig();
     let world = World { container: Mutex::new(rig.container(sim.fill_ml)), rig, robot, config, sim, stop };
 
