@@ -17,7 +17,6 @@ use rand::{RngExt, SeedableRng};
 use rand_pcg::Pcg64Mcg;
 use serde::{Deserialize, Serialize};
 use shared::config::Config;
-use shared::exit::{self, Failure, OrExit as _};
 use shared::ipc::Cell;
 use shared::messages::{FrameHeader, LAYOUT_VERSION, PixelFormat};
 use shared::os;
@@ -33,18 +32,6 @@ const LIQUID_PRIORITY: u8 = 60;
 const CAMERA_PRIORITY: u8 = 50;
 /// Step of the liquid, ns.
 const PHYSICS_NS: u64 = 4_000_000;
-
-/// Command-line arguments.
-#[derive(Debug, clap::Args)]
-#[command(
-    after_help = "Example:\n  simulator run --config config/sim.toml\n\nThen start `feature-worker run` and `rt-controller run` with the same \
-configuration, and act as the operator with `simulator operator`."
-)]
-pub struct Args {
-    /// The simulated cell's configuration.
-    #[arg(long, default_value = shared::config::DEFAULT_FILE)]
-    config: PathBuf,
-}
 
 /// The table `[simulator]` of the configuration.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -144,14 +131,11 @@ impl World {
     }
 }
 
-/// Runs the command.
-pub fn run(args: &Args) -> Result<(), Failure> {
-    let config = Config::read(&args.config).or_exit(exit::BAD_INPUT)?;
-    let sim = SimulatorConfig::new(&config).map_err(|e| format!("{}: {e}", args.config.display())).or_exit(exit::BAD_INPUT)?;
-    simulate(config, sim).or_exit(exit::FAILED)
-}
-
-fn simulate(config: Config, sim: SimulatorConfig) -> Result<(), Box<dyn std::error::Error>> {
+/// Runs the cell until it is asked to stop or its camera fails.
+///
+/// # Errors
+/// When the robot's ports, the cell's shared memory or the operator's socket cannot be had, or the camera fails.
+pub fn simulate(config: Config, sim: SimulatorConfig) -> Result<(), Box<dyn std::error::Error>> {
     let stop = os::stop_at_signals()?;
     let mut start_q_rad = [0.0, -1.571, 1.571, -1.571, -1.571, 0.0];
     start_q_rad[config.robot.joint.index()] = config.robot.start_joint_deg.to_radians();
@@ -256,7 +240,7 @@ fn film(world: &World) -> Result<(), String> {
     Ok(())
 }
 
-/// The main thread: one line asked, one line (JSON) answered; see [`crate::operator`].
+/// The main thread: one line asked, one line (JSON) answered; see [`crate::commands::operator`].
 fn serve_operator(world: &World, listener: &UnixListener) {
     let mut noise = Pcg64Mcg::seed_from_u64(world.sim.seed ^ 0x5C_A1_E0);
     while !world.stop.load(Relaxed) {

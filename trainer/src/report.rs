@@ -1,7 +1,7 @@
 //! `trainer report`: one self-contained HTML page of trainings and evaluations, plots inline as SVG.
 //!
-//! Offline, ordinary thread, allocates. Reads the JSON files that `trainer train`, `trainer refine`, `simulator evaluate`
-//! and `simulator reproduce` write; a file of another kind is refused by name.
+//! Offline, ordinary thread, allocates. Reads the JSON files that `trainer train`, `trainer refine`, `experiments evaluate`
+//! and `experiments reproduce` write; a file of another kind is refused by name.
 
 use std::path::PathBuf;
 

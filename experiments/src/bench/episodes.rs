@@ -8,72 +8,14 @@ use rand_distr::{Distribution, StandardNormal};
 use rand_pcg::Pcg64Mcg;
 use trainer::data::TrainingEpisode;
 
-use super::rig::{Pour, Rig};
-use super::seen::{Eye, Seen};
-use super::{RATE_HZ, World, paper};
+use simulator::physics::{ALPHA_MAX_DEG, RATE_HZ};
+
+use super::simulators::Bench;
 
 /// Frames recorded after the curve has come back, while the last drops fall.
 const SETTLE_FRAMES: usize = 45;
 
-/// Which simulator to record on.
-#[derive(Debug, Clone)]
-pub enum Bench {
-    /// Simulator a.
-    A,
-    /// Simulator b, one rig; the container is built once.
-    B(Box<(Rig, super::container::Container)>),
-    /// The same through a rendered camera.
-    Seen(Box<(Rig, super::container::Container, Eye)>),
-}
-
 impl Bench {
-    /// A bench with `rig` on it.
-    pub fn on(rig: &Rig) -> Self {
-        Self::B(Box::new((rig.clone(), rig.container(0.0))))
-    }
-
-    /// A bench with `rig` on it and a rendered camera over it.
-    pub fn seen(rig: &Rig, eye: Eye) -> Self {
-        Self::Seen(Box::new((rig.clone(), rig.container(0.0), eye)))
-    }
-
-    /// Rig and container of simulator b.
-    fn rig(&self) -> Option<(&Rig, &super::container::Container)> {
-        match self {
-            Self::A => None,
-            Self::B(bench) => Some((&bench.0, &bench.1)),
-            Self::Seen(bench) => Some((&bench.0, &bench.1)),
-        }
-    }
-
-    /// A pour from `volume_ml`.
-    pub fn pour(&self, volume_ml: f64, seed: u64) -> World {
-        let Some((rig, container)) = self.rig() else { return World::A(paper::Pour::new(volume_ml)) };
-        let mut container = container.clone();
-        container.refill(volume_ml);
-        let pour = Pour::new(rig, container, seed);
-        match self {
-            Self::Seen(bench) => World::Seen(Box::new(Seen::new(pour, &bench.2, rig.delay_frames, seed))),
-            _ => World::B(Box::new(pour)),
-        }
-    }
-
-    /// The tilt at which `volume_ml` starts to flow, degrees.
-    pub fn spill_angle_deg(&self, volume_ml: f64) -> f64 {
-        let Some((_, container)) = self.rig() else { return paper::Pour::new(volume_ml).spill_angle_deg() };
-        let mut container = container.clone();
-        container.refill(volume_ml);
-        container.spill_angle_deg()
-    }
-
-    /// What leaves `volume_ml` at the largest tilt if one waits for ever, ml.
-    pub fn reach_ml(&self, volume_ml: f64) -> f64 {
-        let Some((rig, container)) = self.rig() else { return volume_ml };
-        let mut container = container.clone();
-        container.refill(volume_ml);
-        container.volume_ml() - rig.shape.retained_ml(super::ALPHA_MAX_DEG)
-    }
-
     /// Records `n` episodes: volumes stratified over 140 to 460 ml, lambda = spill angle + U(6, 30) degrees, width U(0.7, 2.2) s.
     /// A single episode is the middle one: 300 ml, + 18 degrees, 1.3 s.
     pub fn record(&self, n: usize, seed: u64) -> Vec<TrainingEpisode> {
@@ -88,7 +30,7 @@ impl Bench {
                 let share = (stratum as f64 + rng.random_range(0.0..1.0)) / n as f64;
                 (140.0 + 320.0 * share, rng.random_range(6.0..=30.0), rng.random_range(0.7..=2.2))
             };
-            let lambda_deg = (self.spill_angle_deg(volume_ml) + over_deg).min(super::ALPHA_MAX_DEG);
+            let lambda_deg = (self.spill_angle_deg(volume_ml) + over_deg).min(ALPHA_MAX_DEG);
             let pour_seed = rng.random();
             episodes.push(self.record_one(&format!("{}", k + 1), volume_ml, lambda_deg, sigma_s, pour_seed, &mut rng));
         }
@@ -101,16 +43,16 @@ impl Bench {
         // alpha(0) = 0.05 degrees.
         let beta_s = ((lambda_deg / 0.05).ln() / gamma_per_s2).sqrt();
         let frames = (2.0 * beta_s * RATE_HZ).ceil() as usize;
-        let mut world = self.pour(volume_ml, seed);
+        let mut pour = self.pour(volume_ml, seed);
         let mut episode = TrainingEpisode::empty(name, RATE_HZ);
         for k in 0..frames + SETTLE_FRAMES {
             let t_s = k as f64 / RATE_HZ;
             let alpha_deg = if k < frames { lambda_deg * (-gamma_per_s2 * (t_s - beta_s).powi(2)).exp() } else { 0.0 };
-            let area_px2 = world.frame(alpha_deg);
+            let area_px2 = pour.frame(alpha_deg);
             episode.push(t_s, alpha_deg, f64::NAN, f64::from(area_px2));
         }
         let misread: f64 = StandardNormal.sample(rng);
-        episode.weight_g = (world.poured_ml() + 0.5 * misread).round();
+        episode.weight_g = (pour.poured_ml() + 0.5 * misread).round();
         episode
     }
 }
@@ -118,6 +60,7 @@ impl Bench {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use simulator::physics::rig::Rig;
 
     /// Protects the reference protocol: curves start and end upright, volumes are spread, weights are near the truth.
     #[test]

@@ -1,4 +1,4 @@
-//! `simulator reproduce`: repeats section 4 of the paper, and says what holds of it.
+//! `experiments reproduce`: repeats section 4 of the paper, and says what holds of it.
 //!
 //! Ordinary threads, both cores; allocates. The paper's simulation (simulator a), two actions of +-1 degree, two hidden layers
 //! of 40 neurons (1922 parameters), one experimental episode (a triangle of +-1 degree a frame), random kappa, eq. (5) to (8)
@@ -16,7 +16,7 @@ use trainer::eq8::{DELTA, KERAS_CLIP, LAMBDA, reward};
 use trainer::net::{Adam, Net, Sample};
 use trainer::report::{Series, figure, plot, table};
 
-use crate::physics::paper::Pour;
+use simulator::physics::paper::Pour;
 
 /// Adam steps between two looks at the policy.
 const LOOK_EVERY: usize = 250;
@@ -28,8 +28,8 @@ const KAPPAS: usize = 40;
 /// Command-line arguments.
 #[derive(Debug, clap::Args)]
 #[command(after_help = "Examples:
-  simulator reproduce
-  simulator reproduce --weight 55 --html out/section4.html")]
+  experiments reproduce
+  experiments reproduce --weight 55 --html out/section4.html")]
 pub struct Args {
     /// Volume that the one episode pours, ml; the triangle nearest to it is taken.
     #[arg(long, default_value_t = 99.0)]

@@ -13,19 +13,20 @@ use rand_pcg::Pcg64Mcg;
 use shared::config::ImageConfig;
 use shared::messages::PixelFormat;
 
-use super::RATE_HZ;
-use super::rig::Pour;
-use crate::camera::{Background, Renderer, Scene, View};
-use crate::evaluate_camera::{camera_config, image_config, learn_colour};
+use simulator::camera::{Background, Renderer, Scene, View};
+use simulator::physics::RATE_HZ;
+use simulator::physics::rig::Pour;
+
+use crate::commands::evaluate_camera::{camera_config, image_config, learn_colour};
 
 /// A camera on a rig, set up by a careful person: its view, and the feature worker's configuration for it.
 #[derive(Debug, Clone)]
-pub struct Eye {
+pub struct BenchCamera {
     view: View,
     image: ImageConfig,
 }
 
-impl Eye {
+impl BenchCamera {
     /// Draws scale, lip, spout, background, light, noise and blur from `seed`, and learns the liquid's colour from one pour.
     pub fn seeded(seed: u64) -> Result<Self, String> {
         let mut random = Pcg64Mcg::seed_from_u64(seed ^ 0xe7e);
@@ -53,7 +54,7 @@ struct Camera {
 
 /// A pour that is looked at.
 #[derive(Clone)]
-pub struct Seen {
+pub struct CameraPour {
     /// The physics.
     pub pour: Pour,
     /// None: OpenCV refused; every frame is lost.
@@ -64,17 +65,17 @@ pub struct Seen {
     frame: usize,
 }
 
-impl std::fmt::Debug for Seen {
+impl std::fmt::Debug for CameraPour {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        f.debug_struct("Seen").field("pour", &self.pour).field("frame", &self.frame).finish_non_exhaustive()
+        f.debug_struct("CameraPour").field("pour", &self.pour).field("frame", &self.frame).finish_non_exhaustive()
     }
 }
 
-impl Seen {
-    /// Looks at `pour` with `eye`; the picture shows what was `delay` frames ago.
-    pub fn new(pour: Pour, eye: &Eye, delay: usize, seed: u64) -> Self {
-        let size_px = (eye.view.width_px, eye.view.height_px);
-        let camera = Renderer::new(&eye.view, seed).ok().zip(Extractor::new(&camera_config(&eye.view), &eye.image).ok()).map(
+impl CameraPour {
+    /// Looks at `pour` with `camera`; the picture shows what was `delay` frames ago.
+    pub fn new(pour: Pour, camera: &BenchCamera, delay: usize, seed: u64) -> Self {
+        let size_px = (camera.view.width_px, camera.view.height_px);
+        let camera = Renderer::new(&camera.view, seed).ok().zip(Extractor::new(&camera_config(&camera.view), &camera.image).ok()).map(
             |(renderer, extractor)| {
                 Arc::new(Mutex::new(Camera { renderer, extractor, pixels: vec![0; (size_px.0 * size_px.1 * 3) as usize] }))
             },

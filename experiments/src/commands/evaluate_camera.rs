@@ -1,4 +1,4 @@
-//! `simulator evaluate-camera`: measures the feature extraction against rendered truth.
+//! `experiments evaluate-camera`: measures the feature extraction against rendered truth.
 //!
 //! Each scene is another cell: container, lip, camera pose, liquid, background, light, noise and blur drawn from a seed; its
 //! liquid's colour is learned from one rendered pour as `feature-worker calibrate` does. Then 24 frames of a pour (or of a dry
@@ -25,8 +25,8 @@ use shared::config::{CameraConfig, CameraSource, ImageConfig, LiquidMethod};
 use shared::exit::{self, OrExit as _};
 use shared::messages::{Doubt, PixelFormat};
 
-use crate::camera::{Background, Renderer, Scene, Truth, View};
-use crate::physics::rig::Rig;
+use simulator::camera::{Background, Renderer, Scene, Truth, View};
+use simulator::physics::rig::Rig;
 
 /// Areas from here on count for error and missed flow, px^2.
 const MEASURED_PX2: f64 = 200.0;
@@ -40,8 +40,8 @@ const WORST: usize = 20;
 /// Command-line arguments.
 #[derive(Debug, clap::Args)]
 #[command(
-    after_help = "Examples:\n  simulator evaluate-camera\n  simulator evaluate-camera --frames 9600 --seed 2 --json out/camera.json\n  \
-simulator evaluate-camera --frames 48 --runs 16 --method clear\n\n\
+    after_help = "Examples:\n  experiments evaluate-camera\n  experiments evaluate-camera --frames 9600 --seed 2 --json out/camera.json\n  \
+experiments evaluate-camera --frames 48 --runs 16 --method clear\n\n\
 Prints the error of V_e for areas above 200 px^2 (median and 95th percentile of its size, bias), false flow on dry frames, missed flow \
 (unnoticed: without a doubt) and the share of frames with a doubt, all by condition and over whole pours, and saves the worst 20 frames."
 )]

@@ -1,7 +1,7 @@
 //! One pour in closed loop on a simulated bench, at full speed.
 //!
 //! Pure; allocates once a pour. Policies are driven through the controller's own core, [`rt_controller::core::Core`], as at
-//! run time; baselines, which know no core, through [`Controller`] and the same [`Limiter`].
+//! run time; baselines, which know no core, through [`Baseline`] and the same [`Limiter`].
 
 use rt_controller::core::{Core, Input, Order, Robot, Settings};
 use serde::Serialize;
@@ -11,7 +11,8 @@ use shared::limits::{Limiter, Limits};
 use shared::messages::{Feature, LAYOUT_VERSION};
 use trainer::data::TrainingEpisode;
 
-use crate::physics::{RATE_HZ, World};
+use super::simulators::BenchPour;
+use simulator::physics::RATE_HZ;
 
 /// A pour ends after this many frames.
 pub const MAX_FRAMES: u32 = 900;
@@ -76,7 +77,7 @@ pub struct Trace {
 }
 
 impl Trace {
-    fn push(&mut self, alpha_deg: f64, area_px2: f32, world: &World) {
+    fn push(&mut self, alpha_deg: f64, area_px2: f32, world: &BenchPour) {
         self.t_s.push((self.t_s.len() + 1) as f64 / RATE_HZ);
         self.alpha_deg.push(alpha_deg);
         self.area_px2.push(f64::from(area_px2));
@@ -106,7 +107,7 @@ fn settings(limits: Limits) -> Settings {
 }
 
 /// Pours `goal_ml` with the running controller's core and `agent`; the frames are added to `trace` if there is one.
-pub fn by_core(agent: &Agent, world: &mut World, limits: Limits, init_ml: f64, goal_ml: f64, mut trace: Option<&mut Trace>) -> Poured {
+pub fn by_core(agent: &Agent, world: &mut BenchPour, limits: Limits, init_ml: f64, goal_ml: f64, mut trace: Option<&mut Trace>) -> Poured {
     let mut core = Core::new(settings(limits));
     core.exchange(Box::new(agent.clone()));
     let mut alpha_deg = 0.0f32;
@@ -156,15 +157,15 @@ pub fn by_core(agent: &Agent, world: &mut World, limits: Limits, init_ml: f64, g
 }
 
 /// What decides in a pour, if it is not the agent.
-pub trait Controller {
+pub trait Baseline {
     /// The angle asked for next, degrees relative to the command in force; `None`: the pour is over, upright.
-    fn decide(&mut self, area_px2: f32, alpha_deg: f32, world: &World) -> Option<f32>;
+    fn decide(&mut self, area_px2: f32, alpha_deg: f32, world: &BenchPour) -> Option<f32>;
     /// Volume believed to have been poured, ml.
     fn believed_ml(&self) -> f64;
 }
 
 /// Pours `goal_ml` with `controller`.
-pub fn by_controller(controller: &mut dyn Controller, world: &mut World, limits: Limits, init_ml: f64, goal_ml: f64) -> Poured {
+pub fn by_controller(controller: &mut dyn Baseline, world: &mut BenchPour, limits: Limits, init_ml: f64, goal_ml: f64) -> Poured {
     let mut limiter = Limiter::new(limits, (1.0 / RATE_HZ) as f32, 0.0);
     let mut back = false;
     let mut frames = 0;

@@ -19,16 +19,13 @@ use trainer::law::{self, Law, Worlds};
 use trainer::train::{Estimate, MethodName, Options, Silent, Trained};
 use trainer::{best, calibrate};
 
-use crate::physics::RATE_HZ;
-use crate::physics::episodes::Bench;
-use crate::physics::rig::Rig;
-use crate::physics::seen::Eye;
+use crate::bench::simulators::Bench;
+use crate::bench::through_camera::BenchCamera;
+use simulator::physics::RATE_HZ;
+use simulator::physics::rig::Rig;
 
-pub mod baselines;
-pub mod pour;
-
-use baselines::{BangBang, ByLaw, HandPd, OpenLoop, Oracle, Sum};
-use pour::{Poured, Trace, by_controller, by_core, grid};
+use crate::bench::baselines::{BangBang, ByLaw, HandPd, OpenLoop, Oracle, Sum};
+use crate::bench::pour::{Baseline, Poured, Trace, by_controller, by_core, grid};
 
 /// What pours.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum, Serialize)]
@@ -107,12 +104,12 @@ impl Change {
 /// Command-line arguments.
 #[derive(Debug, clap::Args)]
 #[command(after_help = "Examples:
-  simulator evaluate --sim b --rigs 20 --seeds 2 --episodes 5
-  simulator evaluate --method best,pd-tuned,pd-hand,oracle --json out/evaluation.json
-  simulator evaluate --weights out/weights.bin --rigs 1
-  simulator evaluate --weighed 5 --episodes 5
-  simulator evaluate --container bottle --change noise
-  simulator evaluate --through-camera --rigs 5 --repeats 1")]
+  experiments evaluate --sim b --rigs 20 --seeds 2 --episodes 5
+  experiments evaluate --method best,pd-tuned,pd-hand,oracle --json out/evaluation.json
+  experiments evaluate --weights out/weights.bin --rigs 1
+  experiments evaluate --weighed 5 --episodes 5
+  experiments evaluate --container bottle --change noise
+  experiments evaluate --through-camera --rigs 5 --repeats 1")]
 pub struct Args {
     /// Simulator: a (the paper's) or b (physical).
     #[arg(long, default_value = "b", value_parser = ["a", "b"])]
@@ -289,7 +286,7 @@ impl Setup {
         let pour_seed = 77_000_000 + data_seed * 100_000;
         let benches = match Rig::seeded(rig).with_container(container) {
             Some(rig) if sim != "a" => (Bench::on(&rig), Bench::on(&change.apply(rig))),
-            _ => (Bench::A, Bench::A),
+            _ => (Bench::Paper, Bench::Paper),
         };
         Self { bench: benches.0, test: benches.1, data_seed, pour_seed, limits: Limits::default() }
     }
@@ -297,7 +294,7 @@ impl Setup {
     /// The same rig with a rendered camera over it.
     pub fn through_camera(mut self, rig: u64, container: &str) -> Result<Self, String> {
         let Some(physics) = Rig::seeded(rig).with_container(container) else { return Ok(self) };
-        self.bench = Bench::seen(&physics, Eye::seeded(rig)?);
+        self.bench = Bench::through_camera(&physics, BenchCamera::seeded(rig)?);
         self.test = self.bench.clone();
         Ok(self)
     }
@@ -403,7 +400,7 @@ impl Setup {
         }
     }
 
-    fn controllers<'a>(&self, args: &Args, make: impl Fn(f64) -> Box<dyn pour::Controller + 'a>) -> Vec<Poured> {
+    fn controllers<'a>(&self, args: &Args, make: impl Fn(f64) -> Box<dyn Baseline + 'a>) -> Vec<Poured> {
         let pour = |(init, goal, k): (f64, f64, u64)| {
             by_controller(make(goal).as_mut(), &mut self.test.pour(init, self.pour_seed + k), self.limits, init, goal)
         };

@@ -1,4 +1,4 @@
-//! `simulator motion`: what the robot makes of a recorded pour's targets, with the program that is uploaded and without it.
+//! `experiments motion`: what the robot makes of a recorded pour's targets, with the program that is uploaded and without it.
 //!
 //! Feeds the 30 Hz targets of an episode, at the times at which they were recorded, to two simulated controllers: one runs
 //! `pour.script`, the other hands each target to servoj as it is until the next one comes. Pure stepping, no clock, no socket:
@@ -13,13 +13,13 @@ use shared::config::Config;
 use shared::episode::Episode;
 use shared::exit::{self, Failure, OrExit as _};
 
-use crate::ur::machine::{Machine, RuntimeState};
-use crate::ur::variables::{Input, Series};
+use simulator::ur::machine::{Machine, RuntimeState};
+use simulator::ur::variables::{Input, Series};
 
 /// Command-line arguments.
 #[derive(Debug, clap::Args)]
-#[command(after_help = "Examples:\n  simulator motion out/episodes/episode-0001.mcap\n  \
-simulator motion out/episodes/episode-0001.mcap --series e-series --from 1 --to 3 --out out/motion.svg")]
+#[command(after_help = "Examples:\n  experiments motion out/episodes/episode-0001.mcap\n  \
+experiments motion out/episodes/episode-0001.mcap --series e-series --from 1 --to 3 --out out/motion.svg")]
 pub struct Args {
     /// A recorded pour or curve
     episode: PathBuf,

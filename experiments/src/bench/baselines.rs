@@ -12,8 +12,9 @@ use shared::weights::Estimator;
 use trainer::data::TrainingEpisode;
 use trainer::law::Law;
 
-use super::pour::Controller;
-use crate::physics::{RATE_HZ, World};
+use super::pour::Baseline;
+use super::simulators::BenchPour;
+use simulator::physics::RATE_HZ;
 
 /// The plain linear sum that a lab would write first: `v = c area`, no hold.
 #[derive(Debug, Clone, Copy)]
@@ -41,8 +42,8 @@ impl Sum {
 /// A PD on d, first guess: dalpha = 0.02 d - 1.0 v, at most 0.5 degrees forward; back when less than 1 ml is missing.
 pub struct HandPd(pub Sum);
 
-impl Controller for HandPd {
-    fn decide(&mut self, area_px2: f32, _: f32, _: &World) -> Option<f32> {
+impl Baseline for HandPd {
+    fn decide(&mut self, area_px2: f32, _: f32, _: &BenchPour) -> Option<f32> {
         let d = self.0.see(area_px2);
         (d > 1.0).then(|| (0.02 * d - self.0.v_ml[0]).clamp(-3.0, 0.5) as f32)
     }
@@ -54,8 +55,8 @@ impl Controller for HandPd {
 /// Forward below an outflow of 0.6 ml a frame, back above it; over when less than 3 ml is missing.
 pub struct BangBang(pub Sum);
 
-impl Controller for BangBang {
-    fn decide(&mut self, area_px2: f32, _: f32, _: &World) -> Option<f32> {
+impl Baseline for BangBang {
+    fn decide(&mut self, area_px2: f32, _: f32, _: &BenchPour) -> Option<f32> {
         let d = self.0.see(area_px2);
         (d > 3.0).then_some(if self.0.v_ml[0] < 0.6 { 0.5 } else { -0.5 })
     }
@@ -87,8 +88,8 @@ impl OpenLoop {
     }
 }
 
-impl Controller for OpenLoop {
-    fn decide(&mut self, _: f32, alpha_deg: f32, _: &World) -> Option<f32> {
+impl Baseline for OpenLoop {
+    fn decide(&mut self, _: f32, alpha_deg: f32, _: &BenchPour) -> Option<f32> {
         self.frame += 1;
         let t_s = self.frame as f32 / RATE_HZ as f32;
         (t_s < 2.0 * self.curve.beta_s).then(|| curve_alpha_deg(&self.curve, t_s) - alpha_deg)
@@ -120,8 +121,8 @@ impl ByLaw {
     }
 }
 
-impl Controller for ByLaw {
-    fn decide(&mut self, area_px2: f32, alpha_deg: f32, _: &World) -> Option<f32> {
+impl Baseline for ByLaw {
+    fn decide(&mut self, area_px2: f32, alpha_deg: f32, _: &BenchPour) -> Option<f32> {
         let v = f64::from(self.calibration.volume_ml(self.hold.step(Some(area_px2), self.calibration.hold_above_px2), alpha_deg));
         self.v_ml = [v, self.v_ml[0], self.v_ml[1]];
         self.summed_ml += v;
@@ -156,8 +157,8 @@ impl Oracle {
     }
 }
 
-impl Controller for Oracle {
-    fn decide(&mut self, _: f32, alpha_deg: f32, world: &World) -> Option<f32> {
+impl Baseline for Oracle {
+    fn decide(&mut self, _: f32, alpha_deg: f32, world: &BenchPour) -> Option<f32> {
         let mut copy = world.clone();
         let mut limiter = Limiter::new(self.limits, (1.0 / RATE_HZ) as f32, alpha_deg);
         for _ in 0..60 {

@@ -1,4 +1,4 @@
-//! `simulator demo`: the main job, end to end, with the real processes: record, train, swap the weights, pour, report.
+//! `experiments demo`: the main job, end to end, with the real processes: record, train, swap the weights, pour, report.
 //!
 //! An ordinary process that does what an operator does, in a cell of its own ([`crate::own_cell`]).
 
@@ -14,7 +14,7 @@ use shared::ipc::Cell;
 use shared::messages::Telemetry;
 
 use crate::own_cell::{OwnCell, OwnCellError};
-use crate::pour_plot;
+use crate::plots::pour as pour_plot;
 
 /// What the operator records: millilitres filled in, and the curve's height (degrees) and width (1/s^2).
 /// A fuller container spills earlier, so it is tilted less.
@@ -28,7 +28,7 @@ const TOLERANCE_ML: f64 = 10.0;
 /// Command-line arguments.
 #[derive(Debug, clap::Args)]
 #[command(
-    after_help = "Example:\n  simulator demo --out out/demo --seed 3\n\nLeaves in the output directory: sim.toml, episodes/*.mcap, weights.bin, \
+    after_help = "Example:\n  experiments demo --out out/demo --seed 3\n\nLeaves in the output directory: sim.toml, episodes/*.mcap, weights.bin, \
 pour-*.svg, summary.json and the processes' logs."
 )]
 pub struct Args {

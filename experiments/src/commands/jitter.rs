@@ -1,4 +1,4 @@
-//! `simulator jitter`: latency and jitter of the real processes on this machine, beside cyclictest, at rest and under load.
+//! `experiments jitter`: latency and jitter of the real processes on this machine, beside cyclictest, at rest and under load.
 //!
 //! Ordinary process. Runs the simulated cell in rounds, and between them `cyclictest` with the same priority, core and interval; both
 //! once on the machine as it is and once under `stress-ng`. What the controller measured is read from its journal, tick by tick, so
@@ -20,8 +20,8 @@ use crate::own_cell::{OwnCell, OwnCellError};
 /// Command-line arguments.
 #[derive(Debug, clap::Args)]
 #[command(after_help = "Examples:
-  simulator jitter --weights out/demo/weights.bin
-  simulator jitter --weights out/demo/weights.bin --hours 0.5      (a soak under load instead of the rounds)
+  experiments jitter --weights out/demo/weights.bin
+  experiments jitter --weights out/demo/weights.bin --hours 0.5      (a soak under load instead of the rounds)
 
 Leaves jitter.json and jitter.html in the output directory. Needs cyclictest (package rt-tests) and stress-ng.")]
 pub struct Args {
