@@ -13,8 +13,8 @@ use shared::config::Config;
 use shared::episode::Episode;
 use shared::exit::{self, Failure, OrExit as _};
 
-use simulator::ur::machine::{Machine, RuntimeState};
 use simulator::ur::variables::{Input, Series};
+use simulator::ur::{Machine, RuntimeState};
 
 /// Command-line arguments.
 #[derive(Debug, clap::Args)]
@@ -173,7 +173,7 @@ fn follow(options: &LinkOptions, series: Series, program: &str, targets: &[(f64,
     let send = |machine: &mut Machine, sequence: i32, alpha_deg: f32| {
         let mut write = |name: String, bytes: &[u8]| {
             if let Some(input) = Input::parse(&name) {
-                machine.write_input(input, bytes);
+                machine.robot.write_input(input, bytes);
             }
         };
         let base = options.register_base;
