@@ -22,12 +22,10 @@ use tiny_http::{Header, Response, Server};
 
 use crate::extract::{Extractor, Image, Measurement};
 use crate::inspect::to_bgr;
-use crate::source::{FrameSource as _, NextFrame, ObserverSource};
+use crate::source::{FrameStream, ObserverSource, StreamEvent};
 
 /// Values of V_e that the page shows.
 const HISTORY: usize = 300;
-/// Without a frame for this long the page says so, ns.
-const SILENT_NS: u64 = 1_000_000_000;
 
 /// Command-line arguments.
 #[derive(Debug, clap::Args)]
@@ -73,34 +71,26 @@ fn show(args: &Args, config: &Config) -> Result<(), Failure> {
     opencv::core::set_num_threads(1).or_exit(exit::FAILED)?;
     let mut extractor = Extractor::new(&config.camera, &config.image).or_exit(exit::BAD_INPUT)?;
     let cell = Cell::join(&config.cell.name).or_exit(exit::UNREACHABLE)?;
-    let mut source = ObserverSource::open(&config.camera, &cell).or_exit(exit::UNREACHABLE)?;
+    let source = ObserverSource::open(&config.camera, &cell).or_exit(exit::UNREACHABLE)?;
     let server = Server::http(("127.0.0.1", args.port))
         .map_err(|e| failure(exit::FAILED, format!("port {} on 127.0.0.1: {e}; give another --port", args.port)))?;
     println!("http://{}", server.server_addr());
     let shown = Mutex::new(Shown::default());
     std::thread::scope(|scope| {
         scope.spawn(|| serve(&server, &shown, &stop));
-        let mut last_frame_ns = os::now_ns();
+        let mut frames = FrameStream::new(source, &stop);
         let result = loop {
-            if stop.load(Relaxed) {
-                break Ok(());
-            }
-            let frame = match source.next_frame(Duration::from_millis(100)) {
-                Ok(NextFrame::Frame(frame)) => frame,
-                Ok(NextFrame::Nothing) => {
-                    let mut shown = lock(&shown);
-                    if !shown.silent && os::now_ns() > last_frame_ns + SILENT_NS {
-                        shown.silent = true;
-                        eprintln!("feature-worker: no frames for a second; waiting for the worker or the camera driver to go on");
-                    }
+            let frame = match frames.wait() {
+                Ok(StreamEvent::Frame(frame)) => frame,
+                Ok(StreamEvent::Nothing) => continue,
+                Ok(StreamEvent::FellSilent) => {
+                    lock(&shown).silent = true;
+                    eprintln!("feature-worker: no frames for a second; waiting for the worker or the camera driver to go on");
                     continue;
                 }
-                Ok(NextFrame::End) => break Ok(()),
-                // The signal also cut short the wait for a device, which then looks lost.
-                Err(_) if stop.load(Relaxed) => break Ok(()),
+                Ok(StreamEvent::End) => break Ok(()),
                 Err(e) => break Err(failure(exit::UNREACHABLE, e)),
             };
-            last_frame_ns = os::now_ns();
             let Some(format) = PixelFormat::from_code(frame.header.format) else { continue };
             let (width_px, height_px) = (frame.header.width_px, frame.header.height_px);
             if frame.pixels.len() != width_px as usize * height_px as usize * format.bytes_per_pixel() {
