@@ -5,8 +5,8 @@
 use rt_controller::link::{LinkOptions, Mode};
 use serde::Serialize;
 use shared::episode::Episode;
-use simulator::ur::machine::{Machine, RuntimeState};
 use simulator::ur::variables::{Input, Series};
+use simulator::ur::{Machine, RuntimeState};
 
 /// Cycles within which an uploaded program must have started: 20 s on an e-Series, against 48 ms that it takes.
 const START_CYCLES: u64 = 10_000;
@@ -17,7 +17,7 @@ const LARGEST_DELAY_CYCLES: usize = 250;
 /// faster it had targets in between, which are put back on a straight line.
 pub fn targets(episode: &Episode, rate_hz: f64) -> Vec<(f64, f32)> {
     let mut targets: Vec<(f64, f32)> =
-        episode.frames.iter().filter(|f| f.alpha_commanded_deg.is_finite()).map(|f| (f.t_s, f.alpha_commanded_deg)).collect();
+        episode.rows.iter().filter(|f| f.alpha_commanded_deg.is_finite()).map(|f| (f.t_s, f.alpha_commanded_deg)).collect();
     let period_s = 1.0 / rate_hz;
     let mut i = 1;
     while i < targets.len() {
@@ -76,7 +76,7 @@ pub fn raw_program(options: &LinkOptions, cycle_s: f64) -> String {
 fn send(options: &LinkOptions, machine: &mut Machine, sequence: i32, alpha_deg: f32) {
     let mut write = |name: String, bytes: &[u8]| {
         if let Some(input) = Input::parse(&name) {
-            machine.write_input(input, bytes);
+            machine.robot.write_input(input, bytes);
         }
     };
     let base = options.register_base;

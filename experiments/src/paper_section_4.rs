@@ -5,7 +5,7 @@
 
 use rand::{RngExt, SeedableRng};
 use rand_pcg::Pcg64Mcg;
-use shared::policy::InputScale;
+use shared::mlp::InputScale;
 use simulator::physics::paper::PaperPour;
 use trainer::eq8::{LAMBDA, reward};
 use trainer::net::{Adam, Net, Sample as Example};
@@ -69,7 +69,7 @@ fn examples(alphas_deg: &[f64], volumes_ml: &[f64], scale: &InputScale, random: 
     let weight: f64 = volumes_ml.iter().sum();
     let mut sequences = Vec::new();
     for _ in 0..KAPPAS {
-        // Eq. (6): d_{i+1} = d_i - v_i; the action is the one before the image.
+        // Eq. (6): the goal is kappa times the weight; from there d falls by each volume.
         let mut d = random.random_range(0.5..1.5) * weight;
         let mut states = Vec::new();
         for i in 1..volumes_ml.len() {

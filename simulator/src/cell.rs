@@ -115,7 +115,7 @@ pub fn operator_socket(name: &str) -> PathBuf {
 struct CellState {
     container: Mutex<Container>,
     rig: Rig,
-    robot: ur::Handle,
+    robot: ur::Controller,
     config: Config,
     simulated: SimulatorConfig,
     stop: Arc<AtomicBool>,
@@ -143,7 +143,11 @@ pub fn simulate(config: Config, simulated: SimulatorConfig) -> Result<(), Box<dy
     let stop = os::stop_at_signals()?;
     let mut start_q_rad = [0.0, -1.571, 1.571, -1.571, -1.571, 0.0];
     start_q_rad[config.robot.joint.index()] = config.robot.start_joint_deg.to_radians();
-    let robot = ur::Controller::start(ur::Options { series: simulated.series, start_q_rad, ..ur::Options::new(config.robot.address) })?;
+    let robot = ur::Controller::start(ur::ControllerOptions {
+        series: simulated.series,
+        start_q_rad,
+        ..ur::ControllerOptions::new(config.robot.address)
+    })?;
     let rig = simulated.rig();
     let state = CellState { container: Mutex::new(rig.container(simulated.fill_ml)), rig, robot, config, simulated, stop };
 

@@ -14,15 +14,16 @@ use std::time::{Duration, Instant};
 
 use rt_controller::client::Client;
 use rt_controller::link::Lost;
+use shared::actions::STAY;
 use shared::config::Config;
 use shared::control::{EndReason, Outcome, Reply, Request};
 use shared::estimate::Calibration;
 use shared::ipc;
 use shared::messages::{Feature, LAYOUT_VERSION, Phase};
+use shared::mlp::Mlp;
 use shared::os::now_ns;
-use shared::policy::{Mlp, STAY};
 use shared::weights::Weights;
-use simulator::ur::{Controller, Handle, Options, RuntimeState, Series};
+use simulator::ur::{Controller, ControllerOptions, RuntimeState, Series};
 
 use crate::motion::Motion;
 
@@ -65,7 +66,7 @@ pub struct Cell {
     address: IpAddr,
     pub series: Series,
     pub directory: tempfile::TempDir,
-    pub robot: Arc<Handle>,
+    pub robot: Arc<Controller>,
     pub process: Child,
     pub client: Option<Client>,
     stop: Arc<AtomicBool>,
@@ -86,7 +87,7 @@ impl Cell {
         config.simulator = None;
         std::fs::write(directory.path().join("cell.toml"), toml::to_string(&config).unwrap()).unwrap();
         tilt_until_it_flows().write(&config.controller.weights).unwrap();
-        let robot = Arc::new(Controller::start(Options { series, ..Options::new(address) }).unwrap());
+        let robot = Arc::new(Controller::start(ControllerOptions { series, ..ControllerOptions::new(address) }).unwrap());
         let stop = Arc::new(AtomicBool::new(false));
         let liquid = thread::spawn({
             let (name, robot, stop) = (config.cell.name.clone(), robot.clone(), stop.clone());
@@ -326,13 +327,13 @@ pub fn start_controller(directory: &Path) -> Child {
 
 /// A policy by hand: 2.45 degrees a frame until liquid flows well, then stay.
 fn tilt_until_it_flows() -> Weights {
-    let mut policy = Mlp::ZERO;
-    policy.w1[0][0] = 1.0;
-    policy.w2[0][0] = 1.0;
-    policy.w3[0][STAY] = 1.0;
-    policy.b3[STAY + 7] = 0.5;
+    let mut network = Mlp::ZERO;
+    network.w1[0][0] = 1.0;
+    network.w2[0][0] = 1.0;
+    network.w3[0][STAY] = 1.0;
+    network.b3[STAY + 7] = 0.5;
     let calibration = Calibration { c: ML_PER_PX2 as f32, q: 1.0, tilt: 0.0, hold_above_px2: f32::INFINITY };
-    Weights { policy, calibration, ..tests::steady_weights(STAY + 7) }
+    Weights { network, calibration, ..tests::steady_weights(STAY + 7) }
 }
 
 fn flow_ml_s(alpha_deg: f64) -> f64 {
@@ -340,7 +341,7 @@ fn flow_ml_s(alpha_deg: f64) -> f64 {
 }
 
 /// The camera, the feature worker and the liquid in one: V_e from the tilt of the joint.
-fn publish_features(name: &str, robot: &Handle, stop: &AtomicBool) {
+fn publish_features(name: &str, robot: &Controller, stop: &AtomicBool) {
     let cell = ipc::Cell::join(name).unwrap();
     let publisher = cell.features().unwrap().publisher_builder().create().unwrap();
     let worker_epoch_ns = now_ns();
