@@ -19,7 +19,7 @@ struct Property {
 }
 
 impl ThisMachine {
-    /// Reads what Linux tells of the machine; what it does not tell is said to be unknown.
+    /// Reads what Linux tells of the machine; what it does not tell stays empty.
     pub fn look(cell: &OwnCell) -> Self {
         let mut properties = processor();
         properties.extend(power());

@@ -205,12 +205,12 @@ mod tests {
     /// goals that it never saw, and the same seeds give the same pours.
     #[test]
     fn a_trained_policy_meets_its_goals() {
-        let setup = Trial::new("b", 1, 0, "cylinder", Change::None);
-        let pours = setup.run(Pourer::Best, &PROTOCOL);
+        let trial = Trial::new("b", 1, 0, "cylinder", Change::None);
+        let pours = trial.run(Pourer::Best, &PROTOCOL);
         let summary = Summary::new("best", std::slice::from_ref(&pours));
         assert_eq!((summary.n, summary.never_poured, summary.never_stopped), (45, 0, 0));
         assert!(summary.mae_ml < 3.5 && summary.control_ml < 0.5, "{}", summary.line());
-        assert_eq!(pours, setup.run(Pourer::Best, &PROTOCOL));
+        assert_eq!(pours, trial.run(Pourer::Best, &PROTOCOL));
     }
 
     /// Protects `--through-camera`: what is recorded and poured is seen in rendered pictures, by the feature worker's extraction, and a
