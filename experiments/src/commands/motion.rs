@@ -120,7 +120,7 @@ fn compare(args: &Args, config: &Config, episode: &Episode) -> Result<Report, Bo
         SeriesArg::ESeries => Series::ESeries,
     };
     let mut targets: Vec<(f64, f32)> =
-        episode.frames.iter().filter(|f| f.alpha_commanded_deg.is_finite()).map(|f| (f.t_s, f.alpha_commanded_deg)).collect();
+        episode.rows.iter().filter(|f| f.alpha_commanded_deg.is_finite()).map(|f| (f.t_s, f.alpha_commanded_deg)).collect();
     // An episode has one row a camera frame; a loop that is faster had targets in between.
     let period_s = 1.0 / options.rate_hz;
     let mut i = 1;
