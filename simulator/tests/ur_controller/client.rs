@@ -5,11 +5,11 @@ use std::net::{IpAddr, TcpStream};
 
 use crate::connect;
 
-/// A client that speaks frames.
+/// A client that speaks RTDE packets.
 pub struct RtdeClient {
     pub stream: TcpStream,
     buffer: Vec<u8>,
-    /// Sizes of the pieces that read gave.
+    /// Sizes of the pieces in which the bytes arrived.
     pub pieces: Vec<usize>,
 }
 
@@ -19,14 +19,14 @@ impl RtdeClient {
     }
 
     pub fn send(&mut self, kind: u8, payload: &[u8]) {
-        let mut frame = ((payload.len() + 3) as u16).to_be_bytes().to_vec();
-        frame.push(kind);
-        frame.extend(payload);
-        self.stream.write_all(&frame).unwrap();
+        let mut packet = ((payload.len() + 3) as u16).to_be_bytes().to_vec();
+        packet.push(kind);
+        packet.extend(payload);
+        self.stream.write_all(&packet).unwrap();
     }
 
-    /// The next frame, header included; None: the controller closed. Err: it aborted.
-    pub fn frame(&mut self) -> std::io::Result<Option<Vec<u8>>> {
+    /// The next packet with its header. None when the controller closed the connection, an error when it aborted it.
+    pub fn packet(&mut self) -> std::io::Result<Option<Vec<u8>>> {
         loop {
             if let Some(size) = self.buffer.first_chunk().map(|s| usize::from(u16::from_be_bytes(*s)))
                 && self.buffer.len() >= size
@@ -43,12 +43,12 @@ impl RtdeClient {
         }
     }
 
-    /// The next frame of type `kind`; data and text before it are passed over.
+    /// The next packet of type `kind`. Data and text before it are passed over.
     pub fn answer(&mut self, kind: u8) -> Vec<u8> {
         loop {
-            let frame = self.frame().unwrap().expect("closed");
-            if frame[2] == kind {
-                return frame;
+            let packet = self.packet().unwrap().expect("closed");
+            if packet[2] == kind {
+                return packet;
             }
         }
     }
@@ -59,21 +59,21 @@ impl RtdeClient {
     }
 
     pub fn outputs(&mut self, frequency: f64, names: &str) -> String {
-        let frame = self.ask(b'O', &[&frequency.to_be_bytes(), names.as_bytes()].concat());
-        format!("{}:{}", frame[3], String::from_utf8_lossy(&frame[4..]))
+        let packet = self.ask(b'O', &[&frequency.to_be_bytes(), names.as_bytes()].concat());
+        format!("{}:{}", packet[3], String::from_utf8_lossy(&packet[4..]))
     }
 
     pub fn inputs(&mut self, names: &str) -> String {
-        let frame = self.ask(b'I', names.as_bytes());
-        format!("{}:{}", frame[3], String::from_utf8_lossy(&frame[4..]))
+        let packet = self.ask(b'I', names.as_bytes());
+        format!("{}:{}", packet[3], String::from_utf8_lossy(&packet[4..]))
     }
 
-    /// The next data frame's values.
+    /// The values of the next data packet.
     pub fn data(&mut self) -> Vec<u8> {
         self.answer(b'U').split_off(4)
     }
 
-    /// Negotiated, started, and reading `names` at full rate.
+    /// A client that has negotiated version 2 and reads `names` at full rate.
     pub fn started(address: IpAddr, names: &str) -> Self {
         let mut client = Self::new(address);
         assert_eq!(client.ask(b'V', &[0, 2]), hex("00045601"));

@@ -8,7 +8,7 @@ use simulator::ur::{Fault, RuntimeState, SafetyMode, Series, fault, send_fault};
 use crate::client::{DashboardClient, RtdeClient, double, hex, int};
 use crate::{COUNT, playing, start, state, until, upload};
 
-// Protects the operator's way into another process, and that each fault's text names that fault.
+// Protects the operator's way into another process: each fault has a text that names it, and arrives there.
 #[test]
 fn faults_have_names_and_arrive_over_the_operator_port() {
     let examples = ["2", "40", "input_int_register_24", "hello"];
@@ -41,18 +41,18 @@ fn faults_have_names_and_arrive_over_the_operator_port() {
     let (handle, address) = start(Series::Cb3);
     send_fault(address, &Fault::EmergencyStop).unwrap();
     until("emergency stop", || state(&handle).1 == SafetyMode::RobotEmergencyStop);
-    // A fault that ends clients which came before the operator.
+    // This fault ends clients that came before the operator.
     let mut clients = [RtdeClient::started(address, "timestamp"), RtdeClient::started(address, "timestamp")];
     send_fault(address, &Fault::Fin).unwrap();
     for client in &mut clients {
-        while client.frame().unwrap().is_some() {}
+        while client.packet().unwrap().is_some() {}
     }
     send_fault(address, &Fault::EmergencyRelease).unwrap();
     drop(handle);
     assert!(send_fault(address, &Fault::Fin).unwrap_err().to_string().contains("no simulated controller answers"));
 }
 
-// Protects fault "fin": the stream ends in order and the robot goes on; a new connection works.
+// Protects the fault "fin": the stream ends in order, the robot goes on, and a new connection works.
 #[test]
 fn fault_fin_ends_rtde_connections_in_order() {
     let (handle, address) = start(Series::Cb3);
@@ -60,12 +60,12 @@ fn fault_fin_ends_rtde_connections_in_order() {
     upload(address, COUNT);
     playing(&handle);
     handle.inject(Fault::Fin);
-    while client.frame().unwrap().is_some() {}
+    while client.packet().unwrap().is_some() {}
     assert_eq!(state(&handle).2, RuntimeState::Playing);
     RtdeClient::started(address, "timestamp").data();
 }
 
-// Protects fault "reset": the stream is aborted, not closed in order.
+// Protects the fault "reset": the stream is aborted and not closed in order.
 #[test]
 fn fault_reset_aborts_rtde_connections() {
     let (handle, address) = start(Series::Cb3);
@@ -73,7 +73,7 @@ fn fault_reset_aborts_rtde_connections() {
     client.data();
     handle.inject(Fault::Reset);
     let error = loop {
-        match client.frame() {
+        match client.packet() {
             Ok(Some(_)) => {}
             Ok(None) => panic!("closed in order"),
             Err(error) => break error,
@@ -83,13 +83,13 @@ fn fault_reset_aborts_rtde_connections() {
     RtdeClient::started(address, "timestamp").data();
 }
 
-// Protects fault "offline": everything closes and nobody answers, then everything is back.
+// Protects the fault "offline": everything closes and no port answers, and later everything is back.
 #[test]
 fn fault_offline_closes_all_ports_for_a_while() {
     let (handle, address) = start(Series::Cb3);
     let mut client = RtdeClient::started(address, "timestamp");
     handle.inject(Fault::Offline(600.0));
-    while let Ok(Some(_)) = client.frame() {}
+    while let Ok(Some(_)) = client.packet() {}
     for port in [29999, 30001, 30002, 30003, 30004] {
         assert_eq!(TcpStream::connect(SocketAddr::new(address, port)).unwrap_err().kind(), ErrorKind::ConnectionRefused);
     }
@@ -99,8 +99,8 @@ fn fault_offline_closes_all_ports_for_a_while() {
     DashboardClient::new(address);
 }
 
-// Protects fault "stall": the socket stays open, nothing comes and nothing is taken; afterwards the stream goes on with a gap
-// in the timestamps.
+// Protects the fault "stall": the socket stays open, but nothing comes and nothing is taken. Afterwards the stream goes on with a
+// gap in the timestamps.
 #[test]
 fn fault_stall_is_silent_and_deaf() {
     let (handle, address) = start(Series::Cb3);
@@ -112,7 +112,7 @@ fn fault_stall_is_silent_and_deaf() {
     let mut stamps = vec![before];
     let mut data = client.data();
     while stamps.windows(2).all(|w| w[1] - w[0] < 0.3) {
-        // No frame before the gap may know the write.
+        // No packet before the gap may know the write.
         assert_eq!(int(&data, 8), 0);
         stamps.push(double(&data, 0));
         data = client.data();
@@ -120,9 +120,9 @@ fn fault_stall_is_silent_and_deaf() {
     until("the write arrives in the end", || int(&client.data(), 8) == 7);
 }
 
-// Protects fault "freeze": frames keep coming, but it is always the same one; the robot itself goes on.
+// Protects the fault "freeze": packets keep coming, but it is always the same one, while the robot itself goes on.
 #[test]
-fn fault_freeze_repeats_one_frame() {
+fn fault_freeze_repeats_one_packet() {
     let (handle, address) = start(Series::Cb3);
     upload(address, COUNT);
     playing(&handle);
@@ -144,7 +144,7 @@ fn fault_freeze_repeats_one_frame() {
     }
 }
 
-// Protects fault "slow-reader": inputs are taken late and then all, outputs keep coming.
+// Protects the fault "slow-reader": inputs are taken late and then all at once, while outputs keep coming.
 #[test]
 fn fault_slow_reader_takes_inputs_late() {
     let (handle, address) = start(Series::Cb3);
@@ -162,7 +162,7 @@ fn fault_slow_reader_takes_inputs_late() {
     }
 }
 
-// Protects fault "skip-outputs": a gap of that many cycles in the timestamps, nothing sent twice or late.
+// Protects the fault "skip-outputs": the timestamps have a gap of that many cycles, and nothing is sent twice or late.
 #[test]
 fn fault_skip_outputs_leaves_a_gap() {
     let (handle, address) = start(Series::Cb3);
@@ -178,13 +178,13 @@ fn fault_skip_outputs_leaves_a_gap() {
     });
 }
 
-// Protects faults "split" and "coalesce": the frames are whole and in order for a client that reassembles, and the pieces on
-// the wire are not frames.
+// Protects the faults "split" and "coalesce": a client that reassembles gets the packets whole and in order, although the pieces
+// on the wire are not packets.
 #[test]
 fn faults_split_and_coalesce_keep_the_bytes() {
     let (handle, address) = start(Series::Cb3);
     let mut client = RtdeClient::started(address, "timestamp,actual_q,robot_mode");
-    let frame = 4 + 8 + 48 + 4;
+    let packet = 4 + 8 + 48 + 4;
     let mut last = double(&client.data(), 0);
     for fault in [Fault::Split(600.0), Fault::Coalesce(600.0), Fault::Clear] {
         handle.inject(Fault::Clear);
@@ -195,18 +195,18 @@ fn faults_split_and_coalesce_keep_the_bytes() {
             let data = client.data();
             assert!(double(&data, 0) > last, "{fault}");
             last = double(&data, 0);
-            assert_eq!((data.len(), int(&data, 56)), (frame - 4, 7), "{fault}");
+            assert_eq!((data.len(), int(&data, 56)), (packet - 4, 7), "{fault}");
             seen += 1;
         }
         match fault {
-            Fault::Split(_) => assert!(client.pieces.iter().filter(|p| *p % frame != 0).count() > 20, "{:?}", client.pieces),
-            Fault::Coalesce(_) => assert!(client.pieces.iter().filter(|p| **p == 4 * frame).count() >= 8, "{:?}", client.pieces),
+            Fault::Split(_) => assert!(client.pieces.iter().filter(|p| *p % packet != 0).count() > 20, "{:?}", client.pieces),
+            Fault::Coalesce(_) => assert!(client.pieces.iter().filter(|p| **p == 4 * packet).count() >= 8, "{:?}", client.pieces),
             _ => {}
         }
     }
 }
 
-// Protects faults "in-use", "not-found", "refuse-version-2" and their end by "clear".
+// Protects the faults "in-use", "not-found" and "refuse-version-2", and that "clear" ends them.
 #[test]
 fn faults_that_refuse_a_setup() {
     let (handle, address) = start(Series::Cb3);
@@ -224,8 +224,8 @@ fn faults_that_refuse_a_setup() {
     assert_eq!(client.inputs("input_int_register_24,input_double_register_24"), "1:INT32,DOUBLE");
 }
 
-// Protects fault "text": at any moment, between data frames, in the layout of the session's version; and on connecting, before
-// the first answer.
+// Protects the faults "text" and "text-on-connect": a message comes at any moment between data packets, in the layout of the
+// session's version, or before the first answer.
 #[test]
 fn faults_text_comes_at_any_moment() {
     let (handle, address) = start(Series::Cb3);
@@ -236,12 +236,12 @@ fn faults_text_comes_at_any_moment() {
     handle.inject(Fault::TextOnConnect("SafetySetup has not been confirmed yet".to_owned()));
     let mut client = RtdeClient::new(address);
     client.send(b'V', &[0, 2]);
-    assert_eq!(client.frame().unwrap().unwrap()[2], b'M');
-    assert_eq!(client.frame().unwrap().unwrap(), hex("00045601"));
+    assert_eq!(client.packet().unwrap().unwrap()[2], b'M');
+    assert_eq!(client.packet().unwrap().unwrap(), hex("00045601"));
 }
 
-// Protects faults of the robot itself as a client sees them: protective stop, emergency stop and release, pause and stop on
-// the pendant, late start.
+// Protects the faults of the robot itself as a client sees them: a protective stop, an emergency stop and its release, a pause and
+// a stop on the pendant, and a late start.
 #[test]
 fn faults_of_the_robot_show_in_its_state() {
     let (handle, address) = start(Series::Cb3);

@@ -8,8 +8,8 @@ use simulator::ur::{Controller, ControllerOptions, Fault, LogKind, RuntimeState,
 use crate::client::{DashboardClient, RtdeClient, double, int};
 use crate::{COUNT, address, connect, playing, start, state, until, upload};
 
-// Protects program life over sockets: upload on each script port, runtime_state, status bits, registers, stop, and the line
-// of a mistake in the log.
+// Protects the life of a program over sockets. It can be uploaded on each script port, shows in runtime_state, status bits and
+// registers, and can be stopped; the log names the line of a mistake.
 #[test]
 fn programs_run_from_every_script_port() {
     let (handle, address) = start(Series::Cb3);
@@ -43,19 +43,19 @@ fn programs_run_from_every_script_port() {
     playing(&handle);
 }
 
-// Protects the state streams: sizes of the real-time frame, and packages of the primary interface that add up.
+// Protects the state streams: the size of the real-time package, and that the parts of a primary package add up to it.
 #[test]
 fn state_streams_have_the_real_layout() {
     for (series, bytes) in [(Series::Cb3, 1140), (Series::ESeries, 1220)] {
         let (handle, address) = start(series);
         let mut realtime = connect(address, 30003);
-        let mut frame = vec![0; bytes];
+        let mut package = vec![0; bytes];
         for _ in 0..3 {
-            realtime.read_exact(&mut frame).unwrap();
-            assert_eq!(int(&frame, 0) as usize, bytes);
+            realtime.read_exact(&mut package).unwrap();
+            assert_eq!(int(&package, 0) as usize, bytes);
             let q = handle.joints().actual_q;
-            assert_eq!(double(&frame, 252 + 8), q[1], "actual q of the shoulder");
-            assert_eq!((double(&frame, 756), double(&frame, 812)), (7.0, 1.0), "robot mode, safety mode");
+            assert_eq!(double(&package, 252 + 8), q[1], "actual q of the shoulder");
+            assert_eq!((double(&package, 756), double(&package, 812)), (7.0, 1.0), "robot mode, safety mode");
         }
         let mut primary = connect(address, 30001);
         let mut kinds = Vec::new();
@@ -85,7 +85,7 @@ fn state_streams_have_the_real_layout() {
     }
 }
 
-// Protects the dashboard's words, which clients compare letter by letter, and its part in power, programs and safety.
+// Protects the dashboard's words, which clients compare letter by letter, and what it does to power, programs and safety.
 #[test]
 fn the_dashboard_answers_in_urs_words() {
     let (handle, address) = start(Series::Cb3);
@@ -138,7 +138,7 @@ fn the_dashboard_answers_in_urs_words() {
     assert_eq!(dashboard.ask("power off"), "Failed to execute: power off");
 }
 
-// Protects clean shutdown and isolation: several controllers at once, each address free again when its handle is dropped.
+// Protects isolation and a clean end: several controllers run at once, and each address is free again when its controller is dropped.
 #[test]
 fn several_run_at_once_and_leave_nothing_behind() {
     let addresses = [address(), address(), address()];
@@ -152,12 +152,12 @@ fn several_run_at_once_and_leave_nothing_behind() {
         let mut client = RtdeClient::started(addresses[2], "timestamp");
         client.data();
         drop(handles);
-        while let Ok(Some(_)) = client.frame() {}
+        while let Ok(Some(_)) = client.packet() {}
         assert!(TcpStream::connect(SocketAddr::new(addresses[2], 30004)).is_err());
     }
 }
 
-// Protects what the cell's physics reads: joints and trace follow the program, with the watched register beside them.
+// Protects what the cell's physics reads: joints and trace follow the program, and the watched register stands beside them.
 #[test]
 fn joints_and_trace_follow_the_program() {
     let (handle, address) = start(Series::Cb3);

@@ -16,10 +16,10 @@ use std::time::{Duration, Instant};
 
 use simulator::ur::{Controller, ControllerOptions, RobotMode, RuntimeState, SafetyMode, Series};
 
-/// Gives up on something that should come.
+/// How long to wait for something that should come. Chosen by hand, far above what any test needs.
 const PATIENCE: Duration = Duration::from_secs(20);
 
-/// An address that no other test, and most likely no other process, uses.
+/// An address that no other test uses, and most likely no other process.
 fn address() -> IpAddr {
     static NEXT: AtomicU8 = AtomicU8::new(1);
     let pid = std::process::id();
@@ -70,7 +70,7 @@ fn playing(handle: &Controller) {
     until("playing", || state(handle).2 == RuntimeState::Playing);
 }
 
-/// What ur_rtde 1.6.5's receive interface asks a CB3 3.15 for.
+/// The variables that the receive interface of ur_rtde 1.6.5 asks a CB3 3.15 for.
 const RECEIVE: &str = "timestamp,target_q,target_qd,target_qdd,target_current,target_moment,actual_q,actual_qd,actual_current,\
 joint_control_output,actual_TCP_pose,actual_TCP_speed,actual_TCP_force,target_TCP_pose,target_TCP_speed,actual_digital_input_bits,\
 joint_temperatures,actual_execution_time,robot_mode,joint_mode,safety_mode,actual_tool_accelerometer,speed_scaling,\

@@ -8,8 +8,8 @@ use simulator::ur::{Controller, ControllerOptions, Series, Version};
 use crate::client::{RtdeClient, hex, int};
 use crate::{COUNT, RECEIVE, connect, playing, start, until};
 
-// Protects the IO interface: inputs work on a connection that was never started and never asked for outputs; START is refused
-// there, as on a robot.
+// Protects ur_rtde's IO interface: inputs work on a connection that was never started and never asked for outputs. As on a robot,
+// START is refused there.
 #[test]
 fn inputs_work_without_outputs_and_start() {
     let (_handle, address) = start(Series::Cb3);
@@ -28,7 +28,7 @@ fn inputs_work_without_outputs_and_start() {
     assert_eq!(client.ask(b'P', &[]), hex("00045001"));
 }
 
-// Protects protocol version 1 (what a session has before negotiation): no frequency, no recipe id in answers and data.
+// Protects protocol version 1, which a session has before it negotiates: there is no frequency, and no recipe id in answers and data.
 #[test]
 fn version_1_has_no_recipe_id_for_outputs() {
     let (_handle, address) = start(Series::Cb3);
@@ -36,13 +36,13 @@ fn version_1_has_no_recipe_id_for_outputs() {
     let answer = client.ask(b'O', b"timestamp,robot_mode");
     assert_eq!(&answer[3..], b"DOUBLE,INT32");
     client.ask(b'S', &[]);
-    let frame = client.answer(b'U');
-    assert_eq!((frame.len(), int(&frame, 11)), (3 + 12, 7));
+    let packet = client.answer(b'U');
+    assert_eq!((packet.len(), int(&packet, 11)), (3 + 12, 7));
     assert_eq!(client.ask(b'V', &[0, 7]), hex("00045600"), "no version 7; the session goes on");
     assert_eq!(client.ask(b'V', &[0, 1]), hex("00045601"));
 }
 
-// Protects recipes: a second O replaces the first and stops the stream, P stops it and always says 1, S goes on.
+// Protects recipes: a second O replaces the first and stops the stream, P stops it and always answers 1, and S lets it go on.
 #[test]
 fn outputs_are_replaced_paused_and_resumed() {
     let (_handle, address) = start(Series::Cb3);
@@ -50,16 +50,16 @@ fn outputs_are_replaced_paused_and_resumed() {
     assert_eq!(client.data().len(), 8);
     assert_eq!(client.outputs(125.0, "robot_mode,safety_mode,"), "2:INT32,INT32");
     client.ask(b'S', &[]);
-    let frame = client.answer(b'U');
-    assert_eq!((frame[3], int(&frame, 4), int(&frame, 8)), (2, 7, 1));
+    let packet = client.answer(b'U');
+    assert_eq!((packet[3], int(&packet, 4), int(&packet, 8)), (2, 7, 1));
     assert_eq!(client.ask(b'P', &[]), hex("00045001"));
     client.send(b'v', &[]);
-    assert_eq!(client.frame().unwrap().unwrap()[2], b'v', "no data after the answer to PAUSE");
+    assert_eq!(client.packet().unwrap().unwrap()[2], b'v', "no data after the answer to PAUSE");
     client.ask(b'S', &[]);
     client.data();
 }
 
-// Protects refusals: unknown variables are NOT_FOUND with recipe id 0, and nothing can be started with such a recipe.
+// Protects refusals: an unknown variable is NOT_FOUND, its recipe has the id 0, and nothing can be started with such a recipe.
 #[test]
 fn unknown_variables_make_a_recipe_invalid() {
     let (_handle, address) = start(Series::Cb3);
@@ -72,15 +72,15 @@ fn unknown_variables_make_a_recipe_invalid() {
     assert_eq!(client.outputs(0.0, "timestamp"), "0:DOUBLE", "a frequency below 1 Hz");
     // Data for a recipe that does not exist, or of a wrong length, is answered by a text message and changes nothing.
     client.stream.write_all(&hex("000855090000000b")).unwrap();
-    assert_eq!(client.frame().unwrap().unwrap()[2], b'M');
+    assert_eq!(client.packet().unwrap().unwrap()[2], b'M');
     client.stream.write_all(&hex("00055501ff")).unwrap();
-    assert_eq!(client.frame().unwrap().unwrap()[2], b'M');
+    assert_eq!(client.packet().unwrap().unwrap()[2], b'M');
     let mut reader = RtdeClient::started(address, "input_int_register_24");
     assert_eq!(int(&reader.data(), 0), 0);
 }
 
-// Protects the variable table: every variable of the reference has its type and as many bytes, and newer ones are unknown to
-// older controllers.
+// Protects the table of variables: every variable has the type and the size of UR's RTDE guide, and newer ones are unknown to older
+// controllers.
 #[test]
 fn every_variable_has_its_type_and_size() {
     let sizes = BTreeMap::from([
@@ -171,7 +171,7 @@ fn every_variable_has_its_type_and_size() {
     assert_eq!(types_on(Series::Cb3, old, newer), format!("0:{}", ["NOT_FOUND"; 6].join(",")));
 }
 
-// Protects ownership: one writer per variable across connections, several recipes within one, released when it leaves.
+// Protects ownership: a variable has one writer among all connections, which may use it in several recipes and releases it when it leaves.
 #[test]
 fn one_client_owns_a_variable_until_it_leaves() {
     let (_handle, address) = start(Series::Cb3);
@@ -186,8 +186,8 @@ fn one_client_owns_a_variable_until_it_leaves() {
     until("ownership released", || second.inputs("input_int_register_24,input_int_register_25") != "0:IN_USE,IN_USE");
 }
 
-// Protects the others from a client that does not read: it is closed, they are served without a gap in their recipes. On
-// 30003, which ur_rtde never reads, frames are left out instead and the connection stays.
+// Protects the other clients from one that does not read: it is closed, and they are served without a gap. On port 30003, which
+// ur_rtde never reads, packages are left out instead and the connection stays.
 #[test]
 fn a_client_that_does_not_read_is_closed_and_others_are_not() {
     let (handle, address) = start(Series::ESeries);
@@ -202,7 +202,7 @@ fn a_client_that_does_not_read_is_closed_and_others_are_not() {
     reader.data();
     let mut rest = lazy.stream.try_clone().unwrap();
     let mut sink = Vec::new();
-    // What the kernel had taken is still readable, then the connection ends.
+    // What the kernel had taken can still be read, and then the connection ends.
     match rest.read_to_end(&mut sink) {
         Ok(_) => {}
         Err(e) => assert_eq!(e.kind(), ErrorKind::ConnectionReset),

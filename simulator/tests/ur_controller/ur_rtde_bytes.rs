@@ -7,33 +7,34 @@ use simulator::ur::Series;
 use crate::client::{RtdeClient, double, hex, int};
 use crate::{RECEIVE, start, until};
 
-// Protects the wire format: the bytes logged from ur_rtde 1.6.5 get the answers that a CB3 3.15.8 gave it.
+// Protects the wire format. The bytes that were logged from ur_rtde 1.6.5 get the answers that a CB3 3.15.8 gave.
 #[test]
 fn ur_rtde_receive_interface_byte_for_byte() {
     let (_handle, address) = start(Series::Cb3);
     let mut client = RtdeClient::new(address);
     client.stream.write_all(&hex("0005560002 000376 000376")).unwrap();
-    assert_eq!(client.frame().unwrap().unwrap(), hex("00045601"));
+    assert_eq!(client.packet().unwrap().unwrap(), hex("00045601"));
     for _ in 0..2 {
-        assert_eq!(client.frame().unwrap().unwrap(), hex("00137600000003 0000000f 00000008 00019f63"));
+        assert_eq!(client.packet().unwrap().unwrap(), hex("00137600000003 0000000f 00000008 00019f63"));
     }
     let mut setup = hex("044e4f405f400000000000");
     setup.extend(RECEIVE.as_bytes());
     assert_eq!(setup.len(), 1102, "the request as logged");
     client.stream.write_all(&setup).unwrap();
-    let answer = client.frame().unwrap().unwrap();
+    let answer = client.packet().unwrap().unwrap();
     assert_eq!((answer[2], answer[3]), (b'O', 1));
     assert!(answer[4..].starts_with(b"DOUBLE,VECTOR6D,"), "no comma after the last type, none before the first");
     assert_eq!(answer.iter().filter(|b| **b == b',').count(), 56);
     client.stream.write_all(&hex("000353")).unwrap();
-    assert_eq!(client.frame().unwrap().unwrap(), hex("00045301"));
-    let first = client.frame().unwrap().unwrap();
-    assert_eq!((first.len(), &first[2..4]), (1132, &b"U\x01"[..]), "1132 bytes a frame, as logged");
-    let second = client.frame().unwrap().unwrap();
+    assert_eq!(client.packet().unwrap().unwrap(), hex("00045301"));
+    let first = client.packet().unwrap().unwrap();
+    assert_eq!((first.len(), &first[2..4]), (1132, &b"U\x01"[..]), "1132 bytes a packet, as logged");
+    let second = client.packet().unwrap().unwrap();
     assert!((double(&second, 4) - double(&first, 4) - 0.008).abs() < 1e-9, "timestamps of neighbours are a cycle apart");
 }
 
-/// Fields of ur_rtde's 23 input recipes: ints, doubles, last int after the doubles; sizes of I frame, answer and U frame.
+/// The fields of 22 of ur_rtde's 23 input recipes: how many ints, how many doubles, and whether one more int follows the doubles.
+/// Then the sizes of the I packet, of its answer and of the U packet in bytes.
 const CONTROL: [(usize, usize, bool, usize, usize, usize); 22] = [
     (1, 8, true, 237, 71, 76),
     (1, 11, false, 289, 86, 96),
@@ -59,8 +60,8 @@ const CONTROL: [(usize, usize, bool, usize, usize, usize); 22] = [
     (1, 18, false, 464, 135, 152),
 ];
 
-// Protects the control interface: 23 input recipes with ids in order and one variable in many of them, sizes as logged, and
-// the logged servoJ, watchdog and clear frames arrive in the registers.
+// Protects the control interface. Its 23 input recipes get their ids in order although they share variables, all sizes are as
+// logged, and the logged packets for servoJ, watchdog and clear arrive in the registers.
 #[test]
 fn ur_rtde_control_interface_byte_for_byte() {
     let (_handle, address) = start(Series::Cb3);
@@ -81,8 +82,8 @@ fn ur_rtde_control_interface_byte_for_byte() {
     }
     assert_eq!(client.inputs("input_int_register_0,external_force_torque,"), "23:INT32,VECTOR6D");
     assert_eq!(client.ask(b'S', &[]), hex("00045301"));
-    assert_eq!(client.answer(b'U').len(), 84, "84 bytes a frame, as logged");
-    // The same connection may read its inputs back.
+    assert_eq!(client.answer(b'U').len(), 84, "84 bytes a packet, as logged");
+    // A client may read inputs back.
     let mut reader = RtdeClient::started(
         address,
         "input_int_register_0,input_double_register_0,input_double_register_1,input_double_register_5,input_double_register_8,\

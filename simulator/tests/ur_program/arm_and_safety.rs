@@ -7,7 +7,7 @@ use simulator::ur::{LogKind, Machine, RobotMode, RuntimeState, SafetyMode, Serie
 
 use crate::{START_CYCLES, START_Q, lines, machine, run, steps};
 
-/// The program that servos wrist 3 to input double register 24, every cycle.
+/// A program that servos wrist 3 to input double register 24 in every cycle.
 const FOLLOW: &str = "  q = get_actual_joint_positions()\n  while True:\n    q[5] = read_input_float_register(24)\n    \
                       servoj(q, t=get_steptime(), lookahead_time=0.05, gain=600)\n  end";
 
@@ -26,7 +26,7 @@ fn following() -> Machine {
     machine
 }
 
-// Protects the servo model: a ramp is followed one lookahead late at its own speed, and target_q, actual_q differ.
+// Protects the servo model: a ramp is followed at its own speed and one lookahead late, and actual_q lags behind target_q.
 #[test]
 fn a_ramp_is_followed_one_lookahead_late() {
     let mut machine = following();
@@ -45,7 +45,7 @@ fn a_ramp_is_followed_one_lookahead_late() {
     assert_eq!(servo.target_q[..5], START_Q[..5], "the other joints stay");
 }
 
-// Protects the limits: no demand makes a joint faster than 180 deg/s, and the arm arrives all the same.
+// Protects the limits: no demand makes a joint faster than 180 deg/s, and the arm still arrives.
 #[test]
 fn no_joint_is_faster_than_180_deg_s() {
     let mut machine = following();
@@ -63,7 +63,7 @@ fn no_joint_is_faster_than_180_deg_s() {
     assert!((machine.robot.servo.actual_q[5] - target).abs() < 1e-3);
 }
 
-// Protects against a client that jumps: an absurd demand is a protective stop that says why, with the program paused.
+// Protects against a client that jumps: an absurd demand is a protective stop that says why, and the program is paused.
 #[test]
 fn absurd_demands_are_a_protective_stop() {
     for demand in [START_Q[5] + 0.3, 7.0, f64::NAN] {
@@ -79,7 +79,7 @@ fn absurd_demands_are_a_protective_stop() {
     }
 }
 
-// Protects recovery from a protective stop: locked for 5 s, then unlocked, and only "play" lets the program go on.
+// Protects recovery from a protective stop: it is locked for 5 s, and once it is unlocked only "play" lets the program go on.
 #[test]
 fn a_protective_stop_is_unlocked_and_the_program_played_on() {
     let mut machine = following();
@@ -97,7 +97,7 @@ fn a_protective_stop_is_unlocked_and_the_program_played_on() {
     assert_eq!(machine.runtime_state(), RuntimeState::Playing);
 }
 
-// Protects recovery from an emergency stop: release, power on, brake release; the program is gone.
+// Protects recovery from an emergency stop: it takes release, power and brakes, and the program is gone.
 #[test]
 fn an_emergency_stop_ends_the_program_and_takes_the_power() {
     let mut machine = following();
@@ -124,7 +124,7 @@ fn an_emergency_stop_ends_the_program_and_takes_the_power() {
     assert_eq!(machine.runtime_state(), RuntimeState::Playing);
 }
 
-// Protects the way a moving arm stops with its program: at a bounded deceleration, not at once.
+// Protects the way in which a moving arm stops with its program: at a bounded deceleration and not at once.
 #[test]
 fn a_moving_arm_slows_down_when_its_program_ends() {
     for end in ["stop", "pause", "watchdog", "replaced", "error"] {
@@ -154,7 +154,7 @@ fn a_moving_arm_slows_down_when_its_program_ends() {
     }
 }
 
-// Protects "stopj": the program waits until the arm stands.
+// Protects stopj and movej: the program waits until the arm stands.
 #[test]
 fn stopj_and_movej_wait_for_the_arm() {
     let body = "  q = get_actual_joint_positions()\n  q[5] = q[5] + 0.5\n  q[0] = q[0] - 0.25\n  movej(q, a=5, v=1)\n  \
@@ -166,7 +166,7 @@ fn stopj_and_movej_wait_for_the_arm() {
     assert_eq!(machine.runtime_state(), RuntimeState::Stopped);
 }
 
-// Protects "given the same inputs, the same motion": two runs write the same bytes.
+// Protects determinism: two runs with the same inputs write the same bytes.
 #[test]
 fn two_runs_write_the_same_bytes() {
     let bytes = || {

@@ -6,21 +6,21 @@ use simulator::ur::{LogKind, RuntimeState};
 
 use crate::{lines, run};
 
-/// What `body` writes with textmsg.
+/// The lines that `body` writes with textmsg.
 fn said(body: &str) -> Vec<String> {
     let (_, log) = run(body, 20);
     assert_eq!(lines(&log, LogKind::ProgramError), Vec::<&str>::new(), "in {body}");
     lines(&log, LogKind::Text).into_iter().map(str::to_owned).collect()
 }
 
-/// The error that `body` ends with.
+/// The error with which `body` ends.
 fn error_of(body: &str) -> String {
     let (machine, log) = run(body, 20);
     assert_ne!(machine.runtime_state(), RuntimeState::Playing, "still running: {body}");
     lines(&log, LogKind::ProgramError).first().map_or_else(|| panic!("no error: {body}"), |e| (*e).to_owned())
 }
 
-// Protects the interpreter's results: a robot program that is tested here must mean the same on a robot.
+// Protects the results of expressions: a program that is tested here must mean the same on a robot.
 #[test]
 fn expressions_have_urscript_values() {
     for (expression, value) in [
@@ -58,7 +58,7 @@ fn expressions_have_urscript_values() {
     }
 }
 
-// Protects control flow: loops, branches, functions with defaults and names, recursion, scopes.
+// Protects control flow: loops, branches, functions with defaults and named arguments, recursion, and scopes.
 #[test]
 fn statements_run_in_order() {
     let body = r#"
@@ -96,7 +96,7 @@ fn statements_run_in_order() {
     assert_eq!(said(body), ["names [18, 20, 30]", "6", "3", "2", "total 3", "720"]);
 }
 
-// Protects against silent misreading: each mistake is an error that names its line and cause, never ignored.
+// Protects against silent misreading: each mistake is an error that names its line and cause.
 #[test]
 fn mistakes_name_line_and_cause() {
     for (body, error) in [
@@ -147,7 +147,7 @@ fn mistakes_name_line_and_cause() {
     }
 }
 
-// Protects the reading of "else if" chains and code after the last end: nothing after the program may be dropped silently.
+// Protects code after the last end, an empty program and one that is too long: nothing may be dropped silently.
 #[test]
 fn nothing_after_the_program_is_ignored() {
     let error = check_program("def a():\n  sync()\nend\nb = 1\n").unwrap_err();
@@ -156,7 +156,7 @@ fn nothing_after_the_program_is_ignored() {
     assert!(check_program(&"#".repeat(MAX_SOURCE_BYTES + 1)).is_err());
 }
 
-// Protects threads: they share globals, run in the same cycle, can be joined and killed, and only one may move the arm.
+// Protects threads: they share globals, run in the same cycle and can be joined and killed, and only one may move the arm.
 #[test]
 fn threads_run_beside_the_program() {
     let body = r#"

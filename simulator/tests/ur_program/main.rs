@@ -9,6 +9,7 @@ mod rtde_session;
 
 use simulator::ur::{LogKind, LogLine, Machine, Series};
 
+/// Where the joints stand at the start, in rad, base to wrist 3.
 const START_Q: [f64; 6] = [0.0, -1.5, 1.5, -1.5, -1.5, 0.25];
 
 /// Cycles from upload to the first statement on a CB3 (48 ms).
@@ -22,7 +23,7 @@ fn steps(machine: &mut Machine, cycles: usize) {
     (0..cycles).for_each(|_| machine.step());
 }
 
-/// A CB3 that has run `body` as a program for `cycles` cycles, and what it logged.
+/// A CB3 after it has run `body` as a program for `cycles` cycles, and what it logged.
 fn run(body: &str, cycles: usize) -> (Machine, Vec<LogLine>) {
     let mut machine = machine(Series::Cb3);
     machine.upload(&format!("def test():\n{body}\nend\n"));

@@ -5,7 +5,7 @@ use simulator::ur::{RuntimeState, Series};
 
 use crate::{START_CYCLES, START_Q, machine, run, steps};
 
-// Protects timing: one pass of a servoj or sync loop per control cycle, on both generations.
+// Protects timing: one pass of a loop with servoj, sync or sleep takes one control cycle, on both generations.
 #[test]
 fn one_pass_of_a_loop_is_one_cycle() {
     for series in [Series::Cb3, Series::ESeries] {
@@ -23,7 +23,7 @@ fn one_pass_of_a_loop_is_one_cycle() {
     }
 }
 
-// Protects servoj's blocking time: 33 ms are five cycles of a CB3, and the speed slider stretches them.
+// Protects the time for which servoj blocks: 33 ms are five cycles of a CB3, and the speed slider stretches them.
 #[test]
 fn servoj_blocks_for_its_time_and_the_speed_slider_stretches_it() {
     let body = "  n = 0\n  q = get_actual_joint_positions()\n  while True:\n    n = n + 1\n    write_output_integer_register(0, n)\n    \
@@ -38,7 +38,7 @@ fn servoj_blocks_for_its_time_and_the_speed_slider_stretches_it() {
     assert_eq!(machine.robot.outputs.int[0] - before, 10);
 }
 
-// Protects the watchdog: it lapses after 1/f without an update, whatever the value, and not while updates come.
+// Protects the watchdog: it lapses after 1/f without an update, and not while updates come, even when the value stays the same.
 #[test]
 fn a_watchdog_without_updates_stops_or_pauses_the_program() {
     for (action, state) in [("stop", RuntimeState::Stopped), ("pause", RuntimeState::Paused), ("ignore", RuntimeState::Playing)] {
@@ -59,8 +59,8 @@ fn a_watchdog_without_updates_stops_or_pauses_the_program() {
     assert_eq!(machine.runtime_state(), RuntimeState::Stopped, "a frequency of 0 stops at once");
 }
 
-// Protects program life: upload, 48 ms, playing; a second def replaces the first; sec runs beside; e-Series in local control
-// refuses.
+// Protects the life of programs: one starts 48 ms after its upload, a second def replaces the first, a sec runs beside it, and an
+// e-Series in local control refuses programs.
 #[test]
 fn programs_start_are_replaced_and_refused() {
     let mut machine = machine(Series::ESeries);
@@ -93,7 +93,7 @@ fn programs_start_are_replaced_and_refused() {
     assert_eq!(machine.robot.digital_out, 4);
 }
 
-/// ur_rtde's program as this controller recognises it, with its two numbers.
+/// As much of ur_rtde's program as this controller recognises, with its two register offsets.
 fn ur_rtde_program(offset: usize) -> String {
     format!(
         "def rtde_control():\n    global reg_offset_float = # float register offset\n{offset}    global reg_offset_int = # int register \
@@ -101,7 +101,8 @@ fn ur_rtde_program(offset: usize) -> String {
     )
 }
 
-// Protects ur_rtde's register protocol in both register ranges: ready, done, once per command, servo target, stop, end.
+// Protects ur_rtde's register protocol in both register ranges: the answers "ready" and "done", each command carried out once, servo
+// targets, stop and end.
 #[test]
 fn ur_rtde_register_protocol_is_kept() {
     for offset in [0, 24] {
@@ -112,7 +113,7 @@ fn ur_rtde_register_protocol_is_kept() {
         steps(&mut machine, START_CYCLES);
         assert_eq!(machine.runtime_state(), RuntimeState::Playing);
         assert_eq!(machine.robot.outputs.int[offset], 1, "ready");
-        // servoJ: recipe 2 of the reference.
+        // This is servoJ, whose parameters are those of recipe 2 of ur_rtde.
         let mut q = START_Q;
         q[5] += 0.05;
         for (i, v) in q.iter().chain(&[0.0, 0.0, 1.0 / 30.0, 0.1, 300.0]).enumerate() {
@@ -122,7 +123,7 @@ fn ur_rtde_register_protocol_is_kept() {
         steps(&mut machine, 100);
         assert_eq!(machine.robot.outputs.int[offset], 1, "streaming commands stay ready");
         assert!((machine.robot.servo.actual_q[5] - q[5]).abs() < 1e-3, "{}", machine.robot.servo.actual_q[5]);
-        // servoStop(10): done when the arm stands, ready again when cleared.
+        // servoStop(10) is done when the arm stands, and the program is ready again when the command is cleared.
         machine.robot.write_input(double(0), &10f64.to_be_bytes());
         machine.robot.write_input(int(0), &16i32.to_be_bytes());
         steps(&mut machine, 3);
@@ -130,13 +131,13 @@ fn ur_rtde_register_protocol_is_kept() {
         machine.robot.write_input(int(0), &0i32.to_be_bytes());
         steps(&mut machine, 1);
         assert_eq!(machine.robot.outputs.int[offset], 1, "ready again");
-        // setWatchdog(10), then silence.
+        // After setWatchdog(10) the client falls silent.
         machine.robot.write_input(int(0), &35i32.to_be_bytes());
         steps(&mut machine, 2);
         assert_eq!(machine.robot.outputs.int[offset], 2);
         steps(&mut machine, 20);
         assert_eq!(machine.runtime_state(), RuntimeState::Stopped, "watchdog");
-        // 255 ends the program.
+        // The command 255 ends the program.
         machine.robot.write_input(int(0), &0i32.to_be_bytes());
         machine.upload(&ur_rtde_program(offset));
         steps(&mut machine, START_CYCLES + 2);
@@ -144,7 +145,7 @@ fn ur_rtde_register_protocol_is_kept() {
         machine.robot.write_input(int(0), &255i32.to_be_bytes());
         steps(&mut machine, 2);
         assert_eq!(machine.runtime_state(), RuntimeState::Stopped);
-        // What is not simulated says so.
+        // A command that is not simulated is named in the log.
         machine.robot.write_input(int(0), &4i32.to_be_bytes());
         machine.upload(&ur_rtde_program(offset));
         steps(&mut machine, START_CYCLES + 2);

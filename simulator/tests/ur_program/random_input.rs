@@ -1,4 +1,4 @@
-//! Bounded random input; the cargo-fuzz targets in fuzz/ run the same functions for longer.
+//! Random input for a bounded time. The cargo-fuzz targets in fuzz/ run the same functions for longer.
 
 use proptest::prelude::*;
 use simulator::ur::Machine;
@@ -7,7 +7,7 @@ use simulator::ur::program::check_program;
 use simulator::ur::rtde::{InputOwners, RtdeSession, SessionContext};
 use simulator::ur::{Series, dashboard};
 
-/// Text out of the language's own words, which reaches deeper than random bytes.
+/// A text of the language's own words, which reaches deeper than random bytes.
 fn words() -> impl Strategy<Value = String> {
     let word = prop::sample::select(vec![
         "def ",
@@ -71,7 +71,7 @@ fn words() -> impl Strategy<Value = String> {
     prop::collection::vec(word, 0..120).prop_map(|w| w.concat())
 }
 
-/// Expressions that parse; most are wrong in type or value.
+/// An expression that parses; most are wrong in type or value.
 fn expression() -> impl Strategy<Value = String> {
     let leaf = prop::sample::select(vec![
         "x",
@@ -124,7 +124,7 @@ fn expression() -> impl Strategy<Value = String> {
     })
 }
 
-/// Programs that parse and run until their first mistake.
+/// A program that parses and runs until its first mistake.
 fn program() -> impl Strategy<Value = String> {
     let simple = prop_oneof![
         expression().prop_map(|e| format!("x = {e}")),
@@ -175,58 +175,58 @@ fn session(bytes: &[u8], cut: usize) -> Vec<u8> {
     answers
 }
 
-/// RTDE frames with right sizes and mostly right types.
-fn frames() -> impl Strategy<Value = Vec<u8>> {
+/// RTDE packets with right sizes and mostly right types.
+fn packets() -> impl Strategy<Value = Vec<u8>> {
     let payload = prop_oneof![
         prop::collection::vec(any::<u8>(), 0..40),
         Just(vec![0, 2]),
         Just(b"input_int_register_24,input_double_register_24,".to_vec()),
         Just([&125f64.to_be_bytes()[..], b"timestamp,actual_q,"].concat()),
     ];
-    let frame = (prop::sample::select(b"VvOISPUM\0".to_vec()), payload).prop_map(|(kind, payload)| {
-        let mut frame = ((payload.len() + 3) as u16).to_be_bytes().to_vec();
-        frame.push(kind);
-        frame.extend(payload);
-        frame
+    let packet = (prop::sample::select(b"VvOISPUM\0".to_vec()), payload).prop_map(|(kind, payload)| {
+        let mut packet = ((payload.len() + 3) as u16).to_be_bytes().to_vec();
+        packet.push(kind);
+        packet.extend(payload);
+        packet
     });
-    prop::collection::vec(frame, 0..12).prop_map(|f| f.concat())
+    prop::collection::vec(packet, 0..12).prop_map(|f| f.concat())
 }
 
 proptest! {
     #![proptest_config(ProptestConfig { cases: 2000, failure_persistence: None, ..ProptestConfig::default() })]
 
-    // Protects the controller's thread from any program: no panic, no endless step, joints stay numbers.
+    // Protects the controller's thread from any program: no panic, no endless step, and joints that stay numbers.
     #[test]
     fn programs_of_random_words_do_not_panic(source in words()) {
         run_program(&source);
         run_program(&format!("def a():\n{source}\nend\n"));
     }
 
-    // Protects the same from programs that get past the parser.
+    // Protects the controller's thread from programs that get past the parser.
     #[test]
     fn random_programs_do_not_panic(source in program()) {
         run_program(&source);
     }
 
-    // Protects the same from random characters.
+    // Protects the controller's thread from random characters.
     #[test]
     fn programs_of_random_characters_do_not_panic(source in "\\PC{0,200}") {
         let _ = check_program(&source);
     }
 
-    // Protects the RTDE parser: no panic, and the same answers however the bytes are cut.
+    // Protects the reader of RTDE packets: no panic, and the same answers however the bytes are cut.
     #[test]
-    fn rtde_answers_do_not_depend_on_how_bytes_are_cut(bytes in frames(), cut in 1usize..9) {
+    fn rtde_answers_do_not_depend_on_how_bytes_are_cut(bytes in packets(), cut in 1usize..9) {
         prop_assert_eq!(session(&bytes, cut), session(&bytes, usize::MAX));
     }
 
-    // Protects the RTDE parser from bytes that are no frames at all.
+    // Protects the reader of RTDE packets from bytes that are no packets at all.
     #[test]
     fn rtde_survives_random_bytes(bytes in prop::collection::vec(any::<u8>(), 0..300)) {
         session(&bytes, 7);
     }
 
-    // Protects the line interfaces.
+    // Protects the interfaces that read lines from random bytes.
     #[test]
     fn line_interfaces_survive_random_bytes(bytes in prop::collection::vec(any::<u8>(), 0..300)) {
         let mut assembler = ProgramAssembler::default();
@@ -237,7 +237,7 @@ proptest! {
     }
 }
 
-// Protects the stack: nesting and chains deeper than any real program end in an error, not in an overflow.
+// Protects the stack: nesting and chains deeper than in any real program end in an error and not in an overflow.
 #[test]
 fn deep_sources_are_errors() {
     for source in [

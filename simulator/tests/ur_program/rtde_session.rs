@@ -5,8 +5,8 @@ use simulator::ur::rtde::{InputOwners, RtdeSession, SessionContext};
 
 use crate::machine;
 
-// Protects the frequency rule: 30 Hz of a CB3 are every fourth cycle (31.25 Hz), of an e-Series every sixteenth; a frame whose
-// cycle was missed is sent late and once, and the next one on time.
+// Protects the rule for frequencies: 30 Hz are every fourth cycle of a CB3 (31.25 Hz) and every sixteenth of an e-Series. A packet
+// whose cycle was missed is sent late and once, and the next one on time.
 #[test]
 fn the_divider_is_rounded_down() {
     for (series, frequency, divider) in
@@ -23,7 +23,7 @@ fn the_divider_is_rounded_down() {
         let mut sent = Vec::new();
         for cycle in 1..=10 * divider {
             machine.step();
-            // The controller is short of time in one cycle that a frame is due in.
+            // The controller is short of time in one cycle in which a packet is due.
             if cycle != 5 * divider + 1 && session.output(&machine).is_some() {
                 sent.push(cycle);
             }
