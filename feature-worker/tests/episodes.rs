@@ -8,8 +8,8 @@ use std::time::UNIX_EPOCH;
 use opencv::core::{Mat, Scalar, Vector, VectorToVec};
 use opencv::prelude::*;
 use shared::config::Config;
-use shared::control::Curve;
 use shared::episode::{Episode, EpisodeEnd, EpisodeKind, EpisodeStart, EpisodeWriter, FrameRow, read_table};
+use shared::gaussian_curve::Curve;
 use shared::messages::{Feature, LAYOUT_VERSION, Telemetry};
 
 const FRAMES: u64 = 40;

@@ -12,8 +12,8 @@ use opencv::core::{MatTraitConst, MatTraitConstManual, Vector};
 use rand::Rng;
 use rand_pcg::Pcg32;
 use shared::config::{Config, ImageFormat};
-use shared::control::Curve;
 use shared::episode::{Episode, EpisodeImages, EpisodeKind};
+use shared::gaussian_curve::Curve;
 use shared::ipc::Cell;
 use shared::messages::{Feature, FrameHeader, LAYOUT_VERSION, Phase, PixelFormat, RecorderReport, RecorderState, Telemetry};
 
@@ -98,7 +98,7 @@ impl Scene {
                 at_ns,
                 robot_at_ns: at_ns,
                 episode,
-                policy: 0xabc,
+                weights_id: 0xabc,
                 alpha_deg,
                 alpha_measured_deg: alpha_deg - 2.0,
                 goal_ml: if phase == Phase::Pouring { 75.0 } else { f32::NAN },

@@ -20,17 +20,15 @@
 
 use sha2::{Digest, Sha256};
 
-use crate::control::Curve;
+use crate::gaussian_curve::Curve;
 use crate::messages::Doubt;
 
-mod alpha;
 mod format;
 pub mod read;
 pub mod table;
 pub mod weigh;
 pub mod write;
 
-pub use alpha::AlphaTrack;
 pub use read::{EpisodeError, EpisodeImage, EpisodeImages, find_episodes};
 pub use table::{TableError, read_table, write_table};
 pub use weigh::{WeighError, set_weight};

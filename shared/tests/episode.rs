@@ -6,11 +6,11 @@ use std::time::{Duration, UNIX_EPOCH};
 
 use proptest::prelude::*;
 use shared::config::Config;
-use shared::control::Curve;
 use shared::episode::{
     Episode, EpisodeEnd, EpisodeError, EpisodeImages, EpisodeKind, EpisodeStart, EpisodeWriter, FrameRow, WeighError, find_episodes,
     read_table, set_weight, write_table,
 };
+use shared::gaussian_curve::Curve;
 use shared::messages::{Doubt, Feature, LAYOUT_VERSION, Phase, Telemetry};
 
 const START_NS: u64 = 5_000_000_000;

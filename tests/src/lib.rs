@@ -11,19 +11,19 @@ use std::sync::atomic::{AtomicU32, Ordering};
 use std::time::{Duration, Instant};
 
 use serde_json::Value;
-use shared::agent::Selection;
+use shared::actions::{Selection, action_table};
 use shared::estimate::Calibration;
-use shared::policy::{InputScale, Mlp, action_table};
+use shared::mlp::{InputScale, Mlp};
 use shared::weights::{Estimator, Method, Origin, Weights};
 
 static NEXT: AtomicU32 = AtomicU32::new(0);
 
 /// Weights that tilt out by the same action every frame: they pour, though not well.
 pub fn steady_weights(action: usize) -> Weights {
-    let mut policy = Mlp::ZERO;
-    policy.b3[action] = 1.0;
+    let mut network = Mlp::ZERO;
+    network.b3[action] = 1.0;
     Weights {
-        policy,
+        network,
         actions_deg: action_table(),
         selection: Selection::Argmax,
         scale: InputScale::default(),

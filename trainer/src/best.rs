@@ -3,9 +3,9 @@
 //!
 //! Offline, pure, allocates; the same episodes, options and seed give the same weights on any number of threads.
 
-use shared::agent::Selection;
+use shared::actions::Selection;
 use shared::limits::Limits;
-use shared::policy::{InputScale, Mlp};
+use shared::mlp::{InputScale, Mlp};
 use shared::weights::{Estimator, Method, Origin, Weights};
 
 use crate::calibrate;
@@ -53,7 +53,7 @@ pub fn train(episodes: &[TrainingEpisode], options: &Options, progress: &dyn Pro
         progress.at(k as u64, &format!("loss {loss:.3}"));
     });
     let weights = Weights {
-        policy: net.to_mlp().unwrap_or(Mlp::ZERO),
+        network: net.to_mlp().unwrap_or(Mlp::ZERO),
         actions_deg: table,
         selection: Selection::Argmax,
         scale,

@@ -7,7 +7,8 @@
 use rand::{RngExt, SeedableRng};
 use rand_pcg::Pcg64Mcg;
 use rayon::prelude::*;
-use shared::policy::{ACTIONS, InputScale, Mlp, argmax};
+use shared::actions::{ACTIONS, BACK_DEG_PER_FRAME};
+use shared::mlp::{InputScale, Mlp, argmax};
 
 use crate::train::discretise;
 
@@ -46,7 +47,7 @@ fn collect(
         let v = pour.v_ml.map(|v| v as f32);
         let x = scale.apply(v, d_ml as f32);
         // The frames of the way back teach what d <= 0 means, a few of them are enough.
-        samples.push(Sample { x, action: discretise(table, actions, label.unwrap_or(-3.2)), weight: 1.0 });
+        samples.push(Sample { x, action: discretise(table, actions, label.unwrap_or(BACK_DEG_PER_FRAME.into())), weight: 1.0 });
         let mut asked = match net {
             Some(net) => Some(f64::from(table[argmax(&net.forward(&x))])),
             None => label,

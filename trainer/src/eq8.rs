@@ -18,11 +18,12 @@
 
 use rand::{RngExt, SeedableRng};
 use rand_pcg::Pcg64Mcg;
-use shared::agent::Selection;
+use shared::actions::ACTIONS;
+use shared::actions::Selection;
 use shared::estimate::flow::Flow;
 use shared::estimate::fused::Fused;
 use shared::estimate::{Calibration, Hold};
-use shared::policy::{ACTIONS, InputScale, Mlp};
+use shared::mlp::{InputScale, Mlp};
 use shared::weights::{Estimator, Method, Origin, Weights};
 
 use crate::data::{self, TrainingEpisode};
@@ -184,7 +185,7 @@ pub fn train(episodes: &[TrainingEpisode], options: &Options, progress: &dyn Pro
         }
     }
     let weights = Weights {
-        policy: net.to_mlp().unwrap_or(Mlp::ZERO),
+        network: net.to_mlp().unwrap_or(Mlp::ZERO),
         actions_deg: table,
         selection: if options.method == MethodName::Paper { Selection::Expected } else { Selection::Argmax },
         scale,

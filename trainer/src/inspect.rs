@@ -4,8 +4,9 @@
 
 use std::path::PathBuf;
 
+use shared::actions::ACTIONS;
 use shared::exit::{self, Failure, OrExit as _};
-use shared::policy::{ACTIONS, HIDDEN, INPUTS, PARAMETERS};
+use shared::mlp::{HIDDEN, INPUTS, PARAMETERS};
 use shared::weights::{Estimator, FORMAT_VERSION, Weights};
 
 /// Command-line arguments of `trainer inspect`.

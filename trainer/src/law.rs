@@ -14,6 +14,7 @@ use rand::{RngExt, SeedableRng};
 use rand_distr::{Distribution, StandardNormal};
 use rand_pcg::Pcg64Mcg;
 use rayon::prelude::*;
+use shared::actions::BACK_DEG_PER_FRAME;
 use shared::estimate::flow::{DRIP, Flow, FlowModel, FlowState, HISTORY, Return};
 use shared::estimate::{Calibration, Hold};
 use shared::limits::{Limiter, Limits};
@@ -208,7 +209,7 @@ impl ModelPour<'_> {
         let alpha = f64::from(match dalpha_deg {
             Some(d) => self.limiter.step(self.limiter.alpha_deg() + d as f32),
             None if self.worlds.fused => self.limiter.step_upright(),
-            None => self.limiter.step(self.limiter.alpha_deg() - 3.2),
+            None => self.limiter.step(self.limiter.alpha_deg() + BACK_DEG_PER_FRAME),
         });
         self.history.copy_within(1.., 0);
         self.history[HISTORY - 1] = alpha;

@@ -6,9 +6,9 @@
 use std::path::{Path, PathBuf};
 
 use indicatif::{ProgressBar, ProgressStyle};
+use shared::actions::{ACTIONS, action_table, nearest_action};
 use shared::exit::{self, Failure, OrExit as _, failure};
 use shared::limits::Limits;
-use shared::policy::{ACTIONS, action_table, nearest_action};
 use shared::weights::Weights;
 
 use crate::best;

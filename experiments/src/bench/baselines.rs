@@ -2,11 +2,10 @@
 //!
 //! Pure, any thread. Each sees what a lab would give it; only the oracle sees the truth.
 
-use rt_controller::core::curve_alpha_deg;
-use shared::control::Curve;
 use shared::estimate::flow::Flow;
 use shared::estimate::fused::Fused;
 use shared::estimate::{Calibration, Hold};
+use shared::gaussian_curve::Curve;
 use shared::limits::{Limiter, Limits};
 use shared::weights::Estimator;
 use trainer::data::TrainingEpisode;
@@ -92,7 +91,7 @@ impl Baseline for OpenLoop {
     fn decide(&mut self, _: f32, alpha_deg: f32, _: &BenchPour) -> Option<f32> {
         self.frame += 1;
         let t_s = self.frame as f32 / RATE_HZ as f32;
-        (t_s < 2.0 * self.curve.beta_s).then(|| curve_alpha_deg(&self.curve, t_s) - alpha_deg)
+        (t_s < self.curve.duration_s()).then(|| self.curve.alpha_deg(t_s) - alpha_deg)
     }
     fn believed_ml(&self) -> f64 {
         self.goal_ml

@@ -11,7 +11,7 @@ use rand::{RngExt, SeedableRng};
 use rand_pcg::Pcg64Mcg;
 use rayon::prelude::*;
 use shared::exit::{self, Failure, OrExit as _};
-use shared::policy::InputScale;
+use shared::mlp::InputScale;
 use trainer::eq8::{DELTA, KERAS_CLIP, LAMBDA, reward};
 use trainer::net::{Adam, Net, Sample};
 use trainer::report::{Series, figure, plot, table};

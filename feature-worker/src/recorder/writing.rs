@@ -11,9 +11,10 @@ use std::time::{Duration, SystemTime};
 
 use iceoryx2::port::publisher::Publisher;
 use iceoryx2::port::subscriber::Subscriber;
+use shared::alpha_track::AlphaTrack;
 use shared::config::Config;
-use shared::control::Curve;
-use shared::episode::{AlphaTrack, EpisodeEnd, EpisodeKind, EpisodeStart, EpisodeWriter, FrameRow, WriteError};
+use shared::episode::{EpisodeEnd, EpisodeKind, EpisodeStart, EpisodeWriter, FrameRow, WriteError};
+use shared::gaussian_curve::Curve;
 use shared::ipc::{Cell, IpcError};
 use shared::messages::{Feature, RecorderReport, RecorderState, Telemetry};
 use shared::os::now_ns;
@@ -41,7 +42,7 @@ pub struct RecorderThread {
     handover: Arc<Handover>,
     telemetry: Subscriber<Ipc, Telemetry, ()>,
     reports: Publisher<Ipc, RecorderReport, ()>,
-    track: AlphaTrack,
+    track: AlphaTrack<TRACK_TICKS>,
     kept: VecDeque<OfferedFrame>,
     encoder: Encoder,
     /// Episode of the newest tick; `None` before the first.
@@ -98,7 +99,7 @@ impl RecorderThread {
             handover,
             telemetry,
             reports,
-            track: AlphaTrack::new(TRACK_TICKS),
+            track: AlphaTrack::new(),
             kept: VecDeque::with_capacity(KEPT_FRAMES + 1),
             encoder,
             newest_episode: None,

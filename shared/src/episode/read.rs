@@ -14,8 +14,9 @@ use mcap::sans_io::linear_reader::{LinearReadEvent, LinearReader, LinearReaderOp
 use prost::Message as _;
 
 use super::format::{self, CompressedImage, EpisodeRowJson, TelemetryJson};
-use super::{AlphaTrack, Episode, EpisodeInfo, EpisodeKind, EpisodeRow};
-use crate::control::Curve;
+use super::{Episode, EpisodeInfo, EpisodeKind, EpisodeRow};
+use crate::alpha_track::AlphaTrack;
+use crate::gaussian_curve::Curve;
 use crate::messages::Doubt;
 
 /// Largest record or chunk that is believed, bytes.
@@ -189,10 +190,9 @@ impl Contents {
 
     /// The rows of the episode, the lost ones filled in.
     fn rows(&self, started_at_ns: u64) -> Result<Vec<EpisodeRow>, String> {
-        let mut track = AlphaTrack::new(self.ticks.len().max(1));
-        for t in &self.ticks {
-            track.push(t.at_ns, t.alpha_deg, t.robot_at_ns, t.alpha_measured_deg);
-        }
+        // The ticks are taken as the recorder took them, so that a lost frame gets the angles that it would have written.
+        let mut track = AlphaTrack::<256>::new();
+        let mut ticks = self.ticks.iter();
         let t_s = |at_ns: u64| (i128::from(at_ns) - i128::from(started_at_ns)) as f64 / 1e9;
         let mut rows: Vec<EpisodeRow> = Vec::with_capacity(self.samples.len());
         for row in &self.samples {
@@ -214,6 +214,11 @@ impl Contents {
                     let captured_at_ns = last.captured_at_ns + ((row.captured_at_ns - last.captured_at_ns) as f64 * share) as u64;
                     let between = f64::from(last.alpha_commanded_deg)
                         + share * (f64::from(row.alpha_commanded_deg) - f64::from(last.alpha_commanded_deg));
+                    while !track.covers(captured_at_ns)
+                        && let Some(t) = ticks.next()
+                    {
+                        track.push(t.at_ns, t.alpha_deg, t.robot_at_ns, t.alpha_measured_deg);
+                    }
                     let commanded = track.commanded_deg(captured_at_ns);
                     rows.push(EpisodeRow {
                         sequence: last.sequence + step,

@@ -1,19 +1,17 @@
-//! The policy pi: (v_t, v_t-1, v_t-2, d) -> one of 21 relative angles (section 3.3.2), a 4-32-32-21 network.
+//! The network of the paper's policy pi (section 3.3.2): a 4-32-32-21 multilayer perceptron that maps the three newest outflows
+//! and the missing volume d to one logit for each action.
 //!
-//! Runs in the controller's loop: fixed size, no allocation, no panic. The action table is Fig. 5's:
-//! `alpha_i = 5 sign(i) (i/10)^2` degrees, i = -10..10. Nothing here can fail: inputs that are not finite give the action
-//! "stay" through [`argmax`].
+//! Runs in the controller's loop: fixed size, no allocation, no panic. Nothing here can fail: inputs that are not finite give the
+//! action "stay" through [`argmax`] and [`softmax`].
 
 use serde::{Deserialize, Serialize};
+
+use crate::actions::{ACTIONS, STAY};
 
 /// Inputs of the network: v_t, v_t-1, v_t-2, d.
 pub const INPUTS: usize = 4;
 /// Neurons in each of the two hidden layers.
 pub const HIDDEN: usize = 32;
-/// Actions, i = -10..=10.
-pub const ACTIONS: usize = 21;
-/// Index of the action "stay" (i = 0).
-pub const STAY: usize = ACTIONS / 2;
 /// Number of parameters of [`Mlp`].
 pub const PARAMETERS: usize = INPUTS * HIDDEN + HIDDEN + HIDDEN * HIDDEN + HIDDEN + HIDDEN * ACTIONS + ACTIONS;
 
@@ -176,30 +174,6 @@ fn asinh(x: f32) -> f32 {
     (a + (a * a + 1.0).sqrt()).ln().copysign(x)
 }
 
-/// Fig. 5's table: action index 0..21 (i = -10..10) to degrees, `5 sign(i) (i/10)^2`.
-pub const fn action_table() -> [f32; ACTIONS] {
-    let mut table = [0.0; ACTIONS];
-    let mut k = 0;
-    while k < ACTIONS {
-        let i = k as f32 - STAY as f32;
-        let square = 5.0 * i * i / 100.0;
-        table[k] = if i < 0.0 { -square } else { square };
-        k += 1;
-    }
-    table
-}
-
-/// The action of `table` nearest to `dalpha_deg`; ties and non-finite angles go to the smaller index found first.
-pub fn nearest_action(table: &[f32; ACTIONS], dalpha_deg: f32) -> usize {
-    let mut best = STAY;
-    for (k, a) in table.iter().enumerate() {
-        if (a - dalpha_deg).abs() < (table[best] - dalpha_deg).abs() {
-            best = k;
-        }
-    }
-    best
-}
-
 /// The action with the largest logit; "stay" if none is a number.
 pub fn argmax(logits: &[f32; ACTIONS]) -> usize {
     let mut best = STAY;
@@ -283,19 +257,6 @@ mod tests {
             }
         }
         assert!(same >= 19_990, "{same} of 20000");
-    }
-
-    /// Protects Fig. 5's discretisation: fine near 0, +-5 degrees at the ends, odd, ascending; and its inverse.
-    #[test]
-    fn the_action_table_is_figure_5() {
-        let table = action_table();
-        assert_eq!((table[0], table[9], table[STAY], table[11], table[20]), (-5.0, -0.05, 0.0, 0.05, 5.0));
-        assert!(table.windows(2).all(|w| w[0] < w[1]));
-        for (k, a) in table.iter().enumerate() {
-            assert_eq!(nearest_action(&table, *a), k);
-        }
-        assert_eq!(nearest_action(&table, 99.0), 20);
-        assert_eq!(nearest_action(&table, f32::NAN), STAY);
     }
 
     /// Protects the robot from an undefined action: numbers that are none give "stay".
