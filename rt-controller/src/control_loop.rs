@@ -1,7 +1,7 @@
 //! The fixed-rate loop: absolute deadlines on CLOCK_MONOTONIC; a missed period is skipped and counted, never bursted.
 //!
 //! Runs in the real-time thread. Its ticks do not allocate, lock, log, or call anything that blocks but the sleep itself; the count
-//! of their allocations is part of `status`. The exception is [`Ticks::meet_feature_worker`]. Nothing in it fails: a lost robot is handed
+//! of their allocations is part of `status`. The exception is [`LoopState::meet_feature_worker`]. Nothing in it fails: a lost robot is handed
 //! back and the core ends the pour, a lost feature worker shows as stale features.
 
 use std::sync::atomic::{AtomicU64, Ordering::Relaxed};
@@ -37,20 +37,20 @@ pub fn run(settings: Settings, place: Place, lost_ns: u64, features: &Features, 
     for line in os::become_realtime(place.core, place.priority) {
         say(&line);
     }
-    let mut ticks = Ticks::new(settings, lost_ns, features, exchange);
+    let mut state = LoopState::new(settings, lost_ns, features, exchange);
     let mut deadline_ns = os::now_ns() + settings.period_ns;
     loop {
         os::sleep_until_ns(deadline_ns);
-        ticks.meet_feature_worker();
-        if ticks.tick(deadline_ns) == Next::Ended {
+        state.meet_feature_worker();
+        if state.tick(deadline_ns) == Next::Ended {
             break;
         }
-        let (next_ns, skipped) = ticks.pacer.next_deadline_ns(deadline_ns, os::now_ns());
+        let (next_ns, skipped) = state.pacer.next_deadline_ns(deadline_ns, os::now_ns());
         exchange.skipped_ticks.fetch_add(skipped, Relaxed);
         deadline_ns = next_ns;
     }
     // Upright already: the session's end only stops the robot's program at once instead of after its patience.
-    drop(ticks);
+    drop(state);
     exchange.ended.store(true, Relaxed);
 }
 
@@ -64,7 +64,7 @@ pub enum Next {
 }
 
 /// What the loop keeps from tick to tick.
-pub struct Ticks<'a> {
+pub struct LoopState<'a> {
     core: Box<Core>,
     fresh: heapless::Vec<Feature, MAX_FEATURES>,
     session: Option<Box<Session>>,
@@ -80,7 +80,7 @@ pub struct Ticks<'a> {
     elsewhere: (u64, u64),
 }
 
-impl<'a> Ticks<'a> {
+impl<'a> LoopState<'a> {
     /// Allocates all that the ticks use; call in the thread that makes them.
     pub fn new(settings: Settings, lost_ns: u64, features: &'a Features, exchange: &'a Exchange) -> Self {
         Self {
