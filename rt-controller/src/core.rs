@@ -1,13 +1,14 @@
 //! What decides: one pure step a tick, shared to the letter by the running controller, replay, tests and closed-loop evaluation.
 //!
-//! [`Core::step`] maps what is known at a tick ([`Input`]) to the angle to command and to what happened ([`Output`]). It has no
-//! clock and no device, does not allocate or lock, and does not fail: whatever is in doubt ends with the container upright.
+//! [`Core::step`] maps what is known at a tick ([`Input`]) to the angle to command and to what happened ([`Output`]). It has no clock and
+//! no device, does not allocate or lock, and does not fail: every doubt ends with the container upright. What decides that a pour ends,
+//! and why, is in [`ending`].
 //!
 //! ```text
-//!            robot well          goal                 d <= 0, doubt, abort           upright          flow has ceased
+//!            robot well          goal                 a reason to end                upright          the last drops fell
 //!  NoRobot ------------> Idle ---------> Pouring ---------------------> Returning ---------> Settling ---------------> Idle
 //!     ^                   | curve                                           ^
-//!     |                   +------------> Recording -------------------------+ curve at its end, doubt, abort
+//!     |                   +------------> Recording -------------------------+ a reason to end
 //!     +---- any phase, when the robot may not move
 //! ```
 
@@ -57,9 +58,9 @@ pub struct Input<'a> {
 pub struct Output {
     /// Alpha to command, degrees: within all limits. `None`: command nothing, the robot may not move.
     pub target_deg: Option<f32>,
-    /// The answer to the order of this tick.
+    /// The answer to this tick's order.
     pub ordered: Option<Result<(), Refusal>>,
-    /// The pour or recording that ended in this tick.
+    /// The result of the pour or recording that ended in this tick.
     pub ended: Option<Outcome>,
     /// What an episode records of this tick, without [`Telemetry::weights_id`], which only the caller knows.
     pub telemetry: Telemetry,
