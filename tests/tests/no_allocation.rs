@@ -17,7 +17,7 @@ use shared::config::Config;
 use shared::ipc;
 use shared::messages::{Feature, LAYOUT_VERSION};
 use shared::os::now_ns;
-use simulator::ur::{Controller, Fault, Options};
+use simulator::ur::{Controller, ControllerOptions, Fault};
 use tests::steady_weights;
 
 #[global_allocator]
@@ -35,7 +35,7 @@ fn run(plant: bool) {
     let mut config = Config::parse(include_str!("../../config/sim.toml"), "config/sim.toml").expect("valid");
     config.cell.name.clone_from(&name);
     config.robot.address = address;
-    let robot = Controller::start(Options::new(address)).expect("free");
+    let robot = Controller::start(ControllerOptions::new(address)).expect("free");
     let (exchange, note) = (Exchange::default(), RobotNote::default());
     let (stop, connections) = (AtomicBool::new(false), AtomicU64::new(0));
     let ended = AtomicU64::new(0);

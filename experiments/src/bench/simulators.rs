@@ -4,8 +4,8 @@
 
 use simulator::physics::ALPHA_MAX_DEG;
 use simulator::physics::container::Container;
-use simulator::physics::paper;
-use simulator::physics::rig::{self, Rig};
+use simulator::physics::paper::PaperPour;
+use simulator::physics::rig::{Rig, RigPour};
 
 use super::through_camera::{BenchCamera, CameraPour};
 
@@ -13,9 +13,9 @@ use super::through_camera::{BenchCamera, CameraPour};
 #[derive(Debug, Clone)]
 pub enum BenchPour {
     /// Simulator a.
-    Paper(paper::Pour),
+    Paper(PaperPour),
     /// Simulator b.
-    Rig(Box<rig::Pour>),
+    Rig(Box<RigPour>),
     /// Simulator b through a rendered camera.
     ThroughCamera(Box<CameraPour>),
 }
@@ -74,10 +74,10 @@ impl Bench {
 
     /// A pour from `volume_ml`; `seed` draws what changes from pour to pour.
     pub fn pour(&self, volume_ml: f64, seed: u64) -> BenchPour {
-        let Some((rig, container)) = self.rig() else { return BenchPour::Paper(paper::Pour::new(volume_ml)) };
+        let Some((rig, container)) = self.rig() else { return BenchPour::Paper(PaperPour::new(volume_ml)) };
         let mut container = container.clone();
         container.refill(volume_ml);
-        let pour = rig::Pour::new(rig, container, seed);
+        let pour = RigPour::new(rig, container, seed);
         match self {
             Self::ThroughCamera(bench) => BenchPour::ThroughCamera(Box::new(CameraPour::new(pour, &bench.2, rig.delay_frames, seed))),
             _ => BenchPour::Rig(Box::new(pour)),
@@ -86,7 +86,7 @@ impl Bench {
 
     /// The tilt at which `volume_ml` starts to flow, degrees.
     pub fn spill_angle_deg(&self, volume_ml: f64) -> f64 {
-        let Some((_, container)) = self.rig() else { return paper::Pour::new(volume_ml).spill_angle_deg() };
+        let Some((_, container)) = self.rig() else { return PaperPour::new(volume_ml).spill_angle_deg() };
         let mut container = container.clone();
         container.refill(volume_ml);
         container.spill_angle_deg()

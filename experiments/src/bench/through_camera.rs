@@ -15,7 +15,7 @@ use shared::messages::PixelFormat;
 
 use simulator::camera::{Background, Renderer, Scene, View};
 use simulator::physics::RATE_HZ;
-use simulator::physics::rig::Pour;
+use simulator::physics::rig::RigPour;
 
 use crate::commands::evaluate_camera::{camera_config, image_config, learn_colour};
 
@@ -56,7 +56,7 @@ struct Camera {
 #[derive(Clone)]
 pub struct CameraPour {
     /// The physics.
-    pub pour: Pour,
+    pub pour: RigPour,
     /// None: OpenCV refused; every frame is lost.
     camera: Option<Arc<Mutex<Camera>>>,
     size_px: (u32, u32),
@@ -73,7 +73,7 @@ impl std::fmt::Debug for CameraPour {
 
 impl CameraPour {
     /// Looks at `pour` with `camera`; the picture shows what was `delay` frames ago.
-    pub fn new(pour: Pour, camera: &BenchCamera, delay: usize, seed: u64) -> Self {
+    pub fn new(pour: RigPour, camera: &BenchCamera, delay: usize, seed: u64) -> Self {
         let size_px = (camera.view.width_px, camera.view.height_px);
         let camera = Renderer::new(&camera.view, seed).ok().zip(Extractor::new(&camera_config(&camera.view), &camera.image).ok()).map(
             |(renderer, extractor)| {

@@ -89,8 +89,8 @@ impl Change {
     fn apply(self, mut rig: Rig) -> Rig {
         match self {
             Self::None => {}
-            Self::FlowLow => rig.mu *= 0.6,
-            Self::FlowHigh => rig.mu *= 1.5,
+            Self::FlowLow => rig.fluidity *= 0.6,
+            Self::FlowHigh => rig.fluidity *= 1.5,
             Self::Noise => rig.frame_noise *= 2.0,
             Self::Delay => rig.delay_frames *= 2,
             Self::Dropouts => rig.dropouts = 0.10,

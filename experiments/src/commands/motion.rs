@@ -13,8 +13,8 @@ use shared::config::Config;
 use shared::episode::Episode;
 use shared::exit::{self, Failure, OrExit as _};
 
-use simulator::ur::machine::{Machine, RuntimeState};
 use simulator::ur::variables::{Input, Series};
+use simulator::ur::{Machine, RuntimeState};
 
 /// Command-line arguments.
 #[derive(Debug, clap::Args)]
@@ -120,7 +120,7 @@ fn compare(args: &Args, config: &Config, episode: &Episode) -> Result<Report, Bo
         SeriesArg::ESeries => Series::ESeries,
     };
     let mut targets: Vec<(f64, f32)> =
-        episode.frames.iter().filter(|f| f.alpha_commanded_deg.is_finite()).map(|f| (f.t_s, f.alpha_commanded_deg)).collect();
+        episode.rows.iter().filter(|f| f.alpha_commanded_deg.is_finite()).map(|f| (f.t_s, f.alpha_commanded_deg)).collect();
     // An episode has one row a camera frame; a loop that is faster had targets in between.
     let period_s = 1.0 / options.rate_hz;
     let mut i = 1;
@@ -173,7 +173,7 @@ fn follow(options: &LinkOptions, series: Series, program: &str, targets: &[(f64,
     let send = |machine: &mut Machine, sequence: i32, alpha_deg: f32| {
         let mut write = |name: String, bytes: &[u8]| {
             if let Some(input) = Input::parse(&name) {
-                machine.write_input(input, bytes);
+                machine.robot.write_input(input, bytes);
             }
         };
         let base = options.register_base;

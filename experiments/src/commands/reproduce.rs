@@ -16,7 +16,7 @@ use trainer::eq8::{DELTA, KERAS_CLIP, LAMBDA, reward};
 use trainer::net::{Adam, Net, Sample};
 use trainer::report::{Series, figure, plot, table};
 
-use simulator::physics::paper::Pour;
+use simulator::physics::paper::PaperPour;
 
 /// Adam steps between two looks at the policy.
 const LOOK_EVERY: usize = 250;
@@ -63,13 +63,13 @@ impl Run {
 /// The triangle up to `top` degrees and back, 1 degree a frame, from 300 ml: angles and volumes.
 fn triangle(top: usize) -> (Vec<f64>, Vec<f64>) {
     let alphas: Vec<f64> = (0..=top).chain((0..top).rev()).map(|a| a as f64).collect();
-    let mut pour = Pour::new(300.0);
+    let mut pour = PaperPour::new(300.0);
     let volumes = alphas.iter().map(|a| f64::from(pour.frame(*a)) / 400.0).collect();
     (alphas, volumes)
 }
 
 fn pour_with(net: &Net, scale: &InputScale, init_ml: f64, goal_ml: f64) -> f64 {
-    let mut pour = Pour::new(init_ml);
+    let mut pour = PaperPour::new(init_ml);
     let (mut alpha, mut v) = (0.0f64, [0.0f32; 3]);
     let mut d = goal_ml;
     for _ in 0..FRAMES {

@@ -1,6 +1,7 @@
 //! `simulator operator`: what a person does at the simulated cell: fill the container, read the scale, cause a fault.
 //!
-//! An ordinary process that writes one line to the cell's operator socket and prints the answer.
+//! Ordinary process; allocates. It writes one line to the cell's operator socket and prints the answer. Without a cell that answers it
+//! ends with an error of one line.
 
 use std::io::{BufRead, BufReader, Write};
 use std::os::unix::net::UnixStream;
@@ -18,11 +19,11 @@ use crate::{cell, ur};
 #[command(after_help = "Examples:\n  simulator operator fill 300\n  simulator operator scale\n  simulator operator fault protective-stop")]
 pub struct Args {
     #[command(subcommand)]
-    act: Act,
+    action: Action,
 }
 
 #[derive(Debug, Subcommand)]
-enum Act {
+enum Action {
     /// Puts a filled container into the gripper and an empty, tared cup on the scale.
     Fill {
         /// Volume in ml.
@@ -57,12 +58,12 @@ struct Common {
 
 /// Runs the command.
 pub fn run(args: &Args) -> Result<(), Failure> {
-    let (Act::Fill { common, .. } | Act::Scale { common } | Act::Fault { common, .. }) = &args.act;
+    let (Action::Fill { common, .. } | Action::Scale { common } | Action::Fault { common, .. }) = &args.action;
     let config = Config::read(&common.config).or_exit(exit::BAD_INPUT)?;
-    let line = match &args.act {
-        Act::Fill { volume_ml, .. } => format!("fill {volume_ml}"),
-        Act::Scale { .. } => "scale".into(),
-        Act::Fault { fault, .. } => return cause(&config, fault),
+    let line = match &args.action {
+        Action::Fill { volume_ml, .. } => format!("fill {volume_ml}"),
+        Action::Scale { .. } => "scale".into(),
+        Action::Fault { fault, .. } => return cause(&config, fault),
     };
     let name = &config.cell.name;
     let absent = |e| format!("no simulated cell '{name}' ({e}): is `simulator run` running with the same --config?");
@@ -70,11 +71,11 @@ pub fn run(args: &Args) -> Result<(), Failure> {
     if let Some(error) = answer["error"].as_str() {
         return Err(failure(exit::REFUSED, error));
     }
-    match &args.act {
+    match &args.action {
         _ if common.json => println!("{answer}"),
-        Act::Fill { volume_ml, .. } => println!("{volume_ml} ml in the container, the scale reads 0 g"),
-        Act::Scale { .. } => println!("{} g", answer["weight_g"]),
-        Act::Fault { .. } => {}
+        Action::Fill { volume_ml, .. } => println!("{volume_ml} ml in the container, the scale reads 0 g"),
+        Action::Scale { .. } => println!("{} g", answer["weight_g"]),
+        Action::Fault { .. } => {}
     }
     Ok(())
 }
@@ -84,7 +85,10 @@ fn cause(config: &Config, fault: &str) -> Result<(), Failure> {
     ur::send_fault(config.robot.address, &fault).or_exit(exit::UNREACHABLE)
 }
 
-/// One line to the cell's operator socket, one answer back.
+/// Writes one line to the operator socket of the cell `cell`, and returns its answer.
+///
+/// # Errors
+/// When nothing listens at the socket, or the answer is not JSON.
 pub fn ask(cell: &str, line: &str) -> std::io::Result<Value> {
     let mut stream = UnixStream::connect(cell::operator_socket(cell))?;
     writeln!(stream, "{line}")?;

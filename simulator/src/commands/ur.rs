@@ -12,7 +12,7 @@ use std::time::{Duration, Instant};
 use shared::exit::{self, Failure, OrExit as _, failure};
 use shared::os;
 
-use crate::ur::{Controller, Fault, LogKind, LogLine, Options, Series, fault};
+use crate::ur::{Controller, ControllerOptions, Fault, LogKind, LogLine, Series, fault};
 
 /// Command-line arguments.
 #[derive(Debug, clap::Args)]
@@ -55,7 +55,7 @@ fn help() -> String {
 
 /// Runs the command.
 pub fn run(args: &Args) -> Result<(), Failure> {
-    let mut options = Options::new(args.address);
+    let mut options = ControllerOptions::new(args.address);
     options.series = match args.series {
         SeriesArg::Cb3 => Series::Cb3,
         SeriesArg::E => Series::ESeries,

@@ -23,7 +23,7 @@ use shared::messages::{Feature, LAYOUT_VERSION, Phase};
 use shared::mlp::Mlp;
 use shared::os::now_ns;
 use shared::weights::Weights;
-use simulator::ur::{Controller, Handle, Options, RuntimeState, Series};
+use simulator::ur::{Controller, ControllerOptions, RuntimeState, Series};
 
 use crate::motion::Motion;
 
@@ -66,7 +66,7 @@ pub struct Cell {
     address: IpAddr,
     pub series: Series,
     pub directory: tempfile::TempDir,
-    pub robot: Arc<Handle>,
+    pub robot: Arc<Controller>,
     pub process: Child,
     pub client: Option<Client>,
     stop: Arc<AtomicBool>,
@@ -87,7 +87,7 @@ impl Cell {
         config.simulator = None;
         std::fs::write(directory.path().join("cell.toml"), toml::to_string(&config).unwrap()).unwrap();
         tilt_until_it_flows().write(&config.controller.weights).unwrap();
-        let robot = Arc::new(Controller::start(Options { series, ..Options::new(address) }).unwrap());
+        let robot = Arc::new(Controller::start(ControllerOptions { series, ..ControllerOptions::new(address) }).unwrap());
         let stop = Arc::new(AtomicBool::new(false));
         let liquid = thread::spawn({
             let (name, robot, stop) = (config.cell.name.clone(), robot.clone(), stop.clone());
@@ -341,7 +341,7 @@ fn flow_ml_s(alpha_deg: f64) -> f64 {
 }
 
 /// The camera, the feature worker and the liquid in one: V_e from the tilt of the joint.
-fn publish_features(name: &str, robot: &Handle, stop: &AtomicBool) {
+fn publish_features(name: &str, robot: &Controller, stop: &AtomicBool) {
     let cell = ipc::Cell::join(name).unwrap();
     let publisher = cell.features().unwrap().publisher_builder().create().unwrap();
     let worker_epoch_ns = now_ns();

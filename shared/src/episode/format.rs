@@ -13,7 +13,7 @@ use crate::messages::{Doubt, Feature, Phase, Telemetry};
 pub(super) const IMAGE_TOPIC: &str = "/camera/image/compressed";
 pub(super) const FEATURE_TOPIC: &str = "/feature";
 pub(super) const TELEMETRY_TOPIC: &str = "/telemetry";
-pub(super) const SAMPLE_TOPIC: &str = "/sample";
+pub(super) const ROW_TOPIC: &str = "/sample";
 
 /// Names of the metadata records, and the version in `episode`/`format`.
 pub(super) const META_EPISODE: &str = "episode";
@@ -72,7 +72,7 @@ pub(super) fn compressed_image_schema() -> Vec<u8> {
 
 /// A row of `/sample`: one row of `L_E`, V_e beside it.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-pub(super) struct SampleRow {
+pub(super) struct EpisodeRowJson {
     pub sequence: u64,
     pub captured_at_ns: u64,
     #[serde(deserialize_with = "null_is_nan")]
@@ -87,7 +87,7 @@ pub(super) struct SampleRow {
 
 /// A row of `/feature`: [`Feature`] in words.
 #[derive(Debug, Clone, PartialEq, Serialize)]
-pub(super) struct FeatureRow {
+pub(super) struct FeatureJson {
     sequence: u64,
     captured_at_ns: u64,
     received_at_ns: u64,
@@ -99,7 +99,7 @@ pub(super) struct FeatureRow {
     triangle_px: [f32; 6],
 }
 
-impl FeatureRow {
+impl FeatureJson {
     pub(super) fn new(f: &Feature) -> Self {
         Self {
             sequence: f.sequence,
@@ -117,7 +117,7 @@ impl FeatureRow {
 
 /// A row of `/telemetry`: [`Telemetry`] in words.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-pub(super) struct TelemetryRow {
+pub(super) struct TelemetryJson {
     pub tick: u64,
     pub at_ns: u64,
     pub robot_at_ns: u64,
@@ -139,7 +139,7 @@ pub(super) struct TelemetryRow {
     pub poured_ml: f32,
 }
 
-impl TelemetryRow {
+impl TelemetryJson {
     pub(super) fn new(t: &Telemetry) -> Self {
         Self {
             tick: t.tick,
@@ -206,7 +206,7 @@ pub(super) fn json_schemas() -> [(&'static str, &'static str, String); 3] {
         ),
         (
             "decant.Sample",
-            SAMPLE_TOPIC,
+            ROW_TOPIC,
             schema(
                 "One frame of the episode: alpha at its capture time, and V_e",
                 &[
@@ -244,7 +244,7 @@ mod tests {
     /// Protects viewers and other readers from a field that the schema does not know, or the other way round.
     #[test]
     fn schemas_list_exactly_the_fields_that_are_written() {
-        let sample = SampleRow {
+        let sample = EpisodeRowJson {
             sequence: 1,
             captured_at_ns: 2,
             alpha_commanded_deg: 3.0,
@@ -254,8 +254,8 @@ mod tests {
             image: true,
         };
         let rows = [
-            serde_json::to_value(FeatureRow::new(&Feature::default())).unwrap(),
-            serde_json::to_value(TelemetryRow::new(&Telemetry::default())).unwrap(),
+            serde_json::to_value(FeatureJson::new(&Feature::default())).unwrap(),
+            serde_json::to_value(TelemetryJson::new(&Telemetry::default())).unwrap(),
             serde_json::to_value(sample).unwrap(),
         ];
         for ((name, _, text), row) in json_schemas().into_iter().zip(rows) {
