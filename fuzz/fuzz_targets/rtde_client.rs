@@ -18,7 +18,7 @@ fn frames(bytes: &[u8], cut: usize) -> (Vec<(u8, Vec<u8>)>, Option<Malformed>) {
             inbox.filled(n);
             piece = &piece[n..];
             loop {
-                match inbox.next_frame() {
+                match inbox.next_packet() {
                     Ok(Some(frame)) => {
                         read_anything(frame, &tilt);
                         frames.push((frame.kind, frame.payload.to_vec()));

@@ -9,8 +9,8 @@ use shared::episode::{WeightError, check_reading, set_weight};
 use shared::exit::{self, Failure, OrExit as _, failure};
 use shared::gaussian_curve::Curve;
 
+use super::pour;
 use crate::client::Common;
-use crate::pour;
 
 /// Alpha at the curve's first and last moment, degrees: a start without a jump.
 const END_DEG: f32 = 0.05;
