@@ -4,7 +4,7 @@ use rt_controller::core::{Core, Input, Order, Output, Refusal, Robot, Settings, 
 use shared::agent::{Agent, Selection};
 use shared::config::Config;
 use shared::control::{Curve, EndReason, Outcome};
-use shared::estimate::Calibration;
+use shared::estimator::Calibration;
 use shared::messages::{Doubt, Feature, LAYOUT_VERSION, Phase};
 use shared::policy::{InputScale, Mlp, action_table};
 use shared::weights::{Estimator, Method, Origin, Weights};
@@ -18,7 +18,7 @@ fn always(index: usize) -> Box<Agent> {
         actions_deg: action_table(),
         selection: Selection::Argmax,
         scale: InputScale::default(),
-        calibration: Calibration { c: 0.001, q: 1.0, tilt: 0.0, hold_above_px2: f32::INFINITY },
+        calibration: Calibration { volume_at_1_px2_ml: 0.001, area_exponent: 1.0, log_tilt_slope: 0.0, hold_above_px2: f32::INFINITY },
         estimator: Estimator::Sum,
         rate_hz: 30.0,
         origin: Origin { method: Method::Handmade, actions: 21, episodes: 0, data_sha256: [0; 32] },

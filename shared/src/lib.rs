@@ -8,7 +8,7 @@
 //! | [`config`] | the cell's one TOML file | no |
 //! | [`limits`] | the one place that every target passes | yes |
 //! | [`policy`] | the 4-32-32-21 network and the action table | yes |
-//! | [`estimate`] | area to ml, and the volume poured so far | yes |
+//! | [`estimator`] | area to ml, and the volume poured so far | yes |
 //! | [`agent`] | observation pipeline and policy: a frame in, an action out | yes |
 //! | [`weights`] | the weight file (postcard with a CRC) | no |
 //! | [`episode`] | `E = (L_E, w_E)` as MCAP files and CSV tables | no |
@@ -23,7 +23,7 @@ pub mod agent;
 pub mod config;
 pub mod control;
 pub mod episode;
-pub mod estimate;
+pub mod estimator;
 pub mod exit;
 pub mod ipc;
 pub mod limits;

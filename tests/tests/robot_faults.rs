@@ -21,7 +21,7 @@ use rt_controller::client::Client;
 use rt_controller::link::Lost;
 use shared::config::Config;
 use shared::control::{EndReason, Outcome, Reply, Request};
-use shared::estimate::Calibration;
+use shared::estimator::Calibration;
 use shared::ipc;
 use shared::messages::{Feature, LAYOUT_VERSION, Phase};
 use shared::os::now_ns;
@@ -331,7 +331,8 @@ fn tilt_until_it_flows() -> Weights {
     policy.w2[0][0] = 1.0;
     policy.w3[0][STAY] = 1.0;
     policy.b3[STAY + 7] = 0.5;
-    let calibration = Calibration { c: ML_PER_PX2 as f32, q: 1.0, tilt: 0.0, hold_above_px2: f32::INFINITY };
+    let calibration =
+        Calibration { volume_at_1_px2_ml: ML_PER_PX2 as f32, area_exponent: 1.0, log_tilt_slope: 0.0, hold_above_px2: f32::INFINITY };
     Weights { policy, calibration, ..tests::steady_weights(STAY + 7) }
 }
 

@@ -7,6 +7,7 @@ use serde::{Deserialize, Serialize};
 
 pub mod flow;
 pub mod fused;
+pub mod vessel;
 
 /// V_e in px^2 to ml a frame: `v = c area^q exp(tilt z)`, z = (alpha - 60)/30 within +-1.5, with the dropout hold that goes with it.
 ///
@@ -16,11 +17,11 @@ pub mod fused;
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct Calibration {
     /// c, ml a frame at 1 px^2.
-    pub c: f32,
+    pub volume_at_1_px2_ml: f32,
     /// Exponent q.
-    pub q: f32,
+    pub area_exponent: f32,
     /// Change of log v for 30 degrees more tilt.
-    pub tilt: f32,
+    pub log_tilt_slope: f32,
     /// A single area of 0 right after an area above this repeats that area, px^2; infinite: never.
     pub hold_above_px2: f32,
 }
@@ -28,7 +29,11 @@ pub struct Calibration {
 impl Calibration {
     /// Outflow of a frame with `area_px2`, taken at the commanded tilt `alpha_deg`, ml.
     pub fn volume_ml(&self, area_px2: f32, alpha_deg: f32) -> f32 {
-        if area_px2 > 0.0 { self.c * area_px2.powf(self.q) * (self.tilt * tilt_z(f64::from(alpha_deg)) as f32).exp() } else { 0.0 }
+        if area_px2 > 0.0 {
+            self.volume_at_1_px2_ml * area_px2.powf(self.area_exponent) * (self.log_tilt_slope * tilt_z(f64::from(alpha_deg)) as f32).exp()
+        } else {
+            0.0
+        }
     }
 }
 
@@ -87,13 +92,13 @@ mod tests {
     /// Protects the calibration's formula, and 0 for no stream even with an odd exponent.
     #[test]
     fn volume_is_a_power_of_the_area() {
-        let cal = Calibration { c: 0.002, q: 1.2, tilt: 0.1, hold_above_px2: 60.0 };
+        let cal = Calibration { volume_at_1_px2_ml: 0.002, area_exponent: 1.2, log_tilt_slope: 0.1, hold_above_px2: 60.0 };
         let at_60 = 0.002 * 300f32.powf(1.2);
         assert!((cal.volume_ml(300.0, 60.0) - at_60).abs() < 1e-6);
         assert!((cal.volume_ml(300.0, 90.0) / at_60 - 0.1f32.exp()).abs() < 1e-5);
         assert_eq!(cal.volume_ml(300.0, 105.0), cal.volume_ml(300.0, f32::INFINITY));
         assert_eq!(cal.volume_ml(300.0, 60.0), cal.volume_ml(300.0, f32::NAN));
         assert_eq!(cal.volume_ml(0.0, 60.0), 0.0);
-        assert_eq!(Calibration { q: 0.0, ..cal }.volume_ml(0.0, 60.0), 0.0);
+        assert_eq!(Calibration { area_exponent: 0.0, ..cal }.volume_ml(0.0, 60.0), 0.0);
     }
 }
