@@ -23,7 +23,7 @@ use tiny_http::{Response, Server};
 
 use crate::extract::{Axes, Extractor, Image};
 use crate::inspect::{for_each_frame, to_bgr};
-use crate::source::{Frame, Next, Onlooker};
+use crate::source::{Frame, FrameSource as _, NextFrame, ObserverSource};
 use crate::view::{answer, draw, jpeg};
 
 /// Frames kept for learning and for the picture.
@@ -181,14 +181,14 @@ fn calibrate(args: &Args, mut config: Config) -> Result<(), Failure> {
 fn watch(args: &Args, config: &Config, seen: &mut Seen) -> Result<(), Failure> {
     let reach = |e: String| failure(exit::UNREACHABLE, e);
     let cell = Cell::join(&config.cell.name).map_err(|e| reach(e.to_string()))?;
-    let mut source = Onlooker::open(&config.camera, &cell).map_err(|e| reach(e.to_string()))?;
+    let mut source = ObserverSource::open(&config.camera, &cell).map_err(|e| reach(e.to_string()))?;
     eprintln!("calibrate: watching the camera for {} s; pour once now", args.seconds);
     let end = std::time::Instant::now() + Duration::from_secs(args.seconds);
     while std::time::Instant::now() < end {
-        match source.next(Duration::from_millis(200)).map_err(|e| reach(e.to_string()))? {
-            Next::Frame(frame) => seen.add(&frame).map_err(reach)?,
-            Next::Nothing => {}
-            Next::End => break,
+        match source.next_frame(Duration::from_millis(200)).map_err(|e| reach(e.to_string()))? {
+            NextFrame::Frame(frame) => seen.add(&frame).map_err(reach)?,
+            NextFrame::Nothing => {}
+            NextFrame::End => break,
         }
     }
     if seen.count == 0 { Err(reach("no frame came from the camera; is its driver running?".into())) } else { Ok(()) }

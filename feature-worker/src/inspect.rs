@@ -15,7 +15,7 @@ use shared::exit::{self, Failure, OrExit as _};
 use shared::messages::{Doubt, PixelFormat};
 
 use crate::extract::{Extractor, Image};
-use crate::source::{Capture, Frame, Next};
+use crate::source::{Capture, Frame, FrameSource as _, NextFrame};
 use crate::view;
 
 /// Command-line arguments.
@@ -76,7 +76,7 @@ pub fn for_each_frame(input: &[PathBuf], camera: &CameraConfig, mut each: impl F
             continue;
         }
         let mut capture = Capture::open(&camera, false).map_err(|e| e.to_string())?;
-        while let Next::Frame(mut frame) = capture.next(Duration::ZERO).map_err(|e| e.to_string())? {
+        while let NextFrame::Frame(mut frame) = capture.next_frame(Duration::ZERO).map_err(|e| e.to_string())? {
             count += 1;
             frame.header.sequence = count;
             each(frame)?;

@@ -3,7 +3,8 @@
 use std::process::ExitCode;
 
 use clap::{Parser, Subcommand};
-use feature_worker::{bench, calibrate, episodes, inspect, view, worker};
+use feature_worker::commands::{bench, episodes, run};
+use feature_worker::{calibrate, inspect, view};
 
 /// The vision process: camera frames in, V_e and episodes out.
 #[derive(Parser)]
@@ -16,7 +17,7 @@ struct Cli {
 #[derive(Subcommand)]
 enum Command {
     /// Measures V_e in every frame, publishes it and records episodes.
-    Run(worker::Args),
+    Run(run::Args),
     /// Finds the container's axes and the liquid's colour; writes the [image] section.
     Calibrate(calibrate::Args),
     /// Shows the live stream with what is measured, in a local web page.
@@ -31,7 +32,7 @@ enum Command {
 
 fn main() -> ExitCode {
     shared::exit::end(match Cli::parse().command {
-        Command::Run(args) => worker::run(&args),
+        Command::Run(args) => run::run(&args),
         Command::Calibrate(args) => calibrate::run(&args),
         Command::View(args) => view::run(&args),
         Command::Inspect(args) => inspect::run(&args),

@@ -1,6 +1,6 @@
 //! `feature-worker view`: the live stream with region, axes, outline, line, triangle, V_e and its history, in a local web page.
 //!
-//! A process of its own, so it never slows the worker: it reads the cell's frames as a further subscriber ([`Onlooker`]: a device or
+//! A process of its own, so it never slows the worker: it reads the cell's frames as a further subscriber ([`ObserverSource`]: a device or
 //! file is opened only while no worker runs), measures them again with the same configuration and keeps the newest picture. When no
 //! frames come any more it says so and goes on when they come again.
 //! Threads: this one measures; one answers the browser and compresses a picture only when it is asked for. Allocates.
@@ -22,7 +22,7 @@ use tiny_http::{Header, Response, Server};
 
 use crate::extract::{Extractor, Image, Measurement};
 use crate::inspect::to_bgr;
-use crate::source::{Next, Onlooker};
+use crate::source::{FrameSource as _, NextFrame, ObserverSource};
 
 /// Values of V_e that the page shows.
 const HISTORY: usize = 300;
@@ -73,7 +73,7 @@ fn show(args: &Args, config: &Config) -> Result<(), Failure> {
     opencv::core::set_num_threads(1).or_exit(exit::FAILED)?;
     let mut extractor = Extractor::new(&config.camera, &config.image).or_exit(exit::BAD_INPUT)?;
     let cell = Cell::join(&config.cell.name).or_exit(exit::UNREACHABLE)?;
-    let mut source = Onlooker::open(&config.camera, &cell).or_exit(exit::UNREACHABLE)?;
+    let mut source = ObserverSource::open(&config.camera, &cell).or_exit(exit::UNREACHABLE)?;
     let server = Server::http(("127.0.0.1", args.port))
         .map_err(|e| failure(exit::FAILED, format!("port {} on 127.0.0.1: {e}; give another --port", args.port)))?;
     println!("http://{}", server.server_addr());
@@ -85,9 +85,9 @@ fn show(args: &Args, config: &Config) -> Result<(), Failure> {
             if stop.load(Relaxed) {
                 break Ok(());
             }
-            let frame = match source.next(Duration::from_millis(100)) {
-                Ok(Next::Frame(frame)) => frame,
-                Ok(Next::Nothing) => {
+            let frame = match source.next_frame(Duration::from_millis(100)) {
+                Ok(NextFrame::Frame(frame)) => frame,
+                Ok(NextFrame::Nothing) => {
                     let mut shown = lock(&shown);
                     if !shown.silent && os::now_ns() > last_frame_ns + SILENT_NS {
                         shown.silent = true;
@@ -95,7 +95,7 @@ fn show(args: &Args, config: &Config) -> Result<(), Failure> {
                     }
                     continue;
                 }
-                Ok(Next::End) => break Ok(()),
+                Ok(NextFrame::End) => break Ok(()),
                 // The signal also cut short the wait for a device, which then looks lost.
                 Err(_) if stop.load(Relaxed) => break Ok(()),
                 Err(e) => break Err(failure(exit::UNREACHABLE, e)),

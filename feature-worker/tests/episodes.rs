@@ -1,4 +1,5 @@
 //! `feature-worker episodes` as people and scripts call it: the real program on real files.
+#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::too_many_lines)]
 
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
@@ -7,8 +8,8 @@ use std::time::UNIX_EPOCH;
 use opencv::core::{Mat, Scalar, Vector, VectorToVec};
 use opencv::prelude::*;
 use shared::config::Config;
-use shared::control::Curve;
-use shared::episode::{End, Episode, EpisodeWriter, Kind, Sample, Start, read_table};
+use shared::episode::{Episode, EpisodeEnd, EpisodeKind, EpisodeStart, EpisodeWriter, FrameRow, read_table};
+use shared::gaussian_curve::Curve;
 use shared::messages::{Feature, LAYOUT_VERSION, Telemetry};
 
 const FRAMES: u64 = 40;
@@ -21,8 +22,8 @@ fn grey(n: u64) -> f64 {
 /// Writes an episode of 40 frames with images of their own grey; frames 20 and 21 are lost.
 fn write(directory: &Path, lambda_deg: f32) -> PathBuf {
     let config = Config::read(&Path::new(env!("CARGO_MANIFEST_DIR")).join("../config/sim.toml")).unwrap();
-    let kind = Kind::Recording(Curve { lambda_deg, gamma_per_s2: 0.5, beta_s: 2.0 });
-    let start = Start { episode: 1, kind, started_at_ns: 1_000_000_000, wall_clock: UNIX_EPOCH, config: &config, weights: "" };
+    let kind = EpisodeKind::Recording(Curve { lambda_deg, gamma_per_s2: 0.5, beta_s: 2.0 });
+    let start = EpisodeStart { episode: 1, kind, started_at_ns: 1_000_000_000, wall_clock: UNIX_EPOCH, config: &config, weights: "" };
     let mut writer = EpisodeWriter::create(directory, &start).unwrap();
     for n in 0..FRAMES {
         let at_ns = 1_000_000_000 + n * 33_333_333;
@@ -40,10 +41,10 @@ fn write(directory: &Path, lambda_deg: f32) -> PathBuf {
             Feature { version: LAYOUT_VERSION, sequence: n + 1, captured_at_ns: at_ns + 5_000_000, area_px2, ..Default::default() };
         let image = bytes.to_vec();
         let sample =
-            Sample { feature: &feature, alpha_commanded_deg: lambda_deg, alpha_measured_deg: lambda_deg, image: Some(("jpeg", &image)) };
+            FrameRow { feature: &feature, alpha_commanded_deg: lambda_deg, alpha_measured_deg: lambda_deg, image: Some(("jpeg", &image)) };
         writer.frame(&sample).unwrap();
     }
-    writer.finish(&End { complete: true, reason: "over", disordered_frames: 0 }).unwrap()
+    writer.finish(&EpisodeEnd { complete: true, reason: "over", disordered_frames: 0 }).unwrap()
 }
 
 fn episodes(arguments: &[&str]) -> Output {
@@ -108,7 +109,7 @@ fn exports_hold_every_frame_and_overwrite_nothing() {
         assert_eq!(export(format), 1, "{format} again: nothing is overwritten");
     }
     let tables = read_table(&to("csv/features.csv"), &to("csv/scale.csv")).unwrap();
-    assert_eq!((tables.len(), tables[1].frames.len(), tables[1].weight_g), (2, FRAMES as usize, Some(100.0)));
+    assert_eq!((tables.len(), tables[1].rows.len(), tables[1].weight_g), (2, FRAMES as usize, Some(100.0)));
     assert_eq!(std::fs::read_dir(to("images/episode-0002")).unwrap().count(), FRAMES as usize - 2);
 
     let greys = |path: PathBuf| {

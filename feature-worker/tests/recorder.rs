@@ -1,4 +1,5 @@
 //! The recorder on real shared memory, real images and real files; killed and starved in real processes of its own.
+#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::too_many_lines)]
 
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
@@ -11,8 +12,8 @@ use opencv::core::{MatTraitConst, MatTraitConstManual, Vector};
 use rand::Rng;
 use rand_pcg::Pcg32;
 use shared::config::{Config, ImageFormat};
-use shared::control::Curve;
-use shared::episode::{Episode, Images, Kind};
+use shared::episode::{Episode, EpisodeImages, EpisodeKind};
+use shared::gaussian_curve::Curve;
 use shared::ipc::Cell;
 use shared::messages::{Feature, FrameHeader, LAYOUT_VERSION, Phase, PixelFormat, RecorderReport, RecorderState, Telemetry};
 
@@ -97,7 +98,7 @@ impl Scene {
                 at_ns,
                 robot_at_ns: at_ns,
                 episode,
-                policy: 0xabc,
+                weights_id: 0xabc,
                 alpha_deg,
                 alpha_measured_deg: alpha_deg - 2.0,
                 goal_ml: if phase == Phase::Pouring { 75.0 } else { f32::NAN },
@@ -189,22 +190,22 @@ fn a_recording_becomes_a_complete_episode() {
 
     let episode = Episode::read(&path).unwrap();
     assert!(episode.complete);
-    assert_eq!(episode.kind, Kind::Recording(CURVE));
+    assert_eq!(episode.kind, EpisodeKind::Recording(CURVE));
     assert_eq!((episode.info.ticks, episode.info.lost_ticks, episode.info.lost_frames), (45, 0, 0));
     assert_eq!(episode.info.weights, "0000000000000abc", "the policy that the controller runs");
     assert_eq!(episode.info.images, report.images);
-    assert_eq!(episode.info.images as usize, episode.frames.len());
+    assert_eq!(episode.info.images as usize, episode.rows.len());
     // Ticks 13 to 57 are the episode, tick 58 ends it: frames 13 to 58 were captured in between, 14 is the first after the start.
-    assert!(episode.frames[0].t_s < 0.0 && episode.frames[0].t_s >= -0.2, "a few frames from before");
-    assert_eq!(episode.frames.last().unwrap().sequence, 58, "the last frame before the end");
-    for f in &episode.frames {
+    assert!(episode.rows[0].t_s < 0.0 && episode.rows[0].t_s >= -0.2, "a few frames from before");
+    assert_eq!(episode.rows.last().unwrap().sequence, 58, "the last frame before the end");
+    for f in &episode.rows {
         // Frame n is captured 10 ms after tick n - 1.
         let expected = (f.sequence - 1) as f32 + 0.3;
         assert!((f.alpha_commanded_deg - expected).abs() < 1e-3, "frame {}: {}", f.sequence, f.alpha_commanded_deg);
         assert!((f.alpha_measured_deg - expected + 2.0).abs() < 1e-3);
         assert_eq!(f.area_px2, f.sequence as f32 * 3.0);
     }
-    for (image, frame) in Images::open(&path).unwrap().zip(&episode.frames) {
+    for (image, frame) in EpisodeImages::open(&path).unwrap().zip(&episode.rows) {
         let image = image.unwrap();
         assert_eq!(image.captured_at_ns, frame.captured_at_ns);
         let bytes = Vector::<u8>::from(image.data);
@@ -230,8 +231,8 @@ fn formats_and_compressions_are_recorded_and_nothing_is_overwritten() {
         assert!(path.ends_with(format!("episode-000{}.mcap", episode + 1)), "{}", path.display());
         let read = Episode::read(&path).unwrap();
         assert!(read.complete);
-        assert_eq!(read.kind, Kind::Pour { goal_ml: 75.0 });
-        let image = Images::open(&path).unwrap().last().unwrap().unwrap();
+        assert_eq!(read.kind, EpisodeKind::Pour { goal_ml: 75.0 });
+        let image = EpisodeImages::open(&path).unwrap().last().unwrap().unwrap();
         assert_eq!(image.format, "png");
         let bytes = Vector::<u8>::from(image.data);
         let picture = opencv::imgcodecs::imdecode(&bytes, opencv::imgcodecs::IMREAD_GRAYSCALE).unwrap();
@@ -272,8 +273,8 @@ fn back_to_back_episodes_lose_no_frame() {
     let (first, second) = (Episode::read(&first).unwrap(), Episode::read(&second).unwrap());
     assert!(first.complete && second.complete);
     assert_eq!((first.info.ticks, second.info.ticks), (20, 2));
-    assert_eq!(first.frames.last().unwrap().sequence, last.sequence);
-    assert!(second.frames.iter().any(|f| f.sequence == next.sequence));
+    assert_eq!(first.rows.last().unwrap().sequence, last.sequence);
+    assert!(second.rows.iter().any(|f| f.sequence == next.sequence));
 }
 
 /// Protects V_e from the recorder's limits: without a free buffer the image is lost and counted, the measurement is kept;
@@ -313,10 +314,10 @@ fn dropped_images_and_lost_frames_are_counted_and_lose_no_measurement() {
     assert!(episode.complete);
     assert_eq!(report.dropped, episode.info.dropped_images);
     assert!(episode.info.dropped_images > 0);
-    assert_eq!(episode.info.images + episode.info.dropped_images + episode.info.lost_frames, episode.frames.len() as u64);
+    assert_eq!(episode.info.images + episode.info.dropped_images + episode.info.lost_frames, episode.rows.len() as u64);
     assert_eq!(episode.info.lost_frames, 2);
     for sequence in offered {
-        let frame = episode.frames.iter().find(|f| f.sequence == sequence).unwrap();
+        let frame = episode.rows.iter().find(|f| f.sequence == sequence).unwrap();
         assert_eq!(frame.area_px2, sequence as f32 * 3.0);
     }
 }
@@ -422,9 +423,9 @@ fn a_killed_recorder_leaves_a_file_that_reads_and_says_so() {
     let episode = Episode::read(&file).unwrap();
     assert!(!episode.complete);
     assert_eq!(episode.info.ended, "");
-    assert!(episode.frames.len() > 10, "{} frames", episode.frames.len());
-    assert_eq!(Images::open(&file).unwrap().filter(Result::is_ok).count() as u64, episode.info.images);
-    assert_eq!(episode.info.images as usize, episode.frames.len(), "the cut is between two frames");
+    assert!(episode.rows.len() > 10, "{} frames", episode.rows.len());
+    assert_eq!(EpisodeImages::open(&file).unwrap().filter(Result::is_ok).count() as u64, episode.info.images);
+    assert_eq!(episode.info.images as usize, episode.rows.len(), "the cut is between two frames");
 }
 
 /// Protects the operator from silence when the disk is full: the reason is reported, the worker lives, what fits reads.
@@ -439,7 +440,7 @@ fn a_full_disk_is_reported_and_what_fits_is_kept() {
     let failed = std::fs::read_to_string(dir.path().join("failed.txt")).unwrap();
     assert!(failed.contains("episode-0001.mcap") && failed.contains("check free space"), "{failed}");
     let episode = Episode::read(&dir.path().join("episodes/episode-0001.mcap")).unwrap();
-    assert!(!episode.complete && !episode.frames.is_empty());
+    assert!(!episode.complete && !episode.rows.is_empty());
 }
 
 /// Protects the start from a directory that cannot be.

@@ -5,16 +5,16 @@
 mod ur;
 
 use libfuzzer_sys::fuzz_target;
-use ur::rtde::{Context, Owners, Session};
+use ur::rtde::{InputOwners, RtdeSession, SessionContext};
 
 fn answers(bytes: &[u8], cut: usize) -> Vec<u8> {
     let series = ur::Series::Cb3;
     let mut machine = ur::machine::Machine::new(series, series.default_version(), [0.0; 6]);
-    let mut owners = Owners::default();
-    let mut session = Session::new(1);
+    let mut owners = InputOwners::default();
+    let mut session = RtdeSession::new(1);
     let mut answers = Vec::new();
     for piece in bytes.chunks(cut) {
-        let mut context = Context { machine: &mut machine, owners: &mut owners, hidden: &[], refuse_version_2: false };
+        let mut context = SessionContext { machine: &mut machine, owners: &mut owners, hidden: &[], refuse_version_2: false };
         if session.feed(piece, &mut context, &mut answers).is_err() {
             break;
         }

@@ -7,7 +7,7 @@ mod ur;
 use libfuzzer_sys::fuzz_target;
 
 fuzz_target!(|bytes: &[u8]| {
-    let mut assembler = ur::client_interface::Assembler::default();
+    let mut assembler = ur::client_interface::ProgramAssembler::default();
     let whole = assembler.feed(bytes).len() + usize::from(assembler.finish().is_some());
     assert!(whole <= bytes.len());
     let series = ur::Series::ESeries;

@@ -68,8 +68,8 @@ pub struct Ticks<'a> {
     core: Box<Core>,
     fresh: heapless::Vec<Feature, MAX_FEATURES>,
     session: Option<Box<Session>>,
-    /// Identity of the core's policy; 0: it has none.
-    policy: u64,
+    /// Identity of the core's weights; 0: it has none.
+    weights_id: u64,
     features: &'a Features,
     exchange: &'a Exchange,
     pacer: Pacer,
@@ -87,7 +87,7 @@ impl<'a> Ticks<'a> {
             core: Box::new(Core::new(settings)),
             fresh: heapless::Vec::new(),
             session: None,
-            policy: 0,
+            weights_id: 0,
             features,
             exchange,
             pacer: Pacer::new(settings.period_ns),
@@ -123,7 +123,7 @@ impl<'a> Ticks<'a> {
             && let Some((identity, agent)) = exchange.agents.pop()
         {
             taken = Some(identity);
-            self.policy = identity;
+            self.weights_id = identity;
             exchange.agents_taken.fetch_add(1, Relaxed);
             if let Some(old) = self.core.exchange(agent) {
                 let _ = exchange.old_agents.push(old);
@@ -175,7 +175,7 @@ impl<'a> Ticks<'a> {
         exchange.loop_page_faults.store(faults - self.elsewhere.1, Relaxed);
         let done_ns = os::now_ns();
         exchange.timing.execution.record(done_ns.saturating_sub(woke_ns));
-        let telemetry = Telemetry { policy: self.policy, ..output.telemetry };
+        let telemetry = Telemetry { weights_id: self.weights_id, ..output.telemetry };
         let tick = Tick {
             now_ns: woke_ns,
             features: self.fresh.clone(),

@@ -12,8 +12,10 @@
 //! ```
 
 use serde::{Deserialize, Serialize};
-use shared::agent::{Agent, Decision, Frame};
-use shared::control::{Curve, EndReason, Outcome};
+use shared::agent::{Agent, Decision, Observation};
+use shared::alpha_track::AngleHistory;
+use shared::control::{EndReason, Outcome};
+use shared::gaussian_curve::Curve;
 use shared::limits::{Clipped, Limiter, Limits};
 use shared::messages::{Doubt, Feature, LAYOUT_VERSION, Phase, Telemetry};
 
@@ -174,7 +176,7 @@ pub struct Output {
     pub ordered: Option<Result<(), Refusal>>,
     /// The pour or recording that ended in this tick.
     pub ended: Option<Outcome>,
-    /// What an episode records of this tick; whoever brought the agent knows its [`Telemetry::policy`].
+    /// What an episode records of this tick; whoever brought the agent knows its [`Telemetry::weights_id`].
     pub telemetry: Telemetry,
 }
 
@@ -232,37 +234,20 @@ pub struct Core {
     usable_at_ns: u64,
     shutdown: bool,
     last_tick_ns: u64,
-    commanded: Commanded,
+    commanded: AngleHistory<COMMANDS>,
     counters: Counters,
 }
 
 /// Commands remembered, to know which one was in force when a picture was taken.
 const COMMANDS: usize = 32;
 
-/// The newest commands with their times, oldest first; alpha in between is interpolated, as the recorder does it.
-#[derive(Debug)]
-struct Commanded([(u64, f32); COMMANDS]);
-
-impl Commanded {
-    fn push(&mut self, at_ns: u64, alpha_deg: f32) {
-        self.0.copy_within(1.., 0);
-        self.0[COMMANDS - 1] = (at_ns, alpha_deg);
-    }
-
-    fn at(&self, t_ns: u64) -> f32 {
-        let later = self.0.partition_point(|(at, _)| *at <= t_ns);
-        match (later.checked_sub(1).map(|k| self.0[k]), self.0.get(later)) {
-            (Some((t0, a0)), Some(&(t1, a1))) => a0 + (a1 - a0) * ((t_ns - t0) as f32 / (t1 - t0).max(1) as f32),
-            (Some((_, alpha)), None) | (None, Some(&(_, alpha))) => alpha,
-            (None, None) => 0.0,
-        }
-    }
-}
-
 impl Core {
     /// A controller without robot and weights.
     pub fn new(settings: Settings) -> Self {
         let period_s = settings.period_ns as f32 / 1e9;
+        // Before the first tick the container is taken to be upright.
+        let mut commanded = AngleHistory::new();
+        commanded.push(0, 0.0);
         Self {
             settings,
             agent: None,
@@ -275,7 +260,7 @@ impl Core {
             usable_at_ns: 0,
             shutdown: false,
             last_tick_ns: 0,
-            commanded: Commanded([(0, 0.0); COMMANDS]),
+            commanded,
             counters: Counters::default(),
         }
     }
@@ -372,7 +357,7 @@ impl Core {
             }
             Order::Record { episode, curve } => {
                 self.ready(input)?;
-                if !self.curve_fits(&curve) {
+                if !curve.fits(&self.settings.limits, self.settings.period_ns) {
                     return Err(Refusal::Curve);
                 }
                 self.decision = Decision::NOTHING;
@@ -397,23 +382,6 @@ impl Core {
         let usable = input.features.iter().filter(|f| !foreign(f, input.now_ns) && measured(f).is_some());
         let newest_ns = usable.map(|f| f.captured_at_ns).fold(self.usable_at_ns, u64::max);
         if input.now_ns.saturating_sub(newest_ns) <= self.settings.stale_ns { Ok(()) } else { Err(Refusal::NoFeature) }
-    }
-
-    /// The curve's height, rate and acceleration (their maxima over time) must fit the limits, so that it is run as given.
-    fn curve_fits(&self, curve: &Curve) -> bool {
-        let Curve { lambda_deg, gamma_per_s2, beta_s } = *curve;
-        let limits = &self.settings.limits;
-        let finite = lambda_deg.is_finite() && gamma_per_s2.is_finite() && beta_s.is_finite();
-        // alpha' is largest at t - beta = 1/sqrt(2 gamma), alpha'' at t = beta.
-        finite
-            && lambda_deg > 0.0
-            && lambda_deg <= limits.alpha_max_deg
-            && gamma_per_s2 > 0.0
-            && (0.5..=60.0).contains(&beta_s)
-            && lambda_deg * (2.0 * gamma_per_s2).sqrt() * (-0.5f32).exp()
-                <= limits.rate_deg_s.min(limits.step_deg * 1e9 / self.settings.period_ns as f32)
-            && 2.0 * lambda_deg * gamma_per_s2 <= limits.acceleration_deg_s2
-            && curve_alpha_deg(curve, 0.0) <= 1.0
     }
 
     fn begin(&mut self, episode: u64, goal_ml: Option<f32>, curve: Option<Curve>, phase: Phase, input: &Input) {
@@ -486,11 +454,11 @@ impl Core {
             let (Some(agent), Some(_)) = (&mut self.agent, run.goal_ml) else { continue };
             let alpha_now_deg = self.limiter.alpha_deg();
             for nth in 1..=lost {
-                let alpha_deg = self.commanded.at(between_ns(previous, feature, nth, lost));
-                self.decision = agent.step(Frame { area_px2: None, alpha_deg, alpha_now_deg });
+                let alpha_deg = self.commanded.at_deg(between_ns(previous, feature, nth, lost));
+                self.decision = agent.step(Observation { area_px2: None, alpha_deg, alpha_now_deg });
             }
-            let alpha_deg = self.commanded.at(feature.captured_at_ns);
-            self.decision = agent.step(Frame { area_px2: measured, alpha_deg, alpha_now_deg });
+            let alpha_deg = self.commanded.at_deg(feature.captured_at_ns);
+            self.decision = agent.step(Observation { area_px2: measured, alpha_deg, alpha_now_deg });
             let flowing = self.decision.flowing;
             run.quiet_frames = if flowing { 0 } else { run.quiet_frames + lost + 1 };
             if measured.is_some_and(|area_px2| area_px2 > 0.0) {
@@ -535,7 +503,7 @@ impl Core {
             {
                 self.give_up(EndReason::StreamLost);
             }
-            Phase::Recording if run.curve.is_none_or(|c| seconds(run.started_at_ns) >= 2.0 * f64::from(c.beta_s)) => {
+            Phase::Recording if run.curve.is_none_or(|c| seconds(run.started_at_ns) >= f64::from(c.duration_s())) => {
                 self.phase = Phase::Returning;
             }
             Phase::Returning if self.limiter.alpha_deg().abs() < 0.01 => {
@@ -571,7 +539,7 @@ impl Core {
             Phase::Recording => {
                 let run = self.run?;
                 let t = input.now_ns.saturating_sub(run.started_at_ns) as f32 / 1e9;
-                Some(self.limiter.step(run.curve.map_or(0.0, |c| curve_alpha_deg(&c, t))))
+                Some(self.limiter.step(run.curve.map_or(0.0, |c| c.alpha_deg(t))))
             }
             Phase::Idle | Phase::Returning | Phase::Settling => {
                 let target = self.limiter.step_upright();
@@ -615,7 +583,7 @@ impl Core {
             robot_at_ns: input.robot.at_ns,
             episode: run.map_or(0, |r| r.episode),
             feature_sequence: self.newest.map_or(0, |f| f.sequence),
-            policy: 0,
+            weights_id: 0,
             alpha_deg: self.limiter.alpha_deg(),
             alpha_measured_deg: input.robot.alpha_deg,
             dalpha_deg: asked_deg,
@@ -630,11 +598,6 @@ impl Core {
             reserved: 0.0,
         }
     }
-}
-
-/// alpha(t) of eq. (1), degrees.
-pub fn curve_alpha_deg(curve: &Curve, t_s: f32) -> f32 {
-    curve.lambda_deg * (-curve.gamma_per_s2 * (t_s - curve.beta_s).powi(2)).exp()
 }
 
 /// Of another layout, or of another clock: the age of a picture from the future, on which so much rests, would mean nothing.

@@ -4,8 +4,9 @@ use std::io::{BufRead, IsTerminal, Write};
 use std::path::Path;
 
 use shared::config::Config;
-use shared::control::{Curve, Request};
+use shared::control::Request;
 use shared::exit::{self, Failure, OrExit as _, failure};
+use shared::gaussian_curve::Curve;
 
 use crate::client::Common;
 use crate::pour;

@@ -259,7 +259,7 @@ impl<'a> Service<'a> {
             Phase::NoRobot if !self.robot_note.get().is_empty() => self.robot_note.get(),
             Phase::NoRobot if t.alpha_measured_deg.is_finite() => Refusal::NotUpright(t.alpha_measured_deg).to_string(),
             Phase::NoRobot => "waiting for the robot".into(),
-            _ if t.policy == 0 => format!("no weights: {}", self.refused()),
+            _ if t.weights_id == 0 => format!("no weights: {}", self.refused()),
             _ => String::new(),
         };
         Status {
@@ -285,7 +285,7 @@ impl<'a> Service<'a> {
             loop_allocations: x.loop_allocations.load(Relaxed),
             loop_page_faults: x.loop_page_faults.load(Relaxed),
             events_lost: x.events_lost.load(Relaxed),
-            weights_refused: if t.policy == 0 { String::new() } else { self.refused() },
+            weights_refused: if t.weights_id == 0 { String::new() } else { self.refused() },
             weights: t.weights(),
             weights_taken: x.agents_taken.load(Relaxed),
             timing: vec![

@@ -1,4 +1,5 @@
 //! The pure parts of the robot link: frames, health, the program's text.
+#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::too_many_lines)]
 
 use proptest::prelude::*;
 use rt_controller::link::wire::{self, Inbox, Outputs};

@@ -3,17 +3,16 @@
 //!
 //! Pure and in the controller's loop: no clock, no allocation, no panic, also for input that is not a number.
 
-use serde::{Deserialize, Serialize};
-
+use crate::actions::{self, ACTIONS, STAY, Selection};
 use crate::estimator::Hold;
 use crate::estimator::flow::FlowTables;
 use crate::estimator::fused::FusedEstimator;
-use crate::policy::{self, ACTIONS, STAY};
+use crate::mlp;
 use crate::weights::{Estimator, Weights};
 
-/// What is known of one camera frame.
+/// What is known of one camera frame when the agent acts on it.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Frame {
+pub struct Observation {
     /// V_e in px^2; `None`: the frame was lost or its measurement is doubtful.
     pub area_px2: Option<f32>,
     /// Commanded alpha in force when this frame was taken, degrees from upright.
@@ -66,18 +65,6 @@ struct View {
     poured_ml: f32,
     poured_sd_ml: f32,
     stop_ml: f32,
-}
-
-/// How the network's 21 outputs become an action.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "kebab-case")]
-pub enum Selection {
-    /// The largest output.
-    Argmax,
-    /// The expected angle under the softmax; what falls between two actions is carried to the next frame.
-    Expected,
-    /// Drawn from the softmax with a generator seeded by [`Weights::seed`].
-    Sampled,
 }
 
 /// After the way back has begun, this much missing volume makes the agent pour on, ml.
@@ -163,11 +150,11 @@ impl Agent {
 
     /// One frame: d <- d - V_e (eq. 2), then the policy's action. Call it once for every frame, lost ones included, and
     /// after `finished` until the last drop was seen, so that the whole volume is counted.
-    pub fn step(&mut self, frame: Frame) -> Decision {
+    pub fn step(&mut self, observation: Observation) -> Decision {
         let Some(goal_ml) = self.goal_ml else {
             return Decision::NOTHING;
         };
-        let view = self.observe(frame);
+        let view = self.observe(observation);
         let d_ml = goal_ml - view.poured_ml;
         // What is on its way counts as poured: the network is to stop in time.
         let d_net_ml = d_ml - view.stop_ml;
@@ -185,7 +172,7 @@ impl Agent {
         let (action, dalpha_deg) = if self.returning || self.finished {
             (self.weights.back_action(), -self.back_deg)
         } else {
-            let logits = self.weights.policy.forward(&self.weights.scale.apply(self.v_ml, d_net_ml));
+            let logits = self.weights.network.forward(&self.weights.scale.apply(self.v_ml, d_net_ml));
             let action = self.select(&logits);
             (action, self.weights.actions_deg[action])
         };
@@ -215,39 +202,39 @@ impl Agent {
     }
 
     /// Takes the frame into the sum and, if there is one, the filter.
-    fn observe(&mut self, frame: Frame) -> View {
+    fn observe(&mut self, observation: Observation) -> View {
         let calibration = self.weights.calibration;
-        let area_px2 = self.hold.step(frame.area_px2, calibration.hold_above_px2);
-        let v_ml = calibration.volume_ml(area_px2, frame.alpha_deg);
+        let area_px2 = self.hold.step(observation.area_px2, calibration.hold_above_px2);
+        let v_ml = calibration.volume_ml(area_px2, observation.alpha_deg);
         self.v_ml = [v_ml, self.v_ml[0], self.v_ml[1]];
         self.summed_ml += v_ml;
         let Some(fused) = &mut self.fused else {
             return View { poured_ml: self.summed_ml, poured_sd_ml: 0.0, stop_ml: 0.0 };
         };
         // The filter judges dropouts itself.
-        let y_ml = frame.area_px2.map(|a| f64::from(calibration.volume_ml(a, frame.alpha_deg)));
-        fused.step(y_ml, f64::from(frame.alpha_deg));
+        let y_ml = observation.area_px2.map(|a| f64::from(calibration.volume_ml(a, observation.alpha_deg)));
+        fused.step(y_ml, f64::from(observation.alpha_deg));
         View {
             poured_ml: fused.poured_ml() as f32,
             poured_sd_ml: fused.poured_sd_ml() as f32,
-            stop_ml: fused.stop_volume_ml(f64::from(frame.alpha_now_deg).clamp(-30.0, 200.0)) as f32,
+            stop_ml: fused.stop_volume_ml(f64::from(observation.alpha_now_deg).clamp(-30.0, 200.0)) as f32,
         }
     }
 
     fn select(&mut self, logits: &[f32; ACTIONS]) -> usize {
         match self.weights.selection {
-            Selection::Argmax => policy::argmax(logits),
+            Selection::Argmax => mlp::argmax(logits),
             Selection::Expected => {
-                let p = policy::softmax(logits);
+                let p = mlp::softmax(logits);
                 let mean: f32 = p.iter().zip(&self.weights.actions_deg).map(|(p, a)| p * a).sum();
                 let wanted = mean + self.carry_deg;
-                let action = policy::nearest_action(&self.weights.actions_deg, wanted);
+                let action = actions::nearest_action(&self.weights.actions_deg, wanted);
                 self.carry_deg = (wanted - self.weights.actions_deg[action]).clamp(-1.0, 1.0);
                 action
             }
             Selection::Sampled => {
                 let mut left = self.uniform();
-                for (k, p) in policy::softmax(logits).iter().enumerate() {
+                for (k, p) in mlp::softmax(logits).iter().enumerate() {
                     left -= p;
                     if left < 0.0 {
                         return k;
@@ -273,8 +260,8 @@ mod tests {
     use crate::weights::tests::example;
     use proptest::prelude::*;
 
-    fn frame(area: f32) -> Frame {
-        Frame { area_px2: Some(area), alpha_deg: 50.0, alpha_now_deg: 50.0 }
+    fn frame(area: f32) -> Observation {
+        Observation { area_px2: Some(area), alpha_deg: 50.0, alpha_now_deg: 50.0 }
     }
 
     /// Protects the idle robot: with d = 0 the agent does nothing, whatever it sees.
@@ -318,7 +305,7 @@ mod tests {
         let decision = areas.map(|a| agent.step(frame(a)))[2];
         let v = areas.map(|a| weights.calibration.volume_ml(a, 50.0));
         let x = weights.scale.apply([v[2], v[1], v[0]], 50.0 - v.iter().sum::<f32>());
-        assert_eq!(usize::from(decision.action), policy::argmax(&weights.policy.forward(&x)));
+        assert_eq!(usize::from(decision.action), mlp::argmax(&weights.network.forward(&x)));
     }
 
     /// Protects the mean of the played angles: what the table cannot express in one frame is carried into the next.
@@ -326,12 +313,12 @@ mod tests {
     fn expected_actions_carry_their_remainder() {
         let mut weights = example();
         weights.selection = Selection::Expected;
-        weights.policy = crate::policy::Mlp::ZERO;
-        for b in &mut weights.policy.b3 {
+        weights.network = crate::mlp::Mlp::ZERO;
+        for b in &mut weights.network.b3 {
             *b = -100.0;
         }
         // Half "stay", half the finest action: 0.025 degrees a frame on average, which no action is.
-        (weights.policy.b3[10], weights.policy.b3[11]) = (0.0, 0.0);
+        (weights.network.b3[10], weights.network.b3[11]) = (0.0, 0.0);
         let mut agent = Agent::new(&weights);
         agent.start(50.0);
         let sum: f32 = (0..100).map(|_| agent.step(frame(0.0)).dalpha_deg).sum();
@@ -343,12 +330,12 @@ mod tests {
     #[test]
     fn a_policy_that_stands_still_comes_to_its_end() {
         let mut weights = example();
-        weights.policy = crate::policy::Mlp::ZERO;
+        weights.network = crate::mlp::Mlp::ZERO;
         for (action, flow_at_first, flow_later, ends) in
             [(10, 100.0, 0.0, true), (10, 100.0, 0.1, true), (12, 100.0, 0.0, false), (10, 0.0, 0.0, false), (10, 100.0, 90.0, false)]
         {
-            weights.policy.b3 = [0.0; ACTIONS];
-            weights.policy.b3[action] = 1.0;
+            weights.network.b3 = [0.0; ACTIONS];
+            weights.network.b3[action] = 1.0;
             let mut agent = Agent::new(&weights);
             agent.start(5000.0);
             let first = agent.step(frame(flow_at_first));
@@ -388,7 +375,7 @@ mod tests {
             let mut agent = Agent::new(&weights);
             agent.start(goal);
             for (area_px2, alpha_deg) in frames {
-                let decision = agent.step(Frame { area_px2, alpha_deg, alpha_now_deg: alpha_deg });
+                let decision = agent.step(Observation { area_px2, alpha_deg, alpha_now_deg: alpha_deg });
                 prop_assert!(decision.dalpha_deg.is_finite() && decision.dalpha_deg.abs() <= 5.0);
                 prop_assert!(usize::from(decision.action) < ACTIONS);
             }

@@ -20,21 +20,19 @@
 
 use sha2::{Digest, Sha256};
 
-use crate::control::Curve;
+use crate::gaussian_curve::Curve;
 use crate::messages::Doubt;
 
-mod alpha;
+mod format;
 pub mod read;
-mod rows;
 pub mod table;
 pub mod weigh;
 pub mod write;
 
-pub use alpha::AlphaTrack;
-pub use read::{EpisodeError, Image, Images, find};
+pub use read::{EpisodeError, EpisodeImage, EpisodeImages, find_episodes};
 pub use table::{TableError, read_table, write_table};
 pub use weigh::{WeighError, set_weight};
-pub use write::{End, EpisodeWriter, Sample, Start, WriteError};
+pub use write::{EpisodeEnd, EpisodeStart, EpisodeWriter, FrameRow, WriteError};
 
 /// One experimental episode, without its images.
 #[derive(Debug, Clone, PartialEq)]
@@ -42,21 +40,21 @@ pub struct Episode {
     /// The file's path, or the episode's name in a table.
     pub name: String,
     /// What was run.
-    pub kind: Kind,
-    /// All frames in order of capture, one for each that the camera exposed: the lost ones are there, see [`Frame::lost`].
-    pub frames: Vec<Frame>,
+    pub kind: EpisodeKind,
+    /// All frames in order of capture, one for each that the camera exposed: the lost ones are there, see [`EpisodeRow::lost`].
+    pub rows: Vec<EpisodeRow>,
     /// `w_E`: weight on the scale afterwards, g (= ml of water); finite, >= 0; `None` until somebody read the scale.
     pub weight_g: Option<f64>,
     /// The recorder closed the file in good order and no tick or frame of the end is missing. Only complete episodes may be
     /// trained on: in others the areas do not add up to the weight.
     pub complete: bool,
     /// Where it comes from and what went wrong on the way.
-    pub info: Info,
+    pub info: EpisodeInfo,
 }
 
 /// What was run in an episode.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub enum Kind {
+pub enum EpisodeKind {
     /// The curve of eq. (1).
     Recording(Curve),
     /// A pour by the policy.
@@ -70,7 +68,7 @@ pub enum Kind {
 
 /// One camera frame of an episode: a row of `L_E` with V_e in the image's place.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Frame {
+pub struct EpisodeRow {
     /// The camera's frame number; consecutive within an episode.
     pub sequence: u64,
     /// Middle of the exposure, CLOCK_MONOTONIC ns; interpolated for a lost frame; 0 in tables.
@@ -91,7 +89,7 @@ pub struct Frame {
 
 /// Where an episode comes from and what went wrong on the way; empty and 0 for tables.
 #[derive(Debug, Clone, PartialEq, Default)]
-pub struct Info {
+pub struct EpisodeInfo {
     /// Wall clock at the start, RFC 3339, UTC.
     pub started_at_utc: String,
     /// First tick of the episode, CLOCK_MONOTONIC ns.
@@ -112,7 +110,7 @@ pub struct Info {
     pub images: u64,
     /// Images that the recorder dropped; their V_e is there.
     pub dropped_images: u64,
-    /// Frames of [`Episode::frames`] that nobody measured.
+    /// Frames of [`Episode::rows`] that nobody measured.
     pub lost_frames: u64,
 }
 
@@ -121,7 +119,7 @@ impl Episode {
     /// same hash are the same measurement twice, be it as a file or as a table.
     pub fn content_sha256(&self) -> [u8; 32] {
         let mut hash = Sha256::new();
-        for f in &self.frames {
+        for f in &self.rows {
             hash.update(f.t_s.to_le_bytes());
             hash.update(f.alpha_commanded_deg.to_le_bytes());
             hash.update(if f.area_px2.is_nan() { f32::NAN } else { f.area_px2 }.to_le_bytes());
@@ -146,7 +144,7 @@ impl Episode {
 
     /// Duration from the first to the last frame, s.
     pub fn seconds(&self) -> f64 {
-        match (self.frames.first(), self.frames.last()) {
+        match (self.rows.first(), self.rows.last()) {
             (Some(first), Some(last)) => last.t_s - first.t_s,
             _ => 0.0,
         }

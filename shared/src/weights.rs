@@ -20,11 +20,11 @@ use crc::{CRC_32_ISO_HDLC, Crc};
 use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
 
-use crate::agent::Selection;
+use crate::actions::{ACTIONS, BACK_DEG_PER_FRAME, Selection, nearest_action};
 use crate::estimator::Calibration;
 use crate::estimator::flow::{DELAY_MAX_FRAMES, FlowModel, WayBack};
 use crate::estimator::vessel::Vessel;
-use crate::policy::{ACTIONS, HIDDEN, INPUTS, InputScale, Mlp, nearest_action};
+use crate::mlp::{HIDDEN, INPUTS, InputScale, Mlp};
 
 /// Version of the file format; other versions are refused.
 pub const FORMAT_VERSION: u32 = 3;
@@ -40,7 +40,7 @@ const CRC: Crc<u32> = Crc::<u32>::new(&CRC_32_ISO_HDLC);
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Weights {
     /// The network.
-    pub policy: Mlp,
+    pub network: Mlp,
     /// Angle of each action, degrees, ascending (Fig. 5, or two actions).
     pub actions_deg: [f32; ACTIONS],
     /// How outputs become an action.
@@ -219,7 +219,7 @@ pub enum WeightsError {
 impl Weights {
     /// Index of the action that tilts back: the one nearest to -3.2 degrees a frame.
     pub fn back_action(&self) -> usize {
-        nearest_action(&self.actions_deg, -3.2)
+        nearest_action(&self.actions_deg, BACK_DEG_PER_FRAME)
     }
 
     /// The file's bytes. The same weights give the same bytes.
@@ -310,7 +310,7 @@ impl Weights {
 
     /// Which value must not go to the robot, if any.
     fn check(&self) -> Result<(), String> {
-        if let Some(k) = self.policy.parameters().position(|p| !p.is_finite()) {
+        if let Some(k) = self.network.parameters().position(|p| !p.is_finite()) {
             return Err(format!("parameter {k} of the network is not finite"));
         }
         let ascending = self.actions_deg.windows(2).all(|w| w[0] <= w[1]);
@@ -347,17 +347,17 @@ impl Weights {
 #[cfg(test)]
 pub(crate) mod tests {
     use super::*;
-    use crate::policy::action_table;
+    use crate::actions::action_table;
     use proptest::prelude::*;
 
     /// A network that pours while d > 0 and stays when d is near 0; made by hand.
     pub(crate) fn example() -> Weights {
-        let mut policy = Mlp::ZERO;
-        for (k, p) in policy.parameters_mut().enumerate() {
+        let mut network = Mlp::ZERO;
+        for (k, p) in network.parameters_mut().enumerate() {
             *p = (k as f32 * 0.7).sin() * 0.1;
         }
         Weights {
-            policy,
+            network,
             actions_deg: action_table(),
             selection: Selection::Argmax,
             scale: InputScale::default(),
@@ -444,7 +444,7 @@ pub(crate) mod tests {
         flipped[200] ^= 4;
         assert!(say(&flipped).contains("damaged"));
         for (what, change) in [
-            ("parameter 5", (|w: &mut Weights| w.policy.w1[0][5] = f32::NAN) as fn(&mut Weights)),
+            ("parameter 5", (|w: &mut Weights| w.network.w1[0][5] = f32::NAN) as fn(&mut Weights)),
             ("action table", |w| w.actions_deg[3] = 7.0),
             ("calibration c", |w| w.calibration.volume_at_1_px2_ml = f32::INFINITY),
             ("exponent", |w| w.calibration.area_exponent = f32::NAN),

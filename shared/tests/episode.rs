@@ -1,14 +1,16 @@
 //! Episodes as real files: round trip, damage, weights, tables.
+#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::too_many_lines)]
 
 use std::path::{Path, PathBuf};
 use std::time::{Duration, UNIX_EPOCH};
 
 use proptest::prelude::*;
 use shared::config::Config;
-use shared::control::Curve;
 use shared::episode::{
-    End, Episode, EpisodeError, EpisodeWriter, Images, Kind, Sample, Start, WeighError, find, read_table, set_weight, write_table,
+    Episode, EpisodeEnd, EpisodeError, EpisodeImages, EpisodeKind, EpisodeStart, EpisodeWriter, FrameRow, WeighError, find_episodes,
+    read_table, set_weight, write_table,
 };
+use shared::gaussian_curve::Curve;
 use shared::messages::{Doubt, Feature, LAYOUT_VERSION, Phase, Telemetry};
 
 const START_NS: u64 = 5_000_000_000;
@@ -19,10 +21,10 @@ fn config() -> Config {
     Config::read(&Path::new(env!("CARGO_MANIFEST_DIR")).join("../config/sim.toml")).unwrap()
 }
 
-fn start(config: &Config) -> Start<'_> {
-    Start {
+fn start(config: &Config) -> EpisodeStart<'_> {
+    EpisodeStart {
         episode: 3,
-        kind: Kind::Recording(CURVE),
+        kind: EpisodeKind::Recording(CURVE),
         started_at_ns: START_NS,
         wall_clock: UNIX_EPOCH + Duration::from_secs(1_795_311_559),
         config,
@@ -78,12 +80,12 @@ fn write(directory: &Path, finish: bool) -> PathBuf {
         let alpha = 0.5 * (n as f32 - 10.0);
         let data = vec![n as u8; 300];
         let image = (n != 40).then_some(("jpeg", data.as_slice()));
-        let sample = Sample { feature: &f, alpha_commanded_deg: alpha, alpha_measured_deg: alpha - 0.25, image };
+        let sample = FrameRow { feature: &f, alpha_commanded_deg: alpha, alpha_measured_deg: alpha - 0.25, image };
         writer.frame(&sample).unwrap();
     }
     let path = writer.path().to_path_buf();
     if finish {
-        writer.finish(&End { complete: true, reason: "over", disordered_frames: 0 }).unwrap();
+        writer.finish(&EpisodeEnd { complete: true, reason: "over", disordered_frames: 0 }).unwrap();
     }
     path
 }
@@ -95,16 +97,16 @@ fn an_episode_is_read_as_it_was_written() {
     let path = write(dir.path(), true);
     let episode = Episode::read(&path).unwrap();
     assert!(episode.complete);
-    assert_eq!(episode.kind, Kind::Recording(CURVE));
+    assert_eq!(episode.kind, EpisodeKind::Recording(CURVE));
     assert_eq!(episode.weight_g, None);
     assert_eq!(episode.info.started_at_utc, "2026-11-22T01:39:19Z");
     assert_eq!((episode.info.cell.as_str(), episode.info.weights.as_str()), ("sim", "0123456789abcdef"));
     assert_eq!((episode.info.ticks, episode.info.lost_ticks), (58, 0));
     assert_eq!((episode.info.images, episode.info.dropped_images, episode.info.lost_frames), (57, 1, 2));
 
-    let sequences: Vec<u64> = episode.frames.iter().map(|f| f.sequence).collect();
+    let sequences: Vec<u64> = episode.rows.iter().map(|f| f.sequence).collect();
     assert_eq!(sequences, (8..68).collect::<Vec<_>>(), "one frame for each that the camera exposed");
-    for f in &episode.frames {
+    for f in &episode.rows {
         let n = f.sequence;
         assert_eq!(f.lost, n == 17 || n == 18);
         assert!((f.captured_at_ns as i64 - feature(n, Doubt::None).captured_at_ns as i64).abs() <= 1);
@@ -116,12 +118,12 @@ fn an_episode_is_read_as_it_was_written() {
             assert_eq!(f.area_px2, 0.1 + 7.3 * n as f32);
         }
     }
-    assert_eq!(episode.frames[25 - 8].doubt, Doubt::TooDark);
+    assert_eq!(episode.rows[25 - 8].doubt, Doubt::TooDark);
 
-    let images: Vec<_> = Images::open(&path).unwrap().map(Result::unwrap).collect();
+    let images: Vec<_> = EpisodeImages::open(&path).unwrap().map(Result::unwrap).collect();
     assert_eq!(images.len(), 57);
     assert_eq!((images[0].sequence, images[0].format.as_str(), images[0].data[0]), (8, "jpeg", 8));
-    assert_eq!(images[0].captured_at_ns, episode.frames[0].captured_at_ns);
+    assert_eq!(images[0].captured_at_ns, episode.rows[0].captured_at_ns);
 }
 
 /// Protects people from training on half an episode: a file without its end reads, but says that it is incomplete.
@@ -130,7 +132,7 @@ fn a_file_that_was_never_finished_is_incomplete() {
     let dir = tempfile::tempdir().unwrap();
     let episode = Episode::read(&write(dir.path(), false)).unwrap();
     assert!(!episode.complete);
-    assert!(!episode.frames.is_empty());
+    assert!(!episode.rows.is_empty());
 }
 
 /// Protects people from training on an episode whose camera stopped before its end: its areas do not add up to the weight.
@@ -143,10 +145,10 @@ fn an_episode_whose_last_second_has_no_frames_is_incomplete() {
         writer.telemetry(&tick(n - 10)).unwrap();
         if n < 30 {
             let f = feature(n, Doubt::None);
-            writer.frame(&Sample { feature: &f, alpha_commanded_deg: 0.0, alpha_measured_deg: 0.0, image: None }).unwrap();
+            writer.frame(&FrameRow { feature: &f, alpha_commanded_deg: 0.0, alpha_measured_deg: 0.0, image: None }).unwrap();
         }
     }
-    let path = writer.finish(&End { complete: true, reason: "over", disordered_frames: 0 }).unwrap();
+    let path = writer.finish(&EpisodeEnd { complete: true, reason: "over", disordered_frames: 0 }).unwrap();
     assert!(!Episode::read(&path).unwrap().complete);
 }
 
@@ -156,14 +158,14 @@ fn the_weight_is_added_afterwards_and_nothing_else_changes() {
     let dir = tempfile::tempdir().unwrap();
     let path = write(dir.path(), true);
     let before = Episode::read(&path).unwrap();
-    let images: Vec<_> = Images::open(&path).unwrap().map(Result::unwrap).collect();
+    let images: Vec<_> = EpisodeImages::open(&path).unwrap().map(Result::unwrap).collect();
     assert_eq!(set_weight(&path, 101.5).unwrap(), None);
     assert_eq!(set_weight(&path, 98.0).unwrap(), Some(101.5));
     let after = Episode::read(&path).unwrap();
     assert_eq!(after.weight_g, Some(98.0));
     assert!(after.complete);
     assert_eq!((&after.info, after.content_sha256()), (&before.info, before.content_sha256()));
-    assert_eq!(images, Images::open(&path).unwrap().map(Result::unwrap).collect::<Vec<_>>());
+    assert_eq!(images, EpisodeImages::open(&path).unwrap().map(Result::unwrap).collect::<Vec<_>>());
     assert_eq!(std::fs::read_dir(dir.path()).unwrap().count(), 1, "no temporary file is left");
 }
 
@@ -191,10 +193,10 @@ fn the_same_measurement_twice_is_found() {
     let copy = dir.path().join("copy.mcap");
     std::fs::copy(&path, &copy).unwrap();
     set_weight(&copy, 77.0).unwrap();
-    let files = find(&[dir.path().to_path_buf()]).unwrap();
+    let files = find_episodes(&[dir.path().to_path_buf()]).unwrap();
     let mut episodes: Vec<Episode> = files.iter().map(|f| Episode::read(f).unwrap()).collect();
     assert_eq!(Episode::duplicates(&episodes), [(0, 1)]);
-    episodes[0].frames[30].area_px2 += 1.0;
+    episodes[0].rows[30].area_px2 += 1.0;
     assert_eq!(Episode::duplicates(&episodes), []);
 }
 
@@ -229,13 +231,13 @@ proptest! {
         std::fs::write(&path, &bytes[..(bytes.len() as f64 * at) as usize]).unwrap();
         if let Ok(episode) = Episode::read(&path) {
             prop_assert!(!episode.complete);
-            for (a, b) in episode.frames.iter().zip(&original.frames) {
+            for (a, b) in episode.rows.iter().zip(&original.rows) {
                 prop_assert_eq!(a.sequence, b.sequence);
                 prop_assert_eq!(a.captured_at_ns, b.captured_at_ns);
                 prop_assert_eq!(a.area_px2.to_bits(), b.area_px2.to_bits());
             }
         }
-        for image in Images::open(&path).unwrap() { let _ = image; }
+        for image in EpisodeImages::open(&path).unwrap() { let _ = image; }
     }
 
     /// Protects the trainer from wrong numbers: a file with one flipped bit never reads as a complete episode.
@@ -250,7 +252,7 @@ proptest! {
         if let Ok(episode) = Episode::read(&path) {
             prop_assert!(!episode.complete, "byte {} of {}, bit {}", place, bytes.len(), bit);
         }
-        for image in Images::open(&path).unwrap() { let _ = image; }
+        for image in EpisodeImages::open(&path).unwrap() { let _ = image; }
         prop_assert!(set_weight(&path, 1.0).is_err());
     }
 }
@@ -271,11 +273,11 @@ fn a_table_is_read() {
     let features = "area_px2, note, episode, frame, t_s, alpha_deg\n0,x,a,5,0.0,1\n10.5,x,a,8,0.3,4\nnan,x,b,0,0,0\n,x,b,1,0.1,0.5\n";
     let episodes = tables(features, "episode,weight_g\nb,12\na,99.5\n").unwrap();
     assert_eq!(episodes.iter().map(|e| (e.name.as_str(), e.weight_g)).collect::<Vec<_>>(), [("a", Some(99.5)), ("b", Some(12.0))]);
-    let a = &episodes[0].frames;
+    let a = &episodes[0].rows;
     assert_eq!(a.iter().map(|f| (f.sequence, f.lost)).collect::<Vec<_>>(), [(5, false), (6, true), (7, true), (8, false)]);
     assert_eq!((a[1].alpha_commanded_deg, a[3].area_px2), (2.0, 10.5));
-    assert!(episodes[1].frames.iter().all(|f| f.lost && f.area_px2.is_nan()));
-    assert!(episodes.iter().all(|e| e.complete && e.kind == Kind::Table));
+    assert!(episodes[1].rows.iter().all(|f| f.lost && f.area_px2.is_nan()));
+    assert!(episodes.iter().all(|e| e.complete && e.kind == EpisodeKind::Table));
 }
 
 /// Protects people from silent misreading: each fault is named with file and line.

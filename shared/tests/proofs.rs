@@ -1,9 +1,10 @@
 //! What the proofs of the loop's promises rest on: counters that count, and the forward pass's number of instructions.
+#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::too_many_lines)]
 
 use std::process::Command;
 
+use shared::mlp::Mlp;
 use shared::os;
-use shared::policy::Mlp;
 
 #[global_allocator]
 static ALLOCATOR: os::CountingAllocator = os::CountingAllocator;

@@ -1,10 +1,10 @@
-//! `simulator run`: the simulated cell in real time: UR5 controller, container on its wrist, camera, kitchen scale, operator.
+//! The simulated cell in real time: UR5 controller, a container on its wrist, camera, kitchen scale, operator.
 //!
-//! Threads: the UR controller's own (see [`crate::ur`]); "physics" moves the liquid every 4 ms with the tilt that
-//! the simulated joint really has; "camera" renders and publishes frames; the main thread serves the operator's socket. The
-//! cell offers what a real one offers: RTDE and script ports, camera frames in shared memory. The truth leaves it only as
-//! pixels, joint angles and, after a pour, as the scale's reading. Errors at start are one line; afterwards a failing camera
-//! ends the process, so that nobody measures half a cell.
+//! Threads: the UR controller has its own (see [`crate::ur`]); "physics" moves the liquid every 4 ms with the tilt that the simulated
+//! joint really has; "camera" renders and publishes frames; the main thread serves the operator's socket. All of them allocate. The cell
+//! offers what a real one offers: RTDE and script ports, and camera frames in shared memory. The truth leaves it only as pixels, as joint
+//! angles and, after a pour, as the scale's reading. An error at the start is one line. When the camera fails later, the process ends, so
+//! that nobody measures half a cell.
 
 use std::io::{BufRead, BufReader, Write};
 use std::os::unix::net::{UnixListener, UnixStream};
@@ -17,7 +17,6 @@ use rand::{RngExt, SeedableRng};
 use rand_pcg::Pcg64Mcg;
 use serde::{Deserialize, Serialize};
 use shared::config::Config;
-use shared::exit::{self, Failure, OrExit as _};
 use shared::ipc::Cell;
 use shared::messages::{FrameHeader, LAYOUT_VERSION, PixelFormat};
 use shared::os;
@@ -27,30 +26,19 @@ use crate::physics::container::Container;
 use crate::physics::rig::Rig;
 use crate::ur;
 
-/// SCHED_FIFO priorities where permitted: a real robot, liquid and camera do not wait for this machine's other work. Below the
-/// programs under test.
+/// SCHED_FIFO priority of the liquid, where permitted: a real liquid does not wait for the machine's other work. It is below the
+/// priorities of the programs under test in `config/sim.toml`.
 const LIQUID_PRIORITY: u8 = 60;
+/// SCHED_FIFO priority of the camera, where permitted: below the liquid's, because a late picture does less harm than a late liquid.
 const CAMERA_PRIORITY: u8 = 50;
-/// Step of the liquid, ns.
+/// Step of the liquid, ns: half of a CB3's control period, and short against the film's time constant.
 const PHYSICS_NS: u64 = 4_000_000;
-
-/// Command-line arguments.
-#[derive(Debug, clap::Args)]
-#[command(
-    after_help = "Example:\n  simulator run --config config/sim.toml\n\nThen start `feature-worker run` and `rt-controller run` with the same \
-configuration, and act as the operator with `simulator operator`."
-)]
-pub struct Args {
-    /// The simulated cell's configuration.
-    #[arg(long, default_value = shared::config::DEFAULT_FILE)]
-    config: PathBuf,
-}
 
 /// The table `[simulator]` of the configuration.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct SimulatorConfig {
-    /// Draws the rig: container, lip, liquid and camera (see [`Rig::seeded`]), and all noise.
+    /// Draws the rig (container, lip, liquid and camera, see [`Rig::seeded`]) and all noise.
     pub seed: u64,
     /// Which UR controller: `cb3` (3.15, 125 Hz) or `e-series` (5.x, 500 Hz).
     pub series: ur::Series,
@@ -58,7 +46,7 @@ pub struct SimulatorConfig {
     pub container: String,
     /// Volume in the container at the start, ml.
     pub fill_ml: f64,
-    /// From the middle of the exposure until the frame is published, ms.
+    /// Time from the middle of the exposure until the frame is published, ms.
     pub camera_delay_ms: u32,
     /// Share of frames that the camera loses.
     pub camera_loss: f64,
@@ -81,7 +69,10 @@ impl Default for SimulatorConfig {
 }
 
 impl SimulatorConfig {
-    /// Reads and checks the table `[simulator]`; the error is one line for the operator.
+    /// Reads and checks the table `[simulator]`.
+    ///
+    /// # Errors
+    /// One line for the operator, when the table is missing or a value is not allowed.
     pub fn new(config: &Config) -> Result<Self, String> {
         let table = config.simulator.clone().ok_or("no table [simulator]: this is not a simulated cell's configuration")?;
         let this: Self = toml::Value::Table(table).try_into().map_err(|e: toml::de::Error| format!("[simulator]: {}", e.message()))?;
@@ -120,22 +111,22 @@ pub fn operator_socket(name: &str) -> PathBuf {
     shared::ipc::directory(name).join("operator")
 }
 
-/// What the threads share.
-struct World {
+/// What the threads of the cell share.
+struct CellState {
     container: Mutex<Container>,
     rig: Rig,
-    robot: ur::Handle,
+    robot: ur::Controller,
     config: Config,
-    sim: SimulatorConfig,
+    simulated: SimulatorConfig,
     stop: Arc<AtomicBool>,
 }
 
-impl World {
+impl CellState {
     fn container(&self) -> MutexGuard<'_, Container> {
         self.container.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// The container's real tilt and its rate: degrees, degrees/s.
+    /// The container's actual tilt in degrees, and its rate in degrees/s.
     fn tilt(&self) -> (f64, f64) {
         let robot = &self.config.robot;
         let (joints, i) = (self.robot.joints(), robot.joint.index());
@@ -144,42 +135,43 @@ impl World {
     }
 }
 
-/// Runs the command.
-pub fn run(args: &Args) -> Result<(), Failure> {
-    let config = Config::read(&args.config).or_exit(exit::BAD_INPUT)?;
-    let sim = SimulatorConfig::new(&config).map_err(|e| format!("{}: {e}", args.config.display())).or_exit(exit::BAD_INPUT)?;
-    simulate(config, sim).or_exit(exit::FAILED)
-}
-
-fn simulate(config: Config, sim: SimulatorConfig) -> Result<(), Box<dyn std::error::Error>> {
+/// Runs the cell until it is asked to stop or its camera fails.
+///
+/// # Errors
+/// When the robot's ports, the cell's shared memory or the operator's socket cannot be had, or the camera fails.
+pub fn simulate(config: Config, simulated: SimulatorConfig) -> Result<(), Box<dyn std::error::Error>> {
     let stop = os::stop_at_signals()?;
     let mut start_q_rad = [0.0, -1.571, 1.571, -1.571, -1.571, 0.0];
     start_q_rad[config.robot.joint.index()] = config.robot.start_joint_deg.to_radians();
-    let robot = ur::Controller::start(ur::Options { series: sim.series, start_q_rad, ..ur::Options::new(config.robot.address) })?;
-    let rig = sim.rig();
-    let world = World { container: Mutex::new(rig.container(sim.fill_ml)), rig, robot, config, sim, stop };
+    let robot = ur::Controller::start(ur::ControllerOptions {
+        series: simulated.series,
+        start_q_rad,
+        ..ur::ControllerOptions::new(config.robot.address)
+    })?;
+    let rig = simulated.rig();
+    let state = CellState { container: Mutex::new(rig.container(simulated.fill_ml)), rig, robot, config, simulated, stop };
 
-    let cell = Cell::join(&world.config.cell.name)?;
-    let socket = operator_socket(&world.config.cell.name);
+    let cell = Cell::join(&state.config.cell.name)?;
+    let socket = operator_socket(&state.config.cell.name);
     if let Some(parent) = socket.parent() {
         std::fs::create_dir_all(parent)?;
     }
     if UnixStream::connect(&socket).is_ok() {
-        return Err(format!("cell '{}' is already being simulated", world.config.cell.name).into());
+        return Err(format!("cell '{}' is already being simulated", state.config.cell.name).into());
     }
     let _ = std::fs::remove_file(&socket);
     let listener = UnixListener::bind(&socket)?;
     listener.set_nonblocking(true)?;
-    eprintln!("simulator: cell '{}' is up, UR5 controller on {}", world.config.cell.name, world.config.robot.address);
+    eprintln!("simulator: cell '{}' is up, UR5 controller on {}", state.config.cell.name, state.config.robot.address);
 
     let result = std::thread::scope(|scope| {
-        scope.spawn(|| move_liquid(&world));
+        scope.spawn(|| move_liquid(&state));
         let camera = scope.spawn(|| {
-            let result = film(&world);
-            world.stop.store(true, Relaxed);
+            let result = film(&state);
+            state.stop.store(true, Relaxed);
             result
         });
-        serve_operator(&world, &listener);
+        serve_operator(&state, &listener);
         camera.join().unwrap_or_else(|_| Err("the camera thread failed".into()))
     });
     let _ = std::fs::remove_file(&socket);
@@ -187,61 +179,62 @@ fn simulate(config: Config, sim: SimulatorConfig) -> Result<(), Box<dyn std::err
     result.map_err(Into::into)
 }
 
-/// A period after `at_ns`; now, if that was long ago: the process was suspended, and no time passed in the cell.
+/// The time one period after `at_ns`. If that is more than a second ago, it is the present time: the process was suspended, and no
+/// time passed in the cell.
 fn after(at_ns: u64, period_ns: u64) -> u64 {
     let next_ns = at_ns + period_ns;
     let now_ns = os::now_ns();
     if now_ns > next_ns + 1_000_000_000 { now_ns } else { next_ns }
 }
 
-/// Thread "physics".
-fn move_liquid(world: &World) {
+/// The thread "physics".
+fn move_liquid(state: &CellState) {
     if let Err(line) = os::prioritise(LIQUID_PRIORITY) {
         eprintln!("simulator: {line}");
     }
     let mut next_ns = os::now_ns();
-    while !world.stop.load(Relaxed) {
+    while !state.stop.load(Relaxed) {
         next_ns = after(next_ns, PHYSICS_NS);
         os::sleep_until_ns(next_ns);
-        let (alpha_deg, _) = world.tilt();
-        world.container().step(PHYSICS_NS as f64 / 1e9, alpha_deg);
+        let (alpha_deg, _) = state.tilt();
+        state.container().step(PHYSICS_NS as f64 / 1e9, alpha_deg);
     }
 }
 
-/// Thread "camera".
-fn film(world: &World) -> Result<(), String> {
+/// The thread "camera".
+fn film(state: &CellState) -> Result<(), String> {
     let words = |e: &dyn std::fmt::Debug| format!("camera: {e:?}");
-    let _ = os::prioritise(CAMERA_PRIORITY); // the liquid's thread has said if it is not permitted
-    let cell = Cell::join(&world.config.cell.name).map_err(|e| e.to_string())?;
+    let _ = os::prioritise(CAMERA_PRIORITY); // If that is not permitted, the liquid's thread has said so.
+    let cell = Cell::join(&state.config.cell.name).map_err(|e| e.to_string())?;
     let topic = cell.frames().map_err(|e| e.to_string())?;
-    let view = &world.sim.view;
+    let view = &state.simulated.view;
     let bytes = view.width_px as usize * view.height_px as usize * PixelFormat::Bgr8.bytes_per_pixel();
     let publisher = topic.publisher_builder().initial_max_slice_len(bytes).create().map_err(|e| words(&e))?;
     let notifier = cell.frame_notifier().map_err(|e| e.to_string())?;
-    let mut renderer = Renderer::new(view, world.sim.seed).map_err(|e| e.to_string())?;
-    let mut random = Pcg64Mcg::seed_from_u64(world.sim.seed ^ 0xCA_3E_2A);
+    let mut renderer = Renderer::new(view, state.simulated.seed).map_err(|e| e.to_string())?;
+    let mut random = Pcg64Mcg::seed_from_u64(state.simulated.seed ^ 0xCA_3E_2A);
     let mut pixels = vec![0; bytes];
-    let period_ns = (1e9 / world.config.camera.fps) as u64;
-    let delay_ns = u64::from(world.sim.camera_delay_ms) * 1_000_000;
+    let period_ns = (1e9 / state.config.camera.fps) as u64;
+    let delay_ns = u64::from(state.simulated.camera_delay_ms) * 1_000_000;
     let (mut sequence, mut captured_at_ns) = (0, os::now_ns());
-    while !world.stop.load(Relaxed) {
+    while !state.stop.load(Relaxed) {
         captured_at_ns = after(captured_at_ns, period_ns);
         sequence += 1;
-        // A camera that is not done in time loses frames; it does not send them ever later. (After a suspension no time has passed.)
+        // A camera that is not done in time loses frames instead of sending them later and later. (After a suspension no time has passed.)
         while captured_at_ns + delay_ns + period_ns < os::now_ns() {
             captured_at_ns += period_ns;
             sequence += 1;
         }
         os::sleep_until_ns(captured_at_ns);
-        let (alpha_deg, rate_deg_s) = world.tilt();
-        let scene = Scene::of(&world.container(), captured_at_ns as f64 / 1e9, alpha_deg, rate_deg_s);
+        let (alpha_deg, rate_deg_s) = state.tilt();
+        let scene = Scene::of(&state.container(), captured_at_ns as f64 / 1e9, alpha_deg, rate_deg_s);
         renderer.render(&scene, &mut pixels).map_err(|e| e.to_string())?;
-        if random.random::<f64>() < world.sim.camera_loss {
+        if random.random::<f64>() < state.simulated.camera_loss {
             continue;
         }
         os::sleep_until_ns(captured_at_ns + delay_ns);
-        let mut sample = publisher.loan_slice_uninit(bytes).map_err(|e| words(&e))?;
-        *sample.user_header_mut() = FrameHeader {
+        let mut loan = publisher.loan_slice_uninit(bytes).map_err(|e| words(&e))?;
+        *loan.user_header_mut() = FrameHeader {
             version: LAYOUT_VERSION,
             format: PixelFormat::Bgr8 as u32,
             width_px: view.width_px,
@@ -250,53 +243,53 @@ fn film(world: &World) -> Result<(), String> {
             captured_at_ns,
             published_at_ns: os::now_ns(),
         };
-        sample.write_from_slice(&pixels).send().map_err(|e| words(&e))?;
+        loan.write_from_slice(&pixels).send().map_err(|e| words(&e))?;
         notifier.notify().map_err(|e| words(&e))?;
     }
     Ok(())
 }
 
-/// The main thread: one line asked, one line (JSON) answered; see [`crate::operator`].
-fn serve_operator(world: &World, listener: &UnixListener) {
-    let mut noise = Pcg64Mcg::seed_from_u64(world.sim.seed ^ 0x5C_A1_E0);
-    while !world.stop.load(Relaxed) {
+/// The main thread: reads one line of words and answers with one line of JSON; see [`crate::commands::operator`].
+fn serve_operator(state: &CellState, listener: &UnixListener) {
+    let mut noise = Pcg64Mcg::seed_from_u64(state.simulated.seed ^ 0x5C_A1_E0);
+    while !state.stop.load(Relaxed) {
         match listener.accept() {
             Ok((stream, _)) => {
-                let _ = answer(world, &mut noise, &stream);
+                let _ = answer(state, &mut noise, &stream);
             }
             Err(_) => std::thread::sleep(Duration::from_millis(20)),
         }
     }
 }
 
-fn answer(world: &World, noise: &mut Pcg64Mcg, mut stream: &UnixStream) -> std::io::Result<()> {
+fn answer(state: &CellState, noise: &mut Pcg64Mcg, mut stream: &UnixStream) -> std::io::Result<()> {
     stream.set_nonblocking(false)?;
     stream.set_read_timeout(Some(Duration::from_secs(1)))?;
     let mut line = String::new();
     BufReader::new(stream).read_line(&mut line)?;
-    let reply = match obey(world, noise, line.trim()) {
+    let reply = match obey(state, noise, line.trim()) {
         Ok(value) => value,
         Err(error) => serde_json::json!({ "error": error }),
     };
     writeln!(stream, "{reply}")
 }
 
-fn obey(world: &World, noise: &mut Pcg64Mcg, line: &str) -> Result<serde_json::Value, String> {
+fn obey(state: &CellState, noise: &mut Pcg64Mcg, line: &str) -> Result<serde_json::Value, String> {
     let (verb, rest) = line.split_once(' ').unwrap_or((line, ""));
     match verb {
         "fill" => {
             let volume_ml: f64 = rest.parse().map_err(|_| format!("'{rest}' is no volume in ml"))?;
-            let mut container = world.container();
+            let mut container = state.container();
             if !(volume_ml >= 0.0 && volume_ml <= 0.92 * container.full_ml()) {
                 return Err(format!("{volume_ml} ml: this container takes 0 to {:.0} ml", 0.92 * container.full_ml()));
             }
-            *container = world.rig.container(volume_ml);
+            *container = state.rig.container(volume_ml);
             Ok(serde_json::json!({ "filled_ml": volume_ml }))
         }
         "scale" => {
-            // A kitchen scale: half a gram of error, steps of one gram.
+            // A kitchen scale has an error of about half a gram and shows whole grams.
             let error_g = 0.5 * noise.sample::<f64, _>(rand_distr::StandardNormal);
-            Ok(serde_json::json!({ "weight_g": (world.container().poured_ml() + error_g).round().max(0.0) }))
+            Ok(serde_json::json!({ "weight_g": (state.container().poured_ml() + error_g).round().max(0.0) }))
         }
         _ => Err(format!("'{verb}' is nothing that an operator can do here")),
     }
@@ -306,7 +299,7 @@ fn obey(world: &World, noise: &mut Pcg64Mcg, line: &str) -> Result<serde_json::V
 mod tests {
     use super::*;
 
-    /// Protects a cell that was suspended from catching up: the camera shows the present, and nothing pours in time that nobody saw.
+    /// Protects a cell that was suspended from catching up: the camera shows the present, and nothing flows in a time that nobody saw.
     #[test]
     fn a_suspended_cell_goes_on_from_now() {
         let now_ns = os::now_ns();

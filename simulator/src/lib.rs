@@ -1,17 +1,11 @@
 //! The simulated cell: container physics, rendered camera, UR5 controller, kitchen scale. Only it knows the truth.
+//!
+//! Of our crates it depends on `shared` alone. So Cargo itself holds that the renderer shares no code and no constant with the vision
+//! that is judged by its pictures, and the simulated robot none with the controller that is tried on it.
 #![forbid(unsafe_code)]
 
 pub mod camera;
 pub mod cell;
-pub mod demo;
-pub mod evaluate;
-pub mod evaluate_camera;
-pub mod jitter;
-pub mod motion;
-pub mod operator;
-pub mod own_cell;
+pub mod commands;
 pub mod physics;
-pub mod pour_plot;
-pub mod reproduce;
 pub mod ur;
-pub mod ur_command;

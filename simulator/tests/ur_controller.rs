@@ -1,6 +1,7 @@
 //! The simulated controller over real sockets: bytes as logged from real clients, ownership, program life, faults.
 //!
 //! Every test has a loopback address of its own. No test asserts how long something takes.
+#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::too_many_lines)]
 
 use std::collections::BTreeMap;
 use std::io::{BufRead, BufReader, ErrorKind, Read, Write};
@@ -8,7 +9,9 @@ use std::net::{IpAddr, Ipv4Addr, Shutdown, SocketAddr, TcpStream};
 use std::sync::atomic::{AtomicU8, Ordering};
 use std::time::{Duration, Instant};
 
-use simulator::ur::{Controller, Fault, Handle, LogKind, Options, RobotMode, RuntimeState, SafetyMode, Series, Version, fault, send_fault};
+use simulator::ur::{
+    Controller, ControllerOptions, Fault, LogKind, RobotMode, RuntimeState, SafetyMode, Series, Version, fault, send_fault,
+};
 
 /// Gives up on something that should come.
 const PATIENCE: Duration = Duration::from_secs(20);
@@ -21,9 +24,9 @@ fn address() -> IpAddr {
     IpAddr::V4(Ipv4Addr::new(127, 20 + a, 1 + b, NEXT.fetch_add(1, Ordering::Relaxed)))
 }
 
-fn start(series: Series) -> (Handle, IpAddr) {
+fn start(series: Series) -> (Controller, IpAddr) {
     let address = address();
-    let mut options = Options::new(address);
+    let mut options = ControllerOptions::new(address);
     options.series = series;
     (Controller::start(options).unwrap(), address)
 }
@@ -147,12 +150,12 @@ fn upload(address: IpAddr, program: &str) {
 const COUNT: &str =
     "def count():\n  n = 0\n  while True:\n    n = n + 1\n    write_output_integer_register(24, n)\n    sync()\n  end\nend\n";
 
-fn state(handle: &Handle) -> (RobotMode, SafetyMode, RuntimeState) {
+fn state(handle: &Controller) -> (RobotMode, SafetyMode, RuntimeState) {
     let state = handle.state().unwrap();
     (state.robot_mode, state.safety_mode, state.runtime_state)
 }
 
-fn playing(handle: &Handle) {
+fn playing(handle: &Controller) {
     until("playing", || state(handle).2 == RuntimeState::Playing);
 }
 
@@ -407,7 +410,7 @@ fn every_variable_has_its_type_and_size() {
         assert_eq!(client.inputs(names), format!("1:{}", vec![kind; names.split(',').count()].join(",")));
     }
     let types_on = |series, version, names: &str| {
-        let mut options = Options::new(crate::address());
+        let mut options = ControllerOptions::new(crate::address());
         options.series = series;
         options.version = version;
         let at = options.address;
@@ -664,8 +667,8 @@ fn faults_have_names_and_arrive_over_the_operator_port() {
 fn several_run_at_once_and_leave_nothing_behind() {
     let addresses = [address(), address(), address()];
     for _ in 0..2 {
-        let handles = addresses.map(|a| Controller::start(Options::new(a)).unwrap());
-        let error = Controller::start(Options::new(addresses[0])).unwrap_err().to_string();
+        let handles = addresses.map(|a| Controller::start(ControllerOptions::new(a)).unwrap());
+        let error = Controller::start(ControllerOptions::new(addresses[0])).unwrap_err().to_string();
         assert!(error.contains("29999") && error.contains("is another simulated controller running there?"), "{error}");
         upload(addresses[1], COUNT);
         playing(&handles[1]);

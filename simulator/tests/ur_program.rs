@@ -1,7 +1,9 @@
 //! The simulated controller without sockets: programs, servo model, safety and power, stepped cycle by cycle.
+#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::too_many_lines)]
 
-use simulator::ur::machine::{Machine, check_program};
-use simulator::ur::rtde::{Context, Owners, Session};
+use simulator::ur::Machine;
+use simulator::ur::program::check_program;
+use simulator::ur::rtde::{InputOwners, RtdeSession, SessionContext};
 use simulator::ur::script::MAX_SOURCE_BYTES;
 use simulator::ur::servo::MAX_SPEED_RAD_S;
 use simulator::ur::variables::{Input, Output};
@@ -207,8 +209,8 @@ fn servoj_blocks_for_its_time_and_the_speed_slider_stretches_it() {
                 servoj(q, t=0.033)\n  end";
     let (mut machine, _) = run(body, 10);
     assert_eq!(machine.robot.outputs.int[0], 3);
-    machine.write_input(Input::SpeedSliderMask, &1u32.to_be_bytes());
-    machine.write_input(Input::SpeedSliderFraction, &0.5f64.to_be_bytes());
+    machine.robot.write_input(Input::SpeedSliderMask, &1u32.to_be_bytes());
+    machine.robot.write_input(Input::SpeedSliderFraction, &0.5f64.to_be_bytes());
     steps(&mut machine, 4); // the servoj that was begun at full speed has 4 of its 5 cycles left
     let before = machine.robot.outputs.int[0];
     steps(&mut machine, 9 * 10);
@@ -254,7 +256,7 @@ fn a_watchdog_without_updates_stops_or_pauses_the_program() {
         let body = format!("  rtde_set_watchdog(\"input_int_register_24\", 10, \"{action}\")\n  while True:\n    sync()\n  end");
         let (mut machine, _) = run(&body, 1);
         for _ in 0..50 {
-            machine.write_input(Input::IntRegister(24), &7i32.to_be_bytes());
+            machine.robot.write_input(Input::IntRegister(24), &7i32.to_be_bytes());
             steps(&mut machine, 8);
             assert_eq!(machine.runtime_state(), RuntimeState::Playing, "{action}");
         }
@@ -273,14 +275,14 @@ const FOLLOW: &str = "  q = get_actual_joint_positions()\n  while True:\n    q[5
                       servoj(q, t=get_steptime(), lookahead_time=0.05, gain=600)\n  end";
 
 fn follow(machine: &mut Machine, target: f64) {
-    machine.write_input(Input::DoubleRegister(24), &target.to_be_bytes());
+    machine.robot.write_input(Input::DoubleRegister(24), &target.to_be_bytes());
     machine.step();
 }
 
 /// A machine that runs [`FOLLOW`] at rest.
 fn following() -> Machine {
     let mut machine = machine(Series::Cb3);
-    machine.write_input(Input::DoubleRegister(24), &START_Q[5].to_be_bytes());
+    machine.robot.write_input(Input::DoubleRegister(24), &START_Q[5].to_be_bytes());
     machine.upload(&format!("def follow():\n{FOLLOW}\nend\n"));
     steps(&mut machine, START_CYCLES + 2);
     assert_eq!(machine.runtime_state(), RuntimeState::Playing);
@@ -398,7 +400,7 @@ fn a_moving_arm_slows_down_when_its_program_ends() {
         match end {
             "stop" => assert!(machine.stop_program()),
             "pause" => assert!(machine.pause()),
-            "watchdog" => machine.robot.set_watchdog(Input::IntRegister(0), 0.0, simulator::ur::machine::WatchdogAction::Stop),
+            "watchdog" => machine.robot.set_watchdog(Input::IntRegister(0), 0.0, simulator::ur::watchdog::WatchdogAction::Stop),
             "replaced" => machine.upload("def other():\n  sleep(10)\nend\n"),
             _ => machine.upload("def broken(:\nend\n"),
         }
@@ -501,36 +503,36 @@ fn ur_rtde_register_protocol_is_kept() {
         let mut q = START_Q;
         q[5] += 0.05;
         for (i, v) in q.iter().chain(&[0.0, 0.0, 1.0 / 30.0, 0.1, 300.0]).enumerate() {
-            machine.write_input(double(i), &v.to_be_bytes());
+            machine.robot.write_input(double(i), &v.to_be_bytes());
         }
-        machine.write_input(int(0), &11i32.to_be_bytes());
+        machine.robot.write_input(int(0), &11i32.to_be_bytes());
         steps(&mut machine, 100);
         assert_eq!(machine.robot.outputs.int[offset], 1, "streaming commands stay ready");
         assert!((machine.robot.servo.actual_q[5] - q[5]).abs() < 1e-3, "{}", machine.robot.servo.actual_q[5]);
         // servoStop(10): done when the arm stands, ready again when cleared.
-        machine.write_input(double(0), &10f64.to_be_bytes());
-        machine.write_input(int(0), &16i32.to_be_bytes());
+        machine.robot.write_input(double(0), &10f64.to_be_bytes());
+        machine.robot.write_input(int(0), &16i32.to_be_bytes());
         steps(&mut machine, 3);
         assert_eq!(machine.robot.outputs.int[offset], 2, "done");
-        machine.write_input(int(0), &0i32.to_be_bytes());
+        machine.robot.write_input(int(0), &0i32.to_be_bytes());
         steps(&mut machine, 1);
         assert_eq!(machine.robot.outputs.int[offset], 1, "ready again");
         // setWatchdog(10), then silence.
-        machine.write_input(int(0), &35i32.to_be_bytes());
+        machine.robot.write_input(int(0), &35i32.to_be_bytes());
         steps(&mut machine, 2);
         assert_eq!(machine.robot.outputs.int[offset], 2);
         steps(&mut machine, 20);
         assert_eq!(machine.runtime_state(), RuntimeState::Stopped, "watchdog");
         // 255 ends the program.
-        machine.write_input(int(0), &0i32.to_be_bytes());
+        machine.robot.write_input(int(0), &0i32.to_be_bytes());
         machine.upload(&ur_rtde_program(offset));
         steps(&mut machine, START_CYCLES + 2);
         assert_eq!(machine.runtime_state(), RuntimeState::Playing);
-        machine.write_input(int(0), &255i32.to_be_bytes());
+        machine.robot.write_input(int(0), &255i32.to_be_bytes());
         steps(&mut machine, 2);
         assert_eq!(machine.runtime_state(), RuntimeState::Stopped);
         // What is not simulated says so.
-        machine.write_input(int(0), &4i32.to_be_bytes());
+        machine.robot.write_input(int(0), &4i32.to_be_bytes());
         machine.upload(&ur_rtde_program(offset));
         steps(&mut machine, START_CYCLES + 2);
         assert!(machine.take_log().any(|l| l.text.contains("command 4 is not simulated")));
@@ -545,11 +547,11 @@ fn the_divider_is_rounded_down() {
         [(Series::Cb3, 30.0f64, 4), (Series::ESeries, 30.0, 16), (Series::Cb3, 125.0, 1), (Series::Cb3, 500.0, 1)]
     {
         let mut machine = machine(series);
-        let mut owners = Owners::default();
-        let mut session = Session::new(1);
+        let mut owners = InputOwners::default();
+        let mut session = RtdeSession::new(1);
         let setup = [&[0, 20, b'O'][..], &frequency.to_be_bytes(), b"timestamp"].concat();
         for request in [&[0, 5, b'V', 0, 2][..], &setup, &[0, 3, b'S']] {
-            let mut context = Context { machine: &mut machine, owners: &mut owners, hidden: &[], refuse_version_2: false };
+            let mut context = SessionContext { machine: &mut machine, owners: &mut owners, hidden: &[], refuse_version_2: false };
             session.feed(request, &mut context, &mut Vec::new()).unwrap();
         }
         let mut sent = Vec::new();
@@ -574,9 +576,10 @@ mod fuzz {
     //! Bounded random input; the cargo-fuzz targets in fuzz/ run the same functions for longer.
 
     use proptest::prelude::*;
-    use simulator::ur::client_interface::Assembler;
-    use simulator::ur::machine::{Machine, check_program};
-    use simulator::ur::rtde::{Context, Owners, Session};
+    use simulator::ur::Machine;
+    use simulator::ur::client_interface::ProgramAssembler;
+    use simulator::ur::program::check_program;
+    use simulator::ur::rtde::{InputOwners, RtdeSession, SessionContext};
     use simulator::ur::{Series, dashboard};
 
     /// Text out of the language's own words, which reaches deeper than random bytes.
@@ -743,11 +746,11 @@ mod fuzz {
 
     fn session(bytes: &[u8], cut: usize) -> Vec<u8> {
         let mut machine = Machine::new(Series::Cb3, Series::Cb3.default_version(), [0.0; 6]);
-        let mut owners = Owners::default();
-        let mut session = Session::new(1);
+        let mut owners = InputOwners::default();
+        let mut session = RtdeSession::new(1);
         let mut answers = Vec::new();
         for piece in bytes.chunks(cut.max(1)) {
-            let mut context = Context { machine: &mut machine, owners: &mut owners, hidden: &[], refuse_version_2: false };
+            let mut context = SessionContext { machine: &mut machine, owners: &mut owners, hidden: &[], refuse_version_2: false };
             if session.feed(piece, &mut context, &mut answers).is_err() {
                 break;
             }
@@ -811,7 +814,7 @@ mod fuzz {
         // Protects the line interfaces.
         #[test]
         fn line_interfaces_survive_random_bytes(bytes in prop::collection::vec(any::<u8>(), 0..300)) {
-            let mut assembler = Assembler::default();
+            let mut assembler = ProgramAssembler::default();
             let _ = assembler.feed(&bytes);
             let _ = assembler.finish();
             let mut machine = Machine::new(Series::ESeries, Series::ESeries.default_version(), [0.0; 6]);

@@ -2,6 +2,7 @@
 //! address and directory, all stopped and removed when the [`CellUnderTest`] is dropped.
 //!
 //! Only tests use it: it panics when something does not start, and says what the process printed.
+#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::too_many_lines)]
 #![forbid(unsafe_code)]
 
 use std::path::{Path, PathBuf};
@@ -10,19 +11,19 @@ use std::sync::atomic::{AtomicU32, Ordering};
 use std::time::{Duration, Instant};
 
 use serde_json::Value;
-use shared::agent::Selection;
+use shared::actions::{Selection, action_table};
 use shared::estimator::Calibration;
-use shared::policy::{InputScale, Mlp, action_table};
+use shared::mlp::{InputScale, Mlp};
 use shared::weights::{Estimator, Method, Origin, Weights};
 
 static NEXT: AtomicU32 = AtomicU32::new(0);
 
 /// Weights that tilt out by the same action every frame: they pour, though not well.
 pub fn steady_weights(action: usize) -> Weights {
-    let mut policy = Mlp::ZERO;
-    policy.b3[action] = 1.0;
+    let mut network = Mlp::ZERO;
+    network.b3[action] = 1.0;
     Weights {
-        policy,
+        network,
         actions_deg: action_table(),
         selection: Selection::Argmax,
         scale: InputScale::default(),

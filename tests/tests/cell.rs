@@ -1,4 +1,5 @@
 //! The processes together in the simulated cell: orders, endings, weight swaps, faults of processes.
+#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::too_many_lines)]
 
 use std::time::{Duration, Instant};
 
@@ -29,8 +30,8 @@ fn a_pour_is_followed_to_its_end_and_recorded() {
     assert_eq!(result["outcome"]["reason"], "done");
     let file = result["episode_file"].as_str().expect("the pour was recorded");
     let episode = shared::episode::Episode::read(std::path::Path::new(file)).expect("readable");
-    assert!(episode.complete && episode.frames.len() > 60, "{} frames", episode.frames.len());
-    assert!(episode.frames.iter().any(|f| f.area_px2 > 0.0), "the stream was seen");
+    assert!(episode.complete && episode.rows.len() > 60, "{} frames", episode.rows.len());
+    assert!(episode.rows.iter().any(|f| f.area_px2 > 0.0), "the stream was seen");
     let scale = cell.json("simulator", &["operator", "scale", "--json"]);
     assert!(scale["weight_g"].as_f64() > Some(5.0), "liquid really flowed: {scale}");
     let status = cell.wait_idle();
@@ -46,11 +47,11 @@ fn a_recording_becomes_an_episode() {
     let result = cell.json("rt-controller", &["record", "--lambda", "60", "--gamma", "0.8", "--weight", "33", "--json"]);
     let file = result["episode_file"].as_str().expect("recorded");
     let episode = shared::episode::Episode::read(std::path::Path::new(file)).expect("readable");
-    assert!(matches!(episode.kind, shared::episode::Kind::Recording(c) if c.lambda_deg == 60.0 && c.gamma_per_s2 == 0.8));
+    assert!(matches!(episode.kind, shared::episode::EpisodeKind::Recording(c) if c.lambda_deg == 60.0 && c.gamma_per_s2 == 0.8));
     assert_eq!((episode.weight_g, episode.complete), (Some(33.0), true));
-    let top = episode.frames.iter().map(|f| f.alpha_measured_deg).filter(|a| a.is_finite()).fold(0.0, f32::max);
+    let top = episode.rows.iter().map(|f| f.alpha_measured_deg).filter(|a| a.is_finite()).fold(0.0, f32::max);
     assert!((55.0..61.0).contains(&top), "the joint reached {top} degrees");
-    assert!(episode.info.images as usize >= episode.frames.len() * 9 / 10, "{} images", episode.info.images);
+    assert!(episode.info.images as usize >= episode.rows.len() * 9 / 10, "{} images", episode.info.images);
 }
 
 /// Protects a running lab: a new weight file is taken without restart, a bad one is refused and the old one stays; and an episode

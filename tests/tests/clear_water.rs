@@ -1,9 +1,9 @@
 //! Clear water as a cell's file writes it: rendered from its `[view]`, measured by the feature worker's extraction.
 
+use experiments::commands::evaluate_camera::{camera_config, image_config, measure_pours};
 use feature_worker::extract::{Extractor, Image};
 use shared::messages::PixelFormat;
 use simulator::camera::{Background, Renderer, Scene, View};
-use simulator::evaluate_camera::{camera_config, image_config, measure_pours};
 
 /// Protects the cell with clear water before a plain wall: `liquid_bgr = []` is clear water, dry frames are exactly 0, and the stream is
 /// measured to 15 % on every frame once it stands, while the wrist turns.

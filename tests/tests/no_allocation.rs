@@ -1,6 +1,7 @@
 //! The loop's ticks under an allocator that aborts the process when a tick allocates or frees: the second means, beside the
 //! counter in `status`, and another one's code. The ticks are those of `rt-controller run`, driven here as fast as the robot's
 //! answers allow; real shared memory, real sockets, the program on the simulated robot.
+#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::too_many_lines)]
 
 use std::process::Command;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering::Relaxed};
@@ -16,7 +17,7 @@ use shared::config::Config;
 use shared::ipc;
 use shared::messages::{Feature, LAYOUT_VERSION};
 use shared::os::now_ns;
-use simulator::ur::{Controller, Fault, Options};
+use simulator::ur::{Controller, ControllerOptions, Fault};
 use tests::steady_weights;
 
 #[global_allocator]
@@ -34,7 +35,7 @@ fn run(plant: bool) {
     let mut config = Config::parse(include_str!("../../config/sim.toml"), "config/sim.toml").expect("valid");
     config.cell.name.clone_from(&name);
     config.robot.address = address;
-    let robot = Controller::start(Options::new(address)).expect("free");
+    let robot = Controller::start(ControllerOptions::new(address)).expect("free");
     let (exchange, note) = (Exchange::default(), RobotNote::default());
     let (stop, connections) = (AtomicBool::new(false), AtomicU64::new(0));
     let ended = AtomicU64::new(0);

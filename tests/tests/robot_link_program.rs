@@ -1,14 +1,14 @@
 //! The program on the robot (`rt-controller/robot/pour.script`) on the simulated controller, control cycle by control cycle.
 //!
 //! No sockets and no clock: what is asserted here is exact and holds on every machine.
+#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::too_many_lines)]
 
 use rand::{RngExt, SeedableRng};
 use rt_controller::link::{LinkOptions, Mode, ProgramState, TiltJoint, program};
 use shared::config::Joint;
 use shared::limits::{Limiter, Limits};
-use simulator::ur::Series;
-use simulator::ur::machine::{Machine, RuntimeState, SafetyMode};
 use simulator::ur::variables::Input;
+use simulator::ur::{Machine, RuntimeState, SafetyMode, Series};
 
 const RUN: i32 = 4711;
 /// Where the other five joints stand, rad; wrist 3 is at its start angle.
@@ -104,7 +104,7 @@ impl Robot {
 
     fn send_raw(&mut self, sequence: i32, mode: i32, joint_rad: f64) {
         let base = self.options.register_base;
-        let mut write = |name: String, bytes: &[u8]| self.machine.write_input(Input::parse(&name).unwrap(), bytes);
+        let mut write = |name: String, bytes: &[u8]| self.machine.robot.write_input(Input::parse(&name).unwrap(), bytes);
         write(format!("input_int_register_{base}"), &sequence.to_be_bytes());
         write(format!("input_int_register_{}", base + 1), &mode.to_be_bytes());
         write(format!("input_double_register_{base}"), &joint_rad.to_be_bytes());
@@ -225,7 +225,7 @@ fn a_return_is_never_taken_back() {
 fn a_slow_slider_does_not_bring_the_watchdog_first() {
     let mut robot = Robot::ready(Series::Cb3);
     robot.stream(1.6, &mut limiter(), |_| 100.0);
-    let slider = |robot: &mut Robot, name: &str, bytes: &[u8]| robot.machine.write_input(Input::parse(name).unwrap(), bytes);
+    let slider = |robot: &mut Robot, name: &str, bytes: &[u8]| robot.machine.robot.write_input(Input::parse(name).unwrap(), bytes);
     slider(&mut robot, "speed_slider_mask", &1u32.to_be_bytes());
     slider(&mut robot, "speed_slider_fraction", &0.34f64.to_be_bytes());
     robot.pass(3.0 * (100.0 / 60.0 + 0.7));

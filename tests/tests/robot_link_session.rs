@@ -1,4 +1,5 @@
 //! The robot link over real sockets against the simulated controller: both generations, reconnecting, latency.
+#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::too_many_lines)]
 
 use std::net::{IpAddr, Ipv4Addr};
 use std::thread;
@@ -8,11 +9,11 @@ use rt_controller::link::{LinkError, LinkOptions, Mode, ProgramState, Session, T
 use shared::config::Joint;
 use shared::limits::{Limiter, Limits};
 use shared::os::now_ns;
-use simulator::ur::{Controller, Fault, Handle, Options, Series};
+use simulator::ur::{Controller, ControllerOptions, Fault, Series};
 
-fn cell(last: u8, series: Series) -> (Handle, LinkOptions) {
+fn cell(last: u8, series: Series) -> (Controller, LinkOptions) {
     let address = IpAddr::V4(Ipv4Addr::new(127, 43, 0, last));
-    let robot = Controller::start(Options { series, ..Options::new(address) }).unwrap();
+    let robot = Controller::start(ControllerOptions { series, ..ControllerOptions::new(address) }).unwrap();
     let options = LinkOptions {
         address,
         tilt: TiltJoint { joint: Joint::Wrist3, start_deg: 0.0, direction: 1.0 },

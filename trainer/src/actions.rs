@@ -2,7 +2,7 @@
 //!
 //! Pure, any thread; nothing here allocates or fails.
 
-use shared::policy::{ACTIONS, action_table, nearest_action};
+use shared::actions::{ACTIONS, action_table, nearest_action};
 
 /// Number of the two actions' backward one among the network's outputs: the first.
 const BACKWARD: usize = 0;

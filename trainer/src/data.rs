@@ -135,7 +135,7 @@ impl TrainingEpisode {
 
     fn from_episode(e: &Episode) -> Self {
         let mut own = Self::empty(&e.name, frame_rate_hz(e));
-        for f in &e.frames {
+        for f in &e.rows {
             own.push(f.t_s, f64::from(f.alpha_commanded_deg), f64::from(f.alpha_measured_deg), f64::from(f.area_px2));
         }
         own.weight_g = e.weight_g.unwrap_or(f64::NAN);
@@ -145,7 +145,7 @@ impl TrainingEpisode {
 
 /// Frames a second of an episode, from the median interval.
 fn frame_rate_hz(e: &Episode) -> f64 {
-    let mut steps: Vec<f64> = e.frames.windows(2).map(|w| w[1].t_s - w[0].t_s).filter(|s| *s > 0.0).collect();
+    let mut steps: Vec<f64> = e.rows.windows(2).map(|w| w[1].t_s - w[0].t_s).filter(|s| *s > 0.0).collect();
     steps.sort_by(f64::total_cmp);
     let median = steps.get(steps.len() / 2).copied().unwrap_or(1.0 / 30.0);
     (1.0 / median * 10.0).round() / 10.0
@@ -176,7 +176,7 @@ impl Source {
                 episodes.extend(episode::read_table(features, scale)?);
             }
         } else {
-            for file in episode::find(&self.episodes)? {
+            for file in episode::find_episodes(&self.episodes)? {
                 episodes.push(Episode::read(&file)?);
             }
         }

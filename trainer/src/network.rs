@@ -6,7 +6,8 @@
 use rand::RngExt;
 use rand_pcg::Pcg64Mcg;
 use rayon::prelude::*;
-use shared::policy::{ACTIONS, HIDDEN, INPUTS, Mlp};
+use shared::actions::ACTIONS;
+use shared::mlp::{HIDDEN, INPUTS, Mlp};
 
 /// Adam steps between two losses that a training reports.
 pub const REPORT_EVERY: usize = 50;

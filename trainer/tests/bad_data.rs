@@ -1,4 +1,5 @@
 //! What `trainer check` finds in recordings, with the real program and real files: each fault has its own line.
+#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::too_many_lines)]
 
 mod common;
 
@@ -7,8 +8,8 @@ use std::process::{Command, Output};
 use std::time::UNIX_EPOCH;
 
 use shared::config::Config;
-use shared::control::Curve;
-use shared::episode::{End, EpisodeWriter, Kind, Sample, Start, set_weight};
+use shared::episode::{EpisodeEnd, EpisodeKind, EpisodeStart, EpisodeWriter, FrameRow, set_weight};
+use shared::gaussian_curve::Curve;
 use shared::messages::{Doubt, Feature, LAYOUT_VERSION, Telemetry};
 
 const FRAME_NS: u64 = 33_333_333;
@@ -48,8 +49,8 @@ fn recordings(n: usize) -> Vec<Recording> {
 
 fn write(directory: &Path, recording: &Recording) -> PathBuf {
     let config = Config::read(&Path::new(env!("CARGO_MANIFEST_DIR")).join("../config/sim.toml")).unwrap();
-    let kind = Kind::Recording(Curve { lambda_deg: 60.0, gamma_per_s2: 0.3, beta_s: 5.0 });
-    let start = Start { episode: 1, kind, started_at_ns: FRAME_NS, wall_clock: UNIX_EPOCH, config: &config, weights: "" };
+    let kind = EpisodeKind::Recording(Curve { lambda_deg: 60.0, gamma_per_s2: 0.3, beta_s: 5.0 });
+    let start = EpisodeStart { episode: 1, kind, started_at_ns: FRAME_NS, wall_clock: UNIX_EPOCH, config: &config, weights: "" };
     let mut writer = EpisodeWriter::create(directory, &start).unwrap();
     for (k, row) in recording.rows.iter().enumerate() {
         let tick =
@@ -63,7 +64,7 @@ fn write(directory: &Path, recording: &Recording) -> PathBuf {
             doubt: row.doubt as u32,
             ..Default::default()
         };
-        let sample = Sample { feature: &feature, alpha_commanded_deg: row.alpha_deg, alpha_measured_deg: f32::NAN, image: None };
+        let sample = FrameRow { feature: &feature, alpha_commanded_deg: row.alpha_deg, alpha_measured_deg: f32::NAN, image: None };
         writer.frame(&sample).unwrap();
     }
     let path = writer.path().to_path_buf();
@@ -71,7 +72,7 @@ fn write(directory: &Path, recording: &Recording) -> PathBuf {
         writer.flush().unwrap();
         return path;
     }
-    writer.finish(&End { complete: true, reason: "over", disordered_frames: 0 }).unwrap();
+    writer.finish(&EpisodeEnd { complete: true, reason: "over", disordered_frames: 0 }).unwrap();
     if let Some(weight_g) = recording.weight_g {
         // A damaged file takes no weight.
         let _ = set_weight(&path, weight_g);

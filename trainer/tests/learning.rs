@@ -1,11 +1,12 @@
 //! Tests of the learning, on episodes that the flow model made itself.
+#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::too_many_lines)]
 
 mod common;
 
 use common::{CAMERA, episodes, episodes_of};
 use rand::SeedableRng;
 use rand_pcg::Pcg64Mcg;
-use shared::agent::{Agent, Frame};
+use shared::agent::{Agent, Observation};
 use shared::estimator::Calibration;
 use shared::estimator::flow::{CommandHistory, FlowModel, FlowState, FlowTables};
 use trainer::actions::Actions;
@@ -113,7 +114,7 @@ fn pours(method: MethodName, n: usize, within: f64) {
             poured += out;
             let area = (out / CAMERA.0).powf(1.0 / CAMERA.1);
             let area_px2 = Some(if area < 8.0 { 0.0 } else { area as f32 });
-            let decision = agent.step(Frame { area_px2, alpha_deg: alpha, alpha_now_deg: alpha });
+            let decision = agent.step(Observation { area_px2, alpha_deg: alpha, alpha_now_deg: alpha });
             finished |= decision.finished;
             alpha = if finished { (alpha - 2.0).max(0.0) } else { (alpha + decision.dalpha_deg).clamp(0.0, 110.0) };
         }
@@ -229,7 +230,7 @@ fn every_method_gives_valid_weights() {
             if actions == 2 {
                 let mut agent = Agent::new(&weights);
                 agent.start(50.0);
-                let decision = agent.step(Frame { area_px2: Some(0.0), alpha_deg: 0.0, alpha_now_deg: 0.0 });
+                let decision = agent.step(Observation { area_px2: Some(0.0), alpha_deg: 0.0, alpha_now_deg: 0.0 });
                 assert_eq!(decision.dalpha_deg.abs(), 1.0, "{method:?}");
             }
         }

@@ -1,63 +1,48 @@
 //! Writes episodes as one data set in the layout of LeRobot v3.0 (info.json, stats.json, Parquet tables, MP4 videos).
 //!
-//! What a policy sees is `observation.state` (measured alpha, V_e; NaN where unknown) and `observation.images.camera`; what
-//! was done is `action`, the commanded alpha. LeRobot's clock is exact, `frame_index / fps`: frames that were lost are rows
-//! with the image of the frame before. One video an episode. The weight is an extra column of the episodes' table.
-//! Allocates; holds the rows of all episodes, never their images.
+//! What a policy sees is `observation.state` (measured alpha and V_e; NaN where unknown) and `observation.images.camera`. What was done is
+//! `action`, the commanded alpha. LeRobot's clock is exact, `frame_index / fps`, so a lost frame is a row with the image of the frame
+//! before. Each episode has its own video. The weight is an extra column of the episodes' table. Allocates; holds the rows of all
+//! episodes, but only one image at a time. Nothing that exists is overwritten.
 
-use std::fs::{self, OpenOptions};
+use std::fs;
 use std::path::{Path, PathBuf};
-use std::sync::Arc;
 
 use indicatif::ProgressBar;
-use opencv::core::{self, Mat, MatTraitConst, MatTraitConstManual, Vector};
-use opencv::imgcodecs;
-use parquet::basic::Compression;
-use parquet::data_type::{ByteArray, ByteArrayType, DoubleType, FloatType, Int64Type};
 use parquet::file::metadata::KeyValue;
-use parquet::file::properties::WriterProperties;
-use parquet::file::writer::SerializedFileWriter;
-use parquet::schema::parser::parse_message_type;
 use serde_json::{Value, json};
-use shared::episode::{Episode, Image, Kind};
+use shared::episode::{Episode, EpisodeKind};
 
-use super::export::{ExportError, Video, frames_with_images, rate_hz, write_error};
+use super::output::{ExportError, make_parent, write_error};
+use super::video::{USUAL_RATE_HZ, Video, for_each_row_with_image, mean_rate_hz};
 
+mod parquet_table;
+mod statistics;
+
+use parquet_table::{Column, write_parquet};
+use statistics::{ImageStatistics, Moments};
+
+/// Name of the images' column. LeRobot wants the prefix `observation.images`.
 const CAMERA: &str = "observation.images.camera";
-/// LeRobot's `chunks_size`: files a directory.
+/// Files in one directory, LeRobot's `chunks_size`. LeRobot's own default.
 const FILES_A_CHUNK: usize = 1000;
-/// Every so many-th image counts for the images' statistics.
+/// One of so many images enters the images' statistics. Chosen by hand: neighbouring images are nearly the same.
 const IMAGE_STEP: usize = 10;
 
-/// One column of a table; all have the same number of rows.
-enum Column {
-    Int(Vec<i64>),
-    Float(Vec<f32>),
-    Double(Vec<f64>),
-    Text(Vec<String>),
-    /// Rows of `width` values each.
-    FloatList {
-        width: usize,
-        values: Vec<f32>,
-    },
-    /// Rows of one text each.
-    TextList(Vec<String>),
-}
-
-/// Writes the data set into the new directory `root`.
-pub(super) fn write(files: &[PathBuf], episodes: &[Episode], root: &Path, bar: &ProgressBar) -> Result<(), ExportError> {
+/// Writes the data set of `episodes`, which were read from `files`, into the new directory `root`. Each image moves `bar` on by one.
+pub fn write(files: &[PathBuf], episodes: &[Episode], root: &Path, bar: &ProgressBar) -> Result<(), ExportError> {
     if root.join("meta").exists() {
         return Err(write_error(root, "holds a data set already; name another directory"));
     }
-    let fps = episodes.first().map_or(30.0, rate_hz).round();
+    let fps = episodes.first().map_or(USUAL_RATE_HZ, mean_rate_hz).round();
     let mut tasks: Vec<String> = Vec::new();
-    let mut rows = Rows::default();
-    let mut list = List::default();
-    let mut pictures = Pictures::default();
+    let mut rows = DataTable::default();
+    let mut list = EpisodeTable::default();
+    let mut images = ImageStatistics::new();
     for (number, (file, episode)) in files.iter().zip(episodes).enumerate() {
         let task = match episode.kind {
-            Kind::Pour { goal_ml } => format!("pour {goal_ml} ml"),
-            Kind::Recording(_) | Kind::Table => "tilt along a curve and back".into(),
+            EpisodeKind::Pour { goal_ml } => format!("pour {goal_ml} ml"),
+            EpisodeKind::Recording(_) | EpisodeKind::Table => "tilt along a curve and back".into(),
         };
         let task_index = tasks.iter().position(|t| *t == task).unwrap_or_else(|| {
             tasks.push(task.clone());
@@ -68,9 +53,9 @@ pub(super) fn write(files: &[PathBuf], episodes: &[Episode], root: &Path, bar: &
         make_parent(&path)?;
         let mut video = Video::new(&path, fps);
         let mut shown = 0;
-        frames_with_images(file, episode, |image| {
+        for_each_row_with_image(file, episode, |image| {
             if shown % IMAGE_STEP == 0 {
-                pictures.add(image).map_err(|e| write_error(&path, e.message))?;
+                images.add(image).map_err(|e| write_error(&path, e.message))?;
             }
             shown += 1;
             bar.inc(1);
@@ -82,12 +67,18 @@ pub(super) fn write(files: &[PathBuf], episodes: &[Episode], root: &Path, bar: &
         list.add(episode, task, (from, rows.index.len()), (chunk, index), fps);
     }
 
-    let stats = rows.stats(&pictures);
-    let info = info(episodes.len(), rows.index.len(), tasks.len(), fps, &pictures);
+    let stats = rows.stats(&images);
+    let info = info(episodes.len(), rows.index.len(), tasks.len(), fps, &images);
     write_parquet(&root.join("data/chunk-000/file-000.parquet"), rows.columns(), None)?;
     write_parquet(&root.join("meta/episodes/chunk-000/file-000.parquet"), list.columns(), None)?;
+    write_tasks(&root.join("meta/tasks.parquet"), tasks)?;
+    write_json(&root.join("meta/stats.json"), &stats)?;
+    write_json(&root.join("meta/info.json"), &info)
+}
+
+/// Writes the table of tasks. LeRobot reads this one with pandas and expects the task as the index.
+fn write_tasks(path: &Path, tasks: Vec<String>) -> Result<(), ExportError> {
     let numbers = (0..tasks.len() as i64).collect();
-    // LeRobot reads this one with pandas and expects the task as the index.
     let pandas = json!({
         "index_columns": ["task"],
         "column_indexes": [{ "name": null, "field_name": null, "pandas_type": "unicode", "numpy_type": "object", "metadata": null }],
@@ -98,12 +89,11 @@ pub(super) fn write(files: &[PathBuf], episodes: &[Episode], root: &Path, bar: &
         "pandas_version": "2.0.0",
     });
     let columns = vec![("task_index".into(), Column::Int(numbers)), ("task".into(), Column::Text(tasks))];
-    write_parquet(&root.join("meta/tasks.parquet"), columns, Some(KeyValue::new("pandas".into(), pandas.to_string())))?;
-    write_json(&root.join("meta/stats.json"), &stats)?;
-    write_json(&root.join("meta/info.json"), &info)
+    write_parquet(path, columns, Some(KeyValue::new("pandas".into(), pandas.to_string())))
 }
 
-fn info(episodes: usize, frames: usize, tasks: usize, fps: f64, pictures: &Pictures) -> Value {
+/// The description of the data set, `meta/info.json`.
+fn info(episodes: usize, frames: usize, tasks: usize, fps: f64, images: &ImageStatistics) -> Value {
     let one = |kind: &str| json!({ "dtype": kind, "shape": [1], "names": null });
     json!({
         "codebase_version": "v3.0",
@@ -123,10 +113,10 @@ fn info(episodes: usize, frames: usize, tasks: usize, fps: f64, pictures: &Pictu
             "action": { "dtype": "float32", "shape": [1], "names": ["alpha_commanded_deg"] },
             CAMERA: {
                 "dtype": "video",
-                "shape": [pictures.height, pictures.width, 3],
+                "shape": [images.height_px, images.width_px, 3],
                 "names": ["height", "width", "channels"],
                 "info": {
-                    "video.height": pictures.height, "video.width": pictures.width, "video.codec": "h264",
+                    "video.height": images.height_px, "video.width": images.width_px, "video.codec": "h264",
                     "video.pix_fmt": "yuv420p", "video.is_depth_map": false, "video.fps": fps as i64, "video.channels": 3,
                     "has_audio": false,
                 },
@@ -140,9 +130,9 @@ fn info(episodes: usize, frames: usize, tasks: usize, fps: f64, pictures: &Pictu
     })
 }
 
-/// The table `data`: one row a frame.
+/// The table `data`: one row for each row of each episode.
 #[derive(Default)]
-struct Rows {
+struct DataTable {
     state: Vec<f32>,
     action: Vec<f32>,
     timestamp: Vec<f32>,
@@ -152,11 +142,11 @@ struct Rows {
     task_index: Vec<i64>,
 }
 
-impl Rows {
+impl DataTable {
     fn add(&mut self, episode: &Episode, number: usize, task: usize, fps: f64) {
-        for (n, frame) in episode.frames.iter().enumerate() {
-            self.state.extend([frame.alpha_measured_deg, frame.area_px2]);
-            self.action.push(frame.alpha_commanded_deg);
+        for (n, row) in episode.rows.iter().enumerate() {
+            self.state.extend([row.alpha_measured_deg, row.area_px2]);
+            self.action.push(row.alpha_commanded_deg);
             self.timestamp.push((n as f64 / fps) as f32);
             self.frame_index.push(n as i64);
             self.episode_index.push(number as i64);
@@ -165,7 +155,7 @@ impl Rows {
         }
     }
 
-    fn stats(&self, pictures: &Pictures) -> Value {
+    fn stats(&self, images: &ImageStatistics) -> Value {
         let of = |values: &mut dyn Iterator<Item = f64>| Moments::of(values);
         let ints = |values: &[i64]| of(&mut values.iter().map(|v| *v as f64)).json();
         let lane = |lane: usize| of(&mut self.state.iter().skip(lane).step_by(2).map(|v| f64::from(*v)));
@@ -177,7 +167,7 @@ impl Rows {
             "episode_index": ints(&self.episode_index),
             "index": ints(&self.index),
             "task_index": ints(&self.task_index),
-            CAMERA: pictures.json(),
+            CAMERA: images.json(),
         })
     }
 
@@ -194,9 +184,9 @@ impl Rows {
     }
 }
 
-/// The table `meta/episodes`: one row an episode.
+/// The table `meta/episodes`: one row for each episode.
 #[derive(Default)]
-struct List {
+struct EpisodeTable {
     tasks: Vec<String>,
     length: Vec<i64>,
     from: Vec<i64>,
@@ -207,7 +197,7 @@ struct List {
     weight_g: Vec<f64>,
 }
 
-impl List {
+impl EpisodeTable {
     fn add(&mut self, episode: &Episode, task: String, rows: (usize, usize), video: (usize, usize), fps: f64) {
         self.tasks.push(task);
         self.length.push((rows.1 - rows.0) as i64);
@@ -241,156 +231,7 @@ impl List {
     }
 }
 
-/// Statistics of one number over all rows where it is known.
-#[derive(Clone, Copy)]
-struct Moments {
-    min: f64,
-    max: f64,
-    sum: f64,
-    squares: f64,
-    count: u64,
-}
-
-impl Moments {
-    const EMPTY: Self = Self { min: f64::INFINITY, max: f64::NEG_INFINITY, sum: 0.0, squares: 0.0, count: 0 };
-
-    fn of(values: &mut dyn Iterator<Item = f64>) -> Self {
-        values.filter(|v| v.is_finite()).fold(Self::EMPTY, |m, v| Self {
-            min: m.min.min(v),
-            max: m.max.max(v),
-            sum: m.sum + v,
-            squares: m.squares + v * v,
-            count: m.count + 1,
-        })
-    }
-
-    fn mean(&self) -> f64 {
-        if self.count == 0 { 0.0 } else { self.sum / self.count as f64 }
-    }
-
-    fn std(&self) -> f64 {
-        if self.count == 0 { 0.0 } else { (self.squares / self.count as f64 - self.mean().powi(2)).max(0.0).sqrt() }
-    }
-
-    fn json(&self) -> Value {
-        Self::columns(&[*self])
-    }
-
-    fn columns(all: &[Self]) -> Value {
-        let each = |f: fn(&Self) -> f64| all.iter().map(|m| if m.count == 0 { 0.0 } else { f(m) }).collect::<Vec<_>>();
-        json!({
-            "min": each(|m| m.min),
-            "max": each(|m| m.max),
-            "mean": each(Self::mean),
-            "std": each(Self::std),
-            "count": [all.iter().map(|m| m.count).max().unwrap_or(0)],
-        })
-    }
-}
-
-/// Size and colour statistics of the images, red, green and blue from 0 to 1.
-struct Pictures {
-    width: i32,
-    height: i32,
-    channels: [Moments; 3],
-}
-
-impl Default for Pictures {
-    fn default() -> Self {
-        Self { width: 0, height: 0, channels: [Moments::EMPTY; 3] }
-    }
-}
-
-impl Pictures {
-    fn add(&mut self, image: &Image) -> opencv::Result<()> {
-        let bytes: Vector<u8> = Vector::from_slice(&image.data);
-        let picture: Mat = imgcodecs::imdecode(&bytes, imgcodecs::IMREAD_COLOR)?;
-        (self.width, self.height) = (picture.cols(), picture.rows());
-        let mut planes: Vector<Mat> = Vector::new();
-        core::split(&picture, &mut planes)?;
-        // OpenCV's order is blue, green, red.
-        for (channel, plane) in self.channels.iter_mut().rev().zip(planes) {
-            for value in plane.data_bytes()? {
-                let v = f64::from(*value) / 255.0;
-                channel.min = channel.min.min(v);
-                channel.max = channel.max.max(v);
-                channel.sum += v;
-                channel.squares += v * v;
-            }
-            channel.count += plane.total() as u64;
-        }
-        Ok(())
-    }
-
-    fn json(&self) -> Value {
-        let each =
-            |f: &dyn Fn(&Moments) -> f64| self.channels.iter().map(|m| [[if m.count == 0 { 0.0 } else { f(m) }]]).collect::<Vec<_>>();
-        let pixels = self.width as u64 * self.height as u64;
-        json!({
-            "min": each(&|m| m.min),
-            "max": each(&|m| m.max),
-            "mean": each(&Moments::mean),
-            "std": each(&Moments::std),
-            "count": [self.channels[0].count.checked_div(pixels).unwrap_or(0)],
-        })
-    }
-}
-
-fn make_parent(path: &Path) -> Result<(), ExportError> {
-    let parent = path.parent().unwrap_or(path);
-    fs::create_dir_all(parent).map_err(|e| write_error(parent, e))
-}
-
 fn write_json(path: &Path, value: &Value) -> Result<(), ExportError> {
     make_parent(path)?;
     fs::write(path, format!("{value:#}\n")).map_err(|e| write_error(path, e))
-}
-
-fn write_parquet(path: &Path, columns: Vec<(String, Column)>, note: Option<KeyValue>) -> Result<(), ExportError> {
-    make_parent(path)?;
-    let file = OpenOptions::new().write(true).create_new(true).open(path).map_err(|e| write_error(path, e))?;
-    table(file, columns, note).map_err(|e| write_error(path, e))
-}
-
-/// One table as a Parquet file with one row group.
-fn table(file: fs::File, columns: Vec<(String, Column)>, note: Option<KeyValue>) -> parquet::errors::Result<()> {
-    let mut message = "message schema {\n".to_string();
-    for (name, column) in &columns {
-        message += &match column {
-            Column::Int(_) => format!("required int64 {name};\n"),
-            Column::Float(_) => format!("required float {name};\n"),
-            Column::Double(_) => format!("required double {name};\n"),
-            Column::Text(_) => format!("required binary {name} (UTF8);\n"),
-            Column::FloatList { .. } => format!("required group {name} (LIST) {{ repeated group list {{ required float element; }} }}\n"),
-            Column::TextList(_) => {
-                format!("required group {name} (LIST) {{ repeated group list {{ required binary element (UTF8); }} }}\n")
-            }
-        };
-    }
-    let schema = Arc::new(parse_message_type(&(message + "}"))?);
-    let properties = WriterProperties::builder().set_compression(Compression::UNCOMPRESSED).set_key_value_metadata(note.map(|n| vec![n]));
-    let mut writer = SerializedFileWriter::new(file, schema, Arc::new(properties.build()))?;
-    let mut group = writer.next_row_group()?;
-    let bytes = |texts: Vec<String>| texts.into_iter().map(|t| ByteArray::from(t.into_bytes())).collect::<Vec<_>>();
-    for (_, column) in columns {
-        let Some(mut writer) = group.next_column()? else { break };
-        match column {
-            Column::Int(values) => writer.typed::<Int64Type>().write_batch(&values, None, None)?,
-            Column::Float(values) => writer.typed::<FloatType>().write_batch(&values, None, None)?,
-            Column::Double(values) => writer.typed::<DoubleType>().write_batch(&values, None, None)?,
-            Column::Text(texts) => writer.typed::<ByteArrayType>().write_batch(&bytes(texts), None, None)?,
-            // Repetition level 0 begins a row; definition level 1 says that the value is there.
-            Column::FloatList { width, values } => {
-                let repetition: Vec<i16> = (0..values.len()).map(|i| i16::from(i % width != 0)).collect();
-                writer.typed::<FloatType>().write_batch(&values, Some(&vec![1; values.len()]), Some(&repetition))?
-            }
-            Column::TextList(texts) => {
-                let n = texts.len();
-                writer.typed::<ByteArrayType>().write_batch(&bytes(texts), Some(&vec![1; n]), Some(&vec![0; n]))?
-            }
-        };
-        writer.close()?;
-    }
-    group.close()?;
-    writer.close().map(drop)
 }

@@ -1,4 +1,4 @@
-//! The simulated controller without its sockets, taken in by path: a fuzz build needs neither OpenCV nor iceoryx2.
+//! The simulated controller without its sockets, taken in by path, because a fuzz build needs no OpenCV and no thread.
 
 #[path = "../../../simulator/src/ur/client_interface.rs"]
 pub mod client_interface;
@@ -8,8 +8,20 @@ pub mod dashboard;
 pub mod fault;
 #[path = "../../../simulator/src/ur/kinematics.rs"]
 pub mod kinematics;
+#[path = "../../../simulator/src/ur/log.rs"]
+pub mod log;
 #[path = "../../../simulator/src/ur/machine.rs"]
 pub mod machine;
+#[path = "../../../simulator/src/ur/outputs.rs"]
+pub mod outputs;
+#[path = "../../../simulator/src/ur/power.rs"]
+pub mod power;
+#[path = "../../../simulator/src/ur/program.rs"]
+pub mod program;
+#[path = "../../../simulator/src/ur/registers.rs"]
+pub mod registers;
+#[path = "../../../simulator/src/ur/robot.rs"]
+pub mod robot;
 #[path = "../../../simulator/src/ur/rtde.rs"]
 pub mod rtde;
 #[path = "../../../simulator/src/ur/script/mod.rs"]
@@ -20,6 +32,8 @@ pub mod servo;
 pub mod ur_rtde;
 #[path = "../../../simulator/src/ur/variables.rs"]
 pub mod variables;
+#[path = "../../../simulator/src/ur/watchdog.rs"]
+pub mod watchdog;
 
 pub use fault::Fault;
 pub use variables::Series;

@@ -13,9 +13,10 @@ use mcap::records::{Record, op};
 use mcap::sans_io::linear_reader::{LinearReadEvent, LinearReader, LinearReaderOptions};
 use prost::Message as _;
 
-use super::rows::{self, CompressedImage, SampleRow, TelemetryRow};
-use super::{AlphaTrack, Episode, Frame, Info, Kind};
-use crate::control::Curve;
+use super::format::{self, CompressedImage, EpisodeRowJson, TelemetryJson};
+use super::{Episode, EpisodeInfo, EpisodeKind, EpisodeRow};
+use crate::alpha_track::AlphaTrack;
+use crate::gaussian_curve::Curve;
 use crate::messages::Doubt;
 
 /// Largest record or chunk that is believed, bytes.
@@ -57,7 +58,7 @@ pub enum EpisodeError {
 }
 
 /// What came next in a file.
-pub(super) enum Next<T> {
+pub(super) enum NextRecord<T> {
     /// What the visitor took out of a record.
     Item(T),
     /// The file's regular end.
@@ -92,12 +93,12 @@ impl Records {
     }
 
     /// Shows the records of the data section to `visit`, one by one, until it takes something out of one.
-    pub(super) fn next<T>(&mut self, mut visit: impl FnMut(Record) -> Result<Option<T>, String>) -> Result<Next<T>, EpisodeError> {
+    pub(super) fn next<T>(&mut self, mut visit: impl FnMut(Record) -> Result<Option<T>, String>) -> Result<NextRecord<T>, EpisodeError> {
         let damaged = |what: String| EpisodeError::Damaged { file: self.name.clone(), what };
         loop {
             match self.reader.next_event() {
-                None => return Ok(Next::End),
-                Some(Err(McapError::UnexpectedEof)) => return Ok(Next::Cut),
+                None => return Ok(NextRecord::End),
+                Some(Err(McapError::UnexpectedEof)) => return Ok(NextRecord::Cut),
                 Some(Err(McapError::BadMagic)) if !self.data_ended => {
                     return Err(EpisodeError::NotAnEpisode { file: self.name.clone(), what: "this is no MCAP file".into() });
                 }
@@ -109,7 +110,7 @@ impl Records {
                     self.reader.notify_read(got);
                 }
                 // After a power failure the end of a file can be zeros.
-                Some(Ok(LinearReadEvent::Record { opcode: 0, .. })) => return Ok(Next::Cut),
+                Some(Ok(LinearReadEvent::Record { opcode: 0, .. })) => return Ok(NextRecord::Cut),
                 Some(Ok(LinearReadEvent::Record { opcode, data })) => {
                     if opcode == op::DATA_END {
                         self.data_ended = true;
@@ -119,7 +120,7 @@ impl Records {
                     }
                     let record = mcap::parse_record(opcode, data).map_err(|e| damaged(e.to_string()))?;
                     if let Some(item) = visit(record).map_err(damaged)? {
-                        return Ok(Next::Item(item));
+                        return Ok(NextRecord::Item(item));
                     }
                 }
             }
@@ -131,8 +132,8 @@ impl Records {
 #[derive(Default)]
 struct Contents {
     topics: BTreeMap<u16, String>,
-    samples: Vec<SampleRow>,
-    ticks: Vec<TelemetryRow>,
+    samples: Vec<EpisodeRowJson>,
+    ticks: Vec<TelemetryJson>,
     images: u64,
     metadata: BTreeMap<String, BTreeMap<String, String>>,
 }
@@ -147,9 +148,9 @@ impl Contents {
                 self.metadata.insert(m.name, m.metadata);
             }
             Record::Message { header, data } => match self.topics.get(&header.channel_id).map(String::as_str) {
-                Some(rows::IMAGE_TOPIC) => self.images += 1,
-                Some(rows::SAMPLE_TOPIC) => self.samples.push(parse(rows::SAMPLE_TOPIC, &data)?),
-                Some(rows::TELEMETRY_TOPIC) => self.ticks.push(parse(rows::TELEMETRY_TOPIC, &data)?),
+                Some(format::IMAGE_TOPIC) => self.images += 1,
+                Some(format::ROW_TOPIC) => self.samples.push(parse(format::ROW_TOPIC, &data)?),
+                Some(format::TELEMETRY_TOPIC) => self.ticks.push(parse(format::TELEMETRY_TOPIC, &data)?),
                 _ => {}
             },
             _ => {}
@@ -166,42 +167,41 @@ impl Contents {
         text.parse().map_err(|_| format!("metadata '{record}': {key} = '{text}' is not a number"))
     }
 
-    fn kind(&self) -> Result<Kind, String> {
-        match self.text(rows::META_EPISODE, "kind") {
-            "recording" => Ok(Kind::Recording(Curve {
-                lambda_deg: self.number(rows::META_EPISODE, "lambda_deg")?,
-                gamma_per_s2: self.number(rows::META_EPISODE, "gamma_per_s2")?,
-                beta_s: self.number(rows::META_EPISODE, "beta_s")?,
+    fn kind(&self) -> Result<EpisodeKind, String> {
+        match self.text(format::META_EPISODE, "kind") {
+            "recording" => Ok(EpisodeKind::Recording(Curve {
+                lambda_deg: self.number(format::META_EPISODE, "lambda_deg")?,
+                gamma_per_s2: self.number(format::META_EPISODE, "gamma_per_s2")?,
+                beta_s: self.number(format::META_EPISODE, "beta_s")?,
             })),
-            "pour" => Ok(Kind::Pour { goal_ml: self.number(rows::META_EPISODE, "goal_ml")? }),
-            "table" => Ok(Kind::Table),
+            "pour" => Ok(EpisodeKind::Pour { goal_ml: self.number(format::META_EPISODE, "goal_ml")? }),
+            "table" => Ok(EpisodeKind::Table),
             other => Err(format!("metadata 'episode': kind = '{other}' is none of recording, pour, table")),
         }
     }
 
     fn weight_g(&self) -> Result<Option<f64>, String> {
-        if !self.metadata.contains_key(rows::META_WEIGHT) {
+        if !self.metadata.contains_key(format::META_WEIGHT) {
             return Ok(None);
         }
-        let grams: f64 = self.number(rows::META_WEIGHT, "grams")?;
+        let grams: f64 = self.number(format::META_WEIGHT, "grams")?;
         if grams.is_finite() && grams >= 0.0 { Ok(Some(grams)) } else { Err(format!("metadata 'weight': grams = {grams}")) }
     }
 
-    /// The rows as frames, the lost ones filled in.
-    fn frames(&self, started_at_ns: u64) -> Result<Vec<Frame>, String> {
-        let mut track = AlphaTrack::new(self.ticks.len().max(1));
-        for t in &self.ticks {
-            track.push(t.at_ns, t.alpha_deg, t.robot_at_ns, t.alpha_measured_deg);
-        }
+    /// The rows of the episode, the lost ones filled in.
+    fn rows(&self, started_at_ns: u64) -> Result<Vec<EpisodeRow>, String> {
+        // The ticks are taken as the recorder took them, so that a lost frame gets the angles that it would have written.
+        let mut track = AlphaTrack::<256>::new();
+        let mut ticks = self.ticks.iter();
         let t_s = |at_ns: u64| (i128::from(at_ns) - i128::from(started_at_ns)) as f64 / 1e9;
-        let mut frames: Vec<Frame> = Vec::with_capacity(self.samples.len());
+        let mut rows: Vec<EpisodeRow> = Vec::with_capacity(self.samples.len());
         for row in &self.samples {
             let doubt = Doubt::ALL.into_iter().find(|d| d.words() == row.doubt);
             let doubt = doubt.ok_or_else(|| format!("frame {}: unknown doubt '{}'", row.sequence, row.doubt))?;
             if !row.alpha_commanded_deg.is_finite() || row.area_px2 < 0.0 {
                 return Err(format!("frame {}: commanded alpha {}, area {}", row.sequence, row.alpha_commanded_deg, row.area_px2));
             }
-            if let Some(last) = frames.last().copied() {
+            if let Some(last) = rows.last().copied() {
                 if row.sequence <= last.sequence || row.captured_at_ns <= last.captured_at_ns {
                     return Err(format!("frame {} comes after frame {} in the file", row.sequence, last.sequence));
                 }
@@ -214,8 +214,13 @@ impl Contents {
                     let captured_at_ns = last.captured_at_ns + ((row.captured_at_ns - last.captured_at_ns) as f64 * share) as u64;
                     let between = f64::from(last.alpha_commanded_deg)
                         + share * (f64::from(row.alpha_commanded_deg) - f64::from(last.alpha_commanded_deg));
+                    while !track.covers(captured_at_ns)
+                        && let Some(t) = ticks.next()
+                    {
+                        track.push(t.at_ns, t.alpha_deg, t.robot_at_ns, t.alpha_measured_deg);
+                    }
                     let commanded = track.commanded_deg(captured_at_ns);
-                    frames.push(Frame {
+                    rows.push(EpisodeRow {
                         sequence: last.sequence + step,
                         captured_at_ns,
                         t_s: t_s(captured_at_ns),
@@ -227,7 +232,7 @@ impl Contents {
                     });
                 }
             }
-            frames.push(Frame {
+            rows.push(EpisodeRow {
                 sequence: row.sequence,
                 captured_at_ns: row.captured_at_ns,
                 t_s: t_s(row.captured_at_ns),
@@ -238,35 +243,35 @@ impl Contents {
                 lost: false,
             });
         }
-        Ok(frames)
+        Ok(rows)
     }
 
     fn episode(self, name: &str, whole: bool) -> Result<Episode, String> {
-        let started_at_ns = self.number(rows::META_EPISODE, "started_at_ns")?;
-        let frames = self.frames(started_at_ns)?;
-        let text = |key: &str| self.text(rows::META_EPISODE, key).to_string();
+        let started_at_ns = self.number(format::META_EPISODE, "started_at_ns")?;
+        let rows = self.rows(started_at_ns)?;
+        let text = |key: &str| self.text(format::META_EPISODE, key).to_string();
         let (first_tick, last_tick) = (self.ticks.first().map_or(0, |t| t.tick), self.ticks.last().map_or(0, |t| t.tick));
         let last_at_ns = self.ticks.last().map_or(0, |t| t.at_ns);
-        let seen_to_the_end = frames.last().is_some_and(|f| f.captured_at_ns.saturating_add(SILENT_END_NS) >= last_at_ns);
+        let seen_to_the_end = rows.last().is_some_and(|f| f.captured_at_ns.saturating_add(SILENT_END_NS) >= last_at_ns);
         Ok(Episode {
             name: name.into(),
             kind: self.kind()?,
             weight_g: self.weight_g()?,
-            complete: whole && self.text(rows::META_END, "complete") == "true" && seen_to_the_end,
-            info: Info {
+            complete: whole && self.text(format::META_END, "complete") == "true" && seen_to_the_end,
+            info: EpisodeInfo {
                 started_at_utc: text("started_at_utc"),
                 started_at_ns,
                 cell: text("cell"),
                 config_sha256: text("config_sha256"),
                 weights: text("weights"),
-                ended: self.text(rows::META_END, "reason").into(),
+                ended: self.text(format::META_END, "reason").into(),
                 ticks: self.ticks.len() as u64,
                 lost_ticks: last_tick.saturating_sub(first_tick).saturating_add(1).saturating_sub(self.ticks.len() as u64),
                 images: self.images,
                 dropped_images: self.samples.iter().filter(|s| !s.image).count() as u64,
-                lost_frames: frames.iter().filter(|f| f.lost).count() as u64,
+                lost_frames: rows.iter().filter(|f| f.lost).count() as u64,
             },
-            frames,
+            rows,
         })
     }
 }
@@ -281,25 +286,25 @@ impl Episode {
         let mut records = Records::open(path)?;
         let mut contents = Contents::default();
         let next = records.next(|record| contents.take(record).map(|()| None::<()>))?;
-        let format = contents.text(rows::META_EPISODE, "format");
-        if format != rows::FORMAT {
-            let what = match (contents.metadata.contains_key(rows::META_EPISODE), matches!(next, Next::Cut)) {
-                (true, _) => format!("format {format}, this program reads format {}", rows::FORMAT),
+        let format = contents.text(format::META_EPISODE, "format");
+        if format != format::FORMAT {
+            let what = match (contents.metadata.contains_key(format::META_EPISODE), matches!(next, NextRecord::Cut)) {
+                (true, _) => format!("format {format}, this program reads format {}", format::FORMAT),
                 (false, true) => "its recorder was killed before anything was written".into(),
                 (false, false) => "the metadata 'episode' is missing".into(),
             };
             return Err(EpisodeError::NotAnEpisode { file: records.name, what });
         }
-        contents.episode(&records.name, matches!(next, Next::End)).map_err(|what| records.damaged(what))
+        contents.episode(&records.name, matches!(next, NextRecord::End)).map_err(|what| records.damaged(what))
     }
 }
 
 /// One recorded image.
 #[derive(Debug, Clone, PartialEq)]
-pub struct Image {
+pub struct EpisodeImage {
     /// Low 32 bits of the camera's frame number.
     pub sequence: u32,
-    /// Middle of the exposure, CLOCK_MONOTONIC ns: [`Frame::captured_at_ns`] of its frame.
+    /// Middle of the exposure, CLOCK_MONOTONIC ns: [`EpisodeRow::captured_at_ns`] of its frame.
     pub captured_at_ns: u64,
     /// `jpeg` or `png`.
     pub format: String,
@@ -308,21 +313,21 @@ pub struct Image {
 }
 
 /// The images of one episode, read one by one; ends after the first error.
-pub struct Images {
+pub struct EpisodeImages {
     records: Records,
     channels: Vec<u16>,
     ended: bool,
 }
 
-impl Images {
+impl EpisodeImages {
     /// Opens an episode for its images.
     pub fn open(path: &Path) -> Result<Self, EpisodeError> {
         Ok(Self { records: Records::open(path)?, channels: Vec::new(), ended: false })
     }
 }
 
-impl Iterator for Images {
-    type Item = Result<Image, EpisodeError>;
+impl Iterator for EpisodeImages {
+    type Item = Result<EpisodeImage, EpisodeError>;
 
     fn next(&mut self) -> Option<Self::Item> {
         if self.ended {
@@ -330,20 +335,20 @@ impl Iterator for Images {
         }
         let channels = &mut self.channels;
         let next = self.records.next(|record| match record {
-            Record::Channel(channel) if channel.topic == rows::IMAGE_TOPIC => {
+            Record::Channel(channel) if channel.topic == format::IMAGE_TOPIC => {
                 channels.push(channel.id);
                 Ok(None)
             }
             Record::Message { header, data } if channels.contains(&header.channel_id) => {
-                let image = CompressedImage::decode(&*data).map_err(|e| format!("{}: {e}", rows::IMAGE_TOPIC))?;
+                let image = CompressedImage::decode(&*data).map_err(|e| format!("{}: {e}", format::IMAGE_TOPIC))?;
                 let captured_at_ns = header.log_time;
-                Ok(Some(Image { sequence: header.sequence, captured_at_ns, format: image.format, data: image.data }))
+                Ok(Some(EpisodeImage { sequence: header.sequence, captured_at_ns, format: image.format, data: image.data }))
             }
             _ => Ok(None),
         });
         match next {
-            Ok(Next::Item(image)) => Some(Ok(image)),
-            Ok(Next::End | Next::Cut) => {
+            Ok(NextRecord::Item(image)) => Some(Ok(image)),
+            Ok(NextRecord::End | NextRecord::Cut) => {
                 self.ended = true;
                 None
             }
@@ -356,7 +361,7 @@ impl Iterator for Images {
 }
 
 /// The episode files named by `paths`: files as they are, directories as their `*.mcap` in order of name.
-pub fn find(paths: &[PathBuf]) -> Result<Vec<PathBuf>, EpisodeError> {
+pub fn find_episodes(paths: &[PathBuf]) -> Result<Vec<PathBuf>, EpisodeError> {
     let mut files = Vec::new();
     for path in paths {
         if !path.is_dir() {

@@ -8,7 +8,7 @@ use std::collections::BTreeMap;
 use std::fs::{File, OpenOptions};
 use std::path::Path;
 
-use super::{Episode, Frame, Info, Kind};
+use super::{Episode, EpisodeInfo, EpisodeKind, EpisodeRow};
 use crate::messages::Doubt;
 
 /// Most frames in a row that can be lost; more is a wrong number.
@@ -38,20 +38,20 @@ pub enum TableError {
 }
 
 /// A table being read.
-struct Table {
+struct CsvTable {
     name: String,
     reader: csv::Reader<File>,
     columns: Vec<usize>,
 }
 
 /// One row of the wanted columns.
-struct Row<'a> {
+struct CsvRow<'a> {
     file: &'a str,
     line: u64,
     fields: Vec<&'a str>,
 }
 
-impl Row<'_> {
+impl CsvRow<'_> {
     fn error(&self, what: String) -> TableError {
         TableError::Row { file: self.file.into(), line: self.line, what }
     }
@@ -62,7 +62,7 @@ impl Row<'_> {
     }
 }
 
-impl Table {
+impl CsvTable {
     fn open(path: &Path, wanted: &[&str]) -> Result<Self, TableError> {
         let name = path.display().to_string();
         let fail = |what: String| TableError::File { file: name.clone(), what };
@@ -86,7 +86,7 @@ impl Table {
     }
 
     /// Shows each row to `take`.
-    fn rows(mut self, mut take: impl FnMut(&Row) -> Result<(), TableError>) -> Result<(), TableError> {
+    fn rows(mut self, mut take: impl FnMut(&CsvRow) -> Result<(), TableError>) -> Result<(), TableError> {
         let mut record = csv::StringRecord::new();
         loop {
             match self.reader.read_record(&mut record) {
@@ -95,7 +95,7 @@ impl Table {
                     let line = record.position().map_or(0, csv::Position::line);
                     // The reader refuses rows of another length than the heading's, so every column is there.
                     let fields = self.columns.iter().map(|c| record.get(*c).unwrap_or("")).collect();
-                    take(&Row { file: &self.name, line, fields })?;
+                    take(&CsvRow { file: &self.name, line, fields })?;
                 }
                 Err(e) => {
                     let line = e.position().map_or(0, csv::Position::line);
@@ -117,7 +117,7 @@ impl Table {
 pub fn read_table(features: &Path, scale: &Path) -> Result<Vec<Episode>, TableError> {
     let mut episodes: Vec<Episode> = Vec::new();
     let mut first_line: BTreeMap<String, u64> = BTreeMap::new();
-    Table::open(features, &["episode", "frame", "t_s", "alpha_deg", "area_px2"])?.rows(|row| {
+    CsvTable::open(features, &["episode", "frame", "t_s", "alpha_deg", "area_px2"])?.rows(|row| {
         let name = row.fields[0];
         if name.is_empty() {
             return Err(row.error("episode is empty: a name or number is wanted".into()));
@@ -128,15 +128,15 @@ pub fn read_table(features: &Path, scale: &Path) -> Result<Vec<Episode>, TableEr
             }
             episodes.push(Episode {
                 name: name.into(),
-                kind: Kind::Table,
-                frames: Vec::new(),
+                kind: EpisodeKind::Table,
+                rows: Vec::new(),
                 weight_g: None,
                 complete: true,
-                info: Info::default(),
+                info: EpisodeInfo::default(),
             });
         }
         match episodes.last_mut() {
-            Some(episode) => add_frame(&mut episode.frames, row),
+            Some(episode) => add_row(&mut episode.rows, row),
             None => Ok(()),
         }
     })?;
@@ -144,11 +144,11 @@ pub fn read_table(features: &Path, scale: &Path) -> Result<Vec<Episode>, TableEr
         return Err(TableError::File { file: features.display().to_string(), what: "no rows below the heading".into() });
     }
     for episode in &mut episodes {
-        episode.info.lost_frames = episode.frames.iter().filter(|f| f.lost).count() as u64;
+        episode.info.lost_frames = episode.rows.iter().filter(|f| f.lost).count() as u64;
     }
 
     let mut weighed: BTreeMap<String, u64> = BTreeMap::new();
-    Table::open(scale, &["episode", "weight_g"])?.rows(|row| {
+    CsvTable::open(scale, &["episode", "weight_g"])?.rows(|row| {
         let name = row.fields[0];
         if let Some(line) = weighed.insert(name.into(), row.line) {
             return Err(row.error(format!("episode {name} has a weight in line {line} already")));
@@ -174,7 +174,7 @@ pub fn read_table(features: &Path, scale: &Path) -> Result<Vec<Episode>, TableEr
     Ok(episodes)
 }
 
-fn add_frame(frames: &mut Vec<Frame>, row: &Row) -> Result<(), TableError> {
+fn add_row(rows: &mut Vec<EpisodeRow>, row: &CsvRow) -> Result<(), TableError> {
     let sequence: u64 = row.number(1, "frame", "a whole number")?;
     let t_s: f64 = row.number(2, "t_s", "seconds")?;
     let alpha_deg: f32 = row.number(3, "alpha_deg", "degrees")?;
@@ -185,7 +185,7 @@ fn add_frame(frames: &mut Vec<Frame>, row: &Row) -> Result<(), TableError> {
     if area_px2.is_infinite() || area_px2 < 0.0 {
         return Err(row.error(format!("area_px2 '{}': at least 0 and finite is wanted, or nan for no measurement", row.fields[4])));
     }
-    if let Some(last) = frames.last().copied() {
+    if let Some(last) = rows.last().copied() {
         if sequence == last.sequence {
             return Err(row.error(format!("frame {sequence} is there twice")));
         }
@@ -202,15 +202,15 @@ fn add_frame(frames: &mut Vec<Frame>, row: &Row) -> Result<(), TableError> {
         for step in 1..steps {
             let share = step as f64 / steps as f64;
             let alpha = f64::from(last.alpha_commanded_deg) + share * (f64::from(alpha_deg) - f64::from(last.alpha_commanded_deg));
-            frames.push(frame(last.sequence + step, last.t_s + share * (t_s - last.t_s), alpha as f32, f32::NAN));
+            rows.push(frame(last.sequence + step, last.t_s + share * (t_s - last.t_s), alpha as f32, f32::NAN));
         }
     }
-    frames.push(frame(sequence, t_s, alpha_deg, area_px2));
+    rows.push(frame(sequence, t_s, alpha_deg, area_px2));
     Ok(())
 }
 
-fn frame(sequence: u64, t_s: f64, alpha_deg: f32, area_px2: f32) -> Frame {
-    Frame {
+fn frame(sequence: u64, t_s: f64, alpha_deg: f32, area_px2: f32) -> EpisodeRow {
+    EpisodeRow {
         sequence,
         captured_at_ns: 0,
         t_s,
@@ -236,7 +236,7 @@ pub fn write_table(episodes: &[Episode], features: &Path, scale: &Path) -> Resul
     weights.write_record(["episode", "weight_g"]).map_err(|e| fail(scale, &e))?;
     for (index, episode) in episodes.iter().enumerate() {
         let number = (index + 1).to_string();
-        for f in &episode.frames {
+        for f in &episode.rows {
             let area = if f.area_px2.is_nan() { "nan".into() } else { f.area_px2.to_string() };
             rows.write_record([&number, &f.sequence.to_string(), &f.t_s.to_string(), &f.alpha_commanded_deg.to_string(), &area])
                 .map_err(|e| fail(features, &e))?;

@@ -10,8 +10,8 @@ use std::path::Path;
 use mcap::records::{Metadata, Record};
 use mcap::{WriteOptions, Writer};
 
-use super::read::{Next, Records};
-use super::{Episode, EpisodeError, rows};
+use super::read::{NextRecord, Records};
+use super::{Episode, EpisodeError, format};
 
 /// Why a weight is refused or cannot be written; the file is as it was.
 #[derive(Debug, thiserror::Error)]
@@ -90,11 +90,11 @@ fn copy_with_weight(old: &Path, new: &Path, grams: f64) -> Result<(), WeighError
         let Some(writer) = &mut writer else { return Err("it does not begin with a header".into()) };
         copy(record, writer).map(|()| None)
     })?;
-    let Some(mut writer) = writer.filter(|_| matches!(next, Next::End)) else {
+    let Some(mut writer) = writer.filter(|_| matches!(next, NextRecord::End)) else {
         return Err(WeighError::Incomplete { file: old.display().to_string() });
     };
     let metadata = [("grams".to_string(), grams.to_string())].into();
-    writer.write_metadata(&Metadata { name: rows::META_WEIGHT.into(), metadata }).map_err(|e| fail(&e))?;
+    writer.write_metadata(&Metadata { name: format::META_WEIGHT.into(), metadata }).map_err(|e| fail(&e))?;
     writer.finish().map_err(|e| fail(&e))?;
     let file = writer.into_inner().into_inner().map_err(|e| fail(e.error()))?;
     file.sync_all().map_err(|e| fail(&e))
@@ -105,7 +105,7 @@ fn copy(record: Record, to: &mut Writer<BufWriter<File>>) -> Result<(), String> 
         Record::Schema { header, data } => to.add_schema_with_id(header.id, &header.name, &header.encoding, &data).map(drop),
         Record::Channel(c) => to.add_channel_with_id(c.id, c.schema_id, &c.topic, &c.message_encoding, &c.metadata).map(drop),
         Record::Message { header, data } => to.write_to_known_channel(&header, &data),
-        Record::Metadata(m) if m.name == rows::META_WEIGHT => Ok(()),
+        Record::Metadata(m) if m.name == format::META_WEIGHT => Ok(()),
         Record::Metadata(m) => to.write_metadata(&m),
         Record::Attachment { header, data, .. } => to.attach(&mcap::Attachment {
             log_time: header.log_time,

@@ -14,8 +14,8 @@ use mcap::{WriteOptions, Writer};
 use prost::Message as _;
 use sha2::{Digest, Sha256};
 
-use super::rows::{self, CompressedImage, FeatureRow, SampleRow, TelemetryRow};
-use super::{Kind, hex};
+use super::format::{self, CompressedImage, EpisodeRowJson, FeatureJson, TelemetryJson};
+use super::{EpisodeKind, hex};
 use crate::config::Config;
 use crate::messages::{Doubt, Feature, Telemetry};
 
@@ -47,11 +47,11 @@ pub enum WriteError {
 
 /// What is known at an episode's start.
 #[derive(Debug, Clone)]
-pub struct Start<'a> {
+pub struct EpisodeStart<'a> {
     /// [`Telemetry::episode`].
     pub episode: u64,
     /// What is run.
-    pub kind: Kind,
+    pub kind: EpisodeKind,
     /// First tick of the episode, CLOCK_MONOTONIC ns.
     pub started_at_ns: u64,
     /// The wall clock then.
@@ -64,7 +64,7 @@ pub struct Start<'a> {
 
 /// One frame of an episode.
 #[derive(Debug, Clone, Copy)]
-pub struct Sample<'a> {
+pub struct FrameRow<'a> {
     /// What was measured in it.
     pub feature: &'a Feature,
     /// Commanded alpha at the capture time, degrees.
@@ -77,7 +77,7 @@ pub struct Sample<'a> {
 
 /// How an episode ended.
 #[derive(Debug, Clone, Copy)]
-pub struct End<'a> {
+pub struct EpisodeEnd<'a> {
     /// Nothing is missing at the end.
     pub complete: bool,
     /// One line for people.
@@ -93,14 +93,14 @@ pub struct EpisodeWriter {
     image_channel: u16,
     feature_channel: u16,
     telemetry_channel: u16,
-    sample_channel: u16,
+    row_channel: u16,
     chunk_since_ns: u64,
     chunk_bytes: usize,
 }
 
 impl EpisodeWriter {
     /// Creates the next free `episode-NNNN.mcap` in `directory` (made if missing) and writes what is known at the start.
-    pub fn create(directory: &Path, start: &Start) -> Result<Self, WriteError> {
+    pub fn create(directory: &Path, start: &EpisodeStart) -> Result<Self, WriteError> {
         let (file, path) = next_free(directory)?;
         let fail = |e: mcap::McapError| file_error(&path, &e);
         let options = WriteOptions::new()
@@ -110,21 +110,21 @@ impl EpisodeWriter {
             .library(concat!("decant ", env!("CARGO_PKG_VERSION")));
         let mut writer = Writer::with_options(BufWriter::with_capacity(1 << 16, file), options).map_err(fail)?;
         let none = BTreeMap::new();
-        let schema = writer.add_schema("foxglove.CompressedImage", "protobuf", &rows::compressed_image_schema()).map_err(fail)?;
-        let image_channel = writer.add_channel(schema, rows::IMAGE_TOPIC, "protobuf", &none).map_err(fail)?;
+        let schema = writer.add_schema("foxglove.CompressedImage", "protobuf", &format::compressed_image_schema()).map_err(fail)?;
+        let image_channel = writer.add_channel(schema, format::IMAGE_TOPIC, "protobuf", &none).map_err(fail)?;
         let mut json = [0; 3];
-        for (channel, (name, topic, text)) in json.iter_mut().zip(rows::json_schemas()) {
+        for (channel, (name, topic, text)) in json.iter_mut().zip(format::json_schemas()) {
             let schema = writer.add_schema(name, "jsonschema", text.as_bytes()).map_err(fail)?;
             *channel = writer.add_channel(schema, topic, "json", &none).map_err(fail)?;
         }
-        let [feature_channel, telemetry_channel, sample_channel] = json;
+        let [feature_channel, telemetry_channel, row_channel] = json;
         let mut this = Self {
             writer,
             path,
             image_channel,
             feature_channel,
             telemetry_channel,
-            sample_channel,
+            row_channel,
             chunk_since_ns: start.started_at_ns,
             chunk_bytes: 0,
         };
@@ -137,12 +137,12 @@ impl EpisodeWriter {
         &self.path
     }
 
-    fn describe(&mut self, start: &Start) -> Result<(), WriteError> {
+    fn describe(&mut self, start: &EpisodeStart) -> Result<(), WriteError> {
         let config = toml::to_string(start.config).unwrap_or_default();
         let config_sha256 = hex(&Sha256::digest(config.as_bytes()));
         let unix_ns = start.wall_clock.duration_since(UNIX_EPOCH).map_or(0, |d| d.as_nanos());
         let mut about = vec![
-            ("format", rows::FORMAT.to_string()),
+            ("format", format::FORMAT.to_string()),
             ("episode", start.episode.to_string()),
             ("cell", start.config.cell.name.clone()),
             ("started_at_ns", start.started_at_ns.to_string()),
@@ -152,17 +152,17 @@ impl EpisodeWriter {
             ("weights", start.weights.to_string()),
         ];
         match start.kind {
-            Kind::Recording(curve) => about.extend([
+            EpisodeKind::Recording(curve) => about.extend([
                 ("kind", "recording".to_string()),
                 ("lambda_deg", curve.lambda_deg.to_string()),
                 ("gamma_per_s2", curve.gamma_per_s2.to_string()),
                 ("beta_s", curve.beta_s.to_string()),
             ]),
-            Kind::Pour { goal_ml } => about.extend([("kind", "pour".to_string()), ("goal_ml", goal_ml.to_string())]),
-            Kind::Table => about.push(("kind", "table".to_string())),
+            EpisodeKind::Pour { goal_ml } => about.extend([("kind", "pour".to_string()), ("goal_ml", goal_ml.to_string())]),
+            EpisodeKind::Table => about.push(("kind", "table".to_string())),
         }
-        self.metadata(rows::META_EPISODE, &about)?;
-        self.metadata(rows::META_CONFIG, &[("sha256", config_sha256), ("toml", config)])?;
+        self.metadata(format::META_EPISODE, &about)?;
+        self.metadata(format::META_CONFIG, &[("sha256", config_sha256), ("toml", config)])?;
         self.flush()
     }
 
@@ -173,7 +173,7 @@ impl EpisodeWriter {
     }
 
     /// Writes one frame: its row of `L_E`, its feature and its image.
-    pub fn frame(&mut self, sample: &Sample) -> Result<(), WriteError> {
+    pub fn frame(&mut self, sample: &FrameRow) -> Result<(), WriteError> {
         let feature = sample.feature;
         let at_ns = feature.captured_at_ns;
         if let Some((format, data)) = sample.image {
@@ -185,8 +185,8 @@ impl EpisodeWriter {
             };
             self.message(self.image_channel, feature.sequence, at_ns, &image.encode_to_vec())?;
         }
-        self.json(self.feature_channel, feature.sequence, at_ns, &FeatureRow::new(feature))?;
-        let row = SampleRow {
+        self.json(self.feature_channel, feature.sequence, at_ns, &FeatureJson::new(feature))?;
+        let row = EpisodeRowJson {
             sequence: feature.sequence,
             captured_at_ns: at_ns,
             alpha_commanded_deg: sample.alpha_commanded_deg,
@@ -195,7 +195,7 @@ impl EpisodeWriter {
             doubt: Doubt::from_code(feature.doubt).words().into(),
             image: sample.image.is_some(),
         };
-        self.json(self.sample_channel, feature.sequence, at_ns, &row)?;
+        self.json(self.row_channel, feature.sequence, at_ns, &row)?;
         if at_ns.saturating_sub(self.chunk_since_ns) >= CHUNK_NS || self.chunk_bytes >= CHUNK_BYTES {
             self.chunk_since_ns = at_ns;
             self.flush()?;
@@ -205,7 +205,7 @@ impl EpisodeWriter {
 
     /// Writes one tick of the controller.
     pub fn telemetry(&mut self, telemetry: &Telemetry) -> Result<(), WriteError> {
-        self.json(self.telemetry_channel, telemetry.tick, telemetry.at_ns, &TelemetryRow::new(telemetry))
+        self.json(self.telemetry_channel, telemetry.tick, telemetry.at_ns, &TelemetryJson::new(telemetry))
     }
 
     fn json(&mut self, channel: u16, sequence: u64, at_ns: u64, row: &impl serde::Serialize) -> Result<(), WriteError> {
@@ -227,13 +227,13 @@ impl EpisodeWriter {
     }
 
     /// Writes how it ended and the index, and waits until all is on the disk.
-    pub fn finish(mut self, end: &End) -> Result<PathBuf, WriteError> {
+    pub fn finish(mut self, end: &EpisodeEnd) -> Result<PathBuf, WriteError> {
         let about = [
             ("complete", end.complete.to_string()),
             ("reason", end.reason.to_string()),
             ("disordered_frames", end.disordered_frames.to_string()),
         ];
-        self.metadata(rows::META_END, &about)?;
+        self.metadata(format::META_END, &about)?;
         let Self { mut writer, path, .. } = self;
         writer.finish().map_err(|e| file_error(&path, &e))?;
         let buffered = writer.into_inner();

@@ -1,15 +1,22 @@
-//! A tilted vessel: what it retains, what flows over its lip, the film that drains afterwards.
+//! A tilted vessel: what it retains, what flows over its lip, and the film that drains afterwards.
 //!
 //! Pure, any thread; allocates only in [`Container::new`]. Cannot fail: tilts and volumes are clamped to what makes sense.
 //!
 //! Coordinates: z along the vessel's axis from the bottom, x towards the lip. The lip is at (x_l, H). At tilt alpha the
 //! liquid below the horizontal plane through the lip stays: z cos(alpha) - x sin(alpha) <= H cos(alpha) - x_l sin(alpha).
-//! What is above it flows over the lip as over a weir of width b:
-//! head h = 1000 max(0, V - V_ret)/A_s mm, Q = mu (2/3) 0.6 b sqrt(2 * 9810)/1000 h^1.5 ml/s.
+//! What is above it flows over the lip as over a weir: with the volume V, the retained volume V_ret and the free surface A_s, the head is
+//! h = 1000 max(0, V - V_ret)/A_s mm, and the flow is fluidity (2/3) 0.6 width sqrt(2 * 9810)/1000 h^1.5 ml/s.
 
 use serde::{Deserialize, Serialize};
 
-/// Shape of the inside, all lengths in mm.
+/// Share of the outflow that first stays at the lip as a film. Part of the evaluation's protocol; no measurement is recorded.
+const FILM_SHARE: f64 = 0.12;
+/// Time constant with which the film drains, s. Part of the evaluation's protocol; no measurement is recorded.
+const FILM_S: f64 = 0.30;
+/// Step of the tables over the tilt, degrees: fine enough that linear interpolation does for what lies between.
+const TABLE_STEP_DEG: f64 = 0.25;
+
+/// Shape of a vessel's inside, all lengths in mm.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case", tag = "kind")]
 pub enum Shape {
@@ -29,7 +36,7 @@ pub enum Shape {
         /// Inner height.
         height_mm: f64,
     },
-    /// Body, shoulder, neck.
+    /// Round, with a body, a shoulder and a neck.
     Bottle {
         /// Inner radius of the body.
         body_mm: f64,
@@ -42,7 +49,7 @@ pub enum Shape {
         /// Inner height.
         height_mm: f64,
     },
-    /// Square jug whose lip reaches out over one side.
+    /// Square jug whose lip reaches beyond one side.
     Jug {
         /// Half of the inner side.
         half_side_mm: f64,
@@ -64,7 +71,7 @@ impl Shape {
         }
     }
 
-    /// Distance of the lip from the axis, mm.
+    /// Distance of the lip from the vessel's axis, mm.
     pub fn lip_mm(&self) -> f64 {
         match *self {
             Self::Cylinder { radius_mm, .. } => radius_mm,
@@ -74,7 +81,7 @@ impl Shape {
         }
     }
 
-    /// Half extent in x at height z, mm.
+    /// Half of the extent in x at height z, mm.
     fn reach_mm(&self, z_mm: f64) -> f64 {
         match *self {
             Self::Cylinder { radius_mm, .. } => radius_mm,
@@ -87,7 +94,7 @@ impl Shape {
         }
     }
 
-    /// Full width across x at (x, z), mm; 0 outside.
+    /// Full width across x at the place (x, z), mm; 0 outside of the vessel.
     fn width_mm(&self, x_mm: f64, z_mm: f64) -> f64 {
         if !(0.0..=self.height_mm()).contains(&z_mm) {
             return 0.0;
@@ -99,7 +106,7 @@ impl Shape {
         }
     }
 
-    /// Area of the section at height z on the lip's side of x = c, mm^2.
+    /// Area of the section at height z, of the part on the lip's side of x = c, mm^2.
     fn section_beyond_mm2(&self, c_mm: f64, z_mm: f64) -> f64 {
         let r = self.reach_mm(z_mm);
         let c = c_mm.clamp(-r, r);
@@ -109,7 +116,7 @@ impl Shape {
         }
     }
 
-    /// Volume that stays at tilt `alpha_deg`, ml; the whole inside at 0.
+    /// Volume that stays in the vessel at tilt `alpha_deg`, ml; at 0 that is the whole inside.
     pub fn retained_ml(&self, alpha_deg: f64) -> f64 {
         let (sin, cos) = alpha_deg.max(0.0).to_radians().sin_cos();
         let (height, lip) = (self.height_mm(), self.lip_mm());
@@ -119,11 +126,11 @@ impl Shape {
         }) / 1000.0
     }
 
-    /// Free surface when filled up to the lip at tilt `alpha_deg`, mm^2, at least 300.
+    /// Free surface when the vessel is filled up to the lip at tilt `alpha_deg`, mm^2, at least 300.
     pub fn surface_mm2(&self, alpha_deg: f64) -> f64 {
         let (sin, cos) = alpha_deg.max(0.0).to_radians().sin_cos();
         let (height, lip) = (self.height_mm(), self.lip_mm());
-        // Along whichever axis the plane crosses less steeply.
+        // The integral runs along the axis that the liquid's surface crosses less steeply.
         let area = if cos > sin {
             let reach = [0.0, 0.25, 0.5, 0.75, 1.0].map(|f| self.reach_mm(f * height)).into_iter().fold(0.0, f64::max);
             midpoints(-reach, reach, 400, |x| self.width_mm(x, height - (lip - x) * sin / cos)) / cos
@@ -134,24 +141,18 @@ impl Shape {
     }
 }
 
+/// The integral of `f` from `from` to `to` by the midpoint rule with `n` steps.
 fn midpoints(from: f64, to: f64, n: usize, f: impl Fn(f64) -> f64) -> f64 {
     let step = (to - from) / n as f64;
     (0..n).map(|k| f(from + (k as f64 + 0.5) * step)).sum::<f64>() * step
 }
 
-/// Share of the outflow that first stays as a film at the lip.
-const FILM_SHARE: f64 = 0.12;
-/// Time constant with which the film drains, s.
-const FILM_S: f64 = 0.30;
-/// Resolution of the tables, degrees.
-const TABLE_STEP_DEG: f64 = 0.25;
-
-/// What leaves the lip, for whoever draws it.
+/// What leaves the lip, for the camera that draws it.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct Lip {
-    /// Volume flow leaving the container (film's drain included), ml/s.
+    /// Flow that leaves the container, the draining film included, ml/s.
     pub flow_ml_s: f64,
-    /// Part of it that comes from the film, ml/s.
+    /// The part of the flow that comes from the film, ml/s.
     pub film_ml_s: f64,
     /// Head over the lip, mm.
     pub head_mm: f64,
@@ -166,7 +167,7 @@ pub struct Lip {
 pub struct Container {
     shape: Shape,
     lip_width_mm: f64,
-    mu: f64,
+    fluidity: f64,
     table: std::sync::Arc<[(f64, f64)]>,
     volume_ml: f64,
     film_ml: f64,
@@ -175,17 +176,18 @@ pub struct Container {
 }
 
 impl Container {
-    /// An upright vessel. `lip_width_mm` is b, `mu` the liquid's fluidity (1: water), `volume_ml` is capped at 92 % of full.
-    pub fn new(shape: Shape, lip_width_mm: f64, mu: f64, volume_ml: f64) -> Self {
+    /// An upright vessel with `volume_ml` in it, at most 92 % of full. `fluidity` is relative to water.
+    pub fn new(shape: Shape, lip_width_mm: f64, fluidity: f64, volume_ml: f64) -> Self {
         let steps = (180.0 / TABLE_STEP_DEG) as usize;
         let entry = |k: usize| (shape.retained_ml(k as f64 * TABLE_STEP_DEG), shape.surface_mm2(k as f64 * TABLE_STEP_DEG));
         let table: std::sync::Arc<[(f64, f64)]> = (0..=steps).map(entry).collect();
-        let mut container = Self { shape, lip_width_mm, mu, table, volume_ml: 0.0, film_ml: 0.0, poured_ml: 0.0, lip: Lip::default() };
+        let mut container =
+            Self { shape, lip_width_mm, fluidity, table, volume_ml: 0.0, film_ml: 0.0, poured_ml: 0.0, lip: Lip::default() };
         container.refill(volume_ml);
         container
     }
 
-    /// Puts `volume_ml` into the container (capped at 92 % of full), dry lip, nothing poured.
+    /// Starts again with `volume_ml` in the container, at most 92 % of full, a dry lip and nothing poured.
     pub fn refill(&mut self, volume_ml: f64) {
         self.volume_ml = volume_ml.clamp(0.0, 0.92 * self.full_ml());
         self.film_ml = 0.0;
@@ -193,32 +195,32 @@ impl Container {
         self.lip = Lip::default();
     }
 
-    /// Another liquid: fluidity relative to water.
-    pub fn set_mu(&mut self, mu: f64) {
-        self.mu = mu;
+    /// Takes another liquid: its fluidity relative to water.
+    pub fn set_fluidity(&mut self, fluidity: f64) {
+        self.fluidity = fluidity;
     }
 
-    /// The shape.
+    /// The shape of its inside.
     pub fn shape(&self) -> &Shape {
         &self.shape
     }
 
-    /// Volume when full to the lip upright, ml.
+    /// Volume of the upright container when it is full to the lip, ml.
     pub fn full_ml(&self) -> f64 {
         self.table[0].0
     }
 
-    /// Volume now inside, ml.
+    /// Volume that is inside now, ml.
     pub fn volume_ml(&self) -> f64 {
         self.volume_ml
     }
 
-    /// What has left the lip and falls or has fallen into the receiver, ml.
+    /// Volume that has left the lip and falls or has fallen into the receiver, ml.
     pub fn poured_ml(&self) -> f64 {
         self.poured_ml
     }
 
-    /// Film that will still drip, ml.
+    /// Volume of the film that will still drip, ml.
     pub fn film_ml(&self) -> f64 {
         self.film_ml
     }
@@ -228,7 +230,7 @@ impl Container {
         self.lip
     }
 
-    /// (V_ret ml, A_s mm^2) at a tilt.
+    /// Retained volume in ml and free surface in mm^2 at a tilt.
     fn geometry(&self, tilt_deg: f64) -> (f64, f64) {
         let at = (tilt_deg.clamp(0.0, 180.0) / TABLE_STEP_DEG).min((self.table.len() - 1) as f64 - 1e-9);
         let k = at as usize;
@@ -243,7 +245,7 @@ impl Container {
         k as f64 * TABLE_STEP_DEG
     }
 
-    /// Lets `dt_s` (at most some 20 ms at a time) pass at `tilt_deg`; answers with the flow leaving the lip, ml/s.
+    /// Lets `dt_s` (at most some 20 ms at a time) pass at `tilt_deg`. Returns the flow that leaves the lip, ml/s.
     pub fn step(&mut self, dt_s: f64, tilt_deg: f64) -> f64 {
         if !(dt_s > 0.0 && tilt_deg.is_finite()) {
             return self.lip.flow_ml_s;
@@ -251,7 +253,7 @@ impl Container {
         let (retained_ml, surface_mm2) = self.geometry(tilt_deg);
         let excess_ml = (self.volume_ml - retained_ml).max(0.0);
         let head_mm = 1000.0 * excess_ml / surface_mm2;
-        let weir_ml_s = self.mu * (2.0 / 3.0) * 0.6 * self.lip_width_mm * (2.0f64 * 9810.0).sqrt() / 1000.0 * head_mm.powf(1.5);
+        let weir_ml_s = self.fluidity * (2.0 / 3.0) * 0.6 * self.lip_width_mm * (2.0f64 * 9810.0).sqrt() / 1000.0 * head_mm.powf(1.5);
         let over_ml = (weir_ml_s * dt_s).min(excess_ml / 2.0);
         self.volume_ml -= over_ml;
         self.film_ml += FILM_SHARE * over_ml;
@@ -277,7 +279,7 @@ mod tests {
 
     const BEAKER: Shape = Shape::Cylinder { radius_mm: 38.0, height_mm: 115.0 };
 
-    /// Protects the geometry: the general integral equals the cylinder's own one over x, and the known limits.
+    /// Protects the geometry: the general integral equals the cylinder's own integral over x, and the known limits hold.
     #[test]
     fn a_cylinder_retains_what_its_integral_says() {
         for alpha in [5.0f64, 30.0, 55.0, 70.0, 85.0] {
@@ -292,7 +294,7 @@ mod tests {
         assert!((BEAKER.surface_mm2(0.0) - std::f64::consts::PI * 38.0 * 38.0).abs() < 1.0);
     }
 
-    /// Protects every shape: more tilt never retains more, and the surface agrees on both sides of the change of axis.
+    /// Protects every shape: more tilt never retains more, and the surface is the same on both sides of the change of axis.
     #[test]
     fn retention_falls_with_tilt_for_every_shape() {
         let shapes = [
@@ -310,7 +312,7 @@ mod tests {
         }
     }
 
-    /// Protects the scale: nothing appears or vanishes; the film's rest drips out after the flow.
+    /// Protects the scale: no volume appears or vanishes, and the rest of the film drips out after the flow.
     #[test]
     fn volume_is_conserved() {
         let mut container = Container::new(BEAKER, 20.0, 1.0, 300.0);

@@ -1,6 +1,6 @@
-//! Simulator b: a seeded rig (container, liquid, servo, camera) and one pour of it, frame by frame.
+//! Simulator b: a seeded rig (container, liquid, servo, camera) and one pour on it, frame by frame.
 //!
-//! Pure, any thread; the same seeds give the same pour. Allocates when a rig is set up, not in [`Pour::frame`].
+//! Pure, any thread; the same seeds give the same pour. Allocates when a rig is set up, not in [`RigPour::frame`]. Cannot fail.
 
 use rand::{RngExt, SeedableRng};
 use rand_distr::{Distribution, StandardNormal};
@@ -10,65 +10,68 @@ use serde::{Deserialize, Serialize};
 use super::RATE_HZ;
 use super::container::{Container, Shape};
 
-/// Substeps of a frame.
+/// Steps of the physics in a frame: 11 ms each, short against the servo's time constant and the film's.
 const SUBSTEPS: usize = 3;
-/// Areas below this are read as 0, px^2.
+/// Areas below this read as 0, px^2: a real extraction sees no smaller stream either. Chosen by hand; no measurement is recorded.
 const AREA_MIN_PX2: f64 = 8.0;
-/// Largest delay of the camera that can be simulated, frames.
+/// Largest delay of the camera that can be simulated, frames: twice the largest that is drawn, with some room.
 const DELAY_MAX: usize = 8;
 
-/// What does not change from pour to pour.
+/// Area that the camera reports for an outflow of 1 ml a frame, px^2, the same as in the paper's simulation.
+const AREA_AT_1_ML_PX2: f64 = 400.0;
+
+/// A container, a liquid, a servo and a camera: what does not change from pour to pour.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Rig {
-    /// The container's inside.
+    /// Shape of the container's inside.
     pub shape: Shape,
-    /// Width of the lip b, mm.
+    /// Width of the lip, mm.
     pub lip_width_mm: f64,
-    /// Fluidity of the liquid, 1: water.
-    pub mu: f64,
+    /// Fluidity of the liquid relative to water.
+    pub fluidity: f64,
     /// Time constant of the servo, s.
-    pub servo_tau_s: f64,
+    pub servo_time_constant_s: f64,
     /// Largest rate of the servo, degrees/s.
     pub servo_rate_deg_s: f64,
     /// Camera delay, frames.
     pub delay_frames: usize,
-    /// Exponent of flow to area.
+    /// Exponent with which the area grows with the flow.
     pub area_exponent: f64,
-    /// Relative noise of a frame's area.
+    /// Standard deviation of a frame's area, as a share of it.
     pub frame_noise: f64,
     /// Share of frames whose area reads 0.
     pub dropouts: f64,
-    /// Relative change of the camera's gain from pour to pour.
+    /// Standard deviation of the camera's gain from pour to pour, as a share of it.
     pub gain_sd: f64,
-    /// The camera's gain against the one at training; 1 unless robustness is examined.
+    /// The camera's gain relative to the one at training; it is 1 unless robustness is examined.
     pub gain: f64,
-    /// Relative change of the viscosity from pour to pour.
-    pub viscosity_sd: f64,
+    /// Standard deviation of the fluidity from pour to pour, as a share of it.
+    pub fluidity_sd: f64,
 }
 
 impl Rig {
-    /// A rig with a straight cylinder drawn from `seed`.
+    /// A rig with a straight cylinder, drawn from `seed`.
     pub fn seeded(seed: u64) -> Self {
         let mut rng = Pcg64Mcg::seed_from_u64(seed.wrapping_mul(0x9e37_79b9).wrapping_add(17));
         let shape = Shape::Cylinder { radius_mm: rng.random_range(34.0..=42.0), height_mm: rng.random_range(105.0..=125.0) };
         Self {
             shape,
-            servo_tau_s: rng.random_range(0.080..=0.100),
+            servo_time_constant_s: rng.random_range(0.080..=0.100),
             servo_rate_deg_s: 90.0,
             delay_frames: rng.random_range(1..=3),
             area_exponent: rng.random_range(0.7..=1.0),
-            mu: rng.random_range(0.7..=1.2),
+            fluidity: rng.random_range(0.7..=1.2),
             lip_width_mm: rng.random_range(14.0..=26.0),
             frame_noise: 0.08,
             dropouts: 0.03,
             gain_sd: 0.015,
             gain: 1.0,
-            viscosity_sd: 0.08,
+            fluidity_sd: 0.08,
         }
     }
 
-    /// The same rig with another container of about the same size: `cone-in` (bottom/top 0.75), `cone-out` (1.2),
-    /// `bottle`, `jug`; `cylinder` leaves it. Other names: `None`.
+    /// The same rig with another container of about the same size: `cone-in` (its bottom 0.75 times as wide as its top), `cone-out`
+    /// (1.2 times), `bottle` or `jug`; `cylinder` leaves it as it is. `None` for another name.
     pub fn with_container(mut self, name: &str) -> Option<Self> {
         let Shape::Cylinder { radius_mm, height_mm } = self.shape else { return None };
         self.shape = match name {
@@ -90,13 +93,13 @@ impl Rig {
 
     /// The container, with `volume_ml` of the rig's liquid in it.
     pub fn container(&self, volume_ml: f64) -> Container {
-        Container::new(self.shape, self.lip_width_mm, self.mu, volume_ml)
+        Container::new(self.shape, self.lip_width_mm, self.fluidity, volume_ml)
     }
 }
 
-/// One pour on a rig.
+/// One pour on a rig of simulator b.
 #[derive(Debug, Clone)]
-pub struct Pour {
+pub struct RigPour {
     container: Container,
     rig: Rig,
     gain: f64,
@@ -106,17 +109,17 @@ pub struct Pour {
     rng: Pcg64Mcg,
 }
 
-impl Pour {
-    /// An upright container (from [`Rig::container`]), with this pour's viscosity, gain and noise drawn from `seed`.
+impl RigPour {
+    /// A pour from the upright `container` (from [`Rig::container`]); `seed` draws its fluidity, gain and noise.
     pub fn new(rig: &Rig, mut container: Container, seed: u64) -> Self {
         let mut rng = Pcg64Mcg::seed_from_u64(seed);
         let mut normal = || -> f64 { StandardNormal.sample(&mut rng) };
-        container.set_mu(rig.mu * (1.0 + rig.viscosity_sd * normal()).max(0.3));
+        container.set_fluidity(rig.fluidity * (1.0 + rig.fluidity_sd * normal()).max(0.3));
         let gain = rig.gain * (1.0 + rig.gain_sd * normal());
         Self { container, rig: rig.clone(), gain, tilt_deg: 0.0, flows_ml: [0.0; DELAY_MAX + 1], frame: 0, rng }
     }
 
-    /// One frame with `alpha_deg` commanded; the area that the camera reports at its end, px^2.
+    /// Lets one frame pass with `alpha_deg` commanded. Returns the area that the camera reports at its end, px^2.
     pub fn frame(&mut self, alpha_deg: f64) -> f32 {
         let before_ml = self.container.poured_ml();
         self.advance(alpha_deg);
@@ -128,15 +131,16 @@ impl Pour {
         // Both numbers are drawn in every frame, so that a change of the flow does not shift the noise of later frames.
         let noise: f64 = StandardNormal.sample(&mut self.rng);
         let dropped = self.rng.random_bool(self.rig.dropouts);
-        let area = 400.0 * seen_ml.powf(self.rig.area_exponent) * self.gain * (self.rig.frame_noise * noise).exp();
+        let area = AREA_AT_1_ML_PX2 * seen_ml.powf(self.rig.area_exponent) * self.gain * (self.rig.frame_noise * noise).exp();
         if dropped || area < AREA_MIN_PX2 { 0.0 } else { area as f32 }
     }
 
-    /// Lets a frame's time pass with `alpha_deg` commanded, without looking.
+    /// Lets one frame pass with `alpha_deg` commanded, without a look through the camera.
     pub fn advance(&mut self, alpha_deg: f64) {
         let dt_s = 1.0 / RATE_HZ / SUBSTEPS as f64;
         for _ in 0..SUBSTEPS {
-            let rate = ((alpha_deg - self.tilt_deg) / self.rig.servo_tau_s).clamp(-self.rig.servo_rate_deg_s, self.rig.servo_rate_deg_s);
+            let rate =
+                ((alpha_deg - self.tilt_deg) / self.rig.servo_time_constant_s).clamp(-self.rig.servo_rate_deg_s, self.rig.servo_rate_deg_s);
             self.tilt_deg += rate * dt_s;
             self.container.step(dt_s, self.tilt_deg);
         }
@@ -147,7 +151,7 @@ impl Pour {
         &self.container
     }
 
-    /// What has left the lip, ml.
+    /// The volume that has left the lip, ml.
     pub fn poured_ml(&self) -> f64 {
         self.container.poured_ml()
     }
@@ -169,12 +173,12 @@ mod tests {
 
     fn areas(seed: u64, delay: usize) -> (Vec<f32>, f64) {
         let rig = Rig { delay_frames: delay, ..Rig::seeded(3) };
-        let mut pour = Pour::new(&rig, rig.container(300.0), seed);
+        let mut pour = RigPour::new(&rig, rig.container(300.0), seed);
         let areas = (0..200).map(|k| pour.frame(f64::from(k) * 0.4)).collect();
         (areas, pour.poured_ml())
     }
 
-    /// Protects reproducibility: a seed fixes the rig and the pour; another one changes them.
+    /// Protects reproducibility: a seed fixes the rig and the pour, and another one changes them.
     #[test]
     fn seeds_fix_the_pour() {
         assert_eq!(areas(5, 2), areas(5, 2));
@@ -183,7 +187,7 @@ mod tests {
         assert_ne!(Rig::seeded(4), Rig::seeded(5));
     }
 
-    /// Protects the delay's meaning: two frames more delay show the same stream two frames later.
+    /// Protects the delay's meaning: with two frames more of it, the same stream shows two frames later.
     #[test]
     fn the_camera_sees_late() {
         let first = |delay| areas(5, delay).0.iter().position(|a| *a > 0.0).unwrap();

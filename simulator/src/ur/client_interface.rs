@@ -1,23 +1,27 @@
-//! The client interfaces 30001 to 30003: programs in, state out.
+//! The client interfaces on the ports 30001 to 30003: programs come in, the robot's state goes out.
 //!
-//! Pure; on the controller's thread. 30001 and 30002 send packages 10 times a second, 30003 one frame a control cycle; the
-//! layouts are those of UR's client interface tables. A program is text: bare lines run as one-line programs, `def` and
-//! `sec` reach up to the `end` in column 0.
+//! Pure; bytes in, bytes out. Runs on the controller's thread; allocates the packages, and for uploads up to the longest
+//! program. Ports 30001 and 30002 send packages 10 times a second, port 30003 sends one package a control cycle; the layouts
+//! are those of UR's client interface tables. A program is text: a bare line runs as a program of one line, `def` and `sec`
+//! reach up to the `end` in column 0. Text that is too long to be a program is thrown away, and the caller is told.
 
-use super::machine::{LogKind, LogLine, Machine, RobotMode, RuntimeState, SafetyMode};
+use super::log::{LogKind, LogLine};
+use super::machine::{Machine, SafetyMode};
+use super::power::RobotMode;
+use super::program::RuntimeState;
 use super::script::MAX_SOURCE_BYTES;
 use super::variables::{Output, Series};
 
 /// Cuts a client's text into programs.
 #[derive(Debug, Default)]
-pub struct Assembler {
+pub struct ProgramAssembler {
     line: Vec<u8>,
     program: Vec<u8>,
     overlong: bool,
 }
 
-impl Assembler {
-    /// Takes received bytes; gives the programs that are complete. Err: text without an end, thrown away.
+impl ProgramAssembler {
+    /// Takes received bytes and gives the programs that are now complete. An error stands for text that was thrown away.
     pub fn feed(&mut self, bytes: &[u8]) -> Vec<Result<String, &'static str>> {
         let mut done = Vec::new();
         for &byte in bytes {
@@ -34,7 +38,7 @@ impl Assembler {
         done
     }
 
-    /// The client closed its side: a last line needs no line end.
+    /// Gives what is left when the client closes its side, because a last line needs no line end.
     pub fn finish(&mut self) -> Option<Result<String, &'static str>> {
         if self.line.is_empty() { None } else { self.end_of_line() }
     }
@@ -44,7 +48,6 @@ impl Assembler {
         let text = String::from_utf8_lossy(&line);
         let text = text.trim_end();
         if self.overlong {
-            // Too long to be a program: nothing of it can be run.
             self.overlong = false;
             self.program.clear();
             return Some(Err("program ignored: longer than 1 MiB"));
@@ -64,109 +67,204 @@ impl Assembler {
     }
 }
 
+/// Where the value of a field of the real-time package comes from.
+#[derive(Debug, Clone, Copy)]
+enum Field {
+    /// An RTDE variable of one or more doubles.
+    Variable(Output),
+    /// This many doubles that are not simulated and read as zero.
+    Zeros(usize),
+    RobotMode,
+    JointModes,
+    SafetyMode,
+    DigitalOutputs,
+    ProgramState,
+}
+
+/// The fields of the real-time package after its size, all of them doubles, by the names of UR's client interface tables.
+const REALTIME_FIELDS: &[(&str, Field)] = &[
+    ("Time", Field::Variable(Output::Timestamp)),
+    ("q target", Field::Variable(Output::TargetQ)),
+    ("qd target", Field::Variable(Output::TargetQd)),
+    ("qdd target", Field::Variable(Output::TargetQdd)),
+    ("I target", Field::Zeros(6)),
+    ("M target", Field::Zeros(6)),
+    ("q actual", Field::Variable(Output::ActualQ)),
+    ("qd actual", Field::Variable(Output::ActualQd)),
+    ("I actual", Field::Zeros(6)),
+    ("I control", Field::Zeros(6)),
+    ("Tool vector actual", Field::Variable(Output::ActualTcpPose)),
+    ("TCP speed actual", Field::Variable(Output::ActualTcpSpeed)),
+    ("TCP force", Field::Zeros(6)),
+    ("Tool vector target", Field::Variable(Output::TargetTcpPose)),
+    ("TCP speed target", Field::Variable(Output::TargetTcpSpeed)),
+    ("Digital input bits", Field::Zeros(1)),
+    ("Motor temperatures", Field::Variable(Output::JointTemperatures)),
+    ("Controller timer", Field::Zeros(1)),
+    ("Test value", Field::Zeros(1)),
+    ("Robot mode", Field::RobotMode),
+    ("Joint modes", Field::JointModes),
+    ("Safety mode", Field::SafetyMode),
+    ("for UR's own use", Field::Zeros(6)),
+    ("Tool accelerometer values", Field::Zeros(3)),
+    ("for UR's own use", Field::Zeros(6)),
+    ("Speed scaling", Field::Variable(Output::SpeedScaling)),
+    ("Linear momentum norm", Field::Zeros(1)),
+    ("for UR's own use", Field::Zeros(2)),
+    ("V main", Field::Variable(Output::ActualMainVoltage)),
+    ("V robot", Field::Variable(Output::ActualRobotVoltage)),
+    ("I robot", Field::Zeros(1)),
+    ("V actual", Field::Variable(Output::ActualJointVoltage)),
+    ("Digital outputs", Field::DigitalOutputs),
+    ("Program state", Field::ProgramState),
+    ("Elbow position", Field::Zeros(3)),
+    ("Elbow velocity", Field::Zeros(3)),
+    ("Safety status", Field::SafetyMode),
+    ("for UR's own use", Field::Zeros(3)),
+];
+
+/// The fields that an e-Series of 5.10 or newer appends, by the names of UR's client interface tables.
+const REALTIME_FIELDS_E_SERIES: &[(&str, Field)] =
+    &[("Payload mass", Field::Zeros(1)), ("Payload CoG", Field::Zeros(3)), ("Payload inertia", Field::Zeros(6))];
+
+/// Length of the size that every package starts with (UR's client interface tables).
+const SIZE_BYTES: usize = 4;
+
 fn doubles(to: &mut Vec<u8>, values: &[f64]) {
     values.iter().for_each(|v| to.extend(v.to_be_bytes()));
 }
 
-/// The frame of 30003: 1140 bytes on a CB3 3.15, 1220 on an e-Series of 5.10 or newer.
-pub fn realtime(machine: &Machine) -> Vec<u8> {
-    let mut frame = vec![0; 4];
-    let to = &mut frame;
-    let put = |to: &mut Vec<u8>, outputs: &[Output]| outputs.iter().for_each(|o| machine.read_output(*o, to));
-    put(to, &[Output::Timestamp, Output::TargetQ, Output::TargetQd, Output::TargetQdd, Output::TargetCurrent, Output::TargetMoment]);
-    put(to, &[Output::ActualQ, Output::ActualQd, Output::ActualCurrent, Output::JointControlOutput]);
-    put(to, &[Output::ActualTcpPose, Output::ActualTcpSpeed, Output::ActualTcpForce, Output::TargetTcpPose, Output::TargetTcpSpeed]);
-    doubles(to, &[0.0]); // digital inputs
-    put(to, &[Output::JointTemperatures, Output::ActualExecutionTime]);
-    doubles(to, &[0.0, f64::from(machine.robot_mode() as i32)]);
-    doubles(to, &[if machine.robot_mode() == RobotMode::PowerOff { 239.0 } else { 253.0 }; 6]);
-    doubles(to, &[f64::from(machine.safety_mode() as i32)]);
-    doubles(to, &[0.0; 6]);
-    put(to, &[Output::ActualToolAccelerometer]);
-    doubles(to, &[0.0; 6]);
-    put(to, &[Output::SpeedScaling, Output::ActualMomentum]);
-    doubles(to, &[0.0; 2]);
-    put(to, &[Output::ActualMainVoltage, Output::ActualRobotVoltage, Output::ActualRobotCurrent, Output::ActualJointVoltage]);
-    doubles(to, &[machine.robot.digital_out as f64, f64::from(machine.runtime_state() as i32)]);
-    doubles(to, &[0.0; 6]); // elbow
-    doubles(to, &[f64::from(machine.safety_mode() as i32)]);
-    doubles(to, &[0.0; 3]);
-    if machine.series() == Series::ESeries {
-        doubles(to, &[0.0; 10]); // payload
+/// The package of port 30003: 1140 bytes on a CB3 3.15, 1220 on an e-Series.
+pub fn realtime_package(machine: &Machine) -> Vec<u8> {
+    let mut package = vec![0; SIZE_BYTES];
+    let to = &mut package;
+    let more = if machine.series() == Series::ESeries { REALTIME_FIELDS_E_SERIES } else { &[] };
+    for (_, field) in REALTIME_FIELDS.iter().chain(more) {
+        match field {
+            Field::Variable(output) => machine.read_output(*output, to),
+            Field::Zeros(count) => to.extend(std::iter::repeat_n(0, count * size_of::<f64>())),
+            Field::RobotMode => doubles(to, &[f64::from(machine.robot_mode() as i32)]),
+            Field::JointModes => doubles(to, &[f64::from(machine.joint_mode()); 6]),
+            Field::SafetyMode => doubles(to, &[f64::from(machine.safety_mode() as i32)]),
+            Field::DigitalOutputs => doubles(to, &[machine.robot.digital_out as f64]),
+            Field::ProgramState => doubles(to, &[f64::from(machine.runtime_state() as i32)]),
+        }
     }
-    let size = frame.len() as u32;
-    frame[..4].copy_from_slice(&size.to_be_bytes());
-    frame
+    let size = package.len() as u32;
+    package[..SIZE_BYTES].copy_from_slice(&size.to_be_bytes());
+    package
 }
 
-fn package(kind: u8, body: &[u8]) -> Vec<u8> {
-    let mut all = ((body.len() + 5) as u32).to_be_bytes().to_vec();
-    all.push(kind);
+/// Puts the size and `package_type` before `body`.
+fn package(package_type: u8, body: &[u8]) -> Vec<u8> {
+    let mut all = ((SIZE_BYTES + 1 + body.len()) as u32).to_be_bytes().to_vec();
+    all.push(package_type);
     all.extend(body);
     all
 }
 
-/// Type of the package that carries state.
+/// Type of the package that carries state (UR's client interface tables).
 const ROBOT_STATE: u8 = 16;
-/// Type of the package that carries a message.
+/// Type of the package that carries a message (UR's client interface tables).
 const ROBOT_MESSAGE: u8 = 20;
+/// Type of the part of a state package with the robot's modes (UR's client interface tables).
+const ROBOT_MODE_DATA: u8 = 0;
+/// Type of the part of a state package with the joints (UR's client interface tables).
+const JOINT_DATA: u8 = 1;
+/// Type of the part of a state package with the tool's pose (UR's client interface tables).
+const CARTESIAN_INFO: u8 = 4;
+/// Source of a message: the robot's interface (UR's client interface tables).
+const SOURCE_ROBOT_INTERFACE: i8 = -2;
+/// Source of a message: the running program (UR's client interface tables).
+const SOURCE_PROGRAM: i8 = -3;
+/// Type of a message with a program's text (UR's client interface tables).
+const TEXT_MESSAGE: u8 = 0;
+/// Type of a message with the controller's version (UR's client interface tables).
+const VERSION_MESSAGE: u8 = 3;
+/// Type of a message about a program's mistake (UR's client interface tables).
+const RUNTIME_EXCEPTION: u8 = 10;
 
-/// The state package of 30001 and 30002: robot mode, joints and Cartesian data.
-pub fn state(machine: &Machine) -> Vec<u8> {
-    let mut body = Vec::new();
-    let mut mode = ((machine.robot.timestamp_s() * 1e6) as u64).to_be_bytes().to_vec();
-    let powered = machine.robot_mode() != RobotMode::PowerOff;
-    let emergency = machine.safety_mode() == SafetyMode::RobotEmergencyStop;
-    let protective = machine.safety_mode() == SafetyMode::ProtectiveStop;
-    let (playing, paused) = (machine.runtime_state() == RuntimeState::Playing, machine.runtime_state() == RuntimeState::Paused);
-    mode.extend([true, true, powered, emergency, protective, playing, paused].map(u8::from));
-    mode.extend([machine.robot_mode() as u8, 0]);
-    doubles(&mut mode, &[machine.robot.speed_scaling(), machine.robot.speed_scaling(), 1.0]);
-    mode.push(0);
-    body.extend(package(0, &mode));
-    let servo = &machine.robot.servo;
-    let mut joints = Vec::new();
-    for i in 0..6 {
-        doubles(&mut joints, &[servo.actual_q[i], servo.target_q[i], servo.actual_qd[i]]);
-        [0.0f32, 48.0, 27.0, 27.0].iter().for_each(|v| joints.extend(v.to_be_bytes()));
-        joints.push(if powered { 253 } else { 239 });
-    }
-    body.extend(package(1, &joints));
-    let mut cartesian = Vec::new();
-    machine.read_output(Output::ActualTcpPose, &mut cartesian);
-    doubles(&mut cartesian, &[0.0; 6]); // TCP offset
-    body.extend(package(4, &cartesian));
-    package(ROBOT_STATE, &body)
+fn timestamp_us(machine: &Machine) -> [u8; 8] {
+    ((machine.robot.timestamp_s() * 1e6) as u64).to_be_bytes()
 }
 
-fn message(machine: &Machine, source: i8, kind: u8, rest: &[u8]) -> Vec<u8> {
-    let mut body = ((machine.robot.timestamp_s() * 1e6) as u64).to_be_bytes().to_vec();
-    body.extend([source as u8, kind]);
+fn robot_mode_data(machine: &Machine) -> Vec<u8> {
+    let mut data = timestamp_us(machine).to_vec();
+    let flags = [
+        true, // A real robot is connected.
+        true, // A real robot is enabled.
+        machine.robot_mode() != RobotMode::PowerOff,
+        machine.safety_mode() == SafetyMode::RobotEmergencyStop,
+        machine.safety_mode() == SafetyMode::ProtectiveStop,
+        machine.runtime_state() == RuntimeState::Playing,
+        machine.runtime_state() == RuntimeState::Paused,
+    ];
+    data.extend(flags.map(u8::from));
+    data.extend([machine.robot_mode() as u8, 0]); // The control mode is "position".
+    let speed = machine.robot.speed_scaling();
+    doubles(&mut data, &[speed, speed, 1.0]); // Target fraction, scaling, and the limit of the fraction.
+    data.push(0); // For UR's own use.
+    data
+}
+
+fn joint_data(machine: &Machine) -> Vec<u8> {
+    let servo = &machine.robot.servo;
+    let mut data = Vec::new();
+    for joint in 0..6 {
+        doubles(&mut data, &[servo.actual_q[joint], servo.target_q[joint], servo.actual_qd[joint]]);
+        // Current in A, voltage in V, temperatures of motor and electronics in degrees Celsius.
+        [0.0f32, 48.0, 27.0, 27.0].iter().for_each(|v| data.extend(v.to_be_bytes()));
+        data.push(machine.joint_mode());
+    }
+    data
+}
+
+fn cartesian_info(machine: &Machine) -> Vec<u8> {
+    let mut data = Vec::new();
+    machine.read_output(Output::ActualTcpPose, &mut data);
+    doubles(&mut data, &[0.0; 6]); // The offset of the TCP from the flange.
+    data
+}
+
+/// The state package of the ports 30001 and 30002: robot mode, joints and the tool's pose.
+pub fn state_package(machine: &Machine) -> Vec<u8> {
+    let parts = [
+        package(ROBOT_MODE_DATA, &robot_mode_data(machine)),
+        package(JOINT_DATA, &joint_data(machine)),
+        package(CARTESIAN_INFO, &cartesian_info(machine)),
+    ];
+    package(ROBOT_STATE, &parts.concat())
+}
+
+fn message_package(machine: &Machine, source: i8, message_type: u8, rest: &[u8]) -> Vec<u8> {
+    let mut body = timestamp_us(machine).to_vec();
+    body.extend([source as u8, message_type]);
     body.extend(rest);
     package(ROBOT_MESSAGE, &body)
 }
 
-/// The version message that starts 30001 and 30002.
-pub fn version(machine: &Machine) -> Vec<u8> {
-    let v = machine.version();
+/// The version message that the ports 30001 and 30002 send first.
+pub fn version_package(machine: &Machine) -> Vec<u8> {
+    let version = machine.version();
     let name = b"URControl";
     let mut rest = vec![name.len() as u8];
     rest.extend(name);
-    rest.extend([v.major as u8, v.minor as u8]);
-    rest.extend(v.bugfix.to_be_bytes());
-    rest.extend(v.build.to_be_bytes());
+    rest.extend([version.major as u8, version.minor as u8]);
+    rest.extend(version.bugfix.to_be_bytes());
+    rest.extend(version.build.to_be_bytes());
     rest.extend(b"01-01-2023, 00:00:00");
-    message(machine, -2, 3, &rest)
+    message_package(machine, SOURCE_ROBOT_INTERFACE, VERSION_MESSAGE, &rest)
 }
 
-/// A log line as 30001 sends it: textmsg as a text message, a mistake of the program as a runtime exception.
-pub fn log_line(machine: &Machine, line: &LogLine) -> Option<Vec<u8>> {
+/// A log line as port 30001 sends it: a program's text as a text message, a mistake as a runtime exception. Events are not
+/// sent.
+pub fn log_package(machine: &Machine, line: &LogLine) -> Option<Vec<u8>> {
     match line.kind {
-        LogKind::Text => Some(message(machine, -3, 0, line.text.as_bytes())),
+        LogKind::Text => Some(message_package(machine, SOURCE_PROGRAM, TEXT_MESSAGE, line.text.as_bytes())),
         LogKind::ProgramError => {
-            let mut rest = 0u64.to_be_bytes().to_vec(); // line and column are in the text
+            let mut rest = 0u64.to_be_bytes().to_vec(); // Line and column stand in the text.
             rest.extend(line.text.as_bytes());
-            Some(message(machine, -3, 10, &rest))
+            Some(message_package(machine, SOURCE_PROGRAM, RUNTIME_EXCEPTION, &rest))
         }
         LogKind::Event => None,
     }

@@ -1,41 +1,63 @@
-//! The dashboard server (29999): one command a line, one answer a line, in UR's words. Pure; on the controller's thread.
+//! The dashboard server on port 29999: one command a line, one answer a line, in UR's words.
+//!
+//! Pure. Runs on the controller's thread; allocates the answers. A command that is unknown, or cannot be carried out now, gets
+//! the answer that a robot gives.
 
-use super::machine::{Machine, RuntimeState};
+use super::machine::Machine;
+use super::program::RuntimeState;
 use super::variables::Series;
 
-/// What a client reads on connecting.
+/// The line that a client reads when it connects (as a robot sends it).
 pub const GREETING: &str = "Connected: Universal Robots Dashboard Server";
 
-/// The answer to one command; None: the client wants to leave.
+/// The commands that an e-Series in local control refuses (UR's dashboard server manual); it still answers questions.
+const REMOTE_ONLY: [&str; 7] = ["play", "stop", "pause", "power on", "power off", "brake release", "unlock protective stop"];
+
+/// The answer to one command. None when the client wants to leave.
 pub fn answer(line: &str, machine: &mut Machine) -> Option<String> {
     let line = line.trim();
     let lower = line.to_ascii_lowercase();
-    let failed = || format!("Failed to execute: {line}");
-    let version = machine.version();
-    let e_series = machine.series() == Series::ESeries;
-    let said = match lower.as_str() {
-        "quit" | "exit" => return None,
-        // In local control an e-Series answers questions only.
-        "play" | "stop" | "pause" | "power on" | "power off" | "brake release" | "unlock protective stop" if !machine.remote_control() => {
-            failed()
-        }
-        "play" => if_done(machine.resume(), "Starting program", failed),
-        // The same with no program: ur_rtde ends its program itself and still wants to hear this.
+    if lower == "quit" || lower == "exit" {
+        return None;
+    }
+    if REMOTE_ONLY.contains(&lower.as_str()) {
+        return Some(carry_out(&lower, machine).unwrap_or_else(|| format!("Failed to execute: {line}")));
+    }
+    Some(question(&lower, line, machine))
+}
+
+/// Carries out one of the [`REMOTE_ONLY`] commands. None when that is not possible now.
+fn carry_out(command: &str, machine: &mut Machine) -> Option<String> {
+    if !machine.remote_control() {
+        return None;
+    }
+    let said = match command {
+        "play" => machine.resume().then_some("Starting program")?,
         "stop" => {
             machine.stop_program();
-            "Stopped".to_owned()
+            // The answer is the same when there is no program: ur_rtde ends its program itself and still expects this answer.
+            "Stopped"
         }
-        "pause" => if_done(machine.pause(), "Pausing program", failed),
-        "power on" => if_done(machine.power_on(), "Powering on", failed),
+        "pause" => machine.pause().then_some("Pausing program")?,
+        "power on" => machine.power_on().then_some("Powering on")?,
         "power off" => {
             machine.power_off();
-            "Powering off".to_owned()
+            "Powering off"
         }
-        "brake release" => if_done(machine.brake_release(), "Brake releasing", failed),
-        "unlock protective stop" => match machine.unlock_protective_stop() {
-            Ok(()) => "Protective stop releasing".to_owned(),
-            Err(answer) => answer.to_owned(),
+        "brake release" => machine.brake_release().then_some("Brake releasing")?,
+        _ => match machine.unlock_protective_stop() {
+            Ok(()) => "Protective stop releasing",
+            Err(answer) => answer,
         },
+    };
+    Some(said.to_owned())
+}
+
+/// The answer to all other commands, which change nothing. `line` is the command `lower` as the client wrote it.
+fn question(lower: &str, line: &str, machine: &Machine) -> String {
+    let version = machine.version();
+    let e_series = machine.series() == Series::ESeries;
+    match lower {
         "running" => format!("Program running: {}", machine.runtime_state() == RuntimeState::Playing),
         "robotmode" => format!("Robotmode: {}", machine.robot_mode().name()),
         "safetymode" => format!("Safetymode: {}", machine.safety_mode().name()),
@@ -65,10 +87,5 @@ pub fn answer(line: &str, machine: &mut Machine) -> Option<String> {
         _ if lower.starts_with("addtolog") => "Added log message".to_owned(),
         _ if lower.starts_with("load ") => format!("File not found: {}", line[5..].trim()),
         _ => format!("could not understand: '{line}'"),
-    };
-    Some(said)
-}
-
-fn if_done(done: bool, said: &str, failed: impl Fn() -> String) -> String {
-    if done { said.to_owned() } else { failed() }
+    }
 }

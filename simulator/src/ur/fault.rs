@@ -1,42 +1,43 @@
-//! What can go wrong with a controller, by name: `fin`, `stall=2`, `in-use=input_int_register_24`, ...
+//! What can go wrong with a controller, by name: `fin`, `stall=2`, `in-use=input_int_register_24` and so on.
 //!
-//! Pure. The same words are used on the command line, on the operator port and in tests; [`Fault`] reads and writes them.
+//! Pure; allocates for names and messages. The command line, the operator port and tests use the same words; [`Fault`] reads
+//! and writes them. A text that names no fault is an error which says what is wrong with it.
 
 use std::fmt;
 use std::str::FromStr;
 
 use super::variables::Input;
 
-/// A fault, or the end of one.
+/// A fault, or the end of one. Times are in s.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Fault {
-    /// Closes all RTDE connections in order (FIN).
+    /// All RTDE connections are closed in order (FIN).
     Fin,
-    /// Aborts all RTDE connections (RST).
+    /// All RTDE connections are aborted (RST).
     Reset,
-    /// All sockets close, and nobody answers for this long, s: a controller that restarts, a pulled cable.
+    /// All sockets close and nothing answers for this long, as when a controller restarts or a cable is pulled.
     Offline(f64),
-    /// RTDE connections stay open but nothing is sent or read for this long, s: half open.
+    /// RTDE connections stay open for this long, but nothing is sent or read: they are half open.
     Stall(f64),
-    /// RTDE keeps sending, but always the same frame, for this long, s: a timestamp that stands still.
+    /// RTDE keeps sending the same packet for this long, so that its timestamp stands still.
     Freeze(f64),
-    /// What RTDE clients send is not read for this long, s, and then all at once.
+    /// What RTDE clients send is not read for this long, and then all at once.
     SlowReader(f64),
-    /// RTDE outputs of this many cycles are skipped.
+    /// The RTDE outputs of this many cycles are skipped.
     SkipOutputs(u32),
-    /// RTDE bytes arrive in pieces for this long, s.
+    /// RTDE bytes arrive in pieces for this long.
     Split(f64),
-    /// RTDE frames arrive four at a time for this long, s.
+    /// RTDE packets arrive four at a time for this long.
     Coalesce(f64),
     /// A fieldbus owns this input from now on.
     InUse(String),
-    /// This variable is unknown from now on.
+    /// The variable of this name is unknown from now on.
     NotFound(String),
     /// Protocol version 2 is refused from now on.
     RefuseVersion2,
-    /// Sends an RTDE text message to every client now.
+    /// Every RTDE client gets this text message now.
     Text(String),
-    /// Sends an RTDE text message to every client that connects from now on, before anything else.
+    /// Every RTDE client that connects from now on gets this text message before anything else.
     TextOnConnect(String),
     /// The arm hit something.
     ProtectiveStop,
@@ -44,7 +45,7 @@ pub enum Fault {
     EmergencyStop,
     /// The emergency stop button is released.
     EmergencyRelease,
-    /// Programs start this much later from now on, s.
+    /// Programs start this much later from now on.
     LateStart(f64),
     /// The program is stopped on the pendant.
     ProgramStop,
@@ -52,25 +53,25 @@ pub enum Fault {
     ProgramPause,
     /// The pendant's speed slider is moved to this share of full speed.
     SpeedSlider(f64),
-    /// e-Series: the pendant is switched to local control.
+    /// The pendant of an e-Series is switched to local control.
     LocalControl,
-    /// e-Series: the pendant is switched to remote control.
+    /// The pendant of an e-Series is switched to remote control.
     RemoteControl,
-    /// Ends every fault that lasts; does not heal the robot.
+    /// Every fault that lasts ends. This does not heal the robot.
     Clear,
 }
 
-/// The faults with the meaning of what follows the `=`, for `--help`.
+/// The faults for `--help`, one a line, with the meaning of what follows the `=`.
 pub const HELP: &str = "\
 fin                   close the RTDE connections
 reset                 abort the RTDE connections (RST)
 offline=SECONDS       close everything and be unreachable
 stall=SECONDS         RTDE stays open but is silent and deaf (half open)
-freeze=SECONDS        RTDE repeats one frame: its timestamp stands still
+freeze=SECONDS        RTDE repeats one packet: its timestamp stands still
 slow-reader=SECONDS   RTDE inputs are read late, then all at once
 skip-outputs=CYCLES   leave out RTDE outputs
-split=SECONDS         RTDE frames arrive in pieces
-coalesce=SECONDS      RTDE frames arrive four at a time
+split=SECONDS         RTDE packets arrive in pieces
+coalesce=SECONDS      RTDE packets arrive four at a time
 in-use=INPUT          a fieldbus owns this input variable
 not-found=VARIABLE    this variable does not exist
 refuse-version-2      RTDE protocol version 2 is refused
@@ -87,16 +88,16 @@ local-control         e-Series: programs are ignored
 remote-control        e-Series: programs are taken again
 clear                 end every fault that lasts";
 
-/// Text that names no fault.
+/// A text that names no fault: the text, and what is wrong with it.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[error("fault \"{0}\": {1}")]
-pub struct ParseError(String, String);
+pub struct UnknownFault(String, String);
 
 impl FromStr for Fault {
-    type Err = ParseError;
+    type Err = UnknownFault;
 
-    fn from_str(text: &str) -> Result<Self, ParseError> {
-        let fail = |what: &str| ParseError(text.to_owned(), what.to_owned());
+    fn from_str(text: &str) -> Result<Self, UnknownFault> {
+        let fail = |what: &str| UnknownFault(text.to_owned(), what.to_owned());
         let (name, value) = match text.split_once('=') {
             Some((name, value)) => (name.trim(), Some(value.trim())),
             None => (text.trim(), None),

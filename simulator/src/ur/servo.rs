@@ -1,66 +1,70 @@
-//! The arm: what servoj, stopj and movej do to the six joints. Pure; one step per control cycle; no allocation.
+//! The arm: what servoj, speedj, stopj and movej do to the six joints.
 //!
-//! servoj is modelled as UR's script manual describes its parameters: the position is projected forward by the lookahead time
-//! along the present velocity, and the gain acts like the P-term of a PID controller on what then remains. Per joint
+//! Pure, one step a control cycle, on the controller's thread; does not allocate but for the reason of an error. servoj is
+//! modelled as UR's script manual describes its parameters: the position is projected forward by the lookahead time along the
+//! present velocity, and the gain acts like the P-term of a PID controller on what then remains. For each joint
 //!
 //! `target_qdd = gain * (q_commanded - (target_q + lookahead * target_qd))`
 //!
-//! so a ramp is followed `lookahead` seconds late. Speed is clipped at the UR5's 180 deg/s, acceleration at 40 rad/s^2 (UR
-//! publishes none; it is what ur_rtde allows). The joints follow target_q through a first-order lag, so that target_q,
-//! target_qd and actual_q are three different things, as on a robot. A demand that no arm could follow is a protective stop.
+//! so that a ramp is followed `lookahead` seconds late. Speed and acceleration are limited. The joints follow target_q through
+//! a first-order lag, so that target_q, target_qd and actual_q are three different things, as on a robot. A demand that no arm
+//! could follow is refused with the reason for a protective stop.
 
-/// Largest joint speed of a UR5, rad/s (180 deg/s).
+/// Largest joint speed in rad/s: the UR5's 180 deg/s (UR5 data sheet).
 pub const MAX_SPEED_RAD_S: f64 = std::f64::consts::PI;
-/// Largest joint acceleration, rad/s^2.
+/// Largest joint acceleration in rad/s^2. UR publishes none; this is the most that ur_rtde lets a client ask for.
 pub const MAX_ACCELERATION_RAD_S2: f64 = 40.0;
-/// Range of every joint of a UR5, rad (+-360 deg).
+/// Range of every joint to both sides in rad: the UR5's 360 degrees (UR5 data sheet).
 pub const RANGE_RAD: f64 = 2.0 * std::f64::consts::PI;
-/// Largest difference between two servoj targets in a row, rad. UR publishes no figure; 33 ms at full speed are 0.105 rad.
+/// Largest difference of one joint between two servoj targets in a row, in rad. UR publishes no figure; this is chosen by hand,
+/// as twice what a joint moves in 33 ms at full speed.
 pub const MAX_STEP_RAD: f64 = 0.2;
-/// Largest distance of a servoj target from target_q, rad: the most that the largest lookahead leaves at full speed is 0.63.
+/// Largest distance of a servoj target from target_q, in rad. UR publishes no figure; this is chosen by hand, above the 0.63
+/// rad that the largest lookahead leaves at full speed.
 pub const MAX_LAG_RAD: f64 = 0.8;
-/// Deceleration when a program ends or is paused while the arm moves, rad/s^2.
+/// Deceleration when a program ends or is paused while the arm moves, in rad/s^2. Chosen by hand; no measurement is recorded.
 pub const STOP_RAD_S2: f64 = 10.0;
-/// Deceleration of a protective or emergency stop, rad/s^2.
-pub const FAST_STOP_RAD_S2: f64 = 40.0;
-/// Time constant of the joints' lag behind target_q, s.
+/// Deceleration of a protective or emergency stop, in rad/s^2: as fast as the arm can be accelerated at all.
+pub const FAST_STOP_RAD_S2: f64 = MAX_ACCELERATION_RAD_S2;
+/// Time constant of the joints' lag behind target_q, in s. Chosen by hand; no measurement is recorded.
 const LAG_S: f64 = 0.012;
-/// Steps of the servoj equation in a control cycle last at most this long, s.
+/// Longest step in which the servoj equation is solved, in s. Chosen by hand, well below the shortest lookahead of 30 ms.
 const SUBSTEP_S: f64 = 0.001;
-/// Joint names for messages.
+/// Names of the joints for messages, base to wrist 3 (as on UR's pendant).
 const NAMES: [&str; 6] = ["base", "shoulder", "elbow", "wrist 1", "wrist 2", "wrist 3"];
 
+/// What moves the arm at present.
 #[derive(Debug, Clone, Copy, PartialEq)]
-enum Mode {
+enum Motion {
     Hold,
     Servoj { lookahead_s: f64, gain: f64 },
     Stop { deceleration_rad_s2: f64 },
-    Speed { goal_qd: [f64; 6], acceleration_rad_s2: f64 },
-    Move { goal: [f64; 6], acceleration_rad_s2: f64, speed_rad_s: f64 },
+    Speedj { goal_qd: [f64; 6], acceleration_rad_s2: f64 },
+    Movej { goal: [f64; 6], acceleration_rad_s2: f64, speed_rad_s: f64 },
 }
 
 /// The six joints; angles in rad, speeds in rad/s, accelerations in rad/s^2.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Servo {
-    /// What the last servoj or movej asked for.
+    /// The joint angles that the last servoj or movej asked for.
     pub commanded_q: [f64; 6],
-    /// Calls of servoj so far.
+    /// Number of calls of servoj so far.
     pub servoj_calls: u64,
-    /// Where the trajectory is.
+    /// Where the trajectory is, which the joints follow.
     pub target_q: [f64; 6],
-    /// Its speed.
+    /// The trajectory's speed.
     pub target_qd: [f64; 6],
-    /// Its acceleration.
+    /// The trajectory's acceleration.
     pub target_qdd: [f64; 6],
     /// Where the joints are.
     pub actual_q: [f64; 6],
-    /// Their speed.
+    /// The joints' speed.
     pub actual_qd: [f64; 6],
-    mode: Mode,
+    motion: Motion,
 }
 
 impl Servo {
-    /// At rest at `q` (rad).
+    /// An arm at rest at `q` (rad).
     pub fn new(q: [f64; 6]) -> Self {
         let zero = [0.0; 6];
         Self {
@@ -71,11 +75,14 @@ impl Servo {
             target_qdd: zero,
             actual_q: q,
             actual_qd: zero,
-            mode: Mode::Hold,
+            motion: Motion::Hold,
         }
     }
 
-    /// Follows `q` (rad) from now on. Err: the reason for a protective stop.
+    /// Follows `q` (rad) from now on.
+    ///
+    /// # Errors
+    /// The reason for a protective stop.
     pub fn servoj(&mut self, q: [f64; 6], lookahead_s: f64, gain: f64) -> Result<(), String> {
         let before = if self.is_servoing() { self.commanded_q } else { self.target_q };
         for (i, name) in NAMES.iter().enumerate() {
@@ -95,22 +102,25 @@ impl Servo {
         }
         self.commanded_q = q;
         self.servoj_calls += 1;
-        self.mode = Mode::Servoj { lookahead_s, gain };
+        self.motion = Motion::Servoj { lookahead_s, gain };
         Ok(())
     }
 
     /// Slows all joints down to rest.
     pub fn stop(&mut self, deceleration_rad_s2: f64) {
-        self.mode = Mode::Stop { deceleration_rad_s2 };
+        self.motion = Motion::Stop { deceleration_rad_s2 };
     }
 
-    /// Goes to `goal` (rad), joints in step. Err: the reason for a protective stop.
+    /// Goes to `goal` (rad) with all joints in step.
+    ///
+    /// # Errors
+    /// The reason for a protective stop.
     pub fn movej(&mut self, goal: [f64; 6], acceleration_rad_s2: f64, speed_rad_s: f64) -> Result<(), String> {
         if let Some(i) = goal.iter().position(|q| q.is_nan() || q.abs() > RANGE_RAD) {
             return Err(format!("movej target of {} is {} rad, outside +-{RANGE_RAD:.4}", NAMES[i], goal[i]));
         }
         self.commanded_q = goal;
-        self.mode = Mode::Move {
+        self.motion = Motion::Movej {
             goal,
             acceleration_rad_s2: acceleration_rad_s2.min(MAX_ACCELERATION_RAD_S2),
             speed_rad_s: speed_rad_s.min(MAX_SPEED_RAD_S),
@@ -118,52 +128,41 @@ impl Servo {
         Ok(())
     }
 
-    /// Goes to the joint speeds `goal_qd` (rad/s) and keeps them. Err: the reason for a protective stop.
+    /// Goes to the joint speeds `goal_qd` (rad/s) and keeps them.
+    ///
+    /// # Errors
+    /// The reason for a protective stop.
     pub fn speedj(&mut self, goal_qd: [f64; 6], acceleration_rad_s2: f64) -> Result<(), String> {
         if let Some(i) = goal_qd.iter().position(|v| v.is_nan() || v.abs() > 2.0 * MAX_SPEED_RAD_S) {
             return Err(format!("speedj of {} is {} rad/s, more than twice what it can do", NAMES[i], goal_qd[i]));
         }
-        self.mode = Mode::Speed { goal_qd, acceleration_rad_s2: acceleration_rad_s2.min(MAX_ACCELERATION_RAD_S2) };
+        self.motion = Motion::Speedj { goal_qd, acceleration_rad_s2: acceleration_rad_s2.min(MAX_ACCELERATION_RAD_S2) };
         Ok(())
     }
 
     /// True while servoj moves the arm.
     pub fn is_servoing(&self) -> bool {
-        matches!(self.mode, Mode::Servoj { .. })
+        matches!(self.motion, Motion::Servoj { .. })
     }
 
-    /// True when no trajectory moves the arm and it stands.
+    /// True when the arm stands still and no movej is under way.
     pub fn is_still(&self) -> bool {
-        !matches!(self.mode, Mode::Move { .. }) && self.target_qd.iter().all(|v| v.abs() < 1e-9)
+        !matches!(self.motion, Motion::Movej { .. }) && self.target_qd.iter().all(|v| v.abs() < 1e-9)
     }
 
     /// Lets `dt_s` pass.
     pub fn step(&mut self, dt_s: f64) {
         let before_qd = self.target_qd;
-        match self.mode {
-            Mode::Hold => self.target_qd = [0.0; 6],
-            Mode::Servoj { lookahead_s, gain } => {
-                let substeps = (dt_s / SUBSTEP_S).ceil();
-                let h = dt_s / substeps;
-                for _ in 0..substeps as u32 {
-                    for i in 0..6 {
-                        // Implicit in the speed: stable for every allowed gain and lookahead.
-                        let (q, v) = (self.target_q[i], self.target_qd[i]);
-                        let wanted = (v + h * gain * (self.commanded_q[i] - q)) / (1.0 + h * gain * (lookahead_s + h));
-                        let most = MAX_ACCELERATION_RAD_S2 * h;
-                        let speed = (v + (wanted - v).clamp(-most, most)).clamp(-MAX_SPEED_RAD_S, MAX_SPEED_RAD_S);
-                        self.target_qd[i] = speed;
-                        self.target_q[i] += h * speed;
-                    }
-                }
-            }
-            Mode::Stop { deceleration_rad_s2 } => {
+        match self.motion {
+            Motion::Hold => self.target_qd = [0.0; 6],
+            Motion::Servoj { lookahead_s, gain } => self.step_servoj(lookahead_s, gain, dt_s),
+            Motion::Stop { deceleration_rad_s2 } => {
                 self.slow_down(deceleration_rad_s2, dt_s);
                 if self.target_qd == [0.0; 6] {
-                    self.mode = Mode::Hold;
+                    self.motion = Motion::Hold;
                 }
             }
-            Mode::Speed { goal_qd, acceleration_rad_s2 } => {
+            Motion::Speedj { goal_qd, acceleration_rad_s2 } => {
                 let most = acceleration_rad_s2 * dt_s;
                 for (i, goal) in goal_qd.iter().enumerate() {
                     let goal = goal.clamp(-MAX_SPEED_RAD_S, MAX_SPEED_RAD_S);
@@ -171,7 +170,7 @@ impl Servo {
                     self.target_q[i] = (self.target_q[i] + self.target_qd[i] * dt_s).clamp(-RANGE_RAD, RANGE_RAD);
                 }
             }
-            Mode::Move { goal, acceleration_rad_s2, speed_rad_s } => self.step_move(goal, acceleration_rad_s2, speed_rad_s, dt_s),
+            Motion::Movej { goal, acceleration_rad_s2, speed_rad_s } => self.step_movej(goal, acceleration_rad_s2, speed_rad_s, dt_s),
         }
         let share = 1.0 - (-dt_s / LAG_S).exp();
         for (i, before) in before_qd.iter().enumerate() {
@@ -182,7 +181,24 @@ impl Servo {
         }
     }
 
-    /// All joints in proportion, so that the arm stays on its path.
+    /// Solves the servoj equation for one cycle.
+    fn step_servoj(&mut self, lookahead_s: f64, gain: f64, dt_s: f64) {
+        let substeps = (dt_s / SUBSTEP_S).ceil();
+        let h = dt_s / substeps;
+        for _ in 0..substeps as u32 {
+            for i in 0..6 {
+                // The equation is implicit in the speed, which makes it stable for every allowed gain and lookahead.
+                let (q, v) = (self.target_q[i], self.target_qd[i]);
+                let wanted = (v + h * gain * (self.commanded_q[i] - q)) / (1.0 + h * gain * (lookahead_s + h));
+                let most = MAX_ACCELERATION_RAD_S2 * h;
+                let speed = (v + (wanted - v).clamp(-most, most)).clamp(-MAX_SPEED_RAD_S, MAX_SPEED_RAD_S);
+                self.target_qd[i] = speed;
+                self.target_q[i] += h * speed;
+            }
+        }
+    }
+
+    /// Slows all joints down in proportion, so that the arm stays on its path.
     fn slow_down(&mut self, deceleration_rad_s2: f64, dt_s: f64) {
         let fastest = self.target_qd.iter().fold(0.0f64, |m, v| m.max(v.abs()));
         let left = (fastest - deceleration_rad_s2 * dt_s).max(0.0);
@@ -195,18 +211,18 @@ impl Servo {
     }
 
     /// One cycle of a trapezoidal motion along the straight line in joint space.
-    fn step_move(&mut self, goal: [f64; 6], acceleration: f64, speed: f64, dt_s: f64) {
+    fn step_movej(&mut self, goal: [f64; 6], acceleration: f64, speed: f64, dt_s: f64) {
         let way: [f64; 6] = std::array::from_fn(|i| goal[i] - self.target_q[i]);
         let longest = way.iter().fold(0.0f64, |m, v| m.max(v.abs()));
         let now = self.target_qd.iter().fold(0.0f64, |m, v| m.max(v.abs()));
-        // The speed from which the arm can still stop at the goal, one cycle further on.
+        // From the allowed speed the arm can still stop at the goal after one more cycle.
         let brake = acceleration * dt_s / 2.0;
         let allowed = (brake * brake + 2.0 * acceleration * longest).sqrt() - brake;
         let next = (now + acceleration * dt_s).min(speed).min(allowed.max(0.0));
         if longest <= next * dt_s || longest < 1e-9 {
             self.target_q = goal;
             self.target_qd = [0.0; 6];
-            self.mode = Mode::Hold;
+            self.motion = Motion::Hold;
             return;
         }
         for (i, way) in way.iter().enumerate() {

@@ -1,21 +1,24 @@
-//! RTDE's variables: names, types, since which controller version, and where inputs are kept.
+//! RTDE's variables: their names, their types on the wire, and the controller versions that have them.
 //!
-//! Pure; source: section "Field names and associated types" of UR's RTDE guide. Used on the controller's thread.
+//! Pure. Runs on the controller's thread and does not allocate. The source of all names, types and versions is the section
+//! "Field names and associated types" of UR's RTDE guide. A name that a controller does not have gives None.
+
+use super::registers::{BITS, NUMBERS};
 
 /// Controller generation.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, serde::Serialize, serde::Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Series {
-    /// CB3: 125 cycles a second.
+    /// CB3, with 125 control cycles a second.
     Cb3,
-    /// e-Series: 500 cycles a second.
+    /// e-Series, with 500 control cycles a second.
     ESeries,
 }
 
 /// Controller version.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 pub struct Version {
-    /// 3 for CB3, 5 for the e-Series.
+    /// First number: 3 for CB3, 5 for the e-Series.
     pub major: u32,
     /// Second number.
     pub minor: u32,
@@ -34,7 +37,7 @@ impl Series {
         }
     }
 
-    /// The version a controller of this generation has unless told otherwise.
+    /// The version that a controller of this generation has unless it is told otherwise.
     pub fn default_version(self) -> Version {
         match self {
             Series::Cb3 => Version { major: 3, minor: 15, bugfix: 8, build: 106_339 },
@@ -43,130 +46,216 @@ impl Series {
     }
 }
 
-impl Version {
-    /// True if the version is not older than the one named for its generation; None: never had it.
-    fn has(&self, cb3: Option<(u32, u32)>, e_series: Option<(u32, u32)>) -> bool {
-        let since = if self.major < 5 { cb3 } else { e_series };
-        since.is_some_and(|s| (self.major, self.minor) >= s)
+/// The first version, as (major, minor), of each generation that has a variable; None for a generation that never had it.
+#[derive(Debug, Clone, Copy)]
+struct Since {
+    cb3: Option<(u32, u32)>,
+    e_series: Option<(u32, u32)>,
+}
+
+impl Since {
+    fn includes(self, version: &Version) -> bool {
+        let first = if version.major < 5 { self.cb3 } else { self.e_series };
+        first.is_some_and(|first| (version.major, version.minor) >= first)
     }
 }
 
-/// Type of a variable on the wire.
+const fn since(cb3: (u32, u32), e_series: (u32, u32)) -> Since {
+    Since { cb3: Some(cb3), e_series: Some(e_series) }
+}
+
+const fn e_series_since(major: u32, minor: u32) -> Since {
+    Since { cb3: None, e_series: Some((major, minor)) }
+}
+
+/// Every version has the variable (UR's RTDE guide).
+const ALWAYS: Since = since((0, 0), (0, 0));
+/// The registers above number 23 and the single bit registers exist since these versions (UR's RTDE guide).
+const UPPER_REGISTERS: Since = since((3, 9), (5, 3));
+/// Number of int and of double registers before there were upper ones (UR's RTDE guide).
+const LOWER_NUMBERS: u8 = 24;
+/// First bit register that is a variable of its own; the lower ones are read and written 32 at a time (UR's RTDE guide).
+const FIRST_SINGLE_BIT: u8 = 64;
+
+/// Type of a variable on the wire; numbers are big-endian.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Type {
-    /// 1 byte, 0 or not.
+pub enum WireType {
+    /// One byte, which is 0 for false.
     Bool,
-    /// 1 byte.
+    /// One byte.
     Uint8,
-    /// 4 bytes.
+    /// Four bytes.
     Int32,
-    /// 4 bytes.
+    /// Four bytes.
     Uint32,
-    /// 8 bytes.
+    /// Eight bytes.
     Uint64,
-    /// IEEE 754, 8 bytes.
+    /// An IEEE 754 number of eight bytes.
     Double,
     /// Three doubles.
     Vector3d,
     /// Six doubles.
     Vector6d,
-    /// Six INT32.
+    /// Six signed numbers of four bytes.
     Vector6Int32,
 }
 
-impl Type {
-    /// Its name in recipe answers.
+impl WireType {
+    /// The type's name in the answer to a recipe.
     pub fn name(self) -> &'static str {
         match self {
-            Type::Bool => "BOOL",
-            Type::Uint8 => "UINT8",
-            Type::Int32 => "INT32",
-            Type::Uint32 => "UINT32",
-            Type::Uint64 => "UINT64",
-            Type::Double => "DOUBLE",
-            Type::Vector3d => "VECTOR3D",
-            Type::Vector6d => "VECTOR6D",
-            Type::Vector6Int32 => "VECTOR6INT32",
+            WireType::Bool => "BOOL",
+            WireType::Uint8 => "UINT8",
+            WireType::Int32 => "INT32",
+            WireType::Uint32 => "UINT32",
+            WireType::Uint64 => "UINT64",
+            WireType::Double => "DOUBLE",
+            WireType::Vector3d => "VECTOR3D",
+            WireType::Vector6d => "VECTOR6D",
+            WireType::Vector6Int32 => "VECTOR6INT32",
         }
     }
 
-    /// Bytes of a value.
+    /// Length of a value in bytes.
     pub fn bytes(self) -> usize {
         match self {
-            Type::Bool | Type::Uint8 => 1,
-            Type::Int32 | Type::Uint32 => 4,
-            Type::Uint64 | Type::Double => 8,
-            Type::Vector3d | Type::Vector6Int32 => 24,
-            Type::Vector6d => 48,
+            WireType::Bool | WireType::Uint8 => 1,
+            WireType::Int32 | WireType::Uint32 => 4,
+            WireType::Uint64 | WireType::Double => 8,
+            WireType::Vector3d | WireType::Vector6Int32 => 24,
+            WireType::Vector6d => 48,
         }
     }
 }
 
 /// A variable that clients read.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-#[allow(missing_docs)] // the names are the protocol's
+#[allow(missing_docs)] // The names are those of the protocol.
 pub enum Output {
     Timestamp,
     TargetQ,
     TargetQd,
     TargetQdd,
-    TargetCurrent,
-    TargetMoment,
     ActualQ,
     ActualQd,
-    ActualCurrent,
-    ActualCurrentAsTorque,
-    JointControlOutput,
     ActualTcpPose,
     ActualTcpSpeed,
-    ActualTcpForce,
     TargetTcpPose,
     TargetTcpSpeed,
     JointTemperatures,
     ActualJointVoltage,
     JointMode,
-    ActualToolAccelerometer,
-    ActualDigitalInputBits,
     ActualDigitalOutputBits,
     RobotMode,
     SafetyMode,
-    SafetyStatus,
     RuntimeState,
     RobotStatusBits,
     SafetyStatusBits,
     SpeedScaling,
     TargetSpeedFraction,
-    ActualMomentum,
     ActualMainVoltage,
     ActualRobotVoltage,
-    ActualRobotCurrent,
-    ActualExecutionTime,
-    StandardAnalogInput,
     StandardAnalogOutput(u8),
-    Payload,
-    PayloadCog,
-    PayloadInertia,
     ScriptControlLine,
-    FtRawWrench,
     IntRegister(u8),
     DoubleRegister(u8),
     BitRegister(u8),
-    /// 32 bits from this one on.
+    /// 32 bit registers from this number on.
     BitRegisters(u8),
-    /// An input read back.
+    /// An input variable, which clients may read back.
     Input(Input),
-    /// Something that this arm has not (a tool, an elbow to watch): always 0.
-    Zero(Type),
+    /// A variable that is not simulated and always reads as zero.
+    Zero(WireType),
 }
+
+/// The outputs that are not numbered registers, with the versions that have them (UR's RTDE guide).
+const OUTPUTS: &[(&str, Output, Since)] = {
+    use Output::*;
+    use WireType::{Double, Int32, Uint8, Uint32, Uint64, Vector3d, Vector6d};
+    &[
+        ("timestamp", Timestamp, ALWAYS),
+        ("target_q", TargetQ, ALWAYS),
+        ("target_qd", TargetQd, ALWAYS),
+        ("target_qdd", TargetQdd, ALWAYS),
+        ("target_current", Zero(Vector6d), ALWAYS),
+        ("target_moment", Zero(Vector6d), ALWAYS),
+        ("actual_q", ActualQ, ALWAYS),
+        ("actual_qd", ActualQd, ALWAYS),
+        ("actual_current", Zero(Vector6d), ALWAYS),
+        ("actual_current_as_torque", Zero(Vector6d), e_series_since(5, 23)),
+        ("actual_current_window", Zero(Vector6d), ALWAYS),
+        ("joint_control_output", Zero(Vector6d), ALWAYS),
+        ("actual_TCP_pose", ActualTcpPose, ALWAYS),
+        ("actual_TCP_speed", ActualTcpSpeed, ALWAYS),
+        ("actual_TCP_force", Zero(Vector6d), ALWAYS),
+        ("target_TCP_pose", TargetTcpPose, ALWAYS),
+        ("target_TCP_speed", TargetTcpSpeed, ALWAYS),
+        ("joint_temperatures", JointTemperatures, ALWAYS),
+        ("actual_joint_voltage", ActualJointVoltage, ALWAYS),
+        ("joint_mode", JointMode, ALWAYS),
+        ("joint_position_deviation_ratio", Zero(Double), ALWAYS),
+        ("actual_tool_accelerometer", Zero(Vector3d), ALWAYS),
+        ("actual_digital_input_bits", Zero(Uint64), ALWAYS),
+        ("actual_digital_output_bits", ActualDigitalOutputBits, ALWAYS),
+        ("actual_configurable_digital_input_bits", Zero(Uint64), ALWAYS),
+        ("actual_configurable_digital_output_bits", Zero(Uint64), ALWAYS),
+        ("robot_mode", RobotMode, ALWAYS),
+        ("safety_mode", SafetyMode, ALWAYS),
+        ("safety_status", SafetyMode, since((3, 10), (5, 4))),
+        ("runtime_state", RuntimeState, ALWAYS),
+        ("robot_status_bits", RobotStatusBits, ALWAYS),
+        ("safety_status_bits", SafetyStatusBits, ALWAYS),
+        ("speed_scaling", SpeedScaling, ALWAYS),
+        ("target_speed_fraction", TargetSpeedFraction, ALWAYS),
+        ("actual_momentum", Zero(Double), ALWAYS),
+        ("actual_main_voltage", ActualMainVoltage, ALWAYS),
+        ("actual_robot_voltage", ActualRobotVoltage, ALWAYS),
+        ("actual_robot_current", Zero(Double), ALWAYS),
+        ("actual_execution_time", Zero(Double), ALWAYS),
+        ("io_current", Zero(Double), ALWAYS),
+        ("analog_io_types", Zero(Uint32), ALWAYS),
+        ("standard_analog_input0", Zero(Double), ALWAYS),
+        ("standard_analog_input1", Zero(Double), ALWAYS),
+        ("standard_analog_output0", StandardAnalogOutput(0), ALWAYS),
+        ("standard_analog_output1", StandardAnalogOutput(1), ALWAYS),
+        ("payload", Zero(Double), since((3, 11), (5, 5))),
+        ("payload_cog", Zero(Vector3d), since((3, 11), (5, 5))),
+        ("payload_inertia", Zero(Vector6d), since((3, 15), (5, 11))),
+        ("tcp_offset", Zero(Vector6d), ALWAYS),
+        ("tcp_force_scalar", Zero(Double), ALWAYS),
+        ("elbow_position", Zero(Vector3d), ALWAYS),
+        ("elbow_velocity", Zero(Vector3d), ALWAYS),
+        ("script_control_line", ScriptControlLine, since((3, 14), (5, 9))),
+        ("ft_raw_wrench", Zero(Vector6d), e_series_since(5, 9)),
+        ("tool_mode", Zero(Uint32), ALWAYS),
+        ("tool_analog_input_types", Zero(Uint32), ALWAYS),
+        ("tool_analog_input0", Zero(Double), ALWAYS),
+        ("tool_analog_input1", Zero(Double), ALWAYS),
+        ("tool_output_voltage", Zero(Int32), ALWAYS),
+        ("tool_output_current", Zero(Double), ALWAYS),
+        ("tool_temperature", Zero(Double), ALWAYS),
+        ("tool_output_mode", Zero(Uint8), e_series_since(5, 2)),
+        ("tool_digital_output0_mode", Zero(Uint8), e_series_since(5, 2)),
+        ("tool_digital_output1_mode", Zero(Uint8), e_series_since(5, 2)),
+        ("encoder0_raw", Zero(Int32), ALWAYS),
+        ("encoder1_raw", Zero(Int32), ALWAYS),
+        ("euromap67_input_bits", Zero(Uint32), ALWAYS),
+        ("euromap67_output_bits", Zero(Uint32), ALWAYS),
+        ("euromap67_24V_voltage", Zero(Double), ALWAYS),
+        ("euromap67_24V_current", Zero(Double), ALWAYS),
+        ("output_bit_registers0_to_31", BitRegisters(0), ALWAYS),
+        ("output_bit_registers32_to_63", BitRegisters(32), ALWAYS),
+    ]
+};
 
 /// A variable that clients write.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-#[allow(missing_docs)] // the names are the protocol's
+#[allow(missing_docs)] // The names are those of the protocol.
 pub enum Input {
     IntRegister(u8),
     DoubleRegister(u8),
     BitRegister(u8),
-    /// 32 bits from this one on.
+    /// 32 bit registers from this number on.
     BitRegisters(u8),
     SpeedSliderMask,
     SpeedSliderFraction,
@@ -182,7 +271,30 @@ pub enum Input {
     ExternalForceTorque,
 }
 
-/// `prefix` followed by a number of `low` to `high`.
+/// The inputs that are not numbered registers, with their types (UR's RTDE guide).
+const INPUTS: &[(&str, Input, WireType)] = {
+    use Input::*;
+    use WireType::{Double, Uint8, Uint32, Vector6d};
+    &[
+        ("input_bit_registers0_to_31", BitRegisters(0), Uint32),
+        ("input_bit_registers32_to_63", BitRegisters(32), Uint32),
+        ("speed_slider_mask", SpeedSliderMask, Uint32),
+        ("speed_slider_fraction", SpeedSliderFraction, Double),
+        ("standard_digital_output_mask", StandardDigitalOutputMask, Uint8),
+        ("configurable_digital_output_mask", ConfigurableDigitalOutputMask, Uint8),
+        ("tool_digital_output_mask", ToolDigitalOutputMask, Uint8),
+        ("standard_digital_output", StandardDigitalOutput, Uint8),
+        ("configurable_digital_output", ConfigurableDigitalOutput, Uint8),
+        ("tool_digital_output", ToolDigitalOutput, Uint8),
+        ("standard_analog_output_mask", StandardAnalogOutputMask, Uint8),
+        ("standard_analog_output_type", StandardAnalogOutputType, Uint8),
+        ("standard_analog_output_0", StandardAnalogOutput(0), Double),
+        ("standard_analog_output_1", StandardAnalogOutput(1), Double),
+        ("external_force_torque", ExternalForceTorque, Vector6d),
+    ]
+};
+
+/// The number from `low` to `high` that follows `prefix` in `name`.
 fn numbered(name: &str, prefix: &str, low: u8, high: u8) -> Option<u8> {
     let digits = name.strip_prefix(prefix)?;
     if digits.len() > 1 && digits.starts_with('0') || !digits.bytes().all(|b| b.is_ascii_digit()) {
@@ -194,229 +306,92 @@ fn numbered(name: &str, prefix: &str, low: u8, high: u8) -> Option<u8> {
 impl Output {
     /// The variable of this name, if a controller of this version has it.
     pub fn parse(name: &str, version: &Version) -> Option<Self> {
-        use Output::*;
-        let found = match name {
-            "timestamp" => Timestamp,
-            "target_q" => TargetQ,
-            "target_qd" => TargetQd,
-            "target_qdd" => TargetQdd,
-            "target_current" => TargetCurrent,
-            "target_moment" => TargetMoment,
-            "actual_q" => ActualQ,
-            "actual_qd" => ActualQd,
-            "actual_current" => ActualCurrent,
-            "actual_current_as_torque" if version.has(None, Some((5, 23))) => ActualCurrentAsTorque,
-            "joint_control_output" => JointControlOutput,
-            "actual_TCP_pose" => ActualTcpPose,
-            "actual_TCP_speed" => ActualTcpSpeed,
-            "actual_TCP_force" => ActualTcpForce,
-            "target_TCP_pose" => TargetTcpPose,
-            "target_TCP_speed" => TargetTcpSpeed,
-            "joint_temperatures" => JointTemperatures,
-            "actual_joint_voltage" => ActualJointVoltage,
-            "joint_mode" => JointMode,
-            "actual_tool_accelerometer" => ActualToolAccelerometer,
-            "actual_digital_input_bits" => ActualDigitalInputBits,
-            "actual_digital_output_bits" => ActualDigitalOutputBits,
-            "robot_mode" => RobotMode,
-            "safety_mode" => SafetyMode,
-            "safety_status" if version.has(Some((3, 10)), Some((5, 4))) => SafetyStatus,
-            "runtime_state" => RuntimeState,
-            "robot_status_bits" => RobotStatusBits,
-            "safety_status_bits" => SafetyStatusBits,
-            "speed_scaling" => SpeedScaling,
-            "target_speed_fraction" => TargetSpeedFraction,
-            "actual_momentum" => ActualMomentum,
-            "actual_main_voltage" => ActualMainVoltage,
-            "actual_robot_voltage" => ActualRobotVoltage,
-            "actual_robot_current" => ActualRobotCurrent,
-            "actual_execution_time" => ActualExecutionTime,
-            "standard_analog_input0" | "standard_analog_input1" => StandardAnalogInput,
-            "standard_analog_output0" => StandardAnalogOutput(0),
-            "standard_analog_output1" => StandardAnalogOutput(1),
-            "payload" if version.has(Some((3, 11)), Some((5, 5))) => Payload,
-            "payload_cog" if version.has(Some((3, 11)), Some((5, 5))) => PayloadCog,
-            "payload_inertia" if version.has(Some((3, 15)), Some((5, 11))) => PayloadInertia,
-            "script_control_line" if version.has(Some((3, 14)), Some((5, 9))) => ScriptControlLine,
-            "ft_raw_wrench" if version.has(None, Some((5, 9))) => FtRawWrench,
-            "analog_io_types" | "tool_mode" | "tool_analog_input_types" | "euromap67_input_bits" | "euromap67_output_bits" => {
-                Zero(Type::Uint32)
-            }
-            "tool_analog_input0"
-            | "tool_analog_input1"
-            | "tool_output_current"
-            | "tool_temperature"
-            | "io_current"
-            | "tcp_force_scalar"
-            | "joint_position_deviation_ratio"
-            | "euromap67_24V_voltage"
-            | "euromap67_24V_current" => Zero(Type::Double),
-            "tool_output_voltage" | "encoder0_raw" | "encoder1_raw" => Zero(Type::Int32),
-            "tool_output_mode" | "tool_digital_output0_mode" | "tool_digital_output1_mode" if version.has(None, Some((5, 2))) => {
-                Zero(Type::Uint8)
-            }
-            "actual_configurable_digital_input_bits" | "actual_configurable_digital_output_bits" => Zero(Type::Uint64),
-            "tcp_offset" | "actual_current_window" => Zero(Type::Vector6d),
-            "elbow_position" | "elbow_velocity" => Zero(Type::Vector3d),
-            "output_bit_registers0_to_31" => BitRegisters(0),
-            "output_bit_registers32_to_63" => BitRegisters(32),
-            _ => {
-                let upper = version.has(Some((3, 9)), Some((5, 3)));
-                let last = if upper { 47 } else { 23 };
-                numbered(name, "output_int_register_", 0, last)
-                    .map(IntRegister)
-                    .or_else(|| numbered(name, "output_double_register_", 0, last).map(DoubleRegister))
-                    .or_else(|| numbered(name, "output_bit_register_", 64, 127).filter(|_| upper).map(BitRegister))
-                    .or_else(|| name.starts_with("input_").then(|| self::Input::parse_for(name, version)).flatten().map(Input))?
-            }
-        };
-        Some(found)
+        if let Some((_, output, since)) = OUTPUTS.iter().find(|(n, ..)| *n == name) {
+            return Some(*output).filter(|_| since.includes(version));
+        }
+        let upper = UPPER_REGISTERS.includes(version);
+        let last = if upper { NUMBERS as u8 - 1 } else { LOWER_NUMBERS - 1 };
+        numbered(name, "output_int_register_", 0, last)
+            .map(Output::IntRegister)
+            .or_else(|| numbered(name, "output_double_register_", 0, last).map(Output::DoubleRegister))
+            .or_else(|| numbered(name, "output_bit_register_", FIRST_SINGLE_BIT, BITS as u8 - 1).filter(|_| upper).map(Output::BitRegister))
+            .or_else(|| name.starts_with("input_").then(|| Input::parse_for(name, version)).flatten().map(Output::Input))
     }
 
-    /// Its type.
-    pub fn kind(self) -> Type {
+    /// The variable's type on the wire.
+    pub fn wire_type(self) -> WireType {
         use Output::*;
         match self {
-            JointMode => Type::Vector6Int32,
-            ActualToolAccelerometer | PayloadCog => Type::Vector3d,
-            ActualDigitalInputBits | ActualDigitalOutputBits => Type::Uint64,
-            RobotMode | SafetyMode | SafetyStatus | IntRegister(_) => Type::Int32,
-            RuntimeState | RobotStatusBits | SafetyStatusBits | ScriptControlLine | BitRegisters(_) => Type::Uint32,
+            JointMode => WireType::Vector6Int32,
+            ActualDigitalOutputBits => WireType::Uint64,
+            RobotMode | SafetyMode | IntRegister(_) => WireType::Int32,
+            RuntimeState | RobotStatusBits | SafetyStatusBits | ScriptControlLine | BitRegisters(_) => WireType::Uint32,
             Timestamp
             | SpeedScaling
             | TargetSpeedFraction
-            | ActualMomentum
             | ActualMainVoltage
             | ActualRobotVoltage
-            | ActualRobotCurrent
-            | ActualExecutionTime
-            | StandardAnalogInput
             | StandardAnalogOutput(_)
-            | Payload
-            | DoubleRegister(_) => Type::Double,
-            BitRegister(_) => Type::Bool,
-            Input(input) => input.kind(),
-            Zero(kind) => kind,
-            TargetQ
-            | TargetQd
-            | TargetQdd
-            | TargetCurrent
-            | TargetMoment
-            | ActualQ
-            | ActualQd
-            | ActualCurrent
-            | ActualCurrentAsTorque
-            | JointControlOutput
-            | ActualTcpPose
-            | ActualTcpSpeed
-            | ActualTcpForce
-            | TargetTcpPose
-            | TargetTcpSpeed
-            | JointTemperatures
-            | ActualJointVoltage
-            | PayloadInertia
-            | FtRawWrench => Type::Vector6d,
+            | DoubleRegister(_) => WireType::Double,
+            BitRegister(_) => WireType::Bool,
+            Input(input) => input.wire_type(),
+            Zero(wire_type) => wire_type,
+            TargetQ | TargetQd | TargetQdd | ActualQ | ActualQd | ActualTcpPose | ActualTcpSpeed | TargetTcpPose | TargetTcpSpeed
+            | JointTemperatures | ActualJointVoltage => WireType::Vector6d,
         }
     }
 }
 
+/// First slot after those of the int registers, the double registers, and the single bit registers (follows from their numbers).
+const FIRST_OTHER_SLOT: usize = 2 * NUMBERS + BITS - FIRST_SINGLE_BIT as usize;
+
 impl Input {
-    /// Number of distinct places an input can have; see [`Input::slot`].
-    pub const SLOTS: usize = 256;
+    /// Number of distinct slots of inputs; see [`Input::slot`].
+    pub const SLOTS: usize = FIRST_OTHER_SLOT + INPUTS.len();
 
     /// The input of this name on the newest controller.
     pub fn parse(name: &str) -> Option<Self> {
-        use Input::*;
-        let found = match name {
-            "speed_slider_mask" => SpeedSliderMask,
-            "speed_slider_fraction" => SpeedSliderFraction,
-            "standard_digital_output_mask" => StandardDigitalOutputMask,
-            "configurable_digital_output_mask" => ConfigurableDigitalOutputMask,
-            "tool_digital_output_mask" => ToolDigitalOutputMask,
-            "standard_digital_output" => StandardDigitalOutput,
-            "configurable_digital_output" => ConfigurableDigitalOutput,
-            "tool_digital_output" => ToolDigitalOutput,
-            "standard_analog_output_mask" => StandardAnalogOutputMask,
-            "standard_analog_output_type" => StandardAnalogOutputType,
-            "standard_analog_output_0" => StandardAnalogOutput(0),
-            "standard_analog_output_1" => StandardAnalogOutput(1),
-            "external_force_torque" => ExternalForceTorque,
-            "input_bit_registers0_to_31" => BitRegisters(0),
-            "input_bit_registers32_to_63" => BitRegisters(32),
-            _ => numbered(name, "input_int_register_", 0, 47)
-                .map(IntRegister)
-                .or_else(|| numbered(name, "input_double_register_", 0, 47).map(DoubleRegister))
-                .or_else(|| numbered(name, "input_bit_register_", 64, 127).map(BitRegister))?,
-        };
-        Some(found)
+        if let Some((_, input, _)) = INPUTS.iter().find(|(n, ..)| *n == name) {
+            return Some(*input);
+        }
+        numbered(name, "input_int_register_", 0, NUMBERS as u8 - 1)
+            .map(Input::IntRegister)
+            .or_else(|| numbered(name, "input_double_register_", 0, NUMBERS as u8 - 1).map(Input::DoubleRegister))
+            .or_else(|| numbered(name, "input_bit_register_", FIRST_SINGLE_BIT, BITS as u8 - 1).map(Input::BitRegister))
     }
 
     /// The input of this name, if a controller of this version has it.
     pub fn parse_for(name: &str, version: &Version) -> Option<Self> {
         Self::parse(name).filter(|input| match input {
-            Input::IntRegister(n) | Input::DoubleRegister(n) if *n >= 24 => version.has(Some((3, 9)), Some((5, 3))),
-            Input::BitRegister(_) => version.has(Some((3, 9)), Some((5, 3))),
+            Input::IntRegister(n) | Input::DoubleRegister(n) if *n >= LOWER_NUMBERS => UPPER_REGISTERS.includes(version),
+            Input::BitRegister(_) => UPPER_REGISTERS.includes(version),
             _ => true,
         })
     }
 
-    /// Its type.
-    pub fn kind(self) -> Type {
-        use Input::*;
+    /// Place of this input in [`INPUTS`]; 0 for a numbered register, which has none.
+    fn place(self) -> usize {
+        INPUTS.iter().position(|(_, input, _)| *input == self).unwrap_or(0)
+    }
+
+    /// The input's type on the wire.
+    pub fn wire_type(self) -> WireType {
         match self {
-            IntRegister(_) => Type::Int32,
-            DoubleRegister(_) | SpeedSliderFraction | StandardAnalogOutput(_) => Type::Double,
-            BitRegister(_) => Type::Bool,
-            BitRegisters(_) | SpeedSliderMask => Type::Uint32,
-            ExternalForceTorque => Type::Vector6d,
-            StandardDigitalOutputMask
-            | ConfigurableDigitalOutputMask
-            | ToolDigitalOutputMask
-            | StandardDigitalOutput
-            | ConfigurableDigitalOutput
-            | ToolDigitalOutput
-            | StandardAnalogOutputMask
-            | StandardAnalogOutputType => Type::Uint8,
+            Input::IntRegister(_) => WireType::Int32,
+            Input::DoubleRegister(_) => WireType::Double,
+            Input::BitRegister(_) => WireType::Bool,
+            other => INPUTS[other.place()].2,
         }
     }
 
-    /// A number of its own, below [`Input::SLOTS`]: who owns it and when it was last written are kept under it.
+    /// A number below [`Input::SLOTS`] that no other input has. Who owns an input and when it was last written are kept under
+    /// this number.
     pub fn slot(self) -> usize {
-        use Input::*;
         match self {
-            IntRegister(n) => usize::from(n),
-            DoubleRegister(n) => 48 + usize::from(n),
-            BitRegister(n) => 96 + usize::from(n - 64),
-            BitRegisters(n) => 160 + usize::from(n / 32),
-            SpeedSliderMask => 170,
-            SpeedSliderFraction => 171,
-            StandardDigitalOutputMask => 172,
-            ConfigurableDigitalOutputMask => 173,
-            ToolDigitalOutputMask => 174,
-            StandardDigitalOutput => 175,
-            ConfigurableDigitalOutput => 176,
-            ToolDigitalOutput => 177,
-            StandardAnalogOutputMask => 178,
-            StandardAnalogOutputType => 179,
-            StandardAnalogOutput(n) => 180 + usize::from(n),
-            ExternalForceTorque => 182,
+            Input::IntRegister(n) => usize::from(n),
+            Input::DoubleRegister(n) => NUMBERS + usize::from(n),
+            Input::BitRegister(n) => 2 * NUMBERS + usize::from(n - FIRST_SINGLE_BIT),
+            other => FIRST_OTHER_SLOT + other.place(),
         }
-    }
-}
-
-/// Values of all registers of one direction.
-#[derive(Debug, Clone, PartialEq)]
-pub struct Registers {
-    /// int registers 0 to 47.
-    pub int: [i32; 48],
-    /// double registers 0 to 47.
-    pub double: [f64; 48],
-    /// bit registers 0 to 127, bit n is register n.
-    pub bits: u128,
-}
-
-impl Default for Registers {
-    fn default() -> Self {
-        Self { int: [0; 48], double: [0.0; 48], bits: 0 }
     }
 }

@@ -49,8 +49,8 @@ pub fn check(episodes: &[Episode]) -> Findings {
         if usable.left_out.iter().any(|(name, _)| *name == e.name) {
             continue;
         }
-        let n = e.frames.len().max(1) as f64;
-        let share = |f: &dyn Fn(&shared::episode::Frame) -> bool| e.frames.iter().filter(|x| f(x)).count() as f64 / n;
+        let n = e.rows.len().max(1) as f64;
+        let share = |f: &dyn Fn(&shared::episode::EpisodeRow) -> bool| e.rows.iter().filter(|x| f(x)).count() as f64 / n;
         let mut doubt = |what: String| doubts.push((e.name.clone(), what));
         let lost = share(&|f| f.lost);
         if lost > GAPS {
@@ -63,16 +63,16 @@ pub fn check(episodes: &[Episode]) -> Findings {
                 100.0 * clipped
             ));
         }
-        let last = e.frames.last().map_or(0.0, |f| f64::from(f.alpha_commanded_deg));
+        let last = e.rows.last().map_or(0.0, |f| f64::from(f.alpha_commanded_deg));
         if last > RETURNED_DEG {
             doubt(format!("the angle never returns ({last:.0} degrees at the end): the last volume is not seen; record until upright"));
         }
-        let rising = e.frames.first().map_or(0.0, |f| f64::from(f.alpha_commanded_deg));
+        let rising = e.rows.first().map_or(0.0, |f| f64::from(f.alpha_commanded_deg));
         if rising > RETURNED_DEG {
             doubt(format!("starts at {rising:.0} degrees, not upright: what flowed before is on the scale but not in the images"));
         }
-        let flowing_at_end = e.frames.iter().rev().take(3).all(|f| f.area_px2 > 0.0);
-        if flowing_at_end && e.frames.len() > 3 {
+        let flowing_at_end = e.rows.iter().rev().take(3).all(|f| f.area_px2 > 0.0);
+        if flowing_at_end && e.rows.len() > 3 {
             doubt("still flowing in the last frames: record until the stream has ended".into());
         }
     }

@@ -4,10 +4,12 @@
 
 use std::path::PathBuf;
 
-use crate::data;
+use shared::actions::ACTIONS;
 use shared::exit::{self, Failure, OrExit as _};
-use shared::policy::{ACTIONS, HIDDEN, INPUTS, PARAMETERS};
+use shared::mlp::{HIDDEN, INPUTS, PARAMETERS};
 use shared::weights::{Estimator, FORMAT_VERSION, Weights};
+
+use crate::data;
 
 /// Command-line arguments of `trainer inspect`.
 #[derive(Debug, clap::Args)]

@@ -6,7 +6,7 @@
 
 use std::io::{BufRead, IsTerminal, Write};
 
-use shared::episode::{Episode, Kind};
+use shared::episode::{Episode, EpisodeKind};
 use shared::exit::{self, Failure, OrExit as _, failure};
 
 use super::train::Target;
@@ -39,7 +39,7 @@ pub fn pours(episodes: &[Episode]) -> Vec<(usize, f64, f64, f64)> {
     let mut ordered: Vec<&Episode> = episodes.iter().collect();
     ordered.sort_by(|a, b| (a.info.started_at_utc.as_str(), a.name.as_str()).cmp(&(b.info.started_at_utc.as_str(), b.name.as_str())));
     let weighed = ordered.into_iter().filter_map(|e| match (e.kind, e.weight_g) {
-        (Kind::Pour { goal_ml }, Some(weight)) => Some((f64::from(goal_ml), weight)),
+        (EpisodeKind::Pour { goal_ml }, Some(weight)) => Some((f64::from(goal_ml), weight)),
         _ => None,
     });
     weighed

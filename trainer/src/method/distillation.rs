@@ -7,7 +7,8 @@
 use rand::{RngExt, SeedableRng};
 use rand_pcg::Pcg64Mcg;
 use rayon::prelude::*;
-use shared::policy::{InputScale, Mlp, argmax};
+use shared::actions::BACK_DEG_PER_FRAME;
+use shared::mlp::{InputScale, Mlp, argmax};
 
 use super::control_law::ControlLaw;
 use super::model_pour::{MAX_FRAMES, PossiblePours};
@@ -64,7 +65,7 @@ impl Distillation<'_> {
             let label = self.law.decide(pour.v_ml, d_ml);
             let x = self.scale.apply(pour.v_ml.map(|v| v as f32), d_ml as f32);
             // The frames of the way back teach what d <= 0 means; a few of them are enough.
-            examples.push(Example { x, action: self.actions.discretise(label.unwrap_or(-3.2)), weight: 1.0 });
+            examples.push(Example { x, action: self.actions.discretise(label.unwrap_or(BACK_DEG_PER_FRAME.into())), weight: 1.0 });
             let asked = match network {
                 Some(network) => Some(f64::from(self.actions.angles_deg[argmax(&network.forward(&x))])),
                 None => label,

@@ -7,6 +7,7 @@ use nalgebra::DMatrix;
 use rand::{RngExt, SeedableRng};
 use rand_distr::{Distribution, StandardNormal};
 use rand_pcg::Pcg64Mcg;
+use shared::actions::BACK_DEG_PER_FRAME;
 use shared::estimator::flow::{CommandHistory, FlowModel, FlowState, FlowTables, WayBack};
 use shared::estimator::{Calibration, Hold};
 use shared::limits::{Limiter, Limits};
@@ -152,7 +153,7 @@ impl ModelPour<'_> {
         let alpha_deg = f64::from(match dalpha_deg {
             Some(d) => self.limiter.step(self.limiter.alpha_deg() + d as f32),
             None if self.pours.fused => self.limiter.step_upright(),
-            None => self.limiter.step(self.limiter.alpha_deg() - 3.2),
+            None => self.limiter.step(self.limiter.alpha_deg() + BACK_DEG_PER_FRAME),
         });
         self.history.push(alpha_deg);
         let leaves_ml = self.state.step(&self.flow, self.history.commands(), 0).leaves_ml;

@@ -4,10 +4,10 @@
 //!
 //! Offline, pure, allocates; the same episodes, options and seed give the same weights on any number of threads.
 
-use shared::agent::Selection;
+use shared::actions::Selection;
 use shared::estimator::flow::WayBack;
 use shared::limits::Limits;
-use shared::policy::{InputScale, Mlp};
+use shared::mlp::{InputScale, Mlp};
 use shared::weights::{Estimator, Method, Origin, Weights};
 
 use super::control_law::{self, ControlLaw, SearchSize};
@@ -53,7 +53,7 @@ pub fn train(episodes: &[TrainingEpisode], options: &Options, progress: &dyn Pro
     progress.stage("teaching the network", DISTILLATION.total_steps() as u64);
     let (network, loss) = distillation.run(options.seed, |k, loss| progress.at(k as u64, &format!("loss {loss:.3}")));
     let weights = Weights {
-        policy: network.to_mlp().unwrap_or(Mlp::ZERO),
+        network: network.to_mlp().unwrap_or(Mlp::ZERO),
         actions_deg: distillation.actions.angles_deg,
         selection: Selection::Argmax,
         scale: distillation.scale,

@@ -18,11 +18,11 @@
 
 use rand::{RngExt, SeedableRng};
 use rand_pcg::Pcg64Mcg;
-use shared::agent::Selection;
+use shared::actions::Selection;
 use shared::estimator::flow::{FlowTables, WayBack};
 use shared::estimator::fused::FusedEstimator;
 use shared::estimator::{Calibration, Hold};
-use shared::policy::{InputScale, Mlp};
+use shared::mlp::{InputScale, Mlp};
 use shared::weights::{Estimator, Method, Origin, Weights};
 
 use crate::actions::Actions;
@@ -223,7 +223,7 @@ pub fn train(episodes: &[TrainingEpisode], options: &Options, progress: &dyn Pro
     let examples = examples(&recipe.sequences(episodes, &calibration, &estimator), options.method);
     let (network, loss) = learn(&examples, &recipe, options, progress);
     let weights = Weights {
-        policy: network.to_mlp().unwrap_or(Mlp::ZERO),
+        network: network.to_mlp().unwrap_or(Mlp::ZERO),
         actions_deg: recipe.actions.angles_deg,
         selection: if options.method == MethodName::Paper { Selection::Expected } else { Selection::Argmax },
         scale: recipe.scale,

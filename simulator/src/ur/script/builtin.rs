@@ -1,140 +1,129 @@
 //! The functions built into URScript that this controller knows, with UR's parameter names.
 //!
-//! Pure but for the robot they act on. A function that a robot does not have is not here: `abs`, `min` and `max` do not
-//! exist in URScript (script manual, "Module urmath").
+//! Runs on the controller's thread; allocates for lists and texts, within the limits of [`super::value`]. A wrong argument is an
+//! error of the program. A function that a robot does not have is not here: `abs`, `min` and `max` do not exist in URScript
+//! (script manual, "Module urmath").
 
 use super::value::Value;
-use crate::ur::machine::{Robot, WatchdogAction};
+use crate::ur::kinematics;
+use crate::ur::registers::{BITS, NUMBERS};
+use crate::ur::robot::Robot;
 use crate::ur::variables::Input;
+use crate::ur::watchdog::WatchdogAction;
 
 /// What a call leaves behind.
 pub enum Effect {
-    /// A result; the thread goes on.
+    /// The call has a result, and the thread goes on.
     Value(Value),
     /// The thread waits for the next control cycle.
     Cycle,
-    /// The thread waits for `time_s`, independent of speed scaling.
-    Sleep {
-        /// s
-        time_s: f64,
-    },
-    /// A servoj: the thread waits for `time_s`, stretched by speed scaling.
-    Servo {
-        /// s
-        time_s: f64,
-    },
-    /// A motion that the thread waits out.
+    /// The thread waits for `time_s` (in s), whatever the speed slider says.
+    Sleep { time_s: f64 },
+    /// The thread waits for `time_s` (in s) of a servoj, which a lower speed slider stretches.
+    Servo { time_s: f64 },
+    /// The thread waits until the arm stands still.
     Motion,
 }
 
+type Outcome = Result<Effect, String>;
+
 /// A built-in function.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Builtin {
-    Acos,
-    Asin,
-    Atan,
-    Atan2,
-    Ceil,
-    Cos,
-    D2r,
-    Floor,
-    Length,
-    Log,
-    Norm,
-    Pow,
-    R2d,
-    Sin,
-    Sqrt,
-    Tan,
-    StrCat,
-    StrLen,
-    ToStr,
-    GetSteptime,
-    GetActualJointPositions,
-    GetActualJointSpeeds,
-    GetTargetJointPositions,
-    GetTargetJointSpeeds,
-    GetActualTcpPose,
-    GetTargetTcpPose,
-    IsSteady,
-    ReadInputInteger,
-    ReadInputFloat,
-    ReadInputBoolean,
-    ReadOutputInteger,
-    ReadOutputFloat,
-    ReadOutputBoolean,
-    WriteOutputInteger,
-    WriteOutputFloat,
-    WriteOutputBoolean,
-    SetStandardDigitalOut,
-    GetStandardDigitalIn,
-    RtdeSetWatchdog,
-    Textmsg,
-    Sync,
-    Sleep,
-    Servoj,
-    Stopj,
-    Stopl,
-    Movej,
+#[derive(Debug)]
+pub struct BuiltinFunction {
+    /// The function's name.
+    pub name: &'static str,
+    /// Names of its parameters.
+    pub parameters: &'static [&'static str],
+    /// How many of the parameters must be given.
+    pub required: usize,
+    /// Carries the call out. The slice has one value for each parameter, [`Value::None`] for those left out.
+    pub call: fn(&[Value], &mut Robot) -> Outcome,
 }
 
-/// Name, function, parameters, and how many of them must be given.
-pub type Entry = (&'static str, Builtin, &'static [&'static str], usize);
+const fn function(
+    name: &'static str,
+    parameters: &'static [&'static str],
+    required: usize,
+    call: fn(&[Value], &mut Robot) -> Outcome,
+) -> BuiltinFunction {
+    BuiltinFunction { name, parameters, required, call }
+}
 
-use Builtin::*;
+/// The built-in function of this name.
+pub fn find(name: &str) -> Option<&'static BuiltinFunction> {
+    FUNCTIONS.iter().find(|f| f.name == name)
+}
 
-/// All built-in functions.
-pub const TABLE: &[Entry] = &[
-    ("acos", Acos, &["f"], 1),
-    ("asin", Asin, &["f"], 1),
-    ("atan", Atan, &["f"], 1),
-    ("atan2", Atan2, &["x", "y"], 2),
-    ("ceil", Ceil, &["f"], 1),
-    ("cos", Cos, &["f"], 1),
-    ("d2r", D2r, &["d"], 1),
-    ("floor", Floor, &["f"], 1),
-    ("get_list_length", Length, &["v"], 1),
-    ("length", Length, &["v"], 1),
-    ("log", Log, &["b", "f"], 2),
-    ("norm", Norm, &["a"], 1),
-    ("pow", Pow, &["base", "exponent"], 2),
-    ("r2d", R2d, &["r"], 1),
-    ("sin", Sin, &["f"], 1),
-    ("sqrt", Sqrt, &["f"], 1),
-    ("tan", Tan, &["f"], 1),
-    ("str_cat", StrCat, &["op1", "op2"], 2),
-    ("str_len", StrLen, &["str"], 1),
-    ("to_str", ToStr, &["val"], 1),
-    ("get_steptime", GetSteptime, &[], 0),
-    ("get_actual_joint_positions", GetActualJointPositions, &[], 0),
-    ("get_actual_joint_speeds", GetActualJointSpeeds, &[], 0),
-    ("get_target_joint_positions", GetTargetJointPositions, &[], 0),
-    ("get_target_joint_speeds", GetTargetJointSpeeds, &[], 0),
-    ("get_actual_tcp_pose", GetActualTcpPose, &[], 0),
-    ("get_target_tcp_pose", GetTargetTcpPose, &[], 0),
-    ("is_steady", IsSteady, &[], 0),
-    ("read_input_integer_register", ReadInputInteger, &["address"], 1),
-    ("read_input_float_register", ReadInputFloat, &["address"], 1),
-    ("read_input_boolean_register", ReadInputBoolean, &["address"], 1),
-    ("read_output_integer_register", ReadOutputInteger, &["address"], 1),
-    ("read_output_float_register", ReadOutputFloat, &["address"], 1),
-    ("read_output_boolean_register", ReadOutputBoolean, &["address"], 1),
-    ("write_output_integer_register", WriteOutputInteger, &["address", "value"], 2),
-    ("write_output_float_register", WriteOutputFloat, &["address", "value"], 2),
-    ("write_output_boolean_register", WriteOutputBoolean, &["address", "value"], 2),
-    ("set_standard_digital_out", SetStandardDigitalOut, &["n", "b"], 2),
-    ("get_standard_digital_in", GetStandardDigitalIn, &["n"], 1),
-    ("rtde_set_watchdog", RtdeSetWatchdog, &["variable_name", "min_frequency", "action"], 2),
-    ("textmsg", Textmsg, &["s1", "s2"], 1),
-    ("sync", Sync, &[], 0),
-    ("sleep", Sleep, &["t"], 1),
-    ("servoj", Servoj, &["q", "a", "v", "t", "lookahead_time", "gain"], 1),
-    ("stopj", Stopj, &["a"], 1),
-    ("stopl", Stopl, &["a", "aRot"], 1),
-    ("movej", Movej, &["q", "a", "v", "t", "r"], 1),
+/// All built-in functions that are simulated, with the parameters that UR's script manual names.
+static FUNCTIONS: &[BuiltinFunction] = &[
+    function("acos", &["f"], 1, |a, _| float(number_in(&a[0], "f", -1.0, 1.0)?.acos())),
+    function("asin", &["f"], 1, |a, _| float(number_in(&a[0], "f", -1.0, 1.0)?.asin())),
+    function("atan", &["f"], 1, |a, _| float(a[0].number()?.atan())),
+    function("atan2", &["x", "y"], 2, |a, _| float(a[0].number()?.atan2(a[1].number()?))),
+    function("ceil", &["f"], 1, |a, _| whole(a[0].number()?.ceil())),
+    function("cos", &["f"], 1, |a, _| float(a[0].number()?.cos())),
+    function("d2r", &["d"], 1, |a, _| float(a[0].number()?.to_radians())),
+    function("floor", &["f"], 1, |a, _| whole(a[0].number()?.floor())),
+    function("get_list_length", &["v"], 1, |a, _| length(&a[0])),
+    function("length", &["v"], 1, |a, _| length(&a[0])),
+    function("log", &["b", "f"], 2, |a, _| float(a[1].number()?.log(a[0].number()?))),
+    function("norm", &["a"], 1, |a, _| norm(&a[0])),
+    function("pow", &["base", "exponent"], 2, |a, _| float(a[0].number()?.powf(a[1].number()?))),
+    function("r2d", &["r"], 1, |a, _| float(a[0].number()?.to_degrees())),
+    function("sin", &["f"], 1, |a, _| float(a[0].number()?.sin())),
+    function("sqrt", &["f"], 1, |a, _| float(a[0].number()?.sqrt())),
+    function("tan", &["f"], 1, |a, _| float(a[0].number()?.tan())),
+    function("str_cat", &["op1", "op2"], 2, |a, _| value(Value::text(&format!("{}{}", a[0], a[1]))?)),
+    function("str_len", &["str"], 1, |a, _| value(Value::Int(a[0].str()?.len() as i32))),
+    function("to_str", &["val"], 1, |a, _| value(Value::text(&a[0].to_string())?)),
+    function("get_steptime", &[], 0, |_, robot| value(Value::Float(robot.steptime_s()))),
+    function("get_actual_joint_positions", &[], 0, |_, robot| value(Value::floats(&robot.servo.actual_q))),
+    function("get_actual_joint_speeds", &[], 0, |_, robot| value(Value::floats(&robot.servo.actual_qd))),
+    function("get_target_joint_positions", &[], 0, |_, robot| value(Value::floats(&robot.servo.target_q))),
+    function("get_target_joint_speeds", &[], 0, |_, robot| value(Value::floats(&robot.servo.target_qd))),
+    function("get_actual_tcp_pose", &[], 0, |_, robot| value(Value::Pose(kinematics::pose(&robot.servo.actual_q)))),
+    function("get_target_tcp_pose", &[], 0, |_, robot| value(Value::Pose(kinematics::pose(&robot.servo.target_q)))),
+    function("is_steady", &[], 0, |_, robot| value(Value::Bool(robot.servo.is_still()))),
+    function("read_input_integer_register", &["address"], 1, |a, robot| value(Value::Int(robot.inputs.int[number(&a[0])?]))),
+    function("read_input_float_register", &["address"], 1, |a, robot| value(Value::Float(robot.inputs.double[number(&a[0])?]))),
+    function("read_input_boolean_register", &["address"], 1, |a, robot| value(Value::Bool(robot.inputs.bit(bit(&a[0])?)))),
+    function("read_output_integer_register", &["address"], 1, |a, robot| value(Value::Int(robot.outputs.int[number(&a[0])?]))),
+    function("read_output_float_register", &["address"], 1, |a, robot| value(Value::Float(robot.outputs.double[number(&a[0])?]))),
+    function("read_output_boolean_register", &["address"], 1, |a, robot| value(Value::Bool(robot.outputs.bit(bit(&a[0])?)))),
+    function("write_output_integer_register", &["address", "value"], 2, |a, robot| {
+        robot.outputs.int[number(&a[0])?] = a[1].int()?;
+        nothing()
+    }),
+    function("write_output_float_register", &["address", "value"], 2, |a, robot| {
+        robot.outputs.double[number(&a[0])?] = a[1].number()?;
+        nothing()
+    }),
+    function("write_output_boolean_register", &["address", "value"], 2, |a, robot| {
+        robot.outputs.set_bit(bit(&a[0])?, a[1].bool()?);
+        nothing()
+    }),
+    function("set_standard_digital_out", &["n", "b"], 2, |a, robot| {
+        let mask = 1u64 << standard_digital(&a[0])?;
+        robot.digital_out = if a[1].bool()? { robot.digital_out | mask } else { robot.digital_out & !mask };
+        nothing()
+    }),
+    // Nothing is wired to the digital inputs.
+    function("get_standard_digital_in", &["n"], 1, |a, _| standard_digital(&a[0]).and_then(|_| value(Value::Bool(false)))),
+    function("rtde_set_watchdog", &["variable_name", "min_frequency", "action"], 2, rtde_set_watchdog),
+    function("textmsg", &["s1", "s2"], 1, |a, robot| {
+        let second = if a[1] == Value::None { String::new() } else { a[1].to_string() };
+        robot.textmsg(&format!("{}{second}", a[0]));
+        nothing()
+    }),
+    function("sync", &[], 0, |_, _| Ok(Effect::Cycle)),
+    function("sleep", &["t"], 1, |a, _| Ok(Effect::Sleep { time_s: number_in(&a[0], "sleep: t", 0.0, 1e6)? })),
+    function("servoj", &["q", "a", "v", "t", "lookahead_time", "gain"], 1, servoj),
+    function("stopj", &["a"], 1, stop),
+    function("stopl", &["a", "aRot"], 1, stop),
+    function("movej", &["q", "a", "v", "t", "r"], 1, movej),
 ];
 
-/// What to write instead of a function that other languages have and URScript has not.
+/// What to write instead of a function that other languages have and URScript does not have.
 pub fn hint(name: &str) -> &'static str {
     match name {
         "abs" | "fabs" => "; URScript has no abs, norm(a) gives the absolute value of a number",
@@ -146,150 +135,112 @@ pub fn hint(name: &str) -> &'static str {
     }
 }
 
-fn number_in(value: &Value, name: &str, low: f64, high: f64) -> Result<f64, String> {
-    let number = value.number().map_err(|e| format!("{name}: {e}"))?;
-    if (low..=high).contains(&number) { Ok(number) } else { Err(format!("{name} is {number}, must be {low} to {high}")) }
+fn value(value: Value) -> Outcome {
+    Ok(Effect::Value(value))
 }
 
-fn or_default(value: &Value, default: f64) -> Value {
-    if *value == Value::None { Value::Float(default) } else { value.clone() }
+fn nothing() -> Outcome {
+    value(Value::None)
 }
 
-fn finite(value: f64) -> Result<Value, String> {
-    if value.is_finite() { Ok(Value::Float(value)) } else { Err("result is not a finite number".to_owned()) }
+fn float(number: f64) -> Outcome {
+    if number.is_finite() { value(Value::Float(number)) } else { Err("result is not a finite number".to_owned()) }
 }
 
-fn whole(value: f64) -> Result<Value, String> {
-    if (f64::from(i32::MIN)..=f64::from(i32::MAX)).contains(&value) {
-        Ok(Value::Int(value as i32))
+fn whole(number: f64) -> Outcome {
+    if (f64::from(i32::MIN)..=f64::from(i32::MAX)).contains(&number) {
+        value(Value::Int(number as i32))
     } else {
         Err("result does not fit an int (32 bits)".to_owned())
     }
 }
 
-fn address(value: &Value, low: usize, high: usize) -> Result<usize, String> {
-    let at = value.int().map_err(|e| format!("register address: {e}"))?;
-    usize::try_from(at).ok().filter(|a| (low..=high).contains(a)).ok_or_else(|| format!("register address {at} is outside {low} to {high}"))
+fn length(of: &Value) -> Outcome {
+    match of {
+        Value::List(items) => value(Value::Int(items.len() as i32)),
+        Value::Str(text) => value(Value::Int(text.len() as i32)),
+        other => Err(format!("expected a list or a text, found {}", other.kind())),
+    }
 }
 
-/// Calls a built-in function. `a` has one value for each of its parameters, [`Value::None`] for those left out.
-pub fn call(builtin: Builtin, a: &[Value], robot: &mut Robot) -> Result<Effect, String> {
-    let value = match builtin {
-        Acos => finite(number_in(&a[0], "f", -1.0, 1.0)?.acos())?,
-        Asin => finite(number_in(&a[0], "f", -1.0, 1.0)?.asin())?,
-        Atan => finite(a[0].number()?.atan())?,
-        Atan2 => finite(a[0].number()?.atan2(a[1].number()?))?,
-        Ceil => whole(a[0].number()?.ceil())?,
-        Cos => finite(a[0].number()?.cos())?,
-        D2r => finite(a[0].number()?.to_radians())?,
-        Floor => whole(a[0].number()?.floor())?,
-        Length => match &a[0] {
-            Value::List(items) => Value::Int(items.len() as i32),
-            Value::Str(text) => Value::Int(text.len() as i32),
-            other => return Err(format!("expected a list or a text, found {}", other.kind())),
-        },
-        Log => finite(a[1].number()?.log(a[0].number()?))?,
-        Norm => match &a[0] {
-            Value::Int(v) => Value::Int(v.checked_abs().ok_or("result does not fit an int (32 bits)")?),
-            Value::Float(v) => Value::Float(v.abs()),
-            other => finite(other.numbers()?.iter().map(|v| v * v).sum::<f64>().sqrt())?,
-        },
-        Pow => finite(a[0].number()?.powf(a[1].number()?))?,
-        R2d => finite(a[0].number()?.to_degrees())?,
-        Sin => finite(a[0].number()?.sin())?,
-        Sqrt => finite(a[0].number()?.sqrt())?,
-        Tan => finite(a[0].number()?.tan())?,
-        StrCat => Value::text(&format!("{}{}", a[0], a[1]))?,
-        StrLen => Value::Int(a[0].str()?.len() as i32),
-        ToStr => Value::text(&a[0].to_string())?,
-        GetSteptime => Value::Float(robot.steptime_s()),
-        GetActualJointPositions => Value::floats(&robot.servo.actual_q),
-        GetActualJointSpeeds => Value::floats(&robot.servo.actual_qd),
-        GetTargetJointPositions => Value::floats(&robot.servo.target_q),
-        GetTargetJointSpeeds => Value::floats(&robot.servo.target_qd),
-        GetActualTcpPose => Value::Pose(crate::ur::kinematics::pose(&robot.servo.actual_q)),
-        GetTargetTcpPose => Value::Pose(crate::ur::kinematics::pose(&robot.servo.target_q)),
-        IsSteady => Value::Bool(robot.servo.is_still()),
-        ReadInputInteger => Value::Int(robot.inputs.int[address(&a[0], 0, 47)?]),
-        ReadInputFloat => Value::Float(robot.inputs.double[address(&a[0], 0, 47)?]),
-        ReadInputBoolean => Value::Bool(robot.inputs.bits >> address(&a[0], 0, 127)? & 1 == 1),
-        ReadOutputInteger => Value::Int(robot.outputs.int[address(&a[0], 0, 47)?]),
-        ReadOutputFloat => Value::Float(robot.outputs.double[address(&a[0], 0, 47)?]),
-        ReadOutputBoolean => Value::Bool(robot.outputs.bits >> address(&a[0], 0, 127)? & 1 == 1),
-        WriteOutputInteger => {
-            robot.outputs.int[address(&a[0], 0, 47)?] = a[1].int()?;
-            Value::None
-        }
-        WriteOutputFloat => {
-            robot.outputs.double[address(&a[0], 0, 47)?] = a[1].number()?;
-            Value::None
-        }
-        WriteOutputBoolean => {
-            let bit = 1u128 << address(&a[0], 0, 127)?;
-            if a[1].bool()? {
-                robot.outputs.bits |= bit;
-            } else {
-                robot.outputs.bits &= !bit;
-            }
-            Value::None
-        }
-        SetStandardDigitalOut => {
-            let bit = 1u64 << address(&a[0], 0, 7)?;
-            if a[1].bool()? {
-                robot.digital_out |= bit;
-            } else {
-                robot.digital_out &= !bit;
-            }
-            Value::None
-        }
-        GetStandardDigitalIn => {
-            address(&a[0], 0, 7)?;
-            Value::Bool(false)
-        }
-        RtdeSetWatchdog => {
-            let name = a[0].str()?;
-            let input = Input::parse(name).ok_or_else(|| format!("rtde_set_watchdog: no input variable '{name}'"))?;
-            let action = match &a[2] {
-                Value::None => WatchdogAction::Pause,
-                given => given.str()?.parse()?,
-            };
-            robot.set_watchdog(input, a[1].number()?, action);
-            Value::None
-        }
-        Textmsg => {
-            let second = if a[1] == Value::None { String::new() } else { a[1].to_string() };
-            robot.textmsg(&format!("{}{second}", a[0]));
-            Value::None
-        }
-        Sync => return Ok(Effect::Cycle),
-        Sleep => return Ok(Effect::Sleep { time_s: number_in(&a[0], "sleep: t", 0.0, 1e6)? }),
-        Servoj => {
-            let q = a[0].six().map_err(|e| format!("servoj: {e}"))?;
-            let time_s = number_in(&or_default(&a[3], robot.steptime_s()), "servoj: t", 0.0, 10.0)?;
-            let lookahead_s = number_in(&or_default(&a[4], 0.1), "servoj: lookahead_time", 0.03, 0.2)?;
-            let gain = number_in(&or_default(&a[5], 300.0), "servoj: gain", 100.0, 2000.0)?;
-            robot.servoj(q, lookahead_s, gain);
-            return Ok(Effect::Servo { time_s });
-        }
-        Stopj | Stopl => {
-            robot.servo.stop(number_in(&a[0], "deceleration", 1e-3, 1e3)?);
-            return Ok(Effect::Motion);
-        }
-        Movej => {
-            if matches!(&a[0], Value::Pose(_)) {
-                return Err("movej: only joint positions are simulated, not a pose".to_owned());
-            }
-            for (value, name) in [(&a[3], "t"), (&a[4], "r")] {
-                if *value != Value::None && value.number()? != 0.0 {
-                    return Err(format!("movej: {name} other than 0 is not simulated"));
-                }
-            }
-            let q = a[0].six().map_err(|e| format!("movej: {e}"))?;
-            let acceleration = number_in(&or_default(&a[1], 1.4), "movej: a", 1e-3, 1e3)?;
-            let speed = number_in(&or_default(&a[2], 1.05), "movej: v", 1e-3, 1e3)?;
-            robot.movej(q, acceleration, speed);
-            return Ok(Effect::Motion);
-        }
+fn norm(of: &Value) -> Outcome {
+    match of {
+        Value::Int(v) => value(Value::Int(v.checked_abs().ok_or("result does not fit an int (32 bits)")?)),
+        Value::Float(v) => value(Value::Float(v.abs())),
+        other => float(other.numbers()?.iter().map(|v| v * v).sum::<f64>().sqrt()),
+    }
+}
+
+/// A number from `low` to `high`; `name` is what a message calls it.
+fn number_in(given: &Value, name: &str, low: f64, high: f64) -> Result<f64, String> {
+    let number = given.number().map_err(|e| format!("{name}: {e}"))?;
+    if (low..=high).contains(&number) { Ok(number) } else { Err(format!("{name} is {number}, must be {low} to {high}")) }
+}
+
+fn or_default(given: &Value, default: f64) -> Value {
+    if *given == Value::None { Value::Float(default) } else { given.clone() }
+}
+
+/// The number of a register or of a digital input or output, from 0 to `count` - 1.
+fn address(given: &Value, count: usize) -> Result<usize, String> {
+    let at = given.int().map_err(|e| format!("register address: {e}"))?;
+    usize::try_from(at).ok().filter(|a| *a < count).ok_or_else(|| format!("register address {at} is outside 0 to {}", count - 1))
+}
+
+/// The number of an int or double register.
+fn number(given: &Value) -> Result<usize, String> {
+    address(given, NUMBERS)
+}
+
+/// The number of a bit register.
+fn bit(given: &Value) -> Result<usize, String> {
+    address(given, BITS)
+}
+
+/// The number of one of the eight standard digital inputs or outputs.
+fn standard_digital(given: &Value) -> Result<usize, String> {
+    address(given, 8)
+}
+
+fn rtde_set_watchdog(a: &[Value], robot: &mut Robot) -> Outcome {
+    let name = a[0].str()?;
+    let input = Input::parse(name).ok_or_else(|| format!("rtde_set_watchdog: no input variable '{name}'"))?;
+    let action = match &a[2] {
+        Value::None => WatchdogAction::Pause,
+        given => given.str()?.parse()?,
     };
-    Ok(Effect::Value(value))
+    robot.set_watchdog(input, a[1].number()?, action);
+    nothing()
+}
+
+/// Defaults and ranges are those of UR's script manual.
+fn servoj(a: &[Value], robot: &mut Robot) -> Outcome {
+    let q = a[0].six().map_err(|e| format!("servoj: {e}"))?;
+    let time_s = number_in(&or_default(&a[3], robot.steptime_s()), "servoj: t", 0.0, 10.0)?;
+    let lookahead_s = number_in(&or_default(&a[4], 0.1), "servoj: lookahead_time", 0.03, 0.2)?;
+    let gain = number_in(&or_default(&a[5], 300.0), "servoj: gain", 100.0, 2000.0)?;
+    robot.servoj(q, lookahead_s, gain);
+    Ok(Effect::Servo { time_s })
+}
+
+fn stop(a: &[Value], robot: &mut Robot) -> Outcome {
+    robot.servo.stop(number_in(&a[0], "deceleration", 1e-3, 1e3)?);
+    Ok(Effect::Motion)
+}
+
+/// Defaults are those of UR's script manual.
+fn movej(a: &[Value], robot: &mut Robot) -> Outcome {
+    if matches!(&a[0], Value::Pose(_)) {
+        return Err("movej: only joint positions are simulated, not a pose".to_owned());
+    }
+    for (given, name) in [(&a[3], "t"), (&a[4], "r")] {
+        if *given != Value::None && given.number()? != 0.0 {
+            return Err(format!("movej: {name} other than 0 is not simulated"));
+        }
+    }
+    let q = a[0].six().map_err(|e| format!("movej: {e}"))?;
+    let acceleration = number_in(&or_default(&a[1], 1.4), "movej: a", 1e-3, 1e3)?;
+    let speed = number_in(&or_default(&a[2], 1.05), "movej: v", 1e-3, 1e3)?;
+    robot.movej(q, acceleration, speed);
+    Ok(Effect::Motion)
 }

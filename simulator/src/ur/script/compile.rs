@@ -1,24 +1,26 @@
-//! From a program's tree to code for the stack machine: names become slots, functions and parameters are checked.
+//! From a program's tree to code for the stack machine: names become slots, and functions and parameters are checked.
 //!
-//! Scopes follow UR's script manual ("Scoping rules"): `local` binds to the function, `global` to the program; a name without
+//! Scopes follow UR's script manual ("Scoping rules"): `local` binds to the function and `global` to the program; a name without
 //! either is looked for among the program's variables and is local otherwise. Variables of the program's own body count as
-//! the program's. A function must be defined above its first use. Pure; allocates.
+//! the program's. A function must be defined above its first use. Pure; allocates the code. A mistake is an error with its line.
 
 use std::collections::BTreeMap;
 
 use super::ScriptError;
-use super::builtin::{self, Builtin};
-use super::parse::{Argument, Expr, ExprKind, Function, Operator, Scope, Statement, StatementKind, Unit};
+use super::builtin::{self, BuiltinFunction};
+use super::syntax::{Argument, Expr, ExprKind, Function, Operator, ProgramTree, Scope, Statement, StatementKind};
 use super::value::Value;
 
-/// Most instructions of a program.
+/// Most instructions of a program. Chosen by hand; no measurement is recorded.
 const MAX_OPS: usize = 200_000;
-/// Most variables of the program, and of one function.
+/// Most variables of the program itself. Chosen by hand; no measurement is recorded.
 const MAX_GLOBALS: usize = 1024;
+/// Most variables of one function. Chosen by hand; no measurement is recorded.
 const MAX_LOCALS: usize = 128;
 
-/// One instruction. Values live on a stack; slots are variables.
-#[derive(Debug, Clone, PartialEq)]
+/// One instruction of the stack machine. A number is the slot of a variable, a count of operands, a routine, or the place that a
+/// jump goes to.
+#[derive(Debug, Clone)]
 pub enum Op {
     Push(Value),
     Pop,
@@ -26,10 +28,13 @@ pub enum Op {
     LoadLocal(usize),
     StoreGlobal(usize),
     StoreLocal(usize),
-    /// Stack: index, value.
+    /// Takes the value and, below it, the index from the stack.
     StoreGlobalElement(usize),
+    /// Takes the value and, below it, the index from the stack.
     StoreLocalElement(usize),
+    /// Makes a list of so many values.
     List(usize),
+    /// Makes a pose of six values.
     Pose,
     Index,
     Not,
@@ -37,14 +42,15 @@ pub enum Op {
     Binary(Operator),
     Jump(usize),
     JumpIfFalse(usize),
-    /// Leaves False and jumps, or takes True away and goes on.
+    /// Leaves False on the stack and jumps, or takes True from the stack and goes on.
     And(usize),
-    /// Leaves True and jumps, or takes False away and goes on.
+    /// Leaves True on the stack and jumps, or takes False from the stack and goes on.
     Or(usize),
-    /// The top must be a bool.
+    /// Fails unless the top of the stack is a bool.
     CheckBool,
     Call(usize),
-    Builtin(Builtin, usize),
+    Builtin(&'static BuiltinFunction),
+    /// Starts a thread and leaves it on the stack.
     Run(usize),
     Join,
     Kill,
@@ -53,29 +59,37 @@ pub enum Op {
     Pause,
 }
 
-/// A function's place in the code. Function 0 is the program's own body.
-#[derive(Debug, Clone, PartialEq)]
+/// A function, a thread or, as routine 0, the program's own body.
+#[derive(Debug, Clone)]
 pub struct Routine {
+    /// Place of the first instruction.
     pub entry: usize,
+    /// Number of parameters.
     pub parameters: usize,
-    /// Names of its local variables, parameters first.
+    /// Names of the local variables, parameters first.
     pub locals: Vec<String>,
 }
 
 /// A compiled program.
-#[derive(Debug, Clone, PartialEq)]
+#[derive(Debug, Clone)]
 pub struct Code {
+    /// The instructions of all routines.
     pub ops: Vec<Op>,
     /// Source line of each instruction.
     pub lines: Vec<u32>,
+    /// The routines; the program's own body is the first.
     pub routines: Vec<Routine>,
+    /// Names of the program's variables.
     pub globals: Vec<String>,
 }
 
 /// Compiles a program.
-pub fn compile(unit: &Unit) -> Result<Code, ScriptError> {
+///
+/// # Errors
+/// The program's first mistake, with its line.
+pub fn compile(tree: &ProgramTree) -> Result<Code, ScriptError> {
     let mut globals = BTreeMap::new();
-    collect_globals(&unit.body, true, &mut globals);
+    collect_globals(&tree.body, true, &mut globals);
     if globals.len() > MAX_GLOBALS {
         return Err(ScriptError::new(1, format!("more than {MAX_GLOBALS} variables")));
     }
@@ -86,15 +100,16 @@ pub fn compile(unit: &Unit) -> Result<Code, ScriptError> {
     let code = Code { ops: Vec::new(), lines: Vec::new(), routines: Vec::new(), globals: names };
     let mut compiler = Compiler { code, globals, functions: BTreeMap::new(), locals: Vec::new(), loops: Vec::new(), in_function: false };
     compiler.code.routines.push(Routine { entry: 0, parameters: 0, locals: Vec::new() });
-    compiler.body(&unit.body)?;
-    let last = unit.body.last().map_or(1, |s| s.line);
+    compiler.body(&tree.body)?;
+    let last = tree.body.last().map_or(1, |s| s.line);
     compiler.emit(last, Op::Push(Value::None))?;
     compiler.emit(last, Op::Return)?;
     compiler.code.routines[0].locals = std::mem::take(&mut compiler.locals);
     Ok(compiler.code)
 }
 
-/// Names that belong to the program: those after `global` anywhere, and those assigned without a word in its own body.
+/// Collects the names that belong to the program: those after `global` anywhere, and those that its own body assigns without a
+/// word before them.
 fn collect_globals(body: &[Statement], own_body: bool, globals: &mut BTreeMap<String, usize>) {
     for statement in body {
         match &statement.kind {
@@ -115,28 +130,34 @@ fn collect_globals(body: &[Statement], own_body: bool, globals: &mut BTreeMap<St
     }
 }
 
+/// A function or thread that is defined above.
 #[derive(Clone)]
-struct Known {
+struct KnownFunction {
     routine: usize,
     parameters: Vec<(String, Option<Expr>)>,
     thread: bool,
 }
 
-struct Loop {
+/// A loop whose end is not compiled yet.
+struct OpenLoop {
     start: usize,
+    /// Places of the jumps that go to its end.
     breaks: Vec<usize>,
 }
 
 struct Compiler {
     code: Code,
+    /// Slots of the program's variables.
     globals: BTreeMap<String, usize>,
-    functions: BTreeMap<String, Known>,
+    functions: BTreeMap<String, KnownFunction>,
+    /// Names of the variables of the function that is being compiled.
     locals: Vec<String>,
-    loops: Vec<Loop>,
+    loops: Vec<OpenLoop>,
     in_function: bool,
 }
 
 impl Compiler {
+    /// Appends an instruction and gives its place.
     fn emit(&mut self, line: u32, op: Op) -> Result<usize, ScriptError> {
         if self.code.ops.len() >= MAX_OPS {
             return Err(ScriptError::new(line, "program too long"));
@@ -150,7 +171,7 @@ impl Compiler {
         self.code.ops.len()
     }
 
-    /// Lets the jump at `at` go to the next instruction.
+    /// Lets the jump at the place `at` go to the next instruction.
     fn land(&mut self, at: usize) {
         let here = self.here();
         match &mut self.code.ops[at] {
@@ -178,33 +199,8 @@ impl Compiler {
     fn statement(&mut self, statement: &Statement) -> Result<(), ScriptError> {
         let line = statement.line;
         match &statement.kind {
-            StatementKind::Assign { scope, name, index, value } => {
-                if let Some(index) = index {
-                    self.expr(index)?;
-                    self.expr(value)?;
-                    let store = match (self.local(name), self.globals.get(name)) {
-                        (Some(slot), _) => Op::StoreLocalElement(slot),
-                        (None, Some(slot)) => Op::StoreGlobalElement(*slot),
-                        (None, None) => return Err(ScriptError::new(line, format!("'{name}' has no value yet"))),
-                    };
-                    self.emit(line, store)?;
-                    return Ok(());
-                }
-                self.expr(value)?;
-                let store = match scope {
-                    Scope::Global => Op::StoreGlobal(self.globals[name]),
-                    Scope::Local => match self.local(name) {
-                        Some(slot) => Op::StoreLocal(slot),
-                        None => Op::StoreLocal(self.new_local(line, name)?),
-                    },
-                    Scope::Free => match (self.local(name), self.globals.get(name)) {
-                        (Some(slot), _) => Op::StoreLocal(slot),
-                        (None, Some(slot)) => Op::StoreGlobal(*slot),
-                        (None, None) => Op::StoreLocal(self.new_local(line, name)?),
-                    },
-                };
-                self.emit(line, store)?;
-            }
+            StatementKind::Assign { name, index: Some(index), value, .. } => self.assign_element(line, name, index, value)?,
+            StatementKind::Assign { scope, name, index: None, value } => self.assign(line, *scope, name, value)?,
             StatementKind::Expr(expr) => {
                 self.expr(expr)?;
                 self.emit(line, Op::Pop)?;
@@ -225,25 +221,14 @@ impl Compiler {
                 let start = self.here();
                 self.expr(condition)?;
                 let out = self.emit(condition.line, Op::JumpIfFalse(0))?;
-                self.loops.push(Loop { start, breaks: vec![out] });
+                self.loops.push(OpenLoop { start, breaks: vec![out] });
                 self.body(body)?;
                 self.emit(line, Op::Jump(start))?;
                 if let Some(ended) = self.loops.pop() {
                     ended.breaks.into_iter().for_each(|at| self.land(at));
                 }
             }
-            StatementKind::Break | StatementKind::Continue => {
-                let jump = self.emit(line, Op::Jump(0))?;
-                let is_break = statement.kind == StatementKind::Break;
-                let Some(innermost) = self.loops.last_mut() else {
-                    return Err(ScriptError::new(line, if is_break { "'break' outside a loop" } else { "'continue' outside a loop" }));
-                };
-                if is_break {
-                    innermost.breaks.push(jump);
-                } else {
-                    self.code.ops[jump] = Op::Jump(innermost.start);
-                }
-            }
+            StatementKind::Break | StatementKind::Continue => self.leave_or_repeat(line, statement.kind == StatementKind::Break)?,
             StatementKind::Return(value) => {
                 if !self.in_function {
                     return Err(ScriptError::new(line, "'return' outside a function; 'halt' ends a program"));
@@ -266,9 +251,47 @@ impl Compiler {
         Ok(())
     }
 
+    fn assign(&mut self, line: u32, scope: Scope, name: &str, value: &Expr) -> Result<(), ScriptError> {
+        self.expr(value)?;
+        let store = match (scope, self.local(name), self.globals.get(name)) {
+            (Scope::Global, _, Some(slot)) => Op::StoreGlobal(*slot),
+            (_, Some(slot), _) => Op::StoreLocal(slot),
+            (Scope::Free, None, Some(slot)) => Op::StoreGlobal(*slot),
+            (_, None, _) => Op::StoreLocal(self.new_local(line, name)?),
+        };
+        self.emit(line, store)?;
+        Ok(())
+    }
+
+    fn assign_element(&mut self, line: u32, name: &str, index: &Expr, value: &Expr) -> Result<(), ScriptError> {
+        self.expr(index)?;
+        self.expr(value)?;
+        let store = match (self.local(name), self.globals.get(name)) {
+            (Some(slot), _) => Op::StoreLocalElement(slot),
+            (None, Some(slot)) => Op::StoreGlobalElement(*slot),
+            (None, None) => return Err(ScriptError::new(line, format!("'{name}' has no value yet"))),
+        };
+        self.emit(line, store)?;
+        Ok(())
+    }
+
+    /// Compiles `break` or, when `is_break` is false, `continue`.
+    fn leave_or_repeat(&mut self, line: u32, is_break: bool) -> Result<(), ScriptError> {
+        let jump = self.emit(line, Op::Jump(0))?;
+        let Some(innermost) = self.loops.last_mut() else {
+            return Err(ScriptError::new(line, if is_break { "'break' outside a loop" } else { "'continue' outside a loop" }));
+        };
+        if is_break {
+            innermost.breaks.push(jump);
+        } else {
+            self.code.ops[jump] = Op::Jump(innermost.start);
+        }
+        Ok(())
+    }
+
     fn function(&mut self, line: u32, function: &Function) -> Result<(), ScriptError> {
         let name = &function.name;
-        if self.functions.contains_key(name) || builtin::TABLE.iter().any(|e| e.0 == name) {
+        if self.functions.contains_key(name) || builtin::find(name).is_some() {
             return Err(ScriptError::new(line, format!("there is already a function '{name}'")));
         }
         if function.thread && !function.parameters.is_empty() {
@@ -290,7 +313,7 @@ impl Compiler {
         let over = self.emit(line, Op::Jump(0))?;
         let routine = self.code.routines.len();
         self.code.routines.push(Routine { entry: self.here(), parameters: function.parameters.len(), locals: Vec::new() });
-        self.functions.insert(name.clone(), Known { routine, parameters: function.parameters.clone(), thread: function.thread });
+        self.functions.insert(name.clone(), KnownFunction { routine, parameters: function.parameters.clone(), thread: function.thread });
         let outer_locals = std::mem::replace(&mut self.locals, function.parameters.iter().map(|p| p.0.clone()).collect());
         let outer_loops = std::mem::take(&mut self.loops);
         let outer_in_function = std::mem::replace(&mut self.in_function, true);
@@ -346,43 +369,49 @@ impl Compiler {
                 self.expr(b)?;
                 Op::Binary(*operator)
             }
-            ExprKind::And(a, b) | ExprKind::Or(a, b) => {
-                self.expr(a)?;
-                let short = if matches!(expr.kind, ExprKind::And(..)) { Op::And(0) } else { Op::Or(0) };
-                let jump = self.emit(line, short)?;
-                self.expr(b)?;
-                self.emit(line, Op::CheckBool)?;
-                self.land(jump);
-                return Ok(());
-            }
+            ExprKind::And(a, b) => return self.short_circuit(line, Op::And(0), a, b),
+            ExprKind::Or(a, b) => return self.short_circuit(line, Op::Or(0), a, b),
             ExprKind::Call(name, arguments) => self.call(line, name, arguments)?,
-            ExprKind::Run(name, arguments) => {
-                let Some(known) = self.functions.get(name).filter(|k| k.thread) else {
-                    return Err(ScriptError::new(line, format!("no thread '{name}' is defined above")));
-                };
-                if !arguments.is_empty() {
-                    return Err(ScriptError::new(line, format!("thread '{name}' takes no parameters")));
-                }
-                Op::Run(known.routine)
-            }
+            ExprKind::Run(name, arguments) => self.run(line, name, arguments)?,
         };
         self.emit(line, op)?;
         Ok(())
     }
 
+    /// Compiles `and` or `or`: the jump `short` passes over the second operand when the first one decides.
+    fn short_circuit(&mut self, line: u32, short: Op, a: &Expr, b: &Expr) -> Result<(), ScriptError> {
+        self.expr(a)?;
+        let jump = self.emit(line, short)?;
+        self.expr(b)?;
+        self.emit(line, Op::CheckBool)?;
+        self.land(jump);
+        Ok(())
+    }
+
+    fn run(&self, line: u32, name: &str, arguments: &[Argument]) -> Result<Op, ScriptError> {
+        let Some(known) = self.functions.get(name).filter(|k| k.thread) else {
+            return Err(ScriptError::new(line, format!("no thread '{name}' is defined above")));
+        };
+        if !arguments.is_empty() {
+            return Err(ScriptError::new(line, format!("thread '{name}' takes no parameters")));
+        }
+        Ok(Op::Run(known.routine))
+    }
+
+    /// Compiles the arguments and gives the instruction that calls the function.
     fn call(&mut self, line: u32, name: &str, arguments: &[Argument]) -> Result<Op, ScriptError> {
-        if let Some((_, function, parameters, required)) = builtin::TABLE.iter().find(|e| e.0 == name) {
-            let places = place(line, name, parameters, arguments)?;
+        if let Some(function) = builtin::find(name) {
+            let places = arrange(line, name, function.parameters, arguments)?;
             for (i, given) in places.iter().enumerate() {
                 match given {
                     Some(value) => self.expr(value)?,
-                    None if i < *required => {
-                        return Err(ScriptError::new(line, format!("{name}: parameter '{}' is missing", parameters[i])));
+                    None if i < function.required => {
+                        return Err(ScriptError::new(line, format!("{name}: parameter '{}' is missing", function.parameters[i])));
                     }
                     None => drop(self.emit(line, Op::Push(Value::None))?),
                 }
             }
-            return Ok(Op::Builtin(*function, parameters.len()));
+            return Ok(Op::Builtin(function));
         }
         let Some(known) = self.functions.get(name).cloned() else {
             return Err(ScriptError::new(line, format!("no function '{name}' is defined above or built in{}", builtin::hint(name))));
@@ -391,7 +420,7 @@ impl Compiler {
             return Err(ScriptError::new(line, format!("thread '{name}' is started with 'run {name}()'")));
         }
         let names: Vec<&str> = known.parameters.iter().map(|p| p.0.as_str()).collect();
-        let places = place(line, name, &names, arguments)?;
+        let places = arrange(line, name, &names, arguments)?;
         for (given, (parameter, default)) in places.iter().zip(&known.parameters) {
             match (given, default) {
                 (Some(value), _) => self.expr(value)?,
@@ -403,8 +432,8 @@ impl Compiler {
     }
 }
 
-/// Arguments in the order of the parameters.
-fn place<'a>(line: u32, name: &str, parameters: &[&str], arguments: &'a [Argument]) -> Result<Vec<Option<&'a Expr>>, ScriptError> {
+/// The arguments in the order of the parameters; None for each that is not given.
+fn arrange<'a>(line: u32, name: &str, parameters: &[&str], arguments: &'a [Argument]) -> Result<Vec<Option<&'a Expr>>, ScriptError> {
     let mut places = vec![None; parameters.len()];
     for (i, (given_name, value)) in arguments.iter().enumerate() {
         let at = match given_name {

@@ -1,4 +1,6 @@
-//! URScript's words: text in, tokens out. Pure; allocates; a character that is not part of the language is an error.
+//! URScript's words: text in, tokens out.
+//!
+//! Pure; allocates the tokens. A character that is not part of the language is an error with its line.
 
 use super::ScriptError;
 
@@ -21,17 +23,36 @@ pub enum Token {
     Newline,
 }
 
-/// Reserved words that this interpreter runs.
+impl Token {
+    /// The token in words, for messages.
+    pub fn in_words(&self) -> String {
+        match self {
+            Token::Name(name) => format!("'{name}'"),
+            Token::Keyword(word) => format!("'{word}'"),
+            Token::Int(value) => format!("'{value}'"),
+            Token::Float(value) => format!("'{value}'"),
+            Token::Str(_) => "a text".to_owned(),
+            Token::Symbol(symbol) => format!("'{symbol}'"),
+            Token::Newline => "the end of the line".to_owned(),
+        }
+    }
+}
+
+/// The reserved words that this interpreter knows (UR's script manual).
 const KEYWORDS: &[&str] = &[
     "def", "sec", "thread", "end", "if", "elif", "else", "while", "return", "break", "continue", "halt", "pause", "global", "local", "and",
     "or", "xor", "not", "True", "False", "None", "run", "join", "kill",
 ];
-/// Reserved words of URScript that it does not run: naming them as such is kinder than "unknown name".
+/// The reserved words of URScript (UR's script manual) that this interpreter does not run. An error that says so helps more than
+/// "unknown name".
 const UNSUPPORTED: &[&str] = &["assert", "codeblock", "enum", "enter_critical", "exit_critical", "string", "struct", "to_num"];
-/// Longest first, so that "<=" is not read as "<".
+/// Operators and brackets (UR's script manual), the longer ones first, so that "<=" is not read as "<".
 const SYMBOLS: &[&str] = &["==", "!=", "<=", ">=", "+", "-", "*", "/", "%", "<", ">", "=", "(", ")", "[", "]", ",", ":"];
 
 /// Splits `source` into tokens with their line numbers. Line ends inside brackets do not count.
+///
+/// # Errors
+/// The first part of the source that is not of the language, with its line.
 pub fn lex(source: &str) -> Result<Vec<(Token, u32)>, ScriptError> {
     let mut tokens = Vec::new();
     let mut line = 1u32;
@@ -84,7 +105,7 @@ pub fn lex(source: &str) -> Result<Vec<(Token, u32)>, ScriptError> {
     Ok(tokens)
 }
 
-/// A number at the start of `text`, and its length in bytes.
+/// The number at the start of `text`, and its length in bytes.
 fn number(text: &str, line: u32) -> Result<(Token, usize), ScriptError> {
     let bytes = text.as_bytes();
     let digits = |mut at: usize| {

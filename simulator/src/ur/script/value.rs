@@ -1,26 +1,29 @@
-//! URScript's values and what its operators do with them. Pure; allocates for lists and texts, within [`MAX_CELLS`] and
-//! [`MAX_TEXT_BYTES`]; a value of the wrong type is an error of the program.
+//! URScript's values and what its operators do with them.
+//!
+//! Pure. Runs on the controller's thread; allocates for lists and texts, within [`MAX_CELLS`] and [`MAX_TEXT_BYTES`]. A value of
+//! the wrong type is an error of the program.
 
 use std::fmt;
 use std::sync::Arc;
 
-use super::parse::Operator;
+use super::syntax::Operator;
 
-/// Most numbers, bools and texts in one list, nested ones counted; a long text counts more than once.
+/// Most numbers, bools and texts in one list, those of nested lists included; a long text counts more than once. Chosen by hand;
+/// no measurement is recorded.
 pub const MAX_CELLS: usize = 256;
-/// Longest text, bytes.
+/// Longest text in bytes. Chosen by hand; no measurement is recorded.
 pub const MAX_TEXT_BYTES: usize = 1024;
 
 /// A value of a running program.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Value {
-    /// What a function without a result gives, and what an omitted argument is.
+    /// The result of a function that has none, and the value of an argument that was left out.
     None,
-    /// True or False.
+    /// A bool, True or False.
     Bool(bool),
-    /// 32 bits, as on the robot.
+    /// A whole number of 32 bits, as on the robot.
     Int(i32),
-    /// 64-bit floating point.
+    /// A floating-point number of 64 bits.
     Float(f64),
     /// A text.
     Str(Arc<str>),
@@ -68,13 +71,14 @@ impl Value {
         }
     }
 
-    /// True when a variable holding `self` may be assigned `new`: the type stays, numbers mix, and 0 stands for "no thread".
+    /// True when a variable that holds `self` may be assigned `new`. A variable keeps its type, but ints, floats and threads may
+    /// replace each other, because programs write 0 for "no thread".
     pub fn may_become(&self, new: &Value) -> bool {
         let number = |v: &Value| matches!(v, Value::Int(_) | Value::Float(_) | Value::Thread(_));
         matches!(self, Value::None) || matches!(new, Value::None) || (number(self) && number(new)) || self.kind() == new.kind()
     }
 
-    /// Numbers, bools and texts in it.
+    /// How much the value counts towards [`MAX_CELLS`].
     pub fn cells(&self) -> usize {
         match self {
             Value::List(items) => items.iter().map(Value::cells).sum::<usize>() + 1,
@@ -83,7 +87,7 @@ impl Value {
         }
     }
 
-    /// A list, unless it would be too large.
+    /// A list. It is an error when it would be too large.
     pub fn list(items: Vec<Value>) -> Result<Value, String> {
         let list = Value::List(Arc::new(items));
         if list.cells() > MAX_CELLS { Err(format!("a list of more than {MAX_CELLS} values")) } else { Ok(list) }
@@ -94,12 +98,12 @@ impl Value {
         Value::List(Arc::new(values.iter().map(|v| Value::Float(*v)).collect()))
     }
 
-    /// A text, unless it would be too long.
+    /// A text. It is an error when it would be too long.
     pub fn text(text: &str) -> Result<Value, String> {
         if text.len() > MAX_TEXT_BYTES { Err(format!("a text of more than {MAX_TEXT_BYTES} bytes")) } else { Ok(Value::Str(text.into())) }
     }
 
-    /// As a number.
+    /// The value as a number.
     pub fn number(&self) -> Result<f64, String> {
         match self {
             Value::Int(value) => Ok(f64::from(*value)),
@@ -108,7 +112,7 @@ impl Value {
         }
     }
 
-    /// As a whole number; a float is none, even 1.0.
+    /// The value as a whole number. A float is not one, even 1.0.
     pub fn int(&self) -> Result<i32, String> {
         match self {
             Value::Int(value) => Ok(*value),
@@ -116,7 +120,7 @@ impl Value {
         }
     }
 
-    /// As a bool; a number is none.
+    /// The value as a bool. A number is not one.
     pub fn bool(&self) -> Result<bool, String> {
         match self {
             Value::Bool(value) => Ok(*value),
@@ -124,7 +128,7 @@ impl Value {
         }
     }
 
-    /// As a text.
+    /// The value as a text.
     pub fn str(&self) -> Result<&str, String> {
         match self {
             Value::Str(text) => Ok(text),
@@ -132,7 +136,7 @@ impl Value {
         }
     }
 
-    /// As a list of numbers; a pose is one of six.
+    /// The value as a list of numbers. A pose is a list of six.
     pub fn numbers(&self) -> Result<Vec<f64>, String> {
         match self {
             Value::Pose(pose) => Ok(pose.to_vec()),
@@ -141,14 +145,14 @@ impl Value {
         }
     }
 
-    /// As six joint angles or the like.
+    /// The value as a list of six numbers, such as joint angles.
     pub fn six(&self) -> Result<[f64; 6], String> {
         let Value::List(items) = self else { return Err(format!("expected a list of 6 numbers, found {}", self.kind())) };
         let numbers = items.iter().map(Value::number).collect::<Result<Vec<_>, _>>()?;
         numbers.try_into().map_err(|n: Vec<f64>| format!("expected a list of 6 numbers, found one of {}", n.len()))
     }
 
-    /// The element at `index`.
+    /// The element at `index`, from 0.
     pub fn element(&self, index: &Value) -> Result<Value, String> {
         let at = index.int().map_err(|e| format!("index: {e}"))?;
         let outside = |length: usize| format!("index {at} is outside 0 to {}", length as i64 - 1);
@@ -179,7 +183,7 @@ impl Value {
         }
     }
 
-    /// `-self`
+    /// The value of `-self`.
     pub fn negative(&self) -> Result<Value, String> {
         match self {
             Value::Int(value) => value.checked_neg().map(Value::Int).ok_or_else(overflow),
@@ -194,7 +198,7 @@ fn overflow() -> String {
     "result does not fit an int (32 bits)".to_owned()
 }
 
-/// `a operator b`
+/// The value of `a operator b`.
 pub fn binary(operator: Operator, a: &Value, b: &Value) -> Result<Value, String> {
     use Operator::*;
     match operator {
@@ -235,7 +239,7 @@ fn arithmetic(operator: Operator, a: &Value, b: &Value) -> Result<Value, String>
         (Value::Int(_) | Value::Float(_), Value::List(y)) if operator == Multiply => {
             Value::list(y.iter().map(|y| arithmetic(operator, a, y)).collect::<Result<_, _>>()?)
         }
-        // Division of ints gives a float: UR's own driver script divides two ints and expects radians.
+        // Dividing two ints gives a float, because UR's own driver script divides two ints and expects radians.
         (Value::Int(x), Value::Int(y)) if operator != Divide => match operator {
             Add => x.checked_add(*y),
             Subtract => x.checked_sub(*y),
@@ -247,7 +251,7 @@ fn arithmetic(operator: Operator, a: &Value, b: &Value) -> Result<Value, String>
         .ok_or_else(overflow),
         (Value::Int(_) | Value::Float(_), Value::Int(_) | Value::Float(_)) => {
             let (x, y) = (a.number()?, b.number()?);
-            // What is not a number stays so, as in any IEEE 754 arithmetic: a client may well send a NaN.
+            // A NaN stays a NaN, as in any IEEE 754 arithmetic, because a client may well send one.
             Ok(Value::Float(match operator {
                 Add => x + y,
                 Subtract => x - y,

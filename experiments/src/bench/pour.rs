@@ -1,0 +1,213 @@
+//! One pour in closed loop on a simulated bench, at full speed.
+//!
+//! Pure; allocates once a pour. Policies are driven through the controller's own core, [`rt_controller::core::Core`], as at
+//! run time; baselines, which know no core, through [`Baseline`] and the same [`Limiter`].
+
+use rt_controller::core::{Core, Input, Order, Robot, Settings};
+use serde::Serialize;
+use shared::agent::Agent;
+use shared::control::EndReason;
+use shared::limits::{Limiter, Limits};
+use shared::messages::{Feature, LAYOUT_VERSION};
+use trainer::data::TrainingEpisode;
+
+use super::simulators::BenchPour;
+use simulator::physics::RATE_HZ;
+
+/// A pour ends after this many frames.
+pub const MAX_FRAMES: u32 = 900;
+/// Frames after upright in which the last drops fall and are counted.
+const SETTLE_FRAMES: u32 = 45;
+/// Period of a tick, ns.
+const PERIOD_NS: u64 = 33_333_333;
+
+/// How one pour went.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+pub struct Poured {
+    /// Initial volume asked for, ml.
+    pub init_ml: f64,
+    /// V_G, ml.
+    pub goal_ml: f64,
+    /// On the scale, ml.
+    pub true_ml: f64,
+    /// What the controller believes to have poured, ml.
+    pub believed_ml: f64,
+    /// Until the pour was over, s.
+    pub seconds: f64,
+    /// Frames.
+    pub frames: u32,
+    /// The pour came to its end by itself.
+    pub ended: bool,
+}
+
+impl Poured {
+    /// On the scale minus goal, ml.
+    pub fn error_ml(&self) -> f64 {
+        self.true_ml - self.goal_ml
+    }
+    /// Part of the error that measurement made, ml.
+    pub fn measurement_ml(&self) -> f64 {
+        self.true_ml - self.believed_ml
+    }
+    /// Part of the error that control made, ml.
+    pub fn control_ml(&self) -> f64 {
+        self.believed_ml - self.goal_ml
+    }
+    /// Nothing was poured.
+    pub fn never_poured(&self) -> bool {
+        self.true_ml < 1.0
+    }
+    /// It never came to an end by itself.
+    pub fn never_stopped(&self) -> bool {
+        !self.ended
+    }
+}
+
+/// A pour frame by frame, all columns of the same length.
+#[derive(Debug, Clone, Default, Serialize)]
+pub struct Trace {
+    /// Time, s.
+    pub t_s: Vec<f64>,
+    /// Commanded alpha, degrees.
+    pub alpha_deg: Vec<f64>,
+    /// V_e, px^2.
+    pub area_px2: Vec<f64>,
+    /// What has really left, ml.
+    pub true_ml: Vec<f64>,
+}
+
+impl Trace {
+    fn push(&mut self, alpha_deg: f64, area_px2: f32, world: &BenchPour) {
+        self.t_s.push((self.t_s.len() + 1) as f64 / RATE_HZ);
+        self.alpha_deg.push(alpha_deg);
+        self.area_px2.push(f64::from(area_px2));
+        self.true_ml.push(world.poured_ml());
+    }
+
+    /// The same as an episode, weighed.
+    pub fn weighed(self, name: &str, weight_g: f64) -> TrainingEpisode {
+        let alpha_measured_deg = vec![f64::NAN; self.t_s.len()];
+        let Self { t_s, alpha_deg, area_px2, .. } = self;
+        TrainingEpisode { name: name.into(), rate_hz: RATE_HZ, t_s, alpha_deg, alpha_measured_deg, area_px2, weight_g }
+    }
+}
+
+/// The settings that the core runs with: the defaults of the configuration, no goal limit.
+fn settings(limits: Limits) -> Settings {
+    Settings {
+        period_ns: PERIOD_NS,
+        limits,
+        stale_ns: 200_000_000,
+        max_frames: MAX_FRAMES,
+        empty_frames: 60,
+        goal_max_ml: 1e6,
+        upright_deg: 2.0,
+        patience_ns: 100_000_000,
+    }
+}
+
+/// Pours `goal_ml` with the running controller's core and `agent`; the frames are added to `trace` if there is one.
+pub fn by_core(agent: &Agent, world: &mut BenchPour, limits: Limits, init_ml: f64, goal_ml: f64, mut trace: Option<&mut Trace>) -> Poured {
+    let mut core = Core::new(settings(limits));
+    core.exchange(Box::new(agent.clone()));
+    let mut alpha_deg = 0.0f32;
+    let mut area_px2 = 0.0f32;
+    let mut frames = 0u32;
+    let mut poured =
+        Poured { init_ml, goal_ml, true_ml: 0.0, believed_ml: 0.0, seconds: f64::from(MAX_FRAMES) / RATE_HZ, frames: 0, ended: false };
+    // Ends by the core's own limits; the loop's is there for a core that does not.
+    while frames < 3 * MAX_FRAMES {
+        frames += 1;
+        let now_ns = u64::from(frames + 1) * PERIOD_NS;
+        let feature = Feature {
+            version: LAYOUT_VERSION,
+            sequence: u64::from(frames),
+            worker_epoch_ns: 1,
+            captured_at_ns: now_ns - PERIOD_NS,
+            received_at_ns: now_ns - 1,
+            published_at_ns: now_ns - 1,
+            area_px2,
+            confidence: 1.0,
+            ..Feature::default()
+        };
+        let robot = Robot { hindrance: None, alpha_deg, at_ns: now_ns };
+        let order = (frames == 2).then_some(Order::Pour { episode: 1, goal_ml: goal_ml as f32 });
+        let output = core.step(&Input { now_ns, features: &[feature], robot, order });
+        alpha_deg = output.target_deg.unwrap_or(alpha_deg);
+        area_px2 = world.frame(f64::from(alpha_deg));
+        if let Some(trace) = trace.as_deref_mut() {
+            trace.push(f64::from(alpha_deg), area_px2, world);
+        }
+        if let Some(outcome) = output.ended {
+            poured.believed_ml = f64::from(outcome.poured_ml);
+            poured.seconds = f64::from(outcome.seconds);
+            poured.ended = matches!(outcome.reason, EndReason::Done | EndReason::ContainerEmpty | EndReason::StreamLost);
+            break;
+        }
+    }
+    for _ in 0..SETTLE_FRAMES {
+        let area = world.frame(0.0);
+        if let Some(trace) = trace.as_deref_mut() {
+            trace.push(0.0, area, world);
+        }
+    }
+    poured.true_ml = world.poured_ml();
+    poured.frames = frames;
+    poured
+}
+
+/// What decides in a pour, if it is not the agent.
+pub trait Baseline {
+    /// The angle asked for next, degrees relative to the command in force; `None`: the pour is over, upright.
+    fn decide(&mut self, area_px2: f32, alpha_deg: f32, world: &BenchPour) -> Option<f32>;
+    /// Volume believed to have been poured, ml.
+    fn believed_ml(&self) -> f64;
+}
+
+/// Pours `goal_ml` with `controller`.
+pub fn by_controller(controller: &mut dyn Baseline, world: &mut BenchPour, limits: Limits, init_ml: f64, goal_ml: f64) -> Poured {
+    let mut limiter = Limiter::new(limits, (1.0 / RATE_HZ) as f32, 0.0);
+    let mut back = false;
+    let mut frames = 0;
+    let mut upright_frames = 0;
+    let mut upright_at = None;
+    while upright_frames < SETTLE_FRAMES {
+        let alpha = limiter.alpha_deg();
+        let area = world.frame(f64::from(alpha));
+        let asked = controller.decide(area, alpha, world);
+        frames += 1;
+        back |= asked.is_none();
+        let out_of_time = frames >= MAX_FRAMES;
+        match asked {
+            Some(dalpha) if !back && !out_of_time => limiter.step(alpha + dalpha),
+            _ => limiter.step_upright(),
+        };
+        if (back || out_of_time) && limiter.alpha_deg() <= 0.0 {
+            upright_at.get_or_insert(frames);
+            upright_frames += 1;
+        }
+    }
+    Poured {
+        init_ml,
+        goal_ml,
+        true_ml: world.poured_ml(),
+        believed_ml: controller.believed_ml(),
+        seconds: f64::from(upright_at.unwrap_or(frames)) / RATE_HZ,
+        frames,
+        ended: back,
+    }
+}
+
+/// The grid of the reference: V_init x V_G with V_G <= 0.85 V_init, 45 cells.
+pub fn grid() -> Vec<(f64, f64)> {
+    let mut cells = Vec::new();
+    for init in [150.0, 225.0, 300.0, 375.0, 450.0] {
+        for k in 1..=10 {
+            let goal = 20.0 * f64::from(k);
+            if goal <= 0.85 * init {
+                cells.push((init, goal));
+            }
+        }
+    }
+    cells
+}

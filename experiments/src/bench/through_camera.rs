@@ -1,0 +1,104 @@
+//! Simulator b through a rendered camera: each frame of a pour is drawn, and V_e is what the feature worker's own extraction
+//! finds in the picture, doubts included.
+//!
+//! Any thread; the same seeds give the same pour. Allocates when a pour begins. A frame that cannot be drawn or measured
+//! counts as lost (NaN).
+
+use std::sync::{Arc, Mutex, PoisonError};
+
+use feature_worker::extract::{Extractor, Image};
+use rand::seq::IndexedRandom;
+use rand::{RngExt, SeedableRng};
+use rand_pcg::Pcg64Mcg;
+use shared::config::ImageConfig;
+use shared::messages::PixelFormat;
+
+use simulator::camera::{Background, Renderer, Scene, View};
+use simulator::physics::RATE_HZ;
+use simulator::physics::rig::RigPour;
+
+use crate::commands::evaluate_camera::{camera_config, image_config, learn_colour};
+
+/// A camera on a rig, set up by a careful person: its view, and the feature worker's configuration for it.
+#[derive(Debug, Clone)]
+pub struct BenchCamera {
+    view: View,
+    image: ImageConfig,
+}
+
+impl BenchCamera {
+    /// Draws scale, lip, spout, background, light, noise and blur from `seed`, and learns the liquid's colour from one pour.
+    pub fn seeded(seed: u64) -> Result<Self, String> {
+        let mut random = Pcg64Mcg::seed_from_u64(seed ^ 0xe7e);
+        let colour = *[[150, 62, 20], [40, 36, 180], [60, 150, 40], [140, 40, 110]].choose(&mut random).unwrap_or(&[150, 62, 20]);
+        let placed = View::placed(&mut random);
+        let view = View {
+            liquid_bgr: Some(colour),
+            background: *Background::ALL.choose(&mut random).unwrap_or(&Background::Chess),
+            light: random.random_range(0.7..1.2),
+            noise: random.random_range(1.5..5.0),
+            blur_px: random.random_range(0.0..1.0),
+            ..placed
+        };
+        let mut image = image_config(&view);
+        image.colour_hsv = learn_colour(&View { light: 1.0, ..view.clone() }, &image, seed).map_err(|e| e.to_string())?;
+        Ok(Self { view, image })
+    }
+}
+
+struct Camera {
+    renderer: Renderer,
+    extractor: Extractor,
+    pixels: Vec<u8>,
+}
+
+/// A pour that is looked at.
+#[derive(Clone)]
+pub struct CameraPour {
+    /// The physics.
+    pub pour: RigPour,
+    /// None: OpenCV refused; every frame is lost.
+    camera: Option<Arc<Mutex<Camera>>>,
+    size_px: (u32, u32),
+    late: Vec<Scene>,
+    delay: usize,
+    frame: usize,
+}
+
+impl std::fmt::Debug for CameraPour {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.debug_struct("CameraPour").field("pour", &self.pour).field("frame", &self.frame).finish_non_exhaustive()
+    }
+}
+
+impl CameraPour {
+    /// Looks at `pour` with `camera`; the picture shows what was `delay` frames ago.
+    pub fn new(pour: RigPour, camera: &BenchCamera, delay: usize, seed: u64) -> Self {
+        let size_px = (camera.view.width_px, camera.view.height_px);
+        let camera = Renderer::new(&camera.view, seed).ok().zip(Extractor::new(&camera_config(&camera.view), &camera.image).ok()).map(
+            |(renderer, extractor)| {
+                Arc::new(Mutex::new(Camera { renderer, extractor, pixels: vec![0; (size_px.0 * size_px.1 * 3) as usize] }))
+            },
+        );
+        Self { pour, camera, size_px, late: vec![Scene::default(); delay + 1], delay, frame: 0 }
+    }
+
+    /// One frame with `alpha_deg` commanded; V_e of its picture, px^2, or NaN.
+    pub fn frame(&mut self, alpha_deg: f64) -> f32 {
+        let before_deg = self.pour.tilt_deg();
+        self.pour.advance(alpha_deg);
+        let (tilt_deg, slots) = (self.pour.tilt_deg(), self.late.len());
+        self.late[self.frame % slots] = Scene::of(self.pour.container(), 0.0, tilt_deg, (tilt_deg - before_deg) * RATE_HZ);
+        let shown = Scene { at_s: self.frame as f64 / RATE_HZ, ..self.late[self.frame.saturating_sub(self.delay) % slots] };
+        self.frame += 1;
+        self.camera.as_ref().and_then(|camera| look(camera, &shown, self.size_px)).unwrap_or(f32::NAN)
+    }
+}
+
+fn look(camera: &Mutex<Camera>, scene: &Scene, (width_px, height_px): (u32, u32)) -> Option<f32> {
+    let mut camera = camera.lock().unwrap_or_else(PoisonError::into_inner);
+    let Camera { renderer, extractor, pixels } = &mut *camera;
+    renderer.render(scene, pixels).ok()?;
+    let measured = extractor.measure(Image { width_px, height_px, format: PixelFormat::Bgr8, pixels }).ok()?;
+    measured.doubt.usable().then_some(measured.area_px2)
+}

@@ -1,0 +1,58 @@
+//! Pictures for `bench` when the user gives none: a turning chess board, a blue stream of changing size over the lip, and noise.
+//! Allocates; the same pictures at each call.
+
+use opencv::core::{self, CV_8UC3, Mat, Point, Point2f, Scalar, Size, Vector};
+use opencv::imgproc;
+use shared::config::{CameraConfig, CameraSource, ImageConfig, LiquidMethod};
+
+/// Different pictures; they are measured again and again.
+pub const PICTURES: usize = 40;
+
+/// The camera and the image section that belong to the drawn pictures, at `scale` times 640 pixels of width.
+pub fn config(scale: f32, method: LiquidMethod) -> (CameraConfig, ImageConfig) {
+    let px = |v: f32| (v * scale).round() as u32;
+    let height = if scale > 1.0 { 720 } else { 480 };
+    let camera =
+        CameraConfig { source: CameraSource::SharedMemory, path: String::new(), width_px: px(640.0), height_px: height, fps: 30.0 };
+    let axis = |a: [f32; 4]| a.map(|v| v * scale);
+    let image = ImageConfig {
+        method,
+        region_px: [px(190.0), px(16.0), px(420.0), px(256.0)],
+        x_axis_px: axis([215.0, 250.0, 600.0, 250.0]),
+        y_axis_px: axis([215.0, 350.0, 215.0, 250.0]),
+        colour_hsv: [98, 90, 25, 124, 255, 255],
+        area_min_px2: 30.0,
+    };
+    (camera, image)
+}
+
+/// The pictures, BGR, of the camera's size.
+pub fn pictures(camera: &CameraConfig, image: &ImageConfig) -> Result<Vec<Mat>, opencv::Error> {
+    let (width, height) = (camera.width_px as i32, camera.height_px as i32);
+    let mut board = Mat::new_rows_cols_with_default(2 * height, 2 * width, CV_8UC3, Scalar::all(200.0))?;
+    for row in 0..40 {
+        for column in (row % 2..40).step_by(2) {
+            let square = core::Rect::new(column * 60, row * 60, 60, 60);
+            imgproc::rectangle(&mut board, square, Scalar::all(50.0), imgproc::FILLED, imgproc::LINE_8, 0)?;
+        }
+    }
+    let [x, y] = [image.x_axis_px[0], image.x_axis_px[1]];
+    let scale = camera.width_px as f32 / 640.0;
+    core::set_rng_seed(1)?;
+    let mut frames = Vec::new();
+    for i in 0..PICTURES {
+        let turn = imgproc::get_rotation_matrix_2d(Point2f::new(width as f32, height as f32), f64::from(i as u32), 1.0)?;
+        let mut frame = Mat::default();
+        imgproc::warp_affine(&board, &mut frame, &turn, Size::new(width, height), imgproc::INTER_LINEAR, 0, Scalar::default())?;
+        let size = scale * (20.0 + 2.5 * i as f32);
+        let corners = [(-0.1, 2.0), (-0.1, 0.2), (-3.0, -0.6), (-3.0, -0.9), (0.0, -0.9), (0.6, -0.5), (1.2, 0.0), (2.0, 2.0)];
+        let stream: Vector<Point> = corners.iter().map(|(dx, dy)| Point::new((x + dx * size) as i32, (y + dy * size) as i32)).collect();
+        imgproc::fill_poly(&mut frame, &stream, Scalar::new(150.0, 62.0, 20.0, 0.0), imgproc::LINE_AA, 0, Point::default())?;
+        let mut noise = Mat::new_rows_cols_with_default(height, width, CV_8UC3, Scalar::all(0.0))?;
+        core::randn(&mut noise, &Scalar::all(8.0), &Scalar::all(3.0))?;
+        let mut noisy = Mat::default();
+        core::add(&frame, &noise, &mut noisy, &core::no_array(), -1)?;
+        frames.push(noisy);
+    }
+    Ok(frames)
+}

@@ -1,0 +1,29 @@
+//! `feature-worker run`: measures V_e in every frame, publishes it and records episodes. See [`crate::worker`].
+
+use std::path::PathBuf;
+
+use shared::config::Config;
+use shared::exit::{self, Failure, OrExit as _};
+
+use crate::worker;
+
+/// Command-line arguments.
+#[derive(Debug, clap::Args)]
+#[command(
+    after_help = "Examples:\n  feature-worker run --config config/cell.toml\n  feature-worker run --config config/sim.toml --json\n\n\
+Runs until Ctrl-C or SIGTERM (exit 0), or until its video or image sequence is over."
+)]
+pub struct Args {
+    /// The cell's configuration.
+    #[arg(long, default_value = shared::config::DEFAULT_FILE)]
+    config: PathBuf,
+    /// Print the status as one JSON object a line, to standard output.
+    #[arg(long)]
+    json: bool,
+}
+
+/// Runs the command.
+pub fn run(args: &Args) -> Result<(), Failure> {
+    let config = Config::read(&args.config).or_exit(exit::BAD_INPUT)?;
+    worker::run(&config, args.json)
+}

@@ -1,0 +1,39 @@
+//! Why an export fails, and the new files that it makes. Allocates. What was written before a failure stays.
+
+use std::fs;
+use std::path::Path;
+
+use shared::episode::{EpisodeError, TableError};
+
+/// Why an export failed.
+#[derive(Debug, thiserror::Error)]
+pub enum ExportError {
+    /// An episode cannot be read.
+    #[error(transparent)]
+    Episode(#[from] EpisodeError),
+    /// A table cannot be written.
+    #[error(transparent)]
+    Table(#[from] TableError),
+    /// A file or directory cannot be written.
+    #[error("{path}: {what}")]
+    Write {
+        /// The file or directory.
+        path: String,
+        /// What went wrong.
+        what: String,
+    },
+    /// There is nothing to export.
+    #[error("{0}")]
+    Nothing(String),
+}
+
+/// The error of writing `path`.
+pub fn write_error(path: &Path, what: impl std::fmt::Display) -> ExportError {
+    ExportError::Write { path: path.display().to_string(), what: what.to_string() }
+}
+
+/// Makes the directory in which `path` will lie.
+pub fn make_parent(path: &Path) -> Result<(), ExportError> {
+    let parent = path.parent().unwrap_or(path);
+    fs::create_dir_all(parent).map_err(|e| write_error(parent, e))
+}

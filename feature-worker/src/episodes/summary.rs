@@ -1,0 +1,138 @@
+//! What there is to say about an episode: a summary as JSON, and what is wrong with it in words. Works on an episode in memory;
+//! allocates; cannot fail.
+
+use serde_json::{Value, json};
+use shared::episode::{Episode, EpisodeKind, EpisodeRow};
+use shared::messages::Doubt;
+
+/// A weight above this without any flow means that the vision saw nothing, g. Chosen by hand: more than drops and evaporation.
+const SURELY_POURED_G: f64 = 3.0;
+/// A weight below this means that nothing was poured, g. Chosen by hand: about the resolution of a kitchen scale.
+const NOTHING_POURED_G: f64 = 1.0;
+/// More frames with flow than this contradict a weight of nothing. Chosen by hand: a few drops may look like flow.
+const CHANCE_FLOW_FRAMES: usize = 5;
+
+/// One remark about an episode.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Remark {
+    /// Whether it keeps the episode from being trained on.
+    pub is_wrong: bool,
+    /// The remark in words, with what to do.
+    pub text: String,
+}
+
+impl Remark {
+    /// A remark that keeps the episode from being trained on.
+    pub fn wrong(text: impl Into<String>) -> Self {
+        Self { is_wrong: true, text: text.into() }
+    }
+
+    /// A remark that is only worth knowing.
+    fn note(text: impl Into<String>) -> Self {
+        Self { is_wrong: false, text: text.into() }
+    }
+}
+
+/// All that is worth saying about an episode.
+pub fn remarks(episode: &Episode) -> Vec<Remark> {
+    let info = &episode.info;
+    let mut all = Vec::new();
+    if info.ended.is_empty() {
+        all.push(Remark::wrong("the recorder was killed before the end; record it again"));
+    } else if !episode.complete {
+        let last_s = episode.rows.last().map_or(0.0, |r| r.t_s);
+        all.push(Remark::wrong(format!("incomplete: {}; the last frame is from {last_s:.1} s; record it again", info.ended)));
+    }
+    all.extend(about_weight(episode));
+    if info.lost_frames > 0 {
+        let runs = episode.rows.chunk_by(|a, b| a.lost == b.lost);
+        let longest = runs.filter(|run| run[0].lost).map(<[EpisodeRow]>::len).max().unwrap_or(0);
+        all.push(Remark::note(format!("{} frames were lost, at most {longest} in a row", info.lost_frames)));
+    }
+    for (doubt, frames) in doubts(episode) {
+        let use_of_it = if doubt.usable() { "still used" } else { "not used" };
+        all.push(Remark::note(format!("{frames} frames are doubtful: {} ({use_of_it})", doubt.words())));
+    }
+    if info.dropped_images > 0 {
+        all.push(Remark::note(format!("{} images were dropped; V_e is there for all of them", info.dropped_images)));
+    }
+    if info.lost_ticks > 0 {
+        all.push(Remark::note(format!("{} ticks of the controller are missing", info.lost_ticks)));
+    }
+    let unknown = episode.rows.iter().filter(|r| r.alpha_measured_deg.is_nan()).count();
+    if unknown > 0 {
+        all.push(Remark::note(format!("the robot's measured alpha is unknown in {unknown} frames")));
+    }
+    all
+}
+
+/// Whether the weight fits what the vision saw.
+fn about_weight(episode: &Episode) -> Option<Remark> {
+    let flow = flow_frames(episode);
+    match episode.weight_g {
+        None => Some(Remark::wrong("no weight yet: `feature-worker episodes weigh FILE --weight G`")),
+        Some(w) if w > SURELY_POURED_G && flow == 0 => {
+            Some(Remark::wrong(format!("{w} g on the scale, but no frame shows flow: check [image]")))
+        }
+        Some(w) if w < NOTHING_POURED_G && flow > CHANCE_FLOW_FRAMES => {
+            Some(Remark::wrong(format!("{flow} frames show flow, but the scale says {w} g: check weight and [image]")))
+        }
+        Some(w) if w < NOTHING_POURED_G => Some(Remark::wrong("nothing was poured: there is nothing to learn from it")),
+        Some(_) => None,
+    }
+}
+
+/// Frames in which the vision saw flow.
+fn flow_frames(episode: &Episode) -> usize {
+    episode.rows.iter().filter(|r| r.area_px2 > 0.0).count()
+}
+
+/// How many frames have each doubt; doubts without a frame are left out.
+fn doubts(episode: &Episode) -> Vec<(Doubt, usize)> {
+    let count = |doubt: Doubt| episode.rows.iter().filter(|r| r.doubt == doubt).count();
+    Doubt::ALL.into_iter().filter(|d| *d != Doubt::None).map(|d| (d, count(d))).filter(|(_, n)| *n > 0).collect()
+}
+
+/// What was run in an episode, as JSON.
+fn kind_json(kind: EpisodeKind) -> Value {
+    match kind {
+        EpisodeKind::Recording(c) => {
+            json!({ "kind": "recording", "lambda_deg": c.lambda_deg, "gamma_per_s2": c.gamma_per_s2, "beta_s": c.beta_s })
+        }
+        EpisodeKind::Pour { goal_ml } => json!({ "kind": "pour", "goal_ml": goal_ml }),
+        EpisodeKind::Table => json!({ "kind": "table" }),
+    }
+}
+
+/// Everything about an episode but its rows and its images, as JSON.
+pub fn summary(episode: &Episode) -> Value {
+    let largest = |values: &mut dyn Iterator<Item = f32>| values.filter(|v| v.is_finite()).fold(0.0, f32::max);
+    let area: f64 = episode.rows.iter().filter(|r| !r.area_px2.is_nan()).map(|r| f64::from(r.area_px2)).sum();
+    let doubtful = doubts(episode).into_iter().map(|(doubt, n)| (doubt.words().to_string(), json!(n)));
+    let info = &episode.info;
+    json!({
+        "file": episode.name,
+        "complete": episode.complete,
+        "run": kind_json(episode.kind),
+        "weight_g": episode.weight_g,
+        "seconds": episode.seconds(),
+        "frames": episode.rows.len(),
+        "flow_frames": flow_frames(episode),
+        "lost_frames": info.lost_frames,
+        "doubtful_frames": doubtful.collect::<serde_json::Map<_, _>>(),
+        "area_sum_px2": area,
+        "area_max_px2": largest(&mut episode.rows.iter().map(|r| r.area_px2)),
+        "alpha_max_deg": largest(&mut episode.rows.iter().map(|r| r.alpha_commanded_deg)),
+        "images": info.images,
+        "dropped_images": info.dropped_images,
+        "ticks": info.ticks,
+        "lost_ticks": info.lost_ticks,
+        "ended": info.ended,
+        "started_at_utc": info.started_at_utc,
+        "started_at_ns": info.started_at_ns,
+        "cell": info.cell,
+        "config_sha256": info.config_sha256,
+        "weights": info.weights,
+        "content_sha256": episode.content_sha256().iter().map(|b| format!("{b:02x}")).collect::<String>(),
+    })
+}

@@ -1,0 +1,105 @@
+//! The images of an episode in order of its rows, and as an MP4 video. Allocates; holds one image at a time.
+
+use std::path::{Path, PathBuf};
+
+use opencv::core::{Mat, MatTraitConst, Size, Vector};
+use opencv::imgcodecs;
+use opencv::videoio::{VideoWriter, VideoWriterTrait, VideoWriterTraitConst};
+use shared::episode::{Episode, EpisodeError, EpisodeImage, EpisodeImages};
+
+use super::output::{ExportError, write_error};
+
+/// The rate of an episode that is too short to have one, frames a second: that of the usual camera.
+pub const USUAL_RATE_HZ: f64 = 30.0;
+/// The slowest and the fastest rate that a video gets, frames a second. They bound what a damaged time could give.
+const RATE_LIMITS_HZ: [f64; 2] = [1.0, 240.0];
+/// Codecs of an MP4 file, the best first: H.264 plays everywhere, MPEG-4 is there where OpenCV's FFmpeg was built without it.
+const CODECS: [[char; 4]; 2] = [['a', 'v', 'c', '1'], ['m', 'p', '4', 'v']];
+
+/// Mean rate of an episode, frames a second. Lost frames count, because they are shown too.
+pub fn mean_rate_hz(episode: &Episode) -> f64 {
+    let rate_hz = (episode.rows.len().saturating_sub(1)) as f64 / episode.seconds();
+    let [slowest, fastest] = RATE_LIMITS_HZ;
+    if rate_hz.is_finite() { rate_hz.clamp(slowest, fastest) } else { USUAL_RATE_HZ }
+}
+
+/// Calls `take` once for each row of the episode with its image, or with the image before where there is none. Rows before the first
+/// image get the first image.
+pub fn for_each_row_with_image(
+    file: &Path,
+    episode: &Episode,
+    mut take: impl FnMut(&EpisodeImage) -> Result<(), ExportError>,
+) -> Result<(), ExportError> {
+    let mut images = EpisodeImages::open(file)?.peekable();
+    let mut shown: Option<EpisodeImage> = None;
+    for row in &episode.rows {
+        let due = |next: Option<&Result<EpisodeImage, EpisodeError>>| match next {
+            Some(Ok(image)) => image.captured_at_ns <= row.captured_at_ns,
+            Some(Err(_)) => true,
+            None => false,
+        };
+        while due(images.peek()) || (shown.is_none() && images.peek().is_some()) {
+            if let Some(image) = images.next() {
+                shown = Some(image?);
+            }
+        }
+        match &shown {
+            Some(image) => take(image)?,
+            None => return Err(ExportError::Nothing(format!("{}: has no images", file.display()))),
+        }
+    }
+    Ok(())
+}
+
+/// An image of an episode as pixels, in OpenCV's order blue, green, red.
+pub fn decode(image: &EpisodeImage) -> opencv::Result<Mat> {
+    let bytes: Vector<u8> = Vector::from_slice(&image.data);
+    imgcodecs::imdecode(&bytes, imgcodecs::IMREAD_COLOR)
+}
+
+/// A video file being written. Its size is that of the first image.
+pub struct Video {
+    path: PathBuf,
+    fps: f64,
+    writer: Option<(VideoWriter, Size)>,
+}
+
+impl Video {
+    /// A video that will be written to `path` with `fps` frames a second. The file appears with the first image.
+    pub fn new(path: &Path, fps: f64) -> Self {
+        Self { path: path.into(), fps, writer: None }
+    }
+
+    /// Adds an image.
+    pub fn push(&mut self, image: &EpisodeImage) -> Result<(), ExportError> {
+        let fail = |e: opencv::Error| write_error(&self.path, e.message);
+        let picture = decode(image).map_err(fail)?;
+        let size = picture.size().map_err(fail)?;
+        if self.writer.is_none() {
+            for [a, b, c, d] in CODECS {
+                let fourcc = VideoWriter::fourcc(a, b, c, d).map_err(fail)?;
+                let writer = VideoWriter::new_def(&self.path, fourcc, self.fps, size).map_err(fail)?;
+                if writer.is_opened().map_err(fail)? {
+                    self.writer = Some((writer, size));
+                    break;
+                }
+            }
+        }
+        match &mut self.writer {
+            Some((writer, first)) if *first == size => writer.write(&picture).map_err(fail),
+            Some((_, first)) => Err(write_error(
+                &self.path,
+                format!("an image of {} x {} among {} x {}", size.width, size.height, first.width, first.height),
+            )),
+            None => Err(write_error(&self.path, "OpenCV cannot write MP4 here; install FFmpeg's libraries")),
+        }
+    }
+
+    /// Closes the file.
+    pub fn finish(mut self) -> Result<(), ExportError> {
+        match &mut self.writer {
+            Some((writer, _)) => writer.release().map_err(|e| write_error(&self.path, e.message)),
+            None => Ok(()),
+        }
+    }
+}

@@ -1,0 +1,144 @@
+//! What a source of frames gives, why it cannot, and how a thread waits for it.
+//!
+//! Nothing here allocates but the error texts. A [`FrameStream`] runs in the thread that measures; its waits last at most
+//! [`WAIT`] (a device: until a frame, a signal or OpenCV's own limit), so that a request to stop is seen soon.
+
+use std::sync::atomic::{AtomicBool, Ordering::Relaxed};
+use std::time::Duration;
+
+use shared::ipc::IpcError;
+use shared::messages::FrameHeader;
+use shared::os;
+
+/// How long one wait for a frame lasts. Chosen by hand: a request to stop or a silent camera is noticed within a tenth of a second.
+pub const WAIT: Duration = Duration::from_millis(100);
+/// A source without a frame for this long is reported as silent, ns. Chosen by hand: thirty frames of a 30 Hz camera.
+const SILENT_NS: u64 = 1_000_000_000;
+
+/// Why there are no frames.
+#[derive(Debug, thiserror::Error)]
+pub enum SourceError {
+    /// The device, the video or the first image cannot be opened.
+    #[error("camera.path = \"{path}\": {what}")]
+    Open {
+        /// `[camera] path`.
+        path: String,
+        /// What is wrong and what to do.
+        what: String,
+    },
+    /// The device is there but cannot be used.
+    #[error("camera.path = \"{0}\": cannot be opened; does another program use it, and may this user read it (group 'video')?")]
+    Busy(String),
+    /// The device does not have the configured size.
+    #[error(
+        "camera.width_px, camera.height_px = {} x {}: the camera gives {} x {} instead; write these and calibrate, or choose a size of \
+         `v4l2-ctl --list-formats-ext`",
+        configured.0, configured.1, device.0, device.1
+    )]
+    Size {
+        /// `[camera] width_px` and `height_px`.
+        configured: (u32, u32),
+        /// The size that the device reports, px.
+        device: (u32, u32),
+    },
+    /// The device gives another rate than configured.
+    #[error(
+        "camera.fps = {configured}: the camera gives {device} frames a second at this size; write camera.fps = {device}, or choose a size \
+         and rate of `v4l2-ctl --list-formats-ext`"
+    )]
+    Rate {
+        /// `[camera] fps`.
+        configured: f64,
+        /// The rate that the device reports, frames a second.
+        device: f64,
+    },
+    /// The camera has stopped giving pictures.
+    #[error("camera \"{0}\" gives no more frames; is it unplugged? Plug it in and start again")]
+    Lost(String),
+    /// The cell's shared memory cannot be used.
+    #[error(transparent)]
+    Ipc(#[from] IpcError),
+    /// The frame service has stopped working.
+    #[error("shared memory of service 'frame': {0}; restart the camera driver and the feature worker")]
+    Broken(String),
+    /// OpenCV refused a call.
+    #[error("OpenCV: {0}")]
+    OpenCv(#[from] opencv::Error),
+}
+
+/// One camera picture with its header. The source owns the pixels until its next call.
+#[derive(Debug, Clone, Copy)]
+pub struct Frame<'a> {
+    /// Size, format, number and times of the picture.
+    pub header: FrameHeader,
+    /// The pixels, row by row without padding.
+    pub pixels: &'a [u8],
+}
+
+/// The answer of a source to one wait.
+#[derive(Debug)]
+pub enum NextFrame<'a> {
+    /// A frame came.
+    Frame(Frame<'a>),
+    /// No frame came in time.
+    Nothing,
+    /// The video or the image sequence is over.
+    End,
+}
+
+/// Anything that gives one frame after the other.
+pub trait FrameSource {
+    /// The next frame. Waits up to `timeout`; a device waits until a frame, a signal or OpenCV's own limit of 10 s.
+    fn next_frame(&mut self, timeout: Duration) -> Result<NextFrame<'_>, SourceError>;
+}
+
+/// What a [`FrameStream`] reports after one wait.
+#[derive(Debug)]
+pub enum StreamEvent<'a> {
+    /// A frame came.
+    Frame(Frame<'a>),
+    /// No frame came in time.
+    Nothing,
+    /// No frame has come for a second. This is said once each time that the frames stop.
+    FellSilent,
+    /// The video is over, or the process was asked to stop.
+    End,
+}
+
+/// Frames from `source` until it ends or until somebody sets `stop`. Notices when the frames stay away.
+pub struct FrameStream<'a, S> {
+    source: S,
+    stop: &'a AtomicBool,
+    last_frame_ns: u64,
+    silent: bool,
+}
+
+impl<'a, S: FrameSource> FrameStream<'a, S> {
+    /// Starts to wait now.
+    pub fn new(source: S, stop: &'a AtomicBool) -> Self {
+        Self { source, stop, last_frame_ns: os::now_ns(), silent: false }
+    }
+
+    /// Waits for the next frame, at most for [`WAIT`].
+    pub fn wait(&mut self) -> Result<StreamEvent<'_>, SourceError> {
+        if self.stop.load(Relaxed) {
+            return Ok(StreamEvent::End);
+        }
+        match self.source.next_frame(WAIT) {
+            Ok(NextFrame::Frame(frame)) => {
+                self.last_frame_ns = os::now_ns();
+                self.silent = false;
+                Ok(StreamEvent::Frame(frame))
+            }
+            Ok(NextFrame::Nothing) if !self.silent && os::now_ns() > self.last_frame_ns + SILENT_NS => {
+                self.silent = true;
+                Ok(StreamEvent::FellSilent)
+            }
+            Ok(NextFrame::Nothing) => Ok(StreamEvent::Nothing),
+            Ok(NextFrame::End) => Ok(StreamEvent::End),
+            // A signal to stop also cuts short the wait for a device, which then looks lost.
+            Err(_) if self.stop.load(Relaxed) => Ok(StreamEvent::End),
+            Err(e) => Err(e),
+        }
+    }
+}

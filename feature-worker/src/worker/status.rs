@@ -1,0 +1,89 @@
+//! What the worker tells the operator: one line a second, on standard error, or as JSON on standard output.
+//!
+//! The thread "status" prints what the extraction thread left in a queue of one, so that the extraction thread never writes to a
+//! terminal. A line that cannot be printed is left out.
+
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering::Relaxed};
+use std::thread::JoinHandle;
+use std::time::Duration;
+
+use crossbeam::queue::ArrayQueue;
+use serde::Serialize;
+use shared::os;
+
+/// How often the thread looks for a new status. It also bounds how long the process takes to end.
+const PAUSE: Duration = Duration::from_millis(100);
+/// Time from one line to the next, ns.
+const LINE_NS: u64 = 1_000_000_000;
+
+/// The state of the worker after its newest frame.
+#[derive(Debug, Clone, Copy, Default, Serialize)]
+pub struct Status {
+    /// Frames measured since the start.
+    pub frames: u64,
+    /// Frames that the camera counted but that never came.
+    pub lost: u64,
+    /// Frames that came twice or late and were left out.
+    pub repeated: u64,
+    /// Frames with a doubt.
+    pub doubtful: u64,
+    /// Number of the newest frame.
+    pub sequence: u64,
+    /// V_e of the newest frame, px^2.
+    pub area_px2: f32,
+    /// Confidence of the newest frame, 0 to 1.
+    pub confidence: f32,
+    /// Why the newest frame is doubtful, in words.
+    pub doubt: &'static str,
+    /// Time from taking the newest frame to publishing its feature, us.
+    pub took_us: f32,
+    /// Time from the middle of the newest frame's exposure to publishing its feature, ms.
+    pub latency_ms: f32,
+    /// No frame has come for a second.
+    pub silent: bool,
+}
+
+/// Starts the thread "status". It ends soon after `stop` is set.
+pub fn start_printer(latest: &Arc<ArrayQueue<Status>>, stop: &Arc<AtomicBool>, json: bool) -> std::io::Result<JoinHandle<()>> {
+    let (latest, stop) = (Arc::clone(latest), Arc::clone(stop));
+    std::thread::Builder::new().name("status".into()).spawn(move || print_until_stopped(&latest, &stop, json))
+}
+
+fn print_until_stopped(latest: &ArrayQueue<Status>, stop: &AtomicBool, json: bool) {
+    let mut frames_before = 0;
+    let mut printed_at_ns = os::now_ns();
+    eprintln!("feature-worker: waiting for frames");
+    while !stop.load(Relaxed) {
+        std::thread::sleep(PAUSE);
+        let now_ns = os::now_ns();
+        if now_ns < printed_at_ns + LINE_NS {
+            continue;
+        }
+        let Some(status) = latest.pop() else { continue };
+        if json {
+            match serde_json::to_string(&status) {
+                Ok(line) => println!("{line}"),
+                Err(e) => eprintln!("feature-worker: status: {e}"),
+            }
+        } else if status.silent {
+            eprintln!("feature-worker: no frames for a second; waiting for the camera driver");
+        } else {
+            let fps = (status.frames - frames_before) as f64 * 1e9 / (now_ns - printed_at_ns) as f64;
+            eprintln!(
+                "feature-worker: frame {} ({fps:.0}/s), V_e {:.0} px^2, confidence {:.2}, doubt: {}, {:.2} ms + {:.1} ms old, lost {}, \
+                 repeated {}, doubtful {}",
+                status.sequence,
+                status.area_px2,
+                status.confidence,
+                status.doubt,
+                status.took_us / 1e3,
+                status.latency_ms,
+                status.lost,
+                status.repeated,
+                status.doubtful
+            );
+        }
+        (frames_before, printed_at_ns) = (status.frames, now_ns);
+    }
+}

@@ -1,0 +1,91 @@
+//! What stands behind the sockets: the machine, who owns which input, and the faults that last.
+//!
+//! Pure. Runs on the controller's thread; allocates for names of variables only, and cannot fail. Faults that act on connections
+//! alone are carried out by the server itself.
+
+use crate::ur::fault::Fault;
+use crate::ur::machine::Machine;
+use crate::ur::rtde::InputOwners;
+use crate::ur::variables::Input;
+
+/// The faults that last. A fault is on while the machine's cycle is below its number here.
+#[derive(Default)]
+pub struct StandingFaults {
+    /// Names of variables that the controller pretends not to know.
+    pub hidden: Vec<String>,
+    pub refuse_version_2: bool,
+    pub text_on_connect: Option<String>,
+    pub offline_until: u64,
+    pub stall_until: u64,
+    pub freeze_until: u64,
+    pub slow_reader_until: u64,
+    pub skip_until: u64,
+    pub split_until: u64,
+    pub coalesce_until: u64,
+}
+
+/// What the clients reach through their sockets.
+pub struct Backend {
+    /// The controller without sockets.
+    pub machine: Machine,
+    /// Who owns which input.
+    pub owners: InputOwners,
+    /// The faults that last.
+    pub faults: StandingFaults,
+}
+
+impl Backend {
+    /// True while the machine's cycle is below `until`.
+    pub fn is_before(&self, until: u64) -> bool {
+        self.machine.cycle() < until
+    }
+
+    /// The cycle that comes `time_s` from now.
+    fn cycle_in(&self, time_s: f64) -> u64 {
+        self.machine.cycle() + self.machine.robot.cycles(time_s)
+    }
+
+    /// Takes a program that a client sent, or notes why its text cannot be one.
+    pub fn upload(&mut self, program: Result<String, &'static str>) {
+        match program {
+            Ok(source) => self.machine.upload(&source),
+            Err(what) => self.machine.program_error(what),
+        }
+    }
+
+    /// Carries out the part of a fault that no socket takes part in.
+    pub fn inject(&mut self, fault: &Fault) {
+        match fault {
+            Fault::Offline(s) => self.faults.offline_until = self.cycle_in(*s),
+            Fault::Stall(s) => self.faults.stall_until = self.cycle_in(*s),
+            Fault::Freeze(s) => self.faults.freeze_until = self.cycle_in(*s),
+            Fault::SlowReader(s) => self.faults.slow_reader_until = self.cycle_in(*s),
+            Fault::SkipOutputs(n) => self.faults.skip_until = self.machine.cycle() + u64::from(*n) + 1,
+            Fault::Split(s) => self.faults.split_until = self.cycle_in(*s),
+            Fault::Coalesce(s) => self.faults.coalesce_until = self.cycle_in(*s),
+            Fault::InUse(name) => {
+                if let Some(input) = Input::parse(name) {
+                    self.owners.claim_for_fieldbus(input);
+                }
+            }
+            Fault::NotFound(name) => self.faults.hidden.push(name.clone()),
+            Fault::RefuseVersion2 => self.faults.refuse_version_2 = true,
+            Fault::TextOnConnect(message) => self.faults.text_on_connect = Some(message.clone()),
+            Fault::ProtectiveStop => self.machine.protective_stop("injected"),
+            Fault::EmergencyStop => self.machine.emergency_stop(),
+            Fault::EmergencyRelease => self.machine.release_emergency_stop(),
+            Fault::LateStart(s) => self.machine.set_late_start(*s),
+            Fault::ProgramStop => drop(self.machine.stop_program()),
+            Fault::ProgramPause => drop(self.machine.pause()),
+            Fault::SpeedSlider(share) => self.machine.robot.set_speed_slider(*share),
+            Fault::LocalControl => self.machine.set_remote_control(false),
+            Fault::RemoteControl => self.machine.set_remote_control(true),
+            Fault::Clear => {
+                self.faults = StandingFaults::default();
+                self.owners.release_fieldbus();
+                self.machine.set_late_start(0.0);
+            }
+            Fault::Fin | Fault::Reset | Fault::Text(_) => {}
+        }
+    }
+}

@@ -1,0 +1,330 @@
+//! Holds the habits of the house: files that do not import each other in circles, short files and functions, a header for each file,
+//! a sentence for each constant, and documents that name files which exist.
+//!
+//! It reads the source files as text and starts no process. What it cannot see, such as whether a name is a good one, is left to people;
+//! CONTRIBUTING.md says what they look for.
+#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::too_many_lines)]
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::fs;
+use std::path::{Path, PathBuf};
+
+/// Most lines of a file.
+const FILE_LINES: usize = 500;
+
+/// Files that stay longer, with their lines and the reason. An entry may only shrink, and goes when its file is short enough.
+const LONGER_FILES: &[(&str, usize, &str)] = &[];
+
+/// Most functions that may stay longer than the limit in clippy.toml. Each one carries its reason in its `expect` attribute.
+const LONGER_FUNCTIONS: usize = 0;
+
+/// The one file that may hold unsafe code.
+const UNSAFE_FILE: &str = "shared/src/os.rs";
+
+fn root() -> PathBuf {
+    Path::new(env!("CARGO_MANIFEST_DIR")).parent().expect("the crate lies in the workspace").to_path_buf()
+}
+
+/// The crates of the workspace, as directories.
+fn crates() -> Vec<String> {
+    let manifest = read(&root().join("Cargo.toml"));
+    let members = manifest.split("members = [").nth(1).and_then(|rest| rest.split(']').next()).expect("Cargo.toml lists its members");
+    members.split('"').skip(1).step_by(2).map(str::to_string).collect()
+}
+
+/// All files below `directory` with the ending `extension`, sorted.
+fn files(directory: &Path, extension: &str) -> Vec<PathBuf> {
+    let mut found = Vec::new();
+    let mut open = vec![directory.to_path_buf()];
+    while let Some(directory) = open.pop() {
+        for entry in fs::read_dir(&directory).into_iter().flatten().flatten() {
+            let path = entry.path();
+            let name = entry.file_name().to_string_lossy().into_owned();
+            if path.is_dir() && !name.starts_with('.') && !["target", "out"].contains(&name.as_str()) {
+                open.push(path);
+            } else if path.extension().is_some_and(|e| e == extension) {
+                found.push(path);
+            }
+        }
+    }
+    found.sort();
+    found
+}
+
+fn name_of(path: &Path) -> String {
+    path.strip_prefix(root()).unwrap_or(path).display().to_string()
+}
+
+fn read(path: &Path) -> String {
+    fs::read_to_string(path).unwrap_or_else(|e| panic!("{}: {e}", path.display()))
+}
+
+/// All Rust files of the crates, by name and text.
+fn sources() -> Vec<(String, String)> {
+    crates().iter().flat_map(|c| files(&root().join(c), "rs")).map(|p| (name_of(&p), read(&p))).collect()
+}
+
+/// The text without comments and without the tests at its end.
+fn code(text: &str) -> String {
+    let text = text.split("#[cfg(test)]\nmod tests").next().unwrap_or(text);
+    let lines = text.lines().map(|line| line.split("//").next().unwrap_or(""));
+    lines.collect::<Vec<_>>().join("\n")
+}
+
+/// Fails with all `faults`, a line each.
+fn none(faults: &[String]) {
+    assert!(faults.is_empty(), "\n{}", faults.join("\n"));
+}
+
+/// The paths that a `use` tree such as `a::{b, c::{self, D}}` names.
+fn expand(tree: &str) -> Vec<String> {
+    let tree = tree.trim();
+    let Some(open) = tree.find('{') else {
+        return vec![tree.split(" as ").next().unwrap_or(tree).trim().to_string()];
+    };
+    let (prefix, inner) = (&tree[..open], tree[open + 1..].trim_end().trim_end_matches('}'));
+    let (mut depth, mut start, mut parts) = (0, 0, Vec::new());
+    for (at, c) in inner.char_indices() {
+        match c {
+            '{' => depth += 1,
+            '}' => depth -= 1,
+            ',' if depth == 0 => {
+                parts.push(&inner[start..at]);
+                start = at + 1;
+            }
+            _ => {}
+        }
+    }
+    parts.push(&inner[start..]);
+    parts.iter().filter(|p| !p.trim().is_empty()).flat_map(|p| expand(&format!("{prefix}{}", p.trim()))).collect()
+}
+
+/// The paths that a file's code names: its `use` trees without the re-exports, and paths in the code itself.
+fn paths(code: &str) -> Vec<String> {
+    let mut found = Vec::new();
+    let mut rest = String::new();
+    for statement in code.split_inclusive(';') {
+        let begin = statement.rfind("use ").filter(|at| statement[..*at].chars().next_back().is_none_or(char::is_whitespace));
+        match begin {
+            Some(at) if !statement[..at].trim_end().ends_with("pub") && !statement[..at].trim_end().ends_with(')') => {
+                found.extend(expand(statement[at + 4..].trim_end_matches(';')));
+                rest.push_str(&statement[..at]);
+            }
+            Some(_) => {}
+            None => rest.push_str(statement),
+        }
+    }
+    let is_path = |c: char| c.is_alphanumeric() || c == '_' || c == ':';
+    found.extend(rest.split(|c| !is_path(c)).filter(|p| p.contains("::")).map(str::to_string));
+    found
+}
+
+/// Which files of one crate each of its files imports from, by module path (`vision::line`; empty for the root).
+fn imports(name: &str) -> BTreeMap<String, BTreeSet<String>> {
+    let source = root().join(name).join("src");
+    let module = |path: &Path| {
+        let relative = path.strip_prefix(&source).unwrap_or(path).with_extension("");
+        let mut parts: Vec<String> = relative.iter().map(|p| p.to_string_lossy().into_owned()).collect();
+        if parts.last().is_some_and(|p| p == "mod" || (p == "lib" && parts.len() == 1)) {
+            parts.pop();
+        }
+        parts
+    };
+    let modules: BTreeMap<String, (Vec<String>, PathBuf)> =
+        files(&source, "rs").into_iter().map(|p| (module(&p).join("::"), (module(&p), p))).collect();
+    let own = name.replace('-', "_");
+    let mut graph = BTreeMap::new();
+    for (from, (parts, path)) in &modules {
+        let mut to = BTreeSet::new();
+        for path in paths(&code(&read(path))) {
+            let mut steps: Vec<&str> = path.split("::").filter(|s| !s.is_empty()).collect();
+            let mut at: Vec<String> = parts.clone();
+            match steps.first() {
+                Some(&"crate") => at.clear(),
+                Some(first) if *first == own => at.clear(),
+                Some(&"self") => {}
+                Some(&"super") => {
+                    while steps.first() == Some(&"super") {
+                        at.pop();
+                        steps.remove(0);
+                    }
+                    steps.insert(0, "super");
+                }
+                // A child that this file declares.
+                Some(first) if modules.contains_key(&[parts.join("::"), first.to_string()].join("::")) && !parts.is_empty() => {
+                    steps.insert(0, "self");
+                }
+                _ => continue,
+            }
+            for step in steps.drain(..).skip(1) {
+                at.push(step.to_string());
+            }
+            while !modules.contains_key(&at.join("::")) && !at.is_empty() {
+                at.pop();
+            }
+            let target = at.join("::");
+            if target != *from && modules.contains_key(&target) {
+                to.insert(target);
+            }
+        }
+        graph.insert(from.clone(), to);
+    }
+    graph
+}
+
+/// Protects a reader from circles: of two files one can be read without the other.
+#[test]
+fn no_files_import_each_other_in_a_circle() {
+    let mut faults = Vec::new();
+    for name in crates() {
+        let graph = imports(&name);
+        // What each file reaches; a circle reaches itself.
+        let reach = |from: &String| {
+            let mut seen: BTreeSet<&String> = BTreeSet::new();
+            let mut open: Vec<&String> = graph[from].iter().collect();
+            while let Some(next) = open.pop() {
+                if seen.insert(next) {
+                    open.extend(&graph[next]);
+                }
+            }
+            seen
+        };
+        let reached: BTreeMap<&String, BTreeSet<&String>> = graph.keys().map(|k| (k, reach(k))).collect();
+        let mut told: BTreeSet<&String> = BTreeSet::new();
+        for from in graph.keys() {
+            let circle: Vec<&String> = reached[from].iter().filter(|to| reached[*to].contains(from)).copied().collect();
+            if !circle.is_empty() && told.insert(circle[0]) {
+                let edges: Vec<String> = circle
+                    .iter()
+                    .flat_map(|a| graph[*a].iter().filter(|b| circle.contains(b)).map(move |b| format!("{a} -> {b}")))
+                    .collect();
+                faults.push(format!("{name}: a circle of {} files: {}", circle.len(), edges.join(", ")));
+            }
+        }
+    }
+    none(&faults);
+}
+
+/// Protects the test above: it finds a circle through a group, a parent, and a path in the code.
+#[test]
+fn paths_are_read_as_the_compiler_reads_them() {
+    assert_eq!(expand("crate::{a::{self, B}, c::D as E}"), ["crate::a::self", "crate::a::B", "crate::c::D"]);
+    let code = "use std::fmt;\nuse super::line::{Line,\n fit};\npub use child::Thing;\nfn f() { crate::os::now_ns() }";
+    assert_eq!(paths(code), ["std::fmt", "super::line::Line", "super::line::fit", "crate::os::now_ns"]);
+}
+
+/// Protects a reader from files that do not fit into a head.
+#[test]
+fn files_are_short() {
+    let mut faults = Vec::new();
+    for (name, text) in sources() {
+        let lines = text.lines().count();
+        match LONGER_FILES.iter().find(|(listed, ..)| *listed == name) {
+            None if lines > FILE_LINES => faults.push(format!("{name}: {lines} lines, at most {FILE_LINES}: split it")),
+            Some((_, most, _)) if lines > *most => {
+                faults.push(format!("{name}: {lines} lines, its entry allows {most}: it may only shrink"))
+            }
+            Some((_, most, _)) if lines <= FILE_LINES || lines + 20 < *most => {
+                faults.push(format!("{name}: {lines} lines, its entry says {most}: lower the entry, or take it out"));
+            }
+            _ => {}
+        }
+    }
+    for (name, ..) in LONGER_FILES {
+        if !root().join(name).exists() {
+            faults.push(format!("{name}: is listed as longer, but is not there"));
+        }
+    }
+    none(&faults);
+}
+
+/// Protects the limit on functions, which clippy holds: exceptions do not become more.
+#[test]
+fn long_functions_do_not_become_more() {
+    let exceptions: usize =
+        sources().iter().filter(|(name, _)| !name.ends_with("house.rs")).map(|(_, t)| t.matches("(clippy::too_many_lines").count()).sum();
+    assert_eq!(exceptions, LONGER_FUNCTIONS, "exceptions to clippy::too_many_lines; with fewer of them, lower LONGER_FUNCTIONS");
+}
+
+/// Protects a newcomer: each file begins by saying what it is for.
+#[test]
+fn each_file_says_what_it_is_for() {
+    none(
+        &sources()
+            .iter()
+            .filter(|(_, text)| !text.starts_with("//!"))
+            .map(|(name, _)| format!("{name}: has no header"))
+            .collect::<Vec<_>>(),
+    );
+}
+
+/// Protects every number: each constant outside of functions has its own sentence, which tells where its value comes from.
+#[test]
+fn each_constant_has_its_own_sentence() {
+    let mut faults = Vec::new();
+    for (name, text) in sources().iter().filter(|(name, _)| name.contains("/src/")) {
+        let text = text.split("#[cfg(test)]\nmod tests").next().unwrap_or(text);
+        let mut before = "";
+        for (at, line) in text.lines().enumerate() {
+            let declared = line.trim_start_matches("pub(crate) ").trim_start_matches("pub(super) ").trim_start_matches("pub ");
+            let constant =
+                ["const ", "static "].iter().any(|k| declared.strip_prefix(k).is_some_and(|r| r.starts_with(char::is_uppercase)));
+            if constant && !before.starts_with("///") {
+                faults.push(format!("{name}:{}: {}", at + 1, line.chars().take(60).collect::<String>()));
+            }
+            if !line.starts_with("#[") {
+                before = line;
+            }
+        }
+    }
+    none(&faults);
+}
+
+/// Protects memory: unsafe code stands in one small file.
+#[test]
+fn unsafe_code_stands_in_one_file() {
+    let unsafe_in = |text: &str| ["unsafe {", "unsafe fn", "unsafe impl", "unsafe extern"].iter().any(|u| code(text).contains(u));
+    let faults: Vec<String> = sources()
+        .iter()
+        .filter(|(name, text)| name != UNSAFE_FILE && !name.ends_with("house.rs") && unsafe_in(text))
+        .map(|(name, _)| format!("{name}: unsafe code belongs into {UNSAFE_FILE}"))
+        .collect();
+    none(&faults);
+}
+
+/// Protects the documents: what they link to and the files that they name exist, and nothing is left to be filled in.
+#[test]
+fn documents_are_whole_and_name_files_that_exist() {
+    let mut faults = Vec::new();
+    for file in files(&root(), "md") {
+        let (name, text) = (name_of(&file), read(&file));
+        let directory = file.parent().expect("a file lies in a directory");
+        for (at, line) in text.lines().enumerate() {
+            let mut fault = |what: String| faults.push(format!("{name}:{}: {what}", at + 1));
+            for placeholder in ["TODO", "FIXME", "XXX", "TBD", "| CAM"] {
+                if line.contains(placeholder) {
+                    fault(format!("has the placeholder {placeholder}"));
+                }
+            }
+            for target in line.split("](").skip(1).filter_map(|rest| rest.split(')').next()) {
+                let path = target.split('#').next().unwrap_or("");
+                if !target.contains("://") && !path.is_empty() && !directory.join(path).exists() {
+                    fault(format!("links to {target}, which is not there"));
+                }
+            }
+            for quoted in line.split('`').skip(1).step_by(2) {
+                let source = quoted.ends_with(".rs") && !quoted.contains(['{', '*', ' ']);
+                let script = quoted.starts_with("scripts/") && !quoted.contains([' ', '{', '*']);
+                if (source || script) && name != "CHANGELOG.md" && !is_there(quoted) {
+                    fault(format!("names {quoted}, which is not there"));
+                }
+            }
+        }
+    }
+    none(&faults);
+}
+
+/// Whether a file's name, given from the root or from within a crate, is one of the tree's.
+fn is_there(quoted: &str) -> bool {
+    root().join(quoted).exists() || sources().iter().any(|(name, _)| name.ends_with(&format!("/{quoted}")))
+}
