@@ -1,19 +1,9 @@
 //! The fused estimate: the stream's area and the container's geometry, combined frame by frame.
 //!
 //! How far the tilt must go to keep the flow alive tells how much has left, whatever the camera's gain is. An extended Kalman
-//! filter on the [flow model](super::flow) weighs the two. It runs in the controller's loop and is pure: its size is fixed, it
-//! does not allocate, and it does not panic. It takes about 5 kflop a frame. A measurement that cannot be one counts as a lost
-//! frame.
-//!
-//! | symbol | state of the filter |
-//! |---|---|
-//! | X | headspace: capacity that is used up, ml |
-//! | lambda | logarithm of this pour's flow factor (viscosity) |
-//! | gamma | logarithm of the camera's gain in this pour |
-//! | beta | logarithm of the scale of the vessel's capacity |
-//! | F | film at the lip, ml |
-//! | V | volume that has left the lip, ml |
-//! | delta | delay of this pour above the model's, frames |
+//! filter on the [flow model](super::flow) weighs the two (`filter.rs`). It runs in the controller's loop and is pure: its size is
+//! fixed, it does not allocate, and it does not panic. It takes about 5 kflop a frame. A measurement that cannot be one counts as a
+//! lost frame.
 //!
 //! The filter starts with the first frame that shows flow. Before that, only the tilt is followed.
 //!
@@ -21,27 +11,8 @@
 //! is as the episodes showed; the camera or the liquid has changed; the geometry or the delay is not to be trusted. Each frame's
 //! likelihood moves weight to the explanations that foresaw it (a Gaussian sum), and the estimate is their weighted mean.
 
-use super::flow::{CommandHistory, DRIP_SHARE, FlowNoise, FlowState, FlowTables, WayBack};
-
-/// Number of states of a filter.
-const STATES: usize = 7;
-/// Index of X, the headspace.
-const HEADSPACE: usize = 0;
-/// Index of lambda, the flow factor's logarithm.
-const FLOW_FACTOR: usize = 1;
-/// Index of gamma, the logarithm of the camera's gain.
-const CAMERA_GAIN: usize = 2;
-/// Index of beta, the logarithm of the capacity's scale.
-const CAPACITY_SCALE: usize = 3;
-/// Index of F, the film.
-const FILM: usize = 4;
-/// Index of V, the volume poured.
-const POURED: usize = 5;
-/// Index of delta, the delay above the model's.
-const EXTRA_DELAY: usize = 6;
-
-/// One number for each state.
-type States = [f64; STATES];
+use super::filter::{CAPACITY_SCALE, Drift, EXTRA_DELAY, FILM, FLOW_FACTOR, Filter, HEADSPACE, POURED, Tilt};
+use super::flow::{CommandHistory, FlowNoise, FlowState, FlowTables, WayBack};
 
 /// Number of explanations.
 const EXPLANATIONS: usize = 3;
@@ -59,39 +30,33 @@ const CAMERA_SDS: f64 = 2.5;
 /// This much further the estimate may be from the camera's own sum in any case, ml. Tuned on rigs 100 to 123, see docs/LEARNING.md.
 const CAMERA_ML: f64 = 1.5;
 
-/// Error of an area that does not shrink with it, ml a frame. From the prototype's filter; no other measurement is recorded.
-const SD_FLOOR_ML: f64 = 0.012;
-/// Slopes are taken at no less than this excess, so that a filter that believes the flow has ceased can be told otherwise, ml.
-/// Chosen by hand; no measurement is recorded.
-const EXCESS_MIN_ML: f64 = 0.05;
 /// More than any container gives in a frame, so that it is not a measurement, ml. Chosen by hand; no measurement is recorded.
 const MEASURED_MAX_ML: f64 = 50.0;
-/// A measurement that is further off than this many standard deviations counts less. From the prototype's filter; no other
-/// measurement is recorded.
-const GATE_SDS: f64 = 4.0;
 /// Angles outside of this range are cut to it, degrees: no cell tilts that far.
 const COMMAND_RANGE_DEG: (f64, f64) = (-30.0, 200.0);
 
-/// The tilt that a picture shows, and its change in a frame, degrees.
-#[derive(Debug, Clone, Copy)]
-struct Tilt {
-    tilt_deg: f64,
-    change_deg: f64,
+/// What changes in a frame that the model does not know, where all is as the episodes showed. From the prototype's filter, tuned on
+/// rigs 100 to 123, see docs/LEARNING.md.
+const USUAL_DRIFT: Drift = Drift { headspace_sd_ml: 0.05, log_flow_factor_sd: 0.007 };
+/// The same where the geometry or the delay is not to be trusted. Tuned on rigs 100 to 123, see docs/LEARNING.md.
+const DISTRUSTED_DRIFT: Drift = Drift { headspace_sd_ml: 0.2, log_flow_factor_sd: 0.02 };
+
+/// The doubt where the camera or the liquid has changed, from the usual one. Tuned on rigs 100 to 123, see docs/LEARNING.md.
+fn changed(usual: FlowNoise) -> FlowNoise {
+    FlowNoise { log_camera_gain_sd: (3.0 * usual.log_camera_gain_sd).max(0.1), log_flow_factor_sd: 2.0 * usual.log_flow_factor_sd, ..usual }
 }
 
-/// One explanation: a filter with its own idea of what may be off, and by how much.
+/// The doubt where the geometry or the delay is not to be trusted, from the usual one. Tuned on rigs 100 to 123, see
+/// docs/LEARNING.md.
+fn distrusted(usual: FlowNoise) -> FlowNoise {
+    FlowNoise { log_capacity_scale_sd: (5.0 * usual.log_capacity_scale_sd).max(0.1), extra_delay_sd_frames: 1.5, ..usual }
+}
+
+/// One explanation of what is seen.
 #[derive(Debug, Clone)]
-struct Filter {
-    noise: FlowNoise,
-    /// What the model does not know of the headspace in a frame: a standard deviation in ml, and again for each ml of outflow.
-    headspace_sd_ml: f64,
-    /// What the model does not know of the flow factor's logarithm in a frame: a standard deviation.
-    log_flow_factor_sd: f64,
-    state: States,
-    covariance: [States; STATES],
-    /// Zeros seen in a row.
-    zeros: u32,
-    /// How likely this explanation is; the weights of all add up to 1.
+struct Explanation {
+    filter: Filter,
+    /// How likely it is; the weights of all add up to 1.
     weight: f64,
 }
 
@@ -122,7 +87,7 @@ impl CameraSum {
 pub struct FusedEstimator {
     flow: FlowTables,
     way_back: WayBack,
-    filters: [Filter; EXPLANATIONS],
+    explanations: [Explanation; EXPLANATIONS],
     camera: CameraSum,
     /// Whether flow has been seen.
     started: bool,
@@ -136,31 +101,12 @@ impl FusedEstimator {
     /// An estimator for a pour to come.
     pub fn new(flow: FlowTables, way_back: WayBack) -> Self {
         let noise = flow.model.noise;
-        let usual = Filter {
-            noise,
-            headspace_sd_ml: 0.05,
-            log_flow_factor_sd: 0.007,
-            state: [0.0; STATES],
-            covariance: [[0.0; STATES]; STATES],
-            zeros: 0,
-            weight: 0.0,
-        };
-        let changed = FlowNoise {
-            log_camera_gain_sd: (3.0 * noise.log_camera_gain_sd).max(0.1),
-            log_flow_factor_sd: 2.0 * noise.log_flow_factor_sd,
-            ..noise
-        };
-        let distrusted =
-            FlowNoise { log_capacity_scale_sd: (5.0 * noise.log_capacity_scale_sd).max(0.1), extra_delay_sd_frames: 1.5, ..noise };
-        let filters = [
-            usual.clone(),
-            Filter { noise: changed, ..usual.clone() },
-            Filter { noise: distrusted, headspace_sd_ml: 0.2, log_flow_factor_sd: 0.02, ..usual },
-        ];
+        let filters =
+            [Filter::new(noise, USUAL_DRIFT), Filter::new(changed(noise), USUAL_DRIFT), Filter::new(distrusted(noise), DISTRUSTED_DRIFT)];
         let mut estimator = Self {
             flow,
             way_back,
-            filters,
+            explanations: filters.map(|filter| Explanation { filter, weight: 0.0 }),
             camera: CameraSum::default(),
             started: false,
             followed: false,
@@ -173,11 +119,9 @@ impl FusedEstimator {
 
     /// Forgets the pour.
     pub fn restart(&mut self) {
-        for (filter, prior) in self.filters.iter_mut().zip(PRIOR) {
-            filter.state = [0.0; STATES];
-            filter.covariance = [[0.0; STATES]; STATES];
-            filter.zeros = 0;
-            filter.weight = prior;
+        for (explanation, prior) in self.explanations.iter_mut().zip(PRIOR) {
+            explanation.filter.restart();
+            explanation.weight = prior;
         }
         self.camera = CameraSum::default();
         self.started = false;
@@ -186,7 +130,7 @@ impl FusedEstimator {
 
     /// Weighted mean of one of the states over the explanations.
     fn mean(&self, state: usize) -> f64 {
-        self.filters.iter().map(|f| f.weight * f.state[state]).sum()
+        self.explanations.iter().map(|e| e.weight * e.filter.state[state]).sum()
     }
 
     /// Volume that has left the lip as far as the pictures show, ml.
@@ -200,9 +144,9 @@ impl FusedEstimator {
     /// Standard deviation of [`FusedEstimator::poured_ml`], ml.
     pub fn poured_sd_ml(&self) -> f64 {
         let mean = self.poured_ml();
-        self.filters
+        self.explanations
             .iter()
-            .map(|f| f.weight * (f.covariance[POURED][POURED] + (f.state[POURED] - mean).powi(2)))
+            .map(|Explanation { filter, weight }| weight * (filter.covariance[POURED][POURED] + (filter.state[POURED] - mean).powi(2)))
             .sum::<f64>()
             .max(0.0)
             .sqrt()
@@ -241,14 +185,14 @@ impl FusedEstimator {
         } else {
             let Some(first_ml) = measured_ml.filter(|y| *y > 0.0) else { return };
             self.started = true;
-            for filter in &mut self.filters {
-                filter.start(&self.flow, self.tilt, first_ml);
+            for explanation in &mut self.explanations {
+                explanation.filter.start(&self.flow, self.tilt, first_ml);
             }
         }
-        for filter in &mut self.filters {
-            filter.propagate(&self.flow, self.tilt);
+        for explanation in &mut self.explanations {
+            explanation.filter.propagate(&self.flow, self.tilt);
         }
-        if !self.filters.iter().all(Filter::is_finite) {
+        if !self.explanations.iter().all(|e| e.weight.is_finite() && e.filter.is_finite()) {
             // This cannot happen with checked weights. If it does, the pour goes on as one that has not been seen yet.
             self.restart();
         }
@@ -256,17 +200,17 @@ impl FusedEstimator {
 
     /// Gives a measurement to all filters, and weight to those that foresaw it.
     fn update(&mut self, measured_ml: f64) {
-        let log_likelihoods = self.filters.each_mut().map(|f| f.update(&self.flow, self.tilt, measured_ml));
+        let log_likelihoods = self.explanations.each_mut().map(|e| e.filter.update(&self.flow, self.tilt, measured_ml));
         // A zero may be a dropout: it tells the filters what to believe, but not which of them to believe.
         let log_likelihoods = if measured_ml > 0.0 { log_likelihoods } else { [0.0; EXPLANATIONS] };
         let most = log_likelihoods.iter().copied().fold(f64::NEG_INFINITY, f64::max);
         let mut total = 0.0;
-        for (filter, log_likelihood) in self.filters.iter_mut().zip(log_likelihoods) {
-            filter.weight = (filter.weight * (TEMPER * (log_likelihood - most)).exp()).max(WEIGHT_MIN);
-            total += filter.weight;
+        for (explanation, log_likelihood) in self.explanations.iter_mut().zip(log_likelihoods) {
+            explanation.weight = (explanation.weight * (TEMPER * (log_likelihood - most)).exp()).max(WEIGHT_MIN);
+            total += explanation.weight;
         }
-        for filter in &mut self.filters {
-            filter.weight /= total;
+        for explanation in &mut self.explanations {
+            explanation.weight /= total;
         }
     }
 
@@ -285,196 +229,6 @@ impl FusedEstimator {
         let tilt_deg = self.flow.next_tilt_deg(before_deg, self.flow.delayed_deg(self.history.commands(), 0, 0.0));
         self.tilt = Tilt { tilt_deg, change_deg: tilt_deg - before_deg };
     }
-}
-
-/// Outflow over the lip in a frame, ml, and its slopes in the states that it depends on.
-#[derive(Debug, Clone, Copy)]
-struct Slopes {
-    flow_ml: f64,
-    per_headspace: f64,
-    per_flow_factor: f64,
-    per_extra_delay: f64,
-}
-
-impl Filter {
-    fn is_finite(&self) -> bool {
-        self.weight.is_finite() && self.state.iter().chain(self.covariance.iter().flatten()).all(|s| s.is_finite())
-    }
-
-    /// The first sight of flow gives the headspace: what must have left for the lip to be covered as high as the stream says.
-    fn start(&mut self, flow: &FlowTables, tilt: Tilt, measured_ml: f64) {
-        let noise = self.noise;
-        let Tilt { tilt_deg, change_deg } = tilt;
-        let lost_ml_per_deg = flow.over_lip(tilt_deg, 0.0, 0.0).lost_ml_per_deg;
-        let excess_ml = flow.excess_ml_for(tilt_deg, measured_ml);
-        let excess_per_log = excess_ml / flow.model.head_exponent;
-        self.state = [0.0; STATES];
-        self.state[HEADSPACE] = flow.capacity.lost_ml(tilt_deg) - excess_ml;
-        let variance = |sd: f64| sd * sd;
-        let factor = variance(noise.log_flow_factor_sd);
-        let gain = variance(noise.log_camera_gain_sd);
-        let delay = variance(noise.extra_delay_sd_frames);
-        let mut c = [[0.0; STATES]; STATES];
-        let tilt_sd_ml = lost_ml_per_deg * change_deg * noise.extra_delay_sd_frames;
-        c[HEADSPACE][HEADSPACE] =
-            variance(excess_per_log) * (factor + gain + variance(noise.log_frame_volume_sd)) + variance(tilt_sd_ml) + 1.0;
-        c[FLOW_FACTOR][FLOW_FACTOR] = factor;
-        c[CAMERA_GAIN][CAMERA_GAIN] = gain;
-        c[CAPACITY_SCALE][CAPACITY_SCALE] = variance(noise.log_capacity_scale_sd);
-        c[EXTRA_DELAY][EXTRA_DELAY] = delay;
-        for (other, covariance) in [
-            (FLOW_FACTOR, excess_per_log * factor),
-            (CAMERA_GAIN, excess_per_log * gain),
-            (EXTRA_DELAY, -lost_ml_per_deg * change_deg * delay),
-        ] {
-            c[HEADSPACE][other] = covariance;
-            c[other][HEADSPACE] = covariance;
-        }
-        self.covariance = c;
-    }
-
-    /// Takes a measurement; answers with its log-likelihood.
-    ///
-    /// The filter is linearised twice: at what it foresaw, and at what the measurement makes of that.
-    fn update(&mut self, flow: &FlowTables, tilt: Tilt, measured_ml: f64) -> f64 {
-        let noise = self.noise;
-        let least_ml = noise.least_visible_ml;
-        let prior = self.state;
-        let mut posterior = prior;
-        let mut gained = ([0.0; STATES], 1.0);
-        let mut log_likelihood = 0.0;
-        self.zeros = if measured_ml == 0.0 { self.zeros + 1 } else { 0 };
-        for pass in 0..2 {
-            let (foreseen_ml, slopes) = foresee(flow, tilt, &posterior);
-            let mut seen_ml = measured_ml;
-            if measured_ml == 0.0 {
-                if foreseen_ml <= least_ml || (foreseen_ml > 3.0 * least_ml && self.zeros < 3) {
-                    // There is too little to be seen, or the extraction dropped the stream.
-                    return 0.0;
-                }
-                seen_ml = least_ml;
-            }
-            let projected = self.covariance.map(|row| dot(&row, &slopes));
-            let mut noise_variance = (noise.log_frame_volume_sd * foreseen_ml).powi(2) + SD_FLOOR_ML * SD_FLOOR_ML;
-            let spread = dot(&slopes, &projected).max(0.0);
-            let mut innovation_ml = seen_ml - foreseen_ml;
-            for k in 0..STATES {
-                innovation_ml -= slopes[k] * (prior[k] - posterior[k]);
-            }
-            if pass == 0 {
-                let square = innovation_ml * innovation_ml / (spread + noise_variance);
-                log_likelihood = -0.5 * (square.min(GATE_SDS * GATE_SDS) + (spread + noise_variance).ln());
-            }
-            let limit = GATE_SDS * GATE_SDS * (spread + noise_variance);
-            if innovation_ml * innovation_ml > limit {
-                noise_variance = innovation_ml * innovation_ml / (GATE_SDS * GATE_SDS) - spread;
-            }
-            let total = spread + noise_variance;
-            for k in 0..STATES {
-                posterior[k] = prior[k] + projected[k] / total * innovation_ml;
-            }
-            gained = (projected, total);
-        }
-        self.state = posterior;
-        let (projected, total) = gained;
-        for i in 0..STATES {
-            for j in 0..STATES {
-                self.covariance[i][j] -= projected[i] * projected[j] / total;
-            }
-        }
-        log_likelihood
-    }
-
-    /// One frame of the flow model, for the states and their covariance.
-    fn propagate(&mut self, flow: &FlowTables, tilt: Tilt) {
-        let film_share = flow.model.film_share;
-        let Slopes { flow_ml, per_headspace, per_flow_factor, per_extra_delay } = outflow(flow, tilt, &self.state);
-        let capacity_scale = self.state[CAPACITY_SCALE].exp();
-        let mut flow_slopes = [0.0; STATES];
-        flow_slopes[HEADSPACE] = per_headspace;
-        flow_slopes[FLOW_FACTOR] = per_flow_factor;
-        flow_slopes[EXTRA_DELAY] = per_extra_delay;
-        // The rows of the transition that differ from the identity.
-        let mut to_headspace = flow_slopes.map(|slope| capacity_scale * slope);
-        let mut to_film = flow_slopes.map(|slope| (1.0 - DRIP_SHARE) * film_share * slope);
-        let mut to_poured = flow_slopes.map(|slope| (1.0 - film_share + DRIP_SHARE * film_share) * slope);
-        to_headspace[HEADSPACE] += 1.0;
-        to_headspace[CAPACITY_SCALE] += capacity_scale * flow_ml;
-        to_film[FILM] += 1.0 - DRIP_SHARE;
-        to_poured[POURED] += 1.0;
-        to_poured[FILM] += DRIP_SHARE;
-        self.covariance = transform(&self.covariance, &[(HEADSPACE, to_headspace), (FILM, to_film), (POURED, to_poured)]);
-        self.covariance[HEADSPACE][HEADSPACE] += self.headspace_sd_ml * self.headspace_sd_ml * (1.0 + flow_ml * flow_ml);
-        self.covariance[FLOW_FACTOR][FLOW_FACTOR] += self.log_flow_factor_sd * self.log_flow_factor_sd;
-
-        let mut liquid =
-            FlowState { headspace_ml: self.state[HEADSPACE], film_ml: self.state[FILM], capacity_scale, ..FlowState::default() };
-        self.state[POURED] += liquid.release(flow_ml, film_share);
-        self.state[HEADSPACE] = liquid.headspace_ml;
-        self.state[FILM] = liquid.film_ml;
-    }
-}
-
-/// Outflow over the lip in this frame at `state`.
-fn outflow(flow: &FlowTables, tilt: Tilt, state: &States) -> Slopes {
-    let tilt_deg = tilt.tilt_deg - state[EXTRA_DELAY] * tilt.change_deg;
-    let over = flow.over_lip(tilt_deg, state[HEADSPACE], state[FLOW_FACTOR]);
-    let flow_per_excess = if over.excess_ml < EXCESS_MIN_ML {
-        let headspace_ml = flow.capacity.lost_ml(tilt_deg) - EXCESS_MIN_ML;
-        flow.over_lip(tilt_deg, headspace_ml, state[FLOW_FACTOR]).flow_per_excess
-    } else {
-        over.flow_per_excess
-    };
-    Slopes {
-        flow_ml: over.flow_ml,
-        per_headspace: -flow_per_excess,
-        per_flow_factor: over.flow_per_log_factor_ml,
-        per_extra_delay: -flow_per_excess * over.lost_ml_per_deg * tilt.change_deg,
-    }
-}
-
-/// The measurement that is to be expected at `state`, ml, and its slopes in all states.
-fn foresee(flow: &FlowTables, tilt: Tilt, state: &States) -> (f64, States) {
-    let film_share = flow.model.film_share;
-    let Slopes { flow_ml, per_headspace, per_flow_factor, per_extra_delay } = outflow(flow, tilt, state);
-    let gain = state[CAMERA_GAIN].exp();
-    let foreseen_ml = gain * FlowState { film_ml: state[FILM], ..FlowState::default() }.release(flow_ml, film_share);
-    let per_flow = gain * (1.0 - film_share + DRIP_SHARE * film_share);
-    let mut slopes = [0.0; STATES];
-    slopes[HEADSPACE] = per_flow * per_headspace;
-    slopes[FLOW_FACTOR] = per_flow * per_flow_factor;
-    slopes[CAMERA_GAIN] = foreseen_ml;
-    slopes[FILM] = gain * DRIP_SHARE;
-    slopes[EXTRA_DELAY] = per_flow * per_extra_delay;
-    (foreseen_ml, slopes)
-}
-
-/// A P A' for a transition A that differs from the identity in the given rows.
-fn transform(covariance: &[States; STATES], rows: &[(usize, States); 3]) -> [States; STATES] {
-    let products = rows.map(|(_, row)| {
-        let mut product = [0.0; STATES];
-        for (factor, covariance_row) in row.iter().zip(covariance) {
-            for (sum, c) in product.iter_mut().zip(covariance_row) {
-                *sum += factor * c;
-            }
-        }
-        product
-    });
-    let mut next = *covariance;
-    for ((index, _), product) in rows.iter().zip(&products) {
-        for k in [FLOW_FACTOR, CAMERA_GAIN, CAPACITY_SCALE, EXTRA_DELAY] {
-            next[*index][k] = product[k];
-            next[k][*index] = product[k];
-        }
-        for (other, row) in rows {
-            next[*index][*other] = dot(product, row);
-        }
-    }
-    next
-}
-
-fn dot(a: &States, b: &States) -> f64 {
-    a.iter().zip(b).map(|(x, y)| x * y).sum()
 }
 
 #[cfg(test)]
@@ -536,7 +290,7 @@ mod tests {
     #[test]
     fn a_pour_moves_weight_to_what_explains_it() {
         let of = |gain: f64, late: usize| {
-            pour_into(FusedEstimator::new(FlowTables::new(&FlowModel::default()), BACK), gain, late).2.filters.map(|f| f.weight)
+            pour_into(FusedEstimator::new(FlowTables::new(&FlowModel::default()), BACK), gain, late).2.explanations.map(|e| e.weight)
         };
         let (usual, gain, late) = (of(1.0, 0), of(1.25, 0), of(1.0, 3));
         assert!(usual[0] > PRIOR[0] && usual[0] > gain[0] && usual[0] > late[0], "{usual:?}");
@@ -553,8 +307,8 @@ mod tests {
         let mut wrong = FlowModel { vessel: Vessel { radius_mm: 24.0, ..Vessel::default() }, ..FlowModel::default() };
         wrong.noise.log_capacity_scale_sd = 1e-3;
         let mut filter = FusedEstimator::new(FlowTables::new(&wrong), BACK);
-        (filter.filters[1].noise.log_camera_gain_sd, filter.filters[2].noise.log_capacity_scale_sd) =
-            (wrong.noise.log_camera_gain_sd, wrong.noise.log_capacity_scale_sd);
+        filter.explanations[1].filter.noise.log_camera_gain_sd = wrong.noise.log_camera_gain_sd;
+        filter.explanations[2].filter.noise.log_capacity_scale_sd = wrong.noise.log_capacity_scale_sd;
         let (_, summed, filter) = pour_into(filter, 1.0, 0);
         let most = CAMERA_SDS * wrong.noise.log_camera_gain_sd * summed + CAMERA_ML;
         assert!((filter.mean(POURED) - summed).abs() > 1.2 * most, "not wrong enough: {} {summed}", filter.mean(POURED));
