@@ -7,8 +7,8 @@ use rand::{RngExt, SeedableRng};
 use rand_pcg::Pcg64Mcg;
 use shared::mlp::InputScale;
 use simulator::physics::paper::PaperPour;
-use trainer::eq8::{LAMBDA, reward};
-use trainer::net::{Adam, Net, Sample as Example};
+use trainer::method::policy_gradient::{LAMBDA, reward};
+use trainer::network::{Adam, Example, Network};
 
 /// Adam steps between two looks at the network: enough looks for a curve, few enough to cost little.
 const LOOK_EVERY: usize = 250;
@@ -45,7 +45,7 @@ pub fn triangle(top: usize) -> (Vec<f64>, Vec<f64>) {
 }
 
 /// Pours `goal_ml` with `net`; returns what was poured, ml.
-fn pour_with(net: &Net, scale: &InputScale, init_ml: f64, goal_ml: f64) -> f64 {
+fn pour_with(net: &Network, scale: &InputScale, init_ml: f64, goal_ml: f64) -> f64 {
     let mut pour = PaperPour::new(init_ml);
     let (mut alpha, mut v) = (0.0f64, [0.0f32; 3]);
     let mut d = goal_ml;
@@ -99,9 +99,9 @@ pub fn run_once(top: usize, clip: Option<f32>, steps: usize, seed: u64) -> Run {
     let scale = InputScale::default();
     let mut random = Pcg64Mcg::seed_from_u64(seed);
     let examples = examples(&alphas, &volumes, &scale, &mut random);
-    let mut net = Net::new([4, 40, 40, 2], &mut random);
+    let mut net = Network::new([4, 40, 40, 2], &mut random);
     let mut adam = Adam::new(&net);
-    let look = |net: &Net| -> Vec<(f64, f64)> { goals().map(|(init, goal)| (goal, pour_with(net, &scale, init, goal))).collect() };
+    let look = |net: &Network| -> Vec<(f64, f64)> { goals().map(|(init, goal)| (goal, pour_with(net, &scale, init, goal))).collect() };
     let mae = |pours: &[(f64, f64)]| pours.iter().map(|(g, p)| (p - g).abs()).sum::<f64>() / pours.len() as f64;
     let mut pours = look(&net);
     let mut curve = vec![(0.0, mae(&pours))];

@@ -3,14 +3,14 @@
 //! Pure, any thread; allocates when it is set up; cannot fail. Each baseline sees what a lab would give it; only the oracle sees the
 //! truth.
 
-use shared::estimate::flow::Flow;
-use shared::estimate::fused::Fused;
-use shared::estimate::{Calibration, Hold};
+use shared::estimator::flow::FlowTables;
+use shared::estimator::fused::FusedEstimator;
+use shared::estimator::{Calibration, Hold};
 use shared::gaussian_curve::Curve;
 use shared::limits::{Limiter, Limits};
 use shared::weights::Estimator;
 use trainer::data::TrainingEpisode;
-use trainer::law::Law;
+use trainer::method::control_law::ControlLaw;
 
 use super::pour::Baseline;
 use super::simulators::BenchPour;
@@ -28,7 +28,7 @@ pub struct Sum {
 impl Sum {
     /// A sum with a linear calibration, for a goal in ml.
     pub fn new(linear: &Calibration, goal_ml: f64) -> Self {
-        Self { c: f64::from(linear.c), goal_ml, v_ml: [0.0; 3], poured_ml: 0.0 }
+        Self { c: f64::from(linear.volume_at_1_px2_ml), goal_ml, v_ml: [0.0; 3], poured_ml: 0.0 }
     }
 
     /// Takes one frame's V_e; returns d, ml.
@@ -103,10 +103,10 @@ impl Baseline for OpenLoop {
 
 /// A control law (or a PD, which is a law without the rest) on the network's own estimate, without the network.
 pub struct ByLaw {
-    law: Law,
+    law: ControlLaw,
     calibration: Calibration,
     hold: Hold,
-    fused: Option<Fused>,
+    fused: Option<FusedEstimator>,
     v_ml: [f64; 3],
     summed_ml: f64,
     goal_ml: f64,
@@ -114,10 +114,10 @@ pub struct ByLaw {
 
 impl ByLaw {
     /// A law with the calibration and the estimator of some weights, for a goal in ml.
-    pub fn new(law: Law, calibration: Calibration, estimator: &Estimator, goal_ml: f64) -> Self {
+    pub fn new(law: ControlLaw, calibration: Calibration, estimator: &Estimator, goal_ml: f64) -> Self {
         let fused = match estimator {
             Estimator::Sum => None,
-            Estimator::Fused { model, back } => Some(Fused::new(Flow::new(model), *back)),
+            Estimator::Fused { model, back } => Some(FusedEstimator::new(FlowTables::new(model), *back)),
         };
         Self { law, calibration, hold: Hold::default(), fused, v_ml: [0.0; 3], summed_ml: 0.0, goal_ml }
     }
@@ -141,7 +141,7 @@ impl Baseline for ByLaw {
         self.law.decide(self.v_ml, d).map(|a| a as f32)
     }
     fn believed_ml(&self) -> f64 {
-        self.fused.as_ref().map_or(self.summed_ml, Fused::poured_ml)
+        self.fused.as_ref().map_or(self.summed_ml, FusedEstimator::poured_ml)
     }
 }
 

@@ -9,7 +9,7 @@ use indicatif::{ParallelProgressIterator, ProgressBar, ProgressStyle};
 use rayon::prelude::*;
 use shared::exit::{self, Failure, OrExit as _, failure};
 use shared::weights::Weights;
-use trainer::train::{Estimate, MethodName};
+use trainer::training::{Estimate, MethodName};
 
 use crate::bench::pour::PourResult;
 use crate::pour_evaluation::change::Change;

@@ -8,7 +8,7 @@ use std::path::{Path, PathBuf};
 
 use serde_json::json;
 use shared::exit::Failure;
-use trainer::report;
+use trainer::report::page;
 
 use crate::jitter::this_machine::ThisMachine;
 use crate::jitter::{rounds, soak};
@@ -68,7 +68,7 @@ fn measure(args: &Args) -> Result<(), OwnCellError> {
     let text = serde_json::to_string_pretty(&all).unwrap_or_default();
     let numbers = args.out.join("jitter.json");
     std::fs::write(&numbers, text.clone() + "\n").map_err(file_error(&numbers))?;
-    let html = report::page("Decant: latency and jitter", &(machine.html() + &result.html));
+    let html = page::page("Decant: latency and jitter", &(machine.html() + &result.html));
     let page = args.out.join("jitter.html");
     std::fs::write(&page, html).map_err(file_error(&page))?;
     if args.json {

@@ -8,8 +8,9 @@ use std::path::PathBuf;
 use rayon::prelude::*;
 use serde_json::{Value, json};
 use shared::exit::{self, Failure, OrExit as _};
-use trainer::eq8::{DELTA, KERAS_CLIP};
-use trainer::report::{Series, figure, page, plot, table};
+use trainer::method::policy_gradient::{DELTA, KERAS_CLIP};
+use trainer::report::page::{figure, page, table};
+use trainer::report::plot::{Series, plot};
 
 use crate::paper_section_4::{KAPPAS, Run, run_once, triangle};
 

@@ -3,7 +3,7 @@
 //! Ordinary thread; allocates and blocks. Their order changes from round to round, so that what warms up or wears off meets both.
 
 use serde_json::{Map, Value, json};
-use trainer::report;
+use trainer::report::page;
 
 use super::cell_run::{CellRun, run_cell};
 use super::measured::{Measured, facts_html};
@@ -163,7 +163,7 @@ impl Told {
                 ],
             ),
         ];
-        format!("<h2>{name}</h2>{}{}<div class=plots>{}</div>", report::table(&self.rows()), facts_html(&self.facts), figures.concat())
+        format!("<h2>{name}</h2>{}{}<div class=plots>{}</div>", page::table(&self.rows()), facts_html(&self.facts), figures.concat())
     }
 
     fn numbers(&self, condition: &Condition) -> Value {

@@ -8,7 +8,8 @@ use std::time::{Duration, Instant};
 
 use serde_json::{Value, json};
 use shared::os::now_ns;
-use trainer::report::{self, Series};
+use trainer::report::page;
+use trainer::report::plot::{Series, plot};
 
 use super::cell_run::pour_until;
 use super::measured::{Measured, facts_html};
@@ -118,8 +119,8 @@ fn html(facts: &[String], readings: &[Reading], ticks: &TickTimes, latencies: &V
     let memory = [line("rt-controller", |r| r.controller.resident_mib), line("feature-worker", |r| r.worker.resident_mib)];
     let files = [line("rt-controller", |r| r.controller.files as f64), line("feature-worker", |r| r.worker.files as f64)];
     let figures = [
-        report::figure(&report::plot("minutes", "resident MiB", &memory, true), "Memory."),
-        report::figure(&report::plot("minutes", "open files", &files, true), "Open files."),
+        page::figure(&plot("minutes", "resident MiB", &memory, true), "Memory."),
+        page::figure(&plot("minutes", "open files", &files, true), "Open files."),
         histograms("us", "Wake-up lateness.", &[("rt-controller", ticks.of(Span::Lateness)), ("cyclictest", latencies)]),
     ];
     format!("<h2>Soak</h2>{}<div class=plots>{}</div>", facts_html(facts), figures.concat())

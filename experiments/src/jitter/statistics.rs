@@ -1,6 +1,7 @@
 //! Percentiles of a measurement, and its histograms for the page. Pure, any thread; allocates; cannot fail.
 
-use trainer::report::{self, Series};
+use trainer::report::page;
+use trainer::report::plot::{Series, plot};
 
 /// Steps of a histogram; one more holds what is beyond.
 const STEPS: usize = 60;
@@ -39,7 +40,7 @@ pub fn histograms(title: &str, caption: &str, columns: &[(&str, &Vec<f64>)]) -> 
             Series::line(name, steps.collect())
         })
         .collect();
-    report::figure(&report::plot(title, "% of n", &series, true), caption)
+    page::figure(&plot(title, "% of n", &series, true), caption)
 }
 
 #[cfg(test)]

@@ -3,7 +3,7 @@
 //! Ordinary thread; allocates; cannot fail.
 
 use serde_json::{Value, json};
-use trainer::report;
+use trainer::report::page;
 
 use crate::own_cell::OwnCell;
 
@@ -47,7 +47,7 @@ impl ThisMachine {
     pub fn html(&self) -> String {
         let mut rows = vec![["machine", "is", "better"].map(String::from).to_vec()];
         rows.extend(self.0.iter().map(|p| vec![p.name.into(), p.value.clone(), p.advice.into()]));
-        report::table(&rows)
+        page::table(&rows)
     }
 }
 

@@ -1,7 +1,7 @@
 //! What pours in an evaluation: trained methods and baselines. Plain data; cannot fail.
 
 use serde::Serialize;
-use trainer::train::{Estimate, MethodName};
+use trainer::training::{Estimate, MethodName};
 
 /// What pours.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum, Serialize)]

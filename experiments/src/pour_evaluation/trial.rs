@@ -5,15 +5,17 @@
 use rand::{RngExt, SeedableRng};
 use rand_pcg::Pcg64Mcg;
 use shared::agent::Agent;
-use shared::estimate::Calibration;
+use shared::estimator::Calibration;
 use shared::limits::Limits;
 use shared::weights::{Estimator, Weights};
 use simulator::physics::RATE_HZ;
 use simulator::physics::rig::Rig;
+use trainer::calibration;
 use trainer::data::TrainingEpisode;
-use trainer::law::{self, Law, Worlds};
-use trainer::train::{Estimate, MethodName, Options, Silent, Trained};
-use trainer::{best, calibrate};
+use trainer::method::control_law::{self, ControlLaw};
+use trainer::method::model_pour::PossiblePours;
+use trainer::method::model_search;
+use trainer::training::{Estimate, MethodName, Options, Silent, Trained};
 
 use super::change::Change;
 use super::pourer::Pourer;
@@ -139,10 +141,10 @@ impl Trial {
     /// Trains on recorded episodes and, after `weighed` pours, again on all of them. None when a training fails.
     pub fn train(&self, options: &Options, episodes: u64, weighed: u64) -> Option<(Trained, Vec<TrainingEpisode>)> {
         let mut data = self.record(episodes);
-        let mut trained = trainer::train::train(&data, options, &Silent).ok()?;
+        let mut trained = trainer::method::train(&data, options, &Silent).ok()?;
         if weighed > 0 {
             data.extend(self.weighed_pours(&trained.weights, weighed));
-            trained = trainer::train::train(&data, options, &Silent).ok()?;
+            trained = trainer::method::train(&data, options, &Silent).ok()?;
         }
         Some((trained, data))
     }
@@ -166,10 +168,10 @@ impl Trial {
     }
 
     /// A PD on the fused estimate, tuned by the same search as the control law.
-    fn tuned_pd(&self, data: &[TrainingEpisode], seed: u64) -> (Law, Calibration, Estimator) {
-        let (fit, estimator) = best::estimator(data, Estimate::Fused, &self.limits);
-        let worlds = Worlds::new(&fit, self.limits, RATE_HZ, true);
-        let (law, _) = law::search(&worlds, Law::start_pd(true), best::SEARCH, seed, |_, _| {});
+    fn tuned_pd(&self, data: &[TrainingEpisode], seed: u64) -> (ControlLaw, Calibration, Estimator) {
+        let (fit, estimator) = model_search::estimator(data, Estimate::Fused, &self.limits);
+        let possible = PossiblePours::new(&fit, self.limits, RATE_HZ, true);
+        let (law, _) = control_law::search(&possible, ControlLaw::start_pd(true), model_search::SEARCH, seed, |_, _| {});
         (law, fit.calibration, estimator)
     }
 
@@ -184,7 +186,7 @@ impl Trial {
     /// Pours the grid with a baseline that is not trained.
     fn run_untrained(&self, pourer: Pourer, protocol: &Protocol) -> Vec<PourResult> {
         let data = self.bench.record(protocol.episodes as usize, self.data_seed);
-        let linear = calibrate::fit(&data, Some(1.0));
+        let linear = calibration::calibrate(&data, Some(1.0));
         self.pour_grid(protocol, |goal| match pourer {
             Pourer::PdHand => Box::new(HandPd(Sum::new(&linear, goal))),
             Pourer::BangBang => Box::new(BangBang(Sum::new(&linear, goal))),
