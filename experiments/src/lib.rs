@@ -3,7 +3,7 @@
 //! | file | what it holds |
 //! |---|---|
 //! | [`commands`] | the command line |
-//! | [`bench`] | pours on a simulated rig at full speed |
+//! | [`mod@bench`] | pours on a simulated rig at full speed |
 //! | [`pour_evaluation`] | pours of many rigs against their goals |
 //! | [`camera_setup`], [`camera_evaluation`] | the feature extraction against rendered truth |
 //! | [`paper_section_4`] | the paper's own simulation and training |

@@ -59,7 +59,7 @@ fn pour_with(net: &Network, scale: &InputScale, init_ml: f64, goal_ml: f64) -> f
     pour.poured_ml()
 }
 
-/// Pours that are judged, as volume and goal in ml; the training saw neither.
+/// The 24 pours that are judged, as volume in the container and goal, ml.
 fn goals() -> impl Iterator<Item = (f64, f64)> {
     [200.0, 300.0, 400.0].into_iter().flat_map(|init| (1..=8).map(move |k| (init, 20.0 * f64::from(k))))
 }
