@@ -6,7 +6,7 @@ use shared::actions::{Selection, action_table};
 use shared::agent::Agent;
 use shared::config::Config;
 use shared::control::{EndReason, Outcome};
-use shared::estimate::Calibration;
+use shared::estimator::Calibration;
 use shared::gaussian_curve::Curve;
 use shared::messages::{Doubt, Feature, LAYOUT_VERSION, Phase};
 use shared::mlp::{InputScale, Mlp};
@@ -21,7 +21,7 @@ fn always(index: usize) -> Box<Agent> {
         actions_deg: action_table(),
         selection: Selection::Argmax,
         scale: InputScale::default(),
-        calibration: Calibration { c: 0.001, q: 1.0, tilt: 0.0, hold_above_px2: f32::INFINITY },
+        calibration: Calibration { volume_at_1_px2_ml: 0.001, area_exponent: 1.0, log_tilt_slope: 0.0, hold_above_px2: f32::INFINITY },
         estimator: Estimator::Sum,
         rate_hz: 30.0,
         origin: Origin { method: Method::Handmade, actions: 21, episodes: 0, data_sha256: [0; 32] },
