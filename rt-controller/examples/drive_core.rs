@@ -10,7 +10,7 @@ use rt_controller::core::{Core, Input, Order, Robot, Settings};
 use shared::actions::{Selection, action_table};
 use shared::agent::Agent;
 use shared::control::Outcome;
-use shared::estimate::Calibration;
+use shared::estimator::Calibration;
 use shared::limits::Limits;
 use shared::messages::{Feature, LAYOUT_VERSION};
 use shared::mlp::{InputScale, Mlp};
@@ -64,7 +64,12 @@ fn weights() -> Weights {
         actions_deg: action_table(),
         selection: Selection::Argmax,
         scale: InputScale::default(),
-        calibration: Calibration { c: 1.0 / AREA_OF_1_ML_PX2, q: 1.0, tilt: 0.0, hold_above_px2: f32::INFINITY },
+        calibration: Calibration {
+            volume_at_1_px2_ml: 1.0 / AREA_OF_1_ML_PX2,
+            area_exponent: 1.0,
+            log_tilt_slope: 0.0,
+            hold_above_px2: f32::INFINITY,
+        },
         estimator: Estimator::Sum,
         rate_hz: 30.0,
         origin: Origin { method: Method::Handmade, actions: 21, episodes: 0, data_sha256: [0; 32] },

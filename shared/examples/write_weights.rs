@@ -10,7 +10,7 @@
 use std::path::Path;
 
 use shared::actions::{STAY, Selection, action_table};
-use shared::estimate::Calibration;
+use shared::estimator::Calibration;
 use shared::mlp::{InputScale, Mlp};
 use shared::weights::{Estimator, Method, Origin, Weights, WeightsError};
 
@@ -25,7 +25,7 @@ pub fn constant_action(i: i32) -> Weights {
         selection: Selection::Argmax,
         scale: InputScale::default(),
         // 1 px^2 is 0.002 ml a frame, at every tilt; single frames without a stream are believed.
-        calibration: Calibration { c: 0.002, q: 1.0, tilt: 0.0, hold_above_px2: f32::INFINITY },
+        calibration: Calibration { volume_at_1_px2_ml: 0.002, area_exponent: 1.0, log_tilt_slope: 0.0, hold_above_px2: f32::INFINITY },
         estimator: Estimator::Sum,
         rate_hz: 30.0,
         origin: Origin { method: Method::Handmade, actions: 21, episodes: 0, data_sha256: [0; 32] },

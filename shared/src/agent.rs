@@ -6,9 +6,9 @@
 //! Pure; runs in the controller's loop: no clock, no allocation, no panic, also for input that is not a number.
 
 use crate::actions::{self, ACTIONS, STAY, Selection};
-use crate::estimate::Hold;
-use crate::estimate::flow::Flow;
-use crate::estimate::fused::Fused;
+use crate::estimator::Hold;
+use crate::estimator::flow::FlowTables;
+use crate::estimator::fused::FusedEstimator;
 use crate::mlp;
 use crate::weights::{Estimator, Weights};
 
@@ -83,7 +83,7 @@ const CARRY_MAX_DEG: f32 = 1.0;
 #[derive(Debug, Clone)]
 pub struct Agent {
     weights: Weights,
-    fused: Option<Fused>,
+    fused: Option<FusedEstimator>,
     back_deg: f32,
     goal_ml: Option<f32>,
     hold: Hold,
@@ -100,7 +100,7 @@ impl Agent {
     pub fn new(weights: &Weights) -> Self {
         let (fused, back_deg) = match &weights.estimator {
             Estimator::Sum => (None, -weights.actions_deg[weights.back_action()]),
-            Estimator::Fused { model, back } => (Some(Fused::new(Flow::new(model), *back)), back.rate_deg as f32),
+            Estimator::Fused { model, back } => (Some(FusedEstimator::new(FlowTables::new(model), *back)), back.rate_deg as f32),
         };
         Self {
             weights: weights.clone(),
@@ -299,7 +299,7 @@ mod tests {
         assert!((sum - 2.5).abs() < 0.06, "{sum}");
     }
 
-    /// Protects reproducibility of the sampling policy.
+    /// Protects reproducibility where actions are drawn.
     #[test]
     fn sampling_is_seeded() {
         let mut weights = example();

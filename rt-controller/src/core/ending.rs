@@ -259,7 +259,7 @@ mod tests {
     use super::*;
     use shared::actions::{Selection, action_table};
     use shared::agent::{Agent, Observation};
-    use shared::estimate::Calibration;
+    use shared::estimator::Calibration;
     use shared::mlp::{InputScale, Mlp};
     use shared::weights::{Estimator, Method, Origin, Weights};
 
@@ -274,7 +274,7 @@ mod tests {
             actions_deg: action_table(),
             selection: Selection::Argmax,
             scale: InputScale::default(),
-            calibration: Calibration { c: 0.002, q: 1.15, tilt: 0.05, hold_above_px2: 60.0 },
+            calibration: Calibration { volume_at_1_px2_ml: 0.002, area_exponent: 1.15, log_tilt_slope: 0.05, hold_above_px2: 60.0 },
             estimator: Estimator::Sum,
             rate_hz: 30.0,
             origin: Origin { method: Method::Handmade, actions: 21, episodes: 0, data_sha256: [7; 32] },

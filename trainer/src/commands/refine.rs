@@ -5,14 +5,14 @@
 //! command stops and says how to answer.
 
 use std::io::{BufRead, IsTerminal, Write};
-use std::path::PathBuf;
 
 use shared::episode::{Episode, EpisodeKind};
 use shared::exit::{self, Failure, OrExit as _, failure};
 
+use super::train::Target;
 use crate::consistency;
 use crate::data::{self, Source};
-use crate::train::{self, Estimate, MethodName, Options};
+use crate::training::{Estimate, MethodName, Options};
 
 /// Command-line arguments of `trainer refine`.
 #[derive(Debug, clap::Args)]
@@ -29,18 +29,8 @@ pub struct Args {
     /// Episodes to leave out.
     #[arg(long)]
     leave_out: Vec<String>,
-    /// Seed: the same seed and data give the same bytes.
-    #[arg(long, default_value_t = 1)]
-    seed: u64,
-    /// Configuration of the cell, for the limits; without it the default limits.
-    #[arg(long)]
-    config: Option<PathBuf>,
-    /// Where the weight file goes; replaced atomically.
-    #[arg(long)]
-    out: PathBuf,
-    /// Print a report as JSON.
-    #[arg(long)]
-    json: bool,
+    #[command(flatten)]
+    target: Target,
 }
 
 /// What the weighed pours among `episodes` show, in order: number, goal, weight (both ml), running mean absolute error.
@@ -64,7 +54,7 @@ pub fn pours(episodes: &[Episode]) -> Vec<(usize, f64, f64, f64)> {
 /// Runs the command.
 pub fn run(args: &Args) -> Result<(), Failure> {
     let read = args.source.read().or_exit(exit::BAD_INPUT)?;
-    let limits = train::limits(args.config.as_deref()).or_exit(exit::BAD_INPUT)?;
+    let limits = args.target.limits()?;
     let mut usable = data::usable(&read);
     usable.episodes.retain(|e| !args.leave_out.contains(&e.name));
     for doubt in consistency::doubtful(&usable.episodes) {
@@ -85,10 +75,10 @@ pub fn run(args: &Args) -> Result<(), Failure> {
         }
     }
     let history = pours(&read);
-    let options = Options { method: MethodName::Best, actions: 21, estimate: Estimate::Fused, seed: args.seed, limits };
+    let options = Options { method: MethodName::Best, actions: 21, estimate: Estimate::Fused, seed: args.target.seed, limits };
     let extra = serde_json::json!({ "pours": history.iter().map(|(n, goal, weight, mean)| serde_json::json!({"number": n, "goal_ml": goal, "weight_g": weight, "mae_so_far_ml": mean})).collect::<Vec<_>>() });
-    train::train_and_write(&usable, &options, &args.out, args.json, extra)?;
-    if !args.json && !history.is_empty() {
+    args.target.train_and_write(&usable, &options, extra)?;
+    if !args.target.json && !history.is_empty() {
         println!("pour   goal ml  scale g  error ml  mean |error| so far");
         for (n, goal, weight, mean) in history {
             println!("{n:>4} {goal:>9.1} {weight:>8.0} {:>9.1} {mean:>10.2}", weight - goal);
@@ -98,7 +88,7 @@ pub fn run(args: &Args) -> Result<(), Failure> {
 }
 
 /// Whether to use a doubtful weight; `None`: there is nobody to ask.
-fn ask(doubt: &consistency::Doubtful) -> Option<bool> {
+fn ask(doubt: &consistency::DoubtfulWeight) -> Option<bool> {
     if !std::io::stdin().is_terminal() {
         return None;
     }

@@ -9,6 +9,8 @@ use shared::exit::{self, Failure, OrExit as _};
 use shared::mlp::{HIDDEN, INPUTS, PARAMETERS};
 use shared::weights::{Estimator, FORMAT_VERSION, Weights};
 
+use crate::data;
+
 /// Command-line arguments of `trainer inspect`.
 #[derive(Debug, clap::Args)]
 #[command(after_help = "Examples:
@@ -25,7 +27,7 @@ pub struct Args {
 /// Runs the command.
 pub fn run(args: &Args) -> Result<(), Failure> {
     let w = Weights::read(&args.weights).or_exit(exit::BAD_INPUT)?;
-    let data: String = w.origin.data_sha256.iter().map(|b| format!("{b:02x}")).collect();
+    let data = data::hex(&w.origin.data_sha256);
     if args.json {
         let all = serde_json::json!({
             "format_version": FORMAT_VERSION, "shape": [INPUTS, HIDDEN, HIDDEN, ACTIONS], "parameters": PARAMETERS,
@@ -45,7 +47,7 @@ pub fn run(args: &Args) -> Result<(), Failure> {
     println!("actions     {:?} degrees", w.actions_deg);
     println!(
         "calibration v = {:.6e} area^{:.4} exp({:.4} (alpha - 60)/30) ml, a lone zero after more than {} px^2 is held",
-        w.calibration.c, w.calibration.q, w.calibration.tilt, w.calibration.hold_above_px2
+        w.calibration.volume_at_1_px2_ml, w.calibration.area_exponent, w.calibration.log_tilt_slope, w.calibration.hold_above_px2
     );
     println!("frame rate  {} Hz", w.rate_hz);
     match &w.estimator {
@@ -54,10 +56,16 @@ pub fn run(args: &Args) -> Result<(), Failure> {
             println!("estimate    camera and container geometry, fused");
             println!(
                 "  vessel    R {:.1} mm, H {:.1} mm, bottom/top {:.2}, deviation (log) {:.3?}",
-                m.radius_mm, m.height_mm, m.taper, m.s
+                m.vessel.radius_mm, m.vessel.height_mm, m.vessel.taper, m.vessel.log_shape
             );
-            println!("  flow      ln k {:.3}, exponent {:.3}, k1 {:.3}, k2 {:.3}, film share {:.3}", m.lk, m.p, m.k1, m.k2, m.eta);
-            println!("  motion    lag {:.2} frames, delay {:.2} frames, back at {:.2} degrees a frame", m.tau, m.delay, back.rate_deg);
+            println!(
+                "  flow      ln k {:.3}, exponent {:.3}, k1 {:.3}, k2 {:.3}, film share {:.3}",
+                m.log_weir_coefficient, m.head_exponent, m.log_weir_slope, m.log_weir_curvature, m.film_share
+            );
+            println!(
+                "  motion    lag {:.2} frames, delay {:.2} frames, back at {:.2} degrees a frame",
+                m.lag_frames, m.delay_frames, back.rate_deg
+            );
             println!("  doubts    {:?}", m.noise);
         }
     }
