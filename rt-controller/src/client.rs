@@ -15,17 +15,17 @@ use shared::ipc::{Cell, InService as _, IpcError};
 use shared::messages::{RecorderReport, RecorderState};
 use shared::os;
 
-/// Largest request or answer, bytes: a status with 32 results and five histograms is about 20 kB.
+/// Largest request or answer, bytes. Chosen by hand; no measurement is recorded.
 pub const MESSAGE_MAX: usize = 64 * 1024;
 
 /// Longest wait for the controller's answer; it answers within a tick and a look of its service thread, below 0.1 s.
 const ANSWER: Duration = Duration::from_secs(2);
 /// Longest wait for the recorder to close a file. Chosen by hand; no measurement is recorded.
 const FILE_CLOSED: Duration = Duration::from_secs(10);
-/// How often in a row a controller may say that it does not know the episode that it has started: for a second.
+/// How often in a row a controller may not know the episode that it has started, before it counts as restarted: for a second.
 const UNKNOWN_MAX: u32 = 10;
 
-/// The arguments that all commands have which ask the running controller.
+/// The arguments of all commands that ask the running controller.
 #[derive(Debug, clap::Args)]
 pub struct Common {
     /// The cell's configuration.

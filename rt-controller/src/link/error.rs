@@ -7,7 +7,7 @@ use std::time::Duration;
 
 use shared::control::EndReason;
 
-/// How long a TCP connection, and each answer, may take. Chosen by hand; a robot answers within milliseconds.
+/// How long a TCP connection, and each answer, may take. Chosen by hand; no measurement is recorded.
 pub(super) const ANSWER: Duration = Duration::from_secs(2);
 /// How long the program may take from its upload to its first sign of life. Chosen by hand; no measurement is recorded.
 pub(super) const PROGRAM_START: Duration = Duration::from_secs(5);
