@@ -1,4 +1,4 @@
-//! A connected robot in the controller's loop: drains what the robot sent, writes one target a tick.
+//! A connected robot in the controller's loop: reads what the robot sent, and writes one target a tick.
 //!
 //! [`connect`](super::connect()) makes it on an ordinary thread, which also drops it. `poll` and `send` never block, allocate or panic:
 //! the one buffer holds the protocol's largest packet. Every error of the socket ends the session with a [`Lost`]; nothing is repaired in
@@ -67,7 +67,7 @@ impl Session {
         self.version
     }
 
-    /// The newest state; old if [`Session::poll`] was not called.
+    /// The newest state; it is only as new as the last [`Session::poll`].
     pub fn state(&self) -> &RobotState {
         &self.state
     }
