@@ -1,25 +1,27 @@
 //! The controller core against a leaking toy container: phases, endings, limits, weights, bridging.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::too_many_lines)]
 
-use rt_controller::core::{Core, Input, Order, Output, Refusal, Robot, Settings, curve_alpha_deg};
-use shared::agent::{Agent, Selection};
+use rt_controller::core::{Core, Input, Order, Output, Refusal, Robot, Settings};
+use shared::actions::{Selection, action_table};
+use shared::agent::Agent;
 use shared::config::Config;
-use shared::control::{Curve, EndReason, Outcome};
-use shared::estimate::Calibration;
+use shared::control::{EndReason, Outcome};
+use shared::estimator::Calibration;
+use shared::gaussian_curve::Curve;
 use shared::messages::{Doubt, Feature, LAYOUT_VERSION, Phase};
-use shared::policy::{InputScale, Mlp, action_table};
+use shared::mlp::{InputScale, Mlp};
 use shared::weights::{Estimator, Method, Origin, Weights};
 
 /// A policy that always gives the action `index`; 1 px^2 is 0.001 ml.
 fn always(index: usize) -> Box<Agent> {
-    let mut policy = Mlp::ZERO;
-    policy.b3[index] = 1.0;
+    let mut network = Mlp::ZERO;
+    network.b3[index] = 1.0;
     Box::new(Agent::new(&Weights {
-        policy,
+        network,
         actions_deg: action_table(),
         selection: Selection::Argmax,
         scale: InputScale::default(),
-        calibration: Calibration { c: 0.001, q: 1.0, tilt: 0.0, hold_above_px2: f32::INFINITY },
+        calibration: Calibration { volume_at_1_px2_ml: 0.001, area_exponent: 1.0, log_tilt_slope: 0.0, hold_above_px2: f32::INFINITY },
         estimator: Estimator::Sum,
         rate_hz: 30.0,
         origin: Origin { method: Method::Handmade, actions: 21, episodes: 0, data_sha256: [0; 32] },
@@ -365,7 +367,7 @@ fn a_recording_follows_the_curve() {
         if t > 2.0 * curve.beta_s {
             break;
         }
-        assert!((world.alpha_deg - curve_alpha_deg(&curve, t)).abs() < 0.06, "at {t} s");
+        assert!((world.alpha_deg - curve.alpha_deg(t)).abs() < 0.06, "at {t} s");
         assert_eq!(output.telemetry.lambda_deg, 70.0);
     }
     let outcome = world.finish();

@@ -7,7 +7,8 @@
 use std::hint::black_box;
 use std::time::Instant;
 
-use shared::policy::{ACTIONS, INPUTS, Mlp};
+use shared::actions::ACTIONS;
+use shared::mlp::{INPUTS, Mlp};
 
 /// Calls timed together, so that reading the clock does not matter.
 const BATCH: u32 = 200;

@@ -4,6 +4,7 @@
 
 use serde::{Deserialize, Serialize};
 
+use crate::gaussian_curve::Curve;
 use crate::limits::Clipped;
 use crate::messages::Phase;
 
@@ -21,17 +22,6 @@ pub enum Request {
     Record(Curve),
     /// Bring the container upright at once.
     Abort,
-}
-
-/// The pre-programmed movement of eq. (1): alpha(t) = lambda exp(-gamma (t - beta)^2), from 0 to 2 beta.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
-pub struct Curve {
-    /// Height, degrees.
-    pub lambda_deg: f32,
-    /// Width, 1/s^2.
-    pub gamma_per_s2: f32,
-    /// Time of the top, s.
-    pub beta_s: f32,
 }
 
 /// What the controller answers.

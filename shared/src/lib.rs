@@ -7,9 +7,12 @@
 //! | [`control`] | requests to the controller and its answers | no |
 //! | [`config`] | the cell's one TOML file | no |
 //! | [`limits`] | the one place that every target passes | yes |
-//! | [`policy`] | the 4-32-32-21 network and the action table | yes |
-//! | [`estimate`] | area to ml, and the volume poured so far | yes |
-//! | [`agent`] | observation pipeline and policy: a frame in, an action out | yes |
+//! | [`gaussian_curve`] | eq. (1), the movement of an experimental episode | yes |
+//! | [`alpha_track`] | alpha over time: which angle belongs to a picture | yes |
+//! | [`mlp`] | the 4-32-32-21 network | yes |
+//! | [`actions`] | Fig. 5's table of actions | yes |
+//! | [`estimator`] | area to ml, and the volume poured so far | yes |
+//! | [`agent`] | the weights at work in one pour: an observation in, an action out | yes |
 //! | [`weights`] | the weight file (postcard with a CRC) | no |
 //! | [`episode`] | `E = (L_E, w_E)` as MCAP files and CSV tables | no |
 //! | [`exit`] | exit codes and one-line errors | no |
@@ -19,16 +22,19 @@
 
 #![deny(unsafe_code)]
 
+pub mod actions;
 pub mod agent;
+pub mod alpha_track;
 pub mod config;
 pub mod control;
 pub mod episode;
-pub mod estimate;
+pub mod estimator;
 pub mod exit;
+pub mod gaussian_curve;
 pub mod ipc;
 pub mod limits;
 pub mod messages;
+pub mod mlp;
 #[allow(unsafe_code)]
 pub mod os;
-pub mod policy;
 pub mod weights;

@@ -184,8 +184,8 @@ pub struct Telemetry {
     pub episode: u64,
     /// [`Feature::sequence`] of the newest feature used; 0 before the first.
     pub feature_sequence: u64,
-    /// Identity of the policy in use ([`Telemetry::weights`]); 0: there is none.
-    pub policy: u64,
+    /// Identity of the weights in use ([`Telemetry::weights`]); 0: there are none.
+    pub weights_id: u64,
     /// Commanded alpha after all limits, degrees from upright.
     pub alpha_deg: f32,
     /// Measured alpha, degrees from upright; NaN before the first robot state.
@@ -215,7 +215,7 @@ pub struct Telemetry {
 impl Telemetry {
     /// Identity of the weights in use as `Weights::identity` gives it: 16 hexadecimal digits; empty: there are none.
     pub fn weights(&self) -> String {
-        if self.policy == 0 { String::new() } else { format!("{:016x}", self.policy) }
+        if self.weights_id == 0 { String::new() } else { format!("{:016x}", self.weights_id) }
     }
 }
 
@@ -294,7 +294,7 @@ mod tests {
         assert_eq!(std::mem::offset_of!(Feature, area_px2), 48);
         assert_eq!(std::mem::offset_of!(Feature, triangle_px), 56);
         assert_eq!(size_of::<Telemetry>(), 104);
-        assert_eq!(std::mem::offset_of!(Telemetry, policy), 48);
+        assert_eq!(std::mem::offset_of!(Telemetry, weights_id), 48);
         assert_eq!(std::mem::offset_of!(Telemetry, alpha_deg), 56);
         assert_eq!(size_of::<RecorderReport>(), 552);
     }

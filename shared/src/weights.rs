@@ -20,10 +20,11 @@ use crc::{CRC_32_ISO_HDLC, Crc};
 use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
 
-use crate::agent::Selection;
-use crate::estimate::Calibration;
-use crate::estimate::flow::{DELAY_MAX, FlowModel, FlowNoise, Return};
-use crate::policy::{ACTIONS, HIDDEN, INPUTS, InputScale, Mlp, nearest_action};
+use crate::actions::{ACTIONS, BACK_DEG_PER_FRAME, Selection, nearest_action};
+use crate::estimator::Calibration;
+use crate::estimator::flow::{DELAY_MAX_FRAMES, FlowModel, WayBack};
+use crate::estimator::vessel::Vessel;
+use crate::mlp::{HIDDEN, INPUTS, InputScale, Mlp};
 
 /// Version of the file format; other versions are refused.
 pub const FORMAT_VERSION: u32 = 3;
@@ -39,7 +40,7 @@ const CRC: Crc<u32> = Crc::<u32>::new(&CRC_32_ISO_HDLC);
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Weights {
     /// The network.
-    pub policy: Mlp,
+    pub network: Mlp,
     /// Angle of each action, degrees, ascending (Fig. 5, or two actions).
     pub actions_deg: [f32; ACTIONS],
     /// How outputs become an action.
@@ -70,37 +71,47 @@ pub enum Estimator {
         /// The fitted model.
         model: FlowModel,
         /// How the controller tilts back, to know what still flows then.
-        back: Return,
+        back: WayBack,
     },
 }
 
 impl Estimator {
     fn check(&self) -> Result<(), String> {
         let Self::Fused { model, back } = self else { return Ok(()) };
-        let FlowModel { radius_mm, height_mm, taper, flat, s, lk, p, k1, k2, tau, delay, eta, noise } = *model;
-        let FlowNoise { lambda, gamma, beta, delta, frame, v_min_ml } = noise;
+        let FlowModel {
+            vessel: Vessel { radius_mm, height_mm, taper, even_share, log_shape },
+            log_weir_coefficient,
+            head_exponent,
+            log_weir_slope,
+            log_weir_curvature,
+            lag_frames,
+            delay_frames,
+            film_share,
+            noise,
+        } = *model;
+
         let ranges = [
             ("radius", radius_mm, 1.0, 1000.0),
             ("height", height_mm, 1.0, 5000.0),
             ("taper", taper, 0.05, 20.0),
-            ("share of flat shape", flat, 0.0, 1.0),
-            ("flow coefficient", lk, -20.0, 20.0),
-            ("flow exponent", p, 0.2, 5.0),
-            ("k1", k1, -20.0, 20.0),
-            ("k2", k2, -20.0, 20.0),
-            ("lag", tau, 0.0, 60.0),
-            ("delay", delay, 0.0, DELAY_MAX),
-            ("film share", eta, 0.0, 0.95),
-            ("sd of lambda", lambda, 1e-4, 5.0),
-            ("sd of gamma", gamma, 1e-4, 5.0),
-            ("sd of beta", beta, 1e-6, 5.0),
-            ("sd of the delay", delta, 1e-4, 20.0),
-            ("sd of a frame", frame, 1e-4, 5.0),
-            ("smallest outflow", v_min_ml, 0.0, 10.0),
+            ("share of flat shape", even_share, 0.0, 1.0),
+            ("flow coefficient", log_weir_coefficient, -20.0, 20.0),
+            ("flow exponent", head_exponent, 0.2, 5.0),
+            ("k1", log_weir_slope, -20.0, 20.0),
+            ("k2", log_weir_curvature, -20.0, 20.0),
+            ("lag", lag_frames, 0.0, 60.0),
+            ("delay", delay_frames, 0.0, DELAY_MAX_FRAMES),
+            ("film share", film_share, 0.0, 0.95),
+            ("sd of lambda", noise.log_flow_factor_sd, 1e-4, 5.0),
+            ("sd of gamma", noise.log_camera_gain_sd, 1e-4, 5.0),
+            ("sd of beta", noise.log_capacity_scale_sd, 1e-6, 5.0),
+            ("sd of the delay", noise.extra_delay_sd_frames, 1e-4, 20.0),
+            ("sd of a frame", noise.log_frame_volume_sd, 1e-4, 5.0),
+            ("smallest outflow", noise.least_visible_ml, 0.0, 10.0),
             ("rate back", back.rate_deg, 0.1, 10.0),
             ("change of the rate back", back.change_deg, 0.01, 100.0),
         ];
-        for (name, value, low, high) in ranges.into_iter().chain(s.map(|s| ("shape of the vessel (log)", s, -10.0, 10.0))) {
+        for (name, value, low, high) in ranges.into_iter().chain(log_shape.map(|s| ("shape of the vessel (log)", s, -10.0, 10.0))) {
             if !(low..=high).contains(&value) {
                 return Err(format!("estimator: {name} is {value}, allowed is {low} to {high}"));
             }
@@ -208,7 +219,7 @@ pub enum WeightsError {
 impl Weights {
     /// Index of the action that tilts back: the one nearest to -3.2 degrees a frame.
     pub fn back_action(&self) -> usize {
-        nearest_action(&self.actions_deg, -3.2)
+        nearest_action(&self.actions_deg, BACK_DEG_PER_FRAME)
     }
 
     /// The file's bytes. The same weights give the same bytes.
@@ -299,7 +310,7 @@ impl Weights {
 
     /// Which value must not go to the robot, if any.
     fn check(&self) -> Result<(), String> {
-        if let Some(k) = self.policy.parameters().position(|p| !p.is_finite()) {
+        if let Some(k) = self.network.parameters().position(|p| !p.is_finite()) {
             return Err(format!("parameter {k} of the network is not finite"));
         }
         let ascending = self.actions_deg.windows(2).all(|w| w[0] <= w[1]);
@@ -307,12 +318,12 @@ impl Weights {
             return Err("the action table is not ascending within +-10 degrees".into());
         }
         let InputScale { v_per_ml, d_ml, gain } = self.scale;
-        let Calibration { c, q, tilt, hold_above_px2 } = self.calibration;
+        let Calibration { volume_at_1_px2_ml, area_exponent, log_tilt_slope, hold_above_px2 } = self.calibration;
         let positive = [
             ("input scale of v", v_per_ml),
             ("input scale of d", d_ml),
             ("input gain", gain),
-            ("calibration c", c),
+            ("calibration c", volume_at_1_px2_ml),
             ("frame rate", self.rate_hz),
         ];
         for (name, value) in positive {
@@ -320,11 +331,11 @@ impl Weights {
                 return Err(format!("{name} is {value}, not a positive number"));
             }
         }
-        if !(0.1..=10.0).contains(&q) {
-            return Err(format!("calibration exponent {q} is outside 0.1 to 10"));
+        if !(0.1..=10.0).contains(&area_exponent) {
+            return Err(format!("calibration exponent {area_exponent} is outside 0.1 to 10"));
         }
-        if !(-1.0..=1.0).contains(&tilt) {
-            return Err(format!("calibration's change with the tilt {tilt} is outside -1 to 1"));
+        if !(-1.0..=1.0).contains(&log_tilt_slope) {
+            return Err(format!("calibration's change with the tilt {log_tilt_slope} is outside -1 to 1"));
         }
         if hold_above_px2.is_nan() || hold_above_px2 < 0.0 {
             return Err(format!("dropout hold above {hold_above_px2} px^2 is not a number >= 0"));
@@ -336,21 +347,21 @@ impl Weights {
 #[cfg(test)]
 pub(crate) mod tests {
     use super::*;
-    use crate::policy::action_table;
+    use crate::actions::action_table;
     use proptest::prelude::*;
 
     /// A network that pours while d > 0 and stays when d is near 0; made by hand.
     pub(crate) fn example() -> Weights {
-        let mut policy = Mlp::ZERO;
-        for (k, p) in policy.parameters_mut().enumerate() {
+        let mut network = Mlp::ZERO;
+        for (k, p) in network.parameters_mut().enumerate() {
             *p = (k as f32 * 0.7).sin() * 0.1;
         }
         Weights {
-            policy,
+            network,
             actions_deg: action_table(),
             selection: Selection::Argmax,
             scale: InputScale::default(),
-            calibration: Calibration { c: 0.002, q: 1.15, tilt: 0.05, hold_above_px2: 60.0 },
+            calibration: Calibration { volume_at_1_px2_ml: 0.002, area_exponent: 1.15, log_tilt_slope: 0.05, hold_above_px2: 60.0 },
             estimator: Estimator::Sum,
             rate_hz: 30.0,
             origin: Origin { method: Method::Handmade, actions: 21, episodes: 0, data_sha256: [7; 32] },
@@ -361,7 +372,7 @@ pub(crate) mod tests {
     /// The same with the fused estimate.
     pub(crate) fn fused_example() -> Weights {
         Weights {
-            estimator: Estimator::Fused { model: FlowModel::default(), back: Return { rate_deg: 2.0, change_deg: 1.67 } },
+            estimator: Estimator::Fused { model: FlowModel::default(), back: WayBack { rate_deg: 2.0, change_deg: 1.67 } },
             ..example()
         }
     }
@@ -433,23 +444,23 @@ pub(crate) mod tests {
         flipped[200] ^= 4;
         assert!(say(&flipped).contains("damaged"));
         for (what, change) in [
-            ("parameter 5", (|w: &mut Weights| w.policy.w1[0][5] = f32::NAN) as fn(&mut Weights)),
+            ("parameter 5", (|w: &mut Weights| w.network.w1[0][5] = f32::NAN) as fn(&mut Weights)),
             ("action table", |w| w.actions_deg[3] = 7.0),
-            ("calibration c", |w| w.calibration.c = f32::INFINITY),
-            ("exponent", |w| w.calibration.q = f32::NAN),
-            ("change with the tilt", |w| w.calibration.tilt = f32::NAN),
+            ("calibration c", |w| w.calibration.volume_at_1_px2_ml = f32::INFINITY),
+            ("exponent", |w| w.calibration.area_exponent = f32::NAN),
+            ("change with the tilt", |w| w.calibration.log_tilt_slope = f32::NAN),
             ("frame rate", |w| w.rate_hz = 0.0),
             ("hold", |w| w.calibration.hold_above_px2 = f32::NAN),
             ("estimator: delay", |w| {
                 *w = fused_example();
                 if let Estimator::Fused { model, .. } = &mut w.estimator {
-                    model.delay = f64::NAN;
+                    model.delay_frames = f64::NAN;
                 }
             }),
             ("estimator: sd of gamma", |w| {
                 *w = fused_example();
                 if let Estimator::Fused { model, .. } = &mut w.estimator {
-                    model.noise.gamma = 0.0;
+                    model.noise.log_camera_gain_sd = 0.0;
                 }
             }),
         ] {

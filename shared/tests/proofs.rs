@@ -3,8 +3,8 @@
 
 use std::process::Command;
 
+use shared::mlp::Mlp;
 use shared::os;
-use shared::policy::Mlp;
 
 #[global_allocator]
 static ALLOCATOR: os::CountingAllocator = os::CountingAllocator;

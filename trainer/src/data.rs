@@ -121,11 +121,8 @@ impl TrainingEpisode {
                 "no weight: read the scale and enter it with `feature-worker episodes weigh FILE --weight G`, or in scale.csv".into(),
             );
         }
-        if !self.weight_g.is_finite() || self.weight_g < 0.0 {
-            return Some(format!("weight {} g is not a number >= 0: correct it", self.weight_g));
-        }
-        if self.weight_g == 0.0 {
-            return Some("weight 0 g: nothing was poured, nothing can be learned from it; leave it out".into());
+        if let Err(e) = episode::check_poured(self.weight_g) {
+            return Some(format!("weight {} g: {e}", self.weight_g));
         }
         if !self.area_px2.iter().any(|a| *a > 0.0) {
             return Some(format!("no stream was ever seen, but the scale shows {} g: check the vision or the weight", self.weight_g));
@@ -134,7 +131,7 @@ impl TrainingEpisode {
     }
 
     fn from_episode(e: &Episode) -> Self {
-        let mut own = Self::empty(&e.name, rate_hz(e));
+        let mut own = Self::empty(&e.name, frame_rate_hz(e));
         for f in &e.rows {
             own.push(f.t_s, f64::from(f.alpha_commanded_deg), f64::from(f.alpha_measured_deg), f64::from(f.area_px2));
         }
@@ -143,12 +140,17 @@ impl TrainingEpisode {
     }
 }
 
-/// Frames a second, from the median interval.
-fn rate_hz(e: &Episode) -> f64 {
+/// Frames a second of an episode, from the median interval.
+fn frame_rate_hz(e: &Episode) -> f64 {
     let mut steps: Vec<f64> = e.rows.windows(2).map(|w| w[1].t_s - w[0].t_s).filter(|s| *s > 0.0).collect();
     steps.sort_by(f64::total_cmp);
     let median = steps.get(steps.len() / 2).copied().unwrap_or(1.0 / 30.0);
     (1.0 / median * 10.0).round() / 10.0
+}
+
+/// Frames a second of a data set: those of its first episode, or 30 of an empty set.
+pub fn rate_hz(episodes: &[TrainingEpisode]) -> f64 {
+    episodes.first().map_or(30.0, |e| e.rate_hz)
 }
 
 /// Where a command's episodes are.
@@ -182,6 +184,7 @@ impl Source {
         Ok(episodes)
     }
 }
+
 /// What a data set is good for: the usable episodes, and a line for each one that was left out.
 #[derive(Debug, Clone, Default)]
 pub struct Usable {
@@ -210,6 +213,11 @@ pub fn usable(episodes: &[Episode]) -> Usable {
         }
     }
     result
+}
+
+/// A hash as people read it: 64 hexadecimal digits.
+pub fn hex(hash: &[u8; 32]) -> String {
+    hash.iter().map(|b| format!("{b:02x}")).collect()
 }
 
 /// SHA-256 of what is trained on: columns and weights of all episodes in order; names do not enter.

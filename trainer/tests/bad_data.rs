@@ -8,8 +8,8 @@ use std::process::{Command, Output};
 use std::time::UNIX_EPOCH;
 
 use shared::config::Config;
-use shared::control::Curve;
 use shared::episode::{EpisodeEnd, EpisodeKind, EpisodeStart, EpisodeWriter, FrameRow, set_weight};
+use shared::gaussian_curve::Curve;
 use shared::messages::{Doubt, Feature, LAYOUT_VERSION, Telemetry};
 
 const FRAME_NS: u64 = 33_333_333;

@@ -43,7 +43,7 @@ fn tables_become_weights() {
     let beside: serde_json::Value = serde_json::from_str(&std::fs::read_to_string(dir.path().join("w.bin.json")).unwrap()).unwrap();
     assert_eq!(all["identity"], beside["identity"]);
     assert_eq!(all["data_sha256"], beside["data_sha256"]);
-    assert_eq!(all["weights"]["policy"]["w2"].as_array().unwrap().len(), 32);
+    assert_eq!(all["weights"]["network"]["w2"].as_array().unwrap().len(), 32);
     assert!(run(&["inspect", "w.bin"]).contains("4-32-32-21"));
     run(&["report", "w.bin.json", "--out", "r.html"]);
     let page = std::fs::read_to_string(dir.path().join("r.html")).unwrap();

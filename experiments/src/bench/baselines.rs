@@ -2,15 +2,14 @@
 //!
 //! Pure, any thread. Each sees what a lab would give it; only the oracle sees the truth.
 
-use rt_controller::core::curve_alpha_deg;
-use shared::control::Curve;
-use shared::estimate::flow::Flow;
-use shared::estimate::fused::Fused;
-use shared::estimate::{Calibration, Hold};
+use shared::estimator::flow::FlowTables;
+use shared::estimator::fused::FusedEstimator;
+use shared::estimator::{Calibration, Hold};
+use shared::gaussian_curve::Curve;
 use shared::limits::{Limiter, Limits};
 use shared::weights::Estimator;
 use trainer::data::TrainingEpisode;
-use trainer::law::Law;
+use trainer::method::control_law::ControlLaw;
 
 use super::pour::Baseline;
 use super::simulators::BenchPour;
@@ -28,7 +27,7 @@ pub struct Sum {
 impl Sum {
     /// With a linear calibration.
     pub fn new(linear: &Calibration, goal_ml: f64) -> Self {
-        Self { c: f64::from(linear.c), goal_ml, v_ml: [0.0; 3], poured_ml: 0.0 }
+        Self { c: f64::from(linear.volume_at_1_px2_ml), goal_ml, v_ml: [0.0; 3], poured_ml: 0.0 }
     }
 
     fn see(&mut self, area_px2: f32) -> f64 {
@@ -92,7 +91,7 @@ impl Baseline for OpenLoop {
     fn decide(&mut self, _: f32, alpha_deg: f32, _: &BenchPour) -> Option<f32> {
         self.frame += 1;
         let t_s = self.frame as f32 / RATE_HZ as f32;
-        (t_s < 2.0 * self.curve.beta_s).then(|| curve_alpha_deg(&self.curve, t_s) - alpha_deg)
+        (t_s < self.curve.duration_s()).then(|| self.curve.alpha_deg(t_s) - alpha_deg)
     }
     fn believed_ml(&self) -> f64 {
         self.goal_ml
@@ -101,10 +100,10 @@ impl Baseline for OpenLoop {
 
 /// A law (or a PD, which is a law without the rest) on the policy's own estimate, without the network.
 pub struct ByLaw {
-    law: Law,
+    law: ControlLaw,
     calibration: Calibration,
     hold: Hold,
-    fused: Option<Fused>,
+    fused: Option<FusedEstimator>,
     v_ml: [f64; 3],
     summed_ml: f64,
     goal_ml: f64,
@@ -112,10 +111,10 @@ pub struct ByLaw {
 
 impl ByLaw {
     /// With the calibration and estimator of some weights.
-    pub fn new(law: Law, calibration: Calibration, estimator: &Estimator, goal_ml: f64) -> Self {
+    pub fn new(law: ControlLaw, calibration: Calibration, estimator: &Estimator, goal_ml: f64) -> Self {
         let fused = match estimator {
             Estimator::Sum => None,
-            Estimator::Fused { model, back } => Some(Fused::new(Flow::new(model), *back)),
+            Estimator::Fused { model, back } => Some(FusedEstimator::new(FlowTables::new(model), *back)),
         };
         Self { law, calibration, hold: Hold::default(), fused, v_ml: [0.0; 3], summed_ml: 0.0, goal_ml }
     }
@@ -139,7 +138,7 @@ impl Baseline for ByLaw {
         self.law.decide(self.v_ml, d).map(|a| a as f32)
     }
     fn believed_ml(&self) -> f64 {
-        self.fused.as_ref().map_or(self.summed_ml, Fused::poured_ml)
+        self.fused.as_ref().map_or(self.summed_ml, FusedEstimator::poured_ml)
     }
 }
 

@@ -14,10 +14,12 @@ use shared::agent::Agent;
 use shared::exit::{self, Failure, OrExit as _, failure};
 use shared::limits::Limits;
 use shared::weights::Weights;
+use trainer::calibration;
 use trainer::data::TrainingEpisode;
-use trainer::law::{self, Law, Worlds};
-use trainer::train::{Estimate, MethodName, Options, Silent, Trained};
-use trainer::{best, calibrate};
+use trainer::method::control_law::{self, ControlLaw};
+use trainer::method::model_pour::PossiblePours;
+use trainer::method::model_search;
+use trainer::training::{Estimate, MethodName, Options, Silent, Trained};
 
 use crate::bench::simulators::Bench;
 use crate::bench::through_camera::BenchCamera;
@@ -358,10 +360,10 @@ impl Setup {
     pub fn train(&self, options: &Options, episodes: u64, weighed: u64) -> Option<(Trained, Vec<TrainingEpisode>)> {
         let mut data = self.bench.record(episodes as usize, self.data_seed);
         data.retain(|e| e.fault().is_none());
-        let mut trained = trainer::train::train(&data, options, &Silent).ok()?;
+        let mut trained = trainer::method::train(&data, options, &Silent).ok()?;
         if weighed > 0 {
             data.extend(self.weighed_pours(&trained.weights, weighed));
-            trained = trainer::train::train(&data, options, &Silent).ok()?;
+            trained = trainer::method::train(&data, options, &Silent).ok()?;
         }
         Some((trained, data))
     }
@@ -379,9 +381,9 @@ impl Setup {
             Pourer::PdHand | Pourer::BangBang | Pourer::OpenLoop | Pourer::Oracle => return self.run_plain(pourer, args),
         };
         let tuned = |data: &[TrainingEpisode]| {
-            let (fit, estimator) = best::estimator(data, Estimate::Fused, &self.limits);
-            let worlds = Worlds::new(&fit, self.limits, RATE_HZ, true);
-            let (law, _) = law::search(&worlds, Law::start_pd(true), best::SEARCH, options.seed, |_, _| {});
+            let (fit, estimator) = model_search::estimator(data, Estimate::Fused, &self.limits);
+            let possible = PossiblePours::new(&fit, self.limits, RATE_HZ, true);
+            let (law, _) = control_law::search(&possible, ControlLaw::start_pd(true), model_search::SEARCH, options.seed, |_, _| {});
             (law, fit.calibration, estimator)
         };
         if pourer == Pourer::PdTuned {
@@ -409,7 +411,7 @@ impl Setup {
 
     fn run_plain(&self, pourer: Pourer, args: &Args) -> Vec<Poured> {
         let data = self.bench.record(args.episodes as usize, self.data_seed);
-        let linear = calibrate::fit(&data, Some(1.0));
+        let linear = calibration::calibrate(&data, Some(1.0));
         self.controllers(args, |goal| match pourer {
             Pourer::PdHand => Box::new(HandPd(Sum::new(&linear, goal))),
             Pourer::BangBang => Box::new(BangBang(Sum::new(&linear, goal))),

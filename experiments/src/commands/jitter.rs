@@ -13,7 +13,8 @@ use rt_controller::journal;
 use serde_json::{Value, json};
 use shared::exit::Failure;
 use shared::os::now_ns;
-use trainer::report::{self, Series};
+use trainer::report::page;
+use trainer::report::plot::{Series, plot};
 
 use crate::own_cell::{OwnCell, OwnCellError};
 
@@ -69,7 +70,7 @@ fn measure(args: &Args) -> Result<(), OwnCellError> {
     let text = serde_json::to_string_pretty(&all).unwrap_or_default();
     let numbers = args.out.join("jitter.json");
     std::fs::write(&numbers, text.clone() + "\n").map_err(file_error(numbers.display()))?;
-    let html = report::page("Decant: latency and jitter", &(machine.html() + &result.html));
+    let html = page::page("Decant: latency and jitter", &(machine.html() + &result.html));
     let page = args.out.join("jitter.html");
     std::fs::write(&page, html).map_err(file_error(page.display()))?;
     if args.json {
@@ -143,7 +144,7 @@ impl Machine {
     fn html(&self) -> String {
         let mut rows = vec![["machine", "is", "better"].map(String::from).to_vec()];
         rows.extend(self.0.iter().map(|(name, value, advice)| vec![(*name).into(), value.clone(), (*advice).into()]));
-        report::table(&rows)
+        page::table(&rows)
     }
 }
 
@@ -327,7 +328,7 @@ fn histograms(title: &str, caption: &str, columns: &[(&str, &Vec<f64>)]) -> Stri
             Series::line(name, steps.collect())
         })
         .collect();
-    report::figure(&report::plot(title, "% of n", &series, true), caption)
+    page::figure(&plot(title, "% of n", &series, true), caption)
 }
 
 /// Processor time of a process so far, ns.
@@ -514,9 +515,9 @@ fn rounds(cell: &mut OwnCell, args: &Args) -> Result<Measured, OwnCellError> {
         for fact in &facts {
             text += &format!("{fact}\n");
         }
-        html += &format!("<h2>{name}</h2>{}<ul>", report::table(&rows));
+        html += &format!("<h2>{name}</h2>{}<ul>", page::table(&rows));
         for fact in &facts {
-            html += &format!("<li>{}</li>", report::escape(fact));
+            html += &format!("<li>{}</li>", page::escape(fact));
         }
         html += "</ul><div class=plots>";
         html += &histograms(
@@ -618,11 +619,11 @@ fn soak(cell: &mut OwnCell, hours: f64) -> Result<Measured, OwnCellError> {
     let line = |name: &str, pick: fn(&Sample) -> f64| Series::line(name, samples.iter().map(|s| (s.minutes, pick(s))).collect());
     let mut html = String::from("<h2>Soak</h2><ul>");
     for fact in &facts {
-        html += &format!("<li>{}</li>", report::escape(fact));
+        html += &format!("<li>{}</li>", page::escape(fact));
     }
     html += "</ul><div class=plots>";
-    html += &report::figure(
-        &report::plot(
+    html += &page::figure(
+        &plot(
             "minutes",
             "resident MiB",
             &[line("rt-controller", |s| s.controller.resident_mib), line("feature-worker", |s| s.worker.resident_mib)],
@@ -630,8 +631,8 @@ fn soak(cell: &mut OwnCell, hours: f64) -> Result<Measured, OwnCellError> {
         ),
         "Memory.",
     );
-    html += &report::figure(
-        &report::plot(
+    html += &page::figure(
+        &plot(
             "minutes",
             "open files",
             &[line("rt-controller", |s| s.controller.files as f64), line("feature-worker", |s| s.worker.files as f64)],

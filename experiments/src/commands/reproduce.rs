@@ -11,10 +11,11 @@ use rand::{RngExt, SeedableRng};
 use rand_pcg::Pcg64Mcg;
 use rayon::prelude::*;
 use shared::exit::{self, Failure, OrExit as _};
-use shared::policy::InputScale;
-use trainer::eq8::{DELTA, KERAS_CLIP, LAMBDA, reward};
-use trainer::net::{Adam, Net, Sample};
-use trainer::report::{Series, figure, plot, table};
+use shared::mlp::InputScale;
+use trainer::method::policy_gradient::{DELTA, KERAS_CLIP, LAMBDA, reward};
+use trainer::network::{Adam, Example, Network};
+use trainer::report::page::{self, figure, table};
+use trainer::report::plot::{Series, plot};
 
 use simulator::physics::paper::PaperPour;
 
@@ -68,7 +69,7 @@ fn triangle(top: usize) -> (Vec<f64>, Vec<f64>) {
     (alphas, volumes)
 }
 
-fn pour_with(net: &Net, scale: &InputScale, init_ml: f64, goal_ml: f64) -> f64 {
+fn pour_with(net: &Network, scale: &InputScale, init_ml: f64, goal_ml: f64) -> f64 {
     let mut pour = PaperPour::new(init_ml);
     let (mut alpha, mut v) = (0.0f64, [0.0f32; 3]);
     let mut d = goal_ml;
@@ -109,21 +110,21 @@ fn run_once(top: usize, clip: Option<f32>, steps: usize, seed: u64) -> Run {
     let n = sequences.len() as f64;
     let mean = sequences.iter().map(|s| s.1).sum::<f64>() / n;
     let sd = (sequences.iter().map(|s| (s.1 - mean).powi(2)).sum::<f64>() / n).sqrt().max(1e-9);
-    let samples: Vec<Sample> = sequences
+    let samples: Vec<Example> = sequences
         .iter()
         .flat_map(|(states, r)| {
             let weight = (LAMBDA * (r - mean) / sd) as f32;
-            states.iter().map(move |(x, action)| Sample { x: *x, action: *action, weight })
+            states.iter().map(move |(x, action)| Example { x: *x, action: *action, weight })
         })
         .collect();
-    let mut net = Net::new([4, 40, 40, 2], &mut rng);
+    let mut net = Network::new([4, 40, 40, 2], &mut rng);
     let mut adam = Adam::new(&net);
-    let look = |net: &Net| -> Vec<(f64, f64)> { goals().map(|(init, goal)| (goal, pour_with(net, &scale, init, goal))).collect() };
+    let look = |net: &Network| -> Vec<(f64, f64)> { goals().map(|(init, goal)| (goal, pour_with(net, &scale, init, goal))).collect() };
     let mae = |pours: &[(f64, f64)]| pours.iter().map(|(g, p)| (p - g).abs()).sum::<f64>() / pours.len() as f64;
     let mut pours = look(&net);
     let mut curve = vec![(0.0, mae(&pours))];
     for step in 1..=steps {
-        let batch: Vec<Sample> = (0..256).map(|_| samples[rng.random_range(0..samples.len())]).collect();
+        let batch: Vec<Example> = (0..256).map(|_| samples[rng.random_range(0..samples.len())]).collect();
         net.learn(&batch, clip, 1e-3, &mut adam);
         if step % LOOK_EVERY == 0 {
             pours = look(&net);
@@ -196,7 +197,7 @@ pub fn run(args: &Args) -> Result<(), Failure> {
     println!("{}", verdicts.join("\n"));
     let html = format!("{intro}<p>{}</p>{}<div class=plots>{plots}</div>", verdicts.join("<br>"), table(&rows));
     let report = serde_json::json!({ "kind": "reproduction", "html": html, "weight_ml": weight, "runs": json_runs });
-    let page = || trainer::report::page("Decant: section 4 of the paper", &html);
+    let page = || page::page("Decant: section 4 of the paper", &html);
     let files = [(args.html.as_ref(), page()), (args.json.as_ref(), report.to_string())];
     for (file, text) in files.iter().filter_map(|(f, t)| f.map(|f| (f, t))) {
         std::fs::write(file, text).map_err(|e| format!("{}: {e}", file.display())).or_exit(exit::FAILED)?;

@@ -14,13 +14,14 @@ use std::time::{Duration, Instant};
 
 use rt_controller::client::Client;
 use rt_controller::link::Lost;
+use shared::actions::STAY;
 use shared::config::Config;
 use shared::control::{EndReason, Outcome, Reply, Request};
-use shared::estimate::Calibration;
+use shared::estimator::Calibration;
 use shared::ipc;
 use shared::messages::{Feature, LAYOUT_VERSION, Phase};
+use shared::mlp::Mlp;
 use shared::os::now_ns;
-use shared::policy::{Mlp, STAY};
 use shared::weights::Weights;
 use simulator::ur::{Controller, ControllerOptions, RuntimeState, Series};
 
@@ -326,13 +327,14 @@ pub fn start_controller(directory: &Path) -> Child {
 
 /// A policy by hand: 2.45 degrees a frame until liquid flows well, then stay.
 fn tilt_until_it_flows() -> Weights {
-    let mut policy = Mlp::ZERO;
-    policy.w1[0][0] = 1.0;
-    policy.w2[0][0] = 1.0;
-    policy.w3[0][STAY] = 1.0;
-    policy.b3[STAY + 7] = 0.5;
-    let calibration = Calibration { c: ML_PER_PX2 as f32, q: 1.0, tilt: 0.0, hold_above_px2: f32::INFINITY };
-    Weights { policy, calibration, ..tests::steady_weights(STAY + 7) }
+    let mut network = Mlp::ZERO;
+    network.w1[0][0] = 1.0;
+    network.w2[0][0] = 1.0;
+    network.w3[0][STAY] = 1.0;
+    network.b3[STAY + 7] = 0.5;
+    let calibration =
+        Calibration { volume_at_1_px2_ml: ML_PER_PX2 as f32, area_exponent: 1.0, log_tilt_slope: 0.0, hold_above_px2: f32::INFINITY };
+    Weights { network, calibration, ..tests::steady_weights(STAY + 7) }
 }
 
 fn flow_ml_s(alpha_deg: f64) -> f64 {
