@@ -2,8 +2,7 @@
 //!
 //! Any thread; allocates. The same arguments give the same settings.
 
-use feature_worker::calibrate::ColourLearner;
-use feature_worker::extract::Axes;
+use feature_worker::vision::{Axes, ColourLearner};
 use opencv::core::{Mat, Vec3b};
 use shared::config::{CameraConfig, CameraSource, ImageConfig, LiquidMethod};
 use simulator::camera::{Renderer, Scene, View};

@@ -2,7 +2,7 @@
 
 use experiments::camera_evaluation::measure::measure_pours;
 use experiments::camera_setup::{camera_config, image_config};
-use feature_worker::extract::{Extractor, Image};
+use feature_worker::vision::{Extractor, Image};
 use shared::messages::PixelFormat;
 use simulator::camera::{Background, Renderer, Scene, View};
 

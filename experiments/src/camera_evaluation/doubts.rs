@@ -2,7 +2,7 @@
 
 use std::collections::BTreeMap;
 
-use feature_worker::extract::{Extractor, Image};
+use feature_worker::vision::{Extractor, Image};
 use shared::config::ImageConfig;
 use shared::messages::{Doubt, PixelFormat};
 use simulator::camera::{Background, Renderer, Scene, View};

@@ -1,6 +1,6 @@
 //! Renders scenes and measures them, frame by frame. Any thread; allocates for each run of scenes.
 
-use feature_worker::extract::{Extractor, Image, Measurement};
+use feature_worker::vision::{Extractor, Image, Measurement};
 use rand::SeedableRng;
 use rand_pcg::Pcg64Mcg;
 use shared::config::ImageConfig;

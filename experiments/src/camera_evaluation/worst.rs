@@ -2,7 +2,7 @@
 
 use std::path::Path;
 
-use feature_worker::view;
+use feature_worker::drawing;
 use opencv::core::{Mat, Point, Scalar, Vec3b, Vector};
 use opencv::prelude::*;
 use opencv::{imgcodecs, imgproc};
@@ -68,14 +68,14 @@ impl Worst {
 fn explain(case: &Case, frame: &MeasuredFrame, scene: &Scene) -> Result<Mat, CameraError> {
     let (rows, columns, truth) = (case.view.height_px as i32, case.view.width_px as i32, frame.truth);
     let mut picture = Mat::new_rows_cols_with_bytes::<Vec3b>(rows, columns, frame.pixels)?.try_clone()?;
-    view::draw(&mut picture, frame.extractor, frame.measured)?;
+    drawing::draw(&mut picture, frame.extractor, frame.measured)?;
     // In sixteenths of a pixel.
     let at = |k: usize| Point::new((truth.triangle_px[k][0] * 16.0) as i32, (truth.triangle_px[k][1] * 16.0) as i32);
     if truth.area_px2 > 0.0 {
         imgproc::line(&mut picture, at(1), at(2), Scalar::new(255.0, 0.0, 255.0, 0.0), 1, imgproc::LINE_AA, 4)?;
     }
     let text = format!("truth {:.0} px^2, alpha {:.0}, {:.1} ml/s", truth.area_px2, scene.alpha_deg, scene.flow_ml_s);
-    view::caption(&mut picture, &text, 1)?;
-    view::caption(&mut picture, &case.labels.join(", "), 2)?;
+    drawing::caption(&mut picture, &text, 1)?;
+    drawing::caption(&mut picture, &case.labels.join(", "), 2)?;
     Ok(picture)
 }
