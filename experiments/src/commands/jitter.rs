@@ -14,7 +14,7 @@ use serde_json::{Value, json};
 use shared::exit::Failure;
 use shared::os::now_ns;
 use trainer::report::page;
-use trainer::report::plot::{Series, plot};
+use trainer::report::plot::{PlotSeries, plot};
 
 use crate::own_cell::{OwnCell, OwnCellError};
 
@@ -317,7 +317,7 @@ fn median(values: impl Iterator<Item = f64>) -> f64 {
 fn histograms(title: &str, caption: &str, columns: &[(&str, &Vec<f64>)]) -> String {
     let end = columns.iter().map(|(_, v)| summary(v)[3]).filter(|x| x.is_finite()).fold(1e-3, f64::max) * 1.05;
     let width = end / 60.0;
-    let series: Vec<Series> = columns
+    let series: Vec<PlotSeries> = columns
         .iter()
         .map(|(name, values)| {
             let mut counts = [0.0; 61];
@@ -325,7 +325,7 @@ fn histograms(title: &str, caption: &str, columns: &[(&str, &Vec<f64>)]) -> Stri
                 counts[((v / width) as usize).min(60)] += 100.0 / values.len() as f64;
             }
             let steps = counts.iter().enumerate().flat_map(|(k, c)| [(k as f64 * width, *c), ((k + 1) as f64 * width, *c)]);
-            Series::line(name, steps.collect())
+            PlotSeries::line(name, steps.collect())
         })
         .collect();
     page::figure(&plot(title, "% of n", &series, true), caption)
@@ -616,7 +616,7 @@ fn soak(cell: &mut OwnCell, hours: f64) -> Result<Measured, OwnCellError> {
         format!("wake-up lateness in us: rt-controller p50 {:.1}, p99 {:.1}, p99.9 {:.1}, max {:.1}", late[1], late[2], late[3], late[4]),
         format!("                        cyclictest    p50 {:.1}, p99 {:.1}, p99.9 {:.1}, max {:.1}", yard[1], yard[2], yard[3], yard[4]),
     ];
-    let line = |name: &str, pick: fn(&Sample) -> f64| Series::line(name, samples.iter().map(|s| (s.minutes, pick(s))).collect());
+    let line = |name: &str, pick: fn(&Sample) -> f64| PlotSeries::line(name, samples.iter().map(|s| (s.minutes, pick(s))).collect());
     let mut html = String::from("<h2>Soak</h2><ul>");
     for fact in &facts {
         html += &format!("<li>{}</li>", page::escape(fact));

@@ -15,7 +15,7 @@ use shared::mlp::InputScale;
 use trainer::method::policy_gradient::{DELTA, KERAS_CLIP, LAMBDA, reward};
 use trainer::network::{Adam, Example, Network};
 use trainer::report::page::{self, figure, table};
-use trainer::report::plot::{Series, plot};
+use trainer::report::plot::{PlotSeries, plot};
 
 use simulator::physics::paper::PaperPour;
 
@@ -170,12 +170,13 @@ pub fn run(args: &Args) -> Result<(), Failure> {
             format!("{:.1}", last[last.len() - 1]),
             format!("{good} of {}", last.len()),
         ]);
-        let curves: Vec<Series> = runs.iter().enumerate().map(|(k, r)| Series::line(&format!("seed {}", k + 1), r.curve.clone())).collect();
+        let curves: Vec<PlotSeries> =
+            runs.iter().enumerate().map(|(k, r)| PlotSeries::line(&format!("seed {}", k + 1), r.curve.clone())).collect();
         plots += &figure(&plot("Adam step", "mean absolute error in ml", &curves, true), &format!("Convergence, cross-entropy {name}."));
-        let mut dots = vec![Series::reference("poured = goal", vec![(0.0, 0.0), (160.0, 160.0)])];
+        let mut dots = vec![PlotSeries::reference("poured = goal", vec![(0.0, 0.0), (160.0, 160.0)])];
         let beside =
             |k: usize, r: &Run| r.pours.iter().map(|(goal, poured)| (goal + (k as f64 - (runs.len() - 1) as f64 / 2.0), *poured)).collect();
-        dots.extend(runs.iter().enumerate().map(|(k, r)| Series::dots(&format!("seed {}", k + 1), beside(k, r))));
+        dots.extend(runs.iter().enumerate().map(|(k, r)| PlotSeries::dots(&format!("seed {}", k + 1), beside(k, r))));
         plots += &figure(
             &plot("goal in ml (seeds side by side)", "poured in ml", &dots, true),
             &format!("Goal against poured, cross-entropy {name}."),

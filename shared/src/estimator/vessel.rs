@@ -113,14 +113,14 @@ impl Vessel {
 
 /// A place between two entries of the tables.
 #[derive(Debug, Clone, Copy)]
-pub(super) struct Place {
+pub(super) struct TablePlace {
     /// The entry below.
     index: usize,
     /// How far the place is on the way to the entry above, 0 to 1.
     share: f64,
 }
 
-impl Place {
+impl TablePlace {
     /// Where a tilt is in the tables; what is outside, or is not a number, is put at an end.
     pub(super) fn of(tilt_deg: f64) -> Self {
         // NaN becomes 0 by the cast; the clamp keeps the index inside.
@@ -165,19 +165,19 @@ impl CapacityCurve {
 
     /// Capacity that is lost from upright to a tilt, ml: what leaves a full vessel that is brought there slowly.
     pub fn lost_ml(&self, tilt_deg: f64) -> f64 {
-        self.lost_ml_at(Place::of(tilt_deg))
+        self.lost_ml_at(TablePlace::of(tilt_deg))
     }
 
     /// The same at a place of the tables.
     #[inline]
-    pub(super) fn lost_ml_at(&self, Place { index, share }: Place) -> f64 {
+    pub(super) fn lost_ml_at(&self, TablePlace { index, share }: TablePlace) -> f64 {
         let slope = &self.lost_ml_per_deg;
         self.lost_ml[index] + STEP_DEG * share * (slope[index] + 0.5 * share * (slope[index + 1] - slope[index]))
     }
 
     /// Capacity that is lost at a place of the tables, ml a degree.
     #[inline]
-    pub(super) fn lost_ml_per_deg_at(&self, place: Place) -> f64 {
+    pub(super) fn lost_ml_per_deg_at(&self, place: TablePlace) -> f64 {
         place.read(&self.lost_ml_per_deg)
     }
 }
