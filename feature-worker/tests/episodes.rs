@@ -1,4 +1,4 @@
-//! `feature-worker episodes` as people and scripts call it: the real program on real files.
+//! `feature-worker episodes` as people and scripts call it: the program itself, on real files.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::too_many_lines)]
 
 use std::path::{Path, PathBuf};
@@ -14,12 +14,12 @@ use shared::messages::{Feature, LAYOUT_VERSION, Telemetry};
 
 const FRAMES: u64 = 40;
 
-/// Grey level of picture `n`, far from its neighbours', because video codecs blur small changes away.
+/// Grey level of picture `n`. It is far from its neighbours' levels, because video codecs blur small changes away.
 fn grey(n: u64) -> f64 {
     (n * 97 % 200 + 20) as f64
 }
 
-/// Writes an episode of 40 frames with images of their own grey; frames 20 and 21 are lost.
+/// Writes an episode of 40 frames, each with an image of its own grey. Frames 20 and 21 are lost.
 fn write(directory: &Path, lambda_deg: f32) -> PathBuf {
     let config = Config::read(&Path::new(env!("CARGO_MANIFEST_DIR")).join("../config/sim.toml")).unwrap();
     let kind = EpisodeKind::Recording(Curve { lambda_deg, gamma_per_s2: 0.5, beta_s: 2.0 });
@@ -40,9 +40,9 @@ fn write(directory: &Path, lambda_deg: f32) -> PathBuf {
         let feature =
             Feature { version: LAYOUT_VERSION, sequence: n + 1, captured_at_ns: at_ns + 5_000_000, area_px2, ..Default::default() };
         let image = bytes.to_vec();
-        let sample =
+        let row =
             FrameRow { feature: &feature, alpha_commanded_deg: lambda_deg, alpha_measured_deg: lambda_deg, image: Some(("jpeg", &image)) };
-        writer.frame(&sample).unwrap();
+        writer.frame(&row).unwrap();
     }
     writer.finish(&EpisodeEnd { complete: true, reason: "over", disordered_frames: 0 }).unwrap()
 }
@@ -55,7 +55,7 @@ fn code(output: &Output) -> i32 {
     output.status.code().unwrap()
 }
 
-/// Protects scripts: what is wrong with episodes is told by exit code and JSON; weighing makes them usable, nonsense does not.
+/// Protects scripts: exit code and JSON tell what is wrong with episodes. A weight makes them usable; nonsense does not.
 #[test]
 fn check_and_weigh_tell_by_exit_code_and_json() {
     let dir = tempfile::tempdir().unwrap();
@@ -92,7 +92,7 @@ fn check_and_weigh_tell_by_exit_code_and_json() {
     assert_eq!(code(&episodes(&["list", "--config", &format!("{directory}/none.toml")])), 2);
 }
 
-/// Protects people who take episodes elsewhere: every frame is there, lost ones in their places, and nothing is overwritten.
+/// Protects people who take episodes elsewhere: every frame is there, the lost ones in their places, and nothing is overwritten.
 #[test]
 fn exports_hold_every_frame_and_overwrite_nothing() {
     let dir = tempfile::tempdir().unwrap();

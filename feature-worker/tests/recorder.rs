@@ -1,4 +1,4 @@
-//! The recorder on real shared memory, real images and real files; killed and starved in real processes of its own.
+//! The recorder with real shared memory, images and files. Where it is killed or its disk is full, it runs in a process of its own.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::too_many_lines)]
 
 use std::path::{Path, PathBuf};
@@ -34,7 +34,7 @@ fn config(cell: &str, directory: &Path) -> Config {
     config
 }
 
-/// A controller and a camera for the recorder: 30 Hz in the data's times, as fast as the recorder takes it in real time.
+/// A controller and a camera for the recorder. The times in the data are those of 30 Hz; in real time it runs as fast as the recorder can.
 struct Scene {
     recorder: Recorder,
     telemetry: Publisher<Ipc, Telemetry, ()>,
@@ -43,7 +43,7 @@ struct Scene {
     base_ns: u64,
     tick: u64,
     sequence: u64,
-    /// Pictures of noise, which do not compress.
+    /// Makes pictures of noise, which do not compress.
     noise: Option<Pcg32>,
     _cell: Cell,
     _cleanup: Cleanup,
@@ -79,7 +79,7 @@ impl Scene {
         }
     }
 
-    /// One period: a tick of `episode`, and the frame captured 10 ms after the tick before.
+    /// One period: a tick of `episode`, and a frame that was captured 10 ms after the tick before.
     fn period(&mut self, episode: u64, phase: Phase) {
         let frame = self.feature();
         self.tick(episode, phase);
@@ -157,7 +157,7 @@ impl Scene {
         panic!("no report");
     }
 
-    /// Idle, `periods` of an episode, idle.
+    /// Some idle periods, then `periods` of an episode, then idle periods again.
     fn run(&mut self, episode: u64, phase: Phase, periods: u64) {
         for _ in 0..12 {
             self.period(0, Phase::Idle);
@@ -178,7 +178,7 @@ impl Scene {
     }
 }
 
-/// Protects L_E: every frame of the episode with its image, its V_e and alpha at its capture time, and the curve's parameters.
+/// Protects L_E: the file holds every frame of the episode with its image, its V_e and alpha at its capture time, and the curve's parameters.
 #[test]
 fn a_recording_becomes_a_complete_episode() {
     let dir = tempfile::tempdir().unwrap();
@@ -192,10 +192,10 @@ fn a_recording_becomes_a_complete_episode() {
     assert!(episode.complete);
     assert_eq!(episode.kind, EpisodeKind::Recording(CURVE));
     assert_eq!((episode.info.ticks, episode.info.lost_ticks, episode.info.lost_frames), (45, 0, 0));
-    assert_eq!(episode.info.weights, "0000000000000abc", "the policy that the controller runs");
+    assert_eq!(episode.info.weights, "0000000000000abc", "the weights that the controller runs");
     assert_eq!(episode.info.images, report.images);
     assert_eq!(episode.info.images as usize, episode.rows.len());
-    // Ticks 13 to 57 are the episode, tick 58 ends it: frames 13 to 58 were captured in between, 14 is the first after the start.
+    // Ticks 13 to 57 are the episode, and tick 58 ends it. Frames 13 to 58 were captured in between; 14 is the first after the start.
     assert!(episode.rows[0].t_s < 0.0 && episode.rows[0].t_s >= -0.2, "a few frames from before");
     assert_eq!(episode.rows.last().unwrap().sequence, 58, "the last frame before the end");
     for f in &episode.rows {
@@ -216,7 +216,7 @@ fn a_recording_becomes_a_complete_episode() {
     }
 }
 
-/// Protects every camera format and both compressions, and that a second episode gets a file of its own.
+/// Protects every pixel format and both compressions, and the file of an earlier episode from a later one.
 #[test]
 fn formats_and_compressions_are_recorded_and_nothing_is_overwritten() {
     let dir = tempfile::tempdir().unwrap();
@@ -237,7 +237,7 @@ fn formats_and_compressions_are_recorded_and_nothing_is_overwritten() {
         let bytes = Vector::<u8>::from(image.data);
         let picture = opencv::imgcodecs::imdecode(&bytes, opencv::imgcodecs::IMREAD_GRAYSCALE).unwrap();
         let grey = f64::from(picture.data_bytes().unwrap()[5]);
-        // YUYV is limited range: 16 to 235.
+        // The values of YUYV go from 16 to 235.
         let expected = f64::from(image.sequence);
         let expected = if format == PixelFormat::Yuyv { (expected - 16.0) * 255.0 / 219.0 } else { expected };
         assert!((grey - expected).abs() <= 2.0, "{format:?}: {grey}, expected {expected}");
@@ -277,8 +277,8 @@ fn back_to_back_episodes_lose_no_frame() {
     assert!(second.rows.iter().any(|f| f.sequence == next.sequence));
 }
 
-/// Protects V_e from the recorder's limits: without a free buffer the image is lost and counted, the measurement is kept;
-/// frames that come twice or late are left out, frames that never came are shown as lost.
+/// Protects V_e from the recorder's limits: without a free buffer the image is lost and counted, and the measurement is kept. Frames that
+/// come twice or late are left out, and frames that never came are shown as lost.
 #[test]
 fn dropped_images_and_lost_frames_are_counted_and_lose_no_measurement() {
     let dir = tempfile::tempdir().unwrap();
@@ -289,7 +289,7 @@ fn dropped_images_and_lost_frames_are_counted_and_lose_no_measurement() {
         scene.period(0, Phase::Idle);
     }
     scene.tick(1, Phase::Recording);
-    // A burst that no thread could take: 2 + 8 buffers for 400 frames, 1 ms apart in the data's time.
+    // A burst that no thread could take: 400 frames, 1 ms apart in the data's time, for 2 + 8 buffers.
     let mut offered = Vec::new();
     for i in 0..400 {
         let mut f = scene.feature();
@@ -299,7 +299,7 @@ fn dropped_images_and_lost_frames_are_counted_and_lose_no_measurement() {
     }
     let dropped = scene.recorder.dropped();
     assert!(dropped > 0);
-    // The burst, then its last frame again, then a gap of two.
+    // After the burst comes its last frame again, and then a gap of two.
     let mut again = scene.feature();
     again.captured_at_ns += 399_000_000;
     again.sequence = *offered.last().unwrap();
@@ -322,8 +322,8 @@ fn dropped_images_and_lost_frames_are_counted_and_lose_no_measurement() {
     }
 }
 
-/// Protects people from half an episode: one that began before the recorder, or whose controller was restarted or whose
-/// worker was stopped in the middle, is not called complete.
+/// Protects people from half an episode: one that began before the recorder, whose controller was restarted, or whose worker was stopped in
+/// the middle is not called complete.
 #[test]
 fn half_an_episode_is_never_complete() {
     let dir = tempfile::tempdir().unwrap();
@@ -378,7 +378,7 @@ fn start_child(before: &str, cell: &str, directory: &Path) -> Child {
         .unwrap()
 }
 
-/// Not a test of its own: records until it is killed or the episode failed, for the tests that need a process to kill.
+/// Not a test, but the process that the tests below start: records until it is killed or the episode has failed.
 #[test]
 #[ignore = "run by the tests below in a process of its own"]
 fn child() {
@@ -404,8 +404,8 @@ fn child() {
     }
 }
 
-/// Protects recordings from the out-of-memory killer, a pulled plug and an impatient person: what was written reads, and
-/// says that it is not all.
+/// Protects recordings from the out-of-memory killer, a pulled plug and an impatient person: what was written can be read and says that it
+/// is not everything.
 #[test]
 fn a_killed_recorder_leaves_a_file_that_reads_and_says_so() {
     let dir = tempfile::tempdir().unwrap();
@@ -428,12 +428,12 @@ fn a_killed_recorder_leaves_a_file_that_reads_and_says_so() {
     assert_eq!(episode.info.images as usize, episode.rows.len(), "the cut is between two frames");
 }
 
-/// Protects the operator from silence when the disk is full: the reason is reported, the worker lives, what fits reads.
+/// Protects the operator from silence when the disk is full: the reason is reported, the worker goes on, and what was written can be read.
 #[test]
 fn a_full_disk_is_reported_and_what_fits_is_kept() {
     let dir = tempfile::tempdir().unwrap();
     let cell = format!("full-{}", std::process::id());
-    // Largest file 8192 * 512 bytes (the shared memory must fit too), and no signal for it: writing fails as on a full disk.
+    // The largest file is 8192 * 512 bytes, which is enough for the shared memory, and no signal tells of it: writing fails as on a full disk.
     let status = start_child("trap '' XFSZ; ulimit -f 8192;", &cell, dir.path()).wait().unwrap();
     shared::ipc::remove_files(&cell);
     assert!(status.success());
@@ -443,7 +443,7 @@ fn a_full_disk_is_reported_and_what_fits_is_kept() {
     assert!(!episode.complete && !episode.rows.is_empty());
 }
 
-/// Protects the start from a directory that cannot be.
+/// Protects the start: a directory that cannot be made is refused with the key and in one line.
 #[test]
 fn a_directory_that_cannot_be_made_is_refused_at_the_start() {
     let dir = tempfile::tempdir().unwrap();

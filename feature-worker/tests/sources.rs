@@ -1,4 +1,5 @@
-//! Real videos and image sequences through `feature-worker inspect`, as a process: good ones, and the ways in which they break.
+//! Real videos and image sequences in `feature-worker inspect`, run as a process: good ones and broken ones. Also the numbers, times and
+//! rates of a device's frames.
 
 mod drawn;
 
@@ -20,7 +21,7 @@ fn text(output: &Output) -> String {
     format!("{}{}", String::from_utf8_lossy(&output.stdout), String::from_utf8_lossy(&output.stderr))
 }
 
-/// One clear line that holds all `words`, and the exit code of bad input.
+/// Asserts one clear line that holds all `words`, and the exit code of bad input.
 fn refused(output: &Output, words: &[&str]) {
     let said = text(output);
     assert_eq!(output.status.code(), Some(2), "{said}");
@@ -28,8 +29,8 @@ fn refused(output: &Output, words: &[&str]) {
     assert!(words.iter().all(|w| said.contains(w)), "{words:?} in {said}");
 }
 
-/// Protects people with their own recordings: an MJPEG video of a pour is read to its end, with the flow where it is, in a CSV and
-/// pictures; a truncated video gives what is left of it or a clear line; what is no video at all is refused by name.
+/// Protects people with their own recordings: an MJPEG video of a pour is read to its end and gives a CSV and pictures, with flow where there
+/// is flow. A truncated video gives what is left of it or a clear line. A file that is no video at all is refused by name.
 #[test]
 fn videos_whole_truncated_and_wrong() -> Outcome {
     let directory = tempfile::tempdir()?;
@@ -78,8 +79,8 @@ fn videos_whole_truncated_and_wrong() -> Outcome {
     Ok(())
 }
 
-/// Protects against a camera that changes its size in mid-stream, and against a grey camera with the colour method: both end
-/// with a line that says what to do.
+/// Protects people whose camera changes its size in mid-stream, or who use a grey camera with the colour method: both get a line that says
+/// what to do.
 #[test]
 fn changed_size_and_grey_pictures_say_what_to_do() -> Outcome {
     let directory = tempfile::tempdir()?;
@@ -131,8 +132,8 @@ fn bad_configurations_are_refused_with_key_and_hint() -> Outcome {
     Ok(())
 }
 
-/// Protects the count of lost frames of a V4L2 device: a frame that the driver dropped leaves a gap in the numbers; jitter, a busy kernel
-/// that stamps late and a camera that is 1 % slow or fast do not; a device without timestamps is counted by its frames.
+/// Protects the count of lost frames of a V4L2 device: a frame that the driver dropped leaves a gap in the numbers. Jitter, a busy kernel
+/// that stamps late and a camera that is 1 % slow or fast leave none. Without timestamps the frames themselves are counted.
 #[test]
 fn a_lost_frame_leaves_a_gap() {
     let mut numbering = Numbering::new(30.0, 0);
@@ -150,9 +151,9 @@ fn a_lost_frame_leaves_a_gap() {
     }
 }
 
-/// Protects the age of a frame, on which "stale" and the angle it belongs to rest: one that waited in the driver keeps the driver's time;
-/// timestamps of another clock (wall clock, counted from the device's start, jumping back) are not believed, and no two frames are
-/// of one time.
+/// Protects the age of a frame, which decides whether it is stale and which angle it belongs to. A frame that waited in the driver keeps the
+/// driver's time. Timestamps of another clock (the wall clock, one that counts from the device's start, one that jumps back) are not
+/// believed, and no two frames have the same time.
 #[test]
 fn a_frame_is_as_old_as_its_driver_says() {
     let ns = |ms: u64| ms * 1_000_000;
@@ -171,8 +172,8 @@ fn a_frame_is_as_old_as_its_driver_says() {
     }
 }
 
-/// Protects the count of frames from a camera that runs at another rate than configured: refused with key and hint; a device that
-/// does not tell is taken.
+/// Protects the count of frames: a camera that runs at another rate than configured is refused with key and hint. A device that does not
+/// report its rate is accepted.
 #[test]
 fn another_rate_is_refused() {
     assert!(check_rate(30.0, 0.0).is_ok() && check_rate(30.0, 30.0).is_ok() && check_rate(30.0, 29.97).is_ok());

@@ -1,5 +1,5 @@
-//! `feature-worker run` and `view` as processes on a real cell's shared memory, with this test as the camera driver, or with pictures that
-//! the worker reads itself, as it does a device.
+//! `feature-worker run` and `view` as processes on a real cell's shared memory. The camera driver is this test, or the worker reads pictures
+//! itself, as it reads a device.
 
 mod drawn;
 
@@ -57,7 +57,7 @@ impl Drop for Program {
     }
 }
 
-/// Removes what the cell leaves in shared memory, last.
+/// Removes what the cell leaves in shared memory, when it is dropped after everything else of the cell.
 struct Cleanup(String);
 
 impl Drop for Cleanup {
@@ -87,8 +87,8 @@ impl Driver {
     }
 
     fn publish(&self, sequence: u64, captured_at_ns: u64, format: u32, size: [u32; 2], pixels: &[u8]) -> Result<(), Failure> {
-        let mut sample = self.publisher.loan_slice_uninit(pixels.len())?;
-        *sample.user_header_mut() = FrameHeader {
+        let mut loan = self.publisher.loan_slice_uninit(pixels.len())?;
+        *loan.user_header_mut() = FrameHeader {
             version: LAYOUT_VERSION,
             format,
             width_px: size[0],
@@ -97,7 +97,7 @@ impl Driver {
             captured_at_ns,
             published_at_ns: now_ns(),
         };
-        sample.write_from_slice(pixels).send()?;
+        loan.write_from_slice(pixels).send()?;
         self.notifier.notify()?;
         Ok(())
     }
@@ -109,7 +109,7 @@ impl Driver {
         Ok(at_ns)
     }
 
-    /// The next feature; none after a generous while.
+    /// The next feature; none if it does not come within `patience`.
     fn feature(&self, patience: Duration) -> Result<Option<Feature>, Failure> {
         let begin = Instant::now();
         while begin.elapsed() < patience {
@@ -121,7 +121,7 @@ impl Driver {
         Ok(None)
     }
 
-    /// Publishes until the worker answers: it may still be starting.
+    /// Publishes until the worker answers, because it may still be starting.
     fn wake(&self) -> Result<Feature, Failure> {
         for sequence in 1..600 {
             self.pour(sequence, 0)?;
@@ -133,11 +133,12 @@ impl Driver {
     }
 }
 
+/// How long a test waits for what must come.
 const PATIENCE: Duration = Duration::from_secs(30);
 
-/// Protects the controller's only eye: every frame gives one feature with its sequence and times and the right area; frames
-/// that come twice or out of order give none; frames of another size, format or layout give a doubt and no crash; a driver that
-/// restarts is taken up; SIGTERM ends it with success.
+/// Protects the controller, which sees through the worker alone. Every frame gives one feature with its number, its times and the right area.
+/// Frames that come twice or out of order give none. Frames of another size, format or layout give a doubt and no crash. A driver that
+/// restarts is followed. SIGTERM ends the worker with success.
 #[test]
 fn every_frame_becomes_one_feature() -> Outcome {
     let directory = tempfile::tempdir()?;
@@ -159,7 +160,7 @@ fn every_frame_becomes_one_feature() -> Outcome {
         let truth = 3600.0 * (1.0 - (20 - i) as f32 / 13.0).powi(2);
         assert!((feature.area_px2 / truth - 1.0).abs() < 0.06, "frame {i}: {feature:?} instead of {truth}");
     }
-    // Again, and one that is late.
+    // The same number again, with an older time.
     driver.publish(sequence, now_ns() - 1_000_000_000, 0, [WIDTH as u32, HEIGHT as u32], pour(20)?.data_bytes()?)?;
     assert_eq!(driver.feature(Duration::from_millis(500))?, None);
     let bgr = PixelFormat::Bgr8 as u32;
@@ -169,7 +170,7 @@ fn every_frame_becomes_one_feature() -> Outcome {
         let feature = driver.feature(PATIENCE)?.ok_or("no feature")?;
         assert_eq!((Doubt::from_code(feature.doubt), feature.area_px2), (Doubt::WrongFormat, 0.0));
     }
-    // A driver that begins at 1 again: younger frames with smaller numbers.
+    // A driver that begins at 1 again sends younger frames with smaller numbers.
     for restarted in 1..4 {
         driver.pour(restarted, 20 + restarted as i32)?;
         let feature = driver.feature(PATIENCE)?.ok_or("no feature")?;
@@ -181,7 +182,7 @@ fn every_frame_becomes_one_feature() -> Outcome {
     Ok(())
 }
 
-/// Protects the cell from two eyes that disagree: a second worker is refused with a reason while the first goes on.
+/// Protects the controller from two workers that disagree: a second one is refused with a reason while the first goes on.
 #[test]
 fn a_second_worker_is_refused() -> Outcome {
     let directory = tempfile::tempdir()?;
@@ -199,7 +200,7 @@ fn a_second_worker_is_refused() -> Outcome {
     Ok(())
 }
 
-/// GET or POST over a plain socket: status line, head and body.
+/// Sends GET or POST over a plain socket. Answers with the head, status line included, and the body.
 fn http(address: &str, request: &str, path: &str, body: &str) -> Result<(String, Vec<u8>), Failure> {
     let mut stream = std::net::TcpStream::connect(address)?;
     stream.set_read_timeout(Some(PATIENCE))?;
@@ -210,7 +211,7 @@ fn http(address: &str, request: &str, path: &str, body: &str) -> Result<(String,
     Ok((String::from_utf8_lossy(&answer[..split]).into_owned(), answer[split + 4..].to_vec()))
 }
 
-/// A pour of `PICTURES` frames again and again for five minutes, as a camera that the worker reads itself. Gives the pattern.
+/// Writes a pour of [`PICTURES`] frames again and again for five minutes, as a camera that the worker reads itself. Answers with the pattern.
 fn write_pictures(directory: &Path) -> Result<String, Failure> {
     for i in 0..9000 {
         let file = |i: u64| directory.join(format!("f_{i:05}.png"));
@@ -224,9 +225,10 @@ fn write_pictures(directory: &Path) -> Result<String, Failure> {
     Ok(directory.join("f_%05d.png").display().to_string())
 }
 
+/// Different pictures of the drawn pour.
 const PICTURES: u64 = 36;
 
-/// KiB that the cell holds in shared memory; what was never written is not counted.
+/// KiB that the cell holds in shared memory. Pages that were never written do not count.
 fn held_kib(cell: &str) -> std::io::Result<u64> {
     use std::os::unix::fs::MetadataExt as _;
     let prefix = format!("decant_{cell}_");
@@ -234,9 +236,9 @@ fn held_kib(cell: &str) -> std::io::Result<u64> {
     Ok(files.map(|f| f.metadata().map_or(0, |m| m.blocks() / 2)).sum())
 }
 
-/// Protects who looks on beside a worker that reads the camera itself (only one process can stream from a device): each frame comes with
-/// the camera's number and time and the very pixels that were measured, after its feature. And protects the pour from them: without a
-/// subscriber no frame is copied, and one that does not read costs no feature and has the newest frames when it reads again.
+/// Protects people who watch beside a worker that reads the camera itself, since only one process can stream from a device: each frame comes
+/// after its feature, with the camera's number and time and the very pixels that were measured. It also protects the pour from them: without
+/// a subscriber no frame is copied, and a subscriber that does not read costs no feature and gets the newest frames when it reads again.
 #[test]
 fn a_worker_with_its_own_camera_shares_its_frames() -> Outcome {
     let directory = tempfile::tempdir()?;
@@ -280,7 +282,7 @@ fn a_worker_with_its_own_camera_shares_its_frames() -> Outcome {
         known.extend(follow(1)?);
         while let Some(frame) = frames.receive()? {
             let header = *frame.user_header();
-            // Frames come after their features, so this one's has come, or comes at once.
+            // Frames come after their features, so the feature of this frame has come or comes at once.
             while known.last().is_none_or(|f| f.sequence < header.sequence) {
                 known.extend(follow(1)?);
             }
@@ -298,7 +300,7 @@ fn a_worker_with_its_own_camera_shares_its_frames() -> Outcome {
     let mut woken = 0;
     listener.timed_wait(|_| woken += 1, PATIENCE)?;
     assert!(woken > 0, "a reader is woken by a frame");
-    // It stops reading frames and events, and holds one frame.
+    // The reader stops reading frames and events, and holds one frame.
     let _held = frames.receive()?;
     while frames.receive()?.is_some() {}
     let last = follow(40)?.last().map_or(0, |f| f.sequence);
@@ -307,8 +309,8 @@ fn a_worker_with_its_own_camera_shares_its_frames() -> Outcome {
     Ok(())
 }
 
-/// Protects the people who look on a real cell: the view opens the camera itself while there is no worker, leaves it to a worker that
-/// starts and shows that one's frames, says so when they end (here the worker is killed), and goes on with the next worker.
+/// Protects people who watch a real cell: the view opens the camera itself while there is no worker. It leaves the camera to a worker that
+/// starts and shows that worker's frames, says so when they end (here the worker is killed), and goes on with the next worker.
 #[test]
 fn the_view_follows_a_worker_with_its_own_camera() -> Outcome {
     let directory = tempfile::tempdir()?;
@@ -339,7 +341,7 @@ fn the_view_follows_a_worker_with_its_own_camera() -> Outcome {
             std::thread::sleep(Duration::from_millis(5));
         }
     };
-    // Numbers tell whose frames they are: each process counts the pictures from its own start.
+    // The numbers tell whose frames are shown, because each process counts the pictures from its own start.
     let measured = std::cell::RefCell::new(Vec::<Feature>::new());
     let is_the_workers = |state: &serde_json::Value| -> Result<bool, Failure> {
         while let Some(feature) = features.receive()? {
@@ -361,7 +363,7 @@ fn the_view_follows_a_worker_with_its_own_camera() -> Outcome {
     measured.borrow_mut().clear();
     let second = Program::start("run", &path, &[])?;
     until(&address, "the second worker's frames", &|s| Ok(is_the_workers(s)? && s["silent"] == false))?;
-    // One that comes later takes the worker's frames at once.
+    // A view that starts later takes the worker's frames at once.
     let (_later, address_of_later) = view_at(&path)?;
     until(&address_of_later, "the worker's frames in a second view", &is_the_workers)?;
     second.signal("-TERM")?;
@@ -373,8 +375,8 @@ fn the_view_follows_a_worker_with_its_own_camera() -> Outcome {
     Ok(())
 }
 
-/// Protects the people who look: the view serves its page, the newest picture as JPEG of the camera's size, and the state as JSON
-/// with a history that follows the flow; what it does not have is 404; it reads beside a running worker and takes nothing from it.
+/// Protects people who watch: the view serves its page, the newest picture as a JPEG of the camera's size, and the state as JSON with a
+/// history that follows the flow. It answers 404 for everything else. It reads beside a running worker and takes nothing from it.
 #[test]
 fn the_view_shows_what_the_worker_measures() -> Outcome {
     let directory = tempfile::tempdir()?;

@@ -8,17 +8,17 @@ use iceoryx2::port::client::Client as Port;
 use iceoryx2::service::ipc::Service as Ipc;
 use indicatif::ProgressStyle;
 use shared::control::{Outcome, Reply, Request, Status};
-use shared::ipc::{Cell, IpcError};
+use shared::ipc::{Cell, InService as _, IpcError};
 use shared::messages::{RecorderReport, RecorderState};
 use shared::os;
 
-/// Largest request or answer, bytes.
+/// Largest request or answer, bytes: a status with 32 results and five histograms is about 20 kB.
 pub const MESSAGE_MAX: usize = 64 * 1024;
 
-/// How often a controller may say that it does other things than the episode that it has started: for a second.
+/// How often in a row a controller may say that it does not know the episode that it has started: for a second.
 const UNKNOWN_MAX: u32 = 10;
 
-/// What the commands that ask the running controller have in common on the command line.
+/// The arguments that all commands have which ask the running controller.
 #[derive(Debug, clap::Args)]
 pub struct Common {
     /// The cell's configuration.
@@ -41,11 +41,11 @@ pub enum ClientError {
         /// The cell's name.
         cell: String,
     },
-    /// It knows nothing of an episode that it had started.
+    /// It no longer knows an episode that it had started.
     #[error("rt-controller knows nothing of episode {0} any more: it was restarted; the robot's program brings the container upright")]
     Forgotten(u64),
     /// The answer cannot be read.
-    #[error("rt-controller answered in another version's words: run the same build on both sides")]
+    #[error("rt-controller is another version of Decant: run the same build on both sides")]
     Version,
 }
 
@@ -60,8 +60,7 @@ impl Client {
     /// Connects to the controller of the cell `name`.
     pub fn connect(name: &str) -> Result<Self, ClientError> {
         let cell = Cell::join(name)?;
-        let fail = |e: String| IpcError::Service { service: "control".into(), what: e };
-        let port = cell.control()?.client_builder().initial_max_slice_len(MESSAGE_MAX).create().map_err(|e| fail(format!("{e:?}")))?;
+        let port = cell.control()?.client_builder().initial_max_slice_len(MESSAGE_MAX).create().in_service("control")?;
         Ok(Self { port, cell: name.into(), _cell: cell })
     }
 
@@ -105,7 +104,7 @@ pub enum FollowError {
 impl Client {
     /// Shows the progress of `episode` on standard error until it has ended. Ctrl-C aborts it.
     pub fn follow(&self, episode: u64) -> Result<Outcome, FollowError> {
-        // Without it Ctrl-C ends this command, and the pour goes on.
+        // If that fails, Ctrl-C ends this command and the pour goes on.
         let interrupted = os::stop_at_signals().unwrap_or_default();
         let bar = indicatif::ProgressBar::new(1000);
         bar.set_style(ProgressStyle::with_template("{bar:30} {msg}").unwrap_or_else(|_| ProgressStyle::default_bar()));
@@ -120,7 +119,7 @@ impl Client {
                 bar.finish_and_clear();
                 return if aborted { Err(FollowError::Interrupted(*outcome)) } else { Ok(*outcome) };
             }
-            // The tick that starts an episode may be heard of a little after the answer that it started.
+            // The answer that an episode has started may come a little before the first tick that shows it.
             unknown = if status.episode == episode { 0 } else { unknown + 1 };
             if unknown > UNKNOWN_MAX {
                 return Err(ClientError::Forgotten(episode).into());
@@ -135,29 +134,25 @@ impl Client {
 /// The episode's file: its path, or why there is none.
 #[derive(Debug, Clone)]
 pub struct Recorded {
-    /// Path, or the recorder's reason.
+    /// The path, or the recorder's reason.
     pub file: Result<String, String>,
 }
 
-/// Hears what the recorder says of episodes.
-pub struct RecorderEar {
+/// Receives the recorder's reports about episodes.
+pub struct RecorderReports {
     subscriber: iceoryx2::port::subscriber::Subscriber<Ipc, RecorderReport, ()>,
     _cell: Cell,
 }
 
-impl RecorderEar {
-    /// Listens in the cell `name`.
+impl RecorderReports {
+    /// Subscribes to the reports in the cell `name`.
     pub fn open(name: &str) -> Result<Self, IpcError> {
         let cell = Cell::join(name)?;
-        let subscriber = cell
-            .recorder()?
-            .subscriber_builder()
-            .create()
-            .map_err(|e| IpcError::Service { service: "recorder".into(), what: format!("{e:?}") })?;
+        let subscriber = cell.recorder()?.subscriber_builder().create().in_service("recorder")?;
         Ok(Self { subscriber, _cell: cell })
     }
 
-    /// Waits until the file of `episode` is closed, up to 10 s; `None` if no recorder says anything of it.
+    /// Waits until the file of `episode` is closed, up to 10 s; `None` if no recorder reports anything about it.
     pub fn wait(&self, episode: u64) -> Option<Recorded> {
         let until = Instant::now() + Duration::from_secs(10);
         while Instant::now() < until {

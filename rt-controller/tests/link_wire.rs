@@ -15,7 +15,7 @@ fn bytes(hex: &str) -> Vec<u8> {
 
 fn all_frames(inbox: &mut Inbox) -> Vec<(u8, Vec<u8>)> {
     let mut frames = Vec::new();
-    while let Some(frame) = inbox.next_frame().unwrap() {
+    while let Some(frame) = inbox.next_packet().unwrap() {
         frames.push((frame.kind, frame.payload.to_vec()));
     }
     frames
@@ -309,7 +309,7 @@ proptest! {
         'pieces: for piece in stream.chunks(cut) {
             give(&mut inbox, piece);
             loop {
-                match inbox.next_frame() {
+                match inbox.next_packet() {
                     Err(_) => break 'pieces,
                     Ok(None) => break,
                     Ok(Some(frame)) => wire::read_anything(frame, &tilt()),

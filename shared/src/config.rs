@@ -13,6 +13,15 @@ use crate::limits::Limits;
 /// What `--config` is if it is not given: the simulated cell, so that a real robot moves only when it is named.
 pub const DEFAULT_FILE: &str = "config/sim.toml";
 
+/// What a cell's name may be, in words: it becomes part of file names.
+pub(crate) const CELL_NAME_RULE: &str = "1 to 32 letters, digits, '-' or '_'";
+
+/// Whether `name` keeps [`CELL_NAME_RULE`].
+pub(crate) fn is_cell_name(name: &str) -> bool {
+    let legal = |c: char| c.is_ascii_alphanumeric() || c == '-' || c == '_';
+    (1..=32).contains(&name.len()) && name.chars().all(legal)
+}
+
 /// Why a configuration is refused.
 #[derive(Debug, thiserror::Error)]
 pub enum ConfigError {
@@ -268,91 +277,15 @@ impl Config {
 
     fn check(&self, file: &str) -> Result<(), ConfigError> {
         let check = Check { file };
-        let Self { cell, camera, image, robot, limits, controller, worker, recording, simulator: _ } = self;
-        let name_ok =
-            !cell.name.is_empty() && cell.name.len() <= 32 && cell.name.chars().all(|c| c.is_ascii_alphanumeric() || c == '-' || c == '_');
-        check.rule("cell.name", &cell.name, name_ok, "1 to 32 letters, digits, '-' or '_'")?;
-
-        check.range("camera.width_px", camera.width_px.into(), 64.0, 4096.0)?;
-        check.range("camera.height_px", camera.height_px.into(), 64.0, 4096.0)?;
-        check.range("camera.fps", camera.fps, 1.0, 240.0)?;
-        let needs_path = camera.source != CameraSource::SharedMemory;
-        check.rule(
-            "camera.path",
-            &camera.path,
-            !needs_path || !camera.path.is_empty(),
-            "a device, file or pattern (only source = \"shared-memory\" has none)",
-        )?;
-
-        let [x, y, w, h] = image.region_px.map(f64::from);
-        let inside = w >= 8.0 && h >= 8.0 && x + w <= f64::from(camera.width_px) && y + h <= f64::from(camera.height_px);
-        check.rule(
-            "image.region_px",
-            &format!("{:?}", image.region_px),
-            inside,
-            &format!("x, y, width, height of at least 8 x 8 inside {} x {}", camera.width_px, camera.height_px),
-        )?;
-        let direction = |a: [f32; 4]| (f64::from(a[2] - a[0]), f64::from(a[3] - a[1]));
-        for (key, axis) in [("image.x_axis_px", image.x_axis_px), ("image.y_axis_px", image.y_axis_px)] {
-            let (dx, dy) = direction(axis);
-            let fine = axis.iter().all(|v| v.is_finite()) && dx.hypot(dy) >= 2.0;
-            check.rule(key, &format!("{axis:?}"), fine, "x0, y0, x1, y1 of two points at least 2 px apart")?;
-        }
-        let ((ax, ay), (bx, by)) = (direction(image.x_axis_px), direction(image.y_axis_px));
-        let sine = (ax * by - ay * bx).abs() / (ax.hypot(ay) * bx.hypot(by));
-        check.rule(
-            "image.y_axis_px",
-            &format!("{:?}", image.y_axis_px),
-            sine > 0.17,
-            "an axis at least 10 degrees from image.x_axis_px (these are nearly parallel)",
-        )?;
-        let [h0, s0, v0, h1, s1, v1] = image.colour_hsv;
-        let colour_ok = h0 <= 179 && h1 <= 179 && s0 < s1 && v0 < v1;
-        check.rule(
-            "image.colour_hsv",
-            &format!("{:?}", image.colour_hsv),
-            colour_ok,
-            "h_min, s_min, v_min, h_max, s_max, v_max with h 0 to 179, s_min < s_max, v_min < v_max",
-        )?;
-        check.range("image.area_min_px2", image.area_min_px2.into(), 0.0, 1e5)?;
-
-        check.range("robot.start_joint_deg", robot.start_joint_deg, -360.0, 360.0)?;
-        check.rule("robot.direction", &robot.direction.to_string(), robot.direction.abs() == 1.0, "1 or -1")?;
-        check.range("robot.start_tolerance_deg", robot.start_tolerance_deg, 0.1, 10.0)?;
-        check.range("robot.register_base", robot.register_base.into(), 24.0, 40.0)?;
-        check.range("robot.lookahead_s", robot.lookahead_s, 0.03, 0.2)?;
-        check.range("robot.gain", robot.gain, 100.0, 2000.0)?;
-
-        check.range("limits.alpha_min_deg", limits.alpha_min_deg.into(), -20.0, 0.0)?;
-        check.range("limits.alpha_max_deg", limits.alpha_max_deg.into(), 10.0, 180.0)?;
-        check.range("limits.step_deg", limits.step_deg.into(), 0.1, 6.0)?;
-        check.range("limits.rate_deg_s", limits.rate_deg_s.into(), 1.0, 180.0)?;
-        check.range("limits.acceleration_deg_s2", limits.acceleration_deg_s2.into(), 10.0, 2290.0)?;
-        check.range("limits.return_rate_deg_s", limits.return_rate_deg_s.into(), 1.0, 180.0)?;
-
-        let ends = [limits.alpha_min_deg, limits.alpha_max_deg].map(|a| robot.start_joint_deg + robot.direction * f64::from(a));
-        check.rule(
-            "robot.start_joint_deg",
-            &robot.start_joint_deg.to_string(),
-            ends.iter().all(|e| e.abs() <= 360.0),
-            "an angle from which limits.alpha_min_deg and limits.alpha_max_deg stay within the joint's -360 to 360",
-        )?;
-
-        check.range("controller.rate_hz", controller.rate_hz, 10.0, 125.0)?;
-        check.range("controller.core", controller.core as f64, 0.0, 1023.0)?;
-        check.range("controller.priority", controller.priority.into(), 0.0, 99.0)?;
-        check.range("controller.stale_feature_ms", controller.stale_feature_ms.into(), 50.0, 1000.0)?;
-        check.range("controller.lost_robot_ms", controller.lost_robot_ms.into(), 20.0, 1000.0)?;
-        check.range("controller.max_frames", controller.max_frames.into(), 30.0, 100_000.0)?;
-        check.range("controller.empty_frames", controller.empty_frames.into(), 5.0, 1000.0)?;
-        check.range("controller.goal_max_ml", controller.goal_max_ml.into(), 1.0, 5000.0)?;
-        check.range("worker.core", worker.core as f64, 0.0, 1023.0)?;
-        check.range("worker.priority", worker.priority.into(), 0.0, 99.0)?;
-        check.range("recording.jpeg_quality", recording.jpeg_quality.into(), 1.0, 100.0)?;
-        check.range("recording.queue_frames", recording.queue_frames as f64, 2.0, 1000.0)
+        check.rule("cell.name", &self.cell.name, is_cell_name(&self.cell.name), CELL_NAME_RULE)?;
+        check.camera(&self.camera)?;
+        check.image(&self.image, &self.camera)?;
+        check.robot(&self.robot, &self.limits)?;
+        check.processes(&self.controller, &self.worker, &self.recording)
     }
 }
 
+/// Checks values, and names `file` where one is refused.
 struct Check<'a> {
     file: &'a str,
 }
@@ -367,6 +300,92 @@ impl Check<'_> {
 
     fn range(&self, key: &str, value: f64, low: f64, high: f64) -> Result<(), ConfigError> {
         self.rule(key, &value.to_string(), value >= low && value <= high, &format!("{low} to {high}"))
+    }
+
+    fn camera(&self, camera: &CameraConfig) -> Result<(), ConfigError> {
+        self.range("camera.width_px", camera.width_px.into(), 64.0, 4096.0)?;
+        self.range("camera.height_px", camera.height_px.into(), 64.0, 4096.0)?;
+        self.range("camera.fps", camera.fps, 1.0, 240.0)?;
+        let needs_path = camera.source != CameraSource::SharedMemory;
+        self.rule(
+            "camera.path",
+            &camera.path,
+            !needs_path || !camera.path.is_empty(),
+            "a device, file or pattern (only source = \"shared-memory\" has none)",
+        )
+    }
+
+    fn image(&self, image: &ImageConfig, camera: &CameraConfig) -> Result<(), ConfigError> {
+        let [x, y, w, h] = image.region_px.map(f64::from);
+        let inside = w >= 8.0 && h >= 8.0 && x + w <= f64::from(camera.width_px) && y + h <= f64::from(camera.height_px);
+        self.rule(
+            "image.region_px",
+            &format!("{:?}", image.region_px),
+            inside,
+            &format!("x, y, width, height of at least 8 x 8 inside {} x {}", camera.width_px, camera.height_px),
+        )?;
+        let direction = |a: [f32; 4]| (f64::from(a[2] - a[0]), f64::from(a[3] - a[1]));
+        for (key, axis) in [("image.x_axis_px", image.x_axis_px), ("image.y_axis_px", image.y_axis_px)] {
+            let (dx, dy) = direction(axis);
+            let fine = axis.iter().all(|v| v.is_finite()) && dx.hypot(dy) >= 2.0;
+            self.rule(key, &format!("{axis:?}"), fine, "x0, y0, x1, y1 of two points at least 2 px apart")?;
+        }
+        let ((ax, ay), (bx, by)) = (direction(image.x_axis_px), direction(image.y_axis_px));
+        let sine = (ax * by - ay * bx).abs() / (ax.hypot(ay) * bx.hypot(by));
+        self.rule(
+            "image.y_axis_px",
+            &format!("{:?}", image.y_axis_px),
+            sine > 0.17,
+            "an axis at least 10 degrees from image.x_axis_px (these are nearly parallel)",
+        )?;
+        let [h0, s0, v0, h1, s1, v1] = image.colour_hsv;
+        let colour_ok = h0 <= 179 && h1 <= 179 && s0 < s1 && v0 < v1;
+        self.rule(
+            "image.colour_hsv",
+            &format!("{:?}", image.colour_hsv),
+            colour_ok,
+            "h_min, s_min, v_min, h_max, s_max, v_max with h 0 to 179, s_min < s_max, v_min < v_max",
+        )?;
+        self.range("image.area_min_px2", image.area_min_px2.into(), 0.0, 1e5)
+    }
+
+    fn robot(&self, robot: &RobotConfig, limits: &Limits) -> Result<(), ConfigError> {
+        self.range("robot.start_joint_deg", robot.start_joint_deg, -360.0, 360.0)?;
+        self.rule("robot.direction", &robot.direction.to_string(), robot.direction.abs() == 1.0, "1 or -1")?;
+        self.range("robot.start_tolerance_deg", robot.start_tolerance_deg, 0.1, 10.0)?;
+        self.range("robot.register_base", robot.register_base.into(), 24.0, 40.0)?;
+        self.range("robot.lookahead_s", robot.lookahead_s, 0.03, 0.2)?;
+        self.range("robot.gain", robot.gain, 100.0, 2000.0)?;
+
+        self.range("limits.alpha_min_deg", limits.alpha_min_deg.into(), -20.0, 0.0)?;
+        self.range("limits.alpha_max_deg", limits.alpha_max_deg.into(), 10.0, 180.0)?;
+        self.range("limits.step_deg", limits.step_deg.into(), 0.1, 6.0)?;
+        self.range("limits.rate_deg_s", limits.rate_deg_s.into(), 1.0, 180.0)?;
+        self.range("limits.acceleration_deg_s2", limits.acceleration_deg_s2.into(), 10.0, 2290.0)?;
+        self.range("limits.return_rate_deg_s", limits.return_rate_deg_s.into(), 1.0, 180.0)?;
+
+        let ends = [limits.alpha_min_deg, limits.alpha_max_deg].map(|a| robot.start_joint_deg + robot.direction * f64::from(a));
+        self.rule(
+            "robot.start_joint_deg",
+            &robot.start_joint_deg.to_string(),
+            ends.iter().all(|e| e.abs() <= 360.0),
+            "an angle from which limits.alpha_min_deg and limits.alpha_max_deg stay within the joint's -360 to 360",
+        )
+    }
+
+    fn processes(&self, controller: &ControllerConfig, worker: &WorkerConfig, recording: &RecordingConfig) -> Result<(), ConfigError> {
+        self.range("controller.rate_hz", controller.rate_hz, 10.0, 125.0)?;
+        self.range("controller.core", controller.core as f64, 0.0, 1023.0)?;
+        self.range("controller.priority", controller.priority.into(), 0.0, 99.0)?;
+        self.range("controller.stale_feature_ms", controller.stale_feature_ms.into(), 50.0, 1000.0)?;
+        self.range("controller.lost_robot_ms", controller.lost_robot_ms.into(), 20.0, 1000.0)?;
+        self.range("controller.max_frames", controller.max_frames.into(), 30.0, 100_000.0)?;
+        self.range("controller.empty_frames", controller.empty_frames.into(), 5.0, 1000.0)?;
+        self.range("controller.goal_max_ml", controller.goal_max_ml.into(), 1.0, 5000.0)?;
+        self.range("worker.core", worker.core as f64, 0.0, 1023.0)?;
+        self.range("worker.priority", worker.priority.into(), 0.0, 99.0)?;
+        self.range("recording.jpeg_quality", recording.jpeg_quality.into(), 1.0, 100.0)?;
+        self.range("recording.queue_frames", recording.queue_frames as f64, 2.0, 1000.0)
     }
 }
 

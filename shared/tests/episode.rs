@@ -1,4 +1,4 @@
-//! Episodes as real files: round trip, damage, weights, tables.
+//! Episodes as real files: what is written is what is read, damage is found, weights are added, and tables say the same.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::too_many_lines)]
 
 use std::path::{Path, PathBuf};
@@ -60,7 +60,7 @@ fn tick(number: u64) -> Telemetry {
     }
 }
 
-/// An episode of 60 frames: 17 and 18 are lost, 25 is too dark, 30 is blurred (usable), the image of 40 was dropped.
+/// Writes an episode of 60 frames. Frames 17 and 18 are lost, 25 is too dark, 30 is blurred but usable, and the image of 40 was dropped.
 fn write(directory: &Path, finish: bool) -> PathBuf {
     let config = config();
     let mut writer = EpisodeWriter::create(directory, &start(&config)).unwrap();
@@ -80,8 +80,8 @@ fn write(directory: &Path, finish: bool) -> PathBuf {
         let alpha = 0.5 * (n as f32 - 10.0);
         let data = vec![n as u8; 300];
         let image = (n != 40).then_some(("jpeg", data.as_slice()));
-        let sample = FrameRow { feature: &f, alpha_commanded_deg: alpha, alpha_measured_deg: alpha - 0.25, image };
-        writer.frame(&sample).unwrap();
+        let row = FrameRow { feature: &f, alpha_commanded_deg: alpha, alpha_measured_deg: alpha - 0.25, image };
+        writer.frame(&row).unwrap();
     }
     let path = writer.path().to_path_buf();
     if finish {
@@ -126,7 +126,7 @@ fn an_episode_is_read_as_it_was_written() {
     assert_eq!(images[0].captured_at_ns, episode.rows[0].captured_at_ns);
 }
 
-/// Protects people from training on half an episode: a file without its end reads, but says that it is incomplete.
+/// Protects people from training on half an episode: a file without its end can be read, but says that it is incomplete.
 #[test]
 fn a_file_that_was_never_finished_is_incomplete() {
     let dir = tempfile::tempdir().unwrap();
@@ -152,7 +152,7 @@ fn an_episode_whose_last_second_has_no_frames_is_incomplete() {
     assert!(!Episode::read(&path).unwrap().complete);
 }
 
-/// Protects w_E and all that was recorded: the weight comes and changes, everything else stays, no other file is left.
+/// Protects w_E and all that was recorded: a weight is added and changed, everything else stays, and no other file is left.
 #[test]
 fn the_weight_is_added_afterwards_and_nothing_else_changes() {
     let dir = tempfile::tempdir().unwrap();
@@ -169,14 +169,14 @@ fn the_weight_is_added_afterwards_and_nothing_else_changes() {
     assert_eq!(std::fs::read_dir(dir.path()).unwrap().count(), 1, "no temporary file is left");
 }
 
-/// Protects recordings from nonsense on the command line and from a weight for half an episode.
+/// Protects recordings: nonsense on the command line and a weight for half an episode are refused.
 #[test]
 fn a_wrong_weight_is_refused_and_the_file_is_as_it_was() {
     let dir = tempfile::tempdir().unwrap();
     let path = write(dir.path(), true);
     let bytes = std::fs::read(&path).unwrap();
     for grams in [f64::NAN, f64::INFINITY, -0.1] {
-        assert!(matches!(set_weight(&path, grams), Err(WeighError::Weight(_))));
+        assert!(matches!(set_weight(&path, grams), Err(WeighError::Weight(..))));
     }
     assert_eq!(std::fs::read(&path).unwrap(), bytes);
     std::fs::write(&path, &bytes[..bytes.len() / 2]).unwrap();
@@ -185,7 +185,7 @@ fn a_wrong_weight_is_refused_and_the_file_is_as_it_was() {
     assert_eq!(std::fs::read_dir(dir.path()).unwrap().count(), 1, "no temporary file is left");
 }
 
-/// Protects training from the same measurement counted twice, under another name or with another weight.
+/// Protects training from the same measurement counted twice, be it under another name or with another weight.
 #[test]
 fn the_same_measurement_twice_is_found() {
     let dir = tempfile::tempdir().unwrap();
@@ -200,7 +200,7 @@ fn the_same_measurement_twice_is_found() {
     assert_eq!(Episode::duplicates(&episodes), []);
 }
 
-/// Protects everything that reads episodes from files of other kinds.
+/// Protects everything that reads episodes: files of other kinds are refused in one line.
 #[test]
 fn other_files_are_refused_in_one_line() {
     let dir = tempfile::tempdir().unwrap();
@@ -267,7 +267,7 @@ fn tables(features: &str, scale: &str) -> Result<Vec<Episode>, String> {
 
 const HEADING: &str = "episode,frame,t_s,alpha_deg,area_px2\n";
 
-/// Protects people with their own vision: columns in any order, extra ones, lost and unmeasured frames.
+/// Protects people with their own vision: the table may have its columns in any order, other columns, and lost and unmeasured frames.
 #[test]
 fn a_table_is_read() {
     let features = "area_px2, note, episode, frame, t_s, alpha_deg\n0,x,a,5,0.0,1\n10.5,x,a,8,0.3,4\nnan,x,b,0,0,0\n,x,b,1,0.1,0.5\n";
@@ -280,7 +280,7 @@ fn a_table_is_read() {
     assert!(episodes.iter().all(|e| e.complete && e.kind == EpisodeKind::Table));
 }
 
-/// Protects people from silent misreading: each fault is named with file and line.
+/// Protects people whose tables are wrong: each fault is named with file and line.
 #[test]
 fn faults_in_tables_are_named_with_file_and_line() {
     let good = "1,0,0.0,0,0\n1,1,0.033,0.5,3\n";
@@ -304,7 +304,7 @@ fn faults_in_tables_are_named_with_file_and_line() {
         (features("1,0,0.0,0,0\n2,0,0,0,0\n1,1,0.1,0,0\n"), scale, "features.csv:4: episode 1 began in line 2 already"),
         (features("1,0,0.0,0\n"), scale, "features.csv:2: 4 fields where the heading has 5"),
         (features(good), "episode\n1\n", "scale.csv:1: column 'weight_g' is missing"),
-        (features(good), "episode,weight_g\n1,0\n", "scale.csv:2: weight_g 0"),
+        (features(good), "episode,weight_g\n1,0\n", "scale.csv:2: weight_g '0'"),
         (features(good), "episode,weight_g\n1,nan\n", "scale.csv:2: weight_g 'nan'"),
         (features(good), "episode,weight_g\n1,-2\n", "scale.csv:2: weight_g '-2'"),
         (features(good), "episode,weight_g\n1,5\n1,6\n", "scale.csv:3: episode 1 has a weight in line 2 already"),

@@ -124,11 +124,8 @@ impl TrainingEpisode {
                 "no weight: read the scale and enter it with `feature-worker episodes weigh FILE --weight G`, or in scale.csv".into(),
             );
         }
-        if !self.weight_g.is_finite() || self.weight_g < 0.0 {
-            return Some(format!("weight {} g is not a number >= 0: correct it", self.weight_g));
-        }
-        if self.weight_g == 0.0 {
-            return Some("weight 0 g: nothing was poured, nothing can be learned from it; leave it out".into());
+        if let Err(e) = episode::check_poured(self.weight_g) {
+            return Some(format!("weight {} g: {e}", self.weight_g));
         }
         if !self.area_px2.iter().any(|a| *a > 0.0) {
             return Some(format!("no stream was ever seen, but the scale shows {} g: check the vision or the weight", self.weight_g));

@@ -107,6 +107,7 @@ fn pours(method: MethodName, n: usize, within: f64) {
         let mut poured = 0.0;
         let mut history = CommandHistory::standing_at(0.0);
         let mut alpha = 0.0f32;
+        let mut ending = rt_controller::core::ending::Ending::of_pour();
         let mut finished = false;
         for _ in 0..900 {
             history.push(f64::from(alpha));
@@ -115,7 +116,7 @@ fn pours(method: MethodName, n: usize, within: f64) {
             let area = (out / CAMERA.0).powf(1.0 / CAMERA.1);
             let area_px2 = Some(if area < 8.0 { 0.0 } else { area as f32 });
             let decision = agent.step(Observation { area_px2, alpha_deg: alpha, alpha_now_deg: alpha });
-            finished |= decision.finished;
+            finished |= ending.decided(&decision);
             alpha = if finished { (alpha - 2.0).max(0.0) } else { (alpha + decision.dalpha_deg).clamp(0.0, 110.0) };
         }
         assert!(finished && (poured - goal).abs() < within * goal + 1.0, "{method:?}: goal {goal}, poured {poured}, finished {finished}");

@@ -2,7 +2,7 @@
 //! allocates; cannot fail.
 
 use serde_json::{Value, json};
-use shared::episode::{Episode, EpisodeKind, EpisodeRow};
+use shared::episode::{Episode, EpisodeKind, EpisodeRow, hex};
 use shared::messages::Doubt;
 
 /// A weight above this without any flow means that the vision saw nothing, g. Chosen by hand: more than drops and evaporation.
@@ -133,6 +133,6 @@ pub fn summary(episode: &Episode) -> Value {
         "cell": info.cell,
         "config_sha256": info.config_sha256,
         "weights": info.weights,
-        "content_sha256": episode.content_sha256().iter().map(|b| format!("{b:02x}")).collect::<String>(),
+        "content_sha256": hex(&episode.content_sha256()),
     })
 }

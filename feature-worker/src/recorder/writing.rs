@@ -11,9 +11,8 @@ use std::time::{Duration, SystemTime};
 
 use iceoryx2::port::publisher::Publisher;
 use iceoryx2::port::subscriber::Subscriber;
-use shared::alpha_track::AlphaTrack;
 use shared::config::Config;
-use shared::episode::{EpisodeEnd, EpisodeKind, EpisodeStart, EpisodeWriter, FrameRow, WriteError};
+use shared::episode::{EpisodeEnd, EpisodeKind, EpisodeStart, EpisodeTrack, EpisodeWriter, FrameRow, WriteError};
 use shared::gaussian_curve::Curve;
 use shared::ipc::{Cell, IpcError};
 use shared::messages::{Feature, RecorderReport, RecorderState, Telemetry};
@@ -30,19 +29,18 @@ const AFTER_NS: u64 = 500_000_000;
 const SILENCE_NS: u64 = 2_000_000_000;
 /// How often the thread looks for work. Chosen by hand: much shorter than a frame of a 30 Hz camera.
 const PAUSE: Duration = Duration::from_millis(5);
-/// Ticks of the controller of which alpha is remembered: more than 8 s at the camera's rate of 30 Hz.
-const TRACK_TICKS: usize = 256;
 
 type Ipc = iceoryx2::service::ipc::Service;
 
-/// The recorder's thread.
+/// The recorder's thread, with its ports and the episode under way.
 pub struct RecorderThread {
     config: Config,
     directory: PathBuf,
     handover: Arc<Handover>,
     telemetry: Subscriber<Ipc, Telemetry, ()>,
     reports: Publisher<Ipc, RecorderReport, ()>,
-    track: AlphaTrack<TRACK_TICKS>,
+    track: EpisodeTrack,
+    /// The newest frames that belong to no episode yet, the oldest first.
     kept: VecDeque<OfferedFrame>,
     encoder: Encoder,
     /// Episode of the newest tick; `None` before the first.
@@ -51,35 +49,40 @@ pub struct RecorderThread {
     /// Ticks of the next episode, while frames of the one before are still under way.
     pending: VecDeque<Telemetry>,
     current: Option<OpenEpisode>,
-    // Ports are used until here, so the cell is dropped last.
+    // Declared last, because the ports need it until they are dropped.
     _cell: Cell,
 }
 
-/// The file under way.
+/// The episode under way and its file.
 struct OpenEpisode {
     writer: EpisodeWriter,
     episode: u64,
     started_at_ns: u64,
-    /// First tick that is not of the episode any more, and when it was seen.
+    /// Set once a tick has come that no longer belongs to the episode.
     ended: Option<EpisodeOver>,
+    /// When the newest tick was received, CLOCK_MONOTONIC ns.
     heard_at_ns: u64,
     last_sequence: u64,
     last_captured_at_ns: u64,
+    /// Frames whose alpha is not known yet.
     waiting: VecDeque<WaitingFrame>,
     images: u64,
     dropped: u64,
     disordered: u64,
 }
 
+/// The end of an episode, whose last frames may still be under way.
 #[derive(Clone, Copy)]
 struct EpisodeOver {
+    /// Time of the first tick after the episode, CLOCK_MONOTONIC ns.
     at_ns: u64,
+    /// When that tick was received, CLOCK_MONOTONIC ns.
     seen_at_ns: u64,
-    /// A frame from after the end has come, so all from before have.
+    /// A frame from after the end has come, so all frames from before it have come too.
     frames_passed: bool,
 }
 
-/// A frame that waits for the tick after it.
+/// A frame that waits for the tick after it, which decides its alpha.
 struct WaitingFrame {
     feature: Feature,
     image: Option<Vec<u8>>,
@@ -99,7 +102,7 @@ impl RecorderThread {
             handover,
             telemetry,
             reports,
-            track: AlphaTrack::new(),
+            track: EpisodeTrack::new(),
             kept: VecDeque::with_capacity(KEPT_FRAMES + 1),
             encoder,
             newest_episode: None,
@@ -114,21 +117,21 @@ impl RecorderThread {
     pub fn run(&mut self) {
         loop {
             let stop = self.handover.is_stopped();
-            // Telemetry first, so that a file is open before the frames of its episode are looked at.
+            // The telemetry comes first, so that a file is open before the frames of its episode are looked at.
             while let Ok(Some(tick)) = self.telemetry.receive() {
                 let tick = *tick;
-                self.tick(&tick);
+                self.take_tick(&tick);
             }
-            // Bounded, so that a slow disk cannot keep the thread from the telemetry.
+            // The number of frames is bounded, so that a slow disk cannot keep the thread from the telemetry.
             for _ in 0..KEPT_FRAMES {
                 match self.handover.take() {
-                    Some(frame) => self.frame(frame),
+                    Some(frame) => self.take_frame(frame),
                     None => break,
                 }
             }
-            self.settle(false);
+            self.write_waiting(false);
             self.close_if_over();
-            self.follow();
+            self.take_due_ticks();
             if stop {
                 break;
             }
@@ -137,16 +140,17 @@ impl RecorderThread {
             }
         }
         while let Some(frame) = self.handover.take() {
-            self.frame(frame);
+            self.take_frame(frame);
         }
         while let Some(current) = &self.current {
             let complete = current.ended.is_some();
             self.close(complete, if complete { "over" } else { "the feature worker was stopped" });
-            self.follow();
+            self.take_due_ticks();
         }
     }
 
-    fn tick(&mut self, tick: &Telemetry) {
+    /// Enters a tick into the track of alpha and puts it into the queue.
+    fn take_tick(&mut self, tick: &Telemetry) {
         self.track.push(tick.at_ns, tick.alpha_deg, tick.robot_at_ns, tick.alpha_measured_deg);
         if tick.tick <= self.newest_tick {
             self.pending.clear();
@@ -155,11 +159,12 @@ impl RecorderThread {
         }
         self.newest_tick = tick.tick;
         self.pending.push_back(*tick);
-        self.follow();
+        self.take_due_ticks();
     }
 
-    /// Takes the ticks that are due: those of the next episode wait until the last frames of the one before have come.
-    fn follow(&mut self) {
+    /// Opens and ends episodes as the ticks say, and writes the ticks. Those of the next episode wait until the last frames of the one
+    /// before have come.
+    fn take_due_ticks(&mut self) {
         while let Some(tick) = self.pending.front().copied() {
             if let Some(current) = &mut self.current {
                 current.heard_at_ns = now_ns();
@@ -186,10 +191,11 @@ impl RecorderThread {
                 self.open(&tick);
             }
             let write = |c: &mut OpenEpisode| if tick.episode == c.episode { c.writer.telemetry(&tick) } else { Ok(()) };
-            self.writing(write);
+            self.try_write(write);
         }
     }
 
+    /// Opens the file of the episode that begins with `tick`, and gives it the frames that were kept.
     fn open(&mut self, tick: &Telemetry) {
         let kind = if tick.goal_ml.is_nan() {
             EpisodeKind::Recording(Curve { lambda_deg: tick.lambda_deg, gamma_per_s2: tick.gamma_per_s2, beta_s: tick.beta_s })
@@ -222,15 +228,15 @@ impl RecorderThread {
                 });
                 self.report_path(RecorderState::Writing, tick.episode, 0, 0, &path);
                 for frame in std::mem::take(&mut self.kept) {
-                    self.frame(frame);
+                    self.take_frame(frame);
                 }
             }
             Err(e) => self.report(RecorderState::Failed, tick.episode, 0, 0, &e.to_string()),
         }
     }
 
-    /// A frame goes into the file under way, or into the ring.
-    fn frame(&mut self, frame: OfferedFrame) {
+    /// Puts a frame into the episode under way if it belongs there, and keeps it otherwise.
+    fn take_frame(&mut self, frame: OfferedFrame) {
         let captured_at_ns = frame.feature.captured_at_ns;
         let Some(current) = &mut self.current else { return self.keep(frame) };
         if let Some(ended) = &mut current.ended
@@ -258,6 +264,7 @@ impl RecorderThread {
         self.handover.give_back(frame.pixels);
     }
 
+    /// Keeps a frame for an episode that may begin, and forgets the oldest one.
     fn keep(&mut self, frame: OfferedFrame) {
         self.kept.push_back(frame);
         if self.kept.len() > KEPT_FRAMES
@@ -267,24 +274,24 @@ impl RecorderThread {
         }
     }
 
-    /// Writes the frames whose alpha is known; all of them if `now`.
-    fn settle(&mut self, now: bool) {
+    /// Writes the frames whose alpha is known, or, with `all`, every one that waits.
+    fn write_waiting(&mut self, all: bool) {
         let Self { current: Some(current), track, encoder, .. } = self else { return };
         let mut result = Ok(());
         while let Some(first) = current.waiting.front() {
             let at_ns = first.feature.captured_at_ns;
-            if !now && !track.covers(at_ns) {
+            if !all && !track.covers(at_ns) {
                 break;
             }
-            // The end was not known yet when the frame came.
+            // When the frame came, the end of the episode may not have been known yet.
             if current.ended.is_none_or(|e| at_ns < e.at_ns) {
-                let sample = FrameRow {
+                let row = FrameRow {
                     feature: &first.feature,
                     alpha_commanded_deg: track.commanded_deg(at_ns),
                     alpha_measured_deg: track.measured_deg(at_ns),
                     image: first.image.as_deref().map(|data| (encoder.name(), data)),
                 };
-                result = current.writer.frame(&sample);
+                result = current.writer.frame(&row);
             } else {
                 match first.image {
                     Some(_) => current.images -= 1,
@@ -296,11 +303,11 @@ impl RecorderThread {
                 break;
             }
         }
-        self.writing(|_| result);
+        self.try_write(|_| result);
     }
 
-    /// Gives the file up when writing fails; what is in it stays.
-    fn writing(&mut self, write: impl FnOnce(&mut OpenEpisode) -> Result<(), WriteError>) {
+    /// Writes into the file under way. Gives the file up when that fails; what is in it stays.
+    fn try_write(&mut self, write: impl FnOnce(&mut OpenEpisode) -> Result<(), WriteError>) {
         let Some(mut current) = self.current.take() else { return };
         match write(&mut current) {
             Ok(()) => self.current = Some(current),
@@ -308,6 +315,7 @@ impl RecorderThread {
         }
     }
 
+    /// Closes the file when the last frame has come or can no longer come, or when the controller is gone.
     fn close_if_over(&mut self) {
         let Some(current) = &self.current else { return };
         let now = now_ns();
@@ -318,8 +326,9 @@ impl RecorderThread {
         }
     }
 
+    /// Closes the file under way, if there is one, and reports it.
     fn close(&mut self, complete: bool, reason: &str) {
-        self.settle(true);
+        self.write_waiting(true);
         let Some(current) = self.current.take() else { return };
         let end = EpisodeEnd { complete, reason, disordered_frames: current.disordered };
         let (episode, images, dropped) = (current.episode, current.images, current.dropped);
@@ -333,12 +342,14 @@ impl RecorderThread {
         }
     }
 
+    /// Reports the file of an episode on the service `recorder`.
     fn report_path(&self, state: RecorderState, episode: u64, images: u64, dropped: u64, path: &Path) {
         self.report(state, episode, images, dropped, &path.display().to_string());
     }
 
+    /// Reports what became of an episode on the service `recorder`.
     fn report(&self, state: RecorderState, episode: u64, images: u64, dropped: u64, text: &str) {
-        // Nobody may be listening, and the file is what counts.
+        // A report that cannot be sent is no fault: the file is what counts, and often no process listens.
         let _ = self.reports.send_copy(RecorderReport::new(state, episode, images, dropped, text));
     }
 }

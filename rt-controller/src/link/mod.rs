@@ -25,15 +25,21 @@
 //! | `output_double_register_b` | angle that the program commands to servoj, rad |
 
 pub mod connect;
+mod dialogue;
+mod error;
 pub mod health;
 pub mod program;
 pub mod session;
 pub mod wire;
 
-pub use connect::{LinkError, LinkOptions, connect};
+pub use connect::connect;
+pub use error::LinkError;
 pub use session::{Lost, Session};
 
-use shared::config::{Joint, RobotConfig};
+use std::net::IpAddr;
+
+use shared::config::{Config, Joint, RobotConfig};
+use shared::limits::Limits;
 
 /// What the program on the robot shall do; the code in `input_int_register_b+1`.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -161,5 +167,43 @@ impl TiltJoint {
     /// Alpha in degrees at a joint angle in rad.
     pub fn alpha_deg(&self, joint_rad: f64) -> f32 {
         (self.direction * (joint_rad.to_degrees() - self.start_deg)) as f32
+    }
+}
+
+/// Where the robot is and how its program shall move.
+#[derive(Debug, Clone, PartialEq)]
+pub struct LinkOptions {
+    /// The UR controller's address.
+    pub address: IpAddr,
+    /// The joint that tilts the container.
+    pub tilt: TiltJoint,
+    /// Largest distance from the start angle at which the program starts, degrees.
+    pub start_tolerance_deg: f64,
+    /// First RTDE register used.
+    pub register_base: u8,
+    /// servoj lookahead time, s.
+    pub lookahead_s: f64,
+    /// servoj gain.
+    pub gain: f64,
+    /// Limits on alpha, kept by the program too.
+    pub limits: Limits,
+    /// Targets a second.
+    pub rate_hz: f64,
+}
+
+impl LinkOptions {
+    /// The link's part of the cell's configuration.
+    pub fn new(config: &Config) -> Self {
+        let robot = &config.robot;
+        Self {
+            address: robot.address,
+            tilt: TiltJoint::new(robot),
+            start_tolerance_deg: robot.start_tolerance_deg,
+            register_base: robot.register_base,
+            lookahead_s: robot.lookahead_s,
+            gain: robot.gain,
+            limits: config.limits,
+            rate_hz: config.controller.rate_hz,
+        }
     }
 }

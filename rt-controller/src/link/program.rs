@@ -7,7 +7,7 @@ use super::{LinkError, LinkOptions};
 /// The program as it stands in the repository, with example values.
 pub const SOURCE: &str = include_str!("../../robot/pour.script");
 
-/// Most cycles that the program averages over: keeps its list, and the delay, small.
+/// Most cycles that the program averages over, so that its list and its delay stay small. Chosen by hand; no measurement is recorded.
 const MOST_CYCLES: f64 = 100.0;
 
 /// The program for `options` on a robot with a control cycle of `cycle_s` (0.008 on CB3, 0.002 on e-Series).

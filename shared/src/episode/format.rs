@@ -1,7 +1,8 @@
-//! The messages inside an episode's file and the schemas that let any MCAP reader understand them.
+//! The messages inside an episode's file, and the schemas that let any MCAP reader understand them.
 //!
-//! Images are protobuf `foxglove.CompressedImage`, which viewers show without plug-ins; all else is JSON, which people and
-//! every language can read. NaN is written as `null`. Allocates; ordinary threads only.
+//! Images are protobuf `foxglove.CompressedImage`, which viewers show without plug-ins. All else is JSON, which people and every language
+//! can read; NaN is written as `null`. The names of topics, fields and metadata are part of the format. Allocates; for ordinary threads
+//! only.
 
 use prost::Message as _;
 use prost_types::field_descriptor_proto::{Label, Type};
@@ -10,22 +11,30 @@ use serde::{Deserialize, Deserializer, Serialize};
 
 use crate::messages::{Doubt, Feature, Phase, Telemetry};
 
+/// Topic of the images. Its name is the custom of ROS 2.
 pub(super) const IMAGE_TOPIC: &str = "/camera/image/compressed";
+/// Topic of [`FeatureJson`].
 pub(super) const FEATURE_TOPIC: &str = "/feature";
+/// Topic of [`TelemetryJson`].
 pub(super) const TELEMETRY_TOPIC: &str = "/telemetry";
+/// Topic of [`EpisodeRowJson`].
 pub(super) const ROW_TOPIC: &str = "/sample";
 
-/// Names of the metadata records, and the version in `episode`/`format`.
+/// Metadata record about the start.
 pub(super) const META_EPISODE: &str = "episode";
+/// Metadata record with the whole configuration.
 pub(super) const META_CONFIG: &str = "config";
+/// Metadata record about the end.
 pub(super) const META_END: &str = "end";
+/// Metadata record with the weight.
 pub(super) const META_WEIGHT: &str = "weight";
+/// Version of the format: the value of `format` in the metadata record about the start.
 pub(super) const FORMAT: &str = "1";
 
 /// `foxglove.CompressedImage`.
 #[derive(Clone, PartialEq, prost::Message)]
 pub(super) struct CompressedImage {
-    /// Capture time: CLOCK_MONOTONIC, like the log times.
+    /// Capture time, CLOCK_MONOTONIC like the log times.
     #[prost(message, optional, tag = "1")]
     pub timestamp: Option<prost_types::Timestamp>,
     #[prost(bytes = "vec", tag = "2")]
@@ -36,7 +45,7 @@ pub(super) struct CompressedImage {
     pub frame_id: String,
 }
 
-/// The FileDescriptorSet of [`CompressedImage`], as MCAP wants it for the schema encoding `protobuf`.
+/// The FileDescriptorSet of [`CompressedImage`], which MCAP wants as the schema of a protobuf message.
 pub(super) fn compressed_image_schema() -> Vec<u8> {
     let field = |name: &str, number: i32, kind: Type, type_name: Option<&str>| FieldDescriptorProto {
         name: Some(name.into()),
@@ -70,7 +79,7 @@ pub(super) fn compressed_image_schema() -> Vec<u8> {
     set.encode_to_vec()
 }
 
-/// A row of `/sample`: one row of `L_E`, V_e beside it.
+/// A message of `/sample`: one row of `L_E`, with V_e beside it.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub(super) struct EpisodeRowJson {
     pub sequence: u64,
@@ -85,7 +94,7 @@ pub(super) struct EpisodeRowJson {
     pub image: bool,
 }
 
-/// A row of `/feature`: [`Feature`] in words.
+/// A message of `/feature`: a [`Feature`] with its codes in words.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub(super) struct FeatureJson {
     sequence: u64,
@@ -115,7 +124,7 @@ impl FeatureJson {
     }
 }
 
-/// A row of `/telemetry`: [`Telemetry`] in words.
+/// A message of `/telemetry`: a [`Telemetry`] with its codes in words.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub(super) struct TelemetryJson {
     pub tick: u64,
@@ -158,11 +167,12 @@ impl TelemetryJson {
     }
 }
 
+/// A number in which `null` stands for NaN, which JSON does not have.
 fn null_is_nan<'de, D: Deserializer<'de>>(deserializer: D) -> Result<f32, D::Error> {
     Ok(Option::<f32>::deserialize(deserializer)?.unwrap_or(f32::NAN))
 }
 
-/// Name, topic and JSON schema of the three JSON topics.
+/// Name, topic and JSON schema of each of the three JSON topics.
 pub(super) fn json_schemas() -> [(&'static str, &'static str, String); 3] {
     [
         (
@@ -223,6 +233,7 @@ pub(super) fn json_schemas() -> [(&'static str, &'static str, String); 3] {
     ]
 }
 
+/// A JSON schema of an object with `fields`: name, type and description of each.
 fn schema(title: &str, fields: &[(&str, &str, &str)]) -> String {
     let properties: serde_json::Map<String, serde_json::Value> = fields
         .iter()
@@ -241,10 +252,10 @@ fn schema(title: &str, fields: &[(&str, &str, &str)]) -> String {
 mod tests {
     use super::*;
 
-    /// Protects viewers and other readers from a field that the schema does not know, or the other way round.
+    /// Protects viewers and other readers: the schemas list each field that is written, and no other.
     #[test]
     fn schemas_list_exactly_the_fields_that_are_written() {
-        let sample = EpisodeRowJson {
+        let row = EpisodeRowJson {
             sequence: 1,
             captured_at_ns: 2,
             alpha_commanded_deg: 3.0,
@@ -256,7 +267,7 @@ mod tests {
         let rows = [
             serde_json::to_value(FeatureJson::new(&Feature::default())).unwrap(),
             serde_json::to_value(TelemetryJson::new(&Telemetry::default())).unwrap(),
-            serde_json::to_value(sample).unwrap(),
+            serde_json::to_value(row).unwrap(),
         ];
         for ((name, _, text), row) in json_schemas().into_iter().zip(rows) {
             let schema: serde_json::Value = serde_json::from_str(&text).unwrap();

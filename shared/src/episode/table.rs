@@ -1,18 +1,22 @@
 //! The CSV pair: `features.csv` (`episode, frame, t_s, alpha_deg, area_px2`) and `scale.csv` (`episode, weight_g`), for people
-//! who have their own vision. Allocates; ordinary threads only.
+//! who have their own vision. Allocates; for ordinary threads only. A fault is one line that names the file and the line in it.
 //!
-//! Columns are found by their names; others are ignored. The rows of an episode stand together in order of `frame`; a
-//! missing frame number is a lost frame, an `area_px2` of `nan` or nothing is a frame that gave no measurement.
+//! Columns are found by their names, and other columns are ignored. The rows of an episode stand together in order of `frame`. A missing
+//! frame number is a lost frame; an `area_px2` of `nan` or nothing is a frame that gave no measurement.
 
 use std::collections::BTreeMap;
 use std::fs::{File, OpenOptions};
 use std::path::Path;
 
-use super::{Episode, EpisodeInfo, EpisodeKind, EpisodeRow};
+use super::rows::{EpisodeRow, alpha_between_deg, lost_between};
+use super::weight::{WeightError, check_poured};
+use super::{Episode, EpisodeInfo, EpisodeKind};
 use crate::messages::Doubt;
 
-/// Most frames in a row that can be lost; more is a wrong number.
-const GAP_LIMIT: u64 = 10_000;
+/// Columns of the table of features.
+const FEATURE_COLUMNS: [&str; 5] = ["episode", "frame", "t_s", "alpha_deg", "area_px2"];
+/// Columns of the table of weights.
+const SCALE_COLUMNS: [&str; 2] = ["episode", "weight_g"];
 
 /// Why a pair of tables is refused or cannot be written.
 #[derive(Debug, thiserror::Error)]
@@ -30,7 +34,7 @@ pub enum TableError {
     Row {
         /// The file.
         file: String,
-        /// Line in it; the heading is 1.
+        /// Line in it; the heading is line 1.
         line: u64,
         /// What is wrong and what is wanted.
         what: String,
@@ -41,10 +45,11 @@ pub enum TableError {
 struct CsvTable {
     name: String,
     reader: csv::Reader<File>,
+    /// Place of each wanted column.
     columns: Vec<usize>,
 }
 
-/// One row of the wanted columns.
+/// One row, reduced to the wanted columns.
 struct CsvRow<'a> {
     file: &'a str,
     line: u64,
@@ -71,6 +76,7 @@ impl CsvTable {
         let heading = reader.headers().map_err(|e| fail(e.to_string()))?.clone();
         let mut columns = Vec::new();
         for column in wanted {
+            // Some spreadsheets begin a file with a byte-order mark.
             let mut places = heading.iter().enumerate().filter(|(_, name)| name.trim_start_matches('\u{feff}') == *column);
             let what = match (places.next(), places.next()) {
                 (Some((place, _)), None) => {
@@ -86,7 +92,7 @@ impl CsvTable {
     }
 
     /// Shows each row to `take`.
-    fn rows(mut self, mut take: impl FnMut(&CsvRow) -> Result<(), TableError>) -> Result<(), TableError> {
+    fn for_each_row(mut self, mut take: impl FnMut(&CsvRow) -> Result<(), TableError>) -> Result<(), TableError> {
         let mut record = csv::StringRecord::new();
         loop {
             match self.reader.read_record(&mut record) {
@@ -113,11 +119,23 @@ impl CsvTable {
     }
 }
 
-/// Reads the pair; episodes in the order of their first row in `features`. All of them are complete and have a weight.
+/// Reads the pair. The episodes come in the order of their first row in `features`; all of them are complete and have a weight.
 pub fn read_table(features: &Path, scale: &Path) -> Result<Vec<Episode>, TableError> {
+    let (mut episodes, first_line) = read_features(features)?;
+    read_weights(scale, features, &mut episodes)?;
+    if let Some(episode) = episodes.iter().find(|e| e.weight_g.is_none()) {
+        let line = first_line.get(&episode.name).copied().unwrap_or(0);
+        let what = format!("episode {} has no weight in {}", episode.name, scale.display());
+        return Err(TableError::Row { file: features.display().to_string(), line, what });
+    }
+    Ok(episodes)
+}
+
+/// The episodes without their weights, and the line in which each begins.
+fn read_features(features: &Path) -> Result<(Vec<Episode>, BTreeMap<String, u64>), TableError> {
     let mut episodes: Vec<Episode> = Vec::new();
     let mut first_line: BTreeMap<String, u64> = BTreeMap::new();
-    CsvTable::open(features, &["episode", "frame", "t_s", "alpha_deg", "area_px2"])?.rows(|row| {
+    CsvTable::open(features, &FEATURE_COLUMNS)?.for_each_row(|row| {
         let name = row.fields[0];
         if name.is_empty() {
             return Err(row.error("episode is empty: a name or number is wanted".into()));
@@ -144,36 +162,30 @@ pub fn read_table(features: &Path, scale: &Path) -> Result<Vec<Episode>, TableEr
         return Err(TableError::File { file: features.display().to_string(), what: "no rows below the heading".into() });
     }
     for episode in &mut episodes {
-        episode.info.lost_frames = episode.rows.iter().filter(|f| f.lost).count() as u64;
+        episode.info.lost_frames = episode.rows.iter().filter(|r| r.lost).count() as u64;
     }
+    Ok((episodes, first_line))
+}
 
+/// Enters the weights into the episodes that were read from `features`.
+fn read_weights(scale: &Path, features: &Path, episodes: &mut [Episode]) -> Result<(), TableError> {
     let mut weighed: BTreeMap<String, u64> = BTreeMap::new();
-    CsvTable::open(scale, &["episode", "weight_g"])?.rows(|row| {
-        let name = row.fields[0];
+    CsvTable::open(scale, &SCALE_COLUMNS)?.for_each_row(|row| {
+        let (name, weight) = (row.fields[0], row.fields[1]);
         if let Some(line) = weighed.insert(name.into(), row.line) {
             return Err(row.error(format!("episode {name} has a weight in line {line} already")));
         }
-        let weight_g: f64 = row.number(1, "weight_g", "the scale's reading in g")?;
-        if !weight_g.is_finite() || weight_g < 0.0 {
-            return Err(row.error(format!("weight_g '{}': a finite number above 0 is wanted", row.fields[1])));
-        }
-        if weight_g == 0.0 {
-            return Err(row.error(format!("weight_g 0: nothing was poured in episode {name}; leave it out of both tables")));
-        }
+        let weight_g = weight.parse().map_err(|_| WeightError::NotAReading).and_then(check_poured);
+        let weight_g = weight_g.map_err(|e| row.error(format!("weight_g '{weight}': {e}")))?;
         match episodes.iter_mut().find(|e| e.name == name) {
             Some(episode) => episode.weight_g = Some(weight_g),
             None => return Err(row.error(format!("episode {name} is not in {}", features.display()))),
         }
         Ok(())
-    })?;
-    if let Some(episode) = episodes.iter().find(|e| e.weight_g.is_none()) {
-        let line = first_line.get(&episode.name).copied().unwrap_or(0);
-        let what = format!("episode {} has no weight in {}", episode.name, scale.display());
-        return Err(TableError::Row { file: features.display().to_string(), line, what });
-    }
-    Ok(episodes)
+    })
 }
 
+/// Adds a row of the table to an episode, after the rows of the frames that are missing before it.
 fn add_row(rows: &mut Vec<EpisodeRow>, row: &CsvRow) -> Result<(), TableError> {
     let sequence: u64 = row.number(1, "frame", "a whole number")?;
     let t_s: f64 = row.number(2, "t_s", "seconds")?;
@@ -195,21 +207,16 @@ fn add_row(rows: &mut Vec<EpisodeRow>, row: &CsvRow) -> Result<(), TableError> {
         if t_s <= last.t_s {
             return Err(row.error(format!("t_s {t_s} is not after {} of the frame before", last.t_s)));
         }
-        let steps = sequence - last.sequence;
-        if steps > GAP_LIMIT {
-            return Err(row.error(format!("frame jumps from {} to {sequence}", last.sequence)));
-        }
-        for step in 1..steps {
-            let share = step as f64 / steps as f64;
-            let alpha = f64::from(last.alpha_commanded_deg) + share * (f64::from(alpha_deg) - f64::from(last.alpha_commanded_deg));
-            rows.push(frame(last.sequence + step, last.t_s + share * (t_s - last.t_s), alpha as f32, f32::NAN));
+        for (lost, share) in lost_between(last.sequence, sequence).map_err(|e| row.error(e))? {
+            let alpha_between_deg = alpha_between_deg(last.alpha_commanded_deg, alpha_deg, share);
+            rows.push(episode_row(lost, last.t_s + share * (t_s - last.t_s), alpha_between_deg, f32::NAN));
         }
     }
-    rows.push(frame(sequence, t_s, alpha_deg, area_px2));
+    rows.push(episode_row(sequence, t_s, alpha_deg, area_px2));
     Ok(())
 }
 
-fn frame(sequence: u64, t_s: f64, alpha_deg: f32, area_px2: f32) -> EpisodeRow {
+fn episode_row(sequence: u64, t_s: f64, alpha_deg: f32, area_px2: f32) -> EpisodeRow {
     EpisodeRow {
         sequence,
         captured_at_ns: 0,
@@ -222,23 +229,23 @@ fn frame(sequence: u64, t_s: f64, alpha_deg: f32, area_px2: f32) -> EpisodeRow {
     }
 }
 
-/// Writes the pair; the alpha in it is the commanded one, lost frames are rows without area. Neither file may exist.
-/// Episodes are numbered from 1 in their order; those without a weight are in `features` only.
+/// Writes the pair; neither file may exist. The alpha in it is the commanded one, and lost frames are rows without area. Episodes are
+/// numbered from 1 in their order; those without a weight are in `features` only.
 pub fn write_table(episodes: &[Episode], features: &Path, scale: &Path) -> Result<(), TableError> {
-    let create = |path: &Path| {
-        let fail = |e: std::io::Error| TableError::File { file: path.display().to_string(), what: e.to_string() };
-        OpenOptions::new().write(true).create_new(true).open(path).map(csv::Writer::from_writer).map_err(fail)
-    };
     let fail = |path: &Path, e: &dyn std::fmt::Display| TableError::File { file: path.display().to_string(), what: e.to_string() };
+    let create = |path: &Path| {
+        let file = OpenOptions::new().write(true).create_new(true).open(path);
+        file.map(csv::Writer::from_writer).map_err(|e| fail(path, &e))
+    };
     let mut rows = create(features)?;
     let mut weights = create(scale)?;
-    rows.write_record(["episode", "frame", "t_s", "alpha_deg", "area_px2"]).map_err(|e| fail(features, &e))?;
-    weights.write_record(["episode", "weight_g"]).map_err(|e| fail(scale, &e))?;
+    rows.write_record(FEATURE_COLUMNS).map_err(|e| fail(features, &e))?;
+    weights.write_record(SCALE_COLUMNS).map_err(|e| fail(scale, &e))?;
     for (index, episode) in episodes.iter().enumerate() {
         let number = (index + 1).to_string();
-        for f in &episode.rows {
-            let area = if f.area_px2.is_nan() { "nan".into() } else { f.area_px2.to_string() };
-            rows.write_record([&number, &f.sequence.to_string(), &f.t_s.to_string(), &f.alpha_commanded_deg.to_string(), &area])
+        for r in &episode.rows {
+            let area = if r.area_px2.is_nan() { "nan".into() } else { r.area_px2.to_string() };
+            rows.write_record([&number, &r.sequence.to_string(), &r.t_s.to_string(), &r.alpha_commanded_deg.to_string(), &area])
                 .map_err(|e| fail(features, &e))?;
         }
         if let Some(weight_g) = episode.weight_g {

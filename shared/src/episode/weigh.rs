@@ -1,7 +1,7 @@
-//! Adds the weight `w_E` to an episode afterwards. Allocates; ordinary threads only.
+//! Adds the weight `w_E` to an episode afterwards. Allocates; for ordinary threads only.
 //!
-//! Everything is copied into a new file beside the old one, which is read back, compared and put on the disk before it
-//! takes the old one's name in one step: whenever the machine stops, there is one whole file, with or without the weight.
+//! Everything is copied into a new file beside the old one, which is read back, compared and put on the disk before it takes the old one's
+//! name in one step. Whenever the machine stops, there is one whole file, with or without the weight.
 
 use std::fs::{File, OpenOptions};
 use std::io::BufWriter;
@@ -10,15 +10,19 @@ use std::path::Path;
 use mcap::records::{Metadata, Record};
 use mcap::{WriteOptions, Writer};
 
-use super::read::{NextRecord, Records};
-use super::{Episode, EpisodeError, format};
+use super::records::{EpisodeError, NextRecord, Records};
+use super::weight::{WeightError, check_reading};
+use super::{Episode, format};
 
-/// Why a weight is refused or cannot be written; the file is as it was.
+/// Bytes that are written at a time. Chosen by hand; no measurement is recorded.
+const WRITE_BYTES: usize = 1 << 20;
+
+/// Why a weight is refused or cannot be written. The file is as it was.
 #[derive(Debug, thiserror::Error)]
 pub enum WeighError {
-    /// Not a weight.
-    #[error("weight {0} g: give the scale's reading in g, a finite number of at least 0")]
-    Weight(f64),
+    /// The number cannot be a weight.
+    #[error("weight {0} g: {1}")]
+    Weight(f64, WeightError),
     /// The episode cannot be read.
     #[error(transparent)]
     Episode(#[from] EpisodeError),
@@ -38,13 +42,11 @@ pub enum WeighError {
     },
 }
 
-/// Sets the weight of the episode `path` to `grams` and returns what it was before.
+/// Sets the weight of the episode `path` to `grams`. Answers with the weight that it had before.
 pub fn set_weight(path: &Path, grams: f64) -> Result<Option<f64>, WeighError> {
-    if !(grams.is_finite() && grams >= 0.0) {
-        return Err(WeighError::Weight(grams));
-    }
+    check_reading(grams).map_err(|e| WeighError::Weight(grams, e))?;
     let shown = path.display().to_string();
-    // The file itself, not a link to it, is replaced.
+    // If the path is a link, the file is replaced and not the link.
     let path = path.canonicalize().map_err(|e| EpisodeError::Read { file: shown.clone(), what: e.to_string() })?;
     let before = Episode::read(&path)?;
     let name = path.file_name().and_then(|n| n.to_str()).unwrap_or("episode");
@@ -53,7 +55,7 @@ pub fn set_weight(path: &Path, grams: f64) -> Result<Option<f64>, WeighError> {
         let fail = |what: String| WeighError::Write { file: temporary.display().to_string(), what };
         let after = Episode::read(&temporary)?;
         let expected = Episode { name: after.name.clone(), weight_g: Some(grams), ..before.clone() };
-        // Compared as text, because NaN is not equal to itself.
+        // They are compared as text, because NaN is not equal to itself.
         if format!("{after:?}") != format!("{expected:?}") {
             return Err(fail("the copy differs from the original".into()));
         }
@@ -64,7 +66,7 @@ pub fn set_weight(path: &Path, grams: f64) -> Result<Option<f64>, WeighError> {
     match result {
         Ok(()) => Ok(before.weight_g),
         Err(e) => {
-            // Only ever our own file; after the rename it is not there any more.
+            // This is only ever our own file. After the rename it is no longer there.
             let _ = std::fs::remove_file(&temporary);
             Err(e)
         }
@@ -79,7 +81,7 @@ fn copy_with_weight(old: &Path, new: &Path, grams: f64) -> Result<(), WeighError
     let permissions = std::fs::metadata(old).map_err(|e| fail(&e))?.permissions();
     file.set_permissions(permissions).map_err(|e| fail(&e))?;
     let mut records = Records::open(old)?;
-    let mut target: Option<BufWriter<File>> = Some(BufWriter::with_capacity(1 << 20, file));
+    let mut target: Option<BufWriter<File>> = Some(BufWriter::with_capacity(WRITE_BYTES, file));
     let mut writer: Option<Writer<BufWriter<File>>> = None;
     let next = records.next(|record| {
         if let (Record::Header(header), Some(file)) = (&record, target.take()) {

@@ -1,7 +1,7 @@
-//! Writes one episode's MCAP file, see [`crate::episode`]. Allocates; ordinary threads only.
+//! Writes one episode's MCAP file, see [`crate::episode`]. Allocates; for ordinary threads only.
 //!
-//! A chunk is built in memory and written whole at least every half second, always between two frames, so a recorder that is
-//! killed leaves a file that reads up to then. A new file never takes the name of one that is there.
+//! A chunk is built in memory and written whole at least every half second, always between two frames. A recorder that is killed
+//! therefore leaves a file that can be read up to then. A new file never takes the name of one that is there.
 
 use std::collections::BTreeMap;
 use std::fs::{File, OpenOptions};
@@ -19,12 +19,14 @@ use super::{EpisodeKind, hex};
 use crate::config::Config;
 use crate::messages::{Doubt, Feature, Telemetry};
 
-/// A chunk is closed when it is this old, ns.
+/// A chunk is closed when it is this old, ns. Chosen by hand: a killed recorder loses at most half a second.
 const CHUNK_NS: u64 = 500_000_000;
-/// A chunk is closed when it is this large, bytes.
+/// A chunk is closed when it is this large, bytes. Chosen by hand; no measurement is recorded.
 const CHUNK_BYTES: usize = 1 << 20;
+/// Bytes that are handed to the operating system at a time. Chosen by hand; no measurement is recorded.
+const WRITE_BYTES: usize = 1 << 16;
 
-/// Why an episode cannot be written; what was written before is in the file.
+/// Why an episode cannot be written. What was written before is in the file.
 #[derive(Debug, thiserror::Error)]
 pub enum WriteError {
     /// The directory cannot be read or made.
@@ -45,27 +47,27 @@ pub enum WriteError {
     },
 }
 
-/// What is known at an episode's start.
+/// What is known when an episode starts.
 #[derive(Debug, Clone)]
 pub struct EpisodeStart<'a> {
     /// [`Telemetry::episode`].
     pub episode: u64,
-    /// What is run.
+    /// What the controller runs.
     pub kind: EpisodeKind,
     /// First tick of the episode, CLOCK_MONOTONIC ns.
     pub started_at_ns: u64,
-    /// The wall clock then.
+    /// The wall-clock time of that tick.
     pub wall_clock: SystemTime,
-    /// The cell's configuration; the file gets all of it.
+    /// The cell's configuration, all of which goes into the file.
     pub config: &'a Config,
-    /// Identity of the weights that the controller runs; empty without any.
+    /// Identity of the weights that the controller runs; empty if it has none.
     pub weights: &'a str,
 }
 
-/// One frame of an episode.
+/// One frame as it is written: its feature, its angles and its image.
 #[derive(Debug, Clone, Copy)]
 pub struct FrameRow<'a> {
-    /// What was measured in it.
+    /// What was measured in the frame.
     pub feature: &'a Feature,
     /// Commanded alpha at the capture time, degrees.
     pub alpha_commanded_deg: f32,
@@ -78,15 +80,15 @@ pub struct FrameRow<'a> {
 /// How an episode ended.
 #[derive(Debug, Clone, Copy)]
 pub struct EpisodeEnd<'a> {
-    /// Nothing is missing at the end.
+    /// Whether nothing is missing at the end.
     pub complete: bool,
-    /// One line for people.
+    /// Why it ended: one line for people.
     pub reason: &'a str,
     /// Frames that came twice or out of order and were left out.
     pub disordered_frames: u64,
 }
 
-/// An episode being written. Dropped without [`EpisodeWriter::finish`], its file is incomplete.
+/// An episode being written. If it is dropped without [`EpisodeWriter::finish`], its file is incomplete.
 pub struct EpisodeWriter {
     writer: Writer<BufWriter<File>>,
     path: PathBuf,
@@ -108,7 +110,7 @@ impl EpisodeWriter {
             .chunk_size(None)
             .disable_seeking(true)
             .library(concat!("decant ", env!("CARGO_PKG_VERSION")));
-        let mut writer = Writer::with_options(BufWriter::with_capacity(1 << 16, file), options).map_err(fail)?;
+        let mut writer = Writer::with_options(BufWriter::with_capacity(WRITE_BYTES, file), options).map_err(fail)?;
         let none = BTreeMap::new();
         let schema = writer.add_schema("foxglove.CompressedImage", "protobuf", &format::compressed_image_schema()).map_err(fail)?;
         let image_channel = writer.add_channel(schema, format::IMAGE_TOPIC, "protobuf", &none).map_err(fail)?;
@@ -132,7 +134,7 @@ impl EpisodeWriter {
         Ok(this)
     }
 
-    /// The file.
+    /// The path of the file.
     pub fn path(&self) -> &Path {
         &self.path
     }
@@ -173,10 +175,10 @@ impl EpisodeWriter {
     }
 
     /// Writes one frame: its row of `L_E`, its feature and its image.
-    pub fn frame(&mut self, sample: &FrameRow) -> Result<(), WriteError> {
-        let feature = sample.feature;
+    pub fn frame(&mut self, frame: &FrameRow) -> Result<(), WriteError> {
+        let feature = frame.feature;
         let at_ns = feature.captured_at_ns;
-        if let Some((format, data)) = sample.image {
+        if let Some((format, data)) = frame.image {
             let image = CompressedImage {
                 timestamp: Some(prost_types::Timestamp { seconds: (at_ns / 1_000_000_000) as i64, nanos: (at_ns % 1_000_000_000) as i32 }),
                 data: data.to_vec(),
@@ -189,11 +191,11 @@ impl EpisodeWriter {
         let row = EpisodeRowJson {
             sequence: feature.sequence,
             captured_at_ns: at_ns,
-            alpha_commanded_deg: sample.alpha_commanded_deg,
-            alpha_measured_deg: sample.alpha_measured_deg,
+            alpha_commanded_deg: frame.alpha_commanded_deg,
+            alpha_measured_deg: frame.alpha_measured_deg,
             area_px2: feature.area_px2,
             doubt: Doubt::from_code(feature.doubt).words().into(),
-            image: sample.image.is_some(),
+            image: frame.image.is_some(),
         };
         self.json(self.row_channel, feature.sequence, at_ns, &row)?;
         if at_ns.saturating_sub(self.chunk_since_ns) >= CHUNK_NS || self.chunk_bytes >= CHUNK_BYTES {
@@ -214,19 +216,19 @@ impl EpisodeWriter {
     }
 
     fn message(&mut self, channel_id: u16, sequence: u64, at_ns: u64, data: &[u8]) -> Result<(), WriteError> {
-        // MCAP's own sequence field has 32 bits: the low ones, for readers that look for gaps.
+        // MCAP's own sequence field has 32 bits. It gets the low ones, for readers that look for gaps.
         self.chunk_bytes += data.len();
         let header = MessageHeader { channel_id, sequence: sequence as u32, log_time: at_ns, publish_time: at_ns };
         self.writer.write_to_known_channel(&header, data).map_err(|e| file_error(&self.path, &e))
     }
 
-    /// Closes the chunk under way and hands it to the system.
+    /// Closes the chunk under way and hands it to the operating system.
     pub fn flush(&mut self) -> Result<(), WriteError> {
         self.chunk_bytes = 0;
         self.writer.flush().map_err(|e| file_error(&self.path, &e))
     }
 
-    /// Writes how it ended and the index, and waits until all is on the disk.
+    /// Writes how the episode ended and the index, waits until everything is on the disk, and answers with the file's path.
     pub fn finish(mut self, end: &EpisodeEnd) -> Result<PathBuf, WriteError> {
         let about = [
             ("complete", end.complete.to_string()),
@@ -261,7 +263,7 @@ fn next_free(directory: &Path) -> Result<(File, PathBuf), WriteError> {
     loop {
         number += 1;
         let path = directory.join(format!("episode-{number:04}.mcap"));
-        // Another recorder may take the name between the look and the creation: only a file that was not there is ours.
+        // Another recorder may take the name between the look and the creation. Only a file that was not there is ours.
         match OpenOptions::new().write(true).create_new(true).open(&path) {
             Ok(file) => return Ok((file, path)),
             Err(e) if e.kind() == ErrorKind::AlreadyExists => {}
@@ -270,8 +272,8 @@ fn next_free(directory: &Path) -> Result<(File, PathBuf), WriteError> {
     }
 }
 
-/// Seconds since 1970 as RFC 3339 in UTC. Days to date after Howard Hinnant, "chrono-compatible low-level date algorithms".
-pub(crate) fn rfc3339(unix_s: u64) -> String {
+/// Seconds since 1970 as RFC 3339 in UTC. The date follows Howard Hinnant, "chrono-compatible low-level date algorithms".
+fn rfc3339(unix_s: u64) -> String {
     let (days, second) = (unix_s / 86_400, unix_s % 86_400);
     let z = days + 719_468;
     let (era, doe) = (z / 146_097, z % 146_097);

@@ -1,7 +1,8 @@
 //! `rt-controller run`: the resident process.
 //!
-//! Main thread: clients, telemetry (ordinary). Thread "loop": real-time. Thread "robot": connects. Thread "disk": journal, weights. A
-//! signal brings the container upright and ends the process; a second one ends it at once (the robot's program then goes upright by itself).
+//! It starts the threads: "loop" is real-time, "robot" connects, "disk" writes the journal and reads weights; the main thread serves
+//! clients and publishes telemetry. A signal brings the container upright and ends the process. A second signal ends it at once, and
+//! the program on the robot then goes upright by itself.
 
 use std::io::Write;
 use std::path::PathBuf;
@@ -9,20 +10,22 @@ use std::sync::atomic::{AtomicBool, AtomicU64, Ordering::Relaxed};
 use std::sync::{Arc, Mutex};
 
 use shared::config::Config;
-use shared::exit::{self, Failure, OrExit as _};
-use shared::ipc::{Cell, IpcError};
+use shared::exit::{self, Failure, OrExit as _, failure};
+use shared::ipc::{Cell, InService as _, IpcError};
 
 use crate::control_loop::{self, Place};
 use crate::core::Settings;
 use crate::disk::Disk;
 use crate::exchange::Exchange;
-use crate::service::{self, RobotNote, Service};
+use crate::robot_thread::{self, RobotNote};
+use crate::service::Service;
 
-/// Stack of each thread beside the main one, bytes: all of it is locked in memory.
+/// Stack of each thread beside the main one, bytes; all of it is locked in memory. Chosen by hand; no measurement is recorded.
 const STACK: usize = 512 * 1024;
 
-fn no_thread(e: std::io::Error) -> IpcError {
-    IpcError::Service { service: "thread".into(), what: format!("the system gives no thread: {e}") }
+/// The failure to start a thread.
+fn no_thread(e: std::io::Error) -> Failure {
+    failure(exit::FAILED, format!("no thread could be started: {e}; does the system limit processes or locked memory?"))
 }
 
 /// Command-line arguments.
@@ -45,59 +48,67 @@ pub fn run(args: &Args) -> Result<(), Failure> {
         let _ = writeln!(std::io::stderr(), "rt-controller: a defect, please report it: {panic}");
         std::process::abort();
     }));
-    let stop = Arc::new(AtomicBool::new(false));
-    for signal in [signal_hook::consts::SIGINT, signal_hook::consts::SIGTERM] {
-        // Armed by the first signal, so that only a second one ends the process at once.
-        let second = signal_hook::flag::register_conditional_shutdown(signal, exit::INTERRUPTED.into(), Arc::clone(&stop));
-        let first = signal_hook::flag::register(signal, Arc::clone(&stop));
-        second.and(first).map_err(|e| format!("cannot handle signals: {e}")).or_exit(exit::FAILED)?;
-    }
+    let stop = stop_at_signals()?;
 
-    // First of all, so that what is made from here on is in memory before the loop starts.
+    // Before anything else, so that all that is made from here on is in memory before the loop starts.
     if let Err(line) = shared::os::lock_memory() {
         say(&line);
     }
     let _awake = shared::os::stay_awake().map_err(|line| say(&line));
-    let exchange = Exchange::default();
-    let (note, connections, refused) = (RobotNote::default(), AtomicU64::new(0), Mutex::default());
-    let outcome = std::thread::scope(|scope| {
-        let cell = Cell::join(&config.cell.name)?;
-        let (disk, journal) = Disk::open(&config, &exchange, &refused, &say);
-        let service = Service::open(&cell, &exchange, (&note, &connections), (&refused, journal), &say)?;
-        let (ready_sender, ready) = std::sync::mpsc::channel();
-        let loop_thread = std::thread::Builder::new().name("loop".into()).stack_size(STACK);
-        let spawned = loop_thread.spawn_scoped(scope, {
-            let (config, exchange, say) = (&config, &exchange, &say);
-            move || real_time(config, exchange, say, &ready_sender)
-        });
-        spawned.map_err(no_thread)?;
-        ready.recv().unwrap_or(Ok(()))?;
-        let end = AtomicBool::new(false);
-        std::thread::scope(|inner| {
-            let robot_thread = std::thread::Builder::new().name("robot".into()).stack_size(STACK);
-            let spawned =
-                robot_thread.spawn_scoped(inner, || service::keep_robot_connected(&config, &exchange, &note, &connections, &end, &say));
-            let disk_thread = std::thread::Builder::new().name("disk".into()).stack_size(STACK);
-            let spawned = spawned.and(disk_thread.spawn_scoped(inner, || disk.run(&end)));
-            say(&format!("running in cell '{}' at {} Hz", config.cell.name, config.controller.rate_hz));
-            // Without these threads there is no robot and no policy: the loop ends at once.
-            stop.fetch_or(spawned.is_err(), Relaxed);
-            service.run(&stop);
-            end.store(true, Relaxed);
-            spawned.map(|_| ()).map_err(no_thread)
-        })
-    });
-    outcome.or_exit(exit::FAILED)?;
+    run_threads(&config, &stop, &say)?;
     say("stopped");
     Ok(())
 }
 
-/// The real-time thread: its own node and subscriber, then the loop.
+/// Becomes true at the first Ctrl-C or SIGTERM; the second one ends the process at once.
+fn stop_at_signals() -> Result<Arc<AtomicBool>, Failure> {
+    let stop = Arc::new(AtomicBool::new(false));
+    for signal in [signal_hook::consts::SIGINT, signal_hook::consts::SIGTERM] {
+        // It is armed by the first signal, so that only a second one ends the process at once.
+        let second = signal_hook::flag::register_conditional_shutdown(signal, exit::INTERRUPTED.into(), Arc::clone(&stop));
+        let first = signal_hook::flag::register(signal, Arc::clone(&stop));
+        second.and(first).map_err(|e| format!("cannot handle signals: {e}")).or_exit(exit::FAILED)?;
+    }
+    Ok(stop)
+}
+
+/// Starts the threads, serves clients in this one, and returns when the loop has ended, upright.
+fn run_threads(config: &Config, stop: &AtomicBool, say: &(dyn Fn(&str) + Sync)) -> Result<(), Failure> {
+    let exchange = Exchange::default();
+    let (note, connections, refused) = (RobotNote::default(), AtomicU64::new(0), Mutex::default());
+    std::thread::scope(|scope| {
+        let cell = Cell::join(&config.cell.name).or_exit(exit::FAILED)?;
+        let (disk, journal) = Disk::open(config, &exchange, &refused, say);
+        let service = Service::open(&cell, &exchange, (&note, &connections), (&refused, journal), say).or_exit(exit::FAILED)?;
+        let (ready_sender, ready) = std::sync::mpsc::channel();
+        let exchange = &exchange;
+        thread("loop").spawn_scoped(scope, move || real_time(config, exchange, say, &ready_sender)).map_err(no_thread)?;
+        ready.recv().unwrap_or(Ok(())).or_exit(exit::FAILED)?;
+        let end = AtomicBool::new(false);
+        std::thread::scope(|inner| {
+            let robot = || robot_thread::keep_robot_connected(config, exchange, &note, &connections, &end, say);
+            let spawned = thread("robot").spawn_scoped(inner, robot);
+            let spawned = spawned.and(thread("disk").spawn_scoped(inner, || disk.run(&end)));
+            say(&format!("running in cell '{}' at {} Hz", config.cell.name, config.controller.rate_hz));
+            // Without these threads there is no robot and there are no weights: the loop ends at once.
+            stop.fetch_or(spawned.is_err(), Relaxed);
+            service.run(stop);
+            end.store(true, Relaxed);
+            spawned.map(|_| ()).map_err(no_thread)
+        })
+    })
+}
+
+/// A thread beside the main one.
+fn thread(name: &str) -> std::thread::Builder {
+    std::thread::Builder::new().name(name.into()).stack_size(STACK)
+}
+
+/// The real-time thread: opens its own node and subscriber, tells `ready` how that went, and runs the loop.
 fn real_time(config: &Config, exchange: &Exchange, say: &dyn Fn(&str), ready: &std::sync::mpsc::Sender<Result<(), IpcError>>) {
     let opened = Cell::join(&config.cell.name).and_then(|cell| {
         let subscriber = cell.features()?.subscriber_builder().buffer_size(crate::core::MAX_FEATURES).create();
-        let subscriber = subscriber.map_err(|e| IpcError::Service { service: "feature".into(), what: format!("{e:?}") })?;
-        Ok((cell, subscriber))
+        Ok((cell, subscriber.in_service("feature")?))
     });
     match opened {
         Ok((_cell, subscriber)) => {

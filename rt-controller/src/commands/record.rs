@@ -5,11 +5,12 @@ use std::path::Path;
 
 use shared::config::Config;
 use shared::control::Request;
+use shared::episode::{WeightError, check_reading, set_weight};
 use shared::exit::{self, Failure, OrExit as _, failure};
 use shared::gaussian_curve::Curve;
 
+use super::pour;
 use crate::client::Common;
-use crate::pour;
 
 /// Alpha at the curve's first and last moment, degrees: a start without a jump.
 const END_DEG: f32 = 0.05;
@@ -55,7 +56,7 @@ pub fn run(args: &Args) -> Result<(), Failure> {
     };
     let weight_g = args.weight.or_else(ask_weight);
     if let Some(weight_g) = weight_g {
-        shared::episode::set_weight(Path::new(&file), weight_g).or_exit(exit::FAILED)?;
+        set_weight(Path::new(&file), weight_g).or_exit(exit::FAILED)?;
     }
     if args.common.json {
         println!("{}", serde_json::json!({ "outcome": outcome, "curve": curve, "episode_file": file, "weight_g": weight_g }));
@@ -82,9 +83,10 @@ fn ask_weight() -> Option<f64> {
         if stdin.lock().read_line(&mut line).is_err() || line.trim().is_empty() {
             return None;
         }
-        match line.trim().replace(',', ".").parse::<f64>() {
-            Ok(weight_g) if weight_g.is_finite() && weight_g >= 0.0 => return Some(weight_g),
-            _ => eprintln!("'{}' is no weight: give grams, for example 83", line.trim()),
+        let weight_g = line.trim().replace(',', ".").parse().map_err(|_| WeightError::NotAReading);
+        match weight_g.and_then(check_reading) {
+            Ok(weight_g) => return Some(weight_g),
+            Err(e) => eprintln!("weight '{}': {e}, for example 83", line.trim()),
         }
     }
 }

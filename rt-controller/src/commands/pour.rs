@@ -37,7 +37,7 @@ pub(crate) fn ended(outcome: &Outcome) -> Result<(), Failure> {
 /// Gives an order that moves the container and follows it to its end.
 pub(crate) fn order(cell: &str, request: &Request) -> Result<(Outcome, Option<client::Recorded>), Failure> {
     let client = Client::connect(cell).or_exit(exit::UNREACHABLE)?;
-    let recorder = client::RecorderEar::open(cell).ok();
+    let recorder = client::RecorderReports::open(cell).ok();
     let episode = match client.ask(request).or_exit(exit::UNREACHABLE)? {
         Reply::Started { episode } => episode,
         Reply::Refused { reason } => return Err(failure(exit::REFUSED, reason)),

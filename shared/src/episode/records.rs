@@ -1,0 +1,123 @@
+//! The records of an MCAP file, one after the other, with every checksum compared. Allocates; for ordinary threads only.
+//!
+//! Reads a file whose writer was killed up to its last whole record. A damaged file is an error.
+
+use std::fs::File;
+use std::io::Read;
+use std::path::Path;
+
+use mcap::McapError;
+use mcap::records::{Record, op};
+use mcap::sans_io::linear_reader::{LinearReadEvent, LinearReader, LinearReaderOptions};
+
+/// Largest record or chunk that is believed, bytes. Chosen by hand: far above a chunk of the recorder, far below a computer's memory.
+const RECORD_LIMIT: usize = 256 << 20;
+/// Bytes read at a time. Chosen by hand; no measurement is recorded.
+const READ_BYTES: usize = 1 << 20;
+
+/// Why an episode's file cannot be read.
+#[derive(Debug, thiserror::Error)]
+pub enum EpisodeError {
+    /// The file or directory cannot be opened or read.
+    #[error("{file}: {what}; give an episode (.mcap) or a directory of episodes")]
+    Read {
+        /// The file.
+        file: String,
+        /// The system's words.
+        what: String,
+    },
+    /// It is not an episode of this program.
+    #[error("{file}: not an episode: {what}")]
+    NotAnEpisode {
+        /// The file.
+        file: String,
+        /// What is missing.
+        what: String,
+    },
+    /// A checksum, a record or a value in it is wrong.
+    #[error("{file}: damaged: {what}; take it from a backup, or leave it out")]
+    Damaged {
+        /// The file.
+        file: String,
+        /// What is wrong.
+        what: String,
+    },
+}
+
+/// What came next in a file.
+pub enum NextRecord<T> {
+    /// What the visitor took out of a record.
+    Item(T),
+    /// The file's regular end.
+    End,
+    /// The file stops in the middle: its recorder was killed.
+    Cut,
+}
+
+/// The records of a file, also those inside chunks.
+pub struct Records {
+    file: File,
+    name: String,
+    reader: LinearReader,
+    data_ended: bool,
+}
+
+impl Records {
+    /// Opens a file.
+    pub fn open(path: &Path) -> Result<Self, EpisodeError> {
+        let name = path.display().to_string();
+        let file = File::open(path).map_err(|e| EpisodeError::Read { file: name.clone(), what: e.to_string() })?;
+        let options = LinearReaderOptions::default()
+            .with_check_finishes_after_end_magic(true)
+            .with_prevalidate_chunk_crcs(true)
+            .with_validate_data_section_crc(true)
+            .with_validate_summary_section_crc(true)
+            .with_record_length_limit(RECORD_LIMIT);
+        Ok(Self { file, name, reader: LinearReader::new_with_options(options), data_ended: false })
+    }
+
+    /// The file's name.
+    pub fn name(&self) -> &str {
+        &self.name
+    }
+
+    /// The error of a file with something wrong in it.
+    pub fn damaged(&self, what: impl std::fmt::Display) -> EpisodeError {
+        EpisodeError::Damaged { file: self.name.clone(), what: what.to_string() }
+    }
+
+    /// Shows the records of the data section to `visit`, one by one, until it takes something out of one.
+    pub fn next<T>(&mut self, mut visit: impl FnMut(Record) -> Result<Option<T>, String>) -> Result<NextRecord<T>, EpisodeError> {
+        let damaged = |what: String| EpisodeError::Damaged { file: self.name.clone(), what };
+        loop {
+            match self.reader.next_event() {
+                None => return Ok(NextRecord::End),
+                Some(Err(McapError::UnexpectedEof)) => return Ok(NextRecord::Cut),
+                Some(Err(McapError::BadMagic)) if !self.data_ended => {
+                    return Err(EpisodeError::NotAnEpisode { file: self.name.clone(), what: "this is no MCAP file".into() });
+                }
+                Some(Err(e)) => return Err(damaged(e.to_string())),
+                Some(Ok(LinearReadEvent::ReadRequest(want))) => {
+                    // The file is read in pieces, so that a wrong length never asks for more memory than the file fills.
+                    let buffer = self.reader.insert(want.min(READ_BYTES));
+                    let got = self.file.read(buffer).map_err(|e| EpisodeError::Read { file: self.name.clone(), what: e.to_string() })?;
+                    self.reader.notify_read(got);
+                }
+                // After a power failure the end of a file can be zeros.
+                Some(Ok(LinearReadEvent::Record { opcode: 0, .. })) => return Ok(NextRecord::Cut),
+                Some(Ok(LinearReadEvent::Record { opcode, data })) => {
+                    if opcode == op::DATA_END {
+                        self.data_ended = true;
+                    }
+                    if self.data_ended {
+                        continue;
+                    }
+                    let record = mcap::parse_record(opcode, data).map_err(|e| damaged(e.to_string()))?;
+                    if let Some(item) = visit(record).map_err(damaged)? {
+                        return Ok(NextRecord::Item(item));
+                    }
+                }
+            }
+        }
+    }
+}
