@@ -121,7 +121,7 @@ pub(super) struct TablePlace {
 }
 
 impl TablePlace {
-    /// Where a tilt is in the tables; what is outside, or is not a number, is put at an end.
+    /// Where a tilt is in the tables. A tilt beyond an end is put there; one that is not a number gives a share that is none.
     pub(super) fn of(tilt_deg: f64) -> Self {
         // NaN becomes 0 by the cast; the clamp keeps the index inside.
         let at = (tilt_deg / STEP_DEG).clamp(0.0, (ENTRIES - 2) as f64);
