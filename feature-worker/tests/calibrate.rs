@@ -6,8 +6,7 @@ use std::path::Path;
 use std::process::{Command, Output};
 
 use drawn::{Outcome, pour, write_config};
-use feature_worker::calibrate::{ColourLearner, find_corner};
-use feature_worker::extract::Axes;
+use feature_worker::vision::{Axes, ColourLearner, Extractor, Image, find_corner};
 use opencv::core::{Mat, Vector};
 use opencv::imgcodecs;
 use opencv::prelude::*;
@@ -49,9 +48,9 @@ fn one_pour_is_enough() -> Outcome {
     assert!(imgcodecs::imread(&picture, imgcodecs::IMREAD_COLOR)?.cols() == 640);
     assert_eq!(Config { image: before.image.clone(), ..after.clone() }, before);
     assert!(std::fs::read_to_string(&path)?.contains("# the robot in cell 7"));
-    let mut extractor = feature_worker::extract::Extractor::new(&after.camera, &after.image)?;
+    let mut extractor = Extractor::new(&after.camera, &after.image)?;
     let frame = pour(20)?;
-    let measured = extractor.measure(feature_worker::extract::Image {
+    let measured = extractor.measure(Image {
         width_px: 640,
         height_px: 480,
         format: shared::messages::PixelFormat::Bgr8,

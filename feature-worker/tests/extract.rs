@@ -4,7 +4,7 @@
 mod drawn;
 
 use drawn::{HEIGHT, WIDTH, blue, camera, disc, dry, image_config, noisy, pour, stream, water};
-use feature_worker::extract::{ExtractError, Extractor, Image, Measurement};
+use feature_worker::vision::{ExtractError, Extractor, Image, Measurement};
 use opencv::core::{self, CV_8UC3, CV_16SC3, Mat, Point, Scalar, Size, Vector};
 use opencv::imgproc;
 use opencv::prelude::*;

@@ -5,7 +5,7 @@ mod drawn;
 
 use assert_no_alloc::{AllocDisabler, assert_no_alloc};
 use drawn::{camera, image_config, pour, water};
-use feature_worker::extract::{Extractor, Image};
+use feature_worker::vision::{Extractor, Image};
 use opencv::prelude::*;
 use shared::config::LiquidMethod;
 use shared::messages::PixelFormat;

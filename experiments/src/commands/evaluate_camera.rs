@@ -10,9 +10,8 @@
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
-use feature_worker::calibrate::ColourLearner;
-use feature_worker::extract::{Axes, Extractor, Image, Measurement};
-use feature_worker::view;
+use feature_worker::drawing;
+use feature_worker::vision::{Axes, ColourLearner, Extractor, Image, Measurement};
 use indicatif::ProgressBar;
 use opencv::core::{Mat, Point, Scalar, Vec3b, Vector};
 use opencv::prelude::*;
@@ -431,14 +430,14 @@ fn explain(
 ) -> Result<Mat, Failure> {
     let (rows, columns) = (case.view.height_px as i32, case.view.width_px as i32);
     let mut picture = Mat::new_rows_cols_with_bytes::<Vec3b>(rows, columns, pixels)?.try_clone()?;
-    view::draw(&mut picture, extractor, measured)?;
+    drawing::draw(&mut picture, extractor, measured)?;
     let at = |k: usize| Point::new((truth.triangle_px[k][0] * 16.0) as i32, (truth.triangle_px[k][1] * 16.0) as i32);
     if truth.area_px2 > 0.0 {
         imgproc::line(&mut picture, at(1), at(2), Scalar::new(255.0, 0.0, 255.0, 0.0), 1, imgproc::LINE_AA, 4)?;
     }
     let text = format!("truth {:.0} px^2, alpha {:.0}, {:.1} ml/s", truth.area_px2, scene.alpha_deg, scene.flow_ml_s);
-    view::caption(&mut picture, &text, 1)?;
-    view::caption(&mut picture, &case.labels.join(", "), 2)?;
+    drawing::caption(&mut picture, &text, 1)?;
+    drawing::caption(&mut picture, &case.labels.join(", "), 2)?;
     Ok(picture)
 }
 
