@@ -22,8 +22,8 @@
 //! | a | tilt |
 //! | s | [`Vessel::log_shape`] |
 //! | f | [`Vessel::even_share`] |
-//! | w, W | [`CapacityCurve::lost_ml_per_deg`], [`CapacityCurve::lost_ml`] |
-//! | A | [`CapacityCurve::surface_mm2`] |
+//! | w, W | `lost_ml_per_deg` and [`lost_ml`](CapacityCurve::lost_ml) of [`CapacityCurve`] |
+//! | A | `surface_mm2` of [`CapacityCurve`] |
 
 use serde::{Deserialize, Serialize};
 
