@@ -124,7 +124,7 @@ impl RimCheck {
                 }
             }
         }
-        // What stands behind is out of focus too, so the sharper bundles decide.
+        // What stands behind the rim is out of focus too, so the sharper bundles decide.
         let sharper = self.widths_px.len() / 4;
         self.widths_px.len() >= RIM_SEEN && *self.widths_px.select_nth_unstable_by(sharper, f32::total_cmp).1 > RIM_BLURRED_PX
     }

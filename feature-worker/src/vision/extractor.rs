@@ -66,7 +66,8 @@ pub struct Extractor {
 }
 
 impl Extractor {
-    /// An extractor for images of `camera`'s size with the axes, region and liquid of `image`.
+    /// An extractor for images of `camera`'s size with the axes, region and liquid of `image`. A region in which nothing can be measured
+    /// is refused.
     pub fn new(camera: &CameraConfig, image: &ImageConfig) -> Result<Self, ExtractError> {
         let [x, y, width, height] = image.region_px;
         let region = Rect::new(x as i32, y as i32, width as i32, height as i32);
@@ -130,7 +131,8 @@ impl Extractor {
         [p[0] + self.region.x as f32, p[1] + self.region.y as f32]
     }
 
-    /// Measures one image.
+    /// Measures one image. One of another size than configured, or with missing bytes, gets a doubt and no area. A grey image is an error
+    /// where the liquid is told by its colour; the only other errors are OpenCV's.
     pub fn measure(&mut self, image: Image) -> Result<Measurement, ExtractError> {
         let expected = image.width_px as usize * image.height_px as usize * image.format.bytes_per_pixel();
         if [image.width_px, image.height_px] != self.size_px || image.pixels.len() != expected {
