@@ -1,4 +1,7 @@
-//! The clients' side of the controller's service `control`: one request, one answer. Ordinary threads; allocates.
+//! The clients' side of the controller's service `control`: one request, one answer; and the recorder's reports.
+//!
+//! Runs in ordinary threads of other processes; allocates, and blocks until there is an answer or a time limit has passed. Each failure
+//! is one line that says what to do.
 
 use std::path::PathBuf;
 use std::sync::atomic::Ordering;
@@ -12,13 +15,17 @@ use shared::ipc::{Cell, InService as _, IpcError};
 use shared::messages::{RecorderReport, RecorderState};
 use shared::os;
 
-/// Largest request or answer, bytes: a status with 32 results and five histograms is about 20 kB.
+/// Largest request or answer, bytes. Chosen by hand; no measurement is recorded.
 pub const MESSAGE_MAX: usize = 64 * 1024;
 
-/// How often in a row a controller may say that it does not know the episode that it has started: for a second.
+/// Longest wait for the controller's answer; it answers within a tick and a look of its service thread, below 0.1 s.
+const ANSWER: Duration = Duration::from_secs(2);
+/// Longest wait for the recorder to close a file. Chosen by hand; no measurement is recorded.
+const FILE_CLOSED: Duration = Duration::from_secs(10);
+/// How often in a row a controller may not know the episode that it has started, before it counts as restarted: for a second.
 const UNKNOWN_MAX: u32 = 10;
 
-/// The arguments that all commands have which ask the running controller.
+/// The arguments of all commands that ask the running controller.
 #[derive(Debug, clap::Args)]
 pub struct Common {
     /// The cell's configuration.
@@ -35,7 +42,7 @@ pub enum ClientError {
     /// Shared memory cannot be joined.
     #[error(transparent)]
     Ipc(#[from] IpcError),
-    /// No controller, or it does not answer.
+    /// There is no controller, or it does not answer.
     #[error("no answer from rt-controller in cell '{cell}': is `rt-controller run` running with the same --config, as the same user?")]
     NoAnswer {
         /// The cell's name.
@@ -64,14 +71,14 @@ impl Client {
         Ok(Self { port, cell: name.into(), _cell: cell })
     }
 
-    /// Asks and waits up to 2 s for the answer.
+    /// Sends `request` and waits for the answer, up to two seconds.
     pub fn ask(&self, request: &Request) -> Result<Reply, ClientError> {
         let no_answer = || ClientError::NoAnswer { cell: self.cell.clone() };
         let mut buffer = vec![0; MESSAGE_MAX];
         let bytes = postcard::to_slice(request, &mut buffer).map_err(|_| ClientError::Version)?;
         let loan = self.port.loan_slice_uninit(bytes.len()).map_err(|_| no_answer())?;
         let pending = loan.write_from_slice(bytes).send().map_err(|_| no_answer())?;
-        let until = Instant::now() + Duration::from_secs(2);
+        let until = Instant::now() + ANSWER;
         while Instant::now() < until {
             if let Some(response) = pending.receive().map_err(|_| no_answer())? {
                 return postcard::from_bytes(response.payload()).map_err(|_| ClientError::Version);
@@ -93,10 +100,10 @@ impl Client {
 /// Why a pour could not be followed to its end.
 #[derive(Debug, thiserror::Error)]
 pub enum FollowError {
-    /// The person pressed Ctrl-C; how it ended then.
+    /// The person pressed Ctrl-C; this is how the pour ended then.
     #[error("interrupted: {}", .0.reason.words())]
     Interrupted(Outcome),
-    /// The controller is gone.
+    /// The controller is no longer there.
     #[error(transparent)]
     Client(#[from] ClientError),
 }
@@ -154,7 +161,7 @@ impl RecorderReports {
 
     /// Waits until the file of `episode` is closed, up to 10 s; `None` if no recorder reports anything about it.
     pub fn wait(&self, episode: u64) -> Option<Recorded> {
-        let until = Instant::now() + Duration::from_secs(10);
+        let until = Instant::now() + FILE_CLOSED;
         while Instant::now() < until {
             while let Ok(Some(report)) = self.subscriber.receive() {
                 if report.episode != episode {

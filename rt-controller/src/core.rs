@@ -1,4 +1,4 @@
-//! What decides: one pure step a tick, shared to the letter by the running controller, replay, tests and closed-loop evaluation.
+//! What decides: one pure step a tick. The running controller, replay, tests and evaluations all use this same code.
 //!
 //! [`Core::step`] maps what is known at a tick ([`Input`]) to the angle to command and to what happened ([`Output`]). It has no clock and
 //! no device, does not allocate or lock, and does not fail: every doubt ends with the container upright. What decides that a pour ends,
@@ -69,17 +69,17 @@ pub struct Output {
 /// Counters since the start.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct Counters {
-    /// Ticks done.
+    /// Number of ticks done.
     pub ticks: u64,
-    /// Features used.
+    /// Number of features used.
     pub features: u64,
-    /// Ticks during pours whose newest measurement was stale.
+    /// Number of ticks during pours and recordings whose newest measurement was stale.
     pub stale_features: u64,
-    /// Lost frames bridged.
+    /// Number of lost frames bridged.
     pub bridged_frames: u64,
-    /// Features that came twice or out of order, or with another layout.
+    /// Number of features ignored because they came twice, out of order, or from another layout or clock.
     pub ignored_features: u64,
-    /// What the limits clipped.
+    /// How often each limit changed a request.
     pub clipped: Clipped,
 }
 
@@ -95,7 +95,7 @@ struct Run {
     curve: Option<Curve>,
     ending: Ending,
     settling_since_ns: u64,
-    /// The feature worker that measured when it began.
+    /// Start time of the feature worker that measured when it began, ns.
     worker_epoch_ns: u64,
     counters_before: Counters,
     late_ticks: u32,
@@ -372,7 +372,7 @@ impl Core {
     fn command(&mut self, input: &Input, asked_deg: f32) -> Option<f32> {
         match self.phase {
             Phase::NoRobot => None,
-            // Without a new action, what is left of the last one.
+            // Without a new action, the rest of the last one is carried out.
             Phase::Pouring if asked_deg.is_nan() => Some(self.limiter.step_towards(self.request_deg)),
             Phase::Pouring => Some(self.limiter.step(self.request_deg)),
             Phase::Recording => {

@@ -20,7 +20,7 @@ use crate::core::{Core, Input, MAX_FEATURES, Order, Robot, Settings};
 
 /// First bytes of a journal, its version included.
 const MAGIC: &[u8; 8] = b"decantj2";
-/// Longest entry, bytes: ten times a weight file, the largest thing in a journal.
+/// Longest entry, bytes: more than ten weight files, which are the largest entries.
 const ENTRY_MAX: usize = 128 * 1024;
 /// Size at which a journal stops growing, bytes: about three days of ticks.
 const FILE_MAX: u64 = 2 << 30;
@@ -81,7 +81,7 @@ pub enum JournalError {
         /// The operating system's message.
         what: String,
     },
-    /// Not a journal of this version.
+    /// The file is not a journal of this version.
     #[error("{file}: not a journal of this version; it is written by `rt-controller run` where controller.journal is set")]
     Foreign {
         /// The file.
@@ -128,7 +128,7 @@ impl Writer {
         self.entry(&Entry::Tick(tick))
     }
 
-    /// Passes everything on to the system.
+    /// Passes everything that was added on to the operating system.
     pub fn flush(&mut self) -> std::io::Result<()> {
         self.file.flush()
     }
@@ -148,20 +148,20 @@ impl Writer {
 /// What a replay found.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Replay {
-    /// Ticks replayed.
+    /// Number of ticks replayed.
     pub ticks: u64,
-    /// Pours and recordings that ended in them.
+    /// Results of the pours and recordings that ended in them.
     pub ended: Vec<shared::control::Outcome>,
-    /// Ticks whose target or d differs in any bit.
+    /// Number of ticks whose target or d differs in any bit.
     pub different: u64,
-    /// The first of those.
+    /// Number of the first of those ticks.
     pub first_different: Option<u64>,
     /// The file ends in the middle of an entry.
     pub cut_off: bool,
 }
 
-/// Replays a journal through a new [`Core`] and compares every answer bit by bit. `seen` gets each tick with the answer that
-/// the replay gave.
+/// Replays a journal through a new [`Core`] and compares every answer bit by bit. `seen` is called with each tick and the answer that the
+/// replay gave.
 pub fn replay(path: &Path, mut seen: impl FnMut(&Tick, &crate::core::Output)) -> Result<Replay, JournalError> {
     let file = path.display().to_string();
     let read = |e: std::io::Error| JournalError::Read { file: file.clone(), what: e.to_string() };

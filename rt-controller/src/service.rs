@@ -1,5 +1,5 @@
-//! The controller's ordinary side: answers clients, publishes telemetry, passes ticks on to the journal, and drops what the loop
-//! is done with.
+//! The controller's ordinary side: answers clients, publishes telemetry, passes ticks on to the journal, and drops what the loop no
+//! longer needs.
 //!
 //! Runs in the process's main thread with ordinary scheduling; allocates, but never waits for a disk, because [`crate::disk`] does so. If
 //! it falls behind, the loop goes on and counts what it could not tell. Nothing here ends the process but a signal, or another

@@ -1,7 +1,9 @@
-//! The agent: one frame's V_e in, one relative angle out. The one observation pipeline of the project, used to the letter
-//! by training, evaluation and run time.
+//! The agent: the weights at work in one pour. It turns each observation, which is one frame's V_e and the tilt, into one relative angle.
 //!
-//! Pure and in the controller's loop: no clock, no allocation, no panic, also for input that is not a number.
+//! Training, evaluation and run time all use this file, so that they see the same. When a pour ends is not decided here, but in the
+//! controller's core.
+//!
+//! Pure; runs in the controller's loop: no clock, no allocation, no panic, also for input that is not a number.
 
 use crate::actions::{self, ACTIONS, STAY, Selection};
 use crate::estimator::Hold;
@@ -17,7 +19,7 @@ pub struct Observation {
     pub area_px2: Option<f32>,
     /// Commanded alpha in force when this frame was taken, degrees from upright.
     pub alpha_deg: f32,
-    /// Commanded alpha in force now, degrees; the same, unless the picture is older than the newest command.
+    /// Commanded alpha in force now, degrees; it differs from `alpha_deg` if the picture is older than the newest command.
     pub alpha_now_deg: f32,
 }
 
@@ -297,7 +299,7 @@ mod tests {
         assert!((sum - 2.5).abs() < 0.06, "{sum}");
     }
 
-    /// Protects reproducibility of the sampling policy.
+    /// Protects reproducibility where actions are drawn.
     #[test]
     fn sampling_is_seeded() {
         let mut weights = example();

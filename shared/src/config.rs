@@ -1,7 +1,7 @@
-//! The cell's one TOML file: `config/cell.toml` for the real cell, `config/sim.toml` for the simulated one.
+//! The cell's configuration, one TOML file: `config/cell.toml` for the real cell, `config/sim.toml` for the simulated one.
 //!
-//! Read once at start by every process; allocates. Unknown keys, wrong types and values out of range are refused with
-//! file, key and the allowed range ([`ConfigError`]). Relative paths are relative to the working directory.
+//! Every process reads it once at its start, in an ordinary thread; allocates. Unknown keys, wrong types and values out of range are
+//! refused with file, key and what is allowed ([`ConfigError`]). Relative paths are relative to the working directory.
 
 use std::net::IpAddr;
 use std::path::{Path, PathBuf};
@@ -10,7 +10,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::limits::Limits;
 
-/// What `--config` is if it is not given: the simulated cell, so that a real robot moves only when it is named.
+/// The file that is read without `--config`: the simulated cell, so that a real robot only moves when its file is named.
 pub const DEFAULT_FILE: &str = "config/sim.toml";
 
 /// What a cell's name may be, in words: it becomes part of file names.
@@ -30,27 +30,27 @@ pub enum ConfigError {
     Read {
         /// The file.
         file: String,
-        /// The system's words.
+        /// The operating system's message.
         what: String,
     },
-    /// Not TOML, an unknown key, a missing key or a wrong type.
+    /// The file is not TOML, or has an unknown key, a missing key or a wrong type.
     #[error("{file}: {what}")]
     Parse {
         /// The file.
         file: String,
-        /// Line, key and what was expected.
+        /// The line, the key and what was expected.
         what: String,
     },
-    /// A value outside its range.
+    /// A value is outside its range.
     #[error("{file}: {key} = {value}: allowed is {allowed}")]
     Range {
         /// The file.
         file: String,
         /// The key, with its table.
         key: String,
-        /// What was given.
+        /// The value that was given.
         value: String,
-        /// What is allowed.
+        /// The values that are allowed.
         allowed: String,
     },
 }
@@ -63,7 +63,7 @@ pub struct Config {
     pub cell: CellConfig,
     /// Where frames come from.
     pub camera: CameraConfig,
-    /// Where the lip is in the image, and how liquid is told from background.
+    /// Where the lip is in the image, and how liquid is told from the background.
     pub image: ImageConfig,
     /// The robot and its tilting joint.
     pub robot: RobotConfig,
@@ -75,7 +75,7 @@ pub struct Config {
     pub worker: WorkerConfig,
     /// Episodes.
     pub recording: RecordingConfig,
-    /// The simulated cell's own table; only `simulator` reads it.
+    /// The simulated cell's own table, which only `simulator` reads.
     #[serde(default)]
     pub simulator: Option<toml::Table>,
 }
@@ -119,13 +119,13 @@ pub struct CameraConfig {
     pub fps: f64,
 }
 
-/// How liquid is told from background.
+/// How liquid is told from the background.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum LiquidMethod {
     /// By its colour (`[image] colour`).
     Colour,
-    /// Clear water, by what does not move with the background: wants an even wall behind the lip (docs/VISION.md).
+    /// Clear water, by what does not move with the background. It needs an even card behind the lip (docs/VISION.md).
     Clear,
 }
 
@@ -133,9 +133,9 @@ pub enum LiquidMethod {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct ImageConfig {
-    /// How liquid is told from background.
+    /// How liquid is told from the background.
     pub method: LiquidMethod,
-    /// Region at the lip, px: x, y, width, height.
+    /// The region at the lip that is looked at, px: x, y, width, height.
     pub region_px: [u32; 4],
     /// x-axis of Fig. 4: two points on the glass's top edge, px: x0, y0, x1, y1, from the lip's side into the mouth. The
     /// triangle lies between this direction and that of `y_axis_px`.
@@ -145,7 +145,7 @@ pub struct ImageConfig {
     /// Colour range of the liquid in OpenCV's HSV: h_min, s_min, v_min, h_max, s_max, v_max (h 0-179, s and v 0-255;
     /// h_min > h_max wraps around red).
     pub colour_hsv: [u8; 6],
-    /// Areas below this are no stream, px^2.
+    /// The smallest area that counts as a stream, px^2.
     pub area_min_px2: f32,
 }
 
@@ -159,11 +159,11 @@ pub struct RobotConfig {
     pub joint: Joint,
     /// Angle of that joint when the container is upright (alpha = 0), degrees.
     pub start_joint_deg: f64,
-    /// +1 or -1: sign of the joint's motion for growing alpha.
+    /// +1 or -1: the sign of the joint's motion when alpha grows.
     pub direction: f64,
     /// Largest distance from the start angle at which the program starts, degrees.
     pub start_tolerance_deg: f64,
-    /// First RTDE register used, 24 to 40 (0 to 23 belong to fieldbuses).
+    /// The first RTDE register that is used, 24 to 40; 0 to 23 belong to fieldbuses (RTDE guide).
     pub register_base: u8,
     /// servoj lookahead time, s.
     pub lookahead_s: f64,
@@ -198,26 +198,26 @@ impl Joint {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct ControllerConfig {
-    /// Ticks a second (30 in the paper).
+    /// Ticks a second; 30 in the paper.
     pub rate_hz: f64,
-    /// Core that the loop is pinned to.
+    /// Number of the processor core that the loop is pinned to.
     pub core: usize,
-    /// SCHED_FIFO priority; 0: ordinary scheduling.
+    /// SCHED_FIFO priority of the loop, 1 to 99; 0: ordinary scheduling.
     pub priority: u8,
-    /// The weight file; watched, and taken between pours when it changes.
+    /// The weight file. It is watched, and taken between pours when it changes.
     pub weights: PathBuf,
-    /// Where every tick's inputs are written, for `rt-controller replay`; without it there is no journal.
+    /// The journal, to which every tick's inputs are written for `rt-controller replay`; without this key there is none.
     #[serde(default)]
     pub journal: Option<PathBuf>,
-    /// A pour ends when the newest feature is older than this, ms.
+    /// Largest age of the newest usable measurement during a pour, ms.
     pub stale_feature_ms: u32,
     /// The robot counts as lost when its newest state is older than this, ms.
     pub lost_robot_ms: u32,
-    /// A pour ends after this many frames.
+    /// Largest number of frames of a pour.
     pub max_frames: u32,
-    /// The container is empty after this many frames without flow at the largest tilt.
+    /// Number of frames without flow at the largest tilt after which the container counts as empty.
     pub empty_frames: u32,
-    /// Largest goal that is accepted, ml (the receiving container's size, D_max of eq. 3).
+    /// Largest goal that is accepted, ml: the receiving container's size, D_max of eq. (3).
     pub goal_max_ml: f32,
 }
 
@@ -225,9 +225,9 @@ pub struct ControllerConfig {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct WorkerConfig {
-    /// Core that extraction is pinned to.
+    /// Number of the processor core that the extraction is pinned to.
     pub core: usize,
-    /// SCHED_FIFO priority of extraction; 0: ordinary scheduling.
+    /// SCHED_FIFO priority of the extraction, 1 to 99; 0: ordinary scheduling.
     pub priority: u8,
 }
 
@@ -250,7 +250,7 @@ pub struct RecordingConfig {
     pub image_format: ImageFormat,
     /// JPEG quality, 1 to 100.
     pub jpeg_quality: u8,
-    /// Most images waiting to be written; further ones are dropped and counted.
+    /// Most images that may wait to be written; further ones are dropped and counted.
     pub queue_frames: usize,
 }
 

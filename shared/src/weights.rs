@@ -1,8 +1,8 @@
-//! The weight file: everything that the controller needs to pour, in one postcard blob with a CRC.
+//! The weight file: everything that the controller needs to pour, as postcard bytes with a CRC.
 //!
-//! Read and written by ordinary threads (allocates); the loop only sees a [`Weights`] that was checked here. A file that is
-//! truncated, damaged, of another format version, of another shape or not finite is refused with one line that says which.
-//! Writing is atomic: a temporary file in the same directory, synced, then renamed.
+//! Ordinary threads read and write it, and allocate; the loop only sees [`Weights`] that were checked here. A file that is truncated,
+//! damaged, of another format version, of another shape or not finite is refused with one line that says which of these it is
+//! ([`WeightsError`]). Writing is atomic: a temporary file in the same directory is synced and then renamed.
 //!
 //! ```text
 //! offset  bytes  what
@@ -26,34 +26,38 @@ use crate::estimator::flow::{DELAY_MAX_FRAMES, FlowModel, WayBack};
 use crate::estimator::vessel::Vessel;
 use crate::mlp::{HIDDEN, INPUTS, InputScale, Mlp};
 
-/// Version of the file format; other versions are refused.
+/// Version of the file format; files of other versions are refused.
 pub const FORMAT_VERSION: u32 = 3;
 
+/// First bytes of every weight file.
 const MAGIC: &[u8; 8] = b"decant-w";
+/// Bytes before the payload.
 const HEADER: usize = 24;
+/// Neurons of each layer, inputs first.
 const SHAPE: [usize; 4] = [INPUTS, HIDDEN, HIDDEN, ACTIONS];
-/// Room for the payload; a blob is about 9 kB.
+/// Largest payload, bytes; a usual one is about 9 kB.
 const PAYLOAD_MAX: usize = 64 * 1024;
+/// The checksum at the payload's end.
 const CRC: Crc<u32> = Crc::<u32>::new(&CRC_32_ISO_HDLC);
 
-/// Everything that the controller needs to pour, and where it came from.
+/// Everything that the controller needs to pour, and where it comes from.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Weights {
     /// The network.
     pub network: Mlp,
-    /// Angle of each action, degrees, ascending (Fig. 5, or two actions).
+    /// Angle of each action, degrees a frame, ascending: those of Fig. 5, or only two different ones.
     pub actions_deg: [f32; ACTIONS],
-    /// How outputs become an action.
+    /// How the network's outputs become an action.
     pub selection: Selection,
-    /// How observations become inputs.
+    /// How observations become the network's inputs.
     pub scale: InputScale,
-    /// Area to ml.
+    /// How an area in px^2 becomes a volume in ml.
     pub calibration: Calibration,
     /// How the poured volume is estimated.
     pub estimator: Estimator,
-    /// Frames a second that it was trained for.
+    /// Frames a second that the network was trained for.
     pub rate_hz: f32,
-    /// Where it came from.
+    /// Where the weights come from.
     pub origin: Origin,
     /// Seed of the training, and of [`Selection::Sampled`].
     pub seed: u64,
@@ -62,20 +66,21 @@ pub struct Weights {
 /// How the poured volume is estimated.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
-#[allow(clippy::large_enum_variant)] // a box would put the loop's policy on the heap twice
+#[expect(clippy::large_enum_variant, reason = "there is one of it in a process, and a box would be one more allocation")]
 pub enum Estimator {
     /// The paper's plain sum of the frames' volumes.
     Sum,
-    /// Camera and container geometry, fused by a filter on the flow model.
+    /// What the camera shows and what the container's geometry says, fused by a filter on the flow model.
     Fused {
         /// The fitted model.
         model: FlowModel,
-        /// How the controller tilts back, to know what still flows then.
+        /// How the controller tilts back, which decides how much still flows then.
         back: WayBack,
     },
 }
 
 impl Estimator {
+    /// Names the first value that is outside its range.
     fn check(&self) -> Result<(), String> {
         let Self::Fused { model, back } = self else { return Ok(()) };
         let FlowModel {
@@ -120,20 +125,20 @@ impl Estimator {
     }
 }
 
-/// Where weights came from; the controller only shows it.
+/// Where weights come from; the controller only shows it.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Origin {
-    /// Training method.
+    /// How the network was trained.
     pub method: Method,
-    /// Number of actions trained, 2 or 21.
+    /// Number of actions that were trained, 2 or 21.
     pub actions: u8,
-    /// Episodes trained on.
+    /// Number of episodes that it was trained on.
     pub episodes: u32,
     /// SHA-256 of the training data as the trainer hashes it.
     pub data_sha256: [u8; 32],
 }
 
-/// How the policy was trained.
+/// How a network was trained.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Method {
@@ -143,7 +148,7 @@ pub enum Method {
     Paper,
     /// Behaviour cloning.
     Cloning,
-    /// Flow model, policy search in it, distilled into the network.
+    /// A flow model is fitted, a control law is searched in it, and the law is distilled into the network.
     Best,
     /// Made by hand, for tests and examples.
     Handmade,
@@ -157,7 +162,7 @@ pub enum WeightsError {
     Read {
         /// The file.
         file: String,
-        /// The system's words.
+        /// The operating system's message.
         what: String,
     },
     /// The file cannot be written; what was there before is still there.
@@ -165,39 +170,39 @@ pub enum WeightsError {
     Write {
         /// The file.
         file: String,
-        /// The system's words.
+        /// The operating system's message.
         what: String,
     },
-    /// Not a weight file at all.
+    /// The file is not a weight file.
     #[error("{file}: not a weight file of Decant; train one with `trainer train`")]
     Foreign {
         /// The file.
         file: String,
     },
-    /// Written by another version of the format.
+    /// The file has another version of the format.
     #[error("{file}: format version {found}, this program reads {FORMAT_VERSION}; train again with this version")]
     Version {
         /// The file.
         file: String,
-        /// Version in the file.
+        /// The version in the file.
         found: u32,
     },
-    /// A network of another shape.
+    /// The file holds a network of another shape.
     #[error("{file}: a network of shape {found:?}, this program runs {SHAPE:?}; train again with this version")]
     Shape {
         /// The file.
         file: String,
-        /// Shape in the file.
+        /// The shape in the file, neurons of each layer.
         found: [usize; 4],
     },
-    /// Shorter or longer than its header says.
+    /// The file is shorter or longer than its header says.
     #[error("{file}: truncated or with bytes too many: {found} bytes where the header says {expected}; copy it again")]
     Length {
         /// The file.
         file: String,
-        /// Bytes in the file.
+        /// Number of bytes in the file.
         found: usize,
-        /// Bytes that the header promises.
+        /// Number of bytes that the header announces.
         expected: usize,
     },
     /// The checksum does not match, or the contents make no sense.
@@ -206,7 +211,7 @@ pub enum WeightsError {
         /// The file.
         file: String,
     },
-    /// A value that is not finite or out of its range.
+    /// A value is not finite or out of its range.
     #[error("{file}: {what}; train again")]
     Value {
         /// The file.
@@ -217,7 +222,7 @@ pub enum WeightsError {
 }
 
 impl Weights {
-    /// Index of the action that tilts back: the one nearest to -3.2 degrees a frame.
+    /// Index of the action that tilts back: the one nearest to [`BACK_DEG_PER_FRAME`].
     pub fn back_action(&self) -> usize {
         nearest_action(&self.actions_deg, BACK_DEG_PER_FRAME)
     }
@@ -292,23 +297,23 @@ impl Weights {
             std::fs::rename(&temporary, path)
         };
         put().map_err(|e| {
-            // The half-written temporary file is of no use to anybody; that it cannot be removed changes nothing.
+            // Nobody needs the half-written temporary file, and it does no harm if it cannot be removed.
             let _ = std::fs::remove_file(&temporary);
             WeightsError::Write { file, what: e.to_string() }
         })
     }
 
-    /// Identity: the first 8 bytes of the SHA-256 of the file's bytes, big-endian; 0: they cannot be written.
+    /// The identity: the first 8 bytes of the SHA-256 of the file's bytes, as a big-endian number; 0 if there are no such bytes.
     pub fn id(&self) -> u64 {
         self.to_bytes().map_or(0, |bytes| Sha256::digest(&bytes)[..8].iter().fold(0, |id, b| id << 8 | u64::from(*b)))
     }
 
-    /// [`Weights::id`] as people and files name it: 16 hexadecimal digits.
+    /// The identity as people and files write it: [`Weights::id`] as 16 hexadecimal digits.
     pub fn identity(&self) -> String {
         format!("{:016x}", self.id())
     }
 
-    /// Which value must not go to the robot, if any.
+    /// Names the first value that must not reach the robot.
     fn check(&self) -> Result<(), String> {
         if let Some(k) = self.network.parameters().position(|p| !p.is_finite()) {
             return Err(format!("parameter {k} of the network is not finite"));

@@ -1,4 +1,4 @@
-//! `rt-controller abort`: upright at once. Ordinary process.
+//! `rt-controller abort`: brings the container upright at once, and waits until it is. A short ordinary process; every failure is one line.
 
 use std::path::PathBuf;
 use std::time::{Duration, Instant};
@@ -9,6 +9,11 @@ use shared::exit::{self, Failure, OrExit as _, failure};
 use shared::messages::Phase;
 
 use crate::client::Client;
+
+/// How long the command waits for the container to be upright: the way back from the largest tilt takes about 2 s.
+const UPRIGHT: Duration = Duration::from_secs(20);
+/// Pause between two looks at the controller's state. Chosen by hand; no measurement is recorded.
+const BEAT: Duration = Duration::from_millis(50);
 
 /// Command-line arguments.
 #[derive(Debug, clap::Args)]
@@ -29,7 +34,7 @@ pub fn run(args: &Args) -> Result<(), Failure> {
         _ => return Err(failure(exit::UNREACHABLE, crate::client::ClientError::Version)),
     }
     let tolerance_deg = config.robot.start_tolerance_deg;
-    let until = Instant::now() + Duration::from_secs(20);
+    let until = Instant::now() + UPRIGHT;
     while Instant::now() < until {
         let status = client.status().or_exit(exit::UNREACHABLE)?;
         match status.phase {
@@ -38,7 +43,7 @@ pub fn run(args: &Args) -> Result<(), Failure> {
                 return Ok(());
             }
             Phase::NoRobot => return Err(failure(exit::FAILED, status.hindrance)),
-            _ => std::thread::sleep(Duration::from_millis(50)),
+            _ => std::thread::sleep(BEAT),
         }
     }
     Err(failure(exit::FAILED, "not upright after 20 s: look at the robot"))

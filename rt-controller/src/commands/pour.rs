@@ -1,4 +1,5 @@
-//! `rt-controller pour ML`: asks the running controller for a pour, shows it, ends with its result. Ordinary process.
+//! `rt-controller pour ML`: asks the running controller for a pour, shows its progress, and ends with its result. A short ordinary
+//! process; every failure is one line.
 
 use shared::config::Config;
 use shared::control::{EndReason, Outcome, Reply, Request};
@@ -26,7 +27,7 @@ pub fn run(args: &Args) -> Result<(), Failure> {
     ended(&outcome)
 }
 
-/// Fails unless the order reached its own end.
+/// Fails unless the pour or recording came to its own end.
 pub(crate) fn ended(outcome: &Outcome) -> Result<(), Failure> {
     match outcome.reason {
         EndReason::Done => Ok(()),
@@ -34,7 +35,7 @@ pub(crate) fn ended(outcome: &Outcome) -> Result<(), Failure> {
     }
 }
 
-/// Gives an order that moves the container and follows it to its end.
+/// Gives an order that moves the container, follows it to its end, and waits for the recorder's report, if there is a recorder.
 pub(crate) fn order(cell: &str, request: &Request) -> Result<(Outcome, Option<client::Recorded>), Failure> {
     let client = Client::connect(cell).or_exit(exit::UNREACHABLE)?;
     let recorder = client::RecorderReports::open(cell).ok();
@@ -53,7 +54,7 @@ pub(crate) fn order(cell: &str, request: &Request) -> Result<(Outcome, Option<cl
     Ok((outcome, recorder.and_then(|r| r.wait(episode))))
 }
 
-/// Prints how it ended.
+/// Prints how the pour ended.
 fn report(outcome: &Outcome, recorded: Option<client::Recorded>, json: bool) {
     if json {
         let file = recorded.as_ref().and_then(|r| r.file.as_ref().ok());

@@ -1,4 +1,5 @@
-//! `rt-controller record`: runs the Gaussian curve of eq. (1) and produces one episode. Ordinary process.
+//! `rt-controller record`: runs the Gaussian curve of eq. (1) and produces one episode. A short ordinary process; every failure is one
+//! line.
 
 use std::io::{BufRead, IsTerminal, Write};
 use std::path::Path;
@@ -12,7 +13,7 @@ use shared::gaussian_curve::Curve;
 use super::pour;
 use crate::client::Common;
 
-/// Alpha at the curve's first and last moment, degrees: a start without a jump.
+/// Alpha at the curve's first and last moment if no beta is given, degrees: small enough for a start without a jump.
 const END_DEG: f32 = 0.05;
 
 /// Command-line arguments.
@@ -70,7 +71,7 @@ pub fn run(args: &Args) -> Result<(), Failure> {
     Ok(())
 }
 
-/// Asks a person, if one is there; an empty line means later.
+/// Asks a person for the weight on the scale, if there is one at the terminal; an empty line means later.
 fn ask_weight() -> Option<f64> {
     let stdin = std::io::stdin();
     if !stdin.is_terminal() {

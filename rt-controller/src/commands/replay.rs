@@ -1,4 +1,5 @@
-//! `rt-controller replay FILE`: runs a journal through the same core again and compares every answer. Ordinary process.
+//! `rt-controller replay FILE`: runs a journal through the same core again and compares every answer. A short ordinary process; every
+//! failure is one line.
 
 use std::path::PathBuf;
 

@@ -1,4 +1,5 @@
-//! `rt-controller status`: the running controller's state, counters and histograms. Ordinary process.
+//! `rt-controller status`: shows the running controller's state, counters and histograms. A short ordinary process; every failure is one
+//! line.
 
 use shared::config::Config;
 use shared::control::Status;
@@ -26,6 +27,7 @@ pub fn run(args: &Args) -> Result<(), Failure> {
     Ok(())
 }
 
+/// Prints the status for people.
 fn print(s: &Status) {
     println!("phase      {}", serde_json::to_value(s.phase).ok().and_then(|v| v.as_str().map(String::from)).unwrap_or_default());
     if !s.hindrance.is_empty() {

@@ -1,4 +1,5 @@
-//! `rt-controller step`: the controller core as a filter, so that any other simulator can drive it. Ordinary process.
+//! `rt-controller step`: runs the controller's core as a filter, so that any other simulator can drive it. An ordinary process; every
+//! failure is one line. A simulator in Rust can call the core itself: see `examples/drive_core.rs`.
 
 use std::io::{BufRead, Write};
 use std::path::PathBuf;
@@ -51,14 +52,14 @@ pub fn run(args: &Args) -> Result<(), Failure> {
             confidence: 1.0,
             ..Feature::default()
         };
-        // The robot is taken to be where it was sent: its lag is the other simulator's business.
+        // The robot is taken to be where it was sent; a lag is for the other simulator to add.
         let robot = Robot { hindrance: None, alpha_deg, at_ns: now_ns };
         let output = core.step(&Input { now_ns, features: &[feature], robot, order });
         let before_deg = alpha_deg;
         alpha_deg = output.telemetry.alpha_deg;
         (output, alpha_deg - before_deg)
     };
-    // Two frames before the first line: the robot becomes ready, then the goal is set.
+    // Two frames come before the first line: in one the robot becomes ready, in the other the goal is set.
     frame(0.0, None);
     let (started, _) = frame(0.0, Some(Order::Pour { episode: 1, goal_ml: args.goal }));
     if let Some(Err(refusal)) = started.ordered {

@@ -27,7 +27,7 @@ const UPPER_REGISTERS: [(u32, u32); 2] = [(3, 9), (5, 3)];
 const CB3_HZ: f64 = 125.0;
 /// Control cycles a second of an e-Series robot (RTDE guide).
 const E_SERIES_HZ: f64 = 500.0;
-/// How long one socket is read while the other one waits.
+/// How long one socket is read while the other one waits. Chosen by hand; no measurement is recorded.
 const GLANCE: Duration = Duration::from_millis(20);
 
 /// Connects, checks everything that can be checked, starts the program, and gives a session whose program waits for targets.
@@ -97,7 +97,7 @@ fn ready_for_program(options: &LinkOptions, state: &RobotState) -> Result<(), Li
         RUNTIME_PAUSING | RUNTIME_PAUSED => return Err(LinkError::ProgramPaused { address }),
         _ => return Err(LinkError::ProgramRunning { address }),
     }
-    // Written so that an angle that is not a number is too far.
+    // The comparison is written so that an angle that is not a number is too far.
     if f64::from(state.alpha_deg.abs()) <= options.start_tolerance_deg { Ok(()) } else { Err(too_far(options, state)) }
 }
 
@@ -109,7 +109,7 @@ fn too_far(options: &LinkOptions, state: &RobotState) -> LinkError {
 /// The connection that carries the program; closed when dropped.
 struct Upload {
     stream: TcpStream,
-    /// Bytes of the robot's state stream read and thrown away.
+    /// Bytes of the robot's state stream that were read and thrown away.
     read: usize,
 }
 

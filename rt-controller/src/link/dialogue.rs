@@ -35,7 +35,7 @@ impl Dialogue {
         Ok(Self { at, stream, inbox: Inbox::new(), said: String::new() })
     }
 
-    /// Sends a request and waits for its answer, which `read` decodes; `None` of `read` means that the answer is no such answer.
+    /// Sends a request and waits for its answer, which `read` decodes; `read` gives `None` for bytes that are no such answer.
     pub fn ask<T>(&mut self, kind: u8, payload: &[&[u8]], doing: &'static str, read: impl Fn(&[u8]) -> Option<T>) -> Result<T, LinkError> {
         let mut buffer = [0; REQUEST_MAX];
         let request = wire::encode(kind, payload, &mut buffer).unwrap_or_default();

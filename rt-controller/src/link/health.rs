@@ -1,7 +1,7 @@
 //! Whether the robot may be moved now, and if not, why: a pure function of the newest state and the clock.
 //!
-//! Runs in the controller's loop each tick, after [`Session::poll`](super::Session::poll); allocates nothing. Protocol
-//! background: robot_mode, safety_mode, runtime_state and the status bits of the RTDE guide.
+//! Runs in the controller's loop in each tick, after [`Session::poll`](super::Session::poll); does not allocate or fail. The RTDE guide
+//! explains robot_mode, safety_mode, runtime_state and the status bits.
 
 use shared::control::EndReason;
 

@@ -1,9 +1,9 @@
-//! A connected robot in the controller's loop: drains what the robot sent, writes one target a tick.
+//! A connected robot in the controller's loop: reads what the robot sent, and writes one target a tick.
 //!
-//! Made by [`connect`](super::connect()) on an ordinary thread, which also drops it. `poll` and `send` never block, never
-//! allocate and never panic: the one buffer holds the protocol's largest packet. Whatever goes wrong on the socket ends the
-//! session with a [`Lost`]; there is no repair in place. Dropping it asks the program to come upright and end, in case it can
-//! still hear; if it cannot, it does so by itself 100 ms after the last target.
+//! [`connect`](super::connect()) makes it on an ordinary thread, which also drops it. `poll` and `send` never block, allocate or panic:
+//! the one buffer holds the protocol's largest packet. Every error of the socket ends the session with a [`Lost`]; nothing is repaired in
+//! place. Dropping a session asks the program to come upright and end. If the program cannot receive that, it does so by itself 100 ms
+//! after the last target.
 
 use std::io::{ErrorKind, Read, Write};
 use std::net::{Shutdown, TcpStream};
@@ -67,7 +67,7 @@ impl Session {
         self.version
     }
 
-    /// The newest state; old if [`Session::poll`] was not called.
+    /// The newest state; it is only as new as the last [`Session::poll`].
     pub fn state(&self) -> &RobotState {
         &self.state
     }
@@ -77,7 +77,7 @@ impl Session {
         self.texts
     }
 
-    /// Takes everything that has arrived and gives the newest state; once a tick, before [`super::health::check`].
+    /// Takes everything that has arrived and gives the newest state. Call it once a tick, before [`super::health::check`].
     pub fn poll(&mut self, now_ns: u64) -> Result<&RobotState, Lost> {
         for _ in 0..MOST_READS {
             let space = self.inbox.space();
@@ -98,6 +98,7 @@ impl Session {
         Ok(&self.state)
     }
 
+    /// Reads the whole packets that have arrived into the state.
     fn take_packets(&mut self, now_ns: u64) -> Result<(), Lost> {
         while let Some(packet) = self.inbox.next_packet().map_err(|_| Lost::Protocol)? {
             match packet.kind {
@@ -115,7 +116,7 @@ impl Session {
                     }
                 }
                 wire::TEXT => self.texts += 1,
-                // An answer that came late, or a type of a newer protocol: not ours to judge.
+                // Answers that came late, and types of newer protocols, do not matter here.
                 _ => {}
             }
         }
@@ -146,7 +147,7 @@ impl Session {
 
 impl Drop for Session {
     fn drop(&mut self) {
-        // Unread bytes at the close would make the kernel abort the connection, and this last target with it.
+        // If bytes were left unread, the kernel would reset the connection, and this last target would be lost with it.
         let _ = self.poll(now_ns());
         let stopped = self.state.runtime_state != RUNTIME_PLAYING || health::stopped_for_safety(&self.state).is_some();
         let _ = self.send(if stopped { Mode::Abandon } else { Mode::Stop }, 0.0);
