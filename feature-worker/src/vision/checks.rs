@@ -44,7 +44,9 @@ const RIM_BLURRED_PX: f32 = 5.6;
 /// Checks the light, and that the picture is not the same as the last one.
 #[derive(Default)]
 pub(crate) struct LightCheck {
+    /// Hash of the last picture's bytes; none before the first.
     last_hash: Option<u64>,
+    /// Mean grey level of the last picture.
     mean_level: f32,
 }
 

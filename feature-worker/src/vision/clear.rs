@@ -66,6 +66,7 @@ const STEEP_LEAST: f32 = 4.0;
 pub(crate) struct ClearWater {
     /// Pixels of the full picture per pixel of the small one.
     scale: f32,
+    /// Size of the small region, px.
     size: Size,
     /// In the small region.
     axes: Axes,

@@ -48,7 +48,9 @@ const DIFFERENCE_LEAST: f32 = 12.0;
 
 /// Finds the stream of a coloured liquid in the pictures of one camera.
 pub(crate) struct ColouredLiquid {
+    /// Relative to the region.
     axes: Axes,
+    /// The rays along which the region is sampled.
     grid: RayGrid,
     /// The first of the two fixed-point maps from rays to the region, as `cv::convertMaps` makes them.
     map_a: Mat,

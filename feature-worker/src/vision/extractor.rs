@@ -50,8 +50,11 @@ pub enum ExtractError {
 
 /// Measures V_e in the images of one camera.
 pub struct Extractor {
+    /// Width and height that images must have, px.
     size_px: [u32; 2],
+    /// The region in the image, px.
     region: Rect,
+    /// A smaller triangle is no stream, px^2.
     area_min_px2: f32,
     /// Relative to the region.
     axes: Axes,
@@ -62,6 +65,7 @@ pub struct Extractor {
     line: LineFinder,
     /// The coarse outer edge on the rays, px in the region, from the x-axis to the y-axis. Kept from frame to frame.
     edges: Vec<[f32; 2]>,
+    /// Time spent in the stages of the last measurement.
     stages: Stages,
 }
 

@@ -67,7 +67,9 @@ type Hsv = [u8; 3];
 
 /// Pixels of one place, and how many of them fall into each bin.
 struct Pixels {
+    /// In the order in which they were seen.
     pixels: Vec<Hsv>,
+    /// Their number in each bin.
     bins: Vec<u32>,
 }
 
@@ -101,19 +103,24 @@ fn bin([h, s, v]: Hsv) -> usize {
 
 /// Learns the liquid's colour from the pictures of one pour.
 pub struct ColourLearner {
+    /// In the whole picture.
     axes: Axes,
     /// Right over the lip.
     near: Pixels,
     /// Far from the lip.
     far: Pixels,
+    /// The last picture in hue, saturation and value.
     hsv: Mat,
 }
 
 /// The range of one number over the liquid's pixels.
 #[derive(Debug, Clone, Copy)]
 struct Quantiles {
+    /// Nearly the least.
     low: f32,
+    /// The median.
     middle: f32,
+    /// Nearly the largest.
     high: f32,
 }
 

@@ -65,6 +65,7 @@ struct Pose {
 
 /// The dry background as far as it is remembered.
 pub(super) struct Background {
+    /// Size of the pictures, px.
     size: Size,
     /// Side of the memory, px.
     side: usize,
@@ -77,8 +78,9 @@ pub(super) struct Background {
     /// The point for the motion in each square, as the squares lie in the memory.
     points: Vec<Option<MotionPoint>>,
     motion: MotionFinder,
+    /// How the memory lies in the last picture.
     now: Pose,
-    /// In the picture with which pictures are compared.
+    /// How the memory lies in the picture with which pictures are compared.
     reference: Pose,
     /// Pictures that were remembered.
     frame: usize,
@@ -339,7 +341,9 @@ impl Background {
 struct MemoryRow {
     /// Place of its first pixel in the picture, px.
     from: [f32; 2],
+    /// From the window to the picture.
     map: RigidMap,
+    /// Side of the window, px.
     side: f32,
 }
 

@@ -52,6 +52,7 @@ const EDGE_REACH: usize = 2;
 
 /// The lines that are tried, and where each lies on the rays.
 pub(super) struct Lines {
+    /// In the small region.
     axes: Axes,
     /// Each line's cuts with the x-axis and the y-axis, px.
     legs_px: Vec<[f32; 2]>,

@@ -95,6 +95,7 @@ struct Motion {
 /// A motion with what it leaves.
 #[derive(Debug, Clone, Copy)]
 struct Fit {
+    /// The motion itself.
     motion: Motion,
     /// Exposure against the memory.
     gain: f32,

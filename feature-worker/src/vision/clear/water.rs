@@ -157,6 +157,7 @@ pub(super) enum Verdict {
 
 /// What is known of the water from the frames so far.
 pub(super) struct Water {
+    /// The stream as it was last seen, if there is one.
     stream: Option<Stream>,
     /// Where the stream last was: cuts with the axes, px of the small picture.
     last_legs_px: [f32; 2],
