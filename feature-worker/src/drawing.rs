@@ -18,7 +18,7 @@ const CAPTION_PX: i32 = 20;
 /// Quality of JPEG pictures, 0 to 100. Chosen by hand; no measurement is recorded.
 const JPEG_QUALITY: i32 = 80;
 
-/// A copy of a frame in BGR, whatever its format.
+/// A copy of a frame in BGR, whatever the frame's format is.
 pub fn to_bgr(frame: &Frame) -> Result<Mat, opencv::Error> {
     let (rows, columns) = (frame.header.height_px as i32, frame.header.width_px as i32);
     let mut bgr = Mat::default();

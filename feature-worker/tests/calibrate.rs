@@ -24,8 +24,8 @@ fn calibrate(config: &Path, picture: &Path, more: &[&str]) -> std::io::Result<Ou
     command.arg("calibrate").args(more).arg("--config").arg(config).arg("--picture").arg(picture).output()
 }
 
-/// Protects the five minutes: from one pour the corner is found within 2 px and the axes within 1 degree, the liquid's colour
-/// within a range that measures the pour, and the section is written while the rest of the file, comments too, stays as it was.
+/// Protects the five minutes that calibration may take: from one pour the corner is found within 2 px and the axes within 1 degree, and the
+/// liquid's colour as a range that measures the pour. The section is written, and the rest of the file, comments too, stays as it was.
 #[test]
 fn one_pour_is_enough() -> Outcome {
     let directory = tempfile::tempdir()?;
@@ -60,7 +60,7 @@ fn one_pour_is_enough() -> Outcome {
     Ok(())
 }
 
-/// Protects people whose container is not found: coordinates are taken as given, and nothing is written without --write.
+/// Protects people whose container is not found: coordinates are taken as they are given, and nothing is written without --write.
 #[test]
 fn coordinates_are_taken_and_nothing_is_written_unasked() -> Outcome {
     let directory = tempfile::tempdir()?;
@@ -77,8 +77,8 @@ fn coordinates_are_taken_and_nothing_is_written_unasked() -> Outcome {
     Ok(())
 }
 
-/// Protects people from a calibration that means nothing: frames without edges, and a pour without liquid, are refused with what to
-/// do instead.
+/// Protects people from a calibration that means nothing: frames without edges and a pour without liquid are refused, and the error says
+/// what to do instead.
 #[test]
 fn nothing_to_see_is_said() -> Outcome {
     let flat = Mat::new_rows_cols_with_default(480, 640, opencv::core::CV_8UC3, opencv::core::Scalar::all(128.0))?;

@@ -117,7 +117,7 @@ pub struct Fit {
 }
 
 /// What the episodes say about the camera before anything is fitted.
-struct Camera {
+struct CameraFacts {
     noise: FrameNoise,
     /// Whether the frames have next to no noise.
     clean: bool,
@@ -125,7 +125,7 @@ struct Camera {
     linear: Option<f64>,
 }
 
-impl Camera {
+impl CameraFacts {
     fn new(episodes: &[TrainingEpisode], prepared: &[PreparedEpisode]) -> Self {
         let noise = FrameNoise::of(prepared);
         let clean = noise.area_sd < CLEAN_AREA_SD;
@@ -167,7 +167,7 @@ pub fn fit(episodes: &[TrainingEpisode]) -> Fit {
     let mut prepared: Vec<PreparedEpisode> = episodes.iter().map(PreparedEpisode::new).collect();
     let area_min_px2 = prepared.iter().flat_map(|p| &p.area_px2).copied().filter(|a| *a > 0.0).fold(f64::INFINITY, f64::min);
     let area_min_px2 = if area_min_px2.is_finite() { area_min_px2 } else { 1.0 };
-    let camera = Camera::new(episodes, &prepared);
+    let camera = CameraFacts::new(episodes, &prepared);
     let mut stage = camera.wide_stage();
     let held = camera.linear.map(|log_c| HeldCalibration { log_c, exponent: 1.0, tilt_slope: 0.0 });
 
@@ -204,7 +204,7 @@ fn beginning(prepared: &[PreparedEpisode], episodes: &[TrainingEpisode], log_wei
 }
 
 /// The best of the first solutions, from several beginnings.
-fn best_beginning(problem: &Problem<'_>, episodes: &[TrainingEpisode], camera: &Camera) -> Unknowns {
+fn best_beginning(problem: &Problem<'_>, episodes: &[TrainingEpisode], camera: &CameraFacts) -> Unknowns {
     let begin = |log_weir: f64, (exponent, even_share): (f64, f64)| {
         let mut at = beginning(problem.episodes, episodes, log_weir, exponent, even_share);
         let cost = problem.solve(&mut at, FIRST_EFFORT);
@@ -244,7 +244,7 @@ fn linear(episodes: &[TrainingEpisode]) -> Option<f64> {
 }
 
 /// Model, calibration and their uncertainties from what was found: the newest gain and delay count where they have changed.
-fn conclude(found: &Unknowns, camera: &Camera, area_min_px2: f64, wide: &DMatrix<f64>, narrow: &DMatrix<f64>) -> Fit {
+fn conclude(found: &Unknowns, camera: &CameraFacts, area_min_px2: f64, wide: &DMatrix<f64>, narrow: &DMatrix<f64>) -> Fit {
     let gains = found.of_episodes(CAMERA_GAIN);
     let (log_c, exponent) = (found.shared[LOG_C] - noise::newest_gain(&gains), found.shared[AREA_EXPONENT]);
     let mut model = model_of(&found.shared);

@@ -10,7 +10,7 @@ use serde_json::{Value, json};
 use shared::exit::{self, Failure, OrExit as _};
 use trainer::method::policy_gradient::{DELTA, KERAS_CLIP};
 use trainer::report::page::{figure, page, table};
-use trainer::report::plot::{Series, plot};
+use trainer::report::plot::{PlotSeries, plot};
 
 use crate::paper_section_4::{KAPPAS, Run, run_once, triangle};
 
@@ -77,13 +77,14 @@ impl Form {
     /// Its two figures: convergence, and goal against poured volume.
     fn figures(&self) -> String {
         let (runs, name) = (&self.runs, self.name);
-        let curves: Vec<Series> = runs.iter().enumerate().map(|(k, r)| Series::line(&format!("seed {}", k + 1), r.curve.clone())).collect();
+        let curves: Vec<PlotSeries> =
+            runs.iter().enumerate().map(|(k, r)| PlotSeries::line(&format!("seed {}", k + 1), r.curve.clone())).collect();
         let converges =
             figure(&plot("Adam step", "mean absolute error in ml", &curves, true), &format!("Convergence, cross-entropy {name}."));
-        let mut dots = vec![Series::reference("poured = goal", vec![(0.0, 0.0), (160.0, 160.0)])];
+        let mut dots = vec![PlotSeries::reference("poured = goal", vec![(0.0, 0.0), (160.0, 160.0)])];
         let beside =
             |k: usize, r: &Run| r.pours.iter().map(|(goal, poured)| (goal + (k as f64 - (runs.len() - 1) as f64 / 2.0), *poured)).collect();
-        dots.extend(runs.iter().enumerate().map(|(k, r)| Series::dots(&format!("seed {}", k + 1), beside(k, r))));
+        dots.extend(runs.iter().enumerate().map(|(k, r)| PlotSeries::dots(&format!("seed {}", k + 1), beside(k, r))));
         converges
             + &figure(
                 &plot("goal in ml (seeds side by side)", "poured in ml", &dots, true),

@@ -9,7 +9,7 @@ use std::time::{Duration, Instant};
 use serde_json::{Value, json};
 use shared::os::now_ns;
 use trainer::report::page;
-use trainer::report::plot::{Series, plot};
+use trainer::report::plot::{PlotSeries, plot};
 
 use super::cell_run::pour_until;
 use super::measured::{Measured, facts_html};
@@ -115,7 +115,7 @@ fn facts(elapsed: Duration, ticks: &TickTimes, latencies: &[f64], lost_by_cyclic
 }
 
 fn html(facts: &[String], readings: &[Reading], ticks: &TickTimes, latencies: &Vec<f64>) -> String {
-    let line = |name: &str, pick: fn(&Reading) -> f64| Series::line(name, readings.iter().map(|r| (r.minutes, pick(r))).collect());
+    let line = |name: &str, pick: fn(&Reading) -> f64| PlotSeries::line(name, readings.iter().map(|r| (r.minutes, pick(r))).collect());
     let memory = [line("rt-controller", |r| r.controller.resident_mib), line("feature-worker", |r| r.worker.resident_mib)];
     let files = [line("rt-controller", |r| r.controller.files as f64), line("feature-worker", |r| r.worker.files as f64)];
     let figures = [

@@ -1,7 +1,7 @@
 //! Percentiles of a measurement, and its histograms for the page. Pure, any thread; allocates; cannot fail.
 
 use trainer::report::page;
-use trainer::report::plot::{Series, plot};
+use trainer::report::plot::{PlotSeries, plot};
 
 /// Steps of a histogram; one more holds what is beyond.
 const STEPS: usize = 60;
@@ -29,7 +29,7 @@ pub fn median(values: impl Iterator<Item = f64>) -> f64 {
 pub fn histograms(title: &str, caption: &str, columns: &[(&str, &Vec<f64>)]) -> String {
     let end = columns.iter().map(|(_, v)| summary(v)[3]).filter(|x| x.is_finite()).fold(1e-3, f64::max) * 1.05;
     let width = end / STEPS as f64;
-    let series: Vec<Series> = columns
+    let series: Vec<PlotSeries> = columns
         .iter()
         .map(|(name, values)| {
             let mut counts = [0.0; STEPS + 1];
@@ -37,7 +37,7 @@ pub fn histograms(title: &str, caption: &str, columns: &[(&str, &Vec<f64>)]) -> 
                 counts[((v / width) as usize).min(STEPS)] += 100.0 / values.len() as f64;
             }
             let steps = counts.iter().enumerate().flat_map(|(k, c)| [(k as f64 * width, *c), ((k + 1) as f64 * width, *c)]);
-            Series::line(name, steps.collect())
+            PlotSeries::line(name, steps.collect())
         })
         .collect();
     page::figure(&plot(title, "% of n", &series, true), caption)

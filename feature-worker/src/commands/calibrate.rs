@@ -25,10 +25,10 @@ use crate::vision::{Axes, AxesError, ColourError, ColourLearner, Corner, Extract
 
 mod section;
 
-/// Most pictures that are kept for learning and for the picture. Chosen by hand: some hundred megabytes.
+/// Most pictures that are kept for learning and for the drawn picture. Chosen by hand: about 140 MB at 640 x 480 px.
 const KEEP_PICTURES: usize = 150;
-/// The region's left border, top, right border and bottom from the lip, px of a picture 640 px wide. Chosen by hand, so that the largest
-/// stream fits in.
+/// The region's left border, top, right border and bottom from the lip, px of a picture 640 px wide. Chosen by hand; no
+/// measurement is recorded.
 const REGION_PX: [f32; 4] = [-40.0, -236.0, 380.0, 50.0];
 
 /// Command-line arguments.
@@ -40,7 +40,8 @@ Show one whole pour: dry, tilting, flowing, back. The section is printed; --writ
 it names before you trust it: red must lie on the glass's top edge, green on its left side, white on the liquid's outline."
 )]
 pub struct Args {
-    /// Images, a video or a pattern of one pour; without any, the configured camera (of a running worker: its frames).
+    /// Images, a video, or a file name pattern of one pour. Without any, the configured camera is watched; beside a running worker, the
+    /// worker's frames are.
     input: Vec<PathBuf>,
     /// The cell's configuration.
     #[arg(long, default_value = shared::config::DEFAULT_FILE)]
@@ -48,7 +49,7 @@ pub struct Args {
     /// How long to watch a live camera.
     #[arg(long, default_value_t = 15)]
     seconds: u64,
-    /// The corner where top edge and left side meet, px: X,Y.
+    /// The corner where the top edge and the left side meet, px: X,Y.
     #[arg(long, value_parser = parse_point)]
     lip: Option<[f32; 2]>,
     /// A point of the top edge, further into the mouth, px: X,Y.
@@ -63,13 +64,13 @@ pub struct Args {
     /// Write the section into the configuration.
     #[arg(long)]
     write: bool,
-    /// Where the picture for the eye goes.
+    /// Where to write the picture that a person checks.
     #[arg(long, default_value = "out/calibration.png")]
     picture: PathBuf,
-    /// Correct the axes by clicks in a page on this machine.
+    /// Correct the axes by clicks in a web page on this machine.
     #[arg(long)]
     page: bool,
-    /// The page's port on 127.0.0.1; 0: any free one.
+    /// The page's port on 127.0.0.1. With 0 any free port is taken.
     #[arg(long, default_value_t = 8643)]
     port: u16,
 }
@@ -115,7 +116,7 @@ impl Pour {
             self.pictures.push(bgr);
         }
         if self.pictures.len() > KEEP_PICTURES {
-            // Every second one, and from now on half as many.
+            // Every second picture is dropped, and from now on half as many are kept.
             let mut index = 0;
             self.pictures.retain(|_| {
                 index += 1;

@@ -24,16 +24,16 @@ use crate::vision::{Extractor, Image, Measurement};
 and a picture of every N-th frame with region, axes, outline, edge points, line and triangle drawn on it."
 )]
 pub struct Args {
-    /// Images, one video, or one pattern of an image sequence.
+    /// Images, one video, or one file name pattern of an image sequence.
     #[arg(required = true)]
     input: Vec<PathBuf>,
-    /// The cell's configuration; its [image] table is what is tried.
+    /// The cell's configuration. Its [image] table is what is tried.
     #[arg(long, default_value = shared::config::DEFAULT_FILE)]
     config: PathBuf,
-    /// Directory of the pictures and the CSV.
+    /// Directory for the pictures and the CSV.
     #[arg(long, default_value = "out/inspect")]
     out: PathBuf,
-    /// Write the picture of every N-th frame; 0: none.
+    /// Write the picture of every N-th frame. With 0 none is written.
     #[arg(long, default_value_t = 1)]
     every: u64,
     /// Print a summary as JSON.

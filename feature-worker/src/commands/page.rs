@@ -11,7 +11,7 @@ use tiny_http::{Header, Response, Server};
 /// How long one wait for a request lasts. Chosen by hand: a request to stop is noticed within a tenth of a second.
 const WAIT: Duration = Duration::from_millis(100);
 
-/// A body with its content type; none: there is no such page.
+/// A body with its content type. None means that there is no such page.
 pub(super) type Answer = Option<(Vec<u8>, &'static str)>;
 
 /// An answer in HTML.
@@ -40,7 +40,7 @@ pub(super) struct Page {
 }
 
 impl Page {
-    /// Listens on `port` of 127.0.0.1; 0 is any free one.
+    /// Listens on `port` of 127.0.0.1. With 0 any free port is taken. A port that is in use is an error that says so.
     pub(super) fn open(port: u16) -> Result<Self, Failure> {
         let server = Server::http(("127.0.0.1", port))
             .map_err(|e| failure(exit::FAILED, format!("port {port} on 127.0.0.1: {e}; give another --port")))?;
@@ -62,7 +62,7 @@ impl Page {
             if request.as_reader().read_to_string(&mut body).is_err() {
                 body.clear();
             }
-            // A browser that went away is no fault of ours.
+            // A browser that goes away before the answer is no error.
             let _ = match answer(&path, &body) {
                 Some((body, kind)) => request.respond(response(body, kind)),
                 None => request.respond(Response::from_data("not here").with_status_code(404)),

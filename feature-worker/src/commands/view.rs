@@ -33,14 +33,14 @@ const HISTORY: usize = 300;
     after_help = "Examples:\n  feature-worker view --config config/sim.toml\n  feature-worker view --config config/cell.toml --port 9000\n\n\
 Open the address that it prints in a browser on this machine. Ctrl-C ends it.
 
-Beside `feature-worker run` it shows the worker's frames. Without a worker it opens the camera itself, and leaves it to a worker that \
-starts. When the worker ends it waits for the next one."
+Beside `feature-worker run` it shows the worker's frames. Without a worker it opens the camera itself, and hands it over to a worker \
+that starts. When the worker ends, it waits for the next one."
 )]
 pub struct Args {
     /// The cell's configuration.
     #[arg(long, default_value = shared::config::DEFAULT_FILE)]
     config: PathBuf,
-    /// Port on 127.0.0.1; 0: any free one.
+    /// Port on 127.0.0.1. With 0 any free port is taken.
     #[arg(long, default_value_t = 8642)]
     port: u16,
 }
@@ -134,7 +134,7 @@ fn show(frame: &Frame, extractor: &mut Extractor, shown: &Mutex<Shown>) -> Resul
     Ok(())
 }
 
-/// Thread that answers the browser.
+/// Answers the browser until the command ends.
 fn answer(server: &Page, shown: &Mutex<Shown>, stop: &AtomicBool) {
     server.serve(stop, |path, _| match path {
         "/" => page::html(include_str!("view.html")),

@@ -48,7 +48,7 @@ pub fn for_each_frame(input: &[PathBuf], camera: &CameraConfig, mut each: impl F
 fn each_picture(path: &Path, sequence: u64, each: &mut impl FnMut(Frame) -> Result<(), String>) -> Result<(), String> {
     let picture = imgcodecs::imread(path, imgcodecs::IMREAD_ANYCOLOR).map_err(|e| e.message)?;
     if picture.empty() {
-        return Err(format!("{}: is no picture that can be read", path.display()));
+        return Err(format!("{}: cannot be read as a picture", path.display()));
     }
     let header = FrameHeader {
         format: if picture.channels() == 1 { PixelFormat::Mono8 } else { PixelFormat::Bgr8 } as u32,

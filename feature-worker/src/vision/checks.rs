@@ -44,7 +44,9 @@ const RIM_BLURRED_PX: f32 = 5.6;
 /// Checks the light, and that the picture is not the same as the last one.
 #[derive(Default)]
 pub(crate) struct LightCheck {
+    /// Hash of the last picture's bytes; none before the first.
     last_hash: Option<u64>,
+    /// Mean grey level of the last picture.
     mean_level: f32,
 }
 
@@ -124,7 +126,7 @@ impl RimCheck {
                 }
             }
         }
-        // What stands behind is out of focus too, so the sharper bundles decide.
+        // What stands behind the rim is out of focus too, so the sharper bundles decide.
         let sharper = self.widths_px.len() / 4;
         self.widths_px.len() >= RIM_SEEN && *self.widths_px.select_nth_unstable_by(sharper, f32::total_cmp).1 > RIM_BLURRED_PX
     }

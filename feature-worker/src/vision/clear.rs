@@ -37,7 +37,7 @@ use self::water::{Verdict, Water};
 use super::geometry::{Axes, LinearField};
 use super::liquid::{FineLine, LineRules, Liquid, PROFILE_SAMPLES, Profile, ProfileEdge, REACH, Sighting};
 
-// "Tuned" below means: on seeds 101 to 104 of `evaluate-camera`, see docs/VISION.md.
+// "Tuned" below means that the value was tuned on seeds 101 to 104 of `evaluate-camera`; see docs/VISION.md.
 
 /// Width of the whole small picture, px. All lengths of these files are px of the small picture where nothing else is said. Chosen by hand,
 /// for speed.
@@ -66,6 +66,7 @@ const STEEP_LEAST: f32 = 4.0;
 pub(crate) struct ClearWater {
     /// Pixels of the full picture per pixel of the small one.
     scale: f32,
+    /// Size of the small region, px.
     size: Size,
     /// In the small region.
     axes: Axes,

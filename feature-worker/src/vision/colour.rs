@@ -17,7 +17,7 @@ use shared::messages::{Doubt, PixelFormat};
 use super::geometry::{Axes, NEAR_PX, RAYS, RayGrid};
 use super::liquid::{FineLine, LineRules, Liquid, PROFILE_SAMPLES, Profile, ProfileEdge, REACH, Sighting};
 
-// "Tuned" below means: on seeds 1 and 5001 to 5003 of `evaluate-camera`, see docs/VISION.md.
+// "Tuned" below means that the value was tuned on seeds 1 and 5001 to 5003 of `evaluate-camera`; see docs/VISION.md.
 
 /// Share of rays that a stream fills at least. Tuned.
 const STREAM_RAYS: f32 = 0.8;
@@ -48,19 +48,26 @@ const DIFFERENCE_LEAST: f32 = 12.0;
 
 /// Finds the stream of a coloured liquid in the pictures of one camera.
 pub(crate) struct ColouredLiquid {
+    /// Relative to the region.
     axes: Axes,
+    /// The rays along which the region is sampled.
     grid: RayGrid,
-    /// Fixed-point maps from rays to the region, as `cv::convertMaps` makes them.
+    /// The first of the two fixed-point maps from rays to the region, as `cv::convertMaps` makes them.
     map_a: Mat,
+    /// The second of these maps.
     map_b: Mat,
     /// Least hue, saturation and value.
     low: Scalar,
     /// Largest hue, saturation and value.
     high: Scalar,
+    /// A smaller triangle is no stream, px^2.
     area_min_px2: f32,
     // Pictures along the rays, one ray a row, kept from frame to frame.
+    /// The region in BGR.
     sampled: Mat,
+    /// The same, smoothed.
     smooth: Mat,
+    /// The same in hue, saturation and value.
     hsv: Mat,
     /// Not 0 where there is liquid.
     mask: Mat,

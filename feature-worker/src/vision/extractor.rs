@@ -50,8 +50,11 @@ pub enum ExtractError {
 
 /// Measures V_e in the images of one camera.
 pub struct Extractor {
+    /// Width and height that images must have, px.
     size_px: [u32; 2],
+    /// The region in the image, px.
     region: Rect,
+    /// A smaller triangle is no stream, px^2.
     area_min_px2: f32,
     /// Relative to the region.
     axes: Axes,
@@ -62,11 +65,13 @@ pub struct Extractor {
     line: LineFinder,
     /// The coarse outer edge on the rays, px in the region, from the x-axis to the y-axis. Kept from frame to frame.
     edges: Vec<[f32; 2]>,
+    /// Time spent in the stages of the last measurement.
     stages: Stages,
 }
 
 impl Extractor {
-    /// An extractor for images of `camera`'s size with the axes, region and liquid of `image`.
+    /// An extractor for images of `camera`'s size with the axes, region and liquid of `image`. A region in which nothing can be measured
+    /// is refused.
     pub fn new(camera: &CameraConfig, image: &ImageConfig) -> Result<Self, ExtractError> {
         let [x, y, width, height] = image.region_px;
         let region = Rect::new(x as i32, y as i32, width as i32, height as i32);
@@ -130,7 +135,8 @@ impl Extractor {
         [p[0] + self.region.x as f32, p[1] + self.region.y as f32]
     }
 
-    /// Measures one image.
+    /// Measures one image. One of another size than configured, or with missing bytes, gets a doubt and no area. A grey image is an error
+    /// where the liquid is told by its colour; the only other errors are OpenCV's.
     pub fn measure(&mut self, image: Image) -> Result<Measurement, ExtractError> {
         let expected = image.width_px as usize * image.height_px as usize * image.format.bytes_per_pixel();
         if [image.width_px, image.height_px] != self.size_px || image.pixels.len() != expected {

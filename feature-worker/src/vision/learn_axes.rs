@@ -9,7 +9,7 @@ use opencv::imgproc;
 use opencv::prelude::*;
 use serde::Deserialize;
 
-// "By hand" below means: chosen by hand; no measurement is recorded. Lengths are shares of the picture's width or height.
+// "By hand" below means that the value was chosen by hand and that no measurement is recorded.
 
 /// Grey levels of the gradient between which Canny's edges continue, and from which they begin. By hand.
 const CANNY: [f64; 2] = [14.0, 42.0];
@@ -59,11 +59,11 @@ struct Edge {
     from: [f32; 2],
     /// Its right or lower end, px.
     to: [f32; 2],
-    /// px.
+    /// Its length, px.
     length: f32,
 }
 
-/// Finds the corner in the mean of many pictures in BGR, see the module's text.
+/// Finds the corner in the mean of many pictures of one pour, in BGR.
 pub fn find_corner(mean: &Mat) -> Result<Corner, AxesError> {
     let (width, height) = (mean.cols() as f32, mean.rows() as f32);
     let (level, upright) = find_edges(mean)?;
@@ -75,7 +75,7 @@ pub fn find_corner(mean: &Mat) -> Result<Corner, AxesError> {
             let cross = a[0] * b[1] - a[1] * b[0];
             let t = ((upper[0] - left[0]) * b[1] - (upper[1] - left[1]) * b[0]) / cross;
             let lip = [left[0] + t * a[0], left[1] + t * a[1]];
-            // Both must begin near the corner and leave it to the right and downwards.
+            // Both edges must begin near the corner, and leave it to the right and downwards.
             let gap = (left[0] - lip[0]).hypot(left[1] - lip[1]) + (upper[0] - lip[0]).hypot(upper[1] - lip[1]);
             let inside = lip[0] > 0.03 * width && lip[0] < 0.8 * width && lip[1] > 0.1 * height && lip[1] < 0.9 * height;
             let score = edge.length + side.length - GAP_COST * gap;
@@ -85,7 +85,7 @@ pub fn find_corner(mean: &Mat) -> Result<Corner, AxesError> {
         }
     }
     let (_, Corner { lip, rim, foot }) = best.ok_or(AxesError::NoCorner)?;
-    // A bright rim or wall has an edge on either side: the axes go through their middle.
+    // A bright rim or wall has an edge on either side. The axes go through the middle between them.
     let near = RIM_SIDE * height;
     let (rim_shift, side_shift) = (shift_to_middle(lip, rim, &level, near), shift_to_middle(lip, foot, &upright, near));
     let moved = |p: [f32; 2], shifts: &[[f32; 2]]| shifts.iter().fold(p, |p, s| [p[0] + s[0], p[1] + s[1]]);

@@ -9,11 +9,11 @@ use opencv::prelude::*;
 
 use super::geometry::Axes;
 
-// "Tuned" below means: on seeds 1 and 5001 to 5003 of `evaluate-camera`, see docs/VISION.md. Lengths are px of a picture 640 px wide.
+// "Tuned" below means that the value was tuned on seeds 1 and 5001 to 5003 of `evaluate-camera`; see docs/VISION.md. Lengths are px of a picture 640 px wide.
 
 /// Bins of hue, saturation and value of the first look. Chosen by hand; no measurement is recorded.
 const BINS: [usize; 3] = [18, 8, 8];
-/// Most pixels that are kept of either place. Chosen by hand: some megabytes.
+/// Most pixels that are kept of either place. Chosen by hand: about a megabyte.
 const KEEP: usize = 400_000;
 /// Pixels nearer to the lip than this are near. Tuned.
 const NEAR_PX: f32 = 20.0;
@@ -67,7 +67,9 @@ type Hsv = [u8; 3];
 
 /// Pixels of one place, and how many of them fall into each bin.
 struct Pixels {
+    /// In the order in which they were seen.
     pixels: Vec<Hsv>,
+    /// Their number in each bin.
     bins: Vec<u32>,
 }
 
@@ -101,19 +103,24 @@ fn bin([h, s, v]: Hsv) -> usize {
 
 /// Learns the liquid's colour from the pictures of one pour.
 pub struct ColourLearner {
+    /// In the whole picture.
     axes: Axes,
     /// Right over the lip.
     near: Pixels,
     /// Far from the lip.
     far: Pixels,
+    /// The last picture in hue, saturation and value.
     hsv: Mat,
 }
 
 /// The range of one number over the liquid's pixels.
 #[derive(Debug, Clone, Copy)]
 struct Quantiles {
+    /// Nearly the least.
     low: f32,
+    /// The median.
     middle: f32,
+    /// Nearly the largest.
     high: f32,
 }
 
@@ -156,7 +163,7 @@ impl ColourLearner {
         Ok(())
     }
 
-    /// The range h_min, s_min, v_min, h_max, s_max, v_max for `[image] colour_hsv`.
+    /// The range h_min, s_min, v_min, h_max, s_max, v_max for `[image] colour_hsv`. It is an error if no colour stands out at the lip.
     pub fn range(&self) -> Result<[u8; 6], ColourError> {
         let liquid = |hsv: &&Hsv| {
             let (near, far) = (self.near.share(**hsv), self.far.share(**hsv));
@@ -166,7 +173,7 @@ impl ColourLearner {
         if (seen.len() as f32) < LIQUID_SHARE * self.near.count() {
             return Err(ColourError::NoColour);
         }
-        // Hue is an angle: everything about it relative to its mean direction.
+        // Hue is an angle, so it is taken relative to its mean direction.
         let mean = mean_hue(&seen);
         let relative_hue = |p: &Hsv| (f32::from(p[0]) - mean + 270.0).rem_euclid(180.0) - 90.0;
         let hue = Quantiles::new(&seen, relative_hue);
@@ -199,7 +206,7 @@ impl ColourLearner {
         if (values.len() as f32) < ALIKE_SHARE * self.far.count() {
             return loose;
         }
-        // The most liquid-like of it are noise.
+        // The most liquid-like of these pixels are noise.
         values.sort_by(|a, b| if loose < liquid { b.total_cmp(a) } else { a.total_cmp(b) });
         let nearest = values[values.len() / ALIKE_NOISE];
         if (nearest - loose).signum() == (nearest - liquid).signum() { loose } else { (nearest + liquid) / 2.0 }

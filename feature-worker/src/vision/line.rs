@@ -12,7 +12,7 @@ use super::geometry::{Axes, Line, RAYS, distance};
 use super::liquid::{FineLine, Liquid, PROFILE_SAMPLES, Profile, REACH};
 use super::picture::{RegionPixels, median};
 
-// "Tuned" below means: on seeds 1 and 5001 to 5003 of `evaluate-camera`, see docs/VISION.md.
+// "Tuned" below means that the value was tuned on seeds 1 and 5001 to 5003 of `evaluate-camera`; see docs/VISION.md.
 
 /// Edge points that are tried in pairs for the first line. Chosen by hand: 60 pairs are enough, and cost little.
 const PICKS: usize = 13;
@@ -63,8 +63,9 @@ pub(crate) struct FirstLine {
 struct Across {
     /// Where the line cuts the x-axis.
     from: [f32; 2],
-    /// Unit vector from there to the cut with the y-axis, and the length of the way, px.
+    /// Unit vector from there to the cut with the y-axis.
     along: [f32; 2],
+    /// Distance from one cut to the other, px.
     length: f32,
     /// Unit vector square to the line, away from the lip.
     outwards: [f32; 2],
@@ -112,6 +113,7 @@ pub(crate) struct LineFinder {
     contrasts: Vec<f32>,
     /// Widths of the edge on the profiles that tell it, px.
     widths_px: Vec<f32>,
+    /// Distances whose median is taken.
     scratch: Vec<f32>,
 }
 

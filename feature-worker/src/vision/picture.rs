@@ -33,7 +33,8 @@ pub(crate) struct RegionPixels<'a> {
 }
 
 impl RegionPixels<'_> {
-    /// Bilinear sample in grey levels: blue, green, red. There is none outside of the region.
+    /// The colour at a place between pixels, mixed from the four around it: blue, green, red in grey levels. There is none outside of the
+    /// region.
     pub(crate) fn at(&self, x: f32, y: f32) -> Option<[f32; 3]> {
         let (column, row, fx, fy) = bilinear_corner(x, y, self.width, self.height)?;
         let start = row * self.stride + column * 3;
@@ -110,7 +111,7 @@ pub(crate) fn bilinear_corner(x: f32, y: f32, width: usize, height: usize) -> Op
     Some((column, row, x - column as f32, y - row as f32))
 }
 
-/// The median of samples, the upper one of two, or 0 without any. Reorders them.
+/// The median of samples; of two middle ones it is the upper. It is 0 without samples. Reorders them.
 pub(crate) fn median(values: &mut [f32]) -> f32 {
     let middle = values.len() / 2;
     if values.is_empty() { 0.0 } else { *values.select_nth_unstable_by(middle, f32::total_cmp).1 }

@@ -30,7 +30,7 @@
 
 use serde::{Deserialize, Serialize};
 
-use super::vessel::{CapacityCurve, ENTRIES, Place, Vessel, entry_deg};
+use super::vessel::{CapacityCurve, ENTRIES, TablePlace, Vessel, entry_deg};
 
 /// The largest change of the tilt in a frame, degrees: no robot turns a full container faster. Chosen by hand; no measurement is
 /// recorded.
@@ -152,7 +152,7 @@ impl FlowTables {
     /// Flow over the lip at a tilt, with the headspace that is there, and a pour's own flow factor (logarithm).
     #[inline]
     pub fn over_lip(&self, tilt_deg: f64, headspace_ml: f64, log_flow_factor: f64) -> LipFlow {
-        let place = Place::of(tilt_deg);
+        let place = TablePlace::of(tilt_deg);
         let lost_ml_per_deg = self.capacity.lost_ml_per_deg_at(place);
         let excess_ml = self.capacity.lost_ml_at(place) - headspace_ml;
         if excess_ml <= 0.0 {
@@ -171,7 +171,7 @@ impl FlowTables {
 
     /// The excess above the lip that gives an outflow of `flow_ml` in a frame at a tilt, ml.
     pub fn excess_ml_for(&self, tilt_deg: f64, flow_ml: f64) -> f64 {
-        let log_coefficient = Place::of(tilt_deg).read(&self.log_coefficient);
+        let log_coefficient = TablePlace::of(tilt_deg).read(&self.log_coefficient);
         let weir_ml = ((flow_ml.max(1e-6).ln() - log_coefficient) / self.model.head_exponent).exp();
         weir_ml.max(2.0 * flow_ml)
     }

@@ -22,8 +22,8 @@
 //! | a | tilt |
 //! | s | [`Vessel::log_shape`] |
 //! | f | [`Vessel::even_share`] |
-//! | w, W | [`CapacityCurve::lost_ml_per_deg`], [`CapacityCurve::lost_ml`] |
-//! | A | [`CapacityCurve::surface_mm2`] |
+//! | w, W | `lost_ml_per_deg` and [`lost_ml`](CapacityCurve::lost_ml) of [`CapacityCurve`] |
+//! | A | `surface_mm2` of [`CapacityCurve`] |
 
 use serde::{Deserialize, Serialize};
 
@@ -113,15 +113,15 @@ impl Vessel {
 
 /// A place between two entries of the tables.
 #[derive(Debug, Clone, Copy)]
-pub(super) struct Place {
+pub(super) struct TablePlace {
     /// The entry below.
     index: usize,
     /// How far the place is on the way to the entry above, 0 to 1.
     share: f64,
 }
 
-impl Place {
-    /// Where a tilt is in the tables; what is outside, or is not a number, is put at an end.
+impl TablePlace {
+    /// Where a tilt is in the tables. A tilt beyond an end is put there; one that is not a number gives a share that is none.
     pub(super) fn of(tilt_deg: f64) -> Self {
         // NaN becomes 0 by the cast; the clamp keeps the index inside.
         let at = (tilt_deg / STEP_DEG).clamp(0.0, (ENTRIES - 2) as f64);
@@ -165,19 +165,19 @@ impl CapacityCurve {
 
     /// Capacity that is lost from upright to a tilt, ml: what leaves a full vessel that is brought there slowly.
     pub fn lost_ml(&self, tilt_deg: f64) -> f64 {
-        self.lost_ml_at(Place::of(tilt_deg))
+        self.lost_ml_at(TablePlace::of(tilt_deg))
     }
 
     /// The same at a place of the tables.
     #[inline]
-    pub(super) fn lost_ml_at(&self, Place { index, share }: Place) -> f64 {
+    pub(super) fn lost_ml_at(&self, TablePlace { index, share }: TablePlace) -> f64 {
         let slope = &self.lost_ml_per_deg;
         self.lost_ml[index] + STEP_DEG * share * (slope[index] + 0.5 * share * (slope[index + 1] - slope[index]))
     }
 
     /// Capacity that is lost at a place of the tables, ml a degree.
     #[inline]
-    pub(super) fn lost_ml_per_deg_at(&self, place: Place) -> f64 {
+    pub(super) fn lost_ml_per_deg_at(&self, place: TablePlace) -> f64 {
         place.read(&self.lost_ml_per_deg)
     }
 }

@@ -1,18 +1,19 @@
-//! `trainer refine`: every pour teaches. Refits calibration, model and policy from all weighed episodes so far, pours
-//! included, and writes a new weight file that the running controller takes live.
+//! `trainer refine`: every pour teaches. It refits calibration, model and network from all weighed episodes so far, pours
+//! included, and writes a new weight file, which a running controller takes between two pours.
 //!
-//! Offline, ordinary threads, allocates. A weight that does not fit the others is asked about; without a terminal the
-//! command stops and says how to answer.
+//! Offline, ordinary threads, allocates. A weight that does not fit the others is asked about. Without a terminal, the command
+//! stops and says how to answer.
 
 use std::io::{BufRead, IsTerminal, Write};
 
+use serde::Serialize;
 use shared::episode::{Episode, EpisodeKind};
 use shared::exit::{self, Failure, OrExit as _, failure};
 
-use super::train::Target;
+use super::train::WeightFileArgs;
 use crate::consistency;
-use crate::data::{self, Source};
-use crate::training::{Estimate, MethodName, Options};
+use crate::data::{self, EpisodeSource};
+use crate::training::Options;
 
 /// Command-line arguments of `trainer refine`.
 #[derive(Debug, clap::Args)]
@@ -22,7 +23,7 @@ use crate::training::{Estimate, MethodName, Options};
   trainer refine out/episodes --accept out/episodes/0007.mcap --out out/weights.bin")]
 pub struct Args {
     #[command(flatten)]
-    source: Source,
+    source: EpisodeSource,
     /// Episodes whose weight is right although it does not fit the others.
     #[arg(long)]
     accept: Vec<String>,
@@ -30,23 +31,35 @@ pub struct Args {
     #[arg(long)]
     leave_out: Vec<String>,
     #[command(flatten)]
-    target: Target,
+    weight_file: WeightFileArgs,
 }
 
-/// What the weighed pours among `episodes` show, in order: number, goal, weight (both ml), running mean absolute error.
-pub fn pours(episodes: &[Episode]) -> Vec<(usize, f64, f64, f64)> {
-    let mut sum = 0.0;
+/// What one weighed pour shows.
+#[derive(Debug, Clone, Copy, Serialize)]
+struct WeighedPour {
+    /// Counted from 1, in the order in which they were poured.
+    number: usize,
+    goal_ml: f64,
+    /// What the scale showed, g (1 g = 1 ml).
+    weight_g: f64,
+    /// Mean absolute error of this pour and all before it, ml.
+    mae_so_far_ml: f64,
+}
+
+/// The weighed pours among `episodes`, in the order in which they were poured.
+fn weighed_pours(episodes: &[Episode]) -> Vec<WeighedPour> {
     let mut ordered: Vec<&Episode> = episodes.iter().collect();
     ordered.sort_by(|a, b| (a.info.started_at_utc.as_str(), a.name.as_str()).cmp(&(b.info.started_at_utc.as_str(), b.name.as_str())));
     let weighed = ordered.into_iter().filter_map(|e| match (e.kind, e.weight_g) {
-        (EpisodeKind::Pour { goal_ml }, Some(weight)) => Some((f64::from(goal_ml), weight)),
+        (EpisodeKind::Pour { goal_ml }, Some(weight_g)) => Some((f64::from(goal_ml), weight_g)),
         _ => None,
     });
+    let mut sum_ml = 0.0;
     weighed
-        .enumerate()
-        .map(|(k, (goal, weight))| {
-            sum += (weight - goal).abs();
-            (k + 1, goal, weight, sum / (k + 1) as f64)
+        .zip(1..)
+        .map(|((goal_ml, weight_g), number)| {
+            sum_ml += (weight_g - goal_ml).abs();
+            WeighedPour { number, goal_ml, weight_g, mae_so_far_ml: sum_ml / number as f64 }
         })
         .collect()
 }
@@ -54,7 +67,7 @@ pub fn pours(episodes: &[Episode]) -> Vec<(usize, f64, f64, f64)> {
 /// Runs the command.
 pub fn run(args: &Args) -> Result<(), Failure> {
     let read = args.source.read().or_exit(exit::BAD_INPUT)?;
-    let limits = args.target.limits()?;
+    let limits = args.weight_file.limits()?;
     let mut usable = data::usable(&read);
     usable.episodes.retain(|e| !args.leave_out.contains(&e.name));
     for doubt in consistency::doubtful(&usable.episodes) {
@@ -74,20 +87,19 @@ pub fn run(args: &Args) -> Result<(), Failure> {
             }
         }
     }
-    let history = pours(&read);
-    let options = Options { method: MethodName::Best, actions: 21, estimate: Estimate::Fused, seed: args.target.seed, limits };
-    let extra = serde_json::json!({ "pours": history.iter().map(|(n, goal, weight, mean)| serde_json::json!({"number": n, "goal_ml": goal, "weight_g": weight, "mae_so_far_ml": mean})).collect::<Vec<_>>() });
-    args.target.train_and_write(&usable, &options, extra)?;
-    if !args.target.json && !history.is_empty() {
+    let history = weighed_pours(&read);
+    let options = Options { seed: args.weight_file.seed, limits, ..Options::default() };
+    args.weight_file.train_and_write(&usable, &options, serde_json::json!({ "pours": history }))?;
+    if !args.weight_file.json && !history.is_empty() {
         println!("pour   goal ml  scale g  error ml  mean |error| so far");
-        for (n, goal, weight, mean) in history {
-            println!("{n:>4} {goal:>9.1} {weight:>8.0} {:>9.1} {mean:>10.2}", weight - goal);
+        for WeighedPour { number, goal_ml, weight_g, mae_so_far_ml } in history {
+            println!("{number:>4} {goal_ml:>9.1} {weight_g:>8.0} {:>9.1} {mae_so_far_ml:>10.2}", weight_g - goal_ml);
         }
     }
     Ok(())
 }
 
-/// Whether to use a doubtful weight; `None`: there is nobody to ask.
+/// Asks whether to use a doubtful weight; `None` if there is no terminal to ask at.
 fn ask(doubt: &consistency::DoubtfulWeight) -> Option<bool> {
     if !std::io::stdin().is_terminal() {
         return None;

@@ -11,7 +11,7 @@ use shared::exit::{self, Failure, OrExit as _, failure};
 use shared::limits::Limits;
 
 use crate::consistency;
-use crate::data::{self, Source, Usable};
+use crate::data::{self, EpisodeSource, UsableEpisodes};
 use crate::method;
 use crate::training::{Estimate, MethodName, Options, Progress, Trained};
 
@@ -23,7 +23,7 @@ use crate::training::{Estimate, MethodName, Options, Progress, Trained};
   trainer train out/episodes --estimate sum --seed 7 --out w.bin")]
 pub struct Args {
     #[command(flatten)]
-    source: Source,
+    source: EpisodeSource,
     /// Training method.
     #[arg(long, value_enum, default_value = "best")]
     method: MethodName,
@@ -34,12 +34,12 @@ pub struct Args {
     #[arg(long, value_enum)]
     estimate: Option<Estimate>,
     #[command(flatten)]
-    target: Target,
+    weight_file: WeightFileArgs,
 }
 
 /// What `trainer train` and `trainer refine` are told alike.
 #[derive(Debug, clap::Args)]
-pub struct Target {
+pub struct WeightFileArgs {
     /// Seed: the same seed and data give the same bytes.
     #[arg(long, default_value_t = 1)]
     pub seed: u64,
@@ -81,7 +81,7 @@ impl Progress for Bar {
 /// Runs the command.
 pub fn run(args: &Args) -> Result<(), Failure> {
     let read = args.source.read().or_exit(exit::BAD_INPUT)?;
-    let limits = args.target.limits()?;
+    let limits = args.weight_file.limits()?;
     let can_fuse = matches!(args.method, MethodName::Best | MethodName::Paper);
     let estimate = args.estimate.unwrap_or(if can_fuse { Estimate::Fused } else { Estimate::Sum });
     if estimate == Estimate::Fused && !can_fuse {
@@ -92,11 +92,11 @@ pub fn run(args: &Args) -> Result<(), Failure> {
     for doubt in consistency::doubtful(&usable.episodes) {
         eprintln!("doubtful: {doubt}");
     }
-    let options = Options { method: args.method, actions: args.actions, estimate, seed: args.target.seed, limits };
-    args.target.train_and_write(&usable, &options, serde_json::Value::Null)
+    let options = Options { method: args.method, actions: args.actions, estimate, seed: args.weight_file.seed, limits };
+    args.weight_file.train_and_write(&usable, &options, serde_json::Value::Null)
 }
 
-impl Target {
+impl WeightFileArgs {
     /// The limits of the configuration, or the default ones; a configuration that cannot be read is bad input.
     pub fn limits(&self) -> Result<Limits, Failure> {
         let Some(file) = &self.config else { return Ok(Limits::default()) };
@@ -105,7 +105,7 @@ impl Target {
 
     /// Trains with a progress bar, writes the weight file and, beside it, everything that it came from (`W.json`); `extra` goes
     /// into that file as it is.
-    pub fn train_and_write(&self, usable: &Usable, options: &Options, extra: serde_json::Value) -> Result<(), Failure> {
+    pub fn train_and_write(&self, usable: &UsableEpisodes, options: &Options, extra: serde_json::Value) -> Result<(), Failure> {
         for (name, what) in &usable.left_out {
             eprintln!("left out: {name}: {what}");
         }
@@ -134,7 +134,7 @@ impl Target {
 }
 
 /// Everything that a weight file came from, as JSON for people and for `trainer report`.
-fn summary(out: &Path, usable: &Usable, options: &Options, trained: &Trained, extra: serde_json::Value) -> serde_json::Value {
+fn summary(out: &Path, usable: &UsableEpisodes, options: &Options, trained: &Trained, extra: serde_json::Value) -> serde_json::Value {
     let weights = &trained.weights;
     serde_json::json!({
         "kind": "training",

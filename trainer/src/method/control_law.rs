@@ -33,8 +33,10 @@ const CREEP_DEG: f64 = 0.2;
 const MAX_BACKWARD_DEG: f64 = 3.0;
 /// Largest outflow that a searched law may want, ml a frame. Chosen by hand; no measurement is recorded.
 const MAX_FLOW_ML: f64 = 1.6;
-/// A largest outflow from here on is meant as none at all, as a PD has it, ml a frame.
+/// A largest outflow from here on means that there is none, as in a PD, ml a frame.
 const NO_MAX_FLOW_ML: f64 = 100.0;
+/// Fastest forward tilt that a searched law may have, degrees a frame. Chosen by hand; no measurement is recorded.
+const MAX_FORWARD_DEG: f64 = 3.0;
 
 /// The law's parameters.
 #[derive(Debug, Clone, Copy, PartialEq, serde::Serialize)]
@@ -63,7 +65,7 @@ pub struct ControlLaw {
 const PARAMETERS: usize = 9;
 
 impl ControlLaw {
-    /// Where the search starts. With the fused estimate, the volume in flight is already in d.
+    /// Where the search starts: the values of the prototype's recipe. With the fused estimate, the volume in flight is already in d.
     pub fn start(fused: bool) -> Self {
         let (early_ml, in_flight_frames) = if fused { (0.05, 0.02) } else { (0.5, 3.0) };
         Self {
@@ -119,10 +121,10 @@ impl ControlLaw {
             max_flow_ml: if max_flow_ml < NO_MAX_FLOW_ML { max_flow_ml.min(MAX_FLOW_ML) } else { max_flow_ml },
             damping_frames,
             gain_deg_per_ml,
-            max_forward_deg: max_forward_deg.min(3.0),
+            max_forward_deg: max_forward_deg.min(MAX_FORWARD_DEG),
             smoothing,
             in_flight_frames,
-            max_forward_dry_deg: max_forward_dry_deg.min(3.0),
+            max_forward_dry_deg: max_forward_dry_deg.min(MAX_FORWARD_DEG),
         }
     }
 
@@ -146,7 +148,11 @@ impl ControlLaw {
     }
 }
 
-/// Cost of each frame that a pour takes, ml. From the prototype's search; no other measurement is recorded.
+/// Cost of a squared error, 1/ml. From the prototype's recipe; no other measurement is recorded.
+const SQUARE_COST_PER_ML: f64 = 0.02;
+/// Largest error whose square counts, ml. From the prototype's recipe; no other measurement is recorded.
+const SQUARED_MAX_ML: f64 = 30.0;
+/// Cost of each frame that a pour takes, ml. From the prototype's recipe; no other measurement is recorded.
 const FRAME_COST_ML: f64 = 0.005;
 /// Cost of a pour that never ends, ml. Chosen by hand; no measurement is recorded.
 const ENDLESS_COST_ML: f64 = 5.0;
@@ -156,7 +162,7 @@ fn cost(pours: &PossiblePours, law: &ControlLaw, seed: u64) -> f64 {
     let mut pour = pours.draw(seed);
     let mut back = false;
     let mut d_ml = pour.goal_ml;
-    let of_error = |error_ml: f64| error_ml.abs() + 0.02 * error_ml.abs().min(30.0).powi(2);
+    let of_error = |error_ml: f64| error_ml.abs() + SQUARE_COST_PER_ML * error_ml.abs().min(SQUARED_MAX_ML).powi(2);
     for frame in 0..MAX_FRAMES {
         let asked = if back { None } else { law.decide(pour.v_ml, d_ml) };
         back |= asked.is_none();
@@ -167,6 +173,17 @@ fn cost(pours: &PossiblePours, law: &ControlLaw, seed: u64) -> f64 {
     }
     of_error(pour.error_ml()) + FRAME_COST_ML * MAX_FRAMES as f64 + ENDLESS_COST_ML
 }
+
+/// Standard deviation of the parameters' logarithms in the first iteration. Chosen by hand; no measurement is recorded.
+const FIRST_SD: f64 = 0.4;
+/// Least standard deviation of the parameters' logarithms. Chosen by hand; no measurement is recorded.
+const SD_MIN: f64 = 0.03;
+/// Share of the standard deviation before an iteration that is kept after it. Chosen by hand; no measurement is recorded.
+const SD_KEPT: f64 = 0.3;
+/// Share of the elites' standard deviation in the next one: the rest.
+const SD_NEW: f64 = 0.7;
+/// Parameters whose logarithm is outside of this range mean "none" and "no bound": they stay where they are.
+const SEARCHED_LOGS: std::ops::Range<f64> = -10.0..4.0;
 
 /// Size of the search.
 #[derive(Debug, Clone, Copy)]
@@ -193,8 +210,8 @@ pub fn search(
     let mut rng = Pcg64Mcg::seed_from_u64(seed ^ 0x1a77);
     let mut mean = start.logs();
     // What a PD does not have stays where it is.
-    let free = mean.map(|l| l > -10.0 && l < 4.0);
-    let mut sd = free.map(|f| if f { 0.4f64 } else { 0.0 });
+    let free = mean.map(|l| SEARCHED_LOGS.contains(&l));
+    let mut sd = free.map(|f| if f { FIRST_SD } else { 0.0 });
     let mut curve = Vec::new();
     for iteration in 0..size.iterations {
         let mut laws: Vec<[f64; PARAMETERS]> = vec![mean];
@@ -222,7 +239,7 @@ pub fn search(
             let new_mean = values.iter().sum::<f64>() / values.len() as f64;
             let variance = values.iter().map(|v| (v - new_mean).powi(2)).sum::<f64>() / values.len() as f64;
             mean[k] = new_mean;
-            sd[k] = if free[k] { (0.3 * sd[k] + 0.7 * variance.sqrt()).max(0.03) } else { 0.0 };
+            sd[k] = if free[k] { (SD_KEPT * sd[k] + SD_NEW * variance.sqrt()).max(SD_MIN) } else { 0.0 };
         }
         let best = elites.iter().map(|e| costs[*e]).sum::<f64>() / elites.len() as f64;
         curve.push(best);

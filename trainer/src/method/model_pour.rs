@@ -33,6 +33,26 @@ mod jitter {
     pub const CAMERA_GAIN: f64 = 0.015;
 }
 
+/// Goals that are drawn, ml. From the prototype's recipe; no other measurement is recorded.
+const GOALS_ML: std::ops::Range<f64> = 8.0..220.0;
+/// Largest share of what a container can give within [`LAST_TILT_DEG`] that is drawn as a goal. Chosen by hand; no measurement is
+/// recorded.
+const GOAL_SHARE_MAX: f64 = 0.85;
+/// Tilt up to which a container is poured, degrees. Chosen by hand; no measurement is recorded.
+const LAST_TILT_DEG: f64 = 95.0;
+/// How far below the lowest onset of the episodes flow may start, degrees. From the prototype's recipe; no other measurement is
+/// recorded.
+const BELOW_ONSETS_DEG: f64 = 8.0;
+/// How far above the highest onset flow may start, degrees. From the prototype's recipe; no other measurement is recorded.
+const ABOVE_ONSETS_DEG: f64 = 5.0;
+/// Largest distance of an unknown from the fit's value, so that a fit that knows little gives no absurd pours. Chosen by hand; no
+/// measurement is recorded.
+const MOVED_MAX: f64 = 0.6;
+/// Largest error of a calibration in a pour (log), for the same reason. Chosen by hand; no measurement is recorded.
+const MISCALIBRATED_MAX: f64 = 0.7;
+/// Largest share of frames in which the extraction loses the stream. Chosen by hand; no measurement is recorded.
+const DROPOUTS_MAX: f64 = 0.2;
+
 /// The pours that a fit holds possible, and how the controller moves in them.
 #[derive(Debug, Clone)]
 pub struct PossiblePours {
@@ -71,10 +91,10 @@ impl PossiblePours {
         Self {
             nominal: fit.model,
             root,
-            onset_deg: ((low - 8.0).max(3.0), (high + 5.0).min(88.0)),
+            onset_deg: ((low - BELOW_ONSETS_DEG).max(3.0), (high + ABOVE_ONSETS_DEG).min(88.0)),
             calibration: fit.calibration,
             calibration_root,
-            dropouts: fit.dropouts.min(0.2),
+            dropouts: fit.dropouts.min(DROPOUTS_MAX),
             limits,
             way_back: WayBack::new(&limits, rate_hz),
             rate_hz,
@@ -88,7 +108,7 @@ impl PossiblePours {
         let mut normal = || -> f64 { StandardNormal.sample(&mut rng) };
         let z: Vec<f64> = (0..self.root.nrows()).map(|_| normal()).collect();
         let by: Vec<f64> =
-            (0..self.root.nrows()).map(|r| (0..=r).map(|c| self.root[(r, c)] * z[c]).sum::<f64>().clamp(-0.6, 0.6)).collect();
+            (0..self.root.nrows()).map(|r| (0..=r).map(|c| self.root[(r, c)] * z[c]).sum::<f64>().clamp(-MOVED_MAX, MOVED_MAX)).collect();
         let mut model = fit::moved(&self.nominal, &by);
         model.log_weir_coefficient += jitter::LOG_WEIR_COEFFICIENT * normal();
         model.head_exponent = (model.head_exponent + jitter::HEAD_EXPONENT * normal()).clamp(0.5, 3.5);
@@ -102,8 +122,8 @@ impl PossiblePours {
         let flow = FlowTables::new(&model);
         let onset_deg = rng.random_range(self.onset_deg.0..self.onset_deg.1);
         let headspace_ml = flow.capacity.lost_ml(onset_deg);
-        let most_ml = 0.85 * (flow.capacity.lost_ml(95.0) - headspace_ml);
-        let goal_ml = rng.random_range(8.0..220.0f64).min(most_ml.max(8.0));
+        let most_ml = GOAL_SHARE_MAX * (flow.capacity.lost_ml(LAST_TILT_DEG) - headspace_ml);
+        let goal_ml = rng.random_range(GOALS_ML).min(most_ml.max(GOALS_ML.start));
         ModelPour {
             pours: self,
             flow,
@@ -183,7 +203,8 @@ impl ModelPour<'_> {
         let at_1_px2_ml = f64::from(calibration.volume_ml(1.0, alpha_deg as f32));
         // The calibration is surest at the flows that the episodes showed; a law that pours at those meets its goal better.
         let log_area = (leaves_ml.max(1e-6) / at_1_px2_ml).ln() / exponent;
-        self.believed_ml += leaves_ml * (self.miscalibrated.0 + self.miscalibrated.1 * log_area).clamp(-0.7, 0.7).exp();
+        self.believed_ml +=
+            leaves_ml * (self.miscalibrated.0 + self.miscalibrated.1 * log_area).clamp(-MISCALIBRATED_MAX, MISCALIBRATED_MAX).exp();
         let area_px2 = if seen_ml > 0.0 { (seen_ml / at_1_px2_ml).powf(1.0 / exponent) as f32 } else { 0.0 };
         let held_px2 = self.hold.step(Some(area_px2), calibration.hold_above_px2);
         let v_ml = f64::from(calibration.volume_ml(held_px2, alpha_deg as f32));

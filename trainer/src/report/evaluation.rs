@@ -8,7 +8,7 @@ use serde_json::Value;
 
 use super::json::{items, number, numbers, rounded, text};
 use super::page::{figure, table};
-use super::plot::{Series, histogram, plot};
+use super::plot::{PlotSeries, histogram, plot};
 
 /// Dots of a method in a plot: with every dot of a large evaluation, a page would be tens of megabytes.
 const DOTS: usize = 600;
@@ -82,7 +82,7 @@ fn summaries(summaries: &Value) -> String {
 
 /// Goal against poured, and the errors' histogram, of each method.
 fn pours(methods: &Value) -> String {
-    let mut scatter = vec![Series::reference("poured = goal", vec![(0.0, 0.0), (200.0, 200.0)])];
+    let mut scatter = vec![PlotSeries::reference("poured = goal", vec![(0.0, 0.0), (200.0, 200.0)])];
     let mut bars = Vec::new();
     for method in items(methods) {
         let name = text(&method["name"]);
@@ -90,7 +90,7 @@ fn pours(methods: &Value) -> String {
             items(&method["groups"]).flat_map(items).map(|p| (number(&p["goal_ml"]), number(&p["true_ml"]))).collect();
         let every = (pours.len() / DOTS).max(1);
         let spread = |(k, (goal, poured)): (usize, &(f64, f64))| (goal + (k % 9) as f64 - 4.0, *poured);
-        scatter.push(Series::dots(&name, pours.iter().step_by(every).enumerate().map(spread).collect()));
+        scatter.push(PlotSeries::dots(&name, pours.iter().step_by(every).enumerate().map(spread).collect()));
         let errors: Vec<f64> = pours.iter().map(|(goal, poured)| poured - goal).collect();
         bars.push(histogram(&name, &errors, BIN_ML, LAST_BIN_ML));
     }
@@ -102,9 +102,9 @@ fn pours(methods: &Value) -> String {
 fn trace(trace: &Value) -> String {
     let column = |key: &str| -> Vec<(f64, f64)> { numbers(&trace["t_s"]).into_iter().zip(numbers(&trace[key])).collect() };
     let series = [
-        Series::line("alpha, degrees", column("alpha_deg")),
-        Series::line("poured, ml", column("true_ml")),
-        Series::line("area / 4, px²", column("area_4_px2")),
+        PlotSeries::line("alpha, degrees", column("alpha_deg")),
+        PlotSeries::line("poured, ml", column("true_ml")),
+        PlotSeries::line("area / 4, px²", column("area_4_px2")),
     ];
     let caption = format!("A pour of {} ml from {} ml, {}.", trace["goal_ml"], trace["init_ml"], text(&trace["name"]));
     figure(&plot("time in s", "degrees, ml, px² / 4", &series, true), &caption)
@@ -119,12 +119,12 @@ pub fn against_episodes<'a>(values: impl Iterator<Item = &'a Value>) -> String {
             by_method.entry(text(&s["name"])).or_default().push((n, number(&s["mae_ml"])));
         }
     }
-    let series: Vec<Series> = by_method
+    let series: Vec<PlotSeries> = by_method
         .into_iter()
         .filter(|(_, p)| p.iter().any(|(n, _)| *n != p[0].0))
         .map(|(name, mut points)| {
             points.sort_by(|a, b| a.0.total_cmp(&b.0));
-            Series::line(&name, points)
+            PlotSeries::line(&name, points)
         })
         .collect();
     if series.is_empty() {

@@ -6,12 +6,12 @@ use plotters::prelude::*;
 
 use super::page::escape;
 
-/// How a series is drawn.
+/// How the points of a series are drawn.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Look {
-    /// Joined by a line.
+pub enum SeriesStyle {
+    /// They are joined by a line.
     Line,
-    /// Dots.
+    /// Each is a dot.
     Dots,
     /// A thin dark line that the others are compared with; it takes none of their colours.
     Reference,
@@ -19,31 +19,31 @@ pub enum Look {
 
 /// A line or a cloud of points.
 #[derive(Debug, Clone)]
-pub struct Series {
+pub struct PlotSeries {
     /// Name in the legend.
     pub name: String,
     /// Points.
     pub points: Vec<(f64, f64)>,
     /// How it is drawn.
-    pub look: Look,
+    pub style: SeriesStyle,
 }
 
-impl Series {
-    /// Joined points.
+impl PlotSeries {
+    /// Points that are joined by a line.
     pub fn line(name: &str, points: Vec<(f64, f64)>) -> Self {
-        Self { name: name.into(), points, look: Look::Line }
+        Self { name: name.into(), points, style: SeriesStyle::Line }
     }
-    /// Dots.
+    /// Points that are dots.
     pub fn dots(name: &str, points: Vec<(f64, f64)>) -> Self {
-        Self { name: name.into(), points, look: Look::Dots }
+        Self { name: name.into(), points, style: SeriesStyle::Dots }
     }
-    /// What the others are compared with.
+    /// A line that the others are compared with.
     pub fn reference(name: &str, points: Vec<(f64, f64)>) -> Self {
-        Self { name: name.into(), points, look: Look::Reference }
+        Self { name: name.into(), points, style: SeriesStyle::Reference }
     }
 }
 
-/// Colours that print apart in grey too.
+/// Colours of the series, chosen so that they can be told apart in a grey print too.
 const COLOURS: [RGBColor; 8] = [
     RGBColor(0, 90, 181),
     RGBColor(220, 50, 32),
@@ -55,36 +55,37 @@ const COLOURS: [RGBColor; 8] = [
     RGBColor(160, 110, 60),
 ];
 
-/// Of a reference.
+/// Colour of a reference.
 const DARK: RGBColor = RGBColor(20, 20, 20);
 
 /// The colour of each series.
-fn colours(series: &[Series]) -> Vec<RGBColor> {
+fn colours(series: &[PlotSeries]) -> Vec<RGBColor> {
     let mut free = COLOURS.iter().cycle();
-    series.iter().map(|s| if s.look == Look::Reference { DARK } else { *free.next().unwrap_or(&DARK) }).collect()
+    series.iter().map(|s| if s.style == SeriesStyle::Reference { DARK } else { *free.next().unwrap_or(&DARK) }).collect()
 }
 
-/// A plot as an SVG element, its legend below it. Axes include all points, and 0 on the y-axis if `from_zero`.
-pub fn plot(x_title: &str, y_title: &str, series: &[Series], from_zero: bool) -> String {
+/// A plot as an SVG element, with its legend below it. The axes include all points, and with `from_zero` the y-axis includes 0.
+pub fn plot(x_title: &str, y_title: &str, series: &[PlotSeries], from_zero: bool) -> String {
     let mut svg = String::new();
     if draw(&mut svg, x_title, y_title, series, from_zero).is_err() {
         return "<p>(this plot could not be drawn)</p>".into();
     }
-    // Inline in HTML the XML prologue is not allowed.
+    // Inside HTML, the XML prologue is not allowed.
     let svg = svg.find("<svg").map_or(svg.clone(), |at| svg[at..].to_owned());
     if series.len() < 2 {
         return svg;
     }
-    // Below, where it hides no curve; characters, because browsers print no backgrounds.
-    let entry = |(s, RGBColor(r, g, b)): (&Series, RGBColor)| {
-        let mark = if s.look == Look::Dots { '\u{25cf}' } else { '\u{25ac}' };
+    // The legend is below, where it hides no curve. Its marks are characters, because browsers print no backgrounds.
+    let entry = |(s, RGBColor(r, g, b)): (&PlotSeries, RGBColor)| {
+        let mark = if s.style == SeriesStyle::Dots { '\u{25cf}' } else { '\u{25ac}' };
         format!("<span><b style=\"color:#{r:02x}{g:02x}{b:02x}\">{mark}</b> {}</span> ", escape(&s.name))
     };
     let entries: String = series.iter().zip(colours(series)).map(entry).collect();
     format!("{svg}<div class=legend>{entries}</div>")
 }
 
-fn draw(svg: &mut String, x_title: &str, y_title: &str, series: &[Series], from_zero: bool) -> Result<(), Box<dyn std::error::Error>> {
+/// Draws the plot without its legend into `svg`.
+fn draw(svg: &mut String, x_title: &str, y_title: &str, series: &[PlotSeries], from_zero: bool) -> Result<(), Box<dyn std::error::Error>> {
     let all = || series.iter().flat_map(|s| &s.points).filter(|(x, y)| x.is_finite() && y.is_finite());
     let bounds = |f: fn(&(f64, f64)) -> f64| {
         let low = all().map(f).fold(f64::INFINITY, f64::min);
@@ -98,7 +99,7 @@ fn draw(svg: &mut String, x_title: &str, y_title: &str, series: &[Series], from_
     }
     let pad = |a: f64, b: f64| ((b - a) * 0.04).max(1e-6 * b.abs().max(1.0));
     let (px, py) = (pad(x0, x1), pad(y0, y1));
-    // Whole numbers, such as those of episodes, have nothing in between.
+    // Where all x are whole numbers, as those of episodes are, there are no ticks between them.
     let whole = all().all(|(x, _)| x.fract() == 0.0);
     let tick = |v: f64| ((v * 1e6).round() / 1e6).to_string();
     let root = SVGBackend::with_string(svg, (480, 320)).into_drawing_area();
@@ -121,18 +122,19 @@ fn draw(svg: &mut String, x_title: &str, y_title: &str, series: &[Series], from_
         .draw()?;
     for (s, colour) in series.iter().zip(colours(series)) {
         let points = s.points.iter().copied().filter(|(x, y)| x.is_finite() && y.is_finite());
-        match s.look {
-            Look::Line => chart.draw_series(LineSeries::new(points, colour.stroke_width(2)))?,
-            Look::Reference => chart.draw_series(LineSeries::new(points, colour.stroke_width(1)))?,
-            Look::Dots => chart.draw_series(points.map(|p| Circle::new(p, 2, colour.mix(0.55).filled())))?,
+        match s.style {
+            SeriesStyle::Line => chart.draw_series(LineSeries::new(points, colour.stroke_width(2)))?,
+            SeriesStyle::Reference => chart.draw_series(LineSeries::new(points, colour.stroke_width(1)))?,
+            SeriesStyle::Dots => chart.draw_series(points.map(|p| Circle::new(p, 2, colour.mix(0.55).filled())))?,
         };
     }
     root.present()?;
     Ok(())
 }
 
-/// Shares of `values` in bins of `width`, as a stepped line around the bins' edges.
-pub fn histogram(name: &str, values: &[f64], width: f64, limit: f64) -> Series {
+/// Shares of `values` in bins of `width` from -`limit` to `limit`, in percent, as a stepped line around the bins' edges. The
+/// outermost bins hold what is beyond.
+pub fn histogram(name: &str, values: &[f64], width: f64, limit: f64) -> PlotSeries {
     let bins = (2.0 * limit / width).round() as usize;
     let mut counts = vec![0.0; bins];
     for v in values.iter().filter(|v| v.is_finite()) {
@@ -145,5 +147,5 @@ pub fn histogram(name: &str, values: &[f64], width: f64, limit: f64) -> Series {
         points.extend([(x, *c), (x + width, *c)]);
     }
     points.push((limit, 0.0));
-    Series::line(name, points)
+    PlotSeries::line(name, points)
 }

@@ -6,7 +6,7 @@ use serde_json::Value;
 
 use super::json::{items, number, numbers, rounded, text};
 use super::page::{escape, facts, figure};
-use super::plot::{Series, plot};
+use super::plot::{PlotSeries, plot};
 use crate::network::REPORT_EVERY;
 
 /// A training as `trainer train` and `trainer refine` write it.
@@ -15,11 +15,13 @@ pub fn training(v: &Value) -> String {
     html += &facts(&origin(v));
     html += "<div class=plots>";
     let loss: Vec<(f64, f64)> = (1..).map(|k| (k * REPORT_EVERY) as f64).zip(numbers(&v["loss"])).collect();
-    html += &figure(&plot("Adam step", "loss", &[Series::line("loss", loss)], false), "Learning curve of the network.");
+    html += &figure(&plot("Adam step", "loss", &[PlotSeries::line("loss", loss)], false), "Learning curve of the network.");
     let cost: Vec<(f64, f64)> = (1..).map(f64::from).zip(numbers(&v["search_cost"])).collect();
     if !cost.is_empty() {
-        html +=
-            &figure(&plot("iteration", "cost", &[Series::line("cost", cost)], true), "Search of the control law: mean cost of the elites.");
+        html += &figure(
+            &plot("iteration", "cost", &[PlotSeries::line("cost", cost)], true),
+            "Search of the control law: mean cost of the elites.",
+        );
     }
     if items(&v["extra"]["pours"]).next().is_some() {
         html += &weighed_pours(&v["extra"]["pours"]);
@@ -58,8 +60,8 @@ fn origin(v: &Value) -> Vec<(String, String)> {
 fn weighed_pours(pours: &Value) -> String {
     let of_number = |error_ml: fn(&Value) -> f64| items(pours).map(|p| (number(&p["number"]), error_ml(p))).collect();
     let series = [
-        Series::dots("this pour", of_number(|p| (number(&p["weight_g"]) - number(&p["goal_ml"])).abs())),
-        Series::line("mean so far", of_number(|p| number(&p["mae_so_far_ml"]))),
+        PlotSeries::dots("this pour", of_number(|p| (number(&p["weight_g"]) - number(&p["goal_ml"])).abs())),
+        PlotSeries::line("mean so far", of_number(|p| number(&p["mae_so_far_ml"]))),
     ];
     figure(&plot("weighed pours", "|error| in ml", &series, true), "Error against the number of weighed pours.")
 }

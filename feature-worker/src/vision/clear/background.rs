@@ -17,7 +17,7 @@ use super::rigid::RigidMap;
 use crate::vision::geometry::LinearField;
 use crate::vision::picture::bilinear_corner;
 
-// "Tuned" below means: on seeds 101 to 104 of `evaluate-camera`, see docs/VISION.md.
+// "Tuned" below means that the value was tuned on seeds 101 to 104 of `evaluate-camera`; see docs/VISION.md.
 
 /// Room in the memory around the region, squares. Chosen by hand; no measurement is recorded.
 const ROOM_SQUARES: usize = 3;
@@ -65,6 +65,7 @@ struct Pose {
 
 /// The dry background as far as it is remembered.
 pub(super) struct Background {
+    /// Size of the pictures, px.
     size: Size,
     /// Side of the memory, px.
     side: usize,
@@ -77,8 +78,9 @@ pub(super) struct Background {
     /// The point for the motion in each square, as the squares lie in the memory.
     points: Vec<Option<MotionPoint>>,
     motion: MotionFinder,
+    /// How the memory lies in the last picture.
     now: Pose,
-    /// In the picture with which pictures are compared.
+    /// How the memory lies in the picture with which pictures are compared.
     reference: Pose,
     /// Pictures that were remembered.
     frame: usize,
@@ -240,7 +242,7 @@ impl Background {
             let dry_spans = DrySpans { right: row.dry(right), inner: row.dry(inner), outer: row.dry(outer) };
             let start = wrapped(y + origin[1], side) * side;
             let (kept, ages) = (&mut memory[start..start + side], &mut self.ages[start..start + side]);
-            // Known ground when its row's turn has come, unknown ground always; up to where the window wraps around.
+            // Known ground follows when its row's turn has come, and unknown ground always does. A run ends where the window wraps around.
             let mut x = x0;
             while x < x1 {
                 let column = wrapped(x + origin[0], side);
@@ -317,7 +319,7 @@ impl Background {
             if out || [left, top].iter().any(|v| *v == 0 || *v == side - SQUARE) {
                 continue;
             }
-            // The square and what is around it, grey; negative where it is not known or not fresh.
+            // The square with what is around it, in grey levels; negative where it is not known or not fresh.
             let mut near = [[0i32; NEIGHBOURHOOD]; NEIGHBOURHOOD];
             let [first_column, first_row] = [column, row].map(|square| wrapped(square * SQUARE + side - NEIGHBOURHOOD_BEFORE, side));
             for (j, near) in near.iter_mut().enumerate() {
@@ -339,7 +341,9 @@ impl Background {
 struct MemoryRow {
     /// Place of its first pixel in the picture, px.
     from: [f32; 2],
+    /// From the window to the picture.
     map: RigidMap,
+    /// Side of the window, px.
     side: f32,
 }
 

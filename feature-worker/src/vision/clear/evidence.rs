@@ -15,7 +15,7 @@ use super::water::Stream;
 use crate::vision::geometry::LinearField;
 use crate::vision::picture::median;
 
-// "Tuned" below means: on seeds 101 to 104 of `evaluate-camera`, see docs/VISION.md.
+// "Tuned" below means that the value was tuned on seeds 101 to 104 of `evaluate-camera`; see docs/VISION.md.
 
 /// Within this distance from the lip the ground tells whether it is even; beyond it, whether it is another picture, px. Tuned.
 const MIDDLE_PX: f32 = 60.0;
@@ -27,7 +27,7 @@ const NOISE_SHARE: f32 = 0.012;
 const NOISE_MEDIANS: f32 = 1.1;
 /// The noise when too little of the background is known to tell, grey levels. Chosen by hand; no measurement is recorded.
 const NOISE_UNKNOWN: f32 = 2.0;
-/// The noise and the evenness are taken from samples; fewer than this tell no noise. Chosen by hand; no measurement is recorded.
+/// Fewer samples of even background than this tell no noise. Chosen by hand; no measurement is recorded.
 const NOISE_SAMPLES: usize = 25;
 /// Share of the background's slope that counts as error of its place, px. Tuned.
 const SLOPE_SHARE: f32 = 0.25;
@@ -76,12 +76,17 @@ static FAR: Window = Window::new(2, 25);
 pub(super) struct Evidence {
     /// Size of the small picture.
     size: Size,
-    // Maps from the rays to the picture, to the memory and to the earlier picture, and what these show there.
+    /// Fixed-point maps from the rays to the picture, as `cv::convertMaps` makes them.
     fixed_maps: [Mat; 2],
+    /// Maps in x and y from the rays, and from the places beside them, to the memory.
     memory_maps: [Mat; 2],
+    /// Maps in x and y from the rays to the earlier picture.
     earlier_maps: [Mat; 2],
+    /// The picture along the rays, one ray a row.
     ray_now: Mat,
+    /// The memory along the rays, and then along the places beside them, one ray a row.
     ray_memory: Mat,
+    /// The earlier picture along the rays, one ray a row.
     ray_earlier: Mat,
     /// Difference from the memory, in units of the noise.
     away: Vec<f32>,
@@ -103,23 +108,31 @@ pub(super) struct Evidence {
     shown_around: Vec<f32>,
     /// The step in colour at each sample, grey levels.
     steps: Vec<f32>,
+    /// Noise of the picture and of what is remembered, grey levels.
     noise: f32,
+    /// Share of the known background far from the lip that differs from the memory.
     strange_share: f32,
+    /// Slopes or differences whose median is taken. Kept from frame to frame.
     scratch: Vec<f32>,
 }
 
 /// What the step, the memory and the earlier picture say along one ray.
 struct RayEvidence {
-    /// The step in colour, grey levels, and what it says, -1 to 1.
+    /// The step in colour, grey levels.
     steps: Row,
+    /// What the step says, from -1 (no edge) to 1.
     step_says: Row,
-    /// What the memory says, -1 to 1.5, and how sure it is, 0 to 1.
+    /// What the memory says, from -1 (no edge) to 1.5.
     memory_says: Row,
+    /// How sure the memory is, 0 to 1.
     sure: Row,
-    /// What the moved earlier picture says, and how much the background moves there, 0 to 1.
+    /// What the moved earlier picture says, from about -1 (no edge) to 0.65.
     earlier_says: Row,
+    /// How much the background moves, 0 to 1.
     moving: Row,
+    /// How little the moved earlier picture explains, -1 (all) to 1 (nothing).
     unexplained: Row,
+    /// The share of the surroundings that the moved earlier picture shows.
     shown_around: Row,
 }
 

@@ -32,6 +32,7 @@ fn spread(pixel: [u8; 4]) -> u64 {
 
 /// A small picture, four bytes a pixel.
 pub(super) struct SmallPicture<'a> {
+    /// Row by row without padding.
     pub(super) pixels: &'a [Vec4b],
     /// Pixels in a row.
     pub(super) width: usize,
@@ -75,6 +76,7 @@ pub(super) struct DrySpans {
 pub(super) struct Following {
     /// The run's first column.
     pub(super) x: i32,
+    /// The columns of its row that are surely dry.
     pub(super) dry: DrySpans,
     /// Whether a stream is seen now.
     pub(super) flows: bool,

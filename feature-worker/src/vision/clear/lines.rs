@@ -14,7 +14,7 @@ use super::rigid::RigidMap;
 use super::water::{BEGIN_GROUND, Candidate, EarlierPicture, Stream};
 use crate::vision::geometry::{Axes, distance};
 
-// "Tuned" below means: on seeds 101 to 104 of `evaluate-camera`, see docs/VISION.md.
+// "Tuned" below means that the value was tuned on seeds 101 to 104 of `evaluate-camera`; see docs/VISION.md.
 
 /// Distances on either axis that are tried. Chosen by hand: they reach across the region.
 const LEGS: usize = 41;
@@ -52,6 +52,7 @@ const EDGE_REACH: usize = 2;
 
 /// The lines that are tried, and where each lies on the rays.
 pub(super) struct Lines {
+    /// In the small region.
     axes: Axes,
     /// Each line's cuts with the x-axis and the y-axis, px.
     legs_px: Vec<[f32; 2]>,
@@ -109,7 +110,7 @@ impl Lines {
             if a / b > LEGS_FLAT || b / a > LEGS_STEEP {
                 continue;
             }
-            // Where each ray meets the line: along = u x + v y, and u / a + v / b = 1 on it.
+            // Where each ray meets the line. A ray's direction is u x + v y, and u / a + v / b = 1 on the line.
             let crossings: Vec<f32> = directions
                 .iter()
                 .map(|d| {
@@ -127,7 +128,7 @@ impl Lines {
                 continue;
             }
             let apart = |k: usize| distance(point(k), point(k + 1));
-            // By length; the rays beside the axes are left out.
+            // A ray's weight is the length of line around it. The rays beside the axes are left out.
             let weight = |k: usize| if k == 0 || k == RAYS - 1 { 0.0 } else { apart(k - 1) + apart(k) };
             let total: f32 = (0..RAYS).map(weight).sum();
             legs_px.push([a, b]);
@@ -179,7 +180,7 @@ impl Lines {
             let stay = change.bonus();
             found.evidence = found.score;
             let beats = |total: f32| best.is_none_or(|b| total > b.total);
-            // The band along it can only cost.
+            // The band along the line can only cost, so without a chance it is not read.
             if !beats(outer + found.score + EDGE_WEIGHT * found.edge_share + stay) {
                 continue;
             }
@@ -266,7 +267,7 @@ impl Lines {
             let row = &evidence.value()[ray * SAMPLES..][..SAMPLES];
             let range = middle.saturating_sub(EDGE_REACH)..(middle + EDGE_REACH + 1).min(SAMPLES);
             let best = range.clone().map(|i| row[i]).fold(f32::MIN, f32::max);
-            // Equal neighbours: the middle of them. Without an edge here, the line itself.
+            // Of equal neighbours the middle is taken, and without an edge here the line itself.
             let (mut sum, mut count) = (0usize, 0usize);
             for i in range.filter(|i| best > PIECE && row[*i] >= best - 1e-6) {
                 (sum, count) = (sum + i, count + 1);

@@ -13,7 +13,7 @@ use opencv::prelude::*;
 use super::rigid::RigidMap;
 use crate::vision::picture::{bilinear_corner, median};
 
-// "Tuned" below means: on seeds 101 to 104 of `evaluate-camera`, see docs/VISION.md.
+// "Tuned" below means that the value was tuned on seeds 101 to 104 of `evaluate-camera`; see docs/VISION.md.
 
 /// Side of the squares of which each gives one point, px. Tuned.
 pub(super) const SQUARE: usize = 10;
@@ -95,6 +95,7 @@ struct Motion {
 /// A motion with what it leaves.
 #[derive(Debug, Clone, Copy)]
 struct Fit {
+    /// The motion itself.
     motion: Motion,
     /// Exposure against the memory.
     gain: f32,
@@ -105,7 +106,9 @@ struct Fit {
 /// At which size of the picture the motion is looked for.
 #[derive(Debug, Clone, Copy)]
 enum Level {
+    /// At half the working size.
     Half,
+    /// At the working size.
     Full,
 }
 
@@ -116,11 +119,13 @@ pub(super) struct MotionFinder {
     half_size: Size,
     /// The points as they lay in the last picture. Kept from frame to frame.
     points: Vec<MotionPoint>,
-    /// The last motion, and how much it left unexplained.
+    /// The last motion.
     motion: Motion,
+    /// How much of the points the last motion left unexplained at half the size, grey levels.
     left: f32,
-    // Kept from frame to frame.
+    /// The picture in grey at the working size. Kept from frame to frame.
     grey: Mat,
+    /// The same at half the working size.
     half: Mat,
     /// The points' errors, then their sizes; grey levels.
     scratch: Vec<f32>,
@@ -183,7 +188,7 @@ impl MotionFinder {
     /// Improves `motion` so that the points, moved, become what the picture shows. `before` is the last motion.
     #[inline(always)]
     fn improve(&mut self, level: Level, mut motion: Motion, before: Motion, mut gain: f32) -> opencv::Result<Fit> {
-        // The scale and the middle of its first pixel, and the change at which the search ends, px.
+        // The picture's scale, where the middle of the first pixel comes to lie, and the change at which the search ends, px.
         let (picture, scale, corner, close) = match level {
             Level::Half => (&self.half, 0.5, -0.25, 0.2),
             Level::Full => (&self.grey, 1.0, 0.0, 0.05),
@@ -225,7 +230,7 @@ impl MotionFinder {
     }
 }
 
-/// Bilinear sample of a grey picture; none outside.
+/// The grey level at a place between pixels. There is none outside of the picture.
 #[inline(always)]
 fn grey_at(picture: &[u8], width: usize, height: usize, x: f32, y: f32) -> Option<f32> {
     let (column, row, fx, fy) = bilinear_corner(x, y, width, height)?;

@@ -107,7 +107,7 @@ pub(super) fn size_of(c: &Colour) -> f32 {
     ((c[0] * c[0] + c[1] * c[1] + c[2] * c[2]) * (1.0 / 3.0)).sqrt()
 }
 
-/// A value for each sample of a ray. (`std::array::from_fn` calls `f` out of line for as many.)
+/// A value for each sample of a ray. `std::array::from_fn` is not used, because it calls `f` out of line for so many values.
 #[inline(always)]
 pub(super) fn row(f: impl Fn(usize) -> f32) -> Row {
     let mut row = [0.0; SAMPLES];

@@ -3,8 +3,11 @@
 /// A turn about the origin followed by a shift.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct RigidMap {
+    /// Cosine of the turn.
     pub(super) cos: f32,
+    /// Sine of the turn.
     pub(super) sin: f32,
+    /// The shift after the turn, px.
     pub(super) shift: [f32; 2],
 }
 

@@ -9,7 +9,7 @@ use super::rays::{Colour, each};
 use crate::vision::liquid::FineLine;
 use shared::messages::Doubt;
 
-// "Tuned" below means: on seeds 101 to 104 of `evaluate-camera`, see docs/VISION.md.
+// "Tuned" below means that the value was tuned on seeds 101 to 104 of `evaluate-camera`; see docs/VISION.md.
 
 /// Least score of a line to begin a stream on ground of which nothing is known. Tuned.
 const BEGIN_SCORE: f32 = 0.6;
@@ -157,6 +157,7 @@ pub(super) enum Verdict {
 
 /// What is known of the water from the frames so far.
 pub(super) struct Water {
+    /// The stream as it was last seen, if there is one.
     stream: Option<Stream>,
     /// Where the stream last was: cuts with the axes, px of the small picture.
     last_legs_px: [f32; 2],
