@@ -16,6 +16,7 @@ use shared::estimator::Calibration;
 use shared::mlp::{InputScale, Mlp};
 use shared::weights::{Estimator, Method, Origin, Weights};
 
+/// Counts the cells of this process, so that each gets a name and an address of its own.
 static NEXT: AtomicU32 = AtomicU32::new(0);
 
 /// Weights that tilt out by the same action every frame: they pour, though not well.
