@@ -128,6 +128,7 @@ impl ColouredLiquid {
     }
 
     /// The last sample of liquid on a ray and the score there: px of liquid less px of background, at its largest.
+    #[inline(always)]
     fn last_liquid(&self, mask: &[u8]) -> Option<(usize, f32)> {
         let (mut score, mut best, mut last) = (0.0f32, 0.0f32, None);
         for (r, (value, step)) in mask.iter().zip(&self.grid.steps_px).enumerate() {

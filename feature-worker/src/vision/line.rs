@@ -285,6 +285,7 @@ fn coarse_offset(across: &Across, line: &Line, edges: &[[f32; 2]], next: usize, 
 }
 
 /// Reads one profile. There is none if it leaves the region.
+#[inline(always)]
 fn read_profile(pixels: RegionPixels, centre_px: [f32; 2], outwards: [f32; 2], spacing_px: f32) -> Option<Profile> {
     let mut profile = Profile { colours: [[0.0; 3]; PROFILE_SAMPLES], centre_px, outwards, spacing_px };
     for j in 0..PROFILE_SAMPLES {
