@@ -4,7 +4,7 @@
 //! the connecting thread asks for. No bytes make anything here panic: what does not fit gives `None` or [`Malformed`].
 //!
 //! A packet is a u16 with the size of the whole packet, a u8 with its type, and its payload. Where a value lies in a data packet follows
-//! from the two lists of variables, [`OUTPUTS`] and [`INPUTS`], which is computed and checked at compile time.
+//! from the two lists of variables, `OUTPUTS` and `INPUTS`, which is computed and checked at compile time.
 
 use super::{ProgramState, RobotState, TiltJoint};
 
@@ -27,7 +27,7 @@ pub const START: u8 = b'S';
 const HEADER: usize = 3;
 /// The largest packet that its u16 size can announce, bytes.
 const LARGEST: usize = u16::MAX as usize;
-/// Bytes of a packet with one target: header, recipe id, and the values of [`INPUTS`].
+/// Bytes of a packet with one target: header, recipe id, and the values of `INPUTS`.
 pub const TARGET_LEN: usize = HEADER + 1 + bytes_of(&INPUTS);
 
 /// One whole packet.
@@ -107,7 +107,7 @@ pub fn encode<'a>(kind: u8, parts: &[&[u8]], out: &'a mut [u8]) -> Option<&'a [u
     Some(out)
 }
 
-/// The DATA_PACKAGE with one target: number, mode code and joint angle in rad, in the order of [`INPUTS`].
+/// The DATA_PACKAGE with one target: number, mode code and joint angle in rad, in the order of `INPUTS`.
 pub fn encode_target(recipe: u8, sequence: i32, mode: i32, joint_rad: f64) -> [u8; TARGET_LEN] {
     let mut out = [0; TARGET_LEN];
     let parts: [&[u8]; 4] = [&[recipe], &sequence.to_be_bytes(), &mode.to_be_bytes(), &joint_rad.to_be_bytes()];
@@ -223,7 +223,7 @@ const OUTPUTS: [Variable; 13] = [
     Variable::plain("target_speed_fraction", Type::Double),
 ];
 
-/// Where the values of [`OUTPUTS`] begin in a data packet, bytes behind the recipe id.
+/// Where the values of `OUTPUTS` begin in a data packet, bytes behind the recipe id.
 mod at {
     use super::{OUTPUTS, Type, offset};
 
@@ -306,7 +306,7 @@ pub fn input_names(base: u8) -> [(String, &'static str); INPUTS.len()] {
 #[derive(Debug, Clone, Copy)]
 pub struct Outputs<'a>(&'a [u8; OUTPUTS_LEN]);
 
-/// Bytes of the values of [`OUTPUTS`].
+/// Bytes of the values of `OUTPUTS`.
 const OUTPUTS_LEN: usize = bytes_of(&OUTPUTS);
 
 impl<'a> Outputs<'a> {
