@@ -25,7 +25,7 @@ impl Moments {
         values.filter(|v| v.is_finite()).fold(Self::EMPTY, Self::with)
     }
 
-    /// The same with one more value; the count stays in step.
+    /// The same numbers with one more value.
     fn with(self, value: f64) -> Self {
         Self {
             min: self.min.min(value),
