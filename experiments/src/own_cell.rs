@@ -1,7 +1,7 @@
-//! A simulated cell with a name, an address and a directory of its own, as processes: for commands that work with the real programs.
+//! A simulated cell of real processes with a name, an address and a directory of its own, for experiments with the real programs.
 //!
-//! Ordinary process; allocates and blocks. It does what an operator does, by the programs' command lines, and takes no decision of
-//! the controller. When it is dropped, every process that it started is stopped and the cell's shared memory is removed.
+//! Ordinary process; allocates and blocks. It does what an operator does, by the programs' command lines, and takes no decision of the
+//! controller. When it is dropped, every process that it started is stopped and the cell's shared memory is removed.
 
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, ExitStatus, Stdio};
@@ -16,10 +16,10 @@ use shared::exit::{self, Failure, failure};
 use shared::messages::Phase;
 use shared::os;
 
-/// Why it stopped.
+/// Why the cell, or an operator's command in it, did not do what it was asked to.
 #[derive(Debug, thiserror::Error)]
 pub enum OwnCellError {
-    /// Ctrl-C.
+    /// Ctrl-C was pressed.
     #[error("interrupted; every process that was started is stopped")]
     Interrupted,
     /// The configuration is bad.
@@ -28,9 +28,9 @@ pub enum OwnCellError {
     /// A file or program cannot be used.
     #[error("{what}: {error}")]
     File {
-        /// Which.
+        /// The file or program.
         what: String,
-        /// The system's words.
+        /// What the system says.
         error: std::io::Error,
     },
     /// A command failed.
@@ -40,7 +40,7 @@ pub enum OwnCellError {
         what: String,
         /// Its exit code.
         code: String,
-        /// Its last line, and where to look.
+        /// Its last line, and where to look for more.
         hint: String,
     },
     /// Something took too long.
@@ -48,14 +48,14 @@ pub enum OwnCellError {
     Late {
         /// What was waited for.
         what: String,
-        /// How long.
+        /// How long it was waited for, s.
         seconds: u64,
         /// What was the case instead.
         why: String,
         /// Directory of the logs.
         logs: String,
     },
-    /// Anything else.
+    /// Something else went wrong.
     #[error("{0}")]
     Other(String),
 }
@@ -71,9 +71,9 @@ impl From<OwnCellError> for Failure {
     }
 }
 
-/// The cell.
+/// A cell of its own.
 pub struct OwnCell {
-    /// Its configuration: the given one with its own name, address and files.
+    /// Its configuration: the given one with a name, an address and files of its own.
     pub config: Config,
     /// Directory of all its files.
     pub out: PathBuf,
@@ -87,8 +87,11 @@ pub struct OwnCell {
 }
 
 impl OwnCell {
-    /// Makes the directory and the configuration; nothing runs yet. Weights of an earlier cell there are removed. `kind` becomes
-    /// part of the cell's name. From here on Ctrl-C ends what waits.
+    /// Makes the directory and the configuration; nothing runs yet. Weights of an earlier cell there are removed. `kind` becomes part of
+    /// the cell's name. From here on Ctrl-C ends what waits.
+    ///
+    /// # Errors
+    /// When the configuration is bad, or a file cannot be written.
     pub fn prepare(kind: &str, config: &Path, out: &Path, seed: u64) -> Result<Self, OwnCellError> {
         let file = |what: &Path, error| OwnCellError::File { what: what.display().to_string(), error };
         let bad = |e: &dyn std::fmt::Display| OwnCellError::Config(e.to_string());
@@ -104,7 +107,7 @@ impl OwnCell {
             }
         };
         let path = |name: &str| toml::Value::String(out.join(name).display().to_string());
-        // A name and an address of its own, so that a cell that is already running is left alone.
+        // With a name and an address of its own it leaves a cell alone that is already running.
         let number = std::process::id();
         let address = format!("127.{}.{}.{}", 1 + number / 65_536 % 250, number / 256 % 256, 1 + number % 254);
         set("cell", "name", toml::Value::String(format!("{kind}-{number}")));
@@ -124,6 +127,9 @@ impl OwnCell {
     }
 
     /// Starts simulator, feature worker and controller, and waits until they are ready to pour.
+    ///
+    /// # Errors
+    /// When one of them cannot be started or ends, or they are not ready in time.
     pub fn start(&mut self) -> Result<Client, OwnCellError> {
         for name in ["simulator", "feature-worker", "rt-controller"] {
             let child = self.spawn(name)?;
@@ -140,7 +146,7 @@ impl OwnCell {
         Ok(client)
     }
 
-    /// Stops the processes in order and waits for them.
+    /// Stops the processes in order, and waits for them.
     pub fn stop(&mut self) {
         // The controller first: it brings the container upright while the robot is still there.
         while let Some((_, mut child)) = self.processes.pop() {
@@ -156,21 +162,25 @@ impl OwnCell {
         }
     }
 
-    /// Process id of one of its processes.
+    /// The process id of one of its processes, if it runs.
     pub fn pid(&self, name: &str) -> Option<u32> {
         self.processes.iter().find(|(n, _)| *n == name).map(|(_, child)| child.id())
     }
 
-    /// One line of progress.
+    /// Writes one line of progress to standard error.
     pub fn note(&self, text: &str) {
         eprintln!("[{:5.1} s] {text}", self.started.elapsed().as_secs_f64());
     }
 
-    /// An error once Ctrl-C was pressed.
+    /// Looks for Ctrl-C.
+    ///
+    /// # Errors
+    /// [`OwnCellError::Interrupted`] once it was pressed.
     pub fn interrupted(&self) -> Result<(), OwnCellError> {
         if self.stop.load(Ordering::Relaxed) { Err(OwnCellError::Interrupted) } else { Ok(()) }
     }
 
+    /// Starts `name run`; what it says goes to a file of the logs.
     fn spawn(&self, name: &str) -> Result<Child, OwnCellError> {
         let log = self.out.join(format!("logs/{name}.log"));
         let log = std::fs::File::create(&log).map_err(|error| OwnCellError::File { what: log.display().to_string(), error })?;
@@ -184,7 +194,10 @@ impl OwnCell {
             .map_err(|error| OwnCellError::File { what: name.into(), error })
     }
 
-    /// Runs one command of an operator to its end and reads its JSON.
+    /// Runs one command of an operator to its end, and reads its JSON.
+    ///
+    /// # Errors
+    /// When it cannot be started or does not succeed.
     pub fn command(&self, program: &str, words: &[&str]) -> Result<Value, OwnCellError> {
         let what = format!("{program} {}", words.join(" "));
         let mut child = Command::new(self.bin.join(program));
@@ -197,7 +210,10 @@ impl OwnCell {
         Ok(serde_json::from_slice(&output.stdout).unwrap_or(Value::Null))
     }
 
-    /// An error, with the last line that was said, unless a command succeeded.
+    /// Judges how a command ended.
+    ///
+    /// # Errors
+    /// With the last line that was said, unless the command succeeded.
     pub fn succeeded(&self, what: &str, status: ExitStatus, said: &str) -> Result<(), OwnCellError> {
         self.interrupted()?;
         if status.success() {
@@ -209,12 +225,18 @@ impl OwnCell {
     }
 
     /// What the kitchen scale shows, g.
+    ///
+    /// # Errors
+    /// When the scale cannot be read.
     pub fn scale(&self) -> Result<f64, OwnCellError> {
         let reading = self.command("simulator", &["operator", "scale", "--json"])?;
         reading["weight_g"].as_f64().ok_or_else(|| OwnCellError::Other(format!("the scale reads {reading}")))
     }
 
-    /// Tries until it works, a process dies, Ctrl-C comes or time is up.
+    /// Tries until it works.
+    ///
+    /// # Errors
+    /// When a process ends, Ctrl-C is pressed, or time is up.
     pub fn until<T>(&mut self, what: &str, seconds: u64, attempt: impl Fn() -> Result<T, String>) -> Result<T, OwnCellError> {
         let until = Instant::now() + Duration::from_secs(seconds);
         loop {
@@ -240,7 +262,7 @@ impl OwnCell {
 impl Drop for OwnCell {
     fn drop(&mut self) {
         self.stop();
-        // Also what a killed process left.
+        // This also removes what a killed process left.
         shared::ipc::remove_files(&self.config.cell.name);
     }
 }

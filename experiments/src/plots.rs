@@ -1,3 +1,4 @@
-//! Pictures of one experiment, as SVG files. Plots within a page are drawn by `trainer`'s report.
+//! Pictures of one experiment, as SVG files. The plots on a page are those of the trainer's report.
 
+pub mod motion;
 pub mod pour;

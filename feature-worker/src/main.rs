@@ -3,8 +3,7 @@
 use std::process::ExitCode;
 
 use clap::{Parser, Subcommand};
-use feature_worker::commands::{bench, episodes, run};
-use feature_worker::{calibrate, inspect, view};
+use feature_worker::commands::{bench, calibrate, episodes, inspect, run, view};
 
 /// The vision process: camera frames in, V_e and episodes out.
 #[derive(Parser)]

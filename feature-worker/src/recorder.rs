@@ -1,6 +1,6 @@
 //! Writes episodes (section 3.1 of the paper) in a thread of its own.
 //!
-//! The worker hands each frame over with [`Recorder::offer`], which never waits. The recorder's thread ([`writing`]) follows the
+//! The worker hands each frame over with [`Recorder::offer`], which never waits. The recorder's thread (`writing`) follows the
 //! controller's telemetry, opens a file when an episode begins, compresses and writes its frames, and closes the file when the last
 //! frame of the episode has come. It reports on the service `recorder`. A full or slow disk costs that episode's file or some of its
 //! images and nothing else: the next episode tries again.

@@ -12,10 +12,12 @@ use shared::config::{CameraConfig, CameraSource};
 use shared::ipc::{Cell, FrameTopic};
 
 mod capture;
+mod files;
 mod frame;
 mod shared_memory;
 
 pub use capture::{Capture, Numbering, check_rate};
+pub use files::for_each_frame;
 pub use frame::{Frame, FrameSource, FrameStream, NextFrame, SourceError, StreamEvent, WAIT};
 pub use shared_memory::SharedMemory;
 

@@ -16,9 +16,9 @@ use shared::ipc::Cell;
 use shared::messages::{Doubt, Feature, FrameHeader, LAYOUT_VERSION, PixelFormat};
 use shared::os;
 
-use crate::extract::{Extractor, Image, Measurement};
 use crate::recorder::Recorder;
 use crate::source::{Frame, FrameStream, Source, SourceError, StreamEvent, WAIT};
+use crate::vision::{Extractor, Image, Measurement};
 
 mod republisher;
 mod status;

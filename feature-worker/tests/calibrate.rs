@@ -6,8 +6,7 @@ use std::path::Path;
 use std::process::{Command, Output};
 
 use drawn::{Outcome, pour, write_config};
-use feature_worker::calibrate::{ColourLearner, find_corner};
-use feature_worker::extract::Axes;
+use feature_worker::vision::{Axes, ColourLearner, Extractor, Image, find_corner};
 use opencv::core::{Mat, Vector};
 use opencv::imgcodecs;
 use opencv::prelude::*;
@@ -25,8 +24,8 @@ fn calibrate(config: &Path, picture: &Path, more: &[&str]) -> std::io::Result<Ou
     command.arg("calibrate").args(more).arg("--config").arg(config).arg("--picture").arg(picture).output()
 }
 
-/// Protects the five minutes: from one pour the corner is found within 2 px and the axes within 1 degree, the liquid's colour
-/// within a range that measures the pour, and the section is written while the rest of the file, comments too, stays as it was.
+/// Protects the five minutes that calibration may take: from one pour the corner is found within 2 px and the axes within 1 degree, and the
+/// liquid's colour as a range that measures the pour. The section is written, and the rest of the file, comments too, stays as it was.
 #[test]
 fn one_pour_is_enough() -> Outcome {
     let directory = tempfile::tempdir()?;
@@ -49,9 +48,9 @@ fn one_pour_is_enough() -> Outcome {
     assert!(imgcodecs::imread(&picture, imgcodecs::IMREAD_COLOR)?.cols() == 640);
     assert_eq!(Config { image: before.image.clone(), ..after.clone() }, before);
     assert!(std::fs::read_to_string(&path)?.contains("# the robot in cell 7"));
-    let mut extractor = feature_worker::extract::Extractor::new(&after.camera, &after.image)?;
+    let mut extractor = Extractor::new(&after.camera, &after.image)?;
     let frame = pour(20)?;
-    let measured = extractor.measure(feature_worker::extract::Image {
+    let measured = extractor.measure(Image {
         width_px: 640,
         height_px: 480,
         format: shared::messages::PixelFormat::Bgr8,
@@ -61,7 +60,7 @@ fn one_pour_is_enough() -> Outcome {
     Ok(())
 }
 
-/// Protects people whose container is not found: coordinates are taken as given, and nothing is written without --write.
+/// Protects people whose container is not found: coordinates are taken as they are given, and nothing is written without --write.
 #[test]
 fn coordinates_are_taken_and_nothing_is_written_unasked() -> Outcome {
     let directory = tempfile::tempdir()?;
@@ -78,8 +77,8 @@ fn coordinates_are_taken_and_nothing_is_written_unasked() -> Outcome {
     Ok(())
 }
 
-/// Protects people from a calibration that means nothing: frames without edges, and a pour without liquid, are refused with what to
-/// do instead.
+/// Protects people from a calibration that means nothing: frames without edges and a pour without liquid are refused, and the error says
+/// what to do instead.
 #[test]
 fn nothing_to_see_is_said() -> Outcome {
     let flat = Mat::new_rows_cols_with_default(480, 640, opencv::core::CV_8UC3, opencv::core::Scalar::all(128.0))?;

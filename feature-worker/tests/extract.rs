@@ -4,7 +4,7 @@
 mod drawn;
 
 use drawn::{HEIGHT, WIDTH, blue, camera, disc, dry, image_config, noisy, pour, stream, water};
-use feature_worker::extract::{ExtractError, Extractor, Image, Measurement};
+use feature_worker::vision::{ExtractError, Extractor, Image, Measurement};
 use opencv::core::{self, CV_8UC3, CV_16SC3, Mat, Point, Scalar, Size, Vector};
 use opencv::imgproc;
 use opencv::prelude::*;
@@ -19,7 +19,7 @@ fn colour() -> Result<Extractor, ExtractError> {
     Extractor::new(&camera(), &image_config(LiquidMethod::Colour))
 }
 
-/// Protects V_e itself: triangles of known size, small and large, steep and flat, are measured to 3 %, their corners to 1.5 px.
+/// Protects V_e itself: triangles of known size, small and large, steep and flat, are measured to 3 %, and their corners to 1.5 px.
 #[test]
 fn known_triangles_are_measured() -> Result<(), ExtractError> {
     for (i, (a, b)) in [(22.0f32, 20.0f32), (40.0, 60.0), (90.0, 45.0), (150.0, 140.0), (200.0, 70.0)].into_iter().enumerate() {
@@ -35,17 +35,18 @@ fn known_triangles_are_measured() -> Result<(), ExtractError> {
     Ok(())
 }
 
-/// Protects every camera: the same picture as YUYV gives the same V_e as in BGR, at even and odd corners of the region.
+/// Protects every kind of camera: a picture in YUYV gives the same V_e as in BGR, at even and odd corners of the region.
 #[test]
 fn yuyv_gives_the_same_area() -> Result<(), ExtractError> {
     let picture = blue(&[stream(90.0, 60.0)], 3)?;
     let mut yuv = Mat::default();
     imgproc::cvt_color_def(&picture, &mut yuv, imgproc::COLOR_BGR2YUV)?;
-    // YUYV has limited range: luma 16 to 235, chroma 16 to 240, one chroma for two pixels.
+    // YUYV has a limited range: luma goes from 16 to 235 and chroma from 16 to 240, and two pixels share one chroma.
     let full = yuv.data_typed::<core::Vec3b>()?;
     let mut yuyv = Vec::new();
     let luma = |p: &core::Vec3b| (16.0 + f32::from(p[0]) * 219.0 / 255.0).round() as u8;
-    // OpenCV's YUV has U = 0.492 (B - Y) and V = 0.877 (R - Y); the camera's chroma are 0.564 and 0.713 of them, in limited range.
+    // OpenCV's YUV has U = 0.492 (B - Y) and V = 0.877 (R - Y); a camera's chroma have 0.564 and 0.713 instead, in the limited
+    // range.
     let chroma = |p: &core::Vec3b, k: usize, factor: f32| (128.0 + (f32::from(p[k]) - 128.0) * factor * 224.0 / 255.0).round() as u8;
     for pair in full.chunks_exact(2) {
         yuyv.extend([luma(&pair[0]), chroma(&pair[0], 1, 0.564 / 0.492), luma(&pair[1]), chroma(&pair[0], 2, 0.713 / 0.877)]);
@@ -61,7 +62,7 @@ fn yuyv_gives_the_same_area() -> Result<(), ExtractError> {
     Ok(())
 }
 
-/// Protects the end of a pour: no stream is exactly 0, and neither drops nor a splash nor the bead at the lip are a stream.
+/// Protects the end of a pour: without a stream V_e is exactly 0, and neither drops nor a splash nor the bead at the lip are a stream.
 #[test]
 fn drops_and_splashes_are_no_stream() -> Result<(), ExtractError> {
     let inside = vec![[217.0, 479.0], [217.0, 300.0], [560.0, 270.0], [560.0, 479.0]];
@@ -105,7 +106,7 @@ fn each_cause_raises_its_doubt() -> Result<(), ExtractError> {
     Ok(())
 }
 
-/// Protects against a stream out of nothing: where the colour only fades, over half of the region, there is no edge and no stream.
+/// Protects against a stream out of nothing: where the colour only fades, over half of the region, there is no edge and so no stream.
 #[test]
 fn a_fade_without_an_edge_is_no_stream() -> Result<(), ExtractError> {
     let mut picture = Mat::new_rows_cols_with_default(HEIGHT, WIDTH, CV_8UC3, Scalar::all(185.0))?;
@@ -142,8 +143,8 @@ fn a_dark_liquid_in_noise_is_measured() -> Result<(), ExtractError> {
     Ok(())
 }
 
-/// Protects the start of a pour: a camera that lost its focus is noticed before anything flows, by the glass's own edges; a
-/// sharp one is not doubted, whatever stands behind.
+/// Protects the start of a pour: a camera that has lost its focus is noticed before anything flows, by the glass's own edges. A sharp
+/// picture is not doubted, whatever stands behind the glass.
 #[test]
 fn lost_focus_is_noticed_without_a_stream() -> Result<(), ExtractError> {
     for method in [LiquidMethod::Colour, LiquidMethod::Clear] {
@@ -157,7 +158,7 @@ fn lost_focus_is_noticed_without_a_stream() -> Result<(), ExtractError> {
             let mut soft = Mat::default();
             imgproc::gaussian_blur(&dry(i as f32 * 0.5, i)?, &mut soft, Size::new(0, 0), 5.0, 5.0, core::BORDER_REFLECT_101)?;
             let measured = measure(&mut extractor, &drawn::noisy(&soft, i)?)?;
-            // To the memory of clear water's background, a picture that was lost all at once is first of all another one.
+            // To clear water's memory of the background, a picture that turns soft all at once is first of all another picture.
             let noticed = measured.doubt == Doubt::Blurred || (method == LiquidMethod::Clear && measured.doubt == Doubt::EdgeNotFound);
             assert!(measured.area_px2 == 0.0 && noticed, "{method:?} {i}: {measured:?}");
         }
@@ -165,8 +166,8 @@ fn lost_focus_is_noticed_without_a_stream() -> Result<(), ExtractError> {
     Ok(())
 }
 
-/// Protects the check of focus by the glass's own top edge and left side, whose blurred edge of deviation s is 2.5 s wide: 3 px are
-/// sharp and 10 px are not, whatever stands behind, and a background that is out of focus behind a sharp glass is no reason.
+/// Protects the check of focus by the glass's own top edge and left side. A blur of deviation s makes an edge 2.5 s wide: 3 px are sharp
+/// and 10 px are not, whatever stands behind. A background that is out of focus behind a sharp glass is no reason for a doubt.
 #[test]
 fn focus_is_judged_by_the_glass() -> Result<(), ExtractError> {
     let soft = |picture: &Mat, deviation_px: f64| -> Result<Mat, opencv::Error> {
@@ -186,7 +187,7 @@ fn focus_is_judged_by_the_glass() -> Result<(), ExtractError> {
     Ok(())
 }
 
-/// Protects clear water before an even wall and before a pattern at rest: dry frames are exactly 0 before and after, every frame
+/// Protects clear water before an even wall and before a pattern at rest: V_e is exactly 0 in the dry frames before and after, every frame
 /// with water is measured to 10 % once the stream stands, and none is doubted.
 #[test]
 fn clear_water_is_measured() -> Result<(), ExtractError> {
@@ -211,8 +212,8 @@ fn clear_water_is_measured() -> Result<(), ExtractError> {
     Ok(())
 }
 
-/// Protects pours before a pattern that turns with the wrist: dry frames are exactly 0 before and after, and a stream is measured to
-/// 30 % from its third frame on until it is smaller than at its second.
+/// Protects pours before a pattern that turns with the wrist: V_e is exactly 0 in the dry frames before and after, and a stream is measured
+/// to 30 % from its third frame on, as long as its legs have more than half of their full length.
 #[test]
 fn clear_water_before_a_turning_pattern_is_measured() -> Result<(), ExtractError> {
     for turn_deg in [-0.8f32, 0.5, 1.0] {
@@ -236,8 +237,8 @@ fn clear_water_before_a_turning_pattern_is_measured() -> Result<(), ExtractError
     Ok(())
 }
 
-/// Protects the worker from any picture: whatever the bytes, nothing panics, and an area is finite and not negative, a confidence
-/// between 0 and 1, and no usable frame has an area without its triangle.
+/// Protects the worker from any picture: whatever the bytes are, nothing panics, an area is finite and not negative, a confidence lies
+/// between 0 and 1, and there is an area exactly when there is a triangle.
 #[test]
 fn any_bytes_give_a_sane_measurement() -> Result<(), ExtractError> {
     for method in [LiquidMethod::Colour, LiquidMethod::Clear] {
@@ -258,7 +259,7 @@ fn any_bytes_give_a_sane_measurement() -> Result<(), ExtractError> {
     Ok(())
 }
 
-/// Protects replays: the same frames give the same measurements, bit by bit, whatever was measured before in another extractor.
+/// Protects replays: the same frames give the same measurements to the bit, whatever another extractor has measured before.
 #[test]
 fn the_same_frames_give_the_same_measurements() -> Result<(), ExtractError> {
     let run = || -> Result<Vec<Measurement>, ExtractError> {
@@ -269,7 +270,7 @@ fn the_same_frames_give_the_same_measurements() -> Result<(), ExtractError> {
     Ok(())
 }
 
-/// Protects the operator from a configuration that cannot work: it is refused at once, with the key and a hint.
+/// Protects the operator from a configuration that cannot work: it is refused at once, with the key's name and a hint.
 #[test]
 fn bad_geometry_is_refused() -> Result<(), ExtractError> {
     let refusal = |image: ImageConfig| match Extractor::new(&camera(), &image) {

@@ -1,11 +1,12 @@
-//! The extraction under an allocator that aborts the process when Rust code allocates or frees. OpenCV's own allocations (matrix
-//! headers, buffers kept by it) are made by its C++ and are not seen here.
+//! The extraction under an allocator that aborts the process when Rust code allocates or frees memory.
+//!
+//! This does not show what OpenCV allocates: its matrix headers and the buffers that it keeps are made by its C++ code.
 
 mod drawn;
 
 use assert_no_alloc::{AllocDisabler, assert_no_alloc};
 use drawn::{camera, image_config, pour, water};
-use feature_worker::extract::{Extractor, Image};
+use feature_worker::vision::{Extractor, Image};
 use opencv::prelude::*;
 use shared::config::LiquidMethod;
 use shared::messages::PixelFormat;
@@ -13,8 +14,8 @@ use shared::messages::PixelFormat;
 #[global_allocator]
 static ALLOCATOR: AllocDisabler = AllocDisabler;
 
-/// Protects the extraction thread's pace: after two frames no frame allocates, dry or with a stream, coloured or clear, while the
-/// background turns far enough that the memory of it is moved.
+/// Protects the extraction thread's pace: after two frames no frame allocates, whether dry or with a stream, coloured or clear, while the
+/// background turns so far that its memory is moved on.
 #[test]
 fn no_frame_allocates() -> drawn::Outcome {
     for method in [LiquidMethod::Colour, LiquidMethod::Clear] {

@@ -1,4 +1,4 @@
-//! The RTDE client: any bytes, cut in two ways, give the same frames, and no frame's contents make a reader panic.
+//! The RTDE client: any bytes, cut in two ways, give the same packets, and no packet's contents make a reader panic.
 #![no_main]
 
 use libfuzzer_sys::fuzz_target;
@@ -6,7 +6,7 @@ use rt_controller::link::TiltJoint;
 use rt_controller::link::wire::{Inbox, Malformed, read_anything};
 use shared::config::Joint;
 
-/// Types and payloads of all frames, and how the stream ended.
+/// The types and payloads of all packets, and how the stream ended.
 fn frames(bytes: &[u8], cut: usize) -> (Vec<(u8, Vec<u8>)>, Option<Malformed>) {
     let tilt = TiltJoint { joint: Joint::Wrist3, start_deg: 0.0, direction: 1.0 };
     let (mut inbox, mut frames) = (Inbox::new(), Vec::new());
@@ -18,7 +18,7 @@ fn frames(bytes: &[u8], cut: usize) -> (Vec<(u8, Vec<u8>)>, Option<Malformed>) {
             inbox.filled(n);
             piece = &piece[n..];
             loop {
-                match inbox.next_frame() {
+                match inbox.next_packet() {
                     Ok(Some(frame)) => {
                         read_anything(frame, &tilt);
                         frames.push((frame.kind, frame.payload.to_vec()));

@@ -1,4 +1,7 @@
-//! The clients' side of the controller's service `control`: one request, one answer. Ordinary threads; allocates.
+//! The clients' side of the controller's service `control`: one request, one answer; and the recorder's reports.
+//!
+//! Runs in ordinary threads of other processes; allocates, and blocks until there is an answer or a time limit has passed. Each failure
+//! is one line that says what to do.
 
 use std::path::PathBuf;
 use std::sync::atomic::Ordering;
@@ -8,17 +11,21 @@ use iceoryx2::port::client::Client as Port;
 use iceoryx2::service::ipc::Service as Ipc;
 use indicatif::ProgressStyle;
 use shared::control::{Outcome, Reply, Request, Status};
-use shared::ipc::{Cell, IpcError};
+use shared::ipc::{Cell, InService as _, IpcError};
 use shared::messages::{RecorderReport, RecorderState};
 use shared::os;
 
-/// Largest request or answer, bytes.
+/// Largest request or answer, bytes. Chosen by hand; no measurement is recorded.
 pub const MESSAGE_MAX: usize = 64 * 1024;
 
-/// How often a controller may say that it does other things than the episode that it has started: for a second.
+/// Longest wait for the controller's answer; it answers within a tick and a look of its service thread, below 0.1 s.
+const ANSWER: Duration = Duration::from_secs(2);
+/// Longest wait for the recorder to close a file. Chosen by hand; no measurement is recorded.
+const FILE_CLOSED: Duration = Duration::from_secs(10);
+/// How often in a row a controller may not know the episode that it has started, before it counts as restarted: for a second.
 const UNKNOWN_MAX: u32 = 10;
 
-/// What the commands that ask the running controller have in common on the command line.
+/// The arguments of all commands that ask the running controller.
 #[derive(Debug, clap::Args)]
 pub struct Common {
     /// The cell's configuration.
@@ -35,17 +42,17 @@ pub enum ClientError {
     /// Shared memory cannot be joined.
     #[error(transparent)]
     Ipc(#[from] IpcError),
-    /// No controller, or it does not answer.
+    /// There is no controller, or it does not answer.
     #[error("no answer from rt-controller in cell '{cell}': is `rt-controller run` running with the same --config, as the same user?")]
     NoAnswer {
         /// The cell's name.
         cell: String,
     },
-    /// It knows nothing of an episode that it had started.
+    /// It no longer knows an episode that it had started.
     #[error("rt-controller knows nothing of episode {0} any more: it was restarted; the robot's program brings the container upright")]
     Forgotten(u64),
     /// The answer cannot be read.
-    #[error("rt-controller answered in another version's words: run the same build on both sides")]
+    #[error("rt-controller is another version of Decant: run the same build on both sides")]
     Version,
 }
 
@@ -60,19 +67,18 @@ impl Client {
     /// Connects to the controller of the cell `name`.
     pub fn connect(name: &str) -> Result<Self, ClientError> {
         let cell = Cell::join(name)?;
-        let fail = |e: String| IpcError::Service { service: "control".into(), what: e };
-        let port = cell.control()?.client_builder().initial_max_slice_len(MESSAGE_MAX).create().map_err(|e| fail(format!("{e:?}")))?;
+        let port = cell.control()?.client_builder().initial_max_slice_len(MESSAGE_MAX).create().in_service("control")?;
         Ok(Self { port, cell: name.into(), _cell: cell })
     }
 
-    /// Asks and waits up to 2 s for the answer.
+    /// Sends `request` and waits for the answer, up to two seconds.
     pub fn ask(&self, request: &Request) -> Result<Reply, ClientError> {
         let no_answer = || ClientError::NoAnswer { cell: self.cell.clone() };
         let mut buffer = vec![0; MESSAGE_MAX];
         let bytes = postcard::to_slice(request, &mut buffer).map_err(|_| ClientError::Version)?;
         let loan = self.port.loan_slice_uninit(bytes.len()).map_err(|_| no_answer())?;
         let pending = loan.write_from_slice(bytes).send().map_err(|_| no_answer())?;
-        let until = Instant::now() + Duration::from_secs(2);
+        let until = Instant::now() + ANSWER;
         while Instant::now() < until {
             if let Some(response) = pending.receive().map_err(|_| no_answer())? {
                 return postcard::from_bytes(response.payload()).map_err(|_| ClientError::Version);
@@ -94,10 +100,10 @@ impl Client {
 /// Why a pour could not be followed to its end.
 #[derive(Debug, thiserror::Error)]
 pub enum FollowError {
-    /// The person pressed Ctrl-C; how it ended then.
+    /// The person pressed Ctrl-C; this is how the pour ended then.
     #[error("interrupted: {}", .0.reason.words())]
     Interrupted(Outcome),
-    /// The controller is gone.
+    /// The controller is no longer there.
     #[error(transparent)]
     Client(#[from] ClientError),
 }
@@ -105,7 +111,7 @@ pub enum FollowError {
 impl Client {
     /// Shows the progress of `episode` on standard error until it has ended. Ctrl-C aborts it.
     pub fn follow(&self, episode: u64) -> Result<Outcome, FollowError> {
-        // Without it Ctrl-C ends this command, and the pour goes on.
+        // If that fails, Ctrl-C ends this command and the pour goes on.
         let interrupted = os::stop_at_signals().unwrap_or_default();
         let bar = indicatif::ProgressBar::new(1000);
         bar.set_style(ProgressStyle::with_template("{bar:30} {msg}").unwrap_or_else(|_| ProgressStyle::default_bar()));
@@ -120,7 +126,7 @@ impl Client {
                 bar.finish_and_clear();
                 return if aborted { Err(FollowError::Interrupted(*outcome)) } else { Ok(*outcome) };
             }
-            // The tick that starts an episode may be heard of a little after the answer that it started.
+            // The answer that an episode has started may come a little before the first tick that shows it.
             unknown = if status.episode == episode { 0 } else { unknown + 1 };
             if unknown > UNKNOWN_MAX {
                 return Err(ClientError::Forgotten(episode).into());
@@ -135,31 +141,27 @@ impl Client {
 /// The episode's file: its path, or why there is none.
 #[derive(Debug, Clone)]
 pub struct Recorded {
-    /// Path, or the recorder's reason.
+    /// The path, or the recorder's reason.
     pub file: Result<String, String>,
 }
 
-/// Hears what the recorder says of episodes.
-pub struct RecorderEar {
+/// Receives the recorder's reports about episodes.
+pub struct RecorderReports {
     subscriber: iceoryx2::port::subscriber::Subscriber<Ipc, RecorderReport, ()>,
     _cell: Cell,
 }
 
-impl RecorderEar {
-    /// Listens in the cell `name`.
+impl RecorderReports {
+    /// Subscribes to the reports in the cell `name`.
     pub fn open(name: &str) -> Result<Self, IpcError> {
         let cell = Cell::join(name)?;
-        let subscriber = cell
-            .recorder()?
-            .subscriber_builder()
-            .create()
-            .map_err(|e| IpcError::Service { service: "recorder".into(), what: format!("{e:?}") })?;
+        let subscriber = cell.recorder()?.subscriber_builder().create().in_service("recorder")?;
         Ok(Self { subscriber, _cell: cell })
     }
 
-    /// Waits until the file of `episode` is closed, up to 10 s; `None` if no recorder says anything of it.
+    /// Waits until the file of `episode` is closed, up to 10 s; `None` if no recorder reports anything about it.
     pub fn wait(&self, episode: u64) -> Option<Recorded> {
-        let until = Instant::now() + Duration::from_secs(10);
+        let until = Instant::now() + FILE_CLOSED;
         while Instant::now() < until {
             while let Ok(Some(report)) = self.subscriber.receive() {
                 if report.episode != episode {

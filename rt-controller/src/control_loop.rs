@@ -1,8 +1,8 @@
-//! The fixed-rate loop: absolute deadlines on CLOCK_MONOTONIC; a missed period is skipped and counted, never bursted.
+//! The fixed-rate loop: absolute deadlines on CLOCK_MONOTONIC; a missed period is skipped and counted, never made up for.
 //!
-//! Runs in the real-time thread. Its ticks do not allocate, lock, log, or call anything that blocks but the sleep itself; the count
-//! of their allocations is part of `status`. The exception is [`Ticks::meet_feature_worker`]. Nothing in it fails: a lost robot is handed
-//! back and the core ends the pour, a lost feature worker shows as stale features.
+//! Runs in the real-time thread. Its ticks do not allocate, lock, log, or call anything that blocks but the sleep itself; `status` shows
+//! how often they allocated. The one exception is [`LoopState::meet_feature_worker`], which runs between ticks and outside of pours.
+//! Nothing in it fails: a lost robot is handed back and the core ends the pour, and a lost feature worker shows as stale features.
 
 use std::sync::atomic::{AtomicU64, Ordering::Relaxed};
 
@@ -21,50 +21,51 @@ use crate::pacing::Pacer;
 /// Receives features from shared memory.
 pub type Features = iceoryx2::port::subscriber::Subscriber<iceoryx2::service::ipc::Service, Feature, ()>;
 
-/// Where the loop runs.
+/// Where and how the loop is scheduled.
 #[derive(Debug, Clone, Copy)]
 pub struct Place {
-    /// Core.
+    /// Number of the processor core.
     pub core: usize,
-    /// SCHED_FIFO priority, 0: ordinary scheduling.
+    /// SCHED_FIFO priority, 1 to 99; 0: ordinary scheduling.
     pub priority: u8,
 }
 
 /// Runs until [`Order::Shutdown`] was obeyed and the container is upright.
 ///
-/// `lost_ns` is how long the robot may be silent (`controller.lost_robot_ms`). `say` gets what the operating system did not permit, before the loop starts.
+/// `lost_ns` is how long the robot may be silent (`controller.lost_robot_ms`), ns. Before the loop starts, `say` gets a line for each
+/// thing that the operating system did not permit.
 pub fn run(settings: Settings, place: Place, lost_ns: u64, features: &Features, exchange: &Exchange, say: &dyn Fn(&str)) {
     for line in os::become_realtime(place.core, place.priority) {
         say(&line);
     }
-    let mut ticks = Ticks::new(settings, lost_ns, features, exchange);
+    let mut state = LoopState::new(settings, lost_ns, features, exchange);
     let mut deadline_ns = os::now_ns() + settings.period_ns;
     loop {
         os::sleep_until_ns(deadline_ns);
-        ticks.meet_feature_worker();
-        if ticks.tick(deadline_ns) == Next::Ended {
+        state.meet_feature_worker();
+        if state.tick(deadline_ns) == Next::Ended {
             break;
         }
-        let (next_ns, skipped) = ticks.pacer.next_deadline_ns(deadline_ns, os::now_ns());
+        let (next_ns, skipped) = state.pacer.next_deadline_ns(deadline_ns, os::now_ns());
         exchange.skipped_ticks.fetch_add(skipped, Relaxed);
         deadline_ns = next_ns;
     }
-    // Upright already: the session's end only stops the robot's program at once instead of after its patience.
-    drop(ticks);
+    // The container is upright. The session's end only stops the robot's program at once, instead of after its patience.
+    drop(state);
     exchange.ended.store(true, Relaxed);
 }
 
 /// Whether there is another tick.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Next {
-    /// There is.
+    /// There is one.
     Tick,
     /// The shutdown was obeyed and the container is upright.
     Ended,
 }
 
 /// What the loop keeps from tick to tick.
-pub struct Ticks<'a> {
+pub struct LoopState<'a> {
     core: Box<Core>,
     fresh: heapless::Vec<Feature, MAX_FEATURES>,
     session: Option<Box<Session>>,
@@ -76,12 +77,12 @@ pub struct Ticks<'a> {
     period_ns: u64,
     lost_ns: u64,
     shutdown: bool,
-    /// Allocations and page faults of this thread before its first tick and when it met feature workers.
+    /// Allocations and page faults of this thread outside of its ticks: before the first one, and when it met feature workers.
     elsewhere: (u64, u64),
 }
 
-impl<'a> Ticks<'a> {
-    /// Allocates all that the ticks use; call in the thread that makes them.
+impl<'a> LoopState<'a> {
+    /// Allocates all that the ticks use. Call it in the thread that runs them.
     pub fn new(settings: Settings, lost_ns: u64, features: &'a Features, exchange: &'a Exchange) -> Self {
         Self {
             core: Box::new(Core::new(settings)),
@@ -108,31 +109,12 @@ impl<'a> Ticks<'a> {
             exchange.late_ticks.fetch_add(1, Relaxed);
         }
 
-        self.fresh.clear();
-        // Older ones than fit would be stale; `receive` gives the oldest first.
-        for _ in 0..2 * MAX_FEATURES {
-            let Ok(Some(sample)) = self.features.receive() else { break };
-            if self.fresh.is_full() {
-                self.fresh.remove(0);
-            }
-            let _ = self.fresh.push(*sample);
-        }
-        let mut taken = None;
-        if self.core.may_exchange()
-            && !exchange.old_agents.is_full()
-            && let Some((identity, agent)) = exchange.agents.pop()
-        {
-            taken = Some(identity);
-            self.weights_id = identity;
-            exchange.agents_taken.fetch_add(1, Relaxed);
-            if let Some(old) = self.core.exchange(agent) {
-                let _ = exchange.old_agents.push(old);
-            }
-        }
+        self.receive_features();
+        let taken = self.take_agent();
         if self.session.is_none() {
             self.session = exchange.sessions.pop();
         }
-        let (robot, mut end) = look(self.session.as_deref_mut(), woke_ns, self.lost_ns);
+        let (robot, mut end) = look_at_robot(self.session.as_deref_mut(), woke_ns, self.lost_ns);
         let order = exchange.orders.pop();
         self.shutdown |= order == Some(Order::Shutdown);
 
@@ -143,39 +125,21 @@ impl<'a> Ticks<'a> {
             end = session.send(Mode::Stream, target_deg).err().map(SessionEnd::Lost).or(end);
             written_at_ns = os::now_ns();
         }
-        if let Some(newest) = self.fresh.last() {
-            self.pacer.used(woke_ns, newest.published_at_ns);
-            if written_at_ns != 0 {
-                exchange.timing.wake_to_written.record(written_at_ns.saturating_sub(woke_ns));
-                exchange.timing.feature_age.record(woke_ns.saturating_sub(newest.captured_at_ns));
-                exchange.timing.feature_wait.record(woke_ns.saturating_sub(newest.published_at_ns));
-            }
-        }
-        // A robot that may not move any more is never taken back as it is: it is handed over, and connected anew when it is well.
-        if let Some(end) = end
-            && !exchange.old_sessions.is_full()
-            && let Some(dead) = self.session.take()
-        {
-            let _ = exchange.old_sessions.push((dead, end));
-        }
+        self.measure_features(woke_ns, written_at_ns);
+        self.give_session_back(end);
 
-        let tell = |event| {
-            if exchange.events.push(event).is_err() {
-                exchange.events_lost.fetch_add(1, Relaxed);
-            }
-        };
+        let telemetry = Telemetry { weights_id: self.weights_id, ..output.telemetry };
         if let Some(answer) = output.ordered {
-            tell(Event::Ordered(answer));
+            self.tell(Event::Ordered(answer));
         }
         if let Some(outcome) = output.ended {
-            tell(Event::Ended(outcome));
+            self.tell(Event::Ended(outcome));
         }
         let (allocations, faults) = spent();
         exchange.loop_allocations.store(allocations - self.elsewhere.0, Relaxed);
         exchange.loop_page_faults.store(faults - self.elsewhere.1, Relaxed);
         let done_ns = os::now_ns();
         exchange.timing.execution.record(done_ns.saturating_sub(woke_ns));
-        let telemetry = Telemetry { weights_id: self.weights_id, ..output.telemetry };
         let tick = Tick {
             now_ns: woke_ns,
             features: self.fresh.clone(),
@@ -186,19 +150,78 @@ impl<'a> Ticks<'a> {
             d_ml: telemetry.d_ml,
             times: Times { deadline_ns, decided_at_ns, written_at_ns, done_ns },
         };
-        tell(Event::Tick(tick, telemetry, self.core.counters()));
+        self.tell(Event::Tick(tick, telemetry, self.core.counters()));
         let upright = matches!(self.core.phase(), Phase::Idle | Phase::NoRobot);
         if self.shutdown && upright { Next::Ended } else { Next::Tick }
     }
 
-    /// Opens the shared memory of a feature worker that has come (again). iceoryx2 allocates for it, so it is done
-    /// before a tick, and not in a pour; and counted apart. A worker that comes during a pour is met by `receive`: the pour ends stale anyway.
+    /// Takes the features that have arrived; of more than fit, the newest, because older ones would be stale.
+    fn receive_features(&mut self) {
+        self.fresh.clear();
+        // `receive` gives the oldest first. The bound keeps a flood of features from holding the loop.
+        for _ in 0..2 * MAX_FEATURES {
+            let Ok(Some(feature)) = self.features.receive() else { break };
+            if self.fresh.is_full() {
+                self.fresh.remove(0);
+            }
+            let _ = self.fresh.push(*feature);
+        }
+    }
+
+    /// Takes a new agent, if one waits and no pour is under way; gives the identity of its weights.
+    fn take_agent(&mut self) -> Option<u64> {
+        let exchange = self.exchange;
+        if !self.core.may_exchange() || exchange.old_agents.is_full() {
+            return None;
+        }
+        let (weights_id, agent) = exchange.agents.pop()?;
+        self.weights_id = weights_id;
+        exchange.agents_taken.fetch_add(1, Relaxed);
+        if let Some(old) = self.core.exchange(agent) {
+            let _ = exchange.old_agents.push(old);
+        }
+        Some(weights_id)
+    }
+
+    /// Records how old the newest feature was when it was used, and tells the pacer. `written_at_ns` is 0 if no target was written.
+    fn measure_features(&mut self, woke_ns: u64, written_at_ns: u64) {
+        let Some(newest) = self.fresh.last() else { return };
+        self.pacer.used(woke_ns, newest.published_at_ns);
+        if written_at_ns != 0 {
+            let timing = &self.exchange.timing;
+            timing.wake_to_written.record(written_at_ns.saturating_sub(woke_ns));
+            timing.feature_age.record(woke_ns.saturating_sub(newest.captured_at_ns));
+            timing.feature_wait.record(woke_ns.saturating_sub(newest.published_at_ns));
+        }
+    }
+
+    /// Gives the robot's session back, if it is over. A robot that may not move any more is never taken on as it is: it is connected
+    /// anew when it is well.
+    fn give_session_back(&mut self, end: Option<SessionEnd>) {
+        let old_sessions = &self.exchange.old_sessions;
+        if let Some(end) = end
+            && !old_sessions.is_full()
+            && let Some(session) = self.session.take()
+        {
+            let _ = old_sessions.push((session, end));
+        }
+    }
+
+    /// Tells the ordinary thread, or counts that it could not.
+    fn tell(&self, event: Event) {
+        if self.exchange.events.push(event).is_err() {
+            self.exchange.events_lost.fetch_add(1, Relaxed);
+        }
+    }
+
+    /// Opens the shared memory of a feature worker that has come, or come back. iceoryx2 allocates for it, so this is done before a tick,
+    /// outside of pours, and counted apart. A worker that comes during a pour is met by the tick itself; that pour ends anyway.
     pub fn meet_feature_worker(&mut self) {
         if !self.core.may_exchange() {
             return;
         }
         let before = os::allocations();
-        // What fails here fails in `receive` too, and shows as stale features.
+        // A failure here also is one in `receive`, and shows as stale features.
         let _ = self.features.update_connections();
         if os::allocations() != before {
             let (allocations, faults) = spent();
@@ -216,7 +239,7 @@ fn spent() -> (u64, u64) {
 }
 
 /// The robot as the core sees it, and why its session is over, if it is.
-fn look(session: Option<&mut Session>, now_ns: u64, lost_ns: u64) -> (Robot, Option<SessionEnd>) {
+fn look_at_robot(session: Option<&mut Session>, now_ns: u64, lost_ns: u64) -> (Robot, Option<SessionEnd>) {
     let Some(session) = session else {
         return (Robot { hindrance: Some(EndReason::RobotLost), alpha_deg: f32::NAN, at_ns: 0 }, None);
     };

@@ -1,8 +1,8 @@
 //! The controller's work with files: writes the journal, watches the weight file.
 //!
-//! Runs in a thread of its own with ordinary scheduling; allocates, and blocks for as long as the disk does: clients are answered, an
-//! abort among them, by another thread ([`crate::service`]). Nothing here ends the controller: a journal that cannot be written
-//! ends, weights that cannot be read are refused and the old ones stay.
+//! Runs in a thread of its own with ordinary scheduling; allocates, and blocks for as long as the disk does. Clients, and an abort among
+//! their requests, are answered by another thread ([`crate::service`]). Nothing here ends the controller: a journal that cannot be written
+//! ends, and weights that cannot be read are refused while the old ones stay.
 
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, Ordering::Relaxed};
@@ -18,29 +18,33 @@ use crate::core::Settings;
 use crate::exchange::Exchange;
 use crate::journal::{Tick, Writer};
 
-/// How often it looks.
+/// Pause between two looks at the queue and the weight file. Chosen by hand; no measurement is recorded.
 const BEAT: Duration = Duration::from_millis(40);
-/// Ticks that wait for a slow disk: half a minute at 30 Hz. A journal with a gap cannot be replayed, so a longer wait ends it.
+/// Ticks that may wait for a slow disk: half a minute at 30 Hz. A journal with a gap cannot be replayed, so a longer wait ends it.
 const WAITING_TICKS: usize = 1024;
 
-/// The file thread.
+/// Largest relative difference between the camera's frame rate and the one that weights are trained for. Chosen by hand; no measurement
+/// is recorded.
+const RATE_TOLERANCE: f64 = 0.02;
+
+/// The state of the disk's thread.
 pub struct Disk<'a> {
     exchange: &'a Exchange,
     say: &'a (dyn Fn(&str) + Sync),
-    /// For `status`: why the newest weight file is not used; empty: it is.
+    /// Why the newest weight file is not used, for `status`; empty if it is used.
     refused: &'a Mutex<String>,
     path: PathBuf,
-    /// Frames a second of the camera: calibration and policy are for one rate only.
+    /// Frames a second of the camera; weights are trained for one rate only.
     fps: f64,
-    /// Of the weight file as it was read last: time of change, inode, length.
+    /// Time of change, inode and length of the weight file that was read last.
     seen: Option<(std::time::SystemTime, u64, u64)>,
-    /// `None`: none is kept, or it has ended.
+    /// `None`: no journal is kept, or it has ended.
     journal: Option<Writer>,
     ticks: Receiver<Box<Tick>>,
 }
 
 impl<'a> Disk<'a> {
-    /// Begins the journal, if one is configured, and gives the way to it; none where none is kept.
+    /// Begins the journal, if one is configured, and gives the queue that leads to it; `None` if no journal is kept.
     pub fn open(
         config: &Config,
         exchange: &'a Exchange,
@@ -57,7 +61,7 @@ impl<'a> Disk<'a> {
         (disk, sender)
     }
 
-    /// Works until `end`, and then writes what is left.
+    /// Works until `end` is true, and then writes what is left.
     pub fn run(mut self, end: &AtomicBool) {
         while !end.load(Relaxed) {
             self.write_ticks();
@@ -68,13 +72,14 @@ impl<'a> Disk<'a> {
         self.write(Writer::flush);
     }
 
+    /// Writes the ticks that wait.
     fn write_ticks(&mut self) {
         while let Ok(tick) = self.ticks.try_recv() {
             self.write(|journal| journal.tick(tick));
         }
     }
 
-    /// The first error ends the journal, not the controller.
+    /// Writes to the journal. The first error ends the journal, not the controller.
     fn write(&mut self, what: impl FnOnce(&mut Writer) -> std::io::Result<()>) {
         if let Some(Err(e)) = self.journal.as_mut().map(what) {
             (self.say)(&format!("journal: {e}; no more is written, the controller goes on"));
@@ -104,7 +109,7 @@ impl<'a> Disk<'a> {
                 (self.say)(&format!("weights {} read from {}; the next pour uses them", weights.identity(), self.path.display()));
                 let identity = weights.id();
                 self.write(|journal| journal.weights(identity, &weights));
-                // What was waiting and is displaced is dropped here, in an ordinary thread.
+                // An agent that still waits is replaced, and dropped here, in an ordinary thread.
                 drop(self.exchange.agents.force_push((identity, Box::new(Agent::new(&weights)))));
             }
             Err(e) => {
@@ -115,11 +120,11 @@ impl<'a> Disk<'a> {
     }
 }
 
-/// Weights that fit a camera of `fps`, or why not.
+/// The weights in `path` if they are for a camera of `fps` frames a second, or why they are refused.
 fn read_weights(path: &Path, fps: f64) -> Result<Weights, String> {
     let weights = Weights::read(path).map_err(|e| e.to_string())?;
     let trained = weights.rate_hz;
-    if (f64::from(trained) / fps - 1.0).abs() < 0.02 {
+    if (f64::from(trained) / fps - 1.0).abs() < RATE_TOLERANCE {
         Ok(weights)
     } else {
         Err(format!("trained at {trained} frames/s, camera.fps is {fps}: train with episodes of this camera"))

@@ -1,7 +1,7 @@
 //! What passes between the loop and the ordinary threads: bounded lock-free queues and atomics, all made before the loop starts.
 //!
-//! The loop never blocks on them and never frees what it got: boxes that it is done with go back through a queue to be dropped
-//! by an ordinary thread. When a queue is full, the loop counts what it could not tell ([`Exchange::events_lost`]).
+//! The loop never blocks on them and never frees what it got: boxes that it no longer needs go back through a queue, and an ordinary
+//! thread drops them. When a queue is full, the loop counts what it could not tell ([`Exchange::events_lost`]).
 
 use std::sync::atomic::{AtomicBool, AtomicU64};
 
@@ -17,9 +17,9 @@ use crate::timing::Histogram;
 
 /// What the loop tells the ordinary thread.
 #[derive(Debug, Clone)]
-#[allow(clippy::large_enum_variant)] // a box would be an allocation in the loop
+#[expect(clippy::large_enum_variant, reason = "a box would be an allocation in the loop")]
 pub enum Event {
-    /// Every tick: what it saw and answered, its telemetry, the counters.
+    /// A tick: what it saw and answered, its telemetry, and the counters.
     Tick(Tick, Telemetry, Counters),
     /// The answer to an order.
     Ordered(Result<(), Refusal>),
@@ -30,7 +30,7 @@ pub enum Event {
 /// Why the loop gives a robot's session back.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum SessionEnd {
-    /// The connection is gone.
+    /// The connection was lost.
     Lost(Lost),
     /// The robot may not move any more.
     Unwell(EndReason),
@@ -60,21 +60,21 @@ pub struct Timing {
     pub wake_to_written: Histogram,
 }
 
-/// Everything that is shared.
+/// Everything that the threads share.
 pub struct Exchange {
     /// To the loop: orders.
     pub orders: ArrayQueue<Order>,
     /// From the loop: events.
     pub events: ArrayQueue<Event>,
-    /// To the loop: the newest policy and its identity.
+    /// To the loop: an agent with the newest weights, and their identity.
     pub agents: ArrayQueue<(u64, Box<Agent>)>,
-    /// From the loop: policies to drop.
+    /// From the loop: agents to drop.
     pub old_agents: ArrayQueue<Box<Agent>>,
-    /// To the loop: a connected robot.
+    /// To the loop: the session with a connected robot.
     pub sessions: ArrayQueue<Box<Session>>,
-    /// From the loop: lost robots to drop.
+    /// From the loop: sessions to drop, and why they are over.
     pub old_sessions: ArrayQueue<(Box<Session>, SessionEnd)>,
-    /// Histograms.
+    /// Histograms of the loop.
     pub timing: Timing,
     /// Allocations and frees of the loop since it started.
     pub loop_allocations: AtomicU64,
@@ -84,7 +84,7 @@ pub struct Exchange {
     pub late_ticks: AtomicU64,
     /// Periods skipped.
     pub skipped_ticks: AtomicU64,
-    /// Policies taken.
+    /// Number of agents taken.
     pub agents_taken: AtomicU64,
     /// Events that did not fit the queue.
     pub events_lost: AtomicU64,
@@ -92,15 +92,22 @@ pub struct Exchange {
     pub ended: AtomicBool,
 }
 
+/// Orders that may wait for the loop, which takes one a tick. Chosen by hand; no measurement is recorded.
+const ORDERS: usize = 8;
+/// Events that may wait for the ordinary thread: half a minute of ticks at 30 Hz.
+const EVENTS: usize = 1024;
+/// Agents, and sessions, that may wait to be dropped. Chosen by hand; no measurement is recorded.
+const OLD: usize = 4;
+
 impl Default for Exchange {
     fn default() -> Self {
         Self {
-            orders: ArrayQueue::new(8),
-            events: ArrayQueue::new(1024),
+            orders: ArrayQueue::new(ORDERS),
+            events: ArrayQueue::new(EVENTS),
             agents: ArrayQueue::new(1),
-            old_agents: ArrayQueue::new(4),
+            old_agents: ArrayQueue::new(OLD),
             sessions: ArrayQueue::new(1),
-            old_sessions: ArrayQueue::new(4),
+            old_sessions: ArrayQueue::new(OLD),
             timing: Timing::default(),
             loop_allocations: AtomicU64::new(0),
             loop_page_faults: AtomicU64::new(0),

@@ -1,8 +1,10 @@
 //! The journal: every tick's inputs and answer, so that a run can be replayed bit for bit.
 //!
-//! The loop hands each [`Tick`] to the ordinary thread through a queue; there it is written ([`Writer`]). Reading and replaying
-//! are for commands and tests. A file that was cut off reads up to its last whole entry. Layout: the 8 bytes `decantj2`, then
-//! entries, each a little-endian u32 length and that many bytes of postcard.
+//! The loop hands each [`Tick`] to an ordinary thread through a queue, and that thread writes it ([`Writer`]). Commands and tests read
+//! and replay. Both allocate. A file that was cut off is read up to its last whole entry; every other fault is a [`JournalError`].
+//!
+//! The file begins with the 8 bytes `decantj2`. Then come the entries: a little-endian u32 with the length, and that many bytes of
+//! postcard.
 
 use std::collections::BTreeMap;
 use std::fs::File;
@@ -18,9 +20,9 @@ use crate::core::{Core, Input, MAX_FEATURES, Order, Robot, Settings};
 
 /// First bytes of a journal, its version included.
 const MAGIC: &[u8; 8] = b"decantj2";
-/// Longest entry, bytes: a weight file and some.
+/// Longest entry, bytes: more than ten weight files, which are the largest entries.
 const ENTRY_MAX: usize = 128 * 1024;
-/// A journal stops growing here: about three days.
+/// Size at which a journal stops growing, bytes: about three days of ticks.
 const FILE_MAX: u64 = 2 << 30;
 
 /// One tick: everything that [`Core::step`] saw, and the target that it answered with.
@@ -28,19 +30,19 @@ const FILE_MAX: u64 = 2 << 30;
 pub struct Tick {
     /// When it woke up, ns.
     pub now_ns: u64,
-    /// The features of the tick.
+    /// The features that the tick took.
     pub features: heapless::Vec<Feature, MAX_FEATURES>,
-    /// The robot.
+    /// The robot's newest state.
     pub robot: Robot,
-    /// The order.
+    /// The operator's order, if there was one.
     pub order: Option<Order>,
-    /// Identity of the policy that was taken in this tick.
+    /// Identity of the weights whose agent was taken in this tick.
     pub agent: Option<u64>,
     /// The answer, degrees; `None`: nothing was commanded.
     pub target_deg: Option<f32>,
     /// d after the tick, ml.
     pub d_ml: f32,
-    /// When what happened; measured, so not replayed.
+    /// When the parts of the tick happened; measured, and therefore not replayed.
     pub times: Times,
 }
 
@@ -49,20 +51,22 @@ pub struct Tick {
 pub struct Times {
     /// When it was to wake up.
     pub deadline_ns: u64,
-    /// When the target was decided; writing it is the kernel's time.
+    /// When the target was decided.
     pub decided_at_ns: u64,
-    /// When the target's bytes were with the kernel; 0: none were.
+    /// When the kernel had taken the target's bytes; 0: no target was written.
     pub written_at_ns: u64,
-    /// When all was done but the telling.
+    /// When everything was done but to queue this entry.
     pub done_ns: u64,
 }
 
 /// One entry of the file.
 #[derive(Debug, Serialize, Deserialize)]
 enum Entry {
+    /// The settings of the run; the first entry.
     Settings(Settings),
-    /// Weights with this identity, as the bytes of a weight file; before the tick that takes them.
+    /// Weights with their identity, as the bytes of a weight file. They stand before the tick that takes them.
     Weights(u64, Vec<u8>),
+    /// A tick.
     Tick(Box<Tick>),
 }
 
@@ -74,26 +78,26 @@ pub enum JournalError {
     Read {
         /// The file.
         file: String,
-        /// The system's words.
+        /// The operating system's message.
         what: String,
     },
-    /// Not a journal of this version.
+    /// The file is not a journal of this version.
     #[error("{file}: not a journal of this version; it is written by `rt-controller run` where controller.journal is set")]
     Foreign {
         /// The file.
         file: String,
     },
-    /// An entry that makes no sense.
+    /// An entry cannot be decoded.
     #[error("{file}: damaged at byte {at}; what comes before can be replayed from a copy cut there")]
     Damaged {
         /// The file.
         file: String,
-        /// Where.
+        /// Where the entry begins, bytes.
         at: u64,
     },
 }
 
-/// Writes a journal; ordinary thread.
+/// Writes a journal, from an ordinary thread.
 pub struct Writer {
     file: BufWriter<File>,
     written: u64,
@@ -105,7 +109,7 @@ impl Writer {
         if let Some(parent) = path.parent() {
             std::fs::create_dir_all(parent)?;
         }
-        // What the run before this one did is wanted most after it crashed.
+        // The journal of the run before is wanted most after that run has crashed.
         let _ = std::fs::rename(path, path.with_extension("before.bin"));
         let mut this = Self { file: BufWriter::new(File::create(path)?), written: 0 };
         this.file.write_all(MAGIC)?;
@@ -113,18 +117,18 @@ impl Writer {
         Ok(this)
     }
 
-    /// Weights that the loop may take from now on.
+    /// Adds weights that the loop may take from now on.
     pub fn weights(&mut self, identity: u64, weights: &Weights) -> std::io::Result<()> {
         let bytes = weights.to_bytes().map_err(std::io::Error::other)?;
         self.entry(&Entry::Weights(identity, bytes))
     }
 
-    /// One tick.
+    /// Adds a tick.
     pub fn tick(&mut self, tick: Box<Tick>) -> std::io::Result<()> {
         self.entry(&Entry::Tick(tick))
     }
 
-    /// Passes everything on to the system.
+    /// Passes everything that was added on to the operating system.
     pub fn flush(&mut self) -> std::io::Result<()> {
         self.file.flush()
     }
@@ -144,20 +148,20 @@ impl Writer {
 /// What a replay found.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Replay {
-    /// Ticks replayed.
+    /// Number of ticks replayed.
     pub ticks: u64,
-    /// Pours and recordings that ended in them.
+    /// Results of the pours and recordings that ended in them.
     pub ended: Vec<shared::control::Outcome>,
-    /// Ticks whose target or d differs in any bit.
+    /// Number of ticks whose target or d differs in any bit.
     pub different: u64,
-    /// The first of those.
+    /// Number of the first of those ticks.
     pub first_different: Option<u64>,
     /// The file ends in the middle of an entry.
     pub cut_off: bool,
 }
 
-/// Replays a journal through a new [`Core`] and compares every answer bit by bit. `seen` gets each tick with the answer that
-/// the replay gave.
+/// Replays a journal through a new [`Core`] and compares every answer bit by bit. `seen` is called with each tick and the answer that the
+/// replay gave.
 pub fn replay(path: &Path, mut seen: impl FnMut(&Tick, &crate::core::Output)) -> Result<Replay, JournalError> {
     let file = path.display().to_string();
     let read = |e: std::io::Error| JournalError::Read { file: file.clone(), what: e.to_string() };

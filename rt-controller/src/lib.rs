@@ -2,21 +2,22 @@
 //!
 //! | module | what it holds | thread |
 //! |---|---|---|
-//! | [`core`] | what decides: a pure step | the loop's, and evaluation's |
+//! | [`core`] | what decides: a pure step | the loop's, and that of evaluations |
 //! | [`control_loop`] | the 30 Hz loop | real-time |
-//! | [`exchange`] | queues between the loop and the rest | all |
 //! | [`pacing`] | when the next tick is due | the loop's |
 //! | [`timing`] | the loop's histograms | all |
+//! | [`exchange`] | queues between the loop and the other threads | all |
+//! | [`link`] | RTDE client and the program on the robot | connects in an ordinary thread, then the loop's |
+//! | [`robot_thread`] | connects the robot and hands it over to the loop | ordinary, a thread of its own |
+//! | [`service`] | clients and telemetry | ordinary, the main thread |
+//! | [`disk`] | journal and weight file | ordinary, a thread of its own |
 //! | [`journal`] | every tick's inputs, and their replay | ordinary |
-//! | [`link`] | RTDE client and the robot's program | connects in an ordinary thread, then the loop's |
-//! | [`service`] | clients, telemetry | ordinary |
-//! | [`disk`] | journal, weight file | ordinary, a thread of its own |
-//! | [`client`] | the clients' side | their own process |
-//! | [`run`], [`pour`], [`record`], [`abort`], [`status`], [`step`], [`replay`] | the commands | their own process |
+//! | [`client`] | the clients' side of the service | their own process |
+//! | [`commands`] | the subcommands | their own process |
 #![forbid(unsafe_code)]
 
-pub mod abort;
 pub mod client;
+pub mod commands;
 pub mod control_loop;
 pub mod core;
 pub mod disk;
@@ -24,11 +25,6 @@ pub mod exchange;
 pub mod journal;
 pub mod link;
 pub mod pacing;
-pub mod pour;
-pub mod record;
-pub mod replay;
-pub mod run;
+pub mod robot_thread;
 pub mod service;
-pub mod status;
-pub mod step;
 pub mod timing;

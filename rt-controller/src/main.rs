@@ -3,7 +3,7 @@
 use std::process::ExitCode;
 
 use clap::{Parser, Subcommand};
-use rt_controller::{abort, pour, record, replay, run, status, step};
+use rt_controller::commands::{abort, pour, record, replay, run, status, step};
 
 /// Counts allocations, so that the loop can show that it makes none.
 #[global_allocator]
@@ -19,7 +19,7 @@ struct Cli {
 
 #[derive(Subcommand)]
 enum Command {
-    /// The resident controller process.
+    /// Runs the resident controller process.
     Run(run::Args),
     /// Pours an exact volume with the running controller.
     Pour(pour::Args),
@@ -29,7 +29,7 @@ enum Command {
     Abort(abort::Args),
     /// Shows state, rates, lateness histograms and counters.
     Status(status::Args),
-    /// The controller core as a filter: V_e in, angles out, for any other simulator.
+    /// Runs the controller's core as a filter, V_e in and angles out, for any other simulator.
     Step(step::Args),
     /// Runs a journal through the same core again and compares every answer.
     Replay(replay::Args),

@@ -1,20 +1,22 @@
 //! When the next tick is due: a fixed period, its phase held just after the camera's measurements.
 //!
-//! Camera and loop both run at 30 Hz, but of different clocks. Left free they beat: V_e waits anything from nothing to a whole
-//! period for its tick, and where one overtakes the other a tick has two frames or none. So the phase is pulled, by at most
-//! [`PULL_MAX_NS`] a tick (0.6 % of the period), until V_e has waited [`WAIT_NS`] when it is used. A camera whose rate is
-//! further away is not followed; the loop's rate then wanders within that 0.6 %.
+//! Camera and loop both run at 30 Hz, but by different clocks. Left alone, one would slowly overtake the other: V_e would wait for its
+//! tick for anything between nothing and a whole period, and now and then a tick would have two frames or none. So each tick moves the
+//! phase, by at most [`PULL_MAX_NS`] (0.6 % of the period), until V_e has waited [`WAIT_NS`] when it is used. A camera whose rate
+//! differs by more is not followed; the loop's rate then wanders within that 0.6 %.
 //!
 //! Pure; runs in the real-time thread, does not allocate, does not fail.
 
-/// How long V_e is to have waited when its tick wakes up: more than the worker's jitter, so that a tick seldom comes too early.
+/// How long V_e is to have waited when its tick wakes up, ns: more than the worker's jitter, so that a tick seldom comes too early.
+/// See docs/REALTIME.md for the measured jitter.
 pub const WAIT_NS: i64 = 3_000_000;
-/// Largest change of a period.
+/// Largest change of a period, ns: 0.6 % of the period at 30 Hz. Chosen by hand; no measurement is recorded.
 pub const PULL_MAX_NS: i64 = 200_000;
-/// Share of the phase's error that one tick takes away; the measurement of one frame is noise.
+/// One tick corrects this part of the phase's error, 1 / 8, because the measurement of a single frame is noise. Chosen by hand; no
+/// measurement is recorded.
 const GAIN: i64 = 8;
 
-/// Gives the deadlines.
+/// Computes the deadlines.
 #[derive(Debug, Clone, Copy)]
 pub struct Pacer {
     period_ns: u64,
@@ -22,7 +24,7 @@ pub struct Pacer {
 }
 
 impl Pacer {
-    /// A loop of this period, not yet pulled.
+    /// The pacer of a loop with this period, ns.
     pub fn new(period_ns: u64) -> Self {
         Self { period_ns, pull_ns: 0 }
     }
@@ -31,13 +33,13 @@ impl Pacer {
     pub fn used(&mut self, woke_ns: u64, published_at_ns: u64) {
         let period_ns = self.period_ns as i64;
         let waited_ns = woke_ns.saturating_sub(published_at_ns).min(self.period_ns) as i64;
-        // The nearer way round: a measurement that waited almost a whole period came just after the tick before.
+        // A measurement that waited almost a whole period came just after the tick before, so the error is taken the nearer way round.
         let late_ns = (waited_ns - WAIT_NS + period_ns / 2).rem_euclid(period_ns) - period_ns / 2;
         self.pull_ns = (late_ns / GAIN).clamp(-PULL_MAX_NS, PULL_MAX_NS);
     }
 
-    /// The deadline after `deadline_ns`, and how many periods were missed because it is `now_ns` already: those are skipped,
-    /// never bursted.
+    /// The deadline after `deadline_ns`, and how many periods were missed because it is `now_ns` already. Missed periods are skipped,
+    /// never made up for.
     pub fn next_deadline_ns(&mut self, deadline_ns: u64, now_ns: u64) -> (u64, u64) {
         let pull_ns = std::mem::take(&mut self.pull_ns);
         let next_ns = (deadline_ns + self.period_ns).saturating_add_signed(-pull_ns);

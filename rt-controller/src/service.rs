@@ -1,136 +1,75 @@
-//! The controller's ordinary side: answers clients, publishes telemetry, passes ticks on to the journal, and drops what the loop
-//! is done with.
+//! The controller's ordinary side: answers clients, publishes telemetry, passes ticks on to the journal, and drops what the loop no
+//! longer needs.
 //!
-//! Runs in the process's main thread with ordinary scheduling; allocates, but waits for no disk ([`crate::disk`] does). If it
-//! falls behind, the loop goes on and counts what it could not tell. Nothing here ends the process but a signal or another controller
-//! in the same cell.
+//! Runs in the process's main thread with ordinary scheduling; allocates, but never waits for a disk, because [`crate::disk`] does so. If
+//! it falls behind, the loop goes on and counts what it could not tell. Nothing here ends the process but a signal, or another
+//! controller in the same cell.
 
 use std::collections::VecDeque;
-use std::sync::atomic::{AtomicBool, Ordering::Relaxed};
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering::Relaxed};
 use std::sync::{Mutex, PoisonError};
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
 use crossbeam::channel::Sender;
 use iceoryx2::active_request::ActiveRequest;
 use iceoryx2::port::publisher::Publisher;
 use iceoryx2::port::server::Server;
 use iceoryx2::service::ipc::Service as Ipc;
-use shared::config::Config;
 use shared::control::{Outcome, Reply, Request, Status};
-use shared::ipc::{Cell, IpcError};
+use shared::ipc::{Cell, InService as _, IpcError};
 use shared::messages::{Phase, Telemetry};
 
 use crate::client::MESSAGE_MAX;
 use crate::core::{Counters, Order, Refusal};
 use crate::exchange::{Event, Exchange};
 use crate::journal::Tick;
-use crate::link::{self, LinkOptions};
+use crate::robot_thread::RobotNote;
 
-/// How often the ordinary side looks: far below a person's patience, and cheap.
+/// Pause between two looks at the queues: far below a person's patience, and cheap.
 const BEAT: Duration = Duration::from_millis(40);
-/// How often the robot's keeper looks whether the loop has given it back.
-const ROBOT_BEAT: Duration = Duration::from_millis(100);
-/// Results kept for `status`.
+/// Number of results that are kept for `status`. Chosen by hand; no measurement is recorded.
 const OUTCOMES: usize = 32;
-/// Wait between attempts to reach the robot.
-const RECONNECT: Duration = Duration::from_secs(1);
 
+/// A client's request that waits for its answer.
 type Asked = ActiveRequest<Ipc, [u8], (), [u8], ()>;
 
-/// What the robot's connector has to say to operators; empty when connected.
-#[derive(Debug, Default)]
-pub struct RobotNote(Mutex<String>);
-
-impl RobotNote {
-    fn set(&self, text: String, say: &dyn Fn(&str)) {
-        let mut note = self.0.lock().unwrap_or_else(PoisonError::into_inner);
-        if *note != text {
-            if !text.is_empty() {
-                say(&text);
-            }
-            *note = text;
-        }
-    }
-
-    fn get(&self) -> String {
-        self.0.lock().unwrap_or_else(PoisonError::into_inner).clone()
-    }
-}
-
-/// Keeps a connected robot in the loop's hands; runs in a thread of its own until `stop`, because connecting blocks.
-pub fn keep_robot_connected(
-    config: &Config,
-    exchange: &Exchange,
-    note: &RobotNote,
-    connections: &std::sync::atomic::AtomicU64,
-    stop: &AtomicBool,
-    say: &dyn Fn(&str),
-) {
-    let options = LinkOptions::new(config);
-    let mut connected = false;
-    let mut next = Instant::now();
-    while !stop.load(Relaxed) {
-        while let Some((session, end)) = exchange.old_sessions.pop() {
-            drop(session);
-            note.set(format!("robot: {end}"), say);
-            connected = false;
-            next = Instant::now() + RECONNECT;
-        }
-        if !connected && Instant::now() >= next {
-            match link::connect(&options) {
-                Ok(session) => {
-                    connected = exchange.sessions.push(Box::new(session)).is_ok();
-                    connections.fetch_add(1, Relaxed);
-                    note.set(String::new(), say);
-                    say("robot connected, program running");
-                }
-                Err(e) => {
-                    note.set(e.to_string(), say);
-                    next = Instant::now() + RECONNECT;
-                }
-            }
-        }
-        std::thread::sleep(ROBOT_BEAT);
-    }
-}
-
-/// Everything the ordinary side keeps.
+/// The ordinary side's state.
 pub struct Service<'a> {
     exchange: &'a Exchange,
     robot_note: &'a RobotNote,
-    robot_connections: &'a std::sync::atomic::AtomicU64,
+    robot_connections: &'a AtomicU64,
     say: &'a dyn Fn(&str),
     server: Server<Ipc, [u8], (), [u8], ()>,
     telemetry: Publisher<Ipc, Telemetry, ()>,
-    /// Why the newest weight file is not used; empty: it is.
+    /// Why the newest weight file is not used; empty if it is.
     refused: &'a Mutex<String>,
-    /// To the journal; `None` where none is kept, and after it could not keep up.
+    /// The way to the journal; `None` where none is kept, and after it could not keep up.
     journal: Option<Sender<Box<Tick>>>,
     latest: Option<(Telemetry, Counters)>,
     outcomes: VecDeque<Outcome>,
-    /// Who waits for the answers to the orders in the queue; `None`: our own order.
+    /// The requests whose orders are in the queue, in the same order, each with its episode's number (0: an abort); `None`: the order
+    /// is the service's own.
     waiting: VecDeque<Option<(Asked, u64)>>,
     next_episode: u64,
 }
 
 impl<'a> Service<'a> {
-    /// Opens the services; fails when another controller has them. `journal` takes the ticks, where one is kept.
+    /// Opens the services; fails when another controller has them. `journal` takes the ticks, if one is kept.
     pub fn open(
         cell: &Cell,
         exchange: &'a Exchange,
-        (robot_note, robot_connections): (&'a RobotNote, &'a std::sync::atomic::AtomicU64),
+        (robot_note, robot_connections): (&'a RobotNote, &'a AtomicU64),
         (refused, journal): (&'a Mutex<String>, Option<Sender<Box<Tick>>>),
         say: &'a dyn Fn(&str),
     ) -> Result<Self, IpcError> {
-        let fail = |service: &str, e: String| IpcError::Service { service: service.into(), what: e };
         let server = cell
             .control()?
             .server_builder()
             .initial_max_slice_len(MESSAGE_MAX)
             .max_loaned_responses_per_request(1)
             .create()
-            .map_err(|e| fail("control", format!("{e:?}")))?;
-        let telemetry = cell.telemetry()?.publisher_builder().create().map_err(|e| fail("telemetry", format!("{e:?}")))?;
+            .in_service("control")?;
+        let telemetry = cell.telemetry()?.publisher_builder().create().in_service("telemetry")?;
         // Episode numbers grow over restarts, so that a recorder never takes two runs for one.
         let next_episode = std::time::SystemTime::now().duration_since(std::time::UNIX_EPOCH).map_or(1, |d| d.as_secs());
         Ok(Self {
@@ -149,7 +88,7 @@ impl<'a> Service<'a> {
         })
     }
 
-    /// Works until the loop has ended.
+    /// Works until the loop has ended, which `stop` asks it to do.
     pub fn run(mut self, stop: &AtomicBool) {
         let mut stopping = false;
         while !self.exchange.ended.load(Relaxed) {
@@ -160,15 +99,15 @@ impl<'a> Service<'a> {
                 }
             }
             while self.exchange.old_agents.pop().is_some() {}
-            self.hear();
+            self.take_events();
             self.answer();
             std::thread::sleep(BEAT);
         }
-        self.hear();
+        self.take_events();
     }
 
-    /// Takes what the loop told.
-    fn hear(&mut self) {
+    /// Takes the loop's events.
+    fn take_events(&mut self) {
         while let Some(event) = self.exchange.events.pop() {
             match event {
                 Event::Tick(tick, telemetry, counters) => {
@@ -177,7 +116,7 @@ impl<'a> Service<'a> {
                         self.journal = None;
                     }
                     self.latest = Some((telemetry, counters));
-                    // Nobody listening is no error.
+                    // It does not matter whether anybody listens.
                     let _ = self.telemetry.send_copy(telemetry);
                 }
                 Event::Ordered(answer) => {
@@ -211,10 +150,12 @@ impl<'a> Service<'a> {
         }
     }
 
+    /// Why the newest weight file is not used; empty if it is.
     fn refused(&self) -> String {
         self.refused.lock().unwrap_or_else(PoisonError::into_inner).clone()
     }
 
+    /// The line that the operator gets for a refusal.
     fn words(&self, refusal: Refusal) -> String {
         match refusal {
             Refusal::Robot(_) if !self.robot_note.get().is_empty() => self.robot_note.get(),
@@ -229,7 +170,7 @@ impl<'a> Service<'a> {
             let Ok(request) = postcard::from_bytes::<Request>(asked.payload()) else {
                 reply(
                     &asked,
-                    &Reply::Refused { reason: "the request is in another version's words: run the same build on both sides".into() },
+                    &Reply::Refused { reason: "the request comes from another version of Decant: run the same build on both sides".into() },
                 );
                 continue;
             };

@@ -1,12 +1,12 @@
-//! Histograms that the loop keeps of itself, always.
+//! Histograms that the loop always keeps of itself.
 //!
-//! The loop records (one relaxed atomic add, no allocation, no lock); any thread reads. Nothing fails.
+//! The loop records with two relaxed atomic operations, without allocation or lock; any thread reads. Nothing fails.
 
 use std::sync::atomic::{AtomicU64, Ordering};
 
-/// Sub-bins of each power of two: a bin is at most 1/16 wide.
+/// Number of bins for each power of two, which makes a bin at most 1/16 of its value wide.
 const SUB: u64 = 16;
-/// Enough bins for every u64.
+/// Number of bins, enough for every u64: 16 values below 16, and 16 bins for each of the 60 powers of two from 16 on.
 const BINS: usize = (61 * SUB) as usize;
 
 /// Log-linear histogram of nanoseconds: relative bin width at most 6.25 %, exact below 16 ns, exact maximum.
@@ -22,6 +22,7 @@ impl Default for Histogram {
     }
 }
 
+/// The bin of a value.
 fn bin(value_ns: u64) -> usize {
     if value_ns < SUB {
         return value_ns as usize;
@@ -30,7 +31,7 @@ fn bin(value_ns: u64) -> usize {
     ((shift + 1) * SUB + (value_ns >> shift) - SUB) as usize
 }
 
-/// First value above the bin.
+/// The first value above the bin, ns.
 fn upper_edge_ns(bin: usize) -> u64 {
     let bin = bin as u64;
     if bin < SUB {
@@ -47,7 +48,7 @@ impl Histogram {
         self.max_ns.fetch_max(value_ns, Ordering::Relaxed);
     }
 
-    /// A snapshot for people, in microseconds. Allocates.
+    /// A snapshot for people, in microseconds, under the name `name`. Allocates.
     pub fn snapshot(&self, name: &str) -> shared::control::Histogram {
         let counts: Vec<(usize, u64)> = self.bins.iter().map(|b| b.load(Ordering::Relaxed)).enumerate().filter(|(_, n)| *n > 0).collect();
         let n: u64 = counts.iter().map(|(_, n)| n).sum();

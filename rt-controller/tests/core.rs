@@ -6,13 +6,13 @@ use shared::actions::{Selection, action_table};
 use shared::agent::Agent;
 use shared::config::Config;
 use shared::control::{EndReason, Outcome};
-use shared::estimate::Calibration;
+use shared::estimator::Calibration;
 use shared::gaussian_curve::Curve;
 use shared::messages::{Doubt, Feature, LAYOUT_VERSION, Phase};
 use shared::mlp::{InputScale, Mlp};
 use shared::weights::{Estimator, Method, Origin, Weights};
 
-/// A policy that always gives the action `index`; 1 px^2 is 0.001 ml.
+/// An agent that always chooses the action `index`; 1 px^2 is 0.001 ml.
 fn always(index: usize) -> Box<Agent> {
     let mut network = Mlp::ZERO;
     network.b3[index] = 1.0;
@@ -21,7 +21,7 @@ fn always(index: usize) -> Box<Agent> {
         actions_deg: action_table(),
         selection: Selection::Argmax,
         scale: InputScale::default(),
-        calibration: Calibration { c: 0.001, q: 1.0, tilt: 0.0, hold_above_px2: f32::INFINITY },
+        calibration: Calibration { volume_at_1_px2_ml: 0.001, area_exponent: 1.0, log_tilt_slope: 0.0, hold_above_px2: f32::INFINITY },
         estimator: Estimator::Sum,
         rate_hz: 30.0,
         origin: Origin { method: Method::Handmade, actions: 21, episodes: 0, data_sha256: [0; 32] },
@@ -29,8 +29,8 @@ fn always(index: usize) -> Box<Agent> {
     }))
 }
 
-/// The cell around the core: a robot that follows at once, a container that leaks from 40 degrees on, a camera.
-struct World {
+/// The cell around the core: a robot that follows at once, a container that leaks from 40 degrees on, and a camera.
+struct ToyCell {
     core: Core,
     now_ns: u64,
     sequence: u64,
@@ -45,18 +45,18 @@ struct World {
     settings: Settings,
     out_ml: f32,
     largest_rate_deg_s: f32,
-    /// The camera driver's clock is ahead of ours.
+    /// How far the camera driver's clock is ahead of the controller's, ns.
     clock_ahead_ns: u64,
     last_ended: Option<Outcome>,
 }
 
-impl World {
+impl ToyCell {
     fn new() -> Self {
         let config = Config::parse(include_str!("../../config/sim.toml"), "config/sim.toml").expect("the shipped configuration is valid");
         let settings = Settings::new(&config);
         let mut core = Core::new(settings);
         core.exchange(always(13));
-        let mut world = Self {
+        let mut cell = Self {
             core,
             now_ns: 1_000_000_000,
             sequence: 0,
@@ -73,8 +73,8 @@ impl World {
             clock_ahead_ns: 0,
             last_ended: None,
         };
-        world.tick(None);
-        world
+        cell.tick(None);
+        cell
     }
 
     fn feature(&mut self) -> Feature {
@@ -149,59 +149,59 @@ impl World {
 /// Protects section 3.3.2's beginning: with d = 0 the controller does nothing and stays at the start.
 #[test]
 fn idle_it_stays_at_the_start() {
-    let mut world = World::new();
+    let mut cell = ToyCell::new();
     for _ in 0..100 {
-        assert_eq!(world.tick(None).target_deg, Some(0.0));
+        assert_eq!(cell.tick(None).target_deg, Some(0.0));
     }
-    assert_eq!(world.core.phase(), Phase::Idle);
+    assert_eq!(cell.core.phase(), Phase::Idle);
 }
 
 /// Protects the pour: it tilts, counts, returns to the start angle when d reaches 0, and reports what flowed.
 #[test]
 fn a_pour_ends_upright_with_its_volume() {
-    let mut world = World::new();
-    world.pour(8.0).expect("ready");
-    let outcome = world.finish();
+    let mut cell = ToyCell::new();
+    cell.pour(8.0).expect("ready");
+    let outcome = cell.finish();
     assert_eq!((outcome.reason, outcome.episode, outcome.goal_ml), (EndReason::Done, 5, Some(8.0)));
-    assert_eq!((world.alpha_deg, world.core.phase()), (0.0, Phase::Idle));
-    assert!((outcome.poured_ml - world.out_ml).abs() < 0.05, "reported {}, really {}", outcome.poured_ml, world.out_ml);
+    assert_eq!((cell.alpha_deg, cell.core.phase()), (0.0, Phase::Idle));
+    assert!((outcome.poured_ml - cell.out_ml).abs() < 0.05, "reported {}, really {}", outcome.poured_ml, cell.out_ml);
     assert!(outcome.poured_ml >= 8.0 && outcome.bridged_frames == 0);
-    assert!(world.largest_rate_deg_s <= 90.01);
-    world.pour(3.0).expect("the next pour starts");
+    assert!(cell.largest_rate_deg_s <= 90.01);
+    cell.pour(3.0).expect("the next pour starts");
 }
 
-/// Protects the policy's word where the loop is faster than the camera: an action takes several ticks under the limits, and no more.
+/// Protects the agent's action where the loop is faster than the camera: an action takes several ticks under the limits, and no more.
 #[test]
 fn an_action_is_finished_between_frames() {
-    let mut world = World::new();
-    world.settings.period_ns = 8_000_000;
-    world.core = Core::new(world.settings);
-    world.core.exchange(always(17));
-    world.tick(None);
-    world.pour(50.0).expect("ready");
-    let (first_deg, action_deg) = (world.alpha_deg, action_table()[17]);
-    world.camera = false;
+    let mut cell = ToyCell::new();
+    cell.settings.period_ns = 8_000_000;
+    cell.core = Core::new(cell.settings);
+    cell.core.exchange(always(17));
+    cell.tick(None);
+    cell.pour(50.0).expect("ready");
+    let (first_deg, action_deg) = (cell.alpha_deg, action_table()[17]);
+    cell.camera = false;
     for _ in 0..12 {
-        world.tick(None);
+        cell.tick(None);
     }
     assert!(first_deg < action_deg / 2.0, "the limits allow {first_deg} degrees in one tick");
-    assert!((world.alpha_deg - action_deg).abs() < 0.01, "{} degrees after an action of {action_deg}", world.alpha_deg);
+    assert!((cell.alpha_deg - action_deg).abs() < 0.01, "{} degrees after an action of {action_deg}", cell.alpha_deg);
 }
 
 /// Protects the operator: a second goal while pouring, nonsense goals and missing weights are refused, with the reason.
 #[test]
 fn orders_that_cannot_be_obeyed_are_refused() {
-    let mut world = World::new();
+    let mut cell = ToyCell::new();
     for goal_ml in [0.0, -4.0, f32::NAN, f32::INFINITY, 301.0] {
-        assert_eq!(world.pour(goal_ml), Err(Refusal::Goal(300.0)));
+        assert_eq!(cell.pour(goal_ml), Err(Refusal::Goal(300.0)));
     }
-    world.pour(50.0).expect("ready");
-    assert_eq!(world.pour(60.0), Err(Refusal::Busy));
-    let mut blank = World::new();
+    cell.pour(50.0).expect("ready");
+    assert_eq!(cell.pour(60.0), Err(Refusal::Busy));
+    let mut blank = ToyCell::new();
     blank.core = Core::new(blank.settings);
     blank.tick(None);
     assert_eq!(blank.pour(50.0), Err(Refusal::NoWeights));
-    let mut dark = World::new();
+    let mut dark = ToyCell::new();
     dark.doubt = Doubt::TooDark;
     (0..10).for_each(|_| _ = dark.tick(None));
     assert_eq!(dark.pour(50.0), Err(Refusal::NoFeature), "nothing can be seen");
@@ -212,7 +212,7 @@ fn orders_that_cannot_be_obeyed_are_refused() {
 /// Protects people: whatever goes wrong at full flow, the pour ends with its reason, and upright if the robot may still move.
 #[test]
 fn every_doubt_ends_the_pour_upright_with_its_reason() {
-    type Trouble = fn(&mut World);
+    type Trouble = fn(&mut ToyCell);
     let troubles: [(Trouble, EndReason); 8] = [
         (|w| w.camera = false, EndReason::StaleFeature),
         (|w| w.doubt = Doubt::TooDark, EndReason::StaleFeature),
@@ -224,13 +224,13 @@ fn every_doubt_ends_the_pour_upright_with_its_reason() {
         (|w| _ = w.tick(Some(Order::Shutdown)), EndReason::Shutdown),
     ];
     for (trouble, reason) in troubles {
-        let mut world = World::new();
-        world.pour(200.0).expect("ready");
-        world.run_to_flow();
-        trouble(&mut world);
-        assert_eq!(world.finish().reason, reason);
-        assert_eq!(world.alpha_deg, 0.0, "{reason:?}");
-        assert!(world.largest_rate_deg_s <= 90.01);
+        let mut cell = ToyCell::new();
+        cell.pour(200.0).expect("ready");
+        cell.run_to_flow();
+        trouble(&mut cell);
+        assert_eq!(cell.finish().reason, reason);
+        assert_eq!(cell.alpha_deg, 0.0, "{reason:?}");
+        assert!(cell.largest_rate_deg_s <= 90.01);
     }
 }
 
@@ -238,7 +238,7 @@ fn every_doubt_ends_the_pour_upright_with_its_reason() {
 /// nothing flowed is tilted up to that, also when a bead was taken for a stream before.
 #[test]
 fn a_lost_stream_ends_the_pour_early_and_an_empty_container_late() {
-    let mut lost = World::new();
+    let mut lost = ToyCell::new();
     lost.pour(200.0).expect("ready");
     lost.run_to_flow();
     lost.dry = true;
@@ -251,7 +251,7 @@ fn a_lost_stream_ends_the_pour_early_and_an_empty_container_late() {
     assert!((53.0..62.0).contains(&largest_deg), "{largest_deg}");
     assert_eq!(lost.finish().reason, EndReason::StreamLost);
 
-    let mut empty = World::new();
+    let mut empty = ToyCell::new();
     empty.dry = true;
     empty.pour(200.0).expect("ready");
     for i in 0..40 {
@@ -265,90 +265,90 @@ fn a_lost_stream_ends_the_pour_early_and_an_empty_container_late() {
 #[test]
 fn a_robot_that_may_not_move_gets_no_targets() {
     for reason in [EndReason::ProtectiveStop, EndReason::EmergencyStop, EndReason::RobotLost, EndReason::ProgramStopped] {
-        let mut world = World::new();
-        world.pour(200.0).expect("ready");
-        world.run_to_flow();
-        world.hindrance = Some(reason);
-        let output = world.tick(None);
+        let mut cell = ToyCell::new();
+        cell.pour(200.0).expect("ready");
+        cell.run_to_flow();
+        cell.hindrance = Some(reason);
+        let output = cell.tick(None);
         assert_eq!((output.target_deg, output.ended.map(|o| o.reason)), (None, Some(reason)));
         assert!(output.ended.is_some_and(|o| o.poured_ml > 0.0), "the volume so far is reported");
-        world.hindrance = None;
+        cell.hindrance = None;
         for _ in 0..30 {
-            assert_eq!(world.tick(None).target_deg, None, "still tilted: waits for a person");
+            assert_eq!(cell.tick(None).target_deg, None, "still tilted: waits for a person");
         }
-        world.alpha_deg = 0.3;
-        world.tick(None);
-        assert_eq!(world.core.phase(), Phase::Idle);
-        world.pour(5.0).expect("a new pour works");
+        cell.alpha_deg = 0.3;
+        cell.tick(None);
+        assert_eq!(cell.core.phase(), Phase::Idle);
+        cell.pour(5.0).expect("a new pour works");
     }
 }
 
 /// Protects the volume: frames that were lost are counted and bridged, doubtful ones are not believed.
 #[test]
 fn lost_and_doubtful_frames_are_bridged() {
-    let mut world = World::new();
-    world.pour(30.0).expect("ready");
-    world.run_to_flow();
-    world.feature();
-    world.feature();
-    world.doubt = Doubt::TooDark;
-    world.tick(None);
-    world.doubt = Doubt::None;
-    let outcome = world.finish();
+    let mut cell = ToyCell::new();
+    cell.pour(30.0).expect("ready");
+    cell.run_to_flow();
+    cell.feature();
+    cell.feature();
+    cell.doubt = Doubt::TooDark;
+    cell.tick(None);
+    cell.doubt = Doubt::None;
+    let outcome = cell.finish();
     assert_eq!((outcome.reason, outcome.bridged_frames), (EndReason::Done, 2));
     // The three frames are taken as the one before them: the flow is rising, so a little is missing.
-    assert!((outcome.poured_ml - world.out_ml).abs() < 0.5, "reported {}, really {}", outcome.poured_ml, world.out_ml);
+    assert!((outcome.poured_ml - cell.out_ml).abs() < 0.5, "reported {}, really {}", outcome.poured_ml, cell.out_ml);
 }
 
 /// Protects people: a joint that stays tilted although nothing hinders it is not called upright.
 #[test]
 fn a_joint_that_stays_tilted_is_reported() {
-    let mut world = World::new();
-    world.pour(8.0).expect("ready");
-    world.run_to_flow();
-    world.tick(Some(Order::Abort));
+    let mut cell = ToyCell::new();
+    cell.pour(8.0).expect("ready");
+    cell.run_to_flow();
+    cell.tick(Some(Order::Abort));
     for _ in 0..300 {
-        world.tick_with_joint_at(30.0);
+        cell.tick_with_joint_at(30.0);
     }
-    assert_eq!(world.last_ended.map(|o| o.reason), Some(EndReason::NotUpright));
+    assert_eq!(cell.last_ended.map(|o| o.reason), Some(EndReason::NotUpright));
 }
 
 /// Protects d from being counted twice: repeated, older and foreign features are ignored and counted.
 #[test]
 fn repeated_features_count_once() {
-    let mut world = World::new();
-    world.pour(30.0).expect("ready");
-    world.run_to_flow();
-    world.now_ns += world.settings.period_ns;
-    let feature = world.feature();
-    let once_ml = world.step(&[feature], None).telemetry.d_ml;
-    world.now_ns += world.settings.period_ns;
+    let mut cell = ToyCell::new();
+    cell.pour(30.0).expect("ready");
+    cell.run_to_flow();
+    cell.now_ns += cell.settings.period_ns;
+    let feature = cell.feature();
+    let once_ml = cell.step(&[feature], None).telemetry.d_ml;
+    cell.now_ns += cell.settings.period_ns;
     let older = Feature { sequence: 1, ..feature };
     let foreign = Feature { version: LAYOUT_VERSION + 1, sequence: 1_000_000, ..feature };
-    assert_eq!(world.step(&[feature, older, foreign], None).telemetry.d_ml, once_ml);
-    assert_eq!(world.core.counters().ignored_features, 3);
+    assert_eq!(cell.step(&[feature, older, foreign], None).telemetry.d_ml, once_ml);
+    assert_eq!(cell.core.counters().ignored_features, 3);
 }
 
 /// Protects a pour in progress: new weights wait for its end, and the old ones come back to be dropped elsewhere.
 #[test]
 fn weights_are_exchanged_between_pours_only() {
-    let mut world = World::new();
-    assert!(world.core.exchange(always(13)).is_some());
-    world.pour(8.0).expect("ready");
-    assert!(!world.core.may_exchange());
-    world.finish();
-    assert!(world.core.may_exchange());
-    // A policy that stays never pours: the largest number of frames ends it.
-    world.core.exchange(always(10));
-    world.pour(8.0).expect("ready");
-    let outcome = world.finish();
-    assert_eq!((outcome.reason, outcome.frames >= world.settings.max_frames), (EndReason::MaxFrames, true));
+    let mut cell = ToyCell::new();
+    assert!(cell.core.exchange(always(13)).is_some());
+    cell.pour(8.0).expect("ready");
+    assert!(!cell.core.may_exchange());
+    cell.finish();
+    assert!(cell.core.may_exchange());
+    // An agent that stays never pours: the largest number of frames ends it.
+    cell.core.exchange(always(10));
+    cell.pour(8.0).expect("ready");
+    let outcome = cell.finish();
+    assert_eq!((outcome.reason, outcome.frames >= cell.settings.max_frames), (EndReason::MaxFrames, true));
 }
 
 /// Protects eq. (1): the curve is run as given, to its end; one that leaves the limits is refused before it starts.
 #[test]
 fn a_recording_follows_the_curve() {
-    let mut world = World::new();
+    let mut cell = ToyCell::new();
     let curve = Curve { lambda_deg: 70.0, gamma_per_s2: 0.3, beta_s: 4.914 };
     for bad in [
         Curve { lambda_deg: 200.0, ..curve },
@@ -356,20 +356,20 @@ fn a_recording_follows_the_curve() {
         Curve { beta_s: 1.0, ..curve },
         Curve { beta_s: f32::NAN, ..curve },
     ] {
-        let answer = world.tick(Some(Order::Record { episode: 6, curve: bad })).ordered;
+        let answer = cell.tick(Some(Order::Record { episode: 6, curve: bad })).ordered;
         assert_eq!(answer, Some(Err(Refusal::Curve)), "{bad:?}");
     }
-    world.tick(Some(Order::Record { episode: 6, curve })).ordered.expect("answered").expect("ready");
-    let start_ns = world.now_ns;
+    cell.tick(Some(Order::Record { episode: 6, curve })).ordered.expect("answered").expect("ready");
+    let start_ns = cell.now_ns;
     loop {
-        let output = world.tick(None);
-        let t = (world.now_ns - start_ns) as f32 / 1e9;
+        let output = cell.tick(None);
+        let t = (cell.now_ns - start_ns) as f32 / 1e9;
         if t > 2.0 * curve.beta_s {
             break;
         }
-        assert!((world.alpha_deg - curve.alpha_deg(t)).abs() < 0.06, "at {t} s");
+        assert!((cell.alpha_deg - curve.alpha_deg(t)).abs() < 0.06, "at {t} s");
         assert_eq!(output.telemetry.lambda_deg, 70.0);
     }
-    let outcome = world.finish();
-    assert_eq!((outcome.reason, outcome.goal_ml, world.alpha_deg), (EndReason::Done, None, 0.0));
+    let outcome = cell.finish();
+    assert_eq!((outcome.reason, outcome.goal_ml, cell.alpha_deg), (EndReason::Done, None, 0.0));
 }

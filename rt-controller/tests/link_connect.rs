@@ -85,18 +85,18 @@ struct Seen {
     rtde: TcpStream,
 }
 
-fn frame(kind: u8, payload: &[u8]) -> Vec<u8> {
-    let mut frame = ((payload.len() + 3) as u16).to_be_bytes().to_vec();
-    frame.push(kind);
-    frame.extend(payload);
-    frame
+fn packet(kind: u8, payload: &[u8]) -> Vec<u8> {
+    let mut packet = ((payload.len() + 3) as u16).to_be_bytes().to_vec();
+    packet.push(kind);
+    packet.extend(payload);
+    packet
 }
 
 fn text(message: &str) -> Vec<u8> {
     let mut payload = vec![message.len() as u8];
     payload.extend(message.as_bytes());
     payload.extend([0, 2]);
-    frame(b'M', &payload)
+    packet(b'M', &payload)
 }
 
 /// A DATA_PACKAGE: the clock, the joint, the program's registers.
@@ -110,7 +110,7 @@ fn data(robot: &Robot, timestamp_s: f64, program: ProgramState, echo: i32, run: 
     payload.extend([1, robot.runtime_state].map(u32::to_be_bytes).concat());
     payload.extend([program as i32, echo, run].map(i32::to_be_bytes).concat());
     payload.extend([robot.joint_rad, robot.speed_fraction].map(f64::to_be_bytes).concat());
-    frame(b'U', &payload)
+    packet(b'U', &payload)
 }
 
 impl Server {
@@ -168,7 +168,7 @@ impl Server {
             };
             let mut bytes = robot.chatter.clone();
             if robot.deaf_to != Some(head[2]) {
-                bytes.extend(frame(head[2], &answer));
+                bytes.extend(packet(head[2], &answer));
             }
             send_in_pieces(&mut rtde, &bytes, robot.piece)?;
         }
@@ -220,7 +220,7 @@ fn connects_and_uploads_the_program() {
 #[test]
 fn connects_through_chatter_and_pieces() {
     for (last, piece) in [(2, 1), (3, 7), (4, usize::MAX)] {
-        let chatter = [text("SafetySetup has not been confirmed yet"), frame(b'Z', &[1, 2]), text("")].concat();
+        let chatter = [text("SafetySetup has not been confirmed yet"), packet(b'Z', &[1, 2]), text("")].concat();
         let (session, _seen) = Server::new(last, Robot { chatter, piece, ..Robot::default() }).meet();
         assert_eq!(session.unwrap().state().program_state, ProgramState::Ready);
     }
@@ -328,7 +328,7 @@ fn the_newest_state_counts() {
     seen.rtde.write_all(most).unwrap();
     poll_until(&mut session, |_, s| s.texts() == 49).unwrap();
     let before = *session.state();
-    // The last frames are cut: 30 bytes before the end lies within the last package.
+    // The last packets are cut: 30 bytes before the end lies within the last package.
     assert_eq!(before.sequence_echo, 48);
     assert_eq!(session.poll(now_ns()).unwrap(), &before, "nothing new");
     seen.rtde.write_all(rest).unwrap();
@@ -356,7 +356,7 @@ fn standing_clocks_and_unread_targets_are_noticed() {
     assert_eq!(echo_at(&mut session, 1.0, 1), (false, true), "a clock that jumps back does not advance");
 }
 
-/// Protects the robot from half a target: what arrives are whole frames, numbered from 1, in the agreed recipe.
+/// Protects the robot from half a target: what arrives are whole packets, numbered from 1, in the agreed recipe.
 #[test]
 fn targets_arrive_whole_and_numbered() {
     let (mut session, mut seen, _) = connected(9);
@@ -365,9 +365,9 @@ fn targets_arrive_whole_and_numbered() {
     assert_eq!(session.send(Mode::Stream, f32::NAN), Ok(3));
     let mut received = [0; 60];
     seen.rtde.read_exact(&mut received).unwrap();
-    let parts = |frame: &[u8]| {
-        let int = |at: usize| i32::from_be_bytes(frame[at..at + 4].try_into().unwrap());
-        (frame[..4].to_vec(), int(4), int(8), f64::from_be_bytes(frame[12..20].try_into().unwrap()))
+    let parts = |packet: &[u8]| {
+        let int = |at: usize| i32::from_be_bytes(packet[at..at + 4].try_into().unwrap());
+        (packet[..4].to_vec(), int(4), int(8), f64::from_be_bytes(packet[12..20].try_into().unwrap()))
     };
     let head = vec![0, 20, b'U', 2];
     assert_eq!(parts(&received[..20]), (head.clone(), 1, 2, 90f64.to_radians()));
@@ -445,7 +445,7 @@ fn a_flood_does_not_keep_the_loop() {
         thread::sleep(Duration::from_millis(200));
     }
     let most = (16 << 16) / 192 + 1;
-    assert!(before > 2 * most, "{before} frames wait, too few for this test");
+    assert!(before > 2 * most, "{before} packets wait, too few for this test");
     let taken = session.poll(now_ns()).unwrap().sequence_echo as usize;
     assert!((1..=most).contains(&taken), "{taken} of {before}");
     poll_until(&mut session, |_, s| s.state().sequence_echo == 50_000).unwrap();

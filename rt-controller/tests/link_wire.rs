@@ -1,4 +1,4 @@
-//! The pure parts of the robot link: frames, health, the program's text.
+//! The pure parts of the robot link: packets, health, the program's text.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::too_many_lines)]
 
 use proptest::prelude::*;
@@ -13,12 +13,12 @@ fn bytes(hex: &str) -> Vec<u8> {
     digits.chunks(2).map(|two| u8::from_str_radix(std::str::from_utf8(two).unwrap(), 16).unwrap()).collect()
 }
 
-fn all_frames(inbox: &mut Inbox) -> Vec<(u8, Vec<u8>)> {
-    let mut frames = Vec::new();
-    while let Some(frame) = inbox.next_frame().unwrap() {
-        frames.push((frame.kind, frame.payload.to_vec()));
+fn all_packets(inbox: &mut Inbox) -> Vec<(u8, Vec<u8>)> {
+    let mut packets = Vec::new();
+    while let Some(packet) = inbox.next_packet().unwrap() {
+        packets.push((packet.kind, packet.payload.to_vec()));
     }
-    frames
+    packets
 }
 
 fn give(inbox: &mut Inbox, bytes: &[u8]) {
@@ -26,40 +26,40 @@ fn give(inbox: &mut Inbox, bytes: &[u8]) {
     inbox.filled(bytes.len());
 }
 
-/// Protects the reader from TCP's freedom: the same frames come out wherever the stream is cut, and uncut.
+/// Protects the reader from TCP's freedom: the same packets come out wherever the stream is cut, and uncut.
 #[test]
-fn frames_survive_every_cut() {
-    // Answers recorded of a CB3 3.15.8: version accepted, its version, an input recipe, start, and an empty text frame.
+fn packets_survive_every_cut() {
+    // Answers recorded of a CB3 3.15.8: version accepted, its version, an input recipe, start, and an empty text packet.
     let stream = bytes("00045601 001376000000030000000f0000000800019f63 000f4904494e5433322c494e543332 00045301 00064d000003");
     let mut whole = Inbox::new();
     give(&mut whole, &stream);
-    let expected = all_frames(&mut whole);
+    let expected = all_packets(&mut whole);
     assert_eq!(expected.iter().map(|(kind, _)| *kind).collect::<Vec<_>>(), b"VvISM");
     assert_eq!(wire::controller_version(&expected[1].1), Some([3, 15, 8, 106339]));
     assert_eq!(wire::recipe(&expected[2].1), Some((4, "INT32,INT32")));
     for first in 0..=stream.len() {
         for second in first..=stream.len() {
             let mut inbox = Inbox::new();
-            let mut frames = Vec::new();
+            let mut packets = Vec::new();
             for piece in [&stream[..first], &stream[first..second], &stream[second..]] {
                 give(&mut inbox, piece);
-                frames.extend(all_frames(&mut inbox));
+                packets.extend(all_packets(&mut inbox));
             }
-            assert_eq!(frames, expected, "cut at {first} and {second}");
+            assert_eq!(packets, expected, "cut at {first} and {second}");
         }
     }
 }
 
-/// Protects the inbox from the largest frame: it fits, whatever waits before it, and there is always space.
+/// Protects the inbox from the largest packet: it fits, whatever waits before it, and there is always space.
 #[test]
-fn the_largest_frame_fits() {
+fn the_largest_packet_fits() {
     let mut inbox = Inbox::new();
     let mut largest = vec![0xff, 0xff, b'M'];
     largest.resize(65535, 7);
     let mut stream = bytes("00045601");
     stream.extend(&largest);
     stream.extend(bytes("00045300"));
-    let mut frames = Vec::new();
+    let mut packets = Vec::new();
     for piece in stream.chunks(50_000) {
         let mut rest = piece;
         while !rest.is_empty() {
@@ -67,17 +67,17 @@ fn the_largest_frame_fits() {
             assert!(n > 0);
             give(&mut inbox, &rest[..n]);
             rest = &rest[n..];
-            frames.extend(all_frames(&mut inbox));
+            packets.extend(all_packets(&mut inbox));
         }
     }
-    assert_eq!(frames.iter().map(|(_, payload)| payload.len()).collect::<Vec<_>>(), [1, 65532, 1]);
+    assert_eq!(packets.iter().map(|(_, payload)| payload.len()).collect::<Vec<_>>(), [1, 65532, 1]);
 }
 
 /// Protects the robot's input recipe: number, mode and angle lie where the recipe says.
 #[test]
 fn a_target_is_encoded_as_documented() {
-    let frame = wire::encode_target(2, 258, 2, 1.5);
-    assert_eq!(frame.to_vec(), bytes("0014 55 02 00000102 00000002 3ff8000000000000"));
+    let packet = wire::encode_target(2, 258, 2, 1.5);
+    assert_eq!(packet.to_vec(), bytes("0014 55 02 00000102 00000002 3ff8000000000000"));
     assert_eq!(wire::input_names(24).map(|(name, _)| name), ["input_int_register_24", "input_int_register_25", "input_double_register_24"]);
 }
 
@@ -284,21 +284,21 @@ fn the_average_covers_the_braking_time() {
     assert!(matches!(refused, LinkError::Limits { .. }), "{refused}");
 }
 
-/// Bytes that are frames more often than not, in the types that a client reads.
+/// Bytes that are packets more often than not, in the types that a client reads.
 fn anything() -> impl Strategy<Value = Vec<u8>> {
     let payload = prop_oneof![
         prop::collection::vec(any::<u8>(), 0..40),
         prop::collection::vec(0u8..8, 0..12),
         prop::collection::vec(any::<u8>(), 189)
     ];
-    let frame = (prop::sample::select(b"VvOISMU".to_vec()), payload).prop_map(|(kind, payload)| {
-        let mut frame = (payload.len() as u16 + 3).to_be_bytes().to_vec();
-        frame.push(kind);
-        frame.extend(payload);
-        frame
+    let packet = (prop::sample::select(b"VvOISMU".to_vec()), payload).prop_map(|(kind, payload)| {
+        let mut packet = (payload.len() as u16 + 3).to_be_bytes().to_vec();
+        packet.push(kind);
+        packet.extend(payload);
+        packet
     });
     let noise = prop::collection::vec(any::<u8>(), 0..20);
-    prop::collection::vec(prop_oneof![9 => frame, 1 => noise], 0..20).prop_map(|pieces| pieces.concat())
+    prop::collection::vec(prop_oneof![9 => packet, 1 => noise], 0..20).prop_map(|pieces| pieces.concat())
 }
 
 proptest! {
@@ -309,10 +309,10 @@ proptest! {
         'pieces: for piece in stream.chunks(cut) {
             give(&mut inbox, piece);
             loop {
-                match inbox.next_frame() {
+                match inbox.next_packet() {
                     Err(_) => break 'pieces,
                     Ok(None) => break,
-                    Ok(Some(frame)) => wire::read_anything(frame, &tilt()),
+                    Ok(Some(packet)) => wire::read_anything(packet, &tilt()),
                 }
             }
         }

@@ -3,9 +3,9 @@
 //! The controller's loop, the recorder and, through the recorded episodes, the training all use it, so that they pair pictures and
 //! angles in the same way. Fixed size: nothing here allocates, locks or panics. What is not known is NaN.
 
-/// How long the last measured alpha still counts when no newer one has come, ns.
+/// How long a measured alpha still counts when no newer one has come, ns: as long as a robot may be silent before it counts as lost.
 const HOLD_NS: u64 = 100_000_000;
-/// Ticks after which a frame no longer waits for a newer robot state, ns.
+/// After this much time in ticks a frame no longer waits for a newer state of the robot, ns. Chosen by hand; no measurement is recorded.
 const PATIENCE_NS: u64 = 50_000_000;
 
 /// One angle over time: the newest `N` values, each with its time, ascending in time.
@@ -60,7 +60,7 @@ pub struct AlphaTrack<const N: usize> {
 }
 
 impl<const N: usize> AlphaTrack<N> {
-    /// A track without any tick.
+    /// A track without any value.
     pub const fn new() -> Self {
         Self { commanded: AngleHistory::new(), measured: AngleHistory::new() }
     }
@@ -73,7 +73,7 @@ impl<const N: usize> AlphaTrack<N> {
         }
     }
 
-    /// Whether nothing that is still to come would change alpha at `t_ns`.
+    /// Whether the values that are still to come cannot change alpha at `t_ns`.
     pub fn covers(&self, t_ns: u64) -> bool {
         let tick_ns = self.commanded.newest_ns();
         tick_ns >= t_ns && (self.measured.newest_ns() >= t_ns || tick_ns >= t_ns + PATIENCE_NS)
@@ -109,7 +109,7 @@ mod tests {
         assert!(track.measured_deg(500 * MS).is_nan(), "a robot that went silent measures nothing");
     }
 
-    /// Protects samples from being written before the tick that decides their angle has come.
+    /// Protects rows from being written before the tick that decides their angle has come.
     #[test]
     fn a_frame_waits_for_the_tick_and_the_robot_state_after_it() {
         let mut track = AlphaTrack::<8>::new();

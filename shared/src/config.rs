@@ -1,7 +1,7 @@
-//! The cell's one TOML file: `config/cell.toml` for the real cell, `config/sim.toml` for the simulated one.
+//! The cell's configuration, one TOML file: `config/cell.toml` for the real cell, `config/sim.toml` for the simulated one.
 //!
-//! Read once at start by every process; allocates. Unknown keys, wrong types and values out of range are refused with
-//! file, key and the allowed range ([`ConfigError`]). Relative paths are relative to the working directory.
+//! Every process reads it once at its start, in an ordinary thread; allocates. Unknown keys, wrong types and values out of range are
+//! refused with file, key and what is allowed ([`ConfigError`]). Relative paths are relative to the working directory.
 
 use std::net::IpAddr;
 use std::path::{Path, PathBuf};
@@ -10,8 +10,17 @@ use serde::{Deserialize, Serialize};
 
 use crate::limits::Limits;
 
-/// What `--config` is if it is not given: the simulated cell, so that a real robot moves only when it is named.
+/// The file that is read without `--config`: the simulated cell, so that a real robot only moves when its file is named.
 pub const DEFAULT_FILE: &str = "config/sim.toml";
+
+/// What a cell's name may be, in words: it becomes part of file names.
+pub(crate) const CELL_NAME_RULE: &str = "1 to 32 letters, digits, '-' or '_'";
+
+/// Whether `name` keeps [`CELL_NAME_RULE`].
+pub(crate) fn is_cell_name(name: &str) -> bool {
+    let legal = |c: char| c.is_ascii_alphanumeric() || c == '-' || c == '_';
+    (1..=32).contains(&name.len()) && name.chars().all(legal)
+}
 
 /// Why a configuration is refused.
 #[derive(Debug, thiserror::Error)]
@@ -21,27 +30,27 @@ pub enum ConfigError {
     Read {
         /// The file.
         file: String,
-        /// The system's words.
+        /// The operating system's message.
         what: String,
     },
-    /// Not TOML, an unknown key, a missing key or a wrong type.
+    /// The file is not TOML, or has an unknown key, a missing key or a wrong type.
     #[error("{file}: {what}")]
     Parse {
         /// The file.
         file: String,
-        /// Line, key and what was expected.
+        /// The line, the key and what was expected.
         what: String,
     },
-    /// A value outside its range.
+    /// A value is outside its range.
     #[error("{file}: {key} = {value}: allowed is {allowed}")]
     Range {
         /// The file.
         file: String,
         /// The key, with its table.
         key: String,
-        /// What was given.
+        /// The value that was given.
         value: String,
-        /// What is allowed.
+        /// The values that are allowed.
         allowed: String,
     },
 }
@@ -54,7 +63,7 @@ pub struct Config {
     pub cell: CellConfig,
     /// Where frames come from.
     pub camera: CameraConfig,
-    /// Where the lip is in the image, and how liquid is told from background.
+    /// Where the lip is in the image, and how liquid is told from the background.
     pub image: ImageConfig,
     /// The robot and its tilting joint.
     pub robot: RobotConfig,
@@ -66,7 +75,7 @@ pub struct Config {
     pub worker: WorkerConfig,
     /// Episodes.
     pub recording: RecordingConfig,
-    /// The simulated cell's own table; only `simulator` reads it.
+    /// The simulated cell's own table, which only `simulator` reads.
     #[serde(default)]
     pub simulator: Option<toml::Table>,
 }
@@ -110,13 +119,13 @@ pub struct CameraConfig {
     pub fps: f64,
 }
 
-/// How liquid is told from background.
+/// How liquid is told from the background.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum LiquidMethod {
     /// By its colour (`[image] colour`).
     Colour,
-    /// Clear water, by what does not move with the background: wants an even wall behind the lip (docs/VISION.md).
+    /// Clear water, by what does not move with the background. It needs an even card behind the lip (docs/VISION.md).
     Clear,
 }
 
@@ -124,9 +133,9 @@ pub enum LiquidMethod {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct ImageConfig {
-    /// How liquid is told from background.
+    /// How liquid is told from the background.
     pub method: LiquidMethod,
-    /// Region at the lip, px: x, y, width, height.
+    /// The region at the lip that is looked at, px: x, y, width, height.
     pub region_px: [u32; 4],
     /// x-axis of Fig. 4: two points on the glass's top edge, px: x0, y0, x1, y1, from the lip's side into the mouth. The
     /// triangle lies between this direction and that of `y_axis_px`.
@@ -136,7 +145,7 @@ pub struct ImageConfig {
     /// Colour range of the liquid in OpenCV's HSV: h_min, s_min, v_min, h_max, s_max, v_max (h 0-179, s and v 0-255;
     /// h_min > h_max wraps around red).
     pub colour_hsv: [u8; 6],
-    /// Areas below this are no stream, px^2.
+    /// The smallest area that counts as a stream, px^2.
     pub area_min_px2: f32,
 }
 
@@ -150,11 +159,11 @@ pub struct RobotConfig {
     pub joint: Joint,
     /// Angle of that joint when the container is upright (alpha = 0), degrees.
     pub start_joint_deg: f64,
-    /// +1 or -1: sign of the joint's motion for growing alpha.
+    /// +1 or -1: the sign of the joint's motion when alpha grows.
     pub direction: f64,
     /// Largest distance from the start angle at which the program starts, degrees.
     pub start_tolerance_deg: f64,
-    /// First RTDE register used, 24 to 40 (0 to 23 belong to fieldbuses).
+    /// The first RTDE register that is used, 24 to 40; 0 to 23 belong to fieldbuses (RTDE guide).
     pub register_base: u8,
     /// servoj lookahead time, s.
     pub lookahead_s: f64,
@@ -189,26 +198,26 @@ impl Joint {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct ControllerConfig {
-    /// Ticks a second (30 in the paper).
+    /// Ticks a second; 30 in the paper.
     pub rate_hz: f64,
-    /// Core that the loop is pinned to.
+    /// Number of the processor core that the loop is pinned to.
     pub core: usize,
-    /// SCHED_FIFO priority; 0: ordinary scheduling.
+    /// SCHED_FIFO priority of the loop, 1 to 99; 0: ordinary scheduling.
     pub priority: u8,
-    /// The weight file; watched, and taken between pours when it changes.
+    /// The weight file. It is watched, and taken between pours when it changes.
     pub weights: PathBuf,
-    /// Where every tick's inputs are written, for `rt-controller replay`; without it there is no journal.
+    /// The journal, to which every tick's inputs are written for `rt-controller replay`; without this key there is none.
     #[serde(default)]
     pub journal: Option<PathBuf>,
-    /// A pour ends when the newest feature is older than this, ms.
+    /// Largest age of the newest usable measurement during a pour, ms.
     pub stale_feature_ms: u32,
     /// The robot counts as lost when its newest state is older than this, ms.
     pub lost_robot_ms: u32,
-    /// A pour ends after this many frames.
+    /// Largest number of frames of a pour.
     pub max_frames: u32,
-    /// The container is empty after this many frames without flow at the largest tilt.
+    /// Number of frames without flow at the largest tilt after which the container counts as empty.
     pub empty_frames: u32,
-    /// Largest goal that is accepted, ml (the receiving container's size, D_max of eq. 3).
+    /// Largest goal that is accepted, ml: the receiving container's size, D_max of eq. (3).
     pub goal_max_ml: f32,
 }
 
@@ -216,9 +225,9 @@ pub struct ControllerConfig {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct WorkerConfig {
-    /// Core that extraction is pinned to.
+    /// Number of the processor core that the extraction is pinned to.
     pub core: usize,
-    /// SCHED_FIFO priority of extraction; 0: ordinary scheduling.
+    /// SCHED_FIFO priority of the extraction, 1 to 99; 0: ordinary scheduling.
     pub priority: u8,
 }
 
@@ -241,7 +250,7 @@ pub struct RecordingConfig {
     pub image_format: ImageFormat,
     /// JPEG quality, 1 to 100.
     pub jpeg_quality: u8,
-    /// Most images waiting to be written; further ones are dropped and counted.
+    /// Most images that may wait to be written; further ones are dropped and counted.
     pub queue_frames: usize,
 }
 
@@ -268,91 +277,15 @@ impl Config {
 
     fn check(&self, file: &str) -> Result<(), ConfigError> {
         let check = Check { file };
-        let Self { cell, camera, image, robot, limits, controller, worker, recording, simulator: _ } = self;
-        let name_ok =
-            !cell.name.is_empty() && cell.name.len() <= 32 && cell.name.chars().all(|c| c.is_ascii_alphanumeric() || c == '-' || c == '_');
-        check.rule("cell.name", &cell.name, name_ok, "1 to 32 letters, digits, '-' or '_'")?;
-
-        check.range("camera.width_px", camera.width_px.into(), 64.0, 4096.0)?;
-        check.range("camera.height_px", camera.height_px.into(), 64.0, 4096.0)?;
-        check.range("camera.fps", camera.fps, 1.0, 240.0)?;
-        let needs_path = camera.source != CameraSource::SharedMemory;
-        check.rule(
-            "camera.path",
-            &camera.path,
-            !needs_path || !camera.path.is_empty(),
-            "a device, file or pattern (only source = \"shared-memory\" has none)",
-        )?;
-
-        let [x, y, w, h] = image.region_px.map(f64::from);
-        let inside = w >= 8.0 && h >= 8.0 && x + w <= f64::from(camera.width_px) && y + h <= f64::from(camera.height_px);
-        check.rule(
-            "image.region_px",
-            &format!("{:?}", image.region_px),
-            inside,
-            &format!("x, y, width, height of at least 8 x 8 inside {} x {}", camera.width_px, camera.height_px),
-        )?;
-        let direction = |a: [f32; 4]| (f64::from(a[2] - a[0]), f64::from(a[3] - a[1]));
-        for (key, axis) in [("image.x_axis_px", image.x_axis_px), ("image.y_axis_px", image.y_axis_px)] {
-            let (dx, dy) = direction(axis);
-            let fine = axis.iter().all(|v| v.is_finite()) && dx.hypot(dy) >= 2.0;
-            check.rule(key, &format!("{axis:?}"), fine, "x0, y0, x1, y1 of two points at least 2 px apart")?;
-        }
-        let ((ax, ay), (bx, by)) = (direction(image.x_axis_px), direction(image.y_axis_px));
-        let sine = (ax * by - ay * bx).abs() / (ax.hypot(ay) * bx.hypot(by));
-        check.rule(
-            "image.y_axis_px",
-            &format!("{:?}", image.y_axis_px),
-            sine > 0.17,
-            "an axis at least 10 degrees from image.x_axis_px (these are nearly parallel)",
-        )?;
-        let [h0, s0, v0, h1, s1, v1] = image.colour_hsv;
-        let colour_ok = h0 <= 179 && h1 <= 179 && s0 < s1 && v0 < v1;
-        check.rule(
-            "image.colour_hsv",
-            &format!("{:?}", image.colour_hsv),
-            colour_ok,
-            "h_min, s_min, v_min, h_max, s_max, v_max with h 0 to 179, s_min < s_max, v_min < v_max",
-        )?;
-        check.range("image.area_min_px2", image.area_min_px2.into(), 0.0, 1e5)?;
-
-        check.range("robot.start_joint_deg", robot.start_joint_deg, -360.0, 360.0)?;
-        check.rule("robot.direction", &robot.direction.to_string(), robot.direction.abs() == 1.0, "1 or -1")?;
-        check.range("robot.start_tolerance_deg", robot.start_tolerance_deg, 0.1, 10.0)?;
-        check.range("robot.register_base", robot.register_base.into(), 24.0, 40.0)?;
-        check.range("robot.lookahead_s", robot.lookahead_s, 0.03, 0.2)?;
-        check.range("robot.gain", robot.gain, 100.0, 2000.0)?;
-
-        check.range("limits.alpha_min_deg", limits.alpha_min_deg.into(), -20.0, 0.0)?;
-        check.range("limits.alpha_max_deg", limits.alpha_max_deg.into(), 10.0, 180.0)?;
-        check.range("limits.step_deg", limits.step_deg.into(), 0.1, 6.0)?;
-        check.range("limits.rate_deg_s", limits.rate_deg_s.into(), 1.0, 180.0)?;
-        check.range("limits.acceleration_deg_s2", limits.acceleration_deg_s2.into(), 10.0, 2290.0)?;
-        check.range("limits.return_rate_deg_s", limits.return_rate_deg_s.into(), 1.0, 180.0)?;
-
-        let ends = [limits.alpha_min_deg, limits.alpha_max_deg].map(|a| robot.start_joint_deg + robot.direction * f64::from(a));
-        check.rule(
-            "robot.start_joint_deg",
-            &robot.start_joint_deg.to_string(),
-            ends.iter().all(|e| e.abs() <= 360.0),
-            "an angle from which limits.alpha_min_deg and limits.alpha_max_deg stay within the joint's -360 to 360",
-        )?;
-
-        check.range("controller.rate_hz", controller.rate_hz, 10.0, 125.0)?;
-        check.range("controller.core", controller.core as f64, 0.0, 1023.0)?;
-        check.range("controller.priority", controller.priority.into(), 0.0, 99.0)?;
-        check.range("controller.stale_feature_ms", controller.stale_feature_ms.into(), 50.0, 1000.0)?;
-        check.range("controller.lost_robot_ms", controller.lost_robot_ms.into(), 20.0, 1000.0)?;
-        check.range("controller.max_frames", controller.max_frames.into(), 30.0, 100_000.0)?;
-        check.range("controller.empty_frames", controller.empty_frames.into(), 5.0, 1000.0)?;
-        check.range("controller.goal_max_ml", controller.goal_max_ml.into(), 1.0, 5000.0)?;
-        check.range("worker.core", worker.core as f64, 0.0, 1023.0)?;
-        check.range("worker.priority", worker.priority.into(), 0.0, 99.0)?;
-        check.range("recording.jpeg_quality", recording.jpeg_quality.into(), 1.0, 100.0)?;
-        check.range("recording.queue_frames", recording.queue_frames as f64, 2.0, 1000.0)
+        check.rule("cell.name", &self.cell.name, is_cell_name(&self.cell.name), CELL_NAME_RULE)?;
+        check.camera(&self.camera)?;
+        check.image(&self.image, &self.camera)?;
+        check.robot(&self.robot, &self.limits)?;
+        check.processes(&self.controller, &self.worker, &self.recording)
     }
 }
 
+/// Checks values, and names `file` where one is refused.
 struct Check<'a> {
     file: &'a str,
 }
@@ -367,6 +300,92 @@ impl Check<'_> {
 
     fn range(&self, key: &str, value: f64, low: f64, high: f64) -> Result<(), ConfigError> {
         self.rule(key, &value.to_string(), value >= low && value <= high, &format!("{low} to {high}"))
+    }
+
+    fn camera(&self, camera: &CameraConfig) -> Result<(), ConfigError> {
+        self.range("camera.width_px", camera.width_px.into(), 64.0, 4096.0)?;
+        self.range("camera.height_px", camera.height_px.into(), 64.0, 4096.0)?;
+        self.range("camera.fps", camera.fps, 1.0, 240.0)?;
+        let needs_path = camera.source != CameraSource::SharedMemory;
+        self.rule(
+            "camera.path",
+            &camera.path,
+            !needs_path || !camera.path.is_empty(),
+            "a device, file or pattern (only source = \"shared-memory\" has none)",
+        )
+    }
+
+    fn image(&self, image: &ImageConfig, camera: &CameraConfig) -> Result<(), ConfigError> {
+        let [x, y, w, h] = image.region_px.map(f64::from);
+        let inside = w >= 8.0 && h >= 8.0 && x + w <= f64::from(camera.width_px) && y + h <= f64::from(camera.height_px);
+        self.rule(
+            "image.region_px",
+            &format!("{:?}", image.region_px),
+            inside,
+            &format!("x, y, width, height of at least 8 x 8 inside {} x {}", camera.width_px, camera.height_px),
+        )?;
+        let direction = |a: [f32; 4]| (f64::from(a[2] - a[0]), f64::from(a[3] - a[1]));
+        for (key, axis) in [("image.x_axis_px", image.x_axis_px), ("image.y_axis_px", image.y_axis_px)] {
+            let (dx, dy) = direction(axis);
+            let fine = axis.iter().all(|v| v.is_finite()) && dx.hypot(dy) >= 2.0;
+            self.rule(key, &format!("{axis:?}"), fine, "x0, y0, x1, y1 of two points at least 2 px apart")?;
+        }
+        let ((ax, ay), (bx, by)) = (direction(image.x_axis_px), direction(image.y_axis_px));
+        let sine = (ax * by - ay * bx).abs() / (ax.hypot(ay) * bx.hypot(by));
+        self.rule(
+            "image.y_axis_px",
+            &format!("{:?}", image.y_axis_px),
+            sine > 0.17,
+            "an axis at least 10 degrees from image.x_axis_px (these are nearly parallel)",
+        )?;
+        let [h0, s0, v0, h1, s1, v1] = image.colour_hsv;
+        let colour_ok = h0 <= 179 && h1 <= 179 && s0 < s1 && v0 < v1;
+        self.rule(
+            "image.colour_hsv",
+            &format!("{:?}", image.colour_hsv),
+            colour_ok,
+            "h_min, s_min, v_min, h_max, s_max, v_max with h 0 to 179, s_min < s_max, v_min < v_max",
+        )?;
+        self.range("image.area_min_px2", image.area_min_px2.into(), 0.0, 1e5)
+    }
+
+    fn robot(&self, robot: &RobotConfig, limits: &Limits) -> Result<(), ConfigError> {
+        self.range("robot.start_joint_deg", robot.start_joint_deg, -360.0, 360.0)?;
+        self.rule("robot.direction", &robot.direction.to_string(), robot.direction.abs() == 1.0, "1 or -1")?;
+        self.range("robot.start_tolerance_deg", robot.start_tolerance_deg, 0.1, 10.0)?;
+        self.range("robot.register_base", robot.register_base.into(), 24.0, 40.0)?;
+        self.range("robot.lookahead_s", robot.lookahead_s, 0.03, 0.2)?;
+        self.range("robot.gain", robot.gain, 100.0, 2000.0)?;
+
+        self.range("limits.alpha_min_deg", limits.alpha_min_deg.into(), -20.0, 0.0)?;
+        self.range("limits.alpha_max_deg", limits.alpha_max_deg.into(), 10.0, 180.0)?;
+        self.range("limits.step_deg", limits.step_deg.into(), 0.1, 6.0)?;
+        self.range("limits.rate_deg_s", limits.rate_deg_s.into(), 1.0, 180.0)?;
+        self.range("limits.acceleration_deg_s2", limits.acceleration_deg_s2.into(), 10.0, 2290.0)?;
+        self.range("limits.return_rate_deg_s", limits.return_rate_deg_s.into(), 1.0, 180.0)?;
+
+        let ends = [limits.alpha_min_deg, limits.alpha_max_deg].map(|a| robot.start_joint_deg + robot.direction * f64::from(a));
+        self.rule(
+            "robot.start_joint_deg",
+            &robot.start_joint_deg.to_string(),
+            ends.iter().all(|e| e.abs() <= 360.0),
+            "an angle from which limits.alpha_min_deg and limits.alpha_max_deg stay within the joint's -360 to 360",
+        )
+    }
+
+    fn processes(&self, controller: &ControllerConfig, worker: &WorkerConfig, recording: &RecordingConfig) -> Result<(), ConfigError> {
+        self.range("controller.rate_hz", controller.rate_hz, 10.0, 125.0)?;
+        self.range("controller.core", controller.core as f64, 0.0, 1023.0)?;
+        self.range("controller.priority", controller.priority.into(), 0.0, 99.0)?;
+        self.range("controller.stale_feature_ms", controller.stale_feature_ms.into(), 50.0, 1000.0)?;
+        self.range("controller.lost_robot_ms", controller.lost_robot_ms.into(), 20.0, 1000.0)?;
+        self.range("controller.max_frames", controller.max_frames.into(), 30.0, 100_000.0)?;
+        self.range("controller.empty_frames", controller.empty_frames.into(), 5.0, 1000.0)?;
+        self.range("controller.goal_max_ml", controller.goal_max_ml.into(), 1.0, 5000.0)?;
+        self.range("worker.core", worker.core as f64, 0.0, 1023.0)?;
+        self.range("worker.priority", worker.priority.into(), 0.0, 99.0)?;
+        self.range("recording.jpeg_quality", recording.jpeg_quality.into(), 1.0, 100.0)?;
+        self.range("recording.queue_frames", recording.queue_frames as f64, 2.0, 1000.0)
     }
 }
 

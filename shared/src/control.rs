@@ -1,6 +1,8 @@
-//! Requests to the running controller and its answers: postcard bytes over iceoryx2 request-response.
+//! Requests to the running controller and its answers, which travel as postcard bytes over iceoryx2 request-response; and the reasons for
+//! which a pour ends.
 //!
-//! Used by command-line clients and by the controller's ordinary service thread, never by its loop. Allocates.
+//! Used by command-line clients and by the controller's ordinary service thread, and allocates. The loop only uses [`Outcome`] and
+//! [`EndReason`], which are plain data. Nothing here can fail.
 
 use serde::{Deserialize, Serialize};
 
@@ -11,16 +13,16 @@ use crate::messages::Phase;
 /// What a client asks.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub enum Request {
-    /// State, rates, counters, histograms and the newest result.
+    /// Asks for the state, counters, histograms and newest results.
     Status,
-    /// Pour `goal_ml`.
+    /// Asks for a pour.
     Pour {
         /// Goal volume V_G, ml, > 0.
         goal_ml: f32,
     },
-    /// Run the curve of eq. (1) once.
+    /// Asks to run the curve of eq. (1) once.
     Record(Curve),
-    /// Bring the container upright at once.
+    /// Asks to bring the container upright at once.
     Abort,
 }
 
@@ -32,11 +34,11 @@ pub enum Reply {
         /// Number of the pour or recording.
         episode: u64,
     },
-    /// Upright is being restored.
+    /// The container is coming upright.
     Aborting,
-    /// Not done, and why.
+    /// The request is refused.
     Refused {
-        /// One line for the operator.
+        /// The reason, one line for the operator.
         reason: String,
     },
     /// Answer to [`Request::Status`].
@@ -54,17 +56,17 @@ pub struct Outcome {
     pub goal_ml: Option<f32>,
     /// Estimated volume poured, ml.
     pub poured_ml: f32,
-    /// From the start to upright and settled, s.
+    /// Time from the start until the container was upright and the last drops were counted, s.
     pub seconds: f32,
-    /// Frames, the bridged ones included.
+    /// Number of frames, the bridged ones included.
     pub frames: u32,
-    /// Frames that were lost and bridged.
+    /// Number of frames that were lost and bridged.
     pub bridged_frames: u32,
-    /// Ticks in which no fresh feature was there.
+    /// Number of ticks without a fresh measurement.
     pub stale_features: u32,
-    /// Ticks that woke up late by more than half a period, or were skipped.
+    /// Number of ticks that came more than one and a half periods after the one before.
     pub late_ticks: u32,
-    /// What the limits clipped.
+    /// How often each limit changed a request.
     pub clipped: Clipped,
 }
 
@@ -72,41 +74,41 @@ pub struct Outcome {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum EndReason {
-    /// d reached 0, or the curve was run to its end.
+    /// The agent came to its end, usually because d reached 0; or the curve was run to its end.
     Done,
-    /// `abort`.
+    /// The operator aborted it.
     Aborted,
     /// The configured number of frames was reached.
     MaxFrames,
-    /// Largest tilt, and nothing has flowed.
+    /// Nothing flows although the container is tilted as far as it may be.
     ContainerEmpty,
-    /// No feature, or none that is beyond doubt, for longer than `controller.stale_feature_ms`.
+    /// There was no usable measurement for longer than `controller.stale_feature_ms`.
     StaleFeature,
     /// The feature worker was restarted.
     WorkerRestarted,
     /// The connection to the robot was lost or is half-open.
     RobotLost,
-    /// The robot's timestamp stands still.
+    /// The robot's clock stands still.
     RobotStalled,
-    /// Protective stop.
+    /// The robot made a protective stop.
     ProtectiveStop,
-    /// Emergency stop.
+    /// The emergency stop was pressed.
     EmergencyStop,
-    /// Another safety mode than normal or reduced.
+    /// The robot's safety system is in another mode than normal or reduced.
     SafetyStop,
     /// The program on the robot was stopped.
     ProgramStopped,
-    /// The robot is not powered and released.
+    /// The robot is not switched on, or its brakes are not released.
     RobotNotRunning,
     /// The controller itself was stopped for longer than the robot's patience.
     ControllerOverrun,
     /// The controller is shutting down.
     Shutdown,
-    /// The joint did not come upright although nothing hindered it.
+    /// The joint did not come upright, although nothing hindered it.
     NotUpright,
     /// The pendant's speed slider is below 100 %.
     SpeedReduced,
-    /// A stream was seen, and none any more although the container is tilted further.
+    /// A stream was seen before, and is not seen any more although the container is tilted further.
     StreamLost,
 }
 
@@ -139,11 +141,11 @@ impl EndReason {
 /// The controller's state for people and scripts.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Status {
-    /// What it is doing.
+    /// What the controller is doing.
     pub phase: Phase,
-    /// Why it cannot pour now; empty if it can.
+    /// Why it cannot pour now, one line; empty if it can.
     pub hindrance: String,
-    /// Number of the pour or recording under way; 0 = none.
+    /// Number of the pour or recording under way; 0: none.
     pub episode: u64,
     /// Goal volume of the pour under way, ml.
     pub goal_ml: f32,
@@ -155,41 +157,41 @@ pub struct Status {
     pub alpha_deg: f32,
     /// Measured alpha, degrees; NaN without a robot.
     pub alpha_measured_deg: f32,
-    /// Newest V_e, px^2; NaN if the newest tick had none.
+    /// V_e in the newest tick, px^2; NaN if that tick had none.
     pub area_px2: f32,
-    /// Camera frame of the newest V_e; 0 before the first.
+    /// Number of the camera frame of the newest V_e; 0 before the first.
     pub feature_sequence: u64,
-    /// Ticks done.
+    /// Number of ticks done.
     pub ticks: u64,
-    /// Ticks late by more than half a period.
+    /// Number of ticks late by more than half a period.
     pub late_ticks: u64,
-    /// Periods skipped.
+    /// Number of periods skipped.
     pub skipped_ticks: u64,
-    /// Features used.
+    /// Number of features used.
     pub features: u64,
-    /// Ticks during pours without a fresh feature.
+    /// Number of ticks during pours and recordings without a fresh measurement.
     pub stale_features: u64,
-    /// Lost frames bridged.
+    /// Number of lost frames bridged.
     pub bridged_frames: u64,
-    /// Features that came twice or out of order, or with another layout.
+    /// Number of features ignored because they came twice, out of order, or from another layout or clock.
     pub ignored_features: u64,
-    /// What the limits clipped.
+    /// How often each limit changed a request.
     pub clipped: Clipped,
-    /// Robot connections made.
+    /// Number of times the robot was connected.
     pub robot_connections: u64,
-    /// Heap allocations made by the loop since it started.
+    /// Number of heap allocations of the loop since it started.
     pub loop_allocations: u64,
-    /// Page faults of the loop since it started.
+    /// Number of page faults of the loop since it started.
     pub loop_page_faults: u64,
-    /// Events that the loop could not tell, because the ordinary side fell behind.
+    /// Number of events that were lost because the ordinary side fell behind the loop.
     pub events_lost: u64,
-    /// Identity of the weights in use (first 8 bytes of their hash, hexadecimal); empty without weights.
+    /// Identity of the weights in use, 16 hexadecimal digits; empty without weights.
     pub weights: String,
-    /// Weight files taken since the start.
+    /// Number of weight files taken since the start.
     pub weights_taken: u64,
-    /// Why the newest weight file was refused; empty if it was not.
+    /// Why the newest weight file was refused, one line; empty if it was not.
     pub weights_refused: String,
-    /// Wake-up lateness, tick execution and feature age.
+    /// Histograms of the loop's times.
     pub timing: Vec<Histogram>,
     /// Results of the newest pours and recordings, newest last.
     pub outcomes: Vec<Outcome>,

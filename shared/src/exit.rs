@@ -1,4 +1,4 @@
-//! Exit codes and the one-line error of every binary.
+//! Exit codes and the one-line error of every program. Used at the end of commands, in ordinary threads; allocates.
 
 use std::fmt::Display;
 use std::process::ExitCode;
@@ -16,7 +16,7 @@ pub const REFUSED: u8 = 5;
 /// Interrupted by Ctrl-C or SIGTERM.
 pub const INTERRUPTED: u8 = 130;
 
-/// The exit codes for `--help`.
+/// The exit codes, as `--help` shows them.
 pub const HELP: &str = "Exit codes: 0 done, 1 failed, 2 bad command line, configuration or input file, 3 another part of the cell \
 cannot be reached, 4 the pour ended early, 5 refused, 130 interrupted.";
 
@@ -25,18 +25,18 @@ cannot be reached, 4 the pour ended early, 5 refused, 130 interrupted.";
 pub struct Failure {
     /// One of this module's exit codes.
     pub code: u8,
-    /// What, where, what to do.
+    /// One line: what failed, where, and what to do.
     pub what: String,
 }
 
-/// A failure to return; `Err(failure(..))` or with `?`.
+/// The failure with exit code `code` and the line `what`.
 pub fn failure(code: u8, what: impl Display) -> Failure {
     Failure { code, what: what.to_string() }
 }
 
 /// Turns an operation's error into the command's failure: `Config::read(file).or_exit(BAD_INPUT)?`.
 pub trait OrExit<T> {
-    /// The value, or the error's line with `code`.
+    /// The value, or a failure with the error's line and the exit code `code`.
     fn or_exit(self, code: u8) -> Result<T, Failure>;
 }
 
@@ -46,7 +46,7 @@ impl<T, E: Display> OrExit<T> for Result<T, E> {
     }
 }
 
-/// Ends a command: prints its failure, if it failed, and gives the process's exit code.
+/// Ends a command: prints its failure, if there is one, and gives the process's exit code.
 pub fn end(result: Result<(), Failure>) -> ExitCode {
     match result {
         Ok(()) => ExitCode::SUCCESS,

@@ -11,7 +11,7 @@
 //! | [`alpha_track`] | alpha over time: which angle belongs to a picture | yes |
 //! | [`mlp`] | the 4-32-32-21 network | yes |
 //! | [`actions`] | Fig. 5's table of actions | yes |
-//! | [`estimate`] | area to ml, and the volume poured so far | yes |
+//! | [`estimator`] | area to ml, and the volume poured so far | yes |
 //! | [`agent`] | the weights at work in one pour: an observation in, an action out | yes |
 //! | [`weights`] | the weight file (postcard with a CRC) | no |
 //! | [`episode`] | `E = (L_E, w_E)` as MCAP files and CSV tables | no |
@@ -28,7 +28,7 @@ pub mod alpha_track;
 pub mod config;
 pub mod control;
 pub mod episode;
-pub mod estimate;
+pub mod estimator;
 pub mod exit;
 pub mod gaussian_curve;
 pub mod ipc;

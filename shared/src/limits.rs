@@ -1,7 +1,7 @@
 //! The one place that every target passes: limits on angle, step, rate and acceleration of alpha.
 //!
-//! Pure; runs in the controller's loop: no allocation, no panic. A request that is not finite counts as "stay". What was
-//! clipped is counted. This is not a safety function: the robot's own controller is.
+//! Pure; runs in the controller's loop: no allocation, no panic, no failure. A request that is not finite counts as "stay". Whatever is
+//! clipped is counted. This is no safety function; the robot's own controller has that one.
 
 use serde::{Deserialize, Serialize};
 
@@ -39,13 +39,13 @@ impl Default for Limits {
 /// How often each limit changed a request.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 pub struct Clipped {
-    /// Requests outside the angle range.
+    /// Number of requests outside the range of angles.
     pub angle: u64,
-    /// Requests beyond step or rate.
+    /// Number of requests beyond the largest step or rate.
     pub rate: u64,
-    /// Requests beyond acceleration.
+    /// Number of requests beyond the largest acceleration.
     pub acceleration: u64,
-    /// Requests that were not finite.
+    /// Number of requests that were not finite.
     pub not_finite: u64,
 }
 
@@ -75,7 +75,7 @@ impl Limiter {
         self.rate_deg_s
     }
 
-    /// What was clipped since [`Limiter::new`].
+    /// How often each limit changed a request since [`Limiter::new`].
     pub fn clipped(&self) -> Clipped {
         self.clipped
     }
@@ -86,7 +86,7 @@ impl Limiter {
         self.rate_deg_s = 0.0;
     }
 
-    /// Asks for `request_deg`; answers with the angle to command in this period, degrees.
+    /// Takes the request for an angle, degrees, and gives the angle to command in this period, degrees.
     ///
     /// The rate never exceeds what can be braked to rest before the end of the angle range.
     pub fn step(&mut self, request_deg: f32) -> f32 {
@@ -120,8 +120,8 @@ impl Limiter {
         next
     }
 
-    /// One period on the way to `target_deg`, braking in time to stop there. [`Limiter::step`] does not: it leaves a fast action
-    /// its whole angle, because the next one comes a period later.
+    /// One period on the way to `target_deg`, braking in time to stop there. [`Limiter::step`] does not brake: it gives a fast action its
+    /// whole angle, because the next action comes a period later.
     pub fn step_towards(&mut self, target_deg: f32) -> f32 {
         let distance = target_deg - self.alpha_deg;
         if !distance.is_finite() {
@@ -140,12 +140,13 @@ impl Limiter {
     }
 }
 
-/// Largest rate r such that r, r - change, r - 2 change, ... (each held for dt) travels at most `distance`.
+/// The largest rate r, degrees/s, with which r, r - change, r - 2 change, and so on, each held for dt seconds, lead at most `distance`
+/// degrees far.
 fn braking_rate(distance: f32, change: f32, dt: f32) -> f32 {
     if change <= 0.0 {
         return 0.0;
     }
-    // With n whole periods of braking behind this one: r (n + 1) - change n (n + 1) / 2 = distance / dt, r in (n, n + 1] change.
+    // With n whole periods of braking after this one: r (n + 1) - change n (n + 1) / 2 = distance / dt, and r in (n, n + 1] change.
     let reach = distance / (dt * change);
     let n = ((((8.0 * reach + 1.0).sqrt() - 1.0) / 2.0).ceil() - 1.0).max(0.0);
     change * (reach / (n + 1.0) + n / 2.0)

@@ -1,15 +1,16 @@
 //! Fixed-layout messages that cross shared memory.
 //!
-//! Every struct is `repr(C)` without padding, carries [`LAYOUT_VERSION`] and a sequence number, and is plain data:
-//! it may be read by another process at any time. The byte tables are in `ARCHITECTURE.md` and are held by tests below.
-//! All times are CLOCK_MONOTONIC in nanoseconds. Nothing here allocates.
+//! Every struct is `repr(C)` without padding, carries [`LAYOUT_VERSION`], and is plain data that another process may read at any time.
+//! The byte tables are in `ARCHITECTURE.md` and are held by tests below. All times are CLOCK_MONOTONIC in nanoseconds. Used in the
+//! controller's loop; nothing here allocates or fails: unknown codes read as the most careful meaning. The exception is
+//! [`Telemetry::weights`], which allocates.
 
 use iceoryx2::prelude::ZeroCopySend;
 
-/// Version of all layouts in this file; part of every service's name, so that other versions never connect.
+/// Version of all layouts in this file. It is part of every service's name, so that programs of other versions never connect.
 pub const LAYOUT_VERSION: u32 = 2;
 
-/// Pixel layout of a camera frame.
+/// How the pixels of a camera frame are stored.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[repr(u32)]
 pub enum PixelFormat {
@@ -17,7 +18,7 @@ pub enum PixelFormat {
     Bgr8 = 0,
     /// 1 byte a pixel.
     Mono8 = 1,
-    /// 2 bytes a pixel, 4:2:2, Y0 U Y1 V.
+    /// 2 bytes a pixel, 4:2:2, in the order Y0 U Y1 V.
     Yuyv = 2,
 }
 
@@ -37,7 +38,7 @@ impl PixelFormat {
     }
 }
 
-/// Header of one camera frame (the user header of service `frame`; the payload is the pixels, row by row, no padding).
+/// Header of one camera frame: the user header of the service `frame`, whose payload is the pixels, row by row without padding.
 #[derive(Debug, Clone, Copy, PartialEq, Default, ZeroCopySend)]
 #[repr(C)]
 pub struct FrameHeader {
@@ -49,7 +50,7 @@ pub struct FrameHeader {
     pub width_px: u32,
     /// Height in pixels.
     pub height_px: u32,
-    /// Counts every frame that the camera exposed, also those that were dropped; starts at 1.
+    /// Number of the frame. Every frame that the camera exposed counts, also a dropped one; the first is 1.
     pub sequence: u64,
     /// Middle of the exposure, CLOCK_MONOTONIC ns.
     pub captured_at_ns: u64,
@@ -57,22 +58,22 @@ pub struct FrameHeader {
     pub published_at_ns: u64,
 }
 
-/// Why a feature is doubtful. `None` means: trust it.
+/// Why a feature is doubtful.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 #[repr(u32)]
 pub enum Doubt {
-    /// A good measurement.
+    /// It is not doubtful.
     #[default]
     None = 0,
     /// The region is too dark to see anything.
     TooDark = 1,
-    /// The region is blown out.
+    /// The region is overexposed.
     BlownOut = 2,
-    /// Motion blur or lost focus.
+    /// The picture is blurred by motion or out of focus.
     Blurred = 3,
     /// The camera repeats the same picture.
     Frozen = 4,
-    /// There is liquid, but its outer edge gives no line.
+    /// There is liquid, but no line fits its outer edge.
     EdgeNotFound = 5,
     /// The stream leaves the region, so the area is a lower bound.
     LeavesRegion = 6,
@@ -81,11 +82,11 @@ pub enum Doubt {
 }
 
 impl Doubt {
-    /// All reasons, in code order.
+    /// All reasons, in the order of their codes.
     pub const ALL: [Self; 8] =
         [Self::None, Self::TooDark, Self::BlownOut, Self::Blurred, Self::Frozen, Self::EdgeNotFound, Self::LeavesRegion, Self::WrongFormat];
 
-    /// The reason with this code; unknown codes count as a frame that cannot be used.
+    /// The reason with this code; an unknown code counts as a frame that cannot be used.
     pub fn from_code(code: u32) -> Self {
         Self::ALL.into_iter().find(|d| *d as u32 == code).unwrap_or(Self::WrongFormat)
     }
@@ -110,7 +111,7 @@ impl Doubt {
     }
 }
 
-/// What the feature worker measured in one frame (service `feature`): V_e of section 3.3.1.
+/// What the feature worker measured in one frame, V_e of section 3.3.1 (service `feature`).
 #[derive(Debug, Clone, Copy, PartialEq, Default, ZeroCopySend, serde::Serialize, serde::Deserialize)]
 #[repr(C)]
 pub struct Feature {
@@ -118,21 +119,21 @@ pub struct Feature {
     pub version: u32,
     /// A [`Doubt`] code.
     pub doubt: u32,
-    /// The camera's frame number ([`FrameHeader::sequence`]); a gap means frames that nobody measured.
+    /// The camera's frame number ([`FrameHeader::sequence`]); a gap means that frames were lost.
     pub sequence: u64,
-    /// Start time of the worker process, CLOCK_MONOTONIC ns: a change means that the worker was restarted.
+    /// When the worker process started, CLOCK_MONOTONIC ns; a change means that the worker was restarted.
     pub worker_epoch_ns: u64,
     /// Middle of the frame's exposure, CLOCK_MONOTONIC ns.
     pub captured_at_ns: u64,
-    /// When the worker took the frame, CLOCK_MONOTONIC ns.
+    /// When the worker received the frame, CLOCK_MONOTONIC ns.
     pub received_at_ns: u64,
     /// When the worker published this, CLOCK_MONOTONIC ns.
     pub published_at_ns: u64,
-    /// V_e: area of the triangle in px^2, exactly 0 without a stream, >= 0, finite.
+    /// V_e: the area of the triangle, px^2; finite and >= 0, exactly 0 without a stream.
     pub area_px2: f32,
     /// Confidence, 0 (none) to 1 (full).
     pub confidence: f32,
-    /// Corners of the triangle in the image, x0 y0 x1 y1 x2 y2 in px (axes' crossing, on the x-axis, on the y-axis).
+    /// Corners of the triangle in the image, px, as x0 y0 x1 y1 x2 y2: where the axes cross, on the x-axis, on the y-axis.
     pub triangle_px: [f32; 6],
 }
 
@@ -141,18 +142,18 @@ pub struct Feature {
 #[serde(rename_all = "kebab-case")]
 #[repr(u32)]
 pub enum Phase {
-    /// No usable robot: not connected, or not allowed to move.
+    /// There is no usable robot: it is not connected, or not allowed to move.
     #[default]
     NoRobot = 0,
     /// Upright at the start angle, d = 0.
     Idle = 1,
-    /// A goal is set; the policy decides.
+    /// A goal is set, and the agent decides.
     Pouring = 2,
-    /// The pour or episode is over or aborted; on the way back to the start angle.
+    /// The pour or recording is over or aborted; the container is on the way back to the start angle.
     Returning = 3,
-    /// Runs the curve of eq. (1).
+    /// The curve of eq. (1) is run.
     Recording = 4,
-    /// Upright; the last drops are counted before the result is given.
+    /// The container is upright; the last drops are counted before the result is given.
     Settling = 5,
 }
 
@@ -166,7 +167,7 @@ impl Phase {
     }
 }
 
-/// What one tick of the controller saw, decided and sent (service `telemetry`); everything an episode records of it.
+/// What one tick of the controller saw, decided and sent (service `telemetry`); all of it that an episode records.
 #[derive(Debug, Clone, Copy, PartialEq, Default, ZeroCopySend)]
 #[repr(C)]
 pub struct Telemetry {
@@ -174,13 +175,13 @@ pub struct Telemetry {
     pub version: u32,
     /// A [`Phase`] code.
     pub phase: u32,
-    /// Counts ticks since the controller started.
+    /// Number of the tick since the controller started.
     pub tick: u64,
     /// When the tick woke up, CLOCK_MONOTONIC ns.
     pub at_ns: u64,
     /// When the newest robot state in it arrived, CLOCK_MONOTONIC ns; 0 before the first.
     pub robot_at_ns: u64,
-    /// The pour or recording that this tick belongs to: 0 = none. Unique for a controller process.
+    /// Number of the pour or recording that this tick belongs to, unique for a controller process; 0: none.
     pub episode: u64,
     /// [`Feature::sequence`] of the newest feature used; 0 before the first.
     pub feature_sequence: u64,
@@ -190,7 +191,7 @@ pub struct Telemetry {
     pub alpha_deg: f32,
     /// Measured alpha, degrees from upright; NaN before the first robot state.
     pub alpha_measured_deg: f32,
-    /// Action of the policy in this tick, degrees; NaN if the policy was not asked.
+    /// Relative angle that the agent asked for in this tick, degrees; NaN if it was not asked.
     pub dalpha_deg: f32,
     /// V_e of the newest feature, px^2; NaN if there was none in this tick.
     pub area_px2: f32,
@@ -213,13 +214,13 @@ pub struct Telemetry {
 }
 
 impl Telemetry {
-    /// Identity of the weights in use as `Weights::identity` gives it: 16 hexadecimal digits; empty: there are none.
+    /// Identity of the weights in use as `Weights::identity` gives it: 16 hexadecimal digits; empty if there are none.
     pub fn weights(&self) -> String {
         if self.weights_id == 0 { String::new() } else { format!("{:016x}", self.weights_id) }
     }
 }
 
-/// What the recorder did with an episode (service `recorder`, the newest is kept for late readers).
+/// What the recorder did with an episode (service `recorder`). The newest reports are kept for late readers.
 #[derive(Debug, Clone, Copy, PartialEq, ZeroCopySend)]
 #[repr(C)]
 pub struct RecorderReport {
@@ -229,13 +230,13 @@ pub struct RecorderReport {
     pub state: u32,
     /// [`Telemetry::episode`].
     pub episode: u64,
-    /// Images written.
+    /// Number of images written.
     pub images: u64,
-    /// Images that the recorder had to drop.
+    /// Number of images that the recorder had to drop.
     pub dropped: u64,
     /// Length of `path` in bytes.
     pub path_len: u64,
-    /// The file's absolute path, UTF-8, cut at 512 bytes; or the error's text in state [`RecorderState::Failed`].
+    /// The file's absolute path, or the error's text in state [`RecorderState::Failed`]; UTF-8, at most 512 bytes of it.
     pub path: [u8; 512],
 }
 
@@ -243,11 +244,11 @@ pub struct RecorderReport {
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[repr(u32)]
 pub enum RecorderState {
-    /// Being written.
+    /// The file is being written.
     Writing = 0,
-    /// Closed and whole.
+    /// The file is closed and whole.
     Complete = 1,
-    /// Could not be written; the path holds the reason.
+    /// The file could not be written; the path holds the reason.
     Failed = 2,
 }
 
@@ -263,7 +264,7 @@ impl RecorderState {
 }
 
 impl RecorderReport {
-    /// A report with `text` (a path, or an error's words) cut to fit.
+    /// A report with `text`, which is a path or an error's line, cut to fit.
     pub fn new(state: RecorderState, episode: u64, images: u64, dropped: u64, text: &str) -> Self {
         let mut end = text.len().min(512);
         while !text.is_char_boundary(end) {

@@ -8,14 +8,14 @@ use serde::{Deserialize, Serialize};
 
 use crate::actions::{ACTIONS, STAY};
 
-/// Inputs of the network: v_t, v_t-1, v_t-2, d.
+/// Inputs of the network: v_t, v_t-1, v_t-2 and d (section 3.3.2).
 pub const INPUTS: usize = 4;
-/// Neurons in each of the two hidden layers.
+/// Neurons in each of the two hidden layers. With 32 the network has 1909 parameters; the paper has 2000 (section 4).
 pub const HIDDEN: usize = 32;
 /// Number of parameters of [`Mlp`].
 pub const PARAMETERS: usize = INPUTS * HIDDEN + HIDDEN + HIDDEN * HIDDEN + HIDDEN + HIDDEN * ACTIONS + ACTIONS;
 
-/// The 4-32-32-21 multilayer perceptron, ReLU in both hidden layers; 1909 parameters, f32.
+/// The 4-32-32-21 multilayer perceptron with ReLU in both hidden layers; 1909 parameters, f32.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Mlp {
     /// Weights of layer 1, `[input][neuron]`.
@@ -45,8 +45,8 @@ impl Mlp {
 
     /// Logits of the 21 actions for scaled inputs ([`InputScale::apply`]). About 1800 multiply-adds.
     ///
-    /// On a processor with AVX2 and FMA the wide form runs, on others [`Mlp::forward_portable`]. The wide form rounds each
-    /// multiply-add once, the other twice: logits differ in the last bits, actions only where two are as good.
+    /// On a processor with AVX2 and FMA the wide form runs, on others [`Mlp::forward_portable`]. The wide form rounds each multiply-add
+    /// once, the other one twice. So the logits differ in their last bits, and the action only where two are equally good.
     pub fn forward(&self, x: &[f32; INPUTS]) -> [f32; ACTIONS] {
         #[cfg(target_arch = "x86_64")]
         if let Some(cpu) = pulp::x86::V3::try_new() {
@@ -76,7 +76,7 @@ impl Mlp {
     }
 }
 
-/// Sums input by input, so that the compiler works on all neurons of a layer at once.
+/// One layer. It sums input by input, so that the compiler works on all neurons of the layer at once.
 fn layer<const N: usize, const M: usize>(w: &[[f32; M]; N], b: &[f32; M], x: &[f32; N]) -> [f32; M] {
     let mut sum = *b;
     for (row, xi) in w.iter().zip(x) {
@@ -87,8 +87,8 @@ fn layer<const N: usize, const M: usize>(w: &[[f32; M]; N], b: &[f32; M], x: &[f
     sum
 }
 
-/// The forward pass on eight neurons at once. Written out, because the compiler does not make fused multiply-adds of the plain
-/// loop: compiled for AVX2 that takes half as long again.
+/// The forward pass on eight neurons at once. It is written out because the compiler does not turn the plain loop into fused
+/// multiply-adds; compiled for AVX2, that loop takes half as long again.
 #[cfg(target_arch = "x86_64")]
 mod wide {
     use std::array::from_fn;
@@ -97,9 +97,10 @@ mod wide {
 
     use super::{ACTIONS, INPUTS, Mlp};
 
+    /// Numbers in one register of AVX2.
     const LANES: usize = 8;
 
-    /// What [`V3::vectorize`] compiles for these processors. All that it calls must be inlined to be compiled so too.
+    /// The function that [`V3::vectorize`] compiles for these processors. Everything that it calls must be inlined to be compiled so too.
     pub struct Forward<'a>(pub V3, pub &'a Mlp, pub &'a [f32; INPUTS]);
 
     impl pulp::NullaryFnOnce for Forward<'_> {
@@ -115,8 +116,8 @@ mod wide {
         }
     }
 
-    /// One layer of M neurons in `BLOCKS` = M / 8, rounded up, registers; where M is no multiple of eight, the last register
-    /// overlaps the one before.
+    /// One layer of M neurons in `BLOCKS` registers, which is M / 8, rounded up. If M is no multiple of eight, the last register overlaps
+    /// the one before.
     #[inline(always)]
     fn layer<const BLOCKS: usize, const N: usize, const M: usize>(
         cpu: V3,
@@ -146,11 +147,11 @@ mod wide {
 /// How the four observations enter the network: `[asinh(5 v_t), asinh(5 v_t-1), asinh(5 v_t-2), asinh(d/4)] / 2`.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct InputScale {
-    /// Factor of v before asinh, frames/ml.
+    /// Factor of v before asinh, frames/ml; 5 by default. Chosen by hand; no measurement is recorded.
     pub v_per_ml: f32,
-    /// Divisor of d before asinh, ml.
+    /// Divisor of d before asinh, ml; 4 by default. Chosen by hand; no measurement is recorded.
     pub d_ml: f32,
-    /// Factor after asinh.
+    /// Factor after asinh; 0.5 by default. Chosen by hand; no measurement is recorded.
     pub gain: f32,
 }
 
@@ -168,7 +169,7 @@ impl InputScale {
     }
 }
 
-/// asinh without the standard library's care for tiny arguments, which costs more than the whole first layer.
+/// asinh without the standard library's care for tiny arguments, which would cost more than the whole first layer.
 fn asinh(x: f32) -> f32 {
     let a = x.abs();
     (a + (a * a + 1.0).sqrt()).ln().copysign(x)

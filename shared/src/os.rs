@@ -1,7 +1,7 @@
-//! The operating system's part: the clock, signals, what a real-time process asks of the kernel, and the count of allocations.
+//! What is asked of the operating system: the clock, signals, real-time scheduling, locked memory, and the count of allocations.
 //!
-//! The one module of the project with `unsafe`. Called from any thread; nothing here allocates, except [`stop_at_signals`] and the
-//! error texts of [`become_realtime`]. On failure the caller gets a line for the operator and goes on without the privilege.
+//! This is the only file of the project with `unsafe`. Any thread may call it. Nothing here allocates, except [`stop_at_signals`] and
+//! error texts. Where the system refuses something, the caller gets a line for the operator and goes on without it.
 
 use std::alloc::{GlobalAlloc, Layout, System};
 use std::cell::Cell;
@@ -22,7 +22,7 @@ pub fn sleep_until_ns(deadline_ns: u64) {
 
 /// Pins the calling thread to `core` and, if `priority` > 0, schedules it SCHED_FIFO with that priority (1-99).
 ///
-/// Answers with what was not permitted, one line each; the thread works on without it.
+/// Gives one line for each thing that was not permitted; the thread works on without it.
 pub fn become_realtime(core: usize, priority: u8) -> Vec<String> {
     let mut missing = Vec::new();
     if !core_affinity::set_for_current(core_affinity::CoreId { id: core }) {
@@ -32,7 +32,7 @@ pub fn become_realtime(core: usize, priority: u8) -> Vec<String> {
     missing
 }
 
-/// Schedules the calling thread SCHED_FIFO with `priority` (1-99); 0 leaves it as it is.
+/// Schedules the calling thread SCHED_FIFO with `priority` (1-99); 0 leaves it as it is. The error is one line for the operator.
 pub fn prioritise(priority: u8) -> Result<(), String> {
     if priority == 0 {
         return Ok(());
@@ -48,8 +48,8 @@ pub fn prioritise(priority: u8) -> Result<(), String> {
     ))
 }
 
-/// Locks all present and future pages of the process in memory; answers with the reason when it is not permitted. Call before
-/// other threads allocate: each would get an arena of 64 MiB to be locked.
+/// Locks all present and future pages of the process in memory; gives the reason if that is not permitted. Call it before other threads
+/// allocate, because each of them would get an arena of 64 MiB to be locked.
 pub fn lock_memory() -> Result<(), String> {
     use rustix::mm::{MlockAllFlags, mlockall};
     // SAFETY: sets one number in the allocator, under the allocator's own lock.
@@ -61,8 +61,8 @@ pub fn lock_memory() -> Result<(), String> {
         .map_err(|e| format!("mlockall is not permitted ({e}): set LimitMEMLOCK=infinity or CAP_IPC_LOCK; page faults may delay the loop"))
 }
 
-/// Keeps the processor out of sleep states from which it wakes up slowly, until what it gives back is dropped; answers with the
-/// reason when that is not permitted. `None` where the kernel has no such thing, as in most virtual machines.
+/// Keeps the processor out of sleep states from which it wakes up slowly, as long as the returned file is kept; gives the reason if that
+/// is not permitted. `None` where the kernel has no such file, as in most virtual machines.
 pub fn stay_awake() -> Result<Option<std::fs::File>, String> {
     use std::io::Write;
     let path = "/dev/cpu_dma_latency";
@@ -74,13 +74,13 @@ pub fn stay_awake() -> Result<Option<std::fs::File>, String> {
     }
 }
 
-/// Lets the process end quietly when nobody reads its output any more (`rt-controller status | head`). For commands that only print.
+/// Lets the process end quietly when nobody reads its output any more, as in `rt-controller status | head`. For commands that only print.
 pub fn end_when_nobody_reads() {
     // SAFETY: the default action of a signal is no function of ours, so there is nothing that could be called unsafely.
     unsafe { libc::signal(libc::SIGPIPE, libc::SIG_DFL) };
 }
 
-/// Becomes true when the process is asked to end (Ctrl-C, SIGTERM), which then does not end it any more.
+/// A flag that becomes true when the process is asked to end by Ctrl-C or SIGTERM. These signals then no longer end it by themselves.
 pub fn stop_at_signals() -> std::io::Result<Arc<AtomicBool>> {
     let stop = Arc::new(AtomicBool::new(false));
     for signal in [signal_hook::consts::SIGINT, signal_hook::consts::SIGTERM] {
@@ -101,6 +101,7 @@ pub fn page_faults() -> (u64, u64) {
 }
 
 thread_local! {
+    /// Allocations and frees of this thread.
     static ALLOCATIONS: Cell<u64> = const { Cell::new(0) };
 }
 
@@ -110,9 +111,10 @@ pub fn allocations() -> u64 {
     ALLOCATIONS.try_with(Cell::get).unwrap_or(0)
 }
 
-/// The system's allocator, counting each call in the calling thread ([`allocations`]): how the loop shows that it makes none.
+/// The system's allocator, which also counts the calls of each thread ([`allocations`]). With it the loop shows that it makes none.
 pub struct CountingAllocator;
 
+/// Counts a call of the calling thread.
 fn count() {
     // A thread that is being torn down has no counter any more, and nobody reads it.
     let _ = ALLOCATIONS.try_with(|c| c.set(c.get() + 1));

@@ -1,8 +1,8 @@
-//! The weight file: everything that the controller needs to pour, in one postcard blob with a CRC.
+//! The weight file: everything that the controller needs to pour, as postcard bytes with a CRC.
 //!
-//! Read and written by ordinary threads (allocates); the loop only sees a [`Weights`] that was checked here. A file that is
-//! truncated, damaged, of another format version, of another shape or not finite is refused with one line that says which.
-//! Writing is atomic: a temporary file in the same directory, synced, then renamed.
+//! Ordinary threads read and write it, and allocate; the loop only sees [`Weights`] that were checked here. A file that is truncated,
+//! damaged, of another format version, of another shape or not finite is refused with one line that says which of these it is
+//! ([`WeightsError`]). Writing is atomic: a temporary file in the same directory is synced and then renamed.
 //!
 //! ```text
 //! offset  bytes  what
@@ -21,38 +21,43 @@ use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
 
 use crate::actions::{ACTIONS, BACK_DEG_PER_FRAME, Selection, nearest_action};
-use crate::estimate::Calibration;
-use crate::estimate::flow::{DELAY_MAX, FlowModel, FlowNoise, Return};
+use crate::estimator::Calibration;
+use crate::estimator::flow::{DELAY_MAX_FRAMES, FlowModel, WayBack};
+use crate::estimator::vessel::Vessel;
 use crate::mlp::{HIDDEN, INPUTS, InputScale, Mlp};
 
-/// Version of the file format; other versions are refused.
+/// Version of the file format; files of other versions are refused.
 pub const FORMAT_VERSION: u32 = 3;
 
+/// First bytes of every weight file.
 const MAGIC: &[u8; 8] = b"decant-w";
+/// Bytes before the payload.
 const HEADER: usize = 24;
+/// Neurons of each layer, inputs first.
 const SHAPE: [usize; 4] = [INPUTS, HIDDEN, HIDDEN, ACTIONS];
-/// Room for the payload; a blob is about 9 kB.
+/// Largest payload, bytes; a usual one is about 9 kB.
 const PAYLOAD_MAX: usize = 64 * 1024;
+/// The checksum at the payload's end.
 const CRC: Crc<u32> = Crc::<u32>::new(&CRC_32_ISO_HDLC);
 
-/// Everything that the controller needs to pour, and where it came from.
+/// Everything that the controller needs to pour, and where it comes from.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Weights {
     /// The network.
     pub network: Mlp,
-    /// Angle of each action, degrees, ascending (Fig. 5, or two actions).
+    /// Angle of each action, degrees a frame, ascending: those of Fig. 5, or only two different ones.
     pub actions_deg: [f32; ACTIONS],
-    /// How outputs become an action.
+    /// How the network's outputs become an action.
     pub selection: Selection,
-    /// How observations become inputs.
+    /// How observations become the network's inputs.
     pub scale: InputScale,
-    /// Area to ml.
+    /// How an area in px^2 becomes a volume in ml.
     pub calibration: Calibration,
     /// How the poured volume is estimated.
     pub estimator: Estimator,
-    /// Frames a second that it was trained for.
+    /// Frames a second that the network was trained for.
     pub rate_hz: f32,
-    /// Where it came from.
+    /// Where the weights come from.
     pub origin: Origin,
     /// Seed of the training, and of [`Selection::Sampled`].
     pub seed: u64,
@@ -61,46 +66,57 @@ pub struct Weights {
 /// How the poured volume is estimated.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
-#[allow(clippy::large_enum_variant)] // a box would put the loop's policy on the heap twice
+#[expect(clippy::large_enum_variant, reason = "there is one of it in a process, and a box would be one more allocation")]
 pub enum Estimator {
     /// The paper's plain sum of the frames' volumes.
     Sum,
-    /// Camera and container geometry, fused by a filter on the flow model.
+    /// What the camera shows and what the container's geometry says, fused by a filter on the flow model.
     Fused {
         /// The fitted model.
         model: FlowModel,
-        /// How the controller tilts back, to know what still flows then.
-        back: Return,
+        /// How the controller tilts back, which decides how much still flows then.
+        back: WayBack,
     },
 }
 
 impl Estimator {
+    /// Names the first value that is outside its range.
     fn check(&self) -> Result<(), String> {
         let Self::Fused { model, back } = self else { return Ok(()) };
-        let FlowModel { radius_mm, height_mm, taper, flat, s, lk, p, k1, k2, tau, delay, eta, noise } = *model;
-        let FlowNoise { lambda, gamma, beta, delta, frame, v_min_ml } = noise;
+        let FlowModel {
+            vessel: Vessel { radius_mm, height_mm, taper, even_share, log_shape },
+            log_weir_coefficient,
+            head_exponent,
+            log_weir_slope,
+            log_weir_curvature,
+            lag_frames,
+            delay_frames,
+            film_share,
+            noise,
+        } = *model;
+
         let ranges = [
             ("radius", radius_mm, 1.0, 1000.0),
             ("height", height_mm, 1.0, 5000.0),
             ("taper", taper, 0.05, 20.0),
-            ("share of flat shape", flat, 0.0, 1.0),
-            ("flow coefficient", lk, -20.0, 20.0),
-            ("flow exponent", p, 0.2, 5.0),
-            ("k1", k1, -20.0, 20.0),
-            ("k2", k2, -20.0, 20.0),
-            ("lag", tau, 0.0, 60.0),
-            ("delay", delay, 0.0, DELAY_MAX),
-            ("film share", eta, 0.0, 0.95),
-            ("sd of lambda", lambda, 1e-4, 5.0),
-            ("sd of gamma", gamma, 1e-4, 5.0),
-            ("sd of beta", beta, 1e-6, 5.0),
-            ("sd of the delay", delta, 1e-4, 20.0),
-            ("sd of a frame", frame, 1e-4, 5.0),
-            ("smallest outflow", v_min_ml, 0.0, 10.0),
+            ("share of flat shape", even_share, 0.0, 1.0),
+            ("flow coefficient", log_weir_coefficient, -20.0, 20.0),
+            ("flow exponent", head_exponent, 0.2, 5.0),
+            ("k1", log_weir_slope, -20.0, 20.0),
+            ("k2", log_weir_curvature, -20.0, 20.0),
+            ("lag", lag_frames, 0.0, 60.0),
+            ("delay", delay_frames, 0.0, DELAY_MAX_FRAMES),
+            ("film share", film_share, 0.0, 0.95),
+            ("sd of lambda", noise.log_flow_factor_sd, 1e-4, 5.0),
+            ("sd of gamma", noise.log_camera_gain_sd, 1e-4, 5.0),
+            ("sd of beta", noise.log_capacity_scale_sd, 1e-6, 5.0),
+            ("sd of the delay", noise.extra_delay_sd_frames, 1e-4, 20.0),
+            ("sd of a frame", noise.log_frame_volume_sd, 1e-4, 5.0),
+            ("smallest outflow", noise.least_visible_ml, 0.0, 10.0),
             ("rate back", back.rate_deg, 0.1, 10.0),
             ("change of the rate back", back.change_deg, 0.01, 100.0),
         ];
-        for (name, value, low, high) in ranges.into_iter().chain(s.map(|s| ("shape of the vessel (log)", s, -10.0, 10.0))) {
+        for (name, value, low, high) in ranges.into_iter().chain(log_shape.map(|s| ("shape of the vessel (log)", s, -10.0, 10.0))) {
             if !(low..=high).contains(&value) {
                 return Err(format!("estimator: {name} is {value}, allowed is {low} to {high}"));
             }
@@ -109,20 +125,20 @@ impl Estimator {
     }
 }
 
-/// Where weights came from; the controller only shows it.
+/// Where weights come from; the controller only shows it.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Origin {
-    /// Training method.
+    /// How the network was trained.
     pub method: Method,
-    /// Number of actions trained, 2 or 21.
+    /// Number of actions that were trained, 2 or 21.
     pub actions: u8,
-    /// Episodes trained on.
+    /// Number of episodes that it was trained on.
     pub episodes: u32,
     /// SHA-256 of the training data as the trainer hashes it.
     pub data_sha256: [u8; 32],
 }
 
-/// How the policy was trained.
+/// How a network was trained.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Method {
@@ -132,7 +148,7 @@ pub enum Method {
     Paper,
     /// Behaviour cloning.
     Cloning,
-    /// Flow model, policy search in it, distilled into the network.
+    /// A flow model is fitted, a control law is searched in it, and the law is distilled into the network.
     Best,
     /// Made by hand, for tests and examples.
     Handmade,
@@ -146,7 +162,7 @@ pub enum WeightsError {
     Read {
         /// The file.
         file: String,
-        /// The system's words.
+        /// The operating system's message.
         what: String,
     },
     /// The file cannot be written; what was there before is still there.
@@ -154,39 +170,39 @@ pub enum WeightsError {
     Write {
         /// The file.
         file: String,
-        /// The system's words.
+        /// The operating system's message.
         what: String,
     },
-    /// Not a weight file at all.
+    /// The file is not a weight file.
     #[error("{file}: not a weight file of Decant; train one with `trainer train`")]
     Foreign {
         /// The file.
         file: String,
     },
-    /// Written by another version of the format.
+    /// The file has another version of the format.
     #[error("{file}: format version {found}, this program reads {FORMAT_VERSION}; train again with this version")]
     Version {
         /// The file.
         file: String,
-        /// Version in the file.
+        /// The version in the file.
         found: u32,
     },
-    /// A network of another shape.
+    /// The file holds a network of another shape.
     #[error("{file}: a network of shape {found:?}, this program runs {SHAPE:?}; train again with this version")]
     Shape {
         /// The file.
         file: String,
-        /// Shape in the file.
+        /// The shape in the file, neurons of each layer.
         found: [usize; 4],
     },
-    /// Shorter or longer than its header says.
+    /// The file is shorter or longer than its header says.
     #[error("{file}: truncated or with bytes too many: {found} bytes where the header says {expected}; copy it again")]
     Length {
         /// The file.
         file: String,
-        /// Bytes in the file.
+        /// Number of bytes in the file.
         found: usize,
-        /// Bytes that the header promises.
+        /// Number of bytes that the header announces.
         expected: usize,
     },
     /// The checksum does not match, or the contents make no sense.
@@ -195,7 +211,7 @@ pub enum WeightsError {
         /// The file.
         file: String,
     },
-    /// A value that is not finite or out of its range.
+    /// A value is not finite or out of its range.
     #[error("{file}: {what}; train again")]
     Value {
         /// The file.
@@ -206,7 +222,7 @@ pub enum WeightsError {
 }
 
 impl Weights {
-    /// Index of the action that tilts back: the one nearest to -3.2 degrees a frame.
+    /// Index of the action that tilts back: the one nearest to [`BACK_DEG_PER_FRAME`].
     pub fn back_action(&self) -> usize {
         nearest_action(&self.actions_deg, BACK_DEG_PER_FRAME)
     }
@@ -281,23 +297,23 @@ impl Weights {
             std::fs::rename(&temporary, path)
         };
         put().map_err(|e| {
-            // The half-written temporary file is of no use to anybody; that it cannot be removed changes nothing.
+            // Nobody needs the half-written temporary file, and it does no harm if it cannot be removed.
             let _ = std::fs::remove_file(&temporary);
             WeightsError::Write { file, what: e.to_string() }
         })
     }
 
-    /// Identity: the first 8 bytes of the SHA-256 of the file's bytes, big-endian; 0: they cannot be written.
+    /// The identity: the first 8 bytes of the SHA-256 of the file's bytes, as a big-endian number; 0 if there are no such bytes.
     pub fn id(&self) -> u64 {
         self.to_bytes().map_or(0, |bytes| Sha256::digest(&bytes)[..8].iter().fold(0, |id, b| id << 8 | u64::from(*b)))
     }
 
-    /// [`Weights::id`] as people and files name it: 16 hexadecimal digits.
+    /// The identity as people and files write it: [`Weights::id`] as 16 hexadecimal digits.
     pub fn identity(&self) -> String {
         format!("{:016x}", self.id())
     }
 
-    /// Which value must not go to the robot, if any.
+    /// Names the first value that must not reach the robot.
     fn check(&self) -> Result<(), String> {
         if let Some(k) = self.network.parameters().position(|p| !p.is_finite()) {
             return Err(format!("parameter {k} of the network is not finite"));
@@ -307,12 +323,12 @@ impl Weights {
             return Err("the action table is not ascending within +-10 degrees".into());
         }
         let InputScale { v_per_ml, d_ml, gain } = self.scale;
-        let Calibration { c, q, tilt, hold_above_px2 } = self.calibration;
+        let Calibration { volume_at_1_px2_ml, area_exponent, log_tilt_slope, hold_above_px2 } = self.calibration;
         let positive = [
             ("input scale of v", v_per_ml),
             ("input scale of d", d_ml),
             ("input gain", gain),
-            ("calibration c", c),
+            ("calibration c", volume_at_1_px2_ml),
             ("frame rate", self.rate_hz),
         ];
         for (name, value) in positive {
@@ -320,11 +336,11 @@ impl Weights {
                 return Err(format!("{name} is {value}, not a positive number"));
             }
         }
-        if !(0.1..=10.0).contains(&q) {
-            return Err(format!("calibration exponent {q} is outside 0.1 to 10"));
+        if !(0.1..=10.0).contains(&area_exponent) {
+            return Err(format!("calibration exponent {area_exponent} is outside 0.1 to 10"));
         }
-        if !(-1.0..=1.0).contains(&tilt) {
-            return Err(format!("calibration's change with the tilt {tilt} is outside -1 to 1"));
+        if !(-1.0..=1.0).contains(&log_tilt_slope) {
+            return Err(format!("calibration's change with the tilt {log_tilt_slope} is outside -1 to 1"));
         }
         if hold_above_px2.is_nan() || hold_above_px2 < 0.0 {
             return Err(format!("dropout hold above {hold_above_px2} px^2 is not a number >= 0"));
@@ -350,7 +366,7 @@ pub(crate) mod tests {
             actions_deg: action_table(),
             selection: Selection::Argmax,
             scale: InputScale::default(),
-            calibration: Calibration { c: 0.002, q: 1.15, tilt: 0.05, hold_above_px2: 60.0 },
+            calibration: Calibration { volume_at_1_px2_ml: 0.002, area_exponent: 1.15, log_tilt_slope: 0.05, hold_above_px2: 60.0 },
             estimator: Estimator::Sum,
             rate_hz: 30.0,
             origin: Origin { method: Method::Handmade, actions: 21, episodes: 0, data_sha256: [7; 32] },
@@ -361,7 +377,7 @@ pub(crate) mod tests {
     /// The same with the fused estimate.
     pub(crate) fn fused_example() -> Weights {
         Weights {
-            estimator: Estimator::Fused { model: FlowModel::default(), back: Return { rate_deg: 2.0, change_deg: 1.67 } },
+            estimator: Estimator::Fused { model: FlowModel::default(), back: WayBack { rate_deg: 2.0, change_deg: 1.67 } },
             ..example()
         }
     }
@@ -435,21 +451,21 @@ pub(crate) mod tests {
         for (what, change) in [
             ("parameter 5", (|w: &mut Weights| w.network.w1[0][5] = f32::NAN) as fn(&mut Weights)),
             ("action table", |w| w.actions_deg[3] = 7.0),
-            ("calibration c", |w| w.calibration.c = f32::INFINITY),
-            ("exponent", |w| w.calibration.q = f32::NAN),
-            ("change with the tilt", |w| w.calibration.tilt = f32::NAN),
+            ("calibration c", |w| w.calibration.volume_at_1_px2_ml = f32::INFINITY),
+            ("exponent", |w| w.calibration.area_exponent = f32::NAN),
+            ("change with the tilt", |w| w.calibration.log_tilt_slope = f32::NAN),
             ("frame rate", |w| w.rate_hz = 0.0),
             ("hold", |w| w.calibration.hold_above_px2 = f32::NAN),
             ("estimator: delay", |w| {
                 *w = fused_example();
                 if let Estimator::Fused { model, .. } = &mut w.estimator {
-                    model.delay = f64::NAN;
+                    model.delay_frames = f64::NAN;
                 }
             }),
             ("estimator: sd of gamma", |w| {
                 *w = fused_example();
                 if let Estimator::Fused { model, .. } = &mut w.estimator {
-                    model.noise.gamma = 0.0;
+                    model.noise.log_camera_gain_sd = 0.0;
                 }
             }),
         ] {

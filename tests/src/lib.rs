@@ -12,10 +12,11 @@ use std::time::{Duration, Instant};
 
 use serde_json::Value;
 use shared::actions::{Selection, action_table};
-use shared::estimate::Calibration;
+use shared::estimator::Calibration;
 use shared::mlp::{InputScale, Mlp};
 use shared::weights::{Estimator, Method, Origin, Weights};
 
+/// Counts the cells of this process, so that each gets a name and an address of its own.
 static NEXT: AtomicU32 = AtomicU32::new(0);
 
 /// Weights that tilt out by the same action every frame: they pour, though not well.
@@ -27,7 +28,7 @@ pub fn steady_weights(action: usize) -> Weights {
         actions_deg: action_table(),
         selection: Selection::Argmax,
         scale: InputScale::default(),
-        calibration: Calibration { c: 0.0002, q: 1.0, tilt: 0.0, hold_above_px2: f32::INFINITY },
+        calibration: Calibration { volume_at_1_px2_ml: 0.0002, area_exponent: 1.0, log_tilt_slope: 0.0, hold_above_px2: f32::INFINITY },
         estimator: Estimator::Sum,
         rate_hz: 30.0,
         origin: Origin { method: Method::Handmade, actions: 21, episodes: 0, data_sha256: [action as u8; 32] },

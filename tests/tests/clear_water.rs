@@ -1,7 +1,8 @@
 //! Clear water as a cell's file writes it: rendered from its `[view]`, measured by the feature worker's extraction.
 
-use experiments::commands::evaluate_camera::{camera_config, image_config, measure_pours};
-use feature_worker::extract::{Extractor, Image};
+use experiments::camera_evaluation::measure::measure_pours;
+use experiments::camera_setup::{camera_config, image_config};
+use feature_worker::vision::{Extractor, Image};
 use shared::messages::PixelFormat;
 use simulator::camera::{Background, Renderer, Scene, View};
 

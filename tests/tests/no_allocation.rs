@@ -8,10 +8,10 @@ use std::sync::atomic::{AtomicBool, AtomicU64, Ordering::Relaxed};
 use std::time::{Duration, Instant};
 
 use assert_no_alloc::{AllocDisabler, assert_no_alloc};
-use rt_controller::control_loop::Ticks;
+use rt_controller::control_loop::LoopState;
 use rt_controller::core::{Order, Settings};
 use rt_controller::exchange::{Event, Exchange};
-use rt_controller::service::{RobotNote, keep_robot_connected};
+use rt_controller::robot_thread::{RobotNote, keep_robot_connected};
 use shared::agent::Agent;
 use shared::config::Config;
 use shared::ipc;
@@ -93,7 +93,7 @@ fn run(plant: bool) {
 
         let cell = ipc::Cell::join(&name).expect("shared memory");
         let features = cell.features().expect("shared memory").subscriber_builder().buffer_size(8).create().expect("shared memory");
-        let mut ticks = Ticks::new(Settings::new(&config), 100_000_000, &features, &exchange);
+        let mut ticks = LoopState::new(Settings::new(&config), 100_000_000, &features, &exchange);
         let mut next = Instant::now();
         for _ in 0..TICKS {
             ticks.meet_feature_worker();

@@ -1,13 +1,16 @@
 //! What the trainer works on: weighed episodes as plain columns, read from MCAP files or CSV tables.
 //!
-//! Offline, ordinary thread, allocates. Bad data gets one clear line ([`DataError`]) that names the episode.
+//! Offline, ordinary thread, allocates. Bad data is refused with one line that names the episode ([`DataError`]).
 
 use std::path::PathBuf;
 
 use sha2::{Digest, Sha256};
 use shared::episode::{self, Episode};
 
-/// One experimental episode E = (L_E, w_E), a row a camera frame; all columns have the same length.
+/// Fewer frames than this are no whole curve: one second at 30 frames a second.
+const FRAMES_MIN: usize = 30;
+
+/// One experimental episode E = (L_E, w_E). Each camera frame is one row, and all columns have the same length.
 #[derive(Debug, Clone, PartialEq)]
 pub struct TrainingEpisode {
     /// The episode's name: its file, or its name in a table.
@@ -22,7 +25,7 @@ pub struct TrainingEpisode {
     pub alpha_measured_deg: Vec<f64>,
     /// V_e, px^2; NaN where the frame was lost or its measurement is doubtful.
     pub area_px2: Vec<f64>,
-    /// w_E, g (1 g = 1 ml); NaN: nobody read the scale.
+    /// w_E, g (1 g = 1 ml); NaN where the scale was not read.
     pub weight_g: f64,
 }
 
@@ -38,7 +41,7 @@ pub enum DataError {
     /// No episodes at all.
     #[error("no episodes found in {places}: record some with `rt-controller record`")]
     None {
-        /// Where was looked.
+        /// Where they were looked for.
         places: String,
     },
     /// One episode cannot be trained on.
@@ -49,14 +52,14 @@ pub enum DataError {
         /// What is wrong and what to do.
         what: String,
     },
-    /// Too few for the method.
+    /// There are too few for the method.
     #[error("{found} usable episodes, method {method} needs {needed}: record more")]
     TooFew {
-        /// Usable episodes.
+        /// UsableEpisodes episodes.
         found: usize,
         /// The method.
         method: String,
-        /// Its least number.
+        /// The least number of episodes that it needs.
         needed: usize,
     },
 }
@@ -94,7 +97,7 @@ impl TrainingEpisode {
         self.t_s.is_empty()
     }
 
-    /// What makes this episode unusable, if anything does; `None`: it can be trained on.
+    /// What makes this episode unusable, and what to do about it; `None` if it can be trained on.
     pub fn fault(&self) -> Option<String> {
         let n = self.len();
         if [self.alpha_deg.len(), self.alpha_measured_deg.len(), self.area_px2.len()].iter().any(|l| *l != n) {
@@ -104,8 +107,8 @@ impl TrainingEpisode {
                 self.area_px2.len()
             ));
         }
-        if n < 30 {
-            return Some(format!("only {n} frames: an episode needs a whole curve, at least 30"));
+        if n < FRAMES_MIN {
+            return Some(format!("only {n} frames: an episode needs a whole curve, at least {FRAMES_MIN}"));
         }
         if let Some(k) = self.t_s.iter().chain(&self.alpha_deg).position(|v| !v.is_finite()) {
             return Some(format!("frame {}: time or angle is not finite: export the table again", k % n));
@@ -131,7 +134,7 @@ impl TrainingEpisode {
     }
 
     fn from_episode(e: &Episode) -> Self {
-        let mut own = Self::empty(&e.name, rate_hz(e));
+        let mut own = Self::empty(&e.name, frame_rate_hz(e));
         for f in &e.rows {
             own.push(f.t_s, f64::from(f.alpha_commanded_deg), f64::from(f.alpha_measured_deg), f64::from(f.area_px2));
         }
@@ -140,17 +143,22 @@ impl TrainingEpisode {
     }
 }
 
-/// Frames a second, from the median interval.
-fn rate_hz(e: &Episode) -> f64 {
+/// Frames a second of an episode, from the median interval.
+fn frame_rate_hz(e: &Episode) -> f64 {
     let mut steps: Vec<f64> = e.rows.windows(2).map(|w| w[1].t_s - w[0].t_s).filter(|s| *s > 0.0).collect();
     steps.sort_by(f64::total_cmp);
     let median = steps.get(steps.len() / 2).copied().unwrap_or(1.0 / 30.0);
     (1.0 / median * 10.0).round() / 10.0
 }
 
+/// Frames a second of a data set: those of its first episode, or 30 of an empty set.
+pub fn rate_hz(episodes: &[TrainingEpisode]) -> f64 {
+    episodes.first().map_or(30.0, |e| e.rate_hz)
+}
+
 /// Where a command's episodes are.
 #[derive(Debug, clap::Args)]
-pub struct Source {
+pub struct EpisodeSource {
     /// MCAP episodes, or directories of them, recordings and pours; with --scale: the table of features.
     #[arg(required = true)]
     episodes: Vec<PathBuf>,
@@ -159,8 +167,8 @@ pub struct Source {
     scale: Option<PathBuf>,
 }
 
-impl Source {
-    /// Reads the episodes. Nothing is checked yet but that they can be read.
+impl EpisodeSource {
+    /// Reads the episodes. That they can be read is all that is checked here.
     pub fn read(&self) -> Result<Vec<Episode>, DataError> {
         let mut episodes = Vec::new();
         if let Some(scale) = &self.scale {
@@ -179,18 +187,19 @@ impl Source {
         Ok(episodes)
     }
 }
-/// What a data set is good for: the usable episodes, and a line for each one that was left out.
+
+/// The episodes of a data set that can be trained on, and the others.
 #[derive(Debug, Clone, Default)]
-pub struct Usable {
+pub struct UsableEpisodes {
     /// Episodes to train on.
     pub episodes: Vec<TrainingEpisode>,
-    /// Name and reason of each that was left out.
+    /// Name of each episode that was left out, and why.
     pub left_out: Vec<(String, String)>,
 }
 
-/// Keeps what can be trained on: complete, weighed, sound, and each measurement once.
-pub fn usable(episodes: &[Episode]) -> Usable {
-    let mut result = Usable::default();
+/// Keeps the episodes that can be trained on: complete, weighed and sound ones, and each measurement once.
+pub fn usable(episodes: &[Episode]) -> UsableEpisodes {
+    let mut result = UsableEpisodes::default();
     let doubles = Episode::duplicates(episodes);
     for (k, e) in episodes.iter().enumerate() {
         let own = TrainingEpisode::from_episode(e);
@@ -209,7 +218,12 @@ pub fn usable(episodes: &[Episode]) -> Usable {
     result
 }
 
-/// SHA-256 of what is trained on: columns and weights of all episodes in order; names do not enter.
+/// A hash as people read it: 64 hexadecimal digits.
+pub fn hex(hash: &[u8; 32]) -> String {
+    hash.iter().map(|b| format!("{b:02x}")).collect()
+}
+
+/// SHA-256 of what is trained on: columns and weights of all episodes in order. Their names do not matter.
 pub fn hash(episodes: &[TrainingEpisode]) -> [u8; 32] {
     let mut hash = Sha256::new();
     for e in episodes {

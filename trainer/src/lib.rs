@@ -1,17 +1,24 @@
 //! The offline trainer: weighed episodes in, one weight file out. It knows nothing of the simulator.
+//!
+//! | module | what it holds |
+//! |---|---|
+//! | [`data`] | the episodes, read and checked |
+//! | [`consistency`] | weights that do not fit the others |
+//! | [`calibration`] | area to ml, from the weights alone |
+//! | [`fit`] | the flow model, fitted to the episodes |
+//! | [`actions`], [`network`] | the network's actions, and its training |
+//! | [`training`], [`method`] | what a training is told and gives, and the methods |
+//! | [`report`] | pages of plots and tables |
+//! | [`commands`] | the command line |
 #![forbid(unsafe_code)]
 
-pub mod best;
-pub mod calibrate;
-pub mod check;
+pub mod actions;
+pub mod calibration;
+pub mod commands;
 pub mod consistency;
 pub mod data;
-pub mod distill;
-pub mod eq8;
 pub mod fit;
-pub mod inspect;
-pub mod law;
-pub mod net;
-pub mod refine;
+pub mod method;
+pub mod network;
 pub mod report;
-pub mod train;
+pub mod training;

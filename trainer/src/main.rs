@@ -3,7 +3,7 @@
 use std::process::ExitCode;
 
 use clap::{Parser, Subcommand};
-use trainer::{check, inspect, refine, report, train};
+use trainer::commands::{check, inspect, refine, report, train};
 
 /// The offline trainer: weighed episodes in, one weight file out.
 #[derive(Parser)]

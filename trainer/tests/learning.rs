@@ -7,28 +7,29 @@ use common::{CAMERA, episodes, episodes_of};
 use rand::SeedableRng;
 use rand_pcg::Pcg64Mcg;
 use shared::agent::{Agent, Observation};
-use shared::estimate::Calibration;
-use shared::estimate::flow::{Flow, FlowModel};
+use shared::estimator::Calibration;
+use shared::estimator::flow::{CommandHistory, FlowModel, FlowState, FlowTables};
+use trainer::actions::Actions;
 use trainer::consistency;
 use trainer::data::{self, TrainingEpisode};
-use trainer::eq8;
 use trainer::fit;
-use trainer::net::{Adam, Net, Sample};
-use trainer::train::{Estimate, MethodName, Options, Silent, actions_table, discretise, train};
+use trainer::method::{policy_gradient, train};
+use trainer::network::{Adam, Example, Network};
+use trainer::training::{Estimate, MethodName, Options, Silent};
 
 /// Protects the fit: from five noisy episodes it finds the vessel, the delay and the camera that made them.
 #[test]
 fn the_fit_finds_what_made_the_episodes() {
     let fit = fit::fit(&episodes(5, 1));
-    let (found, made) = (Flow::new(&fit.model), Flow::new(&FlowModel::default()));
+    let (found, made) = (FlowTables::new(&fit.model), FlowTables::new(&FlowModel::default()));
     for (from, to) in [(40.0, 55.0), (50.0, 65.0), (60.0, 75.0)] {
-        let d = |f: &Flow| f.capacity_ml(to) - f.capacity_ml(from);
+        let d = |f: &FlowTables| f.capacity.lost_ml(to) - f.capacity.lost_ml(from);
         assert!((d(&found) / d(&made) - 1.0).abs() < 0.05, "{from} to {to}: {} {}", d(&found), d(&made));
     }
-    let lag = |m: &shared::estimate::flow::FlowModel| m.delay + m.tau;
+    let lag = |m: &FlowModel| m.delay_frames + m.lag_frames;
     assert!((lag(&fit.model) - lag(&FlowModel::default())).abs() < 0.6, "{}", lag(&fit.model));
     let v = |c: f64, q: f64| c * 300f64.powf(q);
-    let (c, q) = (f64::from(fit.calibration.c), f64::from(fit.calibration.q));
+    let (c, q) = (f64::from(fit.calibration.volume_at_1_px2_ml), f64::from(fit.calibration.area_exponent));
     assert!((v(c, q) / v(CAMERA.0, CAMERA.1) - 1.0).abs() < 0.05, "{c} {q}");
 }
 
@@ -36,17 +37,20 @@ fn the_fit_finds_what_made_the_episodes() {
 #[test]
 fn a_changed_delay_is_noticed() {
     let usual = FlowModel::default();
-    let late = FlowModel { delay: usual.delay + 2.5, ..usual };
+    let late = FlowModel { delay_frames: usual.delay_frames + 2.5, ..usual };
     let lag = |data: &[TrainingEpisode]| {
         let model = fit::fit(data).model;
-        model.delay + model.tau
+        model.delay_frames + model.lag_frames
     };
     let mut data = episodes_of(&late, 4, 1, |_| (CAMERA, 0.06));
     let before = lag(&data);
     data.extend(episodes(4, 2));
     let after = lag(&data);
-    let off = after - usual.delay - usual.tau;
-    assert!(before > usual.delay + usual.tau + 1.0 && off.abs() < 0.4, "lag {before} frames before the change, {after} after it");
+    let off = after - usual.delay_frames - usual.lag_frames;
+    assert!(
+        before > usual.delay_frames + usual.lag_frames + 1.0 && off.abs() < 0.4,
+        "lag {before} frames before the change, {after} after it"
+    );
 }
 
 /// Protects learning after somebody touched the camera: with the gain changed between the pours, the newest count.
@@ -59,7 +63,7 @@ fn the_newest_gain_of_the_camera_counts() {
     data.sort_by_key(|e| e.name.parse::<usize>().unwrap() % 2 == 0);
     let found = fit::fit(&data).calibration;
     let v = |c: f64, q: f64| c * 300f64.powf(q);
-    let off = v(f64::from(found.c), f64::from(found.q)) / v(after.0, after.1) - 1.0;
+    let off = v(f64::from(found.volume_at_1_px2_ml), f64::from(found.area_exponent)) / v(after.0, after.1) - 1.0;
     assert!(off.abs() < 0.03, "{off} off the camera as it is now");
 }
 
@@ -67,8 +71,8 @@ fn the_newest_gain_of_the_camera_counts() {
 #[test]
 fn a_linear_camera_is_taken_as_linear() {
     let found = fit::fit(&episodes_of(&FlowModel::default(), 4, 13, |_| ((0.003, 1.0), 0.01))).calibration;
-    let off = f64::from(found.c) / 0.003 - 1.0;
-    assert!((found.q - 1.0).abs() < 0.002 && off.abs() < 0.01, "q {}, c off by {off}", found.q);
+    let off = f64::from(found.volume_at_1_px2_ml) / 0.003 - 1.0;
+    assert!((found.area_exponent - 1.0).abs() < 0.002 && off.abs() < 0.01, "q {}, c off by {off}", found.area_exponent);
 }
 
 /// Protects reproducibility: the same seed and data give the same bytes, on one thread and on many; another seed does not.
@@ -95,28 +99,24 @@ fn the_trained_policies_pour() {
 /// Trains with a method on `n` episodes and pours; the errors are below `within` of the goal and 1 ml.
 fn pours(method: MethodName, n: usize, within: f64) {
     let trained = train(&episodes(n, 3), &Options { method, ..Options::default() }, &Silent).unwrap();
-    let flow = Flow::new(&FlowModel::default());
+    let flow = FlowTables::new(&FlowModel::default());
     for (onset, goal) in [(40.0, 120.0f64), (55.0, 60.0), (65.0, 25.0)] {
         let mut agent = Agent::new(&trained.weights);
         agent.start(goal as f32);
-        let (mut a, mut x, mut film, mut poured) = (0.0, flow.capacity_ml(onset), 0.0, 0.0);
-        let mut history = [0.0; shared::estimate::flow::HISTORY];
+        let mut state = FlowState { headspace_ml: flow.capacity.lost_ml(onset), ..FlowState::default() };
+        let mut poured = 0.0;
+        let mut history = CommandHistory::standing_at(0.0);
         let mut alpha = 0.0f32;
+        let mut ending = rt_controller::core::ending::Ending::of_pour();
         let mut finished = false;
         for _ in 0..900 {
-            history.copy_within(1.., 0);
-            history[history.len() - 1] = f64::from(alpha);
-            a = flow.tilt(a, flow.delayed(&history, 0, 0.0));
-            let v = flow.over(a, x, 0.0).v_ml;
-            x += v;
-            film += 0.1 * v;
-            let out = 0.9 * v + film / 9.0;
-            film -= film / 9.0;
+            history.push(f64::from(alpha));
+            let out = state.step(&flow, history.commands(), 0).leaves_ml;
             poured += out;
             let area = (out / CAMERA.0).powf(1.0 / CAMERA.1);
             let area_px2 = Some(if area < 8.0 { 0.0 } else { area as f32 });
             let decision = agent.step(Observation { area_px2, alpha_deg: alpha, alpha_now_deg: alpha });
-            finished |= decision.finished;
+            finished |= ending.decided(&decision);
             alpha = if finished { (alpha - 2.0).max(0.0) } else { (alpha + decision.dalpha_deg).clamp(0.0, 110.0) };
         }
         assert!(finished && (poured - goal).abs() < within * goal + 1.0, "{method:?}: goal {goal}, poured {poured}, finished {finished}");
@@ -128,7 +128,12 @@ fn pours(method: MethodName, n: usize, within: f64) {
 fn contributions_add_up_to_the_weight() {
     let e = &episodes(1, 4)[0];
     for (q, hold_above_px2) in [(1.0, f32::INFINITY), (1.2, 60.0)] {
-        let sum: f64 = eq8::contributions(e, &Calibration { c: 1.0, q, tilt: 0.0, hold_above_px2 }).iter().sum();
+        let sum: f64 = policy_gradient::contributions(
+            e,
+            &Calibration { volume_at_1_px2_ml: 1.0, area_exponent: q, log_tilt_slope: 0.0, hold_above_px2 },
+        )
+        .iter()
+        .sum();
         assert!((sum - e.weight_g).abs() < 1e-6);
     }
 }
@@ -136,34 +141,34 @@ fn contributions_add_up_to_the_weight() {
 /// Protects eq. (5) and Fig. 5's discretisation, and that two actions are a sign.
 #[test]
 fn rewards_and_actions_are_the_papers() {
-    assert_eq!(eq8::reward(0.0), 1.0);
-    assert!((eq8::reward(10.0) - (-1.0f64).exp()).abs() < 1e-12);
-    assert_eq!(eq8::reward(10.0), eq8::reward(-10.0));
-    let (many, two) = (actions_table(21), actions_table(2));
-    assert_eq!([-9.0, -0.06, 0.0, 0.06, 1.3].map(|a| discretise(&many, 21, a)), [0, 9, 10, 11, 15]);
-    assert_eq!([-2.0, 0.0, 0.3].map(|a| two[usize::from(discretise(&two, 2, a))]), [-1.0, -1.0, 1.0]);
+    assert_eq!(policy_gradient::reward(0.0), 1.0);
+    assert!((policy_gradient::reward(10.0) - (-1.0f64).exp()).abs() < 1e-12);
+    assert_eq!(policy_gradient::reward(10.0), policy_gradient::reward(-10.0));
+    let (many, two) = (Actions::new(21), Actions::new(2));
+    assert_eq!([-9.0, -0.06, 0.0, 0.06, 1.3].map(|a| many.discretise(a)), [0, 9, 10, 11, 15]);
+    assert_eq!([-2.0, 0.0, 0.3].map(|a| two.angles_deg[usize::from(two.discretise(a))]), [-1.0, -1.0, 1.0]);
 }
 
 /// Protects eq. (8)'s gradient: Adam's first step goes against the finite differences of weight x cross-entropy.
 #[test]
 fn the_gradient_is_that_of_the_cross_entropy() {
     let mut rng = Pcg64Mcg::seed_from_u64(5);
-    let net = Net::standard(&mut rng);
-    let samples =
-        [Sample { x: [0.3, 0.2, 0.1, 0.8], action: 13, weight: 0.7 }, Sample { x: [0.0, 0.4, 0.5, -0.3], action: 2, weight: -0.4 }];
-    let loss = |net: &Net| -> f64 {
-        let one = |s: &Sample| {
+    let net = Network::standard(&mut rng);
+    let examples =
+        [Example { x: [0.3, 0.2, 0.1, 0.8], action: 13, weight: 0.7 }, Example { x: [0.0, 0.4, 0.5, -0.3], action: 2, weight: -0.4 }];
+    let loss = |net: &Network| -> f64 {
+        let one = |s: &Example| {
             let logits = net.logits(&s.x);
             let top = logits.iter().copied().fold(f32::MIN, f32::max);
             let sum: f64 = logits.iter().map(|l| f64::from(l - top).exp()).sum();
             -f64::from(s.weight) * (f64::from(logits[usize::from(s.action)] - top) - sum.ln())
         };
-        samples.iter().map(one).sum::<f64>() / 2.0
+        examples.iter().map(one).sum::<f64>() / 2.0
     };
     let before = loss(&net);
     let mut moved = net.clone();
     let mut adam = Adam::new(&net);
-    let told = moved.learn(&samples, None, 1e-4, &mut adam);
+    let told = moved.learn(&examples, None, 1e-4, &mut adam);
     assert!((f64::from(told) - before).abs() < 1e-5, "{told} {before}");
     // Adam's first step is -rate x sign(gradient): the loss falls by about rate x the sum of the gradient's sizes.
     assert!(loss(&moved) < before - 1e-4, "{} {before}", loss(&moved));
@@ -191,7 +196,7 @@ fn faults_are_named() {
     type Case = (&'static str, fn(&mut TrainingEpisode));
     let cases: [Case; 9] = [
         ("no weight", |e| e.weight_g = f64::NAN),
-        ("not a number >= 0", |e| e.weight_g = -3.0),
+        ("a finite number of at least 0", |e| e.weight_g = -3.0),
         ("nothing was poured", |e| e.weight_g = 0.0),
         ("no stream was ever seen", |e| e.area_px2.fill(0.0)),
         ("unequal lengths", |e| _ = e.alpha_deg.pop()),

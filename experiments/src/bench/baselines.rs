@@ -1,21 +1,22 @@
-//! What the learned policy is compared with.
+//! What the learned network is compared with.
 //!
-//! Pure, any thread. Each sees what a lab would give it; only the oracle sees the truth.
+//! Pure, any thread; allocates when it is set up; cannot fail. Each baseline sees what a lab would give it; only the oracle sees the
+//! truth.
 
-use shared::estimate::flow::Flow;
-use shared::estimate::fused::Fused;
-use shared::estimate::{Calibration, Hold};
+use shared::estimator::flow::FlowTables;
+use shared::estimator::fused::FusedEstimator;
+use shared::estimator::{Calibration, Hold};
 use shared::gaussian_curve::Curve;
 use shared::limits::{Limiter, Limits};
 use shared::weights::Estimator;
 use trainer::data::TrainingEpisode;
-use trainer::law::Law;
+use trainer::method::control_law::ControlLaw;
 
 use super::pour::Baseline;
 use super::simulators::BenchPour;
 use simulator::physics::RATE_HZ;
 
-/// The plain linear sum that a lab would write first: `v = c area`, no hold.
+/// The plain linear sum that a lab would write first: `v = c area`, without bridging lost frames.
 #[derive(Debug, Clone, Copy)]
 pub struct Sum {
     c: f64,
@@ -25,11 +26,12 @@ pub struct Sum {
 }
 
 impl Sum {
-    /// With a linear calibration.
+    /// A sum with a linear calibration, for a goal in ml.
     pub fn new(linear: &Calibration, goal_ml: f64) -> Self {
-        Self { c: f64::from(linear.c), goal_ml, v_ml: [0.0; 3], poured_ml: 0.0 }
+        Self { c: f64::from(linear.volume_at_1_px2_ml), goal_ml, v_ml: [0.0; 3], poured_ml: 0.0 }
     }
 
+    /// Takes one frame's V_e; returns d, ml.
     fn see(&mut self, area_px2: f32) -> f64 {
         let v = if area_px2.is_nan() { self.v_ml[0] } else { self.c * f64::from(area_px2) };
         self.v_ml = [v, self.v_ml[0], self.v_ml[1]];
@@ -38,7 +40,8 @@ impl Sum {
     }
 }
 
-/// A PD on d, first guess: dalpha = 0.02 d - 1.0 v, at most 0.5 degrees forward; back when less than 1 ml is missing.
+/// A PD controller on d with the first guess of its gains: dalpha = 0.02 d - 1.0 v, at most 0.5 degrees forward. It goes back when less
+/// than 1 ml is missing.
 pub struct HandPd(pub Sum);
 
 impl Baseline for HandPd {
@@ -51,7 +54,7 @@ impl Baseline for HandPd {
     }
 }
 
-/// Forward below an outflow of 0.6 ml a frame, back above it; over when less than 3 ml is missing.
+/// Two points: forward below an outflow of 0.6 ml a frame, back above it. The pour is over when less than 3 ml is missing.
 pub struct BangBang(pub Sum);
 
 impl Baseline for BangBang {
@@ -64,7 +67,7 @@ impl Baseline for BangBang {
     }
 }
 
-/// Eq. (1) without looking: the height that poured this much in the episodes, by a straight line through them.
+/// Eq. (1) without looking: the curve's height that poured this much in the episodes, by a straight line through them.
 pub struct OpenLoop {
     curve: Curve,
     frame: u32,
@@ -72,7 +75,7 @@ pub struct OpenLoop {
 }
 
 impl OpenLoop {
-    /// Fits height against weight.
+    /// Fits the height of the curves against the weight, and takes the height for a goal in ml.
     pub fn new(episodes: &[TrainingEpisode], goal_ml: f64) -> Self {
         let top = |e: &TrainingEpisode| e.alpha_deg.iter().copied().fold(0.0, f64::max);
         let n = episodes.len().max(1) as f64;
@@ -98,23 +101,23 @@ impl Baseline for OpenLoop {
     }
 }
 
-/// A law (or a PD, which is a law without the rest) on the policy's own estimate, without the network.
+/// A control law (or a PD, which is a law without the rest) on the network's own estimate, without the network.
 pub struct ByLaw {
-    law: Law,
+    law: ControlLaw,
     calibration: Calibration,
     hold: Hold,
-    fused: Option<Fused>,
+    fused: Option<FusedEstimator>,
     v_ml: [f64; 3],
     summed_ml: f64,
     goal_ml: f64,
 }
 
 impl ByLaw {
-    /// With the calibration and estimator of some weights.
-    pub fn new(law: Law, calibration: Calibration, estimator: &Estimator, goal_ml: f64) -> Self {
+    /// A law with the calibration and the estimator of some weights, for a goal in ml.
+    pub fn new(law: ControlLaw, calibration: Calibration, estimator: &Estimator, goal_ml: f64) -> Self {
         let fused = match estimator {
             Estimator::Sum => None,
-            Estimator::Fused { model, back } => Some(Fused::new(Flow::new(model), *back)),
+            Estimator::Fused { model, back } => Some(FusedEstimator::new(FlowTables::new(model), *back)),
         };
         Self { law, calibration, hold: Hold::default(), fused, v_ml: [0.0; 3], summed_ml: 0.0, goal_ml }
     }
@@ -138,11 +141,11 @@ impl Baseline for ByLaw {
         self.law.decide(self.v_ml, d).map(|a| a as f32)
     }
     fn believed_ml(&self) -> f64 {
-        self.fused.as_ref().map_or(self.summed_ml, Fused::poured_ml)
+        self.fused.as_ref().map_or(self.summed_ml, FusedEstimator::poured_ml)
     }
 }
 
-/// Sees the true state and tries out the way back in a copy of the world: what control alone can reach.
+/// Sees the true state and tries out the way back in a copy of the pour: this is what control alone can reach.
 pub struct Oracle {
     goal_ml: f64,
     limits: Limits,
@@ -150,21 +153,21 @@ pub struct Oracle {
 }
 
 impl Oracle {
-    /// For a goal.
+    /// An oracle for a goal in ml.
     pub fn new(goal_ml: f64, limits: Limits) -> Self {
         Self { goal_ml, limits, poured_ml: 0.0 }
     }
 }
 
 impl Baseline for Oracle {
-    fn decide(&mut self, _: f32, alpha_deg: f32, world: &BenchPour) -> Option<f32> {
-        let mut copy = world.clone();
+    fn decide(&mut self, _: f32, alpha_deg: f32, pour: &BenchPour) -> Option<f32> {
+        let mut copy = pour.clone();
         let mut limiter = Limiter::new(self.limits, (1.0 / RATE_HZ) as f32, alpha_deg);
         for _ in 0..60 {
             copy.frame(f64::from(limiter.step_upright()));
         }
-        let flow_ml = world.poured_ml() - self.poured_ml;
-        self.poured_ml = world.poured_ml();
+        let flow_ml = pour.poured_ml() - self.poured_ml;
+        self.poured_ml = pour.poured_ml();
         let d = self.goal_ml - copy.poured_ml();
         (d > 0.02).then(|| (1.2 * ((0.05 * d).clamp(0.01, 0.8) - flow_ml)).clamp(-1.0, 0.5) as f32)
     }

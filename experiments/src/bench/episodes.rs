@@ -1,6 +1,6 @@
-//! Experimental episodes as a person would record them: curves of eq. (1), and the weight read afterwards.
+//! Experimental episodes as a person would record them on a bench: curves of eq. (1), and the weight that is read afterwards.
 //!
-//! Pure, any thread, allocates; the same seed gives the same episodes.
+//! Pure, any thread; allocates; cannot fail. The same seed gives the same episodes.
 
 use rand::seq::SliceRandom;
 use rand::{RngExt, SeedableRng};
@@ -12,35 +12,35 @@ use simulator::physics::{ALPHA_MAX_DEG, RATE_HZ};
 
 use super::simulators::Bench;
 
-/// Frames recorded after the curve has come back, while the last drops fall.
+/// Frames recorded after the curve has come back, while the last drops fall: 1.5 s, five times the time in which the film drains.
 const SETTLE_FRAMES: usize = 45;
 
 impl Bench {
-    /// Records `n` episodes: volumes stratified over 140 to 460 ml, lambda = spill angle + U(6, 30) degrees, width U(0.7, 2.2) s.
-    /// A single episode is the middle one: 300 ml, + 18 degrees, 1.3 s.
+    /// Records `n` episodes. Volumes are stratified over 140 to 460 ml; a curve is 6 to 30 degrees higher than the spill angle and has a
+    /// width (standard deviation) of 0.7 to 2.2 s, both uniformly drawn. A single episode is the middle one: 300 ml, 18 degrees, 1.3 s.
     pub fn record(&self, n: usize, seed: u64) -> Vec<TrainingEpisode> {
-        let mut rng = Pcg64Mcg::seed_from_u64(seed.wrapping_mul(0x5851_f42d).wrapping_add(99));
+        let mut random = Pcg64Mcg::seed_from_u64(seed.wrapping_mul(0x5851_f42d).wrapping_add(99));
         let mut strata: Vec<usize> = (0..n).collect();
-        strata.shuffle(&mut rng);
+        strata.shuffle(&mut random);
         let mut episodes = Vec::with_capacity(n);
         for (k, stratum) in strata.into_iter().enumerate() {
             let (volume_ml, over_deg, sigma_s) = if n == 1 {
                 (300.0, 18.0, 1.3)
             } else {
-                let share = (stratum as f64 + rng.random_range(0.0..1.0)) / n as f64;
-                (140.0 + 320.0 * share, rng.random_range(6.0..=30.0), rng.random_range(0.7..=2.2))
+                let share = (stratum as f64 + random.random_range(0.0..1.0)) / n as f64;
+                (140.0 + 320.0 * share, random.random_range(6.0..=30.0), random.random_range(0.7..=2.2))
             };
             let lambda_deg = (self.spill_angle_deg(volume_ml) + over_deg).min(ALPHA_MAX_DEG);
-            let pour_seed = rng.random();
-            episodes.push(self.record_one(&format!("{}", k + 1), volume_ml, lambda_deg, sigma_s, pour_seed, &mut rng));
+            let pour_seed = random.random();
+            episodes.push(self.record_one(&format!("{}", k + 1), volume_ml, lambda_deg, sigma_s, pour_seed, &mut random));
         }
         episodes
     }
 
-    /// Records one curve of eq. (1) with height `lambda_deg` and width `sigma_s` (gamma = 1/(2 sigma^2)), and weighs it.
-    fn record_one(&self, name: &str, volume_ml: f64, lambda_deg: f64, sigma_s: f64, seed: u64, rng: &mut Pcg64Mcg) -> TrainingEpisode {
+    /// Records one curve of eq. (1) with the height `lambda_deg` and the width `sigma_s` (gamma = 1/(2 sigma^2)), and weighs it.
+    fn record_one(&self, name: &str, volume_ml: f64, lambda_deg: f64, sigma_s: f64, seed: u64, random: &mut Pcg64Mcg) -> TrainingEpisode {
         let gamma_per_s2 = 1.0 / (2.0 * sigma_s * sigma_s);
-        // alpha(0) = 0.05 degrees.
+        // The curve begins at 0.05 degrees.
         let beta_s = ((lambda_deg / 0.05).ln() / gamma_per_s2).sqrt();
         let frames = (2.0 * beta_s * RATE_HZ).ceil() as usize;
         let mut pour = self.pour(volume_ml, seed);
@@ -51,7 +51,7 @@ impl Bench {
             let area_px2 = pour.frame(alpha_deg);
             episode.push(t_s, alpha_deg, f64::NAN, f64::from(area_px2));
         }
-        let misread: f64 = StandardNormal.sample(rng);
+        let misread: f64 = StandardNormal.sample(random);
         episode.weight_g = (pour.poured_ml() + 0.5 * misread).round();
         episode
     }
@@ -62,12 +62,12 @@ mod tests {
     use super::*;
     use simulator::physics::rig::Rig;
 
-    /// Protects the reference protocol: curves start and end upright, volumes are spread, weights are near the truth.
+    /// Protects the reference protocol: curves start and end upright, volumes are spread, and weights are possible.
     #[test]
     fn episodes_follow_equation_1() {
         let bench = Bench::on(&Rig::seeded(0));
         let episodes = bench.record(8, 1);
-        // As text, because the measured angles are not numbers here and differ from themselves.
+        // They are compared as text, because the measured angles are NaN here and differ from themselves.
         let text = |e: &[TrainingEpisode]| format!("{e:?}");
         assert_eq!(text(&episodes), text(&bench.record(8, 1)));
         assert_ne!(text(&episodes), text(&bench.record(8, 2)));

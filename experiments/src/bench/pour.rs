@@ -1,7 +1,7 @@
 //! One pour in closed loop on a simulated bench, at full speed.
 //!
-//! Pure; allocates once a pour. Policies are driven through the controller's own core, [`rt_controller::core::Core`], as at
-//! run time; baselines, which know no core, through [`Baseline`] and the same [`Limiter`].
+//! Pure, any thread; allocates once a pour; cannot fail. Networks are driven through the controller's own core,
+//! [`rt_controller::core::Core`], as at run time. Baselines know no core; they are driven through [`Baseline`] and the same [`Limiter`].
 
 use rt_controller::core::{Core, Input, Order, Robot, Settings};
 use serde::Serialize;
@@ -14,56 +14,56 @@ use trainer::data::TrainingEpisode;
 use super::simulators::BenchPour;
 use simulator::physics::RATE_HZ;
 
-/// A pour ends after this many frames.
+/// A pour ends after this many frames: 30 s, as in `config/sim.toml`.
 pub const MAX_FRAMES: u32 = 900;
-/// Frames after upright in which the last drops fall and are counted.
+/// Frames after upright in which the last drops fall and are counted: 1.5 s, five times the time in which the film drains.
 const SETTLE_FRAMES: u32 = 45;
-/// Period of a tick, ns.
+/// Period of a tick, ns: that of 30 Hz.
 const PERIOD_NS: u64 = 33_333_333;
 
 /// How one pour went.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
-pub struct Poured {
-    /// Initial volume asked for, ml.
+pub struct PourResult {
+    /// Volume in the container at the start, ml.
     pub init_ml: f64,
-    /// V_G, ml.
+    /// The goal, ml.
     pub goal_ml: f64,
-    /// On the scale, ml.
+    /// What has really left, ml.
     pub true_ml: f64,
     /// What the controller believes to have poured, ml.
     pub believed_ml: f64,
-    /// Until the pour was over, s.
+    /// Time until the pour was over, s.
     pub seconds: f64,
-    /// Frames.
+    /// Frames until then.
     pub frames: u32,
-    /// The pour came to its end by itself.
+    /// Whether the pour came to its end by itself.
     pub ended: bool,
 }
 
-impl Poured {
-    /// On the scale minus goal, ml.
+impl PourResult {
+    /// Error of the pour: above 0 too much has left, ml.
     pub fn error_ml(&self) -> f64 {
         self.true_ml - self.goal_ml
     }
-    /// Part of the error that measurement made, ml.
+    /// The part of the error that measurement made, ml.
     pub fn measurement_ml(&self) -> f64 {
         self.true_ml - self.believed_ml
     }
-    /// Part of the error that control made, ml.
+    /// The part of the error that control made, ml.
     pub fn control_ml(&self) -> f64 {
         self.believed_ml - self.goal_ml
     }
-    /// Nothing was poured.
+    /// Whether nothing was poured.
     pub fn never_poured(&self) -> bool {
         self.true_ml < 1.0
     }
-    /// It never came to an end by itself.
+    /// Whether it never came to an end by itself.
     pub fn never_stopped(&self) -> bool {
         !self.ended
     }
 }
 
-/// A pour frame by frame, all columns of the same length.
+/// A pour frame by frame; all columns have the same length.
 #[derive(Debug, Clone, Default, Serialize)]
 pub struct Trace {
     /// Time, s.
@@ -77,14 +77,14 @@ pub struct Trace {
 }
 
 impl Trace {
-    fn push(&mut self, alpha_deg: f64, area_px2: f32, world: &BenchPour) {
+    fn push(&mut self, alpha_deg: f64, area_px2: f32, pour: &BenchPour) {
         self.t_s.push((self.t_s.len() + 1) as f64 / RATE_HZ);
         self.alpha_deg.push(alpha_deg);
         self.area_px2.push(f64::from(area_px2));
-        self.true_ml.push(world.poured_ml());
+        self.true_ml.push(pour.poured_ml());
     }
 
-    /// The same as an episode, weighed.
+    /// The same as an episode that was weighed.
     pub fn weighed(self, name: &str, weight_g: f64) -> TrainingEpisode {
         let alpha_measured_deg = vec![f64::NAN; self.t_s.len()];
         let Self { t_s, alpha_deg, area_px2, .. } = self;
@@ -92,7 +92,7 @@ impl Trace {
     }
 }
 
-/// The settings that the core runs with: the defaults of the configuration, no goal limit.
+/// The settings that the core runs with: those of `config/sim.toml`, but without a limit of the goal.
 fn settings(limits: Limits) -> Settings {
     Settings {
         period_ns: PERIOD_NS,
@@ -106,16 +106,23 @@ fn settings(limits: Limits) -> Settings {
     }
 }
 
-/// Pours `goal_ml` with the running controller's core and `agent`; the frames are added to `trace` if there is one.
-pub fn by_core(agent: &Agent, world: &mut BenchPour, limits: Limits, init_ml: f64, goal_ml: f64, mut trace: Option<&mut Trace>) -> Poured {
+/// Pours `goal_ml` with the controller's own core and `agent`. The frames are added to `trace` if there is one.
+pub fn by_core(
+    agent: &Agent,
+    pour: &mut BenchPour,
+    limits: Limits,
+    init_ml: f64,
+    goal_ml: f64,
+    mut trace: Option<&mut Trace>,
+) -> PourResult {
     let mut core = Core::new(settings(limits));
     core.exchange(Box::new(agent.clone()));
     let mut alpha_deg = 0.0f32;
     let mut area_px2 = 0.0f32;
     let mut frames = 0u32;
     let mut poured =
-        Poured { init_ml, goal_ml, true_ml: 0.0, believed_ml: 0.0, seconds: f64::from(MAX_FRAMES) / RATE_HZ, frames: 0, ended: false };
-    // Ends by the core's own limits; the loop's is there for a core that does not.
+        PourResult { init_ml, goal_ml, true_ml: 0.0, believed_ml: 0.0, seconds: f64::from(MAX_FRAMES) / RATE_HZ, frames: 0, ended: false };
+    // The core ends a pour by its own limits; this one is there for a core that does not.
     while frames < 3 * MAX_FRAMES {
         frames += 1;
         let now_ns = u64::from(frames + 1) * PERIOD_NS;
@@ -134,9 +141,9 @@ pub fn by_core(agent: &Agent, world: &mut BenchPour, limits: Limits, init_ml: f6
         let order = (frames == 2).then_some(Order::Pour { episode: 1, goal_ml: goal_ml as f32 });
         let output = core.step(&Input { now_ns, features: &[feature], robot, order });
         alpha_deg = output.target_deg.unwrap_or(alpha_deg);
-        area_px2 = world.frame(f64::from(alpha_deg));
+        area_px2 = pour.frame(f64::from(alpha_deg));
         if let Some(trace) = trace.as_deref_mut() {
-            trace.push(f64::from(alpha_deg), area_px2, world);
+            trace.push(f64::from(alpha_deg), area_px2, pour);
         }
         if let Some(outcome) = output.ended {
             poured.believed_ml = f64::from(outcome.poured_ml);
@@ -146,26 +153,27 @@ pub fn by_core(agent: &Agent, world: &mut BenchPour, limits: Limits, init_ml: f6
         }
     }
     for _ in 0..SETTLE_FRAMES {
-        let area = world.frame(0.0);
+        let area = pour.frame(0.0);
         if let Some(trace) = trace.as_deref_mut() {
-            trace.push(0.0, area, world);
+            trace.push(0.0, area, pour);
         }
     }
-    poured.true_ml = world.poured_ml();
+    poured.true_ml = pour.poured_ml();
     poured.frames = frames;
     poured
 }
 
-/// What decides in a pour, if it is not the agent.
+/// What decides in a pour instead of the agent.
 pub trait Baseline {
-    /// The angle asked for next, degrees relative to the command in force; `None`: the pour is over, upright.
-    fn decide(&mut self, area_px2: f32, alpha_deg: f32, world: &BenchPour) -> Option<f32>;
-    /// Volume believed to have been poured, ml.
+    /// The angle that is asked for next, in degrees relative to the command in force; `None` when the pour is over. `pour` is the truth,
+    /// which only the oracle may look at.
+    fn decide(&mut self, area_px2: f32, alpha_deg: f32, pour: &BenchPour) -> Option<f32>;
+    /// The volume that it believes to have been poured, ml.
     fn believed_ml(&self) -> f64;
 }
 
-/// Pours `goal_ml` with `controller`.
-pub fn by_controller(controller: &mut dyn Baseline, world: &mut BenchPour, limits: Limits, init_ml: f64, goal_ml: f64) -> Poured {
+/// Pours `goal_ml` with a baseline.
+pub fn by_baseline(baseline: &mut dyn Baseline, pour: &mut BenchPour, limits: Limits, init_ml: f64, goal_ml: f64) -> PourResult {
     let mut limiter = Limiter::new(limits, (1.0 / RATE_HZ) as f32, 0.0);
     let mut back = false;
     let mut frames = 0;
@@ -173,8 +181,8 @@ pub fn by_controller(controller: &mut dyn Baseline, world: &mut BenchPour, limit
     let mut upright_at = None;
     while upright_frames < SETTLE_FRAMES {
         let alpha = limiter.alpha_deg();
-        let area = world.frame(f64::from(alpha));
-        let asked = controller.decide(area, alpha, world);
+        let area = pour.frame(f64::from(alpha));
+        let asked = baseline.decide(area, alpha, pour);
         frames += 1;
         back |= asked.is_none();
         let out_of_time = frames >= MAX_FRAMES;
@@ -187,18 +195,18 @@ pub fn by_controller(controller: &mut dyn Baseline, world: &mut BenchPour, limit
             upright_frames += 1;
         }
     }
-    Poured {
+    PourResult {
         init_ml,
         goal_ml,
-        true_ml: world.poured_ml(),
-        believed_ml: controller.believed_ml(),
+        true_ml: pour.poured_ml(),
+        believed_ml: baseline.believed_ml(),
         seconds: f64::from(upright_at.unwrap_or(frames)) / RATE_HZ,
         frames,
         ended: back,
     }
 }
 
-/// The grid of the reference: V_init x V_G with V_G <= 0.85 V_init, 45 cells.
+/// The grid of pours that is evaluated: 45 pairs of the volume in the container and the goal, ml; the goal is at most 85 % of the volume.
 pub fn grid() -> Vec<(f64, f64)> {
     let mut cells = Vec::new();
     for init in [150.0, 225.0, 300.0, 375.0, 450.0] {

@@ -1,12 +1,12 @@
-//! Simulator b through a rendered camera: each frame of a pour is drawn, and V_e is what the feature worker's own extraction
-//! finds in the picture, doubts included.
+//! Simulator b through a rendered camera: each frame of a pour is drawn, and V_e is what the feature worker's own extraction finds in the
+//! picture, its doubts included.
 //!
-//! Any thread; the same seeds give the same pour. Allocates when a pour begins. A frame that cannot be drawn or measured
-//! counts as lost (NaN).
+//! Any thread; the same seeds give the same pour. Allocates when a pour begins. A frame that cannot be drawn or measured counts as lost
+//! (NaN).
 
 use std::sync::{Arc, Mutex, PoisonError};
 
-use feature_worker::extract::{Extractor, Image};
+use feature_worker::vision::{Extractor, Image};
 use rand::seq::IndexedRandom;
 use rand::{RngExt, SeedableRng};
 use rand_pcg::Pcg64Mcg;
@@ -17,9 +17,12 @@ use simulator::camera::{Background, Renderer, Scene, View};
 use simulator::physics::RATE_HZ;
 use simulator::physics::rig::RigPour;
 
-use crate::commands::evaluate_camera::{camera_config, image_config, learn_colour};
+use crate::camera_setup::{camera_config, image_config, learn_colour};
 
-/// A camera on a rig, set up by a careful person: its view, and the feature worker's configuration for it.
+/// Colours of the liquids, as blue, green, red: such as food dyes give.
+const LIQUIDS_BGR: [[u8; 3]; 4] = [[150, 62, 20], [40, 36, 180], [60, 150, 40], [140, 40, 110]];
+
+/// A camera before a rig, set up by a careful person: its view, and the feature worker's configuration for it.
 #[derive(Debug, Clone)]
 pub struct BenchCamera {
     view: View,
@@ -27,10 +30,14 @@ pub struct BenchCamera {
 }
 
 impl BenchCamera {
-    /// Draws scale, lip, spout, background, light, noise and blur from `seed`, and learns the liquid's colour from one pour.
+    /// A camera whose scale, lip, spout, background, light, noise and blur are drawn from `seed`; the liquid's colour is learned from one
+    /// pour.
+    ///
+    /// # Errors
+    /// One line, when the liquid's colour cannot be learned.
     pub fn seeded(seed: u64) -> Result<Self, String> {
         let mut random = Pcg64Mcg::seed_from_u64(seed ^ 0xe7e);
-        let colour = *[[150, 62, 20], [40, 36, 180], [60, 150, 40], [140, 40, 110]].choose(&mut random).unwrap_or(&[150, 62, 20]);
+        let colour = *LIQUIDS_BGR.choose(&mut random).unwrap_or(&LIQUIDS_BGR[0]);
         let placed = View::placed(&mut random);
         let view = View {
             liquid_bgr: Some(colour),
@@ -46,22 +53,24 @@ impl BenchCamera {
     }
 }
 
+/// The renderer, the extraction, and the picture that goes from one to the other.
 struct Camera {
     renderer: Renderer,
     extractor: Extractor,
     pixels: Vec<u8>,
 }
 
-/// A pour that is looked at.
+/// A pour on a rig whose V_e is measured in rendered pictures.
 #[derive(Clone)]
 pub struct CameraPour {
-    /// The physics.
+    /// The physics of the pour.
     pub pour: RigPour,
-    /// None: OpenCV refused; every frame is lost.
+    /// None when OpenCV refused; then every frame is lost.
     camera: Option<Arc<Mutex<Camera>>>,
     size_px: (u32, u32),
-    late: Vec<Scene>,
-    delay: usize,
+    /// The newest scenes, as a ring; the camera is late.
+    scenes: Vec<Scene>,
+    delay_frames: usize,
     frame: usize,
 }
 
@@ -72,29 +81,30 @@ impl std::fmt::Debug for CameraPour {
 }
 
 impl CameraPour {
-    /// Looks at `pour` with `camera`; the picture shows what was `delay` frames ago.
-    pub fn new(pour: RigPour, camera: &BenchCamera, delay: usize, seed: u64) -> Self {
+    /// Looks at `pour` with `camera`; a picture shows what was `delay_frames` ago.
+    pub fn new(pour: RigPour, camera: &BenchCamera, delay_frames: usize, seed: u64) -> Self {
         let size_px = (camera.view.width_px, camera.view.height_px);
         let camera = Renderer::new(&camera.view, seed).ok().zip(Extractor::new(&camera_config(&camera.view), &camera.image).ok()).map(
             |(renderer, extractor)| {
                 Arc::new(Mutex::new(Camera { renderer, extractor, pixels: vec![0; (size_px.0 * size_px.1 * 3) as usize] }))
             },
         );
-        Self { pour, camera, size_px, late: vec![Scene::default(); delay + 1], delay, frame: 0 }
+        Self { pour, camera, size_px, scenes: vec![Scene::default(); delay_frames + 1], delay_frames, frame: 0 }
     }
 
-    /// One frame with `alpha_deg` commanded; V_e of its picture, px^2, or NaN.
+    /// Lets one frame pass with `alpha_deg` commanded. Returns V_e of its picture in px^2, or NaN.
     pub fn frame(&mut self, alpha_deg: f64) -> f32 {
         let before_deg = self.pour.tilt_deg();
         self.pour.advance(alpha_deg);
-        let (tilt_deg, slots) = (self.pour.tilt_deg(), self.late.len());
-        self.late[self.frame % slots] = Scene::of(self.pour.container(), 0.0, tilt_deg, (tilt_deg - before_deg) * RATE_HZ);
-        let shown = Scene { at_s: self.frame as f64 / RATE_HZ, ..self.late[self.frame.saturating_sub(self.delay) % slots] };
+        let (tilt_deg, slots) = (self.pour.tilt_deg(), self.scenes.len());
+        self.scenes[self.frame % slots] = Scene::of(self.pour.container(), 0.0, tilt_deg, (tilt_deg - before_deg) * RATE_HZ);
+        let shown = Scene { at_s: self.frame as f64 / RATE_HZ, ..self.scenes[self.frame.saturating_sub(self.delay_frames) % slots] };
         self.frame += 1;
         self.camera.as_ref().and_then(|camera| look(camera, &shown, self.size_px)).unwrap_or(f32::NAN)
     }
 }
 
+/// V_e of the picture of `scene`, if it can be used.
 fn look(camera: &Mutex<Camera>, scene: &Scene, (width_px, height_px): (u32, u32)) -> Option<f32> {
     let mut camera = camera.lock().unwrap_or_else(PoisonError::into_inner);
     let Camera { renderer, extractor, pixels } = &mut *camera;

@@ -7,20 +7,29 @@ use std::path::Path;
 use plotters::prelude::*;
 use shared::messages::Telemetry;
 
-type Drawing<'a> = DrawingArea<SVGBackend<'a>, plotters::coord::Shift>;
+/// A part of a picture.
+pub type Drawing<'a> = DrawingArea<SVGBackend<'a>, plotters::coord::Shift>;
 /// One line of a panel: its name, its colour and its points.
 type Line<'a> = (&'a str, RGBColor, Vec<(f64, f64)>);
 
-/// Where the names of the curves begin, px from the left.
+/// Where the names of the curves begin, px from the left: beside the plot, within a picture that is 900 px wide.
 const KEY_FROM_PX: i32 = 760;
 
+/// Colour of the commanded tilt; all colours here are of the palette "tab10", which many plotting programs use.
 const ALPHA: RGBColor = RGBColor(31, 119, 180);
+/// Colour of the measured tilt.
 const MEASURED: RGBColor = RGBColor(255, 127, 14);
+/// Colour of V_e.
 const AREA: RGBColor = RGBColor(44, 160, 44);
+/// Colour of d, the volume that is still to be poured.
 const D: RGBColor = RGBColor(214, 39, 40);
+/// Colour of the poured volume.
 const POURED: RGBColor = RGBColor(148, 103, 189);
 
-/// Draws `ticks` (one pour) to `file` (SVG).
+/// Draws the ticks of one pour to `file` (SVG); `scale_g` is what the scale showed afterwards.
+///
+/// # Errors
+/// When there are no ticks, or the file cannot be written.
 pub fn draw(file: &Path, ticks: &[Telemetry], goal_ml: f32, scale_g: f64) -> Result<(), Box<dyn std::error::Error>> {
     let start_ns = ticks.first().ok_or("no telemetry was heard")?.at_ns;
     let points = |value: &dyn Fn(&Telemetry) -> f32| -> Vec<(f64, f64)> {
@@ -42,12 +51,13 @@ pub fn draw(file: &Path, ticks: &[Telemetry], goal_ml: f32, scale_g: f64) -> Res
     Ok(())
 }
 
+/// Draws one panel with the names of its lines beside it.
 fn panel(area: &Drawing, unit: &str, lines: &[Line]) -> Result<(), Box<dyn std::error::Error>> {
     let all = || lines.iter().flat_map(|l| &l.2);
     let end_s = all().map(|p| p.0).fold(1.0, f64::max);
     let (low, high) = all().fold((0.0f64, 1.0f64), |(l, h), p| (l.min(p.1), h.max(p.1)));
     let margin = 0.05 * (high - low);
-    // Beside the plot, where it hides no curve.
+    // The names stand beside the plot, where they hide no curve.
     let (plot, key) = area.split_horizontally(KEY_FROM_PX);
     for (y, (name, colour, _)) in (20..).step_by(20).zip(lines) {
         key.draw(&PathElement::new([(0, y), (18, y)], colour.stroke_width(2)))?;

@@ -10,7 +10,8 @@ use serde::Serialize;
 use shared::config::{CameraConfig, Config, ImageConfig, LiquidMethod};
 use shared::exit::{self, Failure, OrExit as _};
 
-use crate::inspect::{for_each_frame, to_bgr};
+use crate::drawing::to_bgr;
+use crate::source::for_each_frame;
 
 mod drawn;
 mod measure;

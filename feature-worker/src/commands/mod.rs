@@ -1,5 +1,9 @@
 //! The command line of each subcommand of `feature-worker`: its arguments, its help and what it prints.
 
 pub mod bench;
+pub mod calibrate;
 pub mod episodes;
+pub mod inspect;
+mod page;
 pub mod run;
+pub mod view;

@@ -1,5 +1,5 @@
-//! Pictures for the tests, drawn by a few OpenCV calls: a turning chess board, a glass whose lip is at (215, 250), a stream whose
-//! outer edge cuts the axes at known distances. Knows nothing of how the extraction works.
+//! Pictures for the tests, drawn by a few OpenCV calls: a turning chess board, a glass whose lip is at (215, 250), and a stream whose outer
+//! edge cuts the axes at known distances. Nothing here knows how the extraction works.
 #![allow(dead_code)]
 
 use opencv::core::{self, CV_8UC3, Mat, Point, Point2f, Rect, Scalar, Size, Vector};
@@ -55,7 +55,7 @@ pub fn write_config(
 }
 
 fn polygon(shape: &[[f32; 2]], scale: f32) -> Vector<Point> {
-    // Whole numbers are the pixels' middles.
+    // Whole numbers are the middles of pixels.
     let at = |v: f32| (v * scale + (scale - 1.0) / 2.0).round() as i32;
     shape.iter().map(|p| Point::new(at(p[0]), at(p[1]))).collect()
 }
@@ -73,7 +73,7 @@ pub fn disc(x: f32, y: f32, radius: f32) -> Vec<[f32; 2]> {
     (0..24).map(|k| (k as f32 * std::f32::consts::TAU / 24.0).sin_cos()).map(|(s, c)| [x + radius * c, y + radius * s]).collect()
 }
 
-/// A chess board, turned by `turn_deg` about a point outside the picture and out of focus.
+/// A chess board that is turned by `turn_deg` about a point outside of the picture, and is out of focus.
 pub fn board(turn_deg: f32) -> Result<Mat, opencv::Error> {
     let side = 1600;
     let mut large = Mat::new_rows_cols_with_default(side, side, CV_8UC3, Scalar::all(185.0))?;
@@ -89,7 +89,7 @@ pub fn board(turn_deg: f32) -> Result<Mat, opencv::Error> {
     Ok(soft)
 }
 
-/// Light noise, another for each `seed`.
+/// `picture` with light noise, which is another for each `seed`.
 pub fn noisy(picture: &Mat, seed: i32) -> Result<Mat, opencv::Error> {
     core::set_rng_seed(seed)?;
     let mut noise = picture.clone();
@@ -99,7 +99,7 @@ pub fn noisy(picture: &Mat, seed: i32) -> Result<Mat, opencv::Error> {
     Ok(sum)
 }
 
-/// Share of each pixel that `shapes` cover, 0 to 255.
+/// The share of each pixel that `shapes` cover, 0 to 255.
 fn cover(shapes: &[Vec<[f32; 2]>]) -> Result<Mat, opencv::Error> {
     let mut large = Mat::new_rows_cols_with_default(HEIGHT * FINE, WIDTH * FINE, core::CV_8UC1, Scalar::all(0.0))?;
     for shape in shapes {
@@ -123,7 +123,7 @@ fn pour_over(picture: &mut Mat, shapes: &[Vec<[f32; 2]>]) -> Result<(), opencv::
     Ok(())
 }
 
-/// The glass over everything: a little darker inside, bright lines along top edge and left side.
+/// Draws the glass over everything: it is a little darker inside, with bright lines along its top edge and its left side.
 pub fn glass(picture: &mut Mat) -> Result<(), opencv::Error> {
     let [x, y] = LIP.map(|v| v as i32);
     let mut inside = Mat::roi_mut(picture, Rect::new(x, y, WIDTH - x, HEIGHT - y))?;
@@ -136,15 +136,15 @@ pub fn glass(picture: &mut Mat) -> Result<(), opencv::Error> {
     Ok(())
 }
 
-/// Blue liquid over a board, without glass; `seed` gives each picture its own noise.
+/// Blue liquid over a board, without a glass. `seed` gives each picture its own noise.
 pub fn blue(shapes: &[Vec<[f32; 2]>], seed: i32) -> Result<Mat, opencv::Error> {
     let mut picture = board(seed as f32)?;
     pour_over(&mut picture, shapes)?;
     noisy(&picture, seed)
 }
 
-/// Frame `i` of a pour of blue liquid from a glass that turns by one degree a frame: dry up to frame 7, the largest triangle
-/// (90 x 80 px) at frame 20, dry from 33 on.
+/// Frame `i` of a pour of blue liquid from a glass that turns by one degree a frame. It is dry up to frame 7 and from frame 33 on; the
+/// largest triangle (90 x 80 px) is at frame 20.
 pub fn pour(i: i32) -> Result<Mat, opencv::Error> {
     let mut picture = board(i as f32)?;
     let share = (1.0 - (i - 20) as f32 / 13.0 * if i < 20 { -1.0 } else { 1.0 }).max(0.0);
@@ -162,8 +162,8 @@ pub fn dry(turn_deg: f32, seed: i32) -> Result<Mat, opencv::Error> {
     noisy(&picture, seed)
 }
 
-/// A frame of clear water before a board that turns, or before an even wall: water takes a little light, and much along its edge.
-/// `share` of a triangle of 90 x 80 px; 0: dry.
+/// A frame of clear water before a board that turns, or before an even wall. Water takes a little light, and much along its edge. The
+/// legs of its triangle are `share` of 90 x 80 px; with 0 it is dry.
 pub fn water(share: f32, turn_deg: Option<f32>, seed: i32) -> Result<Mat, opencv::Error> {
     let mut picture = match turn_deg {
         Some(turn_deg) => board(turn_deg)?,

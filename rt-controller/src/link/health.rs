@@ -1,7 +1,7 @@
 //! Whether the robot may be moved now, and if not, why: a pure function of the newest state and the clock.
 //!
-//! Runs in the controller's loop each tick, after [`Session::poll`](super::Session::poll); allocates nothing. Protocol
-//! background: robot_mode, safety_mode, runtime_state and the status bits of the RTDE guide.
+//! Runs in the controller's loop in each tick, after [`Session::poll`](super::Session::poll); does not allocate or fail. The RTDE guide
+//! explains robot_mode, safety_mode, runtime_state and the status bits.
 
 use shared::control::EndReason;
 
@@ -9,11 +9,11 @@ use super::{ProgramState, RobotState};
 
 /// `Ok` if targets may be sent, otherwise the one reason that comes first for the operator.
 ///
-/// `lost_ns` (`controller.lost_robot_ms`) is how long the robot may be silent, its clock may stand still, and its program may
-/// leave targets unread.
+/// `lost_ns` (`controller.lost_robot_ms`) is how long the robot may be silent, how long its clock may stand still, and how long its
+/// program may leave targets unread.
 pub fn check(state: &RobotState, now_ns: u64, lost_ns: u64) -> Result<(), EndReason> {
     let older = |at_ns: u64| now_ns.saturating_sub(at_ns) > lost_ns;
-    // A state that old says nothing about now.
+    // A state that is so old says nothing about now.
     if older(state.received_at_ns) {
         return Err(EndReason::RobotLost);
     }
@@ -24,7 +24,7 @@ pub fn check(state: &RobotState, now_ns: u64, lost_ns: u64) -> Result<(), EndRea
         return Err(EndReason::RobotStalled);
     }
     match state.program_state {
-        // The program ran out of patience. If it has read all that was sent, we were silent; if not, it did not get through.
+        // The program heard nothing for too long. If it has read all that was sent, the controller was silent; if not, the link was.
         ProgramState::Returning | ProgramState::TimedOut if state.sequence_echo == state.sequence_sent => {
             return Err(EndReason::ControllerOverrun);
         }
@@ -32,7 +32,7 @@ pub fn check(state: &RobotState, now_ns: u64, lost_ns: u64) -> Result<(), EndRea
         state if !state.takes_targets() => return Err(EndReason::ProgramStopped),
         _ => {}
     }
-    // By the robot's clock: while that stands still, no program can answer, and it is not the program that has stopped.
+    // Measured by the robot's clock: while that stands still no program can answer, and the program is not what has stopped.
     let unread = state.advanced_at_ns.saturating_sub(state.answered_at_ns) > lost_ns;
     if state.runtime_state != RUNTIME_PLAYING || unread {
         return Err(EndReason::ProgramStopped);
@@ -48,28 +48,49 @@ pub(crate) fn hindrance(state: &RobotState) -> Option<EndReason> {
     if state.robot_mode != ROBOT_MODE_RUNNING {
         return Some(EndReason::RobotNotRunning);
     }
-    // A slower robot stretches the time of servoj: the program's patience, and each target's period with it.
-    // Written so that a share that is not a number is too small.
+    // A slower robot stretches the time of servoj, and with it the program's patience and each target's period. The comparison is
+    // written so that a fraction that is not a number is too small.
     if state.speed_fraction >= FULL_SPEED { None } else { Some(EndReason::SpeedReduced) }
 }
 
 /// Why the robot's safety system keeps it from moving, if it does.
 pub(crate) fn stopped_for_safety(state: &RobotState) -> Option<EndReason> {
-    // safety_status_bits: 2 protective stop, 5 to 7 emergency stops.
-    let bit = |n: u32| state.safety_bits >> n & 1 == 1;
+    let any_bit = |bits: u32| state.safety_bits & bits != 0;
     match state.safety_mode {
-        6 | 7 => Some(EndReason::EmergencyStop),
-        _ if bit(5) || bit(6) || bit(7) => Some(EndReason::EmergencyStop),
-        3 => Some(EndReason::ProtectiveStop),
-        _ if bit(2) => Some(EndReason::ProtectiveStop),
-        1 | 2 => None,
+        SAFETY_MODE_SYSTEM_EMERGENCY_STOP | SAFETY_MODE_ROBOT_EMERGENCY_STOP => Some(EndReason::EmergencyStop),
+        _ if any_bit(EMERGENCY_STOP_BITS) => Some(EndReason::EmergencyStop),
+        SAFETY_MODE_PROTECTIVE_STOP => Some(EndReason::ProtectiveStop),
+        _ if any_bit(PROTECTIVE_STOP_BIT) => Some(EndReason::ProtectiveStop),
+        SAFETY_MODE_NORMAL | SAFETY_MODE_REDUCED => None,
         _ => Some(EndReason::SafetyStop),
     }
 }
 
 /// Least `target_speed_fraction` that counts as full speed; the pendant's slider has steps of 0.01.
 const FULL_SPEED: f64 = 0.995;
-/// robot_mode while the robot is powered and its brakes are released.
+/// `robot_mode` while the robot is powered and its brakes are released (RTDE guide).
 pub(crate) const ROBOT_MODE_RUNNING: i32 = 7;
-/// runtime_state while a program plays.
+/// `runtime_state` while a program is being stopped (RTDE guide).
+pub(crate) const RUNTIME_STOPPING: u32 = 0;
+/// `runtime_state` while no program runs (RTDE guide).
+pub(crate) const RUNTIME_STOPPED: u32 = 1;
+/// `runtime_state` while a program plays (RTDE guide).
 pub(crate) const RUNTIME_PLAYING: u32 = 2;
+/// `runtime_state` while a program is being paused (RTDE guide).
+pub(crate) const RUNTIME_PAUSING: u32 = 3;
+/// `runtime_state` while a program is paused (RTDE guide).
+pub(crate) const RUNTIME_PAUSED: u32 = 4;
+/// `safety_mode` of a robot without hindrance (RTDE guide).
+const SAFETY_MODE_NORMAL: i32 = 1;
+/// `safety_mode` of a robot under its reduced limits (RTDE guide).
+const SAFETY_MODE_REDUCED: i32 = 2;
+/// `safety_mode` after a protective stop (RTDE guide).
+const SAFETY_MODE_PROTECTIVE_STOP: i32 = 3;
+/// `safety_mode` after an emergency stop by the system (RTDE guide).
+const SAFETY_MODE_SYSTEM_EMERGENCY_STOP: i32 = 6;
+/// `safety_mode` after an emergency stop at the robot (RTDE guide).
+const SAFETY_MODE_ROBOT_EMERGENCY_STOP: i32 = 7;
+/// The bit of `safety_status_bits` for a protective stop (RTDE guide).
+const PROTECTIVE_STOP_BIT: u32 = 1 << 2;
+/// The bits of `safety_status_bits` for emergency stops: system, robot, any (RTDE guide).
+const EMERGENCY_STOP_BITS: u32 = 1 << 5 | 1 << 6 | 1 << 7;

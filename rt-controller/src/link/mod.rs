@@ -7,10 +7,10 @@
 //! | [`health::check`] | the controller's loop (pure) | no |
 //! | dropping a [`Session`] | an ordinary thread | frees |
 //!
-//! The loop owns a [`Session`] from the moment an ordinary thread hands it over until [`health::check`] names a reason or
-//! `poll` or `send` fails; then it stops sending and hands the session back to be dropped, which sends a last
-//! [`Mode::Stop`] or [`Mode::Abandon`]. Silence is the universal stop: the program on the robot (`robot/pour.script`) brings the container upright
-//! by itself 100 ms after the last target.
+//! An ordinary thread hands a [`Session`] over to the loop. The loop owns it until [`health::check`] names a reason, or `poll` or `send`
+//! fails; then it stops sending and hands the session back. Dropping the session sends a last [`Mode::Stop`] or [`Mode::Abandon`].
+//! Silence always stops the robot: the program on it (`robot/pour.script`) brings the container upright by itself 100 ms after the last
+//! target. Each failure is a [`LinkError`] or a [`Lost`], one line for the operator.
 //!
 //! Registers, counted from `robot.register_base` (b); all are RTDE general purpose registers:
 //!
@@ -25,28 +25,34 @@
 //! | `output_double_register_b` | angle that the program commands to servoj, rad |
 
 pub mod connect;
+mod dialogue;
+mod error;
 pub mod health;
 pub mod program;
 pub mod session;
 pub mod wire;
 
-pub use connect::{LinkError, LinkOptions, connect};
+pub use connect::connect;
+pub use error::LinkError;
 pub use session::{Lost, Session};
 
-use shared::config::{Joint, RobotConfig};
+use std::net::IpAddr;
 
-/// What the program on the robot shall do; the code in `input_int_register_b+1`.
+use shared::config::{Config, Joint, RobotConfig};
+use shared::limits::Limits;
+
+/// What the program on the robot is to do; the code in `input_int_register_b+1`.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[repr(i32)]
 pub enum Mode {
-    /// Brake to rest and stay there; the target is ignored.
+    /// Brakes to rest and stays there; the target is ignored.
     Hold = 1,
-    /// Follow the targets.
+    /// Follows the targets.
     Stream = 2,
-    /// Come upright at the return rate, then end the program.
+    /// Comes upright at the return rate, and then ends the program.
     Stop = 3,
-    /// Like [`Mode::Stop`], for a robot that stopped by itself in mid-motion: when its program is resumed, it begins from
-    /// where the joint then is, and from rest.
+    /// Like [`Mode::Stop`], for a robot that stopped by itself in mid-motion: when its program is resumed, it begins at rest from where
+    /// the joint then is.
     Abandon = 4,
 }
 
@@ -54,30 +60,30 @@ pub enum Mode {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 #[repr(i32)]
 pub enum ProgramState {
-    /// Nothing written yet, or a code that this version does not know.
+    /// Nothing has been written yet, or a code that this version does not know.
     #[default]
     Unknown = 0,
-    /// Started; waits for the first target.
+    /// The program has started and waits for the first target.
     Ready = 1,
-    /// Follows the targets.
+    /// It follows the targets.
     Following = 2,
-    /// Holds still on command.
+    /// It holds still on command.
     Holding = 3,
-    /// No new target for 100 ms: on its way upright.
+    /// No new target came for 100 ms; the container is on its way upright.
     Returning = 4,
-    /// Ended: upright after [`ProgramState::Returning`].
+    /// The program has ended, upright, after [`ProgramState::Returning`].
     TimedOut = 5,
-    /// On its way upright on command.
+    /// The container is on its way upright on command.
     Stopping = 6,
-    /// Ended: upright after [`ProgramState::Stopping`].
+    /// The program has ended, upright, after [`ProgramState::Stopping`].
     Stopped = 7,
-    /// Ended without moving: the joint was too far from the start angle.
+    /// The program has ended without moving, because the joint was too far from the start angle.
     TooFar = 8,
-    /// The joint was not where it was commanded to be: on its way upright from where it is.
+    /// The joint was not where it was commanded to be; it is on its way upright from where it is.
     OffTrack = 9,
-    /// Ended: upright after [`ProgramState::OffTrack`].
+    /// The program has ended, upright, after [`ProgramState::OffTrack`].
     OffTrackEnded = 10,
-    /// Ended without moving: no first target came within two seconds.
+    /// The program has ended without moving, because no first target came within two seconds.
     Unused = 11,
 }
 
@@ -97,7 +103,7 @@ impl ProgramState {
     }
 }
 
-/// The newest that is known of the robot.
+/// The newest known state of the robot.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct RobotState {
     /// The robot's clock, s since its controller started.
@@ -106,17 +112,17 @@ pub struct RobotState {
     pub alpha_deg: f32,
     /// Measured rate of alpha, degrees/s.
     pub alpha_rate_deg_s: f32,
-    /// Alpha that the robot's servo is steering to at this moment (`target_q`), degrees.
+    /// Alpha that the robot's servo steers to at this moment (`target_q`), degrees.
     pub alpha_target_deg: f32,
     /// Alpha that the program last gave to servoj, degrees.
     pub alpha_command_deg: f32,
-    /// `robot_mode`; 7 = running.
+    /// `robot_mode`; 7: running.
     pub robot_mode: i32,
-    /// `safety_mode`; 1 = normal, 2 = reduced.
+    /// `safety_mode`; 1: normal, 2: reduced.
     pub safety_mode: i32,
     /// `safety_status_bits`.
     pub safety_bits: u32,
-    /// `runtime_state`; 2 = playing.
+    /// `runtime_state`; 2: playing.
     pub runtime_state: u32,
     /// `target_speed_fraction`: the pendant's speed slider, 0 to 1.
     pub speed_fraction: f64,
@@ -128,7 +134,7 @@ pub struct RobotState {
     pub sequence_echo: i32,
     /// Number of the newest target that was sent; 0 before the first.
     pub sequence_sent: i32,
-    /// When this was taken from the socket, CLOCK_MONOTONIC ns.
+    /// When this state was taken from the socket, CLOCK_MONOTONIC ns.
     pub received_at_ns: u64,
     /// When the robot's clock was last seen to advance, CLOCK_MONOTONIC ns.
     pub advanced_at_ns: u64,
@@ -136,7 +142,7 @@ pub struct RobotState {
     pub answered_at_ns: u64,
 }
 
-/// Where the tilting joint is for a given alpha: q = start + direction * alpha.
+/// Which joint tilts the container, and where it is at a given alpha: q = start + direction * alpha.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct TiltJoint {
     /// Which joint.
@@ -161,5 +167,43 @@ impl TiltJoint {
     /// Alpha in degrees at a joint angle in rad.
     pub fn alpha_deg(&self, joint_rad: f64) -> f32 {
         (self.direction * (joint_rad.to_degrees() - self.start_deg)) as f32
+    }
+}
+
+/// Where the robot is, and how the program on it is to move.
+#[derive(Debug, Clone, PartialEq)]
+pub struct LinkOptions {
+    /// The UR controller's address.
+    pub address: IpAddr,
+    /// The joint that tilts the container.
+    pub tilt: TiltJoint,
+    /// Largest distance of the joint from its start angle at which the program starts, degrees.
+    pub start_tolerance_deg: f64,
+    /// First RTDE register that is used.
+    pub register_base: u8,
+    /// servoj lookahead time, s.
+    pub lookahead_s: f64,
+    /// servoj gain.
+    pub gain: f64,
+    /// Limits on alpha, which the program keeps too.
+    pub limits: Limits,
+    /// Targets a second.
+    pub rate_hz: f64,
+}
+
+impl LinkOptions {
+    /// The link's part of the cell's configuration.
+    pub fn new(config: &Config) -> Self {
+        let robot = &config.robot;
+        Self {
+            address: robot.address,
+            tilt: TiltJoint::new(robot),
+            start_tolerance_deg: robot.start_tolerance_deg,
+            register_base: robot.register_base,
+            lookahead_s: robot.lookahead_s,
+            gain: robot.gain,
+            limits: config.limits,
+            rate_hz: config.controller.rate_hz,
+        }
     }
 }

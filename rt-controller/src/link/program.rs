@@ -1,13 +1,13 @@
 //! The text of the program on the robot: `robot/pour.script` with this cell's values filled in.
 //!
-//! Runs on an ordinary thread at connecting; allocates. Values that the program could not keep are refused.
+//! Runs on the connecting thread; allocates. Values that the program could not keep are refused with a [`LinkError`].
 
 use super::{LinkError, LinkOptions};
 
-/// The program as it stands in the repository, with example values.
+/// The program as it stands in `robot/pour.script`, with example values.
 pub const SOURCE: &str = include_str!("../../robot/pour.script");
 
-/// Most cycles that the program averages over: keeps its list, and the delay, small.
+/// Most cycles that the program averages over, so that its list and its delay stay small. Chosen by hand; no measurement is recorded.
 const MOST_CYCLES: f64 = 100.0;
 
 /// The program for `options` on a robot with a control cycle of `cycle_s` (0.008 on CB3, 0.002 on e-Series).
@@ -17,7 +17,8 @@ pub fn text(options: &LinkOptions, cycle_s: f64, run: i32) -> Result<String, Lin
     let limits = &options.limits;
     let period_s = 1.0 / options.rate_hz;
     let braking_s = f64::from(limits.rate_deg_s) / f64::from(limits.acceleration_deg_s2);
-    // Cycles that the program averages over: a whole target period to be smooth, the braking time to stop in time.
+    // The program averages over this many cycles: at least a target's period, to be smooth, and at least the braking time, to stop
+    // before the target.
     let length = (period_s.max(braking_s) / cycle_s - 1e-6).ceil();
     if !(1.0..=MOST_CYCLES).contains(&length) {
         return Err(LinkError::Limits { smoothing_s: period_s.max(braking_s), most_s: MOST_CYCLES * cycle_s });
@@ -25,7 +26,8 @@ pub fn text(options: &LinkOptions, cycle_s: f64, run: i32) -> Result<String, Lin
     let rad = |deg: f32| f64::from(deg).to_radians();
     let return_rate = rad(limits.return_rate_deg_s.min(limits.rate_deg_s));
     let patience_s = patience_s(options.rate_hz);
-    // The way upright and its settling, four times over for a speed slider at a quarter: the program's own way comes first.
+    // The watchdog must wait until the program's own way upright is done, also at a quarter of the speed: four times patience, way and
+    // settling.
     let way_s = patience_s + (rad(limits.alpha_max_deg - limits.alpha_min_deg)) / return_rate + length * cycle_s + 0.3;
     let watchdog_hz = 1.0 / (1.0 + 4.0 * way_s);
 
@@ -53,7 +55,7 @@ pub fn text(options: &LinkOptions, cycle_s: f64, run: i32) -> Result<String, Lin
     ];
     let mut text = String::with_capacity(SOURCE.len() + 1024);
     for line in SOURCE.lines() {
-        // Only the block of values is indented by two, in capitals, and among these names.
+        // Only lines of the block of values are indented by two and begin with one of these names.
         let filled = values.iter().find(|(name, _)| line.strip_prefix("  ").is_some_and(|l| l.starts_with(&format!("{name} = "))));
         match filled {
             Some((name, value)) => text.push_str(&format!("  {name} = {value}")),
@@ -64,7 +66,7 @@ pub fn text(options: &LinkOptions, cycle_s: f64, run: i32) -> Result<String, Lin
     Ok(text)
 }
 
-/// How long the program goes without a new target before it comes upright, s: 100 ms, or three periods of slower streams.
+/// How long the program waits for a new target before it comes upright, s: 100 ms, or three periods if that is more.
 pub fn patience_s(rate_hz: f64) -> f64 {
     (3.0 / rate_hz).max(0.1)
 }

@@ -1,9 +1,9 @@
-//! A connected robot in the controller's loop: drains what the robot sent, writes one target a tick.
+//! A connected robot in the controller's loop: reads what the robot sent, and writes one target a tick.
 //!
-//! Made by [`connect`](super::connect()) on an ordinary thread, which also drops it. `poll` and `send` never block, never
-//! allocate and never panic: the one buffer holds the protocol's largest frame. Whatever goes wrong on the socket ends the
-//! session with a [`Lost`]; there is no repair in place. Dropping it asks the program to come upright and end, in case it can
-//! still hear; if it cannot, it does so by itself 100 ms after the last target.
+//! [`connect`](super::connect()) makes it on an ordinary thread, which also drops it. `poll` and `send` never block, allocate or panic:
+//! the one buffer holds the protocol's largest packet. Every error of the socket ends the session with a [`Lost`]; nothing is repaired in
+//! place. Dropping a session asks the program to come upright and end. If the program cannot receive that, it does so by itself 100 ms
+//! after the last target.
 
 use std::io::{ErrorKind, Read, Write};
 use std::net::{Shutdown, TcpStream};
@@ -14,7 +14,8 @@ use super::health::{self, RUNTIME_PLAYING};
 use super::wire::{self, Inbox, Outputs};
 use super::{Mode, RobotState, TiltJoint};
 
-/// Most reads of one [`Session::poll`]: a robot that floods us cannot keep the loop (16 x 64 KiB; 500 Hz for 10 s).
+/// Most reads of one [`Session::poll`], so that a robot that floods the link cannot hold the loop: 16 of 64 KiB are 10 s of packets at
+/// 500 Hz.
 const MOST_READS: usize = 16;
 
 /// Why a session is over.
@@ -66,17 +67,17 @@ impl Session {
         self.version
     }
 
-    /// The newest state; old if [`Session::poll`] was not called.
+    /// The newest state; it is only as new as the last [`Session::poll`].
     pub fn state(&self) -> &RobotState {
         &self.state
     }
 
-    /// Text frames received since the hand-over.
+    /// Number of text messages received since the hand-over.
     pub fn texts(&self) -> u64 {
         self.texts
     }
 
-    /// Takes everything that has arrived and gives the newest state; once a tick, before [`super::health::check`].
+    /// Takes everything that has arrived and gives the newest state. Call it once a tick, before [`super::health::check`].
     pub fn poll(&mut self, now_ns: u64) -> Result<&RobotState, Lost> {
         for _ in 0..MOST_READS {
             let space = self.inbox.space();
@@ -89,7 +90,7 @@ impl Session {
                 Err(_) => return Err(Lost::Broken),
             };
             self.inbox.filled(n);
-            self.take_frames(now_ns)?;
+            self.take_packets(now_ns)?;
             if n < most {
                 break;
             }
@@ -97,11 +98,12 @@ impl Session {
         Ok(&self.state)
     }
 
-    fn take_frames(&mut self, now_ns: u64) -> Result<(), Lost> {
-        while let Some(frame) = self.inbox.next_frame().map_err(|_| Lost::Protocol)? {
-            match frame.kind {
+    /// Reads the whole packets that have arrived into the state.
+    fn take_packets(&mut self, now_ns: u64) -> Result<(), Lost> {
+        while let Some(packet) = self.inbox.next_packet().map_err(|_| Lost::Protocol)? {
+            match packet.kind {
                 wire::DATA => {
-                    let outputs = Outputs::new_checked(frame.payload, self.output_recipe).ok_or(Lost::Protocol)?;
+                    let outputs = Outputs::new_checked(packet.payload, self.output_recipe).ok_or(Lost::Protocol)?;
                     let before = self.state;
                     outputs.fill(&self.tilt, &mut self.state);
                     self.state.received_at_ns = now_ns;
@@ -114,7 +116,7 @@ impl Session {
                     }
                 }
                 wire::TEXT => self.texts += 1,
-                // An answer that came late, or a type of a newer protocol: not ours to judge.
+                // Answers that came late, and types of newer protocols, do not matter here.
                 _ => {}
             }
         }
@@ -123,15 +125,15 @@ impl Session {
 
     /// Sends one target and gives its number. An alpha that is not finite is sent as [`Mode::Hold`].
     ///
-    /// Either the whole frame goes to the kernel at once, or the session is over.
+    /// Either the whole packet goes to the kernel at once, or the session is over.
     pub fn send(&mut self, mode: Mode, alpha_deg: f32) -> Result<i32, Lost> {
         let (mode, alpha_deg) = if alpha_deg.is_finite() { (mode, alpha_deg) } else { (Mode::Hold, self.state.alpha_deg) };
         let sequence = self.state.sequence_sent.checked_add(1).unwrap_or(1);
-        let frame = wire::encode_target(self.input_recipe, sequence, mode as i32, self.tilt.joint_rad(alpha_deg));
+        let packet = wire::encode_target(self.input_recipe, sequence, mode as i32, self.tilt.joint_rad(alpha_deg));
         loop {
-            match self.stream.write(&frame) {
-                Ok(n) if n == frame.len() => break,
-                // Part of a frame went out; the rest could only follow later.
+            match self.stream.write(&packet) {
+                Ok(n) if n == packet.len() => break,
+                // A part of the packet went out; the rest could only follow later.
                 Ok(_) => return Err(Lost::WouldBlock),
                 Err(e) if e.kind() == ErrorKind::WouldBlock => return Err(Lost::WouldBlock),
                 Err(e) if e.kind() == ErrorKind::Interrupted => {}
@@ -145,7 +147,7 @@ impl Session {
 
 impl Drop for Session {
     fn drop(&mut self) {
-        // Unread bytes at the close would make the kernel abort the connection, and this last target with it.
+        // If bytes were left unread, the kernel would reset the connection, and this last target would be lost with it.
         let _ = self.poll(now_ns());
         let stopped = self.state.runtime_state != RUNTIME_PLAYING || health::stopped_for_safety(&self.state).is_some();
         let _ = self.send(if stopped { Mode::Abandon } else { Mode::Stop }, 0.0);

@@ -1,7 +1,10 @@
-//! RTDE frames (protocol 2, big-endian): checked views of what the robot sends, and the few frames that we send.
+//! RTDE packets (protocol 2, big-endian): checked views of what the robot sends, and the few packets that are sent to it.
 //!
-//! Pure; used by the connecting thread and by the loop. Allocates nothing but [`Inbox::new`]'s one buffer. No bytes make
-//! anything here panic; what does not fit gives `None` or [`Malformed`]. Frame = u16 size of the whole frame, u8 type, payload.
+//! Pure; used by the connecting thread and by the loop. Nothing allocates but [`Inbox::new`], once, and the lists of names, which only
+//! the connecting thread asks for. No bytes make anything here panic: what does not fit gives `None` or [`Malformed`].
+//!
+//! A packet is a u16 with the size of the whole packet, a u8 with its type, and its payload. Where a value lies in a data packet follows
+//! from the two lists of variables, `OUTPUTS` and `INPUTS`, which is computed and checked at compile time.
 
 use super::{ProgramState, RobotState, TiltJoint};
 
@@ -20,28 +23,28 @@ pub const SETUP_INPUTS: u8 = b'I';
 /// CONTROL_PACKAGE_START, 'S'.
 pub const START: u8 = b'S';
 
-/// Bytes before the payload.
+/// Bytes before the payload: the size and the type.
 const HEADER: usize = 3;
-/// The largest frame that its u16 size can announce.
+/// The largest packet that its u16 size can announce, bytes.
 const LARGEST: usize = u16::MAX as usize;
-/// Length of a frame with one target.
-pub const TARGET_LEN: usize = HEADER + 1 + 4 + 4 + 8;
+/// Bytes of a packet with one target: header, recipe id, and the values of `INPUTS`.
+pub const TARGET_LEN: usize = HEADER + 1 + bytes_of(&INPUTS);
 
-/// One whole frame.
+/// One whole packet.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct Frame<'a> {
+pub struct Packet<'a> {
     /// Its type.
     pub kind: u8,
     /// What follows the header.
     pub payload: &'a [u8],
 }
 
-/// The byte stream is not RTDE: a frame announces a size smaller than its own header.
+/// The byte stream is not RTDE: a packet announces a size smaller than its own header.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
-#[error("a frame announces {0} bytes, less than its own header")]
+#[error("a packet announces {0} bytes, less than its own header")]
 pub struct Malformed(pub u16);
 
-/// Puts frames together from whatever pieces the socket delivers.
+/// Puts packets together from whatever pieces the socket delivers.
 #[derive(Debug)]
 pub struct Inbox {
     buffer: Box<[u8]>,
@@ -56,12 +59,13 @@ impl Default for Inbox {
 }
 
 impl Inbox {
-    /// An empty inbox; its only allocation. One byte more than the largest frame, so that there is always space.
+    /// An empty inbox; its only allocation. It holds one byte more than the largest packet, so that there is always
+    /// space.
     pub fn new() -> Self {
         Self { buffer: vec![0; LARGEST + 1].into_boxed_slice(), start: 0, end: 0 }
     }
 
-    /// Where the socket's next bytes go; never empty once [`Inbox::next_frame`] has given `None`.
+    /// Where the socket's next bytes go; never empty once [`Inbox::next_packet`] has given `None`.
     pub fn space(&mut self) -> &mut [u8] {
         self.buffer.copy_within(self.start..self.end, 0);
         self.end -= self.start;
@@ -74,8 +78,8 @@ impl Inbox {
         self.end = (self.end + n).min(self.buffer.len());
     }
 
-    /// The next whole frame; `None` until more bytes come.
-    pub fn next_frame(&mut self) -> Result<Option<Frame<'_>>, Malformed> {
+    /// The next whole packet; `None` until more bytes come.
+    pub fn next_packet(&mut self) -> Result<Option<Packet<'_>>, Malformed> {
         let waiting = &self.buffer[self.start..self.end];
         let &[high, low, kind, ..] = waiting else { return Ok(None) };
         let size = u16::from_be_bytes([high, low]);
@@ -84,11 +88,11 @@ impl Inbox {
         }
         let Some(payload) = waiting.get(HEADER..usize::from(size)) else { return Ok(None) };
         self.start += usize::from(size);
-        Ok(Some(Frame { kind, payload }))
+        Ok(Some(Packet { kind, payload }))
     }
 }
 
-/// Writes a frame into `out` and gives its bytes; `None` if it does not fit into `out` or into a frame.
+/// Writes a packet into `out` and gives its bytes; `None` if it does not fit into `out` or into a packet.
 pub fn encode<'a>(kind: u8, parts: &[&[u8]], out: &'a mut [u8]) -> Option<&'a [u8]> {
     let size = HEADER + parts.iter().map(|p| p.len()).sum::<usize>();
     let out = out.get_mut(..size)?;
@@ -103,11 +107,11 @@ pub fn encode<'a>(kind: u8, parts: &[&[u8]], out: &'a mut [u8]) -> Option<&'a [u
     Some(out)
 }
 
-/// The DATA_PACKAGE with one target: number, mode code and joint angle in rad, in the order of [`input_names`].
+/// The DATA_PACKAGE with one target: number, mode code and joint angle in rad, in the order of `INPUTS`.
 pub fn encode_target(recipe: u8, sequence: i32, mode: i32, joint_rad: f64) -> [u8; TARGET_LEN] {
     let mut out = [0; TARGET_LEN];
     let parts: [&[u8]; 4] = [&[recipe], &sequence.to_be_bytes(), &mode.to_be_bytes(), &joint_rad.to_be_bytes()];
-    // Cannot fail: TARGET_LEN is the sum of the parts (held by a test).
+    // It fits: TARGET_LEN is the sum of the parts.
     let _ = encode(DATA, &parts, &mut out);
     out
 }
@@ -145,44 +149,168 @@ pub fn text(payload: &[u8]) -> Option<(u8, &[u8])> {
     Some((level, message))
 }
 
-/// Names and types of the outputs that we ask for, with registers from `base`; [`Outputs`] reads them.
-pub fn output_names(base: u8) -> [(String, &'static str); 13] {
-    let plain = |name: &str, kind| (name.to_owned(), kind);
-    [
-        plain("timestamp", "DOUBLE"),
-        plain("actual_q", "VECTOR6D"),
-        plain("target_q", "VECTOR6D"),
-        plain("actual_qd", "VECTOR6D"),
-        plain("robot_mode", "INT32"),
-        plain("safety_mode", "INT32"),
-        plain("safety_status_bits", "UINT32"),
-        plain("runtime_state", "UINT32"),
-        (format!("output_int_register_{base}"), "INT32"),
-        (format!("output_int_register_{}", u32::from(base) + 1), "INT32"),
-        (format!("output_int_register_{}", u32::from(base) + 2), "INT32"),
-        (format!("output_double_register_{base}"), "DOUBLE"),
-        plain("target_speed_fraction", "DOUBLE"),
-    ]
+/// A type of RTDE values.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Type {
+    Double,
+    Vector6d,
+    Int32,
+    Uint32,
 }
 
-/// Names and types of the inputs that we write, with registers from `base`; [`encode_target`] writes them.
-pub fn input_names(base: u8) -> [(String, &'static str); 3] {
-    [
-        (format!("input_int_register_{base}"), "INT32"),
-        (format!("input_int_register_{}", u32::from(base) + 1), "INT32"),
-        (format!("input_double_register_{base}"), "DOUBLE"),
-    ]
+impl Type {
+    /// Bytes of one value.
+    const fn bytes(self) -> usize {
+        match self {
+            Self::Double => 8,
+            Self::Vector6d => 6 * 8,
+            Self::Int32 | Self::Uint32 => 4,
+        }
+    }
+
+    /// The type as the robot names it.
+    const fn name(self) -> &'static str {
+        match self {
+            Self::Double => "DOUBLE",
+            Self::Vector6d => "VECTOR6D",
+            Self::Int32 => "INT32",
+            Self::Uint32 => "UINT32",
+        }
+    }
 }
 
-/// A DATA_PACKAGE in our output recipe, checked once for recipe and length.
+/// A variable of a recipe.
+#[derive(Debug, Clone, Copy)]
+struct Variable {
+    /// Its name; that of a register without the number.
+    name: &'static str,
+    /// The number of a register, counted from `robot.register_base`; `None`: this is no register.
+    register: Option<u8>,
+    kind: Type,
+}
+
+impl Variable {
+    const fn plain(name: &'static str, kind: Type) -> Self {
+        Self { name, register: None, kind }
+    }
+
+    const fn register(name: &'static str, number: u8, kind: Type) -> Self {
+        Self { name, register: Some(number), kind }
+    }
+
+    fn full_name(&self, base: u8) -> String {
+        match self.register {
+            Some(number) => format!("{}_{}", self.name, u32::from(base) + u32::from(number)),
+            None => self.name.to_owned(),
+        }
+    }
+}
+
+/// The outputs that are asked of the robot, in the order of their values in a data packet.
+const OUTPUTS: [Variable; 13] = [
+    Variable::plain("timestamp", Type::Double),
+    Variable::plain("actual_q", Type::Vector6d),
+    Variable::plain("target_q", Type::Vector6d),
+    Variable::plain("actual_qd", Type::Vector6d),
+    Variable::plain("robot_mode", Type::Int32),
+    Variable::plain("safety_mode", Type::Int32),
+    Variable::plain("safety_status_bits", Type::Uint32),
+    Variable::plain("runtime_state", Type::Uint32),
+    Variable::register("output_int_register", 0, Type::Int32),
+    Variable::register("output_int_register", 1, Type::Int32),
+    Variable::register("output_int_register", 2, Type::Int32),
+    Variable::register("output_double_register", 0, Type::Double),
+    Variable::plain("target_speed_fraction", Type::Double),
+];
+
+/// Where the values of `OUTPUTS` begin in a data packet, bytes behind the recipe id.
+mod at {
+    use super::{OUTPUTS, Type, offset};
+
+    /// The robot's clock.
+    pub const TIMESTAMP: usize = offset(&OUTPUTS, 0, "timestamp", Type::Double);
+    /// Measured joint angles.
+    pub const ACTUAL_Q: usize = offset(&OUTPUTS, 1, "actual_q", Type::Vector6d);
+    /// Joint angles that the servo steers to.
+    pub const TARGET_Q: usize = offset(&OUTPUTS, 2, "target_q", Type::Vector6d);
+    /// Measured joint rates.
+    pub const ACTUAL_QD: usize = offset(&OUTPUTS, 3, "actual_qd", Type::Vector6d);
+    /// The robot's mode.
+    pub const ROBOT_MODE: usize = offset(&OUTPUTS, 4, "robot_mode", Type::Int32);
+    /// The safety system's mode.
+    pub const SAFETY_MODE: usize = offset(&OUTPUTS, 5, "safety_mode", Type::Int32);
+    /// The safety system's bits.
+    pub const SAFETY_BITS: usize = offset(&OUTPUTS, 6, "safety_status_bits", Type::Uint32);
+    /// Whether a program runs.
+    pub const RUNTIME_STATE: usize = offset(&OUTPUTS, 7, "runtime_state", Type::Uint32);
+    /// What our program is doing.
+    pub const PROGRAM_STATE: usize = offset(&OUTPUTS, 8, "output_int_register", Type::Int32);
+    /// The newest target that our program has read.
+    pub const SEQUENCE_ECHO: usize = offset(&OUTPUTS, 9, "output_int_register", Type::Int32);
+    /// The run number of our program.
+    pub const PROGRAM_RUN: usize = offset(&OUTPUTS, 10, "output_int_register", Type::Int32);
+    /// The joint angle that our program commands.
+    pub const COMMAND: usize = offset(&OUTPUTS, 11, "output_double_register", Type::Double);
+    /// The pendant's speed slider.
+    pub const SPEED_FRACTION: usize = offset(&OUTPUTS, 12, "target_speed_fraction", Type::Double);
+}
+
+/// The inputs that are written, in the order of their values in a data packet; [`encode_target`] writes them.
+const INPUTS: [Variable; 3] = [
+    Variable::register("input_int_register", 0, Type::Int32),
+    Variable::register("input_int_register", 1, Type::Int32),
+    Variable::register("input_double_register", 0, Type::Double),
+];
+
+// The byte tables in ARCHITECTURE.md, and what `encode_target` writes.
+const _: () = assert!(OUTPUTS_LEN == 196 && at::SPEED_FRACTION == 188);
+const _: () = assert!(offset(&INPUTS, 1, "input_int_register", Type::Int32) == size_of::<i32>());
+const _: () = assert!(offset(&INPUTS, 2, "input_double_register", Type::Double) == 2 * size_of::<i32>());
+const _: () = assert!(TARGET_LEN == 20);
+
+/// Bytes of the values of `variables`.
+const fn bytes_of(variables: &[Variable]) -> usize {
+    let (mut bytes, mut k) = (0, 0);
+    while k < variables.len() {
+        bytes += variables[k].kind.bytes();
+        k += 1;
+    }
+    bytes
+}
+
+/// Bytes before the value of the variable `index`; does not compile if that one has another name or type.
+const fn offset(variables: &[Variable], index: usize, name: &str, kind: Type) -> usize {
+    let variable = variables[index];
+    let (has, wanted) = (variable.name.as_bytes(), name.as_bytes());
+    assert!(has.len() == wanted.len() && variable.kind as u8 == kind as u8);
+    let mut k = 0;
+    while k < has.len() {
+        assert!(has[k] == wanted[k]);
+        k += 1;
+    }
+    let (before, _) = variables.split_at(index);
+    bytes_of(before)
+}
+
+/// Names and types of the outputs that are asked for, with registers from `base`; [`Outputs`] reads their values. Allocates.
+pub fn output_names(base: u8) -> [(String, &'static str); OUTPUTS.len()] {
+    OUTPUTS.map(|v| (v.full_name(base), v.kind.name()))
+}
+
+/// Names and types of the inputs that are written, with registers from `base`; [`encode_target`] writes their values. Allocates.
+pub fn input_names(base: u8) -> [(String, &'static str); INPUTS.len()] {
+    INPUTS.map(|v| (v.full_name(base), v.kind.name()))
+}
+
+/// A data packet in the output recipe, checked once for recipe and length.
 #[derive(Debug, Clone, Copy)]
 pub struct Outputs<'a>(&'a [u8; OUTPUTS_LEN]);
 
-/// Bytes of the values of [`output_names`].
-const OUTPUTS_LEN: usize = 8 + 3 * 48 + 4 * 4 + 3 * 4 + 2 * 8;
+/// Bytes of the values of `OUTPUTS`.
+const OUTPUTS_LEN: usize = bytes_of(&OUTPUTS);
 
 impl<'a> Outputs<'a> {
-    /// A view of `payload` if it has our recipe id and length.
+    /// A view of `payload` if it has the recipe id `recipe` and the right length.
     pub fn new_checked(payload: &'a [u8], recipe: u8) -> Option<Self> {
         let (&id, values) = payload.split_first()?;
         (id == recipe).then_some(Self(values.try_into().ok()?))
@@ -194,45 +322,58 @@ impl<'a> Outputs<'a> {
         bytes
     }
 
+    fn int(&self, at: usize) -> i32 {
+        i32::from_be_bytes(self.four(at))
+    }
+
+    fn unsigned(&self, at: usize) -> u32 {
+        u32::from_be_bytes(self.four(at))
+    }
+
     fn real(&self, at: usize) -> f64 {
         let mut bytes = [0; 8];
         bytes.copy_from_slice(&self.0[at..at + 8]);
         f64::from_be_bytes(bytes)
     }
 
+    /// The value of `joint`, 0 to 5, in a vector; a larger number counts as 5.
+    fn of_joint(&self, vector: usize, joint: usize) -> f64 {
+        self.real(vector + Type::Double.bytes() * joint.min(5))
+    }
+
     /// The robot's clock, s.
     pub fn timestamp_s(&self) -> f64 {
-        self.real(0)
+        self.real(at::TIMESTAMP)
     }
 
     /// Measured angle of joint 0 to 5, rad.
     pub fn actual_q(&self, joint: usize) -> f64 {
-        self.real(8 + 8 * joint.min(5))
+        self.of_joint(at::ACTUAL_Q, joint)
     }
 
-    /// Writes what the frame says into `state`; the three times and their bookkeeping are the session's.
+    /// Writes what the packet says into `state`, but for the session's own bookkeeping: the number of the newest target and the times.
     pub fn fill(&self, tilt: &TiltJoint, state: &mut RobotState) {
-        let joint = 8 * tilt.joint.index();
+        let joint = tilt.joint.index();
         state.timestamp_s = self.timestamp_s();
-        state.alpha_deg = tilt.alpha_deg(self.actual_q(tilt.joint.index()));
-        state.alpha_target_deg = tilt.alpha_deg(self.real(56 + joint));
-        state.alpha_rate_deg_s = (tilt.direction * self.real(104 + joint).to_degrees()) as f32;
-        state.robot_mode = i32::from_be_bytes(self.four(152));
-        state.safety_mode = i32::from_be_bytes(self.four(156));
-        state.safety_bits = u32::from_be_bytes(self.four(160));
-        state.runtime_state = u32::from_be_bytes(self.four(164));
-        state.program_state = ProgramState::from_code(i32::from_be_bytes(self.four(168)));
-        state.sequence_echo = i32::from_be_bytes(self.four(172));
-        state.program_run = i32::from_be_bytes(self.four(176));
-        state.alpha_command_deg = tilt.alpha_deg(self.real(180));
-        state.speed_fraction = self.real(188);
+        state.alpha_deg = tilt.alpha_deg(self.actual_q(joint));
+        state.alpha_target_deg = tilt.alpha_deg(self.of_joint(at::TARGET_Q, joint));
+        state.alpha_rate_deg_s = (tilt.direction * self.of_joint(at::ACTUAL_QD, joint).to_degrees()) as f32;
+        state.robot_mode = self.int(at::ROBOT_MODE);
+        state.safety_mode = self.int(at::SAFETY_MODE);
+        state.safety_bits = self.unsigned(at::SAFETY_BITS);
+        state.runtime_state = self.unsigned(at::RUNTIME_STATE);
+        state.program_state = ProgramState::from_code(self.int(at::PROGRAM_STATE));
+        state.sequence_echo = self.int(at::SEQUENCE_ECHO);
+        state.program_run = self.int(at::PROGRAM_RUN);
+        state.alpha_command_deg = tilt.alpha_deg(self.real(at::COMMAND));
+        state.speed_fraction = self.real(at::SPEED_FRACTION);
     }
 }
 
-/// Reads `frame` as everything that it could be, and forgets it: the one entry of the tests that feed arbitrary bytes.
+/// Reads `packet` as everything that it could be, and forgets it: the one entry of the tests that feed arbitrary bytes.
 #[doc(hidden)]
-pub fn read_anything(frame: Frame<'_>, tilt: &TiltJoint) {
-    let payload = frame.payload;
+pub fn read_anything(packet: Packet<'_>, tilt: &TiltJoint) {
+    let payload = packet.payload;
     let _ = (accepted(payload), controller_version(payload), recipe(payload), text(payload));
     if let Some(outputs) = payload.first().and_then(|id| Outputs::new_checked(payload, *id)) {
         outputs.fill(tilt, &mut RobotState::default());

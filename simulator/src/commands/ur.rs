@@ -1,7 +1,7 @@
 //! `simulator ur`: only the simulated UR5 controller, for trying a client or a robot program.
 //!
-//! Main thread: takes faults from standard input, prints the controller's log; the controller has its own thread. Ends with
-//! Ctrl-C or SIGTERM, or after `--seconds`.
+//! The main thread takes faults from standard input and prints the controller's log; the controller has a thread of its own.
+//! Allocates. The command ends with Ctrl-C or SIGTERM, or after `--seconds`; a controller that cannot be started is an error.
 
 use std::io::{BufRead, Write};
 use std::net::{IpAddr, Ipv4Addr};
@@ -24,10 +24,10 @@ pub struct Args {
     /// Controller generation: CB3 3.15 at 125 Hz or e-Series 5.11 at 500 Hz
     #[arg(long, value_enum, default_value = "cb3")]
     series: SeriesArg,
-    /// Joint angles at the start, degrees, base to wrist 3
+    /// Joint angles at the start in degrees, base to wrist 3
     #[arg(long, value_delimiter = ',', num_args = 6, allow_negative_numbers = true, default_value = "0,-90,90,-90,-90,0")]
     joints_deg: Vec<f64>,
-    /// Fault to inject at the start; may be given several times
+    /// Fault to inject at the start; this option may be given several times
     #[arg(long)]
     fault: Vec<Fault>,
     /// End after this many seconds
@@ -73,7 +73,7 @@ pub fn run(args: &Args) -> Result<(), Failure> {
         println!("UR5 controller ({:?}) on {}: ports 29999, 30001 to 30004; lines on standard input are faults", args.series, args.address);
     }
     let (lines, typed) = mpsc::channel();
-    // Blocks in read and ends with the process.
+    // This thread blocks while it reads, and ends with the process.
     std::thread::spawn(move || std::io::stdin().lock().lines().map_while(Result::ok).try_for_each(|line| lines.send(line)));
     let start = Instant::now();
     while !stop.load(Ordering::Relaxed) {
@@ -87,7 +87,7 @@ pub fn run(args: &Args) -> Result<(), Failure> {
             }
         }
         if controller.take_log().iter().try_for_each(|l| print(l, args.json)).is_err() {
-            break; // nobody reads any more
+            break; // Whoever read the log is gone.
         }
         std::thread::sleep(Duration::from_millis(50));
     }

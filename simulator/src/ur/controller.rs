@@ -15,7 +15,8 @@ use super::published::{ControllerState, Joints, Published, TraceRow};
 use super::server::{ListenError, Server, ServerRequest};
 use super::variables::{Series, Version};
 
-/// SCHED_FIFO priority of the controller's thread, where it is permitted. Chosen by hand; see docs/REALTIME.md for the others.
+/// SCHED_FIFO priority of the controller's thread, where it is permitted. Chosen by hand, below the priorities of the processes that
+/// are measured (80 and 70 in config/sim.toml).
 const PRIORITY: u8 = 65;
 /// How long a fault may take to be injected. Chosen by hand, far above a control cycle.
 const INJECT_PATIENCE: Duration = Duration::from_secs(5);

@@ -2,7 +2,7 @@
 //!
 //! A pure step: given the same inputs at the same cycles it does the same. Runs on the controller's thread; allocates for
 //! programs and log lines only, within bounds. What a robot would show in a popup or in its log becomes a
-//! [`LogLine`](super::log::LogLine).
+//! [`LogLine`].
 
 use super::log::LogLine;
 use super::power::{Power, RobotMode};

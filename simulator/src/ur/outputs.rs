@@ -14,7 +14,7 @@ use super::variables::{Input, Output};
 const JOINT_RUNNING: u8 = 253;
 /// A joint's mode while the arm has no power (UR's client interface tables).
 const JOINT_POWER_OFF: u8 = 239;
-/// Supply voltage of a UR5, in V (UR5 service manual).
+/// Voltage of the supply in V. Chosen by hand: the nominal voltage of a UR5.
 const SUPPLY_V: f64 = 48.0;
 /// Temperature of every joint, in degrees Celsius. Chosen by hand: a robot at rest in a room.
 const JOINT_TEMPERATURE_C: f64 = 27.0;

@@ -6,7 +6,7 @@
 //! are answered by a text message.
 
 use super::machine::Machine;
-use super::variables::{Input, Output};
+use super::variables::{Input, Output, WireType};
 
 /// The packet types (UR's RTDE guide).
 mod packet_type {
@@ -183,60 +183,32 @@ impl RtdeSession {
             _ => (max_hz, payload),
         };
         let version = context.machine.version();
-        let mut variables = Vec::new();
-        let mut types = Vec::new();
-        let mut valid = frequency_hz >= 1.0 && names.len() <= MAX_NAMES_BYTES;
-        for name in split_names(names) {
-            match Output::parse(&name, &version).filter(|_| !context.hidden.contains(&name)) {
-                Some(output) => {
-                    types.push(output.wire_type().name());
-                    variables.push(output);
-                }
-                None => {
-                    types.push(NOT_FOUND);
-                    valid = false;
-                }
-            }
-        }
-        valid &= !variables.is_empty();
+        let (variables, types) = read_recipe(names, context.hidden, |name| {
+            let output = Output::parse(name, &version).ok_or(NOT_FOUND)?;
+            Ok((output, output.wire_type()))
+        });
         self.running = false;
         self.outputs = None;
         let mut id = 0;
-        if valid {
+        if let Some(variables) = variables.filter(|_| frequency_hz >= 1.0) {
             self.last_output_id = self.last_output_id.checked_add(1).unwrap_or(1);
             id = self.last_output_id;
             let divider = ((max_hz / frequency_hz).floor() as u64).max(1);
             self.outputs = Some(OutputRecipe { id, variables, divider });
         }
         let mut answer = if self.version >= 2 { vec![id] } else { Vec::new() };
-        answer.extend(types.join(",").into_bytes());
+        answer.extend(types.into_bytes());
         put_packet(answers, packet_type::SETUP_OUTPUTS, &answer);
     }
 
     fn setup_inputs(&mut self, payload: &[u8], context: &mut SessionContext<'_>, answers: &mut Vec<u8>) {
         let version = context.machine.version();
-        let mut variables = Vec::new();
-        let mut types = Vec::new();
-        let mut valid = payload.len() <= MAX_NAMES_BYTES && self.inputs.len() < MAX_RECIPES;
-        for name in split_names(payload) {
-            match Input::parse_for(&name, &version).filter(|_| !context.hidden.contains(&name)) {
-                Some(input) if context.owners.taken(input, self.client) => {
-                    types.push(IN_USE);
-                    valid = false;
-                }
-                Some(input) => {
-                    types.push(input.wire_type().name());
-                    variables.push(input);
-                }
-                None => {
-                    types.push(NOT_FOUND);
-                    valid = false;
-                }
-            }
-        }
-        valid &= !variables.is_empty();
+        let (variables, types) = read_recipe(payload, context.hidden, |name| {
+            let input = Input::parse_for(name, &version).ok_or(NOT_FOUND)?;
+            if context.owners.taken(input, self.client) { Err(IN_USE) } else { Ok((input, input.wire_type())) }
+        });
         let mut id = 0;
-        if valid {
+        if let Some(variables) = variables.filter(|_| self.inputs.len() < MAX_RECIPES) {
             for input in &variables {
                 context.owners.clients[input.slot()] = Some(self.client);
             }
@@ -244,7 +216,7 @@ impl RtdeSession {
             id = self.inputs.len() as u8;
         }
         let mut answer = vec![id];
-        answer.extend(types.join(",").into_bytes());
+        answer.extend(types.into_bytes());
         put_packet(answers, packet_type::SETUP_INPUTS, &answer);
     }
 
@@ -305,6 +277,28 @@ impl RtdeSession {
         put_packet(&mut packet, packet_type::TEXT_MESSAGE, &payload);
         packet
     }
+}
+
+/// Reads the names of a recipe. Gives its variables, or None when the recipe is invalid, and the comma list of their types for the
+/// answer. `find` gives a variable and its type, or what the answer says instead of the type.
+fn read_recipe<V>(names: &[u8], hidden: &[String], find: impl Fn(&str) -> Result<(V, WireType), &'static str>) -> (Option<Vec<V>>, String) {
+    let mut variables = Vec::new();
+    let mut types = Vec::new();
+    let mut valid = names.len() <= MAX_NAMES_BYTES;
+    for name in split_names(names) {
+        let found = if hidden.contains(&name) { Err(NOT_FOUND) } else { find(&name) };
+        match found {
+            Ok((variable, wire_type)) => {
+                types.push(wire_type.name());
+                variables.push(variable);
+            }
+            Err(instead) => {
+                types.push(instead);
+                valid = false;
+            }
+        }
+    }
+    (Some(variables).filter(|v| valid && !v.is_empty()), types.join(","))
 }
 
 /// The names of a comma list. ur_rtde ends the list with a comma, UR's own clients do not.

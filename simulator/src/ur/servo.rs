@@ -35,7 +35,7 @@ const NAMES: [&str; 6] = ["base", "shoulder", "elbow", "wrist 1", "wrist 2", "wr
 
 /// What moves the arm at present.
 #[derive(Debug, Clone, Copy, PartialEq)]
-enum Motion {
+enum ArmMotion {
     Hold,
     Servoj { lookahead_s: f64, gain: f64 },
     Stop { deceleration_rad_s2: f64 },
@@ -60,7 +60,7 @@ pub struct Servo {
     pub actual_q: [f64; 6],
     /// The joints' speed.
     pub actual_qd: [f64; 6],
-    motion: Motion,
+    motion: ArmMotion,
 }
 
 impl Servo {
@@ -75,7 +75,7 @@ impl Servo {
             target_qdd: zero,
             actual_q: q,
             actual_qd: zero,
-            motion: Motion::Hold,
+            motion: ArmMotion::Hold,
         }
     }
 
@@ -102,13 +102,13 @@ impl Servo {
         }
         self.commanded_q = q;
         self.servoj_calls += 1;
-        self.motion = Motion::Servoj { lookahead_s, gain };
+        self.motion = ArmMotion::Servoj { lookahead_s, gain };
         Ok(())
     }
 
     /// Slows all joints down to rest.
     pub fn stop(&mut self, deceleration_rad_s2: f64) {
-        self.motion = Motion::Stop { deceleration_rad_s2 };
+        self.motion = ArmMotion::Stop { deceleration_rad_s2 };
     }
 
     /// Goes to `goal` (rad) with all joints in step.
@@ -120,7 +120,7 @@ impl Servo {
             return Err(format!("movej target of {} is {} rad, outside +-{RANGE_RAD:.4}", NAMES[i], goal[i]));
         }
         self.commanded_q = goal;
-        self.motion = Motion::Movej {
+        self.motion = ArmMotion::Movej {
             goal,
             acceleration_rad_s2: acceleration_rad_s2.min(MAX_ACCELERATION_RAD_S2),
             speed_rad_s: speed_rad_s.min(MAX_SPEED_RAD_S),
@@ -136,33 +136,33 @@ impl Servo {
         if let Some(i) = goal_qd.iter().position(|v| v.is_nan() || v.abs() > 2.0 * MAX_SPEED_RAD_S) {
             return Err(format!("speedj of {} is {} rad/s, more than twice what it can do", NAMES[i], goal_qd[i]));
         }
-        self.motion = Motion::Speedj { goal_qd, acceleration_rad_s2: acceleration_rad_s2.min(MAX_ACCELERATION_RAD_S2) };
+        self.motion = ArmMotion::Speedj { goal_qd, acceleration_rad_s2: acceleration_rad_s2.min(MAX_ACCELERATION_RAD_S2) };
         Ok(())
     }
 
     /// True while servoj moves the arm.
     pub fn is_servoing(&self) -> bool {
-        matches!(self.motion, Motion::Servoj { .. })
+        matches!(self.motion, ArmMotion::Servoj { .. })
     }
 
     /// True when the arm stands still and no movej is under way.
     pub fn is_still(&self) -> bool {
-        !matches!(self.motion, Motion::Movej { .. }) && self.target_qd.iter().all(|v| v.abs() < 1e-9)
+        !matches!(self.motion, ArmMotion::Movej { .. }) && self.target_qd.iter().all(|v| v.abs() < 1e-9)
     }
 
     /// Lets `dt_s` pass.
     pub fn step(&mut self, dt_s: f64) {
         let before_qd = self.target_qd;
         match self.motion {
-            Motion::Hold => self.target_qd = [0.0; 6],
-            Motion::Servoj { lookahead_s, gain } => self.step_servoj(lookahead_s, gain, dt_s),
-            Motion::Stop { deceleration_rad_s2 } => {
+            ArmMotion::Hold => self.target_qd = [0.0; 6],
+            ArmMotion::Servoj { lookahead_s, gain } => self.step_servoj(lookahead_s, gain, dt_s),
+            ArmMotion::Stop { deceleration_rad_s2 } => {
                 self.slow_down(deceleration_rad_s2, dt_s);
                 if self.target_qd == [0.0; 6] {
-                    self.motion = Motion::Hold;
+                    self.motion = ArmMotion::Hold;
                 }
             }
-            Motion::Speedj { goal_qd, acceleration_rad_s2 } => {
+            ArmMotion::Speedj { goal_qd, acceleration_rad_s2 } => {
                 let most = acceleration_rad_s2 * dt_s;
                 for (i, goal) in goal_qd.iter().enumerate() {
                     let goal = goal.clamp(-MAX_SPEED_RAD_S, MAX_SPEED_RAD_S);
@@ -170,7 +170,7 @@ impl Servo {
                     self.target_q[i] = (self.target_q[i] + self.target_qd[i] * dt_s).clamp(-RANGE_RAD, RANGE_RAD);
                 }
             }
-            Motion::Movej { goal, acceleration_rad_s2, speed_rad_s } => self.step_movej(goal, acceleration_rad_s2, speed_rad_s, dt_s),
+            ArmMotion::Movej { goal, acceleration_rad_s2, speed_rad_s } => self.step_movej(goal, acceleration_rad_s2, speed_rad_s, dt_s),
         }
         let share = 1.0 - (-dt_s / LAG_S).exp();
         for (i, before) in before_qd.iter().enumerate() {
@@ -222,7 +222,7 @@ impl Servo {
         if longest <= next * dt_s || longest < 1e-9 {
             self.target_q = goal;
             self.target_qd = [0.0; 6];
-            self.motion = Motion::Hold;
+            self.motion = ArmMotion::Hold;
             return;
         }
         for (i, way) in way.iter().enumerate() {

@@ -17,7 +17,7 @@ use rt_controller::link::Lost;
 use shared::actions::STAY;
 use shared::config::Config;
 use shared::control::{EndReason, Outcome, Reply, Request};
-use shared::estimate::Calibration;
+use shared::estimator::Calibration;
 use shared::ipc;
 use shared::messages::{Feature, LAYOUT_VERSION, Phase};
 use shared::mlp::Mlp;
@@ -332,7 +332,8 @@ fn tilt_until_it_flows() -> Weights {
     network.w2[0][0] = 1.0;
     network.w3[0][STAY] = 1.0;
     network.b3[STAY + 7] = 0.5;
-    let calibration = Calibration { c: ML_PER_PX2 as f32, q: 1.0, tilt: 0.0, hold_above_px2: f32::INFINITY };
+    let calibration =
+        Calibration { volume_at_1_px2_ml: ML_PER_PX2 as f32, area_exponent: 1.0, log_tilt_slope: 0.0, hold_above_px2: f32::INFINITY };
     Weights { network, calibration, ..tests::steady_weights(STAY + 7) }
 }
 

@@ -8,7 +8,7 @@ use serde::Serialize;
 use shared::config::{CameraConfig, ImageConfig};
 use shared::messages::PixelFormat;
 
-use crate::extract::{Extractor, Image};
+use crate::vision::{Extractor, Image};
 
 /// Percentiles of many measurements, us.
 #[derive(Debug, Clone, Copy, Serialize)]

@@ -25,7 +25,7 @@ pub enum Effect {
     Motion,
 }
 
-type Outcome = Result<Effect, String>;
+type CallResult = Result<Effect, String>;
 
 /// A built-in function.
 #[derive(Debug)]
@@ -37,14 +37,14 @@ pub struct BuiltinFunction {
     /// How many of the parameters must be given.
     pub required: usize,
     /// Carries the call out. The slice has one value for each parameter, [`Value::None`] for those left out.
-    pub call: fn(&[Value], &mut Robot) -> Outcome,
+    pub call: fn(&[Value], &mut Robot) -> CallResult,
 }
 
 const fn function(
     name: &'static str,
     parameters: &'static [&'static str],
     required: usize,
-    call: fn(&[Value], &mut Robot) -> Outcome,
+    call: fn(&[Value], &mut Robot) -> CallResult,
 ) -> BuiltinFunction {
     BuiltinFunction { name, parameters, required, call }
 }
@@ -135,19 +135,19 @@ pub fn hint(name: &str) -> &'static str {
     }
 }
 
-fn value(value: Value) -> Outcome {
+fn value(value: Value) -> CallResult {
     Ok(Effect::Value(value))
 }
 
-fn nothing() -> Outcome {
+fn nothing() -> CallResult {
     value(Value::None)
 }
 
-fn float(number: f64) -> Outcome {
+fn float(number: f64) -> CallResult {
     if number.is_finite() { value(Value::Float(number)) } else { Err("result is not a finite number".to_owned()) }
 }
 
-fn whole(number: f64) -> Outcome {
+fn whole(number: f64) -> CallResult {
     if (f64::from(i32::MIN)..=f64::from(i32::MAX)).contains(&number) {
         value(Value::Int(number as i32))
     } else {
@@ -155,7 +155,7 @@ fn whole(number: f64) -> Outcome {
     }
 }
 
-fn length(of: &Value) -> Outcome {
+fn length(of: &Value) -> CallResult {
     match of {
         Value::List(items) => value(Value::Int(items.len() as i32)),
         Value::Str(text) => value(Value::Int(text.len() as i32)),
@@ -163,7 +163,7 @@ fn length(of: &Value) -> Outcome {
     }
 }
 
-fn norm(of: &Value) -> Outcome {
+fn norm(of: &Value) -> CallResult {
     match of {
         Value::Int(v) => value(Value::Int(v.checked_abs().ok_or("result does not fit an int (32 bits)")?)),
         Value::Float(v) => value(Value::Float(v.abs())),
@@ -202,7 +202,7 @@ fn standard_digital(given: &Value) -> Result<usize, String> {
     address(given, 8)
 }
 
-fn rtde_set_watchdog(a: &[Value], robot: &mut Robot) -> Outcome {
+fn rtde_set_watchdog(a: &[Value], robot: &mut Robot) -> CallResult {
     let name = a[0].str()?;
     let input = Input::parse(name).ok_or_else(|| format!("rtde_set_watchdog: no input variable '{name}'"))?;
     let action = match &a[2] {
@@ -214,7 +214,7 @@ fn rtde_set_watchdog(a: &[Value], robot: &mut Robot) -> Outcome {
 }
 
 /// Defaults and ranges are those of UR's script manual.
-fn servoj(a: &[Value], robot: &mut Robot) -> Outcome {
+fn servoj(a: &[Value], robot: &mut Robot) -> CallResult {
     let q = a[0].six().map_err(|e| format!("servoj: {e}"))?;
     let time_s = number_in(&or_default(&a[3], robot.steptime_s()), "servoj: t", 0.0, 10.0)?;
     let lookahead_s = number_in(&or_default(&a[4], 0.1), "servoj: lookahead_time", 0.03, 0.2)?;
@@ -223,13 +223,13 @@ fn servoj(a: &[Value], robot: &mut Robot) -> Outcome {
     Ok(Effect::Servo { time_s })
 }
 
-fn stop(a: &[Value], robot: &mut Robot) -> Outcome {
+fn stop(a: &[Value], robot: &mut Robot) -> CallResult {
     robot.servo.stop(number_in(&a[0], "deceleration", 1e-3, 1e3)?);
     Ok(Effect::Motion)
 }
 
 /// Defaults are those of UR's script manual.
-fn movej(a: &[Value], robot: &mut Robot) -> Outcome {
+fn movej(a: &[Value], robot: &mut Robot) -> CallResult {
     if matches!(&a[0], Value::Pose(_)) {
         return Err("movej: only joint positions are simulated, not a pose".to_owned());
     }

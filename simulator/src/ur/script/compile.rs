@@ -139,7 +139,7 @@ struct KnownFunction {
 }
 
 /// A loop whose end is not compiled yet.
-struct OpenLoop {
+struct UnfinishedLoop {
     start: usize,
     /// Places of the jumps that go to its end.
     breaks: Vec<usize>,
@@ -152,7 +152,7 @@ struct Compiler {
     functions: BTreeMap<String, KnownFunction>,
     /// Names of the variables of the function that is being compiled.
     locals: Vec<String>,
-    loops: Vec<OpenLoop>,
+    loops: Vec<UnfinishedLoop>,
     in_function: bool,
 }
 
@@ -221,7 +221,7 @@ impl Compiler {
                 let start = self.here();
                 self.expr(condition)?;
                 let out = self.emit(condition.line, Op::JumpIfFalse(0))?;
-                self.loops.push(OpenLoop { start, breaks: vec![out] });
+                self.loops.push(UnfinishedLoop { start, breaks: vec![out] });
                 self.body(body)?;
                 self.emit(line, Op::Jump(start))?;
                 if let Some(ended) = self.loops.pop() {

@@ -38,7 +38,7 @@ pub enum StepOutcome {
 }
 
 /// Why a thread's turn ended.
-enum Turn {
+enum TurnEnd {
     Waits,
     Finished,
     Halt,
@@ -46,7 +46,7 @@ enum Turn {
 }
 
 /// What an instruction came to: the end of the thread's turn, or None when the turn goes on. The error has no line yet.
-type Next = Result<Option<Turn>, String>;
+type InstructionResult = Result<Option<TurnEnd>, String>;
 
 /// A running program.
 #[derive(Debug)]
@@ -96,11 +96,11 @@ impl Interpreter {
                 continue;
             }
             match self.turn(i, robot, &mut budget) {
-                Ok(Turn::Waits) => i += 1,
-                Ok(Turn::Finished) if self.threads[i].id == 0 => return StepOutcome::Ended,
-                Ok(Turn::Finished) => drop(self.threads.remove(i)),
-                Ok(Turn::Halt) => return StepOutcome::Ended,
-                Ok(Turn::Pause) => return StepOutcome::Paused,
+                Ok(TurnEnd::Waits) => i += 1,
+                Ok(TurnEnd::Finished) if self.threads[i].id == 0 => return StepOutcome::Ended,
+                Ok(TurnEnd::Finished) => drop(self.threads.remove(i)),
+                Ok(TurnEnd::Halt) => return StepOutcome::Ended,
+                Ok(TurnEnd::Pause) => return StepOutcome::Paused,
                 Err(error) => return StepOutcome::Failed(error),
             }
             // `kill` may have shortened the list.
@@ -127,11 +127,11 @@ impl Interpreter {
     }
 
     /// Runs a thread until it waits or ends.
-    fn turn(&mut self, i: usize, robot: &mut Robot, budget: &mut u32) -> Result<Turn, ScriptError> {
+    fn turn(&mut self, i: usize, robot: &mut Robot, budget: &mut u32) -> Result<TurnEnd, ScriptError> {
         let code = self.code.clone();
         loop {
             let thread = &mut self.threads[i];
-            let Some(call) = thread.calls.last_mut() else { return Ok(Turn::Finished) };
+            let Some(call) = thread.calls.last_mut() else { return Ok(TurnEnd::Finished) };
             let (op, line) = (&code.ops[call.at], code.lines[call.at]);
             if *budget == 0 {
                 let what = format!(
@@ -151,8 +151,8 @@ impl Interpreter {
                 Op::Join => self.join(i),
                 Op::Kill => self.kill(i),
                 Op::Return => Ok(self.return_to_caller(i)),
-                Op::Halt => Ok(Some(Turn::Halt)),
-                Op::Pause => Ok(Some(Turn::Pause)),
+                Op::Halt => Ok(Some(TurnEnd::Halt)),
+                Op::Pause => Ok(Some(TurnEnd::Pause)),
                 op => thread.compute(op, &code, &mut self.globals).map(|()| None),
             };
             if let Some(end) = next.map_err(|what| ScriptError::new(line, what))? {
@@ -161,7 +161,7 @@ impl Interpreter {
         }
     }
 
-    fn call(&mut self, i: usize, routine: usize) -> Next {
+    fn call(&mut self, i: usize, routine: usize) -> InstructionResult {
         let target = &self.code.routines[routine];
         if self.calls >= MAX_CALLS {
             return Err(format!("more than {MAX_CALLS} calls within calls"));
@@ -172,7 +172,7 @@ impl Interpreter {
         Ok(None)
     }
 
-    fn call_builtin(&mut self, i: usize, function: &BuiltinFunction, robot: &mut Robot) -> Next {
+    fn call_builtin(&mut self, i: usize, function: &BuiltinFunction, robot: &mut Robot) -> InstructionResult {
         let thread = &mut self.threads[i];
         let arguments = thread.take(function.parameters.len());
         let wait = match (function.call)(&arguments, robot)? {
@@ -191,10 +191,10 @@ impl Interpreter {
         if moves && self.threads.iter().any(|t| t.id != id && t.wait.moves_robot()) {
             return Err("another thread is already moving the robot".to_owned());
         }
-        Ok(Some(Turn::Waits))
+        Ok(Some(TurnEnd::Waits))
     }
 
-    fn run(&mut self, i: usize, routine: usize) -> Next {
+    fn run(&mut self, i: usize, routine: usize) -> InstructionResult {
         if self.threads.len() >= MAX_THREADS || self.calls >= MAX_CALLS {
             return Err(format!("more than {MAX_THREADS} threads or {MAX_CALLS} calls within calls"));
         }
@@ -203,7 +203,7 @@ impl Interpreter {
         Ok(None)
     }
 
-    fn join(&mut self, i: usize) -> Next {
+    fn join(&mut self, i: usize) -> InstructionResult {
         let thread = &mut self.threads[i];
         let Value::Thread(id) = pop(&mut thread.stack) else { return Err("'join' needs a thread".to_owned()) };
         if id == thread.id {
@@ -213,10 +213,10 @@ impl Interpreter {
             return Ok(None);
         }
         self.threads[i].wait = Wait::Join(id);
-        Ok(Some(Turn::Waits))
+        Ok(Some(TurnEnd::Waits))
     }
 
-    fn kill(&mut self, i: usize) -> Next {
+    fn kill(&mut self, i: usize) -> InstructionResult {
         let thread = &mut self.threads[i];
         let Value::Thread(id) = pop(&mut thread.stack) else { return Err("'kill' needs a thread".to_owned()) };
         if id == thread.id || id == 0 {
@@ -232,13 +232,13 @@ impl Interpreter {
         if let Some(moved) = self.threads.iter_mut().find(|t| t.id == own) {
             moved.wait = Wait::Cycle;
         }
-        Ok(Some(Turn::Waits))
+        Ok(Some(TurnEnd::Waits))
     }
 
     /// Ends the innermost call; its value stays on the stack for the caller.
-    fn return_to_caller(&mut self, i: usize) -> Option<Turn> {
+    fn return_to_caller(&mut self, i: usize) -> Option<TurnEnd> {
         self.threads[i].calls.pop();
         self.calls -= 1;
-        self.threads[i].calls.is_empty().then_some(Turn::Finished)
+        self.threads[i].calls.is_empty().then_some(TurnEnd::Finished)
     }
 }

@@ -1,0 +1,90 @@
+//! Errors and rates of many measured frames. Pure, any thread; allocates; cannot fail.
+
+use serde::Serialize;
+use shared::messages::Doubt;
+
+/// Frames with a truth above this count for error and missed flow, px^2: below it a stream is a few pixels wide and its area no figure of
+/// quality.
+pub const MEASURED_PX2: f64 = 200.0;
+
+/// Figures of many measured frames.
+#[derive(Debug, Default, Serialize)]
+pub struct CameraFigures {
+    /// Number of frames.
+    pub frames: usize,
+    /// Number of frames with a truth above [`MEASURED_PX2`] that were measured.
+    pub measured: usize,
+    /// Median of the size of their errors, per cent.
+    pub median_error_percent: f64,
+    /// 95th percentile of the size of their errors, per cent.
+    pub p95_error_percent: f64,
+    /// Mean of their errors, per cent.
+    pub bias_percent: f64,
+    /// Number of frames without a stream.
+    pub dry: usize,
+    /// Share of the frames without a stream on which one was seen, per cent.
+    pub false_flow_percent: f64,
+    /// Number of frames with a truth above [`MEASURED_PX2`].
+    pub wet: usize,
+    /// Share of these on which no stream was seen, per cent.
+    pub missed_flow_percent: f64,
+    /// Share of these on which no stream was seen and no doubt was raised, per cent.
+    pub unnoticed_percent: f64,
+    /// Share of all frames with a doubt, per cent.
+    pub doubt_percent: f64,
+}
+
+/// One measured frame beside the truth.
+#[derive(Debug, Clone, Copy)]
+pub struct Comparison {
+    /// True V_e, px^2; 0 without a stream.
+    pub truth_px2: f64,
+    /// Measured V_e, px^2.
+    pub area_px2: f64,
+    /// The doubt about it.
+    pub doubt: Doubt,
+}
+
+impl Comparison {
+    /// Signed error, per cent.
+    pub fn error_percent(self) -> f64 {
+        100.0 * (self.area_px2 / self.truth_px2 - 1.0)
+    }
+
+    /// How bad it is, for the list of the worst frames: 0 is not bad.
+    pub fn badness(self) -> f64 {
+        if self.truth_px2 == 0.0 {
+            // False flow counts as worse than an error.
+            if self.area_px2 > 0.0 { 200.0 + self.area_px2 / 10.0 } else { 0.0 }
+        } else if self.truth_px2 >= MEASURED_PX2 {
+            self.error_percent().abs()
+        } else {
+            0.0
+        }
+    }
+}
+
+/// The figures of many frames; NaN where there is nothing to take them from.
+pub fn figures(frames: &[Comparison]) -> CameraFigures {
+    let wet: Vec<&Comparison> = frames.iter().filter(|s| s.truth_px2 > MEASURED_PX2).collect();
+    let mut errors: Vec<f64> = wet.iter().filter(|s| s.area_px2 > 0.0).map(|s| s.error_percent()).collect();
+    let bias_percent = errors.iter().sum::<f64>() / errors.len().max(1) as f64;
+    errors.iter_mut().for_each(|e| *e = e.abs());
+    errors.sort_by(f64::total_cmp);
+    let quantile = |share: f64| errors.get(((errors.len().max(1) - 1) as f64 * share).round() as usize).copied().unwrap_or(f64::NAN);
+    let dry: Vec<&Comparison> = frames.iter().filter(|s| s.truth_px2 == 0.0).collect();
+    let percent = |part: usize, whole: usize| 100.0 * part as f64 / whole.max(1) as f64;
+    CameraFigures {
+        frames: frames.len(),
+        measured: errors.len(),
+        median_error_percent: quantile(0.5),
+        p95_error_percent: quantile(0.95),
+        bias_percent,
+        dry: dry.len(),
+        false_flow_percent: percent(dry.iter().filter(|s| s.area_px2 > 0.0).count(), dry.len()),
+        wet: wet.len(),
+        missed_flow_percent: percent(wet.iter().filter(|s| s.area_px2 == 0.0).count(), wet.len()),
+        unnoticed_percent: percent(wet.iter().filter(|s| s.area_px2 == 0.0 && s.doubt == Doubt::None).count(), wet.len()),
+        doubt_percent: percent(frames.iter().filter(|s| s.doubt != Doubt::None).count(), frames.len()),
+    }
+}

@@ -1,0 +1,23 @@
+//! Latency and jitter of the real processes on this machine, beside cyclictest, at rest and under load.
+//!
+//! | file | what it holds |
+//! |---|---|
+//! | [`this_machine`] | what is known of the machine, and what would make it better |
+//! | [`other_programs`] | cyclictest, the yardstick, and stress-ng, the load |
+//! | [`tick_times`] | what the controller measured of every tick, from its journal |
+//! | [`statistics`] | percentiles, and histograms for the page |
+//! | [`processes`] | processor time, memory and files of a process |
+//! | [`cell_run`] | one run of the cell: at rest, then pouring |
+//! | [`rounds`] | the cell and cyclictest in turns |
+//! | [`soak`] | one long run under load |
+//! | [`measured`] | what a measurement becomes: numbers, text, page |
+
+pub mod cell_run;
+pub mod measured;
+pub mod other_programs;
+pub mod processes;
+pub mod rounds;
+pub mod soak;
+pub mod statistics;
+pub mod this_machine;
+pub mod tick_times;

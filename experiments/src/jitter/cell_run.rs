@@ -1,0 +1,95 @@
+//! One run of the cell: first at rest, then pouring. Ordinary thread; allocates and blocks.
+
+use std::time::{Duration, Instant};
+
+use rt_controller::client::{Client, ClientError};
+use shared::os::now_ns;
+
+use super::processes::{Holding, processor_ns};
+use super::tick_times::TickTimes;
+use crate::own_cell::{OwnCell, OwnCellError};
+
+/// Time that a pour takes at most, with filling: a pour begins only when so much is left. Chosen by hand; no measurement is recorded.
+const A_POUR: Duration = Duration::from_secs(12);
+
+/// Pours until `until`, one pour after the other, each into an empty cup, and at least one. Returns their number.
+///
+/// # Errors
+/// When an operator's command fails; a pour that ends early is none.
+pub fn pour_until(cell: &OwnCell, until: Instant) -> Result<u32, OwnCellError> {
+    let mut pours = 0;
+    while Instant::now() + A_POUR < until || pours == 0 {
+        cell.command("simulator", &["operator", "fill", "300"])?;
+        // A pour that ends early, for instance after a pause of the machine, is a result: the ticks around it are what is looked for.
+        match cell.command("rt-controller", &["pour", "--json", "60"]) {
+            Ok(_) => {}
+            Err(e @ OwnCellError::Step { .. }) => cell.note(&format!("a pour ended early: {e}")),
+            Err(e) => return Err(e),
+        }
+        pours += 1;
+    }
+    sleep_until(cell, until)?;
+    Ok(pours)
+}
+
+/// Sleeps until `until`.
+///
+/// # Errors
+/// At once when Ctrl-C is pressed.
+pub fn sleep_until(cell: &OwnCell, until: Instant) -> Result<(), OwnCellError> {
+    while Instant::now() < until {
+        cell.interrupted()?;
+        std::thread::sleep(Duration::from_millis(50));
+    }
+    Ok(())
+}
+
+/// What was measured in one run of the cell.
+pub struct CellRun {
+    /// The ticks.
+    pub ticks: TickTimes,
+    /// Share of a core that the controller took at rest, per cent.
+    pub idle_percent: f64,
+    /// What the controller held at the end.
+    pub controller: Holding,
+    /// What the feature worker held at the end.
+    pub worker: Holding,
+    /// Number of allocations in the loop.
+    pub allocations: u64,
+    /// Number of page faults in the loop.
+    pub page_faults: u64,
+}
+
+/// Runs the cell for `seconds`: a third of it at rest, then pouring.
+///
+/// # Errors
+/// When the cell does not start, a command fails, or the journal cannot be read.
+pub fn run_cell(cell: &mut OwnCell, seconds: u64) -> Result<CellRun, OwnCellError> {
+    let client = cell.start()?;
+    let unreachable = |e: ClientError| OwnCellError::Other(e.to_string());
+    let before = client.status().map_err(unreachable)?;
+    drop(client);
+    // The machine settles first; what starting costs is not of interest.
+    sleep_until(cell, Instant::now() + Duration::from_secs(1))?;
+    let (from_ns, from) = (now_ns(), Instant::now());
+    let pid = cell.pid("rt-controller");
+    let spent_ns = processor_ns(pid);
+    let rest = Duration::from_secs(seconds) / 3;
+    sleep_until(cell, from + rest)?;
+    let idle_percent = 100.0 * (processor_ns(pid) - spent_ns) as f64 / from.elapsed().as_nanos() as f64;
+    pour_until(cell, from + Duration::from_secs(seconds))?;
+    let to_ns = now_ns();
+    let (controller, worker) = (Holding::of(pid), Holding::of(cell.pid("feature-worker")));
+    let client = Client::connect(&cell.config.cell.name).map_err(unreachable)?;
+    let after = client.status().map_err(unreachable)?;
+    drop(client);
+    cell.stop();
+    Ok(CellRun {
+        ticks: TickTimes::read(cell, from_ns, to_ns)?,
+        idle_percent,
+        controller,
+        worker,
+        allocations: after.loop_allocations - before.loop_allocations,
+        page_faults: after.loop_page_faults - before.loop_page_faults,
+    })
+}

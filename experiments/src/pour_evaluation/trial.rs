@@ -1,0 +1,244 @@
+//! One rig and one set of episodes: they are recorded, a method is trained on them, and it pours the goals of the grid.
+//!
+//! Any thread; allocates. The same arguments give the same numbers on any number of threads. A training that fails pours nothing.
+
+use rand::{RngExt, SeedableRng};
+use rand_pcg::Pcg64Mcg;
+use shared::agent::Agent;
+use shared::estimator::Calibration;
+use shared::limits::Limits;
+use shared::weights::{Estimator, Weights};
+use simulator::physics::RATE_HZ;
+use simulator::physics::rig::Rig;
+use trainer::calibration;
+use trainer::data::TrainingEpisode;
+use trainer::method::control_law::{self, ControlLaw};
+use trainer::method::model_pour::PossiblePours;
+use trainer::method::model_search;
+use trainer::training::{Estimate, MethodName, Options, Silent, Trained};
+
+use super::change::Change;
+use super::pourer::Pourer;
+use crate::bench::baselines::{BangBang, ByLaw, HandPd, OpenLoop, Oracle, Sum};
+use crate::bench::pour::{Baseline, PourResult, Trace, by_baseline, by_core, grid};
+use crate::bench::simulators::Bench;
+use crate::bench::through_camera::BenchCamera;
+
+/// How each trial is carried out.
+#[derive(Debug, Clone, Copy)]
+pub struct Protocol {
+    /// Episodes that are recorded for a training.
+    pub episodes: u64,
+    /// Weighed pours that are added to them before the training that is judged.
+    pub weighed: u64,
+    /// Actions of the trained networks: 2 or 21.
+    pub actions: u8,
+    /// How often the grid is poured.
+    pub repeats: u64,
+}
+
+/// A rig and a data seed: what is recorded, trained and tested together.
+#[derive(Debug, Clone)]
+pub struct Trial {
+    /// The bench on which the training's episodes are recorded.
+    pub bench: Bench,
+    /// The bench of the test; its rig may have changed.
+    pub test: Bench,
+    /// Seed of the episodes.
+    pub data_seed: u64,
+    /// Seed of the test's pours.
+    pub pour_seed: u64,
+    /// Limits of the controller.
+    pub limits: Limits,
+}
+
+impl Trial {
+    /// A trial on simulator `a`, or on a rig of simulator b with a container and a change at the test.
+    pub fn new(sim: &str, rig: u64, seed: u64, container: &str, change: Change) -> Self {
+        let data_seed = rig.wrapping_mul(1000).wrapping_add(seed);
+        let pour_seed = 77_000_000 + data_seed * 100_000;
+        let benches = match Rig::seeded(rig).with_container(container) {
+            Some(rig) if sim != "a" => (Bench::on(&rig), Bench::on(&change.apply(rig))),
+            _ => (Bench::Paper, Bench::Paper),
+        };
+        Self { bench: benches.0, test: benches.1, data_seed, pour_seed, limits: Limits::default() }
+    }
+
+    /// The same rig with a rendered camera before it.
+    ///
+    /// # Errors
+    /// One line, when the camera cannot learn the liquid's colour.
+    pub fn through_camera(mut self, rig: u64, container: &str) -> Result<Self, String> {
+        let Some(physics) = Rig::seeded(rig).with_container(container) else { return Ok(self) };
+        self.bench = Bench::through_camera(&physics, BenchCamera::seeded(rig)?);
+        self.test = self.bench.clone();
+        Ok(self)
+    }
+
+    /// The grid's pours that the container can make at all within the tilt range, with a number each: volume, goal, number.
+    fn cells(&self, repeats: u64) -> Vec<(f64, f64, u64)> {
+        let cells: Vec<(f64, f64)> = grid().into_iter().filter(|(init, goal)| *goal <= 0.95 * self.test.reach_ml(*init)).collect();
+        (0..repeats)
+            .flat_map(|r| {
+                let cells = cells.clone();
+                cells.into_iter().enumerate().map(move |(k, (init, goal))| (init, goal, r * 1000 + k as u64))
+            })
+            .collect()
+    }
+
+    /// Pours the grid with `weights` through the controller's core.
+    pub fn judge(&self, weights: &Weights, repeats: u64) -> Vec<PourResult> {
+        let agent = Agent::new(weights);
+        let pour = |(init, goal, k): (f64, f64, u64)| {
+            by_core(&agent, &mut self.test.pour(init, self.pour_seed + k), self.limits, init, goal, None)
+        };
+        self.cells(repeats).into_iter().map(pour).collect()
+    }
+
+    /// A small, a middle and a large pour, frame by frame, for the report.
+    pub fn examples(&self, weights: &Weights) -> Vec<serde_json::Value> {
+        let agent = Agent::new(weights);
+        let example = |(init, goal): (f64, f64)| {
+            let mut trace = Trace::default();
+            by_core(&agent, &mut self.test.pour(init, self.pour_seed), self.limits, init, goal, Some(&mut trace));
+            let area_4_px2: Vec<f64> = trace.area_px2.iter().map(|a| a / 4.0).collect();
+            serde_json::json!({ "init_ml": init, "goal_ml": goal, "name": "policy", "t_s": trace.t_s, "alpha_deg": trace.alpha_deg,
+                "true_ml": trace.true_ml, "area_4_px2": area_4_px2 })
+        };
+        [(225.0, 40.0), (300.0, 100.0), (375.0, 200.0)].map(example).into()
+    }
+
+    /// Makes `k` pours with `weights` on the test's bench, recorded and weighed, so that what has changed is learned too.
+    pub fn weighed_pours(&self, weights: &Weights, k: u64) -> Vec<TrainingEpisode> {
+        let agent = Agent::new(weights);
+        let mut random = Pcg64Mcg::seed_from_u64(self.data_seed ^ 0x9_0000_0000);
+        (0..k)
+            .map(|n| {
+                let init = random.random_range(150.0..450.0f64);
+                let goal = random.random_range(20.0..200.0f64).min(0.85 * init).min(0.9 * self.test.reach_ml(init));
+                let mut trace = Trace::default();
+                let mut pour = self.test.pour(init, random.random());
+                by_core(&agent, &mut pour, self.limits, init, goal, Some(&mut trace));
+                let misread: f64 = rand_distr::Distribution::sample(&rand_distr::StandardNormal, &mut random);
+                trace.weighed(&format!("pour {}", n + 1), (pour.poured_ml() + 0.5 * misread).round())
+            })
+            .filter(|e| e.fault().is_none())
+            .collect()
+    }
+
+    /// Options of a training.
+    pub fn options(&self, method: MethodName, estimate: Estimate, actions: u8) -> Options {
+        Options { method, estimate, actions, seed: self.data_seed + 1, limits: self.limits }
+    }
+
+    /// Records episodes, without those that no training takes.
+    fn record(&self, episodes: u64) -> Vec<TrainingEpisode> {
+        let mut data = self.bench.record(episodes as usize, self.data_seed);
+        data.retain(|e| e.fault().is_none());
+        data
+    }
+
+    /// Trains on recorded episodes and, after `weighed` pours, again on all of them. None when a training fails.
+    pub fn train(&self, options: &Options, episodes: u64, weighed: u64) -> Option<(Trained, Vec<TrainingEpisode>)> {
+        let mut data = self.record(episodes);
+        let mut trained = trainer::method::train(&data, options, &Silent).ok()?;
+        if weighed > 0 {
+            data.extend(self.weighed_pours(&trained.weights, weighed));
+            trained = trainer::method::train(&data, options, &Silent).ok()?;
+        }
+        Some((trained, data))
+    }
+
+    /// Pours the grid with a method, trained if it needs to be.
+    pub fn run(&self, pourer: Pourer, protocol: &Protocol) -> Vec<PourResult> {
+        let Some((method, estimate)) = pourer.training() else { return self.run_untrained(pourer, protocol) };
+        let options = self.options(method, estimate, protocol.actions);
+        if pourer == Pourer::PdTuned {
+            let (law, calibration, estimator) = self.tuned_pd(&self.record(protocol.episodes), options.seed);
+            return self.pour_grid(protocol, |goal| Box::new(ByLaw::new(law, calibration, &estimator, goal)));
+        }
+        let Some((trained, _)) = self.train(&options, protocol.episodes, protocol.weighed) else { return Vec::new() };
+        match (pourer, trained.law) {
+            (Pourer::Law, Some(law)) => {
+                let weights = &trained.weights;
+                self.pour_grid(protocol, |goal| Box::new(ByLaw::new(law, weights.calibration, &weights.estimator, goal)))
+            }
+            _ => self.judge(&trained.weights, protocol.repeats),
+        }
+    }
+
+    /// A PD on the fused estimate, tuned by the same search as the control law.
+    fn tuned_pd(&self, data: &[TrainingEpisode], seed: u64) -> (ControlLaw, Calibration, Estimator) {
+        let (fit, estimator) = model_search::estimator(data, Estimate::Fused, &self.limits);
+        let possible = PossiblePours::new(&fit, self.limits, RATE_HZ, true);
+        let (law, _) = control_law::search(&possible, ControlLaw::start_pd(true), model_search::SEARCH, seed, |_, _| {});
+        (law, fit.calibration, estimator)
+    }
+
+    /// Pours the grid with the baselines that `make` makes for each goal.
+    fn pour_grid<'a>(&self, protocol: &Protocol, make: impl Fn(f64) -> Box<dyn Baseline + 'a>) -> Vec<PourResult> {
+        let pour = |(init, goal, k): (f64, f64, u64)| {
+            by_baseline(make(goal).as_mut(), &mut self.test.pour(init, self.pour_seed + k), self.limits, init, goal)
+        };
+        self.cells(protocol.repeats).into_iter().map(pour).collect()
+    }
+
+    /// Pours the grid with a baseline that is not trained.
+    fn run_untrained(&self, pourer: Pourer, protocol: &Protocol) -> Vec<PourResult> {
+        let data = self.bench.record(protocol.episodes as usize, self.data_seed);
+        let linear = calibration::calibrate(&data, Some(1.0));
+        self.pour_grid(protocol, |goal| match pourer {
+            Pourer::PdHand => Box::new(HandPd(Sum::new(&linear, goal))),
+            Pourer::BangBang => Box::new(BangBang(Sum::new(&linear, goal))),
+            Pourer::OpenLoop => Box::new(OpenLoop::new(&data, goal)),
+            _ => Box::new(Oracle::new(goal, self.limits)),
+        })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::pour_evaluation::summary::Summary;
+
+    const PROTOCOL: Protocol = Protocol { episodes: 5, weighed: 0, actions: 21, repeats: 1 };
+
+    /// Protects the whole chain on the physical simulator: recorded, trained and poured through the controller's core, a network meets
+    /// goals that it never saw, and the same seeds give the same pours.
+    #[test]
+    fn a_trained_policy_meets_its_goals() {
+        let trial = Trial::new("b", 1, 0, "cylinder", Change::None);
+        let pours = trial.run(Pourer::Best, &PROTOCOL);
+        let summary = Summary::new("best", std::slice::from_ref(&pours));
+        assert_eq!((summary.n, summary.never_poured, summary.never_stopped), (45, 0, 0));
+        assert!(summary.mae_ml < 3.5 && summary.control_ml < 0.5, "{}", summary.line());
+        assert_eq!(pours, trial.run(Pourer::Best, &PROTOCOL));
+    }
+
+    /// Protects `--through-camera`: what is recorded and poured is seen in rendered pictures, by the feature worker's extraction, and a
+    /// network that is trained on that meets its goal.
+    #[test]
+    fn a_pour_is_seen_through_the_rendered_camera() {
+        let plain = Trial::new("b", 101, 0, "cylinder", Change::None);
+        let seen = plain.clone().through_camera(101, "cylinder").unwrap();
+        let options = seen.options(MethodName::Best, Estimate::Fused, 21);
+        let (trained, data) = seen.train(&options, 3, 0).unwrap();
+        for (by_picture, by_formula) in data.iter().zip(plain.bench.record(3, plain.data_seed)) {
+            assert_eq!(by_picture.alpha_deg, by_formula.alpha_deg);
+            assert_ne!(by_picture.area_px2, by_formula.area_px2);
+        }
+        let agent = Agent::new(&trained.weights);
+        let poured = by_core(&agent, &mut seen.test.pour(300.0, seen.pour_seed), seen.limits, 300.0, 60.0, None);
+        assert!(poured.ended && poured.error_ml().abs() < 8.0, "{poured:?}");
+    }
+
+    /// Protects the comparison: the oracle meets every goal, so what the others miss is their fault and not the bench's.
+    #[test]
+    fn the_oracle_meets_every_goal() {
+        for sim in ["a", "b"] {
+            let pours = Trial::new(sim, 2, 0, "cylinder", Change::None).run(Pourer::Oracle, &PROTOCOL);
+            let summary = Summary::new("oracle", &[pours]);
+            assert!(summary.max_ml < 0.7, "{sim}: {}", summary.line());
+        }
+    }
+}

@@ -1,0 +1,302 @@
+//! `feature-worker calibrate`: finds the container's axes and the liquid's colour, and writes the `[image]` section.
+//!
+//! It shows the pictures of one pour to [`crate::vision::find_corner`] and [`ColourLearner`]. A person then checks the picture that is
+//! written, or corrects the corner and the axes: with coordinates on the command line, or with three clicks in a local page. An ordinary
+//! command-line program that allocates. It changes nothing but the `[image]` table of the configuration, and that only with --write or a
+//! click.
+
+use std::path::PathBuf;
+use std::sync::atomic::Ordering::Relaxed;
+use std::time::{Duration, Instant};
+
+use opencv::core::{self, CV_8U, CV_32FC3, Mat, Scalar, Vector};
+use opencv::prelude::*;
+use opencv::{imgcodecs, imgproc};
+use shared::config::{CameraConfig, Config, ImageConfig, LiquidMethod};
+use shared::exit::{self, Failure, OrExit as _, failure};
+use shared::ipc::Cell;
+use shared::messages::PixelFormat;
+use shared::os;
+
+use super::page::{self, Page};
+use crate::drawing::{draw, jpeg, to_bgr};
+use crate::source::{Frame, FrameSource as _, NextFrame, ObserverSource, WAIT, for_each_frame};
+use crate::vision::{Axes, AxesError, ColourError, ColourLearner, Corner, Extractor, Image, find_corner};
+
+mod section;
+
+/// Most pictures that are kept for learning and for the drawn picture. Chosen by hand: about 140 MB at 640 x 480 px.
+const KEEP_PICTURES: usize = 150;
+/// The region's left border, top, right border and bottom from the lip, px of a picture 640 px wide. Chosen by hand; no
+/// measurement is recorded.
+const REGION_PX: [f32; 4] = [-40.0, -236.0, 380.0, 50.0];
+
+/// Command-line arguments.
+#[derive(Debug, clap::Args)]
+#[command(
+    after_help = "Examples:\n  feature-worker calibrate --config config/cell.toml --seconds 20 --page   (live camera: pour once while it runs)\n  \
+feature-worker calibrate pour.mp4 --write\n  feature-worker calibrate pour.mp4 --lip 215,250 --x-axis 600,250 --y-axis 215,470 --write\n\n\
+Show one whole pour: dry, tilting, flowing, back. The section is printed; --write puts it into the configuration. Look at the picture that \
+it names before you trust it: red must lie on the glass's top edge, green on its left side, white on the liquid's outline."
+)]
+pub struct Args {
+    /// Images, a video, or a file name pattern of one pour. Without any, the configured camera is watched; beside a running worker, the
+    /// worker's frames are.
+    input: Vec<PathBuf>,
+    /// The cell's configuration.
+    #[arg(long, default_value = shared::config::DEFAULT_FILE)]
+    config: PathBuf,
+    /// How long to watch a live camera.
+    #[arg(long, default_value_t = 15)]
+    seconds: u64,
+    /// The corner where the top edge and the left side meet, px: X,Y.
+    #[arg(long, value_parser = parse_point)]
+    lip: Option<[f32; 2]>,
+    /// A point of the top edge, further into the mouth, px: X,Y.
+    #[arg(long, value_parser = parse_point)]
+    x_axis: Option<[f32; 2]>,
+    /// A point of the left side, nearer to the foot, px: X,Y.
+    #[arg(long, value_parser = parse_point)]
+    y_axis: Option<[f32; 2]>,
+    /// How the liquid is told from the background.
+    #[arg(long, value_parser = ["colour", "clear"])]
+    method: Option<String>,
+    /// Write the section into the configuration.
+    #[arg(long)]
+    write: bool,
+    /// Where to write the picture that a person checks.
+    #[arg(long, default_value = "out/calibration.png")]
+    picture: PathBuf,
+    /// Correct the axes by clicks in a web page on this machine.
+    #[arg(long)]
+    page: bool,
+    /// The page's port on 127.0.0.1. With 0 any free port is taken.
+    #[arg(long, default_value_t = 8643)]
+    port: u16,
+}
+
+fn parse_point(text: &str) -> Result<[f32; 2], String> {
+    let parts: Vec<f32> = text.split(',').map_while(|p| p.trim().parse().ok()).collect();
+    <[f32; 2]>::try_from(parts).map_err(|_| "two numbers: X,Y in px".into())
+}
+
+/// Runs the command.
+pub fn run(args: &Args) -> Result<(), Failure> {
+    let config = Config::read(&args.config).or_exit(exit::BAD_INPUT)?;
+    calibrate(args, config)
+}
+
+/// What was seen of one pour.
+struct Pour {
+    /// Evenly spread pictures in BGR.
+    pictures: Vec<Mat>,
+    /// The sum of all pictures.
+    sum: Mat,
+    /// Number of all pictures.
+    count: u64,
+    /// One of so many pictures is kept.
+    stride: u64,
+}
+
+impl Pour {
+    fn new() -> Self {
+        Self { pictures: Vec::new(), sum: Mat::default(), count: 0, stride: 1 }
+    }
+
+    fn add(&mut self, frame: &Frame) -> Result<(), String> {
+        let words = |e: opencv::Error| e.message;
+        let bgr = to_bgr(frame).map_err(words)?;
+        if self.count == 0 {
+            self.sum = Mat::new_rows_cols_with_default(bgr.rows(), bgr.cols(), CV_32FC3, Scalar::default()).map_err(words)?;
+        } else if self.sum.size().map_err(words)? != bgr.size().map_err(words)? {
+            return Err(format!("frame {} has another size than those before", self.count + 1));
+        }
+        imgproc::accumulate(&bgr, &mut self.sum, &core::no_array()).map_err(words)?;
+        if self.count.is_multiple_of(self.stride) {
+            self.pictures.push(bgr);
+        }
+        if self.pictures.len() > KEEP_PICTURES {
+            // Every second picture is dropped, and from now on half as many are kept.
+            let mut index = 0;
+            self.pictures.retain(|_| {
+                index += 1;
+                index % 2 == 1
+            });
+            self.stride *= 2;
+        }
+        self.count += 1;
+        Ok(())
+    }
+
+    /// The corner in the mean of all pictures.
+    fn corner(&self) -> Result<Corner, AxesError> {
+        let mut mean = Mat::default();
+        self.sum.convert_to(&mut mean, CV_8U, 1.0 / self.count as f64, 0.0)?;
+        find_corner(&mean)
+    }
+}
+
+fn calibrate(args: &Args, mut config: Config) -> Result<(), Failure> {
+    let bad = |e: String| failure(exit::BAD_INPUT, e);
+    let mut pour = Pour::new();
+    if args.input.is_empty() {
+        watch(args, &config, &mut pour)?;
+    } else {
+        for_each_frame(&args.input, &config.camera, |frame| pour.add(&frame)).map_err(bad)?;
+    }
+    let Some(first) = pour.pictures.first() else { return Err(bad("no frame came".into())) };
+    (config.camera.width_px, config.camera.height_px) = (first.cols() as u32, first.rows() as u32);
+    let method = match args.method.as_deref() {
+        Some("clear") => LiquidMethod::Clear,
+        Some(_) => LiquidMethod::Colour,
+        None => config.image.method,
+    };
+    let corner = choose_corner(args, &pour, [first.cols() as f32, first.rows() as f32])?;
+    match propose(&config.camera, corner, method, &config.image, &pour.pictures) {
+        Ok(image) => config.image = image,
+        // In the page the corner can still be corrected.
+        Err(e) if args.page => eprintln!("calibrate: {e}"),
+        Err(e) => return Err(failure(exit::FAILED, e)),
+    }
+    save_picture(args, &config, &pour.pictures)?;
+    println!("{}", section::text(&config.image));
+    eprintln!("calibrate: look at {}", args.picture.display());
+    if args.write {
+        section::write(&args.config, &config)?;
+    }
+    if args.page { serve(args, config, corner, &pour.pictures) } else { Ok(()) }
+}
+
+/// Watches the configured camera for a while.
+fn watch(args: &Args, config: &Config, pour: &mut Pour) -> Result<(), Failure> {
+    let reach = |e: String| failure(exit::UNREACHABLE, e);
+    let cell = Cell::join(&config.cell.name).or_exit(exit::UNREACHABLE)?;
+    let mut source = ObserverSource::open(&config.camera, &cell).or_exit(exit::UNREACHABLE)?;
+    eprintln!("calibrate: watching the camera for {} s; pour once now", args.seconds);
+    let end = Instant::now() + Duration::from_secs(args.seconds);
+    while Instant::now() < end {
+        match source.next_frame(WAIT).or_exit(exit::UNREACHABLE)? {
+            NextFrame::Frame(frame) => pour.add(&frame).map_err(reach)?,
+            NextFrame::Nothing => {}
+            NextFrame::End => break,
+        }
+    }
+    if pour.count == 0 { Err(reach("no frame came from the camera; is its driver running?".into())) } else { Ok(()) }
+}
+
+/// The corner from the command line, and what that leaves open from the pictures of `width` and `height`, px.
+fn choose_corner(args: &Args, pour: &Pour, [width, height]: [f32; 2]) -> Result<Corner, Failure> {
+    if let (Some(lip), Some(rim), Some(foot)) = (args.lip, args.x_axis, args.y_axis) {
+        return Ok(Corner { lip, rim, foot });
+    }
+    match pour.corner() {
+        Ok(found) => Ok(Corner {
+            lip: args.lip.unwrap_or(found.lip),
+            rim: args.x_axis.unwrap_or(found.rim),
+            foot: args.y_axis.unwrap_or(found.foot),
+        }),
+        Err(e) if args.page => {
+            eprintln!("calibrate: {e}; click the corner in the page");
+            let lip = [0.35 * width, 0.5 * height];
+            Ok(Corner { lip, rim: [0.9 * width, 0.5 * height], foot: [0.35 * width, 0.9 * height] })
+        }
+        Err(e) => Err(failure(exit::FAILED, e)),
+    }
+}
+
+/// The `[image]` table for a corner: the region over the mouth, the axes, and the colour learned from the pictures.
+fn propose(
+    camera: &CameraConfig,
+    corner: Corner,
+    method: LiquidMethod,
+    before: &ImageConfig,
+    pictures: &[Mat],
+) -> Result<ImageConfig, ColourError> {
+    let scale = camera.width_px as f32 / 640.0;
+    let [x, y] = corner.lip;
+    let clamp = |v: f32, most: u32| v.clamp(0.0, most as f32) as u32;
+    let [left, top, right, bottom] = REGION_PX.map(|v| v * scale);
+    let (left, top) = (clamp(x + left, camera.width_px), clamp(y + top, camera.height_px));
+    let (right, bottom) = (clamp(x + right, camera.width_px), clamp(y + bottom, camera.height_px));
+    let mut image = ImageConfig {
+        method,
+        region_px: [left, top, right.saturating_sub(left), bottom.saturating_sub(top)],
+        x_axis_px: [x, y, corner.rim[0], corner.rim[1]],
+        y_axis_px: [corner.foot[0], corner.foot[1], x, y],
+        ..before.clone()
+    };
+    if method == LiquidMethod::Colour {
+        let mut learner = ColourLearner::new(Axes::new(&image));
+        for picture in pictures {
+            learner.add(picture)?;
+        }
+        image.colour_hsv = learner.range()?;
+    }
+    Ok(image)
+}
+
+/// The picture with most flow, with what is measured drawn on it.
+fn best_picture(config: &Config, pictures: &[Mat]) -> Result<Mat, String> {
+    let mut extractor = Extractor::new(&config.camera, &config.image).map_err(|e| e.to_string())?;
+    let mut best: Option<(f32, Mat)> = None;
+    for picture in pictures {
+        let pixels = picture.data_bytes().map_err(|e| e.message)?;
+        let (width_px, height_px) = (picture.cols() as u32, picture.rows() as u32);
+        let measured = extractor.measure(Image { width_px, height_px, format: PixelFormat::Bgr8, pixels }).map_err(|e| e.to_string())?;
+        if best.as_ref().is_none_or(|(area, _)| measured.area_px2 > *area) {
+            let mut drawn = picture.clone();
+            draw(&mut drawn, &extractor, &measured).map_err(|e| e.message)?;
+            best = Some((measured.area_px2, drawn));
+        }
+    }
+    best.map(|(_, drawn)| drawn).ok_or_else(|| "no frame".into())
+}
+
+fn save_picture(args: &Args, config: &Config, pictures: &[Mat]) -> Result<(), Failure> {
+    let fail = |e: String| failure(exit::FAILED, format!("{}: {e}", args.picture.display()));
+    let picture = best_picture(config, pictures).map_err(fail)?;
+    if let Some(parent) = args.picture.parent() {
+        std::fs::create_dir_all(parent).map_err(|e| fail(e.to_string()))?;
+    }
+    let written = imgcodecs::imwrite(&args.picture, &picture, &Vector::new()).map_err(|e| fail(e.message))?;
+    if written { Ok(()) } else { Err(fail("cannot be written".into())) }
+}
+
+/// Serves the page until "Write" or Ctrl-C.
+fn serve(args: &Args, mut config: Config, mut corner: Corner, pictures: &[Mat]) -> Result<(), Failure> {
+    let stop = os::stop_at_signals().or_exit(exit::FAILED)?;
+    let server = Page::open(args.port)?;
+    eprintln!("calibrate: open {} on this machine, click lip, top edge and left side, then Write", server.address());
+    server.serve(&stop, |path, body| match path {
+        "/" => page::html(include_str!("calibrate.html")),
+        "/picture.jpg" => {
+            let picture = best_picture(&config, pictures).or_else(|_| pictures.first().cloned().ok_or_else(String::new));
+            page::jpeg(jpeg(&picture.unwrap_or_default()))
+        }
+        "/state.json" => page::json(&serde_json::json!({ "width": config.camera.width_px, "height": config.camera.height_px,
+            "lip": corner.lip, "rim": corner.rim, "foot": corner.foot, "section": section::text(&config.image) })),
+        "/corner" => page::text(match try_corner(&config, body, pictures) {
+            Ok((tried, clicked)) => {
+                (config, corner) = (tried, clicked);
+                "measured again".into()
+            }
+            Err(e) => e,
+        }),
+        "/write" => {
+            let result = save_picture(args, &config, pictures).and_then(|()| section::write(&args.config, &config));
+            stop.store(result.is_ok(), Relaxed);
+            page::text(result.err().map_or_else(|| format!("written to {}", args.config.display()), |failed| failed.what))
+        }
+        _ => None,
+    });
+    Ok(())
+}
+
+/// The configuration for a corner that was clicked, if something can be measured with it.
+fn try_corner(config: &Config, clicked: &str, pictures: &[Mat]) -> Result<(Config, Corner), String> {
+    let corner = serde_json::from_str::<Corner>(clicked).map_err(|e| e.to_string())?;
+    let image = propose(&config.camera, corner, config.image.method, &config.image, pictures).map_err(|e| e.to_string())?;
+    let tried = Config { image, ..config.clone() };
+    best_picture(&tried, pictures)?;
+    Ok((tried, corner))
+}

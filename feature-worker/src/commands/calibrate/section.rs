@@ -1,0 +1,75 @@
+//! The `[image]` table as text, and its place in the configuration's file.
+//!
+//! Allocates. A configuration that would be refused is not written; every failure names the file.
+
+use std::path::Path;
+
+use shared::config::{Config, ImageConfig, LiquidMethod};
+use shared::exit::{self, Failure, OrExit as _, failure};
+
+/// The `[image]` table as text.
+pub(super) fn text(image: &ImageConfig) -> String {
+    let method = if image.method == LiquidMethod::Colour { "colour" } else { "clear" };
+    let round = |a: [f32; 4]| a.map(|v| (v * 10.0).round() / 10.0);
+    format!(
+        "[image]\nmethod = \"{method}\"\nregion_px = {:?}            # x, y, width, height: the lip and the space over the glass's mouth\n\
+         x_axis_px = {:?}   # glass's top edge, from the lip's side into the mouth\n\
+         y_axis_px = {:?}   # container's left side, from its foot towards its rim\n\
+         colour_hsv = {:?}   # h_min s_min v_min h_max s_max v_max, OpenCV's HSV\n\
+         area_min_px2 = {:?}            # less is no stream\n",
+        image.region_px,
+        round(image.x_axis_px),
+        round(image.y_axis_px),
+        image.colour_hsv,
+        image.area_min_px2
+    )
+}
+
+/// Puts the `[image]` table of `config` into the file in one step. The rest of the file stays as it is.
+pub(super) fn write(path: &Path, config: &Config) -> Result<(), Failure> {
+    let fail = |e: String| failure(exit::FAILED, format!("{}: {e}", path.display()));
+    let before = std::fs::read_to_string(path).map_err(|e| fail(e.to_string()))?;
+    let after = replace(&before, &text(&config.image));
+    let checked = Config::parse(&after, &path.display().to_string()).or_exit(exit::FAILED)?;
+    let size = (checked.camera.width_px, checked.camera.height_px);
+    let (width, height) = (config.camera.width_px, config.camera.height_px);
+    if size != (width, height) {
+        return Err(fail(format!(
+            "[camera] says {} x {} px, but these frames are {width} x {height}; correct width_px and height_px first",
+            size.0, size.1
+        )));
+    }
+    let beside = path.with_extension("toml.new");
+    std::fs::write(&beside, &after).and_then(|()| std::fs::rename(&beside, path)).map_err(|e| fail(e.to_string()))?;
+    eprintln!("calibrate: wrote [image] of {}", path.display());
+    Ok(())
+}
+
+/// The file's text with another `[image]` table.
+fn replace(before: &str, section: &str) -> String {
+    let mut after = String::new();
+    // What stands between the table's last key and the next table belongs to that one.
+    let mut between = String::new();
+    let mut inside = false;
+    for line in before.lines() {
+        let trimmed = line.trim_start();
+        if trimmed.starts_with("[image]") {
+            inside = true;
+            after.push_str(section);
+        } else if inside && !trimmed.starts_with('[') {
+            if !trimmed.is_empty() && !trimmed.starts_with('#') {
+                between.clear();
+            } else {
+                between.push_str(line);
+                between.push('\n');
+            }
+        } else {
+            if std::mem::take(&mut inside) {
+                after.push_str(if between.is_empty() { "\n" } else { &between });
+            }
+            after.push_str(line);
+            after.push('\n');
+        }
+    }
+    after
+}

@@ -1,0 +1,129 @@
+//! `feature-worker inspect`: what is measured in images or a video, as pictures and a CSV.
+//!
+//! An ordinary command-line program that allocates. An input that cannot be read, or has another size than configured, ends it with one
+//! line.
+
+use std::path::PathBuf;
+
+use indicatif::ProgressBar;
+use opencv::core::Vector;
+use opencv::imgcodecs;
+use shared::config::{CameraConfig, Config};
+use shared::exit::{self, Failure, OrExit as _};
+use shared::messages::{Doubt, FrameHeader, PixelFormat};
+
+use crate::drawing::{draw, to_bgr};
+use crate::source::{Frame, for_each_frame};
+use crate::vision::{Extractor, Image, Measurement};
+
+/// Command-line arguments.
+#[derive(Debug, clap::Args)]
+#[command(
+    after_help = "Examples:\n  feature-worker inspect pour.mp4 --config config/cell.toml --out out/inspect\n  feature-worker inspect a.png b.png \
+--json\n  feature-worker inspect 'frames/frame_%04d.png' --every 10\n\nWrites features.csv (frame, t_s, area_px2, confidence, doubt, triangle) \
+and a picture of every N-th frame with region, axes, outline, edge points, line and triangle drawn on it."
+)]
+pub struct Args {
+    /// Images, one video, or one file name pattern of an image sequence.
+    #[arg(required = true)]
+    input: Vec<PathBuf>,
+    /// The cell's configuration. Its [image] table is what is tried.
+    #[arg(long, default_value = shared::config::DEFAULT_FILE)]
+    config: PathBuf,
+    /// Directory for the pictures and the CSV.
+    #[arg(long, default_value = "out/inspect")]
+    out: PathBuf,
+    /// Write the picture of every N-th frame. With 0 none is written.
+    #[arg(long, default_value_t = 1)]
+    every: u64,
+    /// Print a summary as JSON.
+    #[arg(long)]
+    json: bool,
+}
+
+/// What was measured in all frames together.
+#[derive(Default)]
+struct Totals {
+    /// Frames with a stream.
+    flowing: u64,
+    /// Frames with a doubt.
+    doubtful: u64,
+    /// Sum of V_e, px^2.
+    sum_px2: f64,
+}
+
+impl Totals {
+    fn add(&mut self, measured: &Measurement) {
+        self.flowing += u64::from(measured.area_px2 > 0.0);
+        self.doubtful += u64::from(measured.doubt != Doubt::None);
+        self.sum_px2 += f64::from(measured.area_px2);
+    }
+}
+
+/// Runs the command.
+pub fn run(args: &Args) -> Result<(), Failure> {
+    let config = Config::read(&args.config).or_exit(exit::BAD_INPUT)?;
+    inspect(args, &config).or_exit(exit::BAD_INPUT)
+}
+
+fn words(e: impl std::fmt::Display) -> String {
+    e.to_string()
+}
+
+fn inspect(args: &Args, config: &Config) -> Result<(), String> {
+    let mut extractor = Extractor::new(&config.camera, &config.image).map_err(words)?;
+    std::fs::create_dir_all(&args.out).map_err(|e| format!("{}: {e}; give another --out", args.out.display()))?;
+    let table = args.out.join("features.csv");
+    let mut csv = csv::Writer::from_path(&table).map_err(|e| format!("{}: {e}", table.display()))?;
+    csv.write_record(["frame", "t_s", "area_px2", "confidence", "doubt", "x0", "y0", "x1", "y1", "x2", "y2"]).map_err(words)?;
+    let bar = ProgressBar::new_spinner().with_message("frames");
+    let mut totals = Totals::default();
+    let frames = for_each_frame(&args.input, &config.camera, |frame| {
+        let measured = measure(&mut extractor, &config.camera, &frame)?;
+        totals.add(&measured);
+        csv.write_record(row(&frame.header, config.camera.fps, &measured)).map_err(words)?;
+        if args.every > 0 && (frame.header.sequence - 1) % args.every == 0 {
+            let mut picture = to_bgr(&frame).map_err(words)?;
+            draw(&mut picture, &extractor, &measured).map_err(words)?;
+            let path = args.out.join(format!("frame_{:06}.png", frame.header.sequence));
+            imgcodecs::imwrite(&path, &picture, &Vector::new()).map_err(words)?;
+        }
+        bar.inc(1);
+        Ok(())
+    })?;
+    csv.flush().map_err(|e| format!("{}: {e}", table.display()))?;
+    bar.finish_and_clear();
+    let Totals { flowing, doubtful, sum_px2 } = totals;
+    if args.json {
+        let report =
+            serde_json::json!({ "frames": frames, "flowing": flowing, "doubtful": doubtful, "sum_area_px2": sum_px2, "csv": table });
+        println!("{report}");
+    } else {
+        println!("{frames} frames, {flowing} with flow, {doubtful} doubtful, sum of V_e {sum_px2:.0} px^2; see {}", table.display());
+    }
+    Ok(())
+}
+
+/// Measures one frame. One of another size than configured is an error.
+fn measure(extractor: &mut Extractor, camera: &CameraConfig, frame: &Frame) -> Result<Measurement, String> {
+    let header = frame.header;
+    let format = PixelFormat::from_code(header.format).unwrap_or(PixelFormat::Bgr8);
+    let image = Image { width_px: header.width_px, height_px: header.height_px, format, pixels: frame.pixels };
+    let measured = extractor.measure(image).map_err(words)?;
+    if measured.doubt == Doubt::WrongFormat {
+        return Err(format!(
+            "frame {} is {} x {} px, but [camera] says {} x {}; set width_px and height_px to the input's size and calibrate",
+            header.sequence, header.width_px, header.height_px, camera.width_px, camera.height_px
+        ));
+    }
+    Ok(measured)
+}
+
+/// One row of the CSV.
+fn row(header: &FrameHeader, fps: f64, measured: &Measurement) -> Vec<String> {
+    let t_s = (header.sequence - 1) as f64 / fps;
+    let mut row = vec![header.sequence.to_string(), format!("{t_s:.4}"), format!("{:.2}", measured.area_px2)];
+    row.extend([format!("{:.3}", measured.confidence), measured.doubt.words().to_string()]);
+    row.extend(measured.triangle_px.iter().map(|v| format!("{v:.2}")));
+    row
+}

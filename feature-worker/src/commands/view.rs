@@ -1,0 +1,153 @@
+//! `feature-worker view`: the live stream with region, axes, outline, line, triangle, V_e and its history, in a local web page.
+//!
+//! A process of its own, so that it never slows the worker: it reads the cell's frames as one more subscriber (see [`ObserverSource`]),
+//! measures them again with the same configuration, and keeps the newest picture. When no frames come any more it says so, and goes on when
+//! they come again.
+//!
+//! Threads: the calling one measures; another answers the browser, and compresses a picture only when it is asked for. Allocates. A lost
+//! camera ends the command with its reason.
+
+use std::collections::VecDeque;
+use std::path::PathBuf;
+use std::sync::atomic::{AtomicBool, Ordering::Relaxed};
+use std::sync::{Mutex, MutexGuard, PoisonError};
+
+use opencv::core::Mat;
+use shared::config::Config;
+use shared::exit::{self, Failure, OrExit as _};
+use shared::ipc::Cell;
+use shared::messages::PixelFormat;
+use shared::os;
+
+use super::page::{self, Page};
+use crate::drawing::{draw, jpeg, to_bgr};
+use crate::source::{Frame, FrameStream, ObserverSource, StreamEvent};
+use crate::vision::{Extractor, Image};
+
+/// Values of V_e that the page shows. Chosen by hand: ten seconds at 30 frames a second.
+const HISTORY: usize = 300;
+
+/// Command-line arguments.
+#[derive(Debug, clap::Args)]
+#[command(
+    after_help = "Examples:\n  feature-worker view --config config/sim.toml\n  feature-worker view --config config/cell.toml --port 9000\n\n\
+Open the address that it prints in a browser on this machine. Ctrl-C ends it.
+
+Beside `feature-worker run` it shows the worker's frames. Without a worker it opens the camera itself, and hands it over to a worker \
+that starts. When the worker ends, it waits for the next one."
+)]
+pub struct Args {
+    /// The cell's configuration.
+    #[arg(long, default_value = shared::config::DEFAULT_FILE)]
+    config: PathBuf,
+    /// Port on 127.0.0.1. With 0 any free port is taken.
+    #[arg(long, default_value_t = 8642)]
+    port: u16,
+}
+
+/// The newest measurement.
+#[derive(Debug, Clone, Copy, Default)]
+struct Newest {
+    sequence: u64,
+    area_px2: f32,
+    confidence: f32,
+    doubt: &'static str,
+}
+
+/// What the browser may ask for.
+#[derive(Default)]
+struct Shown {
+    /// The newest picture, in BGR; empty before the first.
+    picture: Mat,
+    newest: Newest,
+    /// The last values of V_e, px^2.
+    history: VecDeque<f32>,
+    /// Whether no frame has come for a second.
+    silent: bool,
+}
+
+/// Runs the command.
+pub fn run(args: &Args) -> Result<(), Failure> {
+    let config = Config::read(&args.config).or_exit(exit::BAD_INPUT)?;
+    view(args, &config)
+}
+
+fn lock(shown: &Mutex<Shown>) -> MutexGuard<'_, Shown> {
+    shown.lock().unwrap_or_else(PoisonError::into_inner)
+}
+
+fn view(args: &Args, config: &Config) -> Result<(), Failure> {
+    let stop = os::stop_at_signals().or_exit(exit::FAILED)?;
+    opencv::core::set_num_threads(1).or_exit(exit::FAILED)?;
+    let extractor = Extractor::new(&config.camera, &config.image).or_exit(exit::BAD_INPUT)?;
+    let cell = Cell::join(&config.cell.name).or_exit(exit::UNREACHABLE)?;
+    let source = ObserverSource::open(&config.camera, &cell).or_exit(exit::UNREACHABLE)?;
+    let server = Page::open(args.port)?;
+    println!("{}", server.address());
+    let shown = Mutex::new(Shown::default());
+    std::thread::scope(|scope| {
+        scope.spawn(|| answer(&server, &shown, &stop));
+        let result = watch(FrameStream::new(source, &stop), extractor, &shown);
+        stop.store(true, Relaxed);
+        result
+    })
+}
+
+/// Measures every frame for the browser until the frames end.
+fn watch(mut frames: FrameStream<ObserverSource>, mut extractor: Extractor, shown: &Mutex<Shown>) -> Result<(), Failure> {
+    loop {
+        match frames.wait().or_exit(exit::UNREACHABLE)? {
+            StreamEvent::Frame(frame) => show(&frame, &mut extractor, shown)?,
+            StreamEvent::Nothing => {}
+            StreamEvent::FellSilent => {
+                lock(shown).silent = true;
+                eprintln!("feature-worker: no frames for a second; waiting for the worker or the camera driver to go on");
+            }
+            StreamEvent::End => return Ok(()),
+        }
+    }
+}
+
+/// Measures one frame for the browser. A frame that cannot be drawn is left out.
+fn show(frame: &Frame, extractor: &mut Extractor, shown: &Mutex<Shown>) -> Result<(), Failure> {
+    let Some(format) = PixelFormat::from_code(frame.header.format) else { return Ok(()) };
+    let (width_px, height_px) = (frame.header.width_px, frame.header.height_px);
+    if frame.pixels.len() != width_px as usize * height_px as usize * format.bytes_per_pixel() {
+        return Ok(());
+    }
+    let measured = extractor.measure(Image { width_px, height_px, format, pixels: frame.pixels }).or_exit(exit::BAD_INPUT)?;
+    let mut picture = to_bgr(frame).or_exit(exit::FAILED)?;
+    draw(&mut picture, extractor, &measured).or_exit(exit::FAILED)?;
+    let mut shown = lock(shown);
+    shown.picture = picture;
+    shown.silent = false;
+    shown.newest = Newest {
+        sequence: frame.header.sequence,
+        area_px2: measured.area_px2,
+        confidence: measured.confidence,
+        doubt: measured.doubt.words(),
+    };
+    if shown.history.len() >= HISTORY {
+        shown.history.pop_front();
+    }
+    shown.history.push_back(measured.area_px2);
+    Ok(())
+}
+
+/// Answers the browser until the command ends.
+fn answer(server: &Page, shown: &Mutex<Shown>, stop: &AtomicBool) {
+    server.serve(stop, |path, _| match path {
+        "/" => page::html(include_str!("view.html")),
+        "/picture.jpg" => {
+            let picture = lock(shown).picture.clone();
+            page::jpeg(jpeg(&picture))
+        }
+        "/state.json" => {
+            let shown = lock(shown);
+            let Newest { sequence, area_px2, confidence, doubt } = shown.newest;
+            page::json(&serde_json::json!({ "sequence": sequence, "area_px2": area_px2, "confidence": confidence, "doubt": doubt,
+                "silent": shown.silent, "history": shown.history }))
+        }
+        _ => None,
+    });
+}

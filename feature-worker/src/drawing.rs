@@ -1,0 +1,95 @@
+//! Pictures for the eye: frames in BGR with what was measured drawn on them, captions, JPEG.
+//!
+//! Used by `view`, `calibrate`, `inspect` and the experiments, never by the worker. Everything here allocates; the only failures are
+//! OpenCV's.
+
+use opencv::core::{Mat, Point, Rect, Scalar, Vec2b, Vec3b, Vector};
+use opencv::prelude::*;
+use opencv::{imgcodecs, imgproc};
+use shared::messages::{Doubt, PixelFormat};
+
+use crate::source::Frame;
+use crate::vision::{Extractor, Measurement};
+
+/// Binary digits behind the point in OpenCV's coordinates.
+const SHIFT: i32 = 4;
+/// Height of a line of caption, px. Chosen by hand to fit the font.
+const CAPTION_PX: i32 = 20;
+/// Quality of JPEG pictures, 0 to 100. Chosen by hand; no measurement is recorded.
+const JPEG_QUALITY: i32 = 80;
+
+/// A copy of a frame in BGR, whatever the frame's format is.
+pub fn to_bgr(frame: &Frame) -> Result<Mat, opencv::Error> {
+    let (rows, columns) = (frame.header.height_px as i32, frame.header.width_px as i32);
+    let mut bgr = Mat::default();
+    match PixelFormat::from_code(frame.header.format) {
+        Some(PixelFormat::Mono8) => {
+            imgproc::cvt_color_def(&Mat::new_rows_cols_with_bytes::<u8>(rows, columns, frame.pixels)?, &mut bgr, imgproc::COLOR_GRAY2BGR)?;
+        }
+        Some(PixelFormat::Yuyv) => {
+            let yuyv = Mat::new_rows_cols_with_bytes::<Vec2b>(rows, columns, frame.pixels)?;
+            imgproc::cvt_color_def(&yuyv, &mut bgr, imgproc::COLOR_YUV2BGR_YUYV)?;
+        }
+        _ => Mat::new_rows_cols_with_bytes::<Vec3b>(rows, columns, frame.pixels)?.copy_to(&mut bgr)?,
+    }
+    Ok(bgr)
+}
+
+/// A picture as JPEG; no bytes if the picture is empty.
+pub fn jpeg(picture: &Mat) -> Vec<u8> {
+    let mut bytes = Vector::new();
+    let quality = Vector::from_slice(&[imgcodecs::IMWRITE_JPEG_QUALITY, JPEG_QUALITY]);
+    let ok = !picture.empty() && imgcodecs::imencode(".jpg", picture, &mut bytes, &quality).unwrap_or(false);
+    if ok { bytes.to_vec() } else { Vec::new() }
+}
+
+fn colour(blue: u8, green: u8, red: u8) -> Scalar {
+    Scalar::new(blue.into(), green.into(), red.into(), 0.0)
+}
+
+/// A place in px as OpenCV takes it with [`SHIFT`].
+fn point([x, y]: [f32; 2]) -> Point {
+    let fixed = |v: f32| (v * (1 << SHIFT) as f32).round() as i32;
+    Point::new(fixed(x), fixed(y))
+}
+
+/// Draws what `extractor` has just measured into the BGR picture `image`: the region (grey), the axes (red and green, as in Fig. 4), the
+/// outline of the liquid (white), edge points and line (yellow), the triangle and its numbers.
+pub fn draw(image: &mut Mat, extractor: &Extractor, measured: &Measurement) -> Result<(), opencv::Error> {
+    let (plain, smooth) = (imgproc::LINE_8, imgproc::LINE_AA);
+    let region = extractor.region();
+    imgproc::rectangle(image, region, colour(160, 160, 160), 1, plain, 0)?;
+    let axes = extractor.axes();
+    let reach = (region.width + region.height) as f32 * 0.4;
+    for (axis, shade) in [(axes.x, colour(40, 40, 255)), (axes.y, colour(40, 220, 40))] {
+        let end = |d: f32| point([axes.lip_px[0] + d * axis[0], axes.lip_px[1] + d * axis[1]]);
+        imgproc::line(image, end(0.0), end(reach), shade, 1, smooth, SHIFT)?;
+    }
+    let outline: Vector<Point> = extractor.outline_px().map(point).collect();
+    if !outline.is_empty() {
+        imgproc::polylines(image, &outline, false, colour(255, 255, 255), 1, smooth, SHIFT)?;
+    }
+    let yellow = colour(0, 255, 255);
+    for p in extractor.edge_points_px() {
+        imgproc::circle(image, point(p), 24, yellow, imgproc::FILLED, smooth, SHIFT)?;
+    }
+    if measured.area_px2 > 0.0 {
+        let [x0, y0, x1, y1, x2, y2] = measured.triangle_px;
+        imgproc::line(image, point([x1, y1]), point([x2, y2]), yellow, 2, smooth, SHIFT)?;
+        for corner in [[x1, y1], [x2, y2]] {
+            imgproc::line(image, point([x0, y0]), point(corner), yellow, 1, smooth, SHIFT)?;
+        }
+    }
+    let doubt = if measured.doubt == Doubt::None { String::new() } else { format!("  {}", measured.doubt.words()) };
+    let text = format!("V_e {:.0} px^2  confidence {:.2}{doubt}", measured.area_px2, measured.confidence);
+    caption(image, &text, 0)
+}
+
+/// Writes one line of text over a dark bar at the picture's foot, `line` lines above the lowest.
+pub fn caption(image: &mut Mat, text: &str, line: i32) -> Result<(), opencv::Error> {
+    let (width, height) = (image.cols(), image.rows());
+    let top = height - CAPTION_PX * (line + 1);
+    imgproc::rectangle(image, Rect::new(0, top, width, CAPTION_PX), colour(20, 20, 20), imgproc::FILLED, imgproc::LINE_8, 0)?;
+    let font = imgproc::FONT_HERSHEY_SIMPLEX;
+    imgproc::put_text(image, text, Point::new(6, top + 14), font, 0.45, colour(235, 235, 235), 1, imgproc::LINE_AA, false)
+}

@@ -1,0 +1,34 @@
+//! From an image to V_e, the area of the triangle of section 3.3.1 and Fig. 4.
+//!
+//! | file | what it does |
+//! |---|---|
+//! | `extractor` | measures one image: checks, then the liquid, then the line |
+//! | `checks` | whether a picture can be used: light, repetition, focus |
+//! | `liquid` | what the extractor asks of a liquid; `colour` and `clear` are the two kinds |
+//! | `line` | the stream's edge as a robust line, then through sub-pixel points of profiles |
+//! | `geometry` | lines, the two axes, and the rays between them |
+//! | `picture` | images, their pixels, and samples between pixels |
+//! | `measurement` | what one image tells |
+//! | `learn_axes` | finds the axes in the mean of many pictures |
+//! | `learn_colour` | learns the liquid's colour from the pictures of one pour |
+//!
+//! docs/VISION.md says how well each works. Nothing here knows where images come from or who reads the measurements.
+
+mod checks;
+mod clear;
+mod colour;
+mod extractor;
+mod geometry;
+mod learn_axes;
+mod learn_colour;
+mod line;
+mod liquid;
+mod measurement;
+mod picture;
+
+pub use extractor::{ExtractError, Extractor};
+pub use geometry::Axes;
+pub use learn_axes::{AxesError, Corner, find_corner};
+pub use learn_colour::{ColourError, ColourLearner};
+pub use measurement::{Measurement, Stages};
+pub use picture::Image;

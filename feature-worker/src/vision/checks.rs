@@ -1,0 +1,143 @@
+//! Checks of a picture before and beside the measurement: light, repetition, and focus.
+//!
+//! Called on the extraction thread; nothing is allocated after the start and nothing fails. A picture that cannot be used gets a
+//! [`Doubt`].
+
+use shared::messages::Doubt;
+
+use super::geometry::Axes;
+use super::picture::RegionPixels;
+
+/// Mean grey level below which a picture counts as dark. Chosen by hand; `evaluate-camera` raises the doubt on purpose.
+const DARK_LEVEL: f32 = 14.0;
+/// Share of saturated pixels above which a picture counts as blown out. Chosen by hand; `evaluate-camera` raises the doubt on purpose.
+const BLOWN_SHARE: f32 = 0.5;
+/// A pixel whose three parts reach this is saturated, grey levels. Chosen by hand: a little below 255, because of noise.
+const SATURATED_LEVEL: u8 = 250;
+/// Light is judged by every so many pixels. Chosen by hand, for speed.
+const LIGHT_EVERY: usize = 4;
+
+/// Bundles of profiles across each axis. Chosen by hand; no measurement is recorded.
+const RIM_BUNDLES: usize = 12;
+/// Lines in a bundle; their mean has less noise than one line. Chosen by hand; no measurement is recorded.
+const RIM_LINES: usize = 8;
+/// Distance of the bundles along the axis, px. Chosen by hand; no measurement is recorded.
+const RIM_BUNDLE_PX: f32 = 14.0;
+/// Distance of a bundle's lines, px. Chosen by hand; no measurement is recorded.
+const RIM_LINE_PX: f32 = 1.5;
+/// Samples of a line on either side of the axis, 1 px apart. Chosen by hand; no measurement is recorded.
+const RIM_REACH: usize = 9;
+/// Length over which the steepness of a step is taken, px. Chosen by hand; no measurement is recorded.
+const RIM_STEP: usize = 3;
+/// Samples on either side of the steepest step within which the change of brightness is taken. Chosen by hand, so that a soft edge of
+/// the background beside the rim does not count.
+const RIM_AROUND: usize = 3;
+/// Least change of brightness across the rim that tells anything, grey levels. Tuned on seeds 1 and 5001 to 5003 of `evaluate-camera`,
+/// see docs/VISION.md.
+const RIM_CONTRAST: f32 = 14.0;
+/// Least number of bundles with that change. Tuned as [`RIM_CONTRAST`] was.
+const RIM_SEEN: usize = 5;
+/// A rim of this width is blurred, px; the width is the change of brightness over its steepest step. Tuned as [`RIM_CONTRAST`] was; a
+/// blurred edge of deviation s is 2.5 s wide.
+const RIM_BLURRED_PX: f32 = 5.6;
+
+/// Checks the light, and that the picture is not the same as the last one.
+#[derive(Default)]
+pub(crate) struct LightCheck {
+    /// Hash of the last picture's bytes; none before the first.
+    last_hash: Option<u64>,
+    /// Mean grey level of the last picture.
+    mean_level: f32,
+}
+
+impl LightCheck {
+    /// Why a picture of these BGR pixels cannot be used: it is too dark, blown out, or the same picture as the last one. This is one
+    /// pass, because three OpenCV reductions over the same bytes took longer.
+    pub(crate) fn doubt(&mut self, bytes: &[u8]) -> Option<Doubt> {
+        let mut hash = 0xcbf2_9ce4_8422_2325u64;
+        for chunk in bytes.chunks_exact(8) {
+            let word = u64::from_le_bytes([chunk[0], chunk[1], chunk[2], chunk[3], chunk[4], chunk[5], chunk[6], chunk[7]]);
+            hash = (hash ^ word).wrapping_mul(0x9e37_79b9_7f4a_7c15).rotate_left(29);
+        }
+        let repeated = self.last_hash.replace(hash) == Some(hash);
+        let (mut sum, mut saturated, mut count) = (0u64, 0u32, 0u32);
+        for pixel in bytes.chunks_exact(3).step_by(LIGHT_EVERY) {
+            sum += u64::from(pixel[0]) + u64::from(pixel[1]) + u64::from(pixel[2]);
+            saturated += u32::from(pixel.iter().all(|v| *v >= SATURATED_LEVEL));
+            count += 1;
+        }
+        self.mean_level = sum as f32 / (3.0 * count.max(1) as f32);
+        if self.mean_level < DARK_LEVEL {
+            Some(Doubt::TooDark)
+        } else if saturated as f32 > BLOWN_SHARE * count as f32 {
+            Some(Doubt::BlownOut)
+        } else if repeated {
+            Some(Doubt::Frozen)
+        } else {
+            None
+        }
+    }
+
+    /// Mean grey level of the picture that was checked last.
+    pub(crate) fn mean_level(&self) -> f32 {
+        self.mean_level
+    }
+}
+
+/// Checks the focus by the glass's own top edge and left side, which are always in the same place.
+pub(crate) struct RimCheck {
+    /// Relative to the region.
+    axes: Axes,
+    /// Width of the rim in each bundle that shows it, px. Kept from frame to frame.
+    widths_px: Vec<f32>,
+}
+
+impl RimCheck {
+    /// A check for these axes, relative to the region.
+    pub(crate) fn new(axes: Axes) -> Self {
+        Self { axes, widths_px: Vec::with_capacity(2 * RIM_BUNDLES) }
+    }
+
+    /// Whether the rim has lost its sharp edges. False when it is not seen well enough to tell: the glass is as bright as what is
+    /// behind it, or the axes lie beside the rim.
+    pub(crate) fn is_blurred(&mut self, pixels: RegionPixels) -> bool {
+        self.widths_px.clear();
+        let axes = self.axes;
+        for (along, across) in [(axes.x, axes.y), ([-axes.y[0], -axes.y[1]], axes.x)] {
+            // Square to the axis, so that an oblique container does not look soft.
+            let skew = across[0] * along[0] + across[1] * along[1];
+            let across = [across[0] - skew * along[0], across[1] - skew * along[1]];
+            let length = across[0].hypot(across[1]);
+            for bundle in 0..RIM_BUNDLES {
+                let mut profile = [0.0f32; 2 * RIM_REACH + 1];
+                let inside = profile.iter_mut().enumerate().all(|(j, level)| {
+                    let d = (j as f32 - RIM_REACH as f32) / length;
+                    (0..RIM_LINES).all(|line| {
+                        let s = RIM_BUNDLE_PX * (1 + bundle) as f32 + RIM_LINE_PX * line as f32;
+                        let [x, y] = axes.at(s, along);
+                        let colour = pixels.at(x + d * across[0], y + d * across[1]);
+                        *level += colour.map_or(0.0, |c| c.iter().sum::<f32>()) / (3 * RIM_LINES) as f32;
+                        colour.is_some()
+                    })
+                });
+                let (change, steepness) = steepest_change(&profile);
+                if inside && change >= RIM_CONTRAST {
+                    self.widths_px.push(change / steepness);
+                }
+            }
+        }
+        // What stands behind the rim is out of focus too, so the sharper bundles decide.
+        let sharper = self.widths_px.len() / 4;
+        self.widths_px.len() >= RIM_SEEN && *self.widths_px.select_nth_unstable_by(sharper, f32::total_cmp).1 > RIM_BLURRED_PX
+    }
+}
+
+/// The change of brightness close around a profile's steepest step, grey levels, and the steepness of that step, grey levels a px.
+fn steepest_change(profile: &[f32; 2 * RIM_REACH + 1]) -> (f32, f32) {
+    let steepness = |i: usize| (profile[i + RIM_STEP] - profile[i]).abs() / RIM_STEP as f32;
+    let at =
+        (RIM_AROUND..2 * RIM_REACH + 1 - RIM_STEP - RIM_AROUND).max_by(|i, j| steepness(*i).total_cmp(&steepness(*j))).unwrap_or(RIM_REACH);
+    let around = &profile[at - RIM_AROUND..at + RIM_STEP + 1 + RIM_AROUND];
+    let (low, high) = around.iter().fold((f32::MAX, f32::MIN), |(l, h), v| (l.min(*v), h.max(*v)));
+    (high - low, steepness(at))
+}

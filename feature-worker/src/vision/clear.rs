@@ -1,0 +1,272 @@
+//! Clear water: told from the background by what does not move with it.
+//!
+//! Water has no colour, but it bends light: its outline shows a band of the room instead of what stands behind, and inside it the
+//! background is displaced. The container turns, so the background moves in the picture as one rigid piece, while the stream's outline
+//! stays. So the picture is made small (320 px for the whole width), and in each frame:
+//!
+//! 1. [`background`] remembers the dry background as one picture that is fixed in the world, and finds how it lies in the camera's picture
+//!    ([`motion`], [`rigid`]; [`follow`] is the inner loop of remembering).
+//! 2. [`evidence`] compares the memory and an earlier picture, both moved, with the picture along [`rays`] from the lip. What differs from
+//!    the memory is wet. Where the ground was hidden until now, or is as bright as the water's rim, a step in colour counts that the
+//!    earlier picture, moved, does not explain.
+//! 3. [`lines`] finds the line from axis to axis with the best evidence, and [`water`] decides whether it is a stream.
+//! 4. The full picture's profiles across that line must confirm it.
+//!
+//! The first frame must be dry, and frames must follow each other. Called on the extraction thread. All pictures and tables are kept, so
+//! nothing is allocated after the second frame. The only failures are OpenCV's.
+
+mod background;
+mod evidence;
+mod follow;
+mod lines;
+mod motion;
+mod rays;
+mod rigid;
+mod water;
+
+use opencv::boxed_ref::BoxedRef;
+use opencv::core::{Mat, Size};
+use opencv::imgproc;
+use shared::messages::{Doubt, PixelFormat};
+
+use self::background::{Background, DryPlaces, WetPlaces};
+use self::evidence::{CALM, Evidence};
+use self::lines::Lines;
+use self::rays::{RIM_PX, Rays};
+use self::water::{Verdict, Water};
+use super::geometry::{Axes, LinearField};
+use super::liquid::{FineLine, LineRules, Liquid, PROFILE_SAMPLES, Profile, ProfileEdge, REACH, Sighting};
+
+// "Tuned" below means that the value was tuned on seeds 101 to 104 of `evaluate-camera`; see docs/VISION.md.
+
+/// Width of the whole small picture, px. All lengths of these files are px of the small picture where nothing else is said. Chosen by hand,
+/// for speed.
+const WIDTH_PX: f32 = 320.0;
+/// Pictures are compared with an earlier one until the background has moved so far, px, because slow motion tells little from frame to
+/// frame. Tuned.
+const REFER_PX: f32 = 1.5;
+/// Pictures are compared with the same earlier one for no more than so many frames. Tuned.
+const REFER_FRAMES: u32 = 4;
+/// With a smaller share of profiles that show an edge there is no line. Tuned.
+const PROFILES_LEAST: f32 = 0.2;
+/// Points for the motion keep so far away from the stream's line, on either axis, px. Tuned.
+const KEEP_AWAY_PX: f32 = 5.0;
+/// Water differs from the dry background by at least this much, in units of the small picture's noise. Tuned.
+const WET_NOISES: f32 = 5.0;
+/// Water differs from the dry background by at least this much, grey levels. Tuned.
+const WET_LEAST: f32 = 6.0;
+/// Weight of an edge point before ground as bright as the water's rim. Tuned.
+const HIDDEN_TRUST: f32 = 0.3;
+/// A step this high, as a share of the steepest step of a profile, is steep. Tuned.
+const STEEP_SHARE: f32 = 0.6;
+/// Least height of a profile's steepest step, grey levels a sample. Tuned.
+const STEEP_LEAST: f32 = 4.0;
+
+/// Finds the stream of clear water in the pictures of one camera.
+pub(crate) struct ClearWater {
+    /// Pixels of the full picture per pixel of the small one.
+    scale: f32,
+    /// Size of the small region, px.
+    size: Size,
+    /// In the small region.
+    axes: Axes,
+    rays: Rays,
+    lines: Lines,
+    background: Background,
+    evidence: Evidence,
+    water: Water,
+    // Pictures, kept from frame to frame.
+    /// The small region, three bytes a pixel.
+    small: Mat,
+    /// The same, four bytes a pixel.
+    now: Mat,
+    /// The earlier picture of these with which pictures are compared: the last one, or one from which the background has not moved far.
+    earlier: Mat,
+    /// Frames that were compared with the same earlier picture.
+    compared: u32,
+}
+
+impl ClearWater {
+    /// For a region of `region_px` (width, height) of a picture `width_px` wide; `axes` are relative to the region.
+    pub(crate) fn new(axes: &Axes, region_px: [i32; 2], width_px: u32) -> opencv::Result<Self> {
+        let scale = (width_px as f32 / WIDTH_PX).round().max(1.0);
+        let size = Size::new((region_px[0] / scale as i32).max(8), (region_px[1] / scale as i32).max(8));
+        let axes = Axes { lip_px: axes.lip_px.map(|v| small(v, scale)), ..*axes };
+        let rays = Rays::new(&axes, size);
+        Ok(Self {
+            scale,
+            size,
+            axes,
+            lines: Lines::new(axes, &rays, size),
+            background: Background::new(size)?,
+            evidence: Evidence::new(&rays, size)?,
+            rays,
+            water: Water::new(),
+            small: Mat::default(),
+            now: Mat::default(),
+            earlier: Mat::default(),
+            compared: 0,
+        })
+    }
+
+    /// Height above the rim's light, px.
+    fn height_px(&self) -> LinearField {
+        let (x, turn) = (self.axes.x, self.axes.sine().signum());
+        let above_edge = LinearField::from_zero(self.axes.lip_px, -x[1] * turn, x[0] * turn);
+        LinearField { at_origin: above_edge.at_origin - RIM_PX, ..above_edge }
+    }
+
+    /// Distance to the right of the container's left side, px.
+    fn right_px(&self) -> LinearField {
+        let (y, turn) = (self.axes.y, self.axes.sine().signum());
+        LinearField::from_zero(self.axes.lip_px, y[1] * turn, -y[0] * turn)
+    }
+
+    /// The share `u / a + v / b` of the way from the lip to the line with the legs `a` and `b`, px.
+    fn line_share(&self, [a, b]: [f32; 2]) -> LinearField {
+        let (x, y, sine) = (self.axes.x, self.axes.y, self.axes.sine());
+        LinearField::from_zero(self.axes.lip_px, (y[1] / a - x[1] / b) / sine, (x[0] / b - y[0] / a) / sine)
+    }
+
+    #[inline(always)]
+    fn look_at_it(&mut self, edges_px: &mut Vec<[f32; 2]>) -> opencv::Result<Sighting> {
+        edges_px.clear();
+        let height_px = self.height_px();
+        let mut sighting = Sighting::Dry { confidence: 1.0 };
+        if !self.background.is_new() {
+            let wet = self.water.stream().map(|s| {
+                let line_share = self.line_share(s.legs_px.map(|v| v + KEEP_AWAY_PX));
+                WetPlaces { line_share, right_px: self.right_px() }
+            });
+            self.background.register(&self.now, height_px, wet)?;
+            self.evidence.compare(&self.rays, &self.now, &self.earlier, &self.background, height_px)?;
+            let moved = self.background.moved();
+            self.evidence.weigh(&self.rays, &moved, self.water.stream())?;
+            let best = self.lines.best(&self.evidence, &self.rays, &moved, self.water.stream())?.map(|found| {
+                (found, self.lines.legs_px(found.line), self.lines.earlier_picture(found.line, &self.evidence, &self.rays, &moved))
+            });
+            let verdict = self.water.decide(best, self.evidence.strange_share());
+            sighting = match (verdict, best) {
+                (Verdict::Stream, Some((found, ..))) => {
+                    let scale = self.scale;
+                    self.lines.edges(found.line, &self.evidence, &self.rays, |v| (v + 0.5) * scale - 0.5, edges_px);
+                    Sighting::Stream { seen_share: found.edge_share.min(1.0), leaves_region: false }
+                }
+                (Verdict::Unsure, _) => Sighting::Unsure,
+                _ => sighting,
+            };
+            if self.water.is_elsewhere(self.evidence.strange_share()) {
+                self.background.forget()?;
+            }
+        }
+        self.remember(height_px)?;
+        Ok(sighting)
+    }
+
+    /// Takes what is dry over into the memory of the background, and chooses the picture with which the next ones are compared.
+    #[inline(always)]
+    fn remember(&mut self, height_px: LinearField) -> opencv::Result<()> {
+        let near = self.water.recent_legs_px().map(|legs_px| {
+            let [a, b] = legs_px.map(|v| v.max(1.0));
+            // The outline bulges, and a stream grows from frame to frame.
+            let bulge = 2.0 + 0.1 * (a * b).sqrt();
+            let inner = self.line_share([a + 1.4 * bulge, b + 1.4 * bulge]);
+            let outer = self.line_share([1.35 * a + 8.0, 1.35 * b + 8.0]);
+            (WetPlaces { line_share: inner, right_px: self.right_px() }, outer)
+        });
+        let dry = DryPlaces { height_px, flows: self.water.flows(), near, calm: CALM * self.evidence.noise() };
+        let is_new = self.background.is_new();
+        self.background.remember(&self.now, dry)?;
+        self.compared += 1;
+        if is_new || self.compared >= REFER_FRAMES || self.background.travelled_px() >= REFER_PX {
+            std::mem::swap(&mut self.now, &mut self.earlier);
+            self.background.refer();
+            self.compared = 0;
+        }
+        Ok(())
+    }
+
+    /// The edge on a profile before known ground: the outermost place that differs from the dry background, where half of the difference is
+    /// reached. `differs` is the difference from the background at each sample, grey levels.
+    fn edge_on_known_ground(&self, profile: &Profile, differs: &[[f32; 3]; PROFILE_SAMPLES]) -> Option<ProfileEdge> {
+        let size = |d: &[f32; 3]| (d.iter().map(|v| v * v).sum::<f32>() / 3.0).sqrt();
+        let least = (WET_NOISES * self.evidence.noise()).max(WET_LEAST);
+        let j = (1..2 * REACH).rev().find(|&j| size(&differs[j]) >= least && size(&differs[j - 1]) >= least)?;
+        let full = (j.saturating_sub(4)..=j).max_by(|a, b| size(&differs[*a]).total_cmp(&size(&differs[*b])))?;
+        let (full, height) = (differs[full], size(&differs[full]));
+        let share = |d: &[f32; 3]| d.iter().zip(full).map(|(a, b)| a * b).sum::<f32>() / (3.0 * height * height);
+        let i = (0..2 * REACH).rev().find(|&i| share(&differs[i]) >= 0.5)?;
+        let (inner, outer) = (share(&differs[i]), share(&differs[i + 1]));
+        // Ground as bright as the water's rim hides where it begins.
+        let dry: [f32; 3] = std::array::from_fn(|c| profile.colours[i + 1][c] - differs[i + 1][c]);
+        let hidden = self.water.stream().is_some_and(|s| size(&std::array::from_fn(|c| dry[c] - s.band[c])) < 2.0 * least);
+        (outer < 0.5).then(|| ProfileEdge {
+            sample: i as f32 + (inner - 0.5) / (inner - outer),
+            contrast: height,
+            trust: if hidden { HIDDEN_TRUST } else { 1.0 },
+            width_samples: None,
+        })
+    }
+}
+
+/// A coordinate of the full region in the small one, px.
+fn small(v: f32, scale: f32) -> f32 {
+    (v + 0.5) / scale - 0.5
+}
+
+/// The edge on a profile before ground that is not known: the outermost of the steep steps of brightness.
+fn edge_on_unknown_ground(profile: &Profile) -> Option<ProfileEdge> {
+    let grey = |j: usize| profile.colours[j].iter().sum::<f32>() / 3.0;
+    let step = |j: usize| (grey(j + 1) - grey(j)).abs();
+    let steepest = (0..2 * REACH).map(step).fold(0.0, f32::max);
+    let j = (1..2 * REACH - 1).rev().find(|&j| step(j) >= STEEP_SHARE * steepest && step(j) >= step(j - 1) && step(j) >= step(j + 1))?;
+    if steepest < STEEP_LEAST {
+        return None;
+    }
+    // The top of the parabola through the three steps.
+    let (left, middle, right) = (step(j - 1), step(j), step(j + 1));
+    let curvature = left - 2.0 * middle + right;
+    let shift = if curvature < -1e-3 { (0.5 * (left - right) / curvature).clamp(-0.5, 0.5) } else { 0.0 };
+    let contrast = (grey((j + 3).min(2 * REACH)) - grey(j.saturating_sub(2))).abs().max(steepest);
+    Some(ProfileEdge { sample: j as f32 + 0.5 + shift, contrast, trust: 1.0, width_samples: None })
+}
+
+impl Liquid for ClearWater {
+    fn reads(&self, _format: PixelFormat) -> bool {
+        true
+    }
+
+    fn rules(&self) -> LineRules {
+        // How small a stream may be is decided when its line is confirmed, and water's own edge tells nothing of focus.
+        LineRules { profiles_least: PROFILES_LEAST, first_area_least_px2: 0.0, edge_tells_focus: false }
+    }
+
+    /// The middle four of each block's pixels are averaged, so half of the memory of a large picture is never read.
+    fn take(&mut self, region: &BoxedRef<Mat>) -> opencv::Result<()> {
+        imgproc::resize(region, &mut self.small, self.size, 0.0, 0.0, imgproc::INTER_LINEAR)?;
+        imgproc::cvt_color_def(&self.small, &mut self.now, imgproc::COLOR_BGR2BGRA)
+    }
+
+    fn sampled(&self) -> &Mat {
+        &self.small
+    }
+
+    fn look(&mut self, edges_px: &mut Vec<[f32; 2]>) -> opencv::Result<Sighting> {
+        // With the processor's widest registers.
+        pulp::Arch::new().dispatch(|| self.look_at_it(edges_px))
+    }
+
+    fn edge_on(&self, profile: &Profile) -> Option<ProfileEdge> {
+        let mut differs = [[0.0f32; 3]; PROFILE_SAMPLES];
+        for (j, (differs, seen)) in differs.iter_mut().zip(&profile.colours).enumerate() {
+            let place = profile.place_px(j as f32).map(|v| small(v, self.scale));
+            let Some(dry) = self.background.dry_at(place) else { return edge_on_unknown_ground(profile) };
+            *differs = std::array::from_fn(|c| seen[c] - dry[c]);
+        }
+        self.edge_on_known_ground(profile, &differs)
+    }
+
+    fn confirm(&mut self, line: Option<FineLine>, mean_level: f32) -> Result<FineLine, Doubt> {
+        self.water.confirm(line, mean_level, self.scale, self.axes.sine().abs())
+    }
+}

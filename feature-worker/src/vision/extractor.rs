@@ -1,0 +1,220 @@
+//! V_e from one image: the triangle of section 3.3.1 and Fig. 4.
+//!
+//! The liquid leaves the container at the lip `O`, where the glass's top edge (x-axis) meets its left side (y-axis). Between the two
+//! axes, seen from `O`, liquid comes first and background after it, whatever the tilt. So in each image:
+//!
+//! 1. [`super::checks`] tell whether the light is good enough and the picture is a new one.
+//! 2. The [`Liquid`] tells whether there is a stream, and roughly where its outer edge lies.
+//! 3. [`super::line`] makes that edge a line, which cuts the axes at a and b.
+//! 4. `V_e = a b sin(phi) / 2`, with phi between the axes. Without a stream it is exactly 0.
+//!
+//! Runs on the worker's extraction thread. All buffers are kept, so after the second frame nothing is allocated but OpenCV's matrix
+//! headers. A frame that cannot be measured is no error: it gets a [`Doubt`].
+
+use std::time::Instant;
+
+use opencv::core::Rect;
+use opencv::prelude::*;
+use shared::config::{CameraConfig, ImageConfig, LiquidMethod};
+use shared::messages::Doubt;
+
+use super::checks::{LightCheck, RimCheck};
+use super::clear::ClearWater;
+use super::colour::ColouredLiquid;
+use super::geometry::{Axes, RayGrid};
+use super::line::{BLURRED_PX, LineFinder};
+use super::liquid::{Liquid, Sighting};
+use super::measurement::{Measurement, Stages};
+use super::picture::{Image, RegionPixels, RegionReader};
+
+/// Why an extractor cannot be made, or an image not be measured.
+#[derive(Debug, thiserror::Error)]
+pub enum ExtractError {
+    /// The axes do not cross in the region, or the region has no room between them.
+    #[error("image.region_px = {region:?}: {what}; the region must hold the lip (the axes cross at {lip:?}) and the space over it")]
+    Region {
+        /// The region: x, y, width, height in px.
+        region: [u32; 4],
+        /// Where the axes cross, px.
+        lip: [i32; 2],
+        /// What is wrong.
+        what: &'static str,
+    },
+    /// The colour method is configured for a camera without colour.
+    #[error("image.method = \"colour\" needs a colour camera, this one gives grey pictures; use method = \"clear\"")]
+    NoColour,
+    /// OpenCV refused a call.
+    #[error("OpenCV: {0}")]
+    OpenCv(#[from] opencv::Error),
+}
+
+/// Measures V_e in the images of one camera.
+pub struct Extractor {
+    /// Width and height that images must have, px.
+    size_px: [u32; 2],
+    /// The region in the image, px.
+    region: Rect,
+    /// A smaller triangle is no stream, px^2.
+    area_min_px2: f32,
+    /// Relative to the region.
+    axes: Axes,
+    reader: RegionReader,
+    light: LightCheck,
+    rim: RimCheck,
+    liquid: Box<dyn Liquid>,
+    line: LineFinder,
+    /// The coarse outer edge on the rays, px in the region, from the x-axis to the y-axis. Kept from frame to frame.
+    edges: Vec<[f32; 2]>,
+    /// Time spent in the stages of the last measurement.
+    stages: Stages,
+}
+
+impl Extractor {
+    /// An extractor for images of `camera`'s size with the axes, region and liquid of `image`. A region in which nothing can be measured
+    /// is refused.
+    pub fn new(camera: &CameraConfig, image: &ImageConfig) -> Result<Self, ExtractError> {
+        let [x, y, width, height] = image.region_px;
+        let region = Rect::new(x as i32, y as i32, width as i32, height as i32);
+        let axes = Axes::new(image);
+        let fail = |what| ExtractError::Region { region: image.region_px, lip: axes.lip_px.map(|v| v.round() as i32), what };
+        // From here on everything is relative to the region.
+        let lip = [axes.lip_px[0] - x as f32, axes.lip_px[1] - y as f32];
+        let axes = Axes { lip_px: lip, ..axes };
+        let size = [width as f32, height as f32];
+        if !(0..2).all(|k| lip[k].is_finite() && lip[k] >= 1.0 && lip[k] <= size[k] - 2.0) {
+            return Err(fail("the axes cross outside it"));
+        }
+        let grid = RayGrid::new(&axes, size).ok_or_else(|| fail("there is no room between the axes"))?;
+        let region_px = [region.width, region.height];
+        let edges = Vec::with_capacity(grid.rays.len());
+        let liquid: Box<dyn Liquid> = match image.method {
+            LiquidMethod::Colour => Box::new(ColouredLiquid::new(image, axes, grid)?),
+            LiquidMethod::Clear => Box::new(ClearWater::new(&axes, region_px, camera.width_px)?),
+        };
+        Ok(Self {
+            size_px: [camera.width_px, camera.height_px],
+            region,
+            area_min_px2: image.area_min_px2,
+            axes,
+            reader: RegionReader::new(region),
+            light: LightCheck::default(),
+            rim: RimCheck::new(axes),
+            liquid,
+            line: LineFinder::new(axes, region_px),
+            edges,
+            stages: Stages::default(),
+        })
+    }
+
+    /// The axes in the image, px.
+    pub fn axes(&self) -> Axes {
+        Axes { lip_px: self.in_image(self.axes.lip_px), ..self.axes }
+    }
+
+    /// The region in the image, px.
+    pub fn region(&self) -> Rect {
+        self.region
+    }
+
+    /// The coarse outer edge of the last measurement on each ray with liquid, px in the image: with the lip, the liquid's outline.
+    pub fn outline_px(&self) -> impl Iterator<Item = [f32; 2]> + '_ {
+        self.edges.iter().map(|p| self.in_image(*p))
+    }
+
+    /// The edge points of the last measurement, px in the image: the final line was fitted to these.
+    pub fn edge_points_px(&self) -> impl Iterator<Item = [f32; 2]> + '_ {
+        self.line.points_px().iter().map(|p| self.in_image(*p))
+    }
+
+    /// Time spent in the stages of the last measurement.
+    pub fn stages(&self) -> Stages {
+        self.stages
+    }
+
+    fn in_image(&self, p: [f32; 2]) -> [f32; 2] {
+        [p[0] + self.region.x as f32, p[1] + self.region.y as f32]
+    }
+
+    /// Measures one image. One of another size than configured, or with missing bytes, gets a doubt and no area. A grey image is an error
+    /// where the liquid is told by its colour; the only other errors are OpenCV's.
+    pub fn measure(&mut self, image: Image) -> Result<Measurement, ExtractError> {
+        let expected = image.width_px as usize * image.height_px as usize * image.format.bytes_per_pixel();
+        if [image.width_px, image.height_px] != self.size_px || image.pixels.len() != expected {
+            return Ok(Measurement::nothing(0.0, Doubt::WrongFormat));
+        }
+        if !self.liquid.reads(image.format) {
+            return Err(ExtractError::NoColour);
+        }
+        self.line.clear();
+        // The reader lends the region's pixels, so it is taken out of the extractor until the end.
+        let mut reader = std::mem::replace(&mut self.reader, RegionReader::new(self.region));
+        let measured = self.measure_region(image, &mut reader);
+        self.reader = reader;
+        measured
+    }
+
+    fn measure_region(&mut self, image: Image, reader: &mut RegionReader) -> Result<Measurement, ExtractError> {
+        let start = Instant::now();
+        let pixels = reader.read(image, |region| self.liquid.take(region))?;
+        let sampled = Instant::now();
+        let unusable = self.light.doubt(self.liquid.sampled().data_bytes()?);
+        let checked = Instant::now();
+        let (measured, segmented) = match unusable {
+            Some(doubt) => (Measurement::nothing(0.0, doubt), checked),
+            None => {
+                let sighting = self.liquid.look(&mut self.edges)?;
+                let segmented = Instant::now();
+                (self.follow(sighting, pixels), segmented)
+            }
+        };
+        let edge_tells_focus = measured.area_px2 > 0.0 && self.liquid.rules().edge_tells_focus;
+        let untold = measured.doubt == Doubt::None && !edge_tells_focus;
+        let measured = if untold && self.rim.is_blurred(pixels) { Measurement::nothing(0.0, Doubt::Blurred) } else { measured };
+        let done = Instant::now();
+        let ns = |from: Instant, to: Instant| to.duration_since(from).as_nanos() as u64;
+        self.stages = Stages {
+            rays_ns: ns(start, sampled),
+            checks_ns: ns(sampled, checked),
+            segment_ns: ns(checked, segmented),
+            line_ns: ns(segmented, done),
+        };
+        Ok(measured)
+    }
+
+    /// The measurement of what the liquid saw.
+    fn follow(&mut self, sighting: Sighting, pixels: RegionPixels) -> Measurement {
+        match sighting {
+            Sighting::Dry { confidence } => Measurement::nothing(confidence, Doubt::None),
+            Sighting::Unsure => Measurement::nothing(0.0, Doubt::EdgeNotFound),
+            Sighting::Stream { seen_share, leaves_region } => self.measure_stream(seen_share, leaves_region, pixels),
+        }
+    }
+
+    /// The triangle of a stream whose coarse edge is in `self.edges`.
+    fn measure_stream(&mut self, seen_share: f32, leaves_region: bool, pixels: RegionPixels) -> Measurement {
+        let Some(first) = self.line.first_line(&self.edges) else { return Measurement::nothing(0.0, Doubt::EdgeNotFound) };
+        if self.axes.area_px2(first.legs_px) < self.liquid.rules().first_area_least_px2 {
+            return Measurement::nothing(seen_share, Doubt::None);
+        }
+        let fine = self.line.fine_line(&first, seen_share, &self.edges, pixels, self.liquid.as_ref());
+        let fine = match self.liquid.confirm(fine, self.light.mean_level()) {
+            Ok(fine) => fine,
+            Err(doubt) => return Measurement::nothing(0.0, doubt),
+        };
+        let area_px2 = self.axes.area_px2(fine.legs_px);
+        if area_px2 < self.area_min_px2 {
+            return Measurement::nothing(seen_share, Doubt::None);
+        }
+        let [a, b] = fine.legs_px;
+        let corner = |r: f32, axis: [f32; 2]| self.in_image(self.axes.at(r, axis));
+        let ([x0, y0], [x1, y1], [x2, y2]) = (corner(0.0, self.axes.x), corner(a, self.axes.x), corner(b, self.axes.y));
+        let doubt = if leaves_region {
+            Doubt::LeavesRegion
+        } else if fine.width_px > BLURRED_PX {
+            Doubt::Blurred
+        } else {
+            Doubt::None
+        };
+        Measurement { area_px2, confidence: fine.confidence, doubt, triangle_px: [x0, y0, x1, y1, x2, y2] }
+    }
+}

@@ -1,0 +1,224 @@
+//! Learns the liquid's colour from the pictures of one pour: what is often right over the lip and seldom far from it.
+//!
+//! The background turns behind the container, so what belongs to it is seen in both places; only the liquid stays at the lip. Used by
+//! calibration only: it allocates, and takes as long as it takes.
+
+use opencv::core::{self, Mat};
+use opencv::imgproc;
+use opencv::prelude::*;
+
+use super::geometry::Axes;
+
+// "Tuned" below means that the value was tuned on seeds 1 and 5001 to 5003 of `evaluate-camera`; see docs/VISION.md. Lengths are px of a picture 640 px wide.
+
+/// Bins of hue, saturation and value of the first look. Chosen by hand; no measurement is recorded.
+const BINS: [usize; 3] = [18, 8, 8];
+/// Most pixels that are kept of either place. Chosen by hand: about a megabyte.
+const KEEP: usize = 400_000;
+/// Pixels nearer to the lip than this are near. Tuned.
+const NEAR_PX: f32 = 20.0;
+/// Pixels further from the lip than this are far. Tuned.
+const FAR_PX: f32 = 110.0;
+/// Pixels further from the lip than this, to either side or up or down, are not looked at. Chosen by hand; no measurement is recorded.
+const REACH_PX: f32 = 220.0;
+/// Of the far pixels one of so many is taken. Chosen by hand, for speed.
+const FAR_EVERY: i32 = 5;
+/// Pixels nearer to an axis than this are left out: the rim's own light is near the lip in every picture, and axes that are off by a few px
+/// shall not make it liquid. Tuned.
+const RIM_PX: f32 = 4.0;
+/// A bin is the liquid's when it holds more than this share of the near pixels. Tuned.
+const BIN_SHARE: f32 = 0.004;
+/// A bin is the liquid's when its share of the near pixels is more than so many times that of the far ones. Tuned.
+const BIN_RATIO: f32 = 4.0;
+/// There is a liquid when its bins hold at least this share of the near pixels. Tuned.
+const LIQUID_SHARE: f32 = 0.1;
+/// Shares of the liquid's pixels between which the range is learned. Tuned.
+const TAILS: [f32; 2] = [0.02, 0.98];
+/// Grey liquids (milk, or cola in shadow) have no hue: their median saturation is below this. Tuned.
+const GREY_SATURATION: f32 = 45.0;
+/// Grey liquids have no hue: theirs spreads over more than this, in OpenCV's half degrees. Tuned.
+const GREY_HUES: f32 = 80.0;
+/// Margin on saturation and value of a grey liquid, on either side. Tuned.
+const GREY_MARGIN: f32 = 30.0;
+/// Margin on the hue, in OpenCV's half degrees. Tuned; shadow and exposure hardly move the hue.
+const HUE_MARGIN: f32 = 6.0;
+/// Background within this of the liquid's hues is of like hue, in OpenCV's half degrees. Tuned.
+const LIKE_HUE: f32 = 12.0;
+/// Background further than this from the liquid's mean hue is another colour, in OpenCV's half degrees. Tuned.
+const OTHER_HUE: f32 = 40.0;
+/// Background of like colour counts when it is at least this share of the far pixels. Tuned.
+const ALIKE_SHARE: f32 = 0.002;
+/// One of so many of the background's pixels of like colour is noise: the most liquid-like ones. Tuned.
+const ALIKE_NOISE: usize = 50;
+
+/// Why no colour is learned.
+#[derive(Debug, thiserror::Error)]
+pub enum ColourError {
+    /// No colour stands out at the lip.
+    #[error("no liquid's colour stands out at the lip: show one whole pour, check the axes, or use --method clear for water")]
+    NoColour,
+    /// OpenCV refused a call.
+    #[error("OpenCV: {0}")]
+    OpenCv(#[from] opencv::Error),
+}
+
+/// Hue, saturation and value of a pixel, as OpenCV has them: 0 to 179, 0 to 255, 0 to 255.
+type Hsv = [u8; 3];
+
+/// Pixels of one place, and how many of them fall into each bin.
+struct Pixels {
+    /// In the order in which they were seen.
+    pixels: Vec<Hsv>,
+    /// Their number in each bin.
+    bins: Vec<u32>,
+}
+
+impl Pixels {
+    fn new() -> Self {
+        Self { pixels: Vec::new(), bins: vec![0; BINS.iter().product()] }
+    }
+
+    fn add(&mut self, hsv: Hsv) {
+        if self.pixels.len() < KEEP {
+            self.bins[bin(hsv)] += 1;
+            self.pixels.push(hsv);
+        }
+    }
+
+    /// Number of pixels, at least 1.
+    fn count(&self) -> f32 {
+        self.pixels.len().max(1) as f32
+    }
+
+    /// Share of the pixels that fall into the same bin.
+    fn share(&self, hsv: Hsv) -> f32 {
+        self.bins[bin(hsv)] as f32 / self.count()
+    }
+}
+
+fn bin([h, s, v]: Hsv) -> usize {
+    let bin = |value: u8, most: usize, bins: usize| usize::from(value) * bins / most;
+    (bin(h, 180, BINS[0]) * BINS[1] + bin(s, 256, BINS[1])) * BINS[2] + bin(v, 256, BINS[2])
+}
+
+/// Learns the liquid's colour from the pictures of one pour.
+pub struct ColourLearner {
+    /// In the whole picture.
+    axes: Axes,
+    /// Right over the lip.
+    near: Pixels,
+    /// Far from the lip.
+    far: Pixels,
+    /// The last picture in hue, saturation and value.
+    hsv: Mat,
+}
+
+/// The range of one number over the liquid's pixels.
+#[derive(Debug, Clone, Copy)]
+struct Quantiles {
+    /// Nearly the least.
+    low: f32,
+    /// The median.
+    middle: f32,
+    /// Nearly the largest.
+    high: f32,
+}
+
+impl Quantiles {
+    /// Of at least one pixel.
+    fn new(pixels: &[Hsv], value: impl Fn(&Hsv) -> f32) -> Self {
+        let mut values: Vec<f32> = pixels.iter().map(value).collect();
+        values.sort_by(f32::total_cmp);
+        let at = |share: f32| values[((values.len() - 1) as f32 * share) as usize];
+        Self { low: at(TAILS[0]), middle: at(0.5), high: at(TAILS[1]) }
+    }
+}
+
+impl ColourLearner {
+    /// A learner for a container with these axes in the whole picture.
+    pub fn new(axes: Axes) -> Self {
+        Self { axes, near: Pixels::new(), far: Pixels::new(), hsv: Mat::default() }
+    }
+
+    /// Adds one BGR picture of the pour, dry ones included.
+    pub fn add(&mut self, bgr: &impl core::ToInputArray) -> Result<(), ColourError> {
+        imgproc::cvt_color_def(bgr, &mut self.hsv, imgproc::COLOR_BGR2HSV)?;
+        let (rows, columns) = (self.hsv.rows(), self.hsv.cols());
+        let pixels = self.hsv.data_typed::<core::Vec3b>()?;
+        let scale = columns as f32 / 640.0;
+        let [lip_x, lip_y] = self.axes.lip_px;
+        let reach = REACH_PX * scale;
+        for y in ((lip_y - reach).max(0.0) as i32)..((lip_y + reach) as i32).min(rows) {
+            for x in ((lip_x - reach).max(0.0) as i32)..((lip_x + reach) as i32).min(columns) {
+                let at = [x as f32, y as f32];
+                let distance = (at[0] - lip_x).hypot(at[1] - lip_y);
+                let (near, far) = (distance < NEAR_PX * scale, distance > FAR_PX * scale && (x + y) % FAR_EVERY == 0);
+                if !(near || far) || self.axes.between(at) < RIM_PX * scale {
+                    continue;
+                }
+                let hsv = pixels[(y * columns + x) as usize].0;
+                if far { self.far.add(hsv) } else { self.near.add(hsv) }
+            }
+        }
+        Ok(())
+    }
+
+    /// The range h_min, s_min, v_min, h_max, s_max, v_max for `[image] colour_hsv`. It is an error if no colour stands out at the lip.
+    pub fn range(&self) -> Result<[u8; 6], ColourError> {
+        let liquid = |hsv: &&Hsv| {
+            let (near, far) = (self.near.share(**hsv), self.far.share(**hsv));
+            near > BIN_SHARE && near > BIN_RATIO * far
+        };
+        let seen: Vec<Hsv> = self.near.pixels.iter().filter(liquid).copied().collect();
+        if (seen.len() as f32) < LIQUID_SHARE * self.near.count() {
+            return Err(ColourError::NoColour);
+        }
+        // Hue is an angle, so it is taken relative to its mean direction.
+        let mean = mean_hue(&seen);
+        let relative_hue = |p: &Hsv| (f32::from(p[0]) - mean + 270.0).rem_euclid(180.0) - 90.0;
+        let hue = Quantiles::new(&seen, relative_hue);
+        let saturation = Quantiles::new(&seen, |p| p[1].into());
+        let value = Quantiles::new(&seen, |p| p[2].into());
+        let byte = |v: f32| v.round().clamp(0.0, 255.0) as u8;
+        if saturation.middle < GREY_SATURATION || hue.high - hue.low > GREY_HUES {
+            let [s_min, v_min] = [saturation, value].map(|q| byte(q.low - GREY_MARGIN));
+            let [s_max, v_max] = [saturation, value].map(|q| byte(q.high + GREY_MARGIN));
+            return Ok([0, s_min, v_min, 179, s_max, v_max]);
+        }
+        // Shadow and exposure move value most, and saturation more than hue.
+        let v_min = value.low * 0.3 - 5.0;
+        let v_max = if value.high > 150.0 { 255.0 } else { value.high * 1.7 + 10.0 };
+        let like_hue = |p: &Hsv| (hue.low - LIKE_HUE..=hue.high + LIKE_HUE).contains(&relative_hue(p));
+        let s_min = self.limit(saturation.low * 0.75 - 10.0, saturation.low, &|p| like_hue(p).then_some(f32::from(p[1])));
+        let alike = |p: &Hsv| (f32::from(p[1]) >= s_min).then(|| relative_hue(p)).filter(|h| h.abs() < OTHER_HUE);
+        let h_min = self.limit(hue.low - HUE_MARGIN, hue.low, &|p| alike(p).filter(|h| *h < 0.0));
+        let h_max = self.limit(hue.high + HUE_MARGIN, hue.high, &|p| alike(p).filter(|h| *h > 0.0));
+        let hue_byte = |v: f32| (mean + v).rem_euclid(180.0).round().min(179.0) as u8;
+        Ok([hue_byte(h_min), byte(s_min), byte(v_min), hue_byte(h_max), 255, byte(v_max)])
+    }
+
+    /// A limit of the range: `loose`, which is the liquid's own limit `liquid` with its margin; or, where background of like colour comes
+    /// nearer than that, half way between that and the liquid. `alike` gives the number of a background pixel of like colour.
+    fn limit(&self, loose: f32, liquid: f32, alike: &dyn Fn(&Hsv) -> Option<f32>) -> f32 {
+        let far = &self.far.pixels;
+        let mut values: Vec<f32> = far.iter().filter_map(alike).filter(|v| (v - loose).signum() != (v - liquid).signum()).collect();
+        values.extend(far.iter().filter_map(alike).filter(|v| (loose < liquid) == (*v < loose)).map(|_| loose));
+        if (values.len() as f32) < ALIKE_SHARE * self.far.count() {
+            return loose;
+        }
+        // The most liquid-like of these pixels are noise.
+        values.sort_by(|a, b| if loose < liquid { b.total_cmp(a) } else { a.total_cmp(b) });
+        let nearest = values[values.len() / ALIKE_NOISE];
+        if (nearest - loose).signum() == (nearest - liquid).signum() { loose } else { (nearest + liquid) / 2.0 }
+    }
+}
+
+/// The mean direction of the hues, weighted by saturation, in OpenCV's half degrees.
+fn mean_hue(pixels: &[Hsv]) -> f32 {
+    let (mut sin, mut cos) = (0.0f32, 0.0f32);
+    for [h, s, _] in pixels {
+        let (a, b) = (f32::from(*h) * std::f32::consts::TAU / 180.0).sin_cos();
+        (sin, cos) = (sin + a * f32::from(*s), cos + b * f32::from(*s));
+    }
+    sin.atan2(cos) * 180.0 / std::f32::consts::TAU
+}

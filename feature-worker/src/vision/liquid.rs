@@ -1,0 +1,118 @@
+//! What the extractor asks of a liquid, whatever its kind.
+//!
+//! In each frame the extractor calls [`Liquid::take`] with the region; checks the light of [`Liquid::sampled`]; calls
+//! [`Liquid::look`], which tells whether a stream is there and where its edge roughly lies; then the line's profiles ask
+//! [`Liquid::edge_on`] for the exact place; and [`Liquid::confirm`] has the last word. A frame that the checks reject ends before
+//! `look`, one without a stream before `edge_on`, one without a first line before `confirm`.
+//!
+//! All calls come from the extraction thread. After the second frame they allocate nothing. The only failures are OpenCV's.
+
+use opencv::boxed_ref::BoxedRef;
+use opencv::core::Mat;
+use shared::messages::{Doubt, PixelFormat};
+
+/// Samples of a profile on either side of its centre. Chosen by hand; no measurement is recorded.
+pub(crate) const REACH: usize = 7;
+/// Samples of a profile.
+pub(crate) const PROFILE_SAMPLES: usize = 2 * REACH + 1;
+
+/// Samples of the picture along a short straight path across the stream's edge, from within the liquid outwards.
+pub(crate) struct Profile {
+    /// Blue, green and red at each sample, grey levels.
+    pub(crate) colours: [[f32; 3]; PROFILE_SAMPLES],
+    /// Place of the middle sample in the region, px.
+    pub(crate) centre_px: [f32; 2],
+    /// Unit vector from one sample to the next.
+    pub(crate) outwards: [f32; 2],
+    /// Distance from one sample to the next, px.
+    pub(crate) spacing_px: f32,
+}
+
+impl Profile {
+    /// The place of a sample in the region, px; fractions lie between samples.
+    pub(crate) fn place_px(&self, sample: f32) -> [f32; 2] {
+        let d = (sample - REACH as f32) * self.spacing_px;
+        [self.centre_px[0] + d * self.outwards[0], self.centre_px[1] + d * self.outwards[1]]
+    }
+}
+
+/// Where the stream's edge lies on a profile.
+pub(crate) struct ProfileEdge {
+    /// Place of the edge, samples from the profile's inner end.
+    pub(crate) sample: f32,
+    /// Height of the step at the edge, grey levels.
+    pub(crate) contrast: f32,
+    /// How much the place is trusted, 0 to 1.
+    pub(crate) trust: f32,
+    /// Distance in which the step passes from 80 % to 20 %, samples, where that can be told.
+    pub(crate) width_samples: Option<f32>,
+}
+
+/// Whether a liquid sees a stream.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(crate) enum Sighting {
+    /// There is no stream.
+    Dry {
+        /// Confidence of that, 0 to 1.
+        confidence: f32,
+    },
+    /// It is not known whether there is a stream.
+    Unsure,
+    /// There is a stream.
+    Stream {
+        /// Share of the edge that is seen, 0 to 1.
+        seen_share: f32,
+        /// Whether so much of the stream reaches the region's border that its area is only a lower bound.
+        leaves_region: bool,
+    },
+}
+
+/// The line through the edge points of the profiles.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct FineLine {
+    /// Cuts with the x-axis and the y-axis, px from the lip.
+    pub(crate) legs_px: [f32; 2],
+    /// Median height of the step along it, grey levels.
+    pub(crate) contrast: f32,
+    /// Median distance in which the step passes from 80 % to 20 %, px.
+    pub(crate) width_px: f32,
+    /// From 0 (none) to 1 (full).
+    pub(crate) confidence: f32,
+}
+
+/// What a liquid demands of its line.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct LineRules {
+    /// With a smaller share of profiles that show an edge there is no line.
+    pub(crate) profiles_least: f32,
+    /// With a smaller triangle under the first line there is no stream, px^2.
+    pub(crate) first_area_least_px2: f32,
+    /// Whether the width of the stream's own edge tells that the picture is out of focus.
+    pub(crate) edge_tells_focus: bool,
+}
+
+/// A way to tell a liquid from what stands behind it.
+pub(crate) trait Liquid: Send + Sync {
+    /// Whether images of this format show what the liquid is told by.
+    fn reads(&self, format: PixelFormat) -> bool;
+
+    /// What the liquid demands of its line.
+    fn rules(&self) -> LineRules;
+
+    /// Takes the next picture: the region in BGR at full size.
+    fn take(&mut self, region: &BoxedRef<Mat>) -> opencv::Result<()>;
+
+    /// What was read of the picture that was taken, in BGR: the checks of light look at this.
+    fn sampled(&self) -> &Mat;
+
+    /// Looks for a stream in the picture that was taken. Replaces `edges_px` by points of the stream's outer edge in the region, px,
+    /// from the x-axis to the y-axis; without a stream they are of no use.
+    fn look(&mut self, edges_px: &mut Vec<[f32; 2]>) -> opencv::Result<Sighting>;
+
+    /// Where on a profile the stream's edge lies.
+    fn edge_on(&self, profile: &Profile) -> Option<ProfileEdge>;
+
+    /// Takes note of the final line (none: too few profiles showed an edge) in a picture of this mean grey level. Returns the line if
+    /// it is the stream's, and otherwise the doubt under which there is none.
+    fn confirm(&mut self, line: Option<FineLine>, mean_level: f32) -> Result<FineLine, Doubt>;
+}

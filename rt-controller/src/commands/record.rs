@@ -1,0 +1,93 @@
+//! `rt-controller record`: runs the Gaussian curve of eq. (1) and produces one episode. A short ordinary process; every failure is one
+//! line.
+
+use std::io::{BufRead, IsTerminal, Write};
+use std::path::Path;
+
+use shared::config::Config;
+use shared::control::Request;
+use shared::episode::{WeightError, check_reading, set_weight};
+use shared::exit::{self, Failure, OrExit as _, failure};
+use shared::gaussian_curve::Curve;
+
+use super::pour;
+use crate::client::Common;
+
+/// Alpha at the curve's first and last moment if no beta is given, degrees: small enough for a start without a jump.
+const END_DEG: f32 = 0.05;
+
+/// Command-line arguments.
+#[derive(Debug, clap::Args)]
+#[command(
+    after_help = "Examples:\n  rt-controller record --lambda 70 --gamma 0.3\n  rt-controller record --lambda 60 --gamma 0.5 --weight 83\n\n\
+The curve is alpha(t) = lambda exp(-gamma (t - beta)^2), from t = 0 to 2 beta. Afterwards the weight on the scale is asked for, if a\n\
+person is there; it can also be given later with `feature-worker episodes weigh FILE --weight G`."
+)]
+pub struct Args {
+    /// Height of the curve, degrees.
+    #[arg(long)]
+    lambda: f32,
+    /// Width of the curve, 1/s^2.
+    #[arg(long)]
+    gamma: f32,
+    /// Time of the curve's top, s; by default such that the curve starts at 0.05 degrees.
+    #[arg(long)]
+    beta: Option<f32>,
+    /// Weight on the scale in g, where it is known without asking.
+    #[arg(long)]
+    weight: Option<f64>,
+    #[command(flatten)]
+    common: Common,
+}
+
+/// Runs the command.
+pub fn run(args: &Args) -> Result<(), Failure> {
+    let config = Config::read(&args.common.config).or_exit(exit::BAD_INPUT)?;
+    let beta_s = args.beta.unwrap_or_else(|| ((args.lambda / END_DEG).ln() / args.gamma).sqrt());
+    let curve = Curve { lambda_deg: args.lambda, gamma_per_s2: args.gamma, beta_s };
+    let (outcome, recorded) = pour::order(&config.cell.name, &Request::Record(curve))?;
+    pour::ended(&outcome)?;
+    let file = match recorded.map(|r| r.file) {
+        Some(Ok(file)) => file,
+        Some(Err(e)) => return Err(failure(exit::FAILED, format!("the curve was run, but not recorded: {e}"))),
+        None => {
+            let what = "the curve was run, but no recorder answered: is `feature-worker run` running?";
+            return Err(failure(exit::UNREACHABLE, what));
+        }
+    };
+    let weight_g = args.weight.or_else(ask_weight);
+    if let Some(weight_g) = weight_g {
+        set_weight(Path::new(&file), weight_g).or_exit(exit::FAILED)?;
+    }
+    if args.common.json {
+        println!("{}", serde_json::json!({ "outcome": outcome, "curve": curve, "episode_file": file, "weight_g": weight_g }));
+    } else {
+        println!("recorded: {file}");
+        match weight_g {
+            Some(weight_g) => println!("weight: {weight_g} g"),
+            None => println!("read the scale, then: feature-worker episodes weigh {file} --weight GRAMS"),
+        }
+    }
+    Ok(())
+}
+
+/// Asks a person for the weight on the scale, if there is one at the terminal; an empty line means later.
+fn ask_weight() -> Option<f64> {
+    let stdin = std::io::stdin();
+    if !stdin.is_terminal() {
+        return None;
+    }
+    loop {
+        eprint!("weight on the scale in g (empty: later): ");
+        let _ = std::io::stderr().flush();
+        let mut line = String::new();
+        if stdin.lock().read_line(&mut line).is_err() || line.trim().is_empty() {
+            return None;
+        }
+        let weight_g = line.trim().replace(',', ".").parse().map_err(|_| WeightError::NotAReading);
+        match weight_g.and_then(check_reading) {
+            Ok(weight_g) => return Some(weight_g),
+            Err(e) => eprintln!("weight '{}': {e}, for example 83", line.trim()),
+        }
+    }
+}

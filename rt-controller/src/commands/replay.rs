@@ -1,0 +1,51 @@
+//! `rt-controller replay FILE`: runs a journal through the same core again and compares every answer. A short ordinary process; every
+//! failure is one line.
+
+use std::path::PathBuf;
+
+use shared::exit::{self, Failure, OrExit as _, failure};
+
+use crate::journal;
+
+/// Command-line arguments.
+#[derive(Debug, clap::Args)]
+#[command(after_help = "Examples:\n  rt-controller replay out/journal.bin\n  rt-controller replay out/journal.bin --table > ticks.csv\n\n\
+Exit codes: 0 every answer is the same to the bit, 1 some differ, 2 the file cannot be read.")]
+pub struct Args {
+    /// The journal (controller.journal of the configuration).
+    file: PathBuf,
+    /// Print every tick as CSV instead of the summary.
+    #[arg(long)]
+    table: bool,
+    /// Print the summary as JSON.
+    #[arg(long)]
+    json: bool,
+}
+
+/// Runs the command.
+pub fn run(args: &Args) -> Result<(), Failure> {
+    if args.table {
+        println!("tick,at_ns,phase,area_px2,alpha_deg,alpha_measured_deg,v_ml,d_ml,poured_ml");
+    }
+    let replay = journal::replay(&args.file, |_, output| {
+        let t = output.telemetry;
+        if args.table {
+            let values = [t.area_px2, t.alpha_deg, t.alpha_measured_deg, t.v_ml, t.d_ml, t.poured_ml].map(|v| v.to_string()).join(",");
+            println!("{},{},{},{values}", t.tick, t.at_ns, t.phase);
+        }
+    });
+    let replay = replay.or_exit(exit::BAD_INPUT)?;
+    if args.json {
+        println!("{}", serde_json::json!(replay));
+    } else if !args.table {
+        println!("{} ticks replayed, {} pours and recordings, {} different answers", replay.ticks, replay.ended.len(), replay.different);
+        if replay.cut_off {
+            println!("the file ends in the middle of an entry: the controller was killed, or is still writing");
+        }
+    }
+    if let Some(tick) = replay.first_different {
+        let what = format!("{}: the replay differs from tick {tick} on: another version of the code?", args.file.display());
+        return Err(failure(exit::FAILED, what));
+    }
+    Ok(())
+}

@@ -1,0 +1,347 @@
+//! When and why a pour or recording ends: every rule, as one small state that the core asks.
+//!
+//! Pure; runs in the controller's loop, does not allocate, panic or fail. An ending has three steps. A rule names a reason while the
+//! container is tilted ([`Ending::due`]); the container then comes upright ([`is_commanded_upright`]); the last drops are counted
+//! ([`Ending::settled`]). Reasons that do not come from a rule, such as an operator's abort or a robot that may not move, are given to
+//! [`Ending::end_with`]. The first reason stays.
+//!
+//! | rule | reason |
+//! |---|---|
+//! | [`Ending::agent_is_done`]: the goal is reached, or the agent has tilted back or stood still after a flow | `Done` |
+//! | the curve of a recording was run to its end | `Done` |
+//! | the newest usable measurement is too old | `StaleFeature` |
+//! | the largest number of frames is reached | `MaxFrames` |
+//! | nothing flows at the largest tilt | `ContainerEmpty` |
+//! | a stream was seen, and none any more although the container is tilted further | `StreamLost` |
+//! | [`controller_overran`]: the controller itself was stopped | `ControllerOverrun` |
+//! | [`worker_was_restarted`]: measurements come from another process | `WorkerRestarted` |
+//! | [`Ending::settled`]: the joint did not come upright | `NotUpright` |
+
+use shared::agent::Decision;
+use shared::control::EndReason;
+use shared::messages::Feature;
+
+use super::settings::Settings;
+
+/// After flow was seen, this much of a way back without flow ends the pour, degrees. Chosen by hand; no measurement is recorded.
+const BROUGHT_BACK_DEG: f32 = 10.0;
+/// After flow was seen, this many frames without progress end the pour: three seconds at 30 Hz. The agent then stands still short of
+/// its goal, while what trickles is too little to be seen or flickers about what can be seen. Chosen by hand; no measurement is recorded.
+const STALLED_FRAMES: u32 = 90;
+/// Forward tilt that counts as progress, degrees. Chosen by hand; no measurement is recorded.
+const PROGRESS_DEG: f32 = 1.0;
+/// Poured volume that counts as progress, ml. Chosen by hand; no measurement is recorded.
+const PROGRESS_ML: f32 = 0.5;
+/// Less than this still to come over the lip counts as nothing, ml: about one drop of water.
+const NOTHING_ML: f64 = 0.05;
+/// Frames in a row with a stream from which on the tilt of the stream is remembered. None of 10,800 simulated pours ended by mistake with
+/// this and the three constants below; see docs/LEARNING.md.
+const STREAM_FRAMES: u32 = 5;
+/// Only after this poured volume can a stream be lost, ml: a bead that was taken for a stream is less. See docs/LEARNING.md.
+const STREAM_ML: f32 = 1.0;
+/// Frames in a row without a stream after which it may be lost: longer than the pauses of a bottle that gurgles. See docs/LEARNING.md.
+const STREAM_LOST_FRAMES: u32 = 10;
+/// Tilt beyond that of the stream at which it counts as lost, degrees: what flows at one tilt flows more at a larger one. See
+/// docs/LEARNING.md.
+const STREAM_LOST_DEG: f32 = 10.0;
+/// Within this of the largest alpha the container counts as tilted as far as it goes, degrees. Chosen by hand; no measurement is
+/// recorded.
+const LARGEST_TILT_SLACK_DEG: f32 = 0.5;
+/// A commanded alpha nearer to 0 than this is upright, degrees: far below what a robot can resolve.
+const COMMANDED_UPRIGHT_DEG: f32 = 0.01;
+/// Frames without flow after which the last drops are counted: half a second at 30 Hz. Chosen by hand; no measurement is recorded.
+const SETTLE_QUIET_FRAMES: u32 = 15;
+/// Longest wait for the last drops and for the joint to come upright, s. Chosen by hand; no measurement is recorded.
+const SETTLE_MAX_S: f64 = 3.0;
+
+/// What one frame with a measurement showed during a pour.
+#[derive(Debug, Clone, Copy)]
+pub struct SeenFrame {
+    /// Number of frames lost just before it.
+    pub lost: u32,
+    /// V_e, px^2; `None`: it could not be measured.
+    pub area_px2: Option<f32>,
+    /// The agent sees liquid leave the container.
+    pub flowing: bool,
+    /// Commanded alpha when the picture was taken, degrees.
+    pub alpha_deg: f32,
+    /// Commanded alpha now, degrees.
+    pub alpha_now_deg: f32,
+}
+
+/// What the rules look at in each tick.
+#[derive(Debug, Clone, Copy)]
+pub struct Moment {
+    /// Time since the pour or recording began, s.
+    pub running_s: f64,
+    /// Frames since then, the lost ones included.
+    pub frames: u32,
+    /// Age of the newest usable measurement, ns.
+    pub measurement_age_ns: u64,
+    /// Commanded alpha, degrees.
+    pub alpha_deg: f32,
+    /// Estimated volume poured, ml.
+    pub poured_ml: f32,
+}
+
+/// How far a pour or recording is from its end.
+#[derive(Debug, Clone, Copy)]
+pub struct Ending {
+    /// Length of a recording's curve, s; `None`: this is a pour.
+    curve_s: Option<f64>,
+    reason: EndReason,
+    agent_is_done: bool,
+    seen_flow: bool,
+    brought_back_deg: f32,
+    stalled_frames: u32,
+    advanced_deg: f32,
+    advanced_from_ml: f32,
+    quiet_frames: u32,
+    empty_frames: u32,
+    /// Frames in a row with a stream.
+    stream_frames: u32,
+    /// Frames in a row without one.
+    no_stream_frames: u32,
+    /// Largest tilt at which a stream was seen, degrees.
+    stream_deg: Option<f32>,
+}
+
+impl Ending {
+    /// The ending of a pour that begins now.
+    pub fn of_pour() -> Self {
+        Self {
+            curve_s: None,
+            reason: EndReason::Done,
+            agent_is_done: false,
+            seen_flow: false,
+            brought_back_deg: 0.0,
+            stalled_frames: 0,
+            advanced_deg: 0.0,
+            advanced_from_ml: 0.0,
+            quiet_frames: 0,
+            empty_frames: 0,
+            stream_frames: 0,
+            no_stream_frames: 0,
+            stream_deg: None,
+        }
+    }
+
+    /// The ending of a recording whose curve takes `curve_s` seconds.
+    pub fn of_recording(curve_s: f64) -> Self {
+        Self { curve_s: Some(curve_s), ..Self::of_pour() }
+    }
+
+    /// Why it ends; [`EndReason::Done`] as long as nothing else was said.
+    pub fn reason(&self) -> EndReason {
+        self.reason
+    }
+
+    /// Gives the reason of the end; call it once, when the container begins to come upright.
+    pub fn end_with(&mut self, reason: EndReason) {
+        self.reason = reason;
+    }
+
+    /// The robot may not move any more, for `reason`: a pour that was already ending for another reason than its goal keeps that one.
+    pub fn end_without_robot(&mut self, reason: EndReason) {
+        if self.reason == EndReason::Done {
+            self.reason = reason;
+        }
+    }
+
+    /// Whether the agent has come to its end. Stays true.
+    pub fn agent_is_done(&self) -> bool {
+        self.agent_is_done
+    }
+
+    /// Takes the agent's decision for one frame, the lost ones included; answers with [`Ending::agent_is_done`].
+    pub fn decided(&mut self, decision: &Decision) -> bool {
+        self.agent_is_done |= goal_is_reached(decision);
+        self.seen_flow |= decision.flowing;
+        self.agent_is_done |= self.is_brought_back(decision);
+        self.agent_is_done |= self.stands_still(decision);
+        self.agent_is_done
+    }
+
+    /// A container that was brought back without any flow has poured, although d is still above 0: the agent stopped a little early.
+    fn is_brought_back(&mut self, decision: &Decision) -> bool {
+        let forward = decision.flowing || decision.dalpha_deg > 0.0;
+        self.brought_back_deg = if forward { 0.0 } else { self.brought_back_deg - decision.dalpha_deg };
+        self.seen_flow && self.brought_back_deg > BROUGHT_BACK_DEG
+    }
+
+    /// An agent that gets on neither in tilt nor in volume would stand there for ever.
+    fn stands_still(&mut self, decision: &Decision) -> bool {
+        self.advanced_deg += decision.dalpha_deg;
+        if self.advanced_deg >= PROGRESS_DEG || decision.poured_ml - self.advanced_from_ml >= PROGRESS_ML {
+            (self.stalled_frames, self.advanced_deg, self.advanced_from_ml) = (0, 0.0, decision.poured_ml);
+        } else {
+            self.stalled_frames = self.stalled_frames.saturating_add(1);
+        }
+        self.seen_flow && self.stalled_frames >= STALLED_FRAMES
+    }
+
+    /// Takes what a frame showed during a pour.
+    pub fn saw(&mut self, frame: &SeenFrame, settings: &Settings) {
+        let frames = frame.lost + 1;
+        self.quiet_frames = if frame.flowing { 0 } else { self.quiet_frames + frames };
+        if frame.area_px2.is_some_and(|area_px2| area_px2 > 0.0) {
+            (self.stream_frames, self.no_stream_frames) = (self.stream_frames + 1, 0);
+            if self.stream_frames >= STREAM_FRAMES {
+                self.stream_deg = Some(self.stream_deg.map_or(frame.alpha_deg, |deg| deg.max(frame.alpha_deg)));
+            }
+        } else {
+            (self.stream_frames, self.no_stream_frames) = (0, self.no_stream_frames + frames);
+        }
+        let at_largest_tilt = frame.alpha_now_deg >= settings.limits.alpha_max_deg - LARGEST_TILT_SLACK_DEG;
+        self.empty_frames = if at_largest_tilt && !frame.flowing { self.empty_frames + frames } else { 0 };
+    }
+
+    /// The reason to end now, if there is one. Ask it in every tick while the container is tilted.
+    pub fn due(&self, moment: &Moment, settings: &Settings) -> Option<EndReason> {
+        if moment.measurement_age_ns > settings.stale_ns {
+            return Some(EndReason::StaleFeature);
+        }
+        match self.curve_s {
+            Some(curve_s) => (moment.running_s >= curve_s).then_some(EndReason::Done),
+            None if self.agent_is_done => Some(EndReason::Done),
+            None if moment.frames >= settings.max_frames => Some(EndReason::MaxFrames),
+            None if self.empty_frames >= settings.empty_frames => Some(EndReason::ContainerEmpty),
+            None if self.stream_is_lost(moment) => Some(EndReason::StreamLost),
+            None => None,
+        }
+    }
+
+    /// What flows at one tilt flows more at a larger one: a stream that is gone there has ended, or is no longer seen.
+    fn stream_is_lost(&self, moment: &Moment) -> bool {
+        moment.poured_ml >= STREAM_ML
+            && self.no_stream_frames >= STREAM_LOST_FRAMES
+            && self.stream_deg.is_some_and(|deg| moment.alpha_deg > deg + STREAM_LOST_DEG)
+    }
+
+    /// The container has been commanded upright: the wait for the last drops begins.
+    pub fn begin_settling(&mut self) {
+        self.quiet_frames = 0;
+    }
+
+    /// The final reason, once the last drops are counted: the joint is upright and nothing has flowed for a while, or the wait took
+    /// too long. `alpha_deg` is the measured one: upright is what the joint is, not what it was told.
+    pub fn settled(&self, alpha_deg: f32, settling_s: f64, shutdown: bool, settings: &Settings) -> Option<EndReason> {
+        let upright = alpha_deg.abs() <= settings.upright_deg;
+        let quiet = self.quiet_frames >= SETTLE_QUIET_FRAMES && self.curve_s.is_none();
+        let over = settling_s >= SETTLE_MAX_S;
+        (over || (upright && (quiet || shutdown))).then_some(if upright { self.reason } else { EndReason::NotUpright })
+    }
+}
+
+/// The goal is reached: d, what is still on its way counted, is 0 or less, and nothing more comes over the lip.
+fn goal_is_reached(decision: &Decision) -> bool {
+    decision.tilting_back && decision.over_lip_ml < NOTHING_ML
+}
+
+/// Whether the controller slept so long that the robot's program has gone upright by itself; `last_tick_ns` is 0 before the first tick.
+pub fn controller_overran(now_ns: u64, last_tick_ns: u64, settings: &Settings) -> bool {
+    last_tick_ns != 0 && now_ns.saturating_sub(last_tick_ns) > settings.patience_ns
+}
+
+/// Whether a measurement comes from another process than the one that measured when the pour or recording began.
+pub fn worker_was_restarted(feature: &Feature, worker_epoch_ns: u64) -> bool {
+    feature.worker_epoch_ns != worker_epoch_ns
+}
+
+/// Whether the commanded alpha is upright.
+pub fn is_commanded_upright(alpha_deg: f32) -> bool {
+    alpha_deg.abs() < COMMANDED_UPRIGHT_DEG
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use shared::actions::{Selection, action_table};
+    use shared::agent::{Agent, Observation};
+    use shared::estimator::Calibration;
+    use shared::mlp::{InputScale, Mlp};
+    use shared::weights::{Estimator, Method, Origin, Weights};
+
+    /// A network that pours while d > 0 and stays when d is near 0; made by hand.
+    fn example() -> Weights {
+        let mut network = Mlp::ZERO;
+        for (k, p) in network.parameters_mut().enumerate() {
+            *p = (k as f32 * 0.7).sin() * 0.1;
+        }
+        Weights {
+            network,
+            actions_deg: action_table(),
+            selection: Selection::Argmax,
+            scale: InputScale::default(),
+            calibration: Calibration { volume_at_1_px2_ml: 0.002, area_exponent: 1.15, log_tilt_slope: 0.05, hold_above_px2: 60.0 },
+            estimator: Estimator::Sum,
+            rate_hz: 30.0,
+            origin: Origin { method: Method::Handmade, actions: 21, episodes: 0, data_sha256: [7; 32] },
+            seed: 1,
+        }
+    }
+
+    fn observation(area: f32) -> Observation {
+        Observation { area_px2: Some(area), alpha_deg: 50.0, alpha_now_deg: 50.0 }
+    }
+
+    /// Protects the idle robot: without a goal nothing ends, whatever is seen.
+    #[test]
+    fn without_a_goal_nothing_ends() {
+        let mut agent = Agent::new(&example());
+        for goal in [f32::NAN, -5.0, 0.0, f32::INFINITY] {
+            agent.start(goal);
+            let mut ending = Ending::of_pour();
+            for area in [0.0, 300.0, f32::NAN] {
+                let decision = agent.step(observation(area));
+                assert_eq!((decision.dalpha_deg, decision.d_ml, ending.decided(&decision)), (0.0, 0.0, false));
+            }
+        }
+    }
+
+    /// Protects eq. (2) and (4): d starts at the goal, falls by each frame's volume, goes below 0, and ends the pour.
+    #[test]
+    fn d_counts_down_and_ends_the_pour() {
+        let weights = example();
+        let (mut agent, mut ending) = (Agent::new(&weights), Ending::of_pour());
+        let v = weights.calibration.volume_ml(200.0, 50.0);
+        agent.start(3.5 * v);
+        for k in 0..5 {
+            let decision = agent.step(observation(200.0));
+            assert_eq!(ending.decided(&decision), k >= 3);
+        }
+        agent.start(10.0);
+        assert!(!Ending::of_pour().decided(&agent.step(observation(0.0))), "a new goal starts anew");
+    }
+
+    /// Protects the end of every pour: an agent that stands still short of its goal has come to its end, also while a trickle
+    /// flickers in and out of sight; one that creeps on, still waits for its first flow, or pours has not.
+    #[test]
+    fn an_agent_that_stands_still_comes_to_its_end() {
+        let mut weights = example();
+        weights.network = Mlp::ZERO;
+        for (action, flow_at_first, flow_later, ends) in
+            [(10, 100.0, 0.0, true), (10, 100.0, 0.1, true), (12, 100.0, 0.0, false), (10, 0.0, 0.0, false), (10, 100.0, 90.0, false)]
+        {
+            weights.network.b3 = [0.0; shared::actions::ACTIONS];
+            weights.network.b3[action] = 1.0;
+            let (mut agent, mut ending) = (Agent::new(&weights), Ending::of_pour());
+            agent.start(5000.0);
+            let first = ending.decided(&agent.step(observation(flow_at_first)));
+            let ended = (0..200).filter(|_| ending.decided(&agent.step(observation(flow_later)))).count();
+            assert_eq!((first, ended > 0), (false, ends), "action {action}, then {flow_later} px^2");
+        }
+    }
+
+    /// Protects the operator: the reason that came first is the one that is told.
+    #[test]
+    fn the_first_reason_stays() {
+        let mut ending = Ending::of_pour();
+        ending.end_with(EndReason::StreamLost);
+        ending.end_without_robot(EndReason::ProtectiveStop);
+        assert_eq!(ending.reason(), EndReason::StreamLost);
+        let mut done = Ending::of_pour();
+        done.end_without_robot(EndReason::ProtectiveStop);
+        assert_eq!(done.reason(), EndReason::ProtectiveStop);
+    }
+}

@@ -1,0 +1,126 @@
+//! What an operator may order, when an order is acceptable, and why it is refused otherwise.
+//!
+//! Pure; runs in the controller's loop, so it does not allocate. Only showing a [`Refusal`] as text, which the service thread does,
+//! writes into the caller's buffer.
+
+use serde::{Deserialize, Serialize};
+use shared::control::EndReason;
+use shared::gaussian_curve::Curve;
+use shared::messages::Phase;
+
+use super::robot::Robot;
+use super::settings::Settings;
+
+/// What an operator orders.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+pub enum Order {
+    /// Pour a goal volume: d <- V_G (eq. 4).
+    Pour {
+        /// Number of the pour.
+        episode: u64,
+        /// Goal volume V_G, ml.
+        goal_ml: f32,
+    },
+    /// Run the curve of eq. (1) once.
+    Record {
+        /// Number of the recording.
+        episode: u64,
+        /// The curve.
+        curve: Curve,
+    },
+    /// Bring the container upright at once.
+    Abort,
+    /// Bring the container upright and take no more orders.
+    Shutdown,
+}
+
+/// Why an order is refused.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum Refusal {
+    /// A pour or recording is under way.
+    Busy,
+    /// The robot may not move, for this reason.
+    Robot(EndReason),
+    /// The container is not upright; this is the measured alpha, degrees.
+    NotUpright(f32),
+    /// There is no fresh, usable measurement.
+    NoFeature,
+    /// No valid weights are loaded.
+    NoWeights,
+    /// The goal is not a number above 0 and up to this, ml.
+    Goal(f32),
+    /// The curve leaves the limits.
+    Curve,
+    /// The controller is shutting down.
+    Shutdown,
+}
+
+impl std::fmt::Display for Refusal {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        match self {
+            Self::Busy => write!(f, "a pour or recording is under way: wait for it, or `rt-controller abort`"),
+            Self::Robot(reason) => write!(f, "the robot may not move: {}", reason.words()),
+            Self::NotUpright(deg) => write!(f, "the container is tilted by {deg:.0} degrees: bring it upright at the robot's pendant"),
+            Self::NoFeature => {
+                write!(
+                    f,
+                    "no fresh, usable measurement: is `feature-worker run` running, does the camera deliver, what does the worker say?"
+                )
+            }
+            Self::NoWeights => write!(f, "no valid weight file is loaded: train one, or see `rt-controller status`"),
+            Self::Goal(max) => write!(f, "the goal must be above 0 and at most {max} ml (controller.goal_max_ml)"),
+            Self::Curve => write!(f, "the curve leaves [limits]: choose a smaller lambda or gamma, and a beta of 0.5 to 60 s"),
+            Self::Shutdown => write!(f, "the controller is shutting down"),
+        }
+    }
+}
+
+/// The situation in which an order comes.
+#[derive(Debug, Clone, Copy)]
+pub struct Situation {
+    /// What the controller is doing.
+    pub phase: Phase,
+    /// The robot's newest state.
+    pub robot: Robot,
+    /// Whether the controller is shutting down.
+    pub shutdown: bool,
+    /// Age of the newest usable measurement, ns.
+    pub measurement_age_ns: u64,
+}
+
+impl Situation {
+    /// Whether a pour or recording may begin now: the robot is well and upright, nothing is under way, and the camera sees.
+    pub fn may_begin(&self, settings: &Settings) -> Result<(), Refusal> {
+        if self.shutdown {
+            return Err(Refusal::Shutdown);
+        }
+        if let Some(reason) = self.robot.hindrance {
+            return Err(Refusal::Robot(reason));
+        }
+        match self.phase {
+            Phase::Idle => {}
+            Phase::NoRobot => return Err(Refusal::NotUpright(self.robot.alpha_deg)),
+            _ => return Err(Refusal::Busy),
+        }
+        if self.measurement_age_ns <= settings.stale_ns { Ok(()) } else { Err(Refusal::NoFeature) }
+    }
+
+    /// Whether an abort can be obeyed: the robot can be moved at all.
+    pub fn may_abort(&self) -> Result<(), Refusal> {
+        match (self.robot.hindrance, self.phase) {
+            (Some(reason), _) => Err(Refusal::Robot(reason)),
+            (None, Phase::NoRobot) => Err(Refusal::NotUpright(self.robot.alpha_deg)),
+            (None, _) => Ok(()),
+        }
+    }
+}
+
+/// Whether `goal_ml` is a goal that may be poured.
+pub fn goal_is_legal(goal_ml: f32, settings: &Settings) -> Result<(), Refusal> {
+    if goal_ml > 0.0 && goal_ml <= settings.goal_max_ml { Ok(()) } else { Err(Refusal::Goal(settings.goal_max_ml)) }
+}
+
+/// Whether `curve` keeps the limits, so that it is run exactly as given.
+pub fn curve_is_legal(curve: &Curve, settings: &Settings) -> Result<(), Refusal> {
+    if curve.fits(&settings.limits, settings.period_ns) { Ok(()) } else { Err(Refusal::Curve) }
+}

@@ -1,0 +1,48 @@
+//! The part of the cell's configuration that decisions depend on.
+//!
+//! Read once at start; then plain data that the loop copies. The journal holds it, so that a replay decides under the same settings.
+
+use serde::{Deserialize, Serialize};
+use shared::config::Config;
+use shared::limits::Limits;
+
+use crate::link::program::patience_s;
+
+/// The settings of a controller.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+pub struct Settings {
+    /// Period of a tick, ns.
+    pub period_ns: u64,
+    /// Limits on alpha.
+    pub limits: Limits,
+    /// Largest age of the newest usable measurement during a pour or recording, ns.
+    pub stale_ns: u64,
+    /// Largest number of frames of a pour.
+    pub max_frames: u32,
+    /// Number of frames without flow at the largest tilt after which the container counts as empty. A container that has poured
+    /// is found out before, by the rule of the lost stream.
+    pub empty_frames: u32,
+    /// Largest goal, ml.
+    pub goal_max_ml: f32,
+    /// Largest distance of the measured alpha from 0 that counts as upright, degrees.
+    pub upright_deg: f32,
+    /// After this long without a target the robot's program goes upright by itself, ns; then the controller does so too.
+    pub patience_ns: u64,
+}
+
+impl Settings {
+    /// Takes the settings out of the cell's configuration.
+    pub fn new(config: &Config) -> Self {
+        let controller = &config.controller;
+        Self {
+            period_ns: (1e9 / controller.rate_hz) as u64,
+            limits: config.limits,
+            stale_ns: u64::from(controller.stale_feature_ms) * 1_000_000,
+            max_frames: controller.max_frames,
+            empty_frames: controller.empty_frames,
+            goal_max_ml: controller.goal_max_ml,
+            upright_deg: config.robot.start_tolerance_deg as f32,
+            patience_ns: (patience_s(controller.rate_hz) * 1e9) as u64,
+        }
+    }
+}

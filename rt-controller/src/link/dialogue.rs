@@ -1,0 +1,153 @@
+//! The RTDE connection while a session is set up: requests and their answers, with blocking reads.
+//!
+//! Runs on the connecting thread; allocates, and blocks for [`ANSWER`] at most. Each failure is a [`LinkError`].
+
+use std::io::{ErrorKind, Read, Write};
+use std::net::{IpAddr, SocketAddr, TcpStream};
+use std::time::{Duration, Instant};
+
+use super::error::{ANSWER, LinkError};
+use super::wire::{self, Inbox, Outputs};
+use super::{RobotState, TiltJoint};
+
+/// The robot's port for RTDE (Universal Robots, RTDE guide).
+const RTDE_PORT: u16 = 30004;
+/// Longest request, bytes: the output recipe with its thirteen names is about 300.
+const REQUEST_MAX: usize = 1024;
+
+/// The RTDE connection while it is being set up.
+pub(super) struct Dialogue {
+    /// The robot's address and port.
+    pub at: SocketAddr,
+    /// The connection.
+    pub stream: TcpStream,
+    /// What has arrived on it and was not read yet.
+    pub inbox: Inbox,
+    /// The robot's newest text message, ready to be put behind an error; empty before the first.
+    pub said: String,
+}
+
+impl Dialogue {
+    /// Connects to the robot's RTDE port.
+    pub fn open(address: IpAddr) -> Result<Self, LinkError> {
+        let at = SocketAddr::new(address, RTDE_PORT);
+        let stream = open(at)?;
+        Ok(Self { at, stream, inbox: Inbox::new(), said: String::new() })
+    }
+
+    /// Sends a request and waits for its answer, which `read` decodes; `read` gives `None` for bytes that are no such answer.
+    pub fn ask<T>(&mut self, kind: u8, payload: &[&[u8]], doing: &'static str, read: impl Fn(&[u8]) -> Option<T>) -> Result<T, LinkError> {
+        let mut buffer = [0; REQUEST_MAX];
+        let request = wire::encode(kind, payload, &mut buffer).unwrap_or_default();
+        self.stream.write_all(request).map_err(|e| self.lost(doing, &e))?;
+        let answer = self.wait(doing, ANSWER, |packet| (packet.kind == kind).then(|| read(packet.payload)))?;
+        answer.ok_or_else(|| self.no_answer(doing))?.ok_or_else(|| self.unexpected(doing))
+    }
+
+    /// Agrees on a recipe of `variables`, names and types, and gives its id.
+    pub fn agree(&mut self, kind: u8, head: &[u8], variables: &[(String, &'static str)], doing: &'static str) -> Result<u8, LinkError> {
+        let names: Vec<&str> = variables.iter().map(|(name, _)| name.as_str()).collect();
+        let names = names.join(",");
+        let (id, types) =
+            self.ask(kind, &[head, names.as_bytes()], doing, |payload| wire::recipe(payload).map(|(id, types)| (id, types.to_owned())))?;
+        // Some controllers end the list with a comma.
+        let types: Vec<&str> = types.strip_suffix(',').unwrap_or(&types).split(',').collect();
+        let address = self.at.ip();
+        if types.len() != variables.len() {
+            return Err(self.unexpected(doing));
+        }
+        for ((variable, expected), given) in variables.iter().zip(types) {
+            let variable = variable.clone();
+            match given.trim() {
+                "NOT_FOUND" => return Err(LinkError::NotFound { address, variable }),
+                "IN_USE" => return Err(LinkError::InUse { address, variable }),
+                given if given != *expected => return Err(LinkError::WrongType { address, variable, given: given.into(), expected }),
+                _ => {}
+            }
+        }
+        // The RTDE guide: id 0 means that the recipe is not valid.
+        if id == 0 { Err(self.unexpected(doing)) } else { Ok(id) }
+    }
+
+    /// Waits for the next DATA_PACKAGE and fills `state` from it; `None` if none came in time.
+    pub fn next_state(&mut self, recipe: u8, tilt: &TiltJoint, state: &mut RobotState, within: Duration) -> Result<Option<()>, LinkError> {
+        let doing = "its state";
+        let filled = self.wait(doing, within, |packet| {
+            (packet.kind == wire::DATA).then(|| Outputs::new_checked(packet.payload, recipe).map(|outputs| outputs.fill(tilt, state)))
+        })?;
+        match filled {
+            None => Ok(None),
+            Some(Some(())) => Ok(Some(())),
+            Some(None) => Err(self.unexpected(doing)),
+        }
+    }
+
+    /// Reads packets until `pick` takes one; `None` after `within`. Text packets are remembered and others passed over, because data
+    /// and text may come before an answer.
+    fn wait<T>(
+        &mut self,
+        doing: &'static str,
+        within: Duration,
+        mut pick: impl FnMut(&wire::Packet<'_>) -> Option<T>,
+    ) -> Result<Option<T>, LinkError> {
+        let deadline = Instant::now() + within;
+        loop {
+            loop {
+                match self.inbox.next_packet() {
+                    Ok(None) => break,
+                    Ok(Some(packet)) => {
+                        if let Some(found) = pick(&packet) {
+                            return Ok(Some(found));
+                        }
+                        if let (wire::TEXT, Some((_, message))) = (packet.kind, wire::text(packet.payload)) {
+                            self.said = format!("; the robot said: {}", printable(message));
+                        }
+                    }
+                    Err(_) => return Err(self.unexpected(doing)),
+                }
+            }
+            let left = deadline.saturating_duration_since(Instant::now());
+            if left.is_zero() {
+                return Ok(None);
+            }
+            // A timeout of zero would mean that there is none.
+            let timeout = left.max(Duration::from_millis(1));
+            self.stream.set_read_timeout(Some(timeout)).map_err(|e| self.lost(doing, &e))?;
+            match self.stream.read(self.inbox.space()) {
+                Ok(0) => return Err(self.lost(doing, &ErrorKind::ConnectionAborted.into())),
+                Ok(n) => self.inbox.filled(n),
+                Err(e) if matches!(e.kind(), ErrorKind::WouldBlock | ErrorKind::TimedOut | ErrorKind::Interrupted) => {}
+                Err(e) => return Err(self.lost(doing, &e)),
+            }
+        }
+    }
+
+    fn lost(&self, doing: &'static str, e: &std::io::Error) -> LinkError {
+        LinkError::Lost { at: self.at, doing, what: e.kind().to_string() }
+    }
+
+    /// The error of an answer that did not come.
+    pub fn no_answer(&self, doing: &'static str) -> LinkError {
+        LinkError::NoAnswer { at: self.at, doing }
+    }
+
+    fn unexpected(&self, doing: &'static str) -> LinkError {
+        LinkError::Unexpected { at: self.at, doing, said: self.said.clone() }
+    }
+}
+
+/// Opens a TCP connection that blocks for [`ANSWER`] at most and sends at once.
+pub(super) fn open(at: SocketAddr) -> Result<TcpStream, LinkError> {
+    let open = || {
+        let stream = TcpStream::connect_timeout(&at, ANSWER)?;
+        stream.set_nodelay(true)?;
+        stream.set_write_timeout(Some(ANSWER))?;
+        Ok(stream)
+    };
+    open().map_err(|e: std::io::Error| LinkError::Unreachable { at, what: e.kind().to_string() })
+}
+
+/// A robot's text message in one line.
+fn printable(message: &[u8]) -> String {
+    String::from_utf8_lossy(message).chars().map(|c| if c.is_control() { ' ' } else { c }).collect()
+}

@@ -1,0 +1,7 @@
+//! The subcommands of `trainer`, one file each.
+
+pub mod check;
+pub mod inspect;
+pub mod refine;
+pub mod report;
+pub mod train;

@@ -1,0 +1,131 @@
+//! `trainer check`: says in words what is wrong with a data set, before any training.
+//!
+//! Offline, ordinary thread, allocates. The command fails if it found something, so that scripts can rely on it.
+
+use serde::Serialize;
+use shared::episode::{Episode, EpisodeRow};
+use shared::exit::{self, Failure, OrExit as _, failure};
+use shared::messages::Doubt;
+
+use crate::calibration::EXPONENT_NEEDS;
+use crate::consistency;
+use crate::data::{self, EpisodeSource, TrainingEpisode};
+
+/// An episode that begins or ends below this tilt counts as upright there, degrees. Chosen by hand; no measurement is recorded.
+const UPRIGHT_DEG: f32 = 5.0;
+/// More than this share of lost or clipped frames is worth a line. Chosen by hand; no measurement is recorded.
+const SHARE_MAX: f64 = 0.05;
+
+/// Method paper needs as many episodes. From the prototype's figures for 5 and 10 episodes.
+const PAPER_NEEDS: usize = 10;
+/// Frame rates that are further apart than this are different ones, Hz. Chosen by hand; no measurement is recorded.
+const RATES_APART_HZ: f64 = 0.5;
+
+/// Command-line arguments of `trainer check`.
+#[derive(Debug, clap::Args)]
+#[command(after_help = "Examples:
+  trainer check out/episodes
+  trainer check features.csv --scale scale.csv --json")]
+pub struct Args {
+    #[command(flatten)]
+    source: EpisodeSource,
+    /// Print JSON.
+    #[arg(long)]
+    json: bool,
+}
+
+/// What was found.
+#[derive(Debug, Clone, Serialize)]
+pub struct Findings {
+    /// Episodes looked at.
+    pub episodes: usize,
+    /// Episodes that can be trained on.
+    pub usable: usize,
+    /// Episodes that a training would leave out, and why.
+    pub left_out: Vec<(String, String)>,
+    /// What is doubtful about episodes that can be used, or about the set.
+    pub doubts: Vec<(String, String)>,
+}
+
+/// Looks for faults and doubts in a data set.
+pub fn check(episodes: &[Episode]) -> Findings {
+    let usable = data::usable(episodes);
+    let mut doubts = Vec::new();
+    for e in episodes {
+        if !usable.left_out.iter().any(|(name, _)| *name == e.name) {
+            doubts.extend(recording_doubts(e).into_iter().map(|what| (e.name.clone(), what)));
+        }
+    }
+    doubts.extend(consistency::doubtful(&usable.episodes).into_iter().map(|d| (d.name.clone(), d.to_string())));
+    doubts.extend(set_doubts(&usable.episodes));
+    Findings { episodes: episodes.len(), usable: usable.episodes.len(), left_out: usable.left_out, doubts }
+}
+
+/// What is doubtful about one recording.
+fn recording_doubts(e: &Episode) -> Vec<String> {
+    let mut doubts = Vec::new();
+    let mut doubt = |what: String| doubts.push(what);
+    let n = e.rows.len().max(1) as f64;
+    let share = |of: fn(&EpisodeRow) -> bool| e.rows.iter().filter(|row| of(row)).count() as f64 / n;
+    let lost = share(|row| row.lost);
+    if lost > SHARE_MAX {
+        doubt(format!("{:.0} % of the frames were lost: check the camera's connection and the load of the machine", 100.0 * lost));
+    }
+    let clipped = share(|row| matches!(row.doubt, Doubt::LeavesRegion | Doubt::BlownOut | Doubt::TooDark));
+    if clipped > SHARE_MAX {
+        doubt(format!("{:.0} % of the images are clipped, too dark or blown out: check exposure and [image] region_px", 100.0 * clipped));
+    }
+    let tilt_deg = |row: Option<&EpisodeRow>| row.map_or(0.0, |row| row.alpha_commanded_deg);
+    let last_deg = tilt_deg(e.rows.last());
+    if last_deg > UPRIGHT_DEG {
+        doubt(format!("the angle never returns ({last_deg:.0} degrees at the end): the last volume is not seen; record until upright"));
+    }
+    let first_deg = tilt_deg(e.rows.first());
+    if first_deg > UPRIGHT_DEG {
+        doubt(format!("starts at {first_deg:.0} degrees, not upright: what flowed before is on the scale but not in the images"));
+    }
+    if e.rows.len() > 3 && e.rows.iter().rev().take(3).all(|row| row.area_px2 > 0.0) {
+        doubt("still flowing in the last frames: record until the stream has ended".into());
+    }
+    doubts
+}
+
+/// What is doubtful about the data set as a whole.
+fn set_doubts(episodes: &[TrainingEpisode]) -> Vec<(String, String)> {
+    let mut doubts = Vec::new();
+    let mut doubt = |what: String| doubts.push(("data set".to_owned(), what));
+    let n = episodes.len();
+    if n == 0 {
+        doubt("no episode can be trained on".into());
+    } else if n < EXPONENT_NEEDS {
+        doubt(format!("{n} episodes: below {EXPONENT_NEEDS} the camera's exponent cannot be told; method best works, 5 are much better"));
+    }
+    if n < PAPER_NEEDS {
+        doubt(format!("{n} episodes: enough for method best, too few for method paper, which needs {PAPER_NEEDS}"));
+    }
+    if let Some(first) = episodes.first()
+        && episodes.iter().any(|e| (e.rate_hz - first.rate_hz).abs() > RATES_APART_HZ)
+    {
+        doubt("the episodes have different frame rates: train on one rate only".into());
+    }
+    doubts
+}
+
+/// Runs the command. It fails with exit code 1 if it found something, and with 2 if nothing can be read.
+pub fn run(args: &Args) -> Result<(), Failure> {
+    let episodes = args.source.read().or_exit(exit::BAD_INPUT)?;
+    let findings = check(&episodes);
+    if args.json {
+        println!("{}", serde_json::to_string_pretty(&findings).unwrap_or_default());
+    } else {
+        println!("{} episodes, {} usable", findings.episodes, findings.usable);
+        for (name, what) in &findings.left_out {
+            println!("cannot be used: {name}: {what}");
+        }
+        for (name, what) in &findings.doubts {
+            println!("doubtful: {}", if what.starts_with(name.as_str()) { what.clone() } else { format!("{name}: {what}") });
+        }
+    }
+    let wrong = !findings.left_out.is_empty() || findings.doubts.iter().any(|(name, _)| name != "data set") || findings.usable == 0;
+    if wrong { Err(failure(exit::FAILED, "the data set is not as it should be")) } else { Ok(()) }
+}

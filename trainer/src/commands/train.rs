@@ -1,0 +1,154 @@
+//! `trainer train`: episodes in, one weight file out.
+//!
+//! Offline, ordinary threads, allocates. The whole configuration, the seed, the hash of the data and the learning curve are kept
+//! beside the weight file (`W.json`). The same seed and data give the same bytes on any number of threads. What cannot be read,
+//! trained on or written ends the command with one line.
+
+use std::path::{Path, PathBuf};
+
+use indicatif::{ProgressBar, ProgressStyle};
+use shared::exit::{self, Failure, OrExit as _, failure};
+use shared::limits::Limits;
+
+use crate::consistency;
+use crate::data::{self, EpisodeSource, UsableEpisodes};
+use crate::method;
+use crate::training::{Estimate, MethodName, Options, Progress, Trained};
+
+/// Command-line arguments of `trainer train`.
+#[derive(Debug, clap::Args)]
+#[command(after_help = "Examples:
+  trainer train out/episodes --out out/weights.bin
+  trainer train features.csv --scale scale.csv --out out/weights.bin
+  trainer train out/episodes --estimate sum --seed 7 --out w.bin")]
+pub struct Args {
+    #[command(flatten)]
+    source: EpisodeSource,
+    /// Training method.
+    #[arg(long, value_enum, default_value = "best")]
+    method: MethodName,
+    /// Number of actions: 2 (+-1 degree) or 21 (Fig. 5).
+    #[arg(long, default_value_t = 21, value_parser = parse_actions)]
+    actions: u8,
+    /// How d is estimated; fused with methods best and paper, sum with the others, if not given.
+    #[arg(long, value_enum)]
+    estimate: Option<Estimate>,
+    #[command(flatten)]
+    weight_file: WeightFileArgs,
+}
+
+/// What `trainer train` and `trainer refine` are told alike.
+#[derive(Debug, clap::Args)]
+pub struct WeightFileArgs {
+    /// Seed: the same seed and data give the same bytes.
+    #[arg(long, default_value_t = 1)]
+    pub seed: u64,
+    /// Configuration of the cell, for the limits; without it the default limits.
+    #[arg(long)]
+    config: Option<PathBuf>,
+    /// Where the weight file goes; replaced atomically.
+    #[arg(long)]
+    out: PathBuf,
+    /// Print a report as JSON.
+    #[arg(long)]
+    pub json: bool,
+}
+
+fn parse_actions(text: &str) -> Result<u8, String> {
+    match text {
+        "2" => Ok(2),
+        "21" => Ok(21),
+        _ => Err("2 or 21".into()),
+    }
+}
+
+/// Progress on a terminal.
+struct Bar(ProgressBar);
+
+impl Progress for Bar {
+    fn stage(&self, name: &str, steps: u64) {
+        self.0.reset();
+        self.0.set_length(steps);
+        self.0.set_prefix(name.to_owned());
+        self.0.set_message("");
+    }
+    fn at(&self, step: u64, note: &str) {
+        self.0.set_position(step);
+        self.0.set_message(note.to_owned());
+    }
+}
+
+/// Runs the command.
+pub fn run(args: &Args) -> Result<(), Failure> {
+    let read = args.source.read().or_exit(exit::BAD_INPUT)?;
+    let limits = args.weight_file.limits()?;
+    let can_fuse = matches!(args.method, MethodName::Best | MethodName::Paper);
+    let estimate = args.estimate.unwrap_or(if can_fuse { Estimate::Fused } else { Estimate::Sum });
+    if estimate == Estimate::Fused && !can_fuse {
+        let what = "--estimate fused goes with --method best or paper: the others learn on the paper's own sum";
+        return Err(failure(exit::BAD_INPUT, what));
+    }
+    let usable = data::usable(&read);
+    for doubt in consistency::doubtful(&usable.episodes) {
+        eprintln!("doubtful: {doubt}");
+    }
+    let options = Options { method: args.method, actions: args.actions, estimate, seed: args.weight_file.seed, limits };
+    args.weight_file.train_and_write(&usable, &options, serde_json::Value::Null)
+}
+
+impl WeightFileArgs {
+    /// The limits of the configuration, or the default ones; a configuration that cannot be read is bad input.
+    pub fn limits(&self) -> Result<Limits, Failure> {
+        let Some(file) = &self.config else { return Ok(Limits::default()) };
+        shared::config::Config::read(file).map(|c| c.limits).or_exit(exit::BAD_INPUT)
+    }
+
+    /// Trains with a progress bar, writes the weight file and, beside it, everything that it came from (`W.json`); `extra` goes
+    /// into that file as it is.
+    pub fn train_and_write(&self, usable: &UsableEpisodes, options: &Options, extra: serde_json::Value) -> Result<(), Failure> {
+        for (name, what) in &usable.left_out {
+            eprintln!("left out: {name}: {what}");
+        }
+        let style = ProgressStyle::with_template("{prefix} [{wide_bar}] {pos}/{len} {msg} ({eta} left)");
+        let bar = Bar(ProgressBar::new(1).with_style(style.unwrap_or_else(|_| ProgressStyle::default_bar())));
+        let begin = std::time::Instant::now();
+        let trained = method::train(&usable.episodes, options, &bar).or_exit(exit::BAD_INPUT)?;
+        bar.0.finish_and_clear();
+        let seconds = begin.elapsed().as_secs_f64();
+        let out = &self.out;
+        trained.weights.write(out).or_exit(exit::FAILED)?;
+        let summary = summary(out, usable, options, &trained, extra);
+        let text = serde_json::to_string_pretty(&summary).unwrap_or_default();
+        let mut beside = out.clone().into_os_string();
+        beside.push(".json");
+        let beside = PathBuf::from(beside);
+        std::fs::write(&beside, format!("{text}\n")).map_err(|e| format!("{}: {e}", beside.display())).or_exit(exit::FAILED)?;
+        if self.json {
+            println!("{text}");
+        } else {
+            let n = usable.episodes.len();
+            println!("{}: trained on {n} episodes in {seconds:.1} s, identity {}", out.display(), trained.weights.identity());
+        }
+        Ok(())
+    }
+}
+
+/// Everything that a weight file came from, as JSON for people and for `trainer report`.
+fn summary(out: &Path, usable: &UsableEpisodes, options: &Options, trained: &Trained, extra: serde_json::Value) -> serde_json::Value {
+    let weights = &trained.weights;
+    serde_json::json!({
+        "kind": "training",
+        "weights": out,
+        "identity": weights.identity(),
+        "options": options,
+        "episodes": usable.episodes.iter().map(|e| serde_json::json!({"name": e.name, "weight_g": e.weight_g})).collect::<Vec<_>>(),
+        "left_out": usable.left_out,
+        "data_sha256": data::hex(&weights.origin.data_sha256),
+        "calibration": weights.calibration,
+        "estimator": weights.estimator,
+        "law": trained.law,
+        "search_cost": trained.search_curve,
+        "loss": trained.loss,
+        "extra": extra,
+    })
+}

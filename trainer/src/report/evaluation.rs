@@ -1,0 +1,138 @@
+//! The part of a page that shows evaluations.
+//!
+//! Pure, any thread, allocates.
+
+use std::collections::BTreeMap;
+
+use serde_json::Value;
+
+use super::json::{items, number, numbers, rounded, text};
+use super::page::{figure, table};
+use super::plot::{PlotSeries, histogram, plot};
+
+/// Dots of a method in a plot: with every dot of a large evaluation, a page would be tens of megabytes.
+const DOTS: usize = 600;
+/// Width of the errors' bins, ml.
+const BIN_ML: f64 = 0.5;
+/// Errors beyond this are counted in the outermost bins, ml.
+const LAST_BIN_ML: f64 = 12.0;
+
+/// An evaluation as `experiments evaluate` writes it.
+pub fn evaluation(v: &Value) -> String {
+    let mut html = format!(
+        "<h2>Evaluation: simulator {}, container {}, change {}</h2><p>{} rigs from {}, {} data seeds, {} episodes and {} weighed pours. Errors in ml; the interval is 95 % over rigs and seeds.</p>",
+        text(&v["sim"]),
+        text(&v["container"]),
+        text(&v["change"]),
+        v["rigs"],
+        v["first_rig"],
+        v["seeds"],
+        v["episodes"],
+        v["weighed"]
+    );
+    html += &summaries(&v["summaries"]);
+    html += "<div class=plots>";
+    html += &pours(&v["pours"]);
+    html.extend(items(&v["traces"]).map(trace));
+    html + "</div>"
+}
+
+/// A row of errors for each method.
+fn summaries(summaries: &Value) -> String {
+    let heading = [
+        "method",
+        "n",
+        "MAE",
+        "±",
+        "median",
+        "p95",
+        "max",
+        "bias",
+        "≤ 5 ml",
+        "≤ 5 %",
+        "never poured",
+        "never stopped",
+        "measurement",
+        "control",
+        "s a pour",
+    ];
+    let mut rows = vec![heading.map(String::from).to_vec()];
+    for s in items(summaries) {
+        let percent = |key: &str| s[key].as_f64().map_or_else(String::new, |x| format!("{:.1}\u{a0}%", 100.0 * x));
+        rows.push(vec![
+            text(&s["name"]),
+            s["n"].to_string(),
+            rounded(&s["mae_ml"], 2),
+            rounded(&s["mae_ci_ml"], 2),
+            rounded(&s["median_ml"], 2),
+            rounded(&s["p95_ml"], 2),
+            rounded(&s["max_ml"], 1),
+            rounded(&s["bias_ml"], 2),
+            percent("within_5_ml"),
+            percent("within_5_percent"),
+            s["never_poured"].to_string(),
+            s["never_stopped"].to_string(),
+            rounded(&s["measurement_ml"], 2),
+            rounded(&s["control_ml"], 2),
+            rounded(&s["seconds"], 1),
+        ]);
+    }
+    table(&rows)
+}
+
+/// Goal against poured, and the errors' histogram, of each method.
+fn pours(methods: &Value) -> String {
+    let mut scatter = vec![PlotSeries::reference("poured = goal", vec![(0.0, 0.0), (200.0, 200.0)])];
+    let mut bars = Vec::new();
+    for method in items(methods) {
+        let name = text(&method["name"]);
+        let pours: Vec<(f64, f64)> =
+            items(&method["groups"]).flat_map(items).map(|p| (number(&p["goal_ml"]), number(&p["true_ml"]))).collect();
+        let every = (pours.len() / DOTS).max(1);
+        let spread = |(k, (goal, poured)): (usize, &(f64, f64))| (goal + (k % 9) as f64 - 4.0, *poured);
+        scatter.push(PlotSeries::dots(&name, pours.iter().step_by(every).enumerate().map(spread).collect()));
+        let errors: Vec<f64> = pours.iter().map(|(goal, poured)| poured - goal).collect();
+        bars.push(histogram(&name, &errors, BIN_ML, LAST_BIN_ML));
+    }
+    figure(&plot("goal in ml (spread by ±4 for sight)", "poured in ml", &scatter, true), "Goal against poured.")
+        + &figure(&plot("error in ml (ends hold what is beyond)", "% of the pours", &bars, true), "Errors.")
+}
+
+/// One pour frame by frame.
+fn trace(trace: &Value) -> String {
+    let column = |key: &str| -> Vec<(f64, f64)> { numbers(&trace["t_s"]).into_iter().zip(numbers(&trace[key])).collect() };
+    let series = [
+        PlotSeries::line("alpha, degrees", column("alpha_deg")),
+        PlotSeries::line("poured, ml", column("true_ml")),
+        PlotSeries::line("area / 4, px²", column("area_4_px2")),
+    ];
+    let caption = format!("A pour of {} ml from {} ml, {}.", trace["goal_ml"], trace["init_ml"], text(&trace["name"]));
+    figure(&plot("time in s", "degrees, ml, px² / 4", &series, true), &caption)
+}
+
+/// Error against number of episodes, where several evaluations differ in it; else nothing.
+pub fn against_episodes<'a>(values: impl Iterator<Item = &'a Value>) -> String {
+    let mut by_method: BTreeMap<String, Vec<(f64, f64)>> = BTreeMap::new();
+    for v in values.filter(|v| v["kind"] == "evaluation") {
+        let n = v["episodes"].as_f64().unwrap_or(0.0) + v["weighed"].as_f64().unwrap_or(0.0);
+        for s in items(&v["summaries"]) {
+            by_method.entry(text(&s["name"])).or_default().push((n, number(&s["mae_ml"])));
+        }
+    }
+    let series: Vec<PlotSeries> = by_method
+        .into_iter()
+        .filter(|(_, p)| p.iter().any(|(n, _)| *n != p[0].0))
+        .map(|(name, mut points)| {
+            points.sort_by(|a, b| a.0.total_cmp(&b.0));
+            PlotSeries::line(&name, points)
+        })
+        .collect();
+    if series.is_empty() {
+        return String::new();
+    }
+    let svg = plot("episodes and weighed pours", "mean absolute error in ml", &series, true);
+    format!(
+        "<h2>Error against number of episodes</h2><div class=plots>{}</div>",
+        figure(&svg, "Mean absolute error over all rigs and seeds.")
+    )
+}
