@@ -11,7 +11,7 @@ use shared::messages::{Doubt, PixelFormat};
 use crate::source::Frame;
 use crate::vision::{Extractor, Measurement};
 
-/// Binary digits behind the point in OpenCV's coordinates.
+/// Binary digits after the point in OpenCV's coordinates. Chosen by hand: sixteenths of a pixel.
 const SHIFT: i32 = 4;
 /// Height of a line of caption, px. Chosen by hand to fit the font.
 const CAPTION_PX: i32 = 20;

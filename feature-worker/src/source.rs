@@ -82,7 +82,7 @@ impl FrameSource for ObserverSource<'_> {
     }
 }
 
-/// Whether a process publishes frames. One that was killed counts until the next process joins the cell.
+/// Whether a process publishes frames. A process that was killed counts until the next process joins the cell.
 fn has_publisher(topic: &FrameTopic) -> bool {
     topic.dynamic_config().number_of_publishers() > 0
 }

@@ -45,7 +45,7 @@ fn yuyv_gives_the_same_area() -> Result<(), ExtractError> {
     let full = yuv.data_typed::<core::Vec3b>()?;
     let mut yuyv = Vec::new();
     let luma = |p: &core::Vec3b| (16.0 + f32::from(p[0]) * 219.0 / 255.0).round() as u8;
-    // OpenCV's YUV has U = 0.492 (B - Y) and V = 0.877 (R - Y); a camera's chroma have 0.564 and 0.713 instead, in the limited
+    // OpenCV's YUV has U = 0.492 (B - Y) and V = 0.877 (R - Y); a camera's chroma has 0.564 and 0.713 instead, in the limited
     // range.
     let chroma = |p: &core::Vec3b, k: usize, factor: f32| (128.0 + (f32::from(p[k]) - 128.0) * factor * 224.0 / 255.0).round() as u8;
     for pair in full.chunks_exact(2) {
@@ -187,8 +187,8 @@ fn focus_is_judged_by_the_glass() -> Result<(), ExtractError> {
     Ok(())
 }
 
-/// Protects clear water before an even wall and before a pattern at rest: V_e is exactly 0 in the dry frames before and after, every frame
-/// with water is measured to 10 % once the stream stands, and none is doubted.
+/// Protects clear water in front of an even wall and of a pattern at rest: V_e is exactly 0 in the dry frames before and after, every frame
+/// is measured to 10 % while the stream's legs have more than 0.3 of their full length, and none is doubted.
 #[test]
 fn clear_water_is_measured() -> Result<(), ExtractError> {
     for turn in [None, Some(11.0)] {
@@ -212,8 +212,8 @@ fn clear_water_is_measured() -> Result<(), ExtractError> {
     Ok(())
 }
 
-/// Protects pours before a pattern that turns with the wrist: V_e is exactly 0 in the dry frames before and after, and a stream is measured
-/// to 30 % from its third frame on, as long as its legs have more than half of their full length.
+/// Protects pours in front of a pattern that turns with the wrist: V_e is exactly 0 in the dry frames before and after, and a stream is
+/// measured to 30 % from its third frame on, as long as its legs have more than half of their full length.
 #[test]
 fn clear_water_before_a_turning_pattern_is_measured() -> Result<(), ExtractError> {
     for turn_deg in [-0.8f32, 0.5, 1.0] {

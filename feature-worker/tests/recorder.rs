@@ -178,7 +178,8 @@ impl Scene {
     }
 }
 
-/// Protects L_E: the file holds every frame of the episode with its image, its V_e and alpha at its capture time, and the curve's parameters.
+/// Protects L_E: the file holds every frame of the episode with its image, its V_e and alpha at its capture time, and the curve's
+/// parameters.
 #[test]
 fn a_recording_becomes_a_complete_episode() {
     let dir = tempfile::tempdir().unwrap();
@@ -195,7 +196,7 @@ fn a_recording_becomes_a_complete_episode() {
     assert_eq!(episode.info.weights, "0000000000000abc", "the weights that the controller runs");
     assert_eq!(episode.info.images, report.images);
     assert_eq!(episode.info.images as usize, episode.rows.len());
-    // Ticks 13 to 57 are the episode, and tick 58 ends it. Frames 13 to 58 were captured in between; 14 is the first after the start.
+    // Ticks 13 to 57 are the episode, and tick 58 ends it. Frames 14 to 58 were captured in between.
     assert!(episode.rows[0].t_s < 0.0 && episode.rows[0].t_s >= -0.2, "a few frames from before");
     assert_eq!(episode.rows.last().unwrap().sequence, 58, "the last frame before the end");
     for f in &episode.rows {
@@ -433,7 +434,8 @@ fn a_killed_recorder_leaves_a_file_that_reads_and_says_so() {
 fn a_full_disk_is_reported_and_what_fits_is_kept() {
     let dir = tempfile::tempdir().unwrap();
     let cell = format!("full-{}", std::process::id());
-    // The largest file is 8192 * 512 bytes, which is enough for the shared memory, and no signal tells of it: writing fails as on a full disk.
+    // The largest file is 8192 * 512 bytes, which is enough for the shared memory, and no signal tells of it: writing fails as on a full
+    // disk.
     let status = start_child("trap '' XFSZ; ulimit -f 8192;", &cell, dir.path()).wait().unwrap();
     shared::ipc::remove_files(&cell);
     assert!(status.success());

@@ -200,7 +200,7 @@ fn a_second_worker_is_refused() -> Outcome {
     Ok(())
 }
 
-/// Sends GET or POST over a plain socket. Answers with the head, status line included, and the body.
+/// Sends GET or POST over a plain socket. Returns the head, status line included, and the body.
 fn http(address: &str, request: &str, path: &str, body: &str) -> Result<(String, Vec<u8>), Failure> {
     let mut stream = std::net::TcpStream::connect(address)?;
     stream.set_read_timeout(Some(PATIENCE))?;
@@ -211,7 +211,7 @@ fn http(address: &str, request: &str, path: &str, body: &str) -> Result<(String,
     Ok((String::from_utf8_lossy(&answer[..split]).into_owned(), answer[split + 4..].to_vec()))
 }
 
-/// Writes a pour of [`PICTURES`] frames again and again for five minutes, as a camera that the worker reads itself. Answers with the pattern.
+/// Writes a pour of [`PICTURES`] frames again and again for five minutes, as a camera that the worker reads itself. Returns the pattern.
 fn write_pictures(directory: &Path) -> Result<String, Failure> {
     for i in 0..9000 {
         let file = |i: u64| directory.join(format!("f_{i:05}.png"));

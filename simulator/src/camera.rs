@@ -65,7 +65,7 @@ pub struct Renderer {
 }
 
 impl Renderer {
-    /// A renderer of `view`; `seed` decides background, noise, drops and drift.
+    /// A renderer of `view`; `seed` decides background, noise, drops, drift and the room that water reflects.
     ///
     /// # Errors
     /// When OpenCV refuses, for instance for want of memory.

@@ -93,7 +93,7 @@ impl SimulatorConfig {
         let size = (this.view.width_px, this.view.height_px);
         if size != (config.camera.width_px, config.camera.height_px) {
             return Err(format!(
-                "simulator.view is {} x {} px, but [camera] {} x {}",
+                "simulator.view is {} x {} px, but [camera] says {} x {}; give both the same size",
                 size.0, size.1, config.camera.width_px, config.camera.height_px
             ));
         }
@@ -157,7 +157,11 @@ pub fn simulate(config: Config, simulated: SimulatorConfig) -> Result<(), Box<dy
         std::fs::create_dir_all(parent)?;
     }
     if UnixStream::connect(&socket).is_ok() {
-        return Err(format!("cell '{}' is already being simulated", state.config.cell.name).into());
+        return Err(format!(
+            "cell '{}' is already being simulated; stop that simulator first, or choose another cell.name",
+            state.config.cell.name
+        )
+        .into());
     }
     let _ = std::fs::remove_file(&socket);
     let listener = UnixListener::bind(&socket)?;
@@ -220,7 +224,8 @@ fn film(state: &CellState) -> Result<(), String> {
     while !state.stop.load(Relaxed) {
         captured_at_ns = after(captured_at_ns, period_ns);
         sequence += 1;
-        // A camera that is not done in time loses frames instead of sending them later and later. (After a suspension no time has passed.)
+        // A camera that is not done in time loses frames instead of sending them later and later. After a suspension none are lost, because
+        // `after` began anew.
         while captured_at_ns + delay_ns + period_ns < os::now_ns() {
             captured_at_ns += period_ns;
             sequence += 1;
@@ -291,7 +296,7 @@ fn obey(state: &CellState, noise: &mut Pcg64Mcg, line: &str) -> Result<serde_jso
             let error_g = 0.5 * noise.sample::<f64, _>(rand_distr::StandardNormal);
             Ok(serde_json::json!({ "weight_g": (state.container().poured_ml() + error_g).round().max(0.0) }))
         }
-        _ => Err(format!("'{verb}' is nothing that an operator can do here")),
+        _ => Err(format!("'{verb}' is nothing that an operator can do here; use fill or scale")),
     }
 }
 

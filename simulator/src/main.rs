@@ -17,7 +17,7 @@ struct Cli {
 enum Command {
     /// Runs the simulated cell: UR5 controller, container, camera, scale.
     Run(run::Args),
-    /// What an operator does at the cell: fill the container, read the scale.
+    /// Does what an operator does at the cell: fills the container, reads the scale, causes a fault.
     Operator(operator::Args),
     /// Runs only the simulated UR5 controller.
     Ur(ur::Args),

@@ -1,12 +1,12 @@
 //! The actions that a training may use: all 21 of Fig. 5, or two.
 //!
-//! Pure, any thread; nothing here allocates or fails.
+//! Pure functions, for any thread; nothing here allocates or fails.
 
 use shared::actions::{ACTIONS, action_table, nearest_action};
 
-/// Number of the two actions' backward one among the network's outputs: the first.
+/// Index of the backward one of the two actions among the network's outputs: the first.
 const BACKWARD: usize = 0;
-/// Number of the two actions' forward one among the network's outputs: the last.
+/// Index of the forward one of the two actions among the network's outputs: the last.
 const FORWARD: usize = ACTIONS - 1;
 
 /// The angle of each of the network's outputs, degrees.
@@ -30,8 +30,8 @@ impl Actions {
         Self { two, angles_deg }
     }
 
-    /// The action that stands for a relative angle in degrees: the nearest one, or of two the one with its sign. Standing still
-    /// counts as back.
+    /// The action that stands for a relative angle in degrees: the nearest one or, of two actions, the one with its sign. Standing
+    /// still counts as backward.
     pub fn discretise(&self, dalpha_deg: f64) -> u8 {
         match (self.two, dalpha_deg > 0.0) {
             (true, true) => FORWARD as u8,

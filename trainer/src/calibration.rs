@@ -1,7 +1,7 @@
 //! Area to ml from weights alone: `w_E = c sum area^q`, the paper's normalised contribution volumes with an exponent.
 //!
-//! Offline, pure, allocates. c is found by weighted least squares, and q on a grid with a prior. Too few episodes leave q = 1,
-//! because the exponent cannot be told from them.
+//! Pure functions of the offline trainer, for any thread; they allocate and do not fail. c is found by weighted least squares, and q on a
+//! grid with a prior. Too few episodes leave q = 1, because the exponent cannot be told from them.
 
 use shared::estimator::{Calibration, Hold};
 
@@ -11,12 +11,12 @@ use crate::data::TrainingEpisode;
 pub const HOLD_ABOVE_PX2: f32 = 60.0;
 /// Fewer episodes than this leave q = 1. From the prototype, in which only a linear calibration was any good below this.
 pub const EXPONENT_NEEDS: usize = 4;
-/// The exponent that cameras of the prototype had, and from which fits start.
+/// The exponent that is expected of a camera, as the prototype's cameras had it.
 pub const EXPONENT_EXPECTED: f64 = 1.15;
 /// Standard deviation of the exponent's prior here. From the prototype; no other measurement is recorded.
 const EXPONENT_SD: f64 = 0.4;
 
-/// Standard deviation of a weight as the camera's sum of areas foretells it, g: a constant part and a share of the weight. From the
+/// Standard deviation of a weight as the camera's sum of areas predicts it, g: a constant part and a share of the weight. From the
 /// prototype; no other measurement is recorded.
 fn weight_sd_g(weight_g: f64) -> f64 {
     0.7 + 0.03 * weight_g
@@ -49,7 +49,8 @@ fn factor(episodes: &[TrainingEpisode], exponent: f64) -> (f64, f64) {
     (c, misfit + ((exponent - EXPONENT_EXPECTED) / EXPONENT_SD).powi(2))
 }
 
-/// Finds c and q, or c alone if the exponent is given.
+/// Finds c and q, or c alone if the exponent is given. If it is not given and there are fewer than [`EXPONENT_NEEDS`] episodes, q
+/// is 1.
 pub fn calibrate(episodes: &[TrainingEpisode], exponent: Option<f64>) -> Calibration {
     let exponent = exponent.unwrap_or_else(|| {
         if episodes.len() < EXPONENT_NEEDS {

@@ -1,7 +1,8 @@
 //! Finds weights that do not fit the others: a typo, or a cup that was not tared.
 //!
-//! Offline, pure, allocates. Each weight is compared with what the camera's areas say when they are calibrated on all other
-//! episodes. The worst one is taken out, and the rest are compared again, so that one wrong weight does not accuse the others.
+//! Pure functions of the offline trainer, for any thread; they allocate and do not fail. Each weight is compared with what the camera's
+//! areas say when they are calibrated on all other episodes. The worst one is taken out, and the rest are compared again, so that one wrong
+//! weight does not accuse the others.
 
 use serde::Serialize;
 

@@ -1,6 +1,6 @@
 //! What the trainer works on: weighed episodes as plain columns, read from MCAP files or CSV tables.
 //!
-//! Offline, ordinary thread, allocates. Bad data is refused with one line that names the episode ([`DataError`]).
+//! Used by offline commands on an ordinary thread; it allocates. Bad data is refused with one line that names the episode ([`DataError`]).
 
 use std::path::PathBuf;
 
@@ -53,9 +53,9 @@ pub enum DataError {
         what: String,
     },
     /// There are too few for the method.
-    #[error("{found} usable episodes, method {method} needs {needed}: record more")]
+    #[error("there are {found} usable episodes, and method {method} needs {needed}: record more")]
     TooFew {
-        /// UsableEpisodes episodes.
+        /// Number of usable episodes.
         found: usize,
         /// The method.
         method: String,
@@ -159,7 +159,7 @@ pub fn rate_hz(episodes: &[TrainingEpisode]) -> f64 {
 /// Where a command's episodes are.
 #[derive(Debug, clap::Args)]
 pub struct EpisodeSource {
-    /// MCAP episodes, or directories of them, recordings and pours; with --scale: the table of features.
+    /// Episodes (.mcap) or directories of them, recordings as well as pours; with --scale, the table of features.
     #[arg(required = true)]
     episodes: Vec<PathBuf>,
     /// Table of weights (`episode, weight_g`); the episodes are then read from a table too.
@@ -223,7 +223,8 @@ pub fn hex(hash: &[u8; 32]) -> String {
     hash.iter().map(|b| format!("{b:02x}")).collect()
 }
 
-/// SHA-256 of what is trained on: columns and weights of all episodes in order. Their names do not matter.
+/// SHA-256 of what is trained on: times, commanded angles, areas and weights of all episodes in order. Their names and the measured angles
+/// do not matter.
 pub fn hash(episodes: &[TrainingEpisode]) -> [u8; 32] {
     let mut hash = Sha256::new();
     for e in episodes {

@@ -1,6 +1,6 @@
 //! Fits the [flow model](shared::estimator::flow) to weighed episodes: Levenberg-Marquardt on frames and weights.
 //!
-//! Offline, pure, allocates; deterministic on any number of threads.
+//! Pure functions of the offline trainer, which allocate and do not fail; the result is the same on any number of threads.
 //!
 //! Unknown are the model's parameters and the calibration (c, q and its change with the tilt) for all episodes, and for each
 //! episode the angle at which flow starts, the flow factor lambda (viscosity), the camera's gain gamma and its delay above the
@@ -54,7 +54,7 @@ const SUM_NOISE_AREA_SD_MIN: f64 = 0.015;
 const CLEAN_AREA_SD: f64 = 0.03;
 /// How much a camera's gain is expected to change from pour to pour (log). From the prototype's rigs, whose gain changes by 1.5 %.
 const GAIN_EXPECTED: f64 = 0.017;
-/// The same of a camera whose areas add up exactly. Chosen by hand; no measurement is recorded.
+/// The same for a camera whose areas add up exactly. Chosen by hand; no measurement is recorded.
 const GAIN_LINEAR: f64 = 0.002;
 /// How much the gain may change in the wide stage (log). From the prototype; no other measurement is recorded.
 const GAIN_WIDE: f64 = 0.02;
@@ -65,18 +65,18 @@ const GAIN_NARROW: f64 = 0.03;
 const GAIN_CLEAN: f64 = 0.004;
 /// How far the delays of two episodes are apart as a rule, frames. Tuned on rigs 100 to 123, see docs/LEARNING.md.
 const DELAY_KNOWN_FRAMES: f64 = 0.02;
-/// How far they may be apart when a change is looked for, frames. Tuned on rigs 100 to 123, see docs/LEARNING.md.
+/// How far the delays may be apart when a change is looked for, frames. Tuned on rigs 100 to 123, see docs/LEARNING.md.
 const DELAY_FREE_FRAMES: f64 = 1.0;
-/// How far they may be apart after a change was found, frames. Tuned on rigs 100 to 123, see docs/LEARNING.md.
+/// How far the delays may be apart after a change was found, frames. Tuned on rigs 100 to 123, see docs/LEARNING.md.
 const DELAY_CHANGED_FRAMES: f64 = 0.3;
 /// Below this many episodes the filter's standard deviations are mostly those of the priors, and half of them pours best on rigs 100
 /// to 123, see docs/LEARNING.md.
 const PRIORS_BELOW: usize = 4;
 /// Standard deviation of a pour's flow factor that the filter gets (log). Tuned on rigs 100 to 123, see docs/LEARNING.md.
-const FLOW_FACTOR_SD: f64 = 0.15;
+const FILTER_FLOW_FACTOR_SD: f64 = 0.15;
 /// Standard deviation of a pour's delay that the filter gets, frames. Tuned on rigs 100 to 123, see docs/LEARNING.md.
 const EXTRA_DELAY_SD_FRAMES: f64 = 0.3;
-/// How much more doubt about the camera's gain the filter gets than the episodes show. Tuned on rigs 100 to 123, see
+/// Factor by which the filter doubts the camera's gain more than the episodes show. Tuned on rigs 100 to 123, see
 /// docs/LEARNING.md.
 const GAIN_DOUBT: f64 = 1.6;
 /// Least standard deviation of the capacity's scale, from one pour to the next (log). From the prototype; no other measurement is
@@ -85,7 +85,8 @@ const CAPACITY_SCALE_SD_MIN: f64 = 0.007;
 /// Area at which the calibration's doubt is taken, px^2. From the prototype, whose streams were about as large.
 const JUDGED_AT_PX2: f64 = 300.0;
 
-/// Each of the first solutions: it only has to tell beginnings apart. Chosen by hand, see docs/LEARNING.md for the time it takes.
+/// Effort of each of the first solutions, which only have to tell beginnings apart. Chosen by hand, see docs/LEARNING.md for the time it
+/// takes.
 const FIRST_EFFORT: Effort = Effort { steps: 12, tolerance: 1e-3 };
 /// Steps of the wide stage's solution. Chosen by hand, see docs/LEARNING.md for the time it takes.
 const WIDE_STEPS: usize = 25;
@@ -132,7 +133,7 @@ impl CameraFacts {
         Self { noise, clean, linear: linear(episodes).filter(|_| clean) }
     }
 
-    /// Without noise the valleys are narrow: this many times more beginnings, and as much longer a way.
+    /// Without noise the cost's valleys are narrow, so this many times as many beginnings are tried and as many steps are taken.
     fn longer(&self) -> usize {
         if self.clean { 3 } else { 1 }
     }
@@ -142,7 +143,7 @@ impl CameraFacts {
         (times * self.noise.area_sd).clamp(0.02 * times, most)
     }
 
-    /// How much the gain may change, if it does not usually change as much as in noisy frames.
+    /// How much the gain may change (log): `noisy`, or less where the frames have next to no noise.
     fn gain_sd(&self, noisy: f64) -> f64 {
         if self.clean { GAIN_CLEAN } else { noisy }
     }
@@ -222,7 +223,7 @@ fn best_beginning(problem: &Problem<'_>, episodes: &[TrainingEpisode], camera: &
     best.1
 }
 
-/// Each episode's delay above the model's, if it has changed on the way.
+/// Each episode's delay above the model's, if the delay has changed between the episodes.
 fn changed_delays(problem: &Problem<'_>, found: &Unknowns) -> Option<Vec<f64>> {
     if found.own.len() < 2 * CHANGE_NEEDS {
         return None;
@@ -251,15 +252,16 @@ fn conclude(found: &Unknowns, camera: &CameraFacts, area_min_px2: f64, wide: &DM
     let newest_delay = noise::newest_delay_frames(&found.of_episodes(EXTRA_DELAY));
     model.delay_frames = (model.delay_frames + newest_delay).clamp(0.0, DELAY_MAX_FRAMES);
     // The standard deviation of log v = log c + q log area, as the wide stage knows it.
-    let l = JUDGED_AT_PX2.ln();
-    let log_v_variance = wide[(LOG_C, LOG_C)] + 2.0 * l * wide[(LOG_C, AREA_EXPONENT)] + l * l * wide[(AREA_EXPONENT, AREA_EXPONENT)];
+    let log_area = JUDGED_AT_PX2.ln();
+    let log_v_variance =
+        wide[(LOG_C, LOG_C)] + 2.0 * log_area * wide[(LOG_C, AREA_EXPONENT)] + log_area * log_area * wide[(AREA_EXPONENT, AREA_EXPONENT)];
     let share = if found.own.len() < PRIORS_BELOW { 0.5 } else { 1.0 };
     let gain_expected = if camera.linear.is_some() { GAIN_LINEAR } else { GAIN_EXPECTED };
     let gain_sd = (noise::camera_gain_sd(&gains, gain_expected) * exponent / calibration::EXPONENT_EXPECTED)
         .hypot(0.5 * share * log_v_variance.max(0.0).sqrt());
     let vessel_sd = CAPACITY_SCALE_SD_MIN.hypot(noise::vessel_variance(found, narrow).sqrt());
     model.noise = FlowNoise {
-        log_flow_factor_sd: FLOW_FACTOR_SD,
+        log_flow_factor_sd: FILTER_FLOW_FACTOR_SD,
         log_camera_gain_sd: (GAIN_DOUBT * gain_sd).min(0.5),
         log_capacity_scale_sd: share * noise::trusted_vessel_sd(vessel_sd),
         extra_delay_sd_frames: EXTRA_DELAY_SD_FRAMES,
@@ -281,7 +283,7 @@ fn conclude(found: &Unknowns, camera: &CameraFacts, area_min_px2: f64, wide: &DM
     }
 }
 
-/// The inverse of a matrix J'J; a wide diagonal where it has none.
+/// The inverse of a matrix J'J, or a wide diagonal matrix where it has none.
 fn inverse(matrix: &DMatrix<f64>) -> DMatrix<f64> {
     let mut damped = matrix.clone();
     for k in 0..damped.nrows() {

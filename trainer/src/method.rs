@@ -5,7 +5,8 @@
 //! | `best` | [`model_search`]: [`control_law`] searched in pours of [`model_pour`], then [`distillation`] into the network |
 //! | `literal`, `literal-clipped`, `paper`, `cloning` | [`policy_gradient`], eq. (5) to (8) |
 //!
-//! Offline, pure, allocates; the same episodes, options and seed give the same weights on any number of threads.
+//! Pure functions of the offline trainer, which allocate; the only failure is a lack of episodes. The same episodes, options and seed give
+//! the same weights on any number of threads.
 
 pub mod control_law;
 pub mod distillation;

@@ -1,7 +1,7 @@
 //! The network while it is trained: fully connected, ReLU, softmax, any layer sizes; trained with Adam.
 //!
-//! Offline, pure, allocates. Deterministic on any number of threads: a batch is cut into fixed pieces, whose gradients are
-//! added in order.
+//! Pure functions of the offline trainer, which allocate and do not fail. The result is the same on any number of threads, because a batch
+//! is cut into fixed pieces, whose gradients are added in order.
 
 use rand::RngExt;
 use rand_pcg::Pcg64Mcg;
@@ -22,7 +22,7 @@ const SQUARE_DECAY: f32 = 0.999;
 /// What Adam adds to the root that it divides by: the default of its paper.
 const EPSILON: f32 = 1e-8;
 
-/// Layer sizes, and the parameters in the order w1, b1, w2, b2, w3, b3; weights are stored `[input][neuron]`.
+/// A network: its layer sizes, and its parameters in the order w1, b1, w2, b2, w3, b3; weights are stored `[input][neuron]`.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Network {
     sizes: [usize; 4],
@@ -49,7 +49,7 @@ pub struct Adam {
 }
 
 impl Network {
-    /// He-initialised; the output layer starts small, so that no action is preferred.
+    /// A He-initialised network; its output layer starts small, so that no action is preferred.
     pub fn new(sizes: [usize; 4], rng: &mut Pcg64Mcg) -> Self {
         let mut parameters = Vec::new();
         for l in 0..3 {
@@ -126,7 +126,7 @@ impl Network {
         }
     }
 
-    /// Adds the gradient of one example to `gradient`; answers with its loss.
+    /// Adds the gradient of one example to `gradient`. Returns the example's loss.
     fn backward(&self, example: &Example, clip: Option<f32>, buffer: &mut Buffer, gradient: &mut [f32]) -> f32 {
         self.forward(&example.x, buffer);
         let offsets = self.offsets();
@@ -158,7 +158,7 @@ impl Network {
         loss
     }
 
-    /// One Adam step on a batch; answers with the mean loss. With `clip`, the cross-entropy clips probabilities to
+    /// Takes one Adam step on a batch. Returns the mean loss. With `clip`, the cross-entropy clips probabilities to
     /// `[clip, 1 - clip]`.
     pub fn learn(&mut self, batch: &[Example], clip: Option<f32>, rate: f32, adam: &mut Adam) -> f32 {
         let parts: Vec<(Vec<f32>, f32)> = batch
@@ -220,7 +220,7 @@ fn loss_and_slopes(example: &Example, clip: Option<f32>, logits: &[f32], slopes:
 }
 
 impl Adam {
-    /// At rest, for a network.
+    /// The state before the first step of training `network`.
     pub fn new(network: &Network) -> Self {
         let zeros = vec![0.0; network.parameters.len()];
         Self { mean: zeros.clone(), square: zeros, steps: 0 }

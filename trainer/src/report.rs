@@ -1,6 +1,6 @@
 //! Pages of plots and tables: self-contained HTML with the plots inline as SVG.
 //!
-//! Pure, any thread, allocates. `trainer report` and the experiments make their pages of these parts.
+//! Pure functions, for any thread; they allocate. `trainer report` and the experiments make their pages of these parts.
 //!
 //! | file | what it holds |
 //! |---|---|

@@ -1,6 +1,6 @@
 //! What a training is told, and what comes out of it.
 //!
-//! Pure, any thread, allocates.
+//! This is plain data, for any thread. It allocates and does not fail.
 
 use shared::limits::Limits;
 use shared::weights::Weights;
@@ -30,7 +30,7 @@ pub enum MethodName {
     Paper,
     /// Behaviour cloning, the largest output: eq. (8) with kappa = 1 and the same weight for every frame.
     Cloning,
-    /// Flow model fitted to the episodes, policy search in it, distilled into the network.
+    /// A flow model is fitted to the episodes, a policy is searched in it, and that is distilled into the network.
     Best,
 }
 
@@ -55,7 +55,7 @@ impl Default for Options {
     }
 }
 
-/// Is told how far a training is.
+/// Something that is told how far a training has come.
 pub trait Progress: Sync {
     /// A new stage of `steps` steps begins.
     fn stage(&self, _name: &str, _steps: u64) {}
@@ -67,7 +67,7 @@ pub trait Progress: Sync {
 pub struct Silent;
 impl Progress for Silent {}
 
-/// What came out.
+/// What came out of a training.
 #[derive(Debug, Clone)]
 pub struct Trained {
     /// The weights.

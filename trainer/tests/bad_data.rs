@@ -95,7 +95,8 @@ fn said(out: &Output) -> String {
     format!("{}{}", String::from_utf8_lossy(&out.stdout), String::from_utf8_lossy(&out.stderr))
 }
 
-/// Protects the trainer from bad recordings, and people from guessing: each fault of the last of six recordings is named, and it alone.
+/// Protects the trainer from bad recordings, and people from guessing: each fault of the last of six recordings is named, and no other
+/// recording is blamed.
 #[test]
 fn each_fault_of_a_recording_is_named() {
     type Case = (&'static str, i32, fn(&mut Recording));

@@ -33,7 +33,8 @@ fn the_fit_finds_what_made_the_episodes() {
     assert!((v(c, q) / v(CAMERA.0, CAMERA.1) - 1.0).abs() < 0.05, "{c} {q}");
 }
 
-/// Protects learning after the picture's delay has changed: what the newest pours show counts, and no lag that suits neither.
+/// Protects learning after the picture's delay has changed: what counts is what the newest pours show, and not a lag that fits
+/// neither them nor the older ones.
 #[test]
 fn a_changed_delay_is_noticed() {
     let usual = FlowModel::default();
@@ -53,7 +54,7 @@ fn a_changed_delay_is_noticed() {
     );
 }
 
-/// Protects learning after somebody touched the camera: with the gain changed between the pours, the newest count.
+/// Protects learning after somebody touched the camera: where the gain has changed between the pours, the newest pours count.
 #[test]
 fn the_newest_gain_of_the_camera_counts() {
     let (c, q) = CAMERA;
@@ -75,7 +76,7 @@ fn a_linear_camera_is_taken_as_linear() {
     assert!((found.area_exponent - 1.0).abs() < 0.002 && off.abs() < 0.01, "q {}, c off by {off}", found.area_exponent);
 }
 
-/// Protects reproducibility: the same seed and data give the same bytes, on one thread and on many; another seed does not.
+/// Protects reproducibility: the same seed and data give the same bytes, on one thread and on many; another seed gives others.
 #[test]
 fn training_is_deterministic_on_any_number_of_threads() {
     let data = episodes(4, 2);
@@ -96,7 +97,7 @@ fn the_trained_policies_pour() {
     pours(MethodName::Paper, 10, 0.1);
 }
 
-/// Trains with a method on `n` episodes and pours; the errors are below `within` of the goal and 1 ml.
+/// Trains with a method on `n` episodes and pours. Each error is below the share `within` of the goal plus 1 ml.
 fn pours(method: MethodName, n: usize, within: f64) {
     let trained = train(&episodes(n, 3), &Options { method, ..Options::default() }, &Silent).unwrap();
     let flow = FlowTables::new(&FlowModel::default());
@@ -138,7 +139,7 @@ fn contributions_add_up_to_the_weight() {
     }
 }
 
-/// Protects eq. (5) and Fig. 5's discretisation, and that two actions are a sign.
+/// Protects eq. (5) and the discretisation of Fig. 5, and that with two actions only the angle's sign counts.
 #[test]
 fn rewards_and_actions_are_the_papers() {
     assert_eq!(policy_gradient::reward(0.0), 1.0);

@@ -1,7 +1,8 @@
-//! `feature-worker bench`: time of each stage of the extraction, beside the same pipeline written with Python's OpenCV.
+//! `feature-worker bench`: measures the time of each stage of the extraction, beside the same pipeline written with Python's OpenCV.
 //!
 //! The frames are drawn or read from `--input`. Both programs measure the same bytes in the same run, one after the other, on one
-//! thread. Allocates. Times are printed and never judged. Without Python's OpenCV that part is left out, and the command says so.
+//! thread. The command allocates. It prints times and never judges them. Without Python's OpenCV that part is left out, and the command
+//! says so.
 
 use std::path::PathBuf;
 
@@ -19,7 +20,8 @@ mod python;
 
 use measure::StageTimes;
 
-/// Most frames that are read from `--input`. All of them are held in memory, so that reading is not measured.
+/// The most frames that are read from `--input`: four times as many as are drawn without it. All of them are held in memory, so that
+/// reading is not measured.
 const INPUT_FRAMES: usize = 4 * drawn::PICTURES;
 
 /// Command-line arguments.

@@ -25,7 +25,7 @@ use crate::vision::{Axes, AxesError, ColourError, ColourLearner, Corner, Extract
 
 mod section;
 
-/// Most pictures that are kept for learning and for the drawn picture. Chosen by hand: about 140 MB at 640 x 480 px.
+/// The most pictures that are kept for learning and for the drawn picture. Chosen by hand: about 140 MB at 640 x 480 px.
 const KEEP_PICTURES: usize = 150;
 /// The region's left border, top, right border and bottom from the lip, px of a picture 640 px wide. Chosen by hand; no
 /// measurement is recorded.
@@ -40,8 +40,8 @@ Show one whole pour: dry, tilting, flowing, back. The section is printed; --writ
 it names before you trust it: red must lie on the glass's top edge, green on its left side, white on the liquid's outline."
 )]
 pub struct Args {
-    /// Images, a video, or a file name pattern of one pour. Without any, the configured camera is watched; beside a running worker, the
-    /// worker's frames are.
+    /// Images, a video, or a file name pattern of one pour. Without any, the configured camera is watched; if a worker is running, it is
+    /// the worker's frames that are watched.
     input: Vec<PathBuf>,
     /// The cell's configuration.
     #[arg(long, default_value = shared::config::DEFAULT_FILE)]
@@ -58,7 +58,7 @@ pub struct Args {
     /// A point of the left side, nearer to the foot, px: X,Y.
     #[arg(long, value_parser = parse_point)]
     y_axis: Option<[f32; 2]>,
-    /// How the liquid is told from the background.
+    /// How the liquid is told from the background. Without this, the configuration says how.
     #[arg(long, value_parser = ["colour", "clear"])]
     method: Option<String>,
     /// Write the section into the configuration.
@@ -77,7 +77,7 @@ pub struct Args {
 
 fn parse_point(text: &str) -> Result<[f32; 2], String> {
     let parts: Vec<f32> = text.split(',').map_while(|p| p.trim().parse().ok()).collect();
-    <[f32; 2]>::try_from(parts).map_err(|_| "two numbers: X,Y in px".into())
+    <[f32; 2]>::try_from(parts).map_err(|_| "give two numbers, X,Y in px".into())
 }
 
 /// Runs the command.
@@ -94,7 +94,7 @@ struct Pour {
     sum: Mat,
     /// Number of all pictures.
     count: u64,
-    /// One of so many pictures is kept.
+    /// Of this many pictures, one is kept.
     stride: u64,
 }
 
@@ -109,7 +109,7 @@ impl Pour {
         if self.count == 0 {
             self.sum = Mat::new_rows_cols_with_default(bgr.rows(), bgr.cols(), CV_32FC3, Scalar::default()).map_err(words)?;
         } else if self.sum.size().map_err(words)? != bgr.size().map_err(words)? {
-            return Err(format!("frame {} has another size than those before", self.count + 1));
+            return Err(format!("frame {} has another size than those before; all must come from one camera", self.count + 1));
         }
         imgproc::accumulate(&bgr, &mut self.sum, &core::no_array()).map_err(words)?;
         if self.count.is_multiple_of(self.stride) {
@@ -144,7 +144,7 @@ fn calibrate(args: &Args, mut config: Config) -> Result<(), Failure> {
     } else {
         for_each_frame(&args.input, &config.camera, |frame| pour.add(&frame)).map_err(bad)?;
     }
-    let Some(first) = pour.pictures.first() else { return Err(bad("no frame came".into())) };
+    let Some(first) = pour.pictures.first() else { return Err(bad("there is no frame in the input; show one whole pour".into())) };
     (config.camera.width_px, config.camera.height_px) = (first.cols() as u32, first.rows() as u32);
     let method = match args.method.as_deref() {
         Some("clear") => LiquidMethod::Clear,
@@ -184,7 +184,7 @@ fn watch(args: &Args, config: &Config, pour: &mut Pour) -> Result<(), Failure> {
     if pour.count == 0 { Err(reach("no frame came from the camera; is its driver running?".into())) } else { Ok(()) }
 }
 
-/// The corner from the command line, and what that leaves open from the pictures of `width` and `height`, px.
+/// The corner. What the command line leaves open is found in the pictures, which are `width` by `height` px.
 fn choose_corner(args: &Args, pour: &Pour, [width, height]: [f32; 2]) -> Result<Corner, Failure> {
     if let (Some(lip), Some(rim), Some(foot)) = (args.lip, args.x_axis, args.y_axis) {
         return Ok(Corner { lip, rim, foot });
@@ -249,7 +249,7 @@ fn best_picture(config: &Config, pictures: &[Mat]) -> Result<Mat, String> {
             best = Some((measured.area_px2, drawn));
         }
     }
-    best.map(|(_, drawn)| drawn).ok_or_else(|| "no frame".into())
+    best.map(|(_, drawn)| drawn).ok_or_else(|| "there is no picture to draw on".into())
 }
 
 fn save_picture(args: &Args, config: &Config, pictures: &[Mat]) -> Result<(), Failure> {
@@ -259,7 +259,7 @@ fn save_picture(args: &Args, config: &Config, pictures: &[Mat]) -> Result<(), Fa
         std::fs::create_dir_all(parent).map_err(|e| fail(e.to_string()))?;
     }
     let written = imgcodecs::imwrite(&args.picture, &picture, &Vector::new()).map_err(|e| fail(e.message))?;
-    if written { Ok(()) } else { Err(fail("cannot be written".into())) }
+    if written { Ok(()) } else { Err(fail("cannot be written; give another --picture".into())) }
 }
 
 /// Serves the page until "Write" or Ctrl-C.

@@ -30,7 +30,7 @@ enum Command {
     /// Shows one episode: what was run, from where, how many frames, how much flowed.
     #[command(after_help = "Example:\n  feature-worker episodes show out/episodes/episode-0001.mcap")]
     Show(WhichArgs),
-    /// Says in words what is wrong with episodes; exit code 1 if any cannot be trained on.
+    /// Says in words what is wrong with episodes. The exit code is 1 if any of them cannot be trained on.
     #[command(
         after_help = "Examples:\n  feature-worker episodes check\n  feature-worker episodes check out/episodes/episode-0001.mcap --json"
     )]
@@ -76,7 +76,7 @@ struct ExportArgs {
     /// What to write.
     #[arg(long = "as", value_enum)]
     format: ExportFormat,
-    /// The directory for it; made if missing.
+    /// The directory to write into. It is made if it is missing.
     #[arg(long, value_name = "DIR")]
     to: PathBuf,
 }
@@ -148,7 +148,7 @@ fn list(files: &[PathBuf], as_json: bool) -> Result<(), Failure> {
 
 fn show(files: &[PathBuf], as_json: bool) -> Result<(), Failure> {
     let [file] = files else {
-        return Err(failure(exit::BAD_INPUT, format!("{} episodes; name one file to show", files.len())));
+        return Err(failure(exit::BAD_INPUT, format!("{} episodes were found; name one file to show", files.len())));
     };
     let episode = Episode::read(file).or_exit(exit::BAD_INPUT)?;
     let value = summary(&episode);
@@ -195,7 +195,7 @@ impl CheckedFile {
     }
 }
 
-/// Reads each file and says what is wrong with it, also that it is the same measurement as an earlier one.
+/// Reads each file and says what is wrong with it. A file that holds the same measurement as an earlier one is wrong too.
 fn checked(files: &[PathBuf]) -> Vec<CheckedFile> {
     let mut all: Vec<CheckedFile> = Vec::new();
     let (mut places, mut episodes) = (Vec::new(), Vec::new());

@@ -1,7 +1,7 @@
-//! `feature-worker inspect`: what is measured in images or a video, as pictures and a CSV.
+//! `feature-worker inspect`: writes what is measured in images or a video, as pictures and a CSV file.
 //!
 //! An ordinary command-line program that allocates. An input that cannot be read, or has another size than configured, ends it with one
-//! line.
+//! line that says what to do.
 
 use std::path::PathBuf;
 
@@ -104,7 +104,7 @@ fn inspect(args: &Args, config: &Config) -> Result<(), String> {
     Ok(())
 }
 
-/// Measures one frame. One of another size than configured is an error.
+/// Measures one frame. A frame of another size than configured is an error.
 fn measure(extractor: &mut Extractor, camera: &CameraConfig, frame: &Frame) -> Result<Measurement, String> {
     let header = frame.header;
     let format = PixelFormat::from_code(header.format).unwrap_or(PixelFormat::Bgr8);

@@ -1,6 +1,6 @@
 //! The local web page of `view` and `calibrate`: a server on 127.0.0.1 that answers one request after the other.
 //!
-//! Runs on the thread that calls it; allocates. A browser that goes away is no error.
+//! Runs on the thread that calls it, and allocates. A browser that goes away is no error.
 
 use std::sync::atomic::{AtomicBool, Ordering::Relaxed};
 use std::time::Duration;
@@ -58,7 +58,7 @@ impl Page {
             let Ok(Some(mut request)) = self.server.recv_timeout(WAIT) else { continue };
             let path = request.url().split('?').next().unwrap_or("/").to_string();
             let mut body = String::new();
-            // A body that is no text is answered as an empty one.
+            // A body that is not text is treated as an empty one.
             if request.as_reader().read_to_string(&mut body).is_err() {
                 body.clear();
             }

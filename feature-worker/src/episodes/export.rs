@@ -1,4 +1,6 @@
-//! Writes episodes for other programs: as tables, pictures, videos or a LeRobot data set. Allocates; nothing that exists is overwritten.
+//! Writes episodes for other programs: as tables, pictures, videos or a LeRobot data set.
+//!
+//! Runs on the command's thread and allocates. Nothing that exists is overwritten, and every failure names its file.
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -18,14 +20,14 @@ pub enum ExportFormat {
     Csv,
     /// A directory of pictures for each episode.
     Images,
-    /// An MP4 video for each episode; in place of a lost image the one before is repeated.
+    /// An MP4 video for each episode; where an image is lost, the one before it is repeated.
     Video,
     /// One data set in the layout of LeRobot v3.0.
     Lerobot,
 }
 
-/// Writes the episodes of `files` into the directory `to`, which is made if missing. Answers with what was written. Shows its progress
-/// on the terminal.
+/// Writes the episodes of `files` into the directory `to`, which is made if it is missing. Returns the paths that were written. Shows its
+/// progress on the terminal.
 pub fn export(files: &[PathBuf], format: ExportFormat, to: &Path) -> Result<Vec<PathBuf>, ExportError> {
     if files.is_empty() {
         return Err(ExportError::Nothing("no episodes to export; name .mcap files or a directory of them".into()));

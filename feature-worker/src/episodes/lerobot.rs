@@ -1,9 +1,9 @@
 //! Writes episodes as one data set in the layout of LeRobot v3.0 (info.json, stats.json, Parquet tables, MP4 videos).
 //!
 //! What a policy sees is `observation.state` (measured alpha and V_e; NaN where unknown) and `observation.images.camera`. What was done is
-//! `action`, the commanded alpha. LeRobot's clock is exact, `frame_index / fps`, so a lost frame is a row with the image of the frame
-//! before. Each episode has its own video. The weight is an extra column of the episodes' table. Allocates; holds the rows of all
-//! episodes, but only one image at a time. Nothing that exists is overwritten.
+//! `action`, the commanded alpha. LeRobot's clock is exact, `frame_index / fps`, so a lost frame becomes a row with the image of the frame
+//! before it. Each episode has its own video. The weight is an extra column of the episodes' table. It runs on the command's thread and
+//! allocates: it holds the rows of all episodes, but only one image at a time. Nothing that exists is overwritten.
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -24,9 +24,9 @@ use statistics::{ImageStatistics, Moments};
 
 /// Name of the images' column. LeRobot wants the prefix `observation.images`.
 const CAMERA: &str = "observation.images.camera";
-/// Files in one directory, LeRobot's `chunks_size`. LeRobot's own default.
+/// Files in one directory, which LeRobot calls `chunks_size`; this is LeRobot's own default.
 const FILES_A_CHUNK: usize = 1000;
-/// One of so many images enters the images' statistics. Chosen by hand: neighbouring images are nearly the same.
+/// Of this many images, one enters the images' statistics. Chosen by hand: neighbouring images are nearly the same.
 const IMAGE_STEP: usize = 10;
 
 /// Writes the data set of `episodes`, which were read from `files`, into the new directory `root`. Each image moves `bar` on by one.

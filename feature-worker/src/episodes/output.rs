@@ -1,4 +1,5 @@
-//! Why an export fails, and the new files that it makes. Allocates. What was written before a failure stays.
+//! Why an export fails, and the directories that it makes. Runs on the command's thread and allocates. What was written before a failure
+//! stays.
 
 use std::fs;
 use std::path::Path;

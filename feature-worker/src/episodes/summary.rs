@@ -1,5 +1,5 @@
-//! What there is to say about an episode: a summary as JSON, and what is wrong with it in words. Works on an episode in memory;
-//! allocates; cannot fail.
+//! What there is to say about an episode: a summary as JSON, and what is wrong with it in words. It works on an
+//! episode in memory, on any thread; it allocates and cannot fail.
 
 use serde_json::{Value, json};
 use shared::episode::{Episode, EpisodeKind, EpisodeRow, hex};

@@ -1,4 +1,6 @@
-//! The images of an episode in order of its rows, and as an MP4 video. Allocates; holds one image at a time.
+//! The images of an episode in the order of its rows, and as an MP4 video.
+//!
+//! Runs on the command's thread. It allocates, and holds one image at a time. A failure names the file.
 
 use std::path::{Path, PathBuf};
 
@@ -11,9 +13,9 @@ use super::output::{ExportError, write_error};
 
 /// The rate of an episode that is too short to have one, frames a second: that of the usual camera.
 pub const USUAL_RATE_HZ: f64 = 30.0;
-/// The slowest and the fastest rate that a video gets, frames a second. They bound what a damaged time could give.
+/// The slowest and the fastest rate that a video gets, frames a second. Chosen by hand; they bound what a damaged time could give.
 const RATE_LIMITS_HZ: [f64; 2] = [1.0, 240.0];
-/// Codecs of an MP4 file, the best first: H.264 plays everywhere, MPEG-4 is there where OpenCV's FFmpeg was built without it.
+/// Codecs of an MP4 file, the best first: H.264 plays everywhere, and MPEG-4 is there where OpenCV's FFmpeg was built without H.264.
 const CODECS: [[char; 4]; 2] = [['a', 'v', 'c', '1'], ['m', 'p', '4', 'v']];
 
 /// Mean rate of an episode, frames a second. Lost frames count, because they are shown too.
@@ -45,7 +47,7 @@ pub fn for_each_row_with_image(
         }
         match &shown {
             Some(image) => take(image)?,
-            None => return Err(ExportError::Nothing(format!("{}: has no images", file.display()))),
+            None => return Err(ExportError::Nothing(format!("{}: the episode has no images", file.display()))),
         }
     }
     Ok(())
@@ -89,7 +91,7 @@ impl Video {
             Some((writer, first)) if *first == size => writer.write(&picture).map_err(fail),
             Some((_, first)) => Err(write_error(
                 &self.path,
-                format!("an image of {} x {} among {} x {}", size.width, size.height, first.width, first.height),
+                format!("one image is {} x {} px, but those before it are {} x {} px", size.width, size.height, first.width, first.height),
             )),
             None => Err(write_error(&self.path, "OpenCV cannot write MP4 here; install FFmpeg's libraries")),
         }

@@ -1,5 +1,5 @@
-//! Compresses pictures as `[recording]` says. Used by the recorder's thread alone; allocates. A picture that cannot be compressed is
-//! none, and the recorder counts it as dropped.
+//! Compresses pictures as `[recording]` says. It is used by the recorder's thread alone, and allocates. Where a picture cannot be
+//! compressed it returns nothing, and the recorder counts the image as dropped.
 
 use opencv::core::{Mat, MatTraitConst, Vector, VectorToVec};
 use opencv::{imgcodecs, imgproc};
@@ -19,7 +19,7 @@ pub struct Encoder {
 }
 
 impl Encoder {
-    /// For the image format of `[recording]`.
+    /// A compressor for the image format of `[recording]`.
     pub fn new(config: &Config) -> Self {
         let (extension, name, parameters) = match config.recording.image_format {
             ImageFormat::Jpeg => (".jpg", "jpeg", vec![imgcodecs::IMWRITE_JPEG_QUALITY, i32::from(config.recording.jpeg_quality)]),

@@ -13,10 +13,10 @@ use shared::messages::{Feature, FrameHeader, PixelFormat};
 /// Frames that the recorder keeps from before an episode, because telemetry and frames arrive with different delays. Chosen by hand: a
 /// quarter of a second at 30 Hz.
 pub const KEPT_FRAMES: usize = 8;
-/// Features without image that may wait besides the images while the disk is slow. Chosen by hand: half a minute at 30 Hz.
+/// Features without an image that may wait beside the images while the disk is slow. Chosen by hand: half a minute at 30 Hz.
 const SPARE_FEATURES: usize = 1024;
 
-/// The two queues between the threads: full ones to the recorder, empty ones back.
+/// The two queues between the threads: frames go to the recorder, and empty buffers come back.
 pub struct Handover {
     free: ArrayQueue<Vec<u8>>,
     queue: ArrayQueue<OfferedFrame>,
@@ -83,7 +83,7 @@ impl Handover {
         self.stop.store(true, Ordering::Release);
     }
 
-    /// Recorder's thread: whether it shall end.
+    /// Recorder's thread: whether it is asked to end.
     pub fn is_stopped(&self) -> bool {
         self.stop.load(Ordering::Acquire)
     }

@@ -39,7 +39,7 @@ pub struct Numbering {
 }
 
 impl Numbering {
-    /// For a camera with `fps` frames a second that was opened at `opened_ns`.
+    /// The numbering for a camera with `fps` frames a second that was opened at `opened_ns`.
     pub fn new(fps: f64, opened_ns: u64) -> Self {
         Self { sequence: 0, due_ms: None, last_ns: opened_ns, period_ms: 1e3 / fps }
     }
@@ -140,7 +140,7 @@ impl Capture {
         Ok(Self { capture, camera: camera.clone(), picture: Mat::default(), numbering, due_ns, period_ns: (1e9 / fps) as u64 })
     }
 
-    /// Waits until the next frame of a file is due, at most for `timeout`. Answers whether it is due.
+    /// Waits until the next frame of a file is due, at most for `timeout`. Returns whether it is due.
     fn wait_until_due(&mut self, timeout: Duration) -> bool {
         let Some(due_ns) = self.due_ns else { return true };
         let now_ns = os::now_ns();
@@ -155,7 +155,7 @@ impl Capture {
         true
     }
 
-    /// What it means that no picture could be read. `grabbed`: the source gave something that could not be decoded.
+    /// What it means that no picture could be read. `grabbed` tells whether the source gave something, which then could not be decoded.
     fn without_picture(&self, grabbed: bool) -> Result<NextFrame<'static>, SourceError> {
         match self.camera.source {
             // A damaged MJPEG picture is left out, and the next frame's number shows the gap. (OpenCV 4.6 repeats the last picture
@@ -176,7 +176,7 @@ impl FrameSource for Capture {
         if !self.wait_until_due(timeout) {
             return Ok(NextFrame::Nothing);
         }
-        // OpenCV's decoder reports a damaged picture in the middle of a file as an error; the end of a file is none.
+        // OpenCV's decoder reports a damaged picture in the middle of a file as an error, but the end of a file is not an error.
         let grabbed = self.capture.grab().unwrap_or(false);
         let read = grabbed && self.capture.retrieve_def(&mut self.picture).unwrap_or(false);
         let now_ns = os::now_ns();

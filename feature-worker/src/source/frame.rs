@@ -1,7 +1,7 @@
 //! What a source of frames gives, why it cannot, and how a thread waits for it.
 //!
-//! Nothing here allocates but the error texts. A [`FrameStream`] runs in the thread that measures; its waits last at most
-//! [`WAIT`] (a device: until a frame, a signal or OpenCV's own limit), so that a request to stop is seen soon.
+//! Nothing here allocates but the error texts. A [`FrameStream`] runs in the thread that measures. Its waits last at most [`WAIT`], so
+//! that a request to stop is seen soon. On a device a wait lasts until a frame or a signal comes, or until OpenCV's own limit.
 
 use std::sync::atomic::{AtomicBool, Ordering::Relaxed};
 use std::time::Duration;

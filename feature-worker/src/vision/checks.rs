@@ -14,7 +14,7 @@ const DARK_LEVEL: f32 = 14.0;
 const BLOWN_SHARE: f32 = 0.5;
 /// A pixel whose three parts reach this is saturated, grey levels. Chosen by hand: a little below 255, because of noise.
 const SATURATED_LEVEL: u8 = 250;
-/// Light is judged by every so many pixels. Chosen by hand, for speed.
+/// Of this many pixels, one is looked at to judge the light. Chosen by hand, for speed.
 const LIGHT_EVERY: usize = 4;
 
 /// Bundles of profiles across each axis. Chosen by hand; no measurement is recorded.
@@ -44,7 +44,7 @@ const RIM_BLURRED_PX: f32 = 5.6;
 /// Checks the light, and that the picture is not the same as the last one.
 #[derive(Default)]
 pub(crate) struct LightCheck {
-    /// Hash of the last picture's bytes; none before the first.
+    /// Hash of the last picture's bytes; `None` before the first picture.
     last_hash: Option<u64>,
     /// Mean grey level of the last picture.
     mean_level: f32,
@@ -86,7 +86,7 @@ impl LightCheck {
 
 /// Checks the focus by the glass's own top edge and left side, which are always in the same place.
 pub(crate) struct RimCheck {
-    /// Relative to the region.
+    /// The axes relative to the region.
     axes: Axes,
     /// Width of the rim in each bundle that shows it, px. Kept from frame to frame.
     widths_px: Vec<f32>,

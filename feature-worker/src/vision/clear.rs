@@ -1,4 +1,4 @@
-//! Clear water: told from the background by what does not move with it.
+//! Clear water, which is told from the background by what does not move with it.
 //!
 //! Water has no colour, but it bends light: its outline shows a band of the room instead of what stands behind, and inside it the
 //! background is displaced. The container turns, so the background moves in the picture as one rigid piece, while the stream's outline
@@ -45,9 +45,9 @@ const WIDTH_PX: f32 = 320.0;
 /// Pictures are compared with an earlier one until the background has moved so far, px, because slow motion tells little from frame to
 /// frame. Tuned.
 const REFER_PX: f32 = 1.5;
-/// Pictures are compared with the same earlier one for no more than so many frames. Tuned.
+/// Pictures are compared with the same earlier one for no more than this many frames. Tuned.
 const REFER_FRAMES: u32 = 4;
-/// With a smaller share of profiles that show an edge there is no line. Tuned.
+/// There is no line when a smaller share of the profiles than this shows an edge. Tuned.
 const PROFILES_LEAST: f32 = 0.2;
 /// Points for the motion keep so far away from the stream's line, on either axis, px. Tuned.
 const KEEP_AWAY_PX: f32 = 5.0;
@@ -55,7 +55,7 @@ const KEEP_AWAY_PX: f32 = 5.0;
 const WET_NOISES: f32 = 5.0;
 /// Water differs from the dry background by at least this much, grey levels. Tuned.
 const WET_LEAST: f32 = 6.0;
-/// Weight of an edge point before ground as bright as the water's rim. Tuned.
+/// Weight of an edge point in front of ground that is as bright as the water's rim. Tuned.
 const HIDDEN_TRUST: f32 = 0.3;
 /// A step this high, as a share of the steepest step of a profile, is steep. Tuned.
 const STEEP_SHARE: f32 = 0.6;
@@ -68,7 +68,7 @@ pub(crate) struct ClearWater {
     scale: f32,
     /// Size of the small region, px.
     size: Size,
-    /// In the small region.
+    /// The axes in the small region.
     axes: Axes,
     rays: Rays,
     lines: Lines,
@@ -76,13 +76,14 @@ pub(crate) struct ClearWater {
     evidence: Evidence,
     water: Water,
     // Pictures, kept from frame to frame.
-    /// The small region, three bytes a pixel.
+    /// The small region, with three bytes a pixel.
     small: Mat,
-    /// The same, four bytes a pixel.
+    /// The same, with four bytes a pixel.
     now: Mat,
-    /// The earlier picture of these with which pictures are compared: the last one, or one from which the background has not moved far.
+    /// The earlier picture, of the same kind, with which new ones are compared: the last one, or an older one since which the background
+    /// has not moved far.
     earlier: Mat,
-    /// Frames that were compared with the same earlier picture.
+    /// Number of frames that were compared with the same earlier picture.
     compared: u32,
 }
 
@@ -129,7 +130,7 @@ impl ClearWater {
     }
 
     #[inline(always)]
-    fn look_at_it(&mut self, edges_px: &mut Vec<[f32; 2]>) -> opencv::Result<Sighting> {
+    fn look_for_stream(&mut self, edges_px: &mut Vec<[f32; 2]>) -> opencv::Result<Sighting> {
         edges_px.clear();
         let height_px = self.height_px();
         let mut sighting = Sighting::Dry { confidence: 1.0 };
@@ -186,8 +187,8 @@ impl ClearWater {
         Ok(())
     }
 
-    /// The edge on a profile before known ground: the outermost place that differs from the dry background, where half of the difference is
-    /// reached. `differs` is the difference from the background at each sample, grey levels.
+    /// The edge on a profile in front of known ground: the outermost place that differs from the dry background, where half of the
+    /// difference is reached. `differs` is the difference from the background at each sample, grey levels.
     fn edge_on_known_ground(&self, profile: &Profile, differs: &[[f32; 3]; PROFILE_SAMPLES]) -> Option<ProfileEdge> {
         let size = |d: &[f32; 3]| (d.iter().map(|v| v * v).sum::<f32>() / 3.0).sqrt();
         let least = (WET_NOISES * self.evidence.noise()).max(WET_LEAST);
@@ -214,7 +215,7 @@ fn small(v: f32, scale: f32) -> f32 {
     (v + 0.5) / scale - 0.5
 }
 
-/// The edge on a profile before ground that is not known: the outermost of the steep steps of brightness.
+/// The edge on a profile in front of ground that is not known: the outermost of the steep steps of brightness.
 fn edge_on_unknown_ground(profile: &Profile) -> Option<ProfileEdge> {
     let grey = |j: usize| profile.colours[j].iter().sum::<f32>() / 3.0;
     let step = |j: usize| (grey(j + 1) - grey(j)).abs();
@@ -252,8 +253,8 @@ impl Liquid for ClearWater {
     }
 
     fn look(&mut self, edges_px: &mut Vec<[f32; 2]>) -> opencv::Result<Sighting> {
-        // With the processor's widest registers.
-        pulp::Arch::new().dispatch(|| self.look_at_it(edges_px))
+        // The search runs with the processor's widest registers.
+        pulp::Arch::new().dispatch(|| self.look_for_stream(edges_px))
     }
 
     fn edge_on(&self, profile: &Profile) -> Option<ProfileEdge> {

@@ -1,8 +1,8 @@
-//! Coloured liquid: told from the background by a range of hue, saturation and value.
+//! Coloured liquid, which is told from the background by a range of hue, saturation and value.
 //!
 //! The wedge between the axes is resampled once into rays from the lip (`cv::remap`), one ray a row. Seen from the lip, liquid comes
-//! first and background after it, whatever the tilt. So on each ray the outer edge is where the count of liquid less background pixels
-//! is largest. A stream fills nearly every ray from the lip on; drops and splashes do not, so they are no stream.
+//! first and background after it, whatever the tilt. So on each ray the outer edge is where the number of liquid pixels minus that of
+//! background pixels is largest. A stream fills nearly every ray from the lip on; drops and splashes do not, so they are no stream.
 //!
 //! Called on the extraction thread. All pictures are kept, so after the first frame nothing is allocated but OpenCV's matrix headers.
 //! The only failures are OpenCV's.
@@ -38,7 +38,7 @@ const LEAVES_SHARE: f32 = 0.06;
 /// Side of the square of samples that are smoothed together: a fifth of the noise, for a tenth of what smoothing the region would cost.
 /// Tuned; it costs about 25 us more than 3, see docs/VISION.md.
 const SMOOTH: i32 = 5;
-/// With a smaller share of profiles that show an edge there is no line. Tuned.
+/// There is no line when a smaller share of the profiles than this shows an edge. Tuned.
 const PROFILES_LEAST: f32 = 0.3;
 /// Samples at either end of a profile that tell liquid and background. Chosen by hand; no measurement is recorded.
 const FLANK: usize = 3;
@@ -48,7 +48,7 @@ const DIFFERENCE_LEAST: f32 = 12.0;
 
 /// Finds the stream of a coloured liquid in the pictures of one camera.
 pub(crate) struct ColouredLiquid {
-    /// Relative to the region.
+    /// The axes relative to the region.
     axes: Axes,
     /// The rays along which the region is sampled.
     grid: RayGrid,
@@ -127,7 +127,7 @@ impl ColouredLiquid {
         core::bitwise_or(&one, &self.half_mask, &mut self.mask, &core::no_array())
     }
 
-    /// The last sample of liquid on a ray and the score there: px of liquid less px of background, at its largest.
+    /// The last sample of liquid on a ray and the score there: px of liquid minus px of background, at its largest.
     #[inline(always)]
     fn last_liquid(&self, mask: &[u8]) -> Option<(usize, f32)> {
         let (mut score, mut best, mut last) = (0.0f32, 0.0f32, None);

@@ -27,7 +27,7 @@ use super::liquid::{Liquid, Sighting};
 use super::measurement::{Measurement, Stages};
 use super::picture::{Image, RegionPixels, RegionReader};
 
-/// Why an extractor cannot be made, or an image not be measured.
+/// Why an extractor cannot be made, or why an image cannot be measured.
 #[derive(Debug, thiserror::Error)]
 pub enum ExtractError {
     /// The axes do not cross in the region, or the region has no room between them.
@@ -56,7 +56,7 @@ pub struct Extractor {
     region: Rect,
     /// A smaller triangle is no stream, px^2.
     area_min_px2: f32,
-    /// Relative to the region.
+    /// The axes relative to the region.
     axes: Axes,
     reader: RegionReader,
     light: LightCheck,
@@ -135,8 +135,8 @@ impl Extractor {
         [p[0] + self.region.x as f32, p[1] + self.region.y as f32]
     }
 
-    /// Measures one image. One of another size than configured, or with missing bytes, gets a doubt and no area. A grey image is an error
-    /// where the liquid is told by its colour; the only other errors are OpenCV's.
+    /// Measures one image. An image of another size than configured, or with missing bytes, gets a doubt and no area. A grey image is an
+    /// error where the liquid is told by its colour; the only other errors are OpenCV's.
     pub fn measure(&mut self, image: Image) -> Result<Measurement, ExtractError> {
         let expected = image.width_px as usize * image.height_px as usize * image.format.bytes_per_pixel();
         if [image.width_px, image.height_px] != self.size_px || image.pixels.len() != expected {

@@ -2,7 +2,8 @@
 //!
 //! The container stands still in the picture while the background turns and the liquid moves, so in the mean its edges stay sharp and all
 //! else fades. The longest nearly horizontal and nearly vertical line there that meet at a corner are the glass's top edge and its left
-//! side. Used by calibration only: it allocates, and takes as long as it takes.
+//! side. It is used by calibration only, on the command's thread; it allocates and has no bound on its time.
+//! Where there is no such corner, the error says what to do instead.
 
 use opencv::core::{Mat, Vec4i, Vector};
 use opencv::imgproc;
@@ -11,7 +12,7 @@ use serde::Deserialize;
 
 // "By hand" below means that the value was chosen by hand and that no measurement is recorded.
 
-/// Grey levels of the gradient between which Canny's edges continue, and from which they begin. By hand.
+/// Gradients above which an edge goes on, and above which one begins (Canny's two thresholds), grey levels. By hand.
 const CANNY: [f64; 2] = [14.0, 42.0];
 /// Steps of direction in the Hough transform, half a circle. By hand: a quarter of a degree.
 const HOUGH_STEPS: f64 = 720.0;
@@ -119,8 +120,8 @@ fn find_edges(mean: &Mat) -> Result<(Vec<Edge>, Vec<Edge>), AxesError> {
     Ok((level, upright))
 }
 
-/// The shift, square to it, from the line through `from` and `to` to the middle between the outermost of all edges within `near` px. So
-/// several pieces of one edge count once.
+/// The shift that brings the line through `from` and `to` to the middle between the outermost of all edges within `near` px of it, square
+/// to the line. So several pieces of one edge count once.
 fn shift_to_middle(from: [f32; 2], to: [f32; 2], edges: &[Edge], near: f32) -> [f32; 2] {
     let length = (to[0] - from[0]).hypot(to[1] - from[1]);
     let normal = [-(to[1] - from[1]) / length, (to[0] - from[0]) / length];

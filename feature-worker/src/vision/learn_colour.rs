@@ -1,7 +1,8 @@
 //! Learns the liquid's colour from the pictures of one pour: what is often right over the lip and seldom far from it.
 //!
-//! The background turns behind the container, so what belongs to it is seen in both places; only the liquid stays at the lip. Used by
-//! calibration only: it allocates, and takes as long as it takes.
+//! The background turns behind the container, so what belongs to it is seen in both places; only the liquid stays at the lip. It is used by
+//! calibration only, on the command's thread; it allocates and has no bound on its time. Where no colour stands out, the error says what to
+//! do instead.
 
 use opencv::core::{self, Mat};
 use opencv::imgproc;
@@ -9,11 +10,12 @@ use opencv::prelude::*;
 
 use super::geometry::Axes;
 
-// "Tuned" below means that the value was tuned on seeds 1 and 5001 to 5003 of `evaluate-camera`; see docs/VISION.md. Lengths are px of a picture 640 px wide.
+// "Tuned" below means that the value was tuned on seeds 1 and 5001 to 5003 of `evaluate-camera`; see docs/VISION.md.
+// Lengths are px of a picture 640 px wide.
 
-/// Bins of hue, saturation and value of the first look. Chosen by hand; no measurement is recorded.
+/// Number of bins into which hue, saturation and value are divided. Chosen by hand; no measurement is recorded.
 const BINS: [usize; 3] = [18, 8, 8];
-/// Most pixels that are kept of either place. Chosen by hand: about a megabyte.
+/// The most pixels that are kept of each of the two places. Chosen by hand: about a megabyte.
 const KEEP: usize = 400_000;
 /// Pixels nearer to the lip than this are near. Tuned.
 const NEAR_PX: f32 = 20.0;
@@ -21,14 +23,14 @@ const NEAR_PX: f32 = 20.0;
 const FAR_PX: f32 = 110.0;
 /// Pixels further from the lip than this, to either side or up or down, are not looked at. Chosen by hand; no measurement is recorded.
 const REACH_PX: f32 = 220.0;
-/// Of the far pixels one of so many is taken. Chosen by hand, for speed.
+/// Of this many far pixels, one is taken. Chosen by hand, for speed.
 const FAR_EVERY: i32 = 5;
 /// Pixels nearer to an axis than this are left out: the rim's own light is near the lip in every picture, and axes that are off by a few px
 /// shall not make it liquid. Tuned.
 const RIM_PX: f32 = 4.0;
 /// A bin is the liquid's when it holds more than this share of the near pixels. Tuned.
 const BIN_SHARE: f32 = 0.004;
-/// A bin is the liquid's when its share of the near pixels is more than so many times that of the far ones. Tuned.
+/// A bin is the liquid's when its share of the near pixels is more than this many times that of the far ones. Tuned.
 const BIN_RATIO: f32 = 4.0;
 /// There is a liquid when its bins hold at least this share of the near pixels. Tuned.
 const LIQUID_SHARE: f32 = 0.1;
@@ -36,7 +38,7 @@ const LIQUID_SHARE: f32 = 0.1;
 const TAILS: [f32; 2] = [0.02, 0.98];
 /// Grey liquids (milk, or cola in shadow) have no hue: their median saturation is below this. Tuned.
 const GREY_SATURATION: f32 = 45.0;
-/// Grey liquids have no hue: theirs spreads over more than this, in OpenCV's half degrees. Tuned.
+/// Grey liquids have no hue: their hues spread over more than this, in OpenCV's half degrees. Tuned.
 const GREY_HUES: f32 = 80.0;
 /// Margin on saturation and value of a grey liquid, on either side. Tuned.
 const GREY_MARGIN: f32 = 30.0;
@@ -48,7 +50,7 @@ const LIKE_HUE: f32 = 12.0;
 const OTHER_HUE: f32 = 40.0;
 /// Background of like colour counts when it is at least this share of the far pixels. Tuned.
 const ALIKE_SHARE: f32 = 0.002;
-/// One of so many of the background's pixels of like colour is noise: the most liquid-like ones. Tuned.
+/// Of this many background pixels of like colour, the most liquid-like one is noise. Tuned.
 const ALIKE_NOISE: usize = 50;
 
 /// Why no colour is learned.
@@ -67,7 +69,7 @@ type Hsv = [u8; 3];
 
 /// Pixels of one place, and how many of them fall into each bin.
 struct Pixels {
-    /// In the order in which they were seen.
+    /// The pixels, in the order in which they were seen.
     pixels: Vec<Hsv>,
     /// Their number in each bin.
     bins: Vec<u32>,
@@ -103,11 +105,11 @@ fn bin([h, s, v]: Hsv) -> usize {
 
 /// Learns the liquid's colour from the pictures of one pour.
 pub struct ColourLearner {
-    /// In the whole picture.
+    /// The axes in the whole picture.
     axes: Axes,
-    /// Right over the lip.
+    /// Pixels right over the lip.
     near: Pixels,
-    /// Far from the lip.
+    /// Pixels far from the lip.
     far: Pixels,
     /// The last picture in hue, saturation and value.
     hsv: Mat,
@@ -125,7 +127,7 @@ struct Quantiles {
 }
 
 impl Quantiles {
-    /// Of at least one pixel.
+    /// The quantiles of at least one pixel.
     fn new(pixels: &[Hsv], value: impl Fn(&Hsv) -> f32) -> Self {
         let mut values: Vec<f32> = pixels.iter().map(value).collect();
         values.sort_by(f32::total_cmp);

@@ -1,7 +1,7 @@
 //! The stream's outer edge as a line of sub-pixel accuracy.
 //!
-//! 1. A first line through the coarse edge points is found robustly: of the lines through fixed pairs of them, the one with most edge
-//!    length near it, then least squares over what is near.
+//! 1. A first line through the coarse edge points is found robustly. Of the lines through fixed pairs of them, the one with most edge
+//!    length near it is taken, and then a least-squares line through what is near that one.
 //! 2. Across that line the picture is read again along short profiles, and the liquid is asked where on each profile its edge lies. A
 //!    line with Huber weights through these points cuts the axes at a and b.
 //!
@@ -14,7 +14,7 @@ use super::picture::{RegionPixels, median};
 
 // "Tuned" below means that the value was tuned on seeds 1 and 5001 to 5003 of `evaluate-camera`; see docs/VISION.md.
 
-/// Edge points that are tried in pairs for the first line. Chosen by hand: 60 pairs are enough, and cost little.
+/// Edge points that are tried in pairs for the first line. Chosen by hand: their 55 pairs are enough, and cost little.
 const PICKS: usize = 13;
 /// An edge point lies near a line within this share of the edge points' median distance from the lip. Tuned.
 const NEAR_SHARE: f32 = 0.12;
@@ -26,8 +26,8 @@ const WEIGHT_MOST_PX: f32 = 20.0;
 const INLIERS_LEAST: f32 = 0.6;
 /// Profiles across the line. Chosen by hand; no measurement is recorded.
 const PROFILES: usize = 48;
-/// The samples of a profile lie apart by the line's distance from the lip over this, so that the inner ends of a small triangle's
-/// profiles stay in the liquid. Tuned.
+/// The distance between a profile's samples is the line's distance from the lip divided by this, so that the inner ends of a small
+/// triangle's profiles stay in the liquid. Tuned.
 const SPACINGS: f32 = 18.0;
 /// Distance of a profile's samples, px: the least and the largest. Tuned.
 const SPACING_PX: [f32; 2] = [0.4, 1.0];
@@ -37,7 +37,7 @@ const MARGIN_SHARE: f32 = 0.04;
 const MARGIN_PX: [f32; 2] = [1.0, 1.5];
 /// Rounds of fitting the final line with new weights. Chosen by hand; no measurement is recorded.
 const ROUNDS: usize = 4;
-/// Residuals up to so many medians have full weight: the outline is a little curved, so a few per cent of its length are no outliers.
+/// Residuals up to this many medians have full weight: the outline is a little curved, so a few per cent of its length are no outliers.
 /// Tuned.
 const HUBER_MEDIANS: f32 = 3.0;
 /// Residuals up to this have full weight, px. Tuned.
@@ -59,7 +59,7 @@ pub(crate) struct FirstLine {
     inliers: f32,
 }
 
-/// A path of profiles across the first line.
+/// Where the profiles across the first line lie.
 struct Across {
     /// Where the line cuts the x-axis.
     from: [f32; 2],
@@ -96,9 +96,9 @@ impl Across {
 
 /// Fits the line of one camera's stream.
 pub(crate) struct LineFinder {
-    /// Relative to the region.
+    /// The axes relative to the region.
     axes: Axes,
-    /// A leg this long is no triangle's, px.
+    /// A triangle's legs are shorter than this, px.
     leg_most_px: f32,
     // Lists that are kept from frame to frame.
     /// Length of edge for which each coarse edge point stands, px.

@@ -83,9 +83,9 @@ pub(crate) struct FineLine {
 /// What a liquid demands of its line.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct LineRules {
-    /// With a smaller share of profiles that show an edge there is no line.
+    /// There is no line when a smaller share of the profiles than this shows an edge.
     pub(crate) profiles_least: f32,
-    /// With a smaller triangle under the first line there is no stream, px^2.
+    /// There is no stream when the triangle under the first line is smaller than this, px^2.
     pub(crate) first_area_least_px2: f32,
     /// Whether the width of the stream's own edge tells that the picture is out of focus.
     pub(crate) edge_tells_focus: bool,
@@ -112,7 +112,7 @@ pub(crate) trait Liquid: Send + Sync {
     /// Where on a profile the stream's edge lies.
     fn edge_on(&self, profile: &Profile) -> Option<ProfileEdge>;
 
-    /// Takes note of the final line (none: too few profiles showed an edge) in a picture of this mean grey level. Returns the line if
+    /// Takes note of the final line (`None` if too few profiles showed an edge) in a picture of this mean grey level. Returns the line if
     /// it is the stream's, and otherwise the doubt under which there is none.
     fn confirm(&mut self, line: Option<FineLine>, mean_level: f32) -> Result<FineLine, Doubt>;
 }

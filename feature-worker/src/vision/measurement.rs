@@ -1,4 +1,4 @@
-//! What one image tells, and how long it took to find out. Plain data.
+//! What one image tells, and how long it took to find out. This is plain data, for any thread; it cannot fail.
 
 use shared::messages::Doubt;
 

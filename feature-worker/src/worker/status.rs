@@ -12,9 +12,9 @@ use crossbeam::queue::ArrayQueue;
 use serde::Serialize;
 use shared::os;
 
-/// How often the thread looks for a new status. It also bounds how long the process takes to end.
+/// How often the thread looks for a new status. Chosen by hand; it also bounds how long the process takes to end.
 const PAUSE: Duration = Duration::from_millis(100);
-/// Time from one line to the next, ns.
+/// Time from one line to the next, ns. Chosen by hand.
 const LINE_NS: u64 = 1_000_000_000;
 
 /// The state of the worker after its newest frame.
@@ -38,7 +38,7 @@ pub struct Status {
     pub doubt: &'static str,
     /// Time from taking the newest frame to publishing its feature, us.
     pub took_us: f32,
-    /// Time from the middle of the newest frame's exposure to publishing its feature, ms.
+    /// Time from the newest frame's capture time to publishing its feature, ms.
     pub latency_ms: f32,
     /// No frame has come for a second.
     pub silent: bool,

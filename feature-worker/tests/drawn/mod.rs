@@ -89,7 +89,7 @@ pub fn board(turn_deg: f32) -> Result<Mat, opencv::Error> {
     Ok(soft)
 }
 
-/// `picture` with light noise, which is another for each `seed`.
+/// `picture` with light noise, which differs for each `seed`.
 pub fn noisy(picture: &Mat, seed: i32) -> Result<Mat, opencv::Error> {
     core::set_rng_seed(seed)?;
     let mut noise = picture.clone();
@@ -155,15 +155,15 @@ pub fn pour(i: i32) -> Result<Mat, opencv::Error> {
     noisy(&picture, i)
 }
 
-/// A dry glass before the board.
+/// A dry glass in front of the board.
 pub fn dry(turn_deg: f32, seed: i32) -> Result<Mat, opencv::Error> {
     let mut picture = board(turn_deg)?;
     glass(&mut picture)?;
     noisy(&picture, seed)
 }
 
-/// A frame of clear water before a board that turns, or before an even wall. Water takes a little light, and much along its edge. The
-/// legs of its triangle are `share` of 90 x 80 px; with 0 it is dry.
+/// A frame of clear water in front of a board that turns, or in front of an even wall. Water takes a little light, and much along its edge.
+/// The legs of its triangle are `share` of 90 x 80 px; with 0 it is dry.
 pub fn water(share: f32, turn_deg: Option<f32>, seed: i32) -> Result<Mat, opencv::Error> {
     let mut picture = match turn_deg {
         Some(turn_deg) => board(turn_deg)?,

@@ -1,6 +1,6 @@
-//! What stands behind the container: painted once, then turned with the tilt for every frame.
+//! What stands behind the container. It is painted once and then turned with the tilt for every frame.
 //!
-//! Called by the renderer, on its thread. Allocates when it is painted and at the first frame; failures are OpenCV's.
+//! Called by the renderer, on its thread. It allocates when it is painted and at the first frame. Its failures are OpenCV's.
 
 use opencv::core::{BORDER_REFLECT_101, CV_8UC3, Mat, Point, Point2f, Rect, Scalar, Size};
 use opencv::imgproc;

@@ -11,10 +11,11 @@ const COLUMNS: usize = 4097;
 
 /// The cover of one picture: 0 to 255 for each pixel.
 pub struct Cover {
+    /// The covered share of each pixel, of which 255 is 1.
     pub(super) shares: Mat,
     width: usize,
     height: usize,
-    /// Where the present line crosses the outline, px.
+    /// Where the present line of samples crosses the outline, px.
     crossings: Vec<f64>,
     /// The outline's sides that touch the present row.
     sides: Vec<([f64; 2], [f64; 2])>,

@@ -9,7 +9,7 @@ use opencv::prelude::*;
 
 use super::view::View;
 
-/// What the glass does to each byte of the picture: a factor, of which 128 is 1, and a summand.
+/// What the glass does to each byte of the picture: a factor, for which 128 stands for 1, and a summand.
 pub struct Glass {
     factor: Mat,
     light: Mat,
@@ -45,8 +45,8 @@ impl Glass {
     /// Lays the glass over `frame`.
     pub fn lay(&self, frame: &mut Mat) -> opencv::Result<()> {
         let (factors, lights) = (self.factor.data_bytes()?, self.light.data_bytes()?);
-        // This touches every byte of every frame. The arithmetic cannot wrap here; that it may lets it vectorise although overflow
-        // checks are on.
+        // This touches every byte of every frame. The arithmetic cannot overflow here; it is allowed to wrap only so that it can be
+        // vectorised although overflow checks are on.
         for ((pixel, factor), light) in frame.data_bytes_mut()?.iter_mut().zip(factors).zip(lights) {
             let through = u16::from(*pixel).wrapping_mul(u16::from(*factor)) >> 7;
             *pixel = through.wrapping_add(u16::from(*light)).min(255) as u8;

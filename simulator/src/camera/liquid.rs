@@ -1,4 +1,4 @@
-//! How liquid looks: a coloured one hides what is behind it; clear water bends its light (see [`super::water`]).
+//! How liquid looks: a coloured liquid hides what is behind it, and clear water bends its light (see [`super::water`]).
 //!
 //! Called by the renderer, on its thread. Allocates at the first frames; failures are OpenCV's.
 
@@ -110,7 +110,7 @@ fn lay_clear(cover: &[u8], frame: &mut [Vec3b], water: &WaterRow, thickness: &Th
     }
 }
 
-/// Lays a colour over a pixel that it covers by a share, of which 255 is 1.
+/// Lays a colour over a pixel; `cover` is the share of the pixel that it covers, of which 255 is 1.
 fn blend(pixel: &mut Vec3b, colour: [f32; 3], cover: u8) {
     let share = f32::from(cover) / 255.0;
     for c in 0..3 {

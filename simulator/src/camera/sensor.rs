@@ -55,10 +55,10 @@ impl Sensor {
         let offset: usize = random.random_range(0..NOISE_OFFSETS);
         let gain = (view.light * (1.0 + self.exposure) * 64.0).clamp(0.0, 127.0) as u16;
         let (pixels, noise) = (frame.data_bytes()?, &self.noise[offset..]);
-        // This touches every byte of every frame. The arithmetic cannot wrap here; that it may lets it vectorise although overflow
-        // checks are on.
+        // This touches every byte of every frame. The arithmetic cannot overflow here; it is allowed to wrap only so that it can be
+        // vectorised although overflow checks are on.
         for (((out, pixel), noise), vignette) in out.iter_mut().zip(pixels).zip(noise).zip(&self.vignette) {
-            // 128 is a factor of 1. It is at most 255, so that the product fits 16 bits.
+            // A factor of 128 stands for 1. It is at most 255, so that the product fits 16 bits.
             let factor = (gain.wrapping_mul(*vignette) >> 7).min(255);
             let level = u16::from(*pixel).wrapping_mul(factor) >> 7;
             *out = (level as i16).wrapping_add(i16::from(*noise)).clamp(0, 255) as u8;

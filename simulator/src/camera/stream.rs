@@ -1,11 +1,11 @@
-//! The liquid's outline, seen from the side, from the hydraulics of the outflow; and the truth about it.
+//! The liquid's outline as it is seen from the side, found from the hydraulics of the outflow, and the truth about it.
 //!
 //! 1. The lip is a V-notch weir in the rim's plane, `Q = 8/15 Cd(alpha) sqrt(2 g) tan(theta/2) H^2.5 / sin(alpha)`, solved for the head
 //!    `H` over the lip. `Cd` falls as the wall turns from a sharp crest into a long flat one.
 //! 2. Inside the glass the free surface falls from `H` to the critical depth `0.8 H` near the lip.
 //! 3. From there the liquid flies: a parabola with the speed that Bernoulli gives at that depth.
 //!
-//! Called by the renderer, on its thread; allocates when the outline first grows; cannot fail.
+//! Called by the renderer, on its thread. It allocates when the outline first grows, and for the truth of each frame. It cannot fail.
 
 use std::ops::Range;
 
@@ -143,13 +143,13 @@ fn fitted_line(edge: &[[f64; 2]]) -> ([f64; 2], f64) {
 /// A stream over the lip, in the container's frame; lengths in mm.
 struct Jet {
     flow_ml_s: f64,
-    /// Alpha, 15 to 90 degrees, in rad.
+    /// Alpha, kept within 15 to 90 degrees, in rad.
     steep_rad: f64,
     ripple: Ripple,
     head: f64,
     /// Critical depth.
     depth: f64,
-    /// Level part of the speed at the critical section, mm/s.
+    /// Horizontal part of the speed at the critical section, mm/s.
     speed: f64,
     gravity: [f64; 2],
     upper_start: [f64; 2],
@@ -165,7 +165,7 @@ impl Jet {
         let depth = CRITICAL_DEPTH * head;
         // Slope of the surface at the critical section; the surfaces on both sides of it share it.
         let slope = 1.0 - CRITICAL_DEPTH;
-        // Bernoulli at the free surface: speed^2 = 2 g (head - depth), of which this is the level part.
+        // Bernoulli at the free surface: speed^2 = 2 g (head - depth), of which this is the horizontal part.
         let speed = (2.0 * GRAVITY_MM_S2 * (head - depth) / (1.0 + slope * slope)).sqrt();
         Self {
             flow_ml_s: scene.flow_ml_s,
@@ -227,7 +227,7 @@ impl Jet {
     }
 }
 
-/// The head over the lip in mm that drives `flow_ml_s` (step 1 of this file's text), at a tilt of 15 to 90 degrees.
+/// The head over the lip in mm that drives `flow_ml_s` (step 1 of this file's header), at a tilt of 15 to 90 degrees.
 fn head_mm(view: &View, flow_ml_s: f64, steep_rad: f64) -> f64 {
     let sin = steep_rad.sin();
     let discharge = CD_SHARP * (1.0 - view.flat_wall_loss * sin * sin);

@@ -1,7 +1,7 @@
 //! What the camera is (a view) and what it is shown (a scene).
 //!
-//! Plain data, any thread; cannot fail. The container's frame has its origin at the lip; u runs along the glass's top edge into the
-//! mouth, w along its left side out of the mouth, both in mm.
+//! This is plain data, for any thread. It does not allocate, and cannot fail once it is read. The container's frame has its origin at the
+//! lip; u runs along the glass's top edge into the mouth, w along its left side out of the mouth, both in mm.
 
 use rand::RngExt;
 use rand_pcg::Pcg64Mcg;
@@ -28,7 +28,7 @@ impl Background {
     pub const ALL: [Self; 4] = [Self::Chess, Self::Wood, Self::Clutter, Self::Plain];
 }
 
-/// One camera before one container with one liquid.
+/// One camera in front of one container with one liquid.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct View {
@@ -66,7 +66,7 @@ pub struct View {
 }
 
 impl View {
-    /// A camera as people mount it, before a lip as they differ: `random` draws scale, place, roll and the lip's shape.
+    /// A camera as people mount it, in front of one of the many shapes of lips: `random` draws scale, place, roll and the lip's shape.
     pub fn placed(random: &mut Pcg64Mcg) -> Self {
         Self {
             px_per_mm: random.random_range(5.5..8.5),
@@ -113,7 +113,10 @@ fn colour_or_clear<'de, D: serde::Deserializer<'de>>(deserializer: D) -> Result<
     let levels = Vec::<u8>::deserialize(deserializer)?;
     match levels.len() {
         0 => Ok(None),
-        _ => levels.try_into().map(Some).map_err(|_| serde::de::Error::custom("blue, green, red, or [] for clear water")),
+        _ => levels
+            .try_into()
+            .map(Some)
+            .map_err(|_| serde::de::Error::custom("give liquid_bgr as [blue, green, red], or [] for clear water")),
     }
 }
 

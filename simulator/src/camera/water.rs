@@ -116,7 +116,7 @@ impl WaveRow<'_> {
     }
 }
 
-/// The optics of clear water before one camera.
+/// The optics of clear water in front of one camera.
 pub struct Water {
     width_px: usize,
     px_per_mm: f64,
@@ -138,7 +138,7 @@ pub struct Water {
 }
 
 impl Water {
-    /// Clear water before the camera of `view`; `seed` draws the room.
+    /// Clear water in front of the camera of `view`; `seed` draws the room.
     pub fn new(view: &View, seed: u64) -> Self {
         let (width, height) = (view.width_px as i32, view.height_px as i32);
         Self {
@@ -148,7 +148,7 @@ impl Water {
             gathered: Mat::default(),
             depth: Mat::default(),
             radius: Mat::default(),
-            // It has a generator of its own, so that coloured liquid is drawn with the same numbers as without it.
+            // The room has a random generator of its own, so that it takes no numbers from the one that draws everything else.
             room_level: Pcg64Mcg::seed_from_u64(!seed).random_range(ROOM_LEVELS),
             lenses: (0..=OFF_AXIS).map(|i| Lens::through_cylinder(i as f32 / OFF_AXIS as f32)).collect(),
             mirrored: [width, height].map(|size| Mirror::new(size, BEHIND_MM * view.px_per_mm as f32 * MOST_BENT_RAD.tan())),
@@ -245,8 +245,8 @@ impl WaterRow<'_> {
         std::array::from_fn(|c| passed[c] + reflected[c] + glint)
     }
 
-    /// Grey level of the room, `down` (-1 to 1) from level. Up is up in the picture; the real direction turns with the wrist, which
-    /// matters little.
+    /// Grey level of the room in a direction that is -1 for up, 0 for level and 1 for down. Up is up in the picture; the real direction
+    /// turns with the wrist, which matters little.
     fn room(&self, down: f32) -> f32 {
         self.water.room_level * (1.0 - ROOM_SLOPE * down.clamp(-1.0, 1.0))
     }

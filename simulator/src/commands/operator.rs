@@ -1,7 +1,7 @@
-//! `simulator operator`: what a person does at the simulated cell: fill the container, read the scale, cause a fault.
+//! `simulator operator`: does what a person does at the simulated cell: fills the container, reads the scale, causes a fault.
 //!
-//! Ordinary process; allocates. It writes one line to the cell's operator socket and prints the answer. Without a cell that answers it
-//! ends with an error of one line.
+//! An ordinary process that allocates. It writes one line to the cell's operator socket and prints the answer. Without a cell that answers
+//! it ends with an error of one line.
 
 use std::io::{BufRead, BufReader, Write};
 use std::os::unix::net::UnixStream;
@@ -31,7 +31,7 @@ enum Action {
         #[command(flatten)]
         common: Common,
     },
-    /// Reads the kitchen scale, in g (1 g steps); wait until the pour is over.
+    /// Reads the kitchen scale, in whole grams. Wait until the pour is over.
     Scale {
         #[command(flatten)]
         common: Common,

@@ -1,6 +1,6 @@
 //! `simulator run`: the simulated cell in real time, until Ctrl-C or SIGTERM.
 //!
-//! Ordinary process; the threads of the cell are those of [`crate::cell`]. A bad configuration is an error of one line.
+//! An ordinary process; the threads of the cell are those of [`crate::cell`]. A bad configuration is an error of one line.
 
 use std::path::PathBuf;
 

@@ -1,7 +1,7 @@
-//! `simulator ur`: only the simulated UR5 controller, for trying a client or a robot program.
+//! `simulator ur`: runs only the simulated UR5 controller, for trying a client or a robot program.
 //!
 //! The main thread takes faults from standard input and prints the controller's log; the controller has a thread of its own.
-//! Allocates. The command ends with Ctrl-C or SIGTERM, or after `--seconds`; a controller that cannot be started is an error.
+//! It allocates. The command ends with Ctrl-C or SIGTERM, or after `--seconds`; a controller that cannot be started is an error.
 
 use std::io::{BufRead, Write};
 use std::net::{IpAddr, Ipv4Addr};
@@ -18,22 +18,22 @@ use crate::ur::{Controller, ControllerOptions, Fault, LogKind, LogLine, Series, 
 #[derive(Debug, clap::Args)]
 #[command(after_help = help())]
 pub struct Args {
-    /// Loopback address to listen on; each controller needs its own
+    /// Loopback address to listen on; each controller needs its own.
     #[arg(long, default_value_t = IpAddr::V4(Ipv4Addr::LOCALHOST))]
     address: IpAddr,
-    /// Controller generation: CB3 3.15 at 125 Hz or e-Series 5.11 at 500 Hz
+    /// Controller generation: CB3 3.15 at 125 Hz or e-Series 5.11 at 500 Hz.
     #[arg(long, value_enum, default_value = "cb3")]
     series: SeriesArg,
-    /// Joint angles at the start in degrees, base to wrist 3
+    /// Joint angles at the start in degrees, from the base to wrist 3.
     #[arg(long, value_delimiter = ',', num_args = 6, allow_negative_numbers = true, default_value = "0,-90,90,-90,-90,0")]
     joints_deg: Vec<f64>,
-    /// Fault to inject at the start; this option may be given several times
+    /// Fault to inject at the start; this option may be given several times.
     #[arg(long)]
     fault: Vec<Fault>,
-    /// End after this many seconds
+    /// End after this many seconds.
     #[arg(long)]
     seconds: Option<f64>,
-    /// Print the controller's log as JSON, one object a line
+    /// Print the controller's log as JSON, one object a line.
     #[arg(long)]
     json: bool,
 }

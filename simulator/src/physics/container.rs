@@ -1,6 +1,6 @@
 //! A tilted vessel: what it retains, what flows over its lip, and the film that drains afterwards.
 //!
-//! Pure, any thread; allocates only in [`Container::new`]. Cannot fail: tilts and volumes are clamped to what makes sense.
+//! Pure, on any thread. It allocates only in [`Container::new`]. It cannot fail: tilts and volumes are clamped to what makes sense.
 //!
 //! Coordinates: z along the vessel's axis from the bottom, x towards the lip. The lip is at (x_l, H). At tilt alpha the
 //! liquid below the horizontal plane through the lip stays: z cos(alpha) - x sin(alpha) <= H cos(alpha) - x_l sin(alpha).
@@ -106,7 +106,7 @@ impl Shape {
         }
     }
 
-    /// Area of the section at height z, of the part on the lip's side of x = c, mm^2.
+    /// Area of the part of the section at height z that lies on the lip's side of x = c, mm^2.
     fn section_beyond_mm2(&self, c_mm: f64, z_mm: f64) -> f64 {
         let r = self.reach_mm(z_mm);
         let c = c_mm.clamp(-r, r);
@@ -195,7 +195,7 @@ impl Container {
         self.lip = Lip::default();
     }
 
-    /// Takes another liquid: its fluidity relative to water.
+    /// Changes the liquid: `fluidity` is relative to water.
     pub fn set_fluidity(&mut self, fluidity: f64) {
         self.fluidity = fluidity;
     }
@@ -239,7 +239,7 @@ impl Container {
         (v0 + (v1 - v0) * f, a0 + (a1 - a0) * f)
     }
 
-    /// The tilt at which the present volume reaches the lip, degrees.
+    /// The tilt at which the present volume reaches the lip, degrees, to the step of the table.
     pub fn spill_angle_deg(&self) -> f64 {
         let k = self.table.iter().position(|(retained, _)| *retained <= self.volume_ml).unwrap_or(self.table.len() - 1);
         k as f64 * TABLE_STEP_DEG

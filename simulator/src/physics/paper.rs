@@ -1,6 +1,6 @@
 //! Simulator a: the paper's own simple simulation (section 4), in which the outflow depends linearly on the angle and on what remains.
 //!
-//! Pure, any thread, does not allocate, cannot fail. Per frame: v = min(V, max(0, 0.10 (alpha - (100 - 0.16 V)))), V -= v,
+//! Pure, on any thread. It does not allocate and cannot fail. In each frame: v = min(V, max(0, 0.10 (alpha - (100 - 0.16 V)))), V -= v,
 //! area = 400 v. There is no noise, no lag and no delay.
 
 /// One pour on simulator a.
@@ -39,7 +39,8 @@ impl PaperPour {
 mod tests {
     use super::*;
 
-    /// Protects the definition: the outflow is linear in angle and remaining volume, 400 px^2 stand for 1 ml, and no more leaves than there is.
+    /// Protects the definition: the outflow is linear in angle and remaining volume, 400 px^2 stand for 1 ml, and no more leaves than there
+    /// is.
     #[test]
     fn flow_is_linear_in_angle_and_remaining_volume() {
         let mut pour = PaperPour::new(300.0);

@@ -1,6 +1,6 @@
 //! Simulator b: a seeded rig (container, liquid, servo, camera) and one pour on it, frame by frame.
 //!
-//! Pure, any thread; the same seeds give the same pour. Allocates when a rig is set up, not in [`RigPour::frame`]. Cannot fail.
+//! Pure, on any thread; the same seeds give the same pour. It allocates when a pour is set up, not in [`RigPour::frame`]. It cannot fail.
 
 use rand::{RngExt, SeedableRng};
 use rand_distr::{Distribution, StandardNormal};

@@ -1,6 +1,7 @@
 //! `trainer check`: says in words what is wrong with a data set, before any training.
 //!
-//! Offline, ordinary thread, allocates. The command fails if it found something, so that scripts can rely on it.
+//! An offline command on an ordinary thread; it allocates. The command fails if something is wrong with an episode or no episode can be
+//! used, so that scripts can rely on it. What is doubtful about the set as a whole is only said.
 
 use serde::Serialize;
 use shared::episode::{Episode, EpisodeRow};
@@ -16,7 +17,7 @@ const UPRIGHT_DEG: f32 = 5.0;
 /// More than this share of lost or clipped frames is worth a line. Chosen by hand; no measurement is recorded.
 const SHARE_MAX: f64 = 0.05;
 
-/// Method paper needs as many episodes. From the prototype's figures for 5 and 10 episodes.
+/// Method `paper` needs at least this many episodes. From the prototype's figures for 5 and 10 episodes.
 const PAPER_NEEDS: usize = 10;
 /// Frame rates that are further apart than this are different ones, Hz. Chosen by hand; no measurement is recorded.
 const RATES_APART_HZ: f64 = 0.5;
@@ -111,7 +112,8 @@ fn set_doubts(episodes: &[TrainingEpisode]) -> Vec<(String, String)> {
     doubts
 }
 
-/// Runs the command. It fails with exit code 1 if it found something, and with 2 if nothing can be read.
+/// Runs the command. It fails with exit code 1 if something is wrong with an episode or none can be used, and with 2 if the data cannot be
+/// read.
 pub fn run(args: &Args) -> Result<(), Failure> {
     let episodes = args.source.read().or_exit(exit::BAD_INPUT)?;
     let findings = check(&episodes);
@@ -127,5 +129,5 @@ pub fn run(args: &Args) -> Result<(), Failure> {
         }
     }
     let wrong = !findings.left_out.is_empty() || findings.doubts.iter().any(|(name, _)| name != "data set") || findings.usable == 0;
-    if wrong { Err(failure(exit::FAILED, "the data set is not as it should be")) } else { Ok(()) }
+    if wrong { Err(failure(exit::FAILED, "the data set is not as it should be; what was found says what to do")) } else { Ok(()) }
 }

@@ -1,6 +1,6 @@
-//! `trainer inspect`: everything in a weight file, so that others can rebuild the policy.
+//! `trainer inspect`: prints everything in a weight file, so that others can rebuild the policy.
 //!
-//! Offline, ordinary thread, allocates. A file that is no weight file of this version is refused with one line.
+//! An offline command on an ordinary thread; it allocates. A file that is no weight file of this version is refused with one line.
 
 use std::path::PathBuf;
 

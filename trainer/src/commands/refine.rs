@@ -1,8 +1,8 @@
 //! `trainer refine`: every pour teaches. It refits calibration, model and network from all weighed episodes so far, pours
 //! included, and writes a new weight file, which a running controller takes between two pours.
 //!
-//! Offline, ordinary threads, allocates. A weight that does not fit the others is asked about. Without a terminal, the command
-//! stops and says how to answer.
+//! An offline command that allocates; it trains on ordinary threads. A weight that does not fit the others is asked about. Without a
+//! terminal, the command stops and says how to answer.
 
 use std::io::{BufRead, IsTerminal, Write};
 

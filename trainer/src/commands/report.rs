@@ -1,7 +1,7 @@
-//! `trainer report`: one self-contained HTML page of trainings and evaluations, plots inline as SVG.
+//! `trainer report`: writes one self-contained HTML page of trainings and evaluations, with the plots inline as SVG.
 //!
-//! Offline, ordinary thread, allocates. It reads the JSON files that `trainer train`, `trainer refine`, `experiments evaluate` and
-//! `experiments reproduce` write; a file of another kind is refused by name.
+//! An offline command on an ordinary thread; it allocates. It reads the JSON files that `trainer train`, `trainer refine`, `experiments
+//! evaluate` and `experiments reproduce` write; a file of another kind is refused by name.
 
 use std::path::PathBuf;
 
@@ -19,7 +19,7 @@ pub struct Args {
     /// JSON files written by `train`, `refine`, `evaluate --json` or `reproduce --json`.
     #[arg(required = true)]
     files: Vec<PathBuf>,
-    /// The page.
+    /// Where the page is written.
     #[arg(long)]
     out: PathBuf,
 }

@@ -1,7 +1,7 @@
 //! `trainer train`: episodes in, one weight file out.
 //!
-//! Offline, ordinary threads, allocates. The whole configuration, the seed, the hash of the data and the learning curve are kept
-//! beside the weight file (`W.json`). The same seed and data give the same bytes on any number of threads. What cannot be read,
+//! An offline command that allocates; it trains on ordinary threads. All options, the seed, the hash of the data and the learning curve are
+//! kept beside the weight file (`W.json`). The same seed and data give the same bytes on any number of threads. What cannot be read,
 //! trained on or written ends the command with one line.
 
 use std::path::{Path, PathBuf};
@@ -30,23 +30,23 @@ pub struct Args {
     /// Number of actions: 2 (+-1 degree) or 21 (Fig. 5).
     #[arg(long, default_value_t = 21, value_parser = parse_actions)]
     actions: u8,
-    /// How d is estimated; fused with methods best and paper, sum with the others, if not given.
+    /// How d is estimated. Without this, it is fused with methods best and paper, and sum with the others.
     #[arg(long, value_enum)]
     estimate: Option<Estimate>,
     #[command(flatten)]
     weight_file: WeightFileArgs,
 }
 
-/// What `trainer train` and `trainer refine` are told alike.
+/// The arguments that `trainer train` and `trainer refine` share.
 #[derive(Debug, clap::Args)]
 pub struct WeightFileArgs {
     /// Seed: the same seed and data give the same bytes.
     #[arg(long, default_value_t = 1)]
     pub seed: u64,
-    /// Configuration of the cell, for the limits; without it the default limits.
+    /// Configuration of the cell, from which the limits are taken; without it, they are the default ones.
     #[arg(long)]
     config: Option<PathBuf>,
-    /// Where the weight file goes; replaced atomically.
+    /// Where the weight file goes. A file that is there is replaced in one step.
     #[arg(long)]
     out: PathBuf,
     /// Print a report as JSON.
@@ -58,7 +58,7 @@ fn parse_actions(text: &str) -> Result<u8, String> {
     match text {
         "2" => Ok(2),
         "21" => Ok(21),
-        _ => Err("2 or 21".into()),
+        _ => Err("give 2 or 21".into()),
     }
 }
 

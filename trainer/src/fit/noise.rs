@@ -1,6 +1,6 @@
 //! How sure the fit is: the noise of frames and of pours, what has changed between pours, and the doubt about the vessel.
 //!
-//! Offline, pure, allocates.
+//! Pure functions of the offline trainer, for any thread. They allocate and do not fail.
 
 use nalgebra::DMatrix;
 use shared::estimator::flow::FlowTables;
@@ -16,8 +16,8 @@ const CHANGE_ERRORS: f64 = 3.5;
 const CAMERA_GAIN_SD_MIN: f64 = 0.012;
 /// How much an episode's delay scatters at least when it is looked for, frames. Tuned on rigs 100 to 123, see docs/LEARNING.md.
 const EXTRA_DELAY_SD_MIN_FRAMES: f64 = 0.2;
-/// As many episodes the expected change of the camera's gain counts for, beside those that were fitted. Chosen by hand; no measurement
-/// is recorded.
+/// Number of episodes for which the expected change of the camera's gain counts, beside those that were fitted. Chosen by hand; no
+/// measurement is recorded.
 const EXPECTED_GAIN_EPISODES: f64 = 3.0;
 /// Share of the posterior's standard deviation that the filter gets for the vessel's scale. Tuned on rigs 100 to 123, see
 /// docs/LEARNING.md.
@@ -59,7 +59,7 @@ impl FrameNoise {
                 }
             }
         }
-        // The median is robust against what is no noise.
+        // The median is robust against what is not noise.
         squares.sort_by(f64::total_cmp);
         let variance = squares.get(squares.len() / 2).copied().unwrap_or(0.01) / MEDIAN_OF_SQUARE;
         Self { area_sd: variance.sqrt(), dropouts: if within > 0.0 { zeros / within } else { 0.0 } }

@@ -1,6 +1,6 @@
 //! One episode made ready for the fit, and its residuals.
 //!
-//! Offline, pure, allocates.
+//! Pure functions of the offline trainer, for any thread. They allocate and do not fail.
 
 use shared::estimator::flow::{CommandHistory, FlowState, FlowTables, FrameOutflow};
 use shared::estimator::{Hold, tilt_z};
@@ -9,14 +9,14 @@ use super::unknowns::{AREA_EXPONENT, LOG_C, OWN, SHARED, TILT_SLOPE};
 use crate::calibration;
 use crate::data::TrainingEpisode;
 
-/// Weight of a scale that shows whole grams, and of the person who reads it, g.
+/// Standard deviation of a weight from a scale that shows whole grams, and of the person who reads it, g.
 const WEIGHT_SD_G: f64 = 0.6;
 /// How much the flow factor differs from pour to pour (log). From the prototype's rigs, whose viscosity changes by this.
 const FLOW_FACTOR_SD: f64 = 0.08;
 /// Share of the strongest flow that is added to flows before their logarithm is taken. Tuned on rigs 100 to 123, see
 /// docs/LEARNING.md.
 const FLOOR_SHARE: f64 = 0.036;
-/// Residuals beyond this grow only with the root, standard deviations. Chosen by hand; no measurement is recorded.
+/// A residual beyond this counts only with its square root, standard deviations. Chosen by hand; no measurement is recorded.
 const HUBER_SDS: f64 = 3.0;
 /// Frames before and after a zero in which flow must be seen for the zero to be a dropout. Chosen by hand; no measurement is
 /// recorded.
@@ -56,7 +56,7 @@ pub struct PreparedEpisode {
 }
 
 impl PreparedEpisode {
-    /// From a usable episode.
+    /// Makes a usable episode ready.
     pub fn new(e: &TrainingEpisode) -> Self {
         let n = e.len();
         let area = &e.area_px2;
@@ -159,7 +159,7 @@ impl PreparedEpisode {
     }
 }
 
-/// A residual that counts with its root beyond [`HUBER_SDS`].
+/// A residual that counts with its square root beyond [`HUBER_SDS`].
 fn huber(r: f64) -> f64 {
     if r.abs() <= HUBER_SDS { r } else { r.signum() * (2.0 * HUBER_SDS * r.abs() - HUBER_SDS * HUBER_SDS).sqrt() }
 }

@@ -1,8 +1,8 @@
 //! What is known of vessels, flow and cameras before any episode, as residuals of the fit.
 //!
-//! Offline, pure, allocates. The vessels are those that a gripper holds. What deviates from them in shape pays little more the
-//! further it goes (Cauchy), so that bottles and jugs are not bent into cups. The flow follows a weir, whose coefficient hardly
-//! changes with the angle.
+//! Pure functions of the offline trainer, for any thread; they allocate and do not fail. The vessels are those that a gripper holds. The
+//! price of another shape grows ever more slowly the further it deviates (Cauchy), so that bottles and jugs are not bent into cups. The
+//! flow follows a weir, whose coefficient hardly changes with the angle.
 
 use shared::estimator::vessel::{KNOTS, KNOTS_DEG};
 
@@ -12,9 +12,9 @@ use super::unknowns::{
 };
 use crate::calibration::EXPONENT_EXPECTED;
 
-/// How far a vessel's walls are from straight ones, at each knot (log). Tuned on rigs 100 to 123, see docs/LEARNING.md.
+/// Standard deviation of a vessel's walls from straight ones, at each knot (log). Tuned on rigs 100 to 123, see docs/LEARNING.md.
 const LOG_SHAPE_SD: [f64; KNOTS] = [0.06, 0.06, 0.06, 0.06, 0.06, 0.08, 0.18, 0.6, 0.6];
-/// How much the slope of the log shape changes from knot to knot, for 10 degrees. From the prototype; no other measurement is
+/// Standard deviation of the change of the log shape's slope from knot to knot, for 10 degrees. From the prototype; no other measurement is
 /// recorded.
 const LOG_SHAPE_BEND_SD: f64 = 0.15;
 /// Radius of a vessel that a gripper holds, mm.
@@ -79,7 +79,7 @@ pub struct HeldCalibration {
 /// Standard deviation of each value around a held calibration. From the prototype; no other measurement is recorded.
 const HELD_SD: f64 = 0.002;
 
-/// A residual that pays little more the further it goes (Cauchy).
+/// A residual whose price grows ever more slowly the larger it is (Cauchy).
 fn cauchy(r: f64) -> f64 {
     r.signum() * 2.0 * (1.0 + r * r / 4.0).ln().sqrt()
 }

@@ -1,6 +1,7 @@
 //! The least-squares problem of a stage of the fit, and Levenberg-Marquardt on it.
 //!
-//! Offline, pure, allocates; deterministic on any number of threads: episodes are worked on in parallel and summed in order.
+//! Pure functions of the offline trainer, which allocate and do not fail. The result is the same on any number of threads, because episodes
+//! are worked on in parallel and summed in order.
 
 use nalgebra::{DMatrix, DVector};
 use rayon::prelude::*;
@@ -23,7 +24,7 @@ const TRIES: usize = 8;
 /// Largest step in an episode's own unknowns, degrees, frames or logarithm. Chosen by hand; no measurement is recorded.
 const OWN_STEP_MAX: f64 = 8.0;
 
-/// Where a solution begins, how long it may take, and when it is good enough.
+/// How long a solution may take, and when it is good enough.
 #[derive(Debug, Clone, Copy)]
 pub struct Effort {
     /// Steps at most.
@@ -133,7 +134,7 @@ impl Problem<'_> {
         normal(&jacobian, base)
     }
 
-    /// Levenberg-Marquardt from `at`, which it moves; answers with the cost that it reached.
+    /// Levenberg-Marquardt from `at`, which it moves. Returns the cost that it reached.
     pub fn solve(&self, at: &mut Unknowns, effort: Effort) -> f64 {
         let mut cost = self.cost(at);
         let mut damping = FIRST_DAMPING;

@@ -1,6 +1,6 @@
 //! The unknowns of the fit as numbers in a row, and the flow model that they stand for.
 //!
-//! Offline, pure.
+//! Pure functions of the offline trainer, for any thread. Only [`Unknowns`] allocates, and nothing fails.
 
 use shared::estimator::flow::{DELAY_MAX_FRAMES, FlowModel, FlowNoise};
 use shared::estimator::vessel::{KNOTS, Vessel};

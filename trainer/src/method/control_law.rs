@@ -1,6 +1,7 @@
 //! A control law with a few parameters, and its search by the cross-entropy method in pours of the fitted model.
 //!
-//! Offline, pure, allocates; deterministic on any number of threads: each pour has its own seed, and sums are taken in order.
+//! Pure functions of the offline trainer, which allocate and do not fail. The result is the same on any number of threads, because each
+//! pour has its own seed and sums are taken in order.
 //!
 //! ```text
 //! vbar   = (v0 + s (v1 + v2)) / (1 + 2 s)                     the last three outflows, v0 the newest
@@ -33,7 +34,7 @@ const CREEP_DEG: f64 = 0.2;
 const MAX_BACKWARD_DEG: f64 = 3.0;
 /// Largest outflow that a searched law may want, ml a frame. Chosen by hand; no measurement is recorded.
 const MAX_FLOW_ML: f64 = 1.6;
-/// A largest outflow from here on means that there is none, as in a PD, ml a frame.
+/// A largest outflow of this or more means that the outflow has no bound, as in a PD, ml a frame.
 const NO_MAX_FLOW_ML: f64 = 100.0;
 /// Fastest forward tilt that a searched law may have, degrees a frame. Chosen by hand; no measurement is recorded.
 const MAX_FORWARD_DEG: f64 = 3.0;
@@ -62,10 +63,10 @@ pub struct ControlLaw {
 }
 
 /// Number of parameters of a [`ControlLaw`].
-const PARAMETERS: usize = 9;
+const LAW_PARAMETERS: usize = 9;
 
 impl ControlLaw {
-    /// Where the search starts: the values of the prototype's recipe. With the fused estimate, the volume in flight is already in d.
+    /// Where the search starts: the values of the prototype's recipe. With the fused estimate, the volume in flight is already taken off d.
     pub fn start(fused: bool) -> Self {
         let (early_ml, in_flight_frames) = if fused { (0.05, 0.02) } else { (0.5, 3.0) };
         Self {
@@ -87,7 +88,7 @@ impl ControlLaw {
     }
 
     /// The parameters' logarithms, in the order of the fields.
-    fn logs(&self) -> [f64; PARAMETERS] {
+    fn logs(&self) -> [f64; LAW_PARAMETERS] {
         [
             self.approach_per_frame,
             self.early_ml,
@@ -103,7 +104,7 @@ impl ControlLaw {
     }
 
     /// The law with these logarithms, its bounds kept.
-    fn from_logs(logs: &[f64; PARAMETERS]) -> Self {
+    fn from_logs(logs: &[f64; LAW_PARAMETERS]) -> Self {
         let [
             approach_per_frame,
             early_ml,
@@ -128,7 +129,7 @@ impl ControlLaw {
         }
     }
 
-    /// The relative angle that the law asks for, degrees; `None`: back. `v_ml` are the last three outflows in ml a frame, the newest
+    /// The relative angle that the law asks for, degrees; `None` means back. `v_ml` are the last three outflows in ml a frame, the newest
     /// first.
     pub fn decide(&self, v_ml: [f64; 3], d_ml: f64) -> Option<f64> {
         let [v0, v1, v2] = v_ml;
@@ -180,7 +181,7 @@ const FIRST_SD: f64 = 0.4;
 const SD_MIN: f64 = 0.03;
 /// Share of the standard deviation before an iteration that is kept after it. Chosen by hand; no measurement is recorded.
 const SD_KEPT: f64 = 0.3;
-/// Share of the elites' standard deviation in the next one: the rest.
+/// Share of the elites' standard deviation in that of the next iteration: the rest.
 const SD_NEW: f64 = 0.7;
 /// Parameters whose logarithm is outside of this range mean "none" and "no bound": they stay where they are.
 const SEARCHED_LOGS: std::ops::Range<f64> = -10.0..4.0;
@@ -198,8 +199,8 @@ pub struct SearchSize {
     pub elites: usize,
 }
 
-/// The cross-entropy method over the law's log-parameters, around `start`. Answers with the law at the last mean, and with the
-/// elites' mean cost after each iteration. `progress` is told the iteration and that cost.
+/// The cross-entropy method over the law's log-parameters, around `start`. Returns the law at the last mean, and the elites'
+/// mean cost after each iteration. `progress` is told the iteration and that cost.
 pub fn search(
     pours: &PossiblePours,
     start: ControlLaw,
@@ -214,7 +215,7 @@ pub fn search(
     let mut sd = free.map(|f| if f { FIRST_SD } else { 0.0 });
     let mut curve = Vec::new();
     for iteration in 0..size.iterations {
-        let mut laws: Vec<[f64; PARAMETERS]> = vec![mean];
+        let mut laws: Vec<[f64; LAW_PARAMETERS]> = vec![mean];
         while laws.len() < size.population {
             let mut law = mean;
             for (log, sd) in law.iter_mut().zip(&sd) {
@@ -234,7 +235,7 @@ pub fn search(
         let mut order: Vec<usize> = (0..laws.len()).collect();
         order.sort_by(|a, b| costs[*a].total_cmp(&costs[*b]));
         let elites = &order[..size.elites.min(order.len())];
-        for k in 0..PARAMETERS {
+        for k in 0..LAW_PARAMETERS {
             let values: Vec<f64> = elites.iter().map(|e| laws[*e][k]).collect();
             let new_mean = values.iter().sum::<f64>() / values.len() as f64;
             let variance = values.iter().map(|v| (v - new_mean).powi(2)).sum::<f64>() / values.len() as f64;

@@ -1,8 +1,8 @@
 //! Distils a control law into the 1909-parameter network: DAgger inside the fitted model.
 //!
-//! Offline, pure, allocates; deterministic on any number of threads. In each round the network pours (in the first, the law
-//! does), the law says at every frame what it would have done, and the network learns all that by cross-entropy against the
-//! nearest of its actions.
+//! Pure functions of the offline trainer, which allocate and do not fail; the result is the same on any number of threads. In each round
+//! the network pours (in the first, the law does), the law says at every frame what it would have done, and the network learns all that by
+//! cross-entropy against the nearest of its actions.
 
 use rand::{RngExt, SeedableRng};
 use rand_pcg::Pcg64Mcg;
@@ -15,9 +15,9 @@ use super::model_pour::{MAX_FRAMES, PossiblePours};
 use crate::actions::Actions;
 use crate::network::{Adam, Example, Network, REPORT_EVERY};
 
-/// Learning rate of the first step; it falls linearly to [`LAST_RATE`]. Chosen by hand; no measurement is recorded.
+/// The part of the learning rate that falls linearly from the first step to 0 at the end. Chosen by hand; no measurement is recorded.
 const FIRST_RATE: f32 = 4e-3;
-/// Learning rate that is left at the last step. Chosen by hand; no measurement is recorded.
+/// The part of the learning rate that stays the same, and is left at the end. Chosen by hand; no measurement is recorded.
 const LAST_RATE: f32 = 1e-4;
 
 /// Size of the distillation.
@@ -42,7 +42,7 @@ impl Size {
 
 /// What is distilled, and into what.
 pub struct Distillation<'a> {
-    /// The pours that are poured.
+    /// The pours that may be poured.
     pub pours: &'a PossiblePours,
     /// The teacher.
     pub law: &'a ControlLaw,
@@ -50,12 +50,12 @@ pub struct Distillation<'a> {
     pub actions: Actions,
     /// How observations become the network's inputs.
     pub scale: InputScale,
-    /// How much of it.
+    /// How much is poured and learned.
     pub size: Size,
 }
 
 impl Distillation<'_> {
-    /// One pour by the network if there is one, else by the law; all frames labelled by the law.
+    /// One pour by the network if there is one, otherwise by the law; the law labels all its frames.
     fn collect(&self, network: Option<&Mlp>, seed: u64) -> Vec<Example> {
         let mut pour = self.pours.draw(seed);
         let mut examples = Vec::with_capacity(256);

@@ -1,7 +1,7 @@
 //! Pours in the fitted flow model: what a law is searched in, and what the network learns on.
 //!
-//! Offline, pure, allocates; a pour is the same for the same seed. Each pour has its own container, liquid, camera and
-//! calibration, drawn from what the fit leaves open.
+//! Pure functions of the offline trainer, for any thread; they allocate and do not fail. A pour is the same for the same seed. Each pour
+//! has its own container, liquid, camera and calibration, drawn from what the fit leaves open.
 
 use nalgebra::DMatrix;
 use rand::{RngExt, SeedableRng};
@@ -48,7 +48,8 @@ const ABOVE_ONSETS_DEG: f64 = 5.0;
 /// Largest distance of an unknown from the fit's value, so that a fit that knows little gives no absurd pours. Chosen by hand; no
 /// measurement is recorded.
 const MOVED_MAX: f64 = 0.6;
-/// Largest error of a calibration in a pour (log), for the same reason. Chosen by hand; no measurement is recorded.
+/// Largest error of a calibration in a pour (log), so that a fit that knows little gives no absurd pours. Chosen by hand; no measurement is
+/// recorded.
 const MISCALIBRATED_MAX: f64 = 0.7;
 /// Largest share of frames in which the extraction loses the stream. Chosen by hand; no measurement is recorded.
 const DROPOUTS_MAX: f64 = 0.2;
@@ -58,24 +59,24 @@ const DROPOUTS_MAX: f64 = 0.2;
 pub struct PossiblePours {
     /// What the fit holds most likely.
     nominal: FlowModel,
-    /// Lower root of the covariance of the fit's unknowns.
+    /// Lower Cholesky factor of the covariance of the fit's unknowns.
     root: DMatrix<f64>,
     /// Angles at which flow may start, lowest and highest, degrees.
     onset_deg: (f64, f64),
     calibration: Calibration,
-    /// Lower root of the covariance of the logarithm of the calibration's factor and of its exponent: (1,1), (2,1), (2,2).
+    /// Lower Cholesky factor of the covariance of the calibration's factor (log) and exponent: its elements (1,1), (2,1) and (2,2).
     calibration_root: [f64; 3],
     /// Share of frames in which the extraction loses the stream.
     dropouts: f64,
     limits: Limits,
     way_back: WayBack,
     rate_hz: f64,
-    /// Whether a law sees the fused d (what is on its way taken off) or the plain sum.
+    /// Whether a law sees the fused d, from which what is on its way is taken off, or that of the plain sum.
     pub fused: bool,
 }
 
 impl PossiblePours {
-    /// From a fit, with the controller's limits and its frames a second.
+    /// The pours of a fit, with the controller's limits and its frames a second.
     pub fn new(fit: &Fit, limits: Limits, rate_hz: f64, fused: bool) -> Self {
         let n = fit.covariance.nrows();
         let mut covariance = fit.covariance.clone();
@@ -168,7 +169,7 @@ pub struct ModelPour<'a> {
 }
 
 impl ModelPour<'_> {
-    /// One frame after the relative angle that was asked for, in degrees (`None`: back). Answers with the d that a law sees, ml.
+    /// One frame after the relative angle that was asked for, in degrees (`None` means back). Returns the d that a law sees, ml.
     pub fn frame(&mut self, dalpha_deg: Option<f64>) -> f64 {
         let alpha_deg = f64::from(match dalpha_deg {
             Some(d) => self.limiter.step(self.limiter.alpha_deg() + d as f32),
@@ -217,7 +218,7 @@ impl ModelPour<'_> {
         self.state.headspace_ml >= self.flow.capacity.lost_ml(self.state.tilt_deg) && self.limiter.rate_deg_s() < 0.0
     }
 
-    /// What will be on the scale minus what is to be there, ml.
+    /// What will be on the scale minus what should be there, ml.
     pub fn error_ml(&self) -> f64 {
         self.poured_ml + self.state.film_ml - self.goal_ml
     }

@@ -2,7 +2,8 @@
 //!
 //! This is not REINFORCE: the model is fitted offline, and the policy is searched in that model.
 //!
-//! Offline, pure, allocates; the same episodes, options and seed give the same weights on any number of threads.
+//! Pure functions of the offline trainer, which allocate and do not fail; the same episodes, options and seed give the same weights on any
+//! number of threads.
 
 use shared::actions::Selection;
 use shared::estimator::flow::WayBack;
@@ -19,7 +20,7 @@ use crate::data::{self, TrainingEpisode};
 use crate::fit::{self, Fit};
 use crate::training::{Estimate, Options, Progress, Trained};
 
-/// The size of the search: so small that a training takes seconds (docs/LEARNING.md, speed). The PD that the policy is compared
+/// The size of the search. It is so small that a training takes seconds (docs/LEARNING.md, speed). The PD that the policy is compared
 /// with is searched in the same way.
 pub const SEARCH: SearchSize = SearchSize { population: 16, pours: 32, iterations: 6, elites: 4 };
 /// The size of the distillation, chosen for the same reason.

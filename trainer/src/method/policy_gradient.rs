@@ -1,7 +1,8 @@
 //! The paper's own training, section 3.3, equation by equation; as printed (`literal`), with the clip that Keras adds
 //! (`literal-clipped`), repaired (`paper`), and its plain relative, behaviour cloning (`cloning`).
 //!
-//! Offline, pure, allocates; the same episodes, options and seed give the same weights on any number of threads.
+//! Pure functions of the offline trainer, which allocate and do not fail; the same episodes, options and seed give the same weights on any
+//! number of threads.
 //!
 //! | | literal | paper |
 //! |---|---|---|
@@ -102,7 +103,7 @@ fn fused_sums(episode: &TrainingEpisode, calibration: &Calibration, mut estimato
 
 /// How states are made of an episode's frames.
 struct Recipe {
-    /// As the paper prints it; else repaired.
+    /// Whether it is as the paper prints it; otherwise it is repaired.
     literal: bool,
     actions: Actions,
     scale: InputScale,
@@ -171,8 +172,8 @@ fn examples(sequences: &[Sequence], method: MethodName) -> Vec<Example> {
     examples
 }
 
-/// Trains a network on random batches by eq. (8) with cross-entropy: the gradient on the logits is lambda R^ (p - I). Answers with
-/// the network and its loss.
+/// Trains a network on random batches by eq. (8) with cross-entropy: the gradient on the logits is lambda R^ (p - I). Returns
+/// the network and its losses.
 fn learn(examples: &[Example], recipe: &Recipe, options: &Options, progress: &dyn Progress) -> (Network, Vec<f32>) {
     let mut rng = Pcg64Mcg::seed_from_u64(options.seed ^ 0xe98);
     let mut network = Network::standard(&mut rng);
@@ -195,7 +196,7 @@ fn learn(examples: &[Example], recipe: &Recipe, options: &Options, progress: &dy
     (network, losses)
 }
 
-/// How a method turns areas into volumes, and how it adds them up; the fit where it needs one.
+/// How a method turns areas into volumes, how it adds them up, and the fit where it needs one.
 fn volumes(episodes: &[TrainingEpisode], options: &Options, progress: &dyn Progress) -> (Calibration, Estimator, Option<Fit>) {
     match options.method {
         MethodName::Literal | MethodName::LiteralClipped => {

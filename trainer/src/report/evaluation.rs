@@ -1,6 +1,6 @@
 //! The part of a page that shows evaluations.
 //!
-//! Pure, any thread, allocates.
+//! Pure functions, for any thread. They allocate and do not fail.
 
 use std::collections::BTreeMap;
 
@@ -110,7 +110,7 @@ fn trace(trace: &Value) -> String {
     figure(&plot("time in s", "degrees, ml, px² / 4", &series, true), &caption)
 }
 
-/// Error against number of episodes, where several evaluations differ in it; else nothing.
+/// Error against number of episodes, if several evaluations differ in that number; otherwise nothing.
 pub fn against_episodes<'a>(values: impl Iterator<Item = &'a Value>) -> String {
     let mut by_method: BTreeMap<String, Vec<(f64, f64)>> = BTreeMap::new();
     for v in values.filter(|v| v["kind"] == "evaluation") {

@@ -1,13 +1,13 @@
 //! The pieces of a self-contained HTML page: tables, facts, figures, and the page around them.
 //!
-//! Pure, any thread, allocates.
+//! Pure functions, for any thread. They allocate and do not fail.
 
 /// Text as it must stand in HTML.
 pub fn escape(text: &str) -> String {
     text.replace('&', "&amp;").replace('<', "&lt;").replace('>', "&gt;").replace('"', "&quot;")
 }
 
-/// A table; the first row is the heading. A screen that is narrower scrolls it.
+/// A table, whose first row is the heading. On a narrower screen it can be scrolled.
 pub fn table(rows: &[Vec<String>]) -> String {
     let mut html = String::from("<div class=scroll><table>");
     let words =

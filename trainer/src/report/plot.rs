@@ -1,6 +1,6 @@
 //! Plots as SVG, to stand inside a page.
 //!
-//! Pure, any thread, allocates.
+//! Pure functions, for any thread. They allocate and do not fail.
 
 use plotters::prelude::*;
 

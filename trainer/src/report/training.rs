@@ -1,6 +1,6 @@
 //! The part of a page that shows a training.
 //!
-//! Pure, any thread, allocates.
+//! Pure functions, for any thread. They allocate and do not fail.
 
 use serde_json::Value;
 

@@ -1,11 +1,11 @@
 //! Pictures for `bench` when the user gives none: a turning chess board, a blue stream of changing size over the lip, and noise.
-//! Allocates; the same pictures at each call.
+//! Runs on the calling thread, allocates, and draws the same pictures at each call. The only failures are OpenCV's.
 
 use opencv::core::{self, CV_8UC3, Mat, Point, Point2f, Scalar, Size, Vector};
 use opencv::imgproc;
 use shared::config::{CameraConfig, CameraSource, ImageConfig, LiquidMethod};
 
-/// Different pictures; they are measured again and again.
+/// Number of different pictures, which are measured again and again. Chosen by hand; no measurement is recorded.
 pub const PICTURES: usize = 40;
 
 /// The camera and the image section that belong to the drawn pictures, at `scale` times 640 pixels of width.

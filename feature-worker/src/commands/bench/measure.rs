@@ -1,4 +1,6 @@
-//! Measures the time of each stage of the extraction. Allocates before the measuring, not in it; runs on the calling thread.
+//! Measures the time of each stage of the extraction.
+//!
+//! Runs on the calling thread. It allocates before it measures and not while it does. Its failures are the extraction's.
 
 use std::time::Instant;
 
@@ -27,7 +29,7 @@ fn percentiles(mut ns: Vec<u64>) -> Percentiles {
     Percentiles { p50: at(0.5), p99: at(0.99), max: at(1.0) }
 }
 
-/// Times of one frame: of its four stages, and of all of it.
+/// Times of one frame: of each of its four stages, and of all four together.
 #[derive(Debug, Clone, Copy, Serialize)]
 pub struct StageTimes {
     /// Reading the rays.
@@ -38,7 +40,7 @@ pub struct StageTimes {
     pub segment: Percentiles,
     /// Finding the line of its edge.
     pub line: Percentiles,
-    /// All of it.
+    /// The whole measurement.
     pub total: Percentiles,
 }
 
@@ -47,7 +49,9 @@ pub fn measure(camera: &CameraConfig, image: &ImageConfig, frames: &[Mat], round
     let mut extractor = Extractor::new(camera, image).map_err(|e| e.to_string())?;
     let mut ns: [Vec<u64>; 5] = std::array::from_fn(|_| Vec::with_capacity(rounds));
     for i in 0..rounds + frames.len() {
-        let Some(frame) = frames.get(i % frames.len().max(1)) else { return Err("no frames to measure".into()) };
+        let Some(frame) = frames.get(i % frames.len().max(1)) else {
+            return Err("there are no frames to measure; give another --input".into());
+        };
         let pixels = frame.data_bytes().map_err(|e| e.message)?;
         let image = Image { width_px: camera.width_px, height_px: camera.height_px, format: PixelFormat::Bgr8, pixels };
         let start = Instant::now();

@@ -1,7 +1,8 @@
 //! The yardstick of `bench`: the same pipeline, written with Python's OpenCV, on the same bytes.
 //!
-//! Python and its OpenCV go into a virtual environment, which is made and kept in a directory that the caller names. Allocates, starts
-//! processes and writes files there. Without network or Python there is no yardstick, and the error says why in one line.
+//! Python and its OpenCV go into a virtual environment, which is made and kept in a directory that the caller names. It runs on the calling
+//! thread, allocates, starts processes and writes files there. Without network or Python there is no yardstick, and the error says why in
+//! one line.
 
 use std::io::Write;
 use std::path::{Path, PathBuf};
@@ -29,7 +30,7 @@ pub fn median_us(venv: &Path, camera: &CameraConfig, image: &ImageConfig, frames
     String::from_utf8_lossy(&output.stdout).trim().parse().map_err(|_| format!("bench.py: {}", last_line(&output.stderr, "no answer")))
 }
 
-/// The virtual environment's interpreter with OpenCV in it. Makes the environment when it is not there.
+/// The interpreter of the virtual environment that has OpenCV in it. Makes the environment when it is not there.
 fn environment(venv: &Path) -> Result<PathBuf, String> {
     let interpreter = venv.join("bin/python");
     let works = || Command::new(&interpreter).args(["-c", "import cv2, numpy"]).output().is_ok_and(|o| o.status.success());
@@ -40,7 +41,7 @@ fn environment(venv: &Path) -> Result<PathBuf, String> {
     let install = ["-m", "pip", "install", "--quiet", "numpy", "opencv-python-headless<5"];
     complete(Command::new("python3").args(["-m", "venv"]).arg(venv))?;
     complete(Command::new(&interpreter).args(install))?;
-    if works() { Ok(interpreter) } else { Err("OpenCV cannot be imported".into()) }
+    if works() { Ok(interpreter) } else { Err(format!("OpenCV cannot be imported; delete {} and try again", venv.display())) }
 }
 
 /// Runs a command to its end; what it says last is the error when it fails.

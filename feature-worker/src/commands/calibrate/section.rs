@@ -1,6 +1,6 @@
 //! The `[image]` table as text, and its place in the configuration's file.
 //!
-//! Allocates. A configuration that would be refused is not written; every failure names the file.
+//! Runs on the calling thread and allocates. A configuration that would be refused is not written; every failure names the file.
 
 use std::path::Path;
 
@@ -25,7 +25,7 @@ pub(super) fn text(image: &ImageConfig) -> String {
     )
 }
 
-/// Puts the `[image]` table of `config` into the file in one step. The rest of the file stays as it is.
+/// Puts the `[image]` table of `config` into the file in one step. The other tables stay as they are.
 pub(super) fn write(path: &Path, config: &Config) -> Result<(), Failure> {
     let fail = |e: String| failure(exit::FAILED, format!("{}: {e}", path.display()));
     let before = std::fs::read_to_string(path).map_err(|e| fail(e.to_string()))?;
@@ -48,7 +48,7 @@ pub(super) fn write(path: &Path, config: &Config) -> Result<(), Failure> {
 /// The file's text with another `[image]` table.
 fn replace(before: &str, section: &str) -> String {
     let mut after = String::new();
-    // What stands between the table's last key and the next table belongs to that one.
+    // Comments and empty lines between the table's last key and the next table belong to the next table.
     let mut between = String::new();
     let mut inside = false;
     for line in before.lines() {

@@ -1,4 +1,4 @@
-//! A table as a Parquet file with one row group. Allocates; the file must not exist yet.
+//! Writes a table as a Parquet file with one row group. Runs on the command's thread and allocates; a file that exists already is an error.
 
 use std::fs::{self, OpenOptions};
 use std::path::Path;

@@ -17,10 +17,10 @@ pub struct Moments {
 }
 
 impl Moments {
-    /// Of no value at all.
+    /// The moments of no values.
     const EMPTY: Self = Self { min: f64::INFINITY, max: f64::NEG_INFINITY, sum: 0.0, squares: 0.0, count: 0 };
 
-    /// Of `values`; those that are not finite are left out.
+    /// The moments of `values`; values that are not finite are left out.
     pub fn of(values: &mut dyn Iterator<Item = f64>) -> Self {
         values.filter(|v| v.is_finite()).fold(Self::EMPTY, Self::with)
     }
@@ -77,7 +77,7 @@ pub struct ImageStatistics {
 }
 
 impl ImageStatistics {
-    /// Of no image.
+    /// The statistics before the first image.
     pub fn new() -> Self {
         Self { width_px: 0, height_px: 0, channels: [Moments::EMPTY; 3] }
     }
@@ -95,7 +95,7 @@ impl ImageStatistics {
         Ok(())
     }
 
-    /// The statistics in the shape of LeRobot's images: channels of one row of one column.
+    /// The statistics in the shape that LeRobot has for images: each channel is one row of one column.
     pub fn json(&self) -> Value {
         let each = |number: fn(&Moments) -> f64| self.channels.iter().map(|m| [[m.get(number)]]).collect::<Vec<_>>();
         let pixels = self.width_px as u64 * self.height_px as u64;

@@ -21,11 +21,11 @@ use crate::vision::picture::bilinear_corner;
 
 /// Room in the memory around the region, squares. Chosen by hand; no measurement is recorded.
 const ROOM_SQUARES: usize = 3;
-/// Known ground of the memory is looked at in one of so many rows a frame. Chosen by hand, for speed.
+/// In each frame, known ground is looked at in one of this many rows of the memory. Chosen by hand, for speed.
 const REFRESH_ROWS: usize = 4;
-/// Points for the motion are chosen anew in one of so many rows of squares a frame. Chosen by hand, for speed.
+/// In each frame, points for the motion are chosen anew in one of this many rows of squares. Chosen by hand, for speed.
 const POINT_ROWS: usize = 4;
-/// Points for the motion have been seen within so many of their row's turns. Tuned.
+/// Points for the motion have been seen within this many of their row's turns. Tuned.
 const POINT_AGE: u8 = 4;
 /// Least change over 2 px at a point for the motion, in units of a calm difference. Tuned.
 const STEEP_LEAST: f32 = 0.6;
@@ -82,7 +82,7 @@ pub(super) struct Background {
     now: Pose,
     /// How the memory lies in the picture with which pictures are compared.
     reference: Pose,
-    /// Pictures that were remembered.
+    /// Number of pictures that were remembered.
     frame: usize,
 }
 
@@ -123,7 +123,7 @@ impl Background {
         })
     }
 
-    /// The picture in the window's middle.
+    /// The pose of a picture in the middle of the window.
     fn home(size: Size, side: usize) -> Pose {
         Pose { map: RigidMap::shift([size.width, size.height].map(|v| 0.5 * (v as f32 - side as f32))), gain: 1.0 }
     }
@@ -152,7 +152,8 @@ impl Background {
         self.now.map.after(&self.reference.map.inverse())
     }
 
-    /// How far the picture's middle has moved since then, and its border against that by turning; px.
+    /// How far the background has moved since the picture with which pictures are compared, px: the shift in the picture's middle, and what
+    /// the turn adds at its border.
     pub(super) fn travelled_px(&self) -> f32 {
         let (moved, middle) = (self.moved(), self.middle());
         let to = moved.apply(middle);
@@ -305,7 +306,7 @@ impl Background {
         Ok(())
     }
 
-    /// Chooses the points for the motion anew in one row of the memory's squares: one in each that the picture shows. A change below
+    /// Chooses the points for the motion anew in one row of the memory's squares: one in each square that the picture shows. A change below
     /// `least` over 2 px may be noise.
     #[inline(always)]
     fn choose_points(&mut self, row: usize, least: f32) -> opencv::Result<()> {

@@ -17,9 +17,10 @@ use crate::vision::picture::median;
 
 // "Tuned" below means that the value was tuned on seeds 101 to 104 of `evaluate-camera`; see docs/VISION.md.
 
-/// Within this distance from the lip the ground tells whether it is even; beyond it, whether it is another picture, px. Tuned.
+/// Distance from the lip, px: nearer, the ground tells whether the background is even; further away, it tells whether this is another
+/// picture. Tuned.
 const MIDDLE_PX: f32 = 60.0;
-/// Least noise, grey levels: rounding to whole ones.
+/// Least noise, grey levels: that of rounding to whole levels.
 const NOISE_LEAST: f32 = 0.8;
 /// Least noise as a share of the background's brightness, because the exposure is not known better. Tuned.
 const NOISE_SHARE: f32 = 0.012;
@@ -37,8 +38,8 @@ const WET_FROM: f32 = 2.2;
 const WET_SPAN: f32 = 2.0;
 /// A difference up to this, in units of the noise, is still background. Tuned.
 pub(super) const CALM: f32 = 5.0;
-/// A difference from the moved earlier picture of this size, in units of the noise, is neither explained nor unexplained, and it takes as
-/// much more to be fully so. Tuned.
+/// A difference from the moved earlier picture of this size, in units of the noise, is neither explained nor unexplained.
+/// Twice this is fully unexplained, and no difference is fully explained. Tuned.
 const UNEXPLAINED_FROM: f32 = 2.0;
 /// Background that has moved by more than this since the earlier picture is told from what stands still, px. Tuned.
 const MOVES_PX: f32 = 1.2;

@@ -5,9 +5,9 @@
 
 use opencv::core::Vec4b;
 
-/// Pixels that are looked at together. Chosen by hand, for speed.
+/// Number of pixels that are looked at together. Chosen by hand, for speed.
 pub(super) const RUN: usize = 32;
-/// What is hidden is forgotten when its row's turn has come so many times. Tuned on seeds 101 to 104 of `evaluate-camera`, see
+/// What is hidden is forgotten when its row's turn has come this many times. Tuned on seeds 101 to 104 of `evaluate-camera`, see
 /// docs/VISION.md.
 const FORGOTTEN: u8 = 26;
 /// How fast the memory follows where it fits what is seen, of 256. Tuned as [`FORGOTTEN`] was.
@@ -60,8 +60,8 @@ impl SmallPicture<'_> {
     }
 }
 
-/// The columns of a row of the memory, from the first to before the second, in which it is surely dry. All three hold all columns where no
-/// stream is or was just before.
+/// The columns of a row of the memory, from the first to before the second, in which it is surely dry. All three hold every column when no
+/// stream is seen, now or just before.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct DrySpans {
     /// To the right of the container's left side.

@@ -1,7 +1,7 @@
 //! The lines from axis to axis that are tried for the stream's outline, and the best of them.
 //!
-//! Of about 800 lines the best has most of the evidence just inside and none outside. A line goes on near where the stream was, in the
-//! same shape and with the same band along it.
+//! Of about 800 lines the best has most of the evidence just inside and none outside. The line of a stream that goes on lies near the
+//! stream's last line, with nearly the same shape and the same band along it.
 //!
 //! Called on the extraction thread, within a `pulp` dispatch: what is marked `inline(always)` runs with the processor's widest registers.
 //! Nothing is allocated after the start. The only failures are OpenCV's.
@@ -16,7 +16,7 @@ use crate::vision::geometry::{Axes, distance};
 
 // "Tuned" below means that the value was tuned on seeds 101 to 104 of `evaluate-camera`; see docs/VISION.md.
 
-/// Distances on either axis that are tried. Chosen by hand: they reach across the region.
+/// Number of distances from the lip that are tried on each axis. Chosen by hand: they reach across the region.
 const LEGS: usize = 41;
 /// The shortest distance on an axis that is tried, px. Tuned.
 const LEG_FIRST_PX: f32 = 6.5;
@@ -26,8 +26,8 @@ const LEG_FACTOR: f32 = 1.08;
 const LEGS_FLAT: f32 = 4.0;
 /// Largest ratio of the leg on the y-axis to that on the x-axis. Tuned.
 const LEGS_STEEP: f32 = 2.0;
-/// Least evidence of a piece of the line that counts as edge. Tuned.
-const PIECE: f32 = 0.35;
+/// Least evidence of a sample of the line that counts as edge. Tuned.
+const EDGE_LEAST: f32 = 0.35;
 /// Weight of the share of the line that has an edge. Tuned.
 const EDGE_WEIGHT: f32 = 0.7;
 /// Weight of lying further out, per unit of the logarithm of the distance, because there are edges within the water too. Tuned.
@@ -41,22 +41,22 @@ const GROWS_MOST: f32 = 0.7;
 /// A stream changes its shape by about this from frame to frame: the logarithm of the legs' ratio. Tuned; in the renderer the ratio changes
 /// by no more than 15 % a frame.
 const TURNS: f32 = 0.2;
-/// A stream that was seen once changes its shape by so much more, and one that was seen n times by an n-th of this. Tuned.
+/// A stream that was seen once changes its shape by this much more, and one that was seen n times by an n-th of this. Tuned.
 const TURNS_YOUNG: f32 = 0.3;
-/// A stream changes its shape by no more than so many times its usual change. Tuned.
+/// A stream changes its shape by no more than this many times its usual change. Tuned.
 const TURNS_MOST: f32 = 2.5;
 /// Weight of an even band along the line, and of the same band as before. Tuned.
 const BAND: f32 = 0.5;
-/// The edge on a ray is looked for within so many samples of the line. Tuned.
+/// The edge on a ray is looked for within this many samples of the line. Tuned.
 const EDGE_REACH: usize = 2;
 
 /// The lines that are tried, and where each lies on the rays.
 pub(super) struct Lines {
-    /// In the small region.
+    /// The axes in the small region.
     axes: Axes,
     /// Each line's cuts with the x-axis and the y-axis, px.
     legs_px: Vec<[f32; 2]>,
-    /// Their logarithms.
+    /// The logarithms of `legs_px`.
     log_legs: Vec<[f32; 2]>,
     /// Each line's sample on each ray, counted over all rays.
     cells: Vec<[u16; RAYS]>,
@@ -64,7 +64,7 @@ pub(super) struct Lines {
     weights: Vec<[f32; RAYS]>,
 }
 
-/// What two lines have in common, from the line before to this one.
+/// How a line differs from the stream's line in the last frame.
 #[derive(Debug, Clone, Copy)]
 struct Change {
     /// Growth: the logarithm of the root of the legs' product.
@@ -174,7 +174,7 @@ impl Lines {
                 let (value, known) = (evidence.value()[at], evidence.known()[at]);
                 found.score += weight * value;
                 found.known += weight * known;
-                found.edge_share += if value > PIECE { weight } else { 0.0 };
+                found.edge_share += if value > EDGE_LEAST { weight } else { 0.0 };
             }
             let outer = self.outer(line);
             let stay = change.bonus();
@@ -204,7 +204,7 @@ impl Lines {
                 let (value, known) = (evidence.value()[at], evidence.known()[at]);
                 found.score += weight * value;
                 found.known += weight * known;
-                found.edge_share += if value > PIECE * known { weight * known } else { 0.0 };
+                found.edge_share += if value > EDGE_LEAST * known { weight * known } else { 0.0 };
             }
             if found.known < BEGIN_GROUND {
                 continue;
@@ -267,13 +267,13 @@ impl Lines {
             let row = &evidence.value()[ray * SAMPLES..][..SAMPLES];
             let range = middle.saturating_sub(EDGE_REACH)..(middle + EDGE_REACH + 1).min(SAMPLES);
             let best = range.clone().map(|i| row[i]).fold(f32::MIN, f32::max);
-            // Of equal neighbours the middle is taken, and without an edge here the line itself.
+            // Of equal neighbours the middle is taken; without an edge here, the line itself is.
             let (mut sum, mut count) = (0usize, 0usize);
-            for i in range.filter(|i| best > PIECE && row[*i] >= best - 1e-6) {
+            for i in range.filter(|i| best > EDGE_LEAST && row[*i] >= best - 1e-6) {
                 (sum, count) = (sum + i, count + 1);
             }
             let sample = if count == 0 { middle as f32 } else { sum as f32 / count as f32 };
-            // Half a step further out is the edge.
+            // The edge lies half a step further out.
             let (at, part) = ((sample + 0.5) as usize, (sample + 0.5).fract());
             let [before, after] = [at, at + 1].map(|r| rays.radii_px[r.min(SAMPLES - 1)]);
             let radius = before + part * (after - before);

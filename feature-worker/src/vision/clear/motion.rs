@@ -27,9 +27,9 @@ pub(super) const NEIGHBOURHOOD_BEFORE: usize = ROOM;
 const POINTS_LEAST: usize = 30;
 /// With fewer steep points the background is an even wall, and these are drops or the stream: they do not tell its motion. Tuned.
 const STEEP_POINTS_LEAST: usize = 24;
-/// The motion is looked for from rest too when it leaves so many times more unexplained than the last one did. Tuned.
+/// The motion is looked for from rest too when it leaves more than this many times as much unexplained as the last one did. Tuned.
 const LEFT_GROWS: f32 = 1.2;
-/// A motion found from rest is taken when it leaves less than this share of what the other one leaves. Tuned.
+/// A motion found from rest is taken when it leaves less unexplained than this share of what the other one leaves. Tuned.
 const REST_BETTER: f32 = 0.97;
 /// Largest number of Gauss-Newton steps. Chosen by hand; no measurement is recorded.
 const STEPS_MOST: usize = 8;
@@ -92,7 +92,7 @@ struct Motion {
     turn: f32,
 }
 
-/// A motion with what it leaves.
+/// A motion, and what it leaves unexplained.
 #[derive(Debug, Clone, Copy)]
 struct Fit {
     /// The motion itself.
@@ -125,7 +125,7 @@ pub(super) struct MotionFinder {
     left: f32,
     /// The picture in grey at the working size. Kept from frame to frame.
     grey: Mat,
-    /// The same at half the working size.
+    /// The grey picture at half the working size.
     half: Mat,
     /// The points' errors, then their sizes; grey levels.
     scratch: Vec<f32>,
@@ -161,7 +161,8 @@ impl MotionFinder {
         }
     }
 
-    /// The motion of the points to the BGRA picture `now`, and the exposure against the memory, which was `gain` in the last picture.
+    /// The motion of the points from the last picture to the BGRA picture `now`, and the exposure against the memory, which was `gain` in
+    /// the last picture.
     #[inline(always)]
     pub(super) fn find(&mut self, now: &Mat, gain: f32) -> opencv::Result<(RigidMap, f32)> {
         imgproc::cvt_color_def(now, &mut self.grey, imgproc::COLOR_BGRA2GRAY)?;
@@ -230,7 +231,7 @@ impl MotionFinder {
     }
 }
 
-/// The grey level at a place between pixels. There is none outside of the picture.
+/// The grey level at a place between pixels; `None` outside of the picture.
 #[inline(always)]
 fn grey_at(picture: &[u8], width: usize, height: usize, x: f32, y: f32) -> Option<f32> {
     let (column, row, fx, fy) = bilinear_corner(x, y, width, height)?;

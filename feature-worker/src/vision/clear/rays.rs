@@ -1,7 +1,7 @@
 //! The rays along which clear water is looked for, and arithmetic on all samples of a ray at once.
 //!
-//! The small functions are inlined into the evidence, which runs with the processor's widest registers; they have no branches for that
-//! reason. Nothing is allocated after the start and nothing fails.
+//! The small functions are inlined into the evidence, which runs with the processor's widest registers; for that reason they have no
+//! branches. Called on the extraction thread. Nothing is allocated after the start and nothing fails.
 
 use opencv::core::{Size, Vec4b};
 
@@ -136,7 +136,7 @@ pub(super) fn sizes(c: &Colours) -> Row {
 }
 
 /// For colours that were mixed with unknown ones: the factors that make them whole again, times `gain`, and whether they are known (1 or
-/// 0). Colours of which less than a half is known are not.
+/// 0). Colours of which less than half is known count as unknown.
 #[inline(always)]
 pub(super) fn whole(row: &[Vec4b], gain: f32) -> (Row, [f32; SAMPLES + 1]) {
     let (mut factors, mut known) = ([0.0; SAMPLES], [0.0; SAMPLES + 1]);
@@ -148,7 +148,8 @@ pub(super) fn whole(row: &[Vec4b], gain: f32) -> (Row, [f32; SAMPLES + 1]) {
     (factors, known)
 }
 
-/// How far colours lie from each other, grey levels, each with its neighbour along the ray, where both are `shown`.
+/// How far the colours of two rows lie from each other where they are `shown`, grey levels. The difference at each sample is averaged with
+/// that at the next one, if that is shown too.
 #[inline(always)]
 pub(super) fn apart(a: &Colours, b: &Colours, shown: &[f32; SAMPLES + 1]) -> Row {
     let mut away = [[0.0; SAMPLES + 1]; 3];

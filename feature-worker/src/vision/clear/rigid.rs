@@ -1,4 +1,4 @@
-//! Rigid maps of the plane: a turn and a shift. Pure functions.
+//! Rigid maps of the plane: a turn and a shift. Pure functions, called on the extraction thread; nothing allocates and nothing fails.
 
 /// A turn about the origin followed by a shift.
 #[derive(Debug, Clone, Copy)]

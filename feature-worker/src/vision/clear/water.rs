@@ -1,7 +1,7 @@
 //! Whether there is water: when a stream begins, goes on and ends.
 //!
-//! Beginning a stream takes more evidence than going on. A line that moves with the background, or is at rest with it, is none; a line of
-//! the small picture that the full picture does not confirm is none either.
+//! Beginning a stream takes more evidence than going on. A line that moves with the background, or is at rest with it, is no
+//! stream; nor is a line of the small picture that the full picture does not confirm.
 //!
 //! Called on the extraction thread. Nothing is allocated and nothing fails.
 
@@ -13,7 +13,7 @@ use shared::messages::Doubt;
 
 /// Least score of a line to begin a stream on ground of which nothing is known. Tuned.
 const BEGIN_SCORE: f32 = 0.6;
-/// On known ground that score is less by this. Tuned.
+/// On known ground the least score is lower by this. Tuned.
 const BEGIN_KNOWN: f32 = 0.25;
 /// Least share of a line's length with an edge to begin a stream. Tuned.
 const BEGIN_EDGE: f32 = 0.5;
@@ -27,26 +27,26 @@ const GO_ON_KNOWN: f32 = 0.5;
 const GO_ON_EDGE: f32 = 0.6;
 /// Above this share of known ground a low score means that it is dry. Tuned.
 const SURELY_KNOWN: f32 = 0.5;
-/// A line that the moved earlier picture explains by more than this is background; from -1 (explained) to 1. Tuned.
+/// A line is background when the moved earlier picture leaves less of it unexplained than this, from -1 (nothing) to 1 (all). Tuned.
 const EXPLAINED: f32 = -0.4;
-/// A line that the moved earlier picture explains by less than this goes on as a stream; from -1 (explained) to 1. Tuned.
+/// A line goes on as a stream when the moved earlier picture leaves more of it unexplained than this, from -1 (nothing) to 1 (all). Tuned.
 const UNEXPLAINED: f32 = 0.3;
 /// The earlier picture tells something of a line when the background has moved by more than this across it, px. Tuned.
 const TELLS_PX: f32 = 0.6;
-/// With less evidence than this, no line goes on because it is unexplained. Tuned.
+/// A line goes on for being unexplained only with more evidence than this, and on known ground a lower score is surely no stream. Tuned.
 const HELD: f32 = 0.25;
 /// Background that has moved by less since the earlier picture is at rest, px: then what changes is a stream. Tuned.
 const REST_PX: f32 = 0.2;
-/// A stream in which nothing changes for so many frames, before a background at rest, is none. Tuned; that a stream at rest changes from
-/// frame to frame was shown in the renderer only.
+/// A stream in which nothing changes for more than this many frames, in front of a background at rest, is no stream. Tuned; that a steady
+/// stream changes from frame to frame was shown in the renderer only.
 const STILL_FRAMES: u32 = 12;
 /// The earlier picture tells something of a line when it shows more than this share of it. Chosen by hand; no measurement is recorded.
 const SHOWN_LEAST: f32 = 0.5;
-/// Far from the lip, no more of the background than this share differs from the memory, or it is another picture. Tuned.
+/// When more than this share of the background far from the lip differs from the memory, it is another picture. Tuned.
 const STRANGE: f32 = 0.3;
-/// After so many frames of another picture, that is the background. Tuned.
+/// After more than this many frames of another picture, that picture becomes the background. Tuned.
 const STRANGE_FRAMES: u32 = 15;
-/// For so many frames after a stream the place where it was is not taken for background at once. Tuned.
+/// For this many frames after a stream, the place where it was is not taken for background at once. Tuned.
 const AFTERWARDS: u32 = 3;
 /// How fast the colour of the band along the outline follows, a frame. Tuned.
 const BAND_FOLLOWS: f32 = 0.5;
@@ -66,8 +66,8 @@ const BEAD_PX2: f32 = 24.0;
 const BEGIN_CONFIDENCE: f32 = 0.25;
 /// Least confidence of the full picture's line to go on. Tuned.
 const GO_ON_CONFIDENCE: f32 = 0.1;
-/// Mean grey level below which the least confidence is smaller, in proportion: in dim light all contrast is. Tuned; before a dark wall the
-/// picture is not dim, but is taken for it.
+/// Mean grey level below which the least confidence is smaller, in proportion: in dim light all contrast is smaller. Tuned; a
+/// well-lit picture of a dark wall is mistaken for a dim one.
 const LIT_LEVEL: f32 = 130.0;
 /// The least confidence is never smaller than this share of its usual value. Tuned.
 const LIT_LEAST: f32 = 0.4;
@@ -90,7 +90,7 @@ pub(super) struct Stream {
 pub(super) struct Candidate {
     /// Its number among the lines that are tried.
     pub(super) line: usize,
-    /// By this the lines are compared.
+    /// The number by which lines are compared.
     pub(super) total: f32,
     /// What its samples say.
     pub(super) evidence: f32,
@@ -201,9 +201,9 @@ impl Water {
         if let Some((found, legs_px, earlier)) = best {
             self.still_frames = if earlier.is_still() { self.still_frames + 1 } else { 0 };
             let background = match self.stream {
-                // The best line of a stream is not one that moves with the background.
+                // While a stream is seen, lines that move with the background were left out when the best one was chosen.
                 Some(_) => self.still_frames > STILL_FRAMES,
-                // At rest nothing begins without a change.
+                // In front of a background at rest, no stream begins without a change.
                 None => earlier.shows_line() || self.still_frames > 0,
             };
             surely_none = background || (found.known > SURELY_KNOWN && found.score < HELD);
