@@ -47,8 +47,8 @@ pub struct Service<'a> {
     journal: Option<Sender<Box<Tick>>>,
     latest: Option<(Telemetry, Counters)>,
     outcomes: VecDeque<Outcome>,
-    /// The requests whose orders are in the queue, in the same order, each with its episode's number (0 for an abort); `None` for an
-    /// order that is the service's own.
+    /// The requests whose orders are in the queue, in the same order, each with its episode's number (0 for an abort); `None` for an order
+    /// that is the service's own.
     waiting: VecDeque<Option<(Asked, u64)>>,
     next_episode: u64,
 }

@@ -1,5 +1,5 @@
-//! Measures the time of the network's forward pass in the form that is chosen at run time. The yardstick beside it is the portable form,
-//! a plain column-wise loop.
+//! Measures the time of the network's forward pass in the form that is chosen at run time. The yardstick beside it is the portable form, a
+//! plain column-wise loop.
 //!
 //! `cargo bench -p shared` times batches of both forms in turns, and prints nanoseconds a call. With `--calls N [portable]` it makes N
 //! calls and prints the sum of their results, for a profiler that counts instructions.

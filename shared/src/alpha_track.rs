@@ -66,8 +66,8 @@ impl<const N: usize> AlphaTrack<N> {
         Self { commanded: AngleHistory::new(), measured: AngleHistory::new() }
     }
 
-    /// Adds a tick at `at_ns` with its commanded alpha, and the alpha that the robot reported at `robot_at_ns` (0 if it has never
-    /// reported any).
+    /// Adds a tick at `at_ns` with its commanded alpha, and the alpha that the robot reported at `robot_at_ns` (0 if it has never reported
+    /// any).
     pub fn push(&mut self, at_ns: u64, alpha_deg: f32, robot_at_ns: u64, alpha_measured_deg: f32) {
         self.commanded.push(at_ns, alpha_deg);
         if robot_at_ns > 0 {

@@ -87,8 +87,8 @@ pub fn directory(name: &str) -> PathBuf {
     PathBuf::from(format!("/tmp/decant_{name}"))
 }
 
-/// Removes every file of the cell `name`, also those that a killed process left. Only whoever started the cell may call this, after
-/// all of its processes have ended; a cell that still runs would be torn apart. What cannot be removed stays.
+/// Removes every file of the cell `name`, also those that a killed process left. Only whoever started the cell may call this, after all of
+/// its processes have ended; a cell that still runs would be torn apart. What cannot be removed stays.
 pub fn remove_files(name: &str) {
     let prefix = format!("decant_{name}_");
     for entry in std::fs::read_dir("/dev/shm").into_iter().flatten().flatten() {

@@ -1,9 +1,9 @@
 //! Fixed-layout messages that cross shared memory.
 //!
 //! Every struct is `repr(C)` without padding, carries [`LAYOUT_VERSION`], and is plain data that another process may read at any time.
-//! The byte tables are in `ARCHITECTURE.md` and are held by tests below. All times are CLOCK_MONOTONIC in nanoseconds. They are used
-//! in the controller's loop. Nothing here allocates, except [`Telemetry::weights`], and nothing fails: an unknown code is read as the most
-//! careful meaning.
+//! The byte tables are in `ARCHITECTURE.md` and are held by tests below. All times are CLOCK_MONOTONIC in nanoseconds. The messages are used
+//! in the controller's loop. Nothing here allocates, except [`Telemetry::weights`], and nothing fails: an unknown code is read as the most careful
+//! meaning.
 
 use iceoryx2::prelude::ZeroCopySend;
 

@@ -105,8 +105,7 @@ thread_local! {
     static ALLOCATIONS: Cell<u64> = const { Cell::new(0) };
 }
 
-/// Number of heap allocations and frees of the calling thread since it started; always 0 unless the binary installs
-/// [`CountingAllocator`].
+/// Number of heap allocations and frees of the calling thread since it started; always 0 unless the binary installs [`CountingAllocator`].
 pub fn allocations() -> u64 {
     ALLOCATIONS.try_with(Cell::get).unwrap_or(0)
 }

@@ -1,7 +1,6 @@
 //! The loop's promises over more than 10,000 ticks of the real processes, at 125 Hz instead of 30 so that it takes 90 s: no
-//! allocation, no page fault, no system call that docs/REALTIME.md does not list, weights that are written 100 times
-//! a second without a trace in the pour in progress, and the same inputs giving the same bits again. A second test shows violations to the
-//! checks.
+//! allocation, no page fault, no system call that docs/REALTIME.md does not list, weights that are written 100 times a second without a
+//! trace in the pour in progress, and the same inputs giving the same bits again. A second test shows violations to the checks.
 //!
 //! The tests need `strace` (scripts/test installs it) and permission to trace their own children.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::too_many_lines)]

@@ -360,8 +360,8 @@ fn an_unused_program_ends() {
     assert_eq!(robot.machine.robot.servo.actual_q, STANCE_RAD);
 }
 
-/// Protects people after a pause: resumed after a protective stop at full flow, with nobody streaming, it comes upright from
-/// where it stopped and ends.
+/// Protects people after a pause: resumed after a protective stop at full flow, with nobody streaming, it comes upright from where it
+/// stopped and ends.
 #[test]
 fn resumed_after_a_protective_stop_it_comes_upright() {
     let mut robot = Robot::ready(Series::Cb3);

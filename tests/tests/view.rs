@@ -57,8 +57,8 @@ impl Drop for View {
     }
 }
 
-/// Protects a pour that people watch: the page shows the live picture while the worker works, and both see the same frames. What the
-/// view costs the worker is printed (`--show-output`), measured in turns without and with it.
+/// Protects a pour that people watch: the page shows the live picture while the worker works, and both see the same frames. What the view
+/// costs the worker is printed (`--show-output`), measured in turns without and with it.
 #[test]
 fn the_view_shows_what_the_worker_measures() {
     let mut cell = CellUnderTest::start(|_| {});

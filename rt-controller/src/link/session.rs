@@ -15,8 +15,7 @@ use super::wire::{self, Inbox, Outputs};
 use super::{Mode, RobotState, TiltJoint};
 
 /// Largest number of reads in one [`Session::poll`], so that a robot that floods the link cannot hold the loop: 16 of 64 KiB are 10 s of
-/// packets at
-/// 500 Hz.
+/// packets at 500 Hz.
 const MOST_READS: usize = 16;
 
 /// Why a session is over.

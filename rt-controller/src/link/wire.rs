@@ -59,8 +59,7 @@ impl Default for Inbox {
 }
 
 impl Inbox {
-    /// Makes an empty inbox, which is its only allocation. It holds one byte more than the largest packet, so that there is always
-    /// space.
+    /// Makes an empty inbox, which is its only allocation. It holds one byte more than the largest packet, so that there is always space.
     pub fn new() -> Self {
         Self { buffer: vec![0; LARGEST + 1].into_boxed_slice(), start: 0, end: 0 }
     }

@@ -263,8 +263,8 @@ impl FlowState {
         FrameOutflow { over_lip_ml, leaves_ml: self.release(over_lip_ml, flow.model.film_share) }
     }
 
-    /// The second half of [`FlowState::step`]: takes what passes the lip out of the vessel and through the film, and returns
-    /// what leaves the lip, ml.
+    /// The second half of [`FlowState::step`]: takes what passes the lip out of the vessel and through the film, and returns what leaves
+    /// the lip, ml.
     #[inline]
     pub fn release(&mut self, over_lip_ml: f64, film_share: f64) -> f64 {
         self.headspace_ml += self.capacity_scale * over_lip_ml;

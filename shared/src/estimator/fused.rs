@@ -2,8 +2,7 @@
 //!
 //! How far the tilt must go to keep the flow alive tells how much has left, whatever the camera's gain is. An extended Kalman
 //! filter on the [flow model](super::flow) weighs the two (`filter.rs`). It runs in the controller's loop and is pure: its size is
-//! fixed, it does not allocate, and it does not panic. It takes about 5 kflop a frame. An impossible measurement counts as a lost
-//! frame.
+//! fixed, it does not allocate, and it does not panic. It takes about 5 kflop a frame. An impossible measurement counts as a lost frame.
 //!
 //! The filter starts with the first frame that shows flow. Before that, only the tilt is followed.
 //!
@@ -41,8 +40,7 @@ const USUAL_DRIFT: Drift = Drift { headspace_sd_ml: 0.05, log_flow_factor_sd: 0.
 /// The same as [`USUAL_DRIFT`] where the geometry or the delay is not to be trusted. Tuned on rigs 100 to 123, see docs/LEARNING.md.
 const DISTRUSTED_DRIFT: Drift = Drift { headspace_sd_ml: 0.2, log_flow_factor_sd: 0.02 };
 
-/// The noise to allow for where the camera or the liquid has changed, from the usual noise. Tuned on rigs 100 to 123, see
-/// docs/LEARNING.md.
+/// The noise to allow for where the camera or the liquid has changed, from the usual noise. Tuned on rigs 100 to 123, see docs/LEARNING.md.
 fn noise_if_changed(usual: FlowNoise) -> FlowNoise {
     FlowNoise { log_camera_gain_sd: (3.0 * usual.log_camera_gain_sd).max(0.1), log_flow_factor_sd: 2.0 * usual.log_flow_factor_sd, ..usual }
 }
@@ -289,8 +287,8 @@ mod tests {
         (truth, summed, filter.poured_ml())
     }
 
-    /// Protects the three explanations: each pour makes the one that fits it more likely than it was before. Once nothing has
-    /// changed, once the camera's gain, and once the picture comes late.
+    /// Protects the three explanations: each pour gives more weight to the one that fits it than the other pours do. In the first nothing
+    /// has changed, in the second the camera's gain has, and in the third the picture comes late.
     #[test]
     fn a_pour_moves_weight_to_what_explains_it() {
         let of = |gain: f64, late: usize| {

@@ -14,8 +14,8 @@
 //!
 //! w_0 and A_0 are those of a round vessel with straight walls, where `w_0 = integral of (distance from the lip) dA` over the
 //! free surface. w_even spreads the same capacity evenly over all tilts: beyond the horizontal a beaker is empty, but a bottle
-//! is not. s says how the real vessel differs. Where it holds more than the straight vessel, its surface is larger too, by the
-//! power 2/3 that relates an area to a volume.
+//! is not. s says how the real vessel differs. Where it holds more than the straight vessel, its surface is larger too, by the power 2/3
+//! that relates an area to a volume.
 //!
 //! | symbol | name |
 //! |---|---|

@@ -1,8 +1,8 @@
 //! The fault matrix of the robot link: each fault comes at rest, while tilting out, at full flow and while returning.
 //!
-//! The built `rt-controller run` runs as a process, with real shared memory, and the uploaded program runs on the simulated UR5
-//! controller. Only the liquid is a formula here: its flow grows with the tilt that the joint really has. Every test prints its rows of the
-//! table (`cargo test -p tests --test robot_faults -- --show-output`); times are those of the robot's own clock.
+//! The built `rt-controller run` runs as a process, with real shared memory, and the uploaded program runs on the simulated UR5 controller.
+//! Only the liquid is a formula here: its flow grows with the tilt that the joint really has. Every test prints its rows of the table
+//! (`cargo test -p tests --test robot_faults -- --show-output`); times are those of the robot's own clock.
 //!
 //! Each fault and moment is tried on a CB3 and on an e-Series. No command to servoj may exceed the limits. The container must be upright
 //! and at rest within the bound, or at rest where the robot's own safety stops it. The result must name the reason, and after recovery the
