@@ -2,7 +2,7 @@
 //!
 //! You learn from it what [`Core::step`] needs in each tick, which is the time, the newest measurements and the robot's state, and what
 //! it answers, which is the angle to command and the result of a pour that has ended. The simulator below is a cylinder that leaks the
-//! faster the further it is tilted, a robot that follows at once, and a camera that sees a stream's area. Replace it by your own.
+//! faster the further it is tilted, a robot that follows at once, and a camera that sees a stream's area. Replace it with your own.
 //!
 //! Run it with `cargo run --release -p rt-controller --example drive_core`.
 
@@ -33,11 +33,11 @@ struct Cylinder {
 }
 
 impl Cylinder {
-    /// One period at the commanded angle: what the camera then sees.
+    /// Moves on by one period at the commanded angle, and gives what the camera then sees.
     fn step(&mut self) -> Feature {
         self.now_ns += PERIOD_NS;
         self.frame += 1;
-        // The lip is reached at 40 degrees; what has been poured must be tilted for.
+        // A full cylinder begins to pour at 40 degrees; the more has left it, the further it must be tilted.
         let lip_deg = 40.0 + 0.2 * self.poured_ml;
         let outflow_ml = 0.04 * (self.alpha_deg - lip_deg).max(0.0);
         self.poured_ml += outflow_ml;
@@ -54,8 +54,8 @@ impl Cylinder {
     }
 }
 
-/// Weights made by hand: the network always asks for the action i = 3, which is 0.45 degrees a frame. The agent turns back by itself
-/// when the goal is reached. A trained network would slow down before.
+/// Makes weights by hand. The network always asks for the action i = 3, which is 0.45 degrees a frame. The agent turns back by itself when
+/// the goal is reached. A trained network would slow down before that.
 fn weights() -> Weights {
     let mut network = Mlp::ZERO;
     network.b3[13] = 1.0;
@@ -94,7 +94,7 @@ pub fn pour(goal_ml: f32) -> (Outcome, f32) {
     let mut cylinder = Cylinder { now_ns: 1_000_000_000, frame: 0, alpha_deg: 0.0, poured_ml: 0.0 };
     loop {
         let feature = cylinder.step();
-        // The first tick finds the robot well and upright; then the goal can be set.
+        // In the first tick the core finds that the robot may move and is upright; then the goal can be set.
         let order = (cylinder.frame == 2).then_some(Order::Pour { episode: 1, goal_ml });
         let robot = Robot { hindrance: None, alpha_deg: cylinder.alpha_deg, at_ns: cylinder.now_ns };
         let output = core.step(&Input { now_ns: cylinder.now_ns, features: &[feature], robot, order });

@@ -1,6 +1,6 @@
 //! The clients' side of the controller's service `control`: one request, one answer; and the recorder's reports.
 //!
-//! Runs in ordinary threads of other processes; allocates, and blocks until there is an answer or a time limit has passed. Each failure
+//! It runs in ordinary threads of other processes, allocates, and blocks until there is an answer or a time limit has passed. Each failure
 //! is one line that says what to do.
 
 use std::path::PathBuf;
@@ -18,11 +18,12 @@ use shared::os;
 /// Largest request or answer, bytes. Chosen by hand; no measurement is recorded.
 pub const MESSAGE_MAX: usize = 64 * 1024;
 
-/// Longest wait for the controller's answer; it answers within a tick and a look of its service thread, below 0.1 s.
+/// Longest wait for the controller's answer. Chosen by hand: it answers within a tick and a pause of its service thread, below 0.1 s.
 const ANSWER: Duration = Duration::from_secs(2);
 /// Longest wait for the recorder to close a file. Chosen by hand; no measurement is recorded.
 const FILE_CLOSED: Duration = Duration::from_secs(10);
-/// How often in a row a controller may not know the episode that it has started, before it counts as restarted: for a second.
+/// How many times in a row the controller may be asked and not know the episode that it started, before it counts as restarted. Chosen by
+/// hand: it is asked for about a second.
 const UNKNOWN_MAX: u32 = 10;
 
 /// The arguments of all commands that ask the running controller.
@@ -31,7 +32,7 @@ pub struct Common {
     /// The cell's configuration.
     #[arg(long, default_value = shared::config::DEFAULT_FILE)]
     pub config: PathBuf,
-    /// Print the result as JSON.
+    /// Prints the result as JSON.
     #[arg(long)]
     pub json: bool,
 }
@@ -48,7 +49,7 @@ pub enum ClientError {
         /// The cell's name.
         cell: String,
     },
-    /// It no longer knows an episode that it had started.
+    /// The controller no longer knows an episode that it had started.
     #[error("rt-controller knows nothing of episode {0} any more: it was restarted; the robot's program brings the container upright")]
     Forgotten(u64),
     /// The answer cannot be read.

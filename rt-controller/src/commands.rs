@@ -1,6 +1,7 @@
-//! The subcommands of `rt-controller`, a file each: its arguments, its help, and what it does.
+//! The subcommands of `rt-controller`. Each has a file with its arguments, its help, and what it does.
 //!
-//! `run` is the resident process; the others are short processes that ask it, or work on files.
+//! `run` is the resident process; the others are processes that ask it, or work on files. All of them may allocate, and each failure is one
+//! line.
 
 pub mod abort;
 pub mod pour;

@@ -1,6 +1,6 @@
 //! The fixed-rate loop: absolute deadlines on CLOCK_MONOTONIC; a missed period is skipped and counted, never made up for.
 //!
-//! Runs in the real-time thread. Its ticks do not allocate, lock, log, or call anything that blocks but the sleep itself; `status` shows
+//! It runs in the real-time thread. Its ticks do not allocate, lock, log, or call anything that blocks but the sleep itself; `status` shows
 //! how often they allocated. The one exception is [`LoopState::meet_feature_worker`], which runs between ticks and outside of pours.
 //! Nothing in it fails: a lost robot is handed back and the core ends the pour, and a lost feature worker shows as stale features.
 
@@ -26,7 +26,7 @@ pub type Features = iceoryx2::port::subscriber::Subscriber<iceoryx2::service::ip
 pub struct Place {
     /// Number of the processor core.
     pub core: usize,
-    /// SCHED_FIFO priority, 1 to 99; 0: ordinary scheduling.
+    /// SCHED_FIFO priority, 1 to 99; 0 means ordinary scheduling.
     pub priority: u8,
 }
 
@@ -69,7 +69,7 @@ pub struct LoopState<'a> {
     core: Box<Core>,
     fresh: heapless::Vec<Feature, MAX_FEATURES>,
     session: Option<Box<Session>>,
-    /// Identity of the core's weights; 0: it has none.
+    /// Identity of the core's weights; 0 if it has none.
     weights_id: u64,
     features: &'a Features,
     exchange: &'a Exchange,
@@ -155,7 +155,7 @@ impl<'a> LoopState<'a> {
         if self.shutdown && upright { Next::Ended } else { Next::Tick }
     }
 
-    /// Takes the features that have arrived; of more than fit, the newest, because older ones would be stale.
+    /// Takes the features that have arrived. If they are more than fit, it keeps the newest, because older ones would be stale.
     fn receive_features(&mut self) {
         self.fresh.clear();
         // `receive` gives the oldest first. The bound keeps a flood of features from holding the loop.
@@ -195,8 +195,8 @@ impl<'a> LoopState<'a> {
         }
     }
 
-    /// Gives the robot's session back, if it is over. A robot that may not move any more is never taken on as it is: it is connected
-    /// anew when it is well.
+    /// Gives the robot's session back, if it is over. A robot that may not move any more always ends its session: it is connected anew when
+    /// it may move again.
     fn give_session_back(&mut self, end: Option<SessionEnd>) {
         let old_sessions = &self.exchange.old_sessions;
         if let Some(end) = end
@@ -207,7 +207,7 @@ impl<'a> LoopState<'a> {
         }
     }
 
-    /// Tells the ordinary thread, or counts that it could not.
+    /// Tells the ordinary thread about an event, or counts that it could not.
     fn tell(&self, event: Event) {
         if self.exchange.events.push(event).is_err() {
             self.exchange.events_lost.fetch_add(1, Relaxed);
@@ -221,7 +221,7 @@ impl<'a> LoopState<'a> {
             return;
         }
         let before = os::allocations();
-        // A failure here also is one in `receive`, and shows as stale features.
+        // What fails here fails in `receive` too, and shows as stale features.
         let _ = self.features.update_connections();
         if os::allocations() != before {
             let (allocations, faults) = spent();
@@ -245,8 +245,8 @@ fn look_at_robot(session: Option<&mut Session>, now_ns: u64, lost_ns: u64) -> (R
     };
     let lost = session.poll(now_ns).err();
     let state = session.state();
-    let unwell = health::check(state, now_ns, lost_ns).err();
-    let hindrance = if lost.is_some() { Some(unwell.unwrap_or(EndReason::RobotLost)) } else { unwell };
-    let end = lost.map(SessionEnd::Lost).or(unwell.map(SessionEnd::Unwell));
+    let may_not_move = health::check(state, now_ns, lost_ns).err();
+    let hindrance = if lost.is_some() { Some(may_not_move.unwrap_or(EndReason::RobotLost)) } else { may_not_move };
+    let end = lost.map(SessionEnd::Lost).or(may_not_move.map(SessionEnd::MayNotMove));
     (Robot { hindrance, alpha_deg: state.alpha_deg, at_ns: state.received_at_ns }, end)
 }

@@ -1,11 +1,11 @@
-//! What decides: one pure step a tick. The running controller, replay, tests and evaluations all use this same code.
+//! The controller's decisions: one pure step for each tick. The running controller, replay, tests and evaluations all use this same code.
 //!
 //! [`Core::step`] maps what is known at a tick ([`Input`]) to the angle to command and to what happened ([`Output`]). It has no clock and
-//! no device, does not allocate or lock, and does not fail: every doubt ends with the container upright. What decides that a pour ends,
-//! and why, is in [`ending`].
+//! no device, does not allocate or lock, and does not fail: whatever goes wrong ends the pour, and the container comes upright if the robot
+//! may still move. When and why a pour ends is decided in [`ending`].
 //!
 //! ```text
-//!            robot well          goal                 a reason to end                upright          the last drops fell
+//!            robot may move      goal                 a reason to end                upright          the last drops fell
 //!  NoRobot ------------> Idle ---------> Pouring ---------------------> Returning ---------> Settling ---------------> Idle
 //!     ^                   | curve                                           ^
 //!     |                   +------------> Recording -------------------------+ a reason to end
@@ -33,9 +33,10 @@ pub use order::{Order, Refusal};
 pub use robot::Robot;
 pub use settings::Settings;
 
-/// Most features that one tick takes, the newest ones: the loop would have to be late by a quarter of a second for more.
+/// Largest number of features that one tick takes; it takes the newest. More than these come only if the loop is late by a quarter of a
+/// second.
 pub const MAX_FEATURES: usize = 8;
-/// Commands remembered, to know which one was in force when a picture was taken: a second at 30 Hz.
+/// Number of commands that are remembered, to know which one was in force when a picture was taken: a second at 30 Hz.
 const COMMANDS: usize = 32;
 /// A measurement older than this many periods counts its tick as stale. Chosen by hand; no measurement is recorded.
 const STALE_TICK_PERIODS: u64 = 3;
@@ -56,7 +57,7 @@ pub struct Input<'a> {
 /// What a step decided, and what happened in it.
 #[derive(Debug, Clone, Copy)]
 pub struct Output {
-    /// Alpha to command, degrees: within all limits. `None`: command nothing, the robot may not move.
+    /// Alpha to command, degrees, within all limits; `None` if nothing must be commanded, because the robot may not move.
     pub target_deg: Option<f32>,
     /// The answer to this tick's order.
     pub ordered: Option<Result<(), Refusal>>,
@@ -107,13 +108,13 @@ pub struct Core {
     settings: Settings,
     agent: Option<Box<Agent>>,
     limiter: Limiter,
-    /// Where the last action leads, degrees: a loop faster than the camera needs several ticks to get there.
+    /// The alpha to which the last action leads, degrees. A loop that is faster than the camera needs several ticks to get there.
     request_deg: f32,
     phase: Phase,
     run: Option<Run>,
     decision: Decision,
     newest: Option<Feature>,
-    /// When the newest picture was taken in which V_e could be measured; a camera that only shows darkness is no camera.
+    /// When the newest picture was taken in which V_e could be measured, ns. Pictures that show nothing, such as dark ones, do not count.
     usable_at_ns: u64,
     shutdown: bool,
     last_tick_ns: u64,
@@ -145,7 +146,7 @@ impl Core {
         }
     }
 
-    /// What it is doing.
+    /// What the controller is doing.
     pub fn phase(&self) -> Phase {
         self.phase
     }
@@ -275,8 +276,8 @@ impl Core {
         }
     }
 
-    /// Takes the new features in order and steps the agent once a frame. Answers with the sum of the actions taken, degrees (NaN:
-    /// none), and the newest area, px^2 (NaN: none).
+    /// Takes the new features in order and steps the agent once for each frame. Returns the sum of the actions taken, degrees, and the
+    /// newest area, px^2; each is NaN if there is none.
     fn take_features(&mut self, input: &Input) -> (f32, f32) {
         let (mut asked, mut area) = (f32::NAN, f32::NAN);
         for feature in input.features {
@@ -306,8 +307,8 @@ impl Core {
         (asked, area)
     }
 
-    /// Steps the agent for the frames that were lost and for the one that was measured. Answers with the angle to ask for, degrees,
-    /// while the pour goes on. The lost frames' liquid is bridged, but the moment to act on them has passed.
+    /// Steps the agent for the frames that were lost and for the one that was measured. Returns the angle to ask for, degrees, while the
+    /// pour goes on. The liquid of the lost frames is estimated, but the moment to act on them has passed.
     fn step_agent(&mut self, taken: &Taken, area_px2: Option<f32>, captured_at_ns: u64) -> Option<f32> {
         let (agent, run) = (self.agent.as_mut()?, self.run.as_mut()?);
         run.goal_ml?;

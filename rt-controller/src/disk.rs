@@ -1,6 +1,6 @@
 //! The controller's work with files: writes the journal, watches the weight file.
 //!
-//! Runs in a thread of its own with ordinary scheduling; allocates, and blocks for as long as the disk does. Clients, and an abort among
+//! It runs in a thread of its own with ordinary scheduling, allocates, and blocks for as long as the disk does. Clients, and an abort among
 //! their requests, are answered by another thread ([`crate::service`]). Nothing here ends the controller: a journal that cannot be written
 //! ends, and weights that cannot be read are refused while the old ones stay.
 
@@ -20,7 +20,8 @@ use crate::journal::{Tick, Writer};
 
 /// Pause between two looks at the queue and the weight file. Chosen by hand; no measurement is recorded.
 const BEAT: Duration = Duration::from_millis(40);
-/// Ticks that may wait for a slow disk: half a minute at 30 Hz. A journal with a gap cannot be replayed, so a longer wait ends it.
+/// Number of ticks that may wait for a slow disk: half a minute at 30 Hz. A journal with a gap cannot be replayed, so a longer wait ends
+/// it.
 const WAITING_TICKS: usize = 1024;
 
 /// Largest relative difference between the camera's frame rate and the one that weights are trained for. Chosen by hand; no measurement
@@ -38,7 +39,7 @@ pub struct Disk<'a> {
     fps: f64,
     /// Time of change, inode and length of the weight file that was read last.
     seen: Option<(std::time::SystemTime, u64, u64)>,
-    /// `None`: no journal is kept, or it has ended.
+    /// The journal; `None` if none is kept, or if it has ended.
     journal: Option<Writer>,
     ticks: Receiver<Box<Tick>>,
 }

@@ -33,14 +33,14 @@ pub enum SessionEnd {
     /// The connection was lost.
     Lost(Lost),
     /// The robot may not move any more.
-    Unwell(EndReason),
+    MayNotMove(EndReason),
 }
 
 impl std::fmt::Display for SessionEnd {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         match self {
             Self::Lost(lost) => write!(f, "{lost}"),
-            Self::Unwell(reason) => write!(f, "{}", reason.words()),
+            Self::MayNotMove(reason) => write!(f, "{}", reason.words()),
         }
     }
 }
@@ -76,27 +76,27 @@ pub struct Exchange {
     pub old_sessions: ArrayQueue<(Box<Session>, SessionEnd)>,
     /// Histograms of the loop.
     pub timing: Timing,
-    /// Allocations and frees of the loop since it started.
+    /// Number of allocations and frees of the loop since it started.
     pub loop_allocations: AtomicU64,
-    /// Page faults of the loop since it started.
+    /// Number of page faults of the loop since it started.
     pub loop_page_faults: AtomicU64,
-    /// Ticks late by more than half a period.
+    /// Number of ticks that were late by more than half a period.
     pub late_ticks: AtomicU64,
-    /// Periods skipped.
+    /// Number of periods skipped.
     pub skipped_ticks: AtomicU64,
     /// Number of agents taken.
     pub agents_taken: AtomicU64,
-    /// Events that did not fit the queue.
+    /// Number of events that did not fit into the queue.
     pub events_lost: AtomicU64,
     /// Set by the loop when it has ended, upright.
     pub ended: AtomicBool,
 }
 
-/// Orders that may wait for the loop, which takes one a tick. Chosen by hand; no measurement is recorded.
+/// Number of orders that may wait for the loop, which takes one a tick. Chosen by hand; no measurement is recorded.
 const ORDERS: usize = 8;
-/// Events that may wait for the ordinary thread: half a minute of ticks at 30 Hz.
+/// Number of events that may wait for the ordinary thread: half a minute of ticks at 30 Hz.
 const EVENTS: usize = 1024;
-/// Agents, and sessions, that may wait to be dropped. Chosen by hand; no measurement is recorded.
+/// Number of agents that may wait to be dropped, and of sessions. Chosen by hand; no measurement is recorded.
 const OLD: usize = 4;
 
 impl Default for Exchange {

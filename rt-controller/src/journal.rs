@@ -18,7 +18,7 @@ use shared::weights::Weights;
 
 use crate::core::{Core, Input, MAX_FEATURES, Order, Robot, Settings};
 
-/// First bytes of a journal, its version included.
+/// The first bytes of a journal, which include its version.
 const MAGIC: &[u8; 8] = b"decantj2";
 /// Longest entry, bytes: more than ten weight files, which are the largest entries.
 const ENTRY_MAX: usize = 128 * 1024;
@@ -38,7 +38,7 @@ pub struct Tick {
     pub order: Option<Order>,
     /// Identity of the weights whose agent was taken in this tick.
     pub agent: Option<u64>,
-    /// The answer, degrees; `None`: nothing was commanded.
+    /// The answer, degrees; `None` if nothing was commanded.
     pub target_deg: Option<f32>,
     /// d after the tick, ml.
     pub d_ml: f32,
@@ -49,13 +49,13 @@ pub struct Tick {
 /// The times of a tick besides its wake-up, CLOCK_MONOTONIC ns.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 pub struct Times {
-    /// When it was to wake up.
+    /// When the tick was to wake up.
     pub deadline_ns: u64,
     /// When the target was decided.
     pub decided_at_ns: u64,
-    /// When the kernel had taken the target's bytes; 0: no target was written.
+    /// When the kernel had taken the target's bytes; 0 if no target was written.
     pub written_at_ns: u64,
-    /// When everything was done but to queue this entry.
+    /// When everything was done except queueing this entry.
     pub done_ns: u64,
 }
 
@@ -104,7 +104,7 @@ pub struct Writer {
 }
 
 impl Writer {
-    /// Starts a journal; one that is there already is kept beside it as `NAME.before.bin`.
+    /// Starts a journal. One that is there already is kept beside it, with the ending `before.bin` instead of its own.
     pub fn create(path: &Path, settings: &Settings) -> std::io::Result<Self> {
         if let Some(parent) = path.parent() {
             std::fs::create_dir_all(parent)?;
@@ -154,9 +154,9 @@ pub struct Replay {
     pub ended: Vec<shared::control::Outcome>,
     /// Number of ticks whose target or d differs in any bit.
     pub different: u64,
-    /// Number of the first of those ticks.
+    /// Number of the first of those ticks, counted from 0.
     pub first_different: Option<u64>,
-    /// The file ends in the middle of an entry.
+    /// Whether the file ends in the middle of an entry.
     pub cut_off: bool,
 }
 

@@ -2,11 +2,11 @@
 //!
 //! | module | what it holds | thread |
 //! |---|---|---|
-//! | [`core`] | what decides: a pure step | the loop's, and that of evaluations |
+//! | [`core`] | the decisions, as a pure step | the loop's, and that of evaluations |
 //! | [`control_loop`] | the 30 Hz loop | real-time |
 //! | [`pacing`] | when the next tick is due | the loop's |
 //! | [`timing`] | the loop's histograms | all |
-//! | [`exchange`] | queues between the loop and the other threads | all |
+//! | [`exchange`] | the queues between the loop and the other threads | all |
 //! | [`link`] | RTDE client and the program on the robot | connects in an ordinary thread, then the loop's |
 //! | [`robot_thread`] | connects the robot and hands it over to the loop | ordinary, a thread of its own |
 //! | [`service`] | clients and telemetry | ordinary, the main thread |

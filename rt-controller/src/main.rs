@@ -1,4 +1,5 @@
-//! Command line of `rt-controller`.
+//! The command line of `rt-controller`: it reads the arguments, runs the command in the main thread, and turns a failure into one line and
+//! an exit code.
 
 use std::process::ExitCode;
 

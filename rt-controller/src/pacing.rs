@@ -5,7 +5,7 @@
 //! phase, by at most [`PULL_MAX_NS`] (0.6 % of the period), until V_e has waited [`WAIT_NS`] when it is used. A camera whose rate
 //! differs by more is not followed; the loop's rate then wanders within that 0.6 %.
 //!
-//! Pure; runs in the real-time thread, does not allocate, does not fail.
+//! It is pure and runs in the real-time thread; it does not allocate or fail.
 
 /// How long V_e is to have waited when its tick wakes up, ns: more than the worker's jitter, so that a tick seldom comes too early.
 /// See docs/REALTIME.md for the measured jitter.
@@ -29,7 +29,7 @@ impl Pacer {
         Self { period_ns, pull_ns: 0 }
     }
 
-    /// A tick that woke up at `woke_ns` used a measurement published at `published_at_ns`.
+    /// Takes note that a tick that woke up at `woke_ns` used a measurement that was published at `published_at_ns`.
     pub fn used(&mut self, woke_ns: u64, published_at_ns: u64) {
         let period_ns = self.period_ns as i64;
         let waited_ns = woke_ns.saturating_sub(published_at_ns).min(self.period_ns) as i64;
@@ -57,7 +57,8 @@ mod tests {
 
     const PERIOD_NS: u64 = 33_333_333;
 
-    /// Runs loop and camera, whose period is `camera_ns`, for ten minutes; gives the waits of V_e and the ticks without a frame in the last five.
+    /// Runs the loop, and a camera whose period is `camera_ns`, for ten minutes. Gives how long each V_e waited in the last five minutes,
+    /// and how many ticks had none.
     fn run(camera_ns: u64, first_ns: u64) -> (Vec<u64>, u32) {
         let (mut pacer, mut deadline_ns, mut published_ns) = (Pacer::new(PERIOD_NS), 1_000_000_000, 900_000_000 + first_ns);
         let (mut waits, mut without) = (Vec::new(), 0);

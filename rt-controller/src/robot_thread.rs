@@ -1,8 +1,8 @@
 //! The thread that connects the robot: it checks the robot, uploads the program, hands the session over to the loop, and takes back
 //! sessions that are over.
 //!
-//! Runs in a thread of its own with ordinary scheduling, because connecting blocks for seconds; allocates. Every failure to connect is
-//! shown as a line and tried again a second later; nothing here ends the controller.
+//! It runs in a thread of its own with ordinary scheduling, because connecting blocks for seconds; it allocates. Every failure to connect
+//! is shown as a line and tried again a second later; nothing here ends the controller.
 
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering::Relaxed};
 use std::sync::{Mutex, PoisonError};
@@ -13,7 +13,7 @@ use shared::config::Config;
 use crate::exchange::Exchange;
 use crate::link::{self, LinkOptions};
 
-/// Pause between two looks whether the loop has given a session back. Chosen by hand; no measurement is recorded.
+/// How often the thread looks whether the loop has given a session back. Chosen by hand; no measurement is recorded.
 const BEAT: Duration = Duration::from_millis(100);
 /// Pause before the next attempt to reach the robot. Chosen by hand; no measurement is recorded.
 const RECONNECT: Duration = Duration::from_secs(1);
@@ -23,7 +23,7 @@ const RECONNECT: Duration = Duration::from_secs(1);
 pub struct RobotNote(Mutex<String>);
 
 impl RobotNote {
-    /// Sets the note, and says it once.
+    /// Sets the note, and says it if it is a new one.
     fn set(&self, text: String, say: &dyn Fn(&str)) {
         let mut note = self.0.lock().unwrap_or_else(PoisonError::into_inner);
         if *note != text {

@@ -1,8 +1,8 @@
 //! The controller's ordinary side: answers clients, publishes telemetry, passes ticks on to the journal, and drops what the loop no
 //! longer needs.
 //!
-//! Runs in the process's main thread with ordinary scheduling; allocates, but never waits for a disk, because [`crate::disk`] does so. If
-//! it falls behind, the loop goes on and counts what it could not tell. Nothing here ends the process but a signal, or another
+//! It runs in the process's main thread with ordinary scheduling. It allocates, but never waits for a disk, because [`crate::disk`] does
+//! so. If it falls behind, the loop goes on and counts what it could not tell. Nothing here ends the process but a signal, or another
 //! controller in the same cell.
 
 use std::collections::VecDeque;
@@ -25,7 +25,7 @@ use crate::exchange::{Event, Exchange};
 use crate::journal::Tick;
 use crate::robot_thread::RobotNote;
 
-/// Pause between two looks at the queues: far below a person's patience, and cheap.
+/// Pause between two looks at the queues. Chosen by hand: far below a person's patience, and cheap.
 const BEAT: Duration = Duration::from_millis(40);
 /// Number of results that are kept for `status`. Chosen by hand; no measurement is recorded.
 const OUTCOMES: usize = 32;
@@ -33,7 +33,7 @@ const OUTCOMES: usize = 32;
 /// A client's request that waits for its answer.
 type Asked = ActiveRequest<Ipc, [u8], (), [u8], ()>;
 
-/// The ordinary side's state.
+/// The state of the controller's ordinary side.
 pub struct Service<'a> {
     exchange: &'a Exchange,
     robot_note: &'a RobotNote,
@@ -47,8 +47,8 @@ pub struct Service<'a> {
     journal: Option<Sender<Box<Tick>>>,
     latest: Option<(Telemetry, Counters)>,
     outcomes: VecDeque<Outcome>,
-    /// The requests whose orders are in the queue, in the same order, each with its episode's number (0: an abort); `None`: the order
-    /// is the service's own.
+    /// The requests whose orders are in the queue, in the same order, each with its episode's number (0 for an abort); `None` for an order
+    /// that is the service's own.
     waiting: VecDeque<Option<(Asked, u64)>>,
     next_episode: u64,
 }

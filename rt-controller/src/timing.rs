@@ -1,13 +1,13 @@
-//! Histograms that the loop always keeps of itself.
+//! Histograms of the loop's own times, which it always keeps.
 //!
-//! The loop records with two relaxed atomic operations, without allocation or lock; any thread reads. Nothing fails.
+//! The loop records a value with two relaxed atomic operations, without allocation or lock; any thread may read. Nothing here fails.
 
 use std::sync::atomic::{AtomicU64, Ordering};
 
 /// Number of bins for each power of two, which makes a bin at most 1/16 of its value wide.
-const SUB: u64 = 16;
+const BINS_PER_OCTAVE: u64 = 16;
 /// Number of bins, enough for every u64: 16 values below 16, and 16 bins for each of the 60 powers of two from 16 on.
-const BINS: usize = (61 * SUB) as usize;
+const BINS: usize = (61 * BINS_PER_OCTAVE) as usize;
 
 /// Log-linear histogram of nanoseconds: relative bin width at most 6.25 %, exact below 16 ns, exact maximum.
 #[derive(Debug)]
@@ -24,21 +24,21 @@ impl Default for Histogram {
 
 /// The bin of a value.
 fn bin(value_ns: u64) -> usize {
-    if value_ns < SUB {
+    if value_ns < BINS_PER_OCTAVE {
         return value_ns as usize;
     }
     let shift = u64::from(value_ns.ilog2()) - 4;
-    ((shift + 1) * SUB + (value_ns >> shift) - SUB) as usize
+    ((shift + 1) * BINS_PER_OCTAVE + (value_ns >> shift) - BINS_PER_OCTAVE) as usize
 }
 
 /// The first value above the bin, ns.
 fn upper_edge_ns(bin: usize) -> u64 {
     let bin = bin as u64;
-    if bin < SUB {
+    if bin < BINS_PER_OCTAVE {
         return bin + 1;
     }
-    let shift = bin / SUB - 1;
-    (bin % SUB + SUB + 1).saturating_mul(1 << shift)
+    let shift = bin / BINS_PER_OCTAVE - 1;
+    (bin % BINS_PER_OCTAVE + BINS_PER_OCTAVE + 1).saturating_mul(1 << shift)
 }
 
 impl Histogram {
@@ -93,7 +93,7 @@ mod tests {
         assert!(bin(u64::MAX) < BINS);
     }
 
-    /// Protects the reader from wrong ranks.
+    /// Protects whoever reads percentiles: they are those of the values that were recorded.
     #[test]
     fn percentiles_are_those_of_the_values() {
         let histogram = Histogram::default();

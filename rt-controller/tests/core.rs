@@ -1,4 +1,5 @@
-//! The controller core against a leaking toy container: phases, endings, limits, weights, bridging.
+//! The controller's core with a toy container that leaks: phases, endings, limits, weights, and bridging. The tests use no process and no
+//! clock.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::too_many_lines)]
 
 use rt_controller::core::{Core, Input, Order, Output, Refusal, Robot, Settings};
@@ -40,7 +41,7 @@ struct ToyCell {
     doubt: Doubt,
     camera: bool,
     dry: bool,
-    /// A bead at the lip is taken for a stream.
+    /// Whether a bead at the lip is taken for a stream.
     bead: bool,
     settings: Settings,
     out_ml: f32,
@@ -118,7 +119,7 @@ impl ToyCell {
         output
     }
 
-    /// A tick in which the joint is elsewhere than it was commanded.
+    /// Runs a tick in which the joint is not where it was commanded.
     fn tick_with_joint_at(&mut self, alpha_deg: f32) {
         self.alpha_deg = alpha_deg;
         let output = self.tick(None);
@@ -209,7 +210,7 @@ fn orders_that_cannot_be_obeyed_are_refused() {
     assert_eq!(blank.pour(50.0), Err(Refusal::Robot(EndReason::ProtectiveStop)));
 }
 
-/// Protects people: whatever goes wrong at full flow, the pour ends with its reason, and upright if the robot may still move.
+/// Protects people: whatever goes wrong at full flow, the pour ends upright and with its reason.
 #[test]
 fn every_doubt_ends_the_pour_upright_with_its_reason() {
     type Trouble = fn(&mut ToyCell);
@@ -234,8 +235,8 @@ fn every_doubt_ends_the_pour_upright_with_its_reason() {
     }
 }
 
-/// Protects the cup: a stream that is no longer seen ends the pour 10 degrees further, not at the largest tilt; a container from which
-/// nothing flowed is tilted up to that, also when a bead was taken for a stream before.
+/// Protects the cup: a stream that is no longer seen ends the pour 10 degrees further, and not only at the largest tilt. A container from
+/// which nothing flowed is tilted up to the largest tilt, also when a bead was taken for a stream before.
 #[test]
 fn a_lost_stream_ends_the_pour_early_and_an_empty_container_late() {
     let mut lost = ToyCell::new();
@@ -283,7 +284,7 @@ fn a_robot_that_may_not_move_gets_no_targets() {
     }
 }
 
-/// Protects the volume: frames that were lost are counted and bridged, doubtful ones are not believed.
+/// Protects the volume: frames that were lost are counted and bridged, and doubtful ones are not believed.
 #[test]
 fn lost_and_doubtful_frames_are_bridged() {
     let mut cell = ToyCell::new();

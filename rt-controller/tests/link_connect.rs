@@ -18,7 +18,7 @@ use shared::os::now_ns;
 
 const OUTPUT_TYPES: &str = "DOUBLE,VECTOR6D,VECTOR6D,VECTOR6D,INT32,INT32,UINT32,UINT32,INT32,INT32,INT32,DOUBLE,DOUBLE";
 
-/// What the server says; the defaults are a robot that is well.
+/// What the server says; the defaults are those of a robot that may be moved.
 #[derive(Clone)]
 struct Robot {
     version_accepted: u8,
@@ -26,13 +26,13 @@ struct Robot {
     outputs: (u8, String),
     inputs: (u8, String),
     start_accepted: u8,
-    /// Sent before each answer.
+    /// What is sent before each answer.
     chatter: Vec<u8>,
-    /// Bytes of one TCP segment.
+    /// Number of bytes that are sent at a time.
     piece: usize,
-    /// Closes the RTDE connection instead of answering this request.
+    /// The request at which the RTDE connection is closed instead of being answered.
     closes_at: Option<u8>,
-    /// Never answers this request.
+    /// The request that is never answered.
     deaf_to: Option<u8>,
     robot_mode: i32,
     safety_mode: i32,
@@ -136,7 +136,7 @@ impl Server {
         let options = self.options.clone();
         let served = thread::spawn(move || self.serve().ok());
         let session = connect(&options);
-        // Frees a server that was never asked for its script port.
+        // This frees a server whose script port was never connected to.
         let _ = TcpStream::connect((options.address, 30003));
         (session, served.join().unwrap())
     }
@@ -216,7 +216,7 @@ fn connects_and_uploads_the_program() {
     assert!((state.alpha_deg - 0.01f32.to_degrees()).abs() < 1e-4);
 }
 
-/// Protects the dispatch by type: text and data before every answer, in pieces of a byte or in one, change nothing.
+/// Protects the dispatch by type: text and unknown packets before every answer, in pieces of a byte or in one, change nothing.
 #[test]
 fn connects_through_chatter_and_pieces() {
     for (last, piece) in [(2, 1), (3, 7), (4, usize::MAX)] {
@@ -250,18 +250,18 @@ fn every_refusal_says_what_to_do() {
         (Robot { version: [5, 2, 0, 0], ..well() }, "PolyScope 5.2"),
         (Robot { outputs: (0, with("NOT_FOUND", 6)), ..well() }, "does not know the RTDE variable safety_status_bits; update"),
         (Robot { outputs: (1, with("INT32", 0)), ..well() }, "timestamp has type INT32 instead of DOUBLE"),
-        (Robot { outputs: (1, "DOUBLE".into()), ..well() }, "unexpected bytes in the answer to the output recipe"),
+        (Robot { outputs: (1, "DOUBLE".into()), ..well() }, "unexpected bytes during the request for the output recipe"),
         (
             Robot { inputs: (0, "INT32,INT32,IN_USE".into()), ..well() },
             "input_double_register_24 is in use by another RTDE client or a fieldbus",
         ),
-        (Robot { inputs: (0, "INT32,INT32,DOUBLE".into()), ..well() }, "unexpected bytes in the answer to the input recipe"),
+        (Robot { inputs: (0, "INT32,INT32,DOUBLE".into()), ..well() }, "unexpected bytes during the request for the input recipe"),
         (
             Robot { start_accepted: 0, chatter: text("no recipe"), ..well() },
             "refuses to start sending its state; the robot said: no recipe",
         ),
-        (Robot { closes_at: Some(b'O'), ..well() }, "connection lost while the output recipe"),
-        (Robot { deaf_to: Some(b'v'), ..well() }, "no answer to the controller's version within 2 s"),
+        (Robot { closes_at: Some(b'O'), ..well() }, "connection lost during the request for the output recipe"),
+        (Robot { deaf_to: Some(b'v'), ..well() }, "no answer to the request for the controller's version within 2 s"),
         (Robot { chatter: vec![0, 2, 0], ..well() }, "is this the RTDE port of a UR controller?"),
         (Robot { safety_mode: 3, runtime_state: 4, ..well() }, "protective stop; find the cause, then release it"),
         (Robot { safety_mode: 7, robot_mode: 3, ..well() }, "emergency stop; release"),
@@ -269,12 +269,12 @@ fn every_refusal_says_what_to_do() {
         (Robot { speed_fraction: 0.5, ..well() }, "the speed slider is below 100 %; set it to 100 %"),
         (Robot { runtime_state: 2, ..well() }, "a program is running; wait"),
         (Robot { runtime_state: 4, ..well() }, "a program is paused; resume it"),
-        (Robot { joint_rad: 0.5, ..well() }, "28.6 degrees from its start angle, allowed are 2; bring the container upright"),
+        (Robot { joint_rad: 0.5, ..well() }, "28.6 degrees from its start angle, at most 2 are allowed; bring the container upright"),
         (Robot { joint_rad: f64::NAN, ..well() }, "degrees from its start angle"),
         (Robot { program: ProgramState::TooFar, ..well() }, "bring the container upright"),
         (Robot { starts: false, ..well() }, "the program did not start within 5 s; on an e-Series choose Remote Control"),
     ];
-    // Side by side: some of them wait for what never comes.
+    // They run side by side, because some of them wait for what never comes.
     let tests = cases.into_iter().zip(20..).map(|((robot, words), last)| {
         thread::spawn(move || {
             let (session, _seen) = Server::new(last, robot).meet();
@@ -288,7 +288,7 @@ fn every_refusal_says_what_to_do() {
     }
 }
 
-/// Protects the operator from a wrong address: nobody there is an error that names address and port.
+/// Protects the operator from a wrong address: if nobody is there, the error names address and port.
 #[test]
 fn nobody_there_is_named() {
     let options = Server::new(6, Robot::default()).options;
@@ -314,7 +314,7 @@ fn poll_until(session: &mut Session, mut done: impl FnMut(&Result<(), Lost>, &Se
     panic!("nothing came");
 }
 
-/// Protects the tick: of everything that arrived, in whatever pieces, the newest state counts; nothing arrived leaves it.
+/// Protects the tick: of everything that arrived, in whatever pieces, the newest state counts; if nothing arrived, it stays.
 #[test]
 fn the_newest_state_counts() {
     let (mut session, mut seen, robot) = connected(7);
@@ -328,7 +328,7 @@ fn the_newest_state_counts() {
     seen.rtde.write_all(most).unwrap();
     poll_until(&mut session, |_, s| s.texts() == 49).unwrap();
     let before = *session.state();
-    // The last packets are cut: 30 bytes before the end lies within the last package.
+    // The stream is cut 30 bytes before its end, which is within the last data packet.
     assert_eq!(before.sequence_echo, 48);
     assert_eq!(session.poll(now_ns()).unwrap(), &before, "nothing new");
     seen.rtde.write_all(rest).unwrap();
@@ -356,7 +356,7 @@ fn standing_clocks_and_unread_targets_are_noticed() {
     assert_eq!(echo_at(&mut session, 1.0, 1), (false, true), "a clock that jumps back does not advance");
 }
 
-/// Protects the robot from half a target: what arrives are whole packets, numbered from 1, in the agreed recipe.
+/// Protects the robot from half a target: only whole packets arrive, numbered from 1 and in the agreed recipe.
 #[test]
 fn targets_arrive_whole_and_numbered() {
     let (mut session, mut seen, _) = connected(9);
@@ -390,7 +390,7 @@ fn a_dropped_session_asks_the_program_to_stop() {
     assert_eq!(received[20..32], [0, 20, b'U', 2, 0, 0, 0, 2, 0, 0, 0, 3]);
 }
 
-/// Protects the loop from a robot that is gone: FIN, RST and a torn protocol end the session, each by its name.
+/// Protects the loop from a robot that is gone: FIN, RST and a broken protocol end the session, each with its own reason.
 #[test]
 fn a_lost_robot_ends_the_session() {
     let (mut session, seen, _) = connected(10);
@@ -438,7 +438,7 @@ fn a_flood_does_not_keep_the_loop() {
             }
         }
     });
-    // Until the sockets' buffers are full.
+    // This waits until the sockets' buffers are full.
     let mut before = usize::MAX;
     while sent.load(Ordering::Relaxed) != before {
         before = sent.load(Ordering::Relaxed);
@@ -471,7 +471,7 @@ fn polling_does_not_wait() {
     later.join().unwrap();
 }
 
-/// Protects the names in results: a safety stop during the upload is that stop, not a program that did not start.
+/// Protects the operator: a safety stop during the upload is reported as that stop, and not as a program that did not start.
 #[test]
 fn a_stop_during_the_upload_is_named() {
     let server = Server::new(16, Robot::default());
@@ -483,6 +483,6 @@ fn a_stop_during_the_upload_is_named() {
         seen
     });
     let error = connect(&options).unwrap_err();
-    assert_eq!(error, LinkError::NotWell { address: options.address, reason: EndReason::EmergencyStop });
+    assert_eq!(error, LinkError::MayNotMove { address: options.address, reason: EndReason::EmergencyStop });
     drop(served.join());
 }

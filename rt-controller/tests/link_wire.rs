@@ -1,4 +1,4 @@
-//! The pure parts of the robot link: packets, health, the program's text.
+//! The pure parts of the robot link: packets, health, and the program's text. The tests open no socket.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::too_many_lines)]
 
 use proptest::prelude::*;
@@ -26,10 +26,10 @@ fn give(inbox: &mut Inbox, bytes: &[u8]) {
     inbox.filled(bytes.len());
 }
 
-/// Protects the reader from TCP's freedom: the same packets come out wherever the stream is cut, and uncut.
+/// Protects the reader from the way in which TCP cuts a stream: the same packets come out wherever it is cut, and uncut.
 #[test]
 fn packets_survive_every_cut() {
-    // Answers recorded of a CB3 3.15.8: version accepted, its version, an input recipe, start, and an empty text packet.
+    // These answers were recorded from a CB3 3.15.8: version accepted, its version, an input recipe, start, and an empty text packet.
     let stream = bytes("00045601 001376000000030000000f0000000800019f63 000f4904494e5433322c494e543332 00045301 00064d000003");
     let mut whole = Inbox::new();
     give(&mut whole, &stream);
@@ -158,7 +158,7 @@ fn well() -> RobotState {
     }
 }
 
-/// Protects the arm: each way of not being well is noticed, and named as what it is even when several hold at once.
+/// Protects the arm: each hindrance is noticed, and is named rightly even when several hold at once.
 #[test]
 fn every_hindrance_has_its_reason() {
     use EndReason::*;
@@ -200,7 +200,7 @@ fn every_hindrance_has_its_reason() {
         |s| s.received_at_ns = NOW - LOST,
         |s| s.advanced_at_ns = NOW - LOST,
         |s| s.answered_at_ns = NOW + 5,
-        // The clock stood still between a target and its answer: not the program's fault, and soon the clock's own reason.
+        // The clock stood still between a target and its answer. That is not the program's fault, and soon has a reason of its own.
         |s| (s.advanced_at_ns, s.answered_at_ns) = (NOW - LOST / 2, NOW - LOST - 1),
     ];
     for change in at_the_limit {
@@ -263,7 +263,7 @@ fn the_program_is_filled_in() {
     assert!(text.starts_with("def ") && text.ends_with("\nend\n") && text.is_ascii(), "a program for the script port");
 }
 
-/// Protects the way upright: the watchdog on the robot bites only long after the program's own way would have ended.
+/// Protects the way upright: the watchdog on the robot acts only long after the program's own way has ended.
 #[test]
 fn the_watchdog_leaves_time_for_the_way_upright() {
     let limits = Limits { return_rate_deg_s: 10.0, ..Limits::default() };
@@ -284,7 +284,7 @@ fn the_average_covers_the_braking_time() {
     assert!(matches!(refused, LinkError::Limits { .. }), "{refused}");
 }
 
-/// Bytes that are packets more often than not, in the types that a client reads.
+/// Any bytes; more often than not they are packets of the types that a client reads.
 fn anything() -> impl Strategy<Value = Vec<u8>> {
     let payload = prop_oneof![
         prop::collection::vec(any::<u8>(), 0..40),

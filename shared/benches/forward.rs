@@ -1,8 +1,8 @@
-//! Time of the network's forward pass: in the form chosen at run time, and beside it the yardstick, the portable form, which is
-//! a plain column-wise loop.
+//! Measures the time of the network's forward pass in the form that is chosen at run time. The yardstick beside it is the portable form, a
+//! plain column-wise loop.
 //!
-//! `cargo bench -p shared` prints nanoseconds a call over batches, interleaved. With `--calls N [portable]` it makes N calls
-//! and prints their sum: for a profiler that counts instructions.
+//! `cargo bench -p shared` times batches of both forms in turns, and prints nanoseconds a call. With `--calls N [portable]` it makes N
+//! calls and prints the sum of their results, for a profiler that counts instructions.
 
 use std::hint::black_box;
 use std::time::Instant;
@@ -10,9 +10,9 @@ use std::time::Instant;
 use shared::actions::ACTIONS;
 use shared::mlp::{INPUTS, Mlp};
 
-/// Calls timed together, so that reading the clock does not matter.
+/// Number of calls that are timed together, so that reading the clock does not matter. Chosen by hand; no measurement is recorded.
 const BATCH: u32 = 200;
-/// Batches of each form.
+/// Number of batches of each form. Chosen by hand; no measurement is recorded.
 const BATCHES: usize = 5000;
 
 fn network() -> Mlp {

@@ -1,7 +1,7 @@
 //! Reads an episode and prints what is in it.
 //!
-//! You learn how to open an episode that `feature-worker run` recorded, what one of its rows holds (time, alpha, V_e), how a lost frame
-//! looks, where the weight is, and when an episode may be trained on. Run it with an episode of your own, or without one: it then
+//! You learn from it how to open an episode that `feature-worker run` recorded, what one of its rows holds (time, alpha, V_e), how a lost
+//! frame looks, where the weight is, and when an episode may be trained on. Run it with an episode of your own, or without one: it then
 //! writes a small episode into a temporary directory first, which also shows how an [`EpisodeWriter`] is used.
 //!
 //! ```text
@@ -41,7 +41,7 @@ pub fn describe(file: &Path) -> Result<String, Box<dyn Error>> {
     };
     text += "    t_s  alpha_deg    V_e_px2\n";
     for row in &episode.rows {
-        // V_e is NaN where there is nothing to learn from: the frame was lost, or the vision doubted it.
+        // V_e is NaN where there is nothing to learn from: the frame was lost, or its measurement must not be used.
         let area = if row.lost { "lost".into() } else { format!("{:.1}", row.area_px2) };
         text += &format!("{:7.3}  {:9.2}  {area:>9}\n", row.t_s, row.alpha_commanded_deg);
     }

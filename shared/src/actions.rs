@@ -1,10 +1,10 @@
 //! The actions of the paper's policy pi: Fig. 5's table of 21 relative angles, and how the network's outputs choose one of them.
 //!
-//! Used in the controller's loop and by training: fixed size, no allocation, no panic, no failure.
+//! It is used in the controller's loop and by training: its size is fixed, and it does not allocate, panic or fail.
 
 use serde::{Deserialize, Serialize};
 
-/// Number of actions, i = -10..=10.
+/// Number of actions in Fig. 5, i = -10..=10.
 pub const ACTIONS: usize = 21;
 /// Index of the action "stay" (i = 0).
 pub const STAY: usize = ACTIONS / 2;
@@ -36,7 +36,8 @@ pub const fn action_table() -> [f32; ACTIONS] {
     table
 }
 
-/// The action of `table` nearest to `dalpha_deg`; ties and non-finite angles go to the smaller index found first.
+/// The action of `table` that is nearest to `dalpha_deg`. A tie goes to "stay" if that is one of the two, and otherwise to the smaller
+/// index. An angle that is not finite gives "stay".
 pub fn nearest_action(table: &[f32; ACTIONS], dalpha_deg: f32) -> usize {
     let mut best = STAY;
     for (k, a) in table.iter().enumerate() {
@@ -51,7 +52,7 @@ pub fn nearest_action(table: &[f32; ACTIONS], dalpha_deg: f32) -> usize {
 mod tests {
     use super::*;
 
-    /// Protects Fig. 5's discretisation: fine near 0, +-5 degrees at the ends, odd, ascending; and its inverse.
+    /// Protects Fig. 5's discretisation: fine near 0, +-5 degrees at the ends, odd, and ascending; and the way back from angle to action.
     #[test]
     fn the_action_table_is_figure_5() {
         let table = action_table();

@@ -3,7 +3,8 @@
 //! Training, evaluation and run time all use this file, so that they see the same. When a pour ends is not decided here, but in the
 //! controller's core.
 //!
-//! Pure; runs in the controller's loop: no clock, no allocation, no panic, also for input that is not a number.
+//! It is pure and runs in the controller's loop: it reads no clock, does not allocate, and does not panic, also for input that is not a
+//! number.
 
 use crate::actions::{self, ACTIONS, STAY, Selection};
 use crate::estimator::Hold;
@@ -15,7 +16,7 @@ use crate::weights::{Estimator, Weights};
 /// What is known of one camera frame when the agent acts on it.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Observation {
-    /// V_e in px^2; `None`: the frame was lost or its measurement is doubtful.
+    /// V_e in px^2; `None` if the frame was lost or its measurement must not be used.
     pub area_px2: Option<f32>,
     /// Commanded alpha in force when this frame was taken, degrees from upright.
     pub alpha_deg: f32,
@@ -36,20 +37,20 @@ pub struct Decision {
     pub d_ml: f32,
     /// Estimated volume poured since the goal was set, ml.
     pub poured_ml: f32,
-    /// Standard deviation of `poured_ml` as far as the estimator knows it, ml; 0: it does not.
+    /// Standard deviation of `poured_ml` as far as the estimator knows it, ml; 0 if it does not know it.
     pub poured_sd_ml: f32,
     /// Volume that would still leave the container if the way back began now, ml; 0 with [`Estimator::Sum`].
     pub stop_ml: f32,
     /// The part of `stop_ml` that has still to come over the lip, and does not already hang on the wall outside, ml.
     pub over_lip_ml: f64,
-    /// d, less what is still on its way, has reached 0: the agent tilts back.
+    /// Whether d, less what is still on its way, has reached 0, so that the agent tilts back.
     pub tilting_back: bool,
-    /// Liquid is seen leaving the container in this frame.
+    /// Whether liquid is seen to leave the container in this frame.
     pub flowing: bool,
 }
 
 impl Decision {
-    /// Stay, and nothing known.
+    /// The decision to stay while nothing is known of the volume.
     pub const NOTHING: Self = Self {
         action: STAY as u8,
         dalpha_deg: 0.0,
@@ -64,7 +65,7 @@ impl Decision {
     };
 }
 
-/// What the frames so far say about the volume.
+/// What the frames so far tell about the volume, see the fields of [`Decision`].
 struct VolumeEstimate {
     poured_ml: f32,
     poured_sd_ml: f32,
@@ -72,11 +73,11 @@ struct VolumeEstimate {
     over_lip_ml: f64,
 }
 
-/// After the way back has begun, this much missing volume makes the agent pour on, ml. Chosen by hand; no measurement is recorded.
+/// After the way back has begun, the agent pours on if more than this is missing, ml. Chosen by hand; no measurement is recorded.
 const RESUME_ML: f32 = 0.5;
-/// The tilt, degrees, within which the volume still to come is asked of the flow model: what lies outside is no tilt of a container.
+/// The flow model is only asked about tilts in this range, degrees. Chosen by hand: no cell tilts a container further.
 const MODEL_TILT_DEG: (f64, f64) = (-30.0, 200.0);
-/// Largest part of an angle that [`Selection::Expected`] carries to the next frame, degrees. Chosen by hand; no measurement is recorded.
+/// The most that [`Selection::Expected`] carries from one frame to the next, degrees. Chosen by hand; no measurement is recorded.
 const CARRY_MAX_DEG: f32 = 1.0;
 
 /// The weights at work in one pour: observations, estimator and network.
@@ -131,12 +132,13 @@ impl Agent {
         }
     }
 
-    /// The pour is over: until the next [`Agent::start`] the network is not asked any more; the agent tilts back and counts.
+    /// Tells the agent that the pour is over. Until the next [`Agent::start`] it does not ask the network any more, but tilts back and
+    /// counts.
     pub fn tilt_back(&mut self) {
         self.pour_is_over = true;
     }
 
-    /// One frame: d <- d - V_e (eq. 2), then the network's action. Call it once for every frame, the lost ones included, and after
+    /// Takes one frame: d <- d - V_e (eq. 2), then the network's action. Call it once for every frame, the lost ones included, and after
     /// [`Agent::tilt_back`] until the last drop was seen, so that the whole volume is counted.
     pub fn step(&mut self, observation: Observation) -> Decision {
         let Some(goal_ml) = self.goal_ml else {
@@ -219,7 +221,7 @@ impl Agent {
         }
     }
 
-    /// Next number in [0, 1): splitmix64.
+    /// The next random number in [0, 1), drawn by splitmix64.
     fn uniform(&mut self) -> f32 {
         self.random = self.random.wrapping_add(0x9e37_79b9_7f4a_7c15);
         let z = (self.random ^ (self.random >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
@@ -299,7 +301,7 @@ mod tests {
         assert!((sum - 2.5).abs() < 0.06, "{sum}");
     }
 
-    /// Protects reproducibility where actions are drawn.
+    /// Protects reproducibility: the same seed draws the same actions, another one draws others.
     #[test]
     fn sampling_is_seeded() {
         let mut weights = example();

@@ -1,11 +1,12 @@
 //! The one track of alpha over time: which angle belonged to a picture that was taken between two ticks of the controller.
 //!
 //! The controller's loop, the recorder and, through the recorded episodes, the training all use it, so that they pair pictures and
-//! angles in the same way. Fixed size: nothing here allocates, locks or panics. What is not known is NaN.
+//! angles in the same way. Its size is fixed; nothing here allocates, locks, panics or fails. An angle that is not known is NaN.
 
 /// How long a measured alpha still counts when no newer one has come, ns: as long as a robot may be silent before it counts as lost.
 const HOLD_NS: u64 = 100_000_000;
-/// After this much time in ticks a frame no longer waits for a newer state of the robot, ns. Chosen by hand; no measurement is recorded.
+/// A frame no longer waits for a newer state of the robot once a tick has come this long after it, ns. Chosen by hand; no measurement is
+/// recorded.
 const PATIENCE_NS: u64 = 50_000_000;
 
 /// One angle over time: the newest `N` values, each with its time, ascending in time.
@@ -35,7 +36,7 @@ impl<const N: usize> AngleHistory<N> {
         self.at_within_deg(t_ns, u64::MAX)
     }
 
-    /// The same, but NaN if no value lies within `hold_ns` of `t_ns`.
+    /// The same as [`AngleHistory::at_deg`], but NaN if no value lies within `hold_ns` of `t_ns`.
     fn at_within_deg(&self, t_ns: u64, hold_ns: u64) -> f32 {
         let later = self.0.partition_point(|(at_ns, _)| *at_ns <= t_ns);
         let near = |at_ns: u64| at_ns.abs_diff(t_ns) <= hold_ns;
@@ -65,7 +66,8 @@ impl<const N: usize> AlphaTrack<N> {
         Self { commanded: AngleHistory::new(), measured: AngleHistory::new() }
     }
 
-    /// Adds a tick at `at_ns` with its commanded alpha, and the alpha that the robot reported at `robot_at_ns` (0: never).
+    /// Adds a tick at `at_ns` with its commanded alpha, and the alpha that the robot reported at `robot_at_ns` (0 if it has never reported
+    /// any).
     pub fn push(&mut self, at_ns: u64, alpha_deg: f32, robot_at_ns: u64, alpha_measured_deg: f32) {
         self.commanded.push(at_ns, alpha_deg);
         if robot_at_ns > 0 {
@@ -121,7 +123,7 @@ mod tests {
         assert!(track.covers(97 * MS), "the robot is silent: no use to wait longer");
     }
 
-    /// Protects memory: the history is bounded, and the same robot state twice is one.
+    /// Protects memory: the history is bounded, and a state of the robot that comes twice is kept once.
     #[test]
     fn the_history_is_bounded() {
         let mut track = AlphaTrack::<4>::new();

@@ -1,7 +1,7 @@
 //! The cell's configuration, one TOML file: `config/cell.toml` for the real cell, `config/sim.toml` for the simulated one.
 //!
-//! Every process reads it once at its start, in an ordinary thread; allocates. Unknown keys, wrong types and values out of range are
-//! refused with file, key and what is allowed ([`ConfigError`]). Relative paths are relative to the working directory.
+//! Every process reads it once at its start, in an ordinary thread, and that allocates. Unknown keys, wrong types and values out of range
+//! are refused with a [`ConfigError`], which names the file, the key and what is allowed. Relative paths start at the working directory.
 
 use std::net::IpAddr;
 use std::path::{Path, PathBuf};
@@ -55,7 +55,7 @@ pub enum ConfigError {
     },
 }
 
-/// The whole file.
+/// The configuration, table by table.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Config {
@@ -80,11 +80,11 @@ pub struct Config {
     pub simulator: Option<toml::Table>,
 }
 
-/// `[cell]`
+/// The table `[cell]`.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct CellConfig {
-    /// Names the cell's shared memory: 1 to 32 letters, digits, '-' or '_'.
+    /// The name that sets this cell's shared memory apart: 1 to 32 letters, digits, '-' or '_'.
     pub name: String,
 }
 
@@ -102,7 +102,7 @@ pub enum CameraSource {
     SharedMemory,
 }
 
-/// `[camera]`
+/// The table `[camera]`.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct CameraConfig {
@@ -123,13 +123,13 @@ pub struct CameraConfig {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum LiquidMethod {
-    /// By its colour (`[image] colour`).
+    /// By its colour, which `image.colour_hsv` gives.
     Colour,
-    /// Clear water, by what does not move with the background. It needs an even card behind the lip (docs/VISION.md).
+    /// Clear water is told by what does not move with the background. It needs an even card behind the lip (docs/VISION.md).
     Clear,
 }
 
-/// `[image]`
+/// The table `[image]`.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct ImageConfig {
@@ -149,7 +149,7 @@ pub struct ImageConfig {
     pub area_min_px2: f32,
 }
 
-/// `[robot]`
+/// The table `[robot]`.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct RobotConfig {
@@ -165,9 +165,9 @@ pub struct RobotConfig {
     pub start_tolerance_deg: f64,
     /// The first RTDE register that is used, 24 to 40; 0 to 23 belong to fieldbuses (RTDE guide).
     pub register_base: u8,
-    /// servoj lookahead time, s.
+    /// Lookahead time of the robot's servoj command, s.
     pub lookahead_s: f64,
-    /// servoj gain.
+    /// Gain of the robot's servoj command.
     pub gain: f64,
 }
 
@@ -194,7 +194,7 @@ impl Joint {
     }
 }
 
-/// `[controller]`
+/// The table `[controller]`.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct ControllerConfig {
@@ -202,9 +202,9 @@ pub struct ControllerConfig {
     pub rate_hz: f64,
     /// Number of the processor core that the loop is pinned to.
     pub core: usize,
-    /// SCHED_FIFO priority of the loop, 1 to 99; 0: ordinary scheduling.
+    /// SCHED_FIFO priority of the loop, 1 to 99; 0 means ordinary scheduling.
     pub priority: u8,
-    /// The weight file. It is watched, and taken between pours when it changes.
+    /// The weight file. It is watched, and when it changes it is taken between pours.
     pub weights: PathBuf,
     /// The journal, to which every tick's inputs are written for `rt-controller replay`; without this key there is none.
     #[serde(default)]
@@ -221,13 +221,13 @@ pub struct ControllerConfig {
     pub goal_max_ml: f32,
 }
 
-/// `[worker]`
+/// The table `[worker]`.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct WorkerConfig {
     /// Number of the processor core that the extraction is pinned to.
     pub core: usize,
-    /// SCHED_FIFO priority of the extraction, 1 to 99; 0: ordinary scheduling.
+    /// SCHED_FIFO priority of the extraction, 1 to 99; 0 means ordinary scheduling.
     pub priority: u8,
 }
 
@@ -240,7 +240,7 @@ pub enum ImageFormat {
     Png,
 }
 
-/// `[recording]`
+/// The table `[recording]`.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct RecordingConfig {
@@ -250,7 +250,7 @@ pub struct RecordingConfig {
     pub image_format: ImageFormat,
     /// JPEG quality, 1 to 100.
     pub jpeg_quality: u8,
-    /// Most images that may wait to be written; further ones are dropped and counted.
+    /// Largest number of images that may wait to be written; further ones are dropped and counted.
     pub queue_frames: usize,
 }
 

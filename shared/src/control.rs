@@ -1,7 +1,7 @@
 //! Requests to the running controller and its answers, which travel as postcard bytes over iceoryx2 request-response; and the reasons for
 //! which a pour ends.
 //!
-//! Used by command-line clients and by the controller's ordinary service thread, and allocates. The loop only uses [`Outcome`] and
+//! Command-line clients and the controller's ordinary service thread use it, and it allocates. The loop only uses [`Outcome`] and
 //! [`EndReason`], which are plain data. Nothing here can fail.
 
 use serde::{Deserialize, Serialize};
@@ -74,7 +74,7 @@ pub struct Outcome {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum EndReason {
-    /// The agent came to its end, usually because d reached 0; or the curve was run to its end.
+    /// The agent has finished, usually because d reached 0; or the curve was run to its end.
     Done,
     /// The operator aborted it.
     Aborted,
@@ -145,7 +145,7 @@ pub struct Status {
     pub phase: Phase,
     /// Why it cannot pour now, one line; empty if it can.
     pub hindrance: String,
-    /// Number of the pour or recording under way; 0: none.
+    /// Number of the pour or recording under way; 0 if there is none.
     pub episode: u64,
     /// Goal volume of the pour under way, ml.
     pub goal_ml: f32,
@@ -197,7 +197,7 @@ pub struct Status {
     pub outcomes: Vec<Outcome>,
 }
 
-/// A histogram for people, in microseconds.
+/// A histogram as people read it, in microseconds.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Histogram {
     /// What was measured.

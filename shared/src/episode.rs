@@ -1,9 +1,10 @@
 //! Experimental episodes `E = (L_E, w_E)` (section 3.1 of the paper): MCAP files and CSV tables, in and out.
 //!
 //! Each episode is one MCAP file that describes itself. [`mod@write`] makes it; [`read`] gives the plain [`Episode`] that the trainer works
-//! on, and the images on demand; [`weigh`] adds the weight afterwards; [`table`] reads and writes the CSV pair for people who have their
-//! own vision. For ordinary threads only: allocates, reads and writes files. A damaged file is an error with one line that names the file.
-//! A file whose recorder was killed reads up to its last whole chunk and says `complete: false`.
+//! on, and the images on demand; [`weigh`] adds the weight afterwards; [`table`] reads and writes the CSV pair for people who measure V_e
+//! with software of their own. All of it is for ordinary threads only: it allocates, and it reads and writes files. A damaged file is an
+//! error of one line that names the file. A file whose recorder was killed can be read up to its last whole chunk, and is then not
+//! `complete`.
 //!
 //! What is in the file (times are CLOCK_MONOTONIC ns, so that they match every other message of the cell):
 //!
@@ -77,7 +78,7 @@ pub enum EpisodeKind {
 /// Where an episode comes from and what went wrong on the way. Empty and 0 for tables.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct EpisodeInfo {
-    /// Wall-clock time of the start, RFC 3339, UTC.
+    /// Wall-clock time of the start in UTC, as RFC 3339 writes it.
     pub started_at_utc: String,
     /// First tick of the episode, CLOCK_MONOTONIC ns.
     pub started_at_ns: u64,
@@ -89,21 +90,21 @@ pub struct EpisodeInfo {
     pub weights: String,
     /// How it ended, in words; empty if the recorder was killed.
     pub ended: String,
-    /// Ticks of the controller in the file.
+    /// Number of the controller's ticks in the file.
     pub ticks: u64,
-    /// Ticks of the controller missing between the first and the last.
+    /// Number of the controller's ticks that are missing between the first and the last.
     pub lost_ticks: u64,
-    /// Images in the file.
+    /// Number of images in the file.
     pub images: u64,
-    /// Images that the recorder dropped; V_e of their frames is there.
+    /// Number of images that the recorder dropped; V_e of their frames is there.
     pub dropped_images: u64,
-    /// Rows of [`Episode::rows`] whose frame was lost.
+    /// Number of rows of [`Episode::rows`] whose frame was lost.
     pub lost_frames: u64,
 }
 
 impl Episode {
-    /// Hash of what the trainer sees: times, angles and areas, but not name, weight or file. Two episodes with the same hash are the
-    /// same measurement twice, be it as a file or as a table.
+    /// Hash of what the trainer sees: times, angles and areas, but not name, weight or file. Two episodes with the same hash are one and
+    /// the same measurement, be it as a file or as a table.
     pub fn content_sha256(&self) -> [u8; 32] {
         let mut hash = Sha256::new();
         for row in &self.rows {

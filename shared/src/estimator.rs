@@ -1,7 +1,7 @@
-//! Area to ml, and the volume poured so far.
+//! Turns areas into ml, and estimates the volume poured so far.
 //!
-//! Pure and in the controller's loop: fixed size, no allocation, no panic. An area that is not a finite number >= 0 counts as a
-//! lost frame.
+//! All of it is pure and runs in the controller's loop: its size is fixed, and it does not allocate or panic. An area that is not a finite
+//! number >= 0 counts as a lost frame.
 //!
 //! | file | what it holds |
 //! |---|---|
@@ -17,9 +17,9 @@ pub mod flow;
 pub mod fused;
 pub mod vessel;
 
-/// V_e in px^2 to ml a frame: `v = c area^q exp(tilt z)`, with z of [`tilt_z`], and the dropout hold that goes with it.
+/// Turns V_e in px^2 into ml a frame: `v = c area^q exp(tilt z)`, with z of [`tilt_z`]; and says when the dropout hold bridges a zero.
 ///
-/// The picture of the same flow changes a little with the tilt, because the lip's wall turns into the stream.
+/// The picture of the same flow changes a little with the tilt, because the wall at the lip rotates into the stream.
 ///
 /// Section 3.3.1's normalised contribution volumes are the case q = 1, tilt = 0; then c is `w_E / sum V_e`, and all episodes share
 /// it.
@@ -31,12 +31,12 @@ pub struct Calibration {
     pub area_exponent: f32,
     /// tilt: the change of log v for 30 degrees more tilt, -1 to 1.
     pub log_tilt_slope: f32,
-    /// A single area of 0 right after an area above this repeats that area, px^2; infinite: never.
+    /// A single area of 0 right after an area above this is replaced by that area, px^2; if this is infinite, none is replaced.
     pub hold_above_px2: f32,
 }
 
 impl Calibration {
-    /// Outflow of a frame with `area_px2`, taken at the commanded tilt `alpha_deg`, ml.
+    /// Outflow that a frame with `area_px2` shows, taken at the commanded tilt `alpha_deg`, ml.
     pub fn volume_ml(&self, area_px2: f32, alpha_deg: f32) -> f32 {
         if area_px2 > 0.0 {
             self.volume_at_1_px2_ml * area_px2.powf(self.area_exponent) * (self.log_tilt_slope * tilt_z(f64::from(alpha_deg)) as f32).exp()
@@ -46,13 +46,13 @@ impl Calibration {
     }
 }
 
-/// z of [`Calibration`] at a tilt: (alpha - 60 degrees)/30 degrees within +-1.5; 0 for what is not a number.
+/// z of [`Calibration`] at a tilt: (alpha - 60 degrees)/30 degrees cut to +-1.5; 0 for what is not a number.
 pub fn tilt_z(alpha_deg: f64) -> f64 {
     let z = (alpha_deg - 60.0) / 30.0;
     if z.is_nan() { 0.0 } else { z.clamp(-1.5, 1.5) }
 }
 
-/// The dropout hold: it turns the frames' areas, as they come, into areas that can be summed.
+/// The dropout hold: it turns the frames' areas, one after the other, into areas that can be summed.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct Hold {
     newest_px2: f32,
@@ -97,7 +97,7 @@ mod tests {
         }
     }
 
-    /// Protects the calibration's formula, and 0 for no stream even with an odd exponent.
+    /// Protects the calibration's formula, and that no stream gives 0, whatever the exponent.
     #[test]
     fn volume_is_a_power_of_the_area() {
         let cal = Calibration { volume_at_1_px2_ml: 0.002, area_exponent: 1.2, log_tilt_slope: 0.1, hold_above_px2: 60.0 };

@@ -1,9 +1,10 @@
-//! Exit codes and the one-line error of every program. Used at the end of commands, in ordinary threads; allocates.
+//! Exit codes and the one-line error of every program. They are used at the end of commands, in ordinary threads, and allocate. Nothing
+//! here fails.
 
 use std::fmt::Display;
 use std::process::ExitCode;
 
-/// The work failed on the way (a file could not be written, a check found faults).
+/// The work failed on the way, for example because a file could not be written or a check found faults.
 pub const FAILED: u8 = 1;
 /// Wrong command line, configuration or input file; nothing was changed.
 pub const BAD_INPUT: u8 = 2;

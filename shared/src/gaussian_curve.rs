@@ -1,12 +1,12 @@
 //! Eq. (1), the pre-programmed movement of an experimental episode: alpha(t) = lambda exp(-gamma (t - beta)^2), 0 <= t <= 2 beta.
 //!
-//! Pure; used in the controller's loop, so it does not allocate or panic. The letters are the paper's.
+//! It is pure and used in the controller's loop, so it does not allocate, panic or fail. The letters are the paper's.
 
 use serde::{Deserialize, Serialize};
 
 use crate::limits::Limits;
 
-/// Least beta, s, that [`Curve::fits`] accepts. Chosen by hand; no measurement is recorded.
+/// Smallest beta, s, that [`Curve::fits`] accepts. Chosen by hand; no measurement is recorded.
 const BETA_MIN_S: f32 = 0.5;
 /// Largest beta, s, that [`Curve::fits`] accepts. Chosen by hand; no measurement is recorded.
 const BETA_MAX_S: f32 = 60.0;

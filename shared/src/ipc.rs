@@ -4,8 +4,8 @@
 //! layouts' version is part of each service's name, so that programs of other versions never connect. All processes of a cell run
 //! under one user, because the shared memory is private to that user.
 //!
-//! Opening a service allocates and belongs into an ordinary thread; receiving, and sending a loan, do neither allocate nor block. Every
-//! failure is an [`IpcError`] of one line.
+//! Opening a service allocates and belongs in an ordinary thread. Receiving a message, or sending one in loaned memory, neither allocates
+//! nor blocks. Every failure is an [`IpcError`] of one line.
 
 use std::path::PathBuf;
 
@@ -54,20 +54,20 @@ impl<T, E: std::fmt::Debug> InService<T> for Result<T, E> {
     }
 }
 
-/// Most readers of a topic. Chosen by hand; no measurement is recorded.
+/// Largest number of readers of a topic. Chosen by hand; no measurement is recorded.
 const SUBSCRIBERS_MAX: usize = 8;
-/// Most messages that wait for a reader: two seconds of telemetry at 30 Hz.
+/// Largest number of messages that wait for a reader: two seconds of telemetry at 30 Hz.
 const BUFFER_MAX: usize = 64;
-/// Most readers of camera frames: worker, `view` and `calibrate`, and one more.
+/// Largest number of readers of camera frames: worker, `view`, `calibrate`, and one more.
 const FRAME_READERS_MAX: usize = 4;
-/// Most frames that wait for a reader; each takes the memory of a whole picture.
+/// Largest number of frames that wait for a reader. Chosen by hand: each takes the memory of a whole picture.
 const FRAMES_MAX: usize = 4;
-/// Most clients that ask the controller at the same time. Chosen by hand; no measurement is recorded.
+/// Largest number of clients that ask the controller at the same time. Chosen by hand; no measurement is recorded.
 const CLIENTS_MAX: usize = 8;
-/// Newest reports that a late reader of the recorder gets. Chosen by hand; no measurement is recorded.
+/// Number of the recorder's newest reports that a late reader gets. Chosen by hand; no measurement is recorded.
 const REPORTS_KEPT: usize = 8;
 
-/// iceoryx2's kind of service: between processes.
+/// The kind of iceoryx2 service that works between processes.
 type Ipc = iceoryx2::service::ipc::Service;
 /// A cell's iceoryx2 node.
 pub type CellNode = Node<Ipc>;
@@ -77,18 +77,18 @@ pub type Topic<T> = publish_subscribe::PortFactory<Ipc, T, ()>;
 pub type FrameTopic = publish_subscribe::PortFactory<Ipc, [u8], FrameHeader>;
 /// Requests and answers as postcard bytes, see [`crate::control`].
 pub type ControlService = request_response::PortFactory<Ipc, [u8], (), [u8], ()>;
-/// Wakes a reader of frames when one is there.
+/// Wakes a reader of frames when a frame has come.
 pub type FrameListener = Listener<Ipc>;
-/// Tells the readers that a frame is there.
+/// Tells the readers that a frame has come.
 pub type FrameNotifier = Notifier<Ipc>;
 
-/// Directory of the cell `name` for what is not shared memory.
+/// Directory of the cell `name` for iceoryx2's files that are not shared memory.
 pub fn directory(name: &str) -> PathBuf {
     PathBuf::from(format!("/tmp/decant_{name}"))
 }
 
-/// Removes every file of the cell `name`, also those that a killed process left. Only who started the cell may call this, after all
-/// of its processes have ended; a cell that still runs would be torn apart. What cannot be removed stays.
+/// Removes every file of the cell `name`, also those that a killed process left. Only whoever started the cell may call this, after all of
+/// its processes have ended; a cell that still runs would be torn apart. What cannot be removed stays.
 pub fn remove_files(name: &str) {
     let prefix = format!("decant_{name}_");
     for entry in std::fs::read_dir("/dev/shm").into_iter().flatten().flatten() {
@@ -116,7 +116,7 @@ impl Cell {
         config.global.prefix = FileName::new(format!("decant_{name}_").as_bytes()).map_err(|e| fail(format!("{e:?}")))?;
         let root = Path::new(directory(name).as_os_str().as_encoded_bytes()).map_err(|e| fail(format!("{e:?}")))?;
         config.global.set_root_path(&root);
-        // Each program handles its own signals; iceoryx2 shall not end a wait for good because of one.
+        // Each program handles its own signals, so iceoryx2 must not end a wait for good because of one.
         let node = NodeBuilder::new()
             .config(&config)
             .signal_handling_mode(SignalHandlingMode::Disabled)
@@ -150,7 +150,7 @@ impl Cell {
             .in_service(&full)
     }
 
-    /// Camera frames, from one driver, or from the feature worker that reads the camera itself. A late reader loses the oldest ones.
+    /// Camera frames, from one driver, or from the feature worker that reads the camera itself. A slow reader loses the oldest ones.
     pub fn frames(&self) -> Result<FrameTopic, IpcError> {
         let (name, full) = self.name("frame")?;
         self.node
@@ -171,12 +171,12 @@ impl Cell {
         self.node.service_builder(&name).event().open_or_create().in_service(&full)
     }
 
-    /// Wakes a reader when a frame was published.
+    /// A listener that wakes its reader when a frame was published.
     pub fn frame_listener(&self) -> Result<FrameListener, IpcError> {
         self.frame_event()?.listener_builder().create().in_service("frame-event")
     }
 
-    /// The other side of [`Cell::frame_listener`]: who publishes frames calls `notify()` after each.
+    /// The other side of [`Cell::frame_listener`]: whoever publishes frames calls `notify()` after each.
     pub fn frame_notifier(&self) -> Result<FrameNotifier, IpcError> {
         self.frame_event()?.notifier_builder().create().in_service("frame-event")
     }
@@ -204,7 +204,7 @@ impl Cell {
             .request_response::<[u8], [u8]>()
             .max_servers(1)
             .max_clients(CLIENTS_MAX)
-            // One question at a time: each further answer would lock 64 KiB of the controller's memory.
+            // A client asks one question at a time, because each further answer would lock 64 KiB of the controller's memory.
             .max_active_requests_per_client(1)
             .max_loaned_requests(1)
             .max_response_buffer_size(1)

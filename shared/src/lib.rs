@@ -11,14 +11,15 @@
 //! | [`alpha_track`] | alpha over time: which angle belongs to a picture | yes |
 //! | [`mlp`] | the 4-32-32-21 network | yes |
 //! | [`actions`] | Fig. 5's table of actions | yes |
-//! | [`estimator`] | area to ml, and the volume poured so far | yes |
+//! | [`estimator`] | from areas to ml, and to the volume poured so far | yes |
 //! | [`agent`] | the weights at work in one pour: an observation in, an action out | yes |
 //! | [`weights`] | the weight file (postcard with a CRC) | no |
 //! | [`episode`] | `E = (L_E, w_E)` as MCAP files and CSV tables | no |
 //! | [`exit`] | exit codes and one-line errors | no |
 //! | [`os`] | the operating system: clock, scheduling, locked memory | yes |
 //!
-//! Nothing in a module marked "yes" allocates, locks or panics after construction.
+//! What the loop uses of a module marked "yes" does not allocate, lock or panic after construction; the module's header names the
+//! exceptions that are for other threads.
 
 #![deny(unsafe_code)]
 

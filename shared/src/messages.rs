@@ -1,9 +1,9 @@
 //! Fixed-layout messages that cross shared memory.
 //!
 //! Every struct is `repr(C)` without padding, carries [`LAYOUT_VERSION`], and is plain data that another process may read at any time.
-//! The byte tables are in `ARCHITECTURE.md` and are held by tests below. All times are CLOCK_MONOTONIC in nanoseconds. Used in the
-//! controller's loop; nothing here allocates or fails: unknown codes read as the most careful meaning. The exception is
-//! [`Telemetry::weights`], which allocates.
+//! The byte tables are in `ARCHITECTURE.md` and are held by tests below. All times are CLOCK_MONOTONIC in nanoseconds. The messages are used
+//! in the controller's loop. Nothing here allocates, except [`Telemetry::weights`], and nothing fails: an unknown code is read as the most careful
+//! meaning.
 
 use iceoryx2::prelude::ZeroCopySend;
 
@@ -145,7 +145,7 @@ pub enum Phase {
     /// There is no usable robot: it is not connected, or not allowed to move.
     #[default]
     NoRobot = 0,
-    /// Upright at the start angle, d = 0.
+    /// The container is upright at the start angle, and no goal is set (d = 0).
     Idle = 1,
     /// A goal is set, and the agent decides.
     Pouring = 2,
@@ -153,7 +153,7 @@ pub enum Phase {
     Returning = 3,
     /// The curve of eq. (1) is run.
     Recording = 4,
-    /// The container is upright; the last drops are counted before the result is given.
+    /// The container has been commanded upright, and the last drops are counted before the result is given.
     Settling = 5,
 }
 
@@ -181,11 +181,11 @@ pub struct Telemetry {
     pub at_ns: u64,
     /// When the newest robot state in it arrived, CLOCK_MONOTONIC ns; 0 before the first.
     pub robot_at_ns: u64,
-    /// Number of the pour or recording that this tick belongs to, unique for a controller process; 0: none.
+    /// Number of the pour or recording that this tick belongs to, unique for a controller process; 0 if there is none.
     pub episode: u64,
     /// [`Feature::sequence`] of the newest feature used; 0 before the first.
     pub feature_sequence: u64,
-    /// Identity of the weights in use ([`Telemetry::weights`]); 0: there are none.
+    /// Identity of the weights in use ([`Telemetry::weights`]); 0 if there are none.
     pub weights_id: u64,
     /// Commanded alpha after all limits, degrees from upright.
     pub alpha_deg: f32,
@@ -300,7 +300,7 @@ mod tests {
         assert_eq!(size_of::<RecorderReport>(), 552);
     }
 
-    /// Protects operators from a cut path that is not text.
+    /// Protects operators from a path that is cut within a character and so is no text any more.
     #[test]
     fn a_long_path_is_cut_at_a_character() {
         let long = "ä".repeat(400);

@@ -1,8 +1,8 @@
 //! The network of the paper's policy pi (section 3.3.2): a 4-32-32-21 multilayer perceptron that maps the three newest outflows
 //! and the missing volume d to one logit for each action.
 //!
-//! Runs in the controller's loop: fixed size, no allocation, no panic. Nothing here can fail: inputs that are not finite give the
-//! action "stay" through [`argmax`] and [`softmax`].
+//! It runs in the controller's loop: its size is fixed, and it does not allocate or panic. Nothing here can fail: inputs that are not
+//! finite give the action "stay" through [`argmax`] and [`softmax`].
 
 use serde::{Deserialize, Serialize};
 
@@ -43,7 +43,7 @@ impl Mlp {
         b3: [0.0; ACTIONS],
     };
 
-    /// Logits of the 21 actions for scaled inputs ([`InputScale::apply`]). About 1800 multiply-adds.
+    /// Logits of the 21 actions for scaled inputs ([`InputScale::apply`]). They cost about 1800 multiply-adds.
     ///
     /// On a processor with AVX2 and FMA the wide form runs, on others [`Mlp::forward_portable`]. The wide form rounds each multiply-add
     /// once, the other one twice. So the logits differ in their last bits, and the action only where two are equally good.
@@ -97,10 +97,11 @@ mod wide {
 
     use super::{ACTIONS, INPUTS, Mlp};
 
-    /// Numbers in one register of AVX2.
+    /// How many f32 one register of AVX2 holds.
     const LANES: usize = 8;
 
-    /// The function that [`V3::vectorize`] compiles for these processors. Everything that it calls must be inlined to be compiled so too.
+    /// The function that [`V3::vectorize`] compiles for these processors. Everything that it calls must be inlined, or it is not compiled
+    /// for them.
     pub struct Forward<'a>(pub V3, pub &'a Mlp, pub &'a [f32; INPUTS]);
 
     impl pulp::NullaryFnOnce for Forward<'_> {
@@ -260,7 +261,7 @@ mod tests {
         assert!(same >= 19_990, "{same} of 20000");
     }
 
-    /// Protects the robot from an undefined action: numbers that are none give "stay".
+    /// Protects the robot from an undefined action: logits that are not numbers give "stay".
     #[test]
     fn non_finite_logits_mean_stay() {
         assert_eq!(argmax(&[f32::NAN; ACTIONS]), STAY);

@@ -20,7 +20,7 @@ pub fn sleep_until_ns(deadline_ns: u64) {
     while let Err(rustix::io::Errno::INTR) = rustix::thread::clock_nanosleep_absolute(rustix::thread::ClockId::Monotonic, &request) {}
 }
 
-/// Pins the calling thread to `core` and, if `priority` > 0, schedules it SCHED_FIFO with that priority (1-99).
+/// Pins the calling thread to `core` and, if `priority` > 0, schedules it SCHED_FIFO with that priority (1 to 99).
 ///
 /// Gives one line for each thing that was not permitted; the thread works on without it.
 pub fn become_realtime(core: usize, priority: u8) -> Vec<String> {
@@ -89,7 +89,7 @@ pub fn stop_at_signals() -> std::io::Result<Arc<AtomicBool>> {
     Ok(stop)
 }
 
-/// Page faults of the calling thread so far: (minor, major).
+/// Number of page faults of the calling thread so far: minor ones, and major ones. Both are 0 if the system does not tell.
 pub fn page_faults() -> (u64, u64) {
     // SAFETY: `rusage` is plain data for which all zeroes is a valid value.
     let mut usage: libc::rusage = unsafe { std::mem::zeroed() };
@@ -101,12 +101,11 @@ pub fn page_faults() -> (u64, u64) {
 }
 
 thread_local! {
-    /// Allocations and frees of this thread.
+    /// Number of allocations and frees of this thread.
     static ALLOCATIONS: Cell<u64> = const { Cell::new(0) };
 }
 
-/// Heap allocations and frees of the calling thread since it started; always 0 unless the binary installs
-/// [`CountingAllocator`].
+/// Number of heap allocations and frees of the calling thread since it started; always 0 unless the binary installs [`CountingAllocator`].
 pub fn allocations() -> u64 {
     ALLOCATIONS.try_with(Cell::get).unwrap_or(0)
 }

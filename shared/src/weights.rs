@@ -1,6 +1,6 @@
 //! The weight file: everything that the controller needs to pour, as postcard bytes with a CRC.
 //!
-//! Ordinary threads read and write it, and allocate; the loop only sees [`Weights`] that were checked here. A file that is truncated,
+//! Ordinary threads read and write it, which allocates; the loop only sees [`Weights`] that were checked here. A file that is truncated,
 //! damaged, of another format version, of another shape or not finite is refused with one line that says which of these it is
 //! ([`WeightsError`]). Writing is atomic: a temporary file in the same directory is synced and then renamed.
 //!
@@ -29,15 +29,15 @@ use crate::mlp::{HIDDEN, INPUTS, InputScale, Mlp};
 /// Version of the file format; files of other versions are refused.
 pub const FORMAT_VERSION: u32 = 3;
 
-/// First bytes of every weight file.
+/// The first bytes of every weight file.
 const MAGIC: &[u8; 8] = b"decant-w";
-/// Bytes before the payload.
+/// Number of bytes before the payload.
 const HEADER: usize = 24;
-/// Neurons of each layer, inputs first.
+/// Number of neurons in each layer, inputs first.
 const SHAPE: [usize; 4] = [INPUTS, HIDDEN, HIDDEN, ACTIONS];
-/// Largest payload, bytes; a usual one is about 9 kB.
+/// Largest payload, bytes. Chosen by hand: a usual one has about 9 kB.
 const PAYLOAD_MAX: usize = 64 * 1024;
-/// The checksum at the payload's end.
+/// How the checksum at the payload's end is computed.
 const CRC: Crc<u32> = Crc::<u32>::new(&CRC_32_ISO_HDLC);
 
 /// Everything that the controller needs to pour, and where it comes from.
@@ -80,7 +80,7 @@ pub enum Estimator {
 }
 
 impl Estimator {
-    /// Names the first value that is outside its range.
+    /// Refuses a value that is outside its range, and names it.
     fn check(&self) -> Result<(), String> {
         let Self::Fused { model, back } = self else { return Ok(()) };
         let FlowModel {
@@ -99,19 +99,19 @@ impl Estimator {
             ("radius", radius_mm, 1.0, 1000.0),
             ("height", height_mm, 1.0, 5000.0),
             ("taper", taper, 0.05, 20.0),
-            ("share of flat shape", even_share, 0.0, 1.0),
-            ("flow coefficient", log_weir_coefficient, -20.0, 20.0),
-            ("flow exponent", head_exponent, 0.2, 5.0),
-            ("k1", log_weir_slope, -20.0, 20.0),
-            ("k2", log_weir_curvature, -20.0, 20.0),
+            ("even share", even_share, 0.0, 1.0),
+            ("weir coefficient (log)", log_weir_coefficient, -20.0, 20.0),
+            ("head exponent", head_exponent, 0.2, 5.0),
+            ("slope of the weir coefficient (log)", log_weir_slope, -20.0, 20.0),
+            ("curvature of the weir coefficient (log)", log_weir_curvature, -20.0, 20.0),
             ("lag", lag_frames, 0.0, 60.0),
             ("delay", delay_frames, 0.0, DELAY_MAX_FRAMES),
             ("film share", film_share, 0.0, 0.95),
-            ("sd of lambda", noise.log_flow_factor_sd, 1e-4, 5.0),
-            ("sd of gamma", noise.log_camera_gain_sd, 1e-4, 5.0),
-            ("sd of beta", noise.log_capacity_scale_sd, 1e-6, 5.0),
+            ("sd of the flow factor (log)", noise.log_flow_factor_sd, 1e-4, 5.0),
+            ("sd of the camera's gain (log)", noise.log_camera_gain_sd, 1e-4, 5.0),
+            ("sd of the capacity's scale (log)", noise.log_capacity_scale_sd, 1e-6, 5.0),
             ("sd of the delay", noise.extra_delay_sd_frames, 1e-4, 20.0),
-            ("sd of a frame", noise.log_frame_volume_sd, 1e-4, 5.0),
+            ("sd of a frame's volume (log)", noise.log_frame_volume_sd, 1e-4, 5.0),
             ("smallest outflow", noise.least_visible_ml, 0.0, 10.0),
             ("rate back", back.rate_deg, 0.1, 10.0),
             ("change of the rate back", back.change_deg, 0.01, 100.0),
@@ -180,7 +180,7 @@ pub enum WeightsError {
         file: String,
     },
     /// The file has another version of the format.
-    #[error("{file}: format version {found}, this program reads {FORMAT_VERSION}; train again with this version")]
+    #[error("{file}: format version {found}, but this program reads {FORMAT_VERSION}; train again with this version")]
     Version {
         /// The file.
         file: String,
@@ -188,7 +188,7 @@ pub enum WeightsError {
         found: u32,
     },
     /// The file holds a network of another shape.
-    #[error("{file}: a network of shape {found:?}, this program runs {SHAPE:?}; train again with this version")]
+    #[error("{file}: a network of shape {found:?}, but this program runs {SHAPE:?}; train again with this version")]
     Shape {
         /// The file.
         file: String,
@@ -196,7 +196,7 @@ pub enum WeightsError {
         found: [usize; 4],
     },
     /// The file is shorter or longer than its header says.
-    #[error("{file}: truncated or with bytes too many: {found} bytes where the header says {expected}; copy it again")]
+    #[error("{file}: truncated or too long: it has {found} bytes where its header says {expected}; copy it again")]
     Length {
         /// The file.
         file: String,
@@ -313,7 +313,7 @@ impl Weights {
         format!("{:016x}", self.id())
     }
 
-    /// Names the first value that must not reach the robot.
+    /// Refuses weights that must not reach the robot, and names the first wrong value.
     fn check(&self) -> Result<(), String> {
         if let Some(k) = self.network.parameters().position(|p| !p.is_finite()) {
             return Err(format!("parameter {k} of the network is not finite"));
@@ -462,7 +462,7 @@ pub(crate) mod tests {
                     model.delay_frames = f64::NAN;
                 }
             }),
-            ("estimator: sd of gamma", |w| {
+            ("estimator: sd of the camera's gain", |w| {
                 *w = fused_example();
                 if let Estimator::Fused { model, .. } = &mut w.estimator {
                     model.noise.log_camera_gain_sd = 0.0;

@@ -1,4 +1,4 @@
-//! Episodes as real files: what is written is what is read, damage is found, weights are added, and tables say the same.
+//! Episodes as real files: what is written is what is read, damage is found, weights are added, and tables hold the same measurement.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::too_many_lines)]
 
 use std::path::{Path, PathBuf};
@@ -267,7 +267,8 @@ fn tables(features: &str, scale: &str) -> Result<Vec<Episode>, String> {
 
 const HEADING: &str = "episode,frame,t_s,alpha_deg,area_px2\n";
 
-/// Protects people with their own vision: the table may have its columns in any order, other columns, and lost and unmeasured frames.
+/// Protects people who measure V_e with software of their own: a table may have its columns in any order, further columns, and lost and
+/// unmeasured frames.
 #[test]
 fn a_table_is_read() {
     let features = "area_px2, note, episode, frame, t_s, alpha_deg\n0,x,a,5,0.0,1\n10.5,x,a,8,0.3,4\nnan,x,b,0,0,0\n,x,b,1,0.1,0.5\n";
@@ -280,7 +281,7 @@ fn a_table_is_read() {
     assert!(episodes.iter().all(|e| e.complete && e.kind == EpisodeKind::Table));
 }
 
-/// Protects people whose tables are wrong: each fault is named with file and line.
+/// Protects people whose tables are wrong: each fault is reported with file and line.
 #[test]
 fn faults_in_tables_are_named_with_file_and_line() {
     let good = "1,0,0.0,0,0\n1,1,0.033,0.5,3\n";

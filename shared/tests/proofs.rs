@@ -1,4 +1,6 @@
-//! What the proofs of the loop's promises rest on: counters that count, and the forward pass's number of instructions.
+//! What the proofs of the loop's promises rest on: the counters really count, and the forward pass keeps its number of instructions.
+//!
+//! The count of instructions needs valgrind (scripts/install valgrind).
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::too_many_lines)]
 
 use std::process::Command;
@@ -9,7 +11,7 @@ use shared::os;
 #[global_allocator]
 static ALLOCATOR: os::CountingAllocator = os::CountingAllocator;
 
-/// Protects `loop_allocations`: every allocation and free of this thread is counted, those of others are not.
+/// Protects `loop_allocations`: every allocation and free of this thread is counted, and those of other threads are not.
 #[test]
 fn allocations_of_this_thread_are_counted() {
     let before = os::allocations();
@@ -50,7 +52,7 @@ fn network() -> Mlp {
     net
 }
 
-/// Instructions of one call of the forward pass, by callgrind: the difference between two runs of this very program.
+/// Number of instructions in one call of the forward pass, as callgrind counts them: the difference between two runs of this very program.
 fn instructions(form: &str) -> f64 {
     let exe = std::env::current_exe().expect("tests have a path");
     let count = |calls: u32| -> f64 {
@@ -69,7 +71,7 @@ fn instructions(form: &str) -> f64 {
     (count(11_000) - count(1_000)) / 10_000.0
 }
 
-/// Makes calls when asked to by [`instructions`]; otherwise nothing.
+/// Makes calls if [`instructions`] asks for them; otherwise it does nothing.
 #[test]
 fn calls_for_callgrind() {
     let Some(calls) = std::env::var(CALLS).ok().and_then(|n| n.parse::<u32>().ok()) else { return };
@@ -93,6 +95,7 @@ fn the_forward_pass_keeps_its_number_of_instructions() {
     }
 }
 
-/// About a tenth above what was counted: 573 and 1989.
+/// Largest number of instructions in the form chosen at run time: about a tenth above the 573 that were counted.
 const CHOSEN_MOST: f64 = 630.0;
+/// Largest number of instructions in the portable form: about a tenth above the 1989 that were counted.
 const PORTABLE_MOST: f64 = 2190.0;

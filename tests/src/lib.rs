@@ -1,7 +1,7 @@
-//! A whole cell of real processes for tests: simulator, feature worker, controller, each with its own shared memory, loopback
-//! address and directory, all stopped and removed when the [`CellUnderTest`] is dropped.
+//! A whole cell of real processes for tests: simulator, feature worker and controller. Each cell has its own shared memory, loopback
+//! address and directory, and all of it is stopped and removed when the [`CellUnderTest`] is dropped.
 //!
-//! Only tests use it: it panics when something does not start, and says what the process printed.
+//! Only tests use it, in their own threads: it allocates and waits, and it panics when something does not start.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::too_many_lines)]
 #![forbid(unsafe_code)]
 
@@ -19,7 +19,7 @@ use shared::weights::{Estimator, Method, Origin, Weights};
 /// Counts the cells of this process, so that each gets a name and an address of its own.
 static NEXT: AtomicU32 = AtomicU32::new(0);
 
-/// Weights that tilt out by the same action every frame: they pour, though not well.
+/// Weights that tilt out by the same action in every frame: they pour, but not exactly.
 pub fn steady_weights(action: usize) -> Weights {
     let mut network = Mlp::ZERO;
     network.b3[action] = 1.0;
@@ -47,17 +47,17 @@ pub fn program(name: &str) -> PathBuf {
 
 /// A running cell.
 pub struct CellUnderTest {
-    /// Its directory: configuration, episodes, weights and logs; removed at the end.
+    /// The cell's directory: configuration, episodes, weights and logs; removed at the end.
     pub dir: tempfile::TempDir,
-    /// Its name.
+    /// The cell's name.
     pub name: String,
-    /// Its robot's address.
+    /// The address of the cell's robot.
     pub address: std::net::IpAddr,
     processes: Vec<(String, Child)>,
 }
 
 impl CellUnderTest {
-    /// A cell with nothing running. `adapt` may change the configuration, which is `config/sim.toml`'s.
+    /// Prepares a cell in which nothing runs yet. `adapt` may change the configuration, which is that of `config/sim.toml`.
     pub fn prepare(adapt: impl FnOnce(&mut toml::Table)) -> Self {
         let number = std::process::id() % 15_000 * 16 + NEXT.fetch_add(1, Ordering::Relaxed) % 16;
         let name = format!("test-{}-{number}", std::process::id());
@@ -79,7 +79,7 @@ impl CellUnderTest {
         Self { dir, name, address, processes: Vec::new() }
     }
 
-    /// A cell with simulator, feature worker and controller running, and a robot that is ready.
+    /// Starts a cell with simulator, feature worker and controller, and waits until the robot is ready.
     pub fn start(adapt: impl FnOnce(&mut toml::Table)) -> Self {
         let mut cell = Self::prepare(adapt);
         cell.spawn("simulator");
@@ -99,7 +99,7 @@ impl CellUnderTest {
         self.dir.path().join("weights.bin")
     }
 
-    /// Starts `program run`.
+    /// Starts the program `name` with the command `run`.
     pub fn spawn(&mut self, name: &str) {
         let log =
             std::fs::OpenOptions::new().create(true).append(true).open(self.dir.path().join(format!("{name}.log"))).expect("writable");
@@ -114,7 +114,7 @@ impl CellUnderTest {
         self.processes.push((name.into(), child));
     }
 
-    /// What a process printed so far.
+    /// What a process has printed so far.
     pub fn log(&self, name: &str) -> String {
         std::fs::read_to_string(self.dir.path().join(format!("{name}.log"))).unwrap_or_default()
     }
@@ -179,7 +179,8 @@ impl CellUnderTest {
         serde_json::from_slice(&output.stdout).ok().filter(|_| output.status.success())
     }
 
-    /// Waits until `good` holds for the controller's status; the newest status is in the panic otherwise.
+    /// Waits until `good` holds for the controller's status. If it does not, this panics with the newest status and what the processes
+    /// printed.
     pub fn wait(&self, what: &str, within: Duration, good: impl Fn(&Value) -> bool) -> Value {
         let until = Instant::now() + within;
         let mut newest = None;
@@ -209,7 +210,7 @@ impl CellUnderTest {
 
 impl Drop for CellUnderTest {
     fn drop(&mut self) {
-        // The controller first, while the robot is still there.
+        // The controller ends first, while the robot is still there.
         while let Some((name, mut child)) = self.processes.pop() {
             let pid = rustix::process::Pid::from_child(&child);
             let _ = rustix::process::kill_process(pid, rustix::process::Signal::CONT);

@@ -1,4 +1,4 @@
-//! The processes together in the simulated cell: orders, endings, weight swaps, faults of processes.
+//! The processes together in the simulated cell: orders, endings, weight swaps, and faults of processes.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::too_many_lines)]
 
 use std::time::{Duration, Instant};
@@ -39,7 +39,7 @@ fn a_pour_is_followed_to_its_end_and_recorded() {
     assert_eq!(status["loop_allocations"], before["loop_allocations"]);
 }
 
-/// Protects "what the robot gets": a recording follows eq. (1) at the robot, and its file holds curve, angles and images.
+/// Protects what the robot is told to do: a recording follows eq. (1) at the robot, and its file holds curve, angles and images.
 #[test]
 fn a_recording_becomes_an_episode() {
     let cell = CellUnderTest::start(|_| {});
@@ -83,7 +83,7 @@ fn a_stalled_disk_does_not_delay_an_abort() {
     cell.json("simulator", &["operator", "fill", "300", "--json"]);
     let pour = cell.begin("rt-controller", &["pour", "200", "--json"]);
     cell.wait("tilt", Duration::from_secs(10), |s| s["alpha_measured_deg"].as_f64() > Some(30.0));
-    // A pipe without a writer: who reads it waits.
+    // This is a pipe without a writer: whoever reads it waits.
     let pipe = cell.weights().with_extension("pipe");
     assert!(std::process::Command::new("mkfifo").arg(&pipe).status().expect("coreutils").success());
     std::fs::rename(&pipe, cell.weights()).expect("same directory");
@@ -95,14 +95,14 @@ fn a_stalled_disk_does_not_delay_an_abort() {
     let output = pour.wait_with_output().expect("it ran");
     let result: serde_json::Value = serde_json::from_slice(&output.stdout).expect("JSON");
     assert_eq!((output.status.code(), &result["outcome"]["reason"]), (Some(4), &"aborted".into()));
-    // The disk comes back: what it gives is no weight file, and the next one is taken.
+    // The disk comes back. What it gives is no weight file, and the next file is taken.
     std::fs::rename(cell.weights(), &pipe).expect("same directory");
     std::fs::write(&pipe, b"none").expect("somebody reads");
     cell.wait("the refusal", Duration::from_secs(5), |s| s["weights_refused"] != "");
     cell.take_weights(&steady_weights(TILT_OUT + 1));
 }
 
-/// Protects people: when a process dies or hangs at full tilt, the container comes upright, and the reason is named.
+/// Protects people: when a process dies or hangs at full tilt, the container comes upright, and the result names the reason.
 #[test]
 fn a_dead_or_hanging_process_ends_upright() {
     let mut cell = CellUnderTest::start(|_| {});

@@ -1,4 +1,4 @@
-//! Clear water as a cell's file writes it: rendered from its `[view]`, measured by the feature worker's extraction.
+//! Clear water as a cell's configuration describes it: rendered from its `[view]`, measured by the feature worker's extraction.
 
 use experiments::camera_evaluation::measure::measure_pours;
 use experiments::camera_setup::{camera_config, image_config};
@@ -36,9 +36,9 @@ fn clear_water_before_a_plain_wall_is_measured() -> Result<(), Box<dyn std::erro
 }
 
 /// Protects the cell between and during pours: over two whole pours, with the glass at rest before and after, a stream is seen while it
-/// flows and not otherwise; before a chess board nearly so.
+/// flows and not otherwise. Before a chess board this holds a little less often.
 #[test]
-fn whole_pours_are_seen_from_begin_to_end() -> Result<(), Box<dyn std::error::Error>> {
+fn whole_pours_are_seen_from_beginning_to_end() -> Result<(), Box<dyn std::error::Error>> {
     for (background, false_percent, missed_percent) in [(Background::Plain, 0.5, 2.0), (Background::Chess, 8.0, 8.0)] {
         let view = View { liquid_bgr: None, background, ..View::default() };
         let figures = measure_pours(&view, 2, 2)?;

@@ -9,13 +9,13 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::fs;
 use std::path::{Path, PathBuf};
 
-/// Most lines of a file.
+/// Largest number of lines in a file.
 const FILE_LINES: usize = 500;
 
 /// Files that stay longer, with their lines and the reason. An entry may only shrink, and goes when its file is short enough.
 const LONGER_FILES: &[(&str, usize, &str)] = &[];
 
-/// Most functions that may stay longer than the limit in clippy.toml. Each one carries its reason in its `expect` attribute.
+/// Largest number of functions that may stay longer than the limit in clippy.toml. Each one carries its reason in its `expect` attribute.
 const LONGER_FUNCTIONS: usize = 0;
 
 /// The one file that may hold unsafe code.
@@ -71,7 +71,7 @@ fn code(text: &str) -> String {
     lines.collect::<Vec<_>>().join("\n")
 }
 
-/// Fails with all `faults`, a line each.
+/// Fails if there are `faults`, with a line for each.
 fn none(faults: &[String]) {
     assert!(faults.is_empty(), "\n{}", faults.join("\n"));
 }
@@ -178,7 +178,7 @@ fn no_files_import_each_other_in_a_circle() {
     let mut faults = Vec::new();
     for name in crates() {
         let graph = imports(&name);
-        // What each file reaches; a circle reaches itself.
+        // What each file reaches; a file in a circle reaches itself.
         let reach = |from: &String| {
             let mut seen: BTreeSet<&String> = BTreeSet::new();
             let mut open: Vec<&String> = graph[from].iter().collect();
@@ -213,7 +213,7 @@ fn paths_are_read_as_the_compiler_reads_them() {
     assert_eq!(paths(code), ["std::fmt", "super::line::Line", "super::line::fit", "crate::os::now_ns"]);
 }
 
-/// Protects a reader from files that do not fit into a head.
+/// Protects a reader from files that are too long to keep in mind.
 #[test]
 fn files_are_short() {
     let mut faults = Vec::new();
@@ -238,7 +238,7 @@ fn files_are_short() {
     none(&faults);
 }
 
-/// Protects the limit on functions, which clippy holds: exceptions do not become more.
+/// Protects the limit on functions, which clippy checks: the exceptions do not become more.
 #[test]
 fn long_functions_do_not_become_more() {
     let exceptions: usize =
@@ -287,7 +287,7 @@ fn unsafe_code_stands_in_one_file() {
     let faults: Vec<String> = sources()
         .iter()
         .filter(|(name, text)| name != UNSAFE_FILE && !name.ends_with("house.rs") && unsafe_in(text))
-        .map(|(name, _)| format!("{name}: unsafe code belongs into {UNSAFE_FILE}"))
+        .map(|(name, _)| format!("{name}: unsafe code belongs in {UNSAFE_FILE}"))
         .collect();
     none(&faults);
 }

@@ -1,6 +1,6 @@
-//! The loop's ticks under an allocator that aborts the process when a tick allocates or frees: the second means, beside the
-//! counter in `status`, and another one's code. The ticks are those of `rt-controller run`, driven here as fast as the robot's
-//! answers allow; real shared memory, real sockets, the program on the simulated robot.
+//! The loop's ticks under an allocator that aborts the process when a tick allocates or frees. It is a second proof beside the counter in
+//! `status`, and its code comes from somebody else. The ticks are those of `rt-controller run`, driven here faster than in a cell, with
+//! real shared memory, real sockets, and the program on the simulated robot.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::too_many_lines)]
 
 use std::process::Command;
@@ -25,10 +25,11 @@ static ALLOCATOR: AllocDisabler = AllocDisabler;
 
 const TICKS: u64 = 10_000;
 const PERIOD: Duration = Duration::from_millis(3);
-/// Set in the child that is to abort: its worker comes while a pour is under way, so that a tick meets it.
+/// The environment variable of the child that is to abort: its worker comes while a pour is under way, so that a tick meets it.
 const PLANT: &str = "DECANT_TEST_PLANT";
 
-/// Runs `TICKS` ticks with pours, a weight swap before each, aborts, a lost robot; the worker's frames stop and go on.
+/// Runs `TICKS` ticks with pours, a weight swap before each, an abort, and a robot that is lost and comes back. With `plant`, the worker is
+/// replaced in the middle of a pour.
 fn run(plant: bool) {
     let name = format!("no-allocation-{}", std::process::id());
     let address = std::net::IpAddr::from([127, 45, plant.into(), 1]);
@@ -42,7 +43,7 @@ fn run(plant: bool) {
 
     std::thread::scope(|scope| {
         scope.spawn(|| keep_robot_connected(&config, &exchange, &note, &connections, &stop, &|_| {}));
-        // The ordinary thread: orders, weights, faults; it drops what the loop gives back.
+        // The ordinary thread gives orders, weights and faults, and drops what the loop gives back.
         scope.spawn(|| {
             let worker = ipc::Cell::join(&name).expect("shared memory");
             let topic = worker.features().expect("shared memory");

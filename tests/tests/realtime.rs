@@ -1,8 +1,8 @@
 //! The loop's promises over more than 10,000 ticks of the real processes, at 125 Hz instead of 30 so that it takes 90 s: no
-//! allocation, no page fault, no system call that docs/REALTIME.md does not list, weights swapped 100 times a second without
-//! a trace in the pour in progress, and the same inputs giving the same bits again. Each check is shown a violation, too.
+//! allocation, no page fault, no system call that docs/REALTIME.md does not list, weights that are written 100 times a second without a
+//! trace in the pour in progress, and the same inputs giving the same bits again. A second test shows violations to the checks.
 //!
-//! Needs `strace` (scripts/test installs it) and leave to trace its own children.
+//! The tests need `strace` (scripts/test installs it) and permission to trace their own children.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::too_many_lines)]
 
 use std::collections::BTreeSet;
@@ -80,7 +80,7 @@ fn thread(pid: u32, name: &str) -> u32 {
     found.file_name().to_string_lossy().parse().expect("a number")
 }
 
-/// Writes weights 100 times a second, two policies in turn, until told to stop; gives how many, and the last one's identity.
+/// Writes weights 100 times a second, two kinds in turn, until told to stop. Gives how many it wrote, and the identity of the last.
 fn hammer(file: &Path, stop: &AtomicBool) -> (u64, String) {
     let variants = [steady_weights(TILT_OUT), steady_weights(TILT_OUT + 1)];
     let bytes = variants.each_ref().map(|w| w.to_bytes().expect("valid"));
@@ -103,7 +103,7 @@ fn pour(cell: &CellUnderTest, goal: &str) -> Value {
     serde_json::from_slice::<Value>(&output.stdout).map_or(Value::Null, |v| v["outcome"]["reason"].clone())
 }
 
-/// Protects the loop's deadline, and whoever replays a journal.
+/// Protects the loop's deadline, and people who replay a journal.
 #[test]
 fn ten_thousand_ticks_keep_the_promises() {
     let mut cell = CellUnderTest::start(|config| {
@@ -124,7 +124,7 @@ fn ten_thousand_ticks_keep_the_promises() {
     let ready = |cell: &CellUnderTest| cell.wait("readiness", Duration::from_secs(20), |s| s["phase"] == "idle" && s["hindrance"] == "");
     assert_eq!(pour(&cell, "40"), "done");
 
-    // A frame is late: the worker hangs, is not restarted, and goes on.
+    // Frames are late: the worker hangs, is not restarted, and goes on.
     let hung = {
         cell.json("simulator", &["operator", "fill", "400", "--json"]);
         let pour = cell.begin("rt-controller", &["pour", "200", "--json"]);
@@ -154,11 +154,11 @@ fn ten_thousand_ticks_keep_the_promises() {
     stop.store(true, Relaxed);
     let (written, last) = hammering.join().expect("it ran");
     let calls = trace.calls();
-    // The second means, both the kernel's own books: what it shows of the thread to others.
+    // A second proof, from the kernel's own records: what it shows about the thread to other processes.
     let faults = page_faults(pid, loop_thread);
     let found = found_in(pid, loop_thread, 2000);
 
-    // The worker dies and is replaced: the loop opens new shared memory, outside of pours, and that is counted apart.
+    // The worker dies and is replaced. The loop opens new shared memory outside of pours, and that is counted apart.
     cell.signal("feature-worker", Signal::KILL);
     cell.spawn("feature-worker");
     let before = cell.status().expect("running")["features"].as_u64();
@@ -170,7 +170,7 @@ fn ten_thousand_ticks_keep_the_promises() {
     assert_eq!(calls, documented_calls(), "the loop's system calls, and those that docs/REALTIME.md lists");
     #[cfg(target_arch = "x86_64")]
     {
-        // Numbers of clock_nanosleep, recvfrom, sendto, getrusage; -1: between calls.
+        // These are the numbers of clock_nanosleep, recvfrom, sendto and getrusage; -1 stands for a thread between calls.
         let numbers = BTreeSet::from([230, 45, 44, 98, -1]);
         assert!(found.is_subset(&numbers) && found.contains(&230), "{found:?}");
     }
@@ -207,7 +207,7 @@ fn ten_thousand_ticks_keep_the_promises() {
 }
 
 /// Protects the checks themselves: an ordinary thread makes calls that the list does not have, and a journal whose answer was
-/// changed in one bit is found out.
+/// changed in one bit is noticed.
 #[test]
 fn the_checks_see_violations() {
     let mut cell = CellUnderTest::start(|_| {});
@@ -222,7 +222,8 @@ fn the_checks_see_violations() {
     let last = bytes.len() - 1;
     let untouched = journal::replay(&path, |_, _| {}).expect("a journal");
     assert_eq!(untouched.different, 0);
-    // d_ml of the last tick, before its four times of up to ten bytes each: any bit of the entry but those of the times.
+    // This looks for d_ml of the last tick, which stands before its four times of up to ten bytes each. A changed bit of it must be
+    // noticed.
     let tick = (last - 80..last - 44).rev().find(|k| {
         let mut changed = bytes.clone();
         changed[*k] ^= 1;

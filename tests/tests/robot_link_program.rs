@@ -1,6 +1,6 @@
 //! The program on the robot (`rt-controller/robot/pour.script`) on the simulated controller, control cycle by control cycle.
 //!
-//! No sockets and no clock: what is asserted here is exact and holds on every machine.
+//! The tests use no sockets and no clock, so what they assert is exact and holds on every machine.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::too_many_lines)]
 
 use rand::{RngExt, SeedableRng};
@@ -40,7 +40,7 @@ struct Robot {
     options: LinkOptions,
     cycle_s: f64,
     sequence: i32,
-    /// Since the upload.
+    /// The control cycles since the program started.
     cycles: Vec<Cycle>,
 }
 
@@ -51,7 +51,7 @@ impl Robot {
         let machine = Machine::new(series, series.default_version(), stance);
         let cycle_s = machine.robot.steptime_s();
         let mut robot = Self { machine, options, cycle_s, sequence: 500, cycles: Vec::new() };
-        // What an old session left behind.
+        // This is what an old session left behind.
         robot.send(Mode::Stream, 77.0);
         let text = program::text(&robot.options, cycle_s, RUN).unwrap();
         robot.machine.upload(&text);
@@ -186,7 +186,7 @@ fn it_never_goes_beyond_the_newest_target() {
 }
 
 /// Protects the operator's glass: 100 ms without a target, and the container comes upright at the return rate, the program
-/// ends and says so; the watchdog, which would leave it tilted, does not bite before.
+/// ends and says so; the watchdog, which would leave it tilted, does not act before.
 #[test]
 fn without_targets_it_comes_upright_and_ends() {
     for series in BOTH {
@@ -207,7 +207,7 @@ fn without_targets_it_comes_upright_and_ends() {
     }
 }
 
-/// Protects against a pour that resumes by itself: once it is on its way upright, new targets change nothing.
+/// Protects people from a pour that resumes by itself: once the container is on its way upright, new targets change nothing.
 #[test]
 fn a_return_is_never_taken_back() {
     let mut robot = Robot::ready(Series::Cb3);
@@ -220,7 +220,7 @@ fn a_return_is_never_taken_back() {
     assert!(robot.cycles.last().unwrap().actual_deg.abs() < 0.2);
 }
 
-/// Protects the way upright from the backstop: even with the speed slider at a third the program's own way comes first.
+/// Protects the way upright from the watchdog: even with the speed slider at a third, the program's own way is finished first.
 #[test]
 fn a_slow_slider_does_not_bring_the_watchdog_first() {
     let mut robot = Robot::ready(Series::Cb3);
@@ -233,7 +233,7 @@ fn a_slow_slider_does_not_bring_the_watchdog_first() {
     assert!(robot.cycles.last().unwrap().actual_deg.abs() < 0.2);
 }
 
-/// Protects the arm from whatever comes in: any targets, numbers and modes, not numbers among them, keep every limit.
+/// Protects the arm from whatever comes in: under any targets, sequence numbers and modes, NaN among them, every limit is kept.
 #[test]
 fn no_stream_leads_beyond_the_limits() {
     for seed in 0..20 {
@@ -360,8 +360,8 @@ fn an_unused_program_ends() {
     assert_eq!(robot.machine.robot.servo.actual_q, STANCE_RAD);
 }
 
-/// Protects what a pause leaves: resumed after a protective stop at full flow, with nobody streaming, it comes upright from
-/// where it stopped and ends.
+/// Protects people after a pause: resumed after a protective stop at full flow, with nobody streaming, it comes upright from where it
+/// stopped and ends.
 #[test]
 fn resumed_after_a_protective_stop_it_comes_upright() {
     let mut robot = Robot::ready(Series::Cb3);
@@ -408,7 +408,7 @@ fn resumed_in_mid_motion_it_begins_from_rest() {
     }
 }
 
-/// Protects against a jump: moved by somebody else during a pause, the joint is taken from where it is, and upright.
+/// Protects people from a jump: a joint that was moved by somebody else during a pause is brought upright from where it is.
 #[test]
 fn a_joint_that_was_moved_is_not_jerked_back() {
     let mut robot = Robot::ready(Series::Cb3);

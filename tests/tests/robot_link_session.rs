@@ -1,4 +1,4 @@
-//! The robot link over real sockets against the simulated controller: both generations, reconnecting, latency.
+//! The robot link over real sockets against the simulated controller: both generations, reconnecting, and latency.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::too_many_lines)]
 
 use std::net::{IpAddr, Ipv4Addr};
@@ -27,7 +27,7 @@ fn cell(last: u8, series: Series) -> (Controller, LinkOptions) {
     (robot, options)
 }
 
-/// Ticks at 30 Hz as the loop does, towards `alpha_deg`, until the joint is there.
+/// Sends targets at 30 Hz, as the loop does, until the joint is at `alpha_deg`.
 fn tilt_to(session: &mut Session, limiter: &mut Limiter, alpha_deg: f32) {
     for _ in 0..300 {
         let now = now_ns();
@@ -74,7 +74,7 @@ fn a_program_on_its_way_upright_is_left_alone() {
     let (robot, options) = cell(3, Series::Cb3);
     let mut session = connect(&options).unwrap();
     tilt_to(&mut session, &mut limiter(), 50.0);
-    // As a killed process leaves it: nothing more is sent, the socket is closed.
+    // This is how a killed process leaves it: nothing more is sent, and the socket is closed.
     robot.inject(Fault::Fin);
     assert_eq!(connect(&options).unwrap_err(), LinkError::ProgramRunning { address: options.address });
     let session = loop {
@@ -101,7 +101,7 @@ fn local_control_is_explained() {
     connect(&options).unwrap();
 }
 
-/// Protects against two controllers at one robot: the second is told that the registers are in use.
+/// Protects a robot from two controllers: the second is told that the registers are in use.
 #[test]
 fn a_second_controller_is_refused() {
     let (_robot, options) = cell(5, Series::Cb3);
@@ -110,7 +110,8 @@ fn a_second_controller_is_refused() {
     assert_eq!(second, LinkError::InUse { address: options.address, variable: "input_int_register_24".into() });
 }
 
-/// Measures, and prints: from the target's bytes written to its number read back, and to the joint's first movement.
+/// Protects the link from being slow unnoticed. It prints the times from a target's bytes being written until its number is read back, and
+/// until the joint first moves.
 #[test]
 fn latency_is_measured() {
     for (last, series) in [(6, Series::Cb3), (7, Series::ESeries)] {
@@ -119,13 +120,13 @@ fn latency_is_measured() {
         let (mut echoes, mut motions) = (Vec::new(), Vec::new());
         let mut alpha = 0.0;
         for round in 0..60 {
-            // At rest before each step of one degree, as one tick's target.
+            // The joint is at rest before each step of one degree, which is one tick's target.
             for _ in 0..12 {
                 session.send(Mode::Stream, alpha).unwrap();
                 thread::sleep(Duration::from_millis(33));
                 session.poll(now_ns()).unwrap();
             }
-            // Not in step with the control cycle.
+            // The step must not keep pace with the control cycle.
             thread::sleep(Duration::from_micros(137 * (round % 60)));
             session.poll(now_ns()).unwrap();
             let before = session.state().alpha_deg;
@@ -160,7 +161,7 @@ fn latency_is_measured() {
         println!("{series:?}: target written -> its number read back: {}", percentiles(&mut echoes));
         println!("{series:?}: target written -> joint moved by 0.02 degrees: {}", percentiles(&mut motions));
         println!("{series:?}: published for a real UR: 35 ms to the first motion");
-        // One that is later than 80 ms is missing in the lists: a busy machine may lose a few, a slow link would lose most.
+        // A step that takes longer than 80 ms is missing from the lists: a busy machine may lose a few, but a slow link would lose most.
         assert!(
             echoes.len() >= 50 && motions.len() >= 50,
             "of 60 steps {} were echoed and {} moved the joint",

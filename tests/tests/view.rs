@@ -1,4 +1,4 @@
-//! `feature-worker view` beside the worker, in a running cell.
+//! `feature-worker view` beside the worker, in a running cell of real processes.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::too_many_lines)]
 
 use std::io::{BufRead, BufReader, Read, Write};
@@ -34,7 +34,7 @@ impl View {
         answer.split_off(body)
     }
 
-    /// What its page does: state and picture, 15 times a second. Gives the frames that were shown.
+    /// Does what the view's page does: it asks for state and picture, 15 times a second. Gives the frames that were shown.
     fn look(&self, until: Instant) -> Vec<u64> {
         let mut seen = Vec::new();
         while Instant::now() < until {
@@ -57,8 +57,8 @@ impl Drop for View {
     }
 }
 
-/// Protects the pour from people who look on: the page shows the live picture while the worker works, and both see the same frames.
-/// What the view costs the worker is printed (`--show-output`), in turns without and with it.
+/// Protects a pour that people watch: the page shows the live picture while the worker works, and both see the same frames. What the view
+/// costs the worker is printed (`--show-output`), measured in turns without and with it.
 #[test]
 fn the_view_shows_what_the_worker_measures() {
     let mut cell = CellUnderTest::start(|_| {});

@@ -1,10 +1,10 @@
 #!/usr/bin/env python3
-"""Judges the simulated UR5 controller by a client that nobody here wrote: the ur-rtde library from PyPI.
+"""Checks the simulated UR5 controller with a client that was written elsewhere: the ur-rtde library from PyPI.
 
 Usage: check.py SIMULATOR [CHECK]
 
-SIMULATOR is the simulator binary; each check starts a controller of its own on 127.83.x.y. Needs the package ur-rtde, see
-scripts/check-ur-rtde. Prints one line a check; exit code 0 if all hold, 1 otherwise. With CHECK only that one runs.
+SIMULATOR is the simulator binary; each check starts a controller of its own on 127.83.x.y. It needs the package ur-rtde, see
+scripts/check-ur-rtde. It prints one line for each check; the exit code is 0 if all hold, and 1 otherwise. With CHECK only that one runs.
 
 Every check has a process of its own, because ur-rtde 1.6.5 sometimes crashes when a call meets its own reconnecting thread;
 a check whose process was killed by a signal is repeated.
@@ -83,7 +83,7 @@ def raises(kind, text, action):
 
 
 def stream(control, start, seconds, amplitude=0.3):
-    """servoJ at 30 Hz: wrist 3 out and back. Gives whether every call was accepted, and where wrist 3 was sent last."""
+    """Moves wrist 3 out and back by servoJ at 30 Hz. Gives whether every call was accepted, and where wrist 3 was sent last."""
     ticks = int(seconds * 30)
     accepted = True
     begin = time.monotonic()
@@ -254,7 +254,7 @@ def fault_fin_to_control():
         c = robot.control()
         until("the program started", lambda: robot.started() == 1)
         robot.fault("fin")
-        # By itself, as logged. What it does then is its own affair: it may reconnect over and over, and often crashes.
+        # ur_rtde reconnects by itself. What it does then is its own affair: it may reconnect over and over, and often crashes.
         until("reconnected and the program sent again", lambda: robot.started() == 2, 20)
 
 
@@ -297,7 +297,7 @@ def fault_jump():
 
 
 def fault_pieces():
-    # Split and joined frames reach the client whole.
+    # Packets that are split or joined on their way reach the client whole.
     with Robot("cb3") as robot:
         c = robot.control()
         r = robot.receive()
@@ -349,7 +349,7 @@ def one(name):
         traceback.print_exc()
         sys.stderr.flush()
         os._exit(1)
-    # Without waiting for the client library's threads.
+    # This ends the process without waiting for the client library's threads.
     os._exit(0)
 
 

@@ -1,4 +1,5 @@
-//! `rt-controller abort`: brings the container upright at once, and waits until it is. A short ordinary process; every failure is one line.
+//! `rt-controller abort`: brings the container upright at once, and waits until it is. It is a short,
+//! ordinary process, and every failure is one line.
 
 use std::path::PathBuf;
 use std::time::{Duration, Instant};
@@ -10,7 +11,7 @@ use shared::messages::Phase;
 
 use crate::client::Client;
 
-/// How long the command waits for the container to be upright: the way back from the largest tilt takes about 2 s.
+/// How long the command waits for the container to be upright. Chosen by hand: the way back from the largest tilt takes about 2 s.
 const UPRIGHT: Duration = Duration::from_secs(20);
 /// Pause between two looks at the controller's state. Chosen by hand; no measurement is recorded.
 const BEAT: Duration = Duration::from_millis(50);

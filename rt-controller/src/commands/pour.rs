@@ -1,5 +1,5 @@
-//! `rt-controller pour ML`: asks the running controller for a pour, shows its progress, and ends with its result. A short ordinary
-//! process; every failure is one line.
+//! `rt-controller pour ML`: asks the running controller for a pour, shows its progress, and ends with its result. It is a short,
+//! ordinary process, and every failure is one line.
 
 use shared::config::Config;
 use shared::control::{EndReason, Outcome, Reply, Request};

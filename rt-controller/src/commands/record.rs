@@ -1,5 +1,5 @@
-//! `rt-controller record`: runs the Gaussian curve of eq. (1) and produces one episode. A short ordinary process; every failure is one
-//! line.
+//! `rt-controller record`: runs the Gaussian curve of eq. (1) and produces one episode. It is a short, ordinary process, and every
+//! failure is one line.
 
 use std::io::{BufRead, IsTerminal, Write};
 use std::path::Path;
@@ -13,7 +13,7 @@ use shared::gaussian_curve::Curve;
 use super::pour;
 use crate::client::Common;
 
-/// Alpha at the curve's first and last moment if no beta is given, degrees: small enough for a start without a jump.
+/// Alpha at the curve's first and last moment if no beta is given, degrees. Chosen by hand: small enough for a start without a jump.
 const END_DEG: f32 = 0.05;
 
 /// Command-line arguments.
@@ -27,13 +27,13 @@ pub struct Args {
     /// Height of the curve, degrees.
     #[arg(long)]
     lambda: f32,
-    /// Width of the curve, 1/s^2.
+    /// How narrow the curve is, 1/s^2.
     #[arg(long)]
     gamma: f32,
     /// Time of the curve's top, s; by default such that the curve starts at 0.05 degrees.
     #[arg(long)]
     beta: Option<f32>,
-    /// Weight on the scale in g, where it is known without asking.
+    /// Weight on the scale in g, if it is known already and need not be asked for.
     #[arg(long)]
     weight: Option<f64>,
     #[command(flatten)]
@@ -71,7 +71,7 @@ pub fn run(args: &Args) -> Result<(), Failure> {
     Ok(())
 }
 
-/// Asks a person for the weight on the scale, if there is one at the terminal; an empty line means later.
+/// Asks a person for the weight on the scale, if there is one at the terminal; an empty line means that it is given later.
 fn ask_weight() -> Option<f64> {
     let stdin = std::io::stdin();
     if !stdin.is_terminal() {

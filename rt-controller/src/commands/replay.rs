@@ -1,5 +1,5 @@
-//! `rt-controller replay FILE`: runs a journal through the same core again and compares every answer. A short ordinary process; every
-//! failure is one line.
+//! `rt-controller replay FILE`: runs a journal through the same core again and compares every answer. It is a short,
+//! ordinary process, and every failure is one line.
 
 use std::path::PathBuf;
 
@@ -14,10 +14,10 @@ Exit codes: 0 every answer is the same to the bit, 1 some differ, 2 the file can
 pub struct Args {
     /// The journal (controller.journal of the configuration).
     file: PathBuf,
-    /// Print every tick as CSV instead of the summary.
+    /// Prints every tick as CSV instead of the summary.
     #[arg(long)]
     table: bool,
-    /// Print the summary as JSON.
+    /// Prints the summary as JSON.
     #[arg(long)]
     json: bool,
 }

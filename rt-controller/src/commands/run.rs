@@ -2,7 +2,8 @@
 //!
 //! It starts the threads: "loop" is real-time, "robot" connects, "disk" writes the journal and reads weights; the main thread serves
 //! clients and publishes telemetry. A signal brings the container upright and ends the process. A second signal ends it at once, and
-//! the program on the robot then goes upright by itself.
+//! the program on the robot then goes upright by itself. Starting allocates; each failure to start is one line, and a panic in any thread
+//! ends the process.
 
 use std::io::Write;
 use std::path::PathBuf;
@@ -23,7 +24,7 @@ use crate::service::Service;
 /// Stack of each thread beside the main one, bytes; all of it is locked in memory. Chosen by hand; no measurement is recorded.
 const STACK: usize = 512 * 1024;
 
-/// The failure to start a thread.
+/// The failure of a thread that could not be started.
 fn no_thread(e: std::io::Error) -> Failure {
     failure(exit::FAILED, format!("no thread could be started: {e}; does the system limit processes or locked memory?"))
 }
@@ -50,7 +51,7 @@ pub fn run(args: &Args) -> Result<(), Failure> {
     }));
     let stop = stop_at_signals()?;
 
-    // Before anything else, so that all that is made from here on is in memory before the loop starts.
+    // This comes before the threads are made, so that everything that they need is in memory before the loop starts.
     if let Err(line) = shared::os::lock_memory() {
         say(&line);
     }
@@ -99,7 +100,7 @@ fn run_threads(config: &Config, stop: &AtomicBool, say: &(dyn Fn(&str) + Sync)) 
     })
 }
 
-/// A thread beside the main one.
+/// The builder of a thread beside the main one.
 fn thread(name: &str) -> std::thread::Builder {
     std::thread::Builder::new().name(name.into()).stack_size(STACK)
 }

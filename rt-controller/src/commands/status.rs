@@ -1,5 +1,5 @@
-//! `rt-controller status`: shows the running controller's state, counters and histograms. A short ordinary process; every failure is one
-//! line.
+//! `rt-controller status`: shows the running controller's state, counters and histograms. It is a short, ordinary process,
+//! and every failure is one line.
 
 use shared::config::Config;
 use shared::control::Status;

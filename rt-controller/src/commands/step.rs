@@ -1,5 +1,5 @@
-//! `rt-controller step`: runs the controller's core as a filter, so that any other simulator can drive it. An ordinary process; every
-//! failure is one line. A simulator in Rust can call the core itself: see `examples/drive_core.rs`.
+//! `rt-controller step`: runs the controller's core as a filter, so that any other simulator can drive it. It is an ordinary
+//! process, and every failure is one line. A simulator in Rust can call the core itself: see `examples/drive_core.rs`.
 
 use std::io::{BufRead, Write};
 use std::path::PathBuf;

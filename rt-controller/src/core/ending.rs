@@ -1,9 +1,10 @@
-//! When and why a pour or recording ends: every rule, as one small state that the core asks.
+//! When and why a pour or recording ends: every rule, in one small state that the core asks.
 //!
-//! Pure; runs in the controller's loop, does not allocate, panic or fail. An ending has three steps. A rule names a reason while the
-//! container is tilted ([`Ending::due`]); the container then comes upright ([`is_commanded_upright`]); the last drops are counted
+//! It is pure and runs in the controller's loop; it does not allocate, panic or fail. An ending has three steps. A rule names a reason
+//! while the container is tilted ([`Ending::due`]); the container then comes upright ([`is_commanded_upright`]); the last drops are counted
 //! ([`Ending::settled`]). Reasons that do not come from a rule, such as an operator's abort or a robot that may not move, are given to
-//! [`Ending::end_with`]. The first reason stays.
+//! [`Ending::end_with`] or [`Ending::end_without_robot`]. The first reason other than `Done` stays, unless the joint then does not come
+//! upright.
 //!
 //! | rule | reason |
 //! |---|---|
@@ -12,7 +13,7 @@
 //! | the newest usable measurement is too old | `StaleFeature` |
 //! | the largest number of frames is reached | `MaxFrames` |
 //! | nothing flows at the largest tilt | `ContainerEmpty` |
-//! | a stream was seen, and none any more although the container is tilted further | `StreamLost` |
+//! | a stream was seen before, and is not seen any more although the container is tilted further | `StreamLost` |
 //! | [`controller_overran`]: the controller itself was stopped | `ControllerOverrun` |
 //! | [`worker_was_restarted`]: measurements come from another process | `WorkerRestarted` |
 //! | [`Ending::settled`]: the joint did not come upright | `NotUpright` |
@@ -32,10 +33,10 @@ const STALLED_FRAMES: u32 = 90;
 const PROGRESS_DEG: f32 = 1.0;
 /// Poured volume that counts as progress, ml. Chosen by hand; no measurement is recorded.
 const PROGRESS_ML: f32 = 0.5;
-/// Less than this still to come over the lip counts as nothing, ml: about one drop of water.
+/// If less than this is still to come over the lip, ml, it counts as nothing: this is about one drop of water.
 const NOTHING_ML: f64 = 0.05;
-/// Frames in a row with a stream from which on the tilt of the stream is remembered. None of 10,800 simulated pours ended by mistake with
-/// this and the three constants below; see docs/LEARNING.md.
+/// After this many frames in a row with a stream, the tilt of the stream is remembered. None of 10,800 simulated pours ended by mistake
+/// with this and the three constants below; see docs/LEARNING.md.
 const STREAM_FRAMES: u32 = 5;
 /// Only after this poured volume can a stream be lost, ml: a bead that was taken for a stream is less. See docs/LEARNING.md.
 const STREAM_ML: f32 = 1.0;
@@ -47,21 +48,21 @@ const STREAM_LOST_DEG: f32 = 10.0;
 /// Within this of the largest alpha the container counts as tilted as far as it goes, degrees. Chosen by hand; no measurement is
 /// recorded.
 const LARGEST_TILT_SLACK_DEG: f32 = 0.5;
-/// A commanded alpha nearer to 0 than this is upright, degrees: far below what a robot can resolve.
+/// A commanded alpha nearer to 0 than this is upright, degrees. Chosen by hand: far below what a robot can resolve.
 const COMMANDED_UPRIGHT_DEG: f32 = 0.01;
 /// Frames without flow after which the last drops are counted: half a second at 30 Hz. Chosen by hand; no measurement is recorded.
 const SETTLE_QUIET_FRAMES: u32 = 15;
 /// Longest wait for the last drops and for the joint to come upright, s. Chosen by hand; no measurement is recorded.
 const SETTLE_MAX_S: f64 = 3.0;
 
-/// What one frame with a measurement showed during a pour.
+/// What one frame showed during a pour.
 #[derive(Debug, Clone, Copy)]
 pub struct SeenFrame {
     /// Number of frames lost just before it.
     pub lost: u32,
-    /// V_e, px^2; `None`: it could not be measured.
+    /// V_e, px^2; `None` if it could not be measured.
     pub area_px2: Option<f32>,
-    /// The agent sees liquid leave the container.
+    /// Whether the agent sees liquid leave the container.
     pub flowing: bool,
     /// Commanded alpha when the picture was taken, degrees.
     pub alpha_deg: f32,
@@ -74,7 +75,7 @@ pub struct SeenFrame {
 pub struct Moment {
     /// Time since the pour or recording began, s.
     pub running_s: f64,
-    /// Frames since then, the lost ones included.
+    /// Number of frames since then, the lost ones included.
     pub frames: u32,
     /// Age of the newest usable measurement, ns.
     pub measurement_age_ns: u64,
@@ -87,7 +88,7 @@ pub struct Moment {
 /// How far a pour or recording is from its end.
 #[derive(Debug, Clone, Copy)]
 pub struct Ending {
-    /// Length of a recording's curve, s; `None`: this is a pour.
+    /// Length of a recording's curve, s; `None` in a pour.
     curve_s: Option<f64>,
     reason: EndReason,
     agent_is_done: bool,
@@ -98,9 +99,9 @@ pub struct Ending {
     advanced_from_ml: f32,
     quiet_frames: u32,
     empty_frames: u32,
-    /// Frames in a row with a stream.
+    /// Number of frames in a row with a stream.
     stream_frames: u32,
-    /// Frames in a row without one.
+    /// Number of frames in a row without a stream.
     no_stream_frames: u32,
     /// Largest tilt at which a stream was seen, degrees.
     stream_deg: Option<f32>,
@@ -131,7 +132,7 @@ impl Ending {
         Self { curve_s: Some(curve_s), ..Self::of_pour() }
     }
 
-    /// Why it ends; [`EndReason::Done`] as long as nothing else was said.
+    /// Why the pour or recording ends; [`EndReason::Done`] as long as no other reason was given.
     pub fn reason(&self) -> EndReason {
         self.reason
     }
@@ -141,19 +142,20 @@ impl Ending {
         self.reason = reason;
     }
 
-    /// The robot may not move any more, for `reason`: a pour that was already ending for another reason than its goal keeps that one.
+    /// Gives the reason for which the robot may not move any more. A pour that was already ending for another reason than its goal keeps
+    /// that one.
     pub fn end_without_robot(&mut self, reason: EndReason) {
         if self.reason == EndReason::Done {
             self.reason = reason;
         }
     }
 
-    /// Whether the agent has come to its end. Stays true.
+    /// Whether the agent has finished; once true, it stays true.
     pub fn agent_is_done(&self) -> bool {
         self.agent_is_done
     }
 
-    /// Takes the agent's decision for one frame, the lost ones included; answers with [`Ending::agent_is_done`].
+    /// Takes the agent's decision for one frame, lost or not, and returns [`Ending::agent_is_done`].
     pub fn decided(&mut self, decision: &Decision) -> bool {
         self.agent_is_done |= goal_is_reached(decision);
         self.seen_flow |= decision.flowing;
@@ -162,14 +164,15 @@ impl Ending {
         self.agent_is_done
     }
 
-    /// A container that was brought back without any flow has poured, although d is still above 0: the agent stopped a little early.
+    /// Whether the container was brought back so far without any flow that the pour is over, although d is still above 0: the agent then
+    /// stopped a little early.
     fn is_brought_back(&mut self, decision: &Decision) -> bool {
         let forward = decision.flowing || decision.dalpha_deg > 0.0;
         self.brought_back_deg = if forward { 0.0 } else { self.brought_back_deg - decision.dalpha_deg };
         self.seen_flow && self.brought_back_deg > BROUGHT_BACK_DEG
     }
 
-    /// An agent that gets on neither in tilt nor in volume would stand there for ever.
+    /// Whether the agent has made no progress for so long, neither in tilt nor in volume, that it would stand there for ever.
     fn stands_still(&mut self, decision: &Decision) -> bool {
         self.advanced_deg += decision.dalpha_deg;
         if self.advanced_deg >= PROGRESS_DEG || decision.poured_ml - self.advanced_from_ml >= PROGRESS_ML {
@@ -211,20 +214,21 @@ impl Ending {
         }
     }
 
-    /// What flows at one tilt flows more at a larger one: a stream that is gone there has ended, or is no longer seen.
+    /// Whether the stream is lost. What flows at one tilt flows faster at a larger one, so a stream that is gone there has ended, or is no
+    /// longer seen.
     fn stream_is_lost(&self, moment: &Moment) -> bool {
         moment.poured_ml >= STREAM_ML
             && self.no_stream_frames >= STREAM_LOST_FRAMES
             && self.stream_deg.is_some_and(|deg| moment.alpha_deg > deg + STREAM_LOST_DEG)
     }
 
-    /// The container has been commanded upright: the wait for the last drops begins.
+    /// Begins the wait for the last drops, when the container has been commanded upright.
     pub fn begin_settling(&mut self) {
         self.quiet_frames = 0;
     }
 
     /// The final reason, once the last drops are counted: the joint is upright and nothing has flowed for a while, or the wait took
-    /// too long. `alpha_deg` is the measured one: upright is what the joint is, not what it was told.
+    /// too long. `alpha_deg` is the measured one, because the joint must really be upright.
     pub fn settled(&self, alpha_deg: f32, settling_s: f64, shutdown: bool, settings: &Settings) -> Option<EndReason> {
         let upright = alpha_deg.abs() <= settings.upright_deg;
         let quiet = self.quiet_frames >= SETTLE_QUIET_FRAMES && self.curve_s.is_none();
@@ -233,7 +237,7 @@ impl Ending {
     }
 }
 
-/// The goal is reached: d, what is still on its way counted, is 0 or less, and nothing more comes over the lip.
+/// Whether the goal is reached: d, less what is still on its way, is 0 or less, and nothing more comes over the lip.
 fn goal_is_reached(decision: &Decision) -> bool {
     decision.tilting_back && decision.over_lip_ml < NOTHING_ML
 }
@@ -333,7 +337,7 @@ mod tests {
         }
     }
 
-    /// Protects the operator: the reason that came first is the one that is told.
+    /// Protects the operator: the reason that came first is the one that is reported.
     #[test]
     fn the_first_reason_stays() {
         let mut ending = Ending::of_pour();

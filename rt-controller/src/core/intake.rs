@@ -1,14 +1,15 @@
 //! Which of the feature worker's measurements count: their layout, their clock, their order, and the frames that were lost between.
 //!
-//! Pure; runs in the controller's loop, does not allocate or fail.
+//! It is pure and runs in the controller's loop; it does not allocate or fail.
 
 use shared::messages::{Doubt, Feature, LAYOUT_VERSION};
 
-/// Most lost frames that are bridged at once: one second at 30 Hz. A longer gap is older than `controller.stale_feature_ms` allows.
+/// Largest number of lost frames that are bridged at once: one second at 30 Hz. A longer gap is older than `controller.stale_feature_ms`
+/// allows.
 const MAX_BRIDGED: u64 = 30;
 
-/// Whether a feature has another layout, or comes from the future and so from another clock. Its age, on which so much rests, would
-/// mean nothing.
+/// Whether a feature has another layout, or comes from the future and so from another clock. Its age, on which the endings rest, would mean
+/// nothing.
 pub fn is_foreign(feature: &Feature, now_ns: u64) -> bool {
     feature.version != LAYOUT_VERSION || feature.captured_at_ns > now_ns
 }
@@ -35,7 +36,7 @@ pub struct Taken {
 }
 
 impl Taken {
-    /// Takes `feature` after `previous`; `None` if it must be ignored: it is foreign, or it comes twice or too late.
+    /// Takes `feature` after `previous`; `None` if it must be ignored, because it is foreign, or comes twice or too late.
     pub fn new(previous: Option<Feature>, feature: &Feature, now_ns: u64) -> Option<Self> {
         let of_same_worker = previous.filter(|p| p.worker_epoch_ns == feature.worker_epoch_ns);
         if is_foreign(feature, now_ns) || of_same_worker.is_some_and(|p| feature.sequence <= p.sequence) {

@@ -1,7 +1,7 @@
 //! What an operator may order, when an order is acceptable, and why it is refused otherwise.
 //!
-//! Pure; runs in the controller's loop, so it does not allocate. Only showing a [`Refusal`] as text, which the service thread does,
-//! writes into the caller's buffer.
+//! It is pure and runs in the controller's loop, so it does not allocate. Only showing a [`Refusal`] as text, which the service thread
+//! does, writes into the caller's buffer.
 
 use serde::{Deserialize, Serialize};
 use shared::control::EndReason;
@@ -64,7 +64,7 @@ impl std::fmt::Display for Refusal {
             Self::NoFeature => {
                 write!(
                     f,
-                    "no fresh, usable measurement: is `feature-worker run` running, does the camera deliver, what does the worker say?"
+                    "there is no fresh, usable measurement: check that `feature-worker run` is running and what it says of the camera"
                 )
             }
             Self::NoWeights => write!(f, "no valid weight file is loaded: train one, or see `rt-controller status`"),
@@ -89,7 +89,8 @@ pub struct Situation {
 }
 
 impl Situation {
-    /// Whether a pour or recording may begin now: the robot is well and upright, nothing is under way, and the camera sees.
+    /// Whether a pour or recording may begin now: the robot may move, the container is upright, nothing is under way, and the newest usable
+    /// measurement is fresh.
     pub fn may_begin(&self, settings: &Settings) -> Result<(), Refusal> {
         if self.shutdown {
             return Err(Refusal::Shutdown);

@@ -1,4 +1,5 @@
-//! The robot as the core sees it: plain data, made by the loop from the robot's newest state, and kept in the journal.
+//! The robot as the core sees it: plain data that the loop makes from the robot's newest state, and that the journal keeps. Nothing here
+//! allocates or fails.
 
 use serde::{Deserialize, Serialize};
 use shared::control::EndReason;
@@ -6,7 +7,7 @@ use shared::control::EndReason;
 /// The robot in one tick.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct Robot {
-    /// Why it may not move; `None`: it may.
+    /// Why the robot may not move; `None` if it may.
     pub hindrance: Option<EndReason>,
     /// Measured alpha, degrees; NaN before the first state.
     pub alpha_deg: f32,

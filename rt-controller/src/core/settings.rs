@@ -1,6 +1,7 @@
 //! The part of the cell's configuration that decisions depend on.
 //!
-//! Read once at start; then plain data that the loop copies. The journal holds it, so that a replay decides under the same settings.
+//! It is read once at the start, from a checked configuration, so nothing fails. Then it is plain data that the loop copies. The journal
+//! holds it, so that a replay decides under the same settings.
 
 use serde::{Deserialize, Serialize};
 use shared::config::Config;
@@ -20,7 +21,7 @@ pub struct Settings {
     /// Largest number of frames of a pour.
     pub max_frames: u32,
     /// Number of frames without flow at the largest tilt after which the container counts as empty. A container that has poured
-    /// is found out before, by the rule of the lost stream.
+    /// is noticed earlier, by the rule of the lost stream.
     pub empty_frames: u32,
     /// Largest goal, ml.
     pub goal_max_ml: f32,

@@ -1,8 +1,8 @@
 //! Where the robot is connected: protocol, versions, recipes and the program's upload, until a [`Session`] is ready for the loop.
 //!
-//! Runs on an ordinary thread; blocks for a few seconds at most, allocates. Every failure is a [`LinkError`] whose one line says what to
-//! do; the caller shows it and tries again later. A running program is never replaced, because it may be ours and bringing the
-//! container upright at this moment.
+//! It runs on an ordinary thread, allocates, and blocks for seconds: for some 20 s with a robot that answers late each time. Every failure
+//! is a [`LinkError`] whose one line says what to do; the caller shows it and tries again later. A running program is never replaced,
+//! because it may be ours and bringing the container upright at this moment.
 
 use std::io::{Read, Write};
 use std::net::{IpAddr, SocketAddr, TcpStream};
@@ -19,13 +19,13 @@ use super::{LinkOptions, ProgramState, RobotState, Session, program, wire};
 const PROTOCOL: u16 = 2;
 /// The robot's real-time client interface. It takes programs, and streams state that is read and thrown away here.
 const SCRIPT_PORT: u16 = 30003;
-/// Bytes that must be read from [`SCRIPT_PORT`] before it is closed, or the program may be dropped (URScript manual).
+/// Number of bytes that must be read from [`SCRIPT_PORT`] before it is closed, or the program may be dropped (URScript manual).
 const LEAST_READ: usize = 79;
 /// PolyScope versions, major and minor, since which there are registers 24 to 47 for external clients (RTDE guide).
 const UPPER_REGISTERS: [(u32, u32); 2] = [(3, 9), (5, 3)];
-/// Control cycles a second of a CB3 (RTDE guide).
+/// Number of control cycles a second of a CB3 (RTDE guide).
 const CB3_HZ: f64 = 125.0;
-/// Control cycles a second of an e-Series robot (RTDE guide).
+/// Number of control cycles a second of an e-Series robot (RTDE guide).
 const E_SERIES_HZ: f64 = 500.0;
 /// How long one socket is read while the other one waits. Chosen by hand; no measurement is recorded.
 const GLANCE: Duration = Duration::from_millis(20);
@@ -37,12 +37,12 @@ pub fn connect(options: &LinkOptions) -> Result<Session, LinkError> {
     let address = options.address;
     let mut dialogue = Dialogue::open(address)?;
 
-    if !dialogue.ask(wire::PROTOCOL_VERSION, &[&PROTOCOL.to_be_bytes()], "the protocol version", wire::accepted)? {
+    if !dialogue.ask(wire::PROTOCOL_VERSION, &[&PROTOCOL.to_be_bytes()], "the request for the protocol version", wire::accepted)? {
         return Err(LinkError::VersionRefused { address });
     }
-    let version = dialogue.ask(wire::CONTROLLER_VERSION, &[], "the controller's version", wire::controller_version)?;
+    let version = dialogue.ask(wire::CONTROLLER_VERSION, &[], "the request for the controller's version", wire::controller_version)?;
     let [major, minor, ..] = version;
-    // A later generation than those known here has what these have.
+    // A generation later than those known here is taken to have what these have.
     if UPPER_REGISTERS.iter().any(|&(m, n)| major == m && minor < n) || major < 3 {
         return Err(LinkError::TooOld { address, major, minor });
     }
@@ -52,14 +52,14 @@ pub fn connect(options: &LinkOptions) -> Result<Session, LinkError> {
 
     let outputs = wire::output_names(options.register_base);
     let inputs = wire::input_names(options.register_base);
-    let output_recipe = dialogue.agree(wire::SETUP_OUTPUTS, &rate_hz.to_be_bytes(), &outputs, "the output recipe")?;
-    let input_recipe = dialogue.agree(wire::SETUP_INPUTS, &[], &inputs, "the input recipe")?;
-    if !dialogue.ask(wire::START, &[], "start", wire::accepted)? {
+    let output_recipe = dialogue.agree(wire::SETUP_OUTPUTS, &rate_hz.to_be_bytes(), &outputs, "the request for the output recipe")?;
+    let input_recipe = dialogue.agree(wire::SETUP_INPUTS, &[], &inputs, "the request for the input recipe")?;
+    if !dialogue.ask(wire::START, &[], "the request to start", wire::accepted)? {
         return Err(LinkError::StartRefused { address, said: dialogue.said });
     }
 
     let mut state = RobotState::default();
-    dialogue.next_state(output_recipe, &options.tilt, &mut state, ANSWER)?.ok_or_else(|| dialogue.no_answer("start"))?;
+    dialogue.next_state(output_recipe, &options.tilt, &mut state, ANSWER)?.ok_or_else(|| dialogue.no_answer("the request to start"))?;
     ready_for_program(options, &state)?;
 
     let mut upload = Upload::send(address, &program)?;
@@ -67,10 +67,10 @@ pub fn connect(options: &LinkOptions) -> Result<Session, LinkError> {
     while state.program_run != run || state.runtime_state != RUNTIME_PLAYING || upload.read < LEAST_READ {
         upload.discard();
         let left = deadline.saturating_duration_since(Instant::now());
-        // Short waits, so that the other socket is read too.
+        // The wait is short, so that the other socket is read too.
         dialogue.next_state(output_recipe, &options.tilt, &mut state, left.min(GLANCE))?;
         if let Some(reason) = health::hindrance(&state) {
-            return Err(LinkError::NotWell { address, reason });
+            return Err(LinkError::MayNotMove { address, reason });
         }
         if state.program_run == run && state.program_state == ProgramState::TooFar {
             return Err(too_far(options, &state));
@@ -83,21 +83,21 @@ pub fn connect(options: &LinkOptions) -> Result<Session, LinkError> {
     (state.received_at_ns, state.advanced_at_ns, state.answered_at_ns) = (now, now, now);
     let at = dialogue.at;
     Session::new(dialogue.stream, dialogue.inbox, options.tilt, (output_recipe, input_recipe), version, state)
-        .map_err(|e| LinkError::Lost { at, doing: "handing over", what: e.to_string() })
+        .map_err(|e| LinkError::Lost { at, doing: "the hand-over to the loop", what: e.to_string() })
 }
 
-/// Whether the robot is well, idle and upright, so that the program may be uploaded.
+/// Whether the robot may move, runs no program and holds the container upright, so that the program may be uploaded.
 fn ready_for_program(options: &LinkOptions, state: &RobotState) -> Result<(), LinkError> {
     let address = options.address;
     if let Some(reason) = health::hindrance(state) {
-        return Err(LinkError::NotWell { address, reason });
+        return Err(LinkError::MayNotMove { address, reason });
     }
     match state.runtime_state {
         RUNTIME_STOPPING | RUNTIME_STOPPED => {}
         RUNTIME_PAUSING | RUNTIME_PAUSED => return Err(LinkError::ProgramPaused { address }),
         _ => return Err(LinkError::ProgramRunning { address }),
     }
-    // The comparison is written so that an angle that is not a number is too far.
+    // The comparison is written so that an angle that is not a number counts as too far.
     if f64::from(state.alpha_deg.abs()) <= options.start_tolerance_deg { Ok(()) } else { Err(too_far(options, state)) }
 }
 
@@ -109,7 +109,7 @@ fn too_far(options: &LinkOptions, state: &RobotState) -> LinkError {
 /// The connection that carries the program; closed when dropped.
 struct Upload {
     stream: TcpStream,
-    /// Bytes of the robot's state stream that were read and thrown away.
+    /// Number of bytes of the robot's state stream that were read and thrown away.
     read: usize,
 }
 

@@ -1,6 +1,6 @@
 //! The RTDE connection while a session is set up: requests and their answers, with blocking reads.
 //!
-//! Runs on the connecting thread; allocates, and blocks for [`ANSWER`] at most. Each failure is a [`LinkError`].
+//! It runs on the connecting thread and allocates. Each step blocks for [`ANSWER`] at most. Each failure is a [`LinkError`].
 
 use std::io::{ErrorKind, Read, Write};
 use std::net::{IpAddr, SocketAddr, TcpStream};
@@ -12,7 +12,7 @@ use super::{RobotState, TiltJoint};
 
 /// The robot's port for RTDE (Universal Robots, RTDE guide).
 const RTDE_PORT: u16 = 30004;
-/// Longest request, bytes: the output recipe with its thirteen names is about 300.
+/// Longest request, bytes. Chosen by hand: the output recipe with its thirteen names has about 300.
 const REQUEST_MAX: usize = 1024;
 
 /// The RTDE connection while it is being set up.
@@ -65,13 +65,13 @@ impl Dialogue {
                 _ => {}
             }
         }
-        // The RTDE guide: id 0 means that the recipe is not valid.
+        // According to the RTDE guide, id 0 means that the recipe is not valid.
         if id == 0 { Err(self.unexpected(doing)) } else { Ok(id) }
     }
 
     /// Waits for the next DATA_PACKAGE and fills `state` from it; `None` if none came in time.
     pub fn next_state(&mut self, recipe: u8, tilt: &TiltJoint, state: &mut RobotState, within: Duration) -> Result<Option<()>, LinkError> {
-        let doing = "its state";
+        let doing = "the transfer of its state";
         let filled = self.wait(doing, within, |packet| {
             (packet.kind == wire::DATA).then(|| Outputs::new_checked(packet.payload, recipe).map(|outputs| outputs.fill(tilt, state)))
         })?;

@@ -1,6 +1,6 @@
 //! Why there is no session with the robot: one line for the operator that says what to do.
 //!
-//! Made on the connecting thread; allocates.
+//! The connecting thread makes these errors, which allocates.
 
 use std::net::{IpAddr, SocketAddr};
 use std::time::Duration;
@@ -24,7 +24,7 @@ pub enum LinkError {
         what: String,
     },
     /// The robot closed the connection, or it broke.
-    #[error("robot {at}: connection lost while {doing}: {what}; too many RTDE clients on the robot are one cause")]
+    #[error("robot {at}: connection lost during {doing}: {what}; too many RTDE clients on the robot are one cause")]
     Lost {
         /// Address and port.
         at: SocketAddr,
@@ -34,7 +34,7 @@ pub enum LinkError {
         what: String,
     },
     /// An answer did not come in time.
-    #[error("robot {at}: no answer to {doing} within {} s; restart the robot's controller if this stays", ANSWER.as_secs())]
+    #[error("robot {at}: no answer to {doing} within {} s; restart the robot's controller if this persists", ANSWER.as_secs())]
     NoAnswer {
         /// Address and port.
         at: SocketAddr,
@@ -42,7 +42,7 @@ pub enum LinkError {
         doing: &'static str,
     },
     /// The robot's bytes do not follow the protocol.
-    #[error("robot {at}: unexpected bytes in the answer to {doing}; is this the RTDE port of a UR controller?{said}")]
+    #[error("robot {at}: unexpected bytes during {doing}; is this the RTDE port of a UR controller?{said}")]
     Unexpected {
         /// Address and port.
         at: SocketAddr,
@@ -101,16 +101,16 @@ pub enum LinkError {
         expected: &'static str,
     },
     /// The robot does not start to send its state.
-    #[error("robot {address} refuses to start sending its state{said}; restart the robot's controller if this stays")]
+    #[error("robot {address} refuses to start sending its state{said}; restart the robot's controller if this persists")]
     StartRefused {
         /// The robot's address.
         address: IpAddr,
         /// The robot's newest text message, if there was one.
         said: String,
     },
-    /// The robot is not in a state to be moved.
+    /// The robot is in a state in which it must not be moved.
     #[error("robot {address}: {}; {}", reason.words(), remedy(*reason))]
-    NotWell {
+    MayNotMove {
         /// The robot's address.
         address: IpAddr,
         /// Why it may not move.
@@ -130,7 +130,7 @@ pub enum LinkError {
     },
     /// The container is not upright.
     #[error(
-        "robot {address}: the tilting joint is {alpha_deg:.1} degrees from its start angle, allowed are {tolerance_deg}; \
+        "robot {address}: the tilting joint is {alpha_deg:.1} degrees from its start angle, at most {tolerance_deg} are allowed; \
          bring the container upright with the pendant, or correct robot.start_joint_deg"
     )]
     TooFar {
@@ -143,7 +143,7 @@ pub enum LinkError {
     },
     /// The uploaded program gave no sign of life.
     #[error(
-        "robot {address}: the program did not start within {} s; on an e-Series choose Remote Control, else see the pendant's log",
+        "robot {address}: the program did not start within {} s; on an e-Series choose Remote Control, otherwise see the pendant's log",
         PROGRAM_START.as_secs()
     )]
     NotStarted {
@@ -152,8 +152,8 @@ pub enum LinkError {
     },
     /// The program cannot keep the limits of the configuration.
     #[error(
-        "limits: braking from rate_deg_s with acceleration_deg_s2, and a target's period, may take {most_s} s on this robot, not \
-         {smoothing_s:.3} s; raise acceleration_deg_s2 or lower rate_deg_s"
+        "limits: braking from rate_deg_s with acceleration_deg_s2, and a target's period, may each take {most_s} s at most on this robot, \
+         but one takes {smoothing_s:.3} s; raise acceleration_deg_s2 or lower rate_deg_s"
     )]
     Limits {
         /// The longer of braking time and target period, s.

@@ -1,7 +1,7 @@
 //! Whether the robot may be moved now, and if not, why: a pure function of the newest state and the clock.
 //!
-//! Runs in the controller's loop in each tick, after [`Session::poll`](super::Session::poll); does not allocate or fail. The RTDE guide
-//! explains robot_mode, safety_mode, runtime_state and the status bits.
+//! It runs in the controller's loop in each tick, after [`Session::poll`](super::Session::poll); it does not allocate or fail. The RTDE
+//! guide explains robot_mode, safety_mode, runtime_state and the status bits.
 
 use shared::control::EndReason;
 
@@ -32,7 +32,8 @@ pub fn check(state: &RobotState, now_ns: u64, lost_ns: u64) -> Result<(), EndRea
         state if !state.takes_targets() => return Err(EndReason::ProgramStopped),
         _ => {}
     }
-    // Measured by the robot's clock: while that stands still no program can answer, and the program is not what has stopped.
+    // This is measured up to the last advance of the robot's clock: while that stands still no program can answer, and it is not the
+    // program that has stopped.
     let unread = state.advanced_at_ns.saturating_sub(state.answered_at_ns) > lost_ns;
     if state.runtime_state != RUNTIME_PLAYING || unread {
         return Err(EndReason::ProgramStopped);
@@ -80,7 +81,7 @@ pub(crate) const RUNTIME_PLAYING: u32 = 2;
 pub(crate) const RUNTIME_PAUSING: u32 = 3;
 /// `runtime_state` while a program is paused (RTDE guide).
 pub(crate) const RUNTIME_PAUSED: u32 = 4;
-/// `safety_mode` of a robot without hindrance (RTDE guide).
+/// `safety_mode` of a robot that is not restricted (RTDE guide).
 const SAFETY_MODE_NORMAL: i32 = 1;
 /// `safety_mode` of a robot under its reduced limits (RTDE guide).
 const SAFETY_MODE_REDUCED: i32 = 2;

@@ -1,4 +1,4 @@
-//! The robot link: targets for the tilting joint to a UR controller, its state back, over RTDE (TCP 30004).
+//! The robot link: it sends targets for the tilting joint to a UR controller, and gets its state back, over RTDE (TCP 30004).
 //!
 //! | part | thread | allocates |
 //! |---|---|---|
@@ -21,7 +21,7 @@
 //! | `input_double_register_b` | target angle of the tilting joint, rad |
 //! | `output_int_register_b` | what the program is doing, a [`ProgramState`] code |
 //! | `output_int_register_b+1` | number of the newest target that the program has read |
-//! | `output_int_register_b+2` | the run number that this upload was given: tells a fresh program from an old one's leavings |
+//! | `output_int_register_b+2` | the run number of this upload; it tells a new program's registers from what an old one left |
 //! | `output_double_register_b` | angle that the program commands to servoj, rad |
 
 pub mod connect;
@@ -41,7 +41,7 @@ use std::net::IpAddr;
 use shared::config::{Config, Joint, RobotConfig};
 use shared::limits::Limits;
 
-/// What the program on the robot is to do; the code in `input_int_register_b+1`.
+/// What the program on the robot is to do; it is the code in `input_int_register_b+1`.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[repr(i32)]
 pub enum Mode {
@@ -56,11 +56,11 @@ pub enum Mode {
     Abandon = 4,
 }
 
-/// What the program on the robot says it is doing; the code in `output_int_register_b`.
+/// What the program on the robot says it is doing; it is the code in `output_int_register_b`.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 #[repr(i32)]
 pub enum ProgramState {
-    /// Nothing has been written yet, or a code that this version does not know.
+    /// The program has written nothing yet, or a code that this version does not know.
     #[default]
     Unknown = 0,
     /// The program has started and waits for the first target.
@@ -116,15 +116,15 @@ pub struct RobotState {
     pub alpha_target_deg: f32,
     /// Alpha that the program last gave to servoj, degrees.
     pub alpha_command_deg: f32,
-    /// `robot_mode`; 7: running.
+    /// RTDE's `robot_mode`; 7 is running.
     pub robot_mode: i32,
-    /// `safety_mode`; 1: normal, 2: reduced.
+    /// RTDE's `safety_mode`; 1 is normal, 2 is reduced.
     pub safety_mode: i32,
-    /// `safety_status_bits`.
+    /// RTDE's `safety_status_bits`.
     pub safety_bits: u32,
-    /// `runtime_state`; 2: playing.
+    /// RTDE's `runtime_state`; 2 is playing.
     pub runtime_state: u32,
-    /// `target_speed_fraction`: the pendant's speed slider, 0 to 1.
+    /// RTDE's `target_speed_fraction`: the pendant's speed slider, 0 to 1.
     pub speed_fraction: f64,
     /// What the program says it is doing.
     pub program_state: ProgramState,
@@ -181,9 +181,9 @@ pub struct LinkOptions {
     pub start_tolerance_deg: f64,
     /// First RTDE register that is used.
     pub register_base: u8,
-    /// servoj lookahead time, s.
+    /// Lookahead time of the robot's servoj command, s.
     pub lookahead_s: f64,
-    /// servoj gain.
+    /// Gain of the robot's servoj command.
     pub gain: f64,
     /// Limits on alpha, which the program keeps too.
     pub limits: Limits,

@@ -1,13 +1,14 @@
 //! The text of the program on the robot: `robot/pour.script` with this cell's values filled in.
 //!
-//! Runs on the connecting thread; allocates. Values that the program could not keep are refused with a [`LinkError`].
+//! It runs on the connecting thread and allocates. Values that the program could not keep are refused with a [`LinkError`].
 
 use super::{LinkError, LinkOptions};
 
 /// The program as it stands in `robot/pour.script`, with example values.
 pub const SOURCE: &str = include_str!("../../robot/pour.script");
 
-/// Most cycles that the program averages over, so that its list and its delay stay small. Chosen by hand; no measurement is recorded.
+/// Largest number of cycles that the program averages over, so that its list and its delay stay small. Chosen by hand; no measurement is
+/// recorded.
 const MOST_CYCLES: f64 = 100.0;
 
 /// The program for `options` on a robot with a control cycle of `cycle_s` (0.008 on CB3, 0.002 on e-Series).
@@ -26,8 +27,8 @@ pub fn text(options: &LinkOptions, cycle_s: f64, run: i32) -> Result<String, Lin
     let rad = |deg: f32| f64::from(deg).to_radians();
     let return_rate = rad(limits.return_rate_deg_s.min(limits.rate_deg_s));
     let patience_s = patience_s(options.rate_hz);
-    // The watchdog must wait until the program's own way upright is done, also at a quarter of the speed: four times patience, way and
-    // settling.
+    // The watchdog must wait until the program's own way upright is done, also at a quarter of the speed. So it waits four times as long as
+    // patience, way and settling take.
     let way_s = patience_s + (rad(limits.alpha_max_deg - limits.alpha_min_deg)) / return_rate + length * cycle_s + 0.3;
     let watchdog_hz = 1.0 / (1.0 + 4.0 * way_s);
 

@@ -14,8 +14,8 @@ use super::health::{self, RUNTIME_PLAYING};
 use super::wire::{self, Inbox, Outputs};
 use super::{Mode, RobotState, TiltJoint};
 
-/// Most reads of one [`Session::poll`], so that a robot that floods the link cannot hold the loop: 16 of 64 KiB are 10 s of packets at
-/// 500 Hz.
+/// Largest number of reads in one [`Session::poll`], so that a robot that floods the link cannot hold the loop: 16 of 64 KiB are 10 s of
+/// packets at 500 Hz.
 const MOST_READS: usize = 16;
 
 /// Why a session is over.
@@ -31,7 +31,7 @@ pub enum Lost {
     #[error("the robot takes no more targets")]
     WouldBlock,
     /// What the robot sent is not RTDE, or not in the agreed recipe.
-    #[error("the robot sent what does not fit the recipe")]
+    #[error("the robot sent bytes that do not fit the agreed recipe")]
     Protocol,
 }
 
@@ -49,7 +49,7 @@ pub struct Session {
 }
 
 impl Session {
-    /// Takes over a connection on which recipes are agreed and data flow; `state` is the newest that was received.
+    /// Takes over a connection on which recipes are agreed and data flow; `state` is the newest state that was received.
     pub(super) fn new(
         stream: TcpStream,
         inbox: Inbox,

@@ -1,7 +1,7 @@
 //! RTDE packets (protocol 2, big-endian): checked views of what the robot sends, and the few packets that are sent to it.
 //!
-//! Pure; used by the connecting thread and by the loop. Nothing allocates but [`Inbox::new`], once, and the lists of names, which only
-//! the connecting thread asks for. No bytes make anything here panic: what does not fit gives `None` or [`Malformed`].
+//! All of it is pure; the connecting thread and the loop use it. Nothing allocates but [`Inbox::new`], once, and the lists of names, which
+//! only the connecting thread asks for. No bytes make anything here panic: what does not fit gives `None` or [`Malformed`].
 //!
 //! A packet is a u16 with the size of the whole packet, a u8 with its type, and its payload. Where a value lies in a data packet follows
 //! from the two lists of variables, `OUTPUTS` and `INPUTS`, which is computed and checked at compile time.
@@ -23,11 +23,11 @@ pub const SETUP_INPUTS: u8 = b'I';
 /// CONTROL_PACKAGE_START, 'S'.
 pub const START: u8 = b'S';
 
-/// Bytes before the payload: the size and the type.
+/// Number of bytes before the payload: the size and the type.
 const HEADER: usize = 3;
 /// The largest packet that its u16 size can announce, bytes.
 const LARGEST: usize = u16::MAX as usize;
-/// Bytes of a packet with one target: header, recipe id, and the values of `INPUTS`.
+/// Number of bytes of a packet with one target: header, recipe id, and the values of `INPUTS`.
 pub const TARGET_LEN: usize = HEADER + 1 + bytes_of(&INPUTS);
 
 /// One whole packet.
@@ -59,8 +59,7 @@ impl Default for Inbox {
 }
 
 impl Inbox {
-    /// An empty inbox; its only allocation. It holds one byte more than the largest packet, so that there is always
-    /// space.
+    /// Makes an empty inbox, which is its only allocation. It holds one byte more than the largest packet, so that there is always space.
     pub fn new() -> Self {
         Self { buffer: vec![0; LARGEST + 1].into_boxed_slice(), start: 0, end: 0 }
     }
@@ -116,7 +115,7 @@ pub fn encode_target(recipe: u8, sequence: i32, mode: i32, joint_rad: f64) -> [u
     out
 }
 
-/// Answer to V, S: accepted or not.
+/// Reads the answer to V or S: whether the request was accepted.
 pub fn accepted(payload: &[u8]) -> Option<bool> {
     match payload {
         [code] => Some(*code != 0),
@@ -124,7 +123,7 @@ pub fn accepted(payload: &[u8]) -> Option<bool> {
     }
 }
 
-/// Answer to v: major, minor, bugfix, build.
+/// Reads the answer to v: major, minor, bugfix, build.
 pub fn controller_version(payload: &[u8]) -> Option<[u32; 4]> {
     let bytes: &[u8; 16] = payload.try_into().ok()?;
     let mut version = [0; 4];
@@ -134,13 +133,13 @@ pub fn controller_version(payload: &[u8]) -> Option<[u32; 4]> {
     Some(version)
 }
 
-/// Answer to O, I: recipe id and the comma-separated types.
+/// Reads the answer to O or I: the recipe's id and the comma-separated types.
 pub fn recipe(payload: &[u8]) -> Option<(u8, &str)> {
     let (&id, types) = payload.split_first()?;
     Some((id, std::str::from_utf8(types).ok()?))
 }
 
-/// TEXT_MESSAGE of protocol 2: level (0 exception, 1 error, 2 warning, 3 info) and the message's bytes.
+/// Reads a TEXT_MESSAGE of protocol 2: level (0 exception, 1 error, 2 warning, 3 info) and the message's bytes.
 pub fn text(payload: &[u8]) -> Option<(u8, &[u8])> {
     let (&message_len, rest) = payload.split_first()?;
     let message = rest.get(..usize::from(message_len))?;
@@ -182,9 +181,9 @@ impl Type {
 /// A variable of a recipe.
 #[derive(Debug, Clone, Copy)]
 struct Variable {
-    /// Its name; that of a register without the number.
+    /// The variable's name; for a register, without the number.
     name: &'static str,
-    /// The number of a register, counted from `robot.register_base`; `None`: this is no register.
+    /// The number of a register, counted from `robot.register_base`; `None` if this is not a register.
     register: Option<u8>,
     kind: Type,
 }
@@ -262,7 +261,7 @@ const INPUTS: [Variable; 3] = [
     Variable::register("input_double_register", 0, Type::Double),
 ];
 
-// The byte tables in ARCHITECTURE.md, and what `encode_target` writes.
+// These hold the byte table in ARCHITECTURE.md, and what `encode_target` writes.
 const _: () = assert!(OUTPUTS_LEN == 196 && at::SPEED_FRACTION == 188);
 const _: () = assert!(offset(&INPUTS, 1, "input_int_register", Type::Int32) == size_of::<i32>());
 const _: () = assert!(offset(&INPUTS, 2, "input_double_register", Type::Double) == 2 * size_of::<i32>());

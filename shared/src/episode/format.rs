@@ -1,8 +1,8 @@
 //! The messages inside an episode's file, and the schemas that let any MCAP reader understand them.
 //!
 //! Images are protobuf `foxglove.CompressedImage`, which viewers show without plug-ins. All else is JSON, which people and every language
-//! can read; NaN is written as `null`. The names of topics, fields and metadata are part of the format. Allocates; for ordinary threads
-//! only.
+//! can read; NaN is written as `null`. The names of topics, fields and metadata are part of the format. All of it allocates and is for
+//! ordinary threads only. Nothing here fails; a message that does not fit is found by [`read`](super::read).
 
 use prost::Message as _;
 use prost_types::field_descriptor_proto::{Label, Type};
@@ -11,7 +11,7 @@ use serde::{Deserialize, Deserializer, Serialize};
 
 use crate::messages::{Doubt, Feature, Phase, Telemetry};
 
-/// Topic of the images. Its name is the custom of ROS 2.
+/// Topic of the images, named as ROS 2 does by custom.
 pub(super) const IMAGE_TOPIC: &str = "/camera/image/compressed";
 /// Topic of [`FeatureJson`].
 pub(super) const FEATURE_TOPIC: &str = "/feature";
@@ -20,18 +20,18 @@ pub(super) const TELEMETRY_TOPIC: &str = "/telemetry";
 /// Topic of [`EpisodeRowJson`].
 pub(super) const ROW_TOPIC: &str = "/sample";
 
-/// Metadata record about the start.
+/// Name of the metadata record about the start.
 pub(super) const META_EPISODE: &str = "episode";
-/// Metadata record with the whole configuration.
+/// Name of the metadata record with the whole configuration.
 pub(super) const META_CONFIG: &str = "config";
-/// Metadata record about the end.
+/// Name of the metadata record about the end.
 pub(super) const META_END: &str = "end";
-/// Metadata record with the weight.
+/// Name of the metadata record with the weight.
 pub(super) const META_WEIGHT: &str = "weight";
 /// Version of the format: the value of `format` in the metadata record about the start.
 pub(super) const FORMAT: &str = "1";
 
-/// `foxglove.CompressedImage`.
+/// A message of `/camera/image/compressed`, `foxglove.CompressedImage`.
 #[derive(Clone, PartialEq, prost::Message)]
 pub(super) struct CompressedImage {
     /// Capture time, CLOCK_MONOTONIC like the log times.
@@ -45,7 +45,7 @@ pub(super) struct CompressedImage {
     pub frame_id: String,
 }
 
-/// The FileDescriptorSet of [`CompressedImage`], which MCAP wants as the schema of a protobuf message.
+/// The FileDescriptorSet of [`CompressedImage`], which MCAP requires as the schema of a protobuf message.
 pub(super) fn compressed_image_schema() -> Vec<u8> {
     let field = |name: &str, number: i32, kind: Type, type_name: Option<&str>| FieldDescriptorProto {
         name: Some(name.into()),

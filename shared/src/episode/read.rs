@@ -1,4 +1,4 @@
-//! Reads MCAP episodes, see [`crate::episode`]. Allocates; for ordinary threads only.
+//! Reads MCAP episodes, see [`crate::episode`]. It allocates and is for ordinary threads only.
 //!
 //! The file is read once from start to end, record by record, and every checksum in it is compared. A damaged file is an error, never a
 //! panic and never a wrong number. Memory is bounded by one chunk and the rows.
@@ -17,10 +17,11 @@ use super::{Episode, EpisodeInfo, EpisodeKind};
 use crate::gaussian_curve::Curve;
 use crate::messages::Doubt;
 
-/// How much older the last frame of a complete episode may be than the last tick, ns. Chosen by hand: frames may be under way for so long.
+/// How much older the last frame of a complete episode may be than the last tick, ns. Chosen by hand: so long a newer frame may still have
+/// been on its way to the recorder.
 const SILENT_END_NS: u64 = 500_000_000;
 
-/// All that is in a file but the images.
+/// Everything in a file except the images themselves.
 #[derive(Default)]
 struct Contents {
     /// Topic of each channel.
@@ -51,7 +52,7 @@ impl Contents {
         Ok(())
     }
 
-    /// A text of the metadata; empty if it is missing.
+    /// The text under a key of a metadata record; empty if it is missing.
     fn text(&self, record: &str, key: &str) -> &str {
         self.metadata.get(record).and_then(|m| m.get(key)).map_or("", String::as_str)
     }
@@ -82,7 +83,7 @@ impl Contents {
         check_reading(grams).map(Some).map_err(|e| format!("metadata 'weight': grams = {grams}: {e}"))
     }
 
-    /// The rows of the episode, those of lost frames filled in.
+    /// The rows of the episode; those of lost frames are filled in.
     fn rows(&self, started_at_ns: u64) -> Result<Vec<EpisodeRow>, String> {
         // The ticks are taken as the recorder took them, so that a lost frame gets the angles that it would have written.
         let mut track = EpisodeTrack::new();
@@ -134,7 +135,7 @@ impl Contents {
         Ok(rows)
     }
 
-    /// The episode `name`. `whole`: the file has its regular end.
+    /// Makes the episode called `name`. `whole` tells whether the file has its regular end.
     fn episode(self, name: &str, whole: bool) -> Result<Episode, String> {
         let started_at_ns = self.number(format::META_EPISODE, "started_at_ns")?;
         let rows = self.rows(started_at_ns)?;
@@ -178,7 +179,7 @@ impl Episode {
         let format = contents.text(format::META_EPISODE, "format");
         if format != format::FORMAT {
             let what = match (contents.metadata.contains_key(format::META_EPISODE), matches!(next, NextRecord::Cut)) {
-                (true, _) => format!("format {format}, this program reads format {}", format::FORMAT),
+                (true, _) => format!("it has format {format}, but this program reads format {}", format::FORMAT),
                 (false, true) => "its recorder was killed before anything was written".into(),
                 (false, false) => "the metadata 'episode' is missing".into(),
             };
@@ -201,7 +202,7 @@ pub struct EpisodeImage {
     pub data: Vec<u8>,
 }
 
-/// The images of one episode, read one by one. Ends after the first error.
+/// The images of one episode, read one by one. The iterator ends after the first error.
 pub struct EpisodeImages {
     records: Records,
     channels: Vec<u16>,

@@ -1,6 +1,6 @@
-//! The records of an MCAP file, one after the other, with every checksum compared. Allocates; for ordinary threads only.
+//! The records of an MCAP file, one after the other, with every checksum compared. It allocates and is for ordinary threads only.
 //!
-//! Reads a file whose writer was killed up to its last whole record. A damaged file is an error.
+//! A file whose writer was killed is read up to its last whole chunk. A damaged file is an error.
 
 use std::fs::File;
 use std::io::Read;
@@ -10,9 +10,10 @@ use mcap::McapError;
 use mcap::records::{Record, op};
 use mcap::sans_io::linear_reader::{LinearReadEvent, LinearReader, LinearReaderOptions};
 
-/// Largest record or chunk that is believed, bytes. Chosen by hand: far above a chunk of the recorder, far below a computer's memory.
+/// A record or chunk that claims to be larger than this counts as damaged, bytes. Chosen by hand: far above a chunk of the recorder, far
+/// below a computer's memory.
 const RECORD_LIMIT: usize = 256 << 20;
-/// Bytes read at a time. Chosen by hand; no measurement is recorded.
+/// Number of bytes that are read at a time. Chosen by hand; no measurement is recorded.
 const READ_BYTES: usize = 1 << 20;
 
 /// Why an episode's file cannot be read.
@@ -26,15 +27,15 @@ pub enum EpisodeError {
         /// The system's words.
         what: String,
     },
-    /// It is not an episode of this program.
+    /// The file is not an episode that this program can read.
     #[error("{file}: not an episode: {what}")]
     NotAnEpisode {
         /// The file.
         file: String,
-        /// What is missing.
+        /// What is missing or different.
         what: String,
     },
-    /// A checksum, a record or a value in it is wrong.
+    /// A checksum, a record or a value in the file is wrong.
     #[error("{file}: damaged: {what}; take it from a backup, or leave it out")]
     Damaged {
         /// The file.
@@ -54,7 +55,7 @@ pub enum NextRecord<T> {
     Cut,
 }
 
-/// The records of a file, also those inside chunks.
+/// The records of a file, including those inside chunks.
 pub struct Records {
     file: File,
     name: String,
@@ -86,7 +87,7 @@ impl Records {
         EpisodeError::Damaged { file: self.name.clone(), what: what.to_string() }
     }
 
-    /// Shows the records of the data section to `visit`, one by one, until it takes something out of one.
+    /// Shows the records of the data section to `visit`, one by one, until `visit` takes something out of one.
     pub fn next<T>(&mut self, mut visit: impl FnMut(Record) -> Result<Option<T>, String>) -> Result<NextRecord<T>, EpisodeError> {
         let damaged = |what: String| EpisodeError::Damaged { file: self.name.clone(), what };
         loop {

@@ -1,9 +1,10 @@
-//! One line of an episode, and the lines of lost frames between two others. Pure; does not allocate, but for its error texts.
+//! One row of an episode, and the rows of frames that were lost between two others. It is pure, and allocates nothing but error texts.
 
 use crate::alpha_track::AlphaTrack;
 use crate::messages::Doubt;
 
-/// Most frames in a row that may be lost; a larger gap is a damaged number. Chosen by hand: more than five minutes at 30 Hz.
+/// Largest step between the numbers of two neighbouring frames; a larger one means a damaged number. Chosen by hand: more than five minutes
+/// at 30 Hz.
 const GAP_LIMIT: u64 = 10_000;
 
 /// The track of alpha from which an episode's angles are taken. The recorder and the reader use the same one, so that a lost frame gets
@@ -17,7 +18,7 @@ pub struct EpisodeRow {
     pub sequence: u64,
     /// Middle of the exposure, CLOCK_MONOTONIC ns; interpolated for a lost frame; 0 in tables.
     pub captured_at_ns: u64,
-    /// Middle of the exposure, s since the episode's first tick; negative for the few frames from before.
+    /// Middle of the exposure, s since the episode's first tick; negative for the few frames from before that tick.
     pub t_s: f64,
     /// Commanded alpha at that time, degrees; finite.
     pub alpha_commanded_deg: f32,
@@ -27,7 +28,7 @@ pub struct EpisodeRow {
     pub area_px2: f32,
     /// Why the area is doubtful.
     pub doubt: Doubt,
-    /// The frame was never measured, because the camera or the worker dropped it.
+    /// Whether the frame was never measured, because the camera or the worker dropped it; in tables, whether its area is missing.
     pub lost: bool,
 }
 
@@ -41,7 +42,7 @@ pub(super) fn lost_between(last: u64, sequence: u64) -> Result<impl Iterator<Ite
     Ok((1..steps).map(move |step| (last + step, step as f64 / steps as f64)))
 }
 
-/// The angle at `share` of the way from `from_deg` to `to_deg`, degrees.
+/// The angle after `share` (0 to 1) of the way from `from_deg` to `to_deg`, degrees.
 pub(super) fn alpha_between_deg(from_deg: f32, to_deg: f32, share: f64) -> f32 {
     (f64::from(from_deg) + share * (f64::from(to_deg) - f64::from(from_deg))) as f32
 }

@@ -1,8 +1,9 @@
 //! The CSV pair: `features.csv` (`episode, frame, t_s, alpha_deg, area_px2`) and `scale.csv` (`episode, weight_g`), for people
-//! who have their own vision. Allocates; for ordinary threads only. A fault is one line that names the file and the line in it.
+//! who measure V_e with software of their own. It allocates and is for ordinary threads only. Each error is one line of text that names the
+//! file and the line in it.
 //!
-//! Columns are found by their names, and other columns are ignored. The rows of an episode stand together in order of `frame`. A missing
-//! frame number is a lost frame; an `area_px2` of `nan` or nothing is a frame that gave no measurement.
+//! Columns are found by their names, and other columns are ignored. The rows of an episode stand together in order of `frame`. A frame
+//! number that is missing stands for a lost frame; so does an `area_px2` that is `nan` or empty.
 
 use std::collections::BTreeMap;
 use std::fs::{File, OpenOptions};
@@ -13,9 +14,9 @@ use super::weight::{WeightError, check_poured};
 use super::{Episode, EpisodeInfo, EpisodeKind};
 use crate::messages::Doubt;
 
-/// Columns of the table of features.
+/// The columns of the table of features. Their names are part of the format.
 const FEATURE_COLUMNS: [&str; 5] = ["episode", "frame", "t_s", "alpha_deg", "area_px2"];
-/// Columns of the table of weights.
+/// The columns of the table of weights. Their names are part of the format.
 const SCALE_COLUMNS: [&str; 2] = ["episode", "weight_g"];
 
 /// Why a pair of tables is refused or cannot be written.
@@ -34,9 +35,9 @@ pub enum TableError {
     Row {
         /// The file.
         file: String,
-        /// Line in it; the heading is line 1.
+        /// The line in the file; the heading is line 1.
         line: u64,
-        /// What is wrong and what is wanted.
+        /// What is wrong and what is expected.
         what: String,
     },
 }
@@ -45,7 +46,7 @@ pub enum TableError {
 struct CsvTable {
     name: String,
     reader: csv::Reader<File>,
-    /// Place of each wanted column.
+    /// Where each wanted column stands in a row.
     columns: Vec<usize>,
 }
 

@@ -1,4 +1,4 @@
-//! Adds the weight `w_E` to an episode afterwards. Allocates; for ordinary threads only.
+//! Adds the weight `w_E` to an episode afterwards. It allocates and is for ordinary threads only.
 //!
 //! Everything is copied into a new file beside the old one, which is read back, compared and put on the disk before it takes the old one's
 //! name in one step. Whenever the machine stops, there is one whole file, with or without the weight.
@@ -14,7 +14,7 @@ use super::records::{EpisodeError, NextRecord, Records};
 use super::weight::{WeightError, check_reading};
 use super::{Episode, format};
 
-/// Bytes that are written at a time. Chosen by hand; no measurement is recorded.
+/// Number of bytes that are written at a time. Chosen by hand; no measurement is recorded.
 const WRITE_BYTES: usize = 1 << 20;
 
 /// Why a weight is refused or cannot be written. The file is as it was.
@@ -42,11 +42,11 @@ pub enum WeighError {
     },
 }
 
-/// Sets the weight of the episode `path` to `grams`. Answers with the weight that it had before.
+/// Sets the weight of the episode `path` to `grams`, and returns the weight that it had before.
 pub fn set_weight(path: &Path, grams: f64) -> Result<Option<f64>, WeighError> {
     check_reading(grams).map_err(|e| WeighError::Weight(grams, e))?;
     let shown = path.display().to_string();
-    // If the path is a link, the file is replaced and not the link.
+    // If the path is a link, the file that it leads to is replaced, and not the link.
     let path = path.canonicalize().map_err(|e| EpisodeError::Read { file: shown.clone(), what: e.to_string() })?;
     let before = Episode::read(&path)?;
     let name = path.file_name().and_then(|n| n.to_str()).unwrap_or("episode");

@@ -1,4 +1,4 @@
-//! Writes one episode's MCAP file, see [`crate::episode`]. Allocates; for ordinary threads only.
+//! Writes one episode's MCAP file, see [`crate::episode`]. It allocates and is for ordinary threads only. Every error is a [`WriteError`].
 //!
 //! A chunk is built in memory and written whole at least every half second, always between two frames. A recorder that is killed
 //! therefore leaves a file that can be read up to then. A new file never takes the name of one that is there.
@@ -23,7 +23,7 @@ use crate::messages::{Doubt, Feature, Telemetry};
 const CHUNK_NS: u64 = 500_000_000;
 /// A chunk is closed when it is this large, bytes. Chosen by hand; no measurement is recorded.
 const CHUNK_BYTES: usize = 1 << 20;
-/// Bytes that are handed to the operating system at a time. Chosen by hand; no measurement is recorded.
+/// Number of bytes that are handed to the operating system at a time. Chosen by hand; no measurement is recorded.
 const WRITE_BYTES: usize = 1 << 16;
 
 /// Why an episode cannot be written. What was written before is in the file.
@@ -50,7 +50,7 @@ pub enum WriteError {
 /// What is known when an episode starts.
 #[derive(Debug, Clone)]
 pub struct EpisodeStart<'a> {
-    /// [`Telemetry::episode`].
+    /// Number of the pour or recording, as in [`Telemetry::episode`].
     pub episode: u64,
     /// What the controller runs.
     pub kind: EpisodeKind,
@@ -84,7 +84,7 @@ pub struct EpisodeEnd<'a> {
     pub complete: bool,
     /// Why it ended: one line for people.
     pub reason: &'a str,
-    /// Frames that came twice or out of order and were left out.
+    /// Number of frames that came twice or out of order and were left out.
     pub disordered_frames: u64,
 }
 
@@ -228,7 +228,7 @@ impl EpisodeWriter {
         self.writer.flush().map_err(|e| file_error(&self.path, &e))
     }
 
-    /// Writes how the episode ended and the index, waits until everything is on the disk, and answers with the file's path.
+    /// Writes how the episode ended and the index, waits until everything is on the disk, and returns the file's path.
     pub fn finish(mut self, end: &EpisodeEnd) -> Result<PathBuf, WriteError> {
         let about = [
             ("complete", end.complete.to_string()),

@@ -1,6 +1,7 @@
 //! One explanation of a pour: an extended Kalman filter on the flow model.
 //!
-//! Pure and in the controller's loop: fixed size, no allocation, no panic.
+//! It is pure and runs in the controller's loop: its size is fixed, and it does not allocate or panic. If its numbers ever cease to be
+//! finite, [`Filter::is_finite`] tells the caller.
 //!
 //! | symbol | state of the filter |
 //! |---|---|
@@ -34,10 +35,11 @@ pub(super) const EXTRA_DELAY: usize = 6;
 /// One number for each state.
 type States = [f64; STATES];
 
-/// Error of an area that does not shrink with it, ml a frame. From the prototype's filter; no other measurement is recorded.
+/// Standard deviation of a measured outflow, ml a frame, that remains when the outflow is small. From the prototype's filter; no other
+/// measurement is recorded.
 const SD_FLOOR_ML: f64 = 0.012;
-/// Slopes are taken at no less than this excess, so that a filter that believes the flow has ceased can be told otherwise, ml.
-/// Chosen by hand; no measurement is recorded.
+/// Slopes are taken at no less than this excess, ml, so that a measurement can correct a filter that believes the flow has ceased. Chosen
+/// by hand; no measurement is recorded.
 const EXCESS_MIN_ML: f64 = 0.05;
 /// A measurement that is further off than this many standard deviations counts less. From the prototype's filter; no other
 /// measurement is recorded.
@@ -47,8 +49,8 @@ const GATE_SDS: f64 = 4.0;
 const FIRST_HEADSPACE_VARIANCE_ML2: f64 = 1.0;
 /// A foreseen outflow above this many times the least visible one cannot be overlooked, so that a zero is a dropout. From the
 /// prototype's filter; no other measurement is recorded.
-const OVERLOOKED: f64 = 3.0;
-/// As many zeros in a row are no dropout any more. From the prototype's filter; no other measurement is recorded.
+const SURELY_VISIBLE: f64 = 3.0;
+/// This many zeros in a row are believed, and no longer taken for a dropout. From the prototype's filter; no other measurement is recorded.
 const ZEROS_BELIEVED: u32 = 3;
 
 /// The tilt that a picture shows, and its change in a frame, degrees.
@@ -58,12 +60,12 @@ pub(super) struct Tilt {
     pub change_deg: f64,
 }
 
-/// What the model does not know of a frame (standard deviations).
+/// How far the states may drift in a frame in ways that the model does not foresee, as standard deviations.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Drift {
-    /// Of the headspace, in ml, and again for each ml of outflow.
+    /// Drift of the headspace, in ml, and again for each ml of outflow.
     pub headspace_sd_ml: f64,
-    /// Of the flow factor's logarithm.
+    /// Drift of the flow factor's logarithm.
     pub log_flow_factor_sd: f64,
 }
 
@@ -73,11 +75,11 @@ pub(super) struct Filter {
     /// How far a pour can be off the model.
     pub noise: FlowNoise,
     drift: Drift,
-    /// What is believed.
+    /// What the filter believes.
     pub state: States,
-    /// How far it may be off.
+    /// How far that may be off, as a covariance.
     pub covariance: [States; STATES],
-    /// Zeros seen in a row.
+    /// Number of zeros seen in a row.
     zeros: u32,
 }
 
@@ -101,12 +103,13 @@ impl Filter {
         *self = Self::new(self.noise, self.drift);
     }
 
-    /// Whether all numbers still are numbers.
+    /// Whether all states and their covariance are finite numbers.
     pub fn is_finite(&self) -> bool {
         self.state.iter().chain(self.covariance.iter().flatten()).all(|s| s.is_finite())
     }
 
-    /// The first sight of flow gives the headspace: what must have left for the lip to be covered as high as the stream says.
+    /// Begins with the first frame that shows flow. It gives the headspace, because the stream shows how high the liquid stands above the
+    /// lip.
     pub fn start(&mut self, flow: &FlowTables, tilt: Tilt, measured_ml: f64) {
         let noise = self.noise;
         let Tilt { tilt_deg, change_deg } = tilt;
@@ -139,7 +142,7 @@ impl Filter {
         self.covariance = c;
     }
 
-    /// Takes a measurement; answers with its log-likelihood.
+    /// Takes a measurement, and returns its log-likelihood.
     ///
     /// The filter is linearised twice: at what it foresaw, and at what the measurement makes of that.
     pub fn update(&mut self, flow: &FlowTables, tilt: Tilt, measured_ml: f64) -> f64 {
@@ -154,7 +157,7 @@ impl Filter {
             let (foreseen_ml, slopes) = foresee(flow, tilt, &posterior);
             let mut seen_ml = measured_ml;
             if measured_ml == 0.0 {
-                if foreseen_ml <= least_ml || (foreseen_ml > OVERLOOKED * least_ml && self.zeros < ZEROS_BELIEVED) {
+                if foreseen_ml <= least_ml || (foreseen_ml > SURELY_VISIBLE * least_ml && self.zeros < ZEROS_BELIEVED) {
                     // There is too little to be seen, or the extraction dropped the stream.
                     return 0.0;
                 }
@@ -191,7 +194,7 @@ impl Filter {
         log_likelihood
     }
 
-    /// One frame of the flow model, for the states and their covariance.
+    /// Moves the states and their covariance on by one frame of the flow model.
     pub fn propagate(&mut self, flow: &FlowTables, tilt: Tilt) {
         let film_share = flow.model.film_share;
         let Slopes { flow_ml, per_headspace, per_flow_factor, per_extra_delay } = outflow(flow, tilt, &self.state);
@@ -239,7 +242,7 @@ fn outflow(flow: &FlowTables, tilt: Tilt, state: &States) -> Slopes {
     }
 }
 
-/// The measurement that is to be expected at `state`, ml, and its slopes in all states.
+/// The measurement to expect at `state`, ml, and its slopes in all states.
 fn foresee(flow: &FlowTables, tilt: Tilt, state: &States) -> (f64, States) {
     let film_share = flow.model.film_share;
     let Slopes { flow_ml, per_headspace, per_flow_factor, per_extra_delay } = outflow(flow, tilt, state);

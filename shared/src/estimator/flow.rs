@@ -1,7 +1,8 @@
 //! The flow model: from commanded angles to outflow, with a handful of parameters that are fitted to weighed episodes.
 //!
-//! Pure. [`FlowTables`] and [`FlowState`] are in the controller's loop: they have a fixed size, and nothing here allocates or
-//! panics. The trainer fits [`FlowModel`] with the very same step. All volumes are in ml, angles in degrees, time in frames.
+//! All of it is pure. [`FlowTables`] and [`FlowState`] are used in the controller's loop: they have a fixed size, and nothing here
+//! allocates, panics or fails. The trainer fits [`FlowModel`] with the very same step. All volumes are in ml, angles in degrees, time in
+//! frames.
 //!
 //! ```text
 //! a    += clip((alpha(t - D - delta) - a) / (1 + tau), +-3)            the tilt that this frame shows
@@ -39,9 +40,10 @@ const TILT_STEP_DEG: f64 = 3.0;
 pub(super) const DRIP_SHARE: f64 = 1.0 / 9.0;
 /// Number of commanded angles that are remembered, frames: more than the longest delay that can be modelled.
 const HISTORY: usize = 16;
-/// The longest delay that can be modelled, frames.
+/// The longest delay that can be modelled, frames: a little less than the history holds.
 pub const DELAY_MAX_FRAMES: f64 = (HISTORY - 3) as f64;
-/// The longest way back that is foreseen, frames: 3 s at 30 frames a second, longer than any way back within the limits.
+/// The longest way back that is foreseen, frames: 3 s at 30 frames a second. At the return rate of the shipped configurations, 60
+/// degrees/s, the way back from 110 degrees takes less than 2 s; a much slower one is cut off.
 const STOP_FRAMES: usize = 90;
 /// Less outflow than this in a frame counts as none when the way back is foreseen, ml. Chosen by hand; no measurement is recorded.
 const STOPPED_ML: f64 = 1e-4;
@@ -57,7 +59,7 @@ pub struct FlowModel {
     pub head_exponent: f64,
     /// Change of the weir coefficient's logarithm for 30 degrees more tilt.
     pub log_weir_slope: f64,
-    /// Its change with the square of the tilt, in units of 30 degrees.
+    /// Change of the same logarithm with z^2, where z is the tilt beyond 60 degrees in units of 30 degrees.
     pub log_weir_curvature: f64,
     /// Lag of the tilt behind the delayed command, frames.
     pub lag_frames: f64,
@@ -65,7 +67,7 @@ pub struct FlowModel {
     pub delay_frames: f64,
     /// Share of the outflow that becomes film at the lip.
     pub film_share: f64,
-    /// How far the model can be off.
+    /// How far the model can be off, for the filter.
     pub noise: FlowNoise,
 }
 
@@ -93,18 +95,18 @@ impl Default for FlowModel {
     }
 }
 
-/// How far the model can be off in one pour and in one frame; "sd" is a standard deviation.
+/// How far the model can be off in one pour and in one frame. Each value is a standard deviation (sd), except the last one.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct FlowNoise {
-    /// Of a pour's flow factor (viscosity), as a logarithm.
+    /// Sd of the logarithm of a pour's flow factor (viscosity).
     pub log_flow_factor_sd: f64,
-    /// Of the camera's gain in a pour, as a logarithm; the calibration's error is included.
+    /// Sd of the logarithm of the camera's gain in a pour; the calibration's error is included.
     pub log_camera_gain_sd: f64,
-    /// Of the scale of the vessel's capacity, as a logarithm.
+    /// Sd of the logarithm of the scale of the vessel's capacity.
     pub log_capacity_scale_sd: f64,
-    /// Of a pour's delay, frames.
+    /// Sd of a pour's delay, frames.
     pub extra_delay_sd_frames: f64,
-    /// Of the volume that one frame's area stands for, as a logarithm.
+    /// Sd of the logarithm of the volume that one frame's area stands for.
     pub log_frame_volume_sd: f64,
     /// Smallest outflow that the camera shows, ml a frame.
     pub least_visible_ml: f64,
@@ -124,7 +126,7 @@ pub struct FlowTables {
 /// The flow over the lip in one frame, and its slopes.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct LipFlow {
-    /// Liquid above the lip, ml; negative: what is missing to the lip.
+    /// Liquid above the lip, ml; if negative, what is missing up to the lip.
     pub excess_ml: f64,
     /// Outflow, ml a frame.
     pub flow_ml: f64,
@@ -132,7 +134,7 @@ pub struct LipFlow {
     pub flow_per_excess: f64,
     /// Its change with the logarithm of the flow factor, ml a frame.
     pub flow_per_log_factor_ml: f64,
-    /// Capacity that is lost at this tilt, ml a degree.
+    /// Capacity that the vessel loses for each further degree at this tilt, ml a degree.
     pub lost_ml_per_deg: f64,
 }
 
@@ -218,18 +220,18 @@ impl FlowTables {
     }
 }
 
-/// Where the liquid is, as far as one knows.
+/// Where the liquid is, as far as is known.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct FlowState {
     /// Tilt that the newest picture shows, degrees.
     pub tilt_deg: f64,
-    /// Capacity that is used up, ml: liquid flows where the tilt loses more than this.
+    /// Capacity that is used up, ml: liquid flows once the tilt has lost more capacity than this.
     pub headspace_ml: f64,
     /// Film at the lip, ml.
     pub film_ml: f64,
-    /// Logarithm of this pour's flow over that of the model (viscosity).
+    /// Logarithm of this pour's flow divided by the model's (viscosity).
     pub log_flow_factor: f64,
-    /// Capacity that each ml of outflow uses up: the model's capacity over the vessel's own.
+    /// Capacity that each ml of outflow uses up: the model's capacity divided by the vessel's own.
     pub capacity_scale: f64,
     /// Delay of this pour above the model's, frames.
     pub extra_delay_frames: f64,
@@ -242,12 +244,12 @@ impl Default for FlowState {
     }
 }
 
-/// What one frame of the flow model lets out, ml.
+/// What one frame of the flow model lets out.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct FrameOutflow {
-    /// Over the lip.
+    /// What passes over the lip, ml.
     pub over_lip_ml: f64,
-    /// From the lip, after the film took its share and dripped: what the camera sees.
+    /// What leaves the lip after the film took its share and dripped, ml: this is what the camera sees.
     pub leaves_ml: f64,
 }
 
@@ -261,8 +263,8 @@ impl FlowState {
         FrameOutflow { over_lip_ml, leaves_ml: self.release(over_lip_ml, flow.model.film_share) }
     }
 
-    /// The second half of [`FlowState::step`]: takes what passes the lip out of the vessel and through the film; answers with what
-    /// leaves the lip, ml.
+    /// The second half of [`FlowState::step`]: takes what passes the lip out of the vessel and through the film, and returns what leaves
+    /// the lip, ml.
     #[inline]
     pub fn release(&mut self, over_lip_ml: f64, film_share: f64) -> f64 {
         self.headspace_ml += self.capacity_scale * over_lip_ml;
@@ -278,7 +280,7 @@ impl FlowState {
 pub struct CommandHistory([f64; HISTORY]);
 
 impl CommandHistory {
-    /// A container that has stood at this angle for ever.
+    /// The history of a container that has always stood at this angle.
     pub fn standing_at(command_deg: f64) -> Self {
         Self([command_deg; HISTORY])
     }
@@ -319,7 +321,8 @@ impl WayBack {
         }
     }
 
-    /// The history, the command now in force if it is another one, and the commands of a way back that starts after it, degrees.
+    /// The history, the command now in force if it differs from the newest of the history, and the commands of a way back that starts after
+    /// it, degrees.
     fn commands(self, history: &CommandHistory, now_deg: f64) -> [f64; HISTORY + STOP_FRAMES] {
         let mut commands = [0.0; HISTORY + STOP_FRAMES];
         commands[..HISTORY].copy_from_slice(&history.0);

@@ -2,8 +2,7 @@
 //!
 //! How far the tilt must go to keep the flow alive tells how much has left, whatever the camera's gain is. An extended Kalman
 //! filter on the [flow model](super::flow) weighs the two (`filter.rs`). It runs in the controller's loop and is pure: its size is
-//! fixed, it does not allocate, and it does not panic. It takes about 5 kflop a frame. A measurement that cannot be one counts as a
-//! lost frame.
+//! fixed, it does not allocate, and it does not panic. It takes about 5 kflop a frame. An impossible measurement counts as a lost frame.
 //!
 //! The filter starts with the first frame that shows flow. Before that, only the tilt is followed.
 //!
@@ -16,7 +15,7 @@ use super::flow::{CommandHistory, FlowNoise, FlowState, FlowTables, WayBack};
 
 /// Number of explanations.
 const EXPLANATIONS: usize = 3;
-/// How likely each explanation is before anything was seen. Tuned on rigs 100 to 123, see docs/LEARNING.md.
+/// How likely each explanation is before anything has been seen. Tuned on rigs 100 to 123, see docs/LEARNING.md.
 const PRIOR: [f64; EXPLANATIONS] = [0.6, 0.18, 0.22];
 /// The least weight of an explanation, so that it can come back. Chosen by hand; no measurement is recorded.
 const WEIGHT_MIN: f64 = 1e-6;
@@ -30,25 +29,25 @@ const CAMERA_SDS: f64 = 2.5;
 /// This much further the estimate may be from the camera's own sum in any case, ml. Tuned on rigs 100 to 123, see docs/LEARNING.md.
 const CAMERA_ML: f64 = 1.5;
 
-/// More than any container gives in a frame, so that it is not a measurement, ml. Chosen by hand; no measurement is recorded.
+/// A larger outflow in a frame, ml, than any container gives, so that it is no measurement. Chosen by hand; no measurement is recorded.
 const MEASURED_MAX_ML: f64 = 50.0;
-/// Angles outside of this range are cut to it, degrees: no cell tilts that far.
+/// Commanded angles outside of this range are cut to it, degrees. Chosen by hand: no cell tilts that far.
 const COMMAND_RANGE_DEG: (f64, f64) = (-30.0, 200.0);
 
 /// What changes in a frame that the model does not know, where all is as the episodes showed. From the prototype's filter, tuned on
 /// rigs 100 to 123, see docs/LEARNING.md.
 const USUAL_DRIFT: Drift = Drift { headspace_sd_ml: 0.05, log_flow_factor_sd: 0.007 };
-/// The same where the geometry or the delay is not to be trusted. Tuned on rigs 100 to 123, see docs/LEARNING.md.
+/// The same as [`USUAL_DRIFT`] where the geometry or the delay is not to be trusted. Tuned on rigs 100 to 123, see docs/LEARNING.md.
 const DISTRUSTED_DRIFT: Drift = Drift { headspace_sd_ml: 0.2, log_flow_factor_sd: 0.02 };
 
-/// The doubt where the camera or the liquid has changed, from the usual one. Tuned on rigs 100 to 123, see docs/LEARNING.md.
-fn changed(usual: FlowNoise) -> FlowNoise {
+/// The noise to allow for where the camera or the liquid has changed, from the usual noise. Tuned on rigs 100 to 123, see docs/LEARNING.md.
+fn noise_if_changed(usual: FlowNoise) -> FlowNoise {
     FlowNoise { log_camera_gain_sd: (3.0 * usual.log_camera_gain_sd).max(0.1), log_flow_factor_sd: 2.0 * usual.log_flow_factor_sd, ..usual }
 }
 
-/// The doubt where the geometry or the delay is not to be trusted, from the usual one. Tuned on rigs 100 to 123, see
+/// The noise to allow for where the geometry or the delay is not to be trusted, from the usual noise. Tuned on rigs 100 to 123, see
 /// docs/LEARNING.md.
-fn distrusted(usual: FlowNoise) -> FlowNoise {
+fn noise_if_distrusted(usual: FlowNoise) -> FlowNoise {
     FlowNoise { log_capacity_scale_sd: (5.0 * usual.log_capacity_scale_sd).max(0.1), extra_delay_sd_frames: 1.5, ..usual }
 }
 
@@ -70,7 +69,7 @@ struct CameraSum {
 }
 
 impl CameraSum {
-    /// Adds a frame: a lost one, or a single zero after a frame with flow, repeats the newest outflow.
+    /// Adds a frame. A lost frame, or a single zero after a frame with flow, repeats the newest outflow.
     fn add(&mut self, measured_ml: Option<f64>) {
         if let Some(measured_ml) = measured_ml {
             self.bridges_a_zero = measured_ml == 0.0 && self.newest_ml > 0.0 && !self.bridges_a_zero;
@@ -91,7 +90,7 @@ pub struct FusedEstimator {
     camera: CameraSum,
     /// Whether flow has been seen.
     started: bool,
-    /// Whether this pour has had a frame.
+    /// Whether this pour has had a frame yet.
     followed: bool,
     history: CommandHistory,
     tilt: Tilt,
@@ -101,8 +100,11 @@ impl FusedEstimator {
     /// An estimator for a pour to come.
     pub fn new(flow: FlowTables, way_back: WayBack) -> Self {
         let noise = flow.model.noise;
-        let filters =
-            [Filter::new(noise, USUAL_DRIFT), Filter::new(changed(noise), USUAL_DRIFT), Filter::new(distrusted(noise), DISTRUSTED_DRIFT)];
+        let filters = [
+            Filter::new(noise, USUAL_DRIFT),
+            Filter::new(noise_if_changed(noise), USUAL_DRIFT),
+            Filter::new(noise_if_distrusted(noise), DISTRUSTED_DRIFT),
+        ];
         let mut estimator = Self {
             flow,
             way_back,
@@ -152,7 +154,7 @@ impl FusedEstimator {
             .sqrt()
     }
 
-    /// What the filters believe of the liquid.
+    /// What the filters believe about the liquid.
     pub fn flow_state(&self) -> FlowState {
         FlowState {
             tilt_deg: self.tilt.tilt_deg - self.mean(EXTRA_DELAY) * self.tilt.change_deg,
@@ -240,7 +242,7 @@ mod tests {
 
     const BACK: WayBack = WayBack { rate_deg: 2.0, change_deg: 1.67 };
 
-    /// The model itself, poured: commands in, outflow a frame out.
+    /// A vessel that pours exactly as the model says: it takes commands, and gives the outflow of each frame.
     struct ModelVessel {
         flow: FlowTables,
         state: FlowState,
@@ -263,8 +265,8 @@ mod tests {
         }
     }
 
-    /// A pour that rises, holds, and returns; the camera's gain is off by `gain`, the picture `late` frames later than the model
-    /// knows. (true, camera's sum, filter), ml.
+    /// A pour whose tilt rises, holds, and returns. The camera's gain is off by the factor `gain`, and the picture comes `late` frames
+    /// later than the model knows. Gives the true volume and the camera's sum, ml, and the filter.
     fn pour_into(mut filter: FusedEstimator, gain: f64, late: usize) -> (f64, f64, FusedEstimator) {
         let mut vessel = ModelVessel::new(50.0);
         let mut seen = std::collections::VecDeque::from(vec![0.0; late]);
@@ -285,8 +287,8 @@ mod tests {
         (truth, summed, filter.poured_ml())
     }
 
-    /// Protects the three explanations: each pour makes the one that fits it more likely than the pour before did: nothing changed,
-    /// the camera's gain changed, the picture comes late.
+    /// Protects the three explanations: each pour gives more weight to the one that fits it than the other pours do. In the first nothing
+    /// has changed, in the second the camera's gain has, and in the third the picture comes late.
     #[test]
     fn a_pour_moves_weight_to_what_explains_it() {
         let of = |gain: f64, late: usize| {
@@ -321,7 +323,7 @@ mod tests {
         for gain in [0.95, 1.0, 1.05] {
             let (truth, summed, fused) = pour(gain);
             assert!(truth > 60.0, "{truth}");
-            // Two standard deviations of gain, one slow pour: a fifth of the camera's error is taken away, and none is added.
+            // A gain of two standard deviations leaves less than the camera's whole error, and the right gain less than 0.5 %.
             assert!((fused - truth).abs() < 0.9 * (summed - truth).abs() + 0.005 * truth, "gain {gain}: {truth} {summed} {fused}");
         }
     }
@@ -363,7 +365,7 @@ mod tests {
         assert!((late - volume(&later, 0.0)).abs() < 1e-9);
     }
 
-    /// Protects the volume from lost frames: the model bridges them.
+    /// Protects the volume where frames are lost: the model bridges them.
     #[test]
     fn lost_frames_are_bridged() {
         let run = |lose: bool| {

@@ -1,6 +1,6 @@
 //! The shape of a container: how much of its capacity is lost as it tilts, and how large its free surface is then.
 //!
-//! Pure. [`CapacityCurve`] is read in the controller's loop: it has a fixed size, and reading it neither allocates nor panics.
+//! All of it is pure. [`CapacityCurve`] is read in the controller's loop: it has a fixed size, and reading it neither allocates nor panics.
 //! The trainer fits the [`Vessel`]. Volumes are in ml, angles in degrees from upright.
 //!
 //! The liquid in a container that is filled to its lip turns about the lip as the container tilts. What then lies above the
@@ -14,8 +14,8 @@
 //!
 //! w_0 and A_0 are those of a round vessel with straight walls, where `w_0 = integral of (distance from the lip) dA` over the
 //! free surface. w_even spreads the same capacity evenly over all tilts: beyond the horizontal a beaker is empty, but a bottle
-//! is not. What the vessel really is, s says. Where it holds more than the straight vessel, its surface is larger too, as an
-//! area is to a volume.
+//! is not. s says how the real vessel differs. Where it holds more than the straight vessel, its surface is larger too, by the power 2/3
+//! that relates an area to a volume.
 //!
 //! | symbol | name |
 //! |---|---|
@@ -34,13 +34,14 @@ pub const KNOTS_DEG: [f64; KNOTS] = [20.0, 35.0, 45.0, 55.0, 65.0, 75.0, 85.0, 9
 /// The least capacity that is lost, ml a degree. A straight cup is empty beyond the horizontal, but other vessels are not. Chosen by
 /// hand; no measurement is recorded.
 const LOST_MIN_ML_PER_DEG: f64 = 0.2;
-/// The least free surface, mm^2: a lip is some 15 mm wide, and the liquid reaches a little way back from it.
+/// The least free surface, mm^2. Chosen by hand: a lip is some 15 mm wide, and the liquid reaches a little way back from it.
 const SURFACE_MIN_MM2: f64 = 300.0;
 /// Number of slices in the integral over the free surface. Chosen by hand; no measurement is recorded.
 const SLICES: usize = 64;
 /// Resolution of the tables, degrees. Chosen by hand; no measurement is recorded.
 const STEP_DEG: f64 = 1.0;
-/// Number of entries of each table: they reach beyond the largest tilt that a robot is told to take.
+/// Number of entries of each table: they reach beyond 110 degrees, the largest tilt in the shipped configurations. A tilt beyond 120
+/// degrees counts as 120.
 pub(super) const ENTRIES: usize = 122;
 
 /// The shape of a container.
@@ -50,11 +51,11 @@ pub struct Vessel {
     pub radius_mm: f64,
     /// Its height, mm.
     pub height_mm: f64,
-    /// Its radius at the bottom over its radius at the lip.
+    /// Its radius at the bottom divided by its radius at the lip.
     pub taper: f64,
     /// Share of the capacity that is spread evenly over all tilts, 0 to 1.
     pub even_share: f64,
-    /// Logarithm of the capacity that the real vessel loses a degree over that of the straight one, at [`KNOTS_DEG`].
+    /// Logarithm of the capacity that the real vessel loses a degree, divided by that of the straight one, at [`KNOTS_DEG`].
     pub log_shape: [f64; KNOTS],
 }
 
@@ -77,7 +78,8 @@ impl Vessel {
             let share = (tilt_deg - KNOTS_DEG[knot - 1]) / (KNOTS_DEG[knot] - KNOTS_DEG[knot - 1]);
             self.log_shape[knot - 1] + share * (self.log_shape[knot] - self.log_shape[knot - 1])
         };
-        // The volume of the straight vessel over its 90 degrees, and the surface that loses as much when it turns about the radius.
+        // The straight vessel's volume spread over 90 degrees, and the surface that loses as much when it turns with its middle a radius
+        // away from the lip.
         let t = self.taper;
         let even = std::f64::consts::PI * self.radius_mm * self.radius_mm * self.height_mm * (1.0 + t + t * t) / 3.0 / 90.0 / 1000.0;
         let even_mm2 = even * 1000.0 / (self.radius_mm * 1f64.to_radians());
@@ -116,12 +118,12 @@ impl Vessel {
 pub(super) struct TablePlace {
     /// The entry below.
     index: usize,
-    /// How far the place is on the way to the entry above, 0 to 1.
+    /// How far the place is on the way from there to the entry above, 0 to 1.
     share: f64,
 }
 
 impl TablePlace {
-    /// Where a tilt is in the tables. A tilt beyond an end is put there; one that is not a number gives a share that is none.
+    /// Where a tilt is in the tables. A tilt beyond an end counts as that end; one that is not a number gives a share that is not a number.
     pub(super) fn of(tilt_deg: f64) -> Self {
         // NaN becomes 0 by the cast; the clamp keeps the index inside.
         let at = (tilt_deg / STEP_DEG).clamp(0.0, (ENTRIES - 2) as f64);
@@ -168,7 +170,7 @@ impl CapacityCurve {
         self.lost_ml_at(TablePlace::of(tilt_deg))
     }
 
-    /// The same at a place of the tables.
+    /// The same as [`CapacityCurve::lost_ml`], at a place of the tables.
     #[inline]
     pub(super) fn lost_ml_at(&self, TablePlace { index, share }: TablePlace) -> f64 {
         let slope = &self.lost_ml_per_deg;

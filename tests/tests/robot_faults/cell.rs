@@ -1,6 +1,7 @@
 //! One cell of the fault matrix: its own simulated robot, the controller as a process, and liquid by a formula.
 //!
-//! A cell reaches a moment of a pour, is struck by a fault, and is judged by the robot's own trace; see `main.rs`.
+//! A cell reaches a moment of a pour, is struck by a fault, and is judged by the robot's own trace; see `main.rs`. It allocates, waits and
+//! panics as tests do.
 
 use std::fmt::Write as _;
 use std::io::{BufRead, BufReader, Write};
@@ -27,11 +28,11 @@ use simulator::ur::{Controller, ControllerOptions, RuntimeState, Series};
 
 use crate::motion::Motion;
 
-/// Millilitres in a frame per px^2 of the feature.
+/// Volume that 1 px^2 of a feature's area stands for, ml a frame.
 const ML_PER_PX2: f64 = 0.002;
-/// Detection, the program's patience, braking and settling; the way upright at the return rate comes on top.
+/// Longest time for detection, the program's patience, braking and settling, s; the way upright at the return rate comes on top.
 const UPRIGHT_BOUND_S: f64 = 1.0;
-/// A stop of the robot's own: program stop, protective stop, emergency stop.
+/// Longest time of a stop that the robot makes by itself, s: program stop, protective stop, emergency stop.
 const STOP_BOUND_S: f64 = 0.5;
 /// Rate of the way upright in `config/sim.toml`, degrees/s.
 const RETURN_RATE_DEG_S: f64 = 60.0;
@@ -52,9 +53,9 @@ pub enum Expected {
     Nothing,
     /// The pour ends for this reason, and the program brings the container upright by itself.
     Upright(EndReason),
-    /// The same on a robot that goes at this share of its speed.
+    /// The same as `Upright`, on a robot that moves at this share of its speed.
     Slowed(EndReason, f64),
-    /// Nobody is left who could say anything; the program brings the container upright by itself.
+    /// No controller is left to report anything; the program brings the container upright by itself.
     Orphaned,
     /// The pour ends for this reason, and the robot stops where it is until its operator has acted.
     Stopped(EndReason),
@@ -136,7 +137,7 @@ impl Cell {
         }
     }
 
-    /// Until the controller would pour.
+    /// Waits until the controller would accept a pour.
     fn ready(&mut self) {
         if self.client.is_none() {
             self.client = Some(Client::connect(&self.name).unwrap());
@@ -158,7 +159,7 @@ impl Cell {
         self.until("an outcome", |c| c.client.as_ref()?.status().ok()?.outcomes.into_iter().find(|o| o.episode == episode))
     }
 
-    /// Alpha and its rate: degrees, degrees/s.
+    /// Alpha, degrees, and its rate, degrees/s.
     fn alpha(&self) -> (f64, f64) {
         let joints = self.robot.joints();
         (joints.actual_q[5].to_degrees(), joints.actual_qd[5].to_degrees())
@@ -186,7 +187,7 @@ impl Cell {
         Some(episode)
     }
 
-    /// One cell of the matrix.
+    /// Checks one fault at one moment, and adds a row to the table.
     pub fn check(&mut self, fault: &str, moment: Moment, expected: Expected, strike: impl Fn(&mut Self), recover: impl Fn(&mut Self)) {
         let orphaned = expected == Expected::Orphaned;
         let connections = self.client.as_ref().unwrap().status().unwrap().robot_connections;
@@ -207,7 +208,7 @@ impl Cell {
             Expected::Stopped(_) => self.until("stopped", |c| (c.alpha().1.abs() < 0.5).then_some(())),
             _ => self.until("upright", upright),
         }
-        // Some more cycles, so that a motion that goes on would be seen.
+        // Some more cycles pass, so that a motion that goes on would be seen.
         thread::sleep(Duration::from_millis(400));
         let trace = self.robot.take_trace();
         let motion = Motion::of(&trace, self.series);
@@ -245,7 +246,7 @@ impl Cell {
             assert!(outcome.poured_ml > 0.0 || moment == Moment::TiltingOut, "what was poured is reported\n{}", context());
         }
         if moment == Moment::AtRest && expected != Expected::Nothing && !orphaned {
-            // Nothing was under way that could have a result: then the operator is told.
+            // Nothing was under way that could have a result, so the operator must have been told on the terminal.
             let said = self.said().split_off(said_before);
             let mut words = vec![wanted.words().to_owned()];
             // A controller that was stopped may first find that the robot has meanwhile given it up.
@@ -317,7 +318,7 @@ impl Drop for Cell {
 const HEAD: &str = "| fault | robot | moment | reason | poured ml | alpha at fault | largest alpha | at rest s | upright s | \
 largest rate deg/s | largest acceleration deg/s^2 | next pour of 8 ml |\n|---|---|---|---|---|---|---|---|---|---|---|---|";
 
-/// Starts the controller of the cell in `directory`, which says what it has to say to a file there.
+/// Starts the controller of the cell in `directory`. What it prints goes to a file there.
 pub fn start_controller(directory: &Path) -> Child {
     let path = tests::program("rt-controller");
     let log = std::fs::OpenOptions::new().create(true).append(true).open(directory.join("log")).unwrap();
@@ -325,7 +326,7 @@ pub fn start_controller(directory: &Path) -> Child {
     Command::new(path).arg("run").arg("--config").arg(config).stdin(Stdio::null()).stdout(Stdio::null()).stderr(log).spawn().unwrap()
 }
 
-/// A policy by hand: 2.45 degrees a frame until liquid flows well, then stay.
+/// Weights made by hand: they tilt by 2.45 degrees a frame until liquid flows freely, and then stay.
 fn tilt_until_it_flows() -> Weights {
     let mut network = Mlp::ZERO;
     network.w1[0][0] = 1.0;
@@ -341,7 +342,7 @@ fn flow_ml_s(alpha_deg: f64) -> f64 {
     ((alpha_deg - 50.0) * 1.0).clamp(0.0, 25.0)
 }
 
-/// The camera, the feature worker and the liquid in one: V_e from the tilt of the joint.
+/// Stands for the camera, the feature worker and the liquid at once: it publishes V_e from the tilt of the joint.
 fn publish_features(name: &str, robot: &Controller, stop: &AtomicBool) {
     let cell = ipc::Cell::join(name).unwrap();
     let publisher = cell.features().unwrap().publisher_builder().create().unwrap();

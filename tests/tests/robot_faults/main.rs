@@ -1,11 +1,12 @@
-//! The fault matrix of the robot link: each fault at rest, while tilting out, at full flow and while returning.
+//! The fault matrix of the robot link: each fault comes at rest, while tilting out, at full flow and while returning.
 //!
-//! Real parts: the built `rt-controller run` as a process, the simulated UR5 controller with the program that was uploaded to
-//! it, shared memory. Only the liquid is a formula here: flow grows with the tilt that the joint really has. Every test prints
-//! its rows of the table (`cargo test -p tests --test robot_faults -- --show-output`); times are the robot's own clock.
+//! The built `rt-controller run` runs as a process, with real shared memory, and the uploaded program runs on the simulated UR5 controller.
+//! Only the liquid is a formula here: its flow grows with the tilt that the joint really has. Every test prints its rows of the table
+//! (`cargo test -p tests --test robot_faults -- --show-output`); times are those of the robot's own clock.
 //!
-//! For each fault and moment, on a CB3 and on an e-Series: no command to servoj beyond the limits; upright and stopped within the bound, or stopped where
-//! the robot's own safety stops it; the reason named in the result; and a working next pour after recovery.
+//! Each fault and moment is tried on a CB3 and on an e-Series. No command to servoj may exceed the limits. The container must be upright
+//! and at rest within the bound, or at rest where the robot's own safety stops it. The result must name the reason, and after recovery the
+//! next pour must work.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::too_many_lines)]
 
 mod cell;
@@ -20,7 +21,7 @@ use simulator::ur::{Fault, RobotMode, Series};
 
 use cell::{Cell, Expected, Moment, start_controller};
 
-/// Four cells side by side, because a pour is mostly waiting: in each, the second moment begins with the recovery from the first.
+/// Runs four cells side by side, because a pour is mostly waiting. In each, the second moment begins with the recovery from the first.
 fn matrix(name: &str, last: u8, expected: Expected, strike: impl Fn(&mut Cell) + Sync, recover: impl Fn(&mut Cell) + Sync) {
     let (strike, recover) = (&strike, &recover);
     let halves = [[Moment::AtRest, Moment::FullFlow], [Moment::TiltingOut, Moment::Returning]];
@@ -37,12 +38,12 @@ fn matrix(name: &str, last: u8, expected: Expected, strike: impl Fn(&mut Cell) +
     });
 }
 
-/// A fault that passes or needs nobody.
+/// Checks a fault that passes, or from which the cell recovers without a person.
 fn by_itself(name: &str, last: u8, expected: Expected, fault: Fault) {
     matrix(name, last, expected, |c| c.robot.inject(fault.clone()), |_| {});
 }
 
-/// A fault that shows when connecting: the connection is closed with it, and it lasts until the operator has read about it.
+/// Checks a fault that shows when the controller connects: the connection is closed along with it, and it lasts until `status` names it.
 fn at_connecting(name: &str, last: u8, fault: Fault, words: &str) {
     let strike = |c: &mut Cell| {
         c.robot.inject(fault.clone());
@@ -67,7 +68,7 @@ fn reset() {
     by_itself("reset", 2, Expected::Upright(EndReason::RobotLost), Fault::Reset);
 }
 
-/// Protects the pour from a controller that is gone for a while.
+/// Protects the pour from a UR controller that is gone for a while.
 #[test]
 fn offline() {
     by_itself("offline", 3, Expected::Upright(EndReason::RobotLost), Fault::Offline(1.5));
@@ -194,14 +195,14 @@ fn emergency_stop() {
     matrix("emergency-stop", 18, Expected::Stopped(EndReason::EmergencyStop), strike, recover);
 }
 
-/// Protects the operator's word: a program stopped on the pendant stays stopped until the container is upright again.
+/// Protects the operator's decision: a program stopped on the pendant stays stopped until the container is upright again.
 #[test]
 fn program_stop() {
     let strike = |c: &mut Cell| c.robot.inject(Fault::ProgramStop);
     matrix("program-stop", 19, Expected::Stopped(EndReason::ProgramStopped), strike, Cell::jog_upright_if_tilted);
 }
 
-/// Protects the operator's word: a paused program ends the pour; resumed, it only comes upright.
+/// Protects the operator's decision: a paused program ends the pour; resumed, it only comes upright.
 #[test]
 fn program_pause() {
     let strike = |c: &mut Cell| c.robot.inject(Fault::ProgramPause);

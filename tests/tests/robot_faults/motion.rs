@@ -1,4 +1,5 @@
-//! What the robot's trace says of a motion: how far, how fast, how hard, and when it was at rest and upright.
+//! What the robot's trace says about a motion: how far, how fast, how hard, and when the joint was at rest and upright. It panics on an
+//! empty trace, as tests may.
 
 use simulator::ur::{Series, TraceRow};
 
@@ -8,15 +9,16 @@ pub struct Motion {
     pub peak_deg: f64,
     /// When the joint first came to rest.
     pub rest_s: f64,
-    /// When it was upright and stayed so.
+    /// When the joint was upright and stayed so.
     pub upright_s: Option<f64>,
-    /// Of the angles given to servoj, by the time of the program's cycles.
+    /// Largest rate of the angles given to servoj, over the program's cycles.
     pub fastest_deg_s: f64,
+    /// Largest acceleration of the same angles.
     pub hardest_deg_s2: f64,
 }
 
 impl Motion {
-    /// From a trace of the robot's cycles.
+    /// Finds the motion in a trace of the robot's cycles.
     pub fn of(trace: &[TraceRow], series: Series) -> Self {
         let alpha = |r: &TraceRow| r.actual_q[5].to_degrees();
         let rate = |r: &TraceRow| r.actual_qd[5].to_degrees();
@@ -24,8 +26,8 @@ impl Motion {
         let upright = |r: &TraceRow| alpha(r).abs() < 1.0 && rate(r).abs() < 1.0;
         let upright_from = trace.iter().rposition(|r| !upright(r)).map_or(0, |i| i + 1);
         let rest = trace.iter().find(|r| rate(r).abs() < 1.0).unwrap_or(last);
-        // Only cycles in which servoj moves the joint: what a stop or a jog does is the robot's own. After those, what counts is
-        // where the joint then is and how fast.
+        // Only cycles in which servoj moves the joint count, because a stop or a jog is the robot's own doing. After such a motion, the
+        // place and speed of the joint are taken as the start.
         let cycle_s = 1.0 / series.rate_hz();
         let (mut at, mut speed) = (f64::NAN, f64::NAN);
         let (mut fastest_deg_s, mut hardest_deg_s2) = (0.0f64, 0.0f64);
