@@ -36,7 +36,8 @@ pub const fn action_table() -> [f32; ACTIONS] {
     table
 }
 
-/// The action of `table` nearest to `dalpha_deg`; ties and non-finite angles go to the smaller index found first.
+/// Index of the action of `table` nearest to `dalpha_deg`. A tie goes to [`STAY`] if it is among the nearest, otherwise to the smaller
+/// index; an angle that is not finite gives [`STAY`].
 pub fn nearest_action(table: &[f32; ACTIONS], dalpha_deg: f32) -> usize {
     let mut best = STAY;
     for (k, a) in table.iter().enumerate() {
@@ -51,7 +52,8 @@ pub fn nearest_action(table: &[f32; ACTIONS], dalpha_deg: f32) -> usize {
 mod tests {
     use super::*;
 
-    /// Protects Fig. 5's discretisation: fine near 0, +-5 degrees at the ends, odd, ascending; and its inverse.
+    /// Protects Fig. 5's discretisation: it is fine near 0, +-5 degrees at the ends, odd and ascending. Also
+    /// protects its inverse.
     #[test]
     fn the_action_table_is_figure_5() {
         let table = action_table();

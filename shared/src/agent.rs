@@ -36,7 +36,7 @@ pub struct Decision {
     pub d_ml: f32,
     /// Estimated volume poured since the goal was set, ml.
     pub poured_ml: f32,
-    /// Standard deviation of `poured_ml` as far as the estimator knows it, ml; 0: it does not.
+    /// Standard deviation of `poured_ml` as far as the estimator knows it, ml; 0 if it does not.
     pub poured_sd_ml: f32,
     /// Volume that would still leave the container if the way back began now, ml; 0 with [`Estimator::Sum`].
     pub stop_ml: f32,
@@ -49,7 +49,7 @@ pub struct Decision {
 }
 
 impl Decision {
-    /// Stay, and nothing known.
+    /// The decision to stay, when nothing is known.
     pub const NOTHING: Self = Self {
         action: STAY as u8,
         dalpha_deg: 0.0,
@@ -72,9 +72,10 @@ struct VolumeEstimate {
     over_lip_ml: f64,
 }
 
-/// After the way back has begun, this much missing volume makes the agent pour on, ml. Chosen by hand; no measurement is recorded.
+/// After the way back has begun, more missing volume than this makes the agent pour on, ml; only with the fused estimate. Chosen by
+/// hand; no measurement is recorded.
 const RESUME_ML: f32 = 0.5;
-/// The tilt, degrees, within which the volume still to come is asked of the flow model: what lies outside is no tilt of a container.
+/// The tilt, degrees, within which the volume still to come is asked of the flow model; no container tilts further.
 const MODEL_TILT_DEG: (f64, f64) = (-30.0, 200.0);
 /// Largest part of an angle that [`Selection::Expected`] carries to the next frame, degrees. Chosen by hand; no measurement is recorded.
 const CARRY_MAX_DEG: f32 = 1.0;
@@ -172,7 +173,7 @@ impl Agent {
         }
     }
 
-    /// Takes the frame into the sum and, if there is one, into the filter.
+    /// Adds the frame to the sum and gives it to the fused estimate, if there is one.
     fn observe(&mut self, observation: Observation) -> VolumeEstimate {
         let calibration = self.weights.calibration;
         let area_px2 = self.hold.step(observation.area_px2, calibration.hold_above_px2);
@@ -251,7 +252,8 @@ mod tests {
         }
     }
 
-    /// Protects eq. (2) and (4): d starts at the goal, falls by each frame's volume, goes below 0, and turns the agent back.
+    /// Protects eq. (2) and (4): d starts at the goal, falls by each frame's volume, goes below 0, and makes the agent tilt
+    /// back.
     #[test]
     fn d_counts_down_and_turns_the_agent_back() {
         let weights = example();
@@ -291,7 +293,7 @@ mod tests {
         for b in &mut weights.network.b3 {
             *b = -100.0;
         }
-        // Half "stay", half the finest action: 0.025 degrees a frame on average, which no action is.
+        // Half "stay", half the finest action: 0.025 degrees a frame on average, which no single action gives.
         (weights.network.b3[10], weights.network.b3[11]) = (0.0, 0.0);
         let mut agent = Agent::new(&weights);
         agent.start(50.0);
@@ -299,7 +301,7 @@ mod tests {
         assert!((sum - 2.5).abs() < 0.06, "{sum}");
     }
 
-    /// Protects reproducibility where actions are drawn.
+    /// Protects reproducibility: which actions are drawn depends on the seed alone.
     #[test]
     fn sampling_is_seeded() {
         let mut weights = example();

@@ -5,7 +5,8 @@
 
 /// How long a measured alpha still counts when no newer one has come, ns: as long as a robot may be silent before it counts as lost.
 const HOLD_NS: u64 = 100_000_000;
-/// After this much time in ticks a frame no longer waits for a newer state of the robot, ns. Chosen by hand; no measurement is recorded.
+/// A frame no longer waits for a newer state of the robot once a tick is this much later than the frame, ns. Chosen by hand; no
+/// measurement is recorded.
 const PATIENCE_NS: u64 = 50_000_000;
 
 /// One angle over time: the newest `N` values, each with its time, ascending in time.
@@ -65,7 +66,8 @@ impl<const N: usize> AlphaTrack<N> {
         Self { commanded: AngleHistory::new(), measured: AngleHistory::new() }
     }
 
-    /// Adds a tick at `at_ns` with its commanded alpha, and the alpha that the robot reported at `robot_at_ns` (0: never).
+    /// Adds a tick at `at_ns` with its commanded alpha, and the alpha that the robot reported at `robot_at_ns` (0 if it
+    /// never did).
     pub fn push(&mut self, at_ns: u64, alpha_deg: f32, robot_at_ns: u64, alpha_measured_deg: f32) {
         self.commanded.push(at_ns, alpha_deg);
         if robot_at_ns > 0 {
@@ -121,7 +123,7 @@ mod tests {
         assert!(track.covers(97 * MS), "the robot is silent: no use to wait longer");
     }
 
-    /// Protects memory: the history is bounded, and the same robot state twice is one.
+    /// Protects memory: the history is bounded, and a robot state that comes twice is kept once.
     #[test]
     fn the_history_is_bounded() {
         let mut track = AlphaTrack::<4>::new();

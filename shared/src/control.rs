@@ -74,7 +74,7 @@ pub struct Outcome {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum EndReason {
-    /// The agent came to its end, usually because d reached 0; or the curve was run to its end.
+    /// The agent finished, usually because d reached 0; or the curve was run to its end.
     Done,
     /// The operator aborted it.
     Aborted,

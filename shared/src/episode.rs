@@ -3,7 +3,7 @@
 //! Each episode is one MCAP file that describes itself. [`mod@write`] makes it; [`read`] gives the plain [`Episode`] that the trainer works
 //! on, and the images on demand; [`weigh`] adds the weight afterwards; [`table`] reads and writes the CSV pair for people who have their
 //! own vision. For ordinary threads only: allocates, reads and writes files. A damaged file is an error with one line that names the file.
-//! A file whose recorder was killed reads up to its last whole chunk and says `complete: false`.
+//! A file whose recorder was killed can be read up to its last whole chunk and then says `complete: false`.
 //!
 //! What is in the file (times are CLOCK_MONOTONIC ns, so that they match every other message of the cell):
 //!

@@ -1,6 +1,6 @@
-//! Area to ml, and the volume poured so far.
+//! Turns areas into ml, and estimates the volume poured so far.
 //!
-//! Pure and in the controller's loop: fixed size, no allocation, no panic. An area that is not a finite number >= 0 counts as a
+//! Pure; runs in the controller's loop: fixed size, no allocation, no panic. An area that is not a finite number >= 0 counts as a
 //! lost frame.
 //!
 //! | file | what it holds |
@@ -17,7 +17,7 @@ pub mod flow;
 pub mod fused;
 pub mod vessel;
 
-/// V_e in px^2 to ml a frame: `v = c area^q exp(tilt z)`, with z of [`tilt_z`], and the dropout hold that goes with it.
+/// Turns V_e in px^2 into ml a frame: `v = c area^q exp(tilt z)`, with z of [`tilt_z`], and the dropout hold that goes with it.
 ///
 /// The picture of the same flow changes a little with the tilt, because the lip's wall turns into the stream.
 ///
@@ -97,7 +97,7 @@ mod tests {
         }
     }
 
-    /// Protects the calibration's formula, and 0 for no stream even with an odd exponent.
+    /// Protects the calibration's formula, and that no stream gives 0 whatever the exponent.
     #[test]
     fn volume_is_a_power_of_the_area() {
         let cal = Calibration { volume_at_1_px2_ml: 0.002, area_exponent: 1.2, log_tilt_slope: 0.1, hold_above_px2: 60.0 };

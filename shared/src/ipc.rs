@@ -4,7 +4,7 @@
 //! layouts' version is part of each service's name, so that programs of other versions never connect. All processes of a cell run
 //! under one user, because the shared memory is private to that user.
 //!
-//! Opening a service allocates and belongs into an ordinary thread; receiving, and sending a loan, do neither allocate nor block. Every
+//! Opening a service allocates and belongs in an ordinary thread; receiving, and sending a loan, neither allocate nor block. Every
 //! failure is an [`IpcError`] of one line.
 
 use std::path::PathBuf;
@@ -87,8 +87,8 @@ pub fn directory(name: &str) -> PathBuf {
     PathBuf::from(format!("/tmp/decant_{name}"))
 }
 
-/// Removes every file of the cell `name`, also those that a killed process left. Only who started the cell may call this, after all
-/// of its processes have ended; a cell that still runs would be torn apart. What cannot be removed stays.
+/// Removes every file of the cell `name`, also those that a killed process left. Only the process that started the cell may call this,
+/// after all of its processes have ended; a cell that still runs would be torn apart. What cannot be removed stays.
 pub fn remove_files(name: &str) {
     let prefix = format!("decant_{name}_");
     for entry in std::fs::read_dir("/dev/shm").into_iter().flatten().flatten() {
@@ -116,7 +116,7 @@ impl Cell {
         config.global.prefix = FileName::new(format!("decant_{name}_").as_bytes()).map_err(|e| fail(format!("{e:?}")))?;
         let root = Path::new(directory(name).as_os_str().as_encoded_bytes()).map_err(|e| fail(format!("{e:?}")))?;
         config.global.set_root_path(&root);
-        // Each program handles its own signals; iceoryx2 shall not end a wait for good because of one.
+        // Each program handles its own signals; so iceoryx2 must not end its waits for good because of one.
         let node = NodeBuilder::new()
             .config(&config)
             .signal_handling_mode(SignalHandlingMode::Disabled)
@@ -150,7 +150,7 @@ impl Cell {
             .in_service(&full)
     }
 
-    /// Camera frames, from one driver, or from the feature worker that reads the camera itself. A late reader loses the oldest ones.
+    /// Camera frames, from one driver, or from the feature worker that reads the camera itself. A slow reader loses the oldest ones.
     pub fn frames(&self) -> Result<FrameTopic, IpcError> {
         let (name, full) = self.name("frame")?;
         self.node
@@ -176,7 +176,7 @@ impl Cell {
         self.frame_event()?.listener_builder().create().in_service("frame-event")
     }
 
-    /// The other side of [`Cell::frame_listener`]: who publishes frames calls `notify()` after each.
+    /// The other side of [`Cell::frame_listener`]: whoever publishes frames calls `notify()` after each.
     pub fn frame_notifier(&self) -> Result<FrameNotifier, IpcError> {
         self.frame_event()?.notifier_builder().create().in_service("frame-event")
     }

@@ -18,7 +18,7 @@
 //! | [`exit`] | exit codes and one-line errors | no |
 //! | [`os`] | the operating system: clock, scheduling, locked memory | yes |
 //!
-//! Nothing in a module marked "yes" allocates, locks or panics after construction.
+//! What the loop uses of a module marked "yes" does not allocate, lock or panic after construction.
 
 #![deny(unsafe_code)]
 

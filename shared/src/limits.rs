@@ -1,7 +1,7 @@
 //! The one place that every target passes: limits on angle, step, rate and acceleration of alpha.
 //!
 //! Pure; runs in the controller's loop: no allocation, no panic, no failure. A request that is not finite counts as "stay". Whatever is
-//! clipped is counted. This is no safety function; the robot's own controller has that one.
+//! clipped is counted. This is not a safety function; safety is the task of the robot's own controller.
 
 use serde::{Deserialize, Serialize};
 
@@ -140,8 +140,8 @@ impl Limiter {
     }
 }
 
-/// The largest rate r, degrees/s, with which r, r - change, r - 2 change, and so on, each held for dt seconds, lead at most `distance`
-/// degrees far.
+/// The largest rate r, degrees/s, with which r, r - change, r - 2 change, and so on, each held for dt seconds, lead no
+/// further than `distance` degrees.
 fn braking_rate(distance: f32, change: f32, dt: f32) -> f32 {
     if change <= 0.0 {
         return 0.0;
@@ -167,7 +167,7 @@ mod tests {
             let mut limiter = Limiter::new(limits, DT, 0.0);
             let (mut alpha, mut rate) = (0.0f32, 0.0f32);
             for request in requests {
-                // Also through the way that brakes: it must not panic, whatever it is given.
+                // Half of the requests go to the step that brakes, which must not panic either, whatever it is given.
                 let next = if request.to_bits() % 2 == 0 { limiter.step(request) } else { limiter.step_towards(request) };
                 prop_assert!(next >= limits.alpha_min_deg && next <= limits.alpha_max_deg);
                 let new_rate = (next - alpha) / DT;
@@ -178,7 +178,7 @@ mod tests {
         }
     }
 
-    /// Protects the pour's end: upright is reached, and exactly.
+    /// Protects the pour's end: upright is reached exactly.
     #[test]
     fn the_way_back_ends_at_zero() {
         let mut limiter = Limiter::new(Limits::default(), DT, 80.0);

@@ -100,7 +100,8 @@ mod wide {
     /// Numbers in one register of AVX2.
     const LANES: usize = 8;
 
-    /// The function that [`V3::vectorize`] compiles for these processors. Everything that it calls must be inlined to be compiled so too.
+    /// The function that [`V3::vectorize`] compiles for these processors. Everything that it calls must be inlined, so that it is compiled
+    /// for them too.
     pub struct Forward<'a>(pub V3, pub &'a Mlp, pub &'a [f32; INPUTS]);
 
     impl pulp::NullaryFnOnce for Forward<'_> {
@@ -203,7 +204,7 @@ pub fn softmax(logits: &[f32; ACTIONS]) -> [f32; ACTIONS] {
 mod tests {
     use super::*;
 
-    /// Protects the paper's shape: two hidden layers, about 2000 parameters, 1909 to the letter.
+    /// Protects the paper's shape: two hidden layers and about 2000 parameters, here exactly 1909.
     #[test]
     fn the_network_has_1909_parameters() {
         assert_eq!(PARAMETERS, 1909);
@@ -236,8 +237,8 @@ mod tests {
         }
     }
 
-    /// Protects the action from the processor it is chosen on: for random networks and inputs the form chosen at run time and
-    /// the portable one agree to the last bits, and in the action unless two logits are that close.
+    /// Protects the action from the processor it is chosen on: for random networks and inputs, the form chosen at run time and
+    /// the portable one agree except in their last bits, and choose the same action unless two logits are that close.
     #[test]
     fn both_forms_give_the_same_action() {
         use rand::{RngExt, SeedableRng};
@@ -260,7 +261,7 @@ mod tests {
         assert!(same >= 19_990, "{same} of 20000");
     }
 
-    /// Protects the robot from an undefined action: numbers that are none give "stay".
+    /// Protects the robot from an undefined action: logits that are not numbers give "stay".
     #[test]
     fn non_finite_logits_mean_stay() {
         assert_eq!(argmax(&[f32::NAN; ACTIONS]), STAY);

@@ -99,26 +99,26 @@ impl Estimator {
             ("radius", radius_mm, 1.0, 1000.0),
             ("height", height_mm, 1.0, 5000.0),
             ("taper", taper, 0.05, 20.0),
-            ("share of flat shape", even_share, 0.0, 1.0),
+            ("share of the capacity that is spread evenly", even_share, 0.0, 1.0),
             ("flow coefficient", log_weir_coefficient, -20.0, 20.0),
             ("flow exponent", head_exponent, 0.2, 5.0),
-            ("k1", log_weir_slope, -20.0, 20.0),
-            ("k2", log_weir_curvature, -20.0, 20.0),
+            ("slope of the flow coefficient over the tilt", log_weir_slope, -20.0, 20.0),
+            ("curvature of the flow coefficient over the tilt", log_weir_curvature, -20.0, 20.0),
             ("lag", lag_frames, 0.0, 60.0),
             ("delay", delay_frames, 0.0, DELAY_MAX_FRAMES),
             ("film share", film_share, 0.0, 0.95),
-            ("sd of lambda", noise.log_flow_factor_sd, 1e-4, 5.0),
-            ("sd of gamma", noise.log_camera_gain_sd, 1e-4, 5.0),
-            ("sd of beta", noise.log_capacity_scale_sd, 1e-6, 5.0),
+            ("sd of the flow factor (log)", noise.log_flow_factor_sd, 1e-4, 5.0),
+            ("sd of gamma, the camera's gain (log)", noise.log_camera_gain_sd, 1e-4, 5.0),
+            ("sd of the capacity's scale (log)", noise.log_capacity_scale_sd, 1e-6, 5.0),
             ("sd of the delay", noise.extra_delay_sd_frames, 1e-4, 20.0),
-            ("sd of a frame", noise.log_frame_volume_sd, 1e-4, 5.0),
+            ("sd of a frame's volume (log)", noise.log_frame_volume_sd, 1e-4, 5.0),
             ("smallest outflow", noise.least_visible_ml, 0.0, 10.0),
-            ("rate back", back.rate_deg, 0.1, 10.0),
-            ("change of the rate back", back.change_deg, 0.01, 100.0),
+            ("rate of the way back", back.rate_deg, 0.1, 10.0),
+            ("change of that rate in a frame", back.change_deg, 0.01, 100.0),
         ];
         for (name, value, low, high) in ranges.into_iter().chain(log_shape.map(|s| ("shape of the vessel (log)", s, -10.0, 10.0))) {
             if !(low..=high).contains(&value) {
-                return Err(format!("estimator: {name} is {value}, allowed is {low} to {high}"));
+                return Err(format!("estimator: {name} is {value}, but must be {low} to {high}"));
             }
         }
         Ok(())
@@ -196,7 +196,7 @@ pub enum WeightsError {
         found: [usize; 4],
     },
     /// The file is shorter or longer than its header says.
-    #[error("{file}: truncated or with bytes too many: {found} bytes where the header says {expected}; copy it again")]
+    #[error("{file}: truncated, or has too many bytes: {found} bytes where the header says {expected}; copy it again")]
     Length {
         /// The file.
         file: String,
@@ -355,7 +355,7 @@ pub(crate) mod tests {
     use crate::actions::action_table;
     use proptest::prelude::*;
 
-    /// A network that pours while d > 0 and stays when d is near 0; made by hand.
+    /// Valid weights whose network has arbitrary parameters, made by hand.
     pub(crate) fn example() -> Weights {
         let mut network = Mlp::ZERO;
         for (k, p) in network.parameters_mut().enumerate() {
@@ -397,7 +397,7 @@ pub(crate) mod tests {
         assert_eq!(std::fs::read_dir(dir.path()).unwrap().count(), 1);
     }
 
-    /// Protects the robot: a file cut at any byte is refused, and never panics.
+    /// Protects the robot: a file that is cut at any byte is refused, and reading it never panics.
     #[test]
     fn every_truncation_is_refused() {
         let bytes = example().to_bytes().unwrap();

@@ -17,10 +17,11 @@ use super::{Episode, EpisodeInfo, EpisodeKind};
 use crate::gaussian_curve::Curve;
 use crate::messages::Doubt;
 
-/// How much older the last frame of a complete episode may be than the last tick, ns. Chosen by hand: frames may be under way for so long.
+/// How much older the last frame of a complete episode may be than the last tick, ns. Chosen by hand: frames may be under way for that
+/// long.
 const SILENT_END_NS: u64 = 500_000_000;
 
-/// All that is in a file but the images.
+/// Everything in a file except the images.
 #[derive(Default)]
 struct Contents {
     /// Topic of each channel.
@@ -82,7 +83,7 @@ impl Contents {
         check_reading(grams).map(Some).map_err(|e| format!("metadata 'weight': grams = {grams}: {e}"))
     }
 
-    /// The rows of the episode, those of lost frames filled in.
+    /// The rows of the episode, including those of lost frames.
     fn rows(&self, started_at_ns: u64) -> Result<Vec<EpisodeRow>, String> {
         // The ticks are taken as the recorder took them, so that a lost frame gets the angles that it would have written.
         let mut track = EpisodeTrack::new();
@@ -134,7 +135,7 @@ impl Contents {
         Ok(rows)
     }
 
-    /// The episode `name`. `whole`: the file has its regular end.
+    /// The episode `name`. `whole` says whether the file has its regular end.
     fn episode(self, name: &str, whole: bool) -> Result<Episode, String> {
         let started_at_ns = self.number(format::META_EPISODE, "started_at_ns")?;
         let rows = self.rows(started_at_ns)?;

@@ -10,7 +10,7 @@ use mcap::McapError;
 use mcap::records::{Record, op};
 use mcap::sans_io::linear_reader::{LinearReadEvent, LinearReader, LinearReaderOptions};
 
-/// Largest record or chunk that is believed, bytes. Chosen by hand: far above a chunk of the recorder, far below a computer's memory.
+/// Largest record or chunk that is accepted, bytes. Chosen by hand: far above a chunk of the recorder, far below a computer's memory.
 const RECORD_LIMIT: usize = 256 << 20;
 /// Bytes read at a time. Chosen by hand; no measurement is recorded.
 const READ_BYTES: usize = 1 << 20;
@@ -23,7 +23,7 @@ pub enum EpisodeError {
     Read {
         /// The file.
         file: String,
-        /// The system's words.
+        /// The operating system's message.
         what: String,
     },
     /// It is not an episode of this program.

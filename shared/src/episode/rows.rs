@@ -1,4 +1,4 @@
-//! One line of an episode, and the lines of lost frames between two others. Pure; does not allocate, but for its error texts.
+//! One line of an episode, and the lines of lost frames between two others. Pure; does not allocate, except for its error texts.
 
 use crate::alpha_track::AlphaTrack;
 use crate::messages::Doubt;

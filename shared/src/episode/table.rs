@@ -26,7 +26,7 @@ pub enum TableError {
     File {
         /// The file.
         file: String,
-        /// The system's words.
+        /// The operating system's message.
         what: String,
     },
     /// A row or the heading is wrong.

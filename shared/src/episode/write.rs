@@ -34,7 +34,7 @@ pub enum WriteError {
     Directory {
         /// The directory.
         directory: String,
-        /// The system's words.
+        /// The operating system's message.
         what: String,
     },
     /// Creating or writing the file failed.
@@ -42,7 +42,7 @@ pub enum WriteError {
     File {
         /// The file.
         file: String,
-        /// The system's words.
+        /// The operating system's message.
         what: String,
     },
 }
@@ -299,7 +299,7 @@ mod tests {
         assert_eq!(rfc3339(1_795_311_559), "2026-11-22T01:39:19Z");
     }
 
-    /// Protects earlier episodes: a new one never takes a name that is there, and numbers are not used again below it.
+    /// Protects earlier episodes: a new one never takes a name that is there, and numbers below the highest one are not used again.
     #[test]
     fn the_next_free_name_is_taken() {
         let dir = tempfile::tempdir().unwrap();

@@ -1,6 +1,6 @@
 //! One explanation of a pour: an extended Kalman filter on the flow model.
 //!
-//! Pure and in the controller's loop: fixed size, no allocation, no panic.
+//! Pure; runs in the controller's loop: fixed size, no allocation, no panic. `Filter::is_finite` tells whether its numbers are still good.
 //!
 //! | symbol | state of the filter |
 //! |---|---|
@@ -34,7 +34,8 @@ pub(super) const EXTRA_DELAY: usize = 6;
 /// One number for each state.
 type States = [f64; STATES];
 
-/// Error of an area that does not shrink with it, ml a frame. From the prototype's filter; no other measurement is recorded.
+/// Standard deviation of the part of a frame's error that does not shrink with its area, ml a frame. From the prototype's filter; no other
+/// measurement is recorded.
 const SD_FLOOR_ML: f64 = 0.012;
 /// Slopes are taken at no less than this excess, so that a filter that believes the flow has ceased can be told otherwise, ml.
 /// Chosen by hand; no measurement is recorded.
@@ -42,13 +43,14 @@ const EXCESS_MIN_ML: f64 = 0.05;
 /// A measurement that is further off than this many standard deviations counts less. From the prototype's filter; no other
 /// measurement is recorded.
 const GATE_SDS: f64 = 4.0;
-/// Variance of the headspace at the first sight of flow that nothing else explains, ml^2. From the prototype's filter; no other
+/// The part of the headspace's variance that nothing else explains when flow is first seen, ml^2. From the prototype's filter; no other
 /// measurement is recorded.
 const FIRST_HEADSPACE_VARIANCE_ML2: f64 = 1.0;
 /// A foreseen outflow above this many times the least visible one cannot be overlooked, so that a zero is a dropout. From the
 /// prototype's filter; no other measurement is recorded.
 const OVERLOOKED: f64 = 3.0;
-/// As many zeros in a row are no dropout any more. From the prototype's filter; no other measurement is recorded.
+/// This many zeros in a row are believed, and are no longer taken for a dropout. From the prototype's filter; no other measurement is
+/// recorded.
 const ZEROS_BELIEVED: u32 = 3;
 
 /// The tilt that a picture shows, and its change in a frame, degrees.
@@ -58,7 +60,7 @@ pub(super) struct Tilt {
     pub change_deg: f64,
 }
 
-/// What the model does not know of a frame (standard deviations).
+/// How much a frame may change what the model does not describe (standard deviations).
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Drift {
     /// Of the headspace, in ml, and again for each ml of outflow.
@@ -101,7 +103,7 @@ impl Filter {
         *self = Self::new(self.noise, self.drift);
     }
 
-    /// Whether all numbers still are numbers.
+    /// Whether the state and its covariance are still finite.
     pub fn is_finite(&self) -> bool {
         self.state.iter().chain(self.covariance.iter().flatten()).all(|s| s.is_finite())
     }

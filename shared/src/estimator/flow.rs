@@ -1,7 +1,7 @@
 //! The flow model: from commanded angles to outflow, with a handful of parameters that are fitted to weighed episodes.
 //!
-//! Pure. [`FlowTables`] and [`FlowState`] are in the controller's loop: they have a fixed size, and nothing here allocates or
-//! panics. The trainer fits [`FlowModel`] with the very same step. All volumes are in ml, angles in degrees, time in frames.
+//! Pure. [`FlowTables`] and [`FlowState`] are used in the controller's loop: they have a fixed size, and nothing here allocates or
+//! panics. The trainer fits [`FlowModel`] with the same step. All volumes are in ml, angles in degrees, time in frames.
 //!
 //! ```text
 //! a    += clip((alpha(t - D - delta) - a) / (1 + tau), +-3)            the tilt that this frame shows
@@ -124,7 +124,7 @@ pub struct FlowTables {
 /// The flow over the lip in one frame, and its slopes.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct LipFlow {
-    /// Liquid above the lip, ml; negative: what is missing to the lip.
+    /// Liquid above the lip, ml; negative if the liquid stands below the lip.
     pub excess_ml: f64,
     /// Outflow, ml a frame.
     pub flow_ml: f64,
@@ -218,7 +218,7 @@ impl FlowTables {
     }
 }
 
-/// Where the liquid is, as far as one knows.
+/// Where the liquid is, as far as it is known.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct FlowState {
     /// Tilt that the newest picture shows, degrees.
@@ -236,7 +236,7 @@ pub struct FlowState {
 }
 
 impl Default for FlowState {
-    /// A full and upright container, of which nothing is known that the model does not say.
+    /// A full and upright container, about which nothing is known beyond the model.
     fn default() -> Self {
         Self { tilt_deg: 0.0, headspace_ml: 0.0, film_ml: 0.0, log_flow_factor: 0.0, capacity_scale: 1.0, extra_delay_frames: 0.0 }
     }
@@ -319,7 +319,7 @@ impl WayBack {
         }
     }
 
-    /// The history, the command now in force if it is another one, and the commands of a way back that starts after it, degrees.
+    /// The history, the command now in force if it differs, and the commands of a way back that starts after it, degrees.
     fn commands(self, history: &CommandHistory, now_deg: f64) -> [f64; HISTORY + STOP_FRAMES] {
         let mut commands = [0.0; HISTORY + STOP_FRAMES];
         commands[..HISTORY].copy_from_slice(&history.0);

@@ -2,8 +2,8 @@
 //!
 //! How far the tilt must go to keep the flow alive tells how much has left, whatever the camera's gain is. An extended Kalman
 //! filter on the [flow model](super::flow) weighs the two (`filter.rs`). It runs in the controller's loop and is pure: its size is
-//! fixed, it does not allocate, and it does not panic. It takes about 5 kflop a frame. A measurement that cannot be one counts as a
-//! lost frame.
+//! fixed, it does not allocate, and it does not panic. It takes about 5 kflop a frame. An impossible measurement counts as a lost
+//! frame.
 //!
 //! The filter starts with the first frame that shows flow. Before that, only the tilt is followed.
 //!
@@ -27,26 +27,27 @@ const TEMPER: f64 = 0.5;
 /// The estimate stays within this many standard deviations of the camera's gain from the camera's own sum. Tuned on rigs 100 to
 /// 123, see docs/LEARNING.md.
 const CAMERA_SDS: f64 = 2.5;
-/// This much further the estimate may be from the camera's own sum in any case, ml. Tuned on rigs 100 to 123, see docs/LEARNING.md.
+/// The estimate may be this much further from the camera's own sum in any case, ml. Tuned on rigs 100 to 123, see docs/LEARNING.md.
 const CAMERA_ML: f64 = 1.5;
 
-/// More than any container gives in a frame, so that it is not a measurement, ml. Chosen by hand; no measurement is recorded.
+/// An outflow above this is more than any container gives in a frame, so it is not taken as a measurement, ml. Chosen by hand; no
+/// measurement is recorded.
 const MEASURED_MAX_ML: f64 = 50.0;
-/// Angles outside of this range are cut to it, degrees: no cell tilts that far.
+/// Angles outside this range are cut to it, degrees: no cell tilts that far.
 const COMMAND_RANGE_DEG: (f64, f64) = (-30.0, 200.0);
 
-/// What changes in a frame that the model does not know, where all is as the episodes showed. From the prototype's filter, tuned on
-/// rigs 100 to 123, see docs/LEARNING.md.
+/// How much a frame may change what the model does not describe, where all is as the episodes showed. From the prototype's filter,
+/// tuned on rigs 100 to 123, see docs/LEARNING.md.
 const USUAL_DRIFT: Drift = Drift { headspace_sd_ml: 0.05, log_flow_factor_sd: 0.007 };
 /// The same where the geometry or the delay is not to be trusted. Tuned on rigs 100 to 123, see docs/LEARNING.md.
 const DISTRUSTED_DRIFT: Drift = Drift { headspace_sd_ml: 0.2, log_flow_factor_sd: 0.02 };
 
-/// The doubt where the camera or the liquid has changed, from the usual one. Tuned on rigs 100 to 123, see docs/LEARNING.md.
+/// The noise where the camera or the liquid has changed, from the usual noise. Tuned on rigs 100 to 123, see docs/LEARNING.md.
 fn changed(usual: FlowNoise) -> FlowNoise {
     FlowNoise { log_camera_gain_sd: (3.0 * usual.log_camera_gain_sd).max(0.1), log_flow_factor_sd: 2.0 * usual.log_flow_factor_sd, ..usual }
 }
 
-/// The doubt where the geometry or the delay is not to be trusted, from the usual one. Tuned on rigs 100 to 123, see
+/// The noise where the geometry or the delay is not to be trusted, from the usual noise. Tuned on rigs 100 to 123, see
 /// docs/LEARNING.md.
 fn distrusted(usual: FlowNoise) -> FlowNoise {
     FlowNoise { log_capacity_scale_sd: (5.0 * usual.log_capacity_scale_sd).max(0.1), extra_delay_sd_frames: 1.5, ..usual }
@@ -240,7 +241,7 @@ mod tests {
 
     const BACK: WayBack = WayBack { rate_deg: 2.0, change_deg: 1.67 };
 
-    /// The model itself, poured: commands in, outflow a frame out.
+    /// A vessel that behaves exactly like the model: it takes commands and gives the outflow of each frame.
     struct ModelVessel {
         flow: FlowTables,
         state: FlowState,
@@ -263,8 +264,8 @@ mod tests {
         }
     }
 
-    /// A pour that rises, holds, and returns; the camera's gain is off by `gain`, the picture `late` frames later than the model
-    /// knows. (true, camera's sum, filter), ml.
+    /// A pour that rises, holds, and returns; the camera's gain is off by `gain`, the picture comes `late` frames later than the
+    /// model knows. Gives the true volume and the camera's sum, both in ml, and the estimator.
     fn pour_into(mut filter: FusedEstimator, gain: f64, late: usize) -> (f64, f64, FusedEstimator) {
         let mut vessel = ModelVessel::new(50.0);
         let mut seen = std::collections::VecDeque::from(vec![0.0; late]);
@@ -301,7 +302,7 @@ mod tests {
         }
     }
 
-    /// Protects the volume from a geometry that is wrong and sure of itself: the estimate stays near the camera's own sum.
+    /// Protects the volume from a geometry that is wrong but trusted: the estimate stays near the camera's own sum.
     #[test]
     fn the_estimate_stays_near_the_cameras_sum() {
         let mut wrong = FlowModel { vessel: Vessel { radius_mm: 24.0, ..Vessel::default() }, ..FlowModel::default() };
@@ -321,7 +322,8 @@ mod tests {
         for gain in [0.95, 1.0, 1.05] {
             let (truth, summed, fused) = pour(gain);
             assert!(truth > 60.0, "{truth}");
-            // Two standard deviations of gain, one slow pour: a fifth of the camera's error is taken away, and none is added.
+            // The gain is off by up to two standard deviations in one slow pour. The estimate may keep at most 90 % of the camera's error,
+            // and may add at most 0.5 % of the volume.
             assert!((fused - truth).abs() < 0.9 * (summed - truth).abs() + 0.005 * truth, "gain {gain}: {truth} {summed} {fused}");
         }
     }

@@ -14,8 +14,8 @@
 //!
 //! w_0 and A_0 are those of a round vessel with straight walls, where `w_0 = integral of (distance from the lip) dA` over the
 //! free surface. w_even spreads the same capacity evenly over all tilts: beyond the horizontal a beaker is empty, but a bottle
-//! is not. What the vessel really is, s says. Where it holds more than the straight vessel, its surface is larger too, as an
-//! area is to a volume.
+//! is not. How the real vessel differs, s says. Where it loses more than the straight vessel, its surface is larger
+//! too, with the power 2/3 by which areas grow with volumes.
 //!
 //! | symbol | name |
 //! |---|---|
@@ -121,7 +121,8 @@ pub(super) struct TablePlace {
 }
 
 impl TablePlace {
-    /// Where a tilt is in the tables. A tilt beyond an end is put there; one that is not a number gives a share that is none.
+    /// Where a tilt is in the tables. A tilt beyond an end is put there; one that is not a number gives a share
+    /// that is not a number either.
     pub(super) fn of(tilt_deg: f64) -> Self {
         // NaN becomes 0 by the cast; the clamp keeps the index inside.
         let at = (tilt_deg / STEP_DEG).clamp(0.0, (ENTRIES - 2) as f64);
