@@ -18,11 +18,11 @@ use shared::os;
 /// Largest request or answer, bytes. Chosen by hand; no measurement is recorded.
 pub const MESSAGE_MAX: usize = 64 * 1024;
 
-/// Longest wait for the controller's answer; it answers within a tick and a look of its service thread, below 0.1 s.
+/// Longest wait for the controller's answer; it answers within one tick and one pause of its service thread, below 0.1 s.
 const ANSWER: Duration = Duration::from_secs(2);
 /// Longest wait for the recorder to close a file. Chosen by hand; no measurement is recorded.
 const FILE_CLOSED: Duration = Duration::from_secs(10);
-/// How often in a row a controller may not know the episode that it has started, before it counts as restarted: for a second.
+/// How often in a row a controller may not know an episode that it has started before it counts as restarted: about one second.
 const UNKNOWN_MAX: u32 = 10;
 
 /// The arguments of all commands that ask the running controller.
@@ -49,7 +49,7 @@ pub enum ClientError {
         cell: String,
     },
     /// It no longer knows an episode that it had started.
-    #[error("rt-controller knows nothing of episode {0} any more: it was restarted; the robot's program brings the container upright")]
+    #[error("rt-controller no longer knows episode {0}, because it was restarted; the robot's program brings the container upright")]
     Forgotten(u64),
     /// The answer cannot be read.
     #[error("rt-controller is another version of Decant: run the same build on both sides")]
@@ -100,7 +100,7 @@ impl Client {
 /// Why a pour could not be followed to its end.
 #[derive(Debug, thiserror::Error)]
 pub enum FollowError {
-    /// The person pressed Ctrl-C; this is how the pour ended then.
+    /// Somebody pressed Ctrl-C; this is how the pour then ended.
     #[error("interrupted: {}", .0.reason.words())]
     Interrupted(Outcome),
     /// The controller is no longer there.
@@ -111,7 +111,7 @@ pub enum FollowError {
 impl Client {
     /// Shows the progress of `episode` on standard error until it has ended. Ctrl-C aborts it.
     pub fn follow(&self, episode: u64) -> Result<Outcome, FollowError> {
-        // If that fails, Ctrl-C ends this command and the pour goes on.
+        // If this fails, Ctrl-C ends this command and the pour goes on.
         let interrupted = os::stop_at_signals().unwrap_or_default();
         let bar = indicatif::ProgressBar::new(1000);
         bar.set_style(ProgressStyle::with_template("{bar:30} {msg}").unwrap_or_else(|_| ProgressStyle::default_bar()));

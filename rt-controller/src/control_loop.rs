@@ -1,7 +1,7 @@
 //! The fixed-rate loop: absolute deadlines on CLOCK_MONOTONIC; a missed period is skipped and counted, never made up for.
 //!
-//! Runs in the real-time thread. Its ticks do not allocate, lock, log, or call anything that blocks but the sleep itself; `status` shows
-//! how often they allocated. The one exception is [`LoopState::meet_feature_worker`], which runs between ticks and outside of pours.
+//! Runs in the real-time thread. Its ticks do not allocate, lock, log, or call anything that blocks, except the sleep itself; `status`
+//! shows how often they allocated. The one exception is [`LoopState::meet_feature_worker`], which runs between ticks and outside of pours.
 //! Nothing in it fails: a lost robot is handed back and the core ends the pour, and a lost feature worker shows as stale features.
 
 use std::sync::atomic::{AtomicU64, Ordering::Relaxed};
@@ -155,7 +155,7 @@ impl<'a> LoopState<'a> {
         if self.shutdown && upright { Next::Ended } else { Next::Tick }
     }
 
-    /// Takes the features that have arrived; of more than fit, the newest, because older ones would be stale.
+    /// Takes the features that have arrived. If they are more than fit, it keeps the newest, because older ones would be stale.
     fn receive_features(&mut self) {
         self.fresh.clear();
         // `receive` gives the oldest first. The bound keeps a flood of features from holding the loop.
@@ -195,8 +195,8 @@ impl<'a> LoopState<'a> {
         }
     }
 
-    /// Gives the robot's session back, if it is over. A robot that may not move any more is never taken on as it is: it is connected
-    /// anew when it is well.
+    /// Gives the robot's session back, if it is over. A session whose robot may no longer move is never used again: the robot is connected
+    /// anew when it may move.
     fn give_session_back(&mut self, end: Option<SessionEnd>) {
         let old_sessions = &self.exchange.old_sessions;
         if let Some(end) = end
@@ -207,7 +207,7 @@ impl<'a> LoopState<'a> {
         }
     }
 
-    /// Tells the ordinary thread, or counts that it could not.
+    /// Passes an event to the ordinary thread, or counts it as lost if the queue is full.
     fn tell(&self, event: Event) {
         if self.exchange.events.push(event).is_err() {
             self.exchange.events_lost.fetch_add(1, Relaxed);
@@ -221,7 +221,7 @@ impl<'a> LoopState<'a> {
             return;
         }
         let before = os::allocations();
-        // A failure here also is one in `receive`, and shows as stale features.
+        // What fails here also fails in `receive`, and shows as stale features.
         let _ = self.features.update_connections();
         if os::allocations() != before {
             let (allocations, faults) = spent();

@@ -5,7 +5,7 @@
 //! and why, is in [`ending`].
 //!
 //! ```text
-//!            robot well          goal                 a reason to end                upright          the last drops fell
+//!            robot ready         goal                 a reason to end                upright          the last drops fell
 //!  NoRobot ------------> Idle ---------> Pouring ---------------------> Returning ---------> Settling ---------------> Idle
 //!     ^                   | curve                                           ^
 //!     |                   +------------> Recording -------------------------+ a reason to end
@@ -113,7 +113,7 @@ pub struct Core {
     run: Option<Run>,
     decision: Decision,
     newest: Option<Feature>,
-    /// When the newest picture was taken in which V_e could be measured; a camera that only shows darkness is no camera.
+    /// When the newest picture was taken in which V_e could be measured; a camera that shows only darkness does not count.
     usable_at_ns: u64,
     shutdown: bool,
     last_tick_ns: u64,
@@ -145,7 +145,7 @@ impl Core {
         }
     }
 
-    /// What it is doing.
+    /// What the controller is doing.
     pub fn phase(&self) -> Phase {
         self.phase
     }
@@ -261,7 +261,7 @@ impl Core {
         self.phase = if curve.is_some() { Phase::Recording } else { Phase::Pouring };
     }
 
-    /// Ends what is under way, for `reason`, upright. What is already ending keeps its reason.
+    /// Ends what is under way, for `reason`, and brings the container upright. What is already ending keeps its reason.
     fn give_up(&mut self, reason: EndReason) {
         match self.phase {
             Phase::Pouring | Phase::Recording => {

@@ -55,7 +55,7 @@ pub struct Times {
     pub decided_at_ns: u64,
     /// When the kernel had taken the target's bytes; 0: no target was written.
     pub written_at_ns: u64,
-    /// When everything was done but to queue this entry.
+    /// When everything was done except queueing this entry.
     pub done_ns: u64,
 }
 

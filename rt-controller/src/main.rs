@@ -1,4 +1,4 @@
-//! Command line of `rt-controller`.
+//! Command line of `rt-controller`. Runs in the main thread and allocates; a failure ends the process with one line and an exit code.
 
 use std::process::ExitCode;
 

@@ -13,7 +13,7 @@ use shared::config::Config;
 use crate::exchange::Exchange;
 use crate::link::{self, LinkOptions};
 
-/// Pause between two looks whether the loop has given a session back. Chosen by hand; no measurement is recorded.
+/// Pause between two checks for sessions that the loop has given back. Chosen by hand; no measurement is recorded.
 const BEAT: Duration = Duration::from_millis(100);
 /// Pause before the next attempt to reach the robot. Chosen by hand; no measurement is recorded.
 const RECONNECT: Duration = Duration::from_secs(1);
@@ -23,7 +23,7 @@ const RECONNECT: Duration = Duration::from_secs(1);
 pub struct RobotNote(Mutex<String>);
 
 impl RobotNote {
-    /// Sets the note, and says it once.
+    /// Sets the note, and prints it if it is new.
     fn set(&self, text: String, say: &dyn Fn(&str)) {
         let mut note = self.0.lock().unwrap_or_else(PoisonError::into_inner);
         if *note != text {

@@ -2,8 +2,8 @@
 //! longer needs.
 //!
 //! Runs in the process's main thread with ordinary scheduling; allocates, but never waits for a disk, because [`crate::disk`] does so. If
-//! it falls behind, the loop goes on and counts what it could not tell. Nothing here ends the process but a signal, or another
-//! controller in the same cell.
+//! it falls behind, the loop goes on and counts what it could not tell. Only a signal, or another controller in the same cell,
+//! ends the process.
 
 use std::collections::VecDeque;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering::Relaxed};
@@ -25,7 +25,7 @@ use crate::exchange::{Event, Exchange};
 use crate::journal::Tick;
 use crate::robot_thread::RobotNote;
 
-/// Pause between two looks at the queues: far below a person's patience, and cheap.
+/// Pause between two looks at the queues: too short for a person to notice, and cheap.
 const BEAT: Duration = Duration::from_millis(40);
 /// Number of results that are kept for `status`. Chosen by hand; no measurement is recorded.
 const OUTCOMES: usize = 32;
@@ -43,7 +43,7 @@ pub struct Service<'a> {
     telemetry: Publisher<Ipc, Telemetry, ()>,
     /// Why the newest weight file is not used; empty if it is.
     refused: &'a Mutex<String>,
-    /// The way to the journal; `None` where none is kept, and after it could not keep up.
+    /// The queue to the journal; `None` if no journal is kept, or if the disk could not keep up.
     journal: Option<Sender<Box<Tick>>>,
     latest: Option<(Telemetry, Counters)>,
     outcomes: VecDeque<Outcome>,
@@ -112,7 +112,7 @@ impl<'a> Service<'a> {
             match event {
                 Event::Tick(tick, telemetry, counters) => {
                     if self.journal.as_ref().is_some_and(|j| j.try_send(Box::new(tick)).is_err()) {
-                        (self.say)("journal: the disk does not keep up; no more is written, the controller goes on");
+                        (self.say)("journal: the disk does not keep up; nothing more is written to it, and the controller goes on");
                         self.journal = None;
                     }
                     self.latest = Some((telemetry, counters));

@@ -1,6 +1,6 @@
 //! Histograms that the loop always keeps of itself.
 //!
-//! The loop records with two relaxed atomic operations, without allocation or lock; any thread reads. Nothing fails.
+//! The loop records with two relaxed atomic operations, without allocation or lock; any thread may read. Nothing here fails.
 
 use std::sync::atomic::{AtomicU64, Ordering};
 

@@ -114,7 +114,7 @@ impl CellUnderTest {
         self.processes.push((name.into(), child));
     }
 
-    /// What a process printed so far.
+    /// What a process has printed so far.
     pub fn log(&self, name: &str) -> String {
         std::fs::read_to_string(self.dir.path().join(format!("{name}.log"))).unwrap_or_default()
     }
@@ -199,7 +199,7 @@ impl CellUnderTest {
         self.wait("readiness", Duration::from_secs(30), |s| s["phase"] == "idle" && s["feature_sequence"].as_u64() > Some(0))
     }
 
-    /// Writes weights where the controller watches, and waits until the loop took them.
+    /// Writes weights where the controller watches, and waits until the loop has taken them.
     pub fn take_weights(&self, weights: &Weights) {
         let before = self.status().expect("a controller")["weights_taken"].as_u64();
         weights.write(&self.weights()).expect("writable");
@@ -209,7 +209,7 @@ impl CellUnderTest {
 
 impl Drop for CellUnderTest {
     fn drop(&mut self) {
-        // The controller first, while the robot is still there.
+        // The controller is stopped first, while the robot is still there.
         while let Some((name, mut child)) = self.processes.pop() {
             let pid = rustix::process::Pid::from_child(&child);
             let _ = rustix::process::kill_process(pid, rustix::process::Signal::CONT);

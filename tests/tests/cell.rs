@@ -83,7 +83,7 @@ fn a_stalled_disk_does_not_delay_an_abort() {
     cell.json("simulator", &["operator", "fill", "300", "--json"]);
     let pour = cell.begin("rt-controller", &["pour", "200", "--json"]);
     cell.wait("tilt", Duration::from_secs(10), |s| s["alpha_measured_deg"].as_f64() > Some(30.0));
-    // A pipe without a writer: who reads it waits.
+    // This is a pipe without a writer: whoever reads it waits.
     let pipe = cell.weights().with_extension("pipe");
     assert!(std::process::Command::new("mkfifo").arg(&pipe).status().expect("coreutils").success());
     std::fs::rename(&pipe, cell.weights()).expect("same directory");
@@ -128,7 +128,7 @@ fn a_dead_or_hanging_process_ends_upright() {
         cell.wait("features again", Duration::from_secs(10), |s| s["features"].as_u64() > before && s["phase"] == "idle");
     }
 
-    // The controller dies and is started again at once: whoever waits for the pour is told.
+    // The controller dies and is started again at once: the command that waits for the pour reports it.
     cell.json("simulator", &["operator", "fill", "300", "--json"]);
     let mut pour = cell.begin("rt-controller", &["pour", "200", "--json"]);
     cell.wait("tilt", Duration::from_secs(10), tilted);

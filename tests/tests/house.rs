@@ -172,13 +172,13 @@ fn imports(name: &str) -> BTreeMap<String, BTreeSet<String>> {
     graph
 }
 
-/// Protects a reader from circles: of two files one can be read without the other.
+/// Protects a reader from circles: of any two files, one can be read without the other.
 #[test]
 fn no_files_import_each_other_in_a_circle() {
     let mut faults = Vec::new();
     for name in crates() {
         let graph = imports(&name);
-        // What each file reaches; a circle reaches itself.
+        // Which files each file reaches. A file in a circle reaches itself.
         let reach = |from: &String| {
             let mut seen: BTreeSet<&String> = BTreeSet::new();
             let mut open: Vec<&String> = graph[from].iter().collect();
@@ -213,7 +213,7 @@ fn paths_are_read_as_the_compiler_reads_them() {
     assert_eq!(paths(code), ["std::fmt", "super::line::Line", "super::line::fit", "crate::os::now_ns"]);
 }
 
-/// Protects a reader from files that do not fit into a head.
+/// Protects a reader from files that are too long to keep in mind.
 #[test]
 fn files_are_short() {
     let mut faults = Vec::new();
@@ -238,7 +238,7 @@ fn files_are_short() {
     none(&faults);
 }
 
-/// Protects the limit on functions, which clippy holds: exceptions do not become more.
+/// Protects the limit on functions, which clippy holds: the number of exceptions does not grow.
 #[test]
 fn long_functions_do_not_become_more() {
     let exceptions: usize =

@@ -1,5 +1,5 @@
-//! The loop's ticks under an allocator that aborts the process when a tick allocates or frees: the second means, beside the
-//! counter in `status`, and another one's code. The ticks are those of `rt-controller run`, driven here as fast as the robot's
+//! The loop's ticks under an allocator that aborts the process when a tick allocates or frees: this is the second check beside the
+//! counter in `status`, and its code is not this project's. The ticks are those of `rt-controller run`, driven here as fast as the robot's
 //! answers allow; real shared memory, real sockets, the program on the simulated robot.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::too_many_lines)]
 
@@ -109,7 +109,7 @@ fn run(plant: bool) {
     ipc::remove_files(&name);
 }
 
-/// Protects the loop's deadline from the allocator.
+/// Protects the loop's deadline from the allocator: no tick allocates or frees.
 #[test]
 fn no_tick_allocates() {
     if std::env::var_os(PLANT).is_some() {

@@ -1,8 +1,8 @@
 //! The loop's promises over more than 10,000 ticks of the real processes, at 125 Hz instead of 30 so that it takes 90 s: no
 //! allocation, no page fault, no system call that docs/REALTIME.md does not list, weights swapped 100 times a second without
-//! a trace in the pour in progress, and the same inputs giving the same bits again. Each check is shown a violation, too.
+//! a trace in the pour in progress, and the same inputs giving the same bits again. Each check is also shown a violation.
 //!
-//! Needs `strace` (scripts/test installs it) and leave to trace its own children.
+//! Needs `strace` (scripts/test installs it) and permission to trace its own children.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::too_many_lines)]
 
 use std::collections::BTreeSet;
@@ -45,7 +45,7 @@ impl Trace {
         let _ = rustix::process::kill_process(rustix::process::Pid::from_child(&self.0), Signal::INT);
         self.0.wait().expect("it was ours");
         let text = std::fs::read_to_string(self.1.path()).expect("readable");
-        // `<... clock_nanosleep resumed>` and `--- SIGSTOP ---` are no calls.
+        // `<... clock_nanosleep resumed>` and `--- SIGSTOP ---` are not calls.
         let name = |l: &str| {
             l.split_once('(').map(|(name, _)| name.trim().to_owned()).filter(|n| n.chars().all(|c| c.is_alphanumeric() || c == '_'))
         };
@@ -103,7 +103,7 @@ fn pour(cell: &CellUnderTest, goal: &str) -> Value {
     serde_json::from_slice::<Value>(&output.stdout).map_or(Value::Null, |v| v["outcome"]["reason"].clone())
 }
 
-/// Protects the loop's deadline, and whoever replays a journal.
+/// Protects the loop's deadline, and a journal's replay, which gives the same bits.
 #[test]
 fn ten_thousand_ticks_keep_the_promises() {
     let mut cell = CellUnderTest::start(|config| {
@@ -154,7 +154,7 @@ fn ten_thousand_ticks_keep_the_promises() {
     stop.store(true, Relaxed);
     let (written, last) = hammering.join().expect("it ran");
     let calls = trace.calls();
-    // The second means, both the kernel's own books: what it shows of the thread to others.
+    // The second check comes from the kernel: what it shows other processes of the thread.
     let faults = page_faults(pid, loop_thread);
     let found = found_in(pid, loop_thread, 2000);
 

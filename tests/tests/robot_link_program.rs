@@ -40,7 +40,7 @@ struct Robot {
     options: LinkOptions,
     cycle_s: f64,
     sequence: i32,
-    /// Since the upload.
+    /// Time since the upload, s.
     cycles: Vec<Cycle>,
 }
 
@@ -186,7 +186,7 @@ fn it_never_goes_beyond_the_newest_target() {
 }
 
 /// Protects the operator's glass: 100 ms without a target, and the container comes upright at the return rate, the program
-/// ends and says so; the watchdog, which would leave it tilted, does not bite before.
+/// ends and says so; the watchdog, which would leave it tilted, does not act before that.
 #[test]
 fn without_targets_it_comes_upright_and_ends() {
     for series in BOTH {
@@ -220,7 +220,7 @@ fn a_return_is_never_taken_back() {
     assert!(robot.cycles.last().unwrap().actual_deg.abs() < 0.2);
 }
 
-/// Protects the way upright from the backstop: even with the speed slider at a third the program's own way comes first.
+/// Protects the way upright from the watchdog: even with the speed slider at a third the program's own way comes first.
 #[test]
 fn a_slow_slider_does_not_bring_the_watchdog_first() {
     let mut robot = Robot::ready(Series::Cb3);
@@ -233,7 +233,7 @@ fn a_slow_slider_does_not_bring_the_watchdog_first() {
     assert!(robot.cycles.last().unwrap().actual_deg.abs() < 0.2);
 }
 
-/// Protects the arm from whatever comes in: any targets, numbers and modes, not numbers among them, keep every limit.
+/// Protects the arm from whatever comes in: no targets, numbers or modes, NaN included, break a limit.
 #[test]
 fn no_stream_leads_beyond_the_limits() {
     for seed in 0..20 {

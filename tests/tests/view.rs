@@ -57,7 +57,7 @@ impl Drop for View {
     }
 }
 
-/// Protects the pour from people who look on: the page shows the live picture while the worker works, and both see the same frames.
+/// Protects the pour from spectators: the page shows the live picture while the worker works, and both see the same frames.
 /// What the view costs the worker is printed (`--show-output`), in turns without and with it.
 #[test]
 fn the_view_shows_what_the_worker_measures() {

@@ -12,7 +12,7 @@
 //! | the newest usable measurement is too old | `StaleFeature` |
 //! | the largest number of frames is reached | `MaxFrames` |
 //! | nothing flows at the largest tilt | `ContainerEmpty` |
-//! | a stream was seen, and none any more although the container is tilted further | `StreamLost` |
+//! | a stream was seen before, and is no longer seen although the container is tilted further | `StreamLost` |
 //! | [`controller_overran`]: the controller itself was stopped | `ControllerOverrun` |
 //! | [`worker_was_restarted`]: measurements come from another process | `WorkerRestarted` |
 //! | [`Ending::settled`]: the joint did not come upright | `NotUpright` |
@@ -26,7 +26,8 @@ use super::settings::Settings;
 /// After flow was seen, this much of a way back without flow ends the pour, degrees. Chosen by hand; no measurement is recorded.
 const BROUGHT_BACK_DEG: f32 = 10.0;
 /// After flow was seen, this many frames without progress end the pour: three seconds at 30 Hz. The agent then stands still short of
-/// its goal, while what trickles is too little to be seen or flickers about what can be seen. Chosen by hand; no measurement is recorded.
+/// its goal, while the trickle is too small to be seen, or flickers at the edge of what can be seen. Chosen by hand; no measurement is
+/// recorded.
 const STALLED_FRAMES: u32 = 90;
 /// Forward tilt that counts as progress, degrees. Chosen by hand; no measurement is recorded.
 const PROGRESS_DEG: f32 = 1.0;
@@ -34,10 +35,10 @@ const PROGRESS_DEG: f32 = 1.0;
 const PROGRESS_ML: f32 = 0.5;
 /// Less than this still to come over the lip counts as nothing, ml: about one drop of water.
 const NOTHING_ML: f64 = 0.05;
-/// Frames in a row with a stream from which on the tilt of the stream is remembered. None of 10,800 simulated pours ended by mistake with
-/// this and the three constants below; see docs/LEARNING.md.
+/// After this many frames in a row with a stream, the tilt of the stream is remembered. None of 10,800 simulated pours ended by mistake
+/// with this and the three constants below; see docs/LEARNING.md.
 const STREAM_FRAMES: u32 = 5;
-/// Only after this poured volume can a stream be lost, ml: a bead that was taken for a stream is less. See docs/LEARNING.md.
+/// Only after this poured volume can a stream be lost, ml: a bead that is taken for a stream gives less. See docs/LEARNING.md.
 const STREAM_ML: f32 = 1.0;
 /// Frames in a row without a stream after which it may be lost: longer than the pauses of a bottle that gurgles. See docs/LEARNING.md.
 const STREAM_LOST_FRAMES: u32 = 10;
@@ -51,7 +52,7 @@ const LARGEST_TILT_SLACK_DEG: f32 = 0.5;
 const COMMANDED_UPRIGHT_DEG: f32 = 0.01;
 /// Frames without flow after which the last drops are counted: half a second at 30 Hz. Chosen by hand; no measurement is recorded.
 const SETTLE_QUIET_FRAMES: u32 = 15;
-/// Longest wait for the last drops and for the joint to come upright, s. Chosen by hand; no measurement is recorded.
+/// The longest wait for the last drops and for the joint to come upright, s. Chosen by hand; no measurement is recorded.
 const SETTLE_MAX_S: f64 = 3.0;
 
 /// What one frame with a measurement showed during a pour.
@@ -141,7 +142,7 @@ impl Ending {
         self.reason = reason;
     }
 
-    /// The robot may not move any more, for `reason`: a pour that was already ending for another reason than its goal keeps that one.
+    /// The robot may not move any more, for `reason`: a pour that was already ending for another reason than `Done` keeps that one.
     pub fn end_without_robot(&mut self, reason: EndReason) {
         if self.reason == EndReason::Done {
             self.reason = reason;
@@ -169,7 +170,7 @@ impl Ending {
         self.seen_flow && self.brought_back_deg > BROUGHT_BACK_DEG
     }
 
-    /// An agent that gets on neither in tilt nor in volume would stand there for ever.
+    /// An agent that makes progress neither in tilt nor in volume would stand there for ever.
     fn stands_still(&mut self, decision: &Decision) -> bool {
         self.advanced_deg += decision.dalpha_deg;
         if self.advanced_deg >= PROGRESS_DEG || decision.poured_ml - self.advanced_from_ml >= PROGRESS_ML {
@@ -262,7 +263,7 @@ mod tests {
     use shared::mlp::{InputScale, Mlp};
     use shared::weights::{Estimator, Method, Origin, Weights};
 
-    /// A network that pours while d > 0 and stays when d is near 0; made by hand.
+    /// Valid weights whose network has arbitrary parameters, made by hand.
     fn example() -> Weights {
         let mut network = Mlp::ZERO;
         for (k, p) in network.parameters_mut().enumerate() {
@@ -333,7 +334,7 @@ mod tests {
         }
     }
 
-    /// Protects the operator: the reason that came first is the one that is told.
+    /// Protects the operator: the reason that came first is the one that is reported.
     #[test]
     fn the_first_reason_stays() {
         let mut ending = Ending::of_pour();

@@ -7,8 +7,8 @@ use shared::messages::{Doubt, Feature, LAYOUT_VERSION};
 /// Most lost frames that are bridged at once: one second at 30 Hz. A longer gap is older than `controller.stale_feature_ms` allows.
 const MAX_BRIDGED: u64 = 30;
 
-/// Whether a feature has another layout, or comes from the future and so from another clock. Its age, on which so much rests, would
-/// mean nothing.
+/// Whether a feature has another layout, or comes from the future and so from another clock. Its age, on which the
+/// endings depend, would mean nothing.
 pub fn is_foreign(feature: &Feature, now_ns: u64) -> bool {
     feature.version != LAYOUT_VERSION || feature.captured_at_ns > now_ns
 }

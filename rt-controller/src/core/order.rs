@@ -64,7 +64,7 @@ impl std::fmt::Display for Refusal {
             Self::NoFeature => {
                 write!(
                     f,
-                    "no fresh, usable measurement: is `feature-worker run` running, does the camera deliver, what does the worker say?"
+                    "no fresh, usable measurement: is `feature-worker run` running, does the camera deliver, what does the worker print?"
                 )
             }
             Self::NoWeights => write!(f, "no valid weight file is loaded: train one, or see `rt-controller status`"),
@@ -89,7 +89,8 @@ pub struct Situation {
 }
 
 impl Situation {
-    /// Whether a pour or recording may begin now: the robot is well and upright, nothing is under way, and the camera sees.
+    /// Whether a pour or recording may begin now: the robot may move and is upright, nothing is under way, and there is a fresh, usable
+    /// measurement.
     pub fn may_begin(&self, settings: &Settings) -> Result<(), Refusal> {
         if self.shutdown {
             return Err(Refusal::Shutdown);

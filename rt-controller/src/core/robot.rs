@@ -1,4 +1,5 @@
 //! The robot as the core sees it: plain data, made by the loop from the robot's newest state, and kept in the journal.
+//! It is copied in the loop without allocation, and nothing here fails.
 
 use serde::{Deserialize, Serialize};
 use shared::control::EndReason;

@@ -1,6 +1,7 @@
 //! The part of the cell's configuration that decisions depend on.
 //!
-//! Read once at start; then plain data that the loop copies. The journal holds it, so that a replay decides under the same settings.
+//! It is read once at the start, in an ordinary thread; then it is plain data that the loop copies. Nothing here fails. The journal holds
+//! it, so that a replay decides under the same settings.
 
 use serde::{Deserialize, Serialize};
 use shared::config::Config;
@@ -20,13 +21,14 @@ pub struct Settings {
     /// Largest number of frames of a pour.
     pub max_frames: u32,
     /// Number of frames without flow at the largest tilt after which the container counts as empty. A container that has poured
-    /// is found out before, by the rule of the lost stream.
+    /// is noticed earlier, by the rule of the lost stream.
     pub empty_frames: u32,
     /// Largest goal, ml.
     pub goal_max_ml: f32,
     /// Largest distance of the measured alpha from 0 that counts as upright, degrees.
     pub upright_deg: f32,
-    /// After this long without a target the robot's program goes upright by itself, ns; then the controller does so too.
+    /// After this long without a target the robot's program goes upright by itself, ns; the controller
+    /// then does so too.
     pub patience_ns: u64,
 }
 

@@ -1,4 +1,4 @@
-//! Where the robot is connected: protocol, versions, recipes and the program's upload, until a [`Session`] is ready for the loop.
+//! Connects the robot: it settles protocol, versions and recipes, and uploads the program, until a [`Session`] is ready for the loop.
 //!
 //! Runs on an ordinary thread; blocks for a few seconds at most, allocates. Every failure is a [`LinkError`] whose one line says what to
 //! do; the caller shows it and tries again later. A running program is never replaced, because it may be ours and bringing the
@@ -42,7 +42,7 @@ pub fn connect(options: &LinkOptions) -> Result<Session, LinkError> {
     }
     let version = dialogue.ask(wire::CONTROLLER_VERSION, &[], "the controller's version", wire::controller_version)?;
     let [major, minor, ..] = version;
-    // A later generation than those known here has what these have.
+    // Generations later than these are taken to have the registers too.
     if UPPER_REGISTERS.iter().any(|&(m, n)| major == m && minor < n) || major < 3 {
         return Err(LinkError::TooOld { address, major, minor });
     }
@@ -86,7 +86,7 @@ pub fn connect(options: &LinkOptions) -> Result<Session, LinkError> {
         .map_err(|e| LinkError::Lost { at, doing: "handing over", what: e.to_string() })
 }
 
-/// Whether the robot is well, idle and upright, so that the program may be uploaded.
+/// Whether the robot may move, runs no program and is upright, so that the program may be uploaded.
 fn ready_for_program(options: &LinkOptions, state: &RobotState) -> Result<(), LinkError> {
     let address = options.address;
     if let Some(reason) = health::hindrance(state) {

@@ -1,6 +1,6 @@
 //! Why there is no session with the robot: one line for the operator that says what to do.
 //!
-//! Made on the connecting thread; allocates.
+//! The errors are made on the connecting thread, and allocate.
 
 use std::net::{IpAddr, SocketAddr};
 use std::time::Duration;

@@ -1,4 +1,4 @@
-//! The robot link: targets for the tilting joint to a UR controller, its state back, over RTDE (TCP 30004).
+//! The robot link: it sends targets for the tilting joint to a UR controller and receives the robot's state, over RTDE (TCP 30004).
 //!
 //! | part | thread | allocates |
 //! |---|---|---|
@@ -21,7 +21,7 @@
 //! | `input_double_register_b` | target angle of the tilting joint, rad |
 //! | `output_int_register_b` | what the program is doing, a [`ProgramState`] code |
 //! | `output_int_register_b+1` | number of the newest target that the program has read |
-//! | `output_int_register_b+2` | the run number that this upload was given: tells a fresh program from an old one's leavings |
+//! | `output_int_register_b+2` | the run number that this upload was given: tells a fresh program from what an old one left behind |
 //! | `output_double_register_b` | angle that the program commands to servoj, rad |
 
 pub mod connect;

@@ -26,8 +26,8 @@ pub fn text(options: &LinkOptions, cycle_s: f64, run: i32) -> Result<String, Lin
     let rad = |deg: f32| f64::from(deg).to_radians();
     let return_rate = rad(limits.return_rate_deg_s.min(limits.rate_deg_s));
     let patience_s = patience_s(options.rate_hz);
-    // The watchdog must wait until the program's own way upright is done, also at a quarter of the speed: four times patience, way and
-    // settling.
+    // The watchdog must wait until the program's own way upright is done, even at a quarter of the speed: four times the sum of
+    // patience, way and settling.
     let way_s = patience_s + (rad(limits.alpha_max_deg - limits.alpha_min_deg)) / return_rate + length * cycle_s + 0.3;
     let watchdog_hz = 1.0 / (1.0 + 4.0 * way_s);
 

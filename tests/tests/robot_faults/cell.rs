@@ -136,7 +136,7 @@ impl Cell {
         }
     }
 
-    /// Until the controller would pour.
+    /// Waits until the controller would accept a pour.
     fn ready(&mut self) {
         if self.client.is_none() {
             self.client = Some(Client::connect(&self.name).unwrap());
@@ -295,7 +295,7 @@ impl Cell {
         stream.write_all(format!("def jog():\n  movej({q:?}, 2.0, 1.0)\nend\n").as_bytes()).unwrap();
         self.until("jogged upright", |c| (c.alpha().0.abs() < 0.2 && c.alpha().1.abs() < 0.1).then_some(()));
         self.until("the jog's end", |c| (c.robot.state()?.runtime_state == RuntimeState::Stopped).then_some(()));
-        // What the jog commanded is not ours.
+        // What the jog commanded is not the program's motion.
         self.robot.start_trace(24);
     }
 }
@@ -317,7 +317,7 @@ impl Drop for Cell {
 const HEAD: &str = "| fault | robot | moment | reason | poured ml | alpha at fault | largest alpha | at rest s | upright s | \
 largest rate deg/s | largest acceleration deg/s^2 | next pour of 8 ml |\n|---|---|---|---|---|---|---|---|---|---|---|---|";
 
-/// Starts the controller of the cell in `directory`, which says what it has to say to a file there.
+/// Starts the controller of the cell in `directory`, which writes its messages to a file there.
 pub fn start_controller(directory: &Path) -> Child {
     let path = tests::program("rt-controller");
     let log = std::fs::OpenOptions::new().create(true).append(true).open(directory.join("log")).unwrap();
@@ -325,7 +325,7 @@ pub fn start_controller(directory: &Path) -> Child {
     Command::new(path).arg("run").arg("--config").arg(config).stdin(Stdio::null()).stdout(Stdio::null()).stderr(log).spawn().unwrap()
 }
 
-/// A policy by hand: 2.45 degrees a frame until liquid flows well, then stay.
+/// Weights made by hand: 2.45 degrees a frame until liquid flows well, then stay.
 fn tilt_until_it_flows() -> Weights {
     let mut network = Mlp::ZERO;
     network.w1[0][0] = 1.0;
