@@ -2,7 +2,7 @@
 //!
 //! You learn from it what [`Core::step`] needs in each tick, which is the time, the newest measurements and the robot's state, and what
 //! it answers, which is the angle to command and the result of a pour that has ended. The simulator below is a cylinder that leaks the
-//! faster the further it is tilted, a robot that follows at once, and a camera that sees a stream's area. Replace it by your own.
+//! faster the further it is tilted, a robot that follows at once, and a camera that sees a stream's area. Replace it with your own.
 //!
 //! Run it with `cargo run --release -p rt-controller --example drive_core`.
 
@@ -94,7 +94,7 @@ pub fn pour(goal_ml: f32) -> (Outcome, f32) {
     let mut cylinder = Cylinder { now_ns: 1_000_000_000, frame: 0, alpha_deg: 0.0, poured_ml: 0.0 };
     loop {
         let feature = cylinder.step();
-        // The first tick finds the robot well and upright; then the goal can be set.
+        // The first tick finds a robot that may move and is upright; then the goal can be set.
         let order = (cylinder.frame == 2).then_some(Order::Pour { episode: 1, goal_ml });
         let robot = Robot { hindrance: None, alpha_deg: cylinder.alpha_deg, at_ns: cylinder.now_ns };
         let output = core.step(&Input { now_ns: cylinder.now_ns, features: &[feature], robot, order });

@@ -7,7 +7,7 @@ mod drive_core;
 
 use shared::control::EndReason;
 
-/// Protects who drives the core from a simulator: the example pours its goal, and counts what has really left.
+/// Protects whoever drives the core from a simulator: the example pours its goal, and counts what has really left.
 #[test]
 fn drive_core_pours_its_goal() {
     let (outcome, poured_ml) = drive_core::pour(30.0);

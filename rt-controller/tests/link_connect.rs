@@ -18,7 +18,7 @@ use shared::os::now_ns;
 
 const OUTPUT_TYPES: &str = "DOUBLE,VECTOR6D,VECTOR6D,VECTOR6D,INT32,INT32,UINT32,UINT32,INT32,INT32,INT32,DOUBLE,DOUBLE";
 
-/// What the server says; the defaults are a robot that is well.
+/// What the server says; the defaults describe a robot that may move.
 #[derive(Clone)]
 struct Robot {
     version_accepted: u8,
@@ -39,7 +39,7 @@ struct Robot {
     runtime_state: u32,
     joint_rad: f64,
     speed_fraction: f64,
-    /// What the program does once it was uploaded.
+    /// What the program does once it has been uploaded.
     program: ProgramState,
     /// Whether an uploaded program starts.
     starts: bool,
@@ -288,7 +288,7 @@ fn every_refusal_says_what_to_do() {
     }
 }
 
-/// Protects the operator from a wrong address: nobody there is an error that names address and port.
+/// Protects the operator from a wrong address: if nobody answers, the error names address and port.
 #[test]
 fn nobody_there_is_named() {
     let options = Server::new(6, Robot::default()).options;
@@ -314,7 +314,8 @@ fn poll_until(session: &mut Session, mut done: impl FnMut(&Result<(), Lost>, &Se
     panic!("nothing came");
 }
 
-/// Protects the tick: of everything that arrived, in whatever pieces, the newest state counts; nothing arrived leaves it.
+/// Protects the tick: of everything that arrived, in whatever pieces, the newest state counts; if nothing arrived, the
+/// state stays as it was.
 #[test]
 fn the_newest_state_counts() {
     let (mut session, mut seen, robot) = connected(7);
@@ -390,7 +391,7 @@ fn a_dropped_session_asks_the_program_to_stop() {
     assert_eq!(received[20..32], [0, 20, b'U', 2, 0, 0, 0, 2, 0, 0, 0, 3]);
 }
 
-/// Protects the loop from a robot that is gone: FIN, RST and a torn protocol end the session, each by its name.
+/// Protects the loop from a robot that is gone: FIN, RST and a broken protocol end the session, each with its own reason.
 #[test]
 fn a_lost_robot_ends_the_session() {
     let (mut session, seen, _) = connected(10);
@@ -471,7 +472,7 @@ fn polling_does_not_wait() {
     later.join().unwrap();
 }
 
-/// Protects the names in results: a safety stop during the upload is that stop, not a program that did not start.
+/// Protects the reasons in results: a safety stop during the upload is reported as that stop, and not as a program that did not start.
 #[test]
 fn a_stop_during_the_upload_is_named() {
     let server = Server::new(16, Robot::default());

@@ -158,7 +158,7 @@ fn well() -> RobotState {
     }
 }
 
-/// Protects the arm: each way of not being well is noticed, and named as what it is even when several hold at once.
+/// Protects the arm: each reason why the robot may not move is noticed and named, even when several hold at once.
 #[test]
 fn every_hindrance_has_its_reason() {
     use EndReason::*;
@@ -200,7 +200,7 @@ fn every_hindrance_has_its_reason() {
         |s| s.received_at_ns = NOW - LOST,
         |s| s.advanced_at_ns = NOW - LOST,
         |s| s.answered_at_ns = NOW + 5,
-        // The clock stood still between a target and its answer: not the program's fault, and soon the clock's own reason.
+        // The clock stood still between a target and its answer: that is not the program's fault, and soon the clock gives a reason itself.
         |s| (s.advanced_at_ns, s.answered_at_ns) = (NOW - LOST / 2, NOW - LOST - 1),
     ];
     for change in at_the_limit {
@@ -263,7 +263,7 @@ fn the_program_is_filled_in() {
     assert!(text.starts_with("def ") && text.ends_with("\nend\n") && text.is_ascii(), "a program for the script port");
 }
 
-/// Protects the way upright: the watchdog on the robot bites only long after the program's own way would have ended.
+/// Protects the way upright: the watchdog on the robot acts only long after the program's own way would have ended.
 #[test]
 fn the_watchdog_leaves_time_for_the_way_upright() {
     let limits = Limits { return_rate_deg_s: 10.0, ..Limits::default() };

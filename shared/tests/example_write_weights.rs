@@ -8,7 +8,7 @@ mod write_weights;
 use shared::actions::STAY;
 use shared::agent::{Agent, Observation};
 
-/// Protects who writes weights by hand: the file reads back the same, and an agent tilts by the action that was written.
+/// Protects whoever writes weights by hand: the file reads back the same, and an agent tilts by the action that was written.
 #[test]
 fn written_weights_tilt_by_their_action() {
     let directory = tempfile::tempdir().unwrap();

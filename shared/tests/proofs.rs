@@ -9,7 +9,7 @@ use shared::os;
 #[global_allocator]
 static ALLOCATOR: os::CountingAllocator = os::CountingAllocator;
 
-/// Protects `loop_allocations`: every allocation and free of this thread is counted, those of others are not.
+/// Protects `loop_allocations`: every allocation and free of this thread is counted, and those of other threads are not.
 #[test]
 fn allocations_of_this_thread_are_counted() {
     let before = os::allocations();
@@ -69,7 +69,7 @@ fn instructions(form: &str) -> f64 {
     (count(11_000) - count(1_000)) / 10_000.0
 }
 
-/// Makes calls when asked to by [`instructions`]; otherwise nothing.
+/// Calls the forward pass when [`instructions`] asks for it; otherwise does nothing.
 #[test]
 fn calls_for_callgrind() {
     let Some(calls) = std::env::var(CALLS).ok().and_then(|n| n.parse::<u32>().ok()) else { return };

@@ -40,7 +40,7 @@ struct Robot {
     options: LinkOptions,
     cycle_s: f64,
     sequence: i32,
-    /// Time since the upload, s.
+    /// The control cycles since the upload.
     cycles: Vec<Cycle>,
 }
 

@@ -74,7 +74,7 @@ fn a_program_on_its_way_upright_is_left_alone() {
     let (robot, options) = cell(3, Series::Cb3);
     let mut session = connect(&options).unwrap();
     tilt_to(&mut session, &mut limiter(), 50.0);
-    // As a killed process leaves it: nothing more is sent, the socket is closed.
+    // This is how a killed process leaves it: nothing more is sent, and the socket is closed.
     robot.inject(Fault::Fin);
     assert_eq!(connect(&options).unwrap_err(), LinkError::ProgramRunning { address: options.address });
     let session = loop {

@@ -254,7 +254,8 @@ def fault_fin_to_control():
         c = robot.control()
         until("the program started", lambda: robot.started() == 1)
         robot.fault("fin")
-        # By itself, as logged. What it does then is its own affair: it may reconnect over and over, and often crashes.
+        # The client does this by itself, as its log shows. What it then does is its own affair: it may
+        # reconnect over and over, and often crashes.
         until("reconnected and the program sent again", lambda: robot.started() == 2, 20)
 
 

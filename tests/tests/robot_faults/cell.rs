@@ -158,7 +158,7 @@ impl Cell {
         self.until("an outcome", |c| c.client.as_ref()?.status().ok()?.outcomes.into_iter().find(|o| o.episode == episode))
     }
 
-    /// Alpha and its rate: degrees, degrees/s.
+    /// Alpha, degrees, and its rate, degrees/s.
     fn alpha(&self) -> (f64, f64) {
         let joints = self.robot.joints();
         (joints.actual_q[5].to_degrees(), joints.actual_qd[5].to_degrees())

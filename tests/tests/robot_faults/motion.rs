@@ -1,4 +1,4 @@
-//! What the robot's trace says of a motion: how far, how fast, how hard, and when it was at rest and upright.
+//! What the robot's trace says about a motion: how far, how fast, how hard, and when it was at rest and upright.
 
 use simulator::ur::{Series, TraceRow};
 
@@ -10,13 +10,13 @@ pub struct Motion {
     pub rest_s: f64,
     /// When it was upright and stayed so.
     pub upright_s: Option<f64>,
-    /// Of the angles given to servoj, by the time of the program's cycles.
+    /// Taken from the angles given to servoj, by the time of the program's cycles.
     pub fastest_deg_s: f64,
     pub hardest_deg_s2: f64,
 }
 
 impl Motion {
-    /// From a trace of the robot's cycles.
+    /// The motion that a trace of the robot's cycles shows.
     pub fn of(trace: &[TraceRow], series: Series) -> Self {
         let alpha = |r: &TraceRow| r.actual_q[5].to_degrees();
         let rate = |r: &TraceRow| r.actual_qd[5].to_degrees();
