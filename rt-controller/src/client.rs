@@ -101,7 +101,7 @@ impl Client {
 /// Why a pour could not be followed to its end.
 #[derive(Debug, thiserror::Error)]
 pub enum FollowError {
-    /// The person pressed Ctrl-C; this is how the pour ended then.
+    /// Somebody pressed Ctrl-C; this is how the pour then ended.
     #[error("interrupted: {}", .0.reason.words())]
     Interrupted(Outcome),
     /// The controller is no longer there.
@@ -112,7 +112,7 @@ pub enum FollowError {
 impl Client {
     /// Shows the progress of `episode` on standard error until it has ended. Ctrl-C aborts it.
     pub fn follow(&self, episode: u64) -> Result<Outcome, FollowError> {
-        // If that fails, Ctrl-C ends this command and the pour goes on.
+        // If this fails, Ctrl-C ends this command and the pour goes on.
         let interrupted = os::stop_at_signals().unwrap_or_default();
         let bar = indicatif::ProgressBar::new(1000);
         bar.set_style(ProgressStyle::with_template("{bar:30} {msg}").unwrap_or_else(|_| ProgressStyle::default_bar()));

@@ -262,7 +262,7 @@ impl Core {
         self.phase = if curve.is_some() { Phase::Recording } else { Phase::Pouring };
     }
 
-    /// Ends what is under way, for `reason`, upright. What is already ending keeps its reason.
+    /// Ends what is under way, for `reason`, and brings the container upright. What is already ending keeps its reason.
     fn give_up(&mut self, reason: EndReason) {
         match self.phase {
             Phase::Pouring | Phase::Recording => {

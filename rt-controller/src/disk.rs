@@ -1,4 +1,4 @@
-//! The controller's work with files: writes the journal, watches the weight file.
+//! The controller's work with files: it writes the journal and watches the weight file.
 //!
 //! It runs in a thread of its own with ordinary scheduling, allocates, and blocks for as long as the disk does. Clients, and an abort among
 //! their requests, are answered by another thread ([`crate::service`]). Nothing here ends the controller: a journal that cannot be written
@@ -83,7 +83,7 @@ impl<'a> Disk<'a> {
     /// Writes to the journal. The first error ends the journal, not the controller.
     fn write(&mut self, what: impl FnOnce(&mut Writer) -> std::io::Result<()>) {
         if let Some(Err(e)) = self.journal.as_mut().map(what) {
-            (self.say)(&format!("journal: {e}; no more is written, the controller goes on"));
+            (self.say)(&format!("journal: {e}; nothing more is written to it, and the controller goes on"));
             self.journal = None;
         }
     }

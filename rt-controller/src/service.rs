@@ -43,7 +43,7 @@ pub struct Service<'a> {
     telemetry: Publisher<Ipc, Telemetry, ()>,
     /// Why the newest weight file is not used; empty if it is.
     refused: &'a Mutex<String>,
-    /// The way to the journal; `None` where none is kept, and after it could not keep up.
+    /// The queue to the journal; `None` if no journal is kept, or if the disk could not keep up.
     journal: Option<Sender<Box<Tick>>>,
     latest: Option<(Telemetry, Counters)>,
     outcomes: VecDeque<Outcome>,
@@ -112,7 +112,7 @@ impl<'a> Service<'a> {
             match event {
                 Event::Tick(tick, telemetry, counters) => {
                     if self.journal.as_ref().is_some_and(|j| j.try_send(Box::new(tick)).is_err()) {
-                        (self.say)("journal: the disk does not keep up; no more is written, the controller goes on");
+                        (self.say)("journal: the disk does not keep up; nothing more is written to it, and the controller goes on");
                         self.journal = None;
                     }
                     self.latest = Some((telemetry, counters));

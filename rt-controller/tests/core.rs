@@ -130,7 +130,7 @@ impl ToyCell {
         self.tick(Some(Order::Pour { episode: 5, goal_ml })).ordered.expect("an order is answered in its tick")
     }
 
-    /// Ticks until the pour has ended.
+    /// Runs ticks until the pour has ended.
     fn finish(&mut self) -> Outcome {
         for _ in 0..2000 {
             if let Some(outcome) = self.tick(None).ended {
@@ -171,7 +171,7 @@ fn a_pour_ends_upright_with_its_volume() {
     cell.pour(3.0).expect("the next pour starts");
 }
 
-/// Protects the agent's action where the loop is faster than the camera: an action takes several ticks under the limits, and no more.
+/// Protects the agent's action when the loop is faster than the camera: an action takes several ticks under the limits, and no more.
 #[test]
 fn an_action_is_finished_between_frames() {
     let mut cell = ToyCell::new();
@@ -301,7 +301,7 @@ fn lost_and_doubtful_frames_are_bridged() {
     assert!((outcome.poured_ml - cell.out_ml).abs() < 0.5, "reported {}, really {}", outcome.poured_ml, cell.out_ml);
 }
 
-/// Protects people: a joint that stays tilted although nothing hinders it is not called upright.
+/// Protects people: a joint that stays tilted although nothing hinders it is not reported as upright.
 #[test]
 fn a_joint_that_stays_tilted_is_reported() {
     let mut cell = ToyCell::new();

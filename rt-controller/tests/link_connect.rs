@@ -39,7 +39,7 @@ struct Robot {
     runtime_state: u32,
     joint_rad: f64,
     speed_fraction: f64,
-    /// What the program does once it was uploaded.
+    /// What the program does once it has been uploaded.
     program: ProgramState,
     /// Whether an uploaded program starts.
     starts: bool,

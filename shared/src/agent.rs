@@ -174,7 +174,7 @@ impl Agent {
         }
     }
 
-    /// Takes the frame into the sum and, if there is one, into the filter.
+    /// Adds the frame to the sum and gives it to the fused estimate, if there is one.
     fn observe(&mut self, observation: Observation) -> VolumeEstimate {
         let calibration = self.weights.calibration;
         let area_px2 = self.hold.step(observation.area_px2, calibration.hold_above_px2);
@@ -253,7 +253,8 @@ mod tests {
         }
     }
 
-    /// Protects eq. (2) and (4): d starts at the goal, falls by each frame's volume, goes below 0, and turns the agent back.
+    /// Protects eq. (2) and (4): d starts at the goal, falls by each frame's volume, goes below 0, and makes the agent tilt
+    /// back.
     #[test]
     fn d_counts_down_and_turns_the_agent_back() {
         let weights = example();
@@ -293,7 +294,7 @@ mod tests {
         for b in &mut weights.network.b3 {
             *b = -100.0;
         }
-        // Half "stay", half the finest action: 0.025 degrees a frame on average, which no action is.
+        // Half "stay", half the finest action: 0.025 degrees a frame on average, which no single action gives.
         (weights.network.b3[10], weights.network.b3[11]) = (0.0, 0.0);
         let mut agent = Agent::new(&weights);
         agent.start(50.0);

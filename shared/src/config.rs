@@ -13,7 +13,7 @@ use crate::limits::Limits;
 /// The file that is read without `--config`: the simulated cell, so that a real robot only moves when its file is named.
 pub const DEFAULT_FILE: &str = "config/sim.toml";
 
-/// What a cell's name may be, in words: it becomes part of file names.
+/// The rule for a cell's name, in words; the name becomes part of file names.
 pub(crate) const CELL_NAME_RULE: &str = "1 to 32 letters, digits, '-' or '_'";
 
 /// Whether `name` keeps [`CELL_NAME_RULE`].
@@ -42,7 +42,7 @@ pub enum ConfigError {
         what: String,
     },
     /// A value is outside its range.
-    #[error("{file}: {key} = {value}: allowed is {allowed}")]
+    #[error("{file}: {key} = {value}: it must be {allowed}")]
     Range {
         /// The file.
         file: String,
@@ -408,7 +408,7 @@ mod tests {
         assert!(Config::parse(CELL, "cell.toml").expect("valid").simulator.is_none());
     }
 
-    /// Protects the operator from typing errors: each refusal names file, key and what is allowed.
+    /// Protects the operator from typing errors: each refusal names the file, the key and what is allowed.
     #[test]
     fn mistakes_are_refused_with_file_key_and_range() {
         for (from, to, words) in [
@@ -433,7 +433,7 @@ mod tests {
         }
     }
 
-    /// Protects V_e: axes without a crossing give no triangle.
+    /// Protects V_e: axes that do not cross give no triangle, so they are refused.
     #[test]
     fn parallel_axes_are_refused() {
         let x_axis = CELL.lines().find_map(|l| l.strip_prefix("x_axis_px = ")).expect("there");

@@ -10,7 +10,7 @@ pub const FAILED: u8 = 1;
 pub const BAD_INPUT: u8 = 2;
 /// Another part of the cell (controller, worker, robot, camera, simulator) cannot be reached.
 pub const UNREACHABLE: u8 = 3;
-/// The pour or recording ended for another reason than its goal.
+/// The pour or recording ended before it was done.
 pub const ENDED_EARLY: u8 = 4;
 /// The controller refused the request in its present state.
 pub const REFUSED: u8 = 5;

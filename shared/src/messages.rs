@@ -54,7 +54,7 @@ pub struct FrameHeader {
     pub sequence: u64,
     /// Middle of the exposure, CLOCK_MONOTONIC ns.
     pub captured_at_ns: u64,
-    /// When it was published, CLOCK_MONOTONIC ns.
+    /// When the frame was published, CLOCK_MONOTONIC ns.
     pub published_at_ns: u64,
 }
 
@@ -167,7 +167,8 @@ impl Phase {
     }
 }
 
-/// What one tick of the controller saw, decided and sent (service `telemetry`); all of it that an episode records.
+/// What one tick of the controller saw, decided and sent (service `telemetry`). It holds everything that an
+/// episode records of a tick.
 #[derive(Debug, Clone, Copy, PartialEq, Default, ZeroCopySend)]
 #[repr(C)]
 pub struct Telemetry {
@@ -203,11 +204,11 @@ pub struct Telemetry {
     pub goal_ml: f32,
     /// Estimated volume poured so far, ml.
     pub poured_ml: f32,
-    /// Recording only, eq. (1): lambda, degrees.
+    /// lambda of eq. (1), degrees; NaN unless a curve is recorded.
     pub lambda_deg: f32,
-    /// Recording only, eq. (1): gamma, 1/s^2.
+    /// gamma of eq. (1), 1/s^2; NaN unless a curve is recorded.
     pub gamma_per_s2: f32,
-    /// Recording only, eq. (1): beta, s.
+    /// beta of eq. (1), s; NaN unless a curve is recorded.
     pub beta_s: f32,
     /// Reserved, 0.
     pub reserved: f32,

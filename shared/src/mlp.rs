@@ -204,7 +204,7 @@ pub fn softmax(logits: &[f32; ACTIONS]) -> [f32; ACTIONS] {
 mod tests {
     use super::*;
 
-    /// Protects the paper's shape: two hidden layers, about 2000 parameters, 1909 to the letter.
+    /// Protects the paper's shape: two hidden layers and about 2000 parameters, here exactly 1909.
     #[test]
     fn the_network_has_1909_parameters() {
         assert_eq!(PARAMETERS, 1909);
@@ -237,8 +237,8 @@ mod tests {
         }
     }
 
-    /// Protects the action from the processor it is chosen on: for random networks and inputs the form chosen at run time and
-    /// the portable one agree to the last bits, and in the action unless two logits are that close.
+    /// Protects the action from the processor it is chosen on: for random networks and inputs, the form chosen at run time and
+    /// the portable one agree except in their last bits, and choose the same action unless two logits are that close.
     #[test]
     fn both_forms_give_the_same_action() {
         use rand::{RngExt, SeedableRng};

@@ -22,7 +22,7 @@ pub fn sleep_until_ns(deadline_ns: u64) {
 
 /// Pins the calling thread to `core` and, if `priority` > 0, schedules it SCHED_FIFO with that priority (1 to 99).
 ///
-/// Gives one line for each thing that was not permitted; the thread works on without it.
+/// Gives one line for each thing that was not permitted; the thread carries on without it.
 pub fn become_realtime(core: usize, priority: u8) -> Vec<String> {
     let mut missing = Vec::new();
     if !core_affinity::set_for_current(core_affinity::CoreId { id: core }) {
@@ -76,7 +76,7 @@ pub fn stay_awake() -> Result<Option<std::fs::File>, String> {
 
 /// Lets the process end quietly when nobody reads its output any more, as in `rt-controller status | head`. For commands that only print.
 pub fn end_when_nobody_reads() {
-    // SAFETY: the default action of a signal is no function of ours, so there is nothing that could be called unsafely.
+    // SAFETY: the default action of a signal is not a function of this program, so no code of ours runs in a signal handler.
     unsafe { libc::signal(libc::SIGPIPE, libc::SIG_DFL) };
 }
 

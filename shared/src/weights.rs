@@ -113,12 +113,12 @@ impl Estimator {
             ("sd of the delay", noise.extra_delay_sd_frames, 1e-4, 20.0),
             ("sd of a frame's volume (log)", noise.log_frame_volume_sd, 1e-4, 5.0),
             ("smallest outflow", noise.least_visible_ml, 0.0, 10.0),
-            ("rate back", back.rate_deg, 0.1, 10.0),
-            ("change of the rate back", back.change_deg, 0.01, 100.0),
+            ("rate of the way back", back.rate_deg, 0.1, 10.0),
+            ("change of that rate in a frame", back.change_deg, 0.01, 100.0),
         ];
         for (name, value, low, high) in ranges.into_iter().chain(log_shape.map(|s| ("shape of the vessel (log)", s, -10.0, 10.0))) {
             if !(low..=high).contains(&value) {
-                return Err(format!("estimator: {name} is {value}, allowed is {low} to {high}"));
+                return Err(format!("estimator: {name} is {value}, but must be {low} to {high}"));
             }
         }
         Ok(())
@@ -355,7 +355,7 @@ pub(crate) mod tests {
     use crate::actions::action_table;
     use proptest::prelude::*;
 
-    /// A network that pours while d > 0 and stays when d is near 0; made by hand.
+    /// Valid weights whose network has arbitrary parameters, made by hand.
     pub(crate) fn example() -> Weights {
         let mut network = Mlp::ZERO;
         for (k, p) in network.parameters_mut().enumerate() {
@@ -397,7 +397,7 @@ pub(crate) mod tests {
         assert_eq!(std::fs::read_dir(dir.path()).unwrap().count(), 1);
     }
 
-    /// Protects the robot: a file cut at any byte is refused, and never panics.
+    /// Protects the robot: a file that is cut at any byte is refused, and reading it never panics.
     #[test]
     fn every_truncation_is_refused() {
         let bytes = example().to_bytes().unwrap();

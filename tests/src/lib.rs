@@ -200,7 +200,7 @@ impl CellUnderTest {
         self.wait("readiness", Duration::from_secs(30), |s| s["phase"] == "idle" && s["feature_sequence"].as_u64() > Some(0))
     }
 
-    /// Writes weights where the controller watches, and waits until the loop took them.
+    /// Writes weights where the controller watches, and waits until the loop has taken them.
     pub fn take_weights(&self, weights: &Weights) {
         let before = self.status().expect("a controller")["weights_taken"].as_u64();
         weights.write(&self.weights()).expect("writable");

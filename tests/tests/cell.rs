@@ -128,7 +128,7 @@ fn a_dead_or_hanging_process_ends_upright() {
         cell.wait("features again", Duration::from_secs(10), |s| s["features"].as_u64() > before && s["phase"] == "idle");
     }
 
-    // The controller dies and is started again at once: whoever waits for the pour is told.
+    // The controller dies and is started again at once: the command that waits for the pour reports it.
     cell.json("simulator", &["operator", "fill", "300", "--json"]);
     let mut pour = cell.begin("rt-controller", &["pour", "200", "--json"]);
     cell.wait("tilt", Duration::from_secs(10), tilted);

@@ -172,7 +172,7 @@ fn imports(name: &str) -> BTreeMap<String, BTreeSet<String>> {
     graph
 }
 
-/// Protects a reader from circles: of two files one can be read without the other.
+/// Protects a reader from circles: of any two files, one can be read without the other.
 #[test]
 fn no_files_import_each_other_in_a_circle() {
     let mut faults = Vec::new();

@@ -110,7 +110,7 @@ fn run(plant: bool) {
     ipc::remove_files(&name);
 }
 
-/// Protects the loop's deadline from the allocator.
+/// Protects the loop's deadline from the allocator: no tick allocates or frees.
 #[test]
 fn no_tick_allocates() {
     if std::env::var_os(PLANT).is_some() {

@@ -45,7 +45,7 @@ impl Trace {
         let _ = rustix::process::kill_process(rustix::process::Pid::from_child(&self.0), Signal::INT);
         self.0.wait().expect("it was ours");
         let text = std::fs::read_to_string(self.1.path()).expect("readable");
-        // `<... clock_nanosleep resumed>` and `--- SIGSTOP ---` are no calls.
+        // `<... clock_nanosleep resumed>` and `--- SIGSTOP ---` are not calls.
         let name = |l: &str| {
             l.split_once('(').map(|(name, _)| name.trim().to_owned()).filter(|n| n.chars().all(|c| c.is_alphanumeric() || c == '_'))
         };

@@ -27,7 +27,7 @@ pub fn run(args: &Args) -> Result<(), Failure> {
     ended(&outcome)
 }
 
-/// Fails unless the pour or recording came to its own end.
+/// Fails unless the pour or recording ended with `Done`.
 pub(crate) fn ended(outcome: &Outcome) -> Result<(), Failure> {
     match outcome.reason {
         EndReason::Done => Ok(()),

@@ -20,8 +20,8 @@ const END_DEG: f32 = 0.05;
 #[derive(Debug, clap::Args)]
 #[command(
     after_help = "Examples:\n  rt-controller record --lambda 70 --gamma 0.3\n  rt-controller record --lambda 60 --gamma 0.5 --weight 83\n\n\
-The curve is alpha(t) = lambda exp(-gamma (t - beta)^2), from t = 0 to 2 beta. Afterwards the weight on the scale is asked for, if a\n\
-person is there; it can also be given later with `feature-worker episodes weigh FILE --weight G`."
+The curve is alpha(t) = lambda exp(-gamma (t - beta)^2), from t = 0 to 2 beta. Afterwards the command asks for the weight\n\
+on the scale, if a person is at the terminal; it can also be given later with `feature-worker episodes weigh FILE --weight G`."
 )]
 pub struct Args {
     /// Height of the curve, degrees.
@@ -30,7 +30,7 @@ pub struct Args {
     /// How narrow the curve is, 1/s^2.
     #[arg(long)]
     gamma: f32,
-    /// Time of the curve's top, s; by default such that the curve starts at 0.05 degrees.
+    /// Time of the curve's top, s; by default chosen so that the curve starts at 0.05 degrees.
     #[arg(long)]
     beta: Option<f32>,
     /// Weight on the scale in g, if it is known already and need not be asked for.

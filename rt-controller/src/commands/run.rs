@@ -26,13 +26,13 @@ const STACK: usize = 512 * 1024;
 
 /// The failure of a thread that could not be started.
 fn no_thread(e: std::io::Error) -> Failure {
-    failure(exit::FAILED, format!("no thread could be started: {e}; does the system limit processes or locked memory?"))
+    failure(exit::FAILED, format!("a thread could not be started: {e}; does the system limit processes or locked memory?"))
 }
 
 /// Command-line arguments.
 #[derive(Debug, clap::Args)]
 #[command(after_help = "Examples:\n  rt-controller run --config config/sim.toml\n  rt-controller run --config config/cell.toml\n\n\
-Stops upright on Ctrl-C or SIGTERM.")]
+Ctrl-C or SIGTERM brings the container upright and stops the controller.")]
 pub struct Args {
     /// The cell's configuration.
     #[arg(long, default_value = shared::config::DEFAULT_FILE)]
@@ -46,7 +46,7 @@ pub fn run(args: &Args) -> Result<(), Failure> {
     let say = |text: &str| _ = writeln!(std::io::stderr(), "rt-controller: {text}");
     // Half a controller would be worse than none: without targets the robot's program comes upright by itself.
     std::panic::set_hook(Box::new(|panic| {
-        let _ = writeln!(std::io::stderr(), "rt-controller: a defect, please report it: {panic}");
+        let _ = writeln!(std::io::stderr(), "rt-controller: this is a defect, please report it: {panic}");
         std::process::abort();
     }));
     let stop = stop_at_signals()?;

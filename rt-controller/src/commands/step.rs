@@ -15,7 +15,7 @@ use crate::core::{Core, Input, Order, Robot, Settings};
 /// Command-line arguments.
 #[derive(Debug, clap::Args)]
 #[command(after_help = "Example:\n  printf '0\\n0\\n350\\nnan\\n410\\n' | rt-controller step --weights out/weights.bin --goal 75\n\n\
-Each line in is one frame's V_e in px^2 (nan: no measurement); each line out is 'dalpha_deg alpha_deg d_ml', flushed at once:\n\
+Each line of input is one frame's V_e in px^2 (nan: no measurement); each line of output is 'dalpha_deg alpha_deg d_ml', flushed at once:\n\
 the change and the angle commanded after this frame (all limits of the configuration applied), and the volume still to pour.")]
 pub struct Args {
     /// The weight file.
@@ -70,7 +70,7 @@ pub fn run(args: &Args) -> Result<(), Failure> {
         let area_px2 = match line.as_deref().map(str::trim).map(str::parse::<f32>) {
             Ok(Ok(area_px2)) => area_px2,
             _ => {
-                let what = format!("line {}: not a number: give one V_e in px^2, or nan, a line", number + 1);
+                let what = format!("line {}: not a number: give one V_e in px^2, or nan, on each line", number + 1);
                 return Err(failure(exit::BAD_INPUT, what));
             }
         };

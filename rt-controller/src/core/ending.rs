@@ -27,7 +27,8 @@ use super::settings::Settings;
 /// After flow was seen, this much of a way back without flow ends the pour, degrees. Chosen by hand; no measurement is recorded.
 const BROUGHT_BACK_DEG: f32 = 10.0;
 /// After flow was seen, this many frames without progress end the pour: three seconds at 30 Hz. The agent then stands still short of
-/// its goal, while what trickles is too little to be seen or flickers about what can be seen. Chosen by hand; no measurement is recorded.
+/// its goal, while the trickle is too small to be seen, or flickers at the edge of what can be seen. Chosen by hand; no measurement is
+/// recorded.
 const STALLED_FRAMES: u32 = 90;
 /// Forward tilt that counts as progress, degrees. Chosen by hand; no measurement is recorded.
 const PROGRESS_DEG: f32 = 1.0;
@@ -38,7 +39,7 @@ const NOTHING_ML: f64 = 0.05;
 /// After this many frames in a row with a stream, the tilt of the stream is remembered. None of 10,800 simulated pours ended by mistake
 /// with this and the three constants below; see docs/LEARNING.md.
 const STREAM_FRAMES: u32 = 5;
-/// Only after this poured volume can a stream be lost, ml: a bead that was taken for a stream is less. See docs/LEARNING.md.
+/// Only after this poured volume can a stream be lost, ml: a bead that is taken for a stream gives less. See docs/LEARNING.md.
 const STREAM_ML: f32 = 1.0;
 /// Frames in a row without a stream after which it may be lost: longer than the pauses of a bottle that gurgles. See docs/LEARNING.md.
 const STREAM_LOST_FRAMES: u32 = 10;
@@ -52,7 +53,7 @@ const LARGEST_TILT_SLACK_DEG: f32 = 0.5;
 const COMMANDED_UPRIGHT_DEG: f32 = 0.01;
 /// Frames without flow after which the last drops are counted: half a second at 30 Hz. Chosen by hand; no measurement is recorded.
 const SETTLE_QUIET_FRAMES: u32 = 15;
-/// Longest wait for the last drops and for the joint to come upright, s. Chosen by hand; no measurement is recorded.
+/// The longest wait for the last drops and for the joint to come upright, s. Chosen by hand; no measurement is recorded.
 const SETTLE_MAX_S: f64 = 3.0;
 
 /// What one frame showed during a pour.
@@ -266,7 +267,7 @@ mod tests {
     use shared::mlp::{InputScale, Mlp};
     use shared::weights::{Estimator, Method, Origin, Weights};
 
-    /// A network that pours while d > 0 and stays when d is near 0; made by hand.
+    /// Valid weights whose network has arbitrary parameters, made by hand.
     fn example() -> Weights {
         let mut network = Mlp::ZERO;
         for (k, p) in network.parameters_mut().enumerate() {

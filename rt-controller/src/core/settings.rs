@@ -27,7 +27,8 @@ pub struct Settings {
     pub goal_max_ml: f32,
     /// Largest distance of the measured alpha from 0 that counts as upright, degrees.
     pub upright_deg: f32,
-    /// After this long without a target the robot's program goes upright by itself, ns; then the controller does so too.
+    /// After this long without a target the robot's program goes upright by itself, ns; the controller
+    /// then does so too.
     pub patience_ns: u64,
 }
 

@@ -1,4 +1,4 @@
-//! Where the robot is connected: protocol, versions, recipes and the program's upload, until a [`Session`] is ready for the loop.
+//! Connects the robot: it settles protocol, versions and recipes, and uploads the program, until a [`Session`] is ready for the loop.
 //!
 //! It runs on an ordinary thread, allocates, and blocks for seconds: for some 20 s with a robot that answers late each time. Every failure
 //! is a [`LinkError`] whose one line says what to do; the caller shows it and tries again later. A running program is never replaced,

@@ -7,13 +7,13 @@ use shared::control::EndReason;
 
 use super::{ProgramState, RobotState};
 
-/// `Ok` if targets may be sent, otherwise the one reason that comes first for the operator.
+/// `Ok` if targets may be sent, otherwise the reason that matters most to the operator.
 ///
 /// `lost_ns` (`controller.lost_robot_ms`) is how long the robot may be silent, how long its clock may stand still, and how long its
 /// program may leave targets unread.
 pub fn check(state: &RobotState, now_ns: u64, lost_ns: u64) -> Result<(), EndReason> {
     let older = |at_ns: u64| now_ns.saturating_sub(at_ns) > lost_ns;
-    // A state that is so old says nothing about now.
+    // A state this old says nothing about the present.
     if older(state.received_at_ns) {
         return Err(EndReason::RobotLost);
     }

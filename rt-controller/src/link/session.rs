@@ -1,8 +1,8 @@
 //! A connected robot in the controller's loop: reads what the robot sent, and writes one target a tick.
 //!
 //! [`connect`](super::connect()) makes it on an ordinary thread, which also drops it. `poll` and `send` never block, allocate or panic:
-//! the one buffer holds the protocol's largest packet. Every error of the socket ends the session with a [`Lost`]; nothing is repaired in
-//! place. Dropping a session asks the program to come upright and end. If the program cannot receive that, it does so by itself 100 ms
+//! the one buffer holds the protocol's largest packet. Every error of the socket ends the session with a [`Lost`]; a session is never
+//! repaired. Dropping a session asks the program to come upright and end. If the program cannot receive that, it does so by itself 100 ms
 //! after the last target.
 
 use std::io::{ErrorKind, Read, Write};

@@ -4,7 +4,7 @@
 //! only the connecting thread asks for. No bytes make anything here panic: what does not fit gives `None` or [`Malformed`].
 //!
 //! A packet is a u16 with the size of the whole packet, a u8 with its type, and its payload. Where a value lies in a data packet follows
-//! from the two lists of variables, `OUTPUTS` and `INPUTS`, which is computed and checked at compile time.
+//! from the two lists of variables, `OUTPUTS` and `INPUTS`; it is computed and checked at compile time.
 
 use super::{ProgramState, RobotState, TiltJoint};
 

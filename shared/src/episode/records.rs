@@ -24,7 +24,7 @@ pub enum EpisodeError {
     Read {
         /// The file.
         file: String,
-        /// The system's words.
+        /// The operating system's message.
         what: String,
     },
     /// The file is not an episode that this program can read.

@@ -27,7 +27,7 @@ pub enum TableError {
     File {
         /// The file.
         file: String,
-        /// The system's words.
+        /// The operating system's message.
         what: String,
     },
     /// A row or the heading is wrong.

@@ -34,7 +34,7 @@ pub enum WriteError {
     Directory {
         /// The directory.
         directory: String,
-        /// The system's words.
+        /// The operating system's message.
         what: String,
     },
     /// Creating or writing the file failed.
@@ -42,7 +42,7 @@ pub enum WriteError {
     File {
         /// The file.
         file: String,
-        /// The system's words.
+        /// The operating system's message.
         what: String,
     },
 }

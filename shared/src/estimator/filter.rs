@@ -44,7 +44,7 @@ const EXCESS_MIN_ML: f64 = 0.05;
 /// A measurement that is further off than this many standard deviations counts less. From the prototype's filter; no other
 /// measurement is recorded.
 const GATE_SDS: f64 = 4.0;
-/// Variance of the headspace at the first sight of flow that nothing else explains, ml^2. From the prototype's filter; no other
+/// The part of the headspace's variance that nothing else explains when flow is first seen, ml^2. From the prototype's filter; no other
 /// measurement is recorded.
 const FIRST_HEADSPACE_VARIANCE_ML2: f64 = 1.0;
 /// A foreseen outflow above this many times the least visible one cannot be overlooked, so that a zero is a dropout. From the

@@ -238,7 +238,7 @@ pub struct FlowState {
 }
 
 impl Default for FlowState {
-    /// A full and upright container, of which nothing is known that the model does not say.
+    /// A full and upright container, about which nothing is known beyond the model.
     fn default() -> Self {
         Self { tilt_deg: 0.0, headspace_ml: 0.0, film_ml: 0.0, log_flow_factor: 0.0, capacity_scale: 1.0, extra_delay_frames: 0.0 }
     }

@@ -26,7 +26,7 @@ const TEMPER: f64 = 0.5;
 /// The estimate stays within this many standard deviations of the camera's gain from the camera's own sum. Tuned on rigs 100 to
 /// 123, see docs/LEARNING.md.
 const CAMERA_SDS: f64 = 2.5;
-/// This much further the estimate may be from the camera's own sum in any case, ml. Tuned on rigs 100 to 123, see docs/LEARNING.md.
+/// The estimate may be this much further from the camera's own sum in any case, ml. Tuned on rigs 100 to 123, see docs/LEARNING.md.
 const CAMERA_ML: f64 = 1.5;
 
 /// A larger outflow in a frame, ml, than any container gives, so that it is no measurement. Chosen by hand; no measurement is recorded.
@@ -34,8 +34,8 @@ const MEASURED_MAX_ML: f64 = 50.0;
 /// Commanded angles outside of this range are cut to it, degrees. Chosen by hand: no cell tilts that far.
 const COMMAND_RANGE_DEG: (f64, f64) = (-30.0, 200.0);
 
-/// What changes in a frame that the model does not know, where all is as the episodes showed. From the prototype's filter, tuned on
-/// rigs 100 to 123, see docs/LEARNING.md.
+/// How much a frame may change what the model does not describe, where all is as the episodes showed. From the prototype's filter,
+/// tuned on rigs 100 to 123, see docs/LEARNING.md.
 const USUAL_DRIFT: Drift = Drift { headspace_sd_ml: 0.05, log_flow_factor_sd: 0.007 };
 /// The same as [`USUAL_DRIFT`] where the geometry or the delay is not to be trusted. Tuned on rigs 100 to 123, see docs/LEARNING.md.
 const DISTRUSTED_DRIFT: Drift = Drift { headspace_sd_ml: 0.2, log_flow_factor_sd: 0.02 };
@@ -303,7 +303,7 @@ mod tests {
         }
     }
 
-    /// Protects the volume from a geometry that is wrong and sure of itself: the estimate stays near the camera's own sum.
+    /// Protects the volume from a geometry that is wrong but trusted: the estimate stays near the camera's own sum.
     #[test]
     fn the_estimate_stays_near_the_cameras_sum() {
         let mut wrong = FlowModel { vessel: Vessel { radius_mm: 24.0, ..Vessel::default() }, ..FlowModel::default() };

@@ -296,7 +296,7 @@ impl Cell {
         stream.write_all(format!("def jog():\n  movej({q:?}, 2.0, 1.0)\nend\n").as_bytes()).unwrap();
         self.until("jogged upright", |c| (c.alpha().0.abs() < 0.2 && c.alpha().1.abs() < 0.1).then_some(()));
         self.until("the jog's end", |c| (c.robot.state()?.runtime_state == RuntimeState::Stopped).then_some(()));
-        // What the jog commanded is not ours.
+        // What the jog commanded is not the program's motion.
         self.robot.start_trace(24);
     }
 }
