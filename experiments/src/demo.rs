@@ -113,7 +113,7 @@ pub fn perform(cell: &mut OwnCell, seed: u64) -> Result<DemoSummary, OwnCellErro
     Ok(summary)
 }
 
-/// Records and weighs the episodes; returns what is told of them in `summary.json`.
+/// Records and weighs the episodes; returns their entries for `summary.json`.
 fn record(cell: &OwnCell) -> Result<Vec<Value>, OwnCellError> {
     let mut episodes = Vec::new();
     for (i, (fill_ml, lambda_deg, gamma)) in EPISODES.into_iter().enumerate() {

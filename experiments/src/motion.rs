@@ -58,7 +58,7 @@ pub struct MotionFigures {
     pub joint_acceleration_rms_deg_s2: f64,
     /// Root mean square of the joint's jerk, degrees/s^3.
     pub joint_jerk_rms_deg_s3: f64,
-    /// Time by which the joint is behind the targets, ms: the shift that makes them most alike.
+    /// Time by which the joint is behind the targets, ms: the shift at which the two differ least.
     pub delay_ms: f64,
 }
 

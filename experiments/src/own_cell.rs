@@ -1,6 +1,6 @@
 //! A simulated cell of real processes with a name, an address and a directory of its own, for experiments with the real programs.
 //!
-//! Ordinary process; allocates and blocks. It does what an operator does, by the programs' command lines, and takes no decision of the
+//! Ordinary process; allocates and blocks. It does what an operator does, by the programs' command lines, and makes no decision for the
 //! controller. When it is dropped, every process that it started is stopped and the cell's shared memory is removed.
 
 use std::path::{Path, PathBuf};
@@ -50,7 +50,7 @@ pub enum OwnCellError {
         what: String,
         /// How long it was waited for, s.
         seconds: u64,
-        /// What was the case instead.
+        /// Why the last attempt failed.
         why: String,
         /// Directory of the logs.
         logs: String,
@@ -180,7 +180,7 @@ impl OwnCell {
         if self.stop.load(Ordering::Relaxed) { Err(OwnCellError::Interrupted) } else { Ok(()) }
     }
 
-    /// Starts `name run`; what it says goes to a file of the logs.
+    /// Starts `name run`; its output goes to a log file.
     fn spawn(&self, name: &str) -> Result<Child, OwnCellError> {
         let log = self.out.join(format!("logs/{name}.log"));
         let log = std::fs::File::create(&log).map_err(|error| OwnCellError::File { what: log.display().to_string(), error })?;
@@ -210,10 +210,10 @@ impl OwnCell {
         Ok(serde_json::from_slice(&output.stdout).unwrap_or(Value::Null))
     }
 
-    /// Judges how a command ended.
+    /// Checks that a command succeeded.
     ///
     /// # Errors
-    /// With the last line that was said, unless the command succeeded.
+    /// When the command failed; the error holds the last line that it printed.
     pub fn succeeded(&self, what: &str, status: ExitStatus, said: &str) -> Result<(), OwnCellError> {
         self.interrupted()?;
         if status.success() {
@@ -233,7 +233,7 @@ impl OwnCell {
         reading["weight_g"].as_f64().ok_or_else(|| OwnCellError::Other(format!("the scale reads {reading}")))
     }
 
-    /// Tries until it works.
+    /// Repeats `attempt` until it succeeds.
     ///
     /// # Errors
     /// When a process ends, Ctrl-C is pressed, or time is up.

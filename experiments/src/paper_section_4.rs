@@ -10,7 +10,7 @@ use simulator::physics::paper::PaperPour;
 use trainer::method::policy_gradient::{LAMBDA, reward};
 use trainer::network::{Adam, Example, Network};
 
-/// Adam steps between two looks at the network: enough looks for a curve, few enough to cost little.
+/// Adam steps between two looks at the network: often enough for a curve, and seldom enough to cost little.
 const LOOK_EVERY: usize = 250;
 /// Frames of a pour: 30 s, as everywhere.
 const FRAMES: usize = 900;

@@ -67,7 +67,7 @@ impl Baseline for BangBang {
     }
 }
 
-/// Eq. (1) without looking: the curve's height that poured this much in the episodes, by a straight line through them.
+/// Eq. (1) without the camera: the height of the curve is read from a straight line through the episodes' weights and heights.
 pub struct OpenLoop {
     curve: Curve,
     frame: u32,
@@ -75,7 +75,7 @@ pub struct OpenLoop {
 }
 
 impl OpenLoop {
-    /// Fits the height of the curves against the weight, and takes the height for a goal in ml.
+    /// Fits the height of the curves against the weight, and takes the height that belongs to a goal in ml.
     pub fn new(episodes: &[TrainingEpisode], goal_ml: f64) -> Self {
         let top = |e: &TrainingEpisode| e.alpha_deg.iter().copied().fold(0.0, f64::max);
         let n = episodes.len().max(1) as f64;
@@ -101,7 +101,7 @@ impl Baseline for OpenLoop {
     }
 }
 
-/// A control law (or a PD, which is a law without the rest) on the network's own estimate, without the network.
+/// A control law (or a PD, which is a law without damping, smoothing and volume in flight) on the network's own estimate.
 pub struct ByLaw {
     law: ControlLaw,
     calibration: Calibration,

@@ -84,7 +84,7 @@ impl Trace {
         self.true_ml.push(pour.poured_ml());
     }
 
-    /// The same as an episode that was weighed.
+    /// The pour as a weighed episode.
     pub fn weighed(self, name: &str, weight_g: f64) -> TrainingEpisode {
         let alpha_measured_deg = vec![f64::NAN; self.t_s.len()];
         let Self { t_s, alpha_deg, area_px2, .. } = self;
@@ -92,7 +92,7 @@ impl Trace {
     }
 }
 
-/// The settings that the core runs with: those of `config/sim.toml`, but without a limit of the goal.
+/// The settings that the core runs with: those of `config/sim.toml`, but without a limit on the goal.
 fn settings(limits: Limits) -> Settings {
     Settings {
         period_ns: PERIOD_NS,
@@ -122,7 +122,7 @@ pub fn by_core(
     let mut frames = 0u32;
     let mut poured =
         PourResult { init_ml, goal_ml, true_ml: 0.0, believed_ml: 0.0, seconds: f64::from(MAX_FRAMES) / RATE_HZ, frames: 0, ended: false };
-    // The core ends a pour by its own limits; this one is there for a core that does not.
+    // The core ends a pour by its own limits. This bound is for a core that fails to.
     while frames < 3 * MAX_FRAMES {
         frames += 1;
         let now_ns = u64::from(frames + 1) * PERIOD_NS;

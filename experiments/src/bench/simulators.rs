@@ -41,7 +41,7 @@ impl BenchPour {
     }
 }
 
-/// What stands on the bench: pours are made and episodes are recorded on it.
+/// A simulator that is set up for pours and for recording episodes.
 #[derive(Debug, Clone)]
 pub enum Bench {
     /// Simulator a.
@@ -92,7 +92,7 @@ impl Bench {
         container.spill_angle_deg()
     }
 
-    /// The volume that leaves `volume_ml` at the largest tilt if one waits for ever, ml.
+    /// The volume that flows out of `volume_ml` at the largest tilt if one waits for ever, ml.
     pub fn reach_ml(&self, volume_ml: f64) -> f64 {
         let Some((rig, container)) = self.rig() else { return volume_ml };
         let mut container = container.clone();

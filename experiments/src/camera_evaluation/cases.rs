@@ -1,4 +1,5 @@
-//! Cells as they differ, each condition with a name. Any thread; allocates. The same generator gives the same cells.
+//! Cells that differ in liquid, background, light and more; each condition has a name. Any thread; allocates. The same generator gives the
+//! same cells.
 
 use rand::RngExt;
 use rand::seq::IndexedRandom;

@@ -1,4 +1,4 @@
-//! Frames that nobody should trust, and whether the doubt is raised. Any thread; allocates.
+//! Frames that should not be trusted, and whether a doubt about them is raised. Any thread; allocates.
 
 use std::collections::BTreeMap;
 
@@ -22,7 +22,7 @@ struct Bad {
     cut_short: bool,
 }
 
-/// For each doubt, by its words, the share of frames that deserve it on which it was raised, per cent.
+/// For each doubt, by its text, the share of the frames deserving it on which it was raised, per cent.
 ///
 /// # Errors
 /// When a frame cannot be drawn or measured.

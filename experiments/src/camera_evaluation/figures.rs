@@ -3,8 +3,8 @@
 use serde::Serialize;
 use shared::messages::Doubt;
 
-/// Frames with a truth above this count for error and missed flow, px^2: below it a stream is a few pixels wide and its area no figure of
-/// quality.
+/// Frames with a truth above this count for error and missed flow, px^2: below it a stream is a few pixels wide, and its error says
+/// little about quality.
 pub const MEASURED_PX2: f64 = 200.0;
 
 /// Figures of many measured frames.

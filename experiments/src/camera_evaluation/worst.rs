@@ -1,4 +1,4 @@
-//! The worst frames, kept for the eye: what was seen and the truth are drawn on them. Any thread; allocates.
+//! The worst frames, kept for a person to look at: what was seen and the truth are drawn on them. Any thread; allocates.
 
 use std::path::Path;
 

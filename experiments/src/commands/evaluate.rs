@@ -48,7 +48,7 @@ pub struct Args {
     /// How often the grid of 45 pours is poured for each training.
     #[arg(long, default_value_t = 4, value_parser = clap::value_parser!(u64).range(1..=100))]
     repeats: u64,
-    /// What pours, comma-separated.
+    /// The methods and baselines that pour, comma-separated.
     #[arg(long, value_enum, value_delimiter = ',', default_value = "best")]
     method: Vec<Pourer>,
     /// Actions of the trained policies: 2 or 21.
@@ -66,7 +66,7 @@ pub struct Args {
     /// Renders each frame and runs the feature worker's extraction, instead of the area formula (simulator b).
     #[arg(long, conflicts_with = "change")]
     through_camera: bool,
-    /// Writes everything, every pour included, to this file.
+    /// Writes the whole report, every pour included, to this file as JSON.
     #[arg(long)]
     json: Option<PathBuf>,
 }
@@ -76,13 +76,13 @@ impl Args {
         Protocol { episodes: self.episodes, weighed: self.weighed, actions: self.actions, repeats: self.repeats }
     }
 
-    /// What does not fit together in these arguments is an error.
+    /// Refuses arguments that do not go together.
     fn check(&self) -> Result<(), Failure> {
         if self.through_camera && self.sim == "a" {
             return Err(failure(exit::BAD_INPUT, "--through-camera goes with --sim b: simulator a has nothing to look at"));
         }
         if self.actions != 2 && self.actions != 21 {
-            return Err(failure(exit::BAD_INPUT, "--actions is 2 or 21"));
+            return Err(failure(exit::BAD_INPUT, "--actions must be 2 or 21"));
         }
         Ok(())
     }

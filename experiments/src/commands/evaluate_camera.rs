@@ -49,7 +49,7 @@ pub struct Args {
     /// Directory of the worst frames.
     #[arg(long, default_value = "out/evaluate-camera")]
     out: PathBuf,
-    /// Only this method.
+    /// Evaluates only this method: colour or clear.
     #[arg(long)]
     method: Option<String>,
 }

@@ -50,7 +50,7 @@ pub fn run(args: &Args) -> Result<(), Failure> {
     Ok(measure(args)?)
 }
 
-/// What is said of a file that cannot be written or read.
+/// The error for a file that cannot be written or read.
 fn file_error(path: &Path) -> impl FnOnce(std::io::Error) -> OwnCellError {
     let what = path.display().to_string();
     move |error| OwnCellError::File { what, error }

@@ -20,7 +20,7 @@ use crate::plots;
 #[command(after_help = "Examples:\n  experiments motion out/episodes/episode-0001.mcap\n  \
 experiments motion out/episodes/episode-0001.mcap --series e-series --from 1 --to 3 --out out/motion.svg")]
 pub struct Args {
-    /// A recorded pour or curve
+    /// The episode: a recorded pour or curve
     episode: PathBuf,
     /// The cell's configuration: joint, limits, servoj parameters
     #[arg(long, default_value = shared::config::DEFAULT_FILE)]
@@ -31,10 +31,10 @@ pub struct Args {
     /// Show the picture from this time on, s
     #[arg(long, default_value_t = 0.0)]
     from: f64,
-    /// Show the picture up to this time, s; 0: to the end
+    /// Show the picture up to this time, s; with 0, to the end
     #[arg(long, default_value_t = 0.0)]
     to: f64,
-    /// The picture
+    /// File of the picture (SVG)
     #[arg(long, default_value = "out/motion.svg")]
     out: PathBuf,
     /// Print the figures as JSON
@@ -97,14 +97,14 @@ fn compare(args: &Args, config: &Config, episode: &Episode) -> Result<Report, Bo
         SeriesArg::ESeries => Series::ESeries,
     };
     let targets = motion::targets(episode, options.rate_hz);
-    let Some((end_s, _)) = targets.last().copied() else { return Err("no targets in it".into()) };
+    let Some((end_s, _)) = targets.last().copied() else { return Err("the episode holds no targets; choose another one".into()) };
     let cycle_s = 1.0 / series.rate_hz();
     let with_program = motion::follow(&options, series, &program::text(&options, cycle_s, 1)?, &targets)?;
     let raw = motion::follow(&options, series, &motion::raw_program(&options, cycle_s), &targets)?;
 
     let to_s = if args.to > 0.0 { args.to.min(end_s) } else { end_s };
     if args.from >= to_s {
-        return Err(format!("it ends after {end_s:.1} s: choose --from and --to within").into());
+        return Err(format!("the episode ends after {end_s:.1} s: choose --from and --to within that time").into());
     }
     if let Some(parent) = args.out.parent() {
         std::fs::create_dir_all(parent)?;

@@ -1,4 +1,4 @@
-//! `experiments reproduce`: repeats section 4 of the paper, and says what holds of it.
+//! `experiments reproduce`: repeats section 4 of the paper, and says which of its claims hold.
 //!
 //! Ordinary threads, all cores; allocates. Trains once with the plain cross-entropy and once with the clip of p to [1e-7, 1 - 1e-7] that
 //! Keras applies silently. The same arguments give the same numbers. A file that cannot be written is an error of one line.
@@ -92,7 +92,7 @@ impl Form {
             )
     }
 
-    /// What holds of the paper's claim, in words.
+    /// Whether the paper's claim holds, in words.
     fn verdict(&self) -> String {
         let (good, n) = (self.good(), self.mae_ml.len());
         let words = if good == 0 {
@@ -100,7 +100,7 @@ impl Form {
         } else if 2 * good > n {
             "converges in most runs to below 10 ml: the claim of convergence and of arbitrary goals holds, roughly"
         } else {
-            "converges in some runs only: the claim holds by luck of the seed"
+            "converges in some runs only: whether the claim holds depends on the seed"
         };
         format!("Cross-entropy {}: {words} ({good} of {n}).", self.name)
     }

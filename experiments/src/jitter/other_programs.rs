@@ -34,7 +34,7 @@ pub fn load() -> Result<Running, OwnCellError> {
     Ok(Running(child))
 }
 
-/// Starts cyclictest like the loop, with one reading a line, for `seconds`; its priority is by `below` lower than the loop's.
+/// Starts cyclictest like the loop, with one reading a line, for `seconds`; its priority is lower than the loop's by `below`.
 ///
 /// # Errors
 /// When cyclictest cannot be started.
@@ -66,7 +66,7 @@ pub fn latencies_us(output: &[u8]) -> Vec<f64> {
     text.lines().filter_map(reading).collect()
 }
 
-/// What is said of a program that cannot be started.
+/// The error for a program that cannot be started.
 fn missing(what: &str) -> impl FnOnce(std::io::Error) -> OwnCellError {
     move |error| OwnCellError::File { what: what.into(), error }
 }

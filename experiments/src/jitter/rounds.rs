@@ -1,6 +1,6 @@
 //! The cell and cyclictest in turns, at rest and under load.
 //!
-//! Ordinary thread; allocates and blocks. Their order changes from round to round, so that what warms up or wears off meets both.
+//! Ordinary thread; allocates and blocks. Their order changes from round to round, so that warming up affects both alike.
 
 use serde_json::{Map, Value, json};
 use trainer::report::page;
@@ -12,7 +12,7 @@ use super::statistics::{histograms, median, summary};
 use super::tick_times::{SPANS, Span, TickTimes};
 use crate::own_cell::{OwnCell, OwnCellError};
 
-/// Under which conditions is measured.
+/// The conditions under which the machine is measured.
 const CONDITIONS: [&str; 2] = ["at rest", "under load"];
 
 /// What was measured under one condition: a run of the cell and of cyclictest (latencies in us) for each round.
@@ -64,7 +64,7 @@ fn run_cyclictest(cell: &OwnCell, seconds: u64) -> Result<Vec<f64>, OwnCellError
     Ok(latencies)
 }
 
-/// What is told of one condition, over all rounds.
+/// What is reported about one condition, over all rounds.
 struct Told {
     ticks: TickTimes,
     /// Latencies of cyclictest, us.

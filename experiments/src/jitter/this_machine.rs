@@ -1,4 +1,4 @@
-//! What is known of the machine on which is measured, and what would make it better.
+//! What is known of the machine that is measured on, and what would make it better.
 //!
 //! Ordinary thread; allocates; cannot fail.
 
@@ -19,7 +19,7 @@ struct Property {
 }
 
 impl ThisMachine {
-    /// Reads what Linux tells of the machine; what it does not tell stays empty.
+    /// Reads what Linux tells about the machine; a property that it does not tell stays empty.
     pub fn look(cell: &OwnCell) -> Self {
         let mut properties = processor();
         properties.extend(power());

@@ -27,11 +27,11 @@ pub enum Pourer {
     PdTuned,
     /// The control law that the network was taught, without the network.
     Law,
-    /// Forward, back, stop.
+    /// Two points: forward below an outflow, back above it.
     BangBang,
-    /// Eq. (1) without looking.
+    /// Eq. (1) without the camera.
     OpenLoop,
-    /// The true state: what control alone can reach.
+    /// A controller that sees the true state: what control alone can reach.
     Oracle,
 }
 

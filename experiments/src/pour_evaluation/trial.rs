@@ -75,7 +75,7 @@ impl Trial {
         Ok(self)
     }
 
-    /// The grid's pours that the container can make at all within the tilt range, with a number each: volume, goal, number.
+    /// The pours of the grid that the container can make within the tilt range: volume, goal and a number for each.
     fn cells(&self, repeats: u64) -> Vec<(f64, f64, u64)> {
         let cells: Vec<(f64, f64)> = grid().into_iter().filter(|(init, goal)| *goal <= 0.95 * self.test.reach_ml(*init)).collect();
         (0..repeats)
@@ -131,7 +131,7 @@ impl Trial {
         Options { method, estimate, actions, seed: self.data_seed + 1, limits: self.limits }
     }
 
-    /// Records episodes, without those that no training takes.
+    /// Records episodes, and leaves out those that cannot be trained on.
     fn record(&self, episodes: u64) -> Vec<TrainingEpisode> {
         let mut data = self.bench.record(episodes as usize, self.data_seed);
         data.retain(|e| e.fault().is_none());
