@@ -4,8 +4,8 @@
 //! |---|---|
 //! | `extractor` | measures one image: checks, then the liquid, then the line |
 //! | `checks` | whether a picture can be used: light, repetition, focus |
-//! | `liquid` | what the extractor asks of a liquid; `colour` and `clear` are the two kinds |
-//! | `line` | the stream's edge as a robust line, then through sub-pixel points of profiles |
+//! | `liquid` | what the extractor asks of a liquid; `coloured_liquid` and `clear_water` are the two kinds |
+//! | `stream_edge` | the stream's edge as a robust line, then through sub-pixel points of profiles |
 //! | `geometry` | lines, the two axes, and the rays between them |
 //! | `picture` | images, their pixels, and samples between pixels |
 //! | `measurement` | what one image tells |
@@ -15,16 +15,16 @@
 //! docs/VISION.md says how well each works. Nothing here knows where images come from or who reads the measurements.
 
 mod checks;
-mod clear;
-mod colour;
+mod clear_water;
+mod coloured_liquid;
 mod extractor;
 mod geometry;
 mod learn_axes;
 mod learn_colour;
-mod line;
 mod liquid;
 mod measurement;
 mod picture;
+mod stream_edge;
 
 pub use extractor::{ExtractError, Extractor};
 pub use geometry::Axes;

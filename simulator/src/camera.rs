@@ -8,7 +8,7 @@
 //! |---|---|
 //! | [`view`] | the camera, and the scene that it is shown |
 //! | `board` | what stands behind |
-//! | `stream` | the liquid's outline, from the hydraulics of the outflow, and the truth about it |
+//! | `stream_outline` | the liquid's outline, from the hydraulics of the outflow, and the truth about it |
 //! | `drops` | drops in flight and the bead at the lip |
 //! | `cover` | outlines become a share of each pixel |
 //! | `liquid`, `water` | how coloured liquid and clear water look |
@@ -23,7 +23,7 @@ mod drops;
 mod glass;
 mod liquid;
 mod sensor;
-mod stream;
+mod stream_outline;
 pub mod view;
 mod water;
 
@@ -38,7 +38,7 @@ use drops::Drops;
 use glass::Glass;
 use liquid::Liquid;
 use sensor::Sensor;
-use stream::{Ripple, Stream};
+use stream_outline::{Ripple, Stream};
 pub use view::{Background, Scene, Truth, View};
 
 /// OpenCV could not draw.

@@ -6,13 +6,13 @@
 //! | [`consistency`] | weights that do not fit the others |
 //! | [`calibration`] | area to ml, from the weights alone |
 //! | [`fit`] | the flow model, fitted to the episodes |
-//! | [`actions`], [`network`] | the network's actions, and its training |
+//! | [`allowed_actions`], [`network`] | the network's actions, and its training |
 //! | [`training`], [`method`] | what a training is told and gives, and the methods |
 //! | [`report`] | pages of plots and tables |
 //! | [`commands`] | the command line |
 #![forbid(unsafe_code)]
 
-pub mod actions;
+pub mod allowed_actions;
 pub mod calibration;
 pub mod commands;
 pub mod consistency;

@@ -9,7 +9,7 @@ use rand_pcg::Pcg64Mcg;
 use shared::agent::{Agent, Observation};
 use shared::estimator::Calibration;
 use shared::estimator::flow::{CommandHistory, FlowModel, FlowState, FlowTables};
-use trainer::actions::Actions;
+use trainer::allowed_actions::Actions;
 use trainer::consistency;
 use trainer::data::{self, TrainingEpisode};
 use trainer::fit;

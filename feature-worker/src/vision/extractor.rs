@@ -5,7 +5,7 @@
 //!
 //! 1. [`super::checks`] tell whether the light is good enough and the picture is a new one.
 //! 2. The [`Liquid`] tells whether there is a stream, and roughly where its outer edge lies.
-//! 3. [`super::line`] makes that edge a line, which cuts the axes at a and b.
+//! 3. [`super::stream_edge`] makes that edge a line, which cuts the axes at a and b.
 //! 4. `V_e = a b sin(phi) / 2`, with phi between the axes. Without a stream it is exactly 0.
 //!
 //! Runs on the worker's extraction thread. All buffers are kept, so after the second frame nothing is allocated but OpenCV's matrix
@@ -19,13 +19,13 @@ use shared::config::{CameraConfig, ImageConfig, LiquidMethod};
 use shared::messages::Doubt;
 
 use super::checks::{LightCheck, RimCheck};
-use super::clear::ClearWater;
-use super::colour::ColouredLiquid;
+use super::clear_water::ClearWater;
+use super::coloured_liquid::ColouredLiquid;
 use super::geometry::{Axes, RayGrid};
-use super::line::{BLURRED_PX, LineFinder};
 use super::liquid::{Liquid, Sighting};
 use super::measurement::{Measurement, Stages};
 use super::picture::{Image, RegionPixels, RegionReader};
+use super::stream_edge::{BLURRED_PX, LineFinder};
 
 /// Why an extractor cannot be made, or why an image cannot be measured.
 #[derive(Debug, thiserror::Error)]

@@ -7,7 +7,7 @@ use rand::RngExt;
 use rand_pcg::Pcg64Mcg;
 
 use super::cover::{Cover, join};
-use super::stream::{DRIP_FLOW_ML_S, GRAVITY_MM_S2};
+use super::stream_outline::{DRIP_FLOW_ML_S, GRAVITY_MM_S2};
 use super::view::{Scene, View, to_container};
 
 /// Volume of one drop, ml. Chosen by hand; it is the usual rule of 20 drops a millilitre.

@@ -6,7 +6,7 @@ use opencv::core::{BORDER_REFLECT_101, Mat, Point, Rect, Size, Vec3b};
 use opencv::imgproc;
 use opencv::prelude::*;
 
-use super::stream::Ripple;
+use super::stream_outline::Ripple;
 use super::view::View;
 use super::water::{Water, WaterRow};
 

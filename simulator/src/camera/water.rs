@@ -9,7 +9,7 @@ use opencv::prelude::*;
 use rand::{RngExt, SeedableRng};
 use rand_pcg::Pcg64Mcg;
 
-use super::stream::Ripple;
+use super::stream_outline::Ripple;
 use super::view::View;
 
 /// Refractive index of water at room temperature in visible light.

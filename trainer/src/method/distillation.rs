@@ -12,7 +12,7 @@ use shared::mlp::{InputScale, Mlp, argmax};
 
 use super::control_law::ControlLaw;
 use super::model_pour::{MAX_FRAMES, PossiblePours};
-use crate::actions::Actions;
+use crate::allowed_actions::Actions;
 use crate::network::{Adam, Example, Network, REPORT_EVERY};
 
 /// The part of the learning rate that falls linearly from the first step to 0 at the end. Chosen by hand; no measurement is recorded.

@@ -14,7 +14,7 @@ use shared::weights::{Estimator, Method, Origin, Weights};
 use super::control_law::{self, ControlLaw, SearchSize};
 use super::distillation::{self, Distillation};
 use super::model_pour::PossiblePours;
-use crate::actions::Actions;
+use crate::allowed_actions::Actions;
 use crate::calibration;
 use crate::data::{self, TrainingEpisode};
 use crate::fit::{self, Fit};

@@ -26,7 +26,7 @@ use shared::estimator::{Calibration, Hold};
 use shared::mlp::{InputScale, Mlp};
 use shared::weights::{Estimator, Method, Origin, Weights};
 
-use crate::actions::Actions;
+use crate::allowed_actions::Actions;
 use crate::calibration;
 use crate::data::{self, TrainingEpisode};
 use crate::fit::{self, Fit};
