@@ -17,8 +17,10 @@ pub struct Watch {
     range_rad: [f64; 2],
     /// How far rounding may move an angle, rad.
     rounding_rad: f64,
-    /// The last target and its speed, of the tilting joint; none before the first.
-    told: Option<([f64; 6], f64)>,
+    /// The last target.
+    told: [f64; 6],
+    /// The speeds that the tilting joint may have had there, rad/s; none before the first target.
+    speeds: Vec<f64>,
     calls: u64,
     /// True when the program did not play since the last target.
     interrupted: bool,
@@ -39,7 +41,8 @@ impl Watch {
             dt_s: machine.robot.steptime_s(),
             range_rad: [rad(limits.alpha_min_deg), rad(limits.alpha_max_deg)],
             rounding_rad: if single { 5e-7 } else { 1e-9 },
-            told: None,
+            told: machine.robot.servo.target_q,
+            speeds: Vec::new(),
             calls: machine.robot.servo.servoj_calls,
             interrupted: true,
             arm_q: machine.robot.servo.target_q,
@@ -65,20 +68,17 @@ impl Watch {
         assert_eq!(servo.servoj_calls, self.calls + 1, "two calls of servoj in a cycle");
         self.calls = servo.servoj_calls;
         let q = servo.commanded_q;
-        let speed = (q[self.joint] - self.told.map_or(self.arm_q[self.joint], |(before, _)| before[self.joint])) / self.dt_s;
-        let goes_on = self.told.is_some_and(|(before, rate)| self.follows(&q, &before, rate).is_ok());
-        let from_arm = self.follows(&q, &self.arm_q, self.arm_qd[self.joint]);
-        let arm_was_moved = |what: String| format!("{:.3} s: {what}", machine.robot.timestamp_s());
-        if !goes_on && self.may_begin_anew(&q) {
-            from_arm.map_err(arm_was_moved).unwrap();
-            self.told = Some((q, (q[self.joint] - self.arm_q[self.joint]) / self.dt_s));
+        // The target may go on from the one before, at each speed that that one may have had, or begin anew from where the arm is.
+        let mut from: Vec<([f64; 6], f64)> = self.speeds.iter().map(|speed| (self.told, *speed)).collect();
+        if self.may_begin_anew(&q) {
+            from.push((self.arm_q, self.arm_qd[self.joint]));
             let alpha = self.direction * (self.arm_q[self.joint] - self.start_rad);
             self.range_rad = [self.range_rad[0].min(alpha), self.range_rad[1].max(alpha)];
-        } else {
-            let (before, rate) = self.told.unwrap();
-            self.follows(&q, &before, rate).map_err(arm_was_moved).unwrap();
-            self.told = Some((q, speed));
         }
+        let followed: Vec<Result<f64, String>> = from.iter().map(|(before, speed)| self.follows(&q, before, *speed)).collect();
+        self.speeds = followed.iter().flatten().copied().collect();
+        assert!(!self.speeds.is_empty(), "{:.3} s: {followed:?}", machine.robot.timestamp_s());
+        self.told = q;
         self.interrupted = false;
         let alpha = self.direction * (q[self.joint] - self.start_rad);
         // A stream that reverses out of full speed may cost a hundredth of a degree.
@@ -86,15 +86,13 @@ impl Watch {
         assert!((self.range_rad[0] - spare..=self.range_rad[1] + spare).contains(&alpha), "{alpha} rad is outside {:?}", self.range_rad);
     }
 
-    /// True when the program may leave its last target: after it did not play, or when the arm is not where it was told to be.
+    /// True when the program may leave its last target: when it did not play since, or when another joint was moved.
     fn may_begin_anew(&self, q: &[f64; 6]) -> bool {
-        let lag = self.told.map_or(0.0, |(before, _)| (before[self.joint] - self.arm_q[self.joint]).abs());
-        let moved = (0..6).any(|i| i != self.joint && self.told.is_some_and(|(before, _)| before[i] != q[i]));
-        self.interrupted || lag > 0.01 || moved
+        self.interrupted || self.speeds.is_empty() || (0..6).any(|i| i != self.joint && self.told[i] != q[i])
     }
 
-    /// Whether `q` keeps the limits after `before`, where the tilting joint moved at `rate` (rad/s).
-    fn follows(&self, q: &[f64; 6], before: &[f64; 6], rate: f64) -> Result<(), String> {
+    /// The speed of the tilting joint from `before`, where it was `rate` (rad/s), to `q`, or what is beyond the limits.
+    fn follows(&self, q: &[f64; 6], before: &[f64; 6], rate: f64) -> Result<f64, String> {
         for i in (0..6).filter(|i| *i != self.joint) {
             if (q[i] - before[i]).abs() > self.rounding_rad {
                 return Err(format!("joint {i} is told {} rad after {} rad", q[i], before[i]));
@@ -109,6 +107,6 @@ impl Watch {
         if change > self.acceleration_rad_s2 * self.dt_s + 2.0 * rounding {
             return Err(format!("the tilting joint is told to go from {rate} to {now} rad/s in a cycle"));
         }
-        Ok(())
+        Ok(now)
     }
 }
