@@ -66,7 +66,7 @@ impl Comparison {
             area_px2: measured.area_px2.into(),
             confidence: measured.confidence.into(),
             doubt: measured.doubt,
-            usable: measured.doubt.usable(),
+            usable: measured.is_usable(),
         }
     }
 
