@@ -330,20 +330,13 @@ fn a_joint_that_does_not_follow_ends_the_pour() {
         cell.core.exchange(always(20));
         cell.joint_deg_s = joint_deg_s;
         cell.pour(75.0).expect("ready");
-        let (mut farthest_deg, outcome) = (
-            0.0f32,
-            loop {
-                let output = cell.tick(None);
-                if let Some(outcome) = output.ended {
-                    break outcome;
-                }
-            },
-        );
+        let outcome = cell.finish();
         assert_eq!(outcome.reason, EndReason::NotFollowed, "{joint_deg_s}");
         assert!(cell.alpha_deg.abs() <= 2.0 && cell.out_ml == 0.0, "{joint_deg_s}: {} degrees, {} ml", cell.alpha_deg, cell.out_ml);
         // The same pour again, to look at the commands.
         (0..100).for_each(|_| _ = cell.tick(None));
         cell.pour(75.0).expect("ready again");
+        let mut farthest_deg = 0.0f32;
         while cell.core.phase() == Phase::Pouring {
             let before_deg = cell.alpha_deg;
             let commanded_deg = cell.tick(None).target_deg.unwrap_or(0.0);
