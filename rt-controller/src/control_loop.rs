@@ -109,12 +109,17 @@ impl<'a> LoopState<'a> {
             exchange.late_ticks.fetch_add(1, Relaxed);
         }
 
+        // The memory answers to these while the features are received and the robot's socket is drained.
+        self.core.prefetch(0);
         self.receive_features();
+        self.core.prefetch(1);
         let taken = self.take_agent();
         if self.session.is_none() {
             self.session = exchange.sessions.pop();
         }
+        self.core.prefetch(2);
         let (robot, mut end) = look_at_robot(self.session.as_deref_mut(), woke_ns, self.lost_ns);
+        self.core.prefetch(3);
         let order = exchange.orders.pop();
         self.shutdown |= order == Some(Order::Shutdown);
 
