@@ -4,6 +4,7 @@
 //! |---|---|
 //! | [`this_machine`] | what is known of the machine, and what would make it better |
 //! | [`other_programs`] | cyclictest, the yardstick, and stress-ng, the load |
+//! | [`bare_loop`] | the yardstick of a tick's execution |
 //! | [`tick_times`] | what the controller measured of every tick, from its journal |
 //! | [`statistics`] | percentiles, and histograms for the page |
 //! | [`processes`] | processor time, memory and files of a process |
@@ -12,6 +13,7 @@
 //! | [`soak`] | one long run under load |
 //! | [`measured`] | what a measurement becomes: numbers, text, page |
 
+pub mod bare_loop;
 pub mod cell_run;
 pub mod measured;
 pub mod other_programs;
