@@ -5,6 +5,7 @@ use std::time::{Duration, Instant};
 use rt_controller::client::{Client, ClientError};
 use shared::os::now_ns;
 
+use super::machine_log::MachineLog;
 use super::processes::{Holding, processor_ns};
 use super::tick_times::TickTimes;
 use crate::own_cell::{OwnCell, OwnCellError};
@@ -73,6 +74,7 @@ pub fn run_cell(cell: &mut OwnCell, seconds: u64) -> Result<CellRun, OwnCellErro
     sleep_until(cell, Instant::now() + Duration::from_secs(1))?;
     let (from_ns, from) = (now_ns(), Instant::now());
     let pid = cell.pid("rt-controller");
+    let log = MachineLog::start(pid);
     let spent_ns = processor_ns(pid);
     let rest = Duration::from_secs(seconds) / 3;
     sleep_until(cell, from + rest)?;
@@ -84,8 +86,13 @@ pub fn run_cell(cell: &mut OwnCell, seconds: u64) -> Result<CellRun, OwnCellErro
     let after = client.status().map_err(unreachable)?;
     drop(client);
     cell.stop();
+    let mut ticks = TickTimes::read(cell, from_ns, to_ns)?;
+    let times_ns: Vec<u64> = ticks.worst.iter().map(|w| w.woke_at_ns).collect();
+    for (worst, activity) in ticks.worst.iter_mut().zip(log.around(&times_ns)) {
+        worst.activity = activity;
+    }
     Ok(CellRun {
-        ticks: TickTimes::read(cell, from_ns, to_ns)?,
+        ticks,
         idle_percent,
         controller,
         worker,
