@@ -246,12 +246,13 @@ fn spent() -> (u64, u64) {
 /// The robot as the core sees it, and why its session is over, if it is.
 fn look_at_robot(session: Option<&mut Session>, now_ns: u64, lost_ns: u64) -> (Robot, Option<SessionEnd>) {
     let Some(session) = session else {
-        return (Robot { hindrance: Some(EndReason::RobotLost), alpha_deg: f32::NAN, at_ns: 0 }, None);
+        return (Robot { hindrance: Some(EndReason::RobotLost), ..Robot::that_may_move(f32::NAN, 0) }, None);
     };
     let lost = session.poll(now_ns).err();
     let state = session.state();
     let may_not_move = health::check(state, now_ns, lost_ns).err();
     let hindrance = if lost.is_some() { Some(may_not_move.unwrap_or(EndReason::RobotLost)) } else { may_not_move };
     let end = lost.map(SessionEnd::Lost).or(may_not_move.map(SessionEnd::MayNotMove));
-    (Robot { hindrance, alpha_deg: state.alpha_deg, at_ns: state.received_at_ns }, end)
+    let speed_scaling = state.speed_scaling.map(|share| share as f32);
+    (Robot { hindrance, alpha_deg: state.alpha_deg, at_ns: state.received_at_ns, speed_scaling }, end)
 }

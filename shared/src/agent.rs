@@ -123,6 +123,14 @@ impl Agent {
         }
     }
 
+    /// The lag from a commanded tilt to what a picture shows of it, s, as it was learned from the episodes; `None` if the weights carry none.
+    pub fn learned_lag_s(&self) -> Option<f64> {
+        match &self.weights.estimator {
+            Estimator::Sum => None,
+            Estimator::Fused { model, .. } => Some((model.delay_frames + model.lag_frames) / f64::from(self.weights.rate_hz)),
+        }
+    }
+
     /// Starts a pour: d <- V_G (eq. 4), and everything else is forgotten. A goal that is not a positive number leaves d = 0.
     pub fn start(&mut self, goal_ml: f32) {
         self.goal_ml = Some(goal_ml).filter(|g| g.is_finite() && *g > 0.0);

@@ -2,6 +2,8 @@
 //!
 //! It runs on the connecting thread and allocates. Values that the program could not keep are refused with a [`LinkError`].
 
+use shared::limits::Limits;
+
 use super::{LinkError, LinkOptions};
 
 /// The program as it stands in `robot/pour.script`, with example values.
@@ -10,6 +12,9 @@ pub const SOURCE: &str = include_str!("../../robot/pour.script");
 /// Largest number of cycles that the program averages over, so that its list and its delay stay small. Chosen by hand; no measurement is
 /// recorded.
 const MOST_CYCLES: f64 = 100.0;
+
+/// The lag of a UR's arm behind servoj's path, s (Universal_Robots_Client_Library, issue 86: 34 ms).
+const ARM_LAG_S: f64 = 0.035;
 
 /// The program for `options` on a robot with a control cycle of `cycle_s` (0.008 on CB3, 0.002 on e-Series).
 ///
@@ -70,6 +75,14 @@ pub fn text(options: &LinkOptions, cycle_s: f64, run: i32) -> Result<String, Lin
 /// How long the program waits for a new target before it comes upright, s: 100 ms, or three periods if that is more.
 pub fn patience_s(rate_hz: f64) -> f64 {
     (3.0 / rate_hz).max(0.1)
+}
+
+/// The lag of the joint behind the targets, s: the program walks one period and 8 ms behind them and averages over a period or the braking
+/// time, servoj looks ahead, and the arm takes its own time.
+pub fn usual_lag_s(rate_hz: f64, lookahead_s: f64, limits: &Limits) -> f64 {
+    let period_s = 1.0 / rate_hz;
+    let braking_s = f64::from(limits.rate_deg_s) / f64::from(limits.acceleration_deg_s2);
+    period_s + 0.008 + period_s.max(braking_s) / 2.0 + lookahead_s + ARM_LAG_S
 }
 
 /// A number as URScript reads it: always with a decimal point, never with an exponent.
