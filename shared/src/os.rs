@@ -80,6 +80,17 @@ pub fn end_when_nobody_reads() {
     unsafe { libc::signal(libc::SIGPIPE, libc::SIG_DFL) };
 }
 
+/// Sets a variable of the process's environment, for a library that reads it. It is an error once the process has a second thread.
+pub fn set_variable(name: &str, value: &str) -> Result<(), String> {
+    let threads = std::fs::read_dir("/proc/self/task").map_or(usize::MAX, Iterator::count);
+    if threads != 1 {
+        return Err(format!("{name} cannot be set: the process has {threads} threads already"));
+    }
+    // SAFETY: this is the only thread, as was just counted, so that no other one reads the environment meanwhile.
+    unsafe { std::env::set_var(name, value) };
+    Ok(())
+}
+
 /// A flag that becomes true when the process is asked to end by Ctrl-C or SIGTERM. These signals then no longer end it by themselves.
 pub fn stop_at_signals() -> std::io::Result<Arc<AtomicBool>> {
     let stop = Arc::new(AtomicBool::new(false));
