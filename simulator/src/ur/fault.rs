@@ -59,6 +59,8 @@ pub enum Fault {
     TimeScaling(f64),
     /// The safety configuration lets no joint move faster than this, in degrees/s.
     JointSpeedLimit(f64),
+    /// The arm is held back to this speed, in degrees/s, and nothing tells.
+    HeldBack(f64),
     /// The teach button is pressed, so that the arm can be moved by hand.
     Freedrive,
     /// The teach button is released.
@@ -116,6 +118,7 @@ unlock-protective-stop  unlock a protective stop on the pendant, 5 s after it
 speed-slider=SHARE    move the pendant's speed slider, 0.01 to 1
 time-scaling=SHARE    the controller slows the arm by itself, 0.01 to 1
 joint-speed-limit=DEG_S  the safety configuration limits the joints' speed
+held-back=DEG_S       the arm follows servoj no faster, and nothing tells
 freedrive             press the teach button
 freedrive-end         release it
 hand-move=JOINT:DEG   move a joint by hand; needs freedrive and no program
@@ -179,6 +182,7 @@ impl FromStr for Fault {
             "unlock-protective-stop" => plain(Fault::UnlockProtectiveStop),
             "time-scaling" => number(0.01, 1.0, "a share").map(Fault::TimeScaling),
             "joint-speed-limit" => number(1.0, 180.0, "degrees a second").map(Fault::JointSpeedLimit),
+            "held-back" => number(1.0, 180.0, "degrees a second").map(Fault::HeldBack),
             "freedrive" => plain(Fault::Freedrive),
             "freedrive-end" => plain(Fault::FreedriveEnd),
             "hand-move" => joint_and_degrees(given()?).map(|(joint, deg)| Fault::HandMove(joint, deg)).ok_or_else(|| fail(MOVE)),
@@ -254,6 +258,7 @@ impl fmt::Display for Fault {
             Fault::UnlockProtectiveStop => f.write_str("unlock-protective-stop"),
             Fault::TimeScaling(share) => write!(f, "time-scaling={share}"),
             Fault::JointSpeedLimit(limit) => write!(f, "joint-speed-limit={limit}"),
+            Fault::HeldBack(speed) => write!(f, "held-back={speed}"),
             Fault::Freedrive => f.write_str("freedrive"),
             Fault::FreedriveEnd => f.write_str("freedrive-end"),
             Fault::HandMove(joint, deg) => write!(f, "hand-move={}:{deg}", joint_name(*joint)),

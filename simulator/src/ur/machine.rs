@@ -8,6 +8,7 @@ use super::log::LogLine;
 use super::power::{Power, RobotMode};
 use super::program::{Programs, RuntimeState};
 use super::robot::Robot;
+use super::script::Effort;
 use super::servo;
 use super::variables::{Series, Version};
 
@@ -123,6 +124,16 @@ impl Machine {
     /// Lets the next programs start `late_s` later than usual.
     pub fn set_late_start(&mut self, late_s: f64) {
         self.programs.set_late_start(late_s);
+    }
+
+    /// Lets the programs that are uploaded from now on compute with floats of 32 bits instead of 64.
+    pub fn set_single_precision(&mut self, single: bool) {
+        self.programs.set_single_precision(single);
+    }
+
+    /// What the interpreted program did in the last control cycle; nothing when none is loaded.
+    pub fn program_effort(&self) -> Effort {
+        self.programs.effort()
     }
 
     /// Takes the log lines written since the last call.

@@ -69,6 +69,8 @@ pub struct Servo {
     motion: ArmMotion,
     /// Largest joint speed that the safety configuration allows, in rad/s.
     speed_limit_rad_s: f64,
+    /// Largest joint speed that the arm reaches, whatever the controller knows of it, in rad/s.
+    held_rad_s: f64,
     /// The share of its path's speed at which the speed limit lets the arm move at present, 0 to 1.
     limiting: f64,
     /// The speed along the path of an arm that nothing slows; target_qd is the speed of the arm as it is slowed.
@@ -91,6 +93,7 @@ impl Servo {
             actual_qd: zero,
             motion: ArmMotion::Hold,
             speed_limit_rad_s: MAX_SPEED_RAD_S,
+            held_rad_s: MAX_SPEED_RAD_S,
             limiting: 1.0,
             path_qd: zero,
             slowed: false,
@@ -101,6 +104,11 @@ impl Servo {
     /// its path more slowly.
     pub fn set_speed_limit(&mut self, speed_rad_s: f64) {
         self.speed_limit_rad_s = speed_rad_s;
+    }
+
+    /// Holds servoj back to `speed_rad_s` from now on, without a word: nothing tells, and servoj takes no longer.
+    pub fn hold_back(&mut self, speed_rad_s: f64) {
+        self.held_rad_s = speed_rad_s;
     }
 
     /// The share of its path's speed at which the speed limit lets the arm move at present, 0 to 1.
@@ -271,7 +279,7 @@ impl Servo {
                 let (q, v) = (self.target_q[i], self.path_qd[i]);
                 let wanted = (v + h * gain * (self.commanded_q[i] - q)) / (1.0 + h * gain * (lookahead_s + h));
                 let most = MAX_ACCELERATION_RAD_S2 * h;
-                let speed = (v + (wanted - v).clamp(-most, most)).clamp(-MAX_SPEED_RAD_S, MAX_SPEED_RAD_S);
+                let speed = (v + (wanted - v).clamp(-most, most)).clamp(-self.held_rad_s, self.held_rad_s);
                 self.path_qd[i] = speed;
                 self.target_q[i] += h * speed;
             }

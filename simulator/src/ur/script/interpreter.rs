@@ -174,11 +174,14 @@ impl Interpreter {
                 return Err(ScriptError::new(line, what));
             }
             *budget -= 1;
-            // A statement is a line's instructions in a row; a jump back to the same line begins it anew.
-            if line != counted.0 || call.at < counted.1 {
-                self.effort.statements += 1;
+            // A statement is a line's instructions in a row; a jump back to the same line begins it anew. The jumps that end a branch or
+            // a pass of a loop belong to no statement.
+            if !matches!(op, Op::Jump(_)) {
+                if line != counted.0 || call.at < counted.1 {
+                    self.effort.statements += 1;
+                }
+                counted = (line, call.at);
             }
-            counted = (line, call.at);
             self.effort.calls += u32::from(matches!(op, Op::Call(_) | Op::Builtin(_)));
             self.effort.instructions += 1;
             call.at += 1;

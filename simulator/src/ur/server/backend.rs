@@ -89,6 +89,7 @@ impl Backend {
             }
             Fault::TimeScaling(share) => self.machine.robot.set_own_scaling(*share),
             Fault::JointSpeedLimit(deg_s) => self.machine.robot.servo.set_speed_limit(deg_s.to_radians()),
+            Fault::HeldBack(deg_s) => self.machine.robot.servo.hold_back(deg_s.to_radians()),
             Fault::Freedrive => self.machine.set_freedrive(true),
             Fault::FreedriveEnd => self.machine.set_freedrive(false),
             Fault::HandMove(joint, deg) => self.machine.move_joint(joint.index(), deg.to_radians(), true),
@@ -109,6 +110,7 @@ impl Backend {
                 self.machine.set_late_start(0.0);
                 self.machine.robot.set_own_scaling(1.0);
                 self.machine.robot.servo.set_speed_limit(MAX_SPEED_RAD_S);
+                self.machine.robot.servo.hold_back(MAX_SPEED_RAD_S);
             }
             Fault::Fin | Fault::Reset | Fault::Text(_) => {}
         }
