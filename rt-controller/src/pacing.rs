@@ -5,8 +5,8 @@
 //! phase, by at most [`PULL_MAX_NS`] (0.6 % of the period), until V_e has waited for the margin when it is used. A camera whose rate
 //! differs by more is not followed; the loop's rate then wanders within that 0.6 %.
 //!
-//! The margin follows what this machine does. It covers by half as much again the latest that V_e came, relative to its usual time, within
-//! the last 30 to 60 s, and [`MARGIN_FLOOR_NS`] more. A tick that wakes up late needs no margin, because V_e is then there all the more.
+//! The margin follows what this machine does. It is twice what V_e came late at most, relative to its usual time, within the last 10 to 20 s,
+//! and [`MARGIN_FLOOR_NS`] more. A tick that wakes up late needs no margin, because V_e is then there all the more.
 //!
 //! It is pure and runs in the real-time thread; it does not allocate or fail. What it sees stands in the journal, so that every deadline
 //! can be computed again.
@@ -16,8 +16,8 @@
 const MARGIN_FLOOR_NS: i64 = 300_000;
 /// The largest margin, ns, and the one before anything is known: more than the jitter of a loaded machine. See docs/REALTIME.md.
 pub const MARGIN_MAX_NS: i64 = 3_000_000;
-/// Number of measurements in a window: 30 s at 30 Hz. The latest V_e of this window and the one before decides.
-const WINDOW: u32 = 900;
+/// Number of measurements in a window: 10 s at 30 Hz. The latest V_e of this window and the one before decides.
+const WINDOW: u32 = 300;
 /// Largest change of a period, ns: 0.6 % of the period at 30 Hz. Chosen by hand; no measurement is recorded.
 pub const PULL_MAX_NS: i64 = 200_000;
 /// One tick corrects this part of the phase's error, 1 / 8, because the measurement of a single frame is noise. Chosen by hand; no
@@ -49,8 +49,8 @@ pub struct Pacer {
 impl Pacer {
     /// The pacer of a loop with this period, ns.
     pub fn new(period_ns: u64) -> Self {
-        // Until two windows have passed, it counts as if V_e had come as late as the largest margin allows.
-        let latest_ns = [MARGIN_MAX_NS; 2];
+        // Until a window has passed, it counts as if V_e had come as late as the largest margin allows.
+        let latest_ns = [0, MARGIN_MAX_NS];
         Self { period_ns, wait_ns: None, drift_ns: 0, margin_ns: MARGIN_MAX_NS, latest_ns, seen: 0, known: 0 }
     }
 
@@ -81,7 +81,7 @@ impl Pacer {
             (self.seen, self.latest_ns) = (0, [0, self.latest_ns[0]]);
         }
         let latest_ns = self.latest_ns[0].max(self.latest_ns[1]);
-        self.margin_ns = (MARGIN_FLOOR_NS + latest_ns + latest_ns / 2).clamp(MARGIN_FLOOR_NS, MARGIN_MAX_NS);
+        self.margin_ns = (MARGIN_FLOOR_NS + 2 * latest_ns).clamp(MARGIN_FLOOR_NS, MARGIN_MAX_NS);
     }
 
     /// A duration less as many periods as bring it nearest to 0, ns.
@@ -137,7 +137,7 @@ mod tests {
 
     /// A number between 0 and 999 that looks random, from a frame's number.
     fn noise(frame: u64) -> u64 {
-        frame.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407) >> 33 & 0xffff_ffff_u64 % 1000
+        (frame.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407) >> 33) % 1000
     }
 
     /// Protects the age of V_e: from any start, and with a camera 0.3 % fast or slow, it waits only for the least margin where it comes at its

@@ -106,6 +106,8 @@ impl Condition {
             "ticks lost {}, later than half a period {}; loop: {allocations} allocations, {page_faults} page faults",
             ticks.lost, ticks.late
         ));
+        let [none, one, more] = ticks.with_frames;
+        facts.push(format!("ticks with one frame {one}, with none {none}, with more {more}"));
         if let Some(last) = self.cells.last() {
             let (controller, worker) = (last.controller, last.worker);
             facts.push(format!(
@@ -135,7 +137,7 @@ impl Condition {
         };
         let mut numbers = json!({
             "table": table, "ratios": ratios, "rounds": self.rounds.iter().map(Ratios::json).collect::<Vec<_>>(),
-            "lost_ticks": ticks.lost, "late_ticks": ticks.late, "idle_percent": self.idle_percent(),
+            "ticks_with_frames": ticks.with_frames, "lost_ticks": ticks.lost, "late_ticks": ticks.late, "idle_percent": self.idle_percent(),
             "loop_allocations": self.cells.iter().map(|r| r.allocations).sum::<u64>(),
             "loop_page_faults": self.cells.iter().map(|r| r.page_faults).sum::<u64>(),
             "worst_ticks": ticks.worst.iter().map(worst).collect::<Vec<_>>(),

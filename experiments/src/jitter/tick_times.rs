@@ -80,6 +80,8 @@ pub struct TickTimes {
     pub worst: Vec<WorstTick>,
     /// Durations in us, in the order of [`Span`].
     pub spans_us: [Vec<f64>; SPANS.len()],
+    /// Number of ticks with no frame, with one, and with more.
+    pub with_frames: [u64; 3],
     /// Number of periods without a tick.
     pub lost: u64,
     /// Number of ticks later than half a period.
@@ -123,6 +125,7 @@ impl TickTimes {
                 push(Span::CaptureToWritten, us(feature.captured_at_ns, times.written_at_ns));
                 push(Span::ReceivedToWritten, us(feature.received_at_ns, times.written_at_ns));
             }
+            ticks.with_frames[tick.features.len().min(2)] += 1;
             let (execution_us, frames) = (us(woke_ns, times.done_ns), tick.features.len());
             ticks.keep_worst([WorstTick { woke_at_ns: woke_ns, lateness_us: lateness, execution_us, frames, pouring, activity: None }]);
         });
@@ -164,6 +167,7 @@ impl TickTimes {
             sum.extend_from_slice(part);
         }
         self.keep_worst(other.worst.iter().copied());
+        self.with_frames.iter_mut().zip(other.with_frames).for_each(|(sum, part)| *sum += part);
         self.lost += other.lost;
         self.late += other.late;
     }
