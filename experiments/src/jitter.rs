@@ -14,6 +14,7 @@
 //! | [`cell_run`] | one run of the cell: at rest, then pouring |
 //! | [`condition`] | what was measured at rest, or under load, and how it is told |
 //! | [`rounds`] | the cell and its yardsticks in turns |
+//! | [`storm`] | everything at once that other programs can do to a cell |
 //! | [`soak`] | one long run under load |
 //! | [`measured`] | what a measurement becomes: numbers, text, page |
 
@@ -29,6 +30,7 @@ pub mod ratios;
 pub mod rounds;
 pub mod soak;
 pub mod statistics;
+pub mod storm;
 pub mod this_machine;
 pub mod tick_times;
 

@@ -1,4 +1,4 @@
-//! The cell and its yardsticks in turns, at rest and under load.
+//! The cell and its yardsticks in turns, at rest, under load, and in a storm of other programs' questions.
 //!
 //! Ordinary thread; allocates and blocks. Their order changes from round to round, so that warming up affects all alike.
 
@@ -13,7 +13,7 @@ use super::ratios::Ratios;
 use crate::own_cell::{OwnCell, OwnCellError};
 
 /// The conditions under which the machine is measured.
-const CONDITIONS: [&str; 2] = ["at rest", "under load"];
+const CONDITIONS: [&str; 3] = ["at rest", "under load", "in a storm"];
 /// Length of a quick run's cell and of its yardsticks, s: with starting and stopping, less than 60 s in all.
 const QUICK_S: [u64; 2] = [18, 10];
 /// Parts into which a quick run's ticks are cut in place of rounds: each has more than 100 ticks.
@@ -28,12 +28,13 @@ pub fn measure(cell: &mut OwnCell, rounds: usize, seconds: u64) -> Result<Measur
     for round in 0..rounds {
         for condition in &mut conditions {
             let _load = if condition.name == CONDITIONS[1] { Some(load()?) } else { None };
+            let storm = condition.name == CONDITIONS[2];
             for turn in 0..3 {
                 let say = |cell: &OwnCell, what: &str| cell.note(&format!("round {} of {rounds}: {what} {}", round + 1, condition.name));
                 match (turn + round) % 3 {
                     0 => {
                         say(cell, "the cell");
-                        condition.cells.push(run_cell(cell, seconds)?);
+                        condition.cells.push(run_cell(cell, seconds, storm)?);
                     }
                     1 => {
                         say(cell, "cyclictest");
@@ -64,7 +65,7 @@ pub fn measure_quickly(cell: &mut OwnCell) -> Result<Measured, OwnCellError> {
     cell.note("quick: the bare loop");
     let bare = bare_loop::run(cell, yardstick_s)?;
     cell.note("quick: the cell");
-    let run: CellRun = run_cell(cell, cell_s)?;
+    let run: CellRun = run_cell(cell, cell_s, false)?;
     cell.note("quick: cyclictest");
     let cyclictest = run_cyclictest(cell, yardstick_s)?;
     condition.rounds = run.ticks.parts(QUICK_PARTS).iter().map(|part| Ratios::new(part, &cyclictest, &bare)).collect();
