@@ -7,6 +7,7 @@
 use super::log::LogLine;
 use super::power::{Power, RobotMode};
 use super::program::{Programs, RuntimeState};
+use super::registers::Registers;
 use super::robot::Robot;
 use super::script::Effort;
 use super::servo;
@@ -261,10 +262,12 @@ impl Machine {
         may
     }
 
-    /// Makes the controller look as after its boot: no power, and no program was ever there.
+    /// Makes the controller look as after its boot: no power, empty registers, and no program was ever there.
     pub fn boot(&mut self) {
         self.power_off();
         self.programs.boot();
+        self.robot.inputs = Registers::default();
+        self.robot.outputs = Registers::default();
         self.robot.event("booted");
     }
 
