@@ -162,6 +162,13 @@ impl Core {
         self.run.is_none()
     }
 
+    /// Brings a part of what the next step reads into the processor's caches ([`Agent::prefetch`]). It changes no result.
+    pub fn prefetch(&self, part: usize) {
+        if let Some(agent) = &self.agent {
+            agent.prefetch(part);
+        }
+    }
+
     /// Takes `agent` for the next pours and gives the old one back, in constant time. Call it only when [`Core::may_exchange`];
     /// otherwise the new one comes back unused.
     pub fn exchange(&mut self, agent: Box<Agent>) -> Option<Box<Agent>> {

@@ -17,6 +17,7 @@ use shared::messages::Feature;
 use shared::weights::Weights;
 
 use crate::core::{Core, Input, MAX_FEATURES, Order, Robot, Settings};
+use crate::pacing::Pacer;
 
 /// The first bytes of a journal, which include its version.
 const MAGIC: &[u8; 8] = b"decantj3";
@@ -55,8 +56,10 @@ pub struct Times {
     pub decided_at_ns: u64,
     /// When the kernel had taken the target's bytes; 0 if no target was written.
     pub written_at_ns: u64,
-    /// When everything was done except queueing this entry.
+    /// When everything was done except queueing this entry. The next deadline is reckoned with it.
     pub done_ns: u64,
+    /// How long V_e was to have waited for this tick, ns ([`crate::pacing`]).
+    pub margin_ns: u64,
 }
 
 /// One entry of the file.
@@ -97,9 +100,9 @@ pub enum JournalError {
     },
 }
 
-/// Writes a journal, from an ordinary thread.
-pub struct Writer {
-    file: BufWriter<File>,
+/// Writes a journal, from an ordinary thread, to a file or to anything else that takes bytes.
+pub struct Writer<W: Write = BufWriter<File>> {
+    to: W,
     written: u64,
 }
 
@@ -111,8 +114,15 @@ impl Writer {
         }
         // The journal of the run before is wanted most after that run has crashed.
         let _ = std::fs::rename(path, path.with_extension("before.bin"));
-        let mut this = Self { file: BufWriter::new(File::create(path)?), written: 0 };
-        this.file.write_all(MAGIC)?;
+        Self::begin(BufWriter::new(File::create(path)?), settings)
+    }
+}
+
+impl<W: Write> Writer<W> {
+    /// Starts a journal that goes to `to`.
+    pub fn begin(to: W, settings: &Settings) -> std::io::Result<Self> {
+        let mut this = Self { to, written: 0 };
+        this.to.write_all(MAGIC)?;
         this.entry(&Entry::Settings(*settings))?;
         Ok(this)
     }
@@ -130,7 +140,7 @@ impl Writer {
 
     /// Passes everything that was added on to the operating system.
     pub fn flush(&mut self) -> std::io::Result<()> {
-        self.file.flush()
+        self.to.flush()
     }
 
     fn entry(&mut self, entry: &Entry) -> std::io::Result<()> {
@@ -140,8 +150,8 @@ impl Writer {
         let mut buffer = vec![0; ENTRY_MAX];
         let bytes = postcard::to_slice(entry, &mut buffer).map_err(std::io::Error::other)?;
         self.written += 4 + bytes.len() as u64;
-        self.file.write_all(&(bytes.len() as u32).to_le_bytes())?;
-        self.file.write_all(bytes)
+        self.to.write_all(&(bytes.len() as u32).to_le_bytes())?;
+        self.to.write_all(bytes)
     }
 }
 
@@ -156,21 +166,30 @@ pub struct Replay {
     pub different: u64,
     /// Number of the first of those ticks, counted from 0.
     pub first_different: Option<u64>,
+    /// Number of ticks whose deadline or margin is not the one that follows from the ticks before.
+    pub different_deadlines: u64,
     /// Whether the file ends in the middle of an entry.
     pub cut_off: bool,
 }
 
-/// Replays a journal through a new [`Core`] and compares every answer bit by bit. `seen` is called with each tick and the answer that the
-/// replay gave.
-pub fn replay(path: &Path, mut seen: impl FnMut(&Tick, &crate::core::Output)) -> Result<Replay, JournalError> {
+/// Replays the journal in a file. See [`replay_from`].
+pub fn replay(path: &Path, seen: impl FnMut(&Tick, &crate::core::Output)) -> Result<Replay, JournalError> {
     let file = path.display().to_string();
+    let reader = File::open(path).map_err(|e| JournalError::Read { file: file.clone(), what: e.to_string() })?;
+    replay_from(BufReader::new(reader), &file, seen)
+}
+
+/// Replays a journal through a new [`Core`] and compares every answer bit by bit. `name` is what errors call the journal; `seen` is called with each tick and the answer that the
+/// replay gave.
+pub fn replay_from(mut reader: impl Read, name: &str, mut seen: impl FnMut(&Tick, &crate::core::Output)) -> Result<Replay, JournalError> {
+    let file = name.to_owned();
     let read = |e: std::io::Error| JournalError::Read { file: file.clone(), what: e.to_string() };
-    let mut reader = BufReader::new(File::open(path).map_err(read)?);
     let mut magic = [0; 8];
     if reader.read_exact(&mut magic).is_err() || &magic != MAGIC {
         return Err(JournalError::Foreign { file });
     }
-    let mut result = Replay { ticks: 0, ended: Vec::new(), different: 0, first_different: None, cut_off: false };
+    let mut result = Replay { ticks: 0, ended: Vec::new(), different: 0, first_different: None, different_deadlines: 0, cut_off: false };
+    let mut pacing: Option<(Pacer, Option<u64>)> = None;
     let mut core: Option<Core> = None;
     let mut weights = BTreeMap::new();
     let mut at = MAGIC.len() as u64;
@@ -192,7 +211,10 @@ pub fn replay(path: &Path, mut seen: impl FnMut(&Tick, &crate::core::Output)) ->
             break;
         }
         match (postcard::from_bytes(&buffer).map_err(|_| damaged())?, &mut core) {
-            (Entry::Settings(settings), _) => core = Some(Core::new(settings)),
+            (Entry::Settings(settings), _) => {
+                pacing = Some((Pacer::new(settings.period_ns), None));
+                core = Some(Core::new(settings));
+            }
             (Entry::Weights(identity, bytes), _) => {
                 weights.insert(identity, Weights::from_bytes(&bytes, &file).map_err(|_| damaged())?);
             }
@@ -207,6 +229,12 @@ pub fn replay(path: &Path, mut seen: impl FnMut(&Tick, &crate::core::Output)) ->
                 if !same {
                     result.different += 1;
                     result.first_different.get_or_insert(result.ticks);
+                }
+                if let Some((pacer, deadline_ns)) = &mut pacing {
+                    let same = deadline_ns.is_none_or(|ns| ns == tick.times.deadline_ns) && pacer.margin_ns() == tick.times.margin_ns;
+                    result.different_deadlines += u64::from(!same);
+                    tick.features.iter().for_each(|f| pacer.used(now_ns, f.published_at_ns));
+                    *deadline_ns = Some(pacer.next_deadline_ns(tick.times.deadline_ns, tick.times.done_ns).0);
                 }
                 result.ticks += 1;
                 result.ended.extend(output.ended);

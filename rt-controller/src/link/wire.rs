@@ -31,6 +31,9 @@ const LARGEST: usize = u16::MAX as usize;
 /// Number of bytes of a packet with one target: header, recipe id, and the values of `INPUTS`.
 pub const TARGET_LEN: usize = HEADER + 1 + bytes_of(&INPUTS);
 
+/// Number of bytes of a packet with the robot's state: header, recipe id, and the values of `OUTPUTS`.
+pub const STATE_LEN: usize = HEADER + 1 + bytes_of(&OUTPUTS);
+
 /// One whole packet.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Packet<'a> {
