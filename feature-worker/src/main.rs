@@ -31,7 +31,7 @@ enum Command {
 
 fn main() -> ExitCode {
     shared::exit::end(match Cli::parse().command {
-        Command::Run(args) => run::run(&args),
+        Command::Run(args) => return shared::exit::end_resident(run::run(&args)),
         Command::Calibrate(args) => calibrate::run(&args),
         Command::View(args) => view::run(&args),
         Command::Inspect(args) => inspect::run(&args),

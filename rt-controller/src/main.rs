@@ -42,7 +42,7 @@ fn main() -> ExitCode {
         shared::os::end_when_nobody_reads();
     }
     shared::exit::end(match command {
-        Command::Run(args) => run::run(&args),
+        Command::Run(args) => return shared::exit::end_resident(run::run(&args)),
         Command::Pour(args) => pour::run(&args),
         Command::Record(args) => record::run(&args),
         Command::Abort(args) => abort::run(&args),

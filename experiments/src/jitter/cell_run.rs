@@ -80,7 +80,7 @@ pub fn run_cell(cell: &mut OwnCell, seconds: u64) -> Result<CellRun, OwnCellErro
     pour_until(cell, from + Duration::from_secs(seconds))?;
     let to_ns = now_ns();
     let (controller, worker) = (Holding::of(pid), Holding::of(cell.pid("feature-worker")));
-    let client = Client::connect(&cell.config.cell.name).map_err(unreachable)?;
+    let client = Client::connect(&cell.config.cell).map_err(unreachable)?;
     let after = client.status().map_err(unreachable)?;
     drop(client);
     cell.stop();
