@@ -62,6 +62,7 @@ fn measure_until_stopped(
             format!("cell '{}': service 'feature': {e:?}; is another feature worker running? Stop it first", config.cell.name),
         )
     })?;
+    cell.reserve().or_exit(exit::UNREACHABLE)?;
     // The republisher comes before the camera is opened: a view that holds the camera sees it and lets go.
     let republisher = match config.camera.source {
         CameraSource::SharedMemory => None,
@@ -70,7 +71,6 @@ fn measure_until_stopped(
     let source = open_source(config, &cell, stop)?;
     // Threads inherit the core and the priority, so the other threads start first.
     let recorder = Recorder::start(config).or_exit(exit::FAILED)?;
-    cell.reserve().or_exit(exit::UNREACHABLE)?;
     let latest = Arc::new(ArrayQueue::new(1));
     let printer = status::start_printer(&latest, stop, speaker, json).map_err(|e| failure(exit::FAILED, format!("status thread: {e}")))?;
     for missing in os::become_realtime(config.worker.core, config.worker.priority) {

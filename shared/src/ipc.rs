@@ -143,7 +143,7 @@ impl Cell {
         Ok(Self { node, name, membership })
     }
 
-    /// Has the system set memory aside for everything that the cell has in `/dev/shm` so far. Call it when the ports are made and before
+    /// Has the system set memory aside for what was made in `/dev/shm` since this process joined. Call it when the ports are made and before
     /// they are used, so that a full `/dev/shm` is an error and not the end of the process.
     pub fn reserve(&self) -> Result<(), IpcError> {
         self.membership.reserve().map_err(|what| IpcError::Memory { cell: self.name.clone(), what })

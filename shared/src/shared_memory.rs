@@ -7,7 +7,7 @@
 //! Ordinary threads call this when they join a cell; it allocates and waits for the disk, at most two seconds for another process that is
 //! joining too. Every failure is a [`SharedMemoryError`] of one line.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::fs::{File, OpenOptions};
 use std::io::{Read, Write};
 use std::os::unix::fs::{MetadataExt, OpenOptionsExt, PermissionsExt};
@@ -76,6 +76,8 @@ static HELD: Mutex<BTreeMap<String, (File, usize)>> = Mutex::new(BTreeMap::new()
 #[derive(Debug)]
 pub struct Membership {
     token: String,
+    /// The files that were there before.
+    before: BTreeSet<PathBuf>,
 }
 
 impl Membership {
@@ -97,7 +99,7 @@ impl Membership {
         if let Some(token) = read_token(&file) {
             if let Some((_, uses)) = held.get_mut(&token) {
                 *uses += 1;
-                return Ok(Self { token });
+                return Ok(Self::new(token));
             }
             // Whoever still uses the token holds its lock, so that it was not cleared.
             let path = lock_path(&token);
@@ -105,7 +107,7 @@ impl Membership {
                 && share(&lock, &path)
             {
                 held.insert(token.clone(), (lock, 1));
-                return Ok(Self { token });
+                return Ok(Self::new(token));
             }
         }
         let (token, lock) = new_token(directory)?;
@@ -113,7 +115,12 @@ impl Membership {
         let new = directory.join("token.new");
         std::fs::write(&new, &token).and_then(|()| std::fs::rename(&new, &file)).map_err(|e| failed(&file, e))?;
         held.insert(token.clone(), (lock, 1));
-        Ok(Self { token })
+        Ok(Self::new(token))
+    }
+
+    fn new(token: String) -> Self {
+        let before = files(&prefix(&token)).into_iter().collect();
+        Self { token, before }
     }
 
     /// The first part of the names of the cell's files in `/dev/shm`.
@@ -131,10 +138,10 @@ impl Membership {
         }
     }
 
-    /// Has the system set memory aside for all of the cell's files. iceoryx2 only states their size; without this the process that first
-    /// writes a page of a full `/dev/shm` is killed.
+    /// Has the system set memory aside for the cell's files that were made since this process joined. iceoryx2 only states their size;
+    /// without this the process that first writes a page of a full `/dev/shm` is killed.
     pub fn reserve(&self) -> Result<(), SharedMemoryError> {
-        for path in files(&self.prefix()) {
+        for path in files(&self.prefix()).into_iter().filter(|f| !self.before.contains(f)) {
             let Ok(file) = open(&path, false) else { continue };
             let Ok(bytes) = file.metadata().map(|m| m.len()) else { continue };
             if bytes > 0 && rustix::fs::fallocate(&file, rustix::fs::FallocateFlags::empty(), 0, bytes).is_err() {

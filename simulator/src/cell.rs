@@ -152,7 +152,12 @@ pub fn simulate(config: Config, simulated: SimulatorConfig) -> Result<(), Box<dy
     let rig = simulated.rig();
     let state = CellState { container: Mutex::new(rig.container(simulated.fill_ml)), rig, robot, config, simulated, stop };
 
+    let lost = "simulator: shared memory vanished: /dev/shm is full, or a file there was cut. The simulated cell ends";
+    os::explain_bus_errors(lost, shared::exit::FAILED, Arc::clone(&state.stop));
     let cell = Cell::join(&state.config.cell)?;
+    let view = &state.simulated.view;
+    // The driver has room for 17 frames.
+    cell.check_space(18 * u64::from(view.width_px) * u64::from(view.height_px) * PixelFormat::Bgr8.bytes_per_pixel() as u64)?;
     let socket = operator_socket(&state.config.cell);
     if UnixStream::connect(&socket).is_ok() {
         return Err(format!(

@@ -103,15 +103,34 @@ impl CellUnderTest {
     pub fn spawn(&mut self, name: &str) {
         let log =
             std::fs::OpenOptions::new().create(true).append(true).open(self.dir.path().join(format!("{name}.log"))).expect("writable");
-        let child = Command::new(program(name))
-            .args(["run", "--config"])
-            .arg(self.config())
-            .stdin(Stdio::null())
-            .stdout(Stdio::null())
-            .stderr(log)
-            .spawn()
-            .expect("the program starts");
-        self.processes.push((name.into(), child));
+        self.spawn_with(name, Command::new(program(name)), log.into());
+    }
+
+    /// Starts `command`, which is or becomes the program `name`, with the command `run`; it says what it says to `stderr`.
+    pub fn spawn_with(&mut self, name: &str, mut command: Command, stderr: Stdio) {
+        command.args(["run", "--config"]).arg(self.config()).stdin(Stdio::null()).stdout(Stdio::null()).stderr(stderr);
+        self.processes.push((name.into(), command.spawn().expect("the program starts")));
+    }
+
+    /// The cell's runtime directory.
+    pub fn runtime_dir(&self) -> PathBuf {
+        shared::runtime_dir::Place::from(&self.name).path()
+    }
+
+    /// The cell's files in `/dev/shm`; none if no process has joined the cell.
+    pub fn shared_memory(&self) -> Vec<PathBuf> {
+        let Ok(token) = std::fs::read_to_string(self.runtime_dir().join("token")) else { return Vec::new() };
+        let ours = |e: &std::fs::DirEntry| e.file_name().to_string_lossy().starts_with(&format!("decant-{token}_"));
+        std::fs::read_dir("/dev/shm").expect("there").flatten().filter(ours).map(|e| e.path()).collect()
+    }
+
+    /// Starts a pour and waits until the container is tilted. The cell has weights that pour and a full container.
+    pub fn pour_tilted(&self) -> Child {
+        self.json("simulator", &["operator", "fill", "300", "--json"]);
+        self.wait_idle();
+        let pour = self.begin("rt-controller", &["pour", "200", "--json"]);
+        self.wait("tilt", Duration::from_secs(10), |s| s["alpha_measured_deg"].as_f64() > Some(30.0));
+        pour
     }
 
     /// What a process has printed so far.

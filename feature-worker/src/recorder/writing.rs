@@ -95,6 +95,7 @@ impl RecorderThread {
         let fail = |service: &str, what: String| IpcError::Service { service: service.into(), what };
         let telemetry = cell.telemetry()?.subscriber_builder().create().map_err(|e| fail("telemetry", format!("{e:?}")))?;
         let reports = cell.recorder()?.publisher_builder().create().map_err(|e| fail("recorder", format!("{e:?}")))?;
+        cell.reserve()?;
         let encoder = Encoder::new(&config);
         Ok(Self {
             config,

@@ -142,6 +142,7 @@ fn run_threads(
     cell.check_space(SHARED_MEMORY).or_exit(exit::FAILED)?;
     let (disk, queues) = Disk::open(config, owner, exchange, refused, say).or_exit(exit::BAD_INPUT)?;
     let service = Service::open(&cell, exchange, (note, connections), (refused, queues), say).or_exit(exit::FAILED)?;
+    cell.reserve().or_exit(exit::FAILED)?;
     std::thread::scope(|scope| {
         let (ready_sender, ready) = std::sync::mpsc::channel();
         thread("loop").spawn_scoped(scope, move || real_time(config, exchange, say, &ready_sender)).map_err(no_thread)?;
