@@ -42,7 +42,8 @@ fn a_terminal_that_takes_nothing_holds_nobody() {
         let (reader, writer) = full_pipe();
         let (master, slave) = stopped_terminal();
         for name in ["feature-worker", "rt-controller"] {
-            let stderr = if kind == "pipe" { writer.try_clone().expect("a copy").into() } else { slave.try_clone().expect("a copy").into() };
+            let stderr =
+                if kind == "pipe" { writer.try_clone().expect("a copy").into() } else { slave.try_clone().expect("a copy").into() };
             cell.spawn_with(name, Command::new(program(name)), stderr);
         }
         cell.wait_idle();
