@@ -20,6 +20,7 @@ use std::time::{Duration, Instant};
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
 use serde::{Deserialize, Serialize};
 use shared::messages::Phase;
+use shared::os::peer_uid;
 use shared::runtime_dir::own_uid;
 
 use crate::exchange::Exchange;
@@ -70,11 +71,6 @@ fn is_taken(uid: u32, name: &str) -> bool {
     let address = SocketAddr::from_abstract_name(abstract_name(uid, name));
     let stream = address.and_then(|a| UnixStream::connect_addr(&a));
     stream.is_ok_and(|s| peer_uid(&s) == Some(own_uid()))
-}
-
-/// User number of the process at the other end.
-pub fn peer_uid(stream: &UnixStream) -> Option<u32> {
-    rustix::net::sockopt::socket_peercred(stream).ok().map(|c| c.uid.as_raw())
 }
 
 impl StopSockets {

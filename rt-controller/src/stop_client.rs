@@ -11,10 +11,11 @@ use std::path::PathBuf;
 use std::sync::mpsc;
 use std::time::Duration;
 
+use shared::os::peer_uid;
 use shared::runtime_dir::{Place, bases, own_uid};
 
 use crate::claim;
-use crate::stop::{StopAnswer, abstract_name, peer_uid};
+use crate::stop::{StopAnswer, abstract_name};
 
 /// Longest wait for an answer. Chosen by hand: the controller's thread answers at once.
 const ANSWER: Duration = Duration::from_secs(1);

