@@ -29,7 +29,19 @@ enum Command {
     Bench(bench::Args),
 }
 
+/// Keeps OpenCV and its decoders from writing to the terminal by themselves: every fault that they report is an error of ours, with what to
+/// do. Whoever sets the variables differently gets the messages.
+fn quiet_libraries() {
+    for (name, value) in [("OPENCV_LOG_LEVEL", "SILENT"), ("OPENCV_FFMPEG_LOGLEVEL", "-8"), ("OPENCV_VIDEOIO_DEBUG", "0")] {
+        if std::env::var_os(name).is_none() {
+            // If it cannot be set there is more to read, and nothing is wrong.
+            let _ = shared::os::set_variable(name, value);
+        }
+    }
+}
+
 fn main() -> ExitCode {
+    quiet_libraries();
     let command = Cli::parse().command;
     if matches!(command, Command::Calibrate(_) | Command::View(_)) {
         let lost = "error: shared memory vanished: /dev/shm is full, or a file there was cut";

@@ -137,7 +137,7 @@ struct Newest {
 impl Worker<'_> {
     fn work(&mut self, mut frames: FrameStream<Source>) -> Result<(), Failure> {
         loop {
-            match frames.wait().or_exit(exit::UNREACHABLE)? {
+            match frames.wait().map_err(|e| failure(e.exit_code(), e))? {
                 StreamEvent::Frame(frame) => self.take(&frame)?,
                 StreamEvent::Nothing => {}
                 StreamEvent::FellSilent => {

@@ -209,7 +209,7 @@ impl StopThread<'_> {
     fn state(&self) -> StopAnswer {
         let phase = Phase::from_code(self.exchange.phase.load(SeqCst));
         let alpha_deg = f32::from_bits(self.exchange.alpha_measured.load(SeqCst));
-        let note = self.robot_note.get();
+        let note = self.robot_note.get().text;
         let hindrance = match phase {
             Phase::NoRobot if !note.is_empty() => note,
             Phase::NoRobot if alpha_deg.is_finite() => crate::core::Refusal::NotUpright(alpha_deg).to_string(),

@@ -81,6 +81,17 @@ pub fn end_when_nobody_reads() {
     unsafe { libc::signal(libc::SIGPIPE, libc::SIG_DFL) };
 }
 
+/// Sets a variable of the process's environment, for a library that reads it. It is an error once the process has a second thread.
+pub fn set_variable(name: &str, value: &str) -> Result<(), String> {
+    let threads = std::fs::read_dir("/proc/self/task").map_or(usize::MAX, Iterator::count);
+    if threads != 1 {
+        return Err(format!("{name} cannot be set: the process has {threads} threads already"));
+    }
+    // SAFETY: this is the only thread, as was just counted, so that no other one reads the environment meanwhile.
+    unsafe { std::env::set_var(name, value) };
+    Ok(())
+}
+
 /// A flag that becomes true when the process is asked to end by Ctrl-C or SIGTERM. These signals then no longer end it by themselves.
 pub fn stop_at_signals() -> std::io::Result<Arc<AtomicBool>> {
     let stop = Arc::new(AtomicBool::new(false));
@@ -175,6 +186,28 @@ pub fn page_faults() -> (u64, u64) {
         return (0, 0);
     }
     (usage.ru_minflt as u64, usage.ru_majflt as u64)
+}
+
+/// Bytes of a cache line. Source: all x86-64 processors; a hint more or less does no harm elsewhere.
+const CACHE_LINE: usize = 64;
+
+/// Asks the processor to bring one of `parts` equal parts of `value` into its caches, and does not wait for it. It changes no result and
+/// can only save time. A processor drops what is too much at once, so call it for part 0, 1, ... with some work between. On other
+/// processors than x86-64 it does nothing.
+pub fn prefetch<T>(value: &T, part: usize, parts: usize) {
+    #[cfg(target_arch = "x86_64")]
+    {
+        use std::arch::x86_64::{_MM_HINT_T0, _mm_prefetch};
+        let start = std::ptr::from_ref(value).cast::<i8>();
+        let size = size_of::<T>().div_ceil(parts.max(1));
+        let first = part.saturating_mul(size);
+        for offset in (first..first.saturating_add(size).min(size_of::<T>())).step_by(CACHE_LINE) {
+            // SAFETY: a prefetch is a hint that neither reads into a register nor faults, and the address lies inside `value`.
+            unsafe { _mm_prefetch::<_MM_HINT_T0>(start.wrapping_add(offset)) };
+        }
+    }
+    #[cfg(not(target_arch = "x86_64"))]
+    let _ = (value, part, parts, CACHE_LINE);
 }
 
 thread_local! {

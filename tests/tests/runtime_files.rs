@@ -272,3 +272,36 @@ fn leftovers_of_others_and_limits_do_not_matter() {
         std::fs::remove_file(file).expect("root may");
     }
 }
+
+/// Protects two cells from sharing files by accident: relative paths start at the configuration, wherever one stands, and `DECANT_CONFIG` names
+/// the configuration for every command.
+#[test]
+fn paths_belong_to_the_configuration() {
+    let mut cell = CellUnderTest::prepare(|config| {
+        for (section, key, path) in
+            [("controller", "weights", "w.bin"), ("controller", "journal", "j.bin"), ("recording", "directory", "e")]
+        {
+            config[section].as_table_mut().expect("a table").insert(key.into(), path.into());
+        }
+    });
+    let elsewhere = tempfile::tempdir().expect("a directory");
+    let file = cell.config();
+    let at = |name: &str, words: &[&str]| {
+        let mut command = Command::new(program(name));
+        command.args(words).current_dir(elsewhere.path()).env("DECANT_CONFIG", &file);
+        command
+    };
+    cell.spawn("simulator");
+    cell.spawn("feature-worker");
+    let mut controller = at("rt-controller", &["run"]).stderr(std::process::Stdio::null()).spawn().expect("it starts");
+    cell.wait_idle();
+    let status = at("rt-controller", &["status", "--json"]).output().expect("it runs");
+    let status: serde_json::Value = serde_json::from_slice(&status.stdout).expect("JSON");
+    let weights = cell.dir.path().canonicalize().expect("there").join("w.bin");
+    assert!(status["hindrance"].as_str().is_some_and(|h| h.contains(&weights.display().to_string())), "{status:#}");
+    assert!(cell.dir.path().join("j.bin").exists());
+    assert!(cell.dir.path().join("e").exists());
+    assert_eq!(std::fs::read_dir(elsewhere.path()).expect("there").count(), 0, "nothing is written where one stands");
+    rustix::process::kill_process(rustix::process::Pid::from_child(&controller), Signal::TERM).expect("ours");
+    assert_eq!(controller.wait().expect("ours").code(), Some(0));
+}
