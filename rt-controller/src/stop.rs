@@ -121,6 +121,8 @@ pub struct StopThread<'a> {
     pub tolerance_deg: f32,
     /// Becomes true at a signal, or when a thread cannot go on.
     pub stop: &'a AtomicBool,
+    /// Asks the robot's and the disk's threads to end, should the thread that does so be held up.
+    pub end: &'a AtomicBool,
     /// Becomes true when the process's other threads have ended.
     pub done: &'a AtomicBool,
     /// Ends the process although a thread is held up.
@@ -134,8 +136,12 @@ impl StopThread<'_> {
         let mut ended: Option<Instant> = None;
         while !self.done.load(SeqCst) {
             self.exchange.shutdown.fetch_or(self.stop.load(SeqCst), SeqCst);
-            if self.exchange.ended.load(SeqCst) && ended.get_or_insert_with(Instant::now).elapsed() > GRACE {
-                return (self.give_up)();
+            if self.exchange.ended.load(SeqCst) {
+                let since = ended.get_or_insert_with(Instant::now).elapsed();
+                self.end.fetch_or(since > GRACE / 2, SeqCst);
+                if since > GRACE {
+                    return (self.give_up)();
+                }
             }
             self.wait(&clients);
             // The file comes first: strangers reach only the other one. One of each a turn, so that neither shuts the other out.

@@ -207,6 +207,28 @@ fn an_abort_falls_back_to_the_process() {
     other.kill().and_then(|()| other.wait()).expect("ours");
 }
 
+/// Protects the robot's operator from a service thread that hangs, in a client or elsewhere: an abort is obeyed, and SIGTERM ends the controller
+/// with its journal whole.
+#[test]
+fn an_abort_needs_no_service_thread() {
+    let mut cell = cell();
+    let pour = cell.pour_tilted();
+    // The service thread is the main one; each of its pauses now takes two minutes.
+    let main = cell.pid("rt-controller").to_string();
+    let mut strace = Command::new("strace");
+    strace.args(["-q", "-p", &main, "-e", "trace=clock_nanosleep", "-e", "inject=clock_nanosleep:delay_enter=120s", "-o", "/dev/null"]);
+    let mut strace = strace.spawn().expect("strace is installed (scripts/install strace)");
+    std::thread::sleep(Duration::from_millis(500));
+    assert!(cell.status().is_none(), "the service thread hangs");
+    let (output, took) = timed(abort_of(&cell));
+    println!("abort without the service thread: upright after {took:?}");
+    assert_eq!(output.status.code(), Some(0), "{}", String::from_utf8_lossy(&output.stderr));
+    assert_eq!(cell.stop("rt-controller"), Some(0), "{}", cell.log("rt-controller"));
+    strace.kill().and_then(|()| strace.wait()).expect("ours");
+    assert_eq!(pour.wait_with_output().expect("it ran").status.code(), Some(3));
+    rt_controller::journal::replay(&cell.dir.path().join("journal.bin"), |_, _| {}).expect("a journal");
+}
+
 /// Protects the operator from silent and endless clients at the stop socket: they lose their places, and an abort is obeyed.
 #[test]
 fn clients_that_say_nothing_do_not_keep_an_abort_out() {

@@ -11,7 +11,7 @@ use rustix::process::{Pid, PidfdFlags, Signal, pidfd_open, pidfd_send_signal};
 use shared::config::{Config, VARIABLE};
 use shared::exit::{self, Failure, failure};
 use shared::messages::Phase;
-use shared::runtime_dir::Place;
+use shared::runtime_dir::{Place, own_uid};
 
 use crate::claim;
 use crate::stop_client::{Target, running_cells};
@@ -61,7 +61,13 @@ pub fn run(args: &Args) -> Result<(), Failure> {
 /// The cells that are meant. A configuration that cannot be read must not keep anybody from stopping a robot.
 fn targets(config: Option<&Path>) -> Vec<Target> {
     match config.map(Config::read) {
-        Some(Ok(config)) => vec![Place::from(&config.cell).into()],
+        Some(Ok(config)) => {
+            let named = Target::from(Place::from(&config.cell));
+            // Root stops a cell whoever runs it.
+            let others = || running_cells().into_iter().filter(|t| t.name == named.name).collect::<Vec<_>>();
+            let of_others = if own_uid() == 0 && named.ask("state").is_none() { others() } else { Vec::new() };
+            if of_others.is_empty() { vec![named] } else { of_others }
+        }
         Some(Err(e)) => {
             eprintln!("{e}; every cell that runs is stopped instead");
             running_cells()

@@ -104,6 +104,7 @@ fn start(config: &Config, file: &Path, stop: &AtomicBool, say: &(dyn Fn(&str) + 
         robot_note: &shared.note,
         tolerance_deg: config.robot.start_tolerance_deg as f32,
         stop,
+        end: &shared.end,
         done: &shared.done,
         give_up: &give_up,
     };
@@ -123,6 +124,8 @@ struct Shared {
     connections: AtomicU64,
     /// Why the newest weight file is not used.
     refused: Mutex<String>,
+    /// Whether the robot's and the disk's threads are to end.
+    end: AtomicBool,
     /// Whether everything is written.
     disk_done: AtomicBool,
     /// Whether all other threads have ended.
@@ -137,7 +140,7 @@ fn run_threads(
     stop: &AtomicBool,
     say: &(dyn Fn(&str) + Sync),
 ) -> Result<(), Failure> {
-    let Shared { exchange, note, connections, refused, disk_done, .. } = shared;
+    let Shared { exchange, note, connections, refused, end, disk_done, .. } = shared;
     let cell = Cell::join(&config.cell).or_exit(exit::FAILED)?;
     cell.check_space(SHARED_MEMORY).or_exit(exit::FAILED)?;
     let (disk, queues) = Disk::open(config, owner, exchange, refused, say).or_exit(exit::BAD_INPUT)?;
@@ -147,12 +150,11 @@ fn run_threads(
         let (ready_sender, ready) = std::sync::mpsc::channel();
         thread("loop").spawn_scoped(scope, move || real_time(config, exchange, say, &ready_sender)).map_err(no_thread)?;
         ready.recv().unwrap_or(Ok(())).or_exit(exit::FAILED)?;
-        let end = AtomicBool::new(false);
         std::thread::scope(|inner| {
-            let robot = || robot_thread::keep_robot_connected(config, exchange, note, connections, &end, say);
+            let robot = || robot_thread::keep_robot_connected(config, exchange, note, connections, end, say);
             let spawned = thread("robot").spawn_scoped(inner, robot);
             let writing = || {
-                disk.run(&end);
+                disk.run(end);
                 disk_done.store(true, SeqCst);
             };
             let spawned = spawned.and(thread("disk").spawn_scoped(inner, writing));
