@@ -23,6 +23,7 @@ use crate::control_loop;
 use crate::core::Settings;
 use crate::disk::Disk;
 use crate::exchange::Exchange;
+use crate::link::network::System;
 use crate::robot_thread::{self, RobotNote};
 use crate::service::Service;
 use crate::stop::{StopSockets, StopThread};
@@ -151,7 +152,7 @@ fn run_threads(
         thread("loop").spawn_scoped(scope, move || real_time(config, exchange, say, &ready_sender)).map_err(no_thread)?;
         ready.recv().unwrap_or(Ok(())).or_exit(exit::FAILED)?;
         std::thread::scope(|inner| {
-            let robot = || robot_thread::keep_robot_connected(config, exchange, note, connections, end, say);
+            let robot = || robot_thread::keep_robot_connected(&System, config, exchange, note, connections, end, say);
             let spawned = thread("robot").spawn_scoped(inner, robot);
             let writing = || {
                 disk.run(end);
