@@ -11,6 +11,7 @@ use iceoryx2::port::client::Client as Port;
 use iceoryx2::service::ipc::Service as Ipc;
 use indicatif::ProgressStyle;
 use shared::control::{Outcome, Reply, Request, Status};
+use shared::exit;
 use shared::ipc::{Cell, InService as _, IpcError};
 use shared::messages::{RecorderReport, RecorderState};
 use shared::os;
@@ -23,6 +24,8 @@ pub const MESSAGE_MAX: usize = 64 * 1024;
 
 /// Longest wait for the controller's answer. Chosen by hand: it answers within a tick and a pause of its service thread, below 0.1 s.
 const ANSWER: Duration = Duration::from_secs(2);
+/// Longest wait for a connection. Chosen by hand: it takes milliseconds, or two seconds while another process hangs in joining.
+const CONNECTING: Duration = Duration::from_secs(5);
 /// Longest wait for the recorder to close a file. Chosen by hand; no measurement is recorded.
 const FILE_CLOSED: Duration = Duration::from_secs(10);
 /// How many times in a row the controller may be asked and not know the episode that it started, before it counts as restarted. Chosen by
@@ -75,6 +78,23 @@ impl Client {
         let port = cell.control()?.client_builder().initial_max_slice_len(MESSAGE_MAX).create().in_service("control")?;
         cell.reserve()?;
         Ok(Self { port, place, _cell: cell })
+    }
+
+    /// Connects as a command does: it ends the process with a line if iceoryx2 does not come back, as it does not when somebody cut the cell's
+    /// files in `/dev/shm` to nothing.
+    pub fn connect_or_end(place: impl Into<Place>) -> Result<Self, ClientError> {
+        let (done, watched) = std::sync::mpsc::channel::<()>();
+        let watch = move || {
+            if watched.recv_timeout(CONNECTING) == Err(std::sync::mpsc::RecvTimeoutError::Timeout) {
+                os::tell("error: the cell's files in /dev/shm do not answer: end all programs of the cell and start them again");
+                std::process::exit(exit::UNREACHABLE.into());
+            }
+        };
+        // Without a thread it can only be hoped that the files are whole.
+        let _watching = std::thread::Builder::new().name("watch".into()).spawn(watch);
+        let client = Self::connect(place);
+        drop(done);
+        client
     }
 
     /// Sends `request` and waits for the answer, up to two seconds.

@@ -38,7 +38,7 @@ pub(crate) fn ended(outcome: &Outcome) -> Result<(), Failure> {
 
 /// Gives an order that moves the container, follows it to its end, and waits for the recorder's report, if there is a recorder.
 pub(crate) fn order(cell: &CellConfig, request: &Request) -> Result<(Outcome, Option<client::Recorded>), Failure> {
-    let client = Client::connect(cell).or_exit(exit::UNREACHABLE)?;
+    let client = Client::connect_or_end(cell).or_exit(exit::UNREACHABLE)?;
     resume::take_back_if_it_waits(&client)?;
     let recorder = client::RecorderReports::open(cell).ok();
     let episode = match client.ask(request).or_exit(exit::UNREACHABLE)? {

@@ -30,7 +30,7 @@ pub struct Args {
 /// Runs the command.
 pub fn run(args: &Args) -> Result<(), Failure> {
     let config = Config::read(&args.config).or_exit(exit::BAD_INPUT)?;
-    let client = Client::connect(&config.cell).or_exit(exit::UNREACHABLE)?;
+    let client = Client::connect_or_end(&config.cell).or_exit(exit::UNREACHABLE)?;
     let status = client.status().or_exit(exit::UNREACHABLE)?;
     if status.phase == Phase::NoRobot {
         take_back(&client)?;
