@@ -3,8 +3,10 @@
 
 pub mod check;
 pub mod eye;
+pub mod many;
 pub mod pipe;
 pub mod plan;
+pub mod plot;
 pub mod records;
 pub mod run;
 pub mod site;
