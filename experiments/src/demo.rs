@@ -10,6 +10,7 @@ use std::time::Duration;
 
 use rt_controller::client::Client;
 use serde_json::{Value, json};
+use shared::config::CellConfig;
 use shared::ipc::Cell;
 use shared::messages::Telemetry;
 
@@ -157,7 +158,7 @@ fn train(cell: &mut OwnCell, client: &Client, seed: u64) -> Result<String, OwnCe
 /// Pours once into an empty cup, and draws the pour.
 fn pour(cell: &OwnCell, number: usize, fill_ml: f64, goal_ml: f32) -> Result<DemoPour, OwnCellError> {
     cell.command("simulator", &["operator", "fill", &fill_ml.to_string()])?;
-    let listener = Listener::start(&cell.config.cell.name)?;
+    let listener = Listener::start(&cell.config.cell)?;
     let result = cell.command("rt-controller", &["pour", "--json", &goal_ml.to_string()])?;
     let ticks = listener.finish();
     let poured_ml = cell.scale()?;
@@ -183,9 +184,9 @@ struct Listener {
 
 impl Listener {
     /// Begins to listen to the cell `cell`.
-    fn start(cell: &str) -> Result<Self, OwnCellError> {
+    fn start(cell: &CellConfig) -> Result<Self, OwnCellError> {
         let stop = Arc::new(AtomicBool::new(false));
-        let (cell, stopped) = (cell.to_string(), Arc::clone(&stop));
+        let (cell, stopped) = (cell.clone(), Arc::clone(&stop));
         let (sender, ready) = std::sync::mpsc::channel();
         let thread = std::thread::spawn(move || {
             let mut ticks = Vec::new();

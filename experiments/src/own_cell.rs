@@ -106,7 +106,8 @@ impl OwnCell {
                 t.insert(key.into(), value);
             }
         };
-        let path = |name: &str| toml::Value::String(out.join(name).display().to_string());
+        // Relative paths would start at the configuration, which lies in this directory.
+        let path = |name: &str| toml::Value::String(name.into());
         // With a name and an address of its own it leaves a cell alone that is already running.
         let number = std::process::id();
         let address = format!("127.{}.{}.{}", 1 + number / 65_536 % 250, number / 256 % 256, 1 + number % 254);
@@ -119,7 +120,7 @@ impl OwnCell {
         let config_file = out.join("sim.toml");
         let text = toml::to_string_pretty(&table).map_err(|e| bad(&e))?;
         std::fs::write(&config_file, &text).map_err(|e| file(&config_file, e))?;
-        let config = Config::parse(&text, &config_file.display().to_string()).map_err(|e| bad(&e))?;
+        let config = Config::read(&config_file).map_err(|e| bad(&e))?;
         let stop = os::stop_at_signals().map_err(|e| OwnCellError::Other(e.to_string()))?;
         let exe = std::env::current_exe().map_err(|e| file(Path::new("own program"), e))?;
         let bin = exe.parent().unwrap_or(Path::new(".")).to_path_buf();
@@ -135,8 +136,8 @@ impl OwnCell {
             let child = self.spawn(name)?;
             self.processes.push((name, child));
         }
-        let name = self.config.cell.name.clone();
-        let client = self.until("the cell", 20, || Client::connect(&name).map_err(|e| e.to_string()))?;
+        let place = self.config.cell.clone();
+        let client = self.until("the cell", 20, || Client::connect(&place).map_err(|e| e.to_string()))?;
         self.until("readiness of robot and camera", 30, || match client.status() {
             Ok(s) if s.phase == Phase::Idle && s.feature_sequence > 0 => Ok(()),
             Ok(s) if s.feature_sequence == 0 => Err("no camera frames".into()),
@@ -263,6 +264,6 @@ impl Drop for OwnCell {
     fn drop(&mut self) {
         self.stop();
         // This also removes what a killed process left.
-        shared::ipc::remove_files(&self.config.cell.name);
+        shared::ipc::remove_files(&self.config.cell);
     }
 }

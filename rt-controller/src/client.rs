@@ -14,6 +14,9 @@ use shared::control::{Outcome, Reply, Request, Status};
 use shared::ipc::{Cell, InService as _, IpcError};
 use shared::messages::{RecorderReport, RecorderState};
 use shared::os;
+use shared::runtime_dir::Place;
+
+use crate::stop_client::Target;
 
 /// Largest request or answer, bytes. Chosen by hand; no measurement is recorded.
 pub const MESSAGE_MAX: usize = 64 * 1024;
@@ -30,7 +33,7 @@ const UNKNOWN_MAX: u32 = 10;
 #[derive(Debug, clap::Args)]
 pub struct Common {
     /// The cell's configuration.
-    #[arg(long, default_value = shared::config::DEFAULT_FILE)]
+    #[arg(long, env = shared::config::VARIABLE, default_value = shared::config::DEFAULT_FILE)]
     pub config: PathBuf,
     /// Prints the result as JSON.
     #[arg(long)]
@@ -60,21 +63,23 @@ pub enum ClientError {
 /// A connection to the running controller.
 pub struct Client {
     port: Port<Ipc, [u8], (), [u8], ()>,
-    cell: String,
+    place: Place,
     _cell: Cell,
 }
 
 impl Client {
-    /// Connects to the controller of the cell `name`.
-    pub fn connect(name: &str) -> Result<Self, ClientError> {
-        let cell = Cell::join(name)?;
+    /// Connects to the controller of the cell `place`: the table `[cell]` of the configuration, or a name.
+    pub fn connect(place: impl Into<Place>) -> Result<Self, ClientError> {
+        let place = place.into();
+        let cell = Cell::join(&place)?;
         let port = cell.control()?.client_builder().initial_max_slice_len(MESSAGE_MAX).create().in_service("control")?;
-        Ok(Self { port, cell: name.into(), _cell: cell })
+        cell.reserve()?;
+        Ok(Self { port, place, _cell: cell })
     }
 
     /// Sends `request` and waits for the answer, up to two seconds.
     pub fn ask(&self, request: &Request) -> Result<Reply, ClientError> {
-        let no_answer = || ClientError::NoAnswer { cell: self.cell.clone() };
+        let no_answer = || ClientError::NoAnswer { cell: self.place.name.clone() };
         let mut buffer = vec![0; MESSAGE_MAX];
         let bytes = postcard::to_slice(request, &mut buffer).map_err(|_| ClientError::Version)?;
         let loan = self.port.loan_slice_uninit(bytes.len()).map_err(|_| no_answer())?;
@@ -119,7 +124,10 @@ impl Client {
         let (mut aborted, mut unknown) = (false, 0);
         loop {
             if interrupted.load(Ordering::Relaxed) && !aborted {
-                self.ask(&Request::Abort)?;
+                // The stop socket works where shared memory does not.
+                if Target::from(self.place.clone()).ask("abort").is_none() {
+                    self.ask(&Request::Abort)?;
+                }
                 aborted = true;
             }
             let status = self.status()?;
@@ -153,10 +161,11 @@ pub struct RecorderReports {
 }
 
 impl RecorderReports {
-    /// Subscribes to the reports in the cell `name`.
-    pub fn open(name: &str) -> Result<Self, IpcError> {
-        let cell = Cell::join(name)?;
+    /// Subscribes to the reports in the cell `place`.
+    pub fn open(place: impl Into<Place>) -> Result<Self, IpcError> {
+        let cell = Cell::join(place)?;
         let subscriber = cell.recorder()?.subscriber_builder().create().in_service("recorder")?;
+        cell.reserve()?;
         Ok(Self { subscriber, _cell: cell })
     }
 

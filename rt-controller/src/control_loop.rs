@@ -4,7 +4,7 @@
 //! how often they allocated. The one exception is [`LoopState::meet_feature_worker`], which runs between ticks and outside of pours.
 //! Nothing in it fails: a lost robot is handed back and the core ends the pour, and a lost feature worker shows as stale features.
 
-use std::sync::atomic::{AtomicU64, Ordering::Relaxed};
+use std::sync::atomic::{AtomicU64, Ordering::Relaxed, Ordering::SeqCst};
 
 use iceoryx2::port::update_connections::UpdateConnections;
 use shared::messages::{Feature, Phase, Telemetry};
@@ -12,7 +12,7 @@ use shared::os;
 
 use shared::control::EndReason;
 
-use crate::core::{Core, Input, MAX_FEATURES, Order, Robot, Settings};
+use crate::core::{Core, Input, MAX_FEATURES, Order, Refusal, Robot, Settings};
 use crate::exchange::{Event, Exchange, SessionEnd};
 use crate::journal::{Tick, Times};
 use crate::link::{Mode, Session, health};
@@ -64,6 +64,7 @@ pub fn run(settings: Settings, place: Place, lost_ns: u64, features: &Features, 
     for line in os::become_realtime(place.core, place.priority) {
         say(&line);
     }
+    os::cannot_be_held_up();
     let mut state = LoopState::new(settings, lost_ns, features, exchange);
     let mut deadline_ns = os::now_ns() + settings.period_ns;
     loop {
@@ -156,8 +157,7 @@ impl<'a, O: Outside> LoopState<'a, O> {
         self.core.prefetch(2);
         let (robot, mut end) = look_at_robot(self.session.as_deref_mut(), woke_ns, self.lost_ns);
         self.core.prefetch(3);
-        let order = exchange.orders.pop();
-        self.shutdown |= order == Some(Order::Shutdown);
+        let (order, is_asked) = self.next_order();
 
         let output = self.core.step(&Input { now_ns: woke_ns, features: &self.fresh, robot, order });
         let decided_at_ns = self.outside.now_ns();
@@ -170,7 +170,7 @@ impl<'a, O: Outside> LoopState<'a, O> {
         self.give_session_back(end);
 
         let telemetry = Telemetry { weights_id: self.weights_id, ..output.telemetry };
-        if let Some(answer) = output.ordered {
+        if let Some(answer) = output.ordered.filter(|_| is_asked) {
             self.tell(Event::Ordered(answer));
         }
         if let Some(outcome) = output.ended {
@@ -193,8 +193,32 @@ impl<'a, O: Outside> LoopState<'a, O> {
             times: Times { deadline_ns, decided_at_ns, written_at_ns, done_ns, margin_ns },
         };
         self.tell(Event::Tick(tick, telemetry, self.core.counters()));
+        exchange.alpha_measured.store(telemetry.alpha_measured_deg.to_bits(), SeqCst);
+        exchange.phase.store(telemetry.phase, SeqCst);
         let upright = matches!(self.core.phase(), Phase::Idle | Phase::NoRobot);
         if self.shutdown && upright { Next::Ended } else { Next::Tick }
+    }
+
+    /// The order of this tick, and whether a client waits for its answer. What stops the motion comes before the queue, and refuses what
+    /// waits there.
+    fn next_order(&mut self) -> (Option<Order>, bool) {
+        let exchange = self.exchange;
+        let order = if !self.shutdown && exchange.shutdown.load(SeqCst) {
+            self.shutdown = true;
+            Order::Shutdown
+        } else if exchange.abort.swap(false, SeqCst) {
+            Order::Abort
+        } else {
+            return (exchange.orders.pop(), true);
+        };
+        // No more than fit into the queue, so that a client that asks and asks cannot hold the loop.
+        for _ in 0..exchange.orders.capacity() {
+            if exchange.orders.pop().is_none() {
+                break;
+            }
+            self.tell(Event::Ordered(Err(Refusal::Stopped)));
+        }
+        (Some(order), false)
     }
 
     /// Takes the features that have arrived. If they are more than fit, it keeps the newest, because older ones would be stale.

@@ -7,13 +7,14 @@
 //! postcard.
 
 use std::collections::BTreeMap;
-use std::fs::File;
-use std::io::{BufReader, BufWriter, Read, Write};
+use std::fs::{File, OpenOptions};
+use std::io::{BufReader, BufWriter, ErrorKind, Read, Write};
 use std::path::Path;
 
 use serde::{Deserialize, Serialize};
 use shared::agent::Agent;
 use shared::messages::Feature;
+use shared::regular_file;
 use shared::weights::Weights;
 
 use crate::core::{Core, Input, MAX_FEATURES, Order, Robot, Settings};
@@ -109,14 +110,26 @@ pub struct Writer<W: Write = BufWriter<File>> {
 }
 
 impl Writer {
-    /// Starts a journal. One that is there already is kept beside it, with the ending `before.bin` instead of its own.
+    /// Starts a journal. One that is there already is kept beside it, with the ending `before.bin` instead of its own. A file that is no
+    /// journal, or one that another controller writes, is an error and stays as it is.
     pub fn create(path: &Path, settings: &Settings) -> std::io::Result<Self> {
         if let Some(parent) = path.parent() {
             std::fs::create_dir_all(parent)?;
         }
-        // The journal of the run before is wanted most after that run has crashed.
-        let _ = std::fs::rename(path, path.with_extension("before.bin"));
-        Self::begin(BufWriter::new(File::create(path)?), settings)
+        if path.symlink_metadata().is_ok() {
+            let before = path.with_extension("before.bin");
+            let held = check_is_journal(path)?;
+            if before.symlink_metadata().is_ok() {
+                check_is_journal(&before)?;
+            }
+            // The journal of the run before is wanted most after that run has crashed.
+            std::fs::rename(path, before)?;
+            drop(held);
+        }
+        let file = OpenOptions::new().write(true).create_new(true).open(path)?;
+        // Whoever looks meets the lock; a file system without locks has none to give.
+        let _ = file.try_lock();
+        Self::begin(BufWriter::new(file), settings)
     }
 }
 
@@ -154,6 +167,21 @@ impl<W: Write> Writer<W> {
         self.to.write_all(&(bytes.len() as u32).to_le_bytes())?;
         self.to.write_all(bytes)
     }
+}
+
+/// Checks that the file at `path` is a journal of any version, or empty, and that nobody writes it. Gives it, locked.
+fn check_is_journal(path: &Path) -> std::io::Result<File> {
+    let named = |what: &str| std::io::Error::new(ErrorKind::InvalidInput, format!("{} {what}", path.display()));
+    let (mut file, meta) = regular_file::open(path).map_err(|e| named(&e.to_string()))?;
+    let mut magic = [0; MAGIC.len()];
+    let whole = file.read_exact(&mut magic).is_ok();
+    if meta.len() > 0 && !(whole && magic.starts_with(&MAGIC[..7])) {
+        return Err(named("is no journal and is left as it is: choose another controller.journal"));
+    }
+    if let Err(std::fs::TryLockError::WouldBlock) = file.try_lock() {
+        return Err(named("is being written by another controller: choose another controller.journal"));
+    }
+    Ok(file)
 }
 
 /// What a replay found.

@@ -44,7 +44,7 @@ pub struct Args {
     /// the worker's frames that are watched.
     input: Vec<PathBuf>,
     /// The cell's configuration.
-    #[arg(long, default_value = shared::config::DEFAULT_FILE)]
+    #[arg(long, env = shared::config::VARIABLE, default_value = shared::config::DEFAULT_FILE)]
     config: PathBuf,
     /// How long to watch a live camera.
     #[arg(long, default_value_t = 15)]
@@ -174,7 +174,7 @@ fn calibrate(args: &Args, mut config: Config) -> Result<(), Failure> {
 /// Watches the configured camera for a while.
 fn watch(args: &Args, config: &Config, pour: &mut Pour) -> Result<(), Failure> {
     let reach = |e: String| failure(exit::UNREACHABLE, e);
-    let cell = Cell::join(&config.cell.name).or_exit(exit::UNREACHABLE)?;
+    let cell = Cell::join(&config.cell).or_exit(exit::UNREACHABLE)?;
     let mut source = ObserverSource::open(&config.camera, &cell).or_exit(exit::UNREACHABLE)?;
     eprintln!("calibrate: watching the camera for {} s; pour once now", args.seconds);
     let end = Instant::now() + Duration::from_secs(args.seconds);
