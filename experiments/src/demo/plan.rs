@@ -13,6 +13,8 @@ const CURVES: [(f64, f64, f64); 2] = [(0.85, 15.0, 0.25), (0.5, 13.0, 0.25)];
 const WEIGHED_POURS: [(f64, f64); 3] = [(0.7, 0.2), (0.9, 0.25), (0.5, 0.16)];
 /// Pours that are judged, in the same way: a small, a middling and a large one. Chosen by hand, so that none of them was seen in training.
 const POURS: [(f64, f64); 3] = [(0.45, 0.09), (0.7, 0.27), (0.95, 0.42)];
+/// The largest goal, ml: below `controller.goal_max_ml` of the simulated cell, and less than a cup holds.
+const GOAL_MAX_ML: f64 = 250.0;
 /// The largest height of a curve, degrees: what the simulated robot may be commanded is 110.
 const LAMBDA_MAX_DEG: f64 = 105.0;
 
@@ -53,7 +55,7 @@ impl Plan {
         let holds_ml = rig.shape.retained_ml(0.0);
         let fives = |ml: f64| (ml / 5.0).round() * 5.0;
         let fill = |share: f64| (share * holds_ml / 10.0).floor() * 10.0;
-        let pour = |(fill_share, goal_share): (f64, f64)| PlannedPour { fill_ml: fill(fill_share), goal_ml: fives(goal_share * holds_ml) };
+        let pour = |(fill_share, goal_share): (f64, f64)| PlannedPour { fill_ml: fill(fill_share), goal_ml: fives((goal_share * holds_ml).min(GOAL_MAX_ML)) };
         let curve = |(share, beyond_deg, gamma_per_s2): (f64, f64, f64)| {
             let fill_ml = fill(share);
             let lambda_deg = (rig.container(fill_ml).spill_angle_deg() + beyond_deg).min(LAMBDA_MAX_DEG).round();
