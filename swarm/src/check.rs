@@ -65,6 +65,8 @@ pub struct Checks {
     cycle_s: f64,
     before_q: Option<[f64; 6]>,
     before_rate_deg_s: f64,
+    /// Where the servo steered the tilting joint to after the cycle before, degrees, and how fast, degrees/s.
+    servo: (f64, f64),
     /// The newest target, degrees, and the rate at which it came.
     target: Option<(f64, f64)>,
     pub(crate) phase: Phase,
@@ -90,6 +92,7 @@ impl Checks {
             cycle_s,
             before_q: None,
             before_rate_deg_s: 0.0,
+            servo: (f64::NAN, f64::NAN),
             target: None,
             phase: Phase::NoRobot,
             free_since_s: None,
@@ -137,6 +140,7 @@ impl Checks {
         } else {
             (self.before_rate_deg_s, self.least_deg) = (0.0, q[joint].to_degrees());
         }
+        self.servo = (servo.target_q[joint].to_degrees(), servo.target_qd[joint].to_degrees());
         self.upright(machine, alpha_deg, at_s);
     }
 
@@ -153,16 +157,22 @@ impl Checks {
         if alpha_deg > f64::from(limits.alpha_max_deg) + SLACK_DEG || alpha_deg < f64::from(limits.alpha_min_deg) - UPRIGHT_DEG {
             self.violated("robot-range", at_s, format!("servoj is given {alpha_deg:.3} degrees"));
         }
-        let rate_deg_s = (alpha_deg - before_q[joint].to_degrees()) / self.cycle_s;
+        // A program that begins anew goes on from where the servo steers the joint, and as fast as that moves. Every command goes on either
+        // from there or from the command before.
+        let from_command = (before_q[joint].to_degrees(), self.before_rate_deg_s);
+        let off = |(from_deg, rate_deg_s): (f64, f64)| (alpha_deg - from_deg - rate_deg_s * self.cycle_s).abs();
+        let begins_anew = off(self.servo) < off(from_command);
+        let (from_deg, from_rate_deg_s) = if begins_anew { self.servo } else { from_command };
+        let rate_deg_s = (alpha_deg - from_deg) / self.cycle_s;
         if rate_deg_s.abs() > f64::from(limits.rate_deg_s) * (1.0 + SLACK) + 0.1 {
             self.violated("robot-rate", at_s, format!("servoj is given {rate_deg_s:.2} degrees/s"));
         }
-        let acceleration = (rate_deg_s - self.before_rate_deg_s) / self.cycle_s;
+        let acceleration = (rate_deg_s - from_rate_deg_s) / self.cycle_s;
         if acceleration.abs() > f64::from(limits.acceleration_deg_s2) * (1.0 + SLACK) + 1.0 {
             self.violated("robot-acceleration", at_s, format!("servoj is given {acceleration:.0} degrees/s^2"));
         }
         self.before_rate_deg_s = rate_deg_s;
-        self.least_deg = if self.is_active() { alpha_deg } else { self.least_deg.min(alpha_deg) };
+        self.least_deg = if self.is_active() || begins_anew { alpha_deg } else { self.least_deg.min(alpha_deg) };
         // The joint is still on its way when the pour ends, by what it lags behind.
         if alpha_deg > self.least_deg + AGAIN_DEG && rate_deg_s > 0.0 {
             let least_deg = self.least_deg;

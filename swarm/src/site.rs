@@ -113,6 +113,8 @@ pub struct Site {
     /// Whether the disk is full.
     pub is_disk_full: bool,
     open_faults: Vec<(String, f64, f64)>,
+    /// Whether the newest pour or recording came to its ordinary end, in spite of what happened in it.
+    went_on: bool,
     /// What faults cost.
     pub costs: Vec<Cost>,
     /// How pours and recordings went.
@@ -160,6 +162,7 @@ impl Site {
             new_weights: None,
             is_disk_full: false,
             open_faults: Vec::new(),
+            went_on: false,
             costs: Vec::new(),
             poured: Vec::new(),
             story: wanted.then(Vec::new),
@@ -253,7 +256,10 @@ impl Site {
         let at_s = self.now_s();
         self.checks.cycle(self.robot.machine(), self.joint, alpha_deg, at_s);
         let active = matches!(self.checks.phase, Phase::Pouring | Phase::Recording);
-        if !active && alpha_deg.abs() < UPRIGHT_DEG && !self.open_faults.is_empty() {
+        if !active && alpha_deg.abs() < UPRIGHT_DEG && std::mem::take(&mut self.went_on) {
+            self.open_faults.clear();
+        }
+        if !active && alpha_deg.abs() < UPRIGHT_DEG && self.checks.phase != Phase::Settling && !self.open_faults.is_empty() {
             let poured_ml = self.container.poured_ml();
             for (fault, from_s, from_ml) in self.open_faults.drain(..) {
                 self.costs.push(Cost { fault, excess_ml: poured_ml - from_ml, upright_s: at_s - from_s });
@@ -279,6 +285,7 @@ impl Site {
         let at_s = self.now_s();
         self.say(|| format!("ended: {:?}, {:.1} ml believed", outcome.reason, outcome.poured_ml));
         self.checks.ended(outcome, at_s);
+        self.went_on = matches!(outcome.reason, EndReason::Done | EndReason::ContainerEmpty | EndReason::StreamLost | EndReason::MaxFrames);
         let true_ml = self.container.poured_ml() - self.run_poured_ml;
         self.run_poured_ml = self.container.poured_ml();
         let since_s = at_s - f64::from(outcome.seconds) - 6.0;
