@@ -92,7 +92,11 @@ pub fn measure_cell(clear: bool, i: u64, seed: u64, frames: &mut FaultFrames) ->
     let mut cameras = Vec::new();
     for fault in std::iter::once(None).chain(FAULTS.into_iter().map(Some)) {
         let camera = fault.map(|(kind, strength)| FaultyCamera::new(CameraFault { kind, strength, seed }, size, view.lip_px));
-        cameras.push((format!("{ground}: {}", name(fault)), camera, Extractor::new(&camera_config(view), &case.image)?));
+        cameras.push((
+            format!("{ground}{}: {}", if std::env::var("BYCELL").is_ok() { format!(" {i}") } else { String::new() }, name(fault)),
+            camera,
+            Extractor::new(&camera_config(view), &case.image)?,
+        ));
     }
     let mut clean = vec![0; size[0] * size[1] * 3];
     let mut given = clean.clone();
@@ -114,7 +118,7 @@ pub fn measure_cell(clear: bool, i: u64, seed: u64, frames: &mut FaultFrames) ->
 /// Prints a line for each fault, in the order of the names.
 pub fn print(frames: &FaultFrames) {
     println!(
-        "{:<34}{:>6}{:>9}{:>8}{:>9}{:>8}{:>9}{:>9}{:>9}  doubts on frames with a stream",
+        "{:<34}{:>6}{:>9}{:>8}{:>9}{:>8}{:>9}{:>9}{:>9}  doubts on frames with a stream / without",
         "fault", "wet", "median %", "p95 %", "silent %", "wrong %", "doubt %", "false %", "dry d. %"
     );
     for (row, all) in frames {

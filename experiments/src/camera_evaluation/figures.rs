@@ -118,9 +118,12 @@ pub fn figures(frames: &[Comparison]) -> CameraFigures {
     }
 }
 
-/// The doubts on frames with a truth above [`MEASURED_PX2`], with their number.
+/// The doubts on frames with a truth above [`MEASURED_PX2`], with their number, and after a stroke those on frames without a stream.
 pub fn doubts_in_words(frames: &[Comparison]) -> String {
-    let wet = || frames.iter().filter(|s| s.truth_px2 > MEASURED_PX2);
-    let counted = Doubt::ALL.into_iter().filter(|d| *d != Doubt::None).map(|d| (d, wet().filter(|s| s.doubt == d).count()));
-    counted.filter(|(_, n)| *n > 0).map(|(d, n)| format!("{} {n}", d.words())).collect::<Vec<_>>().join(", ")
+    let count = |chosen: fn(&&Comparison) -> bool| {
+        let counted = Doubt::ALL.into_iter().filter(|d| *d != Doubt::None);
+        let counted = counted.map(|d| (d, frames.iter().filter(chosen).filter(|s| s.doubt == d).count()));
+        counted.filter(|(_, n)| *n > 0).map(|(d, n)| format!("{} {n}", d.words())).collect::<Vec<_>>().join(", ")
+    };
+    format!("{} / {}", count(|s| s.truth_px2 > MEASURED_PX2), count(|s| s.truth_px2 == 0.0))
 }

@@ -49,6 +49,8 @@ const PROFILES_LEAST: f32 = 0.3;
 const CUT_OFF_LEVEL: f64 = 240.0;
 /// A hue this near to that of red, green or blue may move to either side of it, in OpenCV's degrees of 2. Chosen by hand.
 const AT_PRIMARY: f64 = 5.0;
+/// Width of a region for which distances in it were chosen, px.
+const REGION_PX: f32 = 420.0;
 /// Hues from a primary colour to the mixed ones beside it, in OpenCV's degrees of 2.
 const PRIMARY_TO_MIXED: f64 = 30.0;
 /// The ground is learned from samples at least this far from the lip, px, once it was seen dry for [`DRY_FRAMES`]: nearer, a stream
@@ -58,10 +60,27 @@ const LEARN_FROM_PX: f32 = 48.0;
 const DRY_FRAMES: u32 = 10;
 /// Of this many samples, the ground is learned from one a frame, a different one each time. Chosen by hand, for speed.
 const LEARN_EVERY: usize = 7;
+/// Of this many samples far from the lip, one is looked at for the picture's brightness. Chosen by hand, for speed.
+const EXPOSURE_EVERY: usize = 12;
 /// The ground is learned this many samples beyond the liquid: between, both mix. Chosen by hand.
 const LEARN_BEYOND: usize = 6;
-/// A body at the lip is looked for up to this distance, px. Chosen by hand: one of 200 px^2 is 13 px long on the mean ray.
-const BODY_REACH_PX: f32 = 64.0;
+/// Samples of a side of the square beside the container in which the ground is learned. Chosen by hand, for speed.
+const STRIP_SAMPLES: i32 = 16;
+/// Where that square lies in a picture 640 px wide: from and to, px along the x-axis and along the y-axis. What the background brings to
+/// the lip comes from there, or along the rays.
+const STRIP_PX: [[f32; 2]; 2] = [[-34.0, -7.0], [-48.0, 10.0]];
+/// Of this many samples of the square, the ground is learned from one a frame. Chosen by hand.
+const STRIP_EVERY: usize = 4;
+/// This close to the lip a stream begins, px. Chosen by hand.
+const AT_LIP_PX: f32 = 12.0;
+/// The ground is learned beside the container while no more than this share of what is at the lip is foreign or liquid. Chosen by hand.
+const QUIET_SHARE: f32 = 0.3;
+/// A lamp's reflection hides the lip when this share of what is there is white light. Chosen by hand.
+const BLIND_SHARE: f32 = 0.5;
+/// Once it does, it still does while this share is white light, because a stream is darker. Chosen by hand.
+const STILL_BLIND_SHARE: f32 = 0.08;
+/// And so many pictures more. Chosen by hand: a third of a second.
+const BLIND_PICTURES: u32 = 10;
 /// Least share of the rays that a body at the lip fills. Tuned.
 const BODY_RAYS: f32 = 0.7;
 /// Least mean length of a body at the lip, px: a bead is shorter. Tuned.
@@ -107,6 +126,8 @@ pub(crate) struct ColouredLiquid {
     /// Frames that were taken, and those of them without a stream.
     frames: usize,
     dry_frames: u32,
+    /// For how many pictures a lamp's reflection still counts as hiding the lip.
+    blind_pictures: u32,
     /// Number of samples on each ray up to the end of the liquid, or of a body at the lip, in the last picture.
     ends: [usize; RAYS],
     // Pictures along the rays, one ray a row, kept from frame to frame.
@@ -120,6 +141,37 @@ pub(crate) struct ColouredLiquid {
     mask: Mat,
     /// The mask of one range of hues.
     half_mask: Mat,
+    /// The two maps of the square beside the container; empty if it is not within the region.
+    strip_maps: [Mat; 2],
+    /// The square in BGR.
+    strip: Mat,
+    /// The same, smoothed.
+    smooth_strip: Mat,
+}
+
+/// The fixed-point maps from the square beside the container to the region, as `cv::convertMaps` makes them; empty if the region does not
+/// hold it.
+fn strip_maps(axes: &Axes, image: &ImageConfig) -> opencv::Result<[Mat; 2]> {
+    let (mut map_a, mut map_b) = (Mat::default(), Mat::default());
+    let [width, height] = [image.region_px[2], image.region_px[3]].map(|v| v as f32);
+    let scale = width / REGION_PX;
+    let mut map_x = Mat::new_rows_cols_with_default(STRIP_SAMPLES, STRIP_SAMPLES, CV_32FC1, Scalar::all(0.0))?;
+    let mut map_y = map_x.try_clone()?;
+    let mut inside = true;
+    for i in 0..STRIP_SAMPLES {
+        for j in 0..STRIP_SAMPLES {
+            let share = |k: i32| (k as f32 + 0.5) / STRIP_SAMPLES as f32;
+            let at = |[from, to]: [f32; 2], k: i32| scale * (from + share(k) * (to - from));
+            let (u, w) = (at(STRIP_PX[0], j), at(STRIP_PX[1], i));
+            let [x, y] = [0, 1].map(|k| axes.lip_px[k] + u * axes.x[k] + w * axes.y[k]);
+            inside &= x >= 0.0 && y >= 0.0 && x <= width - 1.0 && y <= height - 1.0;
+            (*map_x.at_2d_mut::<f32>(i, j)?, *map_y.at_2d_mut::<f32>(i, j)?) = (x, y);
+        }
+    }
+    if inside {
+        imgproc::convert_maps(&map_x, &map_y, &mut map_a, &mut map_b, CV_16SC2, true)?;
+    }
+    Ok([map_a, map_b])
 }
 
 /// The ranges of hue, saturation and value that are the liquid: its own, and what its colours become when their brightest part is cut off.
@@ -167,6 +219,7 @@ impl ColouredLiquid {
         }
         let (mut map_a, mut map_b) = (Mat::default(), Mat::default());
         imgproc::convert_maps(&map_x, &map_y, &mut map_a, &mut map_b, CV_16SC2, true)?;
+        let strip_maps = strip_maps(&axes, image)?;
         let colour = image.colour_hsv.map(f64::from);
         Ok(Self {
             axes,
@@ -179,12 +232,16 @@ impl ColouredLiquid {
             ground: GroundColours::new(),
             frames: 0,
             dry_frames: 0,
+            blind_pictures: 0,
             ends: [0; RAYS],
             sampled: Mat::default(),
             smooth: Mat::default(),
             hsv: Mat::default(),
             mask: Mat::default(),
             half_mask: Mat::default(),
+            strip_maps,
+            strip: Mat::default(),
+            smooth_strip: Mat::default(),
         })
     }
 
@@ -237,15 +294,31 @@ impl ColouredLiquid {
         Ok(found as f32 >= GREY_SHARE * looked as f32)
     }
 
+    /// Tells the ground's colours how bright the picture is far from the lip.
+    fn expose(&mut self) -> opencv::Result<()> {
+        let far = self.grid.radii_px.iter().take_while(|r| **r < LEARN_FROM_PX).count();
+        let (mut sum, mut count) = (0u32, 0u32);
+        for (i, ray) in self.grid.rays.iter().enumerate() {
+            let (mask, colours) = (self.mask.at_row::<u8>(i as i32)?, self.smooth.at_row::<Vec3b>(i as i32)?);
+            for r in (far + i % EXPOSURE_EVERY..ray.samples).step_by(EXPOSURE_EVERY).filter(|r| mask[*r] == 0) {
+                sum += colours[r].0.iter().map(|v| u32::from(*v)).sum::<u32>();
+                count += 1;
+            }
+        }
+        if count > 0 {
+            self.ground.expose(sum / count);
+        }
+        Ok(())
+    }
+
     /// Whether something lies at the lip like a stream and has foreign colours. Writes its ends into `self.ends`.
     fn is_foreign_body(&mut self) -> opencv::Result<bool> {
-        let reach = self.grid.radii_px.iter().take_while(|r| **r <= BODY_REACH_PX).count();
         let (mut filled, mut foreign, mut samples, mut length_px) = (0usize, 0usize, 0usize, 0.0f32);
         for (i, ray) in self.grid.rays.iter().enumerate() {
             let mask = self.mask.at_row::<u8>(i as i32)?;
             let colours = self.smooth.at_row::<Vec3b>(i as i32)?;
             let (mut score, mut best, mut end, mut strange, mut strange_at_end) = (0.0f32, 0.0f32, 0usize, 0usize, 0usize);
-            for r in 0..reach.min(ray.samples) {
+            for r in 0..ray.samples {
                 let step = self.grid.steps_px[r];
                 match if mask[r] != 0 { None } else { Some(self.ground.tell(colours[r].0)) } {
                     None => score += step,
@@ -255,6 +328,8 @@ impl ColouredLiquid {
                 }
                 if score > best {
                     (best, end, strange_at_end) = (score, r + 1, strange);
+                } else if score < -GAP_MOST_PX {
+                    break;
                 }
             }
             if end > 0 && best >= (2.0 * FILLED - 1.0) * (self.grid.radii_px[end - 1] - NEAR_PX).max(1.0) {
@@ -293,6 +368,8 @@ impl ColouredLiquid {
         for (i, ray) in self.grid.rays.iter().enumerate() {
             let from = match self.ends[i] {
                 0 if new => 0,
+                // A ray without an edge may have a stream on it all the same.
+                0 if !dry => continue,
                 end => (end + LEARN_BEYOND).max(far),
             };
             let (mask, colours) = (self.mask.at_row::<u8>(i as i32)?, self.smooth.at_row::<Vec3b>(i as i32)?);
@@ -306,6 +383,58 @@ impl ColouredLiquid {
         }
         self.frames = self.frames.wrapping_add(1);
         Ok(())
+    }
+
+    /// Which shares of what is close to the lip are white light that the ground is not, and foreign colours or liquid.
+    fn at_lip(&self) -> opencv::Result<(f32, f32)> {
+        let near = self.grid.radii_px.iter().take_while(|r| **r <= AT_LIP_PX).count();
+        let (mut blind, mut foreign, mut looked) = (0usize, 0usize, 0usize);
+        for (i, ray) in self.grid.rays.iter().enumerate() {
+            let (mask, colours) = (self.mask.at_row::<u8>(i as i32)?, self.smooth.at_row::<Vec3b>(i as i32)?);
+            for r in 0..near.min(ray.samples) {
+                let ground = self.ground.tell(colours[r].0);
+                looked += 1;
+                blind += usize::from(ground == Ground::Blind);
+                foreign += usize::from(mask[r] != 0 || ground != Ground::Known);
+            }
+        }
+        let share = |part: usize| part as f32 / looked.max(1) as f32;
+        Ok((share(blind), share(foreign)))
+    }
+
+    /// Learns the ground's colours from beside the container: what comes to the lip from there is known before.
+    fn learn_beside(&mut self) -> opencv::Result<()> {
+        if self.strip.empty() {
+            return Ok(());
+        }
+        let size = core::Size::new(SMOOTH, SMOOTH);
+        imgproc::blur(&self.strip, &mut self.smooth_strip, size, core::Point::new(-1, -1), core::BORDER_REPLICATE)?;
+        let colours: &[Vec3b] = self.smooth_strip.data_typed()?;
+        for colour in colours.iter().skip(self.frames % STRIP_EVERY).step_by(STRIP_EVERY) {
+            self.ground.learn(colour.0, false);
+        }
+        Ok(())
+    }
+
+    /// What is at the lip where no stream is seen.
+    fn look_again(&mut self, confidence: f32) -> opencv::Result<Sighting> {
+        let dry = Sighting::Dry { confidence };
+        if self.dry_frames == 0 {
+            return Ok(dry);
+        }
+        let (blind, foreign) = self.at_lip()?;
+        let still = self.blind_pictures > 0 && blind > STILL_BLIND_SHARE;
+        self.blind_pictures = if blind > BLIND_SHARE || still { BLIND_PICTURES } else { self.blind_pictures.saturating_sub(1) };
+        if self.blind_pictures > 0 {
+            return Ok(Sighting::Unsure(Doubt::BlownOut));
+        }
+        if self.is_foreign_body()? {
+            return Ok(Sighting::Unsure(Doubt::ColoursChanged));
+        }
+        if foreign < QUIET_SHARE {
+            self.learn_beside()?;
+        }
+        Ok(dry)
     }
 
     /// Finds the stream, and writes into `self.ends` where the liquid ends on each ray.
@@ -353,6 +482,10 @@ impl Liquid for ColouredLiquid {
 
     fn take(&mut self, region: &BoxedRef<Mat>) -> opencv::Result<()> {
         let (nearest, border) = (imgproc::INTER_NEAREST, core::BORDER_REPLICATE);
+        let [strip_a, strip_b] = &self.strip_maps;
+        if !strip_a.empty() {
+            imgproc::remap(region, &mut self.strip, strip_a, strip_b, nearest, border, Scalar::default())?;
+        }
         imgproc::remap(region, &mut self.sampled, &self.map_a, &self.map_b, nearest, border, Scalar::default())
     }
 
@@ -365,14 +498,20 @@ impl Liquid for ColouredLiquid {
             return Ok(Sighting::Unsure(Doubt::ColoursChanged));
         }
         self.segment()?;
+        self.expose()?;
         let sighting = match self.find_stream(edges_px)? {
-            Sighting::Dry { .. } if self.dry_frames > 0 && self.is_foreign_body()? => Sighting::Unsure(Doubt::ColoursChanged),
+            Sighting::Dry { confidence } => self.look_again(confidence)?,
             Sighting::Stream { seen_share, doubt: Doubt::None } if self.dry_frames > 0 && self.goes_on_beyond_its_edge()? => {
                 Sighting::Stream { seen_share, doubt: Doubt::ColoursChanged }
             }
             other => other,
         };
-        self.learn(matches!(sighting, Sighting::Dry { .. }))?;
+        match sighting {
+            Sighting::Dry { .. } => self.learn(true)?,
+            Sighting::Stream { doubt: Doubt::None, .. } => self.learn(false)?,
+            // What may be liquid must not be taken for ground.
+            _ => self.ground.forget(),
+        }
         Ok(sighting)
     }
 

@@ -180,7 +180,7 @@ impl Extractor {
         let untold = measured.doubt == Doubt::None && !edge_tells_focus;
         let measured = if untold && self.rim.is_blurred(pixels) { Measurement::nothing(0.0, Doubt::Blurred) } else { measured };
         let seen_dry = measured.doubt == Doubt::None && measured.area_px2 == 0.0;
-        let measured = if seen_dry && !self.presence.is_gone(|legs_px| self.liquid.dry_share(legs_px)) {
+        let measured = if seen_dry && !self.presence.is_gone(self.light.mean_bgr(), |legs_px| self.liquid.dry_share(legs_px)) {
             Measurement::nothing(0.0, Doubt::EdgeNotFound)
         } else {
             measured
@@ -224,7 +224,7 @@ impl Extractor {
         let corner = |r: f32, axis: [f32; 2]| self.in_image(self.axes.at(r, axis));
         let ([x0, y0], [x1, y1], [x2, y2]) = (corner(0.0, self.axes.x), corner(a, self.axes.x), corner(b, self.axes.y));
         let doubt = if doubt == Doubt::None && fine.width_px > BLURRED_PX { Doubt::Blurred } else { doubt };
-        self.presence.saw(area_px2, fine.legs_px);
+        self.presence.saw(area_px2, fine.legs_px, self.light.mean_bgr());
         Measurement { area_px2, confidence: fine.confidence, doubt, triangle_px: [x0, y0, x1, y1, x2, y2] }
     }
 }

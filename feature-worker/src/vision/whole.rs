@@ -45,10 +45,12 @@ const PATTERN: usize = 2 * SIDE_HALF + 1;
 const IN_PLACE: f32 = 0.5;
 /// The side is elsewhere when it agrees there by this much. Chosen by hand.
 const ELSEWHERE: f32 = 0.8;
+/// The side is elsewhere when it agrees there by so much more than in its place. Chosen by hand.
+const SURELY: f32 = 0.45;
 /// A displacement by less than this may be a side that changed its look, px. Chosen by hand.
 const DISPLACED_PX: usize = 5;
-/// The side's pattern is known when it agreed with itself by this much for some pictures. Chosen by hand.
-const KNOWN_SIDE: f32 = 0.85;
+/// The side's pattern is known when it agreed with itself by this much on average. Chosen by hand: a pattern behind it moves.
+const KNOWN_SIDE: f32 = 0.5;
 /// How fast pattern and agreement follow, a picture. Chosen by hand.
 const SIDE_FOLLOWS: f32 = 0.15;
 
@@ -184,8 +186,9 @@ impl SideCheck {
         let at = |shift: usize| -> &[f32] { &steps[shift..shift + PATTERN] };
         let here = agreement(&self.pattern, at(SIDE_REACH));
         if self.agrees >= KNOWN_SIDE && here < IN_PLACE {
+            let elsewhere = (here + SURELY).max(ELSEWHERE);
             let far = |shift: &usize| shift.abs_diff(SIDE_REACH) >= DISPLACED_PX;
-            if (0..=2 * SIDE_REACH).filter(far).any(|shift| agreement(&self.pattern, at(shift)) >= ELSEWHERE) {
+            if (0..=2 * SIDE_REACH).filter(far).any(|shift| agreement(&self.pattern, at(shift)) >= elsewhere) {
                 return true;
             }
         }
