@@ -92,11 +92,7 @@ pub fn measure_cell(clear: bool, i: u64, seed: u64, frames: &mut FaultFrames) ->
     let mut cameras = Vec::new();
     for fault in std::iter::once(None).chain(FAULTS.into_iter().map(Some)) {
         let camera = fault.map(|(kind, strength)| FaultyCamera::new(CameraFault { kind, strength, seed }, size, view.lip_px));
-        cameras.push((
-            format!("{ground}{}: {}", if std::env::var("BYCELL").is_ok() { format!(" {i}") } else { String::new() }, name(fault)),
-            camera,
-            Extractor::new(&camera_config(view), &case.image)?,
-        ));
+        cameras.push((format!("{ground}: {}", name(fault)), camera, Extractor::new(&camera_config(view), &case.image)?));
     }
     let mut clean = vec![0; size[0] * size[1] * 3];
     let mut given = clean.clone();
@@ -133,7 +129,7 @@ pub fn print(frames: &FaultFrames) {
             f.wet_unusable_percent,
             f.false_flow_percent,
             f.dry_doubt_percent,
-            super::figures::doubts_in_words(all)
+            f.doubts
         );
     }
 }

@@ -42,7 +42,7 @@ const RIM_SEEN: usize = 5;
 const RIM_BLURRED_PX: f32 = 5.6;
 /// A rim of this width is blurred at the first sight, px; a narrower one has to be blurred in two pictures in a row, because noise and a
 /// background in motion make single pictures look soft. Chosen by hand; tried on the same seeds.
-const RIM_SURELY_BLURRED_PX: f32 = 7.5;
+const RIM_SURELY_BLURRED_PX: f32 = 6.4;
 
 /// Checks the light, and that the picture is not the same as the last one.
 #[derive(Default)]
@@ -98,14 +98,14 @@ pub(crate) struct RimCheck {
     axes: Axes,
     /// Width of the rim in each bundle that shows it, px. Kept from frame to frame.
     widths_px: Vec<f32>,
-    /// Whether the last picture that was judged looked blurred.
+    /// Whether the last picture that was judged looked blurred; true before the first.
     looked_blurred: bool,
 }
 
 impl RimCheck {
     /// A check for these axes, relative to the region.
     pub(crate) fn new(axes: Axes) -> Self {
-        Self { axes, widths_px: Vec::with_capacity(2 * RIM_BUNDLES), looked_blurred: false }
+        Self { axes, widths_px: Vec::with_capacity(2 * RIM_BUNDLES), looked_blurred: true }
     }
 
     /// Whether the rim has lost its sharp edges. False when it is not seen well enough to tell: the glass is as bright as what is

@@ -17,8 +17,11 @@ use opencv::prelude::*;
 use shared::config::ImageConfig;
 use shared::messages::{Doubt, PixelFormat};
 
+use super::confidence::Basis;
 use super::geometry::{Axes, Line, NEAR_PX, RAYS, RayGrid, distance};
+use super::ground_beside::GroundBeside;
 use super::ground_colours::{Ground, GroundColours};
+use super::hues::ranges;
 use super::liquid::{FineLine, LineRules, Liquid, PROFILE_SAMPLES, Profile, ProfileEdge, REACH, Sighting};
 
 // "Tuned" below means that the value was tuned on seeds 1 and 5001 to 5003 of `evaluate-camera`; see docs/VISION.md.
@@ -44,15 +47,6 @@ const LEAVES_SHARE: f32 = 0.06;
 const SMOOTH: i32 = 5;
 /// There is no line when a smaller share of the profiles than this shows an edge. Tuned.
 const PROFILES_LEAST: f32 = 0.3;
-/// A colour whose brightest part reaches this may be one whose brightest part is cut off, grey levels. Chosen by hand: a little below 255,
-/// because samples are smoothed.
-const CUT_OFF_LEVEL: f64 = 240.0;
-/// A hue this near to that of red, green or blue may move to either side of it, in OpenCV's degrees of 2. Chosen by hand.
-const AT_PRIMARY: f64 = 5.0;
-/// Width of a region for which distances in it were chosen, px.
-const REGION_PX: f32 = 420.0;
-/// Hues from a primary colour to the mixed ones beside it, in OpenCV's degrees of 2.
-const PRIMARY_TO_MIXED: f64 = 30.0;
 /// The ground is learned from samples at least this far from the lip, px, once it was seen dry for [`DRY_FRAMES`]: nearer, a stream
 /// begins. Chosen by hand.
 const LEARN_FROM_PX: f32 = 48.0;
@@ -64,13 +58,6 @@ const LEARN_EVERY: usize = 7;
 const EXPOSURE_EVERY: usize = 12;
 /// The ground is learned this many samples beyond the liquid: between, both mix. Chosen by hand.
 const LEARN_BEYOND: usize = 6;
-/// Samples of a side of the square beside the container in which the ground is learned. Chosen by hand, for speed.
-const STRIP_SAMPLES: i32 = 16;
-/// Where that square lies in a picture 640 px wide: from and to, px along the x-axis and along the y-axis. What the background brings to
-/// the lip comes from there, or along the rays.
-const STRIP_PX: [[f32; 2]; 2] = [[-34.0, -7.0], [-48.0, 10.0]];
-/// Of this many samples of the square, the ground is learned from one a frame. Chosen by hand.
-const STRIP_EVERY: usize = 4;
 /// This close to the lip a stream begins, px. Chosen by hand.
 const AT_LIP_PX: f32 = 12.0;
 /// The ground is learned beside the container while no more than this share of what is at the lip is foreign or liquid. Chosen by hand.
@@ -123,6 +110,8 @@ pub(crate) struct ColouredLiquid {
     /// A smaller triangle is no stream, px^2.
     area_min_px2: f32,
     ground: GroundColours,
+    /// Its mean levels of blue, green and red, far from the lip in the last picture.
+    ground_bgr: Option<[f32; 3]>,
     /// Frames that were taken, and those of them without a stream.
     frames: usize,
     dry_frames: u32,
@@ -141,66 +130,8 @@ pub(crate) struct ColouredLiquid {
     mask: Mat,
     /// The mask of one range of hues.
     half_mask: Mat,
-    /// The two maps of the square beside the container; empty if it is not within the region.
-    strip_maps: [Mat; 2],
-    /// The square in BGR.
-    strip: Mat,
-    /// The same, smoothed.
-    smooth_strip: Mat,
-}
-
-/// The fixed-point maps from the square beside the container to the region, as `cv::convertMaps` makes them; empty if the region does not
-/// hold it.
-fn strip_maps(axes: &Axes, image: &ImageConfig) -> opencv::Result<[Mat; 2]> {
-    let (mut map_a, mut map_b) = (Mat::default(), Mat::default());
-    let [width, height] = [image.region_px[2], image.region_px[3]].map(|v| v as f32);
-    let scale = width / REGION_PX;
-    let mut map_x = Mat::new_rows_cols_with_default(STRIP_SAMPLES, STRIP_SAMPLES, CV_32FC1, Scalar::all(0.0))?;
-    let mut map_y = map_x.try_clone()?;
-    let mut inside = true;
-    for i in 0..STRIP_SAMPLES {
-        for j in 0..STRIP_SAMPLES {
-            let share = |k: i32| (k as f32 + 0.5) / STRIP_SAMPLES as f32;
-            let at = |[from, to]: [f32; 2], k: i32| scale * (from + share(k) * (to - from));
-            let (u, w) = (at(STRIP_PX[0], j), at(STRIP_PX[1], i));
-            let [x, y] = [0, 1].map(|k| axes.lip_px[k] + u * axes.x[k] + w * axes.y[k]);
-            inside &= x >= 0.0 && y >= 0.0 && x <= width - 1.0 && y <= height - 1.0;
-            (*map_x.at_2d_mut::<f32>(i, j)?, *map_y.at_2d_mut::<f32>(i, j)?) = (x, y);
-        }
-    }
-    if inside {
-        imgproc::convert_maps(&map_x, &map_y, &mut map_a, &mut map_b, CV_16SC2, true)?;
-    }
-    Ok([map_a, map_b])
-}
-
-/// The ranges of hue, saturation and value that are the liquid: its own, and what its colours become when their brightest part is cut off.
-/// The hue then moves away from that part's own, as far as that of the mixed colour beside it.
-fn ranges([h0, s0, v0, h1, s1, v1]: [f64; 6]) -> Vec<(Scalar, Scalar)> {
-    let width = (h1 - h0).rem_euclid(180.0);
-    let middle = h0 + 0.5 * width;
-    // The hues of red, green and blue are 0, 60 and 120.
-    let primary = (middle / 60.0).round() * 60.0;
-    let (below, above) = (primary - PRIMARY_TO_MIXED, primary + PRIMARY_TO_MIXED);
-    let mut hues = vec![(h0, h0 + width, v0)];
-    // A liquid that is not red, green or blue itself moves to one side only.
-    if middle >= primary - AT_PRIMARY && above > h0 + width {
-        hues.push((middle, above, v0.max(CUT_OFF_LEVEL)));
-    }
-    if middle <= primary + AT_PRIMARY && below < h0 {
-        hues.push((below, middle, v0.max(CUT_OFF_LEVEL)));
-    }
-    let mut all = Vec::new();
-    for (from, to, v) in hues {
-        // Hues wrap around at 180.
-        for turn in [-180.0, 0.0, 180.0] {
-            let (from, to) = ((from + turn).max(0.0), (to + turn).min(179.0));
-            if from <= to {
-                all.push((Scalar::new(from, s0, v, 0.0), Scalar::new(to, s1, if v > v0 { 255.0 } else { v1 }, 0.0)));
-            }
-        }
-    }
-    all
+    /// The ground beside the container.
+    beside: GroundBeside,
 }
 
 impl ColouredLiquid {
@@ -219,7 +150,7 @@ impl ColouredLiquid {
         }
         let (mut map_a, mut map_b) = (Mat::default(), Mat::default());
         imgproc::convert_maps(&map_x, &map_y, &mut map_a, &mut map_b, CV_16SC2, true)?;
-        let strip_maps = strip_maps(&axes, image)?;
+        let beside = GroundBeside::new(&axes, image)?;
         let colour = image.colour_hsv.map(f64::from);
         Ok(Self {
             axes,
@@ -230,6 +161,7 @@ impl ColouredLiquid {
             needs_colour: colour[1] >= COLOURED_FROM,
             area_min_px2: image.area_min_px2,
             ground: GroundColours::new(),
+            ground_bgr: None,
             frames: 0,
             dry_frames: 0,
             blind_pictures: 0,
@@ -239,9 +171,7 @@ impl ColouredLiquid {
             hsv: Mat::default(),
             mask: Mat::default(),
             half_mask: Mat::default(),
-            strip_maps,
-            strip: Mat::default(),
-            smooth_strip: Mat::default(),
+            beside,
         })
     }
 
@@ -297,16 +227,17 @@ impl ColouredLiquid {
     /// Tells the ground's colours how bright the picture is far from the lip.
     fn expose(&mut self) -> opencv::Result<()> {
         let far = self.grid.radii_px.iter().take_while(|r| **r < LEARN_FROM_PX).count();
-        let (mut sum, mut count) = (0u32, 0u32);
+        let (mut sums, mut count) = ([0u32; 3], 0u32);
         for (i, ray) in self.grid.rays.iter().enumerate() {
             let (mask, colours) = (self.mask.at_row::<u8>(i as i32)?, self.smooth.at_row::<Vec3b>(i as i32)?);
             for r in (far + i % EXPOSURE_EVERY..ray.samples).step_by(EXPOSURE_EVERY).filter(|r| mask[*r] == 0) {
-                sum += colours[r].0.iter().map(|v| u32::from(*v)).sum::<u32>();
+                (0..3).for_each(|k| sums[k] += u32::from(colours[r][k]));
                 count += 1;
             }
         }
-        if count > 0 {
-            self.ground.expose(sum / count);
+        if let Some(mean_sum) = sums.iter().sum::<u32>().checked_div(count) {
+            self.ground.expose(mean_sum);
+            self.ground_bgr = Some(sums.map(|sum| sum as f32 / count as f32));
         }
         Ok(())
     }
@@ -402,24 +333,10 @@ impl ColouredLiquid {
         Ok((share(blind), share(foreign)))
     }
 
-    /// Learns the ground's colours from beside the container: what comes to the lip from there is known before.
-    fn learn_beside(&mut self) -> opencv::Result<()> {
-        if self.strip.empty() {
-            return Ok(());
-        }
-        let size = core::Size::new(SMOOTH, SMOOTH);
-        imgproc::blur(&self.strip, &mut self.smooth_strip, size, core::Point::new(-1, -1), core::BORDER_REPLICATE)?;
-        let colours: &[Vec3b] = self.smooth_strip.data_typed()?;
-        for colour in colours.iter().skip(self.frames % STRIP_EVERY).step_by(STRIP_EVERY) {
-            self.ground.learn(colour.0, false);
-        }
-        Ok(())
-    }
-
     /// What is at the lip where no stream is seen.
     fn look_again(&mut self, confidence: f32) -> opencv::Result<Sighting> {
         let dry = Sighting::Dry { confidence };
-        if self.dry_frames == 0 {
+        if self.dry_frames < DRY_FRAMES {
             return Ok(dry);
         }
         let (blind, foreign) = self.at_lip()?;
@@ -432,7 +349,7 @@ impl ColouredLiquid {
             return Ok(Sighting::Unsure(Doubt::ColoursChanged));
         }
         if foreign < QUIET_SHARE {
-            self.learn_beside()?;
+            self.beside.teach(&mut self.ground, self.frames)?;
         }
         Ok(dry)
     }
@@ -482,10 +399,7 @@ impl Liquid for ColouredLiquid {
 
     fn take(&mut self, region: &BoxedRef<Mat>) -> opencv::Result<()> {
         let (nearest, border) = (imgproc::INTER_NEAREST, core::BORDER_REPLICATE);
-        let [strip_a, strip_b] = &self.strip_maps;
-        if !strip_a.empty() {
-            imgproc::remap(region, &mut self.strip, strip_a, strip_b, nearest, border, Scalar::default())?;
-        }
+        self.beside.take(region)?;
         imgproc::remap(region, &mut self.sampled, &self.map_a, &self.map_b, nearest, border, Scalar::default())
     }
 
@@ -501,7 +415,7 @@ impl Liquid for ColouredLiquid {
         self.expose()?;
         let sighting = match self.find_stream(edges_px)? {
             Sighting::Dry { confidence } => self.look_again(confidence)?,
-            Sighting::Stream { seen_share, doubt: Doubt::None } if self.dry_frames > 0 && self.goes_on_beyond_its_edge()? => {
+            Sighting::Stream { seen_share, doubt: Doubt::None } if self.dry_frames >= DRY_FRAMES && self.goes_on_beyond_its_edge()? => {
                 Sighting::Stream { seen_share, doubt: Doubt::ColoursChanged }
             }
             other => other,
@@ -513,6 +427,14 @@ impl Liquid for ColouredLiquid {
             _ => self.ground.forget(),
         }
         Ok(sighting)
+    }
+
+    fn basis(&self) -> Basis {
+        Basis::Colour
+    }
+
+    fn ground_bgr(&self) -> Option<[f32; 3]> {
+        self.ground_bgr
     }
 
     fn dry_share(&self, legs_px: [f32; 2]) -> f32 {

@@ -17,9 +17,9 @@ const DRY_PICTURES: u32 = 1;
 /// level by less in a second.
 const LIGHT_CHANGE: f32 = 1.25;
 /// Where a colour's share of the light is not what it was, by this factor, colours are no evidence either. Chosen by hand.
-const COLOUR_CHANGE: f32 = 1.08;
-/// After this many pictures in other light, that is the light. Chosen by hand: longer than an exposure takes to swing back.
-const LIGHT_PICTURES: u32 = 15;
+const COLOUR_CHANGE: f32 = 1.1;
+/// After this many pictures in other light, that is the light. Chosen by hand: the end of a pour must not be late.
+const LIGHT_PICTURES: u32 = 6;
 
 /// Remembers the stream until its end was seen.
 pub(crate) struct Presence {
