@@ -29,9 +29,26 @@ enum Command {
     Bench(bench::Args),
 }
 
+/// Keeps OpenCV and its decoders from writing to the terminal by themselves: every fault that they report is an error of ours, with what to
+/// do. Whoever sets the variables differently gets the messages.
+fn quiet_libraries() {
+    for (name, value) in [("OPENCV_LOG_LEVEL", "SILENT"), ("OPENCV_FFMPEG_LOGLEVEL", "-8"), ("OPENCV_VIDEOIO_DEBUG", "0")] {
+        if std::env::var_os(name).is_none() {
+            // If it cannot be set there is more to read, and nothing is wrong.
+            let _ = shared::os::set_variable(name, value);
+        }
+    }
+}
+
 fn main() -> ExitCode {
-    shared::exit::end(match Cli::parse().command {
-        Command::Run(args) => run::run(&args),
+    quiet_libraries();
+    let command = Cli::parse().command;
+    if matches!(command, Command::Calibrate(_) | Command::View(_)) {
+        let lost = "error: shared memory vanished: /dev/shm is full, or a file there was cut";
+        shared::os::explain_bus_errors(lost, shared::exit::UNREACHABLE, std::sync::Arc::default());
+    }
+    shared::exit::end(match command {
+        Command::Run(args) => return shared::exit::end_resident(run::run(&args)),
         Command::Calibrate(args) => calibrate::run(&args),
         Command::View(args) => view::run(&args),
         Command::Inspect(args) => inspect::run(&args),

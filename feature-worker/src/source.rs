@@ -1,4 +1,4 @@
-//! Where frames come from: a V4L2 device, a video file, an image sequence (all through OpenCV) or the cell's shared memory.
+//! Where frames come from: a V4L2 device, the cell's shared memory, or a recording (a video, an image sequence, an episode).
 //!
 //! Called from the thread that measures. Shared memory is read where it lies, and OpenCV reuses one matrix, so a frame allocates
 //! nothing. Every failure is a [`SourceError`] that says what to do, also for a camera that is unplugged, a truncated file and frames
@@ -12,21 +12,33 @@ use shared::config::{CameraConfig, CameraSource};
 use shared::ipc::{Cell, FrameTopic};
 
 mod capture;
+mod container;
 mod files;
 mod frame;
+mod numbering;
+mod pictures;
+mod playback;
+mod recorded;
+mod recording;
 mod shared_memory;
+mod video;
 
-pub use capture::{Capture, Numbering, check_rate};
-pub use files::for_each_frame;
+pub use capture::{Capture, check_rate};
+pub use files::{Contents, for_each_frame};
 pub use frame::{Frame, FrameSource, FrameStream, NextFrame, SourceError, StreamEvent, WAIT};
+pub use numbering::Numbering;
+pub use playback::Playback;
+pub use recording::Recording;
 pub use shared_memory::SharedMemory;
 
 /// The source that `[camera]` configures.
 pub enum Source {
     /// Another process publishes the frames.
     SharedMemory(Box<SharedMemory>),
-    /// OpenCV captures the frames.
+    /// OpenCV captures the frames of a device.
     Capture(Box<Capture>),
+    /// A recording is played.
+    Playback(Box<Playback>),
 }
 
 impl Source {
@@ -34,7 +46,8 @@ impl Source {
     pub fn open(camera: &CameraConfig, cell: &Cell) -> Result<Self, SourceError> {
         match camera.source {
             CameraSource::SharedMemory => Self::shared_memory(cell),
-            _ => Ok(Self::Capture(Box::new(Capture::open(camera, true)?))),
+            CameraSource::Device => Ok(Self::Capture(Box::new(Capture::open(camera)?))),
+            CameraSource::Video | CameraSource::Images => Ok(Self::Playback(Box::new(Playback::open(camera)?))),
         }
     }
 
@@ -48,6 +61,7 @@ impl FrameSource for Source {
         match self {
             Self::SharedMemory(shared) => shared.next_frame(timeout),
             Self::Capture(capture) => capture.next_frame(timeout),
+            Self::Playback(playback) => playback.next_frame(timeout),
         }
     }
 }
@@ -74,7 +88,7 @@ impl<'a> ObserverSource<'a> {
 
 impl FrameSource for ObserverSource<'_> {
     fn next_frame(&mut self, timeout: Duration) -> Result<NextFrame<'_>, SourceError> {
-        if matches!(self.source, Source::Capture(_)) && has_publisher(&self.topic) {
+        if !matches!(self.source, Source::SharedMemory(_)) && has_publisher(&self.topic) {
             eprintln!("feature-worker: a worker starts in this cell; it gets the camera, and its frames are taken from now on");
             self.source = Source::shared_memory(self.cell)?;
         }

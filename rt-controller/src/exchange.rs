@@ -3,7 +3,7 @@
 //! The loop never blocks on them and never frees what it got: boxes that it no longer needs go back through a queue, and an ordinary
 //! thread drops them. When a queue is full, the loop counts the events that it could not pass on ([`Exchange::events_lost`]).
 
-use std::sync::atomic::{AtomicBool, AtomicU64};
+use std::sync::atomic::{AtomicBool, AtomicU32, AtomicU64};
 
 use crossbeam::queue::ArrayQueue;
 use shared::agent::Agent;
@@ -45,6 +45,16 @@ impl std::fmt::Display for SessionEnd {
     }
 }
 
+impl SessionEnd {
+    /// The reason with which a pour ends.
+    pub fn reason(&self) -> EndReason {
+        match self {
+            Self::Lost(_) => EndReason::RobotLost,
+            Self::MayNotMove(reason) => *reason,
+        }
+    }
+}
+
 /// Histograms of the loop, all in nanoseconds.
 #[derive(Debug, Default)]
 pub struct Timing {
@@ -62,6 +72,14 @@ pub struct Timing {
 
 /// Everything that the threads share.
 pub struct Exchange {
+    /// To the loop: bring the container upright at once. It comes before every order in the queue.
+    pub abort: AtomicBool,
+    /// To the loop: bring the container upright, and then end. It comes before everything else.
+    pub shutdown: AtomicBool,
+    /// From the loop: its phase after the newest tick.
+    pub phase: AtomicU32,
+    /// From the loop: the bits of the measured alpha of the newest tick, degrees; NaN without a robot.
+    pub alpha_measured: AtomicU32,
     /// To the loop: orders.
     pub orders: ArrayQueue<Order>,
     /// From the loop: events.
@@ -90,6 +108,8 @@ pub struct Exchange {
     pub events_lost: AtomicU64,
     /// Set by the loop when it has ended, upright.
     pub ended: AtomicBool,
+    /// To the robot's thread: set when the operator asks for the robot; the thread takes it back.
+    pub resume: AtomicBool,
 }
 
 /// Number of orders that may wait for the loop, which takes one a tick. Chosen by hand; no measurement is recorded.
@@ -102,6 +122,10 @@ const OLD: usize = 4;
 impl Default for Exchange {
     fn default() -> Self {
         Self {
+            abort: AtomicBool::new(false),
+            shutdown: AtomicBool::new(false),
+            phase: AtomicU32::new(0),
+            alpha_measured: AtomicU32::new(f32::NAN.to_bits()),
             orders: ArrayQueue::new(ORDERS),
             events: ArrayQueue::new(EVENTS),
             agents: ArrayQueue::new(1),
@@ -116,6 +140,7 @@ impl Default for Exchange {
             agents_taken: AtomicU64::new(0),
             events_lost: AtomicU64::new(0),
             ended: AtomicBool::new(false),
+            resume: AtomicBool::new(false),
         }
     }
 }

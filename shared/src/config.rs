@@ -1,16 +1,19 @@
 //! The cell's configuration, one TOML file: `config/cell.toml` for the real cell, `config/sim.toml` for the simulated one.
 //!
 //! Every process reads it once at its start, in an ordinary thread, and that allocates. Unknown keys, wrong types and values out of range
-//! are refused with a [`ConfigError`], which names the file, the key and what is allowed. Relative paths start at the working directory.
+//! are refused with a [`ConfigError`], which names the file, the key and what is allowed. Relative paths start at the directory of the file.
 
 use std::net::IpAddr;
 use std::path::{Path, PathBuf};
 
 use serde::{Deserialize, Serialize};
 
+use crate::config_paths;
 use crate::limits::Limits;
 
-/// The file that is read without `--config`: the simulated cell, so that a real robot only moves when its file is named.
+/// The environment variable that names the configuration where `--config` is not given.
+pub const VARIABLE: &str = "DECANT_CONFIG";
+/// The file that is read without `--config` and without [`VARIABLE`]: the simulated cell, so that a real robot only moves when its file is named.
 pub const DEFAULT_FILE: &str = "config/sim.toml";
 
 /// The rule for a cell's name, in words; the name becomes part of file names.
@@ -86,6 +89,9 @@ pub struct Config {
 pub struct CellConfig {
     /// The name that sets this cell's shared memory apart: 1 to 32 letters, digits, '-' or '_'.
     pub name: String,
+    /// The directory in which a directory of the cell's name holds its runtime files; without this key [`crate::runtime_dir`] chooses one.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub runtime_dir: Option<PathBuf>,
 }
 
 /// Where frames come from.
@@ -169,6 +175,9 @@ pub struct RobotConfig {
     pub lookahead_s: f64,
     /// Gain of the robot's servoj command.
     pub gain: f64,
+    /// Mass of holder and full vessel that the robot is expected to have been told, kg; without this key any vessel's mass will do.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub payload_kg: Option<f64>,
 }
 
 /// A joint of the UR5, base to tool.
@@ -260,7 +269,40 @@ impl Config {
         let name = file.display().to_string();
         let text = std::fs::read_to_string(file)
             .map_err(|e| ConfigError::Read { file: name.clone(), what: format!("{e}; give --config FILE") })?;
-        Self::parse(&text, &name)
+        let mut config = Self::parse(&text, &name)?;
+        config.place_beside(file);
+        config.check_paths(file)?;
+        Ok(config)
+    }
+
+    /// Makes the paths absolute. Relative ones start at the directory of `file`.
+    fn place_beside(&mut self, file: &Path) {
+        let place = |path: &mut PathBuf| *path = config_paths::beside(file, path);
+        place(&mut self.controller.weights);
+        place(&mut self.recording.directory);
+        self.controller.journal.iter_mut().for_each(place);
+        self.cell.runtime_dir.iter_mut().for_each(place);
+        if matches!(self.camera.source, CameraSource::Device | CameraSource::Video | CameraSource::Images) {
+            self.camera.path = config_paths::beside(file, Path::new(&self.camera.path)).display().to_string();
+        }
+    }
+
+    /// Refuses a configuration in which two keys mean one file, or a key means `file` itself.
+    fn check_paths(&self, file: &Path) -> Result<(), ConfigError> {
+        let mut paths = vec![("the configuration", file.to_path_buf()), ("controller.weights", self.controller.weights.clone())];
+        if let Some(journal) = &self.controller.journal {
+            paths.push(("controller.journal", journal.clone()));
+            paths.push(("the journal before, controller.journal", journal.with_extension("before.bin")));
+        }
+        paths.push(("recording.directory", self.recording.directory.clone()));
+        if !self.camera.path.is_empty() {
+            paths.push(("camera.path", PathBuf::from(&self.camera.path)));
+        }
+        paths.extend(self.cell.runtime_dir.clone().map(|d| ("cell.runtime_dir", d)));
+        let Some((first, second)) = config_paths::clash(&paths) else { return Ok(()) };
+        let value = paths.iter().find(|(key, _)| *key == second).map_or(String::new(), |(_, path)| path.display().to_string());
+        let allowed = format!("another path than {first}: they would overwrite each other");
+        Err(ConfigError::Range { file: file.display().to_string(), key: second.into(), value, allowed })
     }
 
     /// Parses and checks `text`; `file` is named in errors.
@@ -356,6 +398,7 @@ impl Check<'_> {
         self.range("robot.register_base", robot.register_base.into(), 24.0, 40.0)?;
         self.range("robot.lookahead_s", robot.lookahead_s, 0.03, 0.2)?;
         self.range("robot.gain", robot.gain, 100.0, 2000.0)?;
+        self.range("robot.payload_kg", robot.payload_kg.unwrap_or(0.0), 0.0, 5.0)?;
 
         self.range("limits.alpha_min_deg", limits.alpha_min_deg.into(), -20.0, 0.0)?;
         self.range("limits.alpha_max_deg", limits.alpha_max_deg.into(), 10.0, 180.0)?;

@@ -37,6 +37,9 @@ pub struct Args {
     /// Measure these pictures or this video (with --config) instead of drawn frames.
     #[arg(long, requires = "config")]
     input: Option<PathBuf>,
+    /// Take what is there of an --input of which something is missing.
+    #[arg(long)]
+    partial: bool,
     /// The configuration that belongs to --input.
     #[arg(long)]
     config: Option<PathBuf>,
@@ -73,12 +76,13 @@ fn bench(args: &Args) -> Result<(), String> {
     if let (Some(input), Some(file)) = (&args.input, &args.config) {
         let config = Config::read(file).map_err(|e| e.to_string())?;
         let mut frames = Vec::new();
-        for_each_frame(std::slice::from_ref(input), &config.camera, |frame| {
+        let contents = for_each_frame(std::slice::from_ref(input), config.camera.fps, args.partial, |frame| {
             if frames.len() < INPUT_FRAMES {
                 frames.push(to_bgr(&frame).map_err(words)?);
             }
             Ok(())
         })?;
+        contents.missing.iter().for_each(|line| eprintln!("bench: {line}"));
         rows.push(row("input".into(), &config.camera, &config.image, &frames, args)?);
     } else {
         for (scale, size) in [(1.0, "640x480"), (2.0, "1280x720")] {

@@ -40,11 +40,11 @@ Show one whole pour: dry, tilting, flowing, back. The section is printed; --writ
 it names before you trust it: red must lie on the glass's top edge, green on its left side, white on the liquid's outline."
 )]
 pub struct Args {
-    /// Images, a video, or a file name pattern of one pour. Without any, the configured camera is watched; if a worker is running, it is
+    /// Images, a video, a file name pattern, or an episode (.mcap) of one pour. Without any, the configured camera is watched; if a worker is running, it is
     /// the worker's frames that are watched.
     input: Vec<PathBuf>,
     /// The cell's configuration.
-    #[arg(long, default_value = shared::config::DEFAULT_FILE)]
+    #[arg(long, env = shared::config::VARIABLE, default_value = shared::config::DEFAULT_FILE)]
     config: PathBuf,
     /// How long to watch a live camera.
     #[arg(long, default_value_t = 15)]
@@ -61,6 +61,9 @@ pub struct Args {
     /// How the liquid is told from the background. Without this, the configuration says how.
     #[arg(long, value_parser = ["colour", "clear"])]
     method: Option<String>,
+    /// Take what is there of an input of which something is missing: a truncated video, a gap in a sequence, pictures that cannot be read.
+    #[arg(long)]
+    partial: bool,
     /// Write the section into the configuration.
     #[arg(long)]
     write: bool,
@@ -142,7 +145,8 @@ fn calibrate(args: &Args, mut config: Config) -> Result<(), Failure> {
     if args.input.is_empty() {
         watch(args, &config, &mut pour)?;
     } else {
-        for_each_frame(&args.input, &config.camera, |frame| pour.add(&frame)).map_err(bad)?;
+        let contents = for_each_frame(&args.input, config.camera.fps, args.partial, |frame| pour.add(&frame)).map_err(bad)?;
+        contents.missing.iter().for_each(|line| eprintln!("calibrate: {line}"));
     }
     let Some(first) = pour.pictures.first() else { return Err(bad("there is no frame in the input; show one whole pour".into())) };
     (config.camera.width_px, config.camera.height_px) = (first.cols() as u32, first.rows() as u32);
@@ -170,7 +174,7 @@ fn calibrate(args: &Args, mut config: Config) -> Result<(), Failure> {
 /// Watches the configured camera for a while.
 fn watch(args: &Args, config: &Config, pour: &mut Pour) -> Result<(), Failure> {
     let reach = |e: String| failure(exit::UNREACHABLE, e);
-    let cell = Cell::join(&config.cell.name).or_exit(exit::UNREACHABLE)?;
+    let cell = Cell::join(&config.cell).or_exit(exit::UNREACHABLE)?;
     let mut source = ObserverSource::open(&config.camera, &cell).or_exit(exit::UNREACHABLE)?;
     eprintln!("calibrate: watching the camera for {} s; pour once now", args.seconds);
     let end = Instant::now() + Duration::from_secs(args.seconds);

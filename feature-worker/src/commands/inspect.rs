@@ -20,15 +20,15 @@ use crate::vision::{Extractor, Image, Measurement};
 #[derive(Debug, clap::Args)]
 #[command(
     after_help = "Examples:\n  feature-worker inspect pour.mp4 --config config/cell.toml --out out/inspect\n  feature-worker inspect a.png b.png \
---json\n  feature-worker inspect 'frames/frame_%04d.png' --every 10\n\nWrites features.csv (frame, t_s, area_px2, confidence, doubt, triangle) \
-and a picture of every N-th frame with region, axes, outline, edge points, line and triangle drawn on it."
+--json\n  feature-worker inspect 'frames/frame_%04d.png' --every 10\n\nWrites features.csv (frame, t_s, area_px2, confidence, doubt, triangle; times \
+are the file's own, and pictures without times are camera.fps apart) and a picture of every N-th frame with region, axes, outline, edge points, line and triangle drawn on it."
 )]
 pub struct Args {
-    /// Images, one video, or one file name pattern of an image sequence.
+    /// Images, videos, file name patterns of image sequences, or episodes (.mcap).
     #[arg(required = true)]
     input: Vec<PathBuf>,
     /// The cell's configuration. Its [image] table is what is tried.
-    #[arg(long, default_value = shared::config::DEFAULT_FILE)]
+    #[arg(long, env = shared::config::VARIABLE, default_value = shared::config::DEFAULT_FILE)]
     config: PathBuf,
     /// Directory for the pictures and the CSV.
     #[arg(long, default_value = "out/inspect")]
@@ -36,6 +36,9 @@ pub struct Args {
     /// Write the picture of every N-th frame. With 0 none is written.
     #[arg(long, default_value_t = 1)]
     every: u64,
+    /// Take what is there of an input of which something is missing: a truncated video, a gap in a sequence, pictures that cannot be read.
+    #[arg(long)]
+    partial: bool,
     /// Print a summary as JSON.
     #[arg(long)]
     json: bool,
@@ -74,14 +77,16 @@ fn inspect(args: &Args, config: &Config) -> Result<(), String> {
     let mut extractor = Extractor::new(&config.camera, &config.image).map_err(words)?;
     std::fs::create_dir_all(&args.out).map_err(|e| format!("{}: {e}; give another --out", args.out.display()))?;
     let table = args.out.join("features.csv");
-    let mut csv = csv::Writer::from_path(&table).map_err(|e| format!("{}: {e}", table.display()))?;
+    // The table gets its name when it is whole.
+    let unfinished = args.out.join("features.csv.part");
+    let mut csv = csv::Writer::from_path(&unfinished).map_err(|e| format!("{}: {e}", table.display()))?;
     csv.write_record(["frame", "t_s", "area_px2", "confidence", "doubt", "x0", "y0", "x1", "y1", "x2", "y2"]).map_err(words)?;
     let bar = ProgressBar::new_spinner().with_message("frames");
     let mut totals = Totals::default();
-    let frames = for_each_frame(&args.input, &config.camera, |frame| {
+    let contents = for_each_frame(&args.input, config.camera.fps, args.partial, |frame| {
         let measured = measure(&mut extractor, &config.camera, &frame)?;
         totals.add(&measured);
-        csv.write_record(row(&frame.header, config.camera.fps, &measured)).map_err(words)?;
+        csv.write_record(row(&frame.header, &measured)).map_err(words)?;
         if args.every > 0 && (frame.header.sequence - 1) % args.every == 0 {
             let mut picture = to_bgr(&frame).map_err(words)?;
             draw(&mut picture, &extractor, &measured).map_err(words)?;
@@ -91,12 +96,14 @@ fn inspect(args: &Args, config: &Config) -> Result<(), String> {
         bar.inc(1);
         Ok(())
     })?;
-    csv.flush().map_err(|e| format!("{}: {e}", table.display()))?;
+    csv.flush().and_then(|()| std::fs::rename(&unfinished, &table)).map_err(|e| format!("{}: {e}", table.display()))?;
     bar.finish_and_clear();
     let Totals { flowing, doubtful, sum_px2 } = totals;
+    let frames = contents.frames;
+    contents.missing.iter().for_each(|line| eprintln!("inspect: {line}"));
     if args.json {
-        let report =
-            serde_json::json!({ "frames": frames, "flowing": flowing, "doubtful": doubtful, "sum_area_px2": sum_px2, "csv": table });
+        let report = serde_json::json!({ "frames": frames, "flowing": flowing, "doubtful": doubtful, "sum_area_px2": sum_px2,
+            "missing": contents.missing, "csv": table });
         println!("{report}");
     } else {
         println!("{frames} frames, {flowing} with flow, {doubtful} doubtful, sum of V_e {sum_px2:.0} px^2; see {}", table.display());
@@ -120,8 +127,8 @@ fn measure(extractor: &mut Extractor, camera: &CameraConfig, frame: &Frame) -> R
 }
 
 /// One row of the CSV.
-fn row(header: &FrameHeader, fps: f64, measured: &Measurement) -> Vec<String> {
-    let t_s = (header.sequence - 1) as f64 / fps;
+fn row(header: &FrameHeader, measured: &Measurement) -> Vec<String> {
+    let t_s = header.captured_at_ns as f64 / 1e9;
     let mut row = vec![header.sequence.to_string(), format!("{t_s:.4}"), format!("{:.2}", measured.area_px2)];
     row.extend([format!("{:.3}", measured.confidence), measured.doubt.words().to_string()]);
     row.extend(measured.triangle_px.iter().map(|v| format!("{v:.2}")));

@@ -1,61 +1,48 @@
-//! Frames of files that people name on the command line: pictures, videos and patterns of image sequences.
+//! Frames of files that people name on the command line: pictures, videos, patterns of image sequences, and episodes.
 //!
-//! For commands that end when the files do. Allocates; a file that cannot be read is an error that names it.
+//! For commands that end when the files do. Allocates; a file that cannot be read, or of which something is missing, is an error that names
+//! it.
 
-use std::path::{Path, PathBuf};
-use std::time::Duration;
+use std::path::PathBuf;
 
-use opencv::imgcodecs;
-use opencv::prelude::*;
-use shared::config::{CameraConfig, CameraSource};
-use shared::messages::{FrameHeader, PixelFormat};
+use super::frame::{Frame, SourceError};
+use super::recording::Recording;
 
-use super::capture::Capture;
-use super::frame::{Frame, FrameSource as _, NextFrame};
-
-/// Whether `path` is a single picture by its name.
-fn is_picture(path: &Path) -> bool {
-    let extension = path.extension().and_then(|e| e.to_str()).unwrap_or("").to_lowercase();
-    !path.to_string_lossy().contains('%')
-        && ["png", "jpg", "jpeg", "bmp", "tif", "tiff", "pgm", "ppm", "webp"].contains(&extension.as_str())
+/// What the files of a command line held.
+#[derive(Debug, Clone, Default, PartialEq, Eq)]
+pub struct Contents {
+    /// Number of frames that came.
+    pub frames: u64,
+    /// What is missing in which file, a line each.
+    pub missing: Vec<String>,
 }
 
-/// Calls `each` with every frame of pictures, videos or sequences, numbered from 1 on; their size may be any. Returns how many there were.
-/// Ends at the first file that cannot be read, or the first error of `each`, with its text.
-pub fn for_each_frame(input: &[PathBuf], camera: &CameraConfig, mut each: impl FnMut(Frame) -> Result<(), String>) -> Result<u64, String> {
-    let mut count = 0;
+/// Calls `each` with every frame of pictures, videos, sequences or episodes. Numbers count from 1 over all files, and times from the first
+/// frame, ns; `rate_hz` is that of pictures, which have no times. Ends at the first file that cannot be read, or the first error of
+/// `each`, with its text. Without `partial`, something missing is such an error.
+pub fn for_each_frame(
+    input: &[PathBuf],
+    rate_hz: f64,
+    partial: bool,
+    mut each: impl FnMut(Frame) -> Result<(), String>,
+) -> Result<Contents, String> {
+    let mut contents = Contents::default();
+    let words = |e: SourceError| e.to_string();
+    // Number and time that the next file starts after.
+    let (mut number, mut begin_ns) = (0, 0);
     for path in input {
-        if is_picture(path) {
-            count += 1;
-            each_picture(path, count, &mut each)?;
-            continue;
-        }
-        let camera = CameraConfig {
-            source: if path.to_string_lossy().contains('%') { CameraSource::Images } else { CameraSource::Video },
-            path: path.display().to_string(),
-            ..camera.clone()
-        };
-        let mut capture = Capture::open(&camera, false).map_err(|e| e.to_string())?;
-        while let NextFrame::Frame(mut frame) = capture.next_frame(Duration::ZERO).map_err(|e| e.to_string())? {
-            count += 1;
-            frame.header.sequence = count;
+        let mut recording = Recording::open(path, rate_hz, partial).map_err(words)?;
+        let mut last = (0, 0);
+        while let Some(mut frame) = recording.next_frame().map_err(words)? {
+            last = (frame.header.sequence, frame.header.captured_at_ns);
+            frame.header.sequence += number;
+            frame.header.captured_at_ns += begin_ns;
+            contents.frames += 1;
             each(frame)?;
         }
+        contents.missing.extend(recording.remark());
+        number += last.0;
+        begin_ns += last.1 + (1e9 / rate_hz) as u64;
     }
-    Ok(count)
-}
-
-fn each_picture(path: &Path, sequence: u64, each: &mut impl FnMut(Frame) -> Result<(), String>) -> Result<(), String> {
-    let picture = imgcodecs::imread(path, imgcodecs::IMREAD_ANYCOLOR).map_err(|e| e.message)?;
-    if picture.empty() {
-        return Err(format!("{}: cannot be read as a picture", path.display()));
-    }
-    let header = FrameHeader {
-        format: if picture.channels() == 1 { PixelFormat::Mono8 } else { PixelFormat::Bgr8 } as u32,
-        width_px: picture.cols() as u32,
-        height_px: picture.rows() as u32,
-        sequence,
-        ..Default::default()
-    };
-    each(Frame { header, pixels: picture.data_bytes().map_err(|e| e.message)? })
+    Ok(contents)
 }

@@ -6,6 +6,7 @@
 use std::sync::atomic::{AtomicBool, Ordering::Relaxed};
 use std::time::Duration;
 
+use shared::exit;
 use shared::ipc::IpcError;
 use shared::messages::FrameHeader;
 use shared::os;
@@ -18,10 +19,18 @@ const SILENT_NS: u64 = 1_000_000_000;
 /// Why there are no frames.
 #[derive(Debug, thiserror::Error)]
 pub enum SourceError {
-    /// The device, the video or the first image cannot be opened.
+    /// The device cannot be opened.
     #[error("camera.path = \"{path}\": {what}")]
     Open {
         /// `[camera] path`.
+        path: String,
+        /// What is wrong and what to do.
+        what: String,
+    },
+    /// A recording cannot be read.
+    #[error("{path}: {what}")]
+    File {
+        /// The recording.
         path: String,
         /// What is wrong and what to do.
         what: String,
@@ -52,6 +61,24 @@ pub enum SourceError {
         /// The rate that the device reports, frames a second.
         device: f64,
     },
+    /// A recording that is played has another rate than configured.
+    #[error("{path}: it has {own:.2} frames a second, but camera.fps = {configured}; write camera.fps = {own:.2}")]
+    FileRate {
+        /// The recording.
+        path: String,
+        /// `[camera] fps`.
+        configured: f64,
+        /// The recording's mean rate, frames a second.
+        own: f64,
+    },
+    /// Something is missing in a recording.
+    #[error("{path}: {what}; give a whole recording (inspect, calibrate and bench take what is there with --partial)")]
+    Incomplete {
+        /// The recording.
+        path: String,
+        /// What is missing, and where.
+        what: String,
+    },
     /// The camera has stopped giving pictures.
     #[error("camera \"{0}\" gives no more frames; is it unplugged? Plug it in and start again")]
     Lost(String),
@@ -64,6 +91,16 @@ pub enum SourceError {
     /// OpenCV refused a call.
     #[error("OpenCV: {0}")]
     OpenCv(#[from] opencv::Error),
+}
+
+impl SourceError {
+    /// The exit code that fits: bad input where a person must change something, else unreachable.
+    pub fn exit_code(&self) -> u8 {
+        match self {
+            Self::Lost(_) | Self::Ipc(_) | Self::Broken(_) | Self::OpenCv(_) => exit::UNREACHABLE,
+            _ => exit::BAD_INPUT,
+        }
+    }
 }
 
 /// One camera picture with its header. The source owns the pixels until its next call.

@@ -25,7 +25,7 @@ pub struct Args {
     #[arg(long)]
     goal: f32,
     /// The cell's configuration.
-    #[arg(long, default_value = shared::config::DEFAULT_FILE)]
+    #[arg(long, env = shared::config::VARIABLE, default_value = shared::config::DEFAULT_FILE)]
     config: PathBuf,
 }
 
@@ -53,7 +53,7 @@ pub fn run(args: &Args) -> Result<(), Failure> {
             ..Feature::default()
         };
         // The robot is taken to be where it was sent; a lag is for the other simulator to add.
-        let robot = Robot { hindrance: None, alpha_deg, at_ns: now_ns };
+        let robot = Robot::that_may_move(alpha_deg, now_ns);
         let output = core.step(&Input { now_ns, features: &[feature], robot, order });
         let before_deg = alpha_deg;
         alpha_deg = output.telemetry.alpha_deg;

@@ -8,6 +8,7 @@ use shared::control::EndReason;
 use shared::gaussian_curve::Curve;
 use shared::messages::Phase;
 
+use super::following;
 use super::robot::Robot;
 use super::settings::Settings;
 
@@ -41,6 +42,8 @@ pub enum Refusal {
     Busy,
     /// The robot may not move, for this reason.
     Robot(EndReason),
+    /// The robot slows itself to this share of its speed.
+    Slowed(f32),
     /// The container is not upright; this is the measured alpha, degrees.
     NotUpright(f32),
     /// There is no fresh, usable measurement.
@@ -53,6 +56,8 @@ pub enum Refusal {
     Curve,
     /// The controller is shutting down.
     Shutdown,
+    /// The motion was stopped before the order's turn came.
+    Stopped,
 }
 
 impl std::fmt::Display for Refusal {
@@ -60,6 +65,12 @@ impl std::fmt::Display for Refusal {
         match self {
             Self::Busy => write!(f, "a pour or recording is under way: wait for it, or `rt-controller abort`"),
             Self::Robot(reason) => write!(f, "the robot may not move: {}", reason.words()),
+            Self::Slowed(share) => write!(
+                f,
+                "the robot slows itself to {:.0} % of its speed (speed_scaling): look for speed limits of the safety configuration, reduced \
+                 mode, or a wrong payload; a slow robot cannot stop a stream in time",
+                share * 100.0
+            ),
             Self::NotUpright(deg) => write!(f, "the container is tilted by {deg:.0} degrees: bring it upright at the robot's pendant"),
             Self::NoFeature => {
                 write!(
@@ -71,6 +82,7 @@ impl std::fmt::Display for Refusal {
             Self::Goal(max) => write!(f, "the goal must be above 0 and at most {max} ml (controller.goal_max_ml)"),
             Self::Curve => write!(f, "the curve leaves [limits]: choose a smaller lambda or gamma, and a beta of 0.5 to 60 s"),
             Self::Shutdown => write!(f, "the controller is shutting down"),
+            Self::Stopped => write!(f, "an abort came before this order's turn: give it again"),
         }
     }
 }
@@ -102,6 +114,12 @@ impl Situation {
             Phase::Idle => {}
             Phase::NoRobot => return Err(Refusal::NotUpright(self.robot.alpha_deg)),
             _ => return Err(Refusal::Busy),
+        }
+        if self.robot.alpha_deg.is_nan() || self.robot.alpha_deg.abs() > settings.upright_deg {
+            return Err(Refusal::NotUpright(self.robot.alpha_deg));
+        }
+        if let Some(share) = self.robot.speed_scaling.filter(|_| following::is_slowed(&self.robot)) {
+            return Err(Refusal::Slowed(share));
         }
         if self.measurement_age_ns <= settings.stale_ns { Ok(()) } else { Err(Refusal::NoFeature) }
     }

@@ -1,0 +1,309 @@
+//! What a video's container says beside its pictures: how they are turned, when the last one ends, and whether the file is whole.
+//!
+//! OpenCV tells the first in a way that differs between its versions, and the others not at all. Read are MP4 and QuickTime boxes
+//! (ISO/IEC 14496-12), the RIFF chunks of AVI, and the outermost elements of Matroska and WebM (RFC 8794); of other files nothing is said.
+//! For commands that read files, on their own thread; allocates at most [`INDEX_MOST`] bytes. Damaged files are no errors here: what
+//! cannot be read is left out, and numbers from the file are used in checked arithmetic only.
+
+use std::fs::File;
+use std::io::{Read as _, Seek as _, SeekFrom};
+use std::path::Path;
+
+use opencv::core::{self, Mat};
+
+/// The largest index of an MP4 file that is read, bytes. Chosen by hand: an hour at 60 frames a second has about 3 MB.
+const INDEX_MOST: u64 = 1 << 26;
+/// Part of a matrix's larger numbers below which the others count as zero. Chosen by hand: matrices of cameras are exact.
+const NO_SHEAR: f64 = 0.01;
+
+/// How the pictures must be turned to be upright.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) struct Turn {
+    /// Flipped left to right, before the turn.
+    mirrored: bool,
+    /// Quarter turns clockwise, 0 to 3.
+    quarters: u8,
+}
+
+impl Turn {
+    /// The pictures are upright.
+    pub(super) const NONE: Self = Self { mirrored: false, quarters: 0 };
+
+    /// The turn of an MP4 track's matrix, whose a, b, c and d map (x, y) to (a x + c y, b x + d y); `None` if it is no quarter turn.
+    fn of_matrix([a, b, c, d]: [f64; 4]) -> Option<Self> {
+        let (straight, across) = (a.abs().min(d.abs()), b.abs().min(c.abs()));
+        let most = a.abs().max(b.abs()).max(c.abs()).max(d.abs());
+        let clean = |large: f64, small: [f64; 2]| large > 0.5 * most && small.iter().all(|v| v.abs() < NO_SHEAR * most);
+        let turn = |mirrored, quarters| Some(Self { mirrored, quarters });
+        if clean(straight, [b, c]) {
+            match (a > 0.0, d > 0.0) {
+                (true, true) => turn(false, 0),
+                (false, false) => turn(false, 2),
+                (false, true) => turn(true, 0),
+                (true, false) => turn(true, 2),
+            }
+        } else if clean(across, [a, d]) {
+            match (b > 0.0, c > 0.0) {
+                (true, false) => turn(false, 1),
+                (false, true) => turn(false, 3),
+                // Mirrored, then turned: (x, y) goes to (-x, y), and a clockwise turn takes that to (-y, -x).
+                (false, false) => turn(true, 1),
+                (true, true) => turn(true, 3),
+            }
+        } else {
+            None
+        }
+    }
+
+    /// A turn by whole quarters, in degrees clockwise.
+    pub(super) fn of_degrees(degrees: f64) -> Option<Self> {
+        let quarters = degrees / 90.0;
+        (quarters.fract() == 0.0).then(|| Self { mirrored: false, quarters: quarters.rem_euclid(4.0) as u8 })
+    }
+
+    /// `picture` upright; `spare` is a buffer that is used again.
+    pub(super) fn apply(self, picture: &mut Mat, spare: &mut Mat) -> opencv::Result<()> {
+        if self.mirrored {
+            core::flip(picture, spare, 1)?;
+            std::mem::swap(picture, spare);
+        }
+        let code = match self.quarters {
+            1 => core::ROTATE_90_CLOCKWISE,
+            2 => core::ROTATE_180,
+            3 => core::ROTATE_90_COUNTERCLOCKWISE,
+            _ => return Ok(()),
+        };
+        core::rotate(picture, spare, code)?;
+        std::mem::swap(picture, spare);
+        Ok(())
+    }
+}
+
+/// What a container says.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(super) struct Container {
+    /// How the pictures are turned: `None` if this container does not say, `Some(None)` if it says an odd angle.
+    pub turn: Option<Option<Turn>>,
+    /// When the last picture ends, s from the first one.
+    pub end_s: Option<f64>,
+    /// Time from one picture to the next where it is always the same, s.
+    pub period_s: Option<f64>,
+    /// Whether it is always the same, and OpenCV tells it as the rate.
+    pub fixed_rate: bool,
+    /// Whether OpenCV's number of frames is written in the file, and is not an estimate from its duration.
+    pub counts_frames: bool,
+    /// Bytes that the file has too few, judged by the sizes in it.
+    pub missing_bytes: Option<u64>,
+}
+
+impl Container {
+    const UNKNOWN: Self = Self { turn: None, end_s: None, period_s: None, fixed_rate: false, counts_frames: false, missing_bytes: None };
+
+    /// What the file at `path` says.
+    pub(super) fn read(path: &Path) -> std::io::Result<Self> {
+        let mut file = File::open(path)?;
+        let size = file.metadata()?.len();
+        let mut head = Vec::new();
+        (&mut file).take(64).read_to_end(&mut head)?;
+        let kind = |at: usize| head.get(at..at + 4).unwrap_or_default();
+        match (kind(0), kind(4), kind(8)) {
+            (b"RIFF", _, b"AVI ") => avi(&mut file, size),
+            ([0x1a, 0x45, 0xdf, 0xa3], ..) => Ok(matroska(&head, size)),
+            (_, b"ftyp" | b"moov" | b"mdat" | b"wide" | b"free" | b"skip", _) => mp4(&mut file, size),
+            _ => Ok(Self::UNKNOWN),
+        }
+    }
+}
+
+/// How many bytes a file of `size` lacks of what ends at `end`.
+fn missing(end: Option<u64>, size: u64) -> Option<u64> {
+    end.map_or(Some(u64::MAX), |end| end.checked_sub(size)).filter(|m| *m > 0)
+}
+
+fn avi(file: &mut File, size: u64) -> std::io::Result<Container> {
+    let mut known = Container { counts_frames: true, fixed_rate: true, turn: Some(Some(Turn::NONE)), ..Container::UNKNOWN };
+    let mut at = 0u64;
+    let mut head = [0; 8];
+    // A file of more than a gigabyte has several such chunks, one after the other.
+    while at.saturating_add(8) <= size && known.missing_bytes.is_none() {
+        file.seek(SeekFrom::Start(at))?;
+        file.read_exact(&mut head)?;
+        if &head[..4] != b"RIFF" {
+            break;
+        }
+        let body = u64::from(u32::from_le_bytes([head[4], head[5], head[6], head[7]]));
+        // A recorder that was killed leaves no size.
+        known.missing_bytes = if body == 0 { Some(1) } else { missing(at.checked_add(8 + body), size) };
+        at = at.saturating_add(8 + body + body % 2);
+    }
+    Ok(known)
+}
+
+/// A number of Matroska's variable length at `at`, with its length; `None` for one that says "unknown".
+fn variable(bytes: &[u8], at: usize) -> Option<(u64, usize)> {
+    let first = *bytes.get(at)?;
+    let length = first.leading_zeros() as usize + 1;
+    let rest = bytes.get(at + 1..at + length)?;
+    let value = rest.iter().fold(u64::from(first) & (0xff >> length), |v, b| v << 8 | u64::from(*b));
+    (length <= 8 && value != (1 << (7 * length)) - 1).then_some((value, length))
+}
+
+fn matroska(head: &[u8], size: u64) -> Container {
+    let missing_bytes = || {
+        let (header, length) = variable(head, 4)?;
+        let segment = usize::try_from(header).ok()?.checked_add(4 + length)?;
+        if head.get(segment..segment.checked_add(4)?)? != [0x18, 0x53, 0x80, 0x67] {
+            return None;
+        }
+        let (body, length) = variable(head, segment + 4)?;
+        missing((segment as u64 + 4 + length as u64).checked_add(body), size)
+    };
+    Container { missing_bytes: missing_bytes(), ..Container::UNKNOWN }
+}
+
+fn mp4(file: &mut File, size: u64) -> std::io::Result<Container> {
+    let mut known = Container { counts_frames: true, ..Container::UNKNOWN };
+    let mut at = 0u64;
+    while at.saturating_add(8) <= size {
+        file.seek(SeekFrom::Start(at))?;
+        let mut head = Vec::new();
+        file.take(16).read_to_end(&mut head)?;
+        let Some((kind, header, length)) = box_head(&head) else { break };
+        let end = match length {
+            Some(length) => at.checked_add(length),
+            None => Some(size),
+        };
+        known.missing_bytes = missing(end, size);
+        let Some(end) = end.filter(|end| known.missing_bytes.is_none() && *end > at) else { break };
+        if &kind == b"moov" && end - at <= INDEX_MOST {
+            let mut moov = Vec::new();
+            file.seek(SeekFrom::Start(at + header))?;
+            file.take(end - at - header).read_to_end(&mut moov)?;
+            known = Container { missing_bytes: None, ..movie(&moov) };
+        }
+        at = end;
+    }
+    Ok(known)
+}
+
+/// Kind, length of the header, and length in all of the box that begins with `bytes`; the length is `None` up to the file's end. `None` if
+/// this is no box.
+fn box_head(bytes: &[u8]) -> Option<([u8; 4], u64, Option<u64>)> {
+    let kind: [u8; 4] = bytes.get(4..8)?.try_into().ok()?;
+    if !kind.iter().all(|c| c.is_ascii_graphic() || *c == b' ' || *c == 0xa9) {
+        return None;
+    }
+    match u32_at(bytes, 0)? {
+        0 => Some((kind, 8, None)),
+        1 => Some((kind, 16, Some(u64_at(bytes, 8)?.max(16)))),
+        length => Some((kind, 8, (length >= 8).then_some(u64::from(length)))).filter(|_| length >= 8),
+    }
+}
+
+fn u32_at(bytes: &[u8], at: usize) -> Option<u32> {
+    Some(u32::from_be_bytes(bytes.get(at..at.checked_add(4)?)?.try_into().ok()?))
+}
+
+fn u64_at(bytes: &[u8], at: usize) -> Option<u64> {
+    Some(u64::from(u32_at(bytes, at)?) << 32 | u64::from(u32_at(bytes, at + 4)?))
+}
+
+/// The boxes in `bytes`: kind and contents.
+fn boxes(mut bytes: &[u8]) -> impl Iterator<Item = ([u8; 4], &[u8])> {
+    std::iter::from_fn(move || {
+        let (kind, header, length) = box_head(bytes)?;
+        let length = length.map_or(bytes.len(), |l| usize::try_from(l).unwrap_or(usize::MAX).min(bytes.len()));
+        let contents = bytes.get(header as usize..length)?;
+        bytes = &bytes[length..];
+        Some((kind, contents))
+    })
+}
+
+/// The contents of the box at the end of `path`, each in the one before.
+fn inside<'a>(bytes: &'a [u8], path: &[&[u8; 4]]) -> Option<&'a [u8]> {
+    path.iter().try_fold(bytes, |bytes, kind| boxes(bytes).find(|(k, _)| k == *kind).map(|(_, contents)| contents))
+}
+
+/// A header box's time scale (units a second) and duration, of which the second is `None` where it is not known.
+fn scale_and_duration(header: &[u8]) -> Option<(f64, Option<u64>)> {
+    let (scale, duration) = match header.first()? {
+        0 => (u32_at(header, 12)?, u32_at(header, 16).filter(|d| *d != u32::MAX).map(u64::from)),
+        _ => (u32_at(header, 20)?, u64_at(header, 24).filter(|d| *d != u64::MAX)),
+    };
+    (scale > 0).then_some((f64::from(scale), duration.filter(|d| *d > 0)))
+}
+
+/// What the index of an MP4 file says of its first video track.
+fn movie(moov: &[u8]) -> Container {
+    let mut known = Container { counts_frames: true, ..Container::UNKNOWN };
+    let is_video = |trak: &&[u8]| inside(trak, &[b"mdia", b"hdlr"]).is_some_and(|h| h.get(8..12) == Some(b"vide"));
+    let Some(track) = boxes(moov).filter(|(kind, _)| kind == b"trak").map(|(_, trak)| trak).find(is_video) else { return known };
+    if let Some(header) = inside(track, &[b"tkhd"]) {
+        let wide = header.first().is_some_and(|v| *v > 0);
+        let matrix = if wide { 52 } else { 40 };
+        let number = |i: usize| u32_at(header, matrix + 4 * i).map(|v| f64::from(v as i32));
+        if let (Some(a), Some(b), Some(c), Some(d)) = (number(0), number(1), number(3), number(4)) {
+            known.turn = Some(Turn::of_matrix([a, b, c, d]));
+        }
+        let scale = inside(moov, &[b"mvhd"]).and_then(scale_and_duration).map(|(scale, _)| scale);
+        let duration =
+            if wide { u64_at(header, 28).filter(|d| *d != u64::MAX) } else { u32_at(header, 20).filter(|d| *d != u32::MAX).map(u64::from) };
+        known.end_s = scale.zip(duration.filter(|d| *d > 0)).map(|(scale, duration)| duration as f64 / scale);
+    }
+    known.period_s = period_s(track);
+    known
+}
+
+/// Time from one picture to the next, s, if a track has the same for all of them but the last.
+fn period_s(track: &[u8]) -> Option<f64> {
+    let (scale, _) = inside(track, &[b"mdia", b"mdhd"]).and_then(scale_and_duration)?;
+    let times = inside(track, &[b"mdia", b"minf", b"stbl", b"stts"])?;
+    let entry = |i: usize| Some((u32_at(times, 8 + 8 * i)?, u32_at(times, 12 + 8 * i)?));
+    let (_, delta) = entry(0)?;
+    let same = match u32_at(times, 4)? {
+        1 => true,
+        2 => entry(1)?.0 <= 1,
+        _ => false,
+    };
+    (same && delta > 0).then(|| f64::from(delta) / scale)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use rand::{Rng as _, RngExt as _};
+
+    /// Protects the commands from files that others made: whatever the sizes in them say, reading ends, and never in a panic.
+    #[test]
+    fn any_bytes_are_survived() {
+        let file = tempfile::NamedTempFile::new().expect("a file");
+        let mut random = rand_pcg::Pcg32::new(1, 1);
+        let boxed = |kind: &[u8], inner: &[u8]| [&(inner.len() as u32 + 8).to_be_bytes(), kind, inner].concat();
+        let mut track = boxed(b"tkhd", &[0; 84]);
+        let times = [boxed(b"stts", &[0, 0, 0, 0, 0, 0, 0, 1, 0, 0, 0, 9, 0, 0, 0, 5]), Vec::new()].concat();
+        let media =
+            [boxed(b"mdhd", &[7; 24]), boxed(b"hdlr", b"\0\0\0\0\0\0\0\0vide\0\0\0\0"), boxed(b"minf", &boxed(b"stbl", &times))].concat();
+        track.extend(boxed(b"mdia", &media));
+        let movie = boxed(b"moov", &[boxed(b"mvhd", &[1; 100]), boxed(b"trak", &track)].concat());
+        let mp4 = [boxed(b"ftyp", b"isom\0\0\0\0"), movie, boxed(b"mdat", &[0; 64])].concat();
+        let avi = [&b"RIFF"[..], &200u32.to_le_bytes(), b"AVI ", &[0; 200]].concat();
+        let mkv = [&[0x1a, 0x45, 0xdf, 0xa3, 0x84, 1, 2, 3, 4, 0x18, 0x53, 0x80, 0x67, 0x10, 0, 1, 0][..], &[0; 200]].concat();
+        assert!(movie_period(&mp4, file.path()).is_some(), "the whole file is read");
+        for seed in [mp4, avi, mkv] {
+            for _ in 0..3000 {
+                let mut bytes = seed.clone();
+                for _ in 0..random.random_range(1..5) {
+                    let at = random.random_range(0..bytes.len());
+                    bytes[at] = [0, 1, 0xff, 0x7f, random.next_u32() as u8][random.random_range(0..5)];
+                }
+                bytes.truncate(random.random_range(0..=bytes.len()));
+                movie_period(&bytes, file.path());
+            }
+        }
+    }
+
+    fn movie_period(bytes: &[u8], file: &Path) -> Option<f64> {
+        std::fs::write(file, bytes).expect("written");
+        Container::read(file).expect("read").period_s
+    }
+}
