@@ -55,7 +55,10 @@ impl Plan {
         let holds_ml = rig.shape.retained_ml(0.0);
         let fives = |ml: f64| (ml / 5.0).round() * 5.0;
         let fill = |share: f64| (share * holds_ml / 10.0).floor() * 10.0;
-        let pour = |(fill_share, goal_share): (f64, f64)| PlannedPour { fill_ml: fill(fill_share), goal_ml: fives((goal_share * holds_ml).min(GOAL_MAX_ML)) };
+        let pour = |(fill_share, goal_share): (f64, f64)| PlannedPour {
+            fill_ml: fill(fill_share),
+            goal_ml: fives((goal_share * holds_ml).min(GOAL_MAX_ML)),
+        };
         let curve = |(share, beyond_deg, gamma_per_s2): (f64, f64, f64)| {
             let fill_ml = fill(share);
             let lambda_deg = (rig.container(fill_ml).spill_angle_deg() + beyond_deg).min(LAMBDA_MAX_DEG).round();
