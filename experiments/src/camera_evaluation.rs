@@ -10,9 +10,11 @@
 //! | [`figures`] | errors and rates of many measured frames |
 //! | [`worst`] | the worst frames, with what was seen and the truth drawn on them |
 //! | [`doubts`] | frames that nobody should trust, and whether the doubt is raised |
+//! | [`faults`] | whole pours through cameras with the faults that people report |
 
 pub mod cases;
 pub mod doubts;
+pub mod faults;
 pub mod figures;
 pub mod measure;
 pub mod scenes;

@@ -1,5 +1,6 @@
 //! The commands of the program `experiments`, one file each.
 
+pub mod bare_loop;
 pub mod demo;
 pub mod evaluate;
 pub mod evaluate_camera;

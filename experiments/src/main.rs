@@ -3,7 +3,8 @@
 use std::process::ExitCode;
 
 use clap::{Parser, Subcommand};
-use experiments::commands::{demo, evaluate, evaluate_camera, jitter, motion, reproduce};
+use experiments::commands::{bare_loop, demo, evaluate, evaluate_camera, jitter, motion, reproduce};
+use experiments::jitter::bare_loop::BareLoop;
 
 /// Experiments on the simulated cell: the demo, evaluations against the truth, latency on this machine.
 #[derive(Parser)]
@@ -25,6 +26,9 @@ enum Command {
     EvaluateCamera(evaluate_camera::Args),
     /// Measures latency and jitter of the real processes on this machine, beside cyclictest.
     Jitter(jitter::Args),
+    /// The yardstick that `jitter` runs beside the controller: the loop's system calls and nothing else.
+    #[command(hide = true)]
+    BareLoop(BareLoop),
     /// What the robot makes of a recorded pour's targets, with its program and without.
     Motion(motion::Args),
 }
@@ -36,6 +40,7 @@ fn main() -> ExitCode {
         Command::Reproduce(args) => reproduce::run(&args),
         Command::EvaluateCamera(args) => evaluate_camera::run(&args),
         Command::Jitter(args) => jitter::run(&args),
+        Command::BareLoop(settings) => bare_loop::run(&settings),
         Command::Motion(args) => motion::run(&args),
     })
 }

@@ -4,6 +4,9 @@
 //! |---|---|
 //! | `extractor` | measures one image: checks, then the liquid, then the line |
 //! | `checks` | whether a picture can be used: light, repetition, focus |
+//! | `whole` | whether a picture is whole: decoded to its end, of one moment, with the glass in its place |
+//! | `presence` | when a stream that is not seen any more is gone |
+//! | `ground_colours` | the colours of the ground behind a coloured liquid |
 //! | `liquid` | what the extractor asks of a liquid; `coloured_liquid` and `clear_water` are the two kinds |
 //! | `stream_edge` | the stream's edge as a robust line, then through sub-pixel points of profiles |
 //! | `geometry` | lines, the two axes, and the rays between them |
@@ -19,6 +22,7 @@ mod clear_water;
 mod coloured_liquid;
 mod extractor;
 mod geometry;
+mod ground_colours;
 mod learn_axes;
 mod learn_colour;
 mod learn_poses;
@@ -27,7 +31,9 @@ mod learn_steady;
 mod liquid;
 mod measurement;
 mod picture;
+mod presence;
 mod stream_edge;
+mod whole;
 
 pub use extractor::{ExtractError, Extractor};
 pub use geometry::Axes;

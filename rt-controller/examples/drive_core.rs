@@ -88,6 +88,7 @@ pub fn pour(goal_ml: f32) -> (Outcome, f32) {
         goal_max_ml: 300.0,
         upright_deg: 2.0,
         patience_ns: 100_000_000,
+        usual_lag_ns: 156_000_000,
     };
     let mut core = Core::new(settings);
     core.exchange(Box::new(Agent::new(&weights())));
@@ -96,7 +97,7 @@ pub fn pour(goal_ml: f32) -> (Outcome, f32) {
         let feature = cylinder.step();
         // In the first tick the core finds that the robot may move and is upright; then the goal can be set.
         let order = (cylinder.frame == 2).then_some(Order::Pour { episode: 1, goal_ml });
-        let robot = Robot { hindrance: None, alpha_deg: cylinder.alpha_deg, at_ns: cylinder.now_ns };
+        let robot = Robot::that_may_move(cylinder.alpha_deg, cylinder.now_ns);
         let output = core.step(&Input { now_ns: cylinder.now_ns, features: &[feature], robot, order });
         if let Some(Err(refusal)) = output.ordered {
             println!("refused: {refusal}");

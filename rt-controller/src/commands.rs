@@ -7,6 +7,7 @@ pub mod abort;
 pub mod pour;
 pub mod record;
 pub mod replay;
+pub mod resume;
 pub mod run;
 pub mod status;
 pub mod step;

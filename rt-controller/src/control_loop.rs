@@ -46,7 +46,7 @@ pub fn run(settings: Settings, place: Place, lost_ns: u64, features: &Features, 
         if state.tick(deadline_ns) == Next::Ended {
             break;
         }
-        let (next_ns, skipped) = state.pacer.next_deadline_ns(deadline_ns, os::now_ns());
+        let (next_ns, skipped) = state.pacer.next_deadline_ns(deadline_ns, state.done_ns);
         exchange.skipped_ticks.fetch_add(skipped, Relaxed);
         deadline_ns = next_ns;
     }
@@ -77,6 +77,8 @@ pub struct LoopState<'a> {
     period_ns: u64,
     lost_ns: u64,
     shutdown: bool,
+    /// When the newest tick was done, ns: the time that the next deadline is reckoned with, so that the journal has all that it follows from.
+    done_ns: u64,
     /// Allocations and page faults of this thread outside of its ticks: before the first one, and when it met feature workers.
     elsewhere: (u64, u64),
 }
@@ -95,6 +97,7 @@ impl<'a> LoopState<'a> {
             period_ns: settings.period_ns,
             lost_ns,
             shutdown: false,
+            done_ns: 0,
             elsewhere: spent(),
         }
     }
@@ -103,18 +106,24 @@ impl<'a> LoopState<'a> {
     pub fn tick(&mut self, deadline_ns: u64) -> Next {
         let exchange = self.exchange;
         let woke_ns = os::now_ns();
+        let margin_ns = self.pacer.margin_ns();
         let lateness_ns = woke_ns.saturating_sub(deadline_ns);
         exchange.timing.lateness.record(lateness_ns);
         if lateness_ns > self.period_ns / 2 {
             exchange.late_ticks.fetch_add(1, Relaxed);
         }
 
+        // The memory answers to these while the features are received and the robot's socket is drained.
+        self.core.prefetch(0);
         self.receive_features();
+        self.core.prefetch(1);
         let taken = self.take_agent();
         if self.session.is_none() {
             self.session = exchange.sessions.pop();
         }
+        self.core.prefetch(2);
         let (robot, mut end) = look_at_robot(self.session.as_deref_mut(), woke_ns, self.lost_ns);
+        self.core.prefetch(3);
         let order = exchange.orders.pop();
         self.shutdown |= order == Some(Order::Shutdown);
 
@@ -139,6 +148,7 @@ impl<'a> LoopState<'a> {
         exchange.loop_allocations.store(allocations - self.elsewhere.0, Relaxed);
         exchange.loop_page_faults.store(faults - self.elsewhere.1, Relaxed);
         let done_ns = os::now_ns();
+        self.done_ns = done_ns;
         exchange.timing.execution.record(done_ns.saturating_sub(woke_ns));
         let tick = Tick {
             now_ns: woke_ns,
@@ -148,7 +158,7 @@ impl<'a> LoopState<'a> {
             agent: taken,
             target_deg: output.target_deg,
             d_ml: telemetry.d_ml,
-            times: Times { deadline_ns, decided_at_ns, written_at_ns, done_ns },
+            times: Times { deadline_ns, decided_at_ns, written_at_ns, done_ns, margin_ns },
         };
         self.tell(Event::Tick(tick, telemetry, self.core.counters()));
         let upright = matches!(self.core.phase(), Phase::Idle | Phase::NoRobot);
@@ -185,8 +195,10 @@ impl<'a> LoopState<'a> {
 
     /// Records how old the newest feature was when it was used, and tells the pacer. `written_at_ns` is 0 if no target was written.
     fn measure_features(&mut self, woke_ns: u64, written_at_ns: u64) {
+        for feature in &self.fresh {
+            self.pacer.used(woke_ns, feature.published_at_ns);
+        }
         let Some(newest) = self.fresh.last() else { return };
-        self.pacer.used(woke_ns, newest.published_at_ns);
         if written_at_ns != 0 {
             let timing = &self.exchange.timing;
             timing.wake_to_written.record(written_at_ns.saturating_sub(woke_ns));
@@ -241,12 +253,13 @@ fn spent() -> (u64, u64) {
 /// The robot as the core sees it, and why its session is over, if it is.
 fn look_at_robot(session: Option<&mut Session>, now_ns: u64, lost_ns: u64) -> (Robot, Option<SessionEnd>) {
     let Some(session) = session else {
-        return (Robot { hindrance: Some(EndReason::RobotLost), alpha_deg: f32::NAN, at_ns: 0 }, None);
+        return (Robot { hindrance: Some(EndReason::RobotLost), ..Robot::that_may_move(f32::NAN, 0) }, None);
     };
     let lost = session.poll(now_ns).err();
     let state = session.state();
     let may_not_move = health::check(state, now_ns, lost_ns).err();
     let hindrance = if lost.is_some() { Some(may_not_move.unwrap_or(EndReason::RobotLost)) } else { may_not_move };
     let end = lost.map(SessionEnd::Lost).or(may_not_move.map(SessionEnd::MayNotMove));
-    (Robot { hindrance, alpha_deg: state.alpha_deg, at_ns: state.received_at_ns }, end)
+    let speed_scaling = state.speed_scaling.map(|share| share as f32);
+    (Robot { hindrance, alpha_deg: state.alpha_deg, at_ns: state.received_at_ns, speed_scaling }, end)
 }

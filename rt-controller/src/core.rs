@@ -20,10 +20,12 @@ use shared::limits::{Clipped, Limiter};
 use shared::messages::{Feature, LAYOUT_VERSION, Phase, Telemetry};
 
 use ending::{Ending, Moment, SeenFrame};
+use following::{COMMANDS, Following};
 use intake::Taken;
 use order::Situation;
 
 pub mod ending;
+mod following;
 mod intake;
 mod order;
 mod robot;
@@ -36,8 +38,6 @@ pub use settings::Settings;
 /// Largest number of features that one tick takes; it takes the newest. More than these come only if the loop is late by a quarter of a
 /// second.
 pub const MAX_FEATURES: usize = 8;
-/// Number of commands that are remembered, to know which one was in force when a picture was taken: a second at 30 Hz.
-const COMMANDS: usize = 32;
 /// A measurement older than this many periods counts its tick as stale. Chosen by hand; no measurement is recorded.
 const STALE_TICK_PERIODS: u64 = 3;
 
@@ -95,6 +95,7 @@ struct Run {
     /// Curve of a recording.
     curve: Option<Curve>,
     ending: Ending,
+    following: Following,
     settling_since_ns: u64,
     /// Start time of the feature worker that measured when it began, ns.
     worker_epoch_ns: u64,
@@ -159,6 +160,13 @@ impl Core {
     /// Whether a new agent may be taken now: not in the middle of a pour or recording.
     pub fn may_exchange(&self) -> bool {
         self.run.is_none()
+    }
+
+    /// Brings a part of what the next step reads into the processor's caches ([`Agent::prefetch`]). It changes no result.
+    pub fn prefetch(&self, part: usize) {
+        if let Some(agent) = &self.agent {
+            agent.prefetch(part);
+        }
     }
 
     /// Takes `agent` for the next pours and gives the old one back, in constant time. Call it only when [`Core::may_exchange`];
@@ -253,6 +261,7 @@ impl Core {
             goal_ml,
             curve,
             ending: curve.map_or_else(Ending::of_pour, |c| Ending::of_recording(f64::from(c.duration_s()))),
+            following: Following::new(self.agent.as_ref().and_then(|agent| agent.learned_lag_s()), &self.settings),
             settling_since_ns: 0,
             worker_epoch_ns: newest.map_or(0, |f| f.worker_epoch_ns),
             counters_before: self.counters(),
@@ -334,6 +343,7 @@ impl Core {
     fn advance(&mut self, input: &Input) -> Option<Outcome> {
         let run = self.run.as_mut()?;
         let seconds = |since_ns: u64| input.now_ns.saturating_sub(since_ns) as f64 / 1e9;
+        let follows = run.following.follows(&input.robot, &self.commanded);
         match self.phase {
             Phase::Pouring | Phase::Recording => {
                 let age_ns = input.now_ns.saturating_sub(self.usable_at_ns);
@@ -344,6 +354,7 @@ impl Core {
                     measurement_age_ns: age_ns,
                     alpha_deg: self.limiter.alpha_deg(),
                     poured_ml: self.decision.poured_ml,
+                    follows,
                 };
                 if let Some(reason) = run.ending.due(&moment, &self.settings) {
                     self.give_up(reason);
@@ -351,6 +362,7 @@ impl Core {
                 None
             }
             Phase::Returning => {
+                run.ending.returns(follows);
                 if ending::is_commanded_upright(self.limiter.alpha_deg()) {
                     self.phase = Phase::Settling;
                     run.settling_since_ns = input.now_ns;
@@ -359,6 +371,7 @@ impl Core {
                 None
             }
             Phase::Settling => {
+                run.ending.returns(follows);
                 let settling_s = seconds(run.settling_since_ns);
                 let reason = run.ending.settled(input.robot.alpha_deg, settling_s, self.shutdown, &self.settings)?;
                 let run = self.run.take()?;
@@ -371,16 +384,23 @@ impl Core {
 
     /// The angle to command, degrees: every one passes the limiter. `None` without a robot.
     fn command(&mut self, input: &Input, asked_deg: f32) -> Option<f32> {
+        // No tilt is asked for that is out of the joint's reach.
+        let within_reach = |run: &Run, request_deg| run.following.within_reach_deg(request_deg, input.robot.alpha_deg);
         match self.phase {
             Phase::NoRobot => None,
-            // Without a new action, the rest of the last one is carried out.
-            Phase::Pouring if asked_deg.is_nan() => Some(self.limiter.step_towards(self.request_deg)),
-            Phase::Pouring => Some(self.limiter.step(self.request_deg)),
+            Phase::Pouring => {
+                self.request_deg = self.run.as_ref().map_or(self.request_deg, |run| within_reach(run, self.request_deg));
+                // Without a new action, the rest of the last one is carried out.
+                let request_deg = self.request_deg;
+                Some(if asked_deg.is_nan() { self.limiter.step_towards(request_deg) } else { self.limiter.step(request_deg) })
+            }
             Phase::Recording => {
                 let run = self.run?;
                 let t = input.now_ns.saturating_sub(run.started_at_ns) as f32 / 1e9;
-                Some(self.limiter.step(run.curve.map_or(0.0, |c| c.alpha_deg(t))))
+                Some(self.limiter.step(within_reach(&run, run.curve.map_or(0.0, |c| c.alpha_deg(t)))))
             }
+            // What was asked for and not followed is taken back as fast as the limits allow; from there on the way is the usual one.
+            Phase::Returning if self.is_ahead_of(input.robot.alpha_deg) => Some(self.limiter.step(input.robot.alpha_deg)),
             Phase::Idle | Phase::Returning | Phase::Settling => {
                 let target = self.limiter.step_upright();
                 if self.phase == Phase::Returning && self.run.is_none() && ending::is_commanded_upright(target) {
@@ -389,6 +409,12 @@ impl Core {
                 Some(target)
             }
         }
+    }
+
+    /// Whether a pour or recording ends because the joint did not follow, and the command is still beyond it.
+    fn is_ahead_of(&self, measured_deg: f32) -> bool {
+        let not_followed = self.run.is_some_and(|run| run.ending.reason() == EndReason::NotFollowed);
+        not_followed && (0.0..self.limiter.alpha_deg()).contains(&measured_deg)
     }
 
     fn outcome(&self, run: &Run, reason: EndReason, now_ns: u64) -> Outcome {

@@ -45,6 +45,16 @@ impl std::fmt::Display for SessionEnd {
     }
 }
 
+impl SessionEnd {
+    /// The reason with which a pour ends.
+    pub fn reason(&self) -> EndReason {
+        match self {
+            Self::Lost(_) => EndReason::RobotLost,
+            Self::MayNotMove(reason) => *reason,
+        }
+    }
+}
+
 /// Histograms of the loop, all in nanoseconds.
 #[derive(Debug, Default)]
 pub struct Timing {
@@ -90,6 +100,8 @@ pub struct Exchange {
     pub events_lost: AtomicU64,
     /// Set by the loop when it has ended, upright.
     pub ended: AtomicBool,
+    /// To the robot's thread: set when the operator asks for the robot; the thread takes it back.
+    pub resume: AtomicBool,
 }
 
 /// Number of orders that may wait for the loop, which takes one a tick. Chosen by hand; no measurement is recorded.
@@ -116,6 +128,7 @@ impl Default for Exchange {
             agents_taken: AtomicU64::new(0),
             events_lost: AtomicU64::new(0),
             ended: AtomicBool::new(false),
+            resume: AtomicBool::new(false),
         }
     }
 }

@@ -3,7 +3,7 @@
 //! The loop hands each [`Tick`] to an ordinary thread through a queue, and that thread writes it ([`Writer`]). Commands and tests read
 //! and replay. Both allocate. A file that was cut off is read up to its last whole entry; every other fault is a [`JournalError`].
 //!
-//! The file begins with the 8 bytes `decantj2`. Then come the entries: a little-endian u32 with the length, and that many bytes of
+//! The file begins with the 8 bytes `decantj3`. Then come the entries: a little-endian u32 with the length, and that many bytes of
 //! postcard.
 
 use std::collections::BTreeMap;
@@ -17,9 +17,10 @@ use shared::messages::Feature;
 use shared::weights::Weights;
 
 use crate::core::{Core, Input, MAX_FEATURES, Order, Robot, Settings};
+use crate::pacing::Pacer;
 
 /// The first bytes of a journal, which include its version.
-const MAGIC: &[u8; 8] = b"decantj2";
+const MAGIC: &[u8; 8] = b"decantj3";
 /// Longest entry, bytes: more than ten weight files, which are the largest entries.
 const ENTRY_MAX: usize = 128 * 1024;
 /// Size at which a journal stops growing, bytes: about three days of ticks.
@@ -55,8 +56,10 @@ pub struct Times {
     pub decided_at_ns: u64,
     /// When the kernel had taken the target's bytes; 0 if no target was written.
     pub written_at_ns: u64,
-    /// When everything was done except queueing this entry.
+    /// When everything was done except queueing this entry. The next deadline is reckoned with it.
     pub done_ns: u64,
+    /// How long V_e was to have waited for this tick, ns ([`crate::pacing`]).
+    pub margin_ns: u64,
 }
 
 /// One entry of the file.
@@ -156,6 +159,8 @@ pub struct Replay {
     pub different: u64,
     /// Number of the first of those ticks, counted from 0.
     pub first_different: Option<u64>,
+    /// Number of ticks whose deadline or margin is not the one that follows from the ticks before.
+    pub different_deadlines: u64,
     /// Whether the file ends in the middle of an entry.
     pub cut_off: bool,
 }
@@ -170,7 +175,8 @@ pub fn replay(path: &Path, mut seen: impl FnMut(&Tick, &crate::core::Output)) ->
     if reader.read_exact(&mut magic).is_err() || &magic != MAGIC {
         return Err(JournalError::Foreign { file });
     }
-    let mut result = Replay { ticks: 0, ended: Vec::new(), different: 0, first_different: None, cut_off: false };
+    let mut result = Replay { ticks: 0, ended: Vec::new(), different: 0, first_different: None, different_deadlines: 0, cut_off: false };
+    let mut pacing: Option<(Pacer, Option<u64>)> = None;
     let mut core: Option<Core> = None;
     let mut weights = BTreeMap::new();
     let mut at = MAGIC.len() as u64;
@@ -192,7 +198,10 @@ pub fn replay(path: &Path, mut seen: impl FnMut(&Tick, &crate::core::Output)) ->
             break;
         }
         match (postcard::from_bytes(&buffer).map_err(|_| damaged())?, &mut core) {
-            (Entry::Settings(settings), _) => core = Some(Core::new(settings)),
+            (Entry::Settings(settings), _) => {
+                pacing = Some((Pacer::new(settings.period_ns), None));
+                core = Some(Core::new(settings));
+            }
             (Entry::Weights(identity, bytes), _) => {
                 weights.insert(identity, Weights::from_bytes(&bytes, &file).map_err(|_| damaged())?);
             }
@@ -207,6 +216,12 @@ pub fn replay(path: &Path, mut seen: impl FnMut(&Tick, &crate::core::Output)) ->
                 if !same {
                     result.different += 1;
                     result.first_different.get_or_insert(result.ticks);
+                }
+                if let Some((pacer, deadline_ns)) = &mut pacing {
+                    let same = deadline_ns.is_none_or(|ns| ns == tick.times.deadline_ns) && pacer.margin_ns() == tick.times.margin_ns;
+                    result.different_deadlines += u64::from(!same);
+                    tick.features.iter().for_each(|f| pacer.used(now_ns, f.published_at_ns));
+                    *deadline_ns = Some(pacer.next_deadline_ns(tick.times.deadline_ns, tick.times.done_ns).0);
                 }
                 result.ticks += 1;
                 result.ended.extend(output.ended);

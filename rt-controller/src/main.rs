@@ -4,7 +4,7 @@
 use std::process::ExitCode;
 
 use clap::{Parser, Subcommand};
-use rt_controller::commands::{abort, pour, record, replay, run, status, step};
+use rt_controller::commands::{abort, pour, record, replay, resume, run, status, step};
 
 /// Counts allocations, so that the loop can show that it makes none.
 #[global_allocator]
@@ -28,6 +28,8 @@ enum Command {
     Record(record::Args),
     /// Brings the container upright at once.
     Abort(abort::Args),
+    /// Takes the robot back after a person had it in hand.
+    Resume(resume::Args),
     /// Shows state, rates, lateness histograms and counters.
     Status(status::Args),
     /// Runs the controller's core as a filter, V_e in and angles out, for any other simulator.
@@ -46,6 +48,7 @@ fn main() -> ExitCode {
         Command::Pour(args) => pour::run(&args),
         Command::Record(args) => record::run(&args),
         Command::Abort(args) => abort::run(&args),
+        Command::Resume(args) => resume::run(&args),
         Command::Status(args) => status::run(&args),
         Command::Step(args) => step::run(&args),
         Command::Replay(args) => replay::run(&args),

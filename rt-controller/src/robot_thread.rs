@@ -2,46 +2,94 @@
 //! sessions that are over.
 //!
 //! It runs in a thread of its own with ordinary scheduling, because connecting blocks for seconds; it allocates. Every failure to connect
-//! is shown as a line and tried again a second later; nothing here ends the controller.
+//! is shown as a line and tried again a second later; nothing here ends the controller. A robot that a person has, or had, in hand is not
+//! tried again, but left alone until the operator asks for it ([`Exchange::resume`]); what counts as that is in [`hands`].
 
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering::Relaxed};
 use std::sync::{Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
 use shared::config::Config;
+use shared::control::RobotLink;
 
-use crate::exchange::Exchange;
-use crate::link::{self, LinkOptions};
+use crate::exchange::{Exchange, SessionEnd};
+use crate::link::hands::{self, Before, Handover};
+use crate::link::{self, LinkError, LinkOptions, Session, payload};
 
 /// How often the thread looks whether the loop has given a session back. Chosen by hand; no measurement is recorded.
 const BEAT: Duration = Duration::from_millis(100);
 /// Pause before the next attempt to reach the robot. Chosen by hand; no measurement is recorded.
 const RECONNECT: Duration = Duration::from_secs(1);
+/// How long the operator's wish for the robot counts, while it cannot be reached for other reasons than a person. Chosen by hand; no
+/// measurement is recorded.
+const WISH: Duration = Duration::from_secs(10);
 
-/// What the robot's thread has to say to operators; empty while the robot is connected.
+/// What the robot's thread has to say to operators.
 #[derive(Debug, Default)]
-pub struct RobotNote(Mutex<String>);
+pub struct RobotNote(Mutex<Note>);
+
+/// A note's contents.
+#[derive(Debug, Default, Clone)]
+pub struct Note {
+    /// Why the robot is not connected, one line; empty while it is.
+    pub text: String,
+    /// Who has the robot.
+    pub link: RobotLink,
+    /// What is doubtful about the robot's settings, one line; empty if nothing is.
+    pub warning: String,
+}
 
 impl RobotNote {
-    /// Sets the note, and says it if it is a new one.
-    fn set(&self, text: String, say: &dyn Fn(&str)) {
+    /// Sets the note, and says its lines if they are new ones.
+    fn set(&self, text: String, link: RobotLink, say: &dyn Fn(&str)) {
         let mut note = self.0.lock().unwrap_or_else(PoisonError::into_inner);
-        if *note != text {
+        note.link = link;
+        if note.text != text {
             if !text.is_empty() {
                 say(&text);
             }
-            *note = text;
+            note.text = text;
         }
     }
 
+    /// Sets the doubt about the robot's settings, and says it.
+    fn warn(&self, warning: String, say: &dyn Fn(&str)) {
+        if !warning.is_empty() {
+            say(&warning);
+        }
+        self.0.lock().unwrap_or_else(PoisonError::into_inner).warning = warning;
+    }
+
     /// The newest note.
-    pub fn get(&self) -> String {
+    pub fn get(&self) -> Note {
         self.0.lock().unwrap_or_else(PoisonError::into_inner).clone()
+    }
+
+    /// Takes note that the operator asks for the robot, before the thread has seen it.
+    pub fn asked(&self) {
+        let mut note = self.0.lock().unwrap_or_else(PoisonError::into_inner);
+        if note.link == RobotLink::WaitsForOperator {
+            note.link = RobotLink::Connecting;
+        }
     }
 }
 
-/// Connects the robot whenever the loop has none, and hands it over, until `stop`. `note` and `connections` tell `status` about it,
-/// `say` the terminal.
+/// What the thread knows while it goes on.
+struct Progress {
+    /// What is known of the robot from before.
+    before: Before,
+    /// Whether the loop has a session.
+    connected: bool,
+    /// Whether the operator must ask first.
+    waits: bool,
+    /// Until when the operator's wish counts.
+    wish_until: Option<Instant>,
+    /// When the next attempt is due.
+    next: Instant,
+}
+
+/// Connects the robot whenever the loop has none and no person has it in hand, and hands it over, until `stop`. `note` and `connections` tell
+/// `status` about it, `say` the terminal.
 pub fn keep_robot_connected(
     config: &Config,
     exchange: &Exchange,
@@ -51,29 +99,79 @@ pub fn keep_robot_connected(
     say: &dyn Fn(&str),
 ) {
     let options = LinkOptions::new(config);
-    let mut connected = false;
-    let mut next = Instant::now();
+    let mut progress = Progress { before: Before::default(), connected: false, waits: false, wish_until: None, next: Instant::now() };
     while !stop.load(Relaxed) {
         while let Some((session, end)) = exchange.old_sessions.pop() {
-            drop(session);
-            note.set(format!("robot: {end}"), say);
-            connected = false;
-            next = Instant::now() + RECONNECT;
+            progress.take_back(&session, end, &options, note, say);
         }
-        if !connected && Instant::now() >= next {
-            match link::connect(&options) {
+        if exchange.resume.swap(false, Relaxed) && !progress.connected {
+            progress.waits = false;
+            progress.wish_until = Some(Instant::now() + WISH);
+            progress.next = Instant::now();
+        }
+        if !progress.connected && !progress.waits && Instant::now() >= progress.next {
+            progress.before.asked = progress.wish_until.is_some_and(|until| Instant::now() < until);
+            match link::connect_after(&options, &progress.before) {
                 Ok(session) => {
-                    connected = exchange.sessions.push(Box::new(session)).is_ok();
+                    note.warn(payload::warning(session.state(), config.robot.payload_kg).unwrap_or_default(), say);
+                    progress.before.unpowered = false;
+                    progress.wish_until = None;
+                    progress.connected = exchange.sessions.push(Box::new(session)).is_ok();
                     connections.fetch_add(1, Relaxed);
-                    note.set(String::new(), say);
+                    note.set(String::new(), RobotLink::Connected, say);
                     say("robot connected, program running");
                 }
-                Err(e) => {
-                    note.set(e.to_string(), say);
-                    next = Instant::now() + RECONNECT;
-                }
+                Err(e) => progress.failed(&e, &options, note, say),
             }
         }
         std::thread::sleep(BEAT);
     }
 }
+
+impl Progress {
+    /// Takes note of a session that is over. The session itself is dropped by the caller.
+    fn take_back(&mut self, session: &Session, end: SessionEnd, options: &LinkOptions, note: &RobotNote, say: &dyn Fn(&str)) {
+        let last = *session.state();
+        self.connected = false;
+        self.before.unpowered |= hands::without_power(&last);
+        self.before.last = Some(last);
+        self.next = Instant::now() + RECONNECT;
+        match hands::after_session(end.reason(), &last) {
+            Some(why) => self.wait_for_operator(why, options, note, say),
+            None => note.set(format!("robot: {end}"), RobotLink::Connecting, say),
+        }
+    }
+
+    /// Takes note of an attempt that failed with `e`.
+    fn failed(&mut self, e: &LinkError, options: &LinkOptions, note: &RobotNote, say: &dyn Fn(&str)) {
+        self.next = Instant::now() + RECONNECT;
+        self.before.unpowered = match e {
+            LinkError::ProgramRunning { .. } => false,
+            LinkError::MayNotMove { unpowered: true, .. } => true,
+            _ => self.before.unpowered,
+        };
+        // A tilted container must be brought upright by somebody, who then has the robot in hand. A wish is not kept for ever.
+        let wish_is_over = self.wish_until.is_some_and(|until| Instant::now() >= until);
+        if let Some(why) = e.handover() {
+            self.wait_for_operator(why, options, note, say);
+        } else if wish_is_over || matches!(e, LinkError::TooFar { .. }) {
+            self.waits = true;
+            self.wish_until = None;
+            note.set(format!("{e}; then {TAKE_BACK}"), RobotLink::WaitsForOperator, say);
+        } else {
+            note.set(e.to_string(), RobotLink::Connecting, say);
+        }
+    }
+
+    /// Leaves the robot alone until the operator asks for it.
+    fn wait_for_operator(&mut self, why: Handover, options: &LinkOptions, note: &RobotNote, say: &dyn Fn(&str)) {
+        self.waits = true;
+        self.wish_until = None;
+        let remedy = why.remedy();
+        let line = format!("robot {}: {why}; it is not taken back by itself: {remedy}, then {TAKE_BACK}", options.address);
+        note.set(line, RobotLink::WaitsForOperator, say);
+    }
+}
+
+/// How the operator takes the robot back.
+const TAKE_BACK: &str = "`rt-controller resume`, or the next pour or recording";

@@ -158,7 +158,7 @@ impl<'a> Service<'a> {
     /// The line that the operator gets for a refusal.
     fn words(&self, refusal: Refusal) -> String {
         match refusal {
-            Refusal::Robot(_) if !self.robot_note.get().is_empty() => self.robot_note.get(),
+            Refusal::Robot(_) if !self.robot_note.get().text.is_empty() => self.robot_note.get().text,
             Refusal::NoWeights => format!("{refusal} ({})", self.refused()),
             _ => refusal.to_string(),
         }
@@ -179,6 +179,12 @@ impl<'a> Service<'a> {
                     reply(&asked, &Reply::Status(Box::new(self.status())));
                     continue;
                 }
+                Request::Resume => {
+                    self.robot_note.asked();
+                    self.exchange.resume.store(true, Relaxed);
+                    reply(&asked, &Reply::Resuming);
+                    continue;
+                }
                 Request::Abort => (Order::Abort, 0),
                 Request::Pour { goal_ml } => (Order::Pour { episode: self.next_episode, goal_ml }, self.next_episode),
                 Request::Record(curve) => (Order::Record { episode: self.next_episode, curve }, self.next_episode),
@@ -196,8 +202,9 @@ impl<'a> Service<'a> {
         let x = self.exchange;
         let timing = &x.timing;
         let phase = Phase::from_code(t.phase);
+        let note = self.robot_note.get();
         let hindrance = match phase {
-            Phase::NoRobot if !self.robot_note.get().is_empty() => self.robot_note.get(),
+            Phase::NoRobot if !note.text.is_empty() => note.text,
             Phase::NoRobot if t.alpha_measured_deg.is_finite() => Refusal::NotUpright(t.alpha_measured_deg).to_string(),
             Phase::NoRobot => "waiting for the robot".into(),
             _ if t.weights_id == 0 => format!("no weights: {}", self.refused()),
@@ -222,6 +229,8 @@ impl<'a> Service<'a> {
             bridged_frames: c.bridged_frames,
             ignored_features: c.ignored_features,
             clipped: c.clipped,
+            robot: note.link,
+            robot_warning: note.warning,
             robot_connections: self.robot_connections.load(Relaxed),
             loop_allocations: x.loop_allocations.load(Relaxed),
             loop_page_faults: x.loop_page_faults.load(Relaxed),

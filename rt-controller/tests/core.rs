@@ -109,7 +109,7 @@ impl ToyCell {
     }
 
     fn step(&mut self, features: &[Feature], order: Option<Order>) -> Output {
-        let robot = Robot { hindrance: self.hindrance, alpha_deg: self.alpha_deg, at_ns: self.now_ns };
+        let robot = Robot { hindrance: self.hindrance, ..Robot::that_may_move(self.alpha_deg, self.now_ns) };
         let output = self.core.step(&Input { now_ns: self.now_ns, features, robot, order });
         if let Some(target_deg) = output.target_deg {
             let rate = (target_deg - self.alpha_deg).abs() / (self.settings.period_ns as f32 / 1e9);

@@ -2,7 +2,7 @@
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::too_many_lines)]
 
 use proptest::prelude::*;
-use rt_controller::link::wire::{self, Inbox, Outputs};
+use rt_controller::link::wire::{self, Inbox, OutputRecipe, Outputs};
 use rt_controller::link::{LinkError, LinkOptions, ProgramState, RobotState, TiltJoint, health, program};
 use shared::config::Joint;
 use shared::control::EndReason;
@@ -107,8 +107,13 @@ fn the_state_is_read_from_the_recipe() {
     payload.extend([5, 2].map(u32::to_be_bytes).concat());
     payload.extend([2, 41, 99].map(i32::to_be_bytes).concat());
     payload.extend([0.25, 0.75].map(f64::to_be_bytes).concat());
+    let needed_len = payload.len();
+    payload.extend(4u32.to_be_bytes());
+    payload.extend([0.5, 1.5, 0.01, 0.02, 0.03].map(f64::to_be_bytes).concat());
+    payload.extend(77u32.to_be_bytes());
     let mut state = RobotState::default();
-    Outputs::new_checked(&payload, 3).unwrap().fill(&tilt(), &mut state);
+    let recipe = OutputRecipe::new(3, [true; 5]);
+    Outputs::new_checked(&payload, recipe).unwrap().fill(&tilt(), &mut state);
     let alpha = |rad: f64| (10.0 - rad.to_degrees()) as f32;
     let expected = RobotState {
         timestamp_s: 12.5,
@@ -124,13 +129,26 @@ fn the_state_is_read_from_the_recipe() {
         program_run: 99,
         sequence_echo: 41,
         speed_fraction: 0.75,
+        joints_rad: [0.0, 0.1, 0.2, 0.3, 0.4, 0.5],
+        joint_rates_rad_s: [2.0, 2.1, 2.2, 2.3, 2.4, 2.5],
+        status_bits: Some(4),
+        speed_scaling: Some(0.5),
+        payload_kg: Some(1.5),
+        payload_cog_m: Some([0.01, 0.02, 0.03]),
+        control_line: Some(77),
         ..RobotState::default()
     };
     assert_eq!(state, expected);
-    assert!(Outputs::new_checked(&payload, 4).is_none(), "another recipe");
-    assert!(Outputs::new_checked(&payload[..payload.len() - 1], 3).is_none(), "too short");
+    assert!(Outputs::new_checked(&payload, OutputRecipe::new(4, [true; 5])).is_none(), "another recipe");
+    assert!(Outputs::new_checked(&payload[..payload.len() - 1], recipe).is_none(), "too short");
+    // A robot that knows only the payload and the line: they follow the needed values at once.
+    let fewer = [&payload[..needed_len], &2.5f64.to_be_bytes(), &5u32.to_be_bytes()].concat();
+    let mut less = RobotState::default();
+    Outputs::new_checked(&fewer, OutputRecipe::new(3, [false, false, true, false, true])).unwrap().fill(&tilt(), &mut less);
+    let unknown = RobotState { status_bits: None, speed_scaling: None, payload_cog_m: None, ..expected };
+    assert_eq!(less, RobotState { payload_kg: Some(2.5), control_line: Some(5), ..unknown });
     payload.push(0);
-    assert!(Outputs::new_checked(&payload, 3).is_none(), "too long");
+    assert!(Outputs::new_checked(&payload, recipe).is_none(), "too long");
 }
 
 /// Protects the geometry: start and direction of the tilting joint are applied once, both ways.
@@ -164,7 +182,7 @@ fn every_hindrance_has_its_reason() {
     use EndReason::*;
     type Change = fn(&mut RobotState, u64);
     let long_ago = NOW - LOST - 1;
-    let cases: [(&str, EndReason, Change); 19] = [
+    let cases: [(&str, EndReason, Change); 22] = [
         ("silence", RobotLost, |s, ago| s.received_at_ns = ago),
         ("silence, whatever it last said", RobotLost, |s, ago| (s.received_at_ns, s.safety_mode) = (ago, 3)),
         ("clock stands still", RobotStalled, |s, ago| s.advanced_at_ns = ago),
@@ -175,6 +193,9 @@ fn every_hindrance_has_its_reason() {
         ("emergency stop in the bits only", EmergencyStop, |s, _| s.safety_bits = 1 << 7),
         ("safeguard stop", SafetyStop, |s, _| s.safety_mode = 5),
         ("unknown safety mode", SafetyStop, |s, _| s.safety_mode = 0),
+        ("teach button", InHand, |s, _| s.status_bits = Some(1 | 2 | 4)),
+        ("joint elsewhere", NotFollowed, |s, _| s.program_state = ProgramState::OffTrack),
+        ("joint was elsewhere", NotFollowed, |s, _| (s.program_state, s.runtime_state) = (ProgramState::OffTrackEnded, 1)),
         ("brakes on", RobotNotRunning, |s, _| (s.robot_mode, s.runtime_state) = (5, 1)),
         ("speed slider", SpeedReduced, |s, _| s.speed_fraction = 0.99),
         ("speed slider unknown", SpeedReduced, |s, _| s.speed_fraction = f64::NAN),

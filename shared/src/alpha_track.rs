@@ -47,6 +47,15 @@ impl<const N: usize> AngleHistory<N> {
         }
     }
 
+    /// The least and the largest angle in force from `from_ns` to `to_ns`, degrees: those between the two times, and the ones in force at
+    /// them; NaN without any value.
+    pub fn range_deg(&self, from_ns: u64, to_ns: u64) -> (f32, f32) {
+        let ends = [self.at_deg(from_ns), self.at_deg(to_ns)];
+        let between = self.0.iter().filter(|(at_ns, _)| (from_ns..=to_ns).contains(at_ns)).map(|(_, alpha_deg)| *alpha_deg);
+        let all = between.chain(ends);
+        all.fold((f32::NAN, f32::NAN), |(least, largest), alpha_deg| (least.min(alpha_deg), largest.max(alpha_deg)))
+    }
+
     /// The time of the newest value, ns; 0 without any.
     fn newest_ns(&self) -> u64 {
         self.0.last().map_or(0, |newest| newest.0)

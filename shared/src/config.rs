@@ -169,6 +169,9 @@ pub struct RobotConfig {
     pub lookahead_s: f64,
     /// Gain of the robot's servoj command.
     pub gain: f64,
+    /// Mass of holder and full vessel that the robot is expected to have been told, kg; without this key any vessel's mass will do.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub payload_kg: Option<f64>,
 }
 
 /// A joint of the UR5, base to tool.
@@ -356,6 +359,7 @@ impl Check<'_> {
         self.range("robot.register_base", robot.register_base.into(), 24.0, 40.0)?;
         self.range("robot.lookahead_s", robot.lookahead_s, 0.03, 0.2)?;
         self.range("robot.gain", robot.gain, 100.0, 2000.0)?;
+        self.range("robot.payload_kg", robot.payload_kg.unwrap_or(0.0), 0.0, 5.0)?;
 
         self.range("limits.alpha_min_deg", limits.alpha_min_deg.into(), -20.0, 0.0)?;
         self.range("limits.alpha_max_deg", limits.alpha_max_deg.into(), 10.0, 180.0)?;

@@ -24,6 +24,8 @@ pub enum Request {
     Record(Curve),
     /// Asks to bring the container upright at once.
     Abort,
+    /// Asks to take the robot back after a person had it.
+    Resume,
 }
 
 /// What the controller answers.
@@ -43,6 +45,22 @@ pub enum Reply {
     },
     /// Answer to [`Request::Status`].
     Status(Box<Status>),
+    /// The robot is being taken back; [`Status::robot`] shows whether that works.
+    Resuming,
+}
+
+/// Who has the robot.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum RobotLink {
+    /// The controller tries to connect it.
+    #[default]
+    Connecting,
+    /// The controller has it, and its program runs.
+    Connected,
+    /// A person has it, or had it. The controller leaves it alone until the operator asks: `rt-controller resume`, or the next pour or
+    /// recording.
+    WaitsForOperator,
 }
 
 /// How a pour or recording ended.
@@ -110,6 +128,10 @@ pub enum EndReason {
     SpeedReduced,
     /// A stream was seen before, and is not seen any more although the container is tilted further.
     StreamLost,
+    /// The measured tilt does not follow the commanded one: the robot is slower than it is commanded, or something holds or moves it.
+    NotFollowed,
+    /// Somebody has the robot in hand: the teach button (freedrive) is pressed.
+    InHand,
 }
 
 impl EndReason {
@@ -134,6 +156,8 @@ impl EndReason {
             Self::NotUpright => "the container did not come upright: look at the robot",
             Self::SpeedReduced => "the speed slider is below 100 %",
             Self::StreamLost => "the container is empty, or its stream is no longer seen: tilted further than when it flowed",
+            Self::NotFollowed => "the robot does not follow: it is slower than it is commanded, or something holds or moves it",
+            Self::InHand => "somebody has the robot in hand (the teach button is pressed)",
         }
     }
 }
@@ -177,6 +201,10 @@ pub struct Status {
     pub ignored_features: u64,
     /// How often each limit changed a request.
     pub clipped: Clipped,
+    /// Who has the robot.
+    pub robot: RobotLink,
+    /// What is doubtful about the robot's settings, one line; empty if nothing is.
+    pub robot_warning: String,
     /// Number of times the robot was connected.
     pub robot_connections: u64,
     /// Number of heap allocations of the loop since it started.

@@ -8,7 +8,7 @@
 use iceoryx2::prelude::ZeroCopySend;
 
 /// Version of all layouts in this file. It is part of every service's name, so that programs of other versions never connect.
-pub const LAYOUT_VERSION: u32 = 2;
+pub const LAYOUT_VERSION: u32 = 3;
 
 /// How the pixels of a camera frame are stored.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -73,27 +73,49 @@ pub enum Doubt {
     Blurred = 3,
     /// The camera repeats the same picture.
     Frozen = 4,
-    /// There is liquid, but no line fits its outer edge.
+    /// There is liquid, but no line fits its outer edge; or a stream is gone, and dry ground is not seen where it was.
     EdgeNotFound = 5,
     /// The stream leaves the region, so the area is a lower bound.
     LeavesRegion = 6,
     /// The frame has another size or format than configured.
     WrongFormat = 7,
+    /// A part of the picture is missing, shifted, or of another picture.
+    PictureIncomplete = 8,
+    /// At the lip is something with the colours of neither the ground nor the liquid, or the picture has no colour.
+    ColoursChanged = 9,
+    /// The light changes faster than the picture is read, so that it has bands.
+    LightFlickers = 10,
 }
 
 impl Doubt {
     /// All reasons, in the order of their codes.
-    pub const ALL: [Self; 8] =
-        [Self::None, Self::TooDark, Self::BlownOut, Self::Blurred, Self::Frozen, Self::EdgeNotFound, Self::LeavesRegion, Self::WrongFormat];
+    pub const ALL: [Self; 11] = [
+        Self::None,
+        Self::TooDark,
+        Self::BlownOut,
+        Self::Blurred,
+        Self::Frozen,
+        Self::EdgeNotFound,
+        Self::LeavesRegion,
+        Self::WrongFormat,
+        Self::PictureIncomplete,
+        Self::ColoursChanged,
+        Self::LightFlickers,
+    ];
 
     /// The reason with this code; an unknown code counts as a frame that cannot be used.
     pub fn from_code(code: u32) -> Self {
         Self::ALL.into_iter().find(|d| *d as u32 == code).unwrap_or(Self::WrongFormat)
     }
 
-    /// Whether the area may still be used as a measurement.
-    pub fn usable(self) -> bool {
-        matches!(self, Self::None | Self::Blurred | Self::LeavesRegion)
+    /// Whether an area of `area_px2` with this doubt may still be used as a measurement. Nothing seen in a doubtful picture is no
+    /// measurement: it does not say that nothing flows.
+    pub fn usable(self, area_px2: f32) -> bool {
+        match self {
+            Self::None => area_px2 >= 0.0,
+            Self::Blurred | Self::LeavesRegion => area_px2 > 0.0,
+            _ => false,
+        }
     }
 
     /// The reason in words.
@@ -107,6 +129,9 @@ impl Doubt {
             Self::EdgeNotFound => "edge not found",
             Self::LeavesRegion => "stream leaves the region",
             Self::WrongFormat => "wrong frame format",
+            Self::PictureIncomplete => "picture incomplete",
+            Self::ColoursChanged => "colours changed",
+            Self::LightFlickers => "light flickers",
         }
     }
 }
@@ -129,9 +154,9 @@ pub struct Feature {
     pub received_at_ns: u64,
     /// When the worker published this, CLOCK_MONOTONIC ns.
     pub published_at_ns: u64,
-    /// V_e: the area of the triangle, px^2; finite and >= 0, exactly 0 without a stream.
+    /// V_e: the area of the triangle, px^2; finite and >= 0, exactly 0 without a stream, and where nothing could be measured.
     pub area_px2: f32,
-    /// Confidence, 0 (none) to 1 (full).
+    /// Confidence, 0 (none) to 1 (full): the share of such frames whose area is within 20 % of the truth.
     pub confidence: f32,
     /// Corners of the triangle in the image, px, as x0 y0 x1 y1 x2 y2: where the axes cross, on the x-axis, on the y-axis.
     pub triangle_px: [f32; 6],
@@ -299,6 +324,18 @@ mod tests {
         assert_eq!(std::mem::offset_of!(Telemetry, weights_id), 48);
         assert_eq!(std::mem::offset_of!(Telemetry, alpha_deg), 56);
         assert_eq!(size_of::<RecorderReport>(), 552);
+    }
+
+    /// Protects the controller from reading "nothing flows" out of a picture in which nothing could be seen: an area of 0 counts only
+    /// without any doubt.
+    #[test]
+    fn nothing_seen_in_doubt_is_no_measurement() {
+        for doubt in Doubt::ALL {
+            assert_eq!(Doubt::from_code(doubt as u32), doubt);
+            assert_eq!(doubt.usable(0.0), doubt == Doubt::None, "{doubt:?}");
+            assert!(!doubt.usable(f32::NAN), "{doubt:?}");
+            assert_eq!(doubt.usable(300.0), matches!(doubt, Doubt::None | Doubt::Blurred | Doubt::LeavesRegion), "{doubt:?}");
+        }
     }
 
     /// Protects operators from a path that is cut within a character and so is no text any more.

@@ -95,7 +95,8 @@ fn the_forward_pass_keeps_its_number_of_instructions() {
     }
 }
 
-/// Largest number of instructions in the form chosen at run time: about a tenth above the 573 that were counted.
-const CHOSEN_MOST: f64 = 630.0;
+/// Largest number of instructions in the form chosen at run time: about a tenth above the 752 that were counted. One chain
+/// of sums for each register took 573, but 92 ns instead of 78.
+const CHOSEN_MOST: f64 = 830.0;
 /// Largest number of instructions in the portable form: about a tenth above the 1989 that were counted.
 const PORTABLE_MOST: f64 = 2190.0;

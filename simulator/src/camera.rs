@@ -13,6 +13,7 @@
 //! | `cover` | outlines become a share of each pixel |
 //! | `liquid`, `water` | how coloured liquid and clear water look |
 //! | `glass`, `sensor` | the container's glass; exposure, vignette and noise |
+//! | [`faults`] | what goes wrong in real cameras, laid over pictures of any source |
 //!
 //! Called from the cell's camera thread and from experiments. Memory is allocated in [`Renderer::new`], in the first frames, and a little
 //! for outlines in every frame. The same view, seed and scenes give the same bytes. Failures are OpenCV's and come back as errors.
@@ -20,6 +21,7 @@
 mod board;
 mod cover;
 mod drops;
+pub mod faults;
 mod glass;
 mod liquid;
 mod sensor;

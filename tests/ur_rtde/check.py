@@ -149,7 +149,7 @@ def io(series, upper):
         r = robot.receive(upper)
         i = rtde_io.RTDEIOInterface(robot.host, False, upper)
         assert i.setSpeedSlider(0.5)
-        until("slider", lambda: r.getSpeedScaling() == 0.5)
+        until("slider", lambda: r.getTargetSpeedFraction() == 0.5)
         assert i.setStandardDigitalOut(2, True)
         until("output on", lambda: r.getActualDigitalOutputBits() == 4)
         assert i.setStandardDigitalOut(2, False)

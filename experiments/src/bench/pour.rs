@@ -103,6 +103,7 @@ fn settings(limits: Limits) -> Settings {
         goal_max_ml: 1e6,
         upright_deg: 2.0,
         patience_ns: 100_000_000,
+        usual_lag_ns: 156_000_000,
     }
 }
 
@@ -137,7 +138,7 @@ pub fn by_core(
             confidence: 1.0,
             ..Feature::default()
         };
-        let robot = Robot { hindrance: None, alpha_deg, at_ns: now_ns };
+        let robot = Robot::that_may_move(alpha_deg, now_ns);
         let order = (frames == 2).then_some(Order::Pour { episode: 1, goal_ml: goal_ml as f32 });
         let output = core.step(&Input { now_ns, features: &[feature], robot, order });
         alpha_deg = output.target_deg.unwrap_or(alpha_deg);

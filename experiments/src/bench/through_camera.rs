@@ -110,5 +110,5 @@ fn look(camera: &Mutex<Camera>, scene: &Scene, (width_px, height_px): (u32, u32)
     let Camera { renderer, extractor, pixels } = &mut *camera;
     renderer.render(scene, pixels).ok()?;
     let measured = extractor.measure(Image { width_px, height_px, format: PixelFormat::Bgr8, pixels }).ok()?;
-    measured.doubt.usable().then_some(measured.area_px2)
+    measured.is_usable().then_some(measured.area_px2)
 }

@@ -1,11 +1,14 @@
 //! Errors and rates of many measured frames. Pure, any thread; allocates; cannot fail.
 
+use feature_worker::vision::Measurement;
 use serde::Serialize;
 use shared::messages::Doubt;
 
 /// Frames with a truth above this count for error and missed flow, px^2: below it a stream is a few pixels wide, and its error says
 /// little about quality.
 pub const MEASURED_PX2: f64 = 200.0;
+/// An area further than this from the truth is wrong, per cent. This is what confidence speaks of.
+pub const WRONG_PERCENT: f64 = 20.0;
 
 /// Figures of many measured frames.
 #[derive(Debug, Default, Serialize)]
@@ -28,10 +31,16 @@ pub struct CameraFigures {
     pub wet: usize,
     /// Share of these on which no stream was seen, per cent.
     pub missed_flow_percent: f64,
-    /// Share of these on which no stream was seen and no doubt was raised, per cent.
+    /// Share of these on which no stream was seen, and which the controller nevertheless uses, per cent.
     pub unnoticed_percent: f64,
     /// Share of all frames with a doubt, per cent.
     pub doubt_percent: f64,
+    /// Share of the frames with a truth above [`MEASURED_PX2`] that the controller does not use, per cent.
+    pub wet_unusable_percent: f64,
+    /// Share of them that it uses, although the area is wrong by more than [`WRONG_PERCENT`], per cent.
+    pub wrong_percent: f64,
+    /// Share of the frames without a stream that have a doubt, per cent.
+    pub dry_doubt_percent: f64,
 }
 
 /// One measured frame beside the truth.
@@ -41,11 +50,26 @@ pub struct Comparison {
     pub truth_px2: f64,
     /// Measured V_e, px^2.
     pub area_px2: f64,
+    /// Its confidence.
+    pub confidence: f64,
     /// The doubt about it.
     pub doubt: Doubt,
+    /// Whether the controller uses it.
+    pub usable: bool,
 }
 
 impl Comparison {
+    /// A measurement beside the true V_e, px^2.
+    pub fn new(truth_px2: f64, measured: &Measurement) -> Self {
+        Self {
+            truth_px2,
+            area_px2: measured.area_px2.into(),
+            confidence: measured.confidence.into(),
+            doubt: measured.doubt,
+            usable: measured.is_usable(),
+        }
+    }
+
     /// Signed error, per cent.
     pub fn error_percent(self) -> f64 {
         100.0 * (self.area_px2 / self.truth_px2 - 1.0)
@@ -67,7 +91,9 @@ impl Comparison {
 /// The figures of many frames; NaN where there is nothing to take them from.
 pub fn figures(frames: &[Comparison]) -> CameraFigures {
     let wet: Vec<&Comparison> = frames.iter().filter(|s| s.truth_px2 > MEASURED_PX2).collect();
-    let mut errors: Vec<f64> = wet.iter().filter(|s| s.area_px2 > 0.0).map(|s| s.error_percent()).collect();
+    let used = |s: &&&Comparison| s.usable && s.area_px2 > 0.0;
+    let mut errors: Vec<f64> = wet.iter().filter(used).map(|s| s.error_percent()).collect();
+    let wrong = errors.iter().filter(|e| e.abs() > WRONG_PERCENT).count();
     let bias_percent = errors.iter().sum::<f64>() / errors.len().max(1) as f64;
     errors.iter_mut().for_each(|e| *e = e.abs());
     errors.sort_by(f64::total_cmp);
@@ -84,7 +110,17 @@ pub fn figures(frames: &[Comparison]) -> CameraFigures {
         false_flow_percent: percent(dry.iter().filter(|s| s.area_px2 > 0.0).count(), dry.len()),
         wet: wet.len(),
         missed_flow_percent: percent(wet.iter().filter(|s| s.area_px2 == 0.0).count(), wet.len()),
-        unnoticed_percent: percent(wet.iter().filter(|s| s.area_px2 == 0.0 && s.doubt == Doubt::None).count(), wet.len()),
+        unnoticed_percent: percent(wet.iter().filter(|s| s.area_px2 == 0.0 && s.usable).count(), wet.len()),
         doubt_percent: percent(frames.iter().filter(|s| s.doubt != Doubt::None).count(), frames.len()),
+        wet_unusable_percent: percent(wet.iter().filter(|s| !s.usable).count(), wet.len()),
+        wrong_percent: percent(wrong, wet.len()),
+        dry_doubt_percent: percent(dry.iter().filter(|s| s.doubt != Doubt::None).count(), dry.len()),
     }
+}
+
+/// The doubts on frames with a truth above [`MEASURED_PX2`], with their number.
+pub fn doubts_in_words(frames: &[Comparison]) -> String {
+    let wet = || frames.iter().filter(|s| s.truth_px2 > MEASURED_PX2);
+    let counted = Doubt::ALL.into_iter().filter(|d| *d != Doubt::None).map(|d| (d, wet().filter(|s| s.doubt == d).count()));
+    counted.filter(|(_, n)| *n > 0).map(|(d, n)| format!("{} {n}", d.words())).collect::<Vec<_>>().join(", ")
 }

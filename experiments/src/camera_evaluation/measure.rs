@@ -28,7 +28,7 @@ pub struct MeasuredFrame<'a> {
 impl MeasuredFrame<'_> {
     /// Measurement beside truth.
     pub fn comparison(&self) -> Comparison {
-        Comparison { truth_px2: self.truth.area_px2, area_px2: self.measured.area_px2.into(), doubt: self.measured.doubt }
+        Comparison::new(self.truth.area_px2, self.measured)
     }
 }
 

@@ -16,6 +16,7 @@ use simulator::camera::{Background, Scene};
 
 use crate::camera_evaluation::cases::{Case, name};
 use crate::camera_evaluation::doubts;
+use crate::camera_evaluation::faults::{self, FaultFrames};
 use crate::camera_evaluation::figures::{CameraFigures, Comparison, figures};
 use crate::camera_evaluation::measure::measure;
 use crate::camera_evaluation::scenes::{SHORT_FRAMES, short, whole_pours};
@@ -29,7 +30,7 @@ const POURS: usize = 3;
 #[derive(Debug, clap::Args)]
 #[command(
     after_help = "Examples:\n  experiments evaluate-camera\n  experiments evaluate-camera --frames 9600 --seed 2 --json out/camera.json\n  \
-experiments evaluate-camera --frames 48 --runs 16 --method clear\n\n\
+experiments evaluate-camera --frames 48 --runs 16 --method clear\n  experiments evaluate-camera --faults 10\n\n\
 Prints the error of V_e for areas above 200 px^2 (median and 95th percentile of its size, bias), false flow on dry frames, missed flow \
 (unnoticed: without a doubt) and the share of frames with a doubt, all by condition and over whole pours, and saves the worst 20 frames."
 )]
@@ -52,11 +53,18 @@ pub struct Args {
     /// Evaluates only this method: colour or clear.
     #[arg(long)]
     method: Option<String>,
+    /// Instead of this, measure so many whole pours of each method through every fault of a camera.
+    #[arg(long)]
+    faults: Option<u64>,
 }
 
 /// Runs the command.
 pub fn run(args: &Args) -> Result<(), exit::Failure> {
-    evaluate(args).or_exit(exit::FAILED)
+    let done = match args.faults {
+        Some(pours) => evaluate_faults(args, pours),
+        None => evaluate(args),
+    };
+    done.or_exit(exit::FAILED)
 }
 
 /// Frames by method and condition, their number, and the worst of them.
@@ -91,6 +99,28 @@ fn evaluate(args: &Args) -> Result<(), CameraError> {
     println!("\nworst frames: {}", args.out.display());
     if let Some(path) = &args.json {
         let report = serde_json::json!({ "frames": all.frames, "seed": args.seed, "conditions": figures, "doubts_raised_percent": doubts });
+        std::fs::write(path, serde_json::to_string_pretty(&report)?).map_err(|e| format!("{}: {e}", path.display()))?;
+    }
+    Ok(())
+}
+
+/// Measures `pours` whole pours of each method through every fault, and prints a line for each.
+fn evaluate_faults(args: &Args, pours: u64) -> Result<(), CameraError> {
+    let mut frames = FaultFrames::new();
+    let bar = ProgressBar::new(2 * pours).with_message("pours");
+    for (clear, method) in [(false, "colour"), (true, "clear")] {
+        for i in 0..pours {
+            if args.method.as_deref().is_none_or(|m| m == method) {
+                faults::measure_cell(clear, i, args.seed, &mut frames)?;
+            }
+            bar.inc(1);
+        }
+    }
+    bar.finish_and_clear();
+    faults::print(&frames);
+    if let Some(path) = &args.json {
+        let figures: BTreeMap<&str, CameraFigures> = frames.iter().map(|(name, frames)| (name.as_str(), figures(frames))).collect();
+        let report = serde_json::json!({ "pours": pours, "seed": args.seed, "faults": figures });
         std::fs::write(path, serde_json::to_string_pretty(&report)?).map_err(|e| format!("{}: {e}", path.display()))?;
     }
     Ok(())

@@ -5,7 +5,9 @@ use std::time::{Duration, Instant};
 use rt_controller::client::{Client, ClientError};
 use shared::os::now_ns;
 
+use super::machine_log::MachineLog;
 use super::processes::{Holding, processor_ns};
+use super::storm::Storm;
 use super::tick_times::TickTimes;
 use crate::own_cell::{OwnCell, OwnCellError};
 
@@ -60,19 +62,21 @@ pub struct CellRun {
     pub page_faults: u64,
 }
 
-/// Runs the cell for `seconds`: a third of it at rest, then pouring.
+/// Runs the cell for `seconds`: a third of it at rest, then pouring; with `storm`, all the time while other programs do to it what they can.
 ///
 /// # Errors
 /// When the cell does not start, a command fails, or the journal cannot be read.
-pub fn run_cell(cell: &mut OwnCell, seconds: u64) -> Result<CellRun, OwnCellError> {
+pub fn run_cell(cell: &mut OwnCell, seconds: u64, storm: bool) -> Result<CellRun, OwnCellError> {
     let client = cell.start()?;
     let unreachable = |e: ClientError| OwnCellError::Other(e.to_string());
     let before = client.status().map_err(unreachable)?;
     drop(client);
+    let storm = if storm { Some(Storm::start(cell)?) } else { None };
     // The machine settles first; what starting costs is not of interest.
     sleep_until(cell, Instant::now() + Duration::from_secs(1))?;
     let (from_ns, from) = (now_ns(), Instant::now());
     let pid = cell.pid("rt-controller");
+    let log = MachineLog::start(pid);
     let spent_ns = processor_ns(pid);
     let rest = Duration::from_secs(seconds) / 3;
     sleep_until(cell, from + rest)?;
@@ -80,12 +84,18 @@ pub fn run_cell(cell: &mut OwnCell, seconds: u64) -> Result<CellRun, OwnCellErro
     pour_until(cell, from + Duration::from_secs(seconds))?;
     let to_ns = now_ns();
     let (controller, worker) = (Holding::of(pid), Holding::of(cell.pid("feature-worker")));
+    drop(storm);
     let client = Client::connect(&cell.config.cell.name).map_err(unreachable)?;
     let after = client.status().map_err(unreachable)?;
     drop(client);
     cell.stop();
+    let mut ticks = TickTimes::read(cell, from_ns, to_ns)?;
+    let times_ns: Vec<u64> = ticks.worst.iter().map(|w| w.woke_at_ns).collect();
+    for (worst, activity) in ticks.worst.iter_mut().zip(log.around(&times_ns)) {
+        worst.activity = activity;
+    }
     Ok(CellRun {
-        ticks: TickTimes::read(cell, from_ns, to_ns)?,
+        ticks,
         idle_percent,
         controller,
         worker,

@@ -3,8 +3,14 @@
 use serde_json::Value;
 use trainer::report::page;
 
-/// Numbers, terminal text and page of a measurement.
+use super::ratios::Ratios;
+
+/// Verdict, numbers, terminal text and page of a measurement.
 pub struct Measured {
+    /// Sentences that say whether it is good; they stand first.
+    pub verdict: String,
+    /// The rounds of each condition, for the comparison with an earlier run; none for a soak.
+    pub rounds: Vec<(&'static str, Vec<Ratios>)>,
     /// For `jitter.json`.
     pub numbers: Value,
     /// For the terminal.

@@ -15,9 +15,10 @@ use super::cell_run::pour_until;
 use super::measured::{Measured, facts_html};
 use super::other_programs::{Running, cyclictest, latencies_us, load};
 use super::processes::Holding;
-use super::statistics::{histograms, summary};
+use super::statistics::summary;
 use super::tick_times::{Span, TickTimes};
 use crate::own_cell::{OwnCell, OwnCellError};
+use crate::plots::percentiles::percentile_curves;
 
 /// Time between two readings of memory and files: enough of them in an hour to show a leak.
 const READ_EVERY: Duration = Duration::from_secs(60);
@@ -95,7 +96,18 @@ pub fn measure(cell: &mut OwnCell, hours: f64) -> Result<Measured, OwnCellError>
         "lost_by_cyclictest": lost_by_cyclictest, "lateness_us": summary(ticks.of(Span::Lateness)), "cyclictest_us": summary(&latencies),
         "samples": readings.iter().map(Reading::json).collect::<Vec<_>>(),
     });
-    Ok(Measured { numbers, text: format!("\n{}\n", facts.join("\n")), html: html(&facts, &readings, &ticks, &latencies) })
+    let verdict = format!(
+        "Under load, {} of {} ticks were lost, and {lost_by_cyclictest} of cyclictest's.",
+        ticks.lost,
+        ticks.of(Span::Lateness).len()
+    );
+    Ok(Measured {
+        verdict,
+        rounds: Vec::new(),
+        numbers,
+        text: format!("\n{}\n", facts.join("\n")),
+        html: html(&facts, &readings, &ticks, &latencies),
+    })
 }
 
 fn facts(elapsed: Duration, ticks: &TickTimes, latencies: &[f64], lost_by_cyclictest: usize) -> Vec<String> {
@@ -114,14 +126,14 @@ fn facts(elapsed: Duration, ticks: &TickTimes, latencies: &[f64], lost_by_cyclic
     ]
 }
 
-fn html(facts: &[String], readings: &[Reading], ticks: &TickTimes, latencies: &Vec<f64>) -> String {
+fn html(facts: &[String], readings: &[Reading], ticks: &TickTimes, latencies: &[f64]) -> String {
     let line = |name: &str, pick: fn(&Reading) -> f64| PlotSeries::line(name, readings.iter().map(|r| (r.minutes, pick(r))).collect());
     let memory = [line("rt-controller", |r| r.controller.resident_mib), line("feature-worker", |r| r.worker.resident_mib)];
     let files = [line("rt-controller", |r| r.controller.files as f64), line("feature-worker", |r| r.worker.files as f64)];
     let figures = [
         page::figure(&plot("minutes", "resident MiB", &memory, true), "Memory."),
         page::figure(&plot("minutes", "open files", &files, true), "Open files."),
-        histograms("us", "Wake-up lateness.", &[("rt-controller", ticks.of(Span::Lateness)), ("cyclictest", latencies)]),
+        percentile_curves("Wake-up lateness.", &[("rt-controller", ticks.of(Span::Lateness)), ("cyclictest", latencies)]),
     ];
     format!("<h2>Soak</h2>{}<div class=plots>{}</div>", facts_html(facts), figures.concat())
 }

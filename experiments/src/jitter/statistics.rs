@@ -1,10 +1,4 @@
-//! Percentiles of a measurement, and its histograms for the page. Pure, any thread; allocates; cannot fail.
-
-use trainer::report::page;
-use trainer::report::plot::{PlotSeries, plot};
-
-/// Steps of a histogram; one more holds what is beyond.
-const STEPS: usize = 60;
+//! Percentiles of a measurement. Pure, any thread; allocates; cannot fail.
 
 /// Number, p50, p99, p99.9 and maximum of the values; percentiles are ranks, and NaN without values.
 pub fn summary(values: &[f64]) -> [f64; 5] {
@@ -23,24 +17,6 @@ pub fn median(values: impl Iterator<Item = f64>) -> f64 {
         n if n % 2 == 1 => sorted[n / 2],
         n => (sorted[n / 2 - 1] + sorted[n / 2]) / 2.0,
     }
-}
-
-/// A figure with the histogram of each series of values, up to the largest of their 99.9th percentiles.
-pub fn histograms(title: &str, caption: &str, columns: &[(&str, &Vec<f64>)]) -> String {
-    let end = columns.iter().map(|(_, v)| summary(v)[3]).filter(|x| x.is_finite()).fold(1e-3, f64::max) * 1.05;
-    let width = end / STEPS as f64;
-    let series: Vec<PlotSeries> = columns
-        .iter()
-        .map(|(name, values)| {
-            let mut counts = [0.0; STEPS + 1];
-            for v in values.iter() {
-                counts[((v / width) as usize).min(STEPS)] += 100.0 / values.len() as f64;
-            }
-            let steps = counts.iter().enumerate().flat_map(|(k, c)| [(k as f64 * width, *c), ((k + 1) as f64 * width, *c)]);
-            PlotSeries::line(name, steps.collect())
-        })
-        .collect();
-    page::figure(&plot(title, "% of n", &series, true), caption)
 }
 
 #[cfg(test)]

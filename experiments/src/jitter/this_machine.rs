@@ -32,6 +32,12 @@ impl ThisMachine {
         Self(properties)
     }
 
+    /// What makes two runs comparable, in one line: processor, kernel, and how loop and worker are scheduled.
+    pub fn key(&self) -> String {
+        let of = |name: &str| self.0.iter().find(|p| p.name == name).map_or("", |p| p.value.as_str());
+        ["processor", "kernel", "loop", "feature worker"].map(of).join("; ")
+    }
+
     /// For `jitter.json`.
     pub fn json(&self) -> Value {
         self.0.iter().map(|p| json!({ "what": p.name, "is": p.value, "advice": p.advice })).collect()

@@ -4,6 +4,7 @@
 
 use rt_controller::journal;
 
+use super::machine_log::Activity;
 use crate::own_cell::{OwnCell, OwnCellError};
 
 /// What is measured of every tick, or of those that used a new V_e.
@@ -27,10 +28,12 @@ pub enum Span {
     DecidedToWritten,
     /// From the middle of the exposure until the target's bytes are on the socket.
     CaptureToWritten,
+    /// From the worker's receipt of a frame until then: the time that is our own.
+    ReceivedToWritten,
 }
 
 /// The names of the spans, in the order of [`Span`].
-pub const SPANS: [&str; 9] = [
+pub const SPANS: [&str; 10] = [
     "wake-up lateness",
     "tick execution",
     "tick execution in pours",
@@ -40,13 +43,45 @@ pub const SPANS: [&str; 9] = [
     "wake-up to target decided",
     "decided to bytes on the socket",
     "capture to bytes on the socket",
+    "of it our own, from the worker on",
 ];
+
+/// How many of the worst ticks are kept: as many as a person reads.
+const WORST: usize = 10;
+
+/// One of the worst ticks.
+#[derive(Debug, Clone, Copy)]
+pub struct WorstTick {
+    /// When it woke up, ns.
+    pub woke_at_ns: u64,
+    /// Its lateness, us.
+    pub lateness_us: f64,
+    /// Its execution, us.
+    pub execution_us: f64,
+    /// Number of frames that it took.
+    pub frames: usize,
+    /// Whether a pour was under way.
+    pub pouring: bool,
+    /// What the machine did then, if it is known.
+    pub activity: Option<Activity>,
+}
+
+impl WorstTick {
+    /// From its deadline to its end, us; the worst ticks are those that took the longest.
+    fn took_us(&self) -> f64 {
+        self.lateness_us + self.execution_us
+    }
+}
 
 /// Everything that was measured of the ticks of a run.
 #[derive(Debug, Default, Clone)]
 pub struct TickTimes {
+    /// The worst ticks, worst first.
+    pub worst: Vec<WorstTick>,
     /// Durations in us, in the order of [`Span`].
     pub spans_us: [Vec<f64>; SPANS.len()],
+    /// Number of ticks with no frame, with one, and with more.
+    pub with_frames: [u64; 3],
     /// Number of periods without a tick.
     pub lost: u64,
     /// Number of ticks later than half a period.
@@ -77,7 +112,8 @@ impl TickTimes {
             let mut push = |span: Span, us: f64| ticks.spans_us[span as usize].push(us);
             push(Span::Lateness, lateness);
             push(Span::Execution, us(woke_ns, times.done_ns));
-            if output.telemetry.goal_ml.is_finite() && output.telemetry.episode != 0 {
+            let pouring = output.telemetry.goal_ml.is_finite() && output.telemetry.episode != 0;
+            if pouring {
                 push(Span::PouringExecution, us(woke_ns, times.done_ns));
             }
             if let Some(feature) = tick.features.last().filter(|_| times.written_at_ns != 0) {
@@ -87,7 +123,11 @@ impl TickTimes {
                 push(Span::WakeToDecided, us(woke_ns, times.decided_at_ns));
                 push(Span::DecidedToWritten, us(times.decided_at_ns, times.written_at_ns));
                 push(Span::CaptureToWritten, us(feature.captured_at_ns, times.written_at_ns));
+                push(Span::ReceivedToWritten, us(feature.received_at_ns, times.written_at_ns));
             }
+            ticks.with_frames[tick.features.len().min(2)] += 1;
+            let (execution_us, frames) = (us(woke_ns, times.done_ns), tick.features.len());
+            ticks.keep_worst([WorstTick { woke_at_ns: woke_ns, lateness_us: lateness, execution_us, frames, pouring, activity: None }]);
         });
         let replay = replay.map_err(|e| OwnCellError::Other(e.to_string()))?;
         if replay.different != 0 {
@@ -101,11 +141,33 @@ impl TickTimes {
         &self.spans_us[span as usize]
     }
 
+    /// Keeps the worst of the ticks that it has and of `more`.
+    fn keep_worst(&mut self, more: impl IntoIterator<Item = WorstTick>) {
+        self.worst.extend(more);
+        self.worst.sort_by(|a, b| b.took_us().total_cmp(&a.took_us()));
+        self.worst.truncate(WORST);
+    }
+
+    /// The ticks in `parts` parts of equal length, in time; only their lateness and execution.
+    pub fn parts(&self, parts: usize) -> Vec<Self> {
+        let part = |k: usize| {
+            let mut ticks = Self::default();
+            for span in [Span::Lateness, Span::Execution, Span::PouringExecution] {
+                let all = self.of(span);
+                ticks.spans_us[span as usize] = all[all.len() * k / parts..all.len() * (k + 1) / parts].to_vec();
+            }
+            ticks
+        };
+        (0..parts).map(part).collect()
+    }
+
     /// Adds the ticks of another run.
     pub fn add(&mut self, other: &Self) {
         for (sum, part) in self.spans_us.iter_mut().zip(&other.spans_us) {
             sum.extend_from_slice(part);
         }
+        self.keep_worst(other.worst.iter().copied());
+        self.with_frames.iter_mut().zip(other.with_frames).for_each(|(sum, part)| *sum += part);
         self.lost += other.lost;
         self.late += other.late;
     }

@@ -50,7 +50,8 @@ pub fn remarks(episode: &Episode) -> Vec<Remark> {
         all.push(Remark::note(format!("{} frames were lost, at most {longest} in a row", info.lost_frames)));
     }
     for (doubt, frames) in doubts(episode) {
-        let use_of_it = if doubt.usable() { "still used" } else { "not used" };
+        let used = episode.rows.iter().filter(|r| r.doubt == doubt && r.area_px2.is_finite()).count();
+        let use_of_it = if used == 0 { "not used".into() } else { format!("{used} of them still used") };
         all.push(Remark::note(format!("{frames} frames are doubtful: {} ({use_of_it})", doubt.words())));
     }
     if info.dropped_images > 0 {

@@ -151,9 +151,9 @@ impl ClearWater {
                 (Verdict::Stream, Some((found, ..))) => {
                     let scale = self.scale;
                     self.lines.edges(found.line, &self.evidence, &self.rays, |v| (v + 0.5) * scale - 0.5, edges_px);
-                    Sighting::Stream { seen_share: found.edge_share.min(1.0), leaves_region: false }
+                    Sighting::Stream { seen_share: found.edge_share.min(1.0), doubt: Doubt::None }
                 }
-                (Verdict::Unsure, _) => Sighting::Unsure,
+                (Verdict::Unsure, _) => Sighting::Unsure(Doubt::EdgeNotFound),
                 _ => sighting,
             };
             if self.water.is_elsewhere(self.evidence.strange_share()) {
@@ -255,6 +255,10 @@ impl Liquid for ClearWater {
     fn look(&mut self, edges_px: &mut Vec<[f32; 2]>) -> opencv::Result<Sighting> {
         // The search runs with the processor's widest registers.
         pulp::Arch::new().dispatch(|| self.look_for_stream(edges_px))
+    }
+
+    fn dry_share(&self, legs_px: [f32; 2]) -> f32 {
+        self.evidence.dry_share(&self.rays, self.line_share(legs_px.map(|v| v / self.scale)))
     }
 
     fn edge_on(&self, profile: &Profile) -> Option<ProfileEdge> {

@@ -4,17 +4,21 @@
 //! first and background after it, whatever the tilt. So on each ray the outer edge is where the number of liquid pixels minus that of
 //! background pixels is largest. A stream fills nearly every ray from the lip on; drops and splashes do not, so they are no stream.
 //!
+//! A liquid whose colour has left its range would look like no stream. So the ground's own colours are remembered
+//! ([`super::ground_colours`]), and what lies at the lip like a stream, but has the colours of neither, is a reason for a doubt.
+//!
 //! Called on the extraction thread. All pictures are kept, so after the first frame nothing is allocated but OpenCV's matrix headers.
 //! The only failures are OpenCV's.
 
 use opencv::boxed_ref::BoxedRef;
-use opencv::core::{self, CV_16SC2, CV_32FC1, Mat, Scalar};
+use opencv::core::{self, CV_16SC2, CV_32FC1, Mat, Scalar, Vec3b};
 use opencv::imgproc;
 use opencv::prelude::*;
 use shared::config::ImageConfig;
 use shared::messages::{Doubt, PixelFormat};
 
-use super::geometry::{Axes, NEAR_PX, RAYS, RayGrid};
+use super::geometry::{Axes, Line, NEAR_PX, RAYS, RayGrid, distance};
+use super::ground_colours::{Ground, GroundColours};
 use super::liquid::{FineLine, LineRules, Liquid, PROFILE_SAMPLES, Profile, ProfileEdge, REACH, Sighting};
 
 // "Tuned" below means that the value was tuned on seeds 1 and 5001 to 5003 of `evaluate-camera`; see docs/VISION.md.
@@ -40,6 +44,43 @@ const LEAVES_SHARE: f32 = 0.06;
 const SMOOTH: i32 = 5;
 /// There is no line when a smaller share of the profiles than this shows an edge. Tuned.
 const PROFILES_LEAST: f32 = 0.3;
+/// A colour whose brightest part reaches this may be one whose brightest part is cut off, grey levels. Chosen by hand: a little below 255,
+/// because samples are smoothed.
+const CUT_OFF_LEVEL: f64 = 240.0;
+/// A hue this near to that of red, green or blue may move to either side of it, in OpenCV's degrees of 2. Chosen by hand.
+const AT_PRIMARY: f64 = 5.0;
+/// Hues from a primary colour to the mixed ones beside it, in OpenCV's degrees of 2.
+const PRIMARY_TO_MIXED: f64 = 30.0;
+/// The ground is learned from samples at least this far from the lip, px, once it was seen dry for [`DRY_FRAMES`]: nearer, a stream
+/// begins. Chosen by hand.
+const LEARN_FROM_PX: f32 = 48.0;
+/// Frames without a stream after which the surroundings of the lip are known. Chosen by hand: a third of a second.
+const DRY_FRAMES: u32 = 10;
+/// Of this many samples, the ground is learned from one a frame, a different one each time. Chosen by hand, for speed.
+const LEARN_EVERY: usize = 7;
+/// The ground is learned this many samples beyond the liquid: between, both mix. Chosen by hand.
+const LEARN_BEYOND: usize = 6;
+/// A body at the lip is looked for up to this distance, px. Chosen by hand: one of 200 px^2 is 13 px long on the mean ray.
+const BODY_REACH_PX: f32 = 64.0;
+/// Least share of the rays that a body at the lip fills. Tuned.
+const BODY_RAYS: f32 = 0.7;
+/// Least mean length of a body at the lip, px: a bead is shorter. Tuned.
+const BODY_PX: f32 = 9.0;
+/// Least share of a body that has foreign colours. Tuned.
+const BODY_FOREIGN: f32 = 0.3;
+/// This far beyond the stream's edge there is ground, px. Chosen by hand: further than a strong blur reaches.
+const BESIDE_PX: f32 = 8.0;
+/// With this share of foreign colours beside the stream, its edge is not where the liquid ends. Tuned.
+const BESIDE_FOREIGN: f32 = 0.5;
+/// A picture in which this share of the samples has no colour at all is a grey one. Chosen by hand: a sensor's noise alone makes colour.
+const GREY_SHARE: f32 = 0.99;
+/// A sample has no colour when its parts differ by no more than this, grey levels. Chosen by hand: a level or two of rounding.
+const GREY_LEVELS: u8 = 2;
+/// A liquid of at least this saturation is not seen in grey pictures. Chosen by hand.
+const COLOURED_FROM: f64 = 20.0;
+/// Of this many samples, one is looked at to find out whether a picture is grey. Chosen by hand, for speed.
+const GREY_EVERY: usize = 5;
+
 /// Samples at either end of a profile that tell liquid and background. Chosen by hand; no measurement is recorded.
 const FLANK: usize = 3;
 /// Least difference of liquid and background at the ends of a profile: the root of the sum of the squares of the three parts, grey
@@ -56,12 +97,18 @@ pub(crate) struct ColouredLiquid {
     map_a: Mat,
     /// The second of these maps.
     map_b: Mat,
-    /// Least hue, saturation and value.
-    low: Scalar,
-    /// Largest hue, saturation and value.
-    high: Scalar,
+    /// Least and largest hue, saturation and value of what is the liquid.
+    ranges: Vec<(Scalar, Scalar)>,
+    /// Whether the liquid is not to be seen in a picture without colour.
+    needs_colour: bool,
     /// A smaller triangle is no stream, px^2.
     area_min_px2: f32,
+    ground: GroundColours,
+    /// Frames that were taken, and those of them without a stream.
+    frames: usize,
+    dry_frames: u32,
+    /// Number of samples on each ray up to the end of the liquid, or of a body at the lip, in the last picture.
+    ends: [usize; RAYS],
     // Pictures along the rays, one ray a row, kept from frame to frame.
     /// The region in BGR.
     sampled: Mat,
@@ -71,8 +118,37 @@ pub(crate) struct ColouredLiquid {
     hsv: Mat,
     /// Not 0 where there is liquid.
     mask: Mat,
-    /// The mask of one of the two ranges of a colour around hue 0.
+    /// The mask of one range of hues.
     half_mask: Mat,
+}
+
+/// The ranges of hue, saturation and value that are the liquid: its own, and what its colours become when their brightest part is cut off.
+/// The hue then moves away from that part's own, as far as that of the mixed colour beside it.
+fn ranges([h0, s0, v0, h1, s1, v1]: [f64; 6]) -> Vec<(Scalar, Scalar)> {
+    let width = (h1 - h0).rem_euclid(180.0);
+    let middle = h0 + 0.5 * width;
+    // The hues of red, green and blue are 0, 60 and 120.
+    let primary = (middle / 60.0).round() * 60.0;
+    let (below, above) = (primary - PRIMARY_TO_MIXED, primary + PRIMARY_TO_MIXED);
+    let mut hues = vec![(h0, h0 + width, v0)];
+    // A liquid that is not red, green or blue itself moves to one side only.
+    if middle >= primary - AT_PRIMARY && above > h0 + width {
+        hues.push((middle, above, v0.max(CUT_OFF_LEVEL)));
+    }
+    if middle <= primary + AT_PRIMARY && below < h0 {
+        hues.push((below, middle, v0.max(CUT_OFF_LEVEL)));
+    }
+    let mut all = Vec::new();
+    for (from, to, v) in hues {
+        // Hues wrap around at 180.
+        for turn in [-180.0, 0.0, 180.0] {
+            let (from, to) = ((from + turn).max(0.0), (to + turn).min(179.0));
+            if from <= to {
+                all.push((Scalar::new(from, s0, v, 0.0), Scalar::new(to, s1, if v > v0 { 255.0 } else { v1 }, 0.0)));
+            }
+        }
+    }
+    all
 }
 
 impl ColouredLiquid {
@@ -91,15 +167,19 @@ impl ColouredLiquid {
         }
         let (mut map_a, mut map_b) = (Mat::default(), Mat::default());
         imgproc::convert_maps(&map_x, &map_y, &mut map_a, &mut map_b, CV_16SC2, true)?;
-        let [h0, s0, v0, h1, s1, v1] = image.colour_hsv.map(f64::from);
+        let colour = image.colour_hsv.map(f64::from);
         Ok(Self {
             axes,
             grid,
             map_a,
             map_b,
-            low: Scalar::new(h0, s0, v0, 0.0),
-            high: Scalar::new(h1, s1, v1, 0.0),
+            ranges: ranges(colour),
+            needs_colour: colour[1] >= COLOURED_FROM,
             area_min_px2: image.area_min_px2,
+            ground: GroundColours::new(),
+            frames: 0,
+            dry_frames: 0,
+            ends: [0; RAYS],
             sampled: Mat::default(),
             smooth: Mat::default(),
             hsv: Mat::default(),
@@ -114,25 +194,29 @@ impl ColouredLiquid {
         let size = core::Size::new(SMOOTH, SMOOTH);
         imgproc::blur(&self.sampled, &mut self.smooth, size, core::Point::new(-1, -1), core::BORDER_REPLICATE)?;
         imgproc::cvt_color_def(&self.smooth, &mut self.hsv, imgproc::COLOR_BGR2HSV)?;
-        if self.low[0] <= self.high[0] {
-            return core::in_range(&self.hsv, &self.low, &self.high, &mut self.mask);
+        for (i, (low, high)) in self.ranges.iter().enumerate() {
+            if i == 0 {
+                core::in_range(&self.hsv, low, high, &mut self.mask)?;
+                continue;
+            }
+            core::in_range(&self.hsv, low, high, &mut self.half_mask)?;
+            let others = self.half_mask.data_bytes()?;
+            self.mask.data_bytes_mut()?.iter_mut().zip(others).for_each(|(mask, other)| *mask |= other);
         }
-        // Red lies on both sides of hue 0.
-        let (mut low, mut high) = (self.low, self.high);
-        high[0] = 179.0;
-        core::in_range(&self.hsv, &low, &high, &mut self.half_mask)?;
-        (low[0], high[0]) = (0.0, self.high[0]);
-        core::in_range(&self.hsv, &low, &high, &mut self.mask)?;
-        let one = std::mem::take(&mut self.mask);
-        core::bitwise_or(&one, &self.half_mask, &mut self.mask, &core::no_array())
+        Ok(())
     }
 
-    /// The last sample of liquid on a ray and the score there: px of liquid minus px of background, at its largest.
+    /// The last sample of liquid on a ray and the score there: px of liquid minus px of background, at its largest. A lamp's reflection
+    /// near the lip counts as neither.
     #[inline(always)]
-    fn last_liquid(&self, mask: &[u8]) -> Option<(usize, f32)> {
+    fn last_liquid(&self, mask: &[u8], colours: &[Vec3b]) -> Option<(usize, f32)> {
         let (mut score, mut best, mut last) = (0.0f32, 0.0f32, None);
         for (r, (value, step)) in mask.iter().zip(&self.grid.steps_px).enumerate() {
-            score += if *value != 0 { *step } else { -step };
+            if *value != 0 {
+                score += *step;
+            } else if self.grid.radii_px[r] > LEARN_FROM_PX || !self.ground.is_blind(colours[r].0) {
+                score -= *step;
+            }
             if score > best {
                 (best, last) = (score, Some(r));
             } else if score < -GAP_MOST_PX {
@@ -140,6 +224,121 @@ impl ColouredLiquid {
             }
         }
         last.map(|r| (r, best))
+    }
+
+    /// Whether the picture has no colour, although the liquid has.
+    fn is_grey(&self) -> opencv::Result<bool> {
+        if !self.needs_colour {
+            return Ok(false);
+        }
+        let pixels: &[Vec3b] = self.sampled.data_typed()?;
+        let grey = |p: &&Vec3b| p[0].abs_diff(p[1]).max(p[1].abs_diff(p[2])).max(p[0].abs_diff(p[2])) <= GREY_LEVELS;
+        let (looked, found) = (pixels.len().div_ceil(GREY_EVERY), pixels.iter().step_by(GREY_EVERY).filter(grey).count());
+        Ok(found as f32 >= GREY_SHARE * looked as f32)
+    }
+
+    /// Whether something lies at the lip like a stream and has foreign colours. Writes its ends into `self.ends`.
+    fn is_foreign_body(&mut self) -> opencv::Result<bool> {
+        let reach = self.grid.radii_px.iter().take_while(|r| **r <= BODY_REACH_PX).count();
+        let (mut filled, mut foreign, mut samples, mut length_px) = (0usize, 0usize, 0usize, 0.0f32);
+        for (i, ray) in self.grid.rays.iter().enumerate() {
+            let mask = self.mask.at_row::<u8>(i as i32)?;
+            let colours = self.smooth.at_row::<Vec3b>(i as i32)?;
+            let (mut score, mut best, mut end, mut strange, mut strange_at_end) = (0.0f32, 0.0f32, 0usize, 0usize, 0usize);
+            for r in 0..reach.min(ray.samples) {
+                let step = self.grid.steps_px[r];
+                match if mask[r] != 0 { None } else { Some(self.ground.tell(colours[r].0)) } {
+                    None => score += step,
+                    Some(Ground::Foreign) => (score, strange) = (score + step, strange + 1),
+                    Some(Ground::Blind) => {}
+                    Some(Ground::Known) => score -= step,
+                }
+                if score > best {
+                    (best, end, strange_at_end) = (score, r + 1, strange);
+                }
+            }
+            if end > 0 && best >= (2.0 * FILLED - 1.0) * (self.grid.radii_px[end - 1] - NEAR_PX).max(1.0) {
+                filled += 1;
+                samples += end;
+                foreign += strange_at_end;
+                length_px += self.grid.radii_px[end - 1];
+                self.ends[i] = self.ends[i].max(end);
+            }
+        }
+        let mean_px = length_px / filled.max(1) as f32;
+        Ok(filled as f32 >= BODY_RAYS * RAYS as f32 && mean_px >= BODY_PX && foreign as f32 >= BODY_FOREIGN * samples as f32)
+    }
+
+    /// Whether foreign colours lie beside the stream, so that it goes on beyond its edge.
+    fn goes_on_beyond_its_edge(&self) -> opencv::Result<bool> {
+        let (mut foreign, mut looked) = (0usize, 0usize);
+        for (i, ray) in self.grid.rays.iter().enumerate() {
+            let Some(last) = self.ends[i].checked_sub(1) else { continue };
+            let beside_px = self.grid.radii_px[last] + BESIDE_PX;
+            let Some(r) = (last..ray.samples).find(|r| self.grid.radii_px[*r] >= beside_px) else { continue };
+            looked += 1;
+            foreign += usize::from(self.ground.tell(self.smooth.at_row::<Vec3b>(i as i32)?[r].0) == Ground::Foreign);
+        }
+        Ok(foreign as f32 > BESIDE_FOREIGN * looked.max(RAYS / 4) as f32)
+    }
+
+    /// Learns the ground's colours from what lies beyond the liquid and far from the lip, or, while the surroundings of the lip are new and
+    /// `dry`, from everything.
+    fn learn(&mut self, dry: bool) -> opencv::Result<()> {
+        let new = dry && self.dry_frames < DRY_FRAMES;
+        self.dry_frames = self.dry_frames.saturating_add(u32::from(dry));
+        self.ground.forget();
+        let far = self.grid.radii_px.iter().take_while(|r| **r < LEARN_FROM_PX).count();
+        let every = if new { 1 } else { LEARN_EVERY };
+        for (i, ray) in self.grid.rays.iter().enumerate() {
+            let from = match self.ends[i] {
+                0 if new => 0,
+                end => (end + LEARN_BEYOND).max(far),
+            };
+            let (mask, colours) = (self.mask.at_row::<u8>(i as i32)?, self.smooth.at_row::<Vec3b>(i as i32)?);
+            let first = from + (self.frames + 3 * i) % every;
+            for r in (first..ray.samples).step_by(every) {
+                let beside = [r.saturating_sub(3), r, (r + 3).min(ray.samples - 1)];
+                if beside.iter().all(|r| mask[*r] == 0) {
+                    self.ground.learn(colours[r].0, r >= far);
+                }
+            }
+        }
+        self.frames = self.frames.wrapping_add(1);
+        Ok(())
+    }
+
+    /// Finds the stream, and writes into `self.ends` where the liquid ends on each ray.
+    fn find_stream(&mut self, edges_px: &mut Vec<[f32; 2]>) -> opencv::Result<Sighting> {
+        edges_px.clear();
+        self.ends = [0; RAYS];
+        let (mut filled, mut cut_off, mut liquid_px) = (0usize, 0usize, 0.0f32);
+        for (i, ray) in self.grid.rays.iter().enumerate() {
+            let colours = self.smooth.at_row::<Vec3b>(i as i32)?;
+            let Some((r, score)) = self.last_liquid(&self.mask.at_row::<u8>(i as i32)?[..ray.samples], colours) else { continue };
+            // Between the last sample of liquid and the first of background.
+            let r_px = self.grid.radii_px[r] + 0.5 * self.grid.steps_px[r];
+            if r_px >= NEAR_PX + 1.0 && score >= (2.0 * FILLED - 1.0) * (r_px - NEAR_PX) {
+                filled += 1;
+                liquid_px += r_px;
+                cut_off += usize::from(r + 1 >= ray.samples);
+                edges_px.push(self.axes.at(r_px, ray.along));
+                self.ends[i] = r + 1;
+            }
+        }
+        let share = filled as f32 / RAYS as f32;
+        if cut_off as f32 > ALL_LIQUID * RAYS as f32 {
+            return Ok(Sighting::Unsure(Doubt::EdgeNotFound));
+        }
+        if share < STREAM_RAYS {
+            // A good half of the wedge full of liquid is no drop: something hides the stream.
+            let mean_px = liquid_px / filled.max(1) as f32;
+            let hidden = share > HIDDEN_RAYS && mean_px > HIDDEN_PX;
+            let confidence = (1.0 - share).clamp(0.0, 1.0);
+            return Ok(if hidden { Sighting::Unsure(Doubt::EdgeNotFound) } else { Sighting::Dry { confidence } });
+        }
+        let leaves_region = cut_off as f32 > LEAVES_SHARE * RAYS as f32;
+        Ok(Sighting::Stream { seen_share: share, doubt: if leaves_region { Doubt::LeavesRegion } else { Doubt::None } })
     }
 }
 
@@ -162,31 +361,34 @@ impl Liquid for ColouredLiquid {
     }
 
     fn look(&mut self, edges_px: &mut Vec<[f32; 2]>) -> opencv::Result<Sighting> {
+        if self.is_grey()? {
+            return Ok(Sighting::Unsure(Doubt::ColoursChanged));
+        }
         self.segment()?;
-        edges_px.clear();
-        let (mut filled, mut cut_off, mut liquid_px) = (0usize, 0usize, 0.0f32);
+        let sighting = match self.find_stream(edges_px)? {
+            Sighting::Dry { .. } if self.dry_frames > 0 && self.is_foreign_body()? => Sighting::Unsure(Doubt::ColoursChanged),
+            Sighting::Stream { seen_share, doubt: Doubt::None } if self.dry_frames > 0 && self.goes_on_beyond_its_edge()? => {
+                Sighting::Stream { seen_share, doubt: Doubt::ColoursChanged }
+            }
+            other => other,
+        };
+        self.learn(matches!(sighting, Sighting::Dry { .. }))?;
+        Ok(sighting)
+    }
+
+    fn dry_share(&self, legs_px: [f32; 2]) -> f32 {
+        let (from, to) = (self.axes.at(legs_px[0], self.axes.x), self.axes.at(legs_px[1], self.axes.y));
+        let line = Line::through(from, to, distance(from, to));
+        let (mut dry, mut looked) = (0usize, 0usize);
         for (i, ray) in self.grid.rays.iter().enumerate() {
-            let Some((r, score)) = self.last_liquid(&self.mask.at_row::<u8>(i as i32)?[..ray.samples]) else { continue };
-            // Between the last sample of liquid and the first of background.
-            let r_px = self.grid.radii_px[r] + 0.5 * self.grid.steps_px[r];
-            if r_px >= NEAR_PX + 1.0 && score >= (2.0 * FILLED - 1.0) * (r_px - NEAR_PX) {
-                filled += 1;
-                liquid_px += r_px;
-                cut_off += usize::from(r + 1 >= ray.samples);
-                edges_px.push(self.axes.at(r_px, ray.along));
+            let edge_px = line.cut(self.axes.lip_px, ray.along);
+            let (Ok(mask), Ok(colours)) = (self.mask.at_row::<u8>(i as i32), self.smooth.at_row::<Vec3b>(i as i32)) else { continue };
+            for r in (0..ray.samples).take_while(|r| self.grid.radii_px[*r] < edge_px) {
+                looked += 1;
+                dry += usize::from(mask[r] == 0 && self.ground.tell(colours[r].0) == Ground::Known);
             }
         }
-        let share = filled as f32 / RAYS as f32;
-        if cut_off as f32 > ALL_LIQUID * RAYS as f32 {
-            return Ok(Sighting::Unsure);
-        }
-        if share < STREAM_RAYS {
-            // A good half of the wedge full of liquid is no drop: something hides the stream.
-            let mean_px = liquid_px / filled.max(1) as f32;
-            let hidden = share > HIDDEN_RAYS && mean_px > HIDDEN_PX;
-            return Ok(if hidden { Sighting::Unsure } else { Sighting::Dry { confidence: (1.0 - share).clamp(0.0, 1.0) } });
-        }
-        Ok(Sighting::Stream { seen_share: share, leaves_region: cut_off as f32 > LEAVES_SHARE * RAYS as f32 })
+        dry as f32 / looked.max(1) as f32
     }
 
     /// The edge is where the profile, projected on the difference between its two ends, passes one half.

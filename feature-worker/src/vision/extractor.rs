@@ -3,10 +3,11 @@
 //! The liquid leaves the container at the lip `O`, where the glass's top edge (x-axis) meets its left side (y-axis). Between the two
 //! axes, seen from `O`, liquid comes first and background after it, whatever the tilt. So in each image:
 //!
-//! 1. [`super::checks`] tell whether the light is good enough and the picture is a new one.
+//! 1. [`super::checks`] tell whether the light is good enough and the picture is a new one, and [`super::whole`] whether it is whole.
 //! 2. The [`Liquid`] tells whether there is a stream, and roughly where its outer edge lies.
 //! 3. [`super::stream_edge`] makes that edge a line, which cuts the axes at a and b.
 //! 4. `V_e = a b sin(phi) / 2`, with phi between the axes. Without a stream it is exactly 0.
+//! 5. A stream that is not seen any more is not absent until [`super::presence`] says so.
 //!
 //! Runs on the worker's extraction thread. All buffers are kept, so after the second frame nothing is allocated but OpenCV's matrix
 //! headers. A frame that cannot be measured is no error: it gets a [`Doubt`].
@@ -25,7 +26,9 @@ use super::geometry::{Axes, RayGrid};
 use super::liquid::{Liquid, Sighting};
 use super::measurement::{Measurement, Stages};
 use super::picture::{Image, RegionPixels, RegionReader};
+use super::presence::Presence;
 use super::stream_edge::{BLURRED_PX, LineFinder};
+use super::whole::WholeCheck;
 
 /// Why an extractor cannot be made, or why an image cannot be measured.
 #[derive(Debug, thiserror::Error)]
@@ -60,7 +63,9 @@ pub struct Extractor {
     axes: Axes,
     reader: RegionReader,
     light: LightCheck,
+    whole: WholeCheck,
     rim: RimCheck,
+    presence: Presence,
     liquid: Box<dyn Liquid>,
     line: LineFinder,
     /// The coarse outer edge on the rays, px in the region, from the x-axis to the y-axis. Kept from frame to frame.
@@ -98,7 +103,9 @@ impl Extractor {
             axes,
             reader: RegionReader::new(region),
             light: LightCheck::default(),
+            whole: WholeCheck::new(axes, region_px),
             rim: RimCheck::new(axes),
+            presence: Presence::new(camera.width_px),
             liquid,
             line: LineFinder::new(axes, region_px),
             edges,
@@ -157,7 +164,9 @@ impl Extractor {
         let start = Instant::now();
         let pixels = reader.read(image, |region| self.liquid.take(region))?;
         let sampled = Instant::now();
-        let unusable = self.light.doubt(self.liquid.sampled().data_bytes()?);
+        let whole = self.whole.is_whole(pixels);
+        let unlit = self.light.doubt(self.liquid.sampled().data_bytes()?);
+        let unusable = unlit.or((!whole).then_some(Doubt::PictureIncomplete));
         let checked = Instant::now();
         let (measured, segmented) = match unusable {
             Some(doubt) => (Measurement::nothing(0.0, doubt), checked),
@@ -170,6 +179,12 @@ impl Extractor {
         let edge_tells_focus = measured.area_px2 > 0.0 && self.liquid.rules().edge_tells_focus;
         let untold = measured.doubt == Doubt::None && !edge_tells_focus;
         let measured = if untold && self.rim.is_blurred(pixels) { Measurement::nothing(0.0, Doubt::Blurred) } else { measured };
+        let seen_dry = measured.doubt == Doubt::None && measured.area_px2 == 0.0;
+        let measured = if seen_dry && !self.presence.is_gone(|legs_px| self.liquid.dry_share(legs_px)) {
+            Measurement::nothing(0.0, Doubt::EdgeNotFound)
+        } else {
+            measured
+        };
         let done = Instant::now();
         let ns = |from: Instant, to: Instant| to.duration_since(from).as_nanos() as u64;
         self.stages = Stages {
@@ -185,13 +200,13 @@ impl Extractor {
     fn follow(&mut self, sighting: Sighting, pixels: RegionPixels) -> Measurement {
         match sighting {
             Sighting::Dry { confidence } => Measurement::nothing(confidence, Doubt::None),
-            Sighting::Unsure => Measurement::nothing(0.0, Doubt::EdgeNotFound),
-            Sighting::Stream { seen_share, leaves_region } => self.measure_stream(seen_share, leaves_region, pixels),
+            Sighting::Unsure(doubt) => Measurement::nothing(0.0, doubt),
+            Sighting::Stream { seen_share, doubt } => self.measure_stream(seen_share, doubt, pixels),
         }
     }
 
     /// The triangle of a stream whose coarse edge is in `self.edges`.
-    fn measure_stream(&mut self, seen_share: f32, leaves_region: bool, pixels: RegionPixels) -> Measurement {
+    fn measure_stream(&mut self, seen_share: f32, doubt: Doubt, pixels: RegionPixels) -> Measurement {
         let Some(first) = self.line.first_line(&self.edges) else { return Measurement::nothing(0.0, Doubt::EdgeNotFound) };
         if self.axes.area_px2(first.legs_px) < self.liquid.rules().first_area_least_px2 {
             return Measurement::nothing(seen_share, Doubt::None);
@@ -208,13 +223,8 @@ impl Extractor {
         let [a, b] = fine.legs_px;
         let corner = |r: f32, axis: [f32; 2]| self.in_image(self.axes.at(r, axis));
         let ([x0, y0], [x1, y1], [x2, y2]) = (corner(0.0, self.axes.x), corner(a, self.axes.x), corner(b, self.axes.y));
-        let doubt = if leaves_region {
-            Doubt::LeavesRegion
-        } else if fine.width_px > BLURRED_PX {
-            Doubt::Blurred
-        } else {
-            Doubt::None
-        };
+        let doubt = if doubt == Doubt::None && fine.width_px > BLURRED_PX { Doubt::Blurred } else { doubt };
+        self.presence.saw(area_px2, fine.legs_px);
         Measurement { area_px2, confidence: fine.confidence, doubt, triangle_px: [x0, y0, x1, y1, x2, y2] }
     }
 }

@@ -56,14 +56,14 @@ pub(crate) enum Sighting {
         /// Confidence of that, 0 to 1.
         confidence: f32,
     },
-    /// It is not known whether there is a stream.
-    Unsure,
+    /// It is not known whether there is a stream, for this reason.
+    Unsure(Doubt),
     /// There is a stream.
     Stream {
         /// Share of the edge that is seen, 0 to 1.
         seen_share: f32,
-        /// Whether so much of the stream reaches the region's border that its area is only a lower bound.
-        leaves_region: bool,
+        /// Why its area may not be the whole of it.
+        doubt: Doubt,
     },
 }
 
@@ -108,6 +108,9 @@ pub(crate) trait Liquid: Send + Sync {
     /// Looks for a stream in the picture that was taken. Replaces `edges_px` by points of the stream's outer edge in the region, px,
     /// from the x-axis to the y-axis; without a stream they are of no use.
     fn look(&mut self, edges_px: &mut Vec<[f32; 2]>) -> opencv::Result<Sighting>;
+
+    /// Which share of the triangle with these legs, px from the lip, was seen to be ground in the picture that was looked at, 0 to 1.
+    fn dry_share(&self, legs_px: [f32; 2]) -> f32;
 
     /// Where on a profile the stream's edge lies.
     fn edge_on(&self, profile: &Profile) -> Option<ProfileEdge>;

@@ -5,9 +5,9 @@ use shared::messages::Doubt;
 /// What was measured in one image.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Measurement {
-    /// V_e, px^2. It is exactly 0 without a stream.
+    /// V_e, px^2. It is exactly 0 without a stream, and where nothing could be measured.
     pub area_px2: f32,
-    /// From 0 (none) to 1 (full).
+    /// From 0 (none) to 1 (full): the share of such frames whose area is within 20 % of the truth.
     pub confidence: f32,
     /// Why the measurement is doubtful.
     pub doubt: Doubt,
@@ -16,6 +16,11 @@ pub struct Measurement {
 }
 
 impl Measurement {
+    /// Whether it may be used, see [`Doubt::usable`].
+    pub fn is_usable(&self) -> bool {
+        self.doubt.usable(self.area_px2)
+    }
+
     /// A measurement without a stream.
     pub(crate) fn nothing(confidence: f32, doubt: Doubt) -> Self {
         Self { area_px2: 0.0, confidence, doubt, triangle_px: [0.0; 6] }

@@ -32,7 +32,13 @@ pub(crate) struct RegionPixels<'a> {
     height: usize,
 }
 
-impl RegionPixels<'_> {
+impl<'a> RegionPixels<'a> {
+    /// The bytes of a row, three a pixel; none if there is no such row.
+    pub(crate) fn row(&self, y: usize) -> &'a [u8] {
+        let start = y * self.stride;
+        self.bytes.get(start..start + 3 * self.width).unwrap_or_default()
+    }
+
     /// The colour at a place between pixels, mixed from the four around it: blue, green, red in grey levels. There is none outside of the
     /// region.
     pub(crate) fn at(&self, x: f32, y: f32) -> Option<[f32; 3]> {

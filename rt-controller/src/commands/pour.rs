@@ -5,6 +5,7 @@ use shared::config::Config;
 use shared::control::{EndReason, Outcome, Reply, Request};
 use shared::exit::{self, Failure, OrExit as _, failure};
 
+use super::resume;
 use crate::client::{self, Client, Common, FollowError};
 
 /// Command-line arguments.
@@ -38,6 +39,7 @@ pub(crate) fn ended(outcome: &Outcome) -> Result<(), Failure> {
 /// Gives an order that moves the container, follows it to its end, and waits for the recorder's report, if there is a recorder.
 pub(crate) fn order(cell: &str, request: &Request) -> Result<(Outcome, Option<client::Recorded>), Failure> {
     let client = Client::connect(cell).or_exit(exit::UNREACHABLE)?;
+    resume::take_back_if_it_waits(&client)?;
     let recorder = client::RecorderReports::open(cell).ok();
     let episode = match client.ask(request).or_exit(exit::UNREACHABLE)? {
         Reply::Started { episode } => episode,

@@ -5,7 +5,7 @@ use std::path::PathBuf;
 
 use shared::exit::{self, Failure, OrExit as _, failure};
 
-use crate::journal;
+use crate::journal::{self, Replay};
 
 /// Command-line arguments.
 #[derive(Debug, clap::Args)]
@@ -38,7 +38,9 @@ pub fn run(args: &Args) -> Result<(), Failure> {
     if args.json {
         println!("{}", serde_json::json!(replay));
     } else if !args.table {
-        println!("{} ticks replayed, {} pours and recordings, {} different answers", replay.ticks, replay.ended.len(), replay.different);
+        let Replay { ticks, ended, different, different_deadlines, .. } = &replay;
+        println!("{ticks} ticks replayed, {} pours and recordings, {different} different answers", ended.len());
+        println!("{different_deadlines} ticks at another time than the pacing gives");
         if replay.cut_off {
             println!("the file ends in the middle of an entry: the controller was killed, or is still writing");
         }

@@ -27,9 +27,14 @@ pub fn run(args: &Args) -> Result<(), Failure> {
     Ok(())
 }
 
+/// The name that JSON has for a value.
+fn name(value: &impl serde::Serialize) -> String {
+    serde_json::to_value(value).ok().and_then(|v| v.as_str().map(String::from)).unwrap_or_default()
+}
+
 /// Prints the status for people.
 fn print(s: &Status) {
-    println!("phase      {}", serde_json::to_value(s.phase).ok().and_then(|v| v.as_str().map(String::from)).unwrap_or_default());
+    println!("phase      {}", name(&s.phase));
     if !s.hindrance.is_empty() {
         println!("hindrance  {}", s.hindrance);
     }
@@ -44,7 +49,10 @@ fn print(s: &Status) {
     let c = s.clipped;
     println!("clipped    angle {}, rate {}, acceleration {}, not finite {}", c.angle, c.rate, c.acceleration, c.not_finite);
     println!("loop       {} allocations, {} page faults, {} events lost", s.loop_allocations, s.loop_page_faults, s.events_lost);
-    println!("robot      {} connections", s.robot_connections);
+    println!("robot      {}, {} connections", name(&s.robot), s.robot_connections);
+    if !s.robot_warning.is_empty() {
+        println!("           warning: {}", s.robot_warning);
+    }
     println!("\n{:<28} {:>8} {:>10} {:>10} {:>10} {:>10}", "us", "n", "p50", "p99", "p99.9", "max");
     for h in &s.timing {
         println!("{:<28} {:>8} {:>10.1} {:>10.1} {:>10.1} {:>10.1}", h.name, h.n, h.p50_us, h.p99_us, h.p999_us, h.max_us);

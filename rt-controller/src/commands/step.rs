@@ -53,7 +53,7 @@ pub fn run(args: &Args) -> Result<(), Failure> {
             ..Feature::default()
         };
         // The robot is taken to be where it was sent; a lag is for the other simulator to add.
-        let robot = Robot { hindrance: None, alpha_deg, at_ns: now_ns };
+        let robot = Robot::that_may_move(alpha_deg, now_ns);
         let output = core.step(&Input { now_ns, features: &[feature], robot, order });
         let before_deg = alpha_deg;
         alpha_deg = output.telemetry.alpha_deg;

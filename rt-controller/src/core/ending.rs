@@ -14,6 +14,7 @@
 //! | the largest number of frames is reached | `MaxFrames` |
 //! | nothing flows at the largest tilt | `ContainerEmpty` |
 //! | a stream was seen before, and is not seen any more although the container is tilted further | `StreamLost` |
+//! | the measured tilt does not follow the commanded one, on the way out or back ([`super::following`]) | `NotFollowed` |
 //! | [`controller_overran`]: the controller itself was stopped | `ControllerOverrun` |
 //! | [`worker_was_restarted`]: measurements come from another process | `WorkerRestarted` |
 //! | [`Ending::settled`]: the joint did not come upright | `NotUpright` |
@@ -53,7 +54,10 @@ const LARGEST_TILT_SLACK_DEG: f32 = 0.5;
 const COMMANDED_UPRIGHT_DEG: f32 = 0.01;
 /// Frames without flow after which the last drops are counted: half a second at 30 Hz. Chosen by hand; no measurement is recorded.
 const SETTLE_QUIET_FRAMES: u32 = 15;
-/// The longest wait for the last drops and for the joint to come upright, s. Chosen by hand; no measurement is recorded.
+/// The least way upright that counts as coming nearer, degrees. A joint that is slower than this in [`SETTLE_MAX_S`], 0.33 degrees/s, is held.
+/// Chosen by hand; no measurement is recorded.
+const COMING_DEG: f32 = 1.0;
+/// The longest wait for the last drops, and for a joint that comes no nearer to upright, s. Chosen by hand; no measurement is recorded.
 const SETTLE_MAX_S: f64 = 3.0;
 
 /// What one frame showed during a pour.
@@ -84,6 +88,8 @@ pub struct Moment {
     pub alpha_deg: f32,
     /// Estimated volume poured, ml.
     pub poured_ml: f32,
+    /// Whether the joint follows what is commanded.
+    pub follows: bool,
 }
 
 /// How far a pour or recording is from its end.
@@ -106,6 +112,8 @@ pub struct Ending {
     no_stream_frames: u32,
     /// Largest tilt at which a stream was seen, degrees.
     stream_deg: Option<f32>,
+    /// The tilt at which the joint was last seen to have come nearer to upright, degrees, and when, s after it began to settle.
+    nearest: (f32, f64),
 }
 
 impl Ending {
@@ -125,6 +133,7 @@ impl Ending {
             stream_frames: 0,
             no_stream_frames: 0,
             stream_deg: None,
+            nearest: (f32::INFINITY, 0.0),
         }
     }
 
@@ -148,6 +157,14 @@ impl Ending {
     pub fn end_without_robot(&mut self, reason: EndReason) {
         if self.reason == EndReason::Done {
             self.reason = reason;
+        }
+    }
+
+    /// Takes whether the joint follows on its way upright. The way of a slower robot is waited for, but more was then poured than was
+    /// foreseen when it began, so such a pour is not done.
+    pub fn returns(&mut self, follows: bool) {
+        if !follows {
+            self.end_without_robot(EndReason::NotFollowed);
         }
     }
 
@@ -202,6 +219,9 @@ impl Ending {
 
     /// The reason to end now, if there is one. Ask it in every tick while the container is tilted.
     pub fn due(&self, moment: &Moment, settings: &Settings) -> Option<EndReason> {
+        if !moment.follows {
+            return Some(EndReason::NotFollowed);
+        }
         if moment.measurement_age_ns > settings.stale_ns {
             return Some(EndReason::StaleFeature);
         }
@@ -230,10 +250,14 @@ impl Ending {
 
     /// The final reason, once the last drops are counted: the joint is upright and nothing has flowed for a while, or the wait took
     /// too long. `alpha_deg` is the measured one, because the joint must really be upright.
-    pub fn settled(&self, alpha_deg: f32, settling_s: f64, shutdown: bool, settings: &Settings) -> Option<EndReason> {
+    pub fn settled(&mut self, alpha_deg: f32, settling_s: f64, shutdown: bool, settings: &Settings) -> Option<EndReason> {
         let upright = alpha_deg.abs() <= settings.upright_deg;
         let quiet = self.quiet_frames >= SETTLE_QUIET_FRAMES && self.curve_s.is_none();
-        let over = settling_s >= SETTLE_MAX_S;
+        if alpha_deg.abs() < self.nearest.0 - COMING_DEG {
+            self.nearest = (alpha_deg.abs(), settling_s);
+        }
+        // A slow robot is waited for as long as it comes nearer.
+        let over = settling_s >= SETTLE_MAX_S && (upright || settling_s - self.nearest.1 >= SETTLE_MAX_S);
         (over || (upright && (quiet || shutdown))).then_some(if upright { self.reason } else { EndReason::NotUpright })
     }
 }

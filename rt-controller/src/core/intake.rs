@@ -16,7 +16,7 @@ pub fn is_foreign(feature: &Feature, now_ns: u64) -> bool {
 
 /// V_e, px^2, if it could be measured and may be used.
 pub fn usable_area_px2(feature: &Feature) -> Option<f32> {
-    let usable = feature.area_px2.is_finite() && feature.area_px2 >= 0.0 && Doubt::from_code(feature.doubt).usable();
+    let usable = feature.area_px2.is_finite() && Doubt::from_code(feature.doubt).usable(feature.area_px2);
     usable.then_some(feature.area_px2)
 }
 

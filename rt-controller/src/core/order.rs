@@ -8,6 +8,7 @@ use shared::control::EndReason;
 use shared::gaussian_curve::Curve;
 use shared::messages::Phase;
 
+use super::following;
 use super::robot::Robot;
 use super::settings::Settings;
 
@@ -41,6 +42,8 @@ pub enum Refusal {
     Busy,
     /// The robot may not move, for this reason.
     Robot(EndReason),
+    /// The robot slows itself to this share of its speed.
+    Slowed(f32),
     /// The container is not upright; this is the measured alpha, degrees.
     NotUpright(f32),
     /// There is no fresh, usable measurement.
@@ -60,6 +63,12 @@ impl std::fmt::Display for Refusal {
         match self {
             Self::Busy => write!(f, "a pour or recording is under way: wait for it, or `rt-controller abort`"),
             Self::Robot(reason) => write!(f, "the robot may not move: {}", reason.words()),
+            Self::Slowed(share) => write!(
+                f,
+                "the robot slows itself to {:.0} % of its speed (speed_scaling): look for speed limits of the safety configuration, reduced \
+                 mode, or a wrong payload; a slow robot cannot stop a stream in time",
+                share * 100.0
+            ),
             Self::NotUpright(deg) => write!(f, "the container is tilted by {deg:.0} degrees: bring it upright at the robot's pendant"),
             Self::NoFeature => {
                 write!(
@@ -102,6 +111,12 @@ impl Situation {
             Phase::Idle => {}
             Phase::NoRobot => return Err(Refusal::NotUpright(self.robot.alpha_deg)),
             _ => return Err(Refusal::Busy),
+        }
+        if self.robot.alpha_deg.is_nan() || self.robot.alpha_deg.abs() > settings.upright_deg {
+            return Err(Refusal::NotUpright(self.robot.alpha_deg));
+        }
+        if let Some(share) = self.robot.speed_scaling.filter(|_| following::is_slowed(&self.robot)) {
+            return Err(Refusal::Slowed(share));
         }
         if self.measurement_age_ns <= settings.stale_ns { Ok(()) } else { Err(Refusal::NoFeature) }
     }

@@ -13,4 +13,13 @@ pub struct Robot {
     pub alpha_deg: f32,
     /// When that state arrived, CLOCK_MONOTONIC ns; 0 before the first.
     pub at_ns: u64,
+    /// The share of its speed that the robot leaves by itself, 0 to 1 (RTDE's `speed_scaling`); `None` if it does not say.
+    pub speed_scaling: Option<f32>,
+}
+
+impl Robot {
+    /// A robot that may move at its full speed, whose joint was at `alpha_deg` at `at_ns`: what simulators and tests need.
+    pub fn that_may_move(alpha_deg: f32, at_ns: u64) -> Self {
+        Self { hindrance: None, alpha_deg, at_ns, speed_scaling: None }
+    }
 }

@@ -7,7 +7,7 @@ use serde::{Deserialize, Serialize};
 use shared::config::Config;
 use shared::limits::Limits;
 
-use crate::link::program::patience_s;
+use crate::link::program::{patience_s, usual_lag_s};
 
 /// The settings of a controller.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
@@ -30,6 +30,8 @@ pub struct Settings {
     /// After this long without a target the robot's program goes upright by itself, ns; the controller
     /// then does so too.
     pub patience_ns: u64,
+    /// The lag of the joint behind what is commanded that the robot's program and servo need, ns.
+    pub usual_lag_ns: u64,
 }
 
 impl Settings {
@@ -45,6 +47,7 @@ impl Settings {
             goal_max_ml: controller.goal_max_ml,
             upright_deg: config.robot.start_tolerance_deg as f32,
             patience_ns: (patience_s(controller.rate_hz) * 1e9) as u64,
+            usual_lag_ns: (usual_lag_s(controller.rate_hz, config.robot.lookahead_s, &config.limits) * 1e9) as u64,
         }
     }
 }

@@ -2,25 +2,24 @@
 //!
 //! It runs on an ordinary thread, allocates, and blocks for seconds: for some 20 s with a robot that answers late each time. Every failure
 //! is a [`LinkError`] whose one line says what to do; the caller shows it and tries again later. A running program is never replaced,
-//! because it may be ours and bringing the container upright at this moment.
+//! because it may be ours and bringing the container upright at this moment; a paused one neither, because a person has paused it; and a
+//! robot that somebody has, or had, in hand is left alone ([`hands`]).
 
-use std::io::{Read, Write};
-use std::net::{IpAddr, SocketAddr, TcpStream};
 use std::time::{Duration, Instant};
 
+use shared::control::EndReason;
 use shared::os::now_ns;
 
-use super::dialogue::{Dialogue, open};
+use super::dialogue::Dialogue;
 use super::error::{ANSWER, LinkError, PROGRAM_START};
+use super::hands::{self, Before, Handover};
 use super::health::{self, RUNTIME_PAUSED, RUNTIME_PAUSING, RUNTIME_PLAYING, RUNTIME_STOPPED, RUNTIME_STOPPING};
+use super::upload::Upload;
+use super::wire::OutputRecipe;
 use super::{LinkOptions, ProgramState, RobotState, Session, program, wire};
 
 /// The version of RTDE that is spoken (RTDE guide).
 const PROTOCOL: u16 = 2;
-/// The robot's real-time client interface. It takes programs, and streams state that is read and thrown away here.
-const SCRIPT_PORT: u16 = 30003;
-/// Number of bytes that must be read from [`SCRIPT_PORT`] before it is closed, or the program may be dropped (URScript manual).
-const LEAST_READ: usize = 79;
 /// PolyScope versions, major and minor, since which there are registers 24 to 47 for external clients (RTDE guide).
 const UPPER_REGISTERS: [(u32, u32); 2] = [(3, 9), (5, 3)];
 /// Number of control cycles a second of a CB3 (RTDE guide).
@@ -29,11 +28,22 @@ const CB3_HZ: f64 = 125.0;
 const E_SERIES_HZ: f64 = 500.0;
 /// How long one socket is read while the other one waits. Chosen by hand; no measurement is recorded.
 const GLANCE: Duration = Duration::from_millis(20);
+/// How long the robot must stand still before the program is uploaded. Chosen by hand: in this time also a joint that is jogged at 0.3
+/// degrees/s moves visibly.
+const REST: Duration = Duration::from_millis(400);
+/// A robot that said "paused" only stops when it gets its first program; if it has stopped and the program has not started after this, it gets it
+/// again. Chosen by hand: a program starts within 0.1 s.
+const AGAIN: Duration = Duration::from_millis(700);
+
+/// Connects to a robot of which nothing is known from before. See [`connect_after`].
+pub fn connect(options: &LinkOptions) -> Result<Session, LinkError> {
+    connect_after(options, &Before::default())
+}
 
 /// Connects, checks everything that can be checked, starts the program, and gives a session whose program waits for targets.
 ///
 /// The first target is due within two seconds after this returns.
-pub fn connect(options: &LinkOptions) -> Result<Session, LinkError> {
+pub fn connect_after(options: &LinkOptions, before: &Before) -> Result<Session, LinkError> {
     let address = options.address;
     let mut dialogue = Dialogue::open(address)?;
 
@@ -50,35 +60,19 @@ pub fn connect(options: &LinkOptions) -> Result<Session, LinkError> {
     let run = (now_ns() as i32 & i32::MAX).max(1);
     let program = program::text(options, 1.0 / rate_hz, run)?;
 
-    let outputs = wire::output_names(options.register_base);
-    let inputs = wire::input_names(options.register_base);
-    let output_recipe = dialogue.agree(wire::SETUP_OUTPUTS, &rate_hz.to_be_bytes(), &outputs, "the request for the output recipe")?;
-    let input_recipe = dialogue.agree(wire::SETUP_INPUTS, &[], &inputs, "the request for the input recipe")?;
+    let output_recipe = dialogue.agree_outputs(rate_hz, options.register_base)?;
+    let input_recipe = dialogue.agree_inputs(&wire::input_names(options.register_base))?;
     if !dialogue.ask(wire::START, &[], "the request to start", wire::accepted)? {
         return Err(LinkError::StartRefused { address, said: dialogue.said });
     }
 
     let mut state = RobotState::default();
     dialogue.next_state(output_recipe, &options.tilt, &mut state, ANSWER)?.ok_or_else(|| dialogue.no_answer("the request to start"))?;
-    ready_for_program(options, &state)?;
+    ready_for_program(options, before, &state)?;
+    stands_still(options, &mut dialogue, output_recipe, &mut state)?;
+    ready_for_program(options, before, &state)?;
 
-    let mut upload = Upload::send(address, &program)?;
-    let deadline = Instant::now() + PROGRAM_START;
-    while state.program_run != run || state.runtime_state != RUNTIME_PLAYING || upload.read < LEAST_READ {
-        upload.discard();
-        let left = deadline.saturating_duration_since(Instant::now());
-        // The wait is short, so that the other socket is read too.
-        dialogue.next_state(output_recipe, &options.tilt, &mut state, left.min(GLANCE))?;
-        if let Some(reason) = health::hindrance(&state) {
-            return Err(LinkError::MayNotMove { address, reason });
-        }
-        if state.program_run == run && state.program_state == ProgramState::TooFar {
-            return Err(too_far(options, &state));
-        }
-        if left.is_zero() {
-            return Err(LinkError::NotStarted { address });
-        }
-    }
+    start_program(options, &mut dialogue, output_recipe, &mut state, (&program, run))?;
     let now = now_ns();
     (state.received_at_ns, state.advanced_at_ns, state.answered_at_ns) = (now, now, now);
     let at = dialogue.at;
@@ -86,49 +80,83 @@ pub fn connect(options: &LinkOptions) -> Result<Session, LinkError> {
         .map_err(|e| LinkError::Lost { at, doing: "the hand-over to the loop", what: e.to_string() })
 }
 
-/// Whether the robot may move, runs no program and holds the container upright, so that the program may be uploaded.
-fn ready_for_program(options: &LinkOptions, state: &RobotState) -> Result<(), LinkError> {
+/// Whether the robot may move, runs no program, holds the container upright, and is in nobody's hand, so that the program may be uploaded.
+fn ready_for_program(options: &LinkOptions, before: &Before, state: &RobotState) -> Result<(), LinkError> {
     let address = options.address;
     if let Some(reason) = health::hindrance(state) {
-        return Err(LinkError::MayNotMove { address, reason });
+        return Err(may_not_move(options, state, reason));
     }
     match state.runtime_state {
         RUNTIME_STOPPING | RUNTIME_STOPPED => {}
+        RUNTIME_PAUSING | RUNTIME_PAUSED if hands::never_started(before, state) => {}
         RUNTIME_PAUSING | RUNTIME_PAUSED => return Err(LinkError::ProgramPaused { address }),
         _ => return Err(LinkError::ProgramRunning { address }),
+    }
+    if let Some(why) = hands::since(before, state, options.tilt.joint) {
+        return Err(LinkError::Handover { address, why });
     }
     // The comparison is written so that an angle that is not a number counts as too far.
     if f64::from(state.alpha_deg.abs()) <= options.start_tolerance_deg { Ok(()) } else { Err(too_far(options, state)) }
 }
 
+/// Looks at the robot for [`REST`], and fails if a joint moves. `state` becomes the newest one.
+fn stands_still(options: &LinkOptions, dialogue: &mut Dialogue, recipe: OutputRecipe, state: &mut RobotState) -> Result<(), LinkError> {
+    let earlier = *state;
+    let deadline = Instant::now() + REST;
+    loop {
+        let left = deadline.saturating_duration_since(Instant::now());
+        dialogue.next_state(recipe, &options.tilt, state, left)?;
+        // A program that has started meanwhile may move them; it is found afterwards.
+        if let (Some(joint), false) = (hands::moving(&earlier, state), state.runtime_state == RUNTIME_PLAYING) {
+            return Err(LinkError::Handover { address: options.address, why: Handover::Moving(joint) });
+        }
+        if left.is_zero() {
+            return Ok(());
+        }
+    }
+}
+
+/// Uploads the program with its run number, and waits until it shows that it runs. `state` becomes the newest one.
+fn start_program(
+    options: &LinkOptions,
+    dialogue: &mut Dialogue,
+    recipe: OutputRecipe,
+    state: &mut RobotState,
+    (program, run): (&str, i32),
+) -> Result<(), LinkError> {
+    let address = options.address;
+    let mut again = matches!(state.runtime_state, RUNTIME_PAUSING | RUNTIME_PAUSED);
+    let mut upload = Upload::send(address, program)?;
+    let mut sent_at = Instant::now();
+    while state.program_run != run || state.runtime_state != RUNTIME_PLAYING {
+        upload.discard();
+        let left = (sent_at + PROGRAM_START).saturating_duration_since(Instant::now());
+        // The wait is short, so that the other socket is read too.
+        dialogue.next_state(recipe, &options.tilt, state, left.min(GLANCE))?;
+        if let Some(reason) = health::hindrance(state) {
+            return Err(may_not_move(options, state, reason));
+        }
+        if state.program_run == run && state.program_state == ProgramState::TooFar {
+            return Err(too_far(options, state));
+        }
+        if again && state.runtime_state == RUNTIME_STOPPED && sent_at.elapsed() > AGAIN {
+            again = false;
+            upload = Upload::send(address, program)?;
+            sent_at = Instant::now();
+        }
+        if left.is_zero() {
+            return Err(LinkError::NotStarted { address });
+        }
+    }
+    Ok(())
+}
+
+/// The error of a robot that may not be moved.
+fn may_not_move(options: &LinkOptions, state: &RobotState, reason: EndReason) -> LinkError {
+    LinkError::MayNotMove { address: options.address, reason, unpowered: hands::without_power(state) }
+}
+
 /// The error of a joint that is too far from its start angle.
 fn too_far(options: &LinkOptions, state: &RobotState) -> LinkError {
     LinkError::TooFar { address: options.address, alpha_deg: state.alpha_deg, tolerance_deg: options.start_tolerance_deg }
-}
-
-/// The connection that carries the program; closed when dropped.
-struct Upload {
-    stream: TcpStream,
-    /// Number of bytes of the robot's state stream that were read and thrown away.
-    read: usize,
-}
-
-impl Upload {
-    /// Connects and sends `program`.
-    fn send(address: IpAddr, program: &str) -> Result<Self, LinkError> {
-        let at = SocketAddr::new(address, SCRIPT_PORT);
-        let mut stream = open(at)?;
-        let lost = |e: std::io::Error| LinkError::Lost { at, doing: "the program's upload", what: e.kind().to_string() };
-        stream.write_all(program.as_bytes()).map_err(lost)?;
-        stream.set_nonblocking(true).map_err(lost)?;
-        Ok(Self { stream, read: 0 })
-    }
-
-    /// Reads what has arrived. Errors do not matter: the program's sign of life is what counts.
-    fn discard(&mut self) {
-        let mut buffer = [0; 4096];
-        while let Ok(n @ 1..) = self.stream.read(&mut buffer) {
-            self.read += n;
-        }
-    }
 }

@@ -7,12 +7,12 @@ use std::net::{IpAddr, SocketAddr, TcpStream};
 use std::time::{Duration, Instant};
 
 use super::error::{ANSWER, LinkError};
-use super::wire::{self, Inbox, Outputs};
+use super::wire::{self, Inbox, OutputRecipe, Outputs};
 use super::{RobotState, TiltJoint};
 
 /// The robot's port for RTDE (Universal Robots, RTDE guide).
 const RTDE_PORT: u16 = 30004;
-/// Longest request, bytes. Chosen by hand: the output recipe with its thirteen names has about 300.
+/// Longest request, bytes. Chosen by hand: the output recipe with its eighteen names has about 350.
 const REQUEST_MAX: usize = 1024;
 
 /// The RTDE connection while it is being set up.
@@ -31,7 +31,11 @@ impl Dialogue {
     /// Connects to the robot's RTDE port.
     pub fn open(address: IpAddr) -> Result<Self, LinkError> {
         let at = SocketAddr::new(address, RTDE_PORT);
-        let stream = open(at)?;
+        let refused = std::io::ErrorKind::ConnectionRefused.to_string();
+        let stream = open(at).map_err(|e| match e {
+            LinkError::Unreachable { what, .. } if what == refused => LinkError::RtdeRefused { at },
+            e => e,
+        })?;
         Ok(Self { at, stream, inbox: Inbox::new(), said: String::new() })
     }
 
@@ -44,21 +48,65 @@ impl Dialogue {
         answer.ok_or_else(|| self.no_answer(doing))?.ok_or_else(|| self.unexpected(doing))
     }
 
-    /// Agrees on a recipe of `variables`, names and types, and gives its id.
-    pub fn agree(&mut self, kind: u8, head: &[u8], variables: &[(String, &'static str)], doing: &'static str) -> Result<u8, LinkError> {
+    /// Agrees on the input recipe of `variables`, names and types, and gives its id.
+    pub fn agree_inputs(&mut self, variables: &[(String, &'static str)]) -> Result<u8, LinkError> {
+        let doing = "the request for the input recipe";
+        let (id, types) = self.request_recipe(wire::SETUP_INPUTS, &[], variables, doing)?;
+        self.check_recipe(id, variables, &types, doing)
+    }
+
+    /// Agrees on the output recipe at `rate_hz`, with registers from `base`: everything that is needed, and of what is asked for too as much
+    /// as the robot knows.
+    pub fn agree_outputs(&mut self, rate_hz: f64, base: u8) -> Result<OutputRecipe, LinkError> {
+        let doing = "the request for the output recipe";
+        let needed = wire::output_names(base);
+        let extras = wire::extra_names();
+        let mut known = extras.iter().map(|_| true).collect::<Vec<_>>();
+        loop {
+            let asked = extras.iter().zip(&known).filter(|(_, known)| **known).map(|(extra, _)| extra.clone());
+            let variables: Vec<_> = needed.iter().cloned().chain(asked).collect();
+            let (id, types) = self.request_recipe(wire::SETUP_OUTPUTS, &rate_hz.to_be_bytes(), &variables, doing)?;
+            let mut unknown = false;
+            for ((name, _), given) in variables.iter().zip(&types).skip(needed.len()) {
+                if given == "NOT_FOUND"
+                    && let Some(k) = extras.iter().position(|(extra, _)| extra == name)
+                {
+                    (known[k], unknown) = (false, true);
+                }
+            }
+            // A variable that is needed and missing is an error at once. Of the others, the next request leaves out what is missing; there
+            // are fewer of them each time.
+            let (id, types) = if unknown { (1, &types[..needed.len()]) } else { (id, &types[..]) };
+            let id = self.check_recipe(id, &variables[..types.len()], types, doing)?;
+            if !unknown {
+                return Ok(OutputRecipe::new(id, std::array::from_fn(|k| known.get(k) == Some(&true))));
+            }
+        }
+    }
+
+    /// Asks for a recipe of `variables`, and gives its id and as many types.
+    fn request_recipe(
+        &mut self,
+        kind: u8,
+        head: &[u8],
+        variables: &[(String, &'static str)],
+        doing: &'static str,
+    ) -> Result<(u8, Vec<String>), LinkError> {
         let names: Vec<&str> = variables.iter().map(|(name, _)| name.as_str()).collect();
         let names = names.join(",");
         let (id, types) =
             self.ask(kind, &[head, names.as_bytes()], doing, |payload| wire::recipe(payload).map(|(id, types)| (id, types.to_owned())))?;
         // Some controllers end the list with a comma.
-        let types: Vec<&str> = types.strip_suffix(',').unwrap_or(&types).split(',').collect();
+        let types: Vec<String> = types.strip_suffix(',').unwrap_or(&types).split(',').map(|t| t.trim().to_owned()).collect();
+        if types.len() == variables.len() { Ok((id, types)) } else { Err(self.unexpected(doing)) }
+    }
+
+    /// Checks the answer to a request for a recipe, and gives its id.
+    fn check_recipe(&self, id: u8, variables: &[(String, &'static str)], types: &[String], doing: &'static str) -> Result<u8, LinkError> {
         let address = self.at.ip();
-        if types.len() != variables.len() {
-            return Err(self.unexpected(doing));
-        }
         for ((variable, expected), given) in variables.iter().zip(types) {
             let variable = variable.clone();
-            match given.trim() {
+            match given.as_str() {
                 "NOT_FOUND" => return Err(LinkError::NotFound { address, variable }),
                 "IN_USE" => return Err(LinkError::InUse { address, variable }),
                 given if given != *expected => return Err(LinkError::WrongType { address, variable, given: given.into(), expected }),
@@ -70,7 +118,13 @@ impl Dialogue {
     }
 
     /// Waits for the next DATA_PACKAGE and fills `state` from it; `None` if none came in time.
-    pub fn next_state(&mut self, recipe: u8, tilt: &TiltJoint, state: &mut RobotState, within: Duration) -> Result<Option<()>, LinkError> {
+    pub fn next_state(
+        &mut self,
+        recipe: OutputRecipe,
+        tilt: &TiltJoint,
+        state: &mut RobotState,
+        within: Duration,
+    ) -> Result<Option<()>, LinkError> {
         let doing = "the transfer of its state";
         let filled = self.wait(doing, within, |packet| {
             (packet.kind == wire::DATA).then(|| Outputs::new_checked(packet.payload, recipe).map(|outputs| outputs.fill(tilt, state)))

@@ -7,10 +7,15 @@ use std::time::Duration;
 
 use shared::control::EndReason;
 
+use super::hands::{Handover, remedy};
+
 /// How long a TCP connection, and each answer, may take. Chosen by hand; no measurement is recorded.
 pub(super) const ANSWER: Duration = Duration::from_secs(2);
 /// How long the program may take from its upload to its first sign of life. Chosen by hand; no measurement is recorded.
 pub(super) const PROGRAM_START: Duration = Duration::from_secs(5);
+
+/// Where PolyScope's menu has the services that can be switched off (Universal_Robots_ROS2_Driver, robot setup).
+const SERVICES: &str = "Settings > Security > Services in PolyScope's menu";
 
 /// Why there is no session with the robot.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
@@ -22,6 +27,26 @@ pub enum LinkError {
         at: SocketAddr,
         /// The operating system's message.
         what: String,
+    },
+    /// The port for RTDE refuses connections on a robot that is there.
+    #[error(
+        "robot {at}: connection refused; check robot.address, and that PolyScope has started; from PolyScope 5.17 on, and on PolyScope X, \
+         also switch on Real-Time Data Exchange (RTDE) under {SERVICES}"
+    )]
+    RtdeRefused {
+        /// Address and port.
+        at: SocketAddr,
+    },
+    /// None of the ports that take programs can be connected to, although the robot's RTDE port answers.
+    #[error(
+        "robot {address} answers on its RTDE port, but none of its ports for programs does ({closed}); switch on Secondary Client Interface \
+         under {SERVICES}; Primary or Real-Time Client Interface do too"
+    )]
+    ScriptPortsClosed {
+        /// The robot's address.
+        address: IpAddr,
+        /// The ports, each with the operating system's message.
+        closed: String,
     },
     /// The robot closed the connection, or it broke.
     #[error("robot {at}: connection lost during {doing}: {what}; too many RTDE clients on the robot are one cause")]
@@ -115,6 +140,8 @@ pub enum LinkError {
         address: IpAddr,
         /// Why it may not move.
         reason: EndReason,
+        /// Whether its arm has no power or its brakes on.
+        unpowered: bool,
     },
     /// A program is running.
     #[error("robot {address}: a program is running; wait until it has brought the container upright, or stop it on the pendant")]
@@ -127,6 +154,14 @@ pub enum LinkError {
     ProgramPaused {
         /// The robot's address.
         address: IpAddr,
+    },
+    /// Somebody has, or had, the robot in hand; it is not taken unasked.
+    #[error("robot {address}: {why}")]
+    Handover {
+        /// The robot's address.
+        address: IpAddr,
+        /// What shows it.
+        why: Handover,
     },
     /// The container is not upright.
     #[error(
@@ -163,13 +198,16 @@ pub enum LinkError {
     },
 }
 
-/// What the operator must do about a robot that may not be moved, for `reason`.
-fn remedy(reason: EndReason) -> &'static str {
-    match reason {
-        EndReason::ProtectiveStop => "find the cause, then release it on the pendant",
-        EndReason::EmergencyStop => "release the emergency stop, then switch the robot on and release its brakes",
-        EndReason::SafetyStop => "clear it on the pendant",
-        EndReason::SpeedReduced => "set it to 100 % on the pendant: it also stretches the times after which the robot acts by itself",
-        _ => "switch it on and release its brakes",
+impl LinkError {
+    /// What shows that a person has, or had, the robot in hand, so that it must not be tried again until the operator asks; `None` if it may.
+    pub fn handover(&self) -> Option<Handover> {
+        match self {
+            Self::Handover { why, .. } => Some(*why),
+            Self::ProgramPaused { .. } => Some(Handover::Paused),
+            Self::MayNotMove { reason: reason @ (EndReason::ProtectiveStop | EndReason::EmergencyStop | EndReason::InHand), .. } => {
+                Some(Handover::Stopped(*reason))
+            }
+            _ => None,
+        }
     }
 }

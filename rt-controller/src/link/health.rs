@@ -29,6 +29,8 @@ pub fn check(state: &RobotState, now_ns: u64, lost_ns: u64) -> Result<(), EndRea
             return Err(EndReason::ControllerOverrun);
         }
         ProgramState::Returning | ProgramState::TimedOut => return Err(EndReason::RobotLost),
+        // The program found the joint elsewhere than it commanded: a robot that is slower than the program, or is held or moved by hand.
+        ProgramState::OffTrack | ProgramState::OffTrackEnded => return Err(EndReason::NotFollowed),
         state if !state.takes_targets() => return Err(EndReason::ProgramStopped),
         _ => {}
     }
@@ -49,9 +51,17 @@ pub(crate) fn hindrance(state: &RobotState) -> Option<EndReason> {
     if state.robot_mode != ROBOT_MODE_RUNNING {
         return Some(EndReason::RobotNotRunning);
     }
+    if in_hand(state) {
+        return Some(EndReason::InHand);
+    }
     // A slower robot stretches the time of servoj, and with it the program's patience and each target's period. The comparison is
     // written so that a fraction that is not a number is too small.
     if state.speed_fraction >= FULL_SPEED { None } else { Some(EndReason::SpeedReduced) }
+}
+
+/// Whether somebody presses the teach button, so that the arm can be moved by hand.
+pub(crate) fn in_hand(state: &RobotState) -> bool {
+    state.status_bits.is_some_and(|bits| bits & TEACH_BUTTON_BIT != 0)
 }
 
 /// Why the robot's safety system keeps it from moving, if it does.
@@ -69,6 +79,8 @@ pub(crate) fn stopped_for_safety(state: &RobotState) -> Option<EndReason> {
 
 /// Least `target_speed_fraction` that counts as full speed; the pendant's slider has steps of 0.01.
 const FULL_SPEED: f64 = 0.995;
+/// The bit of `robot_status_bits` for a pressed teach button: freedrive (RTDE guide).
+const TEACH_BUTTON_BIT: u32 = 1 << 2;
 /// `robot_mode` while the robot is powered and its brakes are released (RTDE guide).
 pub(crate) const ROBOT_MODE_RUNNING: i32 = 7;
 /// `runtime_state` while a program is being stopped (RTDE guide).

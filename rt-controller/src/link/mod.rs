@@ -5,6 +5,7 @@
 //! | [`connect()`] | an ordinary thread | yes |
 //! | [`Session::poll`], [`Session::send`] | the controller's loop | no |
 //! | [`health::check`] | the controller's loop (pure) | no |
+//! | [`hands`] | an ordinary thread (pure) | no |
 //! | dropping a [`Session`] | an ordinary thread | frees |
 //!
 //! An ordinary thread hands a [`Session`] over to the loop. The loop owns it until [`health::check`] names a reason, or `poll` or `send`
@@ -27,12 +28,15 @@
 pub mod connect;
 mod dialogue;
 mod error;
+pub mod hands;
 pub mod health;
+pub mod payload;
 pub mod program;
 pub mod session;
+mod upload;
 pub mod wire;
 
-pub use connect::connect;
+pub use connect::{connect, connect_after};
 pub use error::LinkError;
 pub use session::{Lost, Session};
 
@@ -126,6 +130,20 @@ pub struct RobotState {
     pub runtime_state: u32,
     /// RTDE's `target_speed_fraction`: the pendant's speed slider, 0 to 1.
     pub speed_fraction: f64,
+    /// Measured angles of all joints, base to wrist 3, rad.
+    pub joints_rad: [f64; 6],
+    /// Measured rates of all joints, rad/s.
+    pub joint_rates_rad_s: [f64; 6],
+    /// RTDE's `robot_status_bits`; `None` if the robot does not know the variable, as with all that follow.
+    pub status_bits: Option<u32>,
+    /// RTDE's `speed_scaling`: the share of its speed that the robot leaves by itself, 0 to 1; the slider is not in it.
+    pub speed_scaling: Option<f64>,
+    /// RTDE's `payload`: the mass that the robot was told that its tool carries, kg.
+    pub payload_kg: Option<f64>,
+    /// RTDE's `payload_cog`: that mass's centre of gravity, m from the flange.
+    pub payload_cog_m: Option<[f64; 3]>,
+    /// RTDE's `script_control_line`: the line that a program stands at; 0 without one.
+    pub control_line: Option<u32>,
     /// What the program says it is doing.
     pub program_state: ProgramState,
     /// Run number of the program that wrote the registers.

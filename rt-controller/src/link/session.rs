@@ -11,7 +11,7 @@ use std::net::{Shutdown, TcpStream};
 use shared::os::now_ns;
 
 use super::health::{self, RUNTIME_PLAYING};
-use super::wire::{self, Inbox, Outputs};
+use super::wire::{self, Inbox, OutputRecipe, Outputs};
 use super::{Mode, RobotState, TiltJoint};
 
 /// Largest number of reads in one [`Session::poll`], so that a robot that floods the link cannot hold the loop: 16 of 64 KiB are 10 s of
@@ -41,7 +41,7 @@ pub struct Session {
     stream: TcpStream,
     inbox: Inbox,
     tilt: TiltJoint,
-    output_recipe: u8,
+    output_recipe: OutputRecipe,
     input_recipe: u8,
     version: [u32; 4],
     state: RobotState,
@@ -54,7 +54,7 @@ impl Session {
         stream: TcpStream,
         inbox: Inbox,
         tilt: TiltJoint,
-        (output_recipe, input_recipe): (u8, u8),
+        (output_recipe, input_recipe): (OutputRecipe, u8),
         version: [u32; 4],
         state: RobotState,
     ) -> std::io::Result<Self> {

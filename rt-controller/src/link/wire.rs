@@ -4,7 +4,8 @@
 //! only the connecting thread asks for. No bytes make anything here panic: what does not fit gives `None` or [`Malformed`].
 //!
 //! A packet is a u16 with the size of the whole packet, a u8 with its type, and its payload. Where a value lies in a data packet follows
-//! from the two lists of variables, `OUTPUTS` and `INPUTS`; it is computed and checked at compile time.
+//! from the lists of variables. `OUTPUTS` and `INPUTS` are needed, and their places are computed and checked at compile time. `EXTRAS` are
+//! asked for too, and a robot that does not know one of them is driven without it ([`OutputRecipe`]).
 
 use super::{ProgramState, RobotState, TiltJoint};
 
@@ -29,6 +30,9 @@ const HEADER: usize = 3;
 const LARGEST: usize = u16::MAX as usize;
 /// Number of bytes of a packet with one target: header, recipe id, and the values of `INPUTS`.
 pub const TARGET_LEN: usize = HEADER + 1 + bytes_of(&INPUTS);
+
+/// Number of bytes of a packet with the robot's state: header, recipe id, and the values of `OUTPUTS`.
+pub const STATE_LEN: usize = HEADER + 1 + bytes_of(&OUTPUTS);
 
 /// One whole packet.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -152,6 +156,7 @@ pub fn text(payload: &[u8]) -> Option<(u8, &[u8])> {
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Type {
     Double,
+    Vector3d,
     Vector6d,
     Int32,
     Uint32,
@@ -162,6 +167,7 @@ impl Type {
     const fn bytes(self) -> usize {
         match self {
             Self::Double => 8,
+            Self::Vector3d => 3 * 8,
             Self::Vector6d => 6 * 8,
             Self::Int32 | Self::Uint32 => 4,
         }
@@ -171,6 +177,7 @@ impl Type {
     const fn name(self) -> &'static str {
         match self {
             Self::Double => "DOUBLE",
+            Self::Vector3d => "VECTOR3D",
             Self::Vector6d => "VECTOR6D",
             Self::Int32 => "INT32",
             Self::Uint32 => "UINT32",
@@ -205,7 +212,7 @@ impl Variable {
     }
 }
 
-/// The outputs that are asked of the robot, in the order of their values in a data packet.
+/// The outputs without which a robot is not driven, in the order of their values in a data packet.
 const OUTPUTS: [Variable; 13] = [
     Variable::plain("timestamp", Type::Double),
     Variable::plain("actual_q", Type::Vector6d),
@@ -221,6 +228,25 @@ const OUTPUTS: [Variable; 13] = [
     Variable::register("output_double_register", 0, Type::Double),
     Variable::plain("target_speed_fraction", Type::Double),
 ];
+
+/// The outputs that follow them where the robot knows them.
+const EXTRAS: [Variable; 5] = [
+    Variable::plain("robot_status_bits", Type::Uint32),
+    Variable::plain("speed_scaling", Type::Double),
+    Variable::plain("payload", Type::Double),
+    Variable::plain("payload_cog", Type::Vector3d),
+    Variable::plain("script_control_line", Type::Uint32),
+];
+/// Index of the robot's status bits among `EXTRAS`.
+const STATUS_BITS: usize = 0;
+/// Index of the share of its speed that the robot leaves by itself among `EXTRAS`.
+const SPEED_SCALING: usize = 1;
+/// Index of the mass at the tool among `EXTRAS`.
+const PAYLOAD: usize = 2;
+/// Index of that mass's centre of gravity among `EXTRAS`.
+const PAYLOAD_COG: usize = 3;
+/// Index of the line that a program stands at among `EXTRAS`.
+const CONTROL_LINE: usize = 4;
 
 /// Where the values of `OUTPUTS` begin in a data packet, bytes behind the recipe id.
 mod at {
@@ -291,9 +317,14 @@ const fn offset(variables: &[Variable], index: usize, name: &str, kind: Type) ->
     bytes_of(before)
 }
 
-/// Names and types of the outputs that are asked for, with registers from `base`; [`Outputs`] reads their values. Allocates.
-pub fn output_names(base: u8) -> [(String, &'static str); OUTPUTS.len()] {
-    OUTPUTS.map(|v| (v.full_name(base), v.kind.name()))
+/// Names and types of the outputs that are needed, with registers from `base`. Allocates.
+pub fn output_names(base: u8) -> Vec<(String, &'static str)> {
+    OUTPUTS.iter().map(|v| (v.full_name(base), v.kind.name())).collect()
+}
+
+/// Names and types of the outputs that are asked for too, where the robot knows them. Allocates.
+pub fn extra_names() -> Vec<(String, &'static str)> {
+    EXTRAS.iter().map(|v| (v.full_name(0), v.kind.name())).collect()
 }
 
 /// Names and types of the inputs that are written, with registers from `base`; [`encode_target`] writes their values. Allocates.
@@ -301,23 +332,51 @@ pub fn input_names(base: u8) -> [(String, &'static str); INPUTS.len()] {
     INPUTS.map(|v| (v.full_name(base), v.kind.name()))
 }
 
+/// The output recipe that was agreed on: its id, and where its values lie.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct OutputRecipe {
+    id: u8,
+    /// Where each of `EXTRAS` begins, bytes behind the recipe id; `None` if the robot does not know it.
+    extras: [Option<usize>; EXTRAS.len()],
+    /// Bytes of all values.
+    values_len: usize,
+}
+
+impl OutputRecipe {
+    /// The recipe `id` of all needed outputs, followed by those of [`extra_names`] for which `known` is true.
+    pub fn new(id: u8, known: [bool; EXTRAS.len()]) -> Self {
+        let mut values_len = OUTPUTS_LEN;
+        let mut extras = [None; EXTRAS.len()];
+        for ((extra, variable), known) in extras.iter_mut().zip(EXTRAS).zip(known) {
+            if known {
+                *extra = Some(values_len);
+                values_len += variable.kind.bytes();
+            }
+        }
+        Self { id, extras, values_len }
+    }
+}
+
 /// A data packet in the output recipe, checked once for recipe and length.
 #[derive(Debug, Clone, Copy)]
-pub struct Outputs<'a>(&'a [u8; OUTPUTS_LEN]);
+pub struct Outputs<'a> {
+    values: &'a [u8],
+    recipe: OutputRecipe,
+}
 
 /// Bytes of the values of `OUTPUTS`.
 const OUTPUTS_LEN: usize = bytes_of(&OUTPUTS);
 
 impl<'a> Outputs<'a> {
-    /// A view of `payload` if it has the recipe id `recipe` and the right length.
-    pub fn new_checked(payload: &'a [u8], recipe: u8) -> Option<Self> {
+    /// A view of `payload` if it has the id and the length of `recipe`.
+    pub fn new_checked(payload: &'a [u8], recipe: OutputRecipe) -> Option<Self> {
         let (&id, values) = payload.split_first()?;
-        (id == recipe).then_some(Self(values.try_into().ok()?))
+        (id == recipe.id && values.len() == recipe.values_len).then_some(Self { values, recipe })
     }
 
     fn four(&self, at: usize) -> [u8; 4] {
         let mut bytes = [0; 4];
-        bytes.copy_from_slice(&self.0[at..at + 4]);
+        bytes.copy_from_slice(&self.values[at..at + 4]);
         bytes
     }
 
@@ -331,13 +390,18 @@ impl<'a> Outputs<'a> {
 
     fn real(&self, at: usize) -> f64 {
         let mut bytes = [0; 8];
-        bytes.copy_from_slice(&self.0[at..at + 8]);
+        bytes.copy_from_slice(&self.values[at..at + 8]);
         f64::from_be_bytes(bytes)
     }
 
     /// The value of `joint`, 0 to 5, in a vector; a larger number counts as 5.
     fn of_joint(&self, vector: usize, joint: usize) -> f64 {
         self.real(vector + Type::Double.bytes() * joint.min(5))
+    }
+
+    /// All six values of a vector.
+    fn of_joints(&self, vector: usize) -> [f64; 6] {
+        std::array::from_fn(|joint| self.of_joint(vector, joint))
     }
 
     /// The robot's clock, s.
@@ -366,6 +430,14 @@ impl<'a> Outputs<'a> {
         state.program_run = self.int(at::PROGRAM_RUN);
         state.alpha_command_deg = tilt.alpha_deg(self.real(at::COMMAND));
         state.speed_fraction = self.real(at::SPEED_FRACTION);
+        state.joints_rad = self.of_joints(at::ACTUAL_Q);
+        state.joint_rates_rad_s = self.of_joints(at::ACTUAL_QD);
+        let extras = self.recipe.extras;
+        state.status_bits = extras[STATUS_BITS].map(|at| self.unsigned(at));
+        state.speed_scaling = extras[SPEED_SCALING].map(|at| self.real(at));
+        state.payload_kg = extras[PAYLOAD].map(|at| self.real(at));
+        state.payload_cog_m = extras[PAYLOAD_COG].map(|at| std::array::from_fn(|axis| self.real(at + Type::Double.bytes() * axis)));
+        state.control_line = extras[CONTROL_LINE].map(|at| self.unsigned(at));
     }
 }
 
@@ -374,7 +446,10 @@ impl<'a> Outputs<'a> {
 pub fn read_anything(packet: Packet<'_>, tilt: &TiltJoint) {
     let payload = packet.payload;
     let _ = (accepted(payload), controller_version(payload), recipe(payload), text(payload));
-    if let Some(outputs) = payload.first().and_then(|id| Outputs::new_checked(payload, *id)) {
-        outputs.fill(tilt, &mut RobotState::default());
+    let Some(&id) = payload.first() else { return };
+    for known in [[true; EXTRAS.len()], [false; EXTRAS.len()]] {
+        if let Some(outputs) = Outputs::new_checked(payload, OutputRecipe::new(id, known)) {
+            outputs.fill(tilt, &mut RobotState::default());
+        }
     }
 }

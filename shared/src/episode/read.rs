@@ -127,7 +127,7 @@ impl Contents {
                 t_s: t_s(frame.captured_at_ns),
                 alpha_commanded_deg: frame.alpha_commanded_deg,
                 alpha_measured_deg: frame.alpha_measured_deg,
-                area_px2: if doubt.usable() { frame.area_px2 } else { f32::NAN },
+                area_px2: if doubt.usable(frame.area_px2) { frame.area_px2 } else { f32::NAN },
                 doubt,
                 lost: false,
             });

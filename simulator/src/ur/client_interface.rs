@@ -201,8 +201,8 @@ fn robot_mode_data(machine: &Machine) -> Vec<u8> {
     ];
     data.extend(flags.map(u8::from));
     data.extend([machine.robot_mode() as u8, 0]); // The control mode is "position".
-    let speed = machine.robot.speed_scaling();
-    doubles(&mut data, &[speed, speed, 1.0]); // Target fraction, scaling, and the limit of the fraction.
+    // Target fraction, scaling, and the limit of the fraction.
+    doubles(&mut data, &[machine.robot.speed_slider(), machine.speed_scaling(), 1.0]);
     data.push(0); // For UR's own use.
     data
 }

@@ -6,6 +6,8 @@
 use std::fmt;
 use std::str::FromStr;
 
+use shared::config::Joint;
+
 use super::variables::Input;
 
 /// A fault, or the end of one. Times are in s.
@@ -53,6 +55,34 @@ pub enum Fault {
     ProgramPause,
     /// The pendant's speed slider is moved to this share of full speed.
     SpeedSlider(f64),
+    /// The controller itself slows the arm to this share of what the slider leaves.
+    TimeScaling(f64),
+    /// The safety configuration lets no joint move faster than this, in degrees/s.
+    JointSpeedLimit(f64),
+    /// The arm is held back to this speed, in degrees/s, and nothing tells.
+    HeldBack(f64),
+    /// The teach button is pressed, so that the arm can be moved by hand.
+    Freedrive,
+    /// The teach button is released.
+    FreedriveEnd,
+    /// Somebody moves this joint by hand by so many degrees, while the teach button is pressed.
+    HandMove(Joint, f64),
+    /// Somebody moves this joint with the pendant by so many degrees.
+    Jog(Joint, f64),
+    /// The robot was just booted and never started.
+    Boot,
+    /// Somebody switches the power on and releases the brakes at the pendant.
+    BrakeRelease,
+    /// The pendant resumes a paused program.
+    ProgramResume,
+    /// A protective stop is unlocked at the pendant.
+    UnlockProtectiveStop,
+    /// Connections to this port are refused from now on, as when its service is disabled in the settings.
+    ClosePort(u16),
+    /// The robot was told that its tool carries this mass, in kg.
+    Payload(f64),
+    /// The robot was told that the centre of gravity of what its tool carries is here, in m from the flange.
+    PayloadCog([f64; 3]),
     /// The pendant of an e-Series is switched to local control.
     LocalControl,
     /// The pendant of an e-Series is switched to remote control.
@@ -83,7 +113,21 @@ emergency-release     release it; then 'power on' and 'brake release' on the das
 late-start=SECONDS    programs start this much later
 program-stop          stop the program on the pendant
 program-pause         pause the program on the pendant
+program-resume        go on with the paused program on the pendant
+unlock-protective-stop  unlock a protective stop on the pendant, 5 s after it
 speed-slider=SHARE    move the pendant's speed slider, 0.01 to 1
+time-scaling=SHARE    the controller slows the arm by itself, 0.01 to 1
+joint-speed-limit=DEG_S  the safety configuration limits the joints' speed
+held-back=DEG_S       the arm follows servoj no faster, and nothing tells
+freedrive             press the teach button
+freedrive-end         release it
+hand-move=JOINT:DEG   move a joint by hand; needs freedrive and no program
+jog=JOINT:DEG         move a joint with the pendant; needs no running program
+boot                  no power, no program ever, 'paused' as after a boot
+brake-release         power on and brakes released on the pendant
+close-port=PORT       refuse connections to this port (a disabled service)
+payload=KG            what the robot was told that its tool carries
+payload-cog=X:Y:Z     its centre of gravity in m
 local-control         e-Series: programs are ignored
 remote-control        e-Series: programs are taken again
 clear                 end every fault that lasts";
@@ -103,10 +147,11 @@ impl FromStr for Fault {
             None => (text.trim(), None),
         };
         let given = || value.filter(|v| !v.is_empty()).ok_or_else(|| fail("needs a value, as in NAME=VALUE"));
-        let seconds = || {
-            let value = given()?.parse::<f64>().ok().filter(|s| (0.0..=3600.0).contains(s));
-            value.ok_or_else(|| fail("needs seconds, 0 to 3600"))
+        let number = |low: f64, high: f64, what: &str| {
+            let value = given()?.parse::<f64>().ok().filter(|s| (low..=high).contains(s));
+            value.ok_or_else(|| fail(&format!("needs {what}, {low} to {high}")))
         };
+        let seconds = || number(0.0, 3600.0, "seconds");
         let plain = |fault: Fault| if value.is_some() { Err(fail("takes no value")) } else { Ok(fault) };
         match name {
             "fin" => plain(Fault::Fin),
@@ -132,9 +177,26 @@ impl FromStr for Fault {
             "late-start" => seconds().map(Fault::LateStart),
             "program-stop" => plain(Fault::ProgramStop),
             "program-pause" => plain(Fault::ProgramPause),
-            "speed-slider" => {
-                let share = given()?.parse::<f64>().ok().filter(|s| (0.01..=1.0).contains(s));
-                share.map(Fault::SpeedSlider).ok_or_else(|| fail("needs a share, 0.01 to 1"))
+            "speed-slider" => number(0.01, 1.0, "a share").map(Fault::SpeedSlider),
+            "program-resume" => plain(Fault::ProgramResume),
+            "unlock-protective-stop" => plain(Fault::UnlockProtectiveStop),
+            "time-scaling" => number(0.01, 1.0, "a share").map(Fault::TimeScaling),
+            "joint-speed-limit" => number(1.0, 180.0, "degrees a second").map(Fault::JointSpeedLimit),
+            "held-back" => number(1.0, 180.0, "degrees a second").map(Fault::HeldBack),
+            "freedrive" => plain(Fault::Freedrive),
+            "freedrive-end" => plain(Fault::FreedriveEnd),
+            "hand-move" => joint_and_degrees(given()?).map(|(joint, deg)| Fault::HandMove(joint, deg)).ok_or_else(|| fail(MOVE)),
+            "jog" => joint_and_degrees(given()?).map(|(joint, deg)| Fault::Jog(joint, deg)).ok_or_else(|| fail(MOVE)),
+            "boot" => plain(Fault::Boot),
+            "brake-release" => plain(Fault::BrakeRelease),
+            "close-port" => {
+                let port = given()?.parse().ok().filter(|port| CLOSABLE_PORTS.contains(port));
+                port.map(Fault::ClosePort).ok_or_else(|| fail("needs a port of a robot: 29999 or 30001 to 30004"))
+            }
+            "payload" => number(0.0, 100.0, "kg").map(Fault::Payload),
+            "payload-cog" => {
+                let numbers: Vec<f64> = given()?.split(':').filter_map(|m| m.parse().ok()).collect();
+                numbers.try_into().map(Fault::PayloadCog).map_err(|_| fail("needs three numbers in m, as in 0:0:0.05"))
             }
             "local-control" => plain(Fault::LocalControl),
             "remote-control" => plain(Fault::RemoteControl),
@@ -142,6 +204,30 @@ impl FromStr for Fault {
             _ => Err(fail("no such fault; 'simulator ur --help' lists them")),
         }
     }
+}
+
+/// The joints by the names that the configuration gives them.
+const JOINTS: [(&str, Joint); 6] = [
+    ("base", Joint::Base),
+    ("shoulder", Joint::Shoulder),
+    ("elbow", Joint::Elbow),
+    ("wrist_1", Joint::Wrist1),
+    ("wrist_2", Joint::Wrist2),
+    ("wrist_3", Joint::Wrist3),
+];
+/// The ports of a robot's services (UR's manuals).
+const CLOSABLE_PORTS: [u16; 5] = [29_999, 30_001, 30_002, 30_003, 30_004];
+/// What is wrong with a motion that cannot be read.
+const MOVE: &str = "needs a joint (base, shoulder, elbow, wrist_1, wrist_2, wrist_3) and degrees, -360 to 360, as in base:10";
+
+fn joint_and_degrees(text: &str) -> Option<(Joint, f64)> {
+    let (name, degrees) = text.split_once(':')?;
+    let (_, joint) = JOINTS.iter().find(|(n, _)| *n == name.trim())?;
+    Some((*joint, degrees.trim().parse().ok().filter(|d| (-360.0..=360.0).contains(d))?))
+}
+
+fn joint_name(joint: Joint) -> &'static str {
+    JOINTS.iter().find(|(_, j)| *j == joint).map_or("", |(name, _)| name)
 }
 
 impl fmt::Display for Fault {
@@ -168,6 +254,20 @@ impl fmt::Display for Fault {
             Fault::ProgramStop => f.write_str("program-stop"),
             Fault::ProgramPause => f.write_str("program-pause"),
             Fault::SpeedSlider(share) => write!(f, "speed-slider={share}"),
+            Fault::ProgramResume => f.write_str("program-resume"),
+            Fault::UnlockProtectiveStop => f.write_str("unlock-protective-stop"),
+            Fault::TimeScaling(share) => write!(f, "time-scaling={share}"),
+            Fault::JointSpeedLimit(limit) => write!(f, "joint-speed-limit={limit}"),
+            Fault::HeldBack(speed) => write!(f, "held-back={speed}"),
+            Fault::Freedrive => f.write_str("freedrive"),
+            Fault::FreedriveEnd => f.write_str("freedrive-end"),
+            Fault::HandMove(joint, deg) => write!(f, "hand-move={}:{deg}", joint_name(*joint)),
+            Fault::Jog(joint, deg) => write!(f, "jog={}:{deg}", joint_name(*joint)),
+            Fault::Boot => f.write_str("boot"),
+            Fault::BrakeRelease => f.write_str("brake-release"),
+            Fault::ClosePort(port) => write!(f, "close-port={port}"),
+            Fault::Payload(mass) => write!(f, "payload={mass}"),
+            Fault::PayloadCog([x, y, z]) => write!(f, "payload-cog={x}:{y}:{z}"),
             Fault::LocalControl => f.write_str("local-control"),
             Fault::RemoteControl => f.write_str("remote-control"),
             Fault::Clear => f.write_str("clear"),

@@ -7,7 +7,9 @@
 use super::log::LogLine;
 use super::power::{Power, RobotMode};
 use super::program::{Programs, RuntimeState};
+use super::registers::Registers;
 use super::robot::Robot;
+use super::script::Effort;
 use super::servo;
 use super::variables::{Series, Version};
 
@@ -51,6 +53,8 @@ pub struct Machine {
     stopped_at: u64,
     series: Series,
     version: Version,
+    /// True while somebody presses the teach button.
+    freedrive: bool,
     /// Always true for a CB3. An e-Series in local control refuses programs and the dashboard's commands.
     remote_control: bool,
 }
@@ -66,6 +70,7 @@ impl Machine {
             power,
             safety: SafetyMode::Normal,
             stopped_at: 0,
+            freedrive: false,
             series,
             version,
             remote_control: true,
@@ -122,6 +127,16 @@ impl Machine {
         self.programs.set_late_start(late_s);
     }
 
+    /// Lets the programs that are uploaded from now on compute with floats of 32 bits instead of 64.
+    pub fn set_single_precision(&mut self, single: bool) {
+        self.programs.set_single_precision(single);
+    }
+
+    /// What the interpreted program did in the last control cycle; nothing when none is loaded.
+    pub fn program_effort(&self) -> Effort {
+        self.programs.effort()
+    }
+
     /// Takes the log lines written since the last call.
     pub fn take_log(&mut self) -> impl Iterator<Item = LogLine> + '_ {
         self.robot.log.take()
@@ -140,7 +155,7 @@ impl Machine {
         if let Some(reason) = self.robot.protective_stop.take() {
             self.protective_stop(&reason);
         }
-        self.robot.servo.step(self.robot.steptime_s());
+        self.robot.step_arm();
     }
 
     fn may_move(&self) -> bool {
@@ -236,6 +251,57 @@ impl Machine {
         self.programs.end_without_power(&mut self.robot);
         self.robot.servo.stop(servo::FAST_STOP_RAD_S2);
         self.power.switch_off();
+    }
+
+    /// Switches the power on and releases the brakes, as somebody does at the pendant. False when the emergency stop is pressed.
+    pub fn start_arm(&mut self) -> bool {
+        let may = self.safety != SafetyMode::RobotEmergencyStop;
+        if may {
+            self.power.start(self.robot.cycle);
+        }
+        may
+    }
+
+    /// Makes the controller look as after its boot: no power, empty registers, and no program was ever there.
+    pub fn boot(&mut self) {
+        self.power_off();
+        self.programs.boot();
+        self.robot.inputs = Registers::default();
+        self.robot.outputs = Registers::default();
+        self.robot.event("booted");
+    }
+
+    /// True while somebody presses the teach button.
+    pub fn freedrive(&self) -> bool {
+        self.freedrive
+    }
+
+    /// Presses or releases the teach button. Released, the arm stands.
+    pub fn set_freedrive(&mut self, pressed: bool) {
+        if self.freedrive && !pressed && self.runtime_state() != RuntimeState::Playing {
+            self.robot.servo.stop(servo::STOP_RAD_S2);
+        }
+        self.freedrive = pressed;
+    }
+
+    /// Lets a person move the joint of this number, 0 to 5, by `by_rad`: with the pendant, or by hand when `by_hand`. That needs a robot
+    /// which may move and runs no program, and by hand the teach button; otherwise the log says why nothing moves.
+    pub fn move_joint(&mut self, joint: usize, by_rad: f64, by_hand: bool) {
+        let hindrance = if !self.may_move() {
+            "the robot may not move"
+        } else if self.runtime_state() == RuntimeState::Playing {
+            "a program runs"
+        } else if by_hand && !self.freedrive {
+            "the teach button is not pressed"
+        } else {
+            let mut goal = self.robot.servo.target_q;
+            if let Some(angle) = goal.get_mut(joint) {
+                *angle += by_rad;
+            }
+            let result = self.robot.servo.move_by_hand(goal);
+            return result.unwrap_or_else(|what| self.robot.event(&what));
+        };
+        self.robot.event(&format!("no joint is moved: {hindrance}"));
     }
 
     /// Releases the brakes, switching the power on first where need be. False when the emergency stop is pressed.

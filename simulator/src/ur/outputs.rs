@@ -1,7 +1,7 @@
 //! The value of every RTDE output variable, read from the machine.
 //!
 //! Pure. Runs on the controller's thread; appends to the caller's buffer and cannot fail. Loads are not simulated: the arm
-//! carries nothing and needs no current.
+//! needs no current, and the payload is what the robot was told.
 
 use super::kinematics;
 use super::machine::{Machine, SafetyMode};
@@ -30,9 +30,15 @@ fn zeros(to: &mut Vec<u8>, count: usize) {
 }
 
 impl Machine {
-    /// RTDE's robot_status_bits: bit 0 is power, bit 1 a running program.
+    /// RTDE's robot_status_bits: bit 0 is power, bit 1 a running program, bit 2 the teach button.
     pub fn robot_status_bits(&self) -> u32 {
-        u32::from(self.robot_mode() != RobotMode::PowerOff) | u32::from(self.runtime_state() == RuntimeState::Playing) << 1
+        let playing = self.runtime_state() == RuntimeState::Playing;
+        u32::from(self.robot_mode() != RobotMode::PowerOff) | u32::from(playing) << 1 | u32::from(self.freedrive()) << 2
+    }
+
+    /// RTDE's speed_scaling, which is 0 while the arm's brakes are on.
+    pub fn speed_scaling(&self) -> f64 {
+        if self.robot_mode() == RobotMode::Running { self.robot.own_scaling() } else { 0.0 }
     }
 
     /// RTDE's safety_status_bits: bit 0 is normal, 2 a protective stop, 6 the robot's emergency stop, 7 any emergency stop, and
@@ -75,7 +81,10 @@ impl Machine {
             Output::ActualMainVoltage => doubles(to, &[SUPPLY_V]),
             Output::ActualRobotVoltage => doubles(to, &[self.robot_voltage()]),
             Output::StandardAnalogOutput(n) => doubles(to, &[robot.analog_out[usize::from(n)]]),
-            Output::SpeedScaling | Output::TargetSpeedFraction => doubles(to, &[robot.speed_scaling()]),
+            Output::SpeedScaling => doubles(to, &[self.speed_scaling()]),
+            Output::TargetSpeedFraction => doubles(to, &[robot.speed_slider()]),
+            Output::Payload => doubles(to, &[robot.payload.0]),
+            Output::PayloadCog => doubles(to, &robot.payload.1),
             Output::JointMode => (0..6).for_each(|_| to.extend(i32::from(self.joint_mode()).to_be_bytes())),
             Output::ActualDigitalOutputBits => to.extend(robot.digital_out.to_be_bytes()),
             Output::RobotMode => to.extend((self.robot_mode() as i32).to_be_bytes()),

@@ -34,6 +34,8 @@ pub struct Power {
     mode: RobotMode,
     /// The mode that comes next, and the cycle at which it does.
     next: Option<(u64, RobotMode)>,
+    /// True when the brakes are released as soon as the arm has power.
+    go_on: bool,
     /// How long each step takes.
     step_cycles: u64,
 }
@@ -41,7 +43,7 @@ pub struct Power {
 impl Power {
     /// An arm with its brakes released, whose later steps between modes take `step_cycles`.
     pub fn running(step_cycles: u64) -> Self {
-        Self { mode: RobotMode::Running, next: None, step_cycles }
+        Self { mode: RobotMode::Running, next: None, go_on: false, step_cycles }
     }
 
     /// The present mode.
@@ -55,6 +57,9 @@ impl Power {
             self.mode = next;
             if next == RobotMode::PowerOn {
                 self.begin(now, RobotMode::Idle);
+            }
+            if next == RobotMode::Idle && self.go_on {
+                self.begin(now, RobotMode::Running);
             }
         }
     }
@@ -78,9 +83,16 @@ impl Power {
         }
     }
 
+    /// Begins all steps up to released brakes, as the pendant's start button does.
+    pub fn start(&mut self, now: u64) {
+        self.release_brakes(now);
+        self.go_on = true;
+    }
+
     /// Switches the power off at once.
     pub fn switch_off(&mut self) {
         self.mode = RobotMode::PowerOff;
         self.next = None;
+        self.go_on = false;
     }
 }

@@ -4,7 +4,7 @@
 //! not started, or ends, and the log says why. Whether the robot may move at all is checked by [`super::machine`].
 
 use super::robot::Robot;
-use super::script::{Interpreter, ScriptError, StepOutcome, parse};
+use super::script::{Effort, Interpreter, ScriptError, StepOutcome, parse};
 use super::servo;
 use super::ur_rtde::UrRtde;
 use super::watchdog::WatchdogAction;
@@ -88,6 +88,7 @@ pub struct Programs {
     starting: Option<Starting>,
     secondary: Vec<Interpreter>,
     late_start_s: f64,
+    single_precision: bool,
 }
 
 impl Default for Programs {
@@ -99,6 +100,7 @@ impl Default for Programs {
             starting: None,
             secondary: Vec::new(),
             late_start_s: 0.0,
+            single_precision: false,
         }
     }
 }
@@ -117,6 +119,19 @@ impl Programs {
     /// Lets the next programs start `late_s` later than usual.
     pub fn set_late_start(&mut self, late_s: f64) {
         self.late_start_s = late_s;
+    }
+
+    /// Lets the programs that are uploaded from now on compute with floats of 32 bits instead of 64.
+    pub fn set_single_precision(&mut self, single: bool) {
+        self.single_precision = single;
+    }
+
+    /// What an interpreted program did in the last control cycle; nothing when none is loaded.
+    pub fn effort(&self) -> Effort {
+        match &self.running {
+            Some(Program::Script(interpreter)) => interpreter.effort(),
+            _ => Effort::default(),
+        }
     }
 
     /// Line at which an interpreted program stands; 0 when none is loaded.
@@ -191,14 +206,25 @@ impl Programs {
     pub fn upload(&mut self, source: &str, robot: &mut Robot) {
         let loaded = match load(source) {
             Ok(Loaded::Secondary(interpreter)) => return self.secondary.push(interpreter),
-            Ok(Loaded::Main { name, program }) => Ok((name, program)),
+            Ok(Loaded::Main { name, mut program }) => {
+                if let Program::Script(interpreter) = &mut program {
+                    interpreter.set_single_precision(self.single_precision);
+                }
+                Ok((name, program))
+            }
             Err(error) => Err(error),
         };
+        self.starting = None;
+        if matches!(self.runtime, RuntimeState::Pausing | RuntimeState::Paused) {
+            // A robot that is paused, or was never started since its boot, only stops when it gets a program; the next one runs
+            // (Universal_Robots_Client_Library #123).
+            robot.event("the robot was paused: it is stopped, and the new program is not started");
+            return self.end(robot);
+        }
         if self.running.is_some() {
             robot.event(&format!("program {} replaced", self.name));
             self.end(robot);
         }
-        self.starting = None;
         match loaded {
             Ok((name, program)) => {
                 let at = robot.cycle + robot.cycles(START_DELAY_S + self.late_start_s);
@@ -210,11 +236,12 @@ impl Programs {
 
     /// Stops the program, as the pendant's stop button does. False when there is none.
     pub fn stop(&mut self, robot: &mut Robot) -> bool {
-        if self.running.is_none() && self.starting.is_none() {
+        let paused = matches!(self.runtime, RuntimeState::Pausing | RuntimeState::Paused);
+        if self.running.is_none() && self.starting.is_none() && !paused {
             return false;
         }
         self.starting = None;
-        if self.running.is_some() {
+        if self.running.is_some() || paused {
             robot.event(&format!("program {} stopped on the pendant", self.name));
             self.end(robot);
         }
@@ -238,6 +265,12 @@ impl Programs {
         self.runtime = RuntimeState::Pausing;
         robot.servo.stop(servo::STOP_RAD_S2);
         true
+    }
+
+    /// Makes the controller look as after its boot: no program was ever there, and it counts as paused (Universal_Robots_Client_Library
+    /// #123).
+    pub fn boot(&mut self) {
+        *self = Self { runtime: RuntimeState::Paused, ..Self::default() };
     }
 
     /// Pauses the running program at once because of a protective stop, and forgets one that is about to start.

@@ -12,6 +12,10 @@ use super::watchdog::{WatchdogAction, Watchdogs};
 /// Controller time at the start, in s. UR's client library waits for 40 s after a boot, so a robot that stands ready is older.
 const START_S: f64 = 60.0;
 
+/// Time in which the arm's speed changes from full to none when the slider or the controller slows it, in s. Chosen by hand; no
+/// measurement is recorded.
+const RAMP_S: f64 = 0.1;
+
 /// What the clients selected before they write outputs: a value counts only where its mask has a bit set.
 #[derive(Debug, Default)]
 struct Masks {
@@ -43,6 +47,12 @@ pub struct Robot {
     /// Set by a demand that the arm cannot follow; the machine turns it into a protective stop.
     pub(super) protective_stop: Option<String>,
     speed_slider: f64,
+    /// The share that the controller's own reasons leave, 0 to 1.
+    own_scaling: f64,
+    /// The shares that the slider and the controller's own reasons leave at present; they follow the two above along a ramp.
+    present: [f64; 2],
+    /// Mass in kg and centre of gravity in m of what the tool carries, as the robot was told.
+    pub(super) payload: (f64, [f64; 3]),
     masks: Masks,
     steptime_s: f64,
 }
@@ -61,6 +71,9 @@ impl Robot {
             cycle: 0,
             protective_stop: None,
             speed_slider: 1.0,
+            own_scaling: 1.0,
+            present: [1.0; 2],
+            payload: (0.0, [0.0; 3]),
             masks: Masks::default(),
             steptime_s,
         }
@@ -81,9 +94,37 @@ impl Robot {
         (time_s / self.steptime_s).round() as u64
     }
 
-    /// Share of full speed that the speed slider leaves, 0 to 1.
-    pub fn speed_scaling(&self) -> f64 {
+    /// Where the speed slider stands, 0 to 1: RTDE's target_speed_fraction.
+    pub fn speed_slider(&self) -> f64 {
         self.speed_slider
+    }
+
+    /// Share of the speed that the controller's own reasons leave at present, 0 to 1: RTDE's speed_scaling. The slider is not in it.
+    pub fn own_scaling(&self) -> f64 {
+        self.present[1] * self.servo.limiting()
+    }
+
+    /// Share of full speed at which the arm goes through its path at present, 0 to 1.
+    pub fn speed_share(&self) -> f64 {
+        self.present[0] * self.own_scaling()
+    }
+
+    /// Slows the arm to `share` (0 to 1) of what the slider leaves, as a controller does by itself for many reasons.
+    pub fn set_own_scaling(&mut self, share: f64) {
+        self.own_scaling = share;
+    }
+
+    /// Tells the robot what its tool carries: the mass in kg and its centre of gravity in m, seen from the flange.
+    pub fn set_payload(&mut self, mass_kg: f64, cog_m: [f64; 3]) {
+        self.payload = (mass_kg, cog_m);
+    }
+
+    /// Lets the arm move for one control cycle.
+    pub(super) fn step_arm(&mut self) {
+        for (present, wanted) in self.present.iter_mut().zip([self.speed_slider, self.own_scaling]) {
+            *present += (wanted - *present).clamp(-self.steptime_s / RAMP_S, self.steptime_s / RAMP_S);
+        }
+        self.servo.step(self.steptime_s, self.present[0] * self.present[1]);
     }
 
     /// Moves the speed slider to `share` of full speed, 0 to 1.

@@ -134,7 +134,7 @@ impl UrRtde {
         let [time_s, lookahead_s, gain] = self.parameters(robot, 8);
         let steptime_s = robot.steptime_s();
         match &mut self.servoj_left_s {
-            Some(left_s) if *left_s > steptime_s * 1.001 => *left_s -= steptime_s,
+            Some(left_s) if *left_s > steptime_s * 1.001 => *left_s -= steptime_s * robot.speed_share(),
             _ => {
                 self.servoj_left_s = Some(time_s);
                 robot.servoj(self.parameters(robot, 0), lookahead_s, gain);

@@ -153,6 +153,8 @@ pub enum Output {
     SafetyStatusBits,
     SpeedScaling,
     TargetSpeedFraction,
+    Payload,
+    PayloadCog,
     ActualMainVoltage,
     ActualRobotVoltage,
     StandardAnalogOutput(u8),
@@ -218,8 +220,8 @@ const OUTPUTS: &[(&str, Output, Since)] = {
         ("standard_analog_input1", Zero(Double), ALWAYS),
         ("standard_analog_output0", StandardAnalogOutput(0), ALWAYS),
         ("standard_analog_output1", StandardAnalogOutput(1), ALWAYS),
-        ("payload", Zero(Double), since((3, 11), (5, 5))),
-        ("payload_cog", Zero(Vector3d), since((3, 11), (5, 5))),
+        ("payload", Payload, since((3, 11), (5, 5))),
+        ("payload_cog", PayloadCog, since((3, 11), (5, 5))),
         ("payload_inertia", Zero(Vector6d), since((3, 15), (5, 11))),
         ("tcp_offset", Zero(Vector6d), ALWAYS),
         ("tcp_force_scalar", Zero(Double), ALWAYS),
@@ -329,10 +331,12 @@ impl Output {
             Timestamp
             | SpeedScaling
             | TargetSpeedFraction
+            | Payload
             | ActualMainVoltage
             | ActualRobotVoltage
             | StandardAnalogOutput(_)
             | DoubleRegister(_) => WireType::Double,
+            PayloadCog => WireType::Vector3d,
             BitRegister(_) => WireType::Bool,
             Input(input) => input.wire_type(),
             Zero(wire_type) => wire_type,

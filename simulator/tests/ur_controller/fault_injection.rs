@@ -3,7 +3,7 @@
 use std::io::{ErrorKind, Write};
 use std::net::{SocketAddr, TcpStream};
 
-use simulator::ur::{Fault, RuntimeState, SafetyMode, Series, fault, send_fault};
+use simulator::ur::{Fault, RobotMode, RuntimeState, SafetyMode, Series, fault, send_fault};
 
 use crate::client::{DashboardClient, RtdeClient, double, hex, int};
 use crate::{COUNT, playing, start, state, until, upload};
@@ -19,6 +19,11 @@ fn faults_have_names_and_arrive_over_the_operator_port() {
             None => name.to_owned(),
             Some((name, "SECONDS")) => format!("{name}={}", examples[0]),
             Some((name, "SHARE")) => format!("{name}=0.5"),
+            Some((name, "DEG_S")) => format!("{name}=30"),
+            Some((name, "JOINT:DEG")) => format!("{name}=wrist_1:-12.5"),
+            Some((name, "PORT")) => format!("{name}=30003"),
+            Some((name, "KG")) => format!("{name}=1.5"),
+            Some((name, "X:Y:Z")) => format!("{name}=0:-0.01:0.08"),
             Some((name, "CYCLES")) => format!("{name}={}", examples[1]),
             Some((name, "INPUT" | "VARIABLE")) => format!("{name}={}", examples[2]),
             Some((name, _)) => format!("{name}={}", examples[3]),
@@ -27,7 +32,7 @@ fn faults_have_names_and_arrive_over_the_operator_port() {
         assert_eq!(fault.to_string(), text);
         seen += 1;
     }
-    assert_eq!(seen, 24);
+    assert_eq!(seen, 38);
     for (text, error) in [
         ("explode", "no such fault"),
         ("stall", "needs a value"),
@@ -35,6 +40,12 @@ fn faults_have_names_and_arrive_over_the_operator_port() {
         ("fin=1", "takes no value"),
         ("speed-slider=0", "needs a share"),
         ("in-use=target_q", "needs the name of an RTDE input"),
+        ("time-scaling=1.5", "needs a share"),
+        ("joint-speed-limit=0", "needs degrees a second"),
+        ("jog=elbow", "needs a joint"),
+        ("hand-move=hip:3", "needs a joint"),
+        ("close-port=29995", "needs a port of a robot"),
+        ("payload-cog=1:2", "needs three numbers"),
     ] {
         assert!(text.parse::<Fault>().unwrap_err().to_string().contains(error), "{text}");
     }
@@ -280,4 +291,55 @@ fn faults_of_the_robot_show_in_its_state() {
         data = client.data();
     }
     assert!(double(&data, 16) - before > 0.4, "started {} s after the upload", double(&data, 16) - before);
+}
+
+// Protects the faults "close-port", "payload" and "payload-cog": a disabled service refuses while the others answer, until "clear"; and
+// the payload that the robot was told is what RTDE says.
+#[test]
+fn fault_close_port_and_payload() {
+    let (handle, address) = start(Series::ESeries);
+    let refused = |port| TcpStream::connect(SocketAddr::new(address, port)).is_err();
+    for closed in [30001, 30002, 30003] {
+        handle.inject(Fault::ClosePort(closed));
+        handle.inject(Fault::ClosePort(closed));
+        for port in [29999, 30001, 30002, 30003, 30004] {
+            assert_eq!(refused(port), port == closed, "{port} while {closed} is closed");
+        }
+        handle.inject(Fault::Clear);
+        until("the port is open again", || !refused(closed));
+    }
+    handle.inject(Fault::Payload(1.5));
+    handle.inject(Fault::PayloadCog([0.0, -0.01, 0.08]));
+    let mut client = RtdeClient::started(address, "payload,payload_cog");
+    let data = client.data();
+    let data = &data[data.len() - 32..];
+    assert_eq!([0, 8, 16, 24].map(|at| double(data, at)), [1.5, 0.0, -0.01, 0.08]);
+}
+
+// Protects the faults that a person at the pendant causes, over the operator port: the words do what the pendant does.
+#[test]
+fn fault_words_do_what_the_pendant_does() {
+    let (handle, address) = start(Series::Cb3);
+    let cause = |text: &str| send_fault(address, &text.parse().unwrap()).unwrap();
+    upload(address, COUNT);
+    playing(&handle);
+    cause("program-pause");
+    until("paused", || state(&handle).2 == RuntimeState::Paused);
+    cause("jog=base:5");
+    until("jogged", || handle.joints().actual_q[0].to_degrees() > 4.99);
+    cause("program-resume");
+    playing(&handle);
+    cause("program-stop");
+    cause("freedrive");
+    cause("hand-move=base:-5");
+    until("moved by hand", || handle.joints().actual_q[0].to_degrees() < 0.01);
+    cause("freedrive-end");
+    cause("emergency-stop");
+    cause("emergency-release");
+    cause("brake-release");
+    until("running", || state(&handle).0 == RobotMode::Running);
+    cause("boot");
+    until("booted", || state(&handle).0 == RobotMode::PowerOff && state(&handle).2 == RuntimeState::Paused);
+    cause("joint-speed-limit=30");
+    cause("time-scaling=0.5");
 }

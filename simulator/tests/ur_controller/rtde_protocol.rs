@@ -22,7 +22,7 @@ fn inputs_work_without_outputs_and_start() {
     assert_eq!(client.inputs("standard_digital_output_mask,standard_digital_output"), "5:UINT8,UINT8");
     client.stream.write_all(&hex("0010 55 04 00000001 3fe0000000000000")).unwrap();
     client.stream.write_all(&hex("0006 55 05 04 04")).unwrap();
-    let mut reader = RtdeClient::started(address, "speed_scaling,target_speed_fraction,actual_digital_output_bits");
+    let mut reader = RtdeClient::started(address, "target_speed_fraction,target_speed_fraction,actual_digital_output_bits");
     until("slider at a half and output 2 on", || reader.data() == hex("3fe0000000000000 3fe0000000000000 0000000000000004"));
     assert_eq!(client.ask(b'S', &[]), hex("00045300"));
     assert_eq!(client.ask(b'P', &[]), hex("00045001"));

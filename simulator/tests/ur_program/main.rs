@@ -6,6 +6,7 @@ mod language;
 mod program_life;
 mod random_input;
 mod rtde_session;
+mod slowed_and_by_hand;
 
 use simulator::ur::{LogKind, LogLine, Machine, Series};
 

@@ -9,7 +9,7 @@ use std::net::{IpAddr, Ipv4Addr, TcpStream};
 use std::path::Path;
 use std::process::{Child, Command, Stdio};
 use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, Ordering::Relaxed};
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering::Relaxed};
 use std::thread::{self, JoinHandle};
 use std::time::{Duration, Instant};
 
@@ -17,7 +17,7 @@ use rt_controller::client::Client;
 use rt_controller::link::Lost;
 use shared::actions::STAY;
 use shared::config::Config;
-use shared::control::{EndReason, Outcome, Reply, Request};
+use shared::control::{EndReason, Outcome, Reply, Request, RobotLink, Status};
 use shared::estimator::Calibration;
 use shared::ipc;
 use shared::messages::{Feature, LAYOUT_VERSION, Phase};
@@ -57,8 +57,17 @@ pub enum Expected {
     Slowed(EndReason, f64),
     /// No controller is left to report anything; the program brings the container upright by itself.
     Orphaned,
-    /// The pour ends for this reason, and the robot stops where it is until its operator has acted.
+    /// The pour ends for this reason, the robot stops where it is until its operator has acted, and is then not taken back unasked.
     Stopped(EndReason),
+    /// The pour ends for this reason, the program comes upright by itself, and the robot is not taken back unasked.
+    InHand(EndReason),
+}
+
+impl Expected {
+    /// Whether the controller leaves the robot alone afterwards until it is asked for it.
+    fn waits(self) -> bool {
+        matches!(self, Self::Stopped(_) | Self::InHand(_))
+    }
 }
 
 /// A simulated cell with its own robot, controller process and liquid.
@@ -71,6 +80,8 @@ pub struct Cell {
     pub process: Child,
     pub client: Option<Client>,
     stop: Arc<AtomicBool>,
+    /// What has really left, ul.
+    poured_ul: Arc<AtomicU64>,
     liquid: Option<JoinHandle<()>>,
     table: String,
 }
@@ -90,9 +101,10 @@ impl Cell {
         tilt_until_it_flows().write(&config.controller.weights).unwrap();
         let robot = Arc::new(Controller::start(ControllerOptions { series, ..ControllerOptions::new(address) }).unwrap());
         let stop = Arc::new(AtomicBool::new(false));
+        let poured_ul = Arc::new(AtomicU64::new(0));
         let liquid = thread::spawn({
-            let (name, robot, stop) = (config.cell.name.clone(), robot.clone(), stop.clone());
-            move || publish_features(&name, &robot, &stop)
+            let (name, robot, stop, poured_ul) = (config.cell.name.clone(), robot.clone(), stop.clone(), poured_ul.clone());
+            move || publish_features(&name, &robot, &stop, &poured_ul)
         });
         let process = start_controller(directory.path());
         let mut cell = Self {
@@ -104,6 +116,7 @@ impl Cell {
             process,
             client: None,
             stop,
+            poured_ul,
             liquid: Some(liquid),
             table: String::new(),
         };
@@ -112,11 +125,11 @@ impl Cell {
     }
 
     /// What the controller has said.
-    fn said(&self) -> String {
+    pub fn said(&self) -> String {
         std::fs::read_to_string(self.directory.path().join("log")).unwrap_or_default()
     }
 
-    fn log(&self) -> String {
+    pub fn log(&self) -> String {
         let theirs = self.said();
         let robot: Vec<String> = self.robot.take_log().into_iter().map(|l| format!("{:.3} {}", l.timestamp_s, l.text)).collect();
         format!("--- rt-controller\n{theirs}--- robot\n{}", robot.join("\n"))
@@ -138,7 +151,7 @@ impl Cell {
     }
 
     /// Waits until the controller would accept a pour.
-    fn ready(&mut self) {
+    pub fn ready(&mut self) {
         if self.client.is_none() {
             self.client = Some(Client::connect(&self.name).unwrap());
         }
@@ -148,25 +161,25 @@ impl Cell {
         });
     }
 
-    fn pour(&self, goal_ml: f32) -> u64 {
+    pub fn pour(&self, goal_ml: f32) -> u64 {
         self.until("pouring", |c| match c.client.as_ref()?.ask(&Request::Pour { goal_ml }) {
             Ok(Reply::Started { episode }) => Some(episode),
             _ => None,
         })
     }
 
-    fn outcome(&self, episode: u64) -> Outcome {
+    pub fn outcome(&self, episode: u64) -> Outcome {
         self.until("an outcome", |c| c.client.as_ref()?.status().ok()?.outcomes.into_iter().find(|o| o.episode == episode))
     }
 
     /// Alpha, degrees, and its rate, degrees/s.
-    fn alpha(&self) -> (f64, f64) {
+    pub fn alpha(&self) -> (f64, f64) {
         let joints = self.robot.joints();
         (joints.actual_q[5].to_degrees(), joints.actual_qd[5].to_degrees())
     }
 
     /// Starts a pour (not at rest) and waits for `moment`.
-    fn reach(&self, moment: Moment) -> Option<u64> {
+    pub fn reach(&self, moment: Moment) -> Option<u64> {
         let reached = |what: &str, there: fn(f64, f64) -> bool| {
             self.until(what, |c| {
                 let (alpha, rate) = c.alpha();
@@ -202,7 +215,7 @@ impl Cell {
         };
         let wanted = match expected {
             Expected::Nothing | Expected::Orphaned => EndReason::Done,
-            Expected::Upright(reason) | Expected::Slowed(reason, _) | Expected::Stopped(reason) => reason,
+            Expected::Upright(reason) | Expected::Slowed(reason, _) | Expected::Stopped(reason) | Expected::InHand(reason) => reason,
         };
         match expected {
             Expected::Stopped(_) => self.until("stopped", |c| (c.alpha().1.abs() < 0.5).then_some(())),
@@ -215,6 +228,10 @@ impl Cell {
 
         self.robot.start_trace(24);
         recover(self);
+        if expected.waits() {
+            self.is_left_alone(Duration::from_millis(2500));
+            self.resume();
+        }
         if expected != Expected::Nothing && !orphaned {
             self.until("connected anew", |c| {
                 let status = c.client.as_ref()?.status().ok()?;
@@ -257,7 +274,7 @@ impl Cell {
         }
         match expected {
             Expected::Nothing => {}
-            Expected::Upright(_) | Expected::Slowed(..) | Expected::Orphaned => {
+            Expected::Upright(_) | Expected::InHand(_) | Expected::Slowed(..) | Expected::Orphaned => {
                 let share = if let Expected::Slowed(_, share) = expected { share } else { 1.0 };
                 let bound = (UPRIGHT_BOUND_S + motion.peak_deg / RETURN_RATE_DEG_S) / share;
                 assert!(motion.upright_s.is_some_and(|s| s <= bound), "upright within {bound:.2} s\n{}", context());
@@ -267,6 +284,69 @@ impl Cell {
         assert!(motion.fastest_deg_s <= 90.0 + 1e-3 && back.fastest_deg_s <= 90.0 + 1e-3, "{}", context());
         assert!(motion.hardest_deg_s2 <= 1500.0 * 1.001 && back.hardest_deg_s2 <= 1500.0 * 1.001, "{}", context());
         assert_eq!(next.reason, EndReason::Done, "the next pour\n{}", context());
+    }
+
+    /// What has really left so far, ml.
+    pub fn poured_ml(&self) -> f64 {
+        self.poured_ul.load(Relaxed) as f64 / 1e3
+    }
+
+    /// Stops the controller as its operator does.
+    pub fn stop_controller(&mut self) {
+        self.client = None;
+        self.signal(rustix::process::Signal::TERM);
+        self.process.wait().unwrap();
+    }
+
+    /// Starts the controller again.
+    pub fn start_controller(&mut self) {
+        self.process = start_controller(self.directory.path());
+        self.client = Some(Client::connect(&self.name).unwrap());
+    }
+
+    /// Sends a program to the robot, as anybody can.
+    pub fn send_program(&self, text: &str) {
+        let mut stream = TcpStream::connect((self.address, 30002)).unwrap();
+        stream.write_all(text.as_bytes()).unwrap();
+    }
+
+    /// The controller's state.
+    pub fn status(&self) -> Status {
+        *self.until("a status", |c| c.client.as_ref()?.status().ok())
+    }
+
+    /// The robot stands ready, but the controller does not take it in this time, and says that it waits.
+    pub fn is_left_alone(&self, time: Duration) {
+        self.until("waiting for the operator", |c| (c.status().robot == RobotLink::WaitsForOperator).then_some(()));
+        let before = self.status().robot_connections;
+        let until = Instant::now() + time;
+        while Instant::now() < until {
+            let status = self.status();
+            let context = || format!("{status:?}\n{}", self.log());
+            assert_eq!((status.robot, status.robot_connections), (RobotLink::WaitsForOperator, before), "taken unasked: {}", context());
+            assert!(status.hindrance.contains("it is not taken back by itself: ") || status.hindrance.contains("; then "), "{}", context());
+            assert!(status.hindrance.ends_with("`rt-controller resume`, or the next pour or recording"), "{}", context());
+            thread::sleep(Duration::from_millis(50));
+        }
+    }
+
+    /// The operator asks for the robot.
+    pub fn resume(&self) {
+        assert_eq!(self.client.as_ref().unwrap().ask(&Request::Resume).unwrap(), Reply::Resuming);
+    }
+
+    /// The operator asks for the robot and does not get it; gives the reason.
+    pub fn resume_in_vain(&self) -> String {
+        self.resume();
+        self.until("refused", |c| Some(c.status()).filter(|s| s.robot == RobotLink::WaitsForOperator)).hindrance
+    }
+
+    /// Runs a command of `rt-controller` in this cell; gives its exit code and what it printed.
+    pub fn command(&self, arguments: &[&str]) -> (i32, String) {
+        let mut command = Command::new(tests::program("rt-controller"));
+        let output = command.args(arguments).arg("--config").arg(self.directory.path().join("cell.toml")).output().unwrap();
+        let text = [output.stdout, output.stderr].map(|bytes| String::from_utf8_lossy(&bytes).into_owned()).concat();
+        (output.status.code().unwrap_or(-1), text)
     }
 
     pub fn signal(&self, signal: rustix::process::Signal) {
@@ -292,8 +372,7 @@ impl Cell {
     fn jog_upright(&self) {
         let mut q = self.robot.joints().actual_q;
         q[5] = 0.0;
-        let mut stream = TcpStream::connect((self.address, 30002)).unwrap();
-        stream.write_all(format!("def jog():\n  movej({q:?}, 2.0, 1.0)\nend\n").as_bytes()).unwrap();
+        self.send_program(&format!("def jog():\n  movej({q:?}, 2.0, 1.0)\nend\n"));
         self.until("jogged upright", |c| (c.alpha().0.abs() < 0.2 && c.alpha().1.abs() < 0.1).then_some(()));
         self.until("the jog's end", |c| (c.robot.state()?.runtime_state == RuntimeState::Stopped).then_some(()));
         // What the jog commanded is not the program's motion.
@@ -338,12 +417,13 @@ fn tilt_until_it_flows() -> Weights {
     Weights { network, calibration, ..tests::steady_weights(STAY + 7) }
 }
 
-fn flow_ml_s(alpha_deg: f64) -> f64 {
+/// Flow at a tilt, ml/s.
+pub fn flow_ml_s(alpha_deg: f64) -> f64 {
     ((alpha_deg - 50.0) * 1.0).clamp(0.0, 25.0)
 }
 
 /// Stands for the camera, the feature worker and the liquid at once: it publishes V_e from the tilt of the joint.
-fn publish_features(name: &str, robot: &Controller, stop: &AtomicBool) {
+fn publish_features(name: &str, robot: &Controller, stop: &AtomicBool, poured_ul: &AtomicU64) {
     let cell = ipc::Cell::join(name).unwrap();
     let publisher = cell.features().unwrap().publisher_builder().create().unwrap();
     let worker_epoch_ns = now_ns();
@@ -354,6 +434,7 @@ fn publish_features(name: &str, robot: &Controller, stop: &AtomicBool) {
         thread::sleep(next.saturating_duration_since(Instant::now()));
         sequence += 1;
         let alpha_deg = robot.joints().actual_q[5].to_degrees();
+        poured_ul.fetch_add((flow_ml_s(alpha_deg) / 30.0 * 1e3).round() as u64, Relaxed);
         let now = now_ns();
         let feature = Feature {
             version: LAYOUT_VERSION,

@@ -11,6 +11,8 @@
 
 mod cell;
 mod motion;
+mod people;
+mod slow;
 
 use std::net::Ipv4Addr;
 use std::thread;
@@ -163,7 +165,7 @@ fn version_refused() {
 }
 
 /// Protects people: a protective stop ends the pour; nothing moves until the operator lets the program go on, which then only
-/// comes upright.
+/// comes upright; and the robot is not taken back before the operator asks.
 #[test]
 fn protective_stop() {
     let recover = |c: &mut Cell| {
@@ -178,7 +180,7 @@ fn protective_stop() {
     matrix("protective-stop", 17, Expected::Stopped(EndReason::ProtectiveStop), strike, recover);
 }
 
-/// Protects people: an emergency stop ends the pour; nothing moves until the operator has powered and moved the robot.
+/// Protects people: an emergency stop ends the pour; nothing moves until the operator has powered and moved the robot, and asks for it.
 #[test]
 fn emergency_stop() {
     let recover = |c: &mut Cell| {
@@ -195,7 +197,8 @@ fn emergency_stop() {
     matrix("emergency-stop", 18, Expected::Stopped(EndReason::EmergencyStop), strike, recover);
 }
 
-/// Protects the operator's decision: a program stopped on the pendant stays stopped until the container is upright again.
+/// Protects the operator's decision: a program stopped on the pendant stays stopped until the container is upright again and the operator
+/// asks for the robot.
 #[test]
 fn program_stop() {
     let strike = |c: &mut Cell| c.robot.inject(Fault::ProgramStop);

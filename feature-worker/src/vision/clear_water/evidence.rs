@@ -216,6 +216,18 @@ impl Evidence {
         self.strange_share
     }
 
+    /// Which share of the places with a `line_share` below 1 in the air was seen to be ground: known, and as it is remembered; or, where it
+    /// is not known, as in the moved earlier picture.
+    pub(super) fn dry_share(&self, rays: &Rays, line_share: LinearField) -> f32 {
+        let (mut dry, mut looked) = (0.0f32, 0.0f32);
+        for i in (0..CELLS).filter(|i| rays.air[*i] > 0.0 && line_share.at(rays.places[*i]) < 1.0) {
+            looked += 1.0;
+            let as_remembered = self.remembered[i] > 0.5 && self.away[i] < CALM;
+            dry += f32::from(u8::from(as_remembered));
+        }
+        dry / looked.max(1.0)
+    }
+
     /// Compares the memory and the picture `earlier`, both moved, with the picture `now` along the rays. `height_px` is the height above
     /// the rim's light.
     #[inline(always)]

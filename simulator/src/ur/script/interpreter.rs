@@ -24,6 +24,17 @@ const MAX_THREADS: usize = 32;
 /// Most values on a thread's stack. Chosen by hand; no measurement is recorded.
 const MAX_STACK: usize = 512;
 
+/// What a program did in one control cycle. A condition counts as a statement, and so does each statement of a function that it calls.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub struct Effort {
+    /// Statements that were carried out.
+    pub statements: u32,
+    /// Calls of functions, the program's own and the built-in ones.
+    pub calls: u32,
+    /// Instructions of the stack machine.
+    pub instructions: u32,
+}
+
 /// How a control cycle of a program ended.
 #[derive(Debug, Clone, PartialEq)]
 pub enum StepOutcome {
@@ -58,6 +69,9 @@ pub struct Interpreter {
     /// Number of calls in all threads.
     calls: usize,
     next_id: u32,
+    /// True when each float is rounded to 32 bits.
+    single_precision: bool,
+    effort: Effort,
 }
 
 impl Interpreter {
@@ -68,9 +82,27 @@ impl Interpreter {
     pub fn new(tree: &ProgramTree) -> Result<Self, ScriptError> {
         let code = compile(tree)?;
         let globals = vec![None; code.globals.len()];
-        let mut interpreter = Self { code: Arc::new(code), globals, threads: Vec::new(), calls: 0, next_id: 0 };
+        let mut interpreter = Self {
+            code: Arc::new(code),
+            globals,
+            threads: Vec::new(),
+            calls: 0,
+            next_id: 0,
+            single_precision: false,
+            effort: Effort::default(),
+        };
         interpreter.spawn(0);
         Ok(interpreter)
+    }
+
+    /// Lets the program compute with floats of 32 bits instead of 64.
+    pub fn set_single_precision(&mut self, single: bool) {
+        self.single_precision = single;
+    }
+
+    /// What the program did in the last control cycle.
+    pub fn effort(&self) -> Effort {
+        self.effort
     }
 
     fn spawn(&mut self, routine: usize) -> u32 {
@@ -89,6 +121,7 @@ impl Interpreter {
     /// Runs one control cycle.
     pub fn step(&mut self, robot: &mut Robot) -> StepOutcome {
         let mut budget = MAX_OPS_PER_CYCLE;
+        self.effort = Effort::default();
         let mut i = 0;
         while i < self.threads.len() {
             if !self.may_go_on(i, robot) {
@@ -129,6 +162,7 @@ impl Interpreter {
     /// Runs a thread until it waits or ends.
     fn turn(&mut self, i: usize, robot: &mut Robot, budget: &mut u32) -> Result<TurnEnd, ScriptError> {
         let code = self.code.clone();
+        let mut counted = (0, 0);
         loop {
             let thread = &mut self.threads[i];
             let Some(call) = thread.calls.last_mut() else { return Ok(TurnEnd::Finished) };
@@ -140,6 +174,16 @@ impl Interpreter {
                 return Err(ScriptError::new(line, what));
             }
             *budget -= 1;
+            // A statement is a line's instructions in a row; a jump back to the same line begins it anew. The jumps that end a branch or
+            // a pass of a loop belong to no statement.
+            if !matches!(op, Op::Jump(_)) {
+                if line != counted.0 || call.at < counted.1 {
+                    self.effort.statements += 1;
+                }
+                counted = (line, call.at);
+            }
+            self.effort.calls += u32::from(matches!(op, Op::Call(_) | Op::Builtin(_)));
+            self.effort.instructions += 1;
             call.at += 1;
             if thread.stack.len() > MAX_STACK {
                 return Err(ScriptError::new(line, "expression too large"));
@@ -150,11 +194,25 @@ impl Interpreter {
                 Op::Run(routine) => self.run(i, *routine),
                 Op::Join => self.join(i),
                 Op::Kill => self.kill(i),
-                Op::Return => Ok(self.return_to_caller(i)),
+                Op::Return => {
+                    let end = self.return_to_caller(i);
+                    // The caller's statement goes on and does not begin again.
+                    if let Some(caller) = self.threads[i].calls.last() {
+                        counted = (code.lines[caller.at], caller.at);
+                    }
+                    Ok(end)
+                }
                 Op::Halt => Ok(Some(TurnEnd::Halt)),
                 Op::Pause => Ok(Some(TurnEnd::Pause)),
                 op => thread.compute(op, &code, &mut self.globals).map(|()| None),
             };
+            let new = matches!(op, Op::Push(_) | Op::Binary(_) | Op::Builtin(_));
+            if self.single_precision
+                && new
+                && let Some(value) = self.threads.get_mut(i).and_then(|t| t.stack.last_mut())
+            {
+                value.round_to_single();
+            }
             if let Some(end) = next.map_err(|what| ScriptError::new(line, what))? {
                 return Ok(end);
             }

@@ -19,7 +19,7 @@ mod syntax;
 mod thread;
 mod value;
 
-pub use interpreter::{Interpreter, StepOutcome};
+pub use interpreter::{Effort, Interpreter, StepOutcome};
 pub use statements::{MAX_SOURCE_BYTES, parse};
 
 /// A mistake in a program.

@@ -76,7 +76,7 @@ impl ScriptThread {
                 *left_s <= 1e-9
             }
             Wait::Servo { left_s } => {
-                *left_s -= robot.steptime_s() * robot.speed_scaling();
+                *left_s -= robot.steptime_s() * robot.speed_share();
                 *left_s <= 1e-9
             }
             Wait::Motion => robot.servo.is_still(),

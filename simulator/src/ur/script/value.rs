@@ -183,6 +183,16 @@ impl Value {
         }
     }
 
+    /// Rounds every float to 32 bits.
+    pub fn round_to_single(&mut self) {
+        match self {
+            Value::Float(value) => *value = f64::from(*value as f32),
+            Value::List(items) => Arc::make_mut(items).iter_mut().for_each(Value::round_to_single),
+            Value::Pose(pose) => pose.iter_mut().for_each(|v| *v = f64::from(*v as f32)),
+            _ => {}
+        }
+    }
+
     /// The value of `-self`.
     pub fn negative(&self) -> Result<Value, String> {
         match self {

@@ -6,6 +6,7 @@
 use crate::ur::fault::Fault;
 use crate::ur::machine::Machine;
 use crate::ur::rtde::InputOwners;
+use crate::ur::servo::MAX_SPEED_RAD_S;
 use crate::ur::variables::Input;
 
 /// The faults that last. A fault is on while the machine's cycle is below its number here.
@@ -22,6 +23,8 @@ pub struct StandingFaults {
     pub skip_until: u64,
     pub split_until: u64,
     pub coalesce_until: u64,
+    /// Ports that refuse connections.
+    pub closed_ports: Vec<u16>,
 }
 
 /// What the clients reach through their sockets.
@@ -78,12 +81,36 @@ impl Backend {
             Fault::ProgramStop => drop(self.machine.stop_program()),
             Fault::ProgramPause => drop(self.machine.pause()),
             Fault::SpeedSlider(share) => self.machine.robot.set_speed_slider(*share),
+            Fault::ProgramResume => drop(self.machine.resume()),
+            Fault::UnlockProtectiveStop => {
+                if let Err(answer) = self.machine.unlock_protective_stop() {
+                    self.machine.program_error(answer);
+                }
+            }
+            Fault::TimeScaling(share) => self.machine.robot.set_own_scaling(*share),
+            Fault::JointSpeedLimit(deg_s) => self.machine.robot.servo.set_speed_limit(deg_s.to_radians()),
+            Fault::HeldBack(deg_s) => self.machine.robot.servo.hold_back(deg_s.to_radians()),
+            Fault::Freedrive => self.machine.set_freedrive(true),
+            Fault::FreedriveEnd => self.machine.set_freedrive(false),
+            Fault::HandMove(joint, deg) => self.machine.move_joint(joint.index(), deg.to_radians(), true),
+            Fault::Jog(joint, deg) => self.machine.move_joint(joint.index(), deg.to_radians(), false),
+            Fault::Boot => self.machine.boot(),
+            Fault::BrakeRelease => drop(self.machine.start_arm()),
+            Fault::ClosePort(port) => {
+                self.faults.closed_ports.retain(|closed| closed != port);
+                self.faults.closed_ports.push(*port);
+            }
+            Fault::Payload(mass_kg) => self.machine.robot.set_payload(*mass_kg, self.machine.robot.payload.1),
+            Fault::PayloadCog(cog_m) => self.machine.robot.set_payload(self.machine.robot.payload.0, *cog_m),
             Fault::LocalControl => self.machine.set_remote_control(false),
             Fault::RemoteControl => self.machine.set_remote_control(true),
             Fault::Clear => {
                 self.faults = StandingFaults::default();
                 self.owners.release_fieldbus();
                 self.machine.set_late_start(0.0);
+                self.machine.robot.set_own_scaling(1.0);
+                self.machine.robot.servo.set_speed_limit(MAX_SPEED_RAD_S);
+                self.machine.robot.servo.hold_back(MAX_SPEED_RAD_S);
             }
             Fault::Fin | Fault::Reset | Fault::Text(_) => {}
         }

@@ -79,6 +79,8 @@ impl<'a> CycleOutput<'a> {
 pub struct Client {
     /// A number that no other client ever has.
     pub id: u64,
+    /// The port that it came to.
+    pub port: u16,
     /// The connection, which does not block.
     pub stream: TcpStream,
     /// False when the connection is to be dropped.
@@ -117,7 +119,7 @@ impl Client {
                 Role::Lines { port, line: Vec::new() }
             }
         };
-        let mut client = Self { id, stream, open: true, role, waiting, blocked_since: None, cut: 0 };
+        let mut client = Self { id, port, stream, open: true, role, waiting, blocked_since: None, cut: 0 };
         client.flush();
         client
     }

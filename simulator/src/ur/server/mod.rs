@@ -155,13 +155,14 @@ impl Server {
         });
     }
 
-    /// Listens again after [`Fault::Offline`].
+    /// Listens again after [`Fault::Offline`], and after [`Fault::ClosePort`] when that was cleared.
     fn reopen(&mut self) {
-        if self.listeners.len() == PORTS.len() || self.backend.is_before(self.backend.faults.offline_until) {
+        let closed = &self.backend.faults.closed_ports;
+        if self.listeners.len() + closed.len() >= PORTS.len() || self.backend.is_before(self.backend.faults.offline_until) {
             return;
         }
         for port in PORTS {
-            if !self.listeners.iter().any(|(p, _)| *p == port) {
+            if !closed.contains(&port) && !self.listeners.iter().any(|(p, _)| *p == port) {
                 // A port that is still taken is tried again in the next cycle.
                 self.listeners.extend(listen(self.address, port).ok());
             }
@@ -240,6 +241,10 @@ impl Server {
             Fault::Offline(_) => {
                 self.listeners.retain(|(port, _)| *port == OPERATOR_PORT);
                 self.clients.iter_mut().filter(|c| !c.is_operator()).for_each(|c| c.open = false);
+            }
+            Fault::ClosePort(port) => {
+                self.listeners.retain(|(p, _)| p != port);
+                self.clients.iter_mut().filter(|c| c.port == *port).for_each(|c| c.open = false);
             }
             Fault::Text(message) => self.clients.iter_mut().for_each(|c| c.send_text(message)),
             _ => {}

@@ -3,203 +3,20 @@
 //! Each test has its own loopback address, because the ports of a UR controller are fixed.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::too_many_lines)]
 
-use std::io::{ErrorKind, Read, Write};
-use std::net::{Ipv4Addr, TcpListener, TcpStream};
+mod handover;
+mod server;
+
+use std::io::{Read, Write};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::thread;
 use std::time::Duration;
 
-use rt_controller::link::{LinkError, LinkOptions, Lost, Mode, ProgramState, Session, TiltJoint, connect};
-use shared::config::Joint;
+use rt_controller::link::{LinkError, Lost, Mode, ProgramState, Session, connect};
 use shared::control::EndReason;
-use shared::limits::Limits;
 use shared::os::now_ns;
 
-const OUTPUT_TYPES: &str = "DOUBLE,VECTOR6D,VECTOR6D,VECTOR6D,INT32,INT32,UINT32,UINT32,INT32,INT32,INT32,DOUBLE,DOUBLE";
-
-/// What the server says; the defaults are those of a robot that may be moved.
-#[derive(Clone)]
-struct Robot {
-    version_accepted: u8,
-    version: [u32; 4],
-    outputs: (u8, String),
-    inputs: (u8, String),
-    start_accepted: u8,
-    /// What is sent before each answer.
-    chatter: Vec<u8>,
-    /// Number of bytes that are sent at a time.
-    piece: usize,
-    /// The request at which the RTDE connection is closed instead of being answered.
-    closes_at: Option<u8>,
-    /// The request that is never answered.
-    deaf_to: Option<u8>,
-    robot_mode: i32,
-    safety_mode: i32,
-    runtime_state: u32,
-    joint_rad: f64,
-    speed_fraction: f64,
-    /// What the program does once it has been uploaded.
-    program: ProgramState,
-    /// Whether an uploaded program starts.
-    starts: bool,
-}
-
-impl Default for Robot {
-    fn default() -> Self {
-        Self {
-            version_accepted: 1,
-            version: [3, 15, 8, 106339],
-            outputs: (1, OUTPUT_TYPES.into()),
-            inputs: (2, "INT32,INT32,DOUBLE".into()),
-            start_accepted: 1,
-            chatter: Vec::new(),
-            piece: usize::MAX,
-            closes_at: None,
-            deaf_to: None,
-            robot_mode: 7,
-            safety_mode: 1,
-            runtime_state: 1,
-            joint_rad: 0.01,
-            speed_fraction: 1.0,
-            program: ProgramState::Ready,
-            starts: true,
-        }
-    }
-}
-
-/// The server while a test runs.
-struct Server {
-    options: LinkOptions,
-    robot: Robot,
-    rtde: TcpListener,
-    script: TcpListener,
-}
-
-/// What the server saw, and its end of the RTDE connection.
-struct Seen {
-    requests: Vec<u8>,
-    /// Payload of the output recipe's request.
-    outputs: Vec<u8>,
-    program: String,
-    rtde: TcpStream,
-}
-
-fn packet(kind: u8, payload: &[u8]) -> Vec<u8> {
-    let mut packet = ((payload.len() + 3) as u16).to_be_bytes().to_vec();
-    packet.push(kind);
-    packet.extend(payload);
-    packet
-}
-
-fn text(message: &str) -> Vec<u8> {
-    let mut payload = vec![message.len() as u8];
-    payload.extend(message.as_bytes());
-    payload.extend([0, 2]);
-    packet(b'M', &payload)
-}
-
-/// A DATA_PACKAGE: the clock, the joint, the program's registers.
-fn data(robot: &Robot, timestamp_s: f64, program: ProgramState, echo: i32, run: i32) -> Vec<u8> {
-    let mut payload = vec![robot.outputs.0];
-    payload.extend(timestamp_s.to_be_bytes());
-    for value in [robot.joint_rad, robot.joint_rad, 0.0] {
-        payload.extend([0.0, 0.0, 0.0, 0.0, 0.0, value].map(f64::to_be_bytes).concat());
-    }
-    payload.extend([robot.robot_mode, robot.safety_mode].map(i32::to_be_bytes).concat());
-    payload.extend([1, robot.runtime_state].map(u32::to_be_bytes).concat());
-    payload.extend([program as i32, echo, run].map(i32::to_be_bytes).concat());
-    payload.extend([robot.joint_rad, robot.speed_fraction].map(f64::to_be_bytes).concat());
-    packet(b'U', &payload)
-}
-
-impl Server {
-    fn new(last: u8, robot: Robot) -> Self {
-        let address = Ipv4Addr::new(127, 41, 0, last);
-        let options = LinkOptions {
-            address: address.into(),
-            tilt: TiltJoint { joint: Joint::Wrist3, start_deg: 0.0, direction: 1.0 },
-            start_tolerance_deg: 2.0,
-            register_base: 24,
-            lookahead_s: 0.05,
-            gain: 600.0,
-            limits: Limits::default(),
-            rate_hz: 30.0,
-        };
-        let rtde = TcpListener::bind((address, 30004)).unwrap();
-        let script = TcpListener::bind((address, 30003)).unwrap();
-        Self { options, robot, rtde, script }
-    }
-
-    /// Connects to the server and gives both ends.
-    fn meet(self) -> (Result<Session, LinkError>, Option<Seen>) {
-        let options = self.options.clone();
-        let served = thread::spawn(move || self.serve().ok());
-        let session = connect(&options);
-        // This frees a server whose script port was never connected to.
-        let _ = TcpStream::connect((options.address, 30003));
-        (session, served.join().unwrap())
-    }
-
-    fn serve(self) -> std::io::Result<Seen> {
-        let robot = self.robot;
-        let (mut rtde, _) = self.rtde.accept()?;
-        rtde.set_nodelay(true)?;
-        let (mut requests, mut outputs) = (Vec::new(), Vec::new());
-        while requests.last() != Some(&b'S') {
-            let mut head = [0; 3];
-            rtde.read_exact(&mut head)?;
-            let mut payload = vec![0; usize::from(u16::from_be_bytes([head[0], head[1]])) - 3];
-            rtde.read_exact(&mut payload)?;
-            requests.push(head[2]);
-            if head[2] == b'O' {
-                outputs.clone_from(&payload);
-            }
-            if robot.closes_at == Some(head[2]) {
-                return Err(ErrorKind::ConnectionAborted.into());
-            }
-            let recipe = |(id, types): &(u8, String)| [&[*id], types.as_bytes()].concat();
-            let answer = match head[2] {
-                b'V' => vec![robot.version_accepted],
-                b'v' => robot.version.map(u32::to_be_bytes).concat(),
-                b'O' => recipe(&robot.outputs),
-                b'I' => recipe(&robot.inputs),
-                _ => vec![robot.start_accepted],
-            };
-            let mut bytes = robot.chatter.clone();
-            if robot.deaf_to != Some(head[2]) {
-                bytes.extend(packet(head[2], &answer));
-            }
-            send_in_pieces(&mut rtde, &bytes, robot.piece)?;
-        }
-        send_in_pieces(&mut rtde, &data(&robot, 1.0, ProgramState::Following, 500, 1), robot.piece)?;
-        let (mut script, _) = self.script.accept()?;
-        script.write_all(&[0; 1108])?;
-        let mut program = Vec::new();
-        let mut buffer = [0; 4096];
-        while !program.ends_with(b"\nend\n") {
-            match script.read(&mut buffer)? {
-                0 => break,
-                n => program.extend(&buffer[..n]),
-            }
-        }
-        let program = String::from_utf8(program).unwrap();
-        let run = program.lines().find_map(|l| l.strip_prefix("  RUN = ")).map_or(0, |v| v.parse().unwrap());
-        // A few cycles in which the program plays but has written nothing: what old programs left stands in the registers.
-        let playing = Robot { runtime_state: if robot.starts { 2 } else { 1 }, ..robot.clone() };
-        for cycle in 1..4 {
-            send_in_pieces(&mut rtde, &data(&playing, 1.0 + 0.008 * f64::from(cycle), ProgramState::Ready, 500, 1), robot.piece)?;
-        }
-        if robot.starts {
-            send_in_pieces(&mut rtde, &data(&playing, 1.04, robot.program, 500, run), robot.piece)?;
-        }
-        Ok(Seen { requests, outputs, program, rtde })
-    }
-}
-
-fn send_in_pieces(stream: &mut TcpStream, bytes: &[u8], piece: usize) -> std::io::Result<()> {
-    bytes.chunks(piece.min(bytes.len().max(1))).try_for_each(|piece| stream.write_all(piece))
-}
+use server::{OUTPUT_TYPES, Robot, Seen, Server, data, packet, text};
 
 /// Protects the connection: the requests come in the protocol's order, the program is this cell's, and the session starts with
 /// the state of the program that was uploaded, not with what an old one left.
@@ -208,11 +25,14 @@ fn connects_and_uploads_the_program() {
     let (session, seen) = Server::new(1, Robot::default()).meet();
     let (session, seen) = (session.unwrap(), seen.unwrap());
     assert_eq!(seen.requests, b"VvOIS");
-    assert!(seen.outputs.starts_with(&125f64.to_be_bytes()) && seen.outputs.ends_with(b",output_double_register_24,target_speed_fraction"));
+    assert!(
+        seen.outputs.starts_with(&125f64.to_be_bytes())
+            && seen.outputs.ends_with(b",target_speed_fraction,robot_status_bits,speed_scaling,payload,payload_cog,script_control_line")
+    );
     assert!(seen.program.starts_with("def decant_pour():\n"));
     assert_eq!(session.version(), [3, 15, 8, 106339]);
     let state = session.state();
-    assert_eq!((state.program_state, state.runtime_state, state.timestamp_s), (ProgramState::Ready, 2, 1.04));
+    assert_eq!((state.program_state, state.runtime_state, state.timestamp_s), (ProgramState::Ready, 2, 100.04));
     assert!((state.alpha_deg - 0.01f32.to_degrees()).abs() < 1e-4);
 }
 
@@ -269,6 +89,16 @@ fn every_refusal_says_what_to_do() {
         (Robot { speed_fraction: 0.5, ..well() }, "the speed slider is below 100 %; set it to 100 %"),
         (Robot { runtime_state: 2, ..well() }, "a program is running; wait"),
         (Robot { runtime_state: 4, ..well() }, "a program is paused; resume it"),
+        (Robot { status_bits: 5, ..well() }, "somebody has the robot in hand (the teach button is pressed); let go of it"),
+        (Robot { base_rad_s: 0.05, ..well() }, "the base joint moves, and no program moves it"),
+        (Robot { base_rad_s: -0.015, ..well() }, "the base joint moves, and no program moves it"),
+        (Robot { runtime_state: 4, registers: (ProgramState::Unknown, 0, 0), control_line: 7, ..well() }, "a program is paused; resume it"),
+        (Robot { runtime_state: 4, registers: (ProgramState::Unknown, 0, 0), status_bits: 3, ..well() }, "a program is paused; resume it"),
+        (
+            Robot { script_ports: &[], ..well() },
+            "answers on its RTDE port, but none of its ports for programs does (30002: connection refused, 30001: connection refused, \
+             30003: connection refused); switch on Secondary Client Interface under Settings > Security > Services",
+        ),
         (Robot { joint_rad: 0.5, ..well() }, "28.6 degrees from its start angle, at most 2 are allowed; bring the container upright"),
         (Robot { joint_rad: f64::NAN, ..well() }, "degrees from its start angle"),
         (Robot { program: ProgramState::TooFar, ..well() }, "bring the container upright"),
@@ -293,7 +123,7 @@ fn every_refusal_says_what_to_do() {
 fn nobody_there_is_named() {
     let options = Server::new(6, Robot::default()).options;
     let error = connect(&options).unwrap_err().to_string();
-    assert!(error.contains("127.41.0.6:30004: cannot connect: connection refused; check robot.address"), "{error}");
+    assert!(error.contains("127.41.0.6:30004: connection refused; check robot.address"), "{error}");
 }
 
 fn connected(last: u8) -> (Session, Seen, Robot) {
@@ -318,7 +148,7 @@ fn poll_until(session: &mut Session, mut done: impl FnMut(&Result<(), Lost>, &Se
 #[test]
 fn the_newest_state_counts() {
     let (mut session, mut seen, robot) = connected(7);
-    assert_eq!(session.poll(now_ns()).unwrap().timestamp_s, 1.04);
+    assert_eq!(session.poll(now_ns()).unwrap().timestamp_s, 100.04);
     let mut bytes = Vec::new();
     for cycle in 0..50 {
         bytes.extend(data(&robot, 2.0 + 0.008 * f64::from(cycle), ProgramState::Following, cycle, 9));
@@ -349,10 +179,10 @@ fn standing_clocks_and_unread_targets_are_noticed() {
         let state = *session.state();
         (state.advanced_at_ns == state.received_at_ns, state.answered_at_ns == state.received_at_ns)
     };
-    assert_eq!(echo_at(&mut session, 2.0, 0), (true, true), "advanced; 0 is new");
-    assert_eq!(echo_at(&mut session, 2.0, 0), (false, false), "stands still; target 1 unread");
-    assert_eq!(echo_at(&mut session, 2.008, 1), (true, true), "target 1 read");
-    assert_eq!(echo_at(&mut session, 2.008, 1), (false, true), "nothing unread");
+    assert_eq!(echo_at(&mut session, 200.0, 0), (true, true), "advanced; 0 is new");
+    assert_eq!(echo_at(&mut session, 200.0, 0), (false, false), "stands still; target 1 unread");
+    assert_eq!(echo_at(&mut session, 200.008, 1), (true, true), "target 1 read");
+    assert_eq!(echo_at(&mut session, 200.008, 1), (false, true), "nothing unread");
     assert_eq!(echo_at(&mut session, 1.0, 1), (false, true), "a clock that jumps back does not advance");
 }
 
@@ -483,6 +313,6 @@ fn a_stop_during_the_upload_is_named() {
         seen
     });
     let error = connect(&options).unwrap_err();
-    assert_eq!(error, LinkError::MayNotMove { address: options.address, reason: EndReason::EmergencyStop });
+    assert_eq!(error, LinkError::MayNotMove { address: options.address, reason: EndReason::EmergencyStop, unpowered: true });
     drop(served.join());
 }

@@ -3,12 +3,18 @@
 //! The tests use no sockets and no clock, so what they assert is exact and holds on every machine.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::too_many_lines)]
 
+mod interrupted;
+mod limits;
+mod precision;
+mod watch;
+
 use rand::{RngExt, SeedableRng};
 use rt_controller::link::{LinkOptions, Mode, ProgramState, TiltJoint, program};
 use shared::config::Joint;
 use shared::limits::{Limiter, Limits};
 use simulator::ur::variables::Input;
 use simulator::ur::{Machine, RuntimeState, SafetyMode, Series};
+use watch::Watch;
 
 const RUN: i32 = 4711;
 /// Where the other five joints stand, rad; wrist 3 is at its start angle.
@@ -42,15 +48,24 @@ struct Robot {
     sequence: i32,
     /// The control cycles since the program started.
     cycles: Vec<Cycle>,
+    /// Looks at everything that servoj is told.
+    watch: Watch,
 }
 
 impl Robot {
     fn new(series: Series, options: LinkOptions, start_rad: f64) -> Self {
+        Self::with_precision(series, options, start_rad, false)
+    }
+
+    /// `single` is true for a controller that computes with floats of 32 bits.
+    fn with_precision(series: Series, options: LinkOptions, start_rad: f64, single: bool) -> Self {
         let mut stance = STANCE_RAD;
         stance[options.tilt.joint.index()] = start_rad;
-        let machine = Machine::new(series, series.default_version(), stance);
+        let mut machine = Machine::new(series, series.default_version(), stance);
+        machine.set_single_precision(single);
         let cycle_s = machine.robot.steptime_s();
-        let mut robot = Self { machine, options, cycle_s, sequence: 500, cycles: Vec::new() };
+        let watch = Watch::new(&options, &machine, single);
+        let mut robot = Self { machine, options, cycle_s, sequence: 500, cycles: Vec::new(), watch };
         // This is what an old session left behind.
         robot.send(Mode::Stream, 77.0);
         let text = program::text(&robot.options, cycle_s, RUN).unwrap();
@@ -78,7 +93,9 @@ impl Robot {
     }
 
     fn step(&mut self) {
+        self.watch.before(&self.machine);
         self.machine.step();
+        self.watch.after(&self.machine);
         let servo = &self.machine.robot.servo;
         let tilt = self.options.tilt;
         let joint = tilt.joint.index();
@@ -360,7 +377,7 @@ fn an_unused_program_ends() {
     assert_eq!(robot.machine.robot.servo.actual_q, STANCE_RAD);
 }
 
-/// Protects people after a pause: resumed after a protective stop at full flow, with nobody streaming, it comes upright from where it
+/// Protects people after a pause: resumed after a protective stop in mid-motion, with nobody streaming, it comes upright from where it
 /// stopped and ends.
 #[test]
 fn resumed_after_a_protective_stop_it_comes_upright() {
@@ -373,9 +390,9 @@ fn resumed_after_a_protective_stop_it_comes_upright() {
     robot.machine.unlock_protective_stop().unwrap();
     assert!(robot.machine.resume());
     robot.pass(0.12);
-    assert_eq!(robot.state(), ProgramState::Returning);
+    assert_eq!(robot.state(), ProgramState::OffTrack, "it is not where it was told to be");
     robot.pass(3.0);
-    assert_eq!((robot.state(), robot.machine.safety_mode()), (ProgramState::TimedOut, SafetyMode::Normal));
+    assert_eq!((robot.state(), robot.machine.safety_mode()), (ProgramState::OffTrackEnded, SafetyMode::Normal));
     assert!(robot.cycles.last().unwrap().actual_deg.abs() < 0.2);
 }
 

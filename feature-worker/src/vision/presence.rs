@@ -1,0 +1,48 @@
+//! When a stream that is not seen any more is gone: a stream of hundreds of px^2 does not end from one picture to the next, so it is not
+//! seen until there is evidence of dry ground where it was.
+//!
+//! Called on the extraction thread. Nothing is allocated and nothing fails.
+
+/// A smaller stream may end between two pictures, px^2 of a picture 640 px wide. Tuned on seeds 1, 5001 to 5003 and 101 to 104 of
+/// `evaluate-camera`, see docs/VISION.md.
+const LASTING_PX2: f32 = 100.0;
+/// Width of the picture for which that holds, px.
+const WIDTH_PX: f32 = 640.0;
+/// The ground is dry when this share of the stream's former place was seen to be ground. Tuned as [`LASTING_PX2`] was.
+const DRY_SHARE: f32 = 0.6;
+/// So many pictures in a row have to show dry ground. Tuned as [`LASTING_PX2`] was: docs/VISION.md shows what more and fewer do.
+const DRY_PICTURES: u32 = 2;
+
+/// Remembers the stream until its end was seen.
+pub(crate) struct Presence {
+    lasting_px2: f32,
+    /// Legs of the stream that may still be there, px from the lip.
+    legs_px: Option<[f32; 2]>,
+    /// Pictures in a row that showed dry ground in its place.
+    dry_pictures: u32,
+}
+
+impl Presence {
+    /// For pictures of this width, px. There is no stream yet.
+    pub(crate) fn new(width_px: u32) -> Self {
+        let scale = width_px as f32 / WIDTH_PX;
+        Self { lasting_px2: LASTING_PX2 * scale * scale, legs_px: None, dry_pictures: 0 }
+    }
+
+    /// A stream was measured.
+    pub(crate) fn saw(&mut self, area_px2: f32, legs_px: [f32; 2]) {
+        self.legs_px = (area_px2 >= self.lasting_px2).then_some(legs_px);
+        self.dry_pictures = 0;
+    }
+
+    /// No stream was seen in a picture without other doubts. Returns whether there is none; `dry_share` tells which share of a triangle with
+    /// these legs was seen to be ground.
+    pub(crate) fn is_gone(&mut self, dry_share: impl FnOnce([f32; 2]) -> f32) -> bool {
+        let Some(legs_px) = self.legs_px else { return true };
+        self.dry_pictures = if dry_share(legs_px) >= DRY_SHARE { self.dry_pictures + 1 } else { 0 };
+        if self.dry_pictures >= DRY_PICTURES {
+            self.legs_px = None;
+        }
+        self.legs_px.is_none()
+    }
+}

@@ -1,0 +1,226 @@
+//! Whether a picture is whole: decoded to its end, of one moment, and with the glass in its place.
+//!
+//! A picture that was not decoded to its end has rows of one colour. A torn one has rows that are those of the picture before, to the
+//! byte, beside rows that are not. In one whose rows are shifted, the container's left side lies elsewhere, and it never moves in the
+//! picture otherwise. Each of them is judged against the pictures before, so that a card without noise or a repeated picture is no reason
+//! for a doubt.
+//!
+//! Called on the extraction thread; nothing is allocated after the start and nothing fails.
+
+use super::geometry::Axes;
+use super::picture::RegionPixels;
+
+/// Pixels of a row that are looked at. Chosen by hand, for speed.
+const COLUMNS: usize = 16;
+/// Most rows that are looked at. Chosen by hand, for speed.
+const ROWS: usize = 300;
+/// A row is of one colour when its levels differ by no more than this. Chosen by hand: a decoder's fill is exact, and a second
+/// compression adds a level or two.
+const ONE_COLOUR: u8 = 2;
+/// This many rows that follow each other are a missing or foreign part: one row of the smallest JPEG blocks. Chosen by hand.
+const PART_PX: usize = 8;
+/// Rows of one colour that last longer than this many pictures belong to the scene. Chosen by hand: one second.
+const SCENE_FRAMES: u32 = 30;
+/// A picture reaches so far below the lip that its last rows show the glass, px. Chosen by hand.
+const BELOW_LIP_PX: f32 = 20.0;
+/// Of the rows that do not repeat, this share has to be really new for the others to be old ones. Chosen by hand: all of them are where a
+/// sensor's noise is left, and few in a compressed video of a still scene.
+const NEW_ROWS: f32 = 0.8;
+
+/// Lines along which the container's left side is read. Chosen by hand, for speed.
+const SIDE_LINES: usize = 12;
+/// The first of them lies this far from the lip, px: nearer, the bead covers the side. Chosen by hand.
+const SIDE_FROM_PX: f32 = 12.0;
+/// Distance of these lines, px. Chosen by hand.
+const SIDE_STEP_PX: f32 = 3.5;
+/// A side that is displaced is looked for up to this distance, px. Chosen by hand: blocks of compressed pictures are 8 to 32 px wide.
+const SIDE_REACH: usize = 72;
+/// The side's pattern reaches this far to either side of it, px. Chosen by hand.
+const SIDE_HALF: usize = 8;
+/// Samples of a line.
+const SIDE_SAMPLES: usize = 2 * (SIDE_REACH + SIDE_HALF) + 2;
+/// Samples of the pattern.
+const PATTERN: usize = 2 * SIDE_HALF + 1;
+/// The side is in its place when its pattern agrees with the remembered one by this much, -1 to 1. Chosen by hand.
+const IN_PLACE: f32 = 0.5;
+/// The side is elsewhere when it agrees there by this much. Chosen by hand.
+const ELSEWHERE: f32 = 0.8;
+/// A displacement by less than this may be a side that changed its look, px. Chosen by hand.
+const DISPLACED_PX: usize = 5;
+/// The side's pattern is known when it agreed with itself by this much for some pictures. Chosen by hand.
+const KNOWN_SIDE: f32 = 0.85;
+/// How fast pattern and agreement follow, a picture. Chosen by hand.
+const SIDE_FOLLOWS: f32 = 0.15;
+
+/// What one row shows.
+#[derive(Clone, Copy, Default)]
+struct RowLook {
+    one_colour: bool,
+    /// Whether all its pixels are those of the row before, to the byte.
+    old: bool,
+    /// Whether most of its pixels are not.
+    new: bool,
+}
+
+/// Checks whether pictures of one camera are whole.
+pub(crate) struct WholeCheck {
+    /// The columns that are looked at.
+    columns: [usize; COLUMNS],
+    /// Rows from one that is looked at to the next.
+    row_step: usize,
+    /// The last row shows the glass.
+    reaches_glass: bool,
+    /// The pixels of the picture before.
+    before: Vec<[[u8; 3]; COLUMNS]>,
+    /// Which rows were of one colour in the last whole picture.
+    plain_before: Vec<bool>,
+    /// Pictures in a row that were not whole.
+    broken: u32,
+    /// Pictures that were seen.
+    seen: u32,
+    side: SideCheck,
+}
+
+impl WholeCheck {
+    /// For a region of `size_px`; `axes` are relative to it.
+    pub(crate) fn new(axes: Axes, size_px: [i32; 2]) -> Self {
+        let (width, height) = (size_px[0].max(1) as usize, size_px[1].max(1) as usize);
+        let row_step = height.div_ceil(ROWS);
+        Self {
+            // Not evenly, so that no pattern falls between them.
+            columns: std::array::from_fn(|i| ((i * 2 + 1) * width / (2 * COLUMNS) + (i * 7) % 5).min(width - 1)),
+            row_step,
+            reaches_glass: height as f32 - 1.0 >= axes.lip_px[1] + BELOW_LIP_PX,
+            before: vec![[[0; 3]; COLUMNS]; height / row_step],
+            plain_before: vec![false; height / row_step],
+            broken: 0,
+            seen: 0,
+            side: SideCheck::new(axes),
+        }
+    }
+
+    /// Takes note of the next picture. Returns whether it is whole.
+    pub(crate) fn is_whole(&mut self, pixels: RegionPixels) -> bool {
+        let first = self.seen == 0;
+        self.seen = self.seen.saturating_add(1);
+        let (mut plain_run, mut new_plain_run, mut old_run) = (0usize, 0usize, 0usize);
+        let (mut most_new_plain, mut most_old) = (0usize, 0usize);
+        let (mut rows_new, mut rows_other) = (0usize, 0usize);
+        for i in 0..self.before.len() {
+            let look = look_at(pixels.row(i * self.row_step), &self.columns, &mut self.before[i]);
+            plain_run = if look.one_colour { plain_run + 1 } else { 0 };
+            new_plain_run = if look.one_colour && !self.plain_before[i] { new_plain_run + 1 } else { 0 };
+            most_new_plain = most_new_plain.max(new_plain_run);
+            old_run = if look.old && !look.one_colour { old_run + 1 } else { 0 };
+            most_old = most_old.max(old_run);
+            if !look.old && !look.one_colour {
+                rows_other += 1;
+                rows_new += usize::from(look.new);
+            }
+        }
+        let part = PART_PX.div_ceil(self.row_step);
+        let ends_early = self.reaches_glass && plain_run >= part;
+        let missing = ends_early || (!first && most_new_plain >= part && self.broken <= SCENE_FRAMES);
+        let torn = !first && most_old >= part && rows_new > 0 && rows_new as f32 >= NEW_ROWS * rows_other as f32;
+        let whole = !missing && !torn && !self.side.is_displaced(pixels);
+        if whole || first || self.broken > SCENE_FRAMES {
+            for (i, plain) in self.plain_before.iter_mut().enumerate() {
+                *plain = is_one_colour(&self.before[i]);
+            }
+        }
+        self.broken = if whole { 0 } else { self.broken.saturating_add(1) };
+        whole
+    }
+}
+
+/// Looks at a row, and takes it over into `before`.
+#[inline(always)]
+fn look_at(row: &[u8], columns: &[usize; COLUMNS], before: &mut [[u8; 3]; COLUMNS]) -> RowLook {
+    let (mut equal, mut count) = (0usize, 0usize);
+    for (column, kept) in columns.iter().zip(before.iter_mut()) {
+        let Some(pixel) = row.get(3 * column..3 * column + 3) else { continue };
+        let pixel = [pixel[0], pixel[1], pixel[2]];
+        // Where the sensor is full or empty, every picture is the same.
+        let tells = pixel.iter().any(|v| *v > 2 && *v < 253);
+        count += usize::from(tells);
+        equal += usize::from(tells && pixel == *kept);
+        *kept = pixel;
+    }
+    RowLook { one_colour: is_one_colour(before), old: count >= COLUMNS / 4 && equal == count, new: 2 * (count - equal) > count }
+}
+
+/// Whether the pixels have one colour.
+#[inline(always)]
+fn is_one_colour(pixels: &[[u8; 3]; COLUMNS]) -> bool {
+    let (mut low, mut high) = (pixels[0], pixels[0]);
+    for pixel in pixels {
+        for k in 0..3 {
+            low[k] = low[k].min(pixel[k]);
+            high[k] = high[k].max(pixel[k]);
+        }
+    }
+    // White may be a wall in bright light, and black the night.
+    let saturated = low.iter().all(|v| *v >= 253) || high.iter().all(|v| *v <= 2);
+    !saturated && (0..3).all(|k| high[k] - low[k] <= ONE_COLOUR)
+}
+
+/// Checks that the container's left side, below the lip, is where it was.
+struct SideCheck {
+    axes: Axes,
+    /// The remembered pattern of steps across the side.
+    pattern: [f32; PATTERN],
+    /// How well it agreed with itself from picture to picture.
+    agrees: f32,
+}
+
+impl SideCheck {
+    fn new(axes: Axes) -> Self {
+        Self { axes, pattern: [0.0; PATTERN], agrees: 0.0 }
+    }
+
+    /// Whether the side is seen elsewhere, and not in its place.
+    fn is_displaced(&mut self, pixels: RegionPixels) -> bool {
+        let steps = self.steps(pixels);
+        let at = |shift: usize| -> &[f32] { &steps[shift..shift + PATTERN] };
+        let here = agreement(&self.pattern, at(SIDE_REACH));
+        if self.agrees >= KNOWN_SIDE && here < IN_PLACE {
+            let far = |shift: &usize| shift.abs_diff(SIDE_REACH) >= DISPLACED_PX;
+            if (0..=2 * SIDE_REACH).filter(far).any(|shift| agreement(&self.pattern, at(shift)) >= ELSEWHERE) {
+                return true;
+            }
+        }
+        self.agrees += SIDE_FOLLOWS * (here - self.agrees);
+        for (kept, now) in self.pattern.iter_mut().zip(&steps[SIDE_REACH..]) {
+            *kept += SIDE_FOLLOWS * (now - *kept);
+        }
+        false
+    }
+
+    /// The mean steps of brightness across the side, from the outside to the inside, along rows of the picture.
+    fn steps(&self, pixels: RegionPixels) -> [f32; SIDE_SAMPLES - 1] {
+        let mut sums = [0.0f32; SIDE_SAMPLES];
+        for line in 0..SIDE_LINES {
+            let [x, y] = self.axes.at(-(SIDE_FROM_PX + SIDE_STEP_PX * line as f32), self.axes.y);
+            let row = if y >= 0.0 { pixels.row(y as usize) } else { &[] };
+            let (left, last) = (x as isize - (SIDE_REACH + SIDE_HALF) as isize, (row.len() / 3) as isize - 1);
+            for (j, sum) in sums.iter_mut().enumerate() {
+                // Beyond the region the last pixel is repeated, so that its border is no step.
+                let at = 3 * (left + j as isize).clamp(0, last.max(0)) as usize;
+                *sum += row.get(at..at + 3).map_or(0.0, |p| f32::from(p[0]) + f32::from(p[1]) + f32::from(p[2]));
+            }
+        }
+        std::array::from_fn(|j| sums[j + 1] - sums[j])
+    }
+}
+
+/// How well two patterns agree, -1 to 1.
+#[inline(always)]
+fn agreement(a: &[f32], b: &[f32]) -> f32 {
+    let (mut ab, mut aa, mut bb) = (0.0f32, 0.0f32, 0.0f32);
+    for (a, b) in a.iter().zip(b) {
+        ab += a * b;
+        aa += a * a;
+        bb += b * b;
+    }
+    ab / (aa * bb).sqrt().max(1.0)
+}

@@ -1,0 +1,73 @@
+//! Which robots get the program: those with few services or few variables, those that were never started, and those that a person has, or had,
+//! in hand. The tests run against the scripted server and panic as tests do.
+
+use rt_controller::link::hands::{Before, Handover};
+use rt_controller::link::{LinkError, ProgramState, RobotState};
+
+use super::server::{Robot, Server};
+
+/// Protects robots on which services are switched off: any one of the three ports for programs is enough.
+#[test]
+fn any_script_port_is_enough() {
+    for (last, script_ports) in [(60, &[30001][..]), (61, &[30002]), (62, &[30003]), (63, &[30003, 30002])] {
+        let (session, seen) = Server::new(last, Robot { script_ports, ..Robot::default() }).meet();
+        assert_eq!(session.unwrap().state().program_state, ProgramState::Ready, "{script_ports:?}");
+        assert!(seen.unwrap().program.starts_with("def decant_pour():\n"), "{script_ports:?}");
+    }
+}
+
+/// Protects old controllers: a robot that does not know what is only good to have is driven without it, and what it knows is read.
+#[test]
+fn a_robot_that_knows_less_is_driven() {
+    let all: &[&str] = &["robot_status_bits", "speed_scaling", "payload", "payload_cog", "script_control_line"];
+    for (last, unknown) in [(64, all), (65, &["payload", "script_control_line"][..]), (66, &["speed_scaling"])] {
+        let (session, seen) = Server::new(last, Robot { unknown, ..Robot::default() }).meet();
+        let (session, seen) = (session.unwrap(), seen.unwrap());
+        assert_eq!(seen.requests, b"VvOOIS");
+        let state = session.state();
+        let knows = |name: &str| !unknown.contains(&name);
+        assert_eq!(state.status_bits, knows("robot_status_bits").then_some(1));
+        assert_eq!(state.speed_scaling, knows("speed_scaling").then_some(0.5));
+        assert_eq!(state.payload_kg, knows("payload").then_some(1.2));
+        assert_eq!(state.payload_cog_m, knows("payload_cog").then_some([0.0, 0.01, 0.1]));
+        assert_eq!(state.control_line, knows("script_control_line").then_some(0));
+    }
+}
+
+/// Protects a booted robot from never getting a program: it says "paused" although nobody has paused anything. It gets the program, and once
+/// more when the first one has only stopped it.
+#[test]
+fn a_robot_that_was_never_started_gets_the_program() {
+    let booted = Robot { runtime_state: 4, registers: (ProgramState::Unknown, 0, 0), ..Robot::default() };
+    let (session, _) = Server::new(67, booted.clone()).meet();
+    assert_eq!(session.unwrap().state().program_state, ProgramState::Ready);
+    let (session, _) = Server::new(68, Robot { stops_first: true, ..booted.clone() }).meet();
+    assert_eq!(session.unwrap().state().program_state, ProgramState::Ready);
+    // An arm that had no power in between has no paused program, whatever old registers say.
+    let used = Robot { registers: (ProgramState::Following, 7, 9), ..booted };
+    assert!(Server::new(69, used.clone()).meet().0.is_err());
+    assert!(Server::new(70, used).meet_after(&Before { unpowered: true, ..Before::default() }).0.is_ok());
+}
+
+/// Protects people who have the robot: after a lost connection it is taken again only if our program there says that it has ended by itself
+/// and no joint was moved; the operator's wish goes before.
+#[test]
+fn a_robot_that_was_handled_meanwhile_waits_for_its_operator() {
+    let last = |base_rad: f64| RobotState { program_run: 9, joints_rad: [base_rad, 0.0, 0.0, 0.0, 0.0, 1.2], ..RobotState::default() };
+    let cases = [
+        (71, (ProgramState::TimedOut, 7, 9), 0.0, None),
+        (72, (ProgramState::Stopped, 7, 9), 0.0, None),
+        (73, (ProgramState::Returning, 7, 9), 0.0, Some(Handover::Interrupted)),
+        (74, (ProgramState::TimedOut, 7, 8), 0.0, Some(Handover::Interrupted)),
+        (75, (ProgramState::Unknown, 0, 0), 0.0, Some(Handover::Interrupted)),
+        (76, (ProgramState::TimedOut, 7, 9), 0.02, Some(Handover::Displaced("base"))),
+    ];
+    for (number, registers, base_rad, why) in cases {
+        let before = Before { last: Some(last(base_rad)), ..Before::default() };
+        let (session, _) = Server::new(number, Robot { registers, ..Robot::default() }).meet_after(&before);
+        assert_eq!(session.as_ref().err().and_then(LinkError::handover), why, "{registers:?}");
+        assert_eq!(session.is_ok(), why.is_none(), "{registers:?}");
+        let (session, _) = Server::new(number + 20, Robot { registers, ..Robot::default() }).meet_after(&Before { asked: true, ..before });
+        assert!(session.is_ok(), "{registers:?}");
+    }
+}
