@@ -192,7 +192,7 @@ fn propose(config: &Config, corner: Corner, pour: &Pour) -> Result<Proposal, Str
         // The background of a pose in which the container rests must not be taken for something that stays at the lip.
         poses.balanced(PICTURES_OF_A_POSE).into_iter().try_for_each(|i| learner.add(&pour.pictures[i])).map_err(words)?;
         image.colour_hsv = learner.range().map_err(words)?;
-        remarks.push(checks::background_differs(learner.dry_background(image.colour_hsv))?);
+        remarks.push(checks::background_differs(learner.near_background(image.colour_hsv))?);
     }
     remarks.push(checks::something_flows(pour, camera, &image)?);
     Ok(Proposal { image, remarks })

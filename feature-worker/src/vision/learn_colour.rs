@@ -41,6 +41,9 @@ const TAILS: [f32; 2] = [0.02, 0.98];
 const PALE: f32 = 0.35;
 /// A picture is dry when less than this share of the pixels near the lip is liquid. By hand: a hanging drop covers less.
 const DRY_NEAR: f32 = 0.1;
+/// Background that is this much darker, brighter or paler than the learned colours is close to them, grey levels. By hand: the exposure of
+/// rendered cameras drifts by 5 % and more.
+const CLOSE: u8 = 8;
 /// Highlights are learned when they are at least this share of the near pixels. By hand.
 const HIGHLIGHT_SHARE: f32 = 0.002;
 /// What may be added to the share of dry background inside the colours for the sake of highlights. By hand.
@@ -266,6 +269,15 @@ impl ColourLearner {
             }
         }
         wider
+    }
+
+    /// What of the background lies inside `range`, or so close to it that a little more or less light brings it there. See
+    /// [`Self::dry_background`].
+    pub fn near_background(&self, [h0, s0, v0, h1, s1, v1]: Range) -> DryBackground {
+        let grey = h0 == 0 && h1 == 179;
+        let hue = |h: u8, by: i16| if grey { h } else { (i16::from(h) + by).rem_euclid(180) as u8 };
+        let (low, high) = (|v: u8| v.saturating_sub(CLOSE), |v: u8| v.saturating_add(CLOSE));
+        self.dry_background([hue(h0, -1), low(s0), low(v0), hue(h1, 1), high(s1), high(v1)])
     }
 
     /// What of the background lies inside `range` in the pictures in which nothing of these colours is at the lip.

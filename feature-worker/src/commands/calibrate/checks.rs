@@ -87,12 +87,12 @@ pub(super) fn background_differs(dry: DryBackground) -> Result<String, String> {
     }
     if dry.inside > BACKGROUND_MOST {
         return Err(format!(
-            "{inside} of the dry background lies inside the learned colours (at most {}): change the background, colour the liquid, or use \
+            "{inside} of the dry background lies inside the learned colours or close to them (at most {}): change the background, colour the liquid, or use \
              --method clear for water",
             percent(BACKGROUND_MOST)
         ));
     }
-    Ok(format!("{inside} of the dry background lies inside the learned colours"))
+    Ok(format!("{inside} of the dry background lies inside the learned colours or close to them"))
 }
 
 /// What was measured in all frames of a pour.
@@ -117,8 +117,10 @@ pub(super) fn something_flows(pour: &Pour, camera: &CameraConfig, image: &ImageC
         let flows = measured.area_px2 > 0.0;
         flow.frames += 1;
         flow.flowing += u32::from(flows);
-        flow.dry += u32::from(!flows && measured.doubt == Doubt::None);
-        flow.unfit += u32::from(!flows && matches!(measured.doubt, Doubt::EdgeNotFound | Doubt::LeavesRegion));
+        let unfit = matches!(measured.doubt, Doubt::EdgeNotFound | Doubt::LeavesRegion);
+        flow.unfit += u32::from(!flows && unfit);
+        // A frame that is a little too sharp or soft for the run time is dry all the same.
+        flow.dry += u32::from(!flows && !unfit);
         flow.runs += u32::from(flows && !flow.flows);
         flow.flows = flows;
     })?;
