@@ -15,6 +15,8 @@ use super::geometry::Axes;
 
 /// Number of bins into which hue, saturation and value are divided. Chosen by hand; no measurement is recorded.
 const BINS: [usize; 3] = [18, 8, 8];
+/// Pixels with less saturation have no hue that means anything. Chosen by hand: one bin of saturation.
+const NO_HUE: u8 = 32;
 /// The most pixels that are kept of each of the two places. Chosen by hand: three megabytes.
 const KEEP: usize = 1_000_000;
 /// Pixels nearer to the lip than this are near. Tuned.
@@ -39,8 +41,11 @@ const TAILS: [f32; 2] = [0.02, 0.98];
 /// Pixels of a coloured liquid with less than this share of its median saturation are noise of the rim or of the board. By hand: a liquid's
 /// thin edge has more.
 const PALE: f32 = 0.35;
-/// A picture is dry when less than this share of the pixels near the lip is liquid. By hand: a hanging drop covers less.
+/// A picture is dry when less than this share of the pixels near the lip is liquid, beside what always is. By hand: a hanging drop covers
+/// less.
 const DRY_NEAR: f32 = 0.1;
+/// The rim's own light is at most this share of the pixels near the lip. By hand.
+const RIM_NEAR: f32 = 0.4;
 /// Background that is this much darker, brighter or paler than the learned colours is close to them, grey levels. By hand: the exposure of
 /// rendered cameras drifts by 5 % and more.
 const CLOSE: u8 = 8;
@@ -83,18 +88,21 @@ type Hsv = [u8; 3];
 struct Pixels {
     /// The pixels, in the order in which they were seen.
     pixels: Vec<Hsv>,
-    /// Their number in each bin.
-    bins: Vec<u32>,
+    /// Their number in each bin, for bins at two places: the second lie half a bin lower, so that no limit between bins tells two like
+    /// pixels apart.
+    bins: [Vec<u32>; 2],
 }
 
 impl Pixels {
     fn new() -> Self {
-        Self { pixels: Vec::new(), bins: vec![0; BINS.iter().product()] }
+        Self { pixels: Vec::new(), bins: std::array::from_fn(|_| vec![0; BINS.iter().map(|b| b + 1).product()]) }
     }
 
     fn add(&mut self, hsv: Hsv) {
         if self.pixels.len() < KEEP {
-            self.bins[bin(hsv)] += 1;
+            for (place, bins) in self.bins.iter_mut().enumerate() {
+                bins[bin(hsv, place)] += 1;
+            }
             self.pixels.push(hsv);
         }
     }
@@ -104,15 +112,17 @@ impl Pixels {
         self.pixels.len().max(1) as f32
     }
 
-    /// Share of the pixels that fall into the same bin.
-    fn share(&self, hsv: Hsv) -> f32 {
-        self.bins[bin(hsv)] as f32 / self.count()
+    /// Share of the pixels that fall into the same bin, for the bins at this place.
+    fn share(&self, hsv: Hsv, place: usize) -> f32 {
+        self.bins[place][bin(hsv, place)] as f32 / self.count()
     }
 }
 
-fn bin([h, s, v]: Hsv) -> usize {
-    let bin = |value: u8, most: usize, bins: usize| usize::from(value) * bins / most;
-    (bin(h, 180, BINS[0]) * BINS[1] + bin(s, 256, BINS[1])) * BINS[2] + bin(v, 256, BINS[2])
+/// The bin of a pixel, for bins at one of two places.
+fn bin([h, s, v]: Hsv, place: usize) -> usize {
+    let bin = |value: u8, most: usize, bins: usize| (2 * usize::from(value) * bins / most + place) / 2;
+    let hue = if s < NO_HUE { 0 } else { bin(h, 180, BINS[0]) % BINS[0] };
+    (hue * (BINS[1] + 1) + bin(s, 256, BINS[1])) * (BINS[2] + 1) + bin(v, 256, BINS[2])
 }
 
 /// Learns the liquid's colour from the pictures of one pour.
@@ -200,8 +210,10 @@ impl ColourLearner {
     /// The range h_min, s_min, v_min, h_max, s_max, v_max for `[image] colour_hsv`. It is an error if no colour stands out at the lip.
     pub fn range(&self) -> Result<Range, ColourError> {
         let liquid = |hsv: &&Hsv| {
-            let (near, far) = (self.near.share(**hsv), self.far.share(**hsv));
-            near > BIN_SHARE && near > BIN_RATIO * far
+            (0..2).all(|place| {
+                let (near, far) = (self.near.share(**hsv, place), self.far.share(**hsv, place));
+                near > BIN_SHARE && near > BIN_RATIO * far
+            })
         };
         let mut seen: Vec<Hsv> = self.near.pixels.iter().filter(liquid).copied().collect();
         if (seen.len() as f32) < LIQUID_SHARE * self.near.count() {
@@ -252,7 +264,7 @@ impl ColourLearner {
     fn with_highlights(&self, range: Range) -> Range {
         let cost = self.dry_background(range).inside + HIGHLIGHT_COST;
         let light: Vec<u8> = {
-            let bright = |p: &&Hsv| p[2] > range[5].min(200) && self.near.share(**p) > BIN_RATIO * self.far.share(**p);
+            let bright = |p: &&Hsv| p[2] > range[5].min(200) && self.near.share(**p, 0) > BIN_RATIO * self.far.share(**p, 0);
             let hue = |p: &&Hsv| contains([range[0], 0, 0, range[3], 255, 255], **p);
             self.near.pixels.iter().filter(hue).filter(bright).map(|p| p[1]).collect()
         };
@@ -280,22 +292,26 @@ impl ColourLearner {
         self.dry_background([hue(h0, -1), low(s0), low(v0), hue(h1, 1), high(s1), high(v1)])
     }
 
-    /// What of the background lies inside `range` in the pictures in which nothing of these colours is at the lip.
+    /// What of the background lies inside `range` in the pictures in which nothing of these colours is at the lip but the rim's own light.
     pub fn dry_background(&self, range: Range) -> DryBackground {
-        let (mut dry, mut all) = ((0usize, 0usize, 0usize), (0usize, 0usize));
+        // Of each picture: the share of the near pixels that is inside, and of how many far pixels how many are.
+        let mut seen = Vec::new();
         let mut begins = [0, 0];
         for ends in &self.ends {
             let inside = |pixels: &[Hsv]| pixels.iter().filter(|p| contains(range, **p)).count();
             let (near, far) = (&self.near.pixels[begins[0]..ends[0]], &self.far.pixels[begins[1]..ends[1]]);
-            let (count, within) = (far.len(), inside(far));
-            if (inside(near) as f32) < DRY_NEAR * near.len().max(1) as f32 {
-                dry = (dry.0 + 1, dry.1 + within, dry.2 + count);
-            }
-            all = (all.0 + within, all.1 + count);
+            seen.push((inside(near) as f32 / near.len().max(1) as f32, inside(far), far.len()));
             begins = *ends;
         }
-        let (within, count) = if dry.0 > 0 { (dry.1, dry.2) } else { all };
-        DryBackground { inside: within as f32 / count.max(1) as f32, dry_pictures: dry.0 as f32 / self.ends.len().max(1) as f32 }
+        let rim = seen.iter().map(|(near, ..)| *near).fold(1.0f32, f32::min);
+        let is_dry = |(near, ..): &&(f32, usize, usize)| rim < RIM_NEAR && *near < rim + DRY_NEAR;
+        let dry = seen.iter().filter(is_dry).count();
+        let sum = |all: bool| {
+            let taken = seen.iter().filter(|one| all || is_dry(one));
+            taken.fold((0, 0), |sum, (_, inside, count)| (sum.0 + inside, sum.1 + count))
+        };
+        let (inside, count) = sum(dry == 0);
+        DryBackground { inside: inside as f32 / count.max(1) as f32, dry_pictures: dry as f32 / seen.len().max(1) as f32 }
     }
 
     /// A limit of the range: `loose`, which is the liquid's own limit `liquid` with its margin; or, where background of like colour comes
