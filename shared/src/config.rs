@@ -117,6 +117,72 @@ pub struct CameraConfig {
     pub height_px: u32,
     /// Frames a second.
     pub fps: f64,
+    /// Exposure time of a device, ms. This and what follows is set at the start and read back; without it, it is left alone.
+    #[serde(default)]
+    pub exposure_ms: Option<Setting>,
+    /// Gain of a device, in its own numbers.
+    #[serde(default)]
+    pub gain: Option<Setting>,
+    /// White balance of a device, K.
+    #[serde(default)]
+    pub white_balance_k: Option<Setting>,
+    /// Focus of a device, in its own numbers.
+    #[serde(default)]
+    pub focus: Option<Setting>,
+    /// The mains' frequency, against which a device's exposure is timed, Hz: 50, 60, or 0 for light that does not flicker.
+    #[serde(default)]
+    pub mains_hz: Option<Setting>,
+    /// What it means that the device refuses one of these.
+    #[serde(default)]
+    pub refused: Refused,
+}
+
+impl Default for CameraConfig {
+    /// Frames of 640 x 480 px at 30 Hz from shared memory.
+    fn default() -> Self {
+        Self {
+            source: CameraSource::SharedMemory,
+            path: String::new(),
+            width_px: 640,
+            height_px: 480,
+            fps: 30.0,
+            exposure_ms: None,
+            gain: None,
+            white_balance_k: None,
+            focus: None,
+            mains_hz: None,
+            refused: Refused::Error,
+        }
+    }
+}
+
+/// How a setting of a device is set.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(untagged)]
+pub enum Setting {
+    /// To this value; its automatic is switched off.
+    Value(f64),
+    /// To what it is at the start; its automatic is switched off.
+    Locked(Locked),
+}
+
+/// The word "locked".
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+#[allow(missing_docs)]
+pub enum Locked {
+    Locked,
+}
+
+/// What it means that a device refuses a setting.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum Refused {
+    /// The worker does not start.
+    #[default]
+    Error,
+    /// The worker says so and starts.
+    Warning,
 }
 
 /// How liquid is told from the background.
@@ -309,6 +375,19 @@ impl Check<'_> {
         self.range("camera.width_px", camera.width_px.into(), 64.0, 4096.0)?;
         self.range("camera.height_px", camera.height_px.into(), 64.0, 4096.0)?;
         self.range("camera.fps", camera.fps, 1.0, 240.0)?;
+        for (key, setting, low, high) in [
+            ("camera.exposure_ms", camera.exposure_ms, 0.01, 1000.0),
+            ("camera.gain", camera.gain, 0.0, 1e6),
+            ("camera.white_balance_k", camera.white_balance_k, 1000.0, 20_000.0),
+            ("camera.focus", camera.focus, 0.0, 1e6),
+        ] {
+            if let Some(Setting::Value(value)) = setting {
+                self.range(key, value, low, high)?;
+            }
+        }
+        if let Some(Setting::Value(value)) = camera.mains_hz {
+            self.rule("camera.mains_hz", &value.to_string(), [0.0, 50.0, 60.0].contains(&value), "50, 60, 0 (off) or \"locked\"")?;
+        }
         let needs_path = camera.source != CameraSource::SharedMemory;
         self.rule(
             "camera.path",
@@ -426,6 +505,9 @@ mod tests {
             ("direction = 1.0", "direction = 0.5", ["robot.direction", "1 or -1"]),
             ("name = \"lab\"", "name = \"../x\"", ["cell.name", "letters"]),
             ("path = \"/dev/video0\"", "path = \"\"", ["camera.path", "device"]),
+            ("fps = 30.0", "fps = 30.0\nmains_hz = 55", ["camera.mains_hz = 55", "50, 60, 0"]),
+            ("fps = 30.0", "fps = 30.0\nexposure_ms = 0", ["camera.exposure_ms = 0", "0.01 to 1000"]),
+            ("fps = 30.0", "fps = 30.0\ngain = \"auto\"", ["gain", "Setting"]),
             ("width_px = 640", "width_px = 320", ["image.region_px", "inside 320"]),
             ("register_base = 24", "register_base = 3", ["robot.register_base", "24 to 40"]),
         ] {

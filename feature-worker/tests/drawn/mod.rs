@@ -5,7 +5,7 @@
 use opencv::core::{self, CV_8UC3, Mat, Point, Point2f, Rect, Scalar, Size, Vector};
 use opencv::imgproc;
 use opencv::prelude::*;
-use shared::config::{CameraConfig, CameraSource, Config, ImageConfig, LiquidMethod};
+use shared::config::{CameraConfig, Config, ImageConfig, LiquidMethod};
 
 pub const WIDTH: i32 = 640;
 pub const HEIGHT: i32 = 480;
@@ -22,7 +22,7 @@ pub fn sim_config() -> &'static str {
 }
 
 pub fn camera() -> CameraConfig {
-    CameraConfig { source: CameraSource::SharedMemory, path: String::new(), width_px: WIDTH as u32, height_px: HEIGHT as u32, fps: 30.0 }
+    CameraConfig { width_px: WIDTH as u32, height_px: HEIGHT as u32, ..CameraConfig::default() }
 }
 
 pub fn image_config(method: LiquidMethod) -> ImageConfig {
