@@ -16,6 +16,8 @@ use shared::exit::{self, Failure, failure};
 use shared::messages::Phase;
 use shared::os;
 
+use crate::own_folder;
+
 /// Why the cell, or an operator's command in it, did not do what it was asked to.
 #[derive(Debug, thiserror::Error)]
 pub enum OwnCellError {
@@ -87,26 +89,26 @@ pub struct OwnCell {
 }
 
 impl OwnCell {
-    /// Makes the directory and the configuration; nothing runs yet. Weights of an earlier cell there are removed. `kind` becomes part of
-    /// the cell's name. From here on Ctrl-C ends what waits.
+    /// Makes the directory and the configuration; nothing runs yet. `results` of an earlier experiment there are removed, with its weights and
+    /// logs. `kind` becomes part of the cell's name. From here on Ctrl-C ends what waits.
     ///
     /// # Errors
-    /// When the configuration is bad, or a file cannot be written.
-    pub fn prepare(kind: &str, config: &Path, out: &Path, seed: u64) -> Result<Self, OwnCellError> {
+    /// When the configuration is bad, the directory is not an experiment's ([`own_folder::claim`]), or a file cannot be written.
+    pub fn prepare(kind: &str, config: &Path, (out, results): (&Path, &[&str]), seed: u64) -> Result<Self, OwnCellError> {
         let file = |what: &Path, error| OwnCellError::File { what: what.display().to_string(), error };
         let bad = |e: &dyn std::fmt::Display| OwnCellError::Config(e.to_string());
         let text = std::fs::read_to_string(config).map_err(|e| file(config, e))?;
         Config::parse(&text, &config.display().to_string()).map_err(|e| bad(&e))?;
         let mut table: toml::Table = text.parse().map_err(|e| bad(&format!("{}: {e}", config.display())))?;
-        let _ = std::fs::remove_dir_all(out.join("logs"));
-        let _ = std::fs::remove_file(out.join("weights.bin"));
+        own_folder::claim(out, &[results, &["logs", "weights.bin"]].concat())?;
         std::fs::create_dir_all(out.join("logs")).map_err(|e| file(out, e))?;
         let mut set = |section: &str, key: &str, value: toml::Value| {
             if let Some(toml::Value::Table(t)) = table.get_mut(section) {
                 t.insert(key.into(), value);
             }
         };
-        let path = |name: &str| toml::Value::String(out.join(name).display().to_string());
+        // Relative paths would start at the configuration, which lies in this directory.
+        let path = |name: &str| toml::Value::String(name.into());
         // With a name and an address of its own it leaves a cell alone that is already running.
         let number = std::process::id();
         let address = format!("127.{}.{}.{}", 1 + number / 65_536 % 250, number / 256 % 256, 1 + number % 254);
@@ -119,7 +121,7 @@ impl OwnCell {
         let config_file = out.join("sim.toml");
         let text = toml::to_string_pretty(&table).map_err(|e| bad(&e))?;
         std::fs::write(&config_file, &text).map_err(|e| file(&config_file, e))?;
-        let config = Config::parse(&text, &config_file.display().to_string()).map_err(|e| bad(&e))?;
+        let config = Config::read(&config_file).map_err(|e| bad(&e))?;
         let stop = os::stop_at_signals().map_err(|e| OwnCellError::Other(e.to_string()))?;
         let exe = std::env::current_exe().map_err(|e| file(Path::new("own program"), e))?;
         let bin = exe.parent().unwrap_or(Path::new(".")).to_path_buf();
@@ -135,8 +137,8 @@ impl OwnCell {
             let child = self.spawn(name)?;
             self.processes.push((name, child));
         }
-        let name = self.config.cell.name.clone();
-        let client = self.until("the cell", 20, || Client::connect(&name).map_err(|e| e.to_string()))?;
+        let place = self.config.cell.clone();
+        let client = self.until("the cell", 20, || Client::connect(&place).map_err(|e| e.to_string()))?;
         self.until("readiness of robot and camera", 30, || match client.status() {
             Ok(s) if s.phase == Phase::Idle && s.feature_sequence > 0 => Ok(()),
             Ok(s) if s.feature_sequence == 0 => Err("no camera frames".into()),
@@ -263,6 +265,6 @@ impl Drop for OwnCell {
     fn drop(&mut self) {
         self.stop();
         // This also removes what a killed process left.
-        shared::ipc::remove_files(&self.config.cell.name);
+        shared::ipc::remove_files(&self.config.cell);
     }
 }

@@ -44,8 +44,13 @@ fn quiet_libraries() {
 
 fn main() -> ExitCode {
     quiet_libraries();
-    shared::exit::end(match Cli::parse().command {
-        Command::Run(args) => run::run(&args),
+    let command = Cli::parse().command;
+    if matches!(command, Command::Calibrate(_) | Command::View(_)) {
+        let lost = "error: shared memory vanished: /dev/shm is full, or a file there was cut";
+        shared::os::explain_bus_errors(lost, shared::exit::UNREACHABLE, std::sync::Arc::default());
+    }
+    shared::exit::end(match command {
+        Command::Run(args) => return shared::exit::end_resident(run::run(&args)),
         Command::Calibrate(args) => calibrate::run(&args),
         Command::Camera(args) => camera::run(&args),
         Command::View(args) => view::run(&args),

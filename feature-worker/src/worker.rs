@@ -15,6 +15,7 @@ use shared::exit::{self, Failure, OrExit as _, failure};
 use shared::ipc::Cell;
 use shared::messages::{Doubt, Feature, FrameHeader, LAYOUT_VERSION, PixelFormat};
 use shared::os;
+use shared::speaker::Speaker;
 
 use crate::recorder::Recorder;
 use crate::source::{Frame, FrameStream, Source, SourceError, StreamEvent, WAIT};
@@ -37,25 +38,43 @@ pub fn run(config: &Config, json: bool) -> Result<(), Failure> {
     // OpenCV's own threads would run on the controller's core and wait for each other.
     opencv::core::set_num_threads(1).or_exit(exit::BAD_INPUT)?;
     let extractor = Extractor::new(&config.camera, &config.image).or_exit(exit::BAD_INPUT)?;
-    let cell = Cell::join(&config.cell.name).or_exit(exit::UNREACHABLE)?;
+    let lost = "feature-worker: shared memory vanished: /dev/shm is full, or a file there was cut. The worker ends";
+    os::explain_bus_errors(lost, exit::FAILED, Arc::clone(&stop));
+    let speaker = Arc::new(Speaker::start("feature-worker"));
+    let result = measure_until_stopped(config, extractor, &stop, &speaker, json);
+    speaker.finish();
+    result
+}
+
+/// Opens everything and measures, until `stop` is set or the camera ends.
+fn measure_until_stopped(
+    config: &Config,
+    extractor: Extractor,
+    stop: &Arc<AtomicBool>,
+    speaker: &Arc<Speaker>,
+    json: bool,
+) -> Result<(), Failure> {
+    let cell = Cell::join(&config.cell).or_exit(exit::UNREACHABLE)?;
+    cell.check_space(shared_memory_bytes(config)).or_exit(exit::UNREACHABLE)?;
     let publisher = cell.features().or_exit(exit::UNREACHABLE)?.publisher_builder().create().map_err(|e| {
         failure(
             exit::UNREACHABLE,
             format!("cell '{}': service 'feature': {e:?}; is another feature worker running? Stop it first", config.cell.name),
         )
     })?;
+    cell.reserve().or_exit(exit::UNREACHABLE)?;
     // The republisher comes before the camera is opened: a view that holds the camera sees it and lets go.
     let republisher = match config.camera.source {
         CameraSource::SharedMemory => None,
         _ => Some(FrameRepublisher::new(&cell, config)?),
     };
-    let source = open_source(config, &cell, &stop)?;
+    let source = open_source(config, &cell, stop)?;
     // Threads inherit the core and the priority, so the other threads start first.
     let recorder = Recorder::start(config).or_exit(exit::FAILED)?;
     let latest = Arc::new(ArrayQueue::new(1));
-    let printer = status::start_printer(&latest, &stop, json).map_err(|e| failure(exit::FAILED, format!("status thread: {e}")))?;
+    let printer = status::start_printer(&latest, stop, speaker, json).map_err(|e| failure(exit::FAILED, format!("status thread: {e}")))?;
     for missing in os::become_realtime(config.worker.core, config.worker.priority) {
-        eprintln!("feature-worker: {missing}");
+        speaker.say(&missing);
     }
     let mut worker = Worker {
         extractor,
@@ -67,11 +86,18 @@ pub fn run(config: &Config, json: bool) -> Result<(), Failure> {
         status: Status { doubt: Doubt::None.words(), ..Status::default() },
         latest: &latest,
     };
-    let result = worker.work(FrameStream::new(source, &stop));
+    let result = worker.work(FrameStream::new(source, stop));
     stop.store(true, Relaxed);
     worker.recorder.stop();
     let _ = printer.join();
     result
+}
+
+/// Space in `/dev/shm` that the worker's ports take, bytes: a little for features and reports, and 17 frames if it publishes a device's.
+fn shared_memory_bytes(config: &Config) -> u64 {
+    let frame = u64::from(config.camera.width_px) * u64::from(config.camera.height_px) * PixelFormat::Bgr8.bytes_per_pixel() as u64;
+    let frames = if config.camera.source == CameraSource::SharedMemory { 0 } else { 18 };
+    (2 << 20) + frames * frame
 }
 
 /// Opens the camera; waits a while for a view that holds it.

@@ -231,7 +231,8 @@ const PICTURES: u64 = 36;
 /// KiB that the cell holds in shared memory. Pages that were never written do not count.
 fn held_kib(cell: &str) -> std::io::Result<u64> {
     use std::os::unix::fs::MetadataExt as _;
-    let prefix = format!("decant_{cell}_");
+    let directory = shared::runtime_dir::Place::from(cell).path();
+    let prefix = format!("decant-{}_", std::fs::read_to_string(directory.join("token"))?);
     let files = std::fs::read_dir("/dev/shm")?.flatten().filter(|f| f.file_name().to_string_lossy().starts_with(&prefix));
     Ok(files.map(|f| f.metadata().map_or(0, |m| m.blocks() / 2)).sum())
 }

@@ -11,15 +11,21 @@ use iceoryx2::port::client::Client as Port;
 use iceoryx2::service::ipc::Service as Ipc;
 use indicatif::ProgressStyle;
 use shared::control::{Outcome, Reply, Request, Status};
+use shared::exit;
 use shared::ipc::{Cell, InService as _, IpcError};
 use shared::messages::{RecorderReport, RecorderState};
 use shared::os;
+use shared::runtime_dir::Place;
+
+use crate::stop_client::Target;
 
 /// Largest request or answer, bytes. Chosen by hand; no measurement is recorded.
 pub const MESSAGE_MAX: usize = 64 * 1024;
 
 /// Longest wait for the controller's answer. Chosen by hand: it answers within a tick and a pause of its service thread, below 0.1 s.
 const ANSWER: Duration = Duration::from_secs(2);
+/// Longest wait for a connection. Chosen by hand: it takes milliseconds, or two seconds while another process hangs in joining.
+const CONNECTING: Duration = Duration::from_secs(5);
 /// Longest wait for the recorder to close a file. Chosen by hand; no measurement is recorded.
 const FILE_CLOSED: Duration = Duration::from_secs(10);
 /// How many times in a row the controller may be asked and not know the episode that it started, before it counts as restarted. Chosen by
@@ -30,7 +36,7 @@ const UNKNOWN_MAX: u32 = 10;
 #[derive(Debug, clap::Args)]
 pub struct Common {
     /// The cell's configuration.
-    #[arg(long, default_value = shared::config::DEFAULT_FILE)]
+    #[arg(long, env = shared::config::VARIABLE, default_value = shared::config::DEFAULT_FILE)]
     pub config: PathBuf,
     /// Prints the result as JSON.
     #[arg(long)]
@@ -60,21 +66,40 @@ pub enum ClientError {
 /// A connection to the running controller.
 pub struct Client {
     port: Port<Ipc, [u8], (), [u8], ()>,
-    cell: String,
+    place: Place,
     _cell: Cell,
 }
 
 impl Client {
-    /// Connects to the controller of the cell `name`.
-    pub fn connect(name: &str) -> Result<Self, ClientError> {
-        let cell = Cell::join(name)?;
+    /// Connects to the controller of the cell `place`: the table `[cell]` of the configuration, or a name.
+    pub fn connect(place: impl Into<Place>) -> Result<Self, ClientError> {
+        let place = place.into();
+        let cell = Cell::join(&place)?;
         let port = cell.control()?.client_builder().initial_max_slice_len(MESSAGE_MAX).create().in_service("control")?;
-        Ok(Self { port, cell: name.into(), _cell: cell })
+        cell.reserve()?;
+        Ok(Self { port, place, _cell: cell })
+    }
+
+    /// Connects as a command does: it ends the process with a line if iceoryx2 does not come back, as it does not when somebody cut the cell's
+    /// files in `/dev/shm` to nothing.
+    pub fn connect_or_end(place: impl Into<Place>) -> Result<Self, ClientError> {
+        let (done, watched) = std::sync::mpsc::channel::<()>();
+        let watch = move || {
+            if watched.recv_timeout(CONNECTING) == Err(std::sync::mpsc::RecvTimeoutError::Timeout) {
+                os::tell("error: the cell's files in /dev/shm do not answer: end all programs of the cell and start them again");
+                std::process::exit(exit::UNREACHABLE.into());
+            }
+        };
+        // Without a thread it can only be hoped that the files are whole.
+        let _watching = std::thread::Builder::new().name("watch".into()).spawn(watch);
+        let client = Self::connect(place);
+        drop(done);
+        client
     }
 
     /// Sends `request` and waits for the answer, up to two seconds.
     pub fn ask(&self, request: &Request) -> Result<Reply, ClientError> {
-        let no_answer = || ClientError::NoAnswer { cell: self.cell.clone() };
+        let no_answer = || ClientError::NoAnswer { cell: self.place.name.clone() };
         let mut buffer = vec![0; MESSAGE_MAX];
         let bytes = postcard::to_slice(request, &mut buffer).map_err(|_| ClientError::Version)?;
         let loan = self.port.loan_slice_uninit(bytes.len()).map_err(|_| no_answer())?;
@@ -119,7 +144,10 @@ impl Client {
         let (mut aborted, mut unknown) = (false, 0);
         loop {
             if interrupted.load(Ordering::Relaxed) && !aborted {
-                self.ask(&Request::Abort)?;
+                // The stop socket works where shared memory does not.
+                if Target::from(self.place.clone()).ask("abort").is_none() {
+                    self.ask(&Request::Abort)?;
+                }
                 aborted = true;
             }
             let status = self.status()?;
@@ -153,10 +181,11 @@ pub struct RecorderReports {
 }
 
 impl RecorderReports {
-    /// Subscribes to the reports in the cell `name`.
-    pub fn open(name: &str) -> Result<Self, IpcError> {
-        let cell = Cell::join(name)?;
+    /// Subscribes to the reports in the cell `place`.
+    pub fn open(place: impl Into<Place>) -> Result<Self, IpcError> {
+        let cell = Cell::join(place)?;
         let subscriber = cell.recorder()?.subscriber_builder().create().in_service("recorder")?;
+        cell.reserve()?;
         Ok(Self { subscriber, _cell: cell })
     }
 

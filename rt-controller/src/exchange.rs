@@ -3,7 +3,7 @@
 //! The loop never blocks on them and never frees what it got: boxes that it no longer needs go back through a queue, and an ordinary
 //! thread drops them. When a queue is full, the loop counts the events that it could not pass on ([`Exchange::events_lost`]).
 
-use std::sync::atomic::{AtomicBool, AtomicU64};
+use std::sync::atomic::{AtomicBool, AtomicU32, AtomicU64};
 
 use crossbeam::queue::ArrayQueue;
 use shared::agent::Agent;
@@ -72,6 +72,14 @@ pub struct Timing {
 
 /// Everything that the threads share.
 pub struct Exchange {
+    /// To the loop: bring the container upright at once. It comes before every order in the queue.
+    pub abort: AtomicBool,
+    /// To the loop: bring the container upright, and then end. It comes before everything else.
+    pub shutdown: AtomicBool,
+    /// From the loop: its phase after the newest tick.
+    pub phase: AtomicU32,
+    /// From the loop: the bits of the measured alpha of the newest tick, degrees; NaN without a robot.
+    pub alpha_measured: AtomicU32,
     /// To the loop: orders.
     pub orders: ArrayQueue<Order>,
     /// From the loop: events.
@@ -114,6 +122,10 @@ const OLD: usize = 4;
 impl Default for Exchange {
     fn default() -> Self {
         Self {
+            abort: AtomicBool::new(false),
+            shutdown: AtomicBool::new(false),
+            phase: AtomicU32::new(0),
+            alpha_measured: AtomicU32::new(f32::NAN.to_bits()),
             orders: ArrayQueue::new(ORDERS),
             events: ArrayQueue::new(EVENTS),
             agents: ArrayQueue::new(1),

@@ -7,13 +7,14 @@
 //! postcard.
 
 use std::collections::BTreeMap;
-use std::fs::File;
-use std::io::{BufReader, BufWriter, Read, Write};
+use std::fs::{File, OpenOptions};
+use std::io::{BufReader, BufWriter, ErrorKind, Read, Write};
 use std::path::Path;
 
 use serde::{Deserialize, Serialize};
 use shared::agent::Agent;
 use shared::messages::Feature;
+use shared::regular_file;
 use shared::weights::Weights;
 
 use crate::core::{Core, Input, MAX_FEATURES, Order, Robot, Settings};
@@ -100,22 +101,43 @@ pub enum JournalError {
     },
 }
 
-/// Writes a journal, from an ordinary thread.
-pub struct Writer {
-    file: BufWriter<File>,
+/// Writes a journal, from an ordinary thread, to a file or to anything else that takes bytes.
+pub struct Writer<W: Write = BufWriter<File>> {
+    to: W,
     written: u64,
+    /// Where an entry is put together.
+    buffer: Vec<u8>,
 }
 
 impl Writer {
-    /// Starts a journal. One that is there already is kept beside it, with the ending `before.bin` instead of its own.
+    /// Starts a journal. One that is there already is kept beside it, with the ending `before.bin` instead of its own. A file that is no
+    /// journal, or one that another controller writes, is an error and stays as it is.
     pub fn create(path: &Path, settings: &Settings) -> std::io::Result<Self> {
         if let Some(parent) = path.parent() {
             std::fs::create_dir_all(parent)?;
         }
-        // The journal of the run before is wanted most after that run has crashed.
-        let _ = std::fs::rename(path, path.with_extension("before.bin"));
-        let mut this = Self { file: BufWriter::new(File::create(path)?), written: 0 };
-        this.file.write_all(MAGIC)?;
+        if path.symlink_metadata().is_ok() {
+            let before = path.with_extension("before.bin");
+            let held = check_is_journal(path)?;
+            if before.symlink_metadata().is_ok() {
+                check_is_journal(&before)?;
+            }
+            // The journal of the run before is wanted most after that run has crashed.
+            std::fs::rename(path, before)?;
+            drop(held);
+        }
+        let file = OpenOptions::new().write(true).create_new(true).open(path)?;
+        // Whoever looks meets the lock; a file system without locks has none to give.
+        let _ = file.try_lock();
+        Self::begin(BufWriter::new(file), settings)
+    }
+}
+
+impl<W: Write> Writer<W> {
+    /// Starts a journal that goes to `to`.
+    pub fn begin(to: W, settings: &Settings) -> std::io::Result<Self> {
+        let mut this = Self { to, written: 0, buffer: vec![0; ENTRY_MAX] };
+        this.to.write_all(MAGIC)?;
         this.entry(&Entry::Settings(*settings))?;
         Ok(this)
     }
@@ -133,19 +155,33 @@ impl Writer {
 
     /// Passes everything that was added on to the operating system.
     pub fn flush(&mut self) -> std::io::Result<()> {
-        self.file.flush()
+        self.to.flush()
     }
 
     fn entry(&mut self, entry: &Entry) -> std::io::Result<()> {
         if self.written > FILE_MAX {
             return Err(std::io::Error::other("the journal is full (2 GiB)"));
         }
-        let mut buffer = vec![0; ENTRY_MAX];
-        let bytes = postcard::to_slice(entry, &mut buffer).map_err(std::io::Error::other)?;
+        let bytes = postcard::to_slice(entry, &mut self.buffer).map_err(std::io::Error::other)?;
         self.written += 4 + bytes.len() as u64;
-        self.file.write_all(&(bytes.len() as u32).to_le_bytes())?;
-        self.file.write_all(bytes)
+        self.to.write_all(&(bytes.len() as u32).to_le_bytes())?;
+        self.to.write_all(bytes)
     }
+}
+
+/// Checks that the file at `path` is a journal of any version, or empty, and that nobody writes it. Gives it, locked.
+fn check_is_journal(path: &Path) -> std::io::Result<File> {
+    let named = |what: &str| std::io::Error::new(ErrorKind::InvalidInput, format!("{} {what}", path.display()));
+    let (mut file, meta) = regular_file::open(path).map_err(|e| named(&e.to_string()))?;
+    let mut magic = [0; MAGIC.len()];
+    let whole = file.read_exact(&mut magic).is_ok();
+    if meta.len() > 0 && !(whole && magic.starts_with(&MAGIC[..7])) {
+        return Err(named("is no journal and is left as it is: choose another controller.journal"));
+    }
+    if let Err(std::fs::TryLockError::WouldBlock) = file.try_lock() {
+        return Err(named("is being written by another controller: choose another controller.journal"));
+    }
+    Ok(file)
 }
 
 /// What a replay found.
@@ -165,12 +201,18 @@ pub struct Replay {
     pub cut_off: bool,
 }
 
-/// Replays a journal through a new [`Core`] and compares every answer bit by bit. `seen` is called with each tick and the answer that the
-/// replay gave.
-pub fn replay(path: &Path, mut seen: impl FnMut(&Tick, &crate::core::Output)) -> Result<Replay, JournalError> {
+/// Replays the journal in a file. See [`replay_from`].
+pub fn replay(path: &Path, seen: impl FnMut(&Tick, &crate::core::Output)) -> Result<Replay, JournalError> {
     let file = path.display().to_string();
+    let reader = File::open(path).map_err(|e| JournalError::Read { file: file.clone(), what: e.to_string() })?;
+    replay_from(BufReader::new(reader), &file, seen)
+}
+
+/// Replays a journal through a new [`Core`] and compares every answer bit by bit. `name` is what errors call the journal; `seen` is called with each tick and the answer that the
+/// replay gave.
+pub fn replay_from(mut reader: impl Read, name: &str, mut seen: impl FnMut(&Tick, &crate::core::Output)) -> Result<Replay, JournalError> {
+    let file = name.to_owned();
     let read = |e: std::io::Error| JournalError::Read { file: file.clone(), what: e.to_string() };
-    let mut reader = BufReader::new(File::open(path).map_err(read)?);
     let mut magic = [0; 8];
     if reader.read_exact(&mut magic).is_err() || &magic != MAGIC {
         return Err(JournalError::Foreign { file });

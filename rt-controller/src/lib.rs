@@ -10,12 +10,16 @@
 //! | [`link`] | RTDE client and the program on the robot | connects in an ordinary thread, then the loop's |
 //! | [`robot_thread`] | connects the robot and hands it over to the loop | ordinary, a thread of its own |
 //! | [`service`] | clients and telemetry | ordinary, the main thread |
-//! | [`disk`] | journal and weight file | ordinary, a thread of its own |
+//! | [`disk`] | journal, weight file, episodes' numbers | ordinary, a thread of its own |
+//! | [`stop`] | the way to stop a motion that depends on nothing else, and its end | ordinary, a thread of its own |
+//! | [`stop_client`] | the clients' side of it | their own process |
+//! | [`claim`] | one controller in a cell, no file in two cells | ordinary |
 //! | [`journal`] | every tick's inputs, and their replay | ordinary |
 //! | [`client`] | the clients' side of the service | their own process |
 //! | [`commands`] | the subcommands | their own process |
 #![forbid(unsafe_code)]
 
+pub mod claim;
 pub mod client;
 pub mod commands;
 pub mod control_loop;
@@ -27,4 +31,6 @@ pub mod link;
 pub mod pacing;
 pub mod robot_thread;
 pub mod service;
+pub mod stop;
+pub mod stop_client;
 pub mod timing;

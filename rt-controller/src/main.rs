@@ -43,8 +43,12 @@ fn main() -> ExitCode {
     if matches!(command, Command::Status(_) | Command::Replay(_)) {
         shared::os::end_when_nobody_reads();
     }
+    if matches!(command, Command::Pour(_) | Command::Record(_) | Command::Resume(_) | Command::Status(_)) {
+        let lost = "error: shared memory vanished: /dev/shm is full, or a file there was cut; `rt-controller abort` needs none";
+        shared::os::explain_bus_errors(lost, shared::exit::UNREACHABLE, std::sync::Arc::default());
+    }
     shared::exit::end(match command {
-        Command::Run(args) => run::run(&args),
+        Command::Run(args) => return shared::exit::end_resident(run::run(&args)),
         Command::Pour(args) => pour::run(&args),
         Command::Record(args) => record::run(&args),
         Command::Abort(args) => abort::run(&args),

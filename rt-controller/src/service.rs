@@ -5,12 +5,12 @@
 //! so. If it falls behind, the loop goes on and counts what it could not tell. Nothing here ends the process but a signal, or another
 //! controller in the same cell.
 
-use std::collections::VecDeque;
-use std::sync::atomic::{AtomicBool, AtomicU64, Ordering::Relaxed};
+use std::collections::{BTreeSet, VecDeque};
+use std::sync::atomic::{AtomicU64, Ordering::Relaxed, Ordering::SeqCst};
 use std::sync::{Mutex, PoisonError};
 use std::time::Duration;
 
-use crossbeam::channel::Sender;
+use crossbeam::channel::{Receiver, Sender};
 use iceoryx2::active_request::ActiveRequest;
 use iceoryx2::port::publisher::Publisher;
 use iceoryx2::port::server::Server;
@@ -21,6 +21,7 @@ use shared::messages::{Phase, Telemetry};
 
 use crate::client::MESSAGE_MAX;
 use crate::core::{Counters, Order, Refusal};
+use crate::disk::Queues;
 use crate::exchange::{Event, Exchange};
 use crate::journal::Tick;
 use crate::robot_thread::RobotNote;
@@ -47,19 +48,21 @@ pub struct Service<'a> {
     journal: Option<Sender<Box<Tick>>>,
     latest: Option<(Telemetry, Counters)>,
     outcomes: VecDeque<Outcome>,
-    /// The requests whose orders are in the queue, in the same order, each with its episode's number (0 for an abort); `None` for an order
-    /// that is the service's own.
-    waiting: VecDeque<Option<(Asked, u64)>>,
-    next_episode: u64,
+    /// The requests whose orders are in the queue, in the same order, each with its episode's number.
+    waiting: VecDeque<(Asked, u64)>,
+    /// Numbers that nobody has used, the smallest first; they belong to no file.
+    numbers: Receiver<u64>,
+    /// Numbers of orders that were refused: the next order takes them.
+    spare: BTreeSet<u64>,
 }
 
 impl<'a> Service<'a> {
-    /// Opens the services; fails when another controller has them. `journal` takes the ticks, if one is kept.
+    /// Opens the services; fails when another controller has them. `disk` leads to the disk's thread.
     pub fn open(
         cell: &Cell,
         exchange: &'a Exchange,
         (robot_note, robot_connections): (&'a RobotNote, &'a AtomicU64),
-        (refused, journal): (&'a Mutex<String>, Option<Sender<Box<Tick>>>),
+        (refused, disk): (&'a Mutex<String>, Queues),
         say: &'a dyn Fn(&str),
     ) -> Result<Self, IpcError> {
         let server = cell
@@ -70,8 +73,6 @@ impl<'a> Service<'a> {
             .create()
             .in_service("control")?;
         let telemetry = cell.telemetry()?.publisher_builder().create().in_service("telemetry")?;
-        // Episode numbers grow over restarts, so that a recorder never takes two runs for one.
-        let next_episode = std::time::SystemTime::now().duration_since(std::time::UNIX_EPOCH).map_or(1, |d| d.as_secs());
         Ok(Self {
             exchange,
             robot_note,
@@ -80,24 +81,18 @@ impl<'a> Service<'a> {
             server,
             telemetry,
             refused,
-            journal,
+            journal: disk.journal,
             latest: None,
             outcomes: VecDeque::new(),
             waiting: VecDeque::new(),
-            next_episode,
+            numbers: disk.numbers,
+            spare: BTreeSet::new(),
         })
     }
 
-    /// Works until the loop has ended, which `stop` asks it to do.
-    pub fn run(mut self, stop: &AtomicBool) {
-        let mut stopping = false;
+    /// Works until the loop has ended.
+    pub fn run(mut self) {
         while !self.exchange.ended.load(Relaxed) {
-            if stop.load(Relaxed) && !stopping {
-                stopping = self.exchange.orders.push(Order::Shutdown).is_ok();
-                if stopping {
-                    self.waiting.push_back(None);
-                }
-            }
             while self.exchange.old_agents.pop().is_some() {}
             self.take_events();
             self.answer();
@@ -120,15 +115,15 @@ impl<'a> Service<'a> {
                     let _ = self.telemetry.send_copy(telemetry);
                 }
                 Event::Ordered(answer) => {
-                    if let Some(Some((asked, episode))) = self.waiting.pop_front() {
-                        reply(
-                            &asked,
-                            &match answer {
-                                Ok(()) if episode == 0 => Reply::Aborting,
-                                Ok(()) => Reply::Started { episode },
-                                Err(refusal) => Reply::Refused { reason: self.words(refusal) },
-                            },
-                        );
+                    if let Some((asked, episode)) = self.waiting.pop_front() {
+                        let answer = match answer {
+                            Ok(()) => Reply::Started { episode },
+                            Err(refusal) => {
+                                self.spare.insert(episode);
+                                Reply::Refused { reason: self.words(refusal) }
+                            }
+                        };
+                        reply(&asked, &answer);
                     }
                 }
                 Event::Ended(outcome) => {
@@ -174,7 +169,7 @@ impl<'a> Service<'a> {
                 );
                 continue;
             };
-            let (order, episode) = match request {
+            let order = match request {
                 Request::Status => {
                     reply(&asked, &Reply::Status(Box::new(self.status())));
                     continue;
@@ -185,16 +180,32 @@ impl<'a> Service<'a> {
                     reply(&asked, &Reply::Resuming);
                     continue;
                 }
-                Request::Abort => (Order::Abort, 0),
-                Request::Pour { goal_ml } => (Order::Pour { episode: self.next_episode, goal_ml }, self.next_episode),
-                Request::Record(curve) => (Order::Record { episode: self.next_episode, curve }, self.next_episode),
+                Request::Abort => {
+                    self.exchange.abort.store(true, SeqCst);
+                    reply(&asked, &Reply::Aborting);
+                    continue;
+                }
+                Request::Pour { goal_ml } => self.next_number().map(|episode| (Order::Pour { episode, goal_ml }, episode)),
+                Request::Record(curve) => self.next_number().map(|episode| (Order::Record { episode, curve }, episode)),
             };
-            self.next_episode += u64::from(episode != 0);
+            let Some((order, episode)) = order else {
+                let reason = "the disk has not given the next episode's number yet: try again, and see what `rt-controller run` says";
+                reply(&asked, &Reply::Refused { reason: reason.into() });
+                continue;
+            };
             match self.exchange.orders.push(order) {
-                Ok(()) => self.waiting.push_back(Some((asked, episode))),
-                Err(_) => reply(&asked, &Reply::Refused { reason: "too many orders at once: try again".into() }),
+                Ok(()) => self.waiting.push_back((asked, episode)),
+                Err(_) => {
+                    self.spare.insert(episode);
+                    reply(&asked, &Reply::Refused { reason: "too many orders at once: try again".into() });
+                }
             }
         }
+    }
+
+    /// A number that no episode has had, if the disk has given one.
+    fn next_number(&mut self) -> Option<u64> {
+        self.spare.pop_first().or_else(|| self.numbers.try_recv().ok())
     }
 
     fn status(&self) -> Status {

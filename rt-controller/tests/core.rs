@@ -38,6 +38,9 @@ struct ToyCell {
     epoch_ns: u64,
     alpha_deg: f32,
     hindrance: Option<EndReason>,
+    speed_scaling: Option<f32>,
+    /// Largest rate of the joint, degrees/s.
+    joint_deg_s: f32,
     doubt: Doubt,
     camera: bool,
     dry: bool,
@@ -64,6 +67,8 @@ impl ToyCell {
             epoch_ns: 7,
             alpha_deg: 0.0,
             hindrance: None,
+            speed_scaling: None,
+            joint_deg_s: f32::INFINITY,
             doubt: Doubt::None,
             camera: true,
             dry: false,
@@ -109,12 +114,14 @@ impl ToyCell {
     }
 
     fn step(&mut self, features: &[Feature], order: Option<Order>) -> Output {
-        let robot = Robot { hindrance: self.hindrance, ..Robot::that_may_move(self.alpha_deg, self.now_ns) };
+        let Self { hindrance, speed_scaling, .. } = *self;
+        let robot = Robot { hindrance, speed_scaling, ..Robot::that_may_move(self.alpha_deg, self.now_ns) };
         let output = self.core.step(&Input { now_ns: self.now_ns, features, robot, order });
         if let Some(target_deg) = output.target_deg {
             let rate = (target_deg - self.alpha_deg).abs() / (self.settings.period_ns as f32 / 1e9);
             self.largest_rate_deg_s = self.largest_rate_deg_s.max(rate);
-            self.alpha_deg = target_deg;
+            let most_deg = self.joint_deg_s * self.settings.period_ns as f32 / 1e9;
+            self.alpha_deg += (target_deg - self.alpha_deg).clamp(-most_deg, most_deg);
         }
         output
     }
@@ -312,6 +319,68 @@ fn a_joint_that_stays_tilted_is_reported() {
         cell.tick_with_joint_at(30.0);
     }
     assert_eq!(cell.last_ended.map(|o| o.reason), Some(EndReason::NotUpright));
+}
+
+/// Protects the cup from a robot that is slower than it is commanded: the pour ends with its own reason before anything flows, no command is
+/// out of the joint's reach, and the result waits until the joint is upright, however long that takes.
+#[test]
+fn a_joint_that_does_not_follow_ends_the_pour() {
+    for joint_deg_s in [30.0, 20.0, 10.0, 2.0] {
+        let mut cell = ToyCell::new();
+        cell.core.exchange(always(20));
+        cell.joint_deg_s = joint_deg_s;
+        cell.pour(75.0).expect("ready");
+        let outcome = cell.finish();
+        assert_eq!(outcome.reason, EndReason::NotFollowed, "{joint_deg_s}");
+        assert!(cell.alpha_deg.abs() <= 2.0 && cell.out_ml == 0.0, "{joint_deg_s}: {} degrees, {} ml", cell.alpha_deg, cell.out_ml);
+        // The same pour again, to look at the commands.
+        (0..100).for_each(|_| _ = cell.tick(None));
+        cell.pour(75.0).expect("ready again");
+        let mut farthest_deg = 0.0f32;
+        while cell.core.phase() == Phase::Pouring {
+            let before_deg = cell.alpha_deg;
+            let commanded_deg = cell.tick(None).target_deg.unwrap_or(0.0);
+            farthest_deg = farthest_deg.max(commanded_deg - before_deg);
+        }
+        // The reach is 90 degrees/s for 0.23 s, and 2 degrees.
+        assert!(farthest_deg < 24.0, "{joint_deg_s}: {farthest_deg} degrees ahead");
+    }
+}
+
+/// Protects the operator from a wrong amount that looks right: if the way back is not followed, more flows than was foreseen, and the pour is
+/// not done. What was given up for another reason keeps it. Both are waited for.
+#[test]
+fn a_slow_way_back_is_waited_for_and_is_not_done() {
+    for (abort, reason) in [(false, EndReason::NotFollowed), (true, EndReason::Aborted)] {
+        let mut cell = ToyCell::new();
+        cell.pour(4.0).expect("ready");
+        cell.run_to_flow();
+        if abort {
+            cell.tick(Some(Order::Abort));
+        }
+        while cell.core.phase() == Phase::Pouring {
+            cell.tick(None);
+        }
+        cell.joint_deg_s = 8.0;
+        let outcome = cell.finish();
+        assert_eq!(outcome.reason, reason);
+        assert!(cell.alpha_deg.abs() <= 2.0 && outcome.seconds > 5.0, "{} degrees after {} s", cell.alpha_deg, outcome.seconds);
+        assert!((outcome.poured_ml - cell.out_ml).abs() < 0.05, "what flowed meanwhile is counted");
+    }
+}
+
+/// Protects the dose before anything moves: a robot that slows itself, and a joint that is not upright, are refused by name.
+#[test]
+fn a_slowed_or_tilted_robot_is_refused() {
+    let mut cell = ToyCell::new();
+    cell.speed_scaling = Some(0.4);
+    assert_eq!(cell.pour(50.0), Err(Refusal::Slowed(0.4)));
+    assert!(Refusal::Slowed(0.4).to_string().contains("40 % of its speed (speed_scaling)"));
+    cell.speed_scaling = Some(1.0);
+    cell.alpha_deg = 5.0;
+    assert_eq!(cell.pour(50.0), Err(Refusal::NotUpright(5.0)));
+    (0..10).for_each(|_| _ = cell.tick(None));
+    cell.pour(50.0).expect("upright again");
 }
 
 /// Protects d from being counted twice: repeated, older and foreign features are ignored and counted.

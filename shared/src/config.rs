@@ -1,16 +1,20 @@
 //! The cell's configuration, one TOML file: `config/cell.toml` for the real cell, `config/sim.toml` for the simulated one.
 //!
 //! Every process reads it once at its start, in an ordinary thread, and that allocates. Unknown keys, wrong types and values out of range
-//! are refused with a [`ConfigError`], which names the file, the key and what is allowed. Relative paths start at the working directory.
+//! are refused with a [`ConfigError`], which names the file, the key and what is allowed. Relative paths start at the directory of the file.
 
 use std::net::IpAddr;
 use std::path::{Path, PathBuf};
 
 use serde::{Deserialize, Serialize};
 
+pub use crate::config_camera::{CameraConfig, CameraSource, Locked, Refused, Setting};
+use crate::config_paths;
 use crate::limits::Limits;
 
-/// The file that is read without `--config`: the simulated cell, so that a real robot only moves when its file is named.
+/// The environment variable that names the configuration where `--config` is not given.
+pub const VARIABLE: &str = "DECANT_CONFIG";
+/// The file that is read without `--config` and without [`VARIABLE`]: the simulated cell, so that a real robot only moves when its file is named.
 pub const DEFAULT_FILE: &str = "config/sim.toml";
 
 /// The rule for a cell's name, in words; the name becomes part of file names.
@@ -86,103 +90,9 @@ pub struct Config {
 pub struct CellConfig {
     /// The name that sets this cell's shared memory apart: 1 to 32 letters, digits, '-' or '_'.
     pub name: String,
-}
-
-/// Where frames come from.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "kebab-case")]
-pub enum CameraSource {
-    /// A V4L2 device through OpenCV.
-    Device,
-    /// A video file through OpenCV.
-    Video,
-    /// An image sequence through OpenCV (`frame_%04d.png`).
-    Images,
-    /// Frames that another process publishes in the cell's shared memory (service `frame`).
-    SharedMemory,
-}
-
-/// The table `[camera]`.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct CameraConfig {
-    /// Where frames come from.
-    pub source: CameraSource,
-    /// Device (`/dev/v4l/by-id/...`), video file or image pattern; empty for shared memory.
-    #[serde(default)]
-    pub path: String,
-    /// Width in px.
-    pub width_px: u32,
-    /// Height in px.
-    pub height_px: u32,
-    /// Frames a second.
-    pub fps: f64,
-    /// Exposure time of a device, ms. This and what follows is set at the start and read back; without it, it is left alone.
-    #[serde(default)]
-    pub exposure_ms: Option<Setting>,
-    /// Gain of a device, in its own numbers.
-    #[serde(default)]
-    pub gain: Option<Setting>,
-    /// White balance of a device, K.
-    #[serde(default)]
-    pub white_balance_k: Option<Setting>,
-    /// Focus of a device, in its own numbers.
-    #[serde(default)]
-    pub focus: Option<Setting>,
-    /// The mains' frequency, against which a device's exposure is timed, Hz: 50, 60, or 0 for light that does not flicker.
-    #[serde(default)]
-    pub mains_hz: Option<Setting>,
-    /// What it means that the device refuses one of these.
-    #[serde(default)]
-    pub refused: Refused,
-}
-
-impl Default for CameraConfig {
-    /// Frames of 640 x 480 px at 30 Hz from shared memory.
-    fn default() -> Self {
-        Self {
-            source: CameraSource::SharedMemory,
-            path: String::new(),
-            width_px: 640,
-            height_px: 480,
-            fps: 30.0,
-            exposure_ms: None,
-            gain: None,
-            white_balance_k: None,
-            focus: None,
-            mains_hz: None,
-            refused: Refused::Error,
-        }
-    }
-}
-
-/// How a setting of a device is set.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
-#[serde(untagged)]
-pub enum Setting {
-    /// To this value; its automatic is switched off.
-    Value(f64),
-    /// To what it is at the start; its automatic is switched off.
-    Locked(Locked),
-}
-
-/// The word "locked".
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "kebab-case")]
-#[allow(missing_docs)]
-pub enum Locked {
-    Locked,
-}
-
-/// What it means that a device refuses a setting.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
-#[serde(rename_all = "kebab-case")]
-pub enum Refused {
-    /// The worker does not start.
-    #[default]
-    Error,
-    /// The worker says so and starts.
-    Warning,
+    /// The directory in which a directory of the cell's name holds its runtime files; without this key [`crate::runtime_dir`] chooses one.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub runtime_dir: Option<PathBuf>,
 }
 
 /// How liquid is told from the background.
@@ -329,7 +239,40 @@ impl Config {
         let name = file.display().to_string();
         let text = std::fs::read_to_string(file)
             .map_err(|e| ConfigError::Read { file: name.clone(), what: format!("{e}; give --config FILE") })?;
-        Self::parse(&text, &name)
+        let mut config = Self::parse(&text, &name)?;
+        config.place_beside(file);
+        config.check_paths(file)?;
+        Ok(config)
+    }
+
+    /// Makes the paths absolute. Relative ones start at the directory of `file`.
+    fn place_beside(&mut self, file: &Path) {
+        let place = |path: &mut PathBuf| *path = config_paths::beside(file, path);
+        place(&mut self.controller.weights);
+        place(&mut self.recording.directory);
+        self.controller.journal.iter_mut().for_each(place);
+        self.cell.runtime_dir.iter_mut().for_each(place);
+        if matches!(self.camera.source, CameraSource::Device | CameraSource::Video | CameraSource::Images) {
+            self.camera.path = config_paths::beside(file, Path::new(&self.camera.path)).display().to_string();
+        }
+    }
+
+    /// Refuses a configuration in which two keys mean one file, or a key means `file` itself.
+    fn check_paths(&self, file: &Path) -> Result<(), ConfigError> {
+        let mut paths = vec![("the configuration", file.to_path_buf()), ("controller.weights", self.controller.weights.clone())];
+        if let Some(journal) = &self.controller.journal {
+            paths.push(("controller.journal", journal.clone()));
+            paths.push(("the journal before, controller.journal", journal.with_extension("before.bin")));
+        }
+        paths.push(("recording.directory", self.recording.directory.clone()));
+        if !self.camera.path.is_empty() {
+            paths.push(("camera.path", PathBuf::from(&self.camera.path)));
+        }
+        paths.extend(self.cell.runtime_dir.clone().map(|d| ("cell.runtime_dir", d)));
+        let Some((first, second)) = config_paths::clash(&paths) else { return Ok(()) };
+        let value = paths.iter().find(|(key, _)| *key == second).map_or(String::new(), |(_, path)| path.display().to_string());
+        let allowed = format!("another path than {first}: they would overwrite each other");
+        Err(ConfigError::Range { file: file.display().to_string(), key: second.into(), value, allowed })
     }
 
     /// Parses and checks `text`; `file` is named in errors.

@@ -27,6 +27,7 @@ use sha2::{Digest, Sha256};
 use crate::gaussian_curve::Curve;
 
 mod format;
+mod number;
 pub mod read;
 mod records;
 mod rows;
@@ -35,12 +36,14 @@ pub mod weigh;
 mod weight;
 pub mod write;
 
+pub use number::take_number;
 pub use read::{EpisodeImage, EpisodeImages, find_episodes};
 pub use records::EpisodeError;
 pub use rows::{EpisodeRow, EpisodeTrack};
 pub use table::{TableError, read_table, write_table};
 pub use weigh::{WeighError, set_weight};
 pub use weight::{WeightError, check_poured, check_reading};
+pub(crate) use write::rfc3339;
 pub use write::{EpisodeEnd, EpisodeStart, EpisodeWriter, FrameRow, WriteError};
 
 /// One experimental episode, without its images.

@@ -47,6 +47,17 @@ impl<T, E: Display> OrExit<T> for Result<T, E> {
     }
 }
 
+/// Ends a resident process: as [`end`], but a terminal that takes nothing does not keep the process alive.
+pub fn end_resident(result: Result<(), Failure>) -> ExitCode {
+    match result {
+        Ok(()) => ExitCode::SUCCESS,
+        Err(Failure { code, what }) => {
+            crate::os::tell(&format!("error: {what}"));
+            ExitCode::from(code)
+        }
+    }
+}
+
 /// Ends a command: prints its failure, if there is one, and gives the process's exit code.
 pub fn end(result: Result<(), Failure>) -> ExitCode {
     match result {

@@ -1,13 +1,11 @@
 //! The iceoryx2 services of one cell, opened the same way by every process.
 //!
-//! A cell's files carry its name (`/dev/shm/decant_NAME_*`, `/tmp/decant_NAME/`), so that cells beside each other never meet. The
-//! layouts' version is part of each service's name, so that programs of other versions never connect. All processes of a cell run
-//! under one user, because the shared memory is private to that user.
+//! A cell's files lie in its runtime directory ([`crate::runtime_dir`]) and, under a name that nobody can guess, in `/dev/shm`
+//! ([`crate::shared_memory`]), so that cells beside each other never meet. The layouts' version is part of each service's name, so that
+//! programs of other versions never connect. All processes of a cell run under one user, because the shared memory is private to that user.
 //!
 //! Opening a service allocates and belongs in an ordinary thread. Receiving a message, or sending one in loaned memory, neither allocates
 //! nor blocks. Every failure is an [`IpcError`] of one line.
-
-use std::path::PathBuf;
 
 use iceoryx2::node::NodeBuilder;
 use iceoryx2::port::listener::Listener;
@@ -15,22 +13,37 @@ use iceoryx2::port::notifier::Notifier;
 use iceoryx2::prelude::*;
 use iceoryx2::service::port_factory::{publish_subscribe, request_response};
 
-use crate::config::{CELL_NAME_RULE, is_cell_name};
 use crate::messages::{FrameHeader, LAYOUT_VERSION};
+use crate::runtime_dir::{Place, RuntimeDirError};
+use crate::shared_memory::{self, Membership, SharedMemoryError};
 
 /// Why a cell's shared memory cannot be used.
 #[derive(Debug, thiserror::Error)]
 pub enum IpcError {
-    /// The cell's name cannot be used in file names.
-    #[error("cell name '{0}': use {CELL_NAME_RULE}")]
-    Name(String),
-    /// The cell could not be joined: missing permissions, no space, or another user's files.
-    #[error("shared memory of cell '{cell}': {what}; check that all processes run as the same user and that /dev/shm and /tmp have space")]
+    /// The cell's runtime directory cannot be used.
+    #[error(transparent)]
+    Directory(#[from] RuntimeDirError),
+    /// There is no space, or files are in the way.
+    #[error("cell '{cell}': {what}")]
+    Memory {
+        /// The cell's name.
+        cell: String,
+        /// What is wrong.
+        what: SharedMemoryError,
+    },
+    /// The cell could not be joined.
+    #[error("shared memory of cell '{cell}': {what}; do all processes run as the same user, and has /dev/shm space?")]
     Node {
         /// The cell's name.
         cell: String,
         /// iceoryx2's name of the error.
         what: String,
+    },
+    /// As many programs use a service as it has room for.
+    #[error("service '{service}' of the cell has no room for another program: end one that uses it (`rt-controller abort` needs no room)")]
+    Full {
+        /// The service's name.
+        service: String,
     },
     /// A service exists with other types or limits, or has too many users.
     #[error("service '{service}': {what}; is another version of Decant running, or the same process twice?")]
@@ -50,7 +63,15 @@ pub trait InService<T> {
 
 impl<T, E: std::fmt::Debug> InService<T> for Result<T, E> {
     fn in_service(self, service: &str) -> Result<T, IpcError> {
-        self.map_err(|e| IpcError::Service { service: service.into(), what: format!("{e:?}") })
+        self.map_err(|e| {
+            let what = format!("{e:?}");
+            // iceoryx2's names of this error begin alike for all kinds of ports and for nodes.
+            let full = ["ExceedsMaxSupportedClients", "ExceedsMaxSupportedSubscribers", "ExceedsMaxNumberOfNodes"];
+            if full.iter().any(|f| what.contains(f)) {
+                return IpcError::Full { service: service.into() };
+            }
+            IpcError::Service { service: service.into(), what }
+        })
     }
 }
 
@@ -82,39 +103,35 @@ pub type FrameListener = Listener<Ipc>;
 /// Tells the readers that a frame has come.
 pub type FrameNotifier = Notifier<Ipc>;
 
-/// Directory of the cell `name` for iceoryx2's files that are not shared memory.
-pub fn directory(name: &str) -> PathBuf {
-    PathBuf::from(format!("/tmp/decant_{name}"))
-}
-
-/// Removes every file of the cell `name`, also those that a killed process left. Only whoever started the cell may call this, after all of
+/// Removes every file of the cell `place`, also those that a killed process left. Only whoever started the cell may call this, after all of
 /// its processes have ended; a cell that still runs would be torn apart. What cannot be removed stays.
-pub fn remove_files(name: &str) {
-    let prefix = format!("decant_{name}_");
-    for entry in std::fs::read_dir("/dev/shm").into_iter().flatten().flatten() {
-        if entry.file_name().to_string_lossy().starts_with(&prefix) {
-            let _ = std::fs::remove_file(entry.path());
-        }
-    }
-    let _ = std::fs::remove_dir_all(directory(name));
+pub fn remove_files(place: impl Into<Place>) {
+    let directory = place.into().path();
+    shared_memory::remove_of(&directory);
+    let _ = std::fs::remove_dir_all(directory);
 }
 
 /// One cell's services.
 pub struct Cell {
     node: CellNode,
+    name: String,
+    // Declared last: the files go when the node has gone.
+    membership: Membership,
 }
 
 impl Cell {
-    /// Joins the shared memory of the cell `name` (see `[cell] name` in the configuration).
-    pub fn join(name: &str) -> Result<Self, IpcError> {
-        if !is_cell_name(name) {
-            return Err(IpcError::Name(name.into()));
-        }
+    /// Joins the shared memory of the cell `place`: the table `[cell]` of the configuration, or a name.
+    pub fn join(place: impl Into<Place>) -> Result<Self, IpcError> {
+        let place = place.into();
+        let directory = place.directory()?;
+        let name = place.name;
+        let membership = Membership::join(&directory).map_err(|what| IpcError::Memory { cell: name.clone(), what })?;
         set_log_level(LogLevel::Fatal);
-        let fail = |what: String| IpcError::Node { cell: name.into(), what };
+        let fail = |what: String| IpcError::Node { cell: name.clone(), what };
+        // iceoryx2 would look for a configuration file in the working directory; this one is complete.
         let mut config = Config::default();
-        config.global.prefix = FileName::new(format!("decant_{name}_").as_bytes()).map_err(|e| fail(format!("{e:?}")))?;
-        let root = Path::new(directory(name).as_os_str().as_encoded_bytes()).map_err(|e| fail(format!("{e:?}")))?;
+        config.global.prefix = FileName::new(membership.prefix().as_bytes()).map_err(|e| fail(format!("{e:?}")))?;
+        let root = Path::new(directory.as_os_str().as_encoded_bytes()).map_err(|e| fail(format!("{e:?}")))?;
         config.global.set_root_path(&root);
         // Each program handles its own signals, so iceoryx2 must not end a wait for good because of one.
         let node = NodeBuilder::new()
@@ -122,7 +139,19 @@ impl Cell {
             .signal_handling_mode(SignalHandlingMode::Disabled)
             .create::<Ipc>()
             .map_err(|e| fail(format!("{e:?}")))?;
-        Ok(Self { node })
+        membership.close_to_others();
+        Ok(Self { node, name, membership })
+    }
+
+    /// Has the system set memory aside for what was made in `/dev/shm` since this process joined. Call it when the ports are made and before
+    /// they are used, so that a full `/dev/shm` is an error and not the end of the process.
+    pub fn reserve(&self) -> Result<(), IpcError> {
+        self.membership.reserve().map_err(|what| IpcError::Memory { cell: self.name.clone(), what })
+    }
+
+    /// Checks that `bytes` more fit into `/dev/shm`.
+    pub fn check_space(&self, bytes: u64) -> Result<(), IpcError> {
+        shared_memory::check_space(bytes).map_err(|what| IpcError::Memory { cell: self.name.clone(), what })
     }
 
     /// The full name of a service, with the layouts' version.

@@ -5,7 +5,9 @@
 //! | [`messages`] | fixed-layout messages in shared memory | yes |
 //! | [`ipc`] | the iceoryx2 services that carry them | receive only |
 //! | [`control`] | requests to the controller and its answers | no |
-//! | [`config`] | the cell's one TOML file | no |
+//! | [`runtime_dir`] | where a cell keeps its sockets and other files of a run | no |
+//! | [`shared_memory`] | the cell's files in `/dev/shm`: their names, who uses them, space for them | no |
+//! | [`config`], [`config_paths`] | the cell's one TOML file, and what its paths mean | no |
 //! | [`limits`] | the one place that every target passes | yes |
 //! | [`gaussian_curve`] | eq. (1), the movement of an experimental episode | yes |
 //! | [`alpha_track`] | alpha over time: which angle belongs to a picture | yes |
@@ -15,7 +17,9 @@
 //! | [`agent`] | the weights at work in one pour: an observation in, an action out | yes |
 //! | [`weights`] | the weight file (postcard with a CRC) | no |
 //! | [`episode`] | `E = (L_E, w_E)` as MCAP files and CSV tables | no |
+//! | [`regular_file`] | files of which only so much is read as is expected | no |
 //! | [`exit`] | exit codes and one-line errors | no |
+//! | [`speaker`] | lines for people, from threads that must not wait for a terminal | no |
 //! | [`os`] | the operating system: clock, scheduling, locked memory | yes |
 //!
 //! What the loop uses of a module marked "yes" does not allocate, lock or panic after construction; the module's header names the
@@ -27,6 +31,8 @@ pub mod actions;
 pub mod agent;
 pub mod alpha_track;
 pub mod config;
+mod config_camera;
+pub mod config_paths;
 pub mod control;
 pub mod episode;
 pub mod estimator;
@@ -38,4 +44,8 @@ pub mod messages;
 pub mod mlp;
 #[allow(unsafe_code)]
 pub mod os;
+pub mod regular_file;
+pub mod runtime_dir;
+pub mod shared_memory;
+pub mod speaker;
 pub mod weights;

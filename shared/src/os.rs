@@ -1,12 +1,13 @@
 //! What is asked of the operating system: the clock, signals, real-time scheduling, locked memory, and the count of allocations.
 //!
-//! This is the only file of the project with `unsafe`. Any thread may call it. Nothing here allocates, except [`stop_at_signals`] and
-//! error texts. Where the system refuses something, the caller gets a line for the operator and goes on without it.
+//! This is the only file of the project with `unsafe`. Any thread may call it. Nothing here allocates, except [`stop_at_signals`],
+//! [`explain_bus_errors`] and texts. Where the system refuses something, the caller gets a line for the operator and goes on without it.
 
 use std::alloc::{GlobalAlloc, Layout, System};
 use std::cell::Cell;
+use std::os::fd::{AsFd, AsRawFd};
 use std::sync::Arc;
-use std::sync::atomic::AtomicBool;
+use std::sync::atomic::{AtomicBool, AtomicI32, AtomicPtr, Ordering::SeqCst};
 
 /// Now, CLOCK_MONOTONIC in nanoseconds.
 pub fn now_ns() -> u64 {
@@ -98,6 +99,82 @@ pub fn stop_at_signals() -> std::io::Result<Arc<AtomicBool>> {
         signal_hook::flag::register(signal, Arc::clone(&stop))?;
     }
     Ok(stop)
+}
+
+/// Writes one line to standard error if that is possible within half a second, and leaves it out otherwise. For the end of a process that
+/// must end, whatever became of its terminal.
+pub fn tell(line: &str) {
+    let stderr = std::io::stderr();
+    if may_be_written(500) {
+        let _ = rustix::io::write(&stderr, format!("{line}\n").as_bytes());
+    }
+}
+
+/// Whether standard error takes a line within `wait_ms`. Nothing in it allocates, so that a signal's handler may call it.
+fn may_be_written(wait_ms: i32) -> bool {
+    let mut waits = libc::pollfd { fd: libc::STDERR_FILENO, events: libc::POLLOUT, revents: 0 };
+    // SAFETY: `waits` is one valid structure, which the call reads and fills.
+    unsafe { libc::poll(&raw mut waits, 1, wait_ms) == 1 }
+}
+
+/// User number of the process at the other end of a Unix socket. A process in another PID namespace has one too.
+pub fn peer_uid(socket: &impl AsFd) -> Option<u32> {
+    let mut credentials = libc::ucred { pid: 0, uid: 0, gid: 0 };
+    let mut length = size_of::<libc::ucred>() as libc::socklen_t;
+    let fd = socket.as_fd().as_raw_fd();
+    // SAFETY: `credentials` is plain data, valid for writes of `length` bytes, and the call writes no more.
+    let done = unsafe { libc::getsockopt(fd, libc::SOL_SOCKET, libc::SO_PEERCRED, (&raw mut credentials).cast(), &raw mut length) };
+    (done == 0).then_some(credentials.uid)
+}
+
+/// What is done when shared memory vanishes under the process.
+struct BusErrors {
+    line: String,
+    code: i32,
+    stop: Arc<AtomicBool>,
+}
+
+/// What [`explain_bus_errors`] was told; null before. It is never freed, because a signal may come at any time.
+static BUS_ERRORS: AtomicPtr<BusErrors> = AtomicPtr::new(std::ptr::null_mut());
+/// Number of the thread that must not be held up, see [`cannot_be_held_up`]; 0 if there is none.
+static URGENT_THREAD: AtomicI32 = AtomicI32::new(0);
+
+/// Says `line` and ends with the exit code `code` when the system takes a page of shared memory away (SIGBUS), as it does when `/dev/shm` is
+/// full or somebody shortens a file there. Without this the process would die without a word.
+///
+/// A process whose loop must first do something else sets [`cannot_be_held_up`] there: if another thread is struck, that thread stops for
+/// good, `stop` becomes true, and it is the process's task to end.
+pub fn explain_bus_errors(line: &str, code: u8, stop: Arc<AtomicBool>) {
+    let told = Box::new(BusErrors { line: format!("{line}\n"), code: code.into(), stop });
+    BUS_ERRORS.store(Box::into_raw(told), SeqCst);
+    let handler = on_bus_error as extern "C" fn(libc::c_int);
+    // SAFETY: the handler only makes system calls that may be made in one, and reads memory that is never freed.
+    unsafe { libc::signal(libc::SIGBUS, handler as libc::sighandler_t) };
+}
+
+/// Marks the calling thread as the one that [`explain_bus_errors`] does not stop: if it is struck itself, the process ends at once.
+pub fn cannot_be_held_up() {
+    URGENT_THREAD.store(rustix::thread::gettid().as_raw_nonzero().get(), SeqCst);
+}
+
+extern "C" fn on_bus_error(_: libc::c_int) {
+    // SAFETY: the pointer is null or leads to a structure that is never freed or changed.
+    let Some(told) = (unsafe { BUS_ERRORS.load(SeqCst).as_ref() }) else { return };
+    if may_be_written(0) {
+        // SAFETY: the line is valid for reads of its length.
+        unsafe { libc::write(libc::STDERR_FILENO, told.line.as_ptr().cast(), told.line.len()) };
+    }
+    let urgent = URGENT_THREAD.load(SeqCst);
+    // SAFETY: this call has no arguments and cannot fail.
+    if urgent != 0 && urgent != unsafe { libc::gettid() } {
+        told.stop.store(true, SeqCst);
+        loop {
+            // SAFETY: this call has no arguments; it waits for a signal.
+            unsafe { libc::pause() };
+        }
+    }
+    // SAFETY: ends the process without running anything of it.
+    unsafe { libc::_exit(told.code) };
 }
 
 /// Number of page faults of the calling thread so far: minor ones, and major ones. Both are 0 if the system does not tell.

@@ -25,6 +25,7 @@ use crate::estimator::Calibration;
 use crate::estimator::flow::{DELAY_MAX_FRAMES, FlowModel, WayBack};
 use crate::estimator::vessel::Vessel;
 use crate::mlp::{HIDDEN, INPUTS, InputScale, Mlp};
+use crate::regular_file;
 
 /// Version of the file format; files of other versions are refused.
 pub const FORMAT_VERSION: u32 = 3;
@@ -279,7 +280,8 @@ impl Weights {
     /// Reads and checks a weight file.
     pub fn read(path: &Path) -> Result<Self, WeightsError> {
         let file = path.display().to_string();
-        let bytes = std::fs::read(path).map_err(|e| WeightsError::Read { file: file.clone(), what: e.to_string() })?;
+        let bytes = regular_file::read(path, (HEADER + PAYLOAD_MAX) as u64)
+            .map_err(|e| WeightsError::Read { file: file.clone(), what: e.to_string() })?;
         Self::from_bytes(&bytes, &file)
     }
 

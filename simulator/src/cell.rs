@@ -20,6 +20,7 @@ use shared::config::Config;
 use shared::ipc::Cell;
 use shared::messages::{FrameHeader, LAYOUT_VERSION, PixelFormat};
 use shared::os;
+use shared::runtime_dir::Place;
 
 use crate::camera::{Renderer, Scene, View};
 use crate::physics::container::Container;
@@ -106,9 +107,9 @@ impl SimulatorConfig {
     }
 }
 
-/// Path of the operator's socket of the cell `name`.
-pub fn operator_socket(name: &str) -> PathBuf {
-    shared::ipc::directory(name).join("operator")
+/// Path of the operator's socket of the cell `place`.
+pub fn operator_socket(place: impl Into<Place>) -> PathBuf {
+    place.into().path().join("operator")
 }
 
 /// What the threads of the cell share.
@@ -151,11 +152,13 @@ pub fn simulate(config: Config, simulated: SimulatorConfig) -> Result<(), Box<dy
     let rig = simulated.rig();
     let state = CellState { container: Mutex::new(rig.container(simulated.fill_ml)), rig, robot, config, simulated, stop };
 
-    let cell = Cell::join(&state.config.cell.name)?;
-    let socket = operator_socket(&state.config.cell.name);
-    if let Some(parent) = socket.parent() {
-        std::fs::create_dir_all(parent)?;
-    }
+    let lost = "simulator: shared memory vanished: /dev/shm is full, or a file there was cut. The simulated cell ends";
+    os::explain_bus_errors(lost, shared::exit::FAILED, Arc::clone(&state.stop));
+    let cell = Cell::join(&state.config.cell)?;
+    let view = &state.simulated.view;
+    // The driver has room for 17 frames.
+    cell.check_space(18 * u64::from(view.width_px) * u64::from(view.height_px) * PixelFormat::Bgr8.bytes_per_pixel() as u64)?;
+    let socket = operator_socket(&state.config.cell);
     if UnixStream::connect(&socket).is_ok() {
         return Err(format!(
             "cell '{}' is already being simulated; stop that simulator first, or choose another cell.name",
@@ -209,7 +212,7 @@ fn move_liquid(state: &CellState) {
 fn film(state: &CellState) -> Result<(), String> {
     let words = |e: &dyn std::fmt::Debug| format!("camera: {e:?}");
     let _ = os::prioritise(CAMERA_PRIORITY); // If that is not permitted, the liquid's thread has said so.
-    let cell = Cell::join(&state.config.cell.name).map_err(|e| e.to_string())?;
+    let cell = Cell::join(&state.config.cell).map_err(|e| e.to_string())?;
     let topic = cell.frames().map_err(|e| e.to_string())?;
     let view = &state.simulated.view;
     let bytes = view.width_px as usize * view.height_px as usize * PixelFormat::Bgr8.bytes_per_pixel();

@@ -45,6 +45,42 @@ pub fn program(name: &str) -> PathBuf {
     path
 }
 
+/// Namespaces of their own for a cell's processes, so that nobody else meets them: network, `/run/decant`, and on demand a `/dev/shm` of a
+/// certain size.
+pub struct Namespaces(Child);
+
+impl Namespaces {
+    /// Makes them; `shm_size` is the size of their `/dev/shm` in the words of mount(8). `None`, with a printed line, where that is not permitted.
+    pub fn new(shm_size: Option<&str>) -> Option<Self> {
+        let shm = shm_size.map_or(String::new(), |size| format!("mount -t tmpfs -o mode=1777,size={size} tmpfs /dev/shm && "));
+        let script = format!(
+            "mkdir -p /run/decant && mount -t tmpfs -o mode=0755 tmpfs /run/decant && {shm}ip link set lo up && echo ready && exec sleep 600"
+        );
+        let mut command = Command::new("unshare");
+        command.args(["-m", "-n", "--propagation", "private", "sh", "-c", &script]).stdout(Stdio::piped()).stderr(Stdio::null());
+        let mut this = Self(command.spawn().ok()?);
+        let ready = this.0.stdout.as_mut().is_some_and(|out| std::io::Read::read_exact(out, &mut [0; 5]).is_ok());
+        if !ready {
+            println!("not run: no namespaces are permitted here (it takes root, and ip of iproute2)");
+        }
+        ready.then_some(this)
+    }
+
+    /// The command `name` in them.
+    pub fn command(&self, name: impl AsRef<std::ffi::OsStr>) -> Command {
+        let mut command = Command::new("nsenter");
+        command.args(["-t", &self.0.id().to_string(), "-m", "-n", "--"]).arg(name);
+        command
+    }
+}
+
+impl Drop for Namespaces {
+    fn drop(&mut self) {
+        let _ = self.0.kill();
+        let _ = self.0.wait();
+    }
+}
+
 /// A running cell.
 pub struct CellUnderTest {
     /// The cell's directory: configuration, episodes, weights and logs; removed at the end.
@@ -53,6 +89,8 @@ pub struct CellUnderTest {
     pub name: String,
     /// The address of the cell's robot.
     pub address: std::net::IpAddr,
+    /// Where its processes run, if not among all others.
+    pub inside: Option<Namespaces>,
     processes: Vec<(String, Child)>,
 }
 
@@ -76,17 +114,27 @@ impl CellUnderTest {
         set("recording", "directory", path("episodes"));
         adapt(&mut config);
         std::fs::write(dir.path().join("cell.toml"), toml::to_string(&config).expect("still TOML")).expect("writable");
-        Self { dir, name, address, processes: Vec::new() }
+        Self { dir, name, address, inside: None, processes: Vec::new() }
     }
 
     /// Starts a cell with simulator, feature worker and controller, and waits until the robot is ready.
     pub fn start(adapt: impl FnOnce(&mut toml::Table)) -> Self {
         let mut cell = Self::prepare(adapt);
-        cell.spawn("simulator");
-        cell.spawn("feature-worker");
-        cell.spawn("rt-controller");
-        cell.wait_idle();
+        cell.spawn_all();
         cell
+    }
+
+    /// Starts simulator, feature worker and controller, and waits until the robot is ready.
+    pub fn spawn_all(&mut self) {
+        for name in ["simulator", "feature-worker", "rt-controller"] {
+            self.spawn(name);
+        }
+        self.wait_idle();
+    }
+
+    /// The program `name`, to be run where the cell is.
+    pub fn program(&self, name: &str) -> Command {
+        self.inside.as_ref().map_or_else(|| Command::new(program(name)), |i| i.command(program(name)))
     }
 
     /// The cell's configuration file.
@@ -103,15 +151,34 @@ impl CellUnderTest {
     pub fn spawn(&mut self, name: &str) {
         let log =
             std::fs::OpenOptions::new().create(true).append(true).open(self.dir.path().join(format!("{name}.log"))).expect("writable");
-        let child = Command::new(program(name))
-            .args(["run", "--config"])
-            .arg(self.config())
-            .stdin(Stdio::null())
-            .stdout(Stdio::null())
-            .stderr(log)
-            .spawn()
-            .expect("the program starts");
-        self.processes.push((name.into(), child));
+        self.spawn_with(name, self.program(name), log.into());
+    }
+
+    /// Starts `command`, which is or becomes the program `name`, with the command `run`; it says what it says to `stderr`.
+    pub fn spawn_with(&mut self, name: &str, mut command: Command, stderr: Stdio) {
+        command.args(["run", "--config"]).arg(self.config()).stdin(Stdio::null()).stdout(Stdio::null()).stderr(stderr);
+        self.processes.push((name.into(), command.spawn().expect("the program starts")));
+    }
+
+    /// The cell's runtime directory.
+    pub fn runtime_dir(&self) -> PathBuf {
+        shared::runtime_dir::Place::from(&self.name).path()
+    }
+
+    /// The cell's files in `/dev/shm`; none if no process has joined the cell.
+    pub fn shared_memory(&self) -> Vec<PathBuf> {
+        let Ok(token) = std::fs::read_to_string(self.runtime_dir().join("token")) else { return Vec::new() };
+        let ours = |e: &std::fs::DirEntry| e.file_name().to_string_lossy().starts_with(&format!("decant-{token}_"));
+        std::fs::read_dir("/dev/shm").expect("there").flatten().filter(ours).map(|e| e.path()).collect()
+    }
+
+    /// Starts a pour and waits until the container is tilted. The cell has weights that pour and a full container.
+    pub fn pour_tilted(&self) -> Child {
+        self.json("simulator", &["operator", "fill", "300", "--json"]);
+        self.wait_idle();
+        let pour = self.begin("rt-controller", &["pour", "200", "--json"]);
+        self.wait("tilt", Duration::from_secs(10), |s| s["alpha_measured_deg"].as_f64() > Some(30.0));
+        pour
     }
 
     /// What a process has printed so far.
@@ -156,12 +223,12 @@ impl CellUnderTest {
 
     /// Runs a command of an operator to its end.
     pub fn command(&self, name: &str, words: &[&str]) -> Output {
-        Command::new(program(name)).args(words).arg("--config").arg(self.config()).stdin(Stdio::null()).output().expect("it runs")
+        self.program(name).args(words).arg("--config").arg(self.config()).stdin(Stdio::null()).output().expect("it runs")
     }
 
     /// Starts a command of an operator in the background.
     pub fn begin(&self, name: &str, words: &[&str]) -> Child {
-        let mut command = Command::new(program(name));
+        let mut command = self.program(name);
         command.args(words).arg("--config").arg(self.config()).stdin(Stdio::null()).stdout(Stdio::piped()).stderr(Stdio::piped());
         command.spawn().expect("it starts")
     }

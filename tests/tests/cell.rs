@@ -75,18 +75,26 @@ fn weights_are_swapped_while_running() {
     assert_eq!(status["weights_refused"], "");
 }
 
-/// Protects people from a slow disk: while the weight file cannot be read to its end, an abort is obeyed and status answers.
+/// The thread `name` of a process.
+fn thread(pid: u32, name: &str) -> u32 {
+    let named = |t: &std::fs::DirEntry| std::fs::read_to_string(t.path().join("comm")).is_ok_and(|c| c.trim() == name);
+    let found = std::fs::read_dir(format!("/proc/{pid}/task")).expect("it runs").flatten().find(named).expect("the thread is there");
+    found.file_name().to_string_lossy().parse().expect("a number")
+}
+
+/// Protects people from a slow disk: while the weight file cannot be read to its end, an abort is obeyed and status answers; and a disk that
+/// does not come back does not keep the controller alive.
 #[test]
 fn a_stalled_disk_does_not_delay_an_abort() {
-    let cell = CellUnderTest::start(|_| {});
+    let mut cell = CellUnderTest::start(|_| {});
     cell.take_weights(&steady_weights(TILT_OUT));
-    cell.json("simulator", &["operator", "fill", "300", "--json"]);
-    let pour = cell.begin("rt-controller", &["pour", "200", "--json"]);
-    cell.wait("tilt", Duration::from_secs(10), |s| s["alpha_measured_deg"].as_f64() > Some(30.0));
-    // This is a pipe without a writer: whoever reads it waits.
-    let pipe = cell.weights().with_extension("pipe");
-    assert!(std::process::Command::new("mkfifo").arg(&pipe).status().expect("coreutils").success());
-    std::fs::rename(&pipe, cell.weights()).expect("same directory");
+    let pour = cell.pour_tilted();
+    // A disk that does not answer: every look at a file takes the disk's thread two minutes.
+    let disk = thread(cell.pid("rt-controller"), "disk");
+    let mut strace = std::process::Command::new("strace");
+    strace.args(["-q", "-p", &disk.to_string(), "-e", "trace=statx", "-e", "inject=statx:delay_enter=120s", "-o", "/dev/null"]);
+    let mut strace = strace.spawn().expect("strace is installed (scripts/install strace)");
+    std::thread::sleep(Duration::from_millis(500));
     let ticks = |s: &serde_json::Value| s["ticks"].as_u64();
     let before = cell.status();
     cell.wait("ten more ticks", Duration::from_secs(5), |s| ticks(s) > before.as_ref().and_then(ticks).map(|t| t + 10));
@@ -95,11 +103,12 @@ fn a_stalled_disk_does_not_delay_an_abort() {
     let output = pour.wait_with_output().expect("it ran");
     let result: serde_json::Value = serde_json::from_slice(&output.stdout).expect("JSON");
     assert_eq!((output.status.code(), &result["outcome"]["reason"]), (Some(4), &"aborted".into()));
-    // The disk comes back. What it gives is no weight file, and the next file is taken.
-    std::fs::rename(cell.weights(), &pipe).expect("same directory");
-    std::fs::write(&pipe, b"none").expect("somebody reads");
-    cell.wait("the refusal", Duration::from_secs(5), |s| s["weights_refused"] != "");
-    cell.take_weights(&steady_weights(TILT_OUT + 1));
+    steady_weights(TILT_OUT + 1).write(&cell.weights()).expect("writable");
+    std::thread::sleep(Duration::from_millis(500));
+    assert_eq!(cell.status().expect("it answers")["weights_taken"], before.expect("it answered")["weights_taken"], "the disk answers");
+    assert_eq!(cell.stop("rt-controller"), Some(1), "{}", cell.log("rt-controller"));
+    assert!(cell.log("rt-controller").contains("the disk does not answer"), "{}", cell.log("rt-controller"));
+    strace.kill().and_then(|()| strace.wait()).expect("ours");
 }
 
 /// Protects people: when a process dies or hangs at full tilt, the container comes upright, and the result names the reason.

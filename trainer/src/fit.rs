@@ -16,6 +16,7 @@
 //! | `unknowns` | the unknowns in a row, and the model that they stand for |
 //! | `prepared` | an episode made ready, and its residuals |
 //! | `priors` | what is known before any episode |
+//! | `servo` | how the joint follows its commands, where it was measured |
 //! | `problem` | the least-squares problem of a stage, and its solution |
 //! | `noise` | how sure the fit is |
 
@@ -30,12 +31,14 @@ mod noise;
 mod prepared;
 mod priors;
 mod problem;
+mod servo;
 mod unknowns;
 
 use noise::{CHANGE_NEEDS, FrameNoise};
 use prepared::{PreparedEpisode, Stage};
 use priors::HeldCalibration;
 use problem::{Effort, Problem};
+use servo::Servo;
 use unknowns::{
     AREA_EXPONENT, CAMERA_GAIN, DELAY, EVEN_SHARE, EXTRA_DELAY, FILM_SHARE, HEAD_EXPONENT, LAG, LOG_C, LOG_RADIUS, LOG_SLENDERNESS,
     LOG_WEIR, ONSET, SHARED, TAPER, TILT_SLOPE, Unknowns, model_of,
@@ -82,9 +85,6 @@ const GAIN_DOUBT: f64 = 1.6;
 /// Least standard deviation of the capacity's scale, from one pour to the next (log). From the prototype; no other measurement is
 /// recorded.
 const CAPACITY_SCALE_SD_MIN: f64 = 0.007;
-/// Area at which the calibration's doubt is taken, px^2. From the prototype, whose streams were about as large.
-const JUDGED_AT_PX2: f64 = 300.0;
-
 /// Effort of each of the first solutions, which only have to tell beginnings apart. Chosen by hand, see docs/LEARNING.md for the time it
 /// takes.
 const FIRST_EFFORT: Effort = Effort { steps: 12, tolerance: 1e-3 };
@@ -172,7 +172,8 @@ pub fn fit(episodes: &[TrainingEpisode]) -> Fit {
     let mut stage = camera.wide_stage();
     let held = camera.linear.map(|log_c| HeldCalibration { log_c, exponent: 1.0, tilt_slope: 0.0 });
 
-    let problem = Problem { episodes: &prepared, area_min_px2, stage, held };
+    let servo = Servo::of(episodes);
+    let problem = Problem { episodes: &prepared, area_min_px2, stage, held, servo };
     let mut found = best_beginning(&problem, episodes, &camera);
     if let Some(delays) = changed_delays(&problem, &found) {
         for ((episode, own), delay) in prepared.iter_mut().zip(&mut found.own).zip(delays) {
@@ -181,7 +182,7 @@ pub fn fit(episodes: &[TrainingEpisode]) -> Fit {
         }
         stage.extra_delay_sd_frames = DELAY_CHANGED_FRAMES;
     }
-    let wide = Problem { episodes: &prepared, area_min_px2, stage, held };
+    let wide = Problem { episodes: &prepared, area_min_px2, stage, held, servo };
     wide.solve(&mut found, Effort { steps: WIDE_STEPS * camera.longer(), tolerance: TOLERANCE });
     let wide_covariance = inverse(&wide.linearise(&found).matrix);
 
@@ -190,24 +191,26 @@ pub fn fit(episodes: &[TrainingEpisode]) -> Fit {
     let narrow = Problem { stage: camera.narrow_stage(stage), held, ..wide };
     narrow.solve(&mut found, Effort { steps: NARROW_STEPS * camera.longer(), tolerance: TOLERANCE });
     let covariance = inverse(&narrow.linearise(&found).matrix);
-    conclude(&found, &camera, area_min_px2, &wide_covariance, &covariance)
+    conclude(&found, &camera, (area_min_px2, median_area_px2(&prepared)), &wide_covariance, &covariance)
 }
 
 /// Where the fit begins: what is usual for a vessel in a gripper, and the calibration that meets the weights with exponent q.
-fn beginning(prepared: &[PreparedEpisode], episodes: &[TrainingEpisode], log_weir: f64, exponent: f64, even_share: f64) -> Unknowns {
+fn beginning(problem: &Problem<'_>, episodes: &[TrainingEpisode], log_weir: f64, exponent: f64, even_share: f64) -> Unknowns {
+    let Servo { delay_frames, lag_frames } = problem.servo.unwrap_or(Servo { delay_frames: 2.0, lag_frames: 2.0 });
     let mut shared = [0.0; SHARED];
     (shared[LOG_RADIUS], shared[LOG_SLENDERNESS], shared[TAPER], shared[EVEN_SHARE]) = (37f64.ln(), 3f64.ln(), 1.0, even_share);
-    (shared[LOG_WEIR], shared[HEAD_EXPONENT], shared[LAG], shared[DELAY], shared[FILM_SHARE]) = (log_weir, 1.5, 2.0, 2.0, 0.05);
+    (shared[LOG_WEIR], shared[HEAD_EXPONENT], shared[LAG], shared[DELAY], shared[FILM_SHARE]) =
+        (log_weir, 1.5, lag_frames, delay_frames, 0.05);
     shared[LOG_C] = f64::from(calibration::calibrate(episodes, Some(exponent)).volume_at_1_px2_ml).ln();
     shared[AREA_EXPONENT] = exponent;
     let flow = FlowTables::new(&model_of(&shared));
-    Unknowns { shared, own: prepared.iter().map(|p| [p.onset_guess_deg(&flow), 0.0, 0.0, 0.0]).collect() }
+    Unknowns { shared, own: problem.episodes.iter().map(|p| [p.onset_guess_deg(&flow), 0.0, 0.0, 0.0]).collect() }
 }
 
 /// The best of the first solutions, from several beginnings.
 fn best_beginning(problem: &Problem<'_>, episodes: &[TrainingEpisode], camera: &CameraFacts) -> Unknowns {
     let begin = |log_weir: f64, (exponent, even_share): (f64, f64)| {
-        let mut at = beginning(problem.episodes, episodes, log_weir, exponent, even_share);
+        let mut at = beginning(problem, episodes, log_weir, exponent, even_share);
         let cost = problem.solve(&mut at, FIRST_EFFORT);
         (cost, at)
     };
@@ -245,14 +248,17 @@ fn linear(episodes: &[TrainingEpisode]) -> Option<f64> {
 }
 
 /// Model, calibration and their uncertainties from what was found: the newest gain and delay count where they have changed.
-fn conclude(found: &Unknowns, camera: &CameraFacts, area_min_px2: f64, wide: &DMatrix<f64>, narrow: &DMatrix<f64>) -> Fit {
+///
+/// `areas_px2` are the smallest area that the camera shows, and the one at which the calibration's doubt is taken.
+fn conclude(found: &Unknowns, camera: &CameraFacts, areas_px2: (f64, f64), wide: &DMatrix<f64>, narrow: &DMatrix<f64>) -> Fit {
+    let (area_min_px2, judged_at_px2) = areas_px2;
     let gains = found.of_episodes(CAMERA_GAIN);
     let (log_c, exponent) = (found.shared[LOG_C] - noise::newest_gain(&gains), found.shared[AREA_EXPONENT]);
     let mut model = model_of(&found.shared);
     let newest_delay = noise::newest_delay_frames(&found.of_episodes(EXTRA_DELAY));
     model.delay_frames = (model.delay_frames + newest_delay).clamp(0.0, DELAY_MAX_FRAMES);
-    // The standard deviation of log v = log c + q log area, as the wide stage knows it.
-    let log_area = JUDGED_AT_PX2.ln();
+    // The standard deviation of log v = log c + q log area, as the wide stage knows it, where the episodes' areas are.
+    let log_area = judged_at_px2.ln();
     let log_v_variance =
         wide[(LOG_C, LOG_C)] + 2.0 * log_area * wide[(LOG_C, AREA_EXPONENT)] + log_area * log_area * wide[(AREA_EXPONENT, AREA_EXPONENT)];
     let share = if found.own.len() < PRIORS_BELOW { 0.5 } else { 1.0 };
@@ -281,6 +287,13 @@ fn conclude(found: &Unknowns, camera: &CameraFacts, area_min_px2: f64, wide: &DM
         calibration_covariance: [LOG_C, AREA_EXPONENT].map(|i| [LOG_C, AREA_EXPONENT].map(|j| wide[(i, j)])),
         dropouts: camera.noise.dropouts,
     }
+}
+
+/// The median of all areas with a stream, px^2; 1 without any.
+fn median_area_px2(prepared: &[PreparedEpisode]) -> f64 {
+    let mut areas: Vec<f64> = prepared.iter().flat_map(|p| &p.area_px2).copied().filter(|a| *a > 0.0).collect();
+    areas.sort_by(f64::total_cmp);
+    areas.get(areas.len() / 2).copied().unwrap_or(1.0)
 }
 
 /// The inverse of a matrix J'J, or a wide diagonal matrix where it has none.

@@ -85,7 +85,7 @@ pub fn run_cell(cell: &mut OwnCell, seconds: u64, storm: bool) -> Result<CellRun
     let to_ns = now_ns();
     let (controller, worker) = (Holding::of(pid), Holding::of(cell.pid("feature-worker")));
     drop(storm);
-    let client = Client::connect(&cell.config.cell.name).map_err(unreachable)?;
+    let client = Client::connect(&cell.config.cell).map_err(unreachable)?;
     let after = client.status().map_err(unreachable)?;
     drop(client);
     cell.stop();

@@ -9,6 +9,7 @@ use std::thread::JoinHandle;
 use std::time::Duration;
 
 use rt_controller::client::Client;
+use shared::config::CellConfig;
 use shared::control::Request;
 use shared::ipc::Cell;
 use shared::weights::Weights;
@@ -38,7 +39,7 @@ impl Storm {
         let bytes = std::fs::read(&file).map_err(|error| OwnCellError::File { what: file.display().to_string(), error })?;
         let weights = Weights::from_bytes(&bytes, "weights.bin").map_err(|e| OwnCellError::Other(e.to_string()))?;
         let stop = Arc::new(AtomicBool::new(false));
-        let name = &cell.config.cell.name;
+        let name = &cell.config.cell;
         let mut threads = Vec::new();
         for _ in 0..ASKERS {
             threads.push(repeat(&stop, name, |client| drop(client.status())));
@@ -63,8 +64,8 @@ impl Drop for Storm {
 }
 
 /// A thread that asks the controller something again and again.
-fn repeat(stop: &Arc<AtomicBool>, name: &str, ask: fn(&Client)) -> JoinHandle<()> {
-    let (stop, name) = (Arc::clone(stop), name.to_owned());
+fn repeat(stop: &Arc<AtomicBool>, name: &CellConfig, ask: fn(&Client)) -> JoinHandle<()> {
+    let (stop, name) = (Arc::clone(stop), name.clone());
     std::thread::spawn(move || {
         let Ok(client) = Client::connect(&name) else { return };
         while !stop.load(Ordering::Relaxed) {
@@ -74,7 +75,7 @@ fn repeat(stop: &Arc<AtomicBool>, name: &str, ask: fn(&Client)) -> JoinHandle<()
 }
 
 /// Reads every tick's telemetry.
-fn read_telemetry(stop: &AtomicBool, name: &str) {
+fn read_telemetry(stop: &AtomicBool, name: &CellConfig) {
     let Ok(cell) = Cell::join(name) else { return };
     let Ok(reader) = cell.telemetry().map_err(drop).and_then(|topic| topic.subscriber_builder().create().map_err(drop)) else { return };
     while !stop.load(Ordering::Relaxed) {

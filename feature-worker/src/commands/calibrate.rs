@@ -48,7 +48,7 @@ pub struct Args {
     /// the worker's frames that are watched.
     input: Vec<PathBuf>,
     /// The cell's configuration.
-    #[arg(long, default_value = shared::config::DEFAULT_FILE)]
+    #[arg(long, env = shared::config::VARIABLE, default_value = shared::config::DEFAULT_FILE)]
     config: PathBuf,
     /// How long to watch a live camera.
     #[arg(long, default_value_t = 15)]
@@ -143,7 +143,7 @@ fn calibrate(args: &Args, mut config: Config) -> Result<(), Failure> {
 /// Watches the configured camera for a while.
 fn watch(args: &Args, config: &Config) -> Result<Pour, Failure> {
     let reach = |e: String| failure(exit::UNREACHABLE, e);
-    let cell = Cell::join(&config.cell.name).or_exit(exit::UNREACHABLE)?;
+    let cell = Cell::join(&config.cell).or_exit(exit::UNREACHABLE)?;
     let mut source = ObserverSource::open(&config.camera, &cell).map_err(|e| failure(e.exit_code(), e))?;
     eprintln!("calibrate: watching the camera for {} s; pour once now", args.seconds);
     let end = Instant::now() + Duration::from_secs(args.seconds);

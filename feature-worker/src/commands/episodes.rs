@@ -50,7 +50,7 @@ struct WhichArgs {
     /// Episodes (.mcap) or directories of them; without any, the directory of `[recording]` in the configuration.
     paths: Vec<PathBuf>,
     /// The cell's configuration.
-    #[arg(long, default_value = shared::config::DEFAULT_FILE)]
+    #[arg(long, env = shared::config::VARIABLE, default_value = shared::config::DEFAULT_FILE)]
     config: PathBuf,
     /// Print JSON.
     #[arg(long)]

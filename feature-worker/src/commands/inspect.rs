@@ -28,7 +28,7 @@ pub struct Args {
     #[arg(required = true)]
     input: Vec<PathBuf>,
     /// The cell's configuration. Its [image] table is what is tried.
-    #[arg(long, default_value = shared::config::DEFAULT_FILE)]
+    #[arg(long, env = shared::config::VARIABLE, default_value = shared::config::DEFAULT_FILE)]
     config: PathBuf,
     /// Directory for the pictures and the CSV.
     #[arg(long, default_value = "out/inspect")]

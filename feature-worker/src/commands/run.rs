@@ -15,7 +15,7 @@ Runs until Ctrl-C or SIGTERM (exit 0), or until its video or image sequence is o
 )]
 pub struct Args {
     /// The cell's configuration.
-    #[arg(long, default_value = shared::config::DEFAULT_FILE)]
+    #[arg(long, env = shared::config::VARIABLE, default_value = shared::config::DEFAULT_FILE)]
     config: PathBuf,
     /// Print the status as one JSON object a line, to standard output.
     #[arg(long)]

@@ -38,7 +38,7 @@ that starts. When the worker ends, it waits for the next one."
 )]
 pub struct Args {
     /// The cell's configuration.
-    #[arg(long, default_value = shared::config::DEFAULT_FILE)]
+    #[arg(long, env = shared::config::VARIABLE, default_value = shared::config::DEFAULT_FILE)]
     config: PathBuf,
     /// Port on 127.0.0.1. With 0 any free port is taken.
     #[arg(long, default_value_t = 8642)]
@@ -80,7 +80,7 @@ fn view(args: &Args, config: &Config) -> Result<(), Failure> {
     let stop = os::stop_at_signals().or_exit(exit::FAILED)?;
     opencv::core::set_num_threads(1).or_exit(exit::FAILED)?;
     let extractor = Extractor::new(&config.camera, &config.image).or_exit(exit::BAD_INPUT)?;
-    let cell = Cell::join(&config.cell.name).or_exit(exit::UNREACHABLE)?;
+    let cell = Cell::join(&config.cell).or_exit(exit::UNREACHABLE)?;
     let source = ObserverSource::open(&config.camera, &cell).map_err(|e| failure(e.exit_code(), e))?;
     let server = Page::open(args.port)?;
     println!("{}", server.address());

@@ -91,10 +91,11 @@ struct WaitingFrame {
 impl RecorderThread {
     /// Joins the cell.
     pub fn new(config: Config, directory: PathBuf, handover: Arc<Handover>) -> Result<Self, IpcError> {
-        let cell = Cell::join(&config.cell.name)?;
+        let cell = Cell::join(&config.cell)?;
         let fail = |service: &str, what: String| IpcError::Service { service: service.into(), what };
         let telemetry = cell.telemetry()?.subscriber_builder().create().map_err(|e| fail("telemetry", format!("{e:?}")))?;
         let reports = cell.recorder()?.publisher_builder().create().map_err(|e| fail("recorder", format!("{e:?}")))?;
+        cell.reserve()?;
         let encoder = Encoder::new(&config);
         Ok(Self {
             config,

@@ -11,6 +11,7 @@ use shared::exit::{self, Failure, OrExit as _, failure};
 use shared::ipc::{Cell, FrameNotifier, FrameTopic};
 use shared::messages::{FrameHeader, PixelFormat};
 use shared::os;
+use shared::shared_memory;
 
 use crate::source::Frame;
 
@@ -39,6 +40,10 @@ impl FrameRepublisher {
     /// too slow loses the oldest frame.
     pub fn offer(&self, frame: &Frame) {
         if self.topic.dynamic_config().number_of_subscribers() == 0 {
+            return;
+        }
+        // A page of a full `/dev/shm` cannot be written, and whoever tries is killed.
+        if shared_memory::check_space(2 * frame.pixels.len() as u64).is_err() {
             return;
         }
         // There is no room for a frame that is larger than configured.

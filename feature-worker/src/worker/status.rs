@@ -1,7 +1,7 @@
 //! What the worker tells the operator: one line a second, on standard error, or as JSON on standard output.
 //!
-//! The thread "status" prints what the extraction thread left in a queue of one, so that the extraction thread never writes to a
-//! terminal. A line that cannot be printed is left out.
+//! The thread "status" hands what the extraction thread left in a queue of one to the process's speaker ([`shared::speaker`]), so that
+//! neither writes to a terminal itself. A line that cannot be printed is left out.
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering::Relaxed};
@@ -11,6 +11,7 @@ use std::time::Duration;
 use crossbeam::queue::ArrayQueue;
 use serde::Serialize;
 use shared::os;
+use shared::speaker::Speaker;
 
 /// How often the thread looks for a new status. Chosen by hand; it also bounds how long the process takes to end.
 const PAUSE: Duration = Duration::from_millis(100);
@@ -45,15 +46,20 @@ pub struct Status {
 }
 
 /// Starts the thread "status". It ends soon after `stop` is set.
-pub fn start_printer(latest: &Arc<ArrayQueue<Status>>, stop: &Arc<AtomicBool>, json: bool) -> std::io::Result<JoinHandle<()>> {
-    let (latest, stop) = (Arc::clone(latest), Arc::clone(stop));
-    std::thread::Builder::new().name("status".into()).spawn(move || print_until_stopped(&latest, &stop, json))
+pub fn start_printer(
+    latest: &Arc<ArrayQueue<Status>>,
+    stop: &Arc<AtomicBool>,
+    speaker: &Arc<Speaker>,
+    json: bool,
+) -> std::io::Result<JoinHandle<()>> {
+    let (latest, stop, speaker) = (Arc::clone(latest), Arc::clone(stop), Arc::clone(speaker));
+    std::thread::Builder::new().name("status".into()).spawn(move || print_until_stopped(&latest, &stop, &speaker, json))
 }
 
-fn print_until_stopped(latest: &ArrayQueue<Status>, stop: &AtomicBool, json: bool) {
+fn print_until_stopped(latest: &ArrayQueue<Status>, stop: &AtomicBool, speaker: &Speaker, json: bool) {
     let mut frames_before = 0;
     let mut printed_at_ns = os::now_ns();
-    eprintln!("feature-worker: waiting for frames");
+    speaker.say("waiting for frames");
     while !stop.load(Relaxed) {
         std::thread::sleep(PAUSE);
         let now_ns = os::now_ns();
@@ -63,15 +69,15 @@ fn print_until_stopped(latest: &ArrayQueue<Status>, stop: &AtomicBool, json: boo
         let Some(status) = latest.pop() else { continue };
         if json {
             match serde_json::to_string(&status) {
-                Ok(line) => println!("{line}"),
-                Err(e) => eprintln!("feature-worker: status: {e}"),
+                Ok(line) => speaker.print(line),
+                Err(e) => speaker.say(&format!("status: {e}")),
             }
         } else if status.silent {
-            eprintln!("feature-worker: no frames for a second; waiting for the camera driver");
+            speaker.say("no frames for a second; waiting for the camera driver");
         } else {
             let fps = (status.frames - frames_before) as f64 * 1e9 / (now_ns - printed_at_ns) as f64;
-            eprintln!(
-                "feature-worker: frame {} ({fps:.0}/s), V_e {:.0} px^2, confidence {:.2}, doubt: {}, {:.2} ms + {:.1} ms old, lost {}, \
+            speaker.say(&format!(
+                "frame {} ({fps:.0}/s), V_e {:.0} px^2, confidence {:.2}, doubt: {}, {:.2} ms + {:.1} ms old, lost {}, \
                  repeated {}, doubtful {}",
                 status.sequence,
                 status.area_px2,
@@ -82,7 +88,7 @@ fn print_until_stopped(latest: &ArrayQueue<Status>, stop: &AtomicBool, json: boo
                 status.lost,
                 status.repeated,
                 status.doubtful
-            );
+            ));
         }
         (frames_before, printed_at_ns) = (status.frames, now_ns);
     }

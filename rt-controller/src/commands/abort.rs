@@ -1,15 +1,20 @@
-//! `rt-controller abort`: brings the container upright at once, and waits until it is. It is a short,
-//! ordinary process, and every failure is one line.
+//! `rt-controller abort`: brings the container upright at once, and waits until it is. It is a short, ordinary process, and every failure
+//! is one line.
+//!
+//! It asks at the controller's stop socket, which needs neither shared memory nor a configuration. If nobody answers there, it sends the
+//! controller's process SIGTERM, which brings the container upright too and ends the controller.
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
-use shared::config::Config;
-use shared::control::{Reply, Request};
-use shared::exit::{self, Failure, OrExit as _, failure};
+use rustix::process::{Pid, PidfdFlags, Signal, pidfd_open, pidfd_send_signal};
+use shared::config::{Config, VARIABLE};
+use shared::exit::{self, Failure, failure};
 use shared::messages::Phase;
+use shared::runtime_dir::{Place, own_uid};
 
-use crate::client::Client;
+use crate::claim;
+use crate::stop_client::{Target, running_cells};
 
 /// How long the command waits for the container to be upright. Chosen by hand: the way back from the largest tilt takes about 2 s.
 const UPRIGHT: Duration = Duration::from_secs(20);
@@ -18,34 +23,115 @@ const BEAT: Duration = Duration::from_millis(50);
 
 /// Command-line arguments.
 #[derive(Debug, clap::Args)]
-#[command(after_help = "Example:\n  rt-controller abort")]
+#[command(after_help = "Examples:\n  rt-controller abort\n  rt-controller abort --config config/cell.toml\n\n\
+Without a configuration it stops every controller of this user that runs (as root: of all users). It does not need shared memory, and\n\
+works while /dev/shm is full or files were deleted. If no controller answers, it sends the process SIGTERM; Ctrl-C in the controller's\n\
+terminal and `kill` do the same. The container then comes upright, and the controller ends.\n\
+Exit codes: 0 upright, 1 not upright, 3 no controller, 5 the robot cannot be moved.")]
 pub struct Args {
-    /// The cell's configuration.
-    #[arg(long, default_value = shared::config::DEFAULT_FILE)]
-    config: PathBuf,
+    /// The cell's configuration; without it, every cell that runs.
+    #[arg(long, env = VARIABLE)]
+    config: Option<PathBuf>,
 }
 
 /// Runs the command.
 pub fn run(args: &Args) -> Result<(), Failure> {
-    let config = Config::read(&args.config).or_exit(exit::BAD_INPUT)?;
-    let client = Client::connect(&config.cell.name).or_exit(exit::UNREACHABLE)?;
-    match client.ask(&Request::Abort).or_exit(exit::UNREACHABLE)? {
-        Reply::Aborting => {}
-        Reply::Refused { reason } => return Err(failure(exit::REFUSED, reason)),
-        _ => return Err(failure(exit::UNREACHABLE, crate::client::ClientError::Version)),
+    let targets = targets(args.config.as_deref());
+    if targets.is_empty() {
+        return Err(failure(exit::UNREACHABLE, "no rt-controller of this user is running"));
     }
-    let tolerance_deg = config.robot.start_tolerance_deg;
+    // Every cell is asked before one is waited for.
+    let asked: Vec<(Target, Result<Asked, Failure>)> = targets.into_iter().map(|t| (t.clone(), ask(&t))).collect();
+    let several = asked.len() > 1;
+    let mut result = Ok(());
+    for (target, asked) in asked {
+        let cell = if several { format!("cell '{}': ", target.name) } else { String::new() };
+        match asked.and_then(|a| wait(&target, a)) {
+            Ok(line) => println!("{cell}{line}"),
+            Err(Failure { code, what }) if several => {
+                eprintln!("error: {cell}{what}");
+                result = Err(failure(code, "not every container is upright"));
+            }
+            Err(e) => return Err(e),
+        }
+    }
+    result
+}
+
+/// The cells that are meant. A configuration that cannot be read must not keep anybody from stopping a robot.
+fn targets(config: Option<&Path>) -> Vec<Target> {
+    match config.map(Config::read) {
+        Some(Ok(config)) => {
+            let named = Target::from(Place::from(&config.cell));
+            // Root stops a cell whoever runs it.
+            let others = || running_cells().into_iter().filter(|t| t.name == named.name).collect::<Vec<_>>();
+            let of_others = if own_uid() == 0 && named.ask("state").is_none() { others() } else { Vec::new() };
+            if of_others.is_empty() { vec![named] } else { of_others }
+        }
+        Some(Err(e)) => {
+            eprintln!("{e}; every cell that runs is stopped instead");
+            running_cells()
+        }
+        None => running_cells(),
+    }
+}
+
+/// How a controller was reached.
+enum Asked {
+    /// At its socket.
+    Socket,
+    /// By SIGTERM to this process.
+    Process(claim::Running),
+}
+
+/// Asks the controller of `target` to stop.
+fn ask(target: &Target) -> Result<Asked, Failure> {
+    if let Some(answer) = target.ask("abort") {
+        return if answer.refused.is_empty() { Ok(Asked::Socket) } else { Err(failure(exit::REFUSED, answer.refused)) };
+    }
+    let absent = || {
+        let what = format!(
+            "no rt-controller of cell '{}' is running; a robot that one has left comes upright by its own program (docs/ROBOT.md)",
+            target.name
+        );
+        failure(exit::UNREACHABLE, what)
+    };
+    let process = target.process().ok_or_else(absent)?;
+    let pid = i32::try_from(process.pid).ok().and_then(Pid::from_raw).ok_or_else(absent)?;
+    // The descriptor means this process even if it ends now and its number is given to another one.
+    let held = pidfd_open(pid, PidfdFlags::empty()).map_err(|_| absent())?;
+    if claim::started(process.pid) != Some(process.started) {
+        return Err(absent());
+    }
+    pidfd_send_signal(&held, Signal::TERM).map_err(|e| failure(exit::FAILED, format!("rt-controller, process {}: {e}", process.pid)))?;
+    Ok(Asked::Process(process))
+}
+
+/// Waits until the container is upright. Gives the line that says so.
+fn wait(target: &Target, asked: Asked) -> Result<String, Failure> {
     let until = Instant::now() + UPRIGHT;
     while Instant::now() < until {
-        let status = client.status().or_exit(exit::UNREACHABLE)?;
-        match status.phase {
-            Phase::Idle | Phase::Settling if f64::from(status.alpha_measured_deg.abs()) <= tolerance_deg => {
-                println!("upright");
-                return Ok(());
+        match &asked {
+            Asked::Socket => match target.ask("state") {
+                Some(state) if state.upright => return Ok("upright".into()),
+                Some(state) if state.phase == Phase::NoRobot => return Err(failure(exit::FAILED, state.hindrance)),
+                Some(_) => {}
+                None => {
+                    let what =
+                        "rt-controller ended meanwhile: the robot's program brings the container upright by itself; look at the robot";
+                    return Err(failure(exit::UNREACHABLE, what));
+                }
+            },
+            Asked::Process(process) => {
+                if claim::started(process.pid) != Some(process.started) {
+                    return Ok(format!(
+                        "rt-controller did not answer and was ended (SIGTERM to process {}): look at the robot",
+                        process.pid
+                    ));
+                }
             }
-            Phase::NoRobot => return Err(failure(exit::FAILED, status.hindrance)),
-            _ => std::thread::sleep(BEAT),
         }
+        std::thread::sleep(BEAT);
     }
     Err(failure(exit::FAILED, "not upright after 20 s: look at the robot"))
 }

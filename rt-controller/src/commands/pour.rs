@@ -1,7 +1,7 @@
 //! `rt-controller pour ML`: asks the running controller for a pour, shows its progress, and ends with its result. It is a short,
 //! ordinary process, and every failure is one line.
 
-use shared::config::Config;
+use shared::config::{CellConfig, Config};
 use shared::control::{EndReason, Outcome, Reply, Request};
 use shared::exit::{self, Failure, OrExit as _, failure};
 
@@ -23,7 +23,7 @@ pub struct Args {
 /// Runs the command.
 pub fn run(args: &Args) -> Result<(), Failure> {
     let config = Config::read(&args.common.config).or_exit(exit::BAD_INPUT)?;
-    let (outcome, recorded) = order(&config.cell.name, &Request::Pour { goal_ml: args.goal_ml })?;
+    let (outcome, recorded) = order(&config.cell, &Request::Pour { goal_ml: args.goal_ml })?;
     report(&outcome, recorded, args.common.json);
     ended(&outcome)
 }
@@ -37,8 +37,8 @@ pub(crate) fn ended(outcome: &Outcome) -> Result<(), Failure> {
 }
 
 /// Gives an order that moves the container, follows it to its end, and waits for the recorder's report, if there is a recorder.
-pub(crate) fn order(cell: &str, request: &Request) -> Result<(Outcome, Option<client::Recorded>), Failure> {
-    let client = Client::connect(cell).or_exit(exit::UNREACHABLE)?;
+pub(crate) fn order(cell: &CellConfig, request: &Request) -> Result<(Outcome, Option<client::Recorded>), Failure> {
+    let client = Client::connect_or_end(cell).or_exit(exit::UNREACHABLE)?;
     resume::take_back_if_it_waits(&client)?;
     let recorder = client::RecorderReports::open(cell).ok();
     let episode = match client.ask(request).or_exit(exit::UNREACHABLE)? {

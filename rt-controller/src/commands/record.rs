@@ -45,7 +45,7 @@ pub fn run(args: &Args) -> Result<(), Failure> {
     let config = Config::read(&args.common.config).or_exit(exit::BAD_INPUT)?;
     let beta_s = args.beta.unwrap_or_else(|| ((args.lambda / END_DEG).ln() / args.gamma).sqrt());
     let curve = Curve { lambda_deg: args.lambda, gamma_per_s2: args.gamma, beta_s };
-    let (outcome, recorded) = pour::order(&config.cell.name, &Request::Record(curve))?;
+    let (outcome, recorded) = pour::order(&config.cell, &Request::Record(curve))?;
     pour::ended(&outcome)?;
     let file = match recorded.map(|r| r.file) {
         Some(Ok(file)) => file,

@@ -23,14 +23,14 @@ alone until you ask for it: with this command, or with the next pour or recordin
 Exit codes: 0 connected, 3 no controller, 5 the robot cannot be taken now (the reason is printed).")]
 pub struct Args {
     /// The cell's configuration.
-    #[arg(long, default_value = shared::config::DEFAULT_FILE)]
+    #[arg(long, env = shared::config::VARIABLE, default_value = shared::config::DEFAULT_FILE)]
     config: std::path::PathBuf,
 }
 
 /// Runs the command.
 pub fn run(args: &Args) -> Result<(), Failure> {
     let config = Config::read(&args.config).or_exit(exit::BAD_INPUT)?;
-    let client = Client::connect(&config.cell.name).or_exit(exit::UNREACHABLE)?;
+    let client = Client::connect_or_end(&config.cell).or_exit(exit::UNREACHABLE)?;
     let status = client.status().or_exit(exit::UNREACHABLE)?;
     if status.phase == Phase::NoRobot {
         take_back(&client)?;

@@ -1,28 +1,37 @@
 //! `rt-controller run`: the resident process.
 //!
-//! It starts the threads: "loop" is real-time, "robot" connects, "disk" writes the journal and reads weights; the main thread serves
+//! It takes the cell, so that no other controller runs in it, and starts the threads: "speaker" writes to the terminal, "stop" takes aborts
+//! and passes signals on, "loop" is real-time, "robot" connects, "disk" writes the journal and reads weights; the main thread serves
 //! clients and publishes telemetry. A signal brings the container upright and ends the process. A second signal ends it at once, and
 //! the program on the robot then goes upright by itself. Starting allocates; each failure to start is one line, and a panic in any thread
 //! ends the process.
 
-use std::io::Write;
-use std::path::PathBuf;
-use std::sync::atomic::{AtomicBool, AtomicU64, Ordering::Relaxed};
+use std::os::unix::fs::MetadataExt;
+use std::path::{Path, PathBuf};
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering::SeqCst};
 use std::sync::{Arc, Mutex};
 
 use shared::config::Config;
 use shared::exit::{self, Failure, OrExit as _, failure};
 use shared::ipc::{Cell, InService as _, IpcError};
+use shared::os;
+use shared::runtime_dir::Place;
+use shared::speaker::Speaker;
 
-use crate::control_loop::{self, Place};
+use crate::claim::Claim;
+use crate::control_loop;
 use crate::core::Settings;
 use crate::disk::Disk;
 use crate::exchange::Exchange;
+use crate::link::network::System;
 use crate::robot_thread::{self, RobotNote};
 use crate::service::Service;
+use crate::stop::{StopSockets, StopThread};
 
 /// Stack of each thread beside the main one, bytes; all of it is locked in memory. Chosen by hand; no measurement is recorded.
 const STACK: usize = 512 * 1024;
+/// Space in `/dev/shm` that must be free before the controller makes its ports, bytes: they take 3.6 MB (measured).
+const SHARED_MEMORY: u64 = 8 << 20;
 
 /// The failure of a thread that could not be started.
 fn no_thread(e: std::io::Error) -> Failure {
@@ -35,30 +44,34 @@ fn no_thread(e: std::io::Error) -> Failure {
 Ctrl-C or SIGTERM brings the container upright and stops the controller.")]
 pub struct Args {
     /// The cell's configuration.
-    #[arg(long, default_value = shared::config::DEFAULT_FILE)]
+    #[arg(long, env = shared::config::VARIABLE, default_value = shared::config::DEFAULT_FILE)]
     config: PathBuf,
 }
 
 /// Runs the command.
 pub fn run(args: &Args) -> Result<(), Failure> {
     let config = Config::read(&args.config).or_exit(exit::BAD_INPUT)?;
-    // A terminal that has gone away is no reason to stop.
-    let say = |text: &str| _ = writeln!(std::io::stderr(), "rt-controller: {text}");
     // Half a controller would be worse than none: without targets the robot's program comes upright by itself.
     std::panic::set_hook(Box::new(|panic| {
-        let _ = writeln!(std::io::stderr(), "rt-controller: this is a defect, please report it: {panic}");
+        os::tell(&format!("rt-controller: this is a defect, please report it: {panic}"));
         std::process::abort();
     }));
     let stop = stop_at_signals()?;
+    let lost = "rt-controller: shared memory vanished: /dev/shm is full, or a file there was cut. The container comes upright and the controller ends";
+    os::explain_bus_errors(lost, exit::FAILED, Arc::clone(&stop));
 
     // This comes before the threads are made, so that everything that they need is in memory before the loop starts.
-    if let Err(line) = shared::os::lock_memory() {
-        say(&line);
+    let unlocked = os::lock_memory().err();
+    let speaker = Speaker::start("rt-controller");
+    let say = |text: &str| speaker.say(text);
+    unlocked.iter().for_each(|line| say(line));
+    let _awake = os::stay_awake().map_err(|line| say(&line));
+    let result = start(&config, &args.config, &stop, &say, &speaker);
+    if result.is_ok() {
+        say("stopped");
     }
-    let _awake = shared::os::stay_awake().map_err(|line| say(&line));
-    run_threads(&config, &stop, &say)?;
-    say("stopped");
-    Ok(())
+    speaker.finish();
+    result
 }
 
 /// Becomes true at the first Ctrl-C or SIGTERM; the second one ends the process at once.
@@ -73,28 +86,84 @@ fn stop_at_signals() -> Result<Arc<AtomicBool>, Failure> {
     Ok(stop)
 }
 
-/// Starts the threads, serves clients in this one, and returns when the loop has ended, upright.
-fn run_threads(config: &Config, stop: &AtomicBool, say: &(dyn Fn(&str) + Sync)) -> Result<(), Failure> {
-    let exchange = Exchange::default();
-    let (note, connections, refused) = (RobotNote::default(), AtomicU64::new(0), Mutex::default());
+/// Takes the cell, opens the way to stop a motion, and runs the threads until the loop has ended, upright.
+fn start(config: &Config, file: &Path, stop: &AtomicBool, say: &(dyn Fn(&str) + Sync), speaker: &Speaker) -> Result<(), Failure> {
+    let directory = Place::from(&config.cell).directory().or_exit(exit::BAD_INPUT)?;
+    let _claim = Claim::take(&directory, file, config).or_exit(exit::REFUSED)?;
+    let sockets = StopSockets::open(&directory, &config.cell.name, say).or_exit(exit::FAILED)?;
+    let owner = std::fs::metadata(file).ok().map(|m| m.uid());
+    let shared = Shared::default();
+    let give_up = || {
+        let written = shared.disk_done.load(SeqCst);
+        say(if written { "stopped" } else { "the disk does not answer: stopped without it, so the end of the journal may be missing" });
+        speaker.finish();
+        std::process::exit(if written { 0 } else { exit::FAILED.into() });
+    };
+    let stopping = StopThread {
+        sockets,
+        exchange: &shared.exchange,
+        robot_note: &shared.note,
+        tolerance_deg: config.robot.start_tolerance_deg as f32,
+        stop,
+        end: &shared.end,
+        done: &shared.done,
+        give_up: &give_up,
+    };
     std::thread::scope(|scope| {
-        let cell = Cell::join(&config.cell.name).or_exit(exit::FAILED)?;
-        let (disk, journal) = Disk::open(config, &exchange, &refused, say);
-        let service = Service::open(&cell, &exchange, (&note, &connections), (&refused, journal), say).or_exit(exit::FAILED)?;
+        thread("stop").spawn_scoped(scope, || stopping.run()).map_err(no_thread)?;
+        let result = run_threads(config, owner, &shared, stop, say);
+        shared.done.store(true, SeqCst);
+        result
+    })
+}
+
+/// What the threads share besides the queues.
+#[derive(Default)]
+struct Shared {
+    exchange: Exchange,
+    note: RobotNote,
+    connections: AtomicU64,
+    /// Why the newest weight file is not used.
+    refused: Mutex<String>,
+    /// Whether the robot's and the disk's threads are to end.
+    end: AtomicBool,
+    /// Whether everything is written.
+    disk_done: AtomicBool,
+    /// Whether all other threads have ended.
+    done: AtomicBool,
+}
+
+/// Starts the threads, serves clients in this one, and returns when the loop has ended, upright.
+fn run_threads(
+    config: &Config,
+    owner: Option<u32>,
+    shared: &Shared,
+    stop: &AtomicBool,
+    say: &(dyn Fn(&str) + Sync),
+) -> Result<(), Failure> {
+    let Shared { exchange, note, connections, refused, end, disk_done, .. } = shared;
+    let cell = Cell::join(&config.cell).or_exit(exit::FAILED)?;
+    cell.check_space(SHARED_MEMORY).or_exit(exit::FAILED)?;
+    let (disk, queues) = Disk::open(config, owner, exchange, refused, say).or_exit(exit::BAD_INPUT)?;
+    let service = Service::open(&cell, exchange, (note, connections), (refused, queues), say).or_exit(exit::FAILED)?;
+    cell.reserve().or_exit(exit::FAILED)?;
+    std::thread::scope(|scope| {
         let (ready_sender, ready) = std::sync::mpsc::channel();
-        let exchange = &exchange;
         thread("loop").spawn_scoped(scope, move || real_time(config, exchange, say, &ready_sender)).map_err(no_thread)?;
         ready.recv().unwrap_or(Ok(())).or_exit(exit::FAILED)?;
-        let end = AtomicBool::new(false);
         std::thread::scope(|inner| {
-            let robot = || robot_thread::keep_robot_connected(config, exchange, &note, &connections, &end, say);
+            let robot = || robot_thread::keep_robot_connected(&System, config, exchange, note, connections, end, say);
             let spawned = thread("robot").spawn_scoped(inner, robot);
-            let spawned = spawned.and(thread("disk").spawn_scoped(inner, || disk.run(&end)));
+            let writing = || {
+                disk.run(end);
+                disk_done.store(true, SeqCst);
+            };
+            let spawned = spawned.and(thread("disk").spawn_scoped(inner, writing));
             say(&format!("running in cell '{}' at {} Hz", config.cell.name, config.controller.rate_hz));
             // Without these threads there is no robot and there are no weights: the loop ends at once.
-            stop.fetch_or(spawned.is_err(), Relaxed);
-            service.run(stop);
-            end.store(true, Relaxed);
+            stop.fetch_or(spawned.is_err(), SeqCst);
+            service.run();
+            end.store(true, SeqCst);
             spawned.map(|_| ()).map_err(no_thread)
         })
     })
@@ -107,14 +176,16 @@ fn thread(name: &str) -> std::thread::Builder {
 
 /// The real-time thread: opens its own node and subscriber, tells `ready` how that went, and runs the loop.
 fn real_time(config: &Config, exchange: &Exchange, say: &dyn Fn(&str), ready: &std::sync::mpsc::Sender<Result<(), IpcError>>) {
-    let opened = Cell::join(&config.cell.name).and_then(|cell| {
+    let opened = Cell::join(&config.cell).and_then(|cell| {
         let subscriber = cell.features()?.subscriber_builder().buffer_size(crate::core::MAX_FEATURES).create();
-        Ok((cell, subscriber.in_service("feature")?))
+        let subscriber = subscriber.in_service("feature")?;
+        cell.reserve()?;
+        Ok((cell, subscriber))
     });
     match opened {
         Ok((_cell, subscriber)) => {
             let _ = ready.send(Ok(()));
-            let place = Place { core: config.controller.core, priority: config.controller.priority };
+            let place = control_loop::Place { core: config.controller.core, priority: config.controller.priority };
             let lost_ns = u64::from(config.controller.lost_robot_ms) * 1_000_000;
             control_loop::run(Settings::new(config), place, lost_ns, &subscriber, exchange, say);
         }

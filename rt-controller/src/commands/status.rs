@@ -18,7 +18,7 @@ pub struct Args {
 /// Runs the command.
 pub fn run(args: &Args) -> Result<(), Failure> {
     let config = Config::read(&args.common.config).or_exit(exit::BAD_INPUT)?;
-    let status = Client::connect(&config.cell.name).and_then(|c| c.status()).or_exit(exit::UNREACHABLE)?;
+    let status = Client::connect_or_end(&config.cell).and_then(|c| c.status()).or_exit(exit::UNREACHABLE)?;
     if args.common.json {
         println!("{}", serde_json::to_string_pretty(&status).or_exit(exit::FAILED)?);
     } else {

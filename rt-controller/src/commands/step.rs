@@ -25,7 +25,7 @@ pub struct Args {
     #[arg(long)]
     goal: f32,
     /// The cell's configuration.
-    #[arg(long, default_value = shared::config::DEFAULT_FILE)]
+    #[arg(long, env = shared::config::VARIABLE, default_value = shared::config::DEFAULT_FILE)]
     config: PathBuf,
 }
 

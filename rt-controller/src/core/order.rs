@@ -56,6 +56,8 @@ pub enum Refusal {
     Curve,
     /// The controller is shutting down.
     Shutdown,
+    /// The motion was stopped before the order's turn came.
+    Stopped,
 }
 
 impl std::fmt::Display for Refusal {
@@ -80,6 +82,7 @@ impl std::fmt::Display for Refusal {
             Self::Goal(max) => write!(f, "the goal must be above 0 and at most {max} ml (controller.goal_max_ml)"),
             Self::Curve => write!(f, "the curve leaves [limits]: choose a smaller lambda or gamma, and a beta of 0.5 to 60 s"),
             Self::Shutdown => write!(f, "the controller is shutting down"),
+            Self::Stopped => write!(f, "an abort came before this order's turn: give it again"),
         }
     }
 }

@@ -15,6 +15,7 @@ use prost::Message as _;
 use sha2::{Digest, Sha256};
 
 use super::format::{self, CompressedImage, EpisodeRowJson, FeatureJson, TelemetryJson};
+use super::number::{LARGEST, take_number};
 use super::{EpisodeKind, hex};
 use crate::config::Config;
 use crate::messages::{Doubt, Feature, Telemetry};
@@ -101,9 +102,10 @@ pub struct EpisodeWriter {
 }
 
 impl EpisodeWriter {
-    /// Creates the next free `episode-NNNN.mcap` in `directory` (made if missing) and writes what is known at the start.
+    /// Creates `episode-NNNN.mcap` in `directory` (made if missing) and writes what is known at the start. NNNN is the episode's number,
+    /// or the next free one if that has a file already.
     pub fn create(directory: &Path, start: &EpisodeStart) -> Result<Self, WriteError> {
-        let (file, path) = next_free(directory)?;
+        let (file, path) = create_file(directory, start.episode)?;
         let fail = |e: mcap::McapError| file_error(&path, &e);
         let options = WriteOptions::new()
             .compression(None)
@@ -249,31 +251,25 @@ fn file_error(path: &Path, what: &dyn std::fmt::Display) -> WriteError {
     WriteError::File { file: path.display().to_string(), what: what.to_string() }
 }
 
-/// Creates `episode-NNNN.mcap` with the number after the highest one that is there.
-fn next_free(directory: &Path) -> Result<(File, PathBuf), WriteError> {
+/// Creates the file of episode `number`, or of the next free number if that one has a file or is none of a directory's numbers.
+fn create_file(directory: &Path, number: u64) -> Result<(File, PathBuf), WriteError> {
     let fail = |e: std::io::Error| WriteError::Directory { directory: directory.display().to_string(), what: e.to_string() };
     std::fs::create_dir_all(directory).map_err(fail)?;
     let directory = directory.canonicalize().map_err(fail)?;
-    let mut number = 0;
-    for entry in std::fs::read_dir(&directory).map_err(fail)? {
-        let name = entry.map_err(fail)?.file_name();
-        let taken = name.to_str().and_then(|n| n.strip_prefix("episode-")?.strip_suffix(".mcap")?.parse::<u32>().ok());
-        number = number.max(taken.map_or(0, u64::from));
-    }
+    let mut number = if (1..=LARGEST).contains(&number) { number } else { take_number(&directory).map_err(fail)? };
     loop {
-        number += 1;
         let path = directory.join(format!("episode-{number:04}.mcap"));
-        // Another recorder may take the name between the look and the creation. Only a file that was not there is ours.
+        // Only a file that was not there is ours.
         match OpenOptions::new().write(true).create_new(true).open(&path) {
             Ok(file) => return Ok((file, path)),
-            Err(e) if e.kind() == ErrorKind::AlreadyExists => {}
+            Err(e) if e.kind() == ErrorKind::AlreadyExists => number = take_number(&directory).map_err(fail)?,
             Err(e) => return Err(file_error(&path, &e)),
         }
     }
 }
 
 /// Seconds since 1970 as RFC 3339 in UTC. The date follows Howard Hinnant, "chrono-compatible low-level date algorithms".
-fn rfc3339(unix_s: u64) -> String {
+pub(crate) fn rfc3339(unix_s: u64) -> String {
     let (days, second) = (unix_s / 86_400, unix_s % 86_400);
     let z = days + 719_468;
     let (era, doe) = (z / 146_097, z % 146_097);
@@ -299,24 +295,25 @@ mod tests {
         assert_eq!(rfc3339(1_795_311_559), "2026-11-22T01:39:19Z");
     }
 
-    /// Protects earlier episodes: a new one never takes a name that is there, and no number below the highest is used again.
+    /// Protects earlier episodes: a file is never overwritten, and one whose number is taken gets the next free one.
     #[test]
-    fn the_next_free_name_is_taken() {
+    fn a_file_that_is_there_is_left_alone() {
         let dir = tempfile::tempdir().unwrap();
         std::fs::write(dir.path().join("episode-0007.mcap"), b"mine").unwrap();
-        std::fs::write(dir.path().join("episode-x.mcap"), b"other").unwrap();
-        let (_, path) = next_free(dir.path()).unwrap();
-        assert!(path.ends_with("episode-0008.mcap"), "{}", path.display());
-        let (_, path) = next_free(dir.path()).unwrap();
-        assert!(path.ends_with("episode-0009.mcap"), "{}", path.display());
+        for (number, name) in
+            [(7, "episode-0008.mcap"), (12, "episode-0012.mcap"), (12, "episode-0013.mcap"), (1 << 52, "episode-0014.mcap")]
+        {
+            let (_, path) = create_file(dir.path(), number).unwrap();
+            assert!(path.ends_with(name), "{number}: {}", path.display());
+        }
         assert_eq!(std::fs::read(dir.path().join("episode-0007.mcap")).unwrap(), b"mine");
 
         let names: Vec<PathBuf> = std::thread::scope(|scope| {
-            let take = || (0..100).map(|_| next_free(dir.path()).unwrap().1).collect::<Vec<_>>();
+            let take = || (0..50).map(|_| create_file(dir.path(), 7).unwrap().1).collect::<Vec<_>>();
             let threads: Vec<_> = (0..4).map(|_| scope.spawn(take)).collect();
             threads.into_iter().flat_map(|t| t.join().unwrap()).collect()
         });
         let distinct: std::collections::BTreeSet<&PathBuf> = names.iter().collect();
-        assert_eq!(distinct.len(), 400, "two recorders at once never get the same file");
+        assert_eq!(distinct.len(), 200, "two recorders at once never get the same file");
     }
 }

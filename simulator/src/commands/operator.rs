@@ -11,6 +11,7 @@ use clap::Subcommand;
 use serde_json::Value;
 use shared::config::Config;
 use shared::exit::{self, Failure, OrExit as _, failure};
+use shared::runtime_dir::Place;
 
 use crate::{cell, ur};
 
@@ -49,7 +50,7 @@ enum Action {
 #[derive(Debug, clap::Args)]
 struct Common {
     /// The simulated cell's configuration.
-    #[arg(long, default_value = shared::config::DEFAULT_FILE)]
+    #[arg(long, env = shared::config::VARIABLE, default_value = shared::config::DEFAULT_FILE)]
     config: PathBuf,
     /// Print the answer as JSON.
     #[arg(long)]
@@ -67,7 +68,7 @@ pub fn run(args: &Args) -> Result<(), Failure> {
     };
     let name = &config.cell.name;
     let absent = |e| format!("no simulated cell '{name}' ({e}): is `simulator run` running with the same --config?");
-    let answer = ask(name, &line).map_err(absent).or_exit(exit::UNREACHABLE)?;
+    let answer = ask(&config.cell, &line).map_err(absent).or_exit(exit::UNREACHABLE)?;
     if let Some(error) = answer["error"].as_str() {
         return Err(failure(exit::REFUSED, error));
     }
@@ -85,12 +86,12 @@ fn cause(config: &Config, fault: &str) -> Result<(), Failure> {
     ur::send_fault(config.robot.address, &fault).or_exit(exit::UNREACHABLE)
 }
 
-/// Writes one line to the operator socket of the cell `cell`, and returns its answer.
+/// Writes one line to the operator socket of the cell `place`, and returns its answer.
 ///
 /// # Errors
 /// When nothing listens at the socket, or the answer is not JSON.
-pub fn ask(cell: &str, line: &str) -> std::io::Result<Value> {
-    let mut stream = UnixStream::connect(cell::operator_socket(cell))?;
+pub fn ask(place: impl Into<Place>, line: &str) -> std::io::Result<Value> {
+    let mut stream = UnixStream::connect(cell::operator_socket(place))?;
     writeln!(stream, "{line}")?;
     let mut answer = String::new();
     BufReader::new(&stream).read_line(&mut answer)?;

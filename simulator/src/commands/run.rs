@@ -17,7 +17,7 @@ configuration, and act as the operator with `simulator operator`."
 )]
 pub struct Args {
     /// The simulated cell's configuration.
-    #[arg(long, default_value = shared::config::DEFAULT_FILE)]
+    #[arg(long, env = shared::config::VARIABLE, default_value = shared::config::DEFAULT_FILE)]
     config: PathBuf,
 }
 

@@ -6,6 +6,7 @@
 
 use shared::estimator::vessel::{KNOTS, KNOTS_DEG};
 
+use super::servo::Servo;
 use super::unknowns::{
     AREA_EXPONENT, DELAY, EVEN_SHARE, FILM_SHARE, HEAD_EXPONENT, LAG, LOG_C, LOG_RADIUS, LOG_SLENDERNESS, LOG_WEIR, SHARED, TAPER,
     TILT_SLOPE, WEIR_CURVATURE, WEIR_SLOPE,
@@ -31,6 +32,15 @@ enum Price {
     Cauchy,
 }
 
+/// Standard deviation of the model's lag around the joint's own, which was measured, frames: what the liquid adds. Chosen by hand; no
+/// measurement is recorded.
+const SERVO_LAG_SD_FRAMES: f64 = 0.3;
+/// From the joint's movement to the stream's area, frames: what falls past the region of the picture was over the lip a little earlier.
+/// Chosen by hand; no measurement is recorded.
+const PICTURE_FRAMES: f64 = 0.5;
+/// Standard deviation of [`PICTURE_FRAMES`]. Chosen by hand; no measurement is recorded.
+const PICTURE_SD_FRAMES: f64 = 0.5;
+
 /// An unknown's expected value and standard deviation.
 struct Prior {
     unknown: usize,
@@ -42,9 +52,13 @@ struct Prior {
 /// The priors of all unknowns but the log shape and the calibration's exponent.
 ///
 /// Radius, slenderness and taper are those of vessels that a gripper holds. The exponent is a weir's. The others began as those of
-/// the prototype and were tuned on rigs 100 to 123, see docs/LEARNING.md.
-fn priors() -> [Prior; 12] {
+/// the prototype and were tuned on rigs 100 to 123, see docs/LEARNING.md. Lag and delay are the joint's own where they were measured.
+fn priors(servo: Option<Servo>) -> [Prior; 12] {
     use Price::{Cauchy, Square};
+    let (lag, lag_sd, delay, delay_sd) = match servo {
+        Some(servo) => (servo.lag_frames, SERVO_LAG_SD_FRAMES, servo.delay_frames + PICTURE_FRAMES, PICTURE_SD_FRAMES),
+        None => (2.0, 0.8, 2.0, 1.2),
+    };
     [
         (LOG_RADIUS, RADIUS_MM.ln(), 0.25, Square),
         (LOG_SLENDERNESS, SLENDERNESS.ln(), 0.3, Square),
@@ -55,8 +69,8 @@ fn priors() -> [Prior; 12] {
         (LOG_WEIR, -3.2, 1.5, Square),
         (WEIR_SLOPE, 0.0, 0.15, Cauchy),
         (WEIR_CURVATURE, 0.0, 0.1, Cauchy),
-        (LAG, 2.0, 0.8, Square),
-        (DELAY, 2.0, 1.2, Square),
+        (LAG, lag, lag_sd, Square),
+        (DELAY, delay, delay_sd, Square),
         (FILM_SHARE, 0.1, 0.1, Square),
     ]
     .map(|(unknown, expected, sd, price)| Prior { unknown, expected, sd, price })
@@ -85,7 +99,7 @@ fn cauchy(r: f64) -> f64 {
 }
 
 /// The priors' residuals, in standard deviations.
-pub fn residuals(shared: &[f64; SHARED], held: Option<HeldCalibration>) -> Vec<f64> {
+pub fn residuals(shared: &[f64; SHARED], held: Option<HeldCalibration>, servo: Option<Servo>) -> Vec<f64> {
     let mut r = Vec::with_capacity(40);
     for k in 0..KNOTS {
         r.push(cauchy(shared[k] / LOG_SHAPE_SD[k]));
@@ -95,7 +109,7 @@ pub fn residuals(shared: &[f64; SHARED], held: Option<HeldCalibration>) -> Vec<f
     for k in 1..KNOTS - 2 {
         r.push(cauchy((slope(k) - slope(k - 1)) / LOG_SHAPE_BEND_SD));
     }
-    for Prior { unknown, expected, sd, price } in priors() {
+    for Prior { unknown, expected, sd, price } in priors(servo) {
         let sds = (shared[unknown] - expected) / sd;
         r.push(match price {
             Price::Square => sds,

@@ -9,6 +9,7 @@ use shared::estimator::flow::FlowTables;
 
 use super::prepared::{PreparedEpisode, Stage};
 use super::priors::{self, HeldCalibration};
+use super::servo::Servo;
 use super::unknowns::{AREA_EXPONENT, DELAY, EVEN_SHARE, FILM_SHARE, HEAD_EXPONENT, LAG, LOG_C, OWN, SHARED, Unknowns, model_of};
 
 /// Step of the difference quotients.
@@ -43,6 +44,8 @@ pub struct Problem<'a> {
     pub stage: Stage,
     /// A calibration that is held on to.
     pub held: Option<HeldCalibration>,
+    /// How the joint follows, if it was measured.
+    pub servo: Option<Servo>,
 }
 
 /// The normal equations at a point: J'J and J'r. The shared unknowns come first, then those of each episode.
@@ -80,7 +83,7 @@ impl Problem<'_> {
             .into_par_iter()
             .map(|k| sum_of_squares(&self.episode_residuals(k, &flow, &at.shared, &at.own[k])))
             .collect();
-        let total = sum_of_squares(&priors::residuals(&at.shared, self.held)) + parts.iter().sum::<f64>();
+        let total = sum_of_squares(&priors::residuals(&at.shared, self.held, self.servo)) + parts.iter().sum::<f64>();
         if total.is_finite() { total } else { f64::INFINITY }
     }
 
@@ -124,12 +127,12 @@ impl Problem<'_> {
 
     /// The priors' part of the normal equations.
     fn linearised_priors(&self, shared: &[f64; SHARED]) -> (DMatrix<f64>, DVector<f64>) {
-        let base = priors::residuals(shared, self.held);
+        let base = priors::residuals(shared, self.held, self.servo);
         let mut jacobian = DMatrix::zeros(base.len(), SHARED);
         for k in 0..SHARED {
             let mut nudged = *shared;
             nudged[k] += NUDGE;
-            set_column(&mut jacobian, k, &priors::residuals(&nudged, self.held), &base, NUDGE);
+            set_column(&mut jacobian, k, &priors::residuals(&nudged, self.held, self.servo), &base, NUDGE);
         }
         normal(&jacobian, base)
     }

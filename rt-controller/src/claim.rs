@@ -1,0 +1,122 @@
+//! That one controller runs a cell, and that no two cells that run share a file.
+//!
+//! A controller takes the lock `controller.lock` in the cell's runtime directory before it touches anything else, and writes into `controller`
+//! who it is and which files it uses. The kernel gives the lock back however the process ends. Commands read the file to find the process.
+//! Ordinary threads use it at the start; it allocates and looks at the disk. Errors are one line each.
+
+use std::fs::{File, OpenOptions};
+use std::os::unix::fs::{MetadataExt, OpenOptionsExt};
+use std::path::{Path, PathBuf};
+
+use serde::{Deserialize, Serialize};
+use shared::config::Config;
+use shared::config_paths::is_same;
+use shared::regular_file;
+
+/// Largest file `controller`, bytes: four paths of the longest length.
+const FILE_MAX: u64 = 32 * 1024;
+
+/// A controller that runs, as its file says.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Running {
+    /// Its process number.
+    pub pid: u32,
+    /// When the process started, in the kernel's ticks since the machine did: with it a number that was given again is not mistaken.
+    pub started: u64,
+    /// The configuration that it read.
+    pub config: PathBuf,
+    /// The files that it uses: the configuration's key, and the path.
+    pub files: Vec<(String, PathBuf)>,
+}
+
+/// The right to run a cell, until it is dropped or the process ends.
+#[derive(Debug)]
+pub struct Claim {
+    path: PathBuf,
+    _lock: File,
+}
+
+impl Claim {
+    /// Takes the cell whose runtime directory is `directory`. The error says who has it, or which file another cell uses.
+    pub fn take(directory: &Path, file: &Path, config: &Config) -> Result<Self, String> {
+        let lock_path = directory.join("controller.lock");
+        let fail = |e: std::io::Error| format!("{}: {e}", lock_path.display());
+        let flags = (rustix::fs::OFlags::NOFOLLOW | rustix::fs::OFlags::NONBLOCK).bits() as i32;
+        let lock =
+            OpenOptions::new().write(true).create(true).truncate(false).mode(0o600).custom_flags(flags).open(&lock_path).map_err(fail)?;
+        let name = &config.cell.name;
+        if lock.try_lock().is_err() {
+            let who = running(directory).map_or(String::new(), |r| format!(" (process {}, {})", r.pid, r.config.display()));
+            return Err(format!(
+                "another rt-controller of cell '{name}' is running{who}: stop it first, or give this cell another cell.name"
+            ));
+        }
+        let mut files = vec![
+            ("controller.weights".to_string(), config.controller.weights.clone()),
+            ("recording.directory".to_string(), config.recording.directory.clone()),
+        ];
+        files.extend(config.controller.journal.clone().map(|j| ("controller.journal".to_string(), j)));
+        let this = Running {
+            pid: std::process::id(),
+            started: started(std::process::id()).unwrap_or(0),
+            config: std::path::absolute(file).unwrap_or_else(|_| file.into()),
+            files,
+        };
+        check_others(directory, &this)?;
+        let path = directory.join("controller");
+        let new = directory.join("controller.new");
+        let text = serde_json::to_string(&this).map_err(|e| e.to_string())?;
+        std::fs::write(&new, text).and_then(|()| std::fs::rename(&new, &path)).map_err(fail)?;
+        Ok(Self { path, _lock: lock })
+    }
+}
+
+impl Drop for Claim {
+    fn drop(&mut self) {
+        let _ = std::fs::remove_file(&self.path);
+    }
+}
+
+/// Refuses files that the controller of another cell uses. Cells in other runtime directories are not seen.
+fn check_others(directory: &Path, this: &Running) -> Result<(), String> {
+    for entry in directory.parent().and_then(|base| std::fs::read_dir(base).ok()).into_iter().flatten().flatten() {
+        if entry.path() == directory {
+            continue;
+        }
+        let Some(other) = running(&entry.path()) else { continue };
+        for (key, path) in &this.files {
+            if let Some((its, _)) = other.files.iter().find(|(_, p)| is_same(p, path)) {
+                let cell = entry.file_name().to_string_lossy().into_owned();
+                return Err(format!(
+                    "{key} = {}: cell '{cell}' uses it as {its} ({}); give each cell files of its own",
+                    path.display(),
+                    other.config.display()
+                ));
+            }
+        }
+    }
+    Ok(())
+}
+
+/// The controller whose runtime directory is `directory`, if it runs.
+pub fn running(directory: &Path) -> Option<Running> {
+    let bytes = regular_file::read(&directory.join("controller"), FILE_MAX).ok()?;
+    let found: Running = serde_json::from_slice(&bytes).ok()?;
+    (started(found.pid) == Some(found.started)).then_some(found)
+}
+
+/// When the process `pid` started, in the kernel's ticks; `None` if there is none, or if it is no rt-controller.
+pub fn started(pid: u32) -> Option<u64> {
+    let stat = std::fs::read_to_string(format!("/proc/{pid}/stat")).ok()?;
+    let (before, after) = stat.rsplit_once(')')?;
+    // The fields are those of proc(5); the 22nd is the start. What ended and was not waited for does not run.
+    let mut fields = after.split_whitespace();
+    let state = fields.next()?;
+    let is_ours = before.ends_with("(rt-controller") && !matches!(state, "Z" | "X");
+    is_ours.then(|| fields.nth(18)?.parse().ok()).flatten()
+}
+
+/// The user who owns the runtime directory of a cell; its controller runs as that user.
+pub fn owner(directory: &Path) -> Option<u32> {
+    directory.symlink_metadata().ok().map(|m| m.uid())
+}

@@ -1,0 +1,102 @@
+//! The clients' side of the stop socket ([`crate::stop`]): finds the controllers that run, and asks them to stop the motion.
+//!
+//! It needs no shared memory. It runs in ordinary threads of other processes, allocates, and waits for an answer a moment at most. Who
+//! answers is checked: the socket's server must be the user whose cell it is, or root.
+
+use std::collections::BTreeMap;
+use std::io::{BufRead, BufReader, Write};
+use std::os::linux::net::SocketAddrExt;
+use std::os::unix::net::{SocketAddr, UnixStream};
+use std::path::PathBuf;
+use std::sync::mpsc;
+use std::time::Duration;
+
+use shared::os::peer_uid;
+use shared::runtime_dir::{Place, bases, own_uid};
+
+use crate::claim;
+use crate::stop::{StopAnswer, abstract_name};
+
+/// Longest wait for an answer. Chosen by hand: the controller's thread answers at once.
+const ANSWER: Duration = Duration::from_secs(1);
+
+/// Where the controller of one cell may be reached.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Target {
+    /// The cell's name.
+    pub name: String,
+    /// The user as whom its controller runs.
+    uid: u32,
+    /// The cell's runtime directories, those that may be there.
+    directories: Vec<PathBuf>,
+}
+
+impl From<Place> for Target {
+    fn from(place: Place) -> Self {
+        let mut directories = vec![place.path()];
+        if place.base.is_none() {
+            directories.extend(bases().into_iter().map(|b| b.join(&place.name)));
+            directories.dedup();
+        }
+        let uid = directories.iter().find(|d| d.join("stop").exists()).and_then(|d| claim::owner(d)).unwrap_or_else(own_uid);
+        Self { name: place.name, uid, directories }
+    }
+}
+
+/// The cells of this user whose controllers run, and for root those of all users.
+pub fn running_cells() -> Vec<Target> {
+    let mut found: BTreeMap<(u32, String), Vec<PathBuf>> = BTreeMap::new();
+    for entry in bases().iter().filter_map(|b| std::fs::read_dir(b).ok()).flatten().flatten() {
+        if entry.path().join("stop").exists()
+            && let Some(uid) = claim::owner(&entry.path())
+        {
+            found.entry((uid, entry.file_name().to_string_lossy().into_owned())).or_default().push(entry.path());
+        }
+    }
+    for line in std::fs::read_to_string("/proc/net/unix").unwrap_or_default().lines() {
+        let Some((uid, name)) = line.split_once("@decant/").and_then(|(_, rest)| rest.split_once('/')) else { continue };
+        if let Ok(uid) = uid.parse() {
+            found.entry((uid, name.into())).or_default();
+        }
+    }
+    let may_stop = |uid: u32, directories: &[PathBuf]| uid == own_uid() || own_uid() == 0 || !directories.is_empty();
+    let targets = found.into_iter().map(|((uid, name), directories)| Target { name, uid, directories });
+    targets.filter(|t| may_stop(t.uid, &t.directories)).collect()
+}
+
+impl Target {
+    /// Sends `line` to the controller and gives its answer; `None` if no controller answers at either socket.
+    pub fn ask(&self, line: &'static str) -> Option<StopAnswer> {
+        let name = abstract_name(self.uid, &self.name);
+        let mut addresses: Vec<SocketAddr> =
+            self.directories.iter().filter_map(|d| SocketAddr::from_pathname(d.join("stop")).ok()).collect();
+        addresses.extend(SocketAddr::from_abstract_name(name).ok());
+        addresses.into_iter().find_map(|address| ask_within(address, self.uid, line))
+    }
+
+    /// The process of the cell's controller, if it runs and its runtime directory still says so.
+    pub fn process(&self) -> Option<claim::Running> {
+        self.directories.iter().find_map(|d| claim::running(d))
+    }
+}
+
+/// Asks at one socket. A thread does it, because a server that was stopped takes no connection and gives no answer.
+fn ask_within(address: SocketAddr, uid: u32, line: &'static str) -> Option<StopAnswer> {
+    let (sender, receiver) = mpsc::channel();
+    let asking = std::thread::Builder::new().spawn(move || {
+        let _ = sender.send(ask_at(&address, uid, line));
+    });
+    asking.ok()?;
+    receiver.recv_timeout(ANSWER).ok().flatten()
+}
+
+fn ask_at(address: &SocketAddr, uid: u32, line: &str) -> Option<StopAnswer> {
+    let mut stream = UnixStream::connect_addr(address).ok()?;
+    if !peer_uid(&stream).is_some_and(|peer| peer == uid || peer == 0) {
+        return None;
+    }
+    stream.write_all(format!("{line}\n").as_bytes()).ok()?;
+    let mut answer = String::new();
+    BufReader::new(&stream).read_line(&mut answer).ok()?;
+    serde_json::from_str(&answer).ok()
+}

@@ -1,0 +1,69 @@
+//! What a path in a configuration means: a relative one starts at the directory of the configuration file, wherever one stands; and no two
+//! keys may mean the same file.
+//!
+//! Ordinary threads use it while they read a configuration; it allocates and looks at the disk. Nothing here fails: what is not there yet
+//! is compared by its name.
+
+use std::os::unix::fs::MetadataExt;
+use std::path::{Component, Path, PathBuf};
+
+/// `path` as the configuration `file` means it, absolute.
+pub fn beside(file: &Path, path: &Path) -> PathBuf {
+    let file = std::path::absolute(file).unwrap_or_else(|_| file.into());
+    tidy(&file.parent().unwrap_or(Path::new("/")).join(path))
+}
+
+/// `path` without `..`, as far as its directory is there. Its last part stays, because it may be a link that people exchange.
+fn tidy(path: &Path) -> PathBuf {
+    for there in path.ancestors().skip(1) {
+        if let Ok(real) = there.canonicalize()
+            && let Ok(rest) = path.strip_prefix(there)
+            && rest.components().all(|c| matches!(c, Component::Normal(_)))
+        {
+            return real.join(rest);
+        }
+    }
+    path.into()
+}
+
+/// The first of `paths` that means the same as one before it: the two keys.
+pub fn clash<'a>(paths: &[(&'a str, PathBuf)]) -> Option<(&'a str, &'a str)> {
+    paths.iter().enumerate().find_map(|(i, (key, path))| {
+        let same = |other: &&(&str, PathBuf)| is_same(&other.1, path);
+        paths[..i].iter().find(same).map(|(first, _)| (*first, *key))
+    })
+}
+
+/// Whether two paths mean the same file or directory.
+pub fn is_same(a: &Path, b: &Path) -> bool {
+    let inode = |p: &Path| p.metadata().map(|m| (m.dev(), m.ino())).ok();
+    let full = |p: &Path| tidy(&std::path::absolute(p).unwrap_or_else(|_| p.into()));
+    full(a) == full(b) || (inode(a).is_some() && inode(a) == inode(b))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Protects a cell's files: they are found from the configuration, and links and detours do not hide that two keys mean one file.
+    #[test]
+    fn paths_start_at_the_configuration_and_meet_only_themselves() {
+        let dir = tempfile::tempdir().expect("a directory");
+        let real = dir.path().canonicalize().expect("it is there");
+        std::fs::create_dir(real.join("config")).expect("new");
+        let file = real.join("config/cell.toml");
+        assert_eq!(beside(&file, Path::new("../out/weights.bin")), real.join("out/weights.bin"));
+        assert_eq!(beside(&file, Path::new("w.bin")), real.join("config/w.bin"));
+        assert_eq!(beside(&file, Path::new("/w.bin")), Path::new("/w.bin"));
+
+        std::fs::write(real.join("w.bin"), b"w").expect("new");
+        std::os::unix::fs::symlink(real.join("w.bin"), real.join("config/link")).expect("a link");
+        std::fs::hard_link(real.join("w.bin"), real.join("hard")).expect("a link");
+        for other in ["w.bin", "config/../w.bin", "config/link", "hard"] {
+            let paths = [("a", real.join("w.bin")), ("b", real.join("other")), ("c", real.join(other))];
+            assert_eq!(clash(&paths), Some(("a", "c")), "{other}");
+        }
+        assert_eq!(clash(&[("a", real.join("w.bin")), ("b", real.join("v.bin"))]), None);
+        assert_eq!(clash(&[("a", real.join("new/x")), ("b", real.join("config/../new/x"))]), Some(("a", "b")), "neither is there");
+    }
+}

@@ -1,0 +1,120 @@
+//! The number of the next episode, from what lies in the episodes' directory: no number is given twice, whatever the wall clock says.
+//!
+//! A number counts as used if a file of any kind, in the directory or below it, begins with `episode-` and that number: an episode that was
+//! moved into a folder, renamed at its end or cut off. The file `.last-number` remembers what was given and has been moved away since. Its
+//! lock keeps two programs from taking the same number.
+//!
+//! Ordinary threads that may wait for the disk use it; it allocates. Errors are those of the system; the caller names the directory.
+
+use std::fs::{File, OpenOptions};
+use std::io::{Error, Read, Result, Seek, Write};
+use std::os::unix::fs::OpenOptionsExt;
+use std::path::Path;
+use std::time::{Duration, Instant};
+
+/// Longest wait for another program that takes a number. Chosen by hand: it takes milliseconds.
+const WAIT: Duration = Duration::from_secs(5);
+/// How many folders deep episodes are looked for. Chosen by hand: people move episodes into a folder or two.
+const DEPTH: usize = 8;
+/// The largest number that a file's name may say, so that a stray one (`episode-99999999999999.mcap`) cannot use up all numbers.
+pub(crate) const LARGEST: u64 = 999_999_999;
+
+/// Takes the next number in `directory`, which is made if it is missing. From then on the number is used.
+pub fn take_number(directory: &Path) -> Result<u64> {
+    std::fs::create_dir_all(directory)?;
+    let flags = (rustix::fs::OFlags::NOFOLLOW | rustix::fs::OFlags::NONBLOCK).bits() as i32;
+    let path = directory.join(".last-number");
+    let mut file = OpenOptions::new().read(true).write(true).create(true).truncate(false).custom_flags(flags).open(path)?;
+    if !file.metadata()?.is_file() {
+        return Err(Error::other(".last-number is no file: remove it"));
+    }
+    lock(&file)?;
+    let mut text = String::new();
+    (&file).take(32).read_to_string(&mut text)?;
+    let given: u64 = text.trim().parse().unwrap_or(0);
+    let number = given.max(highest(directory, DEPTH)?) + 1;
+    file.rewind()?;
+    file.set_len(0)?;
+    writeln!(file, "{number}")?;
+    file.sync_data()?;
+    Ok(number)
+}
+
+/// Takes the file's lock, which goes when the file is closed.
+fn lock(file: &File) -> Result<()> {
+    let until = Instant::now() + WAIT;
+    while file.try_lock().is_err() {
+        if Instant::now() > until {
+            return Err(Error::other("another program holds .last-number: is it stopped?"));
+        }
+        std::thread::sleep(Duration::from_millis(2));
+    }
+    Ok(())
+}
+
+/// The highest number of a file in `directory` and the folders in it, `depth` deep; 0 if there is none. Links are not followed.
+fn highest(directory: &Path, depth: usize) -> Result<u64> {
+    let mut found = 0;
+    for entry in std::fs::read_dir(directory)? {
+        let entry = entry?;
+        found = found.max(number_in(&entry.file_name().to_string_lossy()));
+        if depth > 0 && entry.file_type()?.is_dir() {
+            // A folder that may not be read holds nothing that could be overwritten here.
+            found = found.max(highest(&entry.path(), depth - 1).unwrap_or(0));
+        }
+    }
+    Ok(found)
+}
+
+/// The number that a file's name says; 0 if it says none.
+fn number_in(name: &str) -> u64 {
+    let digits: String = name.strip_prefix("episode-").unwrap_or_default().chars().take_while(char::is_ascii_digit).collect();
+    digits.parse().ok().filter(|n| *n <= LARGEST).unwrap_or(0)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Protects weights on the scale from the wrong episode: a number is never given twice, although files are moved, renamed or deleted.
+    #[test]
+    fn a_number_is_given_once() {
+        let dir = tempfile::tempdir().expect("a directory");
+        let take = || take_number(&dir.path().join("new")).expect("writable");
+        let put = |name: &str| {
+            let path = dir.path().join("new").join(name);
+            std::fs::create_dir_all(path.parent().expect("a folder")).expect("writable");
+            std::fs::write(path, b"").expect("writable");
+        };
+        assert_eq!((take(), take()), (1, 2));
+        put("moved aside/monday/episode-0017.mcap");
+        assert_eq!(take(), 18);
+        put("episode-0020.mcap.part");
+        assert_eq!(take(), 21);
+        put("episode-0025 (copy).mcap");
+        put("episode-x.mcap");
+        put("episode-99999999999999.mcap");
+        assert_eq!(take(), 26);
+        std::fs::remove_dir_all(dir.path().join("new/moved aside")).expect("there");
+        std::fs::rename(dir.path().join("new/episode-0025 (copy).mcap"), dir.path().join("away")).expect("there");
+        assert_eq!(take(), 27, "what was moved out of the directory is remembered");
+        std::fs::remove_file(dir.path().join("new/.last-number")).expect("there");
+        assert_eq!(take(), 21, "without its memory, what lies there decides");
+        std::fs::write(dir.path().join("new/.last-number"), b"nonsense").expect("writable");
+        put("episode-0030.mcap");
+        assert_eq!(take(), 31);
+    }
+
+    /// Protects two programs that take numbers at once: each gets its own.
+    #[test]
+    fn two_programs_never_get_the_same_number() {
+        let dir = tempfile::tempdir().expect("a directory");
+        let numbers: Vec<u64> = std::thread::scope(|scope| {
+            let take = || (0..50).map(|_| take_number(dir.path()).expect("writable")).collect::<Vec<_>>();
+            let threads: Vec<_> = (0..4).map(|_| scope.spawn(take)).collect();
+            threads.into_iter().flat_map(|t| t.join().expect("no panic")).collect()
+        });
+        let distinct: std::collections::BTreeSet<u64> = numbers.iter().copied().collect();
+        assert_eq!(distinct.len(), 200);
+    }
+}

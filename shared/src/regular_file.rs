@@ -1,0 +1,78 @@
+//! Reading files that somebody else may have put there: regular files only, no more bytes than expected, and of owners that are trusted.
+//!
+//! A pipe or a device would hold its reader, and a file of gigabytes would fill its memory. Ordinary threads use it; it allocates up to the
+//! bound. Errors are those of the system, or say what is wrong with the file.
+
+use std::fs::{File, Metadata, OpenOptions};
+use std::io::{Error, Read, Result};
+use std::os::unix::fs::{MetadataExt, OpenOptionsExt};
+use std::path::Path;
+
+use crate::runtime_dir::own_uid;
+
+/// Reads the file at `path`, which has at most `bytes_max` bytes.
+pub fn read(path: &Path, bytes_max: u64) -> Result<Vec<u8>> {
+    let (file, meta) = open(path)?;
+    if meta.len() > bytes_max {
+        return Err(Error::other(format!("{} bytes are too many: at most {bytes_max} belong into such a file", meta.len())));
+    }
+    let mut bytes = Vec::with_capacity(meta.len() as usize);
+    file.take(bytes_max + 1).read_to_end(&mut bytes)?;
+    if bytes.len() as u64 > bytes_max {
+        return Err(Error::other(format!("it grew over {bytes_max} bytes while it was read")));
+    }
+    Ok(bytes)
+}
+
+/// Opens a regular file for reading, without waiting for anything else that may be at `path`.
+pub fn open(path: &Path) -> Result<(File, Metadata)> {
+    let file = OpenOptions::new().read(true).custom_flags(rustix::fs::OFlags::NONBLOCK.bits() as i32).open(path)?;
+    let meta = file.metadata()?;
+    if meta.is_file() { Ok((file, meta)) } else { Err(Error::other("is not a regular file")) }
+}
+
+/// Checks that nobody but this user, root and `trusted` (a user number) may have written the file that `meta` describes.
+pub fn check_owner(meta: &Metadata, trusted: Option<u32>) -> std::result::Result<(), String> {
+    if ![Some(0), Some(own_uid()), trusted].contains(&Some(meta.uid())) {
+        return Err(format!("belongs to user {}: only files of this user, of root and of the configuration's owner are read", meta.uid()));
+    }
+    if meta.mode() & 0o002 != 0 {
+        return Err(format!("everybody may write it (mode {:o}): chmod o-w", meta.mode() & 0o7777));
+    }
+    Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use std::os::unix::fs::PermissionsExt;
+
+    use super::*;
+
+    /// Protects the controller's memory and its end: a huge file, a pipe and a directory are refused at once; so are files of strangers.
+    #[test]
+    fn only_small_regular_files_of_trusted_owners_are_read() {
+        let dir = tempfile::tempdir().expect("a directory");
+        let file = dir.path().join("w");
+        std::fs::write(&file, b"12345").expect("writable");
+        assert_eq!(read(&file, 5).expect("fits"), b"12345");
+        assert!(read(&file, 4).expect_err("too long").to_string().contains("too many"));
+        File::options().write(true).open(&file).and_then(|f| f.set_len(3 << 30)).expect("sparse");
+        assert!(read(&file, 1 << 20).is_err());
+        assert!(read(dir.path(), 5).is_err());
+        let pipe = dir.path().join("pipe");
+        assert!(std::process::Command::new("mkfifo").arg(&pipe).status().expect("coreutils").success());
+        assert!(read(&pipe, 5).expect_err("a pipe").to_string().contains("regular"));
+        assert!(read(Path::new("/dev/zero"), 5).is_err());
+
+        let meta = || file.metadata().expect("there");
+        assert_eq!(check_owner(&meta(), None), Ok(()));
+        std::fs::set_permissions(&file, std::fs::Permissions::from_mode(0o666)).expect("ours");
+        assert!(check_owner(&meta(), None).expect_err("open").contains("everybody"));
+        std::fs::set_permissions(&file, std::fs::Permissions::from_mode(0o644)).expect("ours");
+        if own_uid() == 0 {
+            std::os::unix::fs::chown(&file, Some(65534), None).expect("root may");
+            assert!(check_owner(&meta(), None).expect_err("a stranger's").contains("65534"));
+            assert_eq!(check_owner(&meta(), Some(65534)), Ok(()));
+        }
+    }
+}

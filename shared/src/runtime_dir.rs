@@ -1,0 +1,227 @@
+//! Where a cell keeps its runtime files: the socket that stops a motion, the controller's process number, and iceoryx2's files.
+//!
+//! They live where nobody ages them and only the cell's own user may enter (and, if its mode says so, the user's group). The first of these
+//! that can be used is taken, with the cell's name as the last part:
+//!
+//! 1. `[cell] runtime_dir`, if it is set;
+//! 2. `$RUNTIME_DIRECTORY`, which systemd sets;
+//! 3. `/run/decant`, if it may be written; root makes it;
+//! 4. `decant` in `$XDG_RUNTIME_DIR`, or in `/run/user/UID` if that variable is not set;
+//! 5. `/dev/shm/decant-UID`. iceoryx2 needs `/dev/shm` anyway, systemd-tmpfiles does not age it, and a restart of the machine empties it.
+//!
+//! `/tmp` is never used, because files there are deleted after some days. Ordinary threads call this at their start; it allocates and waits
+//! for the disk. Every failure is a [`RuntimeDirError`] of one line.
+
+use std::fs::{DirBuilder, Metadata};
+use std::os::unix::fs::{DirBuilderExt, MetadataExt};
+use std::path::{Path, PathBuf};
+
+use crate::config::{CELL_NAME_RULE, CellConfig, is_cell_name};
+
+/// Longest path of the directory, bytes. A socket's address holds 107, and iceoryx2 needs 57 of them: a slash, 16 of the prefix, up to 34
+/// digits and `.event`.
+const PATH_MAX: usize = 50;
+/// The bits of a directory's mode that must not be set: a group may look, and others may do nothing.
+const TOO_OPEN: u32 = 0o027;
+
+/// Why the runtime directory cannot be used.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+pub enum RuntimeDirError {
+    /// The cell's name cannot be used in file names.
+    #[error("cell name '{0}': use {CELL_NAME_RULE}")]
+    Name(String),
+    /// The directory, or the one that it lies in, is not safe or cannot be made.
+    #[error("runtime directory {}: {what}", directory.display())]
+    Unusable {
+        /// The directory.
+        directory: PathBuf,
+        /// What is wrong, and what to do.
+        what: String,
+    },
+}
+
+/// A cell and the directory that its configuration names for runtime files, if it names one.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Place {
+    /// The cell's name.
+    pub name: String,
+    /// `[cell] runtime_dir`.
+    pub base: Option<PathBuf>,
+}
+
+impl From<&str> for Place {
+    fn from(name: &str) -> Self {
+        Self { name: name.into(), base: None }
+    }
+}
+
+impl From<&String> for Place {
+    fn from(name: &String) -> Self {
+        Self::from(name.as_str())
+    }
+}
+
+impl From<&CellConfig> for Place {
+    fn from(cell: &CellConfig) -> Self {
+        Self { name: cell.name.clone(), base: cell.runtime_dir.clone() }
+    }
+}
+
+impl From<&Place> for Place {
+    fn from(place: &Place) -> Self {
+        place.clone()
+    }
+}
+
+/// User number of this process.
+pub fn own_uid() -> u32 {
+    rustix::process::geteuid().as_raw()
+}
+
+/// The directories that may hold the directories of cells without a `runtime_dir` of their own, the preferred one first.
+pub fn bases() -> Vec<PathBuf> {
+    let uid = own_uid();
+    let mut found = vec![PathBuf::from("/run/decant")];
+    let session = std::env::var_os("XDG_RUNTIME_DIR").map_or_else(|| PathBuf::from(format!("/run/user/{uid}")), PathBuf::from);
+    let ours = |m: &Metadata| m.is_dir() && m.uid() == uid && m.mode() & 0o022 == 0;
+    if session.is_absolute() && session.symlink_metadata().is_ok_and(|m| ours(&m)) {
+        found.push(session.join("decant"));
+    }
+    found.push(PathBuf::from(format!("/dev/shm/decant-{uid}")));
+    found
+}
+
+/// Whether this process may make files in `path`.
+fn may_write(path: &Path) -> bool {
+    let wanted = rustix::fs::Access::WRITE_OK | rustix::fs::Access::EXEC_OK;
+    rustix::fs::accessat(rustix::fs::CWD, path, wanted, rustix::fs::AtFlags::EACCESS).is_ok()
+}
+
+impl Place {
+    /// Path of the cell's directory; nothing is made or checked.
+    pub fn path(&self) -> PathBuf {
+        if let Some(base) = &self.base {
+            return base.join(&self.name);
+        }
+        let by_systemd = std::env::var("RUNTIME_DIRECTORY").ok().and_then(|list| list.split(':').next().map(PathBuf::from));
+        if let Some(given) = by_systemd.filter(|p| p.is_absolute()) {
+            return if given.ends_with(&self.name) { given } else { given.join(&self.name) };
+        }
+        let system = Path::new("/run/decant");
+        let usable =
+            |base: &Path| base != system || may_write(&base.join(&self.name)) || may_write(base) || (own_uid() == 0 && !base.exists());
+        let base = bases().into_iter().find(|b| usable(b)).unwrap_or_else(|| system.into());
+        base.join(&self.name)
+    }
+
+    /// The cell's directory, made if it is missing. Owner, kind and mode of it and of the one that it lies in are checked.
+    pub fn directory(&self) -> Result<PathBuf, RuntimeDirError> {
+        if !is_cell_name(&self.name) {
+            return Err(RuntimeDirError::Name(self.name.clone()));
+        }
+        let path = self.path();
+        let wrong = |directory: &Path, what: String| RuntimeDirError::Unusable { directory: directory.into(), what };
+        if path.as_os_str().len() > PATH_MAX {
+            let what = format!("its path is longer than {PATH_MAX} bytes: shorten cell.name, or set a shorter cell.runtime_dir");
+            return Err(wrong(&path, what));
+        }
+        if let Some(base) = path.parent() {
+            let mode = if base == Path::new("/run/decant") { 0o755 } else { 0o700 };
+            make(base, mode).map_err(|e| wrong(base, e))?;
+            check_base(base).map_err(|e| wrong(base, e))?;
+        }
+        make(&path, 0o700).map_err(|e| wrong(&path, e))?;
+        check(&path).map_err(|e| wrong(&path, e))?;
+        Ok(path)
+    }
+}
+
+/// Makes the directory `path`, unless something is there.
+fn make(path: &Path, mode: u32) -> Result<(), String> {
+    match DirBuilder::new().mode(mode).create(path) {
+        Err(e) if path.symlink_metadata().is_err() => Err(format!("cannot be made: {e}; set cell.runtime_dir to a directory of your own")),
+        _ => Ok(()),
+    }
+}
+
+/// Checks the directory that the cell's directory lies in: nobody else may put another in its place.
+fn check_base(base: &Path) -> Result<(), String> {
+    let meta = std::fs::metadata(base).map_err(|e| e.to_string())?;
+    if !meta.is_dir() {
+        return Err("is no directory: remove it, or set cell.runtime_dir".into());
+    }
+    let sticky = meta.mode() & 0o1000 != 0;
+    if ![0, own_uid()].contains(&meta.uid()) {
+        return Err(format!("belongs to user {}, not to root or this user: remove it, or set cell.runtime_dir", meta.uid()));
+    }
+    if meta.mode() & 0o022 != 0 && !sticky {
+        return Err(format!("others may write there (mode {:o}): chmod 0755, or set cell.runtime_dir", meta.mode() & 0o7777));
+    }
+    Ok(())
+}
+
+/// Checks the cell's own directory.
+fn check(path: &Path) -> Result<(), String> {
+    let meta = path.symlink_metadata().map_err(|e| e.to_string())?;
+    if meta.is_symlink() || !meta.is_dir() {
+        return Err("is a link or no directory: remove it, or set cell.runtime_dir".into());
+    }
+    if meta.uid() != own_uid() {
+        let what =
+            "belongs to user {}, and this process runs as user {}: run all programs of a cell as one user, or choose another cell.name";
+        return Err(what.replacen("{}", &meta.uid().to_string(), 1).replacen("{}", &own_uid().to_string(), 1));
+    }
+    if meta.mode() & TOO_OPEN != 0 {
+        return Err(format!("is open to others (mode {:o}): chmod 0700, or 0750 for a group that may abort", meta.mode() & 0o7777));
+    }
+    if !may_write(path) {
+        return Err("cannot be written by this user: set cell.runtime_dir to a directory that can".into());
+    }
+    Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use std::os::unix::fs::PermissionsExt;
+
+    use super::*;
+
+    fn refusal(base: &Path) -> String {
+        Place { name: "x".into(), base: Some(base.into()) }.directory().expect_err("must be refused").to_string()
+    }
+
+    /// Protects the cell from others on the machine: a directory that somebody else prepared is refused, and the line says why.
+    #[test]
+    fn a_directory_that_is_not_safe_is_refused() {
+        let dir = tempfile::Builder::new().prefix("r").tempdir_in("/tmp").expect("a directory");
+        let (base, own) = (dir.path(), dir.path().join("x"));
+        let mode = |path: &Path, mode| std::fs::set_permissions(path, std::fs::Permissions::from_mode(mode)).expect("ours");
+        let place = Place { name: "x".into(), base: Some(base.into()) };
+        assert_eq!(place.directory().expect("usable"), own);
+        assert_eq!(own.metadata().expect("made").mode() & 0o7777, 0o700);
+        for (open, word) in [(0o755, "755"), (0o777, "777"), (0o720, "720")] {
+            mode(&own, open);
+            assert!(refusal(base).contains(word));
+        }
+        mode(&own, 0o750);
+        assert!(place.directory().is_ok(), "a group may look");
+        std::fs::remove_dir(&own).expect("empty");
+        std::os::unix::fs::symlink("/run", &own).expect("a link");
+        assert!(refusal(base).contains("is a link"));
+        std::fs::remove_file(&own).expect("ours");
+        std::fs::write(&own, b"").expect("a file");
+        assert!(refusal(base).contains("no directory"));
+        std::fs::remove_file(&own).expect("ours");
+        mode(base, 0o777);
+        assert!(refusal(base).contains("others may write"));
+        mode(base, 0o1777);
+        assert!(place.directory().is_ok(), "nobody can take away what is ours from a sticky directory");
+        if own_uid() == 0 {
+            std::os::unix::fs::chown(&own, Some(65534), None).expect("root may");
+            assert!(refusal(base).contains("belongs to user 65534"));
+        }
+        let long = Place { name: "a-name-of-thirty-two-characters-x".chars().take(32).collect(), base: Some(base.join("somewhere/deep")) };
+        assert!(long.directory().expect_err("too long").to_string().contains("longer than"));
+        assert!(matches!(Place::from("../x").directory(), Err(RuntimeDirError::Name(_))));
+    }
+}

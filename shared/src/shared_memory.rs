@@ -1,0 +1,276 @@
+//! The files of one cell in `/dev/shm`: their unguessable prefix, who uses them, whether there is space for them, and that they go again.
+//!
+//! Each start of a cell draws a token, which the cell's runtime directory keeps, and iceoryx2 names its files `decant-TOKEN_*`. Nobody can
+//! put files of those names there before. Every process of the cell holds a shared lock on `decant-TOKEN.lock` until it ends, however it
+//! ends. So files whose lock can be had alone belong to nobody any more, and whoever starts next removes them.
+//!
+//! Ordinary threads call this when they join a cell; it allocates and waits for the disk, at most two seconds for another process that is
+//! joining too. Every failure is a [`SharedMemoryError`] of one line.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::fs::{File, OpenOptions};
+use std::io::{Read, Write};
+use std::os::unix::fs::{MetadataExt, OpenOptionsExt, PermissionsExt};
+use std::path::{Path, PathBuf};
+use std::sync::{Mutex, PoisonError};
+use std::time::{Duration, Instant};
+
+use crate::runtime_dir::own_uid;
+
+/// Where the system keeps shared memory.
+const SHM: &str = "/dev/shm";
+/// Space that must be free before a cell is joined, bytes: what iceoryx2 touches while it makes a client's ports is about 0.5 MB (measured
+/// on a command that asks for the status).
+const JOIN_BYTES: u64 = 1 << 20;
+/// Longest wait for another process that is joining the same cell. Chosen by hand: joining takes some milliseconds.
+const JOIN_WAIT: Duration = Duration::from_secs(2);
+
+/// Why shared memory cannot be used.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+pub enum SharedMemoryError {
+    /// There is too little space.
+    #[error(
+        "/dev/shm has {free_kib} KiB free of {size_kib}, and {needed_kib} KiB are needed: delete what fills it, or make it larger (mount -o remount,size=256M /dev/shm; in a container --shm-size)"
+    )]
+    Space {
+        /// Free space, KiB.
+        free_kib: u64,
+        /// Its size, KiB.
+        size_kib: u64,
+        /// Space that is needed, KiB.
+        needed_kib: u64,
+    },
+    /// A file cannot be made, read or locked.
+    #[error("{file}: {what}")]
+    File {
+        /// The file.
+        file: String,
+        /// What the system says, and what to do.
+        what: String,
+    },
+}
+
+/// The error of a file.
+fn failed(file: &Path, what: impl std::fmt::Display) -> SharedMemoryError {
+    SharedMemoryError::File { file: file.display().to_string(), what: what.to_string() }
+}
+
+/// Checks that `bytes` more fit into `/dev/shm`.
+pub fn check_space(bytes: u64) -> Result<(), SharedMemoryError> {
+    let Ok(fs) = rustix::fs::statvfs(SHM) else {
+        return Err(failed(Path::new(SHM), "is missing: mount a tmpfs there"));
+    };
+    // A file system without a limit shows a size of zero.
+    if fs.f_blocks == 0 || fs.f_bavail.saturating_mul(fs.f_frsize) >= bytes {
+        return Ok(());
+    }
+    let kib = |blocks: u64| blocks.saturating_mul(fs.f_frsize) / 1024;
+    Err(SharedMemoryError::Space { free_kib: kib(fs.f_bavail), size_kib: kib(fs.f_blocks), needed_kib: bytes / 1024 })
+}
+
+/// The lock files of this process by their tokens, and how many [`Membership`]s use each. A process holds one lock for each token, because
+/// it may join a cell several times.
+static HELD: Mutex<BTreeMap<String, (File, usize)>> = Mutex::new(BTreeMap::new());
+
+/// This process's membership in a cell's shared memory. When the last one of all processes goes, the files go too.
+#[derive(Debug)]
+pub struct Membership {
+    token: String,
+    /// The files that were there before.
+    before: BTreeSet<PathBuf>,
+}
+
+impl Membership {
+    /// Joins the shared memory of the cell whose runtime directory is `directory`; clears what dead processes of this user left.
+    pub fn join(directory: &Path) -> Result<Self, SharedMemoryError> {
+        check_space(JOIN_BYTES)?;
+        let path = directory.join("lock");
+        let joining = open(&path, true).map_err(|e| failed(&path, e))?;
+        let until = Instant::now() + JOIN_WAIT;
+        while joining.try_lock().is_err() {
+            if Instant::now() > until {
+                return Err(failed(&path, "another process has been joining the cell for two seconds: is it stopped?"));
+            }
+            std::thread::sleep(Duration::from_millis(2));
+        }
+        clear_dead();
+        let mut held = HELD.lock().unwrap_or_else(PoisonError::into_inner);
+        let file = directory.join("token");
+        if let Some(token) = read_token(&file) {
+            if let Some((_, uses)) = held.get_mut(&token) {
+                *uses += 1;
+                return Ok(Self::new(token));
+            }
+            // Whoever still uses the token holds its lock, so that it was not cleared.
+            let path = lock_path(&token);
+            if let Ok(lock) = open(&path, false)
+                && share(&lock, &path)
+            {
+                held.insert(token.clone(), (lock, 1));
+                return Ok(Self::new(token));
+            }
+        }
+        let (token, lock) = new_token(directory)?;
+        clear_directory(directory);
+        let new = directory.join("token.new");
+        std::fs::write(&new, &token).and_then(|()| std::fs::rename(&new, &file)).map_err(|e| failed(&file, e))?;
+        held.insert(token.clone(), (lock, 1));
+        Ok(Self::new(token))
+    }
+
+    fn new(token: String) -> Self {
+        let before = files(&prefix(&token)).into_iter().collect();
+        Self { token, before }
+    }
+
+    /// The first part of the names of the cell's files in `/dev/shm`.
+    pub fn prefix(&self) -> String {
+        prefix(&self.token)
+    }
+
+    /// Closes the cell's files to other users. iceoryx2 makes one of them, `*.global_mgmt`, for everybody to write, and has no setting for
+    /// that.
+    pub fn close_to_others(&self) {
+        for file in files(&self.prefix()) {
+            if file.metadata().is_ok_and(|m| m.mode() & 0o077 != 0) {
+                let _ = std::fs::set_permissions(&file, PermissionsExt::from_mode(0o600));
+            }
+        }
+    }
+
+    /// Has the system set memory aside for the cell's files that were made since this process joined. iceoryx2 only states their size;
+    /// without this the process that first writes a page of a full `/dev/shm` is killed.
+    pub fn reserve(&self) -> Result<(), SharedMemoryError> {
+        for path in files(&self.prefix()).into_iter().filter(|f| !self.before.contains(f)) {
+            let Ok(file) = open(&path, false) else { continue };
+            let Ok(bytes) = file.metadata().map(|m| m.len()) else { continue };
+            if bytes > 0 && rustix::fs::fallocate(&file, rustix::fs::FallocateFlags::empty(), 0, bytes).is_err() {
+                check_space(bytes)?;
+                return Err(failed(&path, "no memory could be set aside for it: is /dev/shm full, or the process's memory limited?"));
+            }
+        }
+        Ok(())
+    }
+}
+
+impl Drop for Membership {
+    fn drop(&mut self) {
+        let mut held = HELD.lock().unwrap_or_else(PoisonError::into_inner);
+        let Some((lock, uses)) = held.get_mut(&self.token) else { return };
+        *uses = uses.saturating_sub(1);
+        if *uses > 0 {
+            return;
+        }
+        // iceoryx2 keeps one file for good. It goes with the last process; everything else shows that a port is still in use.
+        let left = files(&self.prefix());
+        let unused = left.iter().all(|f| f.extension().is_some_and(|e| e == "global_mgmt"));
+        if unused && lock.try_lock().is_ok() {
+            remove(&self.token);
+            held.remove(&self.token);
+        } else {
+            let _ = lock.lock_shared();
+        }
+    }
+}
+
+/// Removes the shared memory of the cell whose runtime directory is `directory`, whoever uses it.
+pub fn remove_of(directory: &Path) {
+    if let Some(token) = read_token(&directory.join("token")) {
+        remove(&token);
+    }
+}
+
+/// Removes what dead processes of this user left in `/dev/shm`, of any cell.
+fn clear_dead() {
+    for lock in files("decant-") {
+        let name = lock.file_name().unwrap_or_default().to_string_lossy().into_owned();
+        let Some(token) = name.strip_prefix("decant-").and_then(|n| n.strip_suffix(".lock")) else { continue };
+        if lock.symlink_metadata().is_ok_and(|m| m.uid() == own_uid())
+            && let Ok(file) = open(&lock, false)
+            && file.try_lock().is_ok()
+        {
+            remove(token);
+        }
+    }
+}
+
+/// Removes the files of a token, the lock last.
+fn remove(token: &str) {
+    for file in files(&prefix(token)) {
+        let _ = std::fs::remove_file(file);
+    }
+    let _ = std::fs::remove_file(lock_path(token));
+}
+
+/// Removes what iceoryx2 left in a cell's directory under an older token.
+fn clear_directory(directory: &Path) {
+    for name in ["services", "nodes"] {
+        let _ = std::fs::remove_dir_all(directory.join(name));
+    }
+    for entry in std::fs::read_dir(directory).into_iter().flatten().flatten() {
+        if entry.path().extension().is_some_and(|e| e == "event") {
+            let _ = std::fs::remove_file(entry.path());
+        }
+    }
+}
+
+/// The files in `/dev/shm` whose names begin with `prefix`.
+fn files(prefix: &str) -> Vec<PathBuf> {
+    let entries = std::fs::read_dir(SHM).into_iter().flatten().flatten();
+    entries.filter(|e| e.file_name().to_string_lossy().starts_with(prefix)).map(|e| e.path()).collect()
+}
+
+/// The first part of the names of a token's files.
+fn prefix(token: &str) -> String {
+    format!("decant-{token}_")
+}
+
+/// The lock of a token. It lies beside the files that it speaks for, so that processes with other mounts meet it too.
+fn lock_path(token: &str) -> PathBuf {
+    Path::new(SHM).join(format!("decant-{token}.lock"))
+}
+
+/// Opens a file of ours, never through a link.
+fn open(path: &Path, create: bool) -> std::io::Result<File> {
+    let flags = (rustix::fs::OFlags::NOFOLLOW | rustix::fs::OFlags::NONBLOCK).bits() as i32;
+    let file = OpenOptions::new().read(true).write(true).create(create).mode(0o600).custom_flags(flags).open(path)?;
+    let meta = file.metadata()?;
+    if meta.is_file() && meta.uid() == own_uid() { Ok(file) } else { Err(std::io::Error::other("is not a file of this user: remove it")) }
+}
+
+/// Takes a share of the lock at `path`, if it is still there: somebody who took it for a dead one may just have removed it.
+fn share(lock: &File, path: &Path) -> bool {
+    let inode = |m: std::io::Result<std::fs::Metadata>| m.map(|m| m.ino()).ok();
+    lock.try_lock_shared().is_ok() && inode(lock.metadata()) == inode(path.symlink_metadata())
+}
+
+/// The token in `file`, if there is a whole one.
+fn read_token(file: &Path) -> Option<String> {
+    let mut text = String::new();
+    open(file, false).ok()?.take(64).read_to_string(&mut text).ok()?;
+    (text.len() == 8 && text.bytes().all(|c| c.is_ascii_hexdigit())).then_some(text)
+}
+
+/// Draws a token that nobody uses and takes its lock.
+fn new_token(directory: &Path) -> Result<(String, File), SharedMemoryError> {
+    let random = Path::new("/dev/urandom");
+    let mut source = File::open(random).map_err(|e| failed(random, e))?;
+    loop {
+        let mut bytes = [0; 4];
+        source.read_exact(&mut bytes).map_err(|e| failed(random, e))?;
+        let token = format!("{:08x}", u32::from_le_bytes(bytes));
+        let path = lock_path(&token);
+        match OpenOptions::new().read(true).write(true).create_new(true).mode(0o600).open(&path) {
+            Ok(mut file) => {
+                if !share(&file, &path) {
+                    continue;
+                }
+                // This line is for people who wonder whose files these are. Without space it is left out.
+                let _ = writeln!(file, "{}", directory.display());
+                return Ok((token, file));
+            }
+            Err(e) if e.kind() == std::io::ErrorKind::AlreadyExists => {}
+            Err(e) => return Err(failed(&path, format!("{e}: is /dev/shm full?"))),
+        }
+    }
+}
