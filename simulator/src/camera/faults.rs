@@ -183,7 +183,7 @@ impl CameraFault {
 
     /// Bands of light, of a hundred a second or of a hundred and twenty.
     fn band(&self, t_s: f64, phase: f64, [width, height]: [usize; 2], pixels: &mut [u8]) {
-        let light_hz = if self.seed % 2 == 0 { 100.0 } else { 120.0 };
+        let light_hz = if self.seed.is_multiple_of(2) { 100.0 } else { 120.0 };
         for (y, row) in pixels.chunks_exact_mut(width * 3).enumerate() {
             let at_s = t_s + READOUT_S * y as f64 / height as f64;
             let gain = 1.0 + self.strength * (std::f64::consts::TAU * light_hz * at_s + phase).sin();
