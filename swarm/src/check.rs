@@ -65,8 +65,8 @@ pub struct Checks {
     cycle_s: f64,
     before_q: Option<[f64; 6]>,
     before_rate_deg_s: f64,
-    /// Where the servo steered the tilting joint to after the cycle before, degrees, and how fast, degrees/s.
-    servo: (f64, f64),
+    /// Where the servo steered the tilting joint to, degrees, and how fast, degrees/s: after the cycle before, and after the one before that.
+    servo: [(f64, f64); 2],
     /// The newest target, degrees, and the rate at which it came.
     target: Option<(f64, f64)>,
     pub(crate) phase: Phase,
@@ -92,7 +92,7 @@ impl Checks {
             cycle_s,
             before_q: None,
             before_rate_deg_s: 0.0,
-            servo: (f64::NAN, f64::NAN),
+            servo: [(f64::NAN, f64::NAN); 2],
             target: None,
             phase: Phase::NoRobot,
             free_since_s: None,
@@ -140,7 +140,7 @@ impl Checks {
         } else {
             (self.before_rate_deg_s, self.least_deg) = (0.0, q[joint].to_degrees());
         }
-        self.servo = (servo.target_q[joint].to_degrees(), servo.target_qd[joint].to_degrees());
+        self.servo = [(servo.target_q[joint].to_degrees(), servo.target_qd[joint].to_degrees()), self.servo[0]];
         self.upright(machine, alpha_deg, at_s);
     }
 
@@ -160,9 +160,12 @@ impl Checks {
         // A program that begins anew goes on from where the servo steers the joint, and as fast as that moves. Every command goes on either
         // from there or from the command before.
         let from_command = (before_q[joint].to_degrees(), self.before_rate_deg_s);
-        let off = |(from_deg, rate_deg_s): (f64, f64)| (alpha_deg - from_deg - rate_deg_s * self.cycle_s).abs();
-        let begins_anew = off(self.servo) < off(from_command);
-        let (from_deg, from_rate_deg_s) = if begins_anew { self.servo } else { from_command };
+        // The program looks at the servo just before it commands, or one cycle before where it was resumed between the two.
+        let most_deg = (f64::from(limits.acceleration_deg_s2) * (1.0 + SLACK) + 1.0) * self.cycle_s * self.cycle_s;
+        let keeps = |(from_deg, rate_deg_s): (f64, f64)| (alpha_deg - from_deg - rate_deg_s * self.cycle_s).abs() <= most_deg;
+        let from_servo = self.servo.into_iter().find(|from| keeps(*from)).filter(|_| !keeps(from_command));
+        let begins_anew = from_servo.is_some();
+        let (from_deg, from_rate_deg_s) = from_servo.unwrap_or(from_command);
         let rate_deg_s = (alpha_deg - from_deg) / self.cycle_s;
         if rate_deg_s.abs() > f64::from(limits.rate_deg_s) * (1.0 + SLACK) + 0.1 {
             self.violated("robot-rate", at_s, format!("servoj is given {rate_deg_s:.2} degrees/s"));

@@ -11,4 +11,5 @@ pub mod records;
 pub mod run;
 pub mod site;
 pub mod trained;
+pub mod weight_set;
 pub mod world;

@@ -12,7 +12,7 @@ use swarm::many::{Summary, run_many, shrink};
 use swarm::plan::Plan;
 use swarm::plot::plot;
 use swarm::run::{self, Shown};
-use swarm::trained::TrainedSet;
+use swarm::trained::train_for;
 
 /// Exit code of a violation.
 const VIOLATED: u8 = 1;
@@ -90,7 +90,7 @@ fn kept(text: &str, plan: &Plan) -> Result<Vec<usize>, String> {
 /// One seed.
 fn one(args: &Args, seed: u64, config: &Config) -> Result<bool, String> {
     let mut plan = Plan::draw(seed);
-    let trained = TrainedSet::for_plans([&plan], config, &|text| eprintln!("swarm: {text}"));
+    let trained = train_for([&plan], config, &|text| eprintln!("swarm: {text}"));
     let mut keep = String::new();
     if let Some(text) = &args.keep {
         plan = plan.keep(&kept(text, &plan)?);

@@ -13,7 +13,8 @@ use shared::control::EndReason;
 
 use crate::plan::Plan;
 use crate::run::{self, Shown};
-use crate::trained::TrainedSet;
+use crate::trained::train_for;
+use crate::weight_set::TrainedSet;
 
 /// Median, 99th percentile and largest of some numbers.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
@@ -81,7 +82,7 @@ pub fn run_many(from: u64, seeds: u64, config: &Config, progress: bool) -> (Vec<
             eprintln!("swarm: {text}");
         }
     };
-    let trained = TrainedSet::for_plans(&plans, config, &say);
+    let trained = train_for(&plans, config, &say);
     let bar = if progress { ProgressBar::new(seeds) } else { ProgressBar::hidden() };
     if let Ok(style) = ProgressStyle::with_template("{pos}/{len} seeds  {wide_bar}  {eta}") {
         bar.set_style(style);

@@ -18,7 +18,7 @@ use crate::check::Violation;
 use crate::plan::Plan;
 use crate::records::{Journal, Row};
 use crate::site::{Cost, Poured, Site};
-use crate::trained::TrainedSet;
+use crate::weight_set::TrainedSet;
 use crate::world::{Life, LoopSide, World};
 
 /// What a seed showed.

@@ -2,8 +2,6 @@
 //!
 //! Pure; one thread; allocates. What goes wrong is what is drawn.
 
-use std::net::Ipv4Addr;
-
 use rand::{RngExt, SeedableRng};
 use rand_pcg::Pcg64Mcg;
 use rt_controller::core::{Order, Settings};
@@ -23,7 +21,7 @@ use crate::eye::Eye;
 use crate::pipe::{self, End, Wiring};
 use crate::plan::{Plan, VESSELS, What};
 use crate::records::Row;
-use crate::trained::TrainedSet;
+use crate::weight_set::TrainedSet;
 
 /// The cell's configuration.
 const CONFIG: &str = include_str!("../../config/sim.toml");
@@ -384,6 +382,3 @@ fn rig(plan: &Plan) -> Rig {
 pub fn spill_angle_deg(series: Series, vessel: usize, fill_ml: f64) -> f64 {
     rig(&Plan::recording(series, vessel, fill_ml, 50.0, 1.0)).container(fill_ml).spill_angle_deg()
 }
-
-/// The address that the controller believes the robot to have.
-pub const ADDRESS: Ipv4Addr = Ipv4Addr::LOCALHOST;

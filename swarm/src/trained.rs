@@ -17,6 +17,7 @@ use crate::plan::{Plan, VESSELS};
 use crate::records::Row;
 use crate::run;
 use crate::site::{START_NS, spill_angle_deg};
+use crate::weight_set::TrainedSet;
 
 /// What each of the five recordings is filled with, ml; how far beyond the spill angle it tilts, degrees; and its width, s. They span what
 /// the reference protocol draws (140 to 460 ml, 6 to 30 degrees, 0.7 to 2.2 s).
@@ -25,32 +26,22 @@ const RECORDINGS: [(f64, f64, f32); 5] =
 /// Frames a second of the camera.
 const RATE_HZ: f64 = 30.0;
 
-/// All weights that were trained.
-#[derive(Debug, Clone, Default)]
-pub struct TrainedSet(Arc<BTreeMap<(bool, usize), Weights>>);
-
 /// What was trained in this process.
 static MADE: Mutex<BTreeMap<(bool, usize), Option<Weights>>> = Mutex::new(BTreeMap::new());
 
-impl TrainedSet {
-    /// The weights for a robot and a vessel.
-    pub fn get(&self, series: Series, vessel: usize) -> Option<&Weights> {
-        self.0.get(&(series == Series::ESeries, vessel))
-    }
-
-    /// Trains what the plans need and was not trained yet. Must not be called from a rayon task, because the training uses them.
-    pub fn for_plans<'a>(plans: impl IntoIterator<Item = &'a Plan>, config: &Config, say: &dyn Fn(&str)) -> Self {
-        let mut made = MADE.lock().unwrap_or_else(PoisonError::into_inner);
-        for plan in plans {
-            for vessel in plan.vessels() {
-                made.entry((plan.series == Series::ESeries, vessel)).or_insert_with(|| {
-                    say(&format!("training for a {} on a {:?}", VESSELS[vessel], plan.series));
-                    train(plan.series, vessel, config)
-                });
-            }
+/// Trains what the plans need and was not trained yet. Must not be called from a rayon task that others wait for, because the training uses
+/// them.
+pub fn train_for<'a>(plans: impl IntoIterator<Item = &'a Plan>, config: &Config, say: &dyn Fn(&str)) -> TrainedSet {
+    let mut made = MADE.lock().unwrap_or_else(PoisonError::into_inner);
+    for plan in plans {
+        for vessel in plan.vessels() {
+            made.entry((plan.series == Series::ESeries, vessel)).or_insert_with(|| {
+                say(&format!("training for a {} on a {:?}", VESSELS[vessel], plan.series));
+                train(plan.series, vessel, config)
+            });
         }
-        Self(Arc::new(made.iter().filter_map(|(key, weights)| Some((*key, weights.clone()?))).collect()))
     }
+    TrainedSet(Arc::new(made.iter().filter_map(|(key, weights)| Some((*key, weights.clone()?))).collect()))
 }
 
 /// Records five curves in the virtual cell and trains on them.
