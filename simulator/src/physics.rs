@@ -8,11 +8,13 @@
 //! |---|---|
 //! | [`container`] | vessels, what they retain at a tilt, and the flow over the lip and the film, step by step |
 //! | [`rig`] | a seeded rig of simulator b: container, liquid, servo, camera; one pour on it, frame by frame |
+//! | [`vessel`] | rigs that are not straight: rough curves, gurgle, clinging stream, slosh, late robot, each drawn from a seed |
 //! | [`paper`] | simulator a |
 
 pub mod container;
 pub mod paper;
 pub mod rig;
+pub mod vessel;
 
 /// Frames a second of both simulators, the same as the paper's camera gives.
 pub const RATE_HZ: f64 = 30.0;
