@@ -4,7 +4,7 @@
 
 use feature_worker::vision::{Axes, ColourLearner};
 use opencv::core::{Mat, Vec3b};
-use shared::config::{CameraConfig, CameraSource, ImageConfig, LiquidMethod};
+use shared::config::{CameraConfig, ImageConfig, LiquidMethod};
 use simulator::camera::{Renderer, Scene, View};
 
 /// Why a liquid's colour could not be learned, or a picture could not be drawn or measured.
@@ -15,7 +15,7 @@ const COLOUR_PICTURES: u32 = 16;
 
 /// The `[camera]` table for a view.
 pub fn camera_config(view: &View) -> CameraConfig {
-    CameraConfig { source: CameraSource::SharedMemory, path: String::new(), width_px: view.width_px, height_px: view.height_px, fps: 30.0 }
+    CameraConfig { width_px: view.width_px, height_px: view.height_px, ..CameraConfig::default() }
 }
 
 /// The `[image]` table that a careful person would write for a view: the axes as they are, and the region over the mouth.

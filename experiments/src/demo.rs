@@ -1,4 +1,5 @@
-//! The demo: what an operator does from the first recording to a poured volume, in a cell of its own ([`crate::own_cell`]).
+//! The demo: what an operator does from the first recording to a poured volume, in a cell of its own ([`crate::own_cell`]). What is recorded
+//! and poured follows the vessel (`plan.rs`).
 //!
 //! Ordinary process; allocates and blocks; one thread of its own listens to the controller while a pour runs. A step that fails ends it.
 
@@ -13,21 +14,22 @@ use serde_json::{Value, json};
 use shared::config::CellConfig;
 use shared::ipc::Cell;
 use shared::messages::Telemetry;
+use simulator::cell::SimulatorConfig;
 
 use crate::own_cell::{OwnCell, OwnCellError};
 use crate::plots;
 
-/// What the operator records: millilitres filled in, and the curve's height (degrees) and width (1/s^2). A fuller container spills earlier,
-/// so it is tilted less. Chosen by hand for containers of about 400 ml.
-const EPISODES: [(f64, f32, f32); 5] =
-    [(430.0, 47.0, 0.25), (360.0, 60.0, 0.25), (300.0, 68.0, 0.20), (230.0, 77.0, 0.25), (160.0, 83.0, 0.25)];
-/// What is poured: millilitres filled in, and the goal in ml. Chosen by hand, so that none of it was seen in training.
-const POURS: [(f64, f32); 3] = [(200.0, 35.0), (280.0, 110.0), (450.0, 180.0)];
+mod plan;
+
+use plan::{Plan, PlannedPour};
+
+/// The folder of the pictures of the pours, in the folder of the results.
+const PICTURES: &str = "pours";
 
 /// One pour and its line in the table.
 pub struct DemoPour {
     filled_ml: f64,
-    goal_ml: f32,
+    goal_ml: f64,
     poured_ml: f64,
     /// On the scale minus the goal, ml.
     pub error_ml: f64,
@@ -39,8 +41,10 @@ pub struct DemoPour {
 
 /// What the demo has done.
 pub struct DemoSummary {
-    /// The pours, in order.
+    /// The pours that show what was learned, in order.
     pub pours: Vec<DemoPour>,
+    /// The weighed pours before them, from which it was learned.
+    weighed_pours: Vec<DemoPour>,
     episodes: Vec<Value>,
     weights: String,
     seconds: f64,
@@ -50,19 +54,21 @@ pub struct DemoSummary {
 impl DemoSummary {
     /// `summary.json`.
     pub fn json(&self) -> String {
-        let pours: Vec<Value> = self
-            .pours
-            .iter()
-            .map(|p| {
+        let told = |pours: &[DemoPour]| -> Vec<Value> {
+            let one = |p: &DemoPour| {
                 json!({
                     "v_init_ml": p.filled_ml, "goal_ml": p.goal_ml, "poured_ml": p.poured_ml, "error_ml": p.error_ml,
                     "seconds": p.outcome["seconds"], "late_ticks": p.outcome["late_ticks"], "stale_features": p.outcome["stale_features"],
                     "bridged_frames": p.outcome["bridged_frames"], "estimate_ml": p.outcome["poured_ml"], "reason": p.outcome["reason"],
                     "episode_file": p.episode_file, "plot": p.plot,
                 })
-            })
-            .collect();
-        let all = json!({ "pours": pours, "episodes": self.episodes, "weights": self.weights, "seconds": self.seconds });
+            };
+            pours.iter().map(one).collect()
+        };
+        let all = json!({
+            "pours": told(&self.pours), "weighed_pours": told(&self.weighed_pours), "episodes": self.episodes, "weights": self.weights,
+            "seconds": self.seconds,
+        });
         serde_json::to_string_pretty(&all).unwrap_or_default()
     }
 
@@ -93,47 +99,64 @@ impl DemoSummary {
     }
 }
 
-/// Records, trains, pours, and writes `summary.json`.
+/// Records, trains, pours and weighs, trains again after each, pours, and writes `summary.json`.
 ///
 /// # Errors
 /// One line, when a step fails or is interrupted.
 pub fn perform(cell: &mut OwnCell, seed: u64) -> Result<DemoSummary, OwnCellError> {
+    let plan = Plan::for_rig(&SimulatorConfig::new(&cell.config).map_err(OwnCellError::Config)?.rig());
+    let pictures = cell.out.join(PICTURES);
+    std::fs::create_dir_all(&pictures).map_err(|error| OwnCellError::File { what: pictures.display().to_string(), error })?;
     cell.note("starting the simulated cell, the feature worker and the controller");
     let client = cell.start()?;
-    let episodes = record(cell)?;
-    let weights = train(cell, &client, seed)?;
+    let mut episodes = record(cell, &plan)?;
+    let mut weights = train(cell, &client, seed)?;
+    let mut weighed_pours = Vec::new();
+    for (k, planned) in plan.weighed_pours.iter().enumerate() {
+        cell.note(&format!("weighed pour {} of {}: {} ml from {} ml", k + 1, plan.weighed_pours.len(), planned.goal_ml, planned.fill_ml));
+        let poured = pour(cell, "weighed", k + 1, *planned)?;
+        episodes.push(weigh(cell, &poured.episode_file, poured.poured_ml, planned.fill_ml)?);
+        weighed_pours.push(poured);
+        weights = train(cell, &client, seed)?;
+    }
     let mut pours = Vec::new();
-    for (number, (fill_ml, goal_ml)) in (1..).zip(POURS) {
-        cell.note(&format!("pour {number} of {}: {goal_ml} ml from {fill_ml} ml", POURS.len()));
-        pours.push(pour(cell, number, fill_ml, goal_ml)?);
+    for (k, planned) in plan.pours.iter().enumerate() {
+        cell.note(&format!("pour {} of {}: {} ml from {} ml", k + 1, plan.pours.len(), planned.goal_ml, planned.fill_ml));
+        pours.push(pour(cell, "pour", k + 1, *planned)?);
     }
     let seconds = cell.started.elapsed().as_secs_f64();
-    let summary = DemoSummary { pours, episodes, weights, seconds, out: cell.out.clone() };
+    let summary = DemoSummary { pours, weighed_pours, episodes, weights, seconds, out: cell.out.clone() };
     let file = cell.out.join("summary.json");
     std::fs::write(&file, summary.json() + "\n").map_err(|error| OwnCellError::File { what: file.display().to_string(), error })?;
     Ok(summary)
 }
 
-/// Records and weighs the episodes; returns their entries for `summary.json`.
-fn record(cell: &OwnCell) -> Result<Vec<Value>, OwnCellError> {
+/// Records and weighs the curves; returns their entries for `summary.json`.
+fn record(cell: &OwnCell, plan: &Plan) -> Result<Vec<Value>, OwnCellError> {
     let mut episodes = Vec::new();
-    for (i, (fill_ml, lambda_deg, gamma)) in EPISODES.into_iter().enumerate() {
-        cell.note(&format!("episode {} of {}: {fill_ml} ml, lambda {lambda_deg} degrees, gamma {gamma}/s^2", i + 1, EPISODES.len()));
+    for (k, curve) in plan.curves.iter().enumerate() {
+        let (fill_ml, lambda_deg, gamma) = (curve.fill_ml, curve.lambda_deg, curve.gamma_per_s2);
+        cell.note(&format!("curve {} of {}: {fill_ml} ml, lambda {lambda_deg} degrees, gamma {gamma}/s^2", k + 1, plan.curves.len()));
         cell.command("simulator", &["operator", "fill", &fill_ml.to_string()])?;
         let recorded =
             cell.command("rt-controller", &["record", "--json", "--lambda", &lambda_deg.to_string(), "--gamma", &gamma.to_string()])?;
         let weight_g = cell.scale()?;
-        let file = recorded["episode_file"].as_str().unwrap_or_default().to_string();
-        cell.command("feature-worker", &["episodes", "weigh", &file, "--weight", &weight_g.to_string()])?;
+        episodes.push(weigh(cell, &recorded["episode_file"], weight_g, fill_ml)?);
         cell.note(&format!("  weighed {weight_g} g"));
-        episodes.push(json!({ "file": file, "weight_g": weight_g, "v_init_ml": fill_ml }));
     }
     Ok(episodes)
 }
 
+/// Enters an episode's weight; returns its entry for `summary.json`.
+fn weigh(cell: &OwnCell, file: &Value, weight_g: f64, fill_ml: f64) -> Result<Value, OwnCellError> {
+    let file = file.as_str().unwrap_or_default();
+    cell.command("feature-worker", &["episodes", "weigh", file, "--weight", &weight_g.to_string()])?;
+    Ok(json!({ "file": file, "weight_g": weight_g, "v_init_ml": fill_ml }))
+}
+
 /// Trains, and waits until the running controller has taken the weights; returns their identity.
 fn train(cell: &mut OwnCell, client: &Client, seed: u64) -> Result<String, OwnCellError> {
-    cell.note("training from the episodes");
+    cell.note("training from all weighed episodes");
     let weights = cell.out.join("weights.bin");
     let before = client.status().map_err(|e| OwnCellError::Other(e.to_string()))?.weights_taken;
     let log = cell.out.join("logs/trainer.log");
@@ -156,20 +179,21 @@ fn train(cell: &mut OwnCell, client: &Client, seed: u64) -> Result<String, OwnCe
 }
 
 /// Pours once into an empty cup, and draws the pour.
-fn pour(cell: &OwnCell, number: usize, fill_ml: f64, goal_ml: f32) -> Result<DemoPour, OwnCellError> {
+fn pour(cell: &OwnCell, kind: &str, number: usize, planned: PlannedPour) -> Result<DemoPour, OwnCellError> {
+    let PlannedPour { fill_ml, goal_ml } = planned;
     cell.command("simulator", &["operator", "fill", &fill_ml.to_string()])?;
     let listener = Listener::start(&cell.config.cell)?;
     let result = cell.command("rt-controller", &["pour", "--json", &goal_ml.to_string()])?;
     let ticks = listener.finish();
     let poured_ml = cell.scale()?;
-    let plot = cell.out.join(format!("pour-{number}-{goal_ml:.0}ml.svg"));
-    plots::pour::draw(&plot, &ticks, goal_ml, poured_ml).map_err(|e| OwnCellError::Other(format!("{}: {e}", plot.display())))?;
+    let plot = cell.out.join(PICTURES).join(format!("{kind}-{number}-{goal_ml:.0}ml.svg"));
+    plots::pour::draw(&plot, &ticks, goal_ml as f32, poured_ml).map_err(|e| OwnCellError::Other(format!("{}: {e}", plot.display())))?;
     cell.note(&format!("  poured {poured_ml} g on the scale"));
     Ok(DemoPour {
         filled_ml: fill_ml,
         goal_ml,
         poured_ml,
-        error_ml: poured_ml - f64::from(goal_ml),
+        error_ml: poured_ml - goal_ml,
         outcome: result["outcome"].clone(),
         episode_file: result["episode_file"].clone(),
         plot,

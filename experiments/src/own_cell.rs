@@ -16,6 +16,8 @@ use shared::exit::{self, Failure, failure};
 use shared::messages::Phase;
 use shared::os;
 
+use crate::own_folder;
+
 /// Why the cell, or an operator's command in it, did not do what it was asked to.
 #[derive(Debug, thiserror::Error)]
 pub enum OwnCellError {
@@ -87,19 +89,18 @@ pub struct OwnCell {
 }
 
 impl OwnCell {
-    /// Makes the directory and the configuration; nothing runs yet. Weights of an earlier cell there are removed. `kind` becomes part of
-    /// the cell's name. From here on Ctrl-C ends what waits.
+    /// Makes the directory and the configuration; nothing runs yet. `results` of an earlier experiment there are removed, with its weights and
+    /// logs. `kind` becomes part of the cell's name. From here on Ctrl-C ends what waits.
     ///
     /// # Errors
-    /// When the configuration is bad, or a file cannot be written.
-    pub fn prepare(kind: &str, config: &Path, out: &Path, seed: u64) -> Result<Self, OwnCellError> {
+    /// When the configuration is bad, the directory is not an experiment's ([`own_folder::claim`]), or a file cannot be written.
+    pub fn prepare(kind: &str, config: &Path, (out, results): (&Path, &[&str]), seed: u64) -> Result<Self, OwnCellError> {
         let file = |what: &Path, error| OwnCellError::File { what: what.display().to_string(), error };
         let bad = |e: &dyn std::fmt::Display| OwnCellError::Config(e.to_string());
         let text = std::fs::read_to_string(config).map_err(|e| file(config, e))?;
         Config::parse(&text, &config.display().to_string()).map_err(|e| bad(&e))?;
         let mut table: toml::Table = text.parse().map_err(|e| bad(&format!("{}: {e}", config.display())))?;
-        let _ = std::fs::remove_dir_all(out.join("logs"));
-        let _ = std::fs::remove_file(out.join("weights.bin"));
+        own_folder::claim(out, &[results, &["logs", "weights.bin"]].concat())?;
         std::fs::create_dir_all(out.join("logs")).map_err(|e| file(out, e))?;
         let mut set = |section: &str, key: &str, value: toml::Value| {
             if let Some(toml::Value::Table(t)) = table.get_mut(section) {

@@ -3,7 +3,7 @@
 use std::process::ExitCode;
 
 use clap::{Parser, Subcommand};
-use feature_worker::commands::{bench, calibrate, episodes, inspect, run, view};
+use feature_worker::commands::{bench, calibrate, camera, episodes, inspect, run, view};
 
 /// The vision process: camera frames in, V_e and episodes out.
 #[derive(Parser)]
@@ -19,6 +19,8 @@ enum Command {
     Run(run::Args),
     /// Finds the container's axes and the liquid's colour; writes the [image] section.
     Calibrate(calibrate::Args),
+    /// Lists this machine's cameras: names, formats, rates, controls, and who uses them.
+    Camera(camera::Args),
     /// Shows the live stream with what is measured, in a local web page.
     View(view::Args),
     /// Writes pictures and a CSV of what is measured in images or a video.
@@ -50,6 +52,7 @@ fn main() -> ExitCode {
     shared::exit::end(match command {
         Command::Run(args) => return shared::exit::end_resident(run::run(&args)),
         Command::Calibrate(args) => calibrate::run(&args),
+        Command::Camera(args) => camera::run(&args),
         Command::View(args) => view::run(&args),
         Command::Inspect(args) => inspect::run(&args),
         Command::Episodes(args) => episodes::run(&args),

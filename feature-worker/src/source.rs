@@ -13,6 +13,8 @@ use shared::ipc::{Cell, FrameTopic};
 
 mod capture;
 mod container;
+pub mod controls;
+pub mod devices;
 mod files;
 mod frame;
 mod numbering;

@@ -6,11 +6,13 @@
 //! | `checks` | whether a picture can be used: light, repetition, focus |
 //! | `whole` | whether a picture is whole: decoded to its end, of one moment, with the glass in its place |
 //! | `presence` | when a stream that is not seen any more is gone |
-//! | `ground_colours` | the colours of the ground behind a coloured liquid |
+//! | `ground_colours`, `ground_beside` | the colours of the ground behind a coloured liquid, and where some of them are learned |
+//! | `hues` | the ranges of hue that are a liquid's |
 //! | `liquid` | what the extractor asks of a liquid; `coloured_liquid` and `clear_water` are the two kinds |
 //! | `stream_edge` | the stream's edge as a robust line, then through sub-pixel points of profiles |
 //! | `geometry` | lines, the two axes, and the rays between them |
 //! | `picture` | images, their pixels, and samples between pixels |
+//! | `confidence` | what a measurement's confidence means |
 //! | `measurement` | what one image tells |
 //! | `learn_axes` | finds the axes in the mean of many pictures |
 //! | `learn_colour` | learns the liquid's colour from the pictures of one pour |
@@ -20,11 +22,17 @@
 mod checks;
 mod clear_water;
 mod coloured_liquid;
+mod confidence;
 mod extractor;
 mod geometry;
+mod ground_beside;
 mod ground_colours;
+mod hues;
 mod learn_axes;
 mod learn_colour;
+mod learn_poses;
+mod learn_profile;
+mod learn_steady;
 mod liquid;
 mod measurement;
 mod picture;
@@ -35,6 +43,8 @@ mod whole;
 pub use extractor::{ExtractError, Extractor};
 pub use geometry::Axes;
 pub use learn_axes::{AxesError, Corner, find_corner};
-pub use learn_colour::{ColourError, ColourLearner};
+pub use learn_colour::{ColourError, ColourLearner, DryBackground};
+pub use learn_poses::Poses;
+pub use learn_steady::Steadiness;
 pub use measurement::{Measurement, Stages};
 pub use picture::Image;

@@ -106,9 +106,8 @@ fn open_source(config: &Config, cell: &Cell, stop: &AtomicBool) -> Result<Source
     loop {
         match Source::open(&config.camera, cell) {
             Ok(source) => return Ok(source),
-            Err(SourceError::Busy(_)) if os::now_ns() < begin_ns + LET_GO_NS && !stop.load(Relaxed) => std::thread::sleep(WAIT),
-            Err(e) if config.camera.source == CameraSource::SharedMemory => return Err(failure(exit::UNREACHABLE, e)),
-            Err(e) => return Err(failure(exit::BAD_INPUT, e)),
+            Err(SourceError::Busy { .. }) if os::now_ns() < begin_ns + LET_GO_NS && !stop.load(Relaxed) => std::thread::sleep(WAIT),
+            Err(e) => return Err(failure(e.exit_code(), e)),
         }
     }
 }

@@ -106,6 +106,114 @@ fn each_cause_raises_its_doubt() -> Result<(), ExtractError> {
     Ok(())
 }
 
+/// Protects the controller from parts of a picture: what was not decoded, is of the picture before, or is shifted, is named, above a
+/// stream and without one, and the whole pictures between are measured.
+#[test]
+fn a_picture_that_is_not_whole_is_named() -> Result<(), ExtractError> {
+    type Break = fn(&mut [u8], &[u8]);
+    let breaks: [Break; 4] = [
+        |rows, _| rows.fill(128),
+        |rows, _| rows.chunks_exact_mut(3).for_each(|p| p.copy_from_slice(&[0, 135, 0])),
+        |rows, before| rows.copy_from_slice(before),
+        |rows, _| rows.chunks_exact_mut(640 * 3).for_each(|row| row.rotate_right(24 * 3)),
+    ];
+    for (kind, broken) in breaks.iter().enumerate() {
+        for method in [LiquidMethod::Colour, LiquidMethod::Clear] {
+            let mut extractor = Extractor::new(&camera(), &image_config(method))?;
+            let mut before = Vec::new();
+            for i in 0..44 {
+                let share = ((i - 24) as f32 / 8.0).clamp(0.0, 1.0);
+                let picture = if method == LiquidMethod::Colour { pour((i - 20).max(0))? } else { water(share, None, i)? };
+                let mut pixels = picture.data_bytes()?.to_vec();
+                let clean = pixels.clone();
+                let is_broken = i > 22 && i % 3 == 0;
+                if is_broken {
+                    let from = 160 * 640 * 3;
+                    broken(&mut pixels[from..], &before[from..]);
+                }
+                before = clean;
+                let measured = extractor.measure(Image { width_px: 640, height_px: 480, format: PixelFormat::Bgr8, pixels: &pixels })?;
+                assert_eq!(measured.doubt == Doubt::PictureIncomplete, is_broken, "{kind} {method:?} frame {i}: {measured:?}");
+            }
+        }
+    }
+    Ok(())
+}
+
+/// Protects the controller from a camera whose colours are not those of the calibration: a stream in swapped colours or in grey is not
+/// "nothing".
+#[test]
+fn a_stream_in_other_colours_is_named() -> Result<(), ExtractError> {
+    let swap: fn(&mut [u8]) = |p| p.swap(0, 2);
+    let grey: fn(&mut [u8]) = |p| p.fill(p[1]);
+    for (change, doubted_dry) in [(swap, false), (grey, true)] {
+        let mut extractor = colour()?;
+        for i in -12..24 {
+            let mut pixels = pour(i)?.data_bytes()?.to_vec();
+            pixels.chunks_exact_mut(3).for_each(change);
+            let measured = extractor.measure(Image { width_px: 640, height_px: 480, format: PixelFormat::Bgr8, pixels: &pixels })?;
+            let wanted = if i > 15 || doubted_dry { Doubt::ColoursChanged } else { Doubt::None };
+            if i <= 7 || i > 15 {
+                assert_eq!((measured.area_px2, measured.doubt), (0.0, wanted), "frame {i}");
+            }
+        }
+    }
+    Ok(())
+}
+
+/// Protects the estimate from a stream that is lost: where a stream was, and what is there now was never seen as ground, it is not seen and
+/// not absent; where ground is seen, it is gone at once.
+#[test]
+fn a_lost_stream_is_not_absent() -> Result<(), ExtractError> {
+    for lost in [true, false] {
+        let mut extractor = colour()?;
+        for i in 0..24 {
+            let mut picture = dry(0.0, i)?;
+            if (14..18).contains(&i) || (lost && i >= 18) {
+                let colour = if i < 18 { Scalar::new(150.0, 62.0, 20.0, 0.0) } else { Scalar::new(60.0, 180.0, 60.0, 0.0) };
+                let shape: Vector<Point> = stream(70.0, 60.0).into_iter().map(|[x, y]| Point::new(x as i32, y as i32)).collect();
+                imgproc::fill_poly(&mut picture, &shape, colour, imgproc::LINE_AA, 0, Point::default())?;
+            }
+            let measured = measure(&mut extractor, &picture)?;
+            assert_eq!(measured.area_px2 > 0.0, (14..18).contains(&i), "frame {i}: {measured:?}");
+            if i >= 18 {
+                assert_eq!(measured.doubt == Doubt::None, !lost, "frame {i}: {measured:?}");
+            }
+        }
+    }
+    Ok(())
+}
+
+/// Protects clear water under lamps that flicker, and with a white balance that hunts: bands of 30 % and gains of 20 % are divided out, and
+/// the stream is measured as without them.
+#[test]
+fn bands_and_colours_of_the_light_are_divided_out() -> Result<(), ExtractError> {
+    for (bands, tint) in [(0.3f32, 0.0f32), (0.0, 0.2)] {
+        let mut extractor = Extractor::new(&camera(), &image_config(LiquidMethod::Clear))?;
+        for i in 0..26 {
+            let share = ((i - 9) as f32 / 8.0).clamp(0.0, 1.0);
+            let mut pixels = water(share, None, i)?.data_bytes()?.to_vec();
+            for (y, row) in pixels.chunks_exact_mut(640 * 3).enumerate() {
+                let band = 1.0 + bands * (y as f32 / 30.0 + i as f32 * 2.1).sin();
+                let warm = 1.0 + tint * (i as f32 / 9.0).sin();
+                for pixel in row.chunks_exact_mut(3) {
+                    pixel[0] = (f32::from(pixel[0]) * band / warm).min(255.0) as u8;
+                    pixel[1] = (f32::from(pixel[1]) * band).min(255.0) as u8;
+                    pixel[2] = (f32::from(pixel[2]) * band * warm).min(255.0) as u8;
+                }
+            }
+            let measured = extractor.measure(Image { width_px: 640, height_px: 480, format: PixelFormat::Bgr8, pixels: &pixels })?;
+            let truth = 3600.0 * share * share;
+            if share == 0.0 {
+                assert_eq!(measured.area_px2, 0.0, "frame {i}");
+            } else if share > 0.5 {
+                assert!((measured.area_px2 / truth - 1.0).abs() < 0.15, "{bands} {tint} frame {i}: {measured:?} instead of {truth}");
+            }
+        }
+    }
+    Ok(())
+}
+
 /// Protects against a stream out of nothing: where the colour only fades, over half of the region, there is no edge and so no stream.
 #[test]
 fn a_fade_without_an_edge_is_no_stream() -> Result<(), ExtractError> {

@@ -117,7 +117,6 @@ fn bad_configurations_are_refused_with_key_and_hint() -> Outcome {
         ("region_px = [190, 16, 420, 256]", "region_px = [190, 16, 520, 256]", ["image.region_px", "inside 640 x 480"]),
         ("region_px = [190, 16, 420, 256]", "region_px = [300, 16, 300, 256]", ["image.region_px", "axes cross"]),
         ("colour_hsv = [98, 90, 25, 124, 255, 255]", "colour_hsv = [98, 200, 25, 124, 90, 255]", ["image.colour_hsv", "s_min < s_max"]),
-        ("source = \"shared-memory\"", "source = \"device\"\npath = \"/dev/no-such-camera\"", ["/dev/no-such-camera", "by-id"]),
         ("source = \"shared-memory\"", "source = \"video\"\npath = \"no-such.mp4\"", ["no-such.mp4", "no such file"]),
         ("source = \"shared-memory\"", "source = \"images\"\npath = \"no/f_%03d.png\"", ["no/f_%03d.png", "pattern"]),
     ] {
@@ -129,6 +128,31 @@ fn bad_configurations_are_refused_with_key_and_hint() -> Outcome {
         refused(&output, &words);
     }
     shared::ipc::remove_files(&format!("bad-{}", std::process::id()));
+    Ok(())
+}
+
+/// Protects who looks for the fault: a device that is not there and a file that is no camera are told apart, by their words and exit codes.
+#[test]
+fn a_missing_device_and_no_camera_are_told_apart() -> Outcome {
+    let directory = tempfile::tempdir()?;
+    let file = directory.path().join("video0");
+    std::fs::write(&file, "no device")?;
+    for (path, code, words) in [(Path::new("/dev/no-such-camera"), 3, "no such device"), (&file, 2, "this is no camera")] {
+        let (config, written) = write_config(directory.path(), "devices", |c| {
+            (c.camera.source, c.camera.path) = (shared::config::CameraSource::Device, path.display().to_string());
+        })?;
+        let run = |command: &str| Command::new(env!("CARGO_BIN_EXE_feature-worker")).args([command, "--config"]).arg(&config).output();
+        for command in ["run", "view", "camera"] {
+            let output = run(command)?;
+            let said = text(&output);
+            assert_eq!(output.status.code(), Some(code), "{command}: {said}");
+            assert!(said.contains(words) && said.contains(&path.display().to_string()), "{command}: {said}");
+        }
+        shared::ipc::remove_files(&written.cell.name);
+    }
+    let output = Command::new(env!("CARGO_BIN_EXE_feature-worker")).args(["camera", "--json"]).output()?;
+    let listed: serde_json::Value = serde_json::from_slice(&output.stdout)?;
+    assert!(output.status.success() && listed["cameras"].is_array(), "{}", text(&output));
     Ok(())
 }
 

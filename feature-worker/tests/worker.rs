@@ -443,8 +443,8 @@ fn the_calibration_page_takes_clicks_and_writes() -> Outcome {
     assert!((state["lip"][0].as_f64().unwrap_or(0.0) - 215.0).abs() < 4.0, "found by itself: {state}");
     let click = |body: &str| -> Result<String, Failure> { Ok(String::from_utf8(http(&address, "POST", "/corner", body)?.1)?) };
     assert!(click("nonsense")?.contains("expected"));
-    assert_ne!(click(r#"{"lip":[639,2],"rim":[639,479],"foot":[0,0]}"#)?, "measured again");
-    assert_eq!(click(r#"{"lip":[215,250],"rim":[600,250],"foot":[215,470]}"#)?, "measured again");
+    assert!(!click(r#"{"lip":[639,2],"rim":[639,479],"foot":[0,0]}"#)?.starts_with("measured again"));
+    assert!(click(r#"{"lip":[215,250],"rim":[600,250],"foot":[215,470]}"#)?.starts_with("measured again"));
     assert!(String::from_utf8(http(&address, "POST", "/write", "")?.1)?.contains("written"));
     assert_eq!(page.end()?.0, Some(0));
     let written = shared::config::Config::read(&path)?;

@@ -105,6 +105,8 @@ pub enum JournalError {
 pub struct Writer<W: Write = BufWriter<File>> {
     to: W,
     written: u64,
+    /// Where an entry is put together.
+    buffer: Vec<u8>,
 }
 
 impl Writer {
@@ -134,7 +136,7 @@ impl Writer {
 impl<W: Write> Writer<W> {
     /// Starts a journal that goes to `to`.
     pub fn begin(to: W, settings: &Settings) -> std::io::Result<Self> {
-        let mut this = Self { to, written: 0 };
+        let mut this = Self { to, written: 0, buffer: vec![0; ENTRY_MAX] };
         this.to.write_all(MAGIC)?;
         this.entry(&Entry::Settings(*settings))?;
         Ok(this)
@@ -160,8 +162,7 @@ impl<W: Write> Writer<W> {
         if self.written > FILE_MAX {
             return Err(std::io::Error::other("the journal is full (2 GiB)"));
         }
-        let mut buffer = vec![0; ENTRY_MAX];
-        let bytes = postcard::to_slice(entry, &mut buffer).map_err(std::io::Error::other)?;
+        let bytes = postcard::to_slice(entry, &mut self.buffer).map_err(std::io::Error::other)?;
         self.written += 4 + bytes.len() as u64;
         self.to.write_all(&(bytes.len() as u32).to_le_bytes())?;
         self.to.write_all(bytes)

@@ -221,9 +221,12 @@ fn orders_that_cannot_be_obeyed_are_refused() {
 #[test]
 fn every_doubt_ends_the_pour_upright_with_its_reason() {
     type Trouble = fn(&mut ToyCell);
-    let troubles: [(Trouble, EndReason); 8] = [
+    let troubles: [(Trouble, EndReason); 10] = [
         (|w| w.camera = false, EndReason::StaleFeature),
         (|w| w.doubt = Doubt::TooDark, EndReason::StaleFeature),
+        // Nothing seen in a doubtful picture does not say that nothing flows.
+        (|w| (w.doubt, w.dry) = (Doubt::Blurred, true), EndReason::StaleFeature),
+        (|w| (w.doubt, w.dry) = (Doubt::ColoursChanged, true), EndReason::StaleFeature),
         (|w| w.clock_ahead_ns = 1_000_000_000_000, EndReason::StaleFeature),
         (|w| w.epoch_ns += 1, EndReason::WorkerRestarted),
         (|w| w.dry = true, EndReason::StreamLost),

@@ -8,6 +8,7 @@ use std::path::{Path, PathBuf};
 
 use serde::{Deserialize, Serialize};
 
+pub use crate::config_camera::{CameraConfig, CameraSource, Locked, Refused, Setting};
 use crate::config_paths;
 use crate::limits::Limits;
 
@@ -92,37 +93,6 @@ pub struct CellConfig {
     /// The directory in which a directory of the cell's name holds its runtime files; without this key [`crate::runtime_dir`] chooses one.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub runtime_dir: Option<PathBuf>,
-}
-
-/// Where frames come from.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "kebab-case")]
-pub enum CameraSource {
-    /// A V4L2 device through OpenCV.
-    Device,
-    /// A video file through OpenCV.
-    Video,
-    /// An image sequence through OpenCV (`frame_%04d.png`).
-    Images,
-    /// Frames that another process publishes in the cell's shared memory (service `frame`).
-    SharedMemory,
-}
-
-/// The table `[camera]`.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct CameraConfig {
-    /// Where frames come from.
-    pub source: CameraSource,
-    /// Device (`/dev/v4l/by-id/...`), video file or image pattern; empty for shared memory.
-    #[serde(default)]
-    pub path: String,
-    /// Width in px.
-    pub width_px: u32,
-    /// Height in px.
-    pub height_px: u32,
-    /// Frames a second.
-    pub fps: f64,
 }
 
 /// How liquid is told from the background.
@@ -348,6 +318,19 @@ impl Check<'_> {
         self.range("camera.width_px", camera.width_px.into(), 64.0, 4096.0)?;
         self.range("camera.height_px", camera.height_px.into(), 64.0, 4096.0)?;
         self.range("camera.fps", camera.fps, 1.0, 240.0)?;
+        for (key, setting, low, high) in [
+            ("camera.exposure_ms", camera.exposure_ms, 0.01, 1000.0),
+            ("camera.gain", camera.gain, 0.0, 1e6),
+            ("camera.white_balance_k", camera.white_balance_k, 1000.0, 20_000.0),
+            ("camera.focus", camera.focus, 0.0, 1e6),
+        ] {
+            if let Some(Setting::Value(value)) = setting {
+                self.range(key, value, low, high)?;
+            }
+        }
+        if let Some(Setting::Value(value)) = camera.mains_hz {
+            self.rule("camera.mains_hz", &value.to_string(), [0.0, 50.0, 60.0].contains(&value), "50, 60, 0 (off) or \"locked\"")?;
+        }
         let needs_path = camera.source != CameraSource::SharedMemory;
         self.rule(
             "camera.path",
@@ -465,6 +448,9 @@ mod tests {
             ("direction = 1.0", "direction = 0.5", ["robot.direction", "1 or -1"]),
             ("name = \"lab\"", "name = \"../x\"", ["cell.name", "letters"]),
             ("path = \"/dev/video0\"", "path = \"\"", ["camera.path", "device"]),
+            ("fps = 30.0", "fps = 30.0\nmains_hz = 55", ["camera.mains_hz = 55", "50, 60, 0"]),
+            ("fps = 30.0", "fps = 30.0\nexposure_ms = 0", ["camera.exposure_ms = 0", "0.01 to 1000"]),
+            ("fps = 30.0", "fps = 30.0\ngain = \"auto\"", ["gain", "Setting"]),
             ("width_px = 640", "width_px = 320", ["image.region_px", "inside 320"]),
             ("register_base = 24", "register_base = 3", ["robot.register_base", "24 to 40"]),
         ] {

@@ -31,6 +31,7 @@ pub mod actions;
 pub mod agent;
 pub mod alpha_track;
 pub mod config;
+mod config_camera;
 pub mod config_paths;
 pub mod control;
 pub mod episode;

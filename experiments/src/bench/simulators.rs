@@ -94,9 +94,9 @@ impl Bench {
 
     /// The volume that flows out of `volume_ml` at the largest tilt if one waits for ever, ml.
     pub fn reach_ml(&self, volume_ml: f64) -> f64 {
-        let Some((rig, container)) = self.rig() else { return volume_ml };
+        let Some((_, container)) = self.rig() else { return volume_ml };
         let mut container = container.clone();
         container.refill(volume_ml);
-        container.volume_ml() - rig.shape.retained_ml(ALPHA_MAX_DEG)
+        container.volume_ml() - container.retained_ml(ALPHA_MAX_DEG)
     }
 }

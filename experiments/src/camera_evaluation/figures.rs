@@ -41,6 +41,8 @@ pub struct CameraFigures {
     pub wrong_percent: f64,
     /// Share of the frames without a stream that have a doubt, per cent.
     pub dry_doubt_percent: f64,
+    /// The doubts with their number of frames, on frames with a stream and after a stroke without.
+    pub doubts: String,
 }
 
 /// One measured frame beside the truth.
@@ -115,12 +117,33 @@ pub fn figures(frames: &[Comparison]) -> CameraFigures {
         wet_unusable_percent: percent(wet.iter().filter(|s| !s.usable).count(), wet.len()),
         wrong_percent: percent(wrong, wet.len()),
         dry_doubt_percent: percent(dry.iter().filter(|s| s.doubt != Doubt::None).count(), dry.len()),
+        doubts: doubts_in_words(frames),
     }
 }
 
-/// The doubts on frames with a truth above [`MEASURED_PX2`], with their number.
-pub fn doubts_in_words(frames: &[Comparison]) -> String {
-    let wet = || frames.iter().filter(|s| s.truth_px2 > MEASURED_PX2);
-    let counted = Doubt::ALL.into_iter().filter(|d| *d != Doubt::None).map(|d| (d, wet().filter(|s| s.doubt == d).count()));
-    counted.filter(|(_, n)| *n > 0).map(|(d, n)| format!("{} {n}", d.words())).collect::<Vec<_>>().join(", ")
+/// The doubts on frames with a truth above [`MEASURED_PX2`], with their number, and after a stroke those on frames without a stream.
+fn doubts_in_words(frames: &[Comparison]) -> String {
+    let count = |chosen: fn(&&Comparison) -> bool| {
+        let counted = Doubt::ALL.into_iter().filter(|d| *d != Doubt::None);
+        let counted = counted.map(|d| (d, frames.iter().filter(chosen).filter(|s| s.doubt == d).count()));
+        counted.filter(|(_, n)| *n > 0).map(|(d, n)| format!("{} {n}", d.words())).collect::<Vec<_>>().join(", ")
+    };
+    format!("{} / {}", count(|s| s.truth_px2 > MEASURED_PX2), count(|s| s.truth_px2 == 0.0))
+}
+
+/// Steps of confidence in a table of reliability.
+pub const CONFIDENCES: usize = 10;
+
+/// For each step of confidence the number of frames that the controller uses, their mean confidence, and the share of them whose area is
+/// within [`WRONG_PERCENT`] of the truth (0 where there is no stream); NaN without frames.
+pub fn reliability(frames: &[Comparison]) -> [(usize, f64, f64); CONFIDENCES] {
+    let mut sums = [(0usize, 0.0f64, 0.0f64); CONFIDENCES];
+    for frame in frames.iter().filter(|f| f.usable) {
+        let step = ((frame.confidence * CONFIDENCES as f64) as usize).min(CONFIDENCES - 1);
+        let right = if frame.truth_px2 > 0.0 { frame.error_percent().abs() <= WRONG_PERCENT } else { frame.area_px2 == 0.0 };
+        sums[step].0 += 1;
+        sums[step].1 += frame.confidence;
+        sums[step].2 += f64::from(u8::from(right));
+    }
+    sums.map(|(n, confidence, right)| (n, confidence / n as f64, right / n as f64))
 }

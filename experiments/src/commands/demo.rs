@@ -16,13 +16,13 @@ const TOLERANCE_ML: f64 = 10.0;
 #[derive(Debug, clap::Args)]
 #[command(
     after_help = "Example:\n  experiments demo --out out/demo --seed 3\n\nLeaves in the output directory: sim.toml, episodes/*.mcap, weights.bin, \
-pour-*.svg, summary.json and the processes' logs."
+pours/*.svg, summary.json and the processes' logs."
 )]
 pub struct Args {
     /// The simulated cell's configuration; the demo gives its copy a name and an address of its own.
     #[arg(long, default_value = shared::config::DEFAULT_FILE)]
     config: PathBuf,
-    /// Directory of the results; what an earlier demo left there is replaced.
+    /// Directory of the results: a new or an empty one, or one that an earlier demo made, whose results are then replaced.
     #[arg(long, default_value = "out/demo")]
     out: PathBuf,
     /// Which container, camera and fluid the cell has, and the training's seed.
@@ -35,11 +35,7 @@ pub struct Args {
 
 /// Runs the command.
 pub fn run(args: &Args) -> Result<(), Failure> {
-    for old in ["episodes", "summary.json"] {
-        let old = args.out.join(old);
-        let _ = if old.is_dir() { std::fs::remove_dir_all(old) } else { std::fs::remove_file(old) };
-    }
-    let mut cell = OwnCell::prepare("demo", &args.config, &args.out, args.seed)?;
+    let mut cell = OwnCell::prepare("demo", &args.config, (&args.out, &["episodes", "summary.json", "pours"]), args.seed)?;
     let summary = perform(&mut cell, args.seed)?;
     if args.json {
         println!("{}", summary.json());

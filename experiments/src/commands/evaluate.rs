@@ -9,6 +9,7 @@ use indicatif::{ParallelProgressIterator, ProgressBar, ProgressStyle};
 use rayon::prelude::*;
 use shared::exit::{self, Failure, OrExit as _, failure};
 use shared::weights::Weights;
+use simulator::physics::vessel::VesselKind;
 use trainer::training::{Estimate, MethodName};
 
 use crate::bench::pour::PourResult;
@@ -25,6 +26,7 @@ use crate::pour_evaluation::trial::{Protocol, Trial};
   experiments evaluate --weights out/weights.bin --rigs 1
   experiments evaluate --weighed 5 --episodes 5
   experiments evaluate --container bottle --change noise
+  experiments evaluate --vessel bottle,steep --first-rig 200 --rigs 20 --teach 5,2+3,5+5 --method best,best-sum,paper
   experiments evaluate --through-camera --rigs 5 --repeats 1")]
 pub struct Args {
     /// Simulator: a (the paper's) or b (physical).
@@ -60,6 +62,14 @@ pub struct Args {
     /// Container, for training and test: cylinder, cone-in, cone-out, bottle, jug.
     #[arg(long, default_value = "cylinder", value_parser = ["cylinder", "cone-in", "cone-out", "bottle", "jug"])]
     container: String,
+    /// Vessels, liquids or robots that are not straight, water and prompt, drawn from each rig's seed, comma-separated: rough, cone-in,
+    /// cone-out, bottle, jug, carton, steep, slosh, lag, wild, or all. There is a table for each.
+    #[arg(long, value_delimiter = ',', conflicts_with_all = ["container", "through_camera", "sim"])]
+    vessel: Vec<String>,
+    /// What a training is taught, comma-separated: N curves (5), or N curves and K weighed pours with a training after each (2+3). There is a
+    /// table for each.
+    #[arg(long, value_delimiter = ',', conflicts_with_all = ["episodes", "weighed", "weights"])]
+    teach: Vec<String>,
     /// What is different at the test from what the training saw.
     #[arg(long, value_enum, default_value = "none")]
     change: Change,
@@ -72,8 +82,42 @@ pub struct Args {
 }
 
 impl Args {
-    fn protocol(&self) -> Protocol {
-        Protocol { episodes: self.episodes, weighed: self.weighed, actions: self.actions, repeats: self.repeats }
+    /// What is taught, in the order of the tables.
+    fn protocols(&self) -> Result<Vec<Protocol>, Failure> {
+        let one = |episodes, weighed, refit_after_each| Protocol {
+            episodes,
+            weighed,
+            refit_after_each,
+            actions: self.actions,
+            repeats: self.repeats,
+        };
+        if self.teach.is_empty() {
+            return Ok(vec![one(self.episodes, self.weighed, false)]);
+        }
+        let read = |text: &String| {
+            let (curves, pours) = text.split_once('+').unwrap_or((text, "0"));
+            match (curves.parse::<u64>(), pours.parse::<u64>()) {
+                (Ok(curves @ 1..=200), Ok(pours @ 0..=200)) => Ok(one(curves, pours, true)),
+                _ => Err(failure(exit::BAD_INPUT, format!("--teach {text}: give N or N+K with N from 1 to 200 and K from 0 to 200"))),
+            }
+        };
+        self.teach.iter().map(read).collect()
+    }
+
+    /// The kinds of drawn vessels, in the order of the tables; none for the straight ones.
+    fn kinds(&self) -> Result<Vec<Option<VesselKind>>, Failure> {
+        let mut kinds = Vec::new();
+        for name in &self.vessel {
+            match VesselKind::named(name) {
+                Some(kind) => kinds.push(Some(kind)),
+                None if name == "all" => kinds.extend(VesselKind::ALL.map(Some)),
+                None => {
+                    let names = VesselKind::ALL.map(VesselKind::name).join(", ");
+                    return Err(failure(exit::BAD_INPUT, format!("--vessel {name}: there are {names} and all")));
+                }
+            }
+        }
+        Ok(if kinds.is_empty() { vec![None] } else { kinds })
     }
 
     /// Refuses arguments that do not go together.
@@ -88,11 +132,14 @@ impl Args {
     }
 
     /// One trial for each rig and data seed.
-    fn trials(&self) -> Result<Vec<Trial>, String> {
+    fn trials(&self, kind: Option<VesselKind>) -> Result<Vec<Trial>, String> {
         let rigs = if self.sim == "a" { 0..1 } else { self.first_rig..self.first_rig + self.rigs };
         rigs.flat_map(|rig| (0..self.seeds).map(move |seed| (rig, seed)))
             .map(|(rig, seed)| {
-                let trial = Trial::new(&self.sim, rig, seed, &self.container, self.change);
+                let trial = match kind {
+                    Some(kind) => return Ok(Trial::drawn(kind, rig, seed, self.change)),
+                    None => Trial::new(&self.sim, rig, seed, &self.container, self.change),
+                };
                 if self.through_camera { trial.through_camera(rig, &self.container) } else { Ok(trial) }
             })
             .collect()
@@ -124,31 +171,48 @@ pub fn run(args: &Args) -> Result<(), Failure> {
     for file in &args.weights {
         files.push((file.display().to_string(), Weights::read(file).or_exit(exit::BAD_INPUT)?));
     }
-    let (trials, protocol) = (args.trials().or_exit(exit::FAILED)?, args.protocol());
+    let (kinds, protocols) = (args.kinds()?, args.protocols()?);
     let begin = std::time::Instant::now();
-    let judged: Vec<Judged> = if files.is_empty() {
-        args.method.iter().map(|pourer| Judged::new(&pourer.name(), &trials, |trial| trial.run(*pourer, &protocol))).collect()
-    } else {
-        files.iter().map(|(name, weights)| Judged::new(name, &trials, |trial| trial.judge(weights, args.repeats))).collect()
-    };
-    let seconds = begin.elapsed().as_secs_f64();
-    let summaries: Vec<Summary> = judged.iter().map(|j| Summary::new(&j.name, &j.groups)).collect();
-    print(args, &summaries);
-    let frames: u64 = judged.iter().flat_map(|j| j.groups.iter().flatten()).map(|p| u64::from(p.frames)).sum();
-    eprintln!("{frames} frames, {seconds:.1} s with training");
+    let mut reports = Vec::new();
+    let mut frames = 0;
+    for kind in &kinds {
+        let trials = args.trials(*kind).or_exit(exit::FAILED)?;
+        for protocol in &protocols {
+            let table = Table { vessel: kind.map_or(args.container.as_str(), |kind| kind.name()), protocol };
+            let judged: Vec<Judged> = if files.is_empty() {
+                args.method.iter().map(|pourer| Judged::new(&pourer.name(), &trials, |trial| trial.run(*pourer, protocol))).collect()
+            } else {
+                files.iter().map(|(name, weights)| Judged::new(name, &trials, |trial| trial.judge(weights, args.repeats))).collect()
+            };
+            let summaries: Vec<Summary> = judged.iter().map(|j| Summary::new(&j.name, &j.groups)).collect();
+            print(args, &table, &summaries);
+            frames += judged.iter().flat_map(|j| j.groups.iter().flatten()).map(|p| u64::from(p.frames)).sum::<u64>();
+            if args.json.is_some() {
+                let traces = examples(args, protocol, trials.first(), files.first().map(|(_, weights)| weights));
+                reports.push(report(args, &table, &summaries, &traces, &judged));
+            }
+        }
+    }
+    eprintln!("{frames} frames, {:.1} s with training", begin.elapsed().as_secs_f64());
     if let Some(file) = &args.json {
-        let traces = examples(args, &protocol, trials.first(), files.first().map(|(_, weights)| weights));
-        let text = serde_json::to_string(&report(args, &summaries, &traces, &judged)).unwrap_or_default();
-        std::fs::write(file, text).map_err(|e| format!("{}: {e}", file.display())).or_exit(exit::FAILED)?;
+        // One table is the report that `trainer report` reads; several are a list of them.
+        let all = if reports.len() == 1 { reports.remove(0) } else { serde_json::Value::Array(reports) };
+        std::fs::write(file, all.to_string()).map_err(|e| format!("{}: {e}", file.display())).or_exit(exit::FAILED)?;
     }
     Ok(())
 }
 
+/// Which table it is.
+struct Table<'a> {
+    vessel: &'a str,
+    protocol: &'a Protocol,
+}
+
 /// Prints the table of the methods, and how they differ from the first one.
-fn print(args: &Args, summaries: &[Summary]) {
+fn print(args: &Args, table: &Table<'_>, summaries: &[Summary]) {
     println!(
         "sim {}, container {}, change {:?}, {} rigs from {} x {} data seeds, {} episodes + {} weighed pours, errors in ml",
-        args.sim, args.container, args.change, args.rigs, args.first_rig, args.seeds, args.episodes, args.weighed
+        args.sim, table.vessel, args.change, args.rigs, args.first_rig, args.seeds, table.protocol.episodes, table.protocol.weighed
     );
     println!("{}", Summary::heading());
     for s in summaries {
@@ -167,17 +231,17 @@ fn examples(args: &Args, protocol: &Protocol, trial: Option<&Trial>, weights: Op
         (Some(weights), Some(trial)) => trial.examples(weights),
         (None, Some(trial)) if args.method.contains(&Pourer::Best) => {
             let options = trial.options(MethodName::Best, Estimate::Fused, args.actions);
-            trial.train(&options, protocol.episodes, protocol.weighed).map(|(t, _)| trial.examples(&t.weights)).unwrap_or_default()
+            trial.train(&options, protocol).map(|(t, _)| trial.examples(&t.weights)).unwrap_or_default()
         }
         _ => Vec::new(),
     }
 }
 
 /// Everything, every pour included, for `trainer report`.
-fn report(args: &Args, summaries: &[Summary], traces: &[serde_json::Value], judged: &[Judged]) -> serde_json::Value {
+fn report(args: &Args, table: &Table<'_>, summaries: &[Summary], traces: &[serde_json::Value], judged: &[Judged]) -> serde_json::Value {
     serde_json::json!({
-        "kind": "evaluation", "sim": args.sim, "container": args.container, "change": args.change, "first_rig": args.first_rig,
-        "rigs": args.rigs, "seeds": args.seeds, "episodes": args.episodes, "weighed": args.weighed, "actions": args.actions,
+        "kind": "evaluation", "sim": args.sim, "container": table.vessel, "change": args.change, "first_rig": args.first_rig,
+        "rigs": args.rigs, "seeds": args.seeds, "episodes": table.protocol.episodes, "weighed": table.protocol.weighed, "actions": args.actions,
         "summaries": summaries, "traces": traces,
         "pours": judged.iter().map(|j| serde_json::json!({"name": j.name, "groups": j.groups})).collect::<Vec<_>>(),
     })

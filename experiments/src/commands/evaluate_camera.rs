@@ -17,7 +17,7 @@ use simulator::camera::{Background, Scene};
 use crate::camera_evaluation::cases::{Case, name};
 use crate::camera_evaluation::doubts;
 use crate::camera_evaluation::faults::{self, FaultFrames};
-use crate::camera_evaluation::figures::{CameraFigures, Comparison, figures};
+use crate::camera_evaluation::figures::{CameraFigures, Comparison, figures, reliability};
 use crate::camera_evaluation::measure::measure;
 use crate::camera_evaluation::scenes::{SHORT_FRAMES, short, whole_pours};
 use crate::camera_evaluation::worst::Worst;
@@ -91,6 +91,7 @@ fn evaluate(args: &Args) -> Result<(), CameraError> {
 
     let figures: BTreeMap<&str, CameraFigures> = all.groups.iter().map(|(name, frames)| (name.as_str(), figures(frames))).collect();
     print(&figures);
+    print_reliability(&all.groups);
     let doubts = doubts::raised_percent(args.seed)?;
     println!("\nframes that nobody should trust, and the share for which the doubt was raised:");
     for (name, percent) in &doubts {
@@ -149,15 +150,28 @@ fn measure_case(args: &Args, method: &str, i: usize, run: Option<usize>, all: &m
     })
 }
 
+/// Prints, by condition, how often areas with a confidence are right.
+fn print_reliability(groups: &BTreeMap<String, Vec<Comparison>>) {
+    println!("\nframes, their mean confidence and the share of areas within 20 % of the truth, by steps of confidence:");
+    for (name, frames) in groups {
+        for (kind, chosen) in [("stream seen", true), ("nothing seen", false)] {
+            let frames: Vec<Comparison> = frames.iter().filter(|f| (f.area_px2 > 0.0) == chosen).copied().collect();
+            let steps = reliability(&frames).into_iter().filter(|(n, ..)| *n > 0);
+            let words: Vec<String> = steps.map(|(n, confidence, right)| format!("{n}: {confidence:.2} {right:.2}")).collect();
+            println!("  {:<44}{}", format!("{name}, {kind}"), words.join("  "));
+        }
+    }
+}
+
 /// Prints the table of the conditions.
 fn print(figures: &BTreeMap<&str, CameraFigures>) {
     println!(
-        "{:<32}{:>7}{:>9}{:>8}{:>8}{:>8}{:>9}{:>12}{:>8}",
-        "condition", "frames", "median %", "p95 %", "bias %", "false %", "missed %", "unnoticed %", "doubt %"
+        "{:<32}{:>7}{:>9}{:>8}{:>8}{:>8}{:>9}{:>12}{:>8}{:>8}{:>8}",
+        "condition", "frames", "median %", "p95 %", "bias %", "false %", "missed %", "unnoticed %", "doubt %", "wrong %", "dry d. %"
     );
     for (name, f) in figures {
         println!(
-            "{name:<32}{:>7}{:>9.2}{:>8.2}{:>8.2}{:>8.2}{:>9.2}{:>12.2}{:>8.2}",
+            "{name:<32}{:>7}{:>9.2}{:>8.2}{:>8.2}{:>8.2}{:>9.2}{:>12.2}{:>8.2}{:>8.2}{:>8.2}  {}",
             f.frames,
             f.median_error_percent,
             f.p95_error_percent,
@@ -165,7 +179,10 @@ fn print(figures: &BTreeMap<&str, CameraFigures>) {
             f.false_flow_percent,
             f.missed_flow_percent,
             f.unnoticed_percent,
-            f.doubt_percent
+            f.doubt_percent,
+            f.wrong_percent,
+            f.dry_doubt_percent,
+            f.doubts
         );
     }
 }

@@ -58,7 +58,7 @@ pub struct Args {
 pub fn run(args: &Args) -> Result<(), Failure> {
     // What it is compared with is read first, because it may be overwritten, and a bad file should not cost nine minutes.
     let earlier = args.against.as_deref().map(read_earlier).transpose()?;
-    let mut cell = OwnCell::prepare("jitter", &args.config, &args.out, 1)?;
+    let mut cell = OwnCell::prepare("jitter", &args.config, (&args.out, &[]), 1)?;
     std::fs::copy(&args.weights, args.out.join("weights.bin")).map_err(file_error(&args.weights))?;
     let machine = ThisMachine::look(&cell);
     let result = match args.hours {

@@ -10,6 +10,7 @@ use shared::limits::Limits;
 use shared::weights::{Estimator, Weights};
 use simulator::physics::RATE_HZ;
 use simulator::physics::rig::Rig;
+use simulator::physics::vessel::VesselKind;
 use trainer::calibration;
 use trainer::data::TrainingEpisode;
 use trainer::method::control_law::{self, ControlLaw};
@@ -31,6 +32,8 @@ pub struct Protocol {
     pub episodes: u64,
     /// Weighed pours that are added to them before the training that is judged.
     pub weighed: u64,
+    /// Whether a training follows each weighed pour, and not only the last one.
+    pub refit_after_each: bool,
     /// Actions of the trained networks: 2 or 21.
     pub actions: u8,
     /// How often the grid is poured.
@@ -62,6 +65,13 @@ impl Trial {
             _ => (Bench::Paper, Bench::Paper),
         };
         Self { bench: benches.0, test: benches.1, data_seed, pour_seed, limits: Limits::default() }
+    }
+
+    /// A trial on a rig whose vessel, liquid or robot is drawn as one of this kind.
+    pub fn drawn(kind: VesselKind, rig: u64, seed: u64, change: Change) -> Self {
+        let physics = Rig::drawn(kind, rig);
+        let benches = (Bench::on(&physics), Bench::on(&change.apply(physics)));
+        Self { bench: benches.0, test: benches.1, ..Self::new("a", rig, seed, "cylinder", Change::None) }
     }
 
     /// The same rig with a rendered camera before it.
@@ -112,18 +122,18 @@ impl Trial {
     pub fn weighed_pours(&self, weights: &Weights, k: u64) -> Vec<TrainingEpisode> {
         let agent = Agent::new(weights);
         let mut random = Pcg64Mcg::seed_from_u64(self.data_seed ^ 0x9_0000_0000);
-        (0..k)
-            .map(|n| {
-                let init = random.random_range(150.0..450.0f64);
-                let goal = random.random_range(20.0..200.0f64).min(0.85 * init).min(0.9 * self.test.reach_ml(init));
-                let mut trace = Trace::default();
-                let mut pour = self.test.pour(init, random.random());
-                by_core(&agent, &mut pour, self.limits, init, goal, Some(&mut trace));
-                let misread: f64 = rand_distr::Distribution::sample(&rand_distr::StandardNormal, &mut random);
-                trace.weighed(&format!("pour {}", n + 1), (pour.poured_ml() + 0.5 * misread).round())
-            })
-            .filter(|e| e.fault().is_none())
-            .collect()
+        (0..k).map(|n| self.weighed_pour(&agent, n, &mut random)).filter(|e| e.fault().is_none()).collect()
+    }
+
+    /// Makes one pour from a drawn fill to a drawn goal, and weighs it.
+    fn weighed_pour(&self, agent: &Agent, number: u64, random: &mut Pcg64Mcg) -> TrainingEpisode {
+        let init = random.random_range(150.0..450.0f64);
+        let goal = random.random_range(20.0..200.0f64).min(0.85 * init).min(0.9 * self.test.reach_ml(init));
+        let mut trace = Trace::default();
+        let mut pour = self.test.pour(init, random.random());
+        by_core(agent, &mut pour, self.limits, init, goal, Some(&mut trace));
+        let misread: f64 = rand_distr::Distribution::sample(&rand_distr::StandardNormal, random);
+        trace.weighed(&format!("pour {}", number + 1), (pour.poured_ml() + 0.5 * misread).round())
     }
 
     /// Options of a training.
@@ -138,11 +148,21 @@ impl Trial {
         data
     }
 
-    /// Trains on recorded episodes and, after `weighed` pours, again on all of them. None when a training fails.
-    pub fn train(&self, options: &Options, episodes: u64, weighed: u64) -> Option<(Trained, Vec<TrainingEpisode>)> {
+    /// Trains on recorded episodes and again on all of them after the weighed pours, or after each of them. None when a training fails.
+    pub fn train(&self, options: &Options, protocol: &Protocol) -> Option<(Trained, Vec<TrainingEpisode>)> {
+        let Protocol { episodes, weighed, .. } = *protocol;
         let mut data = self.record(episodes);
         let mut trained = trainer::method::train(&data, options, &Silent).ok()?;
-        if weighed > 0 {
+        if protocol.refit_after_each {
+            let mut random = Pcg64Mcg::seed_from_u64(self.data_seed ^ 0x9_0000_0000);
+            for n in 0..weighed {
+                let episode = self.weighed_pour(&Agent::new(&trained.weights), n, &mut random);
+                if episode.fault().is_none() {
+                    data.push(episode);
+                    trained = trainer::method::train(&data, options, &Silent).ok()?;
+                }
+            }
+        } else if weighed > 0 {
             data.extend(self.weighed_pours(&trained.weights, weighed));
             trained = trainer::method::train(&data, options, &Silent).ok()?;
         }
@@ -157,7 +177,7 @@ impl Trial {
             let (law, calibration, estimator) = self.tuned_pd(&self.record(protocol.episodes), options.seed);
             return self.pour_grid(protocol, |goal| Box::new(ByLaw::new(law, calibration, &estimator, goal)));
         }
-        let Some((trained, _)) = self.train(&options, protocol.episodes, protocol.weighed) else { return Vec::new() };
+        let Some((trained, _)) = self.train(&options, protocol) else { return Vec::new() };
         match (pourer, trained.law) {
             (Pourer::Law, Some(law)) => {
                 let weights = &trained.weights;
@@ -201,7 +221,7 @@ mod tests {
     use super::*;
     use crate::pour_evaluation::summary::Summary;
 
-    const PROTOCOL: Protocol = Protocol { episodes: 5, weighed: 0, actions: 21, repeats: 1 };
+    const PROTOCOL: Protocol = Protocol { episodes: 5, weighed: 0, refit_after_each: false, actions: 21, repeats: 1 };
 
     /// Protects the whole chain on the physical simulator: recorded, trained and poured through the controller's core, a network meets
     /// goals that it never saw, and the same seeds give the same pours.
@@ -222,7 +242,7 @@ mod tests {
         let plain = Trial::new("b", 101, 0, "cylinder", Change::None);
         let seen = plain.clone().through_camera(101, "cylinder").unwrap();
         let options = seen.options(MethodName::Best, Estimate::Fused, 21);
-        let (trained, data) = seen.train(&options, 3, 0).unwrap();
+        let (trained, data) = seen.train(&options, &Protocol { episodes: 3, ..PROTOCOL }).unwrap();
         for (by_picture, by_formula) in data.iter().zip(plain.bench.record(3, plain.data_seed)) {
             assert_eq!(by_picture.alpha_deg, by_formula.alpha_deg);
             assert_ne!(by_picture.area_px2, by_formula.area_px2);

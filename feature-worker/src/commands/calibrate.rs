@@ -9,9 +9,9 @@ use std::path::PathBuf;
 use std::sync::atomic::Ordering::Relaxed;
 use std::time::{Duration, Instant};
 
-use opencv::core::{self, CV_8U, CV_32FC3, Mat, Scalar, Vector};
+use opencv::core::{Mat, Vector};
+use opencv::imgcodecs;
 use opencv::prelude::*;
-use opencv::{imgcodecs, imgproc};
 use shared::config::{CameraConfig, Config, ImageConfig, LiquidMethod};
 use shared::exit::{self, Failure, OrExit as _, failure};
 use shared::ipc::Cell;
@@ -19,14 +19,18 @@ use shared::messages::PixelFormat;
 use shared::os;
 
 use super::page::{self, Page};
-use crate::drawing::{draw, jpeg, to_bgr};
-use crate::source::{Frame, FrameSource as _, NextFrame, ObserverSource, WAIT, for_each_frame};
+use crate::drawing::{draw, jpeg};
+use crate::source::{FrameSource as _, NextFrame, ObserverSource, WAIT};
 use crate::vision::{Axes, AxesError, ColourError, ColourLearner, Corner, Extractor, Image, find_corner};
 
+mod checks;
+mod pour;
 mod section;
 
-/// The most pictures that are kept for learning and for the drawn picture. Chosen by hand: about 140 MB at 640 x 480 px.
-const KEEP_PICTURES: usize = 150;
+use pour::Pour;
+
+/// The most pictures of one pose from which the colour is learned. Chosen by hand: as many as a turning background leaves in one pose.
+const PICTURES_OF_A_POSE: usize = 4;
 /// The region's left border, top, right border and bottom from the lip, px of a picture 640 px wide. Chosen by hand; no
 /// measurement is recorded.
 const REGION_PX: [f32; 4] = [-40.0, -236.0, 380.0, 50.0];
@@ -89,103 +93,69 @@ pub fn run(args: &Args) -> Result<(), Failure> {
     calibrate(args, config)
 }
 
-/// What was seen of one pour.
-struct Pour {
-    /// Evenly spread pictures in BGR.
-    pictures: Vec<Mat>,
-    /// The sum of all pictures.
-    sum: Mat,
-    /// Number of all pictures.
-    count: u64,
-    /// Of this many pictures, one is kept.
-    stride: u64,
-}
-
-impl Pour {
-    fn new() -> Self {
-        Self { pictures: Vec::new(), sum: Mat::default(), count: 0, stride: 1 }
-    }
-
-    fn add(&mut self, frame: &Frame) -> Result<(), String> {
-        let words = |e: opencv::Error| e.message;
-        let bgr = to_bgr(frame).map_err(words)?;
-        if self.count == 0 {
-            self.sum = Mat::new_rows_cols_with_default(bgr.rows(), bgr.cols(), CV_32FC3, Scalar::default()).map_err(words)?;
-        } else if self.sum.size().map_err(words)? != bgr.size().map_err(words)? {
-            return Err(format!("frame {} has another size than those before; all must come from one camera", self.count + 1));
-        }
-        imgproc::accumulate(&bgr, &mut self.sum, &core::no_array()).map_err(words)?;
-        if self.count.is_multiple_of(self.stride) {
-            self.pictures.push(bgr);
-        }
-        if self.pictures.len() > KEEP_PICTURES {
-            // Every second picture is dropped, and from now on half as many are kept.
-            let mut index = 0;
-            self.pictures.retain(|_| {
-                index += 1;
-                index % 2 == 1
-            });
-            self.stride *= 2;
-        }
-        self.count += 1;
-        Ok(())
-    }
-
-    /// The corner in the mean of all pictures.
-    fn corner(&self) -> Result<Corner, AxesError> {
-        let mut mean = Mat::default();
-        self.sum.convert_to(&mut mean, CV_8U, 1.0 / self.count as f64, 0.0)?;
-        find_corner(&mean)
-    }
+/// A table that passed all checks.
+struct Proposal {
+    image: ImageConfig,
+    /// What was seen, a line each.
+    remarks: Vec<String>,
 }
 
 fn calibrate(args: &Args, mut config: Config) -> Result<(), Failure> {
     let bad = |e: String| failure(exit::BAD_INPUT, e);
-    let mut pour = Pour::new();
-    if args.input.is_empty() {
-        watch(args, &config, &mut pour)?;
+    let pour = if args.input.is_empty() {
+        watch(args, &config)?
     } else {
-        let contents = for_each_frame(&args.input, config.camera.fps, args.partial, |frame| pour.add(&frame)).map_err(bad)?;
-        contents.missing.iter().for_each(|line| eprintln!("calibrate: {line}"));
-    }
+        let (pour, missing) = Pour::read(&args.input, config.camera.fps, args.partial).map_err(bad)?;
+        missing.iter().for_each(|line| eprintln!("calibrate: {line}"));
+        pour
+    };
     let Some(first) = pour.pictures.first() else { return Err(bad("there is no frame in the input; show one whole pour".into())) };
     (config.camera.width_px, config.camera.height_px) = (first.cols() as u32, first.rows() as u32);
-    let method = match args.method.as_deref() {
+    config.image.method = match args.method.as_deref() {
         Some("clear") => LiquidMethod::Clear,
         Some(_) => LiquidMethod::Colour,
         None => config.image.method,
     };
+    checks::moves(&pour).map_err(|e| failure(exit::FAILED, e))?;
     let corner = choose_corner(args, &pour, [first.cols() as f32, first.rows() as f32])?;
-    match propose(&config.camera, corner, method, &config.image, &pour.pictures) {
-        Ok(image) => config.image = image,
+    let proposal = match propose(&config, corner, &pour) {
+        Ok(proposal) => Some(proposal),
         // In the page the corner can still be corrected.
-        Err(e) if args.page => eprintln!("calibrate: {e}"),
+        Err(e) if args.page => {
+            eprintln!("calibrate: {e}");
+            None
+        }
         Err(e) => return Err(failure(exit::FAILED, e)),
+    };
+    if let Some(Proposal { image, remarks }) = &proposal {
+        config.image = image.clone();
+        save_picture(args, &config, &pour.pictures)?;
+        println!("{}", section::text(&config.image));
+        remarks.iter().for_each(|line| eprintln!("calibrate: {line}"));
+        eprintln!("calibrate: look at {}", args.picture.display());
+        if args.write {
+            section::write(&args.config, &config)?;
+        }
     }
-    save_picture(args, &config, &pour.pictures)?;
-    println!("{}", section::text(&config.image));
-    eprintln!("calibrate: look at {}", args.picture.display());
-    if args.write {
-        section::write(&args.config, &config)?;
-    }
-    if args.page { serve(args, config, corner, &pour.pictures) } else { Ok(()) }
+    if args.page { serve(args, config, corner, &pour, proposal.is_some()) } else { Ok(()) }
 }
 
 /// Watches the configured camera for a while.
-fn watch(args: &Args, config: &Config, pour: &mut Pour) -> Result<(), Failure> {
+fn watch(args: &Args, config: &Config) -> Result<Pour, Failure> {
     let reach = |e: String| failure(exit::UNREACHABLE, e);
     let cell = Cell::join(&config.cell).or_exit(exit::UNREACHABLE)?;
-    let mut source = ObserverSource::open(&config.camera, &cell).or_exit(exit::UNREACHABLE)?;
+    let mut source = ObserverSource::open(&config.camera, &cell).map_err(|e| failure(e.exit_code(), e))?;
     eprintln!("calibrate: watching the camera for {} s; pour once now", args.seconds);
     let end = Instant::now() + Duration::from_secs(args.seconds);
-    while Instant::now() < end {
+    let mut pour = Pour::live();
+    while Instant::now() < end && !pour.is_full() {
         match source.next_frame(WAIT).or_exit(exit::UNREACHABLE)? {
             NextFrame::Frame(frame) => pour.add(&frame).map_err(reach)?,
             NextFrame::Nothing => {}
             NextFrame::End => break,
         }
     }
-    if pour.count == 0 { Err(reach("no frame came from the camera; is its driver running?".into())) } else { Ok(()) }
+    if pour.count == 0 { Err(reach("no frame came from the camera; is its driver running?".into())) } else { Ok(pour) }
 }
 
 /// The corner. What the command line leaves open is found in the pictures, which are `width` by `height` px.
@@ -193,7 +163,8 @@ fn choose_corner(args: &Args, pour: &Pour, [width, height]: [f32; 2]) -> Result<
     if let (Some(lip), Some(rim), Some(foot)) = (args.lip, args.x_axis, args.y_axis) {
         return Ok(Corner { lip, rim, foot });
     }
-    match pour.corner() {
+    let found = pour.poses().map_err(AxesError::from).and_then(|(_, _, mean)| find_corner(&mean));
+    match found {
         Ok(found) => Ok(Corner {
             lip: args.lip.unwrap_or(found.lip),
             rim: args.x_axis.unwrap_or(found.rim),
@@ -208,35 +179,39 @@ fn choose_corner(args: &Args, pour: &Pour, [width, height]: [f32; 2]) -> Result<
     }
 }
 
-/// The `[image]` table for a corner: the region over the mouth, the axes, and the colour learned from the pictures.
-fn propose(
-    camera: &CameraConfig,
-    corner: Corner,
-    method: LiquidMethod,
-    before: &ImageConfig,
-    pictures: &[Mat],
-) -> Result<ImageConfig, ColourError> {
+/// The `[image]` table for a corner, after all checks: the region over the mouth, the axes, and the colour learned from the pictures.
+fn propose(config: &Config, corner: Corner, pour: &Pour) -> Result<Proposal, String> {
+    let mut remarks = Vec::new();
+    let camera = &config.camera;
+    let (poses, chosen, mean) = pour.poses().map_err(|e| e.message)?;
+    remarks.extend(checks::axes_stay(&corner, &chosen, &mean)?);
+    let mut image = table(camera, corner, &config.image);
+    if image.method == LiquidMethod::Colour {
+        let mut learner = ColourLearner::new(Axes::new(&image));
+        let words = |e: ColourError| e.to_string();
+        // The background of a pose in which the container rests must not be taken for something that stays at the lip.
+        poses.balanced(PICTURES_OF_A_POSE).into_iter().try_for_each(|i| learner.add(&pour.pictures[i])).map_err(words)?;
+        image.colour_hsv = learner.range().map_err(words)?;
+        remarks.push(checks::background_differs(learner.near_background(image.colour_hsv))?);
+    }
+    remarks.push(checks::something_flows(pour, camera, &image)?);
+    Ok(Proposal { image, remarks })
+}
+
+/// The `[image]` table for a corner, without the colour.
+fn table(camera: &CameraConfig, corner: Corner, before: &ImageConfig) -> ImageConfig {
     let scale = camera.width_px as f32 / 640.0;
     let [x, y] = corner.lip;
     let clamp = |v: f32, most: u32| v.clamp(0.0, most as f32) as u32;
     let [left, top, right, bottom] = REGION_PX.map(|v| v * scale);
     let (left, top) = (clamp(x + left, camera.width_px), clamp(y + top, camera.height_px));
     let (right, bottom) = (clamp(x + right, camera.width_px), clamp(y + bottom, camera.height_px));
-    let mut image = ImageConfig {
-        method,
+    ImageConfig {
         region_px: [left, top, right.saturating_sub(left), bottom.saturating_sub(top)],
         x_axis_px: [x, y, corner.rim[0], corner.rim[1]],
         y_axis_px: [corner.foot[0], corner.foot[1], x, y],
         ..before.clone()
-    };
-    if method == LiquidMethod::Colour {
-        let mut learner = ColourLearner::new(Axes::new(&image));
-        for picture in pictures {
-            learner.add(picture)?;
-        }
-        image.colour_hsv = learner.range()?;
     }
-    Ok(image)
 }
 
 /// The picture with most flow, with what is measured drawn on it.
@@ -266,10 +241,11 @@ fn save_picture(args: &Args, config: &Config, pictures: &[Mat]) -> Result<(), Fa
     if written { Ok(()) } else { Err(fail("cannot be written; give another --picture".into())) }
 }
 
-/// Serves the page until "Write" or Ctrl-C.
-fn serve(args: &Args, mut config: Config, mut corner: Corner, pictures: &[Mat]) -> Result<(), Failure> {
+/// Serves the page until "Write" or Ctrl-C. `good` tells whether `config` passed all checks; nothing else is written.
+fn serve(args: &Args, mut config: Config, mut corner: Corner, pour: &Pour, mut good: bool) -> Result<(), Failure> {
     let stop = os::stop_at_signals().or_exit(exit::FAILED)?;
     let server = Page::open(args.port)?;
+    let pictures = &pour.pictures;
     eprintln!("calibrate: open {} on this machine, click lip, top edge and left side, then Write", server.address());
     server.serve(&stop, |path, body| match path {
         "/" => page::html(include_str!("calibrate.html")),
@@ -279,13 +255,16 @@ fn serve(args: &Args, mut config: Config, mut corner: Corner, pictures: &[Mat]) 
         }
         "/state.json" => page::json(&serde_json::json!({ "width": config.camera.width_px, "height": config.camera.height_px,
             "lip": corner.lip, "rim": corner.rim, "foot": corner.foot, "section": section::text(&config.image) })),
-        "/corner" => page::text(match try_corner(&config, body, pictures) {
-            Ok((tried, clicked)) => {
-                (config, corner) = (tried, clicked);
-                "measured again".into()
+        "/corner" => page::text(match try_corner(&config, body, pour) {
+            Ok((tried, clicked, remarks)) => {
+                (config, corner, good) = (tried, clicked, true);
+                format!("measured again: {}", remarks.join("; "))
             }
             Err(e) => e,
         }),
+        "/write" if !good => {
+            page::text("nothing is written: no corner has passed the checks yet; click lip, top edge and left side".into())
+        }
         "/write" => {
             let result = save_picture(args, &config, pictures).and_then(|()| section::write(&args.config, &config));
             stop.store(result.is_ok(), Relaxed);
@@ -296,11 +275,9 @@ fn serve(args: &Args, mut config: Config, mut corner: Corner, pictures: &[Mat]) 
     Ok(())
 }
 
-/// The configuration for a corner that was clicked, if something can be measured with it.
-fn try_corner(config: &Config, clicked: &str, pictures: &[Mat]) -> Result<(Config, Corner), String> {
+/// The configuration for a corner that was clicked, if it passes all checks, and what was seen.
+fn try_corner(config: &Config, clicked: &str, pour: &Pour) -> Result<(Config, Corner, Vec<String>), String> {
     let corner = serde_json::from_str::<Corner>(clicked).map_err(|e| e.to_string())?;
-    let image = propose(&config.camera, corner, config.image.method, &config.image, pictures).map_err(|e| e.to_string())?;
-    let tried = Config { image, ..config.clone() };
-    best_picture(&tried, pictures)?;
-    Ok((tried, corner))
+    let Proposal { image, remarks } = propose(config, corner, pour)?;
+    Ok((Config { image, ..config.clone() }, corner, remarks))
 }

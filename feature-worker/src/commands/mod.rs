@@ -2,6 +2,7 @@
 
 pub mod bench;
 pub mod calibrate;
+pub mod camera;
 pub mod episodes;
 pub mod inspect;
 mod page;

@@ -14,7 +14,7 @@ use std::sync::{Mutex, MutexGuard, PoisonError};
 
 use opencv::core::Mat;
 use shared::config::Config;
-use shared::exit::{self, Failure, OrExit as _};
+use shared::exit::{self, Failure, OrExit as _, failure};
 use shared::ipc::Cell;
 use shared::messages::PixelFormat;
 use shared::os;
@@ -81,7 +81,7 @@ fn view(args: &Args, config: &Config) -> Result<(), Failure> {
     opencv::core::set_num_threads(1).or_exit(exit::FAILED)?;
     let extractor = Extractor::new(&config.camera, &config.image).or_exit(exit::BAD_INPUT)?;
     let cell = Cell::join(&config.cell).or_exit(exit::UNREACHABLE)?;
-    let source = ObserverSource::open(&config.camera, &cell).or_exit(exit::UNREACHABLE)?;
+    let source = ObserverSource::open(&config.camera, &cell).map_err(|e| failure(e.exit_code(), e))?;
     let server = Page::open(args.port)?;
     println!("{}", server.address());
     let shown = Mutex::new(Shown::default());

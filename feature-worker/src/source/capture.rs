@@ -3,15 +3,18 @@
 //! Called from the thread that measures. OpenCV decodes into one matrix that is reused. A device is read at the size and the rate that
 //! are configured, or it is refused.
 
+use std::path::Path;
 use std::time::Duration;
 
 use opencv::core::{CV_8UC1, CV_8UC3, Mat};
 use opencv::prelude::*;
 use opencv::videoio::{self, VideoCapture};
-use shared::config::CameraConfig;
+use shared::config::{CameraConfig, Refused};
 use shared::messages::{FrameHeader, LAYOUT_VERSION, PixelFormat};
 use shared::os;
 
+use super::controls;
+use super::devices::{self, Trouble};
 use super::frame::{Frame, FrameSource, NextFrame, SourceError};
 use super::numbering::Numbering;
 
@@ -60,19 +63,27 @@ impl Capture {
     /// Opens the device that `[camera]` names.
     pub fn open(camera: &CameraConfig) -> Result<Self, SourceError> {
         let fail = |what: &str| SourceError::Open { path: camera.path.clone(), what: what.into() };
-        if !std::path::Path::new(&camera.path).exists() {
-            return Err(fail("no such device; see `ls /dev/v4l/by-id`"));
-        }
+        // Before OpenCV, which does not tell why it cannot open a device.
+        let mut device = devices::open(Path::new(&camera.path))?;
         let opened = VideoCapture::from_file(&camera.path, videoio::CAP_V4L2);
         let mut capture = opened.map_err(|e| fail(&format!("cannot be opened: {}", e.message)))?;
         if !capture.is_opened()? {
-            return Err(SourceError::Busy(camera.path.clone()));
+            return Err(devices::error_of(Path::new("/"), Path::new(&camera.path), Trouble::Busy));
         }
         // OpenCV takes raw pictures where it can. Many cameras give a large size at the full rate only as MJPEG.
         if let Err(raw) = set_mode(&mut capture, camera) {
             let mjpeg = videoio::VideoWriter::fourcc('M', 'J', 'P', 'G')?;
             let _ = capture.set(videoio::CAP_PROP_FOURCC, f64::from(mjpeg))?;
             set_mode(&mut capture, camera).map_err(|_| raw)?;
+        }
+        // After the mode: some drivers start anew with it.
+        let outcome = controls::apply(&mut device, camera);
+        outcome.said.iter().for_each(|line| eprintln!("camera: {line}"));
+        if !outcome.refused.is_empty() {
+            match camera.refused {
+                Refused::Error => return Err(SourceError::Refused(outcome.refused.join("; "))),
+                Refused::Warning => outcome.refused.iter().for_each(|line| eprintln!("camera: warning: {line}")),
+            }
         }
         let numbering = Numbering::new(camera.fps, os::now_ns());
         Ok(Self { capture, path: camera.path.clone(), picture: Mat::default(), numbering })

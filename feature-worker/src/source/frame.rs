@@ -35,9 +35,38 @@ pub enum SourceError {
         /// What is wrong and what to do.
         what: String,
     },
-    /// The device is there but cannot be used.
-    #[error("camera.path = \"{0}\": cannot be opened; does another program use it, and may this user read it (group 'video')?")]
-    Busy(String),
+    /// There is no such device.
+    #[error(
+        "camera.path = \"{0}\": no such device; is it unplugged? `feature-worker camera` lists what there is, and /dev/v4l/by-id lasts"
+    )]
+    Missing(String),
+    /// This user may not open the device.
+    #[error(
+        "camera.path = \"{path}\": permission denied; it belongs to group '{group}': run `sudo usermod -aG {group} $USER`, then log in again"
+    )]
+    Permission {
+        /// `[camera] path`.
+        path: String,
+        /// The group that may open it.
+        group: String,
+    },
+    /// Another program uses the device.
+    #[error("camera.path = \"{path}\": cannot be opened; does another program use it? {users}")]
+    Busy {
+        /// `[camera] path`.
+        path: String,
+        /// The programs that have it open, as far as this user sees them.
+        users: String,
+    },
+    /// The node gives a camera's metadata and no pictures.
+    #[error("camera.path = \"{0}\": this is the camera's metadata node and has no pictures; `feature-worker camera` shows the other one")]
+    Metadata(String),
+    /// The file is no device that gives pictures.
+    #[error("camera.path = \"{0}\": this is no camera; `feature-worker camera` lists what there is")]
+    NotACamera(String),
+    /// The device refuses settings.
+    #[error("{0}; correct it, leave the key out, or write camera.refused = \"warning\"")]
+    Refused(String),
     /// The device does not have the configured size.
     #[error(
         "camera.width_px, camera.height_px = {} x {}: the camera gives {} x {} instead; write these and calibrate, or choose a size of \
@@ -97,7 +126,7 @@ impl SourceError {
     /// The exit code that fits: bad input where a person must change something, else unreachable.
     pub fn exit_code(&self) -> u8 {
         match self {
-            Self::Lost(_) | Self::Ipc(_) | Self::Broken(_) | Self::OpenCv(_) => exit::UNREACHABLE,
+            Self::Missing(_) | Self::Busy { .. } | Self::Lost(_) | Self::Ipc(_) | Self::Broken(_) | Self::OpenCv(_) => exit::UNREACHABLE,
             _ => exit::BAD_INPUT,
         }
     }

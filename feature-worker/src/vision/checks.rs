@@ -40,14 +40,17 @@ const RIM_SEEN: usize = 5;
 /// A rim of this width is blurred, px; the width is the change of brightness over its steepest step. Tuned as [`RIM_CONTRAST`] was; a
 /// blurred edge of deviation s is 2.5 s wide.
 const RIM_BLURRED_PX: f32 = 5.6;
+/// A rim of this width is blurred at the first sight, px; a narrower one has to be blurred in two pictures in a row, because noise and a
+/// background in motion make single pictures look soft. Chosen by hand; tried on the same seeds.
+const RIM_SURELY_BLURRED_PX: f32 = 6.4;
 
 /// Checks the light, and that the picture is not the same as the last one.
 #[derive(Default)]
 pub(crate) struct LightCheck {
     /// Hash of the last picture's bytes; `None` before the first picture.
     last_hash: Option<u64>,
-    /// Mean grey level of the last picture.
-    mean_level: f32,
+    /// Mean levels of blue, green and red in the last picture.
+    mean_bgr: [f32; 3],
 }
 
 impl LightCheck {
@@ -60,14 +63,14 @@ impl LightCheck {
             hash = (hash ^ word).wrapping_mul(0x9e37_79b9_7f4a_7c15).rotate_left(29);
         }
         let repeated = self.last_hash.replace(hash) == Some(hash);
-        let (mut sum, mut saturated, mut count) = (0u64, 0u32, 0u32);
+        let (mut sums, mut saturated, mut count) = ([0u32; 3], 0u32, 0u32);
         for pixel in bytes.chunks_exact(3).step_by(LIGHT_EVERY) {
-            sum += u64::from(pixel[0]) + u64::from(pixel[1]) + u64::from(pixel[2]);
+            (0..3).for_each(|k| sums[k] += u32::from(pixel[k]));
             saturated += u32::from(pixel.iter().all(|v| *v >= SATURATED_LEVEL));
             count += 1;
         }
-        self.mean_level = sum as f32 / (3.0 * count.max(1) as f32);
-        if self.mean_level < DARK_LEVEL {
+        self.mean_bgr = sums.map(|sum| sum as f32 / count.max(1) as f32);
+        if self.mean_level() < DARK_LEVEL {
             Some(Doubt::TooDark)
         } else if saturated as f32 > BLOWN_SHARE * count as f32 {
             Some(Doubt::BlownOut)
@@ -80,7 +83,12 @@ impl LightCheck {
 
     /// Mean grey level of the picture that was checked last.
     pub(crate) fn mean_level(&self) -> f32 {
-        self.mean_level
+        self.mean_bgr.iter().sum::<f32>() / 3.0
+    }
+
+    /// Mean levels of blue, green and red in the picture that was checked last.
+    pub(crate) fn mean_bgr(&self) -> [f32; 3] {
+        self.mean_bgr
     }
 }
 
@@ -90,12 +98,14 @@ pub(crate) struct RimCheck {
     axes: Axes,
     /// Width of the rim in each bundle that shows it, px. Kept from frame to frame.
     widths_px: Vec<f32>,
+    /// Whether the last picture that was judged looked blurred; true before the first.
+    looked_blurred: bool,
 }
 
 impl RimCheck {
     /// A check for these axes, relative to the region.
     pub(crate) fn new(axes: Axes) -> Self {
-        Self { axes, widths_px: Vec::with_capacity(2 * RIM_BUNDLES) }
+        Self { axes, widths_px: Vec::with_capacity(2 * RIM_BUNDLES), looked_blurred: true }
     }
 
     /// Whether the rim has lost its sharp edges. False when it is not seen well enough to tell: the glass is as bright as what is
@@ -128,7 +138,10 @@ impl RimCheck {
         }
         // What stands behind the rim is out of focus too, so the sharper bundles decide.
         let sharper = self.widths_px.len() / 4;
-        self.widths_px.len() >= RIM_SEEN && *self.widths_px.select_nth_unstable_by(sharper, f32::total_cmp).1 > RIM_BLURRED_PX
+        let seen = self.widths_px.len() >= RIM_SEEN;
+        let width_px = if seen { *self.widths_px.select_nth_unstable_by(sharper, f32::total_cmp).1 } else { 0.0 };
+        let looked_blurred = std::mem::replace(&mut self.looked_blurred, width_px > RIM_BLURRED_PX);
+        width_px > RIM_SURELY_BLURRED_PX || (looked_blurred && width_px > RIM_BLURRED_PX)
     }
 }
 

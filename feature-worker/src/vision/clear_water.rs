@@ -4,13 +4,14 @@
 //! background is displaced. The container turns, so the background moves in the picture as one rigid piece, while the stream's outline
 //! stays. So the picture is made small (320 px for the whole width), and in each frame:
 //!
-//! 1. [`background`] remembers the dry background as one picture that is fixed in the world, and finds how it lies in the camera's picture
+//! 1. [`light`] divides out what bands and colours of the light differ from those on the remembered ground.
+//! 2. [`background`] remembers the dry background as one picture that is fixed in the world, and finds how it lies in the camera's picture
 //!    ([`motion`], [`rigid`]; [`follow`] is the inner loop of remembering).
-//! 2. [`evidence`] compares the memory and an earlier picture, both moved, with the picture along [`rays`] from the lip. What differs from
+//! 3. [`evidence`] compares the memory and an earlier picture, both moved, with the picture along [`rays`] from the lip. What differs from
 //!    the memory is wet. Where the ground was hidden until now, or is as bright as the water's rim, a step in colour counts that the
 //!    earlier picture, moved, does not explain.
-//! 3. [`lines`] finds the line from axis to axis with the best evidence, and [`water`] decides whether it is a stream.
-//! 4. The full picture's profiles across that line must confirm it.
+//! 4. [`lines`] finds the line from axis to axis with the best evidence, and [`water`] decides whether it is a stream.
+//! 5. The full picture's profiles across that line must confirm it.
 //!
 //! The first frame must be dry, and frames must follow each other. Called on the extraction thread. All pictures and tables are kept, so
 //! nothing is allocated after the second frame. The only failures are OpenCV's.
@@ -18,6 +19,7 @@
 mod background;
 mod evidence;
 mod follow;
+mod light;
 mod lines;
 mod motion;
 mod rays;
@@ -31,9 +33,11 @@ use shared::messages::{Doubt, PixelFormat};
 
 use self::background::{Background, DryPlaces, WetPlaces};
 use self::evidence::{CALM, Evidence};
+use self::light::Light;
 use self::lines::Lines;
 use self::rays::{RIM_PX, Rays};
 use self::water::{Verdict, Water};
+use super::confidence::Basis;
 use super::geometry::{Axes, LinearField};
 use super::liquid::{FineLine, LineRules, Liquid, PROFILE_SAMPLES, Profile, ProfileEdge, REACH, Sighting};
 
@@ -73,6 +77,7 @@ pub(crate) struct ClearWater {
     rays: Rays,
     lines: Lines,
     background: Background,
+    light: Light,
     evidence: Evidence,
     water: Water,
     // Pictures, kept from frame to frame.
@@ -100,6 +105,7 @@ impl ClearWater {
             axes,
             lines: Lines::new(axes, &rays, size),
             background: Background::new(size)?,
+            light: Light::new(size),
             evidence: Evidence::new(&rays, size)?,
             rays,
             water: Water::new(),
@@ -139,7 +145,12 @@ impl ClearWater {
                 let line_share = self.line_share(s.legs_px.map(|v| v + KEEP_AWAY_PX));
                 WetPlaces { line_share, right_px: self.right_px() }
             });
+            // An even ground tells the light wherever it lies. A pattern tells it where it was found.
+            let told = self.light.divide_out(&mut self.now, &self.background, height_px, wet)?;
             self.background.register(&self.now, height_px, wet)?;
+            if !told {
+                self.light.divide_out(&mut self.now, &self.background, height_px, wet)?;
+            }
             self.evidence.compare(&self.rays, &self.now, &self.earlier, &self.background, height_px)?;
             let moved = self.background.moved();
             self.evidence.weigh(&self.rays, &moved, self.water.stream())?;
@@ -153,6 +164,7 @@ impl ClearWater {
                     self.lines.edges(found.line, &self.evidence, &self.rays, |v| (v + 0.5) * scale - 0.5, edges_px);
                     Sighting::Stream { seen_share: found.edge_share.min(1.0), doubt: Doubt::None }
                 }
+                _ if self.light.flickers() => Sighting::Unsure(Doubt::LightFlickers),
                 (Verdict::Unsure, _) => Sighting::Unsure(Doubt::EdgeNotFound),
                 _ => sighting,
             };
@@ -257,6 +269,14 @@ impl Liquid for ClearWater {
         pulp::Arch::new().dispatch(|| self.look_for_stream(edges_px))
     }
 
+    fn basis(&self) -> Basis {
+        if self.evidence.even() { Basis::EvenGround } else { Basis::Pattern }
+    }
+
+    fn ground_bgr(&self) -> Option<[f32; 3]> {
+        None
+    }
+
     fn dry_share(&self, legs_px: [f32; 2]) -> f32 {
         self.evidence.dry_share(&self.rays, self.line_share(legs_px.map(|v| v / self.scale)))
     }
@@ -266,7 +286,8 @@ impl Liquid for ClearWater {
         for (j, (differs, seen)) in differs.iter_mut().zip(&profile.colours).enumerate() {
             let place = profile.place_px(j as f32).map(|v| small(v, self.scale));
             let Some(dry) = self.background.dry_at(place) else { return edge_on_unknown_ground(profile) };
-            *differs = std::array::from_fn(|c| seen[c] - dry[c]);
+            let gains = self.light.gains(place[1]);
+            *differs = std::array::from_fn(|c| seen[c] / gains[c] - dry[c]);
         }
         self.edge_on_known_ground(profile, &differs)
     }

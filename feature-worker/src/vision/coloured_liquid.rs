@@ -17,8 +17,11 @@ use opencv::prelude::*;
 use shared::config::ImageConfig;
 use shared::messages::{Doubt, PixelFormat};
 
+use super::confidence::Basis;
 use super::geometry::{Axes, Line, NEAR_PX, RAYS, RayGrid, distance};
+use super::ground_beside::GroundBeside;
 use super::ground_colours::{Ground, GroundColours};
+use super::hues::ranges;
 use super::liquid::{FineLine, LineRules, Liquid, PROFILE_SAMPLES, Profile, ProfileEdge, REACH, Sighting};
 
 // "Tuned" below means that the value was tuned on seeds 1 and 5001 to 5003 of `evaluate-camera`; see docs/VISION.md.
@@ -44,13 +47,6 @@ const LEAVES_SHARE: f32 = 0.06;
 const SMOOTH: i32 = 5;
 /// There is no line when a smaller share of the profiles than this shows an edge. Tuned.
 const PROFILES_LEAST: f32 = 0.3;
-/// A colour whose brightest part reaches this may be one whose brightest part is cut off, grey levels. Chosen by hand: a little below 255,
-/// because samples are smoothed.
-const CUT_OFF_LEVEL: f64 = 240.0;
-/// A hue this near to that of red, green or blue may move to either side of it, in OpenCV's degrees of 2. Chosen by hand.
-const AT_PRIMARY: f64 = 5.0;
-/// Hues from a primary colour to the mixed ones beside it, in OpenCV's degrees of 2.
-const PRIMARY_TO_MIXED: f64 = 30.0;
 /// The ground is learned from samples at least this far from the lip, px, once it was seen dry for [`DRY_FRAMES`]: nearer, a stream
 /// begins. Chosen by hand.
 const LEARN_FROM_PX: f32 = 48.0;
@@ -58,10 +54,20 @@ const LEARN_FROM_PX: f32 = 48.0;
 const DRY_FRAMES: u32 = 10;
 /// Of this many samples, the ground is learned from one a frame, a different one each time. Chosen by hand, for speed.
 const LEARN_EVERY: usize = 7;
+/// Of this many samples far from the lip, one is looked at for the picture's brightness. Chosen by hand, for speed.
+const EXPOSURE_EVERY: usize = 12;
 /// The ground is learned this many samples beyond the liquid: between, both mix. Chosen by hand.
 const LEARN_BEYOND: usize = 6;
-/// A body at the lip is looked for up to this distance, px. Chosen by hand: one of 200 px^2 is 13 px long on the mean ray.
-const BODY_REACH_PX: f32 = 64.0;
+/// This close to the lip a stream begins, px. Chosen by hand.
+const AT_LIP_PX: f32 = 12.0;
+/// The ground is learned beside the container while no more than this share of what is at the lip is foreign or liquid. Chosen by hand.
+const QUIET_SHARE: f32 = 0.3;
+/// A lamp's reflection hides the lip when this share of what is there is white light. Chosen by hand.
+const BLIND_SHARE: f32 = 0.5;
+/// Once it does, it still does while this share is white light, because a stream is darker. Chosen by hand.
+const STILL_BLIND_SHARE: f32 = 0.08;
+/// And so many pictures more. Chosen by hand: a third of a second.
+const BLIND_PICTURES: u32 = 10;
 /// Least share of the rays that a body at the lip fills. Tuned.
 const BODY_RAYS: f32 = 0.7;
 /// Least mean length of a body at the lip, px: a bead is shorter. Tuned.
@@ -104,9 +110,13 @@ pub(crate) struct ColouredLiquid {
     /// A smaller triangle is no stream, px^2.
     area_min_px2: f32,
     ground: GroundColours,
+    /// Its mean levels of blue, green and red, far from the lip in the last picture.
+    ground_bgr: Option<[f32; 3]>,
     /// Frames that were taken, and those of them without a stream.
     frames: usize,
     dry_frames: u32,
+    /// For how many pictures a lamp's reflection still counts as hiding the lip.
+    blind_pictures: u32,
     /// Number of samples on each ray up to the end of the liquid, or of a body at the lip, in the last picture.
     ends: [usize; RAYS],
     // Pictures along the rays, one ray a row, kept from frame to frame.
@@ -120,35 +130,8 @@ pub(crate) struct ColouredLiquid {
     mask: Mat,
     /// The mask of one range of hues.
     half_mask: Mat,
-}
-
-/// The ranges of hue, saturation and value that are the liquid: its own, and what its colours become when their brightest part is cut off.
-/// The hue then moves away from that part's own, as far as that of the mixed colour beside it.
-fn ranges([h0, s0, v0, h1, s1, v1]: [f64; 6]) -> Vec<(Scalar, Scalar)> {
-    let width = (h1 - h0).rem_euclid(180.0);
-    let middle = h0 + 0.5 * width;
-    // The hues of red, green and blue are 0, 60 and 120.
-    let primary = (middle / 60.0).round() * 60.0;
-    let (below, above) = (primary - PRIMARY_TO_MIXED, primary + PRIMARY_TO_MIXED);
-    let mut hues = vec![(h0, h0 + width, v0)];
-    // A liquid that is not red, green or blue itself moves to one side only.
-    if middle >= primary - AT_PRIMARY && above > h0 + width {
-        hues.push((middle, above, v0.max(CUT_OFF_LEVEL)));
-    }
-    if middle <= primary + AT_PRIMARY && below < h0 {
-        hues.push((below, middle, v0.max(CUT_OFF_LEVEL)));
-    }
-    let mut all = Vec::new();
-    for (from, to, v) in hues {
-        // Hues wrap around at 180.
-        for turn in [-180.0, 0.0, 180.0] {
-            let (from, to) = ((from + turn).max(0.0), (to + turn).min(179.0));
-            if from <= to {
-                all.push((Scalar::new(from, s0, v, 0.0), Scalar::new(to, s1, if v > v0 { 255.0 } else { v1 }, 0.0)));
-            }
-        }
-    }
-    all
+    /// The ground beside the container.
+    beside: GroundBeside,
 }
 
 impl ColouredLiquid {
@@ -167,6 +150,7 @@ impl ColouredLiquid {
         }
         let (mut map_a, mut map_b) = (Mat::default(), Mat::default());
         imgproc::convert_maps(&map_x, &map_y, &mut map_a, &mut map_b, CV_16SC2, true)?;
+        let beside = GroundBeside::new(&axes, image)?;
         let colour = image.colour_hsv.map(f64::from);
         Ok(Self {
             axes,
@@ -177,14 +161,17 @@ impl ColouredLiquid {
             needs_colour: colour[1] >= COLOURED_FROM,
             area_min_px2: image.area_min_px2,
             ground: GroundColours::new(),
+            ground_bgr: None,
             frames: 0,
             dry_frames: 0,
+            blind_pictures: 0,
             ends: [0; RAYS],
             sampled: Mat::default(),
             smooth: Mat::default(),
             hsv: Mat::default(),
             mask: Mat::default(),
             half_mask: Mat::default(),
+            beside,
         })
     }
 
@@ -237,15 +224,32 @@ impl ColouredLiquid {
         Ok(found as f32 >= GREY_SHARE * looked as f32)
     }
 
+    /// Tells the ground's colours how bright the picture is far from the lip.
+    fn expose(&mut self) -> opencv::Result<()> {
+        let far = self.grid.radii_px.iter().take_while(|r| **r < LEARN_FROM_PX).count();
+        let (mut sums, mut count) = ([0u32; 3], 0u32);
+        for (i, ray) in self.grid.rays.iter().enumerate() {
+            let (mask, colours) = (self.mask.at_row::<u8>(i as i32)?, self.smooth.at_row::<Vec3b>(i as i32)?);
+            for r in (far + i % EXPOSURE_EVERY..ray.samples).step_by(EXPOSURE_EVERY).filter(|r| mask[*r] == 0) {
+                (0..3).for_each(|k| sums[k] += u32::from(colours[r][k]));
+                count += 1;
+            }
+        }
+        if let Some(mean_sum) = sums.iter().sum::<u32>().checked_div(count) {
+            self.ground.expose(mean_sum);
+            self.ground_bgr = Some(sums.map(|sum| sum as f32 / count as f32));
+        }
+        Ok(())
+    }
+
     /// Whether something lies at the lip like a stream and has foreign colours. Writes its ends into `self.ends`.
     fn is_foreign_body(&mut self) -> opencv::Result<bool> {
-        let reach = self.grid.radii_px.iter().take_while(|r| **r <= BODY_REACH_PX).count();
         let (mut filled, mut foreign, mut samples, mut length_px) = (0usize, 0usize, 0usize, 0.0f32);
         for (i, ray) in self.grid.rays.iter().enumerate() {
             let mask = self.mask.at_row::<u8>(i as i32)?;
             let colours = self.smooth.at_row::<Vec3b>(i as i32)?;
             let (mut score, mut best, mut end, mut strange, mut strange_at_end) = (0.0f32, 0.0f32, 0usize, 0usize, 0usize);
-            for r in 0..reach.min(ray.samples) {
+            for r in 0..ray.samples {
                 let step = self.grid.steps_px[r];
                 match if mask[r] != 0 { None } else { Some(self.ground.tell(colours[r].0)) } {
                     None => score += step,
@@ -255,6 +259,8 @@ impl ColouredLiquid {
                 }
                 if score > best {
                     (best, end, strange_at_end) = (score, r + 1, strange);
+                } else if score < -GAP_MOST_PX {
+                    break;
                 }
             }
             if end > 0 && best >= (2.0 * FILLED - 1.0) * (self.grid.radii_px[end - 1] - NEAR_PX).max(1.0) {
@@ -293,6 +299,8 @@ impl ColouredLiquid {
         for (i, ray) in self.grid.rays.iter().enumerate() {
             let from = match self.ends[i] {
                 0 if new => 0,
+                // A ray without an edge may have a stream on it all the same.
+                0 if !dry => continue,
                 end => (end + LEARN_BEYOND).max(far),
             };
             let (mask, colours) = (self.mask.at_row::<u8>(i as i32)?, self.smooth.at_row::<Vec3b>(i as i32)?);
@@ -306,6 +314,44 @@ impl ColouredLiquid {
         }
         self.frames = self.frames.wrapping_add(1);
         Ok(())
+    }
+
+    /// Which shares of what is close to the lip are white light that the ground is not, and foreign colours or liquid.
+    fn at_lip(&self) -> opencv::Result<(f32, f32)> {
+        let near = self.grid.radii_px.iter().take_while(|r| **r <= AT_LIP_PX).count();
+        let (mut blind, mut foreign, mut looked) = (0usize, 0usize, 0usize);
+        for (i, ray) in self.grid.rays.iter().enumerate() {
+            let (mask, colours) = (self.mask.at_row::<u8>(i as i32)?, self.smooth.at_row::<Vec3b>(i as i32)?);
+            for r in 0..near.min(ray.samples) {
+                let ground = self.ground.tell(colours[r].0);
+                looked += 1;
+                blind += usize::from(ground == Ground::Blind);
+                foreign += usize::from(mask[r] != 0 || ground != Ground::Known);
+            }
+        }
+        let share = |part: usize| part as f32 / looked.max(1) as f32;
+        Ok((share(blind), share(foreign)))
+    }
+
+    /// What is at the lip where no stream is seen.
+    fn look_again(&mut self, confidence: f32) -> opencv::Result<Sighting> {
+        let dry = Sighting::Dry { confidence };
+        if self.dry_frames < DRY_FRAMES {
+            return Ok(dry);
+        }
+        let (blind, foreign) = self.at_lip()?;
+        let still = self.blind_pictures > 0 && blind > STILL_BLIND_SHARE;
+        self.blind_pictures = if blind > BLIND_SHARE || still { BLIND_PICTURES } else { self.blind_pictures.saturating_sub(1) };
+        if self.blind_pictures > 0 {
+            return Ok(Sighting::Unsure(Doubt::BlownOut));
+        }
+        if self.is_foreign_body()? {
+            return Ok(Sighting::Unsure(Doubt::ColoursChanged));
+        }
+        if foreign < QUIET_SHARE {
+            self.beside.teach(&mut self.ground, self.frames)?;
+        }
+        Ok(dry)
     }
 
     /// Finds the stream, and writes into `self.ends` where the liquid ends on each ray.
@@ -353,6 +399,7 @@ impl Liquid for ColouredLiquid {
 
     fn take(&mut self, region: &BoxedRef<Mat>) -> opencv::Result<()> {
         let (nearest, border) = (imgproc::INTER_NEAREST, core::BORDER_REPLICATE);
+        self.beside.take(region)?;
         imgproc::remap(region, &mut self.sampled, &self.map_a, &self.map_b, nearest, border, Scalar::default())
     }
 
@@ -365,15 +412,29 @@ impl Liquid for ColouredLiquid {
             return Ok(Sighting::Unsure(Doubt::ColoursChanged));
         }
         self.segment()?;
+        self.expose()?;
         let sighting = match self.find_stream(edges_px)? {
-            Sighting::Dry { .. } if self.dry_frames > 0 && self.is_foreign_body()? => Sighting::Unsure(Doubt::ColoursChanged),
-            Sighting::Stream { seen_share, doubt: Doubt::None } if self.dry_frames > 0 && self.goes_on_beyond_its_edge()? => {
+            Sighting::Dry { confidence } => self.look_again(confidence)?,
+            Sighting::Stream { seen_share, doubt: Doubt::None } if self.dry_frames >= DRY_FRAMES && self.goes_on_beyond_its_edge()? => {
                 Sighting::Stream { seen_share, doubt: Doubt::ColoursChanged }
             }
             other => other,
         };
-        self.learn(matches!(sighting, Sighting::Dry { .. }))?;
+        match sighting {
+            Sighting::Dry { .. } => self.learn(true)?,
+            Sighting::Stream { doubt: Doubt::None, .. } => self.learn(false)?,
+            // What may be liquid must not be taken for ground.
+            _ => self.ground.forget(),
+        }
         Ok(sighting)
+    }
+
+    fn basis(&self) -> Basis {
+        Basis::Colour
+    }
+
+    fn ground_bgr(&self) -> Option<[f32; 3]> {
+        self.ground_bgr
     }
 
     fn dry_share(&self, legs_px: [f32; 2]) -> f32 {

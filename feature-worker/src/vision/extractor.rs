@@ -22,6 +22,7 @@ use shared::messages::Doubt;
 use super::checks::{LightCheck, RimCheck};
 use super::clear_water::ClearWater;
 use super::coloured_liquid::ColouredLiquid;
+use super::confidence;
 use super::geometry::{Axes, RayGrid};
 use super::liquid::{Liquid, Sighting};
 use super::measurement::{Measurement, Stages};
@@ -180,11 +181,17 @@ impl Extractor {
         let untold = measured.doubt == Doubt::None && !edge_tells_focus;
         let measured = if untold && self.rim.is_blurred(pixels) { Measurement::nothing(0.0, Doubt::Blurred) } else { measured };
         let seen_dry = measured.doubt == Doubt::None && measured.area_px2 == 0.0;
-        let measured = if seen_dry && !self.presence.is_gone(|legs_px| self.liquid.dry_share(legs_px)) {
+        let measured = if seen_dry && !self.presence.is_gone(self.light_bgr(), |legs_px| self.liquid.dry_share(legs_px)) {
             Measurement::nothing(0.0, Doubt::EdgeNotFound)
         } else {
             measured
         };
+        let confidence = match measured.doubt {
+            _ if measured.area_px2 > 0.0 => confidence::of_stream(self.liquid.basis(), measured.confidence),
+            Doubt::None => confidence::of_nothing(measured.confidence),
+            _ => 0.0,
+        };
+        let measured = Measurement { confidence, ..measured };
         let done = Instant::now();
         let ns = |from: Instant, to: Instant| to.duration_since(from).as_nanos() as u64;
         self.stages = Stages {
@@ -194,6 +201,11 @@ impl Extractor {
             line_ns: ns(segmented, done),
         };
         Ok(measured)
+    }
+
+    /// Mean levels of blue, green and red of the ground, or, where they are not known, of the picture.
+    fn light_bgr(&self) -> [f32; 3] {
+        self.liquid.ground_bgr().unwrap_or_else(|| self.light.mean_bgr())
     }
 
     /// The measurement of what the liquid saw.
@@ -224,7 +236,7 @@ impl Extractor {
         let corner = |r: f32, axis: [f32; 2]| self.in_image(self.axes.at(r, axis));
         let ([x0, y0], [x1, y1], [x2, y2]) = (corner(0.0, self.axes.x), corner(a, self.axes.x), corner(b, self.axes.y));
         let doubt = if doubt == Doubt::None && fine.width_px > BLURRED_PX { Doubt::Blurred } else { doubt };
-        self.presence.saw(area_px2, fine.legs_px);
+        self.presence.saw(area_px2, fine.legs_px, self.light_bgr());
         Measurement { area_px2, confidence: fine.confidence, doubt, triangle_px: [x0, y0, x1, y1, x2, y2] }
     }
 }

@@ -1,13 +1,14 @@
 //! The colours of the ground: what a coloured liquid is not, and what must be seen again before a stream counts as gone.
 //!
 //! A liquid whose colour leaves its range is seen as ground by the range alone. So the colours that were seen far from the lip, and near
-//! it while the worker was new, are counted in a table of their shares of blue and red. Brightness does not enter, because exposures
-//! wander; places do not, because the background moves. What is in neither the range nor the table is foreign.
+//! it while the worker was new, are counted in a table of their shares of blue and red and their brightness. Brightness is that against
+//! the present picture's ground, because exposures wander; places do not enter, because the background moves. What is in neither the
+//! range nor the table is foreign.
 //!
 //! Called on the extraction thread; nothing is allocated after the start and nothing fails.
 
 /// Shares of blue and of red that are told apart. Chosen by hand: a step is about what noise and a lamp's tint do.
-const SHARES: usize = 32;
+const SHARES: usize = 64;
 /// Colours darker than this sum of their levels are only noise. Chosen by hand.
 const DARK_SUM: usize = 30;
 /// A colour whose parts reach this is white light and not a colour, grey levels. As in the check of light, a little below 255.
@@ -16,23 +17,18 @@ const BLIND_LEVEL: u8 = 250;
 const SEEN: u16 = 4;
 /// What one sample adds to the colours beside its own.
 const SEEN_BESIDE: u16 = 1;
+/// Shares of blue and red that are told apart.
+const CHROMAS: usize = SHARES * SHARES;
+/// Steps of brightness that are told apart, each by a factor of the root of 2. Chosen by hand, from a sixth of the ground's to three times.
+const STEPS: usize = 8;
 /// From a colour's place to those beside it, as the table wraps around.
-const BESIDE: [usize; 8] = [
-    1,
-    SHARES - 1,
-    SHARES,
-    SHARES + 1,
-    SHARES * SHARES - 1,
-    SHARES * SHARES - SHARES + 1,
-    SHARES * SHARES - SHARES,
-    SHARES * SHARES - SHARES - 1,
-];
-/// A colour with this count is known. Chosen by hand: two samples, or eight of colours beside it.
-const KNOWN: u16 = 8;
+const BESIDE: [usize; 8] = [1, SHARES - 1, SHARES, SHARES + 1, CHROMAS - 1, CHROMAS - SHARES + 1, CHROMAS - SHARES, CHROMAS - SHARES - 1];
+/// A colour with this count is known. Chosen by hand: more samples than a drop in flight has.
+const KNOWN: u16 = 48;
 /// A count does not grow further than this. Chosen by hand, so that what is not seen any more is forgotten within a minute.
 const COUNT_MOST: u16 = 4096;
 /// A count loses this share when its turn comes. Chosen by hand, see [`COUNT_MOST`].
-const FORGETS: u16 = 8;
+const FORGETS: u16 = 4;
 
 /// What a colour is to the ground.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -46,16 +42,20 @@ pub(crate) enum Ground {
 }
 
 /// Where what is too dark to have a colour is counted.
-const DARK: usize = SHARES * SHARES;
+const DARK: usize = CHROMAS * STEPS;
 /// Where white light is counted.
 const WHITE: usize = DARK + 1;
 
 /// The colours of the ground that were seen.
 pub(crate) struct GroundColours {
-    /// A count for each share of blue and share of red, which wraps around; then for dark and white.
-    counts: [u16; SHARES * SHARES + 2],
+    /// A count for each step of brightness, share of blue and share of red; then for dark and white.
+    counts: Vec<u16>,
     /// `SHARES / sum` for each sum of three levels, of which 65536 is 1.
     per_sum: [u32; 766],
+    /// The step of brightness for each sum of three levels in the present picture, times [`CHROMAS`].
+    steps: [u32; 766],
+    /// The sum of three levels for which the steps were made.
+    mean_sum: u32,
     /// Which row of the table is forgotten next.
     turn: usize,
 }
@@ -64,7 +64,24 @@ impl GroundColours {
     /// Nothing was seen yet.
     pub(crate) fn new() -> Self {
         let per_sum = std::array::from_fn(|sum| (SHARES * 65_536 / sum.max(1)) as u32);
-        Self { counts: [0; SHARES * SHARES + 2], per_sum, turn: 0 }
+        let mut new = Self { counts: vec![0; CHROMAS * STEPS + 2], per_sum, steps: [0; 766], mean_sum: 0, turn: 0 };
+        new.expose(384);
+        new
+    }
+
+    /// Says how bright the ground is in the present picture: the mean sum of the three levels.
+    pub(crate) fn expose(&mut self, mean_sum: u32) {
+        if mean_sum.abs_diff(self.mean_sum) * 64 <= self.mean_sum {
+            return;
+        }
+        self.mean_sum = mean_sum;
+        // The middle of the steps is the mean's own brightness.
+        let mut step = 0;
+        for (sum, kept) in self.steps.iter_mut().enumerate() {
+            let limit = f64::from(mean_sum) * 2.0f64.powf(0.5 * (step as f64 + 1.5 - STEPS as f64 * 0.6));
+            step += usize::from(step + 1 < STEPS && sum as f64 >= limit);
+            *kept = (step * CHROMAS) as u32;
+        }
     }
 
     /// Where a colour of blue, green and red is counted.
@@ -77,7 +94,7 @@ impl GroundColours {
         } else if blue.min(green).min(red) >= BLIND_LEVEL {
             WHITE
         } else {
-            share(blue) * SHARES + share(red)
+            self.steps[sum] as usize + share(blue) * SHARES + share(red)
         }
     }
 
@@ -110,16 +127,21 @@ impl GroundColours {
         if place >= DARK {
             return;
         }
-        for beside in BESIDE {
-            let count = &mut self.counts[(place + beside) % (SHARES * SHARES)];
+        let (brightness, chroma) = (place / CHROMAS * CHROMAS, place % CHROMAS);
+        let darker = brightness.checked_sub(CHROMAS).map(|b| b + chroma);
+        let brighter = Some(place + CHROMAS).filter(|p| *p < DARK);
+        let around = BESIDE.iter().map(|beside| brightness + (chroma + beside) % CHROMAS);
+        for place in around.chain(darker).chain(brighter) {
+            let count = &mut self.counts[place];
             *count = (*count + SEEN_BESIDE).min(COUNT_MOST);
         }
     }
 
     /// Forgets a little. Call it once for each picture.
     pub(crate) fn forget(&mut self) {
-        let from = self.turn * SHARES;
-        let to = if self.turn + 1 == SHARES { self.counts.len() } else { from + SHARES };
+        let row = SHARES * STEPS;
+        let from = self.turn * row;
+        let to = if self.turn + 1 == SHARES { self.counts.len() } else { from + row };
         for count in &mut self.counts[from..to] {
             *count -= *count / FORGETS;
         }

@@ -10,6 +10,8 @@ use opencv::imgproc;
 use opencv::prelude::*;
 use serde::Deserialize;
 
+use super::learn_profile::{FINE, Piece, slopes};
+
 // "By hand" below means that the value was chosen by hand and that no measurement is recorded.
 
 /// Gradients above which an edge goes on, and above which one begins (Canny's two thresholds), grey levels. By hand.
@@ -28,8 +30,16 @@ const SLOPE_MOST: f32 = 0.4;
 const GAP_COST: f32 = 2.5;
 /// Largest sum of the two gaps at a corner, as a share of the height. By hand.
 const CORNER_GAP: f32 = 0.15;
-/// The edges of one rim or wall lie no further apart than this to either side, as a share of the height. By hand.
-const RIM_SIDE: f32 = 0.012;
+/// The edges of one rim or wall lie no further apart than this, px of a picture 640 px wide. By hand: a millimetre of glass.
+const RIM_PX: usize = 9;
+/// Least step of an edge of a rim or wall, as a share of its largest one. By hand.
+const RIM_STEP: f32 = 0.35;
+/// A bright or dark line is at most so thick, px of a picture 640 px wide. By hand.
+const LINE_PX: usize = 5;
+/// Least share that the inner step of a line has of its outer one. By hand.
+const LINE_ALIKE: f32 = 0.4;
+/// The part of an axis along which its edge is looked at, as shares of its length. By hand: at the lip, the other axis begins.
+const ALONG: [f32; 2] = [0.1, 1.0];
 
 /// Why the axes are not found.
 #[derive(Debug, thiserror::Error)]
@@ -86,9 +96,11 @@ pub fn find_corner(mean: &Mat) -> Result<Corner, AxesError> {
         }
     }
     let (_, Corner { lip, rim, foot }) = best.ok_or(AxesError::NoCorner)?;
-    // A bright rim or wall has an edge on either side. The axes go through the middle between them.
-    let near = RIM_SIDE * height;
-    let (rim_shift, side_shift) = (shift_to_middle(lip, rim, &level, near), shift_to_middle(lip, foot, &upright, near));
+    let mut grey = Mat::default();
+    imgproc::cvt_color_def(mean, &mut grey, imgproc::COLOR_BGR2GRAY)?;
+    // A rim or a wall has several edges. The axes go along the outermost one.
+    let rim_shift = shift_outwards(&Piece::new(lip, rim, ALONG, foot), &grey)?;
+    let side_shift = shift_outwards(&Piece::new(lip, foot, ALONG, rim), &grey)?;
     let moved = |p: [f32; 2], shifts: &[[f32; 2]]| shifts.iter().fold(p, |p, s| [p[0] + s[0], p[1] + s[1]]);
     Ok(Corner { lip: moved(lip, &[rim_shift, side_shift]), rim: moved(rim, &[rim_shift]), foot: moved(foot, &[side_shift]) })
 }
@@ -120,13 +132,25 @@ fn find_edges(mean: &Mat) -> Result<(Vec<Edge>, Vec<Edge>), AxesError> {
     Ok((level, upright))
 }
 
-/// The shift that brings the line through `from` and `to` to the middle between the outermost of all edges within `near` px of it, square
-/// to the line. So several pieces of one edge count once.
-fn shift_to_middle(from: [f32; 2], to: [f32; 2], edges: &[Edge], near: f32) -> [f32; 2] {
-    let length = (to[0] - from[0]).hypot(to[1] - from[1]);
-    let normal = [-(to[1] - from[1]) / length, (to[0] - from[0]) / length];
-    let offset = |p: [f32; 2]| normal[0] * (p[0] - from[0]) + normal[1] * (p[1] - from[1]);
-    let offsets = edges.iter().map(|e| (offset(e.from), offset(e.to))).filter(|(a, b)| a.abs() < near && b.abs() < near);
-    let (low, high) = offsets.map(|(a, b)| (a + b) / 2.0).fold((0.0f32, 0.0f32), |(low, high), v| (low.min(v), high.max(v)));
-    normal.map(|n| n * (low + high) / 2.0)
+/// The shift that brings a piece of an edge to the outermost edge of its rim or wall: to the middle of a bright or dark line, or to a step.
+fn shift_outwards(piece: &Piece, grey: &Mat) -> opencv::Result<[f32; 2]> {
+    let slopes = slopes(&piece.profile(grey, RIM_PX)?);
+    let most = slopes.iter().fold(0.0f32, |most, v| most.max(v.abs()));
+    // The place of the peak that is outermost of those that are steep enough, and the next one further in.
+    let peaks: Vec<usize> = (1..slopes.len().saturating_sub(1))
+        .rev()
+        .filter(|i| {
+            let [before, here, after] = [slopes[i - 1], slopes[*i], slopes[i + 1]].map(f32::abs);
+            here >= RIM_STEP * most && here > 0.0 && here >= before && here > after
+        })
+        .collect();
+    let Some(outer) = peaks.first().copied() else { return Ok([0.0; 2]) };
+    let line = peaks.get(1).filter(|inner| {
+        let opposite = slopes[outer] * slopes[**inner] < 0.0;
+        opposite && outer - **inner <= LINE_PX * FINE && slopes[**inner].abs() > LINE_ALIKE * slopes[outer].abs()
+    });
+    let place = line.map_or(outer as f32, |inner| (outer + inner) as f32 / 2.0);
+    // The slopes begin one sample after the profile.
+    let distance = ((place + 1.0) / FINE as f32 - RIM_PX as f32) * grey.cols() as f32 / 640.0;
+    Ok(piece.outside.map(|n| n * distance))
 }

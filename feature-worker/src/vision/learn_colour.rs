@@ -15,8 +15,10 @@ use super::geometry::Axes;
 
 /// Number of bins into which hue, saturation and value are divided. Chosen by hand; no measurement is recorded.
 const BINS: [usize; 3] = [18, 8, 8];
-/// The most pixels that are kept of each of the two places. Chosen by hand: about a megabyte.
-const KEEP: usize = 400_000;
+/// Pixels with less saturation have no hue that means anything. Chosen by hand: one bin of saturation.
+const NO_HUE: u8 = 32;
+/// The most pixels that are kept of each of the two places. Chosen by hand: three megabytes.
+const KEEP: usize = 1_000_000;
 /// Pixels nearer to the lip than this are near. Tuned.
 const NEAR_PX: f32 = 20.0;
 /// Pixels further from the lip than this are far. Tuned.
@@ -36,6 +38,21 @@ const BIN_RATIO: f32 = 4.0;
 const LIQUID_SHARE: f32 = 0.1;
 /// Shares of the liquid's pixels between which the range is learned. Tuned.
 const TAILS: [f32; 2] = [0.02, 0.98];
+/// Pixels of a coloured liquid with less than this share of its median saturation are noise of the rim or of the board. By hand: a liquid's
+/// thin edge has more.
+const PALE: f32 = 0.35;
+/// A picture is dry when less than this share of the pixels near the lip is liquid, beside what always is. By hand: a hanging drop covers
+/// less.
+const DRY_NEAR: f32 = 0.1;
+/// The rim's own light is at most this share of the pixels near the lip. By hand.
+const RIM_NEAR: f32 = 0.4;
+/// Background that is this much darker, brighter or paler than the learned colours is close to them, grey levels. By hand: the exposure of
+/// rendered cameras drifts by 5 % and more.
+const CLOSE: u8 = 8;
+/// Highlights are learned when they are at least this share of the near pixels. By hand.
+const HIGHLIGHT_SHARE: f32 = 0.002;
+/// What may be added to the share of dry background inside the colours for the sake of highlights. By hand.
+const HIGHLIGHT_COST: f32 = 0.001;
 /// Grey liquids (milk, or cola in shadow) have no hue: their median saturation is below this. Tuned.
 const GREY_SATURATION: f32 = 45.0;
 /// Grey liquids have no hue: their hues spread over more than this, in OpenCV's half degrees. Tuned.
@@ -71,18 +88,21 @@ type Hsv = [u8; 3];
 struct Pixels {
     /// The pixels, in the order in which they were seen.
     pixels: Vec<Hsv>,
-    /// Their number in each bin.
-    bins: Vec<u32>,
+    /// Their number in each bin, for bins at two places: the second lie half a bin lower, so that no limit between bins tells two like
+    /// pixels apart.
+    bins: [Vec<u32>; 2],
 }
 
 impl Pixels {
     fn new() -> Self {
-        Self { pixels: Vec::new(), bins: vec![0; BINS.iter().product()] }
+        Self { pixels: Vec::new(), bins: std::array::from_fn(|_| vec![0; BINS.iter().map(|b| b + 1).product()]) }
     }
 
     fn add(&mut self, hsv: Hsv) {
         if self.pixels.len() < KEEP {
-            self.bins[bin(hsv)] += 1;
+            for (place, bins) in self.bins.iter_mut().enumerate() {
+                bins[bin(hsv, place)] += 1;
+            }
             self.pixels.push(hsv);
         }
     }
@@ -92,15 +112,17 @@ impl Pixels {
         self.pixels.len().max(1) as f32
     }
 
-    /// Share of the pixels that fall into the same bin.
-    fn share(&self, hsv: Hsv) -> f32 {
-        self.bins[bin(hsv)] as f32 / self.count()
+    /// Share of the pixels that fall into the same bin, for the bins at this place.
+    fn share(&self, hsv: Hsv, place: usize) -> f32 {
+        self.bins[place][bin(hsv, place)] as f32 / self.count()
     }
 }
 
-fn bin([h, s, v]: Hsv) -> usize {
-    let bin = |value: u8, most: usize, bins: usize| usize::from(value) * bins / most;
-    (bin(h, 180, BINS[0]) * BINS[1] + bin(s, 256, BINS[1])) * BINS[2] + bin(v, 256, BINS[2])
+/// The bin of a pixel, for bins at one of two places.
+fn bin([h, s, v]: Hsv, place: usize) -> usize {
+    let bin = |value: u8, most: usize, bins: usize| (2 * usize::from(value) * bins / most + place) / 2;
+    let hue = if s < NO_HUE { 0 } else { bin(h, 180, BINS[0]) % BINS[0] };
+    (hue * (BINS[1] + 1) + bin(s, 256, BINS[1])) * (BINS[2] + 1) + bin(v, 256, BINS[2])
 }
 
 /// Learns the liquid's colour from the pictures of one pour.
@@ -111,8 +133,27 @@ pub struct ColourLearner {
     near: Pixels,
     /// Pixels far from the lip.
     far: Pixels,
+    /// Where the pixels of each picture end in `near` and in `far`.
+    ends: Vec<[usize; 2]>,
     /// The last picture in hue, saturation and value.
     hsv: Mat,
+}
+
+/// The range of a colour: h_min, s_min, v_min, h_max, s_max, v_max.
+type Range = [u8; 6];
+
+/// What of the dry background lies inside a range of colours.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct DryBackground {
+    /// Share of the background's pixels that lie inside, 0 to 1; of all pictures if none is dry.
+    pub inside: f32,
+    /// Share of the pictures in which nothing of these colours is at the lip.
+    pub dry_pictures: f32,
+}
+
+fn contains([h0, s0, v0, h1, s1, v1]: Range, [h, s, v]: Hsv) -> bool {
+    let hue = if h0 <= h1 { (h0..=h1).contains(&h) } else { h >= h0 || h <= h1 };
+    hue && (s0..=s1).contains(&s) && (v0..=v1).contains(&v)
 }
 
 /// The range of one number over the liquid's pixels.
@@ -139,7 +180,7 @@ impl Quantiles {
 impl ColourLearner {
     /// A learner for a container with these axes in the whole picture.
     pub fn new(axes: Axes) -> Self {
-        Self { axes, near: Pixels::new(), far: Pixels::new(), hsv: Mat::default() }
+        Self { axes, near: Pixels::new(), far: Pixels::new(), ends: Vec::new(), hsv: Mat::default() }
     }
 
     /// Adds one BGR picture of the pour, dry ones included.
@@ -162,18 +203,25 @@ impl ColourLearner {
                 if far { self.far.add(hsv) } else { self.near.add(hsv) }
             }
         }
+        self.ends.push([self.near.pixels.len(), self.far.pixels.len()]);
         Ok(())
     }
 
     /// The range h_min, s_min, v_min, h_max, s_max, v_max for `[image] colour_hsv`. It is an error if no colour stands out at the lip.
-    pub fn range(&self) -> Result<[u8; 6], ColourError> {
+    pub fn range(&self) -> Result<Range, ColourError> {
         let liquid = |hsv: &&Hsv| {
-            let (near, far) = (self.near.share(**hsv), self.far.share(**hsv));
-            near > BIN_SHARE && near > BIN_RATIO * far
+            (0..2).all(|place| {
+                let (near, far) = (self.near.share(**hsv, place), self.far.share(**hsv, place));
+                near > BIN_SHARE && near > BIN_RATIO * far
+            })
         };
-        let seen: Vec<Hsv> = self.near.pixels.iter().filter(liquid).copied().collect();
+        let mut seen: Vec<Hsv> = self.near.pixels.iter().filter(liquid).copied().collect();
         if (seen.len() as f32) < LIQUID_SHARE * self.near.count() {
             return Err(ColourError::NoColour);
+        }
+        let middle = Quantiles::new(&seen, |p| p[1].into()).middle;
+        if middle >= GREY_SATURATION {
+            seen.retain(|p| f32::from(p[1]) >= PALE * middle);
         }
         // Hue is an angle, so it is taken relative to its mean direction.
         let mean = mean_hue(&seen);
@@ -183,9 +231,7 @@ impl ColourLearner {
         let value = Quantiles::new(&seen, |p| p[2].into());
         let byte = |v: f32| v.round().clamp(0.0, 255.0) as u8;
         if saturation.middle < GREY_SATURATION || hue.high - hue.low > GREY_HUES {
-            let [s_min, v_min] = [saturation, value].map(|q| byte(q.low - GREY_MARGIN));
-            let [s_max, v_max] = [saturation, value].map(|q| byte(q.high + GREY_MARGIN));
-            return Ok([0, s_min, v_min, 179, s_max, v_max]);
+            return Ok(self.grey_range(saturation, value));
         }
         // Shadow and exposure move value most, and saturation more than hue.
         let v_min = value.low * 0.3 - 5.0;
@@ -196,7 +242,76 @@ impl ColourLearner {
         let h_min = self.limit(hue.low - HUE_MARGIN, hue.low, &|p| alike(p).filter(|h| *h < 0.0));
         let h_max = self.limit(hue.high + HUE_MARGIN, hue.high, &|p| alike(p).filter(|h| *h > 0.0));
         let hue_byte = |v: f32| (mean + v).rem_euclid(180.0).round().min(179.0) as u8;
-        Ok([hue_byte(h_min), byte(s_min), byte(v_min), hue_byte(h_max), 255, byte(v_max)])
+        Ok(self.with_highlights([hue_byte(h_min), byte(s_min), byte(v_min), hue_byte(h_max), 255, byte(v_max)]))
+    }
+
+    /// The range of a liquid without a hue. Background that comes close limits it, as it does that of a coloured one.
+    fn grey_range(&self, saturation: Quantiles, value: Quantiles) -> Range {
+        let loose = |q: Quantiles| (q.low - GREY_MARGIN)..=(q.high + GREY_MARGIN);
+        let (saturations, values) = (loose(saturation), loose(value));
+        let of_value = |p: &Hsv| saturations.contains(&f32::from(p[1])).then_some(f32::from(p[2]));
+        let v_min = self.limit(value.low - GREY_MARGIN, value.low, &of_value);
+        let v_max = self.limit(value.high + GREY_MARGIN, value.high, &of_value);
+        let of_saturation = |p: &Hsv| values.contains(&f32::from(p[2])).then_some(f32::from(p[1]));
+        let s_min = self.limit(saturation.low - GREY_MARGIN, saturation.low, &of_saturation);
+        let s_max = self.limit(saturation.high + GREY_MARGIN, saturation.high, &of_saturation);
+        let byte = |v: f32| v.round().clamp(0.0, 255.0) as u8;
+        [0, byte(s_min), byte(v_min), 179, byte(s_max), byte(v_max)]
+    }
+
+    /// `range`, wider by the highlights on the liquid: pixels near the lip that are brighter or paler than it, and seldom far from it. Where
+    /// dry background would come in, it stays as it is.
+    fn with_highlights(&self, range: Range) -> Range {
+        let cost = self.dry_background(range).inside + HIGHLIGHT_COST;
+        let light: Vec<u8> = {
+            let bright = |p: &&Hsv| p[2] > range[5].min(200) && self.near.share(**p, 0) > BIN_RATIO * self.far.share(**p, 0);
+            let hue = |p: &&Hsv| contains([range[0], 0, 0, range[3], 255, 255], **p);
+            self.near.pixels.iter().filter(hue).filter(bright).map(|p| p[1]).collect()
+        };
+        let mut wider = range;
+        for try_wider in [[range[0], range[1], range[2], range[3], 255, 255], {
+            let mut light = light.clone();
+            light.sort_unstable();
+            let palest = light.get(light.len() / 20).copied().unwrap_or(range[1]);
+            [range[0], range[1].min(palest), range[2], range[3], 255, 255]
+        }] {
+            let many = light.len() as f32 >= HIGHLIGHT_SHARE * self.near.count();
+            if many && self.dry_background(try_wider).inside <= cost {
+                wider = try_wider;
+            }
+        }
+        wider
+    }
+
+    /// What of the background lies inside `range`, or so close to it that a little more or less light brings it there. See
+    /// [`Self::dry_background`].
+    pub fn near_background(&self, [h0, s0, v0, h1, s1, v1]: Range) -> DryBackground {
+        let grey = h0 == 0 && h1 == 179;
+        let hue = |h: u8, by: i16| if grey { h } else { (i16::from(h) + by).rem_euclid(180) as u8 };
+        let (low, high) = (|v: u8| v.saturating_sub(CLOSE), |v: u8| v.saturating_add(CLOSE));
+        self.dry_background([hue(h0, -1), low(s0), low(v0), hue(h1, 1), high(s1), high(v1)])
+    }
+
+    /// What of the background lies inside `range` in the pictures in which nothing of these colours is at the lip but the rim's own light.
+    pub fn dry_background(&self, range: Range) -> DryBackground {
+        // Of each picture: the share of the near pixels that is inside, and of how many far pixels how many are.
+        let mut seen = Vec::new();
+        let mut begins = [0, 0];
+        for ends in &self.ends {
+            let inside = |pixels: &[Hsv]| pixels.iter().filter(|p| contains(range, **p)).count();
+            let (near, far) = (&self.near.pixels[begins[0]..ends[0]], &self.far.pixels[begins[1]..ends[1]]);
+            seen.push((inside(near) as f32 / near.len().max(1) as f32, inside(far), far.len()));
+            begins = *ends;
+        }
+        let rim = seen.iter().map(|(near, ..)| *near).fold(1.0f32, f32::min);
+        let is_dry = |(near, ..): &&(f32, usize, usize)| rim < RIM_NEAR && *near < rim + DRY_NEAR;
+        let dry = seen.iter().filter(is_dry).count();
+        let sum = |all: bool| {
+            let taken = seen.iter().filter(|one| all || is_dry(one));
+            taken.fold((0, 0), |sum, (_, inside, count)| (sum.0 + inside, sum.1 + count))
+        };
+        let (inside, count) = sum(dry == 0);
+        DryBackground { inside: inside as f32 / count.max(1) as f32, dry_pictures: dry as f32 / seen.len().max(1) as f32 }
     }
 
     /// A limit of the range: `loose`, which is the liquid's own limit `liquid` with its margin; or, where background of like colour comes

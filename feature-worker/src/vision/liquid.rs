@@ -7,6 +7,7 @@
 //!
 //! All calls come from the extraction thread. After the second frame they allocate nothing. The only failures are OpenCV's.
 
+use super::confidence::Basis;
 use opencv::boxed_ref::BoxedRef;
 use opencv::core::Mat;
 use shared::messages::{Doubt, PixelFormat};
@@ -108,6 +109,12 @@ pub(crate) trait Liquid: Send + Sync {
     /// Looks for a stream in the picture that was taken. Replaces `edges_px` by points of the stream's outer edge in the region, px,
     /// from the x-axis to the y-axis; without a stream they are of no use.
     fn look(&mut self, edges_px: &mut Vec<[f32; 2]>) -> opencv::Result<Sighting>;
+
+    /// What a measurement in the picture that was looked at rests on.
+    fn basis(&self) -> Basis;
+
+    /// Mean levels of blue, green and red of what is not liquid in the picture that was looked at, if that is known.
+    fn ground_bgr(&self) -> Option<[f32; 3]>;
 
     /// Which share of the triangle with these legs, px from the lip, was seen to be ground in the picture that was looked at, 0 to 1.
     fn dry_share(&self, legs_px: [f32; 2]) -> f32;

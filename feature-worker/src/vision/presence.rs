@@ -11,7 +11,15 @@ const WIDTH_PX: f32 = 640.0;
 /// The ground is dry when this share of the stream's former place was seen to be ground. Tuned as [`LASTING_PX2`] was.
 const DRY_SHARE: f32 = 0.6;
 /// So many pictures in a row have to show dry ground. Tuned as [`LASTING_PX2`] was: docs/VISION.md shows what more and fewer do.
-const DRY_PICTURES: u32 = 2;
+const DRY_PICTURES: u32 = 1;
+
+/// Where the light is not what it was, by this factor, colours are no evidence. Chosen by hand: a container that turns changes the mean
+/// level by less in a second.
+const LIGHT_CHANGE: f32 = 1.25;
+/// Where a colour's share of the light is not what it was, by this factor, colours are no evidence either. Chosen by hand.
+const COLOUR_CHANGE: f32 = 1.1;
+/// After this many pictures in other light, that is the light. Chosen by hand: the end of a pour must not be late.
+const LIGHT_PICTURES: u32 = 6;
 
 /// Remembers the stream until its end was seen.
 pub(crate) struct Presence {
@@ -20,29 +28,44 @@ pub(crate) struct Presence {
     legs_px: Option<[f32; 2]>,
     /// Pictures in a row that showed dry ground in its place.
     dry_pictures: u32,
+    /// Mean levels of blue, green and red in the last picture with a stream.
+    bgr: [f32; 3],
+    /// Pictures in a row in other light.
+    other_light: u32,
 }
 
 impl Presence {
     /// For pictures of this width, px. There is no stream yet.
     pub(crate) fn new(width_px: u32) -> Self {
         let scale = width_px as f32 / WIDTH_PX;
-        Self { lasting_px2: LASTING_PX2 * scale * scale, legs_px: None, dry_pictures: 0 }
+        Self { lasting_px2: LASTING_PX2 * scale * scale, legs_px: None, dry_pictures: 0, bgr: [0.0; 3], other_light: 0 }
     }
 
-    /// A stream was measured.
-    pub(crate) fn saw(&mut self, area_px2: f32, legs_px: [f32; 2]) {
+    /// A stream was measured in a picture with these mean levels of blue, green and red.
+    pub(crate) fn saw(&mut self, area_px2: f32, legs_px: [f32; 2], bgr: [f32; 3]) {
+        (self.bgr, self.other_light) = (bgr, 0);
         self.legs_px = (area_px2 >= self.lasting_px2).then_some(legs_px);
         self.dry_pictures = 0;
     }
 
-    /// No stream was seen in a picture without other doubts. Returns whether there is none; `dry_share` tells which share of a triangle with
+    /// No stream was seen in a picture with these mean levels, without other doubts. Returns whether there is none; `dry_share` tells which share of a triangle with
     /// these legs was seen to be ground.
-    pub(crate) fn is_gone(&mut self, dry_share: impl FnOnce([f32; 2]) -> f32) -> bool {
+    pub(crate) fn is_gone(&mut self, bgr: [f32; 3], dry_share: impl FnOnce([f32; 2]) -> f32) -> bool {
         let Some(legs_px) = self.legs_px else { return true };
-        self.dry_pictures = if dry_share(legs_px) >= DRY_SHARE { self.dry_pictures + 1 } else { 0 };
+        self.other_light = if is_other_light(self.bgr, bgr) { self.other_light + 1 } else { 0 };
+        let told = self.other_light == 0 || self.other_light > LIGHT_PICTURES;
+        self.dry_pictures = if told && dry_share(legs_px) >= DRY_SHARE { self.dry_pictures + 1 } else { 0 };
         if self.dry_pictures >= DRY_PICTURES {
             self.legs_px = None;
         }
         self.legs_px.is_none()
     }
+}
+
+/// Whether one picture's mean levels of blue, green and red are those of another light than another's.
+fn is_other_light(before: [f32; 3], now: [f32; 3]) -> bool {
+    let changes: [f32; 3] = std::array::from_fn(|k| now[k].max(1.0) / before[k].max(1.0));
+    let all = changes.iter().sum::<f32>() / 3.0;
+    let off = |change: f32, most: f32| change.max(1.0 / change) > most;
+    off(all, LIGHT_CHANGE) || changes.iter().any(|change| off(change / all, COLOUR_CHANGE))
 }

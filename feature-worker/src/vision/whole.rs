@@ -42,13 +42,17 @@ const SIDE_SAMPLES: usize = 2 * (SIDE_REACH + SIDE_HALF) + 2;
 /// Samples of the pattern.
 const PATTERN: usize = 2 * SIDE_HALF + 1;
 /// The side is in its place when its pattern agrees with the remembered one by this much, -1 to 1. Chosen by hand.
-const IN_PLACE: f32 = 0.5;
+const IN_PLACE: f32 = 0.3;
 /// The side is elsewhere when it agrees there by this much. Chosen by hand.
-const ELSEWHERE: f32 = 0.8;
+const ELSEWHERE: f32 = 0.85;
+/// The side is elsewhere when it agrees there by so much more than in its place. Chosen by hand.
+const SURELY: f32 = 0.45;
 /// A displacement by less than this may be a side that changed its look, px. Chosen by hand.
 const DISPLACED_PX: usize = 5;
-/// The side's pattern is known when it agreed with itself by this much for some pictures. Chosen by hand.
-const KNOWN_SIDE: f32 = 0.85;
+/// The side's pattern is known when it agreed with itself by this much on average. Chosen by hand: a pattern behind it moves.
+const KNOWN_SIDE: f32 = 0.6;
+/// And when it was seen in so many pictures. Chosen by hand.
+const SIDE_PICTURES: u32 = 20;
 /// How fast pattern and agreement follow, a picture. Chosen by hand.
 const SIDE_FOLLOWS: f32 = 0.15;
 
@@ -171,11 +175,13 @@ struct SideCheck {
     pattern: [f32; PATTERN],
     /// How well it agreed with itself from picture to picture.
     agrees: f32,
+    /// Pictures in which it was seen.
+    seen: u32,
 }
 
 impl SideCheck {
     fn new(axes: Axes) -> Self {
-        Self { axes, pattern: [0.0; PATTERN], agrees: 0.0 }
+        Self { axes, pattern: [0.0; PATTERN], agrees: 0.0, seen: 0 }
     }
 
     /// Whether the side is seen elsewhere, and not in its place.
@@ -183,12 +189,14 @@ impl SideCheck {
         let steps = self.steps(pixels);
         let at = |shift: usize| -> &[f32] { &steps[shift..shift + PATTERN] };
         let here = agreement(&self.pattern, at(SIDE_REACH));
-        if self.agrees >= KNOWN_SIDE && here < IN_PLACE {
+        if self.seen >= SIDE_PICTURES && self.agrees >= KNOWN_SIDE && here < IN_PLACE {
+            let elsewhere = (here + SURELY).max(ELSEWHERE);
             let far = |shift: &usize| shift.abs_diff(SIDE_REACH) >= DISPLACED_PX;
-            if (0..=2 * SIDE_REACH).filter(far).any(|shift| agreement(&self.pattern, at(shift)) >= ELSEWHERE) {
+            if (0..=2 * SIDE_REACH).filter(far).any(|shift| agreement(&self.pattern, at(shift)) >= elsewhere) {
                 return true;
             }
         }
+        self.seen = self.seen.saturating_add(1);
         self.agrees += SIDE_FOLLOWS * (here - self.agrees);
         for (kept, now) in self.pattern.iter_mut().zip(&steps[SIDE_REACH..]) {
             *kept += SIDE_FOLLOWS * (now - *kept);

@@ -5,7 +5,7 @@
 use opencv::core::{self, CV_8UC3, Mat, Point, Point2f, Rect, Scalar, Size, Vector};
 use opencv::imgproc;
 use opencv::prelude::*;
-use shared::config::{CameraConfig, CameraSource, Config, ImageConfig, LiquidMethod};
+use shared::config::{CameraConfig, Config, ImageConfig, LiquidMethod};
 
 pub const WIDTH: i32 = 640;
 pub const HEIGHT: i32 = 480;
@@ -22,7 +22,7 @@ pub fn sim_config() -> &'static str {
 }
 
 pub fn camera() -> CameraConfig {
-    CameraConfig { source: CameraSource::SharedMemory, path: String::new(), width_px: WIDTH as u32, height_px: HEIGHT as u32, fps: 30.0 }
+    CameraConfig { width_px: WIDTH as u32, height_px: HEIGHT as u32, ..CameraConfig::default() }
 }
 
 pub fn image_config(method: LiquidMethod) -> ImageConfig {
@@ -112,12 +112,17 @@ fn cover(shapes: &[Vec<[f32; 2]>]) -> Result<Mat, opencv::Error> {
 
 /// `picture` with `shapes` of blue liquid over it.
 fn pour_over(picture: &mut Mat, shapes: &[Vec<[f32; 2]>]) -> Result<(), opencv::Error> {
+    lay_over(picture, shapes, BLUE)
+}
+
+/// `picture` with `shapes` of a liquid of this colour (blue, green, red) over it.
+pub fn lay_over(picture: &mut Mat, shapes: &[Vec<[f32; 2]>], colour: Scalar) -> Result<(), opencv::Error> {
     let cover = cover(shapes)?;
     let cover = cover.data_bytes()?;
     for (pixel, share) in picture.data_typed_mut::<core::Vec3b>()?.iter_mut().zip(cover) {
         for c in 0..3 {
             let share = f64::from(*share) / 255.0;
-            pixel[c] = (f64::from(pixel[c]) * (1.0 - share) + BLUE[c] * share).round() as u8;
+            pixel[c] = (f64::from(pixel[c]) * (1.0 - share) + colour[c] * share).round() as u8;
         }
     }
     Ok(())
@@ -146,10 +151,14 @@ pub fn blue(shapes: &[Vec<[f32; 2]>], seed: i32) -> Result<Mat, opencv::Error> {
 /// Frame `i` of a pour of blue liquid from a glass that turns by one degree a frame. It is dry up to frame 7 and from frame 33 on; the
 /// largest triangle (90 x 80 px) is at frame 20.
 pub fn pour(i: i32) -> Result<Mat, opencv::Error> {
-    let mut picture = board(i as f32)?;
+    pour_before(i, board(i as f32)?, BLUE)
+}
+
+/// Frame `i` of such a pour of a liquid of another colour, before another background.
+pub fn pour_before(i: i32, mut picture: Mat, colour: Scalar) -> Result<Mat, opencv::Error> {
     let share = (1.0 - (i - 20) as f32 / 13.0 * if i < 20 { -1.0 } else { 1.0 }).max(0.0);
     if share > 0.08 {
-        pour_over(&mut picture, &[stream(90.0 * share, 80.0 * share)])?;
+        lay_over(&mut picture, &[stream(90.0 * share, 80.0 * share)], colour)?;
     }
     glass(&mut picture)?;
     noisy(&picture, i)

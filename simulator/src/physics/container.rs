@@ -9,10 +9,14 @@
 
 use serde::{Deserialize, Serialize};
 
+use super::habits::{Habits, Slosh};
+
 /// Share of the outflow that first stays at the lip as a film. Part of the evaluation's protocol; no measurement is recorded.
 const FILM_SHARE: f64 = 0.12;
 /// Time constant with which the film drains, s. Part of the evaluation's protocol; no measurement is recorded.
 const FILM_S: f64 = 0.30;
+/// Share of the outflow that becomes film when the whole stream clings to the wall. Chosen by hand; no measurement is recorded.
+const CLINGING_SHARE: f64 = 0.6;
 /// Step of the tables over the tilt, degrees: fine enough that linear interpolation does for what lies between.
 const TABLE_STEP_DEG: f64 = 0.25;
 
@@ -49,11 +53,11 @@ pub enum Shape {
         /// Inner height.
         height_mm: f64,
     },
-    /// Square jug whose lip reaches beyond one side.
+    /// Square jug whose lip reaches beyond one side, or carton whose lip lies inside of it.
     Jug {
         /// Half of the inner side.
         half_side_mm: f64,
-        /// How far the spout's lip reaches beyond the side.
+        /// How far the spout's lip reaches beyond the side; below 0, how far it lies inside.
         spout_mm: f64,
         /// Inner height.
         height_mm: f64,
@@ -68,6 +72,27 @@ impl Shape {
             | Self::Cone { height_mm, .. }
             | Self::Bottle { height_mm, .. }
             | Self::Jug { height_mm, .. } => height_mm,
+        }
+    }
+
+    /// The same shape with all lengths multiplied by `factor`.
+    pub fn scaled(self, factor: f64) -> Self {
+        let f = factor;
+        match self {
+            Self::Cylinder { radius_mm, height_mm } => Self::Cylinder { radius_mm: radius_mm * f, height_mm: height_mm * f },
+            Self::Cone { bottom_mm, top_mm, height_mm } => {
+                Self::Cone { bottom_mm: bottom_mm * f, top_mm: top_mm * f, height_mm: height_mm * f }
+            }
+            Self::Bottle { body_mm, neck_mm, shoulder_mm, neck_from_mm, height_mm } => Self::Bottle {
+                body_mm: body_mm * f,
+                neck_mm: neck_mm * f,
+                shoulder_mm: shoulder_mm * f,
+                neck_from_mm: neck_from_mm * f,
+                height_mm: height_mm * f,
+            },
+            Self::Jug { half_side_mm, spout_mm, height_mm } => {
+                Self::Jug { half_side_mm: half_side_mm * f, spout_mm: spout_mm * f, height_mm: height_mm * f }
+            }
         }
     }
 
@@ -173,6 +198,9 @@ pub struct Container {
     film_ml: f64,
     poured_ml: f64,
     lip: Lip,
+    habits: Habits,
+    slosh: Slosh,
+    at_s: f64,
 }
 
 impl Container {
@@ -181,10 +209,31 @@ impl Container {
         let steps = (180.0 / TABLE_STEP_DEG) as usize;
         let entry = |k: usize| (shape.retained_ml(k as f64 * TABLE_STEP_DEG), shape.surface_mm2(k as f64 * TABLE_STEP_DEG));
         let table: std::sync::Arc<[(f64, f64)]> = (0..=steps).map(entry).collect();
-        let mut container =
-            Self { shape, lip_width_mm, fluidity, table, volume_ml: 0.0, film_ml: 0.0, poured_ml: 0.0, lip: Lip::default() };
+        let mut container = Self {
+            shape,
+            lip_width_mm,
+            fluidity,
+            table,
+            volume_ml: 0.0,
+            film_ml: 0.0,
+            poured_ml: 0.0,
+            lip: Lip::default(),
+            habits: Habits::default(),
+            slosh: Slosh::default(),
+            at_s: 0.0,
+        };
         container.refill(volume_ml);
         container
+    }
+
+    /// The same container with these habits; a rough curve replaces its smooth one.
+    #[must_use]
+    pub fn with_habits(mut self, habits: Habits) -> Self {
+        self.habits = habits;
+        let mut retained: Vec<f64> = self.table.iter().map(|(retained, _)| *retained).collect();
+        habits.roughen(&mut retained, TABLE_STEP_DEG);
+        self.table = retained.into_iter().zip(self.table.iter()).map(|(retained, (_, surface))| (retained, *surface)).collect();
+        self
     }
 
     /// Starts again with `volume_ml` in the container, at most 92 % of full, a dry lip and nothing poured.
@@ -193,6 +242,8 @@ impl Container {
         self.film_ml = 0.0;
         self.poured_ml = 0.0;
         self.lip = Lip::default();
+        self.slosh = Slosh::default();
+        self.at_s = 0.0;
     }
 
     /// Changes the liquid: `fluidity` is relative to water.
@@ -230,6 +281,21 @@ impl Container {
         self.lip
     }
 
+    /// Volume that stays in this container at a tilt, ml, its rough curve included.
+    pub fn retained_ml(&self, tilt_deg: f64) -> f64 {
+        self.geometry(tilt_deg).0
+    }
+
+    /// How far the liquid's surface swings.
+    pub fn slosh(&self) -> &Slosh {
+        &self.slosh
+    }
+
+    /// What it does beyond a smooth shape and a weir.
+    pub fn habits(&self) -> &Habits {
+        &self.habits
+    }
+
     /// Retained volume in ml and free surface in mm^2 at a tilt.
     fn geometry(&self, tilt_deg: f64) -> (f64, f64) {
         let at = (tilt_deg.clamp(0.0, 180.0) / TABLE_STEP_DEG).min((self.table.len() - 1) as f64 - 1e-9);
@@ -250,16 +316,19 @@ impl Container {
         if !(dt_s > 0.0 && tilt_deg.is_finite()) {
             return self.lip.flow_ml_s;
         }
-        let (retained_ml, surface_mm2) = self.geometry(tilt_deg);
+        let surface_tilt_deg = self.slosh.step(&self.habits, dt_s, tilt_deg);
+        let (retained_ml, surface_mm2) = self.geometry(surface_tilt_deg);
         let excess_ml = (self.volume_ml - retained_ml).max(0.0);
         let head_mm = 1000.0 * excess_ml / surface_mm2;
         let weir_ml_s = self.fluidity * (2.0 / 3.0) * 0.6 * self.lip_width_mm * (2.0f64 * 9810.0).sqrt() / 1000.0 * head_mm.powf(1.5);
-        let over_ml = (weir_ml_s * dt_s).min(excess_ml / 2.0);
+        let over_ml = (weir_ml_s * self.habits.gurgle(self.at_s, head_mm) * dt_s).min(excess_ml / 2.0);
+        self.at_s += dt_s;
         self.volume_ml -= over_ml;
-        self.film_ml += FILM_SHARE * over_ml;
+        let film_share = FILM_SHARE + (CLINGING_SHARE - FILM_SHARE) * self.habits.clinging(over_ml / dt_s);
+        self.film_ml += film_share * over_ml;
         let drip_ml = self.film_ml * (dt_s / FILM_S).min(1.0);
         self.film_ml -= drip_ml;
-        let out_ml = (1.0 - FILM_SHARE) * over_ml + drip_ml;
+        let out_ml = (1.0 - film_share) * over_ml + drip_ml;
         self.poured_ml += out_ml;
         let width_mm = if head_mm > 0.0 { self.lip_width_mm } else { 0.0 };
         self.lip = Lip {

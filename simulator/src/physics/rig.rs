@@ -9,6 +9,7 @@ use serde::{Deserialize, Serialize};
 
 use super::RATE_HZ;
 use super::container::{Container, Shape};
+use super::habits::Habits;
 
 /// Steps of the physics in a frame: 11 ms each, short against the servo's time constant and the film's.
 const SUBSTEPS: usize = 3;
@@ -16,6 +17,11 @@ const SUBSTEPS: usize = 3;
 const AREA_MIN_PX2: f64 = 8.0;
 /// Largest delay of the camera that can be simulated, frames: twice the largest that is drawn, with some room.
 const DELAY_MAX: usize = 8;
+
+/// Largest pure delay of the robot that can be simulated, in steps of the physics: 8 frames.
+const ROBOT_DELAY_MAX: usize = 8 * SUBSTEPS;
+/// Share of a stream's area that is still seen when the whole stream clings to the wall. Chosen by hand; no measurement is recorded.
+const CLINGING_SEEN: f64 = 0.4;
 
 /// Area that the camera reports for an outflow of 1 ml a frame, px^2, the same as in the paper's simulation.
 const AREA_AT_1_ML_PX2: f64 = 400.0;
@@ -47,6 +53,12 @@ pub struct Rig {
     pub gain: f64,
     /// Standard deviation of the fluidity from pour to pour, as a share of it.
     pub fluidity_sd: f64,
+    /// Pure delay of the robot before its servo, frames.
+    #[serde(default)]
+    pub robot_delay_frames: f64,
+    /// What vessel and liquid do beyond a smooth shape and a weir.
+    #[serde(default)]
+    pub habits: Habits,
 }
 
 impl Rig {
@@ -67,6 +79,8 @@ impl Rig {
             gain_sd: 0.015,
             gain: 1.0,
             fluidity_sd: 0.08,
+            robot_delay_frames: 0.0,
+            habits: Habits::default(),
         }
     }
 
@@ -93,7 +107,12 @@ impl Rig {
 
     /// The container, with `volume_ml` of the rig's liquid in it.
     pub fn container(&self, volume_ml: f64) -> Container {
-        Container::new(self.shape, self.lip_width_mm, self.fluidity, volume_ml)
+        let mut container = Container::new(self.shape, self.lip_width_mm, self.fluidity, 0.0);
+        if self.habits != Habits::default() {
+            container = container.with_habits(self.habits);
+        }
+        container.refill(volume_ml);
+        container
     }
 }
 
@@ -106,6 +125,8 @@ pub struct RigPour {
     tilt_deg: f64,
     flows_ml: [f64; DELAY_MAX + 1],
     frame: usize,
+    commands_deg: [f64; ROBOT_DELAY_MAX + 1],
+    step: usize,
     rng: Pcg64Mcg,
 }
 
@@ -116,7 +137,17 @@ impl RigPour {
         let mut normal = || -> f64 { StandardNormal.sample(&mut rng) };
         container.set_fluidity(rig.fluidity * (1.0 + rig.fluidity_sd * normal()).max(0.3));
         let gain = rig.gain * (1.0 + rig.gain_sd * normal());
-        Self { container, rig: rig.clone(), gain, tilt_deg: 0.0, flows_ml: [0.0; DELAY_MAX + 1], frame: 0, rng }
+        Self {
+            container,
+            rig: rig.clone(),
+            gain,
+            tilt_deg: 0.0,
+            flows_ml: [0.0; DELAY_MAX + 1],
+            frame: 0,
+            commands_deg: [0.0; ROBOT_DELAY_MAX + 1],
+            step: 0,
+            rng,
+        }
     }
 
     /// Lets one frame pass with `alpha_deg` commanded. Returns the area that the camera reports at its end, px^2.
@@ -131,14 +162,22 @@ impl RigPour {
         // Both numbers are drawn in every frame, so that a change of the flow does not shift the noise of later frames.
         let noise: f64 = StandardNormal.sample(&mut self.rng);
         let dropped = self.rng.random_bool(self.rig.dropouts);
-        let area = AREA_AT_1_ML_PX2 * seen_ml.powf(self.rig.area_exponent) * self.gain * (self.rig.frame_noise * noise).exp();
+        let clinging = self.rig.habits.clinging(seen_ml * RATE_HZ);
+        let seen_share = 1.0 - (1.0 - CLINGING_SEEN) * clinging;
+        let area = AREA_AT_1_ML_PX2 * seen_share * seen_ml.powf(self.rig.area_exponent) * self.gain * (self.rig.frame_noise * noise).exp();
         if dropped || area < AREA_MIN_PX2 { 0.0 } else { area as f32 }
     }
 
     /// Lets one frame pass with `alpha_deg` commanded, without a look through the camera.
     pub fn advance(&mut self, alpha_deg: f64) {
         let dt_s = 1.0 / RATE_HZ / SUBSTEPS as f64;
+        let delay = ((self.rig.robot_delay_frames * SUBSTEPS as f64).round() as usize).min(ROBOT_DELAY_MAX);
+        let slots = self.commands_deg.len();
         for _ in 0..SUBSTEPS {
+            self.commands_deg[self.step % slots] = alpha_deg;
+            // Before the first command has arrived, the robot stands upright.
+            let alpha_deg = if self.step >= delay { self.commands_deg[(self.step - delay) % slots] } else { 0.0 };
+            self.step += 1;
             let rate =
                 ((alpha_deg - self.tilt_deg) / self.rig.servo_time_constant_s).clamp(-self.rig.servo_rate_deg_s, self.rig.servo_rate_deg_s);
             self.tilt_deg += rate * dt_s;

@@ -12,6 +12,7 @@
 //! | [`outputs`] | the value of every RTDE output | no |
 //! | [`rtde`], [`dashboard`], [`client_interface`] | bytes in, bytes out | no |
 //! | [`fault`] | what can be made to go wrong | no |
+//! | [`InMemory`] | the clients of a controller without sockets | no |
 //! | `server` | the sockets, and the one thread around all of it | yes |
 //! | [`published`] | what that thread publishes in this process | no |
 //! | [`controller`], [`operator_port`] | starting a controller, watching it, and injecting faults | yes |
@@ -49,4 +50,5 @@ pub use operator_port::{OPERATOR_PORT, SendError, send_fault};
 pub use power::RobotMode;
 pub use program::RuntimeState;
 pub use published::{ControllerState, Joints, TraceRow};
+pub use server::in_memory::InMemory;
 pub use variables::{Series, Version};

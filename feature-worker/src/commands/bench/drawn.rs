@@ -3,7 +3,7 @@
 
 use opencv::core::{self, CV_8UC3, Mat, Point, Point2f, Scalar, Size, Vector};
 use opencv::imgproc;
-use shared::config::{CameraConfig, CameraSource, ImageConfig, LiquidMethod};
+use shared::config::{CameraConfig, ImageConfig, LiquidMethod};
 
 /// Number of different pictures, which are measured again and again. Chosen by hand; no measurement is recorded.
 pub const PICTURES: usize = 40;
@@ -12,8 +12,7 @@ pub const PICTURES: usize = 40;
 pub fn config(scale: f32, method: LiquidMethod) -> (CameraConfig, ImageConfig) {
     let px = |v: f32| (v * scale).round() as u32;
     let height = if scale > 1.0 { 720 } else { 480 };
-    let camera =
-        CameraConfig { source: CameraSource::SharedMemory, path: String::new(), width_px: px(640.0), height_px: height, fps: 30.0 };
+    let camera = CameraConfig { width_px: px(640.0), height_px: height, ..CameraConfig::default() };
     let axis = |a: [f32; 4]| a.map(|v| v * scale);
     let image = ImageConfig {
         method,

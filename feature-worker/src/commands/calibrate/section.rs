@@ -29,7 +29,8 @@ pub(super) fn text(image: &ImageConfig) -> String {
 pub(super) fn write(path: &Path, config: &Config) -> Result<(), Failure> {
     let fail = |e: String| failure(exit::FAILED, format!("{}: {e}", path.display()));
     let before = std::fs::read_to_string(path).map_err(|e| fail(e.to_string()))?;
-    let after = replace(&before, &text(&config.image));
+    let after =
+        replace(&before, &text(&config.image)).ok_or_else(|| fail("has no line [image] of its own; write the table there".into()))?;
     let checked = Config::parse(&after, &path.display().to_string()).or_exit(exit::FAILED)?;
     let size = (checked.camera.width_px, checked.camera.height_px);
     let (width, height) = (config.camera.width_px, config.camera.height_px);
@@ -45,18 +46,19 @@ pub(super) fn write(path: &Path, config: &Config) -> Result<(), Failure> {
     Ok(())
 }
 
-/// The file's text with another `[image]` table.
-fn replace(before: &str, section: &str) -> String {
+/// The file's text with another `[image]` table; none if it has no such table.
+fn replace(before: &str, section: &str) -> Option<String> {
     let mut after = String::new();
-    // Comments and empty lines between the table's last key and the next table belong to the next table.
+    // Comments and empty lines behind the table's last key belong to the next table, or to the file's end.
     let mut between = String::new();
-    let mut inside = false;
+    let (mut inside, mut replaced) = (false, false);
     for line in before.lines() {
         let trimmed = line.trim_start();
-        if trimmed.starts_with("[image]") {
-            inside = true;
+        let header = trimmed.split(']').next().filter(|_| trimmed.starts_with('['));
+        if header.is_some_and(|name| name[1..].trim() == "image") {
+            (inside, replaced) = (true, true);
             after.push_str(section);
-        } else if inside && !trimmed.starts_with('[') {
+        } else if inside && header.is_none() {
             if !trimmed.is_empty() && !trimmed.starts_with('#') {
                 between.clear();
             } else {
@@ -66,10 +68,12 @@ fn replace(before: &str, section: &str) -> String {
         } else {
             if std::mem::take(&mut inside) {
                 after.push_str(if between.is_empty() { "\n" } else { &between });
+                between.clear();
             }
             after.push_str(line);
             after.push('\n');
         }
     }
-    after
+    after.push_str(&between);
+    replaced.then_some(after)
 }

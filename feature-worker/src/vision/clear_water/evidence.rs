@@ -113,6 +113,8 @@ pub(super) struct Evidence {
     noise: f32,
     /// Share of the known background far from the lip that differs from the memory.
     strange_share: f32,
+    /// Whether the ground near the lip has no pattern.
+    even: bool,
     /// Slopes or differences whose median is taken. Kept from frame to frame.
     scratch: Vec<f32>,
 }
@@ -172,6 +174,7 @@ impl Evidence {
             steps: cells(),
             noise: NOISE_LEAST,
             strange_share: 0.0,
+            even: false,
             scratch: Vec::with_capacity(CELLS),
         })
     }
@@ -214,6 +217,11 @@ impl Evidence {
     /// Share of the known background far from the lip that differs from the memory.
     pub(super) fn strange_share(&self) -> f32 {
         self.strange_share
+    }
+
+    /// Whether the ground near the lip has no pattern.
+    pub(super) fn even(&self) -> bool {
+        self.even
     }
 
     /// Which share of the places with a `line_share` below 1 in the air was seen to be ground: known, and as it is remembered; or, where it
@@ -356,6 +364,7 @@ impl Evidence {
     #[inline(always)]
     pub(super) fn weigh(&mut self, rays: &Rays, moved: &RigidMap, stream: Option<&Stream>) -> opencv::Result<()> {
         let even = self.is_even(rays);
+        self.even = even;
         let flows = stream.is_some();
         for ray in 0..RAYS {
             let range = ray * SAMPLES..(ray + 1) * SAMPLES;

@@ -4,7 +4,6 @@
 //! not read loses its connection, and nobody else notices.
 
 use std::io::{ErrorKind, Read, Write};
-use std::net::TcpStream;
 
 use super::backend::Backend;
 use crate::ur::client_interface::{self, ProgramAssembler};
@@ -75,14 +74,14 @@ impl<'a> CycleOutput<'a> {
     }
 }
 
-/// A connected client.
-pub struct Client {
+/// A connected client, over a connection that does not block.
+pub struct Client<S> {
     /// A number that no other client ever has.
     pub id: u64,
     /// The port that it came to.
     pub port: u16,
     /// The connection, which does not block.
-    pub stream: TcpStream,
+    pub stream: S,
     /// False when the connection is to be dropped.
     pub open: bool,
     role: Role,
@@ -94,9 +93,9 @@ pub struct Client {
     cut: usize,
 }
 
-impl Client {
+impl<S: Read + Write> Client<S> {
     /// Greets a client that connected to `port`.
-    pub fn new(id: u64, port: u16, stream: TcpStream, backend: &Backend) -> Self {
+    pub fn new(id: u64, port: u16, stream: S, backend: &Backend) -> Self {
         let mut waiting = Vec::new();
         let role = match port {
             RTDE => {

@@ -6,8 +6,9 @@
 
 mod backend;
 mod client;
+pub mod in_memory;
 
-use std::net::{IpAddr, Shutdown, SocketAddr, TcpListener};
+use std::net::{IpAddr, Shutdown, SocketAddr, TcpListener, TcpStream};
 use std::sync::Arc;
 use std::sync::mpsc::{Receiver, SyncSender};
 use std::time::Duration;
@@ -58,7 +59,7 @@ pub struct Server {
     address: IpAddr,
     backend: Backend,
     listeners: Vec<(u16, TcpListener)>,
-    clients: Vec<Client>,
+    clients: Vec<Client<TcpStream>>,
     next_id: u64,
     published: Arc<Published>,
     requests: Receiver<ServerRequest>,

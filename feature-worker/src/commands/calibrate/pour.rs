@@ -1,0 +1,124 @@
+//! What was seen of one pour: kept pictures to learn from, and all frames once more to measure.
+//!
+//! Runs on the command's thread and allocates: at most [`KEEP_PICTURES`] pictures, and of a live camera each frame as JPEG. Files are read a
+//! second time instead.
+
+use std::path::PathBuf;
+
+use opencv::core::{self, Mat, Vector};
+use opencv::imgcodecs;
+use opencv::prelude::*;
+use shared::config::CameraConfig;
+use shared::messages::PixelFormat;
+
+use crate::drawing::to_bgr;
+use crate::source::{Frame, for_each_frame};
+use crate::vision::{Extractor, Image, Measurement, Poses};
+
+/// The most pictures that are kept for learning and for the drawn picture. Chosen by hand: about 140 MB at 640 x 480 px.
+const KEEP_PICTURES: usize = 150;
+/// Quality of the frames of a live camera that are kept, 0 to 100. Chosen by hand: no difference in V_e was seen.
+const FILM_QUALITY: i32 = 97;
+/// The most that is kept of a live camera, bytes. Chosen by hand: more than five minutes at 640 x 480 px.
+const FILM_MOST: usize = 1 << 30;
+
+/// Where all frames come from once more.
+enum Film {
+    /// From these files, of which something may be missing.
+    Files(Vec<PathBuf>, bool),
+    /// From memory, each as JPEG.
+    Kept(Vec<Vec<u8>>, usize),
+}
+
+/// What was seen of one pour.
+pub(super) struct Pour {
+    /// Evenly spread pictures in BGR.
+    pub pictures: Vec<Mat>,
+    /// Number of all pictures.
+    pub count: u64,
+    /// Of this many pictures, one is kept.
+    stride: u64,
+    film: Film,
+}
+
+impl Pour {
+    /// A pour that a live camera shows.
+    pub fn live() -> Self {
+        Self { pictures: Vec::new(), count: 0, stride: 1, film: Film::Kept(Vec::new(), 0) }
+    }
+
+    /// The pour in files. With `partial`, something may be missing. Returns also what is missing, a line each.
+    pub fn read(input: &[PathBuf], rate_hz: f64, partial: bool) -> Result<(Self, Vec<String>), String> {
+        let mut pour = Self { film: Film::Files(input.to_vec(), partial), ..Self::live() };
+        let contents = for_each_frame(input, rate_hz, partial, |frame| pour.add(&frame))?;
+        Ok((pour, contents.missing))
+    }
+
+    /// Adds a frame.
+    pub fn add(&mut self, frame: &Frame) -> Result<(), String> {
+        let words = |e: opencv::Error| e.message;
+        let bgr = to_bgr(frame).map_err(words)?;
+        if let Some(first) = self.pictures.first()
+            && first.size().map_err(words)? != bgr.size().map_err(words)?
+        {
+            return Err(format!("frame {} has another size than those before; all must come from one camera", self.count + 1));
+        }
+        if let Film::Kept(frames, bytes) = &mut self.film {
+            let mut jpeg = Vector::<u8>::new();
+            let quality = Vector::from_slice(&[imgcodecs::IMWRITE_JPEG_QUALITY, FILM_QUALITY]);
+            imgcodecs::imencode(".jpg", &bgr, &mut jpeg, &quality).map_err(words)?;
+            *bytes += jpeg.len();
+            frames.push(jpeg.to_vec());
+        }
+        if self.count.is_multiple_of(self.stride) {
+            self.pictures.push(bgr);
+        }
+        if self.pictures.len() > KEEP_PICTURES {
+            // Every second picture is dropped, and from now on half as many are kept.
+            let mut index = 0;
+            self.pictures.retain(|_| {
+                index += 1;
+                index % 2 == 1
+            });
+            self.stride *= 2;
+        }
+        self.count += 1;
+        Ok(())
+    }
+
+    /// Whether no more can be kept.
+    pub fn is_full(&self) -> bool {
+        matches!(self.film, Film::Kept(_, bytes) if bytes > FILM_MOST)
+    }
+
+    /// The poses among the kept pictures, those pictures, and their mean.
+    pub fn poses(&self) -> Result<(Poses, Vec<&Mat>, Mat), opencv::Error> {
+        let poses = Poses::choose(&self.pictures)?;
+        let chosen = poses.chosen.iter().map(|i| &self.pictures[*i]).collect();
+        let mean = poses.mean(&self.pictures)?;
+        Ok((poses, chosen, mean))
+    }
+
+    /// Measures all frames in their order, and gives each measurement to `take`.
+    pub fn measure(&self, camera: &CameraConfig, mut extractor: Extractor, mut take: impl FnMut(Measurement)) -> Result<(), String> {
+        let mut each = |picture: &Mat| {
+            let pixels = picture.data_bytes().map_err(|e| e.message)?;
+            let (width_px, height_px) = (picture.cols() as u32, picture.rows() as u32);
+            take(extractor.measure(Image { width_px, height_px, format: PixelFormat::Bgr8, pixels }).map_err(|e| e.to_string())?);
+            Ok(())
+        };
+        match &self.film {
+            Film::Files(input, partial) => {
+                for_each_frame(input, camera.fps, *partial, |frame| each(&to_bgr(&frame).map_err(|e| e.message)?)).map(|_| ())
+            }
+            Film::Kept(frames, _) => frames.iter().try_for_each(|jpeg| {
+                each(&imgcodecs::imdecode(&Vector::<u8>::from_slice(jpeg), imgcodecs::IMREAD_COLOR).map_err(|e| e.message)?)
+            }),
+        }
+    }
+}
+
+/// Whether two pictures are the same to the byte.
+pub(super) fn same(a: &Mat, b: &Mat) -> bool {
+    core::norm2(a, b, core::NORM_INF, &core::no_array()).is_ok_and(|difference| difference == 0.0)
+}

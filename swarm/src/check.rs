@@ -1,0 +1,339 @@
+//! The invariants: what must hold in every robot cycle, in every tick and at every end, whatever happens.
+//!
+//! Pure; allocates for what it finds; cannot fail. docs/SWARM.md lists the invariants by the names that are used here.
+
+use rt_controller::core::Settings;
+use rt_controller::journal::Tick;
+use serde::Serialize;
+use shared::control::{EndReason, Outcome};
+use shared::messages::{Phase, Telemetry};
+use simulator::ur::{Fault, Machine, RobotMode, RuntimeState, SafetyMode};
+
+use crate::plan::{EyeFault, What};
+
+/// How much faster or farther than its limit a command may be, as a share: rounding in f32, and the robot's own interpolation in f64.
+const SLACK: f64 = 0.02;
+/// How far a command may be beyond a limit, degrees: rounding in f32.
+const SLACK_DEG: f64 = 0.01;
+/// How far a joint that is not ours may be commanded to move in a cycle, rad: rounding.
+const STILL_RAD: f64 = 1e-6;
+/// A container nearer to 0 than this is upright, degrees (`robot.start_tolerance_deg` of config/sim.toml, and half a degree of lag).
+const UPRIGHT_DEG: f64 = 2.5;
+/// The longest way upright of a program that runs, s: 110 degrees at 60 degrees/s, its patience of 100 ms, and 1 s as in docs/ROBOT.md.
+const WAY_UPRIGHT_S: f64 = 110.0 / 60.0 + 0.1 + 1.0;
+/// How far a container on its way upright may tilt again, degrees: what a joint overtakes while it brakes.
+const AGAIN_DEG: f64 = 6.0;
+/// After this a fault that must end a pour has been noticed, s: `controller.stale_feature_ms` and `lost_robot_ms` of config/sim.toml, three
+/// ticks, and the time that a fault of the loop itself takes is added.
+const NOTICED_S: f64 = 0.5;
+/// Number of violations that are kept for a seed; the first is what counts.
+const MOST: usize = 8;
+
+/// Something that must not happen has happened.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct Violation {
+    /// Name of the invariant.
+    pub invariant: &'static str,
+    /// When, s since the start.
+    pub at_s: f64,
+    /// What was seen.
+    pub what: String,
+}
+
+/// A fault that was injected.
+#[derive(Debug, Clone)]
+pub struct Injected {
+    /// What.
+    pub what: What,
+    /// When, s.
+    pub at_s: f64,
+    /// What the controller was doing.
+    pub phase: Phase,
+    /// What had left the vessel, ml.
+    pub poured_ml: f64,
+}
+
+/// What the checks keep.
+#[derive(Debug)]
+pub struct Checks {
+    settings: Settings,
+    /// Violations so far.
+    pub violations: Vec<Violation>,
+    /// Faults so far, the ordinary course left out.
+    pub faults: Vec<Injected>,
+    /// Control period of the robot, s.
+    cycle_s: f64,
+    before_q: Option<[f64; 6]>,
+    before_rate_deg_s: f64,
+    /// Where the servo steered the tilting joint to, degrees, and how fast, degrees/s: after the cycle before, and after the one before that.
+    servo: [(f64, f64); 2],
+    /// The newest target, degrees, and the rate at which it came.
+    target: Option<(f64, f64)>,
+    pub(crate) phase: Phase,
+    /// Since when the robot could have been on its way upright, s.
+    free_since_s: Option<f64>,
+    /// Smallest commanded tilt since nothing is poured, degrees.
+    least_deg: f64,
+    sequence: (u64, u64),
+    used: u64,
+    run_since_s: f64,
+    /// Number of pours and recordings that have ended in this life of the controller.
+    pub outcomes: Vec<(f64, Outcome)>,
+    features_before: u64,
+}
+
+impl Checks {
+    /// Checks of a cell whose robot has control cycles of `cycle_s`.
+    pub fn new(settings: Settings, cycle_s: f64) -> Self {
+        Self {
+            settings,
+            violations: Vec::new(),
+            faults: Vec::new(),
+            cycle_s,
+            before_q: None,
+            before_rate_deg_s: 0.0,
+            servo: [(f64::NAN, f64::NAN); 2],
+            target: None,
+            phase: Phase::NoRobot,
+            free_since_s: None,
+            least_deg: f64::INFINITY,
+            sequence: (0, 0),
+            used: 0,
+            run_since_s: 0.0,
+            outcomes: Vec::new(),
+            features_before: 0,
+        }
+    }
+
+    /// Takes note of a violation.
+    pub fn violated(&mut self, invariant: &'static str, at_s: f64, what: String) {
+        if self.violations.len() < MOST && !self.violations.iter().any(|v| v.invariant == invariant) {
+            self.violations.push(Violation { invariant, at_s, what });
+        }
+    }
+
+    /// Takes note of something that happens.
+    pub fn happens(&mut self, what: &What, at_s: f64, poured_ml: f64) {
+        if !what.is_ordinary() {
+            self.faults.push(Injected { what: what.clone(), at_s, phase: self.phase, poured_ml });
+        }
+    }
+
+    /// A new controller begins.
+    pub fn controller_started(&mut self) {
+        (self.target, self.phase, self.sequence, self.used, self.features_before) = (None, Phase::NoRobot, (0, 0), 0, 0);
+    }
+
+    fn is_active(&self) -> bool {
+        matches!(self.phase, Phase::Pouring | Phase::Recording)
+    }
+
+    /// Looks at the robot after a control cycle. `joint` is the tilting one, and `alpha_deg` its measured tilt.
+    pub fn cycle(&mut self, machine: &Machine, joint: usize, alpha_deg: f64, at_s: f64) {
+        let servo = &machine.robot.servo;
+        let playing = machine.runtime_state() == RuntimeState::Playing && servo.is_servoing();
+        let q = servo.commanded_q;
+        if !playing {
+            self.before_q = None;
+        } else if let Some(before_q) = self.before_q.replace(q) {
+            self.commanded(&before_q, &q, joint, at_s);
+        } else {
+            (self.before_rate_deg_s, self.least_deg) = (0.0, q[joint].to_degrees());
+        }
+        self.servo = [(servo.target_q[joint].to_degrees(), servo.target_qd[joint].to_degrees()), self.servo[0]];
+        self.upright(machine, alpha_deg, at_s);
+    }
+
+    /// What the program on the robot commands in a cycle.
+    fn commanded(&mut self, before_q: &[f64; 6], q: &[f64; 6], joint: usize, at_s: f64) {
+        let limits = self.settings.limits;
+        for other in (0..6).filter(|j| *j != joint) {
+            let moved = (q[other] - before_q[other]).abs();
+            if moved > STILL_RAD {
+                self.violated("others-still", at_s, format!("joint {other} is commanded to move by {moved:.6} rad in a cycle"));
+            }
+        }
+        let alpha_deg = q[joint].to_degrees();
+        if alpha_deg > f64::from(limits.alpha_max_deg) + SLACK_DEG || alpha_deg < f64::from(limits.alpha_min_deg) - UPRIGHT_DEG {
+            self.violated("robot-range", at_s, format!("servoj is given {alpha_deg:.3} degrees"));
+        }
+        // A program that begins anew goes on from where the servo steers the joint, and as fast as that moves. Every command goes on either
+        // from there or from the command before.
+        let from_command = (before_q[joint].to_degrees(), self.before_rate_deg_s);
+        // The program looks at the servo just before it commands, or one cycle before where it was resumed between the two.
+        let most_deg = (f64::from(limits.acceleration_deg_s2) * (1.0 + SLACK) + 1.0) * self.cycle_s * self.cycle_s;
+        let keeps = |(from_deg, rate_deg_s): (f64, f64)| (alpha_deg - from_deg - rate_deg_s * self.cycle_s).abs() <= most_deg;
+        let from_servo = self.servo.into_iter().find(|from| keeps(*from)).filter(|_| !keeps(from_command));
+        let begins_anew = from_servo.is_some();
+        let (from_deg, from_rate_deg_s) = from_servo.unwrap_or(from_command);
+        let rate_deg_s = (alpha_deg - from_deg) / self.cycle_s;
+        if rate_deg_s.abs() > f64::from(limits.rate_deg_s) * (1.0 + SLACK) + 0.1 {
+            self.violated("robot-rate", at_s, format!("servoj is given {rate_deg_s:.2} degrees/s"));
+        }
+        let acceleration = (rate_deg_s - from_rate_deg_s) / self.cycle_s;
+        if acceleration.abs() > f64::from(limits.acceleration_deg_s2) * (1.0 + SLACK) + 1.0 {
+            self.violated("robot-acceleration", at_s, format!("servoj is given {acceleration:.0} degrees/s^2"));
+        }
+        self.before_rate_deg_s = rate_deg_s;
+        self.least_deg = if self.is_active() || begins_anew { alpha_deg } else { self.least_deg.min(alpha_deg) };
+        // The joint is still on its way when the pour ends, by what it lags behind.
+        if alpha_deg > self.least_deg + AGAIN_DEG && rate_deg_s > 0.0 {
+            let least_deg = self.least_deg;
+            self.violated("no-resume", at_s, format!("tilted from {least_deg:.1} to {alpha_deg:.1} degrees while nothing is poured"));
+        }
+    }
+
+    /// Whether the container comes upright when nothing is poured and the program may bring it there.
+    fn upright(&mut self, machine: &Machine, alpha_deg: f64, at_s: f64) {
+        let may = machine.safety_mode() == SafetyMode::Normal
+            && machine.robot_mode() == RobotMode::Running
+            && machine.runtime_state() == RuntimeState::Playing
+            && machine.speed_scaling() > 0.99
+            && machine.robot.servo.limiting() > 0.99
+            && !machine.freedrive();
+        if !may || self.is_active() {
+            self.free_since_s = None;
+        } else if alpha_deg.abs() > UPRIGHT_DEG {
+            let since_s = *self.free_since_s.get_or_insert(at_s);
+            if at_s - since_s > WAY_UPRIGHT_S && !self.slowed_lately(at_s) {
+                self.violated("upright", at_s, format!("still tilted by {alpha_deg:.1} degrees {:.1} s after the end", at_s - since_s));
+            }
+        } else {
+            self.free_since_s = None;
+        }
+    }
+
+    /// Whether something slows the robot that it does not tell, or did so until lately.
+    fn slowed_lately(&self, at_s: f64) -> bool {
+        let slows = |what: &What| {
+            matches!(what, What::Robot(Fault::HeldBack(_) | Fault::JointSpeedLimit(_) | Fault::TimeScaling(_) | Fault::SpeedSlider(_)))
+        };
+        self.faults.iter().any(|f| slows(&f.what) && at_s - f.at_s < 16.0)
+    }
+
+    /// Looks at a tick of the loop.
+    pub fn tick(&mut self, tick: &Tick, telemetry: &Telemetry, features: u64, at_s: f64) {
+        let limits = self.settings.limits;
+        let before = self.phase;
+        self.phase = Phase::from_code(telemetry.phase);
+        if self.is_active() && !matches!(before, Phase::Pouring | Phase::Recording) {
+            self.run_since_s = at_s;
+        }
+        if tick.agent.is_some() && !matches!(before, Phase::Idle | Phase::NoRobot) {
+            self.violated("swap-between-pours", at_s, format!("weights were taken while {before:?}"));
+        }
+        self.count_frames(tick, features, at_s);
+        let Some(target_deg) = tick.target_deg.map(f64::from) else {
+            self.target = None;
+            return self.noticed(at_s);
+        };
+        let period_s = self.settings.period_ns as f64 / 1e9;
+        if !(f64::from(limits.alpha_min_deg) - SLACK_DEG..=f64::from(limits.alpha_max_deg) + SLACK_DEG).contains(&target_deg) {
+            self.violated("target-range", at_s, format!("a target of {target_deg} degrees"));
+        }
+        if let Some((last_deg, last_rate)) = self.target {
+            let rate = (target_deg - last_deg) / period_s;
+            let most = f64::from(limits.rate_deg_s.min(limits.step_deg / period_s as f32));
+            if rate.abs() > most * (1.0 + SLACK) + 0.1 {
+                self.violated("target-rate", at_s, format!("targets move at {rate:.2} degrees/s"));
+            }
+            let acceleration = (rate - last_rate) / period_s;
+            if acceleration.abs() > f64::from(limits.acceleration_deg_s2) * (1.0 + SLACK) + 1.0 {
+                self.violated("target-acceleration", at_s, format!("targets change by {acceleration:.0} degrees/s^2"));
+            }
+            self.target = Some((target_deg, rate));
+        } else {
+            self.target = Some((target_deg, 0.0));
+        }
+        self.noticed(at_s);
+    }
+
+    /// Every frame is counted once: those of a worker that come in order, each a single time.
+    fn count_frames(&mut self, tick: &Tick, features: u64, at_s: f64) {
+        for feature in &tick.features {
+            let (epoch, sequence) = self.sequence;
+            if feature.captured_at_ns <= tick.now_ns && (feature.worker_epoch_ns != epoch || feature.sequence > sequence) {
+                self.sequence = (feature.worker_epoch_ns, feature.sequence);
+                self.used += 1;
+            }
+        }
+        if features != self.used {
+            let used = self.used;
+            self.violated("frames-once", at_s, format!("{features} frames were counted, and {used} came"));
+            self.used = features;
+        }
+    }
+
+    /// Whether every fault that must end a pour has ended it by now.
+    fn noticed(&mut self, at_s: f64) {
+        if !self.is_active() {
+            return;
+        }
+        let since_s = self.run_since_s;
+        let missed = self.faults.iter().find(|f| {
+            f.at_s > since_s
+                && matches!(f.phase, Phase::Pouring | Phase::Recording)
+                && must_end(&f.what).is_some_and(|s| at_s > f.at_s + NOTICED_S + s)
+        });
+        if let Some(fault) = missed {
+            let what = format!("{:?} at {:.2} s has not ended the pour", fault.what, fault.at_s);
+            self.violated("noticed", at_s, what);
+        }
+    }
+
+    /// Looks at how a pour or recording ended. `poured_ml` is the truth since it began.
+    pub fn ended(&mut self, outcome: &Outcome, at_s: f64) {
+        self.outcomes.push((at_s, *outcome));
+        let since_s = at_s - f64::from(outcome.seconds) - 6.0;
+        let reason = outcome.reason;
+        let ordinary = matches!(reason, EndReason::Done | EndReason::ContainerEmpty | EndReason::StreamLost | EndReason::MaxFrames);
+        let named = self.faults.iter().any(|f| f.at_s >= since_s && reasons(&f.what).contains(&reason));
+        if !ordinary && !named {
+            let faults: Vec<_> = self.faults.iter().filter(|f| f.at_s >= since_s).map(|f| f.what.name()).collect();
+            self.violated("reason", at_s, format!("it ended with {reason:?}, and what happened was {faults:?}"));
+        }
+    }
+}
+
+/// How long a fault needs that must end any pour, s, besides [`NOTICED_S`]; `None` if it need not.
+fn must_end(what: &What) -> Option<f64> {
+    match what {
+        What::Robot(Fault::ProtectiveStop | Fault::EmergencyStop | Fault::ProgramPause | Fault::ProgramStop | Fault::Freedrive) => {
+            Some(0.0)
+        }
+        What::Robot(Fault::Fin | Fault::Reset | Fault::Boot | Fault::Offline(_)) | What::LinkCut | What::Abort => Some(0.0),
+        What::Robot(Fault::SpeedSlider(share)) if *share < 0.9 => Some(0.0),
+        What::Robot(Fault::TimeScaling(share)) if *share < 0.9 => Some(0.2),
+        What::Robot(Fault::Freeze(s) | Fault::Stall(s) | Fault::SlowReader(s)) if *s > 0.3 => Some(0.0),
+        What::LinkStall(ms) if *ms > 300 => Some(f64::from(*ms) / 1000.0),
+        What::Suspended(ms) | What::Overrun(ms) if *ms > 200 => Some(f64::from(*ms) / 1000.0),
+        What::ControllerKilled(ms) => Some(f64::from(*ms) / 1000.0),
+        What::Eye(EyeFault::Killed(ms)) => Some(f64::from(*ms) / 1000.0),
+        What::Eye(EyeFault::Hung(ms)) if *ms > 400 => Some(0.0),
+        _ => None,
+    }
+}
+
+/// The reasons that a fault may be reported with.
+fn reasons(what: &What) -> &'static [EndReason] {
+    use EndReason::*;
+    match what {
+        What::Abort => &[Aborted, NotUpright],
+        What::Robot(fault) => match fault {
+            Fault::ProtectiveStop => &[ProtectiveStop, NotUpright, ProgramStopped, NotFollowed],
+            Fault::EmergencyStop => &[EmergencyStop, ProgramStopped, RobotNotRunning],
+            Fault::ProgramPause | Fault::ProgramStop | Fault::ProgramResume | Fault::Jog(..) => &[ProgramStopped, NotFollowed],
+            Fault::SpeedSlider(_) | Fault::TimeScaling(_) => &[SpeedReduced, NotFollowed, NotUpright, ProgramStopped],
+            Fault::HeldBack(_) | Fault::JointSpeedLimit(_) => &[NotFollowed, NotUpright, ProtectiveStop, ProgramStopped],
+            Fault::Freedrive => &[InHand, NotFollowed],
+            Fault::Boot => &[RobotNotRunning, ProgramStopped],
+            _ => &[RobotLost, RobotStalled, ProgramStopped, NotFollowed, NotUpright],
+        },
+        What::LinkStall(_) | What::LinkSplit(_) | What::LinkCut => &[RobotLost, RobotStalled, ProgramStopped, NotFollowed, NotUpright],
+        What::Eye(EyeFault::Killed(_) | EyeFault::Two(_)) => &[WorkerRestarted, StaleFeature],
+        What::Eye(_) => &[StaleFeature, WorkerRestarted],
+        What::Overrun(_) | What::Suspended(_) => &[ControllerOverrun, StaleFeature, RobotLost, RobotStalled, ProgramStopped, NotFollowed],
+        What::ControllerKilled(_) => &[RobotLost],
+        _ => &[],
+    }
+}

@@ -1,0 +1,186 @@
+//! The eye at the depth `area`: from the flow at the lip to the measurement that the worker would publish, with the errors that vision makes.
+//!
+//! Pure, but for the one random sequence that it owns; it allocates and cannot fail.
+
+use std::collections::VecDeque;
+
+use rand::{RngExt, SeedableRng};
+use rand_distr::{Distribution, StandardNormal};
+use rand_pcg::Pcg64Mcg;
+use shared::messages::{Doubt, Feature, LAYOUT_VERSION};
+
+use crate::plan::EyeFault;
+
+/// Area for an outflow of 1 ml a frame, px^2: that of simulator b.
+const AREA_AT_1_ML_PX2: f64 = 400.0;
+/// Exponent with which the area grows with the flow: the middle of those of simulator b's rigs.
+const AREA_EXPONENT: f64 = 0.85;
+/// Areas below this are no stream, px^2 (`image.area_min_px2` of config/sim.toml).
+const AREA_MIN_PX2: f64 = 30.0;
+/// Standard deviation of an area, as a share of it: docs/VISION.md gives a 95th percentile of 5.3 % in whole pours with colour.
+const NOISE: f64 = 0.027;
+/// Share of the frames with a stream that are doubtful (missed flow with colour in whole pours, docs/VISION.md).
+const DOUBTED: f64 = 0.0016;
+/// Share of the frames with a stream that read 0 without a doubt: docs/VISION.md gives 0 of 7,000 with colour, whose bound at 95 % is 0.0004.
+const MISSED: f64 = 0.0004;
+/// Standard deviation of the camera's gain from pour to pour, as a share of it: that of simulator b.
+const GAIN_SD: f64 = 0.015;
+/// From the middle of the exposure until the measurement is published, ns: `simulator.camera_delay_ms` and 2 ms of extraction.
+const DELAY_NS: u64 = 27_000_000;
+/// The largest further delay of a measurement in an ordinary frame, ns (docs/REALTIME.md gives less than a millisecond).
+const JITTER_NS: u64 = 800_000;
+/// Frames in which a gain drifts, and measurements come late: two seconds at 30 Hz.
+const DRIFT_FRAMES: u32 = 60;
+
+/// The camera and its worker.
+#[derive(Debug)]
+pub struct Eye {
+    random: Pcg64Mcg,
+    sequence: u64,
+    epoch_ns: u64,
+    gain: f64,
+    /// The share by which the gain still drifts in each frame, and for how many frames.
+    drift: (f64, u32),
+    lost: u32,
+    frozen: u32,
+    twice: u32,
+    swapped: bool,
+    held_back: Option<Feature>,
+    late: (u64, u32),
+    false_zero: u32,
+    spike_px2: Option<f32>,
+    stuck: (u32, f32),
+    gone_until_ns: u64,
+    two_until_ns: u64,
+    newest: Feature,
+    /// Measurements on their way, with the time of their publication.
+    pub published: VecDeque<Feature>,
+}
+
+impl Eye {
+    /// An eye whose worker starts at `now_ns`.
+    pub fn new(seed: u64, now_ns: u64) -> Self {
+        let mut random = Pcg64Mcg::seed_from_u64(seed ^ 0xE7E);
+        let normal: f64 = StandardNormal.sample(&mut random);
+        Self {
+            random,
+            sequence: 0,
+            epoch_ns: now_ns,
+            gain: 1.0 + GAIN_SD * normal,
+            drift: (0.0, 0),
+            lost: 0,
+            frozen: 0,
+            twice: 0,
+            swapped: false,
+            held_back: None,
+            late: (0, 0),
+            false_zero: 0,
+            spike_px2: None,
+            stuck: (0, 0.0),
+            gone_until_ns: 0,
+            two_until_ns: 0,
+            newest: Feature::default(),
+            published: VecDeque::new(),
+        }
+    }
+
+    /// Something goes wrong at `now_ns`.
+    pub fn inject(&mut self, fault: EyeFault, now_ns: u64) {
+        let until_ns = |ms: u32| now_ns + u64::from(ms) * 1_000_000;
+        match fault {
+            EyeFault::Loss(frames) => self.lost = frames,
+            EyeFault::Freeze(frames) => self.frozen = frames,
+            EyeFault::Duplicate(frames) => self.twice = frames,
+            EyeFault::Reorder => self.swapped = true,
+            EyeFault::Late(ms) => self.late = (u64::from(ms) * 1_000_000, DRIFT_FRAMES),
+            EyeFault::GainDrift(share) => self.drift = (share / f64::from(DRIFT_FRAMES), DRIFT_FRAMES),
+            EyeFault::FalseZero(frames) => self.false_zero = frames,
+            EyeFault::Spike(area_px2) => self.spike_px2 = Some(area_px2),
+            EyeFault::Stuck(frames) => self.stuck = (frames, self.newest.area_px2),
+            EyeFault::Killed(ms) => {
+                self.gone_until_ns = until_ns(ms);
+                self.epoch_ns = self.gone_until_ns;
+                self.published.clear();
+            }
+            EyeFault::Hung(ms) => self.gone_until_ns = until_ns(ms),
+            EyeFault::Two(ms) => self.two_until_ns = until_ns(ms),
+        }
+    }
+
+    /// A frame was exposed at `now_ns`, in which `flow_ml` left the lip since the frame before. What is measured is added to
+    /// [`Eye::published`].
+    pub fn frame(&mut self, now_ns: u64, flow_ml: f64) {
+        self.sequence += 1;
+        // The same numbers are drawn in every frame, so that a fault does not shift the noise of later frames.
+        let normal: f64 = StandardNormal.sample(&mut self.random);
+        let (doubted, missed) = (self.random.random_bool(DOUBTED), self.random.random_bool(MISSED));
+        let jitter_ns = self.random.random_range(0..JITTER_NS);
+        if self.drift.1 > 0 {
+            self.gain *= 1.0 + self.drift.0;
+            self.drift.1 -= 1;
+        }
+        if now_ns < self.gone_until_ns || counted(&mut self.lost) {
+            return;
+        }
+        let area = AREA_AT_1_ML_PX2 * flow_ml.max(0.0).powf(AREA_EXPONENT) * self.gain * (NOISE * normal).exp();
+        let seen = area >= AREA_MIN_PX2;
+        let mut area_px2 = if seen && !missed { area as f32 } else { 0.0 };
+        let mut doubt = Doubt::None;
+        if seen && doubted {
+            (area_px2, doubt) = (0.0, Doubt::EdgeNotFound);
+        }
+        if counted(&mut self.stuck.0) {
+            area_px2 = self.stuck.1;
+        }
+        if counted(&mut self.false_zero) {
+            (area_px2, doubt) = (0.0, Doubt::None);
+        }
+        if let Some(spike_px2) = self.spike_px2.take() {
+            area_px2 = spike_px2;
+        }
+        if counted(&mut self.frozen) {
+            (area_px2, doubt) = (self.newest.area_px2, Doubt::Frozen);
+        }
+        let mut delay_ns = DELAY_NS + jitter_ns;
+        if counted(&mut self.late.1) {
+            delay_ns += self.late.0;
+        }
+        let feature = Feature {
+            version: LAYOUT_VERSION,
+            doubt: doubt as u32,
+            sequence: self.sequence,
+            worker_epoch_ns: self.epoch_ns,
+            captured_at_ns: now_ns,
+            received_at_ns: now_ns + delay_ns - 2_000_000,
+            published_at_ns: now_ns + delay_ns,
+            area_px2,
+            confidence: 1.0,
+            ..Feature::default()
+        };
+        self.newest = feature;
+        self.publish(feature);
+        if counted(&mut self.twice) {
+            self.publish(feature);
+        }
+        if now_ns < self.two_until_ns {
+            self.publish(Feature { worker_epoch_ns: self.two_until_ns, area_px2: area_px2 * 0.9, ..feature });
+        }
+    }
+
+    /// Puts a measurement on its way; what is published keeps its order, as in shared memory.
+    fn publish(&mut self, feature: Feature) {
+        if std::mem::take(&mut self.swapped) {
+            self.held_back = Some(feature);
+            return;
+        }
+        self.published.push_back(feature);
+        self.published.extend(self.held_back.take());
+    }
+}
+
+/// Counts down; true as long as it was above 0.
+fn counted(left: &mut u32) -> bool {
+    let is_on = *left > 0;
+    *left = left.saturating_sub(1);
+    is_on
+}

@@ -1,0 +1,15 @@
+//! The whole cell in virtual time, in one thread, from a seed: the controller's own code, the robot's own program, and everything that goes
+//! wrong. docs/SWARM.md says what it shows and what it does not.
+
+pub mod check;
+pub mod eye;
+pub mod many;
+pub mod pipe;
+pub mod plan;
+pub mod plot;
+pub mod records;
+pub mod run;
+pub mod site;
+pub mod trained;
+pub mod weight_set;
+pub mod world;
