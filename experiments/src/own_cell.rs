@@ -84,6 +84,7 @@ pub struct OwnCell {
     /// When it was prepared.
     pub started: Instant,
     config_file: PathBuf,
+    table: toml::Table,
     stop: Arc<AtomicBool>,
     processes: Vec<(&'static str, Child)>,
 }
@@ -119,13 +120,24 @@ impl OwnCell {
         set("recording", "directory", path("episodes"));
         set("simulator", "seed", toml::Value::Integer(seed as i64));
         let config_file = out.join("sim.toml");
-        let text = toml::to_string_pretty(&table).map_err(|e| bad(&e))?;
-        std::fs::write(&config_file, &text).map_err(|e| file(&config_file, e))?;
+        write_table(&config_file, &table)?;
         let config = Config::read(&config_file).map_err(|e| bad(&e))?;
         let stop = os::stop_at_signals().map_err(|e| OwnCellError::Other(e.to_string()))?;
         let exe = std::env::current_exe().map_err(|e| file(Path::new("own program"), e))?;
         let bin = exe.parent().unwrap_or(Path::new(".")).to_path_buf();
-        Ok(Self { config, out: out.into(), bin, started: Instant::now(), config_file, stop, processes: Vec::new() })
+        Ok(Self { config, out: out.into(), bin, started: Instant::now(), config_file, table, stop, processes: Vec::new() })
+    }
+
+    /// Gives the next start another key of `[simulator]`, or the configuration's own again.
+    ///
+    /// # Errors
+    /// When the configuration cannot be written.
+    pub fn simulate(&self, other: Option<(&str, toml::Value)>) -> Result<(), OwnCellError> {
+        let mut table = self.table.clone();
+        if let (Some((key, value)), Some(toml::Value::Table(simulator))) = (other, table.get_mut("simulator")) {
+            simulator.insert(key.into(), value);
+        }
+        write_table(&self.config_file, &table)
     }
 
     /// Starts simulator, feature worker and controller, and waits until they are ready to pour.
@@ -182,14 +194,18 @@ impl OwnCell {
         if self.stop.load(Ordering::Relaxed) { Err(OwnCellError::Interrupted) } else { Ok(()) }
     }
 
+    /// A program with its words and this cell's configuration, with nothing to read.
+    pub fn program(&self, program: &str, words: &[&str]) -> Command {
+        let mut command = Command::new(self.bin.join(program));
+        command.args(words).arg("--config").arg(&self.config_file).stdin(Stdio::null());
+        command
+    }
+
     /// Starts `name run`; its output goes to a log file.
     fn spawn(&self, name: &str) -> Result<Child, OwnCellError> {
         let log = self.out.join(format!("logs/{name}.log"));
         let log = std::fs::File::create(&log).map_err(|error| OwnCellError::File { what: log.display().to_string(), error })?;
-        Command::new(self.bin.join(name))
-            .args(["run", "--config"])
-            .arg(&self.config_file)
-            .stdin(Stdio::null())
+        self.program(name, &["run"])
             .stdout(Stdio::null())
             .stderr(log)
             .spawn()
@@ -267,4 +283,10 @@ impl Drop for OwnCell {
         // This also removes what a killed process left.
         shared::ipc::remove_files(&self.config.cell);
     }
+}
+
+/// Writes a configuration.
+fn write_table(file: &Path, table: &toml::Table) -> Result<(), OwnCellError> {
+    let text = toml::to_string_pretty(table).map_err(|e| OwnCellError::Config(e.to_string()))?;
+    std::fs::write(file, text).map_err(|error| OwnCellError::File { what: file.display().to_string(), error })
 }

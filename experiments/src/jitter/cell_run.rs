@@ -7,12 +7,16 @@ use shared::os::now_ns;
 
 use super::machine_log::MachineLog;
 use super::processes::{Holding, processor_ns};
-use super::storm::Storm;
+use super::storm::{ROBOT, Storm};
 use super::tick_times::TickTimes;
 use crate::own_cell::{OwnCell, OwnCellError};
 
 /// Time that a pour takes at most, with filling: a pour begins only when so much is left. Chosen by hand; no measurement is recorded.
 const A_POUR: Duration = Duration::from_secs(12);
+
+/// Time before anything is measured: the loop has found its phase behind the camera (4 s, `rt_controller::pacing`), and what starting
+/// costs is over.
+const SETTLING: Duration = Duration::from_secs(6);
 
 /// Pours until `until`, one pour after the other, each into an empty cup, and at least one. Returns their number.
 ///
@@ -67,13 +71,13 @@ pub struct CellRun {
 /// # Errors
 /// When the cell does not start, a command fails, or the journal cannot be read.
 pub fn run_cell(cell: &mut OwnCell, seconds: u64, storm: bool) -> Result<CellRun, OwnCellError> {
+    cell.simulate(storm.then(|| (ROBOT.0, ROBOT.1.into())))?;
     let client = cell.start()?;
     let unreachable = |e: ClientError| OwnCellError::Other(e.to_string());
     let before = client.status().map_err(unreachable)?;
     drop(client);
     let storm = if storm { Some(Storm::start(cell)?) } else { None };
-    // The machine settles first; what starting costs is not of interest.
-    sleep_until(cell, Instant::now() + Duration::from_secs(1))?;
+    sleep_until(cell, Instant::now() + SETTLING)?;
     let (from_ns, from) = (now_ns(), Instant::now());
     let pid = cell.pid("rt-controller");
     let log = MachineLog::start(pid);

@@ -2,6 +2,7 @@
 //!
 //! Ordinary thread; allocates and blocks. `scripts/jitter` installs both programs.
 
+use std::path::Path;
 use std::process::{Child, Command, Stdio};
 
 use crate::own_cell::{OwnCell, OwnCellError};
@@ -22,11 +23,23 @@ impl Drop for Running {
 /// # Errors
 /// When stress-ng cannot be started.
 pub fn load() -> Result<Running, OwnCellError> {
-    let words = "--cpu 2 --vm 1 --vm-bytes 128M --io 1 --hdd 1 --hdd-bytes 64M --quiet";
+    stress("--cpu 2 --vm 1 --vm-bytes 128M --io 1 --hdd 1 --hdd-bytes 64M", &std::env::temp_dir())
+}
+
+/// Makes the disk of a directory slow, until it is dropped: each small write is on the disk before the next.
+///
+/// # Errors
+/// When stress-ng cannot be started.
+pub fn slow_disk(directory: &Path) -> Result<Running, OwnCellError> {
+    stress("--hdd 1 --hdd-bytes 64M --hdd-write-size 4K --hdd-opts wr-seq,fsync", directory)
+}
+
+/// Runs stress-ng with these words, its files in `directory`.
+fn stress(words: &str, directory: &Path) -> Result<Running, OwnCellError> {
     let child = Command::new("stress-ng")
         .args(words.split(' '))
-        .arg("--temp-path")
-        .arg(std::env::temp_dir())
+        .args(["--quiet", "--temp-path"])
+        .arg(directory)
         .stdout(Stdio::null())
         .stderr(Stdio::null())
         .spawn()

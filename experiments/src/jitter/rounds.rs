@@ -10,12 +10,15 @@ use super::condition::Condition;
 use super::measured::Measured;
 use super::other_programs::{cyclictest, latencies_us, load};
 use super::ratios::Ratios;
+use super::storm::STATES_HZ;
 use crate::own_cell::{OwnCell, OwnCellError};
 
 /// The conditions under which the machine is measured.
 const CONDITIONS: [&str; 3] = ["at rest", "under load", "in a storm"];
+/// Rate at which the cell's robot sends states, Hz: it is a CB3, unless the configuration says otherwise.
+const ROBOT_HZ: u64 = 125;
 /// Length of a quick run's cell and of its yardsticks, s: with starting and stopping, less than 60 s in all.
-const QUICK_S: [u64; 2] = [18, 10];
+const QUICK_S: [u64; 2] = [18, 8];
 /// Parts into which a quick run's ticks are cut in place of rounds: each has more than 100 ticks.
 const QUICK_PARTS: usize = 5;
 
@@ -42,7 +45,7 @@ pub fn measure(cell: &mut OwnCell, rounds: usize, seconds: u64) -> Result<Measur
                     }
                     _ => {
                         say(cell, "the bare loop");
-                        condition.bare.push(bare_loop::run(cell, seconds)?);
+                        condition.bare.push(bare_loop::run(cell, seconds, if storm { STATES_HZ } else { ROBOT_HZ })?);
                     }
                 }
             }
@@ -63,7 +66,7 @@ pub fn measure_quickly(cell: &mut OwnCell) -> Result<Measured, OwnCellError> {
     let [cell_s, yardstick_s] = QUICK_S;
     let mut condition = Condition::new(CONDITIONS[0]);
     cell.note("quick: the bare loop");
-    let bare = bare_loop::run(cell, yardstick_s)?;
+    let bare = bare_loop::run(cell, yardstick_s, ROBOT_HZ)?;
     cell.note("quick: the cell");
     let run: CellRun = run_cell(cell, cell_s, false)?;
     cell.note("quick: cyclictest");
@@ -96,7 +99,10 @@ fn told(conditions: &[Condition]) -> Measured {
         html += &part.html;
         numbers.insert(condition.name.into(), part.numbers);
     }
-    let verdict = conditions.iter().map(Condition::verdict).collect::<Vec<_>>().join(" ");
+    let mut verdict = conditions.iter().map(Condition::verdict).collect::<Vec<_>>().join(" ");
+    if let [rest, _, storm] = conditions {
+        verdict += &format!(" {}", storm.over(rest));
+    }
     Measured {
         verdict,
         rounds: conditions.iter().map(|c| (c.name, c.rounds.clone())).collect(),
