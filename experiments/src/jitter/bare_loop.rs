@@ -40,13 +40,13 @@ pub struct BareLoop {
     states_hz: u64,
 }
 
-/// Execution of each tick of a bare loop that runs like the cell's loop for `seconds` and gets `states_hz` states a second, us.
+/// Execution of each tick of a bare loop that runs like the cell's loop for `time` and gets `states_hz` states a second, us.
 ///
 /// # Errors
 /// When the process cannot be started or ends early, or Ctrl-C is pressed.
-pub fn run(cell: &OwnCell, seconds: u64, states_hz: u64) -> Result<Vec<f64>, OwnCellError> {
+pub fn run(cell: &OwnCell, time: Duration, states_hz: u64) -> Result<Vec<f64>, OwnCellError> {
     let c: &Config = &cell.config;
-    let ticks = (seconds as f64 * c.controller.rate_hz) as u64;
+    let ticks = (time.as_secs_f64() * c.controller.rate_hz) as u64;
     let words = [
         ("--core", c.controller.core.to_string()),
         ("--priority", c.controller.priority.to_string()),

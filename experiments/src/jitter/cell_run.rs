@@ -71,6 +71,20 @@ pub struct CellRun {
 /// # Errors
 /// When the cell does not start, a command fails, or the journal cannot be read.
 pub fn run_cell(cell: &mut OwnCell, seconds: u64, storm: bool) -> Result<CellRun, OwnCellError> {
+    let whole = Duration::from_secs(seconds);
+    Ok(run_cell_beside(cell, (whole / 3, whole), storm, |_| Ok(()))?.0)
+}
+
+/// Runs the cell for a time at rest and until a time pouring; meanwhile another thread does `beside`, once the pours begin.
+///
+/// # Errors
+/// As [`run_cell`], and those of `beside`.
+pub fn run_cell_beside<T: Send>(
+    cell: &mut OwnCell,
+    (rest, whole): (Duration, Duration),
+    storm: bool,
+    beside: impl FnOnce(&OwnCell) -> Result<T, OwnCellError> + Send,
+) -> Result<(CellRun, T), OwnCellError> {
     cell.simulate(storm.then(|| (ROBOT.0, ROBOT.1.into())))?;
     let client = cell.start()?;
     let unreachable = |e: ClientError| OwnCellError::Other(e.to_string());
@@ -82,10 +96,14 @@ pub fn run_cell(cell: &mut OwnCell, seconds: u64, storm: bool) -> Result<CellRun
     let pid = cell.pid("rt-controller");
     let log = MachineLog::start(pid);
     let spent_ns = processor_ns(pid);
-    let rest = Duration::from_secs(seconds) / 3;
     sleep_until(cell, from + rest)?;
     let idle_percent = 100.0 * (processor_ns(pid) - spent_ns) as f64 / from.elapsed().as_nanos() as f64;
-    pour_until(cell, from + Duration::from_secs(seconds))?;
+    let running = &*cell;
+    let beside = std::thread::scope(|scope| {
+        let beside = scope.spawn(|| beside(running));
+        pour_until(running, from + whole)?;
+        beside.join().unwrap_or_else(|_| Err(OwnCellError::Other("the yardsticks beside the cell stopped".into())))
+    })?;
     let to_ns = now_ns();
     let (controller, worker) = (Holding::of(pid), Holding::of(cell.pid("feature-worker")));
     drop(storm);
@@ -98,12 +116,13 @@ pub fn run_cell(cell: &mut OwnCell, seconds: u64, storm: bool) -> Result<CellRun
     for (worst, activity) in ticks.worst.iter_mut().zip(log.around(&times_ns)) {
         worst.activity = activity;
     }
-    Ok(CellRun {
+    let run = CellRun {
         ticks,
         idle_percent,
         controller,
         worker,
         allocations: after.loop_allocations - before.loop_allocations,
         page_faults: after.loop_page_faults - before.loop_page_faults,
-    })
+    };
+    Ok((run, beside))
 }

@@ -4,6 +4,7 @@
 
 use std::path::Path;
 use std::process::{Child, Command, Stdio};
+use std::time::Duration;
 
 use crate::own_cell::{OwnCell, OwnCellError};
 
@@ -47,11 +48,11 @@ fn stress(words: &str, directory: &Path) -> Result<Running, OwnCellError> {
     Ok(Running(child))
 }
 
-/// Starts cyclictest like the loop, with one reading a line, for `seconds`; its priority is lower than the loop's by `below`.
+/// Starts cyclictest like the loop, with one reading a line, for `time`; its priority is lower than the loop's by `below`.
 ///
 /// # Errors
 /// When cyclictest cannot be started.
-pub fn cyclictest(cell: &OwnCell, seconds: u64, below: u8) -> Result<Child, OwnCellError> {
+pub fn cyclictest(cell: &OwnCell, time: Duration, below: u8) -> Result<Child, OwnCellError> {
     let c = &cell.config.controller;
     let interval_us = (1e6 / c.rate_hz) as u64;
     Command::new("cyclictest")
@@ -59,7 +60,7 @@ pub fn cyclictest(cell: &OwnCell, seconds: u64, below: u8) -> Result<Child, OwnC
         .arg(format!("--priority={}", c.priority.saturating_sub(below)))
         .arg(format!("--affinity={}", c.core))
         .arg(format!("--interval={interval_us}"))
-        .arg(format!("--loops={}", seconds * 1_000_000 / interval_us))
+        .arg(format!("--loops={}", time.as_micros() as u64 / interval_us))
         .stdin(Stdio::null())
         .stdout(Stdio::piped())
         .stderr(Stdio::null())

@@ -58,7 +58,7 @@ impl Reading {
 
 /// cyclictest, and the thread that reads its latencies (us).
 fn start_yardstick(cell: &OwnCell, seconds: u64) -> Result<(Running, JoinHandle<Vec<f64>>), OwnCellError> {
-    let mut yardstick = cyclictest(cell, seconds, 1)?;
+    let mut yardstick = cyclictest(cell, Duration::from_secs(seconds), 1)?;
     let output = yardstick.stdout.take();
     let reader = std::thread::spawn(move || {
         let mut bytes = Vec::new();
