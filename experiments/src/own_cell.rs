@@ -205,11 +205,10 @@ impl OwnCell {
     fn spawn(&self, name: &str) -> Result<Child, OwnCellError> {
         let log = self.out.join(format!("logs/{name}.log"));
         let log = std::fs::File::create(&log).map_err(|error| OwnCellError::File { what: log.display().to_string(), error })?;
-        self.program(name, &["run"])
-            .stdout(Stdio::null())
-            .stderr(log)
-            .spawn()
-            .map_err(|error| OwnCellError::File { what: name.into(), error })
+        let mut command = self.program(name, &["run"]);
+        command.stdout(Stdio::null()).stderr(log);
+        let spawned = if name == "simulator" { off_core(self.config.controller.core, || command.spawn()) } else { command.spawn() };
+        spawned.map_err(|error| OwnCellError::File { what: name.into(), error })
     }
 
     /// Runs one command of an operator to its end, and reads its JSON.
@@ -289,4 +288,24 @@ impl Drop for OwnCell {
 fn write_table(file: &Path, table: &toml::Table) -> Result<(), OwnCellError> {
     let text = toml::to_string_pretty(table).map_err(|e| OwnCellError::Config(e.to_string()))?;
     std::fs::write(file, text).map_err(|error| OwnCellError::File { what: file.display().to_string(), error })
+}
+
+/// Does something in a thread that never runs on `core`, and that whatever it starts inherits this from: what stands for the robot is another
+/// machine in truth, and may not share the loop's core. On a machine with one core, or that does not permit it, it runs anywhere.
+pub fn off_core<T: Send>(core: usize, what: impl FnOnce() -> T + Send) -> T {
+    std::thread::scope(|scope| {
+        let others = || {
+            if let Ok(mut cores) = rustix::thread::sched_getaffinity(None)
+                && cores.count() > 1
+            {
+                cores.unset(core);
+                let _ = rustix::thread::sched_setaffinity(None, &cores);
+            }
+            what()
+        };
+        match scope.spawn(others).join() {
+            Ok(value) => value,
+            Err(panic) => std::panic::resume_unwind(panic),
+        }
+    })
 }

@@ -15,7 +15,7 @@ use rt_controller::link::wire;
 use shared::config::Config;
 use shared::os;
 
-use crate::own_cell::{OwnCell, OwnCellError};
+use crate::own_cell::{OwnCell, OwnCellError, off_core};
 
 /// Largest number of bytes that one tick receives: as in the controller's inbox.
 const RECEIVE_MAX: usize = 1 << 16;
@@ -76,10 +76,12 @@ pub fn measure(settings: &BareLoop) -> std::io::Result<Vec<f64>> {
     robot.set_nodelay(true)?;
     socket.set_nonblocking(true)?;
     let reader = robot.try_clone()?;
-    // Both end when the loop closes its socket.
+    // Both end when the loop closes its socket. Which core they run on decides what a send costs the loop, so it is the same in each run.
     let states_hz = settings.states_hz;
-    std::thread::spawn(move || send_states(robot, states_hz));
-    std::thread::spawn(move || read_targets(reader));
+    off_core(settings.core, move || {
+        std::thread::spawn(move || send_states(robot, states_hz));
+        std::thread::spawn(move || read_targets(reader));
+    });
     let mut buffer = vec![0; RECEIVE_MAX];
     let mut times_us = vec![0.0; settings.ticks];
     // What is refused here is refused to the controller too, which says so.
