@@ -6,10 +6,11 @@ use rt_controller::core::Settings;
 use rt_controller::journal::Tick;
 use serde::Serialize;
 use shared::control::{EndReason, Outcome};
+use shared::limits::Limits;
 use shared::messages::{Phase, Telemetry};
 use simulator::ur::{Fault, Machine, RobotMode, RuntimeState, SafetyMode};
 
-use crate::plan::{EyeFault, What};
+use crate::what::{EyeFault, What};
 
 /// How much faster or farther than its limit a command may be, as a share: rounding in f32, and the robot's own interpolation in f64.
 const SLACK: f64 = 0.02;
@@ -49,8 +50,6 @@ pub struct Injected {
     pub at_s: f64,
     /// What the controller was doing.
     pub phase: Phase,
-    /// What had left the vessel, ml.
-    pub poured_ml: f64,
 }
 
 /// What the checks keep.
@@ -113,15 +112,20 @@ impl Checks {
     }
 
     /// Takes note of something that happens.
-    pub fn happens(&mut self, what: &What, at_s: f64, poured_ml: f64) {
+    pub fn happens(&mut self, what: &What, at_s: f64) {
         if !what.is_ordinary() {
-            self.faults.push(Injected { what: what.clone(), at_s, phase: self.phase, poured_ml });
+            self.faults.push(Injected { what: what.clone(), at_s, phase: self.phase });
         }
     }
 
     /// A new controller begins.
     pub fn controller_started(&mut self) {
         (self.target, self.phase, self.sequence, self.used, self.features_before) = (None, Phase::NoRobot, (0, 0), 0, 0);
+    }
+
+    /// The limits on alpha.
+    pub fn limits(&self) -> Limits {
+        self.settings.limits
     }
 
     fn is_active(&self) -> bool {

@@ -3,6 +3,7 @@
 
 pub mod check;
 pub mod eye;
+pub mod faults;
 pub mod many;
 pub mod pipe;
 pub mod plan;
@@ -11,5 +12,7 @@ pub mod records;
 pub mod run;
 pub mod site;
 pub mod trained;
+pub mod vessels;
 pub mod weight_set;
+pub mod what;
 pub mod world;
