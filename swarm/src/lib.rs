@@ -5,6 +5,7 @@ pub mod check;
 pub mod eye;
 pub mod faults;
 pub mod many;
+pub mod noticing;
 pub mod pipe;
 pub mod plan;
 pub mod plot;

@@ -10,10 +10,11 @@ use clap::Parser;
 use shared::config::Config;
 use swarm::faults::{KINDS, named};
 use swarm::many::{Seeds, Spread, Summary, run_many, shrink};
-use swarm::plan::Plan;
+use swarm::plan::{Choice, Plan};
 use swarm::plot::plot;
 use swarm::run::{self, Shown};
 use swarm::trained::train_for;
+use swarm::vessels::VESSELS;
 
 /// Exit code of a violation.
 const VIOLATED: u8 = 1;
@@ -40,6 +41,9 @@ struct Args {
     /// Draws in each pour one fault of this kind, and no other, as in `--only link-cut`.
     #[arg(long, value_name = "FAULT")]
     only: Option<String>,
+    /// Draws from the first so many vessels only, so that little is trained.
+    #[arg(long, value_name = "N", default_value_t = VESSELS.len() as u8, value_parser = clap::value_parser!(u8).range(1..=VESSELS.len() as i64))]
+    vessels: u8,
     /// Writes what they showed to this file.
     #[arg(long, requires = "seeds")]
     json: Option<PathBuf>,
@@ -80,10 +84,10 @@ fn bad_input(line: &str) -> ExitCode {
 
 /// Carries out the command. False if an invariant was violated.
 fn start(args: &Args, config: &Config) -> Result<bool, String> {
-    let only = args.only.as_deref().map(named).transpose()?;
+    let choice = Choice { only: args.only.as_deref().map(named).transpose()?, vessels: usize::from(args.vessels) };
     match (args.seed, args.seeds) {
-        (Some(seed), _) => one(args, &Plan::draw_with(seed, only), config),
-        (None, Some(count)) => many(args, Seeds { from: args.from, count, only }, config),
+        (Some(seed), _) => one(args, &Plan::draw_with(seed, choice), config),
+        (None, Some(count)) => many(args, Seeds { from: args.from, count, choice }, config),
         (None, None) => Err("give --seed or --seeds".into()),
     }
 }
@@ -104,10 +108,17 @@ fn kept(text: &str, plan: &Plan) -> Result<Vec<usize>, String> {
     text.split(',').map(|part| number(part).ok_or_else(wrong)).collect()
 }
 
+/// The options that say from what a seed draws.
+fn drawn_from(args: &Args) -> String {
+    let only = args.only.as_ref().map_or_else(String::new, |name| format!(" --only {name}"));
+    let vessels = if usize::from(args.vessels) < VESSELS.len() { format!(" --vessels {}", args.vessels) } else { String::new() };
+    only + &vessels
+}
+
 /// One seed.
 fn one(args: &Args, drawn: &Plan, config: &Config) -> Result<bool, String> {
     let (mut plan, seed) = (drawn.clone(), drawn.seed);
-    let only = args.only.as_ref().map_or_else(String::new, |name| format!(" --only {name}"));
+    let only = drawn_from(args);
     let mut keep = only.clone();
     if let Some(text) = &args.keep {
         plan = plan.keep(&kept(text, &plan)?);
@@ -167,7 +178,7 @@ fn many(args: &Args, seeds: Seeds, config: &Config) -> Result<bool, String> {
     let (shown, summary) = run_many(seeds, config, true);
     shown.iter().filter(|one| !one.violations.is_empty()).take(10).for_each(|one| {
         print(&format!("seed {}:", one.seed));
-        complain(one, &args.only.as_ref().map_or_else(String::new, |name| format!(" --only {name}")));
+        complain(one, &drawn_from(args));
     });
     report(&summary, started.elapsed().as_secs_f64());
     if let (Some(file), Some(path)) = (file, &args.json) {

@@ -12,7 +12,7 @@ use shared::config::Config;
 use shared::control::EndReason;
 
 use crate::faults::KINDS;
-use crate::plan::Plan;
+use crate::plan::{Choice, Plan};
 use crate::run::{self, Shown};
 use crate::trained::train_for;
 use crate::weight_set::TrainedSet;
@@ -95,14 +95,14 @@ pub struct Seeds {
     pub from: u64,
     /// How many.
     pub count: u64,
-    /// The kind of the one fault of each pour, as an index into [`KINDS`]; otherwise what the seed draws.
-    pub only: Option<usize>,
+    /// From what they draw.
+    pub choice: Choice,
 }
 
 /// Runs seeds on all cores, with a progress bar if `progress`.
 pub fn run_many(seeds: Seeds, config: &Config, progress: bool) -> (Vec<Shown>, Summary) {
     let last = seeds.from.saturating_add(seeds.count);
-    let plans: Vec<Plan> = (seeds.from..last).map(|seed| Plan::draw_with(seed, seeds.only)).collect();
+    let plans: Vec<Plan> = (seeds.from..last).map(|seed| Plan::draw_with(seed, seeds.choice)).collect();
     let say = |text: &str| {
         if progress {
             eprintln!("swarm: {text}");

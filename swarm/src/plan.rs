@@ -17,6 +17,21 @@ const REST_S: f64 = 12.0;
 /// Share of the seeds in which a curve is recorded, learned from, and the weights swapped. Few, because a training takes longer than a pour.
 const LESSONS: f64 = 0.01;
 
+/// From what seeds draw.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Choice {
+    /// The kind of the one fault in each pour, as an index into [`KINDS`]; otherwise none to four of all kinds.
+    pub only: Option<usize>,
+    /// How many of the [`VESSELS`], from the first on. With few of them little is trained.
+    pub vessels: usize,
+}
+
+impl Default for Choice {
+    fn default() -> Self {
+        Self { only: None, vessels: VESSELS.len() }
+    }
+}
+
 /// One thing that happens, and when.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Item {
@@ -52,14 +67,14 @@ pub struct Plan {
 impl Plan {
     /// The plan that `seed` draws.
     pub fn draw(seed: u64) -> Self {
-        Self::draw_with(seed, None)
+        Self::draw_with(seed, Choice::default())
     }
 
-    /// The plan that `seed` draws, with one fault in each pour, of the kind with this number, if one is given.
-    pub fn draw_with(seed: u64, only: Option<usize>) -> Self {
+    /// The plan that `seed` draws from a choice.
+    pub fn draw_with(seed: u64, choice: Choice) -> Self {
         let mut random = Pcg64Mcg::seed_from_u64(seed.wrapping_mul(0x9e37_79b9_7f4a_7c15) ^ 0x5eed);
         let series = if random.random_bool(0.25) { Series::ESeries } else { Series::Cb3 };
-        let vessel = random.random_range(0..VESSELS.len());
+        let vessel = random.random_range(0..choice.vessels.clamp(1, VESSELS.len()));
         let almost_empty = random.random_bool(0.05);
         let fill_ml = if almost_empty { random.random_range(5.0..60.0) } else { random.random_range(150.0..450.0) };
         let delay_ns = (random.random_range(20_000..500_000), random.random_range(0..1_500_000));
@@ -69,17 +84,24 @@ impl Plan {
         if is_lesson {
             at_ms = plan.draw_lesson(&mut random, at_ms);
         }
-        for _ in 0..orders {
+        for nth in 1..=orders {
             let what = if random.random_bool(0.8) { What::Pour(goal_ml(&mut random)) } else { curve(&mut random) };
             plan.push(at_ms, what, None);
             let faults = if random.random_bool(0.1) { 0 } else { random.random_range(1..=4) };
-            match only {
+            match choice.only {
                 Some(kind) => plan.add_fault(&mut random, at_ms, kind),
                 None => plan.draw_faults(&mut random, at_ms, faults),
             }
             at_ms += random.random_range(14_000..22_000);
-            plan.push(at_ms - 1_500, What::Refill(random.random_range(150.0..450.0)), None);
-            plan.push(at_ms - 1_400, What::Resume, None);
+            if nth < orders {
+                plan.push(at_ms - 1_500, What::Refill(random.random_range(150.0..450.0)), None);
+                plan.push(at_ms - 1_400, What::Resume, None);
+            }
+        }
+        for item in &mut plan.items {
+            if let What::Weights(vessel) = &mut item.what {
+                *vessel %= choice.vessels.max(1);
+            }
         }
         plan.finish();
         plan

@@ -146,10 +146,10 @@ pub struct Site {
 }
 
 impl Site {
-    /// The cell of a plan. `wanted` keeps the story and the rows.
-    pub fn new(plan: &Plan, trained: &TrainedSet, config: &Config, wanted: bool) -> Self {
+    /// The cell of a plan, checked against the limits of `checked`. `wanted` keeps the story and the rows.
+    pub fn new(plan: &Plan, trained: &TrainedSet, checked: &Config, wanted: bool) -> Self {
         let series = plan.series;
-        let joint = config.robot.joint.index();
+        let joint = checked.robot.joint.index();
         let right = std::f64::consts::FRAC_PI_2;
         let machine = Machine::new(series, series.default_version(), [0.0, -right, right, -right, -right, 0.0]);
         let (rig, mut container) = vessels::rig(plan.vessel);
@@ -165,7 +165,7 @@ impl Site {
             wiring: Wiring::new(plan.seed, plan.delay_ns.0, plan.delay_ns.1),
             container,
             eye: Eye::new(plan.seed, START_NS, rig.area_exponent),
-            checks: Checks::new(Settings::new(config), cycle_ns as f64 / 1e9),
+            checks: Checks::new(Settings::new(checked), cycle_ns as f64 / 1e9),
             trained: trained.clone(),
             random,
             joint,
@@ -268,6 +268,10 @@ impl Site {
         self.cycle_at_ns += self.cycle_ns;
         self.robot.serve();
         for line in self.robot.cycle() {
+            if line.text.ends_with(" started") {
+                let at_s = self.now_s();
+                self.checks.program_started(at_s);
+            }
             self.say(|| format!("robot: {}", line.text));
         }
         let alpha_deg = self.robot.machine().robot.servo.actual_q[self.joint].to_degrees();
@@ -298,19 +302,19 @@ impl Site {
         if std::mem::take(&mut self.went_on) {
             self.open_faults.clear();
         }
-        if self.checks.phase != Phase::Settling {
-            // Where more than one fault came, the largest of their bounds holds.
-            let bounds = self.open_faults.iter().map(|open| open.kind.bound_ml.unwrap_or(f64::INFINITY));
-            let bound_ml = bounds.fold(0.0, f64::max);
-            for open in std::mem::take(&mut self.open_faults) {
-                let excess_ml = poured_ml - open.noticed_ml.unwrap_or(poured_ml);
-                let fault = open.kind.name;
-                if excess_ml > bound_ml {
-                    let what = format!("{excess_ml:.1} ml left after {fault} could be noticed; at most {bound_ml} may");
-                    self.checks.violated("bound", at_s, what);
-                }
-                self.costs.push(Cost { fault, excess_ml, since_ml: poured_ml - open.at_ml, upright_s: at_s - open.at_s });
-            }
+        if matches!(self.checks.phase, Phase::Settling | Phase::Returning) {
+            return;
+        }
+        let excess_ml = |open: &OpenFault| poured_ml - open.noticed_ml.unwrap_or(poured_ml);
+        // The pour went on after faults that need not end it. So one of them at least must explain what left after it.
+        let is_within = |open: &OpenFault| open.kind.bound_ml.is_none_or(|bound_ml| excess_ml(open) <= bound_ml);
+        if !self.open_faults.is_empty() && !self.open_faults.iter().any(is_within) {
+            let left: Vec<_> = self.open_faults.iter().map(|open| format!("{:.1} ml after {}", excess_ml(open), open.kind.name)).collect();
+            self.checks.violated("bound", at_s, format!("more left after a fault could be noticed than may: {}", left.join(", ")));
+        }
+        for open in std::mem::take(&mut self.open_faults) {
+            let (since_ml, upright_s) = (poured_ml - open.at_ml, at_s - open.at_s);
+            self.costs.push(Cost { fault: open.kind.name, excess_ml: excess_ml(&open), since_ml, upright_s });
         }
     }
 
@@ -345,9 +349,9 @@ impl Site {
     pub fn ended(&mut self, outcome: &Outcome) {
         let at_s = self.now_s();
         self.say(|| format!("ended: {:?}, {:.1} ml believed", outcome.reason, outcome.poured_ml));
-        self.checks.ended(outcome, at_s);
-        self.went_on = matches!(outcome.reason, EndReason::Done | EndReason::ContainerEmpty | EndReason::StreamLost | EndReason::MaxFrames);
         let true_ml = self.container.poured_ml() - self.run_poured_ml;
+        self.checks.ended(outcome, true_ml, at_s);
+        self.went_on = matches!(outcome.reason, EndReason::Done | EndReason::ContainerEmpty | EndReason::StreamLost | EndReason::MaxFrames);
         let since_s = at_s - f64::from(outcome.seconds) - 6.0;
         let faults = self.fault_times.iter().filter(|(began_s, _)| *began_s >= since_s).map(|(_, name)| *name).collect();
         let (reason, goal_ml, believed_ml) = (outcome.reason, outcome.goal_ml, outcome.poured_ml);
