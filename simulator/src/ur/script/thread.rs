@@ -4,7 +4,7 @@
 //! program is an error without a line, which the caller adds.
 
 use super::compile::{Code, Op, Routine};
-use super::value::{Value, binary};
+use super::value::{Value, binary, binary_of_floats};
 use crate::ur::robot::Robot;
 
 /// What a thread waits for.
@@ -104,7 +104,7 @@ impl ScriptThread {
             }
             Op::Pose => {
                 let items = self.take(6);
-                self.stack.push(Value::Pose(Value::list(items).and_then(|l| l.six())?));
+                self.stack.push(Value::Pose(Box::new(Value::list(items).and_then(|l| l.six())?)));
             }
             Op::Index => {
                 let index = pop(stack);
@@ -120,6 +120,14 @@ impl ScriptThread {
                 stack.push(value);
             }
             Op::Binary(operator) => {
+                if let [.., a, Value::Float(y)] = stack.as_mut_slice()
+                    && let Value::Float(x) = a
+                    && let Some(value) = binary_of_floats(*operator, *x, *y)
+                {
+                    *a = value;
+                    stack.pop();
+                    return Ok(());
+                }
                 let b = pop(stack);
                 let a = pop(stack);
                 stack.push(binary(*operator, &a, &b)?);
