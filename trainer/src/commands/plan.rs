@@ -52,7 +52,7 @@ pub fn run(args: &Args) -> Result<(), Failure> {
         None => Limits::default(),
         Some(file) => shared::config::Config::read(file).map(|c| c.limits).or_exit(exit::BAD_INPUT)?,
     };
-    if args.holds.is_some_and(|ml| !(HOLDS_ML.0..=HOLDS_ML.1).contains(&ml)) || !(args.goal_max >= 1.0) {
+    if args.holds.is_some_and(|ml| !(HOLDS_ML.0..=HOLDS_ML.1).contains(&ml)) || args.goal_max.is_nan() || args.goal_max < 1.0 {
         let what = format!("--holds is {} to {} ml, and --goal-max at least 1 ml", HOLDS_ML.0, HOLDS_ML.1);
         return Err(failure(exit::BAD_INPUT, what));
     }
