@@ -16,7 +16,7 @@ use shared::exit::{self, Failure, failure};
 use shared::messages::Phase;
 use shared::os;
 
-use crate::own_folder;
+use crate::own_folder::{self, FolderError};
 
 /// Why the cell, or an operator's command in it, did not do what it was asked to.
 #[derive(Debug, thiserror::Error)]
@@ -62,6 +62,15 @@ pub enum OwnCellError {
     Other(String),
 }
 
+impl From<FolderError> for OwnCellError {
+    fn from(error: FolderError) -> Self {
+        match error {
+            FolderError::NotOurs(_) => Self::Config(error.to_string()),
+            FolderError::File { path, error } => Self::File { what: path.display().to_string(), error },
+        }
+    }
+}
+
 impl From<OwnCellError> for Failure {
     fn from(error: OwnCellError) -> Self {
         let code = match error {
@@ -101,7 +110,7 @@ impl OwnCell {
         let text = std::fs::read_to_string(config).map_err(|e| file(config, e))?;
         Config::parse(&text, &config.display().to_string()).map_err(|e| bad(&e))?;
         let mut table: toml::Table = text.parse().map_err(|e| bad(&format!("{}: {e}", config.display())))?;
-        own_folder::claim(out, &[results, &["logs", "weights.bin"]].concat()).map_err(|e| bad(&e))?;
+        own_folder::claim(out, &[results, &["logs", "weights.bin"]].concat())?;
         std::fs::create_dir_all(out.join("logs")).map_err(|e| file(out, e))?;
         let mut set = |section: &str, key: &str, value: toml::Value| {
             if let Some(toml::Value::Table(t)) = table.get_mut(section) {

@@ -100,7 +100,7 @@ struct Run {
     /// Start time of the feature worker that measured when it began, ns.
     worker_epoch_ns: u64,
     counters_before: Counters,
-    late_ticks: u32,
+    tick_gaps: u32,
 }
 
 /// The controller's state.
@@ -179,10 +179,10 @@ impl Core {
     pub fn step(&mut self, input: &Input) -> Output {
         self.counters.ticks += 1;
         let overran = ending::controller_overran(input.now_ns, self.last_tick_ns, &self.settings);
-        let late = self.last_tick_ns != 0 && input.now_ns.saturating_sub(self.last_tick_ns) > self.settings.period_ns * 3 / 2;
+        let gap = self.last_tick_ns != 0 && input.now_ns.saturating_sub(self.last_tick_ns) > self.settings.period_ns * 3 / 2;
         self.last_tick_ns = input.now_ns;
         if let Some(run) = &mut self.run {
-            run.late_ticks += u32::from(late);
+            run.tick_gaps += u32::from(gap);
         }
 
         let mut ended = self.look_at_robot(input);
@@ -265,7 +265,7 @@ impl Core {
             settling_since_ns: 0,
             worker_epoch_ns: newest.map_or(0, |f| f.worker_epoch_ns),
             counters_before: self.counters(),
-            late_ticks: 0,
+            tick_gaps: 0,
         });
         self.request_deg = self.limiter.alpha_deg();
         self.phase = if curve.is_some() { Phase::Recording } else { Phase::Pouring };
@@ -428,7 +428,7 @@ impl Core {
             frames: run.frames,
             bridged_frames: (now.bridged_frames - before.bridged_frames) as u32,
             stale_features: (now.stale_features - before.stale_features) as u32,
-            late_ticks: run.late_ticks,
+            tick_gaps: run.tick_gaps,
             clipped: Clipped {
                 angle: now.clipped.angle - before.clipped.angle,
                 rate: now.clipped.rate - before.clipped.rate,

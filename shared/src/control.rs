@@ -82,8 +82,8 @@ pub struct Outcome {
     pub bridged_frames: u32,
     /// Number of ticks without a fresh measurement.
     pub stale_features: u32,
-    /// Number of ticks that came more than one and a half periods after the one before.
-    pub late_ticks: u32,
+    /// Number of gaps: ticks that came more than one and a half periods after the one before. [`Status::late_ticks`] counts late wake-ups.
+    pub tick_gaps: u32,
     /// How often each limit changed a request.
     pub clipped: Clipped,
 }

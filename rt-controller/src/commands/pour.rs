@@ -63,14 +63,14 @@ fn report(outcome: &Outcome, recorded: Option<client::Recorded>, json: bool) {
         println!("{}", serde_json::json!({ "outcome": outcome, "episode_file": file }));
     } else {
         println!(
-            "{}: {:.1} ml poured (estimate) for a goal of {:.1} ml in {:.1} s; {} frames ({} bridged), {} late ticks, {} stale features",
+            "{}: {:.1} ml poured (estimate) for a goal of {:.1} ml in {:.1} s; {} frames ({} bridged), {} gaps between ticks, {} stale features",
             outcome.reason.words(),
             outcome.poured_ml,
             outcome.goal_ml.unwrap_or(f32::NAN),
             outcome.seconds,
             outcome.frames,
             outcome.bridged_frames,
-            outcome.late_ticks,
+            outcome.tick_gaps,
             outcome.stale_features
         );
         match recorded.map(|r| r.file) {
