@@ -8,6 +8,7 @@ use std::process::ExitCode;
 
 use clap::Parser;
 use shared::config::Config;
+use simulator::ur::Series;
 use swarm::faults::{KINDS, named};
 use swarm::many::{Seeds, Spread, Summary, run_many, shrink};
 use swarm::plan::{Choice, Plan};
@@ -44,6 +45,9 @@ struct Args {
     /// Draws from the first so many vessels only, so that little is trained.
     #[arg(long, value_name = "N", default_value_t = VESSELS.len() as u8, value_parser = clap::value_parser!(u8).range(1..=VESSELS.len() as i64))]
     vessels: u8,
+    /// Draws only robots of this generation.
+    #[arg(long, value_enum)]
+    robot: Option<Robot>,
     /// Writes what they showed to this file.
     #[arg(long, requires = "seeds")]
     json: Option<PathBuf>,
@@ -56,6 +60,24 @@ struct Args {
     /// Draws the run to this SVG file.
     #[arg(long, requires = "seed")]
     plot: Option<PathBuf>,
+}
+
+/// A generation of robots.
+#[derive(Debug, Clone, Copy, clap::ValueEnum)]
+enum Robot {
+    /// 125 Hz.
+    Cb3,
+    /// 500 Hz.
+    ESeries,
+}
+
+impl Robot {
+    fn series(self) -> Series {
+        match self {
+            Self::Cb3 => Series::Cb3,
+            Self::ESeries => Series::ESeries,
+        }
+    }
 }
 
 fn main() -> ExitCode {
@@ -84,7 +106,11 @@ fn bad_input(line: &str) -> ExitCode {
 
 /// Carries out the command. False if an invariant was violated.
 fn start(args: &Args, config: &Config) -> Result<bool, String> {
-    let choice = Choice { only: args.only.as_deref().map(named).transpose()?, vessels: usize::from(args.vessels) };
+    let choice = Choice {
+        only: args.only.as_deref().map(named).transpose()?,
+        vessels: usize::from(args.vessels),
+        series: args.robot.map(Robot::series),
+    };
     match (args.seed, args.seeds) {
         (Some(seed), _) => one(args, &Plan::draw_with(seed, choice), config),
         (None, Some(count)) => many(args, Seeds { from: args.from, count, choice }, config),
@@ -112,7 +138,11 @@ fn kept(text: &str, plan: &Plan) -> Result<Vec<usize>, String> {
 fn drawn_from(args: &Args) -> String {
     let only = args.only.as_ref().map_or_else(String::new, |name| format!(" --only {name}"));
     let vessels = if usize::from(args.vessels) < VESSELS.len() { format!(" --vessels {}", args.vessels) } else { String::new() };
-    only + &vessels
+    let robot = args.robot.map_or("", |robot| match robot {
+        Robot::Cb3 => " --robot cb3",
+        Robot::ESeries => " --robot e-series",
+    });
+    only + &vessels + robot
 }
 
 /// One seed.
@@ -199,7 +229,16 @@ fn spread(of: &Spread) -> String {
 fn report(summary: &Summary, wall_s: f64) {
     let last = summary.from + (summary.seeds - 1);
     let (pours, virtual_s) = (summary.pours, summary.virtual_s);
-    print(&format!("seeds {} to {last}: {pours} pours and recordings, {virtual_s:.0} s in {wall_s:.1} s", summary.from));
+    let times = virtual_s / summary.processor_s.max(1e-9);
+    print(&format!(
+        "seeds {} to {last}: {pours} pours and recordings, {virtual_s:.0} s in {wall_s:.1} s; {times:.0} times real time a core, training left out",
+        summary.from
+    ));
+    let violating = summary.violations.values().map(|(n, _)| n).sum::<usize>();
+    if violating == 0 && pours > 0 {
+        let bound = 3.0 / pours as f64;
+        print(&format!("no violation in {pours}: fewer than {bound:.1e} a pour at 95 %, if pours are drawn as here"));
+    }
     print(&format!("ended: {:?}", summary.reasons));
     print("| fault | n done | left - goal, ml: median, p99, largest | left - said, ml: median, p99, largest |");
     for row in &summary.done {

@@ -6,6 +6,7 @@ use std::collections::BTreeMap;
 
 use indicatif::{ParallelProgressIterator, ProgressBar, ProgressStyle};
 use rayon::prelude::*;
+use rustix::time::{ClockId, clock_gettime};
 use serde::Serialize;
 use sha2::{Digest, Sha256};
 use shared::config::Config;
@@ -76,6 +77,8 @@ pub struct Summary {
     pub pours: usize,
     /// Virtual time, s.
     pub virtual_s: f64,
+    /// Processor time that it took on all cores together, without the training, s.
+    pub processor_s: f64,
     /// Number of violations by invariant, and the seeds of the first ones.
     pub violations: BTreeMap<String, (usize, Vec<u64>)>,
     /// How often pours and recordings ended for each reason.
@@ -113,9 +116,16 @@ pub fn run_many(seeds: Seeds, config: &Config, progress: bool) -> (Vec<Shown>, S
     if let Ok(style) = ProgressStyle::with_template("{pos}/{len} seeds  {wide_bar}  {eta}") {
         bar.set_style(style);
     }
+    let before_s = processor_s();
     let shown: Vec<Shown> = plans.par_iter().progress_with(bar).map(|plan| run::run(plan, &trained, config, false)).collect();
-    let summary = sum_up(seeds, &shown);
+    let summary = Summary { processor_s: processor_s() - before_s, ..sum_up(seeds, &shown) };
     (shown, summary)
+}
+
+/// Processor time of this process, s.
+fn processor_s() -> f64 {
+    let time = clock_gettime(ClockId::ProcessCPUTime);
+    time.tv_sec as f64 + time.tv_nsec as f64 / 1e9
 }
 
 /// SHA-256 of what was seen, in hexadecimal digits.
@@ -166,6 +176,7 @@ fn sum_up(seeds: Seeds, shown: &[Shown]) -> Summary {
         seeds: seeds.count,
         pours: poured().count(),
         virtual_s: shown.iter().map(|one| one.virtual_s).sum(),
+        processor_s: 0.0,
         violations,
         reasons,
         done: done.into_iter().filter_map(done_row).collect(),

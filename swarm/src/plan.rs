@@ -24,11 +24,13 @@ pub struct Choice {
     pub only: Option<usize>,
     /// How many of the [`VESSELS`], from the first on. With few of them little is trained.
     pub vessels: usize,
+    /// The robot's generation, if not that which a seed draws.
+    pub series: Option<Series>,
 }
 
 impl Default for Choice {
     fn default() -> Self {
-        Self { only: None, vessels: VESSELS.len() }
+        Self { only: None, vessels: VESSELS.len(), series: None }
     }
 }
 
@@ -73,7 +75,8 @@ impl Plan {
     /// The plan that `seed` draws from a choice.
     pub fn draw_with(seed: u64, choice: Choice) -> Self {
         let mut random = Pcg64Mcg::seed_from_u64(seed.wrapping_mul(0x9e37_79b9_7f4a_7c15) ^ 0x5eed);
-        let series = if random.random_bool(0.25) { Series::ESeries } else { Series::Cb3 };
+        let drawn = if random.random_bool(0.25) { Series::ESeries } else { Series::Cb3 };
+        let series = choice.series.unwrap_or(drawn);
         let vessel = random.random_range(0..choice.vessels.clamp(1, VESSELS.len()));
         let almost_empty = random.random_bool(0.05);
         let fill_ml = if almost_empty { random.random_range(5.0..60.0) } else { random.random_range(150.0..450.0) };

@@ -162,8 +162,14 @@ pub fn pop(stack: &mut Vec<Value>) -> Value {
     stack.pop().unwrap_or(Value::None)
 }
 
+#[inline]
 fn load(slot: &Option<Value>, name: &str) -> Result<Value, String> {
-    slot.clone().ok_or_else(|| format!("'{name}' has no value yet"))
+    match slot {
+        // Numbers are what programs compute with most.
+        Some(Value::Float(value)) => Ok(Value::Float(*value)),
+        Some(value) => Ok(value.clone()),
+        None => Err(format!("'{name}' has no value yet")),
+    }
 }
 
 fn store(slot: &mut Option<Value>, value: Value, name: &str) -> Result<(), String> {
