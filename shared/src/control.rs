@@ -74,6 +74,8 @@ pub struct Outcome {
     pub goal_ml: Option<f32>,
     /// Estimated volume poured, ml.
     pub poured_ml: f32,
+    /// Its standard deviation, ml; 0 if it is not known.
+    pub poured_sd_ml: f32,
     /// Time from the start until the container was upright and the last drops were counted, s.
     pub seconds: f32,
     /// Number of frames, the bridged ones included.

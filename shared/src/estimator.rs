@@ -7,14 +7,16 @@
 //! |---|---|
 //! | [`vessel`] | the shape of a container |
 //! | [`flow`] | the flow model: from commanded angles to outflow |
-//! | `filter` | an extended Kalman filter on the flow model |
-//! | [`fused`] | three such filters, and the estimate that they make together |
+//! | `tilt` | the tilt that a picture shows |
+//! | [`filter`] | an extended Kalman filter on the flow model |
+//! | [`fused`] | two such filters, and the estimate that they make together |
 
 use serde::{Deserialize, Serialize};
 
-mod filter;
+pub mod filter;
 pub mod flow;
 pub mod fused;
+mod tilt;
 pub mod vessel;
 
 /// Turns V_e in px^2 into ml a frame: `v = c area^q exp(tilt z)`, with z of [`tilt_z`]; and says when the dropout hold bridges a zero.
