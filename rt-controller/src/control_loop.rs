@@ -21,6 +21,32 @@ use crate::pacing::Pacer;
 /// Receives features from shared memory.
 pub type Features = iceoryx2::port::subscriber::Subscriber<iceoryx2::service::ipc::Service, Feature, ()>;
 
+/// What the loop's ticks stand on besides the robot's session: a clock and the measurements. It is a parameter, so that the same ticks run
+/// on this machine, where [`Features`] is it, and in a simulated world. Nothing in it may block or fail.
+pub trait Outside {
+    /// The present time, CLOCK_MONOTONIC or what stands for it, ns.
+    fn now_ns(&self) -> u64;
+    /// The oldest measurement that has arrived and was not received yet.
+    fn receive(&self) -> Option<Feature>;
+    /// Opens what a feature worker that has come needs. It is called outside of pours, and may allocate.
+    fn meet_feature_worker(&self);
+}
+
+impl Outside for Features {
+    fn now_ns(&self) -> u64 {
+        os::now_ns()
+    }
+
+    fn receive(&self) -> Option<Feature> {
+        Self::receive(self).ok().flatten().map(|feature| *feature)
+    }
+
+    fn meet_feature_worker(&self) {
+        // What fails here fails in `receive` too, and shows as stale features.
+        let _ = self.update_connections();
+    }
+}
+
 /// Where and how the loop is scheduled.
 #[derive(Debug, Clone, Copy)]
 pub struct Place {
@@ -42,12 +68,7 @@ pub fn run(settings: Settings, place: Place, lost_ns: u64, features: &Features, 
     let mut deadline_ns = os::now_ns() + settings.period_ns;
     loop {
         os::sleep_until_ns(deadline_ns);
-        state.meet_feature_worker();
-        if state.tick(deadline_ns) == Next::Ended {
-            break;
-        }
-        let (next_ns, skipped) = state.pacer.next_deadline_ns(deadline_ns, state.done_ns);
-        exchange.skipped_ticks.fetch_add(skipped, Relaxed);
+        let Some(next_ns) = state.wake_up(deadline_ns) else { break };
         deadline_ns = next_ns;
     }
     // The container is upright. The session's end only stops the robot's program at once, instead of after its patience.
@@ -65,13 +86,13 @@ pub enum Next {
 }
 
 /// What the loop keeps from tick to tick.
-pub struct LoopState<'a> {
+pub struct LoopState<'a, O> {
     core: Box<Core>,
     fresh: heapless::Vec<Feature, MAX_FEATURES>,
     session: Option<Box<Session>>,
     /// Identity of the core's weights; 0 if it has none.
     weights_id: u64,
-    features: &'a Features,
+    outside: &'a O,
     exchange: &'a Exchange,
     pacer: Pacer,
     period_ns: u64,
@@ -83,15 +104,15 @@ pub struct LoopState<'a> {
     elsewhere: (u64, u64),
 }
 
-impl<'a> LoopState<'a> {
+impl<'a, O: Outside> LoopState<'a, O> {
     /// Allocates all that the ticks use. Call it in the thread that runs them.
-    pub fn new(settings: Settings, lost_ns: u64, features: &'a Features, exchange: &'a Exchange) -> Self {
+    pub fn new(settings: Settings, lost_ns: u64, outside: &'a O, exchange: &'a Exchange) -> Self {
         Self {
             core: Box::new(Core::new(settings)),
             fresh: heapless::Vec::new(),
             session: None,
             weights_id: 0,
-            features,
+            outside,
             exchange,
             pacer: Pacer::new(settings.period_ns),
             period_ns: settings.period_ns,
@@ -102,10 +123,21 @@ impl<'a> LoopState<'a> {
         }
     }
 
+    /// All that is done after waking up for `deadline_ns`. Gives the next deadline, ns; `None` when the loop has ended.
+    pub fn wake_up(&mut self, deadline_ns: u64) -> Option<u64> {
+        self.meet_feature_worker();
+        if self.tick(deadline_ns) == Next::Ended {
+            return None;
+        }
+        let (next_ns, skipped) = self.pacer.next_deadline_ns(deadline_ns, self.done_ns);
+        self.exchange.skipped_ticks.fetch_add(skipped, Relaxed);
+        Some(next_ns)
+    }
+
     /// One tick, just after waking up for `deadline_ns`.
     pub fn tick(&mut self, deadline_ns: u64) -> Next {
         let exchange = self.exchange;
-        let woke_ns = os::now_ns();
+        let woke_ns = self.outside.now_ns();
         let margin_ns = self.pacer.margin_ns();
         let lateness_ns = woke_ns.saturating_sub(deadline_ns);
         exchange.timing.lateness.record(lateness_ns);
@@ -128,11 +160,11 @@ impl<'a> LoopState<'a> {
         self.shutdown |= order == Some(Order::Shutdown);
 
         let output = self.core.step(&Input { now_ns: woke_ns, features: &self.fresh, robot, order });
-        let decided_at_ns = os::now_ns();
+        let decided_at_ns = self.outside.now_ns();
         let mut written_at_ns = 0;
         if let (Some(session), Some(target_deg)) = (self.session.as_mut(), output.target_deg) {
             end = session.send(Mode::Stream, target_deg).err().map(SessionEnd::Lost).or(end);
-            written_at_ns = os::now_ns();
+            written_at_ns = self.outside.now_ns();
         }
         self.measure_features(woke_ns, written_at_ns);
         self.give_session_back(end);
@@ -147,7 +179,7 @@ impl<'a> LoopState<'a> {
         let (allocations, faults) = spent();
         exchange.loop_allocations.store(allocations - self.elsewhere.0, Relaxed);
         exchange.loop_page_faults.store(faults - self.elsewhere.1, Relaxed);
-        let done_ns = os::now_ns();
+        let done_ns = self.outside.now_ns();
         self.done_ns = done_ns;
         exchange.timing.execution.record(done_ns.saturating_sub(woke_ns));
         let tick = Tick {
@@ -170,11 +202,11 @@ impl<'a> LoopState<'a> {
         self.fresh.clear();
         // `receive` gives the oldest first. The bound keeps a flood of features from holding the loop.
         for _ in 0..2 * MAX_FEATURES {
-            let Ok(Some(feature)) = self.features.receive() else { break };
+            let Some(feature) = self.outside.receive() else { break };
             if self.fresh.is_full() {
                 self.fresh.remove(0);
             }
-            let _ = self.fresh.push(*feature);
+            let _ = self.fresh.push(feature);
         }
     }
 
@@ -233,8 +265,7 @@ impl<'a> LoopState<'a> {
             return;
         }
         let before = os::allocations();
-        // What fails here fails in `receive` too, and shows as stale features.
-        let _ = self.features.update_connections();
+        self.outside.meet_feature_worker();
         if os::allocations() != before {
             let (allocations, faults) = spent();
             let of_ticks = |counter: &AtomicU64| counter.load(Relaxed);

@@ -100,9 +100,9 @@ pub enum JournalError {
     },
 }
 
-/// Writes a journal, from an ordinary thread.
-pub struct Writer {
-    file: BufWriter<File>,
+/// Writes a journal, from an ordinary thread, to a file or to anything else that takes bytes.
+pub struct Writer<W: Write = BufWriter<File>> {
+    to: W,
     written: u64,
 }
 
@@ -114,8 +114,15 @@ impl Writer {
         }
         // The journal of the run before is wanted most after that run has crashed.
         let _ = std::fs::rename(path, path.with_extension("before.bin"));
-        let mut this = Self { file: BufWriter::new(File::create(path)?), written: 0 };
-        this.file.write_all(MAGIC)?;
+        Self::begin(BufWriter::new(File::create(path)?), settings)
+    }
+}
+
+impl<W: Write> Writer<W> {
+    /// Starts a journal that goes to `to`.
+    pub fn begin(to: W, settings: &Settings) -> std::io::Result<Self> {
+        let mut this = Self { to, written: 0 };
+        this.to.write_all(MAGIC)?;
         this.entry(&Entry::Settings(*settings))?;
         Ok(this)
     }
@@ -133,7 +140,7 @@ impl Writer {
 
     /// Passes everything that was added on to the operating system.
     pub fn flush(&mut self) -> std::io::Result<()> {
-        self.file.flush()
+        self.to.flush()
     }
 
     fn entry(&mut self, entry: &Entry) -> std::io::Result<()> {
@@ -143,8 +150,8 @@ impl Writer {
         let mut buffer = vec![0; ENTRY_MAX];
         let bytes = postcard::to_slice(entry, &mut buffer).map_err(std::io::Error::other)?;
         self.written += 4 + bytes.len() as u64;
-        self.file.write_all(&(bytes.len() as u32).to_le_bytes())?;
-        self.file.write_all(bytes)
+        self.to.write_all(&(bytes.len() as u32).to_le_bytes())?;
+        self.to.write_all(bytes)
     }
 }
 
@@ -165,12 +172,18 @@ pub struct Replay {
     pub cut_off: bool,
 }
 
-/// Replays a journal through a new [`Core`] and compares every answer bit by bit. `seen` is called with each tick and the answer that the
-/// replay gave.
-pub fn replay(path: &Path, mut seen: impl FnMut(&Tick, &crate::core::Output)) -> Result<Replay, JournalError> {
+/// Replays the journal in a file. See [`replay_from`].
+pub fn replay(path: &Path, seen: impl FnMut(&Tick, &crate::core::Output)) -> Result<Replay, JournalError> {
     let file = path.display().to_string();
+    let reader = File::open(path).map_err(|e| JournalError::Read { file: file.clone(), what: e.to_string() })?;
+    replay_from(BufReader::new(reader), &file, seen)
+}
+
+/// Replays a journal through a new [`Core`] and compares every answer bit by bit. `name` is what errors call the journal; `seen` is called with each tick and the answer that the
+/// replay gave.
+pub fn replay_from(mut reader: impl Read, name: &str, mut seen: impl FnMut(&Tick, &crate::core::Output)) -> Result<Replay, JournalError> {
+    let file = name.to_owned();
     let read = |e: std::io::Error| JournalError::Read { file: file.clone(), what: e.to_string() };
-    let mut reader = BufReader::new(File::open(path).map_err(read)?);
     let mut magic = [0; 8];
     if reader.read_exact(&mut magic).is_err() || &magic != MAGIC {
         return Err(JournalError::Foreign { file });

@@ -7,13 +7,14 @@
 
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering::Relaxed};
 use std::sync::{Mutex, PoisonError};
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
 use shared::config::Config;
 use shared::control::RobotLink;
 
 use crate::exchange::{Exchange, SessionEnd};
 use crate::link::hands::{self, Before, Handover};
+use crate::link::network::Network;
 use crate::link::{self, LinkError, LinkOptions, Session, payload};
 
 /// How often the thread looks whether the loop has given a session back. Chosen by hand; no measurement is recorded.
@@ -82,15 +83,16 @@ struct Progress {
     connected: bool,
     /// Whether the operator must ask first.
     waits: bool,
-    /// Until when the operator's wish counts.
-    wish_until: Option<Instant>,
-    /// When the next attempt is due.
-    next: Instant,
+    /// Until when the operator's wish counts, ns.
+    wish_until_ns: Option<u64>,
+    /// When the next attempt is due, ns.
+    next_ns: u64,
 }
 
-/// Connects the robot whenever the loop has none and no person has it in hand, and hands it over, until `stop`. `note` and `connections` tell
+/// Connects the robot over `network` whenever the loop has none and no person has it in hand, and hands it over, until `stop`. `note` and `connections` tell
 /// `status` about it, `say` the terminal.
 pub fn keep_robot_connected(
+    network: &dyn Network,
     config: &Config,
     exchange: &Exchange,
     note: &RobotNote,
@@ -99,43 +101,45 @@ pub fn keep_robot_connected(
     say: &dyn Fn(&str),
 ) {
     let options = LinkOptions::new(config);
-    let mut progress = Progress { before: Before::default(), connected: false, waits: false, wish_until: None, next: Instant::now() };
+    let mut progress =
+        Progress { before: Before::default(), connected: false, waits: false, wish_until_ns: None, next_ns: network.now_ns() };
     while !stop.load(Relaxed) {
+        let now_ns = network.now_ns();
         while let Some((session, end)) = exchange.old_sessions.pop() {
-            progress.take_back(&session, end, &options, note, say);
+            progress.take_back(now_ns, &session, end, &options, note, say);
         }
         if exchange.resume.swap(false, Relaxed) && !progress.connected {
             progress.waits = false;
-            progress.wish_until = Some(Instant::now() + WISH);
-            progress.next = Instant::now();
+            progress.wish_until_ns = Some(now_ns + WISH.as_nanos() as u64);
+            progress.next_ns = now_ns;
         }
-        if !progress.connected && !progress.waits && Instant::now() >= progress.next {
-            progress.before.asked = progress.wish_until.is_some_and(|until| Instant::now() < until);
-            match link::connect_after(&options, &progress.before) {
+        if !progress.connected && !progress.waits && now_ns >= progress.next_ns {
+            progress.before.asked = progress.wish_until_ns.is_some_and(|until_ns| now_ns < until_ns);
+            match link::connect_over(network, &options, &progress.before) {
                 Ok(session) => {
                     note.warn(payload::warning(session.state(), config.robot.payload_kg).unwrap_or_default(), say);
                     progress.before.unpowered = false;
-                    progress.wish_until = None;
+                    progress.wish_until_ns = None;
                     progress.connected = exchange.sessions.push(Box::new(session)).is_ok();
                     connections.fetch_add(1, Relaxed);
                     note.set(String::new(), RobotLink::Connected, say);
                     say("robot connected, program running");
                 }
-                Err(e) => progress.failed(&e, &options, note, say),
+                Err(e) => progress.failed(network.now_ns(), &e, &options, note, say),
             }
         }
-        std::thread::sleep(BEAT);
+        network.sleep(BEAT);
     }
 }
 
 impl Progress {
     /// Takes note of a session that is over. The session itself is dropped by the caller.
-    fn take_back(&mut self, session: &Session, end: SessionEnd, options: &LinkOptions, note: &RobotNote, say: &dyn Fn(&str)) {
+    fn take_back(&mut self, now_ns: u64, session: &Session, end: SessionEnd, options: &LinkOptions, note: &RobotNote, say: &dyn Fn(&str)) {
         let last = *session.state();
         self.connected = false;
         self.before.unpowered |= hands::without_power(&last);
         self.before.last = Some(last);
-        self.next = Instant::now() + RECONNECT;
+        self.next_ns = now_ns + RECONNECT.as_nanos() as u64;
         match hands::after_session(end.reason(), &last) {
             Some(why) => self.wait_for_operator(why, options, note, say),
             None => note.set(format!("robot: {end}"), RobotLink::Connecting, say),
@@ -143,20 +147,20 @@ impl Progress {
     }
 
     /// Takes note of an attempt that failed with `e`.
-    fn failed(&mut self, e: &LinkError, options: &LinkOptions, note: &RobotNote, say: &dyn Fn(&str)) {
-        self.next = Instant::now() + RECONNECT;
+    fn failed(&mut self, now_ns: u64, e: &LinkError, options: &LinkOptions, note: &RobotNote, say: &dyn Fn(&str)) {
+        self.next_ns = now_ns + RECONNECT.as_nanos() as u64;
         self.before.unpowered = match e {
             LinkError::ProgramRunning { .. } => false,
             LinkError::MayNotMove { unpowered: true, .. } => true,
             _ => self.before.unpowered,
         };
         // A tilted container must be brought upright by somebody, who then has the robot in hand. A wish is not kept for ever.
-        let wish_is_over = self.wish_until.is_some_and(|until| Instant::now() >= until);
+        let wish_is_over = self.wish_until_ns.is_some_and(|until_ns| now_ns >= until_ns);
         if let Some(why) = e.handover() {
             self.wait_for_operator(why, options, note, say);
         } else if wish_is_over || matches!(e, LinkError::TooFar { .. }) {
             self.waits = true;
-            self.wish_until = None;
+            self.wish_until_ns = None;
             note.set(format!("{e}; then {TAKE_BACK}"), RobotLink::WaitsForOperator, say);
         } else {
             note.set(e.to_string(), RobotLink::Connecting, say);
@@ -166,7 +170,7 @@ impl Progress {
     /// Leaves the robot alone until the operator asks for it.
     fn wait_for_operator(&mut self, why: Handover, options: &LinkOptions, note: &RobotNote, say: &dyn Fn(&str)) {
         self.waits = true;
-        self.wish_until = None;
+        self.wish_until_ns = None;
         let remedy = why.remedy();
         let line = format!("robot {}: {why}; it is not taken back by itself: {remedy}, then {TAKE_BACK}", options.address);
         note.set(line, RobotLink::WaitsForOperator, say);

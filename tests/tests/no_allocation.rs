@@ -11,6 +11,7 @@ use assert_no_alloc::{AllocDisabler, assert_no_alloc};
 use rt_controller::control_loop::LoopState;
 use rt_controller::core::{Order, Settings};
 use rt_controller::exchange::{Event, Exchange};
+use rt_controller::link::network::System;
 use rt_controller::robot_thread::{RobotNote, keep_robot_connected};
 use shared::agent::Agent;
 use shared::config::Config;
@@ -42,7 +43,7 @@ fn run(plant: bool) {
     let ended = AtomicU64::new(0);
 
     std::thread::scope(|scope| {
-        scope.spawn(|| keep_robot_connected(&config, &exchange, &note, &connections, &stop, &|_| {}));
+        scope.spawn(|| keep_robot_connected(&System, &config, &exchange, &note, &connections, &stop, &|_| {}));
         // The ordinary thread gives orders, weights and faults, and drops what the loop gives back.
         scope.spawn(|| {
             let worker = ipc::Cell::join(&name).expect("shared memory");

@@ -223,16 +223,15 @@ pub fn hex(hash: &[u8; 32]) -> String {
     hash.iter().map(|b| format!("{b:02x}")).collect()
 }
 
-/// SHA-256 of what is trained on: times, commanded angles, areas and weights of all episodes in order. Their names and the measured angles
-/// do not matter.
+/// SHA-256 of what is trained on: times, commanded angles, areas and weights of all episodes in order, and the measured angles of those that
+/// have any. Their names do not matter.
 pub fn hash(episodes: &[TrainingEpisode]) -> [u8; 32] {
     let mut hash = Sha256::new();
     for e in episodes {
         hash.update((e.len() as u64).to_le_bytes());
-        for column in [&e.t_s, &e.alpha_deg, &e.area_px2] {
-            for v in column {
-                hash.update(if v.is_nan() { f64::NAN } else { *v }.to_le_bytes());
-            }
+        let measured = e.alpha_measured_deg.iter().any(|a| a.is_finite()).then_some(&e.alpha_measured_deg);
+        for v in [&e.t_s, &e.alpha_deg, &e.area_px2].into_iter().chain(measured).flatten() {
+            hash.update(if v.is_nan() { f64::NAN } else { *v }.to_le_bytes());
         }
         hash.update(e.weight_g.to_le_bytes());
     }

@@ -18,6 +18,7 @@ use crate::control_loop::{self, Place};
 use crate::core::Settings;
 use crate::disk::Disk;
 use crate::exchange::Exchange;
+use crate::link::network::System;
 use crate::robot_thread::{self, RobotNote};
 use crate::service::Service;
 
@@ -87,7 +88,7 @@ fn run_threads(config: &Config, stop: &AtomicBool, say: &(dyn Fn(&str) + Sync)) 
         ready.recv().unwrap_or(Ok(())).or_exit(exit::FAILED)?;
         let end = AtomicBool::new(false);
         std::thread::scope(|inner| {
-            let robot = || robot_thread::keep_robot_connected(config, exchange, &note, &connections, &end, say);
+            let robot = || robot_thread::keep_robot_connected(&System, config, exchange, &note, &connections, &end, say);
             let spawned = thread("robot").spawn_scoped(inner, robot);
             let spawned = spawned.and(thread("disk").spawn_scoped(inner, || disk.run(&end)));
             say(&format!("running in cell '{}' at {} Hz", config.cell.name, config.controller.rate_hz));

@@ -5,15 +5,15 @@
 //! because it may be ours and bringing the container upright at this moment; a paused one neither, because a person has paused it; and a
 //! robot that somebody has, or had, in hand is left alone ([`hands`]).
 
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
 use shared::control::EndReason;
-use shared::os::now_ns;
 
 use super::dialogue::Dialogue;
 use super::error::{ANSWER, LinkError, PROGRAM_START};
 use super::hands::{self, Before, Handover};
 use super::health::{self, RUNTIME_PAUSED, RUNTIME_PAUSING, RUNTIME_PLAYING, RUNTIME_STOPPED, RUNTIME_STOPPING};
+use super::network::{Network, System};
 use super::upload::Upload;
 use super::wire::OutputRecipe;
 use super::{LinkOptions, ProgramState, RobotState, Session, program, wire};
@@ -40,12 +40,17 @@ pub fn connect(options: &LinkOptions) -> Result<Session, LinkError> {
     connect_after(options, &Before::default())
 }
 
+/// Connects over this machine's network. See [`connect_over`].
+pub fn connect_after(options: &LinkOptions, before: &Before) -> Result<Session, LinkError> {
+    connect_over(&System, options, before)
+}
+
 /// Connects, checks everything that can be checked, starts the program, and gives a session whose program waits for targets.
 ///
 /// The first target is due within two seconds after this returns.
-pub fn connect_after(options: &LinkOptions, before: &Before) -> Result<Session, LinkError> {
+pub fn connect_over(network: &dyn Network, options: &LinkOptions, before: &Before) -> Result<Session, LinkError> {
     let address = options.address;
-    let mut dialogue = Dialogue::open(address)?;
+    let mut dialogue = Dialogue::open(network, address)?;
 
     if !dialogue.ask(wire::PROTOCOL_VERSION, &[&PROTOCOL.to_be_bytes()], "the request for the protocol version", wire::accepted)? {
         return Err(LinkError::VersionRefused { address });
@@ -57,7 +62,7 @@ pub fn connect_after(options: &LinkOptions, before: &Before) -> Result<Session, 
         return Err(LinkError::TooOld { address, major, minor });
     }
     let rate_hz = if major >= 5 { E_SERIES_HZ } else { CB3_HZ };
-    let run = (now_ns() as i32 & i32::MAX).max(1);
+    let run = (network.now_ns() as i32 & i32::MAX).max(1);
     let program = program::text(options, 1.0 / rate_hz, run)?;
 
     let output_recipe = dialogue.agree_outputs(rate_hz, options.register_base)?;
@@ -69,11 +74,11 @@ pub fn connect_after(options: &LinkOptions, before: &Before) -> Result<Session, 
     let mut state = RobotState::default();
     dialogue.next_state(output_recipe, &options.tilt, &mut state, ANSWER)?.ok_or_else(|| dialogue.no_answer("the request to start"))?;
     ready_for_program(options, before, &state)?;
-    stands_still(options, &mut dialogue, output_recipe, &mut state)?;
+    stands_still((network, options), &mut dialogue, output_recipe, &mut state)?;
     ready_for_program(options, before, &state)?;
 
-    start_program(options, &mut dialogue, output_recipe, &mut state, (&program, run))?;
-    let now = now_ns();
+    start_program((network, options), &mut dialogue, output_recipe, &mut state, (&program, run))?;
+    let now = network.now_ns();
     (state.received_at_ns, state.advanced_at_ns, state.answered_at_ns) = (now, now, now);
     let at = dialogue.at;
     Session::new(dialogue.stream, dialogue.inbox, options.tilt, (output_recipe, input_recipe), version, state)
@@ -100,11 +105,16 @@ fn ready_for_program(options: &LinkOptions, before: &Before, state: &RobotState)
 }
 
 /// Looks at the robot for [`REST`], and fails if a joint moves. `state` becomes the newest one.
-fn stands_still(options: &LinkOptions, dialogue: &mut Dialogue, recipe: OutputRecipe, state: &mut RobotState) -> Result<(), LinkError> {
+fn stands_still(
+    (network, options): (&dyn Network, &LinkOptions),
+    dialogue: &mut Dialogue<'_>,
+    recipe: OutputRecipe,
+    state: &mut RobotState,
+) -> Result<(), LinkError> {
     let earlier = *state;
-    let deadline = Instant::now() + REST;
+    let deadline_ns = network.now_ns() + REST.as_nanos() as u64;
     loop {
-        let left = deadline.saturating_duration_since(Instant::now());
+        let left = Duration::from_nanos(deadline_ns.saturating_sub(network.now_ns()));
         dialogue.next_state(recipe, &options.tilt, state, left)?;
         // A program that has started meanwhile may move them; it is found afterwards.
         if let (Some(joint), false) = (hands::moving(&earlier, state), state.runtime_state == RUNTIME_PLAYING) {
@@ -118,19 +128,20 @@ fn stands_still(options: &LinkOptions, dialogue: &mut Dialogue, recipe: OutputRe
 
 /// Uploads the program with its run number, and waits until it shows that it runs. `state` becomes the newest one.
 fn start_program(
-    options: &LinkOptions,
-    dialogue: &mut Dialogue,
+    (network, options): (&dyn Network, &LinkOptions),
+    dialogue: &mut Dialogue<'_>,
     recipe: OutputRecipe,
     state: &mut RobotState,
     (program, run): (&str, i32),
 ) -> Result<(), LinkError> {
     let address = options.address;
     let mut again = matches!(state.runtime_state, RUNTIME_PAUSING | RUNTIME_PAUSED);
-    let mut upload = Upload::send(address, program)?;
-    let mut sent_at = Instant::now();
+    let mut upload = Upload::send(network, address, program)?;
+    let mut sent_at_ns = network.now_ns();
     while state.program_run != run || state.runtime_state != RUNTIME_PLAYING {
         upload.discard();
-        let left = (sent_at + PROGRAM_START).saturating_duration_since(Instant::now());
+        let since_sent = Duration::from_nanos(network.now_ns().saturating_sub(sent_at_ns));
+        let left = PROGRAM_START.saturating_sub(since_sent);
         // The wait is short, so that the other socket is read too.
         dialogue.next_state(recipe, &options.tilt, state, left.min(GLANCE))?;
         if let Some(reason) = health::hindrance(state) {
@@ -139,10 +150,10 @@ fn start_program(
         if state.program_run == run && state.program_state == ProgramState::TooFar {
             return Err(too_far(options, state));
         }
-        if again && state.runtime_state == RUNTIME_STOPPED && sent_at.elapsed() > AGAIN {
+        if again && state.runtime_state == RUNTIME_STOPPED && network.now_ns().saturating_sub(sent_at_ns) > AGAIN.as_nanos() as u64 {
             again = false;
-            upload = Upload::send(address, program)?;
-            sent_at = Instant::now();
+            upload = Upload::send(network, address, program)?;
+            sent_at_ns = network.now_ns();
         }
         if left.is_zero() {
             return Err(LinkError::NotStarted { address });

@@ -2,11 +2,12 @@
 //!
 //! It runs on the connecting thread and allocates. Each step blocks for [`ANSWER`] at most. Each failure is a [`LinkError`].
 
-use std::io::{ErrorKind, Read, Write};
-use std::net::{IpAddr, SocketAddr, TcpStream};
-use std::time::{Duration, Instant};
+use std::io::ErrorKind;
+use std::net::{IpAddr, SocketAddr};
+use std::time::Duration;
 
 use super::error::{ANSWER, LinkError};
+use super::network::{Network, Transport};
 use super::wire::{self, Inbox, OutputRecipe, Outputs};
 use super::{RobotState, TiltJoint};
 
@@ -16,27 +17,29 @@ const RTDE_PORT: u16 = 30004;
 const REQUEST_MAX: usize = 1024;
 
 /// The RTDE connection while it is being set up.
-pub(super) struct Dialogue {
+pub(super) struct Dialogue<'a> {
+    /// The clock, and what the connection goes over.
+    network: &'a dyn Network,
     /// The robot's address and port.
     pub at: SocketAddr,
     /// The connection.
-    pub stream: TcpStream,
+    pub stream: Box<dyn Transport>,
     /// What has arrived on it and was not read yet.
     pub inbox: Inbox,
     /// The robot's newest text message, ready to be put behind an error; empty before the first.
     pub said: String,
 }
 
-impl Dialogue {
+impl<'a> Dialogue<'a> {
     /// Connects to the robot's RTDE port.
-    pub fn open(address: IpAddr) -> Result<Self, LinkError> {
+    pub fn open(network: &'a dyn Network, address: IpAddr) -> Result<Self, LinkError> {
         let at = SocketAddr::new(address, RTDE_PORT);
         let refused = std::io::ErrorKind::ConnectionRefused.to_string();
-        let stream = open(at).map_err(|e| match e {
+        let stream = open(network, at).map_err(|e| match e {
             LinkError::Unreachable { what, .. } if what == refused => LinkError::RtdeRefused { at },
             e => e,
         })?;
-        Ok(Self { at, stream, inbox: Inbox::new(), said: String::new() })
+        Ok(Self { network, at, stream, inbox: Inbox::new(), said: String::new() })
     }
 
     /// Sends a request and waits for its answer, which `read` decodes; `read` gives `None` for bytes that are no such answer.
@@ -144,7 +147,7 @@ impl Dialogue {
         within: Duration,
         mut pick: impl FnMut(&wire::Packet<'_>) -> Option<T>,
     ) -> Result<Option<T>, LinkError> {
-        let deadline = Instant::now() + within;
+        let deadline_ns = self.network.now_ns() + within.as_nanos() as u64;
         loop {
             loop {
                 match self.inbox.next_packet() {
@@ -160,14 +163,11 @@ impl Dialogue {
                     Err(_) => return Err(self.unexpected(doing)),
                 }
             }
-            let left = deadline.saturating_duration_since(Instant::now());
+            let left = Duration::from_nanos(deadline_ns.saturating_sub(self.network.now_ns()));
             if left.is_zero() {
                 return Ok(None);
             }
-            // A timeout of zero would mean that there is none.
-            let timeout = left.max(Duration::from_millis(1));
-            self.stream.set_read_timeout(Some(timeout)).map_err(|e| self.lost(doing, &e))?;
-            match self.stream.read(self.inbox.space()) {
+            match self.network.read(&mut *self.stream, self.inbox.space(), left) {
                 Ok(0) => return Err(self.lost(doing, &ErrorKind::ConnectionAborted.into())),
                 Ok(n) => self.inbox.filled(n),
                 Err(e) if matches!(e.kind(), ErrorKind::WouldBlock | ErrorKind::TimedOut | ErrorKind::Interrupted) => {}
@@ -190,15 +190,9 @@ impl Dialogue {
     }
 }
 
-/// Opens a TCP connection that blocks for [`ANSWER`] at most and sends at once.
-pub(super) fn open(at: SocketAddr) -> Result<TcpStream, LinkError> {
-    let open = || {
-        let stream = TcpStream::connect_timeout(&at, ANSWER)?;
-        stream.set_nodelay(true)?;
-        stream.set_write_timeout(Some(ANSWER))?;
-        Ok(stream)
-    };
-    open().map_err(|e: std::io::Error| LinkError::Unreachable { at, what: e.kind().to_string() })
+/// Opens a connection that blocks for [`ANSWER`] at most and sends at once.
+pub(super) fn open(network: &dyn Network, at: SocketAddr) -> Result<Box<dyn Transport>, LinkError> {
+    network.open(at, ANSWER).map_err(|e| LinkError::Unreachable { at, what: e.kind().to_string() })
 }
 
 /// A robot's text message in one line.

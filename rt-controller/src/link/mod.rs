@@ -30,13 +30,14 @@ mod dialogue;
 mod error;
 pub mod hands;
 pub mod health;
+pub mod network;
 pub mod payload;
 pub mod program;
 pub mod session;
 mod upload;
 pub mod wire;
 
-pub use connect::{connect, connect_after};
+pub use connect::{connect, connect_after, connect_over};
 pub use error::LinkError;
 pub use session::{Lost, Session};
 

@@ -5,12 +5,10 @@
 //! repaired. Dropping a session asks the program to come upright and end. If the program cannot receive that, it does so by itself 100 ms
 //! after the last target.
 
-use std::io::{ErrorKind, Read, Write};
-use std::net::{Shutdown, TcpStream};
-
-use shared::os::now_ns;
+use std::io::ErrorKind;
 
 use super::health::{self, RUNTIME_PLAYING};
+use super::network::Transport;
 use super::wire::{self, Inbox, OutputRecipe, Outputs};
 use super::{Mode, RobotState, TiltJoint};
 
@@ -38,7 +36,7 @@ pub enum Lost {
 /// A connected robot with the program running.
 #[derive(Debug)]
 pub struct Session {
-    stream: TcpStream,
+    stream: Box<dyn Transport>,
     inbox: Inbox,
     tilt: TiltJoint,
     output_recipe: OutputRecipe,
@@ -46,20 +44,22 @@ pub struct Session {
     version: [u32; 4],
     state: RobotState,
     texts: u64,
+    /// When [`Session::poll`] was last called, ns.
+    polled_at_ns: u64,
 }
 
 impl Session {
     /// Takes over a connection on which recipes are agreed and data flow; `state` is the newest state that was received.
     pub(super) fn new(
-        stream: TcpStream,
+        mut stream: Box<dyn Transport>,
         inbox: Inbox,
         tilt: TiltJoint,
         (output_recipe, input_recipe): (OutputRecipe, u8),
         version: [u32; 4],
         state: RobotState,
     ) -> std::io::Result<Self> {
-        stream.set_nonblocking(true)?;
-        Ok(Self { stream, inbox, tilt, output_recipe, input_recipe, version, state, texts: 0 })
+        stream.set_wait(None)?;
+        Ok(Self { stream, inbox, tilt, output_recipe, input_recipe, version, state, texts: 0, polled_at_ns: state.received_at_ns })
     }
 
     /// PolyScope's version: major, minor, bugfix, build.
@@ -79,6 +79,7 @@ impl Session {
 
     /// Takes everything that has arrived and gives the newest state. Call it once a tick, before [`super::health::check`].
     pub fn poll(&mut self, now_ns: u64) -> Result<&RobotState, Lost> {
+        self.polled_at_ns = now_ns;
         for _ in 0..MOST_READS {
             let space = self.inbox.space();
             let most = space.len();
@@ -148,9 +149,9 @@ impl Session {
 impl Drop for Session {
     fn drop(&mut self) {
         // If bytes were left unread, the kernel would reset the connection, and this last target would be lost with it.
-        let _ = self.poll(now_ns());
+        let _ = self.poll(self.polled_at_ns);
         let stopped = self.state.runtime_state != RUNTIME_PLAYING || health::stopped_for_safety(&self.state).is_some();
         let _ = self.send(if stopped { Mode::Abandon } else { Mode::Stop }, 0.0);
-        let _ = self.stream.shutdown(Shutdown::Write);
+        self.stream.finish();
     }
 }

@@ -65,8 +65,10 @@ fn at(moment: Moment, series: Series) -> Robot {
     robot
 }
 
-/// Lets the program go on, at `share` of full speed, until it has ended; then the container is upright and stays so.
-fn assert_ends_upright(robot: &mut Robot, share: f64, what: &str) {
+/// Lets the program go on, at `share` of full speed, until it has ended; then the container is upright and stays so. Gives after how many
+/// seconds it was upright.
+fn assert_ends_upright(robot: &mut Robot, share: f64, what: &str) -> f64 {
+    let begun = robot.cycles.len();
     let most_s = (2.2 + 200.0 / 60.0 + 1.0) / share;
     for _ in 0..(most_s / robot.cycle_s) as usize {
         if robot.machine.runtime_state() == RuntimeState::Stopped {
@@ -82,6 +84,8 @@ fn assert_ends_upright(robot: &mut Robot, share: f64, what: &str) {
     assert!(alpha_deg.abs() < 0.2, "{what}: {state:?} at {alpha_deg} deg");
     let log: Vec<_> = robot.machine.take_log().map(|l| l.text).collect();
     assert_eq!(robot.machine.safety_mode(), SafetyMode::Normal, "{what}: {log:?}");
+    let tilted = robot.cycles[begun..].iter().rposition(|c| c.actual_deg.abs() > 0.5).map_or(0, |at| at + 1);
+    tilted as f64 * robot.cycle_s
 }
 
 /// Pauses at `moment`, jogs `joints`, resumes, and sees how it ends. The controller is alive when `abandon` is set, and writes that.
@@ -161,7 +165,9 @@ fn without_the_controller_it_comes_upright_at_any_speed() {
                 let mut robot = at(moment, series);
                 robot.machine.robot.set_speed_slider(slider);
                 robot.machine.robot.set_own_scaling(own);
-                assert_ends_upright(&mut robot, slider * own, &format!("{series:?}, {moment:?}, slider {slider}, own scaling {own}"));
+                let what = format!("{series:?}, {moment:?}, slider {slider}, own scaling {own}");
+                let upright_s = assert_ends_upright(&mut robot, slider * own, &what);
+                println!("{what}: upright after {upright_s:.1} s");
             }
         }
     }
@@ -205,6 +211,24 @@ fn an_arm_that_is_held_back_is_turned_back() {
             assert!(away_deg < 16.0, "{what}: the command is {away_deg} deg from the arm");
             let farthest_deg = robot.cycles.iter().fold(0.0f64, |m, c| m.max(c.target_deg));
             assert!(farthest_deg < 20.0, "{what}: the joint went to {farthest_deg} deg");
+        }
+    }
+}
+
+/// Protects the glass from an arm that becomes slow when it is tilted: on the way upright the command waits for the joint, and the program
+/// ends only when the joint is upright too.
+#[test]
+fn the_way_upright_waits_for_a_slow_arm() {
+    for series in BOTH {
+        for held_deg_s in [5.0f64, 15.0, 40.0] {
+            for moment in [Moment::Tilted, Moment::Reversing] {
+                let mut robot = at(moment, series);
+                robot.machine.robot.servo.hold_back(held_deg_s.to_radians());
+                let what = format!("{series:?}, {moment:?}, held back to {held_deg_s} deg/s");
+                assert_ends_upright(&mut robot, 0.1, &what);
+                let away_deg = robot.cycles.iter().fold(0.0f64, |m, c| m.max((c.command_deg - c.target_deg).abs()));
+                assert!(away_deg < 20.0, "{what}: the command is {away_deg} deg from the arm");
+            }
         }
     }
 }

@@ -3,17 +3,13 @@
 //! Pure functions of the offline trainer, which allocate and do not fail. An episode without measured tilt among others that have it gets the
 //! one that its commands would have led to, by the others' delay and lag.
 
-use shared::estimator::flow::{CommandHistory, DELAY_MAX_FRAMES, Lateness, delayed_deg, followed_deg};
+use shared::estimator::flow::{CommandHistory, Lateness, delayed_deg, followed_deg};
 
+use super::servo::Servo;
 use crate::data::TrainingEpisode;
 
 /// Share of the frames whose measured tilt must be known. Chosen by hand: the first and last frames may come before or after the robot's states.
 const KNOWN_SHARE: f64 = 0.9;
-/// Steps of the search for delay and lag, frames. Chosen by hand: finer than what the picture's own delay can be found to.
-const STEP_FRAMES: f64 = 0.25;
-/// Largest lag that is looked for, frames. Chosen by hand; no measurement is recorded.
-const LAG_MAX_FRAMES: f64 = 8.0;
-
 /// The tilts of all episodes.
 pub struct Tilts {
     /// Tilt of each frame of each episode, degrees.
@@ -25,10 +21,10 @@ pub struct Tilts {
 impl Tilts {
     /// The tilts of usable episodes.
     pub fn of(episodes: &[TrainingEpisode]) -> Self {
-        let known: Vec<&TrainingEpisode> = episodes.iter().filter(|e| has_measured(e)).collect();
-        let Some(robot) = best_lateness(&known) else {
+        let Some(Servo { delay_frames, lag_frames }) = Servo::of(episodes) else {
             return Self { alpha_deg: episodes.iter().map(|e| e.alpha_deg.clone()).collect(), robot: None };
         };
+        let robot = Lateness { lag_frames, delay_frames };
         let tilts = |e: &TrainingEpisode| if has_measured(e) { without_gaps(e) } else { followed(&e.alpha_deg, robot).collect() };
         Self { alpha_deg: episodes.iter().map(tilts).collect(), robot: Some(robot) }
     }
@@ -62,21 +58,4 @@ fn followed(commands: &[f64], late: Lateness) -> impl Iterator<Item = f64> + '_ 
         tilt_deg = followed_deg(tilt_deg, delayed_deg(history.commands(), 0, late.delay_frames), late.lag_frames);
         tilt_deg
     })
-}
-
-/// Delay and lag that meet the measured tilts best; `None` without any.
-fn best_lateness(episodes: &[&TrainingEpisode]) -> Option<Lateness> {
-    let steps = |most: f64| (0..=(most / STEP_FRAMES) as usize).map(|k| k as f64 * STEP_FRAMES);
-    let misfit = |late: Lateness| -> f64 {
-        let of = |e: &&TrainingEpisode| -> f64 {
-            let pairs = followed(&e.alpha_deg, late).zip(&e.alpha_measured_deg);
-            pairs.map(|(tilt, measured)| (tilt - measured).powi(2)).filter(|square| square.is_finite()).sum()
-        };
-        episodes.iter().map(of).sum()
-    };
-    if episodes.is_empty() {
-        return None;
-    }
-    let all = steps(DELAY_MAX_FRAMES).flat_map(|d| steps(LAG_MAX_FRAMES).map(move |l| Lateness { lag_frames: l, delay_frames: d }));
-    all.map(|late| (misfit(late), late)).min_by(|a, b| a.0.total_cmp(&b.0)).map(|(_, late)| late)
 }
