@@ -472,7 +472,7 @@ impl Core {
             lambda_deg: curve.map_or(f32::NAN, |c| c.lambda_deg),
             gamma_per_s2: curve.map_or(f32::NAN, |c| c.gamma_per_s2),
             beta_s: curve.map_or(f32::NAN, |c| c.beta_s),
-            reserved: 0.0,
+            poured_sd_ml: self.decision.poured_sd_ml,
         }
     }
 }

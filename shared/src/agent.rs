@@ -9,6 +9,7 @@
 use crate::actions::{self, ACTIONS, STAY, Selection};
 use crate::estimator::Hold;
 use crate::estimator::fused::{FusedEstimator, FusedFrame};
+use crate::estimator::verdict::Impossible;
 use crate::mlp;
 use crate::os;
 use crate::weights::{Estimator, Weights};
@@ -49,6 +50,8 @@ pub struct Decision {
     pub tilting_back: bool,
     /// Whether liquid is seen to leave the container in this frame.
     pub flowing: bool,
+    /// What the camera sees cannot be, by what was learned of vessel and flow; always `None` with [`Estimator::Sum`].
+    pub impossible: Option<Impossible>,
 }
 
 impl Decision {
@@ -64,6 +67,7 @@ impl Decision {
         over_lip_ml: 0.0,
         tilting_back: false,
         flowing: false,
+        impossible: None,
     };
 }
 
@@ -107,9 +111,7 @@ impl Agent {
     pub fn new(weights: &Weights) -> Self {
         let (fused, back_deg) = match &weights.estimator {
             Estimator::Sum => (None, -weights.actions_deg[weights.back_action()]),
-            Estimator::Fused { model, back } => {
-                (Some(FusedEstimator::new(model, &weights.calibration, *back)), back.rate_deg as f32)
-            }
+            Estimator::Fused { model, back } => (Some(FusedEstimator::new(model, &weights.calibration, *back)), back.rate_deg as f32),
         };
         Self {
             weights: weights.clone(),
@@ -196,6 +198,7 @@ impl Agent {
             over_lip_ml,
             tilting_back: self.returning,
             flowing: self.v_ml[0] > 0.0,
+            impossible: self.fused.as_ref().and_then(FusedEstimator::impossible),
         }
     }
 

@@ -90,6 +90,14 @@ pub struct Outcome {
     pub clipped: Clipped,
 }
 
+impl Outcome {
+    /// The volume poured with its standard deviation, where that is known, ml.
+    pub fn poured_words(&self) -> String {
+        let Self { poured_ml, poured_sd_ml, .. } = self;
+        if *poured_sd_ml > 0.0 { format!("{poured_ml:.1} +- {poured_sd_ml:.1}") } else { format!("{poured_ml:.1}") }
+    }
+}
+
 /// Why a pour or recording ended.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
@@ -134,6 +142,10 @@ pub enum EndReason {
     NotFollowed,
     /// Somebody has the robot in hand: the teach button (freedrive) is pressed.
     InHand,
+    /// The camera shows a stream that the container cannot give at its tilt.
+    ImpossibleFlow,
+    /// The camera shows no stream where even the emptiest container of the episodes would give one.
+    NothingFlows,
 }
 
 impl EndReason {
@@ -160,6 +172,12 @@ impl EndReason {
             Self::StreamLost => "the container is empty, or its stream is no longer seen: tilted further than when it flowed",
             Self::NotFollowed => "the robot does not follow: it is slower than it is commanded, or something holds or moves it",
             Self::InHand => "somebody has the robot in hand (the teach button is pressed)",
+            Self::ImpossibleFlow => {
+                "what the camera shows cannot be: the stream does not follow the tilt as in the episodes; look at camera, vessel and liquid"
+            }
+            Self::NothingFlows => {
+                "nothing is seen to flow, where even the emptiest vessel of the episodes would: look at the camera, or fill the vessel"
+            }
         }
     }
 }

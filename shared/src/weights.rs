@@ -89,6 +89,8 @@ impl Estimator {
             ("sd of the camera's sum", model.camera_sd, 1e-4, 5.0),
             ("sd of a pour's gain", model.gain_sd, 0.0, 5.0),
             ("distance from the camera's sum", model.wide_sds, 0.0, 10.0),
+            ("largest area", model.bounds.most_px2, 1.0, 1e12),
+            ("tilt by which flow must be seen", model.bounds.dry_deg, 1.0, 200.0),
             ("rate of the way back", back.rate_deg, 0.1, 10.0),
             ("change of that rate in a frame", back.change_deg, 0.01, 100.0),
         ];
@@ -385,6 +387,7 @@ pub(crate) mod tests {
     use super::*;
     use crate::actions::action_table;
     use crate::estimator::filter::UNKNOWNS;
+    use crate::estimator::verdict::Bounds;
     use proptest::prelude::*;
 
     /// Valid weights whose network has arbitrary parameters, made by hand.
@@ -414,15 +417,19 @@ pub(crate) mod tests {
         }
         let calibration = Calibration { volume_at_1_px2_ml: 0.002, area_exponent: 1.15, log_tilt_slope: 0.05, hold_above_px2: 60.0 };
         let explanation = Explanation { model: FlowModel::default(), calibration, unknowns };
-        FusedModel { explanations: [explanation; 2], tight_share: 0.9, camera_sd: 0.04, gain_sd: 0.015, wide_sds: 0.5 }
+        FusedModel {
+            explanations: [explanation; 2],
+            tight_share: 0.9,
+            camera_sd: 0.04,
+            gain_sd: 0.015,
+            wide_sds: 0.5,
+            bounds: Bounds { most_px2: 5000.0, dry_deg: 90.0 },
+        }
     }
 
     /// The same with the fused estimate.
     pub(crate) fn fused_example() -> Weights {
-        Weights {
-            estimator: Estimator::Fused { model: fused_model(), back: WayBack { rate_deg: 2.0, change_deg: 1.67 } },
-            ..example()
-        }
+        Weights { estimator: Estimator::Fused { model: fused_model(), back: WayBack { rate_deg: 2.0, change_deg: 1.67 } }, ..example() }
     }
 
     /// Protects the swap: what is written is what is read, with the same identity, and no temporary file is left.

@@ -27,6 +27,7 @@ use nalgebra::DMatrix;
 use shared::estimator::Calibration;
 use shared::estimator::flow::{DELAY_MAX_FRAMES, FlowModel, FlowNoise, FlowTables, Lateness};
 use shared::estimator::fused::{Explanation, FusedModel, TIGHT, WIDE};
+use shared::estimator::verdict::Bounds;
 
 use crate::calibration;
 use crate::data::TrainingEpisode;
@@ -86,6 +87,12 @@ const TIGHT_SHARE_MIN: f64 = 0.01;
 const WIDE_SDS: f64 = 0.5;
 /// Number of calm, weighed pours that the geometry needs not to mislead. From the prototype; no other measurement is recorded.
 const CALM_NEEDS: usize = 3;
+
+/// An area this many times the episodes' largest is no stream. Chosen by hand: a controlled pour stays far below the largest flow of a curve.
+const AREA_MARGIN: f64 = 3.0;
+/// How far beyond the highest onset of the episodes a container may be tilted without any flow, degrees. Chosen by hand; docs/LEARNING.md has
+/// the false alarms.
+const DRY_MARGIN_DEG: f64 = 10.0;
 
 /// Effort of each of the first solutions, which only have to tell beginnings apart. Chosen by hand, see docs/LEARNING.md for the time it
 /// takes.
@@ -320,6 +327,14 @@ impl Conclusion<'_> {
         Explanation { model: self.model(fitted), calibration: fitted.calibration(), unknowns: doubts::unknowns(fitted, doubt) }
     }
 
+    /// What the episodes showed at most, with a margin.
+    fn bounds(&self) -> Bounds {
+        let most = |values: &mut dyn Iterator<Item = f64>| values.fold(1.0, f64::max);
+        let largest_px2 = most(&mut self.episodes.iter().map(|e| e.smooth_max_px2));
+        let onset_deg = most(&mut self.wide.found.of_episodes(ONSET).into_iter());
+        Bounds { most_px2: AREA_MARGIN * largest_px2, dry_deg: (onset_deg + DRY_MARGIN_DEG).clamp(1.0, 180.0) }
+    }
+
     fn fit(&self) -> Fit {
         let frames: usize = self.episodes.iter().map(PreparedEpisode::frames_with_flow).sum();
         let odds = (self.tight.log_evidence - self.wide.log_evidence).clamp(-50.0, 50.0);
@@ -334,6 +349,7 @@ impl Conclusion<'_> {
             camera_sd: doubts::camera_sd(self.tempered),
             gain_sd: noise::camera_gain_sd(&gains, gain_expected),
             wide_sds: if calm >= CALM_NEEDS { WIDE_SDS } else { 0.0 },
+            bounds: self.bounds(),
         };
         let likelier = if tight_share > 0.5 { self.tight } else { self.wide };
         Fit {

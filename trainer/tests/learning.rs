@@ -232,7 +232,8 @@ fn every_method_gives_valid_weights() {
             if actions == 2 {
                 let mut agent = Agent::new(&weights);
                 agent.start(50.0);
-                let decision = agent.step(Observation { area_px2: Some(0.0), alpha_deg: 0.0, alpha_measured_deg: f32::NAN, alpha_now_deg: 0.0 });
+                let decision =
+                    agent.step(Observation { area_px2: Some(0.0), alpha_deg: 0.0, alpha_measured_deg: f32::NAN, alpha_now_deg: 0.0 });
                 assert_eq!(decision.dalpha_deg.abs(), 1.0, "{method:?}");
             }
         }

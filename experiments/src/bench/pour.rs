@@ -125,8 +125,16 @@ pub fn by_core(
     let mut alpha_deg = 0.0f32;
     let mut area_px2 = 0.0f32;
     let mut frames = 0u32;
-    let mut poured =
-        PourResult { init_ml, goal_ml, true_ml: 0.0, believed_ml: 0.0, believed_sd_ml: 0.0, seconds: f64::from(MAX_FRAMES) / RATE_HZ, frames: 0, ended: false };
+    let mut poured = PourResult {
+        init_ml,
+        goal_ml,
+        true_ml: 0.0,
+        believed_ml: 0.0,
+        believed_sd_ml: 0.0,
+        seconds: f64::from(MAX_FRAMES) / RATE_HZ,
+        frames: 0,
+        ended: false,
+    };
     // The core ends a pour by its own limits. This bound is for a core that fails to.
     while frames < 3 * MAX_FRAMES {
         frames += 1;
