@@ -21,6 +21,7 @@
 //! | `priors` | what is known before any episode |
 //! | `problem` | the least-squares problem of a stage, and its solution |
 //! | `noise` | the noise of frames and pours, and what has changed between them |
+//! | `fitted` | the solution of a stage |
 //! | `doubts` | how far a pour may be off the fit |
 
 use nalgebra::DMatrix;
@@ -33,6 +34,7 @@ use crate::calibration;
 use crate::data::TrainingEpisode;
 
 mod doubts;
+mod fitted;
 mod noise;
 mod prepared;
 mod priors;
@@ -41,6 +43,7 @@ mod servo;
 mod tilts;
 mod unknowns;
 
+use fitted::Fitted;
 use noise::{CHANGE_NEEDS, FrameNoise};
 use prepared::{PreparedEpisode, Stage};
 use priors::{HeldCalibration, Priors, VesselPrior};
@@ -48,7 +51,7 @@ use problem::{Effort, Problem};
 use tilts::Tilts;
 use unknowns::{
     AREA_EXPONENT, CAMERA_GAIN, DELAY, EXTRA_DELAY, FILM_SHARE, HEAD_EXPONENT, LAG, LOG_C, LOG_RADIUS, LOG_SLENDERNESS, LOG_WEIR, ONSET,
-    SHARED, TAPER, TILT_SLOPE, Unknowns,
+    SHARED, TAPER, Unknowns,
 };
 
 pub use unknowns::moved;
@@ -164,46 +167,6 @@ impl CameraFacts {
             camera_gain_sd: if self.clean { GAIN_CLEAN } else { GAIN_SD },
             extra_delay_sd_frames,
             area_sum_sd: SUM_NOISE * self.noise.area_sd.max(least_sd),
-        }
-    }
-}
-
-/// One explanation, fitted.
-struct Fitted {
-    found: Unknowns,
-    /// Covariance of all unknowns.
-    covariance: DMatrix<f64>,
-    /// The model of the unknowns that all episodes share.
-    model: FlowModel,
-    /// Logarithm of the evidence, up to a constant that both explanations share.
-    log_evidence: f64,
-    /// Sum of the squared residuals.
-    cost: f64,
-}
-
-impl Fitted {
-    /// Takes what a problem's solution says.
-    fn of(problem: &Problem<'_>, found: &Unknowns, cost: f64) -> Self {
-        let matrix = problem.linearise(found).matrix;
-        let half_log_det = half_log_determinant(&matrix);
-        Self {
-            found: found.clone(),
-            covariance: inverse(&matrix),
-            model: problem.model_of(&found.shared),
-            log_evidence: -0.5 * cost + problem.priors.vessel.half_log_precision - half_log_det,
-            cost,
-        }
-    }
-
-    /// The calibration; the newest gain counts where it has changed.
-    fn calibration(&self) -> Calibration {
-        let gain = noise::newest_gain(&self.found.of_episodes(CAMERA_GAIN));
-        let [log_c, exponent, tilt_slope] = [LOG_C, AREA_EXPONENT, TILT_SLOPE].map(|k| self.found.shared[k]);
-        Calibration {
-            volume_at_1_px2_ml: (log_c - gain).exp() as f32,
-            area_exponent: exponent.clamp(0.2, 5.0) as f32,
-            log_tilt_slope: tilt_slope.clamp(-1.0, 1.0) as f32,
-            hold_above_px2: calibration::HOLD_ABOVE_PX2,
         }
     }
 }
@@ -362,24 +325,6 @@ impl Conclusion<'_> {
             dropouts: self.camera.noise.dropouts,
         }
     }
-}
-
-/// Half of the logarithm of a positive definite matrix's determinant.
-fn half_log_determinant(matrix: &DMatrix<f64>) -> f64 {
-    let mut damped = matrix.clone();
-    for k in 0..damped.nrows() {
-        damped[(k, k)] += 1e-9;
-    }
-    damped.cholesky().map_or(0.0, |c| c.l_dirty().diagonal().iter().map(|d| d.ln()).sum())
-}
-
-/// The inverse of a matrix J'J, or a wide diagonal matrix where it has none.
-fn inverse(matrix: &DMatrix<f64>) -> DMatrix<f64> {
-    let mut damped = matrix.clone();
-    for k in 0..damped.nrows() {
-        damped[(k, k)] += 1e-9;
-    }
-    damped.cholesky().map_or_else(|| DMatrix::identity(matrix.nrows(), matrix.ncols()) * 0.01, |c| c.inverse())
 }
 
 #[cfg(test)]

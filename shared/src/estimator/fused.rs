@@ -34,6 +34,9 @@ pub const EXPLANATIONS: usize = 2;
 const CAMERA_SDS: f64 = 2.5;
 /// Any estimate may be this far from the camera's own sum, ml. From the prototype; no other measurement is recorded.
 const CAMERA_ML: f64 = 0.5;
+/// Share of the deviation that filters and fits find by themselves: the fits temper the frames, so they doubt too much. On rigs 100 to 108 of
+/// simulator b, 82 % of the pours from cylinders were within the whole one, and 78 to 93 % from bottles and cones.
+const DEVIATION_SHARE: f64 = 0.8;
 /// A larger outflow in a frame, ml, than any container gives, so that it is no measurement. Chosen by hand; no measurement is recorded.
 const MEASURED_MAX_ML: f64 = 50.0;
 
@@ -191,7 +194,7 @@ impl FusedEstimator {
         let filter_ml2 = self.explaining[TIGHT].filter.poured_variance_ml2();
         let share = self.tight_share;
         let ml2 = if share > 0.0 { share * filter_ml2 + (1.0 - share) * camera_ml2 } else { camera_ml2 };
-        ml2.max(0.0).sqrt()
+        DEVIATION_SHARE * ml2.max(0.0).sqrt()
     }
 
     /// Whether what was seen cannot be.

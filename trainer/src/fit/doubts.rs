@@ -7,7 +7,7 @@ use shared::estimator::filter::{UNKNOWNS, UnknownsCovariance};
 use shared::estimator::flow::FlowModel;
 use shared::estimator::vessel::{CapacityCurve, KNOTS, Vessel, knot_deg};
 
-use super::Fitted;
+use super::fitted::Fitted;
 use super::unknowns::{AREA_EXPONENT, DELAY, LOG_C, LOG_WEIR, SHARED, VESSEL, model_of};
 
 /// Outflow at which the camera's gain is judged, ml a frame: that of controlled pours. From the prototype's simulations; the demos pour as fast.
