@@ -277,7 +277,7 @@ impl Conclusion<'_> {
             model.lag_frames += robot.lag_frames;
             model.delay_frames = (model.delay_frames + robot.delay_frames).clamp(0.0, DELAY_MAX_FRAMES);
         }
-        let calibration = fitted.calibration();
+        let calibration = fitted.calibration(&fitted.found.of_episodes(CAMERA_GAIN));
         let exponent = f64::from(calibration.area_exponent);
         model.noise = FlowNoise {
             log_frame_volume_sd: (self.camera.noise.area_sd * exponent).clamp(0.02, 1.0),
@@ -287,7 +287,8 @@ impl Conclusion<'_> {
     }
 
     fn explanation(&self, fitted: &Fitted, doubt: f64) -> Explanation {
-        Explanation { model: self.model(fitted), calibration: fitted.calibration(), unknowns: doubts::unknowns(fitted, doubt) }
+        let calibration = fitted.calibration(&fitted.found.of_episodes(CAMERA_GAIN));
+        Explanation { model: self.model(fitted), calibration, unknowns: doubts::unknowns(fitted, doubt) }
     }
 
     /// What the episodes showed at most, with a margin.
@@ -318,7 +319,8 @@ impl Conclusion<'_> {
         Fit {
             model: fused.likelier().model,
             fused,
-            calibration: self.tempered.calibration(),
+            // The last stage sees the pours' gains best.
+            calibration: self.tempered.calibration(&self.wide.found.of_episodes(CAMERA_GAIN)),
             onsets_deg: likelier.found.of_episodes(ONSET),
             covariance: likelier.covariance.view((0, 0), (SHARED, SHARED)).into_owned(),
             calibration_covariance: [LOG_C, AREA_EXPONENT].map(|i| [LOG_C, AREA_EXPONENT].map(|j| self.tempered.covariance[(i, j)])),

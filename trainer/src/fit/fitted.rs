@@ -8,7 +8,7 @@ use shared::estimator::flow::FlowModel;
 
 use super::noise;
 use super::problem::Problem;
-use super::unknowns::{AREA_EXPONENT, CAMERA_GAIN, LOG_C, TILT_SLOPE, Unknowns};
+use super::unknowns::{AREA_EXPONENT, LOG_C, TILT_SLOPE, Unknowns};
 use crate::calibration;
 
 /// One explanation, fitted.
@@ -39,9 +39,9 @@ impl Fitted {
         }
     }
 
-    /// The calibration; the newest gain counts where it has changed.
-    pub fn calibration(&self) -> Calibration {
-        let gain = noise::newest_gain(&self.found.of_episodes(CAMERA_GAIN));
+    /// The calibration; the newest gain counts where `gains`, those of the episodes, have changed.
+    pub fn calibration(&self, gains: &[f64]) -> Calibration {
+        let gain = noise::newest_gain(gains);
         let [log_c, exponent, tilt_slope] = [LOG_C, AREA_EXPONENT, TILT_SLOPE].map(|k| self.found.shared[k]);
         Calibration {
             volume_at_1_px2_ml: (log_c - gain).exp() as f32,
