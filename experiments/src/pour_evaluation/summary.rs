@@ -121,6 +121,7 @@ mod tests {
     #[test]
     fn summaries_count_right() {
         let one = |error: f64, ended: bool| PourResult {
+            believed_sd_ml: 0.0,
             init_ml: 300.0,
             goal_ml: 100.0,
             true_ml: 100.0 + error,

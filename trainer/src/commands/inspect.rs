@@ -63,7 +63,10 @@ fn print(weights: &Weights) {
         Estimator::Sum => println!("estimate    plain sum of the frames' volumes"),
         Estimator::Fused { model, back } => {
             println!("estimate    camera and container geometry, fused");
-            print_model(model, *back);
+            let away = model.wide_sds;
+            println!("  straight  {:.0} % likely; otherwise at most {away} sd from the camera's sum", 100.0 * model.tight_share);
+            println!("  doubts    {:.1} % of the camera's sum, {:.1} % from pour to pour", 100.0 * model.camera_sd, 100.0 * model.gain_sd);
+            print_model(&model.likelier().model, *back);
         }
     }
     println!("all {PARAMETERS} parameters: --json");
@@ -81,5 +84,5 @@ fn print_model(model: &FlowModel, back: WayBack) {
         "  motion    lag {:.2} frames, delay {:.2} frames, back at {:.2} degrees a frame",
         model.lag_frames, model.delay_frames, back.rate_deg
     );
-    println!("  doubts    {:?}", model.noise);
+    println!("  frames    {:?}", model.noise);
 }

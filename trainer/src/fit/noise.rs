@@ -1,12 +1,8 @@
-//! How sure the fit is: the noise of frames and of pours, what has changed between pours, and the doubt about the vessel.
+//! How sure the fit is: the noise of frames and of pours, and what has changed between pours.
 //!
 //! Pure functions of the offline trainer, for any thread. They allocate and do not fail.
 
-use nalgebra::DMatrix;
-use shared::estimator::flow::FlowTables;
-
 use super::prepared::PreparedEpisode;
-use super::unknowns::{ONSET, Unknowns, VESSEL, model_of};
 
 /// Episodes before and after a change of gain or delay, for it to be noticed. Chosen by hand; see docs/LEARNING.md.
 pub const CHANGE_NEEDS: usize = 3;
@@ -19,18 +15,6 @@ const EXTRA_DELAY_SD_MIN_FRAMES: f64 = 0.2;
 /// Number of episodes for which the expected change of the camera's gain counts, beside those that were fitted. Chosen by hand; no
 /// measurement is recorded.
 const EXPECTED_GAIN_EPISODES: f64 = 3.0;
-/// Share of the posterior's standard deviation that the filter gets for the vessel's scale. Tuned on rigs 100 to 123, see
-/// docs/LEARNING.md.
-const VESSEL_SD_SHARE: f64 = 0.34;
-/// Above this standard deviation the priors decide on the vessel (log), and nothing is taken off. Tuned on rigs 100 to 123, see
-/// docs/LEARNING.md.
-const VESSEL_SD_OF_PRIORS: f64 = 0.05;
-/// Windows of tilt over which the doubt about the vessel is averaged. From the prototype; no other measurement is recorded.
-const WINDOWS: usize = 5;
-/// How far beyond the highest onset these windows reach, degrees. From the prototype; no other measurement is recorded.
-const BEYOND_ONSET_DEG: f64 = 12.0;
-/// Step of the difference quotients.
-const NUDGE: f64 = 1e-4;
 /// The median of the square of a normal variable over its variance.
 const MEDIAN_OF_SQUARE: f64 = 0.455;
 
@@ -98,38 +82,6 @@ fn newest(values: &[f64], sd_min: f64) -> f64 {
 pub fn camera_gain_sd(log_camera_gains: &[f64], expected: f64) -> f64 {
     let sum: f64 = log_camera_gains.iter().map(|g| g * g).sum();
     ((EXPECTED_GAIN_EPISODES * expected * expected + sum) / (EXPECTED_GAIN_EPISODES + log_camera_gains.len() as f64)).sqrt()
-}
-
-/// The standard deviation of the vessel's scale that the filter gets, from the posterior's.
-///
-/// The narrow stage tempers the frames' residuals, so its covariance is too wide where the frames decide, and a share of it pours
-/// best on other rigs. Where little was poured the priors decide, and nothing may be taken off.
-pub fn trusted_vessel_sd(posterior_sd: f64) -> f64 {
-    (VESSEL_SD_SHARE * posterior_sd * (posterior_sd / VESSEL_SD_OF_PRIORS).max(1.0)).min(0.5)
-}
-
-/// Posterior variance of the logarithm of the capacity lost in a window of tilt, averaged over windows from the lowest onset to a
-/// little beyond the highest.
-pub fn vessel_variance(at: &Unknowns, covariance: &DMatrix<f64>) -> f64 {
-    let onsets = at.of_episodes(ONSET);
-    let low = onsets.iter().copied().fold(f64::INFINITY, f64::min).clamp(0.0, 110.0);
-    let high = onsets.iter().copied().fold(f64::NEG_INFINITY, f64::max).clamp(0.0, 110.0) + BEYOND_ONSET_DEG;
-    let edges: Vec<f64> = (0..=WINDOWS).map(|k| low + (high - low) * k as f64 / WINDOWS as f64).collect();
-    let log_windows = |shared: &[f64]| -> Vec<f64> {
-        let capacity = FlowTables::new(&model_of(shared)).capacity;
-        edges.windows(2).map(|e| (capacity.lost_ml(e[1]) - capacity.lost_ml(e[0])).max(1e-6).ln()).collect()
-    };
-    let base = log_windows(&at.shared);
-    let slopes: Vec<Vec<f64>> = (0..VESSEL)
-        .map(|k| {
-            let mut shared = at.shared;
-            shared[k] += NUDGE;
-            log_windows(&shared).iter().zip(&base).map(|(a, b)| (a - b) / NUDGE).collect()
-        })
-        .collect();
-    let variance =
-        |w: usize| -> f64 { (0..VESSEL).map(|i| (0..VESSEL).map(|j| slopes[i][w] * covariance[(i, j)] * slopes[j][w]).sum::<f64>()).sum() };
-    (0..WINDOWS).map(variance).sum::<f64>() / WINDOWS as f64
 }
 
 #[cfg(test)]

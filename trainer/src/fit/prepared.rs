@@ -22,6 +22,11 @@ const HUBER_SDS: f64 = 3.0;
 /// recorded.
 const DROPOUT_FRAMES: usize = 3;
 
+/// The least weight of a calm pour, g: below it the scale's rounding says little. Chosen by hand; no measurement is recorded.
+const CALM_G: f64 = 30.0;
+/// The largest mean outflow of a calm pour, ml a frame: controlled pours have 0.7, curves 1.9 in the prototype.
+const CALM_ML_PER_FRAME: f64 = 1.1;
+
 /// How much a stage of the fit lets the episodes differ.
 #[derive(Clone, Copy)]
 pub struct Stage {
@@ -37,7 +42,10 @@ pub struct Stage {
 
 /// One episode made ready.
 pub struct PreparedEpisode {
+    /// Tilt of each frame as the model takes it: measured or commanded, degrees.
     alpha_deg: Vec<f64>,
+    /// The largest of them, degrees.
+    pub top_deg: f64,
     /// Each frame's z, see [`tilt_z`].
     tilt_z: Vec<f64>,
     /// V_e of each frame, px^2; NaN where it is not known.
@@ -56,8 +64,8 @@ pub struct PreparedEpisode {
 }
 
 impl PreparedEpisode {
-    /// Makes a usable episode ready.
-    pub fn new(e: &TrainingEpisode) -> Self {
+    /// Makes a usable episode ready; `alpha_deg` is its tilt, measured or commanded.
+    pub fn new(e: &TrainingEpisode, alpha_deg: Vec<f64>) -> Self {
         let n = e.len();
         let area = &e.area_px2;
         let seen = |k: usize| area[k] > 0.0;
@@ -85,7 +93,8 @@ impl PreparedEpisode {
             .filter(|(a, _)| *a > 0.0)
             .collect();
         Self {
-            alpha_deg: e.alpha_deg.clone(),
+            top_deg: alpha_deg.iter().copied().fold(0.0, f64::max),
+            alpha_deg,
             tilt_z: e.alpha_deg.iter().map(|a| tilt_z(*a)).collect(),
             area_px2: area.clone(),
             held,
@@ -95,6 +104,17 @@ impl PreparedEpisode {
             first: (0..n).find(|k| seen(*k)).unwrap_or(0),
             extra_delay_frames: 0.0,
         }
+    }
+
+    /// Number of frames that show flow.
+    pub fn frames_with_flow(&self) -> usize {
+        self.held.len()
+    }
+
+    /// Whether this is a calm pour as controlled ones are, and not a curve: what it weighs tells the camera's gain at the flow at which the
+    /// controller pours.
+    pub fn is_calm(&self) -> bool {
+        self.weight_g >= CALM_G && self.weight_g <= CALM_ML_PER_FRAME * self.held.len() as f64
     }
 
     /// What the model says left the lip in each frame, and the film after it, ml.
