@@ -7,11 +7,13 @@
 //! | file | what it holds |
 //! |---|---|
 //! | [`container`] | vessels, what they retain at a tilt, and the flow over the lip and the film, step by step |
+//! | [`habits`] | what vessels and liquids do beyond a smooth shape and a weir |
 //! | [`rig`] | a seeded rig of simulator b: container, liquid, servo, camera; one pour on it, frame by frame |
-//! | [`vessel`] | rigs that are not straight: rough curves, gurgle, clinging stream, slosh, late robot, each drawn from a seed |
+//! | [`vessel`] | rigs that are not straight, water and prompt, each drawn from a seed |
 //! | [`paper`] | simulator a |
 
 pub mod container;
+pub mod habits;
 pub mod paper;
 pub mod rig;
 pub mod vessel;

@@ -7,7 +7,7 @@ use std::path::PathBuf;
 use shared::agent::Agent;
 use shared::config::Config;
 use shared::exit::{self, Failure, OrExit as _, failure};
-use shared::messages::{Doubt, Feature, LAYOUT_VERSION};
+use shared::messages::{Doubt, Feature, LAYOUT_VERSION, Telemetry};
 use shared::weights::Weights;
 
 use crate::core::{Core, Input, Order, Robot, Settings};
@@ -15,8 +15,10 @@ use crate::core::{Core, Input, Order, Robot, Settings};
 /// Command-line arguments.
 #[derive(Debug, clap::Args)]
 #[command(after_help = "Example:\n  printf '0\\n0\\n350\\nnan\\n410\\n' | rt-controller step --weights out/weights.bin --goal 75\n\n\
-Each line of input is one frame's V_e in px^2 (nan: no measurement); each line of output is 'dalpha_deg alpha_deg d_ml', flushed at once:\n\
-the change and the angle commanded after this frame (all limits of the configuration applied), and the volume still to pour.")]
+Each line of output is 'dalpha_deg alpha_deg d_ml', flushed at once: the change and the angle commanded now (all limits of the\n\
+configuration applied), and the volume still to pour. The first line comes before any input, because the tick that takes the goal already\n\
+moves, from upright. Then each line of input is one frame's V_e in px^2 (nan: no measurement), and each has one line of output. Each\n\
+alpha_deg is the sum of all dalpha_deg so far.")]
 pub struct Args {
     /// The weight file.
     #[arg(long)]
@@ -55,30 +57,70 @@ pub fn run(args: &Args) -> Result<(), Failure> {
         // The robot is taken to be where it was sent; a lag is for the other simulator to add.
         let robot = Robot::that_may_move(alpha_deg, now_ns);
         let output = core.step(&Input { now_ns, features: &[feature], robot, order });
-        let before_deg = alpha_deg;
         alpha_deg = output.telemetry.alpha_deg;
-        (output, alpha_deg - before_deg)
+        output
     };
-    // Two frames come before the first line: in one the robot becomes ready, in the other the goal is set.
+    // Two frames come before the first line of input: in one the robot becomes ready, in the other the goal is set.
     frame(0.0, None);
-    let (started, _) = frame(0.0, Some(Order::Pour { episode: 1, goal_ml: args.goal }));
+    let started = frame(0.0, Some(Order::Pour { episode: 1, goal_ml: args.goal }));
     if let Some(Err(refusal)) = started.ordered {
         return Err(failure(exit::REFUSED, refusal));
     }
-    let mut out = std::io::stdout().lock();
+    let mut lines = Lines { out: std::io::stdout().lock(), printed: 0 };
+    if lines.print(&started.telemetry).is_err() {
+        return Ok(()); // the reader has gone
+    }
     for (number, line) in std::io::stdin().lock().lines().enumerate() {
-        let area_px2 = match line.as_deref().map(str::trim).map(str::parse::<f32>) {
-            Ok(Ok(area_px2)) => area_px2,
-            _ => {
-                let what = format!("line {}: not a number: give one V_e in px^2, or nan, on each line", number + 1);
-                return Err(failure(exit::BAD_INPUT, what));
-            }
-        };
-        let (output, dalpha_deg) = frame(area_px2, None);
-        let t = output.telemetry;
-        if writeln!(out, "{dalpha_deg:.4} {:.4} {:.4}", t.alpha_deg, t.d_ml).and_then(|()| out.flush()).is_err() {
+        let area_px2 = line.map_err(|e| e.to_string()).and_then(|text| area_px2(&text));
+        let area_px2 = area_px2.map_err(|why| failure(exit::BAD_INPUT, format!("line {}: {why}", number + 1)))?;
+        if lines.print(&frame(area_px2, None).telemetry).is_err() {
             return Ok(()); // the reader has gone
         }
     }
     Ok(())
+}
+
+/// One frame's V_e as it was written; NaN for one that was not measured.
+fn area_px2(text: &str) -> Result<f32, String> {
+    let text = text.trim();
+    match text.parse::<f32>() {
+        Ok(area_px2) if area_px2.is_nan() || (0.0..f32::INFINITY).contains(&area_px2) => Ok(area_px2),
+        Ok(_) => Err(format!("{text} is no area: give a finite V_e of at least 0 px^2, or nan for no measurement")),
+        Err(_) => Err("not a number: give one V_e in px^2, or nan, on each line".into()),
+    }
+}
+
+/// Places of a printed angle: its last digit is 0.0001 degrees.
+const PLACES: f64 = 1e4;
+
+/// Prints the lines of output. What is printed adds up to the last digit, because a change is the difference of two printed angles.
+struct Lines<W> {
+    out: W,
+    /// The angle printed last, in its last digit.
+    printed: i64,
+}
+
+impl<W: Write> Lines<W> {
+    fn print(&mut self, telemetry: &Telemetry) -> std::io::Result<()> {
+        let alpha = (f64::from(telemetry.alpha_deg) * PLACES).round() as i64;
+        let dalpha = alpha - std::mem::replace(&mut self.printed, alpha);
+        writeln!(self.out, "{:.4} {:.4} {:.4}", dalpha as f64 / PLACES, alpha as f64 / PLACES, telemetry.d_ml)?;
+        self.out.flush()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Protects the filter from areas that no camera gives: a negative or endless one is refused in one line that says what to give.
+    #[test]
+    fn areas_that_cannot_be_are_refused() {
+        assert_eq!(area_px2(" 350 "), Ok(350.0));
+        assert_eq!(area_px2("0"), Ok(0.0));
+        assert!(area_px2("nan").is_ok_and(f32::is_nan));
+        for text in ["-1", "1e999", "inf", "-inf", "-0.001", "", "3 4", "much"] {
+            assert!(area_px2(text).is_err_and(|why| why.contains("px^2") && !why.contains('\n')), "{text}");
+        }
+    }
 }

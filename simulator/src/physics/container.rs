@@ -9,7 +9,7 @@
 
 use serde::{Deserialize, Serialize};
 
-use super::vessel::{Habits, Slosh};
+use super::habits::{Habits, Slosh};
 
 /// Share of the outflow that first stays at the lip as a film. Part of the evaluation's protocol; no measurement is recorded.
 const FILM_SHARE: f64 = 0.12;

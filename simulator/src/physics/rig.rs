@@ -9,7 +9,7 @@ use serde::{Deserialize, Serialize};
 
 use super::RATE_HZ;
 use super::container::{Container, Shape};
-use super::vessel::Habits;
+use super::habits::Habits;
 
 /// Steps of the physics in a frame: 11 ms each, short against the servo's time constant and the film's.
 const SUBSTEPS: usize = 3;

@@ -1,0 +1,58 @@
+//! `rt-controller step` as another simulator uses it: a process that gets areas and gives angles.
+#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::too_many_lines)]
+
+#[path = "../../shared/examples/write_weights.rs"]
+#[allow(dead_code)]
+mod write_weights;
+
+use std::io::Write as _;
+use std::process::{Command, Output, Stdio};
+
+/// Runs the filter with weights that always tilt forward, on `areas`.
+fn step(areas: &str) -> Output {
+    let directory = tempfile::tempdir().unwrap();
+    let weights = directory.path().join("w.bin");
+    write_weights::constant_action(3).write(&weights).unwrap();
+    let mut child = Command::new(env!("CARGO_BIN_EXE_rt-controller"))
+        .args(["step", "--goal", "20", "--config", concat!(env!("CARGO_MANIFEST_DIR"), "/../config/sim.toml"), "--weights"])
+        .arg(&weights)
+        .stdin(Stdio::piped())
+        .stdout(Stdio::piped())
+        .stderr(Stdio::piped())
+        .spawn()
+        .unwrap();
+    // It may refuse a line before all are written.
+    let _ = child.stdin.take().unwrap().write_all(areas.as_bytes());
+    child.wait_with_output().unwrap()
+}
+
+/// Protects a simulator that adds up the changes: from upright, every printed angle is the sum of all printed changes, the tick that takes
+/// the goal included, also while the container comes back.
+#[test]
+fn every_angle_is_the_sum_of_the_changes() {
+    let areas = "0\n".repeat(60) + "nan\n" + &"900\n".repeat(60) + &"0\n".repeat(120);
+    let output = step(&areas);
+    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+    let text = String::from_utf8(output.stdout).unwrap();
+    let lines: Vec<Vec<f64>> = text.lines().map(|l| l.split(' ').map(|word| word.parse().unwrap()).collect()).collect();
+    assert_eq!(lines.len(), 1 + areas.lines().count());
+    let mut sum_deg = 0.0;
+    for (number, line) in lines.iter().enumerate() {
+        assert_eq!(line.len(), 3);
+        sum_deg += line[0];
+        assert!((sum_deg - line[1]).abs() < 1e-6, "line {number}: {sum_deg} and {}", line[1]);
+    }
+    let top_deg = lines.iter().map(|l| l[1]).fold(0.0, f64::max);
+    assert!(lines[0][1] > 0.0 && top_deg > 20.0, "the first line moves ({}), and so does the pour ({top_deg})", lines[0][1]);
+}
+
+/// Protects a pour from areas that cannot be: each is refused in one line that names it, with the exit code of bad input.
+#[test]
+fn an_impossible_area_gets_one_line() {
+    for area in ["-1", "1e999", "much"] {
+        let output = step(&format!("0\n{area}\n"));
+        let said = String::from_utf8_lossy(&output.stderr).trim().to_owned();
+        assert_eq!(output.status.code(), Some(i32::from(shared::exit::BAD_INPUT)), "{area}: {said}");
+        assert!(said.lines().count() == 1 && said.contains("line 2"), "{area}: {said}");
+    }
+}
