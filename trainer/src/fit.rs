@@ -95,7 +95,7 @@ const CALM_NEEDS: usize = 3;
 const AREA_MARGIN: f64 = 3.0;
 /// How far beyond the highest onset of the episodes a container may be tilted without any flow, degrees. Chosen by hand; docs/LEARNING.md has
 /// the false alarms.
-const DRY_MARGIN_DEG: f64 = 10.0;
+const DRY_MARGIN_DEG: f64 = 25.0;
 
 /// Effort of each of the first solutions, which only have to tell beginnings apart. Chosen by hand, see docs/LEARNING.md for the time it
 /// takes.

@@ -7,8 +7,8 @@
 //! |---|---|
 //! | a stream is seen although the container is upright | [`Impossible::Flow`] |
 //! | areas larger than three times the largest of the episodes, three frames in a row | [`Impossible::Flow`] |
-//! | the stream does not do what the tilt makes it do, in most of some ten frames | [`Impossible::Flow`] |
-//! | nothing was ever seen to flow, 10 degrees beyond the tilt at which the emptiest episode flowed | [`Impossible::NoFlow`] |
+//! | the stream stays behind what the tilt makes it do, in most of some ten frames | [`Impossible::Flow`] |
+//! | nothing was ever seen to flow, 25 degrees beyond the tilt at which the emptiest episode flowed | [`Impossible::NoFlow`] |
 
 use serde::{Deserialize, Serialize};
 
@@ -50,6 +50,8 @@ pub struct Bounds {
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub(super) struct Watch {
     doubt: f64,
+    /// Whether the frame before was more than was foreseen.
+    leapt: bool,
     too_much_frames: u32,
     no_flow_frames: u32,
     seen_flow: bool,
@@ -83,8 +85,11 @@ impl Watch {
     pub fn foreseen(&mut self, innovation: Option<Innovation>) -> bool {
         let Some(Innovation { sds, .. }) = innovation else { return false };
         let odd = sds.abs() > ODD_SDS;
-        let lone = odd && sds > 0.0 && self.doubt < 0.5;
-        self.doubt = DOUBT_KEPT * self.doubt + f64::from(odd);
+        let lone = odd && sds > 0.0 && !self.leapt;
+        self.leapt = odd && sds > 0.0;
+        // More than was foreseen is what a vessel does that loses much in a degree; it ends a pour early and pours nothing too much. A stream
+        // that comes and goes, as from a bottle that gurgles, is not stuck.
+        self.doubt = if odd && sds > 0.0 { 0.0 } else { DOUBT_KEPT * self.doubt + f64::from(odd) };
         if self.doubt > DOUBT_MAX {
             self.verdict.get_or_insert(Impossible::Flow);
         }
