@@ -22,7 +22,7 @@ pub mod demo;
 pub mod jitter;
 pub mod motion;
 pub mod own_cell;
-mod own_folder;
+pub mod own_folder;
 pub mod paper_section_4;
 pub mod plots;
 pub mod pour_evaluation;

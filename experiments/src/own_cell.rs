@@ -100,7 +100,7 @@ impl OwnCell {
         let text = std::fs::read_to_string(config).map_err(|e| file(config, e))?;
         Config::parse(&text, &config.display().to_string()).map_err(|e| bad(&e))?;
         let mut table: toml::Table = text.parse().map_err(|e| bad(&format!("{}: {e}", config.display())))?;
-        own_folder::claim(out, &[results, &["logs", "weights.bin"]].concat())?;
+        own_folder::claim(out, &[results, &["logs", "weights.bin"]].concat()).map_err(|e| bad(&e))?;
         std::fs::create_dir_all(out.join("logs")).map_err(|e| file(out, e))?;
         let mut set = |section: &str, key: &str, value: toml::Value| {
             if let Some(toml::Value::Table(t)) = table.get_mut(section) {

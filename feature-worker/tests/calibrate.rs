@@ -30,12 +30,13 @@ fn calibrate(config: &Path, picture: &Path, more: &[&str]) -> std::io::Result<Ou
 fn one_pour_is_enough() -> Outcome {
     let directory = tempfile::tempdir()?;
     let pattern = frames(directory.path())?;
-    let (path, before) = write_config(directory.path(), "calibrate", |c| {
+    let (path, _) = write_config(directory.path(), "calibrate", |c| {
         c.image.colour_hsv = [0, 0, 0, 10, 20, 20];
         c.image.x_axis_px = [100.0, 100.0, 200.0, 110.0];
     })?;
     let text = std::fs::read_to_string(&path)?.replace("[robot]", "# the robot in cell 7\n[robot]");
     std::fs::write(&path, &text)?;
+    let before = Config::read(&path)?;
     let picture = directory.path().join("look.png");
     let output = calibrate(&path, &picture, &["--write", &pattern])?;
     let said = String::from_utf8_lossy(&output.stderr).into_owned();

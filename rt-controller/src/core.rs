@@ -25,7 +25,7 @@ use intake::Taken;
 use order::Situation;
 
 pub mod ending;
-mod following;
+pub mod following;
 mod intake;
 mod order;
 mod robot;

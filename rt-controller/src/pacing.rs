@@ -13,7 +13,7 @@
 
 /// The least margin, ns: what a V_e that comes at its usual time to the microsecond would be given. Chosen by hand: the wake-up of
 /// cyclictest's 99.9th percentile on the machines of docs/REALTIME.md.
-const MARGIN_FLOOR_NS: i64 = 300_000;
+pub const MARGIN_FLOOR_NS: i64 = 300_000;
 /// The largest margin, ns, and the one before anything is known: more than the jitter of a loaded machine. See docs/REALTIME.md.
 pub const MARGIN_MAX_NS: i64 = 3_000_000;
 /// Number of measurements in a window: 10 s at 30 Hz. The latest V_e of this window and the one before decides.

@@ -108,8 +108,12 @@ impl Place {
             return if given.ends_with(&self.name) { given } else { given.join(&self.name) };
         }
         let system = Path::new("/run/decant");
-        let usable =
-            |base: &Path| base != system || may_write(&base.join(&self.name)) || may_write(base) || (own_uid() == 0 && !base.exists());
+        let usable = |base: &Path| {
+            base != system
+                || may_write(&base.join(&self.name))
+                || may_write(base)
+                || (own_uid() == 0 && !base.exists() && may_write(Path::new("/run")))
+        };
         let base = bases().into_iter().find(|b| usable(b)).unwrap_or_else(|| system.into());
         base.join(&self.name)
     }

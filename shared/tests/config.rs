@@ -7,7 +7,8 @@ use shared::config::Config;
 #[test]
 fn one_path_for_two_things_is_refused() {
     let dir = tempfile::tempdir().expect("a directory");
-    let file = dir.path().join("cell.toml");
+    std::fs::create_dir(dir.path().join("config")).expect("writable");
+    let file = dir.path().join("config/cell.toml");
     let read = |journal: &str| {
         let text =
             include_str!("../../config/cell.toml").replace("journal = \"../out/lab/journal.bin\"", &format!("journal = \"{journal}\""));
@@ -19,8 +20,9 @@ fn one_path_for_two_things_is_refused() {
     let weights = config.controller.weights;
     assert!(weights.starts_with(dir.path().canonicalize().expect("there")), "{}", weights.display());
     let name = weights.file_name().expect("a name").to_string_lossy().into_owned();
+    let by_detour = format!("../out/lab/{name}");
     for (journal, other) in
-        [(name.as_str(), "controller.weights"), ("cell.toml", "the configuration"), ("./cell.toml", "the configuration")]
+        [(by_detour.as_str(), "controller.weights"), ("cell.toml", "the configuration"), ("./cell.toml", "the configuration")]
     {
         let said = read(journal).expect_err("must be refused");
         assert!(said.contains("controller.journal") && said.contains(other), "{said}");

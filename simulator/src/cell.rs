@@ -288,8 +288,8 @@ fn obey(state: &CellState, noise: &mut Pcg64Mcg, line: &str) -> Result<serde_jso
         "fill" => {
             let volume_ml: f64 = rest.parse().map_err(|_| format!("'{rest}' is no volume in ml"))?;
             let mut container = state.container();
-            if !(volume_ml >= 0.0 && volume_ml <= 0.92 * container.full_ml()) {
-                return Err(format!("{volume_ml} ml: this container takes 0 to {:.0} ml", 0.92 * container.full_ml()));
+            if !(volume_ml >= 0.0 && volume_ml <= container.fill_max_ml()) {
+                return Err(format!("{volume_ml} ml: this container takes 0 to {:.0} ml", container.fill_max_ml()));
             }
             *container = state.rig.container(volume_ml);
             Ok(serde_json::json!({ "filled_ml": volume_ml }))

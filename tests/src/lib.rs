@@ -5,14 +5,18 @@
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::too_many_lines)]
 #![forbid(unsafe_code)]
 
+use std::net::IpAddr;
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Output, Stdio};
 use std::sync::atomic::{AtomicU32, Ordering};
 use std::time::{Duration, Instant};
 
+use rt_controller::link::{LinkOptions, TiltJoint};
 use serde_json::Value;
 use shared::actions::{Selection, action_table};
+use shared::config::Joint;
 use shared::estimator::Calibration;
+use shared::limits::Limits;
 use shared::mlp::{InputScale, Mlp};
 use shared::weights::{Estimator, Method, Origin, Weights};
 
@@ -33,6 +37,20 @@ pub fn steady_weights(action: usize) -> Weights {
         rate_hz: 30.0,
         origin: Origin { method: Method::Handmade, actions: 21, episodes: 0, data_sha256: [action as u8; 32] },
         seed: 1,
+    }
+}
+
+/// How the robot at `address` is linked in tests: wrist 3 tilts, upright at 0, within the default limits.
+pub fn link_options(address: IpAddr) -> LinkOptions {
+    LinkOptions {
+        address,
+        tilt: TiltJoint { joint: Joint::Wrist3, start_deg: 0.0, direction: 1.0 },
+        start_tolerance_deg: 2.0,
+        register_base: 24,
+        lookahead_s: 0.05,
+        gain: 600.0,
+        limits: Limits::default(),
+        rate_hz: 30.0,
     }
 }
 

@@ -5,8 +5,7 @@ use std::net::{IpAddr, Ipv4Addr};
 use std::thread;
 use std::time::Duration;
 
-use rt_controller::link::{LinkError, LinkOptions, Mode, ProgramState, Session, TiltJoint, connect, health};
-use shared::config::Joint;
+use rt_controller::link::{LinkError, LinkOptions, Mode, ProgramState, Session, connect, health};
 use shared::limits::{Limiter, Limits};
 use shared::os::now_ns;
 use simulator::ur::{Controller, ControllerOptions, Fault, Series};
@@ -14,16 +13,7 @@ use simulator::ur::{Controller, ControllerOptions, Fault, Series};
 fn cell(last: u8, series: Series) -> (Controller, LinkOptions) {
     let address = IpAddr::V4(Ipv4Addr::new(127, 43, 0, last));
     let robot = Controller::start(ControllerOptions { series, ..ControllerOptions::new(address) }).unwrap();
-    let options = LinkOptions {
-        address,
-        tilt: TiltJoint { joint: Joint::Wrist3, start_deg: 0.0, direction: 1.0 },
-        start_tolerance_deg: 2.0,
-        register_base: 24,
-        lookahead_s: 0.05,
-        gain: 600.0,
-        limits: Limits::default(),
-        rate_hz: 30.0,
-    };
+    let options = tests::link_options(address);
     (robot, options)
 }
 

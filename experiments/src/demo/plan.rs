@@ -5,10 +5,10 @@
 
 use simulator::physics::rig::Rig;
 
-/// Curves: the fill as a share of what the vessel holds, how far beyond the angle of the first drop, degrees, and the width, 1/s^2. Both spill
+/// Curves: the fill as a share of what is filled in at most, how far beyond the angle of the first drop, degrees, and the width, 1/s^2. Both spill
 /// some 40 to 80 ml. Chosen by hand.
 const CURVES: [(f64, f64, f64); 2] = [(0.85, 15.0, 0.25), (0.5, 13.0, 0.25)];
-/// Weighed pours: fill and goal as shares of what the vessel holds. From different fills, and of 60 ml and more in most vessels, because
+/// Weighed pours: fill and goal as shares of what is filled in at most. From different fills, and of 60 ml and more in most vessels, because
 /// the scale rounds to whole grams. Chosen by hand.
 const WEIGHED_POURS: [(f64, f64); 3] = [(0.7, 0.2), (0.9, 0.25), (0.5, 0.16)];
 /// Pours that are judged, in the same way: a small, a middling and a large one. Chosen by hand, so that none of them was seen in training.
@@ -52,7 +52,7 @@ pub struct Plan {
 impl Plan {
     /// The plan for the vessel of a rig.
     pub fn for_rig(rig: &Rig) -> Self {
-        let holds_ml = rig.shape.retained_ml(0.0);
+        let holds_ml = rig.container(0.0).fill_max_ml();
         let fives = |ml: f64| (ml / 5.0).round() * 5.0;
         let fill = |share: f64| (share * holds_ml / 10.0).floor() * 10.0;
         let pour = |(fill_share, goal_share): (f64, f64)| PlannedPour {
@@ -84,13 +84,13 @@ mod tests {
             for container in ["cylinder", "cone-in", "cone-out", "bottle", "jug"] {
                 let rig = Rig::seeded(seed).with_container(container).unwrap();
                 let plan = Plan::for_rig(&rig);
-                let holds_ml = rig.shape.retained_ml(0.0);
+                let holds_ml = rig.container(0.0).fill_max_ml();
                 for pour in plan.weighed_pours.iter().chain(&plan.pours) {
-                    assert!(pour.fill_ml < holds_ml && pour.goal_ml >= 15.0, "{container} {seed}: {pour:?} of {holds_ml}");
+                    assert!(pour.fill_ml <= holds_ml && pour.goal_ml >= 15.0, "{container} {seed}: {pour:?} of {holds_ml}");
                     assert!(pour.goal_ml < 0.65 * pour.fill_ml && pour.goal_ml <= 300.0, "{container} {seed}: {pour:?}");
                 }
                 for curve in &plan.curves {
-                    assert!(curve.fill_ml < holds_ml && curve.lambda_deg > 15.0, "{container} {seed}: {curve:?}");
+                    assert!(curve.fill_ml <= holds_ml && curve.lambda_deg > 15.0, "{container} {seed}: {curve:?}");
                     let spill_deg = rig.container(curve.fill_ml).spill_angle_deg();
                     assert!(
                         curve.lambda_deg > spill_deg + 2.0 && curve.lambda_deg <= LAMBDA_MAX_DEG,

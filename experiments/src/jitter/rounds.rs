@@ -2,7 +2,7 @@
 //!
 //! Ordinary thread; allocates and blocks. Their order changes from round to round, so that warming up affects all alike.
 
-use serde_json::{Map, Value, json};
+use serde_json::{Map, Value};
 
 use super::bare_loop;
 use super::cell_run::{CellRun, run_cell};
@@ -97,11 +97,10 @@ fn told(conditions: &[Condition]) -> Measured {
         numbers.insert(condition.name.into(), part.numbers);
     }
     let verdict = conditions.iter().map(Condition::verdict).collect::<Vec<_>>().join(" ");
-    let numbers = json!(numbers);
     Measured {
         verdict,
         rounds: conditions.iter().map(|c| (c.name, c.rounds.clone())).collect(),
-        numbers: Value::clone(&numbers),
+        numbers: Value::Object(numbers),
         text,
         html,
     }

@@ -1,7 +1,7 @@
 //! What confidence means: the share of measurements like this one whose area is within 20 % of the truth.
 //!
 //! The extraction's own figure only orders measurements. The tables here turn it into that share. They were read off the tables of
-//! reliability that `evaluate-camera` prints, on the seeds for tuning; docs/VISION.md shows the tables on other seeds.
+//! reliability that `evaluate-camera` prints, on the seeds for tuning.
 //!
 //! Pure, for any thread; nothing fails.
 

@@ -10,7 +10,7 @@ const LASTING_PX2: f32 = 100.0;
 const WIDTH_PX: f32 = 640.0;
 /// The ground is dry when this share of the stream's former place was seen to be ground. Tuned as [`LASTING_PX2`] was.
 const DRY_SHARE: f32 = 0.6;
-/// So many pictures in a row have to show dry ground. Tuned as [`LASTING_PX2`] was: docs/VISION.md shows what more and fewer do.
+/// So many pictures in a row have to show dry ground. Tuned as [`LASTING_PX2`] was.
 const DRY_PICTURES: u32 = 1;
 
 /// Where the light is not what it was, by this factor, colours are no evidence. Chosen by hand: a container that turns changes the mean

@@ -28,10 +28,10 @@ const LAG_MAX_S: f64 = 0.3;
 const LAG_MARGIN: f64 = 0.25;
 /// Distance from the commands that still counts as following, degrees: also the largest distance that counts as upright in the shipped
 /// configurations. Chosen by hand; no measurement is recorded.
-const TOLERANCE_DEG: f32 = 2.0;
+pub const TOLERANCE_DEG: f32 = 2.0;
 /// Number of ticks in a row that a joint may be elsewhere: one that is late by a single state of the robot is not slow. Chosen by hand; no
 /// measurement is recorded.
-const MOST_TICKS: u32 = 3;
+pub const MOST_TICKS: u32 = 3;
 /// Share of its speed below which the robot slows the motion by itself (RTDE's `speed_scaling`). Chosen by hand: above it the lag is the usual
 /// one.
 const FULL_SPEED: f32 = 0.95;

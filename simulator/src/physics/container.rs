@@ -17,6 +17,8 @@ const FILM_SHARE: f64 = 0.12;
 const FILM_S: f64 = 0.30;
 /// Share of the outflow that becomes film when the whole stream clings to the wall. Chosen by hand; no measurement is recorded.
 const CLINGING_SHARE: f64 = 0.6;
+/// Share of its volume up to which a container is filled at most. Chosen by hand.
+const FILL_SHARE_MAX: f64 = 0.92;
 /// Step of the tables over the tilt, degrees: fine enough that linear interpolation does for what lies between.
 const TABLE_STEP_DEG: f64 = 0.25;
 
@@ -254,6 +256,11 @@ impl Container {
     /// The shape of its inside.
     pub fn shape(&self) -> &Shape {
         &self.shape
+    }
+
+    /// The most that a person fills in, ml: a little below the lip, so that nothing spills on the way into the gripper.
+    pub fn fill_max_ml(&self) -> f64 {
+        FILL_SHARE_MAX * self.full_ml()
     }
 
     /// Volume of the upright container when it is full to the lip, ml.

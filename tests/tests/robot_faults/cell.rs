@@ -96,6 +96,7 @@ impl Cell {
         config.robot.address = address;
         config.controller.weights = directory.path().join("weights.bin");
         config.controller.journal = None;
+        config.recording.directory = directory.path().join("episodes");
         config.simulator = None;
         std::fs::write(directory.path().join("cell.toml"), toml::to_string(&config).unwrap()).unwrap();
         tilt_until_it_flows().write(&config.controller.weights).unwrap();

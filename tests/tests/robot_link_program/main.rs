@@ -21,16 +21,7 @@ const RUN: i32 = 4711;
 const STANCE_RAD: [f64; 6] = [0.3, -1.2, 1.4, -0.5, 1.6, 0.0];
 
 fn options() -> LinkOptions {
-    LinkOptions {
-        address: [127, 0, 0, 1].into(),
-        tilt: TiltJoint { joint: Joint::Wrist3, start_deg: 0.0, direction: 1.0 },
-        start_tolerance_deg: 2.0,
-        register_base: 24,
-        lookahead_s: 0.05,
-        gain: 600.0,
-        limits: Limits::default(),
-        rate_hz: 30.0,
-    }
+    tests::link_options([127, 0, 0, 1].into())
 }
 
 /// What one control cycle showed; angles as alpha in degrees.
