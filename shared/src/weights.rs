@@ -342,9 +342,8 @@ pub(crate) mod tests {
         FusedModel {
             explanations: [explanation; 2],
             tight_share: 0.9,
-            camera_sd: 0.04,
+            camera: [[0.04, -0.006], [-0.006, 0.001]],
             gain_sd: 0.015,
-            wide_sds: 0.5,
             bounds: Bounds { most_px2: 5000.0, dry_deg: 90.0 },
         }
     }
@@ -434,10 +433,10 @@ pub(crate) mod tests {
                     model.explanations[1].model.delay_frames = f64::NAN;
                 }
             }),
-            ("estimator: sd of the camera's sum", |w| {
+            ("estimator: variance of log c", |w| {
                 *w = fused_example();
                 if let Estimator::Fused { model, .. } = &mut w.estimator {
-                    model.camera_sd = 0.0;
+                    model.camera[0][0] = f64::NAN;
                 }
             }),
         ] {

@@ -26,11 +26,12 @@
 
 use nalgebra::DMatrix;
 use shared::estimator::Calibration;
-use shared::estimator::flow::{DELAY_MAX_FRAMES, FlowModel, FlowNoise, FlowTables, Lateness};
-use shared::estimator::fused::{Explanation, FusedModel, TIGHT, WIDE};
+use shared::estimator::flow::{DELAY_MAX_FRAMES, FlowModel, FlowNoise, FlowTables, Lateness, WayBack};
+use shared::estimator::fused::{Explanation, FusedEstimator, FusedFrame, FusedModel, TIGHT, WIDE, Whiteness};
 use shared::estimator::verdict::Bounds;
+use shared::limits::Limits;
 
-use crate::calibration;
+use crate::calibration::{self, Doubted};
 use crate::data::TrainingEpisode;
 
 mod doubts;
@@ -44,7 +45,7 @@ mod tilts;
 mod unknowns;
 
 use fitted::Fitted;
-use noise::{CHANGE_NEEDS, FrameNoise};
+use noise::{CHANGE_NEEDS, Changed, FrameNoise};
 use prepared::{PreparedEpisode, Stage};
 use priors::{HeldCalibration, Priors, VesselPrior};
 use problem::{Effort, Problem};
@@ -72,6 +73,9 @@ const GAIN_SD: f64 = 0.02;
 /// How much the gain may change where the frames show no noise (log): a camera that does not waver within a pour hardly does between
 /// two. Chosen by hand; no measurement is recorded.
 const GAIN_CLEAN: f64 = 0.004;
+/// How far the gain may be from the model's when a change is looked for (log): a lens that was touched. Chosen by hand; no measurement is
+/// recorded.
+const GAIN_FREE: f64 = 0.15;
 /// How far the delays of two episodes are apart as a rule, frames. Tuned on rigs 100 to 123, see docs/LEARNING.md.
 const DELAY_KNOWN_FRAMES: f64 = 0.02;
 /// How far the delays may be apart when a change is looked for, frames. Tuned on rigs 100 to 123, see docs/LEARNING.md.
@@ -85,11 +89,9 @@ const TEMPERS: [f64; 3] = [4.0, 3.0, 1.5];
 const AREA_SD_MIN: f64 = 0.02;
 /// The weight of the straight vessel below which it counts as refuted. From the prototype; no other measurement is recorded.
 const TIGHT_SHARE_MIN: f64 = 0.01;
-/// How far the estimate of a vessel of any shape may be from the camera's own sum once [`CALM_NEEDS`] calm pours were weighed, standard
-/// deviations; before that, 0. From the prototype; no other measurement is recorded.
-const WIDE_SDS: f64 = 0.5;
-/// Number of calm, weighed pours that the geometry needs not to mislead. From the prototype; no other measurement is recorded.
-const CALM_NEEDS: usize = 3;
+/// Correlation of the innovations over all episodes up to which the straight vessel is fully trusted, and from which on it counts as refuted.
+/// On rigs 100 to 107 and 200 to 207 it was -0.05 to 0.00 for straight vessels, and 0.2 to 0.8 for others.
+const TRUSTED_CORRELATION: (f64, f64) = (0.10, 0.20);
 
 /// An area this many times the episodes' largest is no stream. Chosen by hand: a controlled pour stays far below the largest flow of a curve.
 const AREA_MARGIN: f64 = 3.0;
@@ -185,14 +187,18 @@ pub fn fit(episodes: &[TrainingEpisode]) -> Fit {
         let (wide, tight) = rayon::join(|| begin(&wide), || begin(&tight));
         [wide, tight]
     };
-    let mut delay_sd_frames = DELAY_KNOWN_FRAMES;
-    if let Some(delays) = changed_delays(&camera.problem(&prepared, &wide, first), &starts[WIDE]) {
-        for (k, (episode, delay)) in prepared.iter_mut().zip(delays).enumerate() {
-            episode.extra_delay_frames = delay;
-            starts.iter_mut().for_each(|start| start.own[k][EXTRA_DELAY] = delay);
+    let changes = Changes::of(&camera.problem(&prepared, &wide, first), &starts[WIDE]);
+    for (k, episode) in prepared.iter_mut().enumerate() {
+        if let Some(delays) = &changes.delays {
+            episode.extra_delay_frames = delays[k];
+            starts.iter_mut().for_each(|start| start.own[k][EXTRA_DELAY] = delays[k]);
         }
-        delay_sd_frames = DELAY_CHANGED_FRAMES;
+        if let Some(gain) = &changes.gain {
+            episode.log_camera_gain = gain.at(k);
+            starts.iter_mut().for_each(|start| start.own[k][CAMERA_GAIN] = gain.at(k));
+        }
     }
+    let delay_sd_frames = if changes.delays.is_some() { DELAY_CHANGED_FRAMES } else { DELAY_KNOWN_FRAMES };
     let stages = TEMPERS.map(|temper| camera.stage(temper, delay_sd_frames));
     let solve = |priors: &Priors, start: &Unknowns| -> [Fitted; 3] {
         let mut at = start.clone();
@@ -203,7 +209,16 @@ pub fn fit(episodes: &[TrainingEpisode]) -> Fit {
         })
     };
     let ([tempered, _, wide], [_, _, tight]) = rayon::join(|| solve(&wide, &starts[WIDE]), || solve(&tight, &starts[TIGHT]));
-    Conclusion { episodes: &prepared, camera: &camera, robot: tilts.robot, tempered: &tempered, wide: &wide, tight: &tight }.fit()
+    let conclusion = Conclusion {
+        recorded: episodes,
+        episodes: &prepared,
+        camera: &camera,
+        robot: tilts.robot,
+        tempered: &tempered,
+        wide: &wide,
+        tight: &tight,
+    };
+    conclusion.fit()
 }
 
 /// Where the fit begins: what is usual for a vessel in a gripper, and the calibration that meets the weights with exponent q.
@@ -233,16 +248,30 @@ fn best_beginning(problem: &Problem<'_>, episodes: &[TrainingEpisode], camera: &
     best.map_or_else(|| beginning(problem, episodes, BEGINNINGS_LOG_WEIR[0], BEGINNINGS[0]), |(_, at)| at)
 }
 
-/// Each episode's delay above the model's, if the delay has changed between the episodes.
-fn changed_delays(problem: &Problem<'_>, found: &Unknowns) -> Option<Vec<f64>> {
-    if found.own.len() < 2 * CHANGE_NEEDS {
-        return None;
+/// What has changed between the episodes.
+#[derive(Default)]
+struct Changes {
+    /// Each episode's delay above the model's, if the delay has changed.
+    delays: Option<Vec<f64>>,
+    /// The camera's gain (log), if it has changed.
+    gain: Option<Changed>,
+}
+
+impl Changes {
+    /// Lets the episodes differ freely, and looks for a change.
+    fn of(problem: &Problem<'_>, found: &Unknowns) -> Self {
+        if found.own.len() < 2 * CHANGE_NEEDS {
+            return Self::default();
+        }
+        let freed = |stage| {
+            let mut free = found.clone();
+            Problem { stage, ..*problem }.solve(&mut free, FIRST_EFFORT);
+            free
+        };
+        let delays = freed(Stage { extra_delay_sd_frames: DELAY_FREE_FRAMES, ..problem.stage }).of_episodes(EXTRA_DELAY);
+        let gains = freed(Stage { camera_gain_sd: GAIN_FREE, ..problem.stage }).of_episodes(CAMERA_GAIN);
+        Self { delays: (noise::newest_delay_frames(&delays) != 0.0).then_some(delays), gain: noise::changed_gain(&gains) }
     }
-    let mut free = found.clone();
-    let stage = Stage { extra_delay_sd_frames: DELAY_FREE_FRAMES, ..problem.stage };
-    Problem { stage, ..*problem }.solve(&mut free, FIRST_EFFORT);
-    let delays = free.of_episodes(EXTRA_DELAY);
-    (noise::newest_delay_frames(&delays) != 0.0).then_some(delays)
 }
 
 /// log c of the paper's own calibration, if it meets the weights as well as they can be read.
@@ -256,6 +285,7 @@ fn linear(episodes: &[TrainingEpisode]) -> Option<f64> {
 
 /// All that is known in the end.
 struct Conclusion<'a> {
+    recorded: &'a [TrainingEpisode],
     episodes: &'a [PreparedEpisode],
     camera: &'a CameraFacts,
     /// How the measured tilt follows the commanded one.
@@ -303,29 +333,63 @@ impl Conclusion<'_> {
         let frames: usize = self.episodes.iter().map(PreparedEpisode::frames_with_flow).sum();
         let odds = (self.tight.log_evidence - self.wide.log_evidence).clamp(-50.0, 50.0);
         let tight_share = Some(1.0 / (1.0 + (-odds).exp())).filter(|share| *share >= TIGHT_SHARE_MIN).unwrap_or(0.0);
-        let calm = self.episodes.iter().filter(|e| e.is_calm()).count();
-        let gains = self.tempered.found.of_episodes(CAMERA_GAIN);
+        let gains: Vec<f64> =
+            self.tempered.found.own.iter().zip(self.episodes).map(|(own, e)| own[CAMERA_GAIN] - e.log_camera_gain).collect();
         let gain_expected = if self.camera.clean { GAIN_CLEAN } else { GAIN_EXPECTED };
         let straight_doubt = (self.tight.cost / frames.max(1) as f64).max(1.0);
-        let fused = FusedModel {
+        let Doubted { calibration, covariance } = self.camera();
+        let mut fused = FusedModel {
             explanations: [self.explanation(self.wide, 1.0), self.explanation(self.tight, straight_doubt)],
             tight_share,
-            camera_sd: doubts::camera_sd(self.tempered),
+            camera: covariance,
             gain_sd: noise::camera_gain_sd(&gains, gain_expected),
-            wide_sds: if calm >= CALM_NEEDS { WIDE_SDS } else { 0.0 },
             bounds: self.bounds(),
         };
-        let likelier = if tight_share > 0.5 { self.tight } else { self.wide };
+        fused.tight_share *= self.trust(&fused, &calibration);
+        let likelier = if fused.tight_share > 0.5 { self.tight } else { self.wide };
         Fit {
             model: fused.likelier().model,
             fused,
-            // The last stage sees the pours' gains best.
-            calibration: self.tempered.calibration(&self.wide.found.of_episodes(CAMERA_GAIN)),
+            calibration,
             onsets_deg: likelier.found.of_episodes(ONSET),
             covariance: likelier.covariance.view((0, 0), (SHARED, SHARED)).into_owned(),
-            calibration_covariance: [LOG_C, AREA_EXPONENT].map(|i| [LOG_C, AREA_EXPONENT].map(|j| self.tempered.covariance[(i, j)])),
+            calibration_covariance: covariance,
             dropouts: self.camera.noise.dropouts,
         }
+    }
+
+    /// The calibration of the camera's own sum, by the weights alone. After a change of the camera's gain, the newest one counts.
+    fn camera(&self) -> Doubted {
+        let exact = self.camera.linear.is_some();
+        let gains: Vec<f64> = self.episodes.iter().map(|e| e.log_camera_gain).collect();
+        if gains.iter().all(|g| *g == 0.0) {
+            return calibration::with_doubt(self.recorded, exact);
+        }
+        let at_the_same_gain: Vec<TrainingEpisode> =
+            self.recorded.iter().zip(&gains).map(|(e, g)| TrainingEpisode { weight_g: e.weight_g * g.exp(), ..e.clone() }).collect();
+        let mut doubted = calibration::with_doubt(&at_the_same_gain, exact);
+        doubted.calibration.volume_at_1_px2_ml *= (-gains.last().copied().unwrap_or(0.0)).exp() as f32;
+        doubted
+    }
+
+    /// How far the straight vessel is to be trusted, by its filter's innovations over the episodes, 0 to 1: those of a right model are white.
+    fn trust(&self, fused: &FusedModel, calibration: &Calibration) -> f64 {
+        if fused.tight_share <= 0.0 {
+            return 0.0;
+        }
+        let mut estimator = FusedEstimator::new(fused, calibration, WayBack::new(&Limits::default(), crate::data::rate_hz(self.recorded)));
+        let (mut products, mut squares) = (0.0, 0.0);
+        for e in self.recorded {
+            estimator.restart();
+            for ((area_px2, command_deg), measured_deg) in e.area_px2.iter().zip(&e.alpha_deg).zip(&e.alpha_measured_deg) {
+                let area_px2 = Some(*area_px2 as f32).filter(|a| !a.is_nan());
+                estimator.step(FusedFrame { area_px2, command_deg: *command_deg, measured_deg: *measured_deg });
+            }
+            let Whiteness { products: p, squares: s, .. } = estimator.whiteness();
+            (products, squares) = (products + p, squares + s);
+        }
+        let (whole, none) = TRUSTED_CORRELATION;
+        ((none - products / squares.max(1.0)) / (none - whole)).clamp(0.0, 1.0)
     }
 }
 

@@ -40,6 +40,8 @@ pub struct PourResult {
     pub frames: u32,
     /// Whether the pour came to its end by itself.
     pub ended: bool,
+    /// Whether it was ended because what the camera saw could not be. In an evaluation the camera is right, so this is a mistake.
+    pub falsely_ended: bool,
 }
 
 impl PourResult {
@@ -54,6 +56,10 @@ impl PourResult {
     /// The part of the error that control made, ml.
     pub fn control_ml(&self) -> f64 {
         self.believed_ml - self.goal_ml
+    }
+    /// Whether what has really left is within the standard deviation of what the controller believes; `None` if it gives none.
+    pub fn covered(&self) -> Option<bool> {
+        (self.believed_sd_ml > 0.0).then(|| self.measurement_ml().abs() <= self.believed_sd_ml)
     }
     /// Whether nothing was poured.
     pub fn never_poured(&self) -> bool {
@@ -134,6 +140,7 @@ pub fn by_core(
         seconds: f64::from(MAX_FRAMES) / RATE_HZ,
         frames: 0,
         ended: false,
+        falsely_ended: false,
     };
     // The core ends a pour by its own limits. This bound is for a core that fails to.
     while frames < 3 * MAX_FRAMES {
@@ -165,6 +172,7 @@ pub fn by_core(
             poured.believed_sd_ml = f64::from(outcome.poured_sd_ml);
             poured.seconds = f64::from(outcome.seconds);
             poured.ended = matches!(outcome.reason, EndReason::Done | EndReason::ContainerEmpty | EndReason::StreamLost);
+            poured.falsely_ended = matches!(outcome.reason, EndReason::ImpossibleFlow | EndReason::NothingFlows);
             break;
         }
     }
@@ -220,6 +228,7 @@ pub fn by_baseline(baseline: &mut dyn Baseline, pour: &mut BenchPour, limits: Li
         seconds: f64::from(upright_at.unwrap_or(frames)) / RATE_HZ,
         frames,
         ended: back,
+        falsely_ended: false,
     }
 }
 

@@ -11,9 +11,10 @@ use crate::estimator::vessel::Vessel;
 pub fn check_fused(model: &FusedModel, back: WayBack) -> Result<(), String> {
     within(&[
         ("weight of the straight vessel", model.tight_share, 0.0, 1.0),
-        ("sd of the camera's sum", model.camera_sd, 1e-4, 5.0),
+        ("variance of log c", model.camera[0][0], 0.0, 25.0),
+        ("variance of q", model.camera[1][1], 0.0, 25.0),
+        ("covariance of log c and q", model.camera[0][1], -25.0, 25.0),
         ("sd of a pour's gain", model.gain_sd, 0.0, 5.0),
-        ("distance from the camera's sum", model.wide_sds, 0.0, 10.0),
         ("largest area", model.bounds.most_px2, 1.0, 1e12),
         ("tilt by which flow must be seen", model.bounds.dry_deg, 1.0, 200.0),
         ("rate of the way back", back.rate_deg, 0.1, 10.0),

@@ -63,9 +63,15 @@ fn print(weights: &Weights) {
         Estimator::Sum => println!("estimate    plain sum of the frames' volumes"),
         Estimator::Fused { model, back } => {
             println!("estimate    camera and container geometry, fused");
-            let away = model.wide_sds;
-            println!("  straight  {:.0} % likely; otherwise at most {away} sd from the camera's sum", 100.0 * model.tight_share);
-            println!("  doubts    {:.1} % of the camera's sum, {:.1} % from pour to pour", 100.0 * model.camera_sd, 100.0 * model.gain_sd);
+            let [[cc, cq], [_, qq]] = model.camera;
+            println!("  straight  {:.0} % likely", 100.0 * model.tight_share);
+            println!(
+                "  doubts    {:.1} % of c, {:.3} of q, {:.2} between them; {:.1} % from pour to pour",
+                100.0 * cc.sqrt(),
+                qq.sqrt(),
+                if cc * qq > 0.0 { cq / (cc * qq).sqrt() } else { 0.0 },
+                100.0 * model.gain_sd
+            );
             print_model(&model.likelier().model, *back);
         }
     }

@@ -1,4 +1,4 @@
-//! How far a pour may be off the fit: the covariance of a pour's unknowns, and the doubt about the camera's own sum.
+//! How far a pour may be off the fit: the covariance of a pour's unknowns.
 //!
 //! Pure functions of the offline trainer, for any thread. They allocate and do not fail.
 
@@ -24,21 +24,10 @@ const EXTRA_DELAY: usize = 2;
 const SHAPE: usize = 3;
 /// Step of the difference quotients.
 const NUDGE: f64 = 1e-4;
-/// The least standard deviation of the camera's sum, as a share. Chosen by hand; no measurement is recorded.
-const CAMERA_SD_MIN: f64 = 1e-3;
 
 /// The logarithm of the area that shows [`JUDGED_AT_ML`].
 fn log_area_judged(fitted: &Fitted) -> f64 {
     (JUDGED_AT_ML.ln() - fitted.found.shared[LOG_C]) / fitted.found.shared[AREA_EXPONENT].max(0.2)
-}
-
-/// The standard deviation of log v at the outflow of controlled pours: that of the camera's own sum, without what changes from pour to pour.
-pub fn camera_sd(fitted: &Fitted) -> f64 {
-    let log_area = log_area_judged(fitted);
-    let p = &fitted.covariance;
-    let (c, q) = (LOG_C, AREA_EXPONENT);
-    let variance = p[(c, c)] + 2.0 * log_area * p[(c, q)] + log_area * log_area * p[(q, q)];
-    variance.max(0.0).sqrt().clamp(CAMERA_SD_MIN, 0.5)
 }
 
 /// The covariance of a pour's unknowns, in the camera's ml. `doubt` is how many times larger than the fit's its covariance is.

@@ -50,32 +50,55 @@ impl FrameNoise {
     }
 }
 
+/// What has changed between the episodes, in the order in which they were poured.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Changed {
+    /// Number of episodes before the change.
+    pub episodes_before: usize,
+    /// Mean of their values.
+    pub before: f64,
+    /// Mean of the values of those after it.
+    pub after: f64,
+}
+
+impl Changed {
+    /// The mean value of the episodes on this episode's side of the change.
+    pub fn at(&self, episode: usize) -> f64 {
+        if episode < self.episodes_before { self.before } else { self.after }
+    }
+}
+
+/// How the camera's gain (log) has changed between the episodes, if it has.
+pub fn changed_gain(log_camera_gains: &[f64]) -> Option<Changed> {
+    changed(log_camera_gains, CAMERA_GAIN_SD_MIN)
+}
+
 /// The camera's gain in the newest episodes (log), if it has changed since the ones before, else 0.
 pub fn newest_gain(log_camera_gains: &[f64]) -> f64 {
-    newest(log_camera_gains, CAMERA_GAIN_SD_MIN)
+    changed_gain(log_camera_gains).map_or(0.0, |c| c.after)
 }
 
 /// The delay in the newest episodes above the model's, if it has changed since the ones before, else 0, frames.
 pub fn newest_delay_frames(extra_delays: &[f64]) -> f64 {
-    newest(extra_delays, EXTRA_DELAY_SD_MIN_FRAMES)
+    changed(extra_delays, EXTRA_DELAY_SD_MIN_FRAMES).map_or(0.0, |c| c.after)
 }
 
-/// Mean of the newest episodes' values if they have changed since the ones before, else 0. The episodes are in the order in which
-/// they were poured; [`CHANGE_NEEDS`] of them at least are on either side of a change, and they scatter by `sd_min` at least.
-fn newest(values: &[f64], sd_min: f64) -> f64 {
+/// The change between the episodes, if there is one. [`CHANGE_NEEDS`] of them at least are on either side of it, and their values scatter by
+/// `sd_min` at least.
+fn changed(values: &[f64], sd_min: f64) -> Option<Changed> {
     let n = values.len();
-    let mut found = (CHANGE_ERRORS, 0.0);
+    let (mut most_errors, mut found) = (CHANGE_ERRORS, None);
     for k in CHANGE_NEEDS..(n + 1).saturating_sub(CHANGE_NEEDS) {
         let (before, after) = values.split_at(k);
         let mean = |g: &[f64]| g.iter().sum::<f64>() / g.len() as f64;
         let spread = |g: &[f64]| g.iter().map(|x| (x - mean(g)).powi(2)).sum::<f64>();
         let sd = ((spread(before) + spread(after)) / (n - 2) as f64).sqrt().max(sd_min);
         let errors = (mean(after) - mean(before)).abs() / (sd * (1.0 / before.len() as f64 + 1.0 / after.len() as f64).sqrt());
-        if errors > found.0 {
-            found = (errors, mean(after));
+        if errors > most_errors {
+            (most_errors, found) = (errors, Some(Changed { episodes_before: k, before: mean(before), after: mean(after) }));
         }
     }
-    found.1
+    found
 }
 
 /// How much the camera's gain changes from pour to pour (log): a mean of what is expected and of what was fitted.
@@ -94,10 +117,10 @@ mod tests {
         let scatter = [0.01, -0.012, 0.004, -0.008, 0.011, -0.003, 0.006];
         let changed =
             |from: usize, by: f64| -> Vec<f64> { scatter.iter().enumerate().map(|(k, g)| g + if k >= from { by } else { 0.0 }).collect() };
-        assert_eq!(newest(&scatter, CAMERA_GAIN_SD_MIN), 0.0);
-        assert!((newest(&changed(4, 0.06), CAMERA_GAIN_SD_MIN) - 0.06).abs() < 0.01);
-        assert!((newest(&changed(3, -0.06), CAMERA_GAIN_SD_MIN) + 0.06).abs() < 0.01);
-        assert_eq!(newest(&changed(5, 0.06), CAMERA_GAIN_SD_MIN), 0.0, "two episodes say nothing");
-        assert_eq!(newest(&changed(4, 0.02), CAMERA_GAIN_SD_MIN), 0.0, "within the scatter");
+        assert_eq!(newest_gain(&scatter), 0.0);
+        assert!((newest_gain(&changed(4, 0.06)) - 0.06).abs() < 0.01);
+        assert!((newest_gain(&changed(3, -0.06)) + 0.06).abs() < 0.01);
+        assert_eq!(newest_gain(&changed(5, 0.06)), 0.0, "two episodes say nothing");
+        assert_eq!(newest_gain(&changed(4, 0.02)), 0.0, "within the scatter");
     }
 }

@@ -22,17 +22,12 @@ const HUBER_SDS: f64 = 3.0;
 /// recorded.
 const DROPOUT_FRAMES: usize = 3;
 
-/// The least weight of a calm pour, g: below it the scale's rounding says little. Chosen by hand; no measurement is recorded.
-const CALM_G: f64 = 30.0;
-/// The largest mean outflow of a calm pour, ml a frame: controlled pours have 0.7, curves 1.9 in the prototype.
-const CALM_ML_PER_FRAME: f64 = 1.1;
-
 /// How much a stage of the fit lets the episodes differ.
 #[derive(Clone, Copy)]
 pub struct Stage {
     /// Noise of a frame's area, relative.
     pub area_sd: f64,
-    /// How much the camera's gain differs from pour to pour (log).
+    /// How far the camera's gain in a pour is from what is known of it (log).
     pub camera_gain_sd: f64,
     /// How far an episode's delay is from what is known of it, frames.
     pub extra_delay_sd_frames: f64,
@@ -61,6 +56,8 @@ pub struct PreparedEpisode {
     first: usize,
     /// Delay above the others', as far as it is known, frames.
     pub extra_delay_frames: f64,
+    /// Logarithm of the camera's gain, as far as it is known.
+    pub log_camera_gain: f64,
 }
 
 impl PreparedEpisode {
@@ -103,18 +100,13 @@ impl PreparedEpisode {
             weight_g: e.weight_g,
             first: (0..n).find(|k| seen(*k)).unwrap_or(0),
             extra_delay_frames: 0.0,
+            log_camera_gain: 0.0,
         }
     }
 
     /// Number of frames that show flow.
     pub fn frames_with_flow(&self) -> usize {
         self.held.len()
-    }
-
-    /// Whether this is a calm pour as controlled ones are, and not a curve: what it weighs tells the camera's gain at the flow at which the
-    /// controller pours.
-    pub fn is_calm(&self) -> bool {
-        self.weight_g >= CALM_G && self.weight_g <= CALM_ML_PER_FRAME * self.held.len() as f64
     }
 
     /// What the model says left the lip in each frame, and the film after it, ml.
@@ -162,7 +154,7 @@ impl PreparedEpisode {
         let camera_ml: f64 = self.held.iter().map(|(a, z)| c * (tilt * z).exp() * a.powf(q)).sum();
         residuals.push((camera_ml / gain - self.weight_g) / WEIGHT_SD_G.hypot(stage.area_sum_sd * self.weight_g));
         residuals.push(log_flow_factor / FLOW_FACTOR_SD);
-        residuals.push(log_camera_gain / stage.camera_gain_sd);
+        residuals.push((log_camera_gain - self.log_camera_gain) / stage.camera_gain_sd);
         residuals.push((extra_delay_frames - self.extra_delay_frames) / stage.extra_delay_sd_frames);
         residuals
     }
