@@ -41,6 +41,9 @@ pub const MAX_FEATURES: usize = 8;
 /// A measurement older than this many periods counts its tick as stale. Chosen by hand; no measurement is recorded.
 const STALE_TICK_PERIODS: u64 = 3;
 
+/// How long a measured alpha still counts when no newer one has come, ns: as long as in the episodes (`shared::alpha_track`).
+const MEASURED_HOLD_NS: u64 = 100_000_000;
+
 /// Everything that a step depends on, besides the core's own state.
 #[derive(Debug, Clone, Copy)]
 pub struct Input<'a> {
@@ -120,6 +123,7 @@ pub struct Core {
     shutdown: bool,
     last_tick_ns: u64,
     commanded: AngleHistory<COMMANDS>,
+    measured: AngleHistory<COMMANDS>,
     counters: Counters,
 }
 
@@ -143,6 +147,7 @@ impl Core {
             shutdown: false,
             last_tick_ns: 0,
             commanded,
+            measured: AngleHistory::new(),
             counters: Counters::default(),
         }
     }
@@ -185,6 +190,9 @@ impl Core {
             run.tick_gaps += u32::from(gap);
         }
 
+        if input.robot.at_ns > 0 {
+            self.measured.push(input.robot.at_ns, input.robot.alpha_deg);
+        }
         let mut ended = self.look_at_robot(input);
         if overran {
             self.give_up(EndReason::ControllerOverrun);
@@ -322,18 +330,20 @@ impl Core {
         let (agent, run) = (self.agent.as_mut()?, self.run.as_mut()?);
         run.goal_ml?;
         let alpha_now_deg = self.limiter.alpha_deg();
-        let mut step = |area_px2, alpha_deg| {
-            let decision = agent.step(Observation { area_px2, alpha_deg, alpha_now_deg });
+        let measured = &self.measured;
+        let mut step = |area_px2, alpha_deg, at_ns| {
+            let alpha_measured_deg = measured.at_within_deg(at_ns, MEASURED_HOLD_NS);
+            let decision = agent.step(Observation { area_px2, alpha_deg, alpha_measured_deg, alpha_now_deg });
             if run.ending.decided(&decision) {
                 agent.tilt_back();
             }
             decision
         };
         for nth in 1..=taken.lost {
-            step(None, self.commanded.at_deg(taken.lost_at_ns(nth)));
+            step(None, self.commanded.at_deg(taken.lost_at_ns(nth)), taken.lost_at_ns(nth));
         }
         let alpha_deg = self.commanded.at_deg(captured_at_ns);
-        self.decision = step(area_px2, alpha_deg);
+        self.decision = step(area_px2, alpha_deg, captured_at_ns);
         let frame = SeenFrame { lost: taken.lost, area_px2, flowing: self.decision.flowing, alpha_deg, alpha_now_deg };
         run.ending.saw(&frame, &self.settings);
         (self.phase == Phase::Pouring && !run.ending.agent_is_done()).then_some(self.decision.dalpha_deg)
@@ -424,6 +434,7 @@ impl Core {
             reason,
             goal_ml: run.goal_ml,
             poured_ml: if run.goal_ml.is_some() { self.decision.poured_ml } else { f32::NAN },
+            poured_sd_ml: if run.goal_ml.is_some() { self.decision.poured_sd_ml } else { 0.0 },
             seconds: now_ns.saturating_sub(run.started_at_ns) as f32 / 1e9,
             frames: run.frames,
             bridged_frames: (now.bridged_frames - before.bridged_frames) as u32,
@@ -461,7 +472,7 @@ impl Core {
             lambda_deg: curve.map_or(f32::NAN, |c| c.lambda_deg),
             gamma_per_s2: curve.map_or(f32::NAN, |c| c.gamma_per_s2),
             beta_s: curve.map_or(f32::NAN, |c| c.beta_s),
-            reserved: 0.0,
+            poured_sd_ml: self.decision.poured_sd_ml,
         }
     }
 }

@@ -74,6 +74,8 @@ pub struct Outcome {
     pub goal_ml: Option<f32>,
     /// Estimated volume poured, ml.
     pub poured_ml: f32,
+    /// Its standard deviation, ml; 0 if it is not known.
+    pub poured_sd_ml: f32,
     /// Time from the start until the container was upright and the last drops were counted, s.
     pub seconds: f32,
     /// Number of frames, the bridged ones included.
@@ -86,6 +88,14 @@ pub struct Outcome {
     pub tick_gaps: u32,
     /// How often each limit changed a request.
     pub clipped: Clipped,
+}
+
+impl Outcome {
+    /// The volume poured with its standard deviation, where that is known, ml.
+    pub fn poured_words(&self) -> String {
+        let Self { poured_ml, poured_sd_ml, .. } = self;
+        if *poured_sd_ml > 0.0 { format!("{poured_ml:.1} +- {poured_sd_ml:.1}") } else { format!("{poured_ml:.1}") }
+    }
 }
 
 /// Why a pour or recording ended.
@@ -132,6 +142,10 @@ pub enum EndReason {
     NotFollowed,
     /// Somebody has the robot in hand: the teach button (freedrive) is pressed.
     InHand,
+    /// The camera shows a stream that the container cannot give at its tilt.
+    ImpossibleFlow,
+    /// The camera shows no stream where even the emptiest container of the episodes would give one.
+    NothingFlows,
 }
 
 impl EndReason {
@@ -158,6 +172,12 @@ impl EndReason {
             Self::StreamLost => "the container is empty, or its stream is no longer seen: tilted further than when it flowed",
             Self::NotFollowed => "the robot does not follow: it is slower than it is commanded, or something holds or moves it",
             Self::InHand => "somebody has the robot in hand (the teach button is pressed)",
+            Self::ImpossibleFlow => {
+                "what the camera shows cannot be: the stream does not follow the tilt as in the episodes; look at camera, vessel and liquid"
+            }
+            Self::NothingFlows => {
+                "nothing is seen to flow, where even the emptiest vessel of the episodes would: look at the camera, or fill the vessel"
+            }
         }
     }
 }

@@ -63,9 +63,9 @@ fn report(outcome: &Outcome, recorded: Option<client::Recorded>, json: bool) {
         println!("{}", serde_json::json!({ "outcome": outcome, "episode_file": file }));
     } else {
         println!(
-            "{}: {:.1} ml poured (estimate) for a goal of {:.1} ml in {:.1} s; {} frames ({} bridged), {} gaps between ticks, {} stale features",
+            "{}: {} ml poured (estimate) for a goal of {:.1} ml in {:.1} s; {} frames ({} bridged), {} gaps between ticks, {} stale features",
             outcome.reason.words(),
-            outcome.poured_ml,
+            outcome.poured_words(),
             outcome.goal_ml.unwrap_or(f32::NAN),
             outcome.seconds,
             outcome.frames,

@@ -15,12 +15,14 @@
 //! | nothing flows at the largest tilt | `ContainerEmpty` |
 //! | a stream was seen before, and is not seen any more although the container is tilted further | `StreamLost` |
 //! | the measured tilt does not follow the commanded one, on the way out or back ([`super::following`]) | `NotFollowed` |
+//! | what the camera shows cannot be, by what was learned of vessel and flow | `ImpossibleFlow`, `NothingFlows` |
 //! | [`controller_overran`]: the controller itself was stopped | `ControllerOverrun` |
 //! | [`worker_was_restarted`]: measurements come from another process | `WorkerRestarted` |
 //! | [`Ending::settled`]: the joint did not come upright | `NotUpright` |
 
 use shared::agent::Decision;
 use shared::control::EndReason;
+use shared::estimator::verdict::Impossible;
 use shared::messages::Feature;
 
 use super::settings::Settings;
@@ -99,6 +101,8 @@ pub struct Ending {
     curve_s: Option<f64>,
     reason: EndReason,
     agent_is_done: bool,
+    /// What the camera sees cannot be.
+    impossible: Option<Impossible>,
     seen_flow: bool,
     brought_back_deg: f32,
     stalled_frames: u32,
@@ -123,6 +127,7 @@ impl Ending {
             curve_s: None,
             reason: EndReason::Done,
             agent_is_done: false,
+            impossible: None,
             seen_flow: false,
             brought_back_deg: 0.0,
             stalled_frames: 0,
@@ -175,6 +180,7 @@ impl Ending {
 
     /// Takes the agent's decision for one frame, lost or not, and returns [`Ending::agent_is_done`].
     pub fn decided(&mut self, decision: &Decision) -> bool {
+        self.impossible = self.impossible.or(decision.impossible);
         self.agent_is_done |= goal_is_reached(decision);
         self.seen_flow |= decision.flowing;
         self.agent_is_done |= self.is_brought_back(decision);
@@ -227,6 +233,8 @@ impl Ending {
         }
         match self.curve_s {
             Some(curve_s) => (moment.running_s >= curve_s).then_some(EndReason::Done),
+            // What cannot be is no reason to believe that the goal was reached.
+            None if self.impossible.is_some() => self.impossible.map(reason_of),
             None if self.agent_is_done => Some(EndReason::Done),
             None if moment.frames >= settings.max_frames => Some(EndReason::MaxFrames),
             None if self.empty_frames >= settings.empty_frames => Some(EndReason::ContainerEmpty),
@@ -265,6 +273,14 @@ impl Ending {
 /// Whether the goal is reached: d, less what is still on its way, is 0 or less, and nothing more comes over the lip.
 fn goal_is_reached(decision: &Decision) -> bool {
     decision.tilting_back && decision.over_lip_ml < NOTHING_ML
+}
+
+/// The reason for what cannot be.
+fn reason_of(impossible: Impossible) -> EndReason {
+    match impossible {
+        Impossible::Flow => EndReason::ImpossibleFlow,
+        Impossible::NoFlow => EndReason::NothingFlows,
+    }
 }
 
 /// Whether the controller slept so long that the robot's program has gone upright by itself; `last_tick_ns` is 0 before the first tick.
@@ -311,7 +327,7 @@ mod tests {
     }
 
     fn observation(area: f32) -> Observation {
-        Observation { area_px2: Some(area), alpha_deg: 50.0, alpha_now_deg: 50.0 }
+        Observation { area_px2: Some(area), alpha_deg: 50.0, alpha_measured_deg: f32::NAN, alpha_now_deg: 50.0 }
     }
 
     /// Protects the idle robot: without a goal nothing ends, whatever is seen.

@@ -62,7 +62,16 @@ fn print(weights: &Weights) {
         Estimator::Sum => println!("estimate    plain sum of the frames' volumes"),
         Estimator::Fused { model, back } => {
             println!("estimate    camera and container geometry, fused");
-            print_model(model, *back);
+            let [[cc, cq], [_, qq]] = model.camera;
+            println!("  straight  {:.0} % likely", 100.0 * model.tight_share);
+            println!(
+                "  doubts    {:.1} % of c, {:.3} of q, {:.2} between them; {:.1} % from pour to pour",
+                100.0 * cc.sqrt(),
+                qq.sqrt(),
+                if cc * qq > 0.0 { cq / (cc * qq).sqrt() } else { 0.0 },
+                100.0 * model.gain_sd
+            );
+            print_model(&model.likelier().model, *back);
         }
     }
     println!("all {PARAMETERS} parameters: --json");
@@ -80,5 +89,5 @@ fn print_model(model: &FlowModel, back: WayBack) {
         "  motion    lag {:.2} frames, delay {:.2} frames, back at {:.2} degrees a frame",
         model.lag_frames, model.delay_frames, back.rate_deg
     );
-    println!("  doubts    {:?}", model.noise);
+    println!("  frames    {:?}", model.noise);
 }
