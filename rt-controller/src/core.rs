@@ -234,12 +234,15 @@ impl Core {
                 situation.may_abort()?;
                 self.give_up(EndReason::Aborted);
             }
-            Order::Pour { episode, goal_ml } => {
+            Order::Pour { episode, goal_ml, flows_by_deg } => {
                 situation.may_begin(&self.settings)?;
                 order::goal_is_legal(goal_ml, &self.settings)?;
                 self.agent.as_mut().ok_or(Refusal::NoWeights)?.start(goal_ml);
                 self.decision = Decision { d_ml: goal_ml, ..Decision::NOTHING };
                 self.begin(episode, Some(goal_ml), None, input);
+                if let Some(run) = &mut self.run {
+                    run.ending = Ending::of_pour_that_flows_by(flows_by_deg);
+                }
             }
             Order::Record { episode, curve } => {
                 situation.may_begin(&self.settings)?;
@@ -424,6 +427,7 @@ impl Core {
             reason,
             goal_ml: run.goal_ml,
             poured_ml: if run.goal_ml.is_some() { self.decision.poured_ml } else { f32::NAN },
+            poured_sd_ml: if run.goal_ml.is_some() { self.decision.poured_sd_ml } else { 0.0 },
             seconds: now_ns.saturating_sub(run.started_at_ns) as f32 / 1e9,
             frames: run.frames,
             bridged_frames: (now.bridged_frames - before.bridged_frames) as u32,
@@ -461,7 +465,7 @@ impl Core {
             lambda_deg: curve.map_or(f32::NAN, |c| c.lambda_deg),
             gamma_per_s2: curve.map_or(f32::NAN, |c| c.gamma_per_s2),
             beta_s: curve.map_or(f32::NAN, |c| c.beta_s),
-            reserved: 0.0,
+            poured_sd_ml: self.decision.poured_sd_ml,
         }
     }
 }

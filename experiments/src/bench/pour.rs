@@ -139,7 +139,7 @@ pub fn by_core(
             ..Feature::default()
         };
         let robot = Robot::that_may_move(alpha_deg, now_ns);
-        let order = (frames == 2).then_some(Order::Pour { episode: 1, goal_ml: goal_ml as f32 });
+        let order = (frames == 2).then_some(Order::Pour { episode: 1, goal_ml: goal_ml as f32, flows_by_deg: None });
         let output = core.step(&Input { now_ns, features: &[feature], robot, order });
         alpha_deg = output.target_deg.unwrap_or(alpha_deg);
         area_px2 = pour.frame(f64::from(alpha_deg));
