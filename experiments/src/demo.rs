@@ -12,6 +12,7 @@ use std::time::Duration;
 use rt_controller::client::Client;
 use serde_json::{Value, json};
 use shared::config::CellConfig;
+use shared::control::volume_words;
 use shared::ipc::Cell;
 use shared::messages::Telemetry;
 use simulator::cell::SimulatorConfig;
@@ -51,6 +52,11 @@ pub struct DemoSummary {
     out: PathBuf,
 }
 
+/// A number of a result; NaN if there is none.
+fn number(value: &Value) -> f32 {
+    value.as_f64().unwrap_or(f64::NAN) as f32
+}
+
 impl DemoSummary {
     /// `summary.json`.
     pub fn json(&self) -> String {
@@ -59,7 +65,8 @@ impl DemoSummary {
                 json!({
                     "v_init_ml": p.filled_ml, "goal_ml": p.goal_ml, "poured_ml": p.poured_ml, "error_ml": p.error_ml,
                     "seconds": p.outcome["seconds"], "tick_gaps": p.outcome["tick_gaps"], "stale_features": p.outcome["stale_features"],
-                    "bridged_frames": p.outcome["bridged_frames"], "estimate_ml": p.outcome["poured_ml"], "reason": p.outcome["reason"],
+                    "bridged_frames": p.outcome["bridged_frames"], "estimate_ml": p.outcome["poured_ml"],
+                    "estimate_sd_ml": p.outcome["poured_sd_ml"], "reason": p.outcome["reason"],
                     "episode_file": p.episode_file, "plot": p.plot,
                 })
             };
@@ -75,17 +82,18 @@ impl DemoSummary {
     /// Prints the table of the pours.
     pub fn print(&self) {
         println!(
-            "\n{:>9} {:>9} {:>9} {:>9} {:>7} {:>10} {:>14}",
-            "filled", "goal", "poured", "error", "time", "tick gaps", "stale features"
+            "\n{:>9} {:>9} {:>9} {:>9} {:>16} {:>7} {:>10} {:>14}",
+            "filled", "goal", "poured", "error", "believed", "time", "tick gaps", "stale features"
         );
-        println!("{:>9} {:>9} {:>9} {:>9} {:>7} {:>10} {:>14}", "ml", "ml", "ml", "ml", "s", "", "");
+        println!("{:>9} {:>9} {:>9} {:>9} {:>16} {:>7} {:>10} {:>14}", "ml", "ml", "ml", "ml", "ml", "s", "", "");
         for p in &self.pours {
             println!(
-                "{:>9.0} {:>9.0} {:>9.0} {:>+9.1} {:>7.1} {:>10} {:>14}",
+                "{:>9.0} {:>9.0} {:>9.0} {:>+9.1} {:>16} {:>7.1} {:>10} {:>14}",
                 p.filled_ml,
                 p.goal_ml,
                 p.poured_ml,
                 p.error_ml,
+                volume_words(number(&p.outcome["poured_ml"]), number(&p.outcome["poured_sd_ml"])),
                 p.outcome["seconds"].as_f64().unwrap_or(f64::NAN),
                 p.outcome["tick_gaps"].to_string(),
                 p.outcome["stale_features"].to_string()

@@ -242,12 +242,15 @@ impl Core {
                 situation.may_abort()?;
                 self.give_up(EndReason::Aborted);
             }
-            Order::Pour { episode, goal_ml } => {
+            Order::Pour { episode, goal_ml, flows_by_deg } => {
                 situation.may_begin(&self.settings)?;
                 order::goal_is_legal(goal_ml, &self.settings)?;
                 self.agent.as_mut().ok_or(Refusal::NoWeights)?.start(goal_ml);
                 self.decision = Decision { d_ml: goal_ml, ..Decision::NOTHING };
                 self.begin(episode, Some(goal_ml), None, input);
+                if let Some(run) = &mut self.run {
+                    run.ending = Ending::of_pour_that_flows_by(flows_by_deg);
+                }
             }
             Order::Record { episode, curve } => {
                 situation.may_begin(&self.settings)?;

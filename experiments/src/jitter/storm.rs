@@ -66,7 +66,7 @@ impl Storm {
             threads.push(repeat(&stop, name, |client| drop(client.status())));
         }
         // An order that is always refused reaches the service thread all the same.
-        threads.push(repeat(&stop, name, |client| drop(client.ask(&Request::Pour { goal_ml: -1.0 }))));
+        threads.push(repeat(&stop, name, |client| drop(client.ask(&Request::Pour { goal_ml: -1.0, flows_by_deg: None }))));
         for _ in 0..READERS {
             let (stop, name) = (Arc::clone(&stop), name.clone());
             threads.push(std::thread::spawn(move || read_telemetry(&stop, &name)));

@@ -38,7 +38,7 @@ pub struct Args {
     /// Largest goal of the pours to come, ml.
     #[arg(long, default_value_t = 250.0)]
     goal_max: f64,
-    /// Configuration of the cell, from which the limits are taken; without it, they are the default ones.
+    /// Configuration of the cell, from which the limits and [container] holds_ml are taken; without it, the limits are the default ones.
     #[arg(long)]
     config: Option<PathBuf>,
     /// Print JSON.
@@ -48,10 +48,9 @@ pub struct Args {
 
 /// Runs the command.
 pub fn run(args: &Args) -> Result<(), Failure> {
-    let limits = match &args.config {
-        None => Limits::default(),
-        Some(file) => shared::config::Config::read(file).map(|c| c.limits).or_exit(exit::BAD_INPUT)?,
-    };
+    let config = args.config.as_deref().map(shared::config::Config::read).transpose().or_exit(exit::BAD_INPUT)?;
+    let limits = config.as_ref().map_or_else(Limits::default, |c| c.limits);
+    let holds_ml = args.holds.or(config.and_then(|c| c.container.holds_ml));
     if args.holds.is_some_and(|ml| !(HOLDS_ML.0..=HOLDS_ML.1).contains(&ml)) || args.goal_max.is_nan() || args.goal_max < 1.0 {
         let what = format!("--holds is {} to {} ml, and --goal-max at least 1 ml", HOLDS_ML.0, HOLDS_ML.1);
         return Err(failure(exit::BAD_INPUT, what));
@@ -63,7 +62,7 @@ pub fn run(args: &Args) -> Result<(), Failure> {
         Err(e) => return Err(failure(exit::BAD_INPUT, e)),
     };
     let wish = Wish { goal_max_ml: args.goal_max, alpha_max_deg: f64::from(limits.alpha_max_deg) - BELOW_LIMIT_DEG };
-    let found = propose(&usable, args.holds, &wish)?;
+    let found = propose(&usable, holds_ml, &wish)?;
     let Some(first) = found.candidates.first() else {
         let what = "nothing can be proposed for this vessel: give what it really holds with --holds, or a smaller --goal-max";
         return Err(failure(exit::FAILED, what));
@@ -94,7 +93,7 @@ pub fn run(args: &Args) -> Result<(), Failure> {
 /// What to weigh next after the usable episodes.
 fn propose(usable: &UsableEpisodes, holds_ml: Option<f64>, wish: &Wish) -> Result<Plan, Failure> {
     let (vessel, weighed) = if usable.episodes.is_empty() {
-        let what = "no episode was weighed yet: say what the vessel holds with --holds ML";
+        let what = "no episode was weighed yet: say what the vessel holds with --holds ML or [container] holds_ml";
         let holds_ml = holds_ml.ok_or_else(|| failure(exit::BAD_INPUT, what))?;
         (Foresight::unknown(holds_ml, wish.alpha_max_deg), Vec::new())
     } else {
