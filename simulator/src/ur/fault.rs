@@ -45,6 +45,10 @@ pub enum Fault {
     TextOnConnect(String),
     /// The arm hit something.
     ProtectiveStop,
+    /// A safeguard is opened.
+    SafeguardOpen,
+    /// It is closed again, with the automatic reset.
+    SafeguardClosed,
     /// The emergency stop button is pressed.
     EmergencyStop,
     /// The emergency stop button is released.
@@ -111,6 +115,8 @@ refuse-version-2      RTDE protocol version 2 is refused
 text=MESSAGE          send an RTDE text message now
 text-on-connect=MESSAGE  send an RTDE text message to whoever connects
 protective-stop       stop the arm; unlock on the dashboard after 5 s
+safeguard-open        open a door or light curtain
+safeguard-closed      close it again, with the automatic reset
 emergency-stop        press the emergency stop
 emergency-release     release it; then 'power on' and 'brake release' on the dashboard
 late-start=SECONDS    programs start this much later
@@ -176,6 +182,8 @@ impl FromStr for Fault {
             "text" => given().map(|v| Fault::Text(v.to_owned())),
             "text-on-connect" => given().map(|v| Fault::TextOnConnect(v.to_owned())),
             "protective-stop" => plain(Fault::ProtectiveStop),
+            "safeguard-open" => plain(Fault::SafeguardOpen),
+            "safeguard-closed" => plain(Fault::SafeguardClosed),
             "emergency-stop" => plain(Fault::EmergencyStop),
             "emergency-release" => plain(Fault::EmergencyRelease),
             "late-start" => seconds().map(Fault::LateStart),
@@ -253,6 +261,8 @@ impl fmt::Display for Fault {
             Fault::Text(m) => write!(f, "text={m}"),
             Fault::TextOnConnect(m) => write!(f, "text-on-connect={m}"),
             Fault::ProtectiveStop => f.write_str("protective-stop"),
+            Fault::SafeguardOpen => f.write_str("safeguard-open"),
+            Fault::SafeguardClosed => f.write_str("safeguard-closed"),
             Fault::EmergencyStop => f.write_str("emergency-stop"),
             Fault::EmergencyRelease => f.write_str("emergency-release"),
             Fault::LateStart(s) => write!(f, "late-start={s}"),

@@ -26,6 +26,8 @@ pub enum SafetyMode {
     Normal = 1,
     /// A demand or a collision stopped the arm; somebody must unlock it.
     ProtectiveStop = 3,
+    /// A safeguard is open: a door, a light curtain.
+    SafeguardStop = 5,
     /// The pendant's emergency stop button is pressed.
     RobotEmergencyStop = 7,
 }
@@ -36,6 +38,7 @@ impl SafetyMode {
         match self {
             SafetyMode::Normal => "NORMAL",
             SafetyMode::ProtectiveStop => "PROTECTIVE_STOP",
+            SafetyMode::SafeguardStop => "SAFEGUARD_STOP",
             SafetyMode::RobotEmergencyStop => "ROBOT_EMERGENCY_STOP",
         }
     }
@@ -199,6 +202,25 @@ impl Machine {
         self.stopped_at = self.robot.cycle;
         self.robot.servo.stop(servo::FAST_STOP_RAD_S2);
         self.programs.pause_for_protective_stop();
+    }
+
+    /// Opens a safeguard: the arm stops, and the program stands still with it.
+    pub fn open_safeguard(&mut self) {
+        if self.may_move() {
+            self.robot.event("safeguard opened");
+            self.safety = SafetyMode::SafeguardStop;
+            self.robot.servo.stop(servo::STOP_RAD_S2);
+            self.programs.pause_for_protective_stop();
+        }
+    }
+
+    /// Closes it again, with the automatic reset: a program that stood still goes on.
+    pub fn close_safeguard(&mut self) {
+        if self.safety == SafetyMode::SafeguardStop {
+            self.safety = SafetyMode::Normal;
+            self.robot.event("safeguard closed");
+            self.programs.resume(&mut self.robot);
+        }
     }
 
     /// Unlocks a protective stop. A robot that was not stopped answers the same.

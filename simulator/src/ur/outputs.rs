@@ -41,12 +41,13 @@ impl Machine {
         if self.robot_mode() == RobotMode::Running { self.robot.own_scaling() } else { 0.0 }
     }
 
-    /// RTDE's safety_status_bits: bit 0 is normal, 2 a protective stop, 6 the robot's emergency stop, 7 any emergency stop, and
+    /// RTDE's safety_status_bits: bit 0 is normal, 2 a protective stop, 4 an open safeguard, 6 the robot's emergency stop, 7 any emergency stop, and
     /// 10 any stop for safety.
     pub fn safety_status_bits(&self) -> u32 {
         match self.safety_mode() {
             SafetyMode::Normal => 1,
             SafetyMode::ProtectiveStop => 1 << 2 | 1 << 10,
+            SafetyMode::SafeguardStop => 1 << 4 | 1 << 10,
             SafetyMode::RobotEmergencyStop => 1 << 6 | 1 << 7 | 1 << 10,
         }
     }

@@ -87,11 +87,23 @@ pub struct Cell {
 }
 
 impl Cell {
+    /// A cell in its place of a table of addresses, which is another one for each process that runs these tests.
     pub fn new(name: &str, address: Ipv4Addr, series: Series) -> Self {
+        let mut cell = Self::not_started(name, address, series);
+        cell.process = start_controller(cell.directory.path());
+        cell.ready();
+        cell
+    }
+
+    /// The same, without a controller yet.
+    pub fn not_started(name: &str, address: Ipv4Addr, series: Series) -> Self {
+        let pid = std::process::id();
+        let [_, _, third, fourth] = address.octets();
+        let address = Ipv4Addr::new(127, 64 + (pid % 128) as u8, third, fourth);
         let directory = tempfile::tempdir().unwrap();
         let sim = Path::new(env!("CARGO_MANIFEST_DIR")).join("../config/sim.toml");
         let mut config = Config::read(&sim).unwrap();
-        config.cell.name = format!("fault-{name}-{}", address.octets()[2]);
+        config.cell.name = format!("fault-{name}-{third}-{pid}");
         let address = IpAddr::V4(address);
         config.robot.address = address;
         config.controller.weights = directory.path().join("weights.bin");
@@ -107,8 +119,9 @@ impl Cell {
             let (name, robot, stop, poured_ul) = (config.cell.name.clone(), robot.clone(), stop.clone(), poured_ul.clone());
             move || publish_features(&name, &robot, &stop, &poured_ul)
         });
-        let process = start_controller(directory.path());
-        let mut cell = Self {
+        // Something that has ended stands for the controller until it is started.
+        let process = Command::new("true").spawn().unwrap();
+        Self {
             name: config.cell.name.clone(),
             address,
             series,
@@ -120,9 +133,7 @@ impl Cell {
             poured_ul,
             liquid: Some(liquid),
             table: String::new(),
-        };
-        cell.ready();
-        cell
+        }
     }
 
     /// What the controller has said.

@@ -11,6 +11,7 @@
 
 mod cell;
 mod motion;
+mod others;
 mod people;
 mod slow;
 

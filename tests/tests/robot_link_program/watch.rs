@@ -50,6 +50,11 @@ impl Watch {
         }
     }
 
+    /// The program is about to be told to begin anew.
+    pub fn begins_anew(&mut self) {
+        self.interrupted = true;
+    }
+
     /// Looks at the arm before a control cycle.
     pub fn before(&mut self, machine: &Machine) {
         self.arm_q = machine.robot.servo.target_q;

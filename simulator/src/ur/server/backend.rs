@@ -77,6 +77,8 @@ impl Backend {
             Fault::RefuseVersion2 => self.faults.refuse_version_2 = true,
             Fault::TextOnConnect(message) => self.faults.text_on_connect = Some(message.clone()),
             Fault::ProtectiveStop => self.machine.protective_stop("injected"),
+            Fault::SafeguardOpen => self.machine.open_safeguard(),
+            Fault::SafeguardClosed => self.machine.close_safeguard(),
             Fault::EmergencyStop => self.machine.emergency_stop(),
             Fault::EmergencyRelease => self.machine.release_emergency_stop(),
             Fault::LateStart(s) => self.machine.set_late_start(*s),
