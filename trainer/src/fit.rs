@@ -65,8 +65,8 @@ const LINEAR_RIVALS: [f64; 8] = [0.7, 0.8, 0.9, 0.95, 1.05, 1.1, 1.2, 1.3];
 /// Exponents that are so unlike q = 1 that the weights have to speak against them.
 const LINEAR_UNLIKE: [f64; 2] = [0.85, 1.15];
 /// How much better another exponent may meet the weights, g^2: twice the variance of a reading (0.6 g), which is what one more unknown gains
-/// by chance. In a demo whose camera had q = 1.2, q = 1 met five weights to 0.97 g and was taken as right, which made the pours 7 % too large;
-/// q = 1.2 met them to 0.40 g, and is ahead by 3.9 g^2.
+/// by chance. In a demo whose camera had q = 1.25, q = 1 met five weights to 0.97 g and was taken as right, which made the pours 7 % too large;
+/// q = 1.25 met them to 0.44 g, and is ahead by 3.7 g^2.
 const LINEAR_BEHIND_G2: f64 = 0.72;
 /// How much worse the unlike exponents have to meet the weights, g^2: nine times the variance of a reading, three standard deviations.
 const LINEAR_AHEAD_G2: f64 = 3.24;
