@@ -322,19 +322,21 @@ fn focus_is_judged_by_the_glass() -> Result<(), ExtractError> {
 }
 
 /// Protects clear water in front of an even wall and of a pattern at rest: V_e is exactly 0 in the dry frames before and after, every frame
-/// is measured to 10 % while the stream's legs have more than 0.3 of their full length, and none is doubted.
+/// is measured to 10 % while the stream's legs have more than 0.3 of their full length, and none is doubted but the frames in which a
+/// stream that ended from one picture to the next may be lost.
 #[test]
 fn clear_water_is_measured() -> Result<(), ExtractError> {
     for turn in [None, Some(11.0)] {
         let mut extractor = Extractor::new(&camera(), &image_config(LiquidMethod::Clear))?;
-        for i in 0..34 {
+        for i in 0..42 {
             let share = match i {
                 6..14 => (i - 5) as f32 / 8.0,
                 14..24 => 1.0,
                 _ => 0.0,
             };
             let measured = measure(&mut extractor, &water(share, turn, i)?)?;
-            assert_eq!(measured.doubt, Doubt::None, "{turn:?} frame {i}: {measured:?}");
+            let may_be_lost = (24..35).contains(&i) && measured.doubt == Doubt::EdgeNotFound;
+            assert!(measured.doubt == Doubt::None || may_be_lost, "{turn:?} frame {i}: {measured:?}");
             let truth = 3600.0 * share * share;
             if share == 0.0 {
                 assert_eq!(measured.area_px2, 0.0, "{turn:?} frame {i}");
