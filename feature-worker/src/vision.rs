@@ -5,6 +5,7 @@
 //! | `extractor` | measures one image: checks, then the liquid, then the line |
 //! | `checks` | whether a picture can be used: light, repetition, focus |
 //! | `whole` | whether a picture is whole: decoded to its end, of one moment, with the glass in its place |
+//! | `reflection` | a lamp's reflection that hides the lip |
 //! | `presence` | when a stream that is not seen any more is gone |
 //! | `ground_colours`, `ground_beside` | the colours of the ground behind a coloured liquid, and where some of them are learned |
 //! | `hues` | the ranges of hue that are a liquid's |
@@ -37,6 +38,7 @@ mod liquid;
 mod measurement;
 mod picture;
 mod presence;
+mod reflection;
 mod stream_edge;
 mod whole;
 

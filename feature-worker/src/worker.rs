@@ -30,6 +30,12 @@ use status::Status;
 /// How long a `view` that holds the camera may take to let go of it, ns. Chosen by hand: a view looks for a worker with each frame.
 const LET_GO_NS: u64 = 3_000_000_000;
 
+/// Pictures after the start in which the ground behind clear water is judged. Chosen by hand: half a second.
+const GROUND_PICTURES: u32 = 15;
+/// What is said of a ground before which clear water cannot be relied upon.
+const UNEVEN_GROUND: &str = "the ground behind the lip has a pattern, and clear water is measured badly before it; put an even card or wall \
+                             there, or colour the water (docs/VISION.md, Clear water)";
+
 type Ipc = iceoryx2::service::ipc::Service;
 
 /// Runs until a signal, the end of the video or a failure. With `json` the status lines are JSON objects on standard output.
@@ -85,6 +91,9 @@ fn measure_until_stopped(
         newest: Newest::default(),
         status: Status { doubt: Doubt::None.words(), ..Status::default() },
         latest: &latest,
+        speaker,
+        judged: 0,
+        uneven: 0,
     };
     let result = worker.work(FrameStream::new(source, stop));
     stop.store(true, Relaxed);
@@ -124,6 +133,10 @@ struct Worker<'a> {
     status: Status,
     /// The queue of one from which the status thread prints.
     latest: &'a ArrayQueue<Status>,
+    speaker: &'a Speaker,
+    /// Pictures in which the ground behind clear water was judged, and those of them in which it had a pattern.
+    judged: u32,
+    uneven: u32,
 }
 
 /// The newest frame that was measured; zeros before the first.
@@ -188,7 +201,17 @@ impl Worker<'_> {
             ..self.status
         };
         self.latest.force_push(self.status);
+        self.judge_ground();
         Ok(())
+    }
+
+    /// Says once, at the start, if the ground is none before which clear water can be measured.
+    fn judge_ground(&mut self) {
+        let Some(even) = self.extractor.ground_is_even().filter(|_| self.judged < GROUND_PICTURES) else { return };
+        (self.judged, self.uneven) = (self.judged + 1, self.uneven + u32::from(!even));
+        if self.judged == GROUND_PICTURES && 2 * self.uneven > GROUND_PICTURES {
+            self.speaker.say(UNEVEN_GROUND);
+        }
     }
 
     /// Whether a frame is younger than all before it. Counts the frames that are missing between the last one and this one.

@@ -162,12 +162,13 @@ fn a_stream_in_other_colours_is_named() -> Result<(), ExtractError> {
 }
 
 /// Protects the estimate from a stream that is lost: where a stream was, and what is there now was never seen as ground, it is not seen and
-/// not absent; where ground is seen, it is gone at once.
+/// not absent. Where ground is seen, a large stream is gone within 0.3 s and not at once, because its colours may be the ground's for a few
+/// pictures.
 #[test]
 fn a_lost_stream_is_not_absent() -> Result<(), ExtractError> {
     for lost in [true, false] {
         let mut extractor = colour()?;
-        for i in 0..24 {
+        for i in 0..40 {
             let mut picture = dry(0.0, i)?;
             if (14..18).contains(&i) || (lost && i >= 18) {
                 let colour = if i < 18 { Scalar::new(150.0, 62.0, 20.0, 0.0) } else { Scalar::new(60.0, 180.0, 60.0, 0.0) };
@@ -176,8 +177,10 @@ fn a_lost_stream_is_not_absent() -> Result<(), ExtractError> {
             }
             let measured = measure(&mut extractor, &picture)?;
             assert_eq!(measured.area_px2 > 0.0, (14..18).contains(&i), "frame {i}: {measured:?}");
-            if i >= 18 {
-                assert_eq!(measured.doubt == Doubt::None, !lost, "frame {i}: {measured:?}");
+            if i == 18 || lost && i > 18 {
+                assert_ne!(measured.doubt, Doubt::None, "frame {i}: {measured:?}");
+            } else if i >= 27 {
+                assert_eq!(measured.doubt, Doubt::None, "frame {i}: {measured:?}");
             }
         }
     }
@@ -211,6 +214,29 @@ fn bands_and_colours_of_the_light_are_divided_out() -> Result<(), ExtractError> 
             }
         }
     }
+    Ok(())
+}
+
+/// Protects clear water before a pattern under lamps that flicker, where bands cannot be divided out once the background moves: the flicker
+/// is named, and a stream is never "nothing". And the pattern itself is told, so that the worker can say that it is no ground for water.
+#[test]
+fn bands_before_a_pattern_are_named() -> Result<(), ExtractError> {
+    let mut extractor = Extractor::new(&camera(), &image_config(LiquidMethod::Clear))?;
+    let mut named = 0;
+    for i in 0..40 {
+        let share = ((i - 20) as f32 / 8.0).clamp(0.0, 1.0);
+        let mut pixels = water(share, Some((i - 12).max(0) as f32), i)?.data_bytes()?.to_vec();
+        for (y, row) in pixels.chunks_exact_mut(640 * 3).enumerate() {
+            let band = 1.0 + 0.15 * (y as f32 / 30.0 + i as f32 * 2.1).sin();
+            row.iter_mut().for_each(|level| *level = (f32::from(*level) * band).min(255.0) as u8);
+        }
+        let measured = extractor.measure(Image { width_px: 640, height_px: 480, format: PixelFormat::Bgr8, pixels: &pixels })?;
+        named += u32::from(measured.doubt == Doubt::LightFlickers);
+        assert!(share < 0.5 || measured.area_px2 > 0.0 || measured.doubt != Doubt::None, "frame {i}: {measured:?}");
+    }
+    assert!(named >= 15, "named in {named} frames");
+    assert_eq!(extractor.ground_is_even(), Some(false));
+    assert_eq!(colour()?.ground_is_even(), None);
     Ok(())
 }
 
@@ -296,19 +322,21 @@ fn focus_is_judged_by_the_glass() -> Result<(), ExtractError> {
 }
 
 /// Protects clear water in front of an even wall and of a pattern at rest: V_e is exactly 0 in the dry frames before and after, every frame
-/// is measured to 10 % while the stream's legs have more than 0.3 of their full length, and none is doubted.
+/// is measured to 10 % while the stream's legs have more than 0.3 of their full length, and none is doubted but the frames in which a
+/// stream that ended from one picture to the next may be lost.
 #[test]
 fn clear_water_is_measured() -> Result<(), ExtractError> {
     for turn in [None, Some(11.0)] {
         let mut extractor = Extractor::new(&camera(), &image_config(LiquidMethod::Clear))?;
-        for i in 0..34 {
+        for i in 0..42 {
             let share = match i {
                 6..14 => (i - 5) as f32 / 8.0,
                 14..24 => 1.0,
                 _ => 0.0,
             };
             let measured = measure(&mut extractor, &water(share, turn, i)?)?;
-            assert_eq!(measured.doubt, Doubt::None, "{turn:?} frame {i}: {measured:?}");
+            let may_be_lost = (24..35).contains(&i) && measured.doubt == Doubt::EdgeNotFound;
+            assert!(measured.doubt == Doubt::None || may_be_lost, "{turn:?} frame {i}: {measured:?}");
             let truth = 3600.0 * share * share;
             if share == 0.0 {
                 assert_eq!(measured.area_px2, 0.0, "{turn:?} frame {i}");

@@ -58,12 +58,12 @@ fn name(fault: Option<(FaultKind, f64)>) -> String {
     fault.map_or_else(|| "none".into(), |(kind, strength)| format!("{kind:?} {strength}"))
 }
 
-/// Measures one whole pour of the `i`-th cell through every fault, and adds its frames to `frames`. The backgrounds come in turn. With a
+/// Measures one whole pour of the `i`-th cell through every fault, or those whose name begins with `only`, and adds its frames to `frames`. The backgrounds come in turn. With a
 /// coloured liquid, every fifth cell has an orange one before bright wood; with clear water, every second has an even wall.
 ///
 /// # Errors
 /// When a picture cannot be drawn or measured.
-pub fn measure_cell(clear: bool, i: u64, seed: u64, frames: &mut FaultFrames) -> Result<(), CameraError> {
+pub fn measure_cell(clear: bool, i: u64, seed: u64, only: Option<&str>, frames: &mut FaultFrames) -> Result<(), CameraError> {
     let seed = seed.wrapping_mul(1_000_003).wrapping_add(500_000 + 2 * i + u64::from(clear));
     let mut random = Pcg64Mcg::seed_from_u64(seed);
     let orange = !clear && i % 5 == 4;
@@ -90,7 +90,8 @@ pub fn measure_cell(clear: bool, i: u64, seed: u64, frames: &mut FaultFrames) ->
     let size = [view.width_px as usize, view.height_px as usize];
     let mut renderer = Renderer::new(view, seed)?;
     let mut cameras = Vec::new();
-    for fault in std::iter::once(None).chain(FAULTS.into_iter().map(Some)) {
+    let chosen = |fault: &Option<(FaultKind, f64)>| only.is_none_or(|only| name(*fault).starts_with(only));
+    for fault in std::iter::once(None).chain(FAULTS.into_iter().map(Some)).filter(chosen) {
         let camera = fault.map(|(kind, strength)| FaultyCamera::new(CameraFault { kind, strength, seed }, size, view.lip_px));
         cameras.push((format!("{ground}: {}", name(fault)), camera, Extractor::new(&camera_config(view), &case.image)?));
     }
@@ -105,22 +106,32 @@ pub fn measure_cell(clear: bool, i: u64, seed: u64, frames: &mut FaultFrames) ->
             }
             let picture = Image { width_px: view.width_px, height_px: view.height_px, format: PixelFormat::Bgr8, pixels: &given };
             let measured = extractor.measure(picture)?;
-            frames.entry(row.clone()).or_default().push(Comparison::new(truth.area_px2, &measured));
+            frames.entry(row.clone()).or_default().push(Comparison::new(number, truth.area_px2, &measured));
         }
     }
     Ok(())
 }
 
+/// The frames of all faults together, by kind of ground.
+pub fn by_ground(frames: &FaultFrames) -> BTreeMap<String, Vec<Comparison>> {
+    let mut all: BTreeMap<String, Vec<Comparison>> = BTreeMap::new();
+    for (row, frames) in frames {
+        let ground = row.split(':').next().unwrap_or(row);
+        all.entry(format!("{ground}, all faults")).or_default().extend(frames);
+    }
+    all
+}
+
 /// Prints a line for each fault, in the order of the names.
 pub fn print(frames: &FaultFrames) {
     println!(
-        "{:<34}{:>6}{:>9}{:>8}{:>9}{:>8}{:>9}{:>9}{:>9}  doubts on frames with a stream / without",
-        "fault", "wet", "median %", "p95 %", "silent %", "wrong %", "doubt %", "false %", "dry d. %"
+        "{:<34}{:>6}{:>9}{:>8}{:>9}{:>8}{:>9}{:>9}{:>9}{:>9}  doubts on frames with a stream / without",
+        "fault", "wet", "median %", "p95 %", "silent %", "wrong %", "doubt %", "false %", "dry d. %", "dry s"
     );
     for (row, all) in frames {
         let f = super::figures::figures(all);
         println!(
-            "{row:<34}{:>6}{:>9.2}{:>8.1}{:>9.2}{:>8.2}{:>9.2}{:>9.2}{:>9.2}  {}",
+            "{row:<34}{:>6}{:>9.2}{:>8.1}{:>9.2}{:>8.2}{:>9.2}{:>9.2}{:>9.2}{:>9.2}  {}",
             f.wet,
             f.median_error_percent,
             f.p95_error_percent,
@@ -129,7 +140,23 @@ pub fn print(frames: &FaultFrames) {
             f.wet_unusable_percent,
             f.false_flow_percent,
             f.dry_doubt_percent,
+            f.dry_after_p95_s,
             f.doubts
         );
     }
+}
+
+/// Writes every frame of every row to a CSV file.
+///
+/// # Errors
+/// When the file cannot be written.
+pub fn write_frames(frames: &FaultFrames, path: &std::path::Path) -> Result<(), CameraError> {
+    let mut text = String::from("row,frame,truth_px2,area_px2,confidence,doubt,usable\n");
+    for (row, all) in frames {
+        for f in all {
+            let doubt = f.doubt.words();
+            text += &format!("\"{row}\",{},{:.1},{:.1},{:.3},{doubt},{}\n", f.number, f.truth_px2, f.area_px2, f.confidence, f.usable);
+        }
+    }
+    std::fs::write(path, text).map_err(|e| format!("{}: {e}", path.display()).into())
 }

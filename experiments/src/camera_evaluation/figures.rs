@@ -10,6 +10,11 @@ pub const MEASURED_PX2: f64 = 200.0;
 /// An area further than this from the truth is wrong, per cent. This is what confidence speaks of.
 pub const WRONG_PERCENT: f64 = 20.0;
 
+/// Frames without a stream after which it has ended for good: half a second.
+pub const DRY_FRAMES: usize = 15;
+/// Frames a second of what is measured here.
+const RATE_HZ: f64 = 30.0;
+
 /// Figures of many measured frames.
 #[derive(Debug, Default, Serialize)]
 pub struct CameraFigures {
@@ -41,6 +46,10 @@ pub struct CameraFigures {
     pub wrong_percent: f64,
     /// Share of the frames without a stream that have a doubt, per cent.
     pub dry_doubt_percent: f64,
+    /// Number of streams that ended for good: at least [`DRY_FRAMES`] without one follow.
+    pub ends: usize,
+    /// 95th percentile of the time from their last frame to the first one that the controller uses and in which nothing flows, s.
+    pub dry_after_p95_s: f64,
     /// The doubts with their number of frames, on frames with a stream and after a stroke without.
     pub doubts: String,
 }
@@ -48,6 +57,8 @@ pub struct CameraFigures {
 /// One measured frame beside the truth.
 #[derive(Debug, Clone, Copy)]
 pub struct Comparison {
+    /// Its number in the run of frames.
+    pub number: usize,
     /// True V_e, px^2; 0 without a stream.
     pub truth_px2: f64,
     /// Measured V_e, px^2.
@@ -61,9 +72,10 @@ pub struct Comparison {
 }
 
 impl Comparison {
-    /// A measurement beside the true V_e, px^2.
-    pub fn new(truth_px2: f64, measured: &Measurement) -> Self {
+    /// The measurement of the frame with this number in its run, beside the true V_e, px^2.
+    pub fn new(number: usize, truth_px2: f64, measured: &Measurement) -> Self {
         Self {
+            number,
             truth_px2,
             area_px2: measured.area_px2.into(),
             confidence: measured.confidence.into(),
@@ -99,14 +111,15 @@ pub fn figures(frames: &[Comparison]) -> CameraFigures {
     let bias_percent = errors.iter().sum::<f64>() / errors.len().max(1) as f64;
     errors.iter_mut().for_each(|e| *e = e.abs());
     errors.sort_by(f64::total_cmp);
-    let quantile = |share: f64| errors.get(((errors.len().max(1) - 1) as f64 * share).round() as usize).copied().unwrap_or(f64::NAN);
     let dry: Vec<&Comparison> = frames.iter().filter(|s| s.truth_px2 == 0.0).collect();
+    let mut ends_s = times_to_dry_s(frames);
+    ends_s.sort_by(f64::total_cmp);
     let percent = |part: usize, whole: usize| 100.0 * part as f64 / whole.max(1) as f64;
     CameraFigures {
         frames: frames.len(),
         measured: errors.len(),
-        median_error_percent: quantile(0.5),
-        p95_error_percent: quantile(0.95),
+        median_error_percent: quantile_of(&errors, 0.5),
+        p95_error_percent: quantile_of(&errors, 0.95),
         bias_percent,
         dry: dry.len(),
         false_flow_percent: percent(dry.iter().filter(|s| s.area_px2 > 0.0).count(), dry.len()),
@@ -117,8 +130,29 @@ pub fn figures(frames: &[Comparison]) -> CameraFigures {
         wet_unusable_percent: percent(wet.iter().filter(|s| !s.usable).count(), wet.len()),
         wrong_percent: percent(wrong, wet.len()),
         dry_doubt_percent: percent(dry.iter().filter(|s| s.doubt != Doubt::None).count(), dry.len()),
+        ends: ends_s.len(),
+        dry_after_p95_s: quantile_of(&ends_s, 0.95),
         doubts: doubts_in_words(frames),
     }
+}
+
+/// The quantile of sorted figures; NaN without any.
+fn quantile_of(sorted: &[f64], share: f64) -> f64 {
+    sorted.get(((sorted.len().max(1) - 1) as f64 * share).round() as usize).copied().unwrap_or(f64::NAN)
+}
+
+/// For each stream that ended for good, the time from its last frame to the first one that the controller uses and in which nothing
+/// flows, s. It is endless if there is none before the run ends.
+pub fn times_to_dry_s(frames: &[Comparison]) -> Vec<f64> {
+    let same_run = |i: usize| frames[i..].iter().enumerate().take_while(move |(k, f)| *k == 0 || f.number == frames[i].number + k);
+    let last = |i: &usize| {
+        frames[*i].truth_px2 > 0.0 && {
+            let dry = same_run(*i).skip(1).take_while(|(_, f)| f.truth_px2 == 0.0).count();
+            dry >= DRY_FRAMES
+        }
+    };
+    let seen_dry = |i: usize| same_run(i).skip(1).find(|(_, f)| f.usable && f.area_px2 == 0.0).map_or(f64::INFINITY, |(k, _)| k as f64);
+    (0..frames.len()).filter(last).map(|i| seen_dry(i) / RATE_HZ).collect()
 }
 
 /// The doubts on frames with a truth above [`MEASURED_PX2`], with their number, and after a stroke those on frames without a stream.

@@ -28,7 +28,7 @@ pub struct MeasuredFrame<'a> {
 impl MeasuredFrame<'_> {
     /// Measurement beside truth.
     pub fn comparison(&self) -> Comparison {
-        Comparison::new(self.truth.area_px2, self.measured)
+        Comparison::new(self.number, self.truth.area_px2, self.measured)
     }
 }
 

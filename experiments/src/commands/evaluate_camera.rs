@@ -56,6 +56,12 @@ pub struct Args {
     /// Instead of this, measure so many whole pours of each method through every fault of a camera.
     #[arg(long)]
     faults: Option<u64>,
+    /// With --faults: only the faults whose name in the table begins so, such as Banding; `none` is the camera without a fault.
+    #[arg(long, requires = "faults")]
+    fault: Option<String>,
+    /// Write what was measured in every frame to this CSV file.
+    #[arg(long)]
+    frames_csv: Option<PathBuf>,
 }
 
 /// Runs the command.
@@ -91,6 +97,9 @@ fn evaluate(args: &Args) -> Result<(), CameraError> {
 
     let figures: BTreeMap<&str, CameraFigures> = all.groups.iter().map(|(name, frames)| (name.as_str(), figures(frames))).collect();
     print(&figures);
+    if let Some(path) = &args.frames_csv {
+        faults::write_frames(&all.groups, path)?;
+    }
     print_reliability(&all.groups);
     let doubts = doubts::raised_percent(args.seed)?;
     println!("\nframes that nobody should trust, and the share for which the doubt was raised:");
@@ -112,13 +121,17 @@ fn evaluate_faults(args: &Args, pours: u64) -> Result<(), CameraError> {
     for (clear, method) in [(false, "colour"), (true, "clear")] {
         for i in 0..pours {
             if args.method.as_deref().is_none_or(|m| m == method) {
-                faults::measure_cell(clear, i, args.seed, &mut frames)?;
+                faults::measure_cell(clear, i, args.seed, args.fault.as_deref(), &mut frames)?;
             }
             bar.inc(1);
         }
     }
     bar.finish_and_clear();
     faults::print(&frames);
+    print_reliability(&faults::by_ground(&frames));
+    if let Some(path) = &args.frames_csv {
+        faults::write_frames(&frames, path)?;
+    }
     if let Some(path) = &args.json {
         let figures: BTreeMap<&str, CameraFigures> = frames.iter().map(|(name, frames)| (name.as_str(), figures(frames))).collect();
         let report = serde_json::json!({ "pours": pours, "seed": args.seed, "faults": figures });
@@ -166,12 +179,23 @@ fn print_reliability(groups: &BTreeMap<String, Vec<Comparison>>) {
 /// Prints the table of the conditions.
 fn print(figures: &BTreeMap<&str, CameraFigures>) {
     println!(
-        "{:<32}{:>7}{:>9}{:>8}{:>8}{:>8}{:>9}{:>12}{:>8}{:>8}{:>8}",
-        "condition", "frames", "median %", "p95 %", "bias %", "false %", "missed %", "unnoticed %", "doubt %", "wrong %", "dry d. %"
+        "{:<32}{:>7}{:>9}{:>8}{:>8}{:>8}{:>9}{:>12}{:>8}{:>8}{:>8}{:>8}",
+        "condition",
+        "frames",
+        "median %",
+        "p95 %",
+        "bias %",
+        "false %",
+        "missed %",
+        "unnoticed %",
+        "doubt %",
+        "wrong %",
+        "dry d. %",
+        "dry s"
     );
     for (name, f) in figures {
         println!(
-            "{name:<32}{:>7}{:>9.2}{:>8.2}{:>8.2}{:>8.2}{:>9.2}{:>12.2}{:>8.2}{:>8.2}{:>8.2}  {}",
+            "{name:<32}{:>7}{:>9.2}{:>8.2}{:>8.2}{:>8.2}{:>9.2}{:>12.2}{:>8.2}{:>8.2}{:>8.2}{:>8.2}  {}",
             f.frames,
             f.median_error_percent,
             f.p95_error_percent,
@@ -182,6 +206,7 @@ fn print(figures: &BTreeMap<&str, CameraFigures>) {
             f.doubt_percent,
             f.wrong_percent,
             f.dry_doubt_percent,
+            f.dry_after_p95_s,
             f.doubts
         );
     }

@@ -4,7 +4,7 @@
 //! background is displaced. The container turns, so the background moves in the picture as one rigid piece, while the stream's outline
 //! stays. So the picture is made small (320 px for the whole width), and in each frame:
 //!
-//! 1. [`light`] divides out what bands and colours of the light differ from those on the remembered ground.
+//! 1. [`flicker`] tells whether the light flickers, and [`light`] divides out what bands and colours of the light differ from those on the remembered ground.
 //! 2. [`background`] remembers the dry background as one picture that is fixed in the world, and finds how it lies in the camera's picture
 //!    ([`motion`], [`rigid`]; [`follow`] is the inner loop of remembering).
 //! 3. [`evidence`] compares the memory and an earlier picture, both moved, with the picture along [`rays`] from the lip. What differs from
@@ -18,6 +18,7 @@
 
 mod background;
 mod evidence;
+mod flicker;
 mod follow;
 mod light;
 mod lines;
@@ -33,6 +34,7 @@ use shared::messages::{Doubt, PixelFormat};
 
 use self::background::{Background, DryPlaces, WetPlaces};
 use self::evidence::{CALM, Evidence};
+use self::flicker::Flicker;
 use self::light::Light;
 use self::lines::Lines;
 use self::rays::{RIM_PX, Rays};
@@ -78,6 +80,7 @@ pub(crate) struct ClearWater {
     lines: Lines,
     background: Background,
     light: Light,
+    flicker: Flicker,
     evidence: Evidence,
     water: Water,
     // Pictures, kept from frame to frame.
@@ -90,6 +93,10 @@ pub(crate) struct ClearWater {
     earlier: Mat,
     /// Number of frames that were compared with the same earlier picture.
     compared: u32,
+    /// A picture was compared with the ground.
+    looked: bool,
+    /// There may be a stream where the last one was seen.
+    held: bool,
 }
 
 impl ClearWater {
@@ -106,6 +113,7 @@ impl ClearWater {
             lines: Lines::new(axes, &rays, size),
             background: Background::new(size)?,
             light: Light::new(size),
+            flicker: Flicker::new(size),
             evidence: Evidence::new(&rays, size)?,
             rays,
             water: Water::new(),
@@ -113,6 +121,8 @@ impl ClearWater {
             now: Mat::default(),
             earlier: Mat::default(),
             compared: 0,
+            looked: false,
+            held: false,
         })
     }
 
@@ -140,7 +150,9 @@ impl ClearWater {
         edges_px.clear();
         let height_px = self.height_px();
         let mut sighting = Sighting::Dry { confidence: 1.0 };
+        let exposure = self.flicker.look(&self.now)?;
         if !self.background.is_new() {
+            self.background.expect_gain(exposure);
             let wet = self.water.stream().map(|s| {
                 let line_share = self.line_share(s.legs_px.map(|v| v + KEEP_AWAY_PX));
                 WetPlaces { line_share, right_px: self.right_px() }
@@ -152,6 +164,7 @@ impl ClearWater {
                 self.light.divide_out(&mut self.now, &self.background, height_px, wet)?;
             }
             self.evidence.compare(&self.rays, &self.now, &self.earlier, &self.background, height_px)?;
+            self.looked = true;
             let moved = self.background.moved();
             self.evidence.weigh(&self.rays, &moved, self.water.stream())?;
             let best = self.lines.best(&self.evidence, &self.rays, &moved, self.water.stream())?.map(|found| {
@@ -159,6 +172,8 @@ impl ClearWater {
             });
             let verdict = self.water.decide(best, self.evidence.strange_share());
             sighting = match (verdict, best) {
+                // Where bands cannot be divided out, neither a line nor its absence means anything.
+                _ if !told && self.flicker.flickers() => Sighting::Unsure(Doubt::LightFlickers),
                 (Verdict::Stream, Some((found, ..))) => {
                     let scale = self.scale;
                     self.lines.edges(found.line, &self.evidence, &self.rays, |v| (v + 0.5) * scale - 0.5, edges_px);
@@ -179,7 +194,7 @@ impl ClearWater {
     /// Takes what is dry over into the memory of the background, and chooses the picture with which the next ones are compared.
     #[inline(always)]
     fn remember(&mut self, height_px: LinearField) -> opencv::Result<()> {
-        let near = self.water.recent_legs_px().map(|legs_px| {
+        let near = self.water.recent_legs_px(self.held).map(|legs_px| {
             let [a, b] = legs_px.map(|v| v.max(1.0));
             // The outline bulges, and a stream grows from frame to frame.
             let bulge = 2.0 + 0.1 * (a * b).sqrt();
@@ -187,7 +202,7 @@ impl ClearWater {
             let outer = self.line_share([1.35 * a + 8.0, 1.35 * b + 8.0]);
             (WetPlaces { line_share: inner, right_px: self.right_px() }, outer)
         });
-        let dry = DryPlaces { height_px, flows: self.water.flows(), near, calm: CALM * self.evidence.noise() };
+        let dry = DryPlaces { height_px, flows: self.water.flows() || self.held, near, calm: CALM * self.evidence.noise() };
         let is_new = self.background.is_new();
         self.background.remember(&self.now, dry)?;
         self.compared += 1;
@@ -273,12 +288,21 @@ impl Liquid for ClearWater {
         if self.evidence.even() { Basis::EvenGround } else { Basis::Pattern }
     }
 
+    fn ground_is_even(&self) -> Option<bool> {
+        // The first picture is compared with nothing.
+        self.looked.then(|| self.evidence.even())
+    }
+
     fn ground_bgr(&self) -> Option<[f32; 3]> {
         None
     }
 
     fn dry_share(&self, legs_px: [f32; 2]) -> f32 {
         self.evidence.dry_share(&self.rays, self.line_share(legs_px.map(|v| v / self.scale)))
+    }
+
+    fn hold_ground(&mut self, held: bool) {
+        self.held = held;
     }
 
     fn edge_on(&self, profile: &Profile) -> Option<ProfileEdge> {
@@ -293,6 +317,6 @@ impl Liquid for ClearWater {
     }
 
     fn confirm(&mut self, line: Option<FineLine>, mean_level: f32) -> Result<FineLine, Doubt> {
-        self.water.confirm(line, mean_level, self.scale, self.axes.sine().abs())
+        self.water.confirm(line, mean_level, self.scale, self.axes.sine().abs(), self.evidence.even() && !self.held)
     }
 }

@@ -23,6 +23,7 @@ use super::ground_beside::GroundBeside;
 use super::ground_colours::{Ground, GroundColours};
 use super::hues::ranges;
 use super::liquid::{FineLine, LineRules, Liquid, PROFILE_SAMPLES, Profile, ProfileEdge, REACH, Sighting};
+use super::reflection::Reflection;
 
 // "Tuned" below means that the value was tuned on seeds 1 and 5001 to 5003 of `evaluate-camera`; see docs/VISION.md.
 
@@ -62,12 +63,8 @@ const LEARN_BEYOND: usize = 6;
 const AT_LIP_PX: f32 = 12.0;
 /// The ground is learned beside the container while no more than this share of what is at the lip is foreign or liquid. Chosen by hand.
 const QUIET_SHARE: f32 = 0.3;
-/// A lamp's reflection hides the lip when this share of what is there is white light. Chosen by hand.
-const BLIND_SHARE: f32 = 0.5;
-/// Once it does, it still does while this share is white light, because a stream is darker. Chosen by hand.
-const STILL_BLIND_SHARE: f32 = 0.08;
-/// And so many pictures more. Chosen by hand: a third of a second.
-const BLIND_PICTURES: u32 = 10;
+/// A liquid in front of a lamp's reflection is brighter than this in all parts, close to the reflection's middle. Chosen by hand.
+const GLOW_LEVEL: u8 = 180;
 /// Least share of the rays that a body at the lip fills. Tuned.
 const BODY_RAYS: f32 = 0.7;
 /// Least mean length of a body at the lip, px: a bead is shorter. Tuned.
@@ -115,8 +112,7 @@ pub(crate) struct ColouredLiquid {
     /// Frames that were taken, and those of them without a stream.
     frames: usize,
     dry_frames: u32,
-    /// For how many pictures a lamp's reflection still counts as hiding the lip.
-    blind_pictures: u32,
+    reflection: Reflection,
     /// Number of samples on each ray up to the end of the liquid, or of a body at the lip, in the last picture.
     ends: [usize; RAYS],
     // Pictures along the rays, one ray a row, kept from frame to frame.
@@ -164,7 +160,7 @@ impl ColouredLiquid {
             ground_bgr: None,
             frames: 0,
             dry_frames: 0,
-            blind_pictures: 0,
+            reflection: Reflection::default(),
             ends: [0; RAYS],
             sampled: Mat::default(),
             smooth: Mat::default(),
@@ -316,21 +312,22 @@ impl ColouredLiquid {
         Ok(())
     }
 
-    /// Which shares of what is close to the lip are white light that the ground is not, and foreign colours or liquid.
-    fn at_lip(&self) -> opencv::Result<(f32, f32)> {
+    /// Which shares of what is close to the lip are white light that the ground is not, glow of it, and foreign colours or liquid.
+    fn at_lip(&self) -> opencv::Result<[f32; 3]> {
         let near = self.grid.radii_px.iter().take_while(|r| **r <= AT_LIP_PX).count();
-        let (mut blind, mut foreign, mut looked) = (0usize, 0usize, 0usize);
+        let (mut blind, mut glows, mut foreign, mut looked) = (0usize, 0usize, 0usize, 0usize);
         for (i, ray) in self.grid.rays.iter().enumerate() {
             let (mask, colours) = (self.mask.at_row::<u8>(i as i32)?, self.smooth.at_row::<Vec3b>(i as i32)?);
             for r in 0..near.min(ray.samples) {
                 let ground = self.ground.tell(colours[r].0);
                 looked += 1;
                 blind += usize::from(ground == Ground::Blind);
+                glows += usize::from(colours[r].0.iter().all(|v| *v >= GLOW_LEVEL));
                 foreign += usize::from(mask[r] != 0 || ground != Ground::Known);
             }
         }
         let share = |part: usize| part as f32 / looked.max(1) as f32;
-        Ok((share(blind), share(foreign)))
+        Ok([share(blind), share(glows), share(foreign)])
     }
 
     /// What is at the lip where no stream is seen.
@@ -339,10 +336,8 @@ impl ColouredLiquid {
         if self.dry_frames < DRY_FRAMES {
             return Ok(dry);
         }
-        let (blind, foreign) = self.at_lip()?;
-        let still = self.blind_pictures > 0 && blind > STILL_BLIND_SHARE;
-        self.blind_pictures = if blind > BLIND_SHARE || still { BLIND_PICTURES } else { self.blind_pictures.saturating_sub(1) };
-        if self.blind_pictures > 0 {
+        let [blind, glows, foreign] = self.at_lip()?;
+        if self.reflection.hides_lip(blind, glows, foreign > QUIET_SHARE) {
             return Ok(Sighting::Unsure(Doubt::BlownOut));
         }
         if self.is_foreign_body()? {
@@ -433,6 +428,10 @@ impl Liquid for ColouredLiquid {
         Basis::Colour
     }
 
+    fn ground_is_even(&self) -> Option<bool> {
+        None
+    }
+
     fn ground_bgr(&self) -> Option<[f32; 3]> {
         self.ground_bgr
     }
@@ -451,6 +450,9 @@ impl Liquid for ColouredLiquid {
         }
         dry as f32 / looked.max(1) as f32
     }
+
+    /// Ground is learned far from the lip only, once the surroundings are known.
+    fn hold_ground(&mut self, _held: bool) {}
 
     /// The edge is where the profile, projected on the difference between its two ends, passes one half.
     fn edge_on(&self, profile: &Profile) -> Option<ProfileEdge> {

@@ -139,6 +139,11 @@ impl Extractor {
         self.stages
     }
 
+    /// Whether the ground at the lip has no pattern, where clear water needs that; `None` for coloured liquids and before the second frame.
+    pub fn ground_is_even(&self) -> Option<bool> {
+        self.liquid.ground_is_even()
+    }
+
     fn in_image(&self, p: [f32; 2]) -> [f32; 2] {
         [p[0] + self.region.x as f32, p[1] + self.region.y as f32]
     }
@@ -180,12 +185,17 @@ impl Extractor {
         let edge_tells_focus = measured.area_px2 > 0.0 && self.liquid.rules().edge_tells_focus;
         let untold = measured.doubt == Doubt::None && !edge_tells_focus;
         let measured = if untold && self.rim.is_blurred(pixels) { Measurement::nothing(0.0, Doubt::Blurred) } else { measured };
+        let not_told = matches!(measured.doubt, Doubt::EdgeNotFound | Doubt::ColoursChanged | Doubt::BlownOut | Doubt::LightFlickers);
+        if not_told && measured.area_px2 == 0.0 {
+            self.presence.saw_unsure(measured.doubt == Doubt::ColoursChanged);
+        }
         let seen_dry = measured.doubt == Doubt::None && measured.area_px2 == 0.0;
         let measured = if seen_dry && !self.presence.is_gone(self.light_bgr(), |legs_px| self.liquid.dry_share(legs_px)) {
             Measurement::nothing(0.0, Doubt::EdgeNotFound)
         } else {
             measured
         };
+        self.liquid.hold_ground(self.presence.holds(measured.area_px2 > 0.0));
         let confidence = match measured.doubt {
             _ if measured.area_px2 > 0.0 => confidence::of_stream(self.liquid.basis(), measured.confidence),
             Doubt::None => confidence::of_nothing(measured.confidence),

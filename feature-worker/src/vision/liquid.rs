@@ -113,11 +113,17 @@ pub(crate) trait Liquid: Send + Sync {
     /// What a measurement in the picture that was looked at rests on.
     fn basis(&self) -> Basis;
 
+    /// Whether the ground at the lip has no pattern, where the liquid needs that and it is known.
+    fn ground_is_even(&self) -> Option<bool>;
+
     /// Mean levels of blue, green and red of what is not liquid in the picture that was looked at, if that is known.
     fn ground_bgr(&self) -> Option<[f32; 3]>;
 
     /// Which share of the triangle with these legs, px from the lip, was seen to be ground in the picture that was looked at, 0 to 1.
     fn dry_share(&self, legs_px: [f32; 2]) -> f32;
+
+    /// Says whether there may be a stream where the last one was seen, so that what is there is not taken for ground.
+    fn hold_ground(&mut self, held: bool);
 
     /// Where on a profile the stream's edge lies.
     fn edge_on(&self, profile: &Profile) -> Option<ProfileEdge>;

@@ -32,6 +32,9 @@ const STEEP_LEAST: f32 = 0.6;
 /// Points for the motion lie at least this far above the rim, px. Tuned.
 const POINT_ABOVE_PX: f32 = 2.0;
 
+/// A smaller step of the exposure is found with the motion, as a share. Chosen by hand.
+const STEP_LEAST: f32 = 0.05;
+
 /// Where water may be in the picture. A place is dry where both values are at least 1, and may be wet elsewhere.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct WetPlaces {
@@ -145,6 +148,13 @@ impl Background {
     /// Exposure against the memory: now, and in the picture with which pictures are compared.
     pub(super) fn gains(&self) -> [f32; 2] {
         [self.now.gain, self.reference.gain]
+    }
+
+    /// The picture that comes is brighter than the last one by this factor, as far as that is known.
+    pub(super) fn expect_gain(&mut self, factor: f32) {
+        if (factor - 1.0).abs() > STEP_LEAST {
+            self.now.gain *= factor;
+        }
     }
 
     /// The background's motion since the picture with which pictures are compared.

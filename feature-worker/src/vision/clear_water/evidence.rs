@@ -9,7 +9,7 @@ use opencv::imgproc;
 use opencv::prelude::*;
 
 use super::background::Background;
-use super::rays::{CELLS, Colours, RAYS, Rays, Row, SAMPLES, Window, apart, around, colours, row, sizes, sums, whole};
+use super::rays::{CELLS, Colours, RAYS, Rays, Row, SAMPLES, Window, apart, around, colours, cut_off, row, sizes, sums, whole};
 use super::rigid::RigidMap;
 use super::water::Stream;
 use crate::vision::geometry::LinearField;
@@ -286,11 +286,11 @@ impl Evidence {
             let (memory, beside) = (self.ray_memory.at_row::<Vec4b>(ray as i32)?, self.ray_memory.at_row::<Vec4b>((RAYS + ray) as i32)?);
             let ((factors, mut known), (factors_beside, known_beside)) = (whole(memory, gain), whole(beside, gain));
             known.iter_mut().zip(&rays.air[range.clone()]).for_each(|(known, air)| *known *= air);
-            let (memory, beside) = (colours(memory, &factors), colours(beside, &factors_beside));
+            let (memory, beside) = (cut_off(colours(memory, &factors)), cut_off(colours(beside, &factors_beside)));
             let mut shown = [0.0; SAMPLES + 1];
             shown[..SAMPLES].copy_from_slice(&self.shown[range.clone()]);
             self.away[range.clone()].copy_from_slice(&apart(&now, &memory, &known));
-            let earlier = colours(self.ray_earlier.at_row(ray as i32)?, &factor);
+            let earlier = cut_off(colours(self.ray_earlier.at_row(ray as i32)?, &factor));
             self.away_earlier[range.clone()].copy_from_slice(&apart(&now, &earlier, &shown));
             let (mut across, mut along) = ([[0.0; SAMPLES + 1]; 3], [[0.0; SAMPLES + 1]; 3]);
             for k in 0..3 {

@@ -129,6 +129,15 @@ pub(super) fn colours(row: &[Vec4b], factors: &Row) -> Colours {
     colours
 }
 
+/// The colours as a sensor gives them, which is full at 255.
+#[inline(always)]
+pub(super) fn cut_off(mut colours: Colours) -> Colours {
+    for part in &mut colours {
+        part.iter_mut().for_each(|level| *level = level.min(255.0));
+    }
+    colours
+}
+
 /// Size of the colours at each place, grey levels.
 #[inline(always)]
 pub(super) fn sizes(c: &Colours) -> Row {

@@ -187,9 +187,10 @@ impl Water {
         self.stream.is_some() || self.dry_frames <= 1
     }
 
-    /// Where the stream was, while the place is not taken for background at once: cuts with the axes, px of the small picture.
-    pub(super) fn recent_legs_px(&self) -> Option<[f32; 2]> {
-        (self.dry_frames <= AFTERWARDS).then_some(self.last_legs_px)
+    /// Where the stream was, while it may be there still or the place is not taken for background at once: cuts with the axes, px of the
+    /// small picture.
+    pub(super) fn recent_legs_px(&self, held: bool) -> Option<[f32; 2]> {
+        (held || self.dry_frames <= AFTERWARDS).then_some(self.last_legs_px)
     }
 
     /// Decides whether there is a stream. `best` is the best line, with its legs in px and what the earlier picture says of it;
@@ -266,14 +267,21 @@ impl Water {
     }
 
     /// Takes note of the full picture's line, whose legs are `scale` times as long as in the small picture; `sine` is that of the angle
-    /// between the axes. What the memory of the background took for water must have its edge in the picture itself.
-    pub(super) fn confirm(&mut self, line: Option<FineLine>, mean_level: f32, scale: f32, sine: f32) -> Result<FineLine, Doubt> {
+    /// between the axes; where the ground is `sure`, a stream that would begin without an edge is none. What the memory of the background took for water must have its edge in the picture itself.
+    pub(super) fn confirm(
+        &mut self,
+        line: Option<FineLine>,
+        mean_level: f32,
+        scale: f32,
+        sine: f32,
+        sure: bool,
+    ) -> Result<FineLine, Doubt> {
         let begins = self.stream.is_some_and(|s| s.age <= 1.0);
         let lit = (mean_level / LIT_LEVEL).clamp(LIT_LEAST, 1.0);
         let least = lit * if begins { BEGIN_CONFIDENCE } else { GO_ON_CONFIDENCE };
         let line = line.filter(|line| line.confidence >= least);
         let confirmed = self.is_same(line.as_ref(), scale, sine);
-        line.filter(|_| confirmed).ok_or(if begins { Doubt::None } else { Doubt::EdgeNotFound })
+        line.filter(|_| confirmed).ok_or(if begins && sure { Doubt::None } else { Doubt::EdgeNotFound })
     }
 
     /// Whether the full picture's line is that of the stream that was seen: a stream does not lose its contrast, nor change its shape.
