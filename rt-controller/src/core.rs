@@ -41,6 +41,9 @@ pub const MAX_FEATURES: usize = 8;
 /// A measurement older than this many periods counts its tick as stale. Chosen by hand; no measurement is recorded.
 const STALE_TICK_PERIODS: u64 = 3;
 
+/// How long a measured alpha still counts when no newer one has come, ns: as long as in the episodes (`shared::alpha_track`).
+const MEASURED_HOLD_NS: u64 = 100_000_000;
+
 /// Everything that a step depends on, besides the core's own state.
 #[derive(Debug, Clone, Copy)]
 pub struct Input<'a> {
@@ -100,7 +103,7 @@ struct Run {
     /// Start time of the feature worker that measured when it began, ns.
     worker_epoch_ns: u64,
     counters_before: Counters,
-    late_ticks: u32,
+    tick_gaps: u32,
 }
 
 /// The controller's state.
@@ -120,6 +123,7 @@ pub struct Core {
     shutdown: bool,
     last_tick_ns: u64,
     commanded: AngleHistory<COMMANDS>,
+    measured: AngleHistory<COMMANDS>,
     counters: Counters,
 }
 
@@ -143,6 +147,7 @@ impl Core {
             shutdown: false,
             last_tick_ns: 0,
             commanded,
+            measured: AngleHistory::new(),
             counters: Counters::default(),
         }
     }
@@ -179,12 +184,15 @@ impl Core {
     pub fn step(&mut self, input: &Input) -> Output {
         self.counters.ticks += 1;
         let overran = ending::controller_overran(input.now_ns, self.last_tick_ns, &self.settings);
-        let late = self.last_tick_ns != 0 && input.now_ns.saturating_sub(self.last_tick_ns) > self.settings.period_ns * 3 / 2;
+        let gap = self.last_tick_ns != 0 && input.now_ns.saturating_sub(self.last_tick_ns) > self.settings.period_ns * 3 / 2;
         self.last_tick_ns = input.now_ns;
         if let Some(run) = &mut self.run {
-            run.late_ticks += u32::from(late);
+            run.tick_gaps += u32::from(gap);
         }
 
+        if input.robot.at_ns > 0 {
+            self.measured.push(input.robot.at_ns, input.robot.alpha_deg);
+        }
         let mut ended = self.look_at_robot(input);
         if overran {
             self.give_up(EndReason::ControllerOverrun);
@@ -234,12 +242,15 @@ impl Core {
                 situation.may_abort()?;
                 self.give_up(EndReason::Aborted);
             }
-            Order::Pour { episode, goal_ml } => {
+            Order::Pour { episode, goal_ml, flows_by_deg } => {
                 situation.may_begin(&self.settings)?;
                 order::goal_is_legal(goal_ml, &self.settings)?;
                 self.agent.as_mut().ok_or(Refusal::NoWeights)?.start(goal_ml);
                 self.decision = Decision { d_ml: goal_ml, ..Decision::NOTHING };
                 self.begin(episode, Some(goal_ml), None, input);
+                if let Some(run) = &mut self.run {
+                    run.ending = Ending::of_pour_that_flows_by(flows_by_deg);
+                }
             }
             Order::Record { episode, curve } => {
                 situation.may_begin(&self.settings)?;
@@ -265,7 +276,7 @@ impl Core {
             settling_since_ns: 0,
             worker_epoch_ns: newest.map_or(0, |f| f.worker_epoch_ns),
             counters_before: self.counters(),
-            late_ticks: 0,
+            tick_gaps: 0,
         });
         self.request_deg = self.limiter.alpha_deg();
         self.phase = if curve.is_some() { Phase::Recording } else { Phase::Pouring };
@@ -322,18 +333,20 @@ impl Core {
         let (agent, run) = (self.agent.as_mut()?, self.run.as_mut()?);
         run.goal_ml?;
         let alpha_now_deg = self.limiter.alpha_deg();
-        let mut step = |area_px2, alpha_deg| {
-            let decision = agent.step(Observation { area_px2, alpha_deg, alpha_now_deg });
+        let measured = &self.measured;
+        let mut step = |area_px2, alpha_deg, at_ns| {
+            let alpha_measured_deg = measured.at_within_deg(at_ns, MEASURED_HOLD_NS);
+            let decision = agent.step(Observation { area_px2, alpha_deg, alpha_measured_deg, alpha_now_deg });
             if run.ending.decided(&decision) {
                 agent.tilt_back();
             }
             decision
         };
         for nth in 1..=taken.lost {
-            step(None, self.commanded.at_deg(taken.lost_at_ns(nth)));
+            step(None, self.commanded.at_deg(taken.lost_at_ns(nth)), taken.lost_at_ns(nth));
         }
         let alpha_deg = self.commanded.at_deg(captured_at_ns);
-        self.decision = step(area_px2, alpha_deg);
+        self.decision = step(area_px2, alpha_deg, captured_at_ns);
         let frame = SeenFrame { lost: taken.lost, area_px2, flowing: self.decision.flowing, alpha_deg, alpha_now_deg };
         run.ending.saw(&frame, &self.settings);
         (self.phase == Phase::Pouring && !run.ending.agent_is_done()).then_some(self.decision.dalpha_deg)
@@ -424,11 +437,12 @@ impl Core {
             reason,
             goal_ml: run.goal_ml,
             poured_ml: if run.goal_ml.is_some() { self.decision.poured_ml } else { f32::NAN },
+            poured_sd_ml: if run.goal_ml.is_some() { self.decision.poured_sd_ml } else { 0.0 },
             seconds: now_ns.saturating_sub(run.started_at_ns) as f32 / 1e9,
             frames: run.frames,
             bridged_frames: (now.bridged_frames - before.bridged_frames) as u32,
             stale_features: (now.stale_features - before.stale_features) as u32,
-            late_ticks: run.late_ticks,
+            tick_gaps: run.tick_gaps,
             clipped: Clipped {
                 angle: now.clipped.angle - before.clipped.angle,
                 rate: now.clipped.rate - before.clipped.rate,
@@ -461,7 +475,7 @@ impl Core {
             lambda_deg: curve.map_or(f32::NAN, |c| c.lambda_deg),
             gamma_per_s2: curve.map_or(f32::NAN, |c| c.gamma_per_s2),
             beta_s: curve.map_or(f32::NAN, |c| c.beta_s),
-            reserved: 0.0,
+            poured_sd_ml: self.decision.poured_sd_ml,
         }
     }
 }

@@ -8,8 +8,8 @@
 
 use crate::actions::{self, ACTIONS, STAY, Selection};
 use crate::estimator::Hold;
-use crate::estimator::flow::FlowTables;
-use crate::estimator::fused::FusedEstimator;
+use crate::estimator::fused::{FusedEstimator, FusedFrame};
+use crate::estimator::verdict::Impossible;
 use crate::mlp;
 use crate::os;
 use crate::weights::{Estimator, Weights};
@@ -21,6 +21,8 @@ pub struct Observation {
     pub area_px2: Option<f32>,
     /// Commanded alpha in force when this frame was taken, degrees from upright.
     pub alpha_deg: f32,
+    /// Measured alpha when this frame was taken, degrees; NaN if the robot gives none.
+    pub alpha_measured_deg: f32,
     /// Commanded alpha in force now, degrees; it differs from `alpha_deg` if the picture is older than the newest command.
     pub alpha_now_deg: f32,
 }
@@ -48,6 +50,8 @@ pub struct Decision {
     pub tilting_back: bool,
     /// Whether liquid is seen to leave the container in this frame.
     pub flowing: bool,
+    /// What the camera sees cannot be, by what was learned of vessel and flow; always `None` with [`Estimator::Sum`].
+    pub impossible: Option<Impossible>,
 }
 
 impl Decision {
@@ -63,6 +67,7 @@ impl Decision {
         over_lip_ml: 0.0,
         tilting_back: false,
         flowing: false,
+        impossible: None,
     };
 }
 
@@ -106,7 +111,7 @@ impl Agent {
     pub fn new(weights: &Weights) -> Self {
         let (fused, back_deg) = match &weights.estimator {
             Estimator::Sum => (None, -weights.actions_deg[weights.back_action()]),
-            Estimator::Fused { model, back } => (Some(FusedEstimator::new(FlowTables::new(model), *back)), back.rate_deg as f32),
+            Estimator::Fused { model, back } => (Some(FusedEstimator::new(model, &weights.calibration, *back)), back.rate_deg as f32),
         };
         Self {
             weights: weights.clone(),
@@ -127,7 +132,10 @@ impl Agent {
     pub fn learned_lag_s(&self) -> Option<f64> {
         match &self.weights.estimator {
             Estimator::Sum => None,
-            Estimator::Fused { model, .. } => Some((model.delay_frames + model.lag_frames) / f64::from(self.weights.rate_hz)),
+            Estimator::Fused { model, .. } => {
+                let model = model.likelier().model;
+                Some((model.delay_frames + model.lag_frames) / f64::from(self.weights.rate_hz))
+            }
         }
     }
 
@@ -190,6 +198,7 @@ impl Agent {
             over_lip_ml,
             tilting_back: self.returning,
             flowing: self.v_ml[0] > 0.0,
+            impossible: self.fused.as_ref().and_then(FusedEstimator::impossible),
         }
     }
 
@@ -204,8 +213,11 @@ impl Agent {
             return VolumeEstimate { poured_ml: self.summed_ml, poured_sd_ml: 0.0, stop_ml: 0.0, over_lip_ml: 0.0 };
         };
         // The filter judges dropouts itself.
-        let y_ml = observation.area_px2.map(|a| f64::from(calibration.volume_ml(a, observation.alpha_deg)));
-        fused.step(y_ml, f64::from(observation.alpha_deg));
+        fused.step(FusedFrame {
+            area_px2: observation.area_px2,
+            command_deg: f64::from(observation.alpha_deg),
+            measured_deg: f64::from(observation.alpha_measured_deg),
+        });
         let (low, high) = MODEL_TILT_DEG;
         let stop_ml = fused.stop_volume_ml(f64::from(observation.alpha_now_deg).clamp(low, high)) as f32;
         VolumeEstimate {
@@ -256,7 +268,7 @@ mod tests {
     use proptest::prelude::*;
 
     fn observation(area: f32) -> Observation {
-        Observation { area_px2: Some(area), alpha_deg: 50.0, alpha_now_deg: 50.0 }
+        Observation { area_px2: Some(area), alpha_deg: 50.0, alpha_measured_deg: f32::NAN, alpha_now_deg: 50.0 }
     }
 
     /// Protects the idle robot: with d = 0 the agent does nothing, whatever it sees.
@@ -352,7 +364,7 @@ mod tests {
             let mut agent = Agent::new(&weights);
             agent.start(goal);
             for (area_px2, alpha_deg) in frames {
-                let decision = agent.step(Observation { area_px2, alpha_deg, alpha_now_deg: alpha_deg });
+                let decision = agent.step(Observation { area_px2, alpha_deg, alpha_measured_deg: f32::NAN, alpha_now_deg: alpha_deg });
                 prop_assert!(decision.dalpha_deg.is_finite() && decision.dalpha_deg.abs() <= 5.0);
                 prop_assert!(usize::from(decision.action) < ACTIONS);
             }

@@ -37,7 +37,7 @@ impl<const N: usize> AngleHistory<N> {
     }
 
     /// The same as [`AngleHistory::at_deg`], but NaN if no value lies within `hold_ns` of `t_ns`.
-    fn at_within_deg(&self, t_ns: u64, hold_ns: u64) -> f32 {
+    pub fn at_within_deg(&self, t_ns: u64, hold_ns: u64) -> f32 {
         let later = self.0.partition_point(|(at_ns, _)| *at_ns <= t_ns);
         let near = |at_ns: u64| at_ns.abs_diff(t_ns) <= hold_ns;
         match (later.checked_sub(1).and_then(|k| self.0.get(k)), self.0.get(later)) {

@@ -19,6 +19,8 @@ pub enum Request {
     Pour {
         /// Goal volume V_G, ml, > 0.
         goal_ml: f32,
+        /// Tilt by which it must flow, degrees, if it is known how much is in the vessel.
+        flows_by_deg: Option<f32>,
     },
     /// Asks to run the curve of eq. (1) once.
     Record(Curve),
@@ -74,6 +76,8 @@ pub struct Outcome {
     pub goal_ml: Option<f32>,
     /// Estimated volume poured, ml.
     pub poured_ml: f32,
+    /// Its standard deviation, ml; 0 if it is not known.
+    pub poured_sd_ml: f32,
     /// Time from the start until the container was upright and the last drops were counted, s.
     pub seconds: f32,
     /// Number of frames, the bridged ones included.
@@ -82,10 +86,22 @@ pub struct Outcome {
     pub bridged_frames: u32,
     /// Number of ticks without a fresh measurement.
     pub stale_features: u32,
-    /// Number of ticks that came more than one and a half periods after the one before.
-    pub late_ticks: u32,
+    /// Number of gaps: ticks that came more than one and a half periods after the one before. [`Status::late_ticks`] counts late wake-ups.
+    pub tick_gaps: u32,
     /// How often each limit changed a request.
     pub clipped: Clipped,
+}
+
+/// A volume with its standard deviation, where that is known (above 0), ml.
+pub fn volume_words(volume_ml: f32, sd_ml: f32) -> String {
+    if sd_ml > 0.0 { format!("{volume_ml:.1} +- {sd_ml:.1}") } else { format!("{volume_ml:.1}") }
+}
+
+impl Outcome {
+    /// The volume poured with its standard deviation, where that is known, ml.
+    pub fn poured_words(&self) -> String {
+        volume_words(self.poured_ml, self.poured_sd_ml)
+    }
 }
 
 /// Why a pour or recording ended.
@@ -132,6 +148,10 @@ pub enum EndReason {
     NotFollowed,
     /// Somebody has the robot in hand: the teach button (freedrive) is pressed.
     InHand,
+    /// The camera shows a stream that the container cannot give at its tilt.
+    ImpossibleFlow,
+    /// The camera shows no stream where even the emptiest container of the episodes would give one.
+    NothingFlows,
 }
 
 impl EndReason {
@@ -158,6 +178,12 @@ impl EndReason {
             Self::StreamLost => "the container is empty, or its stream is no longer seen: tilted further than when it flowed",
             Self::NotFollowed => "the robot does not follow: it is slower than it is commanded, or something holds or moves it",
             Self::InHand => "somebody has the robot in hand (the teach button is pressed)",
+            Self::ImpossibleFlow => {
+                "what the camera shows cannot be: the stream does not follow the tilt as in the episodes; look at camera, vessel and liquid"
+            }
+            Self::NothingFlows => {
+                "nothing is seen to flow, where even the emptiest vessel of the episodes would: look at the camera, or fill the vessel"
+            }
         }
     }
 }
@@ -177,6 +203,8 @@ pub struct Status {
     pub d_ml: f32,
     /// Estimated volume poured, ml.
     pub poured_ml: f32,
+    /// Its standard deviation, ml; 0 if it is not known.
+    pub poured_sd_ml: f32,
     /// Commanded alpha, degrees.
     pub alpha_deg: f32,
     /// Measured alpha, degrees; NaN without a robot.

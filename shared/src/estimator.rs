@@ -7,14 +7,18 @@
 //! |---|---|
 //! | [`vessel`] | the shape of a container |
 //! | [`flow`] | the flow model: from commanded angles to outflow |
-//! | `filter` | an extended Kalman filter on the flow model |
-//! | [`fused`] | three such filters, and the estimate that they make together |
+//! | `tilt` | the tilt that a picture shows |
+//! | [`verdict`] | whether what is seen can be |
+//! | [`filter`] | an extended Kalman filter on the flow model |
+//! | [`fused`] | two such filters, and the estimate that they make together |
 
 use serde::{Deserialize, Serialize};
 
-mod filter;
+pub mod filter;
 pub mod flow;
 pub mod fused;
+mod tilt;
+pub mod verdict;
 pub mod vessel;
 
 /// Turns V_e in px^2 into ml a frame: `v = c area^q exp(tilt z)`, with z of [`tilt_z`]; and says when the dropout hold bridges a zero.
@@ -61,6 +65,11 @@ pub struct Hold {
 }
 
 impl Hold {
+    /// The area that was used for the newest frame, px^2.
+    pub fn newest_px2(&self) -> f32 {
+        self.newest_px2
+    }
+
     /// The area to use for this frame, px^2. A lost frame repeats the newest area. A lone zero right after a strong stream is a
     /// dropout of the extraction, and repeats the area once.
     pub fn step(&mut self, area_px2: Option<f32>, hold_above_px2: f32) -> f32 {

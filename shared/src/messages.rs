@@ -235,8 +235,8 @@ pub struct Telemetry {
     pub gamma_per_s2: f32,
     /// beta of eq. (1), s; NaN unless a curve is recorded.
     pub beta_s: f32,
-    /// Reserved, 0.
-    pub reserved: f32,
+    /// Standard deviation of the estimated volume, ml; 0 if it is not known.
+    pub poured_sd_ml: f32,
 }
 
 impl Telemetry {

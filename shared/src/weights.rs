@@ -22,13 +22,15 @@ use sha2::{Digest, Sha256};
 
 use crate::actions::{ACTIONS, BACK_DEG_PER_FRAME, Selection, nearest_action};
 use crate::estimator::Calibration;
-use crate::estimator::flow::{DELAY_MAX_FRAMES, FlowModel, WayBack};
-use crate::estimator::vessel::Vessel;
+use crate::estimator::flow::WayBack;
+use crate::estimator::fused::FusedModel;
 use crate::mlp::{HIDDEN, INPUTS, InputScale, Mlp};
 use crate::regular_file;
 
+mod ranges;
+
 /// Version of the file format; files of other versions are refused.
-pub const FORMAT_VERSION: u32 = 3;
+pub const FORMAT_VERSION: u32 = 4;
 
 /// The first bytes of every weight file.
 const MAGIC: &[u8; 8] = b"decant-w";
@@ -36,7 +38,7 @@ const MAGIC: &[u8; 8] = b"decant-w";
 const HEADER: usize = 24;
 /// Number of neurons in each layer, inputs first.
 const SHAPE: [usize; 4] = [INPUTS, HIDDEN, HIDDEN, ACTIONS];
-/// Largest payload, bytes. Chosen by hand: a usual one has about 9 kB.
+/// Largest payload, bytes. Chosen by hand: a usual one has about 24 kB.
 const PAYLOAD_MAX: usize = 64 * 1024;
 /// How the checksum at the payload's end is computed.
 const CRC: Crc<u32> = Crc::<u32>::new(&CRC_32_ISO_HDLC);
@@ -73,8 +75,8 @@ pub enum Estimator {
     Sum,
     /// What the camera shows and what the container's geometry says, fused by a filter on the flow model.
     Fused {
-        /// The fitted model.
-        model: FlowModel,
+        /// The fitted models.
+        model: FusedModel,
         /// How the controller tilts back, which decides how much still flows then.
         back: WayBack,
     },
@@ -83,46 +85,10 @@ pub enum Estimator {
 impl Estimator {
     /// Refuses a value that is outside its range, and names it.
     fn check(&self) -> Result<(), String> {
-        let Self::Fused { model, back } = self else { return Ok(()) };
-        let FlowModel {
-            vessel: Vessel { radius_mm, height_mm, taper, even_share, log_shape },
-            log_weir_coefficient,
-            head_exponent,
-            log_weir_slope,
-            log_weir_curvature,
-            lag_frames,
-            delay_frames,
-            film_share,
-            noise,
-        } = *model;
-
-        let ranges = [
-            ("radius", radius_mm, 1.0, 1000.0),
-            ("height", height_mm, 1.0, 5000.0),
-            ("taper", taper, 0.05, 20.0),
-            ("even share", even_share, 0.0, 1.0),
-            ("weir coefficient (log)", log_weir_coefficient, -20.0, 20.0),
-            ("head exponent", head_exponent, 0.2, 5.0),
-            ("slope of the weir coefficient (log)", log_weir_slope, -20.0, 20.0),
-            ("curvature of the weir coefficient (log)", log_weir_curvature, -20.0, 20.0),
-            ("lag", lag_frames, 0.0, 60.0),
-            ("delay", delay_frames, 0.0, DELAY_MAX_FRAMES),
-            ("film share", film_share, 0.0, 0.95),
-            ("sd of the flow factor (log)", noise.log_flow_factor_sd, 1e-4, 5.0),
-            ("sd of the camera's gain (log)", noise.log_camera_gain_sd, 1e-4, 5.0),
-            ("sd of the capacity's scale (log)", noise.log_capacity_scale_sd, 1e-6, 5.0),
-            ("sd of the delay", noise.extra_delay_sd_frames, 1e-4, 20.0),
-            ("sd of a frame's volume (log)", noise.log_frame_volume_sd, 1e-4, 5.0),
-            ("smallest outflow", noise.least_visible_ml, 0.0, 10.0),
-            ("rate of the way back", back.rate_deg, 0.1, 10.0),
-            ("change of that rate in a frame", back.change_deg, 0.01, 100.0),
-        ];
-        for (name, value, low, high) in ranges.into_iter().chain(log_shape.map(|s| ("shape of the vessel (log)", s, -10.0, 10.0))) {
-            if !(low..=high).contains(&value) {
-                return Err(format!("estimator: {name} is {value}, but must be {low} to {high}"));
-            }
+        match self {
+            Self::Sum => Ok(()),
+            Self::Fused { model, back } => ranges::check_fused(model, *back),
         }
-        Ok(())
     }
 }
 
@@ -325,28 +291,13 @@ impl Weights {
             return Err("the action table is not ascending within +-10 degrees".into());
         }
         let InputScale { v_per_ml, d_ml, gain } = self.scale;
-        let Calibration { volume_at_1_px2_ml, area_exponent, log_tilt_slope, hold_above_px2 } = self.calibration;
-        let positive = [
-            ("input scale of v", v_per_ml),
-            ("input scale of d", d_ml),
-            ("input gain", gain),
-            ("calibration c", volume_at_1_px2_ml),
-            ("frame rate", self.rate_hz),
-        ];
+        let positive = [("input scale of v", v_per_ml), ("input scale of d", d_ml), ("input gain", gain), ("frame rate", self.rate_hz)];
         for (name, value) in positive {
             if !(value.is_finite() && value > 0.0) {
                 return Err(format!("{name} is {value}, not a positive number"));
             }
         }
-        if !(0.1..=10.0).contains(&area_exponent) {
-            return Err(format!("calibration exponent {area_exponent} is outside 0.1 to 10"));
-        }
-        if !(-1.0..=1.0).contains(&log_tilt_slope) {
-            return Err(format!("calibration's change with the tilt {log_tilt_slope} is outside -1 to 1"));
-        }
-        if hold_above_px2.is_nan() || hold_above_px2 < 0.0 {
-            return Err(format!("dropout hold above {hold_above_px2} px^2 is not a number >= 0"));
-        }
+        ranges::check_calibration(&self.calibration)?;
         self.estimator.check()
     }
 }
@@ -355,6 +306,10 @@ impl Weights {
 pub(crate) mod tests {
     use super::*;
     use crate::actions::action_table;
+    use crate::estimator::filter::UNKNOWNS;
+    use crate::estimator::flow::FlowModel;
+    use crate::estimator::fused::Explanation;
+    use crate::estimator::verdict::Bounds;
     use proptest::prelude::*;
 
     /// Valid weights whose network has arbitrary parameters, made by hand.
@@ -376,12 +331,26 @@ pub(crate) mod tests {
         }
     }
 
+    /// A fused model of the default vessel, made by hand.
+    pub(crate) fn fused_model() -> FusedModel {
+        let mut unknowns = [[0.0; UNKNOWNS]; UNKNOWNS];
+        for (k, row) in unknowns.iter_mut().enumerate() {
+            row[k] = [0.15f64, 0.04, 0.3].get(k).copied().unwrap_or(0.02).powi(2);
+        }
+        let calibration = Calibration { volume_at_1_px2_ml: 0.002, area_exponent: 1.15, log_tilt_slope: 0.05, hold_above_px2: 60.0 };
+        let explanation = Explanation { model: FlowModel::default(), calibration, unknowns };
+        FusedModel {
+            explanations: [explanation; 2],
+            tight_share: 0.9,
+            camera: [[0.04, -0.006], [-0.006, 0.001]],
+            gain_sd: 0.015,
+            bounds: Bounds { most_px2: 5000.0, dry_deg: 90.0 },
+        }
+    }
+
     /// The same with the fused estimate.
     pub(crate) fn fused_example() -> Weights {
-        Weights {
-            estimator: Estimator::Fused { model: FlowModel::default(), back: WayBack { rate_deg: 2.0, change_deg: 1.67 } },
-            ..example()
-        }
+        Weights { estimator: Estimator::Fused { model: fused_model(), back: WayBack { rate_deg: 2.0, change_deg: 1.67 } }, ..example() }
     }
 
     /// Protects the swap: what is written is what is read, with the same identity, and no temporary file is left.
@@ -461,13 +430,13 @@ pub(crate) mod tests {
             ("estimator: delay", |w| {
                 *w = fused_example();
                 if let Estimator::Fused { model, .. } = &mut w.estimator {
-                    model.delay_frames = f64::NAN;
+                    model.explanations[1].model.delay_frames = f64::NAN;
                 }
             }),
-            ("estimator: sd of the camera's gain", |w| {
+            ("estimator: variance of log c", |w| {
                 *w = fused_example();
                 if let Estimator::Fused { model, .. } = &mut w.estimator {
-                    model.noise.log_camera_gain_sd = 0.0;
+                    model.camera[0][0] = f64::NAN;
                 }
             }),
         ] {

@@ -10,21 +10,14 @@ use shared::limits::Limits;
 use shared::messages::{Phase, Telemetry};
 use simulator::ur::{Fault, Machine, RobotMode, RuntimeState, SafetyMode};
 
+use crate::commanded::{Commanded, SLACK, SLACK_DEG};
 use crate::noticing::{leaves_tilted, must_end, reasons, takes_robot};
 use crate::what::What;
 
-/// How much faster or farther than its limit a command may be, as a share: rounding in f32, and the robot's own interpolation in f64.
-const SLACK: f64 = 0.02;
-/// How far a command may be beyond a limit, degrees: rounding in f32.
-const SLACK_DEG: f64 = 0.01;
-/// How far a joint that is not ours may be commanded to move in a cycle, rad: rounding.
-const STILL_RAD: f64 = 1e-6;
 /// A container nearer to 0 than this is upright, degrees (`robot.start_tolerance_deg` of config/sim.toml, and half a degree of lag).
 const UPRIGHT_DEG: f64 = 2.5;
 /// The longest way upright of a program that runs, s: 110 degrees at 60 degrees/s, its patience of 100 ms, and 1 s as in docs/ROBOT.md.
 const WAY_UPRIGHT_S: f64 = 110.0 / 60.0 + 0.1 + 1.0;
-/// How far a container on its way upright may tilt again, degrees: what a joint overtakes while it brakes.
-const AGAIN_DEG: f64 = 6.0;
 /// After this a fault that must end a pour has been noticed, s: `controller.stale_feature_ms` and `lost_robot_ms` of config/sim.toml, three
 /// ticks, and the time that a fault of the loop itself takes is added.
 const NOTICED_S: f64 = 0.5;
@@ -70,19 +63,13 @@ pub struct Checks {
     pub violations: Vec<Violation>,
     /// Faults so far, the ordinary course left out.
     pub faults: Vec<Injected>,
-    /// Control period of the robot, s.
-    cycle_s: f64,
-    before_q: Option<[f64; 6]>,
-    before_rate_deg_s: f64,
-    /// Where the servo steered the tilting joint to, degrees, and how fast, degrees/s: after the cycle before, and after the one before that.
-    servo: [(f64, f64); 2],
+    /// What the program tells servoj.
+    commanded: Commanded,
     /// The newest target, degrees, and the rate at which it came.
     target: Option<(f64, f64)>,
     pub(crate) phase: Phase,
     /// Since when the robot could have been on its way upright, s.
     free_since_s: Option<f64>,
-    /// Smallest commanded tilt since nothing is poured, degrees.
-    least_deg: f64,
     sequence: (u64, u64),
     used: u64,
     /// Number of frames lost between measurements that came, in the run under way.
@@ -101,17 +88,13 @@ impl Checks {
     /// Checks of a cell whose robot has control cycles of `cycle_s`.
     pub fn new(settings: Settings, cycle_s: f64) -> Self {
         Self {
+            commanded: Commanded::new(settings.limits, cycle_s),
             settings,
             violations: Vec::new(),
             faults: Vec::new(),
-            cycle_s,
-            before_q: None,
-            before_rate_deg_s: 0.0,
-            servo: [(f64::NAN, f64::NAN); 2],
             target: None,
             phase: Phase::NoRobot,
             free_since_s: None,
-            least_deg: f64::INFINITY,
             sequence: (0, 0),
             used: 0,
             lost: 0,
@@ -166,17 +149,10 @@ impl Checks {
 
     /// Looks at the robot after a control cycle. `joint` is the tilting one, and `alpha_deg` its measured tilt.
     pub fn cycle(&mut self, machine: &Machine, joint: usize, alpha_deg: f64, at_s: f64) {
-        let servo = &machine.robot.servo;
-        let playing = machine.runtime_state() == RuntimeState::Playing && servo.is_servoing();
-        let q = servo.commanded_q;
-        if !playing {
-            self.before_q = None;
-        } else if let Some(before_q) = self.before_q.replace(q) {
-            self.commanded(&before_q, &q, joint, at_s);
-        } else {
-            (self.before_rate_deg_s, self.least_deg) = (0.0, q[joint].to_degrees());
+        let active = self.is_active();
+        for (invariant, what) in self.commanded.cycle(machine, joint, active) {
+            self.violated(invariant, at_s, what);
         }
-        self.servo = [(servo.target_q[joint].to_degrees(), servo.target_qd[joint].to_degrees()), self.servo[0]];
         self.upright(machine, alpha_deg, at_s);
         self.left_tilted(machine, alpha_deg, at_s);
     }
@@ -187,45 +163,6 @@ impl Checks {
             self.tilted_since_s = None;
         } else if at_s - *self.tilted_since_s.get_or_insert(at_s) > LEFT_TILTED_S && !self.faults.iter().any(|f| leaves_tilted(&f.what)) {
             self.violated("left-tilted", at_s, format!("the program ended and left the container at {alpha_deg:.1} degrees"));
-        }
-    }
-
-    /// What the program on the robot commands in a cycle.
-    fn commanded(&mut self, before_q: &[f64; 6], q: &[f64; 6], joint: usize, at_s: f64) {
-        let limits = self.settings.limits;
-        for other in (0..6).filter(|j| *j != joint) {
-            let moved = (q[other] - before_q[other]).abs();
-            if moved > STILL_RAD {
-                self.violated("others-still", at_s, format!("joint {other} is commanded to move by {moved:.6} rad in a cycle"));
-            }
-        }
-        let alpha_deg = q[joint].to_degrees();
-        if alpha_deg > f64::from(limits.alpha_max_deg) + SLACK_DEG || alpha_deg < f64::from(limits.alpha_min_deg) - UPRIGHT_DEG {
-            self.violated("robot-range", at_s, format!("servoj is given {alpha_deg:.3} degrees"));
-        }
-        // A program that begins anew goes on from where the servo steers the joint, and as fast as that moves. Every command goes on either
-        // from there or from the command before.
-        let from_command = (before_q[joint].to_degrees(), self.before_rate_deg_s);
-        // The program looks at the servo just before it commands, or one cycle before where it was resumed between the two.
-        let most_deg = (f64::from(limits.acceleration_deg_s2) * (1.0 + SLACK) + 1.0) * self.cycle_s * self.cycle_s;
-        let keeps = |(from_deg, rate_deg_s): (f64, f64)| (alpha_deg - from_deg - rate_deg_s * self.cycle_s).abs() <= most_deg;
-        let from_servo = self.servo.into_iter().find(|from| keeps(*from)).filter(|_| !keeps(from_command));
-        let begins_anew = from_servo.is_some();
-        let (from_deg, from_rate_deg_s) = from_servo.unwrap_or(from_command);
-        let rate_deg_s = (alpha_deg - from_deg) / self.cycle_s;
-        if rate_deg_s.abs() > f64::from(limits.rate_deg_s) * (1.0 + SLACK) + 0.1 {
-            self.violated("robot-rate", at_s, format!("servoj is given {rate_deg_s:.2} degrees/s"));
-        }
-        let acceleration = (rate_deg_s - from_rate_deg_s) / self.cycle_s;
-        if acceleration.abs() > f64::from(limits.acceleration_deg_s2) * (1.0 + SLACK) + 1.0 {
-            self.violated("robot-acceleration", at_s, format!("servoj is given {acceleration:.0} degrees/s^2"));
-        }
-        self.before_rate_deg_s = rate_deg_s;
-        self.least_deg = if self.is_active() || begins_anew { alpha_deg } else { self.least_deg.min(alpha_deg) };
-        // The joint is still on its way when the pour ends, by what it lags behind.
-        if alpha_deg > self.least_deg + AGAIN_DEG && rate_deg_s > 0.0 {
-            let least_deg = self.least_deg;
-            self.violated("no-resume", at_s, format!("tilted from {least_deg:.1} to {alpha_deg:.1} degrees while nothing is poured"));
         }
     }
 
@@ -273,24 +210,25 @@ impl Checks {
             self.target = None;
             return self.noticed(at_s);
         };
+        let begins = self.is_active() && !matches!(before, Phase::Pouring | Phase::Recording);
+        self.commanded.target(target_deg, self.is_active(), begins);
         let period_s = self.settings.period_ns as f64 / 1e9;
         if !(f64::from(limits.alpha_min_deg) - SLACK_DEG..=f64::from(limits.alpha_max_deg) + SLACK_DEG).contains(&target_deg) {
             self.violated("target-range", at_s, format!("a target of {target_deg} degrees"));
         }
-        if let Some((last_deg, last_rate)) = self.target {
-            let rate = (target_deg - last_deg) / period_s;
-            let most = f64::from(limits.rate_deg_s.min(limits.step_deg / period_s as f32));
-            if rate.abs() > most * (1.0 + SLACK) + 0.1 {
-                self.violated("target-rate", at_s, format!("targets move at {rate:.2} degrees/s"));
-            }
-            let acceleration = (rate - last_rate) / period_s;
-            if acceleration.abs() > f64::from(limits.acceleration_deg_s2) * (1.0 + SLACK) + 1.0 {
-                self.violated("target-acceleration", at_s, format!("targets change by {acceleration:.0} degrees/s^2"));
-            }
-            self.target = Some((target_deg, rate));
-        } else {
-            self.target = Some((target_deg, 0.0));
+        // The first target begins at rest, at the joint's measured tilt.
+        let measured_deg = f64::from(tick.robot.alpha_deg.clamp(limits.alpha_min_deg, limits.alpha_max_deg));
+        let (last_deg, last_rate) = self.target.unwrap_or((measured_deg, 0.0));
+        let rate = (target_deg - last_deg) / period_s;
+        let most = f64::from(limits.rate_deg_s.min(limits.step_deg / period_s as f32));
+        if rate.abs() > most * (1.0 + SLACK) + 0.1 {
+            self.violated("target-rate", at_s, format!("targets move at {rate:.2} degrees/s"));
         }
+        let acceleration = (rate - last_rate) / period_s;
+        if acceleration.abs() > f64::from(limits.acceleration_deg_s2) * (1.0 + SLACK) + 1.0 {
+            self.violated("target-acceleration", at_s, format!("targets change by {acceleration:.0} degrees/s^2"));
+        }
+        self.target = Some((target_deg, rate));
         self.noticed(at_s);
     }
 

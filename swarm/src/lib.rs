@@ -2,6 +2,7 @@
 //! wrong. docs/SWARM.md says what it shows and what it does not.
 
 pub mod check;
+pub mod commanded;
 pub mod eye;
 pub mod faults;
 pub mod many;

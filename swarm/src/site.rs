@@ -421,7 +421,7 @@ impl Site {
         match what {
             What::Pour(goal_ml) => {
                 self.episode += 1;
-                return Some(Some(Order::Pour { episode: self.episode, goal_ml: *goal_ml }));
+                return Some(Some(Order::Pour { episode: self.episode, goal_ml: *goal_ml, flows_by_deg: None }));
             }
             What::Record(lambda_deg, width_s) => {
                 self.episode += 1;

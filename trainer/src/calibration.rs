@@ -66,3 +66,53 @@ pub fn calibrate(episodes: &[TrainingEpisode], exponent: Option<f64>) -> Calibra
         hold_above_px2: HOLD_ABOVE_PX2,
     }
 }
+
+/// Noise of a weight that a calibration without doubt would leave, g: what the scale rounds, and who reads it.
+const READ_SD_G: f64 = 0.7;
+/// The least that the misfit of the weights lowers the doubt by, as a variance: few weights may meet each other by chance. Chosen by hand;
+/// docs/LEARNING.md has the coverage.
+const MISFIT_MIN: f64 = 0.25;
+/// Number of weights as which the expected misfit counts.
+const MISFIT_EXPECTED: f64 = 2.0;
+
+/// A calibration, and what the weights leave open of it.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Doubted {
+    /// The calibration.
+    pub calibration: Calibration,
+    /// Covariance of log c and q.
+    pub covariance: [[f64; 2]; 2],
+}
+
+/// The same calibration as [`calibrate`] finds, with its doubt; weights that it meets badly raise the doubt. `exact` takes q = 1 as right.
+///
+/// Where there are too few episodes for q, it is the expected one.
+pub fn with_doubt(episodes: &[TrainingEpisode], exact: bool) -> Doubted {
+    let few = episodes.len() < EXPONENT_NEEDS;
+    let calibration = calibrate(episodes, if exact { Some(1.0) } else { few.then_some(EXPONENT_EXPECTED) });
+    let q = f64::from(calibration.area_exponent);
+    let mut precision = [[0.0, 0.0], [0.0, 1.0 / (EXPONENT_SD * EXPONENT_SD)]];
+    let mut misfit = MISFIT_EXPECTED;
+    for e in episodes {
+        let sum_ml = f64::from(calibration.volume_at_1_px2_ml) * area_sum(e, q);
+        let step = 1e-3;
+        let slope_ml = f64::from(calibration.volume_at_1_px2_ml) * (area_sum(e, q + step) - area_sum(e, q - step)) / (2.0 * step);
+        let sd_g = if exact { READ_SD_G } else { weight_sd_g(e.weight_g) };
+        let slopes = [sum_ml / sd_g, slope_ml / sd_g];
+        misfit += ((sum_ml - e.weight_g) / sd_g).powi(2);
+        for (row, a) in precision.iter_mut().zip(slopes) {
+            for (value, b) in row.iter_mut().zip(slopes) {
+                *value += a * b;
+            }
+        }
+    }
+    let misfit = (misfit / episodes.len().max(1) as f64).max(MISFIT_MIN);
+    let [[cc, cq], [_, qq]] = precision;
+    let determinant = (cc * qq - cq * cq).max(1e-12);
+    let covariance = if exact {
+        [[misfit / cc.max(1e-12), 0.0], [0.0, 0.0]]
+    } else {
+        [[misfit * qq / determinant, -misfit * cq / determinant], [-misfit * cq / determinant, misfit * cc / determinant]]
+    };
+    Doubted { calibration, covariance: covariance.map(|row| row.map(|v| v.clamp(-20.0, 20.0))) }
+}

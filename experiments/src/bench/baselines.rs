@@ -3,8 +3,7 @@
 //! Pure, any thread; allocates when it is set up; cannot fail. Each baseline sees what a lab would give it; only the oracle sees the
 //! truth.
 
-use shared::estimator::flow::FlowTables;
-use shared::estimator::fused::FusedEstimator;
+use shared::estimator::fused::{FusedEstimator, FusedFrame};
 use shared::estimator::{Calibration, Hold};
 use shared::gaussian_curve::Curve;
 use shared::limits::{Limiter, Limits};
@@ -117,7 +116,7 @@ impl ByLaw {
     pub fn new(law: ControlLaw, calibration: Calibration, estimator: &Estimator, goal_ml: f64) -> Self {
         let fused = match estimator {
             Estimator::Sum => None,
-            Estimator::Fused { model, back } => Some(FusedEstimator::new(FlowTables::new(model), *back)),
+            Estimator::Fused { model, back } => Some(FusedEstimator::new(model, &calibration, *back)),
         };
         Self { law, calibration, hold: Hold::default(), fused, v_ml: [0.0; 3], summed_ml: 0.0, goal_ml }
     }
@@ -131,10 +130,8 @@ impl Baseline for ByLaw {
         let d = match &mut self.fused {
             None => self.goal_ml - self.summed_ml,
             Some(fused) => {
-                fused.step(
-                    Some(area_px2).filter(|a| !a.is_nan()).map(|a| f64::from(self.calibration.volume_ml(a, alpha_deg))),
-                    f64::from(alpha_deg),
-                );
+                let area_px2 = Some(area_px2).filter(|a| !a.is_nan());
+                fused.step(FusedFrame { area_px2, command_deg: f64::from(alpha_deg), measured_deg: f64::NAN });
                 self.goal_ml - fused.poured_ml() - fused.stop_volume_ml(f64::from(alpha_deg))
             }
         };

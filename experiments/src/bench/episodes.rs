@@ -49,7 +49,7 @@ impl Bench {
             let t_s = k as f64 / RATE_HZ;
             let alpha_deg = if k < frames { lambda_deg * (-gamma_per_s2 * (t_s - beta_s).powi(2)).exp() } else { 0.0 };
             let area_px2 = pour.frame(alpha_deg);
-            episode.push(t_s, alpha_deg, f64::NAN, f64::from(area_px2));
+            episode.push(t_s, alpha_deg, pour.tilt_deg(), f64::from(area_px2));
         }
         let misread: f64 = StandardNormal.sample(random);
         episode.weight_g = (pour.poured_ml() + 0.5 * misread).round();

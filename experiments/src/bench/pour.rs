@@ -32,12 +32,16 @@ pub struct PourResult {
     pub true_ml: f64,
     /// What the controller believes to have poured, ml.
     pub believed_ml: f64,
+    /// The standard deviation that it gives with it, ml.
+    pub believed_sd_ml: f64,
     /// Time until the pour was over, s.
     pub seconds: f64,
     /// Frames until then.
     pub frames: u32,
     /// Whether the pour came to its end by itself.
     pub ended: bool,
+    /// Whether it was ended because what the camera saw could not be. In an evaluation the camera is right, so this is a mistake.
+    pub falsely_ended: bool,
 }
 
 impl PourResult {
@@ -52,6 +56,10 @@ impl PourResult {
     /// The part of the error that control made, ml.
     pub fn control_ml(&self) -> f64 {
         self.believed_ml - self.goal_ml
+    }
+    /// Whether what has really left is within the standard deviation of what the controller believes; `None` if it gives none.
+    pub fn covered(&self) -> Option<bool> {
+        (self.believed_sd_ml > 0.0).then(|| self.measurement_ml().abs() <= self.believed_sd_ml)
     }
     /// Whether nothing was poured.
     pub fn never_poured(&self) -> bool {
@@ -70,6 +78,8 @@ pub struct Trace {
     pub t_s: Vec<f64>,
     /// Commanded alpha, degrees.
     pub alpha_deg: Vec<f64>,
+    /// Measured alpha, degrees; NaN where the simulator has no joint.
+    pub alpha_measured_deg: Vec<f64>,
     /// V_e, px^2.
     pub area_px2: Vec<f64>,
     /// What has really left, ml.
@@ -80,14 +90,14 @@ impl Trace {
     fn push(&mut self, alpha_deg: f64, area_px2: f32, pour: &BenchPour) {
         self.t_s.push((self.t_s.len() + 1) as f64 / RATE_HZ);
         self.alpha_deg.push(alpha_deg);
+        self.alpha_measured_deg.push(pour.tilt_deg());
         self.area_px2.push(f64::from(area_px2));
         self.true_ml.push(pour.poured_ml());
     }
 
     /// The pour as a weighed episode.
     pub fn weighed(self, name: &str, weight_g: f64) -> TrainingEpisode {
-        let alpha_measured_deg = vec![f64::NAN; self.t_s.len()];
-        let Self { t_s, alpha_deg, area_px2, .. } = self;
+        let Self { t_s, alpha_deg, alpha_measured_deg, area_px2, .. } = self;
         TrainingEpisode { name: name.into(), rate_hz: RATE_HZ, t_s, alpha_deg, alpha_measured_deg, area_px2, weight_g }
     }
 }
@@ -121,8 +131,17 @@ pub fn by_core(
     let mut alpha_deg = 0.0f32;
     let mut area_px2 = 0.0f32;
     let mut frames = 0u32;
-    let mut poured =
-        PourResult { init_ml, goal_ml, true_ml: 0.0, believed_ml: 0.0, seconds: f64::from(MAX_FRAMES) / RATE_HZ, frames: 0, ended: false };
+    let mut poured = PourResult {
+        init_ml,
+        goal_ml,
+        true_ml: 0.0,
+        believed_ml: 0.0,
+        believed_sd_ml: 0.0,
+        seconds: f64::from(MAX_FRAMES) / RATE_HZ,
+        frames: 0,
+        ended: false,
+        falsely_ended: false,
+    };
     // The core ends a pour by its own limits. This bound is for a core that fails to.
     while frames < 3 * MAX_FRAMES {
         frames += 1;
@@ -138,8 +157,10 @@ pub fn by_core(
             confidence: 1.0,
             ..Feature::default()
         };
-        let robot = Robot::that_may_move(alpha_deg, now_ns);
-        let order = (frames == 2).then_some(Order::Pour { episode: 1, goal_ml: goal_ml as f32 });
+        // The joint was measured when the picture was taken. Where there is none, it is where it was commanded.
+        let tilt_deg = if frames > 1 { pour.tilt_deg() as f32 } else { alpha_deg };
+        let robot = Robot::that_may_move(if tilt_deg.is_nan() { alpha_deg } else { tilt_deg }, now_ns - PERIOD_NS);
+        let order = (frames == 2).then_some(Order::Pour { episode: 1, goal_ml: goal_ml as f32, flows_by_deg: None });
         let output = core.step(&Input { now_ns, features: &[feature], robot, order });
         alpha_deg = output.target_deg.unwrap_or(alpha_deg);
         area_px2 = pour.frame(f64::from(alpha_deg));
@@ -148,8 +169,10 @@ pub fn by_core(
         }
         if let Some(outcome) = output.ended {
             poured.believed_ml = f64::from(outcome.poured_ml);
+            poured.believed_sd_ml = f64::from(outcome.poured_sd_ml);
             poured.seconds = f64::from(outcome.seconds);
             poured.ended = matches!(outcome.reason, EndReason::Done | EndReason::ContainerEmpty | EndReason::StreamLost);
+            poured.falsely_ended = matches!(outcome.reason, EndReason::ImpossibleFlow | EndReason::NothingFlows);
             break;
         }
     }
@@ -201,9 +224,11 @@ pub fn by_baseline(baseline: &mut dyn Baseline, pour: &mut BenchPour, limits: Li
         goal_ml,
         true_ml: pour.poured_ml(),
         believed_ml: baseline.believed_ml(),
+        believed_sd_ml: 0.0,
         seconds: f64::from(upright_at.unwrap_or(frames)) / RATE_HZ,
         frames,
         ended: back,
+        falsely_ended: false,
     }
 }
 

@@ -31,6 +31,15 @@ impl BenchPour {
         }
     }
 
+    /// The container's tilt, as a robot measures it, degrees; NaN where the simulator has no joint.
+    pub fn tilt_deg(&self) -> f64 {
+        match self {
+            Self::Paper(_) => f64::NAN,
+            Self::Rig(pour) => pour.tilt_deg(),
+            Self::ThroughCamera(seen) => seen.pour.tilt_deg(),
+        }
+    }
+
     /// The volume that has really left so far, ml. The film that has yet to drip is not in it.
     pub fn poured_ml(&self) -> f64 {
         match self {

@@ -31,6 +31,10 @@ pub struct Summary {
     pub never_poured: usize,
     /// Number of pours that never came to an end by themselves.
     pub never_stopped: usize,
+    /// Number of pours that were ended because of a camera that was right.
+    pub falsely_ended: usize,
+    /// Share of the pours whose error of measurement is within the standard deviation that the controller gives; NaN if it gives none.
+    pub covered: f64,
     /// Mean absolute error of measurement, ml.
     pub measurement_ml: f64,
     /// Mean absolute error of control, ml.
@@ -76,6 +80,11 @@ impl Summary {
             within_5_percent: mean(&|p| f64::from(p.error_ml().abs() <= 0.05 * p.goal_ml)),
             never_poured: pours.iter().filter(|p| p.never_poured()).count(),
             never_stopped: pours.iter().filter(|p| p.never_stopped()).count(),
+            falsely_ended: pours.iter().filter(|p| p.falsely_ended).count(),
+            covered: {
+                let covered: Vec<bool> = pours.iter().filter_map(|p| p.covered()).collect();
+                covered.iter().filter(|c| **c).count() as f64 / covered.len() as f64
+            },
             measurement_ml: mean(&|p| p.measurement_ml().abs()),
             control_ml: mean(&|p| p.control_ml().abs()),
             seconds: mean(&|p| p.seconds),
@@ -86,15 +95,29 @@ impl Summary {
     /// Heading of [`Summary::line`].
     pub fn heading() -> String {
         format!(
-            "{:<16} {:>6} {:>14} {:>7} {:>7} {:>7} {:>7} {:>7} {:>7} {:>6} {:>8} {:>8} {:>6}",
-            "method", "n", "MAE +- 95 %", "median", "p95", "max", "bias", "<=5 ml", "<=5 %", "fails", "measure", "control", "s"
+            "{:<16} {:>6} {:>14} {:>7} {:>7} {:>7} {:>7} {:>7} {:>7} {:>6} {:>6} {:>6} {:>8} {:>8} {:>6}",
+            "method",
+            "n",
+            "MAE +- 95 %",
+            "median",
+            "p95",
+            "max",
+            "bias",
+            "<=5 ml",
+            "<=5 %",
+            "fails",
+            "false",
+            "cover",
+            "measure",
+            "control",
+            "s"
         )
     }
 
     /// The row of the table.
     pub fn line(&self) -> String {
         format!(
-            "{:<16} {:>6} {:>7.2} +- {:>3.2} {:>7.2} {:>7.2} {:>7.2} {:>7.2} {:>6.1}% {:>6.1}% {:>6} {:>8.2} {:>8.2} {:>6.1}",
+            "{:<16} {:>6} {:>7.2} +- {:>3.2} {:>7.2} {:>7.2} {:>7.2} {:>7.2} {:>6.1}% {:>6.1}% {:>6} {:>6} {:>5.0}% {:>8.2} {:>8.2} {:>6.1}",
             self.name,
             self.n,
             self.mae_ml,
@@ -106,6 +129,8 @@ impl Summary {
             100.0 * self.within_5_ml,
             100.0 * self.within_5_percent,
             self.never_poured + self.never_stopped,
+            self.falsely_ended,
+            100.0 * self.covered,
             self.measurement_ml,
             self.control_ml,
             self.seconds
@@ -121,6 +146,8 @@ mod tests {
     #[test]
     fn summaries_count_right() {
         let one = |error: f64, ended: bool| PourResult {
+            believed_sd_ml: 4.0,
+            falsely_ended: !ended,
             init_ml: 300.0,
             goal_ml: 100.0,
             true_ml: 100.0 + error,
@@ -132,6 +159,7 @@ mod tests {
         let s = Summary::new("x", &[vec![one(1.0, true), one(-3.0, true)], vec![one(6.0, false), one(-100.0, true)]]);
         assert_eq!((s.mae_ml, s.bias_ml, s.max_ml, s.median_ml), (27.5, -24.0, 100.0, 3.0));
         assert_eq!((s.never_poured, s.never_stopped, s.within_5_ml, s.within_5_percent), (1, 1, 0.5, 0.5));
+        assert_eq!((s.falsely_ended, s.covered), (1, 0.5));
         assert_eq!(s.groups_ml, [2.0, 53.0]);
         assert!((s.mae_ci_ml - 1.96 * 25.5).abs() < 1e-9);
     }

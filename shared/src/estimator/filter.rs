@@ -1,106 +1,126 @@
-//! One explanation of a pour: an extended Kalman filter on the flow model.
+//! One explanation of a pour: an extended Kalman filter on the flow model, in the camera's own ml.
 //!
 //! It is pure and runs in the controller's loop: its size is fixed, and it does not allocate or panic. If its numbers ever cease to be
-//! finite, [`Filter::is_finite`] tells the caller.
+//! finite, [`Filter::is_finite`] tells the caller. A frame costs about 5 kflop, because most rows of its matrices are sparse.
 //!
 //! | symbol | state of the filter |
 //! |---|---|
-//! | X | headspace: capacity that is used up, ml |
-//! | lambda | logarithm of this pour's flow factor (viscosity) |
-//! | gamma | logarithm of the camera's gain in this pour |
-//! | beta | logarithm of the scale of the vessel's capacity |
+//! | E | liquid above the lip, ml |
 //! | F | film at the lip, ml |
 //! | V | volume that has left the lip, ml |
+//! | lambda | logarithm of this pour's flow factor (viscosity) |
+//! | G | logarithm of the camera's gain in this pour |
 //! | delta | delay of this pour above the model's, frames |
+//! | s | correction of the vessel's log shape, at each knot |
+//!
+//! E, F, V and the capacity are in the camera's ml, so that its gain G does not enter the dynamics or the measurement: both would find it by
+//! mistake, whenever the model is linearised anew. G only turns V into true ml, and is found by its covariance with s: what a camera reads
+//! too large makes the vessel look too large.
+//!
+//! ```text
+//! a_m = (a + a')/2 - delta (a - a');  D = change of a - delta (its change);  E += w(a_m) exp(s(a_m)) D
+//! h   = (1 - eta) v + (F + eta v)/9;  v = min(E/2, weir(a, E) exp(lambda))
+//! z   = ln((y + f)/(h + f)),  f = 0.3 of the least outflow that can be seen;  R = (sd h/(h + f))^2 + (0.012/(h + f))^2
+//! E  -= v;  F += eta v - (F + eta v)/9;  V += h
+//! ```
 
-use super::flow::{DRIP_SHARE, FlowNoise, FlowState, FlowTables};
+use super::flow::{DRIP_SHARE, FlowState, FlowTables};
+use super::vessel::{KNOTS, TablePlace, knot_place};
 
+/// Number of a pour's unknowns before it begins: lambda, G, delta and s.
+pub const UNKNOWNS: usize = 3 + KNOTS;
 /// Number of states of a filter.
-const STATES: usize = 7;
-/// Index of X, the headspace.
-pub(super) const HEADSPACE: usize = 0;
-/// Index of lambda, the flow factor's logarithm.
-pub(super) const FLOW_FACTOR: usize = 1;
-/// Index of gamma, the logarithm of the camera's gain.
-const CAMERA_GAIN: usize = 2;
-/// Index of beta, the logarithm of the capacity's scale.
-pub(super) const CAPACITY_SCALE: usize = 3;
+const STATES: usize = FIRST_UNKNOWN + UNKNOWNS;
+/// Index of E, the liquid above the lip.
+const EXCESS: usize = 0;
 /// Index of F, the film.
-pub(super) const FILM: usize = 4;
+const FILM: usize = 1;
 /// Index of V, the volume poured.
-pub(super) const POURED: usize = 5;
+const POURED: usize = 2;
+/// Index of the first unknown: lambda, the flow factor's logarithm.
+const FIRST_UNKNOWN: usize = 3;
+/// Index of lambda.
+const FLOW_FACTOR: usize = FIRST_UNKNOWN;
+/// Index of G, the logarithm of the camera's gain.
+const CAMERA_GAIN: usize = FIRST_UNKNOWN + 1;
 /// Index of delta, the delay above the model's.
-pub(super) const EXTRA_DELAY: usize = 6;
-
-/// One number for each state.
-type States = [f64; STATES];
+const EXTRA_DELAY: usize = FIRST_UNKNOWN + 2;
+/// Index of s at the first knot.
+const SHAPE: usize = FIRST_UNKNOWN + 3;
 
 /// Standard deviation of a measured outflow, ml a frame, that remains when the outflow is small. From the prototype's filter; no other
 /// measurement is recorded.
 const SD_FLOOR_ML: f64 = 0.012;
+/// Share of the least visible outflow that is added to outflows before their logarithm is taken. From the prototype's filter; no other
+/// measurement is recorded.
+const FLOOR_SHARE: f64 = 0.3;
+/// The least of that floor, ml a frame, for a camera that sees everything. Chosen by hand; no measurement is recorded.
+const FLOOR_MIN_ML: f64 = 1e-3;
 /// Slopes are taken at no less than this excess, ml, so that a measurement can correct a filter that believes the flow has ceased. Chosen
 /// by hand; no measurement is recorded.
 const EXCESS_MIN_ML: f64 = 0.05;
 /// A measurement that is further off than this many standard deviations counts less. From the prototype's filter; no other
 /// measurement is recorded.
 const GATE_SDS: f64 = 4.0;
-/// The part of the headspace's variance that nothing else explains when flow is first seen, ml^2. From the prototype's filter; no other
+/// The part of the excess's variance that nothing else explains when flow is first seen, ml^2. From the prototype's filter; no other
 /// measurement is recorded.
-const FIRST_HEADSPACE_VARIANCE_ML2: f64 = 1.0;
+const FIRST_EXCESS_VARIANCE_ML2: f64 = 0.25;
 /// A foreseen outflow above this many times the least visible one cannot be overlooked, so that a zero is a dropout. From the
 /// prototype's filter; no other measurement is recorded.
 const SURELY_VISIBLE: f64 = 3.0;
 /// This many zeros in a row are believed, and no longer taken for a dropout. From the prototype's filter; no other measurement is recorded.
 const ZEROS_BELIEVED: u32 = 3;
+/// How much the excess drifts for each degree of tilt and each ml of outflow, as a share. From the prototype's filter; no other measurement
+/// is recorded.
+const DRIFT_SHARE: f64 = 0.03;
+/// How much the excess drifts in a frame, as a variance, ml^2. From the prototype's filter; no other measurement is recorded.
+const DRIFT_ML2: f64 = 1e-4;
+/// How much lambda drifts in a frame. From the prototype's filter; no other measurement is recorded.
+const FLOW_FACTOR_DRIFT: f64 = 0.007;
+/// Largest size of a logarithm among the states: a filter that believes more is lost. Chosen by hand; no measurement is recorded.
+const LOG_MAX: f64 = 3.0;
 
-/// The tilt that a picture shows, and its change in a frame, degrees.
-#[derive(Debug, Clone, Copy)]
+/// Covariance of a pour's unknowns before it begins, in the order of the states.
+pub type UnknownsCovariance = [[f64; UNKNOWNS]; UNKNOWNS];
+
+/// The tilt that a picture shows, and its changes in this frame and in the one before, degrees.
+#[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct Tilt {
     pub tilt_deg: f64,
     pub change_deg: f64,
+    pub change_before_deg: f64,
 }
 
-/// How far the states may drift in a frame in ways that the model does not foresee, as standard deviations.
-#[derive(Debug, Clone, Copy)]
-pub(super) struct Drift {
-    /// Drift of the headspace, in ml, and again for each ml of outflow.
-    pub headspace_sd_ml: f64,
-    /// Drift of the flow factor's logarithm.
-    pub log_flow_factor_sd: f64,
+/// What is foreseen of a frame, and how far off it was.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(super) struct Innovation {
+    /// Outflow that was foreseen, ml.
+    pub foreseen_ml: f64,
+    /// How far the measurement is from it, standard deviations.
+    pub sds: f64,
 }
 
-/// A filter with its own idea of what may be off, and by how much.
+/// A filter on a flow model.
 #[derive(Debug, Clone)]
 pub(super) struct Filter {
-    /// How far a pour can be off the model.
-    pub noise: FlowNoise,
-    drift: Drift,
-    /// What the filter believes.
-    pub state: States,
-    /// How far that may be off, as a covariance.
-    pub covariance: [States; STATES],
+    state: [f64; STATES],
+    covariance: [[f64; STATES]; STATES],
     /// Number of zeros seen in a row.
     zeros: u32,
 }
 
-/// Outflow over the lip in a frame, ml, and its slopes in the states that it depends on.
+/// Outflow over the lip in a frame, ml, and its slopes.
 #[derive(Debug, Clone, Copy)]
 struct Slopes {
     flow_ml: f64,
-    per_headspace: f64,
+    per_excess: f64,
     per_flow_factor: f64,
-    per_extra_delay: f64,
 }
 
 impl Filter {
     /// A filter that has seen nothing.
-    pub fn new(noise: FlowNoise, drift: Drift) -> Self {
-        Self { noise, drift, state: [0.0; STATES], covariance: [[0.0; STATES]; STATES], zeros: 0 }
-    }
-
-    /// Forgets the pour.
-    pub fn restart(&mut self) {
-        *self = Self::new(self.noise, self.drift);
+    pub fn new() -> Self {
+        Self { state: [0.0; STATES], covariance: [[0.0; STATES]; STATES], zeros: 0 }
     }
 
     /// Whether all states and their covariance are finite numbers.
@@ -108,180 +128,198 @@ impl Filter {
         self.state.iter().chain(self.covariance.iter().flatten()).all(|s| s.is_finite())
     }
 
-    /// Begins with the first frame that shows flow. It gives the headspace, because the stream shows how high the liquid stands above the
-    /// lip.
-    pub fn start(&mut self, flow: &FlowTables, tilt: Tilt, measured_ml: f64) {
-        let noise = self.noise;
-        let Tilt { tilt_deg, change_deg } = tilt;
-        let lost_ml_per_deg = flow.over_lip(tilt_deg, 0.0, 0.0).lost_ml_per_deg;
-        let excess_ml = flow.excess_ml_for(tilt_deg, measured_ml);
+    /// Begins with the first frame that shows flow: the stream shows how high the liquid stands above the lip.
+    pub fn start(&mut self, flow: &FlowTables, prior: &UnknownsCovariance, tilt: Tilt, measured_ml: f64) {
+        let excess_ml = flow.excess_ml_for(tilt.tilt_deg, measured_ml);
         let excess_per_log = excess_ml / flow.model.head_exponent;
-        self.state = [0.0; STATES];
-        self.state[HEADSPACE] = flow.capacity.lost_ml(tilt_deg) - excess_ml;
-        let variance = |sd: f64| sd * sd;
-        let factor = variance(noise.log_flow_factor_sd);
-        let gain = variance(noise.log_camera_gain_sd);
-        let delay = variance(noise.extra_delay_sd_frames);
-        let mut c = [[0.0; STATES]; STATES];
-        let tilt_sd_ml = lost_ml_per_deg * change_deg * noise.extra_delay_sd_frames;
-        c[HEADSPACE][HEADSPACE] = variance(excess_per_log) * (factor + gain + variance(noise.log_frame_volume_sd))
-            + variance(tilt_sd_ml)
-            + FIRST_HEADSPACE_VARIANCE_ML2;
-        c[FLOW_FACTOR][FLOW_FACTOR] = factor;
-        c[CAMERA_GAIN][CAMERA_GAIN] = gain;
-        c[CAPACITY_SCALE][CAPACITY_SCALE] = variance(noise.log_capacity_scale_sd);
-        c[EXTRA_DELAY][EXTRA_DELAY] = delay;
-        for (other, covariance) in [
-            (FLOW_FACTOR, excess_per_log * factor),
-            (CAMERA_GAIN, excess_per_log * gain),
-            (EXTRA_DELAY, -lost_ml_per_deg * change_deg * delay),
-        ] {
-            c[HEADSPACE][other] = covariance;
-            c[other][HEADSPACE] = covariance;
+        *self = Self::new();
+        self.state[EXCESS] = excess_ml;
+        let p = &mut self.covariance;
+        for (i, row) in prior.iter().enumerate() {
+            p[FIRST_UNKNOWN + i][FIRST_UNKNOWN..].copy_from_slice(row);
+            let covariance = -excess_per_log * prior[0][i];
+            p[EXCESS][FIRST_UNKNOWN + i] = covariance;
+            p[FIRST_UNKNOWN + i][EXCESS] = covariance;
         }
-        self.covariance = c;
+        let noise = flow.model.noise.log_frame_volume_sd;
+        p[EXCESS][EXCESS] = excess_per_log * excess_per_log * (prior[0][0] + noise * noise) + FIRST_EXCESS_VARIANCE_ML2;
     }
 
-    /// Takes a measurement, and returns its log-likelihood.
-    ///
-    /// The filter is linearised twice: at what it foresaw, and at what the measurement makes of that.
-    pub fn update(&mut self, flow: &FlowTables, tilt: Tilt, measured_ml: f64) -> f64 {
-        let noise = self.noise;
-        let least_ml = noise.least_visible_ml;
+    /// Moves the liquid with the container's tilt.
+    pub fn tilt(&mut self, flow: &FlowTables, tilt: Tilt) {
+        let delay = self.state[EXTRA_DELAY];
+        let middle_deg = tilt.tilt_deg - (0.5 + delay) * tilt.change_deg;
+        let change_deg = tilt.change_deg - delay * (tilt.change_deg - tilt.change_before_deg);
+        let (knot, share) = knot_place(middle_deg);
+        let shape = (1.0 - share) * self.state[SHAPE + knot] + share * self.state[SHAPE + knot + 1];
+        let lost_ml_per_deg = flow.capacity.lost_ml_per_deg_at(TablePlace::of(middle_deg)) * shape.exp();
+        let gained_ml = lost_ml_per_deg * change_deg;
+        self.state[EXCESS] += gained_ml;
+        let row = [
+            (EXCESS, 1.0),
+            (EXTRA_DELAY, -lost_ml_per_deg * (tilt.change_deg - tilt.change_before_deg)),
+            (SHAPE + knot, (1.0 - share) * gained_ml),
+            (SHAPE + knot + 1, share * gained_ml),
+        ];
+        self.replace(EXCESS, &row);
+        self.covariance[EXCESS][EXCESS] += (DRIFT_SHARE * lost_ml_per_deg).powi(2) * change_deg.abs();
+    }
+
+    /// Takes a frame's outflow, ml, and says how well it was foreseen; `None` where a zero says nothing.
+    pub fn update(&mut self, flow: &FlowTables, tilt: Tilt, measured_ml: f64) -> Option<Innovation> {
+        let noise = flow.model.noise;
+        let floor_ml = (FLOOR_SHARE * noise.least_visible_ml).max(FLOOR_MIN_ML);
         let prior = self.state;
         let mut posterior = prior;
         let mut gained = ([0.0; STATES], 1.0);
-        let mut log_likelihood = 0.0;
-        self.zeros = if measured_ml == 0.0 { self.zeros + 1 } else { 0 };
+        let mut first = Innovation { foreseen_ml: 0.0, sds: 0.0 };
         for pass in 0..2 {
             let (foreseen_ml, slopes) = foresee(flow, tilt, &posterior);
             let mut seen_ml = measured_ml;
-            if measured_ml == 0.0 {
-                if foreseen_ml <= least_ml || (foreseen_ml > SURELY_VISIBLE * least_ml && self.zeros < ZEROS_BELIEVED) {
+            if measured_ml > 0.0 {
+                self.zeros = 0;
+            } else {
+                if pass == 0 {
+                    self.zeros = self.zeros.saturating_add(1);
+                }
+                let least_ml = noise.least_visible_ml;
+                let overlooked = foreseen_ml > SURELY_VISIBLE * least_ml && self.zeros < ZEROS_BELIEVED;
+                if foreseen_ml <= least_ml || overlooked {
                     // There is too little to be seen, or the extraction dropped the stream.
-                    return 0.0;
+                    return None;
                 }
                 seen_ml = least_ml;
             }
-            let projected = self.covariance.map(|row| dot(&row, &slopes));
-            let mut noise_variance = (noise.log_frame_volume_sd * foreseen_ml).powi(2) + SD_FLOOR_ML * SD_FLOOR_ML;
-            let spread = dot(&slopes, &projected).max(0.0);
-            let mut innovation_ml = seen_ml - foreseen_ml;
-            for k in 0..STATES {
-                innovation_ml -= slopes[k] * (prior[k] - posterior[k]);
+            let scale = 1.0 / (foreseen_ml + floor_ml);
+            let slopes = slopes.map(|(k, slope)| (k, slope * scale));
+            let mut projected = [0.0; STATES];
+            for (k, slope) in slopes {
+                for (sum, covariance) in projected.iter_mut().zip(&self.covariance[k]) {
+                    *sum += slope * covariance;
+                }
+            }
+            let mut noise_variance = (noise.log_frame_volume_sd * foreseen_ml * scale).powi(2) + (SD_FLOOR_ML * scale).powi(2);
+            let spread = slopes.iter().map(|(k, slope)| slope * projected[*k]).sum::<f64>().max(0.0);
+            let mut innovation = ((seen_ml + floor_ml) * scale).ln();
+            for (k, slope) in slopes {
+                innovation -= slope * (prior[k] - posterior[k]);
             }
             if pass == 0 {
-                let square = innovation_ml * innovation_ml / (spread + noise_variance);
-                log_likelihood = -0.5 * (square.min(GATE_SDS * GATE_SDS) + (spread + noise_variance).ln());
+                first = Innovation { foreseen_ml, sds: innovation / (spread + noise_variance).sqrt() };
             }
-            let limit = GATE_SDS * GATE_SDS * (spread + noise_variance);
-            if innovation_ml * innovation_ml > limit {
-                noise_variance = innovation_ml * innovation_ml / (GATE_SDS * GATE_SDS) - spread;
+            if innovation * innovation > GATE_SDS * GATE_SDS * (spread + noise_variance) {
+                noise_variance = innovation * innovation / (GATE_SDS * GATE_SDS) - spread;
             }
             let total = spread + noise_variance;
             for k in 0..STATES {
-                posterior[k] = prior[k] + projected[k] / total * innovation_ml;
+                posterior[k] = prior[k] + projected[k] / total * innovation;
             }
             gained = (projected, total);
         }
         self.state = posterior;
+        for log in &mut self.state[FIRST_UNKNOWN..] {
+            *log = log.clamp(-LOG_MAX, LOG_MAX);
+        }
         let (projected, total) = gained;
-        for i in 0..STATES {
-            for j in 0..STATES {
-                self.covariance[i][j] -= projected[i] * projected[j] / total;
+        for (row, p) in self.covariance.iter_mut().zip(&projected) {
+            let share = p / total;
+            for (covariance, other) in row.iter_mut().zip(&projected) {
+                *covariance -= share * other;
             }
         }
-        log_likelihood
+        Some(first)
     }
 
-    /// Moves the states and their covariance on by one frame of the flow model.
-    pub fn propagate(&mut self, flow: &FlowTables, tilt: Tilt) {
+    /// Lets the liquid of one frame out.
+    pub fn release(&mut self, flow: &FlowTables, tilt: Tilt) {
         let film_share = flow.model.film_share;
-        let Slopes { flow_ml, per_headspace, per_flow_factor, per_extra_delay } = outflow(flow, tilt, &self.state);
-        let capacity_scale = self.state[CAPACITY_SCALE].exp();
-        let mut flow_slopes = [0.0; STATES];
-        flow_slopes[HEADSPACE] = per_headspace;
-        flow_slopes[FLOW_FACTOR] = per_flow_factor;
-        flow_slopes[EXTRA_DELAY] = per_extra_delay;
-        // The rows of the transition that differ from the identity.
-        let mut to_headspace = flow_slopes.map(|slope| capacity_scale * slope);
-        let mut to_film = flow_slopes.map(|slope| (1.0 - DRIP_SHARE) * film_share * slope);
-        let mut to_poured = flow_slopes.map(|slope| (1.0 - film_share + DRIP_SHARE * film_share) * slope);
-        to_headspace[HEADSPACE] += 1.0;
-        to_headspace[CAPACITY_SCALE] += capacity_scale * flow_ml;
-        to_film[FILM] += 1.0 - DRIP_SHARE;
-        to_poured[POURED] += 1.0;
-        to_poured[FILM] += DRIP_SHARE;
-        self.covariance = transform(&self.covariance, &[(HEADSPACE, to_headspace), (FILM, to_film), (POURED, to_poured)]);
-        self.covariance[HEADSPACE][HEADSPACE] += self.drift.headspace_sd_ml * self.drift.headspace_sd_ml * (1.0 + flow_ml * flow_ml);
-        self.covariance[FLOW_FACTOR][FLOW_FACTOR] += self.drift.log_flow_factor_sd * self.drift.log_flow_factor_sd;
-
-        let mut liquid =
-            FlowState { headspace_ml: self.state[HEADSPACE], film_ml: self.state[FILM], capacity_scale, ..FlowState::default() };
+        let Slopes { flow_ml, per_excess, per_flow_factor } = outflow(flow, tilt, &self.state);
+        let leaves = 1.0 - film_share + DRIP_SHARE * film_share;
+        let kept = 1.0 - DRIP_SHARE;
+        // Each row reads the states as they were, so the excess, which the others read, comes last.
+        self.replace(POURED, &[(POURED, 1.0), (FILM, DRIP_SHARE), (EXCESS, leaves * per_excess), (FLOW_FACTOR, leaves * per_flow_factor)]);
+        let film = kept * film_share;
+        self.replace(FILM, &[(FILM, kept), (EXCESS, film * per_excess), (FLOW_FACTOR, film * per_flow_factor)]);
+        self.replace(EXCESS, &[(EXCESS, 1.0 - per_excess), (FLOW_FACTOR, -per_flow_factor)]);
+        let mut liquid = FlowState { film_ml: self.state[FILM], ..FlowState::default() };
         self.state[POURED] += liquid.release(flow_ml, film_share);
-        self.state[HEADSPACE] = liquid.headspace_ml;
         self.state[FILM] = liquid.film_ml;
+        self.state[EXCESS] -= flow_ml;
+        self.covariance[EXCESS][EXCESS] += (DRIFT_SHARE * flow_ml).powi(2) + DRIFT_ML2;
+        self.covariance[FLOW_FACTOR][FLOW_FACTOR] += FLOW_FACTOR_DRIFT * FLOW_FACTOR_DRIFT;
     }
+
+    /// The covariance after the state `index` has become the sum of the given states times their factors.
+    fn replace(&mut self, index: usize, row: &[(usize, f64)]) {
+        let mut product = [0.0; STATES];
+        for (k, factor) in row {
+            for (sum, covariance) in product.iter_mut().zip(&self.covariance[*k]) {
+                *sum += factor * covariance;
+            }
+        }
+        let own = row.iter().map(|(k, factor)| factor * product[*k]).sum();
+        for (k, covariance) in product.iter().enumerate() {
+            self.covariance[index][k] = *covariance;
+            self.covariance[k][index] = *covariance;
+        }
+        self.covariance[index][index] = own;
+    }
+
+    /// Volume that has left the lip, true ml.
+    pub fn poured_ml(&self) -> f64 {
+        self.state[POURED] * self.true_per_seen()
+    }
+
+    /// Variance of [`Filter::poured_ml`], ml^2.
+    pub fn poured_variance_ml2(&self) -> f64 {
+        let (volume, p) = (self.state[POURED], &self.covariance);
+        let seen = p[POURED][POURED] - 2.0 * volume * p[POURED][CAMERA_GAIN] + volume * volume * p[CAMERA_GAIN][CAMERA_GAIN];
+        self.true_per_seen().powi(2) * seen.max(0.0)
+    }
+
+    /// True ml for each ml that the camera sees.
+    pub fn true_per_seen(&self) -> f64 {
+        (-self.state[CAMERA_GAIN]).exp()
+    }
+
+    /// What the filter believes about the liquid, in the camera's ml.
+    pub fn flow_state(&self, flow: &FlowTables, tilt: Tilt) -> FlowState {
+        let tilt_deg = shown_deg(tilt, &self.state);
+        let (knot, share) = knot_place(tilt_deg);
+        let capacity_scale = ((1.0 - share) * self.state[SHAPE + knot] + share * self.state[SHAPE + knot + 1]).exp();
+        FlowState {
+            tilt_deg,
+            headspace_ml: capacity_scale * flow.capacity.lost_ml(tilt_deg) - self.state[EXCESS],
+            film_ml: self.state[FILM],
+            log_flow_factor: self.state[FLOW_FACTOR],
+            capacity_scale,
+            extra_delay_frames: self.state[EXTRA_DELAY],
+        }
+    }
+}
+
+/// The tilt that a picture shows, with this pour's delay.
+fn shown_deg(tilt: Tilt, state: &[f64; STATES]) -> f64 {
+    tilt.tilt_deg - state[EXTRA_DELAY] * tilt.change_deg
 }
 
 /// Outflow over the lip in this frame at `state`.
-fn outflow(flow: &FlowTables, tilt: Tilt, state: &States) -> Slopes {
-    let tilt_deg = tilt.tilt_deg - state[EXTRA_DELAY] * tilt.change_deg;
-    let over = flow.over_lip(tilt_deg, state[HEADSPACE], state[FLOW_FACTOR]);
-    let flow_per_excess = if over.excess_ml < EXCESS_MIN_ML {
-        let headspace_ml = flow.capacity.lost_ml(tilt_deg) - EXCESS_MIN_ML;
-        flow.over_lip(tilt_deg, headspace_ml, state[FLOW_FACTOR]).flow_per_excess
+fn outflow(flow: &FlowTables, tilt: Tilt, state: &[f64; STATES]) -> Slopes {
+    let place = TablePlace::of(shown_deg(tilt, state));
+    let over = flow.with_excess(place, state[EXCESS], state[FLOW_FACTOR]);
+    let per_excess = if state[EXCESS] < EXCESS_MIN_ML {
+        flow.with_excess(place, EXCESS_MIN_ML, state[FLOW_FACTOR]).flow_per_excess
     } else {
         over.flow_per_excess
     };
-    Slopes {
-        flow_ml: over.flow_ml,
-        per_headspace: -flow_per_excess,
-        per_flow_factor: over.flow_per_log_factor_ml,
-        per_extra_delay: -flow_per_excess * over.lost_ml_per_deg * tilt.change_deg,
-    }
+    Slopes { flow_ml: over.flow_ml, per_excess, per_flow_factor: over.flow_per_log_factor_ml }
 }
 
-/// The measurement to expect at `state`, ml, and its slopes in all states.
-fn foresee(flow: &FlowTables, tilt: Tilt, state: &States) -> (f64, States) {
+/// The outflow to expect at `state`, ml, and its slopes in the states that it depends on.
+fn foresee(flow: &FlowTables, tilt: Tilt, state: &[f64; STATES]) -> (f64, [(usize, f64); 3]) {
     let film_share = flow.model.film_share;
-    let Slopes { flow_ml, per_headspace, per_flow_factor, per_extra_delay } = outflow(flow, tilt, state);
-    let gain = state[CAMERA_GAIN].exp();
-    let foreseen_ml = gain * FlowState { film_ml: state[FILM], ..FlowState::default() }.release(flow_ml, film_share);
-    let per_flow = gain * (1.0 - film_share + DRIP_SHARE * film_share);
-    let mut slopes = [0.0; STATES];
-    slopes[HEADSPACE] = per_flow * per_headspace;
-    slopes[FLOW_FACTOR] = per_flow * per_flow_factor;
-    slopes[CAMERA_GAIN] = foreseen_ml;
-    slopes[FILM] = gain * DRIP_SHARE;
-    slopes[EXTRA_DELAY] = per_flow * per_extra_delay;
-    (foreseen_ml, slopes)
-}
-
-/// A P A' for a transition A that differs from the identity in the given rows.
-fn transform(covariance: &[States; STATES], rows: &[(usize, States); 3]) -> [States; STATES] {
-    let products = rows.map(|(_, row)| {
-        let mut product = [0.0; STATES];
-        for (factor, covariance_row) in row.iter().zip(covariance) {
-            for (sum, c) in product.iter_mut().zip(covariance_row) {
-                *sum += factor * c;
-            }
-        }
-        product
-    });
-    let mut next = *covariance;
-    for ((index, _), product) in rows.iter().zip(&products) {
-        for k in [FLOW_FACTOR, CAMERA_GAIN, CAPACITY_SCALE, EXTRA_DELAY] {
-            next[*index][k] = product[k];
-            next[k][*index] = product[k];
-        }
-        for (other, row) in rows {
-            next[*index][*other] = dot(product, row);
-        }
-    }
-    next
-}
-
-fn dot(a: &States, b: &States) -> f64 {
-    a.iter().zip(b).map(|(x, y)| x * y).sum()
+    let Slopes { flow_ml, per_excess, per_flow_factor } = outflow(flow, tilt, state);
+    let foreseen_ml = FlowState { film_ml: state[FILM].max(0.0), ..FlowState::default() }.release(flow_ml, film_share);
+    let leaves = 1.0 - film_share + DRIP_SHARE * film_share;
+    (foreseen_ml, [(EXCESS, leaves * per_excess), (FLOW_FACTOR, leaves * per_flow_factor), (FILM, DRIP_SHARE)])
 }

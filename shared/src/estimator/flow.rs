@@ -5,10 +5,10 @@
 //! frames.
 //!
 //! ```text
-//! a    += clip((alpha(t - D - delta) - a) / (1 + tau), +-3)            the tilt that this frame shows
-//! e     = max(0, W(a) - X)                                             liquid above the lip; flow starts where W(a) = X
+//! a    += clip((alpha(t - D - delta) - a) / (1 + tau), +-3)            the tilt that this frame shows; alpha is measured or commanded
+//! e     = max(0, b W(a) - X)                                           liquid above the lip; flow starts where b W(a) = X
 //! v     = min(e/2, exp(lk + lambda + k1 z + k2 z^2) (e / A(a))^p)      a weir under the head e/A, z = clip((a - 60)/30, -1.8, 1.5)
-//! X    += e^beta v                                                     headspace: the capacity that is used up
+//! X    += v                                                            headspace: the capacity that is used up
 //! F    += eta v;  drip = F/9;  F -= drip                               film
 //! out   = (1 - eta) v + drip                                           leaves the lip
 //! ```
@@ -25,7 +25,7 @@
 //! | lk, k1, k2 | [`FlowModel::log_weir_coefficient`], [`FlowModel::log_weir_slope`], [`FlowModel::log_weir_curvature`] |
 //! | lambda | [`FlowState::log_flow_factor`] |
 //! | p | [`FlowModel::head_exponent`] |
-//! | e^beta | [`FlowState::capacity_scale`] |
+//! | b | [`FlowState::capacity_scale`] |
 //! | F | [`FlowState::film_ml`] |
 //! | eta | [`FlowModel::film_share`] |
 
@@ -65,6 +65,8 @@ pub struct FlowModel {
     pub lag_frames: f64,
     /// Delay from command to picture, frames, 0 to [`DELAY_MAX_FRAMES`].
     pub delay_frames: f64,
+    /// How the picture follows the tilt that the robot measures, where the episodes had one.
+    pub measured: Option<Lateness>,
     /// Share of the outflow that becomes film at the lip.
     pub film_share: f64,
     /// How far the model can be off, for the filter.
@@ -82,31 +84,26 @@ impl Default for FlowModel {
             log_weir_curvature: -0.05,
             lag_frames: 2.0,
             delay_frames: 2.3,
+            measured: None,
             film_share: 0.1,
-            noise: FlowNoise {
-                log_flow_factor_sd: 0.15,
-                log_camera_gain_sd: 0.025,
-                log_capacity_scale_sd: 0.015,
-                extra_delay_sd_frames: 0.3,
-                log_frame_volume_sd: 0.08,
-                least_visible_ml: 0.01,
-            },
+            noise: FlowNoise { log_frame_volume_sd: 0.08, least_visible_ml: 0.01 },
         }
     }
 }
 
-/// How far the model can be off in one pour and in one frame. Each value is a standard deviation (sd), except the last one.
+/// How late a picture shows a tilt.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+pub struct Lateness {
+    /// Lag, frames.
+    pub lag_frames: f64,
+    /// Delay, frames, 0 to [`DELAY_MAX_FRAMES`].
+    pub delay_frames: f64,
+}
+
+/// How far a frame can be off the model.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct FlowNoise {
-    /// Sd of the logarithm of a pour's flow factor (viscosity).
-    pub log_flow_factor_sd: f64,
-    /// Sd of the logarithm of the camera's gain in a pour; the calibration's error is included.
-    pub log_camera_gain_sd: f64,
-    /// Sd of the logarithm of the scale of the vessel's capacity.
-    pub log_capacity_scale_sd: f64,
-    /// Sd of a pour's delay, frames.
-    pub extra_delay_sd_frames: f64,
-    /// Sd of the logarithm of the volume that one frame's area stands for.
+    /// Standard deviation of the logarithm of the volume that one frame's area stands for.
     pub log_frame_volume_sd: f64,
     /// Smallest outflow that the camera shows, ml a frame.
     pub least_visible_ml: f64,
@@ -155,8 +152,13 @@ impl FlowTables {
     #[inline]
     pub fn over_lip(&self, tilt_deg: f64, headspace_ml: f64, log_flow_factor: f64) -> LipFlow {
         let place = TablePlace::of(tilt_deg);
+        self.with_excess(place, self.capacity.lost_ml_at(place) - headspace_ml, log_flow_factor)
+    }
+
+    /// Flow over the lip at a place of the tables, with this much liquid above the lip.
+    #[inline]
+    pub(super) fn with_excess(&self, place: TablePlace, excess_ml: f64, log_flow_factor: f64) -> LipFlow {
         let lost_ml_per_deg = self.capacity.lost_ml_per_deg_at(place);
-        let excess_ml = self.capacity.lost_ml_at(place) - headspace_ml;
         if excess_ml <= 0.0 {
             return LipFlow { excess_ml, lost_ml_per_deg, ..LipFlow::default() };
         }
@@ -181,7 +183,7 @@ impl FlowTables {
     /// The tilt after a frame, from the tilt before it and the delayed command, degrees.
     #[inline]
     pub fn next_tilt_deg(&self, tilt_deg: f64, command_deg: f64) -> f64 {
-        tilt_deg + ((command_deg - tilt_deg) / (1.0 + self.model.lag_frames)).clamp(-TILT_STEP_DEG, TILT_STEP_DEG)
+        followed_deg(tilt_deg, command_deg, self.model.lag_frames)
     }
 
     /// The command that a picture shows, `ahead` frames after the newest of the history, degrees, linear between two commands.
@@ -190,11 +192,7 @@ impl FlowTables {
     /// delay is above the model's.
     #[inline]
     pub fn delayed_deg(&self, commands: &[f64], ahead: usize, extra_delay_frames: f64) -> f64 {
-        let delay = (self.model.delay_frames + extra_delay_frames).clamp(0.0, DELAY_MAX_FRAMES);
-        let whole = delay as usize;
-        let part = delay - whole as f64;
-        let at = (HISTORY - 1 + ahead).saturating_sub(whole).min(commands.len() - 1);
-        commands[at] + part * (commands[at.saturating_sub(1)] - commands[at])
+        delayed_deg(commands, ahead, self.model.delay_frames + extra_delay_frames)
     }
 
     /// What still leaves the lip if the container is brought upright from now on, ml: what the commands already given let out,
@@ -220,6 +218,22 @@ impl FlowTables {
     }
 }
 
+/// The tilt after a frame, from the tilt before it and the delayed angle that it follows with a lag, degrees.
+#[inline]
+pub fn followed_deg(tilt_deg: f64, delayed_deg: f64, lag_frames: f64) -> f64 {
+    tilt_deg + ((delayed_deg - tilt_deg) / (1.0 + lag_frames)).clamp(-TILT_STEP_DEG, TILT_STEP_DEG)
+}
+
+/// The angle that was in force `delay_frames` before the one `ahead` frames after the newest of the history, degrees.
+#[inline]
+pub fn delayed_deg(angles: &[f64], ahead: usize, delay_frames: f64) -> f64 {
+    let delay = delay_frames.clamp(0.0, DELAY_MAX_FRAMES);
+    let whole = delay as usize;
+    let part = delay - whole as f64;
+    let at = (HISTORY - 1 + ahead).saturating_sub(whole).min(angles.len() - 1);
+    angles[at] + part * (angles[at.saturating_sub(1)] - angles[at])
+}
+
 /// Where the liquid is, as far as is known.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct FlowState {
@@ -231,7 +245,7 @@ pub struct FlowState {
     pub film_ml: f64,
     /// Logarithm of this pour's flow divided by the model's (viscosity).
     pub log_flow_factor: f64,
-    /// Capacity that each ml of outflow uses up: the model's capacity divided by the vessel's own.
+    /// The vessel's own capacity divided by the model's.
     pub capacity_scale: f64,
     /// Delay of this pour above the model's, frames.
     pub extra_delay_frames: f64,
@@ -259,7 +273,9 @@ impl FlowState {
     #[inline]
     pub fn step(&mut self, flow: &FlowTables, commands: &[f64], ahead: usize) -> FrameOutflow {
         self.tilt_deg = flow.next_tilt_deg(self.tilt_deg, flow.delayed_deg(commands, ahead, self.extra_delay_frames));
-        let over_lip_ml = flow.over_lip(self.tilt_deg, self.headspace_ml, self.log_flow_factor).flow_ml;
+        let place = TablePlace::of(self.tilt_deg);
+        let excess_ml = self.capacity_scale * flow.capacity.lost_ml_at(place) - self.headspace_ml;
+        let over_lip_ml = flow.with_excess(place, excess_ml, self.log_flow_factor).flow_ml;
         FrameOutflow { over_lip_ml, leaves_ml: self.release(over_lip_ml, flow.model.film_share) }
     }
 
@@ -267,7 +283,7 @@ impl FlowState {
     /// the lip, ml.
     #[inline]
     pub fn release(&mut self, over_lip_ml: f64, film_share: f64) -> f64 {
-        self.headspace_ml += self.capacity_scale * over_lip_ml;
+        self.headspace_ml += over_lip_ml;
         self.film_ml += film_share * over_lip_ml;
         let drip_ml = DRIP_SHARE * self.film_ml;
         self.film_ml -= drip_ml;

@@ -9,13 +9,13 @@
 //! ```text
 //! w(a) = exp(s(a)) max((1 - f) w_0(a) + f w_even, W_MIN)        capacity lost a degree; s is linear between the knots
 //! W(a) = integral of w from 0 to a                              capacity lost from upright to tilt a
-//! A(a) = max(exp(2/3 s(a)) ((1 - f) A_0(a) + f A_even), A_MIN)  free surface at the lip
+//! A(a) = max((2 w)^(2/3), A_MIN)                                free surface at the lip, with w in mm^3 a radian
 //! ```
 //!
-//! w_0 and A_0 are those of a round vessel with straight walls, where `w_0 = integral of (distance from the lip) dA` over the
+//! w_0 is that of a round vessel with straight walls: `w_0 = integral of (distance from the lip) dA` over the
 //! free surface. w_even spreads the same capacity evenly over all tilts: beyond the horizontal a beaker is empty, but a bottle
-//! is not. s says how the real vessel differs. Where it holds more than the straight vessel, its surface is larger too, by the power 2/3
-//! that relates an area to a volume.
+//! is not. s says how the real vessel differs. Real vessels are rough, so s has a knot every 5 degrees. A square of side A^(1/2) whose edge is
+//! the lip loses A^(3/2)/2 a radian; that gives the surface.
 //!
 //! | symbol | name |
 //! |---|---|
@@ -28,9 +28,26 @@
 use serde::{Deserialize, Serialize};
 
 /// Number of angles at which a vessel's shape is given.
-pub const KNOTS: usize = 9;
-/// Angles at which [`Vessel::log_shape`] is given, degrees; it is constant outside of them. Chosen by hand; no measurement is recorded.
-pub const KNOTS_DEG: [f64; KNOTS] = [20.0, 35.0, 45.0, 55.0, 65.0, 75.0, 85.0, 95.0, 108.0];
+pub const KNOTS: usize = 26;
+/// The first of these angles, degrees. From the prototype; no other measurement is recorded.
+const FIRST_KNOT_DEG: f64 = 2.5;
+/// The distance from one to the next, degrees: 10 were too few for real vessels in the prototype; no other measurement is recorded.
+const KNOT_STEP_DEG: f64 = 5.0;
+
+/// The tilt at which [`Vessel::log_shape`] has an entry, degrees.
+pub fn knot_deg(knot: usize) -> f64 {
+    FIRST_KNOT_DEG + KNOT_STEP_DEG * knot as f64
+}
+
+/// Where a tilt is between the knots: the knot below, and the share of the one above it, 0 to 1; beyond the ends s is constant.
+#[inline]
+pub(super) fn knot_place(tilt_deg: f64) -> (usize, f64) {
+    // NaN becomes 0 by the cast; the clamp keeps the index inside.
+    let at = ((tilt_deg - FIRST_KNOT_DEG) / KNOT_STEP_DEG).clamp(0.0, (KNOTS - 1) as f64);
+    let knot = (at as usize).min(KNOTS - 2);
+    (knot, at - knot as f64)
+}
+
 /// The least capacity that is lost, ml a degree. A straight cup is empty beyond the horizontal, but other vessels are not. Chosen by
 /// hand; no measurement is recorded.
 const LOST_MIN_ML_PER_DEG: f64 = 0.2;
@@ -55,7 +72,8 @@ pub struct Vessel {
     pub taper: f64,
     /// Share of the capacity that is spread evenly over all tilts, 0 to 1.
     pub even_share: f64,
-    /// Logarithm of the capacity that the real vessel loses a degree, divided by that of the straight one, at [`KNOTS_DEG`].
+    /// Logarithm of the capacity that the real vessel loses a degree, divided by that of the straight one, at each
+    /// [`knot_deg`].
     pub log_shape: [f64; KNOTS],
 }
 
@@ -69,47 +87,35 @@ impl Default for Vessel {
 impl Vessel {
     /// The capacity lost at a tilt, in ml a degree, and the free surface there, in mm^2.
     fn at(&self, tilt_deg: f64) -> (f64, f64) {
-        let knot = KNOTS_DEG.partition_point(|knot| *knot <= tilt_deg);
-        let log_shape = if knot == 0 {
-            self.log_shape[0]
-        } else if knot == KNOTS {
-            self.log_shape[KNOTS - 1]
-        } else {
-            let share = (tilt_deg - KNOTS_DEG[knot - 1]) / (KNOTS_DEG[knot] - KNOTS_DEG[knot - 1]);
-            self.log_shape[knot - 1] + share * (self.log_shape[knot] - self.log_shape[knot - 1])
-        };
-        // The straight vessel's volume spread over 90 degrees, and the surface that loses as much when it turns with its middle a radius
-        // away from the lip.
+        let (knot, share) = knot_place(tilt_deg);
+        let log_shape = self.log_shape[knot] + share * (self.log_shape[knot + 1] - self.log_shape[knot]);
+        // The straight vessel's volume spread over 90 degrees.
         let t = self.taper;
         let even = std::f64::consts::PI * self.radius_mm * self.radius_mm * self.height_mm * (1.0 + t + t * t) / 3.0 / 90.0 / 1000.0;
-        let even_mm2 = even * 1000.0 / (self.radius_mm * 1f64.to_radians());
-        let (lost, surface_mm2) = self.straight(tilt_deg);
-        let mixed = |straight: f64, even: f64| (1.0 - self.even_share) * straight + self.even_share * even;
-        let lost_ml_per_deg = log_shape.exp() * mixed(lost, even).max(LOST_MIN_ML_PER_DEG);
-        let surface_mm2 = ((2.0 / 3.0 * log_shape).exp() * mixed(surface_mm2, even_mm2)).max(SURFACE_MIN_MM2);
-        (lost_ml_per_deg, surface_mm2)
+        let mixed = (1.0 - self.even_share) * self.straight(tilt_deg) + self.even_share * even;
+        let lost_ml_per_deg = log_shape.exp() * mixed.max(LOST_MIN_ML_PER_DEG);
+        let lost_mm3_per_rad = lost_ml_per_deg * 1000.0 * 180.0 / std::f64::consts::PI;
+        (lost_ml_per_deg, (2.0 * lost_mm3_per_rad).powf(2.0 / 3.0).max(SURFACE_MIN_MM2))
     }
 
-    /// The same two quantities of the straight-walled vessel, without its even share.
+    /// Capacity that the straight-walled vessel loses, ml a degree, without its even share.
     ///
     /// At depth u below the lip, the liquid's plane is at x = R - u cot(a), and the vessel's section there is
     /// 2 sqrt(r^2 - x^2) wide.
-    fn straight(&self, tilt_deg: f64) -> (f64, f64) {
+    fn straight(&self, tilt_deg: f64) -> f64 {
         let (sin, cos) = tilt_deg.max(2.0).to_radians().sin_cos();
         let cot = cos / sin;
         let widest = self.radius_mm * self.taper.max(1.0);
         let depth = if cot > 1e-6 { self.height_mm.min((self.radius_mm + widest) / cot) } else { self.height_mm };
         let step = depth / SLICES as f64;
-        let (mut lever, mut area) = (0.0, 0.0);
+        let mut lever = 0.0;
         for k in 0..SLICES {
             let u = (k as f64 + 0.5) * step;
             let x = self.radius_mm - u * cot;
             let r = self.radius_mm * (1.0 + (self.taper - 1.0) * u / self.height_mm);
-            let width = 2.0 * (r * r - x * x).max(0.0).sqrt();
-            lever += width * u;
-            area += width;
+            lever += 2.0 * (r * r - x * x).max(0.0).sqrt() * u;
         }
-        (lever * step / (sin * sin) * std::f64::consts::PI / 180.0 / 1000.0, area * step / sin)
+        lever * step / (sin * sin) * std::f64::consts::PI / 180.0 / 1000.0
     }
 }
 
@@ -175,6 +181,11 @@ impl CapacityCurve {
     pub(super) fn lost_ml_at(&self, TablePlace { index, share }: TablePlace) -> f64 {
         let slope = &self.lost_ml_per_deg;
         self.lost_ml[index] + STEP_DEG * share * (slope[index] + 0.5 * share * (slope[index + 1] - slope[index]))
+    }
+
+    /// Capacity that is lost at a tilt, ml a degree.
+    pub fn lost_ml_per_deg(&self, tilt_deg: f64) -> f64 {
+        self.lost_ml_per_deg_at(TablePlace::of(tilt_deg))
     }
 
     /// Capacity that is lost at a place of the tables, ml a degree.

@@ -27,7 +27,7 @@ const DROPOUT_FRAMES: usize = 3;
 pub struct Stage {
     /// Noise of a frame's area, relative.
     pub area_sd: f64,
-    /// How much the camera's gain differs from pour to pour (log).
+    /// How far the camera's gain in a pour is from what is known of it (log).
     pub camera_gain_sd: f64,
     /// How far an episode's delay is from what is known of it, frames.
     pub extra_delay_sd_frames: f64,
@@ -37,7 +37,10 @@ pub struct Stage {
 
 /// One episode made ready.
 pub struct PreparedEpisode {
+    /// Tilt of each frame as the model takes it: measured or commanded, degrees.
     alpha_deg: Vec<f64>,
+    /// The largest of them, degrees.
+    pub top_deg: f64,
     /// Each frame's z, see [`tilt_z`].
     tilt_z: Vec<f64>,
     /// V_e of each frame, px^2; NaN where it is not known.
@@ -53,11 +56,13 @@ pub struct PreparedEpisode {
     first: usize,
     /// Delay above the others', as far as it is known, frames.
     pub extra_delay_frames: f64,
+    /// Logarithm of the camera's gain, as far as it is known.
+    pub log_camera_gain: f64,
 }
 
 impl PreparedEpisode {
-    /// Makes a usable episode ready.
-    pub fn new(e: &TrainingEpisode) -> Self {
+    /// Makes a usable episode ready; `alpha_deg` is its tilt, measured or commanded.
+    pub fn new(e: &TrainingEpisode, alpha_deg: Vec<f64>) -> Self {
         let n = e.len();
         let area = &e.area_px2;
         let seen = |k: usize| area[k] > 0.0;
@@ -85,7 +90,8 @@ impl PreparedEpisode {
             .filter(|(a, _)| *a > 0.0)
             .collect();
         Self {
-            alpha_deg: e.alpha_deg.clone(),
+            top_deg: alpha_deg.iter().copied().fold(0.0, f64::max),
+            alpha_deg,
             tilt_z: e.alpha_deg.iter().map(|a| tilt_z(*a)).collect(),
             area_px2: area.clone(),
             held,
@@ -94,7 +100,13 @@ impl PreparedEpisode {
             weight_g: e.weight_g,
             first: (0..n).find(|k| seen(*k)).unwrap_or(0),
             extra_delay_frames: 0.0,
+            log_camera_gain: 0.0,
         }
+    }
+
+    /// Number of frames that show flow.
+    pub fn frames_with_flow(&self) -> usize {
+        self.held.len()
     }
 
     /// What the model says left the lip in each frame, and the film after it, ml.
@@ -142,7 +154,7 @@ impl PreparedEpisode {
         let camera_ml: f64 = self.held.iter().map(|(a, z)| c * (tilt * z).exp() * a.powf(q)).sum();
         residuals.push((camera_ml / gain - self.weight_g) / WEIGHT_SD_G.hypot(stage.area_sum_sd * self.weight_g));
         residuals.push(log_flow_factor / FLOW_FACTOR_SD);
-        residuals.push(log_camera_gain / stage.camera_gain_sd);
+        residuals.push((log_camera_gain - self.log_camera_gain) / stage.camera_gain_sd);
         residuals.push((extra_delay_frames - self.extra_delay_frames) / stage.extra_delay_sd_frames);
         residuals
     }

@@ -5,12 +5,12 @@
 
 use nalgebra::{DMatrix, DVector};
 use rayon::prelude::*;
-use shared::estimator::flow::FlowTables;
+use shared::estimator::flow::{FlowModel, FlowTables};
+use shared::estimator::vessel::{KNOTS, knot_deg};
 
 use super::prepared::{PreparedEpisode, Stage};
-use super::priors::{self, HeldCalibration};
-use super::servo::Servo;
-use super::unknowns::{AREA_EXPONENT, DELAY, EVEN_SHARE, FILM_SHARE, HEAD_EXPONENT, LAG, LOG_C, OWN, SHARED, Unknowns, model_of};
+use super::priors::{HeldCalibration, Priors};
+use super::unknowns::{AREA_EXPONENT, DELAY, FILM_SHARE, HEAD_EXPONENT, LAG, LOG_C, ONSET, OWN, SHARED, Unknowns, model_of};
 
 /// Step of the difference quotients.
 const NUDGE: f64 = 1e-4;
@@ -44,8 +44,8 @@ pub struct Problem<'a> {
     pub stage: Stage,
     /// A calibration that is held on to.
     pub held: Option<HeldCalibration>,
-    /// How the joint follows, if it was measured.
-    pub servo: Option<Servo>,
+    /// What is known before any episode.
+    pub priors: &'a Priors,
 }
 
 /// The normal equations at a point: J'J and J'r. The shared unknowns come first, then those of each episode.
@@ -72,18 +72,30 @@ fn sum_of_squares(residuals: &[f64]) -> f64 {
 }
 
 impl Problem<'_> {
+    /// The flow model of the shared unknowns.
+    pub fn model_of(&self, shared: &[f64; SHARED]) -> FlowModel {
+        model_of(shared, self.priors.vessel.even_share)
+    }
+
+    /// Whether a knot of the vessel's shape changes what the model says of an episode: it must be near the tilts at which something flowed.
+    fn matters(&self, knot: usize, episode: usize, onset_deg: f64) -> bool {
+        let (below, above) = (knot_deg(knot.saturating_sub(1)), knot_deg(knot + 1));
+        let at_end = knot == 0 || knot + 1 == KNOTS;
+        at_end || (above >= onset_deg && below <= self.episodes[episode].top_deg + 1.0)
+    }
+
     fn episode_residuals(&self, k: usize, flow: &FlowTables, shared: &[f64; SHARED], own: &[f64; OWN]) -> Vec<f64> {
         self.episodes[k].residuals(flow, shared, own, &self.stage, self.area_min_px2)
     }
 
     /// Sum of all squared residuals; infinite where it is not a number.
     fn cost(&self, at: &Unknowns) -> f64 {
-        let flow = FlowTables::new(&model_of(&at.shared));
+        let flow = FlowTables::new(&self.model_of(&at.shared));
         let parts: Vec<f64> = (0..self.episodes.len())
             .into_par_iter()
             .map(|k| sum_of_squares(&self.episode_residuals(k, &flow, &at.shared, &at.own[k])))
             .collect();
-        let total = sum_of_squares(&priors::residuals(&at.shared, self.held, self.servo)) + parts.iter().sum::<f64>();
+        let total = sum_of_squares(&self.priors.residuals(&at.shared, self.held)) + parts.iter().sum::<f64>();
         if total.is_finite() { total } else { f64::INFINITY }
     }
 
@@ -94,16 +106,19 @@ impl Problem<'_> {
             .map(|k| {
                 let mut shared = at.shared;
                 shared[k] += step(k);
-                (shared, FlowTables::new(&model_of(&shared)))
+                (shared, FlowTables::new(&self.model_of(&shared)))
             })
             .collect();
-        let flow = FlowTables::new(&model_of(&at.shared));
+        let flow = FlowTables::new(&self.model_of(&at.shared));
         let blocks: Vec<(DMatrix<f64>, DVector<f64>)> = (0..self.episodes.len())
             .into_par_iter()
             .map(|e| {
                 let base = self.episode_residuals(e, &flow, &at.shared, &at.own[e]);
                 let mut jacobian = DMatrix::zeros(base.len(), SHARED + OWN);
                 for (k, (shared, flow)) in nudged.iter().enumerate() {
+                    if k < KNOTS && !self.matters(k, e, at.own[e][ONSET]) {
+                        continue;
+                    }
                     let moved = self.episode_residuals(e, flow, shared, &at.own[e]);
                     set_column(&mut jacobian, k, &moved, &base, step(k));
                 }
@@ -127,14 +142,33 @@ impl Problem<'_> {
 
     /// The priors' part of the normal equations.
     fn linearised_priors(&self, shared: &[f64; SHARED]) -> (DMatrix<f64>, DVector<f64>) {
-        let base = priors::residuals(shared, self.held, self.servo);
+        let base = self.priors.residuals(shared, self.held);
         let mut jacobian = DMatrix::zeros(base.len(), SHARED);
         for k in 0..SHARED {
             let mut nudged = *shared;
             nudged[k] += NUDGE;
-            set_column(&mut jacobian, k, &priors::residuals(&nudged, self.held, self.servo), &base, NUDGE);
+            set_column(&mut jacobian, k, &self.priors.residuals(&nudged, self.held), &base, NUDGE);
         }
         normal(&jacobian, base)
+    }
+
+    /// The point after a step, put back inside the bounds of what makes sense.
+    fn stepped(&self, at: &Unknowns, step: &DVector<f64>) -> Unknowns {
+        let mut next = at.clone();
+        for (k, value) in next.shared.iter_mut().enumerate() {
+            *value -= step[k];
+        }
+        for (e, own) in next.own.iter_mut().enumerate() {
+            for (k, value) in own.iter_mut().enumerate() {
+                *value -= step[SHARED + OWN * e + k].clamp(-OWN_STEP_MAX, OWN_STEP_MAX);
+            }
+        }
+        let model = self.model_of(&next.shared);
+        next.shared[HEAD_EXPONENT] = model.head_exponent;
+        next.shared[LAG] = model.lag_frames;
+        next.shared[DELAY] = model.delay_frames;
+        next.shared[FILM_SHARE] = model.film_share;
+        next
     }
 
     /// Levenberg-Marquardt from `at`, which it moves. Returns the cost that it reached.
@@ -149,7 +183,7 @@ impl Problem<'_> {
                     damping *= 10.0;
                     continue;
                 };
-                let next = stepped(at, &step);
+                let next = self.stepped(at, &step);
                 let new = self.cost(&next);
                 if new < cost {
                     *at = next;
@@ -186,24 +220,4 @@ impl NormalEquations {
         }
         damped.cholesky().map(|cholesky| cholesky.solve(&self.vector))
     }
-}
-
-/// The point after a step, put back inside the bounds of what makes sense.
-fn stepped(at: &Unknowns, step: &DVector<f64>) -> Unknowns {
-    let mut next = at.clone();
-    for (k, value) in next.shared.iter_mut().enumerate() {
-        *value -= step[k];
-    }
-    for (e, own) in next.own.iter_mut().enumerate() {
-        for (k, value) in own.iter_mut().enumerate() {
-            *value -= step[SHARED + OWN * e + k].clamp(-OWN_STEP_MAX, OWN_STEP_MAX);
-        }
-    }
-    let model = model_of(&next.shared);
-    next.shared[EVEN_SHARE] = model.vessel.even_share;
-    next.shared[HEAD_EXPONENT] = model.head_exponent;
-    next.shared[LAG] = model.lag_frames;
-    next.shared[DELAY] = model.delay_frames;
-    next.shared[FILM_SHARE] = model.film_share;
-    next
 }

@@ -34,7 +34,7 @@ pub fn estimator(episodes: &[TrainingEpisode], estimate: Estimate, limits: &Limi
             fit.calibration = calibration::calibrate(episodes, None);
             Estimator::Sum
         }
-        Estimate::Fused => Estimator::Fused { model: fit.model, back: WayBack::new(limits, data::rate_hz(episodes)) },
+        Estimate::Fused => Estimator::Fused { model: fit.fused, back: WayBack::new(limits, data::rate_hz(episodes)) },
     };
     (fit, estimator)
 }

@@ -20,8 +20,8 @@
 use rand::{RngExt, SeedableRng};
 use rand_pcg::Pcg64Mcg;
 use shared::actions::Selection;
-use shared::estimator::flow::{FlowTables, WayBack};
-use shared::estimator::fused::FusedEstimator;
+use shared::estimator::flow::WayBack;
+use shared::estimator::fused::{FusedEstimator, FusedFrame};
 use shared::estimator::{Calibration, Hold};
 use shared::mlp::{InputScale, Mlp};
 use shared::weights::{Estimator, Method, Origin, Weights};
@@ -86,15 +86,13 @@ fn plain_sums(volumes: &[f64]) -> Vec<f64> {
 
 /// The fused estimate's counterpart of [`plain_sums`]: what it takes for poured or on its way after each frame of an episode, in
 /// proportion, so that it ends at w_E, ml.
-fn fused_sums(episode: &TrainingEpisode, calibration: &Calibration, mut estimator: FusedEstimator) -> Vec<f64> {
-    let sums: Vec<f64> = episode
-        .area_px2
-        .iter()
-        .zip(&episode.alpha_deg)
-        .map(|(area, alpha)| {
-            let measured_ml = (!area.is_nan()).then(|| f64::from(calibration.volume_ml(*area as f32, *alpha as f32)));
-            estimator.step(measured_ml, *alpha);
-            estimator.poured_ml() + estimator.stop_volume_ml(*alpha)
+fn fused_sums(episode: &TrainingEpisode, mut estimator: FusedEstimator) -> Vec<f64> {
+    let sums: Vec<f64> = (0..episode.len())
+        .map(|k| {
+            let command_deg = episode.alpha_deg[k];
+            let area_px2 = Some(episode.area_px2[k] as f32).filter(|a| !a.is_nan());
+            estimator.step(FusedFrame { area_px2, command_deg, measured_deg: episode.alpha_measured_deg[k] });
+            estimator.poured_ml() + estimator.stop_volume_ml(command_deg)
         })
         .collect();
     let end = sums.last().copied().unwrap_or(0.0).max(1e-12);
@@ -146,7 +144,7 @@ impl Recipe {
             let volumes = contributions(episode, calibration);
             let poured = match estimator {
                 Estimator::Sum => plain_sums(&volumes),
-                Estimator::Fused { model, back } => fused_sums(episode, calibration, FusedEstimator::new(FlowTables::new(model), *back)),
+                Estimator::Fused { model, back } => fused_sums(episode, FusedEstimator::new(model, calibration, *back)),
             };
             sequences.extend(kappas.iter().map(|kappa| self.sequence(episode, &volumes, &poured, *kappa)));
         }
@@ -207,7 +205,7 @@ fn volumes(episodes: &[TrainingEpisode], options: &Options, progress: &dyn Progr
             progress.stage("fitting the flow model", 1);
             let fit = fit::fit(episodes);
             let back = WayBack::new(&options.limits, data::rate_hz(episodes));
-            (fit.calibration, Estimator::Fused { model: fit.model, back }, Some(fit))
+            (fit.calibration, Estimator::Fused { model: fit.fused, back }, Some(fit))
         }
         _ => (calibration::calibrate(episodes, None), Estimator::Sum, None),
     }
