@@ -174,8 +174,8 @@ fn one(args: &Args, drawn: &Plan, config: &Config) -> Result<bool, String> {
     shown.story.iter().for_each(|line| print(line));
     for poured in &shown.poured {
         let goal = poured.goal_ml.map_or_else(|| "a curve".into(), |goal_ml| format!("goal {goal_ml:.1} ml"));
-        let (reason, believed_ml, true_ml) = (poured.reason.words(), poured.believed_ml, poured.true_ml);
-        print(&format!("{goal}: {reason}; believed {believed_ml:.1} ml, left {true_ml:.1} ml"));
+        let (reason, believed_ml, sd_ml, true_ml) = (poured.reason.words(), poured.believed_ml, poured.sd_ml, poured.true_ml);
+        print(&format!("{goal}: {reason}; believed {believed_ml:.1} +- {sd_ml:.1} ml, left {true_ml:.1} ml"));
     }
     for cost in &shown.costs {
         print(&format!(
@@ -240,9 +240,10 @@ fn report(summary: &Summary, wall_s: f64) {
         print(&format!("no violation in {pours}: fewer than {bound:.1e} a pour at 95 %, if pours are drawn as here"));
     }
     print(&format!("ended: {:?}", summary.reasons));
-    print("| fault | n done | left - goal, ml: median, p99, largest | left - said, ml: median, p99, largest |");
+    print("| fault | n done | left - goal, ml: median, p99, largest | left - said, ml: median, p99, largest | within 2 deviations |");
     for row in &summary.done {
-        print(&format!("| {} | {} | {} | {} |", row.fault, row.error_ml.n, spread(&row.error_ml), spread(&row.said_ml)));
+        let (error, said) = (spread(&row.error_ml), spread(&row.said_ml));
+        print(&format!("| {} | {} | {error} | {said} | {:.0} % |", row.fault, row.error_ml.n, 100.0 * row.covered));
     }
     print("| fault | n ended | ml after it could be noticed: median, p99, largest | bound, ml | ml after it | s until upright |");
     for row in &summary.costs {

@@ -64,6 +64,8 @@ pub struct DoneRow {
     pub error_ml: Spread,
     /// |left - said|, ml.
     pub said_ml: Spread,
+    /// The share of them whose truth lies within two of their own standard deviations of what they say; 0.95 is claimed.
+    pub covered: f64,
 }
 
 /// What many seeds showed.
@@ -149,15 +151,18 @@ fn sum_up(seeds: Seeds, shown: &[Shown]) -> Summary {
     let poured = || shown.iter().flat_map(|one| &one.poured);
     let mut reasons = BTreeMap::new();
     poured().for_each(|p| *reasons.entry(format!("{:?}", p.reason)).or_insert(0) += 1);
-    let mut done: BTreeMap<&str, (Vec<f64>, Vec<f64>)> = BTreeMap::new();
+    let mut done: BTreeMap<&str, (Vec<f64>, Vec<f64>, usize)> = BTreeMap::new();
     for p in poured().filter(|p| p.faults.len() <= 1 && p.reason == EndReason::Done) {
         let Some(goal_ml) = p.goal_ml else { continue };
         let entry = done.entry(p.faults.first().copied().unwrap_or("none")).or_default();
         entry.0.push((p.true_ml - f64::from(goal_ml)).abs());
-        entry.1.push((p.true_ml - f64::from(p.believed_ml)).abs());
+        let off_ml = (p.true_ml - f64::from(p.believed_ml)).abs();
+        entry.1.push(off_ml);
+        entry.2 += usize::from(off_ml <= 2.0 * f64::from(p.sd_ml));
     }
-    let done_row = |(fault, (error, said)): (&str, (Vec<f64>, Vec<f64>))| {
-        Some(DoneRow { fault: fault.to_owned(), error_ml: Spread::of(error)?, said_ml: Spread::of(said)? })
+    let done_row = |(fault, (error, said, covered)): (&str, (Vec<f64>, Vec<f64>, usize))| {
+        let covered = covered as f64 / said.len() as f64;
+        Some(DoneRow { fault: fault.to_owned(), error_ml: Spread::of(error)?, said_ml: Spread::of(said)?, covered })
     };
     let mut costs: BTreeMap<&str, [Vec<f64>; 3]> = BTreeMap::new();
     for cost in shown.iter().filter(|one| one.costs.len() == 1).flat_map(|one| &one.costs) {

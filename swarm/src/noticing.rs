@@ -66,3 +66,9 @@ pub fn leaves_tilted(what: &What) -> bool {
             Fault::ProgramPause | Fault::Freedrive | Fault::Jog(..) | Fault::Boot | Fault::HeldBack(_) | Fault::JointSpeedLimit(_)
         )
 }
+
+/// Whether a pour may end so without any fault: by itself, or because of what vessel and stream show.
+pub fn is_ordinary(reason: EndReason) -> bool {
+    use EndReason::*;
+    matches!(reason, Done | ContainerEmpty | StreamLost | MaxFrames | ImpossibleFlow | NothingFlows)
+}

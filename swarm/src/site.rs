@@ -20,6 +20,7 @@ use simulator::ur::{Fault, InMemory, Machine};
 use crate::check::Checks;
 use crate::eye::Eye;
 use crate::faults::{KINDS, Kind};
+use crate::noticing::is_ordinary;
 use crate::pipe::{self, End, Wiring};
 use crate::plan::Plan;
 use crate::records::Row;
@@ -84,6 +85,8 @@ pub struct Poured {
     pub goal_ml: Option<f32>,
     /// What was believed, ml.
     pub believed_ml: f32,
+    /// Its standard deviation as far as it is known, ml.
+    pub sd_ml: f32,
     /// What left, ml.
     pub true_ml: f64,
     /// The kinds of the faults while it went on or in the 6 s before.
@@ -351,11 +354,12 @@ impl Site {
         self.say(|| format!("ended: {:?}, {:.1} ml believed", outcome.reason, outcome.poured_ml));
         let true_ml = self.container.poured_ml() - self.run_poured_ml;
         self.checks.ended(outcome, true_ml, at_s);
-        self.went_on = matches!(outcome.reason, EndReason::Done | EndReason::ContainerEmpty | EndReason::StreamLost | EndReason::MaxFrames);
+        self.went_on = is_ordinary(outcome.reason);
         let since_s = at_s - f64::from(outcome.seconds) - 6.0;
         let faults = self.fault_times.iter().filter(|(began_s, _)| *began_s >= since_s).map(|(_, name)| *name).collect();
         let (reason, goal_ml, believed_ml) = (outcome.reason, outcome.goal_ml, outcome.poured_ml);
-        self.poured.push(Poured { at_s, seconds: f64::from(outcome.seconds), reason, goal_ml, believed_ml, true_ml, faults });
+        let sd_ml = outcome.poured_sd_ml;
+        self.poured.push(Poured { at_s, seconds: f64::from(outcome.seconds), reason, goal_ml, believed_ml, sd_ml, true_ml, faults });
     }
 
     /// Gives the loop an agent with the weights for the vessel of this number.

@@ -134,6 +134,8 @@ fn wake_up(life: &mut Life<'_>, site: &mut Site, now_ns: u64) {
     site.woke_up();
     life.deadline_ns = life.state.wake_up(deadline_ns);
     while life.exchange.old_agents.pop().is_some() {}
+    // The loop tells an end before the tick that it came in.
+    let mut ended = None;
     while let Some(event) = life.exchange.events.pop() {
         match event {
             Event::Tick(tick, telemetry, counters) => {
@@ -141,8 +143,11 @@ fn wake_up(life: &mut Life<'_>, site: &mut Site, now_ns: u64) {
                 life.journal.tick(tick);
             }
             Event::Ordered(answer) => site.say(|| format!("order: {answer:?}")),
-            Event::Ended(outcome) => site.ended(&outcome),
+            Event::Ended(outcome) => ended = Some(outcome),
         }
+    }
+    if let Some(outcome) = ended {
+        site.ended(&outcome);
     }
 }
 
