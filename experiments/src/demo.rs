@@ -1,5 +1,5 @@
-//! The demo: what an operator does from the first recording to a poured volume, in a cell of its own ([`crate::own_cell`]). What is recorded
-//! and poured follows the vessel (`plan.rs`).
+//! The demo: what an operator does from the first recording to a poured volume, in a cell of its own ([`crate::own_cell`]). What is weighed
+//! is what `trainer plan` proposes, and what is poured at the end follows the vessel (`plan.rs`).
 //!
 //! Ordinary process; allocates and blocks; one thread of its own listens to the controller while a pour runs. A step that fails ends it.
 
@@ -12,6 +12,7 @@ use std::time::Duration;
 use rt_controller::client::Client;
 use serde_json::{Value, json};
 use shared::config::CellConfig;
+use shared::control::volume_words;
 use shared::ipc::Cell;
 use shared::messages::Telemetry;
 use simulator::cell::SimulatorConfig;
@@ -21,7 +22,7 @@ use crate::plots;
 
 mod plan;
 
-use plan::{Plan, PlannedPour};
+use plan::{Plan, PlannedPour, Proposed, WEIGHINGS};
 
 /// The folder of the pictures of the pours, in the folder of the results.
 const PICTURES: &str = "pours";
@@ -51,6 +52,11 @@ pub struct DemoSummary {
     out: PathBuf,
 }
 
+/// A number of a result; NaN if there is none.
+fn number(value: &Value) -> f32 {
+    value.as_f64().unwrap_or(f64::NAN) as f32
+}
+
 impl DemoSummary {
     /// `summary.json`.
     pub fn json(&self) -> String {
@@ -58,8 +64,9 @@ impl DemoSummary {
             let one = |p: &DemoPour| {
                 json!({
                     "v_init_ml": p.filled_ml, "goal_ml": p.goal_ml, "poured_ml": p.poured_ml, "error_ml": p.error_ml,
-                    "seconds": p.outcome["seconds"], "late_ticks": p.outcome["late_ticks"], "stale_features": p.outcome["stale_features"],
-                    "bridged_frames": p.outcome["bridged_frames"], "estimate_ml": p.outcome["poured_ml"], "reason": p.outcome["reason"],
+                    "seconds": p.outcome["seconds"], "tick_gaps": p.outcome["tick_gaps"], "stale_features": p.outcome["stale_features"],
+                    "bridged_frames": p.outcome["bridged_frames"], "estimate_ml": p.outcome["poured_ml"],
+                    "estimate_sd_ml": p.outcome["poured_sd_ml"], "reason": p.outcome["reason"],
                     "episode_file": p.episode_file, "plot": p.plot,
                 })
             };
@@ -75,19 +82,20 @@ impl DemoSummary {
     /// Prints the table of the pours.
     pub fn print(&self) {
         println!(
-            "\n{:>9} {:>9} {:>9} {:>9} {:>7} {:>10} {:>14}",
-            "filled", "goal", "poured", "error", "time", "late ticks", "stale features"
+            "\n{:>9} {:>9} {:>9} {:>9} {:>16} {:>7} {:>10} {:>14}",
+            "filled", "goal", "poured", "error", "believed", "time", "tick gaps", "stale features"
         );
-        println!("{:>9} {:>9} {:>9} {:>9} {:>7} {:>10} {:>14}", "ml", "ml", "ml", "ml", "s", "", "");
+        println!("{:>9} {:>9} {:>9} {:>9} {:>16} {:>7} {:>10} {:>14}", "ml", "ml", "ml", "ml", "ml", "s", "", "");
         for p in &self.pours {
             println!(
-                "{:>9.0} {:>9.0} {:>9.0} {:>+9.1} {:>7.1} {:>10} {:>14}",
+                "{:>9.0} {:>9.0} {:>9.0} {:>+9.1} {:>16} {:>7.1} {:>10} {:>14}",
                 p.filled_ml,
                 p.goal_ml,
                 p.poured_ml,
                 p.error_ml,
+                volume_words(number(&p.outcome["poured_ml"]), number(&p.outcome["poured_sd_ml"])),
                 p.outcome["seconds"].as_f64().unwrap_or(f64::NAN),
-                p.outcome["late_ticks"].to_string(),
+                p.outcome["tick_gaps"].to_string(),
                 p.outcome["stale_features"].to_string()
             );
         }
@@ -109,16 +117,12 @@ pub fn perform(cell: &mut OwnCell, seed: u64) -> Result<DemoSummary, OwnCellErro
     std::fs::create_dir_all(&pictures).map_err(|error| OwnCellError::File { what: pictures.display().to_string(), error })?;
     cell.note("starting the simulated cell, the feature worker and the controller");
     let client = cell.start()?;
-    let mut episodes = record(cell, &plan)?;
-    let mut weights = train(cell, &client, seed)?;
-    let mut weighed_pours = Vec::new();
-    for (k, planned) in plan.weighed_pours.iter().enumerate() {
-        cell.note(&format!("weighed pour {} of {}: {} ml from {} ml", k + 1, plan.weighed_pours.len(), planned.goal_ml, planned.fill_ml));
-        let poured = pour(cell, "weighed", k + 1, *planned)?;
-        episodes.push(weigh(cell, &poured.episode_file, poured.poured_ml, planned.fill_ml)?);
-        weighed_pours.push(poured);
-        weights = train(cell, &client, seed)?;
+    let mut first_hour = FirstHour::default();
+    for k in 0..WEIGHINGS {
+        first_hour.weigh_next(cell, &plan, k)?;
+        first_hour.weights = train(cell, &client, seed)?;
     }
+    let FirstHour { episodes, weights, weighed_pours } = first_hour;
     let mut pours = Vec::new();
     for (k, planned) in plan.pours.iter().enumerate() {
         cell.note(&format!("pour {} of {}: {} ml from {} ml", k + 1, plan.pours.len(), planned.goal_ml, planned.fill_ml));
@@ -131,20 +135,48 @@ pub fn perform(cell: &mut OwnCell, seed: u64) -> Result<DemoSummary, OwnCellErro
     Ok(summary)
 }
 
-/// Records and weighs the curves; returns their entries for `summary.json`.
-fn record(cell: &OwnCell, plan: &Plan) -> Result<Vec<Value>, OwnCellError> {
-    let mut episodes = Vec::new();
-    for (k, curve) in plan.curves.iter().enumerate() {
-        let (fill_ml, lambda_deg, gamma) = (curve.fill_ml, curve.lambda_deg, curve.gamma_per_s2);
-        cell.note(&format!("curve {} of {}: {fill_ml} ml, lambda {lambda_deg} degrees, gamma {gamma}/s^2", k + 1, plan.curves.len()));
-        cell.command("simulator", &["operator", "fill", &fill_ml.to_string()])?;
-        let recorded =
-            cell.command("rt-controller", &["record", "--json", "--lambda", &lambda_deg.to_string(), "--gamma", &gamma.to_string()])?;
-        let weight_g = cell.scale()?;
-        episodes.push(weigh(cell, &recorded["episode_file"], weight_g, fill_ml)?);
-        cell.note(&format!("  weighed {weight_g} g"));
+/// What is recorded and poured before anything is shown.
+#[derive(Default)]
+struct FirstHour {
+    episodes: Vec<Value>,
+    weighed_pours: Vec<DemoPour>,
+    weights: String,
+}
+
+impl FirstHour {
+    /// Asks what teaches most, does it, and weighs it; `nth` counts from 0.
+    fn weigh_next(&mut self, cell: &OwnCell, plan: &Plan, nth: usize) -> Result<(), OwnCellError> {
+        let number = format!("{} of {WEIGHINGS}", nth + 1);
+        match proposal(cell, plan)? {
+            Proposed::Curve { fill_ml, lambda_deg, gamma_per_s2: gamma } => {
+                cell.note(&format!("weighing {number}, a curve: {fill_ml} ml, lambda {lambda_deg} degrees, gamma {gamma}/s^2"));
+                cell.command("simulator", &["operator", "fill", &fill_ml.to_string()])?;
+                let recorded = cell
+                    .command("rt-controller", &["record", "--json", "--lambda", &lambda_deg.to_string(), "--gamma", &gamma.to_string()])?;
+                let weight_g = cell.scale()?;
+                self.episodes.push(weigh(cell, &recorded["episode_file"], weight_g, fill_ml)?);
+                cell.note(&format!("  weighed {weight_g} g"));
+            }
+            Proposed::Pour(planned) => {
+                cell.note(&format!("weighing {number}, a pour: {} ml from {} ml", planned.goal_ml, planned.fill_ml));
+                let poured = pour(cell, "weighed", nth + 1, planned)?;
+                self.episodes.push(weigh(cell, &poured.episode_file, poured.poured_ml, planned.fill_ml)?);
+                self.weighed_pours.push(poured);
+            }
+        }
+        Ok(())
     }
-    Ok(episodes)
+}
+
+/// What `trainer plan` proposes to weigh next.
+fn proposal(cell: &OwnCell, plan: &Plan) -> Result<Proposed, OwnCellError> {
+    let directory = &cell.config.recording.directory;
+    std::fs::create_dir_all(directory).map_err(|error| OwnCellError::File { what: directory.display().to_string(), error })?;
+    let (holds, goal_max) = (plan.holds_ml.to_string(), plan.goal_max_ml.to_string());
+    let words = ["plan", &directory.to_string_lossy(), "--holds", &holds, "--goal-max", &goal_max, "--json"].map(str::to_owned);
+    let said = cell.command("trainer", &words.each_ref().map(String::as_str))?;
+    let next = &said["plan"]["candidates"][0]["next"];
+    serde_json::from_value(next.clone()).map_err(|e| OwnCellError::Other(format!("trainer plan: {next}: {e}")))
 }
 
 /// Enters an episode's weight; returns its entry for `summary.json`.

@@ -16,7 +16,7 @@ use shared::exit::{self, Failure, failure};
 use shared::messages::Phase;
 use shared::os;
 
-use crate::own_folder;
+use crate::own_folder::{self, FolderError};
 
 /// Why the cell, or an operator's command in it, did not do what it was asked to.
 #[derive(Debug, thiserror::Error)]
@@ -62,6 +62,15 @@ pub enum OwnCellError {
     Other(String),
 }
 
+impl From<FolderError> for OwnCellError {
+    fn from(error: FolderError) -> Self {
+        match error {
+            FolderError::NotOurs(_) => Self::Config(error.to_string()),
+            FolderError::File { path, error } => Self::File { what: path.display().to_string(), error },
+        }
+    }
+}
+
 impl From<OwnCellError> for Failure {
     fn from(error: OwnCellError) -> Self {
         let code = match error {
@@ -84,6 +93,7 @@ pub struct OwnCell {
     /// When it was prepared.
     pub started: Instant,
     config_file: PathBuf,
+    table: toml::Table,
     stop: Arc<AtomicBool>,
     processes: Vec<(&'static str, Child)>,
 }
@@ -100,7 +110,7 @@ impl OwnCell {
         let text = std::fs::read_to_string(config).map_err(|e| file(config, e))?;
         Config::parse(&text, &config.display().to_string()).map_err(|e| bad(&e))?;
         let mut table: toml::Table = text.parse().map_err(|e| bad(&format!("{}: {e}", config.display())))?;
-        own_folder::claim(out, &[results, &["logs", "weights.bin"]].concat()).map_err(|e| bad(&e))?;
+        own_folder::claim(out, &[results, &["logs", "weights.bin"]].concat())?;
         std::fs::create_dir_all(out.join("logs")).map_err(|e| file(out, e))?;
         let mut set = |section: &str, key: &str, value: toml::Value| {
             if let Some(toml::Value::Table(t)) = table.get_mut(section) {
@@ -119,13 +129,24 @@ impl OwnCell {
         set("recording", "directory", path("episodes"));
         set("simulator", "seed", toml::Value::Integer(seed as i64));
         let config_file = out.join("sim.toml");
-        let text = toml::to_string_pretty(&table).map_err(|e| bad(&e))?;
-        std::fs::write(&config_file, &text).map_err(|e| file(&config_file, e))?;
+        write_table(&config_file, &table)?;
         let config = Config::read(&config_file).map_err(|e| bad(&e))?;
         let stop = os::stop_at_signals().map_err(|e| OwnCellError::Other(e.to_string()))?;
         let exe = std::env::current_exe().map_err(|e| file(Path::new("own program"), e))?;
         let bin = exe.parent().unwrap_or(Path::new(".")).to_path_buf();
-        Ok(Self { config, out: out.into(), bin, started: Instant::now(), config_file, stop, processes: Vec::new() })
+        Ok(Self { config, out: out.into(), bin, started: Instant::now(), config_file, table, stop, processes: Vec::new() })
+    }
+
+    /// Gives the next start another key of `[simulator]`, or the configuration's own again.
+    ///
+    /// # Errors
+    /// When the configuration cannot be written.
+    pub fn simulate(&self, other: Option<(&str, toml::Value)>) -> Result<(), OwnCellError> {
+        let mut table = self.table.clone();
+        if let (Some((key, value)), Some(toml::Value::Table(simulator))) = (other, table.get_mut("simulator")) {
+            simulator.insert(key.into(), value);
+        }
+        write_table(&self.config_file, &table)
     }
 
     /// Starts simulator, feature worker and controller, and waits until they are ready to pour.
@@ -182,18 +203,21 @@ impl OwnCell {
         if self.stop.load(Ordering::Relaxed) { Err(OwnCellError::Interrupted) } else { Ok(()) }
     }
 
+    /// A program with its words and this cell's configuration, with nothing to read.
+    pub fn program(&self, program: &str, words: &[&str]) -> Command {
+        let mut command = Command::new(self.bin.join(program));
+        command.args(words).arg("--config").arg(&self.config_file).stdin(Stdio::null());
+        command
+    }
+
     /// Starts `name run`; its output goes to a log file.
     fn spawn(&self, name: &str) -> Result<Child, OwnCellError> {
         let log = self.out.join(format!("logs/{name}.log"));
         let log = std::fs::File::create(&log).map_err(|error| OwnCellError::File { what: log.display().to_string(), error })?;
-        Command::new(self.bin.join(name))
-            .args(["run", "--config"])
-            .arg(&self.config_file)
-            .stdin(Stdio::null())
-            .stdout(Stdio::null())
-            .stderr(log)
-            .spawn()
-            .map_err(|error| OwnCellError::File { what: name.into(), error })
+        let mut command = self.program(name, &["run"]);
+        command.stdout(Stdio::null()).stderr(log);
+        let spawned = if name == "simulator" { off_core(self.config.controller.core, || command.spawn()) } else { command.spawn() };
+        spawned.map_err(|error| OwnCellError::File { what: name.into(), error })
     }
 
     /// Runs one command of an operator to its end, and reads its JSON.
@@ -267,4 +291,30 @@ impl Drop for OwnCell {
         // This also removes what a killed process left.
         shared::ipc::remove_files(&self.config.cell);
     }
+}
+
+/// Writes a configuration.
+fn write_table(file: &Path, table: &toml::Table) -> Result<(), OwnCellError> {
+    let text = toml::to_string_pretty(table).map_err(|e| OwnCellError::Config(e.to_string()))?;
+    std::fs::write(file, text).map_err(|error| OwnCellError::File { what: file.display().to_string(), error })
+}
+
+/// Does something in a thread that never runs on `core`, and that whatever it starts inherits this from: what stands for the robot is another
+/// machine in truth, and may not share the loop's core. On a machine with one core, or that does not permit it, it runs anywhere.
+pub fn off_core<T: Send>(core: usize, what: impl FnOnce() -> T + Send) -> T {
+    std::thread::scope(|scope| {
+        let others = || {
+            if let Ok(mut cores) = rustix::thread::sched_getaffinity(None)
+                && cores.count() > 1
+            {
+                cores.unset(core);
+                let _ = rustix::thread::sched_setaffinity(None, &cores);
+            }
+            what()
+        };
+        match scope.spawn(others).join() {
+            Ok(value) => value,
+            Err(panic) => std::panic::resume_unwind(panic),
+        }
+    })
 }

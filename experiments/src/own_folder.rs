@@ -51,7 +51,10 @@ pub fn claim(out: &Path, results: &[&str]) -> Result<(), FolderError> {
 
 #[cfg(test)]
 mod tests {
+    use shared::exit::{self, Failure};
+
     use super::*;
+    use crate::own_cell::OwnCellError;
 
     /// Protects people's files: a folder that holds something else is refused and stays as it is, also with the names of results in it.
     #[test]
@@ -72,5 +75,18 @@ mod tests {
         assert!(!own.join("episodes").exists(), "results of the run before are replaced");
         assert!(own.join("notes.txt").is_file(), "what no experiment made stays");
         std::fs::remove_dir_all(&folder).unwrap();
+    }
+
+    /// Protects scripts: a folder that cannot be written is no bad command line, and a folder of somebody else is one.
+    #[test]
+    fn a_disk_that_fails_is_told_apart() {
+        let code = |error| Failure::from(OwnCellError::from(error)).code;
+        let file = std::env::temp_dir().join(format!("decant-own-folder-file-{}", std::process::id()));
+        std::fs::write(&file, "no folder").unwrap();
+        let error = claim(&file.join("inside"), &[]).unwrap_err();
+        assert!(matches!(error, FolderError::File { .. }), "{error}");
+        assert_eq!(code(error), exit::FAILED);
+        assert_eq!(code(FolderError::NotOurs(file.clone())), exit::BAD_INPUT);
+        std::fs::remove_file(&file).unwrap();
     }
 }

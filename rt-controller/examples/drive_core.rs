@@ -96,7 +96,7 @@ pub fn pour(goal_ml: f32) -> (Outcome, f32) {
     loop {
         let feature = cylinder.step();
         // In the first tick the core finds that the robot may move and is upright; then the goal can be set.
-        let order = (cylinder.frame == 2).then_some(Order::Pour { episode: 1, goal_ml });
+        let order = (cylinder.frame == 2).then_some(Order::Pour { episode: 1, goal_ml, flows_by_deg: None });
         let robot = Robot::that_may_move(cylinder.alpha_deg, cylinder.now_ns);
         let output = core.step(&Input { now_ns: cylinder.now_ns, features: &[feature], robot, order });
         if let Some(Err(refusal)) = output.ordered {

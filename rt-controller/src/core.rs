@@ -103,7 +103,7 @@ struct Run {
     /// Start time of the feature worker that measured when it began, ns.
     worker_epoch_ns: u64,
     counters_before: Counters,
-    late_ticks: u32,
+    tick_gaps: u32,
 }
 
 /// The controller's state.
@@ -184,10 +184,10 @@ impl Core {
     pub fn step(&mut self, input: &Input) -> Output {
         self.counters.ticks += 1;
         let overran = ending::controller_overran(input.now_ns, self.last_tick_ns, &self.settings);
-        let late = self.last_tick_ns != 0 && input.now_ns.saturating_sub(self.last_tick_ns) > self.settings.period_ns * 3 / 2;
+        let gap = self.last_tick_ns != 0 && input.now_ns.saturating_sub(self.last_tick_ns) > self.settings.period_ns * 3 / 2;
         self.last_tick_ns = input.now_ns;
         if let Some(run) = &mut self.run {
-            run.late_ticks += u32::from(late);
+            run.tick_gaps += u32::from(gap);
         }
 
         if input.robot.at_ns > 0 {
@@ -242,12 +242,15 @@ impl Core {
                 situation.may_abort()?;
                 self.give_up(EndReason::Aborted);
             }
-            Order::Pour { episode, goal_ml } => {
+            Order::Pour { episode, goal_ml, flows_by_deg } => {
                 situation.may_begin(&self.settings)?;
                 order::goal_is_legal(goal_ml, &self.settings)?;
                 self.agent.as_mut().ok_or(Refusal::NoWeights)?.start(goal_ml);
                 self.decision = Decision { d_ml: goal_ml, ..Decision::NOTHING };
                 self.begin(episode, Some(goal_ml), None, input);
+                if let Some(run) = &mut self.run {
+                    run.ending = Ending::of_pour_that_flows_by(flows_by_deg);
+                }
             }
             Order::Record { episode, curve } => {
                 situation.may_begin(&self.settings)?;
@@ -273,7 +276,7 @@ impl Core {
             settling_since_ns: 0,
             worker_epoch_ns: newest.map_or(0, |f| f.worker_epoch_ns),
             counters_before: self.counters(),
-            late_ticks: 0,
+            tick_gaps: 0,
         });
         self.request_deg = self.limiter.alpha_deg();
         self.phase = if curve.is_some() { Phase::Recording } else { Phase::Pouring };
@@ -439,7 +442,7 @@ impl Core {
             frames: run.frames,
             bridged_frames: (now.bridged_frames - before.bridged_frames) as u32,
             stale_features: (now.stale_features - before.stale_features) as u32,
-            late_ticks: run.late_ticks,
+            tick_gaps: run.tick_gaps,
             clipped: Clipped {
                 angle: now.clipped.angle - before.clipped.angle,
                 rate: now.clipped.rate - before.clipped.rate,

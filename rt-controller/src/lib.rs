@@ -15,6 +15,7 @@
 //! | [`stop_client`] | the clients' side of it | their own process |
 //! | [`claim`] | one controller in a cell, no file in two cells | ordinary |
 //! | [`journal`] | every tick's inputs, and their replay | ordinary |
+//! | [`foreseen`] | what can be said of a pour before it starts | their own process |
 //! | [`client`] | the clients' side of the service | their own process |
 //! | [`commands`] | the subcommands | their own process |
 #![forbid(unsafe_code)]
@@ -26,6 +27,7 @@ pub mod control_loop;
 pub mod core;
 pub mod disk;
 pub mod exchange;
+pub mod foreseen;
 pub mod journal;
 pub mod link;
 pub mod pacing;

@@ -5,8 +5,8 @@
 //! phase, by at most [`PULL_MAX_NS`] (0.6 % of the period), until V_e has waited for the margin when it is used. A camera whose rate
 //! differs by more is not followed; the loop's rate then wanders within that 0.6 %.
 //!
-//! The margin follows what this machine does. It is twice what V_e came late at most, relative to its usual time, within the last 10 to 20 s,
-//! and [`MARGIN_FLOOR_NS`] more. A tick that wakes up late needs no margin, because V_e is then there all the more.
+//! The margin follows what this machine does. It is twice what V_e came late at most, relative to its usual time, within the last 10 to 12 s,
+//! and [`MARGIN_FLOOR_NS`] more; the largest there is, until V_e was watched for 4 s. A tick that wakes up late needs no margin, because V_e is then there all the more.
 //!
 //! It is pure and runs in the real-time thread; it does not allocate or fail. What it sees stands in the journal, so that every deadline
 //! can be computed again.
@@ -16,8 +16,11 @@
 pub const MARGIN_FLOOR_NS: i64 = 300_000;
 /// The largest margin, ns, and the one before anything is known: more than the jitter of a loaded machine. See docs/REALTIME.md.
 pub const MARGIN_MAX_NS: i64 = 3_000_000;
-/// Number of measurements in a window: 10 s at 30 Hz. The latest V_e of this window and the one before decides.
-const WINDOW: u32 = 300;
+/// Number of measurements in a window: 2 s at 30 Hz.
+const WINDOW: u32 = 60;
+/// Number of windows whose latest V_e decides, this one included: 10 to 12 s. Chosen by hand: a machine whose pauses are further apart loses one
+/// tick in hundreds to each.
+const WINDOWS: usize = 6;
 /// Largest change of a period, ns: 0.6 % of the period at 30 Hz. Chosen by hand; no measurement is recorded.
 pub const PULL_MAX_NS: i64 = 200_000;
 /// One tick corrects this part of the phase's error, 1 / 8, because the measurement of a single frame is noise. Chosen by hand; no
@@ -38,20 +41,20 @@ pub struct Pacer {
     /// By how much the camera's period is longer than the loop's, ns; it is taken off the wait in each period.
     drift_ns: i64,
     margin_ns: i64,
-    /// The latest that V_e came, relative to its usual time, in this window and in the one before, ns.
-    latest_ns: [i64; 2],
+    /// The latest that V_e came, relative to its usual time, in this window and in those before, newest first, ns.
+    latest_ns: [i64; WINDOWS],
     /// Number of measurements in this window.
     seen: u32,
     /// Number of measurements, up to [`KNOWN`].
     known: u32,
+    /// Whether a whole window was seen; before, the margin is the largest.
+    watched: bool,
 }
 
 impl Pacer {
     /// The pacer of a loop with this period, ns.
     pub fn new(period_ns: u64) -> Self {
-        // Until a window has passed, it counts as if V_e had come as late as the largest margin allows.
-        let latest_ns = [0, MARGIN_MAX_NS];
-        Self { period_ns, wait_ns: None, drift_ns: 0, margin_ns: MARGIN_MAX_NS, latest_ns, seen: 0, known: 0 }
+        Self { period_ns, wait_ns: None, drift_ns: 0, margin_ns: MARGIN_MAX_NS, latest_ns: [0; WINDOWS], seen: 0, known: 0, watched: false }
     }
 
     /// How long V_e is to have waited when its tick wakes up, ns.
@@ -78,10 +81,15 @@ impl Pacer {
         self.latest_ns[0] = self.latest_ns[0].max(-error_ns);
         self.seen += 1;
         if self.seen >= WINDOW {
-            (self.seen, self.latest_ns) = (0, [0, self.latest_ns[0]]);
+            self.seen = 0;
+            self.latest_ns.rotate_right(1);
+            self.latest_ns[0] = 0;
+            self.watched = true;
         }
-        let latest_ns = self.latest_ns[0].max(self.latest_ns[1]);
-        self.margin_ns = (MARGIN_FLOOR_NS + 2 * latest_ns).clamp(MARGIN_FLOOR_NS, MARGIN_MAX_NS);
+        if self.watched {
+            let latest_ns = self.latest_ns.into_iter().max().unwrap_or(MARGIN_MAX_NS);
+            self.margin_ns = (MARGIN_FLOOR_NS + 2 * latest_ns).clamp(MARGIN_FLOOR_NS, MARGIN_MAX_NS);
+        }
     }
 
     /// A duration less as many periods as bring it nearest to 0, ns.
@@ -180,9 +188,9 @@ mod tests {
             pacer.margin_ns()
         };
         assert_eq!(see(0, 1), 3_000_000, "nothing is known yet");
-        assert!(see(0, 4 * WINDOW) < 400_000);
+        assert!(see(0, 4 * WINDOW) < 400_000, "watched for 8 s");
         assert_eq!(see(8_000_000, 3), 3_000_000, "V_e came 8 ms late");
-        assert!(see(0, 4 * WINDOW) < 400_000);
+        assert!(see(0, 20 * WINDOW) < 400_000);
     }
 
     /// Protects the robot from bursts: what was missed is skipped, and counted.

@@ -132,7 +132,7 @@ impl<'a> Service<'a> {
                         outcome.episode,
                         outcome
                             .goal_ml
-                            .map_or("curve".into(), |g| format!("goal {g:.1} ml, {:.1} ml poured (estimate)", outcome.poured_ml)),
+                            .map_or("curve".into(), |g| format!("goal {g:.1} ml, {} ml poured (estimate)", outcome.poured_words())),
                         outcome.reason.words(),
                         outcome.seconds
                     ));
@@ -185,7 +185,9 @@ impl<'a> Service<'a> {
                     reply(&asked, &Reply::Aborting);
                     continue;
                 }
-                Request::Pour { goal_ml } => self.next_number().map(|episode| (Order::Pour { episode, goal_ml }, episode)),
+                Request::Pour { goal_ml, flows_by_deg } => {
+                    self.next_number().map(|episode| (Order::Pour { episode, goal_ml, flows_by_deg }, episode))
+                }
                 Request::Record(curve) => self.next_number().map(|episode| (Order::Record { episode, curve }, episode)),
             };
             let Some((order, episode)) = order else {
@@ -228,6 +230,7 @@ impl<'a> Service<'a> {
             goal_ml: t.goal_ml,
             d_ml: t.d_ml,
             poured_ml: t.poured_ml,
+            poured_sd_ml: t.poured_sd_ml,
             alpha_deg: t.alpha_deg,
             alpha_measured_deg: t.alpha_measured_deg,
             area_px2: t.area_px2,

@@ -134,7 +134,7 @@ impl ToyCell {
     }
 
     fn pour(&mut self, goal_ml: f32) -> Result<(), Refusal> {
-        self.tick(Some(Order::Pour { episode: 5, goal_ml })).ordered.expect("an order is answered in its tick")
+        self.tick(Some(Order::Pour { episode: 5, goal_ml, flows_by_deg: None })).ordered.expect("an order is answered in its tick")
     }
 
     /// Runs ticks until the pour has ended.

@@ -182,7 +182,7 @@ fn every_hindrance_has_its_reason() {
     use EndReason::*;
     type Change = fn(&mut RobotState, u64);
     let long_ago = NOW - LOST - 1;
-    let cases: [(&str, EndReason, Change); 22] = [
+    let cases: [(&str, EndReason, Change); 24] = [
         ("silence", RobotLost, |s, ago| s.received_at_ns = ago),
         ("silence, whatever it last said", RobotLost, |s, ago| (s.received_at_ns, s.safety_mode) = (ago, 3)),
         ("clock stands still", RobotStalled, |s, ago| s.advanced_at_ns = ago),
@@ -202,10 +202,14 @@ fn every_hindrance_has_its_reason() {
         ("program paused", ProgramStopped, |s, _| s.runtime_state = 4),
         ("program ended on command", ProgramStopped, |s, _| s.program_state = ProgramState::Stopped),
         ("program hangs", ProgramStopped, |s, ago| s.answered_at_ns = ago),
-        ("program returns because we were silent", ControllerOverrun, |s, _| s.program_state = ProgramState::Returning),
-        ("program ended because we were silent", ControllerOverrun, |s, _| {
-            (s.program_state, s.runtime_state) = (ProgramState::TimedOut, 1);
+        ("program reads on, but what passes over the link is old", RobotLost, |s, ago| s.unread_since_ns = ago),
+        ("program returns because we were silent", ControllerOverrun, |s, _| {
+            (s.program_state, s.was_silent) = (ProgramState::Returning, true);
         }),
+        ("program ended because we were silent", ControllerOverrun, |s, _| {
+            (s.program_state, s.runtime_state, s.was_silent) = (ProgramState::TimedOut, 1, true);
+        }),
+        ("program returns, and has read late all that we sent in time", RobotLost, |s, _| s.program_state = ProgramState::Returning),
         ("program returns because targets do not arrive", RobotLost, |s, _| {
             (s.program_state, s.sequence_sent) = (ProgramState::Returning, s.sequence_echo + 3);
         }),
@@ -217,7 +221,8 @@ fn every_hindrance_has_its_reason() {
         change(&mut state, long_ago);
         assert_eq!(health::check(&state, NOW, LOST), Err(reason), "{what}");
     }
-    let at_the_limit: [fn(&mut RobotState); 4] = [
+    let at_the_limit: [fn(&mut RobotState); 5] = [
+        |s| s.unread_since_ns = NOW - LOST,
         |s| s.received_at_ns = NOW - LOST,
         |s| s.advanced_at_ns = NOW - LOST,
         |s| s.answered_at_ns = NOW + 5,

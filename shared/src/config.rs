@@ -9,6 +9,7 @@ use std::path::{Path, PathBuf};
 use serde::{Deserialize, Serialize};
 
 pub use crate::config_camera::{CameraConfig, CameraSource, Locked, Refused, Setting};
+pub use crate::config_container::ContainerConfig;
 use crate::config_paths;
 use crate::limits::Limits;
 
@@ -69,6 +70,9 @@ pub struct Config {
     pub camera: CameraConfig,
     /// Where the lip is in the image, and how liquid is told from the background.
     pub image: ImageConfig,
+    /// What is known of the vessel.
+    #[serde(default)]
+    pub container: ContainerConfig,
     /// The robot and its tilting joint.
     pub robot: RobotConfig,
     /// Limits on alpha.
@@ -293,6 +297,9 @@ impl Config {
         check.camera(&self.camera)?;
         check.image(&self.image, &self.camera)?;
         check.robot(&self.robot, &self.limits)?;
+        if let Some((key, value, allowed)) = self.container.fault() {
+            check.rule(key, &value.to_string(), false, &allowed)?;
+        }
         check.processes(&self.controller, &self.worker, &self.recording)
     }
 }

@@ -19,6 +19,8 @@ pub enum Request {
     Pour {
         /// Goal volume V_G, ml, > 0.
         goal_ml: f32,
+        /// Tilt by which it must flow, degrees, if it is known how much is in the vessel.
+        flows_by_deg: Option<f32>,
     },
     /// Asks to run the curve of eq. (1) once.
     Record(Curve),
@@ -84,17 +86,21 @@ pub struct Outcome {
     pub bridged_frames: u32,
     /// Number of ticks without a fresh measurement.
     pub stale_features: u32,
-    /// Number of ticks that came more than one and a half periods after the one before.
-    pub late_ticks: u32,
+    /// Number of gaps: ticks that came more than one and a half periods after the one before. [`Status::late_ticks`] counts late wake-ups.
+    pub tick_gaps: u32,
     /// How often each limit changed a request.
     pub clipped: Clipped,
+}
+
+/// A volume with its standard deviation, where that is known (above 0), ml.
+pub fn volume_words(volume_ml: f32, sd_ml: f32) -> String {
+    if sd_ml > 0.0 { format!("{volume_ml:.1} +- {sd_ml:.1}") } else { format!("{volume_ml:.1}") }
 }
 
 impl Outcome {
     /// The volume poured with its standard deviation, where that is known, ml.
     pub fn poured_words(&self) -> String {
-        let Self { poured_ml, poured_sd_ml, .. } = self;
-        if *poured_sd_ml > 0.0 { format!("{poured_ml:.1} +- {poured_sd_ml:.1}") } else { format!("{poured_ml:.1}") }
+        volume_words(self.poured_ml, self.poured_sd_ml)
     }
 }
 
@@ -197,6 +203,8 @@ pub struct Status {
     pub d_ml: f32,
     /// Estimated volume poured, ml.
     pub poured_ml: f32,
+    /// Its standard deviation, ml; 0 if it is not known.
+    pub poured_sd_ml: f32,
     /// Commanded alpha, degrees.
     pub alpha_deg: f32,
     /// Measured alpha, degrees; NaN without a robot.

@@ -32,6 +32,7 @@ pub mod agent;
 pub mod alpha_track;
 pub mod config;
 mod config_camera;
+mod config_container;
 pub mod config_paths;
 pub mod control;
 pub mod episode;

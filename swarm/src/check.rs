@@ -6,26 +6,30 @@ use rt_controller::core::Settings;
 use rt_controller::journal::Tick;
 use serde::Serialize;
 use shared::control::{EndReason, Outcome};
+use shared::limits::Limits;
 use shared::messages::{Phase, Telemetry};
 use simulator::ur::{Fault, Machine, RobotMode, RuntimeState, SafetyMode};
 
-use crate::plan::{EyeFault, What};
+use crate::commanded::{Commanded, SLACK, SLACK_DEG};
+use crate::noticing::{leaves_tilted, must_end, reasons, takes_robot};
+use crate::what::What;
 
-/// How much faster or farther than its limit a command may be, as a share: rounding in f32, and the robot's own interpolation in f64.
-const SLACK: f64 = 0.02;
-/// How far a command may be beyond a limit, degrees: rounding in f32.
-const SLACK_DEG: f64 = 0.01;
-/// How far a joint that is not ours may be commanded to move in a cycle, rad: rounding.
-const STILL_RAD: f64 = 1e-6;
 /// A container nearer to 0 than this is upright, degrees (`robot.start_tolerance_deg` of config/sim.toml, and half a degree of lag).
 const UPRIGHT_DEG: f64 = 2.5;
 /// The longest way upright of a program that runs, s: 110 degrees at 60 degrees/s, its patience of 100 ms, and 1 s as in docs/ROBOT.md.
 const WAY_UPRIGHT_S: f64 = 110.0 / 60.0 + 0.1 + 1.0;
-/// How far a container on its way upright may tilt again, degrees: what a joint overtakes while it brakes.
-const AGAIN_DEG: f64 = 6.0;
 /// After this a fault that must end a pour has been noticed, s: `controller.stale_feature_ms` and `lost_robot_ms` of config/sim.toml, three
 /// ticks, and the time that a fault of the loop itself takes is added.
 const NOTICED_S: f64 = 0.5;
+/// How far what left may be from what a pour that is done says, ml, and as a share of it. Outcomes carry no deviation, so this is a bound of
+/// the cell alone; what is beyond it is an open finding of docs/SWARM.md.
+const SAID: (f64, f64) = (8.0, 0.15);
+/// How far what a pour that is done says may be from its goal, ml, and as a share of it: the last decision counts drops that still fell.
+const MISSED: (f64, f64) = (8.0, 0.08);
+/// How long a container may stand tilted after its program has ended by itself, s: one cycle would do, and the arm needs time to stop.
+const LEFT_TILTED_S: f64 = 2.0;
+/// Most frames that are bridged at once: one second (`MAX_BRIDGED` of the controller's core).
+const MOST_BRIDGED: u64 = 30;
 /// Number of violations that are kept for a seed; the first is what counts.
 const MOST: usize = 8;
 
@@ -49,8 +53,6 @@ pub struct Injected {
     pub at_s: f64,
     /// What the controller was doing.
     pub phase: Phase,
-    /// What had left the vessel, ml.
-    pub poured_ml: f64,
 }
 
 /// What the checks keep.
@@ -61,21 +63,21 @@ pub struct Checks {
     pub violations: Vec<Violation>,
     /// Faults so far, the ordinary course left out.
     pub faults: Vec<Injected>,
-    /// Control period of the robot, s.
-    cycle_s: f64,
-    before_q: Option<[f64; 6]>,
-    before_rate_deg_s: f64,
-    /// Where the servo steered the tilting joint to, degrees, and how fast, degrees/s: after the cycle before, and after the one before that.
-    servo: [(f64, f64); 2],
+    /// What the program tells servoj.
+    commanded: Commanded,
     /// The newest target, degrees, and the rate at which it came.
     target: Option<(f64, f64)>,
     pub(crate) phase: Phase,
     /// Since when the robot could have been on its way upright, s.
     free_since_s: Option<f64>,
-    /// Smallest commanded tilt since nothing is poured, degrees.
-    least_deg: f64,
     sequence: (u64, u64),
     used: u64,
+    /// Number of frames lost between measurements that came, in the run under way.
+    lost: u64,
+    /// Since when the container has stood tilted without a program, s.
+    tilted_since_s: Option<f64>,
+    /// A person has the robot, and nobody asked for it since.
+    is_taken: bool,
     run_since_s: f64,
     /// Number of pours and recordings that have ended in this life of the controller.
     pub outcomes: Vec<(f64, Outcome)>,
@@ -86,19 +88,18 @@ impl Checks {
     /// Checks of a cell whose robot has control cycles of `cycle_s`.
     pub fn new(settings: Settings, cycle_s: f64) -> Self {
         Self {
+            commanded: Commanded::new(settings.limits, cycle_s),
             settings,
             violations: Vec::new(),
             faults: Vec::new(),
-            cycle_s,
-            before_q: None,
-            before_rate_deg_s: 0.0,
-            servo: [(f64::NAN, f64::NAN); 2],
             target: None,
             phase: Phase::NoRobot,
             free_since_s: None,
-            least_deg: f64::INFINITY,
             sequence: (0, 0),
             used: 0,
+            lost: 0,
+            tilted_since_s: None,
+            is_taken: false,
             run_since_s: 0.0,
             outcomes: Vec::new(),
             features_before: 0,
@@ -113,9 +114,22 @@ impl Checks {
     }
 
     /// Takes note of something that happens.
-    pub fn happens(&mut self, what: &What, at_s: f64, poured_ml: f64) {
+    pub fn happens(&mut self, what: &What, at_s: f64) {
+        match what {
+            What::Pour(_) | What::Record(..) | What::Resume => self.is_taken = false,
+            // A controller that was not there does not know.
+            What::ControllerKilled(_) => self.is_taken = false,
+            what => self.is_taken |= takes_robot(what) && self.phase != Phase::NoRobot,
+        }
         if !what.is_ordinary() {
-            self.faults.push(Injected { what: what.clone(), at_s, phase: self.phase, poured_ml });
+            self.faults.push(Injected { what: what.clone(), at_s, phase: self.phase });
+        }
+    }
+
+    /// A program begins on the robot.
+    pub fn program_started(&mut self, at_s: f64) {
+        if self.is_taken {
+            self.violated("taken-unasked", at_s, "a program was started after a person stopped the robot, and nobody asked".into());
         }
     }
 
@@ -124,62 +138,31 @@ impl Checks {
         (self.target, self.phase, self.sequence, self.used, self.features_before) = (None, Phase::NoRobot, (0, 0), 0, 0);
     }
 
+    /// The limits on alpha.
+    pub fn limits(&self) -> Limits {
+        self.settings.limits
+    }
+
     fn is_active(&self) -> bool {
         matches!(self.phase, Phase::Pouring | Phase::Recording)
     }
 
     /// Looks at the robot after a control cycle. `joint` is the tilting one, and `alpha_deg` its measured tilt.
     pub fn cycle(&mut self, machine: &Machine, joint: usize, alpha_deg: f64, at_s: f64) {
-        let servo = &machine.robot.servo;
-        let playing = machine.runtime_state() == RuntimeState::Playing && servo.is_servoing();
-        let q = servo.commanded_q;
-        if !playing {
-            self.before_q = None;
-        } else if let Some(before_q) = self.before_q.replace(q) {
-            self.commanded(&before_q, &q, joint, at_s);
-        } else {
-            (self.before_rate_deg_s, self.least_deg) = (0.0, q[joint].to_degrees());
+        let active = self.is_active();
+        for (invariant, what) in self.commanded.cycle(machine, joint, active) {
+            self.violated(invariant, at_s, what);
         }
-        self.servo = [(servo.target_q[joint].to_degrees(), servo.target_qd[joint].to_degrees()), self.servo[0]];
         self.upright(machine, alpha_deg, at_s);
+        self.left_tilted(machine, alpha_deg, at_s);
     }
 
-    /// What the program on the robot commands in a cycle.
-    fn commanded(&mut self, before_q: &[f64; 6], q: &[f64; 6], joint: usize, at_s: f64) {
-        let limits = self.settings.limits;
-        for other in (0..6).filter(|j| *j != joint) {
-            let moved = (q[other] - before_q[other]).abs();
-            if moved > STILL_RAD {
-                self.violated("others-still", at_s, format!("joint {other} is commanded to move by {moved:.6} rad in a cycle"));
-            }
-        }
-        let alpha_deg = q[joint].to_degrees();
-        if alpha_deg > f64::from(limits.alpha_max_deg) + SLACK_DEG || alpha_deg < f64::from(limits.alpha_min_deg) - UPRIGHT_DEG {
-            self.violated("robot-range", at_s, format!("servoj is given {alpha_deg:.3} degrees"));
-        }
-        // A program that begins anew goes on from where the servo steers the joint, and as fast as that moves. Every command goes on either
-        // from there or from the command before.
-        let from_command = (before_q[joint].to_degrees(), self.before_rate_deg_s);
-        // The program looks at the servo just before it commands, or one cycle before where it was resumed between the two.
-        let most_deg = (f64::from(limits.acceleration_deg_s2) * (1.0 + SLACK) + 1.0) * self.cycle_s * self.cycle_s;
-        let keeps = |(from_deg, rate_deg_s): (f64, f64)| (alpha_deg - from_deg - rate_deg_s * self.cycle_s).abs() <= most_deg;
-        let from_servo = self.servo.into_iter().find(|from| keeps(*from)).filter(|_| !keeps(from_command));
-        let begins_anew = from_servo.is_some();
-        let (from_deg, from_rate_deg_s) = from_servo.unwrap_or(from_command);
-        let rate_deg_s = (alpha_deg - from_deg) / self.cycle_s;
-        if rate_deg_s.abs() > f64::from(limits.rate_deg_s) * (1.0 + SLACK) + 0.1 {
-            self.violated("robot-rate", at_s, format!("servoj is given {rate_deg_s:.2} degrees/s"));
-        }
-        let acceleration = (rate_deg_s - from_rate_deg_s) / self.cycle_s;
-        if acceleration.abs() > f64::from(limits.acceleration_deg_s2) * (1.0 + SLACK) + 1.0 {
-            self.violated("robot-acceleration", at_s, format!("servoj is given {acceleration:.0} degrees/s^2"));
-        }
-        self.before_rate_deg_s = rate_deg_s;
-        self.least_deg = if self.is_active() || begins_anew { alpha_deg } else { self.least_deg.min(alpha_deg) };
-        // The joint is still on its way when the pour ends, by what it lags behind.
-        if alpha_deg > self.least_deg + AGAIN_DEG && rate_deg_s > 0.0 {
-            let least_deg = self.least_deg;
-            self.violated("no-resume", at_s, format!("tilted from {least_deg:.1} to {alpha_deg:.1} degrees while nothing is poured"));
+    /// A program that ends by itself leaves the container upright.
+    fn left_tilted(&mut self, machine: &Machine, alpha_deg: f64, at_s: f64) {
+        if machine.runtime_state() != RuntimeState::Stopped || alpha_deg.abs() <= UPRIGHT_DEG {
+            self.tilted_since_s = None;
+        } else if at_s - *self.tilted_since_s.get_or_insert(at_s) > LEFT_TILTED_S && !self.faults.iter().any(|f| leaves_tilted(&f.what)) {
+            self.violated("left-tilted", at_s, format!("the program ended and left the container at {alpha_deg:.1} degrees"));
         }
     }
 
@@ -217,42 +200,47 @@ impl Checks {
         let before = self.phase;
         self.phase = Phase::from_code(telemetry.phase);
         if self.is_active() && !matches!(before, Phase::Pouring | Phase::Recording) {
-            self.run_since_s = at_s;
+            (self.run_since_s, self.lost) = (at_s, 0);
         }
         if tick.agent.is_some() && !matches!(before, Phase::Idle | Phase::NoRobot) {
             self.violated("swap-between-pours", at_s, format!("weights were taken while {before:?}"));
         }
-        self.count_frames(tick, features, at_s);
+        self.count_frames(tick, features, before, at_s);
         let Some(target_deg) = tick.target_deg.map(f64::from) else {
             self.target = None;
             return self.noticed(at_s);
         };
+        let begins = self.is_active() && !matches!(before, Phase::Pouring | Phase::Recording);
+        self.commanded.target(target_deg, self.is_active(), begins);
         let period_s = self.settings.period_ns as f64 / 1e9;
         if !(f64::from(limits.alpha_min_deg) - SLACK_DEG..=f64::from(limits.alpha_max_deg) + SLACK_DEG).contains(&target_deg) {
             self.violated("target-range", at_s, format!("a target of {target_deg} degrees"));
         }
-        if let Some((last_deg, last_rate)) = self.target {
-            let rate = (target_deg - last_deg) / period_s;
-            let most = f64::from(limits.rate_deg_s.min(limits.step_deg / period_s as f32));
-            if rate.abs() > most * (1.0 + SLACK) + 0.1 {
-                self.violated("target-rate", at_s, format!("targets move at {rate:.2} degrees/s"));
-            }
-            let acceleration = (rate - last_rate) / period_s;
-            if acceleration.abs() > f64::from(limits.acceleration_deg_s2) * (1.0 + SLACK) + 1.0 {
-                self.violated("target-acceleration", at_s, format!("targets change by {acceleration:.0} degrees/s^2"));
-            }
-            self.target = Some((target_deg, rate));
-        } else {
-            self.target = Some((target_deg, 0.0));
+        // The first target begins at rest, at the joint's measured tilt.
+        let measured_deg = f64::from(tick.robot.alpha_deg.clamp(limits.alpha_min_deg, limits.alpha_max_deg));
+        let (last_deg, last_rate) = self.target.unwrap_or((measured_deg, 0.0));
+        let rate = (target_deg - last_deg) / period_s;
+        let most = f64::from(limits.rate_deg_s.min(limits.step_deg / period_s as f32));
+        if rate.abs() > most * (1.0 + SLACK) + 0.1 {
+            self.violated("target-rate", at_s, format!("targets move at {rate:.2} degrees/s"));
         }
+        let acceleration = (rate - last_rate) / period_s;
+        if acceleration.abs() > f64::from(limits.acceleration_deg_s2) * (1.0 + SLACK) + 1.0 {
+            self.violated("target-acceleration", at_s, format!("targets change by {acceleration:.0} degrees/s^2"));
+        }
+        self.target = Some((target_deg, rate));
         self.noticed(at_s);
     }
 
     /// Every frame is counted once: those of a worker that come in order, each a single time.
-    fn count_frames(&mut self, tick: &Tick, features: u64, at_s: f64) {
+    fn count_frames(&mut self, tick: &Tick, features: u64, before: Phase, at_s: f64) {
+        let idle = |phase| matches!(phase, Phase::NoRobot | Phase::Idle);
+        let counts = !idle(before) || !idle(self.phase);
         for feature in &tick.features {
             let (epoch, sequence) = self.sequence;
             if feature.captured_at_ns <= tick.now_ns && (feature.worker_epoch_ns != epoch || feature.sequence > sequence) {
+                let after = if feature.worker_epoch_ns == epoch { feature.sequence - sequence - 1 } else { 0 };
+                self.lost += if counts { after.min(MOST_BRIDGED) } else { 0 };
                 self.sequence = (feature.worker_epoch_ns, feature.sequence);
                 self.used += 1;
             }
@@ -281,9 +269,10 @@ impl Checks {
         }
     }
 
-    /// Looks at how a pour or recording ended. `poured_ml` is the truth since it began.
-    pub fn ended(&mut self, outcome: &Outcome, at_s: f64) {
+    /// Looks at how a pour or recording ended. `true_ml` is what left since it began.
+    pub fn ended(&mut self, outcome: &Outcome, true_ml: f64, at_s: f64) {
         self.outcomes.push((at_s, *outcome));
+        self.says(outcome, true_ml, at_s);
         let since_s = at_s - f64::from(outcome.seconds) - 6.0;
         let reason = outcome.reason;
         let ordinary = matches!(reason, EndReason::Done | EndReason::ContainerEmpty | EndReason::StreamLost | EndReason::MaxFrames);
@@ -293,47 +282,29 @@ impl Checks {
             self.violated("reason", at_s, format!("it ended with {reason:?}, and what happened was {faults:?}"));
         }
     }
-}
 
-/// How long a fault needs that must end any pour, s, besides [`NOTICED_S`]; `None` if it need not.
-fn must_end(what: &What) -> Option<f64> {
-    match what {
-        What::Robot(Fault::ProtectiveStop | Fault::EmergencyStop | Fault::ProgramPause | Fault::ProgramStop | Fault::Freedrive) => {
-            Some(0.0)
+    /// Looks at what a pour says of itself.
+    fn says(&mut self, outcome: &Outcome, true_ml: f64, at_s: f64) {
+        if u64::from(outcome.bridged_frames) > self.lost {
+            let (bridged, lost) = (outcome.bridged_frames, self.lost);
+            self.violated("frames-once", at_s, format!("{bridged} lost frames were bridged, and {lost} were lost"));
         }
-        What::Robot(Fault::Fin | Fault::Reset | Fault::Boot | Fault::Offline(_)) | What::LinkCut | What::Abort => Some(0.0),
-        What::Robot(Fault::SpeedSlider(share)) if *share < 0.9 => Some(0.0),
-        What::Robot(Fault::TimeScaling(share)) if *share < 0.9 => Some(0.2),
-        What::Robot(Fault::Freeze(s) | Fault::Stall(s) | Fault::SlowReader(s)) if *s > 0.3 => Some(0.0),
-        What::LinkStall(ms) if *ms > 300 => Some(f64::from(*ms) / 1000.0),
-        What::Suspended(ms) | What::Overrun(ms) if *ms > 200 => Some(f64::from(*ms) / 1000.0),
-        What::ControllerKilled(ms) => Some(f64::from(*ms) / 1000.0),
-        What::Eye(EyeFault::Killed(ms)) => Some(f64::from(*ms) / 1000.0),
-        What::Eye(EyeFault::Hung(ms)) if *ms > 400 => Some(0.0),
-        _ => None,
-    }
-}
-
-/// The reasons that a fault may be reported with.
-fn reasons(what: &What) -> &'static [EndReason] {
-    use EndReason::*;
-    match what {
-        What::Abort => &[Aborted, NotUpright],
-        What::Robot(fault) => match fault {
-            Fault::ProtectiveStop => &[ProtectiveStop, NotUpright, ProgramStopped, NotFollowed],
-            Fault::EmergencyStop => &[EmergencyStop, ProgramStopped, RobotNotRunning],
-            Fault::ProgramPause | Fault::ProgramStop | Fault::ProgramResume | Fault::Jog(..) => &[ProgramStopped, NotFollowed],
-            Fault::SpeedSlider(_) | Fault::TimeScaling(_) => &[SpeedReduced, NotFollowed, NotUpright, ProgramStopped],
-            Fault::HeldBack(_) | Fault::JointSpeedLimit(_) => &[NotFollowed, NotUpright, ProtectiveStop, ProgramStopped],
-            Fault::Freedrive => &[InHand, NotFollowed],
-            Fault::Boot => &[RobotNotRunning, ProgramStopped],
-            _ => &[RobotLost, RobotStalled, ProgramStopped, NotFollowed, NotUpright],
-        },
-        What::LinkStall(_) | What::LinkSplit(_) | What::LinkCut => &[RobotLost, RobotStalled, ProgramStopped, NotFollowed, NotUpright],
-        What::Eye(EyeFault::Killed(_) | EyeFault::Two(_)) => &[WorkerRestarted, StaleFeature],
-        What::Eye(_) => &[StaleFeature, WorkerRestarted],
-        What::Overrun(_) | What::Suspended(_) => &[ControllerOverrun, StaleFeature, RobotLost, RobotStalled, ProgramStopped, NotFollowed],
-        What::ControllerKilled(_) => &[RobotLost],
-        _ => &[],
+        let Some(goal_ml) = outcome.goal_ml else { return };
+        let most_ml = f64::from(self.settings.goal_max_ml);
+        let (goal_ml, said_ml) = (f64::from(goal_ml), f64::from(outcome.poured_ml));
+        if !(goal_ml > 0.0 && goal_ml <= most_ml) {
+            self.violated("goal-range", at_s, format!("a pour of {goal_ml} ml was begun"));
+        }
+        if outcome.reason != EndReason::Done {
+            return;
+        }
+        // What is not a number is near to nothing.
+        let is_near = |a: f64, b: f64, (ml, share): (f64, f64)| (a - b).abs() <= ml + share * a.abs().max(b.abs());
+        if !is_near(true_ml, said_ml, SAID) {
+            self.violated("said", at_s, format!("done, and it says {said_ml:.1} ml where {true_ml:.1} left"));
+        }
+        if !is_near(said_ml, goal_ml, MISSED) {
+            self.violated("done", at_s, format!("done, and it says {said_ml:.1} ml of {goal_ml:.1}"));
+        }
     }
 }

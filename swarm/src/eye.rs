@@ -9,12 +9,12 @@ use rand_distr::{Distribution, StandardNormal};
 use rand_pcg::Pcg64Mcg;
 use shared::messages::{Doubt, Feature, LAYOUT_VERSION};
 
-use crate::plan::EyeFault;
+use crate::what::EyeFault;
 
 /// Area for an outflow of 1 ml a frame, px^2: that of simulator b.
 const AREA_AT_1_ML_PX2: f64 = 400.0;
-/// Exponent with which the area grows with the flow: the middle of those of simulator b's rigs.
-const AREA_EXPONENT: f64 = 0.85;
+/// Share of a stream's area that is still seen when the whole stream clings to the wall: that of simulator b.
+const CLINGING_SEEN: f64 = 0.4;
 /// Areas below this are no stream, px^2 (`image.area_min_px2` of config/sim.toml).
 const AREA_MIN_PX2: f64 = 30.0;
 /// Standard deviation of an area, as a share of it: docs/VISION.md gives a 95th percentile of 5.3 % in whole pours with colour.
@@ -39,6 +39,8 @@ pub struct Eye {
     sequence: u64,
     epoch_ns: u64,
     gain: f64,
+    /// Exponent with which the area grows with the flow.
+    area_exponent: f64,
     /// The share by which the gain still drifts in each frame, and for how many frames.
     drift: (f64, u32),
     lost: u32,
@@ -58,8 +60,8 @@ pub struct Eye {
 }
 
 impl Eye {
-    /// An eye whose worker starts at `now_ns`.
-    pub fn new(seed: u64, now_ns: u64) -> Self {
+    /// An eye whose worker starts at `now_ns`. The area grows with the flow by `area_exponent`.
+    pub fn new(seed: u64, now_ns: u64, area_exponent: f64) -> Self {
         let mut random = Pcg64Mcg::seed_from_u64(seed ^ 0xE7E);
         let normal: f64 = StandardNormal.sample(&mut random);
         Self {
@@ -67,6 +69,7 @@ impl Eye {
             sequence: 0,
             epoch_ns: now_ns,
             gain: 1.0 + GAIN_SD * normal,
+            area_exponent,
             drift: (0.0, 0),
             lost: 0,
             frozen: 0,
@@ -107,9 +110,9 @@ impl Eye {
         }
     }
 
-    /// A frame was exposed at `now_ns`, in which `flow_ml` left the lip since the frame before. What is measured is added to
-    /// [`Eye::published`].
-    pub fn frame(&mut self, now_ns: u64, flow_ml: f64) {
+    /// A frame was exposed at `now_ns`, in which `flow_ml` left the lip since the frame before, and this share of the stream clings to the
+    /// wall. What is measured is added to [`Eye::published`].
+    pub fn frame(&mut self, now_ns: u64, flow_ml: f64, clinging: f64) {
         self.sequence += 1;
         // The same numbers are drawn in every frame, so that a fault does not shift the noise of later frames.
         let normal: f64 = StandardNormal.sample(&mut self.random);
@@ -122,7 +125,8 @@ impl Eye {
         if now_ns < self.gone_until_ns || counted(&mut self.lost) {
             return;
         }
-        let area = AREA_AT_1_ML_PX2 * flow_ml.max(0.0).powf(AREA_EXPONENT) * self.gain * (NOISE * normal).exp();
+        let seen_share = 1.0 - (1.0 - CLINGING_SEEN) * clinging;
+        let area = AREA_AT_1_ML_PX2 * seen_share * flow_ml.max(0.0).powf(self.area_exponent) * self.gain * (NOISE * normal).exp();
         let seen = area >= AREA_MIN_PX2;
         let mut area_px2 = if seen && !missed { area as f32 } else { 0.0 };
         let mut doubt = Doubt::None;

@@ -2,8 +2,11 @@
 //! wrong. docs/SWARM.md says what it shows and what it does not.
 
 pub mod check;
+pub mod commanded;
 pub mod eye;
+pub mod faults;
 pub mod many;
+pub mod noticing;
 pub mod pipe;
 pub mod plan;
 pub mod plot;
@@ -11,5 +14,7 @@ pub mod records;
 pub mod run;
 pub mod site;
 pub mod trained;
+pub mod vessels;
 pub mod weight_set;
+pub mod what;
 pub mod world;

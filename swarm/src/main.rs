@@ -8,11 +8,14 @@ use std::process::ExitCode;
 
 use clap::Parser;
 use shared::config::Config;
-use swarm::many::{Summary, run_many, shrink};
-use swarm::plan::Plan;
+use simulator::ur::Series;
+use swarm::faults::{KINDS, named};
+use swarm::many::{Seeds, Spread, Summary, run_many, shrink};
+use swarm::plan::{Choice, Plan};
 use swarm::plot::plot;
 use swarm::run::{self, Shown};
 use swarm::trained::train_for;
+use swarm::vessels::VESSELS;
 
 /// Exit code of a violation.
 const VIOLATED: u8 = 1;
@@ -36,6 +39,15 @@ struct Args {
     /// The first of them.
     #[arg(long, default_value_t = 1, requires = "seeds")]
     from: u64,
+    /// Draws in each pour one fault of this kind, and no other, as in `--only link-cut`.
+    #[arg(long, value_name = "FAULT")]
+    only: Option<String>,
+    /// Draws from the first so many vessels only, so that little is trained.
+    #[arg(long, value_name = "N", default_value_t = VESSELS.len() as u8, value_parser = clap::value_parser!(u8).range(1..=VESSELS.len() as i64))]
+    vessels: u8,
+    /// Draws only robots of this generation.
+    #[arg(long, value_enum)]
+    robot: Option<Robot>,
     /// Writes what they showed to this file.
     #[arg(long, requires = "seeds")]
     json: Option<PathBuf>,
@@ -50,23 +62,58 @@ struct Args {
     plot: Option<PathBuf>,
 }
 
-fn main() -> ExitCode {
-    let args = Args::parse();
-    match swarm::site::config().and_then(|config| start(&args, &config)) {
-        Ok(true) => ExitCode::SUCCESS,
-        Ok(false) => VIOLATED.into(),
-        Err(line) => {
-            eprintln!("swarm: {line}");
-            BAD_INPUT.into()
+/// A generation of robots.
+#[derive(Debug, Clone, Copy, clap::ValueEnum)]
+enum Robot {
+    /// 125 Hz.
+    Cb3,
+    /// 500 Hz.
+    ESeries,
+}
+
+impl Robot {
+    fn series(self) -> Series {
+        match self {
+            Self::Cb3 => Series::Cb3,
+            Self::ESeries => Series::ESeries,
         }
     }
 }
 
+fn main() -> ExitCode {
+    let args = match Args::try_parse() {
+        Ok(args) => args,
+        Err(e) if !e.use_stderr() => e.exit(),
+        Err(e) => return bad_input(&one_line(&e.to_string())),
+    };
+    match swarm::site::config().and_then(|config| start(&args, &config)) {
+        Ok(true) => ExitCode::SUCCESS,
+        Ok(false) => VIOLATED.into(),
+        Err(line) => bad_input(&line),
+    }
+}
+
+/// What clap says of a wrong command line, in one line and without its advice.
+fn one_line(text: &str) -> String {
+    let first = text.split("\n\n").next().unwrap_or(text).trim_start_matches("error: ");
+    first.split_whitespace().collect::<Vec<_>>().join(" ")
+}
+
+fn bad_input(line: &str) -> ExitCode {
+    eprintln!("error: {line}");
+    BAD_INPUT.into()
+}
+
 /// Carries out the command. False if an invariant was violated.
 fn start(args: &Args, config: &Config) -> Result<bool, String> {
+    let choice = Choice {
+        only: args.only.as_deref().map(named).transpose()?,
+        vessels: usize::from(args.vessels),
+        series: args.robot.map(Robot::series),
+    };
     match (args.seed, args.seeds) {
-        (Some(seed), _) => one(args, seed, config),
-        (None, Some(seeds)) => many(args, seeds, config),
+        (Some(seed), _) => one(args, &Plan::draw_with(seed, choice), config),
+        (None, Some(count)) => many(args, Seeds { from: args.from, count, choice }, config),
         (None, None) => Err("give --seed or --seeds".into()),
     }
 }
@@ -81,21 +128,33 @@ fn kept(text: &str, plan: &Plan) -> Result<Vec<usize>, String> {
     if text == "none" {
         return Ok(Vec::new());
     }
-    let number = |part: &str| part.trim().parse().ok().filter(|n| *n < plan.faults);
-    let wrong =
-        || format!("--keep {text}: seed {} has the faults 0 to {}; give their numbers, as in 0,2", plan.seed, plan.faults.max(1) - 1);
+    let number = |part: &str| part.trim().parse().ok().filter(|n| *n < plan.faults.len());
+    let there = if plan.faults.is_empty() { "no faults".to_owned() } else { format!("the faults 0 to {}", plan.faults.len() - 1) };
+    let wrong = || format!("--keep {text}: seed {} has {there}; give their numbers, as in 0,2, or none", plan.seed);
     text.split(',').map(|part| number(part).ok_or_else(wrong)).collect()
 }
 
+/// The options that say from what a seed draws.
+fn drawn_from(args: &Args) -> String {
+    let only = args.only.as_ref().map_or_else(String::new, |name| format!(" --only {name}"));
+    let vessels = if usize::from(args.vessels) < VESSELS.len() { format!(" --vessels {}", args.vessels) } else { String::new() };
+    let robot = args.robot.map_or("", |robot| match robot {
+        Robot::Cb3 => " --robot cb3",
+        Robot::ESeries => " --robot e-series",
+    });
+    only + &vessels + robot
+}
+
 /// One seed.
-fn one(args: &Args, seed: u64, config: &Config) -> Result<bool, String> {
-    let mut plan = Plan::draw(seed);
-    let trained = train_for([&plan], config, &|text| eprintln!("swarm: {text}"));
-    let mut keep = String::new();
+fn one(args: &Args, drawn: &Plan, config: &Config) -> Result<bool, String> {
+    let (mut plan, seed) = (drawn.clone(), drawn.seed);
+    let only = drawn_from(args);
+    let mut keep = only.clone();
     if let Some(text) = &args.keep {
         plan = plan.keep(&kept(text, &plan)?);
-        keep = format!(" --keep {text}");
+        keep = format!("{only} --keep {text}");
     }
+    let trained = train_for([&plan], config, &|text| eprintln!("swarm: {text}"));
     if args.shrink {
         let all = run::run(&plan, &trained, config, false);
         let Some(first) = all.violations.first() else {
@@ -104,12 +163,12 @@ fn one(args: &Args, seed: u64, config: &Config) -> Result<bool, String> {
         };
         let fewest = shrink(&plan, first.invariant, &trained, config);
         let text = fewest.iter().map(usize::to_string).collect::<Vec<_>>().join(",");
-        keep = format!(" --keep {}", if text.is_empty() { "none" } else { &text });
+        keep = format!("{only} --keep {}", if text.is_empty() { "none" } else { &text });
         plan = plan.keep(&fewest);
     }
     let shown = run::run(&plan, &trained, config, true);
     for item in &plan.items {
-        let number = item.fault.map_or_else(String::new, |n| format!("fault {n}: "));
+        let number = item.fault.map_or_else(String::new, |n| format!("fault {n} ({}): ", KINDS[plan.faults[n]].name));
         print(&format!("{:8.3} s  plan: {number}{:?}", item.at_ms as f64 / 1000.0, item.what));
     }
     shown.story.iter().for_each(|line| print(line));
@@ -119,7 +178,10 @@ fn one(args: &Args, seed: u64, config: &Config) -> Result<bool, String> {
         print(&format!("{goal}: {reason}; believed {believed_ml:.1} ml, left {true_ml:.1} ml"));
     }
     for cost in &shown.costs {
-        print(&format!("after {}: {:.1} ml more, upright after {:.2} s", cost.fault, cost.excess_ml, cost.upright_s));
+        print(&format!(
+            "{}: {:.1} ml left after it could be noticed, {:.1} after it, upright after {:.2} s",
+            cost.fault, cost.excess_ml, cost.since_ml, cost.upright_s
+        ));
     }
     if let Some(path) = &args.plot {
         plot(&plan, &shown, path)?;
@@ -138,44 +200,55 @@ fn complain(shown: &Shown, keep: &str) {
 }
 
 /// Many seeds.
-fn many(args: &Args, seeds: u64, config: &Config) -> Result<bool, String> {
+fn many(args: &Args, seeds: Seeds, config: &Config) -> Result<bool, String> {
     // A file that cannot be written is known before an hour of work.
     let open = |path: &Path| std::fs::File::create(path).map_err(|e| format!("{}: cannot be written: {e}", path.display()));
     let file = args.json.as_deref().map(open).transpose()?;
     let started = std::time::Instant::now();
-    let (shown, summary) = run_many(args.from, seeds, config, true);
+    let (shown, summary) = run_many(seeds, config, true);
     shown.iter().filter(|one| !one.violations.is_empty()).take(10).for_each(|one| {
         print(&format!("seed {}:", one.seed));
-        complain(one, "");
+        complain(one, &drawn_from(args));
     });
     report(&summary, started.elapsed().as_secs_f64());
     if let (Some(file), Some(path)) = (file, &args.json) {
         let value = serde_json::json!({ "summary": summary, "seeds": shown });
-        let written = serde_json::to_writer(std::io::BufWriter::new(file), &value);
-        written.map_err(|e| format!("{}: cannot be written: {e}; is the disk full?", path.display()))?;
+        let mut file = std::io::BufWriter::new(file);
+        let written = serde_json::to_writer(&mut file, &value).map_err(std::io::Error::from).and_then(|()| file.flush());
+        written.map_err(|e| format!("{}: cannot be written: {e}; make room, or give another file", path.display()))?;
     }
     Ok(summary.violations.is_empty())
+}
+
+/// Median, 99th percentile and largest.
+fn spread(of: &Spread) -> String {
+    format!("{:.1}, {:.1}, {:.1}", of.p50, of.p99, of.largest)
 }
 
 /// Prints what many seeds showed.
 fn report(summary: &Summary, wall_s: f64) {
     let last = summary.from + (summary.seeds - 1);
     let (pours, virtual_s) = (summary.pours, summary.virtual_s);
-    print(&format!("seeds {} to {last}: {pours} pours and recordings, {virtual_s:.0} s in {wall_s:.1} s", summary.from));
-    print(&format!("ended: {:?}", summary.reasons));
-    if let (Some(error), Some(belief)) = (summary.done_error_ml, summary.done_belief_ml) {
-        print(&format!(
-            "done without a fault: |left - goal| {:.1} ml, p99 {:.1}, largest {:.1}; |left - believed| {:.1}, p99 {:.1}, largest {:.1}; n = {}",
-            error.p50, error.p99, error.largest, belief.p50, belief.p99, belief.largest, error.n
-        ));
+    let times = virtual_s / summary.processor_s.max(1e-9);
+    print(&format!(
+        "seeds {} to {last}: {pours} pours and recordings, {virtual_s:.0} s in {wall_s:.1} s; {times:.0} times real time a core, training left out",
+        summary.from
+    ));
+    let violating = summary.violations.values().map(|(n, _)| n).sum::<usize>();
+    if violating == 0 && pours > 0 {
+        let bound = 3.0 / pours as f64;
+        print(&format!("no violation in {pours}: fewer than {bound:.1e} a pour at 95 %, if pours are drawn as here"));
     }
-    print("fault | n | ml more: median, p99, largest | s until upright: median, p99, largest");
+    print(&format!("ended: {:?}", summary.reasons));
+    print("| fault | n done | left - goal, ml: median, p99, largest | left - said, ml: median, p99, largest |");
+    for row in &summary.done {
+        print(&format!("| {} | {} | {} | {} |", row.fault, row.error_ml.n, spread(&row.error_ml), spread(&row.said_ml)));
+    }
+    print("| fault | n ended | ml after it could be noticed: median, p99, largest | bound, ml | ml after it | s until upright |");
     for row in &summary.costs {
-        let (ml, s) = (row.excess_ml, row.upright_s);
-        print(&format!(
-            "{} | {} | {:.1}, {:.1}, {:.1} | {:.2}, {:.2}, {:.2}",
-            row.fault, ml.n, ml.p50, ml.p99, ml.largest, s.p50, s.p99, s.largest
-        ));
+        let bound = row.bound_ml.map_or_else(|| "the vessel".into(), |ml| format!("{ml:.0}"));
+        let (excess, since, upright) = (spread(&row.excess_ml), spread(&row.since_ml), spread(&row.upright_s));
+        print(&format!("| {} | {} | {excess} | {bound} | {since} | {upright} |", row.fault, row.excess_ml.n));
     }
     for (invariant, (n, seeds)) in &summary.violations {
         print(&format!("VIOLATED {invariant}: {n} seeds, such as {seeds:?}"));

@@ -6,12 +6,14 @@ use std::collections::BTreeMap;
 
 use indicatif::{ParallelProgressIterator, ProgressBar, ProgressStyle};
 use rayon::prelude::*;
+use rustix::time::{ClockId, clock_gettime};
 use serde::Serialize;
 use sha2::{Digest, Sha256};
 use shared::config::Config;
 use shared::control::EndReason;
 
-use crate::plan::Plan;
+use crate::faults::KINDS;
+use crate::plan::{Choice, Plan};
 use crate::run::{self, Shown};
 use crate::trained::train_for;
 use crate::weight_set::TrainedSet;
@@ -43,10 +45,25 @@ impl Spread {
 pub struct CostRow {
     /// The fault.
     pub fault: String,
-    /// What left from the fault until the container was upright, ml.
+    /// What left from the moment in which it could first be noticed until the container was upright, ml.
     pub excess_ml: Spread,
+    /// The most that may, ml; `None` if only the vessel bounds it.
+    pub bound_ml: Option<f64>,
+    /// What left from the fault itself until then, ml.
+    pub since_ml: Spread,
     /// How long that took, s.
     pub upright_s: Spread,
+}
+
+/// How near pours that were done came, over many seeds.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct DoneRow {
+    /// The one fault that happened, or "none".
+    pub fault: String,
+    /// |left - goal|, ml.
+    pub error_ml: Spread,
+    /// |left - said|, ml.
+    pub said_ml: Spread,
 }
 
 /// What many seeds showed.
@@ -60,36 +77,55 @@ pub struct Summary {
     pub pours: usize,
     /// Virtual time, s.
     pub virtual_s: f64,
+    /// Processor time that it took on all cores together, without the training, s.
+    pub processor_s: f64,
     /// Number of violations by invariant, and the seeds of the first ones.
     pub violations: BTreeMap<String, (usize, Vec<u64>)>,
     /// How often pours and recordings ended for each reason.
     pub reasons: BTreeMap<String, usize>,
-    /// Largest and mean of |true - goal| of the pours that were done without a fault, ml.
-    pub done_error_ml: Option<Spread>,
-    /// |true - believed| of the same, ml.
-    pub done_belief_ml: Option<Spread>,
-    /// What faults cost, where no other fault came with them.
+    /// How near pours that were done came, where at most one fault happened.
+    pub done: Vec<DoneRow>,
+    /// What faults cost that ended a pour, where no other fault came with them.
     pub costs: Vec<CostRow>,
     /// SHA-256 of everything that was seen: the same seeds give the same.
     pub sha256: String,
 }
 
-/// Runs `seeds` seeds from `from`, with a progress bar if `progress`.
-pub fn run_many(from: u64, seeds: u64, config: &Config, progress: bool) -> (Vec<Shown>, Summary) {
-    let plans: Vec<Plan> = (from..from.saturating_add(seeds)).map(Plan::draw).collect();
+/// Which seeds are run.
+#[derive(Debug, Clone, Copy)]
+pub struct Seeds {
+    /// The first.
+    pub from: u64,
+    /// How many.
+    pub count: u64,
+    /// From what they draw.
+    pub choice: Choice,
+}
+
+/// Runs seeds on all cores, with a progress bar if `progress`.
+pub fn run_many(seeds: Seeds, config: &Config, progress: bool) -> (Vec<Shown>, Summary) {
+    let last = seeds.from.saturating_add(seeds.count);
+    let plans: Vec<Plan> = (seeds.from..last).map(|seed| Plan::draw_with(seed, seeds.choice)).collect();
     let say = |text: &str| {
         if progress {
             eprintln!("swarm: {text}");
         }
     };
     let trained = train_for(&plans, config, &say);
-    let bar = if progress { ProgressBar::new(seeds) } else { ProgressBar::hidden() };
+    let bar = if progress { ProgressBar::new(seeds.count) } else { ProgressBar::hidden() };
     if let Ok(style) = ProgressStyle::with_template("{pos}/{len} seeds  {wide_bar}  {eta}") {
         bar.set_style(style);
     }
+    let before_s = processor_s();
     let shown: Vec<Shown> = plans.par_iter().progress_with(bar).map(|plan| run::run(plan, &trained, config, false)).collect();
-    let summary = sum_up(from, seeds, &shown);
+    let summary = Summary { processor_s: processor_s() - before_s, ..sum_up(seeds, &shown) };
     (shown, summary)
+}
+
+/// Processor time of this process, s.
+fn processor_s() -> f64 {
+    let time = clock_gettime(ClockId::ProcessCPUTime);
+    time.tv_sec as f64 + time.tv_nsec as f64 / 1e9
 }
 
 /// SHA-256 of what was seen, in hexadecimal digits.
@@ -99,7 +135,7 @@ pub fn digest(shown: &[Shown]) -> String {
     hash.finalize().iter().map(|byte| format!("{byte:02x}")).collect()
 }
 
-fn sum_up(from: u64, seeds: u64, shown: &[Shown]) -> Summary {
+fn sum_up(seeds: Seeds, shown: &[Shown]) -> Summary {
     let mut violations: BTreeMap<String, (usize, Vec<u64>)> = BTreeMap::new();
     for one in shown {
         for violation in &one.violations {
@@ -113,25 +149,37 @@ fn sum_up(from: u64, seeds: u64, shown: &[Shown]) -> Summary {
     let poured = || shown.iter().flat_map(|one| &one.poured);
     let mut reasons = BTreeMap::new();
     poured().for_each(|p| *reasons.entry(format!("{:?}", p.reason)).or_insert(0) += 1);
-    let done = || poured().filter(|p| p.faults == 0 && p.reason == EndReason::Done && p.goal_ml.is_some());
-    let mut costs: BTreeMap<&str, (Vec<f64>, Vec<f64>)> = BTreeMap::new();
-    for cost in shown.iter().filter(|one| one.costs.len() == 1).flat_map(|one| &one.costs) {
-        let entry = costs.entry(&cost.fault).or_default();
-        entry.0.push(cost.excess_ml);
-        entry.1.push(cost.upright_s);
+    let mut done: BTreeMap<&str, (Vec<f64>, Vec<f64>)> = BTreeMap::new();
+    for p in poured().filter(|p| p.faults.len() <= 1 && p.reason == EndReason::Done) {
+        let Some(goal_ml) = p.goal_ml else { continue };
+        let entry = done.entry(p.faults.first().copied().unwrap_or("none")).or_default();
+        entry.0.push((p.true_ml - f64::from(goal_ml)).abs());
+        entry.1.push((p.true_ml - f64::from(p.believed_ml)).abs());
     }
-    let row = |(fault, (ml, s)): (&str, (Vec<f64>, Vec<f64>))| {
-        Some(CostRow { fault: fault.to_owned(), excess_ml: Spread::of(ml)?, upright_s: Spread::of(s)? })
+    let done_row = |(fault, (error, said)): (&str, (Vec<f64>, Vec<f64>))| {
+        Some(DoneRow { fault: fault.to_owned(), error_ml: Spread::of(error)?, said_ml: Spread::of(said)? })
+    };
+    let mut costs: BTreeMap<&str, [Vec<f64>; 3]> = BTreeMap::new();
+    for cost in shown.iter().filter(|one| one.costs.len() == 1).flat_map(|one| &one.costs) {
+        let [excess, since, upright] = costs.entry(cost.fault).or_default();
+        excess.push(cost.excess_ml);
+        since.push(cost.since_ml);
+        upright.push(cost.upright_s);
+    }
+    let row = |(fault, [excess, since, upright]): (&str, [Vec<f64>; 3])| {
+        let bound_ml = KINDS.iter().find(|kind| kind.name == fault).and_then(|kind| kind.bound_ml);
+        let (excess_ml, since_ml, upright_s) = (Spread::of(excess)?, Spread::of(since)?, Spread::of(upright)?);
+        Some(CostRow { fault: fault.to_owned(), excess_ml, bound_ml, since_ml, upright_s })
     };
     Summary {
-        from,
-        seeds,
+        from: seeds.from,
+        seeds: seeds.count,
         pours: poured().count(),
         virtual_s: shown.iter().map(|one| one.virtual_s).sum(),
+        processor_s: 0.0,
         violations,
         reasons,
-        done_error_ml: Spread::of(done().map(|p| (p.true_ml - f64::from(p.goal_ml.unwrap_or(0.0))).abs()).collect()),
-        done_belief_ml: Spread::of(done().map(|p| (p.true_ml - f64::from(p.believed_ml)).abs()).collect()),
+        done: done.into_iter().filter_map(done_row).collect(),
         costs: costs.into_iter().filter_map(row).collect(),
         sha256: digest(shown),
     }
@@ -140,7 +188,7 @@ fn sum_up(from: u64, seeds: u64, shown: &[Shown]) -> Summary {
 /// The smallest set of faults of a plan with which `invariant` is still violated, found by leaving out one after the other.
 pub fn shrink(plan: &Plan, invariant: &str, trained: &TrainedSet, config: &Config) -> Vec<usize> {
     let breaks = |keep: &[usize]| run::run(&plan.keep(keep), trained, config, false).violations.iter().any(|v| v.invariant == invariant);
-    let mut keep: Vec<usize> = (0..plan.faults).collect();
+    let mut keep: Vec<usize> = (0..plan.faults.len()).collect();
     let mut k = 0;
     while k < keep.len() {
         let without: Vec<usize> = keep.iter().copied().enumerate().filter(|(i, _)| *i != k).map(|(_, fault)| fault).collect();

@@ -44,7 +44,13 @@ pub struct Shown {
 
 /// Runs a plan. `wanted` keeps the story and the rows.
 pub fn run(plan: &Plan, trained: &TrainedSet, config: &Config, wanted: bool) -> Shown {
-    let site = RefCell::new(Site::new(plan, trained, config, wanted));
+    run_checked(plan, trained, config, config, wanted)
+}
+
+/// Runs a plan with a controller that has `config`, while the checks hold it to `checked`. They differ where it is tried whether the checks
+/// find a limit that is too weak.
+pub fn run_checked(plan: &Plan, trained: &TrainedSet, config: &Config, checked: &Config, wanted: bool) -> Shown {
+    let site = RefCell::new(Site::new(plan, trained, checked, wanted));
     let ran = catch_unwind(AssertUnwindSafe(|| {
         while !site.borrow().is_done() {
             live(&site, config);

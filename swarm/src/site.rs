@@ -5,23 +5,27 @@
 use rand::{RngExt, SeedableRng};
 use rand_pcg::Pcg64Mcg;
 use rt_controller::core::{Order, Settings};
+use rt_controller::journal::Tick;
 use serde::Serialize;
 use shared::agent::Agent;
 use shared::config::Config;
 use shared::control::{EndReason, Outcome};
 use shared::gaussian_curve::Curve;
-use shared::messages::Phase;
+use shared::messages::{Phase, Telemetry};
 use shared::weights::Weights;
 use simulator::physics::container::Container;
 use simulator::physics::rig::Rig;
-use simulator::ur::{Fault, InMemory, Machine, Series};
+use simulator::ur::{Fault, InMemory, Machine};
 
 use crate::check::Checks;
 use crate::eye::Eye;
+use crate::faults::{KINDS, Kind};
 use crate::pipe::{self, End, Wiring};
-use crate::plan::{Plan, VESSELS, What};
+use crate::plan::Plan;
 use crate::records::Row;
-use crate::weight_set::TrainedSet;
+use crate::vessels;
+use crate::weight_set::{Lesson, TrainedSet, episode};
+use crate::what::{Weighed, What};
 
 /// The cell's configuration.
 const CONFIG: &str = include_str!("../../config/sim.toml");
@@ -47,12 +51,24 @@ pub fn config() -> Result<Config, String> {
 /// What a fault during a pour or recording cost.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Cost {
-    /// The fault's name.
-    pub fault: String,
-    /// What left from the fault until the container was upright, ml.
+    /// The fault's kind.
+    pub fault: &'static str,
+    /// What left from the moment in which it could first be noticed until the container was upright, ml.
     pub excess_ml: f64,
+    /// What left from the fault itself until then, ml.
+    pub since_ml: f64,
     /// Time from the fault until the container was upright, s.
     pub upright_s: f64,
+}
+
+/// A fault in a pour or recording whose container is not upright again.
+#[derive(Debug, Clone, Copy)]
+struct OpenFault {
+    kind: Kind,
+    at_s: f64,
+    at_ml: f64,
+    /// What had left when it could first be noticed, ml.
+    noticed_ml: Option<f64>,
 }
 
 /// How a pour or recording went.
@@ -60,6 +76,8 @@ pub struct Cost {
 pub struct Poured {
     /// When it ended, s.
     pub at_s: f64,
+    /// Time from its start until the last drops were counted, s.
+    pub seconds: f64,
     /// Why.
     pub reason: EndReason,
     /// The goal, ml.
@@ -68,8 +86,8 @@ pub struct Poured {
     pub believed_ml: f32,
     /// What left, ml.
     pub true_ml: f64,
-    /// Number of faults while it went on or in the 6 s before.
-    pub faults: usize,
+    /// The kinds of the faults while it went on or in the 6 s before.
+    pub faults: Vec<&'static str>,
 }
 
 /// The cell without the controller.
@@ -110,7 +128,11 @@ pub struct Site {
     pub new_weights: Option<Weights>,
     /// Whether the disk is full.
     pub is_disk_full: bool,
-    open_faults: Vec<(String, f64, f64)>,
+    open_faults: Vec<OpenFault>,
+    /// The numbers of the faults that have begun.
+    begun: Vec<usize>,
+    /// When they began, s, and their kinds.
+    fault_times: Vec<(f64, &'static str)>,
     /// Whether the newest pour or recording came to its ordinary end, in spite of what happened in it.
     went_on: bool,
     /// What faults cost.
@@ -124,23 +146,26 @@ pub struct Site {
 }
 
 impl Site {
-    /// The cell of a plan. `wanted` keeps the story and the rows.
-    pub fn new(plan: &Plan, trained: &TrainedSet, config: &Config, wanted: bool) -> Self {
+    /// The cell of a plan, checked against the limits of `checked`. `wanted` keeps the story and the rows.
+    pub fn new(plan: &Plan, trained: &TrainedSet, checked: &Config, wanted: bool) -> Self {
         let series = plan.series;
-        let joint = config.robot.joint.index();
+        let joint = checked.robot.joint.index();
         let right = std::f64::consts::FRAC_PI_2;
         let machine = Machine::new(series, series.default_version(), [0.0, -right, right, -right, -right, 0.0]);
-        let rig = rig(plan);
+        let (rig, mut container) = vessels::rig(plan.vessel);
         let cycle_ns = (1e9 / series.rate_hz()) as u64;
         let mut random = Pcg64Mcg::seed_from_u64(plan.seed ^ 0x517E);
         let frame_at_ns = START_NS + random.random_range(0..FRAME_NS);
+        vessels::fill(&rig, &mut container, plan.fill_ml, &mut random);
+        // What is learned from needs the rows.
+        let learns = plan.items.iter().any(|item| matches!(item.what, What::Learn(_)));
         Self {
             now_ns: START_NS,
             robot: InMemory::new(machine),
             wiring: Wiring::new(plan.seed, plan.delay_ns.0, plan.delay_ns.1),
-            container: rig.container(plan.fill_ml),
-            eye: Eye::new(plan.seed, START_NS),
-            checks: Checks::new(Settings::new(config), cycle_ns as f64 / 1e9),
+            container,
+            eye: Eye::new(plan.seed, START_NS, rig.area_exponent),
+            checks: Checks::new(Settings::new(checked), cycle_ns as f64 / 1e9),
             trained: trained.clone(),
             random,
             joint,
@@ -160,11 +185,13 @@ impl Site {
             new_weights: None,
             is_disk_full: false,
             open_faults: Vec::new(),
+            begun: Vec::new(),
+            fault_times: Vec::new(),
             went_on: false,
             costs: Vec::new(),
             poured: Vec::new(),
             story: wanted.then(Vec::new),
-            rows: wanted.then(Vec::new),
+            rows: (wanted || learns).then(Vec::new),
             rig,
             plan: plan.clone(),
         }
@@ -199,13 +226,6 @@ impl Site {
         }
     }
 
-    /// Adds a row.
-    pub fn row(&mut self, row: Row) {
-        if let Some(rows) = &mut self.rows {
-            rows.push(row);
-        }
-    }
-
     /// When the next thing happens, ns.
     pub fn next_ns(&self) -> u64 {
         let end_ns = START_NS + self.plan.until_ms * 1_000_000;
@@ -224,16 +244,20 @@ impl Site {
     /// Lets what is due happen. Gives the orders that the operator gives; `None` asks for the robot only.
     pub fn step(&mut self) -> Vec<Option<Order>> {
         if self.now_ns >= self.item_at_ns() {
-            let what = self.plan.items[self.next_item].what.clone();
+            let item = self.plan.items[self.next_item].clone();
             self.next_item += 1;
-            return self.happen(&what).into_iter().collect();
+            if let Some(number) = item.fault {
+                self.fault_begins(number);
+            }
+            return self.happen(&item.what).into_iter().collect();
         }
         if self.now_ns >= self.cycle_at_ns {
             self.cycle();
         } else if self.now_ns >= self.frame_at_ns {
             self.frame_at_ns += FRAME_NS;
             let poured_ml = self.container.poured_ml();
-            self.eye.frame(self.now_ns, poured_ml - self.frame_poured_ml);
+            let clinging = self.container.habits().clinging(self.container.lip().flow_ml_s);
+            self.eye.frame(self.now_ns, poured_ml - self.frame_poured_ml, clinging);
             self.frame_poured_ml = poured_ml;
         }
         Vec::new()
@@ -244,6 +268,10 @@ impl Site {
         self.cycle_at_ns += self.cycle_ns;
         self.robot.serve();
         for line in self.robot.cycle() {
+            if line.text.ends_with(" started") {
+                let at_s = self.now_s();
+                self.checks.program_started(at_s);
+            }
             self.say(|| format!("robot: {}", line.text));
         }
         let alpha_deg = self.robot.machine().robot.servo.actual_q[self.joint].to_degrees();
@@ -253,15 +281,40 @@ impl Site {
         }
         let at_s = self.now_s();
         self.checks.cycle(self.robot.machine(), self.joint, alpha_deg, at_s);
+        self.settle_faults(alpha_deg, at_s);
+    }
+
+    /// Takes note of what had left when a fault could first be noticed, and, when the container is upright again, of what it cost.
+    fn settle_faults(&mut self, alpha_deg: f64, at_s: f64) {
+        if self.open_faults.is_empty() {
+            return;
+        }
+        let poured_ml = self.container.poured_ml();
+        for open in &mut self.open_faults {
+            if open.noticed_ml.is_none() && at_s >= open.at_s + f64::from(open.kind.noticed_ms) / 1000.0 {
+                open.noticed_ml = Some(poured_ml);
+            }
+        }
         let active = matches!(self.checks.phase, Phase::Pouring | Phase::Recording);
-        if !active && alpha_deg.abs() < UPRIGHT_DEG && std::mem::take(&mut self.went_on) {
+        if active || alpha_deg.abs() >= UPRIGHT_DEG {
+            return;
+        }
+        if std::mem::take(&mut self.went_on) {
             self.open_faults.clear();
         }
-        if !active && alpha_deg.abs() < UPRIGHT_DEG && self.checks.phase != Phase::Settling && !self.open_faults.is_empty() {
-            let poured_ml = self.container.poured_ml();
-            for (fault, from_s, from_ml) in self.open_faults.drain(..) {
-                self.costs.push(Cost { fault, excess_ml: poured_ml - from_ml, upright_s: at_s - from_s });
-            }
+        if matches!(self.checks.phase, Phase::Settling | Phase::Returning) {
+            return;
+        }
+        let excess_ml = |open: &OpenFault| poured_ml - open.noticed_ml.unwrap_or(poured_ml);
+        // The pour went on after faults that need not end it. So one of them at least must explain what left after it.
+        let is_within = |open: &OpenFault| open.kind.bound_ml.is_none_or(|bound_ml| excess_ml(open) <= bound_ml);
+        if !self.open_faults.is_empty() && !self.open_faults.iter().any(is_within) {
+            let left: Vec<_> = self.open_faults.iter().map(|open| format!("{:.1} ml after {}", excess_ml(open), open.kind.name)).collect();
+            self.checks.violated("bound", at_s, format!("more left after a fault could be noticed than may: {}", left.join(", ")));
+        }
+        for open in std::mem::take(&mut self.open_faults) {
+            let (since_ml, upright_s) = (poured_ml - open.at_ml, at_s - open.at_s);
+            self.costs.push(Cost { fault: open.kind.name, excess_ml: excess_ml(&open), since_ml, upright_s });
         }
     }
 
@@ -278,25 +331,64 @@ impl Site {
         Some(Ok(ours))
     }
 
+    /// The loop has ticked.
+    pub fn ticked(&mut self, tick: &Tick, telemetry: &Telemetry, features: u64) {
+        let (at_s, before) = (self.now_s(), self.checks.phase);
+        self.checks.tick(tick, telemetry, features, at_s);
+        let runs = |phase| matches!(phase, Phase::Pouring | Phase::Recording);
+        if runs(self.checks.phase) && !runs(before) {
+            self.run_poured_ml = self.container.poured_ml();
+        }
+        let row = Row::new(at_s, tick, telemetry, &self.container);
+        if let Some(rows) = &mut self.rows {
+            rows.push(row);
+        }
+    }
+
     /// A pour or recording ended.
     pub fn ended(&mut self, outcome: &Outcome) {
         let at_s = self.now_s();
         self.say(|| format!("ended: {:?}, {:.1} ml believed", outcome.reason, outcome.poured_ml));
-        self.checks.ended(outcome, at_s);
-        self.went_on = matches!(outcome.reason, EndReason::Done | EndReason::ContainerEmpty | EndReason::StreamLost | EndReason::MaxFrames);
         let true_ml = self.container.poured_ml() - self.run_poured_ml;
-        self.run_poured_ml = self.container.poured_ml();
+        self.checks.ended(outcome, true_ml, at_s);
+        self.went_on = matches!(outcome.reason, EndReason::Done | EndReason::ContainerEmpty | EndReason::StreamLost | EndReason::MaxFrames);
         let since_s = at_s - f64::from(outcome.seconds) - 6.0;
-        let faults = self.checks.faults.iter().filter(|f| f.at_s >= since_s).count();
+        let faults = self.fault_times.iter().filter(|(began_s, _)| *began_s >= since_s).map(|(_, name)| *name).collect();
         let (reason, goal_ml, believed_ml) = (outcome.reason, outcome.goal_ml, outcome.poured_ml);
-        self.poured.push(Poured { at_s, reason, goal_ml, believed_ml, true_ml, faults });
+        self.poured.push(Poured { at_s, seconds: f64::from(outcome.seconds), reason, goal_ml, believed_ml, true_ml, faults });
     }
 
     /// Gives the loop an agent with the weights for the vessel of this number.
     pub fn give_weights(&mut self, vessel: usize) {
-        if let Some(weights) = self.trained.get(self.plan.series, vessel) {
-            self.new_agent = Some((weights.id(), Box::new(Agent::new(weights))));
-            self.new_weights = Some(weights.clone());
+        if let Some(lesson) = self.trained.get(self.plan.series, vessel) {
+            let lesson = lesson.clone();
+            self.take_weights(lesson);
+        }
+    }
+
+    fn take_weights(&mut self, lesson: Lesson) {
+        self.new_agent = Some((lesson.weights.id(), Box::new(lesson.agent)));
+        self.new_weights = Some(lesson.weights);
+    }
+
+    /// The operator weighs what the newest recording left, and trains on it and the episodes from before. A weight that the trainer doubts
+    /// is not used, as `trainer train` says.
+    fn learn(&mut self, weighed: Weighed) {
+        let Some(before) = self.trained.get(self.plan.series, self.plan.vessel).map(|lesson| lesson.episodes.to_vec()) else { return };
+        let Some(last) = self.poured.last().filter(|p| p.goal_ml.is_none() && p.reason == EndReason::Done) else { return };
+        let weight_g = match weighed {
+            Weighed::Right => last.true_ml,
+            Weighed::Mistyped(factor) => factor * last.true_ml,
+            Weighed::Untared(cup_g) => cup_g + last.true_ml,
+        };
+        let times = (last.at_s - last.seconds - 0.1, last.at_s);
+        let new = episode("the new one", self.rows.as_deref().unwrap_or_default(), times, START_NS as f64 / 1e9, weight_g.round());
+        let all: Vec<_> = before.into_iter().chain([new]).filter(|e| e.fault().is_none()).collect();
+        let doubtful = trainer::consistency::doubtful(&all);
+        self.say(|| format!("learning with {weight_g:.0} g; doubted: {doubtful:?}"));
+        let kept = all.into_iter().filter(|e| !doubtful.iter().any(|d| d.name == e.name)).collect();
+        if let Some(lesson) = Lesson::learn(kept, &self.checks.limits()) {
+            self.take_weights(lesson);
         }
     }
 
@@ -307,18 +399,29 @@ impl Site {
         self.checks.controller_started();
     }
 
+    /// The fault of this number begins, or goes on.
+    fn fault_begins(&mut self, number: usize) {
+        let (at_s, at_ml) = (self.now_s(), self.container.poured_ml());
+        if self.begun.contains(&number) {
+            return;
+        }
+        self.begun.push(number);
+        let kind = KINDS[self.plan.faults[number]];
+        self.fault_times.push((at_s, kind.name));
+        if matches!(self.checks.phase, Phase::Pouring | Phase::Recording) {
+            self.open_faults.push(OpenFault { kind, at_s, at_ml, noticed_ml: None });
+        }
+    }
+
     /// Lets `what` happen. Gives the operator's order, if it is one.
     fn happen(&mut self, what: &What) -> Option<Option<Order>> {
-        let (at_s, poured_ml, ms) = (self.now_s(), self.container.poured_ml(), 1_000_000);
+        let (at_s, ms) = (self.now_s(), 1_000_000);
         self.say(|| format!("{what:?}"));
-        self.checks.happens(what, at_s, poured_ml);
-        if !what.is_ordinary() && matches!(self.checks.phase, Phase::Pouring | Phase::Recording) {
-            self.open_faults.push((what.name(), at_s, poured_ml));
-        }
+        self.checks.happens(what, at_s);
         match what {
             What::Pour(goal_ml) => {
                 self.episode += 1;
-                return Some(Some(Order::Pour { episode: self.episode, goal_ml: *goal_ml }));
+                return Some(Some(Order::Pour { episode: self.episode, goal_ml: *goal_ml, flows_by_deg: None }));
             }
             What::Record(lambda_deg, width_s) => {
                 self.episode += 1;
@@ -332,7 +435,7 @@ impl Site {
             What::Refill(fill_ml) => {
                 // Nobody fills a vessel that is tilted or poured from.
                 if self.checks.phase == Phase::Idle {
-                    self.container = self.rig.container(*fill_ml);
+                    vessels::fill(&self.rig, &mut self.container, *fill_ml, &mut self.random);
                     (self.frame_poured_ml, self.run_poured_ml) = (0.0, 0.0);
                 }
             }
@@ -342,6 +445,7 @@ impl Site {
                 }
                 self.robot.inject(fault);
             }
+            What::Learn(weighed) => self.learn(*weighed),
             What::LinkStall(time) => self.wiring.stall(u64::from(*time) * ms),
             What::LinkSplit(time) => self.wiring.split(u64::from(*time) * ms),
             What::LinkCut => self.wiring.cut(),
@@ -362,7 +466,7 @@ impl Site {
 
     /// A damaged weight file must be refused.
     fn offer_bad_weights(&mut self) {
-        let Some(mut bytes) = self.trained.get(self.plan.series, self.plan.vessel).and_then(|w| w.to_bytes().ok()) else { return };
+        let Some(mut bytes) = self.trained.get(self.plan.series, self.plan.vessel).and_then(|l| l.weights.to_bytes().ok()) else { return };
         let at = self.random.random_range(0..bytes.len());
         bytes[at] ^= 1 << self.random.random_range(0..8u8);
         if Weights::from_bytes(&bytes, "weights.bin").is_ok() {
@@ -370,15 +474,4 @@ impl Site {
             self.checks.violated("bad-weights", at_s, format!("a weight file with byte {at} changed was taken"));
         }
     }
-}
-
-/// The rig of a plan.
-fn rig(plan: &Plan) -> Rig {
-    let rig = Rig::seeded(plan.rig_seed);
-    rig.clone().with_container(VESSELS[plan.vessel]).unwrap_or(rig)
-}
-
-/// The tilt at which `fill_ml` starts to flow from a vessel, degrees.
-pub fn spill_angle_deg(series: Series, vessel: usize, fill_ml: f64) -> f64 {
-    rig(&Plan::recording(series, vessel, fill_ml, 50.0, 1.0)).container(fill_ml).spill_angle_deg()
 }

@@ -19,7 +19,7 @@ use shared::control::RobotLink;
 use shared::messages::Feature;
 
 use crate::pipe;
-use crate::records::{Journal, Row};
+use crate::records::Journal;
 use crate::site::Site;
 
 /// Time that a call of the clock takes in the loop, ns: a tick then takes about as long as on the machines of docs/REALTIME.md.
@@ -137,9 +137,7 @@ fn wake_up(life: &mut Life<'_>, site: &mut Site, now_ns: u64) {
     while let Some(event) = life.exchange.events.pop() {
         match event {
             Event::Tick(tick, telemetry, counters) => {
-                let at_s = site.now_s();
-                site.checks.tick(&tick, &telemetry, counters.features, at_s);
-                site.row(Row::new(at_s, &tick, &telemetry, &site.container));
+                site.ticked(&tick, &telemetry, counters.features);
                 life.journal.tick(tick);
             }
             Event::Ordered(answer) => site.say(|| format!("order: {answer:?}")),

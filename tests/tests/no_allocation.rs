@@ -78,7 +78,7 @@ fn run(plant: bool) {
                     number += 1;
                     drop(exchange.agents.force_push((number, Box::new(Agent::new(&steady_weights(13))))));
                     poured += 1;
-                    let _ = exchange.orders.push(Order::Pour { episode: poured, goal_ml: 20.0 });
+                    let _ = exchange.orders.push(Order::Pour { episode: poured, goal_ml: 20.0, flows_by_deg: None });
                 }
                 match sequence {
                     450 => drop(exchange.orders.push(Order::Abort)),

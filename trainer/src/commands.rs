@@ -2,6 +2,7 @@
 
 pub mod check;
 pub mod inspect;
+pub mod plan;
 pub mod refine;
 pub mod report;
 pub mod train;

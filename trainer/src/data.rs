@@ -218,11 +218,6 @@ pub fn usable(episodes: &[Episode]) -> UsableEpisodes {
     result
 }
 
-/// A hash as people read it: 64 hexadecimal digits.
-pub fn hex(hash: &[u8; 32]) -> String {
-    hash.iter().map(|b| format!("{b:02x}")).collect()
-}
-
 /// SHA-256 of what is trained on: times, commanded angles, areas and weights of all episodes in order, and the measured angles of those that
 /// have any. Their names do not matter.
 pub fn hash(episodes: &[TrainingEpisode]) -> [u8; 32] {

@@ -8,6 +8,7 @@
 //! | [`fit`] | the flow model, fitted to the episodes |
 //! | [`allowed_actions`], [`network`] | the network's actions, and its training |
 //! | [`training`], [`method`] | what a training is told and gives, and the methods |
+//! | [`teaching`] | what episodes teach and leave open, and what to record next |
 //! | [`report`] | pages of plots and tables |
 //! | [`commands`] | the command line |
 #![forbid(unsafe_code)]
@@ -21,4 +22,5 @@ pub mod fit;
 pub mod method;
 pub mod network;
 pub mod report;
+pub mod teaching;
 pub mod training;

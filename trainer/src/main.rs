@@ -3,7 +3,7 @@
 use std::process::ExitCode;
 
 use clap::{Parser, Subcommand};
-use trainer::commands::{check, inspect, refine, report, train};
+use trainer::commands::{check, inspect, plan, refine, report, train};
 
 /// The offline trainer: weighed episodes in, one weight file out.
 #[derive(Parser)]
@@ -23,6 +23,8 @@ enum Command {
     Inspect(inspect::Args),
     /// Says what is wrong with a data set before any training.
     Check(check::Args),
+    /// Says which curve or pour to weigh next, because it teaches most.
+    Plan(plan::Args),
     /// Writes the HTML page of a training or evaluation.
     Report(report::Args),
 }
@@ -33,6 +35,7 @@ fn main() -> ExitCode {
         Command::Refine(args) => refine::run(&args),
         Command::Inspect(args) => inspect::run(&args),
         Command::Check(args) => check::run(&args),
+        Command::Plan(args) => plan::run(&args),
         Command::Report(args) => report::run(&args),
     })
 }

@@ -69,6 +69,34 @@ fn refine_asks_about_a_wrong_weight() {
     assert!(text(&out.stdout).contains("doubtful: 3: weight"), "{}", text(&out.stdout));
 }
 
+/// Protects the first hour with a vessel: without anything weighed a curve is proposed if the vessel's volume is known, after curves a pour, as
+/// words and as JSON; and `check` names what fast curves alone do not span.
+#[test]
+fn what_to_weigh_next_is_said() {
+    let dir = tempfile::tempdir().unwrap();
+    std::fs::create_dir(dir.path().join("none")).unwrap();
+    let out = trainer(dir.path(), &["plan", "none"]);
+    assert!(out.status.code() == Some(2) && text(&out.stderr).contains("--holds"), "{}", text(&out.stderr));
+    let out = trainer(dir.path(), &["plan", "none", "--holds", "500", "--json"]);
+    let first: serde_json::Value = serde_json::from_str(&text(&out.stdout)).unwrap();
+    let next = &first["plan"]["candidates"][0]["next"];
+    assert!(next["kind"] == "curve" && next["fill_ml"].as_f64().unwrap() <= 460.0, "{first}");
+
+    tables(dir.path(), 3, |_, w| w);
+    let plan = ["plan", "f.csv", "--scale", "s.csv", "--holds", "520", "--goal-max", "120"];
+    let out = trainer(dir.path(), &plan);
+    let said = text(&out.stdout);
+    assert!(out.status.success() && said.contains("and pour: rt-controller pour") && said.contains("standard deviation"), "{said}");
+    let out = trainer(dir.path(), &[&plan[..], &["--json"]].concat());
+    let then: serde_json::Value = serde_json::from_str(&text(&out.stdout)).unwrap();
+    let next = &then["plan"]["candidates"][0]["next"];
+    assert!(next["kind"] == "pour" && (40.0..=120.0).contains(&next["goal_ml"].as_f64().unwrap()), "{then}");
+
+    let out = trainer(dir.path(), &["check", "f.csv", "--scale", "s.csv", "--json"]);
+    let found: serde_json::Value = serde_json::from_str(&text(&out.stdout)).unwrap();
+    assert!(found["spanned"]["weights_g"][1].as_f64() > Some(20.0) && found["missing"].is_array(), "{found}");
+}
+
 /// Protects the operator from a wrong file: one line, exit code 2, no panic.
 #[test]
 fn wrong_files_are_refused_in_one_line() {

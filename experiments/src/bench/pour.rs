@@ -160,7 +160,7 @@ pub fn by_core(
         // The joint was measured when the picture was taken. Where there is none, it is where it was commanded.
         let tilt_deg = if frames > 1 { pour.tilt_deg() as f32 } else { alpha_deg };
         let robot = Robot::that_may_move(if tilt_deg.is_nan() { alpha_deg } else { tilt_deg }, now_ns - PERIOD_NS);
-        let order = (frames == 2).then_some(Order::Pour { episode: 1, goal_ml: goal_ml as f32 });
+        let order = (frames == 2).then_some(Order::Pour { episode: 1, goal_ml: goal_ml as f32, flows_by_deg: None });
         let output = core.step(&Input { now_ns, features: &[feature], robot, order });
         alpha_deg = output.target_deg.unwrap_or(alpha_deg);
         area_px2 = pour.frame(f64::from(alpha_deg));

@@ -1,7 +1,7 @@
 //! The yardstick of a tick's execution: a loop that does nothing but the system calls of the controller's loop.
 //!
 //! It runs as a process of its own (`experiments bare-loop`), like the controller: one real-time thread with the same core, priority and
-//! rate, and locked memory. A peer sends it states as a robot does, over TCP on the loopback interface, and reads its targets. A tick
+//! rate, and locked memory. A peer sends it states as a robot does, over TCP on the loopback interface, as many as the cell's robot, and reads its targets. A tick
 //! receives what has arrived, sends one target and counts page faults; what else the controller's tick takes is the controller's own.
 //!
 //! The loop's thread allocates nothing between its first tick and its last. A socket that breaks ends it with one line.
@@ -15,10 +15,8 @@ use rt_controller::link::wire;
 use shared::config::Config;
 use shared::os;
 
-use crate::own_cell::{OwnCell, OwnCellError};
+use crate::own_cell::{OwnCell, OwnCellError, off_core};
 
-/// Rate at which the peer sends states, Hz: that of the cell's simulated robot, a CB3 (`simulator.robot_hz` is 125 by default).
-const ROBOT_HZ: u64 = 125;
 /// Largest number of bytes that one tick receives: as in the controller's inbox.
 const RECEIVE_MAX: usize = 1 << 16;
 
@@ -37,20 +35,24 @@ pub struct BareLoop {
     /// Number of ticks.
     #[arg(long)]
     ticks: usize,
+    /// Rate at which the peer sends states, Hz.
+    #[arg(long)]
+    states_hz: u64,
 }
 
-/// Execution of each tick of a bare loop that runs like the cell's loop for `seconds`, us.
+/// Execution of each tick of a bare loop that runs like the cell's loop for `time` and gets `states_hz` states a second, us.
 ///
 /// # Errors
 /// When the process cannot be started or ends early, or Ctrl-C is pressed.
-pub fn run(cell: &OwnCell, seconds: u64) -> Result<Vec<f64>, OwnCellError> {
+pub fn run(cell: &OwnCell, time: Duration, states_hz: u64) -> Result<Vec<f64>, OwnCellError> {
     let c: &Config = &cell.config;
-    let ticks = (seconds as f64 * c.controller.rate_hz) as u64;
+    let ticks = (time.as_secs_f64() * c.controller.rate_hz) as u64;
     let words = [
         ("--core", c.controller.core.to_string()),
         ("--priority", c.controller.priority.to_string()),
         ("--rate-hz", c.controller.rate_hz.to_string()),
         ("--ticks", ticks.to_string()),
+        ("--states-hz", states_hz.to_string()),
     ];
     let mut command = Command::new(cell.bin.join("experiments"));
     command.arg("bare-loop").stdin(Stdio::null());
@@ -74,9 +76,12 @@ pub fn measure(settings: &BareLoop) -> std::io::Result<Vec<f64>> {
     robot.set_nodelay(true)?;
     socket.set_nonblocking(true)?;
     let reader = robot.try_clone()?;
-    // Both end when the loop closes its socket.
-    std::thread::spawn(move || send_states(robot));
-    std::thread::spawn(move || read_targets(reader));
+    // Both end when the loop closes its socket. Which core they run on decides what a send costs the loop, so it is the same in each run.
+    let states_hz = settings.states_hz;
+    off_core(settings.core, move || {
+        std::thread::spawn(move || send_states(robot, states_hz));
+        std::thread::spawn(move || read_targets(reader));
+    });
     let mut buffer = vec![0; RECEIVE_MAX];
     let mut times_us = vec![0.0; settings.ticks];
     // What is refused here is refused to the controller too, which says so.
@@ -107,11 +112,11 @@ fn tick(socket: &mut TcpStream, buffer: &mut [u8], sequence: i32) -> std::io::Re
 }
 
 /// Sends states of a robot's size until nobody reads them.
-fn send_states(mut robot: TcpStream) {
+fn send_states(mut robot: TcpStream, states_hz: u64) {
     let state = vec![0; wire::STATE_LEN];
     let mut next_ns = os::now_ns();
     while robot.write_all(&state).is_ok() {
-        next_ns += 1_000_000_000 / ROBOT_HZ;
+        next_ns += 1_000_000_000 / states_hz.max(1);
         std::thread::sleep(Duration::from_nanos(next_ns.saturating_sub(os::now_ns())));
     }
 }
@@ -129,7 +134,7 @@ mod tests {
     /// Protects the yardstick: it ticks as often as it is asked to, and each tick takes time and less than a period.
     #[test]
     fn a_bare_loop_measures_each_tick() {
-        let settings = BareLoop { core: 0, priority: 0, rate_hz: 200.0, ticks: 40 };
+        let settings = BareLoop { core: 0, priority: 0, rate_hz: 200.0, ticks: 40, states_hz: 500 };
         let times_us = measure(&settings).unwrap();
         assert_eq!(times_us.len(), 40);
         assert!(times_us.iter().all(|t| *t > 0.0));

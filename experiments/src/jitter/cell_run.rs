@@ -7,12 +7,16 @@ use shared::os::now_ns;
 
 use super::machine_log::MachineLog;
 use super::processes::{Holding, processor_ns};
-use super::storm::Storm;
+use super::storm::{ROBOT, Storm};
 use super::tick_times::TickTimes;
 use crate::own_cell::{OwnCell, OwnCellError};
 
 /// Time that a pour takes at most, with filling: a pour begins only when so much is left. Chosen by hand; no measurement is recorded.
 const A_POUR: Duration = Duration::from_secs(12);
+
+/// Time before anything is measured: the loop has found its phase behind the camera (4 s, `rt_controller::pacing`), and what starting
+/// costs is over.
+const SETTLING: Duration = Duration::from_secs(6);
 
 /// Pours until `until`, one pour after the other, each into an empty cup, and at least one. Returns their number.
 ///
@@ -67,21 +71,39 @@ pub struct CellRun {
 /// # Errors
 /// When the cell does not start, a command fails, or the journal cannot be read.
 pub fn run_cell(cell: &mut OwnCell, seconds: u64, storm: bool) -> Result<CellRun, OwnCellError> {
+    let whole = Duration::from_secs(seconds);
+    Ok(run_cell_beside(cell, (whole / 3, whole), storm, |_| Ok(()))?.0)
+}
+
+/// Runs the cell for a time at rest and until a time pouring; meanwhile another thread does `beside`, once the pours begin.
+///
+/// # Errors
+/// As [`run_cell`], and those of `beside`.
+pub fn run_cell_beside<T: Send>(
+    cell: &mut OwnCell,
+    (rest, whole): (Duration, Duration),
+    storm: bool,
+    beside: impl FnOnce(&OwnCell) -> Result<T, OwnCellError> + Send,
+) -> Result<(CellRun, T), OwnCellError> {
+    cell.simulate(storm.then(|| (ROBOT.0, ROBOT.1.into())))?;
     let client = cell.start()?;
     let unreachable = |e: ClientError| OwnCellError::Other(e.to_string());
     let before = client.status().map_err(unreachable)?;
     drop(client);
     let storm = if storm { Some(Storm::start(cell)?) } else { None };
-    // The machine settles first; what starting costs is not of interest.
-    sleep_until(cell, Instant::now() + Duration::from_secs(1))?;
+    sleep_until(cell, Instant::now() + SETTLING)?;
     let (from_ns, from) = (now_ns(), Instant::now());
     let pid = cell.pid("rt-controller");
     let log = MachineLog::start(pid);
     let spent_ns = processor_ns(pid);
-    let rest = Duration::from_secs(seconds) / 3;
     sleep_until(cell, from + rest)?;
     let idle_percent = 100.0 * (processor_ns(pid) - spent_ns) as f64 / from.elapsed().as_nanos() as f64;
-    pour_until(cell, from + Duration::from_secs(seconds))?;
+    let running = &*cell;
+    let beside = std::thread::scope(|scope| {
+        let beside = scope.spawn(|| beside(running));
+        pour_until(running, from + whole)?;
+        beside.join().unwrap_or_else(|_| Err(OwnCellError::Other("the yardsticks beside the cell stopped".into())))
+    })?;
     let to_ns = now_ns();
     let (controller, worker) = (Holding::of(pid), Holding::of(cell.pid("feature-worker")));
     drop(storm);
@@ -94,12 +116,13 @@ pub fn run_cell(cell: &mut OwnCell, seconds: u64, storm: bool) -> Result<CellRun
     for (worst, activity) in ticks.worst.iter_mut().zip(log.around(&times_ns)) {
         worst.activity = activity;
     }
-    Ok(CellRun {
+    let run = CellRun {
         ticks,
         idle_percent,
         controller,
         worker,
         allocations: after.loop_allocations - before.loop_allocations,
         page_faults: after.loop_page_faults - before.loop_page_faults,
-    })
+    };
+    Ok((run, beside))
 }

@@ -57,6 +57,18 @@ impl Condition {
         )
     }
 
+    /// One sentence: this condition's p99 over that of another, each over its yardstick.
+    pub fn over(&self, other: &Self) -> String {
+        let [late, work] = [1, 3].map(|k| self.ratio(k) / other.ratio(k));
+        format!(
+            "{}, p99 of the wake-up is {late:.2} times and p99 of a tick {work:.2} times what it is {}, each over its yardstick; {} ticks were \
+             later than half a period.",
+            capital(self.name),
+            other.name,
+            self.ticks().late
+        )
+    }
+
     /// The median of one ratio over the rounds.
     fn ratio(&self, k: usize) -> f64 {
         median(self.rounds.iter().map(|r| r.0[k]))

@@ -2,7 +2,9 @@
 //!
 //! Ordinary thread; allocates and blocks. `scripts/jitter` installs both programs.
 
+use std::path::Path;
 use std::process::{Child, Command, Stdio};
+use std::time::Duration;
 
 use crate::own_cell::{OwnCell, OwnCellError};
 
@@ -22,11 +24,23 @@ impl Drop for Running {
 /// # Errors
 /// When stress-ng cannot be started.
 pub fn load() -> Result<Running, OwnCellError> {
-    let words = "--cpu 2 --vm 1 --vm-bytes 128M --io 1 --hdd 1 --hdd-bytes 64M --quiet";
+    stress("--cpu 2 --vm 1 --vm-bytes 128M --io 1 --hdd 1 --hdd-bytes 64M", &std::env::temp_dir())
+}
+
+/// Makes the disk of a directory slow, until it is dropped: each small write is on the disk before the next.
+///
+/// # Errors
+/// When stress-ng cannot be started.
+pub fn slow_disk(directory: &Path) -> Result<Running, OwnCellError> {
+    stress("--hdd 1 --hdd-bytes 64M --hdd-write-size 4K --hdd-opts wr-seq,fsync", directory)
+}
+
+/// Runs stress-ng with these words, its files in `directory`.
+fn stress(words: &str, directory: &Path) -> Result<Running, OwnCellError> {
     let child = Command::new("stress-ng")
         .args(words.split(' '))
-        .arg("--temp-path")
-        .arg(std::env::temp_dir())
+        .args(["--quiet", "--temp-path"])
+        .arg(directory)
         .stdout(Stdio::null())
         .stderr(Stdio::null())
         .spawn()
@@ -34,11 +48,11 @@ pub fn load() -> Result<Running, OwnCellError> {
     Ok(Running(child))
 }
 
-/// Starts cyclictest like the loop, with one reading a line, for `seconds`; its priority is lower than the loop's by `below`.
+/// Starts cyclictest like the loop, with one reading a line, for `time`; its priority is lower than the loop's by `below`.
 ///
 /// # Errors
 /// When cyclictest cannot be started.
-pub fn cyclictest(cell: &OwnCell, seconds: u64, below: u8) -> Result<Child, OwnCellError> {
+pub fn cyclictest(cell: &OwnCell, time: Duration, below: u8) -> Result<Child, OwnCellError> {
     let c = &cell.config.controller;
     let interval_us = (1e6 / c.rate_hz) as u64;
     Command::new("cyclictest")
@@ -46,7 +60,7 @@ pub fn cyclictest(cell: &OwnCell, seconds: u64, below: u8) -> Result<Child, OwnC
         .arg(format!("--priority={}", c.priority.saturating_sub(below)))
         .arg(format!("--affinity={}", c.core))
         .arg(format!("--interval={interval_us}"))
-        .arg(format!("--loops={}", seconds * 1_000_000 / interval_us))
+        .arg(format!("--loops={}", time.as_micros() as u64 / interval_us))
         .stdin(Stdio::null())
         .stdout(Stdio::piped())
         .stderr(Stdio::null())

@@ -6,7 +6,8 @@
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
-use serde_json::{Value, json};
+use rt_controller::client::Client;
+use serde_json::{Map, Value, json};
 use shared::os::now_ns;
 use trainer::report::page;
 use trainer::report::plot::{PlotSeries, plot};
@@ -23,33 +24,41 @@ use crate::plots::percentiles::percentile_curves;
 /// Time between two readings of memory and files: enough of them in an hour to show a leak.
 const READ_EVERY: Duration = Duration::from_secs(60);
 
-/// What both processes held at one moment.
+/// The controller's own counters of what went wrong, which are followed over time.
+const COUNTERS: [&str; 6] = ["late ticks", "skipped ticks", "stale features", "events lost", "loop allocations", "loop page faults"];
+
+/// What both processes held at one moment, and [`COUNTERS`] then.
 struct Reading {
     minutes: f64,
     controller: Holding,
     worker: Holding,
+    counters: [u64; COUNTERS.len()],
 }
 
 impl Reading {
-    fn take(cell: &OwnCell, from: Instant) -> Self {
-        Self {
+    fn take(cell: &OwnCell, from: Instant) -> Result<Self, OwnCellError> {
+        let status = Client::connect(&cell.config.cell).and_then(|client| client.status());
+        let s = status.map_err(|e| OwnCellError::Other(e.to_string()))?;
+        Ok(Self {
             minutes: from.elapsed().as_secs_f64() / 60.0,
             controller: Holding::of(cell.pid("rt-controller")),
             worker: Holding::of(cell.pid("feature-worker")),
-        }
+            counters: [s.late_ticks, s.skipped_ticks, s.stale_features, s.events_lost, s.loop_allocations, s.loop_page_faults],
+        })
     }
 
     fn json(&self) -> Value {
+        let counters: Map<String, Value> = COUNTERS.iter().zip(self.counters).map(|(name, n)| ((*name).to_owned(), n.into())).collect();
         json!({
             "minutes": self.minutes, "controller_mib": self.controller.resident_mib, "controller_files": self.controller.files,
-            "worker_mib": self.worker.resident_mib, "worker_files": self.worker.files,
+            "worker_mib": self.worker.resident_mib, "worker_files": self.worker.files, "counters": counters,
         })
     }
 }
 
 /// cyclictest, and the thread that reads its latencies (us).
 fn start_yardstick(cell: &OwnCell, seconds: u64) -> Result<(Running, JoinHandle<Vec<f64>>), OwnCellError> {
-    let mut yardstick = cyclictest(cell, seconds, 1)?;
+    let mut yardstick = cyclictest(cell, Duration::from_secs(seconds), 1)?;
     let output = yardstick.stdout.take();
     let reader = std::thread::spawn(move || {
         let mut bytes = Vec::new();
@@ -75,7 +84,7 @@ pub fn measure(cell: &mut OwnCell, hours: f64) -> Result<Measured, OwnCellError>
     let end = from + Duration::from_secs(seconds);
     while Instant::now() < end {
         pour_until(cell, (Instant::now() + READ_EVERY).min(end))?;
-        let reading = Reading::take(cell, from);
+        let reading = Reading::take(cell, from)?;
         let (c, w) = (reading.controller, reading.worker);
         cell.note(&format!(
             "{:.0} min: rt-controller {:.1} MiB, {} files; feature-worker {:.1} MiB, {} files",
@@ -130,9 +139,15 @@ fn html(facts: &[String], readings: &[Reading], ticks: &TickTimes, latencies: &[
     let line = |name: &str, pick: fn(&Reading) -> f64| PlotSeries::line(name, readings.iter().map(|r| (r.minutes, pick(r))).collect());
     let memory = [line("rt-controller", |r| r.controller.resident_mib), line("feature-worker", |r| r.worker.resident_mib)];
     let files = [line("rt-controller", |r| r.controller.files as f64), line("feature-worker", |r| r.worker.files as f64)];
+    let counters: Vec<PlotSeries> = COUNTERS
+        .iter()
+        .enumerate()
+        .map(|(k, name)| PlotSeries::line(name, readings.iter().map(|r| (r.minutes, r.counters[k] as f64)).collect()))
+        .collect();
     let figures = [
         page::figure(&plot("minutes", "resident MiB", &memory, true), "Memory."),
         page::figure(&plot("minutes", "open files", &files, true), "Open files."),
+        page::figure(&plot("minutes", "number", &counters, true), "What went wrong, since the controller started."),
         percentile_curves("Wake-up lateness.", &[("rt-controller", ticks.of(Span::Lateness)), ("cyclictest", latencies)]),
     ];
     format!("<h2>Soak</h2>{}<div class=plots>{}</div>", facts_html(facts), figures.concat())

@@ -1,8 +1,12 @@
-//! Everything at once that other programs can do to a running cell: questions, refused orders, readers, and new weight files.
+//! Everything at once that other programs and an unkind robot can do to a running cell: questions, refused orders, readers, browsers on the
+//! live page, new weight files, a slow disk under the episodes, and an e-Series that sends each state twice.
 //!
 //! Ordinary threads, which allocate and never pause longer than a millisecond, except the one that replaces the weight file. What fails in
 //! them is left out: they are the weather, and not what is measured.
 
+use std::io::{BufRead as _, BufReader, Read as _, Write as _};
+use std::net::TcpStream;
+use std::process::Stdio;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::thread::JoinHandle;
@@ -14,6 +18,7 @@ use shared::control::Request;
 use shared::ipc::Cell;
 use shared::weights::Weights;
 
+use super::other_programs::{Running, slow_disk};
 use crate::own_cell::{OwnCell, OwnCellError};
 
 /// Number of clients that ask for the status without a pause. Chosen by hand; no measurement is recorded.
@@ -23,21 +28,37 @@ const READERS: usize = 10;
 /// Time between two new weight files, ten a second.
 const SWAP: Duration = Duration::from_millis(100);
 
-/// The threads, until it is dropped.
+/// Number of browsers that look at the live page.
+const BROWSERS: usize = 3;
+/// Pause of a browser between two pictures: 15 a second, as many as the page asks for at most.
+const PICTURE: Duration = Duration::from_millis(66);
+/// The key of `[simulator]`, and its value, that make the robot an e-Series.
+pub const ROBOT: (&str, &str) = ("series", "e-series");
+/// How many states a second the robot sends in a storm: an e-Series has 500, and each comes twice.
+pub const STATES_HZ: u64 = 1000;
+/// How long the robot sends each state twice: longer than any run, in the words of `simulator operator fault`.
+const TWICE: &str = "twice=3600";
+
+/// The threads and programs, until it is dropped.
 pub struct Storm {
     stop: Arc<AtomicBool>,
     threads: Vec<JoinHandle<()>>,
+    // They end when they are dropped, after the threads.
+    _programs: [Running; 2],
 }
 
 impl Storm {
-    /// Lets it loose on a cell that runs.
+    /// Lets it loose on a cell that runs, with [`ROBOT`] as its robot.
     ///
     /// # Errors
-    /// When the cell's weight file cannot be read.
+    /// When the cell's weight file cannot be read, or a program does not start.
     pub fn start(cell: &OwnCell) -> Result<Self, OwnCellError> {
         let file = cell.out.join("weights.bin");
         let bytes = std::fs::read(&file).map_err(|error| OwnCellError::File { what: file.display().to_string(), error })?;
         let weights = Weights::from_bytes(&bytes, "weights.bin").map_err(|e| OwnCellError::Other(e.to_string()))?;
+        cell.command("simulator", &["operator", "fault", TWICE])?;
+        let (page, address) = open_page(cell)?;
+        let programs = [slow_disk(&cell.out)?, page];
         let stop = Arc::new(AtomicBool::new(false));
         let name = &cell.config.cell;
         let mut threads = Vec::new();
@@ -45,14 +66,18 @@ impl Storm {
             threads.push(repeat(&stop, name, |client| drop(client.status())));
         }
         // An order that is always refused reaches the service thread all the same.
-        threads.push(repeat(&stop, name, |client| drop(client.ask(&Request::Pour { goal_ml: -1.0 }))));
+        threads.push(repeat(&stop, name, |client| drop(client.ask(&Request::Pour { goal_ml: -1.0, flows_by_deg: None }))));
         for _ in 0..READERS {
             let (stop, name) = (Arc::clone(&stop), name.clone());
             threads.push(std::thread::spawn(move || read_telemetry(&stop, &name)));
         }
+        for _ in 0..BROWSERS {
+            let (stop, address) = (Arc::clone(&stop), address.clone());
+            threads.push(std::thread::spawn(move || look_at_page(&stop, &address)));
+        }
         let told = Arc::clone(&stop);
         threads.push(std::thread::spawn(move || replace_weights(&told, &file, weights)));
-        Ok(Self { stop, threads })
+        Ok(Self { stop, threads, _programs: programs })
     }
 }
 
@@ -72,6 +97,36 @@ fn repeat(stop: &Arc<AtomicBool>, name: &CellConfig, ask: fn(&Client)) -> JoinHa
             ask(&client);
         }
     })
+}
+
+/// Opens the live page; gives its program and its address, `127.0.0.1:PORT`.
+fn open_page(cell: &OwnCell) -> Result<(Running, String), OwnCellError> {
+    let failed = |error| OwnCellError::File { what: "feature-worker view".into(), error };
+    let mut child =
+        cell.program("feature-worker", &["view", "--port", "0"]).stdout(Stdio::piped()).stderr(Stdio::null()).spawn().map_err(failed)?;
+    let output = child.stdout.take();
+    let page = Running(child);
+    for line in output.into_iter().flat_map(|output| BufReader::new(output).lines()) {
+        if let Some((_, rest)) = line.map_err(failed)?.split_once("http://") {
+            return Ok((page, rest.chars().take_while(|c| c.is_ascii_digit() || ".:".contains(*c)).collect()));
+        }
+    }
+    Err(OwnCellError::Other("feature-worker view ended without an address".into()))
+}
+
+/// Asks for picture and state as the page in a browser does.
+fn look_at_page(stop: &AtomicBool, address: &str) {
+    let mut answer = Vec::new();
+    while !stop.load(Ordering::Relaxed) {
+        for path in ["picture.jpg", "state.json"] {
+            answer.clear();
+            let _ = TcpStream::connect(address).and_then(|mut page| {
+                write!(page, "GET /{path} HTTP/1.1\r\nHost: {address}\r\nConnection: close\r\n\r\n")?;
+                page.read_to_end(&mut answer)
+            });
+        }
+        std::thread::sleep(PICTURE);
+    }
 }
 
 /// Reads every tick's telemetry.

@@ -26,6 +26,7 @@ impl ThisMachine {
         let fact = |name, value| Property { name, value, advice: "" };
         let c = &cell.config;
         let controller = format!("core {}, SCHED_FIFO {}, {} Hz", c.controller.core, c.controller.priority, c.controller.rate_hz);
+        properties.extend(beside(c.controller.core));
         properties.push(fact("loop", controller));
         properties.push(fact("feature worker", format!("core {}, SCHED_FIFO {}", c.worker.core, c.worker.priority)));
         properties.push(fact("load before", read("/proc/loadavg")));
@@ -82,6 +83,25 @@ fn processor() -> Vec<Property> {
         judged("processor", format!("{cores} x {cpu}"), true, ""),
         judged("virtual machine", if virtualised { "yes" } else { "no" }.into(), !virtualised, advice),
         judged("kernel", kernel, realtime, "a PREEMPT_RT kernel (Debian: linux-image-rt-amd64) bounds the wake-up"),
+    ]
+}
+
+/// Who shares the loop's core with it, and by which clock it sleeps.
+fn beside(core: usize) -> Vec<Property> {
+    let siblings = read(&format!("/sys/devices/system/cpu/cpu{core}/topology/thread_siblings_list"));
+    let alone = !siblings.contains([',', '-']);
+    let clock = read("/sys/devices/system/clocksource/clocksource0/current_clocksource");
+    let virtual_call = clock == "tsc" || clock == "kvm-clock";
+    let clock = if clock.is_empty() { "not shown by this machine".into() } else { clock };
+    let interrupts = read("/proc/irq/default_smp_affinity");
+    // The mask is hexadecimal, in groups of 32 cores; the last group has the lowest ones.
+    let mask = interrupts.rsplit(',').next().and_then(|m| u32::from_str_radix(m, 16).ok());
+    let elsewhere = mask.is_some_and(|m| core < 32 && m >> core & 1 == 0);
+    let interrupts = if interrupts.is_empty() { "not shown by this machine".into() } else { format!("cores of the mask {interrupts}") };
+    vec![
+        judged("on the loop's core", format!("processors {siblings}"), alone, "leave the loop's second hyperthread idle, or switch it off"),
+        judged("clock", clock, virtual_call, "clocksource=tsc: other clocks cost a system call or a slow read for each time stamp"),
+        judged("interrupts go to", interrupts, elsewhere, "irqaffinity= without the loop's core, and no irqbalance"),
     ]
 }
 

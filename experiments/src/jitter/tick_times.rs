@@ -148,19 +148,6 @@ impl TickTimes {
         self.worst.truncate(WORST);
     }
 
-    /// The ticks in `parts` parts of equal length, in time; only their lateness and execution.
-    pub fn parts(&self, parts: usize) -> Vec<Self> {
-        let part = |k: usize| {
-            let mut ticks = Self::default();
-            for span in [Span::Lateness, Span::Execution, Span::PouringExecution] {
-                let all = self.of(span);
-                ticks.spans_us[span as usize] = all[all.len() * k / parts..all.len() * (k + 1) / parts].to_vec();
-            }
-            ticks
-        };
-        (0..parts).map(part).collect()
-    }
-
     /// Adds the ticks of another run.
     pub fn add(&mut self, other: &Self) {
         for (sum, part) in self.spans_us.iter_mut().zip(&other.spans_us) {

@@ -56,6 +56,13 @@ fn percentile(nines: f64) -> String {
     if nines < 0.01 { "min".into() } else { format!("{percent:.*} %", (nines - 2.0).max(0.0).ceil() as usize) }
 }
 
+/// A duration on the axis; only 1, 2 and 5 of each decade have room for words.
+fn duration(us: f64) -> String {
+    let words = format!("{us}");
+    let leading = words.trim_start_matches(['0', '.']).chars().next();
+    if matches!(leading, Some('1' | '2' | '5')) { words } else { String::new() }
+}
+
 fn draw(svg: &mut String, series: &[(&str, &[f64])]) -> Result<(), Box<dyn std::error::Error>> {
     let curves: Vec<Vec<(f64, f64)>> = series.iter().map(|(_, values)| curve(values)).collect();
     let all = || curves.iter().flatten();
@@ -78,7 +85,7 @@ fn draw(svg: &mut String, series: &[(&str, &[f64])]) -> Result<(), Box<dyn std::
         .y_desc("us")
         .x_labels(end as usize + 1)
         .x_label_formatter(&|x| percentile(*x))
-        .y_label_formatter(&|y| format!("{y}"))
+        .y_label_formatter(&|y| duration(*y))
         .label_style(("sans-serif", 13))
         .axis_desc_style(("sans-serif", 14))
         .draw()?;

@@ -4,18 +4,27 @@
 use shared::config::{CellConfig, Config};
 use shared::control::{EndReason, Outcome, Reply, Request};
 use shared::exit::{self, Failure, OrExit as _, failure};
+use shared::weights::Weights;
 
 use super::resume;
 use crate::client::{self, Client, Common, FollowError};
+use crate::foreseen;
+
+/// A pour that is expected to be off by more than this is warned of, ml: wanted by the users.
+const WARNED_SD_ML: f32 = 5.0;
 
 /// Command-line arguments.
 #[derive(Debug, clap::Args)]
-#[command(after_help = "Examples:\n  rt-controller pour 75\n  rt-controller pour 120 --json\n\n\
+#[command(after_help = "Examples:\n  rt-controller pour 75\n  rt-controller pour 120 --json\n  rt-controller pour 120 --fill 300\n\n\
 Ctrl-C aborts the pour: the container comes upright.\n\
 Exit codes: 0 poured, 3 no controller, 4 ended early (the reason is printed), 5 refused, 130 interrupted.")]
 pub struct Args {
     /// Goal volume V_G in ml.
     goal_ml: f32,
+    /// What is in the vessel at least, ml: a pour in which nothing flows where this would flow ends at once. Without it, [container]
+    /// least_fill_ml counts, if it is given.
+    #[arg(long)]
+    fill: Option<f64>,
     #[command(flatten)]
     common: Common,
 }
@@ -23,9 +32,56 @@ pub struct Args {
 /// Runs the command.
 pub fn run(args: &Args) -> Result<(), Failure> {
     let config = Config::read(&args.common.config).or_exit(exit::BAD_INPUT)?;
-    let (outcome, recorded) = order(&config.cell, &Request::Pour { goal_ml: args.goal_ml })?;
-    report(&outcome, recorded, args.common.json);
+    let foreseen = Foreseen::of(&config, args)?;
+    if let Some(line) = foreseen.line(args.goal_ml) {
+        eprintln!("{line}");
+    }
+    let request = Request::Pour { goal_ml: args.goal_ml, flows_by_deg: foreseen.flows_by_deg };
+    let (outcome, recorded) = order(&config.cell, &request)?;
+    report(&outcome, recorded, foreseen.sd_ml, args.common.json);
     ended(&outcome)
+}
+
+/// What is known of a pour before it starts.
+struct Foreseen {
+    /// The standard deviation with which it will end, ml, if the weights tell.
+    sd_ml: Option<f32>,
+    /// The tilt by which it must flow, degrees, if the fill is known.
+    flows_by_deg: Option<f32>,
+    /// Whether the controller has the weights that lie in the configured file.
+    same_weights: bool,
+}
+
+impl Foreseen {
+    /// Foresees the pour with the weights that the running controller has.
+    fn of(config: &Config, args: &Args) -> Result<Self, Failure> {
+        let container = config.container;
+        let fill_ml = args.fill.or(container.least_fill_ml);
+        let status = Client::connect_or_end(&config.cell).or_exit(exit::UNREACHABLE)?.status().or_exit(exit::UNREACHABLE)?;
+        let weights = Weights::read(&config.controller.weights).ok().filter(|w| w.identity() == status.weights);
+        let sd_ml = weights.as_ref().and_then(|w| foreseen::poured_sd_ml(w, config.limits, args.goal_ml));
+        let flows_by_deg = weights.as_ref().zip(fill_ml).and_then(|(w, fill_ml)| foreseen::flows_by_deg(w, fill_ml, container.holds_ml));
+        if args.fill.is_some() && flows_by_deg.is_none() {
+            let what = "--fill: the controller's weights do not say by which tilt this fill flows: give what really is in the vessel, or train \
+                        with --estimate fused";
+            return Err(failure(exit::BAD_INPUT, what));
+        }
+        Ok(Self { sd_ml, flows_by_deg, same_weights: weights.is_some() })
+    }
+
+    /// What the operator should know before the pour; `None` if all is well.
+    fn line(&self, goal_ml: f32) -> Option<String> {
+        match self.sd_ml {
+            Some(sd_ml) if sd_ml > WARNED_SD_ML => Some(format!(
+                "warning: a pour of {goal_ml:.0} ml is expected to be off by {sd_ml:.1} ml (standard deviation); `trainer plan` says what to weigh"
+            )),
+            Some(_) => None,
+            None if !self.same_weights => Some(
+                "note: controller.weights is not the file that the controller has taken, so it is not said how far off this will be".into(),
+            ),
+            None => Some("note: the weights do not say how far off this pour will be".into()),
+        }
+    }
 }
 
 /// Fails unless the pour or recording ended with `Done`.
@@ -57,20 +113,20 @@ pub(crate) fn order(cell: &CellConfig, request: &Request) -> Result<(Outcome, Op
 }
 
 /// Prints how the pour ended.
-fn report(outcome: &Outcome, recorded: Option<client::Recorded>, json: bool) {
+fn report(outcome: &Outcome, recorded: Option<client::Recorded>, foreseen_sd_ml: Option<f32>, json: bool) {
     if json {
         let file = recorded.as_ref().and_then(|r| r.file.as_ref().ok());
-        println!("{}", serde_json::json!({ "outcome": outcome, "episode_file": file }));
+        println!("{}", serde_json::json!({ "outcome": outcome, "episode_file": file, "foreseen_sd_ml": foreseen_sd_ml }));
     } else {
         println!(
-            "{}: {} ml poured (estimate) for a goal of {:.1} ml in {:.1} s; {} frames ({} bridged), {} late ticks, {} stale features",
+            "{}: {} ml poured (estimate) for a goal of {:.1} ml in {:.1} s; {} frames ({} bridged), {} gaps between ticks, {} stale features",
             outcome.reason.words(),
             outcome.poured_words(),
             outcome.goal_ml.unwrap_or(f32::NAN),
             outcome.seconds,
             outcome.frames,
             outcome.bridged_frames,
-            outcome.late_ticks,
+            outcome.tick_gaps,
             outcome.stale_features
         );
         match recorded.map(|r| r.file) {

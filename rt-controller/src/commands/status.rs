@@ -3,6 +3,7 @@
 
 use shared::config::Config;
 use shared::control::Status;
+use shared::control::volume_words;
 use shared::exit::{self, Failure, OrExit as _};
 
 use crate::client::{Client, Common};
@@ -39,7 +40,7 @@ fn print(s: &Status) {
         println!("hindrance  {}", s.hindrance);
     }
     println!("alpha      {:.2} deg commanded, {:.2} deg measured", s.alpha_deg, s.alpha_measured_deg);
-    println!("volume     goal {:.1} ml, d {:.1} ml, poured {:.1} ml (estimate)", s.goal_ml, s.d_ml, s.poured_ml);
+    println!("volume     goal {:.1} ml, d {:.1} ml, poured {} ml (estimate)", s.goal_ml, s.d_ml, volume_words(s.poured_ml, s.poured_sd_ml));
     println!("weights    {} ({} taken)", if s.weights.is_empty() { "none" } else { &s.weights }, s.weights_taken);
     if !s.weights_refused.is_empty() {
         println!("           refused: {}", s.weights_refused);
@@ -61,7 +62,7 @@ fn print(s: &Status) {
         println!("\nnewest results");
     }
     for o in &s.outcomes {
-        let what = o.goal_ml.map_or("recording".into(), |g| format!("goal {g:6.1} ml, poured {:6.1} ml", o.poured_ml));
+        let what = o.goal_ml.map_or("recording".into(), |g| format!("goal {g:6.1} ml, poured {:>14} ml", o.poured_words()));
         println!("{:>12}  {what}  {:5.1} s  {}", o.episode, o.seconds, o.reason.words());
     }
 }

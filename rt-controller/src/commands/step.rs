@@ -62,7 +62,7 @@ pub fn run(args: &Args) -> Result<(), Failure> {
     };
     // Two frames come before the first line of input: in one the robot becomes ready, in the other the goal is set.
     frame(0.0, None);
-    let started = frame(0.0, Some(Order::Pour { episode: 1, goal_ml: args.goal }));
+    let started = frame(0.0, Some(Order::Pour { episode: 1, goal_ml: args.goal, flows_by_deg: None }));
     if let Some(Err(refusal)) = started.ordered {
         return Err(failure(exit::REFUSED, refusal));
     }

@@ -13,6 +13,7 @@
 //! | the newest usable measurement is too old | `StaleFeature` |
 //! | the largest number of frames is reached | `MaxFrames` |
 //! | nothing flows at the largest tilt | `ContainerEmpty` |
+//! | nothing was ever seen to flow, beyond the tilt at which the given fill would | `NothingFlows` |
 //! | a stream was seen before, and is not seen any more although the container is tilted further | `StreamLost` |
 //! | the measured tilt does not follow the commanded one, on the way out or back ([`super::following`]) | `NotFollowed` |
 //! | what the camera shows cannot be, by what was learned of vessel and flow | `ImpossibleFlow`, `NothingFlows` |
@@ -62,6 +63,9 @@ const COMING_DEG: f32 = 1.0;
 /// The longest wait for the last drops, and for a joint that comes no nearer to upright, s. Chosen by hand; no measurement is recorded.
 const SETTLE_MAX_S: f64 = 3.0;
 
+/// Number of frames in a row without any flow at a tilt at which the vessel must flow: longer than a joint follows its command late.
+const DRY_FRAMES: u32 = 10;
+
 /// What one frame showed during a pour.
 #[derive(Debug, Clone, Copy)]
 pub struct SeenFrame {
@@ -97,6 +101,10 @@ pub struct Moment {
 /// How far a pour or recording is from its end.
 #[derive(Debug, Clone, Copy)]
 pub struct Ending {
+    /// Tilt by which it must flow, degrees, if it is known how much is in the vessel.
+    flows_by_deg: Option<f32>,
+    /// Number of frames beyond that tilt, in a pour in which nothing was ever seen to flow.
+    dry_frames: u32,
     /// Length of a recording's curve, s; `None` in a pour.
     curve_s: Option<f64>,
     reason: EndReason,
@@ -124,6 +132,8 @@ impl Ending {
     /// The ending of a pour that begins now.
     pub fn of_pour() -> Self {
         Self {
+            flows_by_deg: None,
+            dry_frames: 0,
             curve_s: None,
             reason: EndReason::Done,
             agent_is_done: false,
@@ -140,6 +150,11 @@ impl Ending {
             stream_deg: None,
             nearest: (f32::INFINITY, 0.0),
         }
+    }
+
+    /// The ending of a pour from a vessel that must flow by a tilt, degrees.
+    pub fn of_pour_that_flows_by(flows_by_deg: Option<f32>) -> Self {
+        Self { flows_by_deg, ..Self::of_pour() }
     }
 
     /// The ending of a recording whose curve takes `curve_s` seconds.
@@ -219,6 +234,8 @@ impl Ending {
         } else {
             (self.stream_frames, self.no_stream_frames) = (0, self.no_stream_frames + frames);
         }
+        let dry = !self.seen_flow && self.flows_by_deg.is_some_and(|deg| frame.alpha_deg > deg);
+        self.dry_frames = if dry && !frame.flowing { self.dry_frames + frames } else { 0 };
         let at_largest_tilt = frame.alpha_now_deg >= settings.limits.alpha_max_deg - LARGEST_TILT_SLACK_DEG;
         self.empty_frames = if at_largest_tilt && !frame.flowing { self.empty_frames + frames } else { 0 };
     }
@@ -237,6 +254,7 @@ impl Ending {
             None if self.impossible.is_some() => self.impossible.map(reason_of),
             None if self.agent_is_done => Some(EndReason::Done),
             None if moment.frames >= settings.max_frames => Some(EndReason::MaxFrames),
+            None if self.dry_frames >= DRY_FRAMES => Some(EndReason::NothingFlows),
             None if self.empty_frames >= settings.empty_frames => Some(EndReason::ContainerEmpty),
             None if self.stream_is_lost(moment) => Some(EndReason::StreamLost),
             None => None,
@@ -388,5 +406,28 @@ mod tests {
         let mut done = Ending::of_pour();
         done.end_without_robot(EndReason::ProtectiveStop);
         assert_eq!(done.reason(), EndReason::ProtectiveStop);
+    }
+
+    /// Protects a pour whose camera shows nothing: if it is known how much is in the vessel, the pour ends by name soon after the tilt at which
+    /// that would flow, and not at the largest one. Flow that was seen, or an unknown fill, never ends so.
+    #[test]
+    fn nothing_flows_where_it_must() {
+        let text = include_str!("../../../config/sim.toml");
+        let settings = Settings::new(&shared::config::Config::parse(text, "sim.toml").unwrap());
+        let moment = Moment { running_s: 2.0, frames: 60, measurement_age_ns: 0, alpha_deg: 70.0, poured_ml: 0.0, follows: true };
+        let after = |flows_by_deg: Option<f32>, flowed: bool, frames: u32| {
+            let mut ending = Ending::of_pour_that_flows_by(flows_by_deg);
+            ending.seen_flow = flowed;
+            for _ in 0..frames {
+                let frame = SeenFrame { lost: 0, area_px2: Some(0.0), flowing: false, alpha_deg: 62.0, alpha_now_deg: 63.0 };
+                ending.saw(&frame, &settings);
+            }
+            ending.due(&moment, &settings)
+        };
+        assert_eq!(after(Some(60.0), false, DRY_FRAMES), Some(EndReason::NothingFlows));
+        assert_eq!(after(Some(60.0), false, DRY_FRAMES - 1), None);
+        assert_eq!(after(Some(65.0), false, DRY_FRAMES), None);
+        assert_eq!(after(Some(60.0), true, DRY_FRAMES), None);
+        assert_eq!(after(None, false, DRY_FRAMES), None);
     }
 }

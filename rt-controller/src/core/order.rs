@@ -21,6 +21,8 @@ pub enum Order {
         episode: u64,
         /// Goal volume V_G, ml.
         goal_ml: f32,
+        /// Tilt by which it must flow, degrees, if it is known how much is in the vessel.
+        flows_by_deg: Option<f32>,
     },
     /// Run the curve of eq. (1) once.
     Record {

@@ -81,8 +81,12 @@ pub fn connect_over(network: &dyn Network, options: &LinkOptions, before: &Befor
     let now = network.now_ns();
     (state.received_at_ns, state.advanced_at_ns, state.answered_at_ns) = (now, now, now);
     let at = dialogue.at;
-    Session::new(dialogue.stream, dialogue.inbox, options.tilt, (output_recipe, input_recipe), version, state)
-        .map_err(|e| LinkError::Lost { at, doing: "the hand-over to the loop", what: e.to_string() })
+    let tilt = (options.tilt, options.rate_hz);
+    Session::new(dialogue.stream, dialogue.inbox, tilt, (output_recipe, input_recipe), version, state).map_err(|e| LinkError::Lost {
+        at,
+        doing: "the hand-over to the loop",
+        what: e.to_string(),
+    })
 }
 
 /// Whether the robot may move, runs no program, holds the container upright, and is in nobody's hand, so that the program may be uploaded.

@@ -9,8 +9,8 @@ use super::{ProgramState, RobotState};
 
 /// `Ok` if targets may be sent, otherwise the reason that matters most to the operator.
 ///
-/// `lost_ns` (`controller.lost_robot_ms`) is how long the robot may be silent, how long its clock may stand still, and how long its
-/// program may leave targets unread.
+/// `lost_ns` (`controller.lost_robot_ms`) is how long the robot may be silent, how long its clock may stand still, how long its program may
+/// leave targets unread, and how long a target and the news of it may take on their way.
 pub fn check(state: &RobotState, now_ns: u64, lost_ns: u64) -> Result<(), EndReason> {
     let older = |at_ns: u64| now_ns.saturating_sub(at_ns) > lost_ns;
     // A state this old says nothing about the present.
@@ -24,10 +24,9 @@ pub fn check(state: &RobotState, now_ns: u64, lost_ns: u64) -> Result<(), EndRea
         return Err(EndReason::RobotStalled);
     }
     match state.program_state {
-        // The program heard nothing for too long. If it has read all that was sent, the controller was silent; if not, the link was.
-        ProgramState::Returning | ProgramState::TimedOut if state.sequence_echo == state.sequence_sent => {
-            return Err(EndReason::ControllerOverrun);
-        }
+        // The program heard nothing for too long. That it has read everything by now does not tell why: a link that was held up, or a robot
+        // that did not read, brings all of it at once. The controller knows how long it was silent itself.
+        ProgramState::Returning | ProgramState::TimedOut if state.was_silent => return Err(EndReason::ControllerOverrun),
         ProgramState::Returning | ProgramState::TimedOut => return Err(EndReason::RobotLost),
         // The program found the joint elsewhere than it commanded: a robot that is slower than the program, or is held or moved by hand.
         ProgramState::OffTrack | ProgramState::OffTrackEnded => return Err(EndReason::NotFollowed),
@@ -39,6 +38,10 @@ pub fn check(state: &RobotState, now_ns: u64, lost_ns: u64) -> Result<(), EndRea
     let unread = state.advanced_at_ns.saturating_sub(state.answered_at_ns) > lost_ns;
     if state.runtime_state != RUNTIME_PLAYING || unread {
         return Err(EndReason::ProgramStopped);
+    }
+    // The program reads on, but late: the link holds back what passes over it, so that all that is known of the robot is old too.
+    if state.unread_since_ns != 0 && state.received_at_ns.saturating_sub(state.unread_since_ns) > lost_ns {
+        return Err(EndReason::RobotLost);
     }
     Ok(())
 }

@@ -153,6 +153,11 @@ pub struct RobotState {
     pub sequence_echo: i32,
     /// Number of the newest target that was sent; 0 before the first.
     pub sequence_sent: i32,
+    /// Whether this controller itself was silent so long, within the last second, that the larger part of the program's patience was used up
+    /// before the network came into it.
+    pub was_silent: bool,
+    /// When the oldest target was sent that the program has not read, CLOCK_MONOTONIC ns; 0 if it has read all of them.
+    pub unread_since_ns: u64,
     /// When this state was taken from the socket, CLOCK_MONOTONIC ns.
     pub received_at_ns: u64,
     /// When the robot's clock was last seen to advance, CLOCK_MONOTONIC ns.

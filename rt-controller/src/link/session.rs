@@ -10,11 +10,17 @@ use std::io::ErrorKind;
 use super::health::{self, RUNTIME_PLAYING};
 use super::network::Transport;
 use super::wire::{self, Inbox, OutputRecipe, Outputs};
-use super::{Mode, RobotState, TiltJoint};
+use super::{Mode, RobotState, TiltJoint, program};
 
 /// Largest number of reads in one [`Session::poll`], so that a robot that floods the link cannot hold the loop: 16 of 64 KiB are 10 s of
 /// packets at 500 Hz.
 const MOST_READS: usize = 16;
+/// How long a silence of this controller counts as the reason why the program has given up, ns: one second, which is more than the program's
+/// patience, its answer's way back, and any `controller.lost_robot_ms` of use.
+const SILENCE_COUNTS_NS: u64 = 1_000_000_000;
+/// Number of targets whose times of sending are remembered: two seconds at 30 Hz, half a second at 125 Hz. Of older ones it is enough to know
+/// that they are older.
+const SENT: usize = 64;
 
 /// Why a session is over.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
@@ -46,6 +52,14 @@ pub struct Session {
     texts: u64,
     /// When [`Session::poll`] was last called, ns.
     polled_at_ns: u64,
+    /// When the newest target was sent, ns; 0 before the first.
+    sent_at_ns: u64,
+    /// When the last targets were sent, ns, each at its number modulo [`SENT`].
+    sent_ns: [u64; SENT],
+    /// The silence of this controller that uses up the larger part of the program's patience, ns.
+    silence_ns: u64,
+    /// When such a silence was last seen, ns; 0 if never.
+    silent_at_ns: u64,
 }
 
 impl Session {
@@ -53,13 +67,28 @@ impl Session {
     pub(super) fn new(
         mut stream: Box<dyn Transport>,
         inbox: Inbox,
-        tilt: TiltJoint,
+        (tilt, rate_hz): (TiltJoint, f64),
         (output_recipe, input_recipe): (OutputRecipe, u8),
         version: [u32; 4],
         state: RobotState,
     ) -> std::io::Result<Self> {
         stream.set_wait(None)?;
-        Ok(Self { stream, inbox, tilt, output_recipe, input_recipe, version, state, texts: 0, polled_at_ns: state.received_at_ns })
+        Ok(Self {
+            stream,
+            inbox,
+            tilt,
+            output_recipe,
+            input_recipe,
+            version,
+            state,
+            texts: 0,
+            polled_at_ns: state.received_at_ns,
+            sent_at_ns: 0,
+            sent_ns: [0; SENT],
+            // A period of it is the usual silence, which is nobody's fault.
+            silence_ns: ((program::patience_s(rate_hz) + 1.0 / rate_hz) / 2.0 * 1e9) as u64,
+            silent_at_ns: 0,
+        })
     }
 
     /// PolyScope's version: major, minor, bugfix, build.
@@ -80,6 +109,10 @@ impl Session {
     /// Takes everything that has arrived and gives the newest state. Call it once a tick, before [`super::health::check`].
     pub fn poll(&mut self, now_ns: u64) -> Result<&RobotState, Lost> {
         self.polled_at_ns = now_ns;
+        if self.sent_at_ns != 0 && now_ns.saturating_sub(self.sent_at_ns) > self.silence_ns {
+            self.silent_at_ns = now_ns;
+        }
+        self.state.was_silent = self.silent_at_ns != 0 && now_ns.saturating_sub(self.silent_at_ns) < SILENCE_COUNTS_NS;
         for _ in 0..MOST_READS {
             let space = self.inbox.space();
             let most = space.len();
@@ -115,6 +148,7 @@ impl Session {
                     if echo == sent || echo != before.sequence_echo || sent == 0 {
                         self.state.answered_at_ns = now_ns;
                     }
+                    self.state.unread_since_ns = self.unread_since_ns();
                 }
                 wire::TEXT => self.texts += 1,
                 // Answers that came late, and types of newer protocols, do not matter here.
@@ -122,6 +156,18 @@ impl Session {
             }
         }
         Ok(())
+    }
+
+    /// When the oldest target was sent that the program has not read, ns; 0 if it has read all. A number that this session never sent is one
+    /// of an old session.
+    fn unread_since_ns(&self) -> u64 {
+        let (echo, sent) = (self.state.sequence_echo, self.state.sequence_sent);
+        if echo == sent || sent == 0 {
+            return 0;
+        }
+        let read = if (1..sent).contains(&echo) { echo } else { 0 };
+        let oldest = (read + 1).max(sent.saturating_sub(SENT as i32 - 1));
+        self.sent_ns[oldest as usize % SENT]
     }
 
     /// Sends one target and gives its number. An alpha that is not finite is sent as [`Mode::Hold`].
@@ -142,6 +188,8 @@ impl Session {
             }
         }
         self.state.sequence_sent = sequence;
+        self.sent_at_ns = self.polled_at_ns;
+        self.sent_ns[sequence as usize % SENT] = self.polled_at_ns;
         Ok(sequence)
     }
 }

@@ -186,6 +186,55 @@ fn standing_clocks_and_unread_targets_are_noticed() {
     assert_eq!(echo_at(&mut session, 1.0, 1), (false, true), "a clock that jumps back does not advance");
 }
 
+/// Protects the operator from the wrong culprit: only if this controller was silent for the larger part of the program's patience is it its
+/// fault that the program has given up; a period and a late tick are not, and after a second it is forgotten.
+#[test]
+fn only_our_own_silence_counts_as_ours() {
+    let (mut session, _seen, _) = connected(40);
+    let mut now = session.state().received_at_ns;
+    let mut after = |ms: u64, send: bool| {
+        now += ms * 1_000_000;
+        let was_silent = session.poll(now).unwrap().was_silent;
+        if send {
+            session.send(Mode::Stream, 0.0).unwrap();
+        }
+        was_silent
+    };
+    assert!(!after(1500, true), "before the first target the program waits longer");
+    assert!([33, 33, 60, 33].iter().all(|ms| !after(*ms, true)), "usual ticks and one that is late");
+    assert!(after(90, true), "the tick after a silence");
+    assert!((0..24).all(|_| after(33, true)), "it is remembered for as long as the program's answer takes");
+    assert!(!(0..8).all(|_| after(33, true)), "forgotten after a second");
+}
+
+/// Protects people from news of the past: a link that holds back shows each target read, one after the other, but ever later. The time since
+/// the oldest unread target was sent tells; a number of an old session does not count as read.
+#[test]
+fn old_news_are_noticed() {
+    let (mut session, mut seen, robot) = connected(41);
+    let start = session.state().received_at_ns;
+    let ms = |ms: u64| start + ms * 1_000_000;
+    for k in 1..=30 {
+        session.poll(ms(33 * k)).unwrap();
+        session.send(Mode::Stream, 0.0).unwrap();
+    }
+    let mut unread_since = |echo: i32, timestamp_s: f64| {
+        seen.rtde.write_all(&data(&robot, timestamp_s, ProgramState::Following, echo, 9)).unwrap();
+        for _ in 0..2000 {
+            if session.poll(ms(1000)).unwrap().timestamp_s == timestamp_s {
+                return session.state().unread_since_ns;
+            }
+            thread::sleep(Duration::from_millis(1));
+        }
+        panic!("nothing came");
+    };
+    assert_eq!(unread_since(30, 200.0), 0, "all is read");
+    assert_eq!(unread_since(29, 200.008), ms(33 * 30));
+    assert_eq!(unread_since(10, 200.016), ms(33 * 11), "a second old, though the program reads on");
+    assert_eq!(unread_since(0, 200.024), ms(33));
+    assert_eq!(unread_since(4711, 200.032), ms(33), "what an old session left there");
+}
+
 /// Protects the robot from half a target: only whole packets arrive, numbered from 1 and in the agreed recipe.
 #[test]
 fn targets_arrive_whole_and_numbered() {

@@ -11,7 +11,7 @@ use prost::Message as _;
 
 use super::format::{self, CompressedImage, EpisodeRowJson, TelemetryJson};
 use super::records::{EpisodeError, NextRecord, Records};
-use super::rows::{EpisodeRow, EpisodeTrack, alpha_between_deg, lost_between};
+use super::rows::{EpisodeRow, EpisodeTrack, LostFrames, alpha_between_deg};
 use super::weight::check_reading;
 use super::{Episode, EpisodeInfo, EpisodeKind};
 use crate::gaussian_curve::Curve;
@@ -89,6 +89,7 @@ impl Contents {
         let mut track = EpisodeTrack::new();
         let mut ticks = self.ticks.iter();
         let t_s = |at_ns: u64| (i128::from(at_ns) - i128::from(started_at_ns)) as f64 / 1e9;
+        let mut lost = LostFrames::default();
         let mut rows: Vec<EpisodeRow> = Vec::with_capacity(self.frames.len());
         for frame in &self.frames {
             let doubt = Doubt::ALL.into_iter().find(|d| d.words() == frame.doubt);
@@ -100,7 +101,7 @@ impl Contents {
                 if frame.sequence <= last.sequence || frame.captured_at_ns <= last.captured_at_ns {
                     return Err(format!("frame {} comes after frame {} in the file", frame.sequence, last.sequence));
                 }
-                for (sequence, share) in lost_between(last.sequence, frame.sequence)? {
+                for (sequence, share) in lost.between(last.sequence, frame.sequence)? {
                     let captured_at_ns = last.captured_at_ns + ((frame.captured_at_ns - last.captured_at_ns) as f64 * share) as u64;
                     while !track.covers(captured_at_ns)
                         && let Some(t) = ticks.next()

@@ -9,7 +9,7 @@ use std::collections::BTreeMap;
 use std::fs::{File, OpenOptions};
 use std::path::Path;
 
-use super::rows::{EpisodeRow, alpha_between_deg, lost_between};
+use super::rows::{EpisodeRow, LostFrames, alpha_between_deg};
 use super::weight::{WeightError, check_poured};
 use super::{Episode, EpisodeInfo, EpisodeKind};
 use crate::messages::Doubt;
@@ -136,6 +136,7 @@ pub fn read_table(features: &Path, scale: &Path) -> Result<Vec<Episode>, TableEr
 fn read_features(features: &Path) -> Result<(Vec<Episode>, BTreeMap<String, u64>), TableError> {
     let mut episodes: Vec<Episode> = Vec::new();
     let mut first_line: BTreeMap<String, u64> = BTreeMap::new();
+    let mut lost = LostFrames::default();
     CsvTable::open(features, &FEATURE_COLUMNS)?.for_each_row(|row| {
         let name = row.fields[0];
         if name.is_empty() {
@@ -155,7 +156,7 @@ fn read_features(features: &Path) -> Result<(Vec<Episode>, BTreeMap<String, u64>
             });
         }
         match episodes.last_mut() {
-            Some(episode) => add_row(&mut episode.rows, row),
+            Some(episode) => add_row(&mut episode.rows, &mut lost, row),
             None => Ok(()),
         }
     })?;
@@ -187,7 +188,7 @@ fn read_weights(scale: &Path, features: &Path, episodes: &mut [Episode]) -> Resu
 }
 
 /// Adds a row of the table to an episode, after the rows of the frames that are missing before it.
-fn add_row(rows: &mut Vec<EpisodeRow>, row: &CsvRow) -> Result<(), TableError> {
+fn add_row(rows: &mut Vec<EpisodeRow>, lost: &mut LostFrames, row: &CsvRow) -> Result<(), TableError> {
     let sequence: u64 = row.number(1, "frame", "a whole number")?;
     let t_s: f64 = row.number(2, "t_s", "seconds")?;
     let alpha_deg: f32 = row.number(3, "alpha_deg", "degrees")?;
@@ -208,9 +209,9 @@ fn add_row(rows: &mut Vec<EpisodeRow>, row: &CsvRow) -> Result<(), TableError> {
         if t_s <= last.t_s {
             return Err(row.error(format!("t_s {t_s} is not after {} of the frame before", last.t_s)));
         }
-        for (lost, share) in lost_between(last.sequence, sequence).map_err(|e| row.error(e))? {
+        for (between, share) in lost.between(last.sequence, sequence).map_err(|e| row.error(e))? {
             let alpha_between_deg = alpha_between_deg(last.alpha_commanded_deg, alpha_deg, share);
-            rows.push(episode_row(lost, last.t_s + share * (t_s - last.t_s), alpha_between_deg, f32::NAN));
+            rows.push(episode_row(between, last.t_s + share * (t_s - last.t_s), alpha_between_deg, f32::NAN));
         }
     }
     rows.push(episode_row(sequence, t_s, alpha_deg, area_px2));

@@ -31,6 +31,8 @@ pub enum Fault {
     Split(f64),
     /// RTDE packets arrive four at a time for this long.
     Coalesce(f64),
+    /// Every RTDE packet is sent twice for this long.
+    Twice(f64),
     /// A fieldbus owns this input from now on.
     InUse(String),
     /// The variable of this name is unknown from now on.
@@ -102,6 +104,7 @@ slow-reader=SECONDS   RTDE inputs are read late, then all at once
 skip-outputs=CYCLES   leave out RTDE outputs
 split=SECONDS         RTDE packets arrive in pieces
 coalesce=SECONDS      RTDE packets arrive four at a time
+twice=SECONDS         every RTDE packet is sent twice
 in-use=INPUT          a fieldbus owns this input variable
 not-found=VARIABLE    this variable does not exist
 refuse-version-2      RTDE protocol version 2 is refused
@@ -163,6 +166,7 @@ impl FromStr for Fault {
             "skip-outputs" => given()?.parse().map(Fault::SkipOutputs).map_err(|_| fail("needs a number of cycles")),
             "split" => seconds().map(Fault::Split),
             "coalesce" => seconds().map(Fault::Coalesce),
+            "twice" => seconds().map(Fault::Twice),
             "in-use" => match given()? {
                 variable if Input::parse(variable).is_some() => Ok(Fault::InUse(variable.to_owned())),
                 _ => Err(fail("needs the name of an RTDE input variable")),
@@ -242,6 +246,7 @@ impl fmt::Display for Fault {
             Fault::SkipOutputs(n) => write!(f, "skip-outputs={n}"),
             Fault::Split(s) => write!(f, "split={s}"),
             Fault::Coalesce(s) => write!(f, "coalesce={s}"),
+            Fault::Twice(s) => write!(f, "twice={s}"),
             Fault::InUse(v) => write!(f, "in-use={v}"),
             Fault::NotFound(v) => write!(f, "not-found={v}"),
             Fault::RefuseVersion2 => f.write_str("refuse-version-2"),

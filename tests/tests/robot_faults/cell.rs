@@ -163,7 +163,7 @@ impl Cell {
     }
 
     pub fn pour(&self, goal_ml: f32) -> u64 {
-        self.until("pouring", |c| match c.client.as_ref()?.ask(&Request::Pour { goal_ml }) {
+        self.until("pouring", |c| match c.client.as_ref()?.ask(&Request::Pour { goal_ml, flows_by_deg: None }) {
             Ok(Reply::Started { episode }) => Some(episode),
             _ => None,
         })

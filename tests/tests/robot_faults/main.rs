@@ -125,6 +125,12 @@ fn coalesced() {
     by_itself("coalesce", 11, Expected::Nothing, Fault::Coalesce(1.5));
 }
 
+/// Protects the pour from being ended by what is harmless: every state twice.
+#[test]
+fn twice() {
+    by_itself("twice", 55, Expected::Nothing, Fault::Twice(1.5));
+}
+
 /// Protects the connection from a text message before the first answer.
 #[test]
 fn text_on_connect() {

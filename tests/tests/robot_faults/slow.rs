@@ -62,7 +62,9 @@ fn a_robot_that_slows_itself_is_refused_by_name() {
     assert_eq!(reason, EndReason::NotFollowed, "{}", cell.log());
     assert!(poured_ml < 75.0 + MOST_BEYOND_ML, "{poured_ml}");
     cell.robot.inject(Fault::TimeScaling(0.33));
-    cell.until("slowed", |c| (!matches!(c.client.as_ref()?.ask(&Request::Pour { goal_ml: 8.0 }), Ok(Reply::Started { .. }))).then_some(()));
+    cell.until("slowed", |c| {
+        (!matches!(c.client.as_ref()?.ask(&Request::Pour { goal_ml: 8.0, flows_by_deg: None }), Ok(Reply::Started { .. }))).then_some(())
+    });
     cell.until("upright", |c| (c.alpha().0.abs() < 0.1).then_some(()));
     let (code, said) = cell.command(&["pour", "75"]);
     assert!(code == 5 && said.contains("slows itself to 33 % of its speed (speed_scaling)"), "{code} {said}");

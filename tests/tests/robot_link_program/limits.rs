@@ -233,6 +233,24 @@ fn the_way_upright_waits_for_a_slow_arm() {
     }
 }
 
+/// Protects the arm from a servo that is faster than the limit when the program begins anew: one that catches up after a hard start overshoots
+/// the rate that it was told. In each cycle of such a motion the program is told to begin anew.
+#[test]
+fn a_program_that_begins_anew_is_never_faster_than_the_limit() {
+    for series in BOTH {
+        let mut fastest_deg_s = 0.0f64;
+        for cycles in 0..(0.4 / 0.008) as usize {
+            let mut robot = Robot::ready(series);
+            robot.stream(0.25, &mut limiter(), |_| 110.0);
+            robot.pass(cycles as f64 * 0.002);
+            fastest_deg_s = fastest_deg_s.max(robot.machine.robot.servo.target_qd[5].to_degrees());
+            robot.send(Mode::Abandon, 0.0);
+            assert_ends_upright(&mut robot, 1.0, &format!("{series:?}, begun anew after {cycles} cycles"));
+        }
+        assert!(fastest_deg_s > 92.0, "{series:?}: the servo was never faster than a command: {fastest_deg_s}");
+    }
+}
+
 /// Protects ordinary pours from a false alarm: the hardest motions within the limits, targets that come early, late or in pairs, and a
 /// servo that lags by twice its lookahead are no reason to turn back.
 #[test]

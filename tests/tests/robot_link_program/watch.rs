@@ -71,7 +71,8 @@ impl Watch {
         // The target may go on from the one before, at each speed that that one may have had, or begin anew from where the arm is.
         let mut from: Vec<([f64; 6], f64)> = self.speeds.iter().map(|speed| (self.told, *speed)).collect();
         if self.may_begin_anew(&q) {
-            from.push((self.arm_q, self.arm_qd[self.joint]));
+            // A servo that catches up may be faster than a command may be.
+            from.push((self.arm_q, self.arm_qd[self.joint].clamp(-self.rate_rad_s, self.rate_rad_s)));
             let alpha = self.direction * (self.arm_q[self.joint] - self.start_rad);
             self.range_rad = [self.range_rad[0].min(alpha), self.range_rad[1].max(alpha)];
         }
@@ -100,7 +101,7 @@ impl Watch {
         }
         let now = (q[self.joint] - before[self.joint]) / self.dt_s;
         let rounding = 2.0 * self.rounding_rad / self.dt_s;
-        if now.abs() > self.rate_rad_s.max(rate.abs()) + rounding {
+        if now.abs() > self.rate_rad_s + rounding {
             return Err(format!("the tilting joint is told {now} rad/s"));
         }
         let change = (now - rate).abs();

@@ -1,16 +1,17 @@
 //! `trainer check`: says in words what is wrong with a data set, before any training.
 //!
 //! An offline command on an ordinary thread; it allocates. The command fails if something is wrong with an episode or no episode can be
-//! used, so that scripts can rely on it. What is doubtful about the set as a whole is only said.
+//! used, so that scripts can rely on it. What is doubtful about the set as a whole, and what it does not span, is only said.
 
 use serde::Serialize;
 use shared::episode::{Episode, EpisodeRow};
 use shared::exit::{self, Failure, OrExit as _, failure};
 use shared::messages::Doubt;
 
-use crate::calibration::EXPONENT_NEEDS;
+use crate::calibration::{self, EXPONENT_NEEDS};
 use crate::consistency;
 use crate::data::{self, EpisodeSource, TrainingEpisode};
+use crate::teaching::gaps::{self, Spanned};
 
 /// An episode that begins or ends below this tilt counts as upright there, degrees. Chosen by hand; no measurement is recorded.
 const UPRIGHT_DEG: f32 = 5.0;
@@ -46,6 +47,10 @@ pub struct Findings {
     pub left_out: Vec<(String, String)>,
     /// What is doubtful about episodes that can be used, or about the set.
     pub doubts: Vec<(String, String)>,
+    /// What the episodes span; none without a usable episode.
+    pub spanned: Option<Spanned>,
+    /// Which areas, weights and fills they do not span, and what to record.
+    pub missing: Vec<String>,
 }
 
 /// Looks for faults and doubts in a data set.
@@ -59,7 +64,9 @@ pub fn check(episodes: &[Episode]) -> Findings {
     }
     doubts.extend(consistency::doubtful(&usable.episodes).into_iter().map(|d| (d.name.clone(), d.to_string())));
     doubts.extend(set_doubts(&usable.episodes));
-    Findings { episodes: episodes.len(), usable: usable.episodes.len(), left_out: usable.left_out, doubts }
+    let spanned = gaps::spanned(&usable.episodes, &calibration::calibrate(&usable.episodes, None));
+    let missing = spanned.as_ref().map(Spanned::missing).unwrap_or_default();
+    Findings { episodes: episodes.len(), usable: usable.episodes.len(), left_out: usable.left_out, doubts, spanned, missing }
 }
 
 /// What is doubtful about one recording.
@@ -126,6 +133,9 @@ pub fn run(args: &Args) -> Result<(), Failure> {
         }
         for (name, what) in &findings.doubts {
             println!("doubtful: {}", if what.starts_with(name.as_str()) { what.clone() } else { format!("{name}: {what}") });
+        }
+        for what in &findings.missing {
+            println!("not spanned: {what}");
         }
     }
     let wrong = !findings.left_out.is_empty() || findings.doubts.iter().any(|(name, _)| name != "data set") || findings.usable == 0;

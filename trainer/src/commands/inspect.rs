@@ -5,14 +5,13 @@
 use std::path::PathBuf;
 
 use shared::actions::ACTIONS;
+use shared::episode;
 use shared::estimator::Calibration;
 use shared::estimator::flow::{FlowModel, WayBack};
 use shared::estimator::vessel::Vessel;
 use shared::exit::{self, Failure, OrExit as _};
 use shared::mlp::{HIDDEN, INPUTS, PARAMETERS};
 use shared::weights::{Estimator, FORMAT_VERSION, Weights};
-
-use crate::data;
 
 /// Command-line arguments of `trainer inspect`.
 #[derive(Debug, clap::Args)]
@@ -33,7 +32,7 @@ pub fn run(args: &Args) -> Result<(), Failure> {
     if args.json {
         let all = serde_json::json!({
             "format_version": FORMAT_VERSION, "shape": [INPUTS, HIDDEN, HIDDEN, ACTIONS], "parameters": PARAMETERS,
-            "identity": weights.identity(), "data_sha256": data::hex(&weights.origin.data_sha256), "weights": weights,
+            "identity": weights.identity(), "data_sha256": episode::hex(&weights.origin.data_sha256), "weights": weights,
         });
         println!("{}", serde_json::to_string_pretty(&all).unwrap_or_default());
     } else {
@@ -47,7 +46,7 @@ pub fn run(args: &Args) -> Result<(), Failure> {
 fn print(weights: &Weights) {
     let Weights { network: _, actions_deg, selection, scale, calibration, estimator, rate_hz, origin, seed } = weights;
     println!("trained     method {:?}, {} actions, {} episodes, seed {seed}", origin.method, origin.actions, origin.episodes);
-    println!("data        sha256 {}", data::hex(&origin.data_sha256));
+    println!("data        sha256 {}", episode::hex(&origin.data_sha256));
     println!("network     {INPUTS}-{HIDDEN}-{HIDDEN}-{ACTIONS}, ReLU, {PARAMETERS} parameters, action by {selection:?}");
     println!(
         "inputs      asinh({} v) x {} for v_t, v_t-1, v_t-2 in ml a frame; asinh(d / {} ml) x {}",

@@ -7,6 +7,7 @@
 use std::path::{Path, PathBuf};
 
 use indicatif::{ProgressBar, ProgressStyle};
+use shared::episode;
 use shared::exit::{self, Failure, OrExit as _, failure};
 use shared::limits::Limits;
 
@@ -143,7 +144,7 @@ fn summary(out: &Path, usable: &UsableEpisodes, options: &Options, trained: &Tra
         "options": options,
         "episodes": usable.episodes.iter().map(|e| serde_json::json!({"name": e.name, "weight_g": e.weight_g})).collect::<Vec<_>>(),
         "left_out": usable.left_out,
-        "data_sha256": data::hex(&weights.origin.data_sha256),
+        "data_sha256": episode::hex(&weights.origin.data_sha256),
         "calibration": weights.calibration,
         "estimator": weights.estimator,
         "law": trained.law,

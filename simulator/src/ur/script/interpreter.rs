@@ -232,8 +232,10 @@ impl Interpreter {
 
     fn call_builtin(&mut self, i: usize, function: &BuiltinFunction, robot: &mut Robot) -> InstructionResult {
         let thread = &mut self.threads[i];
-        let arguments = thread.take(function.parameters.len());
-        let wait = match (function.call)(&arguments, robot)? {
+        let at = thread.stack.len().saturating_sub(function.parameters.len());
+        let effect = (function.call)(&thread.stack[at..], robot)?;
+        thread.stack.truncate(at);
+        let wait = match effect {
             Effect::Value(value) => {
                 thread.stack.push(value);
                 return Ok(None);

@@ -4,7 +4,7 @@
 //! program is an error without a line, which the caller adds.
 
 use super::compile::{Code, Op, Routine};
-use super::value::{Value, binary};
+use super::value::{Value, binary, binary_of_floats};
 use crate::ur::robot::Robot;
 
 /// What a thread waits for.
@@ -104,7 +104,7 @@ impl ScriptThread {
             }
             Op::Pose => {
                 let items = self.take(6);
-                self.stack.push(Value::Pose(Value::list(items).and_then(|l| l.six())?));
+                self.stack.push(Value::Pose(Box::new(Value::list(items).and_then(|l| l.six())?)));
             }
             Op::Index => {
                 let index = pop(stack);
@@ -120,6 +120,14 @@ impl ScriptThread {
                 stack.push(value);
             }
             Op::Binary(operator) => {
+                if let [.., a, Value::Float(y)] = stack.as_mut_slice()
+                    && let Value::Float(x) = a
+                    && let Some(value) = binary_of_floats(*operator, *x, *y)
+                {
+                    *a = value;
+                    stack.pop();
+                    return Ok(());
+                }
                 let b = pop(stack);
                 let a = pop(stack);
                 stack.push(binary(*operator, &a, &b)?);
@@ -154,8 +162,14 @@ pub fn pop(stack: &mut Vec<Value>) -> Value {
     stack.pop().unwrap_or(Value::None)
 }
 
+#[inline]
 fn load(slot: &Option<Value>, name: &str) -> Result<Value, String> {
-    slot.clone().ok_or_else(|| format!("'{name}' has no value yet"))
+    match slot {
+        // Numbers are what programs compute with most.
+        Some(Value::Float(value)) => Ok(Value::Float(*value)),
+        Some(value) => Ok(value.clone()),
+        None => Err(format!("'{name}' has no value yet")),
+    }
 }
 
 fn store(slot: &mut Option<Value>, value: Value, name: &str) -> Result<(), String> {

@@ -29,8 +29,8 @@ pub enum Value {
     Str(Arc<str>),
     /// A list.
     List(Arc<Vec<Value>>),
-    /// A pose: x, y, z in m and a rotation vector in rad.
-    Pose([f64; 6]),
+    /// A pose: x, y, z in m and a rotation vector in rad. It is boxed, so that the other values are small.
+    Pose(Box<[f64; 6]>),
     /// A thread started with `run`.
     Thread(u32),
 }
@@ -170,10 +170,11 @@ impl Value {
             return Err(format!("an element of type {} cannot become {}", old.kind(), new.kind()));
         }
         let at = index.int()? as usize;
+        let as_large = old.cells() == new.cells();
         match self {
             Value::List(items) => {
                 Arc::make_mut(items)[at] = new;
-                if self.cells() > MAX_CELLS { Err(format!("a list of more than {MAX_CELLS} values")) } else { Ok(()) }
+                if !as_large && self.cells() > MAX_CELLS { Err(format!("a list of more than {MAX_CELLS} values")) } else { Ok(()) }
             }
             Value::Pose(pose) => {
                 pose[at] = new.number()?;
@@ -206,6 +207,24 @@ impl Value {
 
 fn overflow() -> String {
     "result does not fit an int (32 bits)".to_owned()
+}
+
+/// The value of `a operator b` for two floats, which is what programs compute with most; `None` where that needs more thought.
+pub fn binary_of_floats(operator: Operator, a: f64, b: f64) -> Option<Value> {
+    use Operator::*;
+    Some(match operator {
+        Equal => Value::Bool(a == b),
+        NotEqual => Value::Bool(a != b),
+        Less => Value::Bool(a < b),
+        LessEqual => Value::Bool(a <= b),
+        Greater => Value::Bool(a > b),
+        GreaterEqual => Value::Bool(a >= b),
+        Add => Value::Float(a + b),
+        Subtract => Value::Float(a - b),
+        Multiply => Value::Float(a * b),
+        Divide if b != 0.0 => Value::Float(a / b),
+        _ => return None,
+    })
 }
 
 /// The value of `a operator b`.

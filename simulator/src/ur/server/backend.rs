@@ -23,6 +23,7 @@ pub struct StandingFaults {
     pub skip_until: u64,
     pub split_until: u64,
     pub coalesce_until: u64,
+    pub twice_until: u64,
     /// Ports that refuse connections.
     pub closed_ports: Vec<u16>,
 }
@@ -66,6 +67,7 @@ impl Backend {
             Fault::SkipOutputs(n) => self.faults.skip_until = self.machine.cycle() + u64::from(*n) + 1,
             Fault::Split(s) => self.faults.split_until = self.cycle_in(*s),
             Fault::Coalesce(s) => self.faults.coalesce_until = self.cycle_in(*s),
+            Fault::Twice(s) => self.faults.twice_until = self.cycle_in(*s),
             Fault::InUse(name) => {
                 if let Some(input) = Input::parse(name) {
                     self.owners.claim_for_fieldbus(input);

@@ -280,6 +280,9 @@ impl<S: Read + Write> Client<S> {
             packet.clone_from(&rtde.last);
         }
         rtde.last.clone_from(&packet);
+        if backend.is_before(faults.twice_until) {
+            packet.extend_from_within(..);
+        }
         if coalesce {
             rtde.held.append(&mut packet);
             rtde.held_packets += 1;

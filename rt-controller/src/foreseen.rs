@@ -1,0 +1,160 @@
+//! What can be said of a pour before it starts: how far off it is expected to be, and by which tilt it must flow.
+//!
+//! Used by short commands, in ordinary threads; it allocates and does not fail. What cannot be known is `None`. The pour is foreseen with the
+//! agent that will pour, on the vessel that the weights describe, so the deviation is the one that the agent itself will claim.
+
+use shared::agent::{Agent, Observation};
+use shared::estimator::Calibration;
+use shared::estimator::flow::{CommandHistory, FlowState, FlowTables};
+use shared::estimator::fused::Explanation;
+use shared::limits::{Limiter, Limits};
+use shared::weights::{Estimator, Weights};
+
+/// Tilts at which the flow may begin, degrees: from a nearly full vessel to one that is half empty.
+const ONSETS_DEG: [f32; 3] = [35.0, 50.0, 65.0];
+/// Frames after which a foreseen pour ends in any case: the controller's own default (`controller.max_frames`).
+const MAX_FRAMES: usize = 900;
+/// Frames without flow, on the way back, after which a foreseen pour is over.
+const QUIET_FRAMES: usize = 20;
+/// The largest tilt of the flow model's tables, degrees.
+const LAST_DEG: f64 = 120.0;
+/// How far beyond the tilt of a fill's first drop it must flow, degrees: where capacity curves of real vessels were known least, they were off
+/// by 10 % of the vessel, which is some 8 degrees.
+const BEYOND_DEG: f64 = 10.0;
+
+/// The likelier explanation of the weights; none with the plain sum.
+fn explanation(weights: &Weights) -> Option<&Explanation> {
+    match &weights.estimator {
+        Estimator::Sum => None,
+        Estimator::Fused { model, .. } => Some(model.likelier()),
+    }
+}
+
+/// The standard deviation with which a pour of `goal_ml` will end, ml: the largest over fills from which the goal can be reached. `None` if the
+/// weights carry no deviation, or the vessel cannot give the goal.
+pub fn poured_sd_ml(weights: &Weights, limits: Limits, goal_ml: f32) -> Option<f32> {
+    let Explanation { model, calibration, .. } = explanation(weights)?;
+    let flow = FlowTables::new(model);
+    let sds = ONSETS_DEG.iter().filter_map(|onset_deg| foreseen_sd_ml(weights, (&flow, calibration), limits, goal_ml, *onset_deg));
+    sds.max_by(f32::total_cmp).filter(|sd_ml| *sd_ml > 0.0)
+}
+
+/// The standard deviation at the end of a pour whose flow begins at `onset_deg`; `None` if less than the goal is above the largest tilt.
+fn foreseen_sd_ml(
+    weights: &Weights,
+    (flow, calibration): (&FlowTables, &Calibration),
+    limits: Limits,
+    goal_ml: f32,
+    onset_deg: f32,
+) -> Option<f32> {
+    let headspace_ml = flow.capacity.lost_ml(onset_deg.into());
+    if flow.capacity.lost_ml(limits.alpha_max_deg.into()) - headspace_ml < f64::from(goal_ml) {
+        return None;
+    }
+    let mut agent = Agent::new(weights);
+    agent.start(goal_ml);
+    let mut limiter = Limiter::new(limits, 1.0 / weights.rate_hz, 0.0);
+    let mut state = FlowState { headspace_ml, ..FlowState::default() };
+    let mut history = CommandHistory::standing_at(0.0);
+    let (mut sd_ml, mut quiet) = (0.0, 0);
+    for _ in 0..MAX_FRAMES {
+        let alpha_deg = limiter.alpha_deg();
+        history.push(alpha_deg.into());
+        let leaves_ml = state.step(flow, history.commands(), 0).leaves_ml;
+        let area_px2 = area_px2(calibration, leaves_ml, alpha_deg);
+        let decision =
+            agent.step(Observation { area_px2: Some(area_px2), alpha_deg, alpha_measured_deg: f32::NAN, alpha_now_deg: alpha_deg });
+        sd_ml = decision.poured_sd_ml;
+        quiet = if decision.tilting_back && area_px2 <= 0.0 { quiet + 1 } else { 0 };
+        if quiet >= QUIET_FRAMES {
+            break;
+        }
+        if decision.tilting_back {
+            limiter.step_upright();
+        } else {
+            limiter.step(alpha_deg + decision.dalpha_deg);
+        }
+    }
+    Some(sd_ml)
+}
+
+/// The area that shows an outflow, px^2.
+fn area_px2(calibration: &Calibration, flow_ml: f64, alpha_deg: f32) -> f32 {
+    let at_1_px2_ml = f64::from(calibration.volume_ml(1.0, alpha_deg)).max(1e-12);
+    let area_px2 = (flow_ml.max(0.0) / at_1_px2_ml).powf(1.0 / f64::from(calibration.area_exponent).max(0.2));
+    // Below this no camera shows a stream.
+    if area_px2 < 20.0 { 0.0 } else { area_px2 as f32 }
+}
+
+/// The tilt by which a vessel with `fill_ml` in it must flow, degrees; `None` if the weights describe no vessel or the fill reaches no lip.
+/// `holds_ml` is what the vessel holds, where somebody knows it.
+pub fn flows_by_deg(weights: &Weights, fill_ml: f64, holds_ml: Option<f64>) -> Option<f32> {
+    let capacity = FlowTables::new(&explanation(weights)?.model).capacity;
+    let whole_ml = capacity.lost_ml(LAST_DEG);
+    let empty_ml = whole_ml * (1.0 - fill_ml / holds_ml.unwrap_or(whole_ml)).clamp(0.0, 1.0);
+    let onset_deg = (0..=LAST_DEG as u32).map(f64::from).find(|deg| capacity.lost_ml(*deg) >= empty_ml)?;
+    (onset_deg < LAST_DEG).then_some((onset_deg + BEYOND_DEG) as f32)
+}
+
+#[cfg(test)]
+mod tests {
+    use shared::actions::{STAY, Selection, action_table};
+    use shared::estimator::filter::UNKNOWNS;
+    use shared::estimator::flow::{FlowModel, WayBack};
+    use shared::estimator::fused::{EXPLANATIONS, FusedModel};
+    use shared::estimator::verdict::Bounds;
+    use shared::mlp::{InputScale, Mlp};
+    use shared::weights::{Method, Origin};
+
+    use super::*;
+
+    /// Weights whose network tilts by 0.2 degrees a frame until the goal is reached, for the usual beaker.
+    fn weights() -> Weights {
+        let mut network = Mlp::ZERO;
+        network.b3[STAY + 2] = 1.0;
+        let calibration = Calibration { volume_at_1_px2_ml: 0.0012, area_exponent: 1.2, log_tilt_slope: 0.0, hold_above_px2: 60.0 };
+        let mut unknowns = [[0.0; UNKNOWNS]; UNKNOWNS];
+        for (k, row) in unknowns.iter_mut().enumerate() {
+            row[k] = [0.15f64, 0.04, 0.3].get(k).copied().unwrap_or(0.02).powi(2);
+        }
+        let model = FusedModel {
+            explanations: [Explanation { model: FlowModel::default(), calibration, unknowns }; EXPLANATIONS],
+            tight_share: 0.9,
+            camera: [[0.04, -0.006], [-0.006, 0.001]],
+            gain_sd: 0.015,
+            bounds: Bounds { most_px2: 50_000.0, dry_deg: 90.0 },
+        };
+        Weights {
+            network,
+            actions_deg: action_table(),
+            selection: Selection::Argmax,
+            scale: InputScale::default(),
+            calibration,
+            estimator: Estimator::Fused { model, back: WayBack::new(&Limits::default(), 30.0) },
+            rate_hz: 30.0,
+            origin: Origin { method: Method::Handmade, actions: 21, episodes: 0, data_sha256: [7; 32] },
+            seed: 1,
+        }
+    }
+
+    /// Protects whoever orders a pour: the deviation of a large pour is foreseen as larger than that of a small one, one that the vessel cannot
+    /// give has none, and the plain sum has none.
+    #[test]
+    fn a_deviation_is_foreseen() {
+        let sd = |goal_ml| poured_sd_ml(&weights(), Limits::default(), goal_ml);
+        let (small, large) = (sd(30.0).unwrap(), sd(150.0).unwrap());
+        assert!(small > 0.05 && large > 1.5 * small && large < 30.0, "{small} {large}");
+        assert_eq!(sd(2000.0), None);
+        assert_eq!(poured_sd_ml(&Weights { estimator: Estimator::Sum, ..weights() }, Limits::default(), 30.0), None);
+    }
+
+    /// Protects `pour --fill`: a fuller vessel flows earlier, and a fill that the vessel does not reach its lip with says nothing.
+    #[test]
+    fn a_fill_must_flow_by_a_tilt() {
+        let by = |fill_ml| flows_by_deg(&weights(), fill_ml, Some(520.0));
+        let (full, half) = (by(480.0).unwrap(), by(250.0).unwrap());
+        assert!(full > 15.0 && full + 15.0 < half && half < 90.0, "{full} {half}");
+        assert_eq!(by(0.0), None);
+        assert_eq!(flows_by_deg(&Weights { estimator: Estimator::Sum, ..weights() }, 250.0, None), None);
+    }
+}

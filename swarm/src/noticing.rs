@@ -1,0 +1,68 @@
+//! What a pour must do about a fault: whether it must end, and with which reasons.
+//!
+//! Pure; does not allocate; cannot fail.
+
+use shared::control::EndReason;
+use simulator::ur::Fault;
+
+use crate::what::{EyeFault, What};
+
+/// How long a fault needs that must end any pour, s, besides what any needs; `None` if it need not.
+pub fn must_end(what: &What) -> Option<f64> {
+    match what {
+        What::Robot(Fault::ProtectiveStop | Fault::EmergencyStop | Fault::ProgramPause | Fault::ProgramStop | Fault::Freedrive) => {
+            Some(0.0)
+        }
+        What::Robot(Fault::Fin | Fault::Reset | Fault::Boot | Fault::Offline(_)) | What::LinkCut | What::Abort => Some(0.0),
+        What::Robot(Fault::SpeedSlider(share)) if *share < 0.9 => Some(0.0),
+        What::Robot(Fault::TimeScaling(share)) if *share < 0.9 => Some(0.2),
+        What::Robot(Fault::Freeze(s) | Fault::Stall(s) | Fault::SlowReader(s)) if *s > 0.3 => Some(0.0),
+        What::LinkStall(ms) if *ms > 300 => Some(f64::from(*ms) / 1000.0),
+        What::Suspended(ms) | What::Overrun(ms) if *ms > 200 => Some(f64::from(*ms) / 1000.0),
+        What::ControllerKilled(ms) => Some(f64::from(*ms) / 1000.0),
+        What::Eye(EyeFault::Killed(ms)) => Some(f64::from(*ms) / 1000.0),
+        What::Eye(EyeFault::Hung(ms)) if *ms > 400 => Some(0.0),
+        What::Eye(EyeFault::Loss(frames) | EyeFault::Freeze(frames)) if *frames > 10 => Some(0.0),
+        _ => None,
+    }
+}
+
+/// The reasons that a fault may be reported with.
+pub fn reasons(what: &What) -> &'static [EndReason] {
+    use EndReason::*;
+    match what {
+        What::Abort => &[Aborted, NotUpright],
+        What::Robot(fault) => match fault {
+            Fault::ProtectiveStop => &[ProtectiveStop, NotUpright, ProgramStopped, NotFollowed],
+            Fault::EmergencyStop => &[EmergencyStop, ProgramStopped, RobotNotRunning],
+            Fault::ProgramPause | Fault::ProgramStop | Fault::ProgramResume | Fault::Jog(..) => &[ProgramStopped, NotFollowed],
+            Fault::SpeedSlider(_) | Fault::TimeScaling(_) => &[SpeedReduced, NotFollowed, NotUpright, ProgramStopped],
+            Fault::HeldBack(_) | Fault::JointSpeedLimit(_) => &[NotFollowed, NotUpright, ProtectiveStop, ProgramStopped],
+            Fault::Freedrive => &[InHand, NotFollowed],
+            Fault::Boot => &[RobotNotRunning, ProgramStopped],
+            _ => &[RobotLost, RobotStalled, ProgramStopped, NotFollowed, NotUpright],
+        },
+        What::LinkStall(_) | What::LinkSplit(_) | What::LinkCut => &[RobotLost, RobotStalled, ProgramStopped, NotFollowed, NotUpright],
+        What::Eye(EyeFault::Killed(_) | EyeFault::Two(_)) => &[WorkerRestarted, StaleFeature],
+        What::Eye(_) => &[StaleFeature, WorkerRestarted],
+        What::Overrun(_) | What::Suspended(_) => &[ControllerOverrun, StaleFeature, RobotLost, RobotStalled, ProgramStopped, NotFollowed],
+        What::ControllerKilled(_) => &[RobotLost],
+        _ => &[],
+    }
+}
+
+/// Whether a person takes the robot with it, or stops it, so that it must not be taken back unasked.
+pub fn takes_robot(what: &What) -> bool {
+    let What::Robot(fault) = what else { return false };
+    matches!(fault, Fault::ProtectiveStop | Fault::EmergencyStop | Fault::ProgramStop)
+}
+
+/// Whether the program may end tilted because of it, or the arm be kept from coming upright.
+pub fn leaves_tilted(what: &What) -> bool {
+    let What::Robot(fault) = what else { return false };
+    takes_robot(what)
+        || matches!(
+            fault,
+            Fault::ProgramPause | Fault::Freedrive | Fault::Jog(..) | Fault::Boot | Fault::HeldBack(_) | Fault::JointSpeedLimit(_)
+        )
+}

@@ -1,0 +1,56 @@
+//! The command line: what is wrong is said in one line, and a violation can be shown again.
+#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::too_many_lines)]
+
+use std::process::{Command, Output};
+
+fn swarm(args: &[&str]) -> Output {
+    Command::new(env!("CARGO_BIN_EXE_swarm")).args(args).output().unwrap()
+}
+
+/// Protects an operator who mistypes: one line that names the mistake, on the error stream, and exit code 2.
+#[test]
+fn bad_input_is_one_line() {
+    let cases: [(&[&str], &str); 8] = [
+        (&["--seed", "seven"], "seven"),
+        (&["--seed", "-1"], "-1"),
+        (&["--seeds", "0"], "--seeds"),
+        (&[], "--seed"),
+        (&["--seed", "1", "--only", "earthquake"], "no fault is called earthquake; there are protective-stop, "),
+        (&["--seed", "1", "--keep", "99"], "--keep 99: seed 1 has "),
+        (&["--seeds", "1", "--json", "/nowhere/at/all.json"], "/nowhere/at/all.json: cannot be written"),
+        (&["--seeds", "1", "--only", "earthquake", "--json", "/dev/full"], "earthquake"),
+    ];
+    for (args, part) in cases {
+        let output = swarm(args);
+        let text = String::from_utf8(output.stderr).unwrap();
+        assert_eq!((output.status.code(), text.lines().count()), (Some(2), 1), "{args:?}: {text}");
+        assert!(text.starts_with("error: ") && text.contains(part), "{args:?}: {text}");
+    }
+}
+
+/// Protects an hour of work on a full disk: the results that could not be written are an error, with the file's name.
+#[test]
+fn a_full_disk_is_told() {
+    let output = swarm(&["--seeds", "1", "--from", "1", "--json", "/dev/full"]);
+    let text = String::from_utf8(output.stderr).unwrap();
+    let last = text.lines().last().unwrap();
+    assert_eq!(output.status.code(), Some(2), "{text}");
+    assert!(last.starts_with("error: /dev/full: cannot be written: ") && last.contains("make room"), "{text}");
+}
+
+/// Protects the replay: a seed is told in words, the same twice, and drawn to a file; a plot that cannot be written is one line.
+#[test]
+fn a_seed_is_told_and_drawn() {
+    let plot = std::env::temp_dir().join(format!("swarm-{}.svg", std::process::id()));
+    let args = ["--seed", "3", "--only", "worker-hung", "--plot", plot.to_str().unwrap()];
+    let (one, two) = (swarm(&args), swarm(&args));
+    let drawn = std::fs::read_to_string(&plot).unwrap();
+    std::fs::remove_file(&plot).unwrap();
+    assert_eq!(one.stdout, two.stdout);
+    assert!(String::from_utf8(one.stdout).unwrap().contains("worker-hung"));
+    assert!(["<svg", "degrees", "measured alpha", "poured", "worker-hung"].iter().all(|word| drawn.contains(word)));
+    let nowhere = swarm(&["--seed", "3", "--plot", "/nowhere/at/all.svg"]);
+    let text = String::from_utf8(nowhere.stderr).unwrap();
+    assert_eq!(nowhere.status.code(), Some(2));
+    assert!(text.lines().last().unwrap().starts_with("error: /nowhere/at/all.svg: "), "{text}");
+}

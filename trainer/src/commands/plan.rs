@@ -1,0 +1,117 @@
+//! `trainer plan`: says which curve or pour to weigh next, because it teaches most.
+//!
+//! An offline command on an ordinary thread; it allocates. It changes nothing. Without any weighed episode it needs to know what the vessel
+//! holds. Episodes that cannot be used are named, and left out.
+
+use std::path::PathBuf;
+
+use shared::exit::{self, Failure, OrExit as _, failure};
+use shared::limits::Limits;
+
+use crate::data::{self, DataError, EpisodeSource, UsableEpisodes};
+use crate::fit;
+use crate::teaching::foresight::Foresight;
+use crate::teaching::plan::{Candidate, Plan, Proposal, Wish, plan};
+use crate::teaching::span::Span;
+
+/// Curves stay this far below the largest tilt that may be commanded, degrees: the limiter must not cut them off.
+const BELOW_LIMIT_DEG: f64 = 5.0;
+/// Range of what a vessel may hold, ml. Chosen by hand: a robot that pours holds no less and carries no more.
+const HOLDS_ML: (f64, f64) = (50.0, 10_000.0);
+
+/// Command-line arguments of `trainer plan`.
+#[derive(Debug, clap::Args)]
+#[command(after_help = "Examples:
+  trainer plan out/episodes --holds 500
+  trainer plan out/episodes --holds 500 --goal-max 120 --json
+  trainer plan features.csv --scale scale.csv --holds 500
+
+Says what to record next: two curves first, then what takes most of the doubt about the pours to come, which are small and large goals up to
+--goal-max from every fill. Fill, record or pour, weigh, train, and ask again.
+Exit codes: 0 proposed, 1 nothing can be proposed, 2 the data cannot be read.")]
+pub struct Args {
+    #[command(flatten)]
+    source: EpisodeSource,
+    /// What the vessel holds up to its lip, ml. It is needed before the first weighed episode. Later, fills are reckoned from it.
+    #[arg(long)]
+    holds: Option<f64>,
+    /// Largest goal of the pours to come, ml.
+    #[arg(long, default_value_t = 250.0)]
+    goal_max: f64,
+    /// Configuration of the cell, from which the limits and [container] holds_ml are taken; without it, the limits are the default ones.
+    #[arg(long)]
+    config: Option<PathBuf>,
+    /// Print JSON.
+    #[arg(long)]
+    json: bool,
+}
+
+/// Runs the command.
+pub fn run(args: &Args) -> Result<(), Failure> {
+    let config = args.config.as_deref().map(shared::config::Config::read).transpose().or_exit(exit::BAD_INPUT)?;
+    let limits = config.as_ref().map_or_else(Limits::default, |c| c.limits);
+    let holds_ml = args.holds.or(config.and_then(|c| c.container.holds_ml));
+    if args.holds.is_some_and(|ml| !(HOLDS_ML.0..=HOLDS_ML.1).contains(&ml)) || args.goal_max.is_nan() || args.goal_max < 1.0 {
+        let what = format!("--holds is {} to {} ml, and --goal-max at least 1 ml", HOLDS_ML.0, HOLDS_ML.1);
+        return Err(failure(exit::BAD_INPUT, what));
+    }
+    let usable = match args.source.read() {
+        Ok(episodes) => data::usable(&episodes),
+        // There is nothing yet: that is where a plan begins.
+        Err(DataError::None { .. }) => UsableEpisodes::default(),
+        Err(e) => return Err(failure(exit::BAD_INPUT, e)),
+    };
+    let wish = Wish { goal_max_ml: args.goal_max, alpha_max_deg: f64::from(limits.alpha_max_deg) - BELOW_LIMIT_DEG };
+    let found = propose(&usable, holds_ml, &wish)?;
+    let Some(first) = found.candidates.first() else {
+        let what = "nothing can be proposed for this vessel: give what it really holds with --holds, or a smaller --goal-max";
+        return Err(failure(exit::FAILED, what));
+    };
+    if args.json {
+        let all = serde_json::json!({ "episodes": usable.episodes.len(), "left_out": usable.left_out, "plan": found });
+        println!("{}", serde_json::to_string_pretty(&all).unwrap_or_default());
+        return Ok(());
+    }
+    for (name, what) in &usable.left_out {
+        println!("left out: {name}: {what}");
+    }
+    println!("{}", words(first));
+    if usable.episodes.is_empty() {
+        println!("nothing has been weighed yet; the height is that of a beaker: if nothing flows, take 10 degrees more");
+    } else {
+        println!(
+            "the camera's volume of the pours to come is off by {:.1} ml (standard deviation) now, and by {:.1} ml after it",
+            found.sd_now_ml, first.sd_after_ml
+        );
+    }
+    for other in &found.candidates[1..] {
+        println!("or: {} ({:.1} ml after it)", words(other), other.sd_after_ml);
+    }
+    Ok(())
+}
+
+/// What to weigh next after the usable episodes.
+fn propose(usable: &UsableEpisodes, holds_ml: Option<f64>, wish: &Wish) -> Result<Plan, Failure> {
+    let (vessel, weighed) = if usable.episodes.is_empty() {
+        let what = "no episode was weighed yet: say what the vessel holds with --holds ML or [container] holds_ml";
+        let holds_ml = holds_ml.ok_or_else(|| failure(exit::BAD_INPUT, what))?;
+        (Foresight::unknown(holds_ml, wish.alpha_max_deg), Vec::new())
+    } else {
+        let fit = fit::fit(&usable.episodes);
+        let spans = usable.episodes.iter().map(|e| Span::of_episode(e, &fit.calibration)).collect();
+        (Foresight::new(&fit.model, fit.calibration, holds_ml, wish.alpha_max_deg), spans)
+    };
+    Ok(plan(&vessel, &weighed, wish))
+}
+
+/// A candidate as a person does it.
+fn words(candidate: &Candidate) -> String {
+    match candidate.next {
+        Proposal::Curve { fill_ml, lambda_deg, gamma_per_s2 } => format!(
+            "fill in {fill_ml:.0} ml and record a curve: rt-controller record --lambda {lambda_deg:.0} --gamma {gamma_per_s2}; \
+             some {:.0} g should be on the scale",
+            candidate.weight_ml
+        ),
+        Proposal::Pour { fill_ml, goal_ml } => format!("fill in {fill_ml:.0} ml and pour: rt-controller pour {goal_ml:.0}; weigh it"),
+    }
+}

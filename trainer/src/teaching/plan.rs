@@ -1,0 +1,238 @@
+//! The curve or pour that takes most of the doubt about the pours to come.
+//!
+//! Pure functions of the offline trainer, for any thread; they allocate and do not fail. Each candidate is foreseen in the fitted flow model,
+//! and the one after whose weighing the camera's volumes of the pours to come are least in doubt, on average, is proposed.
+
+use serde::Serialize;
+
+use super::doubt::Doubt;
+use super::foresight::Foresight;
+use super::span::Span;
+
+/// Number of curves that come before any pour: one leaves the exponent open, and a policy that pours needs some idea of both.
+const CURVES_FIRST: usize = 2;
+/// Fills that are considered, as shares of what the vessel holds. The last one leaves room for the way into the gripper.
+const FILL_SHARES: [f64; 6] = [0.4, 0.5, 0.6, 0.7, 0.8, 0.9];
+/// Goals that are considered, ml.
+const GOALS_ML: [f64; 8] = [40.0, 60.0, 80.0, 100.0, 130.0, 160.0, 200.0, 250.0];
+/// How far beyond the tilt of the first drop a curve may go, degrees.
+const BEYOND_DEG: [f64; 4] = [8.0, 12.0, 16.0, 20.0];
+/// Widths of curves, 1/s^2.
+const GAMMAS_PER_S2: [f64; 3] = [0.15, 0.25, 0.5];
+/// Largest share of a fill that is poured: so that a vessel which was misjudged is not poured empty.
+const POURED_SHARE_MAX: f64 = 0.6;
+/// Least volume of a candidate, ml: below it, the scale's rounding hides what is to be learned.
+const LEAST_ML: f64 = 25.0;
+/// Goals of the pours to come, as shares of the largest.
+const GOAL_SHARES: [f64; 4] = [0.1, 0.25, 0.5, 1.0];
+/// Area at which c and q are taken as independent where nothing was seen, log px^2.
+const LOG_AREA_UNSEEN: f64 = 7.5;
+/// What a candidate has to be better by to be proposed instead of an earlier one, share. Curves come after pours.
+const BETTER: f64 = 0.01;
+
+/// What to do next.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+#[serde(tag = "kind", rename_all = "kebab-case")]
+pub enum Proposal {
+    /// Record a curve of eq. (1).
+    Curve {
+        /// What to fill in, ml.
+        fill_ml: f64,
+        /// Height, degrees.
+        lambda_deg: f64,
+        /// Width, 1/s^2.
+        gamma_per_s2: f64,
+    },
+    /// Pour.
+    Pour {
+        /// What to fill in, ml.
+        fill_ml: f64,
+        /// V_G, ml.
+        goal_ml: f64,
+    },
+}
+
+/// A proposal, and what is to be expected of it.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+pub struct Candidate {
+    /// What to do.
+    pub next: Proposal,
+    /// What should be on the scale afterwards, ml.
+    pub weight_ml: f64,
+    /// Mean standard deviation of the camera's volume over the pours to come, when this has been weighed, ml.
+    pub sd_after_ml: f64,
+}
+
+/// What is proposed.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct Plan {
+    /// Mean standard deviation of the camera's volume over the pours to come, ml; of no use before anything was weighed.
+    pub sd_now_ml: f64,
+    /// The best candidate of each kind that is possible, the proposal first.
+    pub candidates: Vec<Candidate>,
+}
+
+/// What is asked for.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Wish {
+    /// The largest goal of the pours to come, ml.
+    pub goal_max_ml: f64,
+    /// The largest tilt of a curve, degrees.
+    pub alpha_max_deg: f64,
+}
+
+/// Rounded down to a multiple of `step`: a fill must go in.
+fn rounded(value: f64, step: f64) -> f64 {
+    (value / step).floor() * step
+}
+
+/// All curves that are possible, with what they show.
+fn curves(vessel: &Foresight, wish: &Wish) -> Vec<(Proposal, Span)> {
+    let mut all = Vec::new();
+    for share in FILL_SHARES {
+        let fill_ml = rounded(share * vessel.holds_ml(), 10.0);
+        for beyond_deg in BEYOND_DEG {
+            let lambda_deg = (vessel.onset_deg(fill_ml) + beyond_deg).round();
+            for gamma_per_s2 in GAMMAS_PER_S2 {
+                let span = vessel.curve(fill_ml, lambda_deg, gamma_per_s2);
+                let possible = (LEAST_ML..POURED_SHARE_MAX * fill_ml).contains(&span.volume_ml());
+                if possible && lambda_deg <= wish.alpha_max_deg {
+                    all.push((Proposal::Curve { fill_ml, lambda_deg, gamma_per_s2 }, span));
+                }
+            }
+        }
+    }
+    all
+}
+
+/// All pours that are possible, with what they show.
+fn pours(vessel: &Foresight, wish: &Wish) -> Vec<(Proposal, Span)> {
+    let mut all = Vec::new();
+    for share in FILL_SHARES {
+        let fill_ml = rounded(share * vessel.holds_ml(), 10.0);
+        for goal_ml in GOALS_ML.into_iter().filter(|goal| *goal <= wish.goal_max_ml.min(POURED_SHARE_MAX * fill_ml)) {
+            if let Some(span) = vessel.pour(fill_ml, goal_ml) {
+                all.push((Proposal::Pour { fill_ml, goal_ml }, span));
+            }
+        }
+    }
+    all
+}
+
+/// The streams of the pours to come: small and large goals from every fill.
+fn pours_to_come(vessel: &Foresight, wish: &Wish) -> Vec<Span> {
+    let goals = GOAL_SHARES.map(|share| share * wish.goal_max_ml);
+    FILL_SHARES
+        .iter()
+        .map(|share| share * vessel.holds_ml())
+        .flat_map(|fill_ml| goals.iter().filter_map(move |goal_ml| vessel.pour(fill_ml, goal_ml.min(POURED_SHARE_MAX * fill_ml))))
+        .collect()
+}
+
+/// The mean standard deviation of the camera's volumes of some pours, ml.
+fn mean_sd_ml(doubt: &Doubt, pours: &[Span]) -> f64 {
+    pours.iter().map(|span| doubt.sd_ml(span)).sum::<f64>() / pours.len().max(1) as f64
+}
+
+/// The doubt that is left by what was weighed.
+pub fn doubt_after(weighed: &[Span]) -> Doubt {
+    let mut areas: Vec<f64> = weighed.iter().filter_map(Span::median_area_px2).map(f64::ln).collect();
+    areas.sort_by(f64::total_cmp);
+    let log_area = areas.get(areas.len() / 2).copied().unwrap_or(LOG_AREA_UNSEEN);
+    weighed.iter().fold(Doubt::before(log_area), |doubt, span| doubt.weighed(span))
+}
+
+/// Proposes what to weigh next, after what was weighed. The candidates are empty if the vessel allows none.
+pub fn plan(vessel: &Foresight, weighed: &[Span], wish: &Wish) -> Plan {
+    let doubt = doubt_after(weighed);
+    let to_come = pours_to_come(vessel, wish);
+    let best = |candidates: Vec<(Proposal, Span)>| -> Option<Candidate> {
+        candidates
+            .into_iter()
+            .map(|(next, span)| Candidate { next, weight_ml: span.volume_ml(), sd_after_ml: mean_sd_ml(&doubt.weighed(&span), &to_come) })
+            .min_by(|a, b| a.sd_after_ml.total_cmp(&b.sd_after_ml))
+    };
+    let curve = best(curves(vessel, wish));
+    let pour = if weighed.len() < CURVES_FIRST { None } else { best(pours(vessel, wish)) };
+    let curve_is_better = match (&curve, &pour) {
+        (Some(curve), Some(pour)) => curve.sd_after_ml < (1.0 - BETTER) * pour.sd_after_ml,
+        _ => false,
+    };
+    let candidates = if curve_is_better { [curve, pour] } else { [pour, curve] };
+    Plan { sd_now_ml: mean_sd_ml(&doubt, &to_come), candidates: candidates.into_iter().flatten().collect() }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const WISH: Wish = Wish { goal_max_ml: 250.0, alpha_max_deg: 105.0 };
+
+    fn next(vessel: &Foresight, weighed: &[Span]) -> (Plan, Candidate) {
+        let plan = plan(vessel, weighed, &WISH);
+        let first = plan.candidates[0];
+        (plan, first)
+    }
+
+    fn span_of(vessel: &Foresight, candidate: &Candidate) -> Span {
+        match candidate.next {
+            Proposal::Curve { fill_ml, lambda_deg, gamma_per_s2 } => vessel.curve(fill_ml, lambda_deg, gamma_per_s2),
+            Proposal::Pour { fill_ml, goal_ml } => vessel.pour(fill_ml, goal_ml).unwrap(),
+        }
+    }
+
+    /// Protects the first hour: two curves come first, then pours from different fills; each weighing takes doubt away, and what follows the
+    /// plan leaves less of it than the same number of pours that are all alike.
+    #[test]
+    fn what_is_proposed_teaches() {
+        let vessel = Foresight::unknown(500.0, 105.0);
+        let mut weighed = Vec::new();
+        let (mut kinds, mut fills, mut sds) = (Vec::new(), Vec::new(), Vec::new());
+        for _ in 0..5 {
+            let (plan, first) = next(&vessel, &weighed);
+            sds.push(plan.sd_now_ml);
+            assert!(first.sd_after_ml < plan.sd_now_ml, "{plan:?}");
+            match first.next {
+                Proposal::Curve { fill_ml, .. } => {
+                    kinds.push('c');
+                    fills.push(fill_ml);
+                }
+                Proposal::Pour { fill_ml, .. } => {
+                    kinds.push('p');
+                    fills.push(fill_ml);
+                }
+            }
+            weighed.push(span_of(&vessel, &first));
+        }
+        assert_eq!(kinds[..2], ['c', 'c'], "{kinds:?}");
+        assert!(kinds[2..].contains(&'p'), "{kinds:?}");
+        let (low, high) = fills.iter().fold((f64::MAX, 0.0f64), |(l, h), f| (l.min(*f), h.max(*f)));
+        assert!(high - low >= 100.0, "{fills:?}");
+        let alike: Vec<Span> = (0..5).map(|_| vessel.curve(450.0, vessel.onset_deg(450.0) + 12.0, 0.25)).collect();
+        let by_plan = mean_sd_ml(&doubt_after(&weighed), &pours_to_come(&vessel, &WISH));
+        let by_habit = mean_sd_ml(&doubt_after(&alike), &pours_to_come(&vessel, &WISH));
+        assert!(by_plan < 0.8 * by_habit, "{by_plan} {by_habit} {sds:?}");
+    }
+
+    /// Protects the bench: whatever the vessel holds, what is proposed goes in, leaves something behind, and can be commanded.
+    #[test]
+    fn what_is_proposed_is_possible() {
+        for holds_ml in [150.0, 300.0, 500.0, 1000.0, 2000.0] {
+            let vessel = Foresight::unknown(holds_ml, 105.0);
+            let mut weighed = Vec::new();
+            for _ in 0..4 {
+                let (_, first) = next(&vessel, &weighed);
+                let (fill_ml, lambda_deg) = match first.next {
+                    Proposal::Curve { fill_ml, lambda_deg, .. } => (fill_ml, lambda_deg),
+                    Proposal::Pour { fill_ml, goal_ml } => {
+                        assert!(goal_ml <= POURED_SHARE_MAX * fill_ml && goal_ml <= WISH.goal_max_ml);
+                        (fill_ml, 0.0)
+                    }
+                };
+                assert!(fill_ml <= 0.92 * holds_ml && lambda_deg <= WISH.alpha_max_deg, "{holds_ml}: {first:?}");
+                assert!(first.weight_ml >= 0.8 * LEAST_ML && first.weight_ml <= 0.7 * fill_ml, "{holds_ml}: {first:?}");
+                weighed.push(span_of(&vessel, &first));
+            }
+        }
+    }
+}
