@@ -10,16 +10,20 @@
 //! | `tilt` | the tilt that a picture shows |
 //! | [`verdict`] | whether what is seen can be |
 //! | [`filter`] | an extended Kalman filter on the flow model |
-//! | [`fused`] | two such filters, and the estimate that they make together |
+//! | `camera_sum` | the camera's own sum, and how far it may be off |
+//! | [`whiteness`] | whether a filter's innovations are independent, as those of a right model are |
+//! | [`fused`] | two filters, and the estimate that they make together with the camera |
 
 use serde::{Deserialize, Serialize};
 
+mod camera_sum;
 pub mod filter;
 pub mod flow;
 pub mod fused;
 mod tilt;
 pub mod verdict;
 pub mod vessel;
+pub mod whiteness;
 
 /// Turns V_e in px^2 into ml a frame: `v = c area^q exp(tilt z)`, with z of [`tilt_z`]; and says when the dropout hold bridges a zero.
 ///

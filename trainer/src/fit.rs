@@ -27,8 +27,9 @@
 use nalgebra::DMatrix;
 use shared::estimator::Calibration;
 use shared::estimator::flow::{DELAY_MAX_FRAMES, FlowModel, FlowNoise, FlowTables, Lateness, WayBack};
-use shared::estimator::fused::{Explanation, FusedEstimator, FusedFrame, FusedModel, TIGHT, WIDE, Whiteness};
+use shared::estimator::fused::{Explanation, FusedEstimator, FusedFrame, FusedModel, TIGHT, WIDE};
 use shared::estimator::verdict::Bounds;
+use shared::estimator::whiteness::Whiteness;
 use shared::limits::Limits;
 
 use crate::calibration::{self, Doubted};

@@ -20,11 +20,13 @@
 
 use serde::{Deserialize, Serialize};
 
-use super::filter::{Filter, Innovation, UnknownsCovariance};
+use super::Calibration;
+use super::camera_sum::{CameraSum, MEASURED_MAX_ML};
+use super::filter::{Filter, UnknownsCovariance};
 use super::flow::{FlowModel, FlowState, FlowTables, WayBack};
 use super::tilt::{Angles, ShownTilt};
 use super::verdict::{Bounds, Impossible, Watch};
-use super::{Calibration, Hold};
+use super::whiteness::Whiteness;
 
 /// Index of the explanation by a vessel of any shape.
 pub const WIDE: usize = 0;
@@ -33,16 +35,6 @@ pub const TIGHT: usize = 1;
 /// Number of explanations.
 pub const EXPLANATIONS: usize = 2;
 
-/// Correlation of the innovations up to which an explanation is fully trusted, and from which on it is not trusted at all, in a pour. On rigs
-/// 100 to 107 and 200 to 207, it was -0.03 to 0.02 where the walls were straight, 0.1 to 0.3 where they were rough, and 0.56 to 0.79 where
-/// the surface swung.
-const TRUSTED_CORRELATION: (f64, f64) = (0.15, 0.35);
-/// The sum of the innovations' squares below which their correlation says little. Chosen by hand: some twenty frames.
-const CORRELATED_SQUARES: f64 = 20.0;
-/// An innovation counts for no more than this in the correlation, standard deviations. Chosen by hand; no measurement is recorded.
-const CORRELATED_SDS: f64 = 6.0;
-/// The least standard deviation of the camera's own sum, ml: the last drops. Chosen by hand; no measurement is recorded.
-const CAMERA_SD_ML: f64 = 0.5;
 /// The estimate of a straight vessel stays within this many standard deviations of the camera's own sum. From the prototype, which tuned it on
 /// simulated rigs; no other measurement is recorded.
 const CAMERA_SDS: f64 = 2.5;
@@ -51,8 +43,6 @@ const CAMERA_ML: f64 = 0.5;
 /// Share of the deviation that the filter finds by itself: the fit tempers the frames, so it doubts too much. On rigs 100 to 107 of simulator b,
 /// 76 % of the pours from cylinders were within 0.8 of it.
 const DEVIATION_SHARE: f64 = 0.72;
-/// A larger outflow in a frame, ml, than any container gives, so that it is no measurement. Chosen by hand; no measurement is recorded.
-const MEASURED_MAX_ML: f64 = 50.0;
 
 /// What an explanation knows before a pour.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
@@ -95,64 +85,6 @@ struct Explaining {
     unknowns: UnknownsCovariance,
     shown: ShownTilt,
     filter: Filter,
-}
-
-/// The camera's own sum of the outflow.
-#[derive(Debug, Clone, Copy, Default)]
-struct CameraSum {
-    hold: Hold,
-    sum_ml: f64,
-    squares_ml2: f64,
-    /// Sum of the outflow times the logarithm of its area.
-    log_area_ml: f64,
-}
-
-impl CameraSum {
-    /// Adds a frame; the dropout hold bridges what is lost.
-    fn add(&mut self, calibration: &Calibration, area_px2: Option<f32>, alpha_deg: f64) {
-        let area_px2 = self.hold.step(area_px2, calibration.hold_above_px2);
-        let ml = f64::from(calibration.volume_ml(area_px2, alpha_deg as f32)).min(MEASURED_MAX_ML);
-        if ml > 0.0 {
-            self.sum_ml += ml;
-            self.squares_ml2 += ml * ml;
-            self.log_area_ml += ml * f64::from(area_px2).ln();
-        }
-    }
-
-    /// Standard deviation of the sum, ml: what the calibration leaves open at the areas of this pour, the pour's own gain, and the frames' noise.
-    fn sd_ml(&self, camera: &[[f64; 2]; 2], gain_sd: f64, frame_sd: f64) -> f64 {
-        let (sum, log) = (self.sum_ml, self.log_area_ml);
-        let [[cc, cq], [_, qq]] = camera;
-        let calibration_ml2 = sum * sum * cc + 2.0 * sum * log * cq + log * log * qq;
-        (calibration_ml2.max(0.0) + (gain_sd * sum).powi(2) + frame_sd * frame_sd * self.squares_ml2 + CAMERA_SD_ML * CAMERA_SD_ML).sqrt()
-    }
-}
-
-/// How white the innovations are: where a model is right, each is independent of the one before it.
-#[derive(Debug, Clone, Copy, PartialEq, Default)]
-pub struct Whiteness {
-    /// Sum of the products of neighbours.
-    pub products: f64,
-    /// Sum of squares.
-    pub squares: f64,
-    newest: f64,
-}
-
-impl Whiteness {
-    fn add(&mut self, innovation: Option<Innovation>) {
-        let Some(Innovation { sds, .. }) = innovation else { return };
-        let sds = sds.clamp(-CORRELATED_SDS, CORRELATED_SDS);
-        self.products += sds * self.newest;
-        self.squares += sds * sds;
-        self.newest = sds;
-    }
-
-    /// How far a model with these innovations is to be trusted, 0 to 1.
-    fn trust(&self) -> f64 {
-        let (whole, none) = TRUSTED_CORRELATION;
-        let correlation = self.products / (self.squares + CORRELATED_SQUARES);
-        ((none - correlation) / (none - whole)).clamp(0.0, 1.0)
-    }
 }
 
 /// One frame, as the fused estimate takes it.

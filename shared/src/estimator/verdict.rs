@@ -31,11 +31,11 @@ const ODD_SDS: f64 = 4.0;
 /// Number of frames in a row in which the stream is behind the tilt: longer than half a swing of a surface that sloshes at 2 Hz.
 const BEHIND_FRAMES: u32 = 10;
 /// How far the capacity may be off what was learned, standard deviations. Chosen by hand; docs/LEARNING.md has the false alarms.
-const CAPACITY_SDS: f64 = 2.5;
+const CAPACITY_SDS: f64 = 4.0;
 /// Largest share of the capacity that this may explain away: some of it there must be. Chosen by hand; no measurement is recorded.
 const CAPACITY_SHARE_MAX: f64 = 0.75;
 /// The least doubt in the balance, ml: a vessel that loses 50 ml in a degree is half of that off. docs/LEARNING.md has the false alarms.
-const BALANCE_ML: f64 = 30.0;
+const BALANCE_ML: f64 = 40.0;
 /// The same as a part of the vessel, degrees: liquid that swings is as far from level. docs/LEARNING.md has the false alarms.
 const BALANCE_DEG: f64 = 3.0;
 /// How far the camera's sum may be off in the balance, as a share. Chosen by hand: three times what five curves leave open.
