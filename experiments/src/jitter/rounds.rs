@@ -21,10 +21,11 @@ use crate::own_cell::{OwnCell, OwnCellError};
 const CONDITIONS: [&str; 3] = ["at rest", "under load", "in a storm"];
 /// Rate at which the cell's robot sends states, Hz: it is a CB3, unless the configuration says otherwise.
 const ROBOT_HZ: u64 = 125;
-/// A quick run: the cell at rest, then so many pieces, each with the cell alone, the bare loop, and cyclictest for such a time, ms. With
-/// starting and stopping it takes less than 60 s.
+/// How long a quick run's cell rests before it pours. With starting, pieces and stopping it takes less than 60 s.
 const QUICK_REST: Duration = Duration::from_secs(4);
+/// Number of pieces of a quick run: two for each of its rounds.
 const QUICK_PIECES: usize = 10;
+/// The times of the cell alone, the bare loop, and cyclictest in a piece, ms: each some thirty ticks or more.
 const QUICK_PIECE_MS: [u64; 3] = [1_500, 1_000, 1_000];
 /// The rounds that the pieces are put together to. The pieces of a round lie half a run apart, so that one of them falls into a pour.
 const QUICK_ROUNDS: usize = 5;
