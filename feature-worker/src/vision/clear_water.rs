@@ -68,6 +68,9 @@ const STEEP_SHARE: f32 = 0.6;
 /// Least height of a profile's steepest step, grey levels a sample. Tuned.
 const STEEP_LEAST: f32 = 4.0;
 
+/// How fast the share of pictures with an even ground follows, a picture. Chosen by hand.
+const EVEN_FOLLOWS: f32 = 0.1;
+
 /// Finds the stream of clear water in the pictures of one camera.
 pub(crate) struct ClearWater {
     /// Pixels of the full picture per pixel of the small one.
@@ -97,6 +100,8 @@ pub(crate) struct ClearWater {
     looked: bool,
     /// There may be a stream where the last one was seen.
     held: bool,
+    /// In which share of the pictures without such a doubt the ground was even, the last ones above all.
+    even_share: f32,
 }
 
 impl ClearWater {
@@ -123,6 +128,7 @@ impl ClearWater {
             compared: 0,
             looked: false,
             held: false,
+            even_share: 0.0,
         })
     }
 
@@ -194,7 +200,9 @@ impl ClearWater {
     /// Takes what is dry over into the memory of the background, and chooses the picture with which the next ones are compared.
     #[inline(always)]
     fn remember(&mut self, height_px: LinearField) -> opencv::Result<()> {
-        let near = self.water.recent_legs_px(self.held).map(|legs_px| {
+        // An even ground that the stream hid is told by what is around it, so it need not be spared.
+        let spared = self.held && self.even_share < 0.5;
+        let near = self.water.recent_legs_px(spared).map(|legs_px| {
             let [a, b] = legs_px.map(|v| v.max(1.0));
             // The outline bulges, and a stream grows from frame to frame.
             let bulge = 2.0 + 0.1 * (a * b).sqrt();
@@ -202,7 +210,7 @@ impl ClearWater {
             let outer = self.line_share([1.35 * a + 8.0, 1.35 * b + 8.0]);
             (WetPlaces { line_share: inner, right_px: self.right_px() }, outer)
         });
-        let dry = DryPlaces { height_px, flows: self.water.flows() || self.held, near, calm: CALM * self.evidence.noise() };
+        let dry = DryPlaces { height_px, flows: self.water.flows() || spared, near, calm: CALM * self.evidence.noise() };
         let is_new = self.background.is_new();
         self.background.remember(&self.now, dry)?;
         self.compared += 1;
@@ -302,6 +310,9 @@ impl Liquid for ClearWater {
     }
 
     fn hold_ground(&mut self, held: bool) {
+        if !held {
+            self.even_share += EVEN_FOLLOWS * (f32::from(u8::from(self.evidence.even())) - self.even_share);
+        }
         self.held = held;
     }
 
