@@ -1,7 +1,7 @@
 //! One explanation of a pour: an extended Kalman filter on the flow model, in the camera's own ml.
 //!
 //! It is pure and runs in the controller's loop: its size is fixed, and it does not allocate or panic. If its numbers ever cease to be
-//! finite, [`Filter::is_finite`] tells the caller. A frame costs about 5 kflop, because most rows of its matrices are sparse.
+//! finite, `Filter::is_finite` tells the caller. A frame costs about 5 kflop, because most rows of its matrices are sparse.
 //!
 //! | symbol | state of the filter |
 //! |---|---|
