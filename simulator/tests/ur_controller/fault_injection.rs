@@ -32,7 +32,7 @@ fn faults_have_names_and_arrive_over_the_operator_port() {
         assert_eq!(fault.to_string(), text);
         seen += 1;
     }
-    assert_eq!(seen, 38);
+    assert_eq!(seen, 41);
     for (text, error) in [
         ("explode", "no such fault"),
         ("stall", "needs a value"),
