@@ -56,7 +56,7 @@ pub struct Args {
 
 /// Runs the command.
 pub fn run(args: &Args) -> Result<(), Failure> {
-    // What it is compared with is read first, because it may be overwritten, and a bad file should not cost nine minutes.
+    // What it is compared with is read first, because it may be overwritten, and a bad file should not cost seventeen minutes.
     let earlier = args.against.as_deref().map(read_earlier).transpose()?;
     let mut cell = OwnCell::prepare("jitter", &args.config, (&args.out, &[]), 1)?;
     std::fs::copy(&args.weights, args.out.join("weights.bin")).map_err(file_error(&args.weights))?;
