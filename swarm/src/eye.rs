@@ -92,7 +92,7 @@ impl Eye {
         let until_ns = |ms: u32| now_ns + u64::from(ms) * 1_000_000;
         match fault {
             EyeFault::Loss(frames) => self.lost = frames,
-            EyeFault::Freeze(frames) => self.frozen = frames,
+            EyeFault::Freeze(frames) => self.frozen = self.frozen.max(frames),
             EyeFault::Duplicate(frames) => self.twice = frames,
             EyeFault::Reorder => self.swapped = true,
             EyeFault::Late(ms) => self.late = (u64::from(ms) * 1_000_000, DRIFT_FRAMES),

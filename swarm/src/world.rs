@@ -12,6 +12,7 @@ use std::time::Duration;
 
 use rt_controller::control_loop::{LoopState, Outside};
 use rt_controller::core::MAX_FEATURES;
+use rt_controller::core::Order;
 use rt_controller::exchange::{Event, Exchange};
 use rt_controller::link::network::{Network, Transport};
 use rt_controller::robot_thread::RobotNote;
@@ -85,8 +86,8 @@ impl World<'_> {
         site.set_now(next_ns);
         if wake_ns > next_ns {
             for order in site.step() {
-                // As the service does: an order asks for the robot, if a person had it.
-                if life.note.get().link == RobotLink::WaitsForOperator {
+                // As the service does: an order that moves asks for the robot, if a person had it; an abort does not.
+                if order != Some(Order::Abort) && life.note.get().link == RobotLink::WaitsForOperator {
                     life.note.asked();
                     life.exchange.resume.store(true, Relaxed);
                 }
@@ -194,8 +195,13 @@ impl Network for World<'_> {
                 Err(e) if e.kind() == ErrorKind::WouldBlock => {}
                 result => return result,
             }
-            if !self.step(until_ns) && self.site.borrow().controller_frozen_until_ns <= until_ns {
-                return Err(ErrorKind::TimedOut.into());
+            // A process that is suspended meanwhile looks again when it goes on.
+            let looks_ns = until_ns.max(self.site.borrow().controller_frozen_until_ns);
+            if !self.step(looks_ns) && looks_ns >= self.site.borrow().controller_frozen_until_ns {
+                return match from.read(buffer) {
+                    Err(e) if e.kind() == ErrorKind::WouldBlock => Err(ErrorKind::TimedOut.into()),
+                    result => result,
+                };
             }
         }
     }

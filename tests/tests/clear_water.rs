@@ -36,14 +36,15 @@ fn clear_water_before_a_plain_wall_is_measured() -> Result<(), Box<dyn std::erro
 }
 
 /// Protects the cell between and during pours: over two whole pours, with the glass at rest before and after, a stream is seen while it
-/// flows and not otherwise. Before a chess board this holds a little less often.
+/// flows and not otherwise. Before a chess board this holds less often, but what is missed is doubted.
 #[test]
 fn whole_pours_are_seen_from_beginning_to_end() -> Result<(), Box<dyn std::error::Error>> {
-    for (background, false_percent, missed_percent) in [(Background::Plain, 0.5, 2.0), (Background::Chess, 8.0, 8.0)] {
+    for (background, false_percent, missed_percent) in [(Background::Plain, 0.5, 2.0), (Background::Chess, 8.0, 12.0)] {
         let view = View { liquid_bgr: None, background, ..View::default() };
         let figures = measure_pours(&view, 2, 2)?;
         assert!(figures.false_flow_percent <= false_percent, "{background:?}: {figures:?}");
         assert!(figures.missed_flow_percent <= missed_percent, "{background:?}: {figures:?}");
+        assert!(figures.unnoticed_percent <= 0.5, "{background:?}: {figures:?}");
     }
     Ok(())
 }
