@@ -203,10 +203,13 @@ impl OwnCell {
         if self.stop.load(Ordering::Relaxed) { Err(OwnCellError::Interrupted) } else { Ok(()) }
     }
 
-    /// A program with its words and this cell's configuration, with nothing to read.
+    /// A program with its words and this cell's configuration, with nothing to read. `episodes` take no configuration.
     pub fn program(&self, program: &str, words: &[&str]) -> Command {
         let mut command = Command::new(self.bin.join(program));
-        command.args(words).arg("--config").arg(&self.config_file).stdin(Stdio::null());
+        command.args(words).stdin(Stdio::null());
+        if words.first() != Some(&"episodes") {
+            command.arg("--config").arg(&self.config_file);
+        }
         command
     }
 
@@ -226,12 +229,12 @@ impl OwnCell {
     /// When it cannot be started or does not succeed.
     pub fn command(&self, program: &str, words: &[&str]) -> Result<Value, OwnCellError> {
         let what = format!("{program} {}", words.join(" "));
-        let mut child = Command::new(self.bin.join(program));
-        child.args(words).stdin(Stdio::null()).stdout(Stdio::piped()).stderr(Stdio::piped());
-        if words.first() != Some(&"episodes") {
-            child.arg("--config").arg(&self.config_file);
-        }
-        let output = child.output().map_err(|error| OwnCellError::File { what: what.clone(), error })?;
+        let mut child = self.program(program, words);
+        let output = child
+            .stdout(Stdio::piped())
+            .stderr(Stdio::piped())
+            .output()
+            .map_err(|error| OwnCellError::File { what: what.clone(), error })?;
         self.succeeded(&what, output.status, &String::from_utf8_lossy(&output.stderr))?;
         Ok(serde_json::from_slice(&output.stdout).unwrap_or(Value::Null))
     }

@@ -247,23 +247,20 @@ impl Core {
                 order::goal_is_legal(goal_ml, &self.settings)?;
                 self.agent.as_mut().ok_or(Refusal::NoWeights)?.start(goal_ml);
                 self.decision = Decision { d_ml: goal_ml, ..Decision::NOTHING };
-                self.begin(episode, Some(goal_ml), None, input);
-                if let Some(run) = &mut self.run {
-                    run.ending = Ending::of_pour_that_flows_by(flows_by_deg);
-                }
+                self.begin(episode, Some(goal_ml), None, Ending::of_pour_that_flows_by(flows_by_deg), input);
             }
             Order::Record { episode, curve } => {
                 situation.may_begin(&self.settings)?;
                 order::curve_is_legal(&curve, &self.settings)?;
                 self.decision = Decision::NOTHING;
-                self.begin(episode, None, Some(curve), input);
+                self.begin(episode, None, Some(curve), Ending::of_recording(f64::from(curve.duration_s())), input);
             }
         }
         Ok(())
     }
 
-    /// Begins a recording of `curve`, or else a pour of `goal_ml`.
-    fn begin(&mut self, episode: u64, goal_ml: Option<f32>, curve: Option<Curve>, input: &Input) {
+    /// Begins a recording of `curve`, or else a pour of `goal_ml`; `ending` says when it is over.
+    fn begin(&mut self, episode: u64, goal_ml: Option<f32>, curve: Option<Curve>, ending: Ending, input: &Input) {
         let newest = input.features.iter().rfind(|f| !intake::is_foreign(f, input.now_ns)).or(self.newest.as_ref());
         self.run = Some(Run {
             episode,
@@ -271,7 +268,7 @@ impl Core {
             frames: 0,
             goal_ml,
             curve,
-            ending: curve.map_or_else(Ending::of_pour, |c| Ending::of_recording(f64::from(c.duration_s()))),
+            ending,
             following: Following::new(self.agent.as_ref().and_then(|agent| agent.learned_lag_s()), &self.settings),
             settling_since_ns: 0,
             worker_epoch_ns: newest.map_or(0, |f| f.worker_epoch_ns),

@@ -16,6 +16,8 @@ const ONSETS_DEG: [f32; 3] = [35.0, 50.0, 65.0];
 const MAX_FRAMES: usize = 900;
 /// Frames without flow, on the way back, after which a foreseen pour is over.
 const QUIET_FRAMES: usize = 20;
+/// Below this area no camera shows a stream, px^2. Chosen by hand; no measurement is recorded.
+const VISIBLE_PX2: f32 = 20.0;
 /// The largest tilt of the flow model's tables, degrees.
 const LAST_DEG: f64 = 120.0;
 /// How far beyond the tilt of a fill's first drop it must flow, degrees: where capacity curves of real vessels were known least, they were off
@@ -61,7 +63,8 @@ fn foreseen_sd_ml(
         let alpha_deg = limiter.alpha_deg();
         history.push(alpha_deg.into());
         let leaves_ml = state.step(flow, history.commands(), 0).leaves_ml;
-        let area_px2 = area_px2(calibration, leaves_ml, alpha_deg);
+        let area_px2 = calibration.area_px2(leaves_ml, alpha_deg) as f32;
+        let area_px2 = if area_px2 < VISIBLE_PX2 { 0.0 } else { area_px2 };
         let decision =
             agent.step(Observation { area_px2: Some(area_px2), alpha_deg, alpha_measured_deg: f32::NAN, alpha_now_deg: alpha_deg });
         sd_ml = decision.poured_sd_ml;
@@ -76,14 +79,6 @@ fn foreseen_sd_ml(
         }
     }
     Some(sd_ml)
-}
-
-/// The area that shows an outflow, px^2.
-fn area_px2(calibration: &Calibration, flow_ml: f64, alpha_deg: f32) -> f32 {
-    let at_1_px2_ml = f64::from(calibration.volume_ml(1.0, alpha_deg)).max(1e-12);
-    let area_px2 = (flow_ml.max(0.0) / at_1_px2_ml).powf(1.0 / f64::from(calibration.area_exponent).max(0.2));
-    // Below this no camera shows a stream.
-    if area_px2 < 20.0 { 0.0 } else { area_px2 as f32 }
 }
 
 /// The tilt by which a vessel with `fill_ml` in it must flow, degrees; `None` if the weights describe no vessel or the fill reaches no lip.

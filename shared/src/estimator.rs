@@ -52,6 +52,12 @@ impl Calibration {
             0.0
         }
     }
+
+    /// Area that shows an outflow at the commanded tilt `alpha_deg`, px^2: the inverse of [`Calibration::volume_ml`]; 0 for no outflow.
+    pub fn area_px2(&self, volume_ml: f64, alpha_deg: f32) -> f64 {
+        let at_1_px2_ml = f64::from(self.volume_ml(1.0, alpha_deg)).max(1e-12);
+        (volume_ml.max(0.0) / at_1_px2_ml).powf(1.0 / f64::from(self.area_exponent).max(0.2))
+    }
 }
 
 /// z of [`Calibration`] at a tilt: (alpha - 60 degrees)/30 degrees cut to +-1.5; 0 for what is not a number.

@@ -206,7 +206,7 @@ impl ModelPour<'_> {
         let log_area = (leaves_ml.max(1e-6) / at_1_px2_ml).ln() / exponent;
         self.believed_ml +=
             leaves_ml * (self.miscalibrated.0 + self.miscalibrated.1 * log_area).clamp(-MISCALIBRATED_MAX, MISCALIBRATED_MAX).exp();
-        let area_px2 = if seen_ml > 0.0 { (seen_ml / at_1_px2_ml).powf(1.0 / exponent) as f32 } else { 0.0 };
+        let area_px2 = calibration.area_px2(seen_ml, alpha_deg as f32) as f32;
         let held_px2 = self.hold.step(Some(area_px2), calibration.hold_above_px2);
         let v_ml = f64::from(calibration.volume_ml(held_px2, alpha_deg as f32));
         self.v_ml = [v_ml, self.v_ml[0], self.v_ml[1]];

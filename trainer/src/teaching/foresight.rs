@@ -87,9 +87,7 @@ impl Foresight {
         let over_lip_ml = self.flow.over_lip(tilt_deg, state.headspace_ml, 0.0).flow_ml;
         let leaves_ml = state.release(over_lip_ml, self.flow.model.film_share);
         if leaves_ml > 0.0 {
-            let at_1_px2_ml = f64::from(self.calibration.volume_ml(1.0, tilt_deg as f32)).max(1e-12);
-            let area_px2 = (leaves_ml / at_1_px2_ml).powf(1.0 / f64::from(self.calibration.area_exponent).max(0.2));
-            span.add(area_px2, tilt_deg, leaves_ml);
+            span.add(self.calibration.area_px2(leaves_ml, tilt_deg as f32), tilt_deg, leaves_ml);
         }
         leaves_ml
     }
