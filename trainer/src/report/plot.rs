@@ -97,7 +97,8 @@ fn draw(svg: &mut String, x_title: &str, y_title: &str, series: &[PlotSeries], f
         y0 = y0.min(0.0);
         y1 = y1.max(0.0);
     }
-    let pad = |a: f64, b: f64| ((b - a) * 0.04).max(1e-6 * b.abs().max(1.0));
+    // Where all values are the same, the axis still has numbers that can be told from each other.
+    let pad = |a: f64, b: f64| if b > a { (b - a) * 0.04 } else { b.abs().max(1.0) };
     let (px, py) = (pad(x0, x1), pad(y0, y1));
     // Where all x are whole numbers, as those of episodes are, there are no ticks between them.
     let whole = all().all(|(x, _)| x.fract() == 0.0);
