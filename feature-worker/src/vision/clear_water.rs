@@ -4,7 +4,8 @@
 //! background is displaced. The container turns, so the background moves in the picture as one rigid piece, while the stream's outline
 //! stays. So the picture is made small (320 px for the whole width), and in each frame:
 //!
-//! 1. [`flicker`] tells whether the light flickers, and [`light`] divides out what bands and colours of the light differ from those on the remembered ground.
+//! 1. [`flicker`] tells whether the light flickers, and [`light`] divides out what bands and colours of the light differ from those on the
+//!    remembered ground.
 //! 2. [`background`] remembers the dry background as one picture that is fixed in the world, and finds how it lies in the camera's picture
 //!    ([`motion`], [`rigid`]; [`follow`] is the inner loop of remembering).
 //! 3. [`evidence`] compares the memory and an earlier picture, both moved, with the picture along [`rays`] from the lip. What differs from

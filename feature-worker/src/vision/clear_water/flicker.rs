@@ -40,6 +40,7 @@ pub(super) struct Flicker {
     // Kept from picture to picture.
     now: Vec<[f32; BLOCKS]>,
     ratios: Vec<f32>,
+    band_ratios: Vec<f32>,
     bands: Vec<f32>,
     /// Pictures with bands, and for how many quiet ones they still count.
     pictures: u32,
@@ -56,6 +57,7 @@ impl Flicker {
             before: room(),
             now: room(),
             ratios: Vec::with_capacity(bands * BLOCKS),
+            band_ratios: Vec::with_capacity(BLOCKS),
             bands: Vec::with_capacity(bands),
             pictures: 0,
             counts_for: 0,
@@ -96,29 +98,23 @@ impl Flicker {
 
     /// Compares the blocks with those of the last picture.
     fn compare(&mut self) -> f32 {
-        let ratios_of = |now: &[f32; BLOCKS], before: &[f32; BLOCKS], ratios: &mut Vec<f32>| {
-            let told = |level: &f32| *level > DARK_LEVEL && *level < BRIGHT_LEVEL;
-            let both = now.iter().zip(before).filter(|(a, b)| told(a) && told(b));
-            ratios.extend(both.map(|(a, b)| a / b));
-        };
+        let told = |level: &f32| *level > DARK_LEVEL && *level < BRIGHT_LEVEL;
         self.bands.clear();
+        self.ratios.clear();
         let mut judged = 0usize;
         for (now, before) in self.now.iter().zip(&self.before) {
-            self.ratios.clear();
-            ratios_of(now, before, &mut self.ratios);
-            if self.ratios.len() < BLOCKS / 2 {
+            self.band_ratios.clear();
+            self.band_ratios.extend(now.iter().zip(before).filter(|(a, b)| told(a) && told(b)).map(|(a, b)| a / b));
+            self.ratios.extend_from_slice(&self.band_ratios);
+            if self.band_ratios.len() < BLOCKS / 2 {
                 continue;
             }
             judged += 1;
-            let middle = median(&mut self.ratios);
-            let agree = self.ratios.iter().filter(|ratio| (*ratio / middle - 1.0).abs() <= AGREES).count();
-            if agree as f32 >= BLOCKS_AGREE * self.ratios.len() as f32 {
+            let middle = median(&mut self.band_ratios);
+            let agree = self.band_ratios.iter().filter(|ratio| (*ratio / middle - 1.0).abs() <= AGREES).count();
+            if agree as f32 >= BLOCKS_AGREE * self.band_ratios.len() as f32 {
                 self.bands.push(middle);
             }
-        }
-        self.ratios.clear();
-        for (now, before) in self.now.iter().zip(&self.before) {
-            ratios_of(now, before, &mut self.ratios);
         }
         let exposure = if self.ratios.is_empty() { 1.0 } else { median(&mut self.ratios) };
         let told = judged >= 4 && self.bands.len() as f32 >= BANDS_TOLD * judged as f32;

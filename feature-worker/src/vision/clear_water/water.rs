@@ -267,7 +267,8 @@ impl Water {
     }
 
     /// Takes note of the full picture's line, whose legs are `scale` times as long as in the small picture; `sine` is that of the angle
-    /// between the axes; where the ground is `sure`, a stream that would begin without an edge is none. What the memory of the background took for water must have its edge in the picture itself.
+    /// between the axes. What the memory of the background took for water must have its edge in the picture itself. Where the ground is
+    /// `sure`, a stream that would begin without an edge is none.
     pub(super) fn confirm(
         &mut self,
         line: Option<FineLine>,
