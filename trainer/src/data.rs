@@ -97,6 +97,12 @@ impl TrainingEpisode {
         self.t_s.is_empty()
     }
 
+    /// The tilt of a frame, degrees: the measured one where there is one, else the commanded one.
+    pub fn tilt_deg(&self, frame: usize) -> f64 {
+        let measured_deg = self.alpha_measured_deg[frame];
+        if measured_deg.is_finite() { measured_deg } else { self.alpha_deg[frame] }
+    }
+
     /// What makes this episode unusable, and what to do about it; `None` if it can be trained on.
     pub fn fault(&self) -> Option<String> {
         let n = self.len();

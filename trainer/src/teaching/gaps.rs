@@ -36,22 +36,16 @@ pub struct Spanned {
     pub last_tilt_deg: f64,
 }
 
-/// The tilt of a frame, degrees: the measured one where there is one.
-fn tilt_deg(episode: &TrainingEpisode, frame: usize) -> f64 {
-    let measured = episode.alpha_measured_deg[frame];
-    if measured.is_finite() { measured } else { episode.alpha_deg[frame] }
-}
-
 /// The tilt at which an episode begins to flow, degrees.
 fn onset_deg(episode: &TrainingEpisode) -> Option<f64> {
-    episode.area_px2.iter().position(|area| *area > 0.0).map(|frame| tilt_deg(episode, frame))
+    episode.area_px2.iter().position(|area| *area > 0.0).map(|frame| episode.tilt_deg(frame))
 }
 
 /// The tilt beyond which an episode pours less than [`SHOWN_ML`], degrees.
 fn last_tilt_deg(episode: &TrainingEpisode, calibration: &Calibration) -> f64 {
     let mut frames: Vec<(f64, f64)> = (0..episode.len())
         .filter(|k| episode.area_px2[*k] > 0.0)
-        .map(|k| (tilt_deg(episode, k), f64::from(calibration.volume_ml(episode.area_px2[k] as f32, tilt_deg(episode, k) as f32))))
+        .map(|k| (episode.tilt_deg(k), f64::from(calibration.volume_ml(episode.area_px2[k] as f32, episode.tilt_deg(k) as f32))))
         .collect();
     frames.sort_by(|a, b| b.0.total_cmp(&a.0));
     let mut beyond_ml = 0.0;

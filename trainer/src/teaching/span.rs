@@ -58,8 +58,7 @@ impl Span {
         let mut hold = Hold::default();
         for (k, area) in episode.area_px2.iter().enumerate() {
             let held = hold.step(Some(*area as f32).filter(|a| !a.is_nan()), calibration.hold_above_px2);
-            let measured = episode.alpha_measured_deg[k];
-            let tilt_deg = if measured.is_finite() { measured } else { episode.alpha_deg[k] };
+            let tilt_deg = episode.tilt_deg(k);
             if held > 0.0 {
                 span.add(f64::from(held), tilt_deg, f64::from(calibration.volume_ml(held, tilt_deg as f32)));
             }
