@@ -88,15 +88,29 @@ pub struct Request {
 }
 
 impl Request {
-    /// The value of `name` in the query, as it is written there.
-    pub fn parameter(&self, name: &str) -> Option<&str> {
-        self.query.split('&').filter_map(|p| p.split_once('=')).find(|(n, _)| *n == name).map(|(_, value)| value)
+    /// The value of `name` in the query.
+    pub fn parameter(&self, name: &str) -> Option<String> {
+        self.query.split('&').filter_map(|p| p.split_once('=')).find(|(n, _)| *n == name).map(|(_, value)| plain(value))
     }
 
     /// The body as JSON.
     pub fn json<T: serde::de::DeserializeOwned>(&self) -> Result<T, String> {
         serde_json::from_slice(&self.body).map_err(|e| format!("the page sent what cannot be read ({e}): load it again"))
     }
+}
+
+/// A value of a query without its escapes; what is no escape stays.
+fn plain(value: &str) -> String {
+    let mut bytes = Vec::new();
+    let mut rest = value;
+    while let Some(at) = rest.find('%') {
+        bytes.extend(rest[..at].bytes());
+        let code = rest.get(at + 1..at + 3).and_then(|c| u8::from_str_radix(c, 16).ok());
+        bytes.push(code.unwrap_or(b'%'));
+        rest = &rest[at + if code.is_some() { 3 } else { 1 }..];
+    }
+    bytes.extend(rest.bytes());
+    String::from_utf8_lossy(&bytes).into_owned()
 }
 
 /// A request that waits for its answer.
