@@ -6,7 +6,7 @@ let frame = null, hold = false, ordered = 0;
 
 /** Draws the camera's picture with region, axes, line and triangle: each with its own dash, and named below. */
 const LINES = [
-  ['region', '#c8c8c8', [2, 3], 'region that is looked at'], ['x', '#ff5a5a', [9, 4], 'x-axis: the glass\'s top edge'],
+  ['region', '#ffffff', [3, 4], 'region that is looked at'], ['x', '#ff5a5a', [9, 4], 'x-axis: the glass\'s top edge'],
   ['y', '#4be04b', [4, 3], 'y-axis: the left side'], ['edge', '#ffff00', [], 'line of the stream and triangle (V_e)'],
 ];
 
@@ -23,10 +23,10 @@ function overlay(p, size, scale, measured) {
     p.setLineDash([]);
   };
   const [x, y, w, h] = about.region_px;
-  draw(0, 1, [[x, y], [x + w, y], [x + w, y + h], [x, y + h]], true);
+  draw(0, 2, [[x, y], [x + w, y], [x + w, y + h], [x, y + h]], true);
   const [ax, ay, bx, by] = about.x_axis_px, [cx, cy, dx, dy] = about.y_axis_px;
-  draw(1, 1.5, [[ax, ay], [bx, by]]);
-  draw(2, 1.5, [[cx, cy], [dx, dy]]);
+  draw(1, 2.5, [[ax, ay], [bx, by]]);
+  draw(2, 2.5, [[cx, cy], [dx, dy]]);
   if (measured && measured.area_px2 > 0) {
     const t = measured.triangle_px;
     draw(3, 1.5, [[t[0], t[1]], [t[2], t[3]], [t[4], t[5]]], true);

@@ -58,6 +58,7 @@ fn get(site: &Site, request: &Request) -> Answer {
         "/pour.js" => Answer::bytes("text/javascript", include_str!("../page/pour.js")),
         "/learn.js" => Answer::bytes("text/javascript", include_str!("../page/learn.js")),
         "/history.js" => Answer::bytes("text/javascript", include_str!("../page/history.js")),
+        "/icon.svg" => Answer::bytes("image/svg+xml", include_str!("../page/icon.svg")),
         "/events" => site.events.stream(),
         "/picture.jpg" => picture(site),
         "/api/about" => Answer::json(&site.about()),
