@@ -14,9 +14,11 @@
 //! | [`wire`] | what crosses the pipe between them |
 //! | [`shelf`] | the weight files |
 //! | [`jobs`], [`programs`] | the house's other programs in the background |
+//! | [`calibration`] | `feature-worker calibrate` in the page |
 //! | [`history`] | the recorded episodes |
 #![forbid(unsafe_code)]
 
+pub mod calibration;
 pub mod cell;
 pub mod history;
 pub mod jobs;

@@ -37,6 +37,8 @@ struct Order {
     accept: Vec<String>,
     leave_out: Vec<String>,
     what: String,
+    seconds: u64,
+    corner: Value,
 }
 
 /// The formats of `feature-worker episodes export`.
@@ -57,6 +59,7 @@ fn get(site: &Site, request: &Request) -> Answer {
         "/live.js" => Answer::bytes("text/javascript", include_str!("../page/live.js")),
         "/pour.js" => Answer::bytes("text/javascript", include_str!("../page/pour.js")),
         "/learn.js" => Answer::bytes("text/javascript", include_str!("../page/learn.js")),
+        "/calibrate.js" => Answer::bytes("text/javascript", include_str!("../page/calibrate.js")),
         "/history.js" => Answer::bytes("text/javascript", include_str!("../page/history.js")),
         "/icon.svg" => Answer::bytes("image/svg+xml", include_str!("../page/icon.svg")),
         "/events" => site.events.stream(),
@@ -74,6 +77,8 @@ fn get(site: &Site, request: &Request) -> Answer {
                 Err(e) => Answer::fault(404, e),
             }
         }
+        "/api/calibration" => Answer::json(&site.calibration.about()),
+        "/api/calibration.jpg" => site.calibration.picture().map_or_else(|e| Answer::fault(404, e), Answer::jpeg),
         "/api/mcap" => site.history.open_file(&file).map_or_else(|e| Answer::fault(404, e), |open| Answer::file(open, &file)),
         "/api/csv" => site.history.csv(&file).map_or_else(
             |e| Answer::fault(404, e),
@@ -174,14 +179,35 @@ fn act(site: &Site, path: &str, order: Order) -> Result<Value, String> {
             "decline" => site.shelf.decline().map(|()| json!({})),
             _ => Err("the page asks for what is not known: load it again".into()),
         },
-        "/api/export" => {
-            let kind = FORMATS.into_iter().find(|f| *f == order.what).ok_or("choose a format")?;
-            let files = order.files.iter().map(|name| site.history.path(name)).collect::<Result<Vec<_>, _>>()?;
-            let seconds = std::time::SystemTime::now().duration_since(std::time::UNIX_EPOCH).map_or(0, |d| d.as_secs());
-            let to = site.history.directory().join("exports").join(format!("{kind}-{seconds}"));
-            site.jobs.start_export(&files, kind, to)?;
-            Ok(site.jobs.about())
-        }
+        "/api/calibrate" => calibrate(site, &order),
+        "/api/export" => export(site, &order),
         _ => Err("there is no such page".into()),
     }
+}
+
+/// One step of a calibration.
+fn calibrate(site: &Site, order: &Order) -> Result<Value, String> {
+    match order.what.as_str() {
+        "colour" | "clear" | "as-configured" => {
+            site.calibration.start(&site.file, order.seconds, &order.what)?;
+            Ok(json!({ "words": "watching" }))
+        }
+        "corner" => site.calibration.order("/corner", &order.corner.to_string()).map(|words| json!({ "words": words })),
+        "write" => site.calibration.order("/write", "{}").map(|words| json!({ "words": words })),
+        "cancel" => {
+            site.calibration.cancel();
+            Ok(json!({ "words": "cancelled" }))
+        }
+        _ => Err("the page asks for what is not known: load it again".into()),
+    }
+}
+
+/// Exports episodes in the background.
+fn export(site: &Site, order: &Order) -> Result<Value, String> {
+    let kind = FORMATS.into_iter().find(|f| *f == order.what).ok_or("choose a format")?;
+    let files = order.files.iter().map(|name| site.history.path(name)).collect::<Result<Vec<_>, _>>()?;
+    let seconds = std::time::SystemTime::now().duration_since(std::time::UNIX_EPOCH).map_or(0, |d| d.as_secs());
+    let to = site.history.directory().join("exports").join(format!("{kind}-{seconds}"));
+    site.jobs.start_export(&files, kind, to)?;
+    Ok(site.jobs.about())
 }

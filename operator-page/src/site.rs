@@ -15,6 +15,7 @@ use shared::messages::{Doubt, Phase};
 use shared::runtime_dir::Place;
 use web::Broadcast;
 
+use crate::calibration::Calibration;
 use crate::cell::{Cell, Live};
 use crate::history::History;
 use crate::jobs::Jobs;
@@ -53,6 +54,8 @@ pub struct Site {
     pub jobs: Arc<Jobs>,
     /// The recorded episodes.
     pub history: History,
+    /// A calibration under way.
+    pub calibration: Arc<Calibration>,
     /// The way to stop.
     pub stopper: Stopper,
     /// All browsers that look.
@@ -76,6 +79,7 @@ impl Site {
             shelf,
             weights: Mutex::new(Value::Null),
             jobs: Arc::default(),
+            calibration: Arc::default(),
             history: History::new(config.recording.directory.clone()),
             stopper: Stopper::new(Place::from(&config.cell), file.clone()),
             events: Broadcast::default(),
