@@ -1,7 +1,7 @@
 // The second tab: record what teaches most, weigh it, learn, and choose the weights.
 'use strict';
 
-let planned = '', tableShown = '', jobShown = '', compareShown = '', table = { episodes: [] };
+let plannedFrom = null, planned = '', tableShown = '', jobShown = '', compareShown = '', table = { episodes: [] };
 /** What a person has said of doubtful episodes: file to true (use it) or false (leave it out). */
 const judged = new Map();
 
@@ -37,6 +37,7 @@ function showPlan(result) {
   planned = key;
   const plan = result?.plan;
   if (!plan) { fill($('plan')); return; }
+  plannedFrom = result.episodes;
   const missing = result.check?.missing || [], left = result.check?.left_out || [];
   const nothing = !plan.candidates.length ? [el('p', { className: 'bad' }, '✕ Nothing can be proposed for this vessel: say what it really holds.')] : [];
   fill($('plan'), result.episodes ? el('p', {}, `The camera's volume of the pours to come is off by ${shown(plan.sd_now_ml)} ml now.`)
@@ -129,6 +130,8 @@ function unweighed() {
   const weighed = table.episodes.filter(e => !e.error && e.weight_g !== null);
   const kinds = kind => weighed.filter(e => e.run.kind === kind).length;
   $('set-words').textContent = `The set: ${kinds('recording')} curves and ${kinds('pour')} pours are weighed${table.unread ? `; ${table.unread} files are still to be read` : ''}.`;
+  const old = plannedFrom !== null && plannedFrom !== weighed.length;
+  $('plan-old').textContent = old ? `! This was proposed from ${plannedFrom} weighed episodes; now there are ${weighed.length}: propose again.` : '';
   const rows = open.slice(0, 12).map(e => {
     const place = el('div', { className: 'proposal' });
     fill(place, el('p', {}, el('b', {}, e.file), ` ${e.started_at_utc}, ${what(e)}`), scale(e.file, e.run.goal_ml ?? NaN, grams => { if (grams === null) place.remove(); else reload(); }));

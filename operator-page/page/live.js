@@ -64,7 +64,8 @@ function headline() {
   document.body.dataset.kind = state.kind;
   $('sign').textContent = SIGNS[state.kind] || '?';
   $('words').textContent = state.doing;
-  $('remedy').textContent = state.remedy || state.live.status?.robot_warning || '';
+  const warning = state.live.status?.robot_warning;
+  $('remedy').textContent = state.remedy || (warning ? `Warning: ${warning}.` : '');
   $('who').textContent = mine ? 'you have the say' : state.say ? `${state.say} has the say` : 'nobody has the say';
   $('take').textContent = mine ? 'Give the say back' : state.say ? 'Take it over' : 'Take the say';
   // A screen reader hears what changes, and not every tenth of a millilitre.

@@ -6,8 +6,7 @@ mod path;
 mod stop;
 mod trouble;
 
-use std::io::{BufRead as _, BufReader, Read as _, Write as _};
-use std::net::TcpStream;
+use std::io::{BufRead as _, BufReader};
 use std::path::{Path, PathBuf};
 use std::process::Child;
 use std::time::Duration;
@@ -41,22 +40,6 @@ impl Page {
 
     fn url(&self) -> String {
         format!("http://{}/", self.address)
-    }
-
-    /// Sends a request as its own page would, and gives the whole answer.
-    fn send(&self, method: &str, path: &str, body: &str) -> String {
-        let mut stream = TcpStream::connect(&self.address).expect("it listens");
-        let own = &self.address;
-        write!(
-            stream,
-            "{method} {path} HTTP/1.1\r\nHost: {own}\r\nOrigin: http://{own}\r\nContent-Type: application/json\r\nConnection: close\r\n\
-             Content-Length: {}\r\n\r\n{body}",
-            body.len()
-        )
-        .expect("it reads");
-        let mut answer = String::new();
-        stream.read_to_string(&mut answer).expect("text");
-        answer
     }
 }
 
