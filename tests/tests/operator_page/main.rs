@@ -2,6 +2,8 @@
 //! wrong on the way. Screenshots of each state are written to `out/operator-page/`.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::too_many_lines)]
 
+mod access;
+mod cost;
 mod path;
 mod stop;
 mod trouble;
