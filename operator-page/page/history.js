@@ -3,10 +3,10 @@
 
 const numeric = (value, digits) => (value === null || value === undefined ? '' : shown(value, digits));
 const COLUMNS = [
-  ['file', 'Episode', e => e.file], ['started_at_utc', 'Started (UTC)', e => (e.started_at_utc || '').replace('T', ' ').replace(/\.?\d*Z$/, '')],
+  ['file', 'Episode', e => e.file], ['started_at_utc', 'Started (UTC)', e => (e.started_at_utc || '').replace('T', ' ').slice(0, 19)],
   ['what', 'What', e => (e.error ? 'UNREADABLE' : what(e))], ['goal', 'Goal, ml', e => numeric(e.run?.goal_ml, 0), true],
   ['weight_g', 'Weight, g', e => numeric(e.weight_g, 1), true], ['error_ml', 'Error, ml', e => numeric(e.error_ml, 1), true],
-  ['seconds', 'Time, s', e => numeric(e.seconds, 1), true], ['ended', 'How it ended', e => e.error || e.ended || '', false, true],
+  ['seconds', 'Time, s', e => numeric(e.seconds, 1), true], ['reason', 'How it ended', e => reasonWords(e), false, true],
   ['doubts', 'Doubts', e => doubtWords(e), false, true], ['weights', 'Weights', e => (e.weights || '').slice(0, 8)],
 ];
 let sorted = ['started_at_utc', -1], chosen = '', rows = null, pictureAt = -1;
@@ -16,7 +16,14 @@ function doubtWords(e) {
   return [...doubtful, ...(e.lost_frames ? [`lost: ${e.lost_frames}`] : []), ...(e.wrong || [])].join('; ');
 }
 
-const valueOf = (e, key) => (key === 'goal' ? e.run?.goal_ml : key === 'what' ? what(e) : key === 'doubts' ? doubtWords(e) : e[key]);
+/** Why a pour ended, as the controller said; a page that was not there only knows what the recorder wrote. */
+function reasonWords(e) {
+  if (e.error) return e.error;
+  if (e.reason) return e.reason;
+  return e.ended ? `recorded to its end (${e.ended})` : 'the recorder was killed';
+}
+
+const valueOf = (e, key) => (key === 'goal' ? e.run?.goal_ml : key === 'what' ? what(e) : key === 'doubts' ? doubtWords(e) : key === 'reason' ? reasonWords(e) : e[key]);
 
 function shownEpisodes() {
   const kind = $('kind').value, word = $('search').value.trim().toLowerCase();
@@ -42,13 +49,13 @@ function showTable() {
     const head = el('th', { scope: 'col', className: number ? 'number' : '', 'aria-sort': on ? (sorted[1] > 0 ? 'ascending' : 'descending') : 'none' },
       el('button', { type: 'button', onclick: () => { sorted = [key, on ? -sorted[1] : 1]; showTable(); } }, `${name}${on ? (sorted[1] > 0 ? ' ▲' : ' ▼') : ''}`));
     return head;
-  }), el('th', { scope: 'col' }, 'Look and save')));
+  }), el('th', { scope: 'col' }, 'Save')));
   fill($('table').tBodies[0], ...list.slice(0, 500).map(e => {
-    const cells = COLUMNS.map(([, , text, number, words]) => el('td', { className: number ? 'number' : words ? 'words' : '' }, text(e)));
+    const look = el('button', { type: 'button', className: 'small look', 'aria-label': `Look at ${e.file}`, onclick: () => open(e.file) }, e.file);
+    const cells = COLUMNS.map(([key, , text, number, words]) => el('td', { className: number ? 'number' : words ? 'words' : '' }, key === 'file' && !e.error ? look : text(e)));
     const save = (path, name) => el('a', { href: `${path}?file=${encodeURIComponent(e.file)}`, download: e.file.replace(/\.mcap$/, name), 'aria-label': `Save ${e.file} as ${name}` }, name.slice(1).toUpperCase());
-    const look = el('button', { type: 'button', className: 'small look', 'aria-label': `Look at ${e.file}`, onclick: () => open(e.file) }, 'Look');
     const tr = el('tr', { className: e.file === chosen ? 'chosen' : '' }, ...cells,
-      el('td', {}, e.error ? null : look, ' ', save('/api/mcap', '.mcap'), ' ', e.error ? null : save('/api/csv', '.csv')));
+      el('td', {}, save('/api/mcap', '.mcap'), ' ', e.error ? null : save('/api/csv', '.csv')));
     return tr;
   }));
   drift();
@@ -63,7 +70,7 @@ function drift() {
   panels($('drift'), { from: 0.5, to: errors.length + 0.5, axis: k => (Number.isInteger(k) ? String(k) : ''), list: [{ title: 'Weight minus goal', unit: 'ml', low: -top, high: top, series: [
     { name: 'one pour', colour: '--series-1', dots: true, points: errors }, { name: 'mean size of the last 5', colour: '--series-2', dash: 1, points: mean }] }] });
   const recent = mean[mean.length - 1][1];
-  $('drift-words').textContent = `${errors.length} weighed pours; the last was off by ${shown(errors[errors.length - 1][1])} ml, the last ${Math.min(5, errors.length)} by ${shown(recent)} ml on average.`;
+  $('drift-words').textContent = `${errors.length} weighed pour${errors.length > 1 ? 's' : ''}; the last was off by ${shown(errors[errors.length - 1][1])} ml, the last ${Math.min(5, errors.length)} by ${shown(recent)} ml on average.`;
 }
 
 async function open(file) {
@@ -74,7 +81,7 @@ async function open(file) {
   $('episode-title').textContent = file;
   const e = table.episodes.find(one => one.file === file) || {};
   const facts = [['What', what(e)], ['Started', e.started_at_utc], ['Goal', e.run?.goal_ml ? `${shown(e.run.goal_ml)} ml` : '–'], ['Weight', e.weight_g === null ? 'not weighed' : `${shown(e.weight_g)} g`],
-    ['Error', Number.isFinite(e.error_ml) ? `${shown(e.error_ml)} ml` : '–'], ['Time', `${shown(e.seconds)} s, ${e.frames} frames`], ['It ended', e.ended || 'the recorder was killed'],
+    ['Error', Number.isFinite(e.error_ml) ? `${shown(e.error_ml)} ml` : '–'], ['Time', `${shown(e.seconds)} s, ${e.frames} frames`], ['It ended', reasonWords(e)], ['By the estimate', e.estimate || '–'],
     ['Weights', e.weights || 'none'], ['Doubts', doubtWords(e) || 'none'], ['Notes', (e.notes || []).join('; ') || 'none']];
   fill($('episode-facts'), ...facts.flatMap(([name, value]) => [el('dt', {}, name), el('dd', {}, value)]));
   $('scrub').max = rows.t_s.length - 1;

@@ -63,7 +63,8 @@ function typed(id) {
   return text === '' ? undefined : Number(text);
 }
 
-const shown = (value, digits = 1) => (Number.isFinite(value) ? value.toFixed(digits) : '–');
+/** A number as people read it; zero has no sign. */
+const shown = (value, digits = 1) => (Number.isFinite(value) ? value.toFixed(digits).replace(/^-(0(\.0*)?)$/, '$1') : '–');
 
 /** The time since something, in words. */
 function ago(seconds) {

@@ -50,13 +50,19 @@ function panels(canvas, { from, to, list, cursor, axis }) {
   const ink = css('--ink'), soft = css('--soft'), grid = css('--grid');
   const left = 46, right = width - 8, foot = 22, gap = 22, each = (height - foot) / list.length;
   const x = t => left + (t - from) / (to - from || 1) * (right - left);
+  const by = step(to - from, width / 90);
+  p.textBaseline = 'alphabetic'; p.fillStyle = soft; p.lineWidth = 1; p.strokeStyle = grid;
+  for (let t = Math.ceil(from / by) * by; t <= to + by / 1e6; t += by) {
+    list.forEach((panel, k) => { p.beginPath(); p.moveTo(x(t), k * each + gap); p.lineTo(x(t), (k + 1) * each - 4); p.stroke(); });
+    p.textAlign = 'center'; p.fillText(axis ? axis(t) : `${Number(t.toPrecision(6))} s`, Math.min(Math.max(x(t), left), right - 12), height - 6);
+  }
   list.forEach((panel, k) => {
     const top = k * each + gap, bottom = (k + 1) * each - 4;
     const [low, high] = range(panel);
     const y = v => bottom - (v - low) / (high - low) * (bottom - top);
-    const by = step(high - low, (bottom - top) / 26);
-    p.textBaseline = 'middle';
-    for (let v = Math.ceil(low / by) * by; v <= high; v += by) {
+    const lines = step(high - low, (bottom - top) / 26);
+    p.textBaseline = 'middle'; p.lineWidth = 1;
+    for (let v = Math.ceil(low / lines) * lines; v <= high; v += lines) {
       p.strokeStyle = grid; p.beginPath(); p.moveTo(left, y(v)); p.lineTo(right, y(v)); p.stroke();
       p.fillStyle = soft; p.textAlign = 'right';
       p.fillText(String(Number(v.toPrecision(6))), left - 5, y(v));
@@ -81,12 +87,6 @@ function panels(canvas, { from, to, list, cursor, axis }) {
     }
     if ((panel.marks || []).length) { p.fillStyle = css('--warn'); p.fillText('× doubtful', at, top - 11); }
   });
-  const by = step(to - from, width / 90);
-  p.textBaseline = 'alphabetic'; p.fillStyle = soft;
-  for (let t = Math.ceil(from / by) * by; t <= to; t += by) {
-    p.strokeStyle = grid; p.beginPath(); p.moveTo(x(t), gap); p.lineTo(x(t), height - foot); p.stroke();
-    p.textAlign = 'center'; p.fillText(axis ? axis(t) : `${Number(t.toPrecision(6))} s`, Math.min(Math.max(x(t), left), right - 12), height - 6);
-  }
   if (Number.isFinite(cursor)) {
     p.strokeStyle = ink; p.lineWidth = 1; p.beginPath(); p.moveTo(x(cursor), gap); p.lineTo(x(cursor), height - foot); p.stroke();
   }

@@ -185,7 +185,7 @@ function result() {
   const head = curve ? `Curve recorded in ${shown(newest.seconds)} s` : `${newest.poured} ml poured of ${shown(goal, 0)} ml`;
   const body = [el('p', { className: 'big' }, head),
     el('p', { className: newest.done ? 'good' : 'bad' }, newest.done ? `✓ Done after ${shown(newest.seconds)} s.` : `✕ It ended early: ${newest.reason}.`)];
-  if (!curve) body.push(el('p', {}, `By the estimate it is ${shown(newest.poured_ml - goal)} ml off.`));
+  if (!curve) body.push(el('p', {}, `By the estimate it is ${shown(Math.abs(newest.poured_ml - goal))} ml ${newest.poured_ml < goal ? 'short of' : 'over'} the goal.`));
   const after = el('div');
   if (newest.file) {
     after.append(scale(newest.file, goal, (grams, error) => {
@@ -230,7 +230,7 @@ function slow() {
   const rows = (status?.outcomes || []).slice().reverse().map(o => el('tr', {}, el('td', { className: 'number' }, o.episode),
     el('td', {}, o.goal_ml === null ? 'curve' : `pour of ${shown(o.goal_ml, 0)} ml`), el('td', { className: 'number' }, o.goal_ml === null ? '' : `${o.poured} ml`),
     el('td', { className: 'number' }, `${shown(o.seconds)} s`), el('td', { className: 'words' }, `${o.done ? '✓' : '✕'} ${o.reason}`)));
-  fill($('outcomes'), rows.length ? el('table', {}, el('thead', {}, el('tr', {}, ...['Number', 'What', 'Poured', 'Time', 'How it ended'].map(h => el('th', { scope: 'col' }, h)))), el('tbody', {}, ...rows))
+  fill($('outcomes'), rows.length ? el('table', {}, el('thead', {}, el('tr', {}, ...[['Number', 1], ['What'], ['Poured', 1], ['Time', 1], ['How it ended']].map(([h, number]) => el('th', { scope: 'col', className: number ? 'number' : '' }, h)))), el('tbody', {}, ...rows))
     : el('p', { className: 'hint' }, 'Nothing has been poured since the controller started.'));
 }
 

@@ -20,6 +20,8 @@ use crate::wire::{self, FromLink, Picture, Point, ToLink};
 const POINTS: usize = 1800;
 /// Number of closed files that are remembered. Chosen by hand: more than the controller's results.
 const FILES: usize = 64;
+/// Number of episodes whose ends are remembered. Chosen by hand: a lab's day.
+const ENDS: usize = 1000;
 /// Longest wait for an answer through the link: the client's own limits, and a little more.
 const ANSWER: Duration = Duration::from_secs(8);
 /// A link that has said nothing for this long hangs and is ended: it asks for the state twice a second, and waits 2 s for an answer.
@@ -50,6 +52,8 @@ pub struct Live {
     pub no_picture: String,
     /// What became of each episode's file.
     pub files: BTreeMap<u64, Result<String, String>>,
+    /// Why pours and recordings ended, and the volume poured by the estimate, by the names of their files.
+    pub ends: BTreeMap<String, (&'static str, String)>,
     looked_at: Option<Instant>,
     heard_at: Option<Instant>,
 }
@@ -58,6 +62,17 @@ impl Live {
     /// Whether the controller ticks.
     pub fn ticks(&self) -> bool {
         self.points_at.is_some_and(|at| at.elapsed() < SILENT)
+    }
+
+    /// Remembers how the episodes ended whose files are known.
+    fn remember_ends(&mut self) {
+        let outcomes = self.status.iter().flat_map(|s| &s.outcomes);
+        let named = outcomes.filter_map(|o| self.files.get(&o.episode)?.as_ref().ok()?.rsplit('/').next().map(|name| (name, o)));
+        let ends: Vec<_> = named.map(|(name, o)| (name.to_string(), (o.reason.words(), o.poured_words()))).collect();
+        self.ends.extend(ends);
+        while self.ends.len() > ENDS {
+            self.ends.pop_first();
+        }
     }
 
     /// What the controller is doing, if it ticks.
@@ -117,6 +132,11 @@ impl Cell {
             self.tell(&ToLink::Look(true));
         }
         answer
+    }
+
+    /// Tells the link whether a pour is held.
+    pub fn hold(&self, held: bool) {
+        self.tell(&ToLink::Hold(held));
     }
 
     /// Sends a message to the link; false if there is none.
@@ -195,6 +215,7 @@ impl Cell {
             FromLink::Status(status) => {
                 live.status = Some(status);
                 live.no_status.clear();
+                live.remember_ends();
             }
             FromLink::NoStatus(what) | FromLink::Broken(what) => {
                 live.status = None;

@@ -85,11 +85,6 @@ impl History {
         Self { directory, table: Mutex::default(), unread: Mutex::default(), open: Mutex::default() }
     }
 
-    /// The directory.
-    pub fn directory(&self) -> &Path {
-        &self.directory
-    }
-
     /// Keeps the table until `stop` is set.
     pub fn keep(&self, stop: &AtomicBool) {
         while !stop.load(Relaxed) {
@@ -111,9 +106,18 @@ impl History {
         }
     }
 
-    /// The table, oldest first, and how many files are still to be read.
-    pub fn table(&self) -> Value {
-        let lines: Vec<Value> = locked(&self.table).values().map(|l| l.value.clone()).collect();
+    /// The table in the order of names, and how many files are still to be read. `ends` says how episodes ended, by name: the reason, and the
+    /// volume poured by the estimate.
+    pub fn table(&self, ends: &BTreeMap<String, (&'static str, String)>) -> Value {
+        let with_end = |(name, line): (&String, &Line)| {
+            let mut value = line.value.clone();
+            if let Some((reason, poured)) = ends.get(name) {
+                value["reason"] = json!(reason);
+                value["estimate"] = json!(format!("{poured} ml"));
+            }
+            value
+        };
+        let lines: Vec<Value> = locked(&self.table).iter().map(with_end).collect();
         json!({ "episodes": lines, "unread": *locked(&self.unread), "directory": self.directory.display().to_string() })
     }
 
@@ -146,6 +150,22 @@ impl History {
         lines.sort_unstable();
         let skipped = last.map_or(0, |n| lines.len().saturating_sub(n));
         lines.into_iter().skip(skipped).map(|(_, name)| self.directory.join(name)).collect()
+    }
+
+    /// What a plan is made from: the weighed files, or else a directory in which no episode is.
+    pub fn for_plan(&self) -> Result<Vec<PathBuf>, String> {
+        let weighed = self.weighed(None);
+        if !weighed.is_empty() {
+            return Ok(weighed);
+        }
+        let none = self.exports();
+        fs::create_dir_all(&none).map_err(|e| format!("{}: {e}", none.display()))?;
+        Ok(vec![none])
+    }
+
+    /// Where exports are written.
+    pub fn exports(&self) -> PathBuf {
+        self.directory.join("exports")
     }
 
     /// The file for a reader's disk.

@@ -91,23 +91,21 @@ impl Jobs {
         })
     }
 
-    /// Plans what to record next from `files`: what is missing, and the best curve or pour.
+    /// Plans what to record next from `of`, of which `weighed` are weighed episodes: what is missing, and the best curve or pour.
     pub fn start_plan(
         self: &Arc<Self>,
-        files: Vec<PathBuf>,
-        directory: &Path,
+        (of, weighed): (&[PathBuf], usize),
         config: &Path,
         holds_ml: Option<f64>,
         goal_max_ml: f32,
     ) -> Result<(), String> {
-        let (directory, config) = (words(directory), words(config));
-        let files: Vec<String> = files.iter().map(|f| words(f)).collect();
+        let config = words(config);
+        let of: Vec<String> = of.iter().map(|f| words(f)).collect();
         self.start(
             "plan",
             Box::new(move |stop, step| {
-                let of = if files.is_empty() { vec![directory] } else { files.clone() };
                 let mut check = Value::Null;
-                if !files.is_empty() {
+                if weighed > 0 {
                     step(Step { stage: "looking at the episodes".into(), ..Step::default() });
                     let arguments = [vec!["check".into(), "--json".into()], of.clone()].concat();
                     check = programs::run("trainer", &arguments, stop, |_| {})?.0;
@@ -117,7 +115,7 @@ impl Jobs {
                 arguments.extend(["--goal-max".into(), goal_max_ml.to_string()]);
                 arguments.extend(holds_ml.iter().flat_map(|ml| ["--holds".into(), ml.to_string()]));
                 let plan = programs::run("trainer", &arguments, stop, |_| {})?.0;
-                Ok(json!({ "plan": plan["plan"], "check": check, "episodes": files.len() }))
+                Ok(json!({ "plan": plan["plan"], "check": check, "episodes": weighed }))
             }),
         )
     }

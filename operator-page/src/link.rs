@@ -2,7 +2,8 @@
 //!
 //! If the cell's shared memory is full, cut or taken away, this process may hang or end; the page and its Stop do not. Three ordinary threads:
 //! one takes telemetry, features and the recorder's reports, one asks the controller, one takes pictures while somebody looks. They allocate
-//! and write what they have to standard output. The process ends when its standard input ends, or with one line that says why.
+//! and write what they have to standard output. The process ends when its standard input ends, or with one line that says why. If the page dies
+//! while a pour is held, nobody holds it any more: then the link stops it before it ends.
 
 use std::collections::VecDeque;
 use std::io::{Stdout, stdin};
@@ -15,6 +16,7 @@ use std::time::{Duration, Instant};
 use feature_worker::drawing::{jpeg, shrunk, to_bgr};
 use feature_worker::source::{FrameSource as _, NextFrame, SharedMemory, WAIT};
 use rt_controller::client::{Client, ClientError};
+use rt_controller::stop_client::Target;
 use shared::config::Config;
 use shared::control::Request;
 use shared::exit::{self, Failure, OrExit as _, failure};
@@ -51,21 +53,26 @@ pub fn run(file: &Path) -> Result<(), Failure> {
     let (look, newest) = (Arc::new(AtomicBool::new(false)), Arc::new(Newest::default()));
     let (asks, asked) = channel();
     let spawn = |name: &str, work: Box<dyn FnOnce() + Send>| std::thread::Builder::new().name(name.into()).spawn(work).map(drop);
-    let (of_telemetry, of_asker, of_camera) = (place.clone(), place.clone(), place);
+    let (of_telemetry, of_asker, of_camera) = (place.clone(), place.clone(), place.clone());
     let (measured, looking, seen) = (Arc::clone(&newest), Arc::clone(&look), newest);
     spawn("telemetry", Box::new(move || end_with(telemetry(&of_telemetry, &token, &measured)))).or_exit(exit::FAILED)?;
     spawn("asker", Box::new(move || asker(&of_asker, &asked))).or_exit(exit::FAILED)?;
     spawn("camera", Box::new(move || camera(&of_camera, &looking, &seen))).or_exit(exit::FAILED)?;
+    let mut held = false;
     let mut input = stdin().lock();
     while let Ok(message) = wire::read::<ToLink>(&mut input) {
         match message {
             ToLink::Look(on) => look.store(on, Relaxed),
+            ToLink::Hold(on) => held = on,
             ToLink::Ask(number, request) => {
                 if asks.send((number, request)).is_err() {
                     break;
                 }
             }
         }
+    }
+    if held {
+        Target::from(place).ask("abort");
     }
     Ok(())
 }

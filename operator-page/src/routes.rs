@@ -66,7 +66,10 @@ fn get(site: &Site, request: &Request) -> Answer {
         "/picture.jpg" => picture(site),
         "/api/about" => Answer::json(&site.about()),
         "/api/minute" => Answer::json(&site.minute()),
-        "/api/episodes" => Answer::json(&site.history.table()),
+        "/api/episodes" => {
+            let ends = site.cell.live().ends.clone();
+            Answer::json(&site.history.table(&ends))
+        }
         "/api/plan" => Answer::json(&site.jobs.plan()),
         "/api/rows" => line(site.history.rows(&file)),
         "/api/frame" => {
@@ -159,8 +162,8 @@ fn act(site: &Site, path: &str, order: Order) -> Result<Value, String> {
         "/api/resume" => orders::resume(site).map(|()| json!({ "words": "the robot is connected" })),
         "/api/weigh" => orders::weigh(site, &order.file, order.grams.ok_or("give the scale's reading in g")?),
         "/api/plan" => {
-            let (directory, most) = (site.history.directory(), site.config.controller.goal_max_ml);
-            site.jobs.start_plan(site.history.weighed(None), directory, &site.file, order.holds_ml, most)?;
+            let (of, weighed) = (site.history.for_plan()?, site.history.weighed(None).len());
+            site.jobs.start_plan((&of, weighed), &site.file, order.holds_ml, site.config.controller.goal_max_ml)?;
             Ok(site.jobs.about())
         }
         "/api/learn" => {
@@ -207,7 +210,7 @@ fn export(site: &Site, order: &Order) -> Result<Value, String> {
     let kind = FORMATS.into_iter().find(|f| *f == order.what).ok_or("choose a format")?;
     let files = order.files.iter().map(|name| site.history.path(name)).collect::<Result<Vec<_>, _>>()?;
     let seconds = std::time::SystemTime::now().duration_since(std::time::UNIX_EPOCH).map_or(0, |d| d.as_secs());
-    let to = site.history.directory().join("exports").join(format!("{kind}-{seconds}"));
+    let to = site.history.exports().join(format!("{kind}-{seconds}"));
     site.jobs.start_export(&files, kind, to)?;
     Ok(site.jobs.about())
 }

@@ -98,6 +98,7 @@ pub fn run(args: &Args) -> Result<(), Failure> {
         scope.spawn(|| site.look_at_weights(stop));
         scope.spawn(|| site.history.keep(stop));
     });
+    site.end();
     Ok(())
 }
 

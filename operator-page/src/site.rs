@@ -98,6 +98,18 @@ impl Site {
     pub fn hold(&self, episode: u64) {
         *locked(&self.held) = episode;
         self.say().hold(true);
+        self.cell.hold(true);
+    }
+
+    /// Ends what would go on without this program: a pour that is held, work in the background.
+    pub fn end(&self) {
+        if std::mem::take(&mut *locked(&self.held)) != 0 {
+            // The link would say the same; whether it is obeyed, nobody is left to tell.
+            let _ = self.stopper.stop();
+        }
+        self.jobs.cancel();
+        self.calibration.cancel();
+        std::thread::sleep(BEAT * 2);
     }
 
     /// What does not change while this program runs.
@@ -150,6 +162,7 @@ impl Site {
         if over || let_go {
             *locked(&self.held) = 0;
             self.say().hold(false);
+            self.cell.hold(false);
         }
         if let_go && !over {
             let this = Arc::clone(self);

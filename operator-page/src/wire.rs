@@ -108,6 +108,8 @@ pub enum ToLink {
     Ask(u64, Request),
     /// Whether anybody looks at pictures.
     Look(bool),
+    /// Whether a pour is held: if the page dies then, the link stops it.
+    Hold(bool),
 }
 
 /// Writes one message.

@@ -51,6 +51,9 @@ fn a_new_cell_learns_to_pour_in_the_browser() {
     let cell = CellUnderTest::start(|config| {
         config["container"].as_table_mut().expect("a table").insert("holds_ml".into(), toml::Value::Float(520.0));
     });
+    // A file's name is text, and never markup.
+    std::fs::create_dir_all(cell.dir.path().join("episodes")).expect("writable");
+    std::fs::write(cell.dir.path().join("episodes/<img src=x onerror=alert(1)>.mcap"), "no episode").expect("writable");
     let page = Page::open(&cell);
     browser.go(&page.url());
     browser.wait("the live picture", SOON, LIVE);
@@ -106,7 +109,9 @@ fn a_new_cell_learns_to_pour_in_the_browser() {
     cell.wait("the weights from before", SOON, |s| s["weights"] == before && s["weights"] != after);
 
     browser.click("#tab-history");
-    browser.wait("three episodes", SOON, "return document.querySelectorAll('#table tbody tr').length === 3");
+    browser.wait("three episodes and the file that is none", SOON, "return document.querySelectorAll('#table tbody tr').length === 4");
+    assert!(browser.text("#table").contains("<img src=x onerror=alert(1)>.mcap"));
+    assert_eq!(browser.run("return document.querySelectorAll('#table img').length"), 0);
     browser.run("document.getElementById('kind').value = 'pour'; document.getElementById('kind').onchange()");
     browser.wait("one pour", SOON, "return document.querySelectorAll('#table tbody tr').length === 1");
     browser.click("#table .look");
