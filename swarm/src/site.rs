@@ -54,6 +54,8 @@ pub fn config() -> Result<Config, String> {
 pub struct Cost {
     /// The fault's kind.
     pub fault: &'static str,
+    /// Whether it came in a pour, and not in a recording.
+    pub in_pour: bool,
     /// What left from the moment in which it could first be noticed until the container was upright, ml.
     pub excess_ml: f64,
     /// What left from the fault itself until then, ml.
@@ -70,6 +72,10 @@ struct OpenFault {
     at_ml: f64,
     /// What had left when it could first be noticed, ml.
     noticed_ml: Option<f64>,
+    /// The container was on its way upright already.
+    is_on_way: bool,
+    /// It was a pour, and no recording.
+    in_pour: bool,
 }
 
 /// How a pour or recording went.
@@ -116,6 +122,8 @@ pub struct Site {
     frame_at_ns: u64,
     frame_poured_ml: f64,
     run_poured_ml: f64,
+    /// The newest run is a pour, and no recording.
+    is_pour: bool,
     next_item: usize,
     episode: u64,
     offline_until_ns: u64,
@@ -178,6 +186,7 @@ impl Site {
             frame_at_ns,
             frame_poured_ml: 0.0,
             run_poured_ml: 0.0,
+            is_pour: true,
             next_item: 0,
             episode: 0,
             offline_until_ns: 0,
@@ -310,14 +319,15 @@ impl Site {
         }
         let excess_ml = |open: &OpenFault| poured_ml - open.noticed_ml.unwrap_or(poured_ml);
         // The pour went on after faults that need not end it. So one of them at least must explain what left after it.
-        let is_within = |open: &OpenFault| open.kind.bound_ml.is_none_or(|bound_ml| excess_ml(open) <= bound_ml);
+        let bound_ml = |open: &OpenFault| if open.in_pour { open.kind.bound_ml } else { None };
+        let is_within = |open: &OpenFault| bound_ml(open).is_none_or(|bound_ml| excess_ml(open) <= bound_ml);
         if !self.open_faults.is_empty() && !self.open_faults.iter().any(is_within) {
             let left: Vec<_> = self.open_faults.iter().map(|open| format!("{:.1} ml after {}", excess_ml(open), open.kind.name)).collect();
             self.checks.violated("bound", at_s, format!("more left after a fault could be noticed than may: {}", left.join(", ")));
         }
-        for open in std::mem::take(&mut self.open_faults) {
+        for open in std::mem::take(&mut self.open_faults).into_iter().filter(|open| !open.is_on_way) {
             let (since_ml, upright_s) = (poured_ml - open.at_ml, at_s - open.at_s);
-            self.costs.push(Cost { fault: open.kind.name, excess_ml: excess_ml(&open), since_ml, upright_s });
+            self.costs.push(Cost { fault: open.kind.name, in_pour: open.in_pour, excess_ml: excess_ml(&open), since_ml, upright_s });
         }
     }
 
@@ -341,6 +351,7 @@ impl Site {
         let runs = |phase| matches!(phase, Phase::Pouring | Phase::Recording);
         if runs(self.checks.phase) && !runs(before) {
             self.run_poured_ml = self.container.poured_ml();
+            self.is_pour = self.checks.phase == Phase::Pouring;
         }
         let row = Row::new(at_s, tick, telemetry, &self.container);
         if let Some(rows) = &mut self.rows {
@@ -391,8 +402,14 @@ impl Site {
         let doubtful = trainer::consistency::doubtful(&all);
         self.say(|| format!("learning with {weight_g:.0} g; doubted: {doubtful:?}"));
         let kept = all.into_iter().filter(|e| !doubtful.iter().any(|d| d.name == e.name)).collect();
-        if let Some(lesson) = Lesson::learn(kept, &self.checks.limits()) {
-            self.take_weights(lesson);
+        let Some(lesson) = Lesson::learn(kept, &self.checks.limits()) else { return };
+        // The controller takes what it can read, so a trainer whose weights it refuses leaves the operator without any.
+        match lesson.weights.to_bytes().and_then(|bytes| Weights::from_bytes(&bytes, "weights.bin")) {
+            Ok(_) => self.take_weights(lesson),
+            Err(e) => {
+                let at_s = self.now_s();
+                self.checks.violated("trained-weights", at_s, format!("the trainer made weights that are refused: {e}"));
+            }
         }
     }
 
@@ -412,8 +429,10 @@ impl Site {
         self.begun.push(number);
         let kind = KINDS[self.plan.faults[number]];
         self.fault_times.push((at_s, kind.name));
-        if matches!(self.checks.phase, Phase::Pouring | Phase::Recording) {
-            self.open_faults.push(OpenFault { kind, at_s, at_ml, noticed_ml: None });
+        let phase = self.checks.phase;
+        let is_on_way = matches!(phase, Phase::Settling | Phase::Returning);
+        if is_on_way || matches!(phase, Phase::Pouring | Phase::Recording) {
+            self.open_faults.push(OpenFault { kind, at_s, at_ml, noticed_ml: None, is_on_way, in_pour: self.is_pour });
         }
     }
 
@@ -421,7 +440,8 @@ impl Site {
     fn happen(&mut self, what: &What) -> Option<Option<Order>> {
         let (at_s, ms) = (self.now_s(), 1_000_000);
         self.say(|| format!("{what:?}"));
-        self.checks.happens(what, at_s);
+        let lives = self.restart_at_ns.is_none();
+        self.checks.happens(what, self.robot.machine(), lives, at_s);
         match what {
             What::Pour(goal_ml) => {
                 self.episode += 1;
