@@ -3,6 +3,7 @@
 
 pub mod check;
 pub mod commanded;
+pub mod costs;
 pub mod eye;
 pub mod faults;
 pub mod many;

@@ -245,11 +245,12 @@ fn report(summary: &Summary, wall_s: f64) {
         let (error, said) = (spread(&row.error_ml), spread(&row.said_ml));
         print(&format!("| {} | {} | {error} | {said} | {:.0} % |", row.fault, row.error_ml.n, 100.0 * row.covered));
     }
-    print("| fault | n ended | ml after it could be noticed: median, p99, largest | bound, ml | ml after it | s until upright |");
+    print("| fault | in a | n ended | ml after it could be noticed: median, p99, largest | bound, ml | ml after it | s until upright |");
     for row in &summary.costs {
         let bound = row.bound_ml.map_or_else(|| "the vessel".into(), |ml| format!("{ml:.0}"));
         let (excess, since, upright) = (spread(&row.excess_ml), spread(&row.since_ml), spread(&row.upright_s));
-        print(&format!("| {} | {} | {excess} | {bound} | {since} | {upright} |", row.fault, row.excess_ml.n));
+        let run = if row.in_pour { "pour" } else { "recording" };
+        print(&format!("| {} | {run} | {} | {excess} | {bound} | {since} | {upright} |", row.fault, row.excess_ml.n));
     }
     for (invariant, (n, seeds)) in &summary.violations {
         print(&format!("VIOLATED {invariant}: {n} seeds, such as {seeds:?}"));

@@ -45,6 +45,8 @@ impl Spread {
 pub struct CostRow {
     /// The fault.
     pub fault: String,
+    /// Whether it came in pours, and not in recordings.
+    pub in_pour: bool,
     /// What left from the moment in which it could first be noticed until the container was upright, ml.
     pub excess_ml: Spread,
     /// The most that may, ml; `None` if only the vessel bounds it.
@@ -164,17 +166,17 @@ fn sum_up(seeds: Seeds, shown: &[Shown]) -> Summary {
         let covered = covered as f64 / said.len() as f64;
         Some(DoneRow { fault: fault.to_owned(), error_ml: Spread::of(error)?, said_ml: Spread::of(said)?, covered })
     };
-    let mut costs: BTreeMap<&str, [Vec<f64>; 3]> = BTreeMap::new();
+    let mut costs: BTreeMap<(&str, bool), [Vec<f64>; 3]> = BTreeMap::new();
     for cost in shown.iter().filter(|one| one.costs.len() == 1).flat_map(|one| &one.costs) {
-        let [excess, since, upright] = costs.entry(cost.fault).or_default();
+        let [excess, since, upright] = costs.entry((cost.fault, cost.in_pour)).or_default();
         excess.push(cost.excess_ml);
         since.push(cost.since_ml);
         upright.push(cost.upright_s);
     }
-    let row = |(fault, [excess, since, upright]): (&str, [Vec<f64>; 3])| {
-        let bound_ml = KINDS.iter().find(|kind| kind.name == fault).and_then(|kind| kind.bound_ml);
+    let row = |((fault, in_pour), [excess, since, upright]): ((&str, bool), [Vec<f64>; 3])| {
+        let bound_ml = KINDS.iter().find(|kind| kind.name == fault && in_pour).and_then(|kind| kind.bound_ml);
         let (excess_ml, since_ml, upright_s) = (Spread::of(excess)?, Spread::of(since)?, Spread::of(upright)?);
-        Some(CostRow { fault: fault.to_owned(), excess_ml, bound_ml, since_ml, upright_s })
+        Some(CostRow { fault: fault.to_owned(), in_pour, excess_ml, bound_ml, since_ml, upright_s })
     };
     Summary {
         from: seeds.from,
