@@ -4,6 +4,7 @@
 
 use rt_controller::core::Settings;
 use rt_controller::journal::Tick;
+use rt_controller::link::ProgramState;
 use serde::Serialize;
 use shared::control::{EndReason, Outcome};
 use shared::limits::Limits;
@@ -29,6 +30,8 @@ const SAID: (f64, f64) = (5.0, 3.0);
 const DRIFT_HIDES: f64 = 1.2 / 0.7;
 /// The output register in which the program says what it is doing (`robot.register_base` of config/sim.toml).
 const STATE_REGISTER: usize = 24;
+/// The output register in which the program says which upload it is.
+const RUN_REGISTER: usize = STATE_REGISTER + 2;
 /// How far what a pour that is done says may be from its goal, ml, and as a share of it: the last decision counts drops that still fell.
 const MISSED: (f64, f64) = (8.0, 0.08);
 /// How long a container may stand tilted after its program has ended by itself, s: one cycle would do, and the arm needs time to stop.
@@ -79,6 +82,8 @@ pub struct Checks {
     pub faults: Vec<Injected>,
     /// What the program tells servoj.
     commanded: Commanded,
+    /// The program's run, and whether it has begun to come upright for good.
+    way_back: (i32, bool),
     /// The newest target, degrees, and the rate at which it came.
     target: Option<(f64, f64)>,
     pub(crate) phase: Phase,
@@ -110,6 +115,7 @@ impl Checks {
     pub fn new(settings: Settings, cycle_s: f64) -> Self {
         Self {
             commanded: Commanded::new(settings.limits, cycle_s),
+            way_back: (0, false),
             settings,
             violations: Vec::new(),
             faults: Vec::new(),
@@ -182,8 +188,24 @@ impl Checks {
         for (invariant, what) in self.commanded.cycle(machine, joint, active) {
             self.violated(invariant, at_s, what);
         }
+        self.stays_on_way_back(machine, at_s);
         self.upright(machine, alpha_deg, at_s);
         self.left_tilted(machine, alpha_deg, at_s);
+    }
+
+    /// A program that has begun to come upright by itself or on command does not take targets again.
+    fn stays_on_way_back(&mut self, machine: &Machine, at_s: f64) {
+        let registers = &machine.robot.outputs.int;
+        let (state, run) = (ProgramState::from_code(registers[STATE_REGISTER]), registers[RUN_REGISTER]);
+        // A new program says that it is ready before it says which upload it is.
+        if run != self.way_back.0 || state == ProgramState::Ready {
+            self.way_back = (run, false);
+        }
+        if !state.takes_targets() {
+            self.way_back.1 = true;
+        } else if std::mem::take(&mut self.way_back.1) {
+            self.violated("no-resume", at_s, format!("the program was on its way upright, and is {state:?} again"));
+        }
     }
 
     /// A program that ends by itself leaves the container upright.
