@@ -362,3 +362,39 @@ impl Checks {
         }
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use shared::config::Config;
+    use shared::limits::Clipped;
+
+    /// Protects the check of what a pour says: a gain that drifted excuses as much as it hides, and no more; without a drift nothing is excused.
+    #[test]
+    fn a_drift_excuses_what_it_hides() {
+        let outcome = Outcome {
+            episode: 1,
+            reason: EndReason::Done,
+            goal_ml: Some(80.0),
+            poured_ml: 80.0,
+            poured_sd_ml: 2.0,
+            seconds: 8.0,
+            frames: 240,
+            bridged_frames: 0,
+            stale_features: 0,
+            tick_gaps: 0,
+            clipped: Clipped::default(),
+        };
+        let found = |drift: f64, true_ml: f64| {
+            let config = Config::parse(include_str!("../../config/sim.toml"), "sim.toml").unwrap();
+            let mut checks = Checks::new(Settings::new(&config), 0.008);
+            checks.gain_drift = drift;
+            checks.ended(&outcome, true_ml, 20.0);
+            checks.violations.first().map(|v| v.invariant)
+        };
+        assert_eq!(found(0.0, 92.0), None, "within five deviations and 3 ml");
+        assert_eq!(found(0.0, 94.0), Some("said"));
+        assert_eq!(found(0.25, 110.0), None);
+        assert_eq!(found(0.25, 220.0), Some("said"));
+    }
+}

@@ -12,6 +12,7 @@ use sha2::{Digest, Sha256};
 use shared::config::Config;
 use shared::control::EndReason;
 
+use crate::camera;
 use crate::faults::KINDS;
 use crate::plan::{Choice, Plan};
 use crate::run::{self, Shown};
@@ -83,6 +84,8 @@ pub struct Summary {
     pub virtual_s: f64,
     /// Processor time that it took on all cores together, without the training, s.
     pub processor_s: f64,
+    /// Processor time that went into drawing pictures and measuring them, without the training, s.
+    pub camera_s: [f64; 2],
     /// Number of violations by invariant, and the seeds of the first ones.
     pub violations: BTreeMap<String, (usize, Vec<u64>)>,
     /// How often pours and recordings ended for each reason.
@@ -120,9 +123,11 @@ pub fn run_many(seeds: Seeds, config: &Config, progress: bool) -> (Vec<Shown>, S
     if let Ok(style) = ProgressStyle::with_template("{pos}/{len} seeds  {wide_bar}  {eta}") {
         bar.set_style(style);
     }
-    let before_s = processor_s();
+    let (before_s, [drawn_s, measured_s]) = (processor_s(), camera::spent_s());
     let shown: Vec<Shown> = plans.par_iter().progress_with(bar).map(|plan| run::run(plan, &trained, config, false)).collect();
-    let summary = Summary { processor_s: processor_s() - before_s, ..sum_up(seeds, &shown) };
+    let spent_s = camera::spent_s();
+    let camera_s = [spent_s[0] - drawn_s, spent_s[1] - measured_s];
+    let summary = Summary { processor_s: processor_s() - before_s, camera_s, ..sum_up(seeds, &shown) };
     (shown, summary)
 }
 
@@ -184,6 +189,7 @@ fn sum_up(seeds: Seeds, shown: &[Shown]) -> Summary {
         pours: poured().count(),
         virtual_s: shown.iter().map(|one| one.virtual_s).sum(),
         processor_s: 0.0,
+        camera_s: [0.0; 2],
         violations,
         reasons,
         done: done.into_iter().filter_map(done_row).collect(),

@@ -14,10 +14,12 @@ use shared::control::{EndReason, Outcome};
 use shared::gaussian_curve::Curve;
 use shared::messages::{Phase, Telemetry};
 use shared::weights::Weights;
+use simulator::camera::Scene;
 use simulator::physics::container::Container;
 use simulator::physics::rig::Rig;
 use simulator::ur::{Fault, InMemory, Machine};
 
+use crate::camera::{Camera, Depth};
 use crate::check::Checks;
 use crate::costs::{Costs, Poured};
 use crate::eye::Eye;
@@ -124,6 +126,15 @@ impl Site {
         let mut random = Pcg64Mcg::seed_from_u64(plan.seed ^ 0x517E);
         let frame_at_ns = START_NS + random.random_range(0..FRAME_NS);
         vessels::fill(&rig, &mut container, plan.fill_ml, &mut random);
+        let mut checks = Checks::new(Settings::new(checked), cycle_ns as f64 / 1e9);
+        let camera = match plan.depth {
+            Depth::Area => None,
+            Depth::Camera => {
+                let made = Camera::new(checked, plan.seed);
+                // Without it the areas would be made of flows, and look like measured ones.
+                made.map_err(|line| checks.violated("camera", 0.0, line)).ok()
+            }
+        };
         // What is learned from needs the rows.
         let learns = plan.items.iter().any(|item| matches!(item.what, What::Learn(_)));
         Self {
@@ -131,8 +142,8 @@ impl Site {
             robot: InMemory::new(machine),
             wiring: Wiring::new(plan.seed, plan.delay_ns.0, plan.delay_ns.1),
             container,
-            eye: Eye::new(plan.seed, START_NS, rig.area_exponent),
-            checks: Checks::new(Settings::new(checked), cycle_ns as f64 / 1e9),
+            eye: Eye::new(plan.seed, START_NS, rig.area_exponent, camera),
+            checks,
             trained: trained.clone(),
             random,
             joint,
@@ -224,7 +235,10 @@ impl Site {
             self.frame_at_ns += FRAME_NS;
             let poured_ml = self.container.poured_ml();
             let clinging = self.container.habits().clinging(self.container.lip().flow_ml_s);
-            self.eye.frame(self.now_ns, poured_ml - self.frame_poured_ml, clinging);
+            let servo = &self.robot.machine().robot.servo;
+            let tilt = (servo.actual_q[self.joint].to_degrees(), servo.actual_qd[self.joint].to_degrees());
+            let scene = Scene::of(&self.container, self.now_s(), tilt.0, tilt.1);
+            self.eye.frame(self.now_ns, poured_ml - self.frame_poured_ml, clinging, &scene);
             self.frame_poured_ml = poured_ml;
         }
         Vec::new()
@@ -299,7 +313,7 @@ impl Site {
 
     /// Gives the loop an agent with the weights for the vessel of this number.
     pub fn give_weights(&mut self, vessel: usize) {
-        if let Some(lesson) = self.trained.get(self.plan.series, vessel) {
+        if let Some(lesson) = self.trained.get((self.plan.series, self.plan.depth), vessel) {
             let lesson = lesson.clone();
             self.take_weights(lesson);
         }
@@ -313,7 +327,10 @@ impl Site {
     /// The operator weighs what the newest recording left, and trains on it and the episodes from before. A weight that the trainer doubts
     /// is not used, as `trainer train` says.
     fn learn(&mut self, weighed: Weighed) {
-        let Some(before) = self.trained.get(self.plan.series, self.plan.vessel).map(|lesson| lesson.episodes.to_vec()) else { return };
+        let Some(before) = self.trained.get((self.plan.series, self.plan.depth), self.plan.vessel).map(|lesson| lesson.episodes.to_vec())
+        else {
+            return;
+        };
         let Some(last) = self.poured.last().filter(|p| p.goal_ml.is_none() && p.reason == EndReason::Done) else { return };
         let weight_g = match weighed {
             Weighed::Right => last.true_ml,
@@ -420,7 +437,11 @@ impl Site {
 
     /// A damaged weight file must be refused.
     fn offer_bad_weights(&mut self) {
-        let Some(mut bytes) = self.trained.get(self.plan.series, self.plan.vessel).and_then(|l| l.weights.to_bytes().ok()) else { return };
+        let Some(mut bytes) =
+            self.trained.get((self.plan.series, self.plan.depth), self.plan.vessel).and_then(|l| l.weights.to_bytes().ok())
+        else {
+            return;
+        };
         let at = self.random.random_range(0..bytes.len());
         bytes[at] ^= 1 << self.random.random_range(0..8u8);
         if Weights::from_bytes(&bytes, "weights.bin").is_ok() {
