@@ -218,6 +218,9 @@ fn print(args: &Args, table: &Table<'_>, summaries: &[Summary]) {
     for s in summaries {
         println!("{}", s.line());
     }
+    for s in summaries.iter().filter(|s| !s.endings.is_empty()) {
+        println!("{}", s.endings_line());
+    }
     for s in summaries.iter().skip(1) {
         let paired: Vec<f64> = s.groups_ml.iter().zip(&summaries[0].groups_ml).map(|(b, a)| b - a).collect();
         let (mean, half) = mean_ci(&paired);

@@ -4,6 +4,7 @@
 
 use rand::{RngExt, SeedableRng};
 use rand_pcg::Pcg64Mcg;
+use rt_controller::foreseen;
 use shared::agent::Agent;
 use shared::estimator::Calibration;
 use shared::limits::Limits;
@@ -21,8 +22,9 @@ use trainer::training::{Estimate, MethodName, Options, Silent, Trained};
 use super::change::Change;
 use super::pourer::Pourer;
 use crate::bench::baselines::{BangBang, ByLaw, HandPd, OpenLoop, Oracle, Sum};
-use crate::bench::pour::{Baseline, PourResult, Trace, by_baseline, by_core, grid};
-use crate::bench::simulators::Bench;
+use crate::bench::eye_fault::EyeFault;
+use crate::bench::pour::{Asked, Baseline, PourResult, Trace, by_baseline, by_core, grid};
+use crate::bench::simulators::{Bench, BenchPour};
 use crate::bench::through_camera::BenchCamera;
 
 /// How each trial is carried out.
@@ -47,6 +49,10 @@ pub struct Trial {
     pub bench: Bench,
     /// The bench of the test; its rig may have changed.
     pub test: Bench,
+    /// The fault of the eye in the test's pours, if there is one.
+    pub eye: Option<EyeFault>,
+    /// Whether somebody tells the controller how much is in the vessel.
+    pub fill_told: bool,
     /// Seed of the episodes.
     pub data_seed: u64,
     /// Seed of the test's pours.
@@ -64,14 +70,28 @@ impl Trial {
             Some(rig) if sim != "a" => (Bench::on(&rig), Bench::on(&change.apply(rig))),
             _ => (Bench::Paper, Bench::Paper),
         };
-        Self { bench: benches.0, test: benches.1, data_seed, pour_seed, limits: Limits::default() }
+        Self {
+            bench: benches.0,
+            test: benches.1,
+            eye: change.eye(),
+            fill_told: change.tells_fill(),
+            data_seed,
+            pour_seed,
+            limits: Limits::default(),
+        }
     }
 
     /// A trial on a rig whose vessel, liquid or robot is drawn as one of this kind.
     pub fn drawn(kind: VesselKind, rig: u64, seed: u64, change: Change) -> Self {
         let physics = Rig::drawn(kind, rig);
         let benches = (Bench::on(&physics), Bench::on(&change.apply(physics)));
-        Self { bench: benches.0, test: benches.1, ..Self::new("a", rig, seed, "cylinder", Change::None) }
+        Self {
+            bench: benches.0,
+            test: benches.1,
+            eye: change.eye(),
+            fill_told: change.tells_fill(),
+            ..Self::new("a", rig, seed, "cylinder", Change::None)
+        }
     }
 
     /// The same rig with a rendered camera before it.
@@ -96,11 +116,19 @@ impl Trial {
             .collect()
     }
 
+    /// A pour of the test from `init_ml`, as its eye sees it.
+    fn test_pour(&self, init_ml: f64, number: u64) -> BenchPour {
+        let seed = self.pour_seed + number;
+        self.test.pour(init_ml, seed).seen_with(self.eye, seed)
+    }
+
     /// Pours the grid with `weights` through the controller's core.
     pub fn judge(&self, weights: &Weights, repeats: u64) -> Vec<PourResult> {
         let agent = Agent::new(weights);
         let pour = |(init, goal, k): (f64, f64, u64)| {
-            by_core(&agent, &mut self.test.pour(init, self.pour_seed + k), self.limits, init, goal, None)
+            let flows_by_deg = self.fill_told.then(|| foreseen::flows_by_deg(weights, init, self.test.full_ml())).flatten();
+            let asked = Asked { flows_by_deg, ..Asked::new(init, goal) };
+            by_core(&agent, &mut self.test_pour(init, k), self.limits, asked, None)
         };
         self.cells(repeats).into_iter().map(pour).collect()
     }
@@ -110,7 +138,7 @@ impl Trial {
         let agent = Agent::new(weights);
         let example = |(init, goal): (f64, f64)| {
             let mut trace = Trace::default();
-            by_core(&agent, &mut self.test.pour(init, self.pour_seed), self.limits, init, goal, Some(&mut trace));
+            by_core(&agent, &mut self.test.pour(init, self.pour_seed), self.limits, Asked::new(init, goal), Some(&mut trace));
             let area_4_px2: Vec<f64> = trace.area_px2.iter().map(|a| a / 4.0).collect();
             serde_json::json!({ "init_ml": init, "goal_ml": goal, "name": "policy", "t_s": trace.t_s, "alpha_deg": trace.alpha_deg,
                 "true_ml": trace.true_ml, "area_4_px2": area_4_px2 })
@@ -131,7 +159,7 @@ impl Trial {
         let goal = random.random_range(20.0..200.0f64).min(0.85 * init).min(0.9 * self.test.reach_ml(init));
         let mut trace = Trace::default();
         let mut pour = self.test.pour(init, random.random());
-        by_core(agent, &mut pour, self.limits, init, goal, Some(&mut trace));
+        by_core(agent, &mut pour, self.limits, Asked::new(init, goal), Some(&mut trace));
         let misread: f64 = rand_distr::Distribution::sample(&rand_distr::StandardNormal, random);
         trace.weighed(&format!("pour {}", number + 1), (pour.poured_ml() + 0.5 * misread).round())
     }
@@ -197,9 +225,8 @@ impl Trial {
 
     /// Pours the grid with the baselines that `make` makes for each goal.
     fn pour_grid<'a>(&self, protocol: &Protocol, make: impl Fn(f64) -> Box<dyn Baseline + 'a>) -> Vec<PourResult> {
-        let pour = |(init, goal, k): (f64, f64, u64)| {
-            by_baseline(make(goal).as_mut(), &mut self.test.pour(init, self.pour_seed + k), self.limits, init, goal)
-        };
+        let pour =
+            |(init, goal, k): (f64, f64, u64)| by_baseline(make(goal).as_mut(), &mut self.test_pour(init, k), self.limits, init, goal);
         self.cells(protocol.repeats).into_iter().map(pour).collect()
     }
 
@@ -248,7 +275,7 @@ mod tests {
             assert_ne!(by_picture.area_px2, by_formula.area_px2);
         }
         let agent = Agent::new(&trained.weights);
-        let poured = by_core(&agent, &mut seen.test.pour(300.0, seen.pour_seed), seen.limits, 300.0, 60.0, None);
+        let poured = by_core(&agent, &mut seen.test.pour(300.0, seen.pour_seed), seen.limits, Asked::new(300.0, 60.0), None);
         assert!(poured.ended && poured.error_ml().abs() < 8.0, "{poured:?}");
     }
 
