@@ -185,11 +185,15 @@ impl Ending {
         }
     }
 
-    /// Takes whether the joint follows on its way upright. The way of a slower robot is waited for, but more was then poured than was
-    /// foreseen when it began, so such a pour is not done.
+    /// Takes whether the joint follows on its way upright, and looks at what was seen meanwhile. The way of a slower robot is waited for, but
+    /// more was then poured than was foreseen when it began, so such a pour is not done.
     pub fn returns(&mut self, follows: bool) {
         if !follows {
             self.end_without_robot(EndReason::NotFollowed);
+        }
+        // A stream that goes on although the container is brought upright was none before either, so the goal was not reached.
+        if let Some(impossible) = self.impossible {
+            self.end_without_robot(reason_of(impossible));
         }
     }
 
@@ -399,6 +403,22 @@ mod tests {
             let first = ending.decided(&agent.step(observation(flow_at_first)));
             let ended = (0..200).filter(|_| ending.decided(&agent.step(observation(flow_later)))).count();
             assert_eq!((first, ended > 0), (false, ends), "action {action}, then {flow_later} px^2");
+        }
+    }
+
+    /// Protects the operator from a camera that shows a false stream: a pour that seemed done is not, if the stream then goes on at an upright
+    /// container. Another reason stays.
+    #[test]
+    fn what_cannot_be_on_the_way_back_is_named() {
+        let impossible = Decision { impossible: Some(Impossible::Flow), ..Decision::NOTHING };
+        for (before, after) in [(EndReason::Done, EndReason::ImpossibleFlow), (EndReason::Aborted, EndReason::Aborted)] {
+            let mut ending = Ending::of_pour();
+            ending.end_with(before);
+            ending.returns(true);
+            assert_eq!(ending.reason(), before);
+            ending.decided(&impossible);
+            ending.returns(true);
+            assert_eq!(ending.reason(), after);
         }
     }
 
