@@ -29,8 +29,6 @@ use crate::regular_file;
 
 mod ranges;
 
-pub use ranges::MOST_VARIANCE;
-
 /// Version of the file format; files of other versions are refused.
 pub const FORMAT_VERSION: u32 = 4;
 

@@ -68,6 +68,8 @@ const COMING_DEG: f32 = 1.0;
 /// The longest wait for the last drops, and for a joint that comes no nearer to upright, s. Chosen by hand; no measurement is recorded.
 const SETTLE_MAX_S: f64 = 3.0;
 
+/// Number of frames in a row with a stream from which on one was seen: a lone flash is none.
+const SEEN_FRAMES: u32 = 2;
 /// Number of frames in a row without any flow at a tilt at which the vessel must flow: longer than a joint follows its command late.
 const DRY_FRAMES: u32 = 10;
 
@@ -119,6 +121,8 @@ pub struct Ending {
     /// What the camera sees cannot be.
     impossible: Option<Impossible>,
     seen_flow: bool,
+    /// Whether a stream was seen in more than a lone frame.
+    seen_stream: bool,
     brought_back_deg: f32,
     stalled_frames: u32,
     advanced_deg: f32,
@@ -147,6 +151,7 @@ impl Ending {
             is_short: false,
             impossible: None,
             seen_flow: false,
+            seen_stream: false,
             brought_back_deg: 0.0,
             stalled_frames: 0,
             advanced_deg: 0.0,
@@ -188,11 +193,15 @@ impl Ending {
         }
     }
 
-    /// Takes whether the joint follows on its way upright. The way of a slower robot is waited for, but more was then poured than was
-    /// foreseen when it began, so such a pour is not done.
+    /// Takes whether the joint follows on its way upright, and looks at what was seen meanwhile. The way of a slower robot is waited for, but
+    /// more was then poured than was foreseen when it began, so such a pour is not done.
     pub fn returns(&mut self, follows: bool) {
         if !follows {
             self.end_without_robot(EndReason::NotFollowed);
+        }
+        // A stream that goes on although the container is brought upright was none before either, so the goal was not reached.
+        if let Some(impossible) = self.impossible {
+            self.end_without_robot(reason_of(impossible));
         }
     }
 
@@ -243,7 +252,8 @@ impl Ending {
         } else {
             (self.stream_frames, self.no_stream_frames) = (0, self.no_stream_frames + frames);
         }
-        let dry = !self.seen_flow && self.flows_by_deg.is_some_and(|deg| frame.alpha_deg > deg);
+        self.seen_stream |= self.stream_frames >= SEEN_FRAMES;
+        let dry = !self.seen_stream && self.flows_by_deg.is_some_and(|deg| frame.alpha_deg > deg);
         self.dry_frames = if dry && !frame.flowing { self.dry_frames + frames } else { 0 };
         let at_largest_tilt = frame.alpha_now_deg >= settings.limits.alpha_max_deg - LARGEST_TILT_SLACK_DEG;
         self.empty_frames = if at_largest_tilt && !frame.flowing { self.empty_frames + frames } else { 0 };
@@ -432,6 +442,22 @@ mod tests {
         }
     }
 
+    /// Protects the operator from a camera that shows a false stream: a pour that seemed done is not, if the stream then goes on at an upright
+    /// container. Another reason stays.
+    #[test]
+    fn what_cannot_be_on_the_way_back_is_named() {
+        let impossible = Decision { impossible: Some(Impossible::Flow), ..Decision::NOTHING };
+        for (before, after) in [(EndReason::Done, EndReason::ImpossibleFlow), (EndReason::Aborted, EndReason::Aborted)] {
+            let mut ending = Ending::of_pour();
+            ending.end_with(before);
+            ending.returns(true);
+            assert_eq!(ending.reason(), before);
+            ending.decided(&impossible);
+            ending.returns(true);
+            assert_eq!(ending.reason(), after);
+        }
+    }
+
     /// Protects the operator: the reason that came first is the one that is reported.
     #[test]
     fn the_first_reason_stays() {
@@ -453,7 +479,7 @@ mod tests {
         let moment = Moment { running_s: 2.0, frames: 60, measurement_age_ns: 0, alpha_deg: 70.0, poured_ml: 0.0, follows: true };
         let after = |flows_by_deg: Option<f32>, flowed: bool, frames: u32| {
             let mut ending = Ending::of_pour_that_flows_by(flows_by_deg);
-            ending.seen_flow = flowed;
+            ending.seen_stream = flowed;
             for _ in 0..frames {
                 let frame = SeenFrame { lost: 0, area_px2: Some(0.0), flowing: false, alpha_deg: 62.0, alpha_now_deg: 63.0 };
                 ending.saw(&frame, &settings);
@@ -465,5 +491,12 @@ mod tests {
         assert_eq!(after(Some(65.0), false, DRY_FRAMES), None);
         assert_eq!(after(Some(60.0), true, DRY_FRAMES), None);
         assert_eq!(after(None, false, DRY_FRAMES), None);
+        // A lone flash is no stream.
+        let mut flashed = Ending::of_pour_that_flows_by(Some(60.0));
+        for k in 0..=DRY_FRAMES {
+            let area_px2 = Some(if k == 0 { 100.0 } else { 0.0 });
+            flashed.saw(&SeenFrame { lost: 0, area_px2, flowing: k == 0, alpha_deg: 62.0, alpha_now_deg: 63.0 }, &settings);
+        }
+        assert_eq!(flashed.due(&moment, &settings), Some(EndReason::NothingFlows));
     }
 }

@@ -7,9 +7,6 @@ use crate::estimator::flow::{DELAY_MAX_FRAMES, FlowModel, Lateness, WayBack};
 use crate::estimator::fused::{Explanation, FusedModel};
 use crate::estimator::vessel::Vessel;
 
-/// Largest variance of an unknown of a pour: a standard deviation of 10 in a logarithm already says that nothing is known of it.
-pub const MOST_VARIANCE: f64 = 100.0;
-
 /// Refuses a fused estimate with a value outside its range, and names it.
 pub fn check_fused(model: &FusedModel, back: WayBack) -> Result<(), String> {
     within(&[
@@ -90,7 +87,7 @@ fn check_explanation(explanation: &Explanation) -> Result<(), String> {
     }
     let unknowns = &explanation.unknowns;
     for (k, row) in unknowns.iter().enumerate() {
-        within(&[("variance of an unknown", row[k], 1e-12, MOST_VARIANCE)])?;
+        within(&[("variance of an unknown", row[k], 1e-12, 100.0)])?;
         for (j, covariance) in row.iter().enumerate() {
             let most = (row[k] * unknowns[j][j]).sqrt() * (1.0 + 1e-9);
             within(&[("covariance of two unknowns", *covariance, -most, most)])?;
