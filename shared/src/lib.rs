@@ -20,6 +20,7 @@
 //! | [`regular_file`] | files of which only so much is read as is expected | no |
 //! | [`exit`] | exit codes and one-line errors | no |
 //! | [`speaker`] | lines for people, from threads that must not wait for a terminal | no |
+//! | [`machine`] | what Linux tells about the machine, and what would make it better | no |
 //! | [`os`] | the operating system: clock, scheduling, locked memory | yes |
 //!
 //! What the loop uses of a module marked "yes" does not allocate, lock or panic after construction; the module's header names the
@@ -41,6 +42,7 @@ pub mod exit;
 pub mod gaussian_curve;
 pub mod ipc;
 pub mod limits;
+pub mod machine;
 pub mod messages;
 pub mod mlp;
 #[allow(unsafe_code)]
