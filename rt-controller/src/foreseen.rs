@@ -91,6 +91,14 @@ pub fn flows_by_deg(weights: &Weights, fill_ml: f64, holds_ml: Option<f64>) -> O
     (onset_deg < LAST_DEG).then_some((onset_deg + BEYOND_DEG) as f32)
 }
 
+/// What may leave at most before a camera that never sees the stream is noticed, ml, if nobody has told how much is in the vessel: a full one
+/// flows early, and an emptier one than any episode's has to flow before nothing is seen for sure. `None` with the plain sum.
+pub fn unseen_ml(weights: &Weights) -> Option<f64> {
+    let Estimator::Fused { model, .. } = &weights.estimator else { return None };
+    let capacity = FlowTables::new(&model.likelier().model).capacity;
+    Some(capacity.lost_ml(model.bounds.dry_deg.min(LAST_DEG)))
+}
+
 #[cfg(test)]
 mod tests {
     use shared::actions::{STAY, Selection, action_table};
@@ -141,6 +149,20 @@ mod tests {
         assert!(small > 0.05 && large > 1.5 * small && large < 30.0, "{small} {large}");
         assert_eq!(sd(2000.0), None);
         assert_eq!(poured_sd_ml(&Weights { estimator: Estimator::Sum, ..weights() }, Limits::default(), 30.0), None);
+    }
+
+    /// Protects whoever pours without telling the fill: what may leave unseen is said, and it grows with the tilt that has to be waited for.
+    #[test]
+    fn what_may_leave_unseen_is_said() {
+        let until = |dry_deg: f64| {
+            let mut weights = weights();
+            if let Estimator::Fused { model, .. } = &mut weights.estimator {
+                model.bounds.dry_deg = dry_deg;
+            }
+            unseen_ml(&weights).unwrap()
+        };
+        assert!(until(60.0) > 100.0 && until(60.0) + 50.0 < until(90.0) && until(90.0) <= until(180.0));
+        assert_eq!(unseen_ml(&Weights { estimator: Estimator::Sum, ..weights() }), None);
     }
 
     /// Protects `pour --fill`: a fuller vessel flows earlier, and a fill that the vessel does not reach its lip with says nothing.

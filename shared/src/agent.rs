@@ -205,19 +205,21 @@ impl Agent {
     /// Adds the frame to the sum and gives it to the fused estimate, if there is one.
     fn observe(&mut self, observation: Observation) -> VolumeEstimate {
         let calibration = self.weights.calibration;
-        let area_px2 = self.hold.step(observation.area_px2, calibration.hold_above_px2);
+        // The filter judges dropouts itself, and says what is no measurement.
+        let believed = self.fused.as_mut().is_none_or(|fused| {
+            fused.step(FusedFrame {
+                area_px2: observation.area_px2,
+                command_deg: f64::from(observation.alpha_deg),
+                measured_deg: f64::from(observation.alpha_measured_deg),
+            })
+        });
+        let area_px2 = self.hold.step(observation.area_px2.filter(|_| believed), calibration.hold_above_px2);
         let v_ml = calibration.volume_ml(area_px2, observation.alpha_deg);
         self.v_ml = [v_ml, self.v_ml[0], self.v_ml[1]];
         self.summed_ml += v_ml;
-        let Some(fused) = &mut self.fused else {
+        let Some(fused) = &self.fused else {
             return VolumeEstimate { poured_ml: self.summed_ml, poured_sd_ml: 0.0, stop_ml: 0.0, over_lip_ml: 0.0 };
         };
-        // The filter judges dropouts itself.
-        fused.step(FusedFrame {
-            area_px2: observation.area_px2,
-            command_deg: f64::from(observation.alpha_deg),
-            measured_deg: f64::from(observation.alpha_measured_deg),
-        });
         let (low, high) = MODEL_TILT_DEG;
         let stop_ml = fused.stop_volume_ml(f64::from(observation.alpha_now_deg).clamp(low, high)) as f32;
         VolumeEstimate {

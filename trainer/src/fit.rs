@@ -355,12 +355,12 @@ impl Conclusion<'_> {
             self.tempered.found.own.iter().zip(self.episodes).map(|(own, e)| own[CAMERA_GAIN] - e.log_camera_gain).collect();
         let gain_expected = if self.camera.clean { GAIN_CLEAN } else { GAIN_EXPECTED };
         let straight_doubt = (self.tight.cost / frames.max(1) as f64).max(1.0);
-        let Doubted { calibration, covariance } = self.camera();
+        let Doubted { calibration, covariance, pour_sd } = self.camera();
         let mut fused = FusedModel {
             explanations: [self.explanation(self.wide, 1.0), self.explanation(self.tight, straight_doubt)],
             tight_share,
             camera: covariance,
-            gain_sd: noise::camera_gain_sd(&gains, gain_expected),
+            gain_sd: noise::camera_gain_sd(&gains, gain_expected).max(if self.camera.clean { 0.0 } else { pour_sd }),
             bounds: self.bounds(),
         };
         fused.tight_share *= self.trust(&fused, &calibration);

@@ -38,6 +38,8 @@ pub struct PourResult {
     pub seconds: f64,
     /// Frames until then.
     pub frames: u32,
+    /// Why it ended; `None` where no core ended it.
+    pub reason: Option<EndReason>,
     /// Whether the pour came to its end by itself.
     pub ended: bool,
     /// Whether it was ended because what the camera saw could not be. In an evaluation the camera is right, so this is a mistake.
@@ -117,15 +119,27 @@ fn settings(limits: Limits) -> Settings {
     }
 }
 
-/// Pours `goal_ml` with the controller's own core and `agent`. The frames are added to `trace` if there is one.
-pub fn by_core(
-    agent: &Agent,
-    pour: &mut BenchPour,
-    limits: Limits,
-    init_ml: f64,
-    goal_ml: f64,
-    mut trace: Option<&mut Trace>,
-) -> PourResult {
+/// What is asked of a pour.
+#[derive(Debug, Clone, Copy)]
+pub struct Asked {
+    /// Volume in the container at the start, ml.
+    pub init_ml: f64,
+    /// The goal, ml.
+    pub goal_ml: f64,
+    /// Tilt by which it must flow, degrees, where somebody has told the fill.
+    pub flows_by_deg: Option<f32>,
+}
+
+impl Asked {
+    /// This goal, from a fill that nobody has told.
+    pub fn new(init_ml: f64, goal_ml: f64) -> Self {
+        Self { init_ml, goal_ml, flows_by_deg: None }
+    }
+}
+
+/// Pours the goal with the controller's own core and `agent`. The frames are added to `trace` if there is one.
+pub fn by_core(agent: &Agent, pour: &mut BenchPour, limits: Limits, asked: Asked, mut trace: Option<&mut Trace>) -> PourResult {
+    let Asked { init_ml, goal_ml, flows_by_deg } = asked;
     let mut core = Core::new(settings(limits));
     core.exchange(Box::new(agent.clone()));
     let mut alpha_deg = 0.0f32;
@@ -139,6 +153,7 @@ pub fn by_core(
         believed_sd_ml: 0.0,
         seconds: f64::from(MAX_FRAMES) / RATE_HZ,
         frames: 0,
+        reason: None,
         ended: false,
         falsely_ended: false,
     };
@@ -160,7 +175,7 @@ pub fn by_core(
         // The joint was measured when the picture was taken. Where there is none, it is where it was commanded.
         let tilt_deg = if frames > 1 { pour.tilt_deg() as f32 } else { alpha_deg };
         let robot = Robot::that_may_move(if tilt_deg.is_nan() { alpha_deg } else { tilt_deg }, now_ns - PERIOD_NS);
-        let order = (frames == 2).then_some(Order::Pour { episode: 1, goal_ml: goal_ml as f32, flows_by_deg: None });
+        let order = (frames == 2).then_some(Order::Pour { episode: 1, goal_ml: goal_ml as f32, flows_by_deg });
         let output = core.step(&Input { now_ns, features: &[feature], robot, order });
         alpha_deg = output.target_deg.unwrap_or(alpha_deg);
         area_px2 = pour.frame(f64::from(alpha_deg));
@@ -171,6 +186,7 @@ pub fn by_core(
             poured.believed_ml = f64::from(outcome.poured_ml);
             poured.believed_sd_ml = f64::from(outcome.poured_sd_ml);
             poured.seconds = f64::from(outcome.seconds);
+            poured.reason = Some(outcome.reason);
             poured.ended = matches!(outcome.reason, EndReason::Done | EndReason::ContainerEmpty | EndReason::StreamLost);
             poured.falsely_ended = matches!(outcome.reason, EndReason::ImpossibleFlow | EndReason::NothingFlows);
             break;
@@ -227,6 +243,7 @@ pub fn by_baseline(baseline: &mut dyn Baseline, pour: &mut BenchPour, limits: Li
         believed_sd_ml: 0.0,
         seconds: f64::from(upright_at.unwrap_or(frames)) / RATE_HZ,
         frames,
+        reason: None,
         ended: back,
         falsely_ended: false,
     }

@@ -7,6 +7,7 @@ use simulator::physics::container::Container;
 use simulator::physics::paper::PaperPour;
 use simulator::physics::rig::{Rig, RigPour};
 
+use super::eye_fault::{EyeFault, FaultyEye};
 use super::through_camera::{BenchCamera, CameraPour};
 
 /// One pour on any of the simulators, frame by frame.
@@ -18,6 +19,8 @@ pub enum BenchPour {
     Rig(Box<RigPour>),
     /// Simulator b through a rendered camera.
     ThroughCamera(Box<CameraPour>),
+    /// Any of them, seen with a faulty eye.
+    Faulty(Box<(BenchPour, FaultyEye)>),
 }
 
 impl BenchPour {
@@ -28,6 +31,20 @@ impl BenchPour {
             Self::Paper(pour) => pour.frame(alpha_deg),
             Self::Rig(pour) => pour.frame(alpha_deg),
             Self::ThroughCamera(seen) => seen.frame(alpha_deg),
+            Self::Faulty(faulty) => {
+                let (pour, eye) = &mut **faulty;
+                let area_px2 = pour.frame(alpha_deg);
+                eye.see(area_px2, alpha_deg)
+            }
+        }
+    }
+
+    /// The same pour, seen with a faulty eye if there is a fault; `seed` draws what it shows.
+    #[must_use]
+    pub fn seen_with(self, fault: Option<EyeFault>, seed: u64) -> Self {
+        match fault {
+            Some(fault) => Self::Faulty(Box::new((self, FaultyEye::new(fault, seed)))),
+            None => self,
         }
     }
 
@@ -37,6 +54,7 @@ impl BenchPour {
             Self::Paper(_) => f64::NAN,
             Self::Rig(pour) => pour.tilt_deg(),
             Self::ThroughCamera(seen) => seen.pour.tilt_deg(),
+            Self::Faulty(faulty) => faulty.0.tilt_deg(),
         }
     }
 
@@ -46,6 +64,7 @@ impl BenchPour {
             Self::Paper(pour) => pour.poured_ml(),
             Self::Rig(pour) => pour.poured_ml(),
             Self::ThroughCamera(seen) => seen.pour.poured_ml(),
+            Self::Faulty(faulty) => faulty.0.poured_ml(),
         }
     }
 }
@@ -99,6 +118,11 @@ impl Bench {
         let mut container = container.clone();
         container.refill(volume_ml);
         container.spill_angle_deg()
+    }
+
+    /// What the vessel holds, ml; `None` for simulator a, which has none.
+    pub fn full_ml(&self) -> Option<f64> {
+        self.rig().map(|(_, container)| container.full_ml())
     }
 
     /// The volume that flows out of `volume_ml` at the largest tilt if one waits for ever, ml.

@@ -76,6 +76,10 @@ pub struct Args {
     /// Renders each frame and runs the feature worker's extraction, instead of the area formula (simulator b).
     #[arg(long, conflicts_with = "change")]
     through_camera: bool,
+    /// Keeps trained weights in this folder and takes them from there the next time, so that the same weights can be judged with another
+    /// change. Use another folder after any change of the trainer.
+    #[arg(long, value_name = "DIR")]
+    keep: Option<PathBuf>,
     /// Writes the whole report, every pour included, to this file as JSON.
     #[arg(long)]
     json: Option<PathBuf>,
@@ -137,9 +141,13 @@ impl Args {
         rigs.flat_map(|rig| (0..self.seeds).map(move |seed| (rig, seed)))
             .map(|(rig, seed)| {
                 let trial = match kind {
-                    Some(kind) => return Ok(Trial::drawn(kind, rig, seed, self.change)),
+                    Some(kind) => Trial::drawn(kind, rig, seed, self.change),
                     None => Trial::new(&self.sim, rig, seed, &self.container, self.change),
                 };
+                let name = kind.map_or(self.container.as_str(), |kind| kind.name());
+                let eye = if self.through_camera { "-seen" } else { "" };
+                let keep = self.keep.as_ref().map(|dir| dir.join(format!("{}-{name}{eye}-{rig}-{seed}", self.sim)));
+                let trial = Trial { keep, ..trial };
                 if self.through_camera { trial.through_camera(rig, &self.container) } else { Ok(trial) }
             })
             .collect()
@@ -167,6 +175,9 @@ impl Judged {
 /// Runs the command.
 pub fn run(args: &Args) -> Result<(), Failure> {
     args.check()?;
+    if let Some(dir) = &args.keep {
+        std::fs::create_dir_all(dir).map_err(|e| format!("{}: {e}", dir.display())).or_exit(exit::FAILED)?;
+    }
     let mut files = Vec::new();
     for file in &args.weights {
         files.push((file.display().to_string(), Weights::read(file).or_exit(exit::BAD_INPUT)?));
@@ -217,6 +228,9 @@ fn print(args: &Args, table: &Table<'_>, summaries: &[Summary]) {
     println!("{}", Summary::heading());
     for s in summaries {
         println!("{}", s.line());
+    }
+    for s in summaries.iter().filter(|s| !s.endings.is_empty()) {
+        println!("{}", s.endings_line());
     }
     for s in summaries.iter().skip(1) {
         let paired: Vec<f64> = s.groups_ml.iter().zip(&summaries[0].groups_ml).map(|(b, a)| b - a).collect();

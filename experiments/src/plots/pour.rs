@@ -26,6 +26,9 @@ const D: RGBColor = RGBColor(214, 39, 40);
 /// Colour of the poured volume.
 const POURED: RGBColor = RGBColor(148, 103, 189);
 
+/// Colour of the poured volume with its standard deviation added, and taken off.
+const DEVIATION: RGBColor = RGBColor(197, 176, 213);
+
 /// Draws the ticks of one pour to `file` (SVG); `scale_g` is what the scale showed afterwards.
 ///
 /// # Errors
@@ -46,7 +49,11 @@ pub fn draw(file: &Path, ticks: &[Telemetry], goal_ml: f32, scale_g: f64) -> Res
         &[("commanded", ALPHA, points(&|t| t.alpha_deg)), ("measured", MEASURED, points(&|t| t.alpha_measured_deg))],
     )?;
     panel(&panels[1], "V_e, px²", &[("V_e", AREA, points(&|t| t.area_px2))])?;
-    panel(&panels[2], "ml", &[("d", D, points(&|t| t.d_ml)), ("poured (estimate)", POURED, points(&|t| t.poured_ml))])?;
+    let with_deviation = |sign: f32| points(&|t| if t.poured_sd_ml > 0.0 { t.poured_ml + sign * t.poured_sd_ml } else { f32::NAN });
+    let poured = ("poured (estimate)", POURED, points(&|t| t.poured_ml));
+    let above = ("its deviation", DEVIATION, with_deviation(1.0));
+    let below = ("", DEVIATION, with_deviation(-1.0));
+    panel(&panels[2], "ml", &[("d", D, points(&|t| t.d_ml)), poured, above, below])?;
     root.present()?;
     Ok(())
 }
@@ -59,7 +66,7 @@ fn panel(area: &Drawing, unit: &str, lines: &[Line]) -> Result<(), Box<dyn std::
     let margin = 0.05 * (high - low);
     // The names stand beside the plot, where they hide no curve.
     let (plot, key) = area.split_horizontally(KEY_FROM_PX);
-    for (y, (name, colour, _)) in (20..).step_by(20).zip(lines) {
+    for (y, (name, colour, _)) in (20..).step_by(20).zip(lines.iter().filter(|(name, ..)| !name.is_empty())) {
         key.draw(&PathElement::new([(0, y), (18, y)], colour.stroke_width(2)))?;
         key.draw(&Text::new(*name, (24, y - 7), ("sans-serif", 13)))?;
     }

@@ -1,5 +1,6 @@
 //! What is different at the test from what the training saw. Plain data; cannot fail.
 
+use crate::bench::eye_fault::EyeFault;
 use serde::Serialize;
 use simulator::physics::rig::Rig;
 
@@ -23,13 +24,32 @@ pub enum Change {
     GainLow,
     /// Camera gain + 5 %.
     GainHigh,
+    /// The camera never sees a stream.
+    EyeBlind,
+    /// The same, and somebody has told how much is in the vessel.
+    EyeBlindFill,
+    /// From the first stream on, the camera sees 90 px^2, the same to the bit.
+    EyeStuck,
+    /// From the first stream on, the camera sees a false one of 150 px^2 that wavers by 5 %.
+    EyeWaverThin,
+    /// The same with 300 px^2: about a wanted stream.
+    EyeWaver,
+    /// The same with 600 px^2.
+    EyeWaverThick,
+    /// The same with 300 px^2, as soon as the container is tilted.
+    EyeWaverEarly,
+    /// One frame shows 200 to 20,000 px^2.
+    EyeSpike,
+    /// The camera's gain falls by 30 % within 10 s.
+    EyeDriftDown,
+    /// The camera's gain rises by 30 % within 10 s.
+    EyeDriftUp,
 }
 
 impl Change {
     /// The rig with this change.
     pub fn apply(self, mut rig: Rig) -> Rig {
         match self {
-            Self::None => {}
             Self::FlowLow => rig.fluidity *= 0.6,
             Self::FlowHigh => rig.fluidity *= 1.5,
             Self::Noise => rig.frame_noise *= 2.0,
@@ -37,7 +57,29 @@ impl Change {
             Self::Dropouts => rig.dropouts = 0.10,
             Self::GainLow => rig.gain *= 0.95,
             Self::GainHigh => rig.gain *= 1.05,
+            _ => {}
         }
         rig
+    }
+
+    /// Whether somebody tells the controller how much is in the vessel.
+    pub fn tells_fill(self) -> bool {
+        self == Self::EyeBlindFill
+    }
+
+    /// The fault that the eye has with this change.
+    pub fn eye(self) -> Option<EyeFault> {
+        Some(match self {
+            Self::EyeBlind | Self::EyeBlindFill => EyeFault::Blind,
+            Self::EyeStuck => EyeFault::Stuck,
+            Self::EyeWaverThin => EyeFault::Wavering(150.0),
+            Self::EyeWaver => EyeFault::Wavering(300.0),
+            Self::EyeWaverThick => EyeFault::Wavering(600.0),
+            Self::EyeWaverEarly => EyeFault::WaveringEarly(300.0),
+            Self::EyeSpike => EyeFault::Spike,
+            Self::EyeDriftDown => EyeFault::DriftDown,
+            Self::EyeDriftUp => EyeFault::DriftUp,
+            _ => return None,
+        })
     }
 }

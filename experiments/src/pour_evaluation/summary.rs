@@ -1,6 +1,10 @@
 //! The errors of one method over many pours. Pure; allocates; cannot fail.
 
+use std::collections::BTreeMap;
+
 use serde::Serialize;
+
+use shared::control::EndReason;
 
 use crate::bench::pour::PourResult;
 
@@ -35,6 +39,14 @@ pub struct Summary {
     pub falsely_ended: usize,
     /// Share of the pours whose error of measurement is within the standard deviation that the controller gives; NaN if it gives none.
     pub covered: f64,
+    /// How many pours ended for each reason, in the order of their names.
+    pub endings: BTreeMap<String, usize>,
+    /// Of the pours that ended as done: the largest difference of what had left from what was said, ml.
+    pub done_off_ml: f64,
+    /// Of these, the share whose difference is more than three of the standard deviations that were said.
+    pub done_beyond_3_sds: f64,
+    /// The most that has left beyond the goal in any pour, ml.
+    pub beyond_goal_ml: f64,
     /// Mean absolute error of measurement, ml.
     pub measurement_ml: f64,
     /// Mean absolute error of control, ml.
@@ -56,6 +68,16 @@ pub fn mean_ci(groups: &[f64]) -> (f64, f64) {
     (mean, 1.96 * (variance / n).sqrt())
 }
 
+/// How many pours ended for each reason.
+fn endings(pours: &[&PourResult]) -> BTreeMap<String, usize> {
+    let mut endings = BTreeMap::new();
+    for reason in pours.iter().filter_map(|p| p.reason) {
+        let name = serde_json::to_value(reason).ok().and_then(|v| v.as_str().map(str::to_owned)).unwrap_or_default();
+        *endings.entry(name).or_insert(0) += 1;
+    }
+    endings
+}
+
 impl Summary {
     /// The summary of groups (one for each rig and seed) of pours.
     pub fn new(name: &str, groups: &[Vec<PourResult>]) -> Self {
@@ -65,6 +87,7 @@ impl Summary {
         let mut errors: Vec<f64> = pours.iter().map(|p| p.error_ml().abs()).collect();
         errors.sort_by(f64::total_cmp);
         let quantile = |q: f64| errors.get(((q * n).ceil() as usize).clamp(1, errors.len().max(1)) - 1).copied().unwrap_or(f64::NAN);
+        let done: Vec<&PourResult> = pours.iter().filter(|p| p.reason == Some(EndReason::Done)).copied().collect();
         let groups_ml: Vec<f64> =
             groups.iter().map(|g| g.iter().map(|p| p.error_ml().abs()).sum::<f64>() / g.len().max(1) as f64).collect();
         Self {
@@ -85,6 +108,10 @@ impl Summary {
                 let covered: Vec<bool> = pours.iter().filter_map(|p| p.covered()).collect();
                 covered.iter().filter(|c| **c).count() as f64 / covered.len() as f64
             },
+            endings: endings(&pours),
+            done_off_ml: done.iter().map(|p| p.measurement_ml().abs()).fold(0.0, f64::max),
+            done_beyond_3_sds: done.iter().filter(|p| p.measurement_ml().abs() > 3.0 * p.believed_sd_ml).count() as f64 / done.len() as f64,
+            beyond_goal_ml: pours.iter().map(|p| p.error_ml()).fold(f64::NEG_INFINITY, f64::max),
             measurement_ml: mean(&|p| p.measurement_ml().abs()),
             control_ml: mean(&|p| p.control_ml().abs()),
             seconds: mean(&|p| p.seconds),
@@ -111,6 +138,19 @@ impl Summary {
             "measure",
             "control",
             "s"
+        )
+    }
+
+    /// How the pours ended, and how far what was said of those that were done is off.
+    pub fn endings_line(&self) -> String {
+        let endings: Vec<String> = self.endings.iter().map(|(reason, n)| format!("{reason} {n}")).collect();
+        format!(
+            "  {}: {}; said of the done ones: off by at most {:.1} ml, {:.1} % beyond 3 sd; at most {:.1} ml beyond a goal",
+            self.name,
+            endings.join(", "),
+            self.done_off_ml,
+            100.0 * self.done_beyond_3_sds,
+            self.beyond_goal_ml
         )
     }
 
@@ -147,6 +187,7 @@ mod tests {
     fn summaries_count_right() {
         let one = |error: f64, ended: bool| PourResult {
             believed_sd_ml: 4.0,
+            reason: Some(if ended { EndReason::Done } else { EndReason::ImpossibleFlow }),
             falsely_ended: !ended,
             init_ml: 300.0,
             goal_ml: 100.0,
@@ -160,6 +201,8 @@ mod tests {
         assert_eq!((s.mae_ml, s.bias_ml, s.max_ml, s.median_ml), (27.5, -24.0, 100.0, 3.0));
         assert_eq!((s.never_poured, s.never_stopped, s.within_5_ml, s.within_5_percent), (1, 1, 0.5, 0.5));
         assert_eq!((s.falsely_ended, s.covered), (1, 0.5));
+        assert_eq!((s.endings["done"], s.endings["impossible-flow"]), (3, 1));
+        assert_eq!((s.done_off_ml, s.done_beyond_3_sds, s.beyond_goal_ml), (100.0, 1.0 / 3.0, 6.0));
         assert_eq!(s.groups_ml, [2.0, 53.0]);
         assert!((s.mae_ci_ml - 1.96 * 25.5).abs() < 1e-9);
     }

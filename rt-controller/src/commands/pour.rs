@@ -33,7 +33,7 @@ pub struct Args {
 pub fn run(args: &Args) -> Result<(), Failure> {
     let config = Config::read(&args.common.config).or_exit(exit::BAD_INPUT)?;
     let foreseen = Foreseen::of(&config, args)?;
-    if let Some(line) = foreseen.line(args.goal_ml) {
+    for line in foreseen.line(args.goal_ml).into_iter().chain(foreseen.unseen_line()) {
         eprintln!("{line}");
     }
     let request = Request::Pour { goal_ml: args.goal_ml, flows_by_deg: foreseen.flows_by_deg };
@@ -48,6 +48,8 @@ struct Foreseen {
     sd_ml: Option<f32>,
     /// The tilt by which it must flow, degrees, if the fill is known.
     flows_by_deg: Option<f32>,
+    /// What may leave before it is noticed that the camera sees nothing, ml, if the fill is not known.
+    unseen_ml: Option<f64>,
     /// Whether the controller has the weights that lie in the configured file.
     same_weights: bool,
 }
@@ -66,7 +68,18 @@ impl Foreseen {
                         with --estimate fused";
             return Err(failure(exit::BAD_INPUT, what));
         }
-        Ok(Self { sd_ml, flows_by_deg, same_weights: weights.is_some() })
+        let unseen_ml = if flows_by_deg.is_none() { weights.as_ref().and_then(foreseen::unseen_ml) } else { None };
+        Ok(Self { sd_ml, flows_by_deg, unseen_ml, same_weights: weights.is_some() })
+    }
+
+    /// What a camera that sees no stream at all could cost, where nobody has told the fill.
+    fn unseen_line(&self) -> Option<String> {
+        self.unseen_ml.map(|ml| {
+            format!(
+                "note: nobody said how much is in the vessel, so if the camera sees no stream at all, up to {ml:.0} ml leave before that is \
+                 noticed: give --fill, or [container] least_fill_ml"
+            )
+        })
     }
 
     /// What the operator should know before the pour; `None` if all is well.

@@ -20,6 +20,7 @@
 //! | [`controller_overran`]: the controller itself was stopped | `ControllerOverrun` |
 //! | [`worker_was_restarted`]: measurements come from another process | `WorkerRestarted` |
 //! | [`Ending::settled`]: the joint did not come upright | `NotUpright` |
+//! | the same: the goal seemed reached, and then too much of it is missing | `StreamLost` |
 
 use shared::agent::Decision;
 use shared::control::EndReason;
@@ -38,6 +39,10 @@ const STALLED_FRAMES: u32 = 90;
 const PROGRESS_DEG: f32 = 1.0;
 /// Poured volume that counts as progress, ml. Chosen by hand; no measurement is recorded.
 const PROGRESS_ML: f32 = 0.5;
+/// A pour that its agent has ended, and that is short of the goal by more than so many ml and more than this share of it, has lost its stream:
+/// what it took for one was none, or has ceased. No pour that was done was shorter among the 3,000 fixed seeds of docs/SWARM.md, but for one with
+/// a false frame.
+const SHORT: (f32, f32) = (8.0, 0.08);
 /// If less than this is still to come over the lip, ml, it counts as nothing: this is about one drop of water.
 const NOTHING_ML: f64 = 0.05;
 /// After this many frames in a row with a stream, the tilt of the stream is remembered. None of 10,800 simulated pours ended by mistake
@@ -63,6 +68,8 @@ const COMING_DEG: f32 = 1.0;
 /// The longest wait for the last drops, and for a joint that comes no nearer to upright, s. Chosen by hand; no measurement is recorded.
 const SETTLE_MAX_S: f64 = 3.0;
 
+/// Number of frames in a row with a stream from which on one was seen: a lone flash is none.
+const SEEN_FRAMES: u32 = 2;
 /// Number of frames in a row without any flow at a tilt at which the vessel must flow: longer than a joint follows its command late.
 const DRY_FRAMES: u32 = 10;
 
@@ -109,9 +116,13 @@ pub struct Ending {
     curve_s: Option<f64>,
     reason: EndReason,
     agent_is_done: bool,
+    /// Too much of the goal is missing by what is believed now.
+    is_short: bool,
     /// What the camera sees cannot be.
     impossible: Option<Impossible>,
     seen_flow: bool,
+    /// Whether a stream was seen in more than a lone frame.
+    seen_stream: bool,
     brought_back_deg: f32,
     stalled_frames: u32,
     advanced_deg: f32,
@@ -137,8 +148,10 @@ impl Ending {
             curve_s: None,
             reason: EndReason::Done,
             agent_is_done: false,
+            is_short: false,
             impossible: None,
             seen_flow: false,
+            seen_stream: false,
             brought_back_deg: 0.0,
             stalled_frames: 0,
             advanced_deg: 0.0,
@@ -180,11 +193,15 @@ impl Ending {
         }
     }
 
-    /// Takes whether the joint follows on its way upright. The way of a slower robot is waited for, but more was then poured than was
-    /// foreseen when it began, so such a pour is not done.
+    /// Takes whether the joint follows on its way upright, and looks at what was seen meanwhile. The way of a slower robot is waited for, but
+    /// more was then poured than was foreseen when it began, so such a pour is not done.
     pub fn returns(&mut self, follows: bool) {
         if !follows {
             self.end_without_robot(EndReason::NotFollowed);
+        }
+        // A stream that goes on although the container is brought upright was none before either, so the goal was not reached.
+        if let Some(impossible) = self.impossible {
+            self.end_without_robot(reason_of(impossible));
         }
     }
 
@@ -196,6 +213,7 @@ impl Ending {
     /// Takes the agent's decision for one frame, lost or not, and returns [`Ending::agent_is_done`].
     pub fn decided(&mut self, decision: &Decision) -> bool {
         self.impossible = self.impossible.or(decision.impossible);
+        self.is_short = is_short(decision);
         self.agent_is_done |= goal_is_reached(decision);
         self.seen_flow |= decision.flowing;
         self.agent_is_done |= self.is_brought_back(decision);
@@ -234,7 +252,8 @@ impl Ending {
         } else {
             (self.stream_frames, self.no_stream_frames) = (0, self.no_stream_frames + frames);
         }
-        let dry = !self.seen_flow && self.flows_by_deg.is_some_and(|deg| frame.alpha_deg > deg);
+        self.seen_stream |= self.stream_frames >= SEEN_FRAMES;
+        let dry = !self.seen_stream && self.flows_by_deg.is_some_and(|deg| frame.alpha_deg > deg);
         self.dry_frames = if dry && !frame.flowing { self.dry_frames + frames } else { 0 };
         let at_largest_tilt = frame.alpha_now_deg >= settings.limits.alpha_max_deg - LARGEST_TILT_SLACK_DEG;
         self.empty_frames = if at_largest_tilt && !frame.flowing { self.empty_frames + frames } else { 0 };
@@ -284,13 +303,22 @@ impl Ending {
         }
         // A slow robot is waited for as long as it comes nearer.
         let over = settling_s >= SETTLE_MAX_S && (upright || settling_s - self.nearest.1 >= SETTLE_MAX_S);
-        (over || (upright && (quiet || shutdown))).then_some(if upright { self.reason } else { EndReason::NotUpright })
+        (over || (upright && (quiet || shutdown))).then_some(match self.reason {
+            _ if !upright => EndReason::NotUpright,
+            EndReason::Done if self.is_short && self.curve_s.is_none() => EndReason::StreamLost,
+            reason => reason,
+        })
     }
 }
 
 /// Whether the goal is reached: d, less what is still on its way, is 0 or less, and nothing more comes over the lip.
 fn goal_is_reached(decision: &Decision) -> bool {
     decision.tilting_back && decision.over_lip_ml < NOTHING_ML
+}
+
+/// Whether so much of the goal is missing that a pour that ends so is not done.
+fn is_short(decision: &Decision) -> bool {
+    decision.d_ml > SHORT.0.max(SHORT.1 * (decision.d_ml + decision.poured_ml))
 }
 
 /// The reason for what cannot be.
@@ -396,6 +424,40 @@ mod tests {
         }
     }
 
+    /// Protects the operator from a pour of nothing that is called done: an agent that came upright far short of its goal, after a frame that
+    /// looked like a stream, has lost its stream. A little short is done, and another reason stays.
+    #[test]
+    fn far_short_of_the_goal_is_not_done() {
+        let settings = Settings::new(&shared::config::Config::parse(include_str!("../../../config/sim.toml"), "sim.toml").unwrap());
+        for (d_ml, poured_ml, before, after) in [
+            (65.0, 6.0, EndReason::Done, EndReason::StreamLost),
+            (7.0, 64.0, EndReason::Done, EndReason::Done),
+            (15.0, 185.0, EndReason::Done, EndReason::Done),
+            (65.0, 6.0, EndReason::Aborted, EndReason::Aborted),
+        ] {
+            let mut ending = Ending::of_pour();
+            ending.decided(&Decision { d_ml, poured_ml, tilting_back: true, ..Decision::NOTHING });
+            ending.end_with(before);
+            assert_eq!(ending.settled(0.0, 4.0, false, &settings), Some(after), "{d_ml} ml are missing");
+        }
+    }
+
+    /// Protects the operator from a camera that shows a false stream: a pour that seemed done is not, if the stream then goes on at an upright
+    /// container. Another reason stays.
+    #[test]
+    fn what_cannot_be_on_the_way_back_is_named() {
+        let impossible = Decision { impossible: Some(Impossible::Flow), ..Decision::NOTHING };
+        for (before, after) in [(EndReason::Done, EndReason::ImpossibleFlow), (EndReason::Aborted, EndReason::Aborted)] {
+            let mut ending = Ending::of_pour();
+            ending.end_with(before);
+            ending.returns(true);
+            assert_eq!(ending.reason(), before);
+            ending.decided(&impossible);
+            ending.returns(true);
+            assert_eq!(ending.reason(), after);
+        }
+    }
+
     /// Protects the operator: the reason that came first is the one that is reported.
     #[test]
     fn the_first_reason_stays() {
@@ -417,7 +479,7 @@ mod tests {
         let moment = Moment { running_s: 2.0, frames: 60, measurement_age_ns: 0, alpha_deg: 70.0, poured_ml: 0.0, follows: true };
         let after = |flows_by_deg: Option<f32>, flowed: bool, frames: u32| {
             let mut ending = Ending::of_pour_that_flows_by(flows_by_deg);
-            ending.seen_flow = flowed;
+            ending.seen_stream = flowed;
             for _ in 0..frames {
                 let frame = SeenFrame { lost: 0, area_px2: Some(0.0), flowing: false, alpha_deg: 62.0, alpha_now_deg: 63.0 };
                 ending.saw(&frame, &settings);
@@ -429,5 +491,12 @@ mod tests {
         assert_eq!(after(Some(65.0), false, DRY_FRAMES), None);
         assert_eq!(after(Some(60.0), true, DRY_FRAMES), None);
         assert_eq!(after(None, false, DRY_FRAMES), None);
+        // A lone flash is no stream.
+        let mut flashed = Ending::of_pour_that_flows_by(Some(60.0));
+        for k in 0..=DRY_FRAMES {
+            let area_px2 = Some(if k == 0 { 100.0 } else { 0.0 });
+            flashed.saw(&SeenFrame { lost: 0, area_px2, flowing: k == 0, alpha_deg: 62.0, alpha_now_deg: 63.0 }, &settings);
+        }
+        assert_eq!(flashed.due(&moment, &settings), Some(EndReason::NothingFlows));
     }
 }

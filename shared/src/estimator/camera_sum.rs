@@ -16,6 +16,8 @@ pub(super) struct CameraSum {
     /// The sum, ml.
     pub sum_ml: f64,
     squares_ml2: f64,
+    /// Outflow of the newest frame, ml.
+    newest_ml: f64,
     /// Sum of the outflow times the logarithm of its area.
     log_area_ml: f64,
 }
@@ -25,11 +27,23 @@ impl CameraSum {
     pub fn add(&mut self, calibration: &Calibration, area_px2: Option<f32>, alpha_deg: f64) {
         let area_px2 = self.hold.step(area_px2, calibration.hold_above_px2);
         let ml = f64::from(calibration.volume_ml(area_px2, alpha_deg as f32)).min(MEASURED_MAX_ML);
+        self.newest_ml = ml;
         if ml > 0.0 {
             self.sum_ml += ml;
             self.squares_ml2 += ml * ml;
             self.log_area_ml += ml * f64::from(area_px2).ln();
         }
+    }
+
+    /// Adds what was withheld of an earlier frame, ml.
+    pub fn add_late(&mut self, ml: f64) {
+        let late_ml = ml - self.newest_ml;
+        if self.sum_ml > 0.0 && late_ml > 0.0 {
+            // The mean area so far stands for its own.
+            self.log_area_ml += late_ml * self.log_area_ml / self.sum_ml;
+            self.squares_ml2 += late_ml * late_ml;
+        }
+        self.sum_ml += late_ml.max(0.0);
     }
 
     /// Standard deviation of the sum, ml: what the calibration leaves open at the areas of this pour, the pour's own gain, and the frames' noise.

@@ -27,6 +27,12 @@
 use super::flow::{DRIP_SHARE, FlowState, FlowTables};
 use super::vessel::{KNOTS, TablePlace, knot_place};
 
+/// Index of the explanation by a vessel of any shape.
+pub const WIDE: usize = 0;
+/// Index of the explanation by a vessel with straight walls.
+pub const TIGHT: usize = 1;
+/// Number of explanations.
+pub const EXPLANATIONS: usize = 2;
 /// Number of a pour's unknowns before it begins: lambda, G, delta and s.
 pub const UNKNOWNS: usize = 3 + KNOTS;
 /// Number of states of a filter.
@@ -115,6 +121,12 @@ struct Slopes {
     flow_ml: f64,
     per_excess: f64,
     per_flow_factor: f64,
+}
+
+impl Default for Filter {
+    fn default() -> Self {
+        Self::new()
+    }
 }
 
 impl Filter {

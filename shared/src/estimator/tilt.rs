@@ -21,13 +21,15 @@ pub(super) struct Angles {
     has_measured: bool,
 }
 
-impl Angles {
+impl Default for Angles {
     /// No angles.
-    pub fn new() -> Self {
+    fn default() -> Self {
         let none = CommandHistory::standing_at(0.0);
         Self { commanded: none, measured: none, begun: false, has_measured: false }
     }
+}
 
+impl Angles {
     /// Adds a frame's angles, degrees. A command that is not a number repeats the one before it. A measured angle that is not a number moves as
     /// the command does, if there was one before.
     pub fn push(&mut self, command_deg: f64, measured_deg: f64) {
@@ -59,12 +61,14 @@ pub(super) struct ShownTilt {
     begun: bool,
 }
 
-impl ShownTilt {
+impl Default for ShownTilt {
     /// A container that has not been seen.
-    pub fn new() -> Self {
+    fn default() -> Self {
         Self { tilt: Tilt { tilt_deg: 0.0, change_deg: 0.0, change_before_deg: 0.0 }, begun: false }
     }
+}
 
+impl ShownTilt {
     /// Takes the angles of a new frame.
     pub fn follow(&mut self, model: &FlowModel, angles: &Angles) {
         let commanded = Lateness { lag_frames: model.lag_frames, delay_frames: model.delay_frames };

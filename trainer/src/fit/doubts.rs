@@ -22,6 +22,8 @@ const GAIN: usize = 1;
 const EXTRA_DELAY: usize = 2;
 /// Index of the shape at the first knot.
 const SHAPE: usize = 3;
+/// Largest standard deviation of an unknown: the filter believes no logarithm that is larger.
+const SD_MAX: f64 = 3.0;
 /// Step of the difference quotients.
 const NUDGE: f64 = 1e-4;
 
@@ -64,11 +66,13 @@ pub fn unknowns(fitted: &Fitted, doubt: f64) -> UnknownsCovariance {
         to_camera[(SHAPE + k, GAIN)] = 1.0;
     }
     let seen = &to_camera * covariance * to_camera.transpose();
+    // What the episodes say nothing about at all is cut to what a filter can use, and a weight file holds.
+    let cut: Vec<f64> = (0..UNKNOWNS).map(|k| (SD_MAX / seen[(k, k)].max(1e-12).sqrt()).min(1.0)).collect();
     let mut unknowns = [[0.0; UNKNOWNS]; UNKNOWNS];
     for (i, row) in unknowns.iter_mut().enumerate() {
         for (j, value) in row.iter_mut().enumerate() {
             let more = if i == j { 1e-8 } else { 0.0 };
-            *value = 0.5 * (seen[(i, j)] + seen[(j, i)]) + more;
+            *value = 0.5 * (seen[(i, j)] + seen[(j, i)]) * cut[i] * cut[j] + more;
         }
     }
     unknowns

@@ -17,6 +17,11 @@ const BIN_ML: f64 = 0.5;
 /// Errors beyond this are counted in the outermost bins, ml.
 const LAST_BIN_ML: f64 = 12.0;
 
+/// The last number of standard deviations on the calibration's axis.
+const LAST_SDS: f64 = 3.0;
+/// Number of points of a line of it.
+const SHARE_STEPS: u32 = 60;
+
 /// An evaluation as `experiments evaluate` writes it.
 pub fn evaluation(v: &Value) -> String {
     let mut html = format!(
@@ -52,6 +57,8 @@ fn summaries(summaries: &Value) -> String {
         "≤ 5 %",
         "never poured",
         "never stopped",
+        "ended by mistake",
+        "within the deviation",
         "measurement",
         "control",
         "s a pour",
@@ -72,6 +79,8 @@ fn summaries(summaries: &Value) -> String {
             percent("within_5_percent"),
             s["never_poured"].to_string(),
             s["never_stopped"].to_string(),
+            s["falsely_ended"].to_string(),
+            percent("covered"),
             rounded(&s["measurement_ml"], 2),
             rounded(&s["control_ml"], 2),
             rounded(&s["seconds"], 1),
@@ -96,6 +105,42 @@ fn pours(methods: &Value) -> String {
     }
     figure(&plot("goal in ml (spread by ±4 for sight)", "poured in ml", &scatter, true), "Goal against poured.")
         + &figure(&plot("error in ml (ends hold what is beyond)", "% of the pours", &bars, true), "Errors.")
+        + &calibration(methods)
+}
+
+/// The share of the pours whose estimate is off by no more than so many of the standard deviations that were said, beside what an honest
+/// deviation gives; nothing where none was said.
+fn calibration(methods: &Value) -> String {
+    let steps = || (0..=SHARE_STEPS).map(|k| LAST_SDS * f64::from(k) / f64::from(SHARE_STEPS));
+    let normal = PlotSeries::reference("honest (normal)", steps().map(|sds| (sds, 100.0 * within_normal(sds))).collect());
+    let mut lines = vec![normal];
+    let mut count = 0;
+    for method in items(methods) {
+        let off_sds: Vec<f64> = items(&method["groups"])
+            .flat_map(items)
+            .filter(|p| number(&p["believed_sd_ml"]) > 0.0)
+            .map(|p| (number(&p["true_ml"]) - number(&p["believed_ml"])).abs() / number(&p["believed_sd_ml"]))
+            .collect();
+        if off_sds.is_empty() {
+            continue;
+        }
+        count += off_sds.len();
+        let share = |sds: f64| 100.0 * off_sds.iter().filter(|off| **off <= sds).count() as f64 / off_sds.len() as f64;
+        lines.push(PlotSeries::line(&text(&method["name"]), steps().map(|sds| (sds, share(sds))).collect()));
+    }
+    if count == 0 {
+        return String::new();
+    }
+    let caption = format!("How often the estimate is within so many of its own standard deviations, over {count} pours.");
+    figure(&plot("standard deviations", "% of the pours within", &lines, true), &caption)
+}
+
+/// The share of a normal distribution within so many standard deviations of its mean, by the midpoint rule.
+fn within_normal(sds: f64) -> f64 {
+    let steps = 200;
+    let step = sds / f64::from(steps);
+    let density = |x: f64| (-0.5 * x * x).exp() * (2.0 / std::f64::consts::PI).sqrt();
+    (0..steps).map(|k| density((f64::from(k) + 0.5) * step) * step).sum()
 }
 
 /// One pour frame by frame.
