@@ -77,8 +77,13 @@ pub fn foresee(site: &Site, goal_ml: f32, fill_ml: Option<f64>) -> Foreseen {
         return Foreseen { possible: true, sd_ml: None, flows_by_deg: None, lines };
     };
     let sd_ml = foreseen::poured_sd_ml(&weights, site.config.limits, goal_ml);
-    let fill_ml = fill_ml.or(container.least_fill_ml);
-    let flows_by_deg = fill_ml.and_then(|ml| foreseen::flows_by_deg(&weights, ml, container.holds_ml));
+    let flows_by_deg = fill_ml.or(container.least_fill_ml).and_then(|ml| foreseen::flows_by_deg(&weights, ml, container.holds_ml));
+    if let (None, Some(unseen_ml)) = (flows_by_deg, foreseen::unseen_ml(&weights)) {
+        lines.push(format!(
+            "It is not known by which tilt it must flow: if the camera sees no stream at all, up to {unseen_ml:.0} ml leave before that is \
+             noticed. Say what is in the vessel."
+        ));
+    }
     match sd_ml {
         Some(sd) if sd > WARNED_SD_ML => {
             lines.push(format!("This is far off: weigh what is proposed under Learn first. Expected deviation {sd:.1} ml."));
