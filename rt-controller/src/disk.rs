@@ -188,7 +188,7 @@ impl<'a> Disk<'a> {
 }
 
 /// The weights in `path` if they are for a camera of `fps` frames a second and of an owner who may give some, or why they are refused.
-fn read_weights(path: &Path, fps: f64, trusted: Option<u32>) -> Result<Weights, String> {
+pub fn read_weights(path: &Path, fps: f64, trusted: Option<u32>) -> Result<Weights, String> {
     let owned = regular_file::open(path).map_err(|e| e.to_string()).and_then(|(_, meta)| regular_file::check_owner(&meta, trusted));
     owned.map_err(|e| format!("{}: {e}", path.display()))?;
     let weights = Weights::read(path).map_err(|e| e.to_string())?;

@@ -3,7 +3,7 @@
 //! The loop hands each [`Tick`] to an ordinary thread through a queue, and that thread writes it ([`Writer`]). Commands and tests read
 //! and replay. Both allocate. A file that was cut off is read up to its last whole entry; every other fault is a [`JournalError`].
 //!
-//! The file begins with the 8 bytes `decantj4`. Then come the entries: a little-endian u32 with the length, and that many bytes of
+//! The file begins with the 8 bytes `decantj5`. Then come the entries: a little-endian u32 with the length, and that many bytes of
 //! postcard.
 
 use std::collections::BTreeMap;
@@ -21,7 +21,7 @@ use crate::core::{Core, Input, MAX_FEATURES, Order, Robot, Settings};
 use crate::pacing::Pacer;
 
 /// The first bytes of a journal, which include its version.
-const MAGIC: &[u8; 8] = b"decantj4";
+const MAGIC: &[u8; 8] = b"decantj5";
 /// Longest entry, bytes: more than ten weight files, which are the largest entries.
 const ENTRY_MAX: usize = 128 * 1024;
 /// Size at which a journal stops growing, bytes: about three days of ticks.

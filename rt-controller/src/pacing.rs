@@ -5,8 +5,10 @@
 //! phase, by at most [`PULL_MAX_NS`] (0.6 % of the period), until V_e has waited for the margin when it is used. A camera whose rate
 //! differs by more is not followed; the loop's rate then wanders within that 0.6 %.
 //!
-//! The margin follows what this machine does. It is twice what V_e came late at most, relative to its usual time, within the last 10 to 12 s,
-//! and [`MARGIN_FLOOR_NS`] more; the largest there is, until V_e was watched for 4 s. A tick that wakes up late needs no margin, because V_e is then there all the more.
+//! The margin follows what this machine does. It is twice what V_e came late, relative to its usual time, in all but one of the frames of
+//! the last 10 to 12 s (their 99.7th percentile), and [`MARGIN_FLOOR_NS`] more; the largest there is, until V_e was watched for 4 s. A
+//! pause of the machine that comes once in that time costs its own frame, and no other frame waits for it. A tick that wakes up late
+//! needs no margin, because V_e is then there all the more.
 //!
 //! It is pure and runs in the real-time thread; it does not allocate or fail. What it sees stands in the journal, so that every deadline
 //! can be computed again.
@@ -18,9 +20,11 @@ pub const MARGIN_FLOOR_NS: i64 = 300_000;
 pub const MARGIN_MAX_NS: i64 = 3_000_000;
 /// Number of measurements in a window: 2 s at 30 Hz.
 const WINDOW: u32 = 60;
-/// Number of windows whose latest V_e decides, this one included: 10 to 12 s. Chosen by hand: a machine whose pauses are further apart loses one
-/// tick in hundreds to each.
+/// Number of windows whose latest V_e decide, this one included: 10 to 12 s. Chosen by hand: a machine whose pauses are further apart loses
+/// one tick in hundreds to each.
 const WINDOWS: usize = 6;
+/// How many of the latest V_e of each window are kept: one that is forgiven and the one that decides.
+const KEPT: usize = 2;
 /// Largest change of a period, ns: 0.6 % of the period at 30 Hz. Chosen by hand; no measurement is recorded.
 pub const PULL_MAX_NS: i64 = 200_000;
 /// One tick corrects this part of the phase's error, 1 / 8, because the measurement of a single frame is noise. Chosen by hand; no
@@ -29,6 +33,12 @@ const GAIN: i64 = 8;
 /// A measurement moves the belief of the difference of the two clocks by this part of its error, 1 / 128. With [`GAIN`] this damps the belief by
 /// 0.7, the usual choice.
 const DRIFT_GAIN: i64 = 128;
+/// A known phase is moved by no more than this part of a measurement's error, ns, so that a pause of the machine does not make the frames
+/// after it look early or late. Chosen by hand: half of the jitter up to which the margin is tested.
+const OUTLIER_NS: i64 = 500_000;
+/// Number of measurements in a row that are off by more than [`OUTLIER_NS`] to the same side, after which the phase is learned anew: half
+/// a second, after which it is the camera that has changed. Chosen by hand.
+const OUTLIERS: i32 = 15;
 /// Number of measurements after which the phase is known, so that a late V_e is told from a wrong belief: five times the belief's own time.
 const KNOWN: u32 = 64;
 
@@ -41,12 +51,14 @@ pub struct Pacer {
     /// By how much the camera's period is longer than the loop's, ns; it is taken off the wait in each period.
     drift_ns: i64,
     margin_ns: i64,
-    /// The latest that V_e came, relative to its usual time, in this window and in those before, newest first, ns.
-    latest_ns: [i64; WINDOWS],
+    /// The latest that V_e came, relative to its usual time, latest first, in this window and in those before, newest first, ns.
+    latest_ns: [[i64; KEPT]; WINDOWS],
     /// Number of measurements in this window.
     seen: u32,
     /// Number of measurements, up to [`KNOWN`].
     known: u32,
+    /// Number of measurements in a row that were off by more than [`OUTLIER_NS`]: positive if they had waited longer, negative if less.
+    outliers: i32,
     /// Whether a whole window was seen; before, the margin is the largest.
     watched: bool,
 }
@@ -54,7 +66,17 @@ pub struct Pacer {
 impl Pacer {
     /// The pacer of a loop with this period, ns.
     pub fn new(period_ns: u64) -> Self {
-        Self { period_ns, wait_ns: None, drift_ns: 0, margin_ns: MARGIN_MAX_NS, latest_ns: [0; WINDOWS], seen: 0, known: 0, watched: false }
+        Self {
+            period_ns,
+            wait_ns: None,
+            drift_ns: 0,
+            margin_ns: MARGIN_MAX_NS,
+            latest_ns: [[0; KEPT]; WINDOWS],
+            seen: 0,
+            known: 0,
+            outliers: 0,
+            watched: false,
+        }
     }
 
     /// How long V_e is to have waited when its tick wakes up, ns.
@@ -72,23 +94,38 @@ impl Pacer {
         };
         // A measurement that waited almost a whole period came just after the tick before, so the error is taken the nearer way round.
         let error_ns = self.nearest(waited_ns - wait_ns);
-        self.wait_ns = Some(self.nearest(wait_ns + error_ns / GAIN));
-        self.drift_ns = (self.drift_ns - error_ns / DRIFT_GAIN).clamp(-PULL_MAX_NS, PULL_MAX_NS);
+        let outlier = self.known == KNOWN && error_ns.abs() > OUTLIER_NS;
+        let learned_ns = if outlier { OUTLIER_NS * error_ns.signum() } else { error_ns };
+        self.wait_ns = Some(self.nearest(wait_ns + learned_ns / GAIN));
+        if !outlier {
+            self.drift_ns = (self.drift_ns - error_ns / DRIFT_GAIN).clamp(-PULL_MAX_NS, PULL_MAX_NS);
+        }
         if self.known < KNOWN {
             self.known += 1;
             return;
         }
-        self.latest_ns[0] = self.latest_ns[0].max(-error_ns);
+        let side = error_ns.signum() as i32;
+        self.outliers = if !outlier {
+            0
+        } else if self.outliers.signum() == side {
+            self.outliers + side
+        } else {
+            side
+        };
+        if self.outliers.abs() >= OUTLIERS {
+            (self.outliers, self.known) = (0, 0);
+        }
+        self.latest_ns[0] = later_two(self.latest_ns[0], -error_ns);
         self.seen += 1;
         if self.seen >= WINDOW {
             self.seen = 0;
             self.latest_ns.rotate_right(1);
-            self.latest_ns[0] = 0;
+            self.latest_ns[0] = [0; KEPT];
             self.watched = true;
         }
         if self.watched {
-            let latest_ns = self.latest_ns.into_iter().max().unwrap_or(MARGIN_MAX_NS);
-            self.margin_ns = (MARGIN_FLOOR_NS + 2 * latest_ns).clamp(MARGIN_FLOOR_NS, MARGIN_MAX_NS);
+            let [_, second_ns] = self.latest_ns.iter().flatten().fold([0; KEPT], |two, late_ns| later_two(two, *late_ns));
+            self.margin_ns = (MARGIN_FLOOR_NS + 2 * second_ns).clamp(MARGIN_FLOOR_NS, MARGIN_MAX_NS);
         }
     }
 
@@ -110,6 +147,11 @@ impl Pacer {
         self.wait_ns = self.wait_ns.map(|wait_ns| self.nearest(wait_ns + later_ns - self.drift_ns.saturating_mul(periods)));
         (next_ns + skipped * self.period_ns, skipped)
     }
+}
+
+/// The two latest of these and one more, latest first, ns.
+fn later_two([first_ns, second_ns]: [i64; KEPT], late_ns: i64) -> [i64; KEPT] {
+    if late_ns > first_ns { [late_ns, first_ns] } else { [first_ns, second_ns.max(late_ns)] }
 }
 
 #[cfg(test)]
@@ -191,6 +233,25 @@ mod tests {
         assert!(see(0, 4 * WINDOW) < 400_000, "watched for 8 s");
         assert_eq!(see(8_000_000, 3), 3_000_000, "V_e came 8 ms late");
         assert!(see(0, 20 * WINDOW) < 400_000);
+        assert!(see(8_000_000, 1) < 400_000, "a lone pause is not waited for by others");
+        assert!(see(0, WINDOW) < 400_000);
+        assert_eq!(see(8_000_000, 1), 3_000_000, "a second one within seconds is");
+    }
+
+    /// Protects the phase: one V_e that comes 8 ms late leaves the waits of those after it as they were, and a camera that starts again at
+    /// another moment is followed within four seconds.
+    #[test]
+    fn a_pause_is_forgotten_and_a_new_phase_is_learned() {
+        let (waits, _) = run(PERIOD_NS, 5_000_000, |frame| if frame % 600 == 0 { 8_000_000 } else { 0 });
+        let mut waits = waits.into_iter().filter(|w| *w < 2 * PERIOD_NS / 3).collect::<Vec<_>>();
+        waits.sort_unstable();
+        assert!(waits[waits.len() * 98 / 100] < 400_000, "{:?}", waits[waits.len() * 98 / 100]);
+        let moved_at = 9_300;
+        let (waits, without) = run(PERIOD_NS, 5_000_000, |frame| if frame < moved_at { 0 } else { 14_000_000 });
+        assert!(without <= 1, "{without}");
+        let settled = &waits[420..];
+        assert!(settled.iter().all(|w| *w <= 2 * MARGIN_MAX_NS as u64), "{:?}", settled.iter().max());
+        assert!(waits[waits.len() - 1] < 400_000);
     }
 
     /// Protects the robot from bursts: what was missed is skipped, and counted.

@@ -142,7 +142,7 @@ pub enum EndReason {
     NotUpright,
     /// The pendant's speed slider is below 100 %.
     SpeedReduced,
-    /// A stream was seen before, and is not seen any more although the container is tilted further.
+    /// A stream was seen before, and is not seen any more although the container is tilted further, or the agent gave up far short of its goal.
     StreamLost,
     /// The measured tilt does not follow the commanded one: the robot is slower than it is commanded, or something holds or moves it.
     NotFollowed,
@@ -175,7 +175,7 @@ impl EndReason {
             Self::Shutdown => "the controller is shutting down",
             Self::NotUpright => "the container did not come upright: look at the robot",
             Self::SpeedReduced => "the speed slider is below 100 %",
-            Self::StreamLost => "the container is empty, or its stream is no longer seen: tilted further than when it flowed",
+            Self::StreamLost => "the container is empty, or its stream is no longer seen: what was seen to flow did not reach the goal",
             Self::NotFollowed => "the robot does not follow: it is slower than it is commanded, or something holds or moves it",
             Self::InHand => "somebody has the robot in hand (the teach button is pressed)",
             Self::ImpossibleFlow => {

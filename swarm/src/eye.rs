@@ -1,6 +1,7 @@
-//! The eye at the depth `area`: from the flow at the lip to the measurement that the worker would publish, with the errors that vision makes.
+//! The eye: from the flow at the lip to the measurement that the worker would publish, with the errors that vision makes (the depth `area`), or
+//! from a drawn picture with the errors that vision really makes ([`crate::camera`]). What goes wrong with the worker is the same at both.
 //!
-//! Pure, but for the one random sequence that it owns; it allocates and cannot fail.
+//! Pure, but for the one random sequence that it owns, and the camera; it allocates and cannot fail.
 
 use std::collections::VecDeque;
 
@@ -8,7 +9,9 @@ use rand::{RngExt, SeedableRng};
 use rand_distr::{Distribution, StandardNormal};
 use rand_pcg::Pcg64Mcg;
 use shared::messages::{Doubt, Feature, LAYOUT_VERSION};
+use simulator::camera::Scene;
 
+use crate::camera::Camera;
 use crate::what::EyeFault;
 
 /// Area for an outflow of 1 ml a frame, px^2: that of simulator b.
@@ -33,8 +36,9 @@ const JITTER_NS: u64 = 800_000;
 const DRIFT_FRAMES: u32 = 60;
 
 /// The camera and its worker.
-#[derive(Debug)]
 pub struct Eye {
+    /// The camera; without one the area follows from the flow.
+    camera: Option<Camera>,
     random: Pcg64Mcg,
     sequence: u64,
     epoch_ns: u64,
@@ -60,15 +64,16 @@ pub struct Eye {
 }
 
 impl Eye {
-    /// An eye whose worker starts at `now_ns`. The area grows with the flow by `area_exponent`.
-    pub fn new(seed: u64, now_ns: u64, area_exponent: f64) -> Self {
+    /// An eye whose worker starts at `now_ns`. Without a camera the area grows with the flow by `area_exponent`.
+    pub fn new(seed: u64, now_ns: u64, area_exponent: f64, camera: Option<Camera>) -> Self {
         let mut random = Pcg64Mcg::seed_from_u64(seed ^ 0xE7E);
         let normal: f64 = StandardNormal.sample(&mut random);
         Self {
+            gain: if camera.is_some() { 1.0 } else { 1.0 + GAIN_SD * normal },
+            camera,
             random,
             sequence: 0,
             epoch_ns: now_ns,
-            gain: 1.0 + GAIN_SD * normal,
             area_exponent,
             drift: (0.0, 0),
             lost: 0,
@@ -111,8 +116,8 @@ impl Eye {
     }
 
     /// A frame was exposed at `now_ns`, in which `flow_ml` left the lip since the frame before, and this share of the stream clings to the
-    /// wall. What is measured is added to [`Eye::published`].
-    pub fn frame(&mut self, now_ns: u64, flow_ml: f64, clinging: f64) {
+    /// wall; a camera saw `scene`. What is measured is added to [`Eye::published`].
+    pub fn frame(&mut self, now_ns: u64, flow_ml: f64, clinging: f64, scene: &Scene) {
         self.sequence += 1;
         // The same numbers are drawn in every frame, so that a fault does not shift the noise of later frames.
         let normal: f64 = StandardNormal.sample(&mut self.random);
@@ -125,14 +130,14 @@ impl Eye {
         if now_ns < self.gone_until_ns || counted(&mut self.lost) {
             return;
         }
-        let seen_share = 1.0 - (1.0 - CLINGING_SEEN) * clinging;
-        let area = AREA_AT_1_ML_PX2 * seen_share * flow_ml.max(0.0).powf(self.area_exponent) * self.gain * (NOISE * normal).exp();
-        let seen = area >= AREA_MIN_PX2;
-        let mut area_px2 = if seen && !missed { area as f32 } else { 0.0 };
-        let mut doubt = Doubt::None;
-        if seen && doubted {
-            (area_px2, doubt) = (0.0, Doubt::EdgeNotFound);
-        }
+        let frozen = counted(&mut self.frozen);
+        let Some((mut area_px2, mut doubt)) = (match &mut self.camera {
+            // A camera that stands still shows its picture again, and the extraction must find that out.
+            Some(camera) => camera.look(scene, frozen).map(|(area_px2, doubt)| (area_px2 * self.gain as f32, doubt)),
+            None => Some(self.modelled(flow_ml, clinging, normal, doubted, missed)),
+        }) else {
+            return;
+        };
         if counted(&mut self.stuck.0) {
             area_px2 = self.stuck.1;
         }
@@ -142,7 +147,7 @@ impl Eye {
         if let Some(spike_px2) = self.spike_px2.take() {
             area_px2 = spike_px2;
         }
-        if counted(&mut self.frozen) {
+        if frozen && self.camera.is_none() {
             (area_px2, doubt) = (self.newest.area_px2, Doubt::Frozen);
         }
         let mut delay_ns = DELAY_NS + jitter_ns;
@@ -168,6 +173,18 @@ impl Eye {
         }
         if now_ns < self.two_until_ns {
             self.publish(Feature { worker_epoch_ns: self.two_until_ns, area_px2: area_px2 * 0.9, ..feature });
+        }
+    }
+
+    /// What vision makes of a flow: area and doubt.
+    fn modelled(&self, flow_ml: f64, clinging: f64, normal: f64, doubted: bool, missed: bool) -> (f32, Doubt) {
+        let seen_share = 1.0 - (1.0 - CLINGING_SEEN) * clinging;
+        let area = AREA_AT_1_ML_PX2 * seen_share * flow_ml.max(0.0).powf(self.area_exponent) * self.gain * (NOISE * normal).exp();
+        let seen = area >= AREA_MIN_PX2;
+        match (seen && doubted, seen && !missed) {
+            (true, _) => (0.0, Doubt::EdgeNotFound),
+            (false, true) => (area as f32, Doubt::None),
+            (false, false) => (0.0, Doubt::None),
         }
     }
 

@@ -39,7 +39,7 @@ const fn unbounded(name: &'static str, noticed_ms: u32, draw: fn(&mut Pcg64Mcg) 
 }
 
 /// All kinds, by the names of the tables and of `--only`.
-pub const KINDS: [Kind; 46] = [
+pub const KINDS: [Kind; 49] = [
     unbounded("protective-stop", 50, |r| pair(Fault::ProtectiveStop, 5_500 + later(r), Fault::UnlockProtectiveStop)),
     unbounded("emergency-stop", 50, |r| {
         let ms = later(r);
@@ -96,6 +96,14 @@ pub const KINDS: [Kind; 46] = [
     unbounded("weights-of-another-vessel", 0, |r| vec![(0, What::Weights(r.random_range(0..VESSELS.len())))]),
     unbounded("disk-full", 0, |_| vec![(0, What::DiskFull)]),
     unbounded("remote-control", 0, |r| pair(Fault::LocalControl, later(r), Fault::RemoteControl)),
+    unbounded("safeguard-stop", 50, |r| pair(Fault::SafeguardOpen, later(r), Fault::SafeguardClosed)),
+    unbounded("hand-move", 50, |r| {
+        // The program comes upright and ends first; then a person moves a joint, and lets go.
+        let joint = if r.random_bool(0.5) { Joint::Base } else { Joint::Wrist3 };
+        let hand = (3_500, What::Robot(Fault::HandMove(joint, r.random_range(-25.0..25.0))));
+        vec![(0, What::Robot(Fault::Freedrive)), hand, (6_000 + later(r), What::Robot(Fault::FreedriveEnd))]
+    }),
+    unbounded("second-client", 0, |r| vec![(0, What::SecondClient(r.random_range(100..9_000)))]),
 ];
 
 /// The number of the kind with this name.

@@ -9,6 +9,7 @@ use std::process::ExitCode;
 use clap::Parser;
 use shared::config::Config;
 use simulator::ur::Series;
+use swarm::camera::Depth;
 use swarm::faults::{KINDS, named};
 use swarm::many::{Seeds, Spread, Summary, run_many, shrink};
 use swarm::plan::{Choice, Plan};
@@ -48,6 +49,9 @@ struct Args {
     /// Draws only robots of this generation.
     #[arg(long, value_enum)]
     robot: Option<Robot>,
+    /// How deep the eye is: `area` makes areas of flows, `camera` draws frames and measures them as the worker does.
+    #[arg(long, value_enum, default_value_t)]
+    eye: Depth,
     /// Writes what they showed to this file.
     #[arg(long, requires = "seeds")]
     json: Option<PathBuf>,
@@ -110,6 +114,7 @@ fn start(args: &Args, config: &Config) -> Result<bool, String> {
         only: args.only.as_deref().map(named).transpose()?,
         vessels: usize::from(args.vessels),
         series: args.robot.map(Robot::series),
+        depth: args.eye,
     };
     match (args.seed, args.seeds) {
         (Some(seed), _) => one(args, &Plan::draw_with(seed, choice), config),
@@ -142,7 +147,8 @@ fn drawn_from(args: &Args) -> String {
         Robot::Cb3 => " --robot cb3",
         Robot::ESeries => " --robot e-series",
     });
-    only + &vessels + robot
+    let eye = if args.eye == Depth::Camera { " --eye camera" } else { "" };
+    only + &vessels + robot + eye
 }
 
 /// One seed.
@@ -234,6 +240,11 @@ fn report(summary: &Summary, wall_s: f64) {
         "seeds {} to {last}: {pours} pours and recordings, {virtual_s:.0} s in {wall_s:.1} s; {times:.0} times real time a core, training left out",
         summary.from
     ));
+    let [drawn_s, measured_s] = summary.camera_s;
+    if drawn_s > 0.0 {
+        let share = |s: f64| 100.0 * s / summary.processor_s.max(1e-9);
+        print(&format!("of the time, {:.0} % drew pictures and {:.0} % measured them", share(drawn_s), share(measured_s)));
+    }
     let violating = summary.violations.values().map(|(n, _)| n).sum::<usize>();
     if violating == 0 && pours > 0 {
         let bound = 3.0 / pours as f64;
@@ -245,11 +256,12 @@ fn report(summary: &Summary, wall_s: f64) {
         let (error, said) = (spread(&row.error_ml), spread(&row.said_ml));
         print(&format!("| {} | {} | {error} | {said} | {:.0} % |", row.fault, row.error_ml.n, 100.0 * row.covered));
     }
-    print("| fault | n ended | ml after it could be noticed: median, p99, largest | bound, ml | ml after it | s until upright |");
+    print("| fault | in a | n ended | ml after it could be noticed: median, p99, largest | bound, ml | ml after it | s until upright |");
     for row in &summary.costs {
         let bound = row.bound_ml.map_or_else(|| "the vessel".into(), |ml| format!("{ml:.0}"));
         let (excess, since, upright) = (spread(&row.excess_ml), spread(&row.since_ml), spread(&row.upright_s));
-        print(&format!("| {} | {} | {excess} | {bound} | {since} | {upright} |", row.fault, row.excess_ml.n));
+        let run = if row.in_pour { "pour" } else { "recording" };
+        print(&format!("| {} | {run} | {} | {excess} | {bound} | {since} | {upright} |", row.fault, row.excess_ml.n));
     }
     for (invariant, (n, seeds)) in &summary.violations {
         print(&format!("VIOLATED {invariant}: {n} seeds, such as {seeds:?}"));

@@ -12,6 +12,7 @@ use sha2::{Digest, Sha256};
 use shared::config::Config;
 use shared::control::EndReason;
 
+use crate::camera;
 use crate::faults::KINDS;
 use crate::plan::{Choice, Plan};
 use crate::run::{self, Shown};
@@ -45,6 +46,8 @@ impl Spread {
 pub struct CostRow {
     /// The fault.
     pub fault: String,
+    /// Whether it came in pours, and not in recordings.
+    pub in_pour: bool,
     /// What left from the moment in which it could first be noticed until the container was upright, ml.
     pub excess_ml: Spread,
     /// The most that may, ml; `None` if only the vessel bounds it.
@@ -81,6 +84,8 @@ pub struct Summary {
     pub virtual_s: f64,
     /// Processor time that it took on all cores together, without the training, s.
     pub processor_s: f64,
+    /// Processor time that went into drawing pictures and measuring them, without the training, s.
+    pub camera_s: [f64; 2],
     /// Number of violations by invariant, and the seeds of the first ones.
     pub violations: BTreeMap<String, (usize, Vec<u64>)>,
     /// How often pours and recordings ended for each reason.
@@ -118,9 +123,11 @@ pub fn run_many(seeds: Seeds, config: &Config, progress: bool) -> (Vec<Shown>, S
     if let Ok(style) = ProgressStyle::with_template("{pos}/{len} seeds  {wide_bar}  {eta}") {
         bar.set_style(style);
     }
-    let before_s = processor_s();
+    let (before_s, [drawn_s, measured_s]) = (processor_s(), camera::spent_s());
     let shown: Vec<Shown> = plans.par_iter().progress_with(bar).map(|plan| run::run(plan, &trained, config, false)).collect();
-    let summary = Summary { processor_s: processor_s() - before_s, ..sum_up(seeds, &shown) };
+    let spent_s = camera::spent_s();
+    let camera_s = [spent_s[0] - drawn_s, spent_s[1] - measured_s];
+    let summary = Summary { processor_s: processor_s() - before_s, camera_s, ..sum_up(seeds, &shown) };
     (shown, summary)
 }
 
@@ -164,17 +171,17 @@ fn sum_up(seeds: Seeds, shown: &[Shown]) -> Summary {
         let covered = covered as f64 / said.len() as f64;
         Some(DoneRow { fault: fault.to_owned(), error_ml: Spread::of(error)?, said_ml: Spread::of(said)?, covered })
     };
-    let mut costs: BTreeMap<&str, [Vec<f64>; 3]> = BTreeMap::new();
+    let mut costs: BTreeMap<(&str, bool), [Vec<f64>; 3]> = BTreeMap::new();
     for cost in shown.iter().filter(|one| one.costs.len() == 1).flat_map(|one| &one.costs) {
-        let [excess, since, upright] = costs.entry(cost.fault).or_default();
+        let [excess, since, upright] = costs.entry((cost.fault, cost.in_pour)).or_default();
         excess.push(cost.excess_ml);
         since.push(cost.since_ml);
         upright.push(cost.upright_s);
     }
-    let row = |(fault, [excess, since, upright]): (&str, [Vec<f64>; 3])| {
-        let bound_ml = KINDS.iter().find(|kind| kind.name == fault).and_then(|kind| kind.bound_ml);
+    let row = |((fault, in_pour), [excess, since, upright]): ((&str, bool), [Vec<f64>; 3])| {
+        let bound_ml = KINDS.iter().find(|kind| kind.name == fault && in_pour).and_then(|kind| kind.bound_ml);
         let (excess_ml, since_ml, upright_s) = (Spread::of(excess)?, Spread::of(since)?, Spread::of(upright)?);
-        Some(CostRow { fault: fault.to_owned(), excess_ml, bound_ml, since_ml, upright_s })
+        Some(CostRow { fault: fault.to_owned(), in_pour, excess_ml, bound_ml, since_ml, upright_s })
     };
     Summary {
         from: seeds.from,
@@ -182,6 +189,7 @@ fn sum_up(seeds: Seeds, shown: &[Shown]) -> Summary {
         pours: poured().count(),
         virtual_s: shown.iter().map(|one| one.virtual_s).sum(),
         processor_s: 0.0,
+        camera_s: [0.0; 2],
         violations,
         reasons,
         done: done.into_iter().filter_map(done_row).collect(),

@@ -10,9 +10,8 @@ use crate::what::{EyeFault, What};
 /// How long a fault needs that must end any pour, s, besides what any needs; `None` if it need not.
 pub fn must_end(what: &What) -> Option<f64> {
     match what {
-        What::Robot(Fault::ProtectiveStop | Fault::EmergencyStop | Fault::ProgramPause | Fault::ProgramStop | Fault::Freedrive) => {
-            Some(0.0)
-        }
+        What::Robot(Fault::ProtectiveStop | Fault::SafeguardOpen | Fault::EmergencyStop) => Some(0.0),
+        What::Robot(Fault::ProgramPause | Fault::ProgramStop | Fault::Freedrive) => Some(0.0),
         What::Robot(Fault::Fin | Fault::Reset | Fault::Boot | Fault::Offline(_)) | What::LinkCut | What::Abort => Some(0.0),
         What::Robot(Fault::SpeedSlider(share)) if *share < 0.9 => Some(0.0),
         What::Robot(Fault::TimeScaling(share)) if *share < 0.9 => Some(0.2),
@@ -34,11 +33,12 @@ pub fn reasons(what: &What) -> &'static [EndReason] {
         What::Abort => &[Aborted, NotUpright],
         What::Robot(fault) => match fault {
             Fault::ProtectiveStop => &[ProtectiveStop, NotUpright, ProgramStopped, NotFollowed],
+            Fault::SafeguardOpen => &[SafetyStop, NotUpright, ProgramStopped, NotFollowed],
             Fault::EmergencyStop => &[EmergencyStop, ProgramStopped, RobotNotRunning],
             Fault::ProgramPause | Fault::ProgramStop | Fault::ProgramResume | Fault::Jog(..) => &[ProgramStopped, NotFollowed],
             Fault::SpeedSlider(_) | Fault::TimeScaling(_) => &[SpeedReduced, NotFollowed, NotUpright, ProgramStopped],
             Fault::HeldBack(_) | Fault::JointSpeedLimit(_) => &[NotFollowed, NotUpright, ProtectiveStop, ProgramStopped],
-            Fault::Freedrive => &[InHand, NotFollowed],
+            Fault::Freedrive | Fault::HandMove(..) => &[InHand, NotFollowed],
             Fault::Boot => &[RobotNotRunning, ProgramStopped],
             _ => &[RobotLost, RobotStalled, ProgramStopped, NotFollowed, NotUpright],
         },
@@ -63,7 +63,14 @@ pub fn leaves_tilted(what: &What) -> bool {
     takes_robot(what)
         || matches!(
             fault,
-            Fault::ProgramPause | Fault::Freedrive | Fault::Jog(..) | Fault::Boot | Fault::HeldBack(_) | Fault::JointSpeedLimit(_)
+            Fault::ProgramPause
+                | Fault::SafeguardOpen
+                | Fault::Freedrive
+                | Fault::HandMove(..)
+                | Fault::Jog(..)
+                | Fault::Boot
+                | Fault::HeldBack(_)
+                | Fault::JointSpeedLimit(_)
         )
 }
 

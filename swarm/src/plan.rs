@@ -7,7 +7,9 @@ use rand::{RngExt, SeedableRng};
 use rand_distr::{Distribution, StandardNormal};
 use rand_pcg::Pcg64Mcg;
 use simulator::ur::Series;
+use simulator::ur::servo::LAG_S;
 
+use crate::camera::Depth;
 use crate::faults::{self, KINDS};
 use crate::vessels::{VESSELS, spill_angle_deg};
 use crate::what::{Weighed, What};
@@ -16,6 +18,12 @@ use crate::what::{Weighed, What};
 const REST_S: f64 = 12.0;
 /// Share of the seeds in which a curve is recorded, learned from, and the weights swapped. Few, because a training takes longer than a pour.
 const LESSONS: f64 = 0.01;
+
+/// Share of the seeds whose robot lags by another time than the one that was learned with.
+const OTHER_LAGS: f64 = 0.3;
+/// From and to which time constant it then lags, s. With servoj's lookahead of 50 ms, and the program's own smoothing, a joint is then late by one
+/// to six frames.
+const LAGS_S: (f64, f64) = (0.002, 0.12);
 
 /// From what seeds draw.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -26,11 +34,13 @@ pub struct Choice {
     pub vessels: usize,
     /// The robot's generation, if not that which a seed draws.
     pub series: Option<Series>,
+    /// How deep the eye is.
+    pub depth: Depth,
 }
 
 impl Default for Choice {
     fn default() -> Self {
-        Self { only: None, vessels: VESSELS.len(), series: None }
+        Self { only: None, vessels: VESSELS.len(), series: None, depth: Depth::Area }
     }
 }
 
@@ -58,6 +68,10 @@ pub struct Plan {
     pub fill_ml: f64,
     /// Delay of the network, ns, and how much more it is at most.
     pub delay_ns: (u64, u64),
+    /// Time constant of the joints' lag, s.
+    pub lag_s: f64,
+    /// How deep the eye is.
+    pub depth: Depth,
     /// What happens, in order.
     pub items: Vec<Item>,
     /// The kind of each fault, as an index into [`KINDS`].
@@ -81,7 +95,18 @@ impl Plan {
         let almost_empty = random.random_bool(0.05);
         let fill_ml = if almost_empty { random.random_range(5.0..60.0) } else { random.random_range(150.0..450.0) };
         let delay_ns = (random.random_range(20_000..500_000), random.random_range(0..1_500_000));
-        let mut plan = Self { seed, series, vessel, fill_ml, delay_ns, items: Vec::new(), faults: Vec::new(), until_ms: 0 };
+        let mut plan = Self {
+            seed,
+            series,
+            vessel,
+            fill_ml,
+            delay_ns,
+            lag_s: lag_s(seed),
+            depth: choice.depth,
+            items: Vec::new(),
+            faults: Vec::new(),
+            until_ms: 0,
+        };
         let mut at_ms = 2_500 + random.random_range(0..1_000u64);
         let (orders, is_lesson) = (random.random_range(1..=2), random.random_bool(LESSONS));
         if is_lesson {
@@ -126,10 +151,11 @@ impl Plan {
     }
 
     /// A cell without faults, in which a curve is recorded.
-    pub fn recording(series: Series, vessel: usize, fill_ml: f64, lambda_deg: f32, width_s: f32) -> Self {
+    pub fn recording((series, depth): (Series, Depth), vessel: usize, fill_ml: f64, lambda_deg: f32, width_s: f32) -> Self {
         let items = vec![Item { at_ms: 3_000, what: What::Record(lambda_deg, width_s), fault: None }];
         let seed = u64::from(lambda_deg.to_bits());
-        let mut plan = Self { seed, series, vessel, fill_ml, delay_ns: (100_000, 0), items, faults: Vec::new(), until_ms: 0 };
+        let mut plan =
+            Self { seed, series, vessel, fill_ml, delay_ns: (100_000, 0), lag_s: LAG_S, depth, items, faults: Vec::new(), until_ms: 0 };
         plan.finish();
         plan
     }
@@ -177,6 +203,12 @@ impl Plan {
         plan.items.retain(|item| item.fault.is_none_or(|number| faults.contains(&number)));
         plan
     }
+}
+
+/// Time constant of a robot's lag, s: mostly the usual one.
+fn lag_s(seed: u64) -> f64 {
+    let mut random = Pcg64Mcg::seed_from_u64(seed ^ 0x1A6);
+    if random.random_bool(OTHER_LAGS) { random.random_range(LAGS_S.0..LAGS_S.1) } else { LAG_S }
 }
 
 /// A goal, ml: mostly an ordinary one, sometimes at or beyond its bounds.

@@ -15,9 +15,10 @@ use shared::config::Config;
 use shared::control::Outcome;
 
 use crate::check::Violation;
+use crate::costs::{Cost, Poured};
 use crate::plan::Plan;
 use crate::records::{Journal, Row};
-use crate::site::{Cost, Poured, Site};
+use crate::site::Site;
 use crate::weight_set::TrainedSet;
 use crate::world::{Life, LoopSide, World};
 
@@ -63,7 +64,7 @@ pub fn run_checked(plan: &Plan, trained: &TrainedSet, config: &Config, checked: 
         virtual_s: site.now_s(),
         violations: site.checks.violations,
         poured: site.poured,
-        costs: site.costs,
+        costs: site.costs.known,
         story: site.story.unwrap_or_default(),
         rows: site.rows.unwrap_or_default(),
     };

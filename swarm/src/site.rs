@@ -2,24 +2,28 @@
 //!
 //! Pure; one thread; allocates. What goes wrong is what is drawn.
 
+use std::io::Write;
+
 use rand::{RngExt, SeedableRng};
 use rand_pcg::Pcg64Mcg;
 use rt_controller::core::{Order, Settings};
 use rt_controller::journal::Tick;
-use serde::Serialize;
 use shared::agent::Agent;
 use shared::config::Config;
 use shared::control::{EndReason, Outcome};
 use shared::gaussian_curve::Curve;
 use shared::messages::{Phase, Telemetry};
 use shared::weights::Weights;
+use simulator::camera::Scene;
 use simulator::physics::container::Container;
 use simulator::physics::rig::Rig;
 use simulator::ur::{Fault, InMemory, Machine};
 
+use crate::camera::{Camera, Depth};
 use crate::check::Checks;
+use crate::costs::{Costs, Poured};
 use crate::eye::Eye;
-use crate::faults::{KINDS, Kind};
+use crate::faults::KINDS;
 use crate::noticing::is_ordinary;
 use crate::pipe::{self, End, Wiring};
 use crate::plan::Plan;
@@ -38,8 +42,12 @@ const FRAME_NS: u64 = 33_340_000;
 const PHYSICS_NS: u64 = 4_000_000;
 /// Largest ordinary lateness of a tick, ns (docs/REALTIME.md).
 const LATENESS_NS: u64 = 150_000;
-/// A container nearer to 0 than this is upright, degrees (`robot.start_tolerance_deg` of config/sim.toml).
-const UPRIGHT_DEG: f64 = 2.0;
+/// What a second client sends when it connects: the protocol's version 2, the outputs that it wants at 125 Hz, an input that it means to write,
+/// and the request to start (RTDE guide). It never reads.
+const SECOND_CLIENT: &[u8] =
+    b"\x00\x05V\x00\x02\x00\x1dO\x40\x5f\x40\x00\x00\x00\x00\x00timestamp,actual_q\x00\x18Iinput_int_register_24\x00\x03S";
+/// The port of RTDE.
+const RTDE_PORT: u16 = 30004;
 
 /// The cell's configuration, parsed.
 ///
@@ -47,50 +55,6 @@ const UPRIGHT_DEG: f64 = 2.0;
 /// The configuration in the source does not parse.
 pub fn config() -> Result<Config, String> {
     Config::parse(CONFIG, "config/sim.toml").map_err(|e| e.to_string())
-}
-
-/// What a fault during a pour or recording cost.
-#[derive(Debug, Clone, PartialEq, Serialize)]
-pub struct Cost {
-    /// The fault's kind.
-    pub fault: &'static str,
-    /// What left from the moment in which it could first be noticed until the container was upright, ml.
-    pub excess_ml: f64,
-    /// What left from the fault itself until then, ml.
-    pub since_ml: f64,
-    /// Time from the fault until the container was upright, s.
-    pub upright_s: f64,
-}
-
-/// A fault in a pour or recording whose container is not upright again.
-#[derive(Debug, Clone, Copy)]
-struct OpenFault {
-    kind: Kind,
-    at_s: f64,
-    at_ml: f64,
-    /// What had left when it could first be noticed, ml.
-    noticed_ml: Option<f64>,
-}
-
-/// How a pour or recording went.
-#[derive(Debug, Clone, PartialEq, Serialize)]
-pub struct Poured {
-    /// When it ended, s.
-    pub at_s: f64,
-    /// Time from its start until the last drops were counted, s.
-    pub seconds: f64,
-    /// Why.
-    pub reason: EndReason,
-    /// The goal, ml.
-    pub goal_ml: Option<f32>,
-    /// What was believed, ml.
-    pub believed_ml: f32,
-    /// Its standard deviation as far as it is known, ml.
-    pub sd_ml: f32,
-    /// What left, ml.
-    pub true_ml: f64,
-    /// The kinds of the faults while it went on or in the 6 s before.
-    pub faults: Vec<&'static str>,
 }
 
 /// The cell without the controller.
@@ -116,6 +80,8 @@ pub struct Site {
     frame_at_ns: u64,
     frame_poured_ml: f64,
     run_poured_ml: f64,
+    /// The newest run is a pour, and no recording.
+    is_pour: bool,
     next_item: usize,
     episode: u64,
     offline_until_ns: u64,
@@ -131,15 +97,14 @@ pub struct Site {
     pub new_weights: Option<Weights>,
     /// Whether the disk is full.
     pub is_disk_full: bool,
-    open_faults: Vec<OpenFault>,
     /// The numbers of the faults that have begun.
     begun: Vec<usize>,
     /// When they began, s, and their kinds.
     fault_times: Vec<(f64, &'static str)>,
-    /// Whether the newest pour or recording came to its ordinary end, in spite of what happened in it.
-    went_on: bool,
     /// What faults cost.
-    pub costs: Vec<Cost>,
+    pub costs: Costs,
+    /// The connections of other clients of the robot, and until when they stay, ns.
+    second_clients: Vec<(u64, End)>,
     /// How pours and recordings went.
     pub poured: Vec<Poured>,
     /// What happened, in words; `None` if nobody wants it.
@@ -154,12 +119,22 @@ impl Site {
         let series = plan.series;
         let joint = checked.robot.joint.index();
         let right = std::f64::consts::FRAC_PI_2;
-        let machine = Machine::new(series, series.default_version(), [0.0, -right, right, -right, -right, 0.0]);
+        let mut machine = Machine::new(series, series.default_version(), [0.0, -right, right, -right, -right, 0.0]);
+        machine.robot.servo.lag_s = plan.lag_s;
         let (rig, mut container) = vessels::rig(plan.vessel);
         let cycle_ns = (1e9 / series.rate_hz()) as u64;
         let mut random = Pcg64Mcg::seed_from_u64(plan.seed ^ 0x517E);
         let frame_at_ns = START_NS + random.random_range(0..FRAME_NS);
         vessels::fill(&rig, &mut container, plan.fill_ml, &mut random);
+        let mut checks = Checks::new(Settings::new(checked), cycle_ns as f64 / 1e9);
+        let camera = match plan.depth {
+            Depth::Area => None,
+            Depth::Camera => {
+                let made = Camera::new(checked, plan.seed);
+                // Without it the areas would be made of flows, and look like measured ones.
+                made.map_err(|line| checks.violated("camera", 0.0, line)).ok()
+            }
+        };
         // What is learned from needs the rows.
         let learns = plan.items.iter().any(|item| matches!(item.what, What::Learn(_)));
         Self {
@@ -167,8 +142,8 @@ impl Site {
             robot: InMemory::new(machine),
             wiring: Wiring::new(plan.seed, plan.delay_ns.0, plan.delay_ns.1),
             container,
-            eye: Eye::new(plan.seed, START_NS, rig.area_exponent),
-            checks: Checks::new(Settings::new(checked), cycle_ns as f64 / 1e9),
+            eye: Eye::new(plan.seed, START_NS, rig.area_exponent, camera),
+            checks,
             trained: trained.clone(),
             random,
             joint,
@@ -178,6 +153,7 @@ impl Site {
             frame_at_ns,
             frame_poured_ml: 0.0,
             run_poured_ml: 0.0,
+            is_pour: true,
             next_item: 0,
             episode: 0,
             offline_until_ns: 0,
@@ -187,11 +163,10 @@ impl Site {
             new_agent: None,
             new_weights: None,
             is_disk_full: false,
-            open_faults: Vec::new(),
             begun: Vec::new(),
             fault_times: Vec::new(),
-            went_on: false,
-            costs: Vec::new(),
+            costs: Costs::default(),
+            second_clients: Vec::new(),
             poured: Vec::new(),
             story: wanted.then(Vec::new),
             rows: (wanted || learns).then(Vec::new),
@@ -260,7 +235,10 @@ impl Site {
             self.frame_at_ns += FRAME_NS;
             let poured_ml = self.container.poured_ml();
             let clinging = self.container.habits().clinging(self.container.lip().flow_ml_s);
-            self.eye.frame(self.now_ns, poured_ml - self.frame_poured_ml, clinging);
+            let servo = &self.robot.machine().robot.servo;
+            let tilt = (servo.actual_q[self.joint].to_degrees(), servo.actual_qd[self.joint].to_degrees());
+            let scene = Scene::of(&self.container, self.now_s(), tilt.0, tilt.1);
+            self.eye.frame(self.now_ns, poured_ml - self.frame_poured_ml, clinging, &scene);
             self.frame_poured_ml = poured_ml;
         }
         Vec::new()
@@ -269,6 +247,8 @@ impl Site {
     /// A control cycle of the robot.
     fn cycle(&mut self) {
         self.cycle_at_ns += self.cycle_ns;
+        let now_ns = self.now_ns;
+        self.second_clients.retain(|(until_ns, _)| now_ns < *until_ns);
         self.robot.serve();
         for line in self.robot.cycle() {
             if line.text.ends_with(" started") {
@@ -284,40 +264,8 @@ impl Site {
         }
         let at_s = self.now_s();
         self.checks.cycle(self.robot.machine(), self.joint, alpha_deg, at_s);
-        self.settle_faults(alpha_deg, at_s);
-    }
-
-    /// Takes note of what had left when a fault could first be noticed, and, when the container is upright again, of what it cost.
-    fn settle_faults(&mut self, alpha_deg: f64, at_s: f64) {
-        if self.open_faults.is_empty() {
-            return;
-        }
-        let poured_ml = self.container.poured_ml();
-        for open in &mut self.open_faults {
-            if open.noticed_ml.is_none() && at_s >= open.at_s + f64::from(open.kind.noticed_ms) / 1000.0 {
-                open.noticed_ml = Some(poured_ml);
-            }
-        }
-        let active = matches!(self.checks.phase, Phase::Pouring | Phase::Recording);
-        if active || alpha_deg.abs() >= UPRIGHT_DEG {
-            return;
-        }
-        if std::mem::take(&mut self.went_on) {
-            self.open_faults.clear();
-        }
-        if matches!(self.checks.phase, Phase::Settling | Phase::Returning) {
-            return;
-        }
-        let excess_ml = |open: &OpenFault| poured_ml - open.noticed_ml.unwrap_or(poured_ml);
-        // The pour went on after faults that need not end it. So one of them at least must explain what left after it.
-        let is_within = |open: &OpenFault| open.kind.bound_ml.is_none_or(|bound_ml| excess_ml(open) <= bound_ml);
-        if !self.open_faults.is_empty() && !self.open_faults.iter().any(is_within) {
-            let left: Vec<_> = self.open_faults.iter().map(|open| format!("{:.1} ml after {}", excess_ml(open), open.kind.name)).collect();
-            self.checks.violated("bound", at_s, format!("more left after a fault could be noticed than may: {}", left.join(", ")));
-        }
-        for open in std::mem::take(&mut self.open_faults) {
-            let (since_ml, upright_s) = (poured_ml - open.at_ml, at_s - open.at_s);
-            self.costs.push(Cost { fault: open.kind.name, excess_ml: excess_ml(&open), since_ml, upright_s });
+        if let Some(wrong) = self.costs.settle(self.checks.phase, alpha_deg, self.container.poured_ml(), at_s) {
+            self.checks.violated("bound", at_s, wrong);
         }
     }
 
@@ -341,6 +289,7 @@ impl Site {
         let runs = |phase| matches!(phase, Phase::Pouring | Phase::Recording);
         if runs(self.checks.phase) && !runs(before) {
             self.run_poured_ml = self.container.poured_ml();
+            self.is_pour = self.checks.phase == Phase::Pouring;
         }
         let row = Row::new(at_s, tick, telemetry, &self.container);
         if let Some(rows) = &mut self.rows {
@@ -354,7 +303,7 @@ impl Site {
         self.say(|| format!("ended: {:?}, {:.1} ml believed", outcome.reason, outcome.poured_ml));
         let true_ml = self.container.poured_ml() - self.run_poured_ml;
         self.checks.ended(outcome, true_ml, at_s);
-        self.went_on = is_ordinary(outcome.reason);
+        self.costs.ended(is_ordinary(outcome.reason));
         let since_s = at_s - f64::from(outcome.seconds) - 6.0;
         let faults = self.fault_times.iter().filter(|(began_s, _)| *began_s >= since_s).map(|(_, name)| *name).collect();
         let (reason, goal_ml, believed_ml) = (outcome.reason, outcome.goal_ml, outcome.poured_ml);
@@ -364,7 +313,7 @@ impl Site {
 
     /// Gives the loop an agent with the weights for the vessel of this number.
     pub fn give_weights(&mut self, vessel: usize) {
-        if let Some(lesson) = self.trained.get(self.plan.series, vessel) {
+        if let Some(lesson) = self.trained.get((self.plan.series, self.plan.depth), vessel) {
             let lesson = lesson.clone();
             self.take_weights(lesson);
         }
@@ -378,7 +327,10 @@ impl Site {
     /// The operator weighs what the newest recording left, and trains on it and the episodes from before. A weight that the trainer doubts
     /// is not used, as `trainer train` says.
     fn learn(&mut self, weighed: Weighed) {
-        let Some(before) = self.trained.get(self.plan.series, self.plan.vessel).map(|lesson| lesson.episodes.to_vec()) else { return };
+        let Some(before) = self.trained.get((self.plan.series, self.plan.depth), self.plan.vessel).map(|lesson| lesson.episodes.to_vec())
+        else {
+            return;
+        };
         let Some(last) = self.poured.last().filter(|p| p.goal_ml.is_none() && p.reason == EndReason::Done) else { return };
         let weight_g = match weighed {
             Weighed::Right => last.true_ml,
@@ -391,8 +343,14 @@ impl Site {
         let doubtful = trainer::consistency::doubtful(&all);
         self.say(|| format!("learning with {weight_g:.0} g; doubted: {doubtful:?}"));
         let kept = all.into_iter().filter(|e| !doubtful.iter().any(|d| d.name == e.name)).collect();
-        if let Some(lesson) = Lesson::learn(kept, &self.checks.limits()) {
-            self.take_weights(lesson);
+        let Some(lesson) = Lesson::learn(kept, &self.checks.limits()) else { return };
+        // The controller takes what it can read, so a trainer whose weights it refuses leaves the operator without any.
+        match lesson.weights.to_bytes().and_then(|bytes| Weights::from_bytes(&bytes, "weights.bin")) {
+            Ok(_) => self.take_weights(lesson),
+            Err(e) => {
+                let at_s = self.now_s();
+                self.checks.violated("trained-weights", at_s, format!("the trainer made weights that are refused: {e}"));
+            }
         }
     }
 
@@ -412,16 +370,15 @@ impl Site {
         self.begun.push(number);
         let kind = KINDS[self.plan.faults[number]];
         self.fault_times.push((at_s, kind.name));
-        if matches!(self.checks.phase, Phase::Pouring | Phase::Recording) {
-            self.open_faults.push(OpenFault { kind, at_s, at_ml, noticed_ml: None });
-        }
+        self.costs.begins(kind, self.checks.phase, self.is_pour, (at_s, at_ml));
     }
 
     /// Lets `what` happen. Gives the operator's order, if it is one.
     fn happen(&mut self, what: &What) -> Option<Option<Order>> {
         let (at_s, ms) = (self.now_s(), 1_000_000);
         self.say(|| format!("{what:?}"));
-        self.checks.happens(what, at_s);
+        let lives = self.restart_at_ns.is_none();
+        self.checks.happens(what, self.robot.machine(), lives, at_s);
         match what {
             What::Pour(goal_ml) => {
                 self.episode += 1;
@@ -453,6 +410,7 @@ impl Site {
             What::LinkStall(time) => self.wiring.stall(u64::from(*time) * ms),
             What::LinkSplit(time) => self.wiring.split(u64::from(*time) * ms),
             What::LinkCut => self.wiring.cut(),
+            What::SecondClient(time) => self.second_client(u64::from(*time) * ms),
             What::Eye(fault) => self.eye.inject(*fault, self.now_ns),
             What::Overrun(time) => self.lateness_ns = u64::from(*time) * ms,
             What::Suspended(time) => self.controller_frozen_until_ns = self.now_ns + u64::from(*time) * ms,
@@ -468,9 +426,22 @@ impl Site {
         None
     }
 
+    /// Somebody else connects to the robot for `time_ns`, asks for what the controller asks for, and never reads what comes.
+    fn second_client(&mut self, time_ns: u64) {
+        if let Some(Ok(mut end)) = self.open(RTDE_PORT) {
+            // Bytes that do not go out are a client that says less.
+            let _ = end.write_all(SECOND_CLIENT);
+            self.second_clients.push((self.now_ns + time_ns, end));
+        }
+    }
+
     /// A damaged weight file must be refused.
     fn offer_bad_weights(&mut self) {
-        let Some(mut bytes) = self.trained.get(self.plan.series, self.plan.vessel).and_then(|l| l.weights.to_bytes().ok()) else { return };
+        let Some(mut bytes) =
+            self.trained.get((self.plan.series, self.plan.depth), self.plan.vessel).and_then(|l| l.weights.to_bytes().ok())
+        else {
+            return;
+        };
         let at = self.random.random_range(0..bytes.len());
         bytes[at] ^= 1 << self.random.random_range(0..8u8);
         if Weights::from_bytes(&bytes, "weights.bin").is_ok() {

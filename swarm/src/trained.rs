@@ -15,7 +15,7 @@ use crate::plan::Plan;
 use crate::run;
 use crate::site::START_NS;
 use crate::vessels::{VESSELS, spill_angle_deg};
-use crate::weight_set::{Lesson, TrainedSet, episode};
+use crate::weight_set::{Key, Lesson, TrainedSet, episode};
 
 /// What each of the five recordings is filled with, ml; how far beyond the spill angle it tilts, degrees; and its width, s. They span what
 /// the reference protocol draws (140 to 460 ml, 6 to 30 degrees, 0.7 to 2.2 s).
@@ -25,13 +25,15 @@ const RECORDINGS: [(f64, f64, f32); 5] =
 const FROM_S: f64 = 2.9;
 
 /// What was trained in this process.
-static MADE: Mutex<BTreeMap<(bool, usize), Option<Lesson>>> = Mutex::new(BTreeMap::new());
+static MADE: Mutex<BTreeMap<Key, Option<Lesson>>> = Mutex::new(BTreeMap::new());
 
 /// Trains what the plans need and was not trained yet. Must not be called from a rayon task, because it uses them under a lock.
 pub fn train_for<'a>(plans: impl IntoIterator<Item = &'a Plan>, config: &Config, say: &dyn Fn(&str)) -> TrainedSet {
     let mut made = MADE.lock().unwrap_or_else(PoisonError::into_inner);
-    let needed: BTreeSet<_> =
-        plans.into_iter().flat_map(|plan| plan.vessels().into_iter().map(|vessel| (plan.series == Series::ESeries, vessel))).collect();
+    let needed: BTreeSet<_> = plans
+        .into_iter()
+        .flat_map(|plan| plan.vessels().into_iter().map(|vessel| (plan.series == Series::ESeries, vessel, plan.depth)))
+        .collect();
     let missing: Vec<_> = needed.into_iter().filter(|key| !made.contains_key(key)).collect();
     if !missing.is_empty() {
         say(&format!("training for {} pairs of robot and vessel", missing.len()));
@@ -42,13 +44,14 @@ pub fn train_for<'a>(plans: impl IntoIterator<Item = &'a Plan>, config: &Config,
 }
 
 /// Records five curves in the virtual cell and trains on them.
-fn train((is_e_series, vessel): (bool, usize), config: &Config) -> Option<Lesson> {
+fn train((is_e_series, vessel, depth): Key, config: &Config) -> Option<Lesson> {
     let series = if is_e_series { Series::ESeries } else { Series::Cb3 };
     let episodes: Vec<TrainingEpisode> = RECORDINGS
         .iter()
         .filter_map(|&(fill_ml, over_deg, width_s)| {
             let lambda_deg = (spill_angle_deg(vessel, fill_ml) + over_deg).min(105.0) as f32;
-            let shown = run::run(&Plan::recording(series, vessel, fill_ml, lambda_deg, width_s), &TrainedSet::default(), config, true);
+            let shown =
+                run::run(&Plan::recording((series, depth), vessel, fill_ml, lambda_deg, width_s), &TrainedSet::default(), config, true);
             let poured = shown.poured.first()?;
             let name = format!("{fill_ml} ml in a {}", VESSELS[vessel].name);
             let made = episode(&name, &shown.rows, (FROM_S, poured.at_s), START_NS as f64 / 1e9, poured.true_ml.round());

@@ -13,6 +13,7 @@ use simulator::ur::Series;
 use trainer::data::TrainingEpisode;
 use trainer::training::{Options, Silent};
 
+use crate::camera::Depth;
 use crate::records::Row;
 
 /// Frames a second of the camera.
@@ -39,14 +40,17 @@ impl Lesson {
     }
 }
 
-/// The lessons for each pair of robot (whether it is an e-Series) and vessel.
+/// For what a lesson is: whether the robot is an e-Series, the vessel, and how deep the eye is.
+pub type Key = (bool, usize, Depth);
+
+/// The lessons for each robot, vessel and eye.
 #[derive(Debug, Clone, Default)]
-pub struct TrainedSet(pub Arc<BTreeMap<(bool, usize), Lesson>>);
+pub struct TrainedSet(pub Arc<BTreeMap<Key, Lesson>>);
 
 impl TrainedSet {
-    /// What was learned for a robot and a vessel.
-    pub fn get(&self, series: Series, vessel: usize) -> Option<&Lesson> {
-        self.0.get(&(series == Series::ESeries, vessel))
+    /// What was learned for a robot, an eye and a vessel.
+    pub fn get(&self, (series, depth): (Series, Depth), vessel: usize) -> Option<&Lesson> {
+        self.0.get(&(series == Series::ESeries, vessel, depth))
     }
 }
 

@@ -66,6 +66,8 @@ pub enum What {
     LinkSplit(u32),
     /// All connections are reset.
     LinkCut,
+    /// Somebody else connects to the robot for so many ms, wants to write what the controller writes, and never reads.
+    SecondClient(u32),
     /// The operator weighs what the newest recording left, and trains again with it.
     Learn(Weighed),
     /// Something happens to the eye.
@@ -112,5 +114,6 @@ fn is_remedy(fault: &Fault) -> bool {
             | Fault::UnlockProtectiveStop
             | Fault::FreedriveEnd
             | Fault::RemoteControl
+            | Fault::SafeguardClosed
     ) || matches!(fault, Fault::SpeedSlider(share) if *share >= 1.0)
 }

@@ -35,7 +35,7 @@ fn limits_that_are_too_weak_are_found() {
         weaken(&mut weak);
         let only = fault.map(|name| named(name).unwrap());
         // Two vessels do, so that little is trained.
-        let plans: Vec<Plan> = (1..=SEEDS).map(|seed| Plan::draw_with(seed, Choice { only, vessels: 2, series: None })).collect();
+        let plans: Vec<Plan> = (1..=SEEDS).map(|seed| Plan::draw_with(seed, Choice { only, vessels: 2, ..Choice::default() })).collect();
         let trained = train_for(&plans, &good, &|_| {});
         let found = plans
             .iter()

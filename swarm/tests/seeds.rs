@@ -14,14 +14,11 @@ const FIXED: (u64, u64) = (500_000, 3_000);
 /// How many fresh seeds are run.
 const FRESH: u64 = 300;
 
-/// Invariants with open findings (docs/SWARM.md): a violation of them is printed and does not fail the test. This list may only shrink.
-const OPEN: [&str; 5] = ["bound", "done", "journal-replays", "said", "taken-unasked"];
-
 fn seeds(from: u64, count: u64) -> Seeds {
     Seeds { from, count, choice: Choice::default() }
 }
 
-/// Complains about every violation, with the command that shows it again. Those of the [`OPEN`] invariants are only printed.
+/// Complains about every violation, with the command that shows it again.
 fn assert_none(shown: &[Shown]) {
     let bad: Vec<String> = shown
         .iter()
@@ -31,8 +28,6 @@ fn assert_none(shown: &[Shown]) {
                 .map(move |v| format!("swarm --seed {} --plot seed.svg: {} at {:.3} s: {}", one.seed, v.invariant, v.at_s, v.what))
         })
         .collect();
-    let (open, bad): (Vec<_>, Vec<_>) = bad.into_iter().partition(|line| OPEN.iter().any(|name| line.contains(&format!(": {name} at"))));
-    println!("{} violations of invariants with open findings:\n{}", open.len(), open.join("\n"));
     assert!(bad.is_empty(), "{} violations:\n{}", bad.len(), bad.join("\n"));
 }
 

@@ -49,30 +49,13 @@ pub fn connect_after(options: &LinkOptions, before: &Before) -> Result<Session, 
 ///
 /// The first target is due within two seconds after this returns.
 pub fn connect_over(network: &dyn Network, options: &LinkOptions, before: &Before) -> Result<Session, LinkError> {
-    let address = options.address;
-    let mut dialogue = Dialogue::open(network, address)?;
-
-    if !dialogue.ask(wire::PROTOCOL_VERSION, &[&PROTOCOL.to_be_bytes()], "the request for the protocol version", wire::accepted)? {
-        return Err(LinkError::VersionRefused { address });
-    }
-    let version = dialogue.ask(wire::CONTROLLER_VERSION, &[], "the request for the controller's version", wire::controller_version)?;
-    let [major, minor, ..] = version;
-    // A generation later than those known here is taken to have what these have.
-    if UPPER_REGISTERS.iter().any(|&(m, n)| major == m && minor < n) || major < 3 {
-        return Err(LinkError::TooOld { address, major, minor });
-    }
-    let rate_hz = if major >= 5 { E_SERIES_HZ } else { CB3_HZ };
+    let (mut dialogue, version, rate_hz) = introduce(network, options)?;
     let run = (network.now_ns() as i32 & i32::MAX).max(1);
     let program = program::text(options, 1.0 / rate_hz, run)?;
 
     let output_recipe = dialogue.agree_outputs(rate_hz, options.register_base)?;
     let input_recipe = dialogue.agree_inputs(&wire::input_names(options.register_base))?;
-    if !dialogue.ask(wire::START, &[], "the request to start", wire::accepted)? {
-        return Err(LinkError::StartRefused { address, said: dialogue.said });
-    }
-
-    let mut state = RobotState::default();
-    dialogue.next_state(output_recipe, &options.tilt, &mut state, ANSWER)?.ok_or_else(|| dialogue.no_answer("the request to start"))?;
+    let mut state = first_state(&mut dialogue, options, output_recipe)?;
     ready_for_program(options, before, &state)?;
     stands_still((network, options), &mut dialogue, output_recipe, &mut state)?;
     ready_for_program(options, before, &state)?;
@@ -87,6 +70,55 @@ pub fn connect_over(network: &dyn Network, options: &LinkOptions, before: &Befor
         doing: "the hand-over to the loop",
         what: e.to_string(),
     })
+}
+
+/// What was seen of a robot that was only looked at.
+#[derive(Debug)]
+pub struct Seen {
+    /// PolyScope's version: major, minor, bug fix and build.
+    pub version: [u32; 4],
+    /// Its first state.
+    pub state: RobotState,
+    /// Whether the registers that Decant writes are free.
+    pub registers: Result<(), LinkError>,
+    /// Whether the program could be uploaded now.
+    pub ready: Result<(), LinkError>,
+}
+
+/// Looks at a robot and changes nothing on it. Registers that somebody else writes are no failure here.
+pub fn look(options: &LinkOptions) -> Result<Seen, LinkError> {
+    let (mut dialogue, version, rate_hz) = introduce(&System, options)?;
+    let output_recipe = dialogue.agree_outputs(rate_hz, options.register_base)?;
+    let registers = dialogue.agree_inputs(&wire::input_names(options.register_base)).map(|_| ());
+    let state = first_state(&mut dialogue, options, output_recipe)?;
+    Ok(Seen { version, state, registers, ready: ready_for_program(options, &Before::default(), &state) })
+}
+
+/// Connects to RTDE, and settles protocol and version. Gives the version and the number of control cycles a second.
+fn introduce<'a>(network: &'a dyn Network, options: &LinkOptions) -> Result<(Dialogue<'a>, [u32; 4], f64), LinkError> {
+    let address = options.address;
+    let mut dialogue = Dialogue::open(network, address)?;
+    if !dialogue.ask(wire::PROTOCOL_VERSION, &[&PROTOCOL.to_be_bytes()], "the request for the protocol version", wire::accepted)? {
+        return Err(LinkError::VersionRefused { address });
+    }
+    let version = dialogue.ask(wire::CONTROLLER_VERSION, &[], "the request for the controller's version", wire::controller_version)?;
+    let [major, minor, ..] = version;
+    // A generation later than those known here is taken to have what these have.
+    if UPPER_REGISTERS.iter().any(|&(m, n)| major == m && minor < n) || major < 3 {
+        return Err(LinkError::TooOld { address, major, minor });
+    }
+    Ok((dialogue, version, if major >= 5 { E_SERIES_HZ } else { CB3_HZ }))
+}
+
+/// Starts the transfer of states, and gives the first one.
+fn first_state(dialogue: &mut Dialogue<'_>, options: &LinkOptions, recipe: OutputRecipe) -> Result<RobotState, LinkError> {
+    let doing = "the request to start";
+    if !dialogue.ask(wire::START, &[], doing, wire::accepted)? {
+        return Err(LinkError::StartRefused { address: options.address, said: dialogue.said.clone() });
+    }
+    let mut state = RobotState::default();
+    dialogue.next_state(recipe, &options.tilt, &mut state, ANSWER)?.ok_or_else(|| dialogue.no_answer(doing))?;
+    Ok(state)
 }
 
 /// Whether the robot may move, runs no program, holds the container upright, and is in nobody's hand, so that the program may be uploaded.

@@ -115,15 +115,26 @@ pub fn moving(earlier: &RobotState, later: &RobotState) -> Option<&'static str> 
 /// Why a robot without a running program must not be taken unasked, as `before` and its present `state` tell; `None` if it may.
 ///
 /// After a lost connection it may be taken if the program that we left there says that it has ended by itself, and if the joints that it does not
-/// move stand where they stood.
+/// move stand where they stood. A controller that has just been started knows nothing from before; it leaves a robot alone on which a program of
+/// ours was stopped in the middle of its work.
 pub fn since(before: &Before, state: &RobotState, tilt: Joint) -> Option<Handover> {
-    let last = before.last.as_ref().filter(|_| !before.asked)?;
+    if before.asked {
+        return None;
+    }
+    let Some(last) = &before.last else { return was_interrupted(state).then_some(Handover::Interrupted) };
     let own_end = matches!(state.program_state, ProgramState::TimedOut | ProgramState::Stopped | ProgramState::Unused);
     if state.program_run != last.program_run || !own_end {
         return Some(Handover::Interrupted);
     }
     let displaced = |k: usize| k != tilt.index() && (state.joints_rad[k] - last.joints_rad[k]).abs() > DISPLACED_RAD;
     joint_where(displaced).map(Handover::Displaced)
+}
+
+/// Whether our program's registers say that it was still at work when it went away: somebody stopped it, also when no controller watched. What a
+/// robot's boot clears, or a later program overwrites, cannot be known.
+fn was_interrupted(state: &RobotState) -> bool {
+    use ProgramState::*;
+    state.program_run != 0 && matches!(state.program_state, Ready | Following | Holding | Returning | Stopping | OffTrack)
 }
 
 /// Whether a robot that says "paused" was only never started since its boot, so that there is no program which somebody has paused.

@@ -37,7 +37,7 @@ pub mod session;
 mod upload;
 pub mod wire;
 
-pub use connect::{connect, connect_after, connect_over};
+pub use connect::{Seen, connect, connect_after, connect_over, look};
 pub use error::LinkError;
 pub use session::{Lost, Session};
 

@@ -46,7 +46,7 @@ fn a_robot_that_was_never_started_gets_the_program() {
     // An arm that had no power in between has no paused program, whatever old registers say.
     let used = Robot { registers: (ProgramState::Following, 7, 9), ..booted };
     assert!(Server::new(69, used.clone()).meet().0.is_err());
-    assert!(Server::new(70, used).meet_after(&Before { unpowered: true, ..Before::default() }).0.is_ok());
+    assert!(Server::new(70, used).meet_after(&Before { unpowered: true, asked: true, ..Before::default() }).0.is_ok());
 }
 
 /// Protects people who have the robot: after a lost connection it is taken again only if our program there says that it has ended by itself
@@ -69,5 +69,25 @@ fn a_robot_that_was_handled_meanwhile_waits_for_its_operator() {
         assert_eq!(session.is_ok(), why.is_none(), "{registers:?}");
         let (session, _) = Server::new(number + 20, Robot { registers, ..Robot::default() }).meet_after(&Before { asked: true, ..before });
         assert!(session.is_ok(), "{registers:?}");
+    }
+}
+
+/// Protects people from a controller that was not there when they pressed stop: a program that was at work when it went away was stopped by
+/// somebody, so a controller that has just been started waits for its operator too. One that ended by itself, or never ran, is no reason.
+#[test]
+fn a_new_controller_sees_that_a_program_was_stopped() {
+    let cases = [
+        (101, (ProgramState::Following, 7, 9), Some(Handover::Interrupted)),
+        (102, (ProgramState::Returning, 7, 9), Some(Handover::Interrupted)),
+        (103, (ProgramState::TimedOut, 7, 9), None),
+        (104, (ProgramState::OffTrackEnded, 7, 9), None),
+        (105, (ProgramState::Unknown, 0, 0), None),
+    ];
+    for (number, registers, why) in cases {
+        let (session, _) = Server::new(number, Robot { registers, ..Robot::default() }).meet();
+        assert_eq!(session.as_ref().err().and_then(LinkError::handover), why, "{registers:?}");
+        assert_eq!(session.is_ok(), why.is_none(), "{registers:?}");
+        let before = Before { asked: true, ..Before::default() };
+        assert!(Server::new(number + 20, Robot { registers, ..Robot::default() }).meet_after(&before).0.is_ok(), "{registers:?}");
     }
 }

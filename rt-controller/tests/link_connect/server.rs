@@ -82,7 +82,7 @@ impl Default for Robot {
             status_bits: 1,
             control_line: 0,
             base_rad_s: 0.0,
-            registers: (ProgramState::Following, 500, 1),
+            registers: (ProgramState::TimedOut, 500, 1),
             script_ports: &[30003],
             stops_first: false,
             program: ProgramState::Ready,

@@ -26,8 +26,8 @@ pub const MAX_LAG_RAD: f64 = 0.8;
 pub const STOP_RAD_S2: f64 = 10.0;
 /// Deceleration of a protective or emergency stop, in rad/s^2: as fast as the arm can be accelerated at all.
 pub const FAST_STOP_RAD_S2: f64 = MAX_ACCELERATION_RAD_S2;
-/// Time constant of the joints' lag behind target_q, in s. Chosen by hand; no measurement is recorded.
-const LAG_S: f64 = 0.012;
+/// Usual time constant of the joints' lag behind target_q, in s. Chosen by hand; no measurement is recorded.
+pub const LAG_S: f64 = 0.012;
 /// Longest step in which the servoj equation is solved, in s. Chosen by hand, well below the shortest lookahead of 30 ms.
 const SUBSTEP_S: f64 = 0.001;
 /// Speed at which a person moves a joint by hand or with the pendant, in rad/s. Chosen by hand; no measurement is recorded.
@@ -66,6 +66,8 @@ pub struct Servo {
     pub actual_q: [f64; 6],
     /// The joints' speed.
     pub actual_qd: [f64; 6],
+    /// Time constant of the joints' lag behind target_q, in s; above 0.
+    pub lag_s: f64,
     motion: ArmMotion,
     /// Largest joint speed that the safety configuration allows, in rad/s.
     speed_limit_rad_s: f64,
@@ -91,6 +93,7 @@ impl Servo {
             target_qdd: zero,
             actual_q: q,
             actual_qd: zero,
+            lag_s: LAG_S,
             motion: ArmMotion::Hold,
             speed_limit_rad_s: MAX_SPEED_RAD_S,
             held_rad_s: MAX_SPEED_RAD_S,
@@ -216,7 +219,7 @@ impl Servo {
             self.step_path(dt_s * share);
         }
         self.target_qd = self.path_qd.map(|v| v * share);
-        let lag = 1.0 - (-dt_s / LAG_S).exp();
+        let lag = 1.0 - (-dt_s / self.lag_s).exp();
         for (i, before) in before_qd.iter().enumerate() {
             self.target_qdd[i] = (self.target_qd[i] - before) / dt_s;
             let way = (self.target_q[i] - self.actual_q[i]) * lag;

@@ -1,0 +1,113 @@
+//! The camera that the configuration names: whether it can be opened, and gives pictures of that size and rate.
+//!
+//! Called once by an ordinary thread; allocates; nothing fails. A camera that streams is not disturbed.
+
+use std::path::Path;
+
+use feature_worker::source::devices;
+use shared::config::{CameraConfig, CameraSource, Config};
+use shared::machine::Finding;
+
+/// Looks at the camera.
+pub fn look(config: &Config) -> Vec<Finding> {
+    let camera = &config.camera;
+    match camera.source {
+        CameraSource::Device => device(camera),
+        CameraSource::SharedMemory => {
+            vec![Finding::green("source", "another program publishes the frames in shared memory; the worker waits for it")]
+        }
+        CameraSource::Video | CameraSource::Images => {
+            let pattern = camera.path.contains('%');
+            let there = Path::new(&camera.path);
+            let there = if pattern { there.parent().unwrap_or(there) } else { there };
+            if there.exists() {
+                vec![Finding::yellow(
+                    "source",
+                    camera.path.clone(),
+                    "recorded pictures are no camera: nothing can be poured by them",
+                    "set camera.source to \"device\"",
+                )]
+            } else {
+                vec![Finding::red("source", format!("{}: no such file", camera.path), "there are no pictures", "set camera.path")]
+            }
+        }
+    }
+}
+
+fn device(camera: &CameraConfig) -> Vec<Finding> {
+    let path = Path::new(&camera.path);
+    if let Err(e) = devices::open(path) {
+        return vec![Finding::red("device", e.to_string(), "there are no pictures", "`decant camera` lists the cameras of this machine")];
+    }
+    let node = std::fs::canonicalize(path).unwrap_or_else(|_| path.into());
+    let found = devices::list(Path::new("/")).into_iter().find(|d| d.path == node);
+    let Some(mut found) = found else {
+        return vec![Finding::yellow("device", camera.path.clone(), "the kernel does not list it", "`decant camera` lists what it knows")];
+    };
+    found.ask();
+    let mut findings = vec![Finding::green("device", format!("{} ({})", camera.path, found.card))];
+    if !camera.path.contains("/by-") {
+        let name = found.names.first().map_or("/dev/v4l/by-id/...".into(), |n| n.display().to_string());
+        let advice = format!("set camera.path to {name}");
+        findings.push(Finding::yellow("name", camera.path.clone(), "node numbers change when another camera is plugged in", advice));
+    }
+    if !found.users.is_empty() {
+        findings.push(Finding::green("used by", found.users.join(", ")));
+    }
+    findings.push(format(camera, &found.formats));
+    let automatic = [("exposure_ms", camera.exposure_ms.is_none()), ("white_balance_k", camera.white_balance_k.is_none())];
+    let left: Vec<&str> = automatic.iter().filter(|(_, left)| *left).map(|(name, _)| *name).collect();
+    if !left.is_empty() {
+        let is = format!("camera.{} not set", left.join(", camera."));
+        let advice = "set them, or \"locked\" (docs/VISION.md)";
+        findings.push(Finding::yellow("automatics", is, "colours and brightness may change during a pour", advice));
+    }
+    findings
+}
+
+/// Whether one of the device's formats, a line each, has the size and rate.
+fn format(camera: &CameraConfig, formats: &[String]) -> Finding {
+    let size = format!(" {} x {}: ", camera.width_px, camera.height_px);
+    let wanted = format!("{} x {} at {} Hz", camera.width_px, camera.height_px, camera.fps);
+    let lists = formats.iter().filter(|f| f.contains(" x ")).count();
+    let of_size: Vec<&String> = formats.iter().filter(|f| f.contains(&size)).collect();
+    let has_rate = |line: &&String| {
+        let rates = line.split(": ").nth(1).unwrap_or_default();
+        let rates = rates.split(" (").next().unwrap_or_default();
+        rates.split([',']).any(|r| match r.split_once(" to ") {
+            Some((least, most)) => {
+                least.trim().parse().is_ok_and(|l: f64| l <= camera.fps) && most.trim().parse().is_ok_and(|m: f64| camera.fps <= m)
+            }
+            None => r.trim().parse().is_ok_and(|r: f64| (r / camera.fps - 1.0).abs() < 0.01),
+        })
+    };
+    let advice = "`decant camera` lists its formats; set camera.width_px, height_px and fps";
+    if lists == 0 || formats.iter().any(|f| f.contains(" to ") && !f.contains(": ")) {
+        return Finding::green("format", format!("{wanted}; the device does not list single sizes"));
+    }
+    if of_size.iter().any(has_rate) {
+        Finding::green("format", wanted)
+    } else {
+        let is = if of_size.is_empty() { format!("{wanted}: no such size") } else { format!("{wanted}: not at this rate") };
+        Finding::red("format", is, "the worker refuses the camera", advice)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use shared::machine::Verdict;
+
+    /// Protects the operator from a camera that cannot do what is configured: sizes and rates are told apart, in the words of
+    /// `feature-worker camera`.
+    #[test]
+    fn size_and_rate_are_looked_up() {
+        let camera = CameraConfig { width_px: 640, height_px: 480, fps: 30.0, ..CameraConfig::default() };
+        let judge = |formats: &[&str]| format(&camera, &formats.iter().map(|f| f.to_string()).collect::<Vec<_>>());
+        assert_eq!(judge(&["MJPG 640 x 480: 30, 15 (Motion-JPEG)"]).verdict, Verdict::Green);
+        assert_eq!(judge(&["MJPG 640 x 480: 5.00 to 60.00 (Motion-JPEG)"]).verdict, Verdict::Green);
+        assert!(judge(&["MJPG 640 x 480: 15 (Motion-JPEG)"]).is.contains("not at this rate"));
+        assert!(judge(&["MJPG 1280 x 720: 30 (Motion-JPEG)"]).is.contains("no such size"));
+        assert_eq!(judge(&["YUYV 32 x 32 to 4096 x 4096 (YUYV)"]).verdict, Verdict::Green);
+    }
+}

@@ -1,0 +1,137 @@
+//! The robot: its ports, versions, mode, registers, payload and speed.
+//!
+//! Called once by an ordinary thread; allocates; waits for up to two seconds for each answer. Nothing fails. Nothing is started or written
+//! on the robot. A robot that a controller of this cell already has is only asked by its dashboard.
+
+use std::io::{BufRead as _, BufReader, ErrorKind, Write as _};
+use std::net::{IpAddr, SocketAddr, TcpStream};
+use std::time::Duration;
+
+use rt_controller::claim;
+use rt_controller::link::{self, LinkError, LinkOptions, RobotState, payload};
+use shared::config::Config;
+use shared::machine::Finding;
+use shared::runtime_dir::Place;
+
+/// The dashboard's port (Universal Robots, dashboard server manual).
+const DASHBOARD: u16 = 29999;
+/// The ports that take a program, and the one that takes targets (Universal Robots, client interfaces and RTDE guide).
+const PORTS: [u16; 4] = [30001, 30002, 30003, 30004];
+/// How long a port may take to answer. Chosen by hand: a robot on the same network answers within milliseconds.
+const ANSWER: Duration = Duration::from_secs(2);
+/// What the robot's target speed is at least, as a fraction, where it is not slowed (core/following.rs in rt-controller ends a pour below it).
+const FULL_SPEED: f64 = 0.95;
+
+/// Looks at the robot.
+pub fn look(config: &Config) -> Vec<Finding> {
+    let address = config.robot.address;
+    let open = |port: u16| TcpStream::connect_timeout(&SocketAddr::new(address, port), ANSWER);
+    let mut findings = Vec::new();
+    let ports: Vec<(u16, Result<(), String>)> = PORTS.iter().map(|p| (*p, open(*p).map(|_| ()).map_err(|e| e.to_string()))).collect();
+    if ports.iter().all(|(_, answer)| answer.is_err()) {
+        let is = format!("{address}: {}", ports.iter().filter_map(|(_, a)| a.as_ref().err()).next_back().cloned().unwrap_or_default());
+        let advice = "switch the robot on, check cable and robot.address, and enable its services (Settings > Security > Services)";
+        return vec![Finding::red("robot", is, "nothing can be moved", advice)];
+    }
+    findings.push(program_port(&ports));
+    findings.push(match &ports[3].1 {
+        Ok(()) => Finding::green("RTDE", "port 30004 is open"),
+        Err(e) => {
+            let advice = "enable Real-Time Data Exchange (Settings > Security > Services), and let no firewall close it";
+            Finding::red("RTDE", format!("port 30004: {e}"), "no target can be sent", advice)
+        }
+    });
+    findings.push(dashboard(address));
+    if let Some(running) = claim::running(&Place::from(&config.cell).path()) {
+        findings.push(Finding::green("state", format!("rt-controller (process {}) has the robot; `decant status` shows it", running.pid)));
+        return findings;
+    }
+    match link::look(&LinkOptions::new(config)) {
+        Ok(seen) => {
+            let [major, minor, bugfix, build] = seen.version;
+            findings.push(Finding::green("version", format!("PolyScope {major}.{minor}.{bugfix} (build {build})")));
+            findings.push(refused("registers", "free", seen.registers, "the program and the targets need them"));
+            findings.push(refused("state", "may move, upright, and no program runs", seen.ready, "the robot is not taken before that"));
+            findings.push(speed(&seen.state));
+            findings.push(match payload::warning(&seen.state, config.robot.payload_kg) {
+                None => {
+                    Finding::green("payload", seen.state.payload_kg.map_or("not told by this robot".into(), |kg| format!("{kg:.2} kg")))
+                }
+                Some(warning) => Finding::yellow("payload", warning, "it may stop protectively, or move more slowly", ""),
+            });
+        }
+        Err(e) => findings.push(refused("RTDE", "", Err(e), "no target can be sent")),
+    }
+    findings
+}
+
+/// One of three ports takes the program.
+fn program_port(ports: &[(u16, Result<(), String>)]) -> Finding {
+    let open: Vec<String> = ports[..3].iter().filter(|(_, answer)| answer.is_ok()).map(|(port, _)| port.to_string()).collect();
+    let advice = "enable the secondary client interface (Settings > Security > Services)";
+    if open.is_empty() {
+        Finding::red("program's port", "30001, 30002 and 30003 are closed", "the program cannot be brought to the robot", advice)
+    } else {
+        Finding::green("program's port", format!("open: {}", open.join(", ")))
+    }
+}
+
+/// What the dashboard says. It is not needed for a pour.
+fn dashboard(address: IpAddr) -> Finding {
+    let ask = || -> std::io::Result<Vec<String>> {
+        let stream = TcpStream::connect_timeout(&SocketAddr::new(address, DASHBOARD), ANSWER)?;
+        stream.set_read_timeout(Some(ANSWER))?;
+        stream.set_write_timeout(Some(ANSWER))?;
+        let mut writer = stream.try_clone()?;
+        let mut reader = BufReader::new(stream).lines();
+        reader.next().transpose()?;
+        let mut answers = Vec::new();
+        for question in ["robotmode", "safetystatus", "is in remote control"] {
+            writeln!(writer, "{question}")?;
+            answers.extend(reader.next().transpose()?);
+        }
+        Ok(answers)
+    };
+    match ask() {
+        Ok(answers) => {
+            let remote = answers.last().map_or("", String::as_str);
+            // A CB3 knows no remote control, and says that it does not understand.
+            let told = if remote.contains("could not understand") { "not known to this robot" } else { remote };
+            let is = format!("{}, remote control: {told}", answers[..answers.len().saturating_sub(1)].join(", "));
+            if remote.eq_ignore_ascii_case("false") {
+                let advice = "switch the pendant to remote control (its upper right corner)";
+                Finding::yellow("dashboard", is, "an e-Series robot in local control takes no program", advice)
+            } else {
+                Finding::green("dashboard", is)
+            }
+        }
+        Err(e) => {
+            let e = match e.kind() {
+                ErrorKind::WouldBlock | ErrorKind::TimedOut => format!("no answer within {} s", ANSWER.as_secs()),
+                _ => e.to_string(),
+            };
+            let advice = "on a robot with PolyScope: enable the dashboard server (Settings > Security > Services)";
+            Finding::yellow("dashboard", format!("port {DASHBOARD}: {e}"), "whether it is in remote control is not known", advice)
+        }
+    }
+}
+
+/// Whether the robot is slowed.
+fn speed(state: &RobotState) -> Finding {
+    let slider = state.speed_fraction;
+    let scaling = state.speed_scaling.map_or(String::new(), |s| format!(", speed scaling {:.0} %", s * 100.0));
+    let is = format!("slider {:.0} %{scaling}", slider * 100.0);
+    if slider >= FULL_SPEED {
+        Finding::green("speed", is)
+    } else {
+        Finding::red("speed", is, "a pour ends before it starts", "set the speed slider on the pendant to 100 %")
+    }
+}
+
+/// A finding of what the link refuses, in its own words.
+fn refused(what: &str, good: &str, result: Result<(), LinkError>, means: &str) -> Finding {
+    match result {
+        Ok(()) => Finding::green(what, good),
+        Err(e) => Finding::red(what, e.to_string(), means, ""),
+    }
+}

@@ -1,0 +1,20 @@
+//! The command line of `decant`, the operator's one program: `doctor` looks at everything that a pour needs, and every other command is
+//! that of the program which does it.
+//!
+//! Ordinary process; allocates. Failures are one line and an exit code; a command of another program ends as that program does.
+
+use std::process::ExitCode;
+
+use clap::Parser as _;
+use decant::cli::{Cli, Command};
+use decant::{doctor, programs};
+
+fn main() -> ExitCode {
+    shared::exit::end(match Cli::parse().command {
+        Command::Doctor(args) => {
+            shared::os::end_when_nobody_reads();
+            doctor::run(&args)
+        }
+        Command::Other(words) => programs::run(&words),
+    })
+}

@@ -1,0 +1,138 @@
+//! What Linux tells about the machine: how well it can run the loop, and what would make it better. `decant doctor` and the page of
+//! `experiments jitter` say it in these words; docs/REALTIME.md explains each step.
+//!
+//! Ordinary threads call it; it allocates and reads `/proc` and `/sys`. Nothing here fails: what the machine does not show is said to be
+//! not shown.
+
+use serde::Serialize;
+
+/// How good something is.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum Verdict {
+    /// As it should be, or only a fact.
+    Green,
+    /// It works, and would work better otherwise.
+    Yellow,
+    /// It does not work.
+    Red,
+}
+
+/// One thing that was looked at.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize)]
+pub struct Finding {
+    /// What was looked at.
+    pub what: String,
+    /// How good it is.
+    pub verdict: Verdict,
+    /// What was found.
+    pub is: String,
+    /// What it means for a pour; empty for a fact.
+    pub means: String,
+    /// What to do; empty if nothing is to be done.
+    pub advice: String,
+}
+
+impl Finding {
+    /// A fact, or what is as it should be.
+    pub fn green(what: &str, is: impl Into<String>) -> Self {
+        Self { what: what.into(), verdict: Verdict::Green, is: is.into(), means: String::new(), advice: String::new() }
+    }
+
+    /// What works and would work better otherwise.
+    pub fn yellow(what: &str, is: impl Into<String>, means: &str, advice: impl Into<String>) -> Self {
+        Self { verdict: Verdict::Yellow, means: means.into(), advice: advice.into(), ..Self::green(what, is) }
+    }
+
+    /// What does not work.
+    pub fn red(what: &str, is: impl Into<String>, means: &str, advice: impl Into<String>) -> Self {
+        Self { verdict: Verdict::Red, ..Self::yellow(what, is, means, advice) }
+    }
+
+    /// Green if `good`, else yellow.
+    fn judged(good: bool, what: &str, is: impl Into<String>, means: &str, advice: &str) -> Self {
+        if good { Self::green(what, is) } else { Self::yellow(what, is, means, advice) }
+    }
+}
+
+/// Looks at the machine, for a loop that is pinned to `core`.
+pub fn look(core: usize) -> Vec<Finding> {
+    let mut findings = processor();
+    findings.extend(power());
+    findings.extend(beside(core));
+    findings
+}
+
+/// A file of `/proc` or `/sys`; empty when it is not there.
+pub fn read(path: &str) -> String {
+    std::fs::read_to_string(path).map(|t| t.trim().to_owned()).unwrap_or_default()
+}
+
+/// A value, or that the machine does not show it.
+fn shown(value: String) -> String {
+    if value.is_empty() { "not shown by this machine".into() } else { value }
+}
+
+/// Processor, virtual machine and kernel.
+fn processor() -> Vec<Finding> {
+    let cpuinfo = read("/proc/cpuinfo");
+    let cpu = cpuinfo.lines().find_map(|l| l.strip_prefix("model name")).map_or("", |m| m.trim_matches([' ', '\t', ':']));
+    let cores = cpuinfo.lines().filter(|l| l.starts_with("processor")).count();
+    let virtualised = cpuinfo.contains(" hypervisor");
+    let version = read("/proc/sys/kernel/version");
+    let realtime = version.contains("PREEMPT_RT") || read("/sys/kernel/realtime") == "1";
+    let kernel = format!("{} {version}", read("/proc/sys/kernel/osrelease"));
+    let guest = if virtualised { "yes" } else { "no" };
+    let rt = "a PREEMPT_RT kernel bounds the wake-up (Debian: apt install linux-image-rt-amd64)";
+    vec![
+        Finding::green("processor", format!("{cores} x {cpu}")),
+        Finding::judged(!virtualised, "virtual machine", guest, "the host's other guests can hold the loop", "run on the robot's own PC"),
+        Finding::judged(realtime, "kernel", kernel, "drivers can delay the loop by milliseconds", rt),
+    ]
+}
+
+/// Who shares the loop's core with it, and by which clock it sleeps.
+fn beside(core: usize) -> Vec<Finding> {
+    let siblings = read(&format!("/sys/devices/system/cpu/cpu{core}/topology/thread_siblings_list"));
+    let alone = !siblings.contains([',', '-']);
+    let clock = read("/sys/devices/system/clocksource/clocksource0/current_clocksource");
+    let fast = clock == "tsc" || clock == "kvm-clock";
+    let interrupts = read("/proc/irq/default_smp_affinity");
+    // The mask is hexadecimal, in groups of 32 cores; the last group has the lowest ones.
+    let mask = interrupts.rsplit(',').next().and_then(|m| u32::from_str_radix(m, 16).ok());
+    let elsewhere = mask.is_some_and(|m| core < 32 && m >> core & 1 == 0);
+    let interrupts = if interrupts.is_empty() { shown(interrupts) } else { format!("cores of the mask {interrupts}") };
+    let idle = "leave the loop's second hyperthread idle, or switch it off";
+    let tsc = "clocksource=tsc on the kernel's command line, where the processor allows it";
+    let affinity = "irqaffinity= without the loop's core, and no irqbalance";
+    vec![
+        Finding::judged(
+            alone,
+            "on the loop's core",
+            format!("processors {}", shown(siblings)),
+            "a sibling takes up to half of its speed",
+            idle,
+        ),
+        Finding::judged(fast, "clock", shown(clock), "each time stamp costs a system call or a slow read", tsc),
+        Finding::judged(elsewhere, "interrupts go to", interrupts, "an interrupt can fall into a tick", affinity),
+    ]
+}
+
+/// What decides how fast a core wakes up, and who else may run on it.
+fn power() -> Vec<Finding> {
+    let governor = read("/sys/devices/system/cpu/cpu0/cpufreq/scaling_governor");
+    let isolated = read("/sys/devices/system/cpu/isolated");
+    let (steady, alone) = (governor == "performance", !isolated.is_empty());
+    let isolated = if alone { isolated } else { "none".into() };
+    let held = std::fs::OpenOptions::new().write(true).open("/dev/cpu_dma_latency").is_ok();
+    let latency = if held { "may be held at 0" } else { "not permitted or not there" };
+    let hold = "let this user write /dev/cpu_dma_latency; rt-controller holds it at 0 then";
+    let full = "cpupower frequency-set -g performance, where the machine lets it";
+    let isolate = "isolcpus=, nohz_full= and rcu_nocbs= for the loop's core";
+    vec![
+        Finding::judged(steady, "governor", shown(governor), "a tick may start at a low clock", full),
+        Finding::judged(alone, "isolated cores", isolated, "other tasks share the loop's core", isolate),
+        Finding::green("RT throttling", format!("{} of 1000000 us", read("/proc/sys/kernel/sched_rt_runtime_us"))),
+        Finding::judged(held, "/dev/cpu_dma_latency", latency, "a core that sleeps deeply wakes up 100 us later", hold),
+    ]
+}

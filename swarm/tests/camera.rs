@@ -1,0 +1,26 @@
+//! The second depth of the eye: drawn frames, measured by the worker's own extraction.
+#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::too_many_lines)]
+
+use shared::control::EndReason;
+use simulator::ur::Series;
+use swarm::camera::{Depth, spent_s};
+use swarm::many::{Seeds, run_many};
+use swarm::plan::Choice;
+use swarm::site::config;
+
+/// Protects the whole way from the liquid over the picture to the cup, with the weights that were learned from pictures: a handful of seeds keeps
+/// every invariant, the same twice, and some of them pour what they say.
+#[test]
+fn seeds_before_a_camera_keep_every_invariant() {
+    let config = config().unwrap();
+    let choice = Choice { vessels: 1, series: Some(Series::Cb3), depth: Depth::Camera, ..Choice::default() };
+    let seeds = Seeds { from: 600_000, count: 6, choice };
+    let (shown, summary) = run_many(seeds, &config, false);
+    let bad: Vec<_> = shown.iter().flat_map(|one| one.violations.iter().map(|v| (one.seed, v))).collect();
+    assert!(bad.is_empty(), "{bad:?}");
+    let done = shown.iter().flat_map(|one| &one.poured).filter(|p| p.reason == EndReason::Done && p.goal_ml.is_some()).count();
+    assert!(done > 0, "no pour was done: {:?}", summary.reasons);
+    assert!(spent_s().iter().all(|s| *s > 0.0), "no picture was drawn or measured");
+    let again = run_many(Seeds { count: 2, ..seeds }, &config, false).0;
+    assert_eq!(format!("{again:?}"), format!("{:?}", &shown[..2]));
+}
