@@ -132,7 +132,7 @@ impl Trial {
         let agent = Agent::new(weights);
         let pour = |(init, goal, k): (f64, f64, u64)| {
             let flows_by_deg = self.fill_told.then(|| foreseen::flows_by_deg(weights, init, self.test.full_ml())).flatten();
-            let asked = Asked { flows_by_deg, ..Asked::new(init, goal) };
+            let asked = Asked { flows_by_deg, calibration: Some(weights.calibration), ..Asked::new(init, goal) };
             by_core(&agent, &mut self.test_pour(init, k), self.limits, asked, None)
         };
         self.cells(repeats).into_iter().map(pour).collect()

@@ -8,7 +8,9 @@ use crate::estimator::flow::{CommandHistory, Lateness};
 use crate::estimator::vessel::Vessel;
 use proptest::prelude::*;
 
+/// The way back of the shipped configurations.
 const BACK: WayBack = WayBack { rate_deg: 2.0, change_deg: 1.67 };
+/// A camera that shows 500 px^2 for an outflow of 1 ml.
 const CAMERA: Calibration = Calibration { volume_at_1_px2_ml: 0.002, area_exponent: 1.0, log_tilt_slope: 0.0, hold_above_px2: 60.0 };
 
 /// A model of the default vessel, with this weight of the straight one.
