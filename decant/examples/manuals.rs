@@ -25,6 +25,7 @@ fn write_all(directory: &Path) -> Result<(), Failure> {
         ("rt-controller", rt_controller::cli::Cli::command()),
         ("feature-worker", feature_worker::cli::Cli::command()),
         ("trainer", trainer::cli::Cli::command()),
+        ("operator-page", operator_page::cli::Cli::command()),
     ];
     for (name, command) in programs {
         // A page a command: decant(1), rt-controller(1), rt-controller-pour(1) and so on.

@@ -2,6 +2,7 @@
 //!
 //! | module | what it holds |
 //! |---|---|
+//! | [`cli`] | the command line |
 //! | [`run`] | the command: threads, ports, token |
 //! | [`routes`] | which request gets which answer |
 //! | [`site`] | what the threads share, and the state that is sent to browsers |
@@ -20,6 +21,7 @@
 
 pub mod calibration;
 pub mod cell;
+pub mod cli;
 pub mod history;
 pub mod jobs;
 pub mod link;
