@@ -10,7 +10,7 @@ use std::process::Command;
 use shared::exit::{BAD_INPUT, Failure, failure};
 
 /// The operator's commands: their name here, the program, its command, and what it is for.
-const COMMANDS: [(&str, &str, &str, &str); 20] = [
+const COMMANDS: [(&str, &str, &str, &str); 21] = [
     ("controller", "rt-controller", "run", "runs the controller of the cell"),
     ("worker", "feature-worker", "run", "runs the cell's camera process"),
     ("pour", "rt-controller", "pour", "pours an exact volume"),
@@ -23,6 +23,7 @@ const COMMANDS: [(&str, &str, &str, &str); 20] = [
     ("camera", "feature-worker", "camera", "lists cameras, and who uses them"),
     ("calibrate", "feature-worker", "calibrate", "finds the container's axes and the liquid's colour"),
     ("view", "feature-worker", "view", "shows the camera and what is measured, in a browser"),
+    ("page", "operator-page", "run", "serves the operator's page: pour, stop, weigh and learn in a browser"),
     ("inspect", "feature-worker", "inspect", "measures images or a video"),
     ("episodes", "feature-worker", "episodes", "lists, shows, weighs and exports episodes"),
     ("plan", "trainer", "plan", "says what to record or pour next"),

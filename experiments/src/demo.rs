@@ -117,6 +117,9 @@ pub fn perform(cell: &mut OwnCell, seed: u64) -> Result<DemoSummary, OwnCellErro
     std::fs::create_dir_all(&pictures).map_err(|error| OwnCellError::File { what: pictures.display().to_string(), error })?;
     cell.note("starting the simulated cell, the feature worker and the controller");
     let client = cell.start()?;
+    if let Some(address) = cell.open_page() {
+        cell.note(&format!("watch it in a browser on this machine: {address}"));
+    }
     let mut first_hour = FirstHour::default();
     for k in 0..WEIGHINGS {
         first_hour.weigh_next(cell, &plan, k)?;

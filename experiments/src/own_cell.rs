@@ -3,6 +3,7 @@
 //! Ordinary process; allocates and blocks. It does what an operator does, by the programs' command lines, and makes no decision for the
 //! controller. When it is dropped, every process that it started is stopped and the cell's shared memory is removed.
 
+use std::io::{BufRead as _, BufReader};
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, ExitStatus, Stdio};
 use std::sync::Arc;
@@ -167,6 +168,16 @@ impl OwnCell {
             Err(e) => Err(e.to_string()),
         })?;
         Ok(client)
+    }
+
+    /// Starts the operator's page of the cell, and gives its address; `None` if there is no page to be had, which ends nothing.
+    pub fn open_page(&mut self) -> Option<String> {
+        let mut command = self.program("operator-page", &["run", "--port", "0"]);
+        let mut child = command.stdout(Stdio::piped()).stderr(Stdio::null()).spawn().ok()?;
+        let mut address = String::new();
+        let said = child.stdout.take().is_some_and(|out| BufReader::new(out).read_line(&mut address).is_ok());
+        self.processes.push(("operator-page", child));
+        (said && !address.is_empty()).then(|| address.trim().into())
     }
 
     /// Stops the processes in order, and waits for them.

@@ -93,3 +93,19 @@ pub fn caption(image: &mut Mat, text: &str, line: i32) -> Result<(), opencv::Err
     let font = imgproc::FONT_HERSHEY_SIMPLEX;
     imgproc::put_text(image, text, Point::new(6, top + 14), font, 0.45, colour(235, 235, 235), 1, imgproc::LINE_AA, false)
 }
+
+/// The picture at most `width_max` px wide.
+pub fn shrunk(picture: &Mat, width_max: i32) -> Result<Mat, opencv::Error> {
+    if picture.cols() <= width_max {
+        return Ok(picture.clone());
+    }
+    let size = opencv::core::Size::new(width_max, picture.rows() * width_max / picture.cols());
+    let mut small = Mat::default();
+    imgproc::resize(picture, &mut small, size, 0.0, 0.0, imgproc::INTER_AREA)?;
+    Ok(small)
+}
+
+/// Lets OpenCV work in the calling thread alone. The error is one line.
+pub fn one_thread() -> Result<(), String> {
+    opencv::core::set_num_threads(1).map_err(|e| e.message)
+}

@@ -11,6 +11,7 @@
 //! | [`commands`] | the command line of each subcommand |
 #![forbid(unsafe_code)]
 
+pub mod cli;
 pub mod commands;
 pub mod drawing;
 pub mod episodes;

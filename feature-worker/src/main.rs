@@ -2,34 +2,9 @@
 
 use std::process::ExitCode;
 
-use clap::{Parser, Subcommand};
+use clap::Parser as _;
+use feature_worker::cli::{Cli, Command};
 use feature_worker::commands::{bench, calibrate, camera, episodes, inspect, run, view};
-
-/// The vision process: camera frames in, V_e and episodes out.
-#[derive(Parser)]
-#[command(version, about, after_help = shared::exit::HELP)]
-struct Cli {
-    #[command(subcommand)]
-    command: Command,
-}
-
-#[derive(Subcommand)]
-enum Command {
-    /// Measures V_e in every frame, publishes it and records episodes.
-    Run(run::Args),
-    /// Finds the container's axes and the liquid's colour; writes the [image] section.
-    Calibrate(calibrate::Args),
-    /// Lists this machine's cameras: names, formats, rates, controls, and who uses them.
-    Camera(camera::Args),
-    /// Shows the live stream with what is measured, in a local web page.
-    View(view::Args),
-    /// Writes pictures and a CSV of what is measured in images or a video.
-    Inspect(inspect::Args),
-    /// Lists, shows, checks, weighs and exports episodes.
-    Episodes(episodes::Args),
-    /// Measures the time of each stage of the extraction.
-    Bench(bench::Args),
-}
 
 /// Keeps OpenCV and its decoders from writing to the terminal by themselves: every fault that they report is an error of ours, with what to
 /// do. Whoever sets the variables differently gets the messages.

@@ -6,7 +6,7 @@
 //! their own. A driver that stops or restarts is waited for; a lost device ends the worker with its reason.
 
 use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, Ordering::Relaxed};
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering::Relaxed};
 
 use crossbeam::queue::ArrayQueue;
 use iceoryx2::port::publisher::Publisher;
@@ -78,7 +78,9 @@ fn measure_until_stopped(
     // Threads inherit the core and the priority, so the other threads start first.
     let recorder = Recorder::start(config).or_exit(exit::FAILED)?;
     let latest = Arc::new(ArrayQueue::new(1));
-    let printer = status::start_printer(&latest, stop, speaker, json).map_err(|e| failure(exit::FAILED, format!("status thread: {e}")))?;
+    let looks = Arc::new(AtomicU64::new(0));
+    let printer =
+        status::start_printer(&latest, &looks, stop, speaker, json).map_err(|e| failure(exit::FAILED, format!("status thread: {e}")))?;
     for missing in os::become_realtime(config.worker.core, config.worker.priority) {
         speaker.say(&missing);
     }
@@ -91,6 +93,7 @@ fn measure_until_stopped(
         newest: Newest::default(),
         status: Status { doubt: Doubt::None.words(), ..Status::default() },
         latest: &latest,
+        looks: &looks,
         speaker,
         judged: 0,
         uneven: 0,
@@ -133,6 +136,8 @@ struct Worker<'a> {
     status: Status,
     /// The queue of one from which the status thread prints.
     latest: &'a ArrayQueue<Status>,
+    /// Number of looks for a frame, for systemd's watchdog.
+    looks: &'a AtomicU64,
     speaker: &'a Speaker,
     /// Pictures in which the ground behind clear water was judged, and those of them in which it had a pattern.
     judged: u32,
@@ -149,6 +154,7 @@ struct Newest {
 impl Worker<'_> {
     fn work(&mut self, mut frames: FrameStream<Source>) -> Result<(), Failure> {
         loop {
+            self.looks.fetch_add(1, Relaxed);
             match frames.wait().map_err(|e| failure(e.exit_code(), e))? {
                 StreamEvent::Frame(frame) => self.take(&frame)?,
                 StreamEvent::Nothing => {}

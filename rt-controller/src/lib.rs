@@ -21,6 +21,7 @@
 #![forbid(unsafe_code)]
 
 pub mod claim;
+pub mod cli;
 pub mod client;
 pub mod commands;
 pub mod control_loop;

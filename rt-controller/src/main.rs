@@ -3,40 +3,13 @@
 
 use std::process::ExitCode;
 
-use clap::{Parser, Subcommand};
+use clap::Parser as _;
+use rt_controller::cli::{Cli, Command};
 use rt_controller::commands::{abort, pour, record, replay, resume, run, status, step};
 
 /// Counts allocations, so that the loop can show that it makes none.
 #[global_allocator]
 static ALLOCATOR: shared::os::CountingAllocator = shared::os::CountingAllocator;
-
-/// The fixed-rate controller: V_e in, servo targets out.
-#[derive(Parser)]
-#[command(version, about, after_help = shared::exit::HELP)]
-struct Cli {
-    #[command(subcommand)]
-    command: Command,
-}
-
-#[derive(Subcommand)]
-enum Command {
-    /// Runs the resident controller process.
-    Run(run::Args),
-    /// Pours an exact volume with the running controller.
-    Pour(pour::Args),
-    /// Records one experimental episode along the Gaussian curve of eq. (1).
-    Record(record::Args),
-    /// Brings the container upright at once.
-    Abort(abort::Args),
-    /// Takes the robot back after a person had it in hand.
-    Resume(resume::Args),
-    /// Shows state, rates, lateness histograms and counters.
-    Status(status::Args),
-    /// Runs the controller's core as a filter, V_e in and angles out, for any other simulator.
-    Step(step::Args),
-    /// Runs a journal through the same core again and compares every answer.
-    Replay(replay::Args),
-}
 
 fn main() -> ExitCode {
     let command = Cli::parse().command;

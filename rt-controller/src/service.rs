@@ -18,6 +18,7 @@ use iceoryx2::service::ipc::Service as Ipc;
 use shared::control::{Outcome, Reply, Request, Status};
 use shared::ipc::{Cell, InService as _, IpcError};
 use shared::messages::{Phase, Telemetry};
+use shared::supervisor::Supervisor;
 
 use crate::client::MESSAGE_MAX;
 use crate::core::{Counters, Order, Refusal};
@@ -92,10 +93,12 @@ impl<'a> Service<'a> {
 
     /// Works until the loop has ended.
     pub fn run(mut self) {
+        let mut supervisor = Supervisor::ready();
         while !self.exchange.ended.load(Relaxed) {
             while self.exchange.old_agents.pop().is_some() {}
             self.take_events();
             self.answer();
+            supervisor.progress(self.latest.as_ref().map_or(0, |(_, counters)| counters.ticks));
             std::thread::sleep(BEAT);
         }
         self.take_events();

@@ -25,7 +25,15 @@ pub struct Curve {
     pub beta_s: f32,
 }
 
+/// Alpha at the first and last moment of a curve whose beta nobody gives, degrees. Chosen by hand: small enough for a start without a jump.
+const END_DEG: f32 = 0.05;
+
 impl Curve {
+    /// The curve with the beta at which it starts and ends nearly upright.
+    pub fn from_upright(lambda_deg: f32, gamma_per_s2: f32) -> Self {
+        Self { lambda_deg, gamma_per_s2, beta_s: ((lambda_deg / END_DEG).ln() / gamma_per_s2).sqrt() }
+    }
+
     /// alpha(t), degrees, `t_s` seconds after the start.
     pub fn alpha_deg(&self, t_s: f32) -> f32 {
         self.lambda_deg * (-self.gamma_per_s2 * (t_s - self.beta_s).powi(2)).exp()

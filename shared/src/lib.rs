@@ -21,6 +21,7 @@
 //! | [`exit`] | exit codes and one-line errors | no |
 //! | [`speaker`] | lines for people, from threads that must not wait for a terminal | no |
 //! | [`machine`] | what Linux tells about the machine, and what would make it better | no |
+//! | [`supervisor`] | what systemd is told of a process that it started | no |
 //! | [`os`] | the operating system: clock, scheduling, locked memory | yes |
 //!
 //! What the loop uses of a module marked "yes" does not allocate, lock or panic after construction; the module's header names the
@@ -51,4 +52,5 @@ pub mod regular_file;
 pub mod runtime_dir;
 pub mod shared_memory;
 pub mod speaker;
+pub mod supervisor;
 pub mod weights;

@@ -232,6 +232,7 @@ fn an_abort_needs_no_service_thread() {
     // A thread that strace holds is let go before the kernel ends the process.
     strace.kill().and_then(|()| strace.wait()).expect("ours");
     assert_eq!(cell.exit_code("rt-controller", Duration::from_secs(10)), Some(0), "{}", cell.log("rt-controller"));
+    assert!(cell.log("rt-controller").contains("aborted by the operator"), "the abort itself was obeyed: {}", cell.log("rt-controller"));
     assert_eq!(pour.wait_with_output().expect("it ran").status.code(), Some(3));
     rt_controller::journal::replay(&cell.dir.path().join("journal.bin"), |_, _| {}).expect("a journal");
 }
@@ -248,7 +249,7 @@ fn clients_that_say_nothing_do_not_keep_an_abort_out() {
     assert_aborted("200 silent clients", &timed(abort_of(&cell)), pour);
 }
 
-/// Protects everybody's cells: an order that waits when an abort comes is not begun after it, and Ctrl-C in a pour stops it.
+/// Protects everybody's cells: orders beside a pour are refused and not begun after an abort, and Ctrl-C in a pour stops it.
 #[test]
 fn a_signal_in_the_pour_command_stops_the_pour() {
     let cell = cell();
@@ -287,6 +288,13 @@ fn strangers_cannot_stop_or_pretend() {
     let copy = public_copy("rt-controller");
     let stranger = as_nobody(&[copy.1.to_str().expect("a path"), "abort"]);
     assert_eq!(stranger.status.code(), Some(3), "{}", String::from_utf8_lossy(&stranger.stderr));
+    // The command does not even ask another user's controller, so this one asks by itself.
+    let ask = "import os,socket,sys\nos.setgid(65534)\nos.setuid(65534)\ns=socket.socket(socket.AF_UNIX)\ns.connect('\\0'+sys.argv[1])\ns.sendall(b'abort\\n')\nprint(s.recv(4096).decode())";
+    let mut asking = cell.inside.as_ref().expect("apart").command("python3");
+    asking.args(["-c", ask, &format!("decant/0/{}", cell.name)]);
+    let answer = timed(asking).0;
+    let answer = String::from_utf8_lossy(&answer.stdout).into_owned();
+    assert!(answer.contains("only the controller's own user and root"), "{answer}");
     let stop = cell.runtime_dir().join("stop");
     let reached = as_nobody(&["test", "-e", stop.to_str().expect("a path")]);
     assert_ne!(reached.status.code(), Some(0), "the directory is closed");

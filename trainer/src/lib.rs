@@ -15,6 +15,7 @@
 
 pub mod allowed_actions;
 pub mod calibration;
+pub mod cli;
 pub mod commands;
 pub mod consistency;
 pub mod data;

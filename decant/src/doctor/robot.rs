@@ -95,7 +95,9 @@ fn dashboard(address: IpAddr) -> Finding {
     match ask() {
         Ok(answers) => {
             let remote = answers.last().map_or("", String::as_str);
-            let is = format!("{}, remote control {remote}", answers[..answers.len().saturating_sub(1)].join(", "));
+            // A CB3 knows no remote control, and says that it does not understand.
+            let told = if remote.contains("could not understand") { "not known to this robot" } else { remote };
+            let is = format!("{}, remote control: {told}", answers[..answers.len().saturating_sub(1)].join(", "));
             if remote.eq_ignore_ascii_case("false") {
                 let advice = "switch the pendant to remote control (its upper right corner)";
                 Finding::yellow("dashboard", is, "an e-Series robot in local control takes no program", advice)

@@ -5,6 +5,7 @@
 //! command-line program that allocates. It changes nothing but the `[image]` table of the configuration, and that only with --write or a
 //! click.
 
+use std::net::IpAddr;
 use std::path::PathBuf;
 use std::sync::atomic::Ordering::Relaxed;
 use std::time::{Duration, Instant};
@@ -17,8 +18,8 @@ use shared::exit::{self, Failure, OrExit as _, failure};
 use shared::ipc::Cell;
 use shared::messages::PixelFormat;
 use shared::os;
+use web::{Answer, Server, Settings};
 
-use super::page::{self, Page};
 use crate::drawing::{draw, jpeg};
 use crate::source::{FrameSource as _, NextFrame, ObserverSource, WAIT};
 use crate::vision::{Axes, AxesError, ColourError, ColourLearner, Corner, Extractor, Image, find_corner};
@@ -244,40 +245,42 @@ fn save_picture(args: &Args, config: &Config, pictures: &[Mat]) -> Result<(), Fa
 /// Serves the page until "Write" or Ctrl-C. `good` tells whether `config` passed all checks; nothing else is written.
 fn serve(args: &Args, mut config: Config, mut corner: Corner, pour: &Pour, mut good: bool) -> Result<(), Failure> {
     let stop = os::stop_at_signals().or_exit(exit::FAILED)?;
-    let server = Page::open(args.port)?;
+    let server = Server::open(IpAddr::from([127, 0, 0, 1]), args.port, Settings::default())?;
     let pictures = &pour.pictures;
-    eprintln!("calibrate: open {} on this machine, click lip, top edge and left side, then Write", server.address());
-    server.serve(&stop, |path, body| match path {
-        "/" => page::html(include_str!("calibrate.html")),
-        "/picture.jpg" => {
+    eprintln!("calibrate: open http://{} on this machine, click lip, top edge and left side, then Write", server.address());
+    server.serve(&stop, |request| match (request.post, request.path.as_str()) {
+        (false, "/") => Answer::html(include_str!("calibrate.html")),
+        (false, "/calibrate.js") => Answer::bytes("text/javascript", include_str!("calibrate.js")),
+        (false, "/calibrate.css") => Answer::bytes("text/css", include_str!("calibrate.css")),
+        (false, "/picture.jpg") => {
             let picture = best_picture(&config, pictures).or_else(|_| pictures.first().cloned().ok_or_else(String::new));
-            page::jpeg(jpeg(&picture.unwrap_or_default()))
+            Answer::jpeg(jpeg(&picture.unwrap_or_default()))
         }
-        "/state.json" => page::json(&serde_json::json!({ "width": config.camera.width_px, "height": config.camera.height_px,
+        (false, "/state.json") => Answer::json(&serde_json::json!({ "width": config.camera.width_px, "height": config.camera.height_px,
             "lip": corner.lip, "rim": corner.rim, "foot": corner.foot, "section": section::text(&config.image) })),
-        "/corner" => page::text(match try_corner(&config, body, pour) {
+        (true, "/corner") => Answer::text(match try_corner(&config, &request.body, pour) {
             Ok((tried, clicked, remarks)) => {
                 (config, corner, good) = (tried, clicked, true);
                 format!("measured again: {}", remarks.join("; "))
             }
             Err(e) => e,
         }),
-        "/write" if !good => {
-            page::text("nothing is written: no corner has passed the checks yet; click lip, top edge and left side".into())
+        (true, "/write") if !good => {
+            Answer::text("nothing is written: no corner has passed the checks yet; click lip, top edge and left side")
         }
-        "/write" => {
+        (true, "/write") => {
             let result = save_picture(args, &config, pictures).and_then(|()| section::write(&args.config, &config));
             stop.store(result.is_ok(), Relaxed);
-            page::text(result.err().map_or_else(|| format!("written to {}", args.config.display()), |failed| failed.what))
+            Answer::text(result.err().map_or_else(|| format!("written to {}", args.config.display()), |failed| failed.what))
         }
-        _ => None,
+        _ => Answer::not_here(),
     });
     Ok(())
 }
 
 /// The configuration for a corner that was clicked, if it passes all checks, and what was seen.
-fn try_corner(config: &Config, clicked: &str, pour: &Pour) -> Result<(Config, Corner, Vec<String>), String> {
-    let corner = serde_json::from_str::<Corner>(clicked).map_err(|e| e.to_string())?;
+fn try_corner(config: &Config, clicked: &[u8], pour: &Pour) -> Result<(Config, Corner, Vec<String>), String> {
+    let corner = serde_json::from_slice::<Corner>(clicked).map_err(|e| e.to_string())?;
     let Proposal { image, remarks } = propose(config, corner, pour)?;
     Ok((Config { image, ..config.clone() }, corner, remarks))
 }

@@ -5,6 +5,5 @@ pub mod calibrate;
 pub mod camera;
 pub mod episodes;
 pub mod inspect;
-mod page;
 pub mod run;
 pub mod view;

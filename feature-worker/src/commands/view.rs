@@ -8,6 +8,7 @@
 //! camera ends the command with its reason.
 
 use std::collections::VecDeque;
+use std::net::IpAddr;
 use std::path::PathBuf;
 use std::sync::atomic::{AtomicBool, Ordering::Relaxed};
 use std::sync::{Mutex, MutexGuard, PoisonError};
@@ -18,8 +19,8 @@ use shared::exit::{self, Failure, OrExit as _, failure};
 use shared::ipc::Cell;
 use shared::messages::PixelFormat;
 use shared::os;
+use web::{Answer, Server, Settings};
 
-use super::page::{self, Page};
 use crate::drawing::{draw, jpeg, to_bgr};
 use crate::source::{Frame, FrameStream, ObserverSource, StreamEvent};
 use crate::vision::{Extractor, Image};
@@ -82,8 +83,8 @@ fn view(args: &Args, config: &Config) -> Result<(), Failure> {
     let extractor = Extractor::new(&config.camera, &config.image).or_exit(exit::BAD_INPUT)?;
     let cell = Cell::join(&config.cell).or_exit(exit::UNREACHABLE)?;
     let source = ObserverSource::open(&config.camera, &cell).map_err(|e| failure(e.exit_code(), e))?;
-    let server = Page::open(args.port)?;
-    println!("{}", server.address());
+    let server = Server::open(IpAddr::from([127, 0, 0, 1]), args.port, Settings::default())?;
+    println!("http://{}", server.address());
     let shown = Mutex::new(Shown::default());
     std::thread::scope(|scope| {
         scope.spawn(|| answer(&server, &shown, &stop));
@@ -135,19 +136,21 @@ fn show(frame: &Frame, extractor: &mut Extractor, shown: &Mutex<Shown>) -> Resul
 }
 
 /// Answers the browser until the command ends.
-fn answer(server: &Page, shown: &Mutex<Shown>, stop: &AtomicBool) {
-    server.serve(stop, |path, _| match path {
-        "/" => page::html(include_str!("view.html")),
+fn answer(server: &Server, shown: &Mutex<Shown>, stop: &AtomicBool) {
+    server.serve(stop, |request| match request.path.as_str() {
+        "/" => Answer::html(include_str!("view.html")),
+        "/view.js" => Answer::bytes("text/javascript", include_str!("view.js")),
+        "/view.css" => Answer::bytes("text/css", include_str!("view.css")),
         "/picture.jpg" => {
             let picture = lock(shown).picture.clone();
-            page::jpeg(jpeg(&picture))
+            Answer::jpeg(jpeg(&picture))
         }
         "/state.json" => {
             let shown = lock(shown);
             let Newest { sequence, area_px2, confidence, doubt } = shown.newest;
-            page::json(&serde_json::json!({ "sequence": sequence, "area_px2": area_px2, "confidence": confidence, "doubt": doubt,
+            Answer::json(&serde_json::json!({ "sequence": sequence, "area_px2": area_px2, "confidence": confidence, "doubt": doubt,
                 "silent": shown.silent, "history": shown.history }))
         }
-        _ => None,
+        _ => Answer::not_here(),
     });
 }

@@ -13,16 +13,20 @@
 //!    earlier picture, moved, does not explain.
 //! 4. [`lines`] finds the line from axis to axis with the best evidence, and [`water`] decides whether it is a stream.
 //! 5. The full picture's profiles across that line must confirm it.
+//! 6. What cannot be told is said by name: a reflection at the lip ([`lip_light`]), and before a pattern lamps that flicker, pictures
+//!    that are missing again and again ([`disturbed`]), and a lip at which no ground is seen.
 //!
 //! The first frame must be dry, and frames must follow each other. Called on the extraction thread. All pictures and tables are kept, so
 //! nothing is allocated after the second frame. The only failures are OpenCV's.
 
 mod background;
+mod disturbed;
 mod evidence;
 mod flicker;
 mod follow;
 mod light;
 mod lines;
+mod lip_light;
 mod motion;
 mod rays;
 mod rigid;
@@ -34,10 +38,12 @@ use opencv::imgproc;
 use shared::messages::{Doubt, PixelFormat};
 
 use self::background::{Background, DryPlaces, WetPlaces};
+use self::disturbed::Disturbed;
 use self::evidence::{CALM, Evidence};
 use self::flicker::Flicker;
 use self::light::Light;
 use self::lines::Lines;
+use self::lip_light::LipLight;
 use self::rays::{RIM_PX, Rays};
 use self::water::{Verdict, Water};
 use super::confidence::Basis;
@@ -69,6 +75,14 @@ const STEEP_SHARE: f32 = 0.6;
 /// Least height of a profile's steepest step, grey levels a sample. Tuned.
 const STEEP_LEAST: f32 = 4.0;
 
+/// While lamps flicker, a stream has to be seen in so many pictures, and after it so many may not show none. Tuned on seed 101 of
+/// `evaluate-camera --faults`.
+const FLICKER_PICTURES: u32 = 5;
+/// Legs of a stream that is as small as any that is measured, px. Chosen by hand: 200 px^2 of a picture 640 px wide.
+const LIP_PX: f32 = 10.0;
+/// Before a pattern, nothing flows where at least this share of such a stream's place is seen to be ground. Tuned on seed 101 of
+/// `evaluate-camera --faults`.
+const LIP_DRY_SHARE: f32 = 0.5;
 /// How fast the share of pictures with an even ground follows, a picture. Chosen by hand.
 const EVEN_FOLLOWS: f32 = 0.1;
 
@@ -85,6 +99,8 @@ pub(crate) struct ClearWater {
     background: Background,
     light: Light,
     flicker: Flicker,
+    lip_light: LipLight,
+    disturbed: Disturbed,
     evidence: Evidence,
     water: Water,
     // Pictures, kept from frame to frame.
@@ -103,6 +119,8 @@ pub(crate) struct ClearWater {
     held: bool,
     /// In which share of the pictures without such a doubt the ground was even, the last ones above all.
     even_share: f32,
+    /// Pictures since a stream was seen.
+    unseen: u32,
 }
 
 impl ClearWater {
@@ -120,6 +138,8 @@ impl ClearWater {
             background: Background::new(size)?,
             light: Light::new(size),
             flicker: Flicker::new(size),
+            lip_light: LipLight::new(&rays, size),
+            disturbed: Disturbed::new(),
             evidence: Evidence::new(&rays, size)?,
             rays,
             water: Water::new(),
@@ -130,6 +150,7 @@ impl ClearWater {
             looked: false,
             held: false,
             even_share: 0.0,
+            unseen: u32::MAX,
         })
     }
 
@@ -157,6 +178,7 @@ impl ClearWater {
         edges_px.clear();
         let height_px = self.height_px();
         let mut sighting = Sighting::Dry { confidence: 1.0 };
+        let hidden = self.lip_light.is_hidden(&self.now)?.then_some(Doubt::BlownOut);
         let exposure = self.flicker.look(&self.now)?;
         if !self.background.is_new() {
             self.background.expect_gain(exposure);
@@ -179,8 +201,8 @@ impl ClearWater {
             });
             let verdict = self.water.decide(best, self.evidence.strange_share());
             sighting = match (verdict, best) {
-                // Where bands cannot be divided out, neither a line nor its absence means anything.
-                _ if !told && self.flicker.flickers() => Sighting::Unsure(Doubt::LightFlickers),
+                // Where bands cannot be divided out, or only now and then, neither a line nor its absence means anything.
+                _ if (!told || self.is_pattern()) && self.flicker.flickers() => Sighting::Unsure(Doubt::LightFlickers),
                 (Verdict::Stream, Some((found, ..))) => {
                     let scale = self.scale;
                     self.lines.edges(found.line, &self.evidence, &self.rays, |v| (v + 0.5) * scale - 0.5, edges_px);
@@ -188,21 +210,36 @@ impl ClearWater {
                 }
                 _ if self.light.flickers() => Sighting::Unsure(Doubt::LightFlickers),
                 (Verdict::Unsure, _) => Sighting::Unsure(Doubt::EdgeNotFound),
+                _ if self.flicker.flickers() && self.unseen < FLICKER_PICTURES => Sighting::Unsure(Doubt::LightFlickers),
+                _ if self.is_pattern() && !self.sees_dry_lip() => Sighting::Unsure(Doubt::EdgeNotFound),
                 _ => sighting,
             };
+            self.unseen = if matches!(sighting, Sighting::Stream { .. }) { 0 } else { self.unseen.saturating_add(1) };
             if self.water.is_elsewhere(self.evidence.strange_share()) {
                 self.background.forget()?;
             }
         }
         self.remember(height_px)?;
-        Ok(sighting)
+        self.disturbed.look();
+        let disturbed = self.disturbed.doubt().filter(|_| self.is_pattern());
+        Ok(hidden.or(disturbed).map_or(sighting, Sighting::Unsure))
+    }
+
+    /// Whether the ground is not even.
+    fn is_pattern(&self) -> bool {
+        self.even_share < 0.5
+    }
+
+    /// Whether ground is seen where a small stream would be.
+    fn sees_dry_lip(&self) -> bool {
+        self.evidence.dry_share(&self.rays, self.line_share([LIP_PX; 2])) >= LIP_DRY_SHARE
     }
 
     /// Takes what is dry over into the memory of the background, and chooses the picture with which the next ones are compared.
     #[inline(always)]
     fn remember(&mut self, height_px: LinearField) -> opencv::Result<()> {
         // An even ground that the stream hid is told by what is around it, so it need not be spared.
-        let spared = self.held && self.even_share < 0.5;
+        let spared = self.held && self.is_pattern();
         let near = self.water.recent_legs_px(spared).map(|legs_px| {
             let [a, b] = legs_px.map(|v| v.max(1.0));
             // The outline bulges, and a stream grows from frame to frame.
@@ -302,6 +339,10 @@ impl Liquid for ClearWater {
         self.looked.then(|| self.evidence.even())
     }
 
+    fn lose_picture(&mut self, doubt: Doubt) {
+        self.disturbed.lose(doubt);
+    }
+
     fn ground_bgr(&self) -> Option<[f32; 3]> {
         None
     }
@@ -329,6 +370,10 @@ impl Liquid for ClearWater {
     }
 
     fn confirm(&mut self, line: Option<FineLine>, mean_level: f32) -> Result<FineLine, Doubt> {
-        self.water.confirm(line, mean_level, self.scale, self.axes.sine().abs(), self.evidence.even() && !self.held)
+        let sine = self.axes.sine().abs();
+        let line = self.water.confirm(line, mean_level, self.scale, sine, self.evidence.even() && !self.held)?;
+        // What bands left over is elsewhere in the next picture.
+        let young = self.water.stream().is_none_or(|s| s.age < FLICKER_PICTURES as f32);
+        if young && self.flicker.flickers() { Err(Doubt::LightFlickers) } else { Ok(line) }
     }
 }

@@ -20,7 +20,7 @@ use shared::messages::{Doubt, PixelFormat};
 use super::confidence::Basis;
 use super::geometry::{Axes, Line, NEAR_PX, RAYS, RayGrid, distance};
 use super::ground_beside::GroundBeside;
-use super::ground_colours::{Ground, GroundColours};
+use super::ground_colours::{Ground, GroundColours, glows as is_glow};
 use super::hues::ranges;
 use super::liquid::{FineLine, LineRules, Liquid, PROFILE_SAMPLES, Profile, ProfileEdge, REACH, Sighting};
 use super::reflection::Reflection;
@@ -63,8 +63,6 @@ const LEARN_BEYOND: usize = 6;
 const AT_LIP_PX: f32 = 12.0;
 /// The ground is learned beside the container while no more than this share of what is at the lip is foreign or liquid. Chosen by hand.
 const QUIET_SHARE: f32 = 0.3;
-/// A liquid in front of a lamp's reflection is brighter than this in all parts, close to the reflection's middle. Chosen by hand.
-const GLOW_LEVEL: u8 = 180;
 /// Least share of the rays that a body at the lip fills. Tuned.
 const BODY_RAYS: f32 = 0.7;
 /// Least mean length of a body at the lip, px: a bead is shorter. Tuned.
@@ -321,8 +319,9 @@ impl ColouredLiquid {
             for r in 0..near.min(ray.samples) {
                 let ground = self.ground.tell(colours[r].0);
                 looked += 1;
-                blind += usize::from(ground == Ground::Blind);
-                glows += usize::from(colours[r].0.iter().all(|v| *v >= GLOW_LEVEL));
+                let light = mask[r] == 0 && ground != Ground::Known && is_glow(colours[r].0);
+                blind += usize::from(ground == Ground::Blind || light);
+                glows += usize::from(is_glow(colours[r].0));
                 foreign += usize::from(mask[r] != 0 || ground != Ground::Known);
             }
         }
@@ -423,6 +422,9 @@ impl Liquid for ColouredLiquid {
         }
         Ok(sighting)
     }
+
+    /// Each picture is judged by itself.
+    fn lose_picture(&mut self, _doubt: Doubt) {}
 
     fn basis(&self) -> Basis {
         Basis::Colour

@@ -175,7 +175,10 @@ impl Extractor {
         let unusable = unlit.or((!whole).then_some(Doubt::PictureIncomplete));
         let checked = Instant::now();
         let (measured, segmented) = match unusable {
-            Some(doubt) => (Measurement::nothing(0.0, doubt), checked),
+            Some(doubt) => {
+                self.liquid.lose_picture(doubt);
+                (Measurement::nothing(0.0, doubt), checked)
+            }
             None => {
                 let sighting = self.liquid.look(&mut self.edges)?;
                 let segmented = Instant::now();

@@ -110,6 +110,9 @@ pub(crate) trait Liquid: Send + Sync {
     /// from the x-axis to the y-axis; without a stream they are of no use.
     fn look(&mut self, edges_px: &mut Vec<[f32; 2]>) -> opencv::Result<Sighting>;
 
+    /// Says that the picture that was taken is not looked at, and why.
+    fn lose_picture(&mut self, doubt: Doubt);
+
     /// What a measurement in the picture that was looked at rests on.
     fn basis(&self) -> Basis;
 

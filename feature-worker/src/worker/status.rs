@@ -4,7 +4,7 @@
 //! neither writes to a terminal itself. A line that cannot be printed is left out.
 
 use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, Ordering::Relaxed};
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering::Relaxed};
 use std::thread::JoinHandle;
 use std::time::Duration;
 
@@ -12,6 +12,7 @@ use crossbeam::queue::ArrayQueue;
 use serde::Serialize;
 use shared::os;
 use shared::speaker::Speaker;
+use shared::supervisor::Supervisor;
 
 /// How often the thread looks for a new status. Chosen by hand; it also bounds how long the process takes to end.
 const PAUSE: Duration = Duration::from_millis(100);
@@ -46,22 +47,27 @@ pub struct Status {
 }
 
 /// Starts the thread "status". It ends soon after `stop` is set.
+///
+/// `looks` grows whenever the extraction thread looks for a frame; systemd is told that it does.
 pub fn start_printer(
     latest: &Arc<ArrayQueue<Status>>,
+    looks: &Arc<AtomicU64>,
     stop: &Arc<AtomicBool>,
     speaker: &Arc<Speaker>,
     json: bool,
 ) -> std::io::Result<JoinHandle<()>> {
-    let (latest, stop, speaker) = (Arc::clone(latest), Arc::clone(stop), Arc::clone(speaker));
-    std::thread::Builder::new().name("status".into()).spawn(move || print_until_stopped(&latest, &stop, &speaker, json))
+    let (latest, looks, stop, speaker) = (Arc::clone(latest), Arc::clone(looks), Arc::clone(stop), Arc::clone(speaker));
+    std::thread::Builder::new().name("status".into()).spawn(move || print_until_stopped(&latest, &looks, &stop, &speaker, json))
 }
 
-fn print_until_stopped(latest: &ArrayQueue<Status>, stop: &AtomicBool, speaker: &Speaker, json: bool) {
+fn print_until_stopped(latest: &ArrayQueue<Status>, looks: &AtomicU64, stop: &AtomicBool, speaker: &Speaker, json: bool) {
     let mut frames_before = 0;
     let mut printed_at_ns = os::now_ns();
+    let mut supervisor = Supervisor::ready();
     speaker.say("waiting for frames");
     while !stop.load(Relaxed) {
         std::thread::sleep(PAUSE);
+        supervisor.progress(looks.load(Relaxed));
         let now_ns = os::now_ns();
         if now_ns < printed_at_ns + LINE_NS {
             continue;

@@ -13,9 +13,6 @@ use shared::gaussian_curve::Curve;
 use super::pour;
 use crate::client::Common;
 
-/// Alpha at the curve's first and last moment if no beta is given, degrees. Chosen by hand: small enough for a start without a jump.
-const END_DEG: f32 = 0.05;
-
 /// Command-line arguments.
 #[derive(Debug, clap::Args)]
 #[command(
@@ -43,8 +40,8 @@ pub struct Args {
 /// Runs the command.
 pub fn run(args: &Args) -> Result<(), Failure> {
     let config = Config::read(&args.common.config).or_exit(exit::BAD_INPUT)?;
-    let beta_s = args.beta.unwrap_or_else(|| ((args.lambda / END_DEG).ln() / args.gamma).sqrt());
-    let curve = Curve { lambda_deg: args.lambda, gamma_per_s2: args.gamma, beta_s };
+    let own = Curve::from_upright(args.lambda, args.gamma);
+    let curve = Curve { beta_s: args.beta.unwrap_or(own.beta_s), ..own };
     let (outcome, recorded) = pour::order(&config.cell, &Request::Record(curve))?;
     pour::ended(&outcome)?;
     let file = match recorded.map(|r| r.file) {

@@ -35,7 +35,7 @@ fn ten_thousand_motions_in_single_precision_end_upright() {
     robot.stream(3.0, &mut limiter, |_| 0.0);
     let rest_deg = robot.cycles.last().unwrap().command_deg;
     println!("at rest at {rest_deg} deg");
-    assert!(rest_deg.abs() < 0.0005, "after 10,000 motions the joint rests at {rest_deg} deg");
+    assert!(rest_deg.abs() < 0.0001, "after 10,000 motions the joint rests at {rest_deg} deg");
     robot.send(Mode::Stop, 0.0);
     robot.pass(1.0);
     assert_eq!((robot.state(), robot.machine.runtime_state()), (ProgramState::Stopped, RuntimeState::Stopped));

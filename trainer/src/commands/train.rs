@@ -5,6 +5,7 @@
 //! trained on or written ends the command with one line.
 
 use std::path::{Path, PathBuf};
+use std::sync::{Mutex, PoisonError};
 
 use indicatif::{ProgressBar, ProgressStyle};
 use shared::episode;
@@ -53,6 +54,9 @@ pub struct WeightFileArgs {
     /// Print a report as JSON.
     #[arg(long)]
     pub json: bool,
+    /// Say how far it has come in lines of JSON on standard error, for a program that shows it.
+    #[arg(long)]
+    progress: bool,
 }
 
 fn parse_actions(text: &str) -> Result<u8, String> {
@@ -60,6 +64,31 @@ fn parse_actions(text: &str) -> Result<u8, String> {
         "2" => Ok(2),
         "21" => Ok(21),
         _ => Err("give 2 or 21".into()),
+    }
+}
+
+/// Progress in lines of JSON: at most one a twentieth of a stage.
+#[derive(Default)]
+struct Lines(Mutex<(String, u64, u64)>);
+
+impl Lines {
+    fn say(name: &str, step: u64, steps: u64, note: &str) {
+        eprintln!("{}", serde_json::json!({ "stage": name, "step": step, "steps": steps, "note": note }));
+    }
+}
+
+impl Progress for Lines {
+    fn stage(&self, name: &str, steps: u64) {
+        *self.0.lock().unwrap_or_else(PoisonError::into_inner) = (name.to_owned(), steps, 0);
+        Self::say(name, 0, steps, "");
+    }
+    fn at(&self, step: u64, note: &str) {
+        let mut stage = self.0.lock().unwrap_or_else(PoisonError::into_inner);
+        let (name, steps, said) = &mut *stage;
+        if step >= *steps || step >= *said + *steps / 20 {
+            *said = step;
+            Self::say(name, step, *steps, note);
+        }
     }
 }
 
@@ -113,7 +142,8 @@ impl WeightFileArgs {
         let style = ProgressStyle::with_template("{prefix} [{wide_bar}] {pos}/{len} {msg} ({eta} left)");
         let bar = Bar(ProgressBar::new(1).with_style(style.unwrap_or_else(|_| ProgressStyle::default_bar())));
         let begin = std::time::Instant::now();
-        let trained = method::train(&usable.episodes, options, &bar).or_exit(exit::BAD_INPUT)?;
+        let progress: &dyn Progress = if self.progress { &Lines::default() } else { &bar };
+        let trained = method::train(&usable.episodes, options, progress).or_exit(exit::BAD_INPUT)?;
         bar.0.finish_and_clear();
         let seconds = begin.elapsed().as_secs_f64();
         let out = &self.out;

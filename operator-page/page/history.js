@@ -1,0 +1,121 @@
+// The third tab: error over time, the table of episodes, one episode on a scrubber, exports.
+'use strict';
+
+const numeric = (value, digits) => (value === null || value === undefined ? '' : shown(value, digits));
+const COLUMNS = [
+  ['file', 'Episode', e => e.file], ['started_at_utc', 'Started (UTC)', e => (e.started_at_utc || '').replace('T', ' ').replace(/\.?\d*Z$/, '')],
+  ['what', 'What', e => (e.error ? 'UNREADABLE' : what(e))], ['goal', 'Goal, ml', e => numeric(e.run?.goal_ml, 0), true],
+  ['weight_g', 'Weight, g', e => numeric(e.weight_g, 1), true], ['error_ml', 'Error, ml', e => numeric(e.error_ml, 1), true],
+  ['seconds', 'Time, s', e => numeric(e.seconds, 1), true], ['ended', 'How it ended', e => e.error || e.ended || '', false, true],
+  ['doubts', 'Doubts', e => doubtWords(e), false, true], ['weights', 'Weights', e => (e.weights || '').slice(0, 8)],
+];
+let sorted = ['started_at_utc', -1], chosen = '', rows = null, pictureAt = -1;
+
+function doubtWords(e) {
+  const doubtful = Object.entries(e.doubtful_frames || {}).map(([name, n]) => `${name}: ${n}`);
+  return [...doubtful, ...(e.lost_frames ? [`lost: ${e.lost_frames}`] : []), ...(e.wrong || [])].join('; ');
+}
+
+const valueOf = (e, key) => (key === 'goal' ? e.run?.goal_ml : key === 'what' ? what(e) : key === 'doubts' ? doubtWords(e) : e[key]);
+
+function shownEpisodes() {
+  const kind = $('kind').value, word = $('search').value.trim().toLowerCase();
+  const fits = e => (!kind || (kind === 'unweighed' ? !e.error && e.weight_g === null : kind === 'wrong' ? e.error || (e.wrong || []).length : e.run?.kind === kind)) &&
+    (!word || COLUMNS.some(([, , text]) => String(text(e)).toLowerCase().includes(word)));
+  const [key, direction] = sorted;
+  const order = (a, b) => {
+    const [x, y] = [valueOf(a, key), valueOf(b, key)];
+    if (x === y) return 0;
+    if (x === null || x === undefined || x === '') return 1;
+    if (y === null || y === undefined || y === '') return -1;
+    return (x < y ? -1 : 1) * direction;
+  };
+  return table.episodes.filter(fits).sort(order);
+}
+
+function showTable() {
+  if ($('history').hidden) return;
+  const list = shownEpisodes();
+  $('table-words').textContent = `${list.length} of ${table.episodes.length} episodes in ${table.directory || '…'}${table.unread ? `; ${table.unread} files are still to be read` : ''}.`;
+  fill($('table').tHead, el('tr', {}, ...COLUMNS.map(([key, name, , number]) => {
+    const on = sorted[0] === key;
+    const head = el('th', { scope: 'col', className: number ? 'number' : '', 'aria-sort': on ? (sorted[1] > 0 ? 'ascending' : 'descending') : 'none' },
+      el('button', { type: 'button', onclick: () => { sorted = [key, on ? -sorted[1] : 1]; showTable(); } }, `${name}${on ? (sorted[1] > 0 ? ' ▲' : ' ▼') : ''}`));
+    return head;
+  }), el('th', { scope: 'col' }, 'Look and save')));
+  fill($('table').tBodies[0], ...list.slice(0, 500).map(e => {
+    const cells = COLUMNS.map(([, , text, number, words]) => el('td', { className: number ? 'number' : words ? 'words' : '' }, text(e)));
+    const save = (path, name) => el('a', { href: `${path}?file=${encodeURIComponent(e.file)}`, download: e.file.replace(/\.mcap$/, name), 'aria-label': `Save ${e.file} as ${name}` }, name.slice(1).toUpperCase());
+    const look = el('button', { type: 'button', className: 'small look', 'aria-label': `Look at ${e.file}`, onclick: () => open(e.file) }, 'Look');
+    const tr = el('tr', { className: e.file === chosen ? 'chosen' : '' }, ...cells,
+      el('td', {}, e.error ? null : look, ' ', save('/api/mcap', '.mcap'), ' ', e.error ? null : save('/api/csv', '.csv')));
+    return tr;
+  }));
+  drift();
+}
+
+function drift() {
+  const weighed = table.episodes.filter(e => Number.isFinite(e.error_ml)).sort((a, b) => (a.started_at_utc < b.started_at_utc ? -1 : 1));
+  if (!weighed.length) { $('drift-words').textContent = 'No pour has been weighed yet.'; pen($('drift')); return; }
+  const errors = weighed.map((e, k) => [k + 1, e.error_ml]);
+  const mean = errors.map(([k]) => { const near = errors.slice(Math.max(0, k - 5), k).map(e => Math.abs(e[1])); return [k, near.reduce((a, b) => a + b, 0) / near.length]; });
+  const top = Math.max(3, ...errors.map(e => Math.abs(e[1])));
+  panels($('drift'), { from: 0.5, to: errors.length + 0.5, axis: k => (Number.isInteger(k) ? String(k) : ''), list: [{ title: 'Weight minus goal', unit: 'ml', low: -top, high: top, series: [
+    { name: 'one pour', colour: '--series-1', dots: true, points: errors }, { name: 'mean size of the last 5', colour: '--series-2', dash: 1, points: mean }] }] });
+  const recent = mean[mean.length - 1][1];
+  $('drift-words').textContent = `${errors.length} weighed pours; the last was off by ${shown(errors[errors.length - 1][1])} ml, the last ${Math.min(5, errors.length)} by ${shown(recent)} ml on average.`;
+}
+
+async function open(file) {
+  rows = await attempt(() => get(`/api/rows?file=${encodeURIComponent(file)}`));
+  if (!rows) return;
+  chosen = file;
+  $('episode').hidden = false;
+  $('episode-title').textContent = file;
+  const e = table.episodes.find(one => one.file === file) || {};
+  const facts = [['What', what(e)], ['Started', e.started_at_utc], ['Goal', e.run?.goal_ml ? `${shown(e.run.goal_ml)} ml` : '–'], ['Weight', e.weight_g === null ? 'not weighed' : `${shown(e.weight_g)} g`],
+    ['Error', Number.isFinite(e.error_ml) ? `${shown(e.error_ml)} ml` : '–'], ['Time', `${shown(e.seconds)} s, ${e.frames} frames`], ['It ended', e.ended || 'the recorder was killed'],
+    ['Weights', e.weights || 'none'], ['Doubts', doubtWords(e) || 'none'], ['Notes', (e.notes || []).join('; ') || 'none']];
+  fill($('episode-facts'), ...facts.flatMap(([name, value]) => [el('dt', {}, name), el('dd', {}, value)]));
+  $('scrub').max = rows.t_s.length - 1;
+  const flowing = rows.area_px2.reduce((best, v, k) => (Number.isFinite(v) && v > (rows.area_px2[best] || 0) ? k : best), 0);
+  $('scrub').value = flowing;
+  pictureAt = -1;
+  scrub();
+  showTable();
+  $('episode').scrollIntoView({ block: 'nearest' });
+}
+
+let loading = false;
+function scrub() {
+  if (!rows || !rows.t_s.length) return;
+  const k = Number($('scrub').value);
+  const words = `${shown(rows.t_s[k], 2)} s: alpha ${shown(rows.alpha_deg[k])}° commanded, ${shown(rows.alpha_measured_deg[k])}° measured, V_e ${shown(rows.area_px2[k], 0)} px²${rows.doubt[k] === 'none' ? '' : `, DOUBT: ${rows.doubt[k]}`}.`;
+  $('scrub-words').textContent = words;
+  $('scrub').setAttribute('aria-valuetext', words);
+  const of = column => rows.t_s.map((t, i) => [t, rows[column][i] ?? NaN]);
+  const marks = rows.t_s.filter((t, i) => rows.doubt[i] !== 'none').map(t => ({ t }));
+  panels($('episode-plot'), { from: rows.t_s[0], to: rows.t_s[rows.t_s.length - 1], cursor: rows.t_s[k], list: [
+    { title: 'Tilt alpha', unit: 'degrees', low: 0, high: 20, series: [{ name: 'commanded', colour: '--series-1', points: of('alpha_deg') }, { name: 'measured', colour: '--series-2', dash: 1, points: of('alpha_measured_deg') }] },
+    { title: 'Stream V_e', unit: 'px²', low: 0, high: 100, marks, series: [{ name: 'V_e', colour: '--series-3', points: of('area_px2') }] }] });
+  if (loading || pictureAt === k) return;
+  loading = true;
+  pictureAt = k;
+  const image = $('episode-picture');
+  image.onload = image.onerror = () => { loading = false; if (Number($('scrub').value) !== pictureAt) scrub(); };
+  image.alt = `Picture of ${chosen} at ${shown(rows.t_s[k], 2)} s`;
+  image.src = `/api/frame?file=${encodeURIComponent(chosen)}&sequence=${rows.sequence[k]}`;
+}
+$('scrub').oninput = scrub;
+$('kind').onchange = showTable;
+$('search').oninput = showTable;
+for (const button of document.querySelectorAll('[data-format]')) {
+  button.onclick = () => attempt(async () => {
+    const files = shownEpisodes().filter(e => !e.error).map(e => e.file);
+    await post('/api/export', { what: button.dataset.format, files });
+    mine = true;
+  });
+}
+addEventListener('table', showTable);
+addEventListener('tab', event => { if (event.detail === 'history') { showTable(); scrub(); } });
+addEventListener('resize', () => { if (!$('history').hidden) { showTable(); scrub(); } });

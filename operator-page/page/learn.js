@@ -1,0 +1,164 @@
+// The second tab: record what teaches most, weigh it, learn, and choose the weights.
+'use strict';
+
+let plannedFrom = null, planned = '', tableShown = '', jobShown = '', compareShown = '', table = { episodes: [] };
+/** What a person has said of doubtful episodes: file to true (use it) or false (leave it out). */
+const judged = new Map();
+
+/** A proposal as a person does it. */
+function proposal(candidate, first) {
+  const next = candidate.next;
+  const head = next.kind === 'curve' ? `Fill in ${shown(next.fill_ml, 0)} ml and record a curve` : `Fill in ${shown(next.fill_ml, 0)} ml and pour ${shown(next.goal_ml, 0)} ml`;
+  const button = el('button', { type: 'button', className: first ? 'primary record' : 'record' }, next.kind === 'curve' ? 'It is filled: record the curve' : 'It is filled: prepare this pour');
+  button.onclick = () => (next.kind === 'curve' ? record(next) : prepare(next));
+  return el('div', { className: 'proposal' }, el('p', {}, el('b', {}, `${first ? '' : 'Or: '}${head}`)),
+    el('p', { className: 'hint' }, next.kind === 'curve' ? `Height ${shown(next.lambda_deg, 0)}°, width ${next.gamma_per_s2} 1/s². ` : '',
+      `Some ${shown(candidate.weight_ml, 0)} g should be on the scale. The camera's volume is then off by ${shown(candidate.sd_after_ml)} ml.`), button);
+}
+
+async function record(next) {
+  const answer = await attempt(() => post('/api/record', { lambda_deg: next.lambda_deg, gamma_per_s2: next.gamma_per_s2 }));
+  if (!answer) return;
+  mine = true;
+  ordered = answer.episode;
+  choose(tabs[0]);
+}
+
+function prepare(next) {
+  $('goal').value = next.goal_ml;
+  $('fill').value = next.fill_ml;
+  choose(tabs[0]);
+  $('pour-form').requestSubmit();
+}
+
+function showPlan(result) {
+  const key = JSON.stringify(result);
+  if (key === planned) return;
+  planned = key;
+  const plan = result?.plan;
+  if (!plan) { fill($('plan')); return; }
+  plannedFrom = result.episodes;
+  const missing = result.check?.missing || [], left = result.check?.left_out || [];
+  const nothing = !plan.candidates.length ? [el('p', { className: 'bad' }, '✕ Nothing can be proposed for this vessel: say what it really holds.')] : [];
+  fill($('plan'), result.episodes ? el('p', {}, `The camera's volume of the pours to come is off by ${shown(plan.sd_now_ml)} ml now.`)
+    : el('p', {}, 'Nothing has been weighed yet. The height is that of a beaker: if nothing flows, take 10 degrees more.'),
+  ...nothing, ...plan.candidates.map((candidate, k) => proposal(candidate, k === 0)),
+  missing.length ? el('p', {}, 'Still missing: ', missing.join('; '), '.') : null,
+  ...left.map(([name, what]) => el('p', { className: 'warn' }, `! Left out: ${name.split('/').pop()}: ${what}`)));
+}
+
+$('make-plan').onclick = () => attempt(async () => {
+  const holds = typed('holds');
+  if (Number.isNaN(holds)) throw new Error('Type what the vessel holds in ml, or leave it empty.');
+  localStorage.setItem('decant-holds', $('holds').value);
+  await post('/api/plan', { holds_ml: holds ?? null });
+  mine = true;
+});
+$('start-learning').onclick = () => learn();
+async function learn() {
+  const last = typed('last');
+  if (last !== undefined && !(last >= 1)) { say('Type how many episodes, or leave it empty.'); return; }
+  const names = use => [...judged].filter(([, used]) => used === use).map(([name]) => name);
+  await attempt(async () => {
+    await post('/api/learn', { last: last === undefined ? null : Math.floor(last), accept: names(true), leave_out: names(false) });
+    mine = true;
+  });
+}
+$('cancel').onclick = () => attempt(() => post('/api/cancel'));
+
+const JOBS = { plan: 'Planning', learn: 'Learning', export: 'Exporting' };
+function showJob(job) {
+  const key = JSON.stringify(job);
+  if (key === jobShown) return;
+  jobShown = key;
+  const busy = job.number > 0 && !job.done;
+  $('cancel').hidden = !busy;
+  for (const id of ['start-learning', 'make-plan']) $(id).disabled = busy;
+  const place = job.kind === 'export' ? $('export-said') : $('job');
+  const other = job.kind === 'export' ? $('job') : $('export-said');
+  fill(other);
+  if (job.number === 0) { fill(place); return; }
+  if (busy) {
+    const bar = el('progress', { 'aria-label': `${JOBS[job.kind]}: ${job.stage}` });
+    if (job.steps > 0) { bar.max = job.steps; bar.value = job.step; }
+    fill(place, el('p', {}, `${JOBS[job.kind]}: ${job.stage || 'starting'}${job.steps ? `, ${job.step} of ${job.steps}` : ''}${job.note ? ` (${job.note})` : ''}`), bar);
+    fill($('doubts'));
+    return;
+  }
+  if (job.error) { fill(place, el('p', { className: 'bad' }, `✕ ${JOBS[job.kind]} failed: ${job.error}`)); return; }
+  const r = job.result || {};
+  if (job.kind === 'plan') { fill(place); showPlan(r); return; }
+  if (job.kind === 'export') { fill(place, el('p', { className: 'good' }, `✓ Written on the robot's computer: ${r.directory}`)); return; }
+  if (r.doubts) { askDoubts(r.doubts); fill(place, el('p', { className: 'warn' }, '! Nothing was learned yet: judge these episodes first.')); return; }
+  fill(place, el('p', { className: 'good' }, `✓ Learned from ${r.episodes} episodes. The new weights are offered under 4.`),
+    ...(r.left_out || []).map(([name, what]) => el('p', { className: 'hint' }, `Left out: ${name.split('/').pop()}: ${what}`)));
+}
+
+/** Asks of each doubtful episode whether it is used. */
+function askDoubts(doubts) {
+  const rows = doubts.map(([name, what]) => {
+    const button = el('button', { type: 'button' });
+    const show = () => { button.textContent = judged.get(name) ? 'Use it all the same' : 'Leave it out'; button.setAttribute('aria-pressed', judged.get(name)); };
+    if (!judged.has(name)) judged.set(name, false);
+    button.onclick = () => { judged.set(name, !judged.get(name)); show(); };
+    show();
+    return el('div', { className: 'proposal' }, el('p', {}, el('b', {}, name.split('/').pop()), `: ${what}`), button);
+  });
+  fill($('doubts'), ...rows, el('button', { type: 'button', className: 'primary', id: 'learn-judged', onclick: learn }, 'Learn with these answers'));
+}
+
+function compare() {
+  const w = state.weights || {};
+  const key = JSON.stringify([w, state.kind === 'moving']);
+  if (key === compareShown) return;
+  compareShown = key;
+  const order = what => () => attempt(async () => {
+    await post('/api/weights', { what });
+    mine = true;
+    say({ accept: 'The new weights are in use from the next pour on.', back: 'The weights from before are in use from the next pour on.', decline: 'The offer is deleted.' }[what], true);
+  });
+  const button = (words, what, main = false) => el('button', { type: 'button', className: main ? `primary ${what}` : what, onclick: order(what) }, words);
+  fill($('compare'), el('h3', {}, 'In use'), weightsWords(w.now, 'None yet.'),
+    w.offer ? el('h3', {}, 'Offered') : null, w.offer ? weightsWords(w.offer, '') : el('p', { className: 'hint' }, 'Nothing is offered: learn first.'),
+    w.offer ? el('p', { className: 'row' }, w.offer.error ? null : button('Use the new weights', 'accept', true), button('Delete the offer', 'decline')) : null,
+    w.before ? el('h3', {}, 'From before') : null, w.before ? weightsWords(w.before, '') : null, w.before ? button('Go back to these', 'back') : null);
+}
+
+/** Episodes without a weight, newest first. */
+function unweighed() {
+  const open = table.episodes.filter(e => !e.error && e.complete && e.weight_g === null).reverse();
+  const weighed = table.episodes.filter(e => !e.error && e.weight_g !== null);
+  const kinds = kind => weighed.filter(e => e.run.kind === kind).length;
+  $('set-words').textContent = `The set: ${kinds('recording')} curves and ${kinds('pour')} pours are weighed${table.unread ? `; ${table.unread} files are still to be read` : ''}.`;
+  const old = plannedFrom !== null && plannedFrom !== weighed.length;
+  $('plan-old').textContent = old ? `! This was proposed from ${plannedFrom} weighed episodes; now there are ${weighed.length}: propose again.` : '';
+  const rows = open.slice(0, 12).map(e => {
+    const place = el('div', { className: 'proposal' });
+    fill(place, el('p', {}, el('b', {}, e.file), ` ${e.started_at_utc}, ${what(e)}`), scale(e.file, e.run.goal_ml ?? NaN, grams => { if (grams === null) place.remove(); else reload(); }));
+    return place;
+  });
+  fill($('unweighed'), ...(rows.length ? rows : [el('p', { className: 'hint' }, 'Everything that was recorded is weighed.')]));
+}
+
+function what(episode) {
+  const run = episode.run || {};
+  if (run.kind === 'pour') return `pour of ${shown(run.goal_ml, 0)} ml`;
+  return run.kind === 'recording' ? `curve of ${shown(run.lambda_deg, 0)}°` : 'table';
+}
+
+async function reload() {
+  try { table = await get('/api/episodes'); } catch { tableShown = ''; return; }
+  dispatchEvent(new CustomEvent('table'));
+}
+addEventListener('table', () => { if (!$('unweighed').contains(document.activeElement) || document.activeElement.value === '') unweighed(); });
+listeners.push(() => {
+  showJob(state.job);
+  compare();
+  if (state.table !== tableShown) { tableShown = state.table; reload(); }
+});
+addEventListener('tab', async event => {
+  if (event.detail !== 'learn') return;
+  unweighed();
+  try { showPlan(await get('/api/plan')); } catch { return; }
+});
+addEventListener('known', () => { $('holds').value = about.holds_ml ?? localStorage.getItem('decant-holds') ?? ''; });

@@ -1,0 +1,115 @@
+// The live part: the stream of states, what the cell is doing in words, who has the say, and Stop.
+'use strict';
+
+let last = 0, source = null, state = null, mine = false, stopPort = 0, announced = '';
+/** The ticks of the last minute, by their place in the rows of the server. */
+let points = [];
+const [TICK, T, ALPHA, MEASURED, AREA, DOUBT, D, POURED, SD, PHASE, EPISODE, GOAL] = [0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11];
+const SIGNS = { ready: '✓', moving: '▶', waiting: '!', lost: '✕' };
+
+/** Stop goes two ways at the same time: with the page's own server, and with a port where nothing else is answered. */
+async function stop() {
+  const begin = performance.now();
+  const word = $('stop-word');
+  word.textContent = 'Stopping …';
+  $('stop-said').textContent = '';
+  const ways = [fetch('/api/stop', { method: 'POST', headers: { 'Content-Type': 'application/json' }, body: '{}' })];
+  if (stopPort) {
+    const other = `http://${location.hostname}:${stopPort}/stop`;
+    ways.push(fetch(other, { method: 'POST', credentials: 'include', headers: { 'Content-Type': 'text/plain' }, body: '' }));
+  }
+  try {
+    const answer = await Promise.any(ways.map(way => way.then(answered)));
+    $('stop-said').textContent = `Stop: ${answer.words} (${(performance.now() - begin).toFixed(0)} ms)`;
+  } catch (error) {
+    const first = error.errors?.find(e => !(e instanceof TypeError));
+    $('stop-said').textContent = `Stop failed: ${first ? first.message : 'the page\'s server cannot be reached'}. Use the robot's own stop.`;
+  }
+  word.textContent = 'Stop';
+}
+$('stop').onclick = stop;
+
+// The space bar stops, wherever the focus is: it never presses another button. In a field for words it is a space.
+function takesSpace(target) { return target.matches?.('input[type="text"], textarea'); }
+for (const kind of ['keydown', 'keyup']) {
+  addEventListener(kind, event => {
+    if (event.code !== 'Space' || takesSpace(event.target)) return;
+    event.preventDefault();
+    event.stopPropagation();
+    if (kind === 'keydown' && !event.repeat) stop();
+  }, true);
+}
+
+function connect() {
+  source?.close();
+  source = new EventSource('/events');
+  source.onmessage = event => {
+    last = performance.now();
+    document.body.classList.remove('lost');
+    $('lost').hidden = true;
+    let next;
+    try { next = JSON.parse(event.data); } catch { return; }
+    state = next;
+    const newest = points.length ? points[points.length - 1][TICK] : -1;
+    const fresh = state.live.points;
+    if (fresh.length && fresh[fresh.length - 1][TICK] < newest) points = [];
+    points.push(...fresh.filter(p => !points.length || p[TICK] > points[points.length - 1][TICK]));
+    if (points.length > 1800) points.splice(0, points.length - 1800);
+    headline();
+    listeners.forEach(listener => listener(state));
+  };
+}
+
+function headline() {
+  document.body.dataset.kind = state.kind;
+  $('sign').textContent = SIGNS[state.kind] || '?';
+  $('words').textContent = state.doing;
+  const warning = state.live.status?.robot_warning;
+  $('remedy').textContent = state.remedy || (warning ? `Warning: ${warning}.` : '');
+  $('who').textContent = mine ? 'you have the say' : state.say ? `${state.say} has the say` : 'nobody has the say';
+  $('take').textContent = mine ? 'Give the say back' : state.say ? 'Take it over' : 'Take the say';
+  // A screen reader hears what changes, and not every tenth of a millilitre.
+  const brief = state.kind === 'moving' ? state.doing.split(':')[0] : `${state.doing}. ${state.remedy}`;
+  if (brief !== announced) { announced = brief; $('announce').textContent = brief; }
+  document.title = `${state.doing} · Decant`;
+}
+
+$('take').onclick = () => attempt(async () => { mine = (await post(mine ? '/api/leave' : '/api/say')).mine; });
+
+// A server that is gone is noticed within a second.
+setInterval(() => {
+  if (performance.now() - last < 900) return;
+  document.body.classList.add('lost');
+  $('lost').hidden = false;
+  if (source?.readyState === EventSource.CLOSED) connect();
+}, 150);
+setInterval(() => { if (!source || (source.readyState !== EventSource.OPEN && performance.now() - last > 3000)) connect(); }, 1500);
+
+/** Whether this page holds a pour. */
+let holding = false;
+async function here() {
+  try { mine = (await post('/api/here', { holding })).mine; } catch { mine = false; }
+}
+setInterval(() => { if (mine && !holding) here(); }, 1500);
+// The connection of Stop's own way is kept open, so that a Stop need not make one.
+setInterval(() => {
+  if (stopPort && !document.hidden) fetch(`http://${location.hostname}:${stopPort}/alive`, { credentials: 'include' }).catch(() => {});
+}, 3000);
+
+async function begin() {
+  try {
+    about = await get('/api/about');
+    points = await get('/api/minute');
+  } catch (error) {
+    say(error.message);
+    setTimeout(begin, 1500);
+    return;
+  }
+  stopPort = about.stop_port;
+  $('cell').textContent = about.cell;
+  $('about').textContent = `Decant ${about.version} · ${about.config}`;
+  dispatchEvent(new CustomEvent('known'));
+  fetch(`http://${location.hostname}:${stopPort}/alive`, { credentials: 'include' }).catch(() => {});
+  connect();
+}
+addEventListener('load', begin);

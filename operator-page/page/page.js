@@ -1,0 +1,113 @@
+// What all parts of the page use: finding and making elements, asking the server, and saying what went wrong. Everything that comes from the
+// server is put into the page as text, never as markup.
+'use strict';
+
+const $ = id => document.getElementById(id);
+
+/** Makes an element. `properties` are set as they are; children are elements or text. */
+function el(tag, properties = {}, ...children) {
+  const made = document.createElement(tag);
+  for (const [name, value] of Object.entries(properties)) {
+    if (name.startsWith('aria-') || name === 'role' || name === 'scope') made.setAttribute(name, value);
+    else made[name] = value;
+  }
+  made.append(...children.filter(c => c !== null && c !== undefined).map(c => (c instanceof Node ? c : String(c))));
+  return made;
+}
+
+/** Puts `children` in the place of what is in `parent`. */
+function fill(parent, ...children) { parent.replaceChildren(...children.filter(c => c !== null && c !== undefined)); }
+
+/** This page's own name for itself, by which the server knows who has the say. */
+const own = { id: sessionStorage.getItem('decant-id') || '', name: localStorage.getItem('decant-name') || '' };
+if (!own.id) {
+  own.id = [...crypto.getRandomValues(new Uint8Array(16))].map(b => b.toString(16).padStart(2, '0')).join('');
+  sessionStorage.setItem('decant-id', own.id);
+}
+
+/** Says one line above the content; an empty line takes it away. */
+function say(line, good = false) {
+  $('said').textContent = line;
+  $('said').classList.toggle('good', good);
+}
+
+async function answered(response) {
+  const answer = await response.json().catch(() => ({}));
+  if (!response.ok) throw new Error(answer.error || `the server answered ${response.status}`);
+  return answer;
+}
+
+/** Looks something up. */
+async function get(path) { return answered(await fetch(path)); }
+
+/** Orders something. */
+async function post(path, order = {}) {
+  const body = JSON.stringify({ ...own, ...order });
+  return answered(await fetch(path, { method: 'POST', headers: { 'Content-Type': 'application/json' }, body }));
+}
+
+/** Does something that may fail, and says so in one line. Gives undefined then. */
+async function attempt(what) {
+  try {
+    say('');
+    return await what();
+  } catch (error) {
+    say(error instanceof TypeError ? 'The page\'s server cannot be reached.' : error.message);
+    return undefined;
+  }
+}
+
+/** A number as people type it; undefined for an empty field, NaN for what is no number. */
+function typed(id) {
+  const text = $(id).value.trim().replace(',', '.');
+  return text === '' ? undefined : Number(text);
+}
+
+const shown = (value, digits = 1) => (Number.isFinite(value) ? value.toFixed(digits) : '–');
+
+/** The time since something, in words. */
+function ago(seconds) {
+  if (!Number.isFinite(seconds)) return 'of unknown age';
+  for (const [unit, name] of [[86400, 'day'], [3600, 'hour'], [60, 'minute']]) {
+    const n = Math.floor(seconds / unit);
+    if (n >= 1) return `${n} ${name}${n > 1 ? 's' : ''} old`;
+  }
+  return 'less than a minute old';
+}
+
+/** What the parts of the page do with each new state. */
+const listeners = [];
+/** What does not change while the server runs; null until it is known. */
+let about = null;
+
+// Tabs: a click, or the arrow keys.
+const tabs = [...document.querySelectorAll('[role="tab"]')];
+function choose(tab, focus = false) {
+  for (const other of tabs) {
+    const chosen = other === tab;
+    other.setAttribute('aria-selected', chosen);
+    other.tabIndex = chosen ? 0 : -1;
+    $(other.getAttribute('aria-controls')).hidden = !chosen;
+  }
+  if (focus) tab.focus();
+  say('');
+  dispatchEvent(new CustomEvent('tab', { detail: tab.getAttribute('aria-controls') }));
+}
+tabs.forEach((tab, k) => {
+  tab.onclick = () => choose(tab);
+  tab.onkeydown = event => {
+    const step = { ArrowRight: 1, ArrowLeft: -1 }[event.key];
+    if (step) { event.preventDefault(); choose(tabs[(k + step + tabs.length) % tabs.length], true); }
+  };
+});
+
+$('name').value = own.name;
+$('name').onchange = () => { own.name = $('name').value.trim(); localStorage.setItem('decant-name', own.name); };
+$('theme').value = localStorage.getItem('decant-theme') || '';
+function theme() {
+  if ($('theme').value) document.documentElement.dataset.theme = $('theme').value;
+  else delete document.documentElement.dataset.theme;
+  localStorage.setItem('decant-theme', $('theme').value);
+}
+$('theme').onchange = theme;
+theme();

@@ -1,0 +1,158 @@
+//! Calibration in the page: `feature-worker calibrate --page` as a child, whose own page answers this one's questions.
+//!
+//! The child watches one pour, finds corner, axes and colour, takes corrections, and writes the configuration; nothing of that is done here. A
+//! thread of its own takes what it says. Allocates, and what is read is bounded. A child that fails gives its lines.
+
+use std::io::{BufRead as _, BufReader, Read as _, Write as _};
+use std::net::{SocketAddr, TcpStream};
+use std::path::Path;
+use std::process::{Child, Command, Stdio};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::time::Duration;
+
+use serde_json::{Value, json};
+
+use crate::programs::program;
+
+/// Longest watch of a camera, s. Chosen by hand: calibrate keeps more than five minutes of it.
+const SECONDS_MAX: u64 = 120;
+/// Number of lines that are kept of what the child says. Chosen by hand; it says about ten.
+const LINES: usize = 40;
+/// Longest wait for the child's answer. Chosen by hand: measuring a long pour again takes some seconds.
+const ANSWER: Duration = Duration::from_secs(50);
+/// Largest answer of the child, bytes: a picture.
+const ANSWER_MAX: u64 = 16 << 20;
+
+#[derive(Default)]
+struct Newest {
+    child: Option<Child>,
+    /// Where the child's page is, once it has one.
+    address: Option<SocketAddr>,
+    lines: Vec<String>,
+    /// Whether the last child has ended, and how.
+    ended: Option<bool>,
+}
+
+impl Newest {
+    /// The process number of the child, if there is one.
+    fn number(&self) -> Option<u32> {
+        self.child.as_ref().map(Child::id)
+    }
+}
+
+/// The calibration under way, if there is one.
+#[derive(Default)]
+pub struct Calibration(Mutex<Newest>);
+
+impl Calibration {
+    fn newest(&self) -> MutexGuard<'_, Newest> {
+        self.0.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// Starts to watch the camera for `seconds`, during which one pour is to be shown. `method` is `colour`, `clear`, or empty.
+    pub fn start(self: &Arc<Self>, config: &Path, seconds: u64, method: &str) -> Result<(), String> {
+        if !(3..=SECONDS_MAX).contains(&seconds) {
+            return Err(format!("the camera can be watched for 3 to {SECONDS_MAX} s"));
+        }
+        self.cancel();
+        if let Some(mut before) = self.newest().child.take() {
+            // It was ended a moment ago.
+            let _ = before.wait();
+        }
+        let path = program("feature-worker");
+        let mut command = Command::new("nice");
+        command.args(["-n", "19"]).arg(&path).arg("calibrate").arg("--config").arg(config);
+        command.args(["--seconds", &seconds.to_string(), "--page", "--port", "0"]);
+        if ["colour", "clear"].contains(&method) {
+            command.args(["--method", method]);
+        }
+        command.stdin(Stdio::null()).stdout(Stdio::null()).stderr(Stdio::piped());
+        let mut child = command.spawn().map_err(|e| format!("{}: {e}", path.display()))?;
+        let said = child.stderr.take();
+        let number = child.id();
+        *self.newest() = Newest { child: Some(child), ..Newest::default() };
+        let this = Arc::clone(self);
+        let listen = move || {
+            for line in said.into_iter().flat_map(|s| BufReader::new(s.take(ANSWER_MAX)).lines()).map_while(Result::ok) {
+                this.take(number, line);
+            }
+            let mut newest = this.newest();
+            if newest.number() != Some(number) {
+                return;
+            }
+            let status = newest.child.take().and_then(|mut child| child.wait().ok());
+            newest.address = None;
+            newest.ended = Some(status.is_some_and(|s| s.success()));
+        };
+        std::thread::Builder::new().name("calibration".into()).spawn(listen).map(drop).map_err(|e| e.to_string())
+    }
+
+    fn take(&self, number: u32, line: String) {
+        let mut newest = self.newest();
+        if newest.number() != Some(number) {
+            return;
+        }
+        if let Some((_, rest)) = line.split_once("open http://") {
+            newest.address = rest.split_whitespace().next().and_then(|a| a.parse().ok());
+        } else if newest.lines.len() < LINES {
+            newest.lines.push(line.trim_start_matches("calibrate: ").trim_start_matches("error: ").into());
+        }
+    }
+
+    /// Ends the child, if there is one. Nothing is written.
+    pub fn cancel(&self) {
+        if let Some(child) = self.newest().child.as_mut() {
+            // It may have ended by itself.
+            let _ = child.kill();
+        }
+    }
+
+    /// How far it has come: what the child says, and its own state when it has found something.
+    pub fn about(&self) -> Value {
+        let (address, lines, busy, ended) = {
+            let newest = self.newest();
+            (newest.address, newest.lines.clone(), newest.child.is_some(), newest.ended)
+        };
+        let state = address.and_then(|_| self.ask(false, "/state.json", "").ok());
+        let state = state.and_then(|bytes| serde_json::from_slice::<Value>(&bytes).ok());
+        json!({ "busy": busy, "lines": lines, "found": state, "ended": ended })
+    }
+
+    /// The picture with what was found.
+    pub fn picture(&self) -> Result<Vec<u8>, String> {
+        self.ask(false, "/picture.jpg", "")
+    }
+
+    /// Tries a corner that was clicked, or writes the configuration: what the child says of it.
+    pub fn order(&self, path: &str, body: &str) -> Result<String, String> {
+        self.ask(true, path, body).map(|bytes| String::from_utf8_lossy(&bytes).into_owned())
+    }
+
+    /// Asks the child's page, as its own page would.
+    fn ask(&self, post: bool, path: &str, body: &str) -> Result<Vec<u8>, String> {
+        let address = self.newest().address.ok_or("no calibration is under way: start one")?;
+        let ask = || -> std::io::Result<Vec<u8>> {
+            let mut stream = TcpStream::connect_timeout(&address, ANSWER)?;
+            stream.set_read_timeout(Some(ANSWER))?;
+            let method = if post { "POST" } else { "GET" };
+            write!(
+                stream,
+                "{method} {path} HTTP/1.1\r\nHost: {address}\r\nOrigin: http://{address}\r\nContent-Type: application/json\r\n\
+                 Connection: close\r\nContent-Length: {}\r\n\r\n{body}",
+                body.len()
+            )?;
+            let mut answer = Vec::new();
+            stream.take(ANSWER_MAX).read_to_end(&mut answer)?;
+            Ok(answer)
+        };
+        let answer = ask().map_err(|e| format!("calibrate does not answer ({e}): start it again"))?;
+        let head = answer.windows(4).position(|w| w == b"\r\n\r\n").ok_or("calibrate gave no answer: start it again")?;
+        if answer.starts_with(b"HTTP/1.1 200") { Ok(answer[head + 4..].to_vec()) } else { Err("calibrate refused: start it again".into()) }
+    }
+}
+
+impl Drop for Calibration {
+    fn drop(&mut self) {
+        self.cancel();
+    }
+}

@@ -1,0 +1,184 @@
+//! Work in the background that other programs of the house do: planning what to record next, learning, exporting. One at a time.
+//!
+//! Each job has a thread of its own that waits for its program. Allocates; only the newest job is remembered. A job that fails says why in
+//! one line, and another can be started.
+
+use std::path::{Path, PathBuf};
+use std::sync::atomic::{AtomicBool, Ordering::Relaxed};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+
+use serde_json::{Value, json};
+
+use crate::programs::{self, Step};
+
+/// A job, and how far it has come.
+#[derive(Debug, Clone, Default)]
+struct Job {
+    /// Its number; 0 before the first.
+    number: u64,
+    kind: &'static str,
+    step: Step,
+    done: bool,
+    error: String,
+    result: Value,
+    stop: Arc<AtomicBool>,
+}
+
+/// The background's state.
+#[derive(Default)]
+pub struct Jobs {
+    newest: Mutex<Job>,
+    /// The newest plan with what it was made from.
+    plan: Mutex<Value>,
+}
+
+/// What a job does: it gets something to call with its progress, and tells its result.
+type Work = Box<dyn FnOnce(&AtomicBool, &mut dyn FnMut(Step)) -> Result<Value, String> + Send>;
+
+fn words(path: &Path) -> String {
+    path.display().to_string()
+}
+
+impl Jobs {
+    fn newest(&self) -> MutexGuard<'_, Job> {
+        self.newest.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// The newest job as the page shows it.
+    pub fn about(&self) -> Value {
+        let job = self.newest();
+        json!({ "number": job.number, "kind": job.kind, "stage": job.step.stage, "step": job.step.step, "steps": job.step.steps,
+            "note": job.step.note, "done": job.done, "error": job.error, "result": job.result })
+    }
+
+    /// The newest plan; null before the first.
+    pub fn plan(&self) -> Value {
+        self.plan.lock().unwrap_or_else(PoisonError::into_inner).clone()
+    }
+
+    /// Cancels the job under way.
+    pub fn cancel(&self) {
+        self.newest().stop.store(true, Relaxed);
+    }
+
+    fn start(self: &Arc<Self>, kind: &'static str, work: Work) -> Result<(), String> {
+        let mut job = self.newest();
+        if job.number > 0 && !job.done {
+            return Err(format!("another job is under way ({}): wait for it, or cancel it", job.kind));
+        }
+        let number = job.number + 1;
+        *job = Job { number, kind, ..Job::default() };
+        let stop = Arc::clone(&job.stop);
+        drop(job);
+        let this = Arc::clone(self);
+        let run = move || {
+            let result = work(&stop, &mut |step| this.newest().step = step);
+            let mut job = this.newest();
+            if kind == "plan"
+                && let Ok(plan) = &result
+            {
+                *this.plan.lock().unwrap_or_else(PoisonError::into_inner) = plan.clone();
+            }
+            match result {
+                Ok(result) => job.result = result,
+                Err(e) => job.error = e,
+            }
+            job.done = true;
+        };
+        std::thread::Builder::new().name("job".into()).spawn(run).map(drop).map_err(|e| {
+            self.newest().done = true;
+            e.to_string()
+        })
+    }
+
+    /// Plans what to record next from `files`: what is missing, and the best curve or pour.
+    pub fn start_plan(
+        self: &Arc<Self>,
+        files: Vec<PathBuf>,
+        directory: &Path,
+        config: &Path,
+        holds_ml: Option<f64>,
+        goal_max_ml: f32,
+    ) -> Result<(), String> {
+        let (directory, config) = (words(directory), words(config));
+        let files: Vec<String> = files.iter().map(|f| words(f)).collect();
+        self.start(
+            "plan",
+            Box::new(move |stop, step| {
+                let of = if files.is_empty() { vec![directory] } else { files.clone() };
+                let mut check = Value::Null;
+                if !files.is_empty() {
+                    step(Step { stage: "looking at the episodes".into(), ..Step::default() });
+                    let arguments = [vec!["check".into(), "--json".into()], of.clone()].concat();
+                    check = programs::run("trainer", &arguments, stop, |_| {})?.0;
+                }
+                step(Step { stage: "planning".into(), ..Step::default() });
+                let mut arguments = [vec!["plan".into(), "--json".into(), "--config".into(), config], of].concat();
+                arguments.extend(["--goal-max".into(), goal_max_ml.to_string()]);
+                arguments.extend(holds_ml.iter().flat_map(|ml| ["--holds".into(), ml.to_string()]));
+                let plan = programs::run("trainer", &arguments, stop, |_| {})?.0;
+                Ok(json!({ "plan": plan["plan"], "check": check, "episodes": files.len() }))
+            }),
+        )
+    }
+
+    /// Learns from `files`, and writes the weights to `out`. `accept` and `leave_out` are the doubtful episodes that a person has judged; if
+    /// there are others, nothing is learned and they are told.
+    pub fn start_learning(
+        self: &Arc<Self>,
+        files: &[PathBuf],
+        accept: Vec<String>,
+        leave_out: Vec<String>,
+        out: &Path,
+        config: &Path,
+    ) -> Result<(), String> {
+        if files.is_empty() {
+            return Err("no episode has been weighed yet: record a curve and weigh it first".into());
+        }
+        let (out, config) = (words(out), words(config));
+        let files: Vec<String> = files.iter().map(|f| words(f)).collect();
+        self.start(
+            "learn",
+            Box::new(move |stop, step| {
+                step(Step { stage: "looking at the episodes".into(), ..Step::default() });
+                let (check, _) = programs::run("trainer", &[vec!["check".into(), "--json".into()], files.clone()].concat(), stop, |_| {})?;
+                let judged = |name: &str| name == "data set" || accept.iter().chain(&leave_out).any(|n| n == name);
+                let doubts = check["doubts"].as_array().cloned().unwrap_or_default();
+                let open: Vec<Value> = doubts.into_iter().filter(|d| !judged(d[0].as_str().unwrap_or(""))).collect();
+                if !open.is_empty() {
+                    return Ok(json!({ "doubts": open }));
+                }
+                let mut arguments = [vec!["refine".into(), "--json".into(), "--progress".into()], files.clone()].concat();
+                arguments.extend(["--config".into(), config, "--out".into(), out]);
+                arguments.extend(accept.iter().flat_map(|name| ["--accept".into(), name.clone()]));
+                arguments.extend(leave_out.iter().flat_map(|name| ["--leave-out".into(), name.clone()]));
+                let (report, _) = programs::run("trainer", &arguments, stop, step)?;
+                let learned = report["episodes"].as_array().map_or(0, Vec::len);
+                Ok(json!({ "identity": report["identity"], "episodes": learned, "left_out": report["left_out"] }))
+            }),
+        )
+    }
+
+    /// Exports `files` in the format `kind` into the new directory `to`.
+    pub fn start_export(self: &Arc<Self>, files: &[PathBuf], kind: &'static str, to: PathBuf) -> Result<(), String> {
+        if files.is_empty() {
+            return Err("there is nothing to export".into());
+        }
+        let files: Vec<String> = files.iter().map(|f| words(f)).collect();
+        self.start(
+            "export",
+            Box::new(move |stop, step| {
+                step(Step { stage: format!("writing {kind}"), ..Step::default() });
+                let mut arguments: Vec<String> = vec!["episodes".into(), "export".into(), "--json".into(), "--as".into(), kind.into()];
+                arguments.extend(["--to".into(), words(&to)]);
+                arguments.extend(files);
+                let (written, succeeded) = programs::run("feature-worker", &arguments, stop, |_| {})?;
+                if succeeded {
+                    Ok(json!({ "directory": words(&to), "written": written["written"] }))
+                } else {
+                    Err("the export failed".into())
+                }
+            }),
+        )
+    }
+}

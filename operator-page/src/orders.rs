@@ -1,0 +1,159 @@
+//! What a page may order: pour, record, take the robot back, weigh. Motion is ordered through the controller's own requests, and nothing else.
+//!
+//! The page's answering threads run it; it allocates and may wait seconds for the controller. Every refusal is a line for the operator.
+
+use std::time::{Duration, Instant};
+
+use rt_controller::foreseen;
+use serde_json::{Value, json};
+use shared::control::{Reply, Request, RobotLink};
+use shared::episode::set_weight;
+use shared::gaussian_curve::Curve;
+use shared::messages::Phase;
+use shared::weights::{Estimator, Weights};
+
+use crate::site::{Site, moves};
+
+/// How long the robot may take to be connected: as `rt-controller resume`.
+const CONNECTED: Duration = Duration::from_secs(15);
+/// Pause between two looks at the cell. Chosen by hand; no measurement is recorded.
+const BEAT: Duration = Duration::from_millis(50);
+/// A pour that is expected to be off by more than this is warned of, ml: as `rt-controller pour`.
+const WARNED_SD_ML: f32 = 5.0;
+/// Least time after which the link's state is one from after a request: it asks twice a second.
+const FRESH: Duration = Duration::from_millis(1200);
+
+/// What is known of a pour before it starts.
+pub struct Foreseen {
+    /// Whether it may be ordered.
+    pub possible: bool,
+    /// The deviation with which it is expected to end, ml, if the weights tell.
+    pub sd_ml: Option<f32>,
+    /// The tilt by which it must flow, degrees, if the fill is known.
+    pub flows_by_deg: Option<f32>,
+    /// What the operator should know, a line each.
+    pub lines: Vec<String>,
+}
+
+impl Foreseen {
+    /// As the page takes it.
+    pub fn json(&self) -> Value {
+        json!({ "possible": self.possible, "sd_ml": self.sd_ml, "flows_by_deg": self.flows_by_deg, "lines": self.lines })
+    }
+}
+
+/// Foresees a pour of `goal_ml`, with `fill_ml` in the vessel if that is known.
+pub fn foresee(site: &Site, goal_ml: f32, fill_ml: Option<f64>) -> Foreseen {
+    let most = site.config.controller.goal_max_ml;
+    let cannot = |line: String| Foreseen { possible: false, sd_ml: None, flows_by_deg: None, lines: vec![line] };
+    if !goal_ml.is_finite() || goal_ml <= 0.0 || goal_ml > most {
+        return cannot(format!("The goal must be above 0 and at most {most} ml (controller.goal_max_ml)."));
+    }
+    let container = site.config.container;
+    if fill_ml.is_some_and(|ml| !ml.is_finite() || ml < f64::from(goal_ml)) {
+        return cannot("There is less in the vessel than is to be poured: fill it, or give a smaller goal.".into());
+    }
+    let (phase, status) = {
+        let live = site.cell.live();
+        (live.phase(), live.status.clone())
+    };
+    let Some(status) = status.filter(|_| phase.is_some()) else { return cannot("The controller does not answer.".into()) };
+    if moves(phase) {
+        return cannot("The robot still moves: wait until it stands upright.".into());
+    }
+    if status.weights.is_empty() {
+        return cannot(format!("There are no weights to pour with: record curves, weigh them, and learn. {}", status.weights_refused));
+    }
+    let mut lines = Vec::new();
+    if phase == Some(Phase::NoRobot) {
+        if status.robot != RobotLink::WaitsForOperator {
+            return cannot(format!("The robot may not move: {}", status.hindrance));
+        }
+        lines.push(format!("The robot is taken back first. It waited: {}", status.hindrance));
+    }
+    let weights = Weights::read(&site.config.controller.weights).ok().filter(|w| w.identity() == status.weights);
+    let Some(weights) = weights else {
+        lines.push("The weight file is not the one that the controller has taken, so it is not said how far off this will be.".into());
+        return Foreseen { possible: true, sd_ml: None, flows_by_deg: None, lines };
+    };
+    let sd_ml = foreseen::poured_sd_ml(&weights, site.config.limits, goal_ml);
+    let fill_ml = fill_ml.or(container.least_fill_ml);
+    let flows_by_deg = fill_ml.and_then(|ml| foreseen::flows_by_deg(&weights, ml, container.holds_ml));
+    match sd_ml {
+        Some(sd) if sd > WARNED_SD_ML => {
+            lines.push(format!("This is far off: weigh what is proposed under Learn first. Expected deviation {sd:.1} ml."));
+        }
+        Some(_) => {}
+        None if matches!(weights.estimator, Estimator::Fused { .. }) => {
+            lines.push("The vessel, as the weights know it, cannot give this goal from a usual fill: the pour may end early.".into());
+        }
+        None => lines.push("These weights do not say how far off this pour will be.".into()),
+    }
+    Foreseen { possible: true, sd_ml, flows_by_deg, lines }
+}
+
+/// Orders a pour. Gives its number.
+pub fn pour(site: &Site, goal_ml: f32, fill_ml: Option<f64>) -> Result<u64, String> {
+    let foreseen = foresee(site, goal_ml, fill_ml);
+    if !foreseen.possible {
+        return Err(foreseen.lines.join(" "));
+    }
+    take_back_if_it_waits(site)?;
+    order(site, Request::Pour { goal_ml, flows_by_deg: foreseen.flows_by_deg })
+}
+
+/// Orders the curve of eq. (1). Gives its number.
+pub fn record(site: &Site, lambda_deg: f32, gamma_per_s2: f32) -> Result<u64, String> {
+    let curve = Curve::from_upright(lambda_deg, gamma_per_s2);
+    if !curve.beta_s.is_finite() || lambda_deg <= 0.0 || gamma_per_s2 <= 0.0 {
+        return Err("The curve's height and width must be above 0: take what is proposed.".into());
+    }
+    take_back_if_it_waits(site)?;
+    order(site, Request::Record(curve))
+}
+
+fn order(site: &Site, request: Request) -> Result<u64, String> {
+    match site.cell.ask(request)? {
+        Reply::Started { episode } => Ok(episode),
+        Reply::Refused { reason } => Err(reason),
+        _ => Err("the controller is another version of Decant: run the same build on both sides".into()),
+    }
+}
+
+/// Takes the robot back after a person had it, and waits until it is connected.
+pub fn resume(site: &Site) -> Result<(), String> {
+    match site.cell.ask(Request::Resume)? {
+        Reply::Resuming => {}
+        Reply::Refused { reason } => return Err(reason),
+        _ => return Err("the controller is another version of Decant: run the same build on both sides".into()),
+    }
+    let asked = Instant::now();
+    loop {
+        std::thread::sleep(BEAT);
+        let live = site.cell.live();
+        let fresh = asked.elapsed() > FRESH;
+        let robot = live.status.as_ref().map(|s| s.robot);
+        let hindrance = live.status.as_ref().map_or_else(|| live.no_status.clone(), |s| s.hindrance.clone());
+        match live.phase() {
+            Some(phase) if phase != Phase::NoRobot => return Ok(()),
+            _ if fresh && robot == Some(RobotLink::WaitsForOperator) => return Err(hindrance),
+            _ if asked.elapsed() > CONNECTED => return Err(hindrance),
+            _ => {}
+        }
+    }
+}
+
+fn take_back_if_it_waits(site: &Site) -> Result<(), String> {
+    let waits = {
+        let live = site.cell.live();
+        live.phase() == Some(Phase::NoRobot) && live.status.as_ref().is_some_and(|s| s.robot == RobotLink::WaitsForOperator)
+    };
+    if waits { resume(site) } else { Ok(()) }
+}
+
+/// Writes the scale's reading into an episode.
+pub fn weigh(site: &Site, name: &str, grams: f64) -> Result<Value, String> {
+    let path = site.history.path(name)?;
+    let before = set_weight(&path, grams).map_err(|e| e.to_string())?;
+    Ok(json!({ "file": name, "weight_g": grams, "before_g": before }))
+}

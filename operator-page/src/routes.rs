@@ -1,0 +1,213 @@
+//! Which request gets which answer.
+//!
+//! The page's answering threads run it. GET looks, POST changes; whatever starts something needs the say. It allocates; every failure is an
+//! answer with one line.
+
+use serde::Deserialize;
+use serde_json::{Value, json};
+use shared::messages::Doubt;
+use web::{Answer, Request};
+
+use crate::orders;
+use crate::site::Site;
+
+/// Who sends a request that changes something.
+#[derive(Deserialize)]
+struct Who {
+    id: String,
+    #[serde(default)]
+    name: String,
+}
+
+/// What a page orders; each path takes some of it.
+#[derive(Default, Deserialize)]
+#[serde(default)]
+struct Order {
+    goal_ml: f32,
+    fill_ml: Option<f64>,
+    hold: bool,
+    holding: bool,
+    lambda_deg: f32,
+    gamma_per_s2: f32,
+    file: String,
+    files: Vec<String>,
+    grams: Option<f64>,
+    holds_ml: Option<f64>,
+    last: Option<usize>,
+    accept: Vec<String>,
+    leave_out: Vec<String>,
+    what: String,
+    seconds: u64,
+    corner: Value,
+}
+
+/// The formats of `feature-worker episodes export`.
+const FORMATS: [&str; 4] = ["csv", "images", "video", "lerobot"];
+
+/// The answer to `request`.
+pub fn answer(site: &Site, request: &Request) -> Answer {
+    if request.post { post(site, request) } else { get(site, request) }
+}
+
+fn get(site: &Site, request: &Request) -> Answer {
+    let file = request.parameter("file").unwrap_or_default();
+    match request.path.as_str() {
+        "/" => Answer::html(include_str!("../page/index.html")),
+        "/page.css" => Answer::bytes("text/css", include_str!("../page/page.css")),
+        "/page.js" => Answer::bytes("text/javascript", include_str!("../page/page.js")),
+        "/plot.js" => Answer::bytes("text/javascript", include_str!("../page/plot.js")),
+        "/live.js" => Answer::bytes("text/javascript", include_str!("../page/live.js")),
+        "/pour.js" => Answer::bytes("text/javascript", include_str!("../page/pour.js")),
+        "/learn.js" => Answer::bytes("text/javascript", include_str!("../page/learn.js")),
+        "/calibrate.js" => Answer::bytes("text/javascript", include_str!("../page/calibrate.js")),
+        "/history.js" => Answer::bytes("text/javascript", include_str!("../page/history.js")),
+        "/icon.svg" => Answer::bytes("image/svg+xml", include_str!("../page/icon.svg")),
+        "/events" => site.events.stream(),
+        "/picture.jpg" => picture(site),
+        "/api/about" => Answer::json(&site.about()),
+        "/api/minute" => Answer::json(&site.minute()),
+        "/api/episodes" => Answer::json(&site.history.table()),
+        "/api/plan" => Answer::json(&site.jobs.plan()),
+        "/api/rows" => line(site.history.rows(&file)),
+        "/api/frame" => {
+            let sequence = request.parameter("sequence").and_then(|n| n.parse().ok()).unwrap_or(0);
+            match site.history.picture(&file, sequence) {
+                Ok(bytes) if bytes.starts_with(b"\x89PNG") => Answer::bytes("image/png", bytes),
+                Ok(bytes) => Answer::jpeg(bytes),
+                Err(e) => Answer::fault(404, e),
+            }
+        }
+        "/api/calibration" => Answer::json(&site.calibration.about()),
+        "/api/calibration.jpg" => site.calibration.picture().map_or_else(|e| Answer::fault(404, e), Answer::jpeg),
+        "/api/mcap" => site.history.open_file(&file).map_or_else(|e| Answer::fault(404, e), |open| Answer::file(open, &file)),
+        "/api/csv" => site.history.csv(&file).map_or_else(
+            |e| Answer::fault(404, e),
+            |text| Answer::bytes("text/csv", text).header("content-disposition", "attachment; filename=\"episode.csv\""),
+        ),
+        _ => Answer::not_here(),
+    }
+}
+
+fn line(result: Result<Value, String>) -> Answer {
+    result.map_or_else(|e| Answer::fault(409, e), |value| Answer::json(&value))
+}
+
+/// The newest picture, with what the worker measured in it as a header.
+fn picture(site: &Site) -> Answer {
+    match site.cell.look() {
+        Err(e) => Answer::fault(503, e),
+        Ok(picture) => {
+            let about = json!({
+                "sequence": picture.sequence, "size_px": [picture.size_px.0, picture.size_px.1],
+                "measured": picture.measured.map(|m| json!({ "area_px2": m.area_px2, "confidence": m.confidence,
+                    "doubt": Doubt::from_code(m.doubt).words(), "triangle_px": m.triangle_px })),
+            });
+            Answer::jpeg(picture.jpeg.clone()).header("x-frame", &about.to_string())
+        }
+    }
+}
+
+fn post(site: &Site, request: &Request) -> Answer {
+    let path = request.path.as_str();
+    if path == "/api/stop" {
+        return stop(site);
+    }
+    let (who, order) = match request.json::<Who>().and_then(|who| request.json::<Order>().map(|order| (who, order))) {
+        Ok(both) => both,
+        Err(e) => return Answer::fault(400, e),
+    };
+    let from = request.peer.ip().to_canonical().to_string();
+    match path {
+        "/api/here" => {
+            let mut say = site.say();
+            say.here(&who.id, order.holding);
+            return Answer::json(&json!({ "mine": say.is(&who.id) }));
+        }
+        "/api/say" => {
+            site.say().take(&who.id, &who.name, &from);
+            return Answer::json(&json!({ "mine": true }));
+        }
+        "/api/leave" => {
+            site.say().leave(&who.id);
+            return Answer::json(&json!({ "mine": false }));
+        }
+        "/api/foresee" => return Answer::json(&orders::foresee(site, order.goal_ml, order.fill_ml).json()),
+        _ => {}
+    }
+    if let Err(e) = site.say().act(&who.id, &who.name, &from) {
+        return Answer::fault(409, e);
+    }
+    line(act(site, path, order))
+}
+
+/// Stops the motion. Whoever asks needs no say.
+pub fn stop(site: &Site) -> Answer {
+    line(site.stopper.stop().map(|words| json!({ "words": words })))
+}
+
+/// What needs the say.
+fn act(site: &Site, path: &str, order: Order) -> Result<Value, String> {
+    match path {
+        "/api/pour" => {
+            let episode = orders::pour(site, order.goal_ml, order.fill_ml)?;
+            if order.hold {
+                site.hold(episode);
+            }
+            Ok(json!({ "episode": episode }))
+        }
+        "/api/record" => orders::record(site, order.lambda_deg, order.gamma_per_s2).map(|episode| json!({ "episode": episode })),
+        "/api/resume" => orders::resume(site).map(|()| json!({ "words": "the robot is connected" })),
+        "/api/weigh" => orders::weigh(site, &order.file, order.grams.ok_or("give the scale's reading in g")?),
+        "/api/plan" => {
+            let (directory, most) = (site.history.directory(), site.config.controller.goal_max_ml);
+            site.jobs.start_plan(site.history.weighed(None), directory, &site.file, order.holds_ml, most)?;
+            Ok(site.jobs.about())
+        }
+        "/api/learn" => {
+            let files = site.history.weighed(order.last);
+            let (offer, config) = (site.shelf.offer(), &site.file);
+            site.jobs.start_learning(&files, order.accept, order.leave_out, &offer, config)?;
+            Ok(site.jobs.about())
+        }
+        "/api/cancel" => {
+            site.jobs.cancel();
+            Ok(site.jobs.about())
+        }
+        "/api/weights" => match order.what.as_str() {
+            "accept" => site.shelf.accept().map(|identity| json!({ "identity": identity })),
+            "back" => site.shelf.back().map(|identity| json!({ "identity": identity })),
+            "decline" => site.shelf.decline().map(|()| json!({})),
+            _ => Err("the page asks for what is not known: load it again".into()),
+        },
+        "/api/calibrate" => calibrate(site, &order),
+        "/api/export" => export(site, &order),
+        _ => Err("there is no such page".into()),
+    }
+}
+
+/// One step of a calibration.
+fn calibrate(site: &Site, order: &Order) -> Result<Value, String> {
+    match order.what.as_str() {
+        "colour" | "clear" | "as-configured" => {
+            site.calibration.start(&site.file, order.seconds, &order.what)?;
+            Ok(json!({ "words": "watching" }))
+        }
+        "corner" => site.calibration.order("/corner", &order.corner.to_string()).map(|words| json!({ "words": words })),
+        "write" => site.calibration.order("/write", "{}").map(|words| json!({ "words": words })),
+        "cancel" => {
+            site.calibration.cancel();
+            Ok(json!({ "words": "cancelled" }))
+        }
+        _ => Err("the page asks for what is not known: load it again".into()),
+    }
+}
+
+/// Exports episodes in the background.
+fn export(site: &Site, order: &Order) -> Result<Value, String> {
+    let kind = FORMATS.into_iter().find(|f| *f == order.what).ok_or("choose a format")?;
+    let files = order.files.iter().map(|name| site.history.path(name)).collect::<Result<Vec<_>, _>>()?;
+    let seconds = std::time::SystemTime::now().duration_since(std::time::UNIX_EPOCH).map_or(0, |d| d.as_secs());
+    let to = site.history.directory().join("exports").join(format!("{kind}-{seconds}"));
+    site.jobs.start_export(&files, kind, to)?;
+    Ok(site.jobs.about())
+}

@@ -1,0 +1,165 @@
+//! A real browser for tests: headless Chromium, by chromedriver and the WebDriver protocol (W3C).
+//!
+//! Only tests use it, in their own threads: it allocates and waits, and it panics when the browser does not do what it is told. Without
+//! chromedriver there is no browser, and a test says so.
+
+use std::io::{BufRead as _, BufReader, Read as _, Write as _};
+use std::net::TcpStream;
+use std::path::Path;
+use std::process::{Child, Command, Stdio};
+use std::time::{Duration, Instant};
+
+use serde_json::{Value, json};
+
+/// The key under which WebDriver passes elements. Source: WebDriver, section "Elements".
+const ELEMENT: &str = "element-6066-11e4-a52e-4f735466cecf";
+
+/// A browser with one window.
+pub struct Browser {
+    driver: Child,
+    port: u16,
+    session: String,
+}
+
+impl Browser {
+    /// Opens a window of `width` by `height` px; `None`, with a printed line, where there is no chromedriver.
+    pub fn open(width: u32, height: u32) -> Option<Self> {
+        let mut command = Command::new("chromedriver");
+        command.arg("--port=0").stdin(Stdio::null()).stdout(Stdio::piped()).stderr(Stdio::null());
+        let Ok(mut driver) = command.spawn() else {
+            println!("not run: there is no chromedriver (scripts/install chromium-driver)");
+            return None;
+        };
+        let lines = BufReader::new(driver.stdout.take().expect("piped")).lines();
+        let port = lines.map_while(Result::ok).find_map(|l| l.split_once(" on port ")?.1.trim_end_matches('.').parse().ok());
+        let mut this = Self { driver, port: port.expect("chromedriver says its port"), session: String::new() };
+        let arguments = [
+            "--headless=new".into(),
+            "--no-sandbox".into(),
+            "--disable-gpu".into(),
+            "--disable-dev-shm-usage".into(),
+            format!("--window-size={width},{height}"),
+        ];
+        let wanted = json!({ "browserName": "chrome", "goog:chromeOptions": { "args": arguments } });
+        let session = this.call("POST", "/session", &json!({ "capabilities": { "alwaysMatch": wanted } }));
+        this.session = session["sessionId"].as_str().expect("a session").into();
+        Some(this)
+    }
+
+    /// One request to chromedriver. Gives its value, or panics with its error.
+    fn call(&self, method: &str, path: &str, body: &Value) -> Value {
+        let mut stream = TcpStream::connect(("127.0.0.1", self.port)).expect("chromedriver listens");
+        stream.set_read_timeout(Some(Duration::from_secs(60))).expect("a socket");
+        let body = if method == "POST" { body.to_string() } else { String::new() };
+        write!(
+            stream,
+            "{method} {path} HTTP/1.1\r\nHost: 127.0.0.1:{}\r\nContent-Type: application/json\r\nContent-Length: {}\r\nConnection: close\r\n\r\n{body}",
+            self.port,
+            body.len()
+        )
+        .expect("it reads");
+        let mut answer = Vec::new();
+        // Chromedriver may keep the connection open; what counts is that the answer is whole.
+        let _ = stream.read_to_end(&mut answer);
+        let text = String::from_utf8_lossy(&answer);
+        let value = text.split_once("\r\n\r\n").map(|(_, body)| serde_json::from_str::<Value>(body).expect("JSON")).expect("an answer");
+        assert!(value["value"]["error"].is_null(), "{method} {path}: {}", value["value"]["message"]);
+        value["value"].clone()
+    }
+
+    fn post(&self, path: &str, body: &Value) -> Value {
+        self.call("POST", &format!("/session/{}{path}", self.session), body)
+    }
+
+    /// Opens an address.
+    pub fn go(&self, url: &str) {
+        self.post("/url", &json!({ "url": url }));
+    }
+
+    /// Runs a script in the page and gives what it returns; promises are waited for.
+    pub fn run(&self, script: &str) -> Value {
+        self.post("/execute/sync", &json!({ "script": script, "args": [] }))
+    }
+
+    /// Waits until a script returns true, and panics with the page's text if it does not.
+    pub fn wait(&self, what: &str, within: Duration, script: &str) {
+        let until = Instant::now() + within;
+        while Instant::now() < until {
+            if self.run(script) == Value::Bool(true) {
+                return;
+            }
+            std::thread::sleep(Duration::from_millis(50));
+        }
+        panic!("{what} did not happen; the page says:\n{}", self.run("return document.body.innerText"));
+    }
+
+    /// The text of an element.
+    pub fn text(&self, css: &str) -> String {
+        self.run(&format!("return document.querySelector({css:?})?.innerText ?? ''")).as_str().unwrap_or_default().into()
+    }
+
+    fn find(&self, css: &str) -> String {
+        let found = self.post("/element", &json!({ "using": "css selector", "value": css }));
+        found[ELEMENT].as_str().expect("an element").into()
+    }
+
+    /// Clicks an element as a person does: it must be there, visible, and not covered.
+    pub fn click(&self, css: &str) {
+        self.post(&format!("/element/{}/click", self.find(css)), &json!({}));
+    }
+
+    /// Empties a field and types into it.
+    pub fn fill(&self, css: &str, text: &str) {
+        let field = self.find(css);
+        self.post(&format!("/element/{field}/clear"), &json!({}));
+        self.post(&format!("/element/{field}/value"), &json!({ "text": text }));
+    }
+
+    /// Presses and lets go of keys, one after the other, wherever the focus is.
+    pub fn press(&self, keys: &[&str]) {
+        let actions: Vec<Value> =
+            keys.iter().flat_map(|k| [json!({ "type": "keyDown", "value": k }), json!({ "type": "keyUp", "value": k })]).collect();
+        self.post("/actions", &json!({ "actions": [{ "type": "key", "id": "keyboard", "actions": actions }] }));
+    }
+
+    /// Sets the window's size, px.
+    pub fn resize(&self, width: u32, height: u32) {
+        self.post("/window/rect", &json!({ "width": width, "height": height }));
+    }
+
+    /// Writes a picture of the window.
+    pub fn screenshot(&self, file: &Path) {
+        let text = self.call("GET", &format!("/session/{}/screenshot", self.session), &Value::Null);
+        std::fs::create_dir_all(file.parent().expect("a directory")).expect("writable");
+        std::fs::write(file, decoded(text.as_str().expect("text"))).expect("writable");
+    }
+}
+
+impl Drop for Browser {
+    fn drop(&mut self) {
+        if !self.session.is_empty() && !std::thread::panicking() {
+            self.call("DELETE", &format!("/session/{}", self.session), &Value::Null);
+        }
+        // Chromedriver ends its browser when it is asked to end.
+        let pid = rustix::process::Pid::from_child(&self.driver);
+        let _ = rustix::process::kill_process(pid, rustix::process::Signal::TERM);
+        let _ = self.driver.wait();
+    }
+}
+
+/// The bytes of a text in base 64 (RFC 4648).
+fn decoded(text: &str) -> Vec<u8> {
+    const LETTERS: &[u8; 64] = b"ABCDEFGHIJKLMNOPQRSTUVWXYZabcdefghijklmnopqrstuvwxyz0123456789+/";
+    let (mut bytes, mut held, mut bits) = (Vec::new(), 0u32, 0);
+    for letter in text.bytes().filter(|b| *b != b'=') {
+        let value = LETTERS.iter().position(|l| *l == letter).expect("base 64");
+        held = held << 6 | value as u32;
+        bits += 6;
+        if bits >= 8 {
+            bits -= 8;
+            bytes.push((held >> bits) as u8);
+            held &= (1 << bits) - 1;
+        }
+    }
+    bytes
+}

@@ -1,0 +1,101 @@
+//! The page for everybody: by keyboard alone, with a screen reader's names, on a phone, at 200 % zoom, in dark and light.
+
+use tests::browser::Browser;
+use tests::{CellUnderTest, steady_weights};
+
+use super::{LIVE, Page, SOON, TILT_OUT, picture, says};
+
+/// Key of the tabulator in WebDriver.
+const TAB: &str = "\u{E004}";
+/// Key Enter in WebDriver.
+const ENTER: &str = "\u{E007}";
+/// Arrow to the right in WebDriver.
+const RIGHT: &str = "\u{E014}";
+
+/// Controls and pictures without a name for a screen reader, and headings that skip a level; empty if all is well.
+const NAMELESS: &str = "
+    const name = e => e.getAttribute('aria-label') || (e.labels && [...e.labels].map(l => l.textContent).join('').trim()) || e.alt || e.textContent.trim();
+    const bad = [...document.querySelectorAll('button, input, select, a, canvas, img, [role=tabpanel], [role=application]')]
+        .filter(e => !name(e) && !e.getAttribute('aria-labelledby')).map(e => e.outerHTML.slice(0, 80));
+    const ids = [...document.querySelectorAll('[id]')].map(e => e.id);
+    return bad.concat(ids.filter((id, k) => ids.indexOf(id) !== k)).join('; ')";
+
+/// Pairs of text and ground that are closer than the contrast of WCAG 2.2 AA (4.5); empty if all is well.
+const FAINT: &str = "
+    const paint = v => { const d = document.createElement('i'); d.style.color = `var(${v})`; document.body.append(d);
+        const c = getComputedStyle(d).color.match(/[0-9.]+/g).map(Number); d.remove(); return c; };
+    const light = c => { const [r, g, b] = c.slice(0, 3).map(v => { v /= 255; return v <= 0.04045 ? v / 12.92 : ((v + 0.055) / 1.055) ** 2.4; }); return 0.2126 * r + 0.7152 * g + 0.0722 * b; };
+    const ratio = (a, b) => { const [x, y] = [light(paint(a)), light(paint(b))]; return (Math.max(x, y) + 0.05) / (Math.min(x, y) + 0.05); };
+    const pairs = ['--ink', '--soft', '--good', '--warn', '--bad'].flatMap(t => [[t, '--paper'], [t, '--card']]).concat([['--on-accent', '--accent'], ['--on-stop', '--stop']]);
+    return pairs.map(([t, g]) => [t, g, ratio(t, g)]).filter(p => p[2] < 4.5).map(p => `${p[0]} on ${p[1]}: ${p[2].toFixed(2)}`).join('; ')";
+
+/// Whether nothing is wider than the window, and Stop is in the window.
+const FITS: &str = "const s = document.getElementById('stop').getBoundingClientRect();
+    return document.documentElement.scrollWidth <= innerWidth && s.bottom <= innerHeight && s.top >= 0 && s.right <= innerWidth";
+
+/// Protects people who do not use a mouse, do not see, or hold a phone: every control has a name and enough contrast, nothing leaves the window at a
+/// phone's size or at 200 % zoom, Stop is always in it, and a pour is ordered and stopped by keys alone.
+#[test]
+fn everybody_can_use_it() {
+    let Some(browser) = Browser::open(1280, 1000) else { return };
+    let cell = CellUnderTest::start(|_| {});
+    cell.take_weights(&steady_weights(TILT_OUT));
+    cell.json("simulator", &["operator", "fill", "300", "--json"]);
+    cell.wait_idle();
+    let page = Page::open(&cell);
+    browser.go(&page.url());
+    browser.wait("the live picture", SOON, LIVE);
+    says(&browser, "Ready to pour");
+
+    // A phone, a phone held across, and what 200 % zoom leaves of 1280 x 1000 px.
+    for (width, height) in [(390, 844), (844, 390), (640, 500), (1280, 1000)] {
+        browser.resize(width, height);
+        for tab in ["learn", "history", "calibrate", "pour"] {
+            browser.run(&format!("document.getElementById('tab-{tab}').click(); scrollTo(0, 0)"));
+            for theme in ["light", "dark"] {
+                browser.run(&format!("document.getElementById('theme').value = '{theme}'; theme()"));
+                assert_eq!(browser.run(FAINT), "", "{theme}");
+                if theme == "dark" || width == 1280 {
+                    browser.screenshot(&picture(&format!("{tab}-{width}-{theme}")));
+                }
+            }
+            assert_eq!(browser.run(FITS), true, "{tab} at {width} x {height}");
+            assert_eq!(browser.run(NAMELESS), "", "{tab}");
+        }
+    }
+
+    // From the first tab to the goal by the tabulator, then by Enter alone.
+    browser.run("document.getElementById('tab-pour').focus()");
+    browser.press(&[RIGHT]);
+    assert_eq!(browser.run("return document.activeElement.id"), "tab-learn");
+    browser.run("document.getElementById('tab-pour').click(); document.getElementById('tab-pour').focus()");
+    for _ in 0..4 {
+        if browser.run("return document.activeElement.id") == "goal" {
+            break;
+        }
+        browser.press(&[TAB]);
+    }
+    assert_eq!(browser.run("return document.activeElement.id"), "goal");
+    browser.press(&["1", "0", "0", ENTER]);
+    browser.wait("the focus on the button that pours", SOON, "return document.activeElement.id === 'go'");
+    // The space bar does not press the button that has the focus: nothing starts.
+    browser.press(&[" "]);
+    browser.wait("the answer", SOON, "return document.getElementById('stop-said').textContent.startsWith('Stop: ')");
+    assert_eq!(cell.status().expect("running")["outcomes"].as_array().map(Vec::len), Some(0));
+    browser.press(&[ENTER]);
+    says(&browser, "Pouring 100 ml");
+    browser.press(&[" "]);
+    cell.wait("the end", SOON, |s| s["phase"] == "idle" && s["outcomes"][0]["reason"] == "aborted");
+
+    // Hold to pour: it goes on while Enter is held, and ends when the page is lost.
+    browser.run("document.getElementById('hold').click()");
+    browser.fill("#goal", "90");
+    browser.click("#foresee");
+    browser.wait("the focus on the button that pours", SOON, "return document.activeElement.id === 'go'");
+    browser.run("document.getElementById('go').dispatchEvent(new KeyboardEvent('keydown', { key: 'Enter', bubbles: true }))");
+    says(&browser, "Pouring 90 ml");
+    std::thread::sleep(std::time::Duration::from_secs(1));
+    assert_eq!(cell.status().expect("running")["phase"], "pouring", "it is held");
+    browser.go("about:blank");
+    cell.wait("the end", SOON, |s| s["phase"] == "idle" && s["outcomes"][1]["reason"] == "aborted");
+}

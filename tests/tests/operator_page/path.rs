@@ -1,0 +1,124 @@
+//! The whole path of a new cell: fill, record, weigh, learn, pour, weigh, learn again, and back to the weights from before.
+
+use std::time::Duration;
+
+use tests::CellUnderTest;
+use tests::browser::Browser;
+
+use super::{LIVE, Page, SOON, picture, says};
+
+/// A training takes some seconds alone, and much longer beside others.
+const TRAINED: Duration = Duration::from_secs(240);
+
+/// Types the scale's reading into the result, and gives it.
+fn weigh(cell: &CellUnderTest, browser: &Browser) -> f64 {
+    browser.wait(
+        "the result",
+        Duration::from_secs(60),
+        "return !!document.querySelector('#result-body .grams') && !document.getElementById('result').hidden",
+    );
+    let grams = cell.json("simulator", &["operator", "scale", "--json"])["weight_g"].as_f64().expect("a weight");
+    browser.fill("#result-body .grams", &grams.to_string());
+    browser.click("#result-body button[type=submit]");
+    browser.wait("the weight", SOON, "return document.getElementById('result-body').textContent.includes('Weighed')");
+    grams
+}
+
+/// Learns, and takes the offer into use.
+fn learn(browser: &Browser) {
+    browser.click("#tab-learn");
+    browser.wait("the button", SOON, "return !document.getElementById('start-learning').disabled");
+    browser.click("#start-learning");
+    browser.wait("the training", SOON, "return !!document.querySelector('#job progress')");
+    browser.screenshot(&picture("learning"));
+    let over = "return !!document.querySelector('#compare .accept') || /failed|judge/.test(document.getElementById('job').textContent)";
+    browser.wait("the offer", TRAINED, over);
+    if browser.text("#job").contains("judge") {
+        browser.run("document.querySelectorAll('#doubts .proposal button').forEach(b => b.click())");
+        browser.click("#learn-judged");
+        browser.wait("the offer", TRAINED, "return !!document.querySelector('#compare .accept')");
+    }
+    browser.screenshot(&picture("offered"));
+    browser.click("#compare .accept");
+    browser.wait("the new weights", SOON, "return document.getElementById('said').textContent.includes('in use')");
+}
+
+/// Protects an operator's first hour with a new cell, all of it in the browser: two curves as they are proposed, their weights, a training, a
+/// pour that is foreseen, confirmed, watched and weighed, a training from all three, and the way back.
+#[test]
+fn a_new_cell_learns_to_pour_in_the_browser() {
+    let Some(browser) = Browser::open(1280, 1000) else { return };
+    let cell = CellUnderTest::start(|config| {
+        config["container"].as_table_mut().expect("a table").insert("holds_ml".into(), toml::Value::Float(520.0));
+    });
+    let page = Page::open(&cell);
+    browser.go(&page.url());
+    browser.wait("the live picture", SOON, LIVE);
+    says(&browser, "Ready to record, but not to pour");
+    browser.screenshot(&picture("no-weights"));
+
+    let mut weights = Vec::new();
+    for curve in 0..2 {
+        browser.click("#tab-learn");
+        browser.wait("the button", SOON, "return !document.getElementById('make-plan').disabled");
+        browser.run("document.getElementById('plan').replaceChildren()");
+        browser.click("#make-plan");
+        browser.wait("a proposal", Duration::from_secs(60), "return !!document.querySelector('#plan .primary.record')");
+        browser.screenshot(&picture(if curve == 0 { "first-proposal" } else { "second-proposal" }));
+        let words = browser.text("#plan .proposal b");
+        let fill = words.split(' ').nth(2).expect("Fill in N ml").to_string();
+        cell.json("simulator", &["operator", "fill", &fill, "--json"]);
+        cell.wait_idle();
+        browser.click("#plan .primary.record");
+        says(&browser, "Recording a curve");
+        weights.push(weigh(&cell, &browser));
+    }
+    assert!(weights.iter().all(|g| *g > 5.0), "something flowed: {weights:?}");
+    learn(&browser);
+    cell.wait("the weights", SOON, |s| s["weights"] != "");
+
+    cell.json("simulator", &["operator", "fill", "350", "--json"]);
+    cell.wait_idle();
+    browser.click("#tab-pour");
+    says(&browser, "Ready to pour");
+    browser.fill("#goal", "500");
+    browser.click("#foresee");
+    browser.wait("the refusal", SOON, "return document.getElementById('said').textContent.includes('at most 300')");
+    browser.fill("#goal", "75");
+    browser.click("#foresee");
+    browser.wait("what is foreseen", SOON, "return document.getElementById('foreseen').textContent.includes('one standard deviation')");
+    browser.screenshot(&picture("foreseen"));
+    browser.click("#go");
+    says(&browser, "Pouring 75 ml");
+    browser.wait("a stream", Duration::from_secs(30), "return points[points.length - 1][POURED] > 25");
+    browser.screenshot(&picture("pouring"));
+    let grams = weigh(&cell, &browser);
+    browser.screenshot(&picture("weighed"));
+    println!("goal 75 ml, {grams} g; the page says: {}", browser.text("#result-body").replace('\n', " "));
+    assert!(browser.text("#result-body").contains("an error of"));
+
+    let before = cell.status().expect("running")["weights"].clone();
+    learn(&browser);
+    let after = cell.wait("the new weights", SOON, |s| s["weights"] != before)["weights"].clone();
+    browser.wait("the way back", SOON, "return !!document.querySelector('#compare .back')");
+    browser.screenshot(&picture("choose-weights"));
+    browser.click("#compare .back");
+    cell.wait("the weights from before", SOON, |s| s["weights"] == before && s["weights"] != after);
+
+    browser.click("#tab-history");
+    browser.wait("three episodes", SOON, "return document.querySelectorAll('#table tbody tr').length === 3");
+    browser.run("document.getElementById('kind').value = 'pour'; document.getElementById('kind').onchange()");
+    browser.wait("one pour", SOON, "return document.querySelectorAll('#table tbody tr').length === 1");
+    browser.click("#table .look");
+    let loaded = "const i = document.getElementById('episode-picture'); return i.complete && i.naturalWidth === 640";
+    browser.wait("the episode's picture", SOON, loaded);
+    browser.run("document.getElementById('table-title').scrollIntoView()");
+    browser.screenshot(&picture("history"));
+    browser.run("document.getElementById('episode').scrollIntoView()");
+    browser.screenshot(&picture("episode"));
+    for format in ["csv", "lerobot"] {
+        browser.click(&format!("#exports [data-format={format}]"));
+        let written = format!("return document.getElementById('export-said').textContent.includes('exports/{format}')");
+        browser.wait("the export", Duration::from_secs(60), &written);
+    }
+}
