@@ -39,9 +39,8 @@ const STALLED_FRAMES: u32 = 90;
 const PROGRESS_DEG: f32 = 1.0;
 /// Poured volume that counts as progress, ml. Chosen by hand; no measurement is recorded.
 const PROGRESS_ML: f32 = 0.5;
-/// A pour that its agent has ended, and that is short of the goal by more than so many ml and more than this share of it, has lost its stream:
-/// what it took for one was none, or has ceased. No pour that was done was shorter among the 3,000 fixed seeds of docs/SWARM.md, but for one with
-/// a false frame.
+/// A pour that is short of its goal by more than so many ml and more than this share of it has lost its stream. No pour that was done was shorter
+/// among the 3,000 fixed seeds of docs/SWARM.md, but for one with a false frame.
 const SHORT: (f32, f32) = (8.0, 0.08);
 /// If less than this is still to come over the lip, ml, it counts as nothing: this is about one drop of water.
 const NOTHING_ML: f64 = 0.05;
@@ -424,8 +423,7 @@ mod tests {
         }
     }
 
-    /// Protects the operator from a pour of nothing that is called done: an agent that came upright far short of its goal, after a frame that
-    /// looked like a stream, has lost its stream. A little short is done, and another reason stays.
+    /// Protects the operator from a pour of nothing that is called done. A little short is done, and another reason stays.
     #[test]
     fn far_short_of_the_goal_is_not_done() {
         let settings = Settings::new(&shared::config::Config::parse(include_str!("../../../config/sim.toml"), "sim.toml").unwrap());
