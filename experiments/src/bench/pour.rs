@@ -7,6 +7,7 @@ use rt_controller::core::{Core, Input, Order, Robot, Settings};
 use serde::Serialize;
 use shared::agent::Agent;
 use shared::control::EndReason;
+use shared::estimator::{Calibration, Hold};
 use shared::limits::{Limiter, Limits};
 use shared::messages::{Feature, LAYOUT_VERSION};
 use trainer::data::TrainingEpisode;
@@ -32,6 +33,8 @@ pub struct PourResult {
     pub true_ml: f64,
     /// What the controller believes to have poured, ml.
     pub believed_ml: f64,
+    /// What the camera's plain sum makes of the same areas, ml, with the weights' own calibration; NaN for a baseline.
+    pub summed_ml: f64,
     /// The standard deviation that it gives with it, ml.
     pub believed_sd_ml: f64,
     /// Time until the pour was over, s.
@@ -54,6 +57,10 @@ impl PourResult {
     /// The part of the error that measurement made, ml.
     pub fn measurement_ml(&self) -> f64 {
         self.true_ml - self.believed_ml
+    }
+    /// What the plain sum would have made of measurement, ml.
+    pub fn sum_ml(&self) -> f64 {
+        self.true_ml - self.summed_ml
     }
     /// The part of the error that control made, ml.
     pub fn control_ml(&self) -> f64 {
@@ -128,28 +135,32 @@ pub struct Asked {
     pub goal_ml: f64,
     /// Tilt by which it must flow, degrees, where somebody has told the fill.
     pub flows_by_deg: Option<f32>,
+    /// The calibration of the camera's own sum, which is then taken beside the estimate.
+    pub calibration: Option<Calibration>,
 }
 
 impl Asked {
     /// This goal, from a fill that nobody has told.
     pub fn new(init_ml: f64, goal_ml: f64) -> Self {
-        Self { init_ml, goal_ml, flows_by_deg: None }
+        Self { init_ml, goal_ml, flows_by_deg: None, calibration: None }
     }
 }
 
 /// Pours the goal with the controller's own core and `agent`. The frames are added to `trace` if there is one.
 pub fn by_core(agent: &Agent, pour: &mut BenchPour, limits: Limits, asked: Asked, mut trace: Option<&mut Trace>) -> PourResult {
-    let Asked { init_ml, goal_ml, flows_by_deg } = asked;
+    let Asked { init_ml, goal_ml, flows_by_deg, calibration } = asked;
     let mut core = Core::new(settings(limits));
     core.exchange(Box::new(agent.clone()));
     let mut alpha_deg = 0.0f32;
     let mut area_px2 = 0.0f32;
     let mut frames = 0u32;
+    let mut hold = Hold::default();
     let mut poured = PourResult {
         init_ml,
         goal_ml,
         true_ml: 0.0,
         believed_ml: 0.0,
+        summed_ml: if calibration.is_some() { 0.0 } else { f64::NAN },
         believed_sd_ml: 0.0,
         seconds: f64::from(MAX_FRAMES) / RATE_HZ,
         frames: 0,
@@ -176,6 +187,10 @@ pub fn by_core(agent: &Agent, pour: &mut BenchPour, limits: Limits, asked: Asked
         let tilt_deg = if frames > 1 { pour.tilt_deg() as f32 } else { alpha_deg };
         let robot = Robot::that_may_move(if tilt_deg.is_nan() { alpha_deg } else { tilt_deg }, now_ns - PERIOD_NS);
         let order = (frames == 2).then_some(Order::Pour { episode: 1, goal_ml: goal_ml as f32, flows_by_deg });
+        if let Some(calibration) = calibration.filter(|_| frames > 2) {
+            let held_px2 = hold.step(Some(area_px2).filter(|a| !a.is_nan()), calibration.hold_above_px2);
+            poured.summed_ml += f64::from(calibration.volume_ml(held_px2, alpha_deg));
+        }
         let output = core.step(&Input { now_ns, features: &[feature], robot, order });
         alpha_deg = output.target_deg.unwrap_or(alpha_deg);
         area_px2 = pour.frame(f64::from(alpha_deg));
@@ -240,6 +255,7 @@ pub fn by_baseline(baseline: &mut dyn Baseline, pour: &mut BenchPour, limits: Li
         goal_ml,
         true_ml: pour.poured_ml(),
         believed_ml: baseline.believed_ml(),
+        summed_ml: f64::NAN,
         believed_sd_ml: 0.0,
         seconds: f64::from(upright_at.unwrap_or(frames)) / RATE_HZ,
         frames,

@@ -198,7 +198,7 @@ impl Ending {
         if !follows {
             self.end_without_robot(EndReason::NotFollowed);
         }
-        // A stream that goes on although the container is brought upright was none before either, so the goal was not reached.
+        // A stream that goes on at an upright container was none before either.
         if let Some(impossible) = self.impossible {
             self.end_without_robot(reason_of(impossible));
         }
@@ -469,7 +469,7 @@ mod tests {
     }
 
     /// Protects a pour whose camera shows nothing: if it is known how much is in the vessel, the pour ends by name soon after the tilt at which
-    /// that would flow, and not at the largest one. Flow that was seen, or an unknown fill, never ends so.
+    /// that would flow, and not at the largest one. Flow that was seen, or an unknown fill, never ends so; a lone flash is no flow.
     #[test]
     fn nothing_flows_where_it_must() {
         let text = include_str!("../../../config/sim.toml");
@@ -489,11 +489,9 @@ mod tests {
         assert_eq!(after(Some(65.0), false, DRY_FRAMES), None);
         assert_eq!(after(Some(60.0), true, DRY_FRAMES), None);
         assert_eq!(after(None, false, DRY_FRAMES), None);
-        // A lone flash is no stream.
         let mut flashed = Ending::of_pour_that_flows_by(Some(60.0));
-        for k in 0..=DRY_FRAMES {
-            let area_px2 = Some(if k == 0 { 100.0 } else { 0.0 });
-            flashed.saw(&SeenFrame { lost: 0, area_px2, flowing: k == 0, alpha_deg: 62.0, alpha_now_deg: 63.0 }, &settings);
+        for area_px2 in std::iter::once(100.0).chain([0.0; DRY_FRAMES as usize]).map(Some) {
+            flashed.saw(&SeenFrame { lost: 0, area_px2, flowing: area_px2 > Some(0.0), alpha_deg: 62.0, alpha_now_deg: 63.0 }, &settings);
         }
         assert_eq!(flashed.due(&moment, &settings), Some(EndReason::NothingFlows));
     }

@@ -60,6 +60,7 @@ fn summaries(summaries: &Value) -> String {
         "ended by mistake",
         "within the deviation",
         "measurement",
+        "plain sum",
         "control",
         "s a pour",
     ];
@@ -82,6 +83,7 @@ fn summaries(summaries: &Value) -> String {
             s["falsely_ended"].to_string(),
             percent("covered"),
             rounded(&s["measurement_ml"], 2),
+            rounded(&s["sum_ml"], 2),
             rounded(&s["control_ml"], 2),
             rounded(&s["seconds"], 1),
         ]);
