@@ -12,7 +12,7 @@ use shared::messages::{Phase, Telemetry};
 use simulator::ur::{Fault, Machine, RobotMode, RuntimeState, SafetyMode};
 
 use crate::commanded::{Commanded, SLACK, SLACK_DEG};
-use crate::noticing::{is_ordinary, leaves_tilted, must_end, reasons, takes_robot};
+use crate::noticing::{is_ordinary, lasts, leaves_tilted, must_end, reasons, takes_robot};
 use crate::what::{EyeFault, What};
 
 /// A container nearer to 0 than this is upright, degrees (`robot.start_tolerance_deg` of config/sim.toml, and half a degree of lag).
@@ -34,6 +34,10 @@ const STATE_REGISTER: usize = 24;
 const RUN_REGISTER: usize = STATE_REGISTER + 2;
 /// How far what a pour that is done says may be from its goal, ml, and as a share of it: the last decision counts drops that still fell.
 const MISSED: (f64, f64) = (8.0, 0.08);
+/// By how many of its own standard deviations it may be farther: it is then said with the number that it may be a pour of the goal or not.
+const MISSED_SDS: f64 = 2.0;
+/// The longest time for which a fault of the robot lasts before somebody ends it, s (faults.rs).
+const LASTS_S: f64 = 9.0;
 /// How long a container may stand tilted after its program has ended by itself, s: one cycle would do, and the arm needs time to stop.
 const LEFT_TILTED_S: f64 = 2.0;
 /// Most frames that are bridged at once: one second (`MAX_BRIDGED` of the controller's core).
@@ -97,6 +101,8 @@ pub struct Checks {
     tilted_since_s: Option<f64>,
     /// Who knows that a person stopped our program, and that nobody asked for the robot since.
     taken: Taken,
+    /// When every fault of the robot that lasts was ended, s.
+    cleared_s: Vec<f64>,
     /// By which share the camera's gain has drifted so far.
     gain_drift: f64,
     run_since_s: f64,
@@ -105,9 +111,16 @@ pub struct Checks {
     features_before: u64,
 }
 
-/// Whether a program of ours is under way on the robot, or paused.
-fn is_at_work(machine: &Machine) -> bool {
-    machine.runtime_state() != RuntimeState::Stopped && machine.robot.outputs.int[STATE_REGISTER] != 0
+/// Whether a stop meets a program of ours. One that is paused is stopped already, and to stop it for good is what the controller asks for; and a
+/// robot that stands behind an open safeguard cannot stop protectively.
+fn stops_ours(what: &What, machine: &Machine) -> bool {
+    let is_ours = machine.runtime_state() != RuntimeState::Stopped && machine.robot.outputs.int[STATE_REGISTER] != 0;
+    is_ours
+        && match what {
+            What::Robot(Fault::ProgramStop) => machine.runtime_state() == RuntimeState::Playing,
+            What::Robot(Fault::ProtectiveStop) => machine.safety_mode() == SafetyMode::Normal,
+            _ => true,
+        }
 }
 
 impl Checks {
@@ -127,6 +140,7 @@ impl Checks {
             lost: 0,
             tilted_since_s: None,
             taken: Taken::default(),
+            cleared_s: Vec::new(),
             gain_drift: 0.0,
             run_since_s: 0.0,
             outcomes: Vec::new(),
@@ -147,7 +161,8 @@ impl Checks {
             What::Pour(_) | What::Record(..) | What::Resume if lives => self.taken = Taken::default(),
             What::ControllerKilled(_) => self.taken.controller = false,
             What::Robot(Fault::Boot) => self.taken.registers = false,
-            what if takes_robot(what) && is_at_work(machine) => {
+            What::Robot(Fault::Clear) => self.cleared_s.push(at_s),
+            what if takes_robot(what) && stops_ours(what, machine) => {
                 self.taken.registers = true;
                 self.taken.controller |= lives && self.phase != Phase::NoRobot;
             }
@@ -313,6 +328,7 @@ impl Checks {
             f.at_s > since_s
                 && matches!(f.phase, Phase::Pouring | Phase::Recording)
                 && must_end(&f.what).is_some_and(|s| at_s > f.at_s + NOTICED_S + s)
+                && !(lasts(&f.what) && self.cleared_s.iter().any(|cleared_s| (f.at_s..f.at_s + NOTICED_S).contains(cleared_s)))
         });
         if let Some(fault) = missed {
             let what = format!("{:?} at {:.2} s has not ended the pour", fault.what, fault.at_s);
@@ -327,7 +343,8 @@ impl Checks {
         let since_s = at_s - f64::from(outcome.seconds) - 6.0;
         let reason = outcome.reason;
         let ordinary = is_ordinary(reason);
-        let named = self.faults.iter().any(|f| f.at_s >= since_s && reasons(&f.what).contains(&reason));
+        let counts = |f: &Injected| f.at_s >= since_s - if lasts(&f.what) { LASTS_S } else { 0.0 };
+        let named = self.faults.iter().any(|f| counts(f) && reasons(&f.what).contains(&reason));
         if !ordinary && !named {
             let faults: Vec<_> = self.faults.iter().filter(|f| f.at_s >= since_s).map(|f| f.what.name()).collect();
             self.violated("reason", at_s, format!("it ended with {reason:?}, and what happened was {faults:?}"));
@@ -357,7 +374,7 @@ impl Checks {
         if !is_near(true_ml, said_ml, (SAID.0 * sd_ml + SAID.1, hidden)) {
             self.violated("said", at_s, format!("done, and it says {said_ml:.1} +- {sd_ml:.1} ml where {true_ml:.1} left"));
         }
-        if !is_near(said_ml, goal_ml, MISSED) {
+        if !is_near(said_ml, goal_ml, (MISSED.0 + MISSED_SDS * sd_ml, MISSED.1)) {
             self.violated("done", at_s, format!("done, and it says {said_ml:.1} ml of {goal_ml:.1}"));
         }
     }

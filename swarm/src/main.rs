@@ -173,6 +173,9 @@ fn one(args: &Args, drawn: &Plan, config: &Config) -> Result<bool, String> {
         plan = plan.keep(&fewest);
     }
     let shown = run::run(&plan, &trained, config, true);
+    let robot = if plan.series == Series::ESeries { "e-Series" } else { "CB3" };
+    let (vessel, fill_ml, lag_ms) = (VESSELS[plan.vessel].name, plan.fill_ml, 1000.0 * plan.lag_s);
+    print(&format!("{robot} that lags by {lag_ms:.0} ms, {vessel}, {fill_ml:.0} ml"));
     for item in &plan.items {
         let number = item.fault.map_or_else(String::new, |n| format!("fault {n} ({}): ", KINDS[plan.faults[n]].name));
         print(&format!("{:8.3} s  plan: {number}{:?}", item.at_ms as f64 / 1000.0, item.what));

@@ -20,6 +20,8 @@ pub fn must_end(what: &What) -> Option<f64> {
         What::Suspended(ms) | What::Overrun(ms) if *ms > 200 => Some(f64::from(*ms) / 1000.0),
         What::ControllerKilled(ms) => Some(f64::from(*ms) / 1000.0),
         What::Eye(EyeFault::Killed(ms)) => Some(f64::from(*ms) / 1000.0),
+        // So long that one of its measurements comes in spite of lost frames.
+        What::Eye(EyeFault::Two(ms)) if *ms > 600 => Some(0.5),
         What::Eye(EyeFault::Hung(ms)) if *ms > 400 => Some(0.0),
         What::Eye(EyeFault::Loss(frames) | EyeFault::Freeze(frames)) if *frames > 10 => Some(0.0),
         _ => None,
@@ -49,6 +51,12 @@ pub fn reasons(what: &What) -> &'static [EndReason] {
         What::ControllerKilled(_) => &[RobotLost],
         _ => &[],
     }
+}
+
+/// Whether the fault is one of the robot that lasts, until it is over or `Clear` ends it.
+pub fn lasts(what: &What) -> bool {
+    use Fault::*;
+    matches!(what, What::Robot(Stall(_) | Freeze(_) | SlowReader(_) | TimeScaling(_) | SpeedSlider(_) | HeldBack(_) | JointSpeedLimit(_)))
 }
 
 /// Whether a person takes the robot with it, or stops it, so that it must not be taken back unasked.

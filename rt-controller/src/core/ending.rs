@@ -39,9 +39,8 @@ const STALLED_FRAMES: u32 = 90;
 const PROGRESS_DEG: f32 = 1.0;
 /// Poured volume that counts as progress, ml. Chosen by hand; no measurement is recorded.
 const PROGRESS_ML: f32 = 0.5;
-/// A pour that its agent has ended, and that is short of the goal by more than so many ml and more than this share of it, has lost its stream:
-/// what it took for one was none, or has ceased. No pour that was done was shorter among the 3,000 fixed seeds of docs/SWARM.md, but for one with
-/// a false frame.
+/// A pour that is short of its goal by more than so many ml and more than this share of it has lost its stream. No pour that was done was shorter
+/// among the 3,000 fixed seeds of docs/SWARM.md, but for one with a false frame.
 const SHORT: (f32, f32) = (8.0, 0.08);
 /// If less than this is still to come over the lip, ml, it counts as nothing: this is about one drop of water.
 const NOTHING_ML: f64 = 0.05;
@@ -199,7 +198,7 @@ impl Ending {
         if !follows {
             self.end_without_robot(EndReason::NotFollowed);
         }
-        // A stream that goes on although the container is brought upright was none before either, so the goal was not reached.
+        // A stream that goes on at an upright container was none before either.
         if let Some(impossible) = self.impossible {
             self.end_without_robot(reason_of(impossible));
         }
@@ -424,8 +423,7 @@ mod tests {
         }
     }
 
-    /// Protects the operator from a pour of nothing that is called done: an agent that came upright far short of its goal, after a frame that
-    /// looked like a stream, has lost its stream. A little short is done, and another reason stays.
+    /// Protects the operator from a pour of nothing that is called done. A little short is done, and another reason stays.
     #[test]
     fn far_short_of_the_goal_is_not_done() {
         let settings = Settings::new(&shared::config::Config::parse(include_str!("../../../config/sim.toml"), "sim.toml").unwrap());
@@ -471,7 +469,7 @@ mod tests {
     }
 
     /// Protects a pour whose camera shows nothing: if it is known how much is in the vessel, the pour ends by name soon after the tilt at which
-    /// that would flow, and not at the largest one. Flow that was seen, or an unknown fill, never ends so.
+    /// that would flow, and not at the largest one. Flow that was seen, or an unknown fill, never ends so; a lone flash is no flow.
     #[test]
     fn nothing_flows_where_it_must() {
         let text = include_str!("../../../config/sim.toml");
@@ -491,11 +489,9 @@ mod tests {
         assert_eq!(after(Some(65.0), false, DRY_FRAMES), None);
         assert_eq!(after(Some(60.0), true, DRY_FRAMES), None);
         assert_eq!(after(None, false, DRY_FRAMES), None);
-        // A lone flash is no stream.
         let mut flashed = Ending::of_pour_that_flows_by(Some(60.0));
-        for k in 0..=DRY_FRAMES {
-            let area_px2 = Some(if k == 0 { 100.0 } else { 0.0 });
-            flashed.saw(&SeenFrame { lost: 0, area_px2, flowing: k == 0, alpha_deg: 62.0, alpha_now_deg: 63.0 }, &settings);
+        for area_px2 in std::iter::once(100.0).chain([0.0; DRY_FRAMES as usize]).map(Some) {
+            flashed.saw(&SeenFrame { lost: 0, area_px2, flowing: area_px2 > Some(0.0), alpha_deg: 62.0, alpha_now_deg: 63.0 }, &settings);
         }
         assert_eq!(flashed.due(&moment, &settings), Some(EndReason::NothingFlows));
     }

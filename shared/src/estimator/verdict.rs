@@ -62,9 +62,9 @@ const SAME_FRAMES: u32 = 10;
 const SAME_DEG: f64 = 3.0;
 /// Number of frames in a row with a stream, from which on it is one.
 const FLOW_FRAMES: u32 = 2;
-/// An outflow leaps if it is more than this many times that of the two frames before it, and ...
+/// An outflow leaps if it is more than this many times that of the two frames before it, and some ml more. Tuned with [`LEAP_ML`].
 const LEAP_FACTOR: f64 = 2.0;
-/// ... this much more, ml. In 585 right pours of the tuning rigs, from straight and steep vessels, the largest was 2.3 ml.
+/// How much more it has to be to be a leap, ml. In 585 right pours of the tuning rigs, from straight and steep vessels, the largest was 2.3 ml.
 const LEAP_ML: f64 = 3.0;
 /// The part of a leap that the next frame has to show for it to be real. Chosen by hand; no measurement is recorded.
 const LEAP_STAYS: f64 = 0.5;
@@ -214,10 +214,10 @@ impl Watch {
     pub fn may_be(&mut self, bounds: &Bounds, area_px2: Option<f32>, tilt_deg: f64) -> bool {
         let Some(area_px2) = area_px2 else { return false };
         let too_large = f64::from(area_px2) > bounds.most_px2;
-        let too_much = too_large || (area_px2 > 0.0 && !self.seen_flow && tilt_deg < UPRIGHT_DEG);
-        self.too_much_frames = if too_much { self.too_much_frames + 1 } else { 0 };
+        let upright = area_px2 > 0.0 && !self.seen_flow && tilt_deg < UPRIGHT_DEG;
+        self.too_much_frames = if too_large || upright { self.too_much_frames + 1 } else { 0 };
         // A lone flash is no stream.
-        self.flow_frames = if area_px2 > 0.0 && !too_much { self.flow_frames + 1 } else { 0 };
+        self.flow_frames = if area_px2 > 0.0 && !upright { self.flow_frames + 1 } else { 0 };
         self.seen_flow |= self.flow_frames >= FLOW_FRAMES;
         let dry = !self.seen_flow && tilt_deg > bounds.dry_deg;
         self.no_flow_frames = if dry { self.no_flow_frames + 1 } else { 0 };
@@ -226,7 +226,8 @@ impl Watch {
         } else if self.no_flow_frames >= NO_FLOW_FRAMES {
             self.verdict.get_or_insert(Impossible::NoFlow);
         }
-        !too_much
+        // A surge that the episodes did not show may be real, and then what it lets out counts: a lone frame of it does not (`leap`).
+        !upright
     }
 
     /// Whether the area stays the same to the bit while the container is tilted.
