@@ -92,6 +92,28 @@ impl LightCheck {
     }
 }
 
+/// Side of the squares at the lip that are looked at, px of a picture 640 px wide. Chosen by hand: so near a reflection is white in front
+/// of a dark liquid too.
+const LIP_SIDE: u32 = 6;
+/// Glass in a lamp's reflection reaches this in all parts, grey levels. Chosen by hand: glass before a white wall is darker.
+const LIP_GLASS: u8 = 240;
+/// Air in a lamp's reflection reaches this in all parts, grey levels. As in the check of light, a little below 255.
+const LIP_WHITE: u8 = 250;
+/// So far along both axes there is no reflection, px of a picture 640 px wide. Chosen by hand.
+const LIP_FAR_PX: f32 = 36.0;
+/// There every so many px are looked at. Chosen by hand: 60 px of ground in both directions.
+const LIP_FAR_STEP: f32 = 10.0;
+/// Ground that reaches this in all parts may itself be white at the lip, grey levels. Chosen by hand: a vignette makes 10 %.
+const LIP_GROUND: u8 = 242;
+/// No more than this share of the ground does so where a reflection is told. Chosen by hand.
+const LIP_GROUND_SHARE: f32 = 0.15;
+
+/// With this share of white light at the lip it may be a reflection. Chosen by hand.
+const LIP_SURE: f32 = 0.5;
+/// White light is a reflection when it is seen in so many pictures. Tuned on seed 3 of `evaluate-camera --faults`: white squares of a chess
+/// board pass in four.
+const LIP_PICTURES: u32 = 8;
+
 /// Checks the focus by the glass's own top edge and left side, which are always in the same place.
 pub(crate) struct RimCheck {
     /// The axes relative to the region.
@@ -142,6 +164,52 @@ impl RimCheck {
         let width_px = if seen { *self.widths_px.select_nth_unstable_by(sharper, f32::total_cmp).1 } else { 0.0 };
         let looked_blurred = std::mem::replace(&mut self.looked_blurred, width_px > RIM_BLURRED_PX);
         width_px > RIM_SURELY_BLURRED_PX || (looked_blurred && width_px > RIM_BLURRED_PX)
+    }
+}
+
+/// Looks for a lamp's reflection on the glass at the lip: there, in the glass and in the air, all is white light, and the ground further
+/// out is darker.
+pub(crate) struct LipCheck {
+    axes: Axes,
+    /// Pixels of this picture for each of one 640 px wide.
+    scale: f32,
+    /// Pictures with white light at the lip, less those that do not tell.
+    pictures: u32,
+}
+
+impl LipCheck {
+    /// For axes relative to the region, and pictures of this width, px.
+    pub(crate) fn new(axes: Axes, width_px: u32) -> Self {
+        Self { axes, scale: width_px as f32 / 640.0, pictures: 0 }
+    }
+
+    /// Which share of the glass just inside the lip, and of the air just outside, is white light; 0 if the ground further out is as bright,
+    /// or while the light is new: a white thing that passes is no reflection.
+    pub(crate) fn white_share(&mut self, pixels: RegionPixels) -> f32 {
+        // The share of a square with this corner, px along the axes, that reaches a level in all parts.
+        let share = |corner: [f32; 2], step: f32, down: f32, level: u8| {
+            let (mut bright, mut looked) = (0u32, 0u32);
+            for i in 0..LIP_SIDE * LIP_SIDE {
+                let along = corner[0] + step * (1 + i % LIP_SIDE) as f32;
+                let up = corner[1] + step * down * (1 + i / LIP_SIDE) as f32;
+                let [x, y] = [0, 1].map(|k| self.axes.lip_px[k] + self.scale * (along * self.axes.x[k] + up * self.axes.y[k]));
+                let row = if x >= 0.0 && y >= 0.0 { pixels.row(y as usize) } else { &[] };
+                let Some(pixel) = row.chunks_exact(3).nth(x.max(0.0) as usize) else { continue };
+                looked += 1;
+                bright += u32::from(pixel.iter().all(|v| *v >= level));
+            }
+            bright as f32 / looked.max(1) as f32
+        };
+        let at_lip = share([0.0; 2], 1.0, -1.0, LIP_GLASS).min(share([0.0; 2], 1.0, 1.0, LIP_WHITE));
+        let ground = || share([LIP_FAR_PX; 2], LIP_FAR_STEP, 1.0, LIP_GROUND);
+        if at_lip < LIP_SURE {
+            self.pictures = self.pictures.saturating_sub(2);
+        } else if ground() > LIP_GROUND_SHARE {
+            return 0.0;
+        } else {
+            self.pictures = (self.pictures + 1).min(2 * LIP_PICTURES);
+        }
+        if self.pictures < LIP_PICTURES { 0.0 } else { at_lip }
     }
 }
 

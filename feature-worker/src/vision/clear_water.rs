@@ -13,8 +13,8 @@
 //!    earlier picture, moved, does not explain.
 //! 4. [`lines`] finds the line from axis to axis with the best evidence, and [`water`] decides whether it is a stream.
 //! 5. The full picture's profiles across that line must confirm it.
-//! 6. What cannot be told is said by name: a reflection at the lip ([`lip_light`]), and before a pattern lamps that flicker, pictures
-//!    that are missing again and again ([`disturbed`]), and a lip at which no ground is seen.
+//! 6. What cannot be told is said by name: a lamp's reflection at the lip, and before a pattern light that flickers or wanders,
+//!    pictures that are missing again and again ([`disturbed`]), and what has changed at the lip.
 //!
 //! The first frame must be dry, and frames must follow each other. Called on the extraction thread. All pictures and tables are kept, so
 //! nothing is allocated after the second frame. The only failures are OpenCV's.
@@ -26,7 +26,6 @@ mod flicker;
 mod follow;
 mod light;
 mod lines;
-mod lip_light;
 mod motion;
 mod rays;
 mod rigid;
@@ -43,12 +42,12 @@ use self::evidence::{CALM, Evidence};
 use self::flicker::Flicker;
 use self::light::Light;
 use self::lines::Lines;
-use self::lip_light::LipLight;
 use self::rays::{RIM_PX, Rays};
 use self::water::{Verdict, Water};
 use super::confidence::Basis;
 use super::geometry::{Axes, LinearField};
 use super::liquid::{FineLine, LineRules, Liquid, PROFILE_SAMPLES, Profile, ProfileEdge, REACH, Sighting};
+use super::reflection::Reflection;
 
 // "Tuned" below means that the value was tuned on seeds 101 to 104 of `evaluate-camera`; see docs/VISION.md.
 
@@ -80,11 +79,15 @@ const STEEP_LEAST: f32 = 4.0;
 const FLICKER_PICTURES: u32 = 5;
 /// Legs of a stream that is as small as any that is measured, px. Chosen by hand: 200 px^2 of a picture 640 px wide.
 const LIP_PX: f32 = 10.0;
-/// Before a pattern, nothing flows where at least this share of such a stream's place is seen to be ground. Tuned on seed 101 of
-/// `evaluate-camera --faults`.
-const LIP_DRY_SHARE: f32 = 0.5;
-/// How fast the share of pictures with an even ground follows, a picture. Chosen by hand.
-const EVEN_FOLLOWS: f32 = 0.1;
+/// Before a pattern, it is not known whether something flows where this share of such a stream's place is known ground that has changed.
+/// Tuned on seed 101 of `evaluate-camera --faults`.
+const LIP_CHANGED: f32 = 0.4;
+/// How fast the share of pictures with an even ground grows and shrinks, a picture. Chosen by hand: dim boards look even in some pictures.
+const EVEN_FOLLOWS: [f32; 2] = [0.02, 0.1];
+/// The ground has a pattern below this share. Tuned on seed 101 of `evaluate-camera --faults`.
+const EVEN_LEAST: f32 = 0.5;
+/// In the first pictures the share is their mean. Chosen by hand: a third of a second.
+const EVEN_PICTURES: f32 = 10.0;
 
 /// Finds the stream of clear water in the pictures of one camera.
 pub(crate) struct ClearWater {
@@ -99,7 +102,9 @@ pub(crate) struct ClearWater {
     background: Background,
     light: Light,
     flicker: Flicker,
-    lip_light: LipLight,
+    reflection: Reflection,
+    /// Whether a lamp's reflection hides the lip.
+    hidden: bool,
     disturbed: Disturbed,
     evidence: Evidence,
     water: Water,
@@ -119,8 +124,12 @@ pub(crate) struct ClearWater {
     held: bool,
     /// In which share of the pictures without such a doubt the ground was even, the last ones above all.
     even_share: f32,
+    /// Pictures of which that is the share, the first ones.
+    even_pictures: f32,
     /// Pictures since a stream was seen.
     unseen: u32,
+    /// Pictures in a row in which the full picture confirmed a stream.
+    confirmed: u32,
 }
 
 impl ClearWater {
@@ -138,7 +147,8 @@ impl ClearWater {
             background: Background::new(size)?,
             light: Light::new(size),
             flicker: Flicker::new(size),
-            lip_light: LipLight::new(&rays, size),
+            reflection: Reflection::default(),
+            hidden: false,
             disturbed: Disturbed::new(),
             evidence: Evidence::new(&rays, size)?,
             rays,
@@ -150,7 +160,9 @@ impl ClearWater {
             looked: false,
             held: false,
             even_share: 0.0,
+            even_pictures: 0.0,
             unseen: u32::MAX,
+            confirmed: 0,
         })
     }
 
@@ -178,7 +190,6 @@ impl ClearWater {
         edges_px.clear();
         let height_px = self.height_px();
         let mut sighting = Sighting::Dry { confidence: 1.0 };
-        let hidden = self.lip_light.is_hidden(&self.now)?.then_some(Doubt::BlownOut);
         let exposure = self.flicker.look(&self.now)?;
         if !self.background.is_new() {
             self.background.expect_gain(exposure);
@@ -211,28 +222,34 @@ impl ClearWater {
                 _ if self.light.flickers() => Sighting::Unsure(Doubt::LightFlickers),
                 (Verdict::Unsure, _) => Sighting::Unsure(Doubt::EdgeNotFound),
                 _ if self.flicker.flickers() && self.unseen < FLICKER_PICTURES => Sighting::Unsure(Doubt::LightFlickers),
-                _ if self.is_pattern() && !self.sees_dry_lip() => Sighting::Unsure(Doubt::EdgeNotFound),
+                _ if self.is_pattern() && self.lip_has_changed() => Sighting::Unsure(Doubt::EdgeNotFound),
                 _ => sighting,
             };
-            self.unseen = if matches!(sighting, Sighting::Stream { .. }) { 0 } else { self.unseen.saturating_add(1) };
+            if matches!(sighting, Sighting::Stream { .. }) {
+                self.unseen = 0;
+            } else {
+                (self.unseen, self.confirmed) = (self.unseen.saturating_add(1), 0);
+            }
             if self.water.is_elsewhere(self.evidence.strange_share()) {
                 self.background.forget()?;
             }
         }
         self.remember(height_px)?;
-        self.disturbed.look();
+        self.disturbed.look(self.flicker.jumps());
+        let hidden = self.hidden.then_some(Doubt::BlownOut);
         let disturbed = self.disturbed.doubt().filter(|_| self.is_pattern());
         Ok(hidden.or(disturbed).map_or(sighting, Sighting::Unsure))
     }
 
     /// Whether the ground is not even.
     fn is_pattern(&self) -> bool {
-        self.even_share < 0.5
+        self.even_share < EVEN_LEAST
     }
 
-    /// Whether ground is seen where a small stream would be.
-    fn sees_dry_lip(&self) -> bool {
-        self.evidence.dry_share(&self.rays, self.line_share([LIP_PX; 2])) >= LIP_DRY_SHARE
+    /// Whether ground that is known has changed where a small stream would be.
+    fn lip_has_changed(&self) -> bool {
+        let [_, wet] = self.evidence.shares(&self.rays, self.line_share([LIP_PX; 2]));
+        wet >= LIP_CHANGED
     }
 
     /// Takes what is dry over into the memory of the background, and chooses the picture with which the next ones are compared.
@@ -339,6 +356,10 @@ impl Liquid for ClearWater {
         self.looked.then(|| self.evidence.even())
     }
 
+    fn see_lip(&mut self, white_share: f32) {
+        self.hidden = self.reflection.hides_lip(white_share, 0.0, false);
+    }
+
     fn lose_picture(&mut self, doubt: Doubt) {
         self.disturbed.lose(doubt);
     }
@@ -348,12 +369,17 @@ impl Liquid for ClearWater {
     }
 
     fn dry_share(&self, legs_px: [f32; 2]) -> f32 {
-        self.evidence.dry_share(&self.rays, self.line_share(legs_px.map(|v| v / self.scale)))
+        let [dry, _] = self.evidence.shares(&self.rays, self.line_share(legs_px.map(|v| v / self.scale)));
+        dry
     }
 
     fn hold_ground(&mut self, held: bool) {
         if !held {
-            self.even_share += EVEN_FOLLOWS * (f32::from(u8::from(self.evidence.even())) - self.even_share);
+            let even = self.evidence.even();
+            self.even_pictures += 1.0;
+            let usual = EVEN_FOLLOWS[usize::from(!even)];
+            let follows = if self.even_pictures <= EVEN_PICTURES { usual.max(1.0 / self.even_pictures) } else { usual };
+            self.even_share += follows * (f32::from(u8::from(even)) - self.even_share);
         }
         self.held = held;
     }
@@ -373,7 +399,7 @@ impl Liquid for ClearWater {
         let sine = self.axes.sine().abs();
         let line = self.water.confirm(line, mean_level, self.scale, sine, self.evidence.even() && !self.held)?;
         // What bands left over is elsewhere in the next picture.
-        let young = self.water.stream().is_none_or(|s| s.age < FLICKER_PICTURES as f32);
-        if young && self.flicker.flickers() { Err(Doubt::LightFlickers) } else { Ok(line) }
+        self.confirmed += 1;
+        if self.confirmed < FLICKER_PICTURES && self.flicker.flickers() { Err(Doubt::LightFlickers) } else { Ok(line) }
     }
 }

@@ -20,7 +20,7 @@ use shared::messages::{Doubt, PixelFormat};
 use super::confidence::Basis;
 use super::geometry::{Axes, Line, NEAR_PX, RAYS, RayGrid, distance};
 use super::ground_beside::GroundBeside;
-use super::ground_colours::{Ground, GroundColours, glows as is_glow};
+use super::ground_colours::{Ground, GroundColours};
 use super::hues::ranges;
 use super::liquid::{FineLine, LineRules, Liquid, PROFILE_SAMPLES, Profile, ProfileEdge, REACH, Sighting};
 use super::reflection::Reflection;
@@ -63,6 +63,8 @@ const LEARN_BEYOND: usize = 6;
 const AT_LIP_PX: f32 = 12.0;
 /// The ground is learned beside the container while no more than this share of what is at the lip is foreign or liquid. Chosen by hand.
 const QUIET_SHARE: f32 = 0.3;
+/// A liquid in front of a lamp's reflection is brighter than this in all parts, close to the reflection's middle. Chosen by hand.
+const GLOW_LEVEL: u8 = 180;
 /// Least share of the rays that a body at the lip fills. Tuned.
 const BODY_RAYS: f32 = 0.7;
 /// Least mean length of a body at the lip, px: a bead is shorter. Tuned.
@@ -111,6 +113,8 @@ pub(crate) struct ColouredLiquid {
     frames: usize,
     dry_frames: u32,
     reflection: Reflection,
+    /// Which share of the glass at the lip is white light.
+    white_lip: f32,
     /// Number of samples on each ray up to the end of the liquid, or of a body at the lip, in the last picture.
     ends: [usize; RAYS],
     // Pictures along the rays, one ray a row, kept from frame to frame.
@@ -159,6 +163,7 @@ impl ColouredLiquid {
             frames: 0,
             dry_frames: 0,
             reflection: Reflection::default(),
+            white_lip: 0.0,
             ends: [0; RAYS],
             sampled: Mat::default(),
             smooth: Mat::default(),
@@ -319,9 +324,8 @@ impl ColouredLiquid {
             for r in 0..near.min(ray.samples) {
                 let ground = self.ground.tell(colours[r].0);
                 looked += 1;
-                let light = mask[r] == 0 && ground != Ground::Known && is_glow(colours[r].0);
-                blind += usize::from(ground == Ground::Blind || light);
-                glows += usize::from(is_glow(colours[r].0));
+                blind += usize::from(ground == Ground::Blind);
+                glows += usize::from(colours[r].0.iter().all(|v| *v >= GLOW_LEVEL));
                 foreign += usize::from(mask[r] != 0 || ground != Ground::Known);
             }
         }
@@ -336,7 +340,7 @@ impl ColouredLiquid {
             return Ok(dry);
         }
         let [blind, glows, foreign] = self.at_lip()?;
-        if self.reflection.hides_lip(blind, glows, foreign > QUIET_SHARE) {
+        if self.reflection.hides_lip(blind.max(self.white_lip), glows, foreign > QUIET_SHARE) {
             return Ok(Sighting::Unsure(Doubt::BlownOut));
         }
         if self.is_foreign_body()? {
@@ -421,6 +425,10 @@ impl Liquid for ColouredLiquid {
             _ => self.ground.forget(),
         }
         Ok(sighting)
+    }
+
+    fn see_lip(&mut self, white_share: f32) {
+        self.white_lip = white_share;
     }
 
     /// Each picture is judged by itself.

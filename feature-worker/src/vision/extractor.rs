@@ -19,7 +19,7 @@ use opencv::prelude::*;
 use shared::config::{CameraConfig, ImageConfig, LiquidMethod};
 use shared::messages::Doubt;
 
-use super::checks::{LightCheck, RimCheck};
+use super::checks::{LightCheck, LipCheck, RimCheck};
 use super::clear_water::ClearWater;
 use super::coloured_liquid::ColouredLiquid;
 use super::confidence;
@@ -66,6 +66,7 @@ pub struct Extractor {
     light: LightCheck,
     whole: WholeCheck,
     rim: RimCheck,
+    lip: LipCheck,
     presence: Presence,
     liquid: Box<dyn Liquid>,
     line: LineFinder,
@@ -106,6 +107,7 @@ impl Extractor {
             light: LightCheck::default(),
             whole: WholeCheck::new(axes, region_px),
             rim: RimCheck::new(axes),
+            lip: LipCheck::new(axes, camera.width_px),
             presence: Presence::new(camera.width_px),
             liquid,
             line: LineFinder::new(axes, region_px),
@@ -180,6 +182,7 @@ impl Extractor {
                 (Measurement::nothing(0.0, doubt), checked)
             }
             None => {
+                self.liquid.see_lip(self.lip.white_share(pixels));
                 let sighting = self.liquid.look(&mut self.edges)?;
                 let segmented = Instant::now();
                 (self.follow(sighting, pixels), segmented)

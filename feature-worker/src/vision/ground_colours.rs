@@ -13,9 +13,6 @@ const SHARES: usize = 64;
 const DARK_SUM: usize = 30;
 /// A colour whose parts reach this is white light and not a colour, grey levels. As in the check of light, a little below 255.
 const BLIND_LEVEL: u8 = 250;
-/// What is brighter than this in all parts is a lamp's reflection or its glow, or a bright ground. Chosen by hand: a liquid close to the
-/// middle of a reflection is.
-const GLOW_LEVEL: u8 = 180;
 /// What one sample adds to its colour.
 const SEEN: u16 = 4;
 /// What one sample adds to the colours beside its own.
@@ -42,12 +39,6 @@ pub(crate) enum Ground {
     Blind,
     /// The ground has no such colour.
     Foreign,
-}
-
-/// Whether a colour is as bright as a lamp's reflection or its glow.
-#[inline(always)]
-pub(crate) fn glows(colour: [u8; 3]) -> bool {
-    colour.iter().all(|v| *v >= GLOW_LEVEL)
 }
 
 /// Where what is too dark to have a colour is counted.
@@ -124,12 +115,11 @@ impl GroundColours {
         colour.iter().all(|v| *v >= BLIND_LEVEL) && self.counts[WHITE] < KNOWN
     }
 
-    /// Takes a colour for one of the ground. Bright light close to the lip may be a reflection and no ground, so it counts only where
-    /// `is_far`.
+    /// Takes a colour for one of the ground. White light close to the lip is a reflection and no ground, so it counts only where `is_far`.
     #[inline(always)]
     pub(crate) fn learn(&mut self, colour: [u8; 3], is_far: bool) {
         let place = self.place(colour);
-        if !is_far && glows(colour) {
+        if place == WHITE && !is_far {
             return;
         }
         let count = &mut self.counts[place];

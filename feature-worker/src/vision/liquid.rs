@@ -110,6 +110,10 @@ pub(crate) trait Liquid: Send + Sync {
     /// from the x-axis to the y-axis; without a stream they are of no use.
     fn look(&mut self, edges_px: &mut Vec<[f32; 2]>) -> opencv::Result<Sighting>;
 
+    /// Says which share of glass and air at the lip is white light that the ground is not, in the picture that was taken: a lamp's
+    /// reflection.
+    fn see_lip(&mut self, white_share: f32);
+
     /// Says that the picture that was taken is not looked at, and why.
     fn lose_picture(&mut self, doubt: Doubt);
 

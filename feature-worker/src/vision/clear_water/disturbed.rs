@@ -1,5 +1,5 @@
-//! Whether pictures are missing again and again. Before a pattern clear water is told by how pictures follow each other, so a camera that
-//! loses every third one does not show it, and the reason is said in every picture.
+//! Whether pictures are missing again and again, or the light wanders. Before a pattern clear water is told by how pictures follow each other, so a camera that
+//! loses every third one, or whose exposure hunts, does not show it, and the reason is said in every picture.
 //!
 //! Pure; called on the extraction thread. Nothing is allocated and nothing fails.
 
@@ -10,18 +10,27 @@ const REMEMBERED: u32 = 60;
 /// So many of them may be lost. Chosen by hand: one broken picture is no reason to end a pour.
 const LOST_MOST: u32 = 1;
 
-/// Remembers which of the last pictures could not be looked at.
+/// For so many pictures a jump of the light counts. Chosen by hand: jumps are told while the background is at rest, and a tilt takes seconds.
+const JUMP_PICTURES: u32 = 100;
+/// All jumps together count for no longer than this many pictures. Chosen by hand: 13 seconds.
+const JUMPS_MOST: u32 = 400;
+/// The light wanders while they count for more pictures than this. Chosen by hand: two jumps that follow each other within two seconds.
+const JUMPS_LEAST: u32 = 150;
+
+/// Remembers what was wrong with the last pictures.
 pub(super) struct Disturbed {
-    /// One bit for each picture, the last one first.
+    /// One bit for each picture that could not be looked at, the last one first.
     lost: u64,
     /// Why the last of them could not be looked at.
     doubt: Doubt,
+    /// For how many pictures the light's jumps still count.
+    jumps: u32,
 }
 
 impl Disturbed {
     /// No picture was lost yet.
     pub(super) fn new() -> Self {
-        Self { lost: 0, doubt: Doubt::None }
+        Self { lost: 0, doubt: Doubt::None, jumps: 0 }
     }
 
     /// A picture could not be looked at, for this reason.
@@ -29,15 +38,20 @@ impl Disturbed {
         (self.lost, self.doubt) = (self.lost << 1 | 1, doubt);
     }
 
-    /// A picture was looked at.
-    pub(super) fn look(&mut self) {
+    /// A picture was looked at; `jumps` says whether its light is another one than that of the picture before.
+    pub(super) fn look(&mut self, jumps: bool) {
         self.lost <<= 1;
+        self.jumps = self.jumps.saturating_sub(1);
+        if jumps {
+            self.jumps = (self.jumps + JUMP_PICTURES).min(JUMPS_MOST);
+        }
     }
 
-    /// The reason for which pictures are missing, if too many are.
+    /// Why clear water is not told before a pattern now, if there is a reason.
     pub(super) fn doubt(&self) -> Option<Doubt> {
         let remembered = self.lost & ((1 << REMEMBERED) - 1);
-        (remembered.count_ones() > LOST_MOST).then_some(self.doubt)
+        let wanders = (self.jumps > JUMPS_LEAST).then_some(Doubt::LightFlickers);
+        (remembered.count_ones() > LOST_MOST).then_some(self.doubt).or(wanders)
     }
 }
 
@@ -50,13 +64,26 @@ mod tests {
     fn one_lost_picture_is_none() {
         let mut disturbed = Disturbed::new();
         disturbed.lose(Doubt::PictureIncomplete);
-        disturbed.look();
+        disturbed.look(false);
         assert_eq!(disturbed.doubt(), None);
         disturbed.lose(Doubt::Frozen);
         assert_eq!(disturbed.doubt(), Some(Doubt::Frozen));
-        (0..57).for_each(|_| disturbed.look());
+        (0..57).for_each(|_| disturbed.look(false));
         assert_eq!(disturbed.doubt(), Some(Doubt::Frozen));
-        (0..60).for_each(|_| disturbed.look());
+        (0..60).for_each(|_| disturbed.look(false));
+        assert_eq!(disturbed.doubt(), None);
+    }
+
+    /// Protects pours before a pattern from an exposure that hunts, and not from a lamp that is switched on once.
+    #[test]
+    fn light_that_wanders_is_named() {
+        let mut disturbed = Disturbed::new();
+        disturbed.look(true);
+        assert_eq!(disturbed.doubt(), None);
+        (0..30).for_each(|_| disturbed.look(false));
+        disturbed.look(true);
+        assert_eq!(disturbed.doubt(), Some(Doubt::LightFlickers));
+        (0..100).for_each(|_| disturbed.look(false));
         assert_eq!(disturbed.doubt(), None);
     }
 }

@@ -224,16 +224,19 @@ impl Evidence {
         self.even
     }
 
-    /// Which share of the places with a `line_share` below 1 in the air was seen to be ground: known, and as it is remembered; or, where it
-    /// is not known, as in the moved earlier picture.
-    pub(super) fn dry_share(&self, rays: &Rays, line_share: LinearField) -> f32 {
-        let (mut dry, mut looked) = (0.0f32, 0.0f32);
+    /// Which shares of the places with a `line_share` below 1 in the air are ground that is known and as it is remembered, and ground that
+    /// is known and is not.
+    pub(super) fn shares(&self, rays: &Rays, line_share: LinearField) -> [f32; 2] {
+        let (mut dry, mut wet, mut looked) = (0.0f32, 0.0f32, 0.0f32);
         for i in (0..CELLS).filter(|i| rays.air[*i] > 0.0 && line_share.at(rays.places[*i]) < 1.0) {
             looked += 1.0;
-            let as_remembered = self.remembered[i] > 0.5 && self.away[i] < CALM;
-            dry += f32::from(u8::from(as_remembered));
+            if self.remembered[i] > 0.5 {
+                let calm = self.away[i] < CALM;
+                dry += f32::from(u8::from(calm));
+                wet += f32::from(u8::from(!calm));
+            }
         }
-        dry / looked.max(1.0)
+        [dry, wet].map(|part| part / looked.max(1.0))
     }
 
     /// Compares the memory and the picture `earlier`, both moved, with the picture `now` along the rays. `height_px` is the height above

@@ -32,6 +32,12 @@ const PICTURES: u32 = 3;
 /// After so many pictures of told light without bands, it flickers no more. Chosen by hand: two seconds.
 const QUIET_PICTURES: u32 = 60;
 
+/// The background is at rest when the light is told in this share of the bands. Chosen by hand.
+const BANDS_AT_REST: f32 = 0.9;
+/// Light that is brighter or darker than in the last picture by more than this factor jumps. Chosen by hand: an automatic exposure that
+/// hunts does so, and a drift of minutes does not.
+const JUMP: f32 = 1.05;
+
 /// Looks for light that flickers.
 pub(super) struct Flicker {
     size: Size,
@@ -45,6 +51,7 @@ pub(super) struct Flicker {
     /// Pictures with bands, and for how many quiet ones they still count.
     pictures: u32,
     counts_for: u32,
+    jumps: bool,
 }
 
 impl Flicker {
@@ -61,6 +68,7 @@ impl Flicker {
             bands: Vec::with_capacity(bands),
             pictures: 0,
             counts_for: 0,
+            jumps: false,
         }
     }
 
@@ -76,6 +84,11 @@ impl Flicker {
     /// Whether the light flickers.
     pub(super) fn flickers(&self) -> bool {
         self.pictures >= PICTURES
+    }
+
+    /// Whether the picture before an unmoved background is brighter or darker than the last one as a whole.
+    pub(super) fn jumps(&self) -> bool {
+        self.jumps
     }
 
     /// Reads the blocks' mean levels.
@@ -117,6 +130,8 @@ impl Flicker {
             }
         }
         let exposure = if self.ratios.is_empty() { 1.0 } else { median(&mut self.ratios) };
+        let at_rest = judged >= 4 && self.bands.len() as f32 >= BANDS_AT_REST * judged as f32;
+        self.jumps = at_rest && exposure.max(1.0 / exposure.max(0.01)) > JUMP;
         let told = judged >= 4 && self.bands.len() as f32 >= BANDS_TOLD * judged as f32;
         if told {
             let (least, most) = self.bands.iter().fold((f32::MAX, 0.0f32), |(low, high), v| (low.min(*v), high.max(*v)));
