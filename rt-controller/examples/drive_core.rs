@@ -81,6 +81,7 @@ fn weights() -> Weights {
 pub fn pour(goal_ml: f32) -> (Outcome, f32) {
     let settings = Settings {
         period_ns: PERIOD_NS,
+        frame_ns: PERIOD_NS,
         limits: Limits::default(),
         stale_ns: 200_000_000,
         max_frames: 900,

@@ -21,11 +21,13 @@ use shared::messages::{Feature, LAYOUT_VERSION, Phase, Telemetry};
 
 use ending::{Ending, Moment, SeenFrame};
 use following::{COMMANDS, Following};
+use frame_rate::FrameRate;
 use intake::Taken;
 use order::Situation;
 
 pub mod ending;
 pub mod following;
+mod frame_rate;
 mod intake;
 mod order;
 mod robot;
@@ -120,6 +122,7 @@ pub struct Core {
     newest: Option<Feature>,
     /// When the newest picture was taken in which V_e could be measured, ns. Pictures that show nothing, such as dark ones, do not count.
     usable_at_ns: u64,
+    frame_rate: FrameRate,
     shutdown: bool,
     last_tick_ns: u64,
     commanded: AngleHistory<COMMANDS>,
@@ -144,6 +147,7 @@ impl Core {
             decision: Decision::NOTHING,
             newest: None,
             usable_at_ns: 0,
+            frame_rate: FrameRate::new(settings.frame_ns),
             shutdown: false,
             last_tick_ns: 0,
             commanded,
@@ -232,6 +236,7 @@ impl Core {
             robot: input.robot,
             shutdown: self.shutdown,
             measurement_age_ns: input.now_ns.saturating_sub(newest_ns),
+            wrong_rate_hz: self.frame_rate.wrong_hz().map(|hz| (hz, self.frame_rate.configured_hz())),
         };
         match order {
             Order::Shutdown => {
@@ -303,6 +308,7 @@ impl Core {
                 continue;
             };
             self.newest = Some(*feature);
+            self.frame_rate.saw(feature);
             self.counters.features += 1;
             let measured = intake::usable_area_px2(feature);
             if measured.is_some() {
@@ -366,7 +372,8 @@ impl Core {
                     poured_ml: self.decision.poured_ml,
                     follows,
                 };
-                if let Some(reason) = run.ending.due(&moment, &self.settings) {
+                let wrong_rate = self.frame_rate.wrong_hz().map(|_| EndReason::FrameRate);
+                if let Some(reason) = run.ending.due(&moment, &self.settings).or(wrong_rate) {
                     self.give_up(reason);
                 }
                 None

@@ -6,18 +6,19 @@
 
 use std::io::ErrorKind;
 use std::path::{Path, PathBuf};
-use std::sync::atomic::{AtomicBool, Ordering::Relaxed};
-use std::sync::{Mutex, PoisonError};
-use std::time::Duration;
+use std::sync::atomic::{AtomicBool, Ordering::Relaxed, Ordering::SeqCst};
+use std::time::{Duration, Instant};
 
 use crossbeam::channel::{Receiver, Sender, TrySendError, bounded};
 use shared::agent::Agent;
 use shared::config::Config;
 use shared::episode::take_number;
+use shared::messages::Phase;
 use shared::regular_file;
 use shared::weights::Weights;
 
 use crate::core::Settings;
+use crate::disk_note::{DiskNote, error_words, free_bytes, space_words};
 use crate::exchange::Exchange;
 use crate::journal::{Tick, Writer};
 
@@ -27,6 +28,16 @@ const BEAT: Duration = Duration::from_millis(40);
 /// it.
 const WAITING_TICKS: usize = 1024;
 
+/// Pause before a journal that could not be written is tried again; it doubles with each failure, up to [`RETRY_MAX`], because each new file moves
+/// the older ones on. Chosen by hand: a full disk is cleaned by a person.
+const RETRY: Duration = Duration::from_secs(60);
+/// Longest such pause. Chosen by hand; no measurement is recorded.
+const RETRY_MAX: Duration = Duration::from_secs(6 * 3600);
+/// Free space with which a journal is begun anew, bytes: an hour of ticks.
+const RETRY_SPACE: u64 = 16 << 20;
+/// Pause between two looks at the free space. Chosen by hand; no measurement is recorded.
+const SPACE_BEAT: Duration = Duration::from_secs(5);
+
 /// Largest relative difference between the camera's frame rate and the one that weights are trained for. Chosen by hand; no measurement
 /// is recorded.
 const RATE_TOLERANCE: f64 = 0.02;
@@ -35,8 +46,8 @@ const RATE_TOLERANCE: f64 = 0.02;
 pub struct Disk<'a> {
     exchange: &'a Exchange,
     say: &'a (dyn Fn(&str) + Sync),
-    /// Why the newest weight file is not used, for `status`; empty if it is used.
-    refused: &'a Mutex<String>,
+    /// What `status` shows of it.
+    note: &'a DiskNote,
     path: PathBuf,
     /// User number of the configuration's owner, whose weight files are read too.
     trusted: Option<u32>,
@@ -44,9 +55,17 @@ pub struct Disk<'a> {
     fps: f64,
     /// Time of change, inode and length of the weight file that was read last.
     seen: Option<(std::time::SystemTime, u64, u64)>,
-    /// The journal; `None` if none is kept, or if it has ended.
+    /// The journal; `None` if none is kept, or while nothing can be written.
     journal: Option<Writer>,
+    /// Where the journal is, and the settings that it begins with; `None` if none is kept.
+    journal_at: Option<(PathBuf, Settings)>,
+    /// When a journal that could not be written is tried again, and when free space is looked at again.
+    retry: Option<Instant>,
+    pause: Duration,
+    space_at: Option<Instant>,
     ticks: Receiver<Box<Tick>>,
+    /// The weights that were read last, for a journal that begins anew.
+    loaded: Option<(u64, Vec<u8>)>,
     /// Directory of the episodes, and the queue of one that the service takes numbers from.
     episodes: PathBuf,
     numbers: Sender<u64>,
@@ -71,7 +90,7 @@ impl<'a> Disk<'a> {
         config: &Config,
         trusted: Option<u32>,
         exchange: &'a Exchange,
-        refused: &'a Mutex<String>,
+        note: &'a DiskNote,
         say: &'a (dyn Fn(&str) + Sync),
     ) -> Result<(Self, Queues), String> {
         let journal = match config.controller.journal.as_ref().map(|path| (path, Writer::create(path, &Settings::new(config)))) {
@@ -79,23 +98,31 @@ impl<'a> Disk<'a> {
             Some((_, Ok(writer))) => Some(writer),
             Some((_, Err(e))) if e.kind() == ErrorKind::InvalidInput => return Err(format!("controller.journal: {e}")),
             Some((path, Err(e))) => {
-                say(&format!("{}: no journal: {e}", path.display()));
+                say(&format!("{}: no journal: {}; tried again each minute", path.display(), error_words(&e)));
+                note.set(|n| n.journal = format!("not written since the start: {}", error_words(&e)));
                 None
             }
         };
+        let journal_at = config.controller.journal.clone().map(|path| (path, Settings::new(config)));
+        let retry = (journal.is_none() && journal_at.is_some()).then(|| Instant::now() + RETRY);
         let (sender, ticks) = bounded(WAITING_TICKS);
-        let sender = journal.is_some().then_some(sender);
+        let sender = journal_at.is_some().then_some(sender);
         let (number_sender, numbers) = bounded(1);
         let disk = Self {
             exchange,
             say,
-            refused,
+            note,
             path: config.controller.weights.clone(),
             trusted,
             fps: config.camera.fps,
             seen: None,
             journal,
+            journal_at,
+            retry,
+            pause: RETRY,
+            space_at: None,
             ticks,
+            loaded: None,
             episodes: config.recording.directory.clone(),
             numbers: number_sender,
             spare_number: None,
@@ -108,7 +135,9 @@ impl<'a> Disk<'a> {
     pub fn run(mut self, end: &AtomicBool) {
         while !end.load(Relaxed) {
             self.write_ticks();
+            self.keep_journal();
             self.look_at_weights();
+            self.look_at_space();
             self.offer_number();
             std::thread::sleep(BEAT);
         }
@@ -123,12 +152,69 @@ impl<'a> Disk<'a> {
         }
     }
 
-    /// Writes to the journal. The first error ends the journal, not the controller.
+    /// Writes to the journal. An error ends this file, not the controller; a new one is begun when the disk takes it.
     fn write(&mut self, what: impl FnOnce(&mut Writer) -> std::io::Result<()>) {
         if let Some(Err(e)) = self.journal.as_mut().map(what) {
-            (self.say)(&format!("journal: {e}; nothing more is written to it, and the controller goes on"));
+            let why = error_words(&e);
+            (self.say)(&format!("journal: {why}; it is begun anew when it can be written, and the controller goes on"));
+            self.note.set(|n| n.journal = format!("not written: {why}"));
             self.journal = None;
+            self.try_later();
         }
+    }
+
+    /// Has the journal tried again after a pause.
+    fn try_later(&mut self) {
+        self.retry = Some(Instant::now() + self.pause);
+        self.pause = (self.pause * 2).min(RETRY_MAX);
+    }
+
+    /// Begins the journal's next part when the file is large, or a new one when the last could not be written; never in a pour or recording.
+    fn keep_journal(&mut self) {
+        let Some((path, settings)) = &self.journal_at else { return };
+        let at_rest = matches!(Phase::from_code(self.exchange.phase.load(SeqCst)), Phase::Idle | Phase::NoRobot) && self.ticks.is_empty();
+        let due = self.retry.is_some_and(|at| Instant::now() >= at);
+        let part = match self.journal.take() {
+            Some(full) if full.is_full() && at_rest => full.next_part(path, settings),
+            None if due && at_rest && free_bytes(path).is_none_or(|free| free >= RETRY_SPACE) => {
+                let weights = self.loaded.iter().cloned().collect();
+                Writer::continue_at(path, settings, weights, self.loaded.as_ref().map(|(identity, _)| *identity))
+            }
+            other => {
+                self.journal = other;
+                return;
+            }
+        };
+        match part {
+            Ok(journal) => {
+                (self.say)(&format!("journal: {} begins a new part", path.display()));
+                (self.journal, self.retry) = (Some(journal), None);
+            }
+            Err(e) => {
+                self.note.set(|n| n.journal = format!("not written: {}", error_words(&e)));
+                self.try_later();
+            }
+        }
+    }
+
+    /// Looks at the journal's size and the free space, now and then.
+    fn look_at_space(&mut self) {
+        if self.space_at.is_some_and(|at| at.elapsed() < SPACE_BEAT) {
+            return;
+        }
+        self.space_at = Some(Instant::now());
+        let journal = self.journal_at.as_ref().map(|(path, _)| path.as_path());
+        let paths: Vec<&Path> = journal.and_then(Path::parent).into_iter().chain([self.episodes.as_path()]).collect();
+        let space = space_words(&paths);
+        let line = match (&self.journal, journal) {
+            (_, None) => Some("none (controller.journal is not set)".to_owned()),
+            (Some(writer), Some(path)) => Some(format!("{}, {:.1} MB", path.display(), writer.len() as f64 / 1e6)),
+            (None, Some(_)) => None,
+        };
+        self.note.set(|n| {
+            n.space = space;
+            n.journal = line.unwrap_or_else(|| std::mem::take(&mut n.journal));
+        });
     }
 
     /// Keeps a number ready for the next episode. What is wrong with the directory is said once.
@@ -145,7 +231,11 @@ impl<'a> Disk<'a> {
                 }
             }
             Err(e) => {
-                let what = format!("recording.directory = {}: {e}: no number for an episode, so no pour begins", self.episodes.display());
+                let what = format!(
+                    "recording.directory = {}: {}: no number for an episode, so no pour begins",
+                    self.episodes.display(),
+                    error_words(&e)
+                );
                 if what != self.no_number {
                     (self.say)(&what);
                     self.no_number = what;
@@ -157,8 +247,8 @@ impl<'a> Disk<'a> {
     /// Notices a new weight file, reads and checks it, and hands it to the loop.
     fn look_at_weights(&mut self) {
         use std::os::unix::fs::MetadataExt;
-        let refused = self.refused;
-        let refuse = |why: String| *refused.lock().unwrap_or_else(PoisonError::into_inner) = why;
+        let note = self.note;
+        let refuse = |why: String| note.set(|n| n.refused = why);
         let Ok(meta) = std::fs::metadata(&self.path) else {
             if self.seen.is_none() {
                 refuse(format!("{}: not there yet", self.path.display()));
@@ -173,9 +263,11 @@ impl<'a> Disk<'a> {
         match read_weights(&self.path, self.fps, self.trusted) {
             Ok(weights) => {
                 refuse(String::new());
+                note.set(|n| n.weights_written = meta.modified().ok());
                 (self.say)(&format!("weights {} read from {}; the next pour uses them", weights.identity(), self.path.display()));
                 let identity = weights.id();
                 self.write(|journal| journal.weights(identity, &weights));
+                self.loaded = weights.to_bytes().ok().map(|bytes| (identity, bytes));
                 // An agent that still waits is replaced, and dropped here, in an ordinary thread.
                 drop(self.exchange.agents.force_push((identity, Box::new(Agent::new(&weights)))));
             }

@@ -3,13 +3,13 @@
 //! The loop hands each [`Tick`] to an ordinary thread through a queue, and that thread writes it ([`Writer`]). Commands and tests read
 //! and replay. Both allocate. A file that was cut off is read up to its last whole entry; every other fault is a [`JournalError`].
 //!
-//! The file begins with the 8 bytes `decantj5`. Then come the entries: a little-endian u32 with the length, and that many bytes of
+//! The file begins with the 8 bytes `decantj6`. Then come the entries: a little-endian u32 with the length, and that many bytes of
 //! postcard.
 
 use std::collections::BTreeMap;
 use std::fs::{File, OpenOptions};
 use std::io::{BufReader, BufWriter, ErrorKind, Read, Write};
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 use serde::{Deserialize, Serialize};
 use shared::agent::Agent;
@@ -21,11 +21,20 @@ use crate::core::{Core, Input, MAX_FEATURES, Order, Robot, Settings};
 use crate::pacing::Pacer;
 
 /// The first bytes of a journal, which include its version.
-const MAGIC: &[u8; 8] = b"decantj5";
+const MAGIC: &[u8; 8] = b"decantj6";
 /// Longest entry, bytes: more than ten weight files, which are the largest entries.
 const ENTRY_MAX: usize = 128 * 1024;
-/// Size at which a journal stops growing, bytes: about three days of ticks.
-const FILE_MAX: u64 = 2 << 30;
+/// Size at which a journal ends and the next part begins, bytes: about 20 h of ticks. Chosen by hand: it is copied and read in a minute.
+const FILE_MAX: u64 = 256 << 20;
+/// Size of all journals that are kept beside the one being written, bytes. Chosen by hand: about three days of ticks.
+const KEPT_BYTES: u64 = 1 << 30;
+/// Number of journals that are kept beside the one being written. Chosen by hand: so many starts do not lose a crash.
+const KEPT: u32 = 20;
+/// Number of ticks at the beginning of a later part that are not compared: as many as the core remembers ([`crate::core`]).
+const UNKNOWN_TICKS: u64 = 64;
+
+/// Latest time that a tick may have, ns: 146 years after the machine's start. A later one is damage, and sums with it would overflow.
+const LATEST_NS: u64 = 1 << 62;
 
 /// One tick: everything that [`Core::step`] saw, and the target that it answered with.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -72,6 +81,8 @@ enum Entry {
     Weights(u64, Vec<u8>),
     /// A tick.
     Tick(Box<Tick>),
+    /// The file begins in the middle of a run, outside of pours and recordings; it stands behind the settings.
+    Continued,
 }
 
 /// Why a journal cannot be read.
@@ -105,51 +116,127 @@ pub enum JournalError {
 pub struct Writer<W: Write = BufWriter<File>> {
     to: W,
     written: u64,
+    /// Weights that the loop has, or may take next, by their identity; the next part begins with them.
+    weights: BTreeMap<u64, Vec<u8>>,
+    /// Identity of the weights that the loop has.
+    taken: Option<u64>,
+    /// Whether the next tick must say which weights the loop has, because it is the first of a later part.
+    names_weights: bool,
     /// Where an entry is put together.
     buffer: Vec<u8>,
 }
 
 impl Writer {
-    /// Starts a journal. One that is there already is kept beside it, with the ending `before.bin` instead of its own. A file that is no
-    /// journal, or one that another controller writes, is an error and stays as it is.
+    /// Starts a journal. Those of the runs before are kept beside it, the newest with the ending `before.bin` instead of its own, older ones with
+    /// `before-2.bin` and so on, as many as fit into the budget. A file in their places that is no journal, or one that another controller
+    /// writes, is an error, and everything stays as it is.
     pub fn create(path: &Path, settings: &Settings) -> std::io::Result<Self> {
-        if let Some(parent) = path.parent() {
-            std::fs::create_dir_all(parent)?;
-        }
-        if path.symlink_metadata().is_ok() {
-            let before = path.with_extension("before.bin");
-            let held = check_is_journal(path)?;
-            if before.symlink_metadata().is_ok() {
-                check_is_journal(&before)?;
-            }
-            // The journal of the run before is wanted most after that run has crashed.
-            std::fs::rename(path, before)?;
-            drop(held);
-        }
-        let file = OpenOptions::new().write(true).create_new(true).open(path)?;
-        // Whoever looks meets the lock; a file system without locks has none to give.
-        let _ = file.try_lock();
-        Self::begin(BufWriter::new(file), settings)
+        Self::begin(BufWriter::new(make_room(path)?), settings)
     }
+
+    /// Begins a later part of a run at `path`, as [`Writer::continued`] says; the journals that are there are kept as by [`Writer::create`].
+    pub fn continue_at(path: &Path, settings: &Settings, weights: BTreeMap<u64, Vec<u8>>, taken: Option<u64>) -> std::io::Result<Self> {
+        Self::continued(BufWriter::new(make_room(path)?), settings, weights, taken)
+    }
+
+    /// Whether the file has become so large that the next part should begin.
+    pub fn is_full(&self) -> bool {
+        self.written > FILE_MAX
+    }
+
+    /// Number of bytes written.
+    pub fn len(&self) -> u64 {
+        self.written
+    }
+
+    /// Whether nothing was written yet.
+    pub fn is_empty(&self) -> bool {
+        self.written == 0
+    }
+
+    /// Ends this file, or what is left of it, and begins the next part of the run at `path`. Call it only outside of pours and recordings.
+    pub fn next_part(mut self, path: &Path, settings: &Settings) -> std::io::Result<Self> {
+        // What cannot be written any more is lost with a disk that is full.
+        let _ = self.flush();
+        let (weights, taken) = (std::mem::take(&mut self.weights), self.taken);
+        drop(self);
+        Self::continue_at(path, settings, weights, taken)
+    }
+}
+
+/// Moves the journals at `path` and beside it one place on, deletes what is beyond the budget, and makes the new file, locked.
+fn make_room(path: &Path) -> std::io::Result<File> {
+    if let Some(parent) = path.parent() {
+        std::fs::create_dir_all(parent)?;
+    }
+    if path.symlink_metadata().is_ok() {
+        let held = check_is_journal(path)?;
+        let there = (1..=KEPT).map(|n| before(path, n)).take_while(|p| p.symlink_metadata().is_ok()).collect::<Vec<_>>();
+        let lengths = there.iter().map(|p| check_is_journal(p).and_then(|f| Ok(f.metadata()?.len()))).collect::<Result<Vec<u64>, _>>()?;
+        // The newest come first; the one that has just ended counts too.
+        let mut sum = held.metadata()?.len();
+        let fits = lengths.iter().take_while(|len| {
+            sum += **len;
+            sum <= KEPT_BYTES
+        });
+        let kept = fits.count().min(KEPT as usize - 1);
+        for old in &there[kept..] {
+            std::fs::remove_file(old)?;
+        }
+        for n in (0..kept).rev() {
+            std::fs::rename(&there[n], before(path, n as u32 + 2))?;
+        }
+        // The journal of the run before is wanted most after that run has crashed.
+        std::fs::rename(path, before(path, 1))?;
+        drop(held);
+    }
+    let file = OpenOptions::new().write(true).create_new(true).open(path)?;
+    // Whoever looks meets the lock; a file system without locks has none to give.
+    let _ = file.try_lock();
+    Ok(file)
+}
+
+/// Where the `n`th journal before the one at `path` is kept, from 1.
+fn before(path: &Path, n: u32) -> PathBuf {
+    path.with_extension(if n == 1 { "before.bin".into() } else { format!("before-{n}.bin") })
 }
 
 impl<W: Write> Writer<W> {
     /// Starts a journal that goes to `to`.
     pub fn begin(to: W, settings: &Settings) -> std::io::Result<Self> {
-        let mut this = Self { to, written: 0, buffer: vec![0; ENTRY_MAX] };
+        let (weights, buffer) = (BTreeMap::new(), vec![0; ENTRY_MAX]);
+        let mut this = Self { to, written: 0, weights, taken: None, names_weights: false, buffer };
         this.to.write_all(MAGIC)?;
         this.entry(&Entry::Settings(*settings))?;
+        Ok(this)
+    }
+
+    /// Starts a later part of a run, which goes to `to`: the loop has the weights `taken` of `weights`.
+    pub fn continued(to: W, settings: &Settings, weights: BTreeMap<u64, Vec<u8>>, taken: Option<u64>) -> std::io::Result<Self> {
+        let mut this = Self::begin(to, settings)?;
+        this.entry(&Entry::Continued)?;
+        for (identity, bytes) in &weights {
+            this.entry(&Entry::Weights(*identity, bytes.clone()))?;
+        }
+        (this.weights, this.taken, this.names_weights) = (weights, taken, taken.is_some());
         Ok(this)
     }
 
     /// Adds weights that the loop may take from now on.
     pub fn weights(&mut self, identity: u64, weights: &Weights) -> std::io::Result<()> {
         let bytes = weights.to_bytes().map_err(std::io::Error::other)?;
+        // Only those that the loop has and the newest ones can still be taken.
+        self.weights.retain(|k, _| Some(*k) == self.taken);
+        self.weights.insert(identity, bytes.clone());
         self.entry(&Entry::Weights(identity, bytes))
     }
 
     /// Adds a tick.
-    pub fn tick(&mut self, tick: Box<Tick>) -> std::io::Result<()> {
+    pub fn tick(&mut self, mut tick: Box<Tick>) -> std::io::Result<()> {
+        self.taken = tick.agent.or(self.taken);
+        if std::mem::take(&mut self.names_weights) {
+            tick.agent = self.taken;
+        }
         self.entry(&Entry::Tick(tick))
     }
 
@@ -159,9 +246,6 @@ impl<W: Write> Writer<W> {
     }
 
     fn entry(&mut self, entry: &Entry) -> std::io::Result<()> {
-        if self.written > FILE_MAX {
-            return Err(std::io::Error::other("the journal is full (2 GiB)"));
-        }
         let bytes = postcard::to_slice(entry, &mut self.buffer).map_err(std::io::Error::other)?;
         self.written += 4 + bytes.len() as u64;
         self.to.write_all(&(bytes.len() as u32).to_le_bytes())?;
@@ -197,6 +281,9 @@ pub struct Replay {
     pub first_different: Option<u64>,
     /// Number of ticks whose deadline or margin is not the one that follows from the ticks before.
     pub different_deadlines: u64,
+    /// Whether the file begins in the middle of a run. Its answers are then compared from its first order on, because what the core knew before
+    /// stands in the part before.
+    pub continued: bool,
     /// Whether the file ends in the middle of an entry.
     pub cut_off: bool,
 }
@@ -208,8 +295,8 @@ pub fn replay(path: &Path, seen: impl FnMut(&Tick, &crate::core::Output)) -> Res
     replay_from(BufReader::new(reader), &file, seen)
 }
 
-/// Replays a journal through a new [`Core`] and compares every answer bit by bit. `name` is what errors call the journal; `seen` is called with each tick and the answer that the
-/// replay gave.
+/// Replays a journal through a new [`Core`] and compares every answer bit by bit. `name` is what errors call the journal; `seen` is called with
+/// each tick and the answer that the replay gave.
 pub fn replay_from(mut reader: impl Read, name: &str, mut seen: impl FnMut(&Tick, &crate::core::Output)) -> Result<Replay, JournalError> {
     let file = name.to_owned();
     let read = |e: std::io::Error| JournalError::Read { file: file.clone(), what: e.to_string() };
@@ -217,16 +304,13 @@ pub fn replay_from(mut reader: impl Read, name: &str, mut seen: impl FnMut(&Tick
     if reader.read_exact(&mut magic).is_err() || &magic != MAGIC {
         return Err(JournalError::Foreign { file });
     }
-    let mut result = Replay { ticks: 0, ended: Vec::new(), different: 0, first_different: None, different_deadlines: 0, cut_off: false };
-    let mut pacing: Option<(Pacer, Option<u64>)> = None;
-    let mut core: Option<Core> = None;
-    let mut weights = BTreeMap::new();
+    let mut rerun = Rerun::new();
     let mut at = MAGIC.len() as u64;
     let mut buffer = Vec::new();
     loop {
         let mut length = [0; 4];
         match reader.read(&mut length[..1]).map_err(read)? {
-            0 => return Ok(result),
+            0 => return Ok(rerun.result),
             _ if reader.read_exact(&mut length[1..]).is_err() => break,
             _ => {}
         }
@@ -239,40 +323,87 @@ pub fn replay_from(mut reader: impl Read, name: &str, mut seen: impl FnMut(&Tick
         if reader.read_exact(&mut buffer).is_err() {
             break;
         }
-        match (postcard::from_bytes(&buffer).map_err(|_| damaged())?, &mut core) {
-            (Entry::Settings(settings), _) => {
-                pacing = Some((Pacer::new(settings.period_ns), None));
-                core = Some(Core::new(settings));
-            }
-            (Entry::Weights(identity, bytes), _) => {
-                weights.insert(identity, Weights::from_bytes(&bytes, &file).map_err(|_| damaged())?);
-            }
-            (Entry::Tick(tick), Some(core)) => {
-                if let Some(identity) = tick.agent {
-                    core.exchange(Box::new(Agent::new(weights.get(&identity).ok_or_else(damaged)?)));
-                }
-                let Tick { now_ns, ref features, robot, order, .. } = *tick;
-                let output = core.step(&Input { now_ns, features, robot, order });
-                let same = output.target_deg.map(f32::to_bits) == tick.target_deg.map(f32::to_bits)
-                    && output.telemetry.d_ml.to_bits() == tick.d_ml.to_bits();
-                if !same {
-                    result.different += 1;
-                    result.first_different.get_or_insert(result.ticks);
-                }
-                if let Some((pacer, deadline_ns)) = &mut pacing {
-                    let same = deadline_ns.is_none_or(|ns| ns == tick.times.deadline_ns) && pacer.margin_ns() == tick.times.margin_ns;
-                    result.different_deadlines += u64::from(!same);
-                    tick.features.iter().for_each(|f| pacer.used(now_ns, f.published_at_ns));
-                    *deadline_ns = Some(pacer.next_deadline_ns(tick.times.deadline_ns, tick.times.done_ns).0);
-                }
-                result.ticks += 1;
-                result.ended.extend(output.ended);
-                seen(&tick, &output);
-            }
-            (Entry::Tick(_), None) => return Err(damaged()),
-        }
+        let entry = postcard::from_bytes(&buffer).map_err(|_| damaged())?;
+        rerun.take(entry, &mut seen).ok_or_else(damaged)?;
         at += 4 + length as u64;
     }
-    result.cut_off = true;
-    Ok(result)
+    rerun.result.cut_off = true;
+    Ok(rerun.result)
+}
+
+/// A replay under way.
+struct Rerun {
+    result: Replay,
+    /// Whether answers are compared already.
+    compared: bool,
+    /// The pacer and the deadline that it gave; `None` where it cannot be known.
+    pacing: Option<(Pacer, Option<u64>)>,
+    core: Option<Core>,
+    weights: BTreeMap<u64, Weights>,
+    /// When the newest tick woke up, ns.
+    before_ns: u64,
+}
+
+impl Rerun {
+    fn new() -> Self {
+        let result = Replay {
+            ticks: 0,
+            ended: Vec::new(),
+            different: 0,
+            first_different: None,
+            different_deadlines: 0,
+            continued: false,
+            cut_off: false,
+        };
+        Self { result, compared: true, pacing: None, core: None, weights: BTreeMap::new(), before_ns: 0 }
+    }
+
+    /// Takes the next entry; `None` if it cannot be right.
+    fn take(&mut self, entry: Entry, seen: &mut impl FnMut(&Tick, &crate::core::Output)) -> Option<()> {
+        match entry {
+            Entry::Settings(settings) => {
+                settings.are_plausible().then_some(())?;
+                self.pacing = Some((Pacer::new(settings.period_ns), None));
+                self.core = Some(Core::new(settings));
+            }
+            Entry::Continued => (self.result.continued, self.compared, self.pacing) = (true, false, None),
+            Entry::Weights(identity, bytes) => {
+                self.weights.insert(identity, Weights::from_bytes(&bytes, "").ok()?);
+            }
+            Entry::Tick(tick) => {
+                let output = self.tick(&tick)?;
+                self.result.ticks += 1;
+                self.result.ended.extend(output.ended);
+                seen(&tick, &output);
+            }
+        }
+        Some(())
+    }
+
+    /// Runs a tick again and compares; `None` if it cannot be right.
+    fn tick(&mut self, tick: &Tick) -> Option<crate::core::Output> {
+        let core = self.core.as_mut()?;
+        if let Some(identity) = tick.agent {
+            core.exchange(Box::new(Agent::new(self.weights.get(&identity)?)));
+        }
+        let Tick { now_ns, ref features, robot, order, times, .. } = *tick;
+        let in_order = now_ns >= self.before_ns && [now_ns, times.deadline_ns, times.done_ns].iter().all(|ns| *ns <= LATEST_NS);
+        in_order.then_some(())?;
+        self.before_ns = now_ns;
+        let output = core.step(&Input { now_ns, features, robot, order });
+        let same = output.target_deg.map(f32::to_bits) == tick.target_deg.map(f32::to_bits)
+            && output.telemetry.d_ml.to_bits() == tick.d_ml.to_bits();
+        self.compared |= self.result.ticks >= UNKNOWN_TICKS && output.ordered == Some(Ok(()));
+        if self.compared && !same {
+            self.result.different += 1;
+            self.result.first_different.get_or_insert(self.result.ticks);
+        }
+        if let Some((pacer, deadline_ns)) = &mut self.pacing {
+            let same = deadline_ns.is_none_or(|ns| ns == times.deadline_ns) && pacer.margin_ns() == times.margin_ns;
+            self.result.different_deadlines += u64::from(!same);
+            features.iter().for_each(|f| pacer.used(now_ns, f.published_at_ns));
+            *deadline_ns = Some(pacer.next_deadline_ns(times.deadline_ns, times.done_ns).0);
+        }
+        Some(output)
+    }
 }

@@ -27,6 +27,7 @@ pub mod commands;
 pub mod control_loop;
 pub mod core;
 pub mod disk;
+pub mod disk_note;
 pub mod exchange;
 pub mod foreseen;
 pub mod journal;

@@ -7,8 +7,7 @@
 
 use std::collections::{BTreeSet, VecDeque};
 use std::sync::atomic::{AtomicU64, Ordering::Relaxed, Ordering::SeqCst};
-use std::sync::{Mutex, PoisonError};
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use crossbeam::channel::{Receiver, Sender};
 use iceoryx2::active_request::ActiveRequest;
@@ -23,6 +22,7 @@ use shared::supervisor::Supervisor;
 use crate::client::MESSAGE_MAX;
 use crate::core::{Counters, Order, Refusal};
 use crate::disk::Queues;
+use crate::disk_note::DiskNote;
 use crate::exchange::{Event, Exchange};
 use crate::journal::Tick;
 use crate::robot_thread::RobotNote;
@@ -44,7 +44,7 @@ pub struct Service<'a> {
     server: Server<Ipc, [u8], (), [u8], ()>,
     telemetry: Publisher<Ipc, Telemetry, ()>,
     /// Why the newest weight file is not used; empty if it is.
-    refused: &'a Mutex<String>,
+    disk_note: &'a DiskNote,
     /// The queue to the journal; `None` if no journal is kept, or if the disk could not keep up.
     journal: Option<Sender<Box<Tick>>>,
     latest: Option<(Telemetry, Counters)>,
@@ -55,6 +55,8 @@ pub struct Service<'a> {
     numbers: Receiver<u64>,
     /// Numbers of orders that were refused: the next order takes them.
     spare: BTreeSet<u64>,
+    /// When this thread began.
+    started: Instant,
 }
 
 impl<'a> Service<'a> {
@@ -63,7 +65,7 @@ impl<'a> Service<'a> {
         cell: &Cell,
         exchange: &'a Exchange,
         (robot_note, robot_connections): (&'a RobotNote, &'a AtomicU64),
-        (refused, disk): (&'a Mutex<String>, Queues),
+        (disk_note, disk): (&'a DiskNote, Queues),
         say: &'a dyn Fn(&str),
     ) -> Result<Self, IpcError> {
         let server = cell
@@ -81,7 +83,8 @@ impl<'a> Service<'a> {
             say,
             server,
             telemetry,
-            refused,
+            disk_note,
+            started: Instant::now(),
             journal: disk.journal,
             latest: None,
             outcomes: VecDeque::new(),
@@ -111,6 +114,7 @@ impl<'a> Service<'a> {
                 Event::Tick(tick, telemetry, counters) => {
                     if self.journal.as_ref().is_some_and(|j| j.try_send(Box::new(tick)).is_err()) {
                         (self.say)("journal: the disk does not keep up; nothing more is written to it, and the controller goes on");
+                        self.disk_note.set(|n| n.journal = "ended: the disk does not keep up".into());
                         self.journal = None;
                     }
                     self.latest = Some((telemetry, counters));
@@ -150,7 +154,7 @@ impl<'a> Service<'a> {
 
     /// Why the newest weight file is not used; empty if it is.
     fn refused(&self) -> String {
-        self.refused.lock().unwrap_or_else(PoisonError::into_inner).clone()
+        self.disk_note.get().refused
     }
 
     /// The line that the operator gets for a refusal.
@@ -219,6 +223,7 @@ impl<'a> Service<'a> {
         let timing = &x.timing;
         let phase = Phase::from_code(t.phase);
         let note = self.robot_note.get();
+        let disk = self.disk_note.get();
         let hindrance = match phase {
             Phase::NoRobot if !note.text.is_empty() => note.text,
             Phase::NoRobot if t.alpha_measured_deg.is_finite() => Refusal::NotUpright(t.alpha_measured_deg).to_string(),
@@ -255,6 +260,11 @@ impl<'a> Service<'a> {
             weights_refused: if t.weights_id == 0 { String::new() } else { self.refused() },
             weights: t.weights(),
             weights_taken: x.agents_taken.load(Relaxed),
+            weights_age_s: disk.weights_written.and_then(|at| at.elapsed().ok()).map(|age| age.as_secs_f64()),
+            journal: disk.journal,
+            space: disk.space,
+            version: env!("CARGO_PKG_VERSION").into(),
+            uptime_s: self.started.elapsed().as_secs_f64(),
             timing: vec![
                 timing.lateness.snapshot("wake-up lateness"),
                 timing.execution.snapshot("tick execution"),

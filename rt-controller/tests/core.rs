@@ -196,11 +196,37 @@ fn an_action_is_finished_between_frames() {
     assert!((cell.alpha_deg - action_deg).abs() < 0.01, "{} degrees after an action of {action_deg}", cell.alpha_deg);
 }
 
+/// Protects the volume from a camera that is not as configured: a pour and a recording are refused with both rates, and a camera that becomes slow in
+/// a pour ends it by name, before it flows.
+#[test]
+fn a_camera_with_another_rate_pours_nothing() {
+    let mut cell = ToyCell::new();
+    cell.settings.frame_ns *= 2;
+    cell.core = Core::new(cell.settings);
+    cell.core.exchange(always(13));
+    (0..20).for_each(|_| _ = cell.tick(None));
+    let Err(refusal @ Refusal::FrameRate(..)) = cell.pour(50.0) else { panic!("not refused") };
+    assert!(refusal.to_string().contains("gives 30.0 frames a second, and camera.fps is 15.0"), "{refusal}");
+
+    let mut cell = ToyCell::new();
+    (0..20).for_each(|_| _ = cell.tick(None));
+    cell.pour(50.0).expect("ready");
+    let ticks = (0..200).find(|k| {
+        cell.camera = k % 2 == 0;
+        cell.tick(None);
+        cell.core.phase() != Phase::Pouring
+    });
+    assert!(ticks.is_some_and(|t| t <= 20), "{ticks:?} ticks");
+    cell.camera = true;
+    let outcome = cell.finish();
+    assert_eq!((outcome.reason, outcome.poured_words().starts_with("at least ")), (EndReason::FrameRate, true));
+}
+
 /// Protects the operator: a second goal while pouring, nonsense goals and missing weights are refused, with the reason.
 #[test]
 fn orders_that_cannot_be_obeyed_are_refused() {
     let mut cell = ToyCell::new();
-    for goal_ml in [0.0, -4.0, f32::NAN, f32::INFINITY, 301.0] {
+    for goal_ml in [0.0, -4.0, 1e-30, f32::NAN, f32::INFINITY, 301.0] {
         assert_eq!(cell.pour(goal_ml), Err(Refusal::Goal(300.0)));
     }
     cell.pour(50.0).expect("ready");

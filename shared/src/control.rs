@@ -100,7 +100,8 @@ pub fn volume_words(volume_ml: f32, sd_ml: f32) -> String {
 impl Outcome {
     /// The volume poured with its standard deviation, where that is known, ml.
     pub fn poured_words(&self) -> String {
-        volume_words(self.poured_ml, self.poured_sd_ml)
+        let volume = volume_words(self.poured_ml, self.poured_sd_ml);
+        if self.reason.leaves_unseen() { format!("at least {volume}") } else { volume }
     }
 }
 
@@ -152,9 +153,19 @@ pub enum EndReason {
     ImpossibleFlow,
     /// The camera shows no stream where even the emptiest container of the episodes would give one.
     NothingFlows,
+    /// The camera's frames do not come at `camera.fps`.
+    FrameRate,
 }
 
 impl EndReason {
+    /// Whether liquid may have left that nobody has seen or counted: without a camera, or without a robot whose way upright is known.
+    pub fn leaves_unseen(self) -> bool {
+        let camera = matches!(self, Self::StaleFeature | Self::WorkerRestarted | Self::FrameRate);
+        let link = matches!(self, Self::RobotLost | Self::RobotStalled | Self::ControllerOverrun | Self::SpeedReduced | Self::InHand);
+        let stopped = matches!(self, Self::ProtectiveStop | Self::EmergencyStop | Self::SafetyStop | Self::ProgramStopped);
+        camera || link || stopped || self == Self::RobotNotRunning
+    }
+
     /// The reason in words.
     pub fn words(self) -> &'static str {
         match self {
@@ -181,6 +192,7 @@ impl EndReason {
             Self::ImpossibleFlow => {
                 "what the camera shows cannot be: the stream does not follow the tilt as in the episodes; look at camera, vessel and liquid"
             }
+            Self::FrameRate => "the camera's frames do not come at camera.fps, so the volume is not known",
             Self::NothingFlows => {
                 "nothing is seen to flow, where even the emptiest vessel of the episodes would: look at the camera, or fill the vessel"
             }
@@ -247,6 +259,16 @@ pub struct Status {
     pub weights_taken: u64,
     /// Why the newest weight file was refused, one line; empty if it was not.
     pub weights_refused: String,
+    /// Age of the weight file that was read last, s; `None` before one was read.
+    pub weights_age_s: Option<f64>,
+    /// The journal, one line: its file and size, or why nothing is written.
+    pub journal: String,
+    /// Free space where journal and episodes lie, one line.
+    pub space: String,
+    /// Version of the controller.
+    pub version: String,
+    /// Time since the controller's start, s.
+    pub uptime_s: f64,
     /// Histograms of the loop's times.
     pub timing: Vec<Histogram>,
     /// Results of the newest pours and recordings, newest last.

@@ -115,6 +115,7 @@ impl Trace {
 fn settings(limits: Limits) -> Settings {
     Settings {
         period_ns: PERIOD_NS,
+        frame_ns: PERIOD_NS,
         limits,
         stale_ns: 200_000_000,
         max_frames: MAX_FRAMES,

@@ -8,8 +8,8 @@
 
 use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering::SeqCst};
-use std::sync::{Arc, Mutex};
 
 use shared::config::Config;
 use shared::exit::{self, Failure, OrExit as _, failure};
@@ -22,6 +22,7 @@ use crate::claim::Claim;
 use crate::control_loop;
 use crate::core::Settings;
 use crate::disk::Disk;
+use crate::disk_note::DiskNote;
 use crate::exchange::Exchange;
 use crate::link::network::System;
 use crate::robot_thread::{self, RobotNote};
@@ -123,8 +124,7 @@ struct Shared {
     exchange: Exchange,
     note: RobotNote,
     connections: AtomicU64,
-    /// Why the newest weight file is not used.
-    refused: Mutex<String>,
+    disk_note: DiskNote,
     /// Whether the robot's and the disk's threads are to end.
     end: AtomicBool,
     /// Whether everything is written.
@@ -141,11 +141,11 @@ fn run_threads(
     stop: &AtomicBool,
     say: &(dyn Fn(&str) + Sync),
 ) -> Result<(), Failure> {
-    let Shared { exchange, note, connections, refused, end, disk_done, .. } = shared;
+    let Shared { exchange, note, connections, disk_note, end, disk_done, .. } = shared;
     let cell = Cell::join(&config.cell).or_exit(exit::FAILED)?;
     cell.check_space(SHARED_MEMORY).or_exit(exit::FAILED)?;
-    let (disk, queues) = Disk::open(config, owner, exchange, refused, say).or_exit(exit::BAD_INPUT)?;
-    let service = Service::open(&cell, exchange, (note, connections), (refused, queues), say).or_exit(exit::FAILED)?;
+    let (disk, queues) = Disk::open(config, owner, exchange, disk_note, say).or_exit(exit::BAD_INPUT)?;
+    let service = Service::open(&cell, exchange, (note, connections), (disk_note, queues), say).or_exit(exit::FAILED)?;
     cell.reserve().or_exit(exit::FAILED)?;
     std::thread::scope(|scope| {
         let (ready_sender, ready) = std::sync::mpsc::channel();

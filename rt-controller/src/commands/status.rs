@@ -8,24 +8,41 @@ use shared::exit::{self, Failure, OrExit as _};
 
 use crate::client::{Client, Common};
 
+/// Pause between two looks with --watch. Chosen by hand; no measurement is recorded.
+const WATCH_BEAT: std::time::Duration = std::time::Duration::from_secs(1);
+
 /// Command-line arguments.
 #[derive(Debug, clap::Args)]
-#[command(after_help = "Examples:\n  rt-controller status\n  rt-controller status --json")]
+#[command(after_help = "Examples:\n  rt-controller status\n  rt-controller status --json\n  rt-controller status --watch")]
 pub struct Args {
     #[command(flatten)]
     common: Common,
+    /// Shows it again each second, until Ctrl-C; with --json, one line each.
+    #[arg(long)]
+    watch: bool,
 }
 
 /// Runs the command.
 pub fn run(args: &Args) -> Result<(), Failure> {
     let config = Config::read(&args.common.config).or_exit(exit::BAD_INPUT)?;
-    let status = Client::connect_or_end(&config.cell).and_then(|c| c.status()).or_exit(exit::UNREACHABLE)?;
-    if args.common.json {
-        println!("{}", serde_json::to_string_pretty(&status).or_exit(exit::FAILED)?);
-    } else {
-        print(&status);
+    let client = Client::connect_or_end(&config.cell).or_exit(exit::UNREACHABLE)?;
+    loop {
+        let status = client.status().or_exit(exit::UNREACHABLE)?;
+        match (args.common.json, args.watch) {
+            (true, false) => println!("{}", serde_json::to_string_pretty(&status).or_exit(exit::FAILED)?),
+            (true, true) => println!("{}", serde_json::to_string(&status).or_exit(exit::FAILED)?),
+            (false, false) => print(&status),
+            (false, true) => {
+                // These clear a terminal and go to its first place (ECMA-48).
+                print!("\x1b[2J\x1b[H");
+                print(&status);
+            }
+        }
+        if !args.watch {
+            return Ok(());
+        }
+        std::thread::sleep(WATCH_BEAT);
     }
-    Ok(())
 }
 
 /// The name that JSON has for a value.
@@ -33,15 +50,37 @@ fn name(value: &impl serde::Serialize) -> String {
     serde_json::to_value(value).ok().and_then(|v| v.as_str().map(String::from)).unwrap_or_default()
 }
 
+/// A time for people.
+fn age(seconds: f64) -> String {
+    let (days, hours, minutes) = (seconds / 86_400.0, seconds / 3600.0, seconds / 60.0);
+    match seconds {
+        s if s >= 172_800.0 => format!("{days:.0} days"),
+        s if s >= 7200.0 => format!("{hours:.0} h"),
+        s if s >= 120.0 => format!("{minutes:.0} min"),
+        s => format!("{s:.0} s"),
+    }
+}
+
 /// Prints the status for people.
 fn print(s: &Status) {
+    println!("version    {}, running for {}", s.version, age(s.uptime_s));
     println!("phase      {}", name(&s.phase));
     if !s.hindrance.is_empty() {
         println!("hindrance  {}", s.hindrance);
     }
-    println!("alpha      {:.2} deg commanded, {:.2} deg measured", s.alpha_deg, s.alpha_measured_deg);
-    println!("volume     goal {:.1} ml, d {:.1} ml, poured {} ml (estimate)", s.goal_ml, s.d_ml, volume_words(s.poured_ml, s.poured_sd_ml));
-    println!("weights    {} ({} taken)", if s.weights.is_empty() { "none" } else { &s.weights }, s.weights_taken);
+    let measured =
+        if s.alpha_measured_deg.is_finite() { format!("{:.2} deg measured", s.alpha_measured_deg) } else { "not measured".into() };
+    println!("alpha      {:.2} deg commanded, {measured}", s.alpha_deg);
+    if s.goal_ml.is_finite() {
+        println!(
+            "volume     goal {:.1} ml, d {:.1} ml, poured {} ml (estimate)",
+            s.goal_ml,
+            s.d_ml,
+            volume_words(s.poured_ml, s.poured_sd_ml)
+        );
+    }
+    let written = s.weights_age_s.map_or(String::new(), |a| format!(", the newest file written {} ago", age(a)));
+    println!("weights    {} ({} taken{written})", if s.weights.is_empty() { "none" } else { &s.weights }, s.weights_taken);
     if !s.weights_refused.is_empty() {
         println!("           refused: {}", s.weights_refused);
     }
@@ -50,6 +89,8 @@ fn print(s: &Status) {
     let c = s.clipped;
     println!("clipped    angle {}, rate {}, acceleration {}, not finite {}", c.angle, c.rate, c.acceleration, c.not_finite);
     println!("loop       {} allocations, {} page faults, {} events lost", s.loop_allocations, s.loop_page_faults, s.events_lost);
+    println!("journal    {}", s.journal);
+    println!("space      {}", s.space);
     println!("robot      {}, {} connections", name(&s.robot), s.robot_connections);
     if !s.robot_warning.is_empty() {
         println!("           warning: {}", s.robot_warning);

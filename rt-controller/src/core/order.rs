@@ -50,9 +50,11 @@ pub enum Refusal {
     NotUpright(f32),
     /// There is no fresh, usable measurement.
     NoFeature,
+    /// The camera gives this many frames a second, and the second number is the configured one.
+    FrameRate(f32, f32),
     /// No valid weights are loaded.
     NoWeights,
-    /// The goal is not a number above 0 and up to this, ml.
+    /// The goal is not a number from [`LEAST_GOAL_ML`] up to this, ml.
     Goal(f32),
     /// The curve leaves the limits.
     Curve,
@@ -80,8 +82,13 @@ impl std::fmt::Display for Refusal {
                     "there is no fresh, usable measurement: check that `feature-worker run` is running and what it says of the camera"
                 )
             }
+            Self::FrameRate(hz, configured_hz) => write!(
+                f,
+                "the camera gives {hz:.1} frames a second, and camera.fps is {configured_hz:.1}: every volume would be wrong; set the camera, or \
+                 camera.fps and train anew (low light makes some cameras slower)"
+            ),
             Self::NoWeights => write!(f, "no valid weight file is loaded: train one, or see `rt-controller status`"),
-            Self::Goal(max) => write!(f, "the goal must be above 0 and at most {max} ml (controller.goal_max_ml)"),
+            Self::Goal(max) => write!(f, "the goal must be {LEAST_GOAL_ML} to {max} ml (controller.goal_max_ml)"),
             Self::Curve => write!(f, "the curve leaves [limits]: choose a smaller lambda or gamma, and a beta of 0.5 to 60 s"),
             Self::Shutdown => write!(f, "the controller is shutting down"),
             Self::Stopped => write!(f, "an abort came before this order's turn: give it again"),
@@ -100,6 +107,8 @@ pub struct Situation {
     pub shutdown: bool,
     /// Age of the newest usable measurement, ns.
     pub measurement_age_ns: u64,
+    /// The camera's rate and the configured one, frames/s, if they differ.
+    pub wrong_rate_hz: Option<(f32, f32)>,
 }
 
 impl Situation {
@@ -123,7 +132,10 @@ impl Situation {
         if let Some(share) = self.robot.speed_scaling.filter(|_| following::is_slowed(&self.robot)) {
             return Err(Refusal::Slowed(share));
         }
-        if self.measurement_age_ns <= settings.stale_ns { Ok(()) } else { Err(Refusal::NoFeature) }
+        if self.measurement_age_ns > settings.stale_ns {
+            return Err(Refusal::NoFeature);
+        }
+        self.wrong_rate_hz.map_or(Ok(()), |(hz, configured_hz)| Err(Refusal::FrameRate(hz, configured_hz)))
     }
 
     /// Whether an abort can be obeyed: the robot can be moved at all.
@@ -136,9 +148,12 @@ impl Situation {
     }
 }
 
+/// The least goal, ml: two drops. Chosen by hand: no stream and no scale of a kitchen tells less.
+const LEAST_GOAL_ML: f32 = 0.1;
+
 /// Whether `goal_ml` is a goal that may be poured.
 pub fn goal_is_legal(goal_ml: f32, settings: &Settings) -> Result<(), Refusal> {
-    if goal_ml > 0.0 && goal_ml <= settings.goal_max_ml { Ok(()) } else { Err(Refusal::Goal(settings.goal_max_ml)) }
+    if goal_ml >= LEAST_GOAL_ML && goal_ml <= settings.goal_max_ml { Ok(()) } else { Err(Refusal::Goal(settings.goal_max_ml)) }
 }
 
 /// Whether `curve` keeps the limits, so that it is run exactly as given.

@@ -14,6 +14,8 @@ use crate::link::program::{patience_s, usual_lag_s};
 pub struct Settings {
     /// Period of a tick, ns.
     pub period_ns: u64,
+    /// Time from one camera frame to the next by the configuration, ns; 0 if it is not known.
+    pub frame_ns: u64,
     /// Limits on alpha.
     pub limits: Limits,
     /// Largest age of the newest usable measurement during a pour or recording, ns.
@@ -34,12 +36,33 @@ pub struct Settings {
     pub usual_lag_ns: u64,
 }
 
+/// The longest time in the settings, ns: an hour, far more than any configuration may say.
+const LONGEST_NS: u64 = 3600 * 1_000_000_000;
+
 impl Settings {
+    /// Whether these can be the settings of a controller. Those of a configuration always can; a file may have been damaged.
+    pub fn are_plausible(&self) -> bool {
+        let Limits { alpha_min_deg, alpha_max_deg, step_deg, rate_deg_s, acceleration_deg_s2, return_rate_deg_s } = self.limits;
+        let times_ns = [self.frame_ns, self.stale_ns, self.patience_ns, self.usual_lag_ns];
+        // The ranges are those of the configuration. What is not a number is in none of them.
+        (1_000_000..=1_000_000_000).contains(&self.period_ns)
+            && times_ns.iter().all(|ns| *ns <= LONGEST_NS)
+            && (-20.0..=0.0).contains(&alpha_min_deg)
+            && (10.0..=180.0).contains(&alpha_max_deg)
+            && (0.1..=6.0).contains(&step_deg)
+            && (1.0..=180.0).contains(&rate_deg_s)
+            && (10.0..=2290.0).contains(&acceleration_deg_s2)
+            && (1.0..=180.0).contains(&return_rate_deg_s)
+            && (0.0..=1e9).contains(&self.goal_max_ml)
+            && (0.0..=10.0).contains(&self.upright_deg)
+    }
+
     /// Takes the settings out of the cell's configuration.
     pub fn new(config: &Config) -> Self {
         let controller = &config.controller;
         Self {
             period_ns: (1e9 / controller.rate_hz) as u64,
+            frame_ns: (1e9 / config.camera.fps) as u64,
             limits: config.limits,
             stale_ns: u64::from(controller.stale_feature_ms) * 1_000_000,
             max_frames: controller.max_frames,

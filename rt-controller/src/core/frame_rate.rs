@@ -1,0 +1,104 @@
+//! Whether the camera's frames come at the rate that the configuration says: by their own times and numbers, and not by when they arrive.
+//!
+//! A frame stands for the volume of one frame time, and the agent acts once a frame. A camera that gives 60 frames a second instead of 30, or 15
+//! because the light is low, makes every volume wrong, and nothing in the pictures shows it. It is pure and runs in the controller's loop; it
+//! does not allocate or fail.
+
+use shared::messages::Feature;
+
+/// Number of frame times that are compared: half a second at 30 Hz. Chosen by hand: less than the way to the first drop.
+const WINDOW: usize = 15;
+/// Largest relative difference of their median from the configured frame time. Chosen by hand: the clocks of cameras differ by far less, and
+/// the next slower rate that cameras offer below 30 is 25.
+const TOLERANCE: f64 = 0.1;
+
+/// The newest frame times of one feature worker.
+#[derive(Debug, Clone, Copy)]
+pub struct FrameRate {
+    /// The configured frame time, ns; 0 if it is not known, and then nothing is compared.
+    frame_ns: u64,
+    newest: Option<(u64, u64, u64)>,
+    times_ns: [u64; WINDOW],
+    seen: usize,
+}
+
+impl FrameRate {
+    /// The watch over frames that should come every `frame_ns`; 0 watches nothing.
+    pub fn new(frame_ns: u64) -> Self {
+        Self { frame_ns, newest: None, times_ns: [0; WINDOW], seen: 0 }
+    }
+
+    /// Takes the next frame of those that count. A frame that was lost has a number too, so that it makes no other time longer.
+    pub fn saw(&mut self, feature: &Feature) {
+        let Feature { worker_epoch_ns, sequence, captured_at_ns, .. } = *feature;
+        match self.newest {
+            Some((epoch_ns, number, at_ns)) if epoch_ns == worker_epoch_ns => {
+                let frames = sequence.saturating_sub(number).max(1);
+                self.times_ns[self.seen % WINDOW] = captured_at_ns.saturating_sub(at_ns) / frames;
+                self.seen = if self.seen + 1 == 2 * WINDOW { WINDOW } else { self.seen + 1 };
+            }
+            _ => self.seen = 0,
+        }
+        self.newest = Some((worker_epoch_ns, sequence, captured_at_ns));
+    }
+
+    /// The rate at which frames really come, frames/s, if it is another than the configured one. The median does not see a single pause.
+    pub fn wrong_hz(&self) -> Option<f32> {
+        if self.frame_ns == 0 || self.seen < WINDOW {
+            return None;
+        }
+        let mut times_ns = self.times_ns;
+        times_ns.sort_unstable();
+        let median_ns = times_ns[WINDOW / 2];
+        let off = (median_ns as f64 / self.frame_ns as f64 - 1.0).abs();
+        (off > TOLERANCE).then_some((1e9 / median_ns.max(1) as f64) as f32)
+    }
+
+    /// The configured rate, frames/s.
+    pub fn configured_hz(&self) -> f32 {
+        (1e9 / self.frame_ns.max(1) as f64) as f32
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// What is found after `frames` frames that come every `frame_ms`; every `lose`th is lost, and every `pause`th comes 0.3 s late.
+    fn wrong_hz(frame_ms: f64, frames: u64, lose: u64, pause: u64) -> Option<f32> {
+        let mut rate = FrameRate::new(1_000_000_000 / 30);
+        for sequence in (0..frames).filter(|k| k % lose != 1) {
+            let late_ns = if sequence % pause == 5 { 300_000_000 } else { 0 };
+            let captured_at_ns = 5_000_000_000 + (sequence as f64 * frame_ms * 1e6) as u64 + late_ns;
+            rate.saw(&Feature { worker_epoch_ns: 7, sequence, captured_at_ns, ..Feature::default() });
+        }
+        rate.wrong_hz()
+    }
+
+    /// Protects the volume from a camera with another rate than the configured one, and ordinary cameras, lost frames and pauses from a false
+    /// alarm.
+    #[test]
+    fn another_rate_is_noticed_within_half_a_second() {
+        for hz in [60.0, 50.0, 25.0, 15.0, 7.5] {
+            let found = wrong_hz(1e3 / hz, 18, 100, 100);
+            assert!(found.is_some_and(|f| (f64::from(f) / hz - 1.0).abs() < 0.01), "{hz}: {found:?}");
+        }
+        for (frame_ms, lose, pause) in [(33.333, 1000, 1000), (33.367, 3, 40), (33.0, 2, 9), (34.0, 1000, 12)] {
+            assert_eq!(wrong_hz(frame_ms, 600, lose, pause), None, "{frame_ms} {lose} {pause}");
+        }
+        assert_eq!(wrong_hz(66.0, 10, 100, 100), None, "too few to say");
+    }
+
+    /// Protects the next worker: with it, everything is learned anew.
+    #[test]
+    fn another_worker_begins_anew() {
+        let mut rate = FrameRate::new(1_000_000_000 / 30);
+        for k in 0..40 {
+            rate.saw(&Feature { worker_epoch_ns: 1, sequence: k, captured_at_ns: k * 66_000_000, ..Feature::default() });
+        }
+        assert!(rate.wrong_hz().is_some());
+        rate.saw(&Feature { worker_epoch_ns: 2, sequence: 0, captured_at_ns: 40 * 66_000_000, ..Feature::default() });
+        assert_eq!(rate.wrong_hz(), None);
+        assert_eq!(FrameRate::new(0).wrong_hz(), None);
+    }
+}

@@ -1,0 +1,67 @@
+//! What the disk's thread has to say to operators: the journal's state, free space, and the weight file. Ordinary threads share it; it
+//! allocates and never fails.
+
+use std::path::Path;
+use std::sync::{Mutex, PoisonError};
+use std::time::SystemTime;
+
+/// The newest state of what lies on disks.
+#[derive(Debug, Default, Clone)]
+pub struct DiskState {
+    /// Why the newest weight file is not used, one line; empty if it is used.
+    pub refused: String,
+    /// When the weight file that was read last was written.
+    pub weights_written: Option<SystemTime>,
+    /// The journal, one line: its file and size, or why nothing is written.
+    pub journal: String,
+    /// Free space where journal and episodes lie, one line.
+    pub space: String,
+}
+
+/// [`DiskState`], shared.
+#[derive(Debug, Default)]
+pub struct DiskNote(Mutex<DiskState>);
+
+impl DiskNote {
+    /// The newest state.
+    pub fn get(&self) -> DiskState {
+        self.0.lock().unwrap_or_else(PoisonError::into_inner).clone()
+    }
+
+    /// Changes the state.
+    pub fn set(&self, change: impl FnOnce(&mut DiskState)) {
+        change(&mut self.0.lock().unwrap_or_else(PoisonError::into_inner));
+    }
+}
+
+/// The free space of the file systems of `paths`, in words; each file system once.
+pub fn space_words(paths: &[&Path]) -> String {
+    let mut seen = Vec::new();
+    let mut words = Vec::new();
+    for path in paths {
+        // A directory that is not made yet lies on the file system of the one above it.
+        let there = path.ancestors().find_map(|p| rustix::fs::statvfs(p).ok().map(|fs| (p, fs)));
+        let Some((there, fs)) = there else { continue };
+        if !seen.contains(&fs.f_fsid) {
+            seen.push(fs.f_fsid);
+            let free_gb = fs.f_bavail as f64 * fs.f_frsize as f64 / 1e9;
+            words.push(format!("{free_gb:.1} GB free in {}", there.display()));
+        }
+    }
+    words.join(", ")
+}
+
+/// The free space where `path` is or will be, bytes; `None` if it is not known.
+pub fn free_bytes(path: &Path) -> Option<u64> {
+    let fs = path.ancestors().find_map(|p| rustix::fs::statvfs(p).ok())?;
+    Some(fs.f_bavail.saturating_mul(fs.f_frsize))
+}
+
+/// An error of the disk in words: a full one is called so.
+pub fn error_words(e: &std::io::Error) -> String {
+    match e.kind() {
+        std::io::ErrorKind::StorageFull => format!("the disk is full ({e}): delete what is not needed"),
+        std::io::ErrorKind::QuotaExceeded => format!("the quota of this user is used up ({e}): delete what is not needed"),
+        _ => e.to_string(),
+    }
+}

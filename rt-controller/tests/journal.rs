@@ -1,0 +1,168 @@
+//! Journals as files from anywhere: whatever is changed in them, reading them gives an answer or one line, and never a panic.
+#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::too_many_lines)]
+
+#[path = "../../shared/examples/write_weights.rs"]
+#[allow(dead_code)]
+mod write_weights;
+
+use std::panic::{AssertUnwindSafe, catch_unwind};
+
+use rt_controller::core::{Core, Input, Order, Robot, Settings};
+use rt_controller::journal::{Tick, Times, Writer, replay_from};
+use shared::agent::Agent;
+use shared::config::Config;
+use shared::messages::{Feature, LAYOUT_VERSION};
+
+fn settings() -> Settings {
+    Settings::new(&Config::parse(include_str!("../../config/sim.toml"), "config/sim.toml").expect("the shipped configuration is valid"))
+}
+
+/// Two parts of a journal of `ticks` ticks, the second of which begins at `cut`, with pours ordered at `orders` and a wrong answer in the tick `lie`, from a cell in which a stream begins
+/// at 20 degrees.
+fn parts(ticks: u64, cut: u64, orders: &[u64], lie: u64) -> [Vec<u8>; 2] {
+    let settings = settings();
+    let weights = write_weights::constant_action(3);
+    let (mut bytes, mut later) = (Vec::new(), Vec::new());
+    let mut writer = Writer::begin(&mut bytes, &settings).expect("memory");
+    let known = [(1, weights.to_bytes().expect("valid"))].into();
+    let mut second = Writer::continued(&mut later, &settings, known, Some(1)).expect("memory");
+    writer.weights(1, &weights).expect("memory");
+    let mut core = Core::new(settings);
+    let mut alpha_deg = 0.0;
+    for k in 0..ticks {
+        let agent = (k == 1).then_some(1);
+        if agent.is_some() {
+            core.exchange(Box::new(Agent::new(&weights)));
+        }
+        let now_ns = 1_000_000_000 + k * settings.period_ns;
+        let mut features = heapless::Vec::new();
+        let feature = Feature {
+            version: LAYOUT_VERSION,
+            sequence: k,
+            worker_epoch_ns: 7,
+            captured_at_ns: now_ns - 20_000_000,
+            received_at_ns: now_ns - 1_000_000,
+            published_at_ns: now_ns - 500_000,
+            area_px2: 30.0 * f32::max(alpha_deg - 20.0, 0.0),
+            confidence: 1.0,
+            ..Feature::default()
+        };
+        features.push(feature).expect("room");
+        let robot = Robot::that_may_move(alpha_deg, now_ns - 4_000_000);
+        let order = orders.contains(&k).then_some(Order::Pour { episode: 1, goal_ml: 50.0, flows_by_deg: None });
+        let output = core.step(&Input { now_ns, features: &features, robot, order });
+        alpha_deg = output.target_deg.unwrap_or(alpha_deg);
+        let times = Times { deadline_ns: now_ns, decided_at_ns: now_ns, written_at_ns: now_ns, done_ns: now_ns, margin_ns: 0 };
+        let d_ml = output.telemetry.d_ml + f32::from(u8::from(k == lie));
+        let target_deg = output.target_deg;
+        let to = if k < cut { &mut writer } else { &mut second };
+        to.tick(Box::new(Tick { now_ns, features, robot, order, agent, target_deg, d_ml, times })).expect("memory");
+    }
+    writer.flush().and_then(|()| second.flush()).expect("memory");
+    drop((writer, second));
+    [bytes, later]
+}
+
+/// A journal of `ticks` ticks with one pour.
+fn journal(ticks: u64) -> Vec<u8> {
+    let [whole, _] = parts(ticks, u64::MAX, &[5], u64::MAX);
+    whole
+}
+
+/// Protects a long run's journal: its later part begins with the weights that the loop has, and from its first order on it replays to the bit; a tick
+/// that was changed there is found.
+#[test]
+fn a_later_part_replays_from_its_first_order_on() {
+    let [first, second] = parts(1200, 700, &[5, 800], u64::MAX);
+    let replayed = replay_from(&first[..], "first", |_, _| {}).expect("whole");
+    assert_eq!((replayed.ticks, replayed.different, replayed.continued, replayed.ended.len()), (700, 0, false, 1));
+    let mut compared = 0;
+    let replayed = replay_from(&second[..], "second", |tick, output| {
+        compared += u32::from(tick.target_deg == output.target_deg);
+    })
+    .expect("whole");
+    assert_eq!((replayed.ticks, replayed.different, replayed.continued, replayed.ended.len()), (500, 0, true, 1), "{replayed:?}");
+    assert!(compared > 400, "{compared}");
+    for (lie, found) in [(750, 0), (900, 1)] {
+        let [_, second] = parts(1200, 700, &[5, 800], lie);
+        let replayed = replay_from(&second[..], "changed", |_, _| {}).expect("whole");
+        assert_eq!(replayed.different, found, "a wrong answer in tick {lie}");
+    }
+}
+
+/// Protects a crash from the starts after it: each start keeps the journals before it, the newest first, and more than one; what is no journal in any of
+/// their places is left, and so is everything else.
+#[test]
+fn starts_keep_the_journals_before_them() {
+    let dir = tempfile::tempdir().expect("a directory");
+    let path = dir.path().join("new/j.bin");
+    for start in 0..5u32 {
+        let mut writer = Writer::create(&path, &settings()).expect("writable");
+        let weights = write_weights::constant_action(start as i32);
+        writer.weights(u64::from(start), &weights).and_then(|()| writer.flush()).expect("space");
+    }
+    let begun = |name: &str| rt_controller::journal::replay(&dir.path().join("new").join(name), |_, _| {}).is_ok();
+    for name in ["j.bin", "j.before.bin", "j.before-2.bin", "j.before-3.bin", "j.before-4.bin"] {
+        assert!(begun(name), "{name}");
+    }
+    let bytes = |name: &str| std::fs::read(dir.path().join("new").join(name)).expect("there");
+    assert_ne!(bytes("j.before-4.bin"), bytes("j.before.bin"), "the oldest is the first");
+    // 30 starts keep 20, and 1 GiB.
+    for _ in 0..30 {
+        drop(Writer::create(&path, &settings()).expect("writable"));
+    }
+    assert_eq!(std::fs::read_dir(dir.path().join("new")).expect("there").count(), 21);
+    std::fs::File::options().write(true).open(dir.path().join("new/j.before-3.bin")).and_then(|f| f.set_len(1 << 30)).expect("sparse");
+    drop(Writer::create(&path, &settings()).expect("writable"));
+    assert_eq!(std::fs::read_dir(dir.path().join("new")).expect("there").count(), 4, "the large one and what is older went");
+    std::fs::write(dir.path().join("new/j.before-2.bin"), b"a letter").expect("writable");
+    assert!(Writer::create(&path, &settings()).is_err());
+    assert_eq!(bytes("j.before-2.bin"), b"a letter");
+    assert!(begun("j.bin") && begun("j.before.bin"));
+}
+
+/// Protects whoever replays a journal from a defect in it: bytes, whole words and lengths are changed at seeded places, mostly in the settings
+/// and the first ticks; none of it is a panic. The whole journal replays to the bit.
+#[test]
+fn a_changed_journal_is_an_answer_or_a_line() {
+    let whole = journal(120);
+    let replayed = replay_from(&whole[..], "whole", |_, _| {}).expect("whole");
+    assert_eq!((replayed.ticks, replayed.different), (120, 0));
+    std::panic::set_hook(Box::new(|_| {}));
+    let mut seed = 0x2545_f491_4f6c_dd1du64;
+    let mut random = move |below: usize| {
+        seed ^= seed << 13;
+        seed ^= seed >> 7;
+        seed ^= seed << 17;
+        (seed >> 16) as usize % below
+    };
+    let (mut panics, mut refused) = (Vec::new(), 0);
+    // The settings are the first entry, before the weights.
+    let settings_end = 12 + u32::from_le_bytes(whole[8..12].try_into().unwrap()) as usize;
+    for round in 0..4000 {
+        let mut changed = whole.clone();
+        for _ in 0..=random(3) {
+            let at = match round % 3 {
+                0 => 12 + random(settings_end - 12),
+                1 => settings_end + random(whole.len() - settings_end),
+                // Past the weights, where a checksum does not keep changes out.
+                _ => whole.len() - 1 - random(whole.len() / 3),
+            };
+            match random(3) {
+                0 => changed[at] = random(256) as u8,
+                1 => changed[at] ^= 1 << random(8),
+                _ => {
+                    let end = (at + 4).min(changed.len());
+                    changed[at..end].fill([0, 0xff, 0x7f, 0x80][random(4)]);
+                }
+            }
+        }
+        match catch_unwind(AssertUnwindSafe(|| replay_from(&changed[..], "changed", |_, _| {}).is_err())) {
+            Ok(err) => refused += usize::from(err),
+            Err(what) => panics.push((round, what.downcast_ref::<String>().cloned().unwrap_or_default())),
+        }
+    }
+    let _ = std::panic::take_hook();
+    assert!(panics.is_empty(), "{} panics, the first: {:?}", panics.len(), &panics[..panics.len().min(3)]);
+    assert!(refused > 300, "{refused} of the changed journals are refused");
+}
