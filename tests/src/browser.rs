@@ -30,8 +30,11 @@ impl Browser {
             println!("not run: there is no chromedriver (scripts/install chromium-driver)");
             return None;
         };
-        let lines = BufReader::new(driver.stdout.take().expect("piped")).lines();
-        let port = lines.map_while(Result::ok).find_map(|l| l.split_once(" on port ")?.1.trim_end_matches('.').parse().ok());
+        let mut lines = BufReader::new(driver.stdout.take().expect("piped")).lines();
+        let said = |line: String| line.split_once("successfully on port ")?.1.trim_end_matches('.').parse().ok();
+        let port = lines.by_ref().map_while(Result::ok).find_map(said);
+        // What it says more is not wanted, and must not hold it up.
+        std::thread::spawn(move || lines.map_while(Result::ok).for_each(drop));
         let mut this = Self { driver, port: port.expect("chromedriver says its port"), session: String::new() };
         let arguments = [
             "--headless=new".into(),
