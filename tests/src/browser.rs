@@ -61,11 +61,19 @@ impl Browser {
             body.len()
         )
         .expect("it reads");
-        let mut answer = Vec::new();
-        // Chromedriver may keep the connection open; what counts is that the answer is whole.
-        let _ = stream.read_to_end(&mut answer);
-        let text = String::from_utf8_lossy(&answer);
-        let value = text.split_once("\r\n\r\n").map(|(_, body)| serde_json::from_str::<Value>(body).expect("JSON")).expect("an answer");
+        // Chromedriver keeps the connection open: the answer's length says where it ends.
+        let mut answer = BufReader::new(stream);
+        let (mut line, mut length) = (String::new(), 0);
+        while line != "\r\n" {
+            line.clear();
+            assert!(answer.read_line(&mut line).expect("an answer") > 0, "{method} {path}: chromedriver has gone");
+            if let Some((_, value)) = line.to_lowercase().split_once("content-length:") {
+                length = value.trim().parse().expect("a length");
+            }
+        }
+        let mut text = vec![0; length];
+        answer.read_exact(&mut text).expect("the answer");
+        let value: Value = serde_json::from_slice(&text).expect("JSON");
         assert!(value["value"]["error"].is_null(), "{method} {path}: {}", value["value"]["message"]);
         value["value"].clone()
     }
