@@ -26,6 +26,9 @@ async function stop() {
     $('stop-said').textContent = `Stop failed: ${first ? first.message : 'the page\'s server cannot be reached'}. Use the robot's own stop.`;
   }
   word.textContent = 'Stop';
+  // What was said of this Stop is not taken for an answer to a later one.
+  const said = $('stop-said').textContent;
+  setTimeout(() => { if ($('stop-said').textContent === said) $('stop-said').textContent = ''; }, 8000);
 }
 $('stop').onclick = stop;
 

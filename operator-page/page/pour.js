@@ -127,6 +127,7 @@ $('hold').onclick = () => {
 };
 
 async function order() {
+  $('stop-said').textContent = '';
   $('result').hidden = true;
   const answer = await attempt(() => post('/api/pour', { goal_ml: foreseen.goal_ml, fill_ml: foreseen.fill_ml, hold }));
   if (answer) { ordered = answer.episode; mine = true; if (!hold) $('confirm').hidden = true; } else if (holding) letGo(false);

@@ -49,8 +49,9 @@ impl Calibration {
         self.0.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// Starts to watch the camera for `seconds`, during which one pour is to be shown. `method` is `colour`, `clear`, or empty.
-    pub fn start(self: &Arc<Self>, config: &Path, seconds: u64, method: &str) -> Result<(), String> {
+    /// Starts to watch the camera for `seconds`, during which one pour is to be shown. `method` is `colour`, `clear`, or
+    /// anything else for the configured one. A picture for people is written to `picture`.
+    pub fn start(self: &Arc<Self>, (config, picture): (&Path, &Path), seconds: u64, method: &str) -> Result<(), String> {
         if !(3..=SECONDS_MAX).contains(&seconds) {
             return Err(format!("the camera can be watched for 3 to {SECONDS_MAX} s"));
         }
@@ -62,6 +63,7 @@ impl Calibration {
         let path = program("feature-worker");
         let mut command = Command::new("nice");
         command.args(["-n", "19"]).arg(&path).arg("calibrate").arg("--config").arg(config);
+        command.arg("--picture").arg(picture);
         command.args(["--seconds", &seconds.to_string(), "--page", "--port", "0"]);
         if ["colour", "clear"].contains(&method) {
             command.args(["--method", method]);

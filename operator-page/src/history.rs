@@ -152,6 +152,13 @@ impl History {
         lines.into_iter().skip(skipped).map(|(_, name)| self.directory.join(name)).collect()
     }
 
+    /// Reads the episode `name` again at once, so that what is asked next knows what was just written into it.
+    pub fn refresh(&self, name: &str) {
+        let path = self.directory.join(name);
+        let (stamp, value) = (stamp(&path), line(&path));
+        locked(&self.table).insert(name.into(), Line { stamp, value });
+    }
+
     /// What a plan is made from: the weighed files, or else a directory in which no episode is.
     pub fn for_plan(&self) -> Result<Vec<PathBuf>, String> {
         let weighed = self.weighed(None);

@@ -160,5 +160,6 @@ fn take_back_if_it_waits(site: &Site) -> Result<(), String> {
 pub fn weigh(site: &Site, name: &str, grams: f64) -> Result<Value, String> {
     let path = site.history.path(name)?;
     let before = set_weight(&path, grams).map_err(|e| e.to_string())?;
+    site.history.refresh(name);
     Ok(json!({ "file": name, "weight_g": grams, "before_g": before }))
 }

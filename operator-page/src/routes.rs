@@ -192,7 +192,8 @@ fn act(site: &Site, path: &str, order: Order) -> Result<Value, String> {
 fn calibrate(site: &Site, order: &Order) -> Result<Value, String> {
     match order.what.as_str() {
         "colour" | "clear" | "as-configured" => {
-            site.calibration.start(&site.file, order.seconds, &order.what)?;
+            let picture = site.config.controller.weights.with_file_name("calibration.png");
+            site.calibration.start((&site.file, &picture), order.seconds, &order.what)?;
             Ok(json!({ "words": "watching" }))
         }
         "corner" => site.calibration.order("/corner", &order.corner.to_string()).map(|words| json!({ "words": words })),

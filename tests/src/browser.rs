@@ -30,8 +30,11 @@ impl Browser {
             println!("not run: there is no chromedriver (scripts/install chromium-driver)");
             return None;
         };
-        let lines = BufReader::new(driver.stdout.take().expect("piped")).lines();
-        let port = lines.map_while(Result::ok).find_map(|l| l.split_once(" on port ")?.1.trim_end_matches('.').parse().ok());
+        let mut lines = BufReader::new(driver.stdout.take().expect("piped")).lines();
+        let said = |line: String| line.split_once("successfully on port ")?.1.trim_end_matches('.').parse().ok();
+        let port = lines.by_ref().map_while(Result::ok).find_map(said);
+        // What it says more is not wanted, and must not hold it up.
+        std::thread::spawn(move || lines.map_while(Result::ok).for_each(drop));
         let mut this = Self { driver, port: port.expect("chromedriver says its port"), session: String::new() };
         let arguments = [
             "--headless=new".into(),
@@ -58,11 +61,19 @@ impl Browser {
             body.len()
         )
         .expect("it reads");
-        let mut answer = Vec::new();
-        // Chromedriver may keep the connection open; what counts is that the answer is whole.
-        let _ = stream.read_to_end(&mut answer);
-        let text = String::from_utf8_lossy(&answer);
-        let value = text.split_once("\r\n\r\n").map(|(_, body)| serde_json::from_str::<Value>(body).expect("JSON")).expect("an answer");
+        // Chromedriver keeps the connection open: the answer's length says where it ends.
+        let mut answer = BufReader::new(stream);
+        let (mut line, mut length) = (String::new(), 0);
+        while line != "\r\n" {
+            line.clear();
+            assert!(answer.read_line(&mut line).expect("an answer") > 0, "{method} {path}: chromedriver has gone");
+            if let Some((_, value)) = line.to_lowercase().split_once("content-length:") {
+                length = value.trim().parse().expect("a length");
+            }
+        }
+        let mut text = vec![0; length];
+        answer.read_exact(&mut text).expect("the answer");
+        let value: Value = serde_json::from_slice(&text).expect("JSON");
         assert!(value["value"]["error"].is_null(), "{method} {path}: {}", value["value"]["message"]);
         value["value"].clone()
     }

@@ -121,6 +121,7 @@ fn a_new_cell_learns_to_pour_in_the_browser() {
     browser.screenshot(&picture("history"));
     browser.run("document.getElementById('episode').scrollIntoView()");
     browser.screenshot(&picture("episode"));
+    browser.run("document.getElementById('exports').scrollIntoView({ block: 'center' })");
     for format in ["csv", "lerobot"] {
         browser.click(&format!("#exports [data-format={format}]"));
         let written = format!("return document.getElementById('export-said').textContent.includes('exports/{format}')");
