@@ -1,5 +1,5 @@
 //! Everything at once that other programs and an unkind robot can do to a running cell: questions, refused orders, readers, browsers on the
-//! live page, new weight files, a slow disk under the episodes, and an e-Series that sends each state twice.
+//! operator's page, new weight files, a slow disk under the episodes, and an e-Series that sends each state twice.
 //!
 //! Ordinary threads, which allocate and never pause longer than a millisecond, except the one that replaces the weight file. What fails in
 //! them is left out: they are the weather, and not what is measured.
@@ -28,9 +28,9 @@ const READERS: usize = 10;
 /// Time between two new weight files, ten a second.
 const SWAP: Duration = Duration::from_millis(100);
 
-/// Number of browsers that look at the live page.
+/// Number of browsers that look at the operator's page.
 const BROWSERS: usize = 3;
-/// Pause of a browser between two pictures: 15 a second, as many as the page asks for at most.
+/// Pause of a browser between two pictures: 15 a second, as many as the page asks for at most. The state comes by itself.
 const PICTURE: Duration = Duration::from_millis(66);
 /// The key of `[simulator]`, and its value, that make the robot an e-Series.
 pub const ROBOT: (&str, &str) = ("series", "e-series");
@@ -72,8 +72,10 @@ impl Storm {
             threads.push(std::thread::spawn(move || read_telemetry(&stop, &name)));
         }
         for _ in 0..BROWSERS {
-            let (stop, address) = (Arc::clone(&stop), address.clone());
-            threads.push(std::thread::spawn(move || look_at_page(&stop, &address)));
+            let (told, site) = (Arc::clone(&stop), address.clone());
+            threads.push(std::thread::spawn(move || look_at_page(&told, &site)));
+            let (told, site) = (Arc::clone(&stop), address.clone());
+            threads.push(std::thread::spawn(move || listen_to_page(&told, &site)));
         }
         let told = Arc::clone(&stop);
         threads.push(std::thread::spawn(move || replace_weights(&told, &file, weights)));
@@ -99,11 +101,11 @@ fn repeat(stop: &Arc<AtomicBool>, name: &CellConfig, ask: fn(&Client)) -> JoinHa
     })
 }
 
-/// Opens the live page; gives its program and its address, `127.0.0.1:PORT`.
+/// Opens the operator's page; gives its program and its address, `127.0.0.1:PORT`.
 fn open_page(cell: &OwnCell) -> Result<(Running, String), OwnCellError> {
-    let failed = |error| OwnCellError::File { what: "feature-worker view".into(), error };
+    let failed = |error| OwnCellError::File { what: "operator-page".into(), error };
     let mut child =
-        cell.program("feature-worker", &["view", "--port", "0"]).stdout(Stdio::piped()).stderr(Stdio::null()).spawn().map_err(failed)?;
+        cell.program("operator-page", &["run", "--port", "0"]).stdout(Stdio::piped()).stderr(Stdio::null()).spawn().map_err(failed)?;
     let output = child.stdout.take();
     let page = Running(child);
     for line in output.into_iter().flat_map(|output| BufReader::new(output).lines()) {
@@ -111,22 +113,37 @@ fn open_page(cell: &OwnCell) -> Result<(Running, String), OwnCellError> {
             return Ok((page, rest.chars().take_while(|c| c.is_ascii_digit() || ".:".contains(*c)).collect()));
         }
     }
-    Err(OwnCellError::Other("feature-worker view ended without an address".into()))
+    Err(OwnCellError::Other("operator-page ended without an address".into()))
 }
 
-/// Asks for picture and state as the page in a browser does.
+/// Asks for pictures as the page in a browser does.
 fn look_at_page(stop: &AtomicBool, address: &str) {
     let mut answer = Vec::new();
     while !stop.load(Ordering::Relaxed) {
-        for path in ["picture.jpg", "state.json"] {
-            answer.clear();
-            let _ = TcpStream::connect(address).and_then(|mut page| {
-                write!(page, "GET /{path} HTTP/1.1\r\nHost: {address}\r\nConnection: close\r\n\r\n")?;
-                page.read_to_end(&mut answer)
-            });
-        }
+        answer.clear();
+        let _ = ask_page(address, "picture.jpg").and_then(|mut page| page.read_to_end(&mut answer));
         std::thread::sleep(PICTURE);
     }
+}
+
+/// Takes the page's states as they come, as a browser does.
+fn listen_to_page(stop: &AtomicBool, address: &str) {
+    let mut bytes = [0; 4096];
+    while !stop.load(Ordering::Relaxed) {
+        let Ok(mut page) = ask_page(address, "events") else {
+            std::thread::sleep(PICTURE);
+            continue;
+        };
+        while !stop.load(Ordering::Relaxed) && page.read(&mut bytes).is_ok_and(|n| n > 0) {}
+    }
+}
+
+/// Asks the page for `path`; the answer can be read from what is given.
+fn ask_page(address: &str, path: &str) -> std::io::Result<TcpStream> {
+    let mut page = TcpStream::connect(address)?;
+    page.set_read_timeout(Some(Duration::from_secs(1)))?;
+    write!(page, "GET /{path} HTTP/1.1\r\nHost: {address}\r\nConnection: close\r\n\r\n")?;
+    Ok(page)
 }
 
 /// Reads every tick's telemetry.
