@@ -20,7 +20,7 @@ pub struct Cli {
 pub enum Command {
     /// Measures V_e in every frame, publishes it and records episodes.
     Run(run::Args),
-    /// Finds the container's axes and the liquid's colour; writes the [image] section.
+    /// Finds the container's axes and the liquid's colour; writes the section `image`.
     Calibrate(calibrate::Args),
     /// Lists this machine's cameras: names, formats, rates, controls, and who uses them.
     Camera(camera::Args),

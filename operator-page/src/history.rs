@@ -1,7 +1,7 @@
 //! The recorded episodes: a table that grows as files appear, and one episode's rows and pictures.
 //!
 //! A thread of its own looks at the directory and reads each new or changed file once; other threads read the table under a lock. Allocates;
-//! the pictures of at most [`OPEN`] episodes are kept, and of each at most [`PICTURES_MAX`]. A file that cannot be read stays in the table
+//! the pictures of at most `OPEN` episodes are kept, and of each at most `PICTURES_MAX`. A file that cannot be read stays in the table
 //! with the reason.
 
 use std::collections::BTreeMap;

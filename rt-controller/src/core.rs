@@ -217,7 +217,7 @@ impl Core {
             Some(reason) => {
                 self.phase = Phase::NoRobot;
                 let mut run = self.run.take()?;
-                run.ending.end_without_robot(reason);
+                run.ending.end_instead_of_done(reason);
                 Some(self.outcome(&run, run.ending.reason(), input.now_ns))
             }
             None if self.phase == Phase::NoRobot && input.robot.alpha_deg.abs() <= self.settings.upright_deg => {
@@ -316,6 +316,7 @@ impl Core {
             }
             let Some(run) = &mut self.run else { continue };
             if ending::worker_was_restarted(feature, run.worker_epoch_ns) {
+                run.ending.end_instead_of_done(EndReason::WorkerRestarted);
                 self.give_up(EndReason::WorkerRestarted);
                 continue;
             }
@@ -360,9 +361,13 @@ impl Core {
         let run = self.run.as_mut()?;
         let seconds = |since_ns: u64| input.now_ns.saturating_sub(since_ns) as f64 / 1e9;
         let follows = run.following.follows(&input.robot, &self.commanded);
+        let age_ns = input.now_ns.saturating_sub(self.usable_at_ns);
+        // What leaves on the way upright is a part of the pour too.
+        if self.phase == Phase::Returning && run.goal_ml.is_some() && age_ns > self.settings.stale_ns {
+            run.ending.end_instead_of_done(EndReason::StaleFeature);
+        }
         match self.phase {
             Phase::Pouring | Phase::Recording => {
-                let age_ns = input.now_ns.saturating_sub(self.usable_at_ns);
                 self.counters.stale_features += u64::from(age_ns > STALE_TICK_PERIODS * self.settings.period_ns);
                 let moment = Moment {
                     running_s: seconds(run.started_at_ns),

@@ -188,7 +188,7 @@ impl<'a> Disk<'a> {
         match part {
             Ok(journal) => {
                 (self.say)(&format!("journal: {} begins a new part", path.display()));
-                (self.journal, self.retry) = (Some(journal), None);
+                (self.journal, self.retry, self.pause) = (Some(journal), None, RETRY);
             }
             Err(e) => {
                 self.note.set(|n| n.journal = format!("not written: {}", error_words(&e)));
@@ -213,7 +213,11 @@ impl<'a> Disk<'a> {
         };
         self.note.set(|n| {
             n.space = space;
-            n.journal = line.unwrap_or_else(|| std::mem::take(&mut n.journal));
+            n.journal = match line {
+                _ if n.journal_gave_up => "ended: the disk does not keep up; restart the controller for a new one".into(),
+                Some(line) => line,
+                None => std::mem::take(&mut n.journal),
+            };
         });
     }
 

@@ -281,7 +281,7 @@ pub struct Replay {
     pub first_different: Option<u64>,
     /// Number of ticks whose deadline or margin is not the one that follows from the ticks before.
     pub different_deadlines: u64,
-    /// Whether the file begins in the middle of a run. Its answers are then compared from its first order on, because what the core knew before
+    /// Whether the file begins in the middle of a run. Its answers are then compared from its first pour or recording on, because what the core knew before
     /// stands in the part before.
     pub continued: bool,
     /// Whether the file ends in the middle of an entry.
@@ -393,7 +393,8 @@ impl Rerun {
         let output = core.step(&Input { now_ns, features, robot, order });
         let same = output.target_deg.map(f32::to_bits) == tick.target_deg.map(f32::to_bits)
             && output.telemetry.d_ml.to_bits() == tick.d_ml.to_bits();
-        self.compared |= self.result.ticks >= UNKNOWN_TICKS && output.ordered == Some(Ok(()));
+        let begins = matches!(order, Some(Order::Pour { .. } | Order::Record { .. })) && output.ordered == Some(Ok(()));
+        self.compared |= self.result.ticks >= UNKNOWN_TICKS && begins;
         if self.compared && !same {
             self.result.different += 1;
             self.result.first_different.get_or_insert(self.result.ticks);

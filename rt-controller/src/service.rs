@@ -43,7 +43,7 @@ pub struct Service<'a> {
     say: &'a dyn Fn(&str),
     server: Server<Ipc, [u8], (), [u8], ()>,
     telemetry: Publisher<Ipc, Telemetry, ()>,
-    /// Why the newest weight file is not used; empty if it is.
+    /// What lies on disks, and what is wrong with it.
     disk_note: &'a DiskNote,
     /// The queue to the journal; `None` if no journal is kept, or if the disk could not keep up.
     journal: Option<Sender<Box<Tick>>>,
@@ -114,7 +114,7 @@ impl<'a> Service<'a> {
                 Event::Tick(tick, telemetry, counters) => {
                     if self.journal.as_ref().is_some_and(|j| j.try_send(Box::new(tick)).is_err()) {
                         (self.say)("journal: the disk does not keep up; nothing more is written to it, and the controller goes on");
-                        self.disk_note.set(|n| n.journal = "ended: the disk does not keep up".into());
+                        self.disk_note.set(|n| n.journal_gave_up = true);
                         self.journal = None;
                     }
                     self.latest = Some((telemetry, counters));

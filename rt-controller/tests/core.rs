@@ -271,6 +271,24 @@ fn every_doubt_ends_the_pour_upright_with_its_reason() {
     }
 }
 
+/// Protects what is said: what leaves on the way upright is a part of the pour, so a camera that dies then, or is another one, leaves no pour
+/// that is done.
+#[test]
+fn a_pour_whose_way_back_is_not_seen_is_not_done() {
+    let troubles: [(fn(&mut ToyCell), EndReason); 3] =
+        [(|_| (), EndReason::Done), (|w| w.camera = false, EndReason::StaleFeature), (|w| w.epoch_ns += 1, EndReason::WorkerRestarted)];
+    for (trouble, reason) in troubles {
+        let mut cell = ToyCell::new();
+        cell.pour(20.0).expect("ready");
+        while cell.core.phase() == Phase::Pouring {
+            cell.tick(None);
+        }
+        trouble(&mut cell);
+        let outcome = cell.finish();
+        assert_eq!((outcome.reason, outcome.poured_words().starts_with("at least ")), (reason, reason != EndReason::Done));
+    }
+}
+
 /// Protects the cup: a stream that is no longer seen ends the pour 10 degrees further, and not only at the largest tilt. A container from
 /// which nothing flowed is tilted up to the largest tilt, also when a bead was taken for a stream before.
 #[test]

@@ -163,7 +163,9 @@ impl EndReason {
         let camera = matches!(self, Self::StaleFeature | Self::WorkerRestarted | Self::FrameRate);
         let link = matches!(self, Self::RobotLost | Self::RobotStalled | Self::ControllerOverrun | Self::SpeedReduced | Self::InHand);
         let stopped = matches!(self, Self::ProtectiveStop | Self::EmergencyStop | Self::SafetyStop | Self::ProgramStopped);
-        camera || link || stopped || self == Self::RobotNotRunning
+        // These end a count that was going on, or say themselves that a stream may not have been seen.
+        let unsure = matches!(self, Self::NotUpright | Self::StreamLost | Self::NothingFlows);
+        camera || link || stopped || unsure || self == Self::RobotNotRunning
     }
 
     /// The reason in words.

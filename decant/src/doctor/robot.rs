@@ -19,8 +19,8 @@ const DASHBOARD: u16 = 29999;
 const PORTS: [u16; 4] = [30001, 30002, 30003, 30004];
 /// How long a port may take to answer. Chosen by hand: a robot on the same network answers within milliseconds.
 const ANSWER: Duration = Duration::from_secs(2);
-/// What the robot's target speed is at least, as a fraction, where it is not slowed (core/following.rs in rt-controller ends a pour below it).
-const FULL_SPEED: f64 = 0.95;
+/// What the robot's target speed is at least, as a fraction, where its slider stands at full speed: link/health.rs in rt-controller refuses less.
+const FULL_SPEED: f64 = 0.995;
 
 /// Looks at the robot.
 pub fn look(config: &Config) -> Vec<Finding> {

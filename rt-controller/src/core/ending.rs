@@ -3,7 +3,7 @@
 //! It is pure and runs in the controller's loop; it does not allocate, panic or fail. An ending has three steps. A rule names a reason
 //! while the container is tilted ([`Ending::due`]); the container then comes upright ([`is_commanded_upright`]); the last drops are counted
 //! ([`Ending::settled`]). Reasons that do not come from a rule, such as an operator's abort or a robot that may not move, are given to
-//! [`Ending::end_with`] or [`Ending::end_without_robot`]. The first reason other than `Done` stays, unless the joint then does not come
+//! [`Ending::end_with`] or [`Ending::end_instead_of_done`]. The first reason other than `Done` stays, unless the joint then does not come
 //! upright.
 //!
 //! | rule | reason |
@@ -39,8 +39,8 @@ const STALLED_FRAMES: u32 = 90;
 const PROGRESS_DEG: f32 = 1.0;
 /// Poured volume that counts as progress, ml. Chosen by hand; no measurement is recorded.
 const PROGRESS_ML: f32 = 0.5;
-/// A pour that is short of its goal by more than so many ml and more than this share of it has lost its stream. No pour that was done was shorter
-/// among the 3,000 fixed seeds of docs/SWARM.md, but for one with a false frame.
+/// A pour that is short of its goal by more than so many ml and more than this share of it, or of a small goal by half, has lost its stream. No
+/// pour that was done was shorter among the 3,000 fixed seeds of docs/SWARM.md, but for one with a false frame.
 const SHORT: (f32, f32) = (8.0, 0.08);
 /// If less than this is still to come over the lip, ml, it counts as nothing: this is about one drop of water.
 const NOTHING_ML: f64 = 0.05;
@@ -184,9 +184,9 @@ impl Ending {
         self.reason = reason;
     }
 
-    /// Gives the reason for which the robot may not move any more. A pour that was already ending for another reason than its goal keeps
-    /// that one.
-    pub fn end_without_robot(&mut self, reason: EndReason) {
+    /// Gives a reason for which a pour is not done although its goal seemed reached: the robot may not move any more, or the camera no longer
+    /// shows what leaves. A pour that was already ending for another reason keeps that one.
+    pub fn end_instead_of_done(&mut self, reason: EndReason) {
         if self.reason == EndReason::Done {
             self.reason = reason;
         }
@@ -196,11 +196,11 @@ impl Ending {
     /// more was then poured than was foreseen when it began, so such a pour is not done.
     pub fn returns(&mut self, follows: bool) {
         if !follows {
-            self.end_without_robot(EndReason::NotFollowed);
+            self.end_instead_of_done(EndReason::NotFollowed);
         }
         // A stream that goes on at an upright container was none before either.
         if let Some(impossible) = self.impossible {
-            self.end_without_robot(reason_of(impossible));
+            self.end_instead_of_done(reason_of(impossible));
         }
     }
 
@@ -317,7 +317,8 @@ fn goal_is_reached(decision: &Decision) -> bool {
 
 /// Whether so much of the goal is missing that a pour that ends so is not done.
 fn is_short(decision: &Decision) -> bool {
-    decision.d_ml > SHORT.0.max(SHORT.1 * (decision.d_ml + decision.poured_ml))
+    let goal_ml = decision.d_ml + decision.poured_ml;
+    decision.d_ml > SHORT.0.max(SHORT.1 * goal_ml).min(goal_ml / 2.0)
 }
 
 /// The reason for what cannot be.
@@ -461,10 +462,10 @@ mod tests {
     fn the_first_reason_stays() {
         let mut ending = Ending::of_pour();
         ending.end_with(EndReason::StreamLost);
-        ending.end_without_robot(EndReason::ProtectiveStop);
+        ending.end_instead_of_done(EndReason::ProtectiveStop);
         assert_eq!(ending.reason(), EndReason::StreamLost);
         let mut done = Ending::of_pour();
-        done.end_without_robot(EndReason::ProtectiveStop);
+        done.end_instead_of_done(EndReason::ProtectiveStop);
         assert_eq!(done.reason(), EndReason::ProtectiveStop);
     }
 

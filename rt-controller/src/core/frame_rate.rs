@@ -17,18 +17,22 @@ const TOLERANCE: f64 = 0.1;
 pub struct FrameRate {
     /// The configured frame time, ns; 0 if it is not known, and then nothing is compared.
     frame_ns: u64,
+    /// Epoch of the worker, number and time of the newest frame, ns.
     newest: Option<(u64, u64, u64)>,
     times_ns: [u64; WINDOW],
     seen: usize,
+    /// Number of frames in a row before each of which another one was missing, and the time from the last but one of them to the last, ns.
+    sparse: (usize, u64),
 }
 
 impl FrameRate {
     /// The watch over frames that should come every `frame_ns`; 0 watches nothing.
     pub fn new(frame_ns: u64) -> Self {
-        Self { frame_ns, newest: None, times_ns: [0; WINDOW], seen: 0 }
+        Self { frame_ns, newest: None, times_ns: [0; WINDOW], seen: 0, sparse: (0, 0) }
     }
 
-    /// Takes the next frame of those that count. A frame that was lost has a number too, so that it makes no other time longer.
+    /// Takes the next frame of those that count. A frame that was lost has a number too, so that it makes no other time longer. Where frames
+    /// have their numbers from their times, as those of a device, a camera of half the rate seems to lose every second one.
     pub fn saw(&mut self, feature: &Feature) {
         let Feature { worker_epoch_ns, sequence, captured_at_ns, .. } = *feature;
         match self.newest {
@@ -36,8 +40,9 @@ impl FrameRate {
                 let frames = sequence.saturating_sub(number).max(1);
                 self.times_ns[self.seen % WINDOW] = captured_at_ns.saturating_sub(at_ns) / frames;
                 self.seen = if self.seen + 1 == 2 * WINDOW { WINDOW } else { self.seen + 1 };
+                self.sparse = if frames > 1 { (self.sparse.0 + 1, captured_at_ns.saturating_sub(at_ns)) } else { (0, 0) };
             }
-            _ => self.seen = 0,
+            _ => (self.seen, self.sparse) = (0, (0, 0)),
         }
         self.newest = Some((worker_epoch_ns, sequence, captured_at_ns));
     }
@@ -46,6 +51,9 @@ impl FrameRate {
     pub fn wrong_hz(&self) -> Option<f32> {
         if self.frame_ns == 0 || self.seen < WINDOW {
             return None;
+        }
+        if self.sparse.0 >= WINDOW {
+            return Some((1e9 / self.sparse.1.max(1) as f64) as f32);
         }
         let mut times_ns = self.times_ns;
         times_ns.sort_unstable();
@@ -83,10 +91,12 @@ mod tests {
             let found = wrong_hz(1e3 / hz, 18, 100, 100);
             assert!(found.is_some_and(|f| (f64::from(f) / hz - 1.0).abs() < 0.01), "{hz}: {found:?}");
         }
-        for (frame_ms, lose, pause) in [(33.333, 1000, 1000), (33.367, 3, 40), (33.0, 2, 9), (34.0, 1000, 12)] {
+        for (frame_ms, lose, pause) in [(33.333, 1000, 1000), (33.367, 3, 40), (33.0, 4, 9), (34.0, 1000, 12)] {
             assert_eq!(wrong_hz(frame_ms, 600, lose, pause), None, "{frame_ms} {lose} {pause}");
         }
         assert_eq!(wrong_hz(66.0, 10, 100, 100), None, "too few to say");
+        let half = wrong_hz(33.333, 60, 2, 100);
+        assert!(half.is_some_and(|hz| (hz / 15.0 - 1.0).abs() < 0.01), "numbered by its times: {half:?}");
     }
 
     /// Protects the next worker: with it, everything is learned anew.

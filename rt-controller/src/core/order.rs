@@ -54,7 +54,7 @@ pub enum Refusal {
     FrameRate(f32, f32),
     /// No valid weights are loaded.
     NoWeights,
-    /// The goal is not a number from [`LEAST_GOAL_ML`] up to this, ml.
+    /// The goal is not a number from `LEAST_GOAL_ML` up to this, ml.
     Goal(f32),
     /// The curve leaves the limits.
     Curve,

@@ -22,7 +22,7 @@
 //! ```
 //!
 //! There is a balance for the vessel of any shape, and one for the straight one where the episodes trust it: its capacity is known far better.
-//! What a balance is off by, beyond some doubts of its own, the estimate has to doubt as well ([`Watch::unexplained_ml`]).
+//! What a balance is off by, beyond some doubts of its own, the estimate has to doubt as well (`Watch::unexplained_ml`).
 
 use serde::{Deserialize, Serialize};
 
