@@ -5,6 +5,8 @@ let last = 0, source = null, state = null, mine = false, stopPort = 0, announced
 /** The ticks of the last minute, by their place in the rows of the server. */
 let points = [];
 const [TICK, T, ALPHA, MEASURED, AREA, DOUBT, D, POURED, SD, PHASE, EPISODE, GOAL] = [0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11];
+/** After this a way of Stop has failed, ms: longer than the server tries. */
+const STOP_WAITS = 6000;
 const SIGNS = { ready: '✓', moving: '▶', waiting: '!', lost: '✕' };
 
 /** Stop goes two ways at the same time: with the page's own server, and with a port where nothing else is answered. */
@@ -13,16 +15,16 @@ async function stop() {
   const word = $('stop-word');
   word.textContent = 'Stopping …';
   $('stop-said').textContent = '';
-  const ways = [fetch('/api/stop', { method: 'POST', headers: { 'Content-Type': 'application/json' }, body: '{}' })];
+  const ways = [fetch('/api/stop', { method: 'POST', headers: { 'Content-Type': 'application/json' }, body: '{}', signal: AbortSignal.timeout(STOP_WAITS) })];
   if (stopPort) {
     const other = `http://${location.hostname}:${stopPort}/stop`;
-    ways.push(fetch(other, { method: 'POST', credentials: 'include', headers: { 'Content-Type': 'text/plain' }, body: '' }));
+    ways.push(fetch(other, { method: 'POST', credentials: 'include', headers: { 'Content-Type': 'text/plain' }, body: '', signal: AbortSignal.timeout(STOP_WAITS) }));
   }
   try {
     const answer = await Promise.any(ways.map(way => way.then(answered)));
     $('stop-said').textContent = `Stop: ${answer.words} (${(performance.now() - begin).toFixed(0)} ms)`;
   } catch (error) {
-    const first = error.errors?.find(e => !(e instanceof TypeError));
+    const first = error.errors?.find(e => !(e instanceof TypeError || e instanceof DOMException));
     $('stop-said').textContent = `Stop failed: ${first ? first.message : 'the page\'s server cannot be reached'}. Use the robot's own stop.`;
   }
   word.textContent = 'Stop';

@@ -148,9 +148,15 @@ function letGo(stops = true) {
   if (stops) stop();
 }
 $('go').onpointerdown = event => { if (hold) { $('go').setPointerCapture(event.pointerId); press(); } };
-for (const kind of ['pointerup', 'pointercancel', 'blur', 'lostpointercapture']) $('go').addEventListener(kind, () => letGo(state?.kind === 'moving'));
-$('go').addEventListener('keydown', event => { if (hold && event.key === 'Enter') { event.preventDefault(); if (!event.repeat) press(); } });
-$('go').addEventListener('keyup', event => { if (event.key === 'Enter') letGo(state?.kind === 'moving'); });
+// Letting go stops also an order that has not begun yet.
+for (const kind of ['pointerup', 'pointercancel', 'blur', 'lostpointercapture']) $('go').addEventListener(kind, () => letGo());
+// An Enter that is still held down from the goal's field confirms nothing.
+$('go').addEventListener('keydown', event => {
+  if (event.key !== 'Enter') return;
+  if (hold || event.repeat) event.preventDefault();
+  if (hold && !event.repeat) press();
+});
+$('go').addEventListener('keyup', event => { if (event.key === 'Enter') letGo(); });
 $('resume').onclick = () => attempt(async () => { await post('/api/resume'); say('The robot is connected.', true); });
 
 /** Asks for the scale's reading of an episode. `done` gets it. */
@@ -178,7 +184,7 @@ function result() {
   const outcomes = state.live.status?.outcomes || [];
   const newest = outcomes[outcomes.length - 1];
   if (!newest || newest.episode !== ordered || resultOf === newest.episode) return;
-  if (!newest.file && !newest.no_file && performance.now() - (result.since ||= performance.now()) < 4000) return;
+  if (!newest.file && !newest.no_file && performance.now() - (result.since ||= performance.now()) < 10000) return;
   result.since = 0;
   resultOf = newest.episode;
   if (holding) letGo(false);

@@ -88,6 +88,8 @@ pub struct Cell {
     link: Mutex<Option<ChildStdin>>,
     waiting: Mutex<BTreeMap<u64, Sender<Result<Reply, String>>>>,
     next: AtomicU64,
+    /// Whether a pour is held; a link that is started again is told.
+    held: AtomicBool,
 }
 
 fn locked<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
@@ -98,7 +100,7 @@ impl Cell {
     /// A cell of which nothing is known yet.
     pub fn new(config: PathBuf) -> Self {
         let (live, link, waiting) = (Mutex::default(), Mutex::default(), Mutex::default());
-        Self { config, live, link, waiting, next: AtomicU64::new(1) }
+        Self { config, live, link, waiting, next: AtomicU64::new(1), held: AtomicBool::new(false) }
     }
 
     /// What is known now. Give it back soon.
@@ -136,6 +138,7 @@ impl Cell {
 
     /// Tells the link whether a pour is held.
     pub fn hold(&self, held: bool) {
+        self.held.store(held, Relaxed);
         self.tell(&ToLink::Hold(held));
     }
 
@@ -168,6 +171,9 @@ impl Cell {
         command.arg("link").arg("--config").arg(&self.config).stdin(Stdio::piped()).stdout(Stdio::piped());
         let mut child = command.spawn()?;
         *locked(&self.link) = child.stdin.take();
+        if self.held.load(Relaxed) {
+            self.tell(&ToLink::Hold(true));
+        }
         let Some(mut output) = child.stdout.take() else { return Err(std::io::ErrorKind::BrokenPipe.into()) };
         let mut live = self.live();
         (live.heard_at, live.looked_at) = (Some(Instant::now()), None);

@@ -8,9 +8,9 @@
 use std::collections::VecDeque;
 use std::io::{Stdout, stdin};
 use std::path::{Path, PathBuf};
-use std::sync::atomic::{AtomicBool, Ordering::Relaxed};
+use std::sync::atomic::{AtomicBool, Ordering::Relaxed, Ordering::SeqCst};
 use std::sync::mpsc::{Receiver, RecvTimeoutError, channel};
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::{Arc, Mutex, OnceLock, PoisonError};
 use std::time::{Duration, Instant};
 
 use feature_worker::drawing::{jpeg, shrunk, to_bgr};
@@ -22,6 +22,7 @@ use shared::control::Request;
 use shared::exit::{self, Failure, OrExit as _, failure};
 use shared::ipc::{Cell, InService as _, IpcError};
 use shared::messages::{Feature, PixelFormat, RecorderReport, RecorderState, Telemetry};
+use shared::os;
 use shared::runtime_dir::Place;
 
 use crate::wire::{self, FromLink, Measured, Picture, Point, Recorded, ToLink};
@@ -44,10 +45,18 @@ const WIDTH_MAX: i32 = 960;
 /// The newest measurements of the worker.
 type Newest = Mutex<VecDeque<Measured>>;
 
+/// Whether a pour is held: it ends with the page and with this process.
+static HELD: AtomicBool = AtomicBool::new(false);
+/// The cell's place, for the end of a held pour.
+static PLACE: OnceLock<Place> = OnceLock::new();
+
 /// Runs the link until standard input ends.
 pub fn run(file: &Path) -> Result<(), Failure> {
     let config = Config::read(file).or_exit(exit::BAD_INPUT)?;
     let place = Place::from(&config.cell);
+    let _ = PLACE.set(place.clone());
+    // A signal to all processes of a terminal or a service ends the page first, which then closes standard input.
+    let _stopped = os::stop_at_signals().or_exit(exit::FAILED)?;
     let token = place.path().join("token");
     opencv_threads()?;
     let (look, newest) = (Arc::new(AtomicBool::new(false)), Arc::new(Newest::default()));
@@ -58,12 +67,11 @@ pub fn run(file: &Path) -> Result<(), Failure> {
     spawn("telemetry", Box::new(move || end_with(telemetry(&of_telemetry, &token, &measured)))).or_exit(exit::FAILED)?;
     spawn("asker", Box::new(move || asker(&of_asker, &asked))).or_exit(exit::FAILED)?;
     spawn("camera", Box::new(move || camera(&of_camera, &looking, &seen))).or_exit(exit::FAILED)?;
-    let mut held = false;
     let mut input = stdin().lock();
     while let Ok(message) = wire::read::<ToLink>(&mut input) {
         match message {
             ToLink::Look(on) => look.store(on, Relaxed),
-            ToLink::Hold(on) => held = on,
+            ToLink::Hold(on) => HELD.store(on, SeqCst),
             ToLink::Ask(number, request) => {
                 if asks.send((number, request)).is_err() {
                     break;
@@ -71,10 +79,21 @@ pub fn run(file: &Path) -> Result<(), Failure> {
             }
         }
     }
-    if held {
-        Target::from(place).ask("abort");
-    }
+    end_held();
     Ok(())
+}
+
+/// Ends a pour that is held, because this process or the page ends.
+fn end_held() {
+    if let (true, Some(place)) = (HELD.swap(false, SeqCst), PLACE.get()) {
+        Target::from(place.clone()).ask("abort");
+    }
+}
+
+/// Ends the process, and with it a pour that is held.
+fn leave(code: u8) -> ! {
+    end_held();
+    std::process::exit(code.into())
 }
 
 fn opencv_threads() -> Result<(), Failure> {
@@ -85,7 +104,7 @@ fn opencv_threads() -> Result<(), Failure> {
 fn send(message: &FromLink, around_bytes: usize) {
     let mut output: std::io::StdoutLock<'_> = Stdout::lock(&std::io::stdout());
     if wire::write(&mut output, message, around_bytes).is_err() {
-        std::process::exit(exit::FAILED.into());
+        leave(exit::FAILED);
     }
 }
 
@@ -93,7 +112,7 @@ fn send(message: &FromLink, around_bytes: usize) {
 fn end_with(result: Result<(), IpcError>) {
     if let Err(e) = result {
         send(&FromLink::Broken(e.to_string()), 0);
-        std::process::exit(exit::UNREACHABLE.into());
+        leave(exit::UNREACHABLE);
     }
 }
 
@@ -129,7 +148,7 @@ fn telemetry(place: &Place, token: &PathBuf, newest: &Newest) -> Result<(), IpcE
             looked = Instant::now();
             if std::fs::read(token).ok() != joined {
                 send(&FromLink::Broken("the cell's shared memory was made anew".into()), 0);
-                std::process::exit(exit::UNREACHABLE.into());
+                leave(exit::UNREACHABLE);
             }
         }
         std::thread::sleep(BEAT);

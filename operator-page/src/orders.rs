@@ -97,28 +97,41 @@ pub fn foresee(site: &Site, goal_ml: f32, fill_ml: Option<f64>) -> Foreseen {
     Foreseen { possible: true, sd_ml, flows_by_deg, lines }
 }
 
-/// Orders a pour. Gives its number.
-pub fn pour(site: &Site, goal_ml: f32, fill_ml: Option<f64>) -> Result<u64, String> {
+/// Orders a pour, unless somebody has stopped since `stops`. Gives its number.
+pub fn pour(site: &Site, stops: u64, goal_ml: f32, fill_ml: Option<f64>) -> Result<u64, String> {
     let foreseen = foresee(site, goal_ml, fill_ml);
     if !foreseen.possible {
         return Err(foreseen.lines.join(" "));
     }
     take_back_if_it_waits(site)?;
-    order(site, Request::Pour { goal_ml, flows_by_deg: foreseen.flows_by_deg })
+    order(site, stops, Request::Pour { goal_ml, flows_by_deg: foreseen.flows_by_deg })
 }
 
-/// Orders the curve of eq. (1). Gives its number.
-pub fn record(site: &Site, lambda_deg: f32, gamma_per_s2: f32) -> Result<u64, String> {
+/// Orders the curve of eq. (1), unless somebody has stopped since `stops`. Gives its number.
+pub fn record(site: &Site, stops: u64, lambda_deg: f32, gamma_per_s2: f32) -> Result<u64, String> {
     let curve = Curve::from_upright(lambda_deg, gamma_per_s2);
     if !curve.beta_s.is_finite() || lambda_deg <= 0.0 || gamma_per_s2 <= 0.0 {
         return Err("The curve's height and width must be above 0: take what is proposed.".into());
     }
     take_back_if_it_waits(site)?;
-    order(site, Request::Record(curve))
+    order(site, stops, Request::Record(curve))
 }
 
-fn order(site: &Site, request: Request) -> Result<u64, String> {
-    match site.cell.ask(request)? {
+/// Orders a motion. One that was stopped on its way does not begin, and one of which it is not known whether it began is stopped.
+fn order(site: &Site, stops: u64, request: Request) -> Result<u64, String> {
+    if site.stops() != stops {
+        return Err("it was stopped before it began".into());
+    }
+    let reply = site.cell.ask(request).map_err(|e| {
+        // Whether this is obeyed is said by the next Stop; the order itself is dropped when its asker has gone.
+        let _ = site.stopper.stop();
+        format!("{e} Whether it began is not known, so it was stopped: look at the robot.")
+    })?;
+    match reply {
+        Reply::Started { .. } if site.stops() != stops => {
+            site.stopper.stop()?;
+            Err("it was stopped as it began".into())
+        }
         Reply::Started { episode } => Ok(episode),
         Reply::Refused { reason } => Err(reason),
         _ => Err("the controller is another version of Decant: run the same build on both sides".into()),

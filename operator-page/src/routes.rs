@@ -127,6 +127,8 @@ fn post(site: &Site, request: &Request) -> Answer {
             return Answer::json(&json!({ "mine": say.is(&who.id) }));
         }
         "/api/say" => {
+            // What the page before ordered, and has not begun, does not begin under another's say.
+            site.stopped();
             site.say().take(&who.id, &who.name, &from);
             return Answer::json(&json!({ "mine": true }));
         }
@@ -137,28 +139,30 @@ fn post(site: &Site, request: &Request) -> Answer {
         "/api/foresee" => return Answer::json(&orders::foresee(site, order.goal_ml, order.fill_ml).json()),
         _ => {}
     }
+    let stops = site.stops();
     if let Err(e) = site.say().act(&who.id, &who.name, &from) {
         return Answer::fault(409, e);
     }
-    line(act(site, path, order))
+    line(act(site, stops, path, order))
 }
 
 /// Stops the motion. Whoever asks needs no say.
 pub fn stop(site: &Site) -> Answer {
+    site.stopped();
     line(site.stopper.stop().map(|words| json!({ "words": words })))
 }
 
-/// What needs the say.
-fn act(site: &Site, path: &str, order: Order) -> Result<Value, String> {
+/// What needs the say. `stops` is the number of stops when it was asked for.
+fn act(site: &Site, stops: u64, path: &str, order: Order) -> Result<Value, String> {
     match path {
         "/api/pour" => {
-            let episode = orders::pour(site, order.goal_ml, order.fill_ml)?;
+            let episode = orders::pour(site, stops, order.goal_ml, order.fill_ml)?;
             if order.hold {
                 site.hold(episode);
             }
             Ok(json!({ "episode": episode }))
         }
-        "/api/record" => orders::record(site, order.lambda_deg, order.gamma_per_s2).map(|episode| json!({ "episode": episode })),
+        "/api/record" => orders::record(site, stops, order.lambda_deg, order.gamma_per_s2).map(|episode| json!({ "episode": episode })),
         "/api/resume" => orders::resume(site).map(|()| json!({ "words": "the robot is connected" })),
         "/api/weigh" => orders::weigh(site, &order.file, order.grams.ok_or("give the scale's reading in g")?),
         "/api/plan" => {

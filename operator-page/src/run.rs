@@ -13,7 +13,7 @@
 //! address without a token, or a configuration that cannot be read ends the command with one line.
 
 use std::net::{IpAddr, Ipv4Addr, SocketAddr};
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::sync::atomic::Ordering::Relaxed;
 
@@ -70,7 +70,7 @@ pub fn run(args: &Args) -> Result<(), Failure> {
     let stop_settings = Settings { rules: of_stop, connections: STOP_CONNECTIONS, listeners: 0, ..Settings::default() };
     let stop_page = Server::on(stop_port, stop_settings)?;
     let site = Arc::new(Site::new(config, file, second_port));
-    announce(page.address(), &word, made, args.address.is_loopback());
+    announce(page.address(), &word, (&token_file, made), args.address.is_loopback());
     std::thread::scope(|scope| {
         let (page, stop_page, site, stop) = (&page, &stop_page, &site, &*stop);
         for _ in 0..ANSWERING {
@@ -102,14 +102,20 @@ pub fn run(args: &Args) -> Result<(), Failure> {
     Ok(())
 }
 
-/// Says where the page is.
-fn announce(address: SocketAddr, word: &str, made: bool, loopback: bool) {
+/// Says where the page is. A log that others read, as systemd's, gets the token's file instead of the token.
+fn announce(address: SocketAddr, word: &str, (file, made): (&Path, bool), loopback: bool) {
+    let logged = std::env::var_os("JOURNAL_STREAM").is_some();
+    let with_token = if logged {
+        format!("http://{address}/?token=... (it is in {})", file.display())
+    } else {
+        format!("http://{address}/?token={word}")
+    };
     if loopback {
         println!("http://{address}");
-        eprintln!("operator-page: open http://{address} on this machine; another user of it needs http://{address}/?token={word}");
+        eprintln!("operator-page: open http://{address} on this machine; another user of it needs {with_token}");
     } else {
-        println!("http://{address}/?token={word}");
-        eprintln!("operator-page: open http://{address}/?token={word}");
+        println!("{with_token}");
+        eprintln!("operator-page: open {with_token}");
         eprintln!("operator-page: whoever has this address can move the robot; it is not encrypted, so use a network that you trust");
     }
     if made {

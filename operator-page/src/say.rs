@@ -49,10 +49,10 @@ impl Say {
         self.holder().is_some_and(|h| h.id == id)
     }
 
-    /// Gives the say to a page. Nobody is asked: the page shows who had it.
+    /// Gives the say to a page. Nobody is asked: the page shows who had it. A pour that another page holds is let go of in a moment, because
+    /// nobody says any more that it is held.
     pub fn take(&mut self, id: &str, name: &str, from: &str) {
         self.holder = Some(Holder { id: id.into(), name: tidy(name, from), seen: Instant::now() });
-        self.held_at = None;
     }
 
     /// Gives the say back.
@@ -70,9 +70,7 @@ impl Say {
         match self.holder() {
             Some(holder) if holder.id != id => Err(format!("{} has the say: take it first", holder.name)),
             _ => {
-                let held_at = self.held_at;
                 self.take(id, name, from);
-                self.held_at = held_at;
                 Ok(())
             }
         }
@@ -137,5 +135,11 @@ mod tests {
         std::thread::sleep(LET_GO + Duration::from_millis(50));
         say.here("b", true);
         assert!(say.let_go(), "another page does not hold it");
+        say.hold(true);
+        say.take("b", "", "y");
+        say.here("a", true);
+        say.here("b", false);
+        std::thread::sleep(LET_GO + Duration::from_millis(50));
+        assert!(say.is_held() && say.let_go(), "who takes the say does not hold what another one held");
     }
 }

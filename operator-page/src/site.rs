@@ -4,7 +4,7 @@
 //! Ordinary threads; each part has its own lock, held for a moment. Allocates, and does not fail: what is not known is `null` or a line.
 
 use std::path::PathBuf;
-use std::sync::atomic::{AtomicBool, Ordering::Relaxed};
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering::Relaxed, Ordering::SeqCst};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
@@ -31,6 +31,8 @@ const BEAT: Duration = Duration::from_millis(75);
 const SLOW: Duration = Duration::from_secs(1);
 /// Number of the newest ticks in each state: half a second, so that a browser that misses some states misses no tick.
 const POINTS: usize = 18;
+/// How often a pour that was let go of is stopped until it is obeyed. Chosen by hand; no measurement is recorded.
+const STOP_TRIES: usize = 3;
 /// Number of the newest results that are sent. Chosen by hand; no measurement is recorded.
 const OUTCOMES: usize = 8;
 
@@ -46,6 +48,8 @@ pub struct Site {
     say: Mutex<Say>,
     /// The pour that is held; 0 if none is.
     held: Mutex<u64>,
+    /// Number of times that somebody stopped, took the say, or let go: an order from before does not begin any more.
+    stops: AtomicU64,
     /// The weight files.
     pub shelf: Shelf,
     /// What the page shows of them.
@@ -76,6 +80,7 @@ impl Site {
             cell: Arc::new(Cell::new(file.clone())),
             say: Mutex::default(),
             held: Mutex::default(),
+            stops: AtomicU64::new(0),
             shelf,
             weights: Mutex::new(Value::Null),
             jobs: Arc::default(),
@@ -94,6 +99,16 @@ impl Site {
         locked(&self.say)
     }
 
+    /// Number of stops so far; see [`Site::stopped`].
+    pub fn stops(&self) -> u64 {
+        self.stops.load(SeqCst)
+    }
+
+    /// Orders that are still on their way do not begin any more.
+    pub fn stopped(&self) {
+        self.stops.fetch_add(1, SeqCst);
+    }
+
     /// From now on the pour `episode` is held.
     pub fn hold(&self, episode: u64) {
         *locked(&self.held) = episode;
@@ -101,12 +116,17 @@ impl Site {
         self.cell.hold(true);
     }
 
-    /// Ends what would go on without this program: a pour that is held, work in the background.
-    pub fn end(&self) {
+    /// Ends a pour that is held, because this program ends.
+    fn end_held(&self) {
         if std::mem::take(&mut *locked(&self.held)) != 0 {
             // The link would say the same; whether it is obeyed, nobody is left to tell.
             let _ = self.stopper.stop();
         }
+    }
+
+    /// Ends what would go on without this program: a pour that is held, work in the background.
+    pub fn end(&self) {
+        self.end_held();
         self.jobs.cancel();
         self.calibration.cancel();
         std::thread::sleep(BEAT * 2);
@@ -141,6 +161,8 @@ impl Site {
             }
             std::thread::sleep(BEAT.saturating_sub(begin.elapsed()));
         }
+        self.stopped();
+        self.end_held();
     }
 
     /// Looks at the weight files until `stop` is set.
@@ -167,7 +189,8 @@ impl Site {
         if let_go && !over {
             let this = Arc::clone(self);
             // Without a thread the pour ends a moment later, when the page's own Stop or the loop's rules end it.
-            let _ = std::thread::Builder::new().name("let-go".into()).spawn(move || this.stopper.stop());
+            let stop = move || (0..STOP_TRIES).any(|_| this.stopper.stop().is_ok());
+            let _ = std::thread::Builder::new().name("let-go".into()).spawn(stop);
         }
     }
 

@@ -39,19 +39,23 @@ impl Stopper {
     fn fall_back(&self) -> Result<String, String> {
         let path = program("rt-controller");
         let mut command = Command::new(&path);
-        command.arg("abort").arg("--config").arg(&self.config).stdin(Stdio::null()).stdout(Stdio::null()).stderr(Stdio::piped());
+        command.arg("abort").arg("--config").arg(&self.config).stdin(Stdio::null()).stdout(Stdio::piped()).stderr(Stdio::piped());
         let mut child = command.spawn().map_err(|e| format!("{}: {e}; use the robot's own stop", path.display()))?;
         let until = Instant::now() + FALLBACK;
         while Instant::now() < until {
             match child.try_wait() {
-                Ok(Some(status)) if status.success() => return Ok("stopped: the container is upright".into()),
-                Ok(Some(_)) => {
-                    let said = child.wait_with_output().map(|o| String::from_utf8_lossy(&o.stderr).trim().to_string()).unwrap_or_default();
-                    return Err(said.trim_start_matches("error: ").into());
+                Ok(Some(status)) => {
+                    // It says itself whether the container is upright, or the robot must be looked at.
+                    let output = child.wait_with_output().map_err(|e| format!("rt-controller abort: {e}; look at the robot"))?;
+                    let said = if status.success() { output.stdout } else { output.stderr };
+                    let said = String::from_utf8_lossy(&said).trim().trim_start_matches("error: ").to_string();
+                    return if status.success() { Ok(said) } else { Err(said) };
                 }
                 _ => std::thread::sleep(FALLBACK / 100),
             }
         }
+        // It goes on by itself; somebody waits for its end.
+        let _ = std::thread::Builder::new().name("abort".into()).spawn(move || child.wait());
         Ok("the controller does not answer; `rt-controller abort` ends it: look at the robot".into())
     }
 }

@@ -169,6 +169,10 @@ impl<'a> Service<'a> {
     /// Answers clients, or passes their orders to the loop.
     fn answer(&mut self) {
         while let Ok(Some(asked)) = self.server.receive() {
+            // Whoever has given up waiting must not find the robot moving later.
+            if !asked.is_connected() {
+                continue;
+            }
             let Ok(request) = postcard::from_bytes::<Request>(asked.payload()) else {
                 reply(
                     &asked,

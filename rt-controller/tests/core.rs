@@ -275,7 +275,8 @@ fn every_doubt_ends_the_pour_upright_with_its_reason() {
 /// that is done.
 #[test]
 fn a_pour_whose_way_back_is_not_seen_is_not_done() {
-    let troubles: [(fn(&mut ToyCell), EndReason); 3] =
+    type Trouble = fn(&mut ToyCell);
+    let troubles: [(Trouble, EndReason); 3] =
         [(|_| (), EndReason::Done), (|w| w.camera = false, EndReason::StaleFeature), (|w| w.epoch_ns += 1, EndReason::WorkerRestarted)];
     for (trouble, reason) in troubles {
         let mut cell = ToyCell::new();

@@ -5,8 +5,10 @@
 
 use std::net::{IpAddr, Ipv4Addr, Ipv6Addr, SocketAddr};
 
-/// The column of `/proc/net/tcp` that holds the user. Source: proc_net_tcp(5) of the kernel's documentation.
-const UID_COLUMN: usize = 7;
+/// The columns of `/proc/net/tcp` that hold state, user and inode. Source: proc_net_tcp of the kernel's documentation.
+const COLUMNS: [usize; 3] = [3, 7, 9];
+/// The state of an established connection in that table (net/tcp_states.h of the kernel).
+const ESTABLISHED: &str = "01";
 
 /// The user of the process at `peer` that has connected to `own`; `None` if it is not on this machine, or the kernel does not tell.
 pub fn uid(peer: SocketAddr, own: SocketAddr) -> Option<u32> {
@@ -27,7 +29,10 @@ fn uid_in(table: &str, peer: SocketAddr, own: SocketAddr) -> Option<u32> {
     table.lines().skip(1).find_map(|line| {
         let columns: Vec<&str> = line.split_whitespace().collect();
         let (from, to) = (columns.get(1)?, columns.get(2)?);
-        if same(from, peer) && same(to, own) { columns.get(UID_COLUMN)?.parse().ok() } else { None }
+        let [state, uid, inode] = COLUMNS.map(|k| columns.get(k).copied().unwrap_or_default());
+        // A closed connection belongs to nobody any more, and the kernel shows it as root's.
+        let alive = state == ESTABLISHED && inode != "0";
+        if same(from, peer) && same(to, own) && alive { uid.parse().ok() } else { None }
     })
 }
 
@@ -64,6 +69,15 @@ mod tests {
             let peer = client.local_addr().unwrap();
             assert_eq!(uid(peer, own), Some(shared::runtime_dir::own_uid()));
             assert_eq!(uid(SocketAddr::new(peer.ip(), 1), own), None);
+            // A client that has closed is nobody, and not root, although the kernel shows the user number 0 for it.
+            let (_accepted, _) = listener.accept().unwrap();
+            drop(client);
+            let closed = std::time::Instant::now();
+            while closed.elapsed() < std::time::Duration::from_millis(200) {
+                let seen = uid(peer, own);
+                assert!(seen.is_none() || seen == Some(shared::runtime_dir::own_uid()), "{seen:?}");
+            }
+            assert_eq!(uid(peer, own), None);
         }
         assert_eq!(uid("192.0.2.7:5000".parse().unwrap(), "192.0.2.8:80".parse().unwrap()), None);
     }
