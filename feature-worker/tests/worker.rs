@@ -204,7 +204,10 @@ fn a_second_worker_is_refused() -> Outcome {
 fn http(address: &str, request: &str, path: &str, body: &str) -> Result<(String, Vec<u8>), Failure> {
     let mut stream = std::net::TcpStream::connect(address)?;
     stream.set_read_timeout(Some(PATIENCE))?;
-    write!(stream, "{request} {path} HTTP/1.1\r\nHost: x\r\nConnection: close\r\nContent-Length: {}\r\n\r\n{body}", body.len())?;
+    let of_body = if request == "POST" { format!("Content-Type: application/json\r\nOrigin: http://{address}\r\n") } else { String::new() };
+    let head =
+        format!("{request} {path} HTTP/1.1\r\nHost: {address}\r\nConnection: close\r\n{of_body}Content-Length: {}\r\n\r\n", body.len());
+    write!(stream, "{head}{body}")?;
     let mut answer = Vec::new();
     stream.read_to_end(&mut answer)?;
     let split = answer.windows(4).position(|w| w == b"\r\n\r\n").ok_or("no head")?;
@@ -409,7 +412,8 @@ fn the_view_shows_what_the_worker_measures() -> Outcome {
     let picture = opencv::imgcodecs::imdecode(&opencv::core::Vector::<u8>::from_slice(&body), opencv::imgcodecs::IMREAD_COLOR)?;
     assert_eq!((picture.cols(), picture.rows()), (WIDTH, HEIGHT));
     let (head, body) = http(&address, "GET", "/", "")?;
-    assert!(head.contains("text/html") && String::from_utf8_lossy(&body).contains("state.json"), "{head}");
+    assert!(head.contains("text/html") && String::from_utf8_lossy(&body).contains("view.js"), "{head}");
+    assert!(String::from_utf8_lossy(&http(&address, "GET", "/view.js", "")?.1).contains("state.json"));
     assert!(http(&address, "GET", "/etc/passwd", "")?.0.contains("404"));
     view.signal("-INT")?;
     assert_eq!(view.end()?.0, Some(0));
@@ -442,7 +446,17 @@ fn the_calibration_page_takes_clicks_and_writes() -> Outcome {
     let state: serde_json::Value = serde_json::from_slice(&http(&address, "GET", "/state.json", "")?.1)?;
     assert!((state["lip"][0].as_f64().unwrap_or(0.0) - 215.0).abs() < 4.0, "found by itself: {state}");
     let click = |body: &str| -> Result<String, Failure> { Ok(String::from_utf8(http(&address, "POST", "/corner", body)?.1)?) };
-    assert!(click("nonsense")?.contains("expected"));
+    let mut stranger = std::net::TcpStream::connect(&address)?;
+    write!(
+        stranger,
+        "POST /write HTTP/1.1\r\nHost: {address}\r\nOrigin: http://elsewhere.example\r\nContent-Type: application/json\r\nContent-Length: \
+         2\r\nConnection: close\r\n\r\n{{}}"
+    )?;
+    let mut answer = String::new();
+    stranger.read_to_string(&mut answer)?;
+    assert!(answer.starts_with("HTTP/1.1 403"), "another site's page writes no configuration: {answer}");
+    let said = click("nonsense")?;
+    assert!(said.contains("expected"), "{said}");
     assert!(!click(r#"{"lip":[639,2],"rim":[639,479],"foot":[0,0]}"#)?.starts_with("measured again"));
     assert!(click(r#"{"lip":[215,250],"rim":[600,250],"foot":[215,470]}"#)?.starts_with("measured again"));
     assert!(String::from_utf8(http(&address, "POST", "/write", "")?.1)?.contains("written"));

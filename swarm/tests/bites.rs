@@ -24,7 +24,7 @@ const WEAK: [Weak; 7] = [
 ];
 
 /// How many seeds are tried for each.
-const SEEDS: u64 = 60;
+const SEEDS: u64 = 240;
 
 /// Protects the checks themselves: each weak limit is found, and by the invariant that is about it.
 #[test]

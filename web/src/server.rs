@@ -47,6 +47,8 @@ const HEADERS_MAX: usize = 64;
 const WAITING: usize = 64;
 /// How long one wait for a request lasts. Chosen by hand: a request to stop is noticed within a tenth of a second.
 const WAIT: Duration = Duration::from_millis(100);
+/// How long a server that ends lets its last answers leave. Chosen by hand: they are short, and most browsers are near.
+const LAST_ANSWERS: Duration = Duration::from_millis(100);
 /// Pause after a connection that could not be taken, as when no more files may be opened.
 const PAUSE: Duration = Duration::from_millis(50);
 
@@ -183,6 +185,8 @@ impl Server {
                     accepting.as_mut().poll(context)
                 })
                 .await;
+                // What was answered last, perhaps the request that ended the server, still leaves.
+                tokio::time::sleep(LAST_ANSWERS).await;
             });
         };
         let thread = std::thread::Builder::new().name("web".into()).spawn(serve).map_err(fail)?;
