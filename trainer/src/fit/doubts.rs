@@ -72,7 +72,8 @@ pub fn unknowns(fitted: &Fitted, doubt: f64) -> UnknownsCovariance {
     for (i, row) in unknowns.iter_mut().enumerate() {
         for (j, value) in row.iter_mut().enumerate() {
             let more = if i == j { 1e-8 } else { 0.0 };
-            *value = 0.5 * (seen[(i, j)] + seen[(j, i)]) * cut[i] * cut[j] + more;
+            // The brackets keep the matrix symmetric to the last bit, as a weight file must be.
+            *value = 0.5 * (seen[(i, j)] + seen[(j, i)]) * (cut[i] * cut[j]) + more;
         }
     }
     unknowns
