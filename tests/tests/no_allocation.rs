@@ -26,6 +26,8 @@ static ALLOCATOR: AllocDisabler = AllocDisabler;
 
 const TICKS: u64 = 10_000;
 const PERIOD: Duration = Duration::from_millis(3);
+/// The camera's frame time, ns.
+const FRAME_NS: u64 = 20_000_000;
 /// The environment variable of the child that is to abort: its worker comes while a pour is under way, so that a tick meets it.
 const PLANT: &str = "DECANT_TEST_PLANT";
 
@@ -37,6 +39,7 @@ fn run(plant: bool) {
     let mut config = Config::parse(include_str!("../../config/sim.toml"), "config/sim.toml").expect("valid");
     config.cell.name.clone_from(&name);
     config.robot.address = address;
+    config.camera.fps = 1e9 / FRAME_NS as f64;
     let robot = Controller::start(ControllerOptions::new(address)).expect("free");
     let (exchange, note) = (Exchange::default(), RobotNote::default());
     let (stop, connections) = (AtomicBool::new(false), AtomicU64::new(0));
@@ -53,7 +56,7 @@ fn run(plant: bool) {
             while !stop.load(Relaxed) {
                 let alpha_deg = robot.joints().actual_q[5].to_degrees();
                 sequence += 1;
-                let now = now_ns();
+                let now = epoch_ns + sequence * FRAME_NS;
                 let feature = Feature {
                     version: LAYOUT_VERSION,
                     sequence,
@@ -89,7 +92,7 @@ fn run(plant: bool) {
                     drop(publisher.take());
                     publisher = Some(topic.publisher_builder().create().expect("shared memory"));
                 }
-                std::thread::sleep(Duration::from_millis(20));
+                std::thread::sleep(Duration::from_nanos((now + FRAME_NS).saturating_sub(now_ns())));
             }
         });
 
