@@ -41,9 +41,7 @@ pub fn space_words(paths: &[&Path]) -> String {
     let mut seen = Vec::new();
     let mut words = Vec::new();
     for path in paths {
-        // A directory that is not made yet lies on the file system of the one above it.
-        let there = path.ancestors().find_map(|p| rustix::fs::statvfs(p).ok().map(|fs| (p, fs)));
-        let Some((there, fs)) = there else { continue };
+        let Some((there, fs)) = file_system(path) else { continue };
         if !seen.contains(&fs.f_fsid) {
             seen.push(fs.f_fsid);
             let free_gb = fs.f_bavail as f64 * fs.f_frsize as f64 / 1e9;
@@ -55,8 +53,13 @@ pub fn space_words(paths: &[&Path]) -> String {
 
 /// The free space where `path` is or will be, bytes; `None` if it is not known.
 pub fn free_bytes(path: &Path) -> Option<u64> {
-    let fs = path.ancestors().find_map(|p| rustix::fs::statvfs(p).ok())?;
+    let (_, fs) = file_system(path)?;
     Some(fs.f_bavail.saturating_mul(fs.f_frsize))
+}
+
+/// The file system where `path` is or will be: a directory that is not made yet lies on that of the one above it.
+fn file_system(path: &Path) -> Option<(&Path, rustix::fs::StatVfs)> {
+    path.ancestors().find_map(|p| rustix::fs::statvfs(p).ok().map(|fs| (p, fs)))
 }
 
 /// An error of the disk in words: a full one is called so.

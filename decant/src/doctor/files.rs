@@ -5,7 +5,7 @@
 use std::os::unix::fs::MetadataExt as _;
 use std::path::{Path, PathBuf};
 
-use rt_controller::{claim, disk};
+use rt_controller::{claim, disk, disk_note};
 use shared::config::Config;
 use shared::machine::Finding;
 use shared::runtime_dir::{Place, own_uid};
@@ -120,10 +120,9 @@ fn room(what: &str, directory: &Path, wanted_bytes: u64, lasts: impl Fn(u64) -> 
         let advice = format!("give it to this user (user {}), or configure another place", own_uid());
         return Finding::red(what, format!("{}: {e}", there.display()), "nothing can be written there", advice);
     }
-    let Ok(fs) = rustix::fs::statvfs(&there) else {
+    let Some(free) = disk_note::free_bytes(&there) else {
         return Finding::yellow(what, format!("{}: its free space is not shown", there.display()), "it may be full", "look at it with df");
     };
-    let free = fs.f_bavail.saturating_mul(fs.f_frsize);
     let is = format!("{}: {} MiB free, {}", there.display(), free >> 20, lasts(free));
     let advice = "delete or move what is no longer needed";
     match free {

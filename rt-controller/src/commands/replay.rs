@@ -42,7 +42,7 @@ pub fn run(args: &Args) -> Result<(), Failure> {
         println!("{ticks} ticks replayed, {} pours and recordings, {different} different answers", ended.len());
         println!("{different_deadlines} ticks at another time than the pacing gives");
         if replay.continued {
-            println!("the file begins in the middle of a run: answers are compared from its first order on, and no deadlines");
+            println!("the file begins in the middle of a run: answers are compared from its first pour or recording on, and no deadlines");
         }
         if replay.cut_off {
             println!("the file ends in the middle of an entry: the controller was killed, or is still writing");
