@@ -188,6 +188,11 @@ impl Checks {
         (self.target, self.phase, self.sequence, self.used, self.features_before) = (None, Phase::NoRobot, (0, 0), 0, 0);
     }
 
+    /// The newest target, degrees, and the rate at which it came, degrees/s; `None` if there is none.
+    pub fn target(&self) -> Option<(f64, f64)> {
+        self.target
+    }
+
     /// The limits on alpha.
     pub fn limits(&self) -> Limits {
         self.settings.limits

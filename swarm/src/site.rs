@@ -19,6 +19,7 @@ use simulator::physics::container::Container;
 use simulator::physics::rig::Rig;
 use simulator::ur::{Fault, InMemory, Machine};
 
+use crate::bound::Moment;
 use crate::camera::{Camera, Depth};
 use crate::check::Checks;
 use crate::costs::{Costs, Poured};
@@ -264,7 +265,10 @@ impl Site {
         }
         let at_s = self.now_s();
         self.checks.cycle(self.robot.machine(), self.joint, alpha_deg, at_s);
-        if let Some(wrong) = self.costs.settle(self.checks.phase, alpha_deg, self.container.poured_ml(), at_s) {
+        let (target, lag_s) = (self.checks.target(), self.plan.lag_s);
+        let return_deg_s = f64::from(self.checks.limits().return_rate_deg_s);
+        let now = Moment { container: &self.container, alpha_deg, target, lag_s, return_deg_s, at_s };
+        if let Some(wrong) = self.costs.settle(self.checks.phase, &now) {
             self.checks.violated("bound", at_s, wrong);
         }
     }
