@@ -92,8 +92,10 @@ pub struct Costs {
 impl Costs {
     /// A fault begins in this phase, when so much had left. The newest run is a pour, or a recording.
     pub fn begins(&mut self, kind: Kind, phase: Phase, in_pour: bool, (at_s, at_ml): (f64, f64)) {
-        let is_on_way = matches!(phase, Phase::Settling | Phase::Returning);
-        if is_on_way || matches!(phase, Phase::Pouring | Phase::Recording) {
+        let is_active = matches!(phase, Phase::Pouring | Phase::Recording);
+        // A robot that is lost is still on its way, as long as the container has not come upright after a fault.
+        let is_on_way = matches!(phase, Phase::Settling | Phase::Returning) || (!is_active && !self.open.is_empty());
+        if is_on_way || is_active {
             self.open.push(OpenFault { kind, at_s, at_ml, noticed: None, is_on_way, in_pour });
         }
     }

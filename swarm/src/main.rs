@@ -9,7 +9,7 @@ use std::process::ExitCode;
 use clap::Parser;
 use shared::config::Config;
 use simulator::ur::Series;
-use swarm::camera::Depth;
+use swarm::camera::{Depth, picture_name};
 use swarm::faults::{KINDS, named};
 use swarm::many::{Seeds, Spread, Summary, at_most, run_until, shrink};
 use swarm::plan::{Choice, Plan};
@@ -179,6 +179,9 @@ fn one(args: &Args, drawn: &Plan, config: &Config) -> Result<bool, String> {
     let robot = if plan.series == Series::ESeries { "e-Series" } else { "CB3" };
     let (vessel, fill_ml, lag_ms) = (VESSELS[plan.vessel].name, plan.fill_ml, 1000.0 * plan.lag_s);
     print(&format!("{robot} that lags by {lag_ms:.0} ms, {vessel}, {fill_ml:.0} ml"));
+    if let Some(fault) = plan.picture {
+        print(&format!("whose camera has a fault: {}", picture_name(fault.kind)));
+    }
     for item in &plan.items {
         let number = item.fault.map_or_else(String::new, |n| format!("fault {n} ({}): ", KINDS[plan.faults[n]].name));
         print(&format!("{:8.3} s  plan: {number}{:?}", item.at_ms as f64 / 1000.0, item.what));

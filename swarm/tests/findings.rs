@@ -33,7 +33,7 @@ fn lagging(seed: u64, (series, lag_s): (Series, f64), vessel: usize, (fill_ml, d
         items.push(Item { at_ms: *at_ms, what: what.clone(), fault });
     }
     let until_ms = items.last().unwrap().at_ms + 12_000;
-    let plan = Plan { seed, series, vessel, fill_ml, delay_ns, lag_s, depth: Depth::Area, items, faults, until_ms };
+    let plan = Plan { seed, series, vessel, fill_ml, delay_ns, lag_s, depth: Depth::Area, picture: None, items, faults, until_ms };
     let config = config().unwrap();
     let shown = run(&plan, &train_for([&plan], &config, &|_| {}), &config, true);
     assert!(shown.violations.is_empty(), "{:?}\n{}", shown.violations, shown.story.join("\n"));
