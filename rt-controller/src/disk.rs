@@ -14,6 +14,7 @@ use shared::agent::Agent;
 use shared::config::Config;
 use shared::episode::take_number;
 use shared::messages::Phase;
+use shared::os;
 use shared::regular_file;
 use shared::weights::Weights;
 
@@ -62,6 +63,9 @@ pub struct Disk<'a> {
     /// When a journal that could not be written is tried again, and when free space is looked at again.
     retry: Option<Instant>,
     pause: Duration,
+    /// Since when no pour or recording is under way, and when the newest tick that was taken from the queue woke up, CLOCK_MONOTONIC ns.
+    at_rest_since_ns: Option<u64>,
+    newest_tick_ns: u64,
     space_at: Option<Instant>,
     ticks: Receiver<Box<Tick>>,
     /// The weights that were read last, for a journal that begins anew.
@@ -120,6 +124,8 @@ impl<'a> Disk<'a> {
             journal_at,
             retry,
             pause: RETRY,
+            at_rest_since_ns: None,
+            newest_tick_ns: 0,
             space_at: None,
             ticks,
             loaded: None,
@@ -148,6 +154,7 @@ impl<'a> Disk<'a> {
     /// Writes the ticks that wait.
     fn write_ticks(&mut self) {
         while let Ok(tick) = self.ticks.try_recv() {
+            self.newest_tick_ns = tick.now_ns;
             self.write(|journal| journal.tick(tick));
         }
     }
@@ -169,10 +176,21 @@ impl<'a> Disk<'a> {
         self.pause = (self.pause * 2).min(RETRY_MAX);
     }
 
+    /// Whether every tick of the last pour or recording has been written: a tick has come that woke up after it was over. That the phase says so is
+    /// not enough, because the last ticks may still be on their way through the other thread.
+    fn is_at_rest(&mut self) -> bool {
+        if !matches!(Phase::from_code(self.exchange.phase.load(SeqCst)), Phase::Idle | Phase::NoRobot) {
+            self.at_rest_since_ns = None;
+            return false;
+        }
+        let since_ns = *self.at_rest_since_ns.get_or_insert_with(os::now_ns);
+        self.newest_tick_ns > since_ns
+    }
+
     /// Begins the journal's next part when the file is large, or a new one when the last could not be written; never in a pour or recording.
     fn keep_journal(&mut self) {
+        let at_rest = self.is_at_rest();
         let Some((path, settings)) = &self.journal_at else { return };
-        let at_rest = matches!(Phase::from_code(self.exchange.phase.load(SeqCst)), Phase::Idle | Phase::NoRobot) && self.ticks.is_empty();
         let due = self.retry.is_some_and(|at| Instant::now() >= at);
         let part = match self.journal.take() {
             Some(full) if full.is_full() && at_rest => full.next_part(path, settings),
