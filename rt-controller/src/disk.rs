@@ -313,3 +313,45 @@ pub fn read_weights(path: &Path, fps: f64, trusted: Option<u32>) -> Result<Weigh
         Err(format!("trained at {trained} frames/s, camera.fps is {fps}: train with episodes of this camera"))
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::core::Robot;
+    use crate::journal::Times;
+
+    /// Protects the end of a pour from the border between two parts of a journal: the loop has said that the pour is over before its last ticks have come
+    /// through the other thread, so the next part waits for a tick from after it.
+    #[test]
+    fn a_part_ends_only_behind_the_last_tick_of_a_pour() {
+        let directory = tempfile::tempdir().unwrap();
+        let mut config = Config::parse(include_str!("../../config/sim.toml"), "config/sim.toml").unwrap();
+        config.controller.weights = directory.path().join("weights.bin");
+        config.controller.journal = Some(directory.path().join("journal.bin"));
+        config.recording.directory = directory.path().join("episodes");
+        let (exchange, note) = (Exchange::default(), DiskNote::default());
+        let say = |_: &str| {};
+        let (mut disk, queues) = Disk::open(&config, None, &exchange, &note, &say).unwrap();
+        let sender = queues.journal.unwrap();
+        let tick_at = |disk: &mut Disk, now_ns: u64| {
+            let (robot, features) = (Robot::that_may_move(0.0, now_ns), heapless::Vec::new());
+            let times = Times::default();
+            let tick = Tick { now_ns, features, robot, order: None, agent: None, target_deg: None, d_ml: 0.0, times };
+            sender.send(Box::new(tick)).unwrap();
+            disk.write_ticks();
+        };
+        let rests = |disk: &mut Disk, phase: Phase| {
+            exchange.phase.store(phase as u32, SeqCst);
+            disk.is_at_rest()
+        };
+        let pouring_ns = os::now_ns();
+        tick_at(&mut disk, pouring_ns);
+        assert!(!rests(&mut disk, Phase::Pouring) && !rests(&mut disk, Phase::Settling));
+        assert!(!rests(&mut disk, Phase::Idle), "its last ticks may still come");
+        tick_at(&mut disk, pouring_ns + 1);
+        assert!(!rests(&mut disk, Phase::Idle), "this was one of them");
+        tick_at(&mut disk, os::now_ns());
+        assert!(rests(&mut disk, Phase::Idle));
+        assert!(!rests(&mut disk, Phase::Recording) && !rests(&mut disk, Phase::Idle), "the next one");
+    }
+}
