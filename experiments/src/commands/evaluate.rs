@@ -76,6 +76,9 @@ pub struct Args {
     /// Renders each frame and runs the feature worker's extraction, instead of the area formula (simulator b).
     #[arg(long, conflicts_with = "change")]
     through_camera: bool,
+    /// With --through-camera: clear water instead of a coloured liquid.
+    #[arg(long, requires = "through_camera")]
+    clear: bool,
     /// Keeps trained weights in this folder and takes them from there the next time, so that the same weights can be judged with another
     /// change. Use another folder after any change of the trainer.
     #[arg(long, value_name = "DIR")]
@@ -145,10 +148,16 @@ impl Args {
                     None => Trial::new(&self.sim, rig, seed, &self.container, self.change),
                 };
                 let name = kind.map_or(self.container.as_str(), |kind| kind.name());
-                let eye = if self.through_camera { "-seen" } else { "" };
+                let eye = if self.clear {
+                    "-clear"
+                } else if self.through_camera {
+                    "-seen"
+                } else {
+                    ""
+                };
                 let keep = self.keep.as_ref().map(|dir| dir.join(format!("{}-{name}{eye}-{rig}-{seed}", self.sim)));
                 let trial = Trial { keep, ..trial };
-                if self.through_camera { trial.through_camera(rig, &self.container) } else { Ok(trial) }
+                if self.through_camera { trial.through_camera(rig, &self.container, self.clear) } else { Ok(trial) }
             })
             .collect()
     }
