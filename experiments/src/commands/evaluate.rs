@@ -53,6 +53,9 @@ pub struct Args {
     /// The methods and baselines that pour, comma-separated.
     #[arg(long, value_enum, value_delimiter = ',', default_value = "best")]
     method: Vec<Pourer>,
+    /// Lets method `law` pour so many times faster, its trickle at the end included, as in --method law --pace 0.5.
+    #[arg(long, default_value_t = 1.0, value_parser = pace)]
+    pace: f64,
     /// Actions of the trained policies: 2 or 21.
     #[arg(long, default_value_t = 21)]
     actions: u8,
@@ -94,6 +97,7 @@ impl Args {
             refit_after_each,
             actions: self.actions,
             repeats: self.repeats,
+            pace: self.pace,
         };
         if self.teach.is_empty() {
             return Ok(vec![one(self.episodes, self.weighed, false)]);
@@ -152,6 +156,11 @@ impl Args {
             })
             .collect()
     }
+}
+
+/// Reads a pace.
+fn pace(text: &str) -> Result<f64, String> {
+    text.parse().ok().filter(|pace| (0.1..=10.0).contains(pace)).ok_or_else(|| "give a number from 0.1 to 10".to_owned())
 }
 
 /// The pours of one method, in groups: one for each trial.

@@ -42,6 +42,8 @@ pub struct Protocol {
     pub actions: u8,
     /// How often the grid is poured.
     pub repeats: u64,
+    /// How many times faster than searched [`Pourer::Law`] lets the liquid flow, and so how much shorter its trickle at the end is.
+    pub pace: f64,
 }
 
 /// A rig and a data seed: what is recorded, trained and tested together.
@@ -224,6 +226,7 @@ impl Trial {
         match (pourer, trained.law) {
             (Pourer::Law, Some(law)) => {
                 let weights = &trained.weights;
+                let law = law.at_pace(protocol.pace);
                 self.pour_grid(protocol, |goal| Box::new(ByLaw::new(law, weights.calibration, &weights.estimator, goal)))
             }
             _ => self.judge(&trained.weights, protocol.repeats),
@@ -263,7 +266,7 @@ mod tests {
     use super::*;
     use crate::pour_evaluation::summary::Summary;
 
-    const PROTOCOL: Protocol = Protocol { episodes: 5, weighed: 0, refit_after_each: false, actions: 21, repeats: 1 };
+    const PROTOCOL: Protocol = Protocol { episodes: 5, weighed: 0, refit_after_each: false, actions: 21, repeats: 1, pace: 1.0 };
 
     /// Protects the whole chain on the physical simulator: recorded, trained and poured through the controller's core, a network meets
     /// goals that it never saw, and the same seeds give the same pours.

@@ -1,7 +1,8 @@
 //! Whether what the camera sees can be, by what was learned of vessel and flow.
 //!
 //! It is pure and runs in the controller's loop: its size is fixed, and it does not allocate, panic or fail. A lone odd frame moves nothing; a
-//! row of them is impossible, and then nothing that the camera says is to be believed.
+//! row of them is impossible, and then nothing that the camera says is to be believed. What was withheld as odd waits for the very next frame: if
+//! that one is lost, it is forgotten, and the estimate doubts as much (`Watch::unconfirmed_ml`).
 //!
 //! | rule | verdict |
 //! |---|---|
@@ -201,6 +202,8 @@ pub(super) struct Watch {
     withheld_ml: Option<f64>,
     /// Outflow of the newest frame if it was a lone leap over what was foreseen, ml.
     odd_ml: Option<f64>,
+    /// What was withheld, and neither confirmed nor refuted by the frame after it, because that one showed nothing, ml.
+    unconfirmed_ml: f64,
     verdict: Option<Impossible>,
 }
 
@@ -251,9 +254,24 @@ impl Watch {
         self.balances.iter().flatten().map(Balance::unexplained_ml).fold(0.0, f64::max)
     }
 
+    /// What was withheld and never confirmed nor refuted, the newest frame's included, ml; at least 0. The estimate has to doubt as much.
+    pub fn unconfirmed_ml(&self) -> f64 {
+        self.unconfirmed_ml + self.withheld_ml.unwrap_or(0.0) + self.odd_ml.unwrap_or(0.0)
+    }
+
+    /// Takes a lost frame: what was withheld in the frame before it is forgotten, as a later one says nothing about it, and stays in doubt.
+    pub fn lost(&mut self) {
+        self.unconfirmed_ml = self.unconfirmed_ml();
+        (self.withheld_ml, self.odd_ml) = (None, None);
+    }
+
     /// Takes the outflow of a frame that may be a measurement, ml, and says whether it counts yet.
     pub fn leap(&mut self, measured_ml: f64) -> Leap {
         let [newest_ml, before_ml] = self.recent_ml;
+        if measured_ml <= 0.0 && newest_ml > 0.0 {
+            // Within a stream, a picture that shows none is as good as lost.
+            self.lost();
+        }
         let withheld_ml = self.withheld_ml.take();
         if let Some(withheld_ml) = withheld_ml.filter(|ml| measured_ml >= LEAP_STAYS * ml) {
             self.recent_ml = [measured_ml, withheld_ml];
