@@ -73,6 +73,9 @@ pub struct Args {
     /// table for each.
     #[arg(long, value_delimiter = ',', conflicts_with_all = ["episodes", "weighed", "weights"])]
     teach: Vec<String>,
+    /// The demo without its processes: `trainer plan` proposes each of the --episodes weighings, and the demo's three pours are judged.
+    #[arg(long, conflicts_with_all = ["sim", "teach"])]
+    demo: bool,
     /// What is different at the test from what the training saw.
     #[arg(long, value_enum, default_value = "none")]
     change: Change,
@@ -94,6 +97,7 @@ impl Args {
         let one = |episodes, weighed, refit_after_each| Protocol {
             episodes,
             weighed,
+            by_plan: self.demo,
             refit_after_each,
             actions: self.actions,
             repeats: self.repeats,
@@ -202,7 +206,10 @@ pub fn run(args: &Args) -> Result<(), Failure> {
             let judged: Vec<Judged> = if files.is_empty() {
                 args.method.iter().map(|pourer| Judged::new(&pourer.name(), &trials, |trial| trial.run(*pourer, protocol))).collect()
             } else {
-                files.iter().map(|(name, weights)| Judged::new(name, &trials, |trial| trial.judge(weights, args.repeats))).collect()
+                files
+                    .iter()
+                    .map(|(name, weights)| Judged::new(name, &trials, |trial| trial.judge(weights, args.repeats, args.demo)))
+                    .collect()
             };
             let summaries: Vec<Summary> = judged.iter().map(|j| Summary::new(&j.name, &j.groups)).collect();
             print(args, &table, &summaries);
