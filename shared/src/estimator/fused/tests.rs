@@ -261,6 +261,22 @@ fn what_the_sum_refuses_is_doubted() {
     assert!(fused.poured_sd_ml() > share.sqrt() * refused_ml, "{} {refused_ml}", fused.poured_sd_ml());
 }
 
+/// Protects the volume from a surge that ebbs so fast that each frame shows less than half of the one before: all of it counts. One that is gone
+/// in the next frame does not, and is doubted where the stream is then another one.
+#[test]
+fn a_surge_that_ebbs_counts() {
+    let pour = |volumes: &[f64]| {
+        let mut fused = new(&with_wide_bounds(0.0));
+        volumes.iter().for_each(|ml| _ = fused.step(frame(*ml, 55.0)));
+        (fused.poured_ml(), fused.poured_sd_ml())
+    };
+    let ebbs = [0.0, 0.5, 0.6, 26.0, 12.0, 5.5, 2.0, 0.3];
+    let (said_ml, _) = pour(&ebbs);
+    assert!((said_ml - ebbs.iter().sum::<f64>()).abs() < 1.0, "{said_ml}");
+    let (said_ml, sd_ml) = pour(&[0.0, 0.5, 0.6, 26.0, 3.0, 0.3]);
+    assert!(said_ml < 6.0 && sd_ml > 25.0, "{said_ml} {sd_ml}");
+}
+
 /// Protects the volume from a surge that the episodes did not show, as a vessel gives it that loses much within a degree: it counts.
 #[test]
 fn a_surge_beyond_the_episodes_counts() {
