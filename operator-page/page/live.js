@@ -130,5 +130,7 @@ async function begin() {
   dispatchEvent(new CustomEvent('known'));
   fetch(`http://${location.hostname}:${stopPort}/alive`, { credentials: 'include' }).catch(() => {});
   connect();
+  // A page that is loaded again may have the say still.
+  here();
 }
 addEventListener('load', begin);
