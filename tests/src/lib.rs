@@ -7,6 +7,7 @@
 
 pub mod attack;
 pub mod browser;
+pub mod parsers;
 
 use std::net::IpAddr;
 use std::path::{Path, PathBuf};
