@@ -141,7 +141,7 @@ fn a_new_cell_learns_to_pour_in_the_browser() {
     browser.click("#foresee");
     browser.wait("what is foreseen", SOON, "return document.getElementById('foreseen').textContent.includes('one standard deviation')");
     let warned = browser.text("#foreseen");
-    assert!(warned.contains("learned from 2 weighed episodes"), "{warned}");
+    assert!(warned.contains("few weighed episodes (2)"), "{warned}");
     browser.screenshot(&picture("foreseen"));
     browser.click("#go");
     says(&browser, "Pouring 75 ml");
