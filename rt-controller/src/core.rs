@@ -73,7 +73,7 @@ pub struct Output {
 }
 
 /// Counters since the start.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct Counters {
     /// Number of ticks done.
     pub ticks: u64,
@@ -87,6 +87,8 @@ pub struct Counters {
     pub ignored_features: u64,
     /// How often each limit changed a request.
     pub clipped: Clipped,
+    /// The rate at which the camera's frames really come, and the configured one, frames/s, if they differ.
+    pub wrong_rate_hz: Option<(f32, f32)>,
 }
 
 /// A pour or recording under way.
@@ -163,7 +165,7 @@ impl Core {
 
     /// Counters since the start.
     pub fn counters(&self) -> Counters {
-        Counters { clipped: self.limiter.clipped(), ..self.counters }
+        Counters { clipped: self.limiter.clipped(), wrong_rate_hz: self.wrong_rate_hz(), ..self.counters }
     }
 
     /// Whether a new agent may be taken now: not in the middle of a pour or recording.
@@ -229,6 +231,10 @@ impl Core {
         }
     }
 
+    fn wrong_rate_hz(&self) -> Option<(f32, f32)> {
+        self.frame_rate.wrong_hz().map(|hz| (hz, self.frame_rate.configured_hz()))
+    }
+
     fn obey(&mut self, order: Order, input: &Input) -> Result<(), Refusal> {
         let newest_ns = intake::newest_usable_ns(input.features, self.usable_at_ns, input.now_ns);
         let situation = Situation {
@@ -236,7 +242,7 @@ impl Core {
             robot: input.robot,
             shutdown: self.shutdown,
             measurement_age_ns: input.now_ns.saturating_sub(newest_ns),
-            wrong_rate_hz: self.frame_rate.wrong_hz().map(|hz| (hz, self.frame_rate.configured_hz())),
+            wrong_rate_hz: self.wrong_rate_hz(),
         };
         match order {
             Order::Shutdown => {

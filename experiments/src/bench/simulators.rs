@@ -100,8 +100,8 @@ impl Bench {
         Self::ThroughCamera(Box::new((rig.clone(), rig.container(0.0), camera)))
     }
 
-    /// Rig and container of simulator b.
-    fn rig(&self) -> Option<(&Rig, &Container)> {
+    /// Rig and container of simulator b; `None` for simulator a.
+    pub fn rig(&self) -> Option<(&Rig, &Container)> {
         match self {
             Self::Paper => None,
             Self::Rig(bench) => Some((&bench.0, &bench.1)),
