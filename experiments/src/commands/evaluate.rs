@@ -269,6 +269,9 @@ fn examples(args: &Args, protocol: &Protocol, trial: Option<&Trial>, weights: Op
     match (weights, trial) {
         (Some(weights), Some(trial)) => trial.examples(weights),
         (None, Some(trial)) if args.method.contains(&Pourer::Best) => {
+            if let Some(weights) = trial.kept(Pourer::Best, protocol).and_then(|file| Weights::read(&file).ok()) {
+                return trial.examples(&weights);
+            }
             let options = trial.options(MethodName::Best, Estimate::Fused, args.actions);
             trial.train(&options, protocol).map(|(t, _)| trial.examples(&t.weights)).unwrap_or_default()
         }
