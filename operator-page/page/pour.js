@@ -1,4 +1,7 @@
 // The first tab: camera, plots, a pour from goal to weight, the weights in use, and the loop's lateness.
+//
+// Runs in the browser's one thread with each new state; pictures are asked for by a timer, one at a time. A picture that does not come is said
+// over the last one, and an order that is refused above the content.
 'use strict';
 
 const SHOWN_S = 30;

@@ -47,8 +47,8 @@ impl Camera {
         Ok(Self { renderer, extractor, size_px: [view.width_px, view.height_px], pixels, is_drawn: false })
     }
 
-    /// Draws `scene`, unless the picture stands still, and measures the picture. `None` if that cannot be done.
-    pub fn look(&mut self, scene: &Scene, stands_still: bool) -> Option<(f32, Doubt)> {
+    /// Draws `scene`, unless the picture stands still, and measures the picture: area, px^2, confidence and doubt. `None` if that cannot be done.
+    pub fn look(&mut self, scene: &Scene, stands_still: bool) -> Option<(f32, f32, Doubt)> {
         let before_ns = processor_ns();
         if !(stands_still && self.is_drawn) {
             self.renderer.render(scene, &mut self.pixels).ok()?;
@@ -60,7 +60,7 @@ impl Camera {
         let measured = self.extractor.measure(picture).ok()?;
         SPENT_NS[0].fetch_add(drawn_ns - before_ns, Relaxed);
         SPENT_NS[1].fetch_add(processor_ns() - drawn_ns, Relaxed);
-        Some((measured.area_px2, measured.doubt))
+        Some((measured.area_px2, measured.confidence, measured.doubt))
     }
 }
 

@@ -6,6 +6,7 @@
 #![forbid(unsafe_code)]
 
 pub mod browser;
+pub mod parsers;
 
 use std::net::IpAddr;
 use std::path::{Path, PathBuf};

@@ -53,6 +53,9 @@ pub struct Args {
     /// The methods and baselines that pour, comma-separated.
     #[arg(long, value_enum, value_delimiter = ',', default_value = "best")]
     method: Vec<Pourer>,
+    /// Lets method `law` pour so many times faster, its trickle at the end included, as in --method law --pace 0.5.
+    #[arg(long, default_value_t = 1.0, value_parser = pace)]
+    pace: f64,
     /// Actions of the trained policies: 2 or 21.
     #[arg(long, default_value_t = 21)]
     actions: u8,
@@ -70,12 +73,18 @@ pub struct Args {
     /// table for each.
     #[arg(long, value_delimiter = ',', conflicts_with_all = ["episodes", "weighed", "weights"])]
     teach: Vec<String>,
+    /// The demo without its processes: `trainer plan` proposes each of the --episodes weighings, and the demo's three pours are judged.
+    #[arg(long, conflicts_with_all = ["sim", "teach"])]
+    demo: bool,
     /// What is different at the test from what the training saw.
     #[arg(long, value_enum, default_value = "none")]
     change: Change,
     /// Renders each frame and runs the feature worker's extraction, instead of the area formula (simulator b).
     #[arg(long, conflicts_with = "change")]
     through_camera: bool,
+    /// With --through-camera: clear water instead of a coloured liquid.
+    #[arg(long, requires = "through_camera")]
+    clear: bool,
     /// Keeps trained weights in this folder and takes them from there the next time, so that the same weights can be judged with another
     /// change. Use another folder after any change of the trainer.
     #[arg(long, value_name = "DIR")]
@@ -91,9 +100,11 @@ impl Args {
         let one = |episodes, weighed, refit_after_each| Protocol {
             episodes,
             weighed,
+            by_plan: self.demo,
             refit_after_each,
             actions: self.actions,
             repeats: self.repeats,
+            pace: self.pace,
         };
         if self.teach.is_empty() {
             return Ok(vec![one(self.episodes, self.weighed, false)]);
@@ -145,13 +156,24 @@ impl Args {
                     None => Trial::new(&self.sim, rig, seed, &self.container, self.change),
                 };
                 let name = kind.map_or(self.container.as_str(), |kind| kind.name());
-                let eye = if self.through_camera { "-seen" } else { "" };
+                let eye = if self.clear {
+                    "-clear"
+                } else if self.through_camera {
+                    "-seen"
+                } else {
+                    ""
+                };
                 let keep = self.keep.as_ref().map(|dir| dir.join(format!("{}-{name}{eye}-{rig}-{seed}", self.sim)));
                 let trial = Trial { keep, ..trial };
-                if self.through_camera { trial.through_camera(rig, &self.container) } else { Ok(trial) }
+                if self.through_camera { trial.through_camera(rig, &self.container, self.clear) } else { Ok(trial) }
             })
             .collect()
     }
+}
+
+/// Reads a pace.
+fn pace(text: &str) -> Result<f64, String> {
+    text.parse().ok().filter(|pace| (0.1..=10.0).contains(pace)).ok_or_else(|| "give a number from 0.1 to 10".to_owned())
 }
 
 /// The pours of one method, in groups: one for each trial.
@@ -194,7 +216,10 @@ pub fn run(args: &Args) -> Result<(), Failure> {
             let judged: Vec<Judged> = if files.is_empty() {
                 args.method.iter().map(|pourer| Judged::new(&pourer.name(), &trials, |trial| trial.run(*pourer, protocol))).collect()
             } else {
-                files.iter().map(|(name, weights)| Judged::new(name, &trials, |trial| trial.judge(weights, args.repeats))).collect()
+                files
+                    .iter()
+                    .map(|(name, weights)| Judged::new(name, &trials, |trial| trial.judge(weights, args.repeats, args.demo)))
+                    .collect()
             };
             let summaries: Vec<Summary> = judged.iter().map(|j| Summary::new(&j.name, &j.groups)).collect();
             if !to_stdout {

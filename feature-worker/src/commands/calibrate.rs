@@ -81,6 +81,9 @@ pub struct Args {
     /// The page's port on 127.0.0.1. With 0 any free port is taken.
     #[arg(long, default_value_t = 8643)]
     port: u16,
+    /// End when standard input ends, because the program that started this one has gone.
+    #[arg(long, hide = true)]
+    end_with_input: bool,
 }
 
 fn parse_point(text: &str) -> Result<[f32; 2], String> {
@@ -90,6 +93,13 @@ fn parse_point(text: &str) -> Result<[f32; 2], String> {
 
 /// Runs the command.
 pub fn run(args: &Args) -> Result<(), Failure> {
+    if args.end_with_input {
+        std::thread::spawn(|| {
+            // However its input ends, nobody is left who asks.
+            let _ = std::io::copy(&mut std::io::stdin(), &mut std::io::sink());
+            std::process::exit(exit::FAILED.into())
+        });
+    }
     let config = Config::read(&args.config).or_exit(exit::BAD_INPUT)?;
     calibrate(args, config)
 }
