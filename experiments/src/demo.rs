@@ -20,7 +20,7 @@ use simulator::cell::SimulatorConfig;
 use crate::own_cell::{OwnCell, OwnCellError};
 use crate::plots;
 
-mod plan;
+pub mod plan;
 
 use plan::{Plan, PlannedPour, Proposed, WEIGHINGS};
 

@@ -329,7 +329,7 @@ impl Core {
             self.counters.bridged_frames += u64::from(taken.lost);
             area = measured.unwrap_or(f32::NAN);
             run.frames += taken.lost + 1;
-            if let Some(dalpha_deg) = self.step_agent(&taken, measured, feature.captured_at_ns) {
+            if let Some(dalpha_deg) = self.step_agent(&taken, measured, feature) {
                 asked = if asked.is_nan() { 0.0 } else { asked } + dalpha_deg;
                 self.request_deg = self.limiter.alpha_deg() + asked;
             }
@@ -339,14 +339,15 @@ impl Core {
 
     /// Steps the agent for the frames that were lost and for the one that was measured. Returns the angle to ask for, degrees, while the
     /// pour goes on. The liquid of the lost frames is estimated, but the moment to act on them has passed.
-    fn step_agent(&mut self, taken: &Taken, area_px2: Option<f32>, captured_at_ns: u64) -> Option<f32> {
+    fn step_agent(&mut self, taken: &Taken, area_px2: Option<f32>, feature: &Feature) -> Option<f32> {
+        let Feature { captured_at_ns, confidence, .. } = *feature;
         let (agent, run) = (self.agent.as_mut()?, self.run.as_mut()?);
         run.goal_ml?;
         let alpha_now_deg = self.limiter.alpha_deg();
         let measured = &self.measured;
         let mut step = |area_px2, alpha_deg, at_ns| {
             let alpha_measured_deg = measured.at_within_deg(at_ns, MEASURED_HOLD_NS);
-            let decision = agent.step(Observation { area_px2, alpha_deg, alpha_measured_deg, alpha_now_deg });
+            let decision = agent.step(Observation { area_px2, confidence, alpha_deg, alpha_measured_deg, alpha_now_deg });
             if run.ending.decided(&decision) {
                 agent.tilt_back();
             }

@@ -38,7 +38,15 @@ impl Bench {
     }
 
     /// Records one curve of eq. (1) with the height `lambda_deg` and the width `sigma_s` (gamma = 1/(2 sigma^2)), and weighs it.
-    fn record_one(&self, name: &str, volume_ml: f64, lambda_deg: f64, sigma_s: f64, seed: u64, random: &mut Pcg64Mcg) -> TrainingEpisode {
+    pub fn record_one(
+        &self,
+        name: &str,
+        volume_ml: f64,
+        lambda_deg: f64,
+        sigma_s: f64,
+        seed: u64,
+        random: &mut Pcg64Mcg,
+    ) -> TrainingEpisode {
         let gamma_per_s2 = 1.0 / (2.0 * sigma_s * sigma_s);
         // The curve begins at 0.05 degrees.
         let beta_s = ((lambda_deg / 0.05).ln() / gamma_per_s2).sqrt();

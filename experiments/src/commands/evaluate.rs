@@ -3,7 +3,7 @@
 //! Ordinary threads, all cores, full speed; allocates. The same arguments give the same numbers on any number of threads. A bad argument
 //! or weight file is an error of one line.
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use indicatif::{ParallelProgressIterator, ProgressBar, ProgressStyle};
 use rayon::prelude::*;
@@ -53,6 +53,9 @@ pub struct Args {
     /// The methods and baselines that pour, comma-separated.
     #[arg(long, value_enum, value_delimiter = ',', default_value = "best")]
     method: Vec<Pourer>,
+    /// Lets method `law` pour so many times faster, its trickle at the end included, as in --method law --pace 0.5.
+    #[arg(long, default_value_t = 1.0, value_parser = pace)]
+    pace: f64,
     /// Actions of the trained policies: 2 or 21.
     #[arg(long, default_value_t = 21)]
     actions: u8,
@@ -70,18 +73,24 @@ pub struct Args {
     /// table for each.
     #[arg(long, value_delimiter = ',', conflicts_with_all = ["episodes", "weighed", "weights"])]
     teach: Vec<String>,
+    /// The demo without its processes: `trainer plan` proposes each of the --episodes weighings, and the demo's three pours are judged.
+    #[arg(long, conflicts_with_all = ["sim", "teach"])]
+    demo: bool,
     /// What is different at the test from what the training saw.
     #[arg(long, value_enum, default_value = "none")]
     change: Change,
     /// Renders each frame and runs the feature worker's extraction, instead of the area formula (simulator b).
     #[arg(long, conflicts_with = "change")]
     through_camera: bool,
+    /// With --through-camera: clear water instead of a coloured liquid.
+    #[arg(long, requires = "through_camera")]
+    clear: bool,
     /// Keeps trained weights in this folder and takes them from there the next time, so that the same weights can be judged with another
     /// change. Use another folder after any change of the trainer.
     #[arg(long, value_name = "DIR")]
     keep: Option<PathBuf>,
-    /// Writes the whole report, every pour included, to this file as JSON.
-    #[arg(long)]
+    /// Prints the whole report, every pour included, as JSON in place of the tables, or writes it to FILE beside them.
+    #[arg(long, value_name = "FILE", num_args = 0..=1, default_missing_value = "-")]
     json: Option<PathBuf>,
 }
 
@@ -91,9 +100,11 @@ impl Args {
         let one = |episodes, weighed, refit_after_each| Protocol {
             episodes,
             weighed,
+            by_plan: self.demo,
             refit_after_each,
             actions: self.actions,
             repeats: self.repeats,
+            pace: self.pace,
         };
         if self.teach.is_empty() {
             return Ok(vec![one(self.episodes, self.weighed, false)]);
@@ -145,13 +156,24 @@ impl Args {
                     None => Trial::new(&self.sim, rig, seed, &self.container, self.change),
                 };
                 let name = kind.map_or(self.container.as_str(), |kind| kind.name());
-                let eye = if self.through_camera { "-seen" } else { "" };
+                let eye = if self.clear {
+                    "-clear"
+                } else if self.through_camera {
+                    "-seen"
+                } else {
+                    ""
+                };
                 let keep = self.keep.as_ref().map(|dir| dir.join(format!("{}-{name}{eye}-{rig}-{seed}", self.sim)));
                 let trial = Trial { keep, ..trial };
-                if self.through_camera { trial.through_camera(rig, &self.container) } else { Ok(trial) }
+                if self.through_camera { trial.through_camera(rig, &self.container, self.clear) } else { Ok(trial) }
             })
             .collect()
     }
+}
+
+/// Reads a pace.
+fn pace(text: &str) -> Result<f64, String> {
+    text.parse().ok().filter(|pace| (0.1..=10.0).contains(pace)).ok_or_else(|| "give a number from 0.1 to 10".to_owned())
 }
 
 /// The pours of one method, in groups: one for each trial.
@@ -184,6 +206,7 @@ pub fn run(args: &Args) -> Result<(), Failure> {
     }
     let (kinds, protocols) = (args.kinds()?, args.protocols()?);
     let begin = std::time::Instant::now();
+    let to_stdout = args.json.as_deref() == Some(Path::new("-"));
     let mut reports = Vec::new();
     let mut frames = 0;
     for kind in &kinds {
@@ -193,10 +216,15 @@ pub fn run(args: &Args) -> Result<(), Failure> {
             let judged: Vec<Judged> = if files.is_empty() {
                 args.method.iter().map(|pourer| Judged::new(&pourer.name(), &trials, |trial| trial.run(*pourer, protocol))).collect()
             } else {
-                files.iter().map(|(name, weights)| Judged::new(name, &trials, |trial| trial.judge(weights, args.repeats))).collect()
+                files
+                    .iter()
+                    .map(|(name, weights)| Judged::new(name, &trials, |trial| trial.judge(weights, args.repeats, args.demo)))
+                    .collect()
             };
             let summaries: Vec<Summary> = judged.iter().map(|j| Summary::new(&j.name, &j.groups)).collect();
-            print(args, &table, &summaries);
+            if !to_stdout {
+                print(args, &table, &summaries);
+            }
             frames += judged.iter().flat_map(|j| j.groups.iter().flatten()).map(|p| u64::from(p.frames)).sum::<u64>();
             if args.json.is_some() {
                 let traces = examples(args, protocol, trials.first(), files.first().map(|(_, weights)| weights));
@@ -208,7 +236,11 @@ pub fn run(args: &Args) -> Result<(), Failure> {
     if let Some(file) = &args.json {
         // One table is the report that `trainer report` reads; several are a list of them.
         let all = if reports.len() == 1 { reports.remove(0) } else { serde_json::Value::Array(reports) };
-        std::fs::write(file, all.to_string()).map_err(|e| format!("{}: {e}", file.display())).or_exit(exit::FAILED)?;
+        if to_stdout {
+            println!("{all}");
+        } else {
+            std::fs::write(file, all.to_string()).map_err(|e| format!("{}: {e}", file.display())).or_exit(exit::FAILED)?;
+        }
     }
     Ok(())
 }
@@ -244,6 +276,9 @@ fn examples(args: &Args, protocol: &Protocol, trial: Option<&Trial>, weights: Op
     match (weights, trial) {
         (Some(weights), Some(trial)) => trial.examples(weights),
         (None, Some(trial)) if args.method.contains(&Pourer::Best) => {
+            if let Some(weights) = trial.kept(Pourer::Best, protocol).and_then(|file| Weights::read(&file).ok()) {
+                return trial.examples(&weights);
+            }
             let options = trial.options(MethodName::Best, Estimate::Fused, args.actions);
             trial.train(&options, protocol).map(|(t, _)| trial.examples(&t.weights)).unwrap_or_default()
         }

@@ -36,12 +36,16 @@ pub struct Protocol {
     pub episodes: u64,
     /// Weighed pours that are added to them before the training that is judged.
     pub weighed: u64,
+    /// Whether `trainer plan` proposes what is weighed, so often as `episodes` and `weighed` say together, and the demo's pours are judged.
+    pub by_plan: bool,
     /// Whether a training follows each weighed pour, and not only the last one.
     pub refit_after_each: bool,
     /// Actions of the trained networks: 2 or 21.
     pub actions: u8,
     /// How often the grid is poured.
     pub repeats: u64,
+    /// How many times faster than searched [`Pourer::Law`] lets the liquid flow, and so how much shorter its trickle at the end is.
+    pub pace: f64,
 }
 
 /// A rig and a data seed: what is recorded, trained and tested together.
@@ -99,20 +103,24 @@ impl Trial {
         }
     }
 
-    /// The same rig with a rendered camera before it.
+    /// The same rig with a rendered camera before it, and clear water in it if `clear`.
     ///
     /// # Errors
     /// One line, when the camera cannot learn the liquid's colour.
-    pub fn through_camera(mut self, rig: u64, container: &str) -> Result<Self, String> {
+    pub fn through_camera(mut self, rig: u64, container: &str, clear: bool) -> Result<Self, String> {
         let Some(physics) = Rig::seeded(rig).with_container(container) else { return Ok(self) };
-        self.bench = Bench::through_camera(&physics, BenchCamera::seeded(rig)?);
+        self.bench = Bench::through_camera(&physics, BenchCamera::seeded(rig, clear)?);
         self.test = self.bench.clone();
         Ok(self)
     }
 
-    /// The pours of the grid that the container can make within the tilt range: volume, goal and a number for each.
-    fn cells(&self, repeats: u64) -> Vec<(f64, f64, u64)> {
-        let cells: Vec<(f64, f64)> = grid().into_iter().filter(|(init, goal)| *goal <= 0.95 * self.test.reach_ml(*init)).collect();
+    /// The pours of the grid, or of the demo, that the container can make within the tilt range: volume, goal and a number for each.
+    fn cells(&self, repeats: u64, by_plan: bool) -> Vec<(f64, f64, u64)> {
+        let all = match self.demo_plan() {
+            Some(plan) if by_plan => plan.pours.iter().map(|pour| (pour.fill_ml, pour.goal_ml)).collect(),
+            _ => grid(),
+        };
+        let cells: Vec<(f64, f64)> = all.into_iter().filter(|(init, goal)| *goal <= 0.95 * self.test.reach_ml(*init)).collect();
         (0..repeats)
             .flat_map(|r| {
                 let cells = cells.clone();
@@ -128,14 +136,14 @@ impl Trial {
     }
 
     /// Pours the grid with `weights` through the controller's core.
-    pub fn judge(&self, weights: &Weights, repeats: u64) -> Vec<PourResult> {
+    pub fn judge(&self, weights: &Weights, repeats: u64, by_plan: bool) -> Vec<PourResult> {
         let agent = Agent::new(weights);
         let pour = |(init, goal, k): (f64, f64, u64)| {
             let flows_by_deg = self.fill_told.then(|| foreseen::flows_by_deg(weights, init, self.test.full_ml())).flatten();
             let asked = Asked { flows_by_deg, calibration: Some(weights.calibration), ..Asked::new(init, goal) };
             by_core(&agent, &mut self.test_pour(init, k), self.limits, asked, None)
         };
-        self.cells(repeats).into_iter().map(pour).collect()
+        self.cells(repeats, by_plan).into_iter().map(pour).collect()
     }
 
     /// A small, a middle and a large pour, frame by frame, for the report.
@@ -162,6 +170,11 @@ impl Trial {
     fn weighed_pour(&self, agent: &Agent, number: u64, random: &mut Pcg64Mcg) -> TrainingEpisode {
         let init = random.random_range(150.0..450.0f64);
         let goal = random.random_range(20.0..200.0f64).min(0.85 * init).min(0.9 * self.test.reach_ml(init));
+        self.weigh_pour(agent, number, (init, goal), random)
+    }
+
+    /// Makes one pour from a fill to a goal, ml, and weighs it.
+    pub(super) fn weigh_pour(&self, agent: &Agent, number: u64, (init, goal): (f64, f64), random: &mut Pcg64Mcg) -> TrainingEpisode {
         let mut trace = Trace::default();
         let mut pour = self.test.pour(init, random.random());
         by_core(agent, &mut pour, self.limits, Asked::new(init, goal), Some(&mut trace));
@@ -184,6 +197,9 @@ impl Trial {
     /// Trains on recorded episodes and again on all of them after the weighed pours, or after each of them. None when a training fails.
     pub fn train(&self, options: &Options, protocol: &Protocol) -> Option<(Trained, Vec<TrainingEpisode>)> {
         let Protocol { episodes, weighed, .. } = *protocol;
+        if protocol.by_plan {
+            return self.first_hour(options, episodes + weighed);
+        }
         let mut data = self.record(episodes);
         let mut trained = trainer::method::train(&data, options, &Silent).ok()?;
         if protocol.refit_after_each {
@@ -202,6 +218,18 @@ impl Trial {
         Some((trained, data))
     }
 
+    /// The file in which the weights of a method are kept, if they are.
+    pub fn kept(&self, pourer: Pourer, protocol: &Protocol) -> Option<PathBuf> {
+        let beginning = self.keep.as_ref().filter(|_| pourer != Pourer::Law)?;
+        let Protocol { episodes, weighed, actions, .. } = *protocol;
+        let each = match protocol {
+            Protocol { by_plan: true, .. } => "plan",
+            Protocol { refit_after_each: true, .. } => "each",
+            _ => "last",
+        };
+        Some(PathBuf::from(format!("{}-{episodes}+{weighed}-{each}-{actions}-{}.bin", beginning.display(), pourer.name())))
+    }
+
     /// Pours the grid with a method, trained if it needs to be.
     pub fn run(&self, pourer: Pourer, protocol: &Protocol) -> Vec<PourResult> {
         let Some((method, estimate)) = pourer.training() else { return self.run_untrained(pourer, protocol) };
@@ -210,13 +238,9 @@ impl Trial {
             let (law, calibration, estimator) = self.tuned_pd(&self.record(protocol.episodes), options.seed);
             return self.pour_grid(protocol, |goal| Box::new(ByLaw::new(law, calibration, &estimator, goal)));
         }
-        let file = self.keep.as_ref().filter(|_| pourer != Pourer::Law).map(|beginning| {
-            let Protocol { episodes, weighed, refit_after_each, actions, .. } = *protocol;
-            let each = if refit_after_each { "each" } else { "last" };
-            PathBuf::from(format!("{}-{episodes}+{weighed}-{each}-{actions}-{}.bin", beginning.display(), pourer.name()))
-        });
+        let file = self.kept(pourer, protocol);
         if let Some(weights) = file.as_ref().and_then(|file| Weights::read(file).ok()) {
-            return self.judge(&weights, protocol.repeats);
+            return self.judge(&weights, protocol.repeats, protocol.by_plan);
         }
         let Some((trained, _)) = self.train(&options, protocol) else { return Vec::new() };
         // A file that cannot be written is one that the next run trains again.
@@ -224,9 +248,10 @@ impl Trial {
         match (pourer, trained.law) {
             (Pourer::Law, Some(law)) => {
                 let weights = &trained.weights;
+                let law = law.at_pace(protocol.pace);
                 self.pour_grid(protocol, |goal| Box::new(ByLaw::new(law, weights.calibration, &weights.estimator, goal)))
             }
-            _ => self.judge(&trained.weights, protocol.repeats),
+            _ => self.judge(&trained.weights, protocol.repeats, protocol.by_plan),
         }
     }
 
@@ -242,7 +267,7 @@ impl Trial {
     fn pour_grid<'a>(&self, protocol: &Protocol, make: impl Fn(f64) -> Box<dyn Baseline + 'a>) -> Vec<PourResult> {
         let pour =
             |(init, goal, k): (f64, f64, u64)| by_baseline(make(goal).as_mut(), &mut self.test_pour(init, k), self.limits, init, goal);
-        self.cells(protocol.repeats).into_iter().map(pour).collect()
+        self.cells(protocol.repeats, protocol.by_plan).into_iter().map(pour).collect()
     }
 
     /// Pours the grid with a baseline that is not trained.
@@ -263,7 +288,8 @@ mod tests {
     use super::*;
     use crate::pour_evaluation::summary::Summary;
 
-    const PROTOCOL: Protocol = Protocol { episodes: 5, weighed: 0, refit_after_each: false, actions: 21, repeats: 1 };
+    const PROTOCOL: Protocol =
+        Protocol { episodes: 5, weighed: 0, by_plan: false, refit_after_each: false, actions: 21, repeats: 1, pace: 1.0 };
 
     /// Protects the whole chain on the physical simulator: recorded, trained and poured through the controller's core, a network meets
     /// goals that it never saw, and the same seeds give the same pours.
@@ -282,7 +308,7 @@ mod tests {
     #[test]
     fn a_pour_is_seen_through_the_rendered_camera() {
         let plain = Trial::new("b", 101, 0, "cylinder", Change::None);
-        let seen = plain.clone().through_camera(101, "cylinder").unwrap();
+        let seen = plain.clone().through_camera(101, "cylinder", false).unwrap();
         let options = seen.options(MethodName::Best, Estimate::Fused, 21);
         let (trained, data) = seen.train(&options, &Protocol { episodes: 3, ..PROTOCOL }).unwrap();
         for (by_picture, by_formula) in data.iter().zip(plain.bench.record(3, plain.data_seed)) {
@@ -310,7 +336,7 @@ mod tests {
             (Change::EyeWaverEarly, 10.0),
             (Change::EyeSpike, 12.0),
         ] {
-            let pours = Trial::new("b", 101, 0, "cylinder", change).judge(&trained.weights, 1);
+            let pours = Trial::new("b", 101, 0, "cylinder", change).judge(&trained.weights, 1, false);
             let summary = Summary::new("best", &[pours]);
             assert!(summary.beyond_goal_ml < most_ml, "{change:?}: {}", summary.endings_line());
             // A false stream that begins before the real one and ends with the way back looks like a fuller vessel.

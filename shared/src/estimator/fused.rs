@@ -26,6 +26,7 @@ pub use super::filter::{EXPLANATIONS, TIGHT, WIDE};
 use super::filter::{Filter, Innovation, UnknownsCovariance};
 use super::flow::{FlowModel, FlowState, FlowTables, WayBack};
 use super::tilt::{Angles, ShownTilt};
+use super::trust;
 use super::verdict::{Bounds, Impossible, Leap, Watch};
 use super::whiteness::Whiteness;
 
@@ -108,6 +109,8 @@ struct Pour {
 pub struct FusedFrame {
     /// V_e, px^2; `None` if the frame was lost.
     pub area_px2: Option<f32>,
+    /// Confidence of the area, 0 to 1: the share of such areas that are within 20 % of the truth. NaN, where no camera says it, weighs in full.
+    pub confidence: f32,
     /// Commanded tilt when it was taken, degrees.
     pub command_deg: f64,
     /// Measured tilt when it was taken, degrees; NaN if it is not known.
@@ -183,17 +186,22 @@ impl FusedEstimator {
     }
 
     /// Standard deviation of [`FusedEstimator::poured_ml`], ml: that of the two estimates' mixture, whose difference counts too, and what the
-    /// tilt has let out but was not seen, or the reverse.
+    /// tilt has let out but was not seen, or the reverse, and what was withheld and never confirmed. Where the straight vessel is held near the
+    /// sum, the part of its correction that is refused counts as well: one of the two is wrong.
     pub fn poured_sd_ml(&self) -> f64 {
         let (share, camera_ml) = (self.share(), self.camera_sd_ml());
         let estimate_ml2 = if share > 0.0 {
             let filter_ml2 = DEVIATION_SHARE * DEVIATION_SHARE * self.pour.following[TIGHT].filter.poured_variance_ml2();
-            let apart_ml2 = share * (1.0 - share) * self.correction_ml().powi(2);
-            share * filter_ml2 + (1.0 - share) * camera_ml * camera_ml + apart_ml2
+            let correction_ml = self.correction_ml();
+            let apart_ml2 = share * (1.0 - share) * correction_ml.powi(2);
+            let refused_ml = self.pour.following[TIGHT].filter.poured_ml() - self.pour.camera.sum_ml - correction_ml;
+            share * (filter_ml2 + refused_ml.powi(2)) + (1.0 - share) * camera_ml * camera_ml + apart_ml2
         } else {
             camera_ml * camera_ml
         };
-        (estimate_ml2.max(0.0) + self.pour.watch.unexplained_ml().powi(2)).sqrt()
+        let Pour { watch, .. } = &self.pour;
+        let withheld_ml = watch.unconfirmed_ml() + if share > STRAIGHT_SHARE { 0.0 } else { watch.lone_ml() };
+        (estimate_ml2.max(0.0) + watch.unexplained_ml().powi(2) + withheld_ml * withheld_ml).sqrt()
     }
 
     /// Whether what was seen cannot be.
@@ -234,6 +242,9 @@ impl FusedEstimator {
         let may_be = watch.may_be(&self.bounds, area_px2, following[WIDE].shown.tilt.tilt_deg);
         let volume_ml = |a: f32| f64::from(self.calibration.volume_ml(a, alpha_deg as f32));
         let area_px2 = area_px2.filter(|a| may_be && volume_ml(*a) <= MEASURED_MAX_ML);
+        if area_px2.is_none() {
+            watch.lost();
+        }
         // A lone leap of the stream is none. One that stays is real, and what was withheld then counts.
         let area_px2 = match area_px2.map(|a| watch.leap(volume_ml(a))) {
             Some(Leap::Withheld) => None,
@@ -244,6 +255,7 @@ impl FusedEstimator {
             Some(Leap::None) | None => area_px2,
         };
         let flows = area_px2.map(|a| a > 0.0);
+        let log_sd = trust::extra_log_sd(frame.confidence);
         let begins = !*started && *flowed && flows == Some(true);
         *flowed = flows.unwrap_or(*flowed);
         let mut innovations: [Option<Innovation>; EXPLANATIONS] = [None; EXPLANATIONS];
@@ -256,7 +268,9 @@ impl FusedEstimator {
                 _ if !*started => continue,
                 measured_ml => {
                     filter.tilt(flow, shown.tilt);
-                    innovations[k] = measured_ml.and_then(|measured_ml| filter.update(flow, shown.tilt, measured_ml));
+                    innovations[k] = measured_ml.and_then(|measured_ml| {
+                        filter.update(flow, shown.tilt, measured_ml, log_sd * f64::from(calibration.area_exponent))
+                    });
                 }
             }
             filter.release(flow, shown.tilt);
@@ -267,7 +281,7 @@ impl FusedEstimator {
             camera.add_late(withheld_ml);
         }
         let leaps = odd == Leap::Withheld;
-        camera.add(&self.calibration, area_px2.filter(|_| !leaps), alpha_deg);
+        camera.add(&self.calibration, area_px2.filter(|_| !leaps), log_sd, alpha_deg);
         *started |= begins;
         if *started {
             for (k, (Explaining { flow, calibration, unknowns }, Following { shown, .. })) in

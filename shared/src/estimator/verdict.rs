@@ -1,7 +1,9 @@
 //! Whether what the camera sees can be, by what was learned of vessel and flow.
 //!
 //! It is pure and runs in the controller's loop: its size is fixed, and it does not allocate, panic or fail. A lone odd frame moves nothing; a
-//! row of them is impossible, and then nothing that the camera says is to be believed.
+//! row of them is impossible, and then nothing that the camera says is to be believed. What was withheld as odd waits for the very next frame, which
+//! confirms it or not. If it does not, it is forgotten, and the estimate doubts as much (`Watch::unconfirmed_ml`, `Watch::lone_ml`), but for a lone
+//! leap of a stream that goes on as before out of a straight vessel.
 //!
 //! | rule | verdict |
 //! |---|---|
@@ -66,8 +68,11 @@ const FLOW_FRAMES: u32 = 2;
 const LEAP_FACTOR: f64 = 2.0;
 /// How much more it has to be to be a leap, ml. In 585 right pours of the tuning rigs, from straight and steep vessels, the largest was 2.3 ml.
 const LEAP_ML: f64 = 3.0;
-/// The part of a leap that the next frame has to show for it to be real. Chosen by hand; no measurement is recorded.
+/// The part of a leap that the next frame has to show for it to be real, unless that one leaps as well. Chosen by hand; no measurement is
+/// recorded.
 const LEAP_STAYS: f64 = 0.5;
+/// After a lone leap, the stream is what it was before up to this factor and this many ml. Chosen by hand: frames of one stream differ by less.
+const AS_BEFORE: (f64, f64) = (2.0, 0.3);
 /// Number of frames in a row that show a stream at an upright container, or too much of one. Chosen by hand: more than a reflection gives.
 const TOO_MUCH_FRAMES: u32 = 3;
 /// A container that is tilted less than this is upright, degrees. Chosen by hand: a full one spills there.
@@ -199,8 +204,12 @@ pub(super) struct Watch {
     /// Outflow in the newest two frames, and what of the newest one was withheld, ml.
     recent_ml: [f64; 2],
     withheld_ml: Option<f64>,
-    /// Outflow of the newest frame if it was a lone leap over what was foreseen, ml.
-    odd_ml: Option<f64>,
+    /// Outflow of the newest frame if it was a lone leap over what was foreseen, and that of the frame before it, ml.
+    odd_ml: Option<(f64, f64)>,
+    /// What was withheld, and neither confirmed nor refuted by the frame after it, ml.
+    unconfirmed_ml: f64,
+    /// What was withheld, and after which the stream was what it was before, ml.
+    lone_ml: f64,
     verdict: Option<Impossible>,
 }
 
@@ -251,16 +260,44 @@ impl Watch {
         self.balances.iter().flatten().map(Balance::unexplained_ml).fold(0.0, f64::max)
     }
 
-    /// Takes the outflow of a frame that may be a measurement, ml, and says whether it counts yet.
+    /// What was withheld and never confirmed nor refuted, the newest frame's included, ml; at least 0. The estimate has to doubt as much.
+    pub fn unconfirmed_ml(&self) -> f64 {
+        self.unconfirmed_ml + self.withheld_ml.unwrap_or(0.0) + self.odd_ml.map_or(0.0, |(odd_ml, _)| odd_ml)
+    }
+
+    /// What was withheld as a lone leap, after which the stream was what it was before, ml; at least 0. A straight vessel gives no such thing, so there
+    /// it was none; a steep one whose liquid swings lets 40 ml out in one frame and goes on as before, so there nobody knows.
+    pub fn lone_ml(&self) -> f64 {
+        self.lone_ml
+    }
+
+    /// Takes what was withheld and is not confirmed by the frame after it, ml.
+    fn not_confirmed(&mut self, withheld_ml: f64, before_ml: f64, after_ml: f64) {
+        let (factor, more_ml) = AS_BEFORE;
+        let as_before = after_ml <= factor * before_ml + more_ml && before_ml <= factor * after_ml + more_ml;
+        *(if as_before { &mut self.lone_ml } else { &mut self.unconfirmed_ml }) += withheld_ml;
+    }
+
+    /// Takes a lost frame: what was withheld in the frame before it is forgotten, as a later one says nothing about it, and stays in doubt.
+    pub fn lost(&mut self) {
+        self.unconfirmed_ml = self.unconfirmed_ml();
+        (self.withheld_ml, self.odd_ml) = (None, None);
+    }
+
+    /// Takes the outflow of a frame that may be a measurement, ml, and says whether it counts yet. Of a surge that ebbs, each frame leaps over what
+    /// was before; so a leap after a leap confirms it.
     pub fn leap(&mut self, measured_ml: f64) -> Leap {
         let [newest_ml, before_ml] = self.recent_ml;
-        let withheld_ml = self.withheld_ml.take();
-        if let Some(withheld_ml) = withheld_ml.filter(|ml| measured_ml >= LEAP_STAYS * ml) {
-            self.recent_ml = [measured_ml, withheld_ml];
-            self.leapt = true;
-            return Leap::Confirmed { withheld_ml };
+        let leaps = measured_ml > LEAP_FACTOR * newest_ml.max(before_ml) + LEAP_ML;
+        if let Some(withheld_ml) = self.withheld_ml.take() {
+            if leaps || measured_ml >= LEAP_STAYS * withheld_ml {
+                self.recent_ml = [measured_ml, withheld_ml];
+                self.leapt = true;
+                return Leap::Confirmed { withheld_ml };
+            }
+            self.not_confirmed(withheld_ml, newest_ml, measured_ml);
         }
-        if measured_ml > LEAP_FACTOR * newest_ml.max(before_ml) + LEAP_ML {
+        if leaps {
             self.withheld_ml = Some(measured_ml);
             return Leap::Withheld;
         }
@@ -274,11 +311,14 @@ impl Watch {
         let leaps = innovation.is_some_and(|i| i.sds > ODD_SDS);
         let lone = leaps && !self.leapt;
         self.leapt = leaps;
-        if let Some(withheld_ml) = self.odd_ml.take().filter(|ml| measured_ml >= LEAP_STAYS * ml) {
-            return Leap::Confirmed { withheld_ml };
+        if let Some((withheld_ml, before_ml)) = self.odd_ml.take() {
+            if leaps || measured_ml >= LEAP_STAYS * withheld_ml {
+                return Leap::Confirmed { withheld_ml };
+            }
+            self.not_confirmed(withheld_ml, before_ml, measured_ml);
         }
         if lone {
-            self.odd_ml = Some(measured_ml);
+            self.odd_ml = Some((measured_ml, self.recent_ml[1]));
             return Leap::Withheld;
         }
         Leap::None

@@ -61,7 +61,7 @@ pub fn run(args: &Args) -> Result<(), Failure> {
         Err(DataError::None { .. }) => UsableEpisodes::default(),
         Err(e) => return Err(failure(exit::BAD_INPUT, e)),
     };
-    let wish = Wish { goal_max_ml: args.goal_max, alpha_max_deg: f64::from(limits.alpha_max_deg) - BELOW_LIMIT_DEG };
+    let wish = wish(&limits, args.goal_max);
     let found = propose(&usable, holds_ml, &wish)?;
     let Some(first) = found.candidates.first() else {
         let what = "nothing can be proposed for this vessel: give what it really holds with --holds, or a smaller --goal-max";
@@ -90,8 +90,16 @@ pub fn run(args: &Args) -> Result<(), Failure> {
     Ok(())
 }
 
+/// What is asked for by a cell with these limits, whose largest goal is known, ml.
+pub fn wish(limits: &Limits, goal_max_ml: f64) -> Wish {
+    Wish { goal_max_ml, alpha_max_deg: f64::from(limits.alpha_max_deg) - BELOW_LIMIT_DEG }
+}
+
 /// What to weigh next after the usable episodes.
-fn propose(usable: &UsableEpisodes, holds_ml: Option<f64>, wish: &Wish) -> Result<Plan, Failure> {
+///
+/// # Errors
+/// One line, where nothing was weighed yet and nobody says what the vessel holds.
+pub fn propose(usable: &UsableEpisodes, holds_ml: Option<f64>, wish: &Wish) -> Result<Plan, Failure> {
     let (vessel, weighed) = if usable.episodes.is_empty() {
         let what = "no episode was weighed yet: say what the vessel holds with --holds ML or [container] holds_ml";
         let holds_ml = holds_ml.ok_or_else(|| failure(exit::BAD_INPUT, what))?;

@@ -87,6 +87,12 @@ impl ControlLaw {
         Self { max_flow_ml: 1e3, damping_frames: 1e-6, smoothing: 1e-6, in_flight_frames: 1e-6, ..Self::start(fused) }
     }
 
+    /// The law that wants `pace` times the outflow of this one, everywhere.
+    #[must_use]
+    pub fn at_pace(self, pace: f64) -> Self {
+        Self { approach_per_frame: pace * self.approach_per_frame, max_flow_ml: pace * self.max_flow_ml, ..self }
+    }
+
     /// The parameters' logarithms, in the order of the fields.
     fn logs(&self) -> [f64; LAW_PARAMETERS] {
         [

@@ -57,7 +57,7 @@ impl ModelVessel {
 
 fn frame(outflow_ml: f64, command_deg: f64) -> FusedFrame {
     let area = (outflow_ml / f64::from(CAMERA.volume_at_1_px2_ml)) as f32;
-    FusedFrame { area_px2: Some(if area < 5.0 { 0.0 } else { area }), command_deg, measured_deg: f64::NAN }
+    FusedFrame { area_px2: Some(if area < 5.0 { 0.0 } else { area }), confidence: 1.0, command_deg, measured_deg: f64::NAN }
 }
 
 /// A pour whose tilt rises, holds, and returns; the camera's gain is off by the factor `gain`. Gives the true volume and the camera's sum,
@@ -222,6 +222,64 @@ fn a_leap_that_stays_counts() {
     assert!((fused.poured_ml() - volumes.iter().sum::<f64>()).abs() < 0.3, "{}", fused.poured_ml());
 }
 
+/// Protects the operator from ml that nobody confirmed: an odd frame, then lost ones. A stream that is as strong much later does not confirm it, and
+/// what is said doubts it. A next frame that shows the stream as it was before refutes it for a straight vessel, and for no other.
+#[test]
+fn odd_and_then_lost_is_doubted() {
+    let run_from = |tight_share: f64, after_the_odd: &[Option<f64>]| {
+        let mut fused = new(&with_wide_bounds(tight_share));
+        let stream = [0.0, 0.5, 0.6, 0.6, 10.0].map(Some);
+        for outflow_ml in stream.iter().chain(after_the_odd) {
+            let shown = frame(outflow_ml.unwrap_or(0.0), 55.0);
+            fused.step(if outflow_ml.is_some() { shown } else { FusedFrame { area_px2: None, ..shown } });
+        }
+        (fused.poured_ml(), fused.poured_sd_ml())
+    };
+    let run = |after_the_odd: &[Option<f64>]| run_from(0.0, after_the_odd);
+    for (tight_share, doubted) in [(1.0, false), (0.0, true)] {
+        let (said_ml, sd_ml) = run_from(tight_share, &[Some(0.6), Some(0.6), Some(0.6)]);
+        assert!(said_ml < 5.0 && (sd_ml > 9.0) == doubted && (doubted || sd_ml < 3.0), "{tight_share}: {said_ml} {sd_ml}");
+    }
+    let (_, newest_sd_ml) = run(&[]);
+    assert!(newest_sd_ml > 9.0, "not confirmed yet: {newest_sd_ml}");
+    for lost in [None, Some(0.0)] {
+        let (said_ml, sd_ml) = run(&[lost, lost, Some(0.6), Some(0.6)]);
+        assert!(said_ml < 5.0 && sd_ml > 9.0, "{lost:?}: {said_ml} {sd_ml}");
+        let (said_ml, sd_ml) = run(&[lost, lost, Some(9.0), Some(0.6)]);
+        assert!(said_ml < 5.0 && sd_ml > 9.0, "{lost:?}: a later one confirms nothing: {said_ml} {sd_ml}");
+    }
+}
+
+/// Protects the operator where camera and straight vessel disagree by more than the sum's own doubt explains: one of the two is wrong, and what
+/// is said doubts by as much as was refused.
+#[test]
+fn what_the_sum_refuses_is_doubted() {
+    let mut wrong = model(1.0);
+    wrong.explanations[TIGHT].model.vessel = Vessel { radius_mm: 24.0, ..Vessel::default() };
+    wrong.explanations[TIGHT].unknowns.iter_mut().skip(3).for_each(|row| row[3..].fill(0.0));
+    let (_, summed, fused) = pour_into(new(&wrong), 1.0);
+    let share = fused.share();
+    let refused_ml = (fused.pour.following[TIGHT].filter.poured_ml() - summed).abs() - CAMERA_SDS * fused.camera_sd_ml() - CAMERA_ML;
+    assert!(share > 0.1 && refused_ml > 2.0, "{share} {refused_ml}");
+    assert!(fused.poured_sd_ml() > share.sqrt() * refused_ml, "{} {refused_ml}", fused.poured_sd_ml());
+}
+
+/// Protects the volume from a surge that ebbs so fast that each frame shows less than half of the one before: all of it counts. One that is gone
+/// in the next frame does not, and is doubted where the stream is then another one.
+#[test]
+fn a_surge_that_ebbs_counts() {
+    let pour = |volumes: &[f64]| {
+        let mut fused = new(&with_wide_bounds(0.0));
+        volumes.iter().for_each(|ml| _ = fused.step(frame(*ml, 55.0)));
+        (fused.poured_ml(), fused.poured_sd_ml())
+    };
+    let ebbs = [0.0, 0.5, 0.6, 26.0, 12.0, 5.5, 2.0, 0.3];
+    let (said_ml, _) = pour(&ebbs);
+    assert!((said_ml - ebbs.iter().sum::<f64>()).abs() < 1.0, "{said_ml}");
+    let (said_ml, sd_ml) = pour(&[0.0, 0.5, 0.6, 26.0, 3.0, 0.3]);
+    assert!(said_ml < 6.0 && sd_ml > 25.0, "{said_ml} {sd_ml}");
+}
+
 /// Protects the volume from a surge that the episodes did not show, as a vessel gives it that loses much within a degree: it counts.
 #[test]
 fn a_surge_beyond_the_episodes_counts() {
@@ -290,7 +348,7 @@ proptest! {
     ) {
         let mut fused = new(&model(share));
         for (area_px2, command_deg, measured_deg) in frames {
-            fused.step(FusedFrame { area_px2, command_deg, measured_deg });
+            fused.step(FusedFrame { area_px2, confidence: 1.0, command_deg, measured_deg });
             prop_assert!(fused.poured_ml().is_finite() && fused.poured_sd_ml().is_finite());
             prop_assert!(fused.stop_volume_ml(command_deg.clamp(-1e6, 1e6)).is_finite());
         }
