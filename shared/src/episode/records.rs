@@ -162,7 +162,7 @@ fn lengths_fit(opcode: u8, data: &[u8]) -> bool {
         *rest = text.get(u32::from_le_bytes(*length) as usize..)?;
         Some(())
     };
-    let mut look = || -> Option<()> {
+    let look = || -> Option<()> {
         let mut rest = data.get(fixed..)?;
         for _ in 0..texts {
             after_text(&mut rest)?;
