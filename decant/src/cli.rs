@@ -6,7 +6,7 @@ use std::ffi::OsString;
 
 use clap::{Parser, Subcommand};
 
-use crate::{doctor, programs};
+use crate::{doctor, metrics, programs};
 
 /// Everything an operator needs, by one name.
 #[derive(Parser)]
@@ -22,6 +22,8 @@ pub struct Cli {
 pub enum Command {
     /// Looks at machine, disk, camera, robot, configuration and weights, and says what is wrong and what to do.
     Doctor(doctor::Args),
+    /// Serves the cell's counters, histograms, ages and errors as OpenMetrics, for Prometheus.
+    Metrics(metrics::Args),
     /// A command of another program; they are listed below.
     #[command(external_subcommand)]
     Other(Vec<OsString>),

@@ -1,5 +1,5 @@
-//! The command line of `decant`, the operator's one program: `doctor` looks at everything that a pour needs, and every other command is
-//! that of the program which does it.
+//! The command line of `decant`, the operator's one program: `doctor` looks at everything that a pour needs, `metrics` serves the cell's figures,
+//! and every other command is that of the program which does it.
 //!
 //! Ordinary process; allocates. Failures are one line and an exit code; a command of another program ends as that program does.
 
@@ -7,7 +7,7 @@ use std::process::ExitCode;
 
 use clap::Parser as _;
 use decant::cli::{Cli, Command};
-use decant::{doctor, programs};
+use decant::{doctor, metrics, programs};
 
 fn main() -> ExitCode {
     shared::exit::end(match Cli::parse().command {
@@ -15,6 +15,7 @@ fn main() -> ExitCode {
             shared::os::end_when_nobody_reads();
             doctor::run(&args)
         }
+        Command::Metrics(args) => metrics::run(&args),
         Command::Other(words) => programs::run(&words),
     })
 }

@@ -6,10 +6,11 @@
 //! | `checks` | whether a picture can be used: light, repetition, focus |
 //! | `whole` | whether a picture is whole: decoded to its end, of one moment, with the glass in its place |
 //! | `reflection` | a lamp's reflection that hides the lip |
+//! | `wandering` | whether colours or brightness wander, so that a coloured liquid may look like the ground |
 //! | `presence` | when a stream that is not seen any more is gone |
 //! | `ground_colours`, `ground_beside` | the colours of the ground behind a coloured liquid, and where some of them are learned |
 //! | `hues` | the ranges of hue that are a liquid's |
-//! | `liquid` | what the extractor asks of a liquid; `coloured_liquid` and `clear_water` are the two kinds |
+//! | `liquid` | what the extractor asks of a liquid; `coloured_liquid` (with `coloured_edge`) and `clear_water` are the two kinds |
 //! | `stream_edge` | the stream's edge as a robust line, then through sub-pixel points of profiles |
 //! | `geometry` | lines, the two axes, and the rays between them |
 //! | `picture` | images, their pixels, and samples between pixels |
@@ -22,6 +23,7 @@
 
 mod checks;
 mod clear_water;
+mod coloured_edge;
 mod coloured_liquid;
 mod confidence;
 mod extractor;
@@ -40,6 +42,7 @@ mod picture;
 mod presence;
 mod reflection;
 mod stream_edge;
+mod wandering;
 mod whole;
 
 pub use extractor::{ExtractError, Extractor};

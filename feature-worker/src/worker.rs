@@ -25,10 +25,16 @@ mod republisher;
 mod status;
 
 use republisher::FrameRepublisher;
+pub use status::Lines;
 use status::Status;
 
 /// How long a `view` that holds the camera may take to let go of it, ns. Chosen by hand: a view looks for a worker with each frame.
 const LET_GO_NS: u64 = 3_000_000_000;
+
+/// Pause before a camera that is not there is looked for again. Chosen by hand; a signal ends the wait after it.
+const MISSING: std::time::Duration = std::time::Duration::from_millis(500);
+/// How long the worker may take to end once it was asked to. Chosen by hand: a disk that works takes the rest of an episode much sooner.
+const GRACE: std::time::Duration = std::time::Duration::from_secs(8);
 
 /// Pictures after the start in which the ground behind clear water is judged. Chosen by hand: half a second.
 const GROUND_PICTURES: u32 = 15;
@@ -38,16 +44,17 @@ const UNEVEN_GROUND: &str = "the ground behind the lip has a pattern, and clear 
 
 type Ipc = iceoryx2::service::ipc::Service;
 
-/// Runs until a signal, the end of the video or a failure. With `json` the status lines are JSON objects on standard output.
-pub fn run(config: &Config, json: bool) -> Result<(), Failure> {
+/// Runs until a signal, the end of the video or a failure. `lines` says what is told meanwhile.
+pub fn run(config: &Config, lines: Lines) -> Result<(), Failure> {
     let stop = os::stop_at_signals().or_exit(exit::FAILED)?;
+    exit::end_within(&stop, GRACE, "feature-worker: the disk or the camera does not answer: ended without it");
     // OpenCV's own threads would run on the controller's core and wait for each other.
     opencv::core::set_num_threads(1).or_exit(exit::BAD_INPUT)?;
     let extractor = Extractor::new(&config.camera, &config.image).or_exit(exit::BAD_INPUT)?;
     let lost = "feature-worker: shared memory vanished: /dev/shm is full, or a file there was cut. The worker ends";
     os::explain_bus_errors(lost, exit::FAILED, Arc::clone(&stop));
     let speaker = Arc::new(Speaker::start("feature-worker"));
-    let result = measure_until_stopped(config, extractor, &stop, &speaker, json);
+    let result = measure_until_stopped(config, extractor, &stop, &speaker, lines);
     speaker.finish();
     result
 }
@@ -58,7 +65,7 @@ fn measure_until_stopped(
     extractor: Extractor,
     stop: &Arc<AtomicBool>,
     speaker: &Arc<Speaker>,
-    json: bool,
+    lines: Lines,
 ) -> Result<(), Failure> {
     let cell = Cell::join(&config.cell).or_exit(exit::UNREACHABLE)?;
     cell.check_space(shared_memory_bytes(config)).or_exit(exit::UNREACHABLE)?;
@@ -74,13 +81,19 @@ fn measure_until_stopped(
         CameraSource::SharedMemory => None,
         _ => Some(FrameRepublisher::new(&cell, config)?),
     };
-    let source = open_source(config, &cell, stop)?;
     // Threads inherit the core and the priority, so the other threads start first.
     let recorder = Recorder::start(config).or_exit(exit::FAILED)?;
     let latest = Arc::new(ArrayQueue::new(1));
     let looks = Arc::new(AtomicU64::new(0));
     let printer =
-        status::start_printer(&latest, &looks, stop, speaker, json).map_err(|e| failure(exit::FAILED, format!("status thread: {e}")))?;
+        status::start_printer(&latest, &looks, stop, speaker, lines).map_err(|e| failure(exit::FAILED, format!("status thread: {e}")))?;
+    let opened = open_source(config, &cell, (stop, &looks), speaker);
+    let Ok(Some(source)) = opened else {
+        stop.store(true, Relaxed);
+        recorder.stop();
+        let _ = printer.join();
+        return opened.map(|_| ());
+    };
     for missing in os::become_realtime(config.worker.core, config.worker.priority) {
         speaker.say(&missing);
     }
@@ -112,13 +125,29 @@ fn shared_memory_bytes(config: &Config) -> u64 {
     (2 << 20) + frames * frame
 }
 
-/// Opens the camera; waits a while for a view that holds it.
-fn open_source(config: &Config, cell: &Cell, stop: &AtomicBool) -> Result<Source, Failure> {
+/// Opens the camera. It waits a while for a view that holds it, and for a device that is not there until it is, with one line. `None` if `stop` was set
+/// meanwhile. `looks` grows, so that systemd sees that the worker waits and does not hang.
+fn open_source(
+    config: &Config,
+    cell: &Cell,
+    (stop, looks): (&AtomicBool, &AtomicU64),
+    speaker: &Speaker,
+) -> Result<Option<Source>, Failure> {
     let begin_ns = os::now_ns();
+    let mut said = false;
     loop {
         match Source::open(&config.camera, cell) {
-            Ok(source) => return Ok(source),
-            Err(SourceError::Busy { .. }) if os::now_ns() < begin_ns + LET_GO_NS && !stop.load(Relaxed) => std::thread::sleep(WAIT),
+            Ok(source) => return Ok(Some(source)),
+            Err(_) if stop.load(Relaxed) => return Ok(None),
+            Err(SourceError::Busy { .. }) if os::now_ns() < begin_ns + LET_GO_NS => std::thread::sleep(WAIT),
+            Err(e @ SourceError::Missing(_)) if config.camera.source == CameraSource::Device => {
+                if !said {
+                    speaker.say(&format!("{e}; it is waited for"));
+                }
+                said = true;
+                looks.fetch_add(1, Relaxed);
+                std::thread::sleep(MISSING);
+            }
             Err(e) => return Err(failure(e.exit_code(), e)),
         }
     }

@@ -1,4 +1,6 @@
 // The fourth tab: the steps of `feature-worker calibrate`, which does the work.
+//
+// Runs in the browser's one thread, and asks the server how far it is while the tab is shown. What calibrate refuses is said in its words.
 'use strict';
 
 let found = null, pin = 'lip', calibrationShown = '', calibrationBusy = false;

@@ -1,4 +1,7 @@
 // The third tab: error over time, the table of episodes, one episode on a scrubber, exports.
+//
+// Runs in the browser's one thread when its tab is shown, the table changes or the scrubber moves; one picture is asked for at a time. An episode
+// that cannot be read stands in the table with its reason.
 'use strict';
 
 const numeric = (value, digits) => (value === null || value === undefined ? '' : shown(value, digits));

@@ -1,4 +1,7 @@
 // The second tab: record what teaches most, weigh it, learn, and choose the weights.
+//
+// Runs in the browser's one thread with each new state; work in the background is done by the server and only shown here. What is refused or
+// fails is said where it was asked for.
 'use strict';
 
 let plannedFrom = null, planned = '', tableShown = '', jobShown = '', compareShown = '', table = { episodes: [] };
@@ -43,8 +46,17 @@ function showPlan(result) {
   fill($('plan'), result.episodes ? el('p', {}, `The camera's volume of the pours to come is off by ${shown(plan.sd_now_ml)} ml now.`)
     : el('p', {}, 'Nothing has been weighed yet. The height is that of a beaker: if nothing flows, take 10 degrees more.'),
   ...nothing, ...plan.candidates.map((candidate, k) => proposal(candidate, k === 0)),
+  ...checked(result.check),
   missing.length ? el('p', {}, 'Still missing: ', missing.join('; '), '.') : null,
   ...left.map(([name, what]) => el('p', { className: 'warn' }, `! Left out: ${name.split('/').pop()}: ${what}`)));
+}
+
+/** What `trainer check` says of the set: what it spans, and what is doubtful. */
+function checked(check) {
+  if (!check) return [];
+  const s = check.spanned;
+  const span = s ? [el('p', { id: 'spanned' }, `The set spans ${shown(s.weights_g[0], 0)} to ${shown(s.weights_g[1], 0)} g; the flow began at ${shown(s.onsets_deg[0], 0)}° to ${shown(s.onsets_deg[1], 0)}° and was seen up to ${shown(s.last_tilt_deg, 0)}°.`)] : [];
+  return [...span, ...(check.doubts || []).map(([name, what]) => el('p', { className: 'warn' }, `! ${name.split('/').pop()}: ${what}`))];
 }
 
 $('make-plan').onclick = () => attempt(async () => {
@@ -88,9 +100,11 @@ function showJob(job) {
   if (job.error) { fill(place, el('p', { className: 'bad' }, `✕ ${JOBS[job.kind]} failed: ${job.error}`)); return; }
   const r = job.result || {};
   if (job.kind === 'plan') { fill(place); showPlan(r); return; }
-  if (job.kind === 'export') { fill(place, el('p', { className: 'good' }, `✓ Written on the robot's computer: ${r.directory}`)); return; }
+  if (job.kind === 'export') { fill(place, el('p', { className: 'good' }, `✓ Written on the robot's computer: ${r.directory}`),
+    ...(r.left_out ?? []).map((l) => el('p', { className: 'bad' }, `Left out: ${l.why}`))); return; }
   if (r.doubts) { askDoubts(r.doubts); fill(place, el('p', { className: 'warn' }, '! Nothing was learned yet: judge these episodes first.')); return; }
-  fill(place, el('p', { className: 'good' }, `✓ Learned from ${r.episodes} episodes. The new weights are offered under 4.`),
+  fill(place, el('p', { className: 'good' }, `✓ Learned from ${many(r.episodes, 'episode')}. The new weights are offered under 4.`),
+    ...(r.remarks || []).map(what => el('p', { className: 'warn' }, `! ${what}`)),
     ...(r.left_out || []).map(([name, what]) => el('p', { className: 'hint' }, `Left out: ${name.split('/').pop()}: ${what}`)));
 }
 
@@ -109,19 +123,37 @@ function askDoubts(doubts) {
 
 function compare() {
   const w = state.weights || {};
-  const key = JSON.stringify([w, state.kind === 'moving']);
+  const key = JSON.stringify([w, state.table, table.episodes.length]);
   if (key === compareShown) return;
   compareShown = key;
-  const order = what => () => attempt(async () => {
-    await post('/api/weights', { what });
+  // The server exchanges what is shown here, or nothing.
+  const order = (what, shownFile) => () => attempt(async () => {
+    await post('/api/weights', { what, identity: shownFile?.identity || '' });
     mine = true;
     say({ accept: 'The new weights are in use from the next pour on.', back: 'The weights from before are in use from the next pour on.', decline: 'The offer is deleted.' }[what], true);
   });
-  const button = (words, what, main = false) => el('button', { type: 'button', className: main ? `primary ${what}` : what, onclick: order(what) }, words);
-  fill($('compare'), el('h3', {}, 'In use'), weightsWords(w.now, 'None yet.'),
-    w.offer ? el('h3', {}, 'Offered') : null, w.offer ? weightsWords(w.offer, '') : el('p', { className: 'hint' }, 'Nothing is offered: learn first.'),
-    w.offer ? el('p', { className: 'row' }, w.offer.error ? null : button('Use the new weights', 'accept', true), button('Delete the offer', 'decline')) : null,
-    w.before ? el('h3', {}, 'From before') : null, w.before ? weightsWords(w.before, '') : null, w.before ? button('Go back to these', 'back') : null);
+  const button = (words, what, file, main = false) => el('button', { type: 'button', className: main ? `primary ${what}` : what, onclick: order(what, file) }, words);
+  const columns = [['In use', w.now], ['Offered', w.offer], ['From before', w.before]].filter(([, file]) => file);
+  const goals = [...new Set(columns.flatMap(([, file]) => (file.expected || []).map(e => e.goal_ml)))].sort((a, b) => a - b);
+  const off = (file, goal) => { const sd = (file.expected || []).find(e => e.goal_ml === goal)?.sd_ml; return Number.isFinite(sd) ? `±${shown(sd)} ml` : 'not known'; };
+  const line = (name, of) => el('tr', {}, el('th', { scope: 'row' }, name), ...columns.map(([, file]) => el('td', {}, of(file))));
+  const facts = [line('Weights', file => (file.error ? `✕ ${file.error}` : file.identity.slice(0, 8))), line('Age', file => (file.error ? '' : ago(file.age_s).replace(' old', ''))),
+    line('Learned from', file => (file.error ? '' : many(file.episodes, 'episode'))),
+    line('Weighed pours with them', file => (file.error ? '' : poursWith(file.identity))),
+    ...goals.map(goal => line(`Expected error, ${shown(goal, 0)} ml`, file => (file.error ? '' : off(file, goal))))];
+  fill($('compare'), columns.length ? el('div', { className: 'scroll' }, el('table', {}, el('thead', {}, el('tr', {}, el('td', {}), ...columns.map(([name]) => el('th', { scope: 'col' }, name)))), el('tbody', {}, ...facts)))
+    : el('p', {}, 'There is no weight file yet.'),
+  el('p', { className: 'hint' }, 'The expected error is one standard deviation, as the weights themselves tell it.'),
+  w.offer ? el('p', { className: 'row' }, w.offer.error ? null : button('Use the offered weights', 'accept', w.offer, true), button('Delete the offer', 'decline', w.offer)) : el('p', { className: 'hint' }, 'Nothing is offered: learn first.'),
+  w.before && !w.before.error ? button('Go back to those from before', 'back', w.before) : null);
+}
+
+/** How far off the weighed pours with some weights were. */
+function poursWith(identity) {
+  const errors = table.episodes.filter(e => e.weights === identity && Number.isFinite(e.error_ml)).map(e => e.error_ml);
+  if (!errors.length) return 'none';
+  const rms = Math.sqrt(errors.reduce((a, e) => a + e * e, 0) / errors.length);
+  return `${errors.length}, off by ${shown(rms)} ml (root mean square)`;
 }
 
 /** Episodes without a weight, newest first. */
@@ -129,9 +161,9 @@ function unweighed() {
   const open = table.episodes.filter(e => !e.error && e.complete && e.weight_g === null).reverse();
   const weighed = table.episodes.filter(e => !e.error && e.weight_g !== null);
   const kinds = kind => weighed.filter(e => e.run.kind === kind).length;
-  $('set-words').textContent = `The set: ${kinds('recording')} curves and ${kinds('pour')} pours are weighed${table.unread ? `; ${table.unread} files are still to be read` : ''}.`;
+  $('set-words').textContent = `Weighed so far: ${many(kinds('recording'), 'curve')} and ${many(kinds('pour'), 'pour')}${table.unread ? `; ${many(table.unread, 'file')} still to be read` : ''}.`;
   const old = plannedFrom !== null && plannedFrom !== weighed.length;
-  $('plan-old').textContent = old ? `! This was proposed from ${plannedFrom} weighed episodes; now there are ${weighed.length}: propose again.` : '';
+  $('plan-old').textContent = old ? `! This was proposed from ${many(plannedFrom, 'weighed episode')}; now there ${weighed.length === 1 ? 'is' : 'are'} ${weighed.length}: propose again.` : '';
   const rows = open.slice(0, 12).map(e => {
     const place = el('div', { className: 'proposal' });
     fill(place, el('p', {}, el('b', {}, e.file), ` ${e.started_at_utc}, ${what(e)}`), scale(e.file, e.run.goal_ml ?? NaN, grams => { if (grams === null) place.remove(); else reload(); }));

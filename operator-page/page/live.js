@@ -1,6 +1,13 @@
 // The live part: the stream of states, what the cell is doing in words, who has the say, and Stop.
+//
+// Runs in the browser's one thread: thirteen times a second when a state comes, and by timers that look whether none does. Stop waits for nothing
+// else and is tried two ways; if both fail, that is said. A state that cannot be read is left out, and the next one comes soon.
 'use strict';
 
+/** Without a state for this long the server is lost, ms: ten states. With LOOKS it is said well within a second. */
+const SILENT = 750;
+/** How often it is looked, ms. */
+const LOOKS = 100;
 let last = 0, source = null, state = null, mine = false, stopPort = 0, announced = '';
 /** The ticks of the last minute, by their place in the rows of the server. */
 let points = [];
@@ -32,7 +39,10 @@ async function stop() {
   const said = $('stop-said').textContent;
   setTimeout(() => { if ($('stop-said').textContent === said) $('stop-said').textContent = ''; }, 8000);
 }
-$('stop').onclick = stop;
+// It stops as the button goes down, and not when it comes up again; a click that no pointer made, as a screen reader's, stops too.
+let pressed = false;
+$('stop').onpointerdown = event => { if (event.button === 0) { pressed = true; stop(); } };
+$('stop').onclick = () => { if (!pressed) stop(); pressed = false; };
 
 // The space bar stops, wherever the focus is: it never presses another button. In a field for words it is a space.
 function takesSpace(target) { return target.matches?.('input[type="text"], textarea'); }
@@ -45,9 +55,17 @@ for (const kind of ['keydown', 'keyup']) {
   }, true);
 }
 
+/** Says that the server is lost, until a state comes. */
+function lose() {
+  document.body.classList.add('lost');
+  $('lost').hidden = false;
+}
+
 function connect() {
   source?.close();
   source = new EventSource('/events');
+  // A server that has ended closes its connections, which is noticed at once.
+  source.onerror = lose;
   source.onmessage = event => {
     last = performance.now();
     document.body.classList.remove('lost');
@@ -83,11 +101,10 @@ $('take').onclick = () => attempt(async () => { mine = (await post(mine ? '/api/
 
 // A server that is gone is noticed within a second.
 setInterval(() => {
-  if (performance.now() - last < 900) return;
-  document.body.classList.add('lost');
-  $('lost').hidden = false;
+  if (performance.now() - last < SILENT) return;
+  lose();
   if (source?.readyState === EventSource.CLOSED) connect();
-}, 150);
+}, LOOKS);
 setInterval(() => { if (!source || (source.readyState !== EventSource.OPEN && performance.now() - last > 3000)) connect(); }, 1500);
 
 /** Whether this page holds a pour. */
@@ -116,5 +133,7 @@ async function begin() {
   dispatchEvent(new CustomEvent('known'));
   fetch(`http://${location.hostname}:${stopPort}/alive`, { credentials: 'include' }).catch(() => {});
   connect();
+  // A page that is loaded again may have the say still.
+  here();
 }
 addEventListener('load', begin);

@@ -1,5 +1,8 @@
 // What all parts of the page use: finding and making elements, asking the server, and saying what went wrong. Everything that comes from the
 // server is put into the page as text, never as markup.
+//
+// All scripts of the page run in the browser's one thread and share their names; index.html loads this one first. Nothing here waits but for
+// the server. What fails is one line above the content (`attempt`); without a server the page greys out (live.js).
 'use strict';
 
 const $ = id => document.getElementById(id);
@@ -18,12 +21,12 @@ function el(tag, properties = {}, ...children) {
 /** Puts `children` in the place of what is in `parent`. */
 function fill(parent, ...children) { parent.replaceChildren(...children.filter(c => c !== null && c !== undefined)); }
 
-/** This page's own name for itself, by which the server knows who has the say. */
+/** This page's own name for itself, by which the server knows who has the say. It lies in the session's storage only while the page is loaded
+ *  anew: a tab that is duplicated gets a copy of the storage, and must not get the say with it. */
 const own = { id: sessionStorage.getItem('decant-id') || '', name: localStorage.getItem('decant-name') || '' };
-if (!own.id) {
-  own.id = [...crypto.getRandomValues(new Uint8Array(16))].map(b => b.toString(16).padStart(2, '0')).join('');
-  sessionStorage.setItem('decant-id', own.id);
-}
+if (!own.id) own.id = [...crypto.getRandomValues(new Uint8Array(16))].map(b => b.toString(16).padStart(2, '0')).join('');
+addEventListener('pagehide', () => sessionStorage.setItem('decant-id', own.id));
+addEventListener('pageshow', () => sessionStorage.removeItem('decant-id'));
 
 /** Says one line above the content; an empty line takes it away. */
 function say(line, good = false) {
@@ -65,6 +68,9 @@ function typed(id) {
 
 /** A number as people read it; zero has no sign. */
 const shown = (value, digits = 1) => (Number.isFinite(value) ? value.toFixed(digits).replace(/^-(0(\.0*)?)$/, '$1') : '–');
+
+/** So many of something, in words. */
+const many = (n, one) => `${n} ${one}${n === 1 ? '' : 's'}`;
 
 /** The time since something, in words. */
 function ago(seconds) {

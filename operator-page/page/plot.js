@@ -1,4 +1,7 @@
 // Plots on a canvas: panels over one time axis. Series differ by dash as well as by colour, and each panel names them in words.
+//
+// Runs in the browser's one thread whenever its caller draws; a plot of a minute takes some milliseconds. Numbers that are not known leave gaps,
+// and nothing fails.
 'use strict';
 
 const css = name => getComputedStyle(document.documentElement).getPropertyValue(name).trim();

@@ -1,17 +1,19 @@
 //! Calibration in the page: `feature-worker calibrate --page` as a child, whose own page answers this one's questions.
 //!
 //! The child watches one pour, finds corner, axes and colour, takes corrections, and writes the configuration; nothing of that is done here. A
-//! thread of its own takes what it says. Allocates, and what is read is bounded. A child that fails gives its lines.
+//! thread of its own takes what it says. There is one child at a time: another start ends the one before first, and a child ends with its
+//! standard input, so also when this program is killed. Allocates, and what is read is bounded. A child that fails gives its lines.
 
 use std::io::{BufRead as _, BufReader, Read as _, Write as _};
 use std::net::{SocketAddr, TcpStream};
-use std::path::Path;
-use std::process::{Child, Command, Stdio};
-use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::path::{Path, PathBuf};
+use std::process::{Child, Command, ExitStatus, Stdio};
+use std::sync::{Arc, Mutex, MutexGuard};
 use std::time::Duration;
 
 use serde_json::{Value, json};
 
+use crate::lock::locked;
 use crate::programs::program;
 
 /// Longest watch of a camera, s. Chosen by hand: calibrate keeps more than five minutes of it.
@@ -38,15 +40,37 @@ impl Newest {
     fn number(&self) -> Option<u32> {
         self.child.as_ref().map(Child::id)
     }
+
+    /// Ends the child, if there is one, and tells how it ended.
+    fn end(&mut self) -> Option<ExitStatus> {
+        let mut child = self.child.take()?;
+        self.address = None;
+        // It may have ended by itself.
+        let _ = child.kill();
+        child.wait().ok()
+    }
 }
 
 /// The calibration under way, if there is one.
-#[derive(Default)]
-pub struct Calibration(Mutex<Newest>);
+pub struct Calibration {
+    program: PathBuf,
+    newest: Mutex<Newest>,
+}
+
+impl Default for Calibration {
+    fn default() -> Self {
+        Self::with(program("feature-worker"))
+    }
+}
 
 impl Calibration {
+    /// Calibrates with this `feature-worker`.
+    fn with(program: PathBuf) -> Self {
+        Self { program, newest: Mutex::default() }
+    }
+
     fn newest(&self) -> MutexGuard<'_, Newest> {
-        self.0.lock().unwrap_or_else(PoisonError::into_inner)
+        locked(&self.newest)
     }
 
     /// Starts to watch the camera for `seconds`, during which one pour is to be shown. `method` is `colour`, `clear`, or
@@ -55,24 +79,22 @@ impl Calibration {
         if !(3..=SECONDS_MAX).contains(&seconds) {
             return Err(format!("the camera can be watched for 3 to {SECONDS_MAX} s"));
         }
-        self.cancel();
-        if let Some(mut before) = self.newest().child.take() {
-            // It was ended a moment ago.
-            let _ = before.wait();
-        }
-        let path = program("feature-worker");
+        let path = &self.program;
         let mut command = Command::new("nice");
-        command.args(["-n", "19"]).arg(&path).arg("calibrate").arg("--config").arg(config);
+        command.args(["-n", "19"]).arg(path).arg("calibrate").arg("--config").arg(config);
         command.arg("--picture").arg(picture);
-        command.args(["--seconds", &seconds.to_string(), "--page", "--port", "0"]);
+        command.args(["--seconds", &seconds.to_string(), "--page", "--port", "0", "--end-with-input"]);
         if ["colour", "clear"].contains(&method) {
             command.args(["--method", method]);
         }
-        command.stdin(Stdio::null()).stdout(Stdio::null()).stderr(Stdio::piped());
+        command.stdin(Stdio::piped()).stdout(Stdio::null()).stderr(Stdio::piped());
+        // Until the new child is known, nobody else starts one.
+        let mut newest = self.newest();
+        newest.end();
         let mut child = command.spawn().map_err(|e| format!("{}: {e}", path.display()))?;
         let said = child.stderr.take();
         let number = child.id();
-        *self.newest() = Newest { child: Some(child), ..Newest::default() };
+        *newest = Newest { child: Some(child), ..Newest::default() };
         let this = Arc::clone(self);
         let listen = move || {
             for line in said.into_iter().flat_map(|s| BufReader::new(s.take(ANSWER_MAX)).lines()).map_while(Result::ok) {
@@ -82,11 +104,14 @@ impl Calibration {
             if newest.number() != Some(number) {
                 return;
             }
-            let status = newest.child.take().and_then(|mut child| child.wait().ok());
-            newest.address = None;
+            // It has closed its standard error, so it has ended, or says more than is read.
+            let status = newest.end();
             newest.ended = Some(status.is_some_and(|s| s.success()));
         };
-        std::thread::Builder::new().name("calibration".into()).spawn(listen).map(drop).map_err(|e| e.to_string())
+        std::thread::Builder::new().name("calibration".into()).spawn(listen).map(drop).map_err(|e| {
+            newest.end();
+            e.to_string()
+        })
     }
 
     fn take(&self, number: u32, line: String) {
@@ -156,5 +181,44 @@ impl Calibration {
 impl Drop for Calibration {
     fn drop(&mut self) {
         self.cancel();
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Protects the camera and the configuration from calibrations that nobody sees: however many people start one at the same time, one child is
+    /// left, and none after a cancel.
+    #[test]
+    fn one_child_at_a_time() {
+        use std::os::unix::fs::PermissionsExt as _;
+        let dir = tempfile::tempdir().unwrap();
+        let (script, pids) = (dir.path().join("worker"), dir.path().join("pids"));
+        std::fs::write(&script, format!("#!/bin/sh\necho $$ >> {}\nexec sleep 30\n", pids.display())).unwrap();
+        std::fs::set_permissions(&script, std::fs::Permissions::from_mode(0o700)).unwrap();
+        let calibration = Arc::new(Calibration::with(script));
+        let alive = || {
+            let began = std::fs::read_to_string(&pids).unwrap_or_default();
+            began.lines().filter(|pid| Path::new("/proc").join(pid).exists()).count()
+        };
+        let wait = |what: &str, good: &dyn Fn() -> bool| {
+            let until = std::time::Instant::now() + Duration::from_secs(10);
+            while !good() {
+                assert!(std::time::Instant::now() < until, "{what}: {} children", alive());
+                std::thread::sleep(Duration::from_millis(10));
+            }
+        };
+        std::thread::scope(|scope| {
+            for _ in 0..8 {
+                scope.spawn(|| calibration.start((dir.path(), dir.path()), 20, "colour").unwrap());
+            }
+        });
+        wait("one is left", &|| alive() == 1);
+        // Whoever was started and forgotten would have said so by now.
+        std::thread::sleep(Duration::from_millis(300));
+        assert_eq!((alive(), &calibration.about()["busy"]), (1, &json!(true)));
+        calibration.cancel();
+        wait("none is left", &|| alive() == 0 && calibration.about()["busy"] == false);
     }
 }

@@ -8,20 +8,20 @@ use std::path::PathBuf;
 use std::process::{Child, ChildStdin, Command, Stdio};
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering::Relaxed};
 use std::sync::mpsc::{Sender, channel};
-use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::sync::{Arc, Mutex, MutexGuard};
 use std::time::{Duration, Instant};
 
 use shared::control::{Reply, Request, Status};
 use shared::messages::Phase;
 
+use crate::ends::Ends;
+use crate::lock::locked;
 use crate::wire::{self, FromLink, Picture, Point, ToLink};
 
 /// Number of ticks that are kept for plots: a minute at 30 Hz.
 const POINTS: usize = 1800;
 /// Number of closed files that are remembered. Chosen by hand: more than the controller's results.
 const FILES: usize = 64;
-/// Number of episodes whose ends are remembered. Chosen by hand: a lab's day.
-const ENDS: usize = 1000;
 /// Longest wait for an answer through the link: the client's own limits, and a little more.
 const ANSWER: Duration = Duration::from_secs(8);
 /// A link that has said nothing for this long hangs and is ended: it asks for the state twice a second, and waits 2 s for an answer.
@@ -52,8 +52,8 @@ pub struct Live {
     pub no_picture: String,
     /// What became of each episode's file.
     pub files: BTreeMap<u64, Result<String, String>>,
-    /// Why pours and recordings ended, and the volume poured by the estimate, by the names of their files.
-    pub ends: BTreeMap<String, (&'static str, String)>,
+    /// How pours and recordings ended.
+    pub ends: Ends,
     looked_at: Option<Instant>,
     heard_at: Option<Instant>,
 }
@@ -62,17 +62,6 @@ impl Live {
     /// Whether the controller ticks.
     pub fn ticks(&self) -> bool {
         self.points_at.is_some_and(|at| at.elapsed() < SILENT)
-    }
-
-    /// Remembers how the episodes ended whose files are known.
-    fn remember_ends(&mut self) {
-        let outcomes = self.status.iter().flat_map(|s| &s.outcomes);
-        let named = outcomes.filter_map(|o| self.files.get(&o.episode)?.as_ref().ok()?.rsplit('/').next().map(|name| (name, o)));
-        let ends: Vec<_> = named.map(|(name, o)| (name.to_string(), (o.reason.words(), o.poured_words()))).collect();
-        self.ends.extend(ends);
-        while self.ends.len() > ENDS {
-            self.ends.pop_first();
-        }
     }
 
     /// What the controller is doing, if it ticks.
@@ -92,14 +81,10 @@ pub struct Cell {
     held: AtomicBool,
 }
 
-fn locked<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
-    mutex.lock().unwrap_or_else(PoisonError::into_inner)
-}
-
 impl Cell {
-    /// A cell of which nothing is known yet.
-    pub fn new(config: PathBuf) -> Self {
-        let (live, link, waiting) = (Mutex::default(), Mutex::default(), Mutex::default());
+    /// A cell of which nothing is known yet but how earlier episodes ended.
+    pub fn new(config: PathBuf, ends: Ends) -> Self {
+        let (live, link, waiting) = (Mutex::new(Live { ends, ..Live::default() }), Mutex::default(), Mutex::default());
         Self { config, live, link, waiting, next: AtomicU64::new(1), held: AtomicBool::new(false) }
     }
 
@@ -219,9 +204,10 @@ impl Cell {
                 live.points_at = Some(Instant::now());
             }
             FromLink::Status(status) => {
+                let live = &mut *live;
+                live.ends.remember(&status.outcomes, &live.files);
                 live.status = Some(status);
                 live.no_status.clear();
-                live.remember_ends();
             }
             FromLink::NoStatus(what) | FromLink::Broken(what) => {
                 live.status = None;

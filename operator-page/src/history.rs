@@ -8,12 +8,15 @@ use std::collections::BTreeMap;
 use std::fs::{self, File};
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, Ordering::Relaxed};
-use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::sync::{Arc, Mutex};
 use std::time::{Duration, SystemTime};
 
 use feature_worker::episodes::summary::{remarks, summary};
 use serde_json::{Value, json};
 use shared::episode::{Episode, EpisodeImages, find_episodes};
+
+use crate::ends::Ends;
+use crate::lock::locked;
 
 /// Pause between two looks at the directory. Chosen by hand: a person waits for a new episode no longer.
 const BEAT: Duration = Duration::from_millis(500);
@@ -45,10 +48,6 @@ pub struct History {
     table: Mutex<BTreeMap<String, Line>>,
     unread: Mutex<usize>,
     open: Mutex<Vec<Arc<Pictures>>>,
-}
-
-fn locked<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
-    mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
 fn stamp(path: &Path) -> Stamp {
@@ -106,14 +105,13 @@ impl History {
         }
     }
 
-    /// The table in the order of names, and how many files are still to be read. `ends` says how episodes ended, by name: the reason, and the
-    /// volume poured by the estimate.
-    pub fn table(&self, ends: &BTreeMap<String, (&'static str, String)>) -> Value {
+    /// The table in the order of names, and how many files are still to be read. `ends` says how episodes ended.
+    pub fn table(&self, ends: &Ends) -> Value {
         let with_end = |(name, line): (&String, &Line)| {
             let mut value = line.value.clone();
-            if let Some((reason, poured)) = ends.get(name) {
-                value["reason"] = json!(reason);
-                value["estimate"] = json!(format!("{poured} ml"));
+            if let Some(end) = ends.of(name) {
+                value["reason"] = json!(end.reason);
+                value["estimate"] = json!(end.poured.as_ref().map(|poured| format!("{poured} ml")));
             }
             value
         };
@@ -150,6 +148,12 @@ impl History {
         lines.sort_unstable();
         let skipped = last.map_or(0, |n| lines.len().saturating_sub(n));
         lines.into_iter().skip(skipped).map(|(_, name)| self.directory.join(name)).collect()
+    }
+
+    /// By how much the weighed pours with the weights `identity` missed their goals, ml.
+    pub fn errors_ml(&self, identity: &str) -> Vec<f64> {
+        let table = locked(&self.table);
+        table.values().filter(|l| l.value["weights"] == identity).filter_map(|l| l.value["error_ml"].as_f64()).collect()
     }
 
     /// Reads the episode `name` again at once, so that what is asked next knows what was just written into it.

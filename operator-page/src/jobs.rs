@@ -5,10 +5,11 @@
 
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, Ordering::Relaxed};
-use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::sync::{Arc, Mutex, MutexGuard};
 
 use serde_json::{Value, json};
 
+use crate::lock::locked;
 use crate::programs::{self, Step};
 
 /// A job, and how far it has come.
@@ -41,7 +42,7 @@ fn words(path: &Path) -> String {
 
 impl Jobs {
     fn newest(&self) -> MutexGuard<'_, Job> {
-        self.newest.lock().unwrap_or_else(PoisonError::into_inner)
+        locked(&self.newest)
     }
 
     /// The newest job as the page shows it.
@@ -53,7 +54,7 @@ impl Jobs {
 
     /// The newest plan; null before the first.
     pub fn plan(&self) -> Value {
-        self.plan.lock().unwrap_or_else(PoisonError::into_inner).clone()
+        locked(&self.plan).clone()
     }
 
     /// Cancels the job under way.
@@ -77,7 +78,7 @@ impl Jobs {
             if kind == "plan"
                 && let Ok(plan) = &result
             {
-                *this.plan.lock().unwrap_or_else(PoisonError::into_inner) = plan.clone();
+                *locked(&this.plan) = plan.clone();
             }
             match result {
                 Ok(result) => job.result = result,
@@ -140,8 +141,10 @@ impl Jobs {
             Box::new(move |stop, step| {
                 step(Step { stage: "looking at the episodes".into(), ..Step::default() });
                 let (check, _) = programs::run("trainer", &[vec!["check".into(), "--json".into()], files.clone()].concat(), stop, |_| {})?;
+                let of_set = |d: &&Value| d[0] == "data set";
                 let judged = |name: &str| name == "data set" || accept.iter().chain(&leave_out).any(|n| n == name);
                 let doubts = check["doubts"].as_array().cloned().unwrap_or_default();
+                let remarks: Vec<Value> = doubts.iter().filter(of_set).map(|d| d[1].clone()).collect();
                 let open: Vec<Value> = doubts.into_iter().filter(|d| !judged(d[0].as_str().unwrap_or(""))).collect();
                 if !open.is_empty() {
                     return Ok(json!({ "doubts": open }));
@@ -152,7 +155,7 @@ impl Jobs {
                 arguments.extend(leave_out.iter().flat_map(|name| ["--leave-out".into(), name.clone()]));
                 let (report, _) = programs::run("trainer", &arguments, stop, step)?;
                 let learned = report["episodes"].as_array().map_or(0, Vec::len);
-                Ok(json!({ "identity": report["identity"], "episodes": learned, "left_out": report["left_out"] }))
+                Ok(json!({ "identity": report["identity"], "episodes": learned, "left_out": report["left_out"], "remarks": remarks }))
             }),
         )
     }
@@ -171,8 +174,10 @@ impl Jobs {
                 arguments.extend(["--to".into(), words(&to)]);
                 arguments.extend(files);
                 let (written, succeeded) = programs::run("feature-worker", &arguments, stop, |_| {})?;
-                if succeeded {
-                    Ok(json!({ "directory": words(&to), "written": written["written"] }))
+                // What cannot be read is left out and named, and the rest is there.
+                let some = written["written"].as_array().is_some_and(|w| !w.is_empty());
+                if succeeded || some {
+                    Ok(json!({ "directory": words(&to), "written": written["written"], "left_out": written["left_out"] }))
                 } else {
                     Err("the export failed".into())
                 }

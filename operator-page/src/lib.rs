@@ -17,14 +17,20 @@
 //! | [`jobs`], [`programs`] | the house's other programs in the background |
 //! | [`calibration`] | `feature-worker calibrate` in the page |
 //! | [`history`] | the recorded episodes |
+//! | [`ends`] | why they ended |
+//! | [`addresses`] | this machine's addresses |
+//! | [`lock`] | how locks are taken |
 #![forbid(unsafe_code)]
 
+pub mod addresses;
 pub mod calibration;
 pub mod cell;
 pub mod cli;
+pub mod ends;
 pub mod history;
 pub mod jobs;
 pub mod link;
+pub mod lock;
 pub mod orders;
 pub mod programs;
 pub mod routes;

@@ -1,4 +1,6 @@
-//! Command line of `operator-page`.
+//! Command line of `operator-page`: it reads the arguments, runs one command, and ends with that command's exit code.
+//!
+//! The main thread; it allocates. What fails is one line on standard error and a documented exit code.
 
 use std::process::ExitCode;
 

@@ -37,6 +37,8 @@ struct Order {
     accept: Vec<String>,
     leave_out: Vec<String>,
     what: String,
+    /// The weights that the page shows.
+    identity: String,
     seconds: u64,
     corner: Value,
 }
@@ -181,9 +183,9 @@ fn act(site: &Site, stops: u64, path: &str, order: Order) -> Result<Value, Strin
             Ok(site.jobs.about())
         }
         "/api/weights" => match order.what.as_str() {
-            "accept" => site.shelf.accept().map(|identity| json!({ "identity": identity })),
-            "back" => site.shelf.back().map(|identity| json!({ "identity": identity })),
-            "decline" => site.shelf.decline().map(|()| json!({})),
+            "accept" => site.shelf.accept(&order.identity).map(|identity| json!({ "identity": identity })),
+            "back" => site.shelf.back(&order.identity).map(|identity| json!({ "identity": identity })),
+            "decline" => site.shelf.decline(&order.identity).map(|()| json!({})),
             _ => Err("the page asks for what is not known: load it again".into()),
         },
         "/api/calibrate" => calibrate(site, &order),

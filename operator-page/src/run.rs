@@ -23,6 +23,7 @@ use shared::os;
 use web::gate::Rules;
 use web::{Server, Settings, token};
 
+use crate::addresses;
 use crate::routes;
 use crate::site::Site;
 
@@ -105,17 +106,22 @@ pub fn run(args: &Args) -> Result<(), Failure> {
 /// Says where the page is. A log that others read, as systemd's, gets the token's file instead of the token.
 fn announce(address: SocketAddr, word: &str, (file, made): (&Path, bool), loopback: bool) {
     let logged = std::env::var_os("JOURNAL_STREAM").is_some();
-    let with_token = if logged {
-        format!("http://{address}/?token=... (it is in {})", file.display())
-    } else {
-        format!("http://{address}/?token={word}")
-    };
-    if loopback {
-        println!("http://{address}");
-        eprintln!("operator-page: open http://{address} on this machine; another user of it needs {with_token}");
-    } else {
-        println!("{with_token}");
-        eprintln!("operator-page: open {with_token}");
+    for ip in addresses::to_open(address.ip()) {
+        let address = SocketAddr::new(ip, address.port());
+        let with_token = if logged {
+            format!("http://{address}/?token=... (it is in {})", file.display())
+        } else {
+            format!("http://{address}/?token={word}")
+        };
+        if loopback {
+            println!("http://{address}");
+            eprintln!("operator-page: open http://{address} on this machine; another user of it needs {with_token}");
+        } else {
+            println!("{with_token}");
+            eprintln!("operator-page: open {with_token}");
+        }
+    }
+    if !loopback {
         eprintln!("operator-page: whoever has this address can move the robot; it is not encrypted, so use a network that you trust");
     }
     if made {

@@ -1,23 +1,31 @@
 //! The weight files: the one that the controller watches, the one that was just learned and is offered, and those from before.
 //!
 //! Ordinary threads use it; it allocates, and reads and writes files. A file is exchanged in one step, so the controller reads the old one or
-//! the new one, and takes it between two pours. Nothing is deleted but an offer that is declined. Every failure is a line that names the file.
+//! the new one, and takes it between two pours. Exchanges wait for each other at a lock file, and each says which weights a person was shown:
+//! if they are others by now, nothing happens. Nothing is deleted but an offer that is declined. Every failure is a line that names the file.
 
 use std::collections::BTreeMap;
-use std::fs;
+use std::fs::{self, File};
+use std::io::Write as _;
 use std::path::{Path, PathBuf};
-use std::sync::{Mutex, PoisonError};
-use std::time::SystemTime;
+use std::sync::Mutex;
+use std::time::{Duration, Instant, SystemTime};
 
 use rt_controller::foreseen;
 use serde_json::{Value, json};
 use shared::limits::Limits;
 use shared::weights::{Estimator, Weights};
 
+use crate::lock::locked;
+
 /// Goals for which the expected error is said, ml, as far as the cell allows them.
 const GOALS_ML: [f32; 4] = [25.0, 50.0, 100.0, 200.0];
 /// Number of files of which the expected errors are remembered. Chosen by hand; no measurement is recorded.
 const REMEMBERED: usize = 16;
+/// Longest wait for another exchange. Chosen by hand: one takes milliseconds.
+const TURN: Duration = Duration::from_secs(5);
+/// What a page is told that shows an older state of the files.
+const OTHERS: &str = "the weight files have changed since this was shown: look at what is there now, and choose again";
 
 /// The weight files of one cell.
 pub struct Shelf {
@@ -87,7 +95,7 @@ impl Shelf {
     /// The deviation with which pours are expected to end, for some goals. `null` where the weights do not tell.
     fn expected(&self, weights: &Weights) -> Value {
         let identity = weights.identity();
-        let mut known = self.expected.lock().unwrap_or_else(PoisonError::into_inner);
+        let mut known = locked(&self.expected);
         if let Some(found) = known.get(&identity) {
             return found.clone();
         }
@@ -101,24 +109,35 @@ impl Shelf {
         value
     }
 
-    /// Takes the offer into use, and keeps the file that was in use.
-    pub fn accept(&self) -> Result<String, String> {
+    /// Takes the offer `shown` into use, and keeps the file that was in use.
+    pub fn accept(&self, shown: &str) -> Result<String, String> {
+        let _turn = self.turn()?;
         let offer = self.offer();
-        let identity = self.exchange(&offer)?;
-        fs::remove_file(&offer).map_err(fault(&offer))?;
-        self.decline_report();
+        let identity = self.exchange(&offer, shown)?;
+        // A training may have written another offer since.
+        if Weights::read(&offer).is_ok_and(|w| w.identity() == identity) {
+            fs::remove_file(&offer).map_err(fault(&offer))?;
+            self.decline_report();
+        }
         Ok(identity)
     }
 
-    /// Goes back to the file from before; the one that was in use is then the one from before.
-    pub fn back(&self) -> Result<String, String> {
+    /// Goes back to the file from before, `shown`; the one that was in use is then the one from before.
+    pub fn back(&self, shown: &str) -> Result<String, String> {
+        let _turn = self.turn()?;
         let before = self.before().ok_or("there are no weights from before")?;
-        self.exchange(&before)
+        self.exchange(&before, shown)
     }
 
-    /// Deletes the offer.
-    pub fn decline(&self) -> Result<(), String> {
+    /// Deletes the offer `shown`; of an offer that cannot be read nothing is shown.
+    pub fn decline(&self, shown: &str) -> Result<(), String> {
+        let _turn = self.turn()?;
         let offer = self.offer();
+        match Weights::read(&offer) {
+            Ok(weights) if weights.identity() != shown => return Err(OTHERS.into()),
+            Err(_) if !shown.is_empty() && offer.exists() => return Err(OTHERS.into()),
+            _ => {}
+        }
         fs::remove_file(&offer).map_err(fault(&offer))?;
         self.decline_report();
         Ok(())
@@ -129,38 +148,78 @@ impl Shelf {
         let _ = fs::remove_file(beside(&self.offer(), ".json"));
     }
 
-    /// Puts `new` where the controller watches, and keeps what was there.
-    fn exchange(&self, new: &Path) -> Result<String, String> {
-        let identity = Weights::read(new).map_err(|e| e.to_string())?.identity();
+    /// One exchange at a time, of all pages of this cell.
+    fn turn(&self) -> Result<File, String> {
         let kept = self.kept();
         fs::create_dir_all(&kept).map_err(fault(&kept))?;
-        let keep = |path: &Path| -> Result<String, String> {
-            let identity = Weights::read(path).map_err(|e| e.to_string())?.identity();
-            copy(path, &kept.join(format!("{identity}.bin")))?;
-            Ok(identity)
-        };
-        keep(new)?;
-        // Without a readable file in use there is nothing to go back to.
-        if let Ok(old) = keep(&self.weights)
-            && old != identity
-        {
-            let file = kept.join("before");
-            fs::write(&file, format!("{old}\n")).map_err(fault(&file))?;
+        let path = kept.join("lock");
+        let file = File::options().create(true).append(true).open(&path).map_err(fault(&path))?;
+        let until = Instant::now() + TURN;
+        while file.try_lock().is_err() {
+            if Instant::now() > until {
+                return Err(format!("{}: another page exchanges weights and does not end: end that page's program", path.display()));
+            }
+            std::thread::sleep(TURN / 1000);
         }
-        copy(new, &self.weights)?;
-        Ok(identity)
+        Ok(file)
+    }
+
+    /// Puts `new` where the controller watches, if it is what was `shown`, and keeps what was there.
+    fn exchange(&self, new: &Path, shown: &str) -> Result<String, String> {
+        let taken = Taken::read(new)?;
+        if taken.identity != shown {
+            return Err(OTHERS.into());
+        }
+        let kept = self.kept();
+        taken.put(&kept.join(format!("{shown}.bin")))?;
+        // Without a readable file in use there is nothing to go back to.
+        if let Ok(old) = Taken::read(&self.weights)
+            && old.identity != taken.identity
+        {
+            old.put(&kept.join(format!("{}.bin", old.identity)))?;
+            put(format!("{}\n", old.identity).as_bytes(), None, &kept.join("before"))?;
+        }
+        taken.put(&self.weights)?;
+        Ok(taken.identity)
     }
 }
 
-/// Copies a file in one step, with its time.
-fn copy(from: &Path, to: &Path) -> Result<(), String> {
-    let partial = beside(to, ".partial");
-    fs::copy(from, &partial).map_err(fault(&partial))?;
-    if let Ok(at) = fs::metadata(from).and_then(|m| m.modified()) {
-        // Without its time a file only looks younger than it is.
-        let _ = fs::File::options().append(true).open(&partial).and_then(|f| f.set_modified(at));
+/// A weight file as it was read: what is checked is what is put somewhere else.
+struct Taken {
+    identity: String,
+    bytes: Vec<u8>,
+    modified: Option<SystemTime>,
+}
+
+impl Taken {
+    fn read(path: &Path) -> Result<Self, String> {
+        let modified = fs::metadata(path).and_then(|m| m.modified()).ok();
+        let weights = Weights::read(path).map_err(|e| e.to_string())?;
+        let bytes = weights.to_bytes().map_err(|e| e.to_string())?;
+        Ok(Self { identity: weights.identity(), bytes, modified })
     }
-    fs::rename(&partial, to).map_err(fault(to))
+
+    fn put(&self, to: &Path) -> Result<(), String> {
+        put(&self.bytes, self.modified, to)
+    }
+}
+
+/// Writes a file in one step, with its time. Only whoever has the turn does it, so that one name for what is not whole yet is enough.
+fn put(bytes: &[u8], modified: Option<SystemTime>, to: &Path) -> Result<(), String> {
+    let partial = beside(to, &format!(".{}.partial", std::process::id()));
+    let write = || {
+        let mut file = File::create(&partial)?;
+        file.write_all(bytes)?;
+        // Without its time a file only looks younger than it is.
+        let _ = modified.map(|at| file.set_modified(at));
+        file.sync_all()?;
+        fs::rename(&partial, to)
+    };
+    write().map_err(|e| {
+        // Nobody needs what is not whole, and it does no harm if it cannot be removed.
+        let _ = fs::remove_file(&partial);
+        fault(to)(e)
+    })
 }
 
 #[cfg(test)]
@@ -192,21 +251,64 @@ mod tests {
         let dir = tempfile::tempdir().unwrap();
         let file = dir.path().join("weights.bin");
         let shelf = Shelf::new(file.clone(), Limits::default(), 120.0);
-        assert!(shelf.back().is_err() && shelf.accept().is_err());
+        let (one, two) = (weights(1).identity(), weights(2).identity());
+        assert!(shelf.back(&one).is_err() && shelf.accept(&two).is_err());
         weights(1).write(&file).unwrap();
         weights(2).write(&shelf.offer()).unwrap();
         let now = || Weights::read(&file).unwrap().seed;
-        shelf.accept().unwrap();
+        shelf.accept(&two).unwrap();
         assert_eq!((now(), shelf.about()["offer"].is_null()), (2, true));
-        shelf.back().unwrap();
+        shelf.back(&one).unwrap();
         assert_eq!(now(), 1);
-        shelf.back().unwrap();
+        shelf.back(&two).unwrap();
         assert_eq!(now(), 2);
         fs::write(shelf.offer(), "no weights").unwrap();
         assert!(shelf.about()["offer"]["error"].is_string());
-        assert!(shelf.accept().is_err());
+        assert!(shelf.accept("").is_err());
         assert_eq!(now(), 2, "a file that is no weight file is not taken");
-        shelf.decline().unwrap();
+        shelf.decline("").unwrap();
         assert!(shelf.about()["offer"].is_null());
+    }
+
+    /// Protects people from a page that is old: what it shows is exchanged or nothing is, also when another offer has come since.
+    #[test]
+    fn a_stale_page_exchanges_nothing() {
+        let dir = tempfile::tempdir().unwrap();
+        let file = dir.path().join("weights.bin");
+        let shelf = Shelf::new(file.clone(), Limits::default(), 120.0);
+        weights(1).write(&file).unwrap();
+        weights(3).write(&shelf.offer()).unwrap();
+        let (one, two) = (weights(1).identity(), weights(2).identity());
+        for shown in [two.as_str(), ""] {
+            assert!(shelf.accept(shown).unwrap_err().contains("choose again") && shelf.decline(shown).is_err());
+        }
+        assert_eq!((Weights::read(&file).unwrap().seed, shelf.offer().exists()), (1, true));
+        shelf.accept(&weights(3).identity()).unwrap();
+        assert!(shelf.back(&two).is_err());
+        shelf.back(&one).unwrap();
+    }
+
+    /// Protects the one way back from two people who click at the same time: of many exchanges at once, some in another process's place, each
+    /// ends whole, and the file in use and the one from before are the two that there are.
+    #[test]
+    fn exchanges_wait_for_each_other() {
+        let dir = tempfile::tempdir().unwrap();
+        let file = dir.path().join("weights.bin");
+        let shelves: Vec<Shelf> = (0..4).map(|_| Shelf::new(file.clone(), Limits::default(), 120.0)).collect();
+        weights(1).write(&file).unwrap();
+        weights(2).write(&shelves[0].offer()).unwrap();
+        let (one, two) = (weights(1).identity(), weights(2).identity());
+        shelves[0].accept(&two).unwrap();
+        let exchanged: usize = std::thread::scope(|scope| {
+            let run = |shelf: &Shelf| (0..50).filter(|k| shelf.back(if k % 2 == 0 { &one } else { &two }).is_ok()).count();
+            let threads: Vec<_> = shelves.iter().map(|shelf| scope.spawn(move || run(shelf))).collect();
+            threads.into_iter().map(|t| t.join().unwrap()).sum()
+        });
+        let about = shelves[0].about();
+        let (now, before) = (about["now"]["identity"].as_str().unwrap(), about["before"]["identity"].as_str().unwrap());
+        // Each exchange that happened has swapped the two.
+        assert_eq!((now, before), if exchanged % 2 == 0 { (two.as_str(), one.as_str()) } else { (one.as_str(), two.as_str()) });
+        let left = fs::read_dir(dir.path()).unwrap().flatten().filter(|f| f.file_name().to_string_lossy().contains("partial")).count();
+        assert_eq!(left, 0);
     }
 }

@@ -5,7 +5,7 @@
 
 use std::path::PathBuf;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering::Relaxed, Ordering::SeqCst};
-use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::sync::{Arc, Mutex, MutexGuard};
 use std::time::{Duration, Instant};
 
 use serde_json::{Value, json};
@@ -17,8 +17,10 @@ use web::Broadcast;
 
 use crate::calibration::Calibration;
 use crate::cell::{Cell, Live};
+use crate::ends::Ends;
 use crate::history::History;
 use crate::jobs::Jobs;
+use crate::lock::locked;
 use crate::say::Say;
 use crate::shelf::Shelf;
 use crate::stop::Stopper;
@@ -33,6 +35,8 @@ const SLOW: Duration = Duration::from_secs(1);
 const POINTS: usize = 18;
 /// How often a pour that was let go of is stopped until it is obeyed. Chosen by hand; no measurement is recorded.
 const STOP_TRIES: usize = 3;
+/// What is remembered of the episodes' ends lies beside them, under this name.
+const ENDS_FILE: &str = "operator-page-ends.json";
 /// Number of the newest results that are sent. Chosen by hand; no measurement is recorded.
 const OUTCOMES: usize = 8;
 
@@ -68,16 +72,12 @@ pub struct Site {
     pub stop_port: u16,
 }
 
-fn locked<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
-    mutex.lock().unwrap_or_else(PoisonError::into_inner)
-}
-
 impl Site {
     /// The page of a cell, of which nothing is known yet.
     pub fn new(config: Config, file: PathBuf, stop_port: u16) -> Self {
         let shelf = Shelf::new(config.controller.weights.clone(), config.limits, config.controller.goal_max_ml);
         Self {
-            cell: Arc::new(Cell::new(file.clone())),
+            cell: Arc::new(Cell::new(file.clone(), Ends::of_file(config.recording.directory.join(ENDS_FILE)))),
             say: Mutex::default(),
             held: Mutex::default(),
             stops: AtomicU64::new(0),
@@ -137,12 +137,9 @@ impl Site {
         let c = &self.config;
         json!({
             "cell": c.cell.name, "version": env!("CARGO_PKG_VERSION"), "config": self.file.display().to_string(),
-            "goal_max_ml": c.controller.goal_max_ml, "rate_hz": c.controller.rate_hz, "alpha_max_deg": c.limits.alpha_max_deg,
-            "holds_ml": c.container.holds_ml, "least_fill_ml": c.container.least_fill_ml,
-            "size_px": [c.camera.width_px, c.camera.height_px],
+            "goal_max_ml": c.controller.goal_max_ml, "holds_ml": c.container.holds_ml,
             "region_px": c.image.region_px, "x_axis_px": c.image.x_axis_px, "y_axis_px": c.image.y_axis_px,
             "doubts": Doubt::ALL.map(Doubt::words), "stop_port": self.stop_port,
-            "recordings": c.recording.directory.display().to_string(),
         })
     }
 

@@ -73,7 +73,7 @@ pub struct Output {
 }
 
 /// Counters since the start.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct Counters {
     /// Number of ticks done.
     pub ticks: u64,
@@ -87,6 +87,8 @@ pub struct Counters {
     pub ignored_features: u64,
     /// How often each limit changed a request.
     pub clipped: Clipped,
+    /// The rate at which the camera's frames really come, and the configured one, frames/s, if they differ.
+    pub wrong_rate_hz: Option<(f32, f32)>,
 }
 
 /// A pour or recording under way.
@@ -163,7 +165,7 @@ impl Core {
 
     /// Counters since the start.
     pub fn counters(&self) -> Counters {
-        Counters { clipped: self.limiter.clipped(), ..self.counters }
+        Counters { clipped: self.limiter.clipped(), wrong_rate_hz: self.wrong_rate_hz(), ..self.counters }
     }
 
     /// Whether a new agent may be taken now: not in the middle of a pour or recording.
@@ -229,6 +231,10 @@ impl Core {
         }
     }
 
+    fn wrong_rate_hz(&self) -> Option<(f32, f32)> {
+        self.frame_rate.wrong_hz().map(|hz| (hz, self.frame_rate.configured_hz()))
+    }
+
     fn obey(&mut self, order: Order, input: &Input) -> Result<(), Refusal> {
         let newest_ns = intake::newest_usable_ns(input.features, self.usable_at_ns, input.now_ns);
         let situation = Situation {
@@ -236,7 +242,7 @@ impl Core {
             robot: input.robot,
             shutdown: self.shutdown,
             measurement_age_ns: input.now_ns.saturating_sub(newest_ns),
-            wrong_rate_hz: self.frame_rate.wrong_hz().map(|hz| (hz, self.frame_rate.configured_hz())),
+            wrong_rate_hz: self.wrong_rate_hz(),
         };
         match order {
             Order::Shutdown => {
@@ -323,7 +329,7 @@ impl Core {
             self.counters.bridged_frames += u64::from(taken.lost);
             area = measured.unwrap_or(f32::NAN);
             run.frames += taken.lost + 1;
-            if let Some(dalpha_deg) = self.step_agent(&taken, measured, feature.captured_at_ns) {
+            if let Some(dalpha_deg) = self.step_agent(&taken, measured, feature) {
                 asked = if asked.is_nan() { 0.0 } else { asked } + dalpha_deg;
                 self.request_deg = self.limiter.alpha_deg() + asked;
             }
@@ -333,14 +339,15 @@ impl Core {
 
     /// Steps the agent for the frames that were lost and for the one that was measured. Returns the angle to ask for, degrees, while the
     /// pour goes on. The liquid of the lost frames is estimated, but the moment to act on them has passed.
-    fn step_agent(&mut self, taken: &Taken, area_px2: Option<f32>, captured_at_ns: u64) -> Option<f32> {
+    fn step_agent(&mut self, taken: &Taken, area_px2: Option<f32>, feature: &Feature) -> Option<f32> {
+        let Feature { captured_at_ns, confidence, .. } = *feature;
         let (agent, run) = (self.agent.as_mut()?, self.run.as_mut()?);
         run.goal_ml?;
         let alpha_now_deg = self.limiter.alpha_deg();
         let measured = &self.measured;
         let mut step = |area_px2, alpha_deg, at_ns| {
             let alpha_measured_deg = measured.at_within_deg(at_ns, MEASURED_HOLD_NS);
-            let decision = agent.step(Observation { area_px2, alpha_deg, alpha_measured_deg, alpha_now_deg });
+            let decision = agent.step(Observation { area_px2, confidence, alpha_deg, alpha_measured_deg, alpha_now_deg });
             if run.ending.decided(&decision) {
                 agent.tilt_back();
             }

@@ -14,6 +14,7 @@ use shared::agent::Agent;
 use shared::config::Config;
 use shared::episode::take_number;
 use shared::messages::Phase;
+use shared::os;
 use shared::regular_file;
 use shared::weights::Weights;
 
@@ -62,6 +63,9 @@ pub struct Disk<'a> {
     /// When a journal that could not be written is tried again, and when free space is looked at again.
     retry: Option<Instant>,
     pause: Duration,
+    /// Since when no pour or recording is under way, and when the newest tick that was taken from the queue woke up, CLOCK_MONOTONIC ns.
+    at_rest_since_ns: Option<u64>,
+    newest_tick_ns: u64,
     space_at: Option<Instant>,
     ticks: Receiver<Box<Tick>>,
     /// The weights that were read last, for a journal that begins anew.
@@ -120,6 +124,8 @@ impl<'a> Disk<'a> {
             journal_at,
             retry,
             pause: RETRY,
+            at_rest_since_ns: None,
+            newest_tick_ns: 0,
             space_at: None,
             ticks,
             loaded: None,
@@ -148,6 +154,7 @@ impl<'a> Disk<'a> {
     /// Writes the ticks that wait.
     fn write_ticks(&mut self) {
         while let Ok(tick) = self.ticks.try_recv() {
+            self.newest_tick_ns = tick.now_ns;
             self.write(|journal| journal.tick(tick));
         }
     }
@@ -169,10 +176,21 @@ impl<'a> Disk<'a> {
         self.pause = (self.pause * 2).min(RETRY_MAX);
     }
 
+    /// Whether every tick of the last pour or recording has been written: a tick has come that woke up after it was over. That the phase says so is
+    /// not enough, because the last ticks may still be on their way through the other thread.
+    fn is_at_rest(&mut self) -> bool {
+        if !matches!(Phase::from_code(self.exchange.phase.load(SeqCst)), Phase::Idle | Phase::NoRobot) {
+            self.at_rest_since_ns = None;
+            return false;
+        }
+        let since_ns = *self.at_rest_since_ns.get_or_insert_with(os::now_ns);
+        self.newest_tick_ns > since_ns
+    }
+
     /// Begins the journal's next part when the file is large, or a new one when the last could not be written; never in a pour or recording.
     fn keep_journal(&mut self) {
+        let at_rest = self.is_at_rest();
         let Some((path, settings)) = &self.journal_at else { return };
-        let at_rest = matches!(Phase::from_code(self.exchange.phase.load(SeqCst)), Phase::Idle | Phase::NoRobot) && self.ticks.is_empty();
         let due = self.retry.is_some_and(|at| Instant::now() >= at);
         let part = match self.journal.take() {
             Some(full) if full.is_full() && at_rest => full.next_part(path, settings),
@@ -293,5 +311,47 @@ pub fn read_weights(path: &Path, fps: f64, trusted: Option<u32>) -> Result<Weigh
         Ok(weights)
     } else {
         Err(format!("trained at {trained} frames/s, camera.fps is {fps}: train with episodes of this camera"))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::core::Robot;
+    use crate::journal::Times;
+
+    /// Protects the end of a pour from the border between two parts of a journal: the loop has said that the pour is over before its last ticks have come
+    /// through the other thread, so the next part waits for a tick from after it.
+    #[test]
+    fn a_part_ends_only_behind_the_last_tick_of_a_pour() {
+        let directory = tempfile::tempdir().unwrap();
+        let mut config = Config::parse(include_str!("../../config/sim.toml"), "config/sim.toml").unwrap();
+        config.controller.weights = directory.path().join("weights.bin");
+        config.controller.journal = Some(directory.path().join("journal.bin"));
+        config.recording.directory = directory.path().join("episodes");
+        let (exchange, note) = (Exchange::default(), DiskNote::default());
+        let say = |_: &str| {};
+        let (mut disk, queues) = Disk::open(&config, None, &exchange, &note, &say).unwrap();
+        let sender = queues.journal.unwrap();
+        let tick_at = |disk: &mut Disk, now_ns: u64| {
+            let (robot, features) = (Robot::that_may_move(0.0, now_ns), heapless::Vec::new());
+            let times = Times::default();
+            let tick = Tick { now_ns, features, robot, order: None, agent: None, target_deg: None, d_ml: 0.0, times };
+            sender.send(Box::new(tick)).unwrap();
+            disk.write_ticks();
+        };
+        let rests = |disk: &mut Disk, phase: Phase| {
+            exchange.phase.store(phase as u32, SeqCst);
+            disk.is_at_rest()
+        };
+        let pouring_ns = os::now_ns();
+        tick_at(&mut disk, pouring_ns);
+        assert!(!rests(&mut disk, Phase::Pouring) && !rests(&mut disk, Phase::Settling));
+        assert!(!rests(&mut disk, Phase::Idle), "its last ticks may still come");
+        tick_at(&mut disk, pouring_ns + 1);
+        assert!(!rests(&mut disk, Phase::Idle), "this was one of them");
+        tick_at(&mut disk, os::now_ns());
+        assert!(rests(&mut disk, Phase::Idle));
+        assert!(!rests(&mut disk, Phase::Recording) && !rests(&mut disk, Phase::Idle), "the next one");
     }
 }

@@ -65,8 +65,13 @@ fn foreseen_sd_ml(
         let leaves_ml = state.step(flow, history.commands(), 0).leaves_ml;
         let area_px2 = calibration.area_px2(leaves_ml, alpha_deg) as f32;
         let area_px2 = if area_px2 < VISIBLE_PX2 { 0.0 } else { area_px2 };
-        let decision =
-            agent.step(Observation { area_px2: Some(area_px2), alpha_deg, alpha_measured_deg: f32::NAN, alpha_now_deg: alpha_deg });
+        let decision = agent.step(Observation {
+            area_px2: Some(area_px2),
+            confidence: 1.0,
+            alpha_deg,
+            alpha_measured_deg: f32::NAN,
+            alpha_now_deg: alpha_deg,
+        });
         sd_ml = decision.poured_sd_ml;
         quiet = if decision.tilting_back && area_px2 <= 0.0 { quiet + 1 } else { 0 };
         if quiet >= QUIET_FRAMES {

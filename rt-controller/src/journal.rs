@@ -8,7 +8,7 @@
 
 use std::collections::BTreeMap;
 use std::fs::{File, OpenOptions};
-use std::io::{BufReader, BufWriter, ErrorKind, Read, Write};
+use std::io::{BufReader, BufWriter, ErrorKind, Read, Seek, SeekFrom, Write};
 use std::path::{Path, PathBuf};
 
 use serde::{Deserialize, Serialize};
@@ -30,6 +30,8 @@ const FILE_MAX: u64 = 256 << 20;
 const KEPT_BYTES: u64 = 1 << 30;
 /// Number of journals that are kept beside the one being written. Chosen by hand: so many starts do not lose a crash.
 const KEPT: u32 = 20;
+/// The first byte of an entry that is a tick: postcard numbers the kinds of [`Entry`] in their order.
+const TICK: u8 = 2;
 /// Number of ticks at the beginning of a later part that are not compared: as many as the core remembers ([`crate::core`]).
 const UNKNOWN_TICKS: u64 = 64;
 
@@ -169,8 +171,13 @@ fn make_room(path: &Path) -> std::io::Result<File> {
     if let Some(parent) = path.parent() {
         std::fs::create_dir_all(parent)?;
     }
-    if path.symlink_metadata().is_ok() {
-        let held = check_is_journal(path)?;
+    let mut held = if path.symlink_metadata().is_ok() { Some(check_is_journal(path)?) } else { None };
+    if let Some(empty) = held.take_if(|file| !has_ticks(file)) {
+        // Nothing happened in it, as in one that could not be written for want of space: it takes no other's place.
+        std::fs::remove_file(path)?;
+        drop(empty);
+    }
+    if let Some(held) = held {
         let there = (1..=KEPT).map(|n| before(path, n)).take_while(|p| p.symlink_metadata().is_ok()).collect::<Vec<_>>();
         let lengths = there.iter().map(|p| check_is_journal(p).and_then(|f| Ok(f.metadata()?.len()))).collect::<Result<Vec<u64>, _>>()?;
         // The newest come first; the one that has just ended counts too.
@@ -266,6 +273,31 @@ fn check_is_journal(path: &Path) -> std::io::Result<File> {
         return Err(named("is being written by another controller: choose another controller.journal"));
     }
     Ok(file)
+}
+
+/// Whether a journal has a tick. One of another version, or one that cannot be read, counts as if it had.
+fn has_ticks(file: &mut File) -> bool {
+    let mut look = || -> std::io::Result<bool> {
+        let mut start = [0; MAGIC.len()];
+        file.rewind()?;
+        match file.read_exact(&mut start) {
+            Ok(()) if &start == MAGIC => {}
+            Ok(()) => return Ok(true),
+            // Not even its first bytes were written.
+            Err(_) => return Ok(false),
+        }
+        let mut head = [0; 5];
+        // Each entry has its length, and begins with its kind; settings and some weights come before the first tick.
+        while file.read_exact(&mut head).is_ok() {
+            if head[4] == TICK {
+                return Ok(true);
+            }
+            let length = u32::from_le_bytes([head[0], head[1], head[2], head[3]]);
+            file.seek(SeekFrom::Current(i64::from(length) - 1))?;
+        }
+        Ok(false)
+    };
+    look().unwrap_or(true)
 }
 
 /// What a replay found.

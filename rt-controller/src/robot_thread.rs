@@ -100,13 +100,12 @@ pub fn keep_robot_connected(
     stop: &AtomicBool,
     say: &dyn Fn(&str),
 ) {
-    let options = LinkOptions::new(config);
     let mut progress =
         Progress { before: Before::default(), connected: false, waits: false, wish_until_ns: None, next_ns: network.now_ns() };
     while !stop.load(Relaxed) {
         let now_ns = network.now_ns();
         while let Some((session, end)) = exchange.old_sessions.pop() {
-            progress.take_back(now_ns, &session, end, &options, note, say);
+            progress.take_back(now_ns, &session, end, config, note, say);
         }
         if exchange.resume.swap(false, Relaxed) && !progress.connected {
             progress.waits = false;
@@ -115,7 +114,9 @@ pub fn keep_robot_connected(
         }
         if !progress.connected && !progress.waits && now_ns >= progress.next_ns {
             progress.before.asked = progress.wish_until_ns.is_some_and(|until_ns| now_ns < until_ns);
-            match link::connect_over(network, &options, &progress.before) {
+            let named = network.resolve(&config.robot.address).map_err(|what| unknown_name(config, what));
+            let connected = named.and_then(|address| link::connect_over(network, &LinkOptions::new(config, address), &progress.before));
+            match connected {
                 Ok(session) => {
                     note.warn(payload::warning(session.state(), config.robot.payload_kg).unwrap_or_default(), say);
                     progress.before.unpowered = false;
@@ -125,29 +126,34 @@ pub fn keep_robot_connected(
                     note.set(String::new(), RobotLink::Connected, say);
                     say("robot connected, program running");
                 }
-                Err(e) => progress.failed(network.now_ns(), &e, &options, note, say),
+                Err(e) => progress.failed(network.now_ns(), &e, config, note, say),
             }
         }
         network.sleep(BEAT);
     }
 }
 
+/// The failure of looking up the robot's name.
+fn unknown_name(config: &Config, what: String) -> LinkError {
+    LinkError::UnknownName { name: config.robot.address.to_string(), what }
+}
+
 impl Progress {
     /// Takes note of a session that is over. The session itself is dropped by the caller.
-    fn take_back(&mut self, now_ns: u64, session: &Session, end: SessionEnd, options: &LinkOptions, note: &RobotNote, say: &dyn Fn(&str)) {
+    fn take_back(&mut self, now_ns: u64, session: &Session, end: SessionEnd, config: &Config, note: &RobotNote, say: &dyn Fn(&str)) {
         let last = *session.state();
         self.connected = false;
         self.before.unpowered |= hands::without_power(&last);
         self.before.last = Some(last);
         self.next_ns = now_ns + RECONNECT.as_nanos() as u64;
         match hands::after_session(end.reason(), &last) {
-            Some(why) => self.wait_for_operator(why, options, note, say),
+            Some(why) => self.wait_for_operator(why, config, note, say),
             None => note.set(format!("robot: {end}"), RobotLink::Connecting, say),
         }
     }
 
     /// Takes note of an attempt that failed with `e`.
-    fn failed(&mut self, now_ns: u64, e: &LinkError, options: &LinkOptions, note: &RobotNote, say: &dyn Fn(&str)) {
+    fn failed(&mut self, now_ns: u64, e: &LinkError, config: &Config, note: &RobotNote, say: &dyn Fn(&str)) {
         self.next_ns = now_ns + RECONNECT.as_nanos() as u64;
         self.before.unpowered = match e {
             LinkError::ProgramRunning { .. } => false,
@@ -157,7 +163,7 @@ impl Progress {
         // A tilted container must be brought upright by somebody, who then has the robot in hand. A wish is not kept for ever.
         let wish_is_over = self.wish_until_ns.is_some_and(|until_ns| now_ns >= until_ns);
         if let Some(why) = e.handover() {
-            self.wait_for_operator(why, options, note, say);
+            self.wait_for_operator(why, config, note, say);
         } else if wish_is_over || matches!(e, LinkError::TooFar { .. }) {
             self.waits = true;
             self.wish_until_ns = None;
@@ -168,11 +174,11 @@ impl Progress {
     }
 
     /// Leaves the robot alone until the operator asks for it.
-    fn wait_for_operator(&mut self, why: Handover, options: &LinkOptions, note: &RobotNote, say: &dyn Fn(&str)) {
+    fn wait_for_operator(&mut self, why: Handover, config: &Config, note: &RobotNote, say: &dyn Fn(&str)) {
         self.waits = true;
         self.wish_until_ns = None;
         let remedy = why.remedy();
-        let line = format!("robot {}: {why}; it is not taken back by itself: {remedy}, then {TAKE_BACK}", options.address);
+        let line = format!("robot {}: {why}; it is not taken back by itself: {remedy}, then {TAKE_BACK}", config.robot.address);
         note.set(line, RobotLink::WaitsForOperator, say);
     }
 }

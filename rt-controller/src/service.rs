@@ -29,6 +29,9 @@ use crate::robot_thread::RobotNote;
 
 /// Pause between two looks at the queues. Chosen by hand: far below a person's patience, and cheap.
 const BEAT: Duration = Duration::from_millis(40);
+/// How long a result can be asked for when the controller ends, at least. Chosen by hand: clients ask ten times a second; the controller's end waits for
+/// other threads that long anyway ([`crate::stop`]).
+const LAST_RESULT: Duration = Duration::from_millis(400);
 /// Number of results that are kept for `status`. Chosen by hand; no measurement is recorded.
 const OUTCOMES: usize = 32;
 
@@ -57,6 +60,8 @@ pub struct Service<'a> {
     spare: BTreeSet<u64>,
     /// When this thread began.
     started: Instant,
+    /// When the newest result came.
+    result_at: Option<Instant>,
 }
 
 impl<'a> Service<'a> {
@@ -85,6 +90,7 @@ impl<'a> Service<'a> {
             telemetry,
             disk_note,
             started: Instant::now(),
+            result_at: None,
             journal: disk.journal,
             latest: None,
             outcomes: VecDeque::new(),
@@ -105,6 +111,11 @@ impl<'a> Service<'a> {
             std::thread::sleep(BEAT);
         }
         self.take_events();
+        // Who watches the pour that the shutdown has ended asks once more, and is told how it ended.
+        while self.result_at.is_some_and(|at| at.elapsed() < LAST_RESULT) {
+            self.answer();
+            std::thread::sleep(BEAT);
+        }
     }
 
     /// Takes the loop's events.
@@ -147,6 +158,7 @@ impl<'a> Service<'a> {
                         self.outcomes.pop_front();
                     }
                     self.outcomes.push_back(outcome);
+                    self.result_at = Some(Instant::now());
                 }
             }
         }
@@ -228,10 +240,12 @@ impl<'a> Service<'a> {
         let phase = Phase::from_code(t.phase);
         let note = self.robot_note.get();
         let disk = self.disk_note.get();
+        let wrong_rate = c.wrong_rate_hz.map_or(String::new(), |(hz, configured_hz)| Refusal::FrameRate(hz, configured_hz).to_string());
         let hindrance = match phase {
             Phase::NoRobot if !note.text.is_empty() => note.text,
             Phase::NoRobot if t.alpha_measured_deg.is_finite() => Refusal::NotUpright(t.alpha_measured_deg).to_string(),
             Phase::NoRobot => "waiting for the robot".into(),
+            _ if !wrong_rate.is_empty() => wrong_rate,
             _ if t.weights_id == 0 => format!("no weights: {}", self.refused()),
             _ => String::new(),
         };

@@ -63,6 +63,13 @@ fn parts(ticks: u64, cut: u64, orders: &[u64], lie: u64) -> [Vec<u8>; 2] {
     [bytes, later]
 }
 
+/// A tick in which nothing happens.
+fn idle_tick() -> Tick {
+    let robot = Robot::that_may_move(0.0, 1);
+    let features = heapless::Vec::new();
+    Tick { now_ns: 1, features, robot, order: None, agent: None, target_deg: None, d_ml: 0.0, times: Times::default() }
+}
+
 /// A journal of `ticks` ticks with one pour.
 fn journal(ticks: u64) -> Vec<u8> {
     let [whole, _] = parts(ticks, u64::MAX, &[5], u64::MAX);
@@ -96,11 +103,13 @@ fn a_later_part_replays_from_its_first_order_on() {
 fn starts_keep_the_journals_before_them() {
     let dir = tempfile::tempdir().expect("a directory");
     let path = dir.path().join("new/j.bin");
-    for start in 0..5u32 {
+    let start = |number: u32| {
         let mut writer = Writer::create(&path, &settings()).expect("writable");
-        let weights = write_weights::constant_action(start as i32);
-        writer.weights(u64::from(start), &weights).and_then(|()| writer.flush()).expect("space");
-    }
+        let weights = write_weights::constant_action(number as i32 % 10);
+        writer.weights(u64::from(number), &weights).expect("space");
+        writer.tick(Box::new(idle_tick())).and_then(|()| writer.flush()).expect("space");
+    };
+    (0..5).for_each(start);
     let begun = |name: &str| rt_controller::journal::replay(&dir.path().join("new").join(name), |_, _| {}).is_ok();
     for name in ["j.bin", "j.before.bin", "j.before-2.bin", "j.before-3.bin", "j.before-4.bin"] {
         assert!(begun(name), "{name}");
@@ -108,17 +117,38 @@ fn starts_keep_the_journals_before_them() {
     let bytes = |name: &str| std::fs::read(dir.path().join("new").join(name)).expect("there");
     assert_ne!(bytes("j.before-4.bin"), bytes("j.before.bin"), "the oldest is the first");
     // 30 starts keep 20, and 1 GiB.
-    for _ in 0..30 {
-        drop(Writer::create(&path, &settings()).expect("writable"));
-    }
+    (0..30).for_each(start);
     assert_eq!(std::fs::read_dir(dir.path().join("new")).expect("there").count(), 21);
     std::fs::File::options().write(true).open(dir.path().join("new/j.before-3.bin")).and_then(|f| f.set_len(1 << 30)).expect("sparse");
-    drop(Writer::create(&path, &settings()).expect("writable"));
+    start(0);
     assert_eq!(std::fs::read_dir(dir.path().join("new")).expect("there").count(), 4, "the large one and what is older went");
     std::fs::write(dir.path().join("new/j.before-2.bin"), b"a letter").expect("writable");
     assert!(Writer::create(&path, &settings()).is_err());
     assert_eq!(bytes("j.before-2.bin"), b"a letter");
     assert!(begun("j.bin") && begun("j.before.bin"));
+}
+
+/// Protects the journals of real runs from a full disk and from starts that were refused: one in which nothing happened, or not even its beginning was
+/// written, takes no place when the next one begins, however often that is tried.
+#[test]
+fn a_journal_without_a_tick_pushes_none_out() {
+    let dir = tempfile::tempdir().expect("a directory");
+    let path = dir.path().join("j.bin");
+    let mut writer = Writer::create(&path, &settings()).expect("writable");
+    writer.tick(Box::new(idle_tick())).and_then(|()| writer.flush()).expect("space");
+    drop(writer);
+    let real = std::fs::read(&path).expect("there");
+    for round in 0..50 {
+        let mut writer = Writer::create(&path, &settings()).expect("writable");
+        writer.weights(1, &write_weights::constant_action(1)).and_then(|()| writer.flush()).expect("space");
+        drop(writer);
+        // As a full disk leaves it.
+        let cut = [0, 3, 8, 40, 2000][round % 5];
+        std::fs::File::options().write(true).open(&path).and_then(|f| f.set_len(cut)).expect("ours");
+    }
+    drop(Writer::create(&path, &settings()).expect("writable"));
+    assert_eq!(std::fs::read(dir.path().join("j.before.bin")).expect("kept"), real);
+    assert_eq!(std::fs::read_dir(dir.path()).expect("there").count(), 2);
 }
 
 /// Protects whoever replays a journal from a defect in it: bytes, whole words and lengths are changed at seeded places, mostly in the settings

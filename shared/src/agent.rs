@@ -19,6 +19,8 @@ use crate::weights::{Estimator, Weights};
 pub struct Observation {
     /// V_e in px^2; `None` if the frame was lost or its measurement must not be used.
     pub area_px2: Option<f32>,
+    /// Confidence of the area, 0 to 1, as in [`crate::messages::Feature`]; NaN, where no camera says it, weighs in full.
+    pub confidence: f32,
     /// Commanded alpha in force when this frame was taken, degrees from upright.
     pub alpha_deg: f32,
     /// Measured alpha when this frame was taken, degrees; NaN if the robot gives none.
@@ -209,6 +211,7 @@ impl Agent {
         let believed = self.fused.as_mut().is_none_or(|fused| {
             fused.step(FusedFrame {
                 area_px2: observation.area_px2,
+                confidence: observation.confidence,
                 command_deg: f64::from(observation.alpha_deg),
                 measured_deg: f64::from(observation.alpha_measured_deg),
             })
@@ -270,7 +273,7 @@ mod tests {
     use proptest::prelude::*;
 
     fn observation(area: f32) -> Observation {
-        Observation { area_px2: Some(area), alpha_deg: 50.0, alpha_measured_deg: f32::NAN, alpha_now_deg: 50.0 }
+        Observation { area_px2: Some(area), confidence: 1.0, alpha_deg: 50.0, alpha_measured_deg: f32::NAN, alpha_now_deg: 50.0 }
     }
 
     /// Protects the idle robot: with d = 0 the agent does nothing, whatever it sees.
@@ -366,7 +369,7 @@ mod tests {
             let mut agent = Agent::new(&weights);
             agent.start(goal);
             for (area_px2, alpha_deg) in frames {
-                let decision = agent.step(Observation { area_px2, alpha_deg, alpha_measured_deg: f32::NAN, alpha_now_deg: alpha_deg });
+                let decision = agent.step(Observation { area_px2, confidence: 1.0, alpha_deg, alpha_measured_deg: f32::NAN, alpha_now_deg: alpha_deg });
                 prop_assert!(decision.dalpha_deg.is_finite() && decision.dalpha_deg.abs() <= 5.0);
                 prop_assert!(usize::from(decision.action) < ACTIONS);
             }

@@ -3,7 +3,6 @@
 //! Every process reads it once at its start, in an ordinary thread, and that allocates. Unknown keys, wrong types and values out of range
 //! are refused with a [`ConfigError`], which names the file, the key and what is allowed. Relative paths start at the directory of the file.
 
-use std::net::IpAddr;
 use std::path::{Path, PathBuf};
 
 use serde::{Deserialize, Serialize};
@@ -12,6 +11,7 @@ pub use crate::config_camera::{CameraConfig, CameraSource, Locked, Refused, Sett
 pub use crate::config_container::ContainerConfig;
 use crate::config_paths;
 use crate::limits::Limits;
+use crate::robot_address::RobotAddress;
 
 /// The environment variable that names the configuration where `--config` is not given.
 pub const VARIABLE: &str = "DECANT_CONFIG";
@@ -133,8 +133,8 @@ pub struct ImageConfig {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct RobotConfig {
-    /// The UR controller's address.
-    pub address: IpAddr,
+    /// The UR controller's address, or its name.
+    pub address: RobotAddress,
     /// The joint that tilts the container.
     pub joint: Joint,
     /// Angle of that joint when the container is upright (alpha = 0), degrees.
@@ -235,6 +235,13 @@ pub struct RecordingConfig {
     pub jpeg_quality: u8,
     /// Largest number of images that may wait to be written; further ones are dropped and counted.
     pub queue_frames: usize,
+    /// Megabytes (1,000,000 bytes) that episodes may take in the directory before `feature-worker episodes prune` deletes some; 0 for no
+    /// bound.
+    #[serde(default)]
+    pub budget_mb: u64,
+    /// Number of episodes that may lie there before `feature-worker episodes prune` deletes some; 0 for no bound.
+    #[serde(default)]
+    pub budget_episodes: usize,
 }
 
 impl Config {

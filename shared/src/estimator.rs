@@ -8,6 +8,7 @@
 //! | [`vessel`] | the shape of a container |
 //! | [`flow`] | the flow model: from commanded angles to outflow |
 //! | `tilt` | the tilt that a picture shows |
+//! | `trust` | how far a measurement with a confidence may be off |
 //! | [`verdict`] | whether what is seen can be |
 //! | [`filter`] | an extended Kalman filter on the flow model |
 //! | `camera_sum` | the camera's own sum, and how far it may be off |
@@ -21,6 +22,7 @@ pub mod filter;
 pub mod flow;
 pub mod fused;
 mod tilt;
+mod trust;
 pub mod verdict;
 pub mod vessel;
 pub mod whiteness;

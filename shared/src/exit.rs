@@ -3,6 +3,9 @@
 
 use std::fmt::Display;
 use std::process::ExitCode;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering::Relaxed};
+use std::time::Duration;
 
 /// The work failed on the way, for example because a file could not be written or a check found faults.
 pub const FAILED: u8 = 1;
@@ -16,6 +19,11 @@ pub const ENDED_EARLY: u8 = 4;
 pub const REFUSED: u8 = 5;
 /// Interrupted by Ctrl-C or SIGTERM.
 pub const INTERRUPTED: u8 = 130;
+
+/// How often [`end_within`] looks at its flag. Chosen by hand; no measurement is recorded.
+const BEAT: Duration = Duration::from_millis(100);
+/// Stack of its thread, bytes; it may be locked in memory. Chosen by hand: its deepest call is a write.
+const STACK: usize = 128 * 1024;
 
 /// The exit codes, as `--help` shows them.
 pub const HELP: &str = "Exit codes: 0 done, 1 failed, 2 bad command line, configuration or input file, 3 another part of the cell \
@@ -45,6 +53,21 @@ impl<T, E: Display> OrExit<T> for Result<T, E> {
     fn or_exit(self, code: u8) -> Result<T, Failure> {
         self.map_err(|e| failure(code, e))
     }
+}
+
+/// Ends the process with `line` and [`FAILED`] if it still runs `within` after `stop` was set, as when a disk or a device holds one of its threads.
+/// Without a thread for it, nothing does.
+pub fn end_within(stop: &Arc<AtomicBool>, within: Duration, line: &'static str) {
+    let stop = Arc::clone(stop);
+    let watch = move || {
+        while !stop.load(Relaxed) {
+            std::thread::sleep(BEAT);
+        }
+        std::thread::sleep(within);
+        crate::os::tell(line);
+        std::process::exit(FAILED.into());
+    };
+    let _ = std::thread::Builder::new().name("end".into()).stack_size(STACK).spawn(watch);
 }
 
 /// Ends a resident process: as [`end`], but a terminal that takes nothing does not keep the process alive.

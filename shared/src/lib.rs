@@ -49,6 +49,7 @@ pub mod mlp;
 #[allow(unsafe_code)]
 pub mod os;
 pub mod regular_file;
+pub mod robot_address;
 pub mod runtime_dir;
 pub mod shared_memory;
 pub mod speaker;

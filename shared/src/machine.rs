@@ -58,7 +58,7 @@ impl Finding {
 /// Looks at the machine, for a loop that is pinned to `core`.
 pub fn look(core: usize) -> Vec<Finding> {
     let mut findings = processor();
-    findings.extend(power());
+    findings.extend(power(core));
     findings.extend(beside(core));
     findings
 }
@@ -118,12 +118,20 @@ fn beside(core: usize) -> Vec<Finding> {
     ]
 }
 
+/// Whether the kernel's list of cores, such as `2-3,6`, has this one.
+fn in_list(list: &str, core: usize) -> bool {
+    list.split(',').any(|part| {
+        let (first, last) = part.split_once('-').unwrap_or((part, part));
+        matches!((first.trim().parse::<usize>(), last.trim().parse::<usize>()), (Ok(first), Ok(last)) if (first..=last).contains(&core))
+    })
+}
+
 /// What decides how fast a core wakes up, and who else may run on it.
-fn power() -> Vec<Finding> {
-    let governor = read("/sys/devices/system/cpu/cpu0/cpufreq/scaling_governor");
+fn power(core: usize) -> Vec<Finding> {
+    let governor = read(&format!("/sys/devices/system/cpu/cpu{core}/cpufreq/scaling_governor"));
     let isolated = read("/sys/devices/system/cpu/isolated");
-    let (steady, alone) = (governor == "performance", !isolated.is_empty());
-    let isolated = if alone { isolated } else { "none".into() };
+    let (steady, alone) = (governor == "performance", in_list(&isolated, core));
+    let isolated = if isolated.is_empty() { "none".into() } else { format!("{isolated}; the loop's core is {core}") };
     let held = std::fs::OpenOptions::new().write(true).open("/dev/cpu_dma_latency").is_ok();
     let latency = if held { "may be held at 0" } else { "not permitted or not there" };
     let hold = "let this user write /dev/cpu_dma_latency; rt-controller holds it at 0 then";
@@ -135,4 +143,16 @@ fn power() -> Vec<Finding> {
         Finding::green("RT throttling", format!("{} of 1000000 us", read("/proc/sys/kernel/sched_rt_runtime_us"))),
         Finding::judged(held, "/dev/cpu_dma_latency", latency, "a core that sleeps deeply wakes up 100 us later", hold),
     ]
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Protects the loop from a green line about somebody else's core: of the kernel's list only the loop's own core counts.
+    #[test]
+    fn the_loops_own_core_is_looked_up() {
+        assert!(in_list("2-3,6", 3) && in_list("2-3,6", 6) && in_list("0", 0) && in_list(" 1 ", 1));
+        assert!(!in_list("2-3,6", 1) && !in_list("2-3,6", 4) && !in_list("", 0) && !in_list("12", 1));
+    }
 }

@@ -16,7 +16,8 @@ fn written_weights_tilt_by_their_action() {
     assert_eq!(write_weights::write_and_read(&directory.path().join("w.bin"), &weights).unwrap(), weights);
     let mut agent = Agent::new(&weights);
     agent.start(50.0);
-    let decision = agent.step(Observation { area_px2: Some(0.0), alpha_deg: 0.0, alpha_measured_deg: f32::NAN, alpha_now_deg: 0.0 });
+    let decision =
+        agent.step(Observation { area_px2: Some(0.0), confidence: 1.0, alpha_deg: 0.0, alpha_measured_deg: f32::NAN, alpha_now_deg: 0.0 });
     assert_eq!(usize::from(decision.action), STAY + 3);
     assert_eq!(decision.dalpha_deg, weights.actions_deg[STAY + 3]);
 }

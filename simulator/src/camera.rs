@@ -112,6 +112,7 @@ impl Renderer {
         self.ripple.amplitude = 0.025 * (1.0 + (scene.at_s * 3.1).sin()) * self.random.random_range(0.5..1.0);
         self.ripple.shimmer_rad = self.random.random_range(0.0..std::f64::consts::TAU);
 
+        self.board.shake(&self.view, &mut self.random);
         self.board.draw(&self.view, scene, &mut self.frame)?;
         self.stream.trace(&self.view, scene, self.ripple);
         let truth = self.stream.truth(&self.view);

@@ -142,13 +142,11 @@ impl CellState {
 /// When the robot's ports, the cell's shared memory or the operator's socket cannot be had, or the camera fails.
 pub fn simulate(config: Config, simulated: SimulatorConfig) -> Result<(), Box<dyn std::error::Error>> {
     let stop = os::stop_at_signals()?;
+    let address = config.robot.address.resolve()?;
     let mut start_q_rad = [0.0, -1.571, 1.571, -1.571, -1.571, 0.0];
     start_q_rad[config.robot.joint.index()] = config.robot.start_joint_deg.to_radians();
-    let robot = ur::Controller::start(ur::ControllerOptions {
-        series: simulated.series,
-        start_q_rad,
-        ..ur::ControllerOptions::new(config.robot.address)
-    })?;
+    let robot =
+        ur::Controller::start(ur::ControllerOptions { series: simulated.series, start_q_rad, ..ur::ControllerOptions::new(address) })?;
     let rig = simulated.rig();
     let state = CellState { container: Mutex::new(rig.container(simulated.fill_ml)), rig, robot, config, simulated, stop };
 

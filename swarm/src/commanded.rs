@@ -1,6 +1,6 @@
 //! What the program on the robot tells servoj: whether each call keeps the limits, leaves the other joints alone, and tilts nothing again.
 //!
-//! Pure; allocates for what it finds and for a few rates; cannot fail. Calls of servoj are compared, and not control cycles: on a slowed robot
+//! Pure; allocates for what it finds only; cannot fail. Calls of servoj are compared, and not control cycles: on a slowed robot
 //! a call takes several cycles. A call either goes on from the one before, or begins anew: from where the servo steers the joints, and as
 //! fast as that moves the tilting one, but no faster than the limit. Where both are possible, both are kept for the next call.
 
@@ -21,6 +21,24 @@ const AGAIN_DEG: f64 = 6.0;
 /// A name from docs/SWARM.md and what was seen.
 pub type Finding = (&'static str, String);
 
+/// The one or two rates at which a call may have moved the tilting joint, degrees/s: seen from the call before it, and from the servo.
+#[derive(Debug, Clone, Copy)]
+struct Rates([f64; 2], usize);
+
+impl Rates {
+    fn one(rate: f64) -> Self {
+        Self([rate, rate], 1)
+    }
+
+    fn two(first: f64, second: f64) -> Self {
+        Self([first, second], 2)
+    }
+
+    fn known(&self) -> &[f64] {
+        &self.0[..self.1]
+    }
+}
+
 /// What is kept from call to call.
 #[derive(Debug)]
 pub struct Commanded {
@@ -29,7 +47,7 @@ pub struct Commanded {
     cycle_s: f64,
     calls: u64,
     /// What servoj was told last, rad, and the rates that the tilting joint may have been told then, degrees/s.
-    told: Option<([f64; 6], Vec<f64>)>,
+    told: Option<([f64; 6], Rates)>,
     /// Where the servo steered all joints to after the cycle before, rad, and how fast the tilting one, degrees/s.
     servo: ([f64; 6], f64),
     /// The largest target of the newest pour, degrees.
@@ -70,8 +88,8 @@ impl Commanded {
         let Limits { alpha_min_deg, alpha_max_deg, rate_deg_s, acceleration_deg_s2, .. } = self.limits;
         let fastest = f64::from(rate_deg_s);
         let servo_q = self.servo.0;
-        let servo_rates = vec![self.servo.1.clamp(-fastest, fastest)];
-        let (told_q, told_rates) = self.told.take().unwrap_or_else(|| (servo_q, servo_rates.clone()));
+        let servo_rates = Rates::one(self.servo.1.clamp(-fastest, fastest));
+        let (told_q, told_rates) = self.told.take().unwrap_or((servo_q, servo_rates));
         for other in (0..6).filter(|j| *j != joint) {
             let moved = (q[other] - told_q[other]).abs().min((q[other] - servo_q[other]).abs());
             if moved > STILL_RAD {
@@ -79,34 +97,46 @@ impl Commanded {
             }
         }
         let alpha_deg = q[joint].to_degrees();
-        if alpha_deg > f64::from(alpha_max_deg) + SLACK_DEG || alpha_deg < f64::from(alpha_min_deg) - BELOW_DEG {
+        // A joint that somebody has moved beyond the range comes back from there.
+        let range = f64::from(alpha_min_deg) - BELOW_DEG..=f64::from(alpha_max_deg) + SLACK_DEG;
+        let beyond_deg = |deg: f64| (deg - range.end()).max(range.start() - deg).max(0.0);
+        let was_beyond_deg = beyond_deg(told_q[joint].to_degrees()).max(beyond_deg(servo_q[joint].to_degrees()));
+        if beyond_deg(alpha_deg) > was_beyond_deg {
             findings.push(("robot-range", format!("servoj is given {alpha_deg:.3} degrees")));
         }
         // For each call that this may follow: the rate that it then has, and how much harder than allowed it accelerates.
         let most = f64::from(acceleration_deg_s2) * (1.0 + SLACK) + 1.0;
-        let steps = |from_q: &[f64; 6], rates: &[f64]| -> Vec<(f64, f64)> {
-            let rate = (alpha_deg - from_q[joint].to_degrees()) / self.cycle_s;
-            rates.iter().map(|before| (rate, (rate - before).abs() / self.cycle_s)).collect()
+        let rate_from = |from_q: &[f64; 6]| (alpha_deg - from_q[joint].to_degrees()) / self.cycle_s;
+        let (told_rate, anew_rate) = (rate_from(&told_q), rate_from(&servo_q));
+        let acceleration = |rate: f64, before: &f64| (rate - before).abs() / self.cycle_s;
+        let keeps = |rate: f64, rates: &Rates| {
+            rate.abs() <= fastest * (1.0 + SLACK) + 0.1 && rates.known().iter().any(|before| acceleration(rate, before) <= most)
         };
-        let keeps = |(rate, acceleration): &(f64, f64)| rate.abs() <= fastest * (1.0 + SLACK) + 0.1 && *acceleration <= most;
-        let (goes_on, anew) = (steps(&told_q, &told_rates), steps(&servo_q, &servo_rates));
-        let kept: Vec<f64> = goes_on.iter().chain(&anew).filter(|step| keeps(step)).map(|step| step.0).collect();
-        let begins_anew = !goes_on.iter().any(keeps) && anew.iter().any(keeps);
-        let mildest = goes_on.iter().chain(&anew).copied().min_by(|a, b| a.1.total_cmp(&b.1));
-        if let (true, Some((rate, acceleration))) = (kept.is_empty(), mildest) {
+        let (goes_on, may_be_anew) = (keeps(told_rate, &told_rates), keeps(anew_rate, &servo_rates));
+        let ways = [(told_rate, &told_rates), (anew_rate, &servo_rates)];
+        let steps = ways.iter().flat_map(|(rate, rates)| rates.known().iter().map(|before| (*rate, acceleration(*rate, before))));
+        let mildest = steps.min_by(|a, b| a.1.total_cmp(&b.1)).unwrap_or((told_rate, f64::INFINITY));
+        if !goes_on && !may_be_anew {
+            let (rate, acceleration) = mildest;
             let name = if acceleration > most { "robot-acceleration" } else { "robot-rate" };
             let (told_deg, servo_deg) = (told_q[joint].to_degrees(), servo_q[joint].to_degrees());
+            let (told, servo) = (told_rates.known(), servo_rates.known());
             findings.push((
                 name,
                 format!(
                     "servoj is given {alpha_deg:.3} degrees, {rate:.1} degrees/s, {acceleration:.0} degrees/s^2, after {told_deg:.3} at \
-{told_rates:.1?}, where the servo is at {servo_deg:.3} and {servo_rates:.1?}"
+{told:.1?}, where the servo is at {servo_deg:.3} and {servo:.1?}"
                 ),
             ));
         }
-        let rising = goes_on.first().is_some_and(|step| step.0 > 0.0);
-        findings.extend(self.again(alpha_deg, rising, active, begins_anew));
-        let rates = if kept.is_empty() { mildest.map(|step| step.0).into_iter().collect() } else { kept };
+        let begins_anew = !goes_on && may_be_anew;
+        findings.extend(self.again(alpha_deg, told_rate > 0.0, active, begins_anew));
+        let rates = match (goes_on, may_be_anew) {
+            (true, true) => Rates::two(told_rate, anew_rate),
+            (true, false) => Rates::one(told_rate),
+            (false, true) => Rates::one(anew_rate),
+            (false, false) => Rates::one(mildest.0),
+        };
         self.told = Some((*q, rates));
         findings
     }
@@ -126,7 +156,8 @@ impl Commanded {
                 .then(|| ("no-resume", format!("tilted to {alpha_deg:.1} degrees after the pour, whose targets ended at {most_deg:.1}")));
         };
         self.least_deg = Some(least_deg.min(alpha_deg));
-        let again = rising && alpha_deg > least_deg + AGAIN_DEG;
+        // A joint that was moved below 0 rises on its way upright.
+        let again = rising && alpha_deg > least_deg.max(0.0) + AGAIN_DEG;
         again.then(|| ("no-resume", format!("tilted from {least_deg:.1} to {alpha_deg:.1} degrees while nothing is poured")))
     }
 }
@@ -142,7 +173,7 @@ mod tests {
         let mut commanded = Commanded::new(Limits::default(), CYCLE_S);
         let at = |deg: f64| [0.1, 0.2, 0.3, 0.4, 0.5, f64::to_radians(deg)];
         let start = calls.first().copied().unwrap_or_default();
-        commanded.told = Some((at(start), vec![0.0]));
+        commanded.told = Some((at(start), Rates::one(0.0)));
         commanded.servo = (at(servo.0), servo.1);
         calls.iter().flat_map(|deg| commanded.call(&at(*deg), 5, active)).map(|(name, _)| name).collect()
     }
@@ -155,6 +186,7 @@ mod tests {
         let fast: Vec<f64> = (0..30).map(|k| 10.0 + 0.045 * f64::from(k * (k + 1))).collect();
         assert!(findings(&fast, (80.0, 0.0), true).contains(&"robot-rate"));
         assert!(findings(&[110.0, 110.05], (40.0, 0.0), true).contains(&"robot-range"));
+        assert!(findings(&[-2.45, -2.55], (0.0, 0.0), true).contains(&"robot-range"));
     }
 
     /// Protects the check from false alarms where a program begins anew: a call may go on from the servo, at the servo's rate, and the next one
@@ -178,7 +210,7 @@ mod tests {
             let mut commanded = Commanded::new(Limits::default(), CYCLE_S);
             commanded.target(largest_deg, true, true);
             let at = |deg: f64| [0.0, 0.0, 0.0, 0.0, 0.0, f64::to_radians(deg)];
-            commanded.told = Some((at(19.9), vec![0.0]));
+            commanded.told = Some((at(19.9), Rates::one(0.0)));
             commanded.servo = (at(90.0), 0.0);
             way.iter().flat_map(|deg| commanded.call(&at(*deg), 5, false)).any(|(name, _)| name == "no-resume")
         };
@@ -188,11 +220,20 @@ mod tests {
         assert!(!again(30.0, &[ramp(20.0, 25.0), ramp(25.0, 0.0)].concat()), "and upright");
     }
 
+    /// Protects the check from false alarms where a person has moved the joint beyond its range: it comes back from there, and goes no farther.
+    #[test]
+    fn a_joint_that_was_moved_beyond_the_range_comes_back() {
+        let back: Vec<f64> = (0..40).map(|k| -22.6 + 0.02 * f64::from(k * (k + 1))).take_while(|deg| *deg < -8.0).collect();
+        assert_eq!(findings(&back, (-22.6, 0.0), false), Vec::<&str>::new());
+        let on: Vec<f64> = [-22.6, -22.62, -22.66].to_vec();
+        assert!(findings(&on, (-22.6, 0.0), false).contains(&"robot-range"));
+    }
+
     /// Protects the other joints: they stay as told, or where the servo is; every other angle is a motion.
     #[test]
     fn the_other_joints_stay_or_are_where_they_are() {
         let mut commanded = Commanded::new(Limits::default(), CYCLE_S);
-        commanded.told = Some(([0.0; 6], vec![0.0]));
+        commanded.told = Some(([0.0; 6], Rates::one(0.0)));
         commanded.servo = ([0.3, 0.0, 0.0, 0.0, 0.0, 0.0], 0.0);
         assert!(commanded.call(&[0.3, 0.0, 0.0, 0.0, 0.0, 0.0], 5, false).is_empty());
         assert_eq!(commanded.call(&[0.301, 0.0, 0.0, 0.0, 0.0, 0.0], 5, false).first().map(|f| f.0), Some("others-still"));

@@ -112,6 +112,8 @@ impl Eye {
             }
             EyeFault::Hung(ms) => self.gone_until_ns = until_ns(ms),
             EyeFault::Two(ms) => self.two_until_ns = until_ns(ms),
+            // The camera has it from its beginning.
+            EyeFault::Picture(_) => {}
         }
     }
 
@@ -131,10 +133,15 @@ impl Eye {
             return;
         }
         let frozen = counted(&mut self.frozen);
-        let Some((mut area_px2, mut doubt)) = (match &mut self.camera {
+        let Some((mut area_px2, confidence, mut doubt)) = (match &mut self.camera {
             // A camera that stands still shows its picture again, and the extraction must find that out.
-            Some(camera) => camera.look(scene, frozen).map(|(area_px2, doubt)| (area_px2 * self.gain as f32, doubt)),
-            None => Some(self.modelled(flow_ml, clinging, normal, doubted, missed)),
+            Some(camera) => {
+                camera.look(scene, frozen).map(|(area_px2, confidence, doubt)| (area_px2 * self.gain as f32, confidence, doubt))
+            }
+            None => {
+                let (area_px2, doubt) = self.modelled(flow_ml, clinging, normal, doubted, missed);
+                Some((area_px2, 1.0, doubt))
+            }
         }) else {
             return;
         };
@@ -163,7 +170,7 @@ impl Eye {
             received_at_ns: now_ns + delay_ns - 2_000_000,
             published_at_ns: now_ns + delay_ns,
             area_px2,
-            confidence: 1.0,
+            confidence,
             ..Feature::default()
         };
         self.newest = feature;

@@ -5,7 +5,9 @@
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::too_many_lines)]
 #![forbid(unsafe_code)]
 
+pub mod attack;
 pub mod browser;
+pub mod parsers;
 
 use std::net::IpAddr;
 use std::path::{Path, PathBuf};

@@ -2,6 +2,11 @@
 //! other programs' own.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::too_many_lines)]
 
+#[path = "doctor/metrics.rs"]
+mod metrics;
+#[path = "doctor/waiting.rs"]
+mod waiting;
+
 use serde_json::Value;
 use tests::{CellUnderTest, program, steady_weights};
 

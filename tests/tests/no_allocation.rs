@@ -38,7 +38,7 @@ fn run(plant: bool) {
     let address = std::net::IpAddr::from([127, 45, plant.into(), 1]);
     let mut config = Config::parse(include_str!("../../config/sim.toml"), "config/sim.toml").expect("valid");
     config.cell.name.clone_from(&name);
-    config.robot.address = address;
+    config.robot.address = address.into();
     config.camera.fps = 1e9 / FRAME_NS as f64;
     let robot = Controller::start(ControllerOptions::new(address)).expect("free");
     let (exchange, note) = (Exchange::default(), RobotNote::default());

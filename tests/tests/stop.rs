@@ -1,6 +1,9 @@
 //! An abort that depends on nothing: it works within a moment while everything else that the processes share is attacked.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::too_many_lines)]
 
+#[path = "stop/attacks.rs"]
+mod attacks;
+
 use std::os::linux::net::SocketAddrExt;
 use std::os::unix::fs::PermissionsExt;
 use std::os::unix::net::{SocketAddr, UnixListener, UnixStream};

@@ -401,7 +401,7 @@ impl Conclusion<'_> {
             estimator.restart();
             for ((area_px2, command_deg), measured_deg) in e.area_px2.iter().zip(&e.alpha_deg).zip(&e.alpha_measured_deg) {
                 let area_px2 = Some(*area_px2 as f32).filter(|a| !a.is_nan());
-                estimator.step(FusedFrame { area_px2, command_deg: *command_deg, measured_deg: *measured_deg });
+                estimator.step(FusedFrame { area_px2, confidence: 1.0, command_deg: *command_deg, measured_deg: *measured_deg });
             }
             let Whiteness { products: p, squares: s, .. } = estimator.whiteness();
             (products, squares) = (products + p, squares + s);

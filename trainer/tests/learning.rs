@@ -116,7 +116,8 @@ fn pours(method: MethodName, n: usize, within: f64) {
             poured += out;
             let area = (out / CAMERA.0).powf(1.0 / CAMERA.1);
             let area_px2 = Some(if area < 8.0 { 0.0 } else { area as f32 });
-            let decision = agent.step(Observation { area_px2, alpha_deg: alpha, alpha_measured_deg: f32::NAN, alpha_now_deg: alpha });
+            let decision =
+                agent.step(Observation { area_px2, confidence: 1.0, alpha_deg: alpha, alpha_measured_deg: f32::NAN, alpha_now_deg: alpha });
             finished |= ending.decided(&decision);
             alpha = if finished { (alpha - 2.0).max(0.0) } else { (alpha + decision.dalpha_deg).clamp(0.0, 110.0) };
         }
@@ -232,8 +233,13 @@ fn every_method_gives_valid_weights() {
             if actions == 2 {
                 let mut agent = Agent::new(&weights);
                 agent.start(50.0);
-                let decision =
-                    agent.step(Observation { area_px2: Some(0.0), alpha_deg: 0.0, alpha_measured_deg: f32::NAN, alpha_now_deg: 0.0 });
+                let decision = agent.step(Observation {
+                    area_px2: Some(0.0),
+                    confidence: 1.0,
+                    alpha_deg: 0.0,
+                    alpha_measured_deg: f32::NAN,
+                    alpha_now_deg: 0.0,
+                });
                 assert_eq!(decision.dalpha_deg.abs(), 1.0, "{method:?}");
             }
         }

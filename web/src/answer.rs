@@ -119,11 +119,10 @@ impl Broadcast {
         self.0.receiver_count()
     }
 
-    /// A stream of the events from now on, beginning with the newest.
+    /// A stream of the events from now on. What was sent before is not in it: while nobody listens nothing may be sent, so the newest event may
+    /// be old.
     pub fn stream(&self) -> Answer {
-        let mut receiver = self.0.subscribe();
-        receiver.mark_changed();
-        Answer::new(200, "text/event-stream", Content::Events(receiver))
+        Answer::new(200, "text/event-stream", Content::Events(self.0.subscribe()))
     }
 }
 
@@ -206,5 +205,24 @@ impl Body for Sending {
             Rest::File(_, left) => *left == 0,
             Rest::Events(_) => false,
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Protects whoever opens a page from a state of the robot that is minutes old: a stream begins with what is sent after it was asked for.
+    #[test]
+    fn a_stream_begins_with_what_is_new() {
+        let events = Broadcast::default();
+        events.send("old");
+        let Content::Events(receiver) = events.stream().content else { panic!("a stream") };
+        let mut first = Box::pin(next(receiver));
+        let mut context = Context::from_waker(std::task::Waker::noop());
+        assert!(first.as_mut().poll(&mut context).is_pending());
+        events.send("new");
+        let Poll::Ready(Some((bytes, _))) = first.as_mut().poll(&mut context) else { panic!("an event") };
+        assert_eq!(bytes, "data: new\n\n");
     }
 }

@@ -155,7 +155,9 @@ pub fn admitted(headers: &HeaderMap, ends: &Ends, rules: &Rules) -> Result<(), R
     let cookie = cookie_name(rules.pages_port.unwrap_or(ends.own.port()));
     let given = headers.get_all(header::COOKIE).iter().filter_map(|c| c.to_str().ok()).flat_map(|c| c.split(';'));
     let mut given = given.filter_map(|c| c.trim().split_once('=')).filter(|(name, _)| *name == cookie);
-    if given.any(|(_, value)| token::same(value, token)) || ends.trusted() {
+    // Programs that keep no cookies, as Prometheus, say it in a header that no other site's page can send.
+    let bearer = text(headers, header::AUTHORIZATION).and_then(|value| value.strip_prefix("Bearer "));
+    if given.any(|(_, value)| token::same(value, token)) || bearer.is_some_and(|word| token::same(word, token)) || ends.trusted() {
         Ok(())
     } else {
         let line = "this browser has no token: open the whole address that the page's program printed in its terminal, with ?token=";
@@ -246,6 +248,8 @@ mod tests {
         assert_eq!(with("a=b; decant-8643=secret"), Ok(()));
         assert_eq!(with("decant-8643=wrong"), Err(401));
         assert_eq!(with("decant-1=secret"), Err(401));
+        let says = |word: &str| admitted(&headers(&[("authorization", word)]), &stranger, &rules).is_ok();
+        assert!(says("Bearer secret") && !says("Bearer wrong") && !says("Bearer ") && !says("secret") && !says("Basic secret"));
         assert_eq!(admitted(&HeaderMap::new(), &ends(), &rules), Ok(()));
         assert_eq!(
             admitted(&HeaderMap::new(), &stranger, &Rules { token: None, ..rules.clone() }).map_err(|e| e.status.as_u16()),

@@ -24,7 +24,14 @@ const FULL_SPEED: f64 = 0.995;
 
 /// Looks at the robot.
 pub fn look(config: &Config) -> Vec<Finding> {
-    let address = config.robot.address;
+    let named = &config.robot.address;
+    let address = match named.resolve() {
+        Ok(address) => address,
+        Err(e) => {
+            let advice = "check robot.address, the network and its name server, or give the address itself";
+            return vec![Finding::red("robot", format!("{named}: its address cannot be looked up: {e}"), "nothing can be moved", advice)];
+        }
+    };
     let open = |port: u16| TcpStream::connect_timeout(&SocketAddr::new(address, port), ANSWER);
     let mut findings = Vec::new();
     let ports: Vec<(u16, Result<(), String>)> = PORTS.iter().map(|p| (*p, open(*p).map(|_| ()).map_err(|e| e.to_string()))).collect();
@@ -32,6 +39,9 @@ pub fn look(config: &Config) -> Vec<Finding> {
         let is = format!("{address}: {}", ports.iter().filter_map(|(_, a)| a.as_ref().err()).next_back().cloned().unwrap_or_default());
         let advice = "switch the robot on, check cable and robot.address, and enable its services (Settings > Security > Services)";
         return vec![Finding::red("robot", is, "nothing can be moved", advice)];
+    }
+    if named.literal().is_none() {
+        findings.push(Finding::green("name", format!("{named} is {address}")));
     }
     findings.push(program_port(&ports));
     findings.push(match &ports[3].1 {
@@ -46,7 +56,7 @@ pub fn look(config: &Config) -> Vec<Finding> {
         findings.push(Finding::green("state", format!("rt-controller (process {}) has the robot; `decant status` shows it", running.pid)));
         return findings;
     }
-    match link::look(&LinkOptions::new(config)) {
+    match link::look(&LinkOptions::new(config, address)) {
         Ok(seen) => {
             let [major, minor, bugfix, build] = seen.version;
             findings.push(Finding::green("version", format!("PolyScope {major}.{minor}.{bugfix} (build {build})")));

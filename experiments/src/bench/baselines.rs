@@ -131,7 +131,7 @@ impl Baseline for ByLaw {
             None => self.goal_ml - self.summed_ml,
             Some(fused) => {
                 let area_px2 = Some(area_px2).filter(|a| !a.is_nan());
-                fused.step(FusedFrame { area_px2, command_deg: f64::from(alpha_deg), measured_deg: f64::NAN });
+                fused.step(FusedFrame { area_px2, confidence: 1.0, command_deg: f64::from(alpha_deg), measured_deg: f64::NAN });
                 self.goal_ml - fused.poured_ml() - fused.stop_volume_ml(f64::from(alpha_deg))
             }
         };

@@ -181,7 +181,7 @@ pub fn by_core(agent: &Agent, pour: &mut BenchPour, limits: Limits, asked: Asked
             received_at_ns: now_ns - 1,
             published_at_ns: now_ns - 1,
             area_px2,
-            confidence: 1.0,
+            confidence: pour.confidence(),
             ..Feature::default()
         };
         // The joint was measured when the picture was taken. Where there is none, it is where it was commanded.

@@ -39,6 +39,15 @@ impl BenchPour {
         }
     }
 
+    /// The confidence of the area that was reported last, 0 to 1; 1 where no camera measured it.
+    pub fn confidence(&self) -> f32 {
+        match self {
+            Self::Paper(_) | Self::Rig(_) => 1.0,
+            Self::ThroughCamera(seen) => seen.confidence(),
+            Self::Faulty(faulty) => faulty.0.confidence(),
+        }
+    }
+
     /// The same pour, seen with a faulty eye if there is a fault; `seed` draws what it shows.
     #[must_use]
     pub fn seen_with(self, fault: Option<EyeFault>, seed: u64) -> Self {

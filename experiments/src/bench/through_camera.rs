@@ -34,16 +34,16 @@ pub struct BenchCamera {
 
 impl BenchCamera {
     /// A camera whose scale, lip, spout, background, light, noise and blur are drawn from `seed`; the liquid's colour is learned from one
-    /// pour.
+    /// pour. With `clear` it is clear water instead.
     ///
     /// # Errors
     /// One line, when the liquid's colour cannot be learned.
-    pub fn seeded(seed: u64) -> Result<Self, String> {
+    pub fn seeded(seed: u64, clear: bool) -> Result<Self, String> {
         let mut random = Pcg64Mcg::seed_from_u64(seed ^ 0xe7e);
         let colour = *LIQUIDS_BGR.choose(&mut random).unwrap_or(&LIQUIDS_BGR[0]);
         let placed = View::placed(&mut random);
         let view = View {
-            liquid_bgr: Some(colour),
+            liquid_bgr: (!clear).then_some(colour),
             background: *Background::ALL.choose(&mut random).unwrap_or(&Background::Chess),
             light: random.random_range(0.7..1.2),
             noise: random.random_range(1.5..5.0),
@@ -51,7 +51,9 @@ impl BenchCamera {
             ..placed
         };
         let mut image = image_config(&view);
-        image.colour_hsv = learn_colour(&View { light: 1.0, ..view.clone() }, &image, seed).map_err(|e| e.to_string())?;
+        if !clear {
+            image.colour_hsv = learn_colour(&View { light: 1.0, ..view.clone() }, &image, seed).map_err(|e| e.to_string())?;
+        }
         Ok(Self { view, image })
     }
 }
@@ -75,6 +77,8 @@ pub struct CameraPour {
     scenes: Vec<Scene>,
     delay_frames: usize,
     frame: usize,
+    /// Confidence of the newest area.
+    confidence: f32,
 }
 
 impl std::fmt::Debug for CameraPour {
@@ -96,7 +100,7 @@ impl CameraPour {
         for (k, camera) in (0..WATCHED_FRAMES).filter_map(|k| camera.as_ref().map(|camera| (k, camera))) {
             look(camera, &Scene { at_s: k as f64 / RATE_HZ, ..upright }, size_px);
         }
-        Self { pour, camera, size_px, scenes: vec![upright; delay_frames + 1], delay_frames, frame: WATCHED_FRAMES }
+        Self { pour, camera, size_px, scenes: vec![upright; delay_frames + 1], delay_frames, frame: WATCHED_FRAMES, confidence: 1.0 }
     }
 
     /// Lets one frame pass with `alpha_deg` commanded. Returns V_e of its picture in px^2, or NaN.
@@ -107,15 +111,23 @@ impl CameraPour {
         self.scenes[self.frame % slots] = Scene::of(self.pour.container(), 0.0, tilt_deg, (tilt_deg - before_deg) * RATE_HZ);
         let shown = Scene { at_s: self.frame as f64 / RATE_HZ, ..self.scenes[self.frame.saturating_sub(self.delay_frames) % slots] };
         self.frame += 1;
-        self.camera.as_ref().and_then(|camera| look(camera, &shown, self.size_px)).unwrap_or(f32::NAN)
+        let seen = self.camera.as_ref().and_then(|camera| look(camera, &shown, self.size_px));
+        let (area_px2, confidence) = seen.unwrap_or((f32::NAN, 0.0));
+        self.confidence = confidence;
+        area_px2
+    }
+
+    /// The confidence of the newest area, 0 to 1.
+    pub fn confidence(&self) -> f32 {
+        self.confidence
     }
 }
 
-/// V_e of the picture of `scene`, if it can be used.
-fn look(camera: &Mutex<Camera>, scene: &Scene, (width_px, height_px): (u32, u32)) -> Option<f32> {
+/// V_e of the picture of `scene` with its confidence, if it can be used.
+fn look(camera: &Mutex<Camera>, scene: &Scene, (width_px, height_px): (u32, u32)) -> Option<(f32, f32)> {
     let mut camera = camera.lock().unwrap_or_else(PoisonError::into_inner);
     let Camera { renderer, extractor, pixels } = &mut *camera;
     renderer.render(scene, pixels).ok()?;
     let measured = extractor.measure(Image { width_px, height_px, format: PixelFormat::Bgr8, pixels }).ok()?;
-    measured.is_usable().then_some(measured.area_px2)
+    measured.is_usable().then_some((measured.area_px2, measured.confidence))
 }

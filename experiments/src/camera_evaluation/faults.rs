@@ -50,6 +50,42 @@ const BRIGHT: f64 = 1.5;
 /// Blue, green and red of orange juice, as in the other cells.
 const ORANGE_BGR: [u8; 3] = [24, 130, 240];
 
+/// What else may be hard for an eye, beside a camera's faults.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum)]
+pub enum Hardship {
+    /// A dark curtain stands behind.
+    Curtain,
+    /// A hand holds camera and container in an untidy room.
+    Hand,
+    /// Drops hang on the container's glass.
+    WetGlass,
+    /// A third of the liquid's surface is foam.
+    Foam,
+}
+
+impl Hardship {
+    /// The view with this hardship.
+    fn on(self, view: View) -> View {
+        match self {
+            Self::Curtain => View { background: Background::Curtain, ..view },
+            Self::Hand => View { background: Background::Clutter, hand_px: 4.0, ..view },
+            Self::WetGlass => View { glass_drops: 24, ..view },
+            Self::Foam => View { foam: 0.33, ..view },
+        }
+    }
+}
+
+/// Which rows are measured, and how.
+#[derive(Debug, Clone, Copy)]
+pub struct Chosen<'a> {
+    /// Only the faults whose name begins so.
+    pub only: Option<&'a str>,
+    /// How much longer than usual an end has to be seen, see [`Extractor::with_patience`].
+    pub patience: f32,
+    /// What else is hard in all cells.
+    pub hardship: Option<Hardship>,
+}
+
 /// Frames of one fault before one kind of ground, by the row's name.
 pub type FaultFrames = BTreeMap<String, Vec<Comparison>>;
 
@@ -58,12 +94,19 @@ fn name(fault: Option<(FaultKind, f64)>) -> String {
     fault.map_or_else(|| "none".into(), |(kind, strength)| format!("{kind:?} {strength}"))
 }
 
-/// Measures one whole pour of the `i`-th cell through every fault, or those whose name begins with `only`, and adds its frames to `frames`. The backgrounds come in turn. With a
+/// Measures one whole pour of the `i`-th cell through every fault, or those that are `chosen`, and adds
+/// its frames to `frames`. The backgrounds come in turn. With a
 /// coloured liquid, every fifth cell has an orange one before bright wood; with clear water, every second has an even wall.
 ///
 /// # Errors
 /// When a picture cannot be drawn or measured.
-pub fn measure_cell(clear: bool, i: u64, seed: u64, only: Option<&str>, frames: &mut FaultFrames) -> Result<(), CameraError> {
+pub fn measure_cell(
+    clear: bool,
+    i: u64,
+    seed: u64,
+    Chosen { only, patience, hardship }: Chosen,
+    frames: &mut FaultFrames,
+) -> Result<(), CameraError> {
     let seed = seed.wrapping_mul(1_000_003).wrapping_add(500_000 + 2 * i + u64::from(clear));
     let mut random = Pcg64Mcg::seed_from_u64(seed);
     let orange = !clear && i % 5 == 4;
@@ -79,12 +122,21 @@ pub fn measure_cell(clear: bool, i: u64, seed: u64, only: Option<&str>, frames: 
         case.image = image_config(&case.view);
         case.image.colour_hsv = learn_colour(&View { light: 1.0, noise: 3.0, blur_px: 0.3, ..case.view.clone() }, &case.image, seed)?;
     }
+    if let Some(hardship) = hardship {
+        case.view = hardship.on(case.view);
+        if !clear {
+            // A person calibrates before the same background, but not with foam.
+            let view = View { light: 1.0, noise: 3.0, blur_px: 0.3, foam: 0.0, ..case.view.clone() };
+            case.image.colour_hsv = learn_colour(&view, &case.image, seed)?;
+        }
+    }
     let ground = match (clear, background) {
         (false, _) if orange => "orange, bright wood",
         (false, _) => "colour",
         (true, Background::Plain) => "clear, even wall",
         (true, _) => "clear, pattern",
     };
+    let ground = hardship.map_or(ground.into(), |hardship| format!("{} {hardship:?}", if clear { "clear" } else { "colour" }));
     let scenes = whole_pours(&mut random, seed, 1);
     let view = &case.view;
     let size = [view.width_px as usize, view.height_px as usize];
@@ -93,7 +145,8 @@ pub fn measure_cell(clear: bool, i: u64, seed: u64, only: Option<&str>, frames: 
     let chosen = |fault: &Option<(FaultKind, f64)>| only.is_none_or(|only| name(*fault).starts_with(only));
     for fault in std::iter::once(None).chain(FAULTS.into_iter().map(Some)).filter(chosen) {
         let camera = fault.map(|(kind, strength)| FaultyCamera::new(CameraFault { kind, strength, seed }, size, view.lip_px));
-        cameras.push((format!("{ground}: {}", name(fault)), camera, Extractor::new(&camera_config(view), &case.image)?));
+        let extractor = Extractor::new(&camera_config(view), &case.image)?;
+        cameras.push((format!("{ground}: {}", name(fault)), camera, extractor.with_patience(patience)));
     }
     let mut clean = vec![0; size[0] * size[1] * 3];
     let mut given = clean.clone();
@@ -125,13 +178,13 @@ pub fn by_ground(frames: &FaultFrames) -> BTreeMap<String, Vec<Comparison>> {
 /// Prints a line for each fault, in the order of the names.
 pub fn print(frames: &FaultFrames) {
     println!(
-        "{:<34}{:>6}{:>9}{:>8}{:>9}{:>8}{:>9}{:>9}{:>9}{:>9}  doubts on frames with a stream / without",
-        "fault", "wet", "median %", "p95 %", "silent %", "wrong %", "doubt %", "false %", "dry d. %", "dry s"
+        "{:<34}{:>6}{:>9}{:>8}{:>9}{:>8}{:>9}{:>9}{:>9}{:>10}{:>9}  doubts on frames with a stream / without",
+        "fault", "wet", "median %", "p95 %", "silent %", "wrong %", "doubt %", "false %", "dry d. %", "calm d. %", "dry s"
     );
     for (row, all) in frames {
         let f = super::figures::figures(all);
         println!(
-            "{row:<34}{:>6}{:>9.2}{:>8.1}{:>9.2}{:>8.2}{:>9.2}{:>9.2}{:>9.2}{:>9.2}  {}",
+            "{row:<34}{:>6}{:>9.2}{:>8.1}{:>9.2}{:>8.2}{:>9.2}{:>9.2}{:>9.2}{:>10.2}{:>9.2}  {}",
             f.wet,
             f.median_error_percent,
             f.p95_error_percent,
@@ -140,6 +193,7 @@ pub fn print(frames: &FaultFrames) {
             f.wet_unusable_percent,
             f.false_flow_percent,
             f.dry_doubt_percent,
+            f.calm_doubt_percent,
             f.dry_after_p95_s,
             f.doubts
         );

@@ -46,6 +46,8 @@ pub struct CameraFigures {
     pub wrong_percent: f64,
     /// Share of the frames without a stream that have a doubt, per cent.
     pub dry_doubt_percent: f64,
+    /// Share of the frames without a stream now and in the [`DRY_FRAMES`] before that have a doubt, per cent.
+    pub calm_doubt_percent: f64,
     /// Number of streams that ended for good: at least [`DRY_FRAMES`] without one follow.
     pub ends: usize,
     /// 95th percentile of the time from their last frame to the first one that the controller uses and in which nothing flows, s.
@@ -112,6 +114,7 @@ pub fn figures(frames: &[Comparison]) -> CameraFigures {
     errors.iter_mut().for_each(|e| *e = e.abs());
     errors.sort_by(f64::total_cmp);
     let dry: Vec<&Comparison> = frames.iter().filter(|s| s.truth_px2 == 0.0).collect();
+    let calm = calm_frames(frames);
     let mut ends_s = times_to_dry_s(frames);
     ends_s.sort_by(f64::total_cmp);
     let percent = |part: usize, whole: usize| 100.0 * part as f64 / whole.max(1) as f64;
@@ -130,10 +133,27 @@ pub fn figures(frames: &[Comparison]) -> CameraFigures {
         wet_unusable_percent: percent(wet.iter().filter(|s| !s.usable).count(), wet.len()),
         wrong_percent: percent(wrong, wet.len()),
         dry_doubt_percent: percent(dry.iter().filter(|s| s.doubt != Doubt::None).count(), dry.len()),
+        calm_doubt_percent: percent(calm.iter().filter(|s| s.doubt != Doubt::None).count(), calm.len()),
         ends: ends_s.len(),
         dry_after_p95_s: quantile_of(&ends_s, 0.95),
         doubts: doubts_in_words(frames),
     }
+}
+
+/// The frames without a stream before which there was none for [`DRY_FRAMES`] either, or that many are not there yet: nothing disturbs them.
+fn calm_frames(frames: &[Comparison]) -> Vec<&Comparison> {
+    let (mut since, mut calm) = (usize::MAX, Vec::new());
+    for frame in frames {
+        since = match (frame.number, frame.truth_px2 > 0.0) {
+            (_, true) => 0,
+            (0, false) => usize::MAX,
+            _ => since.saturating_add(1),
+        };
+        if since > DRY_FRAMES {
+            calm.push(frame);
+        }
+    }
+    calm
 }
 
 /// The quantile of sorted figures; NaN without any.

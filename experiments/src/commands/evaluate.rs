@@ -3,7 +3,7 @@
 //! Ordinary threads, all cores, full speed; allocates. The same arguments give the same numbers on any number of threads. A bad argument
 //! or weight file is an error of one line.
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use indicatif::{ParallelProgressIterator, ProgressBar, ProgressStyle};
 use rayon::prelude::*;
@@ -82,12 +82,15 @@ pub struct Args {
     /// Renders each frame and runs the feature worker's extraction, instead of the area formula (simulator b).
     #[arg(long, conflicts_with = "change")]
     through_camera: bool,
+    /// With --through-camera: clear water instead of a coloured liquid.
+    #[arg(long, requires = "through_camera")]
+    clear: bool,
     /// Keeps trained weights in this folder and takes them from there the next time, so that the same weights can be judged with another
     /// change. Use another folder after any change of the trainer.
     #[arg(long, value_name = "DIR")]
     keep: Option<PathBuf>,
-    /// Writes the whole report, every pour included, to this file as JSON.
-    #[arg(long)]
+    /// Prints the whole report, every pour included, as JSON in place of the tables, or writes it to FILE beside them.
+    #[arg(long, value_name = "FILE", num_args = 0..=1, default_missing_value = "-")]
     json: Option<PathBuf>,
 }
 
@@ -153,10 +156,16 @@ impl Args {
                     None => Trial::new(&self.sim, rig, seed, &self.container, self.change),
                 };
                 let name = kind.map_or(self.container.as_str(), |kind| kind.name());
-                let eye = if self.through_camera { "-seen" } else { "" };
+                let eye = if self.clear {
+                    "-clear"
+                } else if self.through_camera {
+                    "-seen"
+                } else {
+                    ""
+                };
                 let keep = self.keep.as_ref().map(|dir| dir.join(format!("{}-{name}{eye}-{rig}-{seed}", self.sim)));
                 let trial = Trial { keep, ..trial };
-                if self.through_camera { trial.through_camera(rig, &self.container) } else { Ok(trial) }
+                if self.through_camera { trial.through_camera(rig, &self.container, self.clear) } else { Ok(trial) }
             })
             .collect()
     }
@@ -197,6 +206,7 @@ pub fn run(args: &Args) -> Result<(), Failure> {
     }
     let (kinds, protocols) = (args.kinds()?, args.protocols()?);
     let begin = std::time::Instant::now();
+    let to_stdout = args.json.as_deref() == Some(Path::new("-"));
     let mut reports = Vec::new();
     let mut frames = 0;
     for kind in &kinds {
@@ -212,7 +222,9 @@ pub fn run(args: &Args) -> Result<(), Failure> {
                     .collect()
             };
             let summaries: Vec<Summary> = judged.iter().map(|j| Summary::new(&j.name, &j.groups)).collect();
-            print(args, &table, &summaries);
+            if !to_stdout {
+                print(args, &table, &summaries);
+            }
             frames += judged.iter().flat_map(|j| j.groups.iter().flatten()).map(|p| u64::from(p.frames)).sum::<u64>();
             if args.json.is_some() {
                 let traces = examples(args, protocol, trials.first(), files.first().map(|(_, weights)| weights));
@@ -224,7 +236,11 @@ pub fn run(args: &Args) -> Result<(), Failure> {
     if let Some(file) = &args.json {
         // One table is the report that `trainer report` reads; several are a list of them.
         let all = if reports.len() == 1 { reports.remove(0) } else { serde_json::Value::Array(reports) };
-        std::fs::write(file, all.to_string()).map_err(|e| format!("{}: {e}", file.display())).or_exit(exit::FAILED)?;
+        if to_stdout {
+            println!("{all}");
+        } else {
+            std::fs::write(file, all.to_string()).map_err(|e| format!("{}: {e}", file.display())).or_exit(exit::FAILED)?;
+        }
     }
     Ok(())
 }

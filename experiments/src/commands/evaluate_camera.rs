@@ -16,7 +16,7 @@ use simulator::camera::{Background, Scene};
 
 use crate::camera_evaluation::cases::{Case, name};
 use crate::camera_evaluation::doubts;
-use crate::camera_evaluation::faults::{self, FaultFrames};
+use crate::camera_evaluation::faults::{self, Chosen, FaultFrames, Hardship};
 use crate::camera_evaluation::figures::{CameraFigures, Comparison, figures, reliability};
 use crate::camera_evaluation::measure::measure;
 use crate::camera_evaluation::scenes::{SHORT_FRAMES, short, whole_pours};
@@ -59,6 +59,12 @@ pub struct Args {
     /// With --faults: only the faults whose name in the table begins so, such as Banding; `none` is the camera without a fault.
     #[arg(long, requires = "faults")]
     fault: Option<String>,
+    /// With --faults: ask for so many times as many dry pictures before a stream counts as gone.
+    #[arg(long, requires = "faults", default_value_t = 1.0)]
+    patience: f32,
+    /// With --faults: in all cells, this is hard too.
+    #[arg(long, value_enum, requires = "faults")]
+    hardship: Option<Hardship>,
     /// Write what was measured in every frame to this CSV file.
     #[arg(long)]
     frames_csv: Option<PathBuf>,
@@ -121,7 +127,13 @@ fn evaluate_faults(args: &Args, pours: u64) -> Result<(), CameraError> {
     for (clear, method) in [(false, "colour"), (true, "clear")] {
         for i in 0..pours {
             if args.method.as_deref().is_none_or(|m| m == method) {
-                faults::measure_cell(clear, i, args.seed, args.fault.as_deref(), &mut frames)?;
+                faults::measure_cell(
+                    clear,
+                    i,
+                    args.seed,
+                    Chosen { only: args.fault.as_deref(), patience: args.patience, hardship: args.hardship },
+                    &mut frames,
+                )?;
             }
             bar.inc(1);
         }
@@ -179,7 +191,7 @@ fn print_reliability(groups: &BTreeMap<String, Vec<Comparison>>) {
 /// Prints the table of the conditions.
 fn print(figures: &BTreeMap<&str, CameraFigures>) {
     println!(
-        "{:<32}{:>7}{:>9}{:>8}{:>8}{:>8}{:>9}{:>12}{:>8}{:>8}{:>8}{:>8}",
+        "{:<32}{:>7}{:>9}{:>8}{:>8}{:>8}{:>9}{:>12}{:>8}{:>8}{:>8}{:>9}{:>8}",
         "condition",
         "frames",
         "median %",
@@ -191,11 +203,12 @@ fn print(figures: &BTreeMap<&str, CameraFigures>) {
         "doubt %",
         "wrong %",
         "dry d. %",
+        "calm d. %",
         "dry s"
     );
     for (name, f) in figures {
         println!(
-            "{name:<32}{:>7}{:>9.2}{:>8.2}{:>8.2}{:>8.2}{:>9.2}{:>12.2}{:>8.2}{:>8.2}{:>8.2}{:>8.2}  {}",
+            "{name:<32}{:>7}{:>9.2}{:>8.2}{:>8.2}{:>8.2}{:>9.2}{:>12.2}{:>8.2}{:>8.2}{:>8.2}{:>9.2}{:>8.2}  {}",
             f.frames,
             f.median_error_percent,
             f.p95_error_percent,
@@ -206,6 +219,7 @@ fn print(figures: &BTreeMap<&str, CameraFigures>) {
             f.doubt_percent,
             f.wrong_percent,
             f.dry_doubt_percent,
+            f.calm_doubt_percent,
             f.dry_after_p95_s,
             f.doubts
         );

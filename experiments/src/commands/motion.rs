@@ -91,7 +91,8 @@ fn print(report: &Report) {
 
 /// Moves the robot with the program and without it, judges both motions, and draws them.
 fn compare(args: &Args, config: &Config, episode: &Episode) -> Result<Report, Box<dyn std::error::Error>> {
-    let options = LinkOptions::new(config);
+    let address = config.robot.address.resolve()?;
+    let options = LinkOptions::new(config, address);
     let series = match args.series {
         SeriesArg::Cb3 => Series::Cb3,
         SeriesArg::ESeries => Series::ESeries,

@@ -103,13 +103,13 @@ impl Trial {
         }
     }
 
-    /// The same rig with a rendered camera before it.
+    /// The same rig with a rendered camera before it, and clear water in it if `clear`.
     ///
     /// # Errors
     /// One line, when the camera cannot learn the liquid's colour.
-    pub fn through_camera(mut self, rig: u64, container: &str) -> Result<Self, String> {
+    pub fn through_camera(mut self, rig: u64, container: &str, clear: bool) -> Result<Self, String> {
         let Some(physics) = Rig::seeded(rig).with_container(container) else { return Ok(self) };
-        self.bench = Bench::through_camera(&physics, BenchCamera::seeded(rig)?);
+        self.bench = Bench::through_camera(&physics, BenchCamera::seeded(rig, clear)?);
         self.test = self.bench.clone();
         Ok(self)
     }
@@ -308,7 +308,7 @@ mod tests {
     #[test]
     fn a_pour_is_seen_through_the_rendered_camera() {
         let plain = Trial::new("b", 101, 0, "cylinder", Change::None);
-        let seen = plain.clone().through_camera(101, "cylinder").unwrap();
+        let seen = plain.clone().through_camera(101, "cylinder", false).unwrap();
         let options = seen.options(MethodName::Best, Estimate::Fused, 21);
         let (trained, data) = seen.train(&options, &Protocol { episodes: 3, ..PROTOCOL }).unwrap();
         for (by_picture, by_formula) in data.iter().zip(plain.bench.record(3, plain.data_seed)) {

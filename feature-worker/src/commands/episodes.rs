@@ -1,19 +1,21 @@
-//! `feature-worker episodes`: lists, shows, checks, weighs and exports episodes.
+//! `feature-worker episodes`: lists, shows, checks, weighs and exports episodes, and what else people do with them ([`keep`]).
 //!
-//! An ordinary command-line program that works on files alone; no cell needs to run. Allocates. Only `weigh` changes a file, and it does
-//! so in one step (see [`shared::episode::set_weight`]). An export never overwrites anything.
+//! An ordinary command-line program that works on files alone; no cell needs to run. Allocates. Only `weigh` and `note` change a file, and
+//! they do so in one step (see [`shared::episode::set_weight`]). An export never overwrites anything.
 
 use std::path::{Path, PathBuf};
 
 use clap::Subcommand;
 use serde_json::{Value, json};
 use shared::config::Config;
-use shared::episode::{Episode, EpisodeError, EpisodeKind, WeighError, find_episodes, set_weight};
+use shared::episode::{ChangeError, Episode, EpisodeError, EpisodeKind, find_episodes, set_weight};
 use shared::exit::{self, Failure, OrExit as _, failure};
 
-use crate::episodes::export::{ExportFormat, export};
+use crate::episodes::export::{ExportFormat, Exported, export};
 use crate::episodes::output::ExportError;
 use crate::episodes::summary::{Remark, remarks, summary};
+
+mod keep;
 
 /// Command-line arguments.
 #[derive(Debug, clap::Args)]
@@ -38,10 +40,13 @@ enum Command {
     /// Writes the scale's reading into an episode.
     #[command(after_help = "Example:\n  feature-worker episodes weigh out/episodes/episode-0001.mcap --weight 104")]
     Weigh(WeighArgs),
-    /// Writes episodes as tables, images, videos or a LeRobot data set.
+    /// Writes episodes as tables, images, videos or a LeRobot data set. A file that cannot be read is left out and said at the end; the exit
+    /// code is then 1.
     #[command(after_help = "Examples:\n  feature-worker episodes export out/episodes --as csv --to out/table\n  \
         feature-worker episodes export out/episodes/episode-0001.mcap --as video --to out/video")]
     Export(ExportArgs),
+    #[command(flatten)]
+    Keep(keep::Command),
 }
 
 /// Which episodes.
@@ -89,6 +94,7 @@ pub fn run(args: &Args) -> Result<(), Failure> {
         Command::Check(which) => check(&files(which)?, which.json),
         Command::Weigh(args) => weigh(args),
         Command::Export(args) => run_export(args),
+        Command::Keep(command) => keep::run(command),
     }
 }
 
@@ -159,6 +165,9 @@ fn show(files: &[PathBuf], as_json: bool) -> Result<(), Failure> {
     println!("{}", file.display());
     println!("  run        {}", kind_words(episode.kind));
     println!("  started    {} in cell '{}'", episode.info.started_at_utc, episode.info.cell);
+    if !episode.info.note.is_empty() {
+        println!("  note       {}", episode.info.note);
+    }
     println!("  weight     {}", episode.weight_g.map_or("not weighed yet".into(), |w| format!("{w} g")));
     println!("  state      {}", if episode.complete { "complete" } else { "INCOMPLETE" });
     println!("  frames     {} in {:.1} s, {} with flow", value["frames"], episode.seconds(), value["flow_frames"]);
@@ -238,9 +247,13 @@ fn check(files: &[PathBuf], as_json: bool) -> Result<(), Failure> {
     }
 }
 
+/// The failure of changing an episode.
+fn change_failure(e: &ChangeError) -> Failure {
+    failure(if matches!(e, ChangeError::Write { .. }) { exit::FAILED } else { exit::BAD_INPUT }, e)
+}
+
 fn weigh(args: &WeighArgs) -> Result<(), Failure> {
-    let code = |e: &WeighError| if matches!(e, WeighError::Write { .. }) { exit::FAILED } else { exit::BAD_INPUT };
-    let before = set_weight(&args.file, args.weight).map_err(|e| failure(code(&e), e))?;
+    let before = set_weight(&args.file, args.weight).map_err(|e| change_failure(&e))?;
     if args.json {
         print_json(&json!({ "file": args.file.display().to_string(), "weight_g": args.weight, "before_g": before }));
     } else {
@@ -256,13 +269,20 @@ fn run_export(args: &ExportArgs) -> Result<(), Failure> {
         ExportError::Table(_) | ExportError::Write { .. } => exit::FAILED,
     };
     let shown = |path: &Path| path.display().to_string();
-    let written = export(&files(&args.which)?, args.format, &args.to).map_err(|e| failure(code(&e), e))?;
+    let Exported { written, left_out } = export(&files(&args.which)?, args.format, &args.to).map_err(|e| failure(code(&e), e))?;
     if args.which.json {
-        print_json(&json!({ "written": written.iter().map(|p| shown(p)).collect::<Vec<_>>() }));
+        let left_out: Vec<Value> = left_out.iter().map(|l| json!({ "file": shown(&l.file), "why": l.why })).collect();
+        print_json(&json!({ "written": written.iter().map(|p| shown(p)).collect::<Vec<_>>(), "left_out": left_out }));
     } else {
         for path in &written {
             println!("{}", shown(path));
         }
+        for one in &left_out {
+            println!("left out: {}", one.why);
+        }
     }
-    Ok(())
+    match left_out.len() {
+        0 => Ok(()),
+        n => Err(failure(exit::FAILED, format!("{n} episodes were left out; the others are exported"))),
+    }
 }

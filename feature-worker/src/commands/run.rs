@@ -5,7 +5,7 @@ use std::path::PathBuf;
 use shared::config::Config;
 use shared::exit::{self, Failure, OrExit as _};
 
-use crate::worker;
+use crate::worker::{self, Lines};
 
 /// Command-line arguments.
 #[derive(Debug, clap::Args)]
@@ -17,13 +17,25 @@ pub struct Args {
     /// The cell's configuration.
     #[arg(long, env = shared::config::VARIABLE, default_value = shared::config::DEFAULT_FILE)]
     config: PathBuf,
-    /// Print the status as one JSON object a line, to standard output.
+    /// Print the status as one JSON object a second, to standard output.
     #[arg(long)]
     json: bool,
+    /// Print a line each second, instead of only what changes.
+    #[arg(long, short, conflicts_with = "json")]
+    verbose: bool,
+    /// Print only what keeps the worker from working.
+    #[arg(long, short, conflicts_with_all = ["json", "verbose"])]
+    quiet: bool,
 }
 
 /// Runs the command.
 pub fn run(args: &Args) -> Result<(), Failure> {
     let config = Config::read(&args.config).or_exit(exit::BAD_INPUT)?;
-    worker::run(&config, args.json)
+    let lines = match (args.json, args.verbose, args.quiet) {
+        (true, ..) => Lines::Json,
+        (_, true, _) => Lines::EachSecond,
+        (.., true) => Lines::Quiet,
+        _ => Lines::Changes,
+    };
+    worker::run(&config, lines)
 }

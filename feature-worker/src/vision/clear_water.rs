@@ -130,6 +130,8 @@ pub(crate) struct ClearWater {
     unseen: u32,
     /// Pictures in a row in which the full picture confirmed a stream.
     confirmed: u32,
+    /// Share of the last stream's line on ground that was seen dry.
+    known_share: f32,
 }
 
 impl ClearWater {
@@ -163,6 +165,7 @@ impl ClearWater {
             even_pictures: 0.0,
             unseen: u32::MAX,
             confirmed: 0,
+            known_share: 0.0,
         })
     }
 
@@ -215,6 +218,7 @@ impl ClearWater {
                 // Where bands cannot be divided out, or only now and then, neither a line nor its absence means anything.
                 _ if (!told || self.is_pattern()) && self.flicker.flickers() => Sighting::Unsure(Doubt::LightFlickers),
                 (Verdict::Stream, Some((found, ..))) => {
+                    self.known_share = found.known;
                     let scale = self.scale;
                     self.lines.edges(found.line, &self.evidence, &self.rays, |v| (v + 0.5) * scale - 0.5, edges_px);
                     Sighting::Stream { seen_share: found.edge_share.min(1.0), doubt: Doubt::None }
@@ -329,7 +333,7 @@ impl Liquid for ClearWater {
 
     fn rules(&self) -> LineRules {
         // How small a stream may be is decided when its line is confirmed, and water's own edge tells nothing of focus.
-        LineRules { profiles_least: PROFILES_LEAST, first_area_least_px2: 0.0, edge_tells_focus: false }
+        LineRules { profiles_least: PROFILES_LEAST, first_area_least_px2: 0.0, edge_tells_focus: false, unsure_lasts: false }
     }
 
     /// The middle four of each block's pixels are averaged, so half of the memory of a large picture is never read.
@@ -348,7 +352,7 @@ impl Liquid for ClearWater {
     }
 
     fn basis(&self) -> Basis {
-        if self.evidence.even() { Basis::EvenGround } else { Basis::Pattern }
+        if self.evidence.even() { Basis::EvenGround } else { Basis::Pattern(self.known_share) }
     }
 
     fn ground_is_even(&self) -> Option<bool> {

@@ -17,13 +17,15 @@ use opencv::prelude::*;
 use shared::config::ImageConfig;
 use shared::messages::{Doubt, PixelFormat};
 
+use super::coloured_edge;
 use super::confidence::Basis;
 use super::geometry::{Axes, Line, NEAR_PX, RAYS, RayGrid, distance};
 use super::ground_beside::GroundBeside;
 use super::ground_colours::{Ground, GroundColours};
 use super::hues::ranges;
-use super::liquid::{FineLine, LineRules, Liquid, PROFILE_SAMPLES, Profile, ProfileEdge, REACH, Sighting};
+use super::liquid::{FineLine, LineRules, Liquid, Profile, ProfileEdge, Sighting};
 use super::reflection::Reflection;
+use super::wandering::Wandering;
 
 // "Tuned" below means that the value was tuned on seeds 1 and 5001 to 5003 of `evaluate-camera`; see docs/VISION.md.
 
@@ -59,6 +61,9 @@ const LEARN_EVERY: usize = 7;
 const EXPOSURE_EVERY: usize = 12;
 /// The ground is learned this many samples beyond the liquid: between, both mix. Chosen by hand.
 const LEARN_BEYOND: usize = 6;
+/// After a picture in which it was not told what is liquid, the ground is not learned for so many told ones: what lies there may be a liquid
+/// in other colours. Chosen by hand: half a second.
+const LEARN_AFTER: u32 = 15;
 /// This close to the lip a stream begins, px. Chosen by hand.
 const AT_LIP_PX: f32 = 12.0;
 /// The ground is learned beside the container while no more than this share of what is at the lip is foreign or liquid. Chosen by hand.
@@ -84,12 +89,6 @@ const COLOURED_FROM: f64 = 20.0;
 /// Of this many samples, one is looked at to find out whether a picture is grey. Chosen by hand, for speed.
 const GREY_EVERY: usize = 5;
 
-/// Samples at either end of a profile that tell liquid and background. Chosen by hand; no measurement is recorded.
-const FLANK: usize = 3;
-/// Least difference of liquid and background at the ends of a profile: the root of the sum of the squares of the three parts, grey
-/// levels. Tuned.
-const DIFFERENCE_LEAST: f32 = 12.0;
-
 /// Finds the stream of a coloured liquid in the pictures of one camera.
 pub(crate) struct ColouredLiquid {
     /// The axes relative to the region.
@@ -113,6 +112,9 @@ pub(crate) struct ColouredLiquid {
     frames: usize,
     dry_frames: u32,
     reflection: Reflection,
+    wandering: Wandering,
+    /// For how many told pictures more the ground is not learned, see [`LEARN_AFTER`].
+    learn_after: u32,
     /// Which share of the glass at the lip is white light.
     white_lip: f32,
     /// Number of samples on each ray up to the end of the liquid, or of a body at the lip, in the last picture.
@@ -163,6 +165,8 @@ impl ColouredLiquid {
             frames: 0,
             dry_frames: 0,
             reflection: Reflection::default(),
+            wandering: Wandering::new(),
+            learn_after: 0,
             white_lip: 0.0,
             ends: [0; RAYS],
             sampled: Mat::default(),
@@ -227,13 +231,19 @@ impl ColouredLiquid {
     fn expose(&mut self) -> opencv::Result<()> {
         let far = self.grid.radii_px.iter().take_while(|r| **r < LEARN_FROM_PX).count();
         let (mut sums, mut count) = ([0u32; 3], 0u32);
+        let mut rays = [([0.0f32; 3], 0u32); RAYS];
         for (i, ray) in self.grid.rays.iter().enumerate() {
             let (mask, colours) = (self.mask.at_row::<u8>(i as i32)?, self.smooth.at_row::<Vec3b>(i as i32)?);
+            let (mut own, mut looked) = ([0u32; 3], 0u32);
             for r in (far + i % EXPOSURE_EVERY..ray.samples).step_by(EXPOSURE_EVERY).filter(|r| mask[*r] == 0) {
-                (0..3).for_each(|k| sums[k] += u32::from(colours[r][k]));
-                count += 1;
+                (0..3).for_each(|k| own[k] += u32::from(colours[r][k]));
+                looked += 1;
             }
+            (0..3).for_each(|k| sums[k] += own[k]);
+            count += looked;
+            rays[i] = (own.map(|sum| sum as f32 / looked.max(1) as f32), looked);
         }
+        self.wandering.look(&rays);
         if let Some(mean_sum) = sums.iter().sum::<u32>().checked_div(count) {
             self.ground.expose(mean_sum);
             self.ground_bgr = Some(sums.map(|sum| sum as f32 / count as f32));
@@ -346,7 +356,7 @@ impl ColouredLiquid {
         if self.is_foreign_body()? {
             return Ok(Sighting::Unsure(Doubt::ColoursChanged));
         }
-        if foreign < QUIET_SHARE {
+        if foreign < QUIET_SHARE && self.learn_after == 0 {
             self.beside.teach(&mut self.ground, self.frames)?;
         }
         Ok(dry)
@@ -392,7 +402,7 @@ impl Liquid for ColouredLiquid {
     }
 
     fn rules(&self) -> LineRules {
-        LineRules { profiles_least: PROFILES_LEAST, first_area_least_px2: self.area_min_px2, edge_tells_focus: true }
+        LineRules { profiles_least: PROFILES_LEAST, first_area_least_px2: self.area_min_px2, edge_tells_focus: true, unsure_lasts: true }
     }
 
     fn take(&mut self, region: &BoxedRef<Mat>) -> opencv::Result<()> {
@@ -419,12 +429,21 @@ impl Liquid for ColouredLiquid {
             other => other,
         };
         match sighting {
-            Sighting::Dry { .. } => self.learn(true)?,
-            Sighting::Stream { doubt: Doubt::None, .. } => self.learn(false)?,
+            Sighting::Dry { .. } if self.learn_after == 0 => self.learn(true)?,
+            Sighting::Stream { doubt: Doubt::None, .. } if self.learn_after == 0 => self.learn(false)?,
             // What may be liquid must not be taken for ground.
-            _ => self.ground.forget(),
+            Sighting::Dry { .. } | Sighting::Stream { doubt: Doubt::None, .. } => {
+                self.learn_after -= 1;
+                self.ground.forget();
+            }
+            _ => {
+                self.learn_after = LEARN_AFTER;
+                self.ground.forget();
+            }
         }
-        Ok(sighting)
+        // A liquid in the ground's colours is not seen.
+        let untold = self.wandering.doubt().filter(|_| matches!(sighting, Sighting::Dry { .. }));
+        Ok(untold.map_or(sighting, Sighting::Unsure))
     }
 
     fn see_lip(&mut self, white_share: f32) {
@@ -464,35 +483,14 @@ impl Liquid for ColouredLiquid {
     /// Ground is learned far from the lip only, once the surroundings are known.
     fn hold_ground(&mut self, _held: bool) {}
 
-    /// The edge is where the profile, projected on the difference between its two ends, passes one half.
     fn edge_on(&self, profile: &Profile) -> Option<ProfileEdge> {
-        let mean =
-            |range: &[[f32; 3]]| -> [f32; 3] { std::array::from_fn(|c| range.iter().map(|v| v[c]).sum::<f32>() / range.len() as f32) };
-        let inside = mean(&profile.colours[..FLANK]);
-        let outside = mean(&profile.colours[PROFILE_SAMPLES - FLANK..]);
-        let difference: [f32; 3] = std::array::from_fn(|c| inside[c] - outside[c]);
-        let square: f32 = difference.iter().map(|v| v * v).sum();
-        if square < DIFFERENCE_LEAST * DIFFERENCE_LEAST {
-            return None;
-        }
-        // 1 in the liquid, 0 in the background.
-        let scale: [f32; 3] = difference.map(|v| v / square);
-        let levels = profile.colours.map(|p| (0..3).map(|c| (p[c] - outside[c]) * scale[c]).sum::<f32>());
-        // The falling crossing nearest to the profile's centre.
-        let crossing = |height: f32| {
-            levels
-                .windows(2)
-                .enumerate()
-                .filter(|(_, w)| w[0] >= height && w[1] < height)
-                .map(|(j, w)| j as f32 + (w[0] - height) / (w[0] - w[1]))
-                .min_by(|p, q| (p - REACH as f32).abs().total_cmp(&(q - REACH as f32).abs()))
-        };
-        let sample = crossing(0.5)?;
-        let width_samples = crossing(0.8).zip(crossing(0.2)).map(|(high, low)| (low - high).abs());
-        Some(ProfileEdge { sample, contrast: square.sqrt(), trust: 1.0, width_samples })
+        coloured_edge::edge_on(profile)
     }
 
     fn confirm(&mut self, line: Option<FineLine>, _mean_level: f32) -> Result<FineLine, Doubt> {
+        if line.is_none() {
+            self.learn_after = LEARN_AFTER;
+        }
         line.ok_or(Doubt::EdgeNotFound)
     }
 }

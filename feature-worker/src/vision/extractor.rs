@@ -108,12 +108,20 @@ impl Extractor {
             whole: WholeCheck::new(axes, region_px),
             rim: RimCheck::new(axes),
             lip: LipCheck::new(axes, camera.width_px),
-            presence: Presence::new(camera.width_px),
+            presence: Presence::new(camera.width_px, 1.0),
             liquid,
             line: LineFinder::new(axes, region_px),
             edges,
             stages: Stages::default(),
         })
+    }
+
+    /// The same extractor, which asks for `patience` times as many dry pictures before a stream that is not seen any more counts as gone. It is
+    /// for measuring what that costs and gains; 1 is what the worker uses.
+    #[must_use]
+    pub fn with_patience(mut self, patience: f32) -> Self {
+        self.presence = Presence::new(self.size_px[0], patience);
+        self
     }
 
     /// The axes in the image, px.
@@ -193,7 +201,7 @@ impl Extractor {
         let measured = if untold && self.rim.is_blurred(pixels) { Measurement::nothing(0.0, Doubt::Blurred) } else { measured };
         let not_told = matches!(measured.doubt, Doubt::EdgeNotFound | Doubt::ColoursChanged | Doubt::BlownOut | Doubt::LightFlickers);
         if not_told && measured.area_px2 == 0.0 {
-            self.presence.saw_unsure(measured.doubt == Doubt::ColoursChanged);
+            self.presence.saw_unsure(measured.doubt == Doubt::ColoursChanged || self.liquid.rules().unsure_lasts);
         }
         let seen_dry = measured.doubt == Doubt::None && measured.area_px2 == 0.0;
         let measured = if seen_dry && !self.presence.is_gone(self.light_bgr(), |legs_px| self.liquid.dry_share(legs_px)) {

@@ -90,6 +90,8 @@ pub(crate) struct LineRules {
     pub(crate) first_area_least_px2: f32,
     /// Whether the width of the stream's own edge tells that the picture is out of focus.
     pub(crate) edge_tells_focus: bool,
+    /// Whether a picture in which it was not told what flows leaves a doubt on those that follow.
+    pub(crate) unsure_lasts: bool,
 }
 
 /// A way to tell a liquid from what stands behind it.

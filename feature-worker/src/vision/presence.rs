@@ -34,6 +34,8 @@ const LIGHT_PICTURES: u32 = 6;
 /// Remembers the stream until its end was seen.
 pub(crate) struct Presence {
     lasting_px2: f32,
+    /// The pictures that are needed, in units of the usual ones.
+    patience: f32,
     /// Legs of the stream that may still be there, px from the lip.
     legs_px: Option<[f32; 2]>,
     /// Pictures in a row that showed dry ground in its place.
@@ -52,10 +54,11 @@ pub(crate) struct Presence {
 
 impl Presence {
     /// For pictures of this width, px. There is no stream yet.
-    pub(crate) fn new(width_px: u32) -> Self {
+    pub(crate) fn new(width_px: u32, patience: f32) -> Self {
         let scale = width_px as f32 / WIDTH_PX;
         Self {
             lasting_px2: LASTING_PX2 * scale * scale,
+            patience,
             legs_px: None,
             dry_pictures: 0,
             needed: 1,
@@ -72,13 +75,15 @@ impl Presence {
         self.legs_px = (area_px2 >= self.lasting_px2).then_some(legs_px);
         (self.dry_pictures, self.foreign) = (0, 0);
         let doublings = (area_px2 / self.lasting_px2).max(1.0).log2();
-        self.needed = ((PICTURES_PER_DOUBLING * doublings) as u32).clamp(1, PICTURES_MOST);
+        let most = (self.patience * PICTURES_MOST as f32) as u32;
+        self.needed = ((self.patience * PICTURES_PER_DOUBLING * doublings) as u32).clamp(1, most.max(1));
     }
 
-    /// There may be a stream that was not measured; something `foreign` lies at the lip, or it was not told.
-    pub(crate) fn saw_unsure(&mut self, foreign: bool) {
+    /// There may be a stream that was not measured. It `lasts` where something foreign lies at the lip, or the liquid's colours are not told:
+    /// then the next pictures have to show none.
+    pub(crate) fn saw_unsure(&mut self, lasts: bool) {
         self.dry_pictures = 0;
-        if foreign {
+        if lasts {
             self.foreign = FOREIGN_PICTURES;
         }
     }

@@ -373,7 +373,7 @@ mod tests {
     }
 
     fn observation(area: f32) -> Observation {
-        Observation { area_px2: Some(area), alpha_deg: 50.0, alpha_measured_deg: f32::NAN, alpha_now_deg: 50.0 }
+        Observation { area_px2: Some(area), confidence: 1.0, alpha_deg: 50.0, alpha_measured_deg: f32::NAN, alpha_now_deg: 50.0 }
     }
 
     /// Protects the idle robot: without a goal nothing ends, whatever is seen.

@@ -11,6 +11,15 @@ const WINDOW: usize = 15;
 /// Largest relative difference of their median from the configured frame time. Chosen by hand: the clocks of cameras differ by far less, and
 /// the next slower rate that cameras offer below 30 is 25.
 const TOLERANCE: f64 = 0.1;
+/// Number of frames over which a small difference is told: 1.6 s at 30 Hz. Chosen by hand: no more ticks than a replay leaves uncompared.
+const LONG_WINDOW: usize = 48;
+/// Frames in a half of that window.
+const HALF: usize = LONG_WINDOW / 2;
+/// Frames at either end of a half whose median stands for that end: late frames and pauses of single ones do not move it. Chosen by hand.
+const END: usize = 9;
+/// Largest relative difference over each half of the long window, which is the error of the volume that remains. Times that scatter by 5 ms
+/// move a half's rate by 0.6 %, and 28 frames a second instead of 30 by 7 %.
+const LONG_TOLERANCE: f64 = 0.02;
 
 /// The newest frame times of one feature worker.
 #[derive(Debug, Clone, Copy)]
@@ -23,12 +32,17 @@ pub struct FrameRate {
     seen: usize,
     /// Number of frames in a row before each of which another one was missing, and the time from the last but one of them to the last, ns.
     sparse: (usize, u64),
+    /// How much later than by their numbers the newest frames came, ns, as places in a ring, and the number of frames that were taken.
+    late_ns: [i64; LONG_WINDOW],
+    taken: usize,
+    /// Number and time of the frame from which that is counted, ns.
+    first: (u64, u64),
 }
 
 impl FrameRate {
     /// The watch over frames that should come every `frame_ns`; 0 watches nothing.
     pub fn new(frame_ns: u64) -> Self {
-        Self { frame_ns, newest: None, times_ns: [0; WINDOW], seen: 0, sparse: (0, 0) }
+        Self { frame_ns, newest: None, times_ns: [0; WINDOW], seen: 0, sparse: (0, 0), late_ns: [0; LONG_WINDOW], taken: 0, first: (0, 0) }
     }
 
     /// Takes the next frame of those that count. A frame that was lost has a number too, so that it makes no other time longer. Where frames
@@ -42,12 +56,18 @@ impl FrameRate {
                 self.seen = if self.seen + 1 == 2 * WINDOW { WINDOW } else { self.seen + 1 };
                 self.sparse = if frames > 1 { (self.sparse.0 + 1, captured_at_ns.saturating_sub(at_ns)) } else { (0, 0) };
             }
-            _ => (self.seen, self.sparse) = (0, (0, 0)),
+            _ => (self.seen, self.sparse, self.taken, self.first) = (0, (0, 0), 0, (sequence, captured_at_ns)),
         }
+        let due_ns = u128::from(sequence.saturating_sub(self.first.0)) * u128::from(self.frame_ns);
+        let late_ns = i128::from(captured_at_ns) - i128::from(self.first.1) - due_ns.min(u128::from(u64::MAX)) as i128;
+        self.late_ns[self.taken % LONG_WINDOW] = late_ns.clamp(i128::from(i64::MIN), i128::from(i64::MAX)) as i64;
+        self.taken = if self.taken + 1 == 2 * LONG_WINDOW { LONG_WINDOW } else { self.taken + 1 };
         self.newest = Some((worker_epoch_ns, sequence, captured_at_ns));
     }
 
-    /// The rate at which frames really come, frames/s, if it is another than the configured one. The median does not see a single pause.
+    /// The rate at which frames really come, frames/s, if it is another than the configured one. Neither measure sees a single pause: the
+    /// median of the frame times tells a rate of another kind within half a second, and both halves of the long window together a small
+    /// difference. A device whose frames have their numbers from their times has no small difference: its missing numbers are bridged.
     pub fn wrong_hz(&self) -> Option<f32> {
         if self.frame_ns == 0 || self.seen < WINDOW {
             return None;
@@ -59,7 +79,27 @@ impl FrameRate {
         times_ns.sort_unstable();
         let median_ns = times_ns[WINDOW / 2];
         let off = (median_ns as f64 / self.frame_ns as f64 - 1.0).abs();
-        (off > TOLERANCE).then_some((1e9 / median_ns.max(1) as f64) as f32)
+        if off > TOLERANCE {
+            return Some((1e9 / median_ns.max(1) as f64) as f32);
+        }
+        let later = [self.later(0), self.later(HALF)];
+        let both = later.iter().all(|l| *l > LONG_TOLERANCE) || later.iter().all(|l| *l < -LONG_TOLERANCE);
+        both.then(|| (1e9 / (self.frame_ns as f64 * (1.0 + 0.5 * (later[0] + later[1])))) as f32)
+    }
+
+    /// By which share a frame comes later after the one before it than configured, in the half of the long window that begins with this frame;
+    /// 0 while the window is not full.
+    fn later(&self, from: usize) -> f64 {
+        if self.taken < LONG_WINDOW {
+            return 0.0;
+        }
+        let median_of = |first: usize| {
+            let mut late_ns: [i64; END] = std::array::from_fn(|k| self.late_ns[(self.taken + from + first + k) % LONG_WINDOW]);
+            late_ns.sort_unstable();
+            late_ns[END / 2]
+        };
+        let (begin, end) = (median_of(0), median_of(HALF - END));
+        (end as f64 - begin as f64) / (self.frame_ns as f64 * (HALF - END) as f64)
     }
 
     /// The configured rate, frames/s.
@@ -97,6 +137,31 @@ mod tests {
         assert_eq!(wrong_hz(66.0, 10, 100, 100), None, "too few to say");
         let half = wrong_hz(33.333, 60, 2, 100);
         assert!(half.is_some_and(|hz| (hz / 15.0 - 1.0).abs() < 0.01), "numbered by its times: {half:?}");
+    }
+
+    /// Protects the volume from a camera that is a little slower or faster than configured, as 28 frames a second for 30 are, and a camera
+    /// whose times scatter, or that pauses once, from a false alarm.
+    #[test]
+    fn a_small_difference_is_noticed_within_two_seconds() {
+        for hz in [28.0, 29.0, 31.0, 32.0] {
+            assert_eq!(wrong_hz(1e3 / hz, 40, 1000, 1000), None, "{hz}: too few to say");
+            let found = wrong_hz(1e3 / hz, 52, 1000, 1000);
+            assert!(found.is_some_and(|f| (f64::from(f) / hz - 1.0).abs() < 0.01), "{hz}: {found:?}");
+        }
+        for (frame_ms, lose, pause) in [(33.367, 1000, 1000), (33.0, 7, 23), (33.8, 5, 1000), (33.333, 1000, 9)] {
+            assert_eq!(wrong_hz(frame_ms, 600, lose, pause), None, "{frame_ms} {lose} {pause}");
+        }
+        for step_after in [40u64, 70, 100] {
+            let mut rate = FrameRate::new(1_000_000_000 / 30);
+            for k in 0..200u64 {
+                // Up to 10 ms of scatter, and one pause of 0.3 s that no number counts.
+                let scatter_ns = k.wrapping_mul(2_654_435_761) % 10_000_000;
+                let pause_ns = if k > step_after { 300_000_000 } else { 0 };
+                let captured_at_ns = 1_000_000_000 + k * 33_333_333 + scatter_ns + pause_ns;
+                rate.saw(&Feature { worker_epoch_ns: 1, sequence: k, captured_at_ns, ..Feature::default() });
+                assert_eq!(rate.wrong_hz(), None, "frame {k}, pause after {step_after}");
+            }
+        }
     }
 
     /// Protects the next worker: with it, everything is learned anew.

@@ -20,6 +20,16 @@ const SERVICES: &str = "Settings > Security > Services in PolyScope's menu";
 /// Why there is no session with the robot.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 pub enum LinkError {
+    /// The robot's name is not known.
+    #[error(
+        "robot {name}: its address cannot be looked up: {what}; check robot.address, the network and its name server, or give the address itself"
+    )]
+    UnknownName {
+        /// The name.
+        name: String,
+        /// The resolver's message.
+        what: String,
+    },
     /// There is no TCP connection.
     #[error("robot {at}: cannot connect: {what}; check robot.address, the cable, and that the robot is switched on")]
     Unreachable {

@@ -121,7 +121,7 @@ pub fn since(before: &Before, state: &RobotState, tilt: Joint) -> Option<Handove
     if before.asked {
         return None;
     }
-    let Some(last) = &before.last else { return was_interrupted(state).then_some(Handover::Interrupted) };
+    let Some(last) = &before.last else { return left_behind(state) };
     let own_end = matches!(state.program_state, ProgramState::TimedOut | ProgramState::Stopped | ProgramState::Unused);
     if state.program_run != last.program_run || !own_end {
         return Some(Handover::Interrupted);
@@ -130,11 +130,16 @@ pub fn since(before: &Before, state: &RobotState, tilt: Joint) -> Option<Handove
     joint_where(displaced).map(Handover::Displaced)
 }
 
-/// Whether our program's registers say that it was still at work when it went away: somebody stopped it, also when no controller watched. What a
-/// robot's boot clears, or a later program overwrites, cannot be known.
-fn was_interrupted(state: &RobotState) -> bool {
+/// What our program's registers say of how it went away, also when no controller watched: that it was still at work, so somebody stopped it, or
+/// that it ended because the joint was not where it was commanded. What a robot's boot clears, or a later program overwrites, cannot be known.
+fn left_behind(state: &RobotState) -> Option<Handover> {
     use ProgramState::*;
-    state.program_run != 0 && matches!(state.program_state, Ready | Following | Holding | Returning | Stopping | OffTrack)
+    match state.program_state {
+        _ if state.program_run == 0 => None,
+        Ready | Following | Holding | Returning | Stopping | OffTrack => Some(Handover::Interrupted),
+        OffTrackEnded => Some(Handover::Stopped(EndReason::NotFollowed)),
+        _ => None,
+    }
 }
 
 /// Whether a robot that says "paused" was only never started since its boot, so that there is no program which somebody has paused.

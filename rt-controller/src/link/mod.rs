@@ -216,11 +216,11 @@ pub struct LinkOptions {
 }
 
 impl LinkOptions {
-    /// The link's part of the cell's configuration.
-    pub fn new(config: &Config) -> Self {
+    /// The link's part of the cell's configuration, with the robot at `address`.
+    pub fn new(config: &Config, address: IpAddr) -> Self {
         let robot = &config.robot;
         Self {
-            address: robot.address,
+            address,
             tilt: TiltJoint::new(robot),
             start_tolerance_deg: robot.start_tolerance_deg,
             register_base: robot.register_base,

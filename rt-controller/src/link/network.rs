@@ -5,10 +5,11 @@
 //! never blocks, and neither allocates nor panics. Failures are those of the system, as [`std::io::Error`].
 
 use std::io::{Read, Result, Write};
-use std::net::{Shutdown, SocketAddr, TcpStream};
+use std::net::{IpAddr, Shutdown, SocketAddr, TcpStream};
 use std::time::Duration;
 
 use shared::os;
+use shared::robot_address::RobotAddress;
 
 /// A connection to the robot.
 pub trait Transport: Read + Write + std::fmt::Debug + Send {
@@ -24,6 +25,10 @@ pub trait Network {
     fn now_ns(&self) -> u64;
     /// Lets this time pass.
     fn sleep(&self, time: Duration);
+    /// The address of the robot now. A name is looked up, which may take seconds. The error is one line.
+    fn resolve(&self, robot: &RobotAddress) -> std::result::Result<IpAddr, String> {
+        robot.resolve()
+    }
     /// Connects, for `within` at most; writes on the connection block for no longer than that either.
     fn open(&self, at: SocketAddr, within: Duration) -> Result<Box<dyn Transport>>;
     /// Reads what has arrived, and waits for it for `within` at most.

@@ -4,6 +4,8 @@
 use rt_controller::link::hands::{Before, Handover};
 use rt_controller::link::{LinkError, ProgramState, RobotState};
 
+use shared::control::EndReason;
+
 use super::server::{Robot, Server};
 
 /// Protects robots on which services are switched off: any one of the three ports for programs is enough.
@@ -73,14 +75,15 @@ fn a_robot_that_was_handled_meanwhile_waits_for_its_operator() {
 }
 
 /// Protects people from a controller that was not there when they pressed stop: a program that was at work when it went away was stopped by
-/// somebody, so a controller that has just been started waits for its operator too. One that ended by itself, or never ran, is no reason.
+/// somebody, and one that ended because the joint was held or moved shows a hand, so a controller that has just been started waits for its operator
+/// too. One that ended because its controller did, or never ran, is no reason.
 #[test]
 fn a_new_controller_sees_that_a_program_was_stopped() {
     let cases = [
         (101, (ProgramState::Following, 7, 9), Some(Handover::Interrupted)),
         (102, (ProgramState::Returning, 7, 9), Some(Handover::Interrupted)),
         (103, (ProgramState::TimedOut, 7, 9), None),
-        (104, (ProgramState::OffTrackEnded, 7, 9), None),
+        (104, (ProgramState::OffTrackEnded, 7, 9), Some(Handover::Stopped(EndReason::NotFollowed))),
         (105, (ProgramState::Unknown, 0, 0), None),
     ];
     for (number, registers, why) in cases {

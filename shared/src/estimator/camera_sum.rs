@@ -20,11 +20,18 @@ pub(super) struct CameraSum {
     newest_ml: f64,
     /// Sum of the outflow times the logarithm of its area.
     log_area_ml: f64,
+    /// Standard deviation of the newest frame's area beyond the frames' noise (log).
+    newest_log_sd: f64,
+    /// Sum of the outflow times that: a line that slips does so for many frames, so these errors add up.
+    unsure_ml: f64,
 }
 
 impl CameraSum {
-    /// Adds a frame; the dropout hold bridges what is lost.
-    pub fn add(&mut self, calibration: &Calibration, area_px2: Option<f32>, alpha_deg: f64) {
+    /// Adds a frame whose area is off by `log_sd` beyond the frames' noise; the dropout hold bridges what is lost.
+    pub fn add(&mut self, calibration: &Calibration, area_px2: Option<f32>, log_sd: f64, alpha_deg: f64) {
+        if area_px2.is_some() {
+            self.newest_log_sd = log_sd;
+        }
         let area_px2 = self.hold.step(area_px2, calibration.hold_above_px2);
         let ml = f64::from(calibration.volume_ml(area_px2, alpha_deg as f32)).min(MEASURED_MAX_ML);
         self.newest_ml = ml;
@@ -32,6 +39,7 @@ impl CameraSum {
             self.sum_ml += ml;
             self.squares_ml2 += ml * ml;
             self.log_area_ml += ml * f64::from(area_px2).ln();
+            self.unsure_ml += ml * self.newest_log_sd * f64::from(calibration.area_exponent);
         }
     }
 
@@ -46,11 +54,13 @@ impl CameraSum {
         self.sum_ml += late_ml.max(0.0);
     }
 
-    /// Standard deviation of the sum, ml: what the calibration leaves open at the areas of this pour, the pour's own gain, and the frames' noise.
+    /// Standard deviation of the sum, ml: what the calibration leaves open at the areas of this pour, the pour's own gain, the frames' noise, and
+    /// what their confidence leaves open.
     pub fn sd_ml(&self, camera: &[[f64; 2]; 2], gain_sd: f64, frame_sd: f64) -> f64 {
         let (sum, log) = (self.sum_ml, self.log_area_ml);
         let [[cc, cq], [_, qq]] = camera;
         let calibration_ml2 = sum * sum * cc + 2.0 * sum * log * cq + log * log * qq;
-        (calibration_ml2.max(0.0) + (gain_sd * sum).powi(2) + frame_sd * frame_sd * self.squares_ml2 + CAMERA_SD_ML * CAMERA_SD_ML).sqrt()
+        let noise_ml2 = frame_sd * frame_sd * self.squares_ml2 + self.unsure_ml.powi(2) + CAMERA_SD_ML * CAMERA_SD_ML;
+        (calibration_ml2.max(0.0) + (gain_sd * sum).powi(2) + noise_ml2).sqrt()
     }
 }

@@ -26,6 +26,7 @@ pub use super::filter::{EXPLANATIONS, TIGHT, WIDE};
 use super::filter::{Filter, Innovation, UnknownsCovariance};
 use super::flow::{FlowModel, FlowState, FlowTables, WayBack};
 use super::tilt::{Angles, ShownTilt};
+use super::trust;
 use super::verdict::{Bounds, Impossible, Leap, Watch};
 use super::whiteness::Whiteness;
 
@@ -108,6 +109,8 @@ struct Pour {
 pub struct FusedFrame {
     /// V_e, px^2; `None` if the frame was lost.
     pub area_px2: Option<f32>,
+    /// Confidence of the area, 0 to 1: the share of such areas that are within 20 % of the truth. NaN, where no camera says it, weighs in full.
+    pub confidence: f32,
     /// Commanded tilt when it was taken, degrees.
     pub command_deg: f64,
     /// Measured tilt when it was taken, degrees; NaN if it is not known.
@@ -252,6 +255,7 @@ impl FusedEstimator {
             Some(Leap::None) | None => area_px2,
         };
         let flows = area_px2.map(|a| a > 0.0);
+        let log_sd = trust::extra_log_sd(frame.confidence);
         let begins = !*started && *flowed && flows == Some(true);
         *flowed = flows.unwrap_or(*flowed);
         let mut innovations: [Option<Innovation>; EXPLANATIONS] = [None; EXPLANATIONS];
@@ -264,7 +268,9 @@ impl FusedEstimator {
                 _ if !*started => continue,
                 measured_ml => {
                     filter.tilt(flow, shown.tilt);
-                    innovations[k] = measured_ml.and_then(|measured_ml| filter.update(flow, shown.tilt, measured_ml));
+                    innovations[k] = measured_ml.and_then(|measured_ml| {
+                        filter.update(flow, shown.tilt, measured_ml, log_sd * f64::from(calibration.area_exponent))
+                    });
                 }
             }
             filter.release(flow, shown.tilt);
@@ -275,7 +281,7 @@ impl FusedEstimator {
             camera.add_late(withheld_ml);
         }
         let leaps = odd == Leap::Withheld;
-        camera.add(&self.calibration, area_px2.filter(|_| !leaps), alpha_deg);
+        camera.add(&self.calibration, area_px2.filter(|_| !leaps), log_sd, alpha_deg);
         *started |= begins;
         if *started {
             for (k, (Explaining { flow, calibration, unknowns }, Following { shown, .. })) in

@@ -2,7 +2,7 @@
 //!
 //! Called by the renderer, on its thread. It allocates when it is painted and at the first frame. Its failures are OpenCV's.
 
-use opencv::core::{BORDER_REFLECT_101, CV_8UC3, Mat, Point, Point2f, Rect, Scalar, Size};
+use opencv::core::{BORDER_REFLECT_101, CV_8UC3, Mat, Point, Point2f, Rect, Scalar, Size, Vec3b};
 use opencv::imgproc;
 use opencv::prelude::*;
 use rand::RngExt;
@@ -10,19 +10,47 @@ use rand_pcg::Pcg64Mcg;
 
 use super::view::{Background, Scene, View};
 
+/// Share of a hand's speed that is left after a frame. Chosen by hand, so that it trembles at about 3 Hz.
+const HAND_DAMPING: f64 = 0.8;
+/// Share of a hand's way by which it is pulled back in a frame. Chosen as [`HAND_DAMPING`] was.
+const HAND_SPRING: f64 = 0.3;
+/// Grey level of a dark curtain. Chosen by hand, after photographs of pours before one.
+const CURTAIN_LEVEL: f64 = 30.0;
+
 /// The background, at half the picture's resolution.
 pub struct Board {
     /// Square, and larger than the picture's diagonal.
     painted: Mat,
     turned: Mat,
     blurred: Mat,
+    /// Where a hand has moved it, px of the half-size picture, and how fast, px a frame.
+    hand_px: [f64; 2],
+    hand_px_per_frame: [f64; 2],
 }
 
 impl Board {
     /// Paints the background of `view`; `random` draws its details.
     pub fn new(view: &View, random: &mut Pcg64Mcg) -> opencv::Result<Self> {
         let side = f64::from(view.width_px).hypot(f64::from(view.height_px)) as i32 + 2;
-        Ok(Self { painted: paint(view.background, side, random)?, turned: Mat::default(), blurred: Mat::default() })
+        Ok(Self {
+            painted: paint(view.background, side, random)?,
+            turned: Mat::default(),
+            blurred: Mat::default(),
+            hand_px: [0.0; 2],
+            hand_px_per_frame: [0.0; 2],
+        })
+    }
+
+    /// Lets the hand that holds camera and container move on by one frame. Nothing is drawn from `random` without a hand.
+    pub fn shake(&mut self, view: &View, random: &mut Pcg64Mcg) {
+        if view.hand_px <= 0.0 {
+            return;
+        }
+        for (at, speed) in self.hand_px.iter_mut().zip(&mut self.hand_px_per_frame) {
+            // A hand's tremor: a spring that is pushed at random. A uniform push of +-0.33 deviations makes about one deviation of way.
+            *speed = HAND_DAMPING * *speed - HAND_SPRING * *at + random.random_range(-0.33..0.33) * 0.5 * view.hand_px;
+            *at += *speed;
+        }
     }
 
     /// Draws the board into `frame`, turned with the tilt about the wrist's axis and blurred by its motion during the exposure.
@@ -33,7 +61,7 @@ impl Board {
         let middle = self.painted.cols() as f64 / 2.0;
         let mut turn = imgproc::get_rotation_matrix_2d(centre, -(scene.alpha_deg + view.roll_deg), 1.0)?;
         // The board's middle lies at the wrist's axis.
-        let shift = [f64::from(centre.x) - middle, f64::from(centre.y) - middle];
+        let shift = [f64::from(centre.x) - middle + self.hand_px[0], f64::from(centre.y) - middle + self.hand_px[1]];
         for row in 0..2 {
             let (a, b) = (*turn.at_2d::<f64>(row, 0)?, *turn.at_2d::<f64>(row, 1)?);
             *turn.at_2d_mut::<f64>(row, 2)? += a * shift[0] + b * shift[1];
@@ -61,6 +89,7 @@ fn paint(kind: Background, side: i32, random: &mut Pcg64Mcg) -> opencv::Result<M
         Background::Wood => paint_wood(&mut board, side, random)?,
         Background::Clutter => paint_clutter(&mut board, side, random)?,
         Background::Plain => {}
+        Background::Curtain => paint_curtain(&mut board, random)?,
     }
     // The board is behind the plane of focus.
     let mut soft = Mat::default();
@@ -71,6 +100,23 @@ fn paint(kind: Background, side: i32, random: &mut Pcg64Mcg) -> opencv::Result<M
 
 fn fill(board: &mut Mat, rect: Rect, colour: Scalar) -> opencv::Result<()> {
     imgproc::rectangle(board, rect, colour, imgproc::FILLED, imgproc::LINE_8, 0)
+}
+
+/// A dark cloth, whose folds are a little brighter where they turn to the lamp.
+fn paint_curtain(board: &mut Mat, random: &mut Pcg64Mcg) -> opencv::Result<()> {
+    let waves: [(f64, f64, f64); 3] =
+        std::array::from_fn(|_| (random.random_range(25.0..90.0), random.random_range(0.0..6.3), random.random_range(1.0..5.0)));
+    let (rows, columns) = (board.rows(), board.cols());
+    for y in 0..rows {
+        for (x, pixel) in board.at_row_mut::<Vec3b>(y)?.iter_mut().enumerate().take(columns as usize) {
+            // Folds hang a little askew.
+            let along = x as f64 + 0.08 * f64::from(y);
+            let fold: f64 =
+                waves.iter().map(|(period, phase, height)| height * (along * std::f64::consts::TAU / period + phase).sin()).sum();
+            *pixel = Vec3b::from([1.02, 0.98, 1.0].map(|tint: f64| ((CURTAIN_LEVEL + fold) * tint).clamp(0.0, 255.0) as u8));
+        }
+    }
+    Ok(())
 }
 
 fn paint_chess(board: &mut Mat, side: i32, random: &mut Pcg64Mcg) -> opencv::Result<()> {

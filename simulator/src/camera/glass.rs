@@ -35,6 +35,17 @@ impl Glass {
             imgproc::fill_poly(&mut factor, polygon, Scalar::all(passed), imgproc::LINE_AA, 4, Point::default())?;
             imgproc::fill_poly(&mut light, polygon, Scalar::all(added), imgproc::LINE_AA, 4, Point::default())?;
         }
+        for k in 0..view.glass_drops {
+            // Spread evenly without a pattern: by the golden ratio and by its square.
+            let spread = |by: f64| (f64::from(k + 1) * by).fract();
+            let at_mm = [2.0 + 40.0 * spread(0.618_034), -2.0 - 45.0 * spread(0.754_878)];
+            let radius = ((0.3 + 0.7 * spread(0.569_840)) * view.px_per_mm * 16.0) as i32;
+            // A drop is a lens: dark at its border, and with a lamp's image near its top.
+            imgproc::circle(&mut factor, point(at_mm), radius, Scalar::all(70.0), imgproc::FILLED, imgproc::LINE_AA, 4)?;
+            imgproc::circle(&mut factor, point(at_mm), radius * 2 / 3, Scalar::all(124.0), imgproc::FILLED, imgproc::LINE_AA, 4)?;
+            let lamp_mm = [at_mm[0], at_mm[1] + 0.02 * f64::from(radius) / view.px_per_mm];
+            imgproc::circle(&mut light, point(lamp_mm), (radius / 4).max(8), Scalar::all(110.0), imgproc::FILLED, imgproc::LINE_AA, 4)?;
+        }
         let edges = [([0.25, 0.0], [0.25, -far], 120.0), ([0.0, -0.3], [far, -0.3], 105.0), ([wall, -1.0], [wall, -far], 6.0)];
         for (from, to, added) in edges {
             imgproc::line(&mut light, point(from), point(to), Scalar::all(added), 1, imgproc::LINE_AA, 4)?;

@@ -19,6 +19,12 @@ pub struct Liquid {
     /// Width of the softening, px; odd.
     around: i32,
     look: Look,
+    /// Share of its surface that is foam, 0 to 1.
+    foam: f64,
+    /// Side of a patch of foam, px.
+    bubble_px: usize,
+    /// How often liquid was laid: foam changes from frame to frame.
+    laid: u64,
 }
 
 /// The two kinds of liquid.
@@ -55,7 +61,15 @@ impl Liquid {
             Some(bgr) => Look::Coloured(bgr, view.opacity as f32),
             None => Look::Clear(Box::new(Water::new(view, seed))),
         };
-        Self { thickness: Mat::default(), behind: Mat::default(), around: (1.3 * view.px_per_mm) as i32 | 1, look }
+        Self {
+            thickness: Mat::default(),
+            behind: Mat::default(),
+            around: (1.3 * view.px_per_mm) as i32 | 1,
+            look,
+            foam: view.foam,
+            bubble_px: ((0.6 * view.px_per_mm) as usize).max(1),
+            laid: 0,
+        }
     }
 
     /// Lays the liquid in `cover` over `frame` inside of `area`, then clears the cover.
@@ -86,8 +100,19 @@ impl Liquid {
                 }
                 Look::Clear(water) => lay_clear(cover, frame, &water.row(area, y, ripple)?, &thickness),
             }
+            if self.foam > 0.0 {
+                lay_foam(
+                    cover,
+                    frame,
+                    self.foam,
+                    [(area.x as usize) / self.bubble_px, (area.y as usize + y) / self.bubble_px],
+                    self.bubble_px,
+                    self.laid,
+                );
+            }
             cover.fill(0);
         }
+        self.laid += 1;
         Ok(())
     }
 }
@@ -107,6 +132,19 @@ fn lay_coloured(cover: &[u8], frame: &mut [Vec3b], behind: &[Vec3b], thickness: 
 fn lay_clear(cover: &[u8], frame: &mut [Vec3b], water: &WaterRow, thickness: &ThicknessRow) {
     for x in (0..cover.len()).filter(|x| cover[*x] != 0) {
         blend(&mut frame[x], water.colour(x, thickness.lamp(x)), cover[x]);
+    }
+}
+
+/// Lays patches of foam over one row of liquid: `first` is the patch of its first pixel, and the row's patch.
+fn lay_foam(cover: &[u8], frame: &mut [Vec3b], share: f64, first: [usize; 2], bubble_px: usize, laid: u64) {
+    for x in (0..cover.len()).filter(|x| cover[*x] != 0) {
+        // A hash of the place, which changes every few frames as bubbles drift and burst.
+        let place = ((first[0] + x / bubble_px) as u64) << 32 | (first[1] as u64) << 16 | (laid / 3) & 0xffff;
+        let hash = (place ^ (place >> 15)).wrapping_mul(0x9e37_79b9_7f4a_7c15);
+        if ((hash >> 40) as f64) < share * f64::from(1 << 24) {
+            let level = 205.0 + (hash >> 34 & 31) as f32;
+            blend(&mut frame[x], [level; 3], (u16::from(cover[x]) * 4 / 5) as u8);
+        }
     }
 }
 

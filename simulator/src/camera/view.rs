@@ -21,10 +21,12 @@ pub enum Background {
     Clutter,
     /// A plain wall.
     Plain,
+    /// A dark curtain with folds, as people photograph clear water before.
+    Curtain,
 }
 
 impl Background {
-    /// All backgrounds.
+    /// The backgrounds that cells and evaluations draw from.
     pub const ALL: [Self; 4] = [Self::Chess, Self::Wood, Self::Clutter, Self::Plain];
 }
 
@@ -63,6 +65,12 @@ pub struct View {
     pub blur_px: f64,
     /// Exposure time, s.
     pub shutter_s: f64,
+    /// How far a hand lets what stands behind move in the picture, px (standard deviation): camera and container are held together.
+    pub hand_px: f64,
+    /// Number of drops of liquid that hang on the container's glass.
+    pub glass_drops: u32,
+    /// Share of the liquid's surface that is foam, 0 to 1.
+    pub foam: f64,
 }
 
 impl View {
@@ -104,6 +112,9 @@ impl Default for View {
             noise: 3.0,
             blur_px: 0.0,
             shutter_s: 0.008,
+            hand_px: 0.0,
+            glass_drops: 0,
+            foam: 0.0,
         }
     }
 }

@@ -83,7 +83,8 @@ pub fn run(args: &Args) -> Result<(), Failure> {
 
 fn cause(config: &Config, fault: &str) -> Result<(), Failure> {
     let fault: ur::Fault = fault.parse().or_exit(exit::BAD_INPUT)?;
-    ur::send_fault(config.robot.address, &fault).or_exit(exit::UNREACHABLE)
+    let address = config.robot.address.resolve().or_exit(exit::BAD_INPUT)?;
+    ur::send_fault(address, &fault).or_exit(exit::UNREACHABLE)
 }
 
 /// Writes one line to the operator socket of the cell `place`, and returns its answer.

@@ -105,7 +105,7 @@ impl Cell {
         let mut config = Config::read(&sim).unwrap();
         config.cell.name = format!("fault-{name}-{third}-{pid}");
         let address = IpAddr::V4(address);
-        config.robot.address = address;
+        config.robot.address = address.into();
         config.controller.weights = directory.path().join("weights.bin");
         config.controller.journal = None;
         config.recording.directory = directory.path().join("episodes");

@@ -24,18 +24,15 @@ use simulator::ur::{Fault, RobotMode, Series};
 
 use cell::{Cell, Expected, Moment, start_controller};
 
-/// Runs four cells side by side, because a pour is mostly waiting. In each, the second moment begins with the recovery from the first.
+/// Runs a cell for each robot and moment, all side by side, because a pour is mostly waiting.
 fn matrix(name: &str, last: u8, expected: Expected, strike: impl Fn(&mut Cell) + Sync, recover: impl Fn(&mut Cell) + Sync) {
     let (strike, recover) = (&strike, &recover);
-    let halves = [[Moment::AtRest, Moment::FullFlow], [Moment::TiltingOut, Moment::Returning]];
-    let cells = [(Series::Cb3, halves[0]), (Series::Cb3, halves[1]), (Series::ESeries, halves[0]), (Series::ESeries, halves[1])];
+    let moments = [Moment::AtRest, Moment::TiltingOut, Moment::FullFlow, Moment::Returning];
+    let cells = [Series::Cb3, Series::ESeries].into_iter().flat_map(|series| moments.map(|moment| (series, moment)));
     thread::scope(|scope| {
-        for (k, (series, moments)) in (0..).zip(cells) {
+        for (k, (series, moment)) in (0..).zip(cells) {
             scope.spawn(move || {
-                let mut cell = Cell::new(name, Ipv4Addr::new(127, 44, k, last), series);
-                for moment in moments {
-                    cell.check(name, moment, expected, strike, recover);
-                }
+                Cell::new(name, Ipv4Addr::new(127, 44, k, last), series).check(name, moment, expected, strike, recover);
             });
         }
     });

@@ -91,7 +91,7 @@ fn fused_sums(episode: &TrainingEpisode, mut estimator: FusedEstimator) -> Vec<f
         .map(|k| {
             let command_deg = episode.alpha_deg[k];
             let area_px2 = Some(episode.area_px2[k] as f32).filter(|a| !a.is_nan());
-            estimator.step(FusedFrame { area_px2, command_deg, measured_deg: episode.alpha_measured_deg[k] });
+            estimator.step(FusedFrame { area_px2, confidence: 1.0, command_deg, measured_deg: episode.alpha_measured_deg[k] });
             estimator.poured_ml() + estimator.stop_volume_ml(command_deg)
         })
         .collect();

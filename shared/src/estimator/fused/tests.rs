@@ -57,7 +57,7 @@ impl ModelVessel {
 
 fn frame(outflow_ml: f64, command_deg: f64) -> FusedFrame {
     let area = (outflow_ml / f64::from(CAMERA.volume_at_1_px2_ml)) as f32;
-    FusedFrame { area_px2: Some(if area < 5.0 { 0.0 } else { area }), command_deg, measured_deg: f64::NAN }
+    FusedFrame { area_px2: Some(if area < 5.0 { 0.0 } else { area }), confidence: 1.0, command_deg, measured_deg: f64::NAN }
 }
 
 /// A pour whose tilt rises, holds, and returns; the camera's gain is off by the factor `gain`. Gives the true volume and the camera's sum,
@@ -349,7 +349,7 @@ proptest! {
     ) {
         let mut fused = new(&model(share));
         for (area_px2, command_deg, measured_deg) in frames {
-            fused.step(FusedFrame { area_px2, command_deg, measured_deg });
+            fused.step(FusedFrame { area_px2, confidence: 1.0, command_deg, measured_deg });
             prop_assert!(fused.poured_ml().is_finite() && fused.poured_sd_ml().is_finite());
             prop_assert!(fused.stop_volume_ml(command_deg.clamp(-1e6, 1e6)).is_finite());
         }

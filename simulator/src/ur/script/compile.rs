@@ -59,6 +59,13 @@ pub enum Op {
     Pause,
 }
 
+impl Op {
+    /// Whether it needs more than its own thread and the program's variables.
+    pub fn needs_more(&self) -> bool {
+        matches!(self, Op::Call(_) | Op::Builtin(_) | Op::Run(_) | Op::Join | Op::Kill | Op::Return | Op::Halt | Op::Pause)
+    }
+}
+
 /// A function, a thread or, as routine 0, the program's own body.
 #[derive(Debug, Clone)]
 pub struct Routine {

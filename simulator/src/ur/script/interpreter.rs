@@ -10,30 +10,14 @@ use super::ScriptError;
 use super::builtin::{BuiltinFunction, Effect};
 use super::compile::{Code, Op, compile};
 use super::syntax::ProgramTree;
-use super::thread::{CallFrame, ScriptThread, Wait, pop};
+use super::thread::{CallFrame, Effort, MAX_OPS_PER_CYCLE, Pace, ScriptThread, Wait, pop, take};
 use super::value::Value;
 use crate::ur::robot::Robot;
 
-/// Most instructions in one control cycle. A robot stops a program that computes without ever letting time pass; this number is
-/// chosen by hand, and no measurement is recorded.
-const MAX_OPS_PER_CYCLE: u32 = 50_000;
 /// Most calls at once, in all threads together. Chosen by hand; no measurement is recorded.
 const MAX_CALLS: usize = 128;
 /// Most threads at once, the program's own included. Chosen by hand; no measurement is recorded.
 const MAX_THREADS: usize = 32;
-/// Most values on a thread's stack. Chosen by hand; no measurement is recorded.
-const MAX_STACK: usize = 512;
-
-/// What a program did in one control cycle. A condition counts as a statement, and so does each statement of a function that it calls.
-#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
-pub struct Effort {
-    /// Statements that were carried out.
-    pub statements: u32,
-    /// Calls of functions, the program's own and the built-in ones.
-    pub calls: u32,
-    /// Instructions of the stack machine.
-    pub instructions: u32,
-}
 
 /// How a control cycle of a program ended.
 #[derive(Debug, Clone, PartialEq)]
@@ -120,15 +104,22 @@ impl Interpreter {
 
     /// Runs one control cycle.
     pub fn step(&mut self, robot: &mut Robot) -> StepOutcome {
-        let mut budget = MAX_OPS_PER_CYCLE;
-        self.effort = Effort::default();
+        let effort = Effort::default();
+        let mut pace = Pace { budget: MAX_OPS_PER_CYCLE, effort, counted: (0, 0), single_precision: self.single_precision };
+        let outcome = self.turns(robot, &mut pace);
+        self.effort = pace.effort;
+        outcome
+    }
+
+    /// Lets every thread have its turn.
+    fn turns(&mut self, robot: &mut Robot, pace: &mut Pace) -> StepOutcome {
         let mut i = 0;
         while i < self.threads.len() {
             if !self.may_go_on(i, robot) {
                 i += 1;
                 continue;
             }
-            match self.turn(i, robot, &mut budget) {
+            match self.turn(i, robot, pace) {
                 Ok(TurnEnd::Waits) => i += 1,
                 Ok(TurnEnd::Finished) if self.threads[i].id == 0 => return StepOutcome::Ended,
                 Ok(TurnEnd::Finished) => drop(self.threads.remove(i)),
@@ -160,34 +151,17 @@ impl Interpreter {
     }
 
     /// Runs a thread until it waits or ends.
-    fn turn(&mut self, i: usize, robot: &mut Robot, budget: &mut u32) -> Result<TurnEnd, ScriptError> {
+    fn turn(&mut self, i: usize, robot: &mut Robot, pace: &mut Pace) -> Result<TurnEnd, ScriptError> {
         let code = self.code.clone();
-        let mut counted = (0, 0);
+        pace.counted = (0, 0);
         loop {
             let thread = &mut self.threads[i];
-            let Some(call) = thread.calls.last_mut() else { return Ok(TurnEnd::Finished) };
-            let (op, line) = (&code.ops[call.at], code.lines[call.at]);
-            if *budget == 0 {
-                let what = format!(
-                    "{MAX_OPS_PER_CYCLE} instructions without letting time pass: an endless loop without sync(), sleep() or servoj()"
-                );
-                return Err(ScriptError::new(line, what));
-            }
-            *budget -= 1;
-            // A statement is a line's instructions in a row; a jump back to the same line begins it anew. The jumps that end a branch or
-            // a pass of a loop belong to no statement.
-            if !matches!(op, Op::Jump(_)) {
-                if line != counted.0 || call.at < counted.1 {
-                    self.effort.statements += 1;
-                }
-                counted = (line, call.at);
-            }
-            self.effort.calls += u32::from(matches!(op, Op::Call(_) | Op::Builtin(_)));
-            self.effort.instructions += 1;
-            call.at += 1;
-            if thread.stack.len() > MAX_STACK {
-                return Err(ScriptError::new(line, "expression too large"));
-            }
+            let computed = thread.compute(&code, &mut self.globals, pace);
+            // The place of the instruction that needs more than its thread, or that failed.
+            let line = thread.calls.last().map_or(0, |call| code.lines[call.at - 1]);
+            let op = computed.map_err(|what| ScriptError::new(line, what))?;
+            let Some(op) = op else { return Ok(TurnEnd::Finished) };
+            pace.effort.calls += u32::from(matches!(op, Op::Call(_) | Op::Builtin(_)));
             let next = match op {
                 Op::Call(routine) => self.call(i, *routine),
                 Op::Builtin(function) => self.call_builtin(i, function, robot),
@@ -198,20 +172,17 @@ impl Interpreter {
                     let end = self.return_to_caller(i);
                     // The caller's statement goes on and does not begin again.
                     if let Some(caller) = self.threads[i].calls.last() {
-                        counted = (code.lines[caller.at], caller.at);
+                        pace.counted = (code.lines[caller.at], caller.at);
                     }
                     Ok(end)
                 }
-                Op::Halt => Ok(Some(TurnEnd::Halt)),
                 Op::Pause => Ok(Some(TurnEnd::Pause)),
-                op => thread.compute(op, &code, &mut self.globals).map(|()| None),
+                _ => Ok(Some(TurnEnd::Halt)),
             };
-            let new = matches!(op, Op::Push(_) | Op::Binary(_) | Op::Builtin(_));
-            if self.single_precision
-                && new
-                && let Some(value) = self.threads.get_mut(i).and_then(|t| t.stack.last_mut())
+            if matches!(op, Op::Builtin(_))
+                && let Some(thread) = self.threads.get_mut(i)
             {
-                value.round_to_single();
+                pace.round(&mut thread.stack);
             }
             if let Some(end) = next.map_err(|what| ScriptError::new(line, what))? {
                 return Ok(end);
@@ -225,7 +196,7 @@ impl Interpreter {
             return Err(format!("more than {MAX_CALLS} calls within calls"));
         }
         self.calls += 1;
-        let arguments = self.threads[i].take(target.parameters);
+        let arguments = take(&mut self.threads[i].stack, target.parameters);
         self.threads[i].calls.push(CallFrame::new(routine, target, arguments));
         Ok(None)
     }

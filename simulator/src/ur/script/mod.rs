@@ -19,8 +19,9 @@ mod syntax;
 mod thread;
 mod value;
 
-pub use interpreter::{Effort, Interpreter, StepOutcome};
+pub use interpreter::{Interpreter, StepOutcome};
 pub use statements::{MAX_SOURCE_BYTES, parse};
+pub use thread::Effort;
 
 /// A mistake in a program.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]

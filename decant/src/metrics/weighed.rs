@@ -1,0 +1,84 @@
+//! The pours that somebody weighed: how far each was from its goal.
+//!
+//! A thread of its own reads each episode once, and again when its file has changed; it allocates and waits for the disk. A file that cannot be
+//! read is left out.
+
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+use std::sync::atomic::{AtomicBool, Ordering::Relaxed};
+use std::sync::{Mutex, PoisonError};
+use std::time::{Duration, SystemTime};
+
+use shared::episode::{Episode, EpisodeKind, find_episodes};
+
+/// Pause between two looks at the episodes. Chosen by hand: weighing takes a person longer.
+const LOOK: Duration = Duration::from_secs(10);
+/// How long one sleep lasts, so that a request to end is seen. Chosen by hand; no measurement is recorded.
+const BEAT: Duration = Duration::from_millis(100);
+/// Number of newest episodes that are looked at. Chosen by hand: a lab's weeks, and some seconds to read.
+const EPISODES: usize = 300;
+
+/// One pour that was weighed.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Pour {
+    /// Its goal, ml.
+    pub goal_ml: f64,
+    /// What the scale showed, g; of water as many ml.
+    pub weight_g: f64,
+}
+
+impl Pour {
+    /// Poured beyond the goal, ml of water.
+    pub fn error_ml(self) -> f64 {
+        self.weight_g - self.goal_ml
+    }
+}
+
+/// When a file was written, and its length.
+type Stamp = (Option<SystemTime>, u64);
+
+/// The pours of the newest episodes, shared between threads.
+#[derive(Debug, Default)]
+pub struct Weighed(Mutex<BTreeMap<PathBuf, (Stamp, Option<Pour>)>>);
+
+impl Weighed {
+    /// The weighed pours, the oldest first.
+    pub fn pours(&self) -> Vec<Pour> {
+        self.0.lock().unwrap_or_else(PoisonError::into_inner).values().filter_map(|(_, pour)| *pour).collect()
+    }
+
+    /// Looks at the episodes in `directory` again and again, until `stop` is set.
+    pub fn keep(&self, directory: &Path, stop: &AtomicBool) {
+        while !stop.load(Relaxed) {
+            self.look(directory, stop);
+            for _ in 0..LOOK.as_millis() / BEAT.as_millis() {
+                if stop.load(Relaxed) {
+                    return;
+                }
+                std::thread::sleep(BEAT);
+            }
+        }
+    }
+
+    /// Reads what is new in `directory`.
+    pub fn look(&self, directory: &Path, stop: &AtomicBool) {
+        let mut paths = find_episodes(&[directory.to_path_buf()]).unwrap_or_default();
+        // Their names begin with their numbers, which only grow.
+        paths.sort();
+        let newest = paths.split_off(paths.len().saturating_sub(EPISODES));
+        let locked = || self.0.lock().unwrap_or_else(PoisonError::into_inner);
+        locked().retain(|path, _| newest.contains(path));
+        for path in newest {
+            let Ok(meta) = path.metadata() else { continue };
+            let stamp = (meta.modified().ok(), meta.len());
+            if stop.load(Relaxed) || locked().get(&path).is_some_and(|(seen, _)| *seen == stamp) {
+                continue;
+            }
+            let pour = Episode::read(&path).ok().filter(|e| e.complete).and_then(|e| match e.kind {
+                EpisodeKind::Pour { goal_ml } => Some(Pour { goal_ml: f64::from(goal_ml), weight_g: e.weight_g? }),
+                _ => None,
+            });
+            locked().insert(path, (stamp, pour));
+        }
+    }
+}
