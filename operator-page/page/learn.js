@@ -51,12 +51,15 @@ function showPlan(result) {
   ...left.map(([name, what]) => el('p', { className: 'warn' }, `! Left out: ${name.split('/').pop()}: ${what}`)));
 }
 
+/** A remark of `trainer check`; one that only says what is enough is no warning. */
+const remark = (what, before = '') => (what.includes(': enough') ? el('p', { className: 'hint' }, before, what) : el('p', { className: 'warn' }, `! ${before}${what}`));
+
 /** What `trainer check` says of the set: what it spans, and what is doubtful. */
 function checked(check) {
   if (!check) return [];
   const s = check.spanned;
   const span = s ? [el('p', { id: 'spanned' }, `The set spans ${shown(s.weights_g[0], 0)} to ${shown(s.weights_g[1], 0)} g; the flow began at ${shown(s.onsets_deg[0], 0)}° to ${shown(s.onsets_deg[1], 0)}° and was seen up to ${shown(s.last_tilt_deg, 0)}°.`)] : [];
-  return [...span, ...(check.doubts || []).map(([name, what]) => el('p', { className: 'warn' }, `! ${name.split('/').pop()}: ${what}`))];
+  return [...span, ...(check.doubts || []).map(([name, what]) => remark(what, name === 'data set' ? '' : `${name.split('/').pop()}: `))];
 }
 
 $('make-plan').onclick = () => attempt(async () => {
@@ -100,10 +103,11 @@ function showJob(job) {
   if (job.error) { fill(place, el('p', { className: 'bad' }, `✕ ${JOBS[job.kind]} failed: ${job.error}`)); return; }
   const r = job.result || {};
   if (job.kind === 'plan') { fill(place); showPlan(r); return; }
-  if (job.kind === 'export') { fill(place, el('p', { className: 'good' }, `✓ Written on the robot's computer: ${r.directory}`)); return; }
+  if (job.kind === 'export') { fill(place, el('p', { className: 'good' }, `✓ Written on the robot's computer: ${r.directory}`),
+    ...(r.left_out ?? []).map((l) => el('p', { className: 'bad' }, `Left out: ${l.why}`))); return; }
   if (r.doubts) { askDoubts(r.doubts); fill(place, el('p', { className: 'warn' }, '! Nothing was learned yet: judge these episodes first.')); return; }
-  fill(place, el('p', { className: 'good' }, `✓ Learned from ${r.episodes} episode${r.episodes === 1 ? '' : 's'}. The new weights are offered under 4.`),
-    ...(r.remarks || []).map(what => el('p', { className: 'warn' }, `! ${what}`)),
+  fill(place, el('p', { className: 'good' }, `✓ Learned from ${many(r.episodes, 'episode')}. The new weights are offered under 4.`),
+    ...(r.remarks || []).map(what => remark(what)),
     ...(r.left_out || []).map(([name, what]) => el('p', { className: 'hint' }, `Left out: ${name.split('/').pop()}: ${what}`)));
 }
 
@@ -137,7 +141,7 @@ function compare() {
   const off = (file, goal) => { const sd = (file.expected || []).find(e => e.goal_ml === goal)?.sd_ml; return Number.isFinite(sd) ? `±${shown(sd)} ml` : 'not known'; };
   const line = (name, of) => el('tr', {}, el('th', { scope: 'row' }, name), ...columns.map(([, file]) => el('td', {}, of(file))));
   const facts = [line('Weights', file => (file.error ? `✕ ${file.error}` : file.identity.slice(0, 8))), line('Age', file => (file.error ? '' : ago(file.age_s).replace(' old', ''))),
-    line('Learned from', file => (file.error ? '' : `${file.episodes} episode${file.episodes === 1 ? '' : 's'}`)),
+    line('Learned from', file => (file.error ? '' : many(file.episodes, 'episode'))),
     line('Weighed pours with them', file => (file.error ? '' : poursWith(file.identity))),
     ...goals.map(goal => line(`Expected error, ${shown(goal, 0)} ml`, file => (file.error ? '' : off(file, goal))))];
   fill($('compare'), columns.length ? el('div', { className: 'scroll' }, el('table', {}, el('thead', {}, el('tr', {}, el('td', {}), ...columns.map(([name]) => el('th', { scope: 'col' }, name)))), el('tbody', {}, ...facts)))
@@ -160,9 +164,9 @@ function unweighed() {
   const open = table.episodes.filter(e => !e.error && e.complete && e.weight_g === null).reverse();
   const weighed = table.episodes.filter(e => !e.error && e.weight_g !== null);
   const kinds = kind => weighed.filter(e => e.run.kind === kind).length;
-  $('set-words').textContent = `The set: ${kinds('recording')} curves and ${kinds('pour')} pours are weighed${table.unread ? `; ${table.unread} files are still to be read` : ''}.`;
+  $('set-words').textContent = `Weighed so far: ${many(kinds('recording'), 'curve')} and ${many(kinds('pour'), 'pour')}${table.unread ? `; ${many(table.unread, 'file')} still to be read` : ''}.`;
   const old = plannedFrom !== null && plannedFrom !== weighed.length;
-  $('plan-old').textContent = old ? `! This was proposed from ${plannedFrom} weighed episodes; now there are ${weighed.length}: propose again.` : '';
+  $('plan-old').textContent = old ? `! This was proposed from ${many(plannedFrom, 'weighed episode')}; now there ${weighed.length === 1 ? 'is' : 'are'} ${weighed.length}: propose again.` : '';
   const rows = open.slice(0, 12).map(e => {
     const place = el('div', { className: 'proposal' });
     fill(place, el('p', {}, el('b', {}, e.file), ` ${e.started_at_utc}, ${what(e)}`), scale(e.file, e.run.goal_ml ?? NaN, grams => { if (grams === null) place.remove(); else reload(); }));

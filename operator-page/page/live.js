@@ -39,7 +39,10 @@ async function stop() {
   const said = $('stop-said').textContent;
   setTimeout(() => { if ($('stop-said').textContent === said) $('stop-said').textContent = ''; }, 8000);
 }
-$('stop').onclick = stop;
+// It stops as the button goes down, and not when it comes up again; a click that no pointer made, as a screen reader's, stops too.
+let pressed = false;
+$('stop').onpointerdown = event => { if (event.button === 0) { pressed = true; stop(); } };
+$('stop').onclick = () => { if (!pressed) stop(); pressed = false; };
 
 // The space bar stops, wherever the focus is: it never presses another button. In a field for words it is a space.
 function takesSpace(target) { return target.matches?.('input[type="text"], textarea'); }
@@ -130,5 +133,7 @@ async function begin() {
   dispatchEvent(new CustomEvent('known'));
   fetch(`http://${location.hostname}:${stopPort}/alive`, { credentials: 'include' }).catch(() => {});
   connect();
+  // A page that is loaded again may have the say still.
+  here();
 }
 addEventListener('load', begin);

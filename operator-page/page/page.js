@@ -69,6 +69,9 @@ function typed(id) {
 /** A number as people read it; zero has no sign. */
 const shown = (value, digits = 1) => (Number.isFinite(value) ? value.toFixed(digits).replace(/^-(0(\.0*)?)$/, '$1') : '–');
 
+/** So many of something, in words. */
+const many = (n, one) => `${n} ${one}${n === 1 ? '' : 's'}`;
+
 /** The time since something, in words. */
 function ago(seconds) {
   if (!Number.isFinite(seconds)) return 'of unknown age';

@@ -61,7 +61,7 @@ async function picture() {
         canvas.setAttribute('aria-label', `Camera picture. ${words}`);
       }
     } catch (error) {
-      dark(error.message);
+      dark(error instanceof TypeError ? 'the page\'s server cannot be reached' : error.message);
     }
   }
   setTimeout(picture, Math.max(5, 75 - (performance.now() - begin)));
@@ -215,7 +215,7 @@ function weightsWords(weights, none) {
   if (weights.error) return el('p', { className: 'bad' }, `✕ ${weights.error}`);
   const rows = weights.expected.map(e => el('tr', {}, el('td', { className: 'number' }, `${shown(e.goal_ml, 0)} ml`),
     el('td', { className: 'number' }, Number.isFinite(e.sd_ml) ? `±${shown(e.sd_ml)} ml` : 'not known')));
-  return el('div', {}, el('p', {}, `${weights.identity}, ${ago(weights.age_s)}, trained from ${weights.episodes} episodes (${weights.method}${weights.fused ? ', fused' : ''}).`),
+  return el('div', {}, el('p', {}, `${weights.identity}, ${ago(weights.age_s)}, trained from ${many(weights.episodes, 'episode')} (${weights.method}${weights.fused ? ', fused' : ''}).`),
     el('table', {}, el('thead', {}, el('tr', {}, el('th', { className: 'number', scope: 'col' }, 'Goal'), el('th', { className: 'number', scope: 'col' }, 'Expected error'))), el('tbody', {}, ...rows)));
 }
 

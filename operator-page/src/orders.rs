@@ -108,9 +108,11 @@ pub fn foresee(site: &Site, goal_ml: f32, fill_ml: Option<f64>) -> Foreseen {
 /// What the operator should know of weights from few episodes: their deviation cannot be taken at its word.
 fn few(weights: &Weights) -> Option<String> {
     let n = weights.origin.episodes;
-    (1..FEW_EPISODES).contains(&n).then(|| {
-        let of = if n == 1 { "one weighed episode".to_string() } else { format!("{n} weighed episodes") };
-        format!("These weights were learned from {of}: this pour may be off by far more than they say. Weigh it, and learn again.")
+    let few = (1..FEW_EPISODES).contains(&n);
+    few.then(|| {
+        format!(
+            "These weights were learned from few weighed episodes ({n}): this pour may be off by far more than they say. Weigh it, and learn again."
+        )
     })
 }
 
@@ -118,13 +120,10 @@ fn few(weights: &Weights) -> Option<String> {
 fn worse_than_expected(errors_ml: &[f64], sd_ml: f32) -> Option<String> {
     let n = errors_ml.len();
     let rms_ml = (errors_ml.iter().map(|e| e * e).sum::<f64>() / n.max(1) as f64).sqrt();
-    let pours = if n == 1 {
-        "The one weighed pour with these weights was".to_string()
-    } else {
-        format!("The {n} weighed pours with these weights were")
-    };
-    (n > 0 && rms_ml > BEYOND_SD * f64::from(sd_ml))
-        .then(|| format!("{pours} off by {rms_ml:.1} ml, more than these weights expect: learn from it under Record and learn."))
+    let worse = n > 0 && rms_ml > BEYOND_SD * f64::from(sd_ml);
+    worse.then(|| {
+        format!("The weighed pours with these weights ({n}) were off by {rms_ml:.1} ml, more than they expect: learn from them before the next one.")
+    })
 }
 
 /// Orders a pour, unless somebody has stopped since `stops`. Gives its number.
@@ -215,7 +214,7 @@ mod tests {
     #[test]
     fn the_scale_is_believed_before_the_weights() {
         assert!(worse_than_expected(&[-6.1], 1.2).unwrap().contains("6.1 ml"));
-        assert!(worse_than_expected(&[-6.0, 5.0, 0.5], 1.2).unwrap().contains("3 weighed pours"));
+        assert!(worse_than_expected(&[-6.0, 5.0, 0.5], 1.2).unwrap().contains("(3)"));
         assert_eq!(worse_than_expected(&[-2.0, 1.0], 1.2), None);
         assert_eq!(worse_than_expected(&[], 0.0), None);
     }

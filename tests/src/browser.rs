@@ -133,6 +133,30 @@ impl Browser {
         self.post("/actions", &json!({ "actions": [{ "type": "key", "id": "keyboard", "actions": actions }] }));
     }
 
+    /// Presses the pointer's button on an element, or a key, until [`Browser::let_go`].
+    pub fn hold(&self, css: &str, key: Option<&str>) {
+        let pointer = || {
+            let origin = json!({ ELEMENT: self.find(css) });
+            let to = json!({ "type": "pointerMove", "duration": 0, "origin": origin, "x": 0, "y": 0 });
+            json!({ "type": "pointer", "id": "mouse", "actions": [to, { "type": "pointerDown", "button": 0 }] })
+        };
+        let keyboard = |key| json!({ "type": "key", "id": "keyboard", "actions": [{ "type": "keyDown", "value": key }] });
+        self.post("/actions", &json!({ "actions": [key.map_or_else(pointer, keyboard)] }));
+    }
+
+    /// Lets go of all that is held.
+    pub fn let_go(&self) {
+        self.call("DELETE", &format!("/session/{}/actions", self.session), &Value::Null);
+    }
+
+    /// Role and name of everything that the browser shows to a screen reader.
+    pub fn accessible(&self) -> Vec<(String, String)> {
+        let tree = self.post("/goog/cdp/execute", &json!({ "cmd": "Accessibility.getFullAXTree", "params": {} }));
+        let text = |value: &Value| value["value"].as_str().unwrap_or_default().trim().to_string();
+        let shown = tree["nodes"].as_array().expect("a tree").iter().filter(|n| n["ignored"] != true);
+        shown.map(|n| (text(&n["role"]), text(&n["name"]))).collect()
+    }
+
     /// Sets the window's size, px.
     pub fn resize(&self, width: u32, height: u32) {
         self.post("/window/rect", &json!({ "width": width, "height": height }));

@@ -5,6 +5,7 @@
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::too_many_lines)]
 #![forbid(unsafe_code)]
 
+pub mod attack;
 pub mod browser;
 pub mod parsers;
 

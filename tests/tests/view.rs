@@ -64,7 +64,7 @@ fn the_view_shows_what_the_worker_measures() {
     let mut cell = CellUnderTest::start(|_| {});
     let mut rounds = Vec::new();
     let mut shown = Vec::new();
-    for _ in 0..3 {
+    for _ in 0..2 {
         for with_view in [false, true] {
             let view = with_view.then(|| View::open(&cell));
             std::thread::sleep(Duration::from_secs(1));

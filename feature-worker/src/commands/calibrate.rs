@@ -257,20 +257,25 @@ fn serve(args: &Args, mut config: Config, mut corner: Corner, pour: &Pour, mut g
     let stop = os::stop_at_signals().or_exit(exit::FAILED)?;
     let server = Server::open(IpAddr::from([127, 0, 0, 1]), args.port, Settings::default())?;
     let pictures = &pour.pictures;
+    // Drawing measures every picture of the pour, so it is done once for each corner, however often it is asked for.
+    let mut drawn: Option<Vec<u8>> = None;
     eprintln!("calibrate: open http://{} on this machine, click lip, top edge and left side, then Write", server.address());
     server.serve(&stop, |request| match (request.post, request.path.as_str()) {
         (false, "/") => Answer::html(include_str!("calibrate.html")),
         (false, "/calibrate.js") => Answer::bytes("text/javascript", include_str!("calibrate.js")),
         (false, "/calibrate.css") => Answer::bytes("text/css", include_str!("calibrate.css")),
         (false, "/picture.jpg") => {
-            let picture = best_picture(&config, pictures).or_else(|_| pictures.first().cloned().ok_or_else(String::new));
-            Answer::jpeg(jpeg(&picture.unwrap_or_default()))
+            let draw = || {
+                let picture = best_picture(&config, pictures).or_else(|_| pictures.first().cloned().ok_or_else(String::new));
+                jpeg(&picture.unwrap_or_default())
+            };
+            Answer::jpeg(drawn.get_or_insert_with(draw).clone())
         }
         (false, "/state.json") => Answer::json(&serde_json::json!({ "width": config.camera.width_px, "height": config.camera.height_px,
             "lip": corner.lip, "rim": corner.rim, "foot": corner.foot, "section": section::text(&config.image) })),
         (true, "/corner") => Answer::text(match try_corner(&config, &request.body, pour) {
             Ok((tried, clicked, remarks)) => {
-                (config, corner, good) = (tried, clicked, true);
+                (config, corner, good, drawn) = (tried, clicked, true, None);
                 format!("measured again: {}", remarks.join("; "))
             }
             Err(e) => e,

@@ -20,6 +20,18 @@ const NAMELESS: &str = "
     const ids = [...document.querySelectorAll('[id]')].map(e => e.id);
     return bad.concat(ids.filter((id, k) => ids.indexOf(id) !== k)).join('; ')";
 
+/// Roles of what a person uses or looks at; each needs a name.
+const NAMED: [&str; 12] =
+    ["button", "textbox", "combobox", "slider", "image", "img", "tab", "tabpanel", "link", "application", "progressbar", "region"];
+
+/// Marks what is reached by keys alone, from the page's beginning.
+const WALK: &str = "document.activeElement.blur(); scrollTo(0, 0); window.reached = new Set();
+    window.walked ||= addEventListener('focusin', e => window.reached.add(e.target)) || true;
+    return [...document.querySelectorAll('button, input, select, a[href], [tabindex]')].filter(e => e.tabIndex >= 0 && !e.disabled && e.checkVisibility()).length";
+/// What was not; empty if all is well.
+const UNREACHED: &str = "return [...document.querySelectorAll('button, input, select, a[href], [tabindex]')]
+    .filter(e => e.tabIndex >= 0 && !e.disabled && e.checkVisibility() && !window.reached.has(e)).map(e => e.outerHTML.slice(0, 80)).join('; ')";
+
 /// Pairs of text and ground that are closer than the contrast of WCAG 2.2 AA (4.5); empty if all is well.
 const FAINT: &str = "
     const paint = v => { const d = document.createElement('i'); d.style.color = `var(${v})`; document.body.append(d);
@@ -61,6 +73,22 @@ fn everybody_can_use_it() {
             }
             assert_eq!(browser.run(FITS), true, "{tab} at {width} x {height}");
             assert_eq!(browser.run(NAMELESS), "", "{tab}");
+            if width == 1280 {
+                // What the browser itself tells a screen reader.
+                let all = browser.accessible();
+                let nameless: Vec<_> = all.iter().filter(|(role, name)| NAMED.contains(&role.as_str()) && name.is_empty()).collect();
+                let stop = all.iter().any(|(role, name)| role == "button" && name.starts_with("Stop"));
+                assert!(nameless.is_empty() && stop, "{tab}: {nameless:?} of {all:?}");
+                // What scrolls is a step too.
+                let steps = browser.run(WALK).as_u64().expect("a number") as usize + 8;
+                browser.press(&vec![TAB; steps]);
+                assert_eq!(browser.run(UNREACHED), "", "{tab}: by {steps} steps");
+                // Letters of twice the size, without a larger window.
+                browser.run("document.documentElement.style.fontSize = '200%'; scrollTo(0, 0)");
+                assert_eq!(browser.run(FITS), true, "{tab} with large letters");
+                browser.screenshot(&picture(&format!("{tab}-large-letters")));
+                browser.run("document.documentElement.style.fontSize = ''");
+            }
         }
     }
 
@@ -87,15 +115,23 @@ fn everybody_can_use_it() {
     browser.press(&[" "]);
     cell.wait("the end", SOON, |s| s["phase"] == "idle" && s["outcomes"][0]["reason"] == "aborted");
 
-    // Hold to pour: it goes on while Enter is held, and ends when the page is lost.
+    // Hold to pour: it goes on while the button or Enter is held, and ends when it is let go of, or when the page is lost.
     browser.run("document.getElementById('hold').click()");
-    browser.fill("#goal", "90");
-    browser.click("#foresee");
-    browser.wait("the focus on the button that pours", SOON, "return document.activeElement.id === 'go'");
-    browser.run("document.getElementById('go').dispatchEvent(new KeyboardEvent('keydown', { key: 'Enter', bubbles: true }))");
-    says(&browser, "Pouring 90 ml");
-    std::thread::sleep(std::time::Duration::from_secs(1));
-    assert_eq!(cell.status().expect("running")["phase"], "pouring", "it is held");
-    browser.go("about:blank");
-    cell.wait("the end", SOON, |s| s["phase"] == "idle" && s["outcomes"][1]["reason"] == "aborted");
+    for (k, key) in [None, Some(ENTER)].into_iter().enumerate() {
+        says(&browser, "Ready to pour");
+        browser.fill("#goal", "90");
+        browser.click("#foresee");
+        browser.wait("the focus on the button that pours", SOON, "return document.activeElement.id === 'go'");
+        browser.hold("#go", key);
+        says(&browser, "Pouring 90 ml");
+        std::thread::sleep(std::time::Duration::from_secs(1));
+        assert_eq!(cell.status().expect("running")["phase"], "pouring", "it is held");
+        if key.is_none() {
+            browser.screenshot(&picture("held"));
+            browser.let_go();
+        } else {
+            browser.go("about:blank");
+        }
+        cell.wait("the end", SOON, |s| s["phase"] == "idle" && s["outcomes"][k + 1]["reason"] == "aborted");
+    }
 }

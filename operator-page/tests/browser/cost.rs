@@ -38,7 +38,7 @@ fn look(address: &str, stop: &AtomicBool) -> usize {
 fn three_open_pages_beside_the_loop() {
     let mut cell = CellUnderTest::start(|_| {});
     let mut rounds = Vec::new();
-    for _ in 0..3 {
+    for _ in 0..2 {
         for open in [false, true] {
             let page = open.then(|| Page::open(&cell));
             let stop = Arc::new(AtomicBool::new(false));

@@ -5,7 +5,7 @@ use std::time::Duration;
 use tests::CellUnderTest;
 use tests::browser::Browser;
 
-use super::{LIVE, Page, SOON, picture, says};
+use super::{LIVE, Page, SOON, picture, says, worker_pages};
 
 /// A training takes some seconds alone, and much longer beside others.
 const TRAINED: Duration = Duration::from_secs(240);
@@ -24,13 +24,18 @@ fn weigh(cell: &CellUnderTest, browser: &Browser) -> f64 {
     grams
 }
 
-/// Learns, and takes the offer into use.
-fn learn(browser: &Browser) {
+/// Begins to learn.
+fn begin_to_learn(browser: &Browser) {
     browser.click("#tab-learn");
     browser.wait("the button", SOON, "return !document.getElementById('start-learning').disabled");
     browser.click("#start-learning");
     browser.wait("the training", SOON, "return !!document.querySelector('#job progress')");
     browser.screenshot(&picture("learning"));
+}
+
+/// Waits for the offer, and takes it into use.
+fn take_the_offer(browser: &Browser) {
+    browser.click("#tab-learn");
     let over = "return !!document.querySelector('#compare .accept') || /failed|judge/.test(document.getElementById('job').textContent)";
     browser.wait("the offer", TRAINED, over);
     if browser.text("#job").contains("judge") {
@@ -43,8 +48,40 @@ fn learn(browser: &Browser) {
     browser.wait("the new weights", SOON, "return document.getElementById('said').textContent.includes('in use')");
 }
 
+/// Corrects what was found while the second curve was recorded, by keys and by a click, and writes it.
+fn calibrate(cell: &CellUnderTest, browser: &Browser) {
+    let image = || cell.config().display().to_string();
+    let read = || shared::config::Config::read(&cell.config()).unwrap_or_else(|e| panic!("{}: {e}", image())).image;
+    let before = read();
+    browser.click("#tab-calibrate");
+    browser.wait("what was found", Duration::from_secs(60), "return !document.getElementById('calibrate-write').hidden");
+    browser.wait("its picture", SOON, "return document.getElementById('spot-picture').naturalWidth === 640");
+    browser.screenshot(&picture("calibrated"));
+    // By keys: the lip 2 px to the left and back by 1.
+    browser.run("document.getElementById('spot').focus()");
+    browser.press(&["\u{E012}", "\u{E012}", "\u{E014}"]);
+    browser.click("#measure");
+    browser.wait(
+        "the new measurement",
+        Duration::from_secs(60),
+        "return document.getElementById('said').textContent.includes('measured again')",
+    );
+    browser.wait("the picture with it", SOON, "return found !== null");
+    browser.run("document.getElementById('write-title').scrollIntoView({ block: 'center' })");
+    browser.click("#calibrate-write");
+    browser.wait("that it is written", SOON, "return document.getElementById('said').textContent.includes('written to')");
+    browser.wait("the child's end", SOON, "return document.getElementById('calibrate-lines').textContent.includes('It is written')");
+    browser.run("scrollTo(0, 0)");
+    browser.screenshot(&picture("calibration-written"));
+    let after = read();
+    assert_ne!(after, before, "the configuration has what was found");
+    let lip = [after.x_axis_px[0], after.x_axis_px[1]];
+    assert!((lip[0] - before.x_axis_px[0]).abs() < 6.0 && (lip[1] - before.x_axis_px[1]).abs() < 6.0, "{lip:?}");
+}
+
 /// Protects an operator's first hour with a new cell, all of it in the browser: two curves as they are proposed, their weights, a training, a
-/// pour that is foreseen, confirmed, watched and weighed, a training from all three, and the way back.
+/// pour that is foreseen, confirmed, watched and weighed, a training from all three, and the way back; and a calibration that watches the second
+/// curve, is corrected and written while the first training runs. At the end the worker's own pages are attacked.
 #[test]
 fn a_new_cell_learns_to_pour_in_the_browser() {
     let Some(browser) = Browser::open(1280, 1000) else { return };
@@ -72,12 +109,25 @@ fn a_new_cell_learns_to_pour_in_the_browser() {
         let fill = words.split(' ').nth(2).expect("Fill in N ml").to_string();
         cell.json("simulator", &["operator", "fill", &fill, "--json"]);
         cell.wait_idle();
+        if curve == 1 {
+            browser.click("#tab-calibrate");
+            browser.fill("#watch-seconds", "18");
+            browser.click("#watch");
+            browser.wait(
+                "the camera is watched",
+                SOON,
+                "return document.getElementById('calibrate-lines').textContent.includes('watching the camera')",
+            );
+            browser.click("#tab-learn");
+        }
         browser.click("#plan .primary.record");
         says(&browser, "Recording a curve");
         weights.push(weigh(&cell, &browser));
     }
     assert!(weights.iter().all(|g| *g > 5.0), "something flowed: {weights:?}");
-    learn(&browser);
+    begin_to_learn(&browser);
+    calibrate(&cell, &browser);
+    take_the_offer(&browser);
     cell.wait("the weights", SOON, |s| s["weights"] != "");
 
     cell.json("simulator", &["operator", "fill", "350", "--json"]);
@@ -90,6 +140,8 @@ fn a_new_cell_learns_to_pour_in_the_browser() {
     browser.fill("#goal", "75");
     browser.click("#foresee");
     browser.wait("what is foreseen", SOON, "return document.getElementById('foreseen').textContent.includes('one standard deviation')");
+    let warned = browser.text("#foreseen");
+    assert!(warned.contains("few weighed episodes (2)"), "{warned}");
     browser.screenshot(&picture("foreseen"));
     browser.click("#go");
     says(&browser, "Pouring 75 ml");
@@ -101,10 +153,14 @@ fn a_new_cell_learns_to_pour_in_the_browser() {
     assert!(browser.text("#result-body").contains("an error of"));
 
     let before = cell.status().expect("running")["weights"].clone();
-    learn(&browser);
+    begin_to_learn(&browser);
+    take_the_offer(&browser);
     let after = cell.wait("the new weights", SOON, |s| s["weights"] != before)["weights"].clone();
     browser.wait("the way back", SOON, "return !!document.querySelector('#compare .back')");
+    browser.run("document.getElementById('compare-title').scrollIntoView()");
     browser.screenshot(&picture("choose-weights"));
+    let beside = "return [...document.querySelectorAll('#compare thead th')].map(h => h.textContent).join() + [...document.querySelectorAll('#compare tbody th')].filter(h => h.textContent.startsWith('Expected error')).length";
+    assert_eq!(browser.run(beside), "In use,From before4", "the expected errors stand beside each other");
     browser.click("#compare .back");
     cell.wait("the weights from before", SOON, |s| s["weights"] == before && s["weights"] != after);
 
@@ -127,4 +183,5 @@ fn a_new_cell_learns_to_pour_in_the_browser() {
         let written = format!("return document.getElementById('export-said').textContent.includes('exports/{format}')");
         browser.wait("the export", Duration::from_secs(60), &written);
     }
+    worker_pages::stand_attacks(&cell);
 }

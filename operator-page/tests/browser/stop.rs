@@ -3,7 +3,7 @@
 use std::io::{Read as _, Write as _};
 use std::net::{IpAddr, TcpStream};
 use std::sync::mpsc::{Receiver, channel};
-use std::time::{Duration, SystemTime, UNIX_EPOCH};
+use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 
 use shared::os::now_ns;
 use tests::browser::Browser;
@@ -60,6 +60,11 @@ fn delay(clicked_ms: f64, speeds: &Receiver<(u64, f64)>) -> Duration {
     Duration::from_nanos((slower.0 as f64 - clicked_ns) as u64)
 }
 
+/// Number of pictures that the page has drawn.
+fn frames(browser: &Browser) -> f64 {
+    browser.run("return Number(document.getElementById('camera').dataset.frames)").as_f64().expect("a number")
+}
+
 /// Protects whoever stands beside the robot: a click and the space bar stop a pour, also while 100 half-open connections and a request
 /// without end are there. How long it takes from the click until the robot moves slower is printed (`--show-output`), and not judged.
 #[test]
@@ -72,6 +77,7 @@ fn stop_stops_by_click_and_by_space_bar() {
     browser.wait("the live picture", SOON, LIVE);
     browser.run("for (const kind of ['pointerdown', 'keydown']) addEventListener(kind, e => { window.pressedAt = performance.timeOrigin + e.timeStamp; }, true)");
     let speeds = speeds(cell.address);
+    let (shown, since) = (frames(&browser), Instant::now());
     let rounds = std::env::var("DECANT_STOPS").ok().and_then(|n| n.parse().ok()).unwrap_or(4);
     let mut delays = Vec::new();
     let mut attack = Vec::new();
@@ -115,6 +121,7 @@ fn stop_stops_by_click_and_by_space_bar() {
         delays.push(took);
     }
     drop(attack);
+    println!("{:.1} pictures a second were shown", (frames(&browser) - shown) / since.elapsed().as_secs_f64());
     delays.sort();
     println!(
         "p50 {:?}, p95 {:?} of {} stops",

@@ -2,9 +2,10 @@
 
 use std::io::{Read as _, Write as _};
 use std::net::TcpListener;
-use std::time::{Duration, Instant};
+use std::time::{Duration, SystemTime, UNIX_EPOCH};
 
 use rustix::process::Signal;
+use tests::attack::attack;
 use tests::browser::Browser;
 use tests::{CellUnderTest, steady_weights};
 
@@ -41,8 +42,20 @@ fn other_site(target: &str) -> String {
     format!("http://{address}/")
 }
 
+/// Starts the simulator anew, in a room without light.
+fn darken(cell: &mut CellUnderTest) {
+    assert_eq!(cell.stop("simulator"), Some(0));
+    let text = std::fs::read_to_string(cell.config()).expect("there");
+    let mut config: toml::Table = text.parse().expect("TOML");
+    let simulator = config["simulator"].as_table_mut().expect("a table");
+    let view = simulator.entry("view").or_insert_with(|| toml::Table::new().into()).as_table_mut().expect("a table");
+    view.insert("light".into(), toml::Value::Float(0.05));
+    std::fs::write(cell.config(), config.to_string()).expect("writable");
+    cell.spawn("simulator");
+}
+
 /// Protects the robot from other people's pages, and people from a page that is old: what a second origin sends moves nothing, one page at a time
-/// has the say, and a page says within a second that it has lost its server.
+/// has the say, a picture that is too dark is doubted, and a page says within a second that it has lost its server.
 #[test]
 fn others_move_nothing_and_losses_are_said() {
     let Some(browser) = Browser::open(1280, 1000) else { return };
@@ -51,6 +64,7 @@ fn others_move_nothing_and_losses_are_said() {
     cell.json("simulator", &["operator", "fill", "300", "--json"]);
     cell.wait_idle();
     let page = Page::open(&cell);
+    attack(&page.address, page.process.id());
 
     browser.go(&other_site(&page.address));
     browser.wait("the other site's requests", SOON, "return document.title !== '' && !document.title.startsWith('http')");
@@ -85,7 +99,21 @@ fn others_move_nothing_and_losses_are_said() {
     browser.wait("the refusal", SOON, "return document.getElementById('said').textContent.includes('has the say')");
     browser.screenshot(&picture("another-has-the-say"));
     browser.click("#take");
+    // A tab that is duplicated gets a copy of the storage, but not the say; one that is loaded again keeps it.
+    browser.run("window.twin = open(location.href)");
+    browser.wait("the twin", SOON, "return !!twin.document.getElementById('cell')?.textContent.startsWith('test')");
+    browser.run("twin.document.getElementById('take').click()");
+    browser.wait("the say is the twin's", SOON, "return twin.document.getElementById('who').textContent.includes('you have')");
+    browser.wait("the say is not this page's", SOON, "return !document.getElementById('who').textContent.includes('you have')");
+    browser.run("twin.close()");
+    browser.click("#take");
     browser.wait("the say", SOON, "return document.getElementById('who').textContent.includes('you have')");
+    browser.go(&page.url());
+    browser.wait("the live picture", SOON, LIVE);
+    browser.wait("the say", SOON, "return document.getElementById('who').textContent.includes('you have')");
+    browser.fill("#goal", "60");
+    browser.click("#foresee");
+    browser.wait("what is foreseen", SOON, "return !document.getElementById('confirm').hidden");
     browser.click("#go");
     says(&browser, "Pouring 60 ml");
     says(&other, "Pouring 60 ml");
@@ -105,6 +133,9 @@ fn others_move_nothing_and_losses_are_said() {
     says(&browser, "The robot may not move");
     assert!(browser.text("#remedy").len() > 20, "{}", browser.text("#remedy"));
     browser.screenshot(&picture("robot-stopped"));
+    darken(&mut cell);
+    browser.wait("the doubt", SOON, "return document.getElementById('frame-words').textContent.includes('DOUBT: too dark')");
+    browser.screenshot(&picture("camera-dark"));
     cell.signal("simulator", Signal::STOP);
     browser.wait("no picture", SOON, "return document.getElementById('frame-words').textContent.includes('No picture')");
     says(&browser, "The robot may not move");
@@ -114,10 +145,24 @@ fn others_move_nothing_and_losses_are_said() {
     says(&browser, "The controller does not answer");
     browser.screenshot(&picture("controller-lost"));
 
-    let began = Instant::now();
-    drop(page);
-    browser.wait("the loss", Duration::from_secs(5), LOST);
-    println!("the page was grey {:?} after its server was asked to end", began.elapsed());
+    // Once the server only hangs, and once it is killed.
+    browser.run(
+        "window.lostAt = 0; new MutationObserver(() => { if (document.body.classList.contains('lost')) window.lostAt ||= Date.now(); })
+         .observe(document.body, { attributes: true })",
+    );
+    let pid = rustix::process::Pid::from_child(&page.process);
+    for (signal, what) in [(Signal::STOP, "hung"), (Signal::KILL, "was killed")] {
+        rustix::process::kill_process(pid, signal).expect("it is ours");
+        let at_ms = SystemTime::now().duration_since(UNIX_EPOCH).expect("after 1970").as_secs_f64() * 1e3;
+        browser.wait("the loss", Duration::from_secs(5), LOST);
+        let lost_ms = browser.run("return window.lostAt").as_f64().expect("a time");
+        println!("the page was grey {:.0} ms after its server {what}", lost_ms - at_ms);
+        if signal == Signal::STOP {
+            rustix::process::kill_process(pid, Signal::CONT).expect("it is ours");
+            browser.wait("the server is back", SOON, "return !document.body.classList.contains('lost')");
+            browser.run("window.lostAt = 0");
+        }
+    }
     browser.screenshot(&picture("server-lost"));
     browser.click("#stop");
     browser.wait("that Stop failed", SOON, "return document.getElementById('stop-said').textContent.includes('robot\\'s own stop')");
