@@ -87,6 +87,22 @@ impl Browser {
         self.post("/url", &json!({ "url": url }));
     }
 
+    /// The windows that are open, the oldest first.
+    pub fn windows(&self) -> Vec<String> {
+        let all = self.call("GET", &format!("/session/{}/window/handles", self.session), &Value::Null);
+        all.as_array().expect("a list").iter().filter_map(|w| w.as_str().map(String::from)).collect()
+    }
+
+    /// From now on everything happens in this window.
+    pub fn enter(&self, window: &str) {
+        self.post("/window", &json!({ "handle": window }));
+    }
+
+    /// Closes the window; another one must be entered.
+    pub fn close(&self) {
+        self.call("DELETE", &format!("/session/{}/window", self.session), &Value::Null);
+    }
+
     /// Runs a script in the page and gives what it returns; promises are waited for.
     pub fn run(&self, script: &str) -> Value {
         self.post("/execute/sync", &json!({ "script": script, "args": [] }))

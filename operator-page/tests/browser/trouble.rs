@@ -100,12 +100,18 @@ fn others_move_nothing_and_losses_are_said() {
     browser.screenshot(&picture("another-has-the-say"));
     browser.click("#take");
     // A tab that is duplicated gets a copy of the storage, but not the say; one that is loaded again keeps it.
-    browser.run("window.twin = open(location.href)");
-    browser.wait("the twin", SOON, "return !!twin.document.getElementById('cell')?.textContent.startsWith('test')");
-    browser.run("twin.document.getElementById('take').click()");
-    browser.wait("the say is the twin's", SOON, "return twin.document.getElementById('who').textContent.includes('you have')");
+    let first = browser.windows();
+    browser.run("open(location.href)");
+    let twin = browser.windows().into_iter().find(|w| !first.contains(w)).expect("a second window");
+    let holds = "return document.getElementById('who').textContent.includes('you have')";
+    browser.enter(&twin);
+    browser.wait("the live picture", SOON, LIVE);
+    assert_eq!(browser.run(holds), false, "the twin has not the say");
+    browser.click("#take");
+    browser.wait("the say is the twin's", SOON, holds);
+    browser.close();
+    browser.enter(&first[0]);
     browser.wait("the say is not this page's", SOON, "return !document.getElementById('who').textContent.includes('you have')");
-    browser.run("twin.close()");
     browser.click("#take");
     browser.wait("the say", SOON, "return document.getElementById('who').textContent.includes('you have')");
     browser.go(&page.url());
