@@ -93,12 +93,12 @@ struct Cell<'a> {
     asked: Option<Instant>,
     /// How many pours and recordings ended for which reason since this process started, and the newest one.
     ended: BTreeMap<&'static str, u64>,
-    newest: u64,
+    newest: Option<u64>,
 }
 
 impl<'a> Cell<'a> {
     fn new(config: &'a Config) -> Self {
-        Self { config, client: None, status: None, asked: None, ended: BTreeMap::new(), newest: 0 }
+        Self { config, client: None, status: None, asked: None, ended: BTreeMap::new(), newest: None }
     }
 
     /// Asks the controller, unless it was asked just now.
@@ -139,11 +139,11 @@ impl<'a> Cell<'a> {
     fn count(&mut self) {
         let Some(status) = &self.status else { return };
         let newest = status.outcomes.iter().map(|o| o.episode).max().unwrap_or(0);
-        if self.newest > 0 {
-            for outcome in status.outcomes.iter().filter(|o| o.episode > self.newest) {
+        if let Some(before) = self.newest {
+            for outcome in status.outcomes.iter().filter(|o| o.episode > before) {
                 *self.ended.entry(outcome.reason.words()).or_default() += 1;
             }
         }
-        self.newest = newest.max(self.newest).max(1);
+        self.newest = self.newest.max(Some(newest));
     }
 }

@@ -137,6 +137,128 @@ fn exports_hold_every_frame_and_overwrite_nothing() {
         let reader = parquet::file::serialized_reader::SerializedFileReader::new(file).unwrap();
         use parquet::file::reader::FileReader;
         assert_eq!(reader.metadata().file_metadata().num_rows() as u64, rows);
-        assert_eq!(reader.get_row_iter(None).unwrap().filter(Result::is_ok).count() as u64, rows);
+        let read: Vec<String> = reader.get_row_iter(None).unwrap().map(|row| row.unwrap().to_string()).collect();
+        assert_eq!(read.len() as u64, rows);
+        assert!(!read.iter().any(|row| row.contains("NaN")), "{:?}", read.iter().find(|row| row.contains("NaN")));
+        if rows == 2 * FRAMES {
+            assert!(read[20].contains("action: [50.0, 0.0], known: [false, "), "frame 20 is lost: {}", read[20]);
+            assert!(read[19].contains("known: [true, true, true]"), "{}", read[19]);
+        }
     }
+    let stats: serde_json::Value = serde_json::from_slice(&std::fs::read(to("lerobot/meta/stats.json")).unwrap()).unwrap();
+    for column in ["observation.state", "action", "known", "observation.images.camera", "timestamp", "index"] {
+        for number in ["min", "max", "mean", "std", "count", "q01", "q10", "q50", "q90", "q99"] {
+            assert!(stats[column][number].is_array(), "{column} {number}");
+        }
+    }
+    assert_eq!(stats["action"]["q50"].as_array().unwrap()[0], 55.0, "half of the rows are at 50, half at 60");
+}
+
+/// Protects people with one bad file among many: the others are exported, the bad one is named, and the exit code says it.
+#[test]
+fn a_file_that_cannot_be_read_does_not_stop_an_export() {
+    let dir = tempfile::tempdir().unwrap();
+    let recorded = dir.path().join("recorded");
+    for lambda in [50.0, 60.0] {
+        shared::episode::set_weight(&write(&recorded, lambda), 100.0).unwrap();
+    }
+    std::fs::write(recorded.join("episode-0000.mcap"), "no episode").unwrap();
+    for format in ["csv", "images", "video", "lerobot"] {
+        let to = dir.path().join(format);
+        let output = episodes(&["export", recorded.to_str().unwrap(), "--as", format, "--to", to.to_str().unwrap(), "--json"]);
+        assert_eq!(code(&output), 1, "{format}");
+        let said: serde_json::Value = serde_json::from_slice(&output.stdout).unwrap();
+        assert!(said["left_out"][0]["why"].as_str().unwrap().contains("episode-0000.mcap"), "{format}: {said}");
+        let written = said["written"].as_array().unwrap();
+        assert_eq!(written.len(), if format == "lerobot" { 1 } else { 2 }, "{format}");
+        assert!(written.iter().all(|w| Path::new(w.as_str().unwrap()).exists()));
+    }
+    let none = episodes(&["export", recorded.join("episode-0000.mcap").to_str().unwrap(), "--as", "csv", "--to", "x"]);
+    assert_eq!((code(&none), Path::new("x").exists()), (2, false), "nothing to export is a wrong input");
+}
+
+/// Protects recordings and everything that lies beside them: pruning says first, spares what is weighed, under way, the newest, or not an
+/// episode of ours, and goes no further than the budget asks.
+#[test]
+fn pruning_deletes_no_more_than_it_must() {
+    let dir = tempfile::tempdir().unwrap();
+    let files: Vec<PathBuf> = (0..6).map(|n| write(dir.path(), 50.0 + n as f32)).collect();
+    shared::episode::set_weight(&files[0], 70.0).unwrap();
+    let foreign = dir.path().join("episode-0099.mcap");
+    std::fs::write(&foreign, "mine").unwrap();
+    std::os::unix::fs::symlink(&files[1], dir.path().join("link.mcap")).unwrap();
+    let held = std::fs::File::open(&files[2]).unwrap();
+    held.try_lock().unwrap();
+    let prune = |more: &[&str]| {
+        let output = episodes(&[&["prune", dir.path().to_str().unwrap(), "--budget-mb", "0", "--json"][..], more].concat());
+        (code(&output), serde_json::from_slice::<serde_json::Value>(&output.stdout).unwrap())
+    };
+    let there = |files: &[PathBuf]| files.iter().map(|f| f.exists()).collect::<Vec<_>>();
+    let (ended, said) = prune(&["--budget-episodes", "3"]);
+    assert_eq!((ended, said["episodes"].as_array().unwrap().len(), said["deleted"].as_bool()), (0, 2, Some(false)));
+    assert_eq!(there(&files), [true; 6], "without --yes nothing is deleted");
+    let (ended, said) = prune(&["--budget-episodes", "3", "--yes"]);
+    assert_eq!((ended, said["stay"]["episodes"].as_u64()), (0, Some(3)));
+    assert_eq!(there(&files), [true, false, true, false, true, true], "the oldest that is neither weighed nor being written");
+    assert_eq!(said["kept"].as_array().unwrap().len(), 3, "a foreign file, a link, one that is being written: {said}");
+    let (ended, said) = prune(&["--budget-episodes", "1", "--yes"]);
+    assert_eq!((ended, said["stay"]["within_budget"].as_bool()), (1, Some(false)), "the weighed one is spared");
+    assert_eq!(there(&files), [true, false, true, false, false, true]);
+    let (ended, _) = prune(&["--budget-episodes", "1", "--yes", "--weighed"]);
+    assert_eq!((ended, there(&files)), (0, vec![false, false, true, false, false, true]));
+    assert!(foreign.exists() && std::fs::symlink_metadata(dir.path().join("link.mcap")).is_ok());
+
+    let delete = |file: &Path, more: &[&str]| code(&episodes(&[&["delete", file.to_str().unwrap()][..], more].concat()));
+    assert_eq!((delete(&files[5], &[]), files[5].exists()), (0, true));
+    assert_eq!((delete(&foreign, &["--yes"]), foreign.exists()), (2, true));
+    assert_eq!((delete(&files[2], &["--yes"]), files[2].exists()), (2, true), "it is being written");
+    drop(held);
+    assert_eq!((delete(&files[2], &["--yes"]), files[2].exists()), (0, false));
+}
+
+/// Protects judgements from the data that was trained on: the parts of a split share no measurement, the same seed gives the same parts, and
+/// merging them gives all episodes back, each once, under new numbers.
+#[test]
+fn parts_share_nothing_and_merge_to_the_whole() {
+    let dir = tempfile::tempdir().unwrap();
+    let recorded = dir.path().join("recorded");
+    let files: Vec<PathBuf> = (0..5).map(|n| write(&recorded, 50.0 + n as f32)).collect();
+    std::fs::copy(&files[0], recorded.join("twice.mcap")).unwrap();
+    assert_eq!(code(&episodes(&["note", files[4].to_str().unwrap(), "--text", "askew"])), 0);
+    let split = |name: &str, shares: &[&str]| {
+        let to = dir.path().join(name);
+        let output = episodes(&[&["split", recorded.to_str().unwrap(), "--to", to.to_str().unwrap(), "--json"][..], shares].concat());
+        (code(&output), String::from_utf8(output.stdout).unwrap().replace(name, ""), to)
+    };
+    let shares = ["--share", "train=0.6", "--share", "check=0.4"];
+    let (ended, said, to) = split("first", &shares);
+    assert_eq!(ended, 0, "{said}");
+    let count = |part: &str| std::fs::read_dir(to.join(part)).unwrap().count();
+    assert_eq!((count("train"), count("check")), (3, 2));
+    assert!(said.contains("the same measurement"), "{said}");
+    assert_eq!(split("other", &shares).1, said, "the same seed");
+    assert_eq!(split("third", &["--share", "a=0.9", "--share", "b=0.9"]).0, 2);
+    assert_eq!(split("third", &["--share", "../a=0.9"]).0, 2);
+    let merged = dir.path().join("merged");
+    let output =
+        episodes(&["merge", to.join("train").to_str().unwrap(), to.join("check").to_str().unwrap(), "--to", merged.to_str().unwrap()]);
+    assert_eq!(code(&output), 0);
+    let read = |dir: &Path| {
+        let files = shared::episode::find_episodes(&[dir.to_path_buf()]).unwrap();
+        let mut all: Vec<([u8; 32], String)> =
+            files.iter().map(|f| Episode::read(f).unwrap()).map(|e| (e.content_sha256(), e.info.note)).collect();
+        all.sort();
+        all.dedup();
+        all
+    };
+    assert_eq!(read(&merged), read(&recorded));
+    assert!(merged.join("episode-0005.mcap").exists() && !merged.join("episode-0006.mcap").exists());
+
+    let bytes = std::fs::read(&files[1]).unwrap();
+    let cut = dir.path().join("cut.mcap");
+    std::fs::write(&cut, &bytes[..bytes.len() - 100]).unwrap();
+    assert_eq!(code(&episodes(&["recover", cut.to_str().unwrap()])), 0);
+    assert!(Episode::read(&dir.path().join("cut-recovered.mcap")).unwrap().complete, "only the index was missing");
+    assert_eq!(code(&episodes(&["recover", files[1].to_str().unwrap()])), 2, "nothing to recover");
+    assert_eq!(code(&episodes(&["recover", cut.to_str().unwrap()])), 1, "nothing is overwritten");
 }

@@ -103,7 +103,8 @@ function showJob(job) {
   if (job.error) { fill(place, el('p', { className: 'bad' }, `✕ ${JOBS[job.kind]} failed: ${job.error}`)); return; }
   const r = job.result || {};
   if (job.kind === 'plan') { fill(place); showPlan(r); return; }
-  if (job.kind === 'export') { fill(place, el('p', { className: 'good' }, `✓ Written on the robot's computer: ${r.directory}`)); return; }
+  if (job.kind === 'export') { fill(place, el('p', { className: 'good' }, `✓ Written on the robot's computer: ${r.directory}`),
+    ...(r.left_out ?? []).map((l) => el('p', { className: 'bad' }, `Left out: ${l.why}`))); return; }
   if (r.doubts) { askDoubts(r.doubts); fill(place, el('p', { className: 'warn' }, '! Nothing was learned yet: judge these episodes first.')); return; }
   fill(place, el('p', { className: 'good' }, `✓ Learned from ${many(r.episodes, 'episode')}. The new weights are offered under 4.`),
     ...(r.remarks || []).map(what => remark(what)),

@@ -235,6 +235,13 @@ pub struct RecordingConfig {
     pub jpeg_quality: u8,
     /// Largest number of images that may wait to be written; further ones are dropped and counted.
     pub queue_frames: usize,
+    /// Megabytes (1,000,000 bytes) that episodes may take in the directory before `feature-worker episodes prune` deletes some; 0 for no
+    /// bound.
+    #[serde(default)]
+    pub budget_mb: u64,
+    /// Number of episodes that may lie there before `feature-worker episodes prune` deletes some; 0 for no bound.
+    #[serde(default)]
+    pub budget_episodes: usize,
 }
 
 impl Config {

@@ -1,23 +1,29 @@
 //! Experimental episodes `E = (L_E, w_E)` (section 3.1 of the paper): MCAP files and CSV tables, in and out.
 //!
 //! Each episode is one MCAP file that describes itself. [`mod@write`] makes it; [`read`] gives the plain [`Episode`] that the trainer works
-//! on, and the images on demand; [`weigh`] adds the weight afterwards; [`table`] reads and writes the CSV pair for people who measure V_e
-//! with software of their own. All of it is for ordinary threads only: it allocates, and it reads and writes files. A damaged file is an
-//! error of one line that names the file. A file whose recorder was killed can be read up to its last whole chunk, and is then not
-//! `complete`.
+//! on, and the images on demand; [`weigh`] adds the weight or a note afterwards; [`recover`] makes a whole file of one that was cut; [`table`]
+//! reads and writes the CSV pair for people who measure V_e with software of their own. All of it is for ordinary threads only: it allocates,
+//! and it reads and writes files. A damaged file is an error of one line that names the file. A file whose recorder was killed can be read up
+//! to its last whole chunk, and is then not `complete`.
 //!
-//! What is in the file (times are CLOCK_MONOTONIC ns, so that they match every other message of the cell):
+//! What is in the file, in format 2. Log times are Unix time, so that Foxglove and Rerun show episodes of different days one after the other.
+//! Times in the messages are CLOCK_MONOTONIC ns, so that they match every other message of the cell; `clock_offset_ns` of the metadata
+//! `episode` is the one less the other at the start. What is unknown is NaN.
 //!
 //! | topic or metadata | encoding | what |
 //! |---|---|---|
 //! | `/camera/image/compressed` | protobuf, `foxglove.CompressedImage` | `Image_i`, JPEG or PNG |
-//! | `/feature` | JSON, `decant.Feature` | what the feature worker measured in each frame, with all its times |
-//! | `/telemetry` | JSON, `decant.Telemetry` | each tick of the controller: alpha, phase, d, v, poured |
-//! | `/sample` | JSON, `decant.Sample` | one row for each frame: alpha(i) commanded and measured at the capture time, V_e, doubt |
-//! | metadata `episode` | text | kind, lambda, gamma, beta or goal, cell, hashes of configuration and weights, wall-clock start |
+//! | `/camera/annotations` | protobuf, `foxglove.ImageAnnotations` | the triangle and V_e over the image, or the doubt |
+//! | `/feature` | protobuf, `decant.Feature` | what the feature worker measured in each frame, with all its times |
+//! | `/telemetry` | protobuf, `decant.Telemetry` | each tick of the controller: alpha, phase, d, v, poured |
+//! | `/sample` | protobuf, `decant.Sample` | one row for each frame: alpha(i) commanded and measured at the capture time, V_e, doubt |
+//! | metadata `episode` | text | kind, lambda, gamma, beta or goal, cell, hashes of configuration and weights, wall-clock start, clock offset |
 //! | metadata `config` | text | the whole configuration |
 //! | metadata `end` | text | how it ended and what was dropped; missing if the recorder was killed |
 //! | metadata `weight` | text | `w_E` in g; missing until it is read from the scale |
+//! | metadata `note` | text | what a person wrote about it |
+//!
+//! Format 1, which is still read, had JSON in place of `decant.*`, no annotations, and log times that were CLOCK_MONOTONIC.
 
 use std::collections::BTreeMap;
 use std::collections::btree_map::Entry;
@@ -27,10 +33,14 @@ use sha2::{Digest, Sha256};
 use crate::gaussian_curve::Curve;
 
 mod format;
+mod format_1;
 mod number;
 pub mod read;
 mod records;
+pub mod recover;
+mod rewrite;
 mod rows;
+mod schema;
 pub mod table;
 pub mod weigh;
 mod weight;
@@ -39,9 +49,11 @@ pub mod write;
 pub use number::take_number;
 pub use read::{EpisodeImage, EpisodeImages, find_episodes};
 pub use records::EpisodeError;
+pub use recover::recover;
+pub use rewrite::ChangeError;
 pub use rows::{EpisodeRow, EpisodeTrack};
 pub use table::{TableError, read_table, write_table};
-pub use weigh::{WeighError, set_weight};
+pub use weigh::{set_note, set_weight};
 pub use weight::{WeightError, check_poured, check_reading};
 pub(crate) use write::rfc3339;
 pub use write::{EpisodeEnd, EpisodeStart, EpisodeWriter, FrameRow, WriteError};
@@ -93,6 +105,8 @@ pub struct EpisodeInfo {
     pub weights: String,
     /// How it ended, in words; empty if the recorder was killed.
     pub ended: String,
+    /// What a person wrote about it; mostly empty.
+    pub note: String,
     /// Number of the controller's ticks in the file.
     pub ticks: u64,
     /// Number of the controller's ticks that are missing between the first and the last.

@@ -7,8 +7,8 @@ use std::time::{Duration, UNIX_EPOCH};
 use proptest::prelude::*;
 use shared::config::Config;
 use shared::episode::{
-    Episode, EpisodeEnd, EpisodeError, EpisodeImages, EpisodeKind, EpisodeStart, EpisodeWriter, FrameRow, WeighError, find_episodes,
-    read_table, set_weight, write_table,
+    ChangeError, Episode, EpisodeEnd, EpisodeError, EpisodeImages, EpisodeKind, EpisodeStart, EpisodeWriter, FrameRow, find_episodes,
+    read_table, recover, set_note, set_weight, write_table,
 };
 use shared::gaussian_curve::Curve;
 use shared::messages::{Doubt, Feature, LAYOUT_VERSION, Phase, Telemetry};
@@ -176,13 +176,155 @@ fn a_wrong_weight_is_refused_and_the_file_is_as_it_was() {
     let path = write(dir.path(), true);
     let bytes = std::fs::read(&path).unwrap();
     for grams in [f64::NAN, f64::INFINITY, -0.1] {
-        assert!(matches!(set_weight(&path, grams), Err(WeighError::Weight(..))));
+        assert!(matches!(set_weight(&path, grams), Err(ChangeError::Weight(..))));
     }
     assert_eq!(std::fs::read(&path).unwrap(), bytes);
     std::fs::write(&path, &bytes[..bytes.len() / 2]).unwrap();
-    assert!(matches!(set_weight(&path, 10.0), Err(WeighError::Incomplete { .. })));
+    assert!(matches!(set_weight(&path, 10.0), Err(ChangeError::Incomplete { .. })));
     assert_eq!(std::fs::read(&path).unwrap(), bytes[..bytes.len() / 2], "what could still be read is still there");
     assert_eq!(std::fs::read_dir(dir.path()).unwrap().count(), 1, "no temporary file is left");
+}
+
+/// Protects what people wrote: a note is kept beside everything else, replaced, and taken away; one that is too long is refused.
+#[test]
+fn a_note_is_added_afterwards_and_nothing_else_changes() {
+    let dir = tempfile::tempdir().unwrap();
+    let path = write(dir.path(), true);
+    set_weight(&path, 50.0).unwrap();
+    let before = Episode::read(&path).unwrap();
+    assert_eq!(set_note(&path, "the cup stood askew").unwrap(), "");
+    assert_eq!(Episode::read(&path).unwrap().info.note, "the cup stood askew");
+    assert!(matches!(set_note(&path, &"x".repeat(5000)), Err(ChangeError::Note(..))));
+    assert_eq!(set_note(&path, "").unwrap(), "the cup stood askew");
+    assert_eq!(format!("{:?}", Episode::read(&path).unwrap()), format!("{before:?}"));
+}
+
+/// Protects viewers: log times are Unix time and never go back, although frames are written after later ticks, and image and row have one time.
+#[test]
+fn log_times_are_unix_time_and_in_order() {
+    let dir = tempfile::tempdir().unwrap();
+    let bytes = std::fs::read(write(dir.path(), true)).unwrap();
+    let (mut last, mut messages, mut annotations) = (0, 0, 0);
+    for message in mcap::MessageStream::new(&bytes).unwrap() {
+        let message = message.unwrap();
+        assert!(message.log_time >= last, "{}: {} after {last}", message.channel.topic, message.log_time);
+        last = message.log_time;
+        messages += 1;
+        annotations += u32::from(message.channel.topic == "/camera/annotations");
+        let schema = message.channel.schema.as_ref().unwrap();
+        assert_eq!((message.channel.message_encoding.as_str(), schema.encoding.as_str()), ("protobuf", "protobuf"));
+        let since_start_ns = message.log_time as i64 - 1_795_311_559_000_000_000;
+        assert!((-100_000_000..3_000_000_000).contains(&since_start_ns), "{since_start_ns}");
+    }
+    assert_eq!((messages, annotations), (58 * 4 - 1 + 58, 58));
+}
+
+/// Protects recordings of earlier versions: a file of format 1 (JSON, CLOCK_MONOTONIC log times) reads as when it was written, can be weighed
+/// again, and is recovered when cut.
+#[test]
+fn a_file_of_format_1_is_still_read() {
+    let old = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/data/format-1.mcap");
+    let episode = Episode::read(&old).unwrap();
+    let hash: String = episode.content_sha256().iter().map(|b| format!("{b:02x}")).collect();
+    assert_eq!(hash, "049c02f6499d0c8cd72bb5339fe163edd5c7c07e5999c4a66122340e0669c676", "as the program of that time said");
+    assert_eq!((episode.weight_g, episode.complete, episode.kind), (Some(42.5), true, EpisodeKind::Recording(CURVE)));
+    assert_eq!((episode.rows.len(), episode.info.lost_frames, episode.info.images, episode.info.ticks), (30, 2, 27, 30));
+    let images: Vec<_> = EpisodeImages::open(&old).unwrap().map(Result::unwrap).collect();
+    assert_eq!((images[0].captured_at_ns, images[0].sequence), (episode.rows[0].captured_at_ns, 100));
+    let dir = tempfile::tempdir().unwrap();
+    let copy = dir.path().join("copy.mcap");
+    std::fs::copy(&old, &copy).unwrap();
+    assert_eq!(set_weight(&copy, 40.0).unwrap(), Some(42.5));
+    let bytes = std::fs::read(&old).unwrap();
+    std::fs::write(&copy, &bytes[..bytes.len() - 700]).unwrap();
+    let recovered = recover(&copy, &dir.path().join("new.mcap")).unwrap();
+    assert_eq!(recovered.rows.len(), 30);
+}
+
+/// Protects recordings from killed recorders: cut at any byte, a file is made whole as far as its chunks go, or is refused in one line; the old
+/// one stays; what is recovered passes as complete only if nothing of it is missing.
+#[test]
+fn a_file_cut_anywhere_is_recovered() {
+    let dir = tempfile::tempdir().unwrap();
+    let path = write(dir.path(), true);
+    let original = Episode::read(&path).unwrap();
+    let bytes = std::fs::read(&path).unwrap();
+    let (cut, new) = (dir.path().join("cut.mcap"), dir.path().join("new.mcap"));
+    let (mut recovered, mut complete, mut refused) = (0, 0, 0);
+    let places = (0..bytes.len()).step_by(251).chain((bytes.len() - 300..bytes.len()).step_by(3));
+    for place in places {
+        std::fs::write(&cut, &bytes[..place]).unwrap();
+        match recover(&cut, &new) {
+            Ok(episode) => {
+                recovered += 1;
+                let whole = std::fs::read(&new).unwrap();
+                assert!(mcap::Summary::read(&whole).unwrap().is_some(), "{place}: it has an index");
+                assert!(mcap::MessageStream::new(&whole).unwrap().all(|m| m.is_ok()));
+                let back = Episode::read(&new).unwrap();
+                assert_eq!(format!("{:?}", back.rows), format!("{:?}", episode.rows));
+                assert_eq!(
+                    format!("{:?}", back.rows),
+                    format!("{:?}", &original.rows[..back.rows.len()]),
+                    "the first frames of the original"
+                );
+                assert!(!back.complete || back.rows.len() == original.rows.len(), "{place}");
+                assert!(back.complete || back.info.ended.contains("recovered"), "{place}");
+                complete += usize::from(back.complete);
+                assert!(matches!(recover(&new, &dir.path().join("again.mcap")), Err(ChangeError::Whole { .. })));
+                std::fs::remove_file(&new).unwrap();
+            }
+            Err(e) => {
+                refused += 1;
+                assert!(!e.to_string().contains('\n') && !new.exists(), "{place}: {e}");
+                assert!(place < 20_000, "{place}: {e}");
+            }
+        }
+        assert_eq!(std::fs::read(&cut).unwrap().len(), place);
+    }
+    assert!(recovered > 150 && complete > 90 && refused > 10, "{recovered} {complete} {refused}");
+    std::fs::write(&cut, &bytes[..bytes.len() - 9]).unwrap();
+    std::fs::write(&new, "mine").unwrap();
+    assert!(matches!(recover(&cut, &new), Err(ChangeError::Write { .. })));
+    assert_eq!(std::fs::read(&new).unwrap(), b"mine", "nothing is overwritten");
+    let mut names: Vec<_> = std::fs::read_dir(dir.path()).unwrap().map(|e| e.unwrap().file_name().into_string().unwrap()).collect();
+    names.sort();
+    assert_eq!(names, ["cut.mcap", "episode-0003.mcap", "new.mcap"], "no temporary file is left");
+}
+
+/// Protects the memory: a few kilobytes that claim to be gigabytes, by compression or by a length, are refused before they are unpacked.
+#[test]
+fn a_small_file_cannot_fill_the_memory() {
+    let dir = tempfile::tempdir().unwrap();
+    let file = dir.path().join("bomb.mcap");
+    let options = mcap::WriteOptions::new().compression(Some(mcap::Compression::Zstd)).chunk_size(None).emit_message_indexes(false);
+    let mut writer = options.create(std::io::BufWriter::new(std::fs::File::create(&file).unwrap())).unwrap();
+    let channel = writer.add_channel(0, "/sample", "json", &Default::default()).unwrap();
+    let row =
+        r#"{"sequence":1,"captured_at_ns":1,"alpha_commanded_deg":0,"alpha_measured_deg":0,"area_px2":0,"doubt":"none","image":false}"#;
+    for _ in 0..20 {
+        for sequence in 0..30_000 {
+            let header = mcap::records::MessageHeader { channel_id: channel, sequence, log_time: 1, publish_time: 1 };
+            writer.write_to_known_channel(&header, row.as_bytes()).unwrap();
+        }
+        writer.flush().unwrap();
+    }
+    writer.finish().unwrap();
+    drop(writer);
+    let bytes = std::fs::metadata(&file).unwrap().len();
+    let said = Episode::read(&file).unwrap_err().to_string();
+    assert!(bytes < 1_500_000 && said.contains("times larger than the file"), "{bytes}: {said}");
+}
+
+/// Protects episodes under way: a file is locked while it is written, and free afterwards.
+#[test]
+fn a_file_is_locked_while_it_is_written() {
+    let dir = tempfile::tempdir().unwrap();
+    let config = config();
+    let writer = EpisodeWriter::create(dir.path(), &start(&config)).unwrap();
+    let path = writer.path().to_path_buf();
+    assert!(std::fs::File::open(&path).unwrap().try_lock().is_err());
+    writer.finish(&EpisodeEnd { complete: true, reason: "over", disordered_frames: 0 }).unwrap();
+    assert!(std::fs::File::open(&path).unwrap().try_lock().is_ok());
 }
 
 /// Protects training from the same measurement counted twice, be it under another name or with another weight.

@@ -9,6 +9,7 @@ use feature_worker::vision::{Extractor, Image};
 use rustix::time::{ClockId, clock_gettime};
 use shared::config::Config;
 use shared::messages::{Doubt, PixelFormat};
+use simulator::camera::faults::{CameraFault, FaultKind, FaultyCamera};
 use simulator::camera::{Renderer, Scene, View};
 
 /// How deep the eye is.
@@ -24,9 +25,31 @@ pub enum Depth {
 /// Processor time that was spent in drawing and in measuring, ns.
 static SPENT_NS: [AtomicU64; 2] = [AtomicU64::new(0), AtomicU64::new(0)];
 
+/// What tables call a fault of the pictures.
+pub fn picture_name(kind: FaultKind) -> &'static str {
+    match kind {
+        FaultKind::Banding => "picture-banding",
+        FaultKind::WhiteBalance => "picture-white-balance",
+        FaultKind::ExposureHunting => "picture-exposure-hunting",
+        FaultKind::ExposureStep => "picture-exposure-step",
+        FaultKind::GreyBelow => "picture-grey-below",
+        FaultKind::GreenBelow => "picture-green-below",
+        FaultKind::ShiftedBelow => "picture-shifted-below",
+        FaultKind::Torn => "picture-torn",
+        FaultKind::Repeated => "picture-repeated",
+        FaultKind::Highlight => "picture-highlight",
+        FaultKind::WarmLight => "picture-warm-light",
+        FaultKind::SwappedColours => "picture-swapped-colours",
+        FaultKind::Grey => "picture-grey",
+        FaultKind::LimitedRange => "picture-limited-range",
+    }
+}
+
 /// A camera and its worker's extraction.
 pub struct Camera {
     renderer: Renderer,
+    /// What is wrong with its pictures, and the number of the next one.
+    faulty: Option<(FaultyCamera, u64)>,
     extractor: Extractor,
     size_px: [u32; 2],
     /// The newest picture.
@@ -35,16 +58,18 @@ pub struct Camera {
 }
 
 impl Camera {
-    /// The camera of config/sim.toml before the usual view.
+    /// The camera of config/sim.toml before the usual view, with a fault of its pictures or without one.
     ///
     /// # Errors
     /// One line, when the view cannot be drawn or the region cannot be measured in.
-    pub fn new(config: &Config, seed: u64) -> Result<Self, String> {
+    pub fn new(config: &Config, seed: u64, fault: Option<CameraFault>) -> Result<Self, String> {
         let view = View::default();
         let renderer = Renderer::new(&view, seed).map_err(|e| e.to_string())?;
         let extractor = Extractor::new(&config.camera, &config.image).map_err(|e| e.to_string())?;
         let pixels = vec![0; view.width_px as usize * view.height_px as usize * PixelFormat::Bgr8.bytes_per_pixel()];
-        Ok(Self { renderer, extractor, size_px: [view.width_px, view.height_px], pixels, is_drawn: false })
+        let size_px = [view.width_px, view.height_px];
+        let faulty = fault.map(|fault| (FaultyCamera::new(fault, size_px.map(|px| px as usize), view.lip_px), 0));
+        Ok(Self { renderer, faulty, extractor, size_px, pixels, is_drawn: false })
     }
 
     /// Draws `scene`, unless the picture stands still, and measures the picture: area, px^2, confidence and doubt. `None` if that cannot be done.
@@ -52,6 +77,10 @@ impl Camera {
         let before_ns = processor_ns();
         if !(stands_still && self.is_drawn) {
             self.renderer.render(scene, &mut self.pixels).ok()?;
+            if let Some((camera, number)) = &mut self.faulty {
+                camera.pass(*number, &mut self.pixels);
+                *number += 1;
+            }
             self.is_drawn = true;
         }
         let drawn_ns = processor_ns();

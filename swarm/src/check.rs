@@ -188,6 +188,11 @@ impl Checks {
         (self.target, self.phase, self.sequence, self.used, self.features_before) = (None, Phase::NoRobot, (0, 0), 0, 0);
     }
 
+    /// The newest target, degrees, and the rate at which it came, degrees/s; `None` if there is none.
+    pub fn target(&self) -> Option<(f64, f64)> {
+        self.target
+    }
+
     /// The limits on alpha.
     pub fn limits(&self) -> Limits {
         self.settings.limits
@@ -343,7 +348,9 @@ impl Checks {
         let since_s = at_s - f64::from(outcome.seconds) - 6.0;
         let reason = outcome.reason;
         let ordinary = is_ordinary(reason);
-        let counts = |f: &Injected| f.at_s >= since_s - if lasts(&f.what) { LASTS_S } else { 0.0 };
+        let counts = |f: &Injected| {
+            matches!(f.what, What::Eye(EyeFault::Picture(_))) || f.at_s >= since_s - if lasts(&f.what) { LASTS_S } else { 0.0 }
+        };
         let named = self.faults.iter().any(|f| counts(f) && reasons(&f.what).contains(&reason));
         if !ordinary && !named {
             let faults: Vec<_> = self.faults.iter().filter(|f| f.at_s >= since_s).map(|f| f.what.name()).collect();

@@ -97,7 +97,11 @@ impl Commanded {
             }
         }
         let alpha_deg = q[joint].to_degrees();
-        if alpha_deg > f64::from(alpha_max_deg) + SLACK_DEG || alpha_deg < f64::from(alpha_min_deg) - BELOW_DEG {
+        // A joint that somebody has moved beyond the range comes back from there.
+        let range = f64::from(alpha_min_deg) - BELOW_DEG..=f64::from(alpha_max_deg) + SLACK_DEG;
+        let beyond_deg = |deg: f64| (deg - range.end()).max(range.start() - deg).max(0.0);
+        let was_beyond_deg = beyond_deg(told_q[joint].to_degrees()).max(beyond_deg(servo_q[joint].to_degrees()));
+        if beyond_deg(alpha_deg) > was_beyond_deg {
             findings.push(("robot-range", format!("servoj is given {alpha_deg:.3} degrees")));
         }
         // For each call that this may follow: the rate that it then has, and how much harder than allowed it accelerates.
@@ -152,7 +156,8 @@ impl Commanded {
                 .then(|| ("no-resume", format!("tilted to {alpha_deg:.1} degrees after the pour, whose targets ended at {most_deg:.1}")));
         };
         self.least_deg = Some(least_deg.min(alpha_deg));
-        let again = rising && alpha_deg > least_deg + AGAIN_DEG;
+        // A joint that was moved below 0 rises on its way upright.
+        let again = rising && alpha_deg > least_deg.max(0.0) + AGAIN_DEG;
         again.then(|| ("no-resume", format!("tilted from {least_deg:.1} to {alpha_deg:.1} degrees while nothing is poured")))
     }
 }
@@ -181,6 +186,7 @@ mod tests {
         let fast: Vec<f64> = (0..30).map(|k| 10.0 + 0.045 * f64::from(k * (k + 1))).collect();
         assert!(findings(&fast, (80.0, 0.0), true).contains(&"robot-rate"));
         assert!(findings(&[110.0, 110.05], (40.0, 0.0), true).contains(&"robot-range"));
+        assert!(findings(&[-2.45, -2.55], (0.0, 0.0), true).contains(&"robot-range"));
     }
 
     /// Protects the check from false alarms where a program begins anew: a call may go on from the servo, at the servo's rate, and the next one
@@ -212,6 +218,15 @@ mod tests {
         assert!(again(30.0, &ramp(20.0, 40.0)), "beyond them");
         assert!(again(30.0, &[ramp(20.0, 25.0), ramp(25.0, 10.0), ramp(10.0, 18.0)].concat()), "again");
         assert!(!again(30.0, &[ramp(20.0, 25.0), ramp(25.0, 0.0)].concat()), "and upright");
+    }
+
+    /// Protects the check from false alarms where a person has moved the joint beyond its range: it comes back from there, and goes no farther.
+    #[test]
+    fn a_joint_that_was_moved_beyond_the_range_comes_back() {
+        let back: Vec<f64> = (0..40).map(|k| -22.6 + 0.02 * f64::from(k * (k + 1))).take_while(|deg| *deg < -8.0).collect();
+        assert_eq!(findings(&back, (-22.6, 0.0), false), Vec::<&str>::new());
+        let on: Vec<f64> = [-22.6, -22.62, -22.66].to_vec();
+        assert!(findings(&on, (-22.6, 0.0), false).contains(&"robot-range"));
     }
 
     /// Protects the other joints: they stay as told, or where the servo is; every other angle is a motion.

@@ -6,6 +6,7 @@ use serde::Serialize;
 use shared::control::EndReason;
 use shared::messages::Phase;
 
+use crate::bound::{Moment, most_ml};
 use crate::faults::Kind;
 
 /// A container nearer to 0 than this is upright, degrees (`robot.start_tolerance_deg` of config/sim.toml).
@@ -20,6 +21,8 @@ pub struct Cost {
     pub in_pour: bool,
     /// What left from the moment in which it could first be noticed until the container was upright, ml.
     pub excess_ml: f64,
+    /// The most that may leave then ([`crate::bound`]), ml; `None` where only the vessel's content bounds it.
+    pub bound_ml: Option<f64>,
     /// What left from the fault itself until then, ml.
     pub since_ml: f64,
     /// Time from the fault until the container was upright, s.
@@ -53,8 +56,8 @@ struct OpenFault {
     kind: Kind,
     at_s: f64,
     at_ml: f64,
-    /// What had left when it could first be noticed, ml.
-    noticed_ml: Option<f64>,
+    /// What had left when it could first be noticed, ml, and the most that may leave from then on, if it is a fault that bounds it.
+    noticed: Option<(f64, Option<f64>)>,
     /// The container was on its way upright already.
     is_on_way: bool,
     /// It was a pour, and no recording.
@@ -63,12 +66,16 @@ struct OpenFault {
 
 impl OpenFault {
     fn excess_ml(&self, poured_ml: f64) -> f64 {
-        poured_ml - self.noticed_ml.unwrap_or(poured_ml)
+        poured_ml - self.noticed.map_or(poured_ml, |(noticed_ml, _)| noticed_ml)
     }
 
-    /// Whether no more has left than may. How high a recording tilts, and so what leaves on its way back, is what its operator chose.
+    fn bound_ml(&self) -> Option<f64> {
+        self.noticed.and_then(|(_, bound_ml)| bound_ml)
+    }
+
+    /// Whether no more has left than may.
     fn is_within(&self, poured_ml: f64) -> bool {
-        self.kind.bound_ml.filter(|_| self.in_pour).is_none_or(|bound_ml| self.excess_ml(poured_ml) <= bound_ml)
+        self.bound_ml().is_none_or(|bound_ml| self.excess_ml(poured_ml) <= bound_ml)
     }
 }
 
@@ -85,9 +92,11 @@ pub struct Costs {
 impl Costs {
     /// A fault begins in this phase, when so much had left. The newest run is a pour, or a recording.
     pub fn begins(&mut self, kind: Kind, phase: Phase, in_pour: bool, (at_s, at_ml): (f64, f64)) {
-        let is_on_way = matches!(phase, Phase::Settling | Phase::Returning);
-        if is_on_way || matches!(phase, Phase::Pouring | Phase::Recording) {
-            self.open.push(OpenFault { kind, at_s, at_ml, noticed_ml: None, is_on_way, in_pour });
+        let is_active = matches!(phase, Phase::Pouring | Phase::Recording);
+        // A robot that is lost is still on its way, as long as the container has not come upright after a fault.
+        let is_on_way = matches!(phase, Phase::Settling | Phase::Returning) || (!is_active && !self.open.is_empty());
+        if is_on_way || is_active {
+            self.open.push(OpenFault { kind, at_s, at_ml, noticed: None, is_on_way, in_pour });
         }
     }
 
@@ -98,10 +107,11 @@ impl Costs {
 
     /// Takes note of what had left when a fault could first be noticed, and, when the container is upright again, of what it cost. Gives what
     /// is wrong if more has left than may.
-    pub fn settle(&mut self, phase: Phase, alpha_deg: f64, poured_ml: f64, at_s: f64) -> Option<String> {
+    pub fn settle(&mut self, phase: Phase, now: &Moment<'_>) -> Option<String> {
+        let (at_s, alpha_deg, poured_ml) = (now.at_s, now.alpha_deg, now.container.poured_ml());
         for open in &mut self.open {
-            if open.noticed_ml.is_none() && at_s >= open.at_s + f64::from(open.kind.noticed_ms) / 1000.0 {
-                open.noticed_ml = Some(poured_ml);
+            if open.noticed.is_none() && at_s >= open.at_s + f64::from(open.kind.noticed_ms) / 1000.0 {
+                open.noticed = Some((poured_ml, open.kind.is_bounded.then(|| most_ml(now))));
             }
         }
         let active = matches!(phase, Phase::Pouring | Phase::Recording);
@@ -116,13 +126,17 @@ impl Costs {
         }
         // The pour went on after faults that need not end it. So one of them at least must explain what left after it.
         let wrong = (!self.open.is_empty() && !self.open.iter().any(|open| open.is_within(poured_ml))).then(|| {
-            let left: Vec<_> =
-                self.open.iter().map(|open| format!("{:.1} ml after {}", open.excess_ml(poured_ml), open.kind.name)).collect();
+            let tell = |open: &OpenFault| {
+                let bound_ml = open.bound_ml().unwrap_or_default();
+                format!("{:.1} ml after {}, where {bound_ml:.1} may", open.excess_ml(poured_ml), open.kind.name)
+            };
+            let left: Vec<_> = self.open.iter().map(tell).collect();
             format!("more left after a fault could be noticed than may: {}", left.join(", "))
         });
         for open in std::mem::take(&mut self.open).into_iter().filter(|open| !open.is_on_way) {
-            let (excess_ml, since_ml) = (open.excess_ml(poured_ml), poured_ml - open.at_ml);
-            self.known.push(Cost { fault: open.kind.name, in_pour: open.in_pour, excess_ml, since_ml, upright_s: at_s - open.at_s });
+            let (excess_ml, bound_ml) = (open.excess_ml(poured_ml), open.bound_ml());
+            let (since_ml, upright_s) = (poured_ml - open.at_ml, at_s - open.at_s);
+            self.known.push(Cost { fault: open.kind.name, in_pour: open.in_pour, excess_ml, bound_ml, since_ml, upright_s });
         }
         wrong
     }

@@ -112,6 +112,8 @@ impl Eye {
             }
             EyeFault::Hung(ms) => self.gone_until_ns = until_ns(ms),
             EyeFault::Two(ms) => self.two_until_ns = until_ns(ms),
+            // The camera has it from its beginning.
+            EyeFault::Picture(_) => {}
         }
     }
 

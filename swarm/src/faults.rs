@@ -21,21 +21,20 @@ pub struct Kind {
     /// After this time it could first be noticed, ms: the bounds of ARCHITECTURE.md's table of deadlines, and for what is told by the robot
     /// or the operator one packet and one tick.
     pub noticed_ms: u32,
-    /// The most that may leave from then on until the container is upright, in a pour that ends because of it, ml; `None` where only the
-    /// vessel's content bounds it: the robot stands tilted or returns slower than it can, or the pour need not end and goes on to its goal.
-    /// The value is above the largest that was seen (docs/SWARM.md): a recording at its largest flow gives some 80 ml on the way upright.
-    pub bound_ml: Option<f64>,
+    /// Whether what may leave from then on is bounded ([`crate::bound`]), if a pour or recording ends because of it. It is not where the robot
+    /// stands tilted or returns slower than it can, or where the pour need not end and goes on to its goal.
+    pub is_bounded: bool,
     draw: fn(&mut Pcg64Mcg) -> Happens,
 }
 
-/// A kind whose bound is `bound_ml`.
-const fn bounded(name: &'static str, noticed_ms: u32, bound_ml: f64, draw: fn(&mut Pcg64Mcg) -> Happens) -> Kind {
-    Kind { name, noticed_ms, bound_ml: Some(bound_ml), draw }
+/// A kind after which no more leaves than a prompt way upright gives.
+const fn bounded(name: &'static str, noticed_ms: u32, draw: fn(&mut Pcg64Mcg) -> Happens) -> Kind {
+    Kind { name, noticed_ms, is_bounded: true, draw }
 }
 
 /// A kind that only the vessel's content bounds.
 const fn unbounded(name: &'static str, noticed_ms: u32, draw: fn(&mut Pcg64Mcg) -> Happens) -> Kind {
-    Kind { name, noticed_ms, bound_ml: None, draw }
+    Kind { name, noticed_ms, is_bounded: false, draw }
 }
 
 /// All kinds, by the names of the tables and of `--only`.
@@ -59,23 +58,21 @@ pub const KINDS: [Kind; 49] = [
         vec![(0, What::Robot(Fault::ProgramPause)), (800, What::Robot(jog)), resume]
     }),
     unbounded("boot", 50, |r| pair(Fault::Boot, later(r), Fault::BrakeRelease)),
-    bounded("fin", 50, 100.0, |_| robot(Fault::Fin)),
-    bounded("link-cut", 50, 100.0, |_| vec![(0, What::LinkCut)]),
-    bounded("offline", 50, 100.0, |r| {
-        robot(Fault::Offline(if r.random_bool(0.05) { r.random_range(10.0..40.0) } else { 4.0 * seconds(r) }))
-    }),
-    bounded("stall", 150, 100.0, |r| robot(Fault::Stall(seconds(r)))),
-    bounded("freeze", 150, 100.0, |r| robot(Fault::Freeze(seconds(r)))),
-    bounded("slow-reader", 150, 100.0, |r| robot(Fault::SlowReader(seconds(r)))),
+    bounded("fin", 50, |_| robot(Fault::Fin)),
+    bounded("link-cut", 50, |_| vec![(0, What::LinkCut)]),
+    bounded("offline", 50, |r| robot(Fault::Offline(if r.random_bool(0.05) { r.random_range(10.0..40.0) } else { 4.0 * seconds(r) }))),
+    bounded("stall", 150, |r| robot(Fault::Stall(seconds(r)))),
+    bounded("freeze", 150, |r| robot(Fault::Freeze(seconds(r)))),
+    bounded("slow-reader", 150, |r| robot(Fault::SlowReader(seconds(r)))),
     unbounded("skip-outputs", 150, |r| robot(Fault::SkipOutputs(r.random_range(1..60)))),
     unbounded("coalesce", 150, |r| robot(Fault::Coalesce(seconds(r)))),
     unbounded("split", 150, |r| robot(Fault::Split(seconds(r)))),
     unbounded("late-start", 0, |r| pair(Fault::LateStart(seconds(r)), 9_000, Fault::Clear)),
     unbounded("in-use", 0, |r| pair(Fault::InUse("input_int_register_24".into()), later(r), Fault::Clear)),
-    bounded("link-stall", 150, 100.0, |r| vec![(0, What::LinkStall(r.random_range(20..1_500)))]),
+    bounded("link-stall", 150, |r| vec![(0, What::LinkStall(r.random_range(20..1_500)))]),
     unbounded("link-split", 150, |r| vec![(0, What::LinkSplit(r.random_range(20..3_000)))]),
-    bounded("eye-loss", 250, 100.0, |r| eye(EyeFault::Loss(frames(r)))),
-    bounded("eye-freeze", 250, 100.0, |r| eye(EyeFault::Freeze(frames(r)))),
+    bounded("eye-loss", 250, |r| eye(EyeFault::Loss(frames(r)))),
+    bounded("eye-freeze", 250, |r| eye(EyeFault::Freeze(frames(r)))),
     unbounded("eye-duplicate", 250, |r| eye(EyeFault::Duplicate(frames(r)))),
     unbounded("eye-reorder", 250, |_| eye(EyeFault::Reorder)),
     unbounded("eye-late", 250, |r| eye(EyeFault::Late(r.random_range(10..300)))),
@@ -83,13 +80,13 @@ pub const KINDS: [Kind; 49] = [
     unbounded("eye-false-zero", 400, |r| eye(EyeFault::FalseZero(frames(r)))),
     unbounded("eye-spike", 250, |r| eye(EyeFault::Spike(r.random_range(200.0..20_000.0)))),
     unbounded("eye-stuck", 400, |r| eye(EyeFault::Stuck(frames(r)))),
-    bounded("worker-killed", 250, 100.0, |r| eye(EyeFault::Killed(r.random_range(100..4_000)))),
-    bounded("worker-hung", 250, 100.0, |r| eye(EyeFault::Hung(r.random_range(50..3_000)))),
-    bounded("second-worker", 50, 100.0, |r| eye(EyeFault::Two(r.random_range(100..3_000)))),
-    bounded("overrun", 150, 100.0, |r| vec![(0, What::Overrun(r.random_range(20..400)))]),
-    bounded("suspended", 150, 100.0, |r| vec![(0, What::Suspended(r.random_range(50..5_000)))]),
-    bounded("controller-killed", 150, 100.0, |r| vec![(0, What::ControllerKilled(r.random_range(100..4_000)))]),
-    bounded("abort", 50, 100.0, |_| vec![(0, What::Abort)]),
+    bounded("worker-killed", 250, |r| eye(EyeFault::Killed(r.random_range(100..4_000)))),
+    bounded("worker-hung", 250, |r| eye(EyeFault::Hung(r.random_range(50..3_000)))),
+    bounded("second-worker", 50, |r| eye(EyeFault::Two(r.random_range(100..3_000)))),
+    bounded("overrun", 150, |r| vec![(0, What::Overrun(r.random_range(20..400)))]),
+    bounded("suspended", 150, |r| vec![(0, What::Suspended(r.random_range(50..5_000)))]),
+    bounded("controller-killed", 150, |r| vec![(0, What::ControllerKilled(r.random_range(100..4_000)))]),
+    bounded("abort", 50, |_| vec![(0, What::Abort)]),
     unbounded("second-order", 0, |r| vec![(0, if r.random_bool(0.5) { What::Pour(60.0) } else { What::Record(70.0, 1.0) })]),
     unbounded("resume-asked", 0, |_| vec![(0, What::Resume)]),
     unbounded("bad-weights", 0, |_| vec![(0, What::BadWeights)]),

@@ -1,6 +1,7 @@
 //! The whole cell in virtual time, in one thread, from a seed: the controller's own code, the robot's own program, and everything that goes
 //! wrong. docs/SWARM.md says what it shows and what it does not.
 
+pub mod bound;
 pub mod camera;
 pub mod check;
 pub mod commanded;

@@ -6,6 +6,7 @@
 use rand::{RngExt, SeedableRng};
 use rand_distr::{Distribution, StandardNormal};
 use rand_pcg::Pcg64Mcg;
+use simulator::camera::faults::{CameraFault, FaultKind};
 use simulator::ur::Series;
 use simulator::ur::servo::LAG_S;
 
@@ -24,6 +25,9 @@ const OTHER_LAGS: f64 = 0.3;
 /// From and to which time constant it then lags, s. With servoj's lookahead of 50 ms, and the program's own smoothing, a joint is then late by one
 /// to six frames.
 const LAGS_S: (f64, f64) = (0.002, 0.12);
+
+/// Share of the seeds before a drawn camera whose pictures have a fault.
+const FAULTY_PICTURES: f64 = 0.5;
 
 /// From what seeds draw.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -72,6 +76,8 @@ pub struct Plan {
     pub lag_s: f64,
     /// How deep the eye is.
     pub depth: Depth,
+    /// What is wrong with the camera's pictures, if one is drawn and something is wrong.
+    pub picture: Option<CameraFault>,
     /// What happens, in order.
     pub items: Vec<Item>,
     /// The kind of each fault, as an index into [`KINDS`].
@@ -103,6 +109,7 @@ impl Plan {
             delay_ns,
             lag_s: lag_s(seed),
             depth: choice.depth,
+            picture: if choice.depth == Depth::Camera { picture(seed) } else { None },
             items: Vec::new(),
             faults: Vec::new(),
             until_ms: 0,
@@ -154,8 +161,8 @@ impl Plan {
     pub fn recording((series, depth): (Series, Depth), vessel: usize, fill_ml: f64, lambda_deg: f32, width_s: f32) -> Self {
         let items = vec![Item { at_ms: 3_000, what: What::Record(lambda_deg, width_s), fault: None }];
         let seed = u64::from(lambda_deg.to_bits());
-        let mut plan =
-            Self { seed, series, vessel, fill_ml, delay_ns: (100_000, 0), lag_s: LAG_S, depth, items, faults: Vec::new(), until_ms: 0 };
+        let (delay_ns, lag_s, picture, faults, until_ms) = ((100_000, 0), LAG_S, None, Vec::new(), 0);
+        let mut plan = Self { seed, series, vessel, fill_ml, delay_ns, lag_s, depth, picture, items, faults, until_ms };
         plan.finish();
         plan
     }
@@ -209,6 +216,15 @@ impl Plan {
 fn lag_s(seed: u64) -> f64 {
     let mut random = Pcg64Mcg::seed_from_u64(seed ^ 0x1A6);
     if random.random_bool(OTHER_LAGS) { random.random_range(LAGS_S.0..LAGS_S.1) } else { LAG_S }
+}
+
+/// What is wrong with a camera's pictures: one of the faults that people report, as strong as usual, or nothing. The weights were learned with
+/// pictures that have none.
+fn picture(seed: u64) -> Option<CameraFault> {
+    let mut random = Pcg64Mcg::seed_from_u64(seed ^ 0xCA3E7A);
+    let kind = FaultKind::ALL[random.random_range(0..FaultKind::ALL.len())];
+    let fault = CameraFault { kind, strength: kind.usual_strength(), seed: random.random() };
+    random.random_bool(FAULTY_PICTURES).then_some(fault)
 }
 
 /// A goal, ml: mostly an ordinary one, sometimes at or beyond its bounds.

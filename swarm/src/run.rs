@@ -13,12 +13,14 @@ use rt_controller::robot_thread::{RobotNote, keep_robot_connected};
 use serde::Serialize;
 use shared::config::Config;
 use shared::control::Outcome;
+use simulator::ur::Series;
 
 use crate::check::Violation;
 use crate::costs::{Cost, Poured};
 use crate::plan::Plan;
 use crate::records::{Journal, Row};
 use crate::site::Site;
+use crate::vessels::VESSELS;
 use crate::weight_set::TrainedSet;
 use crate::world::{Life, LoopSide, World};
 
@@ -27,6 +29,12 @@ use crate::world::{Life, LoopSide, World};
 pub struct Shown {
     /// The seed.
     pub seed: u64,
+    /// The robot's generation.
+    pub series: Series,
+    /// The vessel's name.
+    pub vessel: &'static str,
+    /// Time constant of the robot's lag, s.
+    pub lag_s: f64,
     /// Virtual time, s.
     pub virtual_s: f64,
     /// What must not have happened.
@@ -61,6 +69,9 @@ pub fn run_checked(plan: &Plan, trained: &TrainedSet, config: &Config, checked: 
     let site = site.into_inner();
     let mut shown = Shown {
         seed: plan.seed,
+        series: plan.series,
+        vessel: VESSELS[plan.vessel].name,
+        lag_s: plan.lag_s,
         virtual_s: site.now_s(),
         violations: site.checks.violations,
         poured: site.poured,

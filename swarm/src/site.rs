@@ -19,7 +19,8 @@ use simulator::physics::container::Container;
 use simulator::physics::rig::Rig;
 use simulator::ur::{Fault, InMemory, Machine};
 
-use crate::camera::{Camera, Depth};
+use crate::bound::Moment;
+use crate::camera::{Camera, Depth, picture_name};
 use crate::check::Checks;
 use crate::costs::{Costs, Poured};
 use crate::eye::Eye;
@@ -30,7 +31,7 @@ use crate::plan::Plan;
 use crate::records::Row;
 use crate::vessels;
 use crate::weight_set::{Lesson, TrainedSet, episode};
-use crate::what::{Weighed, What};
+use crate::what::{EyeFault, Weighed, What};
 
 /// The cell's configuration.
 const CONFIG: &str = include_str!("../../config/sim.toml");
@@ -130,11 +131,14 @@ impl Site {
         let camera = match plan.depth {
             Depth::Area => None,
             Depth::Camera => {
-                let made = Camera::new(checked, plan.seed);
+                let made = Camera::new(checked, plan.seed, plan.picture);
                 // Without it the areas would be made of flows, and look like measured ones.
                 made.map_err(|line| checks.violated("camera", 0.0, line)).ok()
             }
         };
+        if let Some(fault) = plan.picture {
+            checks.happens(&What::Eye(EyeFault::Picture(fault.kind)), &machine, true, 0.0);
+        }
         // What is learned from needs the rows.
         let learns = plan.items.iter().any(|item| matches!(item.what, What::Learn(_)));
         Self {
@@ -264,7 +268,10 @@ impl Site {
         }
         let at_s = self.now_s();
         self.checks.cycle(self.robot.machine(), self.joint, alpha_deg, at_s);
-        if let Some(wrong) = self.costs.settle(self.checks.phase, alpha_deg, self.container.poured_ml(), at_s) {
+        let (target, lag_s) = (self.checks.target(), self.plan.lag_s);
+        let return_deg_s = f64::from(self.checks.limits().return_rate_deg_s);
+        let now = Moment { container: &self.container, alpha_deg, target, lag_s, return_deg_s, at_s };
+        if let Some(wrong) = self.costs.settle(self.checks.phase, &now) {
             self.checks.violated("bound", at_s, wrong);
         }
     }
@@ -305,7 +312,9 @@ impl Site {
         self.checks.ended(outcome, true_ml, at_s);
         self.costs.ended(is_ordinary(outcome.reason));
         let since_s = at_s - f64::from(outcome.seconds) - 6.0;
-        let faults = self.fault_times.iter().filter(|(began_s, _)| *began_s >= since_s).map(|(_, name)| *name).collect();
+        let pictures = self.plan.picture.map(|fault| picture_name(fault.kind));
+        let faults = self.fault_times.iter().filter(|(began_s, _)| *began_s >= since_s).map(|(_, name)| *name);
+        let faults = pictures.into_iter().chain(faults).collect();
         let (reason, goal_ml, believed_ml) = (outcome.reason, outcome.goal_ml, outcome.poured_ml);
         let sd_ml = outcome.poured_sd_ml;
         self.poured.push(Poured { at_s, seconds: f64::from(outcome.seconds), reason, goal_ml, believed_ml, sd_ml, true_ml, faults });

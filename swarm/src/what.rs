@@ -3,6 +3,7 @@
 //! Plain data; allocates for names only; cannot fail.
 
 use serde::Serialize;
+use simulator::camera::faults::FaultKind;
 use simulator::ur::Fault;
 
 /// What the worker or its camera does wrong.
@@ -32,6 +33,8 @@ pub enum EyeFault {
     Hung(u32),
     /// A second worker measures too, for so many ms.
     Two(u32),
+    /// The camera's pictures have this fault, from the cell's start to its end (`--eye camera`).
+    Picture(FaultKind),
 }
 
 /// What the operator enters as an episode's weight.

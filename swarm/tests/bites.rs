@@ -44,3 +44,22 @@ fn limits_that_are_too_weak_are_found() {
         assert!(found.is_some(), "{what}: {SEEDS} seeds violate none of {invariants:?}");
     }
 }
+
+/// Protects `scripts/check-swarm` from mistakes that can no longer be planted: what each replaces stands exactly once where it is planted, and the
+/// invariants that are to find it are named.
+#[test]
+fn planted_mistakes_have_their_places() {
+    let root = concat!(env!("CARGO_MANIFEST_DIR"), "/..");
+    let bugs: toml::Table = std::fs::read_to_string(format!("{root}/swarm/bugs.toml")).unwrap().parse().unwrap();
+    let bugs = bugs["bug"].as_array().unwrap();
+    assert!(bugs.len() >= 20, "{} mistakes", bugs.len());
+    for bug in bugs {
+        let name = bug["name"].as_str().unwrap();
+        assert!(!bug["found_by"].as_array().unwrap().is_empty(), "{name}: no invariant is to find it");
+        for edit in bug["edits"].as_array().unwrap() {
+            let (file, old) = (edit["file"].as_str().unwrap(), edit["old"].as_str().unwrap());
+            let text = std::fs::read_to_string(format!("{root}/{file}")).unwrap();
+            assert_eq!(text.matches(old).count(), 1, "{name}: {old:?} in {file}; correct swarm/bugs.toml");
+        }
+    }
+}

@@ -3,7 +3,6 @@
 
 use std::time::{SystemTime, UNIX_EPOCH};
 
-use simulator::ur::servo::LAG_S;
 use swarm::check::Violation;
 use swarm::many::{Seeds, digest, run_many};
 use swarm::plan::{Choice, Plan};
@@ -20,18 +19,10 @@ fn seeds(from: u64, count: u64) -> Seeds {
     Seeds { from, count, choice: Choice::default() }
 }
 
-/// The one finding that is open (docs/SWARM.md): a robot that lags by more than was learned can pour more from a steep vessel than it says.
-fn is_open(seed: u64, violation: &Violation) -> bool {
-    violation.invariant == "said" && Plan::draw(seed).lag_s > 2.0 * LAG_S
-}
-
-/// Complains about every violation, with the command that shows it again. Those of the finding that is open are only printed.
+/// Complains about every violation, with the command that shows it again.
 fn assert_none(shown: &[Shown]) {
     let tell = |seed: u64, v: &Violation| format!("swarm --seed {seed} --plot seed.svg: {} at {:.3} s: {}", v.invariant, v.at_s, v.what);
-    let all = shown.iter().flat_map(|one| one.violations.iter().map(|v| (one.seed, v)));
-    let (open, bad): (Vec<_>, Vec<_>) = all.partition(|(seed, v)| is_open(*seed, v));
-    open.iter().for_each(|(seed, v)| println!("open: {}", tell(*seed, v)));
-    let bad: Vec<String> = bad.into_iter().map(|(seed, v)| tell(seed, v)).collect();
+    let bad: Vec<String> = shown.iter().flat_map(|one| one.violations.iter().map(|v| tell(one.seed, v))).collect();
     assert!(bad.is_empty(), "{} violations:\n{}", bad.len(), bad.join("\n"));
 }
 

@@ -35,9 +35,9 @@ fn sim() -> Config {
 
 /// A parser that allocates without bound ends the process instead of the machine.
 fn bound_memory() {
-    let taken = std::fs::read_to_string("/proc/self/statm").unwrap();
-    let pages: u64 = taken.split_whitespace().next().unwrap().parse().unwrap();
-    let most = pages * rustix::param::page_size() as u64 + MEMORY;
+    let status = std::fs::read_to_string("/proc/self/status").unwrap();
+    let taken_kib = status.lines().find_map(|l| l.strip_prefix("VmSize:")).and_then(|l| l.trim().strip_suffix(" kB")).unwrap();
+    let most = taken_kib.parse::<u64>().unwrap() * 1024 + MEMORY;
     let before = rustix::process::getrlimit(rustix::process::Resource::As);
     let limit = rustix::process::Rlimit { current: Some(most), maximum: before.maximum };
     rustix::process::setrlimit(rustix::process::Resource::As, limit).unwrap();

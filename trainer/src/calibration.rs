@@ -75,6 +75,9 @@ const MISFIT_MIN: f64 = 0.25;
 /// Number of weights as which the expected misfit counts.
 const MISFIT_EXPECTED: f64 = 2.0;
 
+/// The largest entry of the covariance of log c and q: a weight file holds 25.
+const COVARIANCE_MAX: f64 = 24.0;
+
 /// By how much a pour misses its weight as a rule (log): a camera's gain of 1.5 % on the rigs, and what is left of a power law.
 const POUR_SD: f64 = 0.017;
 /// Number of episodes as which that counts. Chosen by hand, as in the fit.
@@ -127,5 +130,35 @@ pub fn with_doubt(episodes: &[TrainingEpisode], exact: bool) -> Doubted {
     // Two unknowns have met two of the weights.
     let seen = if few { 0.0 } else { misses.max(0.0) * n / (n - 2.0).max(1.0) };
     let pour_sd = ((POURS_EXPECTED * POUR_SD * POUR_SD + seen) / (POURS_EXPECTED + if few { 0.0 } else { n })).sqrt();
-    Doubted { calibration, covariance: covariance.map(|row| row.map(|v| v.clamp(-20.0, 20.0))), pour_sd }
+    // Cut as a whole: entries that are cut one by one are no covariance, and leave no doubt at all at the areas of the episodes.
+    let largest = covariance.iter().flatten().fold(0.0f64, |most, v| most.max(v.abs()));
+    let share = (COVARIANCE_MAX / largest.max(1e-12)).min(1.0);
+    Doubted { calibration, covariance: covariance.map(|row| row.map(|v| share * v)), pour_sd }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Protects what is said of a pour after one or two weighings before a camera that shows large areas: the doubt of q is there at other areas
+    /// than theirs, and that of the weights at theirs.
+    #[test]
+    fn few_weights_leave_doubt_at_any_area() {
+        for area in [100.0, 1000.0, 10_000.0, 30_000.0f64] {
+            for weights_g in [&[40.0][..], &[40.0, 44.0]] {
+                let one = |weight_g: &f64| {
+                    let mut e = TrainingEpisode::empty("x", 30.0);
+                    (0..60).for_each(|k| e.push(f64::from(k) / 30.0, 50.0, f64::NAN, area));
+                    e.weight_g = *weight_g;
+                    e
+                };
+                let episodes: Vec<TrainingEpisode> = weights_g.iter().map(one).collect();
+                let [[cc, cq], [_, qq]] = with_doubt(&episodes, false).covariance;
+                let sd = |area: f64| (cc + 2.0 * area.ln() * cq + area.ln().powi(2) * qq).sqrt();
+                assert!(sd(area) > 0.02 && sd(area) < 0.1, "{area} px^2: {}", sd(area));
+                assert!(sd(0.5 * area) > 0.5 * EXPONENT_SD * 2f64.ln(), "{area} px^2: {}", sd(0.5 * area));
+                assert!(cc <= 25.0 && qq <= 25.0 && cq.abs() <= 25.0, "a weight file holds no more");
+            }
+        }
+    }
 }

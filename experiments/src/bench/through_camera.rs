@@ -19,6 +19,9 @@ use simulator::physics::rig::RigPour;
 
 use crate::camera_setup::{camera_config, image_config, learn_colour};
 
+/// Frames for which the camera has watched the upright vessel before a pour: a worker runs long before it, and has learned the ground. Chosen by
+/// hand: a second and a half.
+const WATCHED_FRAMES: usize = 45;
 /// Colours of the liquids, as blue, green, red: such as food dyes give.
 const LIQUIDS_BGR: [[u8; 3]; 4] = [[150, 62, 20], [40, 36, 180], [60, 150, 40], [140, 40, 110]];
 
@@ -93,7 +96,11 @@ impl CameraPour {
                 Arc::new(Mutex::new(Camera { renderer, extractor, pixels: vec![0; (size_px.0 * size_px.1 * 3) as usize] }))
             },
         );
-        Self { pour, camera, size_px, scenes: vec![Scene::default(); delay_frames + 1], delay_frames, frame: 0, confidence: 1.0 }
+        let upright = Scene::of(pour.container(), 0.0, pour.tilt_deg(), 0.0);
+        for (k, camera) in (0..WATCHED_FRAMES).filter_map(|k| camera.as_ref().map(|camera| (k, camera))) {
+            look(camera, &Scene { at_s: k as f64 / RATE_HZ, ..upright }, size_px);
+        }
+        Self { pour, camera, size_px, scenes: vec![upright; delay_frames + 1], delay_frames, frame: WATCHED_FRAMES, confidence: 1.0 }
     }
 
     /// Lets one frame pass with `alpha_deg` commanded. Returns V_e of its picture in px^2, or NaN.

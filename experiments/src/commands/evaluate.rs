@@ -3,7 +3,7 @@
 //! Ordinary threads, all cores, full speed; allocates. The same arguments give the same numbers on any number of threads. A bad argument
 //! or weight file is an error of one line.
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use indicatif::{ParallelProgressIterator, ProgressBar, ProgressStyle};
 use rayon::prelude::*;
@@ -89,8 +89,8 @@ pub struct Args {
     /// change. Use another folder after any change of the trainer.
     #[arg(long, value_name = "DIR")]
     keep: Option<PathBuf>,
-    /// Writes the whole report, every pour included, to this file as JSON.
-    #[arg(long)]
+    /// Prints the whole report, every pour included, as JSON in place of the tables, or writes it to FILE beside them.
+    #[arg(long, value_name = "FILE", num_args = 0..=1, default_missing_value = "-")]
     json: Option<PathBuf>,
 }
 
@@ -206,6 +206,7 @@ pub fn run(args: &Args) -> Result<(), Failure> {
     }
     let (kinds, protocols) = (args.kinds()?, args.protocols()?);
     let begin = std::time::Instant::now();
+    let to_stdout = args.json.as_deref() == Some(Path::new("-"));
     let mut reports = Vec::new();
     let mut frames = 0;
     for kind in &kinds {
@@ -221,7 +222,9 @@ pub fn run(args: &Args) -> Result<(), Failure> {
                     .collect()
             };
             let summaries: Vec<Summary> = judged.iter().map(|j| Summary::new(&j.name, &j.groups)).collect();
-            print(args, &table, &summaries);
+            if !to_stdout {
+                print(args, &table, &summaries);
+            }
             frames += judged.iter().flat_map(|j| j.groups.iter().flatten()).map(|p| u64::from(p.frames)).sum::<u64>();
             if args.json.is_some() {
                 let traces = examples(args, protocol, trials.first(), files.first().map(|(_, weights)| weights));
@@ -233,7 +236,11 @@ pub fn run(args: &Args) -> Result<(), Failure> {
     if let Some(file) = &args.json {
         // One table is the report that `trainer report` reads; several are a list of them.
         let all = if reports.len() == 1 { reports.remove(0) } else { serde_json::Value::Array(reports) };
-        std::fs::write(file, all.to_string()).map_err(|e| format!("{}: {e}", file.display())).or_exit(exit::FAILED)?;
+        if to_stdout {
+            println!("{all}");
+        } else {
+            std::fs::write(file, all.to_string()).map_err(|e| format!("{}: {e}", file.display())).or_exit(exit::FAILED)?;
+        }
     }
     Ok(())
 }
@@ -269,6 +276,9 @@ fn examples(args: &Args, protocol: &Protocol, trial: Option<&Trial>, weights: Op
     match (weights, trial) {
         (Some(weights), Some(trial)) => trial.examples(weights),
         (None, Some(trial)) if args.method.contains(&Pourer::Best) => {
+            if let Some(weights) = trial.kept(Pourer::Best, protocol).and_then(|file| Weights::read(&file).ok()) {
+                return trial.examples(&weights);
+            }
             let options = trial.options(MethodName::Best, Estimate::Fused, args.actions);
             trial.train(&options, protocol).map(|(t, _)| trial.examples(&t.weights)).unwrap_or_default()
         }

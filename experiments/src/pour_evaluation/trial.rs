@@ -218,6 +218,18 @@ impl Trial {
         Some((trained, data))
     }
 
+    /// The file in which the weights of a method are kept, if they are.
+    pub fn kept(&self, pourer: Pourer, protocol: &Protocol) -> Option<PathBuf> {
+        let beginning = self.keep.as_ref().filter(|_| pourer != Pourer::Law)?;
+        let Protocol { episodes, weighed, actions, .. } = *protocol;
+        let each = match protocol {
+            Protocol { by_plan: true, .. } => "plan",
+            Protocol { refit_after_each: true, .. } => "each",
+            _ => "last",
+        };
+        Some(PathBuf::from(format!("{}-{episodes}+{weighed}-{each}-{actions}-{}.bin", beginning.display(), pourer.name())))
+    }
+
     /// Pours the grid with a method, trained if it needs to be.
     pub fn run(&self, pourer: Pourer, protocol: &Protocol) -> Vec<PourResult> {
         let Some((method, estimate)) = pourer.training() else { return self.run_untrained(pourer, protocol) };
@@ -226,17 +238,7 @@ impl Trial {
             let (law, calibration, estimator) = self.tuned_pd(&self.record(protocol.episodes), options.seed);
             return self.pour_grid(protocol, |goal| Box::new(ByLaw::new(law, calibration, &estimator, goal)));
         }
-        let file = self.keep.as_ref().filter(|_| pourer != Pourer::Law).map(|beginning| {
-            let Protocol { episodes, weighed, refit_after_each, actions, .. } = *protocol;
-            let each = if protocol.by_plan {
-                "plan"
-            } else if refit_after_each {
-                "each"
-            } else {
-                "last"
-            };
-            PathBuf::from(format!("{}-{episodes}+{weighed}-{each}-{actions}-{}.bin", beginning.display(), pourer.name()))
-        });
+        let file = self.kept(pourer, protocol);
         if let Some(weights) = file.as_ref().and_then(|file| Weights::read(file).ok()) {
             return self.judge(&weights, protocol.repeats, protocol.by_plan);
         }

@@ -1,19 +1,23 @@
-//! `feature-worker episodes`: lists, shows, checks, weighs and exports episodes.
+//! `feature-worker episodes`: lists, shows, checks, weighs and exports episodes, and what else people do with them ([`keep`]).
 //!
-//! An ordinary command-line program that works on files alone; no cell needs to run. Allocates. Only `weigh` changes a file, and it does
-//! so in one step (see [`shared::episode::set_weight`]). An export never overwrites anything.
+//! An ordinary command-line program that works on files alone; no cell needs to run. Allocates. Only `weigh` and `note` change a file, and
+//! they do so in one step (see [`shared::episode::set_weight`]). An export never overwrites anything.
 
 use std::path::{Path, PathBuf};
 
 use clap::Subcommand;
 use serde_json::{Value, json};
-use shared::config::Config;
-use shared::episode::{Episode, EpisodeError, EpisodeKind, WeighError, find_episodes, set_weight};
+use shared::episode::{Episode, EpisodeError, EpisodeKind, set_weight};
 use shared::exit::{self, Failure, OrExit as _, failure};
 
-use crate::episodes::export::{ExportFormat, export};
+use crate::episodes::export::{ExportFormat, Exported, export};
 use crate::episodes::output::ExportError;
 use crate::episodes::summary::{Remark, remarks, summary};
+
+mod keep;
+mod which;
+
+use which::{WhichArgs, change_failure, files, print_json};
 
 /// Command-line arguments.
 #[derive(Debug, clap::Args)]
@@ -38,23 +42,13 @@ enum Command {
     /// Writes the scale's reading into an episode.
     #[command(after_help = "Example:\n  feature-worker episodes weigh out/episodes/episode-0001.mcap --weight 104")]
     Weigh(WeighArgs),
-    /// Writes episodes as tables, images, videos or a LeRobot data set.
+    /// Writes episodes as tables, images, videos or a LeRobot data set. A file that cannot be read is left out and said at the end; the exit
+    /// code is then 1.
     #[command(after_help = "Examples:\n  feature-worker episodes export out/episodes --as csv --to out/table\n  \
         feature-worker episodes export out/episodes/episode-0001.mcap --as video --to out/video")]
     Export(ExportArgs),
-}
-
-/// Which episodes.
-#[derive(Debug, clap::Args)]
-struct WhichArgs {
-    /// Episodes (.mcap) or directories of them; without any, the directory of `[recording]` in the configuration.
-    paths: Vec<PathBuf>,
-    /// The cell's configuration.
-    #[arg(long, env = shared::config::VARIABLE, default_value = shared::config::DEFAULT_FILE)]
-    config: PathBuf,
-    /// Print JSON.
-    #[arg(long)]
-    json: bool,
+    #[command(flatten)]
+    Keep(keep::Command),
 }
 
 #[derive(Debug, clap::Args)]
@@ -89,16 +83,8 @@ pub fn run(args: &Args) -> Result<(), Failure> {
         Command::Check(which) => check(&files(which)?, which.json),
         Command::Weigh(args) => weigh(args),
         Command::Export(args) => run_export(args),
+        Command::Keep(command) => keep::run(command),
     }
-}
-
-/// The files that the arguments name.
-fn files(which: &WhichArgs) -> Result<Vec<PathBuf>, Failure> {
-    let paths = match which.paths.as_slice() {
-        [] => vec![Config::read(&which.config).or_exit(exit::BAD_INPUT)?.recording.directory],
-        given => given.to_vec(),
-    };
-    find_episodes(&paths).or_exit(exit::BAD_INPUT)
 }
 
 fn kind_words(kind: EpisodeKind) -> String {
@@ -107,10 +93,6 @@ fn kind_words(kind: EpisodeKind) -> String {
         EpisodeKind::Pour { goal_ml } => format!("pour of {goal_ml} ml"),
         EpisodeKind::Table => "table".into(),
     }
-}
-
-fn print_json(value: &Value) {
-    println!("{value:#}");
 }
 
 fn list(files: &[PathBuf], as_json: bool) -> Result<(), Failure> {
@@ -159,6 +141,9 @@ fn show(files: &[PathBuf], as_json: bool) -> Result<(), Failure> {
     println!("{}", file.display());
     println!("  run        {}", kind_words(episode.kind));
     println!("  started    {} in cell '{}'", episode.info.started_at_utc, episode.info.cell);
+    if !episode.info.note.is_empty() {
+        println!("  note       {}", episode.info.note);
+    }
     println!("  weight     {}", episode.weight_g.map_or("not weighed yet".into(), |w| format!("{w} g")));
     println!("  state      {}", if episode.complete { "complete" } else { "INCOMPLETE" });
     println!("  frames     {} in {:.1} s, {} with flow", value["frames"], episode.seconds(), value["flow_frames"]);
@@ -239,8 +224,7 @@ fn check(files: &[PathBuf], as_json: bool) -> Result<(), Failure> {
 }
 
 fn weigh(args: &WeighArgs) -> Result<(), Failure> {
-    let code = |e: &WeighError| if matches!(e, WeighError::Write { .. }) { exit::FAILED } else { exit::BAD_INPUT };
-    let before = set_weight(&args.file, args.weight).map_err(|e| failure(code(&e), e))?;
+    let before = set_weight(&args.file, args.weight).map_err(|e| change_failure(&e))?;
     if args.json {
         print_json(&json!({ "file": args.file.display().to_string(), "weight_g": args.weight, "before_g": before }));
     } else {
@@ -256,13 +240,20 @@ fn run_export(args: &ExportArgs) -> Result<(), Failure> {
         ExportError::Table(_) | ExportError::Write { .. } => exit::FAILED,
     };
     let shown = |path: &Path| path.display().to_string();
-    let written = export(&files(&args.which)?, args.format, &args.to).map_err(|e| failure(code(&e), e))?;
+    let Exported { written, left_out } = export(&files(&args.which)?, args.format, &args.to).map_err(|e| failure(code(&e), e))?;
     if args.which.json {
-        print_json(&json!({ "written": written.iter().map(|p| shown(p)).collect::<Vec<_>>() }));
+        let left_out: Vec<Value> = left_out.iter().map(|l| json!({ "file": shown(&l.file), "why": l.why })).collect();
+        print_json(&json!({ "written": written.iter().map(|p| shown(p)).collect::<Vec<_>>(), "left_out": left_out }));
     } else {
         for path in &written {
             println!("{}", shown(path));
         }
+        for one in &left_out {
+            println!("left out: {}", one.why);
+        }
     }
-    Ok(())
+    match left_out.len() {
+        0 => Ok(()),
+        n => Err(failure(exit::FAILED, format!("{n} episodes were left out; the others are exported"))),
+    }
 }

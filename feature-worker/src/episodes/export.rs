@@ -10,7 +10,7 @@ use indicatif::{ProgressBar, ProgressStyle};
 use shared::episode::{Episode, EpisodeImages, write_table};
 
 use super::lerobot;
-use super::output::{ExportError, write_error};
+use super::output::{ExportError, LeftOut, write_error};
 use super::video::{Video, for_each_row_with_image, mean_rate_hz};
 
 /// What an export writes.
@@ -26,39 +26,61 @@ pub enum ExportFormat {
     Lerobot,
 }
 
-/// Writes the episodes of `files` into the directory `to`, which is made if it is missing. Returns the paths that were written. Shows its
-/// progress on the terminal.
-pub fn export(files: &[PathBuf], format: ExportFormat, to: &Path) -> Result<Vec<PathBuf>, ExportError> {
-    if files.is_empty() {
-        return Err(ExportError::Nothing("no episodes to export; name .mcap files or a directory of them".into()));
+/// What an export wrote.
+#[derive(Debug)]
+pub struct Exported {
+    /// The files or directories.
+    pub written: Vec<PathBuf>,
+    /// The episodes that could not be exported, in no way a reason to stop for the others.
+    pub left_out: Vec<LeftOut>,
+}
+
+/// Writes the episodes of `files` into the directory `to`, which is made if it is missing. A file that cannot be read is left out and
+/// returned. Shows its progress on the terminal.
+pub fn export(files: &[PathBuf], format: ExportFormat, to: &Path) -> Result<Exported, ExportError> {
+    let (mut episodes, mut left_out) = (Vec::new(), Vec::new());
+    for file in files {
+        match Episode::read(file) {
+            Ok(episode) => episodes.push((file.clone(), episode)),
+            Err(e) => left_out.push(LeftOut { file: file.clone(), why: e.to_string() }),
+        }
+    }
+    if episodes.is_empty() {
+        return Err(ExportError::Nothing(match left_out.first() {
+            None => "no episodes to export; name .mcap files or a directory of them".into(),
+            Some(first) => format!("none of {} episodes can be read; {}", files.len(), first.why),
+        }));
     }
     fs::create_dir_all(to).map_err(|e| write_error(to, e))?;
-    let episodes = files.iter().map(|f| Episode::read(f)).collect::<Result<Vec<_>, _>>()?;
     if format == ExportFormat::Csv {
         let pair = [to.join("features.csv"), to.join("scale.csv")];
+        let episodes: Vec<Episode> = episodes.into_iter().map(|(_, episode)| episode).collect();
         write_table(&episodes, &pair[0], &pair[1])?;
-        return Ok(pair.into());
+        return Ok(Exported { written: pair.into(), left_out });
     }
-    let bar = progress(episodes.iter().map(|e| e.rows.len() as u64).sum());
-    let written = match format {
-        ExportFormat::Lerobot => {
-            lerobot::write(files, &episodes, to, &bar)?;
-            vec![to.to_path_buf()]
-        }
-        _ => {
-            let mut written = Vec::new();
-            for (file, episode) in files.iter().zip(&episodes) {
-                let target = to.join(file.file_stem().unwrap_or(file.as_os_str()));
-                written.push(match format {
-                    ExportFormat::Video => video(file, episode, &target.with_extension("mp4"), &bar)?,
-                    _ => pictures(file, &target, &bar)?,
-                });
+    let bar = progress(episodes.iter().map(|(_, e)| e.rows.len() as u64).sum());
+    let mut written = Vec::new();
+    if format == ExportFormat::Lerobot {
+        left_out.append(&mut lerobot::write(&episodes, to, &bar)?);
+        written.push(to.to_path_buf());
+    } else {
+        for (file, episode) in &episodes {
+            let target = to.join(file.file_stem().unwrap_or(file.as_os_str()));
+            let one = match format {
+                ExportFormat::Video => video(file, episode, &target.with_extension("mp4"), &bar),
+                _ => pictures(file, &target, &bar),
+            };
+            match one {
+                Ok(path) => written.push(path),
+                Err(e @ (ExportError::Episode(_) | ExportError::Nothing(_))) => {
+                    left_out.push(LeftOut { file: file.clone(), why: e.to_string() });
+                }
+                Err(e) => return Err(e),
             }
-            written
         }
-    };
+    }
     bar.finish_and_clear();
-    Ok(written)
+    Ok(Exported { written, left_out })
 }
 
 fn progress(total: u64) -> ProgressBar {
@@ -88,10 +110,14 @@ fn video(file: &Path, episode: &Episode, target: &Path, bar: &ProgressBar) -> Re
         return Err(write_error(target, "is there already; name another directory"));
     }
     let mut video = Video::new(target, mean_rate_hz(episode));
-    for_each_row_with_image(file, episode, |image| {
+    let shown = for_each_row_with_image(file, episode, |image| {
         bar.inc(1);
         video.push(image)
-    })?;
-    video.finish()?;
+    });
+    if let Err(e) = shown.and_then(|()| video.finish()) {
+        // It was not there before, so it is ours, and half a video would look like a whole one.
+        let _ = fs::remove_file(target);
+        return Err(e);
+    }
     Ok(target.to_path_buf())
 }

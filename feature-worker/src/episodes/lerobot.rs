@@ -1,26 +1,29 @@
 //! Writes episodes as one data set in the layout of LeRobot v3.0 (info.json, stats.json, Parquet tables, MP4 videos).
 //!
-//! What a policy sees is `observation.state` (measured alpha and V_e; NaN where unknown) and `observation.images.camera`. What was done is
-//! `action`, the commanded alpha. LeRobot's clock is exact, `frame_index / fps`, so a lost frame becomes a row with the image of the frame
-//! before it. Each episode has its own video. The weight is an extra column of the episodes' table. It runs on the command's thread and
-//! allocates: it holds the rows of all episodes, but only one image at a time. Nothing that exists is overwritten.
+//! What a policy sees is `observation.state` (measured alpha and V_e) and `observation.images.camera`. What was done is `action`, the commanded
+//! alpha and its rate. `known` says of each row whether the frame is there, and whether alpha and V_e were measured; where not, they are filled
+//! with the value before. No number is NaN. LeRobot's clock is exact, `frame_index / fps`, so a lost frame becomes a row with the image of the
+//! frame before it. Each episode has its own video, and its own statistics, from which LeRobot makes those of parts. The weight is an extra
+//! column of the episodes' table, null where there is none. It runs on the command's thread and allocates: it holds the rows of all episodes,
+//! but only one image at a time. Nothing that exists is overwritten. `scripts/check-lerobot` trains and edits with LeRobot itself.
 
+use std::collections::BTreeMap;
 use std::fs;
 use std::path::{Path, PathBuf};
 
 use indicatif::ProgressBar;
 use parquet::file::metadata::KeyValue;
 use serde_json::{Value, json};
-use shared::episode::{Episode, EpisodeKind};
+use shared::episode::{Episode, EpisodeKind, EpisodeRow};
 
-use super::output::{ExportError, make_parent, write_error};
+use super::output::{ExportError, LeftOut, make_parent, write_error};
 use super::video::{USUAL_RATE_HZ, Video, for_each_row_with_image, mean_rate_hz};
 
 mod parquet_table;
 mod statistics;
 
 use parquet_table::{Column, write_parquet};
-use statistics::{ImageStatistics, Moments};
+use statistics::{ImageLevels, NUMBERS, Summary};
 
 /// Name of the images' column. LeRobot wants the prefix `observation.images`.
 const CAMERA: &str = "observation.images.camera";
@@ -29,51 +32,165 @@ const FILES_A_CHUNK: usize = 1000;
 /// Of this many images, one enters the images' statistics. Chosen by hand: neighbouring images are nearly the same.
 const IMAGE_STEP: usize = 10;
 
-/// Writes the data set of `episodes`, which were read from `files`, into the new directory `root`. Each image moves `bar` on by one.
-pub fn write(files: &[PathBuf], episodes: &[Episode], root: &Path, bar: &ProgressBar) -> Result<(), ExportError> {
+/// Writes the data set of `episodes`, each with the file that it was read from, into the new directory `root`. Each image moves `bar` on by
+/// one. Returns what was left out: files without images, with images that cannot be read, or of another size than those before.
+pub fn write(episodes: &[(PathBuf, Episode)], root: &Path, bar: &ProgressBar) -> Result<Vec<LeftOut>, ExportError> {
     if root.join("meta").exists() {
         return Err(write_error(root, "holds a data set already; name another directory"));
     }
-    let fps = episodes.first().map_or(USUAL_RATE_HZ, mean_rate_hz).round();
-    let mut tasks: Vec<String> = Vec::new();
-    let mut rows = DataTable::default();
-    let mut list = EpisodeTable::default();
-    let mut images = ImageStatistics::new();
-    for (number, (file, episode)) in files.iter().zip(episodes).enumerate() {
+    let mut set = DataSet::new(episodes.first().map_or(USUAL_RATE_HZ, |(_, e)| mean_rate_hz(e)).round());
+    let mut left_out = Vec::new();
+    for (file, episode) in episodes {
+        match set.add(file, episode, root, bar) {
+            Ok(()) => {}
+            Err(e @ (ExportError::Episode(_) | ExportError::Nothing(_))) => {
+                left_out.push(LeftOut { file: file.clone(), why: e.to_string() })
+            }
+            Err(e) => return Err(e),
+        }
+    }
+    if set.list.length.is_empty() {
+        let first = left_out.first().map_or(String::new(), |l| format!("; {}", l.why));
+        return Err(ExportError::Nothing(format!("no episode can be exported{first}")));
+    }
+    set.finish(root)?;
+    Ok(left_out)
+}
+
+/// The data set under way.
+struct DataSet {
+    fps: f64,
+    tasks: Vec<String>,
+    rows: DataTable,
+    list: EpisodeTable,
+    images: ImageLevels,
+    /// Width and height of the images, px, and the name of the videos' codec.
+    video: Option<(i32, i32, &'static str)>,
+}
+
+impl DataSet {
+    fn new(fps: f64) -> Self {
+        let (rows, list) = (DataTable::default(), EpisodeTable::default());
+        Self { fps, tasks: Vec::new(), rows, list, images: ImageLevels::new(), video: None }
+    }
+
+    /// Writes the video of an episode and takes its rows. On failure the data set is as it was before.
+    fn add(&mut self, file: &Path, episode: &Episode, root: &Path, bar: &ProgressBar) -> Result<(), ExportError> {
+        let number = self.list.length.len();
         let task = match episode.kind {
             EpisodeKind::Pour { goal_ml } => format!("pour {goal_ml} ml"),
             EpisodeKind::Recording(_) | EpisodeKind::Table => "tilt along a curve and back".into(),
         };
-        let task_index = tasks.iter().position(|t| *t == task).unwrap_or_else(|| {
-            tasks.push(task.clone());
-            tasks.len() - 1
-        });
         let (chunk, index) = (number / FILES_A_CHUNK, number % FILES_A_CHUNK);
         let path = root.join(format!("videos/{CAMERA}/chunk-{chunk:03}/file-{index:03}.mp4"));
         make_parent(&path)?;
-        let mut video = Video::new(&path, fps);
+        let levels = match self.write_video(file, episode, &path, bar) {
+            Ok(levels) => levels,
+            Err(e) => {
+                // The file is ours: the directory was new.
+                let _ = fs::remove_file(&path);
+                return Err(e);
+            }
+        };
+        let task_index = self.tasks.iter().position(|t| *t == task).unwrap_or_else(|| {
+            self.tasks.push(task.clone());
+            self.tasks.len() - 1
+        });
+        self.images.join(&levels);
+        let from = self.rows.index.len();
+        self.rows.add(episode, number, task_index, self.fps);
+        let mut summaries = self.rows.summaries(from);
+        summaries.push((CAMERA, levels.summaries()));
+        self.list.add(episode, task, (from, self.rows.index.len()), (chunk, index), self.fps, &summaries);
+        Ok(())
+    }
+
+    fn write_video(&mut self, file: &Path, episode: &Episode, path: &Path, bar: &ProgressBar) -> Result<ImageLevels, ExportError> {
+        let mut video = Video::new(path, self.fps);
+        let mut levels = ImageLevels::new();
         let mut shown = 0;
+        let known = self.video.map(|(width, height, _)| (width, height));
         for_each_row_with_image(file, episode, |image| {
             if shown % IMAGE_STEP == 0 {
-                images.add(image).map_err(|e| write_error(&path, e.message))?;
+                levels.add(image).map_err(|e| unreadable(file, &e.message))?;
             }
             shown += 1;
             bar.inc(1);
-            video.push(image)
+            video.push(image)?;
+            match (known, video.size()) {
+                (Some(first), Some(size)) if first != size => {
+                    Err(unreadable(file, &format!("its images are {} x {} px, those before {} x {} px", size.0, size.1, first.0, first.1)))
+                }
+                _ => Ok(()),
+            }
         })?;
+        if let Some((width, height)) = video.size() {
+            self.video = Some((width, height, video.codec()));
+        }
         video.finish()?;
-        let from = rows.index.len();
-        rows.add(episode, number, task_index, fps);
-        list.add(episode, task, (from, rows.index.len()), (chunk, index), fps);
+        Ok(levels)
     }
 
-    let stats = rows.stats(&images);
-    let info = info(episodes.len(), rows.index.len(), tasks.len(), fps, &images);
-    write_parquet(&root.join("data/chunk-000/file-000.parquet"), rows.columns(), None)?;
-    write_parquet(&root.join("meta/episodes/chunk-000/file-000.parquet"), list.columns(), None)?;
-    write_tasks(&root.join("meta/tasks.parquet"), tasks)?;
-    write_json(&root.join("meta/stats.json"), &stats)?;
-    write_json(&root.join("meta/info.json"), &info)
+    /// Writes all tables.
+    fn finish(self, root: &Path) -> Result<(), ExportError> {
+        let mut stats = serde_json::Map::new();
+        for (name, summaries) in self.rows.summaries(0) {
+            stats.insert(name.into(), Summary::json(&summaries));
+        }
+        stats.insert(CAMERA.into(), Summary::image_json(&self.images.summaries()));
+        let info = self.info();
+        write_parquet(&root.join("data/chunk-000/file-000.parquet"), self.rows.columns(), None)?;
+        write_parquet(&root.join("meta/episodes/chunk-000/file-000.parquet"), self.list.columns(), None)?;
+        write_tasks(&root.join("meta/tasks.parquet"), self.tasks)?;
+        write_json(&root.join("meta/stats.json"), &stats.into())?;
+        write_json(&root.join("meta/info.json"), &info)
+    }
+
+    /// The description of the data set, `meta/info.json`.
+    fn info(&self) -> Value {
+        let one = |kind: &str| json!({ "dtype": kind, "shape": [1], "names": null });
+        let (episodes, fps) = (self.list.length.len(), self.fps as i64);
+        let (width_px, height_px, codec) = self.video.unwrap_or((0, 0, ""));
+        json!({
+            "codebase_version": "v3.0",
+            "robot_type": "ur5",
+            "total_episodes": episodes,
+            "total_frames": self.rows.index.len(),
+            "total_tasks": self.tasks.len(),
+            "chunks_size": FILES_A_CHUNK,
+            "data_files_size_in_mb": 100,
+            "video_files_size_in_mb": 200,
+            "fps": fps,
+            "splits": { "train": format!("0:{episodes}") },
+            "data_path": "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet",
+            "video_path": "videos/{video_key}/chunk-{chunk_index:03d}/file-{file_index:03d}.mp4",
+            "features": {
+                "observation.state": { "dtype": "float32", "shape": [2], "names": ["alpha_measured_deg", "area_px2"] },
+                "action": { "dtype": "float32", "shape": [2], "names": ["alpha_commanded_deg", "alpha_commanded_deg_per_s"] },
+                "known": { "dtype": "bool", "shape": [3], "names": ["frame", "alpha_measured_deg", "area_px2"] },
+                CAMERA: {
+                    "dtype": "video",
+                    "shape": [height_px, width_px, 3],
+                    "names": ["height", "width", "channels"],
+                    "info": {
+                        "video.height": height_px, "video.width": width_px, "video.codec": codec,
+                        "video.pix_fmt": "yuv420p", "video.fps": fps, "video.channels": 3,
+                        "has_audio": false, "is_depth_map": false,
+                    },
+                },
+                "timestamp": one("float32"),
+                "frame_index": one("int64"),
+                "episode_index": one("int64"),
+                "index": one("int64"),
+                "task_index": one("int64"),
+            },
+        })
+    }
+}
+
+/// The error of an episode that cannot be exported, although others can.
+fn unreadable(file: &Path, what: &str) -> ExportError {
+    ExportError::Nothing(format!("{}: {what}", file.display()))
 }
 
 /// Writes the table of tasks. LeRobot reads this one with pandas and expects the task as the index.
@@ -92,49 +209,15 @@ fn write_tasks(path: &Path, tasks: Vec<String>) -> Result<(), ExportError> {
     write_parquet(path, columns, Some(KeyValue::new("pandas".into(), pandas.to_string())))
 }
 
-/// The description of the data set, `meta/info.json`.
-fn info(episodes: usize, frames: usize, tasks: usize, fps: f64, images: &ImageStatistics) -> Value {
-    let one = |kind: &str| json!({ "dtype": kind, "shape": [1], "names": null });
-    json!({
-        "codebase_version": "v3.0",
-        "robot_type": "ur5",
-        "total_episodes": episodes,
-        "total_frames": frames,
-        "total_tasks": tasks,
-        "chunks_size": FILES_A_CHUNK,
-        "data_files_size_in_mb": 100,
-        "video_files_size_in_mb": 200,
-        "fps": fps as i64,
-        "splits": { "train": format!("0:{episodes}") },
-        "data_path": "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet",
-        "video_path": "videos/{video_key}/chunk-{chunk_index:03d}/file-{file_index:03d}.mp4",
-        "features": {
-            "observation.state": { "dtype": "float32", "shape": [2], "names": ["alpha_measured_deg", "area_px2"] },
-            "action": { "dtype": "float32", "shape": [1], "names": ["alpha_commanded_deg"] },
-            CAMERA: {
-                "dtype": "video",
-                "shape": [images.height_px, images.width_px, 3],
-                "names": ["height", "width", "channels"],
-                "info": {
-                    "video.height": images.height_px, "video.width": images.width_px, "video.codec": "h264",
-                    "video.pix_fmt": "yuv420p", "video.is_depth_map": false, "video.fps": fps as i64, "video.channels": 3,
-                    "has_audio": false,
-                },
-            },
-            "timestamp": one("float32"),
-            "frame_index": one("int64"),
-            "episode_index": one("int64"),
-            "index": one("int64"),
-            "task_index": one("int64"),
-        },
-    })
-}
-
 /// The table `data`: one row for each row of each episode.
 #[derive(Default)]
 struct DataTable {
+    /// Two in a row.
     state: Vec<f32>,
+    /// Two in a row.
     action: Vec<f32>,
+    /// Three in a row.
+    known: Vec<bool>,
     timestamp: Vec<f32>,
     frame_index: Vec<i64>,
     episode_index: Vec<i64>,
@@ -143,10 +226,21 @@ struct DataTable {
 }
 
 impl DataTable {
+    /// Takes the rows of an episode. What is not known is the value before, as a policy at work would have it: of V_e 0 before the first, of
+    /// alpha the commanded one.
     fn add(&mut self, episode: &Episode, number: usize, task: usize, fps: f64) {
+        let (mut alpha_deg, mut area_px2) = (None, 0.0);
         for (n, row) in episode.rows.iter().enumerate() {
-            self.state.extend([row.alpha_measured_deg, row.area_px2]);
-            self.action.push(row.alpha_commanded_deg);
+            let (alpha_known, area_known) = (row.alpha_measured_deg.is_finite(), row.area_px2.is_finite());
+            if alpha_known {
+                alpha_deg = Some(row.alpha_measured_deg);
+            }
+            if area_known {
+                area_px2 = row.area_px2;
+            }
+            self.state.extend([alpha_deg.unwrap_or(row.alpha_commanded_deg), area_px2]);
+            self.known.extend([!row.lost, alpha_known, area_known]);
+            self.action.extend([row.alpha_commanded_deg, rate_deg_per_s(&episode.rows, n)]);
             self.timestamp.push((n as f64 / fps) as f32);
             self.frame_index.push(n as i64);
             self.episode_index.push(number as i64);
@@ -155,26 +249,31 @@ impl DataTable {
         }
     }
 
-    fn stats(&self, images: &ImageStatistics) -> Value {
-        let of = |values: &mut dyn Iterator<Item = f64>| Moments::of(values);
-        let ints = |values: &[i64]| of(&mut values.iter().map(|v| *v as f64)).json();
-        let lane = |lane: usize| of(&mut self.state.iter().skip(lane).step_by(2).map(|v| f64::from(*v)));
-        json!({
-            "observation.state": Moments::columns(&[lane(0), lane(1)]),
-            "action": of(&mut self.action.iter().map(|v| f64::from(*v))).json(),
-            "timestamp": of(&mut self.timestamp.iter().map(|v| f64::from(*v))).json(),
-            "frame_index": ints(&self.frame_index),
-            "episode_index": ints(&self.episode_index),
-            "index": ints(&self.index),
-            "task_index": ints(&self.task_index),
-            CAMERA: images.json(),
-        })
+    /// The statistics of each column over the rows from row `from` on.
+    fn summaries(&self, from: usize) -> Vec<(&'static str, Vec<Summary>)> {
+        let ints = |values: &[i64]| vec![Summary::of(values[from..].iter().map(|v| *v as f64))];
+        let floats = |values: &[f32], width: usize| {
+            let lane = |lane| Summary::of(values[from * width..].iter().skip(lane).step_by(width).map(|v| f64::from(*v)));
+            (0..width).map(lane).collect::<Vec<_>>()
+        };
+        let known: Vec<f32> = self.known.iter().map(|k| f32::from(u8::from(*k))).collect();
+        vec![
+            ("observation.state", floats(&self.state, 2)),
+            ("action", floats(&self.action, 2)),
+            ("known", floats(&known, 3)),
+            ("timestamp", floats(&self.timestamp, 1)),
+            ("frame_index", ints(&self.frame_index)),
+            ("episode_index", ints(&self.episode_index)),
+            ("index", ints(&self.index)),
+            ("task_index", ints(&self.task_index)),
+        ]
     }
 
     fn columns(self) -> Vec<(String, Column)> {
         vec![
             ("observation.state".into(), Column::FloatList { width: 2, values: self.state }),
-            ("action".into(), Column::Float(self.action)),
+            ("action".into(), Column::FloatList { width: 2, values: self.action }),
+            ("known".into(), Column::BoolList { width: 3, values: self.known }),
             ("timestamp".into(), Column::Float(self.timestamp)),
             ("frame_index".into(), Column::Int(self.frame_index)),
             ("episode_index".into(), Column::Int(self.episode_index)),
@@ -182,6 +281,14 @@ impl DataTable {
             ("task_index".into(), Column::Int(self.task_index)),
         ]
     }
+}
+
+/// Rate of the commanded alpha from row `n` to the next, degrees a second; at the last row, from the one before; 0 for a single row.
+fn rate_deg_per_s(rows: &[EpisodeRow], n: usize) -> f32 {
+    let from = if n + 1 < rows.len() { n } else { n.saturating_sub(1) };
+    let (Some(a), Some(b)) = (rows.get(from), rows.get(from + 1)) else { return 0.0 };
+    let rate = f64::from(b.alpha_commanded_deg - a.alpha_commanded_deg) / (b.t_s - a.t_s);
+    if rate.is_finite() { rate as f32 } else { 0.0 }
 }
 
 /// The table `meta/episodes`: one row for each episode.
@@ -194,11 +301,23 @@ struct EpisodeTable {
     video_chunk: Vec<i64>,
     video_file: Vec<i64>,
     seconds: Vec<f64>,
-    weight_g: Vec<f64>,
+    weight_g: Vec<Option<f64>>,
+    /// The columns of the statistics, by column and number: values a row, all values.
+    stats: BTreeMap<(String, &'static str), (usize, Vec<f64>)>,
+    /// How many rows, or images, the statistics of a column are made of.
+    counts: BTreeMap<String, Vec<i64>>,
 }
 
 impl EpisodeTable {
-    fn add(&mut self, episode: &Episode, task: String, rows: (usize, usize), video: (usize, usize), fps: f64) {
+    fn add(
+        &mut self,
+        episode: &Episode,
+        task: String,
+        rows: (usize, usize),
+        video: (usize, usize),
+        fps: f64,
+        summaries: &[(&'static str, Vec<Summary>)],
+    ) {
         self.tasks.push(task);
         self.length.push((rows.1 - rows.0) as i64);
         self.from.push(rows.0 as i64);
@@ -206,17 +325,25 @@ impl EpisodeTable {
         self.video_chunk.push(video.0 as i64);
         self.video_file.push(video.1 as i64);
         self.seconds.push((rows.1 - rows.0) as f64 / fps);
-        self.weight_g.push(episode.weight_g.unwrap_or(f64::NAN));
+        self.weight_g.push(episode.weight_g);
+        for (column, all) in summaries {
+            for (i, number) in NUMBERS.into_iter().enumerate() {
+                let (width, values) = self.stats.entry(((*column).into(), number)).or_default();
+                *width = all.len();
+                values.extend(all.iter().map(|s| s.numbers[i]));
+            }
+            self.counts.entry((*column).into()).or_default().push(all.first().map_or(0, |s| s.count as i64));
+        }
     }
 
     fn columns(self) -> Vec<(String, Column)> {
         let n = self.length.len();
         let zeros = || Column::Int(vec![0; n]);
-        vec![
+        let mut columns = vec![
             ("episode_index".into(), Column::Int((0..n as i64).collect())),
             ("tasks".into(), Column::TextList(self.tasks)),
             ("length".into(), Column::Int(self.length)),
-            ("weight_g".into(), Column::Double(self.weight_g)),
+            ("weight_g".into(), Column::OptionalDouble(self.weight_g)),
             ("data/chunk_index".into(), zeros()),
             ("data/file_index".into(), zeros()),
             ("dataset_from_index".into(), Column::Int(self.from)),
@@ -227,7 +354,16 @@ impl EpisodeTable {
             (format!("videos/{CAMERA}/to_timestamp"), Column::Double(self.seconds)),
             ("meta/episodes/chunk_index".into(), zeros()),
             ("meta/episodes/file_index".into(), zeros()),
-        ]
+        ];
+        for ((column, number), (width, values)) in self.stats {
+            let name = format!("stats/{column}/{number}");
+            let list = if column == CAMERA { Column::ChannelList { width, values } } else { Column::DoubleList { width, values } };
+            columns.push((name, list));
+        }
+        for (column, counts) in self.counts {
+            columns.push((format!("stats/{column}/count"), Column::IntList(counts)));
+        }
+        columns
     }
 }
 

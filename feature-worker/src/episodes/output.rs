@@ -2,7 +2,7 @@
 //! stays.
 
 use std::fs;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 use shared::episode::{EpisodeError, TableError};
 
@@ -26,6 +26,15 @@ pub enum ExportError {
     /// There is nothing to export.
     #[error("{0}")]
     Nothing(String),
+}
+
+/// A file that an export leaves out.
+#[derive(Debug)]
+pub struct LeftOut {
+    /// The file.
+    pub file: PathBuf,
+    /// Why, in one line that names it.
+    pub why: String,
 }
 
 /// The error of writing `path`.

@@ -116,6 +116,7 @@ pub fn summary(episode: &Episode) -> Value {
         "complete": episode.complete,
         "run": kind_json(episode.kind),
         "weight_g": episode.weight_g,
+        "note": episode.info.note,
         "seconds": episode.seconds(),
         "frames": episode.rows.len(),
         "flow_frames": flow_frames(episode),

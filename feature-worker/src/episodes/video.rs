@@ -16,7 +16,7 @@ pub const USUAL_RATE_HZ: f64 = 30.0;
 /// The slowest and the fastest rate that a video gets, frames a second. Chosen by hand; they bound what a damaged time could give.
 const RATE_LIMITS_HZ: [f64; 2] = [1.0, 240.0];
 /// Codecs of an MP4 file, the best first: H.264 plays everywhere, and MPEG-4 is there where OpenCV's FFmpeg was built without H.264.
-const CODECS: [[char; 4]; 2] = [['a', 'v', 'c', '1'], ['m', 'p', '4', 'v']];
+const CODECS: [([char; 4], &str); 2] = [(['a', 'v', 'c', '1'], "h264"), (['m', 'p', '4', 'v'], "mpeg4")];
 
 /// Mean rate of an episode, frames a second. Lost frames count, because they are shown too.
 pub fn mean_rate_hz(episode: &Episode) -> f64 {
@@ -64,12 +64,13 @@ pub struct Video {
     path: PathBuf,
     fps: f64,
     writer: Option<(VideoWriter, Size)>,
+    codec: &'static str,
 }
 
 impl Video {
     /// A video that will be written to `path` with `fps` frames a second. The file appears with the first image.
     pub fn new(path: &Path, fps: f64) -> Self {
-        Self { path: path.into(), fps, writer: None }
+        Self { path: path.into(), fps, writer: None, codec: "" }
     }
 
     /// Adds an image.
@@ -78,11 +79,12 @@ impl Video {
         let picture = decode(image).map_err(fail)?;
         let size = picture.size().map_err(fail)?;
         if self.writer.is_none() {
-            for [a, b, c, d] in CODECS {
+            for ([a, b, c, d], name) in CODECS {
                 let fourcc = VideoWriter::fourcc(a, b, c, d).map_err(fail)?;
                 let writer = VideoWriter::new_def(&self.path, fourcc, self.fps, size).map_err(fail)?;
                 if writer.is_opened().map_err(fail)? {
                     self.writer = Some((writer, size));
+                    self.codec = name;
                     break;
                 }
             }
@@ -95,6 +97,16 @@ impl Video {
             )),
             None => Err(write_error(&self.path, "OpenCV cannot write MP4 here; install FFmpeg's libraries")),
         }
+    }
+
+    /// Width and height, px; `None` before the first image.
+    pub fn size(&self) -> Option<(i32, i32)> {
+        self.writer.as_ref().map(|(_, size)| (size.width, size.height))
+    }
+
+    /// The codec's name, as FFmpeg writes it; empty before the first image.
+    pub fn codec(&self) -> &'static str {
+        self.codec
     }
 
     /// Closes the file.

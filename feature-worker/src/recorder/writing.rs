@@ -207,7 +207,8 @@ impl RecorderThread {
             episode: tick.episode,
             kind,
             started_at_ns: tick.at_ns,
-            wall_clock: SystemTime::now(),
+            // The tick is a little older than now, and both clocks are to tell of one moment.
+            wall_clock: SystemTime::now() - Duration::from_nanos(now_ns().saturating_sub(tick.at_ns)),
             config: &self.config,
             weights: &tick.weights(),
         };

@@ -15,13 +15,15 @@ const AGREES: f32 = 0.04;
 const RAYS_AGREE: f32 = 0.7;
 /// And when so many rays show the ground. Chosen by hand.
 const RAYS_LEAST: usize = RAYS / 3;
+/// A ray with a brighter or darker part tells nothing: it may be cut off, grey levels. Chosen by hand.
+const TOLD_LEVELS: [f32; 2] = [3.0, 225.0];
 /// Pictures over which the light's way is looked at. Chosen by hand: two seconds, a period of a white balance that hunts.
 const PICTURES: usize = 60;
 /// Colours wander when the share of one of them in the light changes by this factor. Tuned on seeds 1 to 4 of `evaluate-camera --faults`: gains
 /// of red and blue that wander by 10 % change it by 1.14 to 1.22, and liquids are still told then; by 20 %, by 1.31 to 1.5.
 const COLOURS: f32 = 1.25;
 /// Brightness wanders when it changes by this factor. Tuned as [`COLOURS`] was: an exposure that hunts by 1.6 changes it by 2.6.
-const BRIGHTNESS: f32 = 3.2;
+const BRIGHTNESS: f32 = 4.0;
 /// For so many pictures it counts, because it is told only while the background is at rest or even. Chosen by hand: ten seconds.
 const COUNTS_FOR: u32 = 300;
 
@@ -89,7 +91,7 @@ impl Wandering {
         self.ratios.iter_mut().for_each(Vec::clear);
         for ((now, count), (before, count_before)) in now.iter().zip(&self.before) {
             // Another number of samples are other places.
-            if *count > 0 && count == count_before && now.iter().chain(before).all(|v| *v >= 2.0) {
+            if *count > 0 && count == count_before && now.iter().chain(before).all(|v| (TOLD_LEVELS[0]..=TOLD_LEVELS[1]).contains(v)) {
                 (0..3).for_each(|k| self.ratios[k].push((now[k] / before[k]).ln()));
             }
         }

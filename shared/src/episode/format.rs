@@ -1,23 +1,22 @@
-//! The messages inside an episode's file, and the schemas that let any MCAP reader understand them.
+//! The messages inside an episode's file, in format 2: protobuf, so that Foxglove and Rerun plot the numbers and show the pictures with the
+//! triangle. Their schemas are in [`schema`](super::schema).
 //!
-//! Images are protobuf `foxglove.CompressedImage`, which viewers show without plug-ins. All else is JSON, which people and every language
-//! can read; NaN is written as `null`. The names of topics, fields and metadata are part of the format. All of it allocates and is for
-//! ordinary threads only. Nothing here fails; a message that does not fit is found by [`read`](super::read).
+//! The names of topics, fields and metadata, and the fields' numbers, are part of the format. What is unknown is NaN. All of it allocates
+//! and is for ordinary threads only. Nothing here fails; a message that does not fit is found by [`read`](super::read).
 
-use prost::Message as _;
-use prost_types::field_descriptor_proto::{Label, Type};
-use prost_types::{DescriptorProto, FieldDescriptorProto, FileDescriptorProto, FileDescriptorSet};
-use serde::{Deserialize, Deserializer, Serialize};
+use prost_types::Timestamp;
 
 use crate::messages::{Doubt, Feature, Phase, Telemetry};
 
 /// Topic of the images, named as ROS 2 does by custom.
 pub(super) const IMAGE_TOPIC: &str = "/camera/image/compressed";
-/// Topic of [`FeatureJson`].
+/// Topic of [`ImageAnnotations`]: what is drawn over the images.
+pub(super) const ANNOTATION_TOPIC: &str = "/camera/annotations";
+/// Topic of [`FeatureMessage`].
 pub(super) const FEATURE_TOPIC: &str = "/feature";
-/// Topic of [`TelemetryJson`].
+/// Topic of [`TelemetryMessage`].
 pub(super) const TELEMETRY_TOPIC: &str = "/telemetry";
-/// Topic of [`EpisodeRowJson`].
+/// Topic of [`RowMessage`].
 pub(super) const ROW_TOPIC: &str = "/sample";
 
 /// Name of the metadata record about the start.
@@ -28,15 +27,48 @@ pub(super) const META_CONFIG: &str = "config";
 pub(super) const META_END: &str = "end";
 /// Name of the metadata record with the weight.
 pub(super) const META_WEIGHT: &str = "weight";
-/// Version of the format: the value of `format` in the metadata record about the start.
-pub(super) const FORMAT: &str = "1";
+/// Name of the metadata record with what a person wrote about the episode.
+pub(super) const META_NOTE: &str = "note";
+/// Version of the format: the value of `format` in the metadata record about the start. Format 1 had JSON messages, and log times that were
+/// CLOCK_MONOTONIC.
+pub(super) const FORMAT: &str = "2";
+/// The older format, which is still read.
+pub(super) const FORMAT_1: &str = "1";
+/// Key in the metadata record about the start: Unix time less CLOCK_MONOTONIC when the episode started, ns.
+pub(super) const CLOCK_OFFSET: &str = "clock_offset_ns";
+
+/// Thickness of the triangle's lines, px. Chosen by hand: seen at 1280 x 720, and hides little at 640 x 480.
+const LINE_PX: f64 = 2.0;
+/// Height of the text beside the triangle, px. Chosen by hand: legible at 640 x 480.
+const FONT_PX: f64 = 14.0;
+/// Colour of what is measured: green, as in `inspect`'s pictures.
+const MEASURED: Color = Color { r: 0.1, g: 0.9, b: 0.2, a: 1.0 };
+/// Colour of what is doubtful: red.
+const DOUBTFUL: Color = Color { r: 1.0, g: 0.2, b: 0.1, a: 1.0 };
+/// `LINE_LOOP` of `foxglove.PointsAnnotation.Type`.
+const LINE_LOOP: i32 = 2;
+
+/// CLOCK_MONOTONIC in Unix time, ns; 0 before 1970.
+pub(super) fn unix_ns(at_ns: u64, offset_ns: i128) -> u64 {
+    u64::try_from((i128::from(at_ns) + offset_ns).max(0)).unwrap_or(u64::MAX)
+}
+
+/// Unix time in CLOCK_MONOTONIC, ns; 0 before the machine started.
+pub(super) fn monotonic_ns(unix_ns: u64, offset_ns: i128) -> u64 {
+    u64::try_from((i128::from(unix_ns) - offset_ns).max(0)).unwrap_or(u64::MAX)
+}
+
+/// Unix time as protobuf has it.
+pub(super) fn timestamp(unix_ns: u64) -> Timestamp {
+    Timestamp { seconds: (unix_ns / 1_000_000_000) as i64, nanos: (unix_ns % 1_000_000_000) as i32 }
+}
 
 /// A message of `/camera/image/compressed`, `foxglove.CompressedImage`.
 #[derive(Clone, PartialEq, prost::Message)]
 pub(super) struct CompressedImage {
-    /// Capture time, CLOCK_MONOTONIC like the log times.
+    /// Capture time, Unix time like the log times.
     #[prost(message, optional, tag = "1")]
-    pub timestamp: Option<prost_types::Timestamp>,
+    pub timestamp: Option<Timestamp>,
     #[prost(bytes = "vec", tag = "2")]
     pub data: Vec<u8>,
     #[prost(string, tag = "3")]
@@ -45,70 +77,141 @@ pub(super) struct CompressedImage {
     pub frame_id: String,
 }
 
-/// The FileDescriptorSet of [`CompressedImage`], which MCAP requires as the schema of a protobuf message.
-pub(super) fn compressed_image_schema() -> Vec<u8> {
-    let field = |name: &str, number: i32, kind: Type, type_name: Option<&str>| FieldDescriptorProto {
-        name: Some(name.into()),
-        number: Some(number),
-        label: Some(Label::Optional.into()),
-        r#type: Some(kind.into()),
-        type_name: type_name.map(Into::into),
-        ..Default::default()
-    };
-    let file = |name: &str, package: &str, dependency: &[&str], message: &str, field: Vec<FieldDescriptorProto>| FileDescriptorProto {
-        name: Some(name.into()),
-        package: Some(package.into()),
-        dependency: dependency.iter().map(|d| (*d).into()).collect(),
-        message_type: vec![DescriptorProto { name: Some(message.into()), field, ..Default::default() }],
-        syntax: Some("proto3".into()),
-        ..Default::default()
-    };
-    let timestamp = vec![field("seconds", 1, Type::Int64, None), field("nanos", 2, Type::Int32, None)];
-    let image = vec![
-        field("timestamp", 1, Type::Message, Some(".google.protobuf.Timestamp")),
-        field("frame_id", 4, Type::String, None),
-        field("data", 2, Type::Bytes, None),
-        field("format", 3, Type::String, None),
-    ];
-    let set = FileDescriptorSet {
-        file: vec![
-            file("google/protobuf/timestamp.proto", "google.protobuf", &[], "Timestamp", timestamp),
-            file("foxglove/CompressedImage.proto", "foxglove", &["google/protobuf/timestamp.proto"], "CompressedImage", image),
-        ],
-    };
-    set.encode_to_vec()
+/// A message of `/camera/annotations`, `foxglove.ImageAnnotations`.
+#[derive(Clone, PartialEq, prost::Message)]
+pub(super) struct ImageAnnotations {
+    #[prost(message, repeated, tag = "2")]
+    pub points: Vec<PointsAnnotation>,
+    #[prost(message, repeated, tag = "3")]
+    pub texts: Vec<TextAnnotation>,
+    #[prost(message, optional, tag = "5")]
+    pub timestamp: Option<Timestamp>,
+}
+
+/// `foxglove.PointsAnnotation`: the triangle.
+#[derive(Clone, PartialEq, prost::Message)]
+pub(super) struct PointsAnnotation {
+    #[prost(message, optional, tag = "1")]
+    pub timestamp: Option<Timestamp>,
+    #[prost(int32, tag = "2")]
+    pub kind: i32,
+    #[prost(message, repeated, tag = "3")]
+    pub points: Vec<Point2>,
+    #[prost(message, optional, tag = "4")]
+    pub outline_color: Option<Color>,
+    #[prost(double, tag = "7")]
+    pub thickness: f64,
+}
+
+/// `foxglove.TextAnnotation`: V_e, or why there is none.
+#[derive(Clone, PartialEq, prost::Message)]
+pub(super) struct TextAnnotation {
+    #[prost(message, optional, tag = "1")]
+    pub timestamp: Option<Timestamp>,
+    #[prost(message, optional, tag = "2")]
+    pub position: Option<Point2>,
+    #[prost(string, tag = "3")]
+    pub text: String,
+    #[prost(double, tag = "4")]
+    pub font_size: f64,
+    #[prost(message, optional, tag = "5")]
+    pub text_color: Option<Color>,
+}
+
+/// `foxglove.Point2`, px.
+#[derive(Clone, Copy, PartialEq, prost::Message)]
+pub(super) struct Point2 {
+    #[prost(double, tag = "1")]
+    pub x: f64,
+    #[prost(double, tag = "2")]
+    pub y: f64,
+}
+
+/// `foxglove.Color`, each from 0 to 1.
+#[derive(Clone, Copy, PartialEq, prost::Message)]
+pub(super) struct Color {
+    #[prost(double, tag = "1")]
+    pub r: f64,
+    #[prost(double, tag = "2")]
+    pub g: f64,
+    #[prost(double, tag = "3")]
+    pub b: f64,
+    #[prost(double, tag = "4")]
+    pub a: f64,
+}
+
+impl ImageAnnotations {
+    /// What is drawn over the frame of `feature`: the triangle and its area, or the doubt. Empty where nothing flows, so that the one before
+    /// goes away.
+    pub(super) fn new(feature: &Feature, unix_ns: u64) -> Self {
+        let doubt = Doubt::from_code(feature.doubt);
+        let (timestamp, colour) = (Some(timestamp(unix_ns)), if doubt == Doubt::None { MEASURED } else { DOUBTFUL });
+        let corners: Vec<Point2> = feature.triangle_px.chunks_exact(2).map(|p| Point2 { x: f64::from(p[0]), y: f64::from(p[1]) }).collect();
+        let drawn = feature.area_px2 > 0.0 && feature.triangle_px.iter().all(|v| v.is_finite());
+        let position = if drawn { corners.first().copied() } else { Some(Point2 { x: FONT_PX, y: 2.0 * FONT_PX }) };
+        let text = match (doubt, drawn) {
+            (Doubt::None, false) => None,
+            (Doubt::None, true) => Some(format!("V_e {:.0} px^2", feature.area_px2)),
+            (doubt, _) => Some(doubt.words().into()),
+        };
+        Self {
+            timestamp,
+            points: if drawn {
+                vec![PointsAnnotation { timestamp, kind: LINE_LOOP, points: corners, outline_color: Some(colour), thickness: LINE_PX }]
+            } else {
+                Vec::new()
+            },
+            texts: text
+                .map(|text| TextAnnotation { timestamp, position, text, font_size: FONT_PX, text_color: Some(colour) })
+                .into_iter()
+                .collect(),
+        }
+    }
 }
 
 /// A message of `/sample`: one row of `L_E`, with V_e beside it.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-pub(super) struct EpisodeRowJson {
+#[derive(Clone, PartialEq, prost::Message)]
+pub(super) struct RowMessage {
+    #[prost(uint64, tag = "1")]
     pub sequence: u64,
+    #[prost(uint64, tag = "2")]
     pub captured_at_ns: u64,
-    #[serde(deserialize_with = "null_is_nan")]
+    #[prost(float, tag = "3")]
     pub alpha_commanded_deg: f32,
-    #[serde(deserialize_with = "null_is_nan")]
+    #[prost(float, tag = "4")]
     pub alpha_measured_deg: f32,
-    #[serde(deserialize_with = "null_is_nan")]
+    #[prost(float, tag = "5")]
     pub area_px2: f32,
+    #[prost(string, tag = "6")]
     pub doubt: String,
+    #[prost(bool, tag = "7")]
     pub image: bool,
 }
 
 /// A message of `/feature`: a [`Feature`] with its codes in words.
-#[derive(Debug, Clone, PartialEq, Serialize)]
-pub(super) struct FeatureJson {
-    sequence: u64,
-    captured_at_ns: u64,
-    received_at_ns: u64,
-    published_at_ns: u64,
-    worker_epoch_ns: u64,
-    area_px2: f32,
-    confidence: f32,
-    doubt: &'static str,
-    triangle_px: [f32; 6],
+#[derive(Clone, PartialEq, prost::Message)]
+pub(super) struct FeatureMessage {
+    #[prost(uint64, tag = "1")]
+    pub sequence: u64,
+    #[prost(uint64, tag = "2")]
+    pub captured_at_ns: u64,
+    #[prost(uint64, tag = "3")]
+    pub received_at_ns: u64,
+    #[prost(uint64, tag = "4")]
+    pub published_at_ns: u64,
+    #[prost(uint64, tag = "5")]
+    pub worker_epoch_ns: u64,
+    #[prost(float, tag = "6")]
+    pub area_px2: f32,
+    #[prost(float, tag = "7")]
+    pub confidence: f32,
+    #[prost(string, tag = "8")]
+    pub doubt: String,
+    #[prost(float, repeated, tag = "9")]
+    pub triangle_px: Vec<f32>,
 }
 
-impl FeatureJson {
+impl FeatureMessage {
     pub(super) fn new(f: &Feature) -> Self {
         Self {
             sequence: f.sequence,
@@ -118,44 +221,53 @@ impl FeatureJson {
             worker_epoch_ns: f.worker_epoch_ns,
             area_px2: f.area_px2,
             confidence: f.confidence,
-            doubt: Doubt::from_code(f.doubt).words(),
-            triangle_px: f.triangle_px,
+            doubt: Doubt::from_code(f.doubt).words().into(),
+            triangle_px: f.triangle_px.to_vec(),
         }
     }
 }
 
 /// A message of `/telemetry`: a [`Telemetry`] with its codes in words.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-pub(super) struct TelemetryJson {
+#[derive(Clone, PartialEq, prost::Message)]
+pub(super) struct TelemetryMessage {
+    #[prost(uint64, tag = "1")]
     pub tick: u64,
+    #[prost(uint64, tag = "2")]
     pub at_ns: u64,
+    #[prost(uint64, tag = "3")]
     pub robot_at_ns: u64,
+    #[prost(uint64, tag = "4")]
     pub feature_sequence: u64,
-    pub phase: Phase,
-    #[serde(deserialize_with = "null_is_nan")]
+    #[prost(string, tag = "5")]
+    pub phase: String,
+    #[prost(float, tag = "6")]
     pub alpha_deg: f32,
-    #[serde(deserialize_with = "null_is_nan")]
+    #[prost(float, tag = "7")]
     pub alpha_measured_deg: f32,
-    #[serde(deserialize_with = "null_is_nan")]
+    #[prost(float, tag = "8")]
     pub dalpha_deg: f32,
-    #[serde(deserialize_with = "null_is_nan")]
+    #[prost(float, tag = "9")]
     pub area_px2: f32,
-    #[serde(deserialize_with = "null_is_nan")]
+    #[prost(float, tag = "10")]
     pub v_ml: f32,
-    #[serde(deserialize_with = "null_is_nan")]
+    #[prost(float, tag = "11")]
     pub d_ml: f32,
-    #[serde(deserialize_with = "null_is_nan")]
+    #[prost(float, tag = "12")]
     pub poured_ml: f32,
+    #[prost(float, tag = "13")]
+    pub goal_ml: f32,
+    #[prost(float, tag = "14")]
+    pub poured_sd_ml: f32,
 }
 
-impl TelemetryJson {
+impl TelemetryMessage {
     pub(super) fn new(t: &Telemetry) -> Self {
         Self {
             tick: t.tick,
             at_ns: t.at_ns,
             robot_at_ns: t.robot_at_ns,
             feature_sequence: t.feature_sequence,
-            phase: Phase::from_code(t.phase),
+            phase: phase_words(Phase::from_code(t.phase)).into(),
             alpha_deg: t.alpha_deg,
             alpha_measured_deg: t.alpha_measured_deg,
             dalpha_deg: t.dalpha_deg,
@@ -163,117 +275,20 @@ impl TelemetryJson {
             v_ml: t.v_ml,
             d_ml: t.d_ml,
             poured_ml: t.poured_ml,
+            goal_ml: t.goal_ml,
+            poured_sd_ml: t.poured_sd_ml,
         }
     }
 }
 
-/// A number in which `null` stands for NaN, which JSON does not have.
-fn null_is_nan<'de, D: Deserializer<'de>>(deserializer: D) -> Result<f32, D::Error> {
-    Ok(Option::<f32>::deserialize(deserializer)?.unwrap_or(f32::NAN))
-}
-
-/// Name, topic and JSON schema of each of the three JSON topics.
-pub(super) fn json_schemas() -> [(&'static str, &'static str, String); 3] {
-    [
-        (
-            "decant.Feature",
-            FEATURE_TOPIC,
-            schema(
-                "What the feature worker measured in one frame (V_e, section 3.3.1)",
-                &[
-                    ("sequence", "integer", "the camera's frame number"),
-                    ("captured_at_ns", "integer", "middle of the exposure, CLOCK_MONOTONIC ns"),
-                    ("received_at_ns", "integer", "when the worker took the frame, CLOCK_MONOTONIC ns"),
-                    ("published_at_ns", "integer", "when the worker published V_e, CLOCK_MONOTONIC ns"),
-                    ("worker_epoch_ns", "integer", "start of the worker process, CLOCK_MONOTONIC ns"),
-                    ("area_px2", "number", "V_e, px^2"),
-                    ("confidence", "number", "0 to 1"),
-                    ("doubt", "string", "why the area is doubtful"),
-                    ("triangle_px", "array", "x0 y0 x1 y1 x2 y2, px"),
-                ],
-            ),
-        ),
-        (
-            "decant.Telemetry",
-            TELEMETRY_TOPIC,
-            schema(
-                "What one tick of the controller saw and decided",
-                &[
-                    ("tick", "integer", "ticks since the controller started"),
-                    ("at_ns", "integer", "when the tick woke up, CLOCK_MONOTONIC ns"),
-                    ("robot_at_ns", "integer", "when the newest robot state arrived, CLOCK_MONOTONIC ns"),
-                    ("feature_sequence", "integer", "newest feature used"),
-                    ("phase", "string", "pouring, recording, returning or settling"),
-                    ("alpha_deg", "number", "commanded alpha, degrees"),
-                    ("alpha_measured_deg", "number", "measured alpha, degrees"),
-                    ("dalpha_deg", "number", "the policy's action, degrees; null if it was not asked"),
-                    ("area_px2", "number", "V_e of the newest feature, px^2; null without one"),
-                    ("v_ml", "number", "outflow attributed to the newest frame, ml"),
-                    ("d_ml", "number", "volume still to pour, ml"),
-                    ("poured_ml", "number", "estimated volume poured so far, ml"),
-                ],
-            ),
-        ),
-        (
-            "decant.Sample",
-            ROW_TOPIC,
-            schema(
-                "One frame of the episode: alpha at its capture time, and V_e",
-                &[
-                    ("sequence", "integer", "the camera's frame number"),
-                    ("captured_at_ns", "integer", "middle of the exposure, CLOCK_MONOTONIC ns"),
-                    ("alpha_commanded_deg", "number", "commanded alpha, interpolated, degrees"),
-                    ("alpha_measured_deg", "number", "measured alpha, interpolated, degrees; null if unknown"),
-                    ("area_px2", "number", "V_e, px^2"),
-                    ("doubt", "string", "why the area is doubtful"),
-                    ("image", "boolean", "whether the image is in this file"),
-                ],
-            ),
-        ),
-    ]
-}
-
-/// A JSON schema of an object with `fields`: name, type and description of each.
-fn schema(title: &str, fields: &[(&str, &str, &str)]) -> String {
-    let properties: serde_json::Map<String, serde_json::Value> = fields
-        .iter()
-        .map(|(name, kind, what)| {
-            let mut field = serde_json::json!({ "type": kind, "description": what });
-            if *kind == "array" {
-                field["items"] = serde_json::json!({ "type": "number" });
-            }
-            ((*name).into(), field)
-        })
-        .collect();
-    serde_json::json!({ "title": title, "type": "object", "properties": properties }).to_string()
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    /// Protects viewers and other readers: the schemas list each field that is written, and no other.
-    #[test]
-    fn schemas_list_exactly_the_fields_that_are_written() {
-        let row = EpisodeRowJson {
-            sequence: 1,
-            captured_at_ns: 2,
-            alpha_commanded_deg: 3.0,
-            alpha_measured_deg: 4.0,
-            area_px2: 5.0,
-            doubt: String::new(),
-            image: true,
-        };
-        let rows = [
-            serde_json::to_value(FeatureJson::new(&Feature::default())).unwrap(),
-            serde_json::to_value(TelemetryJson::new(&Telemetry::default())).unwrap(),
-            serde_json::to_value(row).unwrap(),
-        ];
-        for ((name, _, text), row) in json_schemas().into_iter().zip(rows) {
-            let schema: serde_json::Value = serde_json::from_str(&text).unwrap();
-            let documented: Vec<&String> = schema["properties"].as_object().unwrap().keys().collect();
-            let written: Vec<&String> = row.as_object().unwrap().keys().collect();
-            assert_eq!(documented, written, "{name}");
-        }
+/// The phase's name, as everywhere else.
+fn phase_words(phase: Phase) -> &'static str {
+    match phase {
+        Phase::NoRobot => "no-robot",
+        Phase::Idle => "idle",
+        Phase::Pouring => "pouring",
+        Phase::Returning => "returning",
+        Phase::Recording => "recording",
+        Phase::Settling => "settling",
     }
 }

@@ -9,7 +9,8 @@ use std::path::{Path, PathBuf};
 use mcap::records::Record;
 use prost::Message as _;
 
-use super::format::{self, CompressedImage, EpisodeRowJson, TelemetryJson};
+use super::format::{self, CompressedImage, RowMessage, TelemetryMessage};
+use super::format_1;
 use super::records::{EpisodeError, NextRecord, Records};
 use super::rows::{EpisodeRow, EpisodeTrack, LostFrames, alpha_between_deg};
 use super::weight::check_reading;
@@ -24,10 +25,10 @@ const SILENT_END_NS: u64 = 500_000_000;
 /// Everything in a file except the images themselves.
 #[derive(Default)]
 struct Contents {
-    /// Topic of each channel.
-    topics: BTreeMap<u16, String>,
-    frames: Vec<EpisodeRowJson>,
-    ticks: Vec<TelemetryJson>,
+    /// Topic of each channel, and whether its messages are JSON, as in format 1.
+    topics: BTreeMap<u16, (String, bool)>,
+    frames: Vec<RowMessage>,
+    ticks: Vec<TelemetryMessage>,
     images: u64,
     metadata: BTreeMap<String, BTreeMap<String, String>>,
 }
@@ -36,15 +37,21 @@ impl Contents {
     fn take(&mut self, record: Record) -> Result<(), String> {
         match record {
             Record::Channel(channel) => {
-                self.topics.insert(channel.id, channel.topic);
+                self.topics.insert(channel.id, (channel.topic, channel.message_encoding == "json"));
             }
             Record::Metadata(m) => {
                 self.metadata.insert(m.name, m.metadata);
             }
-            Record::Message { header, data } => match self.topics.get(&header.channel_id).map(String::as_str) {
-                Some(format::IMAGE_TOPIC) => self.images += 1,
-                Some(format::ROW_TOPIC) => self.frames.push(parse(format::ROW_TOPIC, &data)?),
-                Some(format::TELEMETRY_TOPIC) => self.ticks.push(parse(format::TELEMETRY_TOPIC, &data)?),
+            Record::Message { header, data } => match self.topics.get(&header.channel_id).map(|(topic, json)| (topic.as_str(), *json)) {
+                Some((format::IMAGE_TOPIC, _)) => self.images += 1,
+                Some((topic @ format::ROW_TOPIC, json)) => {
+                    let row = if json { format_1::row(&data) } else { decode(&data) };
+                    self.frames.push(row.map_err(|e| format!("{topic}: {e}"))?);
+                }
+                Some((topic @ format::TELEMETRY_TOPIC, json)) => {
+                    let tick = if json { format_1::tick(&data) } else { decode(&data) };
+                    self.ticks.push(tick.map_err(|e| format!("{topic}: {e}"))?);
+                }
                 _ => {}
             },
             _ => {}
@@ -139,6 +146,7 @@ impl Contents {
     /// Makes the episode called `name`. `whole` tells whether the file has its regular end.
     fn episode(self, name: &str, whole: bool) -> Result<Episode, String> {
         let started_at_ns = self.number(format::META_EPISODE, "started_at_ns")?;
+        self.metadata.get(format::META_EPISODE).map_or(Ok(0), clock_offset_ns)?;
         let rows = self.rows(started_at_ns)?;
         let text = |key: &str| self.text(format::META_EPISODE, key).to_string();
         let (first_tick, last_tick) = (self.ticks.first().map_or(0, |t| t.tick), self.ticks.last().map_or(0, |t| t.tick));
@@ -156,6 +164,7 @@ impl Contents {
                 config_sha256: text("config_sha256"),
                 weights: text("weights"),
                 ended: self.text(format::META_END, "reason").into(),
+                note: self.text(format::META_NOTE, "text").into(),
                 ticks: self.ticks.len() as u64,
                 lost_ticks: last_tick.saturating_sub(first_tick).saturating_add(1).saturating_sub(self.ticks.len() as u64),
                 images: self.images,
@@ -167,8 +176,9 @@ impl Contents {
     }
 }
 
-fn parse<T: serde::de::DeserializeOwned>(topic: &str, data: &[u8]) -> Result<T, String> {
-    serde_json::from_slice(data).map_err(|e| format!("{topic}: {e}"))
+/// A protobuf message of format 2.
+fn decode<T: prost::Message + Default>(data: &[u8]) -> Result<T, String> {
+    T::decode(data).map_err(|e| e.to_string())
 }
 
 impl Episode {
@@ -178,9 +188,9 @@ impl Episode {
         let mut contents = Contents::default();
         let next = records.next(|record| contents.take(record).map(|()| None::<()>))?;
         let format = contents.text(format::META_EPISODE, "format");
-        if format != format::FORMAT {
+        if ![format::FORMAT_1, format::FORMAT].contains(&format) {
             let what = match (contents.metadata.contains_key(format::META_EPISODE), matches!(next, NextRecord::Cut)) {
-                (true, _) => format!("it has format {format}, but this program reads format {}", format::FORMAT),
+                (true, _) => format!("it has format {format}, but this program reads formats {} and {}", format::FORMAT_1, format::FORMAT),
                 (false, true) => "its recorder was killed before anything was written".into(),
                 (false, false) => "the metadata 'episode' is missing".into(),
             };
@@ -207,13 +217,15 @@ pub struct EpisodeImage {
 pub struct EpisodeImages {
     records: Records,
     channels: Vec<u16>,
+    /// Unix time less CLOCK_MONOTONIC, ns; 0 in format 1, whose log times are CLOCK_MONOTONIC; `None` before the file has said it.
+    offset_ns: Option<i128>,
     ended: bool,
 }
 
 impl EpisodeImages {
     /// Opens an episode for its images.
     pub fn open(path: &Path) -> Result<Self, EpisodeError> {
-        Ok(Self { records: Records::open(path)?, channels: Vec::new(), ended: false })
+        Ok(Self { records: Records::open(path)?, channels: Vec::new(), offset_ns: None, ended: false })
     }
 }
 
@@ -224,15 +236,20 @@ impl Iterator for EpisodeImages {
         if self.ended {
             return None;
         }
-        let channels = &mut self.channels;
+        let (channels, offset_ns) = (&mut self.channels, &mut self.offset_ns);
         let next = self.records.next(|record| match record {
             Record::Channel(channel) if channel.topic == format::IMAGE_TOPIC => {
                 channels.push(channel.id);
                 Ok(None)
             }
+            Record::Metadata(m) if m.name == format::META_EPISODE => {
+                *offset_ns = Some(clock_offset_ns(&m.metadata)?);
+                Ok(None)
+            }
             Record::Message { header, data } if channels.contains(&header.channel_id) => {
+                let offset_ns = offset_ns.ok_or("an image comes before the metadata 'episode'")?;
                 let image = CompressedImage::decode(&*data).map_err(|e| format!("{}: {e}", format::IMAGE_TOPIC))?;
-                let captured_at_ns = header.log_time;
+                let captured_at_ns = format::monotonic_ns(header.log_time, offset_ns);
                 Ok(Some(EpisodeImage { sequence: header.sequence, captured_at_ns, format: image.format, data: image.data }))
             }
             _ => Ok(None),
@@ -245,6 +262,16 @@ impl Iterator for EpisodeImages {
         self.ended = true;
         item
     }
+}
+
+/// Unix time less CLOCK_MONOTONIC by the metadata about the start, ns; 0 in format 1.
+fn clock_offset_ns(about: &BTreeMap<String, String>) -> Result<i128, String> {
+    let text = |key: &str| about.get(key).map_or("", String::as_str);
+    if text("format") == format::FORMAT_1 {
+        return Ok(0);
+    }
+    let offset = text(format::CLOCK_OFFSET);
+    offset.parse::<i64>().map(i128::from).map_err(|_| format!("metadata 'episode': {} = '{offset}' is not a number", format::CLOCK_OFFSET))
 }
 
 /// The episode files that `paths` name: files as they are, directories as the `*.mcap` in them in order of name.

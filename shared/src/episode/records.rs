@@ -3,16 +3,26 @@
 //! A file whose writer was killed is read up to its last whole chunk. A damaged file is an error.
 
 use std::fs::File;
-use std::io::Read;
+use std::io::Read as _;
 use std::path::Path;
 
 use mcap::McapError;
 use mcap::records::{Record, op};
 use mcap::sans_io::linear_reader::{LinearReadEvent, LinearReader, LinearReaderOptions};
 
+use crate::regular_file;
+
 /// A record or chunk that claims to be larger than this counts as damaged, bytes. Chosen by hand: far above a chunk of the recorder, far
 /// below a computer's memory.
 const RECORD_LIMIT: usize = 256 << 20;
+/// A record may be so large in any file, bytes: of one that was cut, the last chunk may say to be larger than what is left. Chosen by hand: far
+/// above a chunk of the recorder.
+const RECORD_ALWAYS: usize = 64 << 20;
+/// A file's records are at most so many times larger than the file, and [`EXPANSION_BYTES`] more. Others count as damaged: a few bytes of a
+/// compressed chunk would fill the memory. Chosen by hand; the recorder does not compress, and other programs reach a tenth of it.
+const EXPANSION: u64 = 32;
+/// See [`EXPANSION`]; so that small files may be compressed well, bytes. Chosen by hand.
+const EXPANSION_BYTES: u64 = 4 << 20;
 /// Number of bytes that are read at a time. Chosen by hand; no measurement is recorded.
 const READ_BYTES: usize = 1 << 20;
 
@@ -61,20 +71,24 @@ pub struct Records {
     name: String,
     reader: LinearReader,
     data_ended: bool,
+    /// So many bytes of records may still come.
+    bytes_left: u64,
 }
 
 impl Records {
     /// Opens a file.
     pub fn open(path: &Path) -> Result<Self, EpisodeError> {
         let name = path.display().to_string();
-        let file = File::open(path).map_err(|e| EpisodeError::Read { file: name.clone(), what: e.to_string() })?;
+        let read_error = |e: std::io::Error| EpisodeError::Read { file: name.clone(), what: e.to_string() };
+        let (file, meta) = regular_file::open(path).map_err(read_error)?;
+        let bytes_left = meta.len().saturating_mul(EXPANSION).saturating_add(EXPANSION_BYTES);
         let options = LinearReaderOptions::default()
             .with_check_finishes_after_end_magic(true)
             .with_prevalidate_chunk_crcs(true)
             .with_validate_data_section_crc(true)
             .with_validate_summary_section_crc(true)
-            .with_record_length_limit(RECORD_LIMIT);
-        Ok(Self { file, name, reader: LinearReader::new_with_options(options), data_ended: false })
+            .with_record_length_limit(usize::try_from(bytes_left).unwrap_or(usize::MAX).clamp(RECORD_ALWAYS, RECORD_LIMIT));
+        Ok(Self { file, name, reader: LinearReader::new_with_options(options), data_ended: false, bytes_left })
     }
 
     /// The file's name.
@@ -113,6 +127,13 @@ impl Records {
                     if self.data_ended {
                         continue;
                     }
+                    self.bytes_left = self
+                        .bytes_left
+                        .checked_sub(data.len() as u64)
+                        .ok_or_else(|| damaged(format!("its records are more than {EXPANSION} times larger than the file")))?;
+                    if !lengths_fit(opcode, data) {
+                        return Err(damaged("a text in it is longer than its record".into()));
+                    }
                     let record = mcap::parse_record(opcode, data).map_err(|e| damaged(e.to_string()))?;
                     if let Some(item) = visit(record).map_err(damaged)? {
                         return Ok(NextRecord::Item(item));
@@ -121,4 +142,39 @@ impl Records {
             }
         }
     }
+}
+
+/// Whether the texts and maps in a record are no longer than the record: the library sets memory aside for what their lengths say, up to 4 GiB, before it
+/// looks whether they are there. The layouts are those of the MCAP specification, section Records.
+fn lengths_fit(opcode: u8, data: &[u8]) -> bool {
+    // Bytes before the texts, number of texts, and whether a map of texts follows.
+    let (fixed, texts, map) = match opcode {
+        op::HEADER => (0, 2, false),
+        op::SCHEMA => (2, 3, false),
+        op::CHANNEL => (4, 2, true),
+        op::MESSAGE_INDEX => (2, 1, false),
+        op::ATTACHMENT => (16, 2, false),
+        op::METADATA => (0, 1, true),
+        _ => return true,
+    };
+    let after_text = |rest: &mut &[u8]| -> Option<()> {
+        let (length, text) = rest.split_first_chunk::<4>()?;
+        *rest = text.get(u32::from_le_bytes(*length) as usize..)?;
+        Some(())
+    };
+    let look = || -> Option<()> {
+        let mut rest = data.get(fixed..)?;
+        for _ in 0..texts {
+            after_text(&mut rest)?;
+        }
+        if map {
+            let (length, pairs) = rest.split_first_chunk::<4>()?;
+            let mut pairs = pairs.get(..u32::from_le_bytes(*length) as usize)?;
+            while !pairs.is_empty() {
+                after_text(&mut pairs)?;
+            }
+        }
+        Some(())
+    };
+    look().is_some()
 }

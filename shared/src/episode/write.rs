@@ -1,7 +1,9 @@
 //! Writes one episode's MCAP file, see [`crate::episode`]. It allocates and is for ordinary threads only. Every error is a [`WriteError`].
 //!
 //! A chunk is built in memory and written whole at least every half second, always between two frames. A recorder that is killed
-//! therefore leaves a file that can be read up to then. A new file never takes the name of one that is there.
+//! therefore leaves a file that can be read up to then. The messages of a file are in the order of their times, although a frame is written
+//! after the tick that follows it. A new file never takes the name of one that is there. While it is written it is locked, so that nothing
+//! that deletes episodes takes it away.
 
 use std::collections::BTreeMap;
 use std::fs::{File, OpenOptions};
@@ -11,12 +13,11 @@ use std::time::{SystemTime, UNIX_EPOCH};
 
 use mcap::records::MessageHeader;
 use mcap::{WriteOptions, Writer};
-use prost::Message as _;
 use sha2::{Digest, Sha256};
 
-use super::format::{self, CompressedImage, EpisodeRowJson, FeatureJson, TelemetryJson};
+use super::format::{self, CompressedImage, FeatureMessage, ImageAnnotations, RowMessage, TelemetryMessage};
 use super::number::{LARGEST, take_number};
-use super::{EpisodeKind, hex};
+use super::{EpisodeKind, hex, schema};
 use crate::config::Config;
 use crate::messages::{Doubt, Feature, Telemetry};
 
@@ -24,6 +25,8 @@ use crate::messages::{Doubt, Feature, Telemetry};
 const CHUNK_NS: u64 = 500_000_000;
 /// A chunk is closed when it is this large, bytes. Chosen by hand; no measurement is recorded.
 const CHUNK_BYTES: usize = 1 << 20;
+/// A frame is written at most so much later than a tick of its time, ns. Chosen by hand: twice as long as the recorder waits for a frame.
+const LATE_NS: u64 = 1_000_000_000;
 /// Number of bytes that are handed to the operating system at a time. Chosen by hand; no measurement is recorded.
 const WRITE_BYTES: usize = 1 << 16;
 
@@ -93,12 +96,22 @@ pub struct EpisodeEnd<'a> {
 pub struct EpisodeWriter {
     writer: Writer<BufWriter<File>>,
     path: PathBuf,
-    image_channel: u16,
-    feature_channel: u16,
-    telemetry_channel: u16,
-    row_channel: u16,
+    /// Channels of the images, what is drawn over them, the features, the ticks and the rows.
+    channels: [u16; 5],
+    /// Unix time less CLOCK_MONOTONIC, ns.
+    offset_ns: i128,
     chunk_since_ns: u64,
-    chunk_bytes: usize,
+    /// What is not in a chunk yet.
+    pending: Vec<Pending>,
+    pending_bytes: usize,
+}
+
+/// A message that waits for those before it.
+struct Pending {
+    at_ns: u64,
+    channel: u16,
+    sequence: u32,
+    data: Vec<u8>,
 }
 
 impl EpisodeWriter {
@@ -114,23 +127,20 @@ impl EpisodeWriter {
             .library(concat!("decant ", env!("CARGO_PKG_VERSION")));
         let mut writer = Writer::with_options(BufWriter::with_capacity(WRITE_BYTES, file), options).map_err(fail)?;
         let none = BTreeMap::new();
-        let schema = writer.add_schema("foxglove.CompressedImage", "protobuf", &format::compressed_image_schema()).map_err(fail)?;
-        let image_channel = writer.add_channel(schema, format::IMAGE_TOPIC, "protobuf", &none).map_err(fail)?;
-        let mut json = [0; 3];
-        for (channel, (name, topic, text)) in json.iter_mut().zip(format::json_schemas()) {
-            let schema = writer.add_schema(name, "jsonschema", text.as_bytes()).map_err(fail)?;
-            *channel = writer.add_channel(schema, topic, "json", &none).map_err(fail)?;
+        let mut channels = [0; 5];
+        for (channel, (topic, name, schema)) in channels.iter_mut().zip(schema::channels()) {
+            let schema = writer.add_schema(name, "protobuf", &schema).map_err(fail)?;
+            *channel = writer.add_channel(schema, topic, "protobuf", &none).map_err(fail)?;
         }
-        let [feature_channel, telemetry_channel, row_channel] = json;
+        let unix_ns = start.wall_clock.duration_since(UNIX_EPOCH).map_or(0, |d| d.as_nanos());
         let mut this = Self {
             writer,
             path,
-            image_channel,
-            feature_channel,
-            telemetry_channel,
-            row_channel,
+            channels,
+            offset_ns: unix_ns as i128 - i128::from(start.started_at_ns),
             chunk_since_ns: start.started_at_ns,
-            chunk_bytes: 0,
+            pending: Vec::new(),
+            pending_bytes: 0,
         };
         this.describe(start)?;
         Ok(this)
@@ -151,6 +161,7 @@ impl EpisodeWriter {
             ("cell", start.config.cell.name.clone()),
             ("started_at_ns", start.started_at_ns.to_string()),
             ("started_at_unix_ns", unix_ns.to_string()),
+            (format::CLOCK_OFFSET, self.offset_ns.to_string()),
             ("started_at_utc", rfc3339((unix_ns / 1_000_000_000) as u64)),
             ("config_sha256", config_sha256.clone()),
             ("weights", start.weights.to_string()),
@@ -176,21 +187,20 @@ impl EpisodeWriter {
         self.writer.write_metadata(&record).map_err(|e| file_error(&self.path, &e))
     }
 
-    /// Writes one frame: its row of `L_E`, its feature and its image.
+    /// Writes one frame: its row of `L_E`, its feature, its image and what is drawn over it.
     pub fn frame(&mut self, frame: &FrameRow) -> Result<(), WriteError> {
         let feature = frame.feature;
         let at_ns = feature.captured_at_ns;
+        let unix_ns = format::unix_ns(at_ns, self.offset_ns);
+        let [images, annotations, features, _, rows] = self.channels;
         if let Some((format, data)) = frame.image {
-            let image = CompressedImage {
-                timestamp: Some(prost_types::Timestamp { seconds: (at_ns / 1_000_000_000) as i64, nanos: (at_ns % 1_000_000_000) as i32 }),
-                data: data.to_vec(),
-                format: format.into(),
-                frame_id: "camera".into(),
-            };
-            self.message(self.image_channel, feature.sequence, at_ns, &image.encode_to_vec())?;
+            let timestamp = Some(format::timestamp(unix_ns));
+            let image = CompressedImage { timestamp, data: data.to_vec(), format: format.into(), frame_id: "camera".into() };
+            self.message(images, feature.sequence, at_ns, &image);
         }
-        self.json(self.feature_channel, feature.sequence, at_ns, &FeatureJson::new(feature))?;
-        let row = EpisodeRowJson {
+        self.message(annotations, feature.sequence, at_ns, &ImageAnnotations::new(feature, unix_ns));
+        self.message(features, feature.sequence, at_ns, &FeatureMessage::new(feature));
+        let row = RowMessage {
             sequence: feature.sequence,
             captured_at_ns: at_ns,
             alpha_commanded_deg: frame.alpha_commanded_deg,
@@ -199,39 +209,55 @@ impl EpisodeWriter {
             doubt: Doubt::from_code(feature.doubt).words().into(),
             image: frame.image.is_some(),
         };
-        self.json(self.row_channel, feature.sequence, at_ns, &row)?;
-        if at_ns.saturating_sub(self.chunk_since_ns) >= CHUNK_NS || self.chunk_bytes >= CHUNK_BYTES {
+        self.message(rows, feature.sequence, at_ns, &row);
+        if at_ns.saturating_sub(self.chunk_since_ns) >= CHUNK_NS || self.pending_bytes >= CHUNK_BYTES {
             self.chunk_since_ns = at_ns;
-            self.flush()?;
+            self.flush_until(at_ns)?;
         }
         Ok(())
     }
 
     /// Writes one tick of the controller.
     pub fn telemetry(&mut self, telemetry: &Telemetry) -> Result<(), WriteError> {
-        self.json(self.telemetry_channel, telemetry.tick, telemetry.at_ns, &TelemetryJson::new(telemetry))
+        let at_ns = telemetry.at_ns;
+        self.message(self.channels[3], telemetry.tick, at_ns, &TelemetryMessage::new(telemetry));
+        // The frames have stopped: their ticks are kept all the same.
+        if at_ns.saturating_sub(self.chunk_since_ns) >= 2 * LATE_NS {
+            self.chunk_since_ns = at_ns - LATE_NS;
+            self.flush_until(at_ns - LATE_NS)?;
+        }
+        Ok(())
     }
 
-    fn json(&mut self, channel: u16, sequence: u64, at_ns: u64, row: &impl serde::Serialize) -> Result<(), WriteError> {
-        let text = serde_json::to_vec(row).map_err(|e| file_error(&self.path, &e))?;
-        self.message(channel, sequence, at_ns, &text)
-    }
-
-    fn message(&mut self, channel_id: u16, sequence: u64, at_ns: u64, data: &[u8]) -> Result<(), WriteError> {
+    fn message(&mut self, channel: u16, sequence: u64, at_ns: u64, message: &impl prost::Message) {
+        let data = message.encode_to_vec();
+        self.pending_bytes += data.len();
         // MCAP's own sequence field has 32 bits. It gets the low ones, for readers that look for gaps.
-        self.chunk_bytes += data.len();
-        let header = MessageHeader { channel_id, sequence: sequence as u32, log_time: at_ns, publish_time: at_ns };
-        self.writer.write_to_known_channel(&header, data).map_err(|e| file_error(&self.path, &e))
+        self.pending.push(Pending { at_ns, channel, sequence: sequence as u32, data });
     }
 
     /// Closes the chunk under way and hands it to the operating system.
     pub fn flush(&mut self) -> Result<(), WriteError> {
-        self.chunk_bytes = 0;
-        self.writer.flush().map_err(|e| file_error(&self.path, &e))
+        self.flush_until(u64::MAX)
+    }
+
+    /// Writes all messages up to `until_ns` in the order of their times, as one chunk.
+    fn flush_until(&mut self, until_ns: u64) -> Result<(), WriteError> {
+        let fail = |e: mcap::McapError| file_error(&self.path, &e);
+        self.pending.sort_by_key(|m| m.at_ns);
+        let due = self.pending.partition_point(|m| m.at_ns <= until_ns);
+        for message in self.pending.drain(..due) {
+            self.pending_bytes -= message.data.len();
+            let log_time = format::unix_ns(message.at_ns, self.offset_ns);
+            let header = MessageHeader { channel_id: message.channel, sequence: message.sequence, log_time, publish_time: log_time };
+            self.writer.write_to_known_channel(&header, &message.data).map_err(fail)?;
+        }
+        self.writer.flush().map_err(fail)
     }
 
     /// Writes how the episode ended and the index, waits until everything is on the disk, and returns the file's path.
     pub fn finish(mut self, end: &EpisodeEnd) -> Result<PathBuf, WriteError> {
+        self.flush()?;
         let about = [
             ("complete", end.complete.to_string()),
             ("reason", end.reason.to_string()),
@@ -261,7 +287,11 @@ fn create_file(directory: &Path, number: u64) -> Result<(File, PathBuf), WriteEr
         let path = directory.join(format!("episode-{number:04}.mcap"));
         // Only a file that was not there is ours.
         match OpenOptions::new().write(true).create_new(true).open(&path) {
-            Ok(file) => return Ok((file, path)),
+            Ok(file) => {
+                // Nobody else has the file yet, so the lock is free. A file system without locks is no reason not to record.
+                let _ = file.try_lock();
+                return Ok((file, path));
+            }
             Err(e) if e.kind() == ErrorKind::AlreadyExists => number = take_number(&directory).map_err(fail)?,
             Err(e) => return Err(file_error(&path, &e)),
         }

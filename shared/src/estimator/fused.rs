@@ -200,7 +200,8 @@ impl FusedEstimator {
             camera_ml * camera_ml
         };
         let Pour { watch, .. } = &self.pour;
-        (estimate_ml2.max(0.0) + watch.unexplained_ml().powi(2) + watch.unconfirmed_ml().powi(2)).sqrt()
+        let withheld_ml = watch.unconfirmed_ml() + if share > STRAIGHT_SHARE { 0.0 } else { watch.lone_ml() };
+        (estimate_ml2.max(0.0) + watch.unexplained_ml().powi(2) + withheld_ml * withheld_ml).sqrt()
     }
 
     /// Whether what was seen cannot be.

@@ -2,7 +2,8 @@
 //!
 //! It is pure and runs in the controller's loop: its size is fixed, and it does not allocate, panic or fail. A lone odd frame moves nothing; a
 //! row of them is impossible, and then nothing that the camera says is to be believed. What was withheld as odd waits for the very next frame, which
-//! confirms or refutes it. If that one is lost or does neither, it is forgotten, and the estimate doubts as much (`Watch::unconfirmed_ml`).
+//! confirms it or not. If it does not, it is forgotten, and the estimate doubts as much (`Watch::unconfirmed_ml`, `Watch::lone_ml`), but for a lone
+//! leap of a stream that goes on as before out of a straight vessel.
 //!
 //! | rule | verdict |
 //! |---|---|
@@ -70,8 +71,7 @@ const LEAP_ML: f64 = 3.0;
 /// The part of a leap that the next frame has to show for it to be real, unless that one leaps as well. Chosen by hand; no measurement is
 /// recorded.
 const LEAP_STAYS: f64 = 0.5;
-/// A frame refutes the leap before it if its outflow is that of before the leap, up to this factor and this many ml: what lets 10 ml and more out
-/// at once does not flow afterwards as if nothing had been. Chosen by hand: frames of one stream differ by less.
+/// After a lone leap, the stream is what it was before up to this factor and this many ml. Chosen by hand: frames of one stream differ by less.
 const AS_BEFORE: (f64, f64) = (2.0, 0.3);
 /// Number of frames in a row that show a stream at an upright container, or too much of one. Chosen by hand: more than a reflection gives.
 const TOO_MUCH_FRAMES: u32 = 3;
@@ -208,6 +208,8 @@ pub(super) struct Watch {
     odd_ml: Option<(f64, f64)>,
     /// What was withheld, and neither confirmed nor refuted by the frame after it, ml.
     unconfirmed_ml: f64,
+    /// What was withheld, and after which the stream was what it was before, ml.
+    lone_ml: f64,
     verdict: Option<Impossible>,
 }
 
@@ -263,6 +265,19 @@ impl Watch {
         self.unconfirmed_ml + self.withheld_ml.unwrap_or(0.0) + self.odd_ml.map_or(0.0, |(odd_ml, _)| odd_ml)
     }
 
+    /// What was withheld as a lone leap, after which the stream was what it was before, ml; at least 0. A straight vessel gives no such thing, so there
+    /// it was none; a steep one whose liquid swings lets 40 ml out in one frame and goes on as before, so there nobody knows.
+    pub fn lone_ml(&self) -> f64 {
+        self.lone_ml
+    }
+
+    /// Takes what was withheld and is not confirmed by the frame after it, ml.
+    fn not_confirmed(&mut self, withheld_ml: f64, before_ml: f64, after_ml: f64) {
+        let (factor, more_ml) = AS_BEFORE;
+        let as_before = after_ml <= factor * before_ml + more_ml && before_ml <= factor * after_ml + more_ml;
+        *(if as_before { &mut self.lone_ml } else { &mut self.unconfirmed_ml }) += withheld_ml;
+    }
+
     /// Takes a lost frame: what was withheld in the frame before it is forgotten, as a later one says nothing about it, and stays in doubt.
     pub fn lost(&mut self) {
         self.unconfirmed_ml = self.unconfirmed_ml();
@@ -280,7 +295,7 @@ impl Watch {
                 self.leapt = true;
                 return Leap::Confirmed { withheld_ml };
             }
-            self.unconfirmed_ml += unless_refuted(withheld_ml, newest_ml, measured_ml);
+            self.not_confirmed(withheld_ml, newest_ml, measured_ml);
         }
         if leaps {
             self.withheld_ml = Some(measured_ml);
@@ -300,7 +315,7 @@ impl Watch {
             if leaps || measured_ml >= LEAP_STAYS * withheld_ml {
                 return Leap::Confirmed { withheld_ml };
             }
-            self.unconfirmed_ml += unless_refuted(withheld_ml, before_ml, measured_ml);
+            self.not_confirmed(withheld_ml, before_ml, measured_ml);
         }
         if lone {
             self.odd_ml = Some((measured_ml, self.recent_ml[1]));
@@ -308,11 +323,4 @@ impl Watch {
         }
         Leap::None
     }
-}
-
-/// What stays in doubt of an outflow that was withheld and not confirmed, ml: all of it, unless the stream after it is what it was before.
-fn unless_refuted(withheld_ml: f64, before_ml: f64, after_ml: f64) -> f64 {
-    let (factor, more_ml) = AS_BEFORE;
-    let as_before = after_ml <= factor * before_ml + more_ml && before_ml <= factor * after_ml + more_ml;
-    if as_before { 0.0 } else { withheld_ml }
 }

@@ -12,7 +12,7 @@ use std::time::{Duration, Instant};
 use tests::{CellUnderTest, Namespaces, steady_weights};
 
 /// How often each attack is measured.
-const ROUNDS: usize = 5;
+const ROUNDS: usize = 3;
 /// Size of the `/dev/shm` that is filled, in the words of mount(8).
 const SMALL: &str = "64M";
 

@@ -24,14 +24,23 @@ pub struct Args {
     out: PathBuf,
 }
 
+/// What is said of a file that holds no JSON, such as the weight file itself.
+fn wanted(name: &str) -> String {
+    let beside = format!("{name}.json");
+    let beside = if std::path::Path::new(&beside).exists() { format!("give {beside} instead") } else { "such as weights.bin.json".into() };
+    format!(
+        "{name}: holds no JSON; a page is made of what `trainer train` and `refine` write beside the weights, or `experiments evaluate --json` \
+         and `reproduce --json` write: {beside}"
+    )
+}
+
 /// Runs the command.
 pub fn run(args: &Args) -> Result<(), Failure> {
     let mut files = Vec::new();
     for file in &args.files {
         let name = file.display().to_string();
-        let text = std::fs::read_to_string(file).map_err(|e| e.to_string());
-        let value = text.and_then(|t| serde_json::from_str(&t).map_err(|e| e.to_string()));
-        let value = value.map_err(|e| format!("{name}: {e}")).or_exit(exit::BAD_INPUT)?;
+        let bytes = std::fs::read(file).map_err(|e| format!("{name}: {e}")).or_exit(exit::BAD_INPUT)?;
+        let value = serde_json::from_slice(&bytes).map_err(|_| wanted(&name)).or_exit(exit::BAD_INPUT)?;
         files.push((name, value));
     }
     let html = report::build(&files).or_exit(exit::BAD_INPUT)?;

@@ -8,7 +8,7 @@ use serde_json::Value;
 
 use super::json::{items, number, numbers, rounded, text};
 use super::page::{figure, table};
-use super::plot::{PlotSeries, histogram, plot};
+use super::plot::{PlotSeries, histogram, plot, plot_below};
 
 /// Dots of a method in a plot: with every dot of a large evaluation, a page would be tens of megabytes.
 const DOTS: usize = 600;
@@ -17,6 +17,8 @@ const BIN_ML: f64 = 0.5;
 /// Errors beyond this are counted in the outermost bins, ml.
 const LAST_BIN_ML: f64 = 12.0;
 
+/// Columns of a table of errors. Chosen by hand: with the names of the rows they fit a window of 1,000 px.
+const METHODS_A_TABLE: usize = 6;
 /// The last number of standard deviations on the calibration's axis.
 const LAST_SDS: f64 = 3.0;
 /// Number of points of a line of it.
@@ -42,7 +44,7 @@ pub fn evaluation(v: &Value) -> String {
     html + "</div>"
 }
 
-/// A row of errors for each method.
+/// Errors of each method. The methods are the columns, so that the table is narrow; many of them make several tables.
 fn summaries(summaries: &Value) -> String {
     let heading = [
         "method",
@@ -64,10 +66,10 @@ fn summaries(summaries: &Value) -> String {
         "control",
         "s a pour",
     ];
-    let mut rows = vec![heading.map(String::from).to_vec()];
+    let mut methods = Vec::new();
     for s in items(summaries) {
         let percent = |key: &str| s[key].as_f64().map_or_else(String::new, |x| format!("{:.1}\u{a0}%", 100.0 * x));
-        rows.push(vec![
+        methods.push([
             text(&s["name"]),
             s["n"].to_string(),
             rounded(&s["mae_ml"], 2),
@@ -88,7 +90,12 @@ fn summaries(summaries: &Value) -> String {
             rounded(&s["seconds"], 1),
         ]);
     }
-    table(&rows)
+    let names = heading.map(String::from);
+    let one = |methods: &[[String; 18]]| {
+        let row = |(i, name): (usize, &String)| [name.clone()].into_iter().chain(methods.iter().map(|m| m[i].clone())).collect();
+        table(&names.iter().enumerate().map(row).collect::<Vec<Vec<String>>>())
+    };
+    methods.chunks(METHODS_A_TABLE).map(one).collect()
 }
 
 /// Goal against poured, and the errors' histogram, of each method.
@@ -148,13 +155,14 @@ fn within_normal(sds: f64) -> f64 {
 /// One pour frame by frame.
 fn trace(trace: &Value) -> String {
     let column = |key: &str| -> Vec<(f64, f64)> { numbers(&trace["t_s"]).into_iter().zip(numbers(&trace[key])).collect() };
-    let series = [
-        PlotSeries::line("alpha, degrees", column("alpha_deg")),
-        PlotSeries::line("poured, ml", column("true_ml")),
-        PlotSeries::line("area / 4, px²", column("area_4_px2")),
+    let area_px2: Vec<(f64, f64)> = column("area_4_px2").into_iter().map(|(t, quarter)| (t, 4.0 * quarter)).collect();
+    let panels = [
+        ("alpha, degrees", PlotSeries::line("alpha", column("alpha_deg"))),
+        ("V_e, px²", PlotSeries::line("V_e", area_px2)),
+        ("poured, ml", PlotSeries::line("poured", column("true_ml"))),
     ];
     let caption = format!("A pour of {} ml from {} ml, {}.", trace["goal_ml"], trace["init_ml"], text(&trace["name"]));
-    figure(&plot("time in s", "degrees, ml, px² / 4", &series, true), &caption)
+    figure(&plot_below("time in s", &panels), &caption)
 }
 
 /// Error against number of episodes, if several evaluations differ in that number; otherwise nothing.

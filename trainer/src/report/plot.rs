@@ -55,6 +55,8 @@ const COLOURS: [RGBColor; 8] = [
     RGBColor(160, 110, 60),
 ];
 
+/// Height of each plot of several one below the other, px. Chosen by hand: three are as high as wide, and a little more.
+const PANEL_PX: u32 = 190;
 /// Colour of a reference.
 const DARK: RGBColor = RGBColor(20, 20, 20);
 
@@ -84,8 +86,41 @@ pub fn plot(x_title: &str, y_title: &str, series: &[PlotSeries], from_zero: bool
     format!("{svg}<div class=legend>{entries}</div>")
 }
 
+/// Plots one below the other over the same x, each with the title and the unit of its own y-axis, as one SVG element.
+pub fn plot_below(x_title: &str, panels: &[(&str, PlotSeries)]) -> String {
+    let mut svg = String::new();
+    let drawn = || -> Result<(), Box<dyn std::error::Error>> {
+        let root = SVGBackend::with_string(&mut svg, (480, PANEL_PX * panels.len() as u32)).into_drawing_area();
+        root.fill(&WHITE)?;
+        for (area, (y_title, series)) in root.split_evenly((panels.len(), 1)).iter().zip(panels) {
+            draw_on(area, x_title, y_title, std::slice::from_ref(series), true)?;
+        }
+        root.present()?;
+        Ok(())
+    };
+    if drawn().is_err() {
+        return "<p>(this plot could not be drawn)</p>".into();
+    }
+    svg.find("<svg").map_or(svg.clone(), |at| svg[at..].to_owned())
+}
+
 /// Draws the plot without its legend into `svg`.
 fn draw(svg: &mut String, x_title: &str, y_title: &str, series: &[PlotSeries], from_zero: bool) -> Result<(), Box<dyn std::error::Error>> {
+    let root = SVGBackend::with_string(svg, (480, 320)).into_drawing_area();
+    root.fill(&WHITE)?;
+    draw_on(&root, x_title, y_title, series, from_zero)?;
+    root.present()?;
+    Ok(())
+}
+
+/// Draws a plot into an area.
+fn draw_on(
+    area: &DrawingArea<SVGBackend<'_>, plotters::coord::Shift>,
+    x_title: &str,
+    y_title: &str,
+    series: &[PlotSeries],
+    from_zero: bool,
+) -> Result<(), Box<dyn std::error::Error>> {
     let all = || series.iter().flat_map(|s| &s.points).filter(|(x, y)| x.is_finite() && y.is_finite());
     let bounds = |f: fn(&(f64, f64)) -> f64| {
         let low = all().map(f).fold(f64::INFINITY, f64::min);
@@ -103,9 +138,7 @@ fn draw(svg: &mut String, x_title: &str, y_title: &str, series: &[PlotSeries], f
     // Where all x are whole numbers, as those of episodes are, there are no ticks between them.
     let whole = all().all(|(x, _)| x.fract() == 0.0);
     let tick = |v: f64| ((v * 1e6).round() / 1e6).to_string();
-    let root = SVGBackend::with_string(svg, (480, 320)).into_drawing_area();
-    root.fill(&WHITE)?;
-    let mut chart = ChartBuilder::on(&root)
+    let mut chart = ChartBuilder::on(area)
         .margin(10)
         .x_label_area_size(44)
         .y_label_area_size(58)
@@ -129,7 +162,6 @@ fn draw(svg: &mut String, x_title: &str, y_title: &str, series: &[PlotSeries], f
             SeriesStyle::Dots => chart.draw_series(points.map(|p| Circle::new(p, 2, colour.mix(0.55).filled())))?,
         };
     }
-    root.present()?;
     Ok(())
 }
 

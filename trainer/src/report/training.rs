@@ -15,12 +15,18 @@ pub fn training(v: &Value) -> String {
     html += &facts(&origin(v));
     html += "<div class=plots>";
     let loss: Vec<(f64, f64)> = (1..).map(|k| (k * REPORT_EVERY) as f64).zip(numbers(&v["loss"])).collect();
-    html += &figure(&plot("Adam step", "loss", &[PlotSeries::line("loss", loss)], false), "Learning curve of the network.");
+    html += &figure(
+        &plot("step of the optimiser", "loss", &[PlotSeries::line("loss", loss)], false),
+        "Learning curve of the network: the cross-entropy between its answers and the actions that the method teaches, mean over the examples of \
+         one step of the optimiser (Adam). It falls while something is learned and levels off when no more is to be had. Its level is no error in \
+         ml: an evaluation tells that. If it still falls at its end, more steps may help.",
+    );
     let cost: Vec<(f64, f64)> = (1..).map(f64::from).zip(numbers(&v["search_cost"])).collect();
     if !cost.is_empty() {
         html += &figure(
             &plot("iteration", "cost", &[PlotSeries::line("cost", cost)], true),
-            "Search of the control law: mean cost of the elites.",
+            "Search of the control law: mean cost of the best candidates of each round in pours of the fitted model, made of error and time. It falls \
+             until the search has settled.",
         );
     }
     if items(&v["extra"]["pours"]).next().is_some() {

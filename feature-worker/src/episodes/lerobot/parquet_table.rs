@@ -5,7 +5,7 @@ use std::path::Path;
 use std::sync::Arc;
 
 use parquet::basic::Compression;
-use parquet::data_type::{ByteArray, ByteArrayType, DoubleType, FloatType, Int64Type};
+use parquet::data_type::{BoolType, ByteArray, ByteArrayType, DoubleType, FloatType, Int64Type};
 use parquet::errors::Result as ParquetResult;
 use parquet::file::metadata::KeyValue;
 use parquet::file::properties::WriterProperties;
@@ -22,6 +22,8 @@ pub enum Column {
     Float(Vec<f32>),
     /// Numbers of 64 bits.
     Double(Vec<f64>),
+    /// Numbers of 64 bits, of which some are not there.
+    OptionalDouble(Vec<Option<f64>>),
     /// Texts.
     Text(Vec<String>),
     /// Rows of `width` values each.
@@ -30,6 +32,29 @@ pub enum Column {
         width: usize,
         /// All rows, one after the other.
         values: Vec<f32>,
+    },
+    /// Rows of `width` marks each.
+    BoolList {
+        /// Values in each row.
+        width: usize,
+        /// All rows, one after the other.
+        values: Vec<bool>,
+    },
+    /// Rows of `width` values each.
+    DoubleList {
+        /// Values in each row.
+        width: usize,
+        /// All rows, one after the other.
+        values: Vec<f64>,
+    },
+    /// Rows of a list with one number each.
+    IntList(Vec<i64>),
+    /// Rows of `width` lists of one list of one value each: a number for each channel of an image, as LeRobot has them.
+    ChannelList {
+        /// Channels.
+        width: usize,
+        /// All rows, one after the other.
+        values: Vec<f64>,
     },
     /// Rows of a list with one text each.
     TextList(Vec<String>),
@@ -43,6 +68,14 @@ impl Column {
             Self::Int(_) => format!("required int64 {name};\n"),
             Self::Float(_) => format!("required float {name};\n"),
             Self::Double(_) => format!("required double {name};\n"),
+            Self::OptionalDouble(_) => format!("optional double {name};\n"),
+            Self::BoolList { .. } => list("boolean element"),
+            Self::DoubleList { .. } => list("double element"),
+            Self::IntList(_) => list("int64 element"),
+            Self::ChannelList { .. } => format!(
+                "required group {name} (LIST) {{ repeated group list {{ required group element (LIST) {{ repeated group list {{ \
+                 required group element (LIST) {{ repeated group list {{ required double element; }} }} }} }} }} }}\n"
+            ),
             Self::Text(_) => format!("required binary {name} (UTF8);\n"),
             Self::FloatList { .. } => list("float element"),
             Self::TextList(_) => list("binary element (UTF8)"),
@@ -57,9 +90,26 @@ impl Column {
             Self::Float(values) => writer.typed::<FloatType>().write_batch(&values, None, None),
             Self::Double(values) => writer.typed::<DoubleType>().write_batch(&values, None, None),
             Self::Text(texts) => writer.typed::<ByteArrayType>().write_batch(&bytes(texts), None, None),
+            Self::OptionalDouble(values) => {
+                let there: Vec<i16> = values.iter().map(|v| i16::from(v.is_some())).collect();
+                let values: Vec<f64> = values.into_iter().flatten().collect();
+                writer.typed::<DoubleType>().write_batch(&values, Some(&there), None)
+            }
             Self::FloatList { width, values } => {
-                let repetition: Vec<i16> = (0..values.len()).map(|i| i16::from(i % width != 0)).collect();
-                writer.typed::<FloatType>().write_batch(&values, Some(&vec![1; values.len()]), Some(&repetition))
+                writer.typed::<FloatType>().write_batch(&values, Some(&vec![1; values.len()]), Some(&repetition(width, values.len())))
+            }
+            Self::BoolList { width, values } => {
+                writer.typed::<BoolType>().write_batch(&values, Some(&vec![1; values.len()]), Some(&repetition(width, values.len())))
+            }
+            Self::DoubleList { width, values } => {
+                writer.typed::<DoubleType>().write_batch(&values, Some(&vec![1; values.len()]), Some(&repetition(width, values.len())))
+            }
+            Self::IntList(values) => {
+                writer.typed::<Int64Type>().write_batch(&values, Some(&vec![1; values.len()]), Some(&vec![0; values.len()]))
+            }
+            // A list in a list in a list: each value is there by level 3, and is the only one of its two inner lists.
+            Self::ChannelList { width, values } => {
+                writer.typed::<DoubleType>().write_batch(&values, Some(&vec![3; values.len()]), Some(&repetition(width, values.len())))
             }
             Self::TextList(texts) => {
                 let n = texts.len();
@@ -67,6 +117,11 @@ impl Column {
             }
         }
     }
+}
+
+/// Repetition levels of `values` values in rows of `width`.
+fn repetition(width: usize, values: usize) -> Vec<i16> {
+    (0..values).map(|i| i16::from(i % width != 0)).collect()
 }
 
 /// Writes `columns`, each with its name, to the new file `path`, with a `note` in the file's metadata.

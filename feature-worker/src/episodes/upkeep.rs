@@ -1,0 +1,201 @@
+//! Deletes, prunes, splits and merges episodes, without ever touching anything else.
+//!
+//! Used by `feature-worker episodes`, on the command's thread; no cell needs to run. Allocates. What is deleted is an episode that can be read,
+//! a regular file of its own name, and not under way: the recorder holds a lock on the file that it writes. Copies are compared with the
+//! original before they get their name, and never take the place of a file. A failure names its file, and leaves the rest as it is.
+
+use std::fs::{self, File};
+use std::io::ErrorKind;
+use std::os::unix::fs::MetadataExt;
+use std::path::{Path, PathBuf};
+use std::time::{Duration, SystemTime};
+
+use sha2::{Digest, Sha256};
+use shared::episode::{Episode, hex, take_number};
+
+use super::output::{ExportError, LeftOut, write_error};
+
+/// A file without its end that changed more recently than this counts as under way, also where the file system has no locks. Chosen by hand:
+/// the recorder writes twice a second.
+const UNDER_WAY: Duration = Duration::from_secs(60);
+
+/// An episode that may be deleted.
+#[derive(Debug)]
+pub struct Found {
+    /// Its file.
+    pub path: PathBuf,
+    /// Its size, bytes.
+    pub bytes: u64,
+    /// What is in it.
+    pub episode: Episode,
+    /// Inode and time of change when it was looked at.
+    stamp: (u64, i64, i64),
+}
+
+/// Looks whether `path` is an episode that may be deleted; if not, says why.
+pub fn look(path: &Path) -> Result<Found, LeftOut> {
+    let refuse = |why: &str| LeftOut { file: path.to_path_buf(), why: format!("{}: {why}", path.display()) };
+    let meta = fs::symlink_metadata(path).map_err(|e| refuse(&e.to_string()))?;
+    if !meta.is_file() {
+        return Err(refuse("it is a link or no regular file"));
+    }
+    let file = File::open(path).map_err(|e| refuse(&e.to_string()))?;
+    match file.try_lock() {
+        Ok(()) => {}
+        Err(fs::TryLockError::WouldBlock) => return Err(refuse("it is being written")),
+        Err(fs::TryLockError::Error(e)) if e.kind() == ErrorKind::Unsupported => {}
+        Err(fs::TryLockError::Error(e)) => return Err(refuse(&e.to_string())),
+    }
+    let episode = Episode::read(path).map_err(|e| LeftOut { file: path.to_path_buf(), why: e.to_string() })?;
+    let age = meta.modified().ok().and_then(|t| SystemTime::now().duration_since(t).ok()).unwrap_or_default();
+    if episode.info.ended.is_empty() && age < UNDER_WAY {
+        return Err(refuse("its end is missing and it changed within the last minute: it may be under way"));
+    }
+    Ok(Found { path: path.to_path_buf(), bytes: meta.len(), episode, stamp: (meta.ino(), meta.mtime(), meta.mtime_nsec()) })
+}
+
+/// Deletes an episode, if it is still the one that was looked at.
+pub fn delete(found: &Found) -> Result<(), ExportError> {
+    let fail = |what: &dyn std::fmt::Display| write_error(&found.path, what);
+    let meta = fs::symlink_metadata(&found.path).map_err(|e| fail(&e))?;
+    if (meta.ino(), meta.mtime(), meta.mtime_nsec()) != found.stamp {
+        return Err(fail(&"it changed meanwhile, and is kept; look again"));
+    }
+    fs::remove_file(&found.path).map_err(|e| fail(&e))
+}
+
+/// What episodes may take together; 0 is no bound.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Budget {
+    /// Bytes.
+    pub bytes: u64,
+    /// Number.
+    pub episodes: usize,
+}
+
+impl Budget {
+    /// Whether so many episodes of so many bytes are within it.
+    pub fn holds(self, episodes: usize, bytes: u64) -> bool {
+        (self.bytes == 0 || bytes <= self.bytes) && (self.episodes == 0 || episodes <= self.episodes)
+    }
+}
+
+/// What is to go so that the rest is within `budget`: places in `found`, in the order of deletion. First go those that cannot be trained on for
+/// want of their end, then those without a weight, then, only if `weighed`, those with one; the oldest first. The newest of all stays.
+pub fn to_prune(found: &[Found], budget: Budget, weighed: bool) -> Vec<usize> {
+    let age = |i: &usize| (&found[*i].episode.info.started_at_utc, &found[*i].path);
+    let mut order: Vec<usize> = (0..found.len()).collect();
+    order.sort_by_key(age);
+    order.pop();
+    let rank = |i: &usize| match (&found[*i].episode.weight_g, found[*i].episode.complete) {
+        (Some(_), _) => 2,
+        (None, true) => 1,
+        (None, false) => 0,
+    };
+    order.retain(|i| weighed || rank(i) < 2);
+    order.sort_by_key(rank);
+    let (mut episodes, mut bytes) = (found.len(), found.iter().map(|f| f.bytes).sum::<u64>());
+    order
+        .into_iter()
+        .take_while(|i| {
+            let over = !budget.holds(episodes, bytes);
+            episodes -= usize::from(over);
+            bytes -= if over { found[*i].bytes } else { 0 };
+            over
+        })
+        .collect()
+}
+
+/// What a copy of episodes made.
+#[derive(Debug, Default)]
+pub struct Copied {
+    /// The original of each new file, and the new file.
+    pub files: Vec<(PathBuf, PathBuf)>,
+    /// What was left out.
+    pub left_out: Vec<LeftOut>,
+}
+
+/// Reads `files`. The same measurement twice is taken once.
+fn distinct(files: &[PathBuf], copied: &mut Copied) -> Vec<(PathBuf, Episode)> {
+    let mut all: Vec<(PathBuf, Episode)> = Vec::new();
+    for file in files {
+        match Episode::read(file) {
+            Ok(episode) => match all.iter().find(|(_, e)| e.content_sha256() == episode.content_sha256()) {
+                Some((first, _)) => {
+                    let why = format!("{}: the same measurement as {}", file.display(), first.display());
+                    copied.left_out.push(LeftOut { file: file.clone(), why });
+                }
+                None => all.push((file.clone(), episode)),
+            },
+            Err(e) => copied.left_out.push(LeftOut { file: file.clone(), why: e.to_string() }),
+        }
+    }
+    all
+}
+
+/// Copies all episodes of `files` into the directory `to`, in the order of their start, each with the next number that is free there.
+pub fn merge(files: &[PathBuf], to: &Path) -> Result<Copied, ExportError> {
+    let mut copied = Copied::default();
+    let mut all = distinct(files, &mut copied);
+    all.sort_by(|a, b| a.1.info.started_at_utc.cmp(&b.1.info.started_at_utc));
+    for (file, episode) in all {
+        let number = take_number(to).map_err(|e| write_error(to, e))?;
+        let new = to.join(format!("episode-{number:04}.mcap"));
+        copy(&file, &episode, &new)?;
+        copied.files.push((file, new));
+    }
+    Ok(copied)
+}
+
+/// Copies the episodes of `files` into directories below `to`, one for each of `shares` by name, each episode into one. Which goes where depends
+/// on the measurements and on `seed` alone. What the shares leave is left out.
+pub fn split(files: &[PathBuf], to: &Path, shares: &[(String, f64)], seed: u64) -> Result<Copied, ExportError> {
+    let mut copied = Copied::default();
+    let mut all = distinct(files, &mut copied);
+    all.sort_by_cached_key(|(_, episode)| {
+        let mut hash = Sha256::new();
+        hash.update(seed.to_le_bytes());
+        hash.update(episode.content_sha256());
+        hex(&hash.finalize())
+    });
+    let (n, mut share, mut all) = (all.len() as f64, 0.0, all.into_iter());
+    let mut taken = 0;
+    for (name, part) in shares {
+        share += part;
+        let until = (share * n).round() as usize;
+        let directory = to.join(name);
+        fs::create_dir_all(&directory).map_err(|e| write_error(&directory, e))?;
+        while taken < until
+            && let Some((file, episode)) = all.next()
+        {
+            let new = directory.join(file.file_name().unwrap_or(file.as_os_str()));
+            copy(&file, &episode, &new)?;
+            copied.files.push((file, new));
+            taken += 1;
+        }
+    }
+    copied.left_out.extend(all.map(|(file, _)| {
+        let why = format!("{}: the shares leave it out", file.display());
+        LeftOut { file, why }
+    }));
+    Ok(copied)
+}
+
+/// Copies an episode to the new file `new`, under a name that no program takes for an episode until it is whole and on the disk.
+fn copy(file: &Path, episode: &Episode, new: &Path) -> Result<(), ExportError> {
+    let fail = |e: &dyn std::fmt::Display| write_error(new, e);
+    let name = new.file_name().unwrap_or_default().to_string_lossy().into_owned();
+    let part = new.with_file_name(format!(".{name}.{}.new", std::process::id()));
+    let made = fs::copy(file, &part).and_then(|_| File::open(&part)?.sync_all()).map_err(|e| fail(&e)).and_then(|()| {
+        let after = Episode { name: episode.name.clone(), ..Episode::read(&part)? };
+        // They are compared as text, because NaN is not equal to itself.
+        if format!("{after:?}") != format!("{episode:?}") {
+            return Err(fail(&"the copy differs from the original"));
+        }
+        // Unlike a rename, a link never takes the place of a file that is there.
+        fs::hard_link(&part, new).map_err(|e| fail(&e))
+    });
+    // This is only ever our own file.
+    let _ = fs::remove_file(&part);
+    made
+}

@@ -1,0 +1,50 @@
+//! Makes a whole file of one that was cut: its recorder was killed, the power failed, or a copy was broken off. It allocates and is for
+//! ordinary threads only.
+//!
+//! What stands before the cut in whole chunks, with their checksums, is copied; the rest is left out, because nothing says whether it is right.
+//! The old file stays as it is. A file that is damaged in another way is refused, as everywhere.
+
+use std::path::Path;
+
+use mcap::records::Metadata;
+
+use super::records::NextRecord;
+use super::rewrite::{ChangeError, beside, copy, sync_directory};
+use super::{Episode, EpisodeInfo, format};
+
+/// How a recovered episode is said to have ended, if its own end is missing.
+const REASON: &str = "its end is missing: it was recovered from a file that was cut";
+
+/// Writes what is whole in `old` to the new file `new`, and returns it. The episode is complete only if nothing but the file's index was
+/// cut off.
+pub fn recover(old: &Path, new: &Path) -> Result<Episode, ChangeError> {
+    let original = Episode::read(old)?;
+    let fail = |what: String| ChangeError::Write { file: new.display().to_string(), what };
+    let temporary = beside(new);
+    let result = copy(old, &temporary, None, |writer, end| {
+        if !matches!(end, NextRecord::Cut) {
+            return Err(ChangeError::Whole { file: old.display().to_string() });
+        }
+        if !original.info.ended.is_empty() {
+            return Ok(());
+        }
+        let metadata = [("complete".to_string(), "false".to_string()), ("reason".to_string(), REASON.to_string())].into();
+        writer.write_metadata(&Metadata { name: format::META_END.into(), metadata }).map_err(|e| fail(e.to_string()))
+    })
+    .and_then(|()| {
+        let after = Episode::read(&temporary)?;
+        let ended = if original.info.ended.is_empty() { REASON.to_string() } else { original.info.ended.clone() };
+        let info = EpisodeInfo { ended, ..original.info.clone() };
+        let expected = Episode { name: after.name.clone(), complete: after.complete, info, ..original.clone() };
+        if format!("{after:?}") != format!("{expected:?}") {
+            return Err(fail("the copy differs from the original".into()));
+        }
+        // Unlike a rename, a link never takes the place of a file that is there.
+        std::fs::hard_link(&temporary, new).map_err(|e| fail(e.to_string()))?;
+        sync_directory(new).map_err(|e| fail(e.to_string()))?;
+        Ok(Episode { name: new.display().to_string(), ..after })
+    });
+    // This is only ever our own file.
+    let _ = std::fs::remove_file(&temporary);
+    result
+}

@@ -1,0 +1,165 @@
+//! Writes an episode's records into a new file: with another weight or note, or without the damaged end. It allocates and is for ordinary
+//! threads only.
+//!
+//! Everything is copied into a new file beside the old one, which is read back, compared and put on the disk before it takes the old one's
+//! name in one step. Whenever the machine stops, there is one whole file, the old or the new one.
+
+use std::fs::{File, OpenOptions};
+use std::io::BufWriter;
+use std::path::{Path, PathBuf};
+
+use mcap::records::{Metadata, Record};
+use mcap::{WriteOptions, Writer};
+
+use super::Episode;
+use super::records::{EpisodeError, NextRecord, Records};
+use super::weight::WeightError;
+
+/// Number of bytes that are written at a time. Chosen by hand; no measurement is recorded.
+const WRITE_BYTES: usize = 1 << 20;
+
+/// Why an episode is not changed. The file is as it was.
+#[derive(Debug, thiserror::Error)]
+pub enum ChangeError {
+    /// The number cannot be a weight.
+    #[error("weight {0} g: {1}")]
+    Weight(f64, WeightError),
+    /// The text cannot be a note.
+    #[error("this note has {0} bytes; at most {1} are kept")]
+    Note(usize, usize),
+    /// The episode cannot be read.
+    #[error(transparent)]
+    Episode(#[from] EpisodeError),
+    /// The recorder was killed, so the frames do not add up to any weight.
+    #[error("{file}: its recorder was killed before the end, so its frames do not add up to a weight; record the episode again")]
+    Incomplete {
+        /// The file.
+        file: String,
+    },
+    /// The file has no end.
+    #[error("{file}: its end is missing; `feature-worker episodes recover {file}` makes a whole file of it first")]
+    Cut {
+        /// The file.
+        file: String,
+    },
+    /// The file is not cut, so there is nothing to recover.
+    #[error("{file}: the file is whole; there is nothing to recover")]
+    Whole {
+        /// The file.
+        file: String,
+    },
+    /// The new file cannot be written or differs from the old one.
+    #[error("{file}: {what}; the episode is as it was")]
+    Write {
+        /// The new file.
+        file: String,
+        /// What went wrong.
+        what: String,
+    },
+}
+
+/// Sets the metadata record `name` of the episode `path` to one pair, in place of any that was there. `expected` says what the episode then
+/// reads as. Returns the episode as it was.
+pub(super) fn set_metadata(
+    path: &Path,
+    name: &str,
+    (key, value): (&str, String),
+    expected: impl FnOnce(Episode) -> Episode,
+) -> Result<Episode, ChangeError> {
+    let shown = path.display().to_string();
+    // If the path is a link, the file that it leads to is replaced, and not the link.
+    let path = path.canonicalize().map_err(|e| EpisodeError::Read { file: shown.clone(), what: e.to_string() })?;
+    let before = Episode::read(&path)?;
+    let temporary = beside(&path);
+    let fail = |what: String| ChangeError::Write { file: temporary.display().to_string(), what };
+    let result = copy(&path, &temporary, Some(name), |writer, end| {
+        if !matches!(end, NextRecord::End) {
+            return Err(ChangeError::Cut { file: path.display().to_string() });
+        }
+        let metadata = [(key.to_string(), value)].into();
+        writer.write_metadata(&Metadata { name: name.into(), metadata }).map_err(|e| fail(e.to_string()))
+    })
+    .and_then(|()| {
+        let after = Episode::read(&temporary)?;
+        let expected = Episode { name: after.name.clone(), ..expected(before.clone()) };
+        // They are compared as text, because NaN is not equal to itself.
+        if format!("{after:?}") != format!("{expected:?}") {
+            return Err(fail("the copy differs from the original".into()));
+        }
+        std::fs::rename(&temporary, &path).map_err(|e| fail(e.to_string()))?;
+        sync_directory(&path).map_err(|e| fail(e.to_string()))
+    });
+    match result {
+        Ok(()) => Ok(before),
+        Err(e) => {
+            // This is only ever our own file. After the rename it is no longer there.
+            let _ = std::fs::remove_file(&temporary);
+            Err(e)
+        }
+    }
+}
+
+/// The name of a new file beside `path`, which no program takes for an episode.
+pub(super) fn beside(path: &Path) -> PathBuf {
+    let name = path.file_name().and_then(|n| n.to_str()).unwrap_or("episode");
+    path.with_file_name(format!(".{name}.{}.new", std::process::id()))
+}
+
+/// Puts the directory of `path` on the disk, so that the file's name stays after a power failure.
+pub(super) fn sync_directory(path: &Path) -> std::io::Result<()> {
+    File::open(path.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new(".")))?.sync_all()
+}
+
+/// Copies the records of `old` to the new file `new`, without the metadata record `without`, up to the end or the cut. Then `last` may write
+/// more; it is told how the records ended. Waits until everything is on the disk.
+pub(super) fn copy(
+    old: &Path,
+    new: &Path,
+    without: Option<&str>,
+    last: impl FnOnce(&mut Writer<BufWriter<File>>, NextRecord<()>) -> Result<(), ChangeError>,
+) -> Result<(), ChangeError> {
+    let shown = new.display().to_string();
+    let fail = |what: &dyn std::fmt::Display| ChangeError::Write { file: shown.clone(), what: what.to_string() };
+    let file = OpenOptions::new().write(true).create_new(true).open(new).map_err(|e| fail(&e))?;
+    let permissions = std::fs::metadata(old).map_err(|e| fail(&e))?.permissions();
+    file.set_permissions(permissions).map_err(|e| fail(&e))?;
+    let mut records = Records::open(old)?;
+    let mut target: Option<BufWriter<File>> = Some(BufWriter::with_capacity(WRITE_BYTES, file));
+    let mut writer: Option<Writer<BufWriter<File>>> = None;
+    let next = records.next(|record| {
+        if let (Record::Header(header), Some(file)) = (&record, target.take()) {
+            let options = WriteOptions::new().compression(None).profile(&header.profile).library(&header.library);
+            writer = Some(Writer::with_options(file, options.disable_seeking(true)).map_err(|e| e.to_string())?);
+            return Ok(None::<()>);
+        }
+        let Some(writer) = &mut writer else { return Err("it does not begin with a header".into()) };
+        copy_record(record, writer, without).map(|()| None)
+    })?;
+    let Some(mut writer) = writer else { return Err(ChangeError::Cut { file: old.display().to_string() }) };
+    last(&mut writer, next)?;
+    writer.finish().map_err(|e| fail(&e))?;
+    let file = writer.into_inner().into_inner().map_err(|e| fail(e.error()))?;
+    file.sync_all().map_err(|e| fail(&e))
+}
+
+fn copy_record(record: Record, to: &mut Writer<BufWriter<File>>, without: Option<&str>) -> Result<(), String> {
+    let result = match record {
+        Record::Schema { header, data } => to.add_schema_with_id(header.id, &header.name, &header.encoding, &data).map(drop),
+        Record::Channel(c) => to.add_channel_with_id(c.id, c.schema_id, &c.topic, &c.message_encoding, &c.metadata).map(drop),
+        Record::Message { header, data } => to.write_to_known_channel(&header, &data),
+        Record::Metadata(m) if Some(m.name.as_str()) == without => Ok(()),
+        Record::Metadata(m) => to.write_metadata(&m),
+        Record::Attachment { header, data, .. } => to.attach(&mcap::Attachment {
+            log_time: header.log_time,
+            create_time: header.create_time,
+            name: header.name,
+            media_type: header.media_type,
+            data,
+        }),
+        // The writer makes its own indexes.
+        Record::MessageIndex(_) => Ok(()),
+        Record::Unknown { opcode, data } => to.write_private_record(opcode, &data, Default::default()),
+        other => return Err(format!("unexpected record with opcode {:#04x}", other.opcode())),
+    };
+    result.map_err(|e| e.to_string())
+}
