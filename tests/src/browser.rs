@@ -87,10 +87,11 @@ impl Browser {
         self.post("/url", &json!({ "url": url }));
     }
 
-    /// The windows that are open, the oldest first.
-    pub fn windows(&self) -> Vec<String> {
-        let all = self.call("GET", &format!("/session/{}/window/handles", self.session), &Value::Null);
-        all.as_array().expect("a list").iter().filter_map(|w| w.as_str().map(String::from)).collect()
+    /// The window in which everything happens, and a new one.
+    pub fn windows(&self) -> [String; 2] {
+        let own = self.call("GET", &format!("/session/{}/window", self.session), &Value::Null);
+        let new = self.post("/window/new", &json!({ "type": "tab" }));
+        [&own, &new["handle"]].map(|handle| handle.as_str().expect("a handle").into())
     }
 
     /// From now on everything happens in this window.

@@ -100,17 +100,19 @@ fn others_move_nothing_and_losses_are_said() {
     browser.screenshot(&picture("another-has-the-say"));
     browser.click("#take");
     // A tab that is duplicated gets a copy of the storage, but not the say; one that is loaded again keeps it.
-    let first = browser.windows();
-    browser.run("open(location.href)");
-    let twin = browser.windows().into_iter().find(|w| !first.contains(w)).expect("a second window");
+    let copy = browser.run("return JSON.stringify(sessionStorage)").as_str().expect("text").to_string();
+    let [first, twin] = browser.windows();
     let holds = "return document.getElementById('who').textContent.includes('you have')";
     browser.enter(&twin);
+    browser.go(&format!("{}icon.svg", page.url()));
+    browser.run(&format!("for (const [name, value] of Object.entries({copy})) sessionStorage.setItem(name, value)"));
+    browser.go(&page.url());
     browser.wait("the live picture", SOON, LIVE);
     assert_eq!(browser.run(holds), false, "the twin has not the say");
     browser.click("#take");
     browser.wait("the say is the twin's", SOON, holds);
     browser.close();
-    browser.enter(&first[0]);
+    browser.enter(&first);
     browser.wait("the say is not this page's", SOON, "return !document.getElementById('who').textContent.includes('you have')");
     browser.click("#take");
     browser.wait("the say", SOON, "return document.getElementById('who').textContent.includes('you have')");
