@@ -25,7 +25,7 @@ const COMMANDS: [(&str, &str, &str, &str); 21] = [
     ("view", "feature-worker", "view", "shows the camera and what is measured, in a browser"),
     ("page", "operator-page", "run", "serves the operator's page: pour, stop, weigh and learn in a browser"),
     ("inspect", "feature-worker", "inspect", "measures images or a video"),
-    ("episodes", "feature-worker", "episodes", "lists, shows, weighs and exports episodes"),
+    ("episodes", "feature-worker", "episodes", "lists, shows, weighs, exports, recovers, prunes and merges episodes"),
     ("plan", "trainer", "plan", "says what to record or pour next"),
     ("check", "trainer", "check", "says what is wrong with a data set"),
     ("train", "trainer", "train", "trains weights from episodes"),

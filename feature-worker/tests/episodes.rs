@@ -141,7 +141,7 @@ fn exports_hold_every_frame_and_overwrite_nothing() {
         assert_eq!(read.len() as u64, rows);
         assert!(!read.iter().any(|row| row.contains("NaN")), "{:?}", read.iter().find(|row| row.contains("NaN")));
         if rows == 2 * FRAMES {
-            assert!(read[20].contains("action: [50.0, 0.0], known: [false, "), "frame 20 is lost: {}", read[20]);
+            assert!(read[20].contains("action: [50.0, 0E0], known: [false, "), "frame 20 is lost: {}", read[20]);
             assert!(read[19].contains("known: [true, true, true]"), "{}", read[19]);
         }
     }

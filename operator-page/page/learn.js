@@ -51,12 +51,15 @@ function showPlan(result) {
   ...left.map(([name, what]) => el('p', { className: 'warn' }, `! Left out: ${name.split('/').pop()}: ${what}`)));
 }
 
+/** A remark of `trainer check`; one that only says what is enough is no warning. */
+const remark = (what, before = '') => (what.includes(': enough') ? el('p', { className: 'hint' }, before, what) : el('p', { className: 'warn' }, `! ${before}${what}`));
+
 /** What `trainer check` says of the set: what it spans, and what is doubtful. */
 function checked(check) {
   if (!check) return [];
   const s = check.spanned;
   const span = s ? [el('p', { id: 'spanned' }, `The set spans ${shown(s.weights_g[0], 0)} to ${shown(s.weights_g[1], 0)} g; the flow began at ${shown(s.onsets_deg[0], 0)}° to ${shown(s.onsets_deg[1], 0)}° and was seen up to ${shown(s.last_tilt_deg, 0)}°.`)] : [];
-  return [...span, ...(check.doubts || []).map(([name, what]) => el('p', { className: 'warn' }, `! ${name.split('/').pop()}: ${what}`))];
+  return [...span, ...(check.doubts || []).map(([name, what]) => remark(what, name === 'data set' ? '' : `${name.split('/').pop()}: `))];
 }
 
 $('make-plan').onclick = () => attempt(async () => {
@@ -104,7 +107,7 @@ function showJob(job) {
     ...(r.left_out ?? []).map((l) => el('p', { className: 'bad' }, `Left out: ${l.why}`))); return; }
   if (r.doubts) { askDoubts(r.doubts); fill(place, el('p', { className: 'warn' }, '! Nothing was learned yet: judge these episodes first.')); return; }
   fill(place, el('p', { className: 'good' }, `✓ Learned from ${many(r.episodes, 'episode')}. The new weights are offered under 4.`),
-    ...(r.remarks || []).map(what => el('p', { className: 'warn' }, `! ${what}`)),
+    ...(r.remarks || []).map(what => remark(what)),
     ...(r.left_out || []).map(([name, what]) => el('p', { className: 'hint' }, `Left out: ${name.split('/').pop()}: ${what}`)));
 }
 

@@ -307,7 +307,7 @@ mod tests {
         let about = shelves[0].about();
         let (now, before) = (about["now"]["identity"].as_str().unwrap(), about["before"]["identity"].as_str().unwrap());
         // Each exchange that happened has swapped the two.
-        assert_eq!((now, before), if exchanged % 2 == 0 { (two.as_str(), one.as_str()) } else { (one.as_str(), two.as_str()) });
+        assert_eq!((now, before), if exchanged.is_multiple_of(2) { (two.as_str(), one.as_str()) } else { (one.as_str(), two.as_str()) });
         let left = fs::read_dir(dir.path()).unwrap().flatten().filter(|f| f.file_name().to_string_lossy().contains("partial")).count();
         assert_eq!(left, 0);
     }

@@ -258,11 +258,11 @@ fn report(summary: &Summary, wall_s: f64) {
     }
     let violating = summary.violations.values().map(|(n, _)| n).sum::<usize>();
     if pours > 0 {
-        let [all, cb3, e_series] = [pours, cb3, e_series].map(|n| at_most(violating) / n.max(1) as f64);
         let seen = if violating == 0 { "no violation".to_owned() } else { format!("{violating} violations") };
-        print(&format!("{seen} in {pours}: at 95 % fewer than {all:.1e} a pour, if pours are drawn as here"));
-        if violating == 0 {
-            print(&format!("on a CB3 alone fewer than {cb3:.1e}, on an e-Series alone fewer than {e_series:.1e}"));
+        let rate = |n: usize| at_most(violating) / n as f64;
+        print(&format!("{seen} in {pours}: at 95 % fewer than {:.1e} a pour, if pours are drawn as here", rate(pours)));
+        if violating == 0 && cb3 > 0 && e_series > 0 {
+            print(&format!("on a CB3 alone fewer than {:.1e}, on an e-Series alone fewer than {:.1e}", rate(cb3), rate(e_series)));
         }
     }
     print(&format!("ended: {:?}", summary.reasons));

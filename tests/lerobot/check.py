@@ -18,7 +18,7 @@ import pandas
 import torch
 from lerobot.configs.types import FeatureType
 from lerobot.datasets import dataset_tools
-from lerobot.datasets.feature_utils import dataset_to_policy_features
+from lerobot.utils.feature_utils import dataset_to_policy_features
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.policies.act.configuration_act import ACTConfig
 from lerobot.policies.act.modeling_act import ACTPolicy

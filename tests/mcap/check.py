@@ -7,6 +7,7 @@ Prints a line for each point. Ends with 1 at the first that does not hold.
 
 import math
 import pathlib
+import re
 import subprocess
 import sys
 import tempfile
@@ -78,7 +79,8 @@ def check_rerun(rerun, file):
         subprocess.run([rerun, "mcap", "convert", str(file), "-o", str(rrd)], capture_output=True, check=True)
         printed = subprocess.run([rerun, "rrd", "print", "-vv", str(rrd)], capture_output=True, text=True, check=True).stdout
         for topic, name in NUMBERS:
-            holds(f"{file.name}: Rerun has {topic} {name} as a number", topic in printed and name in printed)
+            column = re.search(f'"{name}": (non-null )?(Float32|Float64)', printed)
+            holds(f"{file.name}: Rerun has {topic} {name} as a number", topic in printed and column is not None)
 
 
 def main():

@@ -9,7 +9,6 @@ use std::time::{Duration, Instant};
 use rt_controller::journal;
 use shared::os::now_ns;
 use tests::CellUnderTest;
-use tests::attack::attack;
 
 /// The view's process and the address that it printed.
 struct View {
@@ -58,40 +57,11 @@ impl Drop for View {
     }
 }
 
-/// Attacks the view, and the page on which a calibration is corrected.
-fn attack_the_worker_s_pages(cell: &CellUnderTest) {
-    let view = View::open(cell);
-    while view.get("/picture.jpg").is_empty() {
-        std::thread::sleep(Duration::from_millis(50));
-    }
-    attack(&view.address, view.process.id());
-    drop(view);
-    let episodes = std::fs::read_dir(cell.dir.path().join("episodes")).expect("there").flatten();
-    let episode = episodes.map(|e| e.path()).find(|p| p.extension().is_some_and(|e| e == "mcap")).expect("an episode");
-    let picture = cell.dir.path().join("calibration.png");
-    let mut process = cell.begin(
-        "feature-worker",
-        &["calibrate", episode.to_str().expect("text"), "--page", "--port", "0", "--picture", picture.to_str().expect("text")],
-    );
-    let mut said = BufReader::new(process.stderr.take().expect("piped")).lines().map_while(Result::ok);
-    let address =
-        said.find_map(|line| Some(line.split_once("open http://")?.1.split_whitespace().next()?.to_string())).expect("an address");
-    let calibrate = View { process, address };
-    let before = std::fs::read(cell.config()).expect("there");
-    attack(&calibrate.address, calibrate.process.id());
-    assert_eq!(std::fs::read(cell.config()).expect("there"), before, "nobody has written the configuration");
-}
-
 /// Protects a pour that people watch: the page shows the live picture while the worker works, and both see the same frames. What the view
-/// costs the worker is printed (`--show-output`), measured in turns without and with it. Afterwards the view and the page of `calibrate` are attacked as
-/// other people and their pages could: both answer their own user meanwhile, nobody else, and do not grow.
+/// costs the worker is printed (`--show-output`), measured in turns without and with it.
 #[test]
 fn the_view_shows_what_the_worker_measures() {
     let mut cell = CellUnderTest::start(|_| {});
-    cell.json("simulator", &["operator", "fill", "300", "--json"]);
-    cell.wait_idle();
-    // A pour for the calibration, recorded while people look.
-    let recording = cell.begin("rt-controller", &["record", "--lambda", "80", "--gamma", "0.4", "--json"]);
     let mut rounds = Vec::new();
     let mut shown = Vec::new();
     for _ in 0..2 {
@@ -106,9 +76,6 @@ fn the_view_shows_what_the_worker_measures() {
             rounds.push((with_view, from_ns..now_ns()));
         }
     }
-    let recorded = recording.wait_with_output().expect("it ends");
-    assert!(recorded.status.success(), "{}", String::from_utf8_lossy(&recorded.stderr));
-    attack_the_worker_s_pages(&cell);
     assert_eq!(cell.stop("rt-controller"), Some(0));
     let mut features = Vec::new();
     journal::replay(&cell.dir.path().join("journal.bin"), |tick, _| features.extend(tick.features.iter().copied())).expect("a journal");

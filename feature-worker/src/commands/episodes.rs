@@ -7,8 +7,7 @@ use std::path::{Path, PathBuf};
 
 use clap::Subcommand;
 use serde_json::{Value, json};
-use shared::config::Config;
-use shared::episode::{ChangeError, Episode, EpisodeError, EpisodeKind, find_episodes, set_weight};
+use shared::episode::{Episode, EpisodeError, EpisodeKind, set_weight};
 use shared::exit::{self, Failure, OrExit as _, failure};
 
 use crate::episodes::export::{ExportFormat, Exported, export};
@@ -16,6 +15,9 @@ use crate::episodes::output::ExportError;
 use crate::episodes::summary::{Remark, remarks, summary};
 
 mod keep;
+mod which;
+
+use which::{WhichArgs, change_failure, files, print_json};
 
 /// Command-line arguments.
 #[derive(Debug, clap::Args)]
@@ -47,19 +49,6 @@ enum Command {
     Export(ExportArgs),
     #[command(flatten)]
     Keep(keep::Command),
-}
-
-/// Which episodes.
-#[derive(Debug, clap::Args)]
-struct WhichArgs {
-    /// Episodes (.mcap) or directories of them; without any, the directory of `[recording]` in the configuration.
-    paths: Vec<PathBuf>,
-    /// The cell's configuration.
-    #[arg(long, env = shared::config::VARIABLE, default_value = shared::config::DEFAULT_FILE)]
-    config: PathBuf,
-    /// Print JSON.
-    #[arg(long)]
-    json: bool,
 }
 
 #[derive(Debug, clap::Args)]
@@ -98,25 +87,12 @@ pub fn run(args: &Args) -> Result<(), Failure> {
     }
 }
 
-/// The files that the arguments name.
-fn files(which: &WhichArgs) -> Result<Vec<PathBuf>, Failure> {
-    let paths = match which.paths.as_slice() {
-        [] => vec![Config::read(&which.config).or_exit(exit::BAD_INPUT)?.recording.directory],
-        given => given.to_vec(),
-    };
-    find_episodes(&paths).or_exit(exit::BAD_INPUT)
-}
-
 fn kind_words(kind: EpisodeKind) -> String {
     match kind {
         EpisodeKind::Recording(c) => format!("curve lambda {} deg, gamma {} /s2, beta {} s", c.lambda_deg, c.gamma_per_s2, c.beta_s),
         EpisodeKind::Pour { goal_ml } => format!("pour of {goal_ml} ml"),
         EpisodeKind::Table => "table".into(),
     }
-}
-
-fn print_json(value: &Value) {
-    println!("{value:#}");
 }
 
 fn list(files: &[PathBuf], as_json: bool) -> Result<(), Failure> {
@@ -245,11 +221,6 @@ fn check(files: &[PathBuf], as_json: bool) -> Result<(), Failure> {
         0 => Ok(()),
         wrong => Err(failure(exit::FAILED, format!("{wrong} of {} episodes cannot be trained on", all.len()))),
     }
-}
-
-/// The failure of changing an episode.
-fn change_failure(e: &ChangeError) -> Failure {
-    failure(if matches!(e, ChangeError::Write { .. }) { exit::FAILED } else { exit::BAD_INPUT }, e)
 }
 
 fn weigh(args: &WeighArgs) -> Result<(), Failure> {

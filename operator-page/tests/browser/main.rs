@@ -7,6 +7,7 @@ mod cost;
 mod path;
 mod stop;
 mod trouble;
+mod worker_pages;
 
 use std::io::{BufRead as _, BufReader};
 use std::path::{Path, PathBuf};

@@ -5,7 +5,7 @@ use std::time::Duration;
 use tests::CellUnderTest;
 use tests::browser::Browser;
 
-use super::{LIVE, Page, SOON, picture, says};
+use super::{LIVE, Page, SOON, picture, says, worker_pages};
 
 /// A training takes some seconds alone, and much longer beside others.
 const TRAINED: Duration = Duration::from_secs(240);
@@ -81,7 +81,7 @@ fn calibrate(cell: &CellUnderTest, browser: &Browser) {
 
 /// Protects an operator's first hour with a new cell, all of it in the browser: two curves as they are proposed, their weights, a training, a
 /// pour that is foreseen, confirmed, watched and weighed, a training from all three, and the way back; and a calibration that watches the second
-/// curve, is corrected and written while the first training runs.
+/// curve, is corrected and written while the first training runs. At the end the worker's own pages are attacked.
 #[test]
 fn a_new_cell_learns_to_pour_in_the_browser() {
     let Some(browser) = Browser::open(1280, 1000) else { return };
@@ -183,4 +183,5 @@ fn a_new_cell_learns_to_pour_in_the_browser() {
         let written = format!("return document.getElementById('export-said').textContent.includes('exports/{format}')");
         browser.wait("the export", Duration::from_secs(60), &written);
     }
+    worker_pages::stand_attacks(&cell);
 }

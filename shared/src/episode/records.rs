@@ -131,6 +131,9 @@ impl Records {
                         .bytes_left
                         .checked_sub(data.len() as u64)
                         .ok_or_else(|| damaged(format!("its records are more than {EXPANSION} times larger than the file")))?;
+                    if !lengths_fit(opcode, data) {
+                        return Err(damaged("a text in it is longer than its record".into()));
+                    }
                     let record = mcap::parse_record(opcode, data).map_err(|e| damaged(e.to_string()))?;
                     if let Some(item) = visit(record).map_err(damaged)? {
                         return Ok(NextRecord::Item(item));
@@ -139,4 +142,39 @@ impl Records {
             }
         }
     }
+}
+
+/// Whether the texts and maps in a record are no longer than the record: the library sets memory aside for what their lengths say, up to 4 GiB, before it
+/// looks whether they are there. The layouts are those of the MCAP specification, section Records.
+fn lengths_fit(opcode: u8, data: &[u8]) -> bool {
+    // Bytes before the texts, number of texts, and whether a map of texts follows.
+    let (fixed, texts, map) = match opcode {
+        op::HEADER => (0, 2, false),
+        op::SCHEMA => (2, 3, false),
+        op::CHANNEL => (4, 2, true),
+        op::MESSAGE_INDEX => (2, 1, false),
+        op::ATTACHMENT => (16, 2, false),
+        op::METADATA => (0, 1, true),
+        _ => return true,
+    };
+    let after_text = |rest: &mut &[u8]| -> Option<()> {
+        let (length, text) = rest.split_first_chunk::<4>()?;
+        *rest = text.get(u32::from_le_bytes(*length) as usize..)?;
+        Some(())
+    };
+    let look = || -> Option<()> {
+        let mut rest = data.get(fixed..)?;
+        for _ in 0..texts {
+            after_text(&mut rest)?;
+        }
+        if map {
+            let (length, pairs) = rest.split_first_chunk::<4>()?;
+            let mut pairs = pairs.get(..u32::from_le_bytes(*length) as usize)?;
+            while !pairs.is_empty() {
+                after_text(&mut pairs)?;
+            }
+        }
+        Some(())
+    };
+    look().is_some()
 }

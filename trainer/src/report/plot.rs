@@ -89,7 +89,7 @@ pub fn plot(x_title: &str, y_title: &str, series: &[PlotSeries], from_zero: bool
 /// Plots one below the other over the same x, each with the title and the unit of its own y-axis, as one SVG element.
 pub fn plot_below(x_title: &str, panels: &[(&str, PlotSeries)]) -> String {
     let mut svg = String::new();
-    let drawn = || -> Result<(), Box<dyn std::error::Error>> {
+    let mut drawn = || -> Result<(), Box<dyn std::error::Error>> {
         let root = SVGBackend::with_string(&mut svg, (480, PANEL_PX * panels.len() as u32)).into_drawing_area();
         root.fill(&WHITE)?;
         for (area, (y_title, series)) in root.split_evenly((panels.len(), 1)).iter().zip(panels) {

@@ -10,7 +10,7 @@ use shared::config::Config;
 use shared::episode::{find_episodes, recover, set_note};
 use shared::exit::{self, Failure, OrExit as _, failure};
 
-use super::{WhichArgs, change_failure, files, print_json};
+use super::which::{WhichArgs, change_failure, files, print_json};
 use crate::episodes::output::{ExportError, LeftOut};
 use crate::episodes::upkeep::{self, Budget, Copied, Found};
 

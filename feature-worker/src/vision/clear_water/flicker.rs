@@ -19,9 +19,8 @@ const ROW_EVERY: usize = 2;
 const DARK_LEVEL: f32 = 12.0;
 /// Blocks brighter than this may be cut off, grey levels. Chosen by hand.
 const BRIGHT_LEVEL: f32 = 240.0;
-/// A block agrees with its band when its light changed by the same factor up to this share. Chosen by hand: noise alone makes 0.6 %, and the
-/// slope of a strong band within its blocks some per cent.
-const AGREES: f32 = 0.04;
+/// A block agrees with its band when its light changed by the same factor up to this share. Chosen by hand: noise alone makes 0.6 %.
+const AGREES: f32 = 0.025;
 /// The light of a band is told when this share of its blocks agrees. Chosen by hand.
 const BLOCKS_AGREE: f32 = 0.7;
 /// The light of a picture is told when it is in this share of the bands. Chosen by hand.
