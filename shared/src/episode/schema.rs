@@ -252,6 +252,7 @@ mod tests {
     /// Protects viewers and other readers: by its schema alone each message reads as what was written, field by field, also where a number is
     /// unknown.
     #[test]
+    #[allow(clippy::unwrap_used, clippy::too_many_lines)]
     fn a_foreign_reader_finds_each_field() {
         let triangle_px = [1.5, 2.5, 3.5, 4.5, 5.5, 6.5];
         let f = Feature {
