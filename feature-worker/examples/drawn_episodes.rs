@@ -39,7 +39,7 @@ fn main() -> Result<(), Box<dyn Error>> {
 fn write(directory: &Path, number: u64) -> Result<PathBuf, Box<dyn Error>> {
     let config = Config::read(Path::new(concat!(env!("CARGO_MANIFEST_DIR"), "/../config/sim.toml")))?;
     let curve = Curve { lambda_deg: 50.0 + number as f32, gamma_per_s2: 4.0, beta_s: 1.0 };
-    let goal_ml = if number % 2 == 0 { 50.0 } else { f32::NAN };
+    let goal_ml = if number.is_multiple_of(2) { 50.0 } else { f32::NAN };
     let kind = if goal_ml.is_nan() { EpisodeKind::Recording(curve) } else { EpisodeKind::Pour { goal_ml } };
     let started_at_ns = 1_000_000_000 * number;
     // Each on another day, and each after a start of the machine.
