@@ -1,7 +1,7 @@
 //! Experimental episodes `E = (L_E, w_E)` (section 3.1 of the paper): MCAP files and CSV tables, in and out.
 //!
 //! Each episode is one MCAP file that describes itself. [`mod@write`] makes it; [`read`] gives the plain [`Episode`] that the trainer works
-//! on, and the images on demand; [`weigh`] adds the weight or a note afterwards; [`recover`] makes a whole file of one that was cut; [`table`]
+//! on, and the images on demand; [`weigh`] adds the weight or a note afterwards; [`mod@recover`] makes a whole file of one that was cut; [`table`]
 //! reads and writes the CSV pair for people who measure V_e with software of their own. All of it is for ordinary threads only: it allocates,
 //! and it reads and writes files. A damaged file is an error of one line that names the file. A file whose recorder was killed can be read up
 //! to its last whole chunk, and is then not `complete`.

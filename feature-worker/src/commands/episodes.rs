@@ -1,4 +1,4 @@
-//! `feature-worker episodes`: lists, shows, checks, weighs and exports episodes, and what else people do with them ([`keep`]).
+//! `feature-worker episodes`: lists, shows, checks, weighs and exports episodes, and what else people do with them.
 //!
 //! An ordinary command-line program that works on files alone; no cell needs to run. Allocates. Only `weigh` and `note` change a file, and
 //! they do so in one step (see [`shared::episode::set_weight`]). An export never overwrites anything.

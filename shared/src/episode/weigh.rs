@@ -1,6 +1,6 @@
 //! Adds the weight `w_E`, or what a person wrote, to an episode afterwards. It allocates and is for ordinary threads only.
 //!
-//! The file is replaced in one step, see [`rewrite`](super::rewrite): whenever the machine stops, there is one whole file, with or without the
+//! The file is replaced in one step, see `rewrite`: whenever the machine stops, there is one whole file, with or without the
 //! weight.
 
 use std::path::Path;
