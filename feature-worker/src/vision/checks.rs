@@ -37,12 +37,12 @@ const RIM_AROUND: usize = 3;
 const RIM_CONTRAST: f32 = 14.0;
 /// Least number of bundles with that change. Tuned as [`RIM_CONTRAST`] was.
 const RIM_SEEN: usize = 5;
-/// A rim of this width is blurred, px; the width is the change of brightness over its steepest step. Tuned on seeds 2 and 4 of
-/// `evaluate-camera --faults`; a blurred edge of deviation s is 2.5 s wide, and at 2.7 px a stream of its own edge counts as blurred too.
-const RIM_BLURRED_PX: f32 = 7.0;
+/// A rim of this width is blurred, px; the width is the change of brightness over its steepest step. Tuned as [`RIM_CONTRAST`] was; a
+/// blurred edge of deviation s is 2.5 s wide.
+const RIM_BLURRED_PX: f32 = 5.6;
 /// A rim of this width is blurred at the first sight, px; a narrower one has to be blurred in two pictures in a row, because noise and a
 /// background in motion make single pictures look soft. Chosen by hand; tried on the same seeds.
-const RIM_SURELY_BLURRED_PX: f32 = 8.0;
+const RIM_SURELY_BLURRED_PX: f32 = 6.4;
 
 /// Checks the light, and that the picture is not the same as the last one.
 #[derive(Default)]

@@ -181,7 +181,6 @@ impl Filter {
     /// says nothing.
     pub fn update(&mut self, flow: &FlowTables, tilt: Tilt, measured_ml: f64, extra_log_sd: f64) -> Option<Innovation> {
         let noise = flow.model.noise;
-        let log_variance = noise.log_frame_volume_sd.powi(2) + extra_log_sd.powi(2);
         let floor_ml = (FLOOR_SHARE * noise.least_visible_ml).max(FLOOR_MIN_ML);
         let prior = self.state;
         let mut posterior = prior;
@@ -212,7 +211,8 @@ impl Filter {
                     *sum += slope * covariance;
                 }
             }
-            let mut noise_variance = log_variance * (foreseen_ml * scale).powi(2) + (SD_FLOOR_ML * scale).powi(2);
+            let mut noise_variance = (noise.log_frame_volume_sd * foreseen_ml * scale).powi(2) + (SD_FLOOR_ML * scale).powi(2);
+            noise_variance += (extra_log_sd * foreseen_ml * scale).powi(2);
             let spread = slopes.iter().map(|(k, slope)| slope * projected[*k]).sum::<f64>().max(0.0);
             let mut innovation = ((seen_ml + floor_ml) * scale).ln();
             for (k, slope) in slopes {
