@@ -300,7 +300,7 @@ mod tests {
         let (one, two) = (weights(1).identity(), weights(2).identity());
         shelves[0].accept(&two).unwrap();
         let exchanged: usize = std::thread::scope(|scope| {
-            let run = |shelf: &Shelf| (0..50).filter(|k| shelf.back(if k % 2 == 0 { &one } else { &two }).is_ok()).count();
+            let run = |shelf: &Shelf| (0..12).filter(|k| shelf.back(if k % 2 == 0 { &one } else { &two }).is_ok()).count();
             let threads: Vec<_> = shelves.iter().map(|shelf| scope.spawn(move || run(shelf))).collect();
             threads.into_iter().map(|t| t.join().unwrap()).sum()
         });

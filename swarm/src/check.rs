@@ -40,6 +40,8 @@ const MISSED_SDS: f64 = 2.0;
 const LASTS_S: f64 = 9.0;
 /// How long a container may stand tilted after its program has ended by itself, s: one cycle would do, and the arm needs time to stop.
 const LEFT_TILTED_S: f64 = 2.0;
+/// For how long a robot still follows the last target that was sent, s: the patience of its program, and what it is behind.
+const FOLLOWED_S: f64 = 0.3;
 /// Most frames that are bridged at once: one second (`MAX_BRIDGED` of the controller's core).
 const MOST_BRIDGED: u64 = 30;
 /// Number of violations that are kept for a seed; the first is what counts.
@@ -90,6 +92,8 @@ pub struct Checks {
     way_back: (i32, bool),
     /// The newest target, degrees, and the rate at which it came.
     target: Option<(f64, f64)>,
+    /// When the newest target was sent, s, and which, degrees; also when there is none any more.
+    last_target: Option<(f64, f64)>,
     pub(crate) phase: Phase,
     /// Since when the robot could have been on its way upright, s.
     free_since_s: Option<f64>,
@@ -133,6 +137,7 @@ impl Checks {
             violations: Vec::new(),
             faults: Vec::new(),
             target: None,
+            last_target: None,
             phase: Phase::NoRobot,
             free_since_s: None,
             sequence: (0, 0),
@@ -188,9 +193,11 @@ impl Checks {
         (self.target, self.phase, self.sequence, self.used, self.features_before) = (None, Phase::NoRobot, (0, 0), 0, 0);
     }
 
-    /// The newest target, degrees, and the rate at which it came, degrees/s; `None` if there is none.
-    pub fn target(&self) -> Option<(f64, f64)> {
-        self.target
+    /// The target in force, degrees, and the rate at which targets come, degrees/s; `None` if there is none. The robot still follows the last one
+    /// of a controller that sends no more.
+    pub fn target(&self, at_s: f64) -> Option<(f64, f64)> {
+        let last = self.last_target.filter(|(sent_s, _)| at_s - sent_s < FOLLOWED_S).map(|(_, deg)| (deg, 0.0));
+        self.target.or(last)
     }
 
     /// The limits on alpha.
@@ -300,6 +307,7 @@ impl Checks {
             self.violated("target-acceleration", at_s, format!("targets change by {acceleration:.0} degrees/s^2"));
         }
         self.target = Some((target_deg, rate));
+        self.last_target = Some((at_s, target_deg));
         self.noticed(at_s);
     }
 

@@ -268,7 +268,7 @@ impl Site {
         }
         let at_s = self.now_s();
         self.checks.cycle(self.robot.machine(), self.joint, alpha_deg, at_s);
-        let (target, lag_s) = (self.checks.target(), self.plan.lag_s);
+        let (target, lag_s) = (self.checks.target(at_s), self.plan.lag_s);
         let return_deg_s = f64::from(self.checks.limits().return_rate_deg_s);
         let now = Moment { container: &self.container, alpha_deg, target, lag_s, return_deg_s, at_s };
         if let Some(wrong) = self.costs.settle(self.checks.phase, &now) {

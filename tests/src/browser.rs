@@ -87,6 +87,23 @@ impl Browser {
         self.post("/url", &json!({ "url": url }));
     }
 
+    /// The window in which everything happens, and a new one.
+    pub fn windows(&self) -> [String; 2] {
+        let own = self.call("GET", &format!("/session/{}/window", self.session), &Value::Null);
+        let new = self.post("/window/new", &json!({ "type": "tab" }));
+        [&own, &new["handle"]].map(|handle| handle.as_str().expect("a handle").into())
+    }
+
+    /// From now on everything happens in this window.
+    pub fn enter(&self, window: &str) {
+        self.post("/window", &json!({ "handle": window }));
+    }
+
+    /// Closes the window; another one must be entered.
+    pub fn close(&self) {
+        self.call("DELETE", &format!("/session/{}/window", self.session), &Value::Null);
+    }
+
     /// Runs a script in the page and gives what it returns; promises are waited for.
     pub fn run(&self, script: &str) -> Value {
         self.post("/execute/sync", &json!({ "script": script, "args": [] }))

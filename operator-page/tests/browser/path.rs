@@ -46,6 +46,7 @@ fn take_the_offer(browser: &Browser) {
     browser.screenshot(&picture("offered"));
     browser.click("#compare .accept");
     browser.wait("the new weights", SOON, "return document.getElementById('said').textContent.includes('in use')");
+    browser.run("scrollTo(0, 0)");
 }
 
 /// Corrects what was found while the second curve was recorded, by keys and by a click, and writes it.
@@ -164,6 +165,7 @@ fn a_new_cell_learns_to_pour_in_the_browser() {
     browser.click("#compare .back");
     cell.wait("the weights from before", SOON, |s| s["weights"] == before && s["weights"] != after);
 
+    browser.run("scrollTo(0, 0)");
     browser.click("#tab-history");
     browser.wait("three episodes and the file that is none", SOON, "return document.querySelectorAll('#table tbody tr').length === 4");
     assert!(browser.text("#table").contains("<img src=x onerror=alert(1)>.mcap"));

@@ -6,7 +6,7 @@
 const WITHIN: f64 = 0.2;
 /// From this confidence on, a measurement has no more noise than the fit of the episodes found. Chosen by hand: most frames of the episodes
 /// have more.
-const SURE: f64 = 0.95;
+const SURE: f32 = 0.95;
 /// A lower confidence counts as this one. Chosen by hand: such a measurement is off by a factor of 25.
 const LEAST: f64 = 0.05;
 /// The constant of Winitzki's approximation of the error function, "A handy approximation for the error function and its inverse" (2008);
@@ -16,11 +16,10 @@ const WINITZKI: f64 = 0.147;
 /// Standard deviation of the logarithm of an area with this confidence, beyond what every measurement has: that of the normal distribution
 /// which lies within 20 % of the truth with this probability. What is not a number is sure: it comes from no camera.
 pub(super) fn extra_log_sd(confidence: f32) -> f64 {
-    let confidence = f64::from(confidence);
     if confidence.is_nan() || confidence >= SURE {
         return 0.0;
     }
-    (log_sd(confidence.max(LEAST)).powi(2) - log_sd(SURE).powi(2)).max(0.0).sqrt()
+    (log_sd(f64::from(confidence).max(LEAST)).powi(2) - log_sd(f64::from(SURE)).powi(2)).max(0.0).sqrt()
 }
 
 /// Standard deviation of a normal distribution that lies within [`WITHIN`] of its mean with this probability, between 0 and 1.

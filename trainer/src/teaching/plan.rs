@@ -181,8 +181,8 @@ mod tests {
         }
     }
 
-    /// Protects the first hour: two curves come first, then pours from different fills; each weighing takes doubt away, and what follows the
-    /// plan leaves less of it than the same number of pours that are all alike.
+    /// Protects the first hour: two curves come first, then pours from different fills; each is the one of its kind that leaves least doubt, and what
+    /// follows the plan leaves less of it than the same number of pours that are all alike.
     #[test]
     fn what_is_proposed_teaches() {
         let vessel = Foresight::unknown(500.0, 105.0);
@@ -192,6 +192,10 @@ mod tests {
             let (plan, first) = next(&vessel, &weighed);
             sds.push(plan.sd_now_ml);
             assert!(first.sd_after_ml < plan.sd_now_ml, "{plan:?}");
+            let (doubt, to_come) = (doubt_after(&weighed), pours_to_come(&vessel, &WISH));
+            let possible = if weighed.len() < CURVES_FIRST { curves(&vessel, &WISH) } else { pours(&vessel, &WISH) };
+            let least = possible.iter().map(|(_, span)| mean_sd_ml(&doubt.weighed(span), &to_come)).fold(f64::MAX, f64::min);
+            assert!(first.sd_after_ml < least + 1e-9, "another one leaves {least} ml: {plan:?}");
             match first.next {
                 Proposal::Curve { fill_ml, .. } => {
                     kinds.push('c');
@@ -219,6 +223,10 @@ mod tests {
     fn what_is_proposed_is_possible() {
         for holds_ml in [150.0, 300.0, 500.0, 1000.0, 2000.0] {
             let vessel = Foresight::unknown(holds_ml, 105.0);
+            for (possible, _) in curves(&vessel, &WISH).into_iter().chain(pours(&vessel, &WISH)) {
+                let (Proposal::Curve { fill_ml, .. } | Proposal::Pour { fill_ml, .. }) = possible;
+                assert!(fill_ml <= 0.92 * holds_ml, "{holds_ml}: {possible:?}");
+            }
             let mut weighed = Vec::new();
             for _ in 0..4 {
                 let (_, first) = next(&vessel, &weighed);
