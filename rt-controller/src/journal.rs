@@ -266,7 +266,9 @@ fn check_is_journal(path: &Path) -> std::io::Result<File> {
     let (mut file, meta) = regular_file::open(path).map_err(|e| named(&e.to_string()))?;
     let mut magic = [0; MAGIC.len()];
     let whole = file.read_exact(&mut magic).is_ok();
-    if meta.len() > 0 && !(whole && magic.starts_with(&MAGIC[..7])) {
+    // A full disk may have cut the first bytes.
+    let there = if whole { MAGIC.len() - 1 } else { usize::try_from(meta.len()).unwrap_or(MAGIC.len()).min(MAGIC.len() - 1) };
+    if magic[..there] != MAGIC[..there] {
         return Err(named("is no journal and is left as it is: choose another controller.journal"));
     }
     if let Err(std::fs::TryLockError::WouldBlock) = file.try_lock() {
