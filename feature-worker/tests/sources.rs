@@ -3,8 +3,9 @@
 
 mod drawn;
 
+use std::io::{BufRead as _, BufReader};
 use std::path::Path;
-use std::process::{Command, Output};
+use std::process::{Command, Output, Stdio};
 
 use drawn::{HEIGHT, Outcome, WIDTH, pour, write_config};
 use feature_worker::source::{Numbering, check_rate};
@@ -141,12 +142,26 @@ fn a_missing_device_and_no_camera_are_told_apart() -> Outcome {
         let (config, written) = write_config(directory.path(), "devices", |c| {
             (c.camera.source, c.camera.path) = (shared::config::CameraSource::Device, path.display().to_string());
         })?;
-        let run = |command: &str| Command::new(env!("CARGO_BIN_EXE_feature-worker")).args([command, "--config"]).arg(&config).output();
-        for command in ["run", "view", "camera"] {
-            let output = run(command)?;
+        let command = |name: &str| {
+            let mut command = Command::new(env!("CARGO_BIN_EXE_feature-worker"));
+            command.args([name, "--config"]).arg(&config).stderr(Stdio::piped());
+            command
+        };
+        for name in ["run", "view", "camera"] {
+            if (name, code) == ("run", 3) {
+                // A worker waits for a camera that is not there, and says so.
+                let mut worker = command(name).spawn()?;
+                let mut said = BufReader::new(worker.stderr.take().ok_or("no standard error")?).lines().map_while(Result::ok);
+                let line = said.find(|line| line.contains("waited for")).ok_or("nothing is waited for")?;
+                assert!(line.contains(words) && line.contains(&path.display().to_string()), "{line}");
+                Command::new("kill").arg(worker.id().to_string()).status()?;
+                assert!(worker.wait()?.success());
+                continue;
+            }
+            let output = command(name).output()?;
             let said = text(&output);
-            assert_eq!(output.status.code(), Some(code), "{command}: {said}");
-            assert!(said.contains(words) && said.contains(&path.display().to_string()), "{command}: {said}");
+            assert_eq!(output.status.code(), Some(code), "{name}: {said}");
+            assert!(said.contains(words) && said.contains(&path.display().to_string()), "{name}: {said}");
         }
         shared::ipc::remove_files(&written.cell.name);
     }

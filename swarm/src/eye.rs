@@ -59,6 +59,8 @@ pub struct Eye {
     gone_until_ns: u64,
     two_until_ns: u64,
     newest: Feature,
+    /// By how much the areas lied that were stuck or a false zero, and had no doubt: the sum of how far each frame's volume is from what left, ml.
+    pub lied_ml: f64,
     /// Measurements on their way, with the time of their publication.
     pub published: VecDeque<Feature>,
 }
@@ -88,6 +90,7 @@ impl Eye {
             gone_until_ns: 0,
             two_until_ns: 0,
             newest: Feature::default(),
+            lied_ml: 0.0,
             published: VecDeque::new(),
         }
     }
@@ -145,11 +148,16 @@ impl Eye {
         }) else {
             return;
         };
-        if counted(&mut self.stuck.0) {
+        let (stuck, false_zero) = (counted(&mut self.stuck.0), counted(&mut self.false_zero));
+        if stuck {
             area_px2 = self.stuck.1;
         }
-        if counted(&mut self.false_zero) {
+        if false_zero {
             (area_px2, doubt) = (0.0, Doubt::None);
+        }
+        if stuck || false_zero {
+            let told_ml = (f64::from(area_px2) / AREA_AT_1_ML_PX2).powf(1.0 / self.area_exponent);
+            self.lied_ml += (flow_ml - told_ml).abs();
         }
         if let Some(spike_px2) = self.spike_px2.take() {
             area_px2 = spike_px2;
