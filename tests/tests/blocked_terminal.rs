@@ -64,7 +64,9 @@ fn a_terminal_that_takes_nothing_holds_nobody() {
         }
         let pour = cell.pour_tilted();
         assert_eq!(cell.stop("rt-controller"), Some(0), "{kind}: the controller ends");
-        assert_eq!(pour.wait_with_output().expect("it ran").status.code(), Some(3), "{kind}: the pour's command learns that");
+        let output = pour.wait_with_output().expect("it ran");
+        assert_eq!(output.status.code(), Some(4), "{kind}: the pour's command learns that");
+        assert!(String::from_utf8_lossy(&output.stdout).contains("shutting down"));
         assert_eq!(cell.stop("feature-worker"), Some(0), "{kind}: the worker ends");
         drop((reader, master));
     }
