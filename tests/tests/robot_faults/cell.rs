@@ -316,10 +316,13 @@ impl Cell {
         self.client = Some(Client::connect(&self.name).unwrap());
     }
 
-    /// Sends a program to the robot, as anybody can.
+    /// Sends a program to the robot, as anybody can. Who closes at once, with the robot's own messages unread, may take the program back with a reset.
     pub fn send_program(&self, text: &str) {
         let mut stream = TcpStream::connect((self.address, 30002)).unwrap();
         stream.write_all(text.as_bytes()).unwrap();
+        stream.shutdown(std::net::Shutdown::Write).unwrap();
+        stream.set_read_timeout(Some(Duration::from_millis(200))).unwrap();
+        while std::io::Read::read(&mut stream, &mut [0; 4096]).is_ok_and(|n| n > 0) {}
     }
 
     /// The controller's state.
