@@ -66,7 +66,7 @@ fn a_terminal_that_takes_nothing_holds_nobody() {
         assert_eq!(cell.stop("rt-controller"), Some(0), "{kind}: the controller ends");
         let output = pour.wait_with_output().expect("it ran");
         assert_eq!(output.status.code(), Some(4), "{kind}: the pour's command learns that");
-        assert!(String::from_utf8_lossy(&output.stdout).contains("shutting down"));
+        assert!(String::from_utf8_lossy(&output.stdout).contains("shutdown"));
         assert_eq!(cell.stop("feature-worker"), Some(0), "{kind}: the worker ends");
         drop((reader, master));
     }
