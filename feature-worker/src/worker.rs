@@ -13,6 +13,7 @@ use iceoryx2::port::publisher::Publisher;
 use shared::config::{CameraSource, Config};
 use shared::exit::{self, Failure, OrExit as _, failure};
 use shared::ipc::Cell;
+use shared::level::Level;
 use shared::messages::{Doubt, Feature, FrameHeader, LAYOUT_VERSION, PixelFormat};
 use shared::os;
 use shared::speaker::Speaker;
@@ -95,7 +96,7 @@ fn measure_until_stopped(
         return opened.map(|_| ());
     };
     for missing in os::become_realtime(config.worker.core, config.worker.priority) {
-        speaker.say(&missing);
+        speaker.say(Level::Warning, &missing);
     }
     let mut worker = Worker {
         extractor,
@@ -142,7 +143,7 @@ fn open_source(
             Err(SourceError::Busy { .. }) if os::now_ns() < begin_ns + LET_GO_NS => std::thread::sleep(WAIT),
             Err(e @ SourceError::Missing(_)) if config.camera.source == CameraSource::Device => {
                 if !said {
-                    speaker.say(&format!("{e}; it is waited for"));
+                    speaker.say(Level::Warning, &format!("{e}; it is waited for"));
                 }
                 said = true;
                 looks.fetch_add(1, Relaxed);
@@ -245,7 +246,7 @@ impl Worker<'_> {
         let Some(even) = self.extractor.ground_is_even().filter(|_| self.judged < GROUND_PICTURES) else { return };
         (self.judged, self.uneven) = (self.judged + 1, self.uneven + u32::from(!even));
         if self.judged == GROUND_PICTURES && 2 * self.uneven > GROUND_PICTURES {
-            self.speaker.say(UNEVEN_GROUND);
+            self.speaker.say(Level::Warning, UNEVEN_GROUND);
         }
     }
 

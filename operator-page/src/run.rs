@@ -19,6 +19,7 @@ use std::sync::atomic::Ordering::Relaxed;
 
 use shared::config::Config;
 use shared::exit::{self, Failure, OrExit as _};
+use shared::level::Level;
 use shared::os;
 use web::gate::Rules;
 use web::{Server, Settings, token};
@@ -122,7 +123,8 @@ fn announce(address: SocketAddr, word: &str, (file, made): (&Path, bool), loopba
         }
     }
     if !loopback {
-        eprintln!("operator-page: whoever has this address can move the robot; it is not encrypted, so use a network that you trust");
+        let line = "operator-page: whoever has this address can move the robot; it is not encrypted, so use a network that you trust";
+        eprintln!("{}", Level::Warning.marked(line));
     }
     if made {
         eprintln!("operator-page: the token was made now, and stays the same until its file is deleted");

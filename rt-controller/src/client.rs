@@ -13,6 +13,7 @@ use indicatif::ProgressStyle;
 use shared::control::{Outcome, Reply, Request, Status};
 use shared::exit;
 use shared::ipc::{Cell, InService as _, IpcError};
+use shared::level::Level;
 use shared::messages::{RecorderReport, RecorderState};
 use shared::os;
 use shared::runtime_dir::Place;
@@ -86,7 +87,7 @@ impl Client {
         let (done, watched) = std::sync::mpsc::channel::<()>();
         let watch = move || {
             if watched.recv_timeout(CONNECTING) == Err(std::sync::mpsc::RecvTimeoutError::Timeout) {
-                os::tell("error: the cell's files in /dev/shm do not answer: end all programs of the cell and start them again");
+                os::tell(Level::Error, "error: the cell's files in /dev/shm do not answer: end all programs of the cell and start them again");
                 std::process::exit(exit::UNREACHABLE.into());
             }
         };

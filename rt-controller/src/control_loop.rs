@@ -7,6 +7,7 @@
 use std::sync::atomic::{AtomicU64, Ordering::Relaxed, Ordering::SeqCst};
 
 use iceoryx2::port::update_connections::UpdateConnections;
+use shared::level::Level;
 use shared::messages::{Feature, Phase, Telemetry};
 use shared::os;
 
@@ -60,9 +61,9 @@ pub struct Place {
 ///
 /// `lost_ns` is how long the robot may be silent (`controller.lost_robot_ms`), ns. Before the loop starts, `say` gets a line for each
 /// thing that the operating system did not permit.
-pub fn run(settings: Settings, place: Place, lost_ns: u64, features: &Features, exchange: &Exchange, say: &dyn Fn(&str)) {
+pub fn run(settings: Settings, place: Place, lost_ns: u64, features: &Features, exchange: &Exchange, say: &dyn Fn(Level, &str)) {
     for line in os::become_realtime(place.core, place.priority) {
-        say(&line);
+        say(Level::Warning, &line);
     }
     os::cannot_be_held_up();
     let mut state = LoopState::new(settings, lost_ns, features, exchange);

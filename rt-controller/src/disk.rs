@@ -13,6 +13,7 @@ use crossbeam::channel::{Receiver, Sender, TrySendError, bounded};
 use shared::agent::Agent;
 use shared::config::Config;
 use shared::episode::take_number;
+use shared::level::Level;
 use shared::messages::Phase;
 use shared::os;
 use shared::regular_file;
@@ -46,7 +47,7 @@ const RATE_TOLERANCE: f64 = 0.02;
 /// The state of the disk's thread.
 pub struct Disk<'a> {
     exchange: &'a Exchange,
-    say: &'a (dyn Fn(&str) + Sync),
+    say: &'a (dyn Fn(Level, &str) + Sync),
     /// What `status` shows of it.
     note: &'a DiskNote,
     path: PathBuf,
@@ -95,14 +96,14 @@ impl<'a> Disk<'a> {
         trusted: Option<u32>,
         exchange: &'a Exchange,
         note: &'a DiskNote,
-        say: &'a (dyn Fn(&str) + Sync),
+        say: &'a (dyn Fn(Level, &str) + Sync),
     ) -> Result<(Self, Queues), String> {
         let journal = match config.controller.journal.as_ref().map(|path| (path, Writer::create(path, &Settings::new(config)))) {
             None => None,
             Some((_, Ok(writer))) => Some(writer),
             Some((_, Err(e))) if e.kind() == ErrorKind::InvalidInput => return Err(format!("controller.journal: {e}")),
             Some((path, Err(e))) => {
-                say(&format!("{}: no journal: {}; tried again each minute", path.display(), error_words(&e)));
+                say(Level::Warning, &format!("{}: no journal: {}; tried again each minute", path.display(), error_words(&e)));
                 note.set(|n| n.journal = format!("not written since the start: {}", error_words(&e)));
                 None
             }
@@ -163,7 +164,7 @@ impl<'a> Disk<'a> {
     fn write(&mut self, what: impl FnOnce(&mut Writer) -> std::io::Result<()>) {
         if let Some(Err(e)) = self.journal.as_mut().map(what) {
             let why = error_words(&e);
-            (self.say)(&format!("journal: {why}; it is begun anew when it can be written, and the controller goes on"));
+            (self.say)(Level::Warning, &format!("journal: {why}; it is begun anew when it can be written, and the controller goes on"));
             self.note.set(|n| n.journal = format!("not written: {why}"));
             self.journal = None;
             self.try_later();
@@ -205,7 +206,7 @@ impl<'a> Disk<'a> {
         };
         match part {
             Ok(journal) => {
-                (self.say)(&format!("journal: {} begins a new part", path.display()));
+                (self.say)(Level::Info, &format!("journal: {} begins a new part", path.display()));
                 (self.journal, self.retry, self.pause) = (Some(journal), None, RETRY);
             }
             Err(e) => {
@@ -259,7 +260,7 @@ impl<'a> Disk<'a> {
                     error_words(&e)
                 );
                 if what != self.no_number {
-                    (self.say)(&what);
+                    (self.say)(Level::Error, &what);
                     self.no_number = what;
                 }
             }
@@ -286,7 +287,7 @@ impl<'a> Disk<'a> {
             Ok(weights) => {
                 refuse(String::new());
                 note.set(|n| n.weights_written = meta.modified().ok());
-                (self.say)(&format!("weights {} read from {}; the next pour uses them", weights.identity(), self.path.display()));
+                (self.say)(Level::Info, &format!("weights {} read from {}; the next pour uses them", weights.identity(), self.path.display()));
                 let identity = weights.id();
                 self.write(|journal| journal.weights(identity, &weights));
                 self.loaded = weights.to_bytes().ok().map(|bytes| (identity, bytes));
@@ -294,7 +295,7 @@ impl<'a> Disk<'a> {
                 drop(self.exchange.agents.force_push((identity, Box::new(Agent::new(&weights)))));
             }
             Err(e) => {
-                (self.say)(&format!("weights refused, the old ones stay: {e}"));
+                (self.say)(Level::Warning, &format!("weights refused, the old ones stay: {e}"));
                 refuse(e);
             }
         }
@@ -330,7 +331,7 @@ mod tests {
         config.controller.journal = Some(directory.path().join("journal.bin"));
         config.recording.directory = directory.path().join("episodes");
         let (exchange, note) = (Exchange::default(), DiskNote::default());
-        let say = |_: &str| {};
+        let say = |_: Level, _: &str| {};
         let (mut disk, queues) = Disk::open(&config, None, &exchange, &note, &say).unwrap();
         let sender = queues.journal.unwrap();
         let tick_at = |disk: &mut Disk, now_ns: u64| {

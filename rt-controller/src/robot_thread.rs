@@ -11,6 +11,7 @@ use std::time::Duration;
 
 use shared::config::Config;
 use shared::control::RobotLink;
+use shared::level::Level;
 
 use crate::exchange::{Exchange, SessionEnd};
 use crate::link::hands::{self, Before, Handover};
@@ -42,21 +43,21 @@ pub struct Note {
 
 impl RobotNote {
     /// Sets the note, and says its lines if they are new ones.
-    fn set(&self, text: String, link: RobotLink, say: &dyn Fn(&str)) {
+    fn set(&self, text: String, link: RobotLink, say: &dyn Fn(Level, &str)) {
         let mut note = self.0.lock().unwrap_or_else(PoisonError::into_inner);
         note.link = link;
         if note.text != text {
             if !text.is_empty() {
-                say(&text);
+                say(Level::Warning, &text);
             }
             note.text = text;
         }
     }
 
     /// Sets the doubt about the robot's settings, and says it.
-    fn warn(&self, warning: String, say: &dyn Fn(&str)) {
+    fn warn(&self, warning: String, say: &dyn Fn(Level, &str)) {
         if !warning.is_empty() {
-            say(&warning);
+            say(Level::Warning, &warning);
         }
         self.0.lock().unwrap_or_else(PoisonError::into_inner).warning = warning;
     }
@@ -98,7 +99,7 @@ pub fn keep_robot_connected(
     note: &RobotNote,
     connections: &AtomicU64,
     stop: &AtomicBool,
-    say: &dyn Fn(&str),
+    say: &dyn Fn(Level, &str),
 ) {
     let mut progress =
         Progress { before: Before::default(), connected: false, waits: false, wish_until_ns: None, next_ns: network.now_ns() };
@@ -124,7 +125,7 @@ pub fn keep_robot_connected(
                     progress.connected = exchange.sessions.push(Box::new(session)).is_ok();
                     connections.fetch_add(1, Relaxed);
                     note.set(String::new(), RobotLink::Connected, say);
-                    say("robot connected, program running");
+                    say(Level::Info, "robot connected, program running");
                 }
                 Err(e) => progress.failed(network.now_ns(), &e, config, note, say),
             }
@@ -140,7 +141,7 @@ fn unknown_name(config: &Config, what: String) -> LinkError {
 
 impl Progress {
     /// Takes note of a session that is over. The session itself is dropped by the caller.
-    fn take_back(&mut self, now_ns: u64, session: &Session, end: SessionEnd, config: &Config, note: &RobotNote, say: &dyn Fn(&str)) {
+    fn take_back(&mut self, now_ns: u64, session: &Session, end: SessionEnd, config: &Config, note: &RobotNote, say: &dyn Fn(Level, &str)) {
         let last = *session.state();
         self.connected = false;
         self.before.unpowered |= hands::without_power(&last);
@@ -153,7 +154,7 @@ impl Progress {
     }
 
     /// Takes note of an attempt that failed with `e`.
-    fn failed(&mut self, now_ns: u64, e: &LinkError, config: &Config, note: &RobotNote, say: &dyn Fn(&str)) {
+    fn failed(&mut self, now_ns: u64, e: &LinkError, config: &Config, note: &RobotNote, say: &dyn Fn(Level, &str)) {
         self.next_ns = now_ns + RECONNECT.as_nanos() as u64;
         self.before.unpowered = match e {
             LinkError::ProgramRunning { .. } => false,
@@ -174,7 +175,7 @@ impl Progress {
     }
 
     /// Leaves the robot alone until the operator asks for it.
-    fn wait_for_operator(&mut self, why: Handover, config: &Config, note: &RobotNote, say: &dyn Fn(&str)) {
+    fn wait_for_operator(&mut self, why: Handover, config: &Config, note: &RobotNote, say: &dyn Fn(Level, &str)) {
         self.waits = true;
         self.wish_until_ns = None;
         let remedy = why.remedy();

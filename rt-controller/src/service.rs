@@ -14,8 +14,9 @@ use iceoryx2::active_request::ActiveRequest;
 use iceoryx2::port::publisher::Publisher;
 use iceoryx2::port::server::Server;
 use iceoryx2::service::ipc::Service as Ipc;
-use shared::control::{Outcome, Reply, Request, Status};
+use shared::control::{EndReason, Outcome, Reply, Request, Status};
 use shared::ipc::{Cell, InService as _, IpcError};
+use shared::level::Level;
 use shared::messages::{Phase, Telemetry};
 use shared::supervisor::Supervisor;
 
@@ -43,7 +44,7 @@ pub struct Service<'a> {
     exchange: &'a Exchange,
     robot_note: &'a RobotNote,
     robot_connections: &'a AtomicU64,
-    say: &'a dyn Fn(&str),
+    say: &'a dyn Fn(Level, &str),
     server: Server<Ipc, [u8], (), [u8], ()>,
     telemetry: Publisher<Ipc, Telemetry, ()>,
     /// What lies on disks, and what is wrong with it.
@@ -71,7 +72,7 @@ impl<'a> Service<'a> {
         exchange: &'a Exchange,
         (robot_note, robot_connections): (&'a RobotNote, &'a AtomicU64),
         (disk_note, disk): (&'a DiskNote, Queues),
-        say: &'a dyn Fn(&str),
+        say: &'a dyn Fn(Level, &str),
     ) -> Result<Self, IpcError> {
         let server = cell
             .control()?
@@ -124,7 +125,7 @@ impl<'a> Service<'a> {
             match event {
                 Event::Tick(tick, telemetry, counters) => {
                     if self.journal.as_ref().is_some_and(|j| j.try_send(Box::new(tick)).is_err()) {
-                        (self.say)("journal: the disk does not keep up; nothing more is written to it, and the controller goes on");
+                        (self.say)(Level::Warning, "journal: the disk does not keep up; nothing more is written to it, and the controller goes on");
                         self.disk_note.set(|n| n.journal_gave_up = true);
                         self.journal = None;
                     }
@@ -145,7 +146,8 @@ impl<'a> Service<'a> {
                     }
                 }
                 Event::Ended(outcome) => {
-                    (self.say)(&format!(
+                    let level = if outcome.reason == EndReason::Done { Level::Info } else { Level::Warning };
+                    let line = format!(
                         "episode {}: {}, {} after {:.1} s",
                         outcome.episode,
                         outcome
@@ -153,7 +155,8 @@ impl<'a> Service<'a> {
                             .map_or("curve".into(), |g| format!("goal {g:.1} ml, {} ml poured (estimate)", outcome.poured_words())),
                         outcome.reason.words(),
                         outcome.seconds
-                    ));
+                    );
+                    (self.say)(level, &line);
                     if self.outcomes.len() == OUTCOMES {
                         self.outcomes.pop_front();
                     }

@@ -19,6 +19,7 @@ use std::time::{Duration, Instant};
 
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
 use serde::{Deserialize, Serialize};
+use shared::level::Level;
 use shared::messages::Phase;
 use shared::os::peer_uid;
 use shared::runtime_dir::own_uid;
@@ -77,7 +78,7 @@ impl StopSockets {
     /// Opens the sockets of the cell `name` in `directory`. The error is one line. `say` gets a line if only the file could be had.
     ///
     /// Call it with the controller's lock held, because it takes the place of a socket that a dead controller left.
-    pub fn open(directory: &Path, name: &str, say: &dyn Fn(&str)) -> Result<Self, String> {
+    pub fn open(directory: &Path, name: &str, say: &dyn Fn(Level, &str)) -> Result<Self, String> {
         let path = directory.join("stop");
         let fail = |e: std::io::Error| format!("{}: {e}: no way to stop a motion, so none is begun", path.display());
         if is_taken(own_uid(), name) {
@@ -91,7 +92,7 @@ impl StopSockets {
         let nameless = SocketAddr::from_abstract_name(abstract_name(own_uid(), name)).and_then(|a| UnixListener::bind_addr(&a));
         let nameless = nameless.and_then(|l| l.set_nonblocking(true).map(|()| l));
         if let Err(e) = &nameless {
-            say(&format!("the second way to stop, socket @{}: {e}: another user has its name", abstract_name(own_uid(), name)));
+            say(Level::Warning, &format!("the second way to stop, socket @{}: {e}: another user has its name", abstract_name(own_uid(), name)));
         }
         Ok(Self { file, path, nameless: nameless.ok() })
     }

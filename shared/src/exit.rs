@@ -7,6 +7,8 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering::Relaxed};
 use std::time::Duration;
 
+use crate::level::Level;
+
 /// The work failed on the way, for example because a file could not be written or a check found faults.
 pub const FAILED: u8 = 1;
 /// Wrong command line, configuration or input file; nothing was changed.
@@ -64,10 +66,17 @@ pub fn end_within(stop: &Arc<AtomicBool>, within: Duration, line: &'static str) 
             std::thread::sleep(BEAT);
         }
         std::thread::sleep(within);
-        crate::os::tell(line);
+        crate::os::tell(Level::Error, line);
         std::process::exit(FAILED.into());
     };
     let _ = std::thread::Builder::new().name("end".into()).stack_size(STACK).spawn(watch);
+}
+
+/// Makes a panic in any thread of the resident process `name` one line that matters, in place of what Rust prints.
+pub fn explain_panics(name: &'static str) {
+    std::panic::set_hook(Box::new(move |panic| {
+        crate::os::tell(Level::Error, &format!("{name}: this is a defect, please report it: {panic}"));
+    }));
 }
 
 /// Ends a resident process: as [`end`], but a terminal that takes nothing does not keep the process alive.
@@ -75,7 +84,7 @@ pub fn end_resident(result: Result<(), Failure>) -> ExitCode {
     match result {
         Ok(()) => ExitCode::SUCCESS,
         Err(Failure { code, what }) => {
-            crate::os::tell(&format!("error: {what}"));
+            crate::os::tell(Level::Error, &format!("error: {what}"));
             ExitCode::from(code)
         }
     }
@@ -86,7 +95,7 @@ pub fn end(result: Result<(), Failure>) -> ExitCode {
     match result {
         Ok(()) => ExitCode::SUCCESS,
         Err(Failure { code, what }) => {
-            eprintln!("error: {what}");
+            eprintln!("{}", Level::Error.marked(&format!("error: {what}")));
             ExitCode::from(code)
         }
     }

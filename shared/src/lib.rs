@@ -42,6 +42,7 @@ pub mod estimator;
 pub mod exit;
 pub mod gaussian_curve;
 pub mod ipc;
+pub mod level;
 pub mod limits;
 pub mod machine;
 pub mod messages;

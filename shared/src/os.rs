@@ -9,6 +9,8 @@ use std::os::fd::{AsFd, AsRawFd};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicI32, AtomicPtr, Ordering::SeqCst};
 
+use crate::level::Level;
+
 /// Now, CLOCK_MONOTONIC in nanoseconds.
 pub fn now_ns() -> u64 {
     let t = rustix::time::clock_gettime(rustix::time::ClockId::Monotonic);
@@ -103,10 +105,10 @@ pub fn stop_at_signals() -> std::io::Result<Arc<AtomicBool>> {
 
 /// Writes one line to standard error if that is possible within half a second, and leaves it out otherwise. For the end of a process that
 /// must end, whatever became of its terminal.
-pub fn tell(line: &str) {
+pub fn tell(level: Level, line: &str) {
     let stderr = std::io::stderr();
     if may_be_written(500) {
-        let _ = rustix::io::write(&stderr, format!("{line}\n").as_bytes());
+        let _ = rustix::io::write(&stderr, format!("{}\n", level.marked(line)).as_bytes());
     }
 }
 
@@ -145,7 +147,7 @@ static URGENT_THREAD: AtomicI32 = AtomicI32::new(0);
 /// A process whose loop must first do something else sets [`cannot_be_held_up`] there: if another thread is struck, that thread stops for
 /// good, `stop` becomes true, and it is the process's task to end.
 pub fn explain_bus_errors(line: &str, code: u8, stop: Arc<AtomicBool>) {
-    let told = Box::new(BusErrors { line: format!("{line}\n"), code: code.into(), stop });
+    let told = Box::new(BusErrors { line: format!("{}\n", Level::Error.marked(line)), code: code.into(), stop });
     BUS_ERRORS.store(Box::into_raw(told), SeqCst);
     let handler = on_bus_error as extern "C" fn(libc::c_int);
     // SAFETY: the handler only makes system calls that may be made in one, and reads memory that is never freed.

@@ -2,7 +2,8 @@
 //!
 //! A terminal that was stopped with Ctrl-S, or a pipe that nobody reads, holds whoever writes to it. Only the thread "speaker" may be held.
 //! Everybody else puts lines into the queue, which never waits; what does not fit is dropped and counted, and the count is said as soon as
-//! the terminal takes lines again. Each line begins with the time in UTC, unless systemd's journal keeps the time itself.
+//! the terminal takes lines again. Each line begins with the time in UTC, or, if systemd's journal takes it, with its priority: the journal keeps the time
+//! itself.
 //!
 //! Any ordinary thread may speak; it allocates. Nothing here fails: what cannot be written is lost.
 
@@ -13,6 +14,7 @@ use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
 use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 
 use crate::episode::rfc3339;
+use crate::level::{Level, to_journal};
 use crate::os;
 
 /// Number of lines that may wait. Chosen by hand: more than a process says in a pour.
@@ -24,8 +26,8 @@ const LAST_LINES: Duration = Duration::from_millis(300);
 
 /// One line and where it goes.
 enum Line {
-    /// To standard error, with time and name.
-    Said(String),
+    /// To standard error, with time or priority, and name.
+    Said(Level, String),
     /// To standard output, as it is.
     Printed(String),
 }
@@ -52,14 +54,14 @@ impl Speaker {
         let its = Arc::clone(&counts);
         let spawned = std::thread::Builder::new().name("speaker".into()).stack_size(STACK).spawn(move || write_lines(name, &queue, &its));
         if let Err(e) = spawned {
-            os::tell(&format!("{name}: no thread could be started, so nothing more is said: {e}"));
+            os::tell(Level::Error, &format!("{name}: no thread could be started, so nothing more is said: {e}"));
         }
         Self { lines, counts }
     }
 
     /// Says `text` on standard error.
-    pub fn say(&self, text: &str) {
-        self.queue(Line::Said(text.into()));
+    pub fn say(&self, level: Level, text: &str) {
+        self.queue(Line::Said(level, text.into()));
     }
 
     /// Writes `line` to standard output.
@@ -91,32 +93,31 @@ impl Speaker {
 
 /// The thread "speaker".
 fn write_lines(name: &str, queue: &Receiver<Line>, counts: &Counts) {
-    let stamped = std::env::var_os("JOURNAL_STREAM").is_none();
     let mut told = 0;
     while let Ok(line) = queue.recv() {
         match line {
-            Line::Said(text) => write(std::io::stderr().as_fd(), &format!("{}{name}: {text}\n", stamp(stamped))),
+            Line::Said(level, text) => write(std::io::stderr().as_fd(), &said(level, &format!("{name}: {text}"))),
             Line::Printed(text) => write(std::io::stdout().as_fd(), &format!("{text}\n")),
         }
         let dropped = counts.dropped.load(SeqCst);
         if dropped > told {
             let lost = dropped - told;
-            let what = format!("{}{name}: {lost} lines are missing here, because what reads them had stopped\n", stamp(stamped));
-            write(std::io::stderr().as_fd(), &what);
+            let what = format!("{name}: {lost} lines are missing here, because what reads them had stopped");
+            write(std::io::stderr().as_fd(), &said(Level::Warning, &what));
             told = dropped;
         }
         counts.written.fetch_add(1, SeqCst);
     }
 }
 
-/// The time, as a line begins with it.
-fn stamp(stamped: bool) -> String {
-    if !stamped {
-        return String::new();
+/// A line as it is written: after its priority if systemd's journal reads it, else after the time.
+fn said(level: Level, line: &str) -> String {
+    if to_journal() {
+        return level.marked(line) + "\n";
     }
     let since = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default();
     let whole = rfc3339(since.as_secs());
-    format!("{}.{:03}Z ", whole.trim_end_matches('Z'), since.subsec_millis())
+    format!("{}.{:03}Z {line}\n", whole.trim_end_matches('Z'), since.subsec_millis())
 }
 
 /// Writes all of `text`, for as long as it takes. It goes past the standard library's lock, so that nobody waits for this thread.

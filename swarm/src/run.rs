@@ -103,7 +103,7 @@ fn live(site: &RefCell<Site>, config: &Config) {
         journal: Journal::new(&settings),
     };
     let world = World { site, life: RefCell::new(life), stop: &stop };
-    let say = |text: &str| site.borrow_mut().say(|| text.to_owned());
+    let say = |_: shared::level::Level, text: &str| site.borrow_mut().say(|| text.to_owned());
     keep_robot_connected(&world, config, &exchange, &note, &connections, &stop, &say);
     let mut site = site.borrow_mut();
     let outcomes: Vec<Outcome> = site.checks.outcomes[before..].iter().map(|(_, outcome)| *outcome).collect();

@@ -46,7 +46,7 @@ fn run(plant: bool) {
     let ended = AtomicU64::new(0);
 
     std::thread::scope(|scope| {
-        scope.spawn(|| keep_robot_connected(&System, &config, &exchange, &note, &connections, &stop, &|_| {}));
+        scope.spawn(|| keep_robot_connected(&System, &config, &exchange, &note, &connections, &stop, &|_, _| {}));
         // The ordinary thread gives orders, weights and faults, and drops what the loop gives back.
         scope.spawn(|| {
             let worker = ipc::Cell::join(&name).expect("shared memory");

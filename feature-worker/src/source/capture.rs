@@ -10,6 +10,7 @@ use opencv::core::{CV_8UC1, CV_8UC3, Mat};
 use opencv::prelude::*;
 use opencv::videoio::{self, VideoCapture};
 use shared::config::{CameraConfig, Refused};
+use shared::level::Level;
 use shared::messages::{FrameHeader, LAYOUT_VERSION, PixelFormat};
 use shared::os;
 
@@ -82,7 +83,7 @@ impl Capture {
         if !outcome.refused.is_empty() {
             match camera.refused {
                 Refused::Error => return Err(SourceError::Refused(outcome.refused.join("; "))),
-                Refused::Warning => outcome.refused.iter().for_each(|line| eprintln!("camera: warning: {line}")),
+                Refused::Warning => outcome.refused.iter().for_each(|line| eprintln!("{}", Level::Warning.marked(&format!("camera: warning: {line}")))),
             }
         }
         let numbering = Numbering::new(camera.fps, os::now_ns());

@@ -7,6 +7,7 @@ use std::path::Path;
 use std::time::Duration;
 
 use shared::config::CameraConfig;
+use shared::level::Level;
 use shared::messages::FrameHeader;
 use shared::os;
 
@@ -54,7 +55,7 @@ impl FrameSource for Playback {
                 }
                 None => {
                     if let Some(remark) = self.recording.remark() {
-                        eprintln!("feature-worker: {remark}");
+                        eprintln!("{}", Level::Warning.marked(&format!("feature-worker: {remark}")));
                     }
                     return Ok(NextFrame::End);
                 }

@@ -10,6 +10,7 @@ use std::time::Duration;
 
 use crossbeam::queue::ArrayQueue;
 use serde::Serialize;
+use shared::level::Level;
 use shared::os;
 use shared::speaker::Speaker;
 use shared::supervisor::Supervisor;
@@ -81,7 +82,7 @@ fn print_until_stopped(latest: &ArrayQueue<Status>, looks: &AtomicU64, stop: &At
     let mut printed_at_ns = os::now_ns();
     let mut supervisor = Supervisor::ready();
     if lines != Lines::Quiet {
-        speaker.say("waiting for frames");
+        speaker.say(Level::Info, "waiting for frames");
     }
     while !stop.load(Relaxed) {
         std::thread::sleep(PAUSE);
@@ -94,11 +95,11 @@ fn print_until_stopped(latest: &ArrayQueue<Status>, looks: &AtomicU64, stop: &At
         if lines == Lines::Json {
             match serde_json::to_string(&status) {
                 Ok(line) => speaker.print(line),
-                Err(e) => speaker.say(&format!("status: {e}")),
+                Err(e) => speaker.say(Level::Warning, &format!("status: {e}")),
             }
         } else if lines == Lines::EachSecond && !status.silent {
             let fps = (status.frames - frames_before) as f64 * 1e9 / (now_ns - printed_at_ns) as f64;
-            speaker.say(&format!(
+            speaker.say(Level::Info, &format!(
                 "frame {} ({fps:.0}/s), V_e {:.0} px^2, confidence {:.2}, doubt: {}, {:.2} ms + {:.1} ms old, lost {}, \
                  repeated {}, doubtful {}",
                 status.sequence,
@@ -112,9 +113,9 @@ fn print_until_stopped(latest: &ArrayQueue<Status>, looks: &AtomicU64, stop: &At
                 status.doubtful
             ));
         } else if lines != Lines::Quiet
-            && let Some(line) = changes.line(&status, now_ns)
+            && let Some((level, line)) = changes.line(&status, now_ns)
         {
-            speaker.say(&line);
+            speaker.say(level, &line);
         }
         (frames_before, printed_at_ns) = (status.frames, now_ns);
     }
@@ -131,7 +132,7 @@ struct Changes {
 impl Changes {
     /// The line about `status`, if it differs from what was said last. A camera that falls silent or comes back is said at once, a doubt that comes and
     /// goes at most each [`CHANGE_NS`].
-    fn line(&mut self, status: &Status, now_ns: u64) -> Option<String> {
+    fn line(&mut self, status: &Status, now_ns: u64) -> Option<(Level, String)> {
         let state = (status.silent, if status.silent { "" } else { status.doubt });
         let at_once = self.said.is_none_or(|said| said.0 != state.0);
         if self.said == Some(state) || (!at_once && now_ns < self.at_ns + CHANGE_NS) {
@@ -139,9 +140,9 @@ impl Changes {
         }
         (self.said, self.at_ns) = (Some(state), now_ns);
         Some(match state {
-            (true, _) => "no frames for a second; waiting for the camera driver".into(),
-            (false, "none") => format!("frames are measured, without a doubt; {} were lost so far", status.lost),
-            (false, doubt) => format!("the pictures are doubted: {doubt}; {} of {} so far", status.doubtful, status.frames),
+            (true, _) => (Level::Warning, "no frames for a second; waiting for the camera driver".into()),
+            (false, "none") => (Level::Info, format!("frames are measured, without a doubt; {} were lost so far", status.lost)),
+            (false, doubt) => (Level::Warning, format!("the pictures are doubted: {doubt}; {} of {} so far", status.doubtful, status.frames)),
         })
     }
 }

@@ -14,6 +14,7 @@ use std::sync::atomic::{AtomicBool, AtomicU64, Ordering::SeqCst};
 use shared::config::Config;
 use shared::exit::{self, Failure, OrExit as _, failure};
 use shared::ipc::{Cell, InService as _, IpcError};
+use shared::level::Level;
 use shared::os;
 use shared::runtime_dir::Place;
 use shared::speaker::Speaker;
@@ -54,7 +55,7 @@ pub fn run(args: &Args) -> Result<(), Failure> {
     let config = Config::read(&args.config).or_exit(exit::BAD_INPUT)?;
     // Half a controller would be worse than none: without targets the robot's program comes upright by itself.
     std::panic::set_hook(Box::new(|panic| {
-        os::tell(&format!("rt-controller: this is a defect, please report it: {panic}"));
+        os::tell(Level::Error, &format!("rt-controller: this is a defect, please report it: {panic}"));
         std::process::abort();
     }));
     let stop = stop_at_signals()?;
@@ -64,12 +65,12 @@ pub fn run(args: &Args) -> Result<(), Failure> {
     // This comes before the threads are made, so that everything that they need is in memory before the loop starts.
     let unlocked = os::lock_memory().err();
     let speaker = Speaker::start("rt-controller");
-    let say = |text: &str| speaker.say(text);
-    unlocked.iter().for_each(|line| say(line));
-    let _awake = os::stay_awake().map_err(|line| say(&line));
+    let say = |level: Level, text: &str| speaker.say(level, text);
+    unlocked.iter().for_each(|line| say(Level::Warning, line));
+    let _awake = os::stay_awake().map_err(|line| say(Level::Warning, &line));
     let result = start(&config, &args.config, &stop, &say, &speaker);
     if result.is_ok() {
-        say("stopped");
+        say(Level::Info, "stopped");
     }
     speaker.finish();
     result
@@ -88,7 +89,7 @@ fn stop_at_signals() -> Result<Arc<AtomicBool>, Failure> {
 }
 
 /// Takes the cell, opens the way to stop a motion, and runs the threads until the loop has ended, upright.
-fn start(config: &Config, file: &Path, stop: &AtomicBool, say: &(dyn Fn(&str) + Sync), speaker: &Speaker) -> Result<(), Failure> {
+fn start(config: &Config, file: &Path, stop: &AtomicBool, say: &(dyn Fn(Level, &str) + Sync), speaker: &Speaker) -> Result<(), Failure> {
     let directory = Place::from(&config.cell).directory().or_exit(exit::BAD_INPUT)?;
     let _claim = Claim::take(&directory, file, config).or_exit(exit::REFUSED)?;
     let sockets = StopSockets::open(&directory, &config.cell.name, say).or_exit(exit::FAILED)?;
@@ -96,7 +97,10 @@ fn start(config: &Config, file: &Path, stop: &AtomicBool, say: &(dyn Fn(&str) + 
     let shared = Shared::default();
     let give_up = || {
         let written = shared.disk_done.load(SeqCst);
-        say(if written { "stopped" } else { "the disk does not answer: stopped without it, so the end of the journal may be missing" });
+        match written {
+            true => say(Level::Info, "stopped"),
+            false => say(Level::Error, "the disk does not answer: stopped without it, so the end of the journal may be missing"),
+        }
         speaker.finish();
         std::process::exit(if written { 0 } else { exit::FAILED.into() });
     };
@@ -139,7 +143,7 @@ fn run_threads(
     owner: Option<u32>,
     shared: &Shared,
     stop: &AtomicBool,
-    say: &(dyn Fn(&str) + Sync),
+    say: &(dyn Fn(Level, &str) + Sync),
 ) -> Result<(), Failure> {
     let Shared { exchange, note, connections, disk_note, end, disk_done, .. } = shared;
     let cell = Cell::join(&config.cell).or_exit(exit::FAILED)?;
@@ -159,7 +163,7 @@ fn run_threads(
                 disk_done.store(true, SeqCst);
             };
             let spawned = spawned.and(thread("disk").spawn_scoped(inner, writing));
-            say(&format!("running in cell '{}' at {} Hz", config.cell.name, config.controller.rate_hz));
+            say(Level::Info, &format!("running in cell '{}' at {} Hz", config.cell.name, config.controller.rate_hz));
             // Without these threads there is no robot and there are no weights: the loop ends at once.
             stop.fetch_or(spawned.is_err(), SeqCst);
             service.run();
@@ -175,7 +179,7 @@ fn thread(name: &str) -> std::thread::Builder {
 }
 
 /// The real-time thread: opens its own node and subscriber, tells `ready` how that went, and runs the loop.
-fn real_time(config: &Config, exchange: &Exchange, say: &dyn Fn(&str), ready: &std::sync::mpsc::Sender<Result<(), IpcError>>) {
+fn real_time(config: &Config, exchange: &Exchange, say: &dyn Fn(Level, &str), ready: &std::sync::mpsc::Sender<Result<(), IpcError>>) {
     let opened = Cell::join(&config.cell).and_then(|cell| {
         let subscriber = cell.features()?.subscriber_builder().buffer_size(crate::core::MAX_FEATURES).create();
         let subscriber = subscriber.in_service("feature")?;
