@@ -65,7 +65,7 @@ pub fn run(args: &Args) -> Result<(), Failure> {
         None => Ok(()),
         Some(first) => {
             let red = sections.iter().flat_map(|s| &s.2).filter(|f| f.verdict == Verdict::Red).count();
-            Err(failure(first.1, format!("{red} red, the first in '{}': a pour cannot work before that is mended", first.0)))
+            Err(failure(first.1, format!("{red} red, the first in '{}': mend that before you pour", first.0)))
         }
     }
 }

@@ -14,9 +14,9 @@ use std::path::PathBuf;
 use std::time::{Duration, Instant};
 
 use rt_controller::client::Client;
-use rt_controller::disk_note::free_bytes;
 use shared::config::Config;
 use shared::control::Status;
+use shared::disk_space::free_bytes;
 use shared::exit::{self, Failure, OrExit as _};
 use shared::os;
 use shared::runtime_dir::Place;
@@ -61,6 +61,7 @@ pub struct Args {
 /// Runs the command.
 pub fn run(args: &Args) -> Result<(), Failure> {
     let config = Config::read(&args.config).or_exit(exit::BAD_INPUT)?;
+    exit::explain_panics("decant metrics");
     let stop = os::stop_at_signals().or_exit(exit::FAILED)?;
     exit::end_within(&stop, GRACE, "decant metrics: the disk does not answer: ended without it");
     let token_file = config.controller.weights.with_file_name(format!("metrics-{}.token", config.cell.name));

@@ -3,6 +3,7 @@
 //! Used by `feature-worker episodes`, on files alone; no cell needs to run. Allocates. An export never overwrites anything.
 
 pub mod export;
+pub mod folder;
 mod lerobot;
 pub mod output;
 pub mod summary;

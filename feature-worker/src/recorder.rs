@@ -3,13 +3,15 @@
 //! The worker hands each frame over with [`Recorder::offer`], which never waits. The recorder's thread (`writing`) follows the
 //! controller's telemetry, opens a file when an episode begins, compresses and writes its frames, and closes the file when the last
 //! frame of the episode has come. It reports on the service `recorder`. A full or slow disk costs that episode's file or some of its
-//! images and nothing else: the next episode tries again.
+//! images and nothing else: the next episode tries again. An episode that would leave no room on the disk is not begun. Nothing is ever deleted here;
+//! what is not recorded, and a directory over its budget, is said.
 
 use std::sync::{Arc, mpsc};
 use std::thread::JoinHandle;
 
 use shared::config::Config;
 use shared::ipc::IpcError;
+use shared::level::Level;
 use shared::messages::{Feature, FrameHeader};
 
 mod encoder;
@@ -46,8 +48,8 @@ pub struct Recorder {
 
 impl Recorder {
     /// Starts the recorder's thread. Call it before the calling thread takes a real-time priority or pins itself, because
-    /// a thread inherits both.
-    pub fn start(config: &Config) -> Result<Self, RecorderError> {
+    /// a thread inherits both. `say` gets a line for what is not recorded, and for what is over its budget.
+    pub fn start(config: &Config, say: impl Fn(Level, &str) + Send + 'static) -> Result<Self, RecorderError> {
         let directory = &config.recording.directory;
         let fail = |e: std::io::Error| RecorderError::Directory { directory: directory.display().to_string(), what: e.to_string() };
         std::fs::create_dir_all(directory).map_err(fail)?;
@@ -58,7 +60,7 @@ impl Recorder {
         let (its_config, its_handover) = (config.clone(), handover.clone());
         let thread = std::thread::Builder::new()
             .name("recorder".into())
-            .spawn(move || match RecorderThread::new(its_config, directory, its_handover) {
+            .spawn(move || match RecorderThread::new(its_config, directory, its_handover, Box::new(say)) {
                 Ok(mut recorder) => {
                     let _ = started.send(Ok(()));
                     recorder.run();

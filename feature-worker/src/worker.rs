@@ -48,6 +48,7 @@ type Ipc = iceoryx2::service::ipc::Service;
 /// Runs until a signal, the end of the video or a failure. `lines` says what is told meanwhile.
 pub fn run(config: &Config, lines: Lines) -> Result<(), Failure> {
     let stop = os::stop_at_signals().or_exit(exit::FAILED)?;
+    exit::explain_panics("feature-worker");
     exit::end_within(&stop, GRACE, "feature-worker: the disk or the camera does not answer: ended without it");
     // OpenCV's own threads would run on the controller's core and wait for each other.
     opencv::core::set_num_threads(1).or_exit(exit::BAD_INPUT)?;
@@ -83,7 +84,8 @@ fn measure_until_stopped(
         _ => Some(FrameRepublisher::new(&cell, config)?),
     };
     // Threads inherit the core and the priority, so the other threads start first.
-    let recorder = Recorder::start(config).or_exit(exit::FAILED)?;
+    let its = Arc::clone(speaker);
+    let recorder = Recorder::start(config, move |level, text| its.say(level, text)).or_exit(exit::FAILED)?;
     let latest = Arc::new(ArrayQueue::new(1));
     let looks = Arc::new(AtomicU64::new(0));
     let printer =

@@ -63,7 +63,7 @@ impl Scene {
         let cell = Cell::join(&config.cell.name).unwrap();
         let telemetry = cell.telemetry().unwrap().publisher_builder().create().unwrap();
         let reports = cell.recorder().unwrap().subscriber_builder().create().unwrap();
-        let recorder = Recorder::start(config).unwrap();
+        let recorder = Recorder::start(config, |_, _| {}).unwrap();
         let base_ns = shared::os::now_ns();
         Self {
             recorder,
@@ -451,6 +451,6 @@ fn a_directory_that_cannot_be_made_is_refused_at_the_start() {
     let dir = tempfile::tempdir().unwrap();
     let file = dir.path().join("file");
     std::fs::write(&file, "").unwrap();
-    let error = Recorder::start(&config("nodir", &file.join("inside"))).err().unwrap().to_string();
+    let error = Recorder::start(&config("nodir", &file.join("inside")), |_, _| {}).err().unwrap().to_string();
     assert!(error.starts_with("recording.directory") && !error.contains('\n'), "{error}");
 }

@@ -59,6 +59,7 @@ pub struct Args {
 pub fn run(args: &Args) -> Result<(), Failure> {
     let config = Config::read(&args.config).or_exit(exit::BAD_INPUT)?;
     let file = std::path::absolute(&args.config).or_exit(exit::BAD_INPUT)?;
+    exit::explain_panics("operator-page");
     let stop = os::stop_at_signals().or_exit(exit::FAILED)?;
     let token_file = config.controller.weights.with_file_name(format!("operator-page-{}.token", config.cell.name));
     let (word, made) = token::read_or_make(&token_file).or_exit(exit::FAILED)?;

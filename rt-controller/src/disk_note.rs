@@ -5,6 +5,8 @@ use std::path::Path;
 use std::sync::{Mutex, PoisonError};
 use std::time::SystemTime;
 
+use shared::disk_space::file_system;
+
 /// The newest state of what lies on disks.
 #[derive(Debug, Default, Clone)]
 pub struct DiskState {
@@ -49,17 +51,6 @@ pub fn space_words(paths: &[&Path]) -> String {
         }
     }
     words.join(", ")
-}
-
-/// The free space where `path` is or will be, bytes; `None` if it is not known.
-pub fn free_bytes(path: &Path) -> Option<u64> {
-    let (_, fs) = file_system(path)?;
-    Some(fs.f_bavail.saturating_mul(fs.f_frsize))
-}
-
-/// The file system where `path` is or will be: a directory that is not made yet lies on that of the one above it.
-fn file_system(path: &Path) -> Option<(&Path, rustix::fs::StatVfs)> {
-    path.ancestors().find_map(|p| rustix::fs::statvfs(p).ok().map(|fs| (p, fs)))
 }
 
 /// An error of the disk in words: a full one is called so.

@@ -37,6 +37,7 @@ mod config_camera;
 mod config_container;
 pub mod config_paths;
 pub mod control;
+pub mod disk_space;
 pub mod episode;
 pub mod estimator;
 pub mod exit;

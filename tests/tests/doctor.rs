@@ -2,8 +2,12 @@
 //! other programs' own.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::too_many_lines)]
 
+#[path = "doctor/logs.rs"]
+mod logs;
 #[path = "doctor/metrics.rs"]
 mod metrics;
+#[path = "doctor/room.rs"]
+mod room;
 #[path = "doctor/waiting.rs"]
 mod waiting;
 

@@ -5,8 +5,10 @@
 use std::os::unix::fs::MetadataExt as _;
 use std::path::{Path, PathBuf};
 
-use rt_controller::{claim, disk, disk_note};
+use feature_worker::episodes::folder::{Budget, Folder, LEFT_FREE, MEGABYTE};
+use rt_controller::{claim, disk};
 use shared::config::Config;
+use shared::disk_space::free_bytes;
 use shared::machine::Finding;
 use shared::runtime_dir::{Place, own_uid};
 use shared::shared_memory::{self, SharedMemoryError};
@@ -22,6 +24,10 @@ const EPISODE_BYTES: u64 = 8 << 20;
 const DAYS: u64 = 7;
 /// Number of episodes below which room is short. Chosen by hand: some days of a lab's pours.
 const EPISODES: u64 = 200;
+/// Days that the disk must last at today's rate of recording. Chosen by hand: below a week somebody should look, below two days at once.
+const LASTS_DAYS: [f64; 2] = [7.0, 2.0];
+/// Share of the budget from which on nobody seems to prune. Chosen by hand.
+const FAR_OVER: f64 = 1.5;
 
 /// Looks at the cell's files.
 pub fn look(file: &Path, config: &Config) -> Vec<Finding> {
@@ -30,13 +36,13 @@ pub fn look(file: &Path, config: &Config) -> Vec<Finding> {
     findings.push(shared_memory());
     findings.push(strangers());
     findings.push(weights(file, config));
-    if let Some(journal) = &config.controller.journal {
-        findings.push(room("journal", journal.parent().unwrap_or(journal), JOURNAL_HOUR_BYTES * 24 * DAYS, |free| {
-            format!("room for {} days", free / (JOURNAL_HOUR_BYTES * 24))
-        }));
-    }
-    let episode = episode_bytes(&config.recording.directory);
-    findings.push(room("episodes", &config.recording.directory, EPISODES * episode, |free| format!("room for {} more", free / episode)));
+    findings.extend(config.controller.journal.as_ref().map(|file| journal(file.parent().unwrap_or(file))));
+    let folder = Folder::look(&config.recording.directory);
+    findings.push(match writable("episodes", &config.recording.directory) {
+        Ok((there, free)) => episodes(&there, free, folder),
+        Err(finding) => finding,
+    });
+    findings.push(budget(Budget::of(&config.recording), folder));
     findings
 }
 
@@ -104,31 +110,66 @@ fn weights(file: &Path, config: &Config) -> Finding {
     }
 }
 
-/// Mean size of the episodes in `directory`, bytes.
-fn episode_bytes(directory: &Path) -> u64 {
-    let entries = std::fs::read_dir(directory).into_iter().flatten().flatten();
-    let sizes: Vec<u64> =
-        entries.filter(|e| e.path().extension().is_some_and(|x| x == "mcap")).filter_map(|e| e.metadata().ok().map(|m| m.len())).collect();
-    if sizes.is_empty() { EPISODE_BYTES } else { (sizes.iter().sum::<u64>() / sizes.len() as u64).max(1) }
+/// How long the disk lasts: at the rate of the last day, or for how many episodes if there was none.
+fn episodes(there: &Path, free: u64, folder: Folder) -> Finding {
+    let left = free.saturating_sub(LEFT_FREE);
+    let one = folder.bytes.checked_div(folder.episodes as u64).map_or(EPISODE_BYTES, |mean| mean.max(1));
+    let days = left as f64 / folder.new_bytes as f64;
+    let lasts = match folder.new_bytes {
+        0 => format!("room for {} more", left / one),
+        new => format!("{days:.1} days at today's {} MB a day", new.div_ceil(MEGABYTE)),
+    };
+    let is = format!("{}: {} episodes, {} MB; {} MB free, {lasts}", there.display(), folder.episodes, folder.bytes / MEGABYTE, free / MEGABYTE);
+    let advice = "delete or move what is no longer needed (`decant episodes prune`)";
+    let soon = "the disk will be full soon, and then nothing is recorded";
+    match left {
+        0 => Finding::red("episodes", is, "the disk is full: nothing more is recorded", advice),
+        _ if folder.new_bytes > 0 && days < LASTS_DAYS[1] => Finding::red("episodes", is, soon, advice),
+        _ if folder.new_bytes > 0 && days < LASTS_DAYS[0] => Finding::yellow("episodes", is, soon, advice),
+        _ if left < EPISODES * one => Finding::yellow("episodes", is, soon, advice),
+        _ => Finding::green("episodes", is),
+    }
 }
 
-/// Whether `directory`, or the first above it that is there, may be written and has `wanted_bytes` free.
-fn room(what: &str, directory: &Path, wanted_bytes: u64, lasts: impl Fn(u64) -> String) -> Finding {
+/// Whether the episodes are within their budget.
+fn budget(budget: Budget, folder: Folder) -> Finding {
+    let what = "episodes' budget";
+    if budget.is_none() {
+        return Finding::green(what, "none is set (recording.budget_mb, recording.budget_episodes)");
+    }
+    let is = format!("{} episodes of {} MB, and {} may be", folder.episodes, folder.bytes / MEGABYTE, budget.words());
+    let means = "nothing is deleted by itself, so the disk fills";
+    let advice = "`decant episodes prune` says what it would delete, and spares what is weighed; docs/DATA.md says how it is run each night";
+    match budget.share(folder.episodes, folder.bytes) {
+        share if share > FAR_OVER => Finding::red(what, is, means, advice),
+        share if share > 1.0 => Finding::yellow(what, is, means, advice),
+        _ => Finding::green(what, is),
+    }
+}
+
+/// `directory`, or the first above it that is there, and its free space, bytes, if it may be written.
+fn writable(what: &str, directory: &Path) -> Result<(PathBuf, u64), Finding> {
     let there: PathBuf = directory.ancestors().find(|d| d.is_dir()).unwrap_or(Path::new("/")).into();
     let access = rustix::fs::Access::WRITE_OK | rustix::fs::Access::EXEC_OK;
     if let Err(e) = rustix::fs::accessat(rustix::fs::CWD, &there, access, rustix::fs::AtFlags::EACCESS) {
         let advice = format!("give it to this user (user {}), or configure another place", own_uid());
-        return Finding::red(what, format!("{}: {e}", there.display()), "nothing can be written there", advice);
+        return Err(Finding::red(what, format!("{}: {e}", there.display()), "nothing can be written there", advice));
     }
-    let Some(free) = disk_note::free_bytes(&there) else {
-        return Finding::yellow(what, format!("{}: its free space is not shown", there.display()), "it may be full", "look at it with df");
+    let unknown = || Finding::yellow(what, format!("{}: its free space is not shown", there.display()), "it may be full", "look at it with df");
+    free_bytes(&there).ok_or_else(unknown).map(|free| (there, free))
+}
+
+/// How long the disk lasts for the journal in `directory`.
+fn journal(directory: &Path) -> Finding {
+    let (there, free) = match writable("journal", directory) {
+        Ok(found) => found,
+        Err(finding) => return finding,
     };
-    let is = format!("{}: {} MiB free, {}", there.display(), free >> 20, lasts(free));
+    let is = format!("{}: {} MB free, room for {} days", there.display(), free / MEGABYTE, free / (JOURNAL_HOUR_BYTES * 24));
     let advice = "delete or move what is no longer needed";
     match free {
-        // One episode, or an hour of the journal, must fit.
-        0..JOURNAL_HOUR_BYTES => Finding::red(what, is, "the disk is full: nothing more is recorded", advice),
-        free if free < wanted_bytes => Finding::yellow(what, is, "the disk will be full soon", advice),
-        _ => Finding::green(what, is),
+        0..JOURNAL_HOUR_BYTES => Finding::red("journal", is, "the disk is full: nothing more is recorded", advice),
+        free if free < JOURNAL_HOUR_BYTES * 24 * DAYS => Finding::yellow("journal", is, "the disk will be full soon", advice),
+        _ => Finding::green("journal", is),
     }
 }

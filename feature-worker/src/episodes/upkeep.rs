@@ -13,6 +13,7 @@ use std::time::{Duration, SystemTime};
 use sha2::{Digest, Sha256};
 use shared::episode::{Episode, hex, take_number};
 
+use super::folder::Budget;
 use super::output::{ExportError, LeftOut, write_error};
 
 /// A file without its end that changed more recently than this counts as under way, also where the file system has no locks. Chosen by hand:
@@ -62,22 +63,6 @@ pub fn delete(found: &Found) -> Result<(), ExportError> {
         return Err(fail(&"it changed meanwhile, and is kept; look again"));
     }
     fs::remove_file(&found.path).map_err(|e| fail(&e))
-}
-
-/// What episodes may take together; 0 is no bound.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct Budget {
-    /// Bytes.
-    pub bytes: u64,
-    /// Number.
-    pub episodes: usize,
-}
-
-impl Budget {
-    /// Whether so many episodes of so many bytes are within it.
-    pub fn holds(self, episodes: usize, bytes: u64) -> bool {
-        (self.bytes == 0 || bytes <= self.bytes) && (self.episodes == 0 || episodes <= self.episodes)
-    }
 }
 
 /// What is to go so that the rest is within `budget`: places in `found`, in the order of deletion. First go those that cannot be trained on for

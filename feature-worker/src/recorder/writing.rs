@@ -2,7 +2,7 @@
 //!
 //! When an episode's number appears in the telemetry it opens a file and takes the few frames from just before. When the number is gone
 //! and the last frame of the episode has come, it closes the file. An episode that was under way when the recorder started is not
-//! recorded, because its beginning is missing. Allocates and writes files; a file that cannot be written is given up and reported.
+//! recorded, because its beginning is missing. Allocates and writes files; a file that cannot be written is given up, reported and said.
 
 use std::collections::VecDeque;
 use std::path::{Path, PathBuf};
@@ -12,14 +12,17 @@ use std::time::{Duration, SystemTime};
 use iceoryx2::port::publisher::Publisher;
 use iceoryx2::port::subscriber::Subscriber;
 use shared::config::Config;
+use shared::disk_space::free_bytes;
 use shared::episode::{EpisodeEnd, EpisodeKind, EpisodeStart, EpisodeTrack, EpisodeWriter, FrameRow, WriteError};
 use shared::gaussian_curve::Curve;
 use shared::ipc::{Cell, IpcError};
+use shared::level::Level;
 use shared::messages::{Feature, RecorderReport, RecorderState, Telemetry};
 use shared::os::now_ns;
 
 use super::encoder::Encoder;
 use super::handover::{Handover, KEPT_FRAMES, OfferedFrame};
+use crate::episodes::folder::{Budget, DAY, Folder, LEFT_FREE, MEGABYTE};
 
 /// Frames from up to this long before an episode's first tick belong to its file, ns. Chosen by hand: they show that nothing flows yet.
 const BEFORE_NS: u64 = 200_000_000;
@@ -31,6 +34,8 @@ const SILENCE_NS: u64 = 2_000_000_000;
 const PAUSE: Duration = Duration::from_millis(5);
 
 type Ipc = iceoryx2::service::ipc::Service;
+/// What the operator is told.
+type Say = Box<dyn Fn(Level, &str) + Send>;
 
 /// The recorder's thread, with its ports and the episode under way.
 pub struct RecorderThread {
@@ -49,6 +54,9 @@ pub struct RecorderThread {
     /// Ticks of the next episode, while frames of the one before are still under way.
     pending: VecDeque<Telemetry>,
     current: Option<OpenEpisode>,
+    say: Say,
+    /// When it was said that the episodes are over their budget, CLOCK_MONOTONIC ns; `None` while they are not.
+    over_budget_ns: Option<u64>,
     // Declared last, because the ports need it until they are dropped.
     _cell: Cell,
 }
@@ -90,7 +98,7 @@ struct WaitingFrame {
 
 impl RecorderThread {
     /// Joins the cell.
-    pub fn new(config: Config, directory: PathBuf, handover: Arc<Handover>) -> Result<Self, IpcError> {
+    pub fn new(config: Config, directory: PathBuf, handover: Arc<Handover>, say: Say) -> Result<Self, IpcError> {
         let cell = Cell::join(&config.cell)?;
         let fail = |service: &str, what: String| IpcError::Service { service: service.into(), what };
         let telemetry = cell.telemetry()?.subscriber_builder().create().map_err(|e| fail("telemetry", format!("{e:?}")))?;
@@ -110,6 +118,8 @@ impl RecorderThread {
             newest_tick: 0,
             pending: VecDeque::new(),
             current: None,
+            say,
+            over_budget_ns: None,
             _cell: cell,
         })
     }
@@ -198,6 +208,15 @@ impl RecorderThread {
 
     /// Opens the file of the episode that begins with `tick`, and gives it the frames that were kept.
     fn open(&mut self, tick: &Telemetry) {
+        if let Some(free) = free_bytes(&self.directory).filter(|free| *free < LEFT_FREE) {
+            let what = format!(
+                "{}: only {} MB are free, and the last {} stay free: nothing is recorded. Delete what is not needed (`episodes prune`)",
+                self.directory.display(),
+                free / MEGABYTE,
+                LEFT_FREE / MEGABYTE
+            );
+            return self.report(RecorderState::Failed, tick.episode, 0, 0, &what);
+        }
         let kind = if tick.goal_ml.is_nan() {
             EpisodeKind::Recording(Curve { lambda_deg: tick.lambda_deg, gamma_per_s2: tick.gamma_per_s2, beta_s: tick.beta_s })
         } else {
@@ -335,12 +354,35 @@ impl RecorderThread {
         let end = EpisodeEnd { complete, reason, disordered_frames: current.disordered };
         let (episode, images, dropped) = (current.episode, current.images, current.dropped);
         match current.writer.finish(&end) {
-            Ok(path) if complete => self.report_path(RecorderState::Complete, episode, images, dropped, &path),
+            Ok(path) if complete => {
+                self.report_path(RecorderState::Complete, episode, images, dropped, &path);
+                self.look_at_budget();
+            }
             Ok(path) => {
                 let what = format!("{reason}; {} is incomplete", path.display());
                 self.report(RecorderState::Failed, episode, images, dropped, &what);
             }
             Err(e) => self.report(RecorderState::Failed, episode, images, dropped, &e.to_string()),
+        }
+    }
+
+    /// Says that the episodes are over their budget, when they come to be and once a day while they are.
+    fn look_at_budget(&mut self) {
+        let budget = Budget::of(&self.config.recording);
+        let folder = if budget.is_none() { Folder::default() } else { Folder::look(&self.directory) };
+        let now = now_ns();
+        if budget.holds(folder.episodes, folder.bytes) {
+            self.over_budget_ns = None;
+        } else if self.over_budget_ns.is_none_or(|said| now - said > DAY.as_nanos() as u64) {
+            self.over_budget_ns = Some(now);
+            let what = format!(
+                "{}: {} episodes take {} MB, and the budget is {}: nothing is deleted by itself, `episodes prune` does it",
+                self.directory.display(),
+                folder.episodes,
+                folder.bytes / MEGABYTE,
+                budget.words()
+            );
+            (self.say)(Level::Warning, &what);
         }
     }
 
@@ -351,6 +393,9 @@ impl RecorderThread {
 
     /// Reports what became of an episode on the service `recorder`.
     fn report(&self, state: RecorderState, episode: u64, images: u64, dropped: u64, text: &str) {
+        if state == RecorderState::Failed {
+            (self.say)(Level::Warning, &format!("recorder: {text}"));
+        }
         // A report that cannot be sent is no fault: the file is what counts, and often no process listens.
         let _ = self.reports.send_copy(RecorderReport::new(state, episode, images, dropped, text));
     }

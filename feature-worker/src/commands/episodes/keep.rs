@@ -11,11 +11,9 @@ use shared::episode::{find_episodes, recover, set_note};
 use shared::exit::{self, Failure, OrExit as _, failure};
 
 use super::which::{WhichArgs, change_failure, files, print_json};
+use crate::episodes::folder::{Budget, MEGABYTE};
 use crate::episodes::output::{ExportError, LeftOut};
-use crate::episodes::upkeep::{self, Budget, Copied, Found};
-
-/// Bytes of a megabyte, as disks are sold.
-const MEGABYTE: u64 = 1_000_000;
+use crate::episodes::upkeep::{self, Copied, Found};
 
 /// The commands.
 #[derive(Debug, clap::Subcommand)]
@@ -260,7 +258,7 @@ fn prune(args: &PruneArgs) -> Result<(), Failure> {
         bytes: args.budget_mb.or(configured.as_ref().map(|r| r.budget_mb)).unwrap_or(0).saturating_mul(MEGABYTE),
         episodes: args.budget_episodes.or(configured.as_ref().map(|r| r.budget_episodes)).unwrap_or(0),
     };
-    let none = budget.holds(usize::MAX, u64::MAX);
+    let none = budget.is_none();
     let (found, kept) = look(&files(&args.which)?);
     let going: Vec<&Found> = upkeep::to_prune(&found, budget, args.weighed).into_iter().map(|i| &found[i]).collect();
     delete_all(&going, args.yes)?;
