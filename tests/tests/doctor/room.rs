@@ -9,7 +9,7 @@ use super::{examine, line};
 /// Records a short curve; gives what the command said.
 fn record(cell: &CellUnderTest) -> String {
     cell.wait_idle();
-    let output = cell.command("rt-controller", &["record", "--json", "--lambda", "5", "--gamma", "2", "--beta", "0.3"]);
+    let output = cell.command("rt-controller", &["record", "--json", "--lambda", "5", "--gamma", "2"]);
     String::from_utf8_lossy(&[output.stdout, output.stderr].concat()).into_owned()
 }
 
@@ -43,10 +43,12 @@ fn the_disk_is_not_filled_in_silence() {
     cell.spawn_all();
     let count = |cell: &CellUnderTest| in_episodes(cell.inside.as_ref().expect("there"), "ls $EPISODES/*.mcap | wc -l");
 
-    assert!(record(&cell).contains("episode-0001.mcap"));
+    let said = record(&cell);
+    assert!(said.contains("episode-0001.mcap"), "{said}");
     assert_eq!(line(&examine(&cell).0, "files", "episodes' budget").0, "green");
     assert!(!cell.log("feature-worker").contains("the budget is"), "{}", cell.log("feature-worker"));
-    assert!(record(&cell).contains("episode-0002.mcap"));
+    let said = record(&cell);
+    assert!(said.contains("episode-0002.mcap"), "{said}");
     wait_for(&cell, "2 episodes take");
     let (verdict, words) = line(&examine(&cell).0, "files", "episodes' budget");
     assert!(verdict == "red" && words.contains("decant episodes prune"), "{words}");
