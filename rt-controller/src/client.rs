@@ -87,7 +87,10 @@ impl Client {
         let (done, watched) = std::sync::mpsc::channel::<()>();
         let watch = move || {
             if watched.recv_timeout(CONNECTING) == Err(std::sync::mpsc::RecvTimeoutError::Timeout) {
-                os::tell(Level::Error, "error: the cell's files in /dev/shm do not answer: end all programs of the cell and start them again");
+                os::tell(
+                    Level::Error,
+                    "error: the cell's files in /dev/shm do not answer: end all programs of the cell and start them again",
+                );
                 std::process::exit(exit::UNREACHABLE.into());
             }
         };

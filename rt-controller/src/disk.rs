@@ -288,7 +288,10 @@ impl<'a> Disk<'a> {
             Ok(weights) => {
                 refuse(String::new());
                 note.set(|n| n.weights_written = meta.modified().ok());
-                (self.say)(Level::Info, &format!("weights {} read from {}; the next pour uses them", weights.identity(), self.path.display()));
+                (self.say)(
+                    Level::Info,
+                    &format!("weights {} read from {}; the next pour uses them", weights.identity(), self.path.display()),
+                );
                 let identity = weights.id();
                 self.write(|journal| journal.weights(identity, &weights));
                 self.loaded = weights.to_bytes().ok().map(|bytes| (identity, bytes));

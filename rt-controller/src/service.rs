@@ -125,7 +125,10 @@ impl<'a> Service<'a> {
             match event {
                 Event::Tick(tick, telemetry, counters) => {
                     if self.journal.as_ref().is_some_and(|j| j.try_send(Box::new(tick)).is_err()) {
-                        (self.say)(Level::Warning, "journal: the disk does not keep up; nothing more is written to it, and the controller goes on");
+                        (self.say)(
+                            Level::Warning,
+                            "journal: the disk does not keep up; nothing more is written to it, and the controller goes on",
+                        );
                         self.disk_note.set(|n| n.journal_gave_up = true);
                         self.journal = None;
                     }

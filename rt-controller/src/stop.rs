@@ -92,7 +92,10 @@ impl StopSockets {
         let nameless = SocketAddr::from_abstract_name(abstract_name(own_uid(), name)).and_then(|a| UnixListener::bind_addr(&a));
         let nameless = nameless.and_then(|l| l.set_nonblocking(true).map(|()| l));
         if let Err(e) = &nameless {
-            say(Level::Warning, &format!("the second way to stop, socket @{}: {e}: another user has its name", abstract_name(own_uid(), name)));
+            say(
+                Level::Warning,
+                &format!("the second way to stop, socket @{}: {e}: another user has its name", abstract_name(own_uid(), name)),
+            );
         }
         Ok(Self { file, path, nameless: nameless.ok() })
     }

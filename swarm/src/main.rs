@@ -3,7 +3,7 @@
 //! Ordinary threads; allocates. Bad input is one line and exit code 2; a violation is one line for each and exit code 1.
 
 use std::io::Write;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 use std::process::ExitCode;
 
 use clap::Parser;
@@ -17,6 +17,7 @@ use swarm::plot::plot;
 use swarm::run::{self, Shown};
 use swarm::trained::train_for;
 use swarm::vessels::VESSELS;
+use trainer::report::json_out::JsonOut;
 
 /// Exit code of a violation.
 const VIOLATED: u8 = 1;
@@ -55,8 +56,8 @@ struct Args {
     /// Begins no more of them after so many minutes.
     #[arg(long, requires = "seeds", value_parser = clap::value_parser!(u64).range(1..=100_000))]
     minutes: Option<u64>,
-    /// Writes what they showed to this file.
-    #[arg(long, requires = "seeds")]
+    /// Prints what they showed as JSON in place of the text, or writes it to FILE beside it.
+    #[arg(long, requires = "seeds", value_name = "FILE", num_args = 0..=1, default_missing_value = "-")]
     json: Option<PathBuf>,
     /// Keeps only the faults with these numbers, as in `--keep 0,2`; `--keep none` keeps none.
     #[arg(long, requires = "seed")]
@@ -217,21 +218,19 @@ fn complain(shown: &Shown, keep: &str) {
 /// Many seeds.
 fn many(args: &Args, seeds: Seeds, config: &Config) -> Result<bool, String> {
     // A file that cannot be written is known before an hour of work.
-    let open = |path: &Path| std::fs::File::create(path).map_err(|e| format!("{}: cannot be written: {e}", path.display()));
-    let file = args.json.as_deref().map(open).transpose()?;
+    let json = JsonOut::open(args.json.as_deref()).map_err(|e| e.what)?;
     let started = std::time::Instant::now();
     let until = args.minutes.map(|minutes| started + std::time::Duration::from_secs(60 * minutes));
     let (shown, summary) = run_until(seeds, config, until, true);
-    shown.iter().filter(|one| !one.violations.is_empty()).take(10).for_each(|one| {
-        print(&format!("seed {}:", one.seed));
-        complain(one, &drawn_from(args));
-    });
-    report(&summary, started.elapsed().as_secs_f64());
-    if let (Some(file), Some(path)) = (file, &args.json) {
-        let value = serde_json::json!({ "summary": summary, "seeds": shown });
-        let mut file = std::io::BufWriter::new(file);
-        let written = serde_json::to_writer(&mut file, &value).map_err(std::io::Error::from).and_then(|()| file.flush());
-        written.map_err(|e| format!("{}: cannot be written: {e}; make room, or give another file", path.display()))?;
+    if json.tables() {
+        shown.iter().filter(|one| !one.violations.is_empty()).take(10).for_each(|one| {
+            print(&format!("seed {}:", one.seed));
+            complain(one, &drawn_from(args));
+        });
+        report(&summary, started.elapsed().as_secs_f64());
+    }
+    if json.wanted() {
+        json.write(&serde_json::json!({ "summary": summary, "seeds": shown })).map_err(|e| e.what)?;
     }
     Ok(summary.violations.is_empty())
 }

@@ -2,6 +2,8 @@
 //! other programs' own.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::too_many_lines)]
 
+#[path = "doctor/json.rs"]
+mod json;
 #[path = "doctor/logs.rs"]
 mod logs;
 #[path = "doctor/metrics.rs"]

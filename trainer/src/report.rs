@@ -13,6 +13,7 @@ use serde_json::Value;
 
 mod evaluation;
 mod json;
+pub mod json_out;
 pub mod page;
 pub mod plot;
 mod training;

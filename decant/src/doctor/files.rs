@@ -119,7 +119,8 @@ fn episodes(there: &Path, free: u64, folder: Folder) -> Finding {
         0 => format!("room for {} more", left / one),
         new => format!("{days:.1} days at today's {} MB a day", new.div_ceil(MEGABYTE)),
     };
-    let is = format!("{}: {} episodes, {} MB; {} MB free, {lasts}", there.display(), folder.episodes, folder.bytes / MEGABYTE, free / MEGABYTE);
+    let is =
+        format!("{}: {} episodes, {} MB; {} MB free, {lasts}", there.display(), folder.episodes, folder.bytes / MEGABYTE, free / MEGABYTE);
     let advice = "delete or move what is no longer needed (`decant episodes prune`)";
     let soon = "the disk will be full soon, and then nothing is recorded";
     match left {
@@ -139,7 +140,8 @@ fn budget(budget: Budget, folder: Folder) -> Finding {
     }
     let is = format!("{} episodes of {} MB, and {} may be", folder.episodes, folder.bytes / MEGABYTE, budget.words());
     let means = "nothing is deleted by itself, so the disk fills";
-    let advice = "`decant episodes prune` says what it would delete, and spares what is weighed; docs/DATA.md says how it is run each night";
+    let advice =
+        "`decant episodes prune` says what it would delete, and spares what is weighed; docs/DATA.md says how it is run each night";
     match budget.share(folder.episodes, folder.bytes) {
         share if share > FAR_OVER => Finding::red(what, is, means, advice),
         share if share > 1.0 => Finding::yellow(what, is, means, advice),
@@ -155,7 +157,8 @@ fn writable(what: &str, directory: &Path) -> Result<(PathBuf, u64), Finding> {
         let advice = format!("give it to this user (user {}), or configure another place", own_uid());
         return Err(Finding::red(what, format!("{}: {e}", there.display()), "nothing can be written there", advice));
     }
-    let unknown = || Finding::yellow(what, format!("{}: its free space is not shown", there.display()), "it may be full", "look at it with df");
+    let unknown =
+        || Finding::yellow(what, format!("{}: its free space is not shown", there.display()), "it may be full", "look at it with df");
     free_bytes(&there).ok_or_else(unknown).map(|free| (there, free))
 }
 

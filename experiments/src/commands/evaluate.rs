@@ -3,13 +3,14 @@
 //! Ordinary threads, all cores, full speed; allocates. The same arguments give the same numbers on any number of threads. A bad argument
 //! or weight file is an error of one line.
 
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 
 use indicatif::{ParallelProgressIterator, ProgressBar, ProgressStyle};
 use rayon::prelude::*;
 use shared::exit::{self, Failure, OrExit as _, failure};
 use shared::weights::Weights;
 use simulator::physics::vessel::VesselKind;
+use trainer::report::json_out::JsonOut;
 use trainer::training::{Estimate, MethodName};
 
 use crate::bench::pour::PourResult;
@@ -197,6 +198,7 @@ impl Judged {
 /// Runs the command.
 pub fn run(args: &Args) -> Result<(), Failure> {
     args.check()?;
+    let json = JsonOut::open(args.json.as_deref())?;
     if let Some(dir) = &args.keep {
         std::fs::create_dir_all(dir).map_err(|e| format!("{}: {e}", dir.display())).or_exit(exit::FAILED)?;
     }
@@ -206,7 +208,6 @@ pub fn run(args: &Args) -> Result<(), Failure> {
     }
     let (kinds, protocols) = (args.kinds()?, args.protocols()?);
     let begin = std::time::Instant::now();
-    let to_stdout = args.json.as_deref() == Some(Path::new("-"));
     let mut reports = Vec::new();
     let mut frames = 0;
     for kind in &kinds {
@@ -222,27 +223,19 @@ pub fn run(args: &Args) -> Result<(), Failure> {
                     .collect()
             };
             let summaries: Vec<Summary> = judged.iter().map(|j| Summary::new(&j.name, &j.groups)).collect();
-            if !to_stdout {
+            if json.tables() {
                 print(args, &table, &summaries);
             }
             frames += judged.iter().flat_map(|j| j.groups.iter().flatten()).map(|p| u64::from(p.frames)).sum::<u64>();
-            if args.json.is_some() {
+            if json.wanted() {
                 let traces = examples(args, protocol, trials.first(), files.first().map(|(_, weights)| weights));
                 reports.push(report(args, &table, &summaries, &traces, &judged));
             }
         }
     }
     eprintln!("{frames} frames, {:.1} s with training", begin.elapsed().as_secs_f64());
-    if let Some(file) = &args.json {
-        // One table is the report that `trainer report` reads; several are a list of them.
-        let all = if reports.len() == 1 { reports.remove(0) } else { serde_json::Value::Array(reports) };
-        if to_stdout {
-            println!("{all}");
-        } else {
-            std::fs::write(file, all.to_string()).map_err(|e| format!("{}: {e}", file.display())).or_exit(exit::FAILED)?;
-        }
-    }
-    Ok(())
+    // One table is the report that `trainer report` reads; several are a list of them.
+    json.write(&if reports.len() == 1 { reports.remove(0) } else { serde_json::Value::Array(reports) })
 }
 
 /// Which table it is.

@@ -11,8 +11,10 @@ use std::path::PathBuf;
 use indicatif::ProgressBar;
 use rand::SeedableRng;
 use rand_pcg::Pcg64Mcg;
+use serde_json::{Value, json};
 use shared::exit::{self, OrExit as _};
 use simulator::camera::{Background, Scene};
+use trainer::report::json_out::JsonOut;
 
 use crate::camera_evaluation::cases::{Case, name};
 use crate::camera_evaluation::doubts;
@@ -44,8 +46,8 @@ pub struct Args {
     /// Seed of everything that is drawn.
     #[arg(long, default_value_t = 1)]
     seed: u64,
-    /// Write all figures to this file.
-    #[arg(long)]
+    /// Prints all figures as JSON in place of the tables, or writes them to FILE beside them.
+    #[arg(long, value_name = "FILE", num_args = 0..=1, default_missing_value = "-")]
     json: Option<PathBuf>,
     /// Directory of the worst frames.
     #[arg(long, default_value = "out/evaluate-camera")]
@@ -72,11 +74,12 @@ pub struct Args {
 
 /// Runs the command.
 pub fn run(args: &Args) -> Result<(), exit::Failure> {
+    let json = JsonOut::open(args.json.as_deref())?;
     let done = match args.faults {
-        Some(pours) => evaluate_faults(args, pours),
-        None => evaluate(args),
+        Some(pours) => evaluate_faults(args, pours, json.tables()),
+        None => evaluate(args, json.tables()),
     };
-    done.or_exit(exit::FAILED)
+    json.write(&done.or_exit(exit::FAILED)?)
 }
 
 /// Frames by method and condition, their number, and the worst of them.
@@ -87,7 +90,7 @@ struct Measured {
     worst: Worst,
 }
 
-fn evaluate(args: &Args) -> Result<(), CameraError> {
+fn evaluate(args: &Args, tables: bool) -> Result<Value, CameraError> {
     let short_scenes = args.frames.div_ceil(SHORT_FRAMES).max(2);
     let bar = ProgressBar::new((short_scenes + args.runs) as u64).with_message("scenes");
     let mut all = Measured::default();
@@ -102,26 +105,24 @@ fn evaluate(args: &Args) -> Result<(), CameraError> {
     all.worst.save(&args.out)?;
 
     let figures: BTreeMap<&str, CameraFigures> = all.groups.iter().map(|(name, frames)| (name.as_str(), figures(frames))).collect();
-    print(&figures);
     if let Some(path) = &args.frames_csv {
         faults::write_frames(&all.groups, path)?;
     }
-    print_reliability(&all.groups);
     let doubts = doubts::raised_percent(args.seed)?;
-    println!("\nframes that nobody should trust, and the share for which the doubt was raised:");
-    for (name, percent) in &doubts {
-        println!("  {name:<24}{percent:>6.1} %");
+    if tables {
+        print(&figures);
+        print_reliability(&all.groups);
+        println!("\nframes that nobody should trust, and the share for which the doubt was raised:");
+        for (name, percent) in &doubts {
+            println!("  {name:<24}{percent:>6.1} %");
+        }
+        println!("\nworst frames: {}", args.out.display());
     }
-    println!("\nworst frames: {}", args.out.display());
-    if let Some(path) = &args.json {
-        let report = serde_json::json!({ "frames": all.frames, "seed": args.seed, "conditions": figures, "doubts_raised_percent": doubts });
-        std::fs::write(path, serde_json::to_string_pretty(&report)?).map_err(|e| format!("{}: {e}", path.display()))?;
-    }
-    Ok(())
+    Ok(json!({ "frames": all.frames, "seed": args.seed, "conditions": figures, "doubts_raised_percent": doubts }))
 }
 
-/// Measures `pours` whole pours of each method through every fault, and prints a line for each.
-fn evaluate_faults(args: &Args, pours: u64) -> Result<(), CameraError> {
+/// Measures `pours` whole pours of each method through every fault, and prints a line for each if `tables` are wanted.
+fn evaluate_faults(args: &Args, pours: u64, tables: bool) -> Result<Value, CameraError> {
     let mut frames = FaultFrames::new();
     let bar = ProgressBar::new(2 * pours).with_message("pours");
     for (clear, method) in [(false, "colour"), (true, "clear")] {
@@ -139,17 +140,15 @@ fn evaluate_faults(args: &Args, pours: u64) -> Result<(), CameraError> {
         }
     }
     bar.finish_and_clear();
-    faults::print(&frames);
-    print_reliability(&faults::by_ground(&frames));
+    if tables {
+        faults::print(&frames);
+        print_reliability(&faults::by_ground(&frames));
+    }
     if let Some(path) = &args.frames_csv {
         faults::write_frames(&frames, path)?;
     }
-    if let Some(path) = &args.json {
-        let figures: BTreeMap<&str, CameraFigures> = frames.iter().map(|(name, frames)| (name.as_str(), figures(frames))).collect();
-        let report = serde_json::json!({ "pours": pours, "seed": args.seed, "faults": figures });
-        std::fs::write(path, serde_json::to_string_pretty(&report)?).map_err(|e| format!("{}: {e}", path.display()))?;
-    }
-    Ok(())
+    let figures: BTreeMap<&str, CameraFigures> = frames.iter().map(|(name, frames)| (name.as_str(), figures(frames))).collect();
+    Ok(json!({ "pours": pours, "seed": args.seed, "faults": figures }))
 }
 
 /// Measures the `i`-th cell: a short scene, or the `run`-th run of whole pours.

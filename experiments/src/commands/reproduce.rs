@@ -9,6 +9,7 @@ use rayon::prelude::*;
 use serde_json::{Value, json};
 use shared::exit::{self, Failure, OrExit as _};
 use trainer::method::policy_gradient::{DELTA, KERAS_CLIP};
+use trainer::report::json_out::JsonOut;
 use trainer::report::page::{figure, page, table};
 use trainer::report::plot::{PlotSeries, plot};
 
@@ -35,8 +36,8 @@ pub struct Args {
     /// Writes the report as a page.
     #[arg(long)]
     html: Option<PathBuf>,
-    /// Writes the report as JSON, for `trainer report`.
-    #[arg(long)]
+    /// Prints the report as JSON in place of the text, or writes it to FILE beside it, for `trainer report`.
+    #[arg(long, value_name = "FILE", num_args = 0..=1, default_missing_value = "-")]
     json: Option<PathBuf>,
 }
 
@@ -112,23 +113,30 @@ pub fn run(args: &Args) -> Result<(), Failure> {
     let far = |top: usize| (poured(top) - args.weight).abs();
     let top = (50..=100).min_by(|a, b| far(*a).total_cmp(&far(*b))).unwrap_or(70);
     let weight = poured(top);
-    println!(
-        "section 4: simulator a, 300 ml, one triangle of +-1 degree up to {top} degrees pours {weight:.1} ml; delta {DELTA}, 2 actions, 4-40-40-2"
-    );
+    let json = JsonOut::open(args.json.as_deref())?;
+    if json.tables() {
+        println!(
+            "section 4: simulator a, 300 ml, one triangle of +-1 degree up to {top} degrees pours {weight:.1} ml; delta {DELTA}, 2 actions, \
+             4-40-40-2"
+        );
+    }
     let forms: Vec<Form> = [("as printed", None), ("clipped to [1e-7, 1 - 1e-7]", Some(KERAS_CLIP))]
         .into_iter()
         .map(|(name, clip)| Form::run(name, clip, top, args))
         .collect();
     let verdicts: Vec<String> = forms.iter().map(Form::verdict).collect();
-    println!("{}", verdicts.join("\n"));
+    if json.tables() {
+        println!("{}", verdicts.join("\n"));
+    }
     let html = html(args, top, weight, &forms, &verdicts);
     let runs: Vec<Value> = forms.iter().map(|f| json!({ "name": f.name, "mae_ml": f.mae_ml })).collect();
     let report = json!({ "kind": "reproduction", "html": html, "weight_ml": weight, "runs": runs });
-    let files = [(args.html.as_ref(), page("Decant: section 4 of the paper", &html)), (args.json.as_ref(), report.to_string())];
-    for (file, text) in files.iter().filter_map(|(f, t)| f.map(|f| (f, t))) {
-        std::fs::write(file, text).map_err(|e| format!("{}: {e}", file.display())).or_exit(exit::FAILED)?;
+    if let Some(file) = &args.html {
+        std::fs::write(file, page("Decant: section 4 of the paper", &html))
+            .map_err(|e| format!("{}: {e}", file.display()))
+            .or_exit(exit::FAILED)?;
     }
-    Ok(())
+    json.write(&report)
 }
 
 /// The report as a part of a page.

@@ -104,7 +104,9 @@ mod tests {
         assert_eq!(folder, Folder { episodes: 3, bytes: 3_000_000, new_bytes: 2_000_000 });
         assert_eq!(Folder::look(&dir.path().join("none")), Folder::default());
         let budget = |megabytes, episodes| Budget { bytes: megabytes * MEGABYTE, episodes };
-        for (budget, holds) in [(budget(0, 0), true), (budget(3, 3), true), (budget(2, 0), false), (budget(0, 2), false), (budget(9, 2), false)] {
+        for (budget, holds) in
+            [(budget(0, 0), true), (budget(3, 3), true), (budget(2, 0), false), (budget(0, 2), false), (budget(9, 2), false)]
+        {
             assert_eq!(budget.holds(folder.episodes, folder.bytes), holds, "{budget:?}");
         }
         assert_eq!(budget(20, 7).words(), "7 episodes or 20 MB");

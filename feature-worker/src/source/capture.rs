@@ -83,7 +83,9 @@ impl Capture {
         if !outcome.refused.is_empty() {
             match camera.refused {
                 Refused::Error => return Err(SourceError::Refused(outcome.refused.join("; "))),
-                Refused::Warning => outcome.refused.iter().for_each(|line| eprintln!("{}", Level::Warning.marked(&format!("camera: warning: {line}")))),
+                Refused::Warning => {
+                    outcome.refused.iter().for_each(|line| eprintln!("{}", Level::Warning.marked(&format!("camera: warning: {line}"))))
+                }
             }
         }
         let numbering = Numbering::new(camera.fps, os::now_ns());

@@ -99,19 +99,22 @@ fn print_until_stopped(latest: &ArrayQueue<Status>, looks: &AtomicU64, stop: &At
             }
         } else if lines == Lines::EachSecond && !status.silent {
             let fps = (status.frames - frames_before) as f64 * 1e9 / (now_ns - printed_at_ns) as f64;
-            speaker.say(Level::Info, &format!(
-                "frame {} ({fps:.0}/s), V_e {:.0} px^2, confidence {:.2}, doubt: {}, {:.2} ms + {:.1} ms old, lost {}, \
+            speaker.say(
+                Level::Info,
+                &format!(
+                    "frame {} ({fps:.0}/s), V_e {:.0} px^2, confidence {:.2}, doubt: {}, {:.2} ms + {:.1} ms old, lost {}, \
                  repeated {}, doubtful {}",
-                status.sequence,
-                status.area_px2,
-                status.confidence,
-                status.doubt,
-                status.took_us / 1e3,
-                status.latency_ms,
-                status.lost,
-                status.repeated,
-                status.doubtful
-            ));
+                    status.sequence,
+                    status.area_px2,
+                    status.confidence,
+                    status.doubt,
+                    status.took_us / 1e3,
+                    status.latency_ms,
+                    status.lost,
+                    status.repeated,
+                    status.doubtful
+                ),
+            );
         } else if lines != Lines::Quiet
             && let Some((level, line)) = changes.line(&status, now_ns)
         {
@@ -142,7 +145,9 @@ impl Changes {
         Some(match state {
             (true, _) => (Level::Warning, "no frames for a second; waiting for the camera driver".into()),
             (false, "none") => (Level::Info, format!("frames are measured, without a doubt; {} were lost so far", status.lost)),
-            (false, doubt) => (Level::Warning, format!("the pictures are doubted: {doubt}; {} of {} so far", status.doubtful, status.frames)),
+            (false, doubt) => {
+                (Level::Warning, format!("the pictures are doubted: {doubt}; {} of {} so far", status.doubtful, status.frames))
+            }
         })
     }
 }
