@@ -46,7 +46,7 @@ function shownEpisodes() {
 function showTable() {
   if ($('history').hidden) return;
   const list = shownEpisodes();
-  $('table-words').textContent = `${list.length} of ${table.episodes.length} episodes in ${table.directory || '…'}${table.unread ? `; ${table.unread} files are still to be read` : ''}.`;
+  $('table-words').textContent = `Episodes: ${list.length} of ${table.episodes.length} in ${table.directory || '…'}${table.unread ? `; still to be read: ${table.unread}` : ''}.`;
   fill($('table').tHead, el('tr', {}, ...COLUMNS.map(([key, name, , number]) => {
     const on = sorted[0] === key;
     const head = el('th', { scope: 'col', className: number ? 'number' : '', 'aria-sort': on ? (sorted[1] > 0 ? 'ascending' : 'descending') : 'none' },

@@ -50,6 +50,7 @@ pub mod messages;
 pub mod mlp;
 #[allow(unsafe_code)]
 pub mod os;
+pub mod plural;
 pub mod regular_file;
 pub mod robot_address;
 pub mod runtime_dir;

@@ -16,6 +16,7 @@ use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 use crate::episode::rfc3339;
 use crate::level::{Level, to_journal};
 use crate::os;
+use crate::plural::counted;
 
 /// Number of lines that may wait. Chosen by hand: more than a process says in a pour.
 const WAITING: usize = 256;
@@ -102,7 +103,7 @@ fn write_lines(name: &str, queue: &Receiver<Line>, counts: &Counts) {
         let dropped = counts.dropped.load(SeqCst);
         if dropped > told {
             let lost = dropped - told;
-            let what = format!("{name}: {lost} lines are missing here, because what reads them had stopped");
+            let what = format!("{name}: {} missing here, because what reads them had stopped", counted(lost, "line"));
             write(std::io::stderr().as_fd(), &said(Level::Warning, &what));
             told = dropped;
         }

@@ -95,7 +95,7 @@ fn dropped_lines_are_counted() {
     assert_eq!(cell.stop("rt-controller"), Some(0));
     let text = reading.join().expect("it ran").expect("text");
     let lines: Vec<&str> = text.trim_start_matches('x').lines().collect();
-    let gap = lines.iter().find(|l| l.contains("lines are missing here")).expect("the gap is named");
+    let gap = lines.iter().find(|l| l.contains("lines missing here")).expect("the gap is named");
     let words: Vec<&str> = gap.split_whitespace().collect();
     assert!(words[2].parse::<u32>().is_ok_and(|n| n > 100), "{gap}");
     assert!(lines.iter().all(|l| l.as_bytes().get(10) == Some(&b'T') && l.contains("Z rt-controller: ")), "{lines:?}");

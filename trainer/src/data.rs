@@ -6,6 +6,7 @@ use std::path::PathBuf;
 
 use sha2::{Digest, Sha256};
 use shared::episode::{self, Episode};
+use shared::plural::counted;
 
 /// Fewer frames than this are no whole curve: one second at 30 frames a second.
 const FRAMES_MIN: usize = 30;
@@ -114,7 +115,7 @@ impl TrainingEpisode {
             ));
         }
         if n < FRAMES_MIN {
-            return Some(format!("only {n} frames: an episode needs a whole curve, at least {FRAMES_MIN}"));
+            return Some(format!("only {}: an episode needs a whole curve, at least {FRAMES_MIN}", counted(n, "frame")));
         }
         if let Some(k) = self.t_s.iter().chain(&self.alpha_deg).position(|v| !v.is_finite()) {
             return Some(format!("frame {}: time or angle is not finite: export the table again", k % n));

@@ -10,6 +10,7 @@ use rt_controller::{claim, disk};
 use shared::config::Config;
 use shared::disk_space::free_bytes;
 use shared::machine::Finding;
+use shared::plural::counted;
 use shared::runtime_dir::{Place, own_uid};
 use shared::shared_memory::{self, SharedMemoryError};
 
@@ -101,7 +102,7 @@ fn weights(file: &Path, config: &Config) -> Finding {
     match disk::read_weights(path, config.camera.fps, trusted) {
         Ok(weights) => {
             let origin = &weights.origin;
-            let how = format!("trained from {} episodes by {:?}", origin.episodes, origin.method);
+            let how = format!("trained from {} by {:?}", counted(origin.episodes, "episode"), origin.method);
             let age = path.metadata().ok().and_then(|m| m.modified().ok()).and_then(|t| t.elapsed().ok());
             let age = age.map_or(String::new(), |age| format!(", {:.1} days old", age.as_secs_f64() / 86_400.0));
             Finding::green("weights", format!("{} {how}{age}", weights.identity()))
@@ -119,8 +120,13 @@ fn episodes(there: &Path, free: u64, folder: Folder) -> Finding {
         0 => format!("room for {} more", left / one),
         new => format!("{days:.1} days at today's {} MB a day", new.div_ceil(MEGABYTE)),
     };
-    let is =
-        format!("{}: {} episodes, {} MB; {} MB free, {lasts}", there.display(), folder.episodes, folder.bytes / MEGABYTE, free / MEGABYTE);
+    let is = format!(
+        "{}: {} of {} MB; {} MB free, {lasts}",
+        there.display(),
+        counted(folder.episodes, "episode"),
+        folder.bytes / MEGABYTE,
+        free / MEGABYTE
+    );
     let advice = "delete or move what is no longer needed (`decant episodes prune`)";
     let soon = "the disk will be full soon, and then nothing is recorded";
     match left {
@@ -138,7 +144,7 @@ fn budget(budget: Budget, folder: Folder) -> Finding {
     if budget.is_none() {
         return Finding::green(what, "none is set (recording.budget_mb, recording.budget_episodes)");
     }
-    let is = format!("{} episodes of {} MB, and {} may be", folder.episodes, folder.bytes / MEGABYTE, budget.words());
+    let is = format!("{} of {} MB, and {} may be", counted(folder.episodes, "episode"), folder.bytes / MEGABYTE, budget.words());
     let means = "nothing is deleted by itself, so the disk fills";
     let advice =
         "`decant episodes prune` says what it would delete, and spares what is weighed; docs/DATA.md says how it is run each night";
@@ -168,7 +174,7 @@ fn journal(directory: &Path) -> Finding {
         Ok(found) => found,
         Err(finding) => return finding,
     };
-    let is = format!("{}: {} MB free, room for {} days", there.display(), free / MEGABYTE, free / (JOURNAL_HOUR_BYTES * 24));
+    let is = format!("{}: {} MB free, room for {}", there.display(), free / MEGABYTE, counted(free / (JOURNAL_HOUR_BYTES * 24), "day"));
     let advice = "delete or move what is no longer needed";
     match free {
         0..JOURNAL_HOUR_BYTES => Finding::red("journal", is, "the disk is full: nothing more is recorded", advice),

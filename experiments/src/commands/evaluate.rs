@@ -8,6 +8,7 @@ use std::path::PathBuf;
 use indicatif::{ParallelProgressIterator, ProgressBar, ProgressStyle};
 use rayon::prelude::*;
 use shared::exit::{self, Failure, OrExit as _, failure};
+use shared::plural::counted;
 use shared::weights::Weights;
 use simulator::physics::vessel::VesselKind;
 use trainer::report::json_out::JsonOut;
@@ -233,7 +234,7 @@ pub fn run(args: &Args) -> Result<(), Failure> {
             }
         }
     }
-    eprintln!("{frames} frames, {:.1} s with training", begin.elapsed().as_secs_f64());
+    eprintln!("{}, {:.1} s with training", counted(frames, "frame"), begin.elapsed().as_secs_f64());
     // One table is the report that `trainer report` reads; several are a list of them.
     json.write(&if reports.len() == 1 { reports.remove(0) } else { serde_json::Value::Array(reports) })
 }

@@ -9,6 +9,7 @@ use clap::Subcommand;
 use serde_json::{Value, json};
 use shared::episode::{Episode, EpisodeError, EpisodeKind, set_weight};
 use shared::exit::{self, Failure, OrExit as _, failure};
+use shared::plural::counted;
 
 use crate::episodes::export::{ExportFormat, Exported, export};
 use crate::episodes::output::ExportError;
@@ -120,17 +121,17 @@ fn list(files: &[PathBuf], as_json: bool) -> Result<(), Failure> {
                 Err(e) => println!("{name:<24} UNREADABLE: {e}"),
             }
         }
-        println!("{} episodes", files.len());
+        println!("{}", counted(files.len(), "episode"));
     }
     match read.iter().filter(|r| r.is_err()).count() {
         0 => Ok(()),
-        bad => Err(failure(exit::FAILED, format!("{bad} of {} episodes cannot be read", files.len()))),
+        bad => Err(failure(exit::FAILED, format!("{bad} of {} cannot be read", counted(files.len(), "episode")))),
     }
 }
 
 fn show(files: &[PathBuf], as_json: bool) -> Result<(), Failure> {
     let [file] = files else {
-        return Err(failure(exit::BAD_INPUT, format!("{} episodes were found; name one file to show", files.len())));
+        return Err(failure(exit::BAD_INPUT, format!("{} found; name one file to show", counted(files.len(), "episode"))));
     };
     let episode = Episode::read(file).or_exit(exit::BAD_INPUT)?;
     let value = summary(&episode);
@@ -215,11 +216,11 @@ fn check(files: &[PathBuf], as_json: bool) -> Result<(), Failure> {
                 println!("  {} {}", if remark.is_wrong { "wrong:" } else { "note: " }, remark.text);
             }
         }
-        println!("{} of {} episodes can be trained on", all.len() - wrong, all.len());
+        println!("{} of {} can be trained on", all.len() - wrong, counted(all.len(), "episode"));
     }
     match wrong {
         0 => Ok(()),
-        wrong => Err(failure(exit::FAILED, format!("{wrong} of {} episodes cannot be trained on", all.len()))),
+        wrong => Err(failure(exit::FAILED, format!("{wrong} of {} cannot be trained on", counted(all.len(), "episode")))),
     }
 }
 
@@ -254,6 +255,6 @@ fn run_export(args: &ExportArgs) -> Result<(), Failure> {
     }
     match left_out.len() {
         0 => Ok(()),
-        n => Err(failure(exit::FAILED, format!("{n} episodes were left out; the others are exported"))),
+        n => Err(failure(exit::FAILED, format!("{} left out; the others are exported", counted(n, "episode")))),
     }
 }

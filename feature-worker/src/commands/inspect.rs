@@ -11,6 +11,7 @@ use opencv::imgcodecs;
 use shared::config::{CameraConfig, Config};
 use shared::exit::{self, Failure, OrExit as _};
 use shared::messages::{Doubt, FrameHeader, PixelFormat};
+use shared::plural::counted;
 
 use crate::drawing::{draw, to_bgr};
 use crate::source::{Frame, for_each_frame};
@@ -106,7 +107,11 @@ fn inspect(args: &Args, config: &Config) -> Result<(), String> {
             "missing": contents.missing, "csv": table });
         println!("{report}");
     } else {
-        println!("{frames} frames, {flowing} with flow, {doubtful} doubtful, sum of V_e {sum_px2:.0} px^2; see {}", table.display());
+        println!(
+            "{}, {flowing} with flow, {doubtful} doubtful, sum of V_e {sum_px2:.0} px^2; see {}",
+            counted(frames, "frame"),
+            table.display()
+        );
     }
     Ok(())
 }

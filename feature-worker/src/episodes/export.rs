@@ -8,6 +8,7 @@ use std::path::{Path, PathBuf};
 use clap::ValueEnum;
 use indicatif::{ProgressBar, ProgressStyle};
 use shared::episode::{Episode, EpisodeImages, write_table};
+use shared::plural::counted;
 
 use super::lerobot;
 use super::output::{ExportError, LeftOut, write_error};
@@ -48,7 +49,7 @@ pub fn export(files: &[PathBuf], format: ExportFormat, to: &Path) -> Result<Expo
     if episodes.is_empty() {
         return Err(ExportError::Nothing(match left_out.first() {
             None => "no episodes to export; name .mcap files or a directory of them".into(),
-            Some(first) => format!("none of {} episodes can be read; {}", files.len(), first.why),
+            Some(first) => format!("none of {} can be read; {}", counted(files.len(), "episode"), first.why),
         }));
     }
     fs::create_dir_all(to).map_err(|e| write_error(to, e))?;

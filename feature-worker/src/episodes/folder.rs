@@ -7,6 +7,7 @@ use std::path::Path;
 use std::time::{Duration, SystemTime};
 
 use shared::config::RecordingConfig;
+use shared::plural::counted;
 
 /// A megabyte, as in `recording.budget_mb`, bytes (SI).
 pub const MEGABYTE: u64 = 1_000_000;
@@ -77,7 +78,7 @@ impl Budget {
 
     /// It in words, such as "500 episodes or 20000 MB".
     pub fn words(self) -> String {
-        let number = (self.episodes > 0).then(|| format!("{} episodes", self.episodes));
+        let number = (self.episodes > 0).then(|| counted(self.episodes, "episode"));
         let size = (self.bytes > 0).then(|| format!("{} MB", self.bytes / MEGABYTE));
         number.into_iter().chain(size).collect::<Vec<_>>().join(" or ")
     }

@@ -4,6 +4,7 @@
 use serde_json::{Value, json};
 use shared::episode::{Episode, EpisodeKind, EpisodeRow, hex};
 use shared::messages::Doubt;
+use shared::plural::counted;
 
 /// A weight above this without any flow means that the vision saw nothing, g. Chosen by hand: more than drops and evaporation.
 const SURELY_POURED_G: f64 = 3.0;
@@ -47,22 +48,22 @@ pub fn remarks(episode: &Episode) -> Vec<Remark> {
     if info.lost_frames > 0 {
         let runs = episode.rows.chunk_by(|a, b| a.lost == b.lost);
         let longest = runs.filter(|run| run[0].lost).map(<[EpisodeRow]>::len).max().unwrap_or(0);
-        all.push(Remark::note(format!("{} frames were lost, at most {longest} in a row", info.lost_frames)));
+        all.push(Remark::note(format!("{} lost, at most {longest} in a row", counted(info.lost_frames, "frame"))));
     }
     for (doubt, frames) in doubts(episode) {
         let used = episode.rows.iter().filter(|r| r.doubt == doubt && r.area_px2.is_finite()).count();
         let use_of_it = if used == 0 { "not used".into() } else { format!("{used} of them still used") };
-        all.push(Remark::note(format!("{frames} frames are doubtful: {} ({use_of_it})", doubt.words())));
+        all.push(Remark::note(format!("{} doubtful: {} ({use_of_it})", counted(frames, "frame"), doubt.words())));
     }
     if info.dropped_images > 0 {
-        all.push(Remark::note(format!("{} images were dropped; V_e is there for all of them", info.dropped_images)));
+        all.push(Remark::note(format!("{} dropped; V_e is there all the same", counted(info.dropped_images, "image"))));
     }
     if info.lost_ticks > 0 {
-        all.push(Remark::note(format!("{} ticks of the controller are missing", info.lost_ticks)));
+        all.push(Remark::note(format!("{} of the controller missing", counted(info.lost_ticks, "tick"))));
     }
     let unknown = episode.rows.iter().filter(|r| r.alpha_measured_deg.is_nan()).count();
     if unknown > 0 {
-        all.push(Remark::note(format!("the robot's measured alpha is unknown in {unknown} frames")));
+        all.push(Remark::note(format!("the robot's measured alpha is unknown in {}", counted(unknown, "frame"))));
     }
     all
 }
@@ -76,7 +77,7 @@ fn about_weight(episode: &Episode) -> Option<Remark> {
             Some(Remark::wrong(format!("{w} g on the scale, but no frame shows flow: check [image]")))
         }
         Some(w) if w < NOTHING_POURED_G && flow > CHANCE_FLOW_FRAMES => {
-            Some(Remark::wrong(format!("{flow} frames show flow, but the scale says {w} g: check weight and [image]")))
+            Some(Remark::wrong(format!("flow in {}, but the scale says {w} g: check weight and [image]", counted(flow, "frame"))))
         }
         Some(w) if w < NOTHING_POURED_G => Some(Remark::wrong("nothing was poured: there is nothing to learn from it")),
         Some(_) => None,

@@ -19,6 +19,7 @@ use shared::ipc::{Cell, IpcError};
 use shared::level::Level;
 use shared::messages::{Feature, RecorderReport, RecorderState, Telemetry};
 use shared::os::now_ns;
+use shared::plural::counted;
 
 use super::encoder::Encoder;
 use super::handover::{Handover, KEPT_FRAMES, OfferedFrame};
@@ -376,9 +377,9 @@ impl RecorderThread {
         } else if self.over_budget_ns.is_none_or(|said| now - said > DAY.as_nanos() as u64) {
             self.over_budget_ns = Some(now);
             let what = format!(
-                "{}: {} episodes take {} MB, and the budget is {}: nothing is deleted by itself, `episodes prune` does it",
+                "{}: {} of {} MB, and the budget is {}: nothing is deleted by itself, `episodes prune` does it",
                 self.directory.display(),
-                folder.episodes,
+                counted(folder.episodes, "episode"),
                 folder.bytes / MEGABYTE,
                 budget.words()
             );

@@ -10,6 +10,7 @@ use std::path::{Path, PathBuf};
 use opencv::core::{Mat, Vector};
 use opencv::imgcodecs;
 use opencv::prelude::*;
+use shared::plural::counted;
 
 use super::frame::SourceError;
 
@@ -183,10 +184,15 @@ impl Sequence {
         let left_out: Vec<String> = self.left_out.iter().take(LIST_MOST).map(u64::to_string).collect();
         match (self.absent, self.left_out.len()) {
             (0, 0) => None,
-            (absent, 0) => Some(format!("{}: {absent} pictures are missing between the first and the last", self.path)),
+            (absent, 0) => Some(format!("{}: {} missing between the first and the last", self.path, counted(absent, "picture"))),
             (absent, bad) => {
                 let dots = if bad > LIST_MOST { ", ..." } else { "" };
-                Some(format!("{}: {absent} pictures are missing and {bad} cannot be read ({}{dots})", self.path, left_out.join(", ")))
+                Some(format!(
+                    "{}: {} missing and {bad} cannot be read ({}{dots})",
+                    self.path,
+                    counted(absent, "picture"),
+                    left_out.join(", ")
+                ))
             }
         }
     }

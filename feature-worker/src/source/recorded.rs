@@ -8,6 +8,7 @@ use std::path::Path;
 
 use opencv::core::Mat;
 use shared::episode::{Episode, EpisodeImages};
+use shared::plural::counted;
 
 use super::frame::SourceError;
 use super::pictures;
@@ -38,7 +39,7 @@ impl Recorded {
         let Some(first) = episode.rows.first() else { return Err(fail("the episode has no frames".into())) };
         let mut missing = Vec::new();
         if !episode.complete {
-            missing.push(format!("its end is missing; it has {} frames", episode.rows.len()));
+            missing.push(format!("its end is missing; it has {}", counted(episode.rows.len(), "frame")));
         }
         if episode.info.dropped_images > 0 {
             missing.push(format!("{} of its images were dropped while it was recorded", episode.info.dropped_images));

@@ -4,6 +4,7 @@
 use shared::config::{CellConfig, Config};
 use shared::control::{EndReason, Outcome, Reply, Request};
 use shared::exit::{self, Failure, OrExit as _, failure};
+use shared::plural::counted;
 use shared::weights::Weights;
 
 use super::resume;
@@ -132,15 +133,15 @@ fn report(outcome: &Outcome, recorded: Option<client::Recorded>, foreseen_sd_ml:
         println!("{}", serde_json::json!({ "outcome": outcome, "episode_file": file, "foreseen_sd_ml": foreseen_sd_ml }));
     } else {
         println!(
-            "{}: {} ml poured (estimate) for a goal of {:.1} ml in {:.1} s; {} frames ({} bridged), {} gaps between ticks, {} stale features",
+            "{}: {} ml poured (estimate) for a goal of {:.1} ml in {:.1} s; {} ({} bridged), {} between ticks, {}",
             outcome.reason.words(),
             outcome.poured_words(),
             outcome.goal_ml.unwrap_or(f32::NAN),
             outcome.seconds,
-            outcome.frames,
+            counted(outcome.frames, "frame"),
             outcome.bridged_frames,
-            outcome.tick_gaps,
-            outcome.stale_features
+            counted(outcome.tick_gaps, "gap"),
+            counted(outcome.stale_features, "stale feature")
         );
         match recorded.map(|r| r.file) {
             Some(Ok(file)) => println!("recorded: {file}\nread the scale, then: feature-worker episodes weigh {file} --weight GRAMS"),

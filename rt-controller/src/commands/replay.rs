@@ -4,6 +4,7 @@
 use std::path::PathBuf;
 
 use shared::exit::{self, Failure, OrExit as _, failure};
+use shared::plural::counted;
 
 use crate::journal::{self, Replay};
 
@@ -39,8 +40,8 @@ pub fn run(args: &Args) -> Result<(), Failure> {
         println!("{}", serde_json::json!(replay));
     } else if !args.table {
         let Replay { ticks, ended, different, different_deadlines, .. } = &replay;
-        println!("{ticks} ticks replayed, {} pours and recordings, {different} different answers", ended.len());
-        println!("{different_deadlines} ticks at another time than the pacing gives");
+        println!("{} replayed, pours and recordings: {}, different answers: {different}", counted(*ticks, "tick"), ended.len());
+        println!("{} at another time than the pacing gives", counted(*different_deadlines, "tick"));
         if replay.continued {
             println!("the file begins in the middle of a run: answers are compared from its first pour or recording on, and no deadlines");
         }

@@ -49,7 +49,7 @@ fn the_disk_is_not_filled_in_silence() {
     assert!(!cell.log("feature-worker").contains("the budget is"), "{}", cell.log("feature-worker"));
     let said = record(&cell);
     assert!(said.contains("episode-0002.mcap"), "{said}");
-    wait_for(&cell, "2 episodes take");
+    wait_for(&cell, "2 episodes of");
     let (verdict, words) = line(&examine(&cell).0, "files", "episodes' budget");
     assert!(verdict == "red" && words.contains("decant episodes prune"), "{words}");
     assert_eq!(count(&cell), "2", "nothing is deleted by itself");

@@ -7,6 +7,7 @@ use serde::Serialize;
 use shared::episode::{Episode, EpisodeRow};
 use shared::exit::{self, Failure, OrExit as _, failure};
 use shared::messages::Doubt;
+use shared::plural::counted;
 
 use crate::calibration::{self, EXPONENT_NEEDS};
 use crate::consistency;
@@ -106,10 +107,13 @@ fn set_doubts(episodes: &[TrainingEpisode]) -> Vec<(String, String)> {
     if n == 0 {
         doubt("no episode can be trained on".into());
     } else if n < EXPONENT_NEEDS {
-        doubt(format!("{n} episodes: below {EXPONENT_NEEDS} the camera's exponent cannot be told; method best works, 5 are much better"));
+        doubt(format!(
+            "{}: below {EXPONENT_NEEDS} the camera's exponent cannot be told; method best works, 5 are much better",
+            counted(n, "episode")
+        ));
     }
-    if n < PAPER_NEEDS {
-        doubt(format!("{n} episodes: enough for method best, too few for method paper, which needs {PAPER_NEEDS}"));
+    if (1..PAPER_NEEDS).contains(&n) {
+        doubt(format!("{}: enough for method best, too few for method paper, which needs {PAPER_NEEDS}", counted(n, "episode")));
     }
     if let Some(first) = episodes.first()
         && episodes.iter().any(|e| (e.rate_hz - first.rate_hz).abs() > RATES_APART_HZ)
@@ -127,7 +131,7 @@ pub fn run(args: &Args) -> Result<(), Failure> {
     if args.json {
         println!("{}", serde_json::to_string_pretty(&findings).unwrap_or_default());
     } else {
-        println!("{} episodes, {} usable", findings.episodes, findings.usable);
+        println!("{}, {} usable", counted(findings.episodes, "episode"), findings.usable);
         for (name, what) in &findings.left_out {
             println!("cannot be used: {name}: {what}");
         }

@@ -11,6 +11,7 @@ use shared::estimator::flow::{FlowModel, WayBack};
 use shared::estimator::vessel::Vessel;
 use shared::exit::{self, Failure, OrExit as _};
 use shared::mlp::{HIDDEN, INPUTS, PARAMETERS};
+use shared::plural::counted;
 use shared::weights::{Estimator, FORMAT_VERSION, Weights};
 
 /// Command-line arguments of `trainer inspect`.
@@ -45,7 +46,7 @@ pub fn run(args: &Args) -> Result<(), Failure> {
 /// Prints what is in the weights, for people.
 fn print(weights: &Weights) {
     let Weights { network: _, actions_deg, selection, scale, calibration, estimator, rate_hz, origin, seed } = weights;
-    println!("trained     method {:?}, {} actions, {} episodes, seed {seed}", origin.method, origin.actions, origin.episodes);
+    println!("trained     method {:?}, {} actions, {}, seed {seed}", origin.method, origin.actions, counted(origin.episodes, "episode"));
     println!("data        sha256 {}", episode::hex(&origin.data_sha256));
     println!("network     {INPUTS}-{HIDDEN}-{HIDDEN}-{ACTIONS}, ReLU, {PARAMETERS} parameters, action by {selection:?}");
     println!(

@@ -11,6 +11,7 @@ use indicatif::{ProgressBar, ProgressStyle};
 use shared::episode;
 use shared::exit::{self, Failure, OrExit as _, failure};
 use shared::limits::Limits;
+use shared::plural::counted;
 
 use crate::consistency;
 use crate::data::{self, EpisodeSource, UsableEpisodes};
@@ -157,8 +158,8 @@ impl WeightFileArgs {
         if self.json {
             println!("{text}");
         } else {
-            let n = usable.episodes.len();
-            println!("{}: trained on {n} episodes in {seconds:.1} s, identity {}", out.display(), trained.weights.identity());
+            let n = counted(usable.episodes.len(), "episode");
+            println!("{}: trained on {n} in {seconds:.1} s, identity {}", out.display(), trained.weights.identity());
         }
         Ok(())
     }

@@ -9,6 +9,7 @@ use serde_json::{Value, json};
 use shared::config::Config;
 use shared::episode::{find_episodes, recover, set_note};
 use shared::exit::{self, Failure, OrExit as _, failure};
+use shared::plural::counted;
 
 use super::which::{WhichArgs, change_failure, files, print_json};
 use crate::episodes::folder::{Budget, MEGABYTE};
@@ -179,7 +180,7 @@ fn run_recover(args: &RecoverArgs) -> Result<(), Failure> {
         print_json(&json!({ "file": shown(&new), "frames": frames, "seconds": seconds, "complete": episode.complete }));
     } else {
         let state = if episode.complete { "nothing is missing" } else { "its end is missing, so it cannot be trained on" };
-        println!("{}: {frames} frames in {seconds:.1} s; {state}", shown(&new));
+        println!("{}: {} in {seconds:.1} s; {state}", shown(&new), counted(frames, "frame"));
     }
     Ok(())
 }
@@ -272,7 +273,7 @@ fn prune(args: &PruneArgs) -> Result<(), Failure> {
         print_json(&value);
     } else {
         tell(&going, &kept, args.yes);
-        println!("{stay} episodes of {:.1} MB stay", bytes as f64 / MEGABYTE as f64);
+        println!("{} of {:.1} MB left", counted(stay, "episode"), bytes as f64 / MEGABYTE as f64);
         if none {
             println!("there is no budget: set recording.budget_mb or recording.budget_episodes, or say --budget-mb or --budget-episodes");
         }
@@ -311,6 +312,6 @@ fn tell_copied(copied: &Copied, as_json: bool) -> Result<(), Failure> {
     }
     match copied.left_out.iter().filter(|l| shared::episode::Episode::read(&l.file).is_err()).count() {
         0 => Ok(()),
-        n => Err(failure(exit::FAILED, format!("{n} episodes cannot be read; the others are copied"))),
+        n => Err(failure(exit::FAILED, format!("{} cannot be read; the others are copied", counted(n, "episode")))),
     }
 }
