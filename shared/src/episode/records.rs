@@ -23,6 +23,10 @@ const RECORD_ALWAYS: usize = 64 << 20;
 const EXPANSION: u64 = 32;
 /// See [`EXPANSION`]; so that small files may be compressed well, bytes. Chosen by hand.
 const EXPANSION_BYTES: u64 = 4 << 20;
+/// Records that may only stand behind the data (MCAP specification, section Summary).
+const INDEXES: [u8; 5] = [op::CHUNK_INDEX, op::ATTACHMENT_INDEX, op::STATISTICS, op::METADATA_INDEX, op::SUMMARY_OFFSET];
+/// Length of an attachment's data and its checksum, bytes (MCAP specification).
+const ATTACHMENT_REST: usize = 12;
 /// Number of bytes that are read at a time. Chosen by hand; no measurement is recorded.
 const READ_BYTES: usize = 1 << 20;
 
@@ -131,6 +135,9 @@ impl Records {
                         .bytes_left
                         .checked_sub(data.len() as u64)
                         .ok_or_else(|| damaged(format!("its records are more than {EXPANSION} times larger than the file")))?;
+                    if INDEXES.contains(&opcode) {
+                        return Err(damaged(format!("a record of its index (opcode {opcode:#04x}) stands among the measurements")));
+                    }
                     if !lengths_fit(opcode, data) {
                         return Err(damaged("a text in it is longer than its record".into()));
                     }
@@ -168,13 +175,61 @@ fn lengths_fit(opcode: u8, data: &[u8]) -> bool {
             after_text(&mut rest)?;
         }
         if map {
-            let (length, pairs) = rest.split_first_chunk::<4>()?;
-            let mut pairs = pairs.get(..u32::from_le_bytes(*length) as usize)?;
-            while !pairs.is_empty() {
+            let (length, mut pairs) = rest.split_first_chunk::<4>()?;
+            // As the library reads them: pair by pair, also when the last one goes beyond the map's own length.
+            let behind = pairs.len().checked_sub(u32::from_le_bytes(*length) as usize)?;
+            while pairs.len() > behind {
+                after_text(&mut pairs)?;
                 after_text(&mut pairs)?;
             }
         }
-        Some(())
+        (opcode != op::ATTACHMENT || rest.len() >= ATTACHMENT_REST).then_some(())
     };
     look().is_some()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// A file whose data section holds one record, which is cut behind it.
+    fn file(opcode: u8, record: &[u8]) -> Vec<u8> {
+        let header = [0; 8];
+        let mut bytes = mcap::MAGIC.to_vec();
+        for (opcode, data) in [(op::HEADER, &header[..]), (opcode, record)] {
+            bytes.push(opcode);
+            bytes.extend((data.len() as u64).to_le_bytes());
+            bytes.extend(data);
+        }
+        bytes
+    }
+
+    /// Protects whoever opens a file of others: a text that says to be longer than its record is damage, before gigabytes are set aside for it or the
+    /// library panics, in every kind of record.
+    #[test]
+    fn lengths_beyond_a_record_are_damage() {
+        let huge = 2_000_000_000_u32.to_le_bytes();
+        let text = |t: &str| [&(t.len() as u32).to_le_bytes()[..], t.as_bytes()].concat();
+        let dir = tempfile::tempdir().unwrap();
+        for (name, opcode, record) in [
+            ("metadata's name", op::METADATA, huge.to_vec()),
+            ("a value behind its map", op::METADATA, [text("n"), 5_u32.to_le_bytes().to_vec(), text("k"), huge.to_vec()].concat()),
+            ("index of metadata", op::METADATA_INDEX, [&[0; 16][..], &huge].concat()),
+            ("index of attachments", op::ATTACHMENT_INDEX, [&[0; 38][..], &huge].concat()),
+            ("index of chunks", op::CHUNK_INDEX, [&[0; 44][..], &huge].concat()),
+            ("attachment without its end", op::ATTACHMENT, [&[0; 16][..], &text("n"), &text("m"), &[0; 9]].concat()),
+        ] {
+            let path = dir.path().join("e.mcap");
+            std::fs::write(&path, file(opcode, &record)).unwrap();
+            let end = Records::open(&path).and_then(|mut r| r.next(|_| Ok(None::<()>)).map(|_| ()));
+            assert!(matches!(end, Err(EpisodeError::Damaged { .. })), "{name}: {end:?}");
+        }
+        std::fs::write(
+            dir.path().join("e.mcap"),
+            file(op::METADATA, &[text("n"), 10_u32.to_le_bytes().to_vec(), text("k"), text("v")].concat()),
+        )
+        .unwrap();
+        let end = Records::open(&dir.path().join("e.mcap")).and_then(|mut r| r.next(|_| Ok(None::<()>)));
+        assert!(matches!(end, Ok(NextRecord::Cut)), "what fits is read");
+    }
 }
