@@ -222,7 +222,9 @@ mod tests {
             let path = dir.path().join("e.mcap");
             std::fs::write(&path, file(opcode, &record)).unwrap();
             let end = Records::open(&path).and_then(|mut r| r.next(|_| Ok(None::<()>)).map(|_| ()));
-            assert!(matches!(end, Err(EpisodeError::Damaged { .. })), "{name}: {end:?}");
+            // By our words: the library would set the memory aside before it finds out.
+            let ours = |what: &str| what.contains("longer than its record") || what.contains("a record of its index");
+            assert!(matches!(&end, Err(EpisodeError::Damaged { what, .. }) if ours(what)), "{name}: {end:?}");
         }
         std::fs::write(
             dir.path().join("e.mcap"),
