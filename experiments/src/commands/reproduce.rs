@@ -54,7 +54,6 @@ impl Form {
         let runs: Vec<Run> = (0..args.seeds).into_par_iter().map(|seed| run_once(top, clip, args.steps as usize, seed + 1)).collect();
         let mut mae_ml: Vec<f64> = runs.iter().map(Run::last_mae_ml).collect();
         mae_ml.sort_by(f64::total_cmp);
-        println!("{name:<28} MAE of the runs: {}", mae_ml.iter().map(|m| format!("{m:.1}")).collect::<Vec<_>>().join(" "));
         Self { name, runs, mae_ml }
     }
 
@@ -126,6 +125,9 @@ pub fn run(args: &Args) -> Result<(), Failure> {
         .collect();
     let verdicts: Vec<String> = forms.iter().map(Form::verdict).collect();
     if json.tables() {
+        for Form { name, mae_ml, .. } in &forms {
+            println!("{name:<28} MAE of the runs: {}", mae_ml.iter().map(|m| format!("{m:.1}")).collect::<Vec<_>>().join(" "));
+        }
         println!("{}", verdicts.join("\n"));
     }
     let html = html(args, top, weight, &forms, &verdicts);

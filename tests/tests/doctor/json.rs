@@ -46,8 +46,8 @@ fn json_is_the_same_everywhere() {
         let run = |more: &[&str]| Command::new(program("experiments")).args(words).args(more).current_dir(&dir).output().expect("it runs");
         let output = run(&[]);
         let said = String::from_utf8_lossy(&output.stdout).into_owned();
-        let value: Value = serde_json::from_str(&said).unwrap_or_else(|e| panic!("{words:?}: {e}: {said}"));
-        assert!(output.status.success() && value.is_object(), "{words:?}: {said}");
+        let value: Value = serde_json::from_str(&said).unwrap_or_else(|e| panic!("{words:?}: {e}: {}", said.lines().next().unwrap_or("")));
+        assert!(output.status.success() && value.is_object(), "{words:?}: {:?}", output.status);
         let refused = run(&["no-directory/out.json"]);
         let error = String::from_utf8_lossy(&refused.stderr).into_owned();
         assert!(refused.status.code() == Some(1) && error.contains("cannot be written"), "{words:?}: {error}");

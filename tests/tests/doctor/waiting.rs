@@ -48,3 +48,47 @@ fn a_missing_camera_is_waited_for() {
     assert_eq!(log.matches("no such device").count(), 1, "{log}");
     assert!(log.contains("it is waited for"), "{log}");
 }
+
+/// Protects a pour from a camera that is gone while the worker runs by hand: here a played sequence whose pictures vanish. The worker ends with one line
+/// that says what is missing, the pour ends upright by name, and a worker that is started again finds nothing to play and says that.
+#[test]
+fn a_camera_that_vanishes_ends_the_worker_by_name() {
+    let mut cell = CellUnderTest::start(|_| {});
+    cell.json("rt-controller", &["record", "--json", "--lambda", "5", "--gamma", "2"]);
+    let (episodes, pictures) = (cell.dir.path().join("episodes"), cell.dir.path().join("pictures"));
+    let words = ["episodes", "export", episodes.to_str().expect("text"), "--as", "images", "--to", pictures.to_str().expect("text")];
+    let exported = cell.program("feature-worker").args(words).output().expect("it runs");
+    assert!(exported.status.success(), "{}", String::from_utf8_lossy(&exported.stderr));
+    assert_eq!(cell.stop("feature-worker"), Some(0));
+
+    // The same dry pictures again and again, for half a minute.
+    let mut once: Vec<_> = std::fs::read_dir(pictures.join("episode-0001")).expect("there").map(|e| e.expect("ours").path()).collect();
+    once.sort();
+    let ending = once[0].extension().expect("an ending").to_str().expect("text").to_owned();
+    let played = cell.dir.path().join("played");
+    std::fs::create_dir(&played).expect("ours");
+    for (n, picture) in once.iter().cycle().take(900).enumerate() {
+        std::fs::hard_link(picture, played.join(format!("{n:04}.{ending}"))).expect("ours");
+    }
+    let text = std::fs::read_to_string(cell.config()).expect("ours");
+    let mut config: toml::Table = text.parse().expect("TOML");
+    config["camera"]["source"] = "images".into();
+    config["camera"]
+        .as_table_mut()
+        .expect("a table")
+        .insert("path".into(), played.join(format!("%04d.{ending}")).display().to_string().into());
+    std::fs::write(cell.config(), toml::to_string(&config).expect("TOML")).expect("ours");
+    cell.spawn("feature-worker");
+    cell.take_weights(&steady_weights(13));
+    let pour = cell.pour_tilted();
+    std::fs::remove_dir_all(&played).expect("ours");
+    let output = pour.wait_with_output().expect("it ran");
+    let result: serde_json::Value = serde_json::from_slice(&output.stdout).expect("JSON");
+    assert_eq!((output.status.code(), &result["outcome"]["reason"]), (Some(4), &"stale-feature".into()), "{result}");
+    cell.wait("upright", Duration::from_secs(5), |s| s["alpha_measured_deg"].as_f64().is_some_and(|a| a.abs() < 1.0));
+    assert_eq!(cell.exit_code("feature-worker", Duration::from_secs(10)), Some(2), "{}", cell.log("feature-worker"));
+    let log = cell.log("feature-worker");
+    assert!(log.contains("is missing"), "{log}");
+    cell.spawn("feature-worker");
+    assert_eq!(cell.exit_code("feature-worker", Duration::from_secs(10)), Some(2), "{}", cell.log("feature-worker"));
+}
