@@ -68,7 +68,7 @@ fn summaries(summaries: &Value) -> String {
     ];
     let mut methods = Vec::new();
     for s in items(summaries) {
-        let percent = |key: &str| s[key].as_f64().map_or_else(String::new, |x| format!("{:.1}\u{a0}%", 100.0 * x));
+        let percent = |key: &str| s[key].as_f64().map_or_else(|| "-".into(), |x| format!("{:.1}\u{a0}%", 100.0 * x));
         methods.push([
             text(&s["name"]),
             s["n"].to_string(),
