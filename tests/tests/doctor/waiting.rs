@@ -1,5 +1,6 @@
 //! What is not there yet is waited for, by name, and a cell that is asked to end ends and says so.
 
+use std::process::Stdio;
 use std::time::Duration;
 
 use tests::{CellUnderTest, Namespaces, steady_weights};
@@ -59,7 +60,11 @@ fn a_camera_that_vanishes_ends_the_worker_by_name() {
     let words = ["episodes", "export", episodes.to_str().expect("text"), "--as", "images", "--to", pictures.to_str().expect("text")];
     let exported = cell.program("feature-worker").args(words).output().expect("it runs");
     assert!(exported.status.success(), "{}", String::from_utf8_lossy(&exported.stderr));
-    assert_eq!(cell.stop("feature-worker"), Some(0));
+    assert_eq!((cell.stop("feature-worker"), cell.stop("simulator")), (Some(0), Some(0)));
+    // The robot alone, because a simulated camera would publish frames too.
+    let mut robot = cell.program("simulator");
+    robot.args(["ur", "--address", &cell.address.to_string()]).stdin(Stdio::piped()).stdout(Stdio::null()).stderr(Stdio::null());
+    let mut robot = robot.spawn().expect("it starts");
 
     // The same dry pictures again and again, for half a minute.
     let mut once: Vec<_> = std::fs::read_dir(pictures.join("episode-0001")).expect("there").map(|e| e.expect("ours").path()).collect();
@@ -80,7 +85,10 @@ fn a_camera_that_vanishes_ends_the_worker_by_name() {
     std::fs::write(cell.config(), toml::to_string(&config).expect("TOML")).expect("ours");
     cell.spawn("feature-worker");
     cell.take_weights(&steady_weights(13));
-    let pour = cell.pour_tilted();
+    let before = cell.status().expect("running")["features"].as_u64();
+    cell.wait("measurements", Duration::from_secs(20), |s| s["phase"] == "idle" && s["features"].as_u64() > before);
+    let pour = cell.begin("rt-controller", &["pour", "200", "--json"]);
+    cell.wait("tilt", Duration::from_secs(10), |s| s["alpha_measured_deg"].as_f64() > Some(30.0));
     std::fs::remove_dir_all(&played).expect("ours");
     let output = pour.wait_with_output().expect("it ran");
     let result: serde_json::Value = serde_json::from_slice(&output.stdout).expect("JSON");
@@ -88,7 +96,8 @@ fn a_camera_that_vanishes_ends_the_worker_by_name() {
     cell.wait("upright", Duration::from_secs(5), |s| s["alpha_measured_deg"].as_f64().is_some_and(|a| a.abs() < 1.0));
     assert_eq!(cell.exit_code("feature-worker", Duration::from_secs(10)), Some(2), "{}", cell.log("feature-worker"));
     let log = cell.log("feature-worker");
-    assert!(log.contains("is missing"), "{log}");
+    assert!(log.contains("no such file") && log.contains("give a whole recording"), "{log}");
     cell.spawn("feature-worker");
     assert_eq!(cell.exit_code("feature-worker", Duration::from_secs(10)), Some(2), "{}", cell.log("feature-worker"));
+    robot.kill().and_then(|()| robot.wait()).expect("ours");
 }
