@@ -54,7 +54,7 @@ pub enum DataError {
         what: String,
     },
     /// There are too few for the method.
-    #[error("there are {found} usable episodes, and method {method} needs {needed}: record more")]
+    #[error("usable episodes: {found}, and method {method} needs {needed}: record more")]
     TooFew {
         /// Number of usable episodes.
         found: usize,

@@ -147,9 +147,9 @@ impl Sequence {
                 }
                 expected = number + 1;
             }
-            let more = if gaps.len() > LIST_MOST { format!(" and {} more gaps", gaps.len() - LIST_MOST) } else { String::new() };
+            let more = if gaps.len() > LIST_MOST { format!(" and {}", counted(gaps.len() - LIST_MOST, "more gap")) } else { String::new() };
             gaps.truncate(LIST_MOST);
-            let what = format!("of the numbers {first} to {last}, {absent} are missing: {}{more}", gaps.join(", "));
+            let what = format!("of the numbers {first} to {last}, {absent} missing: {}{more}", gaps.join(", "));
             return Err(SourceError::Incomplete { path, what });
         }
         Ok(Self { path, files: files.into_iter(), first, picture: Mat::default(), partial, left_out: Vec::new(), absent })

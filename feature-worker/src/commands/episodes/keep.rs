@@ -246,7 +246,7 @@ fn delete(args: &DeleteArgs) -> Result<(), Failure> {
     }
     match kept.len() {
         0 => Ok(()),
-        n => Err(failure(exit::BAD_INPUT, format!("{n} of {} are not deleted", args.files.len()))),
+        n => Err(failure(exit::BAD_INPUT, format!("not deleted: {n} of {}", args.files.len()))),
     }
 }
 
