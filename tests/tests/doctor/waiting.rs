@@ -60,7 +60,9 @@ fn a_camera_that_vanishes_ends_the_worker_by_name() {
     let words = ["episodes", "export", episodes.to_str().expect("text"), "--as", "images", "--to", pictures.to_str().expect("text")];
     let exported = cell.program("feature-worker").args(words).output().expect("it runs");
     assert!(exported.status.success(), "{}", String::from_utf8_lossy(&exported.stderr));
-    assert_eq!((cell.stop("feature-worker"), cell.stop("simulator")), (Some(0), Some(0)));
+    for name in ["feature-worker", "rt-controller", "simulator"] {
+        assert_eq!(cell.stop(name), Some(0), "{name}");
+    }
     // The robot alone, because a simulated camera would publish frames too.
     let mut robot = cell.program("simulator");
     robot.args(["ur", "--address", &cell.address.to_string()]).stdin(Stdio::piped()).stdout(Stdio::null()).stderr(Stdio::null());
@@ -84,6 +86,8 @@ fn a_camera_that_vanishes_ends_the_worker_by_name() {
         .insert("path".into(), played.join(format!("%04d.{ending}")).display().to_string().into());
     std::fs::write(cell.config(), toml::to_string(&config).expect("TOML")).expect("ours");
     cell.spawn("feature-worker");
+    cell.spawn("rt-controller");
+    cell.wait_idle();
     cell.take_weights(&steady_weights(13));
     let before = cell.status().expect("running")["features"].as_u64();
     cell.wait("measurements", Duration::from_secs(20), |s| s["phase"] == "idle" && s["features"].as_u64() > before);
