@@ -1,6 +1,6 @@
 //! What is not there yet is waited for, by name, and a cell that is asked to end ends and says so.
 
-use std::process::Stdio;
+use std::process::{Child, Stdio};
 use std::time::Duration;
 
 use tests::{CellUnderTest, Namespaces, steady_weights};
@@ -50,6 +50,16 @@ fn a_missing_camera_is_waited_for() {
     assert!(log.contains("it is waited for"), "{log}");
 }
 
+/// A process that ends with the test, however that ends.
+struct Ends(Child);
+
+impl Drop for Ends {
+    fn drop(&mut self) {
+        let _ = self.0.kill();
+        let _ = self.0.wait();
+    }
+}
+
 /// Protects a pour from a camera that is gone while the worker runs by hand: here a played sequence whose pictures vanish. The worker ends with one line
 /// that says what is missing, the pour ends upright by name, and a worker that is started again finds nothing to play and says that.
 #[test]
@@ -66,7 +76,7 @@ fn a_camera_that_vanishes_ends_the_worker_by_name() {
     // The robot alone, because a simulated camera would publish frames too.
     let mut robot = cell.program("simulator");
     robot.args(["ur", "--address", &cell.address.to_string()]).stdin(Stdio::piped()).stdout(Stdio::null()).stderr(Stdio::null());
-    let mut robot = robot.spawn().expect("it starts");
+    let _robot = Ends(robot.spawn().expect("it starts"));
 
     // The same dry pictures again and again, for half a minute.
     let mut once: Vec<_> = std::fs::read_dir(pictures.join("episode-0001")).expect("there").map(|e| e.expect("ours").path()).collect();
@@ -103,5 +113,4 @@ fn a_camera_that_vanishes_ends_the_worker_by_name() {
     assert!(log.contains("no such file") && log.contains("give a whole recording"), "{log}");
     cell.spawn("feature-worker");
     assert_eq!(cell.exit_code("feature-worker", Duration::from_secs(10)), Some(2), "{}", cell.log("feature-worker"));
-    robot.kill().and_then(|()| robot.wait()).expect("ours");
 }
