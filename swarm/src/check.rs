@@ -30,6 +30,8 @@ const SAID: (f64, f64) = (5.0, 3.0);
 const DRIFT_HIDES: f64 = 1.2 / 0.7;
 /// The output register in which the program says what it is doing (`robot.register_base` of config/sim.toml).
 const STATE_REGISTER: usize = 24;
+/// The output register in which the program says which target it took.
+const ECHO_REGISTER: usize = STATE_REGISTER + 1;
 /// The output register in which the program says which upload it is.
 const RUN_REGISTER: usize = STATE_REGISTER + 2;
 /// How far what a pour that is done says may be from its goal, ml, and as a share of it: the last decision counts drops that still fell.
@@ -105,6 +107,9 @@ pub struct Checks {
     lost: u64,
     /// Since when the container has stood tilted without a program, s.
     tilted_since_s: Option<f64>,
+    /// How many targets were sent in the newest session, and the number of the newest one that the robot took.
+    sent: i32,
+    echoed: i32,
     /// When the operator last asked for the robot, s.
     asked_s: f64,
     /// Who knows that a person stopped our program, and that nobody asked for the robot since.
@@ -148,6 +153,8 @@ impl Checks {
             used: 0,
             lost: 0,
             tilted_since_s: None,
+            sent: 0,
+            echoed: 0,
             asked_s: f64::NEG_INFINITY,
             taken: Taken::default(),
             cleared_s: Vec::new(),
@@ -223,9 +230,20 @@ impl Checks {
         for (invariant, what) in self.commanded.cycle(machine, joint, active) {
             self.violated(invariant, at_s, what);
         }
+        self.targets_numbered(machine, at_s);
         self.stays_on_way_back(machine, at_s);
         self.upright(machine, alpha_deg, at_s);
         self.left_tilted(machine, alpha_deg, at_s);
+    }
+
+    /// The targets of a session are numbered one by one, so none that the robot takes has a number above how many were sent; the last word of a
+    /// session, that the program shall bring the container upright, is no target and has a number too.
+    fn targets_numbered(&mut self, machine: &Machine, at_s: f64) {
+        let echo = machine.robot.outputs.int[ECHO_REGISTER];
+        if echo != self.echoed && echo > self.sent + 1 {
+            self.violated("targets-numbered", at_s, format!("the robot has taken target {echo}, and {} were sent", self.sent));
+        }
+        self.echoed = echo;
     }
 
     /// A program that has begun to come upright by itself or on command does not take targets again.
@@ -296,6 +314,8 @@ impl Checks {
             self.target = None;
             return self.noticed(at_s);
         };
+        // What an earlier session sent may still be on its way when the robot is lost.
+        self.sent = if before == Phase::NoRobot { 1 } else { self.sent + 1 };
         let begins = self.is_active() && !matches!(before, Phase::Pouring | Phase::Recording);
         self.commanded.target(target_deg, self.is_active(), begins);
         let period_s = self.settings.period_ns as f64 / 1e9;
