@@ -185,7 +185,10 @@ fn a_stream_that_was_not_shown_is_in_the_deviation() {
     assert!(honest_sd_ml < 3.0, "{honest_sd_ml}");
     for (lies, shows) in [(84..106, (|_| 0.0) as fn(f32) -> f32), (104..112, |_| 0.0), (95..104, |newest| newest)] {
         let (off_ml, sd_ml) = run(lies.clone(), shows);
-        assert!(sd_ml > 1.4 * honest_sd_ml && off_ml < 2.0 * sd_ml, "{lies:?}: off by {off_ml}, said {sd_ml}, {honest_sd_ml} without a lie");
+        assert!(
+            sd_ml > 1.4 * honest_sd_ml && off_ml < 2.0 * sd_ml,
+            "{lies:?}: off by {off_ml}, said {sd_ml}, {honest_sd_ml} without a lie"
+        );
     }
     let (_, lone_sd_ml) = run(104..105, |_| 0.0);
     assert!(lone_sd_ml < 1.3 * honest_sd_ml, "{lone_sd_ml} and {honest_sd_ml}");
