@@ -181,7 +181,7 @@ impl Extractor {
         let pixels = reader.read(image, |region| self.liquid.take(region))?;
         let sampled = Instant::now();
         let whole = self.whole.is_whole(pixels);
-        let unlit = self.light.doubt(self.liquid.sampled().data_bytes()?);
+        let unlit = self.light.doubt(self.liquid.sampled().data_bytes()?, pixels);
         let unusable = unlit.or((!whole).then_some(Doubt::PictureIncomplete));
         let checked = Instant::now();
         let (measured, segmented) = match unusable {
