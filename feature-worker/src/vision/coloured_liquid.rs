@@ -119,6 +119,8 @@ pub(crate) struct ColouredLiquid {
     half_mask: Mat,
     /// The ground beside the container.
     beside: Square,
+    /// More of it, to tell what goes on there from what is at the lip.
+    beside_wide: Square,
     /// The glass below the lip.
     glass: InGlass,
 }
@@ -139,7 +141,7 @@ impl ColouredLiquid {
         }
         let (mut map_a, mut map_b) = (Mat::default(), Mat::default());
         imgproc::convert_maps(&map_x, &map_y, &mut map_a, &mut map_b, CV_16SC2, true)?;
-        let beside = Square::beside(&axes, image)?;
+        let (beside, beside_wide) = (Square::beside(&axes, image)?, Square::beside_wide(&axes, image)?);
         let colour = image.colour_hsv.map(f64::from);
         let ranges = ranges(colour);
         let glass = InGlass::new(&axes, image, &ranges)?;
@@ -166,6 +168,7 @@ impl ColouredLiquid {
             mask: Mat::default(),
             half_mask: Mat::default(),
             beside,
+            beside_wide,
             glass,
         })
     }
@@ -298,7 +301,7 @@ impl ColouredLiquid {
         self.ends = ends;
         if let Some(body) = body
             && !self.is_excused(body)?
-            && !foreign::goes_on_beside(body, self.beside.colours()?)
+            && !foreign::goes_on_beside(body, self.beside_wide.colours()?)
         {
             return Ok(Sighting::Unsure(Doubt::ColoursChanged));
         }
@@ -354,6 +357,7 @@ impl Liquid for ColouredLiquid {
     fn take(&mut self, region: &BoxedRef<Mat>) -> opencv::Result<()> {
         let (nearest, border) = (imgproc::INTER_NEAREST, core::BORDER_REPLICATE);
         self.beside.take(region)?;
+        self.beside_wide.take(region)?;
         self.glass.take(region)?;
         imgproc::remap(region, &mut self.sampled, &self.map_a, &self.map_b, nearest, border, Scalar::default())
     }

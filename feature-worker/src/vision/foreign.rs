@@ -38,9 +38,9 @@ const LIKE_LIQUID: f32 = 0.5;
 const ALIKE_LEVELS: f32 = 5.0;
 /// See [`ALIKE_LEVELS`]. Chosen by hand: what a vignette and a lamp's fall-off make over 40 px.
 const ALIKE_SHARE: f32 = 0.08;
-/// What is foreign goes on beside the container when this share of the square there has its colour. Chosen by hand: a jet that falls along the
-/// wall covers half of it.
-const GOES_ON: f32 = 0.75;
+/// What is foreign goes on beside the container when this share of the square there has its colour. Chosen by hand: no
+/// jet covers half of it.
+const GOES_ON: f32 = 0.6;
 
 /// A picture along the rays.
 pub(super) struct Seen<'a> {

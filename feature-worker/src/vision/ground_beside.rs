@@ -23,6 +23,9 @@ const SQUARE_SAMPLES: i32 = 16;
 /// Where the square beside the container lies in a picture 640 px wide: from and to, px along the x-axis and along the y-axis. What the
 /// background brings to the lip comes from there, or along the rays.
 const BESIDE_PX: [[f32; 2]; 2] = [[-34.0, -7.0], [-48.0, 10.0]];
+/// Where the larger square beside the container lies, in the same way. Chosen by hand: a jet of liquid that is thin crosses its lower part, and a
+/// thick one its upper part, so that none fills it.
+const BESIDE_WIDE_PX: [[f32; 2]; 2] = [[-36.0, -7.0], [-48.0, 60.0]];
 /// Where the square in the glass lies, in the same way: while something flows, the liquid stands there. Chosen by hand: beyond the wall's
 /// own light, and within the region that calibration writes.
 const GLASS_PX: [[f32; 2]; 2] = [[6.0, 18.0], [-46.0, -14.0]];
@@ -58,6 +61,11 @@ impl Square {
     /// Beside the container, for the region and axes of a camera; `axes` are relative to the region.
     pub(super) fn beside(axes: &Axes, image: &ImageConfig) -> opencv::Result<Self> {
         Self::new(axes, image, BESIDE_PX)
+    }
+
+    /// A larger square beside the container, in the same way.
+    pub(super) fn beside_wide(axes: &Axes, image: &ImageConfig) -> opencv::Result<Self> {
+        Self::new(axes, image, BESIDE_WIDE_PX)
     }
 
     /// Takes the next picture's square.
