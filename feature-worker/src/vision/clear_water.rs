@@ -378,7 +378,8 @@ impl Liquid for ClearWater {
     }
 
     fn hold_ground(&mut self, held: bool) {
-        if !held {
+        // A ground that was shifted or torn is not known, and what is not known looks even.
+        if !held && self.disturbed.doubt().is_none() {
             let even = self.evidence.even();
             self.even_pictures += 1.0;
             let usual = EVEN_FOLLOWS[usize::from(!even)];
