@@ -34,6 +34,12 @@ const BESIDE_FOREIGN: f32 = 0.5;
 /// What is foreign may be the liquid when it is no further from its colour than this share of the distance from there to the ground's mean
 /// colour: a thin stream shows the ground through itself. Chosen by hand.
 const LIKE_LIQUID: f32 = 0.5;
+/// What is foreign may be the liquid in a lamp's reflection when it is brighter than it in all parts by more than this, grey levels. Chosen by
+/// hand: more than an exposure's drift.
+const LIT_LEVELS: f32 = 8.0;
+/// And when the part that is brighter by least is so by this share of the one that is by most. Chosen by hand: where the most is cut off, it is
+/// less.
+const LIT_SHARE: f32 = 0.4;
 /// Two mean colours are one when they differ by no more than these levels, and [`ALIKE_SHARE`] of their mean level. Chosen by hand.
 const ALIKE_LEVELS: f32 = 5.0;
 /// See [`ALIKE_LEVELS`]. Chosen by hand: what a vignette and a lamp's fall-off make over 40 px.
@@ -150,7 +156,11 @@ impl Seen<'_> {
 pub(super) fn is_not_the_liquid(foreign: [f32; 3], liquid: [f32; 3], ground: [f32; 3]) -> bool {
     // Light that is cut off has lost its colour.
     let glows = foreign.iter().all(|v| *v >= f32::from(GLOW_LEVEL));
-    !glows && distance(foreign, liquid) > LIKE_LIQUID * distance(ground, liquid)
+    // Liquid in a lamp's reflection is brighter by much the same in all parts.
+    let brighter: [f32; 3] = std::array::from_fn(|k| foreign[k] - liquid[k]);
+    let (least, most) = brighter.iter().fold((f32::MAX, f32::MIN), |(l, m), v| (l.min(*v), m.max(*v)));
+    let lit = least > LIT_LEVELS && least >= LIT_SHARE * most;
+    !glows && !lit && distance(foreign, liquid) > LIKE_LIQUID * distance(ground, liquid)
 }
 
 /// Whether what is foreign at the lip goes on outside the container, in the square beside it, as only ground does.

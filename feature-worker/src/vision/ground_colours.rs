@@ -13,9 +13,6 @@ const SHARES: usize = 64;
 const DARK_SUM: usize = 30;
 /// A colour whose parts reach this is white light and not a colour, grey levels. As in the check of light, a little below 255.
 const BLIND_LEVEL: u8 = 250;
-/// Ground far from the lip that is as bright as this in all parts, grey levels, may be white light elsewhere: a vignette makes it darker
-/// there. Chosen by hand: a tenth below white.
-const NEARLY_WHITE: u8 = 225;
 /// Shares are taken of levels that are raised by this share of the ground's mean sum, because in dark colours noise alone makes every share.
 /// Chosen by hand.
 const RAISED_SHARE: f64 = 0.1;
@@ -135,9 +132,6 @@ impl GroundColours {
         let place = self.place(colour);
         if place == WHITE && !is_far {
             return;
-        }
-        if is_far && place != WHITE && colour.iter().all(|v| *v >= NEARLY_WHITE) {
-            self.counts[WHITE] = (self.counts[WHITE] + SEEN).min(COUNT_MOST);
         }
         let count = &mut self.counts[place];
         *count = (*count + SEEN).min(COUNT_MOST);
