@@ -56,6 +56,8 @@ pub(crate) struct LightCheck {
     last_hash: Option<u64>,
     /// Mean levels of blue, green and red in the last picture.
     mean_bgr: [f32; 3],
+    /// Whether half of what was read of it is saturated.
+    half_white: bool,
 }
 
 impl LightCheck {
@@ -75,15 +77,21 @@ impl LightCheck {
             count += 1;
         }
         self.mean_bgr = sums.map(|sum| sum as f32 / count.max(1) as f32);
+        self.half_white = saturated as f32 > BLOWN_SHARE * count as f32;
         if self.mean_level() < DARK_LEVEL {
             Some(Doubt::TooDark)
-        } else if saturated as f32 > BLOWN_SHARE * count as f32 && saturated_share(region) > BLOWN_REGION_SHARE {
+        } else if self.half_white && saturated_share(region) > BLOWN_REGION_SHARE {
             Some(Doubt::BlownOut)
         } else if repeated {
             Some(Doubt::Frozen)
         } else {
             None
         }
+    }
+
+    /// Whether half of what was read of the picture that was checked last is saturated.
+    pub(crate) fn is_half_white(&self) -> bool {
+        self.half_white
     }
 
     /// Mean grey level of the picture that was checked last.

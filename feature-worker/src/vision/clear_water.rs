@@ -364,6 +364,10 @@ impl Liquid for ClearWater {
         self.hidden = self.reflection.hides_lip(white_share, 0.0, false);
     }
 
+    fn bears_white(&mut self, half_white: bool) -> bool {
+        !half_white
+    }
+
     fn lose_picture(&mut self, doubt: Doubt) {
         self.disturbed.lose(doubt);
     }

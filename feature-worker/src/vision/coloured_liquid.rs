@@ -104,6 +104,8 @@ pub(crate) struct ColouredLiquid {
     learn_after: u32,
     /// Which share of the glass at the lip is white light.
     white_lip: f32,
+    /// Whether half of what was read is saturated.
+    half_white: bool,
     /// Number of samples on each ray up to the end of the liquid, or of a body at the lip, in the last picture.
     ends: [usize; RAYS],
     // Pictures along the rays, one ray a row, kept from frame to frame.
@@ -161,6 +163,7 @@ impl ColouredLiquid {
             wandering: Wandering::new(),
             learn_after: 0,
             white_lip: 0.0,
+            half_white: false,
             ends: [0; RAYS],
             sampled: Mat::default(),
             smooth: Mat::default(),
@@ -292,6 +295,10 @@ impl ColouredLiquid {
             return Ok(dry);
         }
         self.glass.see_dry()?;
+        // A lamp's reflection before white squares hides a stream, but not the liquid below the lip.
+        if self.half_white && !self.glass.is_empty()? {
+            return Ok(Sighting::Unsure(Doubt::BlownOut));
+        }
         let [blind, glows, foreign] = self.seen().at_lip()?;
         if self.reflection.hides_lip(blind.max(self.white_lip), glows, foreign > QUIET_SHARE) {
             return Ok(Sighting::Unsure(Doubt::BlownOut));
@@ -403,6 +410,16 @@ impl Liquid for ColouredLiquid {
 
     fn see_lip(&mut self, white_share: f32) {
         self.white_lip = white_share;
+    }
+
+    /// A white square of a board behind the lip hides no stream.
+    fn bears_white(&mut self, half_white: bool) -> bool {
+        self.half_white = half_white;
+        if half_white {
+            // Nor is a lamp's reflection before white squares taken for ground.
+            self.learn_after = LEARN_AFTER;
+        }
+        true
     }
 
     /// Each picture is judged by itself.

@@ -128,6 +128,11 @@ impl InGlass {
         Ok(())
     }
 
+    /// Whether the glass is seen not to hold the liquid just below the lip.
+    pub(super) fn is_empty(&mut self) -> opencv::Result<bool> {
+        Ok(self.look()?.0.is_some_and(|share| share <= EMPTY_SHARE))
+    }
+
     /// The mean levels of blue, green and red of the liquid in the glass, if it stands there in its own colours.
     pub(super) fn liquid(&mut self) -> opencv::Result<Option<[f32; 3]>> {
         if self.empty_pictures < EMPTY_PICTURES {
