@@ -181,9 +181,9 @@ fn new_ground_is_no_liquid() -> Result<(), ExtractError> {
         let mut extractor = Extractor::new(&camera(), &image)?;
         for i in 0..48 {
             let mut picture = dry(0.0, i)?;
-            lay_over(&mut picture, &[far.clone()], white)?;
+            lay_over(&mut picture, std::slice::from_ref(&far), white)?;
             for (shape, colour) in shapes.iter().filter(|_| i >= 44) {
-                lay_over(&mut picture, &[shape.clone()], *colour)?;
+                lay_over(&mut picture, std::slice::from_ref(shape), *colour)?;
             }
             let measured = measure(&mut extractor, &picture)?;
             let wanted = if i < 44 { Doubt::None } else { wanted };
