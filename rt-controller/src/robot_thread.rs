@@ -110,6 +110,7 @@ pub fn keep_robot_connected(
         if exchange.resume.swap(false, Relaxed) && !progress.connected {
             progress.waits = false;
             progress.wish_until_ns = Some(now_ns + WISH.as_nanos() as u64);
+            progress.before.ran = false;
             progress.next_ns = now_ns;
         }
         if !progress.connected && !progress.waits && now_ns >= progress.next_ns {
@@ -155,6 +156,7 @@ impl Progress {
     /// Takes note of an attempt that failed with `e`.
     fn failed(&mut self, now_ns: u64, e: &LinkError, config: &Config, note: &RobotNote, say: &dyn Fn(&str)) {
         self.next_ns = now_ns + RECONNECT.as_nanos() as u64;
+        self.before.ran |= matches!(e, LinkError::ProgramRunning { .. });
         self.before.unpowered = match e {
             LinkError::ProgramRunning { .. } => false,
             LinkError::MayNotMove { unpowered: true, .. } => true,

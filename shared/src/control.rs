@@ -155,6 +155,8 @@ pub enum EndReason {
     NothingFlows,
     /// The camera's frames do not come at `camera.fps`.
     FrameRate,
+    /// The goal seemed reached, and then far more left than was foreseen.
+    GoalExceeded,
 }
 
 impl EndReason {
@@ -195,6 +197,9 @@ impl EndReason {
                 "what the camera shows cannot be: the stream does not follow the tilt as in the episodes; look at camera, vessel and liquid"
             }
             Self::FrameRate => "the camera's frames do not come at camera.fps, so the volume is not known",
+            Self::GoalExceeded => {
+                "far more was poured than the goal, and than was foreseen: pour from this vessel and weigh, so that it is learned"
+            }
             Self::NothingFlows => {
                 "nothing is seen to flow, where even the emptiest vessel of the episodes would: look at the camera, or fill the vessel"
             }

@@ -59,8 +59,6 @@ pub struct Eye {
     gone_until_ns: u64,
     two_until_ns: u64,
     newest: Feature,
-    /// By how much the areas lied that were stuck or a false zero, and had no doubt: the sum of how far each frame's volume is from what left, ml.
-    pub lied_ml: f64,
     /// Measurements on their way, with the time of their publication.
     pub published: VecDeque<Feature>,
 }
@@ -90,7 +88,6 @@ impl Eye {
             gone_until_ns: 0,
             two_until_ns: 0,
             newest: Feature::default(),
-            lied_ml: 0.0,
             published: VecDeque::new(),
         }
     }
@@ -154,10 +151,6 @@ impl Eye {
         }
         if false_zero {
             (area_px2, doubt) = (0.0, Doubt::None);
-        }
-        if stuck || false_zero {
-            let told_ml = (f64::from(area_px2) / AREA_AT_1_ML_PX2).powf(1.0 / self.area_exponent);
-            self.lied_ml += (flow_ml - told_ml).abs();
         }
         if let Some(spike_px2) = self.spike_px2.take() {
             area_px2 = spike_px2;

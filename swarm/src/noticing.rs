@@ -85,5 +85,5 @@ pub fn leaves_tilted(what: &What) -> bool {
 /// Whether a pour may end so without any fault: by itself, or because of what vessel and stream show.
 pub fn is_ordinary(reason: EndReason) -> bool {
     use EndReason::*;
-    matches!(reason, Done | ContainerEmpty | StreamLost | MaxFrames | ImpossibleFlow | NothingFlows)
+    matches!(reason, Done | ContainerEmpty | StreamLost | MaxFrames | ImpossibleFlow | NothingFlows | GoalExceeded)
 }

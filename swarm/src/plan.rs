@@ -18,7 +18,7 @@ use crate::what::{Weighed, What};
 /// How long a cell runs after its last order and fault, s: the longest way upright and the wait for the last drops, twice.
 const REST_S: f64 = 12.0;
 /// Share of the seeds in which a curve is recorded, learned from, and the weights swapped. Few, because a training takes longer than a pour.
-const LESSONS: f64 = 0.01;
+const LESSONS: f64 = 0.003;
 
 /// Share of the seeds whose robot lags by another time than the one that was learned with.
 const OTHER_LAGS: f64 = 0.3;

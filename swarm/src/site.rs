@@ -81,7 +81,6 @@ pub struct Site {
     frame_at_ns: u64,
     frame_poured_ml: f64,
     run_poured_ml: f64,
-    run_lied_ml: f64,
     /// The newest run is a pour, and no recording.
     is_pour: bool,
     next_item: usize,
@@ -158,7 +157,6 @@ impl Site {
             frame_at_ns,
             frame_poured_ml: 0.0,
             run_poured_ml: 0.0,
-            run_lied_ml: 0.0,
             is_pour: true,
             next_item: 0,
             episode: 0,
@@ -297,7 +295,7 @@ impl Site {
         self.checks.tick(tick, telemetry, features, at_s);
         let runs = |phase| matches!(phase, Phase::Pouring | Phase::Recording);
         if runs(self.checks.phase) && !runs(before) {
-            (self.run_poured_ml, self.run_lied_ml) = (self.container.poured_ml(), self.eye.lied_ml);
+            self.run_poured_ml = self.container.poured_ml();
             self.is_pour = self.checks.phase == Phase::Pouring;
         }
         let row = Row::new(at_s, tick, telemetry, &self.container);
@@ -311,7 +309,6 @@ impl Site {
         let at_s = self.now_s();
         self.say(|| format!("ended: {:?}, {:.1} ml believed", outcome.reason, outcome.poured_ml));
         let true_ml = self.container.poured_ml() - self.run_poured_ml;
-        self.checks.lied_ml = self.eye.lied_ml - self.run_lied_ml;
         self.checks.ended(outcome, true_ml, at_s);
         self.costs.ended(is_ordinary(outcome.reason));
         let since_s = at_s - f64::from(outcome.seconds) - 6.0;

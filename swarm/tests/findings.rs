@@ -160,3 +160,22 @@ fn a_lag_that_was_not_learned_is_in_the_deviation() {
     let pour = &shown.poured[0];
     assert!(pour.reason != EndReason::Done || (pour.true_ml - f64::from(pour.believed_ml)).abs() < 2.5 * f64::from(pour.sd_ml), "{pour:?}");
 }
+
+/// Protects a person who stops our program on the pendant after the operator has asked for the robot (seed 2017372): the program was seen to run then,
+/// and comes upright after a pause. Whenever the stop comes, nothing starts before the operator asks again; what ended by itself is taken back.
+#[test]
+fn a_stop_after_the_operator_asked_has_the_last_word() {
+    let mut stopped = 0;
+    for stop_ms in (14_200..16_000).step_by(60) {
+        let happens = [
+            (3_000, What::Pour(120.0), None),
+            (7_000, What::Robot(Fault::ProgramPause), Some("program-pause")),
+            (13_500, What::Robot(Fault::ProgramResume), Some("program-pause")),
+            (13_700, What::Pour(80.0), None),
+            (stop_ms, What::Robot(Fault::ProgramStop), Some("program-stop")),
+        ];
+        let shown = shown(2_017_372, Series::Cb3, 1, (300.0, (266_117, 645_915)), &happens);
+        stopped += usize::from(tells(&shown, "stopped on the pendant", 14.0, 17.0));
+    }
+    assert!(stopped > 10, "only {stopped} stops found the program at work");
+}

@@ -20,7 +20,7 @@
 //! | [`controller_overran`]: the controller itself was stopped | `ControllerOverrun` |
 //! | [`worker_was_restarted`]: measurements come from another process | `WorkerRestarted` |
 //! | [`Ending::settled`]: the joint did not come upright | `NotUpright` |
-//! | the same: the goal seemed reached, and then too much of it is missing | `StreamLost` |
+//! | the same: the goal seemed reached, and then too much of it is missing, or was poured | `StreamLost`, `GoalExceeded` |
 
 use shared::agent::Decision;
 use shared::control::EndReason;
@@ -320,7 +320,7 @@ fn not_done(decision: &Decision) -> Option<EndReason> {
     let (d_ml, goal_ml) = (decision.d_ml, decision.d_ml + decision.poured_ml);
     let is_short = d_ml > OFF.0.max(OFF.1 * goal_ml).min(goal_ml / 2.0);
     let is_beyond = decision.poured_sd_ml > 0.0 && -d_ml > OFF.0 + OFF.1 * decision.poured_ml + 2.0 * decision.poured_sd_ml;
-    is_short.then_some(EndReason::StreamLost).or(is_beyond.then_some(EndReason::ImpossibleFlow))
+    is_short.then_some(EndReason::StreamLost).or(is_beyond.then_some(EndReason::GoalExceeded))
 }
 
 /// The reason for what cannot be.
@@ -429,7 +429,7 @@ mod tests {
     /// Protects the operator from nothing, or a cup that ran over unseen, that is called done. A little off is done, and another reason stays.
     #[test]
     fn far_off_the_goal_is_not_done() {
-        use EndReason::{Aborted, Done, ImpossibleFlow, StreamLost};
+        use EndReason::{Aborted, Done, GoalExceeded, StreamLost};
         let settings = Settings::new(&shared::config::Config::parse(include_str!("../../../config/sim.toml"), "sim.toml").unwrap());
         let after = |d_ml: f32, poured_ml: f32, poured_sd_ml: f32, before| {
             let mut ending = Ending::of_pour();
@@ -440,7 +440,7 @@ mod tests {
         assert_eq!([after(65.0, 6.0, 0.0, Done), after(65.0, 6.0, 20.0, Done)], [StreamLost; 2]);
         assert_eq!(after(65.0, 6.0, 0.0, Aborted), Aborted);
         assert_eq!([after(7.0, 64.0, 0.0, Done), after(15.0, 185.0, 0.0, Done), after(-55.0, 94.0, 20.0, Done)], [Done; 3]);
-        assert_eq!([after(-85.0, 124.0, 20.0, Done), after(-85.0, 124.0, 0.0, Done)], [ImpossibleFlow, Done]);
+        assert_eq!([after(-85.0, 124.0, 20.0, Done), after(-85.0, 124.0, 0.0, Done)], [GoalExceeded, Done]);
     }
 
     /// Protects the operator from a false stream: a pour that seemed done is not, if it goes on at an upright container. Another reason stays.

@@ -86,6 +86,8 @@ pub struct Before {
     pub last: Option<RobotState>,
     /// Whether the operator asks for the robot now, so that it does not matter what happened meanwhile.
     pub asked: bool,
+    /// Whether a program was seen to run since then, so that what happens to it afterwards matters after all.
+    pub ran: bool,
     /// Whether the arm was seen without power or with its brakes on since a program was last seen to run: no program can then be paused.
     pub unpowered: bool,
 }
@@ -116,10 +118,11 @@ pub fn moving(earlier: &RobotState, later: &RobotState) -> Option<&'static str> 
 ///
 /// After a lost connection it may be taken if the program that we left there says that it has ended by itself, and if the joints that it does not
 /// move stand where they stood. A controller that has just been started knows nothing from before; it leaves a robot alone on which a program of
-/// ours was stopped in the middle of its work.
+/// ours was stopped in the middle of its work. An operator's wish answers for what was before it, and not for a program that ran after it and was
+/// then stopped: whoever stopped that has the last word.
 pub fn since(before: &Before, state: &RobotState, tilt: Joint) -> Option<Handover> {
     if before.asked {
-        return None;
+        return if before.ran { left_behind(state) } else { None };
     }
     let Some(last) = &before.last else { return left_behind(state) };
     let own_end = matches!(state.program_state, ProgramState::TimedOut | ProgramState::Stopped | ProgramState::Unused);

@@ -74,6 +74,23 @@ fn a_robot_that_was_handled_meanwhile_waits_for_its_operator() {
     }
 }
 
+/// Protects people who stop our program after the operator has asked for the robot: a wish does not answer for a program that was seen to run since.
+/// One that has ended by itself, or another's that left nothing in our registers, is no reason.
+#[test]
+fn a_stop_after_the_operator_asked_counts() {
+    let cases = [
+        (131, (ProgramState::Returning, 7, 9), Some(Handover::Interrupted)),
+        (132, (ProgramState::Stopped, 7, 9), None),
+        (133, (ProgramState::Unknown, 0, 0), None),
+    ];
+    for (number, registers, why) in cases {
+        let before = Before { asked: true, ran: true, ..Before::default() };
+        let (session, _) = Server::new(number, Robot { registers, ..Robot::default() }).meet_after(&before);
+        assert_eq!(session.as_ref().err().and_then(LinkError::handover), why, "{registers:?}");
+        assert_eq!(session.is_ok(), why.is_none(), "{registers:?}");
+    }
+}
+
 /// Protects people from a controller that was not there when they pressed stop: a program that was at work when it went away was stopped by
 /// somebody, and one that ended because the joint was held or moved shows a hand, so a controller that has just been started waits for its operator
 /// too. One that ended because its controller did, or never ran, is no reason.

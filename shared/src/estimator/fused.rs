@@ -186,8 +186,8 @@ impl FusedEstimator {
     }
 
     /// Standard deviation of [`FusedEstimator::poured_ml`], ml: that of the two estimates' mixture, whose difference counts too, and what the
-    /// tilt has let out but was not seen, or the reverse, and what was withheld and never confirmed. Where the straight vessel is held near the
-    /// sum, the part of its correction that is refused counts as well: one of the two is wrong.
+    /// tilt has let out but was not seen, or the reverse, what may have left behind areas that are doubtful in themselves, and what was withheld and
+    /// never confirmed. Where the straight vessel is held near the sum, the part of its correction that is refused counts as well: one of the two is wrong.
     pub fn poured_sd_ml(&self) -> f64 {
         let (share, camera_ml) = (self.share(), self.camera_sd_ml());
         let estimate_ml2 = if share > 0.0 {
@@ -200,8 +200,9 @@ impl FusedEstimator {
             camera_ml * camera_ml
         };
         let Pour { watch, .. } = &self.pour;
+        let unseen_ml2 = watch.unexplained_ml().powi(2) + watch.unshown_ml().powi(2);
         let withheld_ml = watch.unconfirmed_ml() + if share > STRAIGHT_SHARE { 0.0 } else { watch.lone_ml() };
-        (estimate_ml2.max(0.0) + watch.unexplained_ml().powi(2) + withheld_ml * withheld_ml).sqrt()
+        (estimate_ml2.max(0.0) + unseen_ml2 + withheld_ml * withheld_ml).sqrt()
     }
 
     /// Whether what was seen cannot be.
@@ -254,6 +255,9 @@ impl FusedEstimator {
             }
             Some(Leap::None) | None => area_px2,
         };
+        if let Some(a) = area_px2 {
+            watch.shows(&self.explaining[WIDE].flow, following[WIDE].shown.tilt, volume_ml(a));
+        }
         let flows = area_px2.map(|a| a > 0.0);
         let log_sd = trust::extra_log_sd(frame.confidence);
         let begins = !*started && *flowed && flows == Some(true);

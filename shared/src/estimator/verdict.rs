@@ -3,7 +3,8 @@
 //! It is pure and runs in the controller's loop: its size is fixed, and it does not allocate, panic or fail. A lone odd frame moves nothing; a
 //! row of them is impossible, and then nothing that the camera says is to be believed. What was withheld as odd waits for the very next frame, which
 //! confirms it or not. If it does not, it is forgotten, and the estimate doubts as much (`Watch::unconfirmed_ml`, `Watch::lone_ml`), but for a lone
-//! leap of a stream that goes on as before out of a straight vessel.
+//! leap of a stream that goes on as before out of a straight vessel. A large stream that is gone within a frame, or whose area stays the same to the
+//! bit, moves nothing either, as nobody knows whether it was seen; what may have left meanwhile is in doubt (`Watch::unshown_ml`).
 //!
 //! | rule | verdict |
 //! |---|---|
@@ -62,6 +63,21 @@ const BEHIND_FACTOR: f64 = 2.0;
 const SAME_FRAMES: u32 = 10;
 /// How far the container must be tilted meanwhile, degrees. Chosen by hand; no measurement is recorded.
 const SAME_DEG: f64 = 3.0;
+/// A stream of more than this in a frame, ml, does not end between two frames unless the container is brought back. Chosen by hand: a stream that
+/// ebbs away takes several frames for that.
+const ABRUPT_ML: f64 = 0.7;
+/// The container is brought back if it is tilted less by this than when the stream was seen last, degrees. Chosen by hand: noise of the tilt is less.
+const BROUGHT_BACK_DEG: f64 = 0.5;
+/// For so many frames a stream that is gone may still run as before: at a tilt that stands, half a second later it has ebbed away.
+const GONE_FRAMES: u32 = 15;
+/// A stream may rise so far within a frame at a tilt that stands, as excess above the lip, ml. Chosen by hand; no measurement is recorded.
+const RISES_ML: f64 = 0.3;
+/// A stream may be so many frames old when it is first seen to run in two of them. Chosen by hand: the first may be too small to be seen.
+const ONSET_FRAMES: f64 = 3.0;
+/// After so many frames without it a stream has ended, and another one begins. Chosen by hand: more than the extraction drops in a row.
+const ENDED_FRAMES: u32 = 3;
+/// From so many equal areas in a row on they are in doubt. Chosen by hand: two may be chance.
+const REPEATED_FRAMES: u32 = 3;
 /// Number of frames in a row with a stream, from which on it is one.
 const FLOW_FRAMES: u32 = 2;
 /// An outflow leaps if it is more than this many times that of the two frames before it, and some ml more. Tuned with [`LEAP_ML`].
@@ -174,6 +190,14 @@ impl Balance {
     }
 }
 
+/// For how many frames a stream of `ml` in a frame must have run unseen before it was first seen, at most [`GONE_FRAMES`]: the tilt lets the liquid
+/// rise above the lip by so much a frame. Half of the stream is then the least mean of what it gave.
+fn frames_before(flow: &FlowTables, tilt: Tilt, ml: f64) -> f64 {
+    let faster_deg = tilt.change_deg.max(tilt.change_before_deg).max(0.0);
+    let rises_ml = flow.capacity.lost_ml_per_deg_at(TablePlace::of(tilt.tilt_deg)) * faster_deg + RISES_ML;
+    (flow.excess_ml_for(tilt.tilt_deg, ml) / rises_ml - ONSET_FRAMES).clamp(0.0, f64::from(GONE_FRAMES))
+}
+
 /// Whether the outflow of a frame leaps.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) enum Leap {
@@ -210,6 +234,12 @@ pub(super) struct Watch {
     unconfirmed_ml: f64,
     /// What was withheld, and after which the stream was what it was before, ml.
     lone_ml: f64,
+    /// Outflow of the newest frame with a stream, ml, the lesser of two, and its tilt, degrees.
+    stream: (f64, f64),
+    /// Number of frames in a row without a stream.
+    gone_frames: u32,
+    /// What may have left in frames that showed no stream or always the same one, ml.
+    unshown_ml: f64,
     verdict: Option<Impossible>,
 }
 
@@ -269,6 +299,39 @@ impl Watch {
     /// it was none; a steep one whose liquid swings lets 40 ml out in one frame and goes on as before, so there nobody knows.
     pub fn lone_ml(&self) -> f64 {
         self.lone_ml
+    }
+
+    /// What may have left unseen while a large stream was gone within a frame, always had the same area, or was not there yet, ml; at least 0. The
+    /// estimate has to doubt as much.
+    pub fn unshown_ml(&self) -> f64 {
+        self.unshown_ml
+    }
+
+    /// Takes the outflow of a frame that may be a measurement, ml, and the tilt that it shows, by the vessel of any shape: what a camera shows that
+    /// does not see the stream any more, or did not see how it began. Call it after [`Watch::may_be`] and [`Watch::leap`], and not for what is withheld.
+    pub fn shows(&mut self, flow: &FlowTables, tilt: Tilt, measured_ml: f64) {
+        let ((stream_ml, stream_deg), tilt_deg) = (self.stream, tilt.tilt_deg);
+        if measured_ml > 0.0 {
+            // A lone flash is no stream, and a lone zero none that ended.
+            let [newest_ml, before_ml] = self.recent_ml;
+            let goes_on = stream_ml > 0.0 && self.gone_frames < ENDED_FRAMES;
+            let now_ml = if goes_on { measured_ml } else { newest_ml.min(before_ml) };
+            if !goes_on && now_ml > ABRUPT_ML {
+                self.unshown_ml += 0.5 * now_ml * frames_before(flow, tilt, now_ml);
+            }
+            (self.stream, self.gone_frames) = ((now_ml, tilt_deg), 0);
+            let (_, repeated, _) = self.same;
+            self.unshown_ml += if repeated >= REPEATED_FRAMES { measured_ml } else { 0.0 };
+            return;
+        }
+        self.gone_frames = self.gone_frames.saturating_add(1);
+        let may_run = stream_ml > ABRUPT_ML && tilt_deg > stream_deg - BROUGHT_BACK_DEG && self.gone_frames <= GONE_FRAMES;
+        if may_run {
+            // A lone zero is bridged by sum and filter.
+            self.unshown_ml += if self.gone_frames > 1 { stream_ml } else { 0.0 };
+        } else if self.gone_frames >= ENDED_FRAMES {
+            self.stream = (0.0, tilt_deg);
+        }
     }
 
     /// Takes what was withheld and is not confirmed by the frame after it, ml.

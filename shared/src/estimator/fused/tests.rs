@@ -166,6 +166,34 @@ fn lost_frames_and_spikes_are_bridged() {
     }
 }
 
+/// Protects what is said of a pour whose camera did not show the stream for a while and had no doubt: what left meanwhile is in the deviation. A stream
+/// that begins, ebbs or drops out for one frame is not doubted so.
+#[test]
+fn a_stream_that_was_not_shown_is_in_the_deviation() {
+    let run = |lies: std::ops::Range<usize>, shows: fn(f32) -> f32| {
+        let (mut vessel, mut fused, mut newest_px2) = (ModelVessel::new(50.0), new(&model(0.5)), 0.0);
+        let mut alpha: f64 = 0.0;
+        for k in 0..260 {
+            alpha = if k < 150 { 0.6 * k as f64 } else { alpha - 2.0 }.clamp(0.0, 62.0);
+            let shown = frame(vessel.frame(alpha), alpha);
+            newest_px2 = if lies.contains(&k) { newest_px2 } else { shown.area_px2.unwrap() };
+            fused.step(if lies.contains(&k) { FusedFrame { area_px2: Some(shows(newest_px2)), ..shown } } else { shown });
+        }
+        ((fused.poured_ml() - vessel.poured_ml).abs(), fused.poured_sd_ml())
+    };
+    let (_, honest_sd_ml) = run(0..0, |newest| newest);
+    assert!(honest_sd_ml < 3.0, "{honest_sd_ml}");
+    for (lies, shows) in [(84..106, (|_| 0.0) as fn(f32) -> f32), (104..112, |_| 0.0), (95..104, |newest| newest)] {
+        let (off_ml, sd_ml) = run(lies.clone(), shows);
+        assert!(
+            sd_ml > 1.4 * honest_sd_ml && off_ml < 2.0 * sd_ml,
+            "{lies:?}: off by {off_ml}, said {sd_ml}, {honest_sd_ml} without a lie"
+        );
+    }
+    let (_, lone_sd_ml) = run(104..105, |_| 0.0);
+    assert!(lone_sd_ml < 1.3 * honest_sd_ml, "{lone_sd_ml} and {honest_sd_ml}");
+}
+
 /// Protects the goal from a camera that shows something else than the stream: it is noticed before much is poured.
 #[test]
 fn what_cannot_be_is_noticed() {
