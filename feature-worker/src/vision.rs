@@ -8,7 +8,8 @@
 //! | `reflection` | a lamp's reflection that hides the lip |
 //! | `wandering` | whether colours or brightness wander, so that a coloured liquid may look like the ground |
 //! | `presence` | when a stream that is not seen any more is gone |
-//! | `ground_colours`, `ground_beside` | the colours of the ground behind a coloured liquid, and where some of them are learned |
+//! | `ground_colours`, `ground_beside` | the colours of the ground behind a coloured liquid; what is seen beside the container and in the glass |
+//! | `foreign` | what has the colours of neither the ground nor the coloured liquid |
 //! | `hues` | the ranges of hue that are a liquid's |
 //! | `liquid` | what the extractor asks of a liquid; `coloured_liquid` (with `coloured_edge`) and `clear_water` are the two kinds |
 //! | `stream_edge` | the stream's edge as a robust line, then through sub-pixel points of profiles |
@@ -27,6 +28,7 @@ mod coloured_edge;
 mod coloured_liquid;
 mod confidence;
 mod extractor;
+mod foreign;
 mod geometry;
 mod ground_beside;
 mod ground_colours;

@@ -3,7 +3,7 @@
 
 mod drawn;
 
-use drawn::{HEIGHT, WIDTH, blue, camera, disc, dry, image_config, noisy, pour, stream, water};
+use drawn::{HEIGHT, WIDTH, blue, camera, disc, dry, image_config, lay_over, noisy, pour, stream, water};
 use feature_worker::vision::{ExtractError, Extractor, Image, Measurement};
 use opencv::core::{self, CV_8UC3, CV_16SC3, Mat, Point, Scalar, Size, Vector};
 use opencv::imgproc;
@@ -156,6 +156,38 @@ fn a_stream_in_other_colours_is_named() -> Result<(), ExtractError> {
             if i <= 7 || i > 15 {
                 assert_eq!((measured.area_px2, measured.doubt), (0.0, wanted), "frame {i}");
             }
+        }
+    }
+    Ok(())
+}
+
+/// Protects dry pictures from doubts: ground in new colours is ground where it goes on beside the container, and where the liquid in the glass
+/// has its own colours; otherwise it may be the liquid. And one white square at the lip is no picture that is blown out.
+#[test]
+fn new_ground_is_no_liquid() -> Result<(), ExtractError> {
+    let (green, white, blue) = (Scalar::new(60.0, 180.0, 60.0, 0.0), Scalar::all(255.0), Scalar::new(150.0, 62.0, 20.0, 0.0));
+    let box_of = |x: f32, y: f32, right: f32, down: f32| vec![[x, y], [right, y], [right, down], [x, down]];
+    let (far, at_lip) = (box_of(520.0, 60.0, 610.0, 200.0), box_of(180.0, 110.0, 400.0, 249.0));
+    let (right, across) = (box_of(216.0, 170.0, 290.0, 249.0), box_of(150.0, 170.0, 290.0, 249.0 + 50.0));
+    let inside = (box_of(216.0, 252.0, 300.0, 479.0), blue);
+    for (shapes, wanted) in [
+        (vec![(right.clone(), green)], Doubt::ColoursChanged),
+        (vec![(across, green)], Doubt::None),
+        (vec![(right, green), inside], Doubt::None),
+        (vec![(at_lip, white)], Doubt::None),
+    ] {
+        // As calibration writes it, with room below the lip and beside the container.
+        let image = ImageConfig { region_px: [171, 14, 440, 296], ..image_config(LiquidMethod::Colour) };
+        let mut extractor = Extractor::new(&camera(), &image)?;
+        for i in 0..48 {
+            let mut picture = dry(0.0, i)?;
+            lay_over(&mut picture, std::slice::from_ref(&far), white)?;
+            for (shape, colour) in shapes.iter().filter(|_| i >= 44) {
+                lay_over(&mut picture, std::slice::from_ref(shape), *colour)?;
+            }
+            let measured = measure(&mut extractor, &picture)?;
+            let wanted = if i < 44 { Doubt::None } else { wanted };
+            assert_eq!((measured.area_px2, measured.doubt), (0.0, wanted), "frame {i}");
         }
     }
     Ok(())

@@ -12,6 +12,11 @@ use super::picture::RegionPixels;
 const DARK_LEVEL: f32 = 14.0;
 /// Share of saturated pixels above which a picture counts as blown out. Chosen by hand; `evaluate-camera` raises the doubt on purpose.
 const BLOWN_SHARE: f32 = 0.5;
+/// And so it has to be over the whole region, because what is read of it may lie close around the lip, in front of one white square of a
+/// board. Chosen by hand: more than the half of a chess board that is white.
+const BLOWN_REGION_SHARE: f32 = 0.6;
+/// Rows and columns from one pixel of the region that is looked at for this to the next. Chosen by hand, for speed.
+const BLOWN_EVERY: usize = 12;
 /// A pixel whose three parts reach this is saturated, grey levels. Chosen by hand: a little below 255, because of noise.
 const SATURATED_LEVEL: u8 = 250;
 /// Of this many pixels, one is looked at to judge the light. Chosen by hand, for speed.
@@ -51,12 +56,14 @@ pub(crate) struct LightCheck {
     last_hash: Option<u64>,
     /// Mean levels of blue, green and red in the last picture.
     mean_bgr: [f32; 3],
+    /// Whether half of what was read of it is saturated.
+    half_white: bool,
 }
 
 impl LightCheck {
     /// Why a picture of these BGR pixels cannot be used: it is too dark, blown out, or the same picture as the last one. This is one
-    /// pass, because three OpenCV reductions over the same bytes took longer.
-    pub(crate) fn doubt(&mut self, bytes: &[u8]) -> Option<Doubt> {
+    /// pass, because three OpenCV reductions over the same bytes took longer. `region` is all of the picture that may be read.
+    pub(crate) fn doubt(&mut self, bytes: &[u8], region: RegionPixels) -> Option<Doubt> {
         let mut hash = 0xcbf2_9ce4_8422_2325u64;
         for chunk in bytes.chunks_exact(8) {
             let word = u64::from_le_bytes([chunk[0], chunk[1], chunk[2], chunk[3], chunk[4], chunk[5], chunk[6], chunk[7]]);
@@ -70,15 +77,21 @@ impl LightCheck {
             count += 1;
         }
         self.mean_bgr = sums.map(|sum| sum as f32 / count.max(1) as f32);
+        self.half_white = saturated as f32 > BLOWN_SHARE * count as f32;
         if self.mean_level() < DARK_LEVEL {
             Some(Doubt::TooDark)
-        } else if saturated as f32 > BLOWN_SHARE * count as f32 {
+        } else if self.half_white && saturated_share(region) > BLOWN_REGION_SHARE {
             Some(Doubt::BlownOut)
         } else if repeated {
             Some(Doubt::Frozen)
         } else {
             None
         }
+    }
+
+    /// Whether half of what was read of the picture that was checked last is saturated.
+    pub(crate) fn is_half_white(&self) -> bool {
+        self.half_white
     }
 
     /// Mean grey level of the picture that was checked last.
@@ -90,6 +103,18 @@ impl LightCheck {
     pub(crate) fn mean_bgr(&self) -> [f32; 3] {
         self.mean_bgr
     }
+}
+
+/// The share of a region's pixels that are saturated.
+fn saturated_share(region: RegionPixels) -> f32 {
+    let (mut saturated, mut count) = (0u32, 0u32);
+    for row in (0..region.height()).step_by(BLOWN_EVERY).map(|y| region.row(y)) {
+        for pixel in row.chunks_exact(3).step_by(BLOWN_EVERY) {
+            saturated += u32::from(pixel.iter().all(|v| *v >= SATURATED_LEVEL));
+            count += 1;
+        }
+    }
+    saturated as f32 / count.max(1) as f32
 }
 
 /// Side of the squares at the lip that are looked at, px of a picture 640 px wide. Chosen by hand: so near a reflection is white in front

@@ -364,6 +364,10 @@ impl Liquid for ClearWater {
         self.hidden = self.reflection.hides_lip(white_share, 0.0, false);
     }
 
+    fn bears_white(&mut self, half_white: bool) -> bool {
+        !half_white
+    }
+
     fn lose_picture(&mut self, doubt: Doubt) {
         self.disturbed.lose(doubt);
     }
@@ -378,7 +382,8 @@ impl Liquid for ClearWater {
     }
 
     fn hold_ground(&mut self, held: bool) {
-        if !held {
+        // A ground that was shifted or torn is not known, and what is not known looks even.
+        if !held && self.disturbed.doubt().is_none() {
             let even = self.evidence.even();
             self.even_pictures += 1.0;
             let usual = EVEN_FOLLOWS[usize::from(!even)];

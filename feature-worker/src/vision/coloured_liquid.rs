@@ -19,8 +19,9 @@ use shared::messages::{Doubt, PixelFormat};
 
 use super::coloured_edge;
 use super::confidence::Basis;
+use super::foreign::{self, Seen};
 use super::geometry::{Axes, Line, NEAR_PX, RAYS, RayGrid, distance};
-use super::ground_beside::GroundBeside;
+use super::ground_beside::{InGlass, Square};
 use super::ground_colours::{Ground, GroundColours};
 use super::hues::ranges;
 use super::liquid::{FineLine, LineRules, Liquid, Profile, ProfileEdge, Sighting};
@@ -64,22 +65,8 @@ const LEARN_BEYOND: usize = 6;
 /// After a picture in which it was not told what is liquid, the ground is not learned for so many told ones: what lies there may be a liquid
 /// in other colours. Chosen by hand: half a second.
 const LEARN_AFTER: u32 = 15;
-/// This close to the lip a stream begins, px. Chosen by hand.
-const AT_LIP_PX: f32 = 12.0;
 /// The ground is learned beside the container while no more than this share of what is at the lip is foreign or liquid. Chosen by hand.
 const QUIET_SHARE: f32 = 0.3;
-/// A liquid in front of a lamp's reflection is brighter than this in all parts, close to the reflection's middle. Chosen by hand.
-const GLOW_LEVEL: u8 = 180;
-/// Least share of the rays that a body at the lip fills. Tuned.
-const BODY_RAYS: f32 = 0.7;
-/// Least mean length of a body at the lip, px: a bead is shorter. Tuned.
-const BODY_PX: f32 = 9.0;
-/// Least share of a body that has foreign colours. Tuned.
-const BODY_FOREIGN: f32 = 0.3;
-/// This far beyond the stream's edge there is ground, px. Chosen by hand: further than a strong blur reaches.
-const BESIDE_PX: f32 = 8.0;
-/// With this share of foreign colours beside the stream, its edge is not where the liquid ends. Tuned.
-const BESIDE_FOREIGN: f32 = 0.5;
 /// A picture in which this share of the samples has no colour at all is a grey one. Chosen by hand: a sensor's noise alone makes colour.
 const GREY_SHARE: f32 = 0.99;
 /// A sample has no colour when its parts differ by no more than this, grey levels. Chosen by hand: a level or two of rounding.
@@ -117,6 +104,8 @@ pub(crate) struct ColouredLiquid {
     learn_after: u32,
     /// Which share of the glass at the lip is white light.
     white_lip: f32,
+    /// Whether half of what was read is saturated.
+    half_white: bool,
     /// Number of samples on each ray up to the end of the liquid, or of a body at the lip, in the last picture.
     ends: [usize; RAYS],
     // Pictures along the rays, one ray a row, kept from frame to frame.
@@ -131,7 +120,11 @@ pub(crate) struct ColouredLiquid {
     /// The mask of one range of hues.
     half_mask: Mat,
     /// The ground beside the container.
-    beside: GroundBeside,
+    beside: Square,
+    /// More of it, to tell what goes on there from what is at the lip.
+    beside_wide: Square,
+    /// The glass below the lip.
+    glass: InGlass,
 }
 
 impl ColouredLiquid {
@@ -150,14 +143,16 @@ impl ColouredLiquid {
         }
         let (mut map_a, mut map_b) = (Mat::default(), Mat::default());
         imgproc::convert_maps(&map_x, &map_y, &mut map_a, &mut map_b, CV_16SC2, true)?;
-        let beside = GroundBeside::new(&axes, image)?;
+        let (beside, beside_wide) = (Square::beside(&axes, image)?, Square::beside_wide(&axes, image)?);
         let colour = image.colour_hsv.map(f64::from);
+        let ranges = ranges(colour);
+        let glass = InGlass::new(&axes, image, &ranges)?;
         Ok(Self {
             axes,
             grid,
             map_a,
             map_b,
-            ranges: ranges(colour),
+            ranges,
             needs_colour: colour[1] >= COLOURED_FROM,
             area_min_px2: image.area_min_px2,
             ground: GroundColours::new(),
@@ -168,6 +163,7 @@ impl ColouredLiquid {
             wandering: Wandering::new(),
             learn_after: 0,
             white_lip: 0.0,
+            half_white: false,
             ends: [0; RAYS],
             sampled: Mat::default(),
             smooth: Mat::default(),
@@ -175,6 +171,8 @@ impl ColouredLiquid {
             mask: Mat::default(),
             half_mask: Mat::default(),
             beside,
+            beside_wide,
+            glass,
         })
     }
 
@@ -251,52 +249,6 @@ impl ColouredLiquid {
         Ok(())
     }
 
-    /// Whether something lies at the lip like a stream and has foreign colours. Writes its ends into `self.ends`.
-    fn is_foreign_body(&mut self) -> opencv::Result<bool> {
-        let (mut filled, mut foreign, mut samples, mut length_px) = (0usize, 0usize, 0usize, 0.0f32);
-        for (i, ray) in self.grid.rays.iter().enumerate() {
-            let mask = self.mask.at_row::<u8>(i as i32)?;
-            let colours = self.smooth.at_row::<Vec3b>(i as i32)?;
-            let (mut score, mut best, mut end, mut strange, mut strange_at_end) = (0.0f32, 0.0f32, 0usize, 0usize, 0usize);
-            for r in 0..ray.samples {
-                let step = self.grid.steps_px[r];
-                match if mask[r] != 0 { None } else { Some(self.ground.tell(colours[r].0)) } {
-                    None => score += step,
-                    Some(Ground::Foreign) => (score, strange) = (score + step, strange + 1),
-                    Some(Ground::Blind) => {}
-                    Some(Ground::Known) => score -= step,
-                }
-                if score > best {
-                    (best, end, strange_at_end) = (score, r + 1, strange);
-                } else if score < -GAP_MOST_PX {
-                    break;
-                }
-            }
-            if end > 0 && best >= (2.0 * FILLED - 1.0) * (self.grid.radii_px[end - 1] - NEAR_PX).max(1.0) {
-                filled += 1;
-                samples += end;
-                foreign += strange_at_end;
-                length_px += self.grid.radii_px[end - 1];
-                self.ends[i] = self.ends[i].max(end);
-            }
-        }
-        let mean_px = length_px / filled.max(1) as f32;
-        Ok(filled as f32 >= BODY_RAYS * RAYS as f32 && mean_px >= BODY_PX && foreign as f32 >= BODY_FOREIGN * samples as f32)
-    }
-
-    /// Whether foreign colours lie beside the stream, so that it goes on beyond its edge.
-    fn goes_on_beyond_its_edge(&self) -> opencv::Result<bool> {
-        let (mut foreign, mut looked) = (0usize, 0usize);
-        for (i, ray) in self.grid.rays.iter().enumerate() {
-            let Some(last) = self.ends[i].checked_sub(1) else { continue };
-            let beside_px = self.grid.radii_px[last] + BESIDE_PX;
-            let Some(r) = (last..ray.samples).find(|r| self.grid.radii_px[*r] >= beside_px) else { continue };
-            looked += 1;
-            foreign += usize::from(self.ground.tell(self.smooth.at_row::<Vec3b>(i as i32)?[r].0) == Ground::Foreign);
-        }
-        Ok(foreign as f32 > BESIDE_FOREIGN * looked.max(RAYS / 4) as f32)
-    }
-
     /// Learns the ground's colours from what lies beyond the liquid and far from the lip, or, while the surroundings of the lip are new and
     /// `dry`, from everything.
     fn learn(&mut self, dry: bool) -> opencv::Result<()> {
@@ -325,22 +277,15 @@ impl ColouredLiquid {
         Ok(())
     }
 
-    /// Which shares of what is close to the lip are white light that the ground is not, glow of it, and foreign colours or liquid.
-    fn at_lip(&self) -> opencv::Result<[f32; 3]> {
-        let near = self.grid.radii_px.iter().take_while(|r| **r <= AT_LIP_PX).count();
-        let (mut blind, mut glows, mut foreign, mut looked) = (0usize, 0usize, 0usize, 0usize);
-        for (i, ray) in self.grid.rays.iter().enumerate() {
-            let (mask, colours) = (self.mask.at_row::<u8>(i as i32)?, self.smooth.at_row::<Vec3b>(i as i32)?);
-            for r in 0..near.min(ray.samples) {
-                let ground = self.ground.tell(colours[r].0);
-                looked += 1;
-                blind += usize::from(ground == Ground::Blind);
-                glows += usize::from(colours[r].0.iter().all(|v| *v >= GLOW_LEVEL));
-                foreign += usize::from(mask[r] != 0 || ground != Ground::Known);
-            }
-        }
-        let share = |part: usize| part as f32 / looked.max(1) as f32;
-        Ok([share(blind), share(glows), share(foreign)])
+    /// The picture along the rays.
+    fn seen(&self) -> Seen<'_> {
+        Seen { grid: &self.grid, mask: &self.mask, smooth: &self.smooth, ground: &self.ground }
+    }
+
+    /// Whether the liquid is seen in the glass in its own colours, and what is foreign is not like it.
+    fn is_excused(&mut self, foreign: [f32; 3]) -> opencv::Result<bool> {
+        let liquid = self.glass.liquid()?;
+        Ok(liquid.zip(self.ground_bgr).is_some_and(|(liquid, ground)| foreign::is_not_the_liquid(foreign, liquid, ground)))
     }
 
     /// What is at the lip where no stream is seen.
@@ -349,11 +294,22 @@ impl ColouredLiquid {
         if self.dry_frames < DRY_FRAMES {
             return Ok(dry);
         }
-        let [blind, glows, foreign] = self.at_lip()?;
+        self.glass.see_dry()?;
+        // A lamp's reflection before white squares hides a stream, but not the liquid below the lip.
+        if self.half_white && !self.glass.is_empty()? {
+            return Ok(Sighting::Unsure(Doubt::BlownOut));
+        }
+        let [blind, glows, foreign] = self.seen().at_lip()?;
         if self.reflection.hides_lip(blind.max(self.white_lip), glows, foreign > QUIET_SHARE) {
             return Ok(Sighting::Unsure(Doubt::BlownOut));
         }
-        if self.is_foreign_body()? {
+        let mut ends = self.ends;
+        let body = self.seen().body(&mut ends)?;
+        self.ends = ends;
+        if let Some(body) = body
+            && !self.is_excused(body)?
+            && !foreign::goes_on_beside(body, self.beside_wide.colours()?)
+        {
             return Ok(Sighting::Unsure(Doubt::ColoursChanged));
         }
         if foreign < QUIET_SHARE && self.learn_after == 0 {
@@ -408,6 +364,8 @@ impl Liquid for ColouredLiquid {
     fn take(&mut self, region: &BoxedRef<Mat>) -> opencv::Result<()> {
         let (nearest, border) = (imgproc::INTER_NEAREST, core::BORDER_REPLICATE);
         self.beside.take(region)?;
+        self.beside_wide.take(region)?;
+        self.glass.take(region)?;
         imgproc::remap(region, &mut self.sampled, &self.map_a, &self.map_b, nearest, border, Scalar::default())
     }
 
@@ -423,8 +381,12 @@ impl Liquid for ColouredLiquid {
         self.expose()?;
         let sighting = match self.find_stream(edges_px)? {
             Sighting::Dry { confidence } => self.look_again(confidence)?,
-            Sighting::Stream { seen_share, doubt: Doubt::None } if self.dry_frames >= DRY_FRAMES && self.goes_on_beyond_its_edge()? => {
-                Sighting::Stream { seen_share, doubt: Doubt::ColoursChanged }
+            Sighting::Stream { seen_share, doubt: Doubt::None } if self.dry_frames >= DRY_FRAMES => {
+                let untold = match self.seen().beyond(&self.ends)? {
+                    Some(beyond) => !self.is_excused(beyond)?,
+                    None => false,
+                };
+                Sighting::Stream { seen_share, doubt: if untold { Doubt::ColoursChanged } else { Doubt::None } }
             }
             other => other,
         };
@@ -448,6 +410,16 @@ impl Liquid for ColouredLiquid {
 
     fn see_lip(&mut self, white_share: f32) {
         self.white_lip = white_share;
+    }
+
+    /// A white square of a board behind the lip hides no stream.
+    fn bears_white(&mut self, half_white: bool) -> bool {
+        self.half_white = half_white;
+        if half_white {
+            // Nor is a lamp's reflection before white squares taken for ground.
+            self.learn_after = LEARN_AFTER;
+        }
+        true
     }
 
     /// Each picture is judged by itself.

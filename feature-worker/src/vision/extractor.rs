@@ -181,7 +181,8 @@ impl Extractor {
         let pixels = reader.read(image, |region| self.liquid.take(region))?;
         let sampled = Instant::now();
         let whole = self.whole.is_whole(pixels);
-        let unlit = self.light.doubt(self.liquid.sampled().data_bytes()?);
+        let unlit = self.light.doubt(self.liquid.sampled().data_bytes()?, pixels);
+        let unlit = unlit.or((!self.liquid.bears_white(self.light.is_half_white())).then_some(Doubt::BlownOut));
         let unusable = unlit.or((!whole).then_some(Doubt::PictureIncomplete));
         let checked = Instant::now();
         let (measured, segmented) = match unusable {

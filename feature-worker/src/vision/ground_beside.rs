@@ -1,5 +1,8 @@
-//! The ground beside the container, on the far side of its left wall: what the background brings to the lip from there is known before it
-//! comes.
+//! Squares of the picture beside the rays: the ground on the far side of the container's left wall, and the inside of the glass just below
+//! the lip.
+//!
+//! What the background brings to the lip comes from beside the container, so its colours are known before they come. And where the
+//! liquid in the glass is seen in its own colours, what is foreign at the lip is not that liquid.
 //!
 //! Called on the extraction thread. The pictures are kept, so nothing is allocated after the first frame but OpenCV's matrix headers. The
 //! only failures are OpenCV's.
@@ -15,18 +18,33 @@ use super::ground_colours::GroundColours;
 
 /// Width of a region for which distances in it were chosen, px.
 const REGION_PX: f32 = 420.0;
-/// Samples of a side of the square beside the container in which the ground is learned. Chosen by hand, for speed.
-const STRIP_SAMPLES: i32 = 16;
-/// Where that square lies in a picture 640 px wide: from and to, px along the x-axis and along the y-axis. What the background brings to
-/// the lip comes from there, or along the rays.
-const STRIP_PX: [[f32; 2]; 2] = [[-34.0, -7.0], [-48.0, 10.0]];
-/// Of this many samples of the square, the ground is learned from one a frame. Chosen by hand.
-const STRIP_EVERY: usize = 4;
+/// Samples of a side of a square. Chosen by hand, for speed.
+const SQUARE_SAMPLES: i32 = 16;
+/// Where the square beside the container lies in a picture 640 px wide: from and to, px along the x-axis and along the y-axis. What the
+/// background brings to the lip comes from there, or along the rays.
+const BESIDE_PX: [[f32; 2]; 2] = [[-34.0, -7.0], [-48.0, 10.0]];
+/// Where the larger square beside the container lies, in the same way. Chosen by hand: a jet of liquid that is thin crosses its lower part, and a
+/// thick one its upper part, so that none fills it.
+const BESIDE_WIDE_PX: [[f32; 2]; 2] = [[-36.0, -7.0], [-48.0, 60.0]];
+/// Where the square in the glass lies, in the same way: while something flows, the liquid stands there. Chosen by hand: beyond the wall's
+/// own light, and within the region that calibration writes.
+const GLASS_PX: [[f32; 2]; 2] = [[6.0, 18.0], [-46.0, -14.0]];
+/// Of this many samples of the square beside the container, the ground is learned from one a frame. Chosen by hand.
+const TEACH_EVERY: usize = 4;
 /// Side of the square of samples that are smoothed together, as along the rays. Chosen by hand.
 const SMOOTH: i32 = 5;
+/// The liquid stands in the glass when this share of its square has the liquid's colours. Chosen by hand.
+const TOLD_SHARE: f32 = 0.6;
+/// The square in the glass shows what is in the glass only if it was seen without the liquid: in no more than this share of it, for
+/// [`EMPTY_PICTURES`]. Chosen by hand: a jug in the liquid's colour never is.
+const EMPTY_SHARE: f32 = 0.2;
+/// So many pictures in which the glass was looked at. Chosen by hand.
+const EMPTY_PICTURES: u32 = 5;
+/// Of this many pictures without a stream, the glass is looked at in one. Chosen by hand, for speed.
+const EMPTY_EVERY: usize = 4;
 
-/// Samples a square beside the container.
-pub(super) struct GroundBeside {
+/// Samples a square of the region.
+pub(super) struct Square {
     /// The two maps of the square; empty if it is not within the region.
     maps: [Mat; 2],
     /// The square in BGR.
@@ -35,10 +53,19 @@ pub(super) struct GroundBeside {
     smooth: Mat,
 }
 
-impl GroundBeside {
-    /// For the region and axes of a camera; `axes` are relative to the region.
-    pub(super) fn new(axes: &Axes, image: &ImageConfig) -> opencv::Result<Self> {
-        Ok(Self { maps: maps(axes, image)?, pixels: Mat::default(), smooth: Mat::default() })
+impl Square {
+    fn new(axes: &Axes, image: &ImageConfig, at_px: [[f32; 2]; 2]) -> opencv::Result<Self> {
+        Ok(Self { maps: maps(axes, image, at_px)?, pixels: Mat::default(), smooth: Mat::default() })
+    }
+
+    /// Beside the container, for the region and axes of a camera; `axes` are relative to the region.
+    pub(super) fn beside(axes: &Axes, image: &ImageConfig) -> opencv::Result<Self> {
+        Self::new(axes, image, BESIDE_PX)
+    }
+
+    /// A larger square beside the container, in the same way.
+    pub(super) fn beside_wide(axes: &Axes, image: &ImageConfig) -> opencv::Result<Self> {
+        Self::new(axes, image, BESIDE_WIDE_PX)
     }
 
     /// Takes the next picture's square.
@@ -50,35 +77,103 @@ impl GroundBeside {
         imgproc::remap(region, &mut self.pixels, map_a, map_b, imgproc::INTER_NEAREST, core::BORDER_REPLICATE, Scalar::default())
     }
 
-    /// Learns the ground's colours from beside the container: what comes to the lip from there is known before.
-    pub(super) fn teach(&mut self, ground: &mut GroundColours, frame: usize) -> opencv::Result<()> {
+    /// The smoothed colours of the square that was taken; none if it is not within the region.
+    pub(super) fn colours(&mut self) -> opencv::Result<&[Vec3b]> {
         if self.pixels.empty() {
-            return Ok(());
+            return Ok(&[]);
         }
         let size = core::Size::new(SMOOTH, SMOOTH);
         imgproc::blur(&self.pixels, &mut self.smooth, size, core::Point::new(-1, -1), core::BORDER_REPLICATE)?;
-        let colours: &[Vec3b] = self.smooth.data_typed()?;
-        for colour in colours.iter().skip(frame % STRIP_EVERY).step_by(STRIP_EVERY) {
+        self.smooth.data_typed()
+    }
+
+    /// Learns the ground's colours from the square: what comes to the lip from there is known before.
+    pub(super) fn teach(&mut self, ground: &mut GroundColours, frame: usize) -> opencv::Result<()> {
+        for colour in self.colours()?.iter().skip(frame % TEACH_EVERY).step_by(TEACH_EVERY) {
             ground.learn(colour.0, false);
         }
         Ok(())
     }
 }
 
-/// The fixed-point maps from the square beside the container to the region, as `cv::convertMaps` makes them; empty if the region does not
-/// hold it.
-fn maps(axes: &Axes, image: &ImageConfig) -> opencv::Result<[Mat; 2]> {
+/// The inside of the glass just below the lip.
+pub(super) struct InGlass {
+    square: Square,
+    hsv: Mat,
+    ranges: Vec<(Scalar, Scalar)>,
+    /// Pictures in which the square was seen without the liquid.
+    empty_pictures: u32,
+    turn: usize,
+}
+
+impl InGlass {
+    /// For the region, axes and the liquid's ranges; `axes` are relative to the region.
+    pub(super) fn new(axes: &Axes, image: &ImageConfig, ranges: &[(Scalar, Scalar)]) -> opencv::Result<Self> {
+        let square = Square::new(axes, image, GLASS_PX)?;
+        Ok(Self { square, hsv: Mat::default(), ranges: ranges.to_vec(), empty_pictures: 0, turn: 0 })
+    }
+
+    /// Takes the next picture's square.
+    pub(super) fn take(&mut self, region: &BoxedRef<Mat>) -> opencv::Result<()> {
+        self.square.take(region)
+    }
+
+    /// Says that no stream is seen in the picture that was taken.
+    pub(super) fn see_dry(&mut self) -> opencv::Result<()> {
+        self.turn += 1;
+        if self.empty_pictures < EMPTY_PICTURES && self.turn.is_multiple_of(EMPTY_EVERY) {
+            let (share, _) = self.look()?;
+            self.empty_pictures += u32::from(share.is_some_and(|share| share <= EMPTY_SHARE));
+        }
+        Ok(())
+    }
+
+    /// Whether the glass is seen not to hold the liquid just below the lip.
+    pub(super) fn is_empty(&mut self) -> opencv::Result<bool> {
+        Ok(self.look()?.0.is_some_and(|share| share <= EMPTY_SHARE))
+    }
+
+    /// The mean levels of blue, green and red of the liquid in the glass, if it stands there in its own colours.
+    pub(super) fn liquid(&mut self) -> opencv::Result<Option<[f32; 3]>> {
+        if self.empty_pictures < EMPTY_PICTURES {
+            return Ok(None);
+        }
+        let (share, mean) = self.look()?;
+        Ok(share.filter(|share| *share >= TOLD_SHARE).map(|_| mean))
+    }
+
+    /// Which share of the square has the liquid's colours, and their mean; no share if the square is not within the region.
+    fn look(&mut self) -> opencv::Result<(Option<f32>, [f32; 3])> {
+        if self.square.colours()?.is_empty() {
+            return Ok((None, [0.0; 3]));
+        }
+        imgproc::cvt_color_def(&self.square.smooth, &mut self.hsv, imgproc::COLOR_BGR2HSV)?;
+        let (hsv, colours): (&[Vec3b], &[Vec3b]) = (self.hsv.data_typed()?, self.square.smooth.data_typed()?);
+        let (mut inside, mut sums) = (0usize, [0u32; 3]);
+        for (hsv, colour) in hsv.iter().zip(colours) {
+            let within = |(low, high): &(Scalar, Scalar)| (0..3).all(|k| (low[k]..=high[k]).contains(&f64::from(hsv[k])));
+            if self.ranges.iter().any(within) {
+                inside += 1;
+                (0..3).for_each(|k| sums[k] += u32::from(colour[k]));
+            }
+        }
+        Ok((Some(inside as f32 / hsv.len() as f32), sums.map(|sum| sum as f32 / inside.max(1) as f32)))
+    }
+}
+
+/// The fixed-point maps from a square to the region, as `cv::convertMaps` makes them; empty if the region does not hold it.
+fn maps(axes: &Axes, image: &ImageConfig, at_px: [[f32; 2]; 2]) -> opencv::Result<[Mat; 2]> {
     let (mut map_a, mut map_b) = (Mat::default(), Mat::default());
     let [width, height] = [image.region_px[2], image.region_px[3]].map(|v| v as f32);
     let scale = width / REGION_PX;
-    let mut map_x = Mat::new_rows_cols_with_default(STRIP_SAMPLES, STRIP_SAMPLES, CV_32FC1, Scalar::all(0.0))?;
+    let mut map_x = Mat::new_rows_cols_with_default(SQUARE_SAMPLES, SQUARE_SAMPLES, CV_32FC1, Scalar::all(0.0))?;
     let mut map_y = map_x.try_clone()?;
     let mut inside = true;
-    for i in 0..STRIP_SAMPLES {
-        for j in 0..STRIP_SAMPLES {
-            let share = |k: i32| (k as f32 + 0.5) / STRIP_SAMPLES as f32;
+    for i in 0..SQUARE_SAMPLES {
+        for j in 0..SQUARE_SAMPLES {
+            let share = |k: i32| (k as f32 + 0.5) / SQUARE_SAMPLES as f32;
             let at = |[from, to]: [f32; 2], k: i32| scale * (from + share(k) * (to - from));
-            let (u, w) = (at(STRIP_PX[0], j), at(STRIP_PX[1], i));
+            let (u, w) = (at(at_px[0], j), at(at_px[1], i));
             let [x, y] = [0, 1].map(|k| axes.lip_px[k] + u * axes.x[k] + w * axes.y[k]);
             inside &= x >= 0.0 && y >= 0.0 && x <= width - 1.0 && y <= height - 1.0;
             (*map_x.at_2d_mut::<f32>(i, j)?, *map_y.at_2d_mut::<f32>(i, j)?) = (x, y);

@@ -13,6 +13,11 @@ const SHARES: usize = 64;
 const DARK_SUM: usize = 30;
 /// A colour whose parts reach this is white light and not a colour, grey levels. As in the check of light, a little below 255.
 const BLIND_LEVEL: u8 = 250;
+/// Shares are taken of levels that are raised by this share of the ground's mean sum, because in dark colours noise alone makes every share.
+/// Chosen by hand.
+const RAISED_SHARE: f64 = 0.1;
+/// But by no more than this, grey levels. Chosen by hand: ten times the noise of a smoothed sample.
+const RAISED_MOST: f64 = 16.0;
 /// What one sample adds to its colour.
 const SEEN: u16 = 4;
 /// What one sample adds to the colours beside its own.
@@ -50,8 +55,10 @@ const WHITE: usize = DARK + 1;
 pub(crate) struct GroundColours {
     /// A count for each step of brightness, share of blue and share of red; then for dark and white.
     counts: Vec<u16>,
-    /// `SHARES / sum` for each sum of three levels, of which 65536 is 1.
+    /// `SHARES / sum` for each sum of three levels, which are `raised`, of which 65536 is 1.
     per_sum: [u32; 766],
+    /// What is added to each level before its share is taken.
+    raised: u32,
     /// The step of brightness for each sum of three levels in the present picture, times [`CHROMAS`].
     steps: [u32; 766],
     /// The sum of three levels for which the steps were made.
@@ -63,8 +70,8 @@ pub(crate) struct GroundColours {
 impl GroundColours {
     /// Nothing was seen yet.
     pub(crate) fn new() -> Self {
-        let per_sum = std::array::from_fn(|sum| (SHARES * 65_536 / sum.max(1)) as u32);
-        let mut new = Self { counts: vec![0; CHROMAS * STEPS + 2], per_sum, steps: [0; 766], mean_sum: 0, turn: 0 };
+        let counts = vec![0; CHROMAS * STEPS + 2];
+        let mut new = Self { counts, per_sum: [0; 766], raised: 0, steps: [0; 766], mean_sum: 0, turn: 0 };
         new.expose(384);
         new
     }
@@ -75,6 +82,10 @@ impl GroundColours {
             return;
         }
         self.mean_sum = mean_sum;
+        self.raised = (RAISED_SHARE * f64::from(mean_sum)).min(RAISED_MOST) as u32;
+        for (sum, kept) in self.per_sum.iter_mut().enumerate() {
+            *kept = (SHARES * 65_536 / (sum + 3 * self.raised as usize).max(1)) as u32;
+        }
         // The middle of the steps is the mean's own brightness.
         let mut step = 0;
         for (sum, kept) in self.steps.iter_mut().enumerate() {
@@ -88,7 +99,7 @@ impl GroundColours {
     #[inline(always)]
     fn place(&self, [blue, green, red]: [u8; 3]) -> usize {
         let sum = usize::from(blue) + usize::from(green) + usize::from(red);
-        let share = |level: u8| (((u32::from(level) * self.per_sum[sum]) >> 16) as usize).min(SHARES - 1);
+        let share = |level: u8| ((((u32::from(level) + self.raised) * self.per_sum[sum]) >> 16) as usize).min(SHARES - 1);
         if sum < DARK_SUM {
             DARK
         } else if blue.min(green).min(red) >= BLIND_LEVEL {

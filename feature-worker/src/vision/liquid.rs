@@ -116,6 +116,9 @@ pub(crate) trait Liquid: Send + Sync {
     /// reflection.
     fn see_lip(&mut self, white_share: f32);
 
+    /// Says whether half of what was read of the picture that was taken is saturated. Returns whether it can be looked at all the same.
+    fn bears_white(&mut self, half_white: bool) -> bool;
+
     /// Says that the picture that was taken is not looked at, and why.
     fn lose_picture(&mut self, doubt: Doubt);
 

@@ -33,6 +33,11 @@ pub(crate) struct RegionPixels<'a> {
 }
 
 impl<'a> RegionPixels<'a> {
+    /// Number of rows.
+    pub(crate) fn height(&self) -> usize {
+        self.height
+    }
+
     /// The bytes of a row, three a pixel; none if there is no such row.
     pub(crate) fn row(&self, y: usize) -> &'a [u8] {
         let start = y * self.stride;

@@ -61,7 +61,12 @@ impl Wandering {
     pub(super) fn look(&mut self, now: &[([f32; 3], u32); RAYS]) {
         self.colours_for = self.colours_for.saturating_sub(1);
         self.brightness_for = self.brightness_for.saturating_sub(1);
-        if let Some(change) = self.change(now) {
+        let change = self.change(now);
+        if change.is_none() {
+            // The light's way has a gap that nothing bridges: of a light that rises and falls, only the rise may have been told.
+            self.told = 0;
+        }
+        if let Some(change) = change {
             (0..3).for_each(|k| self.light[k] += change[k]);
             self.way[self.told % PICTURES] = self.light;
             self.told = if self.told + 1 == 2 * PICTURES { PICTURES } else { self.told + 1 };
@@ -138,5 +143,22 @@ mod tests {
         assert_eq!(doubt(|t| [2.5f32.powf((4.2 * t).sin()); 3], 0.0), Some(Doubt::LightFlickers));
         assert_eq!(doubt(|t| [1.6f32.powf((4.2 * t).sin()); 3], 0.0), None);
         assert_eq!(doubt(wave(0.2), 0.3), None, "the background moves, so the light is not told");
+    }
+
+    /// Protects dry frames under an exposure that hunts a little while the background moves now and then: rises that are told and falls that
+    /// are not do not add up to a far way.
+    #[test]
+    fn a_way_with_gaps_does_not_add_up() {
+        let mut wandering = Wandering::new();
+        for picture in 0..240 {
+            let phase = 4.2 * picture as f32 / 30.0;
+            let (gain, moves) = (1.6f32.powf(phase.sin()), if phase.cos() < 0.0 { 0.3 } else { 0.0 });
+            let rays: [([f32; 3], u32); RAYS] = std::array::from_fn(|i| {
+                let level = (60.0 + i as f32) * (1.0 + moves * (0.9 * picture as f32 + i as f32).sin());
+                ([level * gain; 3], 6)
+            });
+            wandering.look(&rays);
+        }
+        assert_eq!(wandering.doubt(), None);
     }
 }

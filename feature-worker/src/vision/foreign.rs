@@ -1,0 +1,175 @@
+//! What lies at the lip, or beside a coloured stream, and has the colours of neither the ground nor the liquid: it may be a liquid whose
+//! colours have left their range, or ground that was never seen.
+//!
+//! Called on the extraction thread. Nothing is allocated; the only failures are OpenCV's.
+
+use opencv::core::{Mat, Vec3b};
+use opencv::prelude::*;
+
+use super::geometry::{NEAR_PX, RAYS, RayGrid};
+use super::ground_colours::{Ground, GroundColours};
+
+// "Tuned" below means that the value was tuned on seeds 1 and 5001 to 5003 of `evaluate-camera`; see docs/VISION.md.
+
+/// This close to the lip a stream begins, px. Chosen by hand.
+const AT_LIP_PX: f32 = 12.0;
+/// A liquid in front of a lamp's reflection is brighter than this in all parts, close to the reflection's middle. Chosen by hand.
+const GLOW_LEVEL: u8 = 180;
+/// More background than this before the first liquid ends a ray, px. As in the search for the stream.
+const GAP_MOST_PX: f32 = 24.0;
+/// Least share of a body between lip and edge on a ray that counts as filled. As in the search for the stream.
+const FILLED: f32 = 0.55;
+/// Least share of the rays that a body at the lip fills. Tuned.
+const BODY_RAYS: f32 = 0.7;
+/// Least mean length of a body at the lip, px: a bead is shorter. Tuned.
+const BODY_PX: f32 = 9.0;
+/// Least share of a body that has foreign colours. Tuned.
+const BODY_FOREIGN: f32 = 0.3;
+/// This far beyond the stream's edge there is ground, px. Chosen by hand: further than a strong blur reaches.
+const BESIDE_PX: f32 = 8.0;
+/// And so many samples beyond it: the squares of samples that are smoothed together reach two. Chosen by hand.
+const BESIDE_SAMPLES: usize = 4;
+/// With this share of foreign colours beside the stream, its edge is not where the liquid ends. Tuned.
+const BESIDE_FOREIGN: f32 = 0.5;
+/// What is foreign may be the liquid when it is no further from its colour than this share of the distance from there to the ground's mean
+/// colour: a thin stream shows the ground through itself. Chosen by hand.
+const LIKE_LIQUID: f32 = 0.5;
+/// What is foreign may be the liquid in a lamp's reflection when it is brighter than it in all parts by more than this, grey levels. Chosen by
+/// hand: more than an exposure's drift.
+const LIT_LEVELS: f32 = 8.0;
+/// And when the part that is brighter by least is so by this share of the one that is by most. Chosen by hand: where the most is cut off, it is
+/// less.
+const LIT_SHARE: f32 = 0.4;
+/// Two mean colours are one when they differ by no more than these levels, and [`ALIKE_SHARE`] of their mean level. Chosen by hand.
+const ALIKE_LEVELS: f32 = 5.0;
+/// See [`ALIKE_LEVELS`]. Chosen by hand: what a vignette and a lamp's fall-off make over 40 px.
+const ALIKE_SHARE: f32 = 0.08;
+/// What is foreign goes on beside the container when this share of the square there has its colour. Chosen by hand: no
+/// jet covers half of it.
+const GOES_ON: f32 = 0.6;
+
+/// A picture along the rays.
+pub(super) struct Seen<'a> {
+    pub(super) grid: &'a RayGrid,
+    /// Not 0 where there is liquid.
+    pub(super) mask: &'a Mat,
+    /// Smoothed colours.
+    pub(super) smooth: &'a Mat,
+    pub(super) ground: &'a GroundColours,
+}
+
+/// A mean of colours.
+#[derive(Default)]
+struct Mean {
+    sums: [u32; 3],
+    count: u32,
+}
+
+impl Mean {
+    fn add(&mut self, colour: Vec3b) {
+        (0..3).for_each(|k| self.sums[k] += u32::from(colour[k]));
+        self.count += 1;
+    }
+
+    fn levels(&self) -> [f32; 3] {
+        self.sums.map(|sum| sum as f32 / self.count.max(1) as f32)
+    }
+}
+
+impl Seen<'_> {
+    /// The mean colour of what lies at the lip like a stream and is foreign, if something does. Writes its ends into `ends`.
+    pub(super) fn body(&self, ends: &mut [usize; RAYS]) -> opencv::Result<Option<[f32; 3]>> {
+        let (mut filled, mut foreign, mut samples, mut length_px, mut mean) = (0usize, 0usize, 0usize, 0.0f32, Mean::default());
+        for (i, ray) in self.grid.rays.iter().enumerate() {
+            let mask = self.mask.at_row::<u8>(i as i32)?;
+            let colours = self.smooth.at_row::<Vec3b>(i as i32)?;
+            let (mut score, mut best, mut end, mut strange, mut strange_at_end) = (0.0f32, 0.0f32, 0usize, 0usize, 0usize);
+            for r in 0..ray.samples {
+                let step = self.grid.steps_px[r];
+                match if mask[r] != 0 { None } else { Some(self.ground.tell(colours[r].0)) } {
+                    None => score += step,
+                    Some(Ground::Foreign) => {
+                        (score, strange) = (score + step, strange + 1);
+                        if self.grid.radii_px[r] <= AT_LIP_PX {
+                            mean.add(colours[r]);
+                        }
+                    }
+                    Some(Ground::Blind) => {}
+                    Some(Ground::Known) => score -= step,
+                }
+                if score > best {
+                    (best, end, strange_at_end) = (score, r + 1, strange);
+                } else if score < -GAP_MOST_PX {
+                    break;
+                }
+            }
+            if end > 0 && best >= (2.0 * FILLED - 1.0) * (self.grid.radii_px[end - 1] - NEAR_PX).max(1.0) {
+                filled += 1;
+                samples += end;
+                foreign += strange_at_end;
+                length_px += self.grid.radii_px[end - 1];
+                ends[i] = ends[i].max(end);
+            }
+        }
+        let mean_px = length_px / filled.max(1) as f32;
+        let is = filled as f32 >= BODY_RAYS * RAYS as f32 && mean_px >= BODY_PX && foreign as f32 >= BODY_FOREIGN * samples as f32;
+        Ok(is.then(|| mean.levels()))
+    }
+
+    /// The mean colour of what is foreign beside a stream with these ends, if it goes on beyond its edge.
+    pub(super) fn beyond(&self, ends: &[usize; RAYS]) -> opencv::Result<Option<[f32; 3]>> {
+        let (mut foreign, mut looked, mut mean) = (0usize, 0usize, Mean::default());
+        for (i, ray) in self.grid.rays.iter().enumerate() {
+            let Some(last) = ends[i].checked_sub(1) else { continue };
+            let beside_px = self.grid.radii_px[last] + BESIDE_PX;
+            let Some(r) = (last + BESIDE_SAMPLES..ray.samples).find(|r| self.grid.radii_px[*r] >= beside_px) else { continue };
+            let colour = self.smooth.at_row::<Vec3b>(i as i32)?[r];
+            looked += 1;
+            if self.ground.tell(colour.0) == Ground::Foreign {
+                foreign += 1;
+                mean.add(colour);
+            }
+        }
+        Ok((foreign as f32 > BESIDE_FOREIGN * looked.max(RAYS / 4) as f32).then(|| mean.levels()))
+    }
+
+    /// Which shares of what is close to the lip are white light that the ground is not, glow of it, and foreign colours or liquid.
+    pub(super) fn at_lip(&self) -> opencv::Result<[f32; 3]> {
+        let near = self.grid.radii_px.iter().take_while(|r| **r <= AT_LIP_PX).count();
+        let (mut blind, mut glows, mut foreign, mut looked) = (0usize, 0usize, 0usize, 0usize);
+        for (i, ray) in self.grid.rays.iter().enumerate() {
+            let (mask, colours) = (self.mask.at_row::<u8>(i as i32)?, self.smooth.at_row::<Vec3b>(i as i32)?);
+            for r in 0..near.min(ray.samples) {
+                let ground = self.ground.tell(colours[r].0);
+                looked += 1;
+                blind += usize::from(ground == Ground::Blind);
+                glows += usize::from(colours[r].0.iter().all(|v| *v >= GLOW_LEVEL));
+                foreign += usize::from(mask[r] != 0 || ground != Ground::Known);
+            }
+        }
+        let share = |part: usize| part as f32 / looked.max(1) as f32;
+        Ok([share(blind), share(glows), share(foreign)])
+    }
+}
+
+/// Whether what is foreign is surely not the liquid, which is seen in the glass in its own colours; `ground` is the ground's mean colour.
+pub(super) fn is_not_the_liquid(foreign: [f32; 3], liquid: [f32; 3], ground: [f32; 3]) -> bool {
+    // Light that is cut off has lost its colour.
+    let glows = foreign.iter().all(|v| *v >= f32::from(GLOW_LEVEL));
+    // Liquid in a lamp's reflection is brighter by much the same in all parts.
+    let brighter: [f32; 3] = std::array::from_fn(|k| foreign[k] - liquid[k]);
+    let (least, most) = brighter.iter().fold((f32::MAX, f32::MIN), |(l, m), v| (l.min(*v), m.max(*v)));
+    let lit = least > LIT_LEVELS && least >= LIT_SHARE * most;
+    !glows && !lit && distance(foreign, liquid) > LIKE_LIQUID * distance(ground, liquid)
+}
+
+/// Whether what is foreign at the lip goes on outside the container, in the square beside it, as only ground does.
+pub(super) fn goes_on_beside(foreign: [f32; 3], beside: &[Vec3b]) -> bool {
+    let most = ALIKE_LEVELS + ALIKE_SHARE * foreign.iter().sum::<f32>() / 3.0;
+    let alike = beside.iter().filter(|c| (0..3).all(|k| (f32::from(c[k]) - foreign[k]).abs() <= most)).count();
+    !beside.is_empty() && alike as f32 >= GOES_ON * beside.len() as f32
+}
+
+fn distance(a: [f32; 3], b: [f32; 3]) -> f32 {
+    (0..3).map(|k| (a[k] - b[k]) * (a[k] - b[k])).sum::<f32>().sqrt()
+}
