@@ -198,7 +198,7 @@ impl EndReason {
             }
             Self::FrameRate => "the camera's frames do not come at camera.fps, so the volume is not known",
             Self::GoalExceeded => {
-                "far more was poured than the goal, and than was foreseen: pour from this vessel and weigh, so that it is learned"
+                "far more was poured than the goal: the vessel gave more than was learned of it, or its stream was not seen for a while; look at the camera, and weigh"
             }
             Self::NothingFlows => {
                 "nothing is seen to flow, where even the emptiest vessel of the episodes would: look at the camera, or fill the vessel"

@@ -181,10 +181,12 @@ impl Checks {
             What::ControllerKilled(_) => self.taken.controller = false,
             What::Robot(Fault::Boot) => self.taken.registers = false,
             What::Robot(Fault::Clear) => self.cleared_s.push(at_s),
-            // A stop before the controller has looked at the robot looks like one before the operator asked.
-            what if takes_robot(what) && stops_ours(what, machine) && at_s > self.asked_s + LOOKS_S => {
-                self.taken.registers = true;
-                self.taken.controller |= lives && self.phase != Phase::NoRobot;
+            what if takes_robot(what) && stops_ours(what, machine) => {
+                let has_session = lives && self.phase != Phase::NoRobot;
+                // Without a session, a stop before the controller has looked at the robot looks like one before the operator asked.
+                let unseen = matches!(what, What::Robot(Fault::ProgramStop)) && !has_session && at_s < self.asked_s + LOOKS_S;
+                self.taken.registers |= !unseen;
+                self.taken.controller |= has_session;
             }
             _ => {}
         }
@@ -236,8 +238,9 @@ impl Checks {
         self.left_tilted(machine, alpha_deg, at_s);
     }
 
-    /// The targets of a session are numbered one by one, so none that the robot takes has a number above how many were sent; the last word of a
-    /// session, that the program shall bring the container upright, is no target and has a number too.
+    /// The targets of a session are numbered one by one, so none that the robot takes has a number above how many were sent. (Numbers that repeat
+    /// are targets that the program does not see; what it then does is checked as always.) The last word of a session, that the program shall bring
+    /// the container upright, is no target and has a number too.
     fn targets_numbered(&mut self, machine: &Machine, at_s: f64) {
         let echo = machine.robot.outputs.int[ECHO_REGISTER];
         if echo != self.echoed && echo > self.sent + 1 {

@@ -203,7 +203,8 @@ pub fn by_core(agent: &Agent, pour: &mut BenchPour, limits: Limits, asked: Asked
             poured.believed_sd_ml = f64::from(outcome.poured_sd_ml);
             poured.seconds = f64::from(outcome.seconds);
             poured.reason = Some(outcome.reason);
-            poured.ended = matches!(outcome.reason, EndReason::Done | EndReason::ContainerEmpty | EndReason::StreamLost);
+            poured.ended =
+                matches!(outcome.reason, EndReason::Done | EndReason::ContainerEmpty | EndReason::StreamLost | EndReason::GoalExceeded);
             poured.falsely_ended = matches!(outcome.reason, EndReason::ImpossibleFlow | EndReason::NothingFlows);
             break;
         }

@@ -200,7 +200,8 @@ fn start_program(
 
 /// The error of a robot that may not be moved.
 fn may_not_move(options: &LinkOptions, state: &RobotState, reason: EndReason) -> LinkError {
-    LinkError::MayNotMove { address: options.address, reason, unpowered: hands::without_power(state) }
+    let program_runs = state.runtime_state == RUNTIME_PLAYING;
+    LinkError::MayNotMove { address: options.address, reason, unpowered: hands::without_power(state), program_runs }
 }
 
 /// The error of a joint that is too far from its start angle.

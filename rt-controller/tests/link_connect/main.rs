@@ -362,6 +362,9 @@ fn a_stop_during_the_upload_is_named() {
         seen
     });
     let error = connect(&options).unwrap_err();
-    assert_eq!(error, LinkError::MayNotMove { address: options.address, reason: EndReason::EmergencyStop, unpowered: true });
+    assert_eq!(
+        error,
+        LinkError::MayNotMove { address: options.address, reason: EndReason::EmergencyStop, unpowered: true, program_runs: false }
+    );
     drop(served.join());
 }

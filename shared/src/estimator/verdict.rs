@@ -234,10 +234,12 @@ pub(super) struct Watch {
     unconfirmed_ml: f64,
     /// What was withheld, and after which the stream was what it was before, ml.
     lone_ml: f64,
-    /// Outflow of the newest frame with a stream, ml, the lesser of two, and its tilt, degrees.
+    /// Outflow of the newest frame with a stream, ml (at its beginning the lesser of two), and its tilt, degrees.
     stream: (f64, f64),
     /// Number of frames in a row without a stream.
     gone_frames: u32,
+    /// What of it the newest gap in the stream has added, ml.
+    gap_ml: f64,
     /// What may have left in frames that showed no stream or always the same one, ml.
     unshown_ml: f64,
     verdict: Option<Impossible>,
@@ -317,8 +319,11 @@ impl Watch {
             let goes_on = stream_ml > 0.0 && self.gone_frames < ENDED_FRAMES;
             let now_ml = if goes_on { measured_ml } else { newest_ml.min(before_ml) };
             if !goes_on && now_ml > ABRUPT_ML {
-                self.unshown_ml += 0.5 * now_ml * frames_before(flow, tilt, now_ml);
+                // What a gap has counted already may be the same liquid.
+                let before_ml = 0.5 * now_ml * frames_before(flow, tilt, now_ml);
+                self.unshown_ml += (before_ml - self.gap_ml).max(0.0);
             }
+            self.gap_ml = if goes_on || now_ml > ABRUPT_ML { 0.0 } else { self.gap_ml };
             (self.stream, self.gone_frames) = ((now_ml, tilt_deg), 0);
             let (_, repeated, _) = self.same;
             self.unshown_ml += if repeated >= REPEATED_FRAMES { measured_ml } else { 0.0 };
@@ -328,7 +333,9 @@ impl Watch {
         let may_run = stream_ml > ABRUPT_ML && tilt_deg > stream_deg - BROUGHT_BACK_DEG && self.gone_frames <= GONE_FRAMES;
         if may_run {
             // A lone zero is bridged by sum and filter.
-            self.unshown_ml += if self.gone_frames > 1 { stream_ml } else { 0.0 };
+            let more_ml = if self.gone_frames > 1 { stream_ml } else { 0.0 };
+            self.gap_ml += more_ml;
+            self.unshown_ml += more_ml;
         } else if self.gone_frames >= ENDED_FRAMES {
             self.stream = (0.0, tilt_deg);
         }
