@@ -148,7 +148,7 @@ impl GroundColours {
         }
     }
 
-    /// Forgets a little. Call it once for each picture.
+    /// Forgets a little. Call it once for each picture that is learned from.
     pub(crate) fn forget(&mut self) {
         let row = SHARES * STEPS;
         let from = self.turn * row;
