@@ -323,11 +323,14 @@ impl ColouredLiquid {
         let mut ends = self.ends;
         let body = self.seen().body(&mut ends)?;
         self.ends = ends;
-        if let Some(body) = body
-            && !self.is_excused(body)?
-            && !foreign::goes_on_beside(body, self.beside_wide.colours()?)
-        {
-            return Ok(Sighting::Unsure(Doubt::ColoursChanged));
+        if let Some(body) = body {
+            let is_ground = match body.colour {
+                Some(colour) => self.is_excused(colour)? || foreign::goes_on_beside(colour, self.beside_wide.colours()?),
+                None => false,
+            };
+            if !is_ground {
+                return Ok(Sighting::Unsure(Doubt::ColoursChanged));
+            }
         }
         if foreign < QUIET_SHARE && self.learn_after == 0 && !self.half_white {
             self.beside.teach(&mut self.ground, self.frames)?;

@@ -3,7 +3,8 @@
 use super::drawn::{camera, dry, image_config, lay_over, noisy, stream};
 use super::{colour, measure};
 use feature_worker::vision::{ExtractError, Extractor};
-use opencv::core::{Mat, Scalar};
+use opencv::core::{Mat, Rect, Scalar};
+use opencv::imgproc;
 use shared::config::{ImageConfig, LiquidMethod};
 use shared::messages::Doubt;
 
@@ -55,32 +56,26 @@ fn half_white_from_the_start_is_no_dry_picture() -> Result<(), ExtractError> {
 fn the_ground_outlasts_what_hides_it() -> Result<(), ExtractError> {
     // As calibration writes it, with room below the lip and beside the container.
     let image = ImageConfig { region_px: [171, 14, 440, 296], ..image_config(LiquidMethod::Colour) };
-    let ground = |i: i32| -> Result<Mat, ExtractError> {
-        // Patches of many colours, so that none of them goes on beside the container.
-        let mut picture = dry(0.0, i)?;
-        for k in 0..42 {
-            let (x, y) = ((150 + 45 * (k % 7)) as f32, (20 + 39 * (k / 7)) as f32);
-            let patch = vec![[x, y], [x + 45.0, y], [x + 45.0, y + 39.0], [x, y + 39.0]];
-            let level = |step: i32| f64::from(40 + (k * step + k / 7 * 50) % 150);
-            lay_over(&mut picture, &[patch], Scalar::new(level(31) * 0.4, level(47), level(67), 0.0))?;
-        }
-        Ok(noisy(&picture, i)?)
-    };
-    let hidden = |i: i32, white: bool| -> Result<Mat, ExtractError> {
-        let body = vec![[216.0, 200.0], [260.0, 200.0], [260.0, 249.0], [216.0, 249.0]];
-        let mut picture = ground(i)?;
-        lay_over(&mut picture, &[body], Scalar::new(200.0, 30.0, 200.0, 0.0))?;
-        Ok(if white { half_white(i, None)? } else { noisy(&picture, i)? })
-    };
+    // Patches of many colours, so that none of them goes on beside the container.
+    let mut patches = dry(0.0, 0)?;
+    for k in 0..42i32 {
+        let (x, y) = (150 + 45 * (k % 7), 20 + 39 * (k / 7));
+        let level = |step: i32| f64::from(40 + (k * step + k / 7 * 50) % 150);
+        let colour = Scalar::new(level(31) * 0.4, level(47), level(67), 0.0);
+        imgproc::rectangle(&mut patches, Rect::new(x, y, 45, 39), colour, imgproc::FILLED, 8, 0)?;
+    }
+    let mut body = patches.clone();
+    imgproc::rectangle(&mut body, Rect::new(216, 200, 44, 49), Scalar::new(200.0, 30.0, 200.0, 0.0), imgproc::FILLED, 8, 0)?;
     for white in [true, false] {
         let mut extractor = Extractor::new(&camera(), &image)?;
-        let clear: Vec<Mat> = (0..45).map(ground).collect::<Result<_, _>>()?;
+        let clear: Vec<Mat> = (0..45).map(|i| noisy(&patches, i)).collect::<Result<_, _>>()?;
         for (i, picture) in clear.iter().enumerate() {
             let measured = measure(&mut extractor, picture)?;
             assert_eq!((measured.area_px2, measured.doubt), (0.0, Doubt::None), "{white} picture {i}");
         }
         // More than the half minute in which what is not seen would be forgotten.
-        let pictures: Vec<Mat> = (0..6).map(|i| hidden(i, white)).collect::<Result<_, _>>()?;
+        let pictures: Vec<Mat> =
+            (0..6).map(|i| if white { half_white(i, None) } else { Ok(noisy(&body, i)?) }).collect::<Result<_, ExtractError>>()?;
         for i in 0..1100 {
             let measured = measure(&mut extractor, &pictures[i % 6])?;
             let wanted = if white { Doubt::None } else { Doubt::ColoursChanged };
