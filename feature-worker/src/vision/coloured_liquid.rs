@@ -19,7 +19,7 @@ use shared::messages::{Doubt, PixelFormat};
 
 use super::coloured_edge;
 use super::confidence::Basis;
-use super::foreign::{self, Seen};
+use super::foreign::{self, FILLED, GAP_MOST_PX, Seen};
 use super::geometry::{Axes, Line, NEAR_PX, RAYS, RayGrid, distance};
 use super::ground_beside::{InGlass, Square};
 use super::ground_colours::{Ground, GroundColours};
@@ -36,10 +36,6 @@ const STREAM_RAYS: f32 = 0.8;
 const HIDDEN_RAYS: f32 = 0.5;
 /// Mean length of liquid on the full rays above which they are full far out, px. Tuned.
 const HIDDEN_PX: f32 = 14.0;
-/// More background than this before the first liquid ends a ray, px. Tuned.
-const GAP_MOST_PX: f32 = 24.0;
-/// Least share of liquid between lip and edge on a ray that counts as filled. Tuned.
-const FILLED: f32 = 0.55;
 /// With more than this share of rays full of liquid to the region's border, the colour tells nothing in this light. Chosen by hand; no
 /// measurement is recorded.
 const ALL_LIQUID: f32 = 0.9;

@@ -15,10 +15,10 @@ use super::ground_colours::{Ground, GroundColours};
 const AT_LIP_PX: f32 = 12.0;
 /// A liquid in front of a lamp's reflection is brighter than this in all parts, close to the reflection's middle. Chosen by hand.
 const GLOW_LEVEL: u8 = 180;
-/// More background than this before the first liquid ends a ray, px. As in the search for the stream.
-const GAP_MOST_PX: f32 = 24.0;
-/// Least share of a body between lip and edge on a ray that counts as filled. As in the search for the stream.
-const FILLED: f32 = 0.55;
+/// More background than this before the first liquid, or the first of a body, ends a ray, px. Tuned.
+pub(super) const GAP_MOST_PX: f32 = 24.0;
+/// Least share of liquid, or of a body, between lip and edge on a ray that counts as filled. Tuned.
+pub(super) const FILLED: f32 = 0.55;
 /// Least share of the rays that a body at the lip fills. Tuned.
 const BODY_RAYS: f32 = 0.7;
 /// Least mean length of a body at the lip, px: a bead is shorter. Tuned.
