@@ -44,10 +44,7 @@ fn percent(share: f32) -> String {
 /// Refuses what is no moving picture.
 pub(super) fn moves(pour: &Pour) -> Result<(), String> {
     if pour.count < FRAMES_LEAST {
-        return Err(format!(
-            "too few pictures ({}) to tell the container from what stands still; show one whole pour",
-            pour.count
-        ));
+        return Err(format!("too few pictures ({}) to tell the container from what stands still; show one whole pour", pour.count));
     }
     if pour.pictures.windows(2).all(|w| same(&w[0], &w[1])) {
         return Err("all pictures are the same still picture; show one whole pour".into());
