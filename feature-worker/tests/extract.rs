@@ -2,6 +2,7 @@
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::too_many_lines)]
 
 mod drawn;
+mod ground;
 
 use drawn::{HEIGHT, WIDTH, blue, camera, disc, dry, image_config, lay_over, noisy, pour, stream, water};
 use feature_worker::vision::{ExtractError, Extractor, Image, Measurement};

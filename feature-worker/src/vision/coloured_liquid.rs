@@ -19,7 +19,7 @@ use shared::messages::{Doubt, PixelFormat};
 
 use super::coloured_edge;
 use super::confidence::Basis;
-use super::foreign::{self, Seen};
+use super::foreign::{self, FILLED, GAP_MOST_PX, Seen};
 use super::geometry::{Axes, Line, NEAR_PX, RAYS, RayGrid, distance};
 use super::ground_beside::{InGlass, Square};
 use super::ground_colours::{Ground, GroundColours};
@@ -36,10 +36,6 @@ const STREAM_RAYS: f32 = 0.8;
 const HIDDEN_RAYS: f32 = 0.5;
 /// Mean length of liquid on the full rays above which they are full far out, px. Tuned.
 const HIDDEN_PX: f32 = 14.0;
-/// More background than this before the first liquid ends a ray, px. Tuned.
-const GAP_MOST_PX: f32 = 24.0;
-/// Least share of liquid between lip and edge on a ray that counts as filled. Tuned.
-const FILLED: f32 = 0.55;
 /// With more than this share of rays full of liquid to the region's border, the colour tells nothing in this light. Chosen by hand; no
 /// measurement is recorded.
 const ALL_LIQUID: f32 = 0.9;
@@ -277,6 +273,21 @@ impl ColouredLiquid {
         Ok(())
     }
 
+    /// Learns the ground in a picture in which this was seen, or does not. It is forgotten only while it is learned: what hides it for long must not
+    /// make all of it foreign.
+    fn follow_ground(&mut self, sighting: Sighting) -> opencv::Result<()> {
+        match sighting {
+            // A lamp's reflection before white squares is no ground. The pictures after it are learned from as ever.
+            Sighting::Dry { .. } | Sighting::Stream { doubt: Doubt::None, .. } | Sighting::Unsure(Doubt::BlownOut) if self.half_white => {}
+            Sighting::Dry { .. } if self.learn_after == 0 => self.learn(true)?,
+            Sighting::Stream { doubt: Doubt::None, .. } if self.learn_after == 0 => self.learn(false)?,
+            // What may be liquid must not be taken for ground.
+            Sighting::Dry { .. } | Sighting::Stream { doubt: Doubt::None, .. } => self.learn_after -= 1,
+            _ => self.learn_after = LEARN_AFTER,
+        }
+        Ok(())
+    }
+
     /// The picture along the rays.
     fn seen(&self) -> Seen<'_> {
         Seen { grid: &self.grid, mask: &self.mask, smooth: &self.smooth, ground: &self.ground }
@@ -291,14 +302,16 @@ impl ColouredLiquid {
     /// What is at the lip where no stream is seen.
     fn look_again(&mut self, confidence: f32) -> opencv::Result<Sighting> {
         let dry = Sighting::Dry { confidence };
-        if self.dry_frames < DRY_FRAMES {
+        let known = self.dry_frames >= DRY_FRAMES;
+        // A lamp's reflection before white squares hides a stream, but not the liquid below the lip, and not what is foreign where the ground is
+        // known. It is not learned in such pictures, so there is no end to wait for.
+        if self.half_white && (!known || !self.glass.is_empty()?) {
+            return Ok(Sighting::Unsure(Doubt::BlownOut));
+        }
+        if !known {
             return Ok(dry);
         }
         self.glass.see_dry()?;
-        // A lamp's reflection before white squares hides a stream, but not the liquid below the lip.
-        if self.half_white && !self.glass.is_empty()? {
-            return Ok(Sighting::Unsure(Doubt::BlownOut));
-        }
         let [blind, glows, foreign] = self.seen().at_lip()?;
         if self.reflection.hides_lip(blind.max(self.white_lip), glows, foreign > QUIET_SHARE) {
             return Ok(Sighting::Unsure(Doubt::BlownOut));
@@ -306,13 +319,16 @@ impl ColouredLiquid {
         let mut ends = self.ends;
         let body = self.seen().body(&mut ends)?;
         self.ends = ends;
-        if let Some(body) = body
-            && !self.is_excused(body)?
-            && !foreign::goes_on_beside(body, self.beside_wide.colours()?)
-        {
-            return Ok(Sighting::Unsure(Doubt::ColoursChanged));
+        if let Some(body) = body {
+            let is_ground = match body.colour {
+                Some(colour) => self.is_excused(colour)? || foreign::goes_on_beside(colour, self.beside_wide.colours()?),
+                None => false,
+            };
+            if !is_ground {
+                return Ok(Sighting::Unsure(Doubt::ColoursChanged));
+            }
         }
-        if foreign < QUIET_SHARE && self.learn_after == 0 {
+        if foreign < QUIET_SHARE && self.learn_after == 0 && !self.half_white {
             self.beside.teach(&mut self.ground, self.frames)?;
         }
         Ok(dry)
@@ -390,19 +406,7 @@ impl Liquid for ColouredLiquid {
             }
             other => other,
         };
-        match sighting {
-            Sighting::Dry { .. } if self.learn_after == 0 => self.learn(true)?,
-            Sighting::Stream { doubt: Doubt::None, .. } if self.learn_after == 0 => self.learn(false)?,
-            // What may be liquid must not be taken for ground.
-            Sighting::Dry { .. } | Sighting::Stream { doubt: Doubt::None, .. } => {
-                self.learn_after -= 1;
-                self.ground.forget();
-            }
-            _ => {
-                self.learn_after = LEARN_AFTER;
-                self.ground.forget();
-            }
-        }
+        self.follow_ground(sighting)?;
         // A liquid in the ground's colours is not seen.
         let untold = self.wandering.doubt().filter(|_| matches!(sighting, Sighting::Dry { .. }));
         Ok(untold.map_or(sighting, Sighting::Unsure))
@@ -415,10 +419,6 @@ impl Liquid for ColouredLiquid {
     /// A white square of a board behind the lip hides no stream.
     fn bears_white(&mut self, half_white: bool) -> bool {
         self.half_white = half_white;
-        if half_white {
-            // Nor is a lamp's reflection before white squares taken for ground.
-            self.learn_after = LEARN_AFTER;
-        }
         true
     }
 

@@ -15,22 +15,24 @@ use super::ground_colours::{Ground, GroundColours};
 const AT_LIP_PX: f32 = 12.0;
 /// A liquid in front of a lamp's reflection is brighter than this in all parts, close to the reflection's middle. Chosen by hand.
 const GLOW_LEVEL: u8 = 180;
-/// More background than this before the first liquid ends a ray, px. As in the search for the stream.
-const GAP_MOST_PX: f32 = 24.0;
-/// Least share of a body between lip and edge on a ray that counts as filled. As in the search for the stream.
-const FILLED: f32 = 0.55;
+/// More background than this before the first liquid, or the first of a body, ends a ray, px. Tuned.
+pub(super) const GAP_MOST_PX: f32 = 24.0;
+/// Least share of liquid, or of a body, between lip and edge on a ray that counts as filled. Tuned.
+pub(super) const FILLED: f32 = 0.55;
 /// Least share of the rays that a body at the lip fills. Tuned.
 const BODY_RAYS: f32 = 0.7;
 /// Least mean length of a body at the lip, px: a bead is shorter. Tuned.
 const BODY_PX: f32 = 9.0;
 /// Least share of a body that has foreign colours. Tuned.
 const BODY_FOREIGN: f32 = 0.3;
+/// A body's colour is known when this share of the rays that it fills show it close to the lip. Chosen by hand: on fewer it may be that of an edge.
+const COLOUR_RAYS: f32 = 0.5;
 /// This far beyond the stream's edge there is ground, px. Chosen by hand: further than a strong blur reaches.
-const BESIDE_PX: f32 = 8.0;
+const BEYOND_PX: f32 = 8.0;
 /// And so many samples beyond it: the squares of samples that are smoothed together reach two. Chosen by hand.
-const BESIDE_SAMPLES: usize = 4;
+const BEYOND_SAMPLES: usize = 4;
 /// With this share of foreign colours beside the stream, its edge is not where the liquid ends. Tuned.
-const BESIDE_FOREIGN: f32 = 0.5;
+const BEYOND_FOREIGN: f32 = 0.5;
 /// What is foreign may be the liquid when it is no further from its colour than this share of the distance from there to the ground's mean
 /// colour: a thin stream shows the ground through itself. Chosen by hand.
 const LIKE_LIQUID: f32 = 0.5;
@@ -59,10 +61,16 @@ pub(super) struct Seen<'a> {
 }
 
 /// A mean of colours.
-#[derive(Default)]
+#[derive(Clone, Copy, Default)]
 struct Mean {
     sums: [u32; 3],
     count: u32,
+}
+
+/// Something foreign that lies at the lip like a stream.
+pub(super) struct Body {
+    /// Its mean colour close to the lip, if it shows it there.
+    pub(super) colour: Option<[f32; 3]>,
 }
 
 impl Mean {
@@ -71,19 +79,26 @@ impl Mean {
         self.count += 1;
     }
 
+    fn join(&mut self, other: Mean) {
+        (0..3).for_each(|k| self.sums[k] += other.sums[k]);
+        self.count += other.count;
+    }
+
     fn levels(&self) -> [f32; 3] {
         self.sums.map(|sum| sum as f32 / self.count.max(1) as f32)
     }
 }
 
 impl Seen<'_> {
-    /// The mean colour of what lies at the lip like a stream and is foreign, if something does. Writes its ends into `ends`.
-    pub(super) fn body(&self, ends: &mut [usize; RAYS]) -> opencv::Result<Option<[f32; 3]>> {
-        let (mut filled, mut foreign, mut samples, mut length_px, mut mean) = (0usize, 0usize, 0usize, 0.0f32, Mean::default());
+    /// What lies at the lip like a stream and is foreign, if something does. Writes its ends into `ends`.
+    pub(super) fn body(&self, ends: &mut [usize; RAYS]) -> opencv::Result<Option<Body>> {
+        let (mut filled, mut foreign, mut samples, mut length_px) = (0usize, 0usize, 0usize, 0.0f32);
+        let (mut shown, mut mean) = (0usize, Mean::default());
         for (i, ray) in self.grid.rays.iter().enumerate() {
             let mask = self.mask.at_row::<u8>(i as i32)?;
             let colours = self.smooth.at_row::<Vec3b>(i as i32)?;
             let (mut score, mut best, mut end, mut strange, mut strange_at_end) = (0.0f32, 0.0f32, 0usize, 0usize, 0usize);
+            let (mut own, mut own_at_end) = (Mean::default(), Mean::default());
             for r in 0..ray.samples {
                 let step = self.grid.steps_px[r];
                 match if mask[r] != 0 { None } else { Some(self.ground.tell(colours[r].0)) } {
@@ -91,14 +106,14 @@ impl Seen<'_> {
                     Some(Ground::Foreign) => {
                         (score, strange) = (score + step, strange + 1);
                         if self.grid.radii_px[r] <= AT_LIP_PX {
-                            mean.add(colours[r]);
+                            own.add(colours[r]);
                         }
                     }
                     Some(Ground::Blind) => {}
                     Some(Ground::Known) => score -= step,
                 }
                 if score > best {
-                    (best, end, strange_at_end) = (score, r + 1, strange);
+                    (best, end, strange_at_end, own_at_end) = (score, r + 1, strange, own);
                 } else if score < -GAP_MOST_PX {
                     break;
                 }
@@ -107,13 +122,16 @@ impl Seen<'_> {
                 filled += 1;
                 samples += end;
                 foreign += strange_at_end;
+                shown += usize::from(own_at_end.count > 0);
+                mean.join(own_at_end);
                 length_px += self.grid.radii_px[end - 1];
                 ends[i] = ends[i].max(end);
             }
         }
         let mean_px = length_px / filled.max(1) as f32;
         let is = filled as f32 >= BODY_RAYS * RAYS as f32 && mean_px >= BODY_PX && foreign as f32 >= BODY_FOREIGN * samples as f32;
-        Ok(is.then(|| mean.levels()))
+        let told = shown as f32 >= COLOUR_RAYS * filled as f32;
+        Ok(is.then(|| Body { colour: told.then(|| mean.levels()) }))
     }
 
     /// The mean colour of what is foreign beside a stream with these ends, if it goes on beyond its edge.
@@ -121,8 +139,8 @@ impl Seen<'_> {
         let (mut foreign, mut looked, mut mean) = (0usize, 0usize, Mean::default());
         for (i, ray) in self.grid.rays.iter().enumerate() {
             let Some(last) = ends[i].checked_sub(1) else { continue };
-            let beside_px = self.grid.radii_px[last] + BESIDE_PX;
-            let Some(r) = (last + BESIDE_SAMPLES..ray.samples).find(|r| self.grid.radii_px[*r] >= beside_px) else { continue };
+            let beyond_px = self.grid.radii_px[last] + BEYOND_PX;
+            let Some(r) = (last + BEYOND_SAMPLES..ray.samples).find(|r| self.grid.radii_px[*r] >= beyond_px) else { continue };
             let colour = self.smooth.at_row::<Vec3b>(i as i32)?[r];
             looked += 1;
             if self.ground.tell(colour.0) == Ground::Foreign {
@@ -130,7 +148,7 @@ impl Seen<'_> {
                 mean.add(colour);
             }
         }
-        Ok((foreign as f32 > BESIDE_FOREIGN * looked.max(RAYS / 4) as f32).then(|| mean.levels()))
+        Ok((foreign as f32 > BEYOND_FOREIGN * looked.max(RAYS / 4) as f32).then(|| mean.levels()))
     }
 
     /// Which shares of what is close to the lip are white light that the ground is not, glow of it, and foreign colours or liquid.
@@ -172,4 +190,98 @@ pub(super) fn goes_on_beside(foreign: [f32; 3], beside: &[Vec3b]) -> bool {
 
 fn distance(a: [f32; 3], b: [f32; 3]) -> f32 {
     (0..3).map(|k| (a[k] - b[k]) * (a[k] - b[k])).sum::<f32>().sqrt()
+}
+
+#[cfg(test)]
+#[allow(clippy::unwrap_used)]
+mod tests {
+    use opencv::core::{CV_8UC1, CV_8UC3, Scalar};
+    use shared::config::{ImageConfig, LiquidMethod};
+
+    use super::super::geometry::Axes;
+    use super::*;
+
+    const GROUND: [u8; 3] = [90, 90, 90];
+    const GREEN: [u8; 3] = [60, 180, 60];
+
+    /// The colour of the body in a picture that has the colour `at` of a ray and a distance from the lip, px; `None` if there is no body. The first
+    /// so many px are seen as liquid.
+    fn body(at: impl Fn(usize, f32) -> [u8; 3], liquid_px: f32) -> opencv::Result<Option<Option<[f32; 3]>>> {
+        let image = ImageConfig {
+            region_px: [191, 16, 420, 270],
+            x_axis_px: [215.0, 250.0, 600.0, 250.0],
+            y_axis_px: [215.0, 470.0, 215.0, 250.0],
+            method: LiquidMethod::Colour,
+            colour_hsv: [98, 90, 25, 124, 255, 255],
+            area_min_px2: 30.0,
+        };
+        let axes = Axes { lip_px: [24.0, 234.0], ..Axes::new(&image) };
+        let grid = RayGrid::new(&axes, [420.0, 270.0]).unwrap();
+        let mut ground = GroundColours::new();
+        ground.expose(270);
+        (0..200).for_each(|_| ground.learn(GROUND, true));
+        let (rows, columns) = (RAYS as i32, grid.radii_px.len() as i32);
+        let mut mask = Mat::new_rows_cols_with_default(rows, columns, CV_8UC1, Scalar::all(0.0))?;
+        let mut smooth = Mat::new_rows_cols_with_default(rows, columns, CV_8UC3, Scalar::all(0.0))?;
+        for i in 0..RAYS {
+            for (r, radius) in grid.radii_px.iter().enumerate() {
+                smooth.at_row_mut::<Vec3b>(i as i32)?[r] = at(i, *radius).into();
+                mask.at_row_mut::<u8>(i as i32)?[r] = if *radius <= liquid_px { 255 } else { 0 };
+            }
+        }
+        let seen = Seen { grid: &grid, mask: &mask, smooth: &smooth, ground: &ground };
+        Ok(seen.body(&mut [0; RAYS])?.map(|body| body.colour))
+    }
+
+    /// Protects pours from a body at the lip that is excused by a colour that it does not have: where its first px are white light or look like
+    /// the liquid, or show it on a few rays only, its colour is not known; rays without the body and what lies beyond its end do not enter.
+    #[test]
+    fn a_body_has_its_own_colour_or_none() -> opencv::Result<()> {
+        let green = Some([60.0, 180.0, 60.0]);
+        let after = |first: [u8; 3]| {
+            move |_: usize, r: f32| {
+                if r <= 13.0 {
+                    first
+                } else if r <= 40.0 {
+                    GREEN
+                } else {
+                    GROUND
+                }
+            }
+        };
+        assert_eq!(body(|_, r| if r <= 40.0 { GREEN } else { GROUND }, 0.0)?, Some(green));
+        assert_eq!(body(after([255; 3]), 0.0)?, Some(None), "white light first");
+        assert_eq!(body(after(GREEN), 13.0)?, Some(None), "liquid first");
+        let few = |i: usize, r: f32| {
+            if r > 40.0 {
+                GROUND
+            } else if r > 13.0 || i < 10 {
+                GREEN
+            } else {
+                [255; 3]
+            }
+        };
+        assert_eq!(body(few, 0.0)?, Some(None), "on a few rays");
+        let specks = |i: usize, r: f32| match (i.is_multiple_of(4), r) {
+            (true, 10.0..=12.0) => [30, 30, 250],
+            (true, _) | (_, 40.0..) => GROUND,
+            _ => GREEN,
+        };
+        assert_eq!(body(specks, 0.0)?, Some(green), "specks of another colour");
+        // Half of the rays end at 9 px, before other specks.
+        let beyond = |i: usize, r: f32| match r {
+            ..9.5 => GREEN,
+            _ if i.is_multiple_of(2) => {
+                if r < 40.0 {
+                    GREEN
+                } else {
+                    GROUND
+                }
+            }
+            12.0 => [30, 30, 250],
+            _ => GROUND,
+        };
+        assert_eq!(body(beyond, 0.0)?, Some(green), "specks beyond its end");
+        Ok(())
+    }
 }

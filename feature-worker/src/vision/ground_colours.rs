@@ -1,9 +1,10 @@
 //! The colours of the ground: what a coloured liquid is not, and what must be seen again before a stream counts as gone.
 //!
 //! A liquid whose colour leaves its range is seen as ground by the range alone. So the colours that were seen far from the lip, and near
-//! it while the worker was new, are counted in a table of their shares of blue and red and their brightness. Brightness is that against
-//! the present picture's ground, because exposures wander; places do not enter, because the background moves. What is in neither the
-//! range nor the table is foreign.
+//! it while the worker was new, are counted in a table of their shares of blue and red and their brightness. The shares are those of levels
+//! that are raised by a share of the present picture's mean, because in dark colours noise alone makes every share; and brightness is that
+//! against the present picture's ground. So an exposure that wanders changes neither. Places do not enter, because the background moves.
+//! What is in neither the range nor the table is foreign.
 //!
 //! Called on the extraction thread; nothing is allocated after the start and nothing fails.
 
@@ -13,11 +14,11 @@ const SHARES: usize = 64;
 const DARK_SUM: usize = 30;
 /// A colour whose parts reach this is white light and not a colour, grey levels. As in the check of light, a little below 255.
 const BLIND_LEVEL: u8 = 250;
-/// Shares are taken of levels that are raised by this share of the ground's mean sum, because in dark colours noise alone makes every share.
-/// Chosen by hand.
+/// Shares are taken of levels that are raised by this share of the ground's mean sum, whatever it is. Chosen by hand: in dim light, where the
+/// mean sum is 100, by some times the noise of a smoothed sample.
 const RAISED_SHARE: f64 = 0.1;
-/// But by no more than this, grey levels. Chosen by hand: ten times the noise of a smoothed sample.
-const RAISED_MOST: f64 = 16.0;
+/// Levels are raised in such parts of a grey level, so that in dim light too it is the same share.
+const RAISED_PARTS: u32 = 16;
 /// What one sample adds to its colour.
 const SEEN: u16 = 4;
 /// What one sample adds to the colours beside its own.
@@ -57,7 +58,7 @@ pub(crate) struct GroundColours {
     counts: Vec<u16>,
     /// `SHARES / sum` for each sum of three levels, which are `raised`, of which 65536 is 1.
     per_sum: [u32; 766],
-    /// What is added to each level before its share is taken.
+    /// What is added to each level before its share is taken, in [`RAISED_PARTS`].
     raised: u32,
     /// The step of brightness for each sum of three levels in the present picture, times [`CHROMAS`].
     steps: [u32; 766],
@@ -82,9 +83,10 @@ impl GroundColours {
             return;
         }
         self.mean_sum = mean_sum;
-        self.raised = (RAISED_SHARE * f64::from(mean_sum)).min(RAISED_MOST) as u32;
+        let raised = RAISED_SHARE * f64::from(mean_sum);
+        self.raised = (raised * f64::from(RAISED_PARTS)).round() as u32;
         for (sum, kept) in self.per_sum.iter_mut().enumerate() {
-            *kept = (SHARES * 65_536 / (sum + 3 * self.raised as usize).max(1)) as u32;
+            *kept = ((SHARES * 65_536) as f64 / (sum as f64 + 3.0 * raised).max(1.0)) as u32;
         }
         // The middle of the steps is the mean's own brightness.
         let mut step = 0;
@@ -99,7 +101,11 @@ impl GroundColours {
     #[inline(always)]
     fn place(&self, [blue, green, red]: [u8; 3]) -> usize {
         let sum = usize::from(blue) + usize::from(green) + usize::from(red);
-        let share = |level: u8| ((((u32::from(level) + self.raised) * self.per_sum[sum]) >> 16) as usize).min(SHARES - 1);
+        // Darker colours than those of `DARK_SUM` do not come here, so nothing overflows.
+        let share = |level: u8| {
+            let raised = RAISED_PARTS * u32::from(level) + self.raised;
+            ((raised * self.per_sum[sum] / (RAISED_PARTS << 16)) as usize).min(SHARES - 1)
+        };
         if sum < DARK_SUM {
             DARK
         } else if blue.min(green).min(red) >= BLIND_LEVEL {
@@ -148,7 +154,7 @@ impl GroundColours {
         }
     }
 
-    /// Forgets a little. Call it once for each picture.
+    /// Forgets a little. Call it once for each picture that is learned from.
     pub(crate) fn forget(&mut self) {
         let row = SHARES * STEPS;
         let from = self.turn * row;
@@ -157,5 +163,52 @@ impl GroundColours {
             *count -= *count / FORGETS;
         }
         self.turn = (self.turn + 1) % SHARES;
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// A colour in another exposure.
+    fn exposed(colour: [u8; 3], gain: f32) -> [u8; 3] {
+        colour.map(|level| (f32::from(level) * gain).round() as u8)
+    }
+
+    /// Protects dry pictures under an exposure that hunts: ground of any colour stays known, and what is no ground stays foreign.
+    #[test]
+    fn the_ground_is_known_in_any_exposure() {
+        for mean_sum in [90u32, 150, 200, 250, 330] {
+            let most = (245 / 2).min(mean_sum as usize);
+            let colours: Vec<[u8; 3]> = (0..most)
+                .step_by(7)
+                .flat_map(|blue| (0..most).step_by(9).flat_map(move |green| (0..most).step_by(8).map(move |red| [blue, green, red])))
+                .filter(|levels| (mean_sum as usize / 2..2 * mean_sum as usize).contains(&levels.iter().sum()))
+                .map(|levels| levels.map(|level| level as u8))
+                .filter(|levels| exposed(*levels, 0.6).iter().map(|v| u32::from(*v)).sum::<u32>() >= 45)
+                .collect();
+            assert!(colours.len() > 100, "{mean_sum}");
+            for known in colours.iter().step_by(11) {
+                let mut ground = GroundColours::new();
+                ground.expose(mean_sum);
+                // With a level of noise, as every sensor has.
+                for i in 0..540u32 {
+                    let [blue, green, red] = *known;
+                    let noise = |level: u8, k: u32| (level + (i / 3u32.pow(k) % 3) as u8).saturating_sub(1);
+                    ground.learn([noise(blue, 0), noise(green, 1), noise(red, 2)], true);
+                }
+                let foreign = colours.iter().find(|other| {
+                    let sums = [*known, **other].map(|c| c.iter().map(|v| f32::from(*v)).sum::<f32>());
+                    (0..3).any(|k| (f32::from(known[k]) / sums[0] - f32::from(other[k]) / sums[1]).abs() > 0.3)
+                });
+                for gain in [0.6, 0.7, 0.8, 0.9, 1.0, 1.1, 1.3, 1.6, 2.0] {
+                    ground.expose((mean_sum as f32 * gain).round() as u32);
+                    assert_eq!(ground.tell(exposed(*known, gain)), Ground::Known, "{known:?} of {mean_sum} x {gain}");
+                    if let Some(other) = foreign {
+                        assert_eq!(ground.tell(exposed(*other, gain)), Ground::Foreign, "{other:?} for {known:?} of {mean_sum} x {gain}");
+                    }
+                }
+            }
+        }
     }
 }

@@ -63,8 +63,10 @@ impl Wandering {
         self.brightness_for = self.brightness_for.saturating_sub(1);
         let change = self.change(now);
         if change.is_none() {
-            // The light's way has a gap that nothing bridges: of a light that rises and falls, only the rise may have been told.
-            self.told = 0;
+            // The light's way has a gap that nothing bridges: of a light that rises and falls, only the rise may have been told. A new way
+            // begins in this picture, against which the next one is compared.
+            self.way[0] = self.light;
+            self.told = 1;
         }
         if let Some(change) = change {
             (0..3).for_each(|k| self.light[k] += change[k]);
@@ -160,5 +162,27 @@ mod tests {
             wandering.look(&rays);
         }
         assert_eq!(wandering.doubt(), None);
+    }
+
+    /// Protects pours from a step of the white balance in the first picture that tells the light again after others that did not, or in one
+    /// that comes between them: it is named.
+    #[test]
+    fn a_step_right_after_a_gap_is_named() {
+        let doubt = |steps_at: usize, is_gap: &dyn Fn(usize) -> bool| {
+            let mut wandering = Wandering::new();
+            for picture in 0..40usize {
+                let (red, moves) = (if picture < steps_at { 1.0 } else { 1.5 }, if is_gap(picture) { 0.3 } else { 0.0 });
+                let rays: [([f32; 3], u32); RAYS] = std::array::from_fn(|i| {
+                    let level = (60.0 + i as f32) * (1.0 + moves * (0.9 * picture as f32 + i as f32).sin());
+                    ([level, level, level * red], 6)
+                });
+                wandering.look(&rays);
+            }
+            wandering.doubt()
+        };
+        // Picture 21 is the first that is compared with one in which nothing moved.
+        assert_eq!(doubt(21, &|picture| (10..20).contains(&picture)), Some(Doubt::ColoursChanged));
+        assert_eq!(doubt(21, &|picture| picture % 3 == 1), Some(Doubt::ColoursChanged));
+        assert_eq!(doubt(1, &|_| false), Some(Doubt::ColoursChanged), "right after the first picture");
     }
 }

@@ -7,7 +7,6 @@
 use opencv::core::Mat;
 use shared::config::{CameraConfig, ImageConfig, LiquidMethod};
 use shared::messages::Doubt;
-use shared::plural::counted;
 
 use super::pour::{Pour, same};
 use crate::vision::{Corner, DryBackground, Extractor, Steadiness};
@@ -45,10 +44,7 @@ fn percent(share: f32) -> String {
 /// Refuses what is no moving picture.
 pub(super) fn moves(pour: &Pour) -> Result<(), String> {
     if pour.count < FRAMES_LEAST {
-        return Err(format!(
-            "{} are too few to tell the container from what stands still; show one whole pour",
-            counted(pour.count, "picture")
-        ));
+        return Err(format!("too few pictures ({}) to tell the container from what stands still; show one whole pour", pour.count));
     }
     if pour.pictures.windows(2).all(|w| same(&w[0], &w[1])) {
         return Err("all pictures are the same still picture; show one whole pour".into());
