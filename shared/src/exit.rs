@@ -76,14 +76,13 @@ pub fn end_within(stop: &Arc<AtomicBool>, within: Duration, line: &'static str) 
 /// Makes a panic in any thread of the resident process `name` one line that matters, in place of what Rust prints.
 pub fn explain_panics(name: &'static str) {
     std::panic::set_hook(Box::new(move |panic| {
-        crate::os::tell(Level::Error, &of_panic(name, panic));
+        crate::os::tell(Level::Error, &format!("{name}: this is a defect, please report it: {}", one_line(panic)));
     }));
 }
 
-/// The one line of a panic in the process `name`: Rust puts place and message on lines of their own, and the message may have several.
-pub fn of_panic(name: &str, panic: &PanicHookInfo) -> String {
-    let words = panic.to_string();
-    format!("{name}: this is a defect, please report it: {}", words.lines().collect::<Vec<_>>().join(" "))
+/// A panic's place and message in one line: Rust puts them on lines of their own, and the message may have several.
+pub fn one_line(panic: &PanicHookInfo) -> String {
+    panic.to_string().lines().collect::<Vec<_>>().join(" ")
 }
 
 /// Ends a resident process: as [`end`], but a terminal that takes nothing does not keep the process alive.
