@@ -29,7 +29,11 @@ $('curve').onclick = () => attempt(async () => {
 /** Asks how far the calibration has come. */
 async function look() {
   let now;
-  try { now = await get('/api/calibration'); } catch { return; }
+  try { now = await get('/api/calibration'); } catch {
+    // A server that is slow for once is asked again.
+    if (calibrationBusy && !$('calibrate').hidden) setTimeout(look, 700);
+    return;
+  }
   calibrationBusy = now.busy;
   const key = JSON.stringify(now);
   if (key !== calibrationShown) {

@@ -53,6 +53,7 @@ static PLACE: OnceLock<Place> = OnceLock::new();
 /// Runs the link until standard input ends.
 pub fn run(file: &Path) -> Result<(), Failure> {
     let config = Config::read(file).or_exit(exit::BAD_INPUT)?;
+    exit::explain_panics("operator-page link");
     let place = Place::from(&config.cell);
     let _ = PLACE.set(place.clone());
     // A signal to all processes of a terminal or a service ends the page first, which then closes standard input.

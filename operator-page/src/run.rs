@@ -107,6 +107,7 @@ pub fn run(args: &Args) -> Result<(), Failure> {
 
 /// Says where the page is. A log that others read, as systemd's, gets the token's file instead of the token.
 fn announce(address: SocketAddr, word: &str, (file, made): (&Path, bool), loopback: bool) {
+    let say = |level: Level, text: &str| eprintln!("{}", level.marked(&format!("operator-page: {text}")));
     let logged = std::env::var_os("JOURNAL_STREAM").is_some();
     for ip in addresses::to_open(address.ip()) {
         let address = SocketAddr::new(ip, address.port());
@@ -117,17 +118,16 @@ fn announce(address: SocketAddr, word: &str, (file, made): (&Path, bool), loopba
         };
         if loopback {
             println!("http://{address}");
-            eprintln!("operator-page: open http://{address} on this machine; another user of it needs {with_token}");
+            say(Level::Info, &format!("open http://{address} on this machine; another user of it needs {with_token}"));
         } else {
             println!("{with_token}");
-            eprintln!("operator-page: open {with_token}");
+            say(Level::Info, &format!("open {with_token}"));
         }
     }
     if !loopback {
-        let line = "operator-page: whoever has this address can move the robot; it is not encrypted, so use a network that you trust";
-        eprintln!("{}", Level::Warning.marked(line));
+        say(Level::Warning, "whoever has this address can move the robot; it is not encrypted, so use a network that you trust");
     }
     if made {
-        eprintln!("operator-page: the token was made now, and stays the same until its file is deleted");
+        say(Level::Info, "the token was made now, and stays the same until its file is deleted");
     }
 }

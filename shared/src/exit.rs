@@ -2,6 +2,7 @@
 //! here fails.
 
 use std::fmt::Display;
+use std::panic::PanicHookInfo;
 use std::process::ExitCode;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering::Relaxed};
@@ -75,8 +76,13 @@ pub fn end_within(stop: &Arc<AtomicBool>, within: Duration, line: &'static str) 
 /// Makes a panic in any thread of the resident process `name` one line that matters, in place of what Rust prints.
 pub fn explain_panics(name: &'static str) {
     std::panic::set_hook(Box::new(move |panic| {
-        crate::os::tell(Level::Error, &format!("{name}: this is a defect, please report it: {panic}"));
+        crate::os::tell(Level::Error, &format!("{name}: this is a defect, please report it: {}", one_line(panic)));
     }));
+}
+
+/// A panic's place and message in one line: Rust puts them on lines of their own, and the message may have several.
+pub fn one_line(panic: &PanicHookInfo) -> String {
+    panic.to_string().lines().collect::<Vec<_>>().join(" ")
 }
 
 /// Ends a resident process: as [`end`], but a terminal that takes nothing does not keep the process alive.
@@ -98,5 +104,30 @@ pub fn end(result: Result<(), Failure>) -> ExitCode {
             eprintln!("{}", Level::Error.marked(&format!("error: {what}")));
             ExitCode::from(code)
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Set in the process that is to panic.
+    const PANICS: &str = "DECANT_TEST_PANICS";
+
+    /// Protects the journal, where each line is an entry of its own, from a panic in pieces: whatever its message, it is one line with name and place.
+    #[test]
+    #[allow(clippy::panic)]
+    fn a_panic_is_one_line() {
+        if std::env::var_os(PANICS).is_some() {
+            explain_panics("worker");
+            panic!("first\nsecond");
+        }
+        // The hook is the whole process's, so this test panics in another one.
+        let mut other = std::process::Command::new(std::env::current_exe().unwrap());
+        let ended = other.args(["--exact", "exit::tests::a_panic_is_one_line", "--nocapture"]).env(PANICS, "1").output().unwrap();
+        let said = String::from_utf8(ended.stderr).unwrap();
+        assert!(!ended.status.success() && said.lines().count() == 1, "{said}");
+        assert!(said.starts_with("worker: this is a defect, please report it: panicked at ") && said.contains("exit.rs:"), "{said}");
+        assert!(said.ends_with("first second\n"), "{said}");
     }
 }

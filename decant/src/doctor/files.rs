@@ -5,7 +5,7 @@
 use std::os::unix::fs::MetadataExt as _;
 use std::path::{Path, PathBuf};
 
-use feature_worker::episodes::folder::{Budget, Folder, LEFT_FREE, MEGABYTE};
+use feature_worker::episodes::folder::{Budget, Folder, LEAST_FREE, MEGABYTE, recorded_today};
 use rt_controller::{claim, disk};
 use shared::config::Config;
 use shared::disk_space::free_bytes;
@@ -40,7 +40,7 @@ pub fn look(file: &Path, config: &Config) -> Vec<Finding> {
     findings.extend(config.controller.journal.as_ref().map(|file| journal(file.parent().unwrap_or(file))));
     let folder = Folder::look(&config.recording.directory);
     findings.push(match writable("episodes", &config.recording.directory) {
-        Ok((there, free)) => episodes(&there, free, folder),
+        Ok((there, free)) => episodes(&there, free, folder, recorded_today(&config.recording.directory)),
         Err(finding) => finding,
     });
     findings.push(budget(Budget::of(&config.recording), folder));
@@ -112,16 +112,16 @@ fn weights(file: &Path, config: &Config) -> Finding {
 }
 
 /// How long the disk lasts: at the rate of the last day, or for how many episodes if there was none.
-fn episodes(there: &Path, free: u64, folder: Folder) -> Finding {
-    let left = free.saturating_sub(LEFT_FREE);
+fn episodes(there: &Path, free: u64, folder: Folder, today: u64) -> Finding {
+    let left = free.saturating_sub(LEAST_FREE);
     let one = folder.bytes.checked_div(folder.episodes as u64).map_or(EPISODE_BYTES, |mean| mean.max(1));
-    let days = left as f64 / folder.new_bytes as f64;
-    let lasts = match folder.new_bytes {
+    let days = left as f64 / today as f64;
+    let lasts = match today {
         0 => format!("room for {} more", left / one),
         new => format!("{days:.1} days at today's {} MB a day", new.div_ceil(MEGABYTE)),
     };
     let is = format!(
-        "{}: {} of {} MB; {} MB free, {lasts}",
+        "{}: {}, {} MB together; {} MB free, {lasts}",
         there.display(),
         counted(folder.episodes, "episode"),
         folder.bytes / MEGABYTE,
@@ -131,8 +131,8 @@ fn episodes(there: &Path, free: u64, folder: Folder) -> Finding {
     let soon = "the disk will be full soon, and then nothing is recorded";
     match left {
         0 => Finding::red("episodes", is, "the disk is full: nothing more is recorded", advice),
-        _ if folder.new_bytes > 0 && days < LASTS_DAYS[1] => Finding::red("episodes", is, soon, advice),
-        _ if folder.new_bytes > 0 && days < LASTS_DAYS[0] => Finding::yellow("episodes", is, soon, advice),
+        _ if today > 0 && days < LASTS_DAYS[1] => Finding::red("episodes", is, soon, advice),
+        _ if today > 0 && days < LASTS_DAYS[0] => Finding::yellow("episodes", is, soon, advice),
         _ if left < EPISODES * one => Finding::yellow("episodes", is, soon, advice),
         _ => Finding::green("episodes", is),
     }
@@ -144,7 +144,7 @@ fn budget(budget: Budget, folder: Folder) -> Finding {
     if budget.is_none() {
         return Finding::green(what, "none is set (recording.budget_mb, recording.budget_episodes)");
     }
-    let is = format!("{} of {} MB, and {} may be", counted(folder.episodes, "episode"), folder.bytes / MEGABYTE, budget.words());
+    let is = format!("{}, {} MB together; the budget is {}", counted(folder.episodes, "episode"), folder.bytes / MEGABYTE, budget.words());
     let means = "nothing is deleted by itself, so the disk fills";
     let advice =
         "`decant episodes prune` says what it would delete, and spares what is weighed; docs/DATA.md says how it is run each night";

@@ -1,18 +1,21 @@
-//! How much the episodes of a directory take, against their budget and the disk. Nothing is opened or changed.
+//! How much the episodes of a directory take, against their budget and the disk. Nothing is changed.
 //!
-//! Used by the recorder's thread after each episode, and by `decant doctor`. Allocates and reads the directory. Nothing here fails: a file that
-//! cannot be looked at counts for nothing.
+//! The recorder's thread looks at the directory whenever an episode's file is closed or given up; `decant doctor` also reads the first records of
+//! what changed today. Both allocate. Nothing here fails: a file that cannot be looked at counts for nothing.
 
-use std::path::Path;
+use std::fs::Metadata;
+use std::path::{Path, PathBuf};
 use std::time::{Duration, SystemTime};
 
 use shared::config::RecordingConfig;
+use shared::episode::began_at;
 use shared::plural::counted;
 
 /// A megabyte, as in `recording.budget_mb`, bytes (SI).
 pub const MEGABYTE: u64 = 1_000_000;
-/// What the recorder leaves free on the disk of the episodes, bytes. Chosen by hand: hours of the journal, and weights many times.
-pub const LEFT_FREE: u64 = 64 * MEGABYTE;
+/// With less free on their disk than this, bytes, no episode is begun; one that was begun may take of it. Chosen by hand: some episodes, hours of the
+/// journal, and weights many times.
+pub const LEAST_FREE: u64 = 64 * MEGABYTE;
 /// The time over which the present rate of recording is measured.
 pub const DAY: Duration = Duration::from_secs(86_400);
 
@@ -23,23 +26,30 @@ pub struct Folder {
     pub episodes: usize,
     /// Their size, bytes.
     pub bytes: u64,
-    /// Size of those that were written within the last [`DAY`], bytes.
-    pub new_bytes: u64,
+}
+
+/// The episodes of `directory` with their paths.
+fn episodes(directory: &Path) -> impl Iterator<Item = (PathBuf, Metadata)> {
+    let found = std::fs::read_dir(directory).into_iter().flatten().flatten();
+    let found = found.filter_map(|entry| Some((entry.path(), entry.metadata().ok()?)));
+    found.filter(|(path, meta)| meta.is_file() && path.extension().is_some_and(|x| x == "mcap"))
+}
+
+/// Size of the episodes of `directory` that were recorded within the last [`DAY`], bytes. A weight, a note or a copy gives an old episode's file a new
+/// time, so what is in the file counts; only one that does not say it counts by the file's time.
+pub fn recorded_today(directory: &Path) -> u64 {
+    let is_today = |at: SystemTime| SystemTime::now().duration_since(at).unwrap_or_default() < DAY;
+    let new = |(path, meta): &(PathBuf, Metadata)| meta.modified().is_ok_and(is_today) && began_at(path).is_none_or(is_today);
+    episodes(directory).filter(new).map(|(_, meta)| meta.len()).sum()
 }
 
 impl Folder {
     /// Looks at `directory`. One that is not there holds no episode.
     pub fn look(directory: &Path) -> Self {
         let mut folder = Self::default();
-        for entry in std::fs::read_dir(directory).into_iter().flatten().flatten() {
-            let Ok(meta) = entry.metadata() else { continue };
-            if !meta.is_file() || entry.path().extension().is_none_or(|x| x != "mcap") {
-                continue;
-            }
+        for (_, meta) in episodes(directory) {
             folder.episodes += 1;
             folder.bytes += meta.len();
-            let age = meta.modified().ok().and_then(|at| SystemTime::now().duration_since(at).ok()).unwrap_or_default();
-            folder.new_bytes += if age < DAY { meta.len() } else { 0 };
         }
         folder
     }
@@ -76,11 +86,11 @@ impl Budget {
         of(bytes as f64, self.bytes as f64).max(of(episodes as f64, self.episodes as f64))
     }
 
-    /// It in words, such as "500 episodes or 20000 MB".
+    /// It in words, such as "500 episodes and 20000 MB".
     pub fn words(self) -> String {
         let number = (self.episodes > 0).then(|| counted(self.episodes, "episode"));
         let size = (self.bytes > 0).then(|| format!("{} MB", self.bytes / MEGABYTE));
-        number.into_iter().chain(size).collect::<Vec<_>>().join(" or ")
+        number.into_iter().chain(size).collect::<Vec<_>>().join(" and ")
     }
 }
 
@@ -88,7 +98,7 @@ impl Budget {
 mod tests {
     use super::*;
 
-    /// Protects the figures that people clean up by: only episodes count, those of today by themselves, and a bound of 0 is none.
+    /// Protects the figures that people clean up by: only episodes count, and a bound of 0 is none.
     #[test]
     fn a_folder_is_held_against_its_budget() {
         let dir = tempfile::tempdir().unwrap();
@@ -102,7 +112,8 @@ mod tests {
         }
         std::fs::create_dir(dir.path().join("d.mcap")).unwrap();
         let folder = Folder::look(dir.path());
-        assert_eq!(folder, Folder { episodes: 3, bytes: 3_000_000, new_bytes: 2_000_000 });
+        assert_eq!(folder, Folder { episodes: 3, bytes: 3_000_000 });
+        assert_eq!(recorded_today(dir.path()), 2_000_000);
         assert_eq!(Folder::look(&dir.path().join("none")), Folder::default());
         let budget = |megabytes, episodes| Budget { bytes: megabytes * MEGABYTE, episodes };
         for (budget, holds) in
@@ -110,6 +121,32 @@ mod tests {
         {
             assert_eq!(budget.holds(folder.episodes, folder.bytes), holds, "{budget:?}");
         }
-        assert_eq!(budget(20, 7).words(), "7 episodes or 20 MB");
+        assert_eq!(budget(20, 7).words(), "7 episodes and 20 MB");
+    }
+
+    /// Protects who reads how long the disk lasts from work on old episodes: one that was recorded last week and weighed today is none of today.
+    #[test]
+    fn an_old_episode_that_is_weighed_is_not_new() {
+        use shared::config::Config;
+        use shared::episode::{EpisodeEnd, EpisodeKind, EpisodeStart, EpisodeWriter, FrameRow, set_weight};
+        use shared::messages::Feature;
+        let config = Config::read(&Path::new(env!("CARGO_MANIFEST_DIR")).join("../config/sim.toml")).unwrap();
+        let dir = tempfile::tempdir().unwrap();
+        let recorded = |episode, days| {
+            let wall_clock = SystemTime::now() - DAY * days;
+            let kind = EpisodeKind::Pour { goal_ml: 50.0 };
+            let start = EpisodeStart { episode, kind, started_at_ns: 1, wall_clock, config: &config, weights: "" };
+            let mut writer = EpisodeWriter::create(dir.path(), &start).unwrap();
+            let feature = Feature { captured_at_ns: 2, sequence: 1, ..Default::default() };
+            let row = FrameRow { feature: &feature, alpha_commanded_deg: 0.0, alpha_measured_deg: 0.0, image: None };
+            writer.frame(&row).unwrap();
+            let path = writer.finish(&EpisodeEnd { complete: true, reason: "over", disordered_frames: 0 }).unwrap();
+            set_weight(&path, 40.0).unwrap();
+            std::fs::metadata(path).unwrap().len()
+        };
+        recorded(1, 7);
+        assert_eq!(recorded_today(dir.path()), 0);
+        let new = recorded(2, 0);
+        assert_eq!(recorded_today(dir.path()), new);
     }
 }

@@ -23,7 +23,7 @@ use shared::plural::counted;
 
 use super::encoder::Encoder;
 use super::handover::{Handover, KEPT_FRAMES, OfferedFrame};
-use crate::episodes::folder::{Budget, DAY, Folder, LEFT_FREE, MEGABYTE};
+use crate::episodes::folder::{Budget, DAY, Folder, LEAST_FREE, MEGABYTE};
 
 /// Frames from up to this long before an episode's first tick belong to its file, ns. Chosen by hand: they show that nothing flows yet.
 const BEFORE_NS: u64 = 200_000_000;
@@ -209,12 +209,12 @@ impl RecorderThread {
 
     /// Opens the file of the episode that begins with `tick`, and gives it the frames that were kept.
     fn open(&mut self, tick: &Telemetry) {
-        if let Some(free) = free_bytes(&self.directory).filter(|free| *free < LEFT_FREE) {
+        if let Some(free) = free_bytes(&self.directory).filter(|free| *free < LEAST_FREE) {
             let what = format!(
-                "{}: only {} MB are free, and the last {} stay free: nothing is recorded. Delete what is not needed (`episodes prune`)",
+                "{}: only {} MB are free, and below {} MB no episode is begun: nothing is recorded. Delete what is not needed (`episodes prune`)",
                 self.directory.display(),
                 free / MEGABYTE,
-                LEFT_FREE / MEGABYTE
+                LEAST_FREE / MEGABYTE
             );
             return self.report(RecorderState::Failed, tick.episode, 0, 0, &what);
         }
@@ -333,7 +333,10 @@ impl RecorderThread {
         let Some(mut current) = self.current.take() else { return };
         match write(&mut current) {
             Ok(()) => self.current = Some(current),
-            Err(e) => self.report(RecorderState::Failed, current.episode, current.images, current.dropped, &e.to_string()),
+            Err(e) => {
+                self.report(RecorderState::Failed, current.episode, current.images, current.dropped, &e.to_string());
+                self.look_at_budget();
+            }
         }
     }
 
@@ -355,16 +358,14 @@ impl RecorderThread {
         let end = EpisodeEnd { complete, reason, disordered_frames: current.disordered };
         let (episode, images, dropped) = (current.episode, current.images, current.dropped);
         match current.writer.finish(&end) {
-            Ok(path) if complete => {
-                self.report_path(RecorderState::Complete, episode, images, dropped, &path);
-                self.look_at_budget();
-            }
+            Ok(path) if complete => self.report_path(RecorderState::Complete, episode, images, dropped, &path),
             Ok(path) => {
                 let what = format!("{reason}; {} is incomplete", path.display());
                 self.report(RecorderState::Failed, episode, images, dropped, &what);
             }
             Err(e) => self.report(RecorderState::Failed, episode, images, dropped, &e.to_string()),
         }
+        self.look_at_budget();
     }
 
     /// Says that the episodes are over their budget, when they come to be and once a day while they are.
@@ -377,7 +378,7 @@ impl RecorderThread {
         } else if self.over_budget_ns.is_none_or(|said| now - said > DAY.as_nanos() as u64) {
             self.over_budget_ns = Some(now);
             let what = format!(
-                "{}: {} of {} MB, and the budget is {}: nothing is deleted by itself, `episodes prune` does it",
+                "{}: {}, {} MB together; the budget is {}: nothing is deleted by itself, `episodes prune` does it",
                 self.directory.display(),
                 counted(folder.episodes, "episode"),
                 folder.bytes / MEGABYTE,

@@ -79,7 +79,7 @@ impl Capture {
         }
         // After the mode: some drivers start anew with it.
         let outcome = controls::apply(&mut device, camera);
-        outcome.said.iter().for_each(|line| eprintln!("camera: {line}"));
+        outcome.said.iter().for_each(|line| eprintln!("{}", Level::Info.marked(&format!("camera: {line}"))));
         if !outcome.refused.is_empty() {
             match camera.refused {
                 Refused::Error => return Err(SourceError::Refused(outcome.refused.join("; "))),

@@ -1,6 +1,6 @@
 //! The whole path of a new cell: fill, record, weigh, learn, pour, weigh, learn again, and back to the weights from before.
 
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use tests::CellUnderTest;
 use tests::browser::Browser;
@@ -9,6 +9,8 @@ use super::{LIVE, Page, SOON, picture, says, worker_pages};
 
 /// A training takes some seconds alone, and much longer beside others.
 const TRAINED: Duration = Duration::from_secs(240);
+/// Only a calibration that hangs takes longer. It has the least priority.
+const CALIBRATED: Duration = Duration::from_secs(240);
 
 /// Types the scale's reading into the result, and gives it.
 fn weigh(cell: &CellUnderTest, browser: &Browser) -> f64 {
@@ -49,29 +51,42 @@ fn take_the_offer(browser: &Browser) {
     browser.run("scrollTo(0, 0)");
 }
 
+/// Waits until the calibration under way has come so far that `script` gives true. It runs behind everything else, so however long it takes, only
+/// its own end is too early.
+fn wait_for_calibration(browser: &Browser, what: &str, script: &str) {
+    let ended = "return !!document.querySelector('#calibrate-lines .good, #calibrate-lines .bad')";
+    let until = Instant::now() + CALIBRATED;
+    while browser.run(script) != true {
+        // It may have come so far and ended since the look before.
+        let over = browser.run(ended) == true || Instant::now() > until;
+        assert!(!over || browser.run(script) == true, "{what} did not happen; the page says:\n{}", browser.text("body"));
+        std::thread::sleep(Duration::from_millis(100));
+    }
+}
+
 /// Corrects what was found while the second curve was recorded, by keys and by a click, and writes it.
 fn calibrate(cell: &CellUnderTest, browser: &Browser) {
     let image = || cell.config().display().to_string();
     let read = || shared::config::Config::read(&cell.config()).unwrap_or_else(|e| panic!("{}: {e}", image())).image;
     let before = read();
     browser.click("#tab-calibrate");
-    browser.wait("what was found", Duration::from_secs(60), "return !document.getElementById('calibrate-write').hidden");
-    browser.wait("its picture", SOON, "return document.getElementById('spot-picture').naturalWidth === 640");
+    wait_for_calibration(browser, "what was found", "return !document.getElementById('calibrate-write').hidden");
+    wait_for_calibration(browser, "its picture", "return document.getElementById('spot-picture').naturalWidth === 640");
     browser.screenshot(&picture("calibrated"));
     // By keys: the lip 2 px to the left and back by 1.
     browser.run("document.getElementById('spot').focus()");
     browser.press(&["\u{E012}", "\u{E012}", "\u{E014}"]);
     browser.click("#measure");
-    browser.wait(
-        "the new measurement",
-        Duration::from_secs(60),
-        "return document.getElementById('said').textContent.includes('measured again')",
-    );
-    browser.wait("the picture with it", SOON, "return found !== null");
+    wait_for_calibration(browser, "the new measurement", "return document.getElementById('said').textContent.includes('measured again')");
+    wait_for_calibration(browser, "the picture with it", "return found !== null");
     browser.run("document.getElementById('write-title').scrollIntoView({ block: 'center' })");
     browser.click("#calibrate-write");
-    browser.wait("that it is written", SOON, "return document.getElementById('said').textContent.includes('written to')");
-    browser.wait("the child's end", SOON, "return document.getElementById('calibrate-lines').textContent.includes('It is written')");
+    wait_for_calibration(browser, "that it is written", "return document.getElementById('said').textContent.includes('written to')");
+    wait_for_calibration(
+        browser,
+        "the child's end",
+        "return document.getElementById('calibrate-lines').textContent.includes('It is written')",
+    );
     browser.run("scrollTo(0, 0)");
     browser.screenshot(&picture("calibration-written"));
     let after = read();
@@ -114,9 +129,9 @@ fn a_new_cell_learns_to_pour_in_the_browser() {
             browser.click("#tab-calibrate");
             browser.fill("#watch-seconds", "18");
             browser.click("#watch");
-            browser.wait(
+            wait_for_calibration(
+                &browser,
                 "the camera is watched",
-                SOON,
                 "return document.getElementById('calibrate-lines').textContent.includes('watching the camera')",
             );
             browser.click("#tab-learn");

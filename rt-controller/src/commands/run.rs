@@ -55,7 +55,7 @@ pub fn run(args: &Args) -> Result<(), Failure> {
     let config = Config::read(&args.config).or_exit(exit::BAD_INPUT)?;
     // Half a controller would be worse than none: without targets the robot's program comes upright by itself.
     std::panic::set_hook(Box::new(|panic| {
-        os::tell(Level::Error, &format!("rt-controller: this is a defect, please report it: {panic}"));
+        os::tell(Level::Error, &format!("rt-controller: this is a defect, please report it: {}", exit::one_line(panic)));
         std::process::abort();
     }));
     let stop = stop_at_signals()?;

@@ -34,6 +34,8 @@ pub(super) const META_NOTE: &str = "note";
 pub(super) const FORMAT: &str = "2";
 /// The older format, which is still read.
 pub(super) const FORMAT_1: &str = "1";
+/// Key in the metadata record about the start: its Unix time, ns.
+pub(super) const STARTED_AT_UNIX_NS: &str = "started_at_unix_ns";
 /// Key in the metadata record about the start: Unix time less CLOCK_MONOTONIC when the episode started, ns.
 pub(super) const CLOCK_OFFSET: &str = "clock_offset_ns";
 

@@ -5,6 +5,7 @@
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
+use std::time::{Duration, SystemTime, UNIX_EPOCH};
 
 use mcap::records::Record;
 use prost::Message as _;
@@ -21,6 +22,20 @@ use crate::messages::Doubt;
 /// How much older the last frame of a complete episode may be than the last tick, ns. Chosen by hand: so long a newer frame may still have
 /// been on its way to the recorder.
 const SILENT_END_NS: u64 = 500_000_000;
+
+/// When the episode in the file `path` began, by its own first records; no more of it is read. `None` if they do not say.
+pub fn began_at(path: &Path) -> Option<SystemTime> {
+    let said = |about: &BTreeMap<String, String>| about.get(format::STARTED_AT_UNIX_NS).and_then(|ns| ns.parse().ok());
+    let next = Records::open(path).ok()?.next(|record| {
+        Ok(match record {
+            Record::Metadata(m) if m.name == format::META_EPISODE => Some(said(&m.metadata)),
+            Record::Message { .. } => Some(None),
+            _ => None,
+        })
+    });
+    let Ok(NextRecord::Item(Some(ns))) = next else { return None };
+    UNIX_EPOCH.checked_add(Duration::from_nanos(ns))
+}
 
 /// Everything in a file except the images themselves.
 #[derive(Default)]

@@ -160,7 +160,7 @@ impl EpisodeWriter {
             ("episode", start.episode.to_string()),
             ("cell", start.config.cell.name.clone()),
             ("started_at_ns", start.started_at_ns.to_string()),
-            ("started_at_unix_ns", unix_ns.to_string()),
+            (format::STARTED_AT_UNIX_NS, unix_ns.to_string()),
             (format::CLOCK_OFFSET, self.offset_ns.to_string()),
             ("started_at_utc", rfc3339((unix_ns / 1_000_000_000) as u64)),
             ("config_sha256", config_sha256.clone()),

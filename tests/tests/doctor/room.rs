@@ -49,9 +49,12 @@ fn the_disk_is_not_filled_in_silence() {
     assert!(!cell.log("feature-worker").contains("the budget is"), "{}", cell.log("feature-worker"));
     let said = record(&cell);
     assert!(said.contains("episode-0002.mcap"), "{said}");
-    wait_for(&cell, "2 episodes of");
+    wait_for(&cell, "2 episodes, ");
     let (verdict, words) = line(&examine(&cell).0, "files", "episodes' budget");
-    assert!(verdict == "red" && words.contains("decant episodes prune"), "{words}");
+    assert!(
+        verdict == "red" && words.contains("MB together; the budget is 1 episode") && words.contains("decant episodes prune"),
+        "{words}"
+    );
     assert_eq!(count(&cell), "2", "nothing is deleted by itself");
 
     in_episodes(cell.inside.as_ref().expect("there"), "head -c 360000000 /dev/zero > $EPISODES/other");

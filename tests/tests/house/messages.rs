@@ -68,11 +68,10 @@ const NO_MESSAGES_IN: [&str; 10] = [
 ];
 
 /// Texts that are parts of a protocol or of a longer message, or that tell of nothing wrong.
-const PARTS: [&str; 17] = [
+const PARTS: [&str; 16] = [
     "default-src 'none'",
     "HttpOnly; SameSite",
     "HTTP/1.1\\r",
-    "operator-page: open",
     "http://…/?token",
     "the request to start",
     "the request for",
