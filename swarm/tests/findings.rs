@@ -179,3 +179,15 @@ fn a_stop_after_the_operator_asked_has_the_last_word() {
     }
     assert!(stopped > 10, "only {stopped} stops found the program at work");
 }
+
+/// Protects the check (seed 3037645): a freeze of 44 ms within one of 333 ms ended that too, in the simulated robot, and nothing was left to notice.
+#[test]
+fn a_shorter_fault_does_not_end_a_longer_one_of_its_kind() {
+    let happens = [
+        (3_200, What::Pour(92.75543), None),
+        (4_880, What::Robot(Fault::Freeze(0.333)), Some("freeze")),
+        (4_963, What::Robot(Fault::Freeze(0.044)), Some("freeze")),
+    ];
+    let shown = shown(3_037_645, Series::Cb3, 1, (300.0, (266_117, 645_915)), &happens);
+    assert!(tells(&shown, "ended: RobotStalled", 4.9, 5.4), "{}", shown.story.join("\n"));
+}
