@@ -155,7 +155,7 @@ pub enum EndReason {
     NothingFlows,
     /// The camera's frames do not come at `camera.fps`.
     FrameRate,
-    /// The goal seemed reached, and then far more left than was foreseen.
+    /// The goal seemed reached, and then far more left than the goal and the deviation allow.
     GoalExceeded,
 }
 

@@ -7,7 +7,7 @@ use opencv::core::{Mat, Vec3b};
 use opencv::prelude::*;
 
 use super::geometry::{NEAR_PX, RAYS, RayGrid};
-use super::ground_colours::{Ground, GroundColours};
+use super::ground_colours::{Ground, GroundColours, Mean};
 
 // "Tuned" below means that the value was tuned on seeds 1 and 5001 to 5003 of `evaluate-camera`; see docs/VISION.md.
 
@@ -60,33 +60,10 @@ pub(super) struct Seen<'a> {
     pub(super) ground: &'a GroundColours,
 }
 
-/// A mean of colours.
-#[derive(Clone, Copy, Default)]
-struct Mean {
-    sums: [u32; 3],
-    count: u32,
-}
-
 /// Something foreign that lies at the lip like a stream.
 pub(super) struct Body {
     /// Its mean colour close to the lip, if it shows it there.
     pub(super) colour: Option<[f32; 3]>,
-}
-
-impl Mean {
-    fn add(&mut self, colour: Vec3b) {
-        (0..3).for_each(|k| self.sums[k] += u32::from(colour[k]));
-        self.count += 1;
-    }
-
-    fn join(&mut self, other: Mean) {
-        (0..3).for_each(|k| self.sums[k] += other.sums[k]);
-        self.count += other.count;
-    }
-
-    fn levels(&self) -> [f32; 3] {
-        self.sums.map(|sum| sum as f32 / self.count.max(1) as f32)
-    }
 }
 
 impl Seen<'_> {
@@ -106,7 +83,7 @@ impl Seen<'_> {
                     Some(Ground::Foreign) => {
                         (score, strange) = (score + step, strange + 1);
                         if self.grid.radii_px[r] <= AT_LIP_PX {
-                            own.add(colours[r]);
+                            own.add(colours[r].0);
                         }
                     }
                     Some(Ground::Blind) => {}
@@ -145,7 +122,7 @@ impl Seen<'_> {
             looked += 1;
             if self.ground.tell(colour.0) == Ground::Foreign {
                 foreign += 1;
-                mean.add(colour);
+                mean.add(colour.0);
             }
         }
         Ok((foreign as f32 > BEYOND_FOREIGN * looked.max(RAYS / 4) as f32).then(|| mean.levels()))
@@ -188,6 +165,7 @@ pub(super) fn goes_on_beside(foreign: [f32; 3], beside: &[Vec3b]) -> bool {
     !beside.is_empty() && alike as f32 >= GOES_ON * beside.len() as f32
 }
 
+/// Distance between two colours, grey levels.
 fn distance(a: [f32; 3], b: [f32; 3]) -> f32 {
     (0..3).map(|k| (a[k] - b[k]) * (a[k] - b[k])).sum::<f32>().sqrt()
 }

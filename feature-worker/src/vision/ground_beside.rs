@@ -14,7 +14,7 @@ use opencv::prelude::*;
 use shared::config::ImageConfig;
 
 use super::geometry::Axes;
-use super::ground_colours::GroundColours;
+use super::ground_colours::{GroundColours, Mean};
 
 /// Width of a region for which distances in it were chosen, px.
 const REGION_PX: f32 = 420.0;
@@ -149,15 +149,14 @@ impl InGlass {
         }
         imgproc::cvt_color_def(&self.square.smooth, &mut self.hsv, imgproc::COLOR_BGR2HSV)?;
         let (hsv, colours): (&[Vec3b], &[Vec3b]) = (self.hsv.data_typed()?, self.square.smooth.data_typed()?);
-        let (mut inside, mut sums) = (0usize, [0u32; 3]);
+        let mut inside = Mean::default();
         for (hsv, colour) in hsv.iter().zip(colours) {
             let within = |(low, high): &(Scalar, Scalar)| (0..3).all(|k| (low[k]..=high[k]).contains(&f64::from(hsv[k])));
             if self.ranges.iter().any(within) {
-                inside += 1;
-                (0..3).for_each(|k| sums[k] += u32::from(colour[k]));
+                inside.add(colour.0);
             }
         }
-        Ok((Some(inside as f32 / hsv.len() as f32), sums.map(|sum| sum as f32 / inside.max(1) as f32)))
+        Ok((Some(inside.count as f32 / hsv.len() as f32), inside.levels()))
     }
 }
 

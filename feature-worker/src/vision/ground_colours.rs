@@ -166,6 +166,30 @@ impl GroundColours {
     }
 }
 
+/// A mean of colours.
+#[derive(Clone, Copy, Default)]
+pub(super) struct Mean {
+    sums: [u32; 3],
+    pub(super) count: u32,
+}
+
+impl Mean {
+    pub(super) fn add(&mut self, colour: [u8; 3]) {
+        (0..3).for_each(|k| self.sums[k] += u32::from(colour[k]));
+        self.count += 1;
+    }
+
+    pub(super) fn join(&mut self, other: Mean) {
+        (0..3).for_each(|k| self.sums[k] += other.sums[k]);
+        self.count += other.count;
+    }
+
+    /// Its levels of blue, green and red; 0 of none.
+    pub(super) fn levels(&self) -> [f32; 3] {
+        self.sums.map(|sum| sum as f32 / self.count.max(1) as f32)
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;

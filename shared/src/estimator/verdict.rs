@@ -3,8 +3,9 @@
 //! It is pure and runs in the controller's loop: its size is fixed, and it does not allocate, panic or fail. A lone odd frame moves nothing; a
 //! row of them is impossible, and then nothing that the camera says is to be believed. What was withheld as odd waits for the very next frame, which
 //! confirms it or not. If it does not, it is forgotten, and the estimate doubts as much (`Watch::unconfirmed_ml`, `Watch::lone_ml`), but for a lone
-//! leap of a stream that goes on as before out of a straight vessel. A large stream that is gone within a frame, or whose area stays the same to the
-//! bit, moves nothing either, as nobody knows whether it was seen; what may have left meanwhile is in doubt (`Watch::unshown_ml`).
+//! leap of a stream that goes on as before out of a straight vessel. A large stream that is gone within a frame, or begins so large, or whose area
+//! stays the same to the bit, moves nothing either, as nobody knows whether it was seen; what may have left meanwhile is in doubt
+//! (`Watch::unshown_ml`).
 //!
 //! | rule | verdict |
 //! |---|---|
@@ -320,8 +321,8 @@ impl Watch {
             let now_ml = if goes_on { measured_ml } else { newest_ml.min(before_ml) };
             if !goes_on && now_ml > ABRUPT_ML {
                 // What a gap has counted already may be the same liquid.
-                let before_ml = 0.5 * now_ml * frames_before(flow, tilt, now_ml);
-                self.unshown_ml += (before_ml - self.gap_ml).max(0.0);
+                let ran_ml = 0.5 * now_ml * frames_before(flow, tilt, now_ml);
+                self.unshown_ml += (ran_ml - self.gap_ml).max(0.0);
             }
             self.gap_ml = if goes_on || now_ml > ABRUPT_ML { 0.0 } else { self.gap_ml };
             (self.stream, self.gone_frames) = ((now_ml, tilt_deg), 0);

@@ -57,17 +57,17 @@ impl Backend {
         }
     }
 
-    /// Carries out the part of a fault that no socket takes part in. One that lasts does not end another of its kind that lasts longer.
+    /// Carries out the part of a fault that no socket takes part in.
     pub fn inject(&mut self, fault: &Fault) {
         match fault {
-            Fault::Offline(s) => self.faults.offline_until = self.faults.offline_until.max(self.cycle_in(*s)),
-            Fault::Stall(s) => self.faults.stall_until = self.faults.stall_until.max(self.cycle_in(*s)),
-            Fault::Freeze(s) => self.faults.freeze_until = self.faults.freeze_until.max(self.cycle_in(*s)),
-            Fault::SlowReader(s) => self.faults.slow_reader_until = self.faults.slow_reader_until.max(self.cycle_in(*s)),
-            Fault::SkipOutputs(n) => self.faults.skip_until = self.faults.skip_until.max(self.machine.cycle() + u64::from(*n) + 1),
-            Fault::Split(s) => self.faults.split_until = self.faults.split_until.max(self.cycle_in(*s)),
-            Fault::Coalesce(s) => self.faults.coalesce_until = self.faults.coalesce_until.max(self.cycle_in(*s)),
-            Fault::Twice(s) => self.faults.twice_until = self.faults.twice_until.max(self.cycle_in(*s)),
+            Fault::Offline(s) => lengthen(self.cycle_in(*s), &mut self.faults.offline_until),
+            Fault::Stall(s) => lengthen(self.cycle_in(*s), &mut self.faults.stall_until),
+            Fault::Freeze(s) => lengthen(self.cycle_in(*s), &mut self.faults.freeze_until),
+            Fault::SlowReader(s) => lengthen(self.cycle_in(*s), &mut self.faults.slow_reader_until),
+            Fault::SkipOutputs(n) => lengthen(self.machine.cycle() + u64::from(*n) + 1, &mut self.faults.skip_until),
+            Fault::Split(s) => lengthen(self.cycle_in(*s), &mut self.faults.split_until),
+            Fault::Coalesce(s) => lengthen(self.cycle_in(*s), &mut self.faults.coalesce_until),
+            Fault::Twice(s) => lengthen(self.cycle_in(*s), &mut self.faults.twice_until),
             Fault::InUse(name) => {
                 if let Some(input) = Input::parse(name) {
                     self.owners.claim_for_fieldbus(input);
@@ -119,4 +119,9 @@ impl Backend {
             Fault::Fin | Fault::Reset | Fault::Text(_) => {}
         }
     }
+}
+
+/// Lets a fault last until this cycle. One that stands already and lasts longer is not ended by it.
+fn lengthen(cycle: u64, until: &mut u64) {
+    *until = cycle.max(*until);
 }
