@@ -87,7 +87,7 @@ impl Commanded {
     /// A call of servoj with `q`, rad.
     fn call(&mut self, q: &[f64; 6], joint: usize, active: bool) -> Vec<Finding> {
         let mut findings = Vec::new();
-        let Limits { alpha_min_deg, alpha_max_deg, rate_deg_s, acceleration_deg_s2, .. } = self.limits;
+        let Limits { rate_deg_s, acceleration_deg_s2, .. } = self.limits;
         let fastest = f64::from(rate_deg_s);
         let servo_q = self.servo.0;
         let servo_rates = Rates::one(self.servo.1.clamp(-fastest, fastest));
