@@ -10,8 +10,7 @@ use std::path::PathBuf;
 use std::sync::atomic::Ordering::Relaxed;
 use std::time::{Duration, Instant};
 
-use opencv::core::{Mat, Vector};
-use opencv::imgcodecs;
+use opencv::core::Mat;
 use opencv::prelude::*;
 use shared::config::{CameraConfig, Config, ImageConfig, LiquidMethod};
 use shared::exit::{self, Failure, OrExit as _, failure};
@@ -20,7 +19,7 @@ use shared::messages::PixelFormat;
 use shared::os;
 use web::{Answer, Server, Settings};
 
-use crate::drawing::{draw, jpeg};
+use crate::drawing::{draw, jpeg, save};
 use crate::source::{FrameSource as _, NextFrame, ObserverSource, WAIT};
 use crate::vision::{Axes, AxesError, ColourError, ColourLearner, Corner, Extractor, Image, find_corner};
 
@@ -248,8 +247,7 @@ fn save_picture(args: &Args, config: &Config, pictures: &[Mat]) -> Result<(), Fa
     if let Some(parent) = args.picture.parent() {
         std::fs::create_dir_all(parent).map_err(|e| fail(e.to_string()))?;
     }
-    let written = imgcodecs::imwrite(&args.picture, &picture, &Vector::new()).map_err(|e| fail(e.message))?;
-    if written { Ok(()) } else { Err(fail("cannot be written; give another --picture".into())) }
+    save(&picture, &args.picture).map_err(|e| fail(format!("{e}; give another --picture")))
 }
 
 /// Serves the page until "Write" or Ctrl-C. `good` tells whether `config` passed all checks; nothing else is written.

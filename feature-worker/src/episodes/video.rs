@@ -6,7 +6,9 @@ use std::path::{Path, PathBuf};
 
 use opencv::core::{Mat, MatTraitConst, Size, Vector};
 use opencv::imgcodecs;
-use opencv::videoio::{VideoWriter, VideoWriterTrait, VideoWriterTraitConst};
+use opencv::videoio::{
+    CAP_FFMPEG, CAP_PROP_FRAME_COUNT, VideoCapture, VideoCaptureTraitConst, VideoWriter, VideoWriterTrait, VideoWriterTraitConst,
+};
 use shared::episode::{Episode, EpisodeError, EpisodeImage, EpisodeImages};
 
 use super::output::{ExportError, write_error};
@@ -65,12 +67,14 @@ pub struct Video {
     fps: f64,
     writer: Option<(VideoWriter, Size)>,
     codec: &'static str,
+    /// Pictures so far.
+    pushed: u64,
 }
 
 impl Video {
     /// A video that will be written to `path` with `fps` frames a second. The file appears with the first image.
     pub fn new(path: &Path, fps: f64) -> Self {
-        Self { path: path.into(), fps, writer: None, codec: "" }
+        Self { path: path.into(), fps, writer: None, codec: "", pushed: 0 }
     }
 
     /// Adds an image.
@@ -90,7 +94,10 @@ impl Video {
             }
         }
         match &mut self.writer {
-            Some((writer, first)) if *first == size => writer.write(&picture).map_err(fail),
+            Some((writer, first)) if *first == size => {
+                self.pushed += 1;
+                writer.write(&picture).map_err(fail)
+            }
             Some((_, first)) => Err(write_error(
                 &self.path,
                 format!("one image is {} x {} px, but those before it are {} x {} px", size.width, size.height, first.width, first.height),
@@ -112,8 +119,22 @@ impl Video {
     /// Closes the file.
     pub fn finish(mut self) -> Result<(), ExportError> {
         match &mut self.writer {
-            Some((writer, _)) => writer.release().map_err(|e| write_error(&self.path, e.message)),
-            None => Ok(()),
+            Some((writer, _)) => writer.release().map_err(|e| write_error(&self.path, e.message))?,
+            None => return Ok(()),
         }
+        self.check()
+    }
+
+    /// Looks whether the file is whole: OpenCV says nothing of a disk that was full.
+    fn check(&self) -> Result<(), ExportError> {
+        let count = || -> opencv::Result<f64> {
+            let video = VideoCapture::from_file(&self.path, CAP_FFMPEG)?;
+            if video.is_opened()? { video.get(CAP_PROP_FRAME_COUNT) } else { Ok(0.0) }
+        };
+        let found = count().unwrap_or(0.0);
+        if found == self.pushed as f64 {
+            return Ok(());
+        }
+        Err(write_error(&self.path, format!("has {found} of {} pictures: is the disk full?", self.pushed)))
     }
 }

@@ -9,8 +9,9 @@ use std::path::Path;
 use mcap::records::Metadata;
 
 use super::records::NextRecord;
-use super::rewrite::{ChangeError, beside, copy, sync_directory};
+use super::rewrite::{ChangeError, copy};
 use super::{Episode, EpisodeInfo, format};
+use crate::whole_file;
 
 /// How a recovered episode is said to have ended, if its own end is missing.
 const REASON: &str = "its end is missing: it was recovered from a file that was cut";
@@ -20,7 +21,7 @@ const REASON: &str = "its end is missing: it was recovered from a file that was 
 pub fn recover(old: &Path, new: &Path) -> Result<Episode, ChangeError> {
     let original = Episode::read(old)?;
     let fail = |what: String| ChangeError::Write { file: new.display().to_string(), what };
-    let temporary = beside(new);
+    let temporary = whole_file::beside(new).map_err(|e| fail(e.to_string()))?;
     let result = copy(old, &temporary, None, |writer, end| {
         if !matches!(end, NextRecord::Cut) {
             return Err(ChangeError::Whole { file: old.display().to_string() });
@@ -39,9 +40,7 @@ pub fn recover(old: &Path, new: &Path) -> Result<Episode, ChangeError> {
         if format!("{after:?}") != format!("{expected:?}") {
             return Err(fail("the copy differs from the original".into()));
         }
-        // Unlike a rename, a link never takes the place of a file that is there.
-        std::fs::hard_link(&temporary, new).map_err(|e| fail(e.to_string()))?;
-        sync_directory(new).map_err(|e| fail(e.to_string()))?;
+        whole_file::give_name(&temporary, new).map_err(|e| fail(e.to_string()))?;
         Ok(Episode { name: new.display().to_string(), ..after })
     });
     // This is only ever our own file.

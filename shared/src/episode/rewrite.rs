@@ -6,7 +6,7 @@
 
 use std::fs::{File, OpenOptions};
 use std::io::BufWriter;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
 use mcap::records::{Metadata, Record};
 use mcap::{WriteOptions, Writer};
@@ -14,6 +14,7 @@ use mcap::{WriteOptions, Writer};
 use super::Episode;
 use super::records::{EpisodeError, NextRecord, Records};
 use super::weight::WeightError;
+use crate::whole_file;
 
 /// Number of bytes that are written at a time. Chosen by hand; no measurement is recorded.
 const WRITE_BYTES: usize = 1 << 20;
@@ -70,7 +71,7 @@ pub(super) fn set_metadata(
     // If the path is a link, the file that it leads to is replaced, and not the link.
     let path = path.canonicalize().map_err(|e| EpisodeError::Read { file: shown.clone(), what: e.to_string() })?;
     let before = Episode::read(&path)?;
-    let temporary = beside(&path);
+    let temporary = whole_file::beside(&path).map_err(|e| ChangeError::Write { file: shown, what: e.to_string() })?;
     let fail = |what: String| ChangeError::Write { file: temporary.display().to_string(), what };
     let result = copy(&path, &temporary, Some(name), |writer, end| {
         if !matches!(end, NextRecord::End) {
@@ -87,7 +88,8 @@ pub(super) fn set_metadata(
             return Err(fail("the copy differs from the original".into()));
         }
         std::fs::rename(&temporary, &path).map_err(|e| fail(e.to_string()))?;
-        sync_directory(&path).map_err(|e| fail(e.to_string()))
+        whole_file::sync_directory(&path);
+        Ok(())
     });
     match result {
         Ok(()) => Ok(before),
@@ -97,17 +99,6 @@ pub(super) fn set_metadata(
             Err(e)
         }
     }
-}
-
-/// The name of a new file beside `path`, which no program takes for an episode.
-pub(super) fn beside(path: &Path) -> PathBuf {
-    let name = path.file_name().and_then(|n| n.to_str()).unwrap_or("episode");
-    path.with_file_name(format!(".{name}.{}.new", std::process::id()))
-}
-
-/// Puts the directory of `path` on the disk, so that the file's name stays after a power failure.
-pub(super) fn sync_directory(path: &Path) -> std::io::Result<()> {
-    File::open(path.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new(".")))?.sync_all()
 }
 
 /// Copies the records of `old` to the new file `new`, without the metadata record `without`, up to the end or the cut. Then `last` may write

@@ -13,11 +13,15 @@ use super::rows::{EpisodeRow, LostFrames, alpha_between_deg};
 use super::weight::{WeightError, check_poured};
 use super::{Episode, EpisodeInfo, EpisodeKind};
 use crate::messages::Doubt;
+use crate::regular_file;
 
 /// The columns of the table of features. Their names are part of the format.
 const FEATURE_COLUMNS: [&str; 5] = ["episode", "frame", "t_s", "alpha_deg", "area_px2"];
 /// The columns of the table of weights. Their names are part of the format.
 const SCALE_COLUMNS: [&str; 2] = ["episode", "weight_g"];
+
+/// Largest table that is read, bytes. Chosen by hand: ten hours of frames take 50 MB.
+const FILE_MAX: u64 = 256 << 20;
 
 /// Why a pair of tables is refused or cannot be written.
 #[derive(Debug, thiserror::Error)]
@@ -72,7 +76,7 @@ impl CsvTable {
     fn open(path: &Path, wanted: &[&str]) -> Result<Self, TableError> {
         let name = path.display().to_string();
         let fail = |what: String| TableError::File { file: name.clone(), what };
-        let file = File::open(path).map_err(|e| fail(e.to_string()))?;
+        let (file, _) = regular_file::open_at_most(path, FILE_MAX).map_err(|e| fail(e.to_string()))?;
         let mut reader = csv::ReaderBuilder::new().trim(csv::Trim::All).from_reader(file);
         let heading = reader.headers().map_err(|e| fail(e.to_string()))?.clone();
         let mut columns = Vec::new();

@@ -6,6 +6,7 @@
 use std::path::PathBuf;
 
 use shared::exit::{self, Failure, OrExit as _, failure};
+use shared::level::plain;
 use shared::limits::Limits;
 
 use crate::data::{self, DataError, EpisodeSource, UsableEpisodes};
@@ -73,7 +74,7 @@ pub fn run(args: &Args) -> Result<(), Failure> {
         return Ok(());
     }
     for (name, what) in &usable.left_out {
-        println!("left out: {name}: {what}");
+        println!("left out: {}", plain(&format!("{name}: {what}")));
     }
     println!("{}", words(first));
     if usable.episodes.is_empty() {
