@@ -9,6 +9,7 @@ use std::os::unix::fs::{MetadataExt as _, PermissionsExt as _, fchown};
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicU32, Ordering::Relaxed};
 
+use crate::disk_space::error_words;
 use crate::regular_file;
 
 /// Puts `bytes` into the file at `path`, which keeps its mode and owner if it is there. `begins` is how every file of this kind begins: a file
@@ -28,9 +29,27 @@ pub fn replace(path: &Path, bytes: &[u8], begins: &[u8]) -> Result<()> {
         file.sync_all()?;
         std::fs::rename(&new, path)
     };
-    put().inspect_err(|_| remove(&new))?;
+    put().map_err(|e| gone(&new, &e))?;
     sync_directory(path);
     Ok(())
+}
+
+/// Puts `bytes` into the new file `path`. It is an error if something is there.
+pub fn create(path: &Path, bytes: &[u8]) -> Result<()> {
+    let new = beside(path)?;
+    let put = || {
+        let mut file = OpenOptions::new().write(true).create_new(true).open(&new)?;
+        file.write_all(bytes)?;
+        file.sync_all()?;
+        give_name(&new, path)
+    };
+    put().map_err(|e| gone(&new, &e))
+}
+
+/// The error `e` in words, after what it left at `new` is taken away.
+fn gone(new: &Path, e: &Error) -> Error {
+    remove(new);
+    Error::new(e.kind(), error_words(e))
 }
 
 /// Whether [`replace`] may put a file at `path`, so that it is known before long work: what is there is a regular file, and empty or of the kind
@@ -133,6 +152,9 @@ mod tests {
         give_name(&new, &path).unwrap();
         std::fs::write(&new, "2").unwrap();
         assert_eq!(give_name(&new, &path).unwrap_err().kind(), ErrorKind::AlreadyExists);
+        assert_eq!(create(&path, b"3").unwrap_err().kind(), ErrorKind::AlreadyExists);
+        create(&dir.path().join("other"), b"3").unwrap();
+        assert_eq!(names(dir.path()), ["new", "other", "path"]);
         assert_eq!(std::fs::read(&path).unwrap(), b"1");
     }
 }

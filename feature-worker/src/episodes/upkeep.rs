@@ -15,7 +15,7 @@ use shared::episode::{Episode, hex, take_number};
 use shared::whole_file;
 
 use super::folder::Budget;
-use super::output::{ExportError, LeftOut, write_error};
+use super::output::{ExportError, LeftOut, disk_error, write_error};
 
 /// A file without its end that changed more recently than this counts as under way, also where the file system has no locks. Chosen by hand:
 /// the recorder writes twice a second.
@@ -128,7 +128,7 @@ pub fn merge(files: &[PathBuf], to: &Path) -> Result<Copied, ExportError> {
     let mut all = distinct(files, &mut copied)?;
     all.sort_by(|a, b| a.1.info.started_at_utc.cmp(&b.1.info.started_at_utc));
     for (file, episode) in all {
-        let number = take_number(to).map_err(|e| write_error(to, e))?;
+        let number = take_number(to).map_err(|e| disk_error(to, &e))?;
         let new = to.join(format!("episode-{number:04}.mcap"));
         copy(&file, &episode, &new)?;
         copied.files.push((file, new));
@@ -153,7 +153,7 @@ pub fn split(files: &[PathBuf], to: &Path, shares: &[(String, f64)], seed: u64) 
         share += part;
         let until = (share * n).round() as usize;
         let directory = to.join(name);
-        fs::create_dir_all(&directory).map_err(|e| write_error(&directory, e))?;
+        fs::create_dir_all(&directory).map_err(|e| disk_error(&directory, &e))?;
         while taken < until
             && let Some((file, episode)) = all.next()
         {
@@ -174,13 +174,13 @@ pub fn split(files: &[PathBuf], to: &Path, shares: &[(String, f64)], seed: u64) 
 fn copy(file: &Path, episode: &Episode, new: &Path) -> Result<(), ExportError> {
     let fail = |e: &dyn std::fmt::Display| write_error(new, e);
     let part = whole_file::beside(new).map_err(|e| fail(&e))?;
-    let made = fs::copy(file, &part).and_then(|_| File::open(&part)?.sync_all()).map_err(|e| fail(&e)).and_then(|()| {
+    let made = fs::copy(file, &part).and_then(|_| File::open(&part)?.sync_all()).map_err(|e| disk_error(new, &e)).and_then(|()| {
         let after = Episode { name: episode.name.clone(), ..Episode::read(&part)? };
         // They are compared as text, because NaN is not equal to itself.
         if format!("{after:?}") != format!("{episode:?}") {
             return Err(fail(&"the copy differs from the original"));
         }
-        whole_file::give_name(&part, new).map_err(|e| fail(&e))
+        whole_file::give_name(&part, new).map_err(|e| disk_error(new, &e))
     });
     // This is only ever our own file.
     let _ = fs::remove_file(&part);

@@ -11,12 +11,14 @@ use opencv::videoio::{
 };
 use shared::episode::{Episode, EpisodeError, EpisodeImage, EpisodeImages};
 
-use super::output::{ExportError, write_error};
+use super::output::{ExportError, disk_error, write_error};
 
 /// The rate of an episode that is too short to have one, frames a second: that of the usual camera.
 pub const USUAL_RATE_HZ: f64 = 30.0;
 /// The slowest and the fastest rate that a video gets, frames a second. Chosen by hand; they bound what a damaged time could give.
 const RATE_LIMITS_HZ: [f64; 2] = [1.0, 240.0];
+/// Bytes with which it is tried whether the disk takes a file at all. Chosen by hand: more than what some disks keep beside a file's name.
+const PROBE: usize = 64 * 1024;
 /// Codecs of an MP4 file, the best first: H.264 plays everywhere, and MPEG-4 is there where OpenCV's FFmpeg was built without H.264.
 const CODECS: [([char; 4], &str); 2] = [(['a', 'v', 'c', '1'], "h264"), (['m', 'p', '4', 'v'], "mpeg4")];
 
@@ -83,9 +85,11 @@ impl Video {
         let picture = decode(image).map_err(fail)?;
         let size = picture.size().map_err(fail)?;
         if self.writer.is_none() {
+            // OpenCV says no more than that it cannot write, so the disk is asked first.
+            std::fs::write(&self.path, [0; PROBE]).map_err(|e| disk_error(&self.path, &e))?;
             for ([a, b, c, d], name) in CODECS {
                 let fourcc = VideoWriter::fourcc(a, b, c, d).map_err(fail)?;
-                let writer = VideoWriter::new_def(&self.path, fourcc, self.fps, size).map_err(fail)?;
+                let writer = VideoWriter::new_with_backend(&self.path, CAP_FFMPEG, fourcc, self.fps, size, true).map_err(fail)?;
                 if writer.is_opened().map_err(fail)? {
                     self.writer = Some((writer, size));
                     self.codec = name;

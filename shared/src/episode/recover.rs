@@ -10,7 +10,9 @@ use mcap::records::Metadata;
 
 use super::records::NextRecord;
 use super::rewrite::{ChangeError, copy};
+use super::write::mcap_words;
 use super::{Episode, EpisodeInfo, format};
+use crate::disk_space::error_words;
 use crate::whole_file;
 
 /// How a recovered episode is said to have ended, if its own end is missing.
@@ -30,7 +32,7 @@ pub fn recover(old: &Path, new: &Path) -> Result<Episode, ChangeError> {
             return Ok(());
         }
         let metadata = [("complete".to_string(), "false".to_string()), ("reason".to_string(), REASON.to_string())].into();
-        writer.write_metadata(&Metadata { name: format::META_END.into(), metadata }).map_err(|e| fail(e.to_string()))
+        writer.write_metadata(&Metadata { name: format::META_END.into(), metadata }).map_err(|e| fail(mcap_words(&e)))
     })
     .and_then(|()| {
         let after = Episode::read(&temporary)?;
@@ -40,7 +42,7 @@ pub fn recover(old: &Path, new: &Path) -> Result<Episode, ChangeError> {
         if format!("{after:?}") != format!("{expected:?}") {
             return Err(fail("the copy differs from the original".into()));
         }
-        whole_file::give_name(&temporary, new).map_err(|e| fail(e.to_string()))?;
+        whole_file::give_name(&temporary, new).map_err(|e| fail(error_words(&e)))?;
         Ok(Episode { name: new.display().to_string(), ..after })
     });
     // This is only ever our own file.
