@@ -31,6 +31,8 @@ use pour::Pour;
 
 /// The most pictures of one pose from which the colour is learned. Chosen by hand: as many as a turning background leaves in one pose.
 const PICTURES_OF_A_POSE: usize = 4;
+/// Farthest place of a point that is clicked or given, px: twice the largest picture's size.
+const FAR_PX: f32 = 8192.0;
 /// The region's left border, top, right border and bottom from the lip, px of a picture 640 px wide. Chosen by hand; no
 /// measurement is recorded.
 const REGION_PX: [f32; 4] = [-40.0, -236.0, 380.0, 50.0];
@@ -87,7 +89,8 @@ pub struct Args {
 
 fn parse_point(text: &str) -> Result<[f32; 2], String> {
     let parts: Vec<f32> = text.split(',').map_while(|p| p.trim().parse().ok()).collect();
-    <[f32; 2]>::try_from(parts).map_err(|_| "give two numbers, X,Y in px".into())
+    let point = <[f32; 2]>::try_from(parts).ok().filter(|point| point.iter().all(|px| px.abs() <= FAR_PX));
+    point.ok_or_else(|| "give two numbers, X,Y in px".into())
 }
 
 /// Runs the command.

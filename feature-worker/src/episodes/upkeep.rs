@@ -12,7 +12,7 @@ use std::time::{Duration, SystemTime};
 
 use sha2::{Digest, Sha256};
 use shared::episode::{Episode, hex, take_number};
-use shared::whole_file;
+use shared::{regular_file, whole_file};
 
 use super::folder::Budget;
 use super::output::{ExportError, LeftOut, disk_error, write_error};
@@ -41,7 +41,7 @@ pub fn look(path: &Path) -> Result<Found, LeftOut> {
     if !meta.is_file() {
         return Err(refuse("it is a link or no regular file"));
     }
-    let file = File::open(path).map_err(|e| refuse(&e.to_string()))?;
+    let (file, _) = regular_file::open(path).map_err(|e| refuse(&e.to_string()))?;
     match file.try_lock() {
         Ok(()) => {}
         Err(fs::TryLockError::WouldBlock) => return Err(refuse("it is being written")),
