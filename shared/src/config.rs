@@ -284,10 +284,18 @@ impl Config {
             paths.push(("camera.path", PathBuf::from(&self.camera.path)));
         }
         paths.extend(self.cell.runtime_dir.clone().map(|d| ("cell.runtime_dir", d)));
-        let Some((first, second)) = config_paths::clash(&paths) else { return Ok(()) };
-        let value = paths.iter().find(|(key, _)| *key == second).map_or(String::new(), |(_, path)| path.display().to_string());
-        let allowed = format!("another path than {first}: they would overwrite each other");
-        Err(ConfigError::Range { file: file.display().to_string(), key: second.into(), value, allowed })
+        let refused = |key: &str, allowed: String| {
+            let value = paths.iter().find(|(k, _)| *k == key).map_or(String::new(), |(_, path)| path.display().to_string());
+            ConfigError::Range { file: file.display().to_string(), key: key.into(), value, allowed }
+        };
+        // What tells other programs of a path tells it as text.
+        if let Some((key, _)) = paths.iter().find(|(_, path)| path.to_str().is_none()) {
+            return Err(refused(key, "text in UTF-8: give its directory another name".into()));
+        }
+        match config_paths::clash(&paths) {
+            Some((first, second)) => Err(refused(second, format!("another path than {first}: they would overwrite each other"))),
+            None => Ok(()),
+        }
     }
 
     /// Parses and checks `text`; `file` is named in errors.

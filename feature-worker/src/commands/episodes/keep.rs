@@ -172,8 +172,9 @@ fn note(args: &NoteArgs) -> Result<(), Failure> {
 
 fn run_recover(args: &RecoverArgs) -> Result<(), Failure> {
     let new = args.to.clone().unwrap_or_else(|| {
-        let stem = args.file.file_stem().unwrap_or_default().to_string_lossy();
-        args.file.with_file_name(format!("{stem}-recovered.mcap"))
+        let mut name = args.file.file_stem().unwrap_or_default().to_os_string();
+        name.push("-recovered.mcap");
+        args.file.with_file_name(name)
     });
     let episode = recover(&args.file, &new).map_err(|e| change_failure(&e))?;
     let (frames, seconds) = (episode.rows.len(), episode.seconds());
