@@ -20,6 +20,11 @@ pub fn check_reading(weight_g: f64) -> Result<f64, WeightError> {
     if (0.0..=READING_MAX_G).contains(&weight_g) { Ok(weight_g.abs()) } else { Err(WeightError::NotAReading) }
 }
 
+/// The weight that a file has: finite and at least 0 g. One that no scale shows can still be read, so that it can be corrected.
+pub fn check_kept(weight_g: f64) -> Result<f64, WeightError> {
+    if weight_g.is_finite() && weight_g >= 0.0 { Ok(weight_g) } else { Err(WeightError::NotAReading) }
+}
+
 /// The weight, if something can be learned from it: above 0 g.
 pub fn check_poured(weight_g: f64) -> Result<f64, WeightError> {
     if check_reading(weight_g)? > 0.0 { Ok(weight_g) } else { Err(WeightError::NothingPoured) }
