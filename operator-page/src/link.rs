@@ -122,7 +122,7 @@ fn end_with(result: Result<(), IpcError>) {
 }
 
 /// Takes telemetry, features and reports. It ends when the cell's shared memory is no longer the one that was joined.
-fn telemetry(place: &Place, token: &PathBuf, newest: &Newest) -> Result<(), IpcError> {
+fn telemetry(place: &Place, token: &Path, newest: &Newest) -> Result<(), IpcError> {
     let cell = Cell::join(place)?;
     let ticks = cell.telemetry()?.subscriber_builder().create().in_service("telemetry")?;
     let features = cell.features()?.subscriber_builder().create().in_service("feature")?;
