@@ -115,7 +115,7 @@ mod tests {
         let files: BTreeMap<u64, Result<String, String>> =
             [(7, Ok("/data/episode-0009.mcap".into())), (8, Ok("episode-0010.mcap".into())), (9, Err("no space".into()))].into();
         for garbage in ["", "no JSON", "{\"version\":9,\"ends\":{\"episode-0009.mcap\":{\"reason\":\"x\",\"poured\":null}}}"] {
-            fs::write(&file, garbage).unwrap();
+            std::fs::write(&file, garbage).unwrap();
             let mut ends = Ends::of_file(file.clone());
             assert_eq!(ends.of("episode-0009.mcap"), None);
             ends.remember(&[outcome(7, Some(90.0)), outcome(8, None), outcome(9, Some(90.0))], &files);

@@ -44,7 +44,8 @@ pub fn clash<'a>(paths: &[(&'a str, PathBuf)]) -> Option<(&'a str, &'a str)> {
 pub fn is_same(a: &Path, b: &Path) -> bool {
     let inode = |p: &Path| p.metadata().map(|m| (m.dev(), m.ino())).ok();
     let full = |p: &Path| tidy(&std::path::absolute(p).unwrap_or_else(|_| p.into()));
-    full(a) == full(b) || (inode(a).is_some() && inode(a) == inode(b))
+    let (a, b) = (full(a), full(b));
+    a == b || (inode(&a).is_some() && inode(&a) == inode(&b))
 }
 
 #[cfg(test)]

@@ -128,27 +128,6 @@ pub fn end(result: Result<(), Failure>) -> ExitCode {
 mod tests {
     use super::*;
 
-    /// Set in the process that is to print.
-    const PRINTS: &str = "DECANT_TEST_PRINTS";
-
-    /// Protects whoever sends a command's output to a full disk or to `head`: it is said in one line with an exit code, and is no defect.
-    #[test]
-    fn output_that_cannot_be_written_is_one_line() {
-        if std::env::var_os(PRINTS).is_some() {
-            explain_panics("command");
-            // The tests' harness would take what is printed.
-            std::thread::spawn(|| println!("{}", "x".repeat(1 << 20))).join().unwrap();
-        }
-        let full = std::fs::File::options().write(true).open("/dev/full").unwrap();
-        let mut other = std::process::Command::new(std::env::current_exe().unwrap());
-        let arguments = ["--exact", "exit::tests::output_that_cannot_be_written_is_one_line", "--nocapture"];
-        let ended = other.args(arguments).env(PRINTS, "1").stdout(full).stderr(std::process::Stdio::piped()).spawn().unwrap();
-        let ended = ended.wait_with_output().unwrap();
-        let said = String::from_utf8(ended.stderr).unwrap();
-        assert_eq!((ended.status.code(), said.lines().count()), (Some(FAILED.into()), 1), "{said}");
-        assert!(said.starts_with("error: standard output cannot be written: No space left"), "{said}");
-    }
-
     /// Set in the process that is to panic.
     const PANICS: &str = "DECANT_TEST_PANICS";
 
