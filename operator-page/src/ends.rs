@@ -79,7 +79,7 @@ impl Ends {
         let Some(file) = &self.file else { return };
         let kept = Kept { version: VERSION, ends: self.by_name.clone() };
         // What cannot be kept is still known until this program ends.
-        let _ = serde_json::to_vec(&kept).map(|text| whole_file::replace(file, &text, b"{"));
+        let _ = serde_json::to_vec(&kept).map(|text| whole_file::replace(file, &text, b""));
     }
 }
 
