@@ -12,10 +12,11 @@ use super::unknowns::{AREA_EXPONENT, DELAY, LOG_C, LOG_WEIR, SHARED, VESSEL, mod
 
 /// Outflow at which the camera's gain is judged, ml a frame: that of controlled pours. From the prototype's simulations; the demos pour as fast.
 const JUDGED_AT_ML: f64 = 0.7;
-/// How much a pour's flow factor and delay change from pour to pour. From the prototype; no other measurement is recorded.
+/// How much the flow factor changes from pour to pour (log). From the prototype; no other measurement is recorded.
 const FLOW_FACTOR_SD: f64 = 0.1;
+/// How much the delay changes from pour to pour. From the prototype; no other measurement is recorded.
 const DELAY_SD_FRAMES: f64 = 0.3;
-/// How much the gain may change from pour to pour. From the prototype.
+/// How much the gain may change from pour to pour (log). From the prototype; no other measurement is recorded.
 const GAIN_SD: f64 = 0.02;
 /// The same for a straight vessel that ten episodes tell well, and what is then left of its covariance, which the fit's tempered noise makes too large.
 /// Tuned on rigs 100 to 107; docs/LEARNING.md has what they gain. Of five episodes only, a vessel is told so badly that its error passes for a gain.
