@@ -10,6 +10,7 @@ use decant::cli::{Cli, Command};
 use decant::{doctor, metrics, programs};
 
 fn main() -> ExitCode {
+    shared::exit::explain_panics("decant");
     shared::exit::end(match Cli::parse().command {
         Command::Doctor(args) => {
             shared::os::end_when_nobody_reads();

@@ -34,6 +34,7 @@ enum Command {
 }
 
 fn main() -> ExitCode {
+    shared::exit::explain_panics("experiments");
     shared::exit::end(match Cli::parse().command {
         Command::Demo(args) => demo::run(&args),
         Command::Evaluate(args) => evaluate::run(&args),

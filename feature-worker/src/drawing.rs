@@ -1,12 +1,15 @@
 //! Pictures for the eye: frames in BGR with what was measured drawn on them, captions, JPEG.
 //!
 //! Used by `view`, `calibrate`, `inspect` and the experiments, never by the worker. Everything here allocates; the only failures are
-//! OpenCV's.
+//! OpenCV's, and those of the disk where a picture is saved.
+
+use std::path::Path;
 
 use opencv::core::{Mat, Point, Rect, Scalar, Vec2b, Vec3b, Vector};
 use opencv::prelude::*;
 use opencv::{imgcodecs, imgproc};
 use shared::messages::{Doubt, PixelFormat};
+use shared::whole_file;
 
 use crate::source::Frame;
 use crate::vision::{Extractor, Measurement};
@@ -103,6 +106,19 @@ pub fn shrunk(picture: &Mat, width_max: i32) -> Result<Mat, opencv::Error> {
     let mut small = Mat::default();
     imgproc::resize(picture, &mut small, size, 0.0, 0.0, imgproc::INTER_AREA)?;
     Ok(small)
+}
+
+/// Writes the picture to the file at `path` in one step, in the format that the name's ending says. OpenCV's own writing does not tell of a full disk.
+pub fn save(picture: &Mat, path: &Path) -> Result<(), String> {
+    let ending = path.extension().and_then(|e| e.to_str()).unwrap_or_default();
+    let mut bytes = Vector::new();
+    let made = imgcodecs::imencode(&format!(".{ending}"), picture, &mut bytes, &Vector::new());
+    if !made.unwrap_or(false) {
+        return Err(format!("'{ending}' is no ending of a picture that can be written, such as png or jpg"));
+    }
+    // What is replaced begins as it does: a picture of the same format.
+    let begins = bytes.as_slice().get(..2).unwrap_or_default();
+    whole_file::replace(path, bytes.as_slice(), begins).map_err(|e| e.to_string())
 }
 
 /// Lets OpenCV work in the calling thread alone. The error is one line.

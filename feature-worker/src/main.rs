@@ -19,7 +19,11 @@ fn quiet_libraries() {
 
 fn main() -> ExitCode {
     quiet_libraries();
+    shared::exit::explain_panics("feature-worker");
     let command = Cli::parse().command;
+    if matches!(command, Command::Camera(_)) {
+        shared::os::end_when_nobody_reads();
+    }
     if matches!(command, Command::Calibrate(_) | Command::View(_)) {
         let lost = "error: shared memory vanished: /dev/shm is full, or a file there was cut";
         shared::os::explain_bus_errors(lost, shared::exit::UNREACHABLE, std::sync::Arc::default());

@@ -211,6 +211,9 @@ fn pruning_deletes_no_more_than_it_must() {
     let delete = |file: &Path, more: &[&str]| code(&episodes(&[&["delete", file.to_str().unwrap()][..], more].concat()));
     assert_eq!((delete(&files[5], &[]), files[5].exists()), (0, true));
     assert_eq!((delete(&foreign, &["--yes"]), foreign.exists()), (2, true));
+    let said = episodes(&["delete", foreign.to_str().unwrap(), "--yes", "--json"]);
+    let said: serde_json::Value = serde_json::from_slice(&said.stdout).unwrap();
+    assert_eq!(said["deleted"].as_bool(), Some(false), "what was kept was not deleted: {said}");
     assert_eq!((delete(&files[2], &["--yes"]), files[2].exists()), (2, true), "it is being written");
     drop(held);
     assert_eq!((delete(&files[2], &["--yes"]), files[2].exists()), (0, false));
@@ -261,4 +264,50 @@ fn parts_share_nothing_and_merge_to_the_whole() {
     assert!(Episode::read(&dir.path().join("cut-recovered.mcap")).unwrap().complete, "only the index was missing");
     assert_eq!(code(&episodes(&["recover", files[1].to_str().unwrap()])), 2, "nothing to recover");
     assert_eq!(code(&episodes(&["recover", cut.to_str().unwrap()])), 1, "nothing is overwritten");
+}
+
+/// Protects whoever works on a disk that is full: it is called so by every command that writes, the episode is not said to be damaged, and nothing is left
+/// that looks like a result. It takes root, for a small file system of its own.
+#[test]
+fn a_full_disk_is_called_so() {
+    let dir = tempfile::tempdir().unwrap();
+    let file = write(dir.path(), 50.0);
+    let bytes = std::fs::read(&file).unwrap();
+    let cut = dir.path().join("cut.mcap");
+    std::fs::write(&cut, &bytes[..bytes.len() - 100]).unwrap();
+    let small = dir.path().join("small");
+    std::fs::create_dir(&small).unwrap();
+    // The one file there is an episode, and the rest of the space is taken.
+    let script = r#"mount -t tmpfs -o size=1m tmpfs "$0" && cp "$1" "$0/e.mcap" && dd if=/dev/zero of="$0/fill" bs=4k status=none 2>/dev/null
+        shift; "$@"; code=$?; cmp "$0/e.mcap" "$FILE" >&2; ls -A "$0"; exit $code"#;
+    let run = |words: &[&str]| {
+        let mut command = Command::new("unshare");
+        command.args(["-m", "--propagation", "private", "sh", "-c", script]).arg(&small).arg(&file).env("FILE", &file);
+        command.arg(env!("CARGO_BIN_EXE_feature-worker")).args(words).output().unwrap()
+    };
+    if code(&run(&["--version"])) != 0 {
+        println!("not run: it takes root");
+        return;
+    }
+    let [cut, here] = [&cut, &small].map(|p| p.to_str().unwrap());
+    let [own, table] = ["e.mcap", "new.mcap"].map(|name| small.join(name).display().to_string());
+    let file = file.to_str().unwrap();
+    for words in [
+        &["episodes", "recover", cut, "--to", &table][..],
+        &["episodes", "weigh", &own, "--weight", "80"],
+        &["episodes", "note", &own, "--text", "askew"],
+        &["episodes", "merge", file, "--to", here],
+        &["episodes", "split", file, "--to", here, "--share", "new=1"],
+        &["episodes", "export", file, "--as", "csv", "--to", here],
+        &["episodes", "export", file, "--as", "images", "--to", here],
+        &["episodes", "export", file, "--as", "video", "--to", here],
+    ] {
+        let output = run(words);
+        let (said, left) = (String::from_utf8_lossy(&output.stderr), String::from_utf8_lossy(&output.stdout));
+        assert_eq!((code(&output), said.lines().count()), (1, 1), "{words:?}: {said}");
+        assert!(said.contains("the disk is full"), "{words:?}: {said}");
+        // A directory for a part, and the memory of numbers, may have been made before.
+        let left: Vec<&str> = left.lines().filter(|name| ![".last-number", "new"].contains(name)).collect();
+        assert_eq!(left, ["e.mcap", "fill"], "{words:?}");
+    }
 }

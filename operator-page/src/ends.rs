@@ -5,11 +5,11 @@
 //! `ENDS_MAX`. A file that cannot be read or written costs nothing but the reasons from before: then the table says what the recorder wrote.
 
 use std::collections::BTreeMap;
-use std::fs;
 use std::path::PathBuf;
 
 use serde::{Deserialize, Serialize};
 use shared::control::Outcome;
+use shared::{regular_file, whole_file};
 
 /// Number of episodes whose ends are remembered. Chosen by hand: some days of a lab.
 const ENDS_MAX: usize = 2000;
@@ -44,8 +44,7 @@ pub struct Ends {
 impl Ends {
     /// The ends that `file` keeps.
     pub fn of_file(file: PathBuf) -> Self {
-        let small = fs::metadata(&file).is_ok_and(|m| m.is_file() && m.len() <= FILE_MAX);
-        let text = if small { fs::read(&file).unwrap_or_default() } else { Vec::new() };
+        let text = regular_file::read(&file, FILE_MAX).unwrap_or_default();
         let kept = serde_json::from_slice::<Kept>(&text).ok().filter(|k| k.version == VERSION);
         Self { file: Some(file), by_name: kept.unwrap_or_default().ends }
     }
@@ -79,9 +78,8 @@ impl Ends {
     fn write(&self) {
         let Some(file) = &self.file else { return };
         let kept = Kept { version: VERSION, ends: self.by_name.clone() };
-        let partial = file.with_extension(format!("{}.partial", std::process::id()));
         // What cannot be kept is still known until this program ends.
-        let _ = serde_json::to_vec(&kept).map(|text| fs::write(&partial, text).and_then(|()| fs::rename(&partial, file)));
+        let _ = serde_json::to_vec(&kept).map(|text| whole_file::replace(file, &text, b""));
     }
 }
 
@@ -117,7 +115,7 @@ mod tests {
         let files: BTreeMap<u64, Result<String, String>> =
             [(7, Ok("/data/episode-0009.mcap".into())), (8, Ok("episode-0010.mcap".into())), (9, Err("no space".into()))].into();
         for garbage in ["", "no JSON", "{\"version\":9,\"ends\":{\"episode-0009.mcap\":{\"reason\":\"x\",\"poured\":null}}}"] {
-            fs::write(&file, garbage).unwrap();
+            std::fs::write(&file, garbage).unwrap();
             let mut ends = Ends::of_file(file.clone());
             assert_eq!(ends.of("episode-0009.mcap"), None);
             ends.remember(&[outcome(7, Some(90.0)), outcome(8, None), outcome(9, Some(90.0))], &files);

@@ -14,6 +14,7 @@ use std::time::{Duration, SystemTime};
 use feature_worker::episodes::summary::{remarks, summary};
 use serde_json::{Value, json};
 use shared::episode::{Episode, EpisodeImages, find_episodes};
+use shared::regular_file;
 
 use crate::ends::Ends;
 use crate::lock::locked;
@@ -182,7 +183,7 @@ impl History {
     /// The file for a reader's disk.
     pub fn open_file(&self, name: &str) -> Result<File, String> {
         let path = self.path(name)?;
-        File::open(&path).map_err(|e| format!("{}: {e}", path.display()))
+        regular_file::open(&path).map(|(file, _)| file).map_err(|e| format!("{}: {e}", path.display()))
     }
 
     /// One episode's rows for a plot, column by column.

@@ -7,7 +7,7 @@
 
 use std::collections::VecDeque;
 use std::io::{Stdout, stdin};
-use std::path::{Path, PathBuf};
+use std::path::Path;
 use std::sync::atomic::{AtomicBool, Ordering::Relaxed, Ordering::SeqCst};
 use std::sync::mpsc::{Receiver, RecvTimeoutError, channel};
 use std::sync::{Arc, Mutex, OnceLock, PoisonError};
@@ -23,6 +23,7 @@ use shared::exit::{self, Failure, OrExit as _, failure};
 use shared::ipc::{Cell, InService as _, IpcError};
 use shared::messages::{Feature, PixelFormat, RecorderReport, RecorderState, Telemetry};
 use shared::os;
+use shared::regular_file;
 use shared::runtime_dir::Place;
 
 use crate::wire::{self, FromLink, Measured, Picture, Point, Recorded, ToLink};
@@ -41,6 +42,9 @@ const SILENT: Duration = Duration::from_secs(1);
 const KEPT: usize = 64;
 /// Largest width of a picture for the page, px. Chosen by hand: a phone shows less, and a wider one costs time.
 const WIDTH_MAX: i32 = 960;
+
+/// Largest file with the name of the cell's shared memory that is read, bytes. Chosen by hand: it has some digits.
+const TOKEN_MAX: u64 = 64;
 
 /// The newest measurements of the worker.
 type Newest = Mutex<VecDeque<Measured>>;
@@ -118,13 +122,13 @@ fn end_with(result: Result<(), IpcError>) {
 }
 
 /// Takes telemetry, features and reports. It ends when the cell's shared memory is no longer the one that was joined.
-fn telemetry(place: &Place, token: &PathBuf, newest: &Newest) -> Result<(), IpcError> {
+fn telemetry(place: &Place, token: &Path, newest: &Newest) -> Result<(), IpcError> {
     let cell = Cell::join(place)?;
     let ticks = cell.telemetry()?.subscriber_builder().create().in_service("telemetry")?;
     let features = cell.features()?.subscriber_builder().create().in_service("feature")?;
     let reports = cell.recorder()?.subscriber_builder().create().in_service("recorder")?;
     cell.reserve()?;
-    let joined = std::fs::read(token).ok();
+    let joined = regular_file::read(token, TOKEN_MAX).ok();
     let mut doubts: VecDeque<Measured> = VecDeque::new();
     let mut looked = Instant::now();
     loop {
@@ -147,7 +151,7 @@ fn telemetry(place: &Place, token: &PathBuf, newest: &Newest) -> Result<(), IpcE
         }
         if looked.elapsed() > SILENT {
             looked = Instant::now();
-            if std::fs::read(token).ok() != joined {
+            if regular_file::read(token, TOKEN_MAX).ok() != joined {
                 send(&FromLink::Broken("the cell's shared memory was made anew".into()), 0);
                 leave(exit::UNREACHABLE);
             }

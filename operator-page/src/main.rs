@@ -9,6 +9,7 @@ use operator_page::cli::{Cli, Command};
 use operator_page::{link, run};
 
 fn main() -> ExitCode {
+    shared::exit::explain_panics("operator-page");
     shared::exit::end(match Cli::parse().command {
         Command::Run(args) => run::run(&args),
         Command::Link { config } => link::run(&config),

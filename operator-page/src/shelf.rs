@@ -14,6 +14,7 @@ use std::time::{Duration, Instant, SystemTime};
 use rt_controller::foreseen;
 use serde_json::{Value, json};
 use shared::limits::Limits;
+use shared::regular_file;
 use shared::weights::{Estimator, Weights};
 
 use crate::lock::locked;
@@ -24,6 +25,8 @@ const GOALS_ML: [f32; 4] = [25.0, 50.0, 100.0, 200.0];
 const REMEMBERED: usize = 16;
 /// Longest wait for another exchange. Chosen by hand: one takes milliseconds.
 const TURN: Duration = Duration::from_secs(5);
+/// Largest file `before`, bytes. Chosen by hand: 16 digits and a line's end.
+const NAME_MAX: u64 = 64;
 /// What a page is told that shows an older state of the files.
 const OTHERS: &str = "the weight files have changed since this was shown: look at what is there now, and choose again";
 
@@ -64,7 +67,7 @@ impl Shelf {
 
     /// The file that one click goes back to, if there is one.
     fn before(&self) -> Option<PathBuf> {
-        let name = fs::read_to_string(self.kept().join("before")).ok()?;
+        let name = regular_file::read_text(&self.kept().join("before"), NAME_MAX).ok()?;
         let name = name.trim();
         let plain = name.bytes().all(|b| b.is_ascii_hexdigit()) && !name.is_empty();
         plain.then(|| self.kept().join(format!("{name}.bin"))).filter(|file| file.exists())

@@ -13,7 +13,9 @@ use shared::config::Config;
 use shared::config_paths::is_same;
 use shared::regular_file;
 
-/// Largest file `controller`, bytes: four paths of the longest length.
+use crate::journal::before;
+
+/// Largest file `controller`, bytes: five paths of the longest length, and room for what JSON writes longer.
 const FILE_MAX: u64 = 32 * 1024;
 
 /// A controller that runs, as its file says.
@@ -55,7 +57,10 @@ impl Claim {
             ("controller.weights".to_string(), config.controller.weights.clone()),
             ("recording.directory".to_string(), config.recording.directory.clone()),
         ];
-        files.extend(config.controller.journal.clone().map(|j| ("controller.journal".to_string(), j)));
+        if let Some(journal) = &config.controller.journal {
+            files.push(("controller.journal".to_string(), journal.clone()));
+            files.push(("the journal before, controller.journal".to_string(), before(journal, 1)));
+        }
         let this = Running {
             pid: std::process::id(),
             started: started(std::process::id()).unwrap_or(0),

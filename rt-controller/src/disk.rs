@@ -12,7 +12,7 @@ use std::time::{Duration, Instant};
 use crossbeam::channel::{Receiver, Sender, TrySendError, bounded};
 use shared::agent::Agent;
 use shared::config::Config;
-use shared::disk_space::free_bytes;
+use shared::disk_space::{error_words, free_bytes};
 use shared::episode::take_number;
 use shared::level::Level;
 use shared::messages::Phase;
@@ -21,7 +21,7 @@ use shared::regular_file;
 use shared::weights::Weights;
 
 use crate::core::Settings;
-use crate::disk_note::{DiskNote, error_words, space_words};
+use crate::disk_note::{DiskNote, space_words};
 use crate::exchange::Exchange;
 use crate::journal::{Tick, Writer};
 

@@ -52,12 +52,3 @@ pub fn space_words(paths: &[&Path]) -> String {
     }
     words.join(", ")
 }
-
-/// An error of the disk in words: a full one is called so.
-pub fn error_words(e: &std::io::Error) -> String {
-    match e.kind() {
-        std::io::ErrorKind::StorageFull => format!("the disk is full ({e}): delete what is not needed"),
-        std::io::ErrorKind::QuotaExceeded => format!("the quota of this user is used up ({e}): delete what is not needed"),
-        _ => e.to_string(),
-    }
-}

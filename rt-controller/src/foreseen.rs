@@ -23,6 +23,8 @@ const LAST_DEG: f64 = 120.0;
 /// How far beyond the tilt of a fill's first drop it must flow, degrees: where capacity curves of real vessels were known least, they were off
 /// by 10 % of the vessel, which is some 8 degrees.
 const BEYOND_DEG: f64 = 10.0;
+/// A vessel whose size was learned may hold so many times more. Chosen by hand: sizes are learned within a tenth.
+const OVERFULL: f64 = 1.25;
 
 /// The likelier explanation of the weights; none with the plain sum.
 fn explanation(weights: &Weights) -> Option<&Explanation> {
@@ -86,11 +88,15 @@ fn foreseen_sd_ml(
     Some(sd_ml)
 }
 
-/// The tilt by which a vessel with `fill_ml` in it must flow, degrees; `None` if the weights describe no vessel or the fill reaches no lip.
+/// The tilt by which a vessel with `fill_ml` in it must flow, degrees; `None` if the weights describe no vessel, the fill reaches no lip, or the vessel
+/// does not hold it.
 /// `holds_ml` is what the vessel holds, where somebody knows it.
 pub fn flows_by_deg(weights: &Weights, fill_ml: f64, holds_ml: Option<f64>) -> Option<f32> {
     let capacity = FlowTables::new(&explanation(weights)?.model).capacity;
     let whole_ml = capacity.lost_ml(LAST_DEG);
+    if !(0.0..=holds_ml.unwrap_or(OVERFULL * whole_ml)).contains(&fill_ml) {
+        return None;
+    }
     let empty_ml = whole_ml * (1.0 - fill_ml / holds_ml.unwrap_or(whole_ml)).clamp(0.0, 1.0);
     let onset_deg = (0..=LAST_DEG as u32).map(f64::from).find(|deg| capacity.lost_ml(*deg) >= empty_ml)?;
     (onset_deg < LAST_DEG).then_some((onset_deg + BEYOND_DEG) as f32)
@@ -176,7 +182,9 @@ mod tests {
         let by = |fill_ml| flows_by_deg(&weights(), fill_ml, Some(520.0));
         let (full, half) = (by(480.0).unwrap(), by(250.0).unwrap());
         assert!(full > 15.0 && full + 15.0 < half && half < 90.0, "{full} {half}");
-        assert_eq!(by(0.0), None);
+        for wrong in [0.0, -1.0, 521.0, 1e30, f64::INFINITY, f64::NAN] {
+            assert_eq!((by(wrong), flows_by_deg(&weights(), 20.0 * wrong, None)), (None, None), "{wrong}");
+        }
         assert_eq!(flows_by_deg(&Weights { estimator: Estimator::Sum, ..weights() }, 250.0, None), None);
     }
 }

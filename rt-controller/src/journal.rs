@@ -204,7 +204,7 @@ fn make_room(path: &Path) -> std::io::Result<File> {
 }
 
 /// Where the `n`th journal before the one at `path` is kept, from 1.
-fn before(path: &Path, n: u32) -> PathBuf {
+pub fn before(path: &Path, n: u32) -> PathBuf {
     path.with_extension(if n == 1 { "before.bin".into() } else { format!("before-{n}.bin") })
 }
 
@@ -325,7 +325,7 @@ pub struct Replay {
 /// Replays the journal in a file. See [`replay_from`].
 pub fn replay(path: &Path, seen: impl FnMut(&Tick, &crate::core::Output)) -> Result<Replay, JournalError> {
     let file = path.display().to_string();
-    let reader = File::open(path).map_err(|e| JournalError::Read { file: file.clone(), what: e.to_string() })?;
+    let (reader, _) = regular_file::open(path).map_err(|e| JournalError::Read { file: file.clone(), what: e.to_string() })?;
     replay_from(BufReader::new(reader), &file, seen)
 }
 

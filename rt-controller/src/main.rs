@@ -12,6 +12,7 @@ use rt_controller::commands::{abort, pour, record, replay, resume, run, status, 
 static ALLOCATOR: shared::os::CountingAllocator = shared::os::CountingAllocator;
 
 fn main() -> ExitCode {
+    shared::exit::explain_panics("rt-controller");
     let command = Cli::parse().command;
     if matches!(command, Command::Status(_) | Command::Replay(_)) {
         shared::os::end_when_nobody_reads();

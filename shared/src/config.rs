@@ -11,12 +11,16 @@ pub use crate::config_camera::{CameraConfig, CameraSource, Locked, Refused, Sett
 pub use crate::config_container::ContainerConfig;
 use crate::config_paths;
 use crate::limits::Limits;
+use crate::regular_file;
 use crate::robot_address::RobotAddress;
 
 /// The environment variable that names the configuration where `--config` is not given.
 pub const VARIABLE: &str = "DECANT_CONFIG";
 /// The file that is read without `--config` and without [`VARIABLE`]: the simulated cell, so that a real robot only moves when its file is named.
 pub const DEFAULT_FILE: &str = "config/sim.toml";
+
+/// Largest configuration that is read, bytes. Chosen by hand: a hundred times the longest one that is known.
+pub const FILE_MAX: u64 = 1 << 20;
 
 /// The rule for a cell's name, in words; the name becomes part of file names.
 pub(crate) const CELL_NAME_RULE: &str = "1 to 32 letters, digits, '-' or '_'";
@@ -248,7 +252,7 @@ impl Config {
     /// Reads and checks `file`.
     pub fn read(file: &Path) -> Result<Self, ConfigError> {
         let name = file.display().to_string();
-        let text = std::fs::read_to_string(file)
+        let text = regular_file::read_text(file, FILE_MAX)
             .map_err(|e| ConfigError::Read { file: name.clone(), what: format!("{e}; give --config FILE") })?;
         let mut config = Self::parse(&text, &name)?;
         config.place_beside(file);
@@ -280,10 +284,18 @@ impl Config {
             paths.push(("camera.path", PathBuf::from(&self.camera.path)));
         }
         paths.extend(self.cell.runtime_dir.clone().map(|d| ("cell.runtime_dir", d)));
-        let Some((first, second)) = config_paths::clash(&paths) else { return Ok(()) };
-        let value = paths.iter().find(|(key, _)| *key == second).map_or(String::new(), |(_, path)| path.display().to_string());
-        let allowed = format!("another path than {first}: they would overwrite each other");
-        Err(ConfigError::Range { file: file.display().to_string(), key: second.into(), value, allowed })
+        let refused = |key: &str, allowed: String| {
+            let value = paths.iter().find(|(k, _)| *k == key).map_or(String::new(), |(_, path)| path.display().to_string());
+            ConfigError::Range { file: file.display().to_string(), key: key.into(), value, allowed }
+        };
+        // What tells other programs of a path tells it as text.
+        if let Some((key, _)) = paths.iter().find(|(_, path)| path.to_str().is_none()) {
+            return Err(refused(key, "text in UTF-8: give its directory another name".into()));
+        }
+        match config_paths::clash(&paths) {
+            Some((first, second)) => Err(refused(second, format!("another path than {first}: they would overwrite each other"))),
+            None => Ok(()),
+        }
     }
 
     /// Parses and checks `text`; `file` is named in errors.

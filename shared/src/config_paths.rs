@@ -13,15 +13,21 @@ pub fn beside(file: &Path, path: &Path) -> PathBuf {
     tidy(&file.parent().unwrap_or(Path::new("/")).join(path))
 }
 
-/// `path` without `..`, as far as its directory is there. Its last part stays, because it may be a link that people exchange.
+/// `path` without `..` and without links, as far as its directory is there; what is not there yet is no link. Its last part stays, because it may be a
+/// link that people exchange.
 fn tidy(path: &Path) -> PathBuf {
     for there in path.ancestors().skip(1) {
-        if let Ok(real) = there.canonicalize()
-            && let Ok(rest) = path.strip_prefix(there)
-            && rest.components().all(|c| matches!(c, Component::Normal(_)))
-        {
-            return real.join(rest);
+        let (Ok(mut real), Ok(rest)) = (there.canonicalize(), path.strip_prefix(there)) else { continue };
+        for part in rest.components() {
+            match part {
+                Component::Normal(name) => real.push(name),
+                Component::ParentDir => drop(real.pop()),
+                _ => {}
+            }
         }
+        // A way back may lead to what is there.
+        let back = rest.components().any(|part| part == Component::ParentDir);
+        return if back { tidy(&real) } else { real };
     }
     path.into()
 }
@@ -38,7 +44,8 @@ pub fn clash<'a>(paths: &[(&'a str, PathBuf)]) -> Option<(&'a str, &'a str)> {
 pub fn is_same(a: &Path, b: &Path) -> bool {
     let inode = |p: &Path| p.metadata().map(|m| (m.dev(), m.ino())).ok();
     let full = |p: &Path| tidy(&std::path::absolute(p).unwrap_or_else(|_| p.into()));
-    full(a) == full(b) || (inode(a).is_some() && inode(a) == inode(b))
+    let (a, b) = (full(a), full(b));
+    a == b || (inode(&a).is_some() && inode(&a) == inode(&b))
 }
 
 #[cfg(test)]
@@ -65,5 +72,8 @@ mod tests {
         }
         assert_eq!(clash(&[("a", real.join("w.bin")), ("b", real.join("v.bin"))]), None);
         assert_eq!(clash(&[("a", real.join("new/x")), ("b", real.join("config/../new/x"))]), Some(("a", "b")), "neither is there");
+        // A directory that is made later must not make two paths one.
+        assert_eq!(clash(&[("a", real.join("w.bin")), ("b", real.join("later/../config/link"))]), Some(("a", "b")));
+        assert_eq!(beside(&file, Path::new("later/deeper/../../../w.bin")), real.join("w.bin"));
     }
 }

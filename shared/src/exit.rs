@@ -2,6 +2,7 @@
 //! here fails.
 
 use std::fmt::Display;
+use std::io::Write as _;
 use std::panic::PanicHookInfo;
 use std::process::ExitCode;
 use std::sync::Arc;
@@ -73,11 +74,26 @@ pub fn end_within(stop: &Arc<AtomicBool>, within: Duration, line: &'static str) 
     let _ = std::thread::Builder::new().name("end".into()).stack_size(STACK).spawn(watch);
 }
 
-/// Makes a panic in any thread of the resident process `name` one line that matters, in place of what Rust prints.
+/// Makes a panic in any thread of the process `name` one line that matters, in place of what Rust prints. What a command cannot print, because
+/// the disk that its output goes to is full or nobody reads it any more, is no defect: it ends the process with one line and [`FAILED`].
 pub fn explain_panics(name: &'static str) {
     std::panic::set_hook(Box::new(move |panic| {
+        if let Some(why) = unprinted(panic) {
+            crate::os::tell(
+                Level::Error,
+                &format!("error: standard output cannot be written: {why}; what was to be said is not all there"),
+            );
+            std::process::exit(FAILED.into());
+        }
         crate::os::tell(Level::Error, &format!("{name}: this is a defect, please report it: {}", one_line(panic)));
     }));
+}
+
+/// Why standard output or standard error could not be written, if that is what the panic is about: `println!` knows no other way to say it.
+fn unprinted(panic: &PanicHookInfo) -> Option<String> {
+    let message = panic.payload().downcast_ref::<String>()?;
+    let (_, why) = message.strip_prefix("failed printing to std")?.split_once(": ")?;
+    Some(why.into())
 }
 
 /// A panic's place and message in one line: Rust puts them on lines of their own, and the message may have several.
@@ -101,7 +117,8 @@ pub fn end(result: Result<(), Failure>) -> ExitCode {
     match result {
         Ok(()) => ExitCode::SUCCESS,
         Err(Failure { code, what }) => {
-            eprintln!("{}", Level::Error.marked(&format!("error: {what}")));
+            // The exit code says it too, so that a standard error that cannot be written changes nothing.
+            let _ = writeln!(std::io::stderr(), "{}", Level::Error.marked(&format!("error: {what}")));
             ExitCode::from(code)
         }
     }

@@ -18,6 +18,7 @@
 //! | [`weights`] | the weight file (postcard with a CRC) | no |
 //! | [`episode`] | `E = (L_E, w_E)` as MCAP files and CSV tables | no |
 //! | [`regular_file`] | files of which only so much is read as is expected | no |
+//! | [`whole_file`] | files that are written in one step, and never in place of one of another kind | no |
 //! | [`exit`] | exit codes and one-line errors | no |
 //! | [`speaker`] | lines for people, from threads that must not wait for a terminal | no |
 //! | [`machine`] | what Linux tells about the machine, and what would make it better | no |
@@ -58,3 +59,4 @@ pub mod shared_memory;
 pub mod speaker;
 pub mod supervisor;
 pub mod weights;
+pub mod whole_file;

@@ -8,20 +8,29 @@ use std::io::{Error, Read, Result};
 use std::os::unix::fs::{MetadataExt, OpenOptionsExt};
 use std::path::Path;
 
-use crate::runtime_dir::own_uid;
-
 /// Reads the file at `path`, which has at most `bytes_max` bytes.
 pub fn read(path: &Path, bytes_max: u64) -> Result<Vec<u8>> {
-    let (file, meta) = open(path)?;
-    if meta.len() > bytes_max {
-        return Err(Error::other(format!("{} bytes are too many: at most {bytes_max} belong into such a file", meta.len())));
-    }
+    let (file, meta) = open_at_most(path, bytes_max)?;
     let mut bytes = Vec::with_capacity(meta.len() as usize);
     file.take(bytes_max + 1).read_to_end(&mut bytes)?;
     if bytes.len() as u64 > bytes_max {
         return Err(Error::other(format!("it grew over {bytes_max} bytes while it was read")));
     }
     Ok(bytes)
+}
+
+/// Reads the text in the file at `path`, which has at most `bytes_max` bytes.
+pub fn read_text(path: &Path, bytes_max: u64) -> Result<String> {
+    String::from_utf8(read(path, bytes_max)?).map_err(|_| Error::other("is no text in UTF-8"))
+}
+
+/// Opens a regular file of at most `bytes_max` bytes for reading.
+pub fn open_at_most(path: &Path, bytes_max: u64) -> Result<(File, Metadata)> {
+    let (file, meta) = open(path)?;
+    if meta.len() > bytes_max {
+        return Err(Error::other(format!("{} bytes are too many: at most {bytes_max} belong into such a file", meta.len())));
+    }
+    Ok((file, meta))
 }
 
 /// Opens a regular file for reading, without waiting for anything else that may be at `path`.
@@ -33,7 +42,7 @@ pub fn open(path: &Path) -> Result<(File, Metadata)> {
 
 /// Checks that nobody but this user, root and `trusted` (a user number) may have written the file that `meta` describes.
 pub fn check_owner(meta: &Metadata, trusted: Option<u32>) -> std::result::Result<(), String> {
-    if ![Some(0), Some(own_uid()), trusted].contains(&Some(meta.uid())) {
+    if ![Some(0), Some(rustix::process::geteuid().as_raw()), trusted].contains(&Some(meta.uid())) {
         return Err(format!("belongs to user {}: only files of this user, of root and of the configuration's owner are read", meta.uid()));
     }
     if meta.mode() & 0o002 != 0 {
@@ -69,7 +78,7 @@ mod tests {
         std::fs::set_permissions(&file, std::fs::Permissions::from_mode(0o666)).expect("ours");
         assert!(check_owner(&meta(), None).expect_err("open").contains("everybody"));
         std::fs::set_permissions(&file, std::fs::Permissions::from_mode(0o644)).expect("ours");
-        if own_uid() == 0 {
+        if rustix::process::geteuid().is_root() {
             std::os::unix::fs::chown(&file, Some(65534), None).expect("root may");
             assert!(check_owner(&meta(), None).expect_err("a stranger's").contains("65534"));
             assert_eq!(check_owner(&meta(), Some(65534)), Ok(()));

@@ -14,7 +14,7 @@ use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
 use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 
 use crate::episode::rfc3339;
-use crate::level::{Level, to_journal};
+use crate::level::{Level, plain, to_journal};
 use crate::os;
 use crate::plural::counted;
 
@@ -118,7 +118,7 @@ fn said(level: Level, line: &str) -> String {
     }
     let since = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default();
     let whole = rfc3339(since.as_secs());
-    format!("{}.{:03}Z {line}\n", whole.trim_end_matches('Z'), since.subsec_millis())
+    format!("{}.{:03}Z {}\n", whole.trim_end_matches('Z'), since.subsec_millis(), plain(line))
 }
 
 /// Writes all of `text`, for as long as it takes. It goes past the standard library's lock, so that nobody waits for this thread.

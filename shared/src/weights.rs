@@ -13,7 +13,6 @@
 //!     24      n  postcard of `Weights`, then its CRC-32 (ISO-HDLC), 4 bytes
 //! ```
 
-use std::io::Write;
 use std::path::Path;
 
 use crc::{CRC_32_ISO_HDLC, Crc};
@@ -25,7 +24,7 @@ use crate::estimator::Calibration;
 use crate::estimator::flow::WayBack;
 use crate::estimator::fused::FusedModel;
 use crate::mlp::{HIDDEN, INPUTS, InputScale, Mlp};
-use crate::regular_file;
+use crate::{regular_file, whole_file};
 
 mod ranges;
 
@@ -256,19 +255,12 @@ impl Weights {
         let file = path.display().to_string();
         self.check().map_err(|what| WeightsError::Value { file: file.clone(), what })?;
         let bytes = self.to_bytes()?;
-        let mut temporary = path.as_os_str().to_owned();
-        temporary.push(format!(".{}.tmp", std::process::id()));
-        let put = || -> std::io::Result<()> {
-            let mut out = std::fs::File::create(&temporary)?;
-            out.write_all(&bytes)?;
-            out.sync_all()?;
-            std::fs::rename(&temporary, path)
-        };
-        put().map_err(|e| {
-            // Nobody needs the half-written temporary file, and it does no harm if it cannot be removed.
-            let _ = std::fs::remove_file(&temporary);
-            WeightsError::Write { file, what: e.to_string() }
-        })
+        whole_file::replace(path, &bytes, MAGIC).map_err(|e| WeightsError::Write { file, what: e.to_string() })
+    }
+
+    /// Whether [`Weights::write`] may put a file at `path`: what is there is a weight file, or empty.
+    pub fn may_write(path: &Path) -> Result<(), WeightsError> {
+        whole_file::check(path, MAGIC).map_err(|e| WeightsError::Write { file: path.display().to_string(), what: e.to_string() })
     }
 
     /// The identity: the first 8 bytes of the SHA-256 of the file's bytes, as a big-endian number; 0 if there are no such bytes.

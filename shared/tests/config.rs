@@ -28,3 +28,21 @@ fn one_path_for_two_things_is_refused() {
         assert!(said.contains("controller.journal") && said.contains(other), "{said}");
     }
 }
+
+/// Protects a cell in a directory with an odd name: blanks, line ends and percent signs are a path as any other, and what is no text is refused by name instead
+/// of being read as another path.
+#[test]
+fn odd_names_are_paths_or_are_refused() {
+    use std::os::unix::ffi::OsStrExt as _;
+    let dir = tempfile::tempdir().expect("a directory");
+    for (name, good) in [(&b"a b%02d\nc"[..], true), (b"a\xff", false)] {
+        let place = dir.path().join(std::ffi::OsStr::from_bytes(name));
+        std::fs::create_dir(&place).expect("writable");
+        let file = place.join("cell.toml");
+        std::fs::write(&file, include_str!("../../config/sim.toml")).expect("writable");
+        match Config::read(&file) {
+            Ok(config) => assert!(good && config.recording.directory.ends_with("out/episodes")),
+            Err(e) => assert!(!good && e.to_string().contains("text in UTF-8"), "{e}"),
+        }
+    }
+}

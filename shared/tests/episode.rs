@@ -175,7 +175,7 @@ fn a_wrong_weight_is_refused_and_the_file_is_as_it_was() {
     let dir = tempfile::tempdir().unwrap();
     let path = write(dir.path(), true);
     let bytes = std::fs::read(&path).unwrap();
-    for grams in [f64::NAN, f64::INFINITY, -0.1] {
+    for grams in [50_001.0, 1e30, f64::NAN, f64::INFINITY, -0.1] {
         assert!(matches!(set_weight(&path, grams), Err(ChangeError::Weight(..))));
     }
     assert_eq!(std::fs::read(&path).unwrap(), bytes);

@@ -24,6 +24,7 @@ enum Command {
 }
 
 fn main() -> ExitCode {
+    shared::exit::explain_panics("simulator");
     shared::exit::end(match Cli::parse().command {
         Command::Run(args) => run::run(&args),
         Command::Operator(args) => operator::run(&args),

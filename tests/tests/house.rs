@@ -24,6 +24,27 @@ const LONGER_FUNCTIONS: usize = 0;
 /// The one file that may hold unsafe code.
 const UNSAFE_FILE: &str = "shared/src/os.rs";
 
+/// Crates that only developers run, on files of their own.
+const OWN_WAYS: [&str; 4] = ["simulator", "experiments", "swarm", "tests"];
+/// Files that are opened in another way than through `regular_file` and `whole_file`: the source file, a part of its line, and why.
+const OPENED_OTHERWISE: &[(&str, &str, &str)] = &[
+    ("feature-worker/src/source/devices.rs", "etc/group", "the system's own file"),
+    ("feature-worker/src/source/devices.rs", "\"comm\"", "in /proc"),
+    ("feature-worker/src/source/devices.rs", "\"name\"", "in /sys"),
+    ("shared/src/machine.rs", "read_to_string(path)", "in /proc and /sys"),
+    ("web/src/peer.rs", "read_to_string(table)", "in /proc"),
+    ("operator-page/src/addresses.rs", "read_to_string(table)", "in /proc"),
+    ("operator-page/src/shelf.rs", "File::create(&partial)", "the new file gets the old one's time before its name"),
+    ("shared/src/whole_file.rs", "File::open(directory)", "a directory"),
+    ("shared/src/shared_memory.rs", "std::fs::write(&new, &token)", "in the runtime directory, which nobody else may enter"),
+    ("shared/src/shared_memory.rs", "File::open(random)", "the kernel's random numbers"),
+    ("rt-controller/src/claim.rs", "std::fs::write(&new, text)", "in the runtime directory, which nobody else may enter"),
+    ("feature-worker/src/episodes/export.rs", "fs::write(&path, &image.data)", "in a directory that is new"),
+    ("feature-worker/src/episodes/upkeep.rs", "File::open(&part)", "a file that this program has just made"),
+    ("feature-worker/src/episodes/video.rs", "fs::write(&self.path, [0; PROBE])", "OpenCV writes the file"),
+    ("feature-worker/src/commands/bench/python.rs", "directory.join(", "in a directory that is new"),
+];
+
 fn root() -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).parent().expect("the crate lies in the workspace").to_path_buf()
 }
@@ -292,6 +313,32 @@ fn unsafe_code_stands_in_one_file() {
         .filter(|(name, text)| name != UNSAFE_FILE && !name.ends_with("house.rs") && unsafe_in(text))
         .map(|(name, _)| format!("{name}: unsafe code belongs in {UNSAFE_FILE}"))
         .collect();
+    none(&faults);
+}
+
+/// Protects memory, devices and what a person names by mistake: files are read by `regular_file` and written by `whole_file`, so that a pipe holds nobody, a
+/// huge file fills nothing, and a full disk leaves the old file. Files of other kinds are in the list.
+#[test]
+fn files_are_opened_in_one_way() {
+    let mut faults = Vec::new();
+    for (name, text) in
+        sources().iter().filter(|(name, _)| name.contains("/src/") && !OWN_WAYS.contains(&name.split('/').next().unwrap_or("")))
+    {
+        for line in code(text).lines() {
+            let opens = ["fs::read(", "fs::read_to_string(", "fs::write(", "File::open(", "File::create(", "from_path("]
+                .iter()
+                .any(|o| line.contains(o));
+            let of_system = ["/proc/", "/sys", "/dev/"].iter().any(|d| line.contains(d));
+            if opens && !of_system && !OPENED_OTHERWISE.iter().any(|(file, part, _)| file == name && line.contains(part)) {
+                faults.push(format!("{name}: `{}`: use regular_file or whole_file", line.trim()));
+            }
+        }
+    }
+    for (file, part, _) in OPENED_OTHERWISE {
+        if !sources().iter().any(|(name, text)| name == file && code(text).contains(part)) {
+            faults.push(format!("{file}: `{part}` is listed as opened otherwise, but is not there"));
+        }
+    }
     none(&faults);
 }
 

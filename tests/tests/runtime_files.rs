@@ -314,3 +314,76 @@ fn paths_belong_to_the_configuration() {
     rustix::process::kill_process(rustix::process::Pid::from_child(&controller), Signal::TERM).expect("ours");
     assert_eq!(controller.wait().expect("ours").code(), Some(0));
 }
+
+/// Protects the files of a cell that runs from a second one that names them by accident, in whatever words: through a link, a hard link or a detour, or as
+/// the place to which its own journal moves.
+#[test]
+fn two_cells_share_no_file() {
+    let base = tempfile::Builder::new().prefix("d").tempdir_in("/tmp").expect("a directory");
+    let prepare = |name: &'static str| {
+        CellUnderTest::prepare(|config| {
+            let cell = config["cell"].as_table_mut().expect("a table");
+            cell.insert("name".into(), name.into());
+            cell.insert("runtime_dir".into(), base.path().display().to_string().into());
+        })
+    };
+    let mut first = prepare("first");
+    steady_weights(TILT_OUT).write(&first.weights()).expect("writable");
+    first.spawn("rt-controller");
+    let until = std::time::Instant::now() + Duration::from_secs(20);
+    while !base.path().join("first/controller").exists() {
+        assert!(std::time::Instant::now() < until, "{}", first.log("rt-controller"));
+        std::thread::sleep(Duration::from_millis(20));
+    }
+    let its = first.dir.path().canonicalize().expect("there");
+    let second = prepare("second");
+    let own = second.dir.path();
+    std::os::unix::fs::symlink(its.join("weights.bin"), own.join("link.bin")).expect("a link");
+    std::fs::hard_link(its.join("weights.bin"), own.join("hard.bin")).expect("a link");
+    std::os::unix::fs::symlink(&its, own.join("theirs")).expect("a link");
+    let text = std::fs::read_to_string(second.config()).expect("there");
+    for (key, mine, path) in [
+        ("controller.weights", "weights.bin", own.join("link.bin")),
+        ("controller.weights", "weights.bin", own.join("hard.bin")),
+        ("controller.weights", "weights.bin", own.join("theirs/weights.bin")),
+        ("controller.weights", "weights.bin", its.join("episodes/../weights.bin")),
+        ("controller.weights", "weights.bin", its.join("journal.bin")),
+        ("controller.journal", "journal.bin", its.join("journal.bin")),
+        ("the journal before, controller.journal", "journal.bin", its.join("journal.dat")),
+        ("recording.directory", "episodes", own.join("theirs/episodes")),
+    ] {
+        let other = text.replace(&own.join(mine).display().to_string(), &path.display().to_string());
+        assert_ne!(other, text);
+        std::fs::write(second.config(), other).expect("writable");
+        let output = second.command("rt-controller", &["run"]);
+        let said = said(&output);
+        assert_eq!(output.status.code(), Some(5), "{}: {said}", path.display());
+        assert!(said.contains(&format!("error: {key} = ")) && said.contains("cell 'first' uses it as"), "{}: {said}", path.display());
+    }
+    assert_eq!(first.stop("rt-controller"), Some(0), "the first has not noticed anything");
+}
+
+/// Protects whoever names a wrong file, and the machine's memory: a pipe, a device, a directory and a huge file in place of a configuration are refused in
+/// one line, at once.
+#[test]
+fn what_is_no_configuration_is_refused_at_once() {
+    let dir = tempfile::tempdir().expect("a directory");
+    let (pipe, huge) = (dir.path().join("a\npipe"), dir.path().join("huge"));
+    assert!(Command::new("mkfifo").arg(&pipe).status().expect("coreutils").success());
+    std::fs::File::create(&huge).and_then(|f| f.set_len(6 << 30)).expect("sparse");
+    for file in [&pipe, &huge, dir.path(), Path::new("/dev/zero")] {
+        for (name, words) in [
+            ("rt-controller", &["run"][..]),
+            ("rt-controller", &["status"]),
+            ("feature-worker", &["run"]),
+            ("operator-page", &["run"]),
+            ("decant", &["metrics"]),
+        ] {
+            let mut command = Command::new("timeout");
+            let output = command.arg("30").arg(program(name)).args(words).arg("--config").arg(file).output().expect("coreutils");
+            let said = String::from_utf8_lossy(&output.stderr);
+            assert_eq!((output.status.code(), said.lines().count()), (Some(2), 1), "{name} {}: {said}", file.display());
+            assert!(said.contains("is not a regular file") || said.contains("bytes are too many"), "{name} {}: {said}", file.display());
+        }
+    }
+}

@@ -7,7 +7,12 @@ use trainer::cli::{Cli, Command};
 use trainer::commands::{check, inspect, plan, refine, report, train};
 
 fn main() -> ExitCode {
-    shared::exit::end(match Cli::parse().command {
+    shared::exit::explain_panics("trainer");
+    let command = Cli::parse().command;
+    if matches!(command, Command::Inspect(_) | Command::Check(_) | Command::Plan(_)) {
+        shared::os::end_when_nobody_reads();
+    }
+    shared::exit::end(match command {
         Command::Train(args) => train::run(&args),
         Command::Refine(args) => refine::run(&args),
         Command::Inspect(args) => inspect::run(&args),

@@ -117,6 +117,49 @@ fn wrong_files_are_refused_in_one_line() {
     }
 }
 
+/// Protects what a person names by mistake, and the machine: a file of another kind and a device are never replaced, and what is no file holds no command.
+/// A page whose place is taken is refused too. Nothing is left beside.
+#[test]
+fn a_slip_of_the_finger_costs_nothing() {
+    let dir = tempfile::tempdir().unwrap();
+    tables(dir.path(), 2, |_, w| w);
+    for name in ["pipe", "pipe.csv", "pipe.json"] {
+        assert!(Command::new("mkfifo").arg(dir.path().join(name)).status().unwrap().success());
+    }
+    std::os::unix::fs::symlink("/dev/null", dir.path().join("device")).unwrap();
+    std::fs::File::create(dir.path().join("huge.csv")).and_then(|f| f.set_len(6 << 30)).unwrap();
+    std::fs::write(dir.path().join("e.mcap"), "an episode").unwrap();
+    std::fs::write(dir.path().join("new.bin.json"), "notes").unwrap();
+    std::fs::write(dir.path().join("t.json"), r#"{"kind":"training"}"#).unwrap();
+    let train = ["train", "f.csv", "--scale", "s.csv", "--out"];
+    let before = std::fs::read_dir(dir.path()).unwrap().count();
+    for (args, words) in [
+        ([&train[..], &["e.mcap"]].concat(), "e.mcap: cannot be written: is a file of another kind"),
+        ([&train[..], &["pipe"]].concat(), "is not a regular file"),
+        ([&train[..], &["device"]].concat(), "is not a regular file"),
+        ([&train[..], &["new.bin"]].concat(), "new.bin.json: is a file of another kind"),
+        (vec!["check", "pipe.csv", "--scale", "s.csv"], "is not a regular file"),
+        (vec!["check", "f.csv", "--scale", "pipe.csv"], "is not a regular file"),
+        (vec!["check", "f.csv", "--scale", "huge.csv"], "bytes are too many"),
+        (vec!["report", "pipe.json", "--out", "r.html"], "is not a regular file"),
+        (vec!["plan", "f.csv", "--scale", "s.csv", "--goal-max", "inf"], "--goal-max 1 to 5000 ml"),
+    ] {
+        let out = trainer(dir.path(), &args);
+        let said = text(&out.stderr);
+        assert_eq!((out.status.code(), said.lines().count()), (Some(2), 1), "{args:?}: {said}");
+        assert!(said.contains(words), "{args:?}: {said}");
+    }
+    assert_eq!(std::fs::read(dir.path().join("e.mcap")).unwrap(), b"an episode");
+    assert_eq!(std::fs::read_dir(dir.path()).unwrap().count(), before);
+
+    let full = std::fs::File::options().write(true).open("/dev/full").unwrap();
+    let mut command = Command::new(env!("CARGO_BIN_EXE_trainer"));
+    let out = command.current_dir(dir.path()).args(["check", "f.csv", "--scale", "s.csv"]).stdout(full).output().unwrap();
+    let said = text(&out.stderr);
+    assert_eq!((out.status.code(), said.lines().count()), (Some(1), 1), "{said}");
+    assert!(said.starts_with("error: standard output cannot be written: No space left"), "{said}");
+}
+
 /// Protects "offline means offline": nothing of the simulator is in the trainer.
 #[test]
 fn the_trainer_knows_no_simulator() {

@@ -228,7 +228,7 @@ fn faults_are_named() {
     type Case = (&'static str, fn(&mut TrainingEpisode));
     let cases: [Case; 9] = [
         ("no weight", |e| e.weight_g = f64::NAN),
-        ("a finite number of at least 0", |e| e.weight_g = -3.0),
+        ("from 0 to 50000", |e| e.weight_g = -3.0),
         ("nothing was poured", |e| e.weight_g = 0.0),
         ("no stream was ever seen", |e| e.area_px2.fill(0.0)),
         ("unequal lengths", |e| _ = e.alpha_deg.pop()),

@@ -8,6 +8,7 @@ use std::os::unix::fs::{OpenOptionsExt as _, PermissionsExt as _};
 use std::path::Path;
 
 use sha2::{Digest as _, Sha256};
+use shared::regular_file;
 
 /// Random bytes of a token: 128 bits cannot be guessed over a network.
 const BYTES: u64 = 16;
@@ -19,9 +20,9 @@ const LEAST: usize = 16;
 /// The token in `file`, which is made if it is not there. The second value tells whether it was made now.
 pub fn read_or_make(file: &Path) -> Result<(String, bool), String> {
     let fail = |e: std::io::Error| format!("{}: {e}", file.display());
-    match OpenOptions::new().read(true).open(file) {
-        Ok(open) => {
-            let mode = open.metadata().map_err(fail)?.permissions().mode();
+    match regular_file::open(file) {
+        Ok((open, meta)) => {
+            let mode = meta.permissions().mode();
             if mode & 0o077 != 0 {
                 return Err(format!(
                     "{}: others may read it; run `chmod 600` on it, or delete it, so that a new one is made",
@@ -47,8 +48,12 @@ pub fn read_or_make(file: &Path) -> Result<(String, bool), String> {
                 std::fs::create_dir_all(parent).map_err(fail)?;
             }
             let mut new = OpenOptions::new().write(true).create_new(true).mode(0o600).open(file).map_err(fail)?;
-            new.set_permissions(Permissions::from_mode(0o600)).map_err(fail)?;
-            writeln!(new, "{token}").map_err(fail)?;
+            let written = new.set_permissions(Permissions::from_mode(0o600)).and_then(|()| writeln!(new, "{token}"));
+            written.map_err(|e| {
+                // An empty one would keep the next start from making its own.
+                let _ = std::fs::remove_file(file);
+                fail(e)
+            })?;
             Ok((token, true))
         }
         Err(e) => Err(fail(e)),

@@ -10,8 +10,7 @@ use std::path::PathBuf;
 use std::sync::atomic::Ordering::Relaxed;
 use std::time::{Duration, Instant};
 
-use opencv::core::{Mat, Vector};
-use opencv::imgcodecs;
+use opencv::core::Mat;
 use opencv::prelude::*;
 use shared::config::{CameraConfig, Config, ImageConfig, LiquidMethod};
 use shared::exit::{self, Failure, OrExit as _, failure};
@@ -20,7 +19,7 @@ use shared::messages::PixelFormat;
 use shared::os;
 use web::{Answer, Server, Settings};
 
-use crate::drawing::{draw, jpeg};
+use crate::drawing::{draw, jpeg, save};
 use crate::source::{FrameSource as _, NextFrame, ObserverSource, WAIT};
 use crate::vision::{Axes, AxesError, ColourError, ColourLearner, Corner, Extractor, Image, find_corner};
 
@@ -32,6 +31,8 @@ use pour::Pour;
 
 /// The most pictures of one pose from which the colour is learned. Chosen by hand: as many as a turning background leaves in one pose.
 const PICTURES_OF_A_POSE: usize = 4;
+/// Farthest place of a point that is clicked or given, px: twice the largest picture's size.
+const FAR_PX: f32 = 8192.0;
 /// The region's left border, top, right border and bottom from the lip, px of a picture 640 px wide. Chosen by hand; no
 /// measurement is recorded.
 const REGION_PX: [f32; 4] = [-40.0, -236.0, 380.0, 50.0];
@@ -88,7 +89,8 @@ pub struct Args {
 
 fn parse_point(text: &str) -> Result<[f32; 2], String> {
     let parts: Vec<f32> = text.split(',').map_while(|p| p.trim().parse().ok()).collect();
-    <[f32; 2]>::try_from(parts).map_err(|_| "give two numbers, X,Y in px".into())
+    let point = <[f32; 2]>::try_from(parts).ok().filter(|point| point.iter().all(|px| px.abs() <= FAR_PX));
+    point.ok_or_else(|| "give two numbers, X,Y in px".into())
 }
 
 /// Runs the command.
@@ -248,8 +250,7 @@ fn save_picture(args: &Args, config: &Config, pictures: &[Mat]) -> Result<(), Fa
     if let Some(parent) = args.picture.parent() {
         std::fs::create_dir_all(parent).map_err(|e| fail(e.to_string()))?;
     }
-    let written = imgcodecs::imwrite(&args.picture, &picture, &Vector::new()).map_err(|e| fail(e.message))?;
-    if written { Ok(()) } else { Err(fail("cannot be written; give another --picture".into())) }
+    save(&picture, &args.picture).map_err(|e| fail(format!("{e}; give another --picture")))
 }
 
 /// Serves the page until "Write" or Ctrl-C. `good` tells whether `config` passed all checks; nothing else is written.

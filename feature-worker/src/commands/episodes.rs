@@ -9,6 +9,7 @@ use clap::Subcommand;
 use serde_json::{Value, json};
 use shared::episode::{Episode, EpisodeError, EpisodeKind, set_weight};
 use shared::exit::{self, Failure, OrExit as _, failure};
+use shared::level::plain;
 use shared::plural::counted;
 
 use crate::episodes::export::{ExportFormat, Exported, export};
@@ -108,17 +109,18 @@ fn list(files: &[PathBuf], as_json: bool) -> Result<(), Failure> {
         println!("{:<24} {:<20} {:>7} {:>6} {:>8}  {:<10} what", "episode", "started (UTC)", "seconds", "frames", "weight g", "state");
         for (file, result) in files.iter().zip(&read) {
             let name = file.file_name().unwrap_or(file.as_os_str()).to_string_lossy();
+            let name = plain(&name);
             match result {
                 Ok(e) => println!(
                     "{name:<24} {:<20} {:>7.1} {:>6} {:>8}  {:<10} {}",
-                    e.info.started_at_utc,
+                    plain(&e.info.started_at_utc),
                     e.seconds(),
                     e.rows.len(),
                     e.weight_g.map_or("-".into(), |w| w.to_string()),
                     if e.complete { "complete" } else { "INCOMPLETE" },
                     kind_words(e.kind)
                 ),
-                Err(e) => println!("{name:<24} UNREADABLE: {e}"),
+                Err(e) => println!("{name:<24} UNREADABLE: {}", plain(&e.to_string())),
             }
         }
         println!("{}", counted(files.len(), "episode"));
@@ -139,11 +141,11 @@ fn show(files: &[PathBuf], as_json: bool) -> Result<(), Failure> {
         print_json(&value);
         return Ok(());
     }
-    println!("{}", file.display());
+    println!("{}", plain(&file.display().to_string()));
     println!("  run        {}", kind_words(episode.kind));
-    println!("  started    {} in cell '{}'", episode.info.started_at_utc, episode.info.cell);
+    println!("  started    {} in cell '{}'", plain(&episode.info.started_at_utc), plain(&episode.info.cell));
     if !episode.info.note.is_empty() {
-        println!("  note       {}", episode.info.note);
+        println!("  note       {}", plain(&episode.info.note));
     }
     println!("  weight     {}", episode.weight_g.map_or("not weighed yet".into(), |w| format!("{w} g")));
     println!("  state      {}", if episode.complete { "complete" } else { "INCOMPLETE" });
@@ -156,10 +158,10 @@ fn show(files: &[PathBuf], as_json: bool) -> Result<(), Failure> {
     );
     println!("  images     {} ({} dropped)", episode.info.images, episode.info.dropped_images);
     println!("  ticks      {} ({} missing)", episode.info.ticks, episode.info.lost_ticks);
-    println!("  config     {}", episode.info.config_sha256);
-    println!("  weights    {}", if episode.info.weights.is_empty() { "none" } else { &episode.info.weights });
+    println!("  config     {}", plain(&episode.info.config_sha256));
+    println!("  weights    {}", if episode.info.weights.is_empty() { "none".into() } else { plain(&episode.info.weights) });
     for remark in remarks(&episode) {
-        println!("  {} {}", if remark.is_wrong { "WRONG     " } else { "note      " }, remark.text);
+        println!("  {} {}", if remark.is_wrong { "WRONG     " } else { "note      " }, plain(&remark.text));
     }
     Ok(())
 }
@@ -211,9 +213,9 @@ fn check(files: &[PathBuf], as_json: bool) -> Result<(), Failure> {
         print_json(&json!({ "episodes": all.iter().map(line).collect::<Vec<_>>(), "usable": all.len() - wrong }));
     } else {
         for file in &all {
-            println!("{}: {}", file.name, if file.is_wrong() { "WRONG" } else { "good" });
+            println!("{}: {}", plain(&file.name), if file.is_wrong() { "WRONG" } else { "good" });
             for remark in &file.remarks {
-                println!("  {} {}", if remark.is_wrong { "wrong:" } else { "note: " }, remark.text);
+                println!("  {} {}", if remark.is_wrong { "wrong:" } else { "note: " }, plain(&remark.text));
             }
         }
         println!("{} of {} can be trained on", all.len() - wrong, counted(all.len(), "episode"));
@@ -230,7 +232,7 @@ fn weigh(args: &WeighArgs) -> Result<(), Failure> {
         print_json(&json!({ "file": args.file.display().to_string(), "weight_g": args.weight, "before_g": before }));
     } else {
         let before = before.map_or("had none before".into(), |b| format!("was {b} g"));
-        println!("{}: {} g ({before})", args.file.display(), args.weight);
+        println!("{}: {} g ({before})", plain(&args.file.display().to_string()), args.weight);
     }
     Ok(())
 }
@@ -247,10 +249,10 @@ fn run_export(args: &ExportArgs) -> Result<(), Failure> {
         print_json(&json!({ "written": written.iter().map(|p| shown(p)).collect::<Vec<_>>(), "left_out": left_out }));
     } else {
         for path in &written {
-            println!("{}", shown(path));
+            println!("{}", plain(&shown(path)));
         }
         for one in &left_out {
-            println!("left out: {}", one.why);
+            println!("left out: {}", plain(&one.why));
         }
     }
     match left_out.len() {

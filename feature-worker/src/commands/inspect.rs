@@ -3,17 +3,16 @@
 //! An ordinary command-line program that allocates. An input that cannot be read, or has another size than configured, ends it with one
 //! line that says what to do.
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use indicatif::ProgressBar;
-use opencv::core::Vector;
-use opencv::imgcodecs;
 use shared::config::{CameraConfig, Config};
-use shared::exit::{self, Failure, OrExit as _};
+use shared::exit::{self, Failure, OrExit as _, failure};
 use shared::messages::{Doubt, FrameHeader, PixelFormat};
 use shared::plural::counted;
+use shared::whole_file;
 
-use crate::drawing::{draw, to_bgr};
+use crate::drawing::{draw, save, to_bgr};
 use crate::source::{Frame, for_each_frame};
 use crate::vision::{Extractor, Image, Measurement};
 
@@ -67,21 +66,22 @@ impl Totals {
 /// Runs the command.
 pub fn run(args: &Args) -> Result<(), Failure> {
     let config = Config::read(&args.config).or_exit(exit::BAD_INPUT)?;
-    inspect(args, &config).or_exit(exit::BAD_INPUT)
+    inspect(args, &config)
 }
 
 fn words(e: impl std::fmt::Display) -> String {
     e.to_string()
 }
 
-fn inspect(args: &Args, config: &Config) -> Result<(), String> {
-    let mut extractor = Extractor::new(&config.camera, &config.image).map_err(words)?;
-    std::fs::create_dir_all(&args.out).map_err(|e| format!("{}: {e}; give another --out", args.out.display()))?;
+fn inspect(args: &Args, config: &Config) -> Result<(), Failure> {
+    let mut extractor = Extractor::new(&config.camera, &config.image).or_exit(exit::BAD_INPUT)?;
+    let unwritten = |path: &Path, e: &dyn std::fmt::Display| format!("{}: {e}; make room, or give another --out", path.display());
+    std::fs::create_dir_all(&args.out).map_err(|e| unwritten(&args.out, &e)).or_exit(exit::FAILED)?;
     let table = args.out.join("features.csv");
-    // The table gets its name when it is whole.
-    let unfinished = args.out.join("features.csv.part");
-    let mut csv = csv::Writer::from_path(&unfinished).map_err(|e| format!("{}: {e}", table.display()))?;
-    csv.write_record(["frame", "t_s", "area_px2", "confidence", "doubt", "x0", "y0", "x1", "y1", "x2", "y2"]).map_err(words)?;
+    // The table is kept until it is whole: some hundred bytes a frame.
+    let mut csv = csv::Writer::from_writer(Vec::new());
+    csv.write_record(["frame", "t_s", "area_px2", "confidence", "doubt", "x0", "y0", "x1", "y1", "x2", "y2"]).or_exit(exit::FAILED)?;
+    let mut code = exit::BAD_INPUT;
     let bar = ProgressBar::new_spinner().with_message("frames");
     let mut totals = Totals::default();
     let contents = for_each_frame(&args.input, config.camera.fps, args.partial, |frame| {
@@ -92,12 +92,17 @@ fn inspect(args: &Args, config: &Config) -> Result<(), String> {
             let mut picture = to_bgr(&frame).map_err(words)?;
             draw(&mut picture, &extractor, &measured).map_err(words)?;
             let path = args.out.join(format!("frame_{:06}.png", frame.header.sequence));
-            imgcodecs::imwrite(&path, &picture, &Vector::new()).map_err(words)?;
+            save(&picture, &path).map_err(|e| {
+                code = exit::FAILED;
+                unwritten(&path, &e)
+            })?;
         }
         bar.inc(1);
         Ok(())
-    })?;
-    csv.flush().and_then(|()| std::fs::rename(&unfinished, &table)).map_err(|e| format!("{}: {e}", table.display()))?;
+    });
+    let contents = contents.map_err(|what| failure(code, what))?;
+    let rows = csv.into_inner().map_err(|e| e.to_string()).or_exit(exit::FAILED)?;
+    whole_file::replace(&table, &rows, b"frame,").map_err(|e| unwritten(&table, &e)).or_exit(exit::FAILED)?;
     bar.finish_and_clear();
     let Totals { flowing, doubtful, sum_px2 } = totals;
     let frames = contents.frames;

@@ -11,7 +11,7 @@ use shared::episode::{Episode, EpisodeImages, write_table};
 use shared::plural::counted;
 
 use super::lerobot;
-use super::output::{ExportError, LeftOut, write_error};
+use super::output::{ExportError, LeftOut, disk_error, write_error};
 use super::video::{Video, for_each_row_with_image, mean_rate_hz};
 
 /// What an export writes.
@@ -52,7 +52,7 @@ pub fn export(files: &[PathBuf], format: ExportFormat, to: &Path) -> Result<Expo
             Some(first) => format!("none of {} can be read; {}", counted(files.len(), "episode"), first.why),
         }));
     }
-    fs::create_dir_all(to).map_err(|e| write_error(to, e))?;
+    fs::create_dir_all(to).map_err(|e| disk_error(to, &e))?;
     if format == ExportFormat::Csv {
         let pair = [to.join("features.csv"), to.join("scale.csv")];
         let episodes: Vec<Episode> = episodes.into_iter().map(|(_, episode)| episode).collect();
@@ -94,15 +94,21 @@ fn progress(total: u64) -> ProgressBar {
 
 /// Writes the images of one episode into the new directory `target`, as they were recorded.
 fn pictures(file: &Path, target: &Path, bar: &ProgressBar) -> Result<PathBuf, ExportError> {
-    fs::create_dir(target).map_err(|e| write_error(target, e))?;
-    for image in EpisodeImages::open(file)? {
-        let image = image?;
-        let extension = if image.format == "png" { "png" } else { "jpg" };
-        let path = target.join(format!("frame-{:08}.{extension}", image.sequence));
-        fs::write(&path, &image.data).map_err(|e| write_error(&path, e))?;
-        bar.inc(1);
-    }
-    Ok(target.to_path_buf())
+    fs::create_dir(target).map_err(|e| disk_error(target, &e))?;
+    let write = || {
+        for image in EpisodeImages::open(file)? {
+            let image = image?;
+            let extension = if image.format == "png" { "png" } else { "jpg" };
+            let path = target.join(format!("frame-{:08}.{extension}", image.sequence));
+            fs::write(&path, &image.data).map_err(|e| disk_error(&path, &e))?;
+            bar.inc(1);
+        }
+        Ok(target.to_path_buf())
+    };
+    write().inspect_err(|_| {
+        // It was not there before, so it is ours, and a part of an episode would look like all of it.
+        let _ = fs::remove_dir_all(target);
+    })
 }
 
 /// Writes the images of one episode as the new video `target`.

@@ -15,6 +15,7 @@ use indicatif::ProgressBar;
 use parquet::file::metadata::KeyValue;
 use serde_json::{Value, json};
 use shared::episode::{Episode, EpisodeKind, EpisodeRow};
+use shared::whole_file;
 
 use super::output::{ExportError, LeftOut, make_parent, write_error};
 use super::video::{USUAL_RATE_HZ, Video, for_each_row_with_image, mean_rate_hz};
@@ -369,5 +370,5 @@ impl EpisodeTable {
 
 fn write_json(path: &Path, value: &Value) -> Result<(), ExportError> {
     make_parent(path)?;
-    fs::write(path, format!("{value:#}\n")).map_err(|e| write_error(path, e))
+    whole_file::create(path, format!("{value:#}\n").as_bytes()).map_err(|e| write_error(path, e))
 }

@@ -4,6 +4,7 @@
 use std::fs;
 use std::path::{Path, PathBuf};
 
+use shared::disk_space::error_words;
 use shared::episode::{EpisodeError, TableError};
 
 /// Why an export failed.
@@ -42,8 +43,13 @@ pub fn write_error(path: &Path, what: impl std::fmt::Display) -> ExportError {
     ExportError::Write { path: path.display().to_string(), what: what.to_string() }
 }
 
+/// The error of the disk in writing `path`: a full one is called so.
+pub fn disk_error(path: &Path, e: &std::io::Error) -> ExportError {
+    write_error(path, error_words(e))
+}
+
 /// Makes the directory in which `path` will lie.
 pub fn make_parent(path: &Path) -> Result<(), ExportError> {
     let parent = path.parent().unwrap_or(path);
-    fs::create_dir_all(parent).map_err(|e| write_error(parent, e))
+    fs::create_dir_all(parent).map_err(|e| disk_error(parent, &e))
 }

@@ -12,9 +12,10 @@ use std::time::{Duration, SystemTime};
 
 use sha2::{Digest, Sha256};
 use shared::episode::{Episode, hex, take_number};
+use shared::{regular_file, whole_file};
 
 use super::folder::Budget;
-use super::output::{ExportError, LeftOut, write_error};
+use super::output::{ExportError, LeftOut, disk_error, write_error};
 
 /// A file without its end that changed more recently than this counts as under way, also where the file system has no locks. Chosen by hand:
 /// the recorder writes twice a second.
@@ -40,7 +41,7 @@ pub fn look(path: &Path) -> Result<Found, LeftOut> {
     if !meta.is_file() {
         return Err(refuse("it is a link or no regular file"));
     }
-    let file = File::open(path).map_err(|e| refuse(&e.to_string()))?;
+    let (file, _) = regular_file::open(path).map_err(|e| refuse(&e.to_string()))?;
     match file.try_lock() {
         Ok(()) => {}
         Err(fs::TryLockError::WouldBlock) => return Err(refuse("it is being written")),
@@ -100,8 +101,8 @@ pub struct Copied {
     pub left_out: Vec<LeftOut>,
 }
 
-/// Reads `files`. The same measurement twice is taken once.
-fn distinct(files: &[PathBuf], copied: &mut Copied) -> Vec<(PathBuf, Episode)> {
+/// Reads `files`. The same measurement twice is taken once. It is an error if there is none.
+fn distinct(files: &[PathBuf], copied: &mut Copied) -> Result<Vec<(PathBuf, Episode)>, ExportError> {
     let mut all: Vec<(PathBuf, Episode)> = Vec::new();
     for file in files {
         match Episode::read(file) {
@@ -115,16 +116,19 @@ fn distinct(files: &[PathBuf], copied: &mut Copied) -> Vec<(PathBuf, Episode)> {
             Err(e) => copied.left_out.push(LeftOut { file: file.clone(), why: e.to_string() }),
         }
     }
-    all
+    if all.is_empty() && copied.left_out.is_empty() {
+        return Err(ExportError::Nothing("no episodes to copy; name .mcap files or a directory of them".into()));
+    }
+    Ok(all)
 }
 
 /// Copies all episodes of `files` into the directory `to`, in the order of their start, each with the next number that is free there.
 pub fn merge(files: &[PathBuf], to: &Path) -> Result<Copied, ExportError> {
     let mut copied = Copied::default();
-    let mut all = distinct(files, &mut copied);
+    let mut all = distinct(files, &mut copied)?;
     all.sort_by(|a, b| a.1.info.started_at_utc.cmp(&b.1.info.started_at_utc));
     for (file, episode) in all {
-        let number = take_number(to).map_err(|e| write_error(to, e))?;
+        let number = take_number(to).map_err(|e| disk_error(to, &e))?;
         let new = to.join(format!("episode-{number:04}.mcap"));
         copy(&file, &episode, &new)?;
         copied.files.push((file, new));
@@ -136,7 +140,7 @@ pub fn merge(files: &[PathBuf], to: &Path) -> Result<Copied, ExportError> {
 /// on the measurements and on `seed` alone. What the shares leave is left out.
 pub fn split(files: &[PathBuf], to: &Path, shares: &[(String, f64)], seed: u64) -> Result<Copied, ExportError> {
     let mut copied = Copied::default();
-    let mut all = distinct(files, &mut copied);
+    let mut all = distinct(files, &mut copied)?;
     all.sort_by_cached_key(|(_, episode)| {
         let mut hash = Sha256::new();
         hash.update(seed.to_le_bytes());
@@ -149,7 +153,7 @@ pub fn split(files: &[PathBuf], to: &Path, shares: &[(String, f64)], seed: u64) 
         share += part;
         let until = (share * n).round() as usize;
         let directory = to.join(name);
-        fs::create_dir_all(&directory).map_err(|e| write_error(&directory, e))?;
+        fs::create_dir_all(&directory).map_err(|e| disk_error(&directory, &e))?;
         while taken < until
             && let Some((file, episode)) = all.next()
         {
@@ -169,16 +173,14 @@ pub fn split(files: &[PathBuf], to: &Path, shares: &[(String, f64)], seed: u64) 
 /// Copies an episode to the new file `new`, under a name that no program takes for an episode until it is whole and on the disk.
 fn copy(file: &Path, episode: &Episode, new: &Path) -> Result<(), ExportError> {
     let fail = |e: &dyn std::fmt::Display| write_error(new, e);
-    let name = new.file_name().unwrap_or_default().to_string_lossy().into_owned();
-    let part = new.with_file_name(format!(".{name}.{}.new", std::process::id()));
-    let made = fs::copy(file, &part).and_then(|_| File::open(&part)?.sync_all()).map_err(|e| fail(&e)).and_then(|()| {
+    let part = whole_file::beside(new).map_err(|e| fail(&e))?;
+    let made = fs::copy(file, &part).and_then(|_| File::open(&part)?.sync_all()).map_err(|e| disk_error(new, &e)).and_then(|()| {
         let after = Episode { name: episode.name.clone(), ..Episode::read(&part)? };
         // They are compared as text, because NaN is not equal to itself.
         if format!("{after:?}") != format!("{episode:?}") {
             return Err(fail(&"the copy differs from the original"));
         }
-        // Unlike a rename, a link never takes the place of a file that is there.
-        fs::hard_link(&part, new).map_err(|e| fail(&e))
+        whole_file::give_name(&part, new).map_err(|e| disk_error(new, &e))
     });
     // This is only ever our own file.
     let _ = fs::remove_file(&part);

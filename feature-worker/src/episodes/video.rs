@@ -6,15 +6,19 @@ use std::path::{Path, PathBuf};
 
 use opencv::core::{Mat, MatTraitConst, Size, Vector};
 use opencv::imgcodecs;
-use opencv::videoio::{VideoWriter, VideoWriterTrait, VideoWriterTraitConst};
+use opencv::videoio::{
+    CAP_FFMPEG, CAP_PROP_FRAME_COUNT, VideoCapture, VideoCaptureTraitConst, VideoWriter, VideoWriterTrait, VideoWriterTraitConst,
+};
 use shared::episode::{Episode, EpisodeError, EpisodeImage, EpisodeImages};
 
-use super::output::{ExportError, write_error};
+use super::output::{ExportError, disk_error, write_error};
 
 /// The rate of an episode that is too short to have one, frames a second: that of the usual camera.
 pub const USUAL_RATE_HZ: f64 = 30.0;
 /// The slowest and the fastest rate that a video gets, frames a second. Chosen by hand; they bound what a damaged time could give.
 const RATE_LIMITS_HZ: [f64; 2] = [1.0, 240.0];
+/// Bytes with which it is tried whether the disk takes a file at all. Chosen by hand: more than what some disks keep beside a file's name.
+const PROBE: usize = 64 * 1024;
 /// Codecs of an MP4 file, the best first: H.264 plays everywhere, and MPEG-4 is there where OpenCV's FFmpeg was built without H.264.
 const CODECS: [([char; 4], &str); 2] = [(['a', 'v', 'c', '1'], "h264"), (['m', 'p', '4', 'v'], "mpeg4")];
 
@@ -65,12 +69,14 @@ pub struct Video {
     fps: f64,
     writer: Option<(VideoWriter, Size)>,
     codec: &'static str,
+    /// Pictures so far.
+    pushed: u64,
 }
 
 impl Video {
     /// A video that will be written to `path` with `fps` frames a second. The file appears with the first image.
     pub fn new(path: &Path, fps: f64) -> Self {
-        Self { path: path.into(), fps, writer: None, codec: "" }
+        Self { path: path.into(), fps, writer: None, codec: "", pushed: 0 }
     }
 
     /// Adds an image.
@@ -79,9 +85,11 @@ impl Video {
         let picture = decode(image).map_err(fail)?;
         let size = picture.size().map_err(fail)?;
         if self.writer.is_none() {
+            // OpenCV says no more than that it cannot write, so the disk is asked first.
+            std::fs::write(&self.path, [0; PROBE]).map_err(|e| disk_error(&self.path, &e))?;
             for ([a, b, c, d], name) in CODECS {
                 let fourcc = VideoWriter::fourcc(a, b, c, d).map_err(fail)?;
-                let writer = VideoWriter::new_def(&self.path, fourcc, self.fps, size).map_err(fail)?;
+                let writer = VideoWriter::new_with_backend(&self.path, CAP_FFMPEG, fourcc, self.fps, size, true).map_err(fail)?;
                 if writer.is_opened().map_err(fail)? {
                     self.writer = Some((writer, size));
                     self.codec = name;
@@ -90,7 +98,10 @@ impl Video {
             }
         }
         match &mut self.writer {
-            Some((writer, first)) if *first == size => writer.write(&picture).map_err(fail),
+            Some((writer, first)) if *first == size => {
+                self.pushed += 1;
+                writer.write(&picture).map_err(fail)
+            }
             Some((_, first)) => Err(write_error(
                 &self.path,
                 format!("one image is {} x {} px, but those before it are {} x {} px", size.width, size.height, first.width, first.height),
@@ -112,8 +123,22 @@ impl Video {
     /// Closes the file.
     pub fn finish(mut self) -> Result<(), ExportError> {
         match &mut self.writer {
-            Some((writer, _)) => writer.release().map_err(|e| write_error(&self.path, e.message)),
-            None => Ok(()),
+            Some((writer, _)) => writer.release().map_err(|e| write_error(&self.path, e.message))?,
+            None => return Ok(()),
         }
+        self.check()
+    }
+
+    /// Looks whether the file is whole: OpenCV says nothing of a disk that was full.
+    fn check(&self) -> Result<(), ExportError> {
+        let count = || -> opencv::Result<f64> {
+            let video = VideoCapture::from_file(&self.path, CAP_FFMPEG)?;
+            if video.is_opened()? { video.get(CAP_PROP_FRAME_COUNT) } else { Ok(0.0) }
+        };
+        let found = count().unwrap_or(0.0);
+        if found == self.pushed as f64 {
+            return Ok(());
+        }
+        Err(write_error(&self.path, format!("has {found} of {} pictures: is the disk full?", self.pushed)))
     }
 }

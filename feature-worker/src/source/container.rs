@@ -10,6 +10,7 @@ use std::io::{Read as _, Seek as _, SeekFrom};
 use std::path::Path;
 
 use opencv::core::{self, Mat};
+use shared::regular_file;
 
 /// The largest index of an MP4 file that is read, bytes. Chosen by hand: an hour at 60 frames a second has about 3 MB.
 const INDEX_MOST: u64 = 1 << 26;
@@ -101,8 +102,8 @@ impl Container {
 
     /// What the file at `path` says.
     pub(super) fn read(path: &Path) -> std::io::Result<Self> {
-        let mut file = File::open(path)?;
-        let size = file.metadata()?.len();
+        let (mut file, meta) = regular_file::open(path)?;
+        let size = meta.len();
         let mut head = Vec::new();
         (&mut file).take(64).read_to_end(&mut head)?;
         let kind = |at: usize| head.get(at..at + 4).unwrap_or_default();

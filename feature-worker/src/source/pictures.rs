@@ -11,6 +11,7 @@ use opencv::core::{Mat, Vector};
 use opencv::imgcodecs;
 use opencv::prelude::*;
 use shared::plural::counted;
+use shared::regular_file;
 
 use super::frame::SourceError;
 
@@ -18,6 +19,9 @@ use super::frame::SourceError;
 const ENDINGS: [&str; 9] = ["png", "jpg", "jpeg", "bmp", "tif", "tiff", "pgm", "ppm", "webp"];
 /// The most numbers that an error lists. Chosen by hand: the line stays readable.
 const LIST_MOST: usize = 5;
+
+/// Largest file of a picture that is read, bytes. Chosen by hand: the largest picture that a camera may have takes 50 MB without compression.
+const FILE_MAX: u64 = 256 << 20;
 
 /// Whether `path` is a single picture by its name.
 pub(super) fn is_picture(path: &Path) -> bool {
@@ -37,11 +41,15 @@ pub(super) fn decode(bytes: &[u8], picture: &mut Mat) -> Result<(), String> {
 
 /// The picture in the file at `path`.
 pub(super) fn read(path: &Path, picture: &mut Mat) -> Result<(), String> {
-    let bytes = std::fs::read(path).map_err(|e| match e.kind() {
+    decode(&regular_file::read(path, FILE_MAX).map_err(|e| unreadable(&e))?, picture)
+}
+
+/// Why a file cannot be read, in words.
+pub(super) fn unreadable(e: &std::io::Error) -> String {
+    match e.kind() {
         std::io::ErrorKind::NotFound => "no such file".to_string(),
         _ => e.to_string(),
-    })?;
-    decode(&bytes, picture)
+    }
 }
 
 /// What is missing at the end of a JPEG or PNG. OpenCV shows the first part of such a JPEG as a picture.

@@ -7,7 +7,7 @@ use std::collections::HashMap;
 use std::path::Path;
 
 use opencv::core::Mat;
-use shared::episode::{Episode, EpisodeImages};
+use shared::episode::{Episode, EpisodeError, EpisodeImages};
 use shared::plural::counted;
 
 use super::frame::SourceError;
@@ -34,8 +34,10 @@ impl Recorded {
     pub(super) fn open(path: &Path, partial: bool) -> Result<Self, SourceError> {
         let name = path.display().to_string();
         let fail = |what: String| SourceError::File { path: name.clone(), what };
-        let episode = Episode::read(path).map_err(|e| fail(e.to_string()))?;
-        let images = EpisodeImages::open(path).map_err(|e| fail(e.to_string()))?;
+        // The error names the file, and so does the source's.
+        let unread = |e: EpisodeError| fail(e.to_string().trim_start_matches(&format!("{name}: ")).to_owned());
+        let episode = Episode::read(path).map_err(unread)?;
+        let images = EpisodeImages::open(path).map_err(unread)?;
         let Some(first) = episode.rows.first() else { return Err(fail("the episode has no frames".into())) };
         let mut missing = Vec::new();
         if !episode.complete {

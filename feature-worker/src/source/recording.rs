@@ -40,7 +40,11 @@ impl Recording {
         } else if pictures::is_picture(path) {
             Kind::Sequence(Sequence::single(path, partial))
         } else {
-            Kind::Video(Box::new(Video::open(&path.display().to_string(), partial)?))
+            let name = path.to_str().ok_or_else(|| SourceError::File {
+                path: path.display().to_string(),
+                what: "its name is no text in UTF-8, so OpenCV cannot open it: give it another name".into(),
+            })?;
+            Kind::Video(Box::new(Video::open(name, partial)?))
         };
         Ok(Self { path: path.display().to_string(), kind, rate_hz })
     }

@@ -11,6 +11,7 @@ use opencv::videoio::{self, VideoCapture};
 
 use super::container::{Container, Turn};
 use super::frame::SourceError;
+use super::pictures::unreadable;
 
 /// Periods that the end of the last picture may lie before the end of the video. Chosen by hand: rounding, and a sound track's padding.
 const END_PERIODS: f64 = 2.5;
@@ -78,10 +79,7 @@ impl Video {
     /// Opens the video at `path`. With `partial`, what is missing is counted and is no error.
     pub(super) fn open(path: &str, partial: bool) -> Result<Self, SourceError> {
         let fail = |what: String| SourceError::File { path: path.into(), what };
-        if !std::path::Path::new(path).exists() {
-            return Err(fail("no such file".into()));
-        }
-        let container = Container::read(path.as_ref()).map_err(|e| fail(e.to_string()))?;
+        let container = Container::read(path.as_ref()).map_err(|e| fail(unreadable(&e)))?;
         let opened = VideoCapture::from_file(path, videoio::CAP_FFMPEG).map_err(|e| fail(format!("cannot be opened: {}", e.message)))?;
         let mut capture = opened;
         if !capture.is_opened()? {

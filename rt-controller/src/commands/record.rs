@@ -40,6 +40,8 @@ pub struct Args {
 /// Runs the command.
 pub fn run(args: &Args) -> Result<(), Failure> {
     let config = Config::read(&args.common.config).or_exit(exit::BAD_INPUT)?;
+    // It is known before anything moves that the weight can be written.
+    let given_g = args.weight.map(|g| check_reading(g).map_err(|e| format!("--weight {g}: {e}"))).transpose().or_exit(exit::BAD_INPUT)?;
     let own = Curve::from_upright(args.lambda, args.gamma);
     let curve = Curve { beta_s: args.beta.unwrap_or(own.beta_s), ..own };
     let (outcome, recorded) = pour::order(&config.cell, &Request::Record(curve))?;
@@ -52,7 +54,7 @@ pub fn run(args: &Args) -> Result<(), Failure> {
             return Err(failure(exit::UNREACHABLE, what));
         }
     };
-    let weight_g = args.weight.or_else(ask_weight);
+    let weight_g = given_g.or_else(ask_weight);
     if let Some(weight_g) = weight_g {
         set_weight(Path::new(&file), weight_g).or_exit(exit::FAILED)?;
     }

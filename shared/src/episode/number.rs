@@ -33,9 +33,11 @@ pub fn take_number(directory: &Path) -> Result<u64> {
     (&file).take(32).read_to_string(&mut text)?;
     let given: u64 = text.trim().parse().unwrap_or(0);
     let number = given.max(highest(directory, DEPTH)?) + 1;
+    // The number before is written over, and not taken away first: a disk that is full then leaves it.
+    let text = format!("{number}\n");
     file.rewind()?;
-    file.set_len(0)?;
-    writeln!(file, "{number}")?;
+    file.write_all(text.as_bytes())?;
+    file.set_len(text.len() as u64)?;
     file.sync_data()?;
     Ok(number)
 }

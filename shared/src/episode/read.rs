@@ -14,7 +14,7 @@ use super::format::{self, CompressedImage, RowMessage, TelemetryMessage};
 use super::format_1;
 use super::records::{EpisodeError, NextRecord, Records};
 use super::rows::{EpisodeRow, EpisodeTrack, LostFrames, alpha_between_deg};
-use super::weight::check_reading;
+use super::weight::check_kept;
 use super::{Episode, EpisodeInfo, EpisodeKind};
 use crate::gaussian_curve::Curve;
 use crate::messages::Doubt;
@@ -102,7 +102,7 @@ impl Contents {
             return Ok(None);
         }
         let grams: f64 = self.number(format::META_WEIGHT, "grams")?;
-        check_reading(grams).map(Some).map_err(|e| format!("metadata 'weight': grams = {grams}: {e}"))
+        check_kept(grams).map(Some).map_err(|e| format!("metadata 'weight': grams = {grams}: {e}"))
     }
 
     /// The rows of the episode; those of lost frames are filled in.

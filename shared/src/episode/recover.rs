@@ -9,8 +9,11 @@ use std::path::Path;
 use mcap::records::Metadata;
 
 use super::records::NextRecord;
-use super::rewrite::{ChangeError, beside, copy, sync_directory};
+use super::rewrite::{ChangeError, copy};
+use super::write::mcap_words;
 use super::{Episode, EpisodeInfo, format};
+use crate::disk_space::error_words;
+use crate::whole_file;
 
 /// How a recovered episode is said to have ended, if its own end is missing.
 const REASON: &str = "its end is missing: it was recovered from a file that was cut";
@@ -20,7 +23,7 @@ const REASON: &str = "its end is missing: it was recovered from a file that was 
 pub fn recover(old: &Path, new: &Path) -> Result<Episode, ChangeError> {
     let original = Episode::read(old)?;
     let fail = |what: String| ChangeError::Write { file: new.display().to_string(), what };
-    let temporary = beside(new);
+    let temporary = whole_file::beside(new).map_err(|e| fail(e.to_string()))?;
     let result = copy(old, &temporary, None, |writer, end| {
         if !matches!(end, NextRecord::Cut) {
             return Err(ChangeError::Whole { file: old.display().to_string() });
@@ -29,7 +32,7 @@ pub fn recover(old: &Path, new: &Path) -> Result<Episode, ChangeError> {
             return Ok(());
         }
         let metadata = [("complete".to_string(), "false".to_string()), ("reason".to_string(), REASON.to_string())].into();
-        writer.write_metadata(&Metadata { name: format::META_END.into(), metadata }).map_err(|e| fail(e.to_string()))
+        writer.write_metadata(&Metadata { name: format::META_END.into(), metadata }).map_err(|e| fail(mcap_words(&e)))
     })
     .and_then(|()| {
         let after = Episode::read(&temporary)?;
@@ -39,9 +42,7 @@ pub fn recover(old: &Path, new: &Path) -> Result<Episode, ChangeError> {
         if format!("{after:?}") != format!("{expected:?}") {
             return Err(fail("the copy differs from the original".into()));
         }
-        // Unlike a rename, a link never takes the place of a file that is there.
-        std::fs::hard_link(&temporary, new).map_err(|e| fail(e.to_string()))?;
-        sync_directory(new).map_err(|e| fail(e.to_string()))?;
+        whole_file::give_name(&temporary, new).map_err(|e| fail(error_words(&e)))?;
         Ok(Episode { name: new.display().to_string(), ..after })
     });
     // This is only ever our own file.

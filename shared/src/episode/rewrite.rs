@@ -6,14 +6,17 @@
 
 use std::fs::{File, OpenOptions};
 use std::io::BufWriter;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
 use mcap::records::{Metadata, Record};
-use mcap::{WriteOptions, Writer};
+use mcap::{McapError, WriteOptions, Writer};
 
 use super::Episode;
 use super::records::{EpisodeError, NextRecord, Records};
 use super::weight::WeightError;
+use super::write::mcap_words;
+use crate::disk_space::error_words;
+use crate::whole_file;
 
 /// Number of bytes that are written at a time. Chosen by hand; no measurement is recorded.
 const WRITE_BYTES: usize = 1 << 20;
@@ -70,14 +73,14 @@ pub(super) fn set_metadata(
     // If the path is a link, the file that it leads to is replaced, and not the link.
     let path = path.canonicalize().map_err(|e| EpisodeError::Read { file: shown.clone(), what: e.to_string() })?;
     let before = Episode::read(&path)?;
-    let temporary = beside(&path);
+    let temporary = whole_file::beside(&path).map_err(|e| ChangeError::Write { file: shown, what: e.to_string() })?;
     let fail = |what: String| ChangeError::Write { file: temporary.display().to_string(), what };
     let result = copy(&path, &temporary, Some(name), |writer, end| {
         if !matches!(end, NextRecord::End) {
             return Err(ChangeError::Cut { file: path.display().to_string() });
         }
         let metadata = [(key.to_string(), value)].into();
-        writer.write_metadata(&Metadata { name: name.into(), metadata }).map_err(|e| fail(e.to_string()))
+        writer.write_metadata(&Metadata { name: name.into(), metadata }).map_err(|e| fail(mcap_words(&e)))
     })
     .and_then(|()| {
         let after = Episode::read(&temporary)?;
@@ -86,8 +89,9 @@ pub(super) fn set_metadata(
         if format!("{after:?}") != format!("{expected:?}") {
             return Err(fail("the copy differs from the original".into()));
         }
-        std::fs::rename(&temporary, &path).map_err(|e| fail(e.to_string()))?;
-        sync_directory(&path).map_err(|e| fail(e.to_string()))
+        std::fs::rename(&temporary, &path).map_err(|e| fail(error_words(&e)))?;
+        whole_file::sync_directory(&path);
+        Ok(())
     });
     match result {
         Ok(()) => Ok(before),
@@ -99,17 +103,6 @@ pub(super) fn set_metadata(
     }
 }
 
-/// The name of a new file beside `path`, which no program takes for an episode.
-pub(super) fn beside(path: &Path) -> PathBuf {
-    let name = path.file_name().and_then(|n| n.to_str()).unwrap_or("episode");
-    path.with_file_name(format!(".{name}.{}.new", std::process::id()))
-}
-
-/// Puts the directory of `path` on the disk, so that the file's name stays after a power failure.
-pub(super) fn sync_directory(path: &Path) -> std::io::Result<()> {
-    File::open(path.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new(".")))?.sync_all()
-}
-
 /// Copies the records of `old` to the new file `new`, without the metadata record `without`, up to the end or the cut. Then `last` may write
 /// more; it is told how the records ended. Waits until everything is on the disk.
 pub(super) fn copy(
@@ -119,31 +112,44 @@ pub(super) fn copy(
     last: impl FnOnce(&mut Writer<BufWriter<File>>, NextRecord<()>) -> Result<(), ChangeError>,
 ) -> Result<(), ChangeError> {
     let shown = new.display().to_string();
-    let fail = |what: &dyn std::fmt::Display| ChangeError::Write { file: shown.clone(), what: what.to_string() };
-    let file = OpenOptions::new().write(true).create_new(true).open(new).map_err(|e| fail(&e))?;
-    let permissions = std::fs::metadata(old).map_err(|e| fail(&e))?.permissions();
-    file.set_permissions(permissions).map_err(|e| fail(&e))?;
+    let fail = |what: String| ChangeError::Write { file: shown.clone(), what };
+    let disk = |e: &std::io::Error| fail(error_words(e));
+    let file = OpenOptions::new().write(true).create_new(true).open(new).map_err(|e| disk(&e))?;
+    let permissions = std::fs::metadata(old).map_err(|e| disk(&e))?.permissions();
+    file.set_permissions(permissions).map_err(|e| disk(&e))?;
     let mut records = Records::open(old)?;
     let mut target: Option<BufWriter<File>> = Some(BufWriter::with_capacity(WRITE_BYTES, file));
     let mut writer: Option<Writer<BufWriter<File>>> = None;
+    // What cannot be written is no fault of the old file.
+    let mut unwritten: Option<String> = None;
     let next = records.next(|record| {
+        let mut not_written = |e: McapError| {
+            let what = mcap_words(&e);
+            unwritten = Some(what.clone());
+            what
+        };
         if let (Record::Header(header), Some(file)) = (&record, target.take()) {
             let options = WriteOptions::new().compression(None).profile(&header.profile).library(&header.library);
-            writer = Some(Writer::with_options(file, options.disable_seeking(true)).map_err(|e| e.to_string())?);
+            writer = Some(Writer::with_options(file, options.disable_seeking(true)).map_err(not_written)?);
             return Ok(None::<()>);
         }
         let Some(writer) = &mut writer else { return Err("it does not begin with a header".into()) };
-        copy_record(record, writer, without).map(|()| None)
-    })?;
+        copy_record(record, writer, without)?.map_err(&mut not_written).map(|()| None)
+    });
+    if let Some(what) = unwritten {
+        return Err(fail(what));
+    }
+    let next = next?;
     let Some(mut writer) = writer else { return Err(ChangeError::Cut { file: old.display().to_string() }) };
     last(&mut writer, next)?;
-    writer.finish().map_err(|e| fail(&e))?;
-    let file = writer.into_inner().into_inner().map_err(|e| fail(e.error()))?;
-    file.sync_all().map_err(|e| fail(&e))
+    writer.finish().map_err(|e| fail(mcap_words(&e)))?;
+    let file = writer.into_inner().into_inner().map_err(|e| disk(e.error()))?;
+    file.sync_all().map_err(|e| disk(&e))
 }
 
-fn copy_record(record: Record, to: &mut Writer<BufWriter<File>>, without: Option<&str>) -> Result<(), String> {
-    let result = match record {
+/// Writes a record into the new file, if it belongs there. The outer error says what is wrong with the record.
+fn copy_record(record: Record, to: &mut Writer<BufWriter<File>>, without: Option<&str>) -> Result<Result<(), McapError>, String> {
+    let written = match record {
         Record::Schema { header, data } => to.add_schema_with_id(header.id, &header.name, &header.encoding, &data).map(drop),
         Record::Channel(c) => to.add_channel_with_id(c.id, c.schema_id, &c.topic, &c.message_encoding, &c.metadata).map(drop),
         Record::Message { header, data } => to.write_to_known_channel(&header, &data),
@@ -161,5 +167,5 @@ fn copy_record(record: Record, to: &mut Writer<BufWriter<File>>, without: Option
         Record::Unknown { opcode, data } => to.write_private_record(opcode, &data, Default::default()),
         other => return Err(format!("unexpected record with opcode {:#04x}", other.opcode())),
     };
-    result.map_err(|e| e.to_string())
+    Ok(written)
 }

@@ -6,18 +6,22 @@
 //! number that is missing stands for a lost frame; so does an `area_px2` that is `nan` or empty.
 
 use std::collections::BTreeMap;
-use std::fs::{File, OpenOptions};
+use std::fs::File;
 use std::path::Path;
 
 use super::rows::{EpisodeRow, LostFrames, alpha_between_deg};
 use super::weight::{WeightError, check_poured};
 use super::{Episode, EpisodeInfo, EpisodeKind};
 use crate::messages::Doubt;
+use crate::{regular_file, whole_file};
 
 /// The columns of the table of features. Their names are part of the format.
 const FEATURE_COLUMNS: [&str; 5] = ["episode", "frame", "t_s", "alpha_deg", "area_px2"];
 /// The columns of the table of weights. Their names are part of the format.
 const SCALE_COLUMNS: [&str; 2] = ["episode", "weight_g"];
+
+/// Largest table that is read, bytes. Chosen by hand: ten hours of frames take 50 MB.
+const FILE_MAX: u64 = 256 << 20;
 
 /// Why a pair of tables is refused or cannot be written.
 #[derive(Debug, thiserror::Error)]
@@ -72,7 +76,7 @@ impl CsvTable {
     fn open(path: &Path, wanted: &[&str]) -> Result<Self, TableError> {
         let name = path.display().to_string();
         let fail = |what: String| TableError::File { file: name.clone(), what };
-        let file = File::open(path).map_err(|e| fail(e.to_string()))?;
+        let (file, _) = regular_file::open_at_most(path, FILE_MAX).map_err(|e| fail(e.to_string()))?;
         let mut reader = csv::ReaderBuilder::new().trim(csv::Trim::All).from_reader(file);
         let heading = reader.headers().map_err(|e| fail(e.to_string()))?.clone();
         let mut columns = Vec::new();
@@ -232,15 +236,11 @@ fn episode_row(sequence: u64, t_s: f64, alpha_deg: f32, area_px2: f32) -> Episod
 }
 
 /// Writes the pair; neither file may exist. The alpha in it is the commanded one, and lost frames are rows without area. Episodes are
-/// numbered from 1 in their order; those without a weight are in `features` only.
+/// numbered from 1 in their order; those without a weight are in `features` only. What cannot be written whole is not written at all.
 pub fn write_table(episodes: &[Episode], features: &Path, scale: &Path) -> Result<(), TableError> {
     let fail = |path: &Path, e: &dyn std::fmt::Display| TableError::File { file: path.display().to_string(), what: e.to_string() };
-    let create = |path: &Path| {
-        let file = OpenOptions::new().write(true).create_new(true).open(path);
-        file.map(csv::Writer::from_writer).map_err(|e| fail(path, &e))
-    };
-    let mut rows = create(features)?;
-    let mut weights = create(scale)?;
+    let mut rows = csv::Writer::from_writer(Vec::new());
+    let mut weights = csv::Writer::from_writer(Vec::new());
     rows.write_record(FEATURE_COLUMNS).map_err(|e| fail(features, &e))?;
     weights.write_record(SCALE_COLUMNS).map_err(|e| fail(scale, &e))?;
     for (index, episode) in episodes.iter().enumerate() {
@@ -254,6 +254,11 @@ pub fn write_table(episodes: &[Episode], features: &Path, scale: &Path) -> Resul
             weights.write_record([number, weight_g.to_string()]).map_err(|e| fail(scale, &e))?;
         }
     }
-    rows.flush().map_err(|e| fail(features, &e))?;
-    weights.flush().map_err(|e| fail(scale, &e))
+    let (rows, weights) = (rows.into_inner().map_err(|e| fail(features, &e))?, weights.into_inner().map_err(|e| fail(scale, &e))?);
+    whole_file::create(features, &rows).map_err(|e| fail(features, &e))?;
+    whole_file::create(scale, &weights).map_err(|e| {
+        // It was not there before, so it is ours, and the pair is useless without the other.
+        let _ = std::fs::remove_file(features);
+        fail(scale, &e)
+    })
 }

@@ -14,7 +14,7 @@ const NOTE_BYTES: usize = 4096;
 
 /// Sets the weight of the episode `path` to `grams`, and returns the weight that it had before.
 pub fn set_weight(path: &Path, grams: f64) -> Result<Option<f64>, ChangeError> {
-    check_reading(grams).map_err(|e| ChangeError::Weight(grams, e))?;
+    let grams = check_reading(grams).map_err(|e| ChangeError::Weight(grams, e))?;
     let expected = |before| Episode { weight_g: Some(grams), ..before };
     match set_metadata(path, format::META_WEIGHT, ("grams", grams.to_string()), expected) {
         Ok(before) => Ok(before.weight_g),

@@ -12,13 +12,14 @@ use std::path::{Path, PathBuf};
 use std::time::{SystemTime, UNIX_EPOCH};
 
 use mcap::records::MessageHeader;
-use mcap::{WriteOptions, Writer};
+use mcap::{McapError, WriteOptions, Writer};
 use sha2::{Digest, Sha256};
 
 use super::format::{self, CompressedImage, FeatureMessage, ImageAnnotations, RowMessage, TelemetryMessage};
 use super::number::{LARGEST, take_number};
 use super::{EpisodeKind, hex, schema};
 use crate::config::Config;
+use crate::disk_space::error_words;
 use crate::messages::{Doubt, Feature, Telemetry};
 
 /// A chunk is closed when it is this old, ns. Chosen by hand: a killed recorder loses at most half a second.
@@ -119,7 +120,7 @@ impl EpisodeWriter {
     /// or the next free one if that has a file already.
     pub fn create(directory: &Path, start: &EpisodeStart) -> Result<Self, WriteError> {
         let (file, path) = create_file(directory, start.episode)?;
-        let fail = |e: mcap::McapError| file_error(&path, &e);
+        let fail = |e: McapError| WriteError::File { file: path.display().to_string(), what: mcap_words(&e) };
         let options = WriteOptions::new()
             .compression(None)
             .chunk_size(None)
@@ -184,7 +185,7 @@ impl EpisodeWriter {
     fn metadata(&mut self, name: &str, pairs: &[(&str, String)]) -> Result<(), WriteError> {
         let metadata = pairs.iter().map(|(k, v)| ((*k).to_string(), v.clone())).collect();
         let record = mcap::records::Metadata { name: name.into(), metadata };
-        self.writer.write_metadata(&record).map_err(|e| file_error(&self.path, &e))
+        self.writer.write_metadata(&record).map_err(|e| WriteError::File { file: self.path.display().to_string(), what: mcap_words(&e) })
     }
 
     /// Writes one frame: its row of `L_E`, its feature, its image and what is drawn over it.
@@ -243,7 +244,7 @@ impl EpisodeWriter {
 
     /// Writes all messages up to `until_ns` in the order of their times, as one chunk.
     fn flush_until(&mut self, until_ns: u64) -> Result<(), WriteError> {
-        let fail = |e: mcap::McapError| file_error(&self.path, &e);
+        let fail = |e: McapError| WriteError::File { file: self.path.display().to_string(), what: mcap_words(&e) };
         self.pending.sort_by_key(|m| m.at_ns);
         let due = self.pending.partition_point(|m| m.at_ns <= until_ns);
         for message in self.pending.drain(..due) {
@@ -265,7 +266,7 @@ impl EpisodeWriter {
         ];
         self.metadata(format::META_END, &about)?;
         let Self { mut writer, path, .. } = self;
-        writer.finish().map_err(|e| file_error(&path, &e))?;
+        writer.finish().map_err(|e| WriteError::File { file: path.display().to_string(), what: mcap_words(&e) })?;
         let buffered = writer.into_inner();
         let file = buffered.into_inner().map_err(|e| file_error(&path, e.error()))?;
         file.sync_all().map_err(|e| file_error(&path, &e))?;
@@ -273,13 +274,21 @@ impl EpisodeWriter {
     }
 }
 
-fn file_error(path: &Path, what: &dyn std::fmt::Display) -> WriteError {
-    WriteError::File { file: path.display().to_string(), what: what.to_string() }
+fn file_error(path: &Path, e: &std::io::Error) -> WriteError {
+    WriteError::File { file: path.display().to_string(), what: error_words(e) }
+}
+
+/// An error of the mcap crate in words. What the disk said is inside of it.
+pub(super) fn mcap_words(e: &McapError) -> String {
+    match e {
+        McapError::Io(e) => error_words(e),
+        e => e.to_string(),
+    }
 }
 
 /// Creates the file of episode `number`, or of the next free number if that one has a file or is none of a directory's numbers.
 fn create_file(directory: &Path, number: u64) -> Result<(File, PathBuf), WriteError> {
-    let fail = |e: std::io::Error| WriteError::Directory { directory: directory.display().to_string(), what: e.to_string() };
+    let fail = |e: std::io::Error| WriteError::Directory { directory: directory.display().to_string(), what: error_words(&e) };
     std::fs::create_dir_all(directory).map_err(fail)?;
     let directory = directory.canonicalize().map_err(fail)?;
     let mut number = if (1..=LARGEST).contains(&number) { number } else { take_number(&directory).map_err(fail)? };

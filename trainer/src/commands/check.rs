@@ -6,6 +6,7 @@
 use serde::Serialize;
 use shared::episode::{Episode, EpisodeRow};
 use shared::exit::{self, Failure, OrExit as _, failure};
+use shared::level::plain;
 use shared::messages::Doubt;
 use shared::plural::counted;
 
@@ -133,10 +134,10 @@ pub fn run(args: &Args) -> Result<(), Failure> {
     } else {
         println!("{}, {} usable", counted(findings.episodes, "episode"), findings.usable);
         for (name, what) in &findings.left_out {
-            println!("cannot be used: {name}: {what}");
+            println!("cannot be used: {}", plain(&format!("{name}: {what}")));
         }
         for (name, what) in &findings.doubts {
-            println!("doubtful: {}", if what.starts_with(name.as_str()) { what.clone() } else { format!("{name}: {what}") });
+            println!("doubtful: {}", plain(&if what.starts_with(name.as_str()) { what.clone() } else { format!("{name}: {what}") }));
         }
         for what in &findings.missing {
             println!("not spanned: {what}");

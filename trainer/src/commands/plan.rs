@@ -6,6 +6,7 @@
 use std::path::PathBuf;
 
 use shared::exit::{self, Failure, OrExit as _, failure};
+use shared::level::plain;
 use shared::limits::Limits;
 
 use crate::data::{self, DataError, EpisodeSource, UsableEpisodes};
@@ -18,6 +19,8 @@ use crate::teaching::span::Span;
 const BELOW_LIMIT_DEG: f64 = 5.0;
 /// Range of what a vessel may hold, ml. Chosen by hand: a robot that pours holds no less and carries no more.
 const HOLDS_ML: (f64, f64) = (50.0, 10_000.0);
+/// Largest goal that a plan may have, ml: as controller.goal_max_ml.
+const GOAL_MAX_ML: f64 = 5000.0;
 
 /// Command-line arguments of `trainer plan`.
 #[derive(Debug, clap::Args)]
@@ -51,8 +54,8 @@ pub fn run(args: &Args) -> Result<(), Failure> {
     let config = args.config.as_deref().map(shared::config::Config::read).transpose().or_exit(exit::BAD_INPUT)?;
     let limits = config.as_ref().map_or_else(Limits::default, |c| c.limits);
     let holds_ml = args.holds.or(config.and_then(|c| c.container.holds_ml));
-    if args.holds.is_some_and(|ml| !(HOLDS_ML.0..=HOLDS_ML.1).contains(&ml)) || args.goal_max.is_nan() || args.goal_max < 1.0 {
-        let what = format!("--holds is {} to {} ml, and --goal-max at least 1 ml", HOLDS_ML.0, HOLDS_ML.1);
+    if args.holds.is_some_and(|ml| !(HOLDS_ML.0..=HOLDS_ML.1).contains(&ml)) || !(1.0..=GOAL_MAX_ML).contains(&args.goal_max) {
+        let what = format!("--holds is {} to {} ml, and --goal-max 1 to {GOAL_MAX_ML} ml", HOLDS_ML.0, HOLDS_ML.1);
         return Err(failure(exit::BAD_INPUT, what));
     }
     let usable = match args.source.read() {
@@ -73,7 +76,7 @@ pub fn run(args: &Args) -> Result<(), Failure> {
         return Ok(());
     }
     for (name, what) in &usable.left_out {
-        println!("left out: {name}: {what}");
+        println!("left out: {}", plain(&format!("{name}: {what}")));
     }
     println!("{}", words(first));
     if usable.episodes.is_empty() {

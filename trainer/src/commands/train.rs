@@ -10,13 +10,19 @@ use std::sync::{Mutex, PoisonError};
 use indicatif::{ProgressBar, ProgressStyle};
 use shared::episode;
 use shared::exit::{self, Failure, OrExit as _, failure};
+use shared::level::plain;
 use shared::limits::Limits;
 use shared::plural::counted;
+use shared::weights::Weights;
+use shared::whole_file;
 
 use crate::consistency;
 use crate::data::{self, EpisodeSource, UsableEpisodes};
 use crate::method;
 use crate::training::{Estimate, MethodName, Options, Progress, Trained};
+
+/// How the file beside the weights begins (RFC 8259).
+const JSON: &[u8] = b"{";
 
 /// Command-line arguments of `trainer train`.
 #[derive(Debug, clap::Args)]
@@ -111,6 +117,7 @@ impl Progress for Bar {
 
 /// Runs the command.
 pub fn run(args: &Args) -> Result<(), Failure> {
+    args.weight_file.check()?;
     let read = args.source.read().or_exit(exit::BAD_INPUT)?;
     let limits = args.weight_file.limits()?;
     let can_fuse = matches!(args.method, MethodName::Best | MethodName::Paper);
@@ -121,13 +128,27 @@ pub fn run(args: &Args) -> Result<(), Failure> {
     }
     let usable = data::usable(&read);
     for doubt in consistency::doubtful(&usable.episodes) {
-        eprintln!("doubtful: {doubt}");
+        eprintln!("doubtful: {}", plain(&doubt.to_string()));
     }
     let options = Options { method: args.method, actions: args.actions, estimate, seed: args.weight_file.seed, limits };
     args.weight_file.train_and_write(&usable, &options, serde_json::Value::Null)
 }
 
 impl WeightFileArgs {
+    /// The file beside the weights that says what they came from.
+    fn beside(&self) -> PathBuf {
+        let mut name = self.out.clone().into_os_string();
+        name.push(".json");
+        name.into()
+    }
+
+    /// Refuses, before the work, names that other files have: a weight file replaces nothing but a weight file.
+    pub fn check(&self) -> Result<(), Failure> {
+        Weights::may_write(&self.out).or_exit(exit::BAD_INPUT)?;
+        let beside = self.beside();
+        whole_file::check(&beside, JSON).map_err(|e| format!("{}: {e}", beside.display())).or_exit(exit::BAD_INPUT)
+    }
+
     /// The limits of the configuration, or the default ones; a configuration that cannot be read is bad input.
     pub fn limits(&self) -> Result<Limits, Failure> {
         let Some(file) = &self.config else { return Ok(Limits::default()) };
@@ -138,7 +159,7 @@ impl WeightFileArgs {
     /// into that file as it is.
     pub fn train_and_write(&self, usable: &UsableEpisodes, options: &Options, extra: serde_json::Value) -> Result<(), Failure> {
         for (name, what) in &usable.left_out {
-            eprintln!("left out: {name}: {what}");
+            eprintln!("left out: {}", plain(&format!("{name}: {what}")));
         }
         let style = ProgressStyle::with_template("{prefix} [{wide_bar}] {pos}/{len} {msg} ({eta} left)");
         let bar = Bar(ProgressBar::new(1).with_style(style.unwrap_or_else(|_| ProgressStyle::default_bar())));
@@ -151,10 +172,10 @@ impl WeightFileArgs {
         trained.weights.write(out).or_exit(exit::FAILED)?;
         let summary = summary(out, usable, options, &trained, extra);
         let text = serde_json::to_string_pretty(&summary).unwrap_or_default();
-        let mut beside = out.clone().into_os_string();
-        beside.push(".json");
-        let beside = PathBuf::from(beside);
-        std::fs::write(&beside, format!("{text}\n")).map_err(|e| format!("{}: {e}", beside.display())).or_exit(exit::FAILED)?;
+        let beside = self.beside();
+        whole_file::replace(&beside, format!("{text}\n").as_bytes(), JSON)
+            .map_err(|e| format!("{}: {e}; the weights are written, but not what they came from", beside.display()))
+            .or_exit(exit::FAILED)?;
         if self.json {
             println!("{text}");
         } else {

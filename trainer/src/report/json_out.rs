@@ -6,6 +6,10 @@ use std::path::{Path, PathBuf};
 
 use serde_json::Value;
 use shared::exit::{self, Failure, OrExit as _};
+use shared::whole_file;
+
+/// How such a file begins (RFC 8259): only one that begins so is replaced.
+const JSON: &[u8] = b"{";
 
 /// Where the JSON goes.
 #[derive(Debug)]
@@ -26,7 +30,7 @@ impl JsonOut {
             None => Ok(Self::Nowhere),
             Some(path) if path == Path::new("-") => Ok(Self::Stdout),
             Some(path) => {
-                let opened = std::fs::File::options().append(true).create(true).open(path);
+                let opened = whole_file::check(path, JSON).and_then(|()| std::fs::File::options().append(true).create(true).open(path));
                 opened.map(|_| Self::File(path.into())).map_err(|e| words(path, &e)).or_exit(exit::FAILED)
             }
         }
@@ -50,7 +54,9 @@ impl JsonOut {
                 println!("{value}");
                 Ok(())
             }
-            Self::File(path) => std::fs::write(path, value.to_string()).map_err(|e| words(path, &e)).or_exit(exit::FAILED),
+            Self::File(path) => {
+                whole_file::replace(path, value.to_string().as_bytes(), JSON).map_err(|e| words(path, &e)).or_exit(exit::FAILED)
+            }
         }
     }
 }

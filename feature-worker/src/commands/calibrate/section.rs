@@ -4,8 +4,9 @@
 
 use std::path::Path;
 
-use shared::config::{Config, ImageConfig, LiquidMethod};
+use shared::config::{Config, FILE_MAX, ImageConfig, LiquidMethod};
 use shared::exit::{self, Failure, OrExit as _, failure};
+use shared::{regular_file, whole_file};
 
 /// The `[image]` table as text.
 pub(super) fn text(image: &ImageConfig) -> String {
@@ -28,7 +29,9 @@ pub(super) fn text(image: &ImageConfig) -> String {
 /// Puts the `[image]` table of `config` into the file in one step. The other tables stay as they are.
 pub(super) fn write(path: &Path, config: &Config) -> Result<(), Failure> {
     let fail = |e: String| failure(exit::FAILED, format!("{}: {e}", path.display()));
-    let before = std::fs::read_to_string(path).map_err(|e| fail(e.to_string()))?;
+    // If the path is a link, the file that it leads to is replaced, and not the link.
+    let file = path.canonicalize().map_err(|e| fail(e.to_string()))?;
+    let before = regular_file::read_text(&file, FILE_MAX).map_err(|e| fail(e.to_string()))?;
     let after =
         replace(&before, &text(&config.image)).ok_or_else(|| fail("has no line [image] of its own; write the table there".into()))?;
     let checked = Config::parse(&after, &path.display().to_string()).or_exit(exit::FAILED)?;
@@ -40,8 +43,7 @@ pub(super) fn write(path: &Path, config: &Config) -> Result<(), Failure> {
             size.0, size.1
         )));
     }
-    let beside = path.with_extension("toml.new");
-    std::fs::write(&beside, &after).and_then(|()| std::fs::rename(&beside, path)).map_err(|e| fail(e.to_string()))?;
+    whole_file::replace(&file, after.as_bytes(), b"").map_err(|e| fail(e.to_string()))?;
     eprintln!("calibrate: wrote [image] of {}", path.display());
     Ok(())
 }

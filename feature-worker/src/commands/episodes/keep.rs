@@ -9,6 +9,7 @@ use serde_json::{Value, json};
 use shared::config::Config;
 use shared::episode::{find_episodes, recover, set_note};
 use shared::exit::{self, Failure, OrExit as _, failure};
+use shared::level::plain;
 use shared::plural::counted;
 
 use super::which::{WhichArgs, change_failure, files, print_json};
@@ -164,15 +165,16 @@ fn note(args: &NoteArgs) -> Result<(), Failure> {
         print_json(&json!({ "file": shown(&args.file), "note": args.text, "before": before }));
     } else {
         let before = if before.is_empty() { "had none before".into() } else { format!("was '{before}'") };
-        println!("{}: '{}' ({before})", shown(&args.file), args.text);
+        println!("{}", plain(&format!("{}: '{}' ({before})", shown(&args.file), args.text)));
     }
     Ok(())
 }
 
 fn run_recover(args: &RecoverArgs) -> Result<(), Failure> {
     let new = args.to.clone().unwrap_or_else(|| {
-        let stem = args.file.file_stem().unwrap_or_default().to_string_lossy();
-        args.file.with_file_name(format!("{stem}-recovered.mcap"))
+        let mut name = args.file.file_stem().unwrap_or_default().to_os_string();
+        name.push("-recovered.mcap");
+        args.file.with_file_name(name)
     });
     let episode = recover(&args.file, &new).map_err(|e| change_failure(&e))?;
     let (frames, seconds) = (episode.rows.len(), episode.seconds());
@@ -180,7 +182,7 @@ fn run_recover(args: &RecoverArgs) -> Result<(), Failure> {
         print_json(&json!({ "file": shown(&new), "frames": frames, "seconds": seconds, "complete": episode.complete }));
     } else {
         let state = if episode.complete { "nothing is missing" } else { "its end is missing, so it cannot be trained on" };
-        println!("{}: {} in {seconds:.1} s; {state}", shown(&new), counted(frames, "frame"));
+        println!("{}: {} in {seconds:.1} s; {state}", plain(&shown(&new)), counted(frames, "frame"));
     }
     Ok(())
 }
@@ -197,20 +199,26 @@ fn look(files: &[PathBuf]) -> (Vec<Found>, Vec<LeftOut>) {
     (found, kept)
 }
 
-/// Deletes the episodes, or says which it would.
-fn delete_all(going: &[&Found], yes: bool) -> Result<(), Failure> {
+/// Deletes the episodes of `going` if `yes`. Those that cannot be deleted go to `kept`, with the reason, and the others are deleted all the same.
+/// Returns how many could not be.
+fn delete_all(going: &mut Vec<&Found>, kept: &mut Vec<LeftOut>, yes: bool) -> usize {
+    let before = kept.len();
     if yes {
-        for one in going {
-            upkeep::delete(one).or_exit(exit::FAILED)?;
-        }
+        going.retain(|one| match upkeep::delete(one) {
+            Ok(()) => true,
+            Err(e) => {
+                kept.push(LeftOut { file: one.path.clone(), why: e.to_string() });
+                false
+            }
+        });
     }
-    Ok(())
+    kept.len() - before
 }
 
 fn as_json(going: &[&Found], kept: &[LeftOut], yes: bool) -> Value {
     let gone = |f: &&Found| json!({ "file": shown(&f.path), "bytes": f.bytes, "weight_g": f.episode.weight_g });
     json!({
-        "deleted": yes,
+        "deleted": yes && !going.is_empty(),
         "episodes": going.iter().map(gone).collect::<Vec<_>>(),
         "kept": kept.iter().map(|k| json!({ "file": shown(&k.file), "why": k.why })).collect::<Vec<_>>(),
     })
@@ -222,13 +230,13 @@ fn tell(going: &[&Found], kept: &[LeftOut], yes: bool) {
         let what = if yes { "deleted" } else { "would delete" };
         println!(
             "{what} {} ({:.1} MB, {weight}, {})",
-            shown(&one.path),
+            plain(&shown(&one.path)),
             one.bytes as f64 / MEGABYTE as f64,
-            one.episode.info.started_at_utc
+            plain(&one.episode.info.started_at_utc)
         );
     }
     for one in kept {
-        println!("kept: {}", one.why);
+        println!("kept: {}", plain(&one.why));
     }
     if !yes && !going.is_empty() {
         println!("nothing was deleted; say --yes to do it");
@@ -236,9 +244,9 @@ fn tell(going: &[&Found], kept: &[LeftOut], yes: bool) {
 }
 
 fn delete(args: &DeleteArgs) -> Result<(), Failure> {
-    let (found, kept) = look(&args.files);
-    let going: Vec<&Found> = found.iter().collect();
-    delete_all(&going, args.yes)?;
+    let (found, mut kept) = look(&args.files);
+    let mut going: Vec<&Found> = found.iter().collect();
+    let undeleted = delete_all(&mut going, &mut kept, args.yes);
     if args.json {
         print_json(&as_json(&going, &kept, args.yes));
     } else {
@@ -246,7 +254,10 @@ fn delete(args: &DeleteArgs) -> Result<(), Failure> {
     }
     match kept.len() {
         0 => Ok(()),
-        n => Err(failure(exit::BAD_INPUT, format!("not deleted: {n} of {}", args.files.len()))),
+        n => {
+            let code = if undeleted > 0 { exit::FAILED } else { exit::BAD_INPUT };
+            Err(failure(code, format!("not deleted: {n} of {}", args.files.len())))
+        }
     }
 }
 
@@ -260,9 +271,9 @@ fn prune(args: &PruneArgs) -> Result<(), Failure> {
         episodes: args.budget_episodes.or(configured.as_ref().map(|r| r.budget_episodes)).unwrap_or(0),
     };
     let none = budget.is_none();
-    let (found, kept) = look(&files(&args.which)?);
-    let going: Vec<&Found> = upkeep::to_prune(&found, budget, args.weighed).into_iter().map(|i| &found[i]).collect();
-    delete_all(&going, args.yes)?;
+    let (found, mut kept) = look(&files(&args.which)?);
+    let mut going: Vec<&Found> = upkeep::to_prune(&found, budget, args.weighed).into_iter().map(|i| &found[i]).collect();
+    let undeleted = delete_all(&mut going, &mut kept, args.yes);
     let bytes = found.iter().map(|f| f.bytes).sum::<u64>() - going.iter().map(|f| f.bytes).sum::<u64>();
     let stay = found.len() - going.len();
     let holds = budget.holds(stay, bytes);
@@ -277,6 +288,9 @@ fn prune(args: &PruneArgs) -> Result<(), Failure> {
         if none {
             println!("there is no budget: set recording.budget_mb or recording.budget_episodes, or say --budget-mb or --budget-episodes");
         }
+    }
+    if undeleted > 0 {
+        return Err(failure(exit::FAILED, format!("{} could not be deleted", counted(undeleted, "episode"))));
     }
     if holds {
         return Ok(());
@@ -304,10 +318,10 @@ fn tell_copied(copied: &Copied, as_json: bool) -> Result<(), Failure> {
         print_json(&json!({ "copied": files.collect::<Vec<_>>(), "left_out": left_out.collect::<Vec<_>>() }));
     } else {
         for (from, to) in &copied.files {
-            println!("{} -> {}", shown(from), shown(to));
+            println!("{} -> {}", plain(&shown(from)), plain(&shown(to)));
         }
         for one in &copied.left_out {
-            println!("left out: {}", one.why);
+            println!("left out: {}", plain(&one.why));
         }
     }
     match copied.left_out.iter().filter(|l| shared::episode::Episode::read(&l.file).is_err()).count() {

@@ -12,7 +12,7 @@ use parquet::file::properties::WriterProperties;
 use parquet::file::writer::{SerializedColumnWriter, SerializedFileWriter};
 use parquet::schema::parser::parse_message_type;
 
-use crate::episodes::output::{ExportError, make_parent, write_error};
+use crate::episodes::output::{ExportError, disk_error, make_parent, write_error};
 
 /// The values of one column. All columns of a table have the same number of rows.
 pub enum Column {
@@ -127,8 +127,12 @@ fn repetition(width: usize, values: usize) -> Vec<i16> {
 /// Writes `columns`, each with its name, to the new file `path`, with a `note` in the file's metadata.
 pub fn write_parquet(path: &Path, columns: Vec<(String, Column)>, note: Option<KeyValue>) -> Result<(), ExportError> {
     make_parent(path)?;
-    let file = OpenOptions::new().write(true).create_new(true).open(path).map_err(|e| write_error(path, e))?;
-    write_columns(file, columns, note).map_err(|e| write_error(path, e))
+    let file = OpenOptions::new().write(true).create_new(true).open(path).map_err(|e| disk_error(path, &e))?;
+    write_columns(file, columns, note).map_err(|e| {
+        // It was not there before, so it is ours, and nobody needs a part of it.
+        let _ = fs::remove_file(path);
+        write_error(path, e)
+    })
 }
 
 fn write_columns(file: fs::File, columns: Vec<(String, Column)>, note: Option<KeyValue>) -> ParquetResult<()> {

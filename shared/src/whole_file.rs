@@ -1,0 +1,163 @@
+//! Writing files in one step: whoever looks sees the old file or the new one, whole, and a disk that is full leaves the old one and nothing else.
+//!
+//! Only files are replaced that are of the kind that is written: a slip of the finger in `--out` costs no episode, no configuration and no device.
+//! Ordinary threads use it; it allocates and waits for the disk. Errors are those of the system, or say what is in the way.
+
+use std::fs::{File, OpenOptions, Permissions};
+use std::io::{Error, ErrorKind, Read as _, Result, Write as _};
+use std::os::unix::fs::{MetadataExt as _, PermissionsExt as _, fchown};
+use std::path::{Path, PathBuf};
+use std::sync::atomic::{AtomicU32, Ordering::Relaxed};
+
+use crate::disk_space::error_words;
+use crate::regular_file;
+
+/// Puts `bytes` into the file at `path`, which keeps its mode and owner if it is there. `begins` is how every file of this kind begins: a file
+/// that begins otherwise is left as it is. If `path` is a link, the new file takes the link's place.
+pub fn replace(path: &Path, bytes: &[u8], begins: &[u8]) -> Result<()> {
+    check(path, begins)?;
+    let before = path.metadata().ok();
+    let new = beside(path)?;
+    let put = || {
+        let mut file = OpenOptions::new().write(true).create_new(true).open(&new)?;
+        if let Some(before) = &before {
+            // Only root may give a file away; for everybody else it is their own file in place of another.
+            let _ = fchown(&file, Some(before.uid()), Some(before.gid()));
+            file.set_permissions(Permissions::from_mode(before.mode() & 0o777))?;
+        }
+        file.write_all(bytes)?;
+        file.sync_all()?;
+        std::fs::rename(&new, path)
+    };
+    put().map_err(|e| gone(&new, &e))?;
+    sync_directory(path);
+    Ok(())
+}
+
+/// Puts `bytes` into the new file `path`. It is an error if something is there.
+pub fn create(path: &Path, bytes: &[u8]) -> Result<()> {
+    let new = beside(path)?;
+    let put = || {
+        let mut file = OpenOptions::new().write(true).create_new(true).open(&new)?;
+        file.write_all(bytes)?;
+        file.sync_all()?;
+        give_name(&new, path)
+    };
+    put().map_err(|e| gone(&new, &e))
+}
+
+/// The error `e` in words, after what it left at `new` is taken away.
+fn gone(new: &Path, e: &Error) -> Error {
+    remove(new);
+    Error::new(e.kind(), error_words(e))
+}
+
+/// Whether [`replace`] may put a file at `path`, so that it is known before long work: what is there is a regular file, and empty or of the kind
+/// that begins with `begins`.
+pub fn check(path: &Path, begins: &[u8]) -> Result<()> {
+    let file = match regular_file::open(path) {
+        Ok((file, _)) => file,
+        Err(e) if e.kind() == ErrorKind::NotFound => return Ok(()),
+        Err(e) => return Err(e),
+    };
+    let mut start = Vec::new();
+    file.take(begins.len() as u64).read_to_end(&mut start)?;
+    // Of one that was cut there may be less than its beginning.
+    let same = begins.get(..start.len()).is_some_and(|begins| start.eq_ignore_ascii_case(begins));
+    if same {
+        Ok(())
+    } else {
+        Err(Error::new(ErrorKind::AlreadyExists, "is a file of another kind and is left as it is: give another name"))
+    }
+}
+
+/// Gives the file `new` the name `path`, unless something has that name already.
+pub fn give_name(new: &Path, path: &Path) -> Result<()> {
+    use rustix::fs::{CWD, RenameFlags, renameat_with};
+    match renameat_with(CWD, new, CWD, path, RenameFlags::NOREPLACE) {
+        // Some file systems know only links for it, and some others no links.
+        Err(rustix::io::Errno::INVAL | rustix::io::Errno::NOSYS) => {
+            std::fs::hard_link(new, path)?;
+            remove(new);
+        }
+        renamed => renamed?,
+    }
+    sync_directory(path);
+    Ok(())
+}
+
+/// A new name in the directory of `path`, which no program takes for anything of its own.
+pub fn beside(path: &Path) -> Result<PathBuf> {
+    static NEXT: AtomicU32 = AtomicU32::new(0);
+    if path.file_name().is_none() {
+        return Err(Error::new(ErrorKind::InvalidInput, "is no file name"));
+    }
+    Ok(path.with_file_name(format!(".decant-{}-{}.new", std::process::id(), NEXT.fetch_add(1, Relaxed))))
+}
+
+/// Nobody needs what is not whole, and it does no harm if it cannot be removed.
+fn remove(new: &Path) {
+    let _ = std::fs::remove_file(new);
+}
+
+/// Puts the directory of `path` on the disk, so that the file's name stays after a power failure. A file system that cannot do it does without.
+pub fn sync_directory(path: &Path) {
+    let directory = path.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."));
+    let _ = File::open(directory).and_then(|d| d.sync_all());
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn names(directory: &Path) -> Vec<String> {
+        let mut names: Vec<String> = directory.read_dir().unwrap().map(|e| e.unwrap().file_name().to_string_lossy().into_owned()).collect();
+        names.sort();
+        names
+    }
+
+    /// Protects whatever a person names by mistake: only an empty file, or one of the same kind, is replaced; mode and owner stay, and nothing is left
+    /// beside it.
+    #[test]
+    fn only_files_of_the_same_kind_are_replaced() {
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("w.bin");
+        replace(&path, b"kind 1", b"kind").unwrap();
+        std::fs::set_permissions(&path, Permissions::from_mode(0o640)).unwrap();
+        replace(&path, b"kind 2", b"kind").unwrap();
+        assert_eq!(std::fs::read(&path).unwrap(), b"kind 2");
+        assert_eq!(path.metadata().unwrap().mode() & 0o777, 0o640);
+        std::fs::write(&path, "an episode").unwrap();
+        assert!(replace(&path, b"kind 3", b"kind").unwrap_err().to_string().contains("another kind"));
+        assert_eq!(std::fs::read(&path).unwrap(), b"an episode");
+        for cut in ["", "ki"] {
+            std::fs::write(&path, cut).unwrap();
+            replace(&path, b"kind 4", b"kind").unwrap();
+        }
+
+        let (pipe, device, place) = (dir.path().join("pipe"), dir.path().join("device"), dir.path().join("place"));
+        assert!(std::process::Command::new("mkfifo").arg(&pipe).status().unwrap().success());
+        std::os::unix::fs::symlink("/dev/null", &device).unwrap();
+        std::fs::create_dir(&place).unwrap();
+        for other in [&pipe, &device, &place] {
+            assert!(replace(other, b"kind 5", b"kind").unwrap_err().to_string().contains("regular"), "{}", other.display());
+        }
+        assert!(replace(Path::new("/"), b"", b"").is_err() && replace(&dir.path().join("no/w.bin"), b"", b"").is_err());
+        assert_eq!(names(dir.path()), ["device", "pipe", "place", "w.bin"]);
+    }
+
+    /// Protects a file that is there from a new one that is to get its name.
+    #[test]
+    fn a_name_is_given_only_once() {
+        let dir = tempfile::tempdir().unwrap();
+        let (new, path) = (dir.path().join("new"), dir.path().join("path"));
+        std::fs::write(&new, "1").unwrap();
+        give_name(&new, &path).unwrap();
+        std::fs::write(&new, "2").unwrap();
+        assert_eq!(give_name(&new, &path).unwrap_err().kind(), ErrorKind::AlreadyExists);
+        assert_eq!(create(&path, b"3").unwrap_err().kind(), ErrorKind::AlreadyExists);
+        create(&dir.path().join("other"), b"3").unwrap();
+        assert_eq!(names(dir.path()), ["new", "other", "path"]);
+        assert_eq!(std::fs::read(&path).unwrap(), b"1");
+    }
+}
