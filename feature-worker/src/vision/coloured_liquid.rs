@@ -21,7 +21,7 @@ use super::coloured_edge;
 use super::confidence::Basis;
 use super::foreign::{self, FILLED, GAP_MOST_PX, Seen};
 use super::geometry::{Axes, Line, NEAR_PX, RAYS, RayGrid, distance};
-use super::ground_beside::{InGlass, Square};
+use super::ground_beside::{InGlass, Place, Square};
 use super::ground_colours::{Ground, GroundColours};
 use super::hues::ranges;
 use super::liquid::{FineLine, LineRules, Liquid, Profile, ProfileEdge, Sighting};
@@ -36,6 +36,11 @@ const STREAM_RAYS: f32 = 0.8;
 const HIDDEN_RAYS: f32 = 0.5;
 /// Mean length of liquid on the full rays above which they are full far out, px. Tuned.
 const HIDDEN_PX: f32 = 14.0;
+/// With more than this share of rays with that much liquid, wherever it lies on them up to [`BEHIND_PX`], and no stream, something hides the
+/// stream's begin or a part of it. Chosen by hand: more than a splash.
+const BEHIND_RAYS: f32 = 0.4;
+/// So far from the lip that liquid is looked for, px. Chosen by hand: as far as most streams reach.
+const BEHIND_PX: f32 = 100.0;
 /// With more than this share of rays full of liquid to the region's border, the colour tells nothing in this light. Chosen by hand; no
 /// measurement is recorded.
 const ALL_LIQUID: f32 = 0.9;
@@ -98,6 +103,8 @@ pub(crate) struct ColouredLiquid {
     wandering: Wandering,
     /// For how many told pictures more the ground is not learned, see [`LEARN_AFTER`].
     learn_after: u32,
+    /// Whether a stream may be where the last one was seen.
+    held: bool,
     /// Which share of the glass at the lip is white light.
     white_lip: f32,
     /// Whether half of what was read is saturated.
@@ -124,8 +131,8 @@ pub(crate) struct ColouredLiquid {
 }
 
 impl ColouredLiquid {
-    /// For the colours of `image`. `axes` and `grid` are relative to the region.
-    pub(crate) fn new(image: &ImageConfig, axes: Axes, grid: RayGrid) -> opencv::Result<Self> {
+    /// For the colours of `image` in pictures `width_px` wide. `axes` and `grid` are relative to the region.
+    pub(crate) fn new(image: &ImageConfig, width_px: u32, axes: Axes, grid: RayGrid) -> opencv::Result<Self> {
         let shape = (RAYS as i32, grid.radii_px.len() as i32);
         let mut map_x = Mat::new_rows_cols_with_default(shape.0, shape.1, CV_32FC1, Scalar::all(-1.0))?;
         let mut map_y = map_x.try_clone()?;
@@ -139,10 +146,11 @@ impl ColouredLiquid {
         }
         let (mut map_a, mut map_b) = (Mat::default(), Mat::default());
         imgproc::convert_maps(&map_x, &map_y, &mut map_a, &mut map_b, CV_16SC2, true)?;
-        let (beside, beside_wide) = (Square::beside(&axes, image)?, Square::beside_wide(&axes, image)?);
+        let place = Place::new(axes, image, width_px);
+        let (beside, beside_wide) = (Square::beside(&place)?, Square::beside_wide(&place)?);
         let colour = image.colour_hsv.map(f64::from);
         let ranges = ranges(colour);
-        let glass = InGlass::new(&axes, image, &ranges)?;
+        let glass = InGlass::new(&place, &ranges)?;
         Ok(Self {
             axes,
             grid,
@@ -158,6 +166,7 @@ impl ColouredLiquid {
             reflection: Reflection::default(),
             wandering: Wandering::new(),
             learn_after: 0,
+            held: false,
             white_lip: 0.0,
             half_white: false,
             ends: [0; RAYS],
@@ -279,6 +288,8 @@ impl ColouredLiquid {
         match sighting {
             // A lamp's reflection before white squares is no ground. The pictures after it are learned from as ever.
             Sighting::Dry { .. } | Sighting::Stream { doubt: Doubt::None, .. } | Sighting::Unsure(Doubt::BlownOut) if self.half_white => {}
+            // A stream that was there before the surroundings of the lip were known may be there still, in other colours.
+            Sighting::Dry { .. } if self.learn_after == 0 && self.held && self.dry_frames < DRY_FRAMES => {}
             Sighting::Dry { .. } if self.learn_after == 0 => self.learn(true)?,
             Sighting::Stream { doubt: Doubt::None, .. } if self.learn_after == 0 => self.learn(false)?,
             // What may be liquid must not be taken for ground.
@@ -359,7 +370,8 @@ impl ColouredLiquid {
         if share < STREAM_RAYS {
             // A good half of the wedge full of liquid is no drop: something hides the stream.
             let mean_px = liquid_px / filled.max(1) as f32;
-            let hidden = share > HIDDEN_RAYS && mean_px > HIDDEN_PX;
+            let hidden = (share > HIDDEN_RAYS && mean_px > HIDDEN_PX)
+                || self.seen().rays_with_liquid(HIDDEN_PX, BEHIND_PX)? as f32 > BEHIND_RAYS * RAYS as f32;
             let confidence = (1.0 - share).clamp(0.0, 1.0);
             return Ok(if hidden { Sighting::Unsure(Doubt::EdgeNotFound) } else { Sighting::Dry { confidence } });
         }
@@ -406,9 +418,11 @@ impl Liquid for ColouredLiquid {
             }
             other => other,
         };
+        // While the ground is not known nothing else is looked for, so only pictures that it is learned from are dry: as many as make it known.
+        let unknown = (self.dry_frames < DRY_FRAMES && self.learn_after > 0).then_some(Doubt::EdgeNotFound);
         self.follow_ground(sighting)?;
         // A liquid in the ground's colours is not seen.
-        let untold = self.wandering.doubt().filter(|_| matches!(sighting, Sighting::Dry { .. }));
+        let untold = self.wandering.doubt().or(unknown).filter(|_| matches!(sighting, Sighting::Dry { .. }));
         Ok(untold.map_or(sighting, Sighting::Unsure))
     }
 
@@ -452,8 +466,10 @@ impl Liquid for ColouredLiquid {
         dry as f32 / looked.max(1) as f32
     }
 
-    /// Ground is learned far from the lip only, once the surroundings are known.
-    fn hold_ground(&mut self, _held: bool) {}
+    /// Once the surroundings of the lip are known, ground is learned far from it only; until then it is not where a stream is held.
+    fn hold_ground(&mut self, held: bool) {
+        self.held = held;
+    }
 
     fn edge_on(&self, profile: &Profile) -> Option<ProfileEdge> {
         coloured_edge::edge_on(profile)

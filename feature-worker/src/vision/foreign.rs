@@ -42,6 +42,13 @@ const LIT_LEVELS: f32 = 8.0;
 /// And when the part that is brighter by least is so by this share of the one that is by most. Chosen by hand: where the most is cut off, it is
 /// less.
 const LIT_SHARE: f32 = 0.4;
+/// What is foreign may be the liquid, with the ground seen through it, when its shares of blue, green and red differ from the ground's in the same
+/// direction as the liquid's do: the cosine of the angle between. Chosen by hand: ground of several colours has no one mean.
+const MIXED_COSINE: f32 = 0.8;
+/// And no further than this share of the way to the liquid's. Chosen by hand: a little beyond it.
+const MIXED_MOST: f32 = 1.15;
+/// Shares that differ by less than this tell no direction. Chosen by hand: two steps of the ground's table.
+const MIXED_LEAST: f32 = 0.03;
 /// Two mean colours are one when they differ by no more than these levels, and [`ALIKE_SHARE`] of their mean level. Chosen by hand.
 const ALIKE_LEVELS: f32 = 5.0;
 /// See [`ALIKE_LEVELS`]. Chosen by hand: what a vignette and a lamp's fall-off make over 40 px.
@@ -128,6 +135,18 @@ impl Seen<'_> {
         Ok((foreign as f32 > BEYOND_FOREIGN * looked.max(RAYS / 4) as f32).then(|| mean.levels()))
     }
 
+    /// How many rays have more than so much liquid on them, wherever it lies up to this distance from the lip, px.
+    pub(super) fn rays_with_liquid(&self, least_px: f32, within_px: f32) -> opencv::Result<usize> {
+        let near = self.grid.radii_px.iter().take_while(|r| **r <= within_px).count();
+        let mut rays = 0;
+        for (i, ray) in self.grid.rays.iter().enumerate() {
+            let mask = &self.mask.at_row::<u8>(i as i32)?[..near.min(ray.samples)];
+            let liquid_px: f32 = mask.iter().zip(&self.grid.steps_px).map(|(value, step)| if *value != 0 { *step } else { 0.0 }).sum();
+            rays += usize::from(liquid_px > least_px);
+        }
+        Ok(rays)
+    }
+
     /// Which shares of what is close to the lip are white light that the ground is not, glow of it, and foreign colours or liquid.
     pub(super) fn at_lip(&self) -> opencv::Result<[f32; 3]> {
         let near = self.grid.radii_px.iter().take_while(|r| **r <= AT_LIP_PX).count();
@@ -155,7 +174,24 @@ pub(super) fn is_not_the_liquid(foreign: [f32; 3], liquid: [f32; 3], ground: [f3
     let brighter: [f32; 3] = std::array::from_fn(|k| foreign[k] - liquid[k]);
     let (least, most) = brighter.iter().fold((f32::MAX, f32::MIN), |(l, m), v| (l.min(*v), m.max(*v)));
     let lit = least > LIT_LEVELS && least >= LIT_SHARE * most;
-    !glows && !lit && distance(foreign, liquid) > LIKE_LIQUID * distance(ground, liquid)
+    !glows && !lit && !is_mixed(foreign, liquid, ground) && distance(foreign, liquid) > LIKE_LIQUID * distance(ground, liquid)
+}
+
+/// Whether what is foreign may be the ground seen through a little of the liquid. Brightness tells nothing, because the ground has brighter
+/// and darker places.
+fn is_mixed(foreign: [f32; 3], liquid: [f32; 3], ground: [f32; 3]) -> bool {
+    let shares = |c: [f32; 3]| c.map(|level| level / c.iter().sum::<f32>().max(1.0));
+    let ground = shares(ground);
+    let from_ground = |c: [f32; 3]| -> [f32; 3] { std::array::from_fn(|k| shares(c)[k] - ground[k]) };
+    let (seen, whole) = (from_ground(foreign), from_ground(liquid));
+    let dot = |a: [f32; 3], b: [f32; 3]| (0..3).map(|k| a[k] * b[k]).sum::<f32>();
+    let (seen_length, length) = (dot(seen, seen).sqrt(), dot(whole, whole).sqrt());
+    if length < MIXED_LEAST {
+        // A liquid without a colour of its own, before ground without one.
+        return seen_length < MIXED_LEAST;
+    }
+    let along = dot(seen, whole) / length;
+    along >= MIXED_COSINE * seen_length && along <= MIXED_MOST * length
 }
 
 /// Whether what is foreign at the lip goes on outside the container, in the square beside it, as only ground does.

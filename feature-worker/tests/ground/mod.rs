@@ -1,9 +1,10 @@
-//! What the extraction of a coloured liquid says where half of the picture is white, on drawn pictures.
+//! What the extraction of a coloured liquid says of ground: half white, never known, seen through a thin stream, and in front of a stream. On drawn
+//! pictures.
 
-use super::drawn::{camera, dry, image_config, lay_over, noisy, stream};
+use super::drawn::{blue, camera, dry, image_config, lay_over, noisy, stream};
 use super::{colour, measure};
 use feature_worker::vision::{ExtractError, Extractor};
-use opencv::core::{Mat, Rect, Scalar};
+use opencv::core::{self, Mat, Rect, Scalar};
 use opencv::imgproc;
 use shared::config::{ImageConfig, LiquidMethod};
 use shared::messages::Doubt;
@@ -86,6 +87,115 @@ fn the_ground_outlasts_what_hides_it() -> Result<(), ExtractError> {
             if i >= 12 {
                 assert_eq!((measured.area_px2, measured.doubt), (0.0, Doubt::None), "{white} picture {i} after it");
             }
+        }
+    }
+    Ok(())
+}
+
+/// The colour of the liquid that the tests are set up for, and one that it does not have.
+const OWN: Scalar = Scalar::new(150.0, 62.0, 20.0, 0.0);
+const OTHER: Scalar = Scalar::new(60.0, 180.0, 60.0, 0.0);
+
+/// An extractor with the region that calibration writes, with room below the lip and beside the container.
+fn with_room() -> Result<Extractor, ExtractError> {
+    Extractor::new(&camera(), &ImageConfig { region_px: [171, 14, 440, 296], ..image_config(LiquidMethod::Colour) })
+}
+
+/// Protects pours of an eye that cannot tell a picture now and then, from the first one on: no more than ten pictures are called dry before the
+/// ground is known, so a stream in other colours is never "nothing". Once every picture is told, the ground gets known.
+#[test]
+fn ground_that_never_gets_known_is_named() -> Result<(), ExtractError> {
+    let everywhere = vec![[0.0, 0.0], [640.0, 0.0], [640.0, 480.0], [0.0, 480.0]];
+    for every in [3, 8, 15] {
+        let (mut extractor, mut dry_pictures) = (colour()?, 0);
+        for i in 0..170 {
+            let lost = i < 90 && i % every == 0;
+            let picture = if lost {
+                blue(std::slice::from_ref(&everywhere), i)?
+            } else {
+                let mut picture = dry(0.0, i)?;
+                if (60..90).contains(&i) || i >= 150 {
+                    lay_over(&mut picture, &[stream(40.0, 36.0)], OTHER)?;
+                }
+                picture
+            };
+            let measured = measure(&mut extractor, &picture)?;
+            assert_eq!(measured.area_px2, 0.0, "{every} picture {i}");
+            dry_pictures += u32::from(i < 90 && measured.doubt == Doubt::None);
+            let is_stream = lost || (60..90).contains(&i) || i >= 150;
+            assert!(!is_stream || measured.doubt != Doubt::None, "{every} picture {i}: {measured:?}");
+            assert!(!(130..150).contains(&i) || measured.doubt == Doubt::None, "{every} picture {i}: {measured:?}");
+        }
+        assert!(dry_pictures <= 10, "{every}: {dry_pictures}");
+    }
+    Ok(())
+}
+
+/// Protects a worker that starts while a stream flows: when its colours change, it is not learned as ground and is never "nothing". When it ends, that
+/// is told.
+#[test]
+fn a_stream_from_the_first_picture_on_is_no_ground() -> Result<(), ExtractError> {
+    for ends in [false, true] {
+        let mut extractor = colour()?;
+        for i in 0..90 {
+            let mut picture = dry(0.0, i)?;
+            match i {
+                0..20 => lay_over(&mut picture, &[stream(60.0, 50.0)], OWN)?,
+                _ if ends => {}
+                _ => lay_over(&mut picture, &[stream(60.0, 50.0)], OTHER)?,
+            }
+            let measured = measure(&mut extractor, &picture)?;
+            match i {
+                0..20 => assert!(measured.area_px2 > 1200.0, "picture {i}: {measured:?}"),
+                _ if ends => assert!(i < 40 || (measured.area_px2, measured.doubt) == (0.0, Doubt::None), "picture {i}: {measured:?}"),
+                _ => assert_ne!(measured.doubt, Doubt::None, "picture {i}"),
+            }
+        }
+    }
+    Ok(())
+}
+
+/// Protects thin streams, through which the ground is seen: what is neither in the liquid's range nor ground, but a mixture of both, is the
+/// liquid, although the liquid in the glass is seen in its own colours.
+#[test]
+fn a_thin_stream_is_not_new_ground() -> Result<(), ExtractError> {
+    let inside = vec![[216.0, 252.0], [300.0, 252.0], [300.0, 479.0], [216.0, 479.0]];
+    for share in [0.25, 0.35] {
+        let mut extractor = with_room()?;
+        for i in 0..60 {
+            let mut picture = dry(0.0, i)?;
+            if i >= 44 {
+                let (mut poured, clear) = (picture.clone(), picture.clone());
+                lay_over(&mut poured, &[stream(40.0, 36.0)], OWN)?;
+                core::add_weighted(&poured, share, &clear, 1.0 - share, 0.0, &mut picture, -1)?;
+                lay_over(&mut picture, std::slice::from_ref(&inside), OWN)?;
+            }
+            let measured = measure(&mut extractor, &picture)?;
+            let told = measured.area_px2 > 0.0 || measured.doubt != Doubt::None;
+            assert_eq!(told, i >= 44, "{share} picture {i}: {measured:?}");
+        }
+    }
+    Ok(())
+}
+
+/// Protects pours from something in the ground's colours that hides the lip, or half of the stream: what flows beyond it is not "nothing".
+#[test]
+fn a_stream_behind_something_in_the_grounds_colours_is_named() -> Result<(), ExtractError> {
+    let at_lip = vec![[214.0, 215.0], [250.0, 215.0], [250.0, 251.0], [214.0, 251.0]];
+    let one_half = vec![[214.0, 251.0], [214.0, 16.0], [449.0, 16.0]];
+    let other_half = vec![[214.0, 251.0], [449.0, 16.0], [600.0, 16.0], [600.0, 251.0]];
+    for hidden in [at_lip, one_half, other_half] {
+        let mut extractor = with_room()?;
+        for i in 0..60 {
+            let mut picture = dry(0.0, i)?;
+            if i >= 44 {
+                lay_over(&mut picture, &[stream(90.0, 80.0)], OWN)?;
+                lay_over(&mut picture, std::slice::from_ref(&hidden), Scalar::all(185.0))?;
+                picture = noisy(&picture, i)?;
+            }
+            let measured = measure(&mut extractor, &picture)?;
+            let told = measured.area_px2 > 0.0 || measured.doubt != Doubt::None;
+            assert_eq!(told, i >= 44, "{hidden:?} picture {i}: {measured:?}");
         }
     }
     Ok(())
