@@ -200,14 +200,16 @@ impl ColouredLiquid {
     }
 
     /// The last sample of liquid on a ray and the score there: px of liquid minus px of background, at its largest. A lamp's reflection
-    /// near the lip counts as neither.
+    /// near the lip counts as neither, and so does white ground that it may be.
     #[inline(always)]
     fn last_liquid(&self, mask: &[u8], colours: &[Vec3b]) -> Option<(usize, f32)> {
         let (mut score, mut best, mut last) = (0.0f32, 0.0f32, None);
         for (r, (value, step)) in mask.iter().zip(&self.grid.steps_px).enumerate() {
             if *value != 0 {
                 score += *step;
-            } else if self.grid.radii_px[r] > LEARN_FROM_PX || !self.ground.is_blind(colours[r].0) {
+            } else if self.grid.radii_px[r] > LEARN_FROM_PX
+                || !(self.ground.is_blind(colours[r].0) || self.seen().is_hidden(r, colours[r].0))
+            {
                 score -= *step;
             }
             if score > best {
@@ -267,7 +269,14 @@ impl ColouredLiquid {
                 0 if new => 0,
                 // A ray without an edge may have a stream on it all the same.
                 0 if !dry => continue,
-                end => (end + LEARN_BEYOND).max(far),
+                end => {
+                    // What goes on from the liquid in a foreign colour may be more of it.
+                    let beyond = self.seen().beyond_end(i, end)?.filter(|_| !dry && self.dry_frames >= DRY_FRAMES);
+                    if beyond.is_some_and(|colour| self.ground.tell(colour) == Ground::Foreign) {
+                        continue;
+                    }
+                    (end + LEARN_BEYOND).max(far)
+                }
             };
             let (mask, colours) = (self.mask.at_row::<u8>(i as i32)?, self.smooth.at_row::<Vec3b>(i as i32)?);
             let first = from + (self.frames + 3 * i) % every;

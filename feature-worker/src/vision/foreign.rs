@@ -13,6 +13,8 @@ use super::ground_colours::{Ground, GroundColours, Mean};
 
 /// This close to the lip a stream begins, px. Chosen by hand.
 const AT_LIP_PX: f32 = 12.0;
+/// So far from the lip white light may be a lamp's reflection before ground that is white too, px. Chosen by hand: where its glow is cut off.
+const REFLECTION_PX: f32 = 16.0;
 /// A liquid in front of a lamp's reflection is brighter than this in all parts, close to the reflection's middle. Chosen by hand.
 const GLOW_LEVEL: u8 = 180;
 /// More background than this before the first liquid, or the first of a body, ends a ray, px. Tuned.
@@ -94,6 +96,7 @@ impl Seen<'_> {
                         }
                     }
                     Some(Ground::Blind) => {}
+                    Some(Ground::Known) if self.is_hidden(r, colours[r].0) => {}
                     Some(Ground::Known) => score -= step,
                 }
                 if score > best {
@@ -118,18 +121,29 @@ impl Seen<'_> {
         Ok(is.then(|| Body { colour: told.then(|| mean.levels()) }))
     }
 
+    /// Whether white light hides what is in this sample of a ray: ground that is white too, or a stream in a lamp's reflection.
+    #[inline(always)]
+    pub(super) fn is_hidden(&self, sample: usize, colour: [u8; 3]) -> bool {
+        self.grid.radii_px[sample] <= REFLECTION_PX && GroundColours::is_white(colour)
+    }
+
+    /// The colour just beyond the stream's end on a ray, if the region shows it.
+    pub(super) fn beyond_end(&self, ray: usize, end: usize) -> opencv::Result<Option<[u8; 3]>> {
+        let Some(last) = end.checked_sub(1) else { return Ok(None) };
+        let beyond_px = self.grid.radii_px[last] + BEYOND_PX;
+        let r = (last + BEYOND_SAMPLES..self.grid.rays[ray].samples).find(|r| self.grid.radii_px[*r] >= beyond_px);
+        r.map(|r| self.smooth.at_row::<Vec3b>(ray as i32).map(|colours| colours[r].0)).transpose()
+    }
+
     /// The mean colour of what is foreign beside a stream with these ends, if it goes on beyond its edge.
     pub(super) fn beyond(&self, ends: &[usize; RAYS]) -> opencv::Result<Option<[f32; 3]>> {
         let (mut foreign, mut looked, mut mean) = (0usize, 0usize, Mean::default());
-        for (i, ray) in self.grid.rays.iter().enumerate() {
-            let Some(last) = ends[i].checked_sub(1) else { continue };
-            let beyond_px = self.grid.radii_px[last] + BEYOND_PX;
-            let Some(r) = (last + BEYOND_SAMPLES..ray.samples).find(|r| self.grid.radii_px[*r] >= beyond_px) else { continue };
-            let colour = self.smooth.at_row::<Vec3b>(i as i32)?[r];
+        for (i, end) in ends.iter().enumerate() {
+            let Some(colour) = self.beyond_end(i, *end)? else { continue };
             looked += 1;
-            if self.ground.tell(colour.0) == Ground::Foreign {
+            if self.ground.tell(colour) == Ground::Foreign {
                 foreign += 1;
-                mean.add(colour.0);
+                mean.add(colour);
             }
         }
         Ok((foreign as f32 > BEYOND_FOREIGN * looked.max(RAYS / 4) as f32).then(|| mean.levels()))

@@ -126,10 +126,16 @@ impl GroundColours {
         }
     }
 
+    /// Whether a colour is white light, whatever the ground is.
+    #[inline(always)]
+    pub(crate) fn is_white(colour: [u8; 3]) -> bool {
+        colour.iter().all(|v| *v >= BLIND_LEVEL)
+    }
+
     /// Whether a colour is white light that the ground was not seen to be.
     #[inline(always)]
     pub(crate) fn is_blind(&self, colour: [u8; 3]) -> bool {
-        colour.iter().all(|v| *v >= BLIND_LEVEL) && self.counts[WHITE] < KNOWN
+        Self::is_white(colour) && self.counts[WHITE] < KNOWN
     }
 
     /// Takes a colour for one of the ground. White light close to the lip is a reflection and no ground, so it counts only where `is_far`.

@@ -6,6 +6,7 @@ use super::{colour, measure};
 use feature_worker::vision::{ExtractError, Extractor};
 use opencv::core::{self, Mat, Rect, Scalar};
 use opencv::imgproc;
+use opencv::prelude::*;
 use shared::config::{ImageConfig, LiquidMethod};
 use shared::messages::Doubt;
 
@@ -196,6 +197,56 @@ fn a_stream_behind_something_in_the_grounds_colours_is_named() -> Result<(), Ext
             let measured = measure(&mut extractor, &picture)?;
             let told = measured.area_px2 > 0.0 || measured.doubt != Doubt::None;
             assert_eq!(told, i >= 44, "{hidden:?} picture {i}: {measured:?}");
+        }
+    }
+    Ok(())
+}
+
+/// Protects streams of two colours: what goes on from the liquid's edge in another colour, on less than half of the rays, is not learned as ground, so
+/// a stream that takes this colour as a whole is never "nothing".
+#[test]
+fn a_stream_with_a_second_colour_does_not_teach_it_as_ground() -> Result<(), ExtractError> {
+    let outer = vec![[215.0, 250.0], [215.0, 135.0], [270.4, 184.0]];
+    let mut extractor = with_room()?;
+    for i in 0..150 {
+        let mut picture = dry(0.0, i)?;
+        match i {
+            0..20 => {}
+            20..80 => {
+                lay_over(&mut picture, std::slice::from_ref(&outer), OTHER)?;
+                lay_over(&mut picture, &[stream(90.0, 80.0)], OWN)?;
+            }
+            _ => lay_over(&mut picture, &[stream(90.0, 80.0)], OTHER)?,
+        }
+        let measured = measure(&mut extractor, &picture)?;
+        let told = measured.area_px2 > 0.0 || measured.doubt != Doubt::None;
+        assert_eq!(told, i >= 20, "picture {i}: {measured:?}");
+    }
+    Ok(())
+}
+
+/// Protects small streams under a lamp's reflection before ground that is as white as it is: white light at the lip is no ground there, so they are
+/// measured or named. Without a stream there is no doubt.
+#[test]
+fn a_stream_under_a_reflection_before_white_ground_is_told() -> Result<(), ExtractError> {
+    let box_of = |x: f32, y: f32, right: f32, down: f32| vec![[x, y], [right, y], [right, down], [x, down]];
+    let (far, at_lip) = (box_of(260.0, 155.0, 310.0, 205.0), box_of(190.0, 203.0, 262.0, 249.0));
+    for (a, b) in [(24.0, 20.0), (30.0, 26.0), (40.0, 36.0)] {
+        let mut extractor = with_room()?;
+        for i in 0..60 {
+            let mut picture = dry(0.0, i)?;
+            lay_over(&mut picture, &[far.clone(), at_lip.clone()], Scalar::all(255.0))?;
+            if i >= 44 {
+                lay_over(&mut picture, &[stream(a, b)], OWN)?;
+            }
+            for (k, pixel) in picture.data_typed_mut::<core::Vec3b>()?.iter_mut().enumerate() {
+                let (right, down) = (((k % 640) as f32 - 215.0) / 18.0, ((k / 640) as f32 - 250.0) / 12.0);
+                let light = (255.0 * (-0.5 * (right * right + down * down)).exp()) as u8;
+                (0..3).for_each(|c| pixel[c] = pixel[c].saturating_add(light));
+            }
+            let measured = measure(&mut extractor, &picture)?;
+            let told = measured.area_px2 > 0.0 || measured.doubt != Doubt::None;
+            assert_eq!(told, i >= 44, "{a} x {b} picture {i}: {measured:?}");
         }
     }
     Ok(())
