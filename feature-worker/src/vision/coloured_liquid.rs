@@ -251,7 +251,9 @@ impl ColouredLiquid {
         self.wandering.look(&rays);
         if let Some(mean_sum) = sums.iter().sum::<u32>().checked_div(count) {
             self.ground.expose(mean_sum);
-            self.ground_bgr = Some(sums.map(|sum| sum as f32 / count as f32));
+            let bgr = sums.map(|sum| sum as f32 / count as f32);
+            self.ground.see_mean(bgr);
+            self.ground_bgr = Some(bgr);
         }
         Ok(())
     }
