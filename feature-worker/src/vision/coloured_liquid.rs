@@ -352,6 +352,8 @@ impl ColouredLiquid {
         }
         if foreign < QUIET_SHARE && self.learn_after == 0 && !self.half_white {
             self.beside.teach(&mut self.ground, self.frames)?;
+        } else {
+            self.beside.forget_kept();
         }
         Ok(dry)
     }
@@ -429,6 +431,9 @@ impl Liquid for ColouredLiquid {
             }
             other => other,
         };
+        if !matches!(sighting, Sighting::Dry { .. }) {
+            self.beside.forget_kept();
+        }
         // While the ground is not known nothing else is looked for, so only pictures that it is learned from are dry: as many as make it known.
         let unknown = (self.dry_frames < DRY_FRAMES && self.learn_after > 0).then_some(Doubt::EdgeNotFound);
         self.follow_ground(sighting)?;

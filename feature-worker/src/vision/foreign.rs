@@ -55,8 +55,8 @@ const MIXED_LEAST: f32 = 0.03;
 const ALIKE_LEVELS: f32 = 5.0;
 /// See [`ALIKE_LEVELS`]. Chosen by hand: what a vignette and a lamp's fall-off make over 40 px.
 const ALIKE_SHARE: f32 = 0.08;
-/// What is foreign goes on beside the container when this share of the square there has its colour. Chosen by hand: no
-/// jet covers half of it.
+/// What is foreign goes on beside the container when this share of both halves of the square there has its colour. Chosen by hand: a thick jet
+/// covers more than this of the whole square.
 const GOES_ON: f32 = 0.6;
 
 /// A picture along the rays.
@@ -211,8 +211,10 @@ fn is_mixed(foreign: [f32; 3], liquid: [f32; 3], ground: [f32; 3]) -> bool {
 /// Whether what is foreign at the lip goes on outside the container, in the square beside it, as only ground does.
 pub(super) fn goes_on_beside(foreign: [f32; 3], beside: &[Vec3b]) -> bool {
     let most = ALIKE_LEVELS + ALIKE_SHARE * foreign.iter().sum::<f32>() / 3.0;
-    let alike = beside.iter().filter(|c| (0..3).all(|k| (f32::from(c[k]) - foreign[k]).abs() <= most)).count();
-    !beside.is_empty() && alike as f32 >= GOES_ON * beside.len() as f32
+    let alike = |c: &&Vec3b| (0..3).all(|k| (f32::from(c[k]) - foreign[k]).abs() <= most);
+    let goes_on = |half: &[Vec3b]| half.iter().filter(alike).count() as f32 >= GOES_ON * half.len() as f32;
+    let (lower, upper) = beside.split_at(beside.len() / 2);
+    !beside.is_empty() && goes_on(lower) && goes_on(upper)
 }
 
 /// Distance between two colours, grey levels.

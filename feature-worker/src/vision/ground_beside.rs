@@ -23,14 +23,19 @@ const SQUARE_SAMPLES: i32 = 16;
 /// Where the square beside the container lies in a picture 640 px wide: from and to, px along the x-axis and along the y-axis. What the
 /// background brings to the lip comes from there, or along the rays.
 const BESIDE_PX: [[f32; 2]; 2] = [[-34.0, -7.0], [-48.0, 10.0]];
-/// Where the larger square beside the container lies, in the same way. Chosen by hand: a jet of liquid that is thin crosses its lower part, and a
-/// thick one its upper part, so that none fills it.
+/// Where the larger square beside the container lies, in the same way. Chosen by hand: a jet of liquid falls across its lower half at a small tilt and
+/// across its upper half at a large one, so that none fills both.
 const BESIDE_WIDE_PX: [[f32; 2]; 2] = [[-36.0, -7.0], [-48.0, 60.0]];
 /// Where the square in the glass lies, in the same way: while something flows, the liquid stands there. Chosen by hand: beyond the wall's
 /// own light, and within the region that calibration writes.
 const GLASS_PX: [[f32; 2]; 2] = [[6.0, 18.0], [-46.0, -14.0]];
 /// Of this many samples of the square beside the container, the ground is learned from one a frame. Chosen by hand.
 const TEACH_EVERY: usize = 4;
+/// And only when nothing foreign came to the lip for so many pictures more: a jet of liquid crosses the square before its stream is seen. Chosen by
+/// hand: a stream that begins is seen in 4 pictures, and the ground does not come to the lip much faster.
+const TEACH_AFTER: usize = 4;
+/// Samples of a square.
+const SAMPLES: usize = (SQUARE_SAMPLES * SQUARE_SAMPLES) as usize;
 /// Side of the square of samples that are smoothed together, as along the rays. Chosen by hand.
 const SMOOTH: i32 = 5;
 /// The liquid stands in the glass when this share of its square has the liquid's colours. Chosen by hand.
@@ -51,11 +56,15 @@ pub(super) struct Square {
     pixels: Mat,
     /// The same, smoothed.
     smooth: Mat,
+    /// The last smoothed squares, of quiet pictures in a row, as a ring, and how many there were.
+    kept: Vec<Vec3b>,
+    quiet: usize,
 }
 
 impl Square {
     fn new(place: &Place, at_px: [[f32; 2]; 2]) -> opencv::Result<Self> {
-        Ok(Self { maps: place.maps(at_px)?, pixels: Mat::default(), smooth: Mat::default() })
+        let kept = vec![Vec3b::default(); TEACH_AFTER * SAMPLES];
+        Ok(Self { maps: place.maps(at_px)?, pixels: Mat::default(), smooth: Mat::default(), kept, quiet: 0 })
     }
 
     /// Beside the container.
@@ -87,12 +96,24 @@ impl Square {
         self.smooth.data_typed()
     }
 
-    /// Learns the ground's colours from the square: what comes to the lip from there is known before.
+    /// Says that nothing foreign is at the lip in the picture that was taken. Learns the ground's colours from the square of an earlier such picture:
+    /// what comes to the lip from there is known before.
     pub(super) fn teach(&mut self, ground: &mut GroundColours, frame: usize) -> opencv::Result<()> {
-        for colour in self.colours()?.iter().skip(frame % TEACH_EVERY).step_by(TEACH_EVERY) {
-            ground.learn(colour.0, false);
+        if self.colours()?.len() != SAMPLES {
+            return Ok(());
         }
+        let kept = &mut self.kept[self.quiet % TEACH_AFTER * SAMPLES..][..SAMPLES];
+        if self.quiet >= TEACH_AFTER {
+            kept.iter().skip(frame % TEACH_EVERY).step_by(TEACH_EVERY).for_each(|colour| ground.learn(colour.0, false));
+        }
+        kept.copy_from_slice(self.smooth.data_typed()?);
+        self.quiet = self.quiet.wrapping_add(1);
         Ok(())
+    }
+
+    /// Says that something may be at the lip: what the square showed just before it may be a jet of it.
+    pub(super) fn forget_kept(&mut self) {
+        self.quiet = 0;
     }
 }
 

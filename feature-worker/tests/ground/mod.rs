@@ -251,3 +251,41 @@ fn a_stream_under_a_reflection_before_white_ground_is_told() -> Result<(), Extra
     }
     Ok(())
 }
+
+/// Protects the first pictures of a stream in other colours: its jet crosses what is seen beside the container before the stream is seen at the lip,
+/// and is not learned as ground there.
+#[test]
+fn a_jet_beside_the_container_is_no_ground() -> Result<(), ExtractError> {
+    let jet = vec![[176.0, 238.0], [210.0, 238.0], [210.0, 252.0], [176.0, 252.0]];
+    let mut extractor = with_room()?;
+    for i in 0..110 {
+        let mut picture = dry(0.0, i)?;
+        match i {
+            0..44 => {}
+            44..48 => lay_over(&mut picture, std::slice::from_ref(&jet), OTHER)?,
+            _ => lay_over(&mut picture, &[stream(40.0, 36.0)], OTHER)?,
+        }
+        let measured = measure(&mut extractor, &picture)?;
+        assert_eq!(measured.area_px2, 0.0, "picture {i}");
+        assert!(i < 48 || measured.doubt != Doubt::None, "picture {i}: {measured:?}");
+    }
+    Ok(())
+}
+
+/// Protects thick streams in other colours: a jet that covers three quarters of what is seen beside the container is no ground that goes on there.
+#[test]
+fn a_thick_jet_is_no_ground_that_goes_on() -> Result<(), ExtractError> {
+    let jet = vec![[150.0, 180.0], [216.0, 180.0], [216.0, 272.0], [150.0, 272.0]];
+    let body = vec![[214.0, 170.0], [290.0, 170.0], [290.0, 249.0], [214.0, 249.0]];
+    let mut extractor = with_room()?;
+    for i in 0..70 {
+        let mut picture = dry(0.0, i)?;
+        if i >= 44 {
+            lay_over(&mut picture, &[jet.clone(), body.clone()], OTHER)?;
+        }
+        let measured = measure(&mut extractor, &picture)?;
+        let wanted = if i < 44 { Doubt::None } else { Doubt::ColoursChanged };
+        assert_eq!((measured.area_px2, measured.doubt), (0.0, wanted), "picture {i}");
+    }
+    Ok(())
+}
