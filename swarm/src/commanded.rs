@@ -50,6 +50,8 @@ pub struct Commanded {
     told: Option<([f64; 6], Rates)>,
     /// Where the servo steered all joints to after the cycle before, rad, and how fast the tilting one, degrees/s.
     servo: ([f64; 6], f64),
+    /// How far beyond the range a command may be since the program began anew, degrees: it may have begun at a joint that a hand was moving.
+    excused_deg: f64,
     /// The largest target of the newest pour, degrees.
     largest_deg: f64,
     /// Smallest commanded tilt since nothing is poured and the command has turned back, degrees; `None` before that.
@@ -60,7 +62,7 @@ impl Commanded {
     /// Nothing was told yet.
     pub fn new(limits: Limits, cycle_s: f64) -> Self {
         let servo = ([f64::NAN; 6], f64::NAN);
-        Self { limits, cycle_s, calls: 0, told: None, servo, largest_deg: 0.0, least_deg: None }
+        Self { limits, cycle_s, calls: 0, told: None, servo, excused_deg: 0.0, largest_deg: 0.0, least_deg: None }
     }
 
     /// Takes a target that the controller sent; `active` says whether it pours or records.
@@ -97,13 +99,6 @@ impl Commanded {
             }
         }
         let alpha_deg = q[joint].to_degrees();
-        // A joint that somebody has moved beyond the range comes back from there.
-        let range = f64::from(alpha_min_deg) - BELOW_DEG..=f64::from(alpha_max_deg) + SLACK_DEG;
-        let beyond_deg = |deg: f64| (deg - range.end()).max(range.start() - deg).max(0.0);
-        let was_beyond_deg = beyond_deg(told_q[joint].to_degrees()).max(beyond_deg(servo_q[joint].to_degrees()));
-        if beyond_deg(alpha_deg) > was_beyond_deg {
-            findings.push(("robot-range", format!("servoj is given {alpha_deg:.3} degrees")));
-        }
         // For each call that this may follow: the rate that it then has, and how much harder than allowed it accelerates.
         let most = f64::from(acceleration_deg_s2) * (1.0 + SLACK) + 1.0;
         let rate_from = |from_q: &[f64; 6]| (alpha_deg - from_q[joint].to_degrees()) / self.cycle_s;
@@ -130,6 +125,7 @@ impl Commanded {
             ));
         }
         let begins_anew = !goes_on && may_be_anew;
+        findings.extend(self.beyond(alpha_deg, (told_q[joint].to_degrees(), servo_q[joint].to_degrees()), anew_rate, begins_anew));
         findings.extend(self.again(alpha_deg, told_rate > 0.0, active, begins_anew));
         let rates = match (goes_on, may_be_anew) {
             (true, true) => Rates::two(told_rate, anew_rate),
@@ -139,6 +135,24 @@ impl Commanded {
         };
         self.told = Some((*q, rates));
         findings
+    }
+
+    /// Whether a command is beyond the range, where neither the one before it nor the servo was. A joint that somebody has moved there comes back; one that
+    /// somebody is moving, when a program begins anew, has to be braked first.
+    fn beyond(&mut self, alpha_deg: f64, (told_deg, servo_deg): (f64, f64), anew_rate: f64, begins_anew: bool) -> Option<Finding> {
+        let Limits { alpha_min_deg, alpha_max_deg, acceleration_deg_s2, .. } = self.limits;
+        let range = f64::from(alpha_min_deg) - BELOW_DEG..=f64::from(alpha_max_deg) + SLACK_DEG;
+        let middle_deg = 0.5 * (range.start() + range.end());
+        let beyond_deg = |deg: f64| (deg - range.end()).max(range.start() - deg).max(0.0);
+        if begins_anew {
+            let braked_deg = alpha_deg + anew_rate * (self.cycle_s + anew_rate.abs() / (2.0 * f64::from(acceleration_deg_s2)));
+            self.excused_deg = beyond_deg(alpha_deg).max(beyond_deg(braked_deg));
+        } else if (alpha_deg - middle_deg).abs() <= (told_deg - middle_deg).abs() {
+            // It is braked.
+            self.excused_deg = 0.0;
+        }
+        let may_be_deg = beyond_deg(told_deg).max(beyond_deg(servo_deg)).max(self.excused_deg);
+        (beyond_deg(alpha_deg) > may_be_deg).then(|| ("robot-range", format!("servoj is given {alpha_deg:.3} degrees")))
     }
 
     /// Whether the container is tilted again while nothing is poured. A slowed robot is still on its way to the last targets when the pour
@@ -227,6 +241,9 @@ mod tests {
         assert_eq!(findings(&back, (-22.6, 0.0), false), Vec::<&str>::new());
         let on: Vec<f64> = [-22.6, -22.62, -22.66].to_vec();
         assert!(findings(&on, (-22.6, 0.0), false).contains(&"robot-range"));
+        // While a hand moves it on at 15 degrees/s (seed 5039681), a program begins where it is, and brakes it: no harder, and no farther.
+        assert_eq!(findings(&[-0.5, -2.59, -2.69, -2.75, -2.77, -2.73], (-2.47, -15.0), false), Vec::<&str>::new());
+        assert!(findings(&[-0.5, -2.59, -2.71, -2.83, -2.95, -3.07], (-2.47, -15.0), false).contains(&"robot-range"));
     }
 
     /// Protects the other joints: they stay as told, or where the servo is; every other angle is a motion.

@@ -92,26 +92,30 @@ impl Eye {
         }
     }
 
-    /// Something goes wrong at `now_ns`.
+    /// Something goes wrong at `now_ns`. It does not end what is longer, and of its kind.
     pub fn inject(&mut self, fault: EyeFault, now_ns: u64) {
         let until_ns = |ms: u32| now_ns + u64::from(ms) * 1_000_000;
         match fault {
-            EyeFault::Loss(frames) => self.lost = frames,
+            EyeFault::Loss(frames) => self.lost = self.lost.max(frames),
             EyeFault::Freeze(frames) => self.frozen = self.frozen.max(frames),
-            EyeFault::Duplicate(frames) => self.twice = frames,
+            EyeFault::Duplicate(frames) => self.twice = self.twice.max(frames),
             EyeFault::Reorder => self.swapped = true,
-            EyeFault::Late(ms) => self.late = (u64::from(ms) * 1_000_000, DRIFT_FRAMES),
+            EyeFault::Late(ms) => {
+                let (late_ns, frames) = self.late;
+                let still_ns = if frames > 0 { late_ns } else { 0 };
+                self.late = (still_ns.max(u64::from(ms) * 1_000_000), DRIFT_FRAMES);
+            }
             EyeFault::GainDrift(share) => self.drift = (share / f64::from(DRIFT_FRAMES), DRIFT_FRAMES),
-            EyeFault::FalseZero(frames) => self.false_zero = frames,
+            EyeFault::FalseZero(frames) => self.false_zero = self.false_zero.max(frames),
             EyeFault::Spike(area_px2) => self.spike_px2 = Some(area_px2),
-            EyeFault::Stuck(frames) => self.stuck = (frames, self.newest.area_px2),
+            EyeFault::Stuck(frames) => self.stuck = (self.stuck.0.max(frames), self.newest.area_px2),
             EyeFault::Killed(ms) => {
-                self.gone_until_ns = until_ns(ms);
+                self.gone_until_ns = self.gone_until_ns.max(until_ns(ms));
                 self.epoch_ns = self.gone_until_ns;
                 self.published.clear();
             }
-            EyeFault::Hung(ms) => self.gone_until_ns = until_ns(ms),
-            EyeFault::Two(ms) => self.two_until_ns = until_ns(ms),
+            EyeFault::Hung(ms) => self.gone_until_ns = self.gone_until_ns.max(until_ns(ms)),
+            EyeFault::Two(ms) => self.two_until_ns = self.two_until_ns.max(until_ns(ms)),
             // The camera has it from its beginning.
             EyeFault::Picture(_) => {}
         }

@@ -5,6 +5,7 @@
 use std::io::Write;
 use std::path::PathBuf;
 use std::process::ExitCode;
+use std::sync::atomic::Ordering;
 
 use clap::Parser;
 use shared::config::Config;
@@ -35,7 +36,7 @@ struct Args {
     /// Runs this seed and prints what happens.
     #[arg(long, conflicts_with = "seeds", required_unless_present = "seeds")]
     seed: Option<u64>,
-    /// Runs so many seeds, on all cores.
+    /// Runs so many seeds, on all cores. Ctrl-C ends it with those under way, and prints what it has shown so far.
     #[arg(long, value_parser = clap::value_parser!(u64).range(1..=100_000_000))]
     seeds: Option<u64>,
     /// The first of them.
@@ -221,7 +222,13 @@ fn many(args: &Args, seeds: Seeds, config: &Config) -> Result<bool, String> {
     let json = JsonOut::open(args.json.as_deref()).map_err(|e| e.what)?;
     let started = std::time::Instant::now();
     let until = args.minutes.map(|minutes| started + std::time::Duration::from_secs(60 * minutes));
-    let (shown, summary) = run_until(seeds, config, until, true);
+    // What an hour has shown is not lost with Ctrl-C.
+    let stop = shared::os::stop_at_signals().map_err(|e| format!("the signals that end a program cannot be watched: {e}"))?;
+    let over = || {
+        let is_late = until.is_some_and(|until| std::time::Instant::now() >= until);
+        stop.load(Ordering::Relaxed).then_some("stopped").or(is_late.then_some("the time is over"))
+    };
+    let (shown, summary) = run_until(seeds, config, &over, true);
     if json.tables() {
         shown.iter().filter(|one| !one.violations.is_empty()).take(10).for_each(|one| {
             print(&format!("seed {}:", one.seed));

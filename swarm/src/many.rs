@@ -3,7 +3,7 @@
 //! Uses rayon; the order of the results is that of the seeds, whatever the number of threads. Allocates; cannot fail.
 
 use std::collections::BTreeMap;
-use std::time::Instant;
+use std::time::{Duration, Instant};
 
 use indicatif::{ParallelProgressIterator, ProgressBar, ProgressStyle};
 use rayon::prelude::*;
@@ -107,8 +107,10 @@ pub struct Summary {
 
 /// What the table calls pours without a fault on a robot that lags by more than twice what was learned.
 pub const OTHER_LAG: &str = "none, but more than twice the lag";
-/// How many seeds are run between two looks at the time.
+/// How many seeds are run between two looks at the time, and at what asks for an end.
 const AT_ONCE: u64 = 256;
+/// How often it is said how far it is, where there is no terminal. Chosen by hand: a line a minute.
+const TELLS: Duration = Duration::from_secs(60);
 
 /// The most that something happens on average, at 95 %, that happened `seen` times: the mean of the Poisson distribution that gives no more than
 /// this in one case of 20. For none it is 3.0.
@@ -141,11 +143,11 @@ pub struct Seeds {
 
 /// Runs seeds on all cores, with a progress bar if `progress`.
 pub fn run_many(seeds: Seeds, config: &Config, progress: bool) -> (Vec<Shown>, Summary) {
-    run_until(seeds, config, None, progress)
+    run_until(seeds, config, &|| None, progress)
 }
 
-/// The same, but begins no more of them at `until`.
-pub fn run_until(seeds: Seeds, config: &Config, until: Option<Instant>, progress: bool) -> (Vec<Shown>, Summary) {
+/// The same, but begins no more of them once `over` says why.
+pub fn run_until(seeds: Seeds, config: &Config, over: &dyn Fn() -> Option<&'static str>, progress: bool) -> (Vec<Shown>, Summary) {
     let last = seeds.from.saturating_add(seeds.count);
     let say = |text: &str| {
         if progress {
@@ -158,10 +160,16 @@ pub fn run_until(seeds: Seeds, config: &Config, until: Option<Instant>, progress
     }
     let mut shown: Vec<Shown> = Vec::new();
     let (mut spent_s, mut camera_s) = (0.0, [0.0; 2]);
+    let mut told = Instant::now();
     for from in (seeds.from..last).step_by(AT_ONCE as usize) {
-        if until.is_some_and(|until| Instant::now() >= until) {
-            say("the time is over");
+        if let Some(why) = over() {
+            say(&format!("{why}: {} of {} seeds were run", shown.len(), seeds.count));
             break;
+        }
+        // Without a terminal there is no bar.
+        if bar.is_hidden() && told.elapsed() >= TELLS {
+            say(&format!("{} of {} seeds", shown.len(), seeds.count));
+            told = Instant::now();
         }
         let plans: Vec<Plan> = (from..last.min(from.saturating_add(AT_ONCE))).map(|seed| Plan::draw_with(seed, seeds.choice)).collect();
         let trained = train_for(&plans, config, &say);

@@ -76,13 +76,13 @@ impl Wiring {
     /// Lets nothing arrive for this time; what is sent meanwhile arrives afterwards.
     pub fn stall(&self, time_ns: u64) {
         let mut wires = self.wires();
-        wires.stalled_until_ns = wires.now_ns + time_ns;
+        wires.stalled_until_ns = wires.stalled_until_ns.max(wires.now_ns + time_ns);
     }
 
     /// Splits what is sent in the next time into pieces.
     pub fn split(&self, time_ns: u64) {
         let mut wires = self.wires();
-        wires.split_until_ns = wires.now_ns + time_ns;
+        wires.split_until_ns = wires.split_until_ns.max(wires.now_ns + time_ns);
     }
 
     /// Breaks all connections, as a reset does.

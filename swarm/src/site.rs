@@ -421,8 +421,10 @@ impl Site {
             What::LinkCut => self.wiring.cut(),
             What::SecondClient(time) => self.second_client(u64::from(*time) * ms),
             What::Eye(fault) => self.eye.inject(*fault, self.now_ns),
-            What::Overrun(time) => self.lateness_ns = u64::from(*time) * ms,
-            What::Suspended(time) => self.controller_frozen_until_ns = self.now_ns + u64::from(*time) * ms,
+            What::Overrun(time) => self.lateness_ns = self.lateness_ns.max(u64::from(*time) * ms),
+            What::Suspended(time) => {
+                self.controller_frozen_until_ns = self.controller_frozen_until_ns.max(self.now_ns + u64::from(*time) * ms);
+            }
             What::ControllerKilled(time) => {
                 // The kernel closes what the process had open.
                 self.wiring.cut();

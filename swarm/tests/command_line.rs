@@ -1,7 +1,8 @@
 //! The command line: what is wrong is said in one line, and a violation can be shown again.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::too_many_lines)]
 
-use std::process::{Command, Output};
+use std::io::{BufRead, BufReader};
+use std::process::{Command, Output, Stdio};
 
 fn swarm(args: &[&str]) -> Output {
     Command::new(env!("CARGO_BIN_EXE_swarm")).args(args).output().unwrap()
@@ -36,6 +37,22 @@ fn a_full_disk_is_told() {
     let last = text.lines().last().unwrap();
     assert_eq!(output.status.code(), Some(2), "{text}");
     assert!(last.starts_with("error: /dev/full: cannot be written: ") && last.contains("make room"), "{text}");
+}
+
+/// Protects an hour of work from Ctrl-C: what the seeds so far have shown is printed, and the rest is left out.
+#[test]
+fn a_signal_ends_it_with_its_results() {
+    let args = ["--seeds", "100000", "--from", "1", "--vessels", "1", "--robot", "cb3"];
+    let mut child = Command::new(env!("CARGO_BIN_EXE_swarm")).args(args).stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().unwrap();
+    let mut lines = BufReader::new(child.stderr.take().unwrap()).lines();
+    assert!(lines.next().unwrap().unwrap().contains("training"));
+    assert!(Command::new("kill").arg(child.id().to_string()).status().unwrap().success());
+    let said: Vec<String> = lines.map(Result::unwrap).collect();
+    let output = child.wait_with_output().unwrap();
+    let text = String::from_utf8(output.stdout).unwrap();
+    assert_eq!(output.status.code(), Some(0), "{said:?}");
+    assert!(said.iter().any(|line| line.contains("stopped: ") && line.contains(" of 100000 seeds were run")), "{said:?}");
+    assert!(text.starts_with("seeds 1 to 256: "), "{text}");
 }
 
 /// Protects the replay: a seed is told in words, the same twice, and drawn to a file; a plot that cannot be written is one line.

@@ -3,14 +3,21 @@
 //! Pure functions of the offline trainer, for any thread; they allocate and do not fail. Each weight is compared with what the camera's
 //! areas say when they are calibrated on all other episodes. The worst one is taken out, and the rest are compared again, so that one wrong
 //! weight does not accuse the others.
+//!
+//! Two or three weights leave the exponent of the area open, so each pair of them is compared at the exponent that suits it best. Of three, the
+//! two that are least apart accuse the third. Two that contradict each other accuse both, as nobody knows which one is wrong.
 
 use serde::Serialize;
 
 use crate::calibration;
 use crate::data::TrainingEpisode;
 
-/// Fewer episodes than this cannot contradict each other. Chosen by hand; no measurement is recorded.
+/// So many episodes calibrate each other, the exponent included. Chosen by hand; no measurement is recorded.
 const NEEDS: usize = 4;
+/// Exponents of the area at which two weights may agree: those of the prototype's cameras, and more. Chosen by hand.
+const EXPONENTS: std::ops::RangeInclusive<u32> = 80..=170;
+/// By how much two weights may be apart at the best of them (log), as a standard deviation: the largest spread of many. Chosen by hand.
+const PAIR_SPREAD: f64 = 0.15;
 /// Standard deviations at which a weight is doubted. Chosen by hand; no measurement is recorded.
 const DOUBTED_SDS: f64 = 4.0;
 /// Standard deviation of reading the scale, g. Chosen by hand; no measurement is recorded.
@@ -41,6 +48,36 @@ impl std::fmt::Display for DoubtfulWeight {
     }
 }
 
+/// What an episode's weight and areas say about the weight of another one, g, with its standard deviation, at the exponent that suits the other one
+/// best; and by how many standard deviations it is off all the same.
+fn told_by(one: &TrainingEpisode, other: &TrainingEpisode) -> (f64, f64, f64) {
+    let at = |exponent: u32| {
+        let exponent = f64::from(exponent) / 100.0;
+        let expected_g = one.weight_g * calibration::area_sum(other, exponent) / calibration::area_sum(one, exponent).max(1e-9);
+        let sd_g = READING_SD_G.hypot(expected_g * PAIR_SPREAD.hypot(READING_SD_G / one.weight_g));
+        (expected_g, sd_g, (other.weight_g - expected_g).abs() / sd_g)
+    };
+    let first = at(*EXPONENTS.start());
+    EXPONENTS.step_by(10).map(at).fold(first, |best, next| if next.2 < best.2 { next } else { best })
+}
+
+/// Weights of two or three episodes that contradict each other.
+fn doubtful_of_few(episodes: &[TrainingEpisode]) -> Vec<DoubtfulWeight> {
+    let apart_sds = |j: usize, k: usize| told_by(&episodes[j], &episodes[k]).2.min(told_by(&episodes[k], &episodes[j]).2);
+    let pairs = (0..episodes.len()).flat_map(|k| (0..k).map(move |j| (j, k)));
+    let Some((least_sds, (j, k))) = pairs.map(|(j, k)| (apart_sds(j, k), (j, k))).min_by(|a, b| a.0.total_cmp(&b.0)) else {
+        return Vec::new();
+    };
+    let trusted: &[usize] = if least_sds < DOUBTED_SDS { &[j, k] } else { &[] };
+    let accused = (0..episodes.len()).filter(|i| !trusted.contains(i)).filter_map(|i| {
+        let others = (0..episodes.len()).filter(|o| *o != i && (trusted.is_empty() || trusted.contains(o)));
+        let (expected_g, sd_g, sds) = others.map(|o| told_by(&episodes[o], &episodes[i])).max_by(|a, b| a.2.total_cmp(&b.2))?;
+        let e = &episodes[i];
+        (sds >= DOUBTED_SDS).then(|| DoubtfulWeight { name: e.name.clone(), weight_g: e.weight_g, expected_g, sd_g })
+    });
+    accused.collect()
+}
+
 /// Weights that do not fit the others, worst first.
 pub fn doubtful(episodes: &[TrainingEpisode]) -> Vec<DoubtfulWeight> {
     let mut left: Vec<TrainingEpisode> = episodes.to_vec();
@@ -67,6 +104,9 @@ pub fn doubtful(episodes: &[TrainingEpisode]) -> Vec<DoubtfulWeight> {
         let e = &left[worst];
         found.push(DoubtfulWeight { name: e.name.clone(), weight_g: e.weight_g, expected_g: expected_g[worst], sd_g: sd_g(worst) });
         left.remove(worst);
+    }
+    if left.len() < NEEDS {
+        found.extend(doubtful_of_few(&left));
     }
     found
 }

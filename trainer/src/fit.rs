@@ -45,6 +45,7 @@ mod servo;
 mod tilts;
 mod unknowns;
 
+use doubts::Doubt;
 use fitted::Fitted;
 use noise::{CHANGE_NEEDS, Changed, FrameNoise};
 use prepared::{PreparedEpisode, Stage};
@@ -334,7 +335,7 @@ impl Conclusion<'_> {
         model
     }
 
-    fn explanation(&self, fitted: &Fitted, doubt: f64) -> Explanation {
+    fn explanation(&self, fitted: &Fitted, doubt: Doubt) -> Explanation {
         let calibration = fitted.calibration(&fitted.found.of_episodes(CAMERA_GAIN));
         Explanation { model: self.model(fitted), calibration, unknowns: doubts::unknowns(fitted, doubt) }
     }
@@ -354,10 +355,10 @@ impl Conclusion<'_> {
         let gains: Vec<f64> =
             self.tempered.found.own.iter().zip(self.episodes).map(|(own, e)| own[CAMERA_GAIN] - e.log_camera_gain).collect();
         let gain_expected = if self.camera.clean { GAIN_CLEAN } else { GAIN_EXPECTED };
-        let straight_doubt = (self.tight.cost / frames.max(1) as f64).max(1.0);
+        let straight_doubt = Doubt::tight((self.tight.cost / frames.max(1) as f64).max(1.0), self.episodes.len());
         let Doubted { calibration, covariance, pour_sd } = self.camera();
         let mut fused = FusedModel {
-            explanations: [self.explanation(self.wide, 1.0), self.explanation(self.tight, straight_doubt)],
+            explanations: [self.explanation(self.wide, Doubt::wide()), self.explanation(self.tight, straight_doubt)],
             tight_share,
             camera: covariance,
             gain_sd: noise::camera_gain_sd(&gains, gain_expected).max(if self.camera.clean { 0.0 } else { pour_sd }),

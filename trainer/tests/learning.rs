@@ -190,6 +190,36 @@ fn a_wrong_weight_is_found() {
     assert!((doubts[0].expected_g - right).abs() < 0.15 * right, "{doubts:?}");
 }
 
+/// Protects the first lessons with a vessel from a typo: of three weights the one that contradicts the two others is named, of two that contradict each
+/// other both are, and right ones are not, though their streams differ.
+#[test]
+fn a_wrong_weight_is_found_among_few() {
+    let mut wrong = Vec::new();
+    for seed in 1..=40 {
+        for n in [2, 3] {
+            let right = episodes(n, seed);
+            let doubts = consistency::doubtful(&right);
+            if !doubts.is_empty() {
+                wrong.push(format!("seed {seed}, {n} right ones: {doubts:?}"));
+            }
+            for (k, factor) in (0..n).flat_map(|k| [(k, 0.1), (k, 10.0)]) {
+                let mut typed = right.clone();
+                typed[k].weight_g = (factor * typed[k].weight_g).round();
+                // A tenth of a light one is no weight at all.
+                if typed.iter().any(|e| e.weight_g < 5.0) {
+                    continue;
+                }
+                let names: Vec<_> = consistency::doubtful(&typed).into_iter().map(|d| d.name).collect();
+                let expected: Vec<_> = typed.iter().enumerate().filter(|(j, _)| n == 2 || *j == k).map(|(_, e)| e.name.clone()).collect();
+                if names != expected {
+                    wrong.push(format!("seed {seed}, {n} episodes, number {k} times {factor}: {names:?}"));
+                }
+            }
+        }
+    }
+    assert!(wrong.is_empty(), "{}", wrong.join("\n"));
+}
+
 /// Protects the trainer from bad data: each fault is named in words, before any training.
 #[test]
 fn faults_are_named() {

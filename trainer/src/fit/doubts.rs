@@ -12,8 +12,16 @@ use super::unknowns::{AREA_EXPONENT, DELAY, LOG_C, LOG_WEIR, SHARED, VESSEL, mod
 
 /// Outflow at which the camera's gain is judged, ml a frame: that of controlled pours. From the prototype's simulations; the demos pour as fast.
 const JUDGED_AT_ML: f64 = 0.7;
-/// How much a pour's flow factor, gain and delay change from pour to pour. From the prototype; no other measurement is recorded.
-const POUR_SDS: [f64; 3] = [0.1, 0.02, 0.3];
+/// How much a pour's flow factor and delay change from pour to pour. From the prototype; no other measurement is recorded.
+const FLOW_FACTOR_SD: f64 = 0.1;
+const DELAY_SD_FRAMES: f64 = 0.3;
+/// How much the gain may change from pour to pour. From the prototype.
+const GAIN_SD: f64 = 0.02;
+/// The same for a straight vessel that ten episodes tell well, and what is then left of its covariance, which the fit's tempered noise makes too large.
+/// Tuned on rigs 100 to 107; docs/LEARNING.md has what they gain. Of five episodes only, a vessel is told so badly that its error passes for a gain.
+const WELL_TOLD: (f64, f64) = (0.03, 0.7);
+/// Up to so many episodes tell a straight vessel badly, and twice as many tell it well. Tuned with [`WELL_TOLD`].
+const FEW: f64 = 5.0;
 /// Index of the flow factor among a pour's unknowns; gain, delay and shape follow.
 const FLOW_FACTOR: usize = 0;
 /// Index of the gain.
@@ -32,8 +40,31 @@ fn log_area_judged(fitted: &Fitted) -> f64 {
     (JUDGED_AT_ML.ln() - fitted.found.shared[LOG_C]) / fitted.found.shared[AREA_EXPONENT].max(0.2)
 }
 
-/// The covariance of a pour's unknowns, in the camera's ml. `doubt` is how many times larger than the fit's its covariance is.
-pub fn unknowns(fitted: &Fitted, doubt: f64) -> UnknownsCovariance {
+/// How far an explanation is doubted.
+#[derive(Debug, Clone, Copy)]
+pub struct Doubt {
+    /// How many times larger than the fit's its covariance is.
+    scale: f64,
+    /// How much the gain may change from pour to pour (log).
+    gain_sd: f64,
+}
+
+impl Doubt {
+    /// That of the vessel of any shape.
+    pub fn wide() -> Self {
+        Self { scale: 1.0, gain_sd: GAIN_SD }
+    }
+
+    /// That of the straight vessel, whose frames are met `misfit` times as badly as their noise explains, after so many episodes.
+    pub fn tight(misfit: f64, episodes: usize) -> Self {
+        let told = (episodes as f64 / FEW - 1.0).clamp(0.0, 1.0);
+        let (gain_sd, scale) = WELL_TOLD;
+        Self { scale: misfit * (1.0 + told * (scale - 1.0)), gain_sd: GAIN_SD + told * (gain_sd - GAIN_SD) }
+    }
+}
+
+/// The covariance of a pour's unknowns, in the camera's ml.
+pub fn unknowns(fitted: &Fitted, doubt: Doubt) -> UnknownsCovariance {
     let mut slopes = DMatrix::zeros(UNKNOWNS, SHARED);
     slopes[(FLOW_FACTOR, LOG_WEIR)] = 1.0;
     slopes[(GAIN, LOG_C)] = -1.0;
@@ -55,8 +86,8 @@ pub fn unknowns(fitted: &Fitted, doubt: f64) -> UnknownsCovariance {
         }
     }
     let shared = fitted.covariance.view((0, 0), (SHARED, SHARED));
-    let mut covariance = &slopes * (shared * doubt) * slopes.transpose();
-    for (k, sd) in POUR_SDS.into_iter().enumerate() {
+    let mut covariance = &slopes * (shared * doubt.scale) * slopes.transpose();
+    for (k, sd) in [(FLOW_FACTOR, FLOW_FACTOR_SD), (GAIN, doubt.gain_sd), (EXTRA_DELAY, DELAY_SD_FRAMES)] {
         covariance[(k, k)] += sd * sd;
     }
     // In the camera's ml, capacity and flow carry its gain.
@@ -77,4 +108,18 @@ pub fn unknowns(fitted: &Fitted, doubt: f64) -> UnknownsCovariance {
         }
     }
     unknowns
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Protects first lessons from a gain that is their vessel's error, and many episodes from less freedom than they bear.
+    #[test]
+    fn many_episodes_leave_the_gain_more_freedom() {
+        let (few, many, more) = (Doubt::tight(2.0, 5), Doubt::tight(2.0, 10), Doubt::tight(2.0, 40));
+        assert_eq!((few.scale, few.gain_sd), (2.0, Doubt::wide().gain_sd));
+        assert!(many.scale < few.scale && many.gain_sd > few.gain_sd);
+        assert_eq!((many.scale, many.gain_sd), (more.scale, more.gain_sd));
+    }
 }
