@@ -10,7 +10,7 @@ use std::sync::atomic::{AtomicBool, AtomicU64, Ordering::Relaxed};
 
 use crossbeam::queue::ArrayQueue;
 use iceoryx2::port::publisher::Publisher;
-use shared::config::{CameraSource, Config};
+use shared::config::{CameraConfig, CameraSource, Config, ImageConfig};
 use shared::exit::{self, Failure, OrExit as _, failure};
 use shared::ipc::Cell;
 use shared::level::Level;
@@ -20,7 +20,7 @@ use shared::speaker::Speaker;
 
 use crate::recorder::Recorder;
 use crate::source::{Frame, FrameStream, Source, SourceError, StreamEvent, WAIT};
-use crate::vision::{Extractor, Image, Measurement};
+use crate::vision::{Extractor, Image, Measurement, RoomBeside, room_beside};
 
 mod republisher;
 mod status;
@@ -56,9 +56,29 @@ pub fn run(config: &Config, lines: Lines) -> Result<(), Failure> {
     let lost = "feature-worker: shared memory vanished: /dev/shm is full, or a file there was cut. The worker ends";
     os::explain_bus_errors(lost, exit::FAILED, Arc::clone(&stop));
     let speaker = Arc::new(Speaker::start("feature-worker"));
+    if let Some(lacks) = lacks_room(&config.camera, &config.image) {
+        speaker.say(Level::Warning, &lacks);
+    }
     let result = measure_until_stopped(config, extractor, &stop, &speaker, lines);
     speaker.finish();
     result
+}
+
+/// What the region is wanting beside the lip, with what to do.
+pub(crate) fn lacks_room(camera: &CameraConfig, image: &ImageConfig) -> Option<String> {
+    let region = image.region_px;
+    match room_beside(camera, image) {
+        RoomBeside::Enough => None,
+        RoomBeside::Wanted(wanted) => Some(format!(
+            "image.region_px = {region:?} does not hold the ground beside the lip and the glass below it, so more pictures than need be are \
+             doubted (colours changed); write region_px = {wanted:?}"
+        )),
+        RoomBeside::BeyondPicture => Some(
+            "the picture ends close beside the lip or below it, so more pictures than need be are doubted (colours changed); move the camera \
+             until 40 px beside the lip and 50 px of the glass below it are seen (of a picture 640 px wide)"
+                .into(),
+        ),
+    }
 }
 
 /// Opens everything and measures, until `stop` is set or the camera ends.

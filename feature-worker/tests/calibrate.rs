@@ -6,7 +6,7 @@ use std::path::Path;
 use std::process::{Command, Output};
 
 use drawn::{Outcome, pour, write_config};
-use feature_worker::vision::{Axes, ColourLearner, Extractor, Image, find_corner};
+use feature_worker::vision::{Axes, ColourLearner, Extractor, Image, RoomBeside, find_corner, room_beside};
 use opencv::core::{Mat, Vector};
 use opencv::imgcodecs;
 use opencv::prelude::*;
@@ -25,7 +25,7 @@ fn calibrate(config: &Path, picture: &Path, more: &[&str]) -> std::io::Result<Ou
 }
 
 /// Protects the five minutes that calibration may take: from one pour the corner is found within 2 px and the axes within 1 degree, and the
-/// liquid's colour as a range that measures the pour. The section is written, and the rest of the file, comments too, stays as it was.
+/// liquid's colour as a range that measures the pour; the region has room beside the lip and below it. The section is written, and the rest of the file, comments too, stays as it was.
 #[test]
 fn one_pour_is_enough() -> Outcome {
     let directory = tempfile::tempdir()?;
@@ -46,6 +46,7 @@ fn one_pour_is_enough() -> Outcome {
     let axes = Axes::new(&after.image);
     assert!((axes.lip_px[0] - 215.0).abs() < 2.0 && (axes.lip_px[1] - 250.0).abs() < 2.0, "{axes:?}");
     assert!(axes.x[1].abs() < 0.0175 && axes.y[0].abs() < 0.0175 && axes.x[0] > 0.0 && axes.y[1] < 0.0, "{axes:?}");
+    assert_eq!(room_beside(&after.camera, &after.image), RoomBeside::Enough);
     assert!(imgcodecs::imread(&picture, imgcodecs::IMREAD_COLOR)?.cols() == 640);
     assert_eq!(Config { image: before.image.clone(), ..after.clone() }, before);
     assert!(std::fs::read_to_string(&path)?.contains("# the robot in cell 7"));

@@ -115,8 +115,8 @@ fn bad_configurations_are_refused_with_key_and_hint() -> Outcome {
     let good = std::fs::read_to_string(drawn::sim_config())?;
     for (from, to, words) in [
         ("y_axis_px = [215.0, 470.0, 215.0, 250.0]", "y_axis_px = [600.0, 252.0, 215.0, 250.0]", ["image.y_axis_px", "10 degrees"]),
-        ("region_px = [190, 16, 420, 256]", "region_px = [190, 16, 520, 256]", ["image.region_px", "inside 640 x 480"]),
-        ("region_px = [190, 16, 420, 256]", "region_px = [300, 16, 300, 256]", ["image.region_px", "axes cross"]),
+        ("region_px = [175, 16, 435, 284]", "region_px = [175, 16, 520, 284]", ["image.region_px", "inside 640 x 480"]),
+        ("region_px = [175, 16, 435, 284]", "region_px = [300, 16, 300, 284]", ["image.region_px", "axes cross"]),
         ("colour_hsv = [98, 90, 25, 124, 255, 255]", "colour_hsv = [98, 200, 25, 124, 90, 255]", ["image.colour_hsv", "s_min < s_max"]),
         ("source = \"shared-memory\"", "source = \"video\"\npath = \"no-such.mp4\"", ["no-such.mp4", "no such file"]),
         ("source = \"shared-memory\"", "source = \"images\"\npath = \"no/f_%03d.png\"", ["no/f_%03d.png", "pattern"]),

@@ -138,7 +138,7 @@ const PATIENCE: Duration = Duration::from_secs(30);
 
 /// Protects the controller, which sees through the worker alone. Every frame gives one feature with its number, its times and the right area.
 /// Frames that come twice or out of order give none. Frames of another size, format or layout give a doubt and no crash. A driver that
-/// restarts is followed. SIGTERM ends the worker with success.
+/// restarts is followed. SIGTERM ends the worker with success. That the region has no room beside the lip is said, with one that has.
 #[test]
 fn every_frame_becomes_one_feature() -> Outcome {
     let directory = tempfile::tempdir()?;
@@ -179,6 +179,7 @@ fn every_frame_becomes_one_feature() -> Outcome {
     worker.signal("-TERM")?;
     let (code, said) = worker.end()?;
     assert_eq!(code, Some(0), "{said}");
+    assert!(said.contains("image.region_px = [191, 16, 420, 270]") && said.contains("write region_px = [179, 16, 432, 282]"), "{said}");
     Ok(())
 }
 

@@ -21,7 +21,8 @@ use web::{Answer, Server, Settings};
 
 use crate::drawing::{draw, jpeg, save};
 use crate::source::{FrameSource as _, NextFrame, ObserverSource, WAIT};
-use crate::vision::{Axes, AxesError, ColourError, ColourLearner, Corner, Extractor, Image, find_corner};
+use crate::vision::{Axes, AxesError, ColourError, ColourLearner, Corner, Extractor, Image, RoomBeside, find_corner, room_beside};
+use crate::worker::lacks_room;
 
 mod checks;
 mod pour;
@@ -199,6 +200,10 @@ fn propose(config: &Config, corner: Corner, pour: &Pour) -> Result<Proposal, Str
     let (poses, chosen, mean) = pour.poses().map_err(|e| e.message)?;
     remarks.extend(checks::axes_stay(&corner, &chosen, &mean)?);
     let mut image = table(camera, corner, &config.image);
+    if let RoomBeside::Wanted(region_px) = room_beside(camera, &image) {
+        // The camera is turned about its own axis, so that what is beside the lip lies lower or higher.
+        image.region_px = region_px;
+    }
     if image.method == LiquidMethod::Colour {
         let mut learner = ColourLearner::new(Axes::new(&image));
         let words = |e: ColourError| e.to_string();
@@ -208,6 +213,7 @@ fn propose(config: &Config, corner: Corner, pour: &Pour) -> Result<Proposal, Str
         remarks.push(checks::background_differs(learner.near_background(image.colour_hsv))?);
     }
     remarks.push(checks::something_flows(pour, camera, &image)?);
+    remarks.extend(lacks_room(camera, &image));
     Ok(Proposal { image, remarks })
 }
 

@@ -21,7 +21,7 @@ use super::coloured_edge;
 use super::confidence::Basis;
 use super::foreign::{self, FILLED, GAP_MOST_PX, Seen};
 use super::geometry::{Axes, Line, NEAR_PX, RAYS, RayGrid, distance};
-use super::ground_beside::{InGlass, Square};
+use super::ground_beside::{InGlass, Place, Square};
 use super::ground_colours::{Ground, GroundColours};
 use super::hues::ranges;
 use super::liquid::{FineLine, LineRules, Liquid, Profile, ProfileEdge, Sighting};
@@ -36,6 +36,11 @@ const STREAM_RAYS: f32 = 0.8;
 const HIDDEN_RAYS: f32 = 0.5;
 /// Mean length of liquid on the full rays above which they are full far out, px. Tuned.
 const HIDDEN_PX: f32 = 14.0;
+/// With more than this share of rays with that much liquid, wherever it lies on them up to [`BEHIND_PX`], and no stream, something hides the
+/// stream's begin or a part of it. Chosen by hand: more than a splash.
+const BEHIND_RAYS: f32 = 0.4;
+/// So far from the lip that liquid is looked for, px. Chosen by hand: as far as most streams reach.
+const BEHIND_PX: f32 = 100.0;
 /// With more than this share of rays full of liquid to the region's border, the colour tells nothing in this light. Chosen by hand; no
 /// measurement is recorded.
 const ALL_LIQUID: f32 = 0.9;
@@ -98,6 +103,8 @@ pub(crate) struct ColouredLiquid {
     wandering: Wandering,
     /// For how many told pictures more the ground is not learned, see [`LEARN_AFTER`].
     learn_after: u32,
+    /// Whether a stream may be where the last one was seen.
+    held: bool,
     /// Which share of the glass at the lip is white light.
     white_lip: f32,
     /// Whether half of what was read is saturated.
@@ -124,8 +131,8 @@ pub(crate) struct ColouredLiquid {
 }
 
 impl ColouredLiquid {
-    /// For the colours of `image`. `axes` and `grid` are relative to the region.
-    pub(crate) fn new(image: &ImageConfig, axes: Axes, grid: RayGrid) -> opencv::Result<Self> {
+    /// For the colours of `image` in pictures `width_px` wide. `axes` and `grid` are relative to the region.
+    pub(crate) fn new(image: &ImageConfig, width_px: u32, axes: Axes, grid: RayGrid) -> opencv::Result<Self> {
         let shape = (RAYS as i32, grid.radii_px.len() as i32);
         let mut map_x = Mat::new_rows_cols_with_default(shape.0, shape.1, CV_32FC1, Scalar::all(-1.0))?;
         let mut map_y = map_x.try_clone()?;
@@ -139,10 +146,11 @@ impl ColouredLiquid {
         }
         let (mut map_a, mut map_b) = (Mat::default(), Mat::default());
         imgproc::convert_maps(&map_x, &map_y, &mut map_a, &mut map_b, CV_16SC2, true)?;
-        let (beside, beside_wide) = (Square::beside(&axes, image)?, Square::beside_wide(&axes, image)?);
+        let place = Place::new(axes, image, width_px);
+        let (beside, beside_wide) = (Square::beside(&place)?, Square::beside_wide(&place)?);
         let colour = image.colour_hsv.map(f64::from);
         let ranges = ranges(colour);
-        let glass = InGlass::new(&axes, image, &ranges)?;
+        let glass = InGlass::new(&place, &ranges)?;
         Ok(Self {
             axes,
             grid,
@@ -158,6 +166,7 @@ impl ColouredLiquid {
             reflection: Reflection::default(),
             wandering: Wandering::new(),
             learn_after: 0,
+            held: false,
             white_lip: 0.0,
             half_white: false,
             ends: [0; RAYS],
@@ -191,14 +200,16 @@ impl ColouredLiquid {
     }
 
     /// The last sample of liquid on a ray and the score there: px of liquid minus px of background, at its largest. A lamp's reflection
-    /// near the lip counts as neither.
+    /// near the lip counts as neither, and so does white ground that it may be.
     #[inline(always)]
     fn last_liquid(&self, mask: &[u8], colours: &[Vec3b]) -> Option<(usize, f32)> {
         let (mut score, mut best, mut last) = (0.0f32, 0.0f32, None);
         for (r, (value, step)) in mask.iter().zip(&self.grid.steps_px).enumerate() {
             if *value != 0 {
                 score += *step;
-            } else if self.grid.radii_px[r] > LEARN_FROM_PX || !self.ground.is_blind(colours[r].0) {
+            } else if self.grid.radii_px[r] > LEARN_FROM_PX
+                || !(self.ground.is_blind(colours[r].0) || self.seen().is_hidden(r, colours[r].0))
+            {
                 score -= *step;
             }
             if score > best {
@@ -240,7 +251,9 @@ impl ColouredLiquid {
         self.wandering.look(&rays);
         if let Some(mean_sum) = sums.iter().sum::<u32>().checked_div(count) {
             self.ground.expose(mean_sum);
-            self.ground_bgr = Some(sums.map(|sum| sum as f32 / count as f32));
+            let bgr = sums.map(|sum| sum as f32 / count as f32);
+            self.ground.see_mean(bgr);
+            self.ground_bgr = Some(bgr);
         }
         Ok(())
     }
@@ -258,7 +271,14 @@ impl ColouredLiquid {
                 0 if new => 0,
                 // A ray without an edge may have a stream on it all the same.
                 0 if !dry => continue,
-                end => (end + LEARN_BEYOND).max(far),
+                end => {
+                    // What goes on from the liquid in a foreign colour may be more of it.
+                    let beyond = self.seen().beyond_end(i, end)?.filter(|_| !dry && self.dry_frames >= DRY_FRAMES);
+                    if beyond.is_some_and(|colour| self.ground.tell(colour) == Ground::Foreign) {
+                        continue;
+                    }
+                    (end + LEARN_BEYOND).max(far)
+                }
             };
             let (mask, colours) = (self.mask.at_row::<u8>(i as i32)?, self.smooth.at_row::<Vec3b>(i as i32)?);
             let first = from + (self.frames + 3 * i) % every;
@@ -279,6 +299,8 @@ impl ColouredLiquid {
         match sighting {
             // A lamp's reflection before white squares is no ground. The pictures after it are learned from as ever.
             Sighting::Dry { .. } | Sighting::Stream { doubt: Doubt::None, .. } | Sighting::Unsure(Doubt::BlownOut) if self.half_white => {}
+            // A stream that was there before the surroundings of the lip were known may be there still, in other colours.
+            Sighting::Dry { .. } if self.learn_after == 0 && self.held && self.dry_frames < DRY_FRAMES => {}
             Sighting::Dry { .. } if self.learn_after == 0 => self.learn(true)?,
             Sighting::Stream { doubt: Doubt::None, .. } if self.learn_after == 0 => self.learn(false)?,
             // What may be liquid must not be taken for ground.
@@ -330,6 +352,8 @@ impl ColouredLiquid {
         }
         if foreign < QUIET_SHARE && self.learn_after == 0 && !self.half_white {
             self.beside.teach(&mut self.ground, self.frames)?;
+        } else {
+            self.beside.forget_kept();
         }
         Ok(dry)
     }
@@ -359,7 +383,8 @@ impl ColouredLiquid {
         if share < STREAM_RAYS {
             // A good half of the wedge full of liquid is no drop: something hides the stream.
             let mean_px = liquid_px / filled.max(1) as f32;
-            let hidden = share > HIDDEN_RAYS && mean_px > HIDDEN_PX;
+            let hidden = (share > HIDDEN_RAYS && mean_px > HIDDEN_PX)
+                || self.seen().rays_with_liquid(HIDDEN_PX, BEHIND_PX)? as f32 > BEHIND_RAYS * RAYS as f32;
             let confidence = (1.0 - share).clamp(0.0, 1.0);
             return Ok(if hidden { Sighting::Unsure(Doubt::EdgeNotFound) } else { Sighting::Dry { confidence } });
         }
@@ -406,9 +431,14 @@ impl Liquid for ColouredLiquid {
             }
             other => other,
         };
+        if !matches!(sighting, Sighting::Dry { .. }) {
+            self.beside.forget_kept();
+        }
+        // While the ground is not known nothing else is looked for, so only pictures that it is learned from are dry: as many as make it known.
+        let unknown = (self.dry_frames < DRY_FRAMES && self.learn_after > 0).then_some(Doubt::EdgeNotFound);
         self.follow_ground(sighting)?;
         // A liquid in the ground's colours is not seen.
-        let untold = self.wandering.doubt().filter(|_| matches!(sighting, Sighting::Dry { .. }));
+        let untold = self.wandering.doubt().or(unknown).filter(|_| matches!(sighting, Sighting::Dry { .. }));
         Ok(untold.map_or(sighting, Sighting::Unsure))
     }
 
@@ -452,8 +482,10 @@ impl Liquid for ColouredLiquid {
         dry as f32 / looked.max(1) as f32
     }
 
-    /// Ground is learned far from the lip only, once the surroundings are known.
-    fn hold_ground(&mut self, _held: bool) {}
+    /// Once the surroundings of the lip are known, ground is learned far from it only; until then it is not where a stream is held.
+    fn hold_ground(&mut self, held: bool) {
+        self.held = held;
+    }
 
     fn edge_on(&self, profile: &Profile) -> Option<ProfileEdge> {
         coloured_edge::edge_on(profile)

@@ -95,7 +95,7 @@ impl Extractor {
         let region_px = [region.width, region.height];
         let edges = Vec::with_capacity(grid.rays.len());
         let liquid: Box<dyn Liquid> = match image.method {
-            LiquidMethod::Colour => Box::new(ColouredLiquid::new(image, axes, grid)?),
+            LiquidMethod::Colour => Box::new(ColouredLiquid::new(image, camera.width_px, axes, grid)?),
             LiquidMethod::Clear => Box::new(ClearWater::new(&axes, region_px, camera.width_px)?),
         };
         Ok(Self {

@@ -13,6 +13,8 @@ use super::ground_colours::{Ground, GroundColours, Mean};
 
 /// This close to the lip a stream begins, px. Chosen by hand.
 const AT_LIP_PX: f32 = 12.0;
+/// So far from the lip white light may be a lamp's reflection before ground that is white too, px. Chosen by hand: where its glow is cut off.
+const REFLECTION_PX: f32 = 16.0;
 /// A liquid in front of a lamp's reflection is brighter than this in all parts, close to the reflection's middle. Chosen by hand.
 const GLOW_LEVEL: u8 = 180;
 /// More background than this before the first liquid, or the first of a body, ends a ray, px. Tuned.
@@ -42,12 +44,19 @@ const LIT_LEVELS: f32 = 8.0;
 /// And when the part that is brighter by least is so by this share of the one that is by most. Chosen by hand: where the most is cut off, it is
 /// less.
 const LIT_SHARE: f32 = 0.4;
+/// What is foreign may be the liquid, with the ground seen through it, when its shares of blue, green and red differ from the ground's in the same
+/// direction as the liquid's do: the cosine of the angle between. Chosen by hand: ground of several colours has no one mean.
+const MIXED_COSINE: f32 = 0.8;
+/// And no further than this share of the way to the liquid's. Chosen by hand: a little beyond it.
+const MIXED_MOST: f32 = 1.15;
+/// Shares that differ by less than this tell no direction. Chosen by hand: two steps of the ground's table.
+const MIXED_LEAST: f32 = 0.03;
 /// Two mean colours are one when they differ by no more than these levels, and [`ALIKE_SHARE`] of their mean level. Chosen by hand.
 const ALIKE_LEVELS: f32 = 5.0;
 /// See [`ALIKE_LEVELS`]. Chosen by hand: what a vignette and a lamp's fall-off make over 40 px.
 const ALIKE_SHARE: f32 = 0.08;
-/// What is foreign goes on beside the container when this share of the square there has its colour. Chosen by hand: no
-/// jet covers half of it.
+/// What is foreign goes on beside the container when this share of both halves of the square there has its colour. Chosen by hand: a thick jet
+/// covers more than this of the whole square.
 const GOES_ON: f32 = 0.6;
 
 /// A picture along the rays.
@@ -87,6 +96,7 @@ impl Seen<'_> {
                         }
                     }
                     Some(Ground::Blind) => {}
+                    Some(Ground::Known) if self.is_hidden(r, colours[r].0) => {}
                     Some(Ground::Known) => score -= step,
                 }
                 if score > best {
@@ -111,21 +121,44 @@ impl Seen<'_> {
         Ok(is.then(|| Body { colour: told.then(|| mean.levels()) }))
     }
 
+    /// Whether white light hides what is in this sample of a ray: ground that is white too, or a stream in a lamp's reflection.
+    #[inline(always)]
+    pub(super) fn is_hidden(&self, sample: usize, colour: [u8; 3]) -> bool {
+        self.grid.radii_px[sample] <= REFLECTION_PX && GroundColours::is_white(colour)
+    }
+
+    /// The colour just beyond the stream's end on a ray, if the region shows it.
+    pub(super) fn beyond_end(&self, ray: usize, end: usize) -> opencv::Result<Option<[u8; 3]>> {
+        let Some(last) = end.checked_sub(1) else { return Ok(None) };
+        let beyond_px = self.grid.radii_px[last] + BEYOND_PX;
+        let r = (last + BEYOND_SAMPLES..self.grid.rays[ray].samples).find(|r| self.grid.radii_px[*r] >= beyond_px);
+        r.map(|r| self.smooth.at_row::<Vec3b>(ray as i32).map(|colours| colours[r].0)).transpose()
+    }
+
     /// The mean colour of what is foreign beside a stream with these ends, if it goes on beyond its edge.
     pub(super) fn beyond(&self, ends: &[usize; RAYS]) -> opencv::Result<Option<[f32; 3]>> {
         let (mut foreign, mut looked, mut mean) = (0usize, 0usize, Mean::default());
-        for (i, ray) in self.grid.rays.iter().enumerate() {
-            let Some(last) = ends[i].checked_sub(1) else { continue };
-            let beyond_px = self.grid.radii_px[last] + BEYOND_PX;
-            let Some(r) = (last + BEYOND_SAMPLES..ray.samples).find(|r| self.grid.radii_px[*r] >= beyond_px) else { continue };
-            let colour = self.smooth.at_row::<Vec3b>(i as i32)?[r];
+        for (i, end) in ends.iter().enumerate() {
+            let Some(colour) = self.beyond_end(i, *end)? else { continue };
             looked += 1;
-            if self.ground.tell(colour.0) == Ground::Foreign {
+            if self.ground.tell(colour) == Ground::Foreign {
                 foreign += 1;
-                mean.add(colour.0);
+                mean.add(colour);
             }
         }
         Ok((foreign as f32 > BEYOND_FOREIGN * looked.max(RAYS / 4) as f32).then(|| mean.levels()))
+    }
+
+    /// How many rays have more than so much liquid on them, wherever it lies up to this distance from the lip, px.
+    pub(super) fn rays_with_liquid(&self, least_px: f32, within_px: f32) -> opencv::Result<usize> {
+        let near = self.grid.radii_px.iter().take_while(|r| **r <= within_px).count();
+        let mut rays = 0;
+        for (i, ray) in self.grid.rays.iter().enumerate() {
+            let mask = &self.mask.at_row::<u8>(i as i32)?[..near.min(ray.samples)];
+            let liquid_px: f32 = mask.iter().zip(&self.grid.steps_px).map(|(value, step)| if *value != 0 { *step } else { 0.0 }).sum();
+            rays += usize::from(liquid_px > least_px);
+        }
+        Ok(rays)
     }
 
     /// Which shares of what is close to the lip are white light that the ground is not, glow of it, and foreign colours or liquid.
@@ -155,14 +188,33 @@ pub(super) fn is_not_the_liquid(foreign: [f32; 3], liquid: [f32; 3], ground: [f3
     let brighter: [f32; 3] = std::array::from_fn(|k| foreign[k] - liquid[k]);
     let (least, most) = brighter.iter().fold((f32::MAX, f32::MIN), |(l, m), v| (l.min(*v), m.max(*v)));
     let lit = least > LIT_LEVELS && least >= LIT_SHARE * most;
-    !glows && !lit && distance(foreign, liquid) > LIKE_LIQUID * distance(ground, liquid)
+    !glows && !lit && !is_mixed(foreign, liquid, ground) && distance(foreign, liquid) > LIKE_LIQUID * distance(ground, liquid)
+}
+
+/// Whether what is foreign may be the ground seen through a little of the liquid. Brightness tells nothing, because the ground has brighter
+/// and darker places.
+fn is_mixed(foreign: [f32; 3], liquid: [f32; 3], ground: [f32; 3]) -> bool {
+    let shares = |c: [f32; 3]| c.map(|level| level / c.iter().sum::<f32>().max(1.0));
+    let ground = shares(ground);
+    let from_ground = |c: [f32; 3]| -> [f32; 3] { std::array::from_fn(|k| shares(c)[k] - ground[k]) };
+    let (seen, whole) = (from_ground(foreign), from_ground(liquid));
+    let dot = |a: [f32; 3], b: [f32; 3]| (0..3).map(|k| a[k] * b[k]).sum::<f32>();
+    let (seen_length, length) = (dot(seen, seen).sqrt(), dot(whole, whole).sqrt());
+    if length < MIXED_LEAST {
+        // A liquid without a colour of its own, before ground without one.
+        return seen_length < MIXED_LEAST;
+    }
+    let along = dot(seen, whole) / length;
+    along >= MIXED_COSINE * seen_length && along <= MIXED_MOST * length
 }
 
 /// Whether what is foreign at the lip goes on outside the container, in the square beside it, as only ground does.
 pub(super) fn goes_on_beside(foreign: [f32; 3], beside: &[Vec3b]) -> bool {
     let most = ALIKE_LEVELS + ALIKE_SHARE * foreign.iter().sum::<f32>() / 3.0;
-    let alike = beside.iter().filter(|c| (0..3).all(|k| (f32::from(c[k]) - foreign[k]).abs() <= most)).count();
-    !beside.is_empty() && alike as f32 >= GOES_ON * beside.len() as f32
+    let alike = |c: &&Vec3b| (0..3).all(|k| (f32::from(c[k]) - foreign[k]).abs() <= most);
+    let goes_on = |half: &[Vec3b]| half.iter().filter(alike).count() as f32 >= GOES_ON * half.len() as f32;
+    let (lower, upper) = beside.split_at(beside.len() / 2);
+    !beside.is_empty() && goes_on(lower) && goes_on(upper)
 }
 
 /// Distance between two colours, grey levels.

@@ -36,6 +36,15 @@ const COUNT_MOST: u16 = 4096;
 /// A count loses this share when its turn comes. Chosen by hand, see [`COUNT_MOST`].
 const FORGETS: u16 = 4;
 
+/// Where the ground's mean reaches this in a part, most of it is cut off there, grey levels. Chosen by hand: boards differ by a tenth.
+const CUT_OFF_MEAN: f32 = 235.0;
+/// A part that is cut off may be so many grey levels brighter than it looks, in steps of [`BEYOND_STEP`]. Chosen by hand: half as bright again.
+const BEYOND_MOST: u32 = 120;
+/// See [`BEYOND_MOST`]. Chosen by hand: less than a step of the shares.
+const BEYOND_STEP: usize = 15;
+/// Sums of three levels that a table holds: two of them beyond what is cut off.
+const SUMS: usize = 3 * 255 + 2 * BEYOND_MOST as usize + 1;
+
 /// What a colour is to the ground.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Ground {
@@ -57,13 +66,15 @@ pub(crate) struct GroundColours {
     /// A count for each step of brightness, share of blue and share of red; then for dark and white.
     counts: Vec<u16>,
     /// `SHARES / sum` for each sum of three levels, which are `raised`, of which 65536 is 1.
-    per_sum: [u32; 766],
+    per_sum: [u32; SUMS],
     /// What is added to each level before its share is taken, in [`RAISED_PARTS`].
     raised: u32,
     /// The step of brightness for each sum of three levels in the present picture, times [`CHROMAS`].
-    steps: [u32; 766],
+    steps: [u32; SUMS],
     /// The sum of three levels for which the steps were made.
     mean_sum: u32,
+    /// In which parts most of the ground is cut off.
+    cut_off: [bool; 3],
     /// Which row of the table is forgotten next.
     turn: usize,
 }
@@ -72,7 +83,7 @@ impl GroundColours {
     /// Nothing was seen yet.
     pub(crate) fn new() -> Self {
         let counts = vec![0; CHROMAS * STEPS + 2];
-        let mut new = Self { counts, per_sum: [0; 766], raised: 0, steps: [0; 766], mean_sum: 0, turn: 0 };
+        let mut new = Self { counts, per_sum: [0; SUMS], raised: 0, steps: [0; SUMS], mean_sum: 0, cut_off: [false; 3], turn: 0 };
         new.expose(384);
         new
     }
@@ -97,18 +108,39 @@ impl GroundColours {
         }
     }
 
+    /// Says the ground's mean levels of blue, green and red in the present picture.
+    pub(crate) fn see_mean(&mut self, bgr: [f32; 3]) {
+        self.cut_off = bgr.map(|level| level >= CUT_OFF_MEAN);
+    }
+
+    /// Whether a colour is one of the ground, but for how bright it is in parts in which most of the ground is cut off: the sensor made of
+    /// known ground what has other shares.
+    fn is_known_beyond(&self, colour: [u8; 3]) -> bool {
+        let cut_off: [bool; 3] = std::array::from_fn(|k| self.cut_off[k] && colour[k] >= BLIND_LEVEL);
+        let beyond = |by: u32| self.place_of(std::array::from_fn(|k| u32::from(colour[k]) + if cut_off[k] { by } else { 0 }));
+        // White light has no colour at all.
+        let tells = cut_off.contains(&true) && cut_off.contains(&false);
+        tells && (0..=BEYOND_MOST).step_by(BEYOND_STEP).skip(1).any(|by| self.counts[beyond(by)] >= KNOWN)
+    }
+
     /// Where a colour of blue, green and red is counted.
     #[inline(always)]
-    fn place(&self, [blue, green, red]: [u8; 3]) -> usize {
-        let sum = usize::from(blue) + usize::from(green) + usize::from(red);
+    fn place(&self, colour: [u8; 3]) -> usize {
+        self.place_of(colour.map(u32::from))
+    }
+
+    /// Where these levels of blue, green and red are counted; two of them may be larger than 255 by [`BEYOND_MOST`].
+    #[inline(always)]
+    fn place_of(&self, [blue, green, red]: [u32; 3]) -> usize {
+        let sum = (blue + green + red) as usize;
         // Darker colours than those of `DARK_SUM` do not come here, so nothing overflows.
-        let share = |level: u8| {
-            let raised = RAISED_PARTS * u32::from(level) + self.raised;
+        let share = |level: u32| {
+            let raised = RAISED_PARTS * level + self.raised;
             ((raised * self.per_sum[sum] / (RAISED_PARTS << 16)) as usize).min(SHARES - 1)
         };
         if sum < DARK_SUM {
             DARK
-        } else if blue.min(green).min(red) >= BLIND_LEVEL {
+        } else if blue.min(green).min(red) >= u32::from(BLIND_LEVEL) {
             WHITE
         } else {
             self.steps[sum] as usize + share(blue) * SHARES + share(red)
@@ -122,14 +154,21 @@ impl GroundColours {
         match self.counts[place] {
             KNOWN.. => Ground::Known,
             _ if place >= DARK => Ground::Blind,
+            _ if self.is_known_beyond(colour) => Ground::Known,
             _ => Ground::Foreign,
         }
+    }
+
+    /// Whether a colour is white light, whatever the ground is.
+    #[inline(always)]
+    pub(crate) fn is_white(colour: [u8; 3]) -> bool {
+        colour.iter().all(|v| *v >= BLIND_LEVEL)
     }
 
     /// Whether a colour is white light that the ground was not seen to be.
     #[inline(always)]
     pub(crate) fn is_blind(&self, colour: [u8; 3]) -> bool {
-        colour.iter().all(|v| *v >= BLIND_LEVEL) && self.counts[WHITE] < KNOWN
+        Self::is_white(colour) && self.counts[WHITE] < KNOWN
     }
 
     /// Takes a colour for one of the ground. White light close to the lip is a reflection and no ground, so it counts only where `is_far`.
@@ -234,5 +273,26 @@ mod tests {
                 }
             }
         }
+    }
+
+    /// Protects dry pictures when the exposure rises until red is cut off over the whole ground: it stays known, and an orange liquid that is cut off
+    /// in the same way stays foreign. Where only some of the ground is cut off, nothing is excused.
+    #[test]
+    fn ground_that_is_cut_off_is_known() {
+        let mut ground = GroundColours::new();
+        ground.expose(520);
+        for i in 0..900u32 {
+            let [blue, green, red] = exposed([110, 175, 235], 0.9 + 0.15 * ((i / 30) % 2) as f32);
+            let noise = |level: u8, k: u32| (level + (i / 3u32.pow(k) % 3) as u8).saturating_sub(1);
+            ground.learn([noise(blue, 0), noise(green, 1), noise(red, 2)], true);
+        }
+        ground.expose(639);
+        let (wood, orange) = ([148, 236, 255], [45, 220, 255]);
+        assert_eq!(ground.tell(wood), Ground::Foreign, "as before the mean is told");
+        ground.see_mean([140.0, 225.0, 252.0]);
+        assert_eq!([wood, orange].map(|colour| ground.tell(colour)), [Ground::Known, Ground::Foreign]);
+        assert_eq!(ground.tell([20, 60, 255]), Ground::Foreign);
+        ground.see_mean([120.0, 180.0, 225.0]);
+        assert_eq!(ground.tell(wood), Ground::Foreign);
     }
 }

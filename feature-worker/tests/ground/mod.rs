@@ -1,10 +1,12 @@
-//! What the extraction of a coloured liquid says where half of the picture is white, on drawn pictures.
+//! What the extraction of a coloured liquid says of ground: half white, never known, seen through a thin stream, and in front of a stream. On drawn
+//! pictures.
 
-use super::drawn::{camera, dry, image_config, lay_over, noisy, stream};
+use super::drawn::{blue, camera, dry, image_config, lay_over, noisy, stream};
 use super::{colour, measure};
 use feature_worker::vision::{ExtractError, Extractor};
-use opencv::core::{Mat, Rect, Scalar};
+use opencv::core::{self, Mat, Rect, Scalar};
 use opencv::imgproc;
+use opencv::prelude::*;
 use shared::config::{ImageConfig, LiquidMethod};
 use shared::messages::Doubt;
 
@@ -87,6 +89,203 @@ fn the_ground_outlasts_what_hides_it() -> Result<(), ExtractError> {
                 assert_eq!((measured.area_px2, measured.doubt), (0.0, Doubt::None), "{white} picture {i} after it");
             }
         }
+    }
+    Ok(())
+}
+
+/// The colour of the liquid that the tests are set up for, and one that it does not have.
+const OWN: Scalar = Scalar::new(150.0, 62.0, 20.0, 0.0);
+const OTHER: Scalar = Scalar::new(60.0, 180.0, 60.0, 0.0);
+
+/// An extractor with the region that calibration writes, with room below the lip and beside the container.
+fn with_room() -> Result<Extractor, ExtractError> {
+    Extractor::new(&camera(), &ImageConfig { region_px: [171, 14, 440, 296], ..image_config(LiquidMethod::Colour) })
+}
+
+/// Protects pours of an eye that cannot tell a picture now and then, from the first one on: no more than ten pictures are called dry before the
+/// ground is known, so a stream in other colours is never "nothing". Once every picture is told, the ground gets known.
+#[test]
+fn ground_that_never_gets_known_is_named() -> Result<(), ExtractError> {
+    let everywhere = vec![[0.0, 0.0], [640.0, 0.0], [640.0, 480.0], [0.0, 480.0]];
+    for every in [3, 8, 15] {
+        let (mut extractor, mut dry_pictures) = (colour()?, 0);
+        for i in 0..170 {
+            let lost = i < 90 && i % every == 0;
+            let picture = if lost {
+                blue(std::slice::from_ref(&everywhere), i)?
+            } else {
+                let mut picture = dry(0.0, i)?;
+                if (60..90).contains(&i) || i >= 150 {
+                    lay_over(&mut picture, &[stream(40.0, 36.0)], OTHER)?;
+                }
+                picture
+            };
+            let measured = measure(&mut extractor, &picture)?;
+            assert_eq!(measured.area_px2, 0.0, "{every} picture {i}");
+            dry_pictures += u32::from(i < 90 && measured.doubt == Doubt::None);
+            let is_stream = lost || (60..90).contains(&i) || i >= 150;
+            assert!(!is_stream || measured.doubt != Doubt::None, "{every} picture {i}: {measured:?}");
+            assert!(!(130..150).contains(&i) || measured.doubt == Doubt::None, "{every} picture {i}: {measured:?}");
+        }
+        assert!(dry_pictures <= 10, "{every}: {dry_pictures}");
+    }
+    Ok(())
+}
+
+/// Protects a worker that starts while a stream flows: when its colours change, it is not learned as ground and is never "nothing". When it ends, that
+/// is told.
+#[test]
+fn a_stream_from_the_first_picture_on_is_no_ground() -> Result<(), ExtractError> {
+    for ends in [false, true] {
+        let mut extractor = colour()?;
+        for i in 0..90 {
+            let mut picture = dry(0.0, i)?;
+            match i {
+                0..20 => lay_over(&mut picture, &[stream(60.0, 50.0)], OWN)?,
+                _ if ends => {}
+                _ => lay_over(&mut picture, &[stream(60.0, 50.0)], OTHER)?,
+            }
+            let measured = measure(&mut extractor, &picture)?;
+            match i {
+                0..20 => assert!(measured.area_px2 > 1200.0, "picture {i}: {measured:?}"),
+                _ if ends => assert!(i < 40 || (measured.area_px2, measured.doubt) == (0.0, Doubt::None), "picture {i}: {measured:?}"),
+                _ => assert_ne!(measured.doubt, Doubt::None, "picture {i}"),
+            }
+        }
+    }
+    Ok(())
+}
+
+/// Protects thin streams, through which the ground is seen: what is neither in the liquid's range nor ground, but a mixture of both, is the
+/// liquid, although the liquid in the glass is seen in its own colours.
+#[test]
+fn a_thin_stream_is_not_new_ground() -> Result<(), ExtractError> {
+    let inside = vec![[216.0, 252.0], [300.0, 252.0], [300.0, 479.0], [216.0, 479.0]];
+    for share in [0.25, 0.35] {
+        let mut extractor = with_room()?;
+        for i in 0..60 {
+            let mut picture = dry(0.0, i)?;
+            if i >= 44 {
+                let (mut poured, clear) = (picture.clone(), picture.clone());
+                lay_over(&mut poured, &[stream(40.0, 36.0)], OWN)?;
+                core::add_weighted(&poured, share, &clear, 1.0 - share, 0.0, &mut picture, -1)?;
+                lay_over(&mut picture, std::slice::from_ref(&inside), OWN)?;
+            }
+            let measured = measure(&mut extractor, &picture)?;
+            let told = measured.area_px2 > 0.0 || measured.doubt != Doubt::None;
+            assert_eq!(told, i >= 44, "{share} picture {i}: {measured:?}");
+        }
+    }
+    Ok(())
+}
+
+/// Protects pours from something in the ground's colours that hides the lip, or half of the stream: what flows beyond it is not "nothing".
+#[test]
+fn a_stream_behind_something_in_the_grounds_colours_is_named() -> Result<(), ExtractError> {
+    let at_lip = vec![[214.0, 215.0], [250.0, 215.0], [250.0, 251.0], [214.0, 251.0]];
+    let one_half = vec![[214.0, 251.0], [214.0, 16.0], [449.0, 16.0]];
+    let other_half = vec![[214.0, 251.0], [449.0, 16.0], [600.0, 16.0], [600.0, 251.0]];
+    for hidden in [at_lip, one_half, other_half] {
+        let mut extractor = with_room()?;
+        for i in 0..60 {
+            let mut picture = dry(0.0, i)?;
+            if i >= 44 {
+                lay_over(&mut picture, &[stream(90.0, 80.0)], OWN)?;
+                lay_over(&mut picture, std::slice::from_ref(&hidden), Scalar::all(185.0))?;
+                picture = noisy(&picture, i)?;
+            }
+            let measured = measure(&mut extractor, &picture)?;
+            let told = measured.area_px2 > 0.0 || measured.doubt != Doubt::None;
+            assert_eq!(told, i >= 44, "{hidden:?} picture {i}: {measured:?}");
+        }
+    }
+    Ok(())
+}
+
+/// Protects streams of two colours: what goes on from the liquid's edge in another colour, on less than half of the rays, is not learned as ground, so
+/// a stream that takes this colour as a whole is never "nothing".
+#[test]
+fn a_stream_with_a_second_colour_does_not_teach_it_as_ground() -> Result<(), ExtractError> {
+    let outer = vec![[215.0, 250.0], [215.0, 135.0], [270.4, 184.0]];
+    let mut extractor = with_room()?;
+    for i in 0..150 {
+        let mut picture = dry(0.0, i)?;
+        match i {
+            0..20 => {}
+            20..80 => {
+                lay_over(&mut picture, std::slice::from_ref(&outer), OTHER)?;
+                lay_over(&mut picture, &[stream(90.0, 80.0)], OWN)?;
+            }
+            _ => lay_over(&mut picture, &[stream(90.0, 80.0)], OTHER)?,
+        }
+        let measured = measure(&mut extractor, &picture)?;
+        let told = measured.area_px2 > 0.0 || measured.doubt != Doubt::None;
+        assert_eq!(told, i >= 20, "picture {i}: {measured:?}");
+    }
+    Ok(())
+}
+
+/// Protects small streams under a lamp's reflection before ground that is as white as it is: white light at the lip is no ground there, so they are
+/// measured or named. Without a stream there is no doubt.
+#[test]
+fn a_stream_under_a_reflection_before_white_ground_is_told() -> Result<(), ExtractError> {
+    let box_of = |x: f32, y: f32, right: f32, down: f32| vec![[x, y], [right, y], [right, down], [x, down]];
+    let (far, at_lip) = (box_of(260.0, 155.0, 310.0, 205.0), box_of(190.0, 203.0, 262.0, 249.0));
+    for (a, b) in [(24.0, 20.0), (30.0, 26.0), (40.0, 36.0)] {
+        let mut extractor = with_room()?;
+        for i in 0..60 {
+            let mut picture = dry(0.0, i)?;
+            lay_over(&mut picture, &[far.clone(), at_lip.clone()], Scalar::all(255.0))?;
+            if i >= 44 {
+                lay_over(&mut picture, &[stream(a, b)], OWN)?;
+            }
+            for (k, pixel) in picture.data_typed_mut::<core::Vec3b>()?.iter_mut().enumerate() {
+                let (right, down) = (((k % 640) as f32 - 215.0) / 18.0, ((k / 640) as f32 - 250.0) / 12.0);
+                let light = (255.0 * (-0.5 * (right * right + down * down)).exp()) as u8;
+                (0..3).for_each(|c| pixel[c] = pixel[c].saturating_add(light));
+            }
+            let measured = measure(&mut extractor, &picture)?;
+            let told = measured.area_px2 > 0.0 || measured.doubt != Doubt::None;
+            assert_eq!(told, i >= 44, "{a} x {b} picture {i}: {measured:?}");
+        }
+    }
+    Ok(())
+}
+
+/// Protects the first pictures of a stream in other colours: its jet crosses what is seen beside the container before the stream is seen at the lip,
+/// and is not learned as ground there.
+#[test]
+fn a_jet_beside_the_container_is_no_ground() -> Result<(), ExtractError> {
+    let jet = vec![[176.0, 238.0], [210.0, 238.0], [210.0, 252.0], [176.0, 252.0]];
+    let mut extractor = with_room()?;
+    for i in 0..110 {
+        let mut picture = dry(0.0, i)?;
+        match i {
+            0..44 => {}
+            44..48 => lay_over(&mut picture, std::slice::from_ref(&jet), OTHER)?,
+            _ => lay_over(&mut picture, &[stream(40.0, 36.0)], OTHER)?,
+        }
+        let measured = measure(&mut extractor, &picture)?;
+        assert_eq!(measured.area_px2, 0.0, "picture {i}");
+        assert!(i < 48 || measured.doubt != Doubt::None, "picture {i}: {measured:?}");
+    }
+    Ok(())
+}
+
+/// Protects thick streams in other colours: a jet that covers three quarters of what is seen beside the container is no ground that goes on there.
+#[test]
+fn a_thick_jet_is_no_ground_that_goes_on() -> Result<(), ExtractError> {
+    let jet = vec![[150.0, 180.0], [216.0, 180.0], [216.0, 272.0], [150.0, 272.0]];
+    let body = vec![[214.0, 170.0], [290.0, 170.0], [290.0, 249.0], [214.0, 249.0]];
+    let mut extractor = with_room()?;
+    for i in 0..70 {
+        let mut picture = dry(0.0, i)?;
+        if i >= 44 {
+            lay_over(&mut picture, &[jet.clone(), body.clone()], OTHER)?;
+        }
+        let measured = measure(&mut extractor, &picture)?;
+        let wanted = if i < 44 { Doubt::None } else { Doubt::ColoursChanged };
+        assert_eq!((measured.area_px2, measured.doubt), (0.0, wanted), "picture {i}");
     }
     Ok(())
 }

@@ -16,7 +16,7 @@ pub fn config(scale: f32, method: LiquidMethod) -> (CameraConfig, ImageConfig) {
     let axis = |a: [f32; 4]| a.map(|v| v * scale);
     let image = ImageConfig {
         method,
-        region_px: [px(190.0), px(16.0), px(420.0), px(256.0)],
+        region_px: [px(175.0), px(14.0), px(420.0), px(286.0)],
         x_axis_px: axis([215.0, 250.0, 600.0, 250.0]),
         y_axis_px: axis([215.0, 350.0, 215.0, 250.0]),
         colour_hsv: [98, 90, 25, 124, 255, 255],
