@@ -394,10 +394,11 @@ impl Liquid for ClearWater {
     }
 
     fn edge_on(&self, profile: &Profile) -> Option<ProfileEdge> {
+        let ground = self.background.ground();
         let mut differs = [[0.0f32; 3]; PROFILE_SAMPLES];
         for (j, (differs, seen)) in differs.iter_mut().zip(&profile.colours).enumerate() {
             let place = profile.place_px(j as f32).map(|v| small(v, self.scale));
-            let Some(dry) = self.background.dry_at(place) else { return edge_on_unknown_ground(profile) };
+            let Some(dry) = ground.at(place) else { return edge_on_unknown_ground(profile) };
             let gains = self.light.gains(place[1]);
             *differs = std::array::from_fn(|c| seen[c] / gains[c] - dry[c]);
         }

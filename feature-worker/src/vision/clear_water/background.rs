@@ -179,21 +179,10 @@ impl Background {
         [self.size.width, self.size.height].map(|v| v as f32 / 2.0)
     }
 
-    /// The colour of the dry background at a place in the picture, grey levels, where it is known.
-    pub(super) fn dry_at(&self, place: [f32; 2]) -> Option<[f32; 3]> {
-        let [x, y] = self.now.map.apply_back(place);
-        let (column, row, fx, fy) = bilinear_corner(x, y, self.side, self.side)?;
-        let (column, row) = (wrapped(column + self.origin[0], self.side), wrapped(row + self.origin[1], self.side));
-        let (right, below) = (wrapped(column + 1, self.side), wrapped(row + 1, self.side));
-        let pixels: &[Vec4b] = self.memory.data_typed().ok()?;
-        let at = |row: usize, column: usize| pixels.get(row * self.side + column).map(|p| p.0);
-        let four = [at(row, column)?, at(row, right)?, at(below, column)?, at(below, right)?];
-        let mix = |k: usize| {
-            let [a, b, c, d] = four.map(|p| f32::from(p[k]));
-            let (top, bottom) = (a + (b - a) * fx, c + (d - c) * fx);
-            self.now.gain * (top + (bottom - top) * fy)
-        };
-        four.iter().all(|p| p[3] > 0).then(|| [mix(0), mix(1), mix(2)])
+    /// The dry ground as it lies in the picture.
+    pub(super) fn ground(&self) -> DryGround<'_> {
+        let pixels = self.memory.data_typed().unwrap_or_default();
+        DryGround { pixels, side: self.side, origin: self.origin, now: self.now }
     }
 
     /// Puts what is remembered of these places in the picture into `found`: colours and how known they are (0 to 255), all four mixed
@@ -345,6 +334,35 @@ impl Background {
             self.points[row * squares + column] = MotionPoint::steepest(&near, [column * SQUARE, row * SQUARE], least);
         }
         Ok(())
+    }
+}
+
+/// The dry ground as it lies in the picture.
+pub(super) struct DryGround<'a> {
+    /// The memory.
+    pixels: &'a [Vec4b],
+    side: usize,
+    origin: [usize; 2],
+    now: Pose,
+}
+
+impl DryGround<'_> {
+    /// Its colour at a place in the picture, grey levels, where it is known.
+    #[inline(always)]
+    pub(super) fn at(&self, place: [f32; 2]) -> Option<[f32; 3]> {
+        let [x, y] = self.now.map.apply_back(place);
+        let (column, row, fx, fy) = bilinear_corner(x, y, self.side, self.side)?;
+        let (column, row) = (wrapped(column + self.origin[0], self.side), wrapped(row + self.origin[1], self.side));
+        let (right, below) = (wrapped(column + 1, self.side), wrapped(row + 1, self.side));
+        let at = |row: usize, column: usize| self.pixels.get(row * self.side + column).map(|p| p.0);
+        let four = [at(row, column)?, at(row, right)?, at(below, column)?, at(below, right)?];
+        let known = four.iter().all(|p| p[3] > 0);
+        let [a, b, c, d] = four.map(|p| p.map(f32::from));
+        let mix = |k: usize| {
+            let (top, bottom) = (a[k] + (b[k] - a[k]) * fx, c[k] + (d[k] - c[k]) * fx);
+            self.now.gain * (top + (bottom - top) * fy)
+        };
+        known.then(|| [mix(0), mix(1), mix(2)])
     }
 }
 

@@ -51,10 +51,37 @@ pub(super) struct Light {
     uneven: bool,
     // Ratios whose medians are taken.
     ratios: Vec<f32>,
-    /// Row and ratio of each place that is known; then how far each place is from its row's light, as a share.
-    places: Vec<(f32, f32)>,
+    /// The places that are known; then how far each is from its row's light, as a share.
+    places: Vec<Place>,
     away: Vec<f32>,
-    colour_ratios: [Vec<f32>; 3],
+}
+
+/// A place whose ground is known.
+struct Place {
+    y: f32,
+    /// Blue, green and red in the picture and of the ground, grey levels.
+    seen: [f32; 3],
+    dry: [f32; 3],
+    /// The light there: the picture's brightness against the ground's.
+    ratio: f32,
+}
+
+impl Place {
+    /// A place in row `y` with this colour before this ground, unless it tells nothing of the light.
+    #[inline(always)]
+    fn new(y: f32, pixel: Vec4b, dry: [f32; 3]) -> Option<Self> {
+        let seen = [0, 1, 2].map(|k| f32::from(pixel[k]));
+        let (dry_sum, seen_sum) = (dry.iter().sum::<f32>(), seen.iter().sum::<f32>());
+        let brightest = seen.iter().chain(&dry).copied().fold(0.0, f32::max);
+        let tells = dry_sum >= 3.0 * DARK_LEVEL && brightest <= BRIGHT_LEVEL && seen_sum > 0.0;
+        tells.then(|| Self { y, seen, dry, ratio: seen_sum / dry_sum })
+    }
+
+    /// The light of one colour against that of all, where the ground has enough of it.
+    #[inline(always)]
+    fn colour_ratio(&self, k: usize) -> Option<f32> {
+        (self.dry[k] >= DARK_LEVEL).then(|| self.seen[k] / self.dry[k] / self.ratio)
+    }
 }
 
 impl Light {
@@ -68,10 +95,9 @@ impl Light {
             colours: [1.0; 3],
             differs: false,
             uneven: false,
-            ratios: Vec::with_capacity(places.max(bands)),
+            ratios: Vec::with_capacity(places * bands),
             places: Vec::with_capacity(places * bands),
             away: Vec::with_capacity(places * bands),
-            colour_ratios: std::array::from_fn(|_| Vec::with_capacity(bands * places)),
         }
     }
 
@@ -89,8 +115,7 @@ impl Light {
             return Ok(false);
         }
         self.places.clear();
-        self.colour_ratios.iter_mut().for_each(Vec::clear);
-        let (width, pixels) = (self.size.width as usize, now.data_typed::<Vec4b>()?);
+        let (width, pixels, ground) = (self.size.width as usize, now.data_typed::<Vec4b>()?, background.ground());
         self.bands.clear();
         for band in 0..(self.size.height as usize).div_ceil(BAND_PX) {
             let before = self.places.len();
@@ -100,14 +125,18 @@ impl Light {
                     // Not below each other, so that no upright edge is met in every row.
                     let x = (k * width + (row * width) / BAND_PX) / PLACES;
                     let Some(pixel) = pixels.get(y * width + x).filter(|_| x < width) else { continue };
-                    self.compare([x as f32, y as f32], pixel, background, height_px, wet);
+                    let at = [x as f32, y as f32];
+                    let wet = wet.is_some_and(|w| w.line_share.at(at) <= 1.0 || w.right_px.at(at) < 1.0);
+                    if !wet && height_px.at(at) >= 0.0 {
+                        self.places.extend(ground.at(at).and_then(|dry| Place::new(at[1], *pixel, dry)));
+                    }
                 }
             }
             let places = &self.places[before..];
             if places.len() >= PLACES_LEAST {
                 self.ratios.clear();
-                self.ratios.extend(places.iter().map(|(_, ratio)| *ratio));
-                let middle = places.iter().map(|(y, _)| y).sum::<f32>() / places.len() as f32;
+                self.ratios.extend(places.iter().map(|p| p.ratio));
+                let middle = places.iter().map(|p| p.y).sum::<f32>() / places.len() as f32;
                 self.bands.push((middle, median(&mut self.ratios).max(0.05)));
             }
         }
@@ -116,10 +145,13 @@ impl Light {
         }
         (self.differs, self.colours) = (true, [1.0; 3]);
         self.away.clear();
-        for i in 0..self.places.len() {
-            let (y, ratio) = self.places[i];
-            let gain = self.gains(y)[0];
-            self.away.push((ratio / gain - 1.0).abs());
+        // The places lie row by row.
+        let (mut row, mut gain) = (f32::NAN, 1.0);
+        for place in &self.places {
+            if place.y != row {
+                (row, gain) = (place.y, self.gains(place.y)[0]);
+            }
+            self.away.push((place.ratio / gain - 1.0).abs());
         }
         self.differs = false;
         let most = self.away.len() * 9 / 10;
@@ -128,8 +160,10 @@ impl Light {
         if !told {
             return Ok(false);
         }
-        for (colour, ratios) in self.colours.iter_mut().zip(&mut self.colour_ratios) {
-            *colour = median(ratios).max(0.05);
+        for (k, colour) in self.colours.iter_mut().enumerate() {
+            self.ratios.clear();
+            self.ratios.extend(self.places.iter().filter_map(|place| place.colour_ratio(k)));
+            *colour = median(&mut self.ratios).max(0.05);
         }
         self.ratios.clear();
         self.ratios.extend(self.bands.iter().map(|(_, gain)| *gain));
@@ -141,29 +175,6 @@ impl Light {
             self.divide(now)?;
         }
         Ok(true)
-    }
-
-    /// Compares the picture with the ground at a place.
-    #[inline(always)]
-    fn compare(&mut self, place: [f32; 2], pixel: &Vec4b, background: &Background, height_px: LinearField, wet: Option<WetPlaces>) {
-        let wet = wet.is_some_and(|w| w.line_share.at(place) <= 1.0 || w.right_px.at(place) < 1.0);
-        if wet || height_px.at(place) < 0.0 {
-            return;
-        }
-        let Some(dry) = background.dry_at(place) else { return };
-        let seen = [0, 1, 2].map(|k| f32::from(pixel[k]));
-        let (dry_sum, seen_sum) = (dry.iter().sum::<f32>(), seen.iter().sum::<f32>());
-        let cut_off = seen.iter().chain(&dry).any(|v| *v > BRIGHT_LEVEL);
-        if dry_sum < 3.0 * DARK_LEVEL || cut_off || seen_sum <= 0.0 {
-            return;
-        }
-        let ratio = seen_sum / dry_sum;
-        self.places.push((place[1], ratio));
-        for k in 0..3 {
-            if dry[k] >= DARK_LEVEL {
-                self.colour_ratios[k].push(seen[k] / dry[k] / ratio);
-            }
-        }
     }
 
     /// Gains of blue, green and red in a row of the small picture.
