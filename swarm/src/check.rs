@@ -127,7 +127,9 @@ pub struct Checks {
 /// Whether a stop meets a program of ours. One that is paused is stopped already, and to stop it for good is what the controller asks for; and a
 /// robot that stands behind an open safeguard cannot stop protectively.
 fn stops_ours(what: &What, machine: &Machine) -> bool {
-    let is_ours = machine.runtime_state() != RuntimeState::Stopped && machine.robot.outputs.int[STATE_REGISTER] != 0;
+    // One that ends by itself in this very cycle has ended.
+    let runs = !matches!(machine.runtime_state(), RuntimeState::Stopped | RuntimeState::Stopping);
+    let is_ours = runs && machine.robot.outputs.int[STATE_REGISTER] != 0;
     is_ours
         && match what {
             What::Robot(Fault::ProgramStop) => machine.runtime_state() == RuntimeState::Playing,

@@ -9,21 +9,25 @@
 
 use serde::Serialize;
 
-use crate::calibration;
+use crate::calibration::{self, Doubted};
 use crate::data::TrainingEpisode;
 
 /// So many episodes calibrate each other, the exponent included. Chosen by hand; no measurement is recorded.
 const NEEDS: usize = 4;
 /// Exponents of the area at which two weights may agree: those of the prototype's cameras, and more. Chosen by hand.
 const EXPONENTS: std::ops::RangeInclusive<u32> = 80..=170;
-/// By how much two weights may be apart at the best of them (log), as a standard deviation: the largest spread of many. Chosen by hand.
-const PAIR_SPREAD: f64 = 0.15;
+/// By how much two weights may be apart at the best of them (log), as a standard deviation. Chosen by hand: none of 80 right sets of simulated rigs was accused.
+const PAIR_SPREAD: f64 = 0.08;
 /// Standard deviations at which a weight is doubted. Chosen by hand; no measurement is recorded.
 const DOUBTED_SDS: f64 = 4.0;
 /// Standard deviation of reading the scale, g. Chosen by hand; no measurement is recorded.
 const READING_SD_G: f64 = 0.7;
-/// Standard deviation of a normal distribution over the median of its absolute values.
-const SD_PER_MEDIAN: f64 = 1.4826;
+/// By how much a right weight may be off what the others say beyond the doubt of their calibration (log), as a standard deviation. Chosen by hand.
+const SPREAD_LEAST: f64 = 0.03;
+/// The same of few episodes, times their number. Chosen by hand; no measurement is recorded.
+const SPREAD_FEW: f64 = 0.1;
+/// Step of the exponent for a difference quotient.
+const STEP: f64 = 1e-3;
 
 /// A weight that does not fit.
 #[derive(Debug, Clone, PartialEq, Serialize)]
@@ -78,31 +82,34 @@ fn doubtful_of_few(episodes: &[TrainingEpisode]) -> Vec<DoubtfulWeight> {
     accused.collect()
 }
 
+/// What the other episodes say about the weight of the one with this index, g, with its standard deviation.
+fn told_by_others(episodes: &[TrainingEpisode], k: usize) -> (f64, f64) {
+    let others: Vec<TrainingEpisode> = episodes.iter().enumerate().filter(|(j, _)| *j != k).map(|(_, e)| e.clone()).collect();
+    // Others that contradict each other raise the doubt of their calibration, and so accuse nobody.
+    let Doubted { calibration, covariance, .. } = calibration::with_doubt(&others, false);
+    let (c, q) = (f64::from(calibration.volume_at_1_px2_ml), f64::from(calibration.area_exponent));
+    let expected_g = c * calibration::area_sum(&episodes[k], q);
+    let slope =
+        (calibration::area_sum(&episodes[k], q + STEP) / calibration::area_sum(&episodes[k], q - STEP).max(1e-9)).ln() / (2.0 * STEP);
+    let [[of_c, both], [_, of_q]] = covariance;
+    let log_variance = of_c + 2.0 * both * slope + of_q * slope * slope;
+    let spread = SPREAD_LEAST + SPREAD_FEW / episodes.len() as f64;
+    (expected_g, READING_SD_G.hypot(expected_g * spread.hypot(log_variance.max(0.0).sqrt())))
+}
+
 /// Weights that do not fit the others, worst first.
 pub fn doubtful(episodes: &[TrainingEpisode]) -> Vec<DoubtfulWeight> {
     let mut left: Vec<TrainingEpisode> = episodes.to_vec();
     let mut found = Vec::new();
     while left.len() >= NEEDS {
-        let expected_g: Vec<f64> = (0..left.len())
-            .map(|k| {
-                let others: Vec<TrainingEpisode> = left.iter().enumerate().filter(|(j, _)| *j != k).map(|(_, e)| e.clone()).collect();
-                let calibration = calibration::calibrate(&others, None);
-                f64::from(calibration.volume_at_1_px2_ml) * calibration::area_sum(&left[k], f64::from(calibration.area_exponent))
-            })
-            .collect();
-        let logs: Vec<f64> = left.iter().zip(&expected_g).map(|(e, x)| (e.weight_g / x.max(1e-3)).ln()).collect();
-        let mut sizes: Vec<f64> = logs.iter().map(|l| l.abs()).collect();
-        sizes.sort_by(f64::total_cmp);
-        // The usual deviation is robust against the wrong ones; few episodes tell it badly, so it has bounds.
-        let spread = (SD_PER_MEDIAN * sizes[sizes.len() / 2]).clamp(0.03 + 0.1 / left.len() as f64, 0.15);
-        let sd_g = |k: usize| READING_SD_G.hypot(spread * expected_g[k]);
-        let sds = |k: usize| (left[k].weight_g - expected_g[k]).abs() / sd_g(k);
+        let told: Vec<(f64, f64)> = (0..left.len()).map(|k| told_by_others(&left, k)).collect();
+        let sds = |k: usize| (left[k].weight_g - told[k].0).abs() / told[k].1;
         let Some(worst) = (0..left.len()).max_by(|a, b| sds(*a).total_cmp(&sds(*b))) else { break };
         if sds(worst) < DOUBTED_SDS {
             break;
         }
-        let e = &left[worst];
-        found.push(DoubtfulWeight { name: e.name.clone(), weight_g: e.weight_g, expected_g: expected_g[worst], sd_g: sd_g(worst) });
+        let (e, (expected_g, sd_g)) = (&left[worst], told[worst]);
+        found.push(DoubtfulWeight { name: e.name.clone(), weight_g: e.weight_g, expected_g, sd_g });
         left.remove(worst);
     }
     if left.len() < NEEDS {

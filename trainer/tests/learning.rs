@@ -190,6 +190,30 @@ fn a_wrong_weight_is_found() {
     assert!((doubts[0].expected_g - right).abs() < 0.15 * right, "{doubts:?}");
 }
 
+/// Protects every lesson from a weight that is half or twice as large, whichever of a few it is: it is found, hardly ever another one is accused in its
+/// place, and never a right one among right ones.
+#[test]
+fn half_a_weight_is_found() {
+    let mut accused = Vec::new();
+    let (mut typos, mut found, mut others) = (0, 0, 0);
+    for seed in 1..=8 {
+        for n in [4, 5, 8] {
+            let right = episodes(n, seed);
+            accused.extend(consistency::doubtful(&right));
+            for (k, factor) in (0..n).flat_map(|k| [(k, 0.5), (k, 2.0)]) {
+                let mut typed = right.clone();
+                typed[k].weight_g = (factor * typed[k].weight_g).round();
+                let doubts = consistency::doubtful(&typed);
+                typos += 1;
+                found += usize::from(doubts.iter().any(|d| d.name == typed[k].name));
+                others += usize::from(doubts.iter().any(|d| d.name != typed[k].name));
+            }
+        }
+    }
+    assert_eq!(accused, []);
+    assert!(100 * found >= 97 * typos && 100 * others <= typos, "{found} of {typos} found, {others} with others");
+}
+
 /// Protects the first lessons with a vessel from a typo: of three weights the one that contradicts the two others is named, of two that contradict each
 /// other both are, and right ones are not, though their streams differ.
 #[test]
