@@ -3,12 +3,17 @@
 
 use super::drawn::{blue, camera, dry, image_config, lay_over, noisy, stream};
 use super::{colour, measure};
-use feature_worker::vision::{ExtractError, Extractor};
+use feature_worker::vision::{ExtractError, Extractor, Measurement};
 use opencv::core::{self, Mat, Rect, Scalar};
 use opencv::imgproc;
 use opencv::prelude::*;
 use shared::config::{ImageConfig, LiquidMethod};
 use shared::messages::Doubt;
+
+/// Whether the picture is not called dry: something is measured, or there is a doubt.
+fn is_told(measured: &Measurement) -> bool {
+    measured.area_px2 > 0.0 || measured.doubt != Doubt::None
+}
 
 /// A picture of which the rays see more than half in white, and the region holds less than 60 % of it; with a stream of this colour.
 fn half_white(seed: i32, liquid: Option<Scalar>) -> Result<Mat, ExtractError> {
@@ -172,8 +177,7 @@ fn a_thin_stream_is_not_new_ground() -> Result<(), ExtractError> {
                 lay_over(&mut picture, std::slice::from_ref(&inside), OWN)?;
             }
             let measured = measure(&mut extractor, &picture)?;
-            let told = measured.area_px2 > 0.0 || measured.doubt != Doubt::None;
-            assert_eq!(told, i >= 44, "{share} picture {i}: {measured:?}");
+            assert_eq!(is_told(&measured), i >= 44, "{share} picture {i}: {measured:?}");
         }
     }
     Ok(())
@@ -195,8 +199,7 @@ fn a_stream_behind_something_in_the_grounds_colours_is_named() -> Result<(), Ext
                 picture = noisy(&picture, i)?;
             }
             let measured = measure(&mut extractor, &picture)?;
-            let told = measured.area_px2 > 0.0 || measured.doubt != Doubt::None;
-            assert_eq!(told, i >= 44, "{hidden:?} picture {i}: {measured:?}");
+            assert_eq!(is_told(&measured), i >= 44, "{hidden:?} picture {i}: {measured:?}");
         }
     }
     Ok(())
@@ -219,8 +222,7 @@ fn a_stream_with_a_second_colour_does_not_teach_it_as_ground() -> Result<(), Ext
             _ => lay_over(&mut picture, &[stream(90.0, 80.0)], OTHER)?,
         }
         let measured = measure(&mut extractor, &picture)?;
-        let told = measured.area_px2 > 0.0 || measured.doubt != Doubt::None;
-        assert_eq!(told, i >= 20, "picture {i}: {measured:?}");
+        assert_eq!(is_told(&measured), i >= 20, "picture {i}: {measured:?}");
     }
     Ok(())
 }
@@ -245,8 +247,7 @@ fn a_stream_under_a_reflection_before_white_ground_is_told() -> Result<(), Extra
                 (0..3).for_each(|c| pixel[c] = pixel[c].saturating_add(light));
             }
             let measured = measure(&mut extractor, &picture)?;
-            let told = measured.area_px2 > 0.0 || measured.doubt != Doubt::None;
-            assert_eq!(told, i >= 44, "{a} x {b} picture {i}: {measured:?}");
+            assert_eq!(is_told(&measured), i >= 44, "{a} x {b} picture {i}: {measured:?}");
         }
     }
     Ok(())
