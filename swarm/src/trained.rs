@@ -43,7 +43,7 @@ pub fn train_for<'a>(plans: impl IntoIterator<Item = &'a Plan>, config: &Config,
     TrainedSet(Arc::new(made.iter().filter_map(|(key, lesson)| Some((*key, lesson.clone()?))).collect()))
 }
 
-/// Records five curves in the virtual cell and trains on them.
+/// Records five curves in the virtual cell and trains on those that are over when their run ends: two of them (docs/SWARM.md).
 fn train((is_e_series, vessel, depth): Key, config: &Config) -> Option<Lesson> {
     let series = if is_e_series { Series::ESeries } else { Series::Cb3 };
     let episodes: Vec<TrainingEpisode> = RECORDINGS
