@@ -157,7 +157,7 @@ impl Progress {
     /// Takes note of an attempt that failed with `e`.
     fn failed(&mut self, now_ns: u64, e: &LinkError, config: &Config, note: &RobotNote, say: &dyn Fn(Level, &str)) {
         self.next_ns = now_ns + RECONNECT.as_nanos() as u64;
-        self.before.ran |= matches!(e, LinkError::ProgramRunning { .. } | LinkError::MayNotMove { program_runs: true, .. });
+        self.before.ran |= matches!(e, LinkError::ProgramRunning { .. } | LinkError::MayNotMove { program_there: true, .. });
         self.before.unpowered = match e {
             LinkError::ProgramRunning { .. } => false,
             LinkError::MayNotMove { unpowered: true, .. } => true,

@@ -60,7 +60,7 @@ pub fn connect_over(network: &dyn Network, options: &LinkOptions, before: &Befor
     stands_still((network, options), &mut dialogue, output_recipe, &mut state)?;
     ready_for_program(options, before, &state)?;
 
-    start_program((network, options), &mut dialogue, output_recipe, &mut state, (&program, run))?;
+    start_program((network, options, before), &mut dialogue, output_recipe, &mut state, (&program, run))?;
     let now = network.now_ns();
     (state.received_at_ns, state.advanced_at_ns, state.answered_at_ns) = (now, now, now);
     let at = dialogue.at;
@@ -125,7 +125,7 @@ fn first_state(dialogue: &mut Dialogue<'_>, options: &LinkOptions, recipe: Outpu
 fn ready_for_program(options: &LinkOptions, before: &Before, state: &RobotState) -> Result<(), LinkError> {
     let address = options.address;
     if let Some(reason) = health::hindrance(state) {
-        return Err(may_not_move(options, state, reason));
+        return Err(may_not_move((options, before), state, reason));
     }
     match state.runtime_state {
         RUNTIME_STOPPING | RUNTIME_STOPPED => {}
@@ -164,7 +164,7 @@ fn stands_still(
 
 /// Uploads the program with its run number, and waits until it shows that it runs. `state` becomes the newest one.
 fn start_program(
-    (network, options): (&dyn Network, &LinkOptions),
+    (network, options, before): (&dyn Network, &LinkOptions, &Before),
     dialogue: &mut Dialogue<'_>,
     recipe: OutputRecipe,
     state: &mut RobotState,
@@ -181,7 +181,7 @@ fn start_program(
         // The wait is short, so that the other socket is read too.
         dialogue.next_state(recipe, &options.tilt, state, left.min(GLANCE))?;
         if let Some(reason) = health::hindrance(state) {
-            return Err(may_not_move(options, state, reason));
+            return Err(may_not_move((options, before), state, reason));
         }
         if state.program_run == run && state.program_state == ProgramState::TooFar {
             return Err(too_far(options, state));
@@ -199,9 +199,12 @@ fn start_program(
 }
 
 /// The error of a robot that may not be moved.
-fn may_not_move(options: &LinkOptions, state: &RobotState, reason: EndReason) -> LinkError {
-    let program_runs = state.runtime_state == RUNTIME_PLAYING;
-    LinkError::MayNotMove { address: options.address, reason, unpowered: hands::without_power(state), program_runs }
+fn may_not_move((options, before): (&LinkOptions, &Before), state: &RobotState, reason: EndReason) -> LinkError {
+    let unpowered = hands::without_power(state);
+    // A paused program counts: it goes on when somebody resumes it, and may then be stopped before the next look at the robot.
+    let program_there = state.runtime_state == RUNTIME_PLAYING
+        || (matches!(state.runtime_state, RUNTIME_PAUSING | RUNTIME_PAUSED) && !unpowered && !hands::never_started(before, state));
+    LinkError::MayNotMove { address: options.address, reason, unpowered, program_there }
 }
 
 /// The error of a joint that is too far from its start angle.

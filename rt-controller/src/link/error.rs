@@ -152,8 +152,8 @@ pub enum LinkError {
         reason: EndReason,
         /// Whether its arm has no power or its brakes on.
         unpowered: bool,
-        /// Whether a program runs nevertheless.
-        program_runs: bool,
+        /// Whether a program is there nevertheless: it runs, or is paused and can be resumed.
+        program_there: bool,
     },
     /// A program is running.
     #[error("robot {address}: a program is running; wait until it has brought the container upright, or stop it on the pendant")]

@@ -86,7 +86,7 @@ pub struct Before {
     pub last: Option<RobotState>,
     /// Whether the operator asks for the robot now, so that it does not matter what happened meanwhile.
     pub asked: bool,
-    /// Whether a program was seen to run since the operator last asked, so that what happens to it afterwards matters after all.
+    /// Whether a program was seen since the operator last asked, running or paused, so that what happens to it afterwards matters after all.
     pub ran: bool,
     /// Whether the arm was seen without power or with its brakes on since a program was last seen to run: no program can then be paused.
     pub unpowered: bool,

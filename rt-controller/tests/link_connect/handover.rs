@@ -111,3 +111,17 @@ fn a_new_controller_sees_that_a_program_was_stopped() {
         assert!(Server::new(number + 20, Robot { registers, ..Robot::default() }).meet_after(&before).0.is_ok(), "{registers:?}");
     }
 }
+
+/// Protects people who stop our program after it stood paused behind an open safeguard: the look at the robot says that a program is there, so that
+/// its stop counts even if it went on and was stopped between two looks. A booted robot, and an arm without power, have none.
+#[test]
+fn a_paused_program_behind_a_safeguard_is_there() {
+    let paused = Robot { safety_mode: 5, runtime_state: 4, registers: (ProgramState::Following, 7, 9), ..Robot::default() };
+    let booted = Robot { registers: (ProgramState::Unknown, 0, 0), ..paused.clone() };
+    let unpowered = Robot { robot_mode: 3, ..paused.clone() };
+    for (number, robot, there) in [(134, paused, true), (135, booted, false), (136, unpowered, false)] {
+        let (session, _) = Server::new(number, robot).meet_after(&Before { asked: true, ..Before::default() });
+        let error = session.err();
+        assert!(matches!(error, Some(LinkError::MayNotMove { program_there, .. }) if program_there == there), "{number}: {error:?}");
+    }
+}

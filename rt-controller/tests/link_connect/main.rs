@@ -364,7 +364,7 @@ fn a_stop_during_the_upload_is_named() {
     let error = connect(&options).unwrap_err();
     assert_eq!(
         error,
-        LinkError::MayNotMove { address: options.address, reason: EndReason::EmergencyStop, unpowered: true, program_runs: false }
+        LinkError::MayNotMove { address: options.address, reason: EndReason::EmergencyStop, unpowered: true, program_there: false }
     );
     drop(served.join());
 }
