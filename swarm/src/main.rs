@@ -165,7 +165,7 @@ fn one(args: &Args, drawn: &Plan, config: &Config) -> Result<bool, String> {
         plan = plan.keep(&kept(text, &plan)?);
         keep = format!("{only} --keep {text}");
     }
-    let trained = train_for([&plan], config, &|text| eprintln!("swarm: {text}"));
+    let trained = train_for([&plan], config, &|text| eprintln!("swarm: {text}"))?;
     if args.shrink {
         let all = run::run(&plan, &trained, config, false);
         let Some(first) = all.violations.first() else {
@@ -228,7 +228,7 @@ fn many(args: &Args, seeds: Seeds, config: &Config) -> Result<bool, String> {
         let is_late = until.is_some_and(|until| std::time::Instant::now() >= until);
         stop.load(Ordering::Relaxed).then_some("stopped").or(is_late.then_some("the time is over"))
     };
-    let (shown, summary) = run_until(seeds, config, &over, true);
+    let (shown, summary) = run_until(seeds, config, &over, true)?;
     if json.tables() {
         shown.iter().filter(|one| !one.violations.is_empty()).take(10).for_each(|one| {
             print(&format!("seed {}:", one.seed));

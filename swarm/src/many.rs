@@ -142,12 +142,23 @@ pub struct Seeds {
 }
 
 /// Runs seeds on all cores, with a progress bar if `progress`.
-pub fn run_many(seeds: Seeds, config: &Config, progress: bool) -> (Vec<Shown>, Summary) {
+///
+/// # Errors
+/// As of [`train_for`].
+pub fn run_many(seeds: Seeds, config: &Config, progress: bool) -> Result<(Vec<Shown>, Summary), String> {
     run_until(seeds, config, &|| None, progress)
 }
 
 /// The same, but begins no more of them once `over` says why.
-pub fn run_until(seeds: Seeds, config: &Config, over: &dyn Fn() -> Option<&'static str>, progress: bool) -> (Vec<Shown>, Summary) {
+///
+/// # Errors
+/// As of [`train_for`].
+pub fn run_until(
+    seeds: Seeds,
+    config: &Config,
+    over: &dyn Fn() -> Option<&'static str>,
+    progress: bool,
+) -> Result<(Vec<Shown>, Summary), String> {
     let last = seeds.from.saturating_add(seeds.count);
     let say = |text: &str| {
         if progress {
@@ -172,7 +183,7 @@ pub fn run_until(seeds: Seeds, config: &Config, over: &dyn Fn() -> Option<&'stat
             told = Instant::now();
         }
         let plans: Vec<Plan> = (from..last.min(from.saturating_add(AT_ONCE))).map(|seed| Plan::draw_with(seed, seeds.choice)).collect();
-        let trained = train_for(&plans, config, &say);
+        let trained = train_for(&plans, config, &say)?;
         let (before_s, [drawn_s, measured_s]) = (processor_s(), camera::spent_s());
         let bar = bar.clone();
         let new: Vec<Shown> = plans.par_iter().progress_with(bar).map(|plan| run::run(plan, &trained, config, false)).collect();
@@ -185,7 +196,7 @@ pub fn run_until(seeds: Seeds, config: &Config, over: &dyn Fn() -> Option<&'stat
         shown.extend(new);
     }
     let summary = Summary { processor_s: spent_s, camera_s, ..sum_up(seeds.from, &shown) };
-    (shown, summary)
+    Ok((shown, summary))
 }
 
 /// Processor time of this process, s.

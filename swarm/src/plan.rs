@@ -15,8 +15,11 @@ use crate::faults::{self, KINDS};
 use crate::vessels::{VESSELS, spill_angle_deg};
 use crate::what::{Weighed, What};
 
-/// How long a cell runs after its last order and fault, s: the longest way upright and the wait for the last drops, twice.
-const REST_S: f64 = 12.0;
+/// How long a cell runs after its last order and fault, and after the last curve, ms: the longest way upright and the wait for the last drops,
+/// twice.
+const REST_MS: u64 = 12_000;
+/// How long after its curve a recording is learned from, ms: it is over by then, unless a fault holds it up.
+const WEIGHED_MS: u64 = 7_000;
 /// Share of the seeds in which a curve is recorded, learned from, and the weights swapped. Few, because a training takes longer than a pour.
 const LESSONS: f64 = 0.003;
 
@@ -146,15 +149,17 @@ impl Plan {
     fn draw_lesson(&mut self, random: &mut Pcg64Mcg, at_ms: u64) -> u64 {
         let spill_deg = spill_angle_deg(self.vessel, self.fill_ml);
         let lambda_deg = (spill_deg + random.random_range(6.0..30.0)).min(105.0) as f32;
-        self.push(at_ms, What::Record(lambda_deg, random.random_range(0.7..2.2)), None);
+        let record = What::Record(lambda_deg, random.random_range(0.7..2.2));
+        let weighed_ms = at_ms + record.takes_ms() + WEIGHED_MS;
+        self.push(at_ms, record, None);
         let weighed = match random.random_range(0..4) {
             0 => Weighed::Untared(random.random_range(20.0..250.0)),
             1 => Weighed::Mistyped([0.1, 0.5, 1.3, 2.0, 10.0][random.random_range(0..5)]),
             _ => Weighed::Right,
         };
-        self.push(at_ms + 15_000, What::Learn(weighed), None);
-        self.push(at_ms + 15_500, What::Refill(random.random_range(150.0..450.0)), None);
-        at_ms + 17_000
+        self.push(weighed_ms, What::Learn(weighed), None);
+        self.push(weighed_ms + 500, What::Refill(random.random_range(150.0..450.0)), None);
+        weighed_ms + 2_000
     }
 
     /// A cell without faults, in which a curve is recorded.
@@ -173,8 +178,8 @@ impl Plan {
 
     fn finish(&mut self) {
         self.items.sort_by_key(|item| item.at_ms);
-        let last_ms = self.items.last().map_or(0, |item| item.at_ms);
-        self.until_ms = last_ms + (REST_S * 1000.0) as u64;
+        let last_ms = self.items.iter().map(|item| item.at_ms + item.what.takes_ms()).max();
+        self.until_ms = last_ms.unwrap_or(0) + REST_MS;
     }
 
     /// Draws `faults` faults around the order at `from_ms`.

@@ -11,7 +11,6 @@ use rt_controller::journal::Tick;
 use shared::agent::Agent;
 use shared::config::Config;
 use shared::control::{EndReason, Outcome};
-use shared::gaussian_curve::Curve;
 use shared::messages::{Phase, Telemetry};
 use shared::weights::Weights;
 use simulator::camera::Scene;
@@ -31,7 +30,7 @@ use crate::plan::Plan;
 use crate::records::Row;
 use crate::vessels;
 use crate::weight_set::{Lesson, TrainedSet, episode};
-use crate::what::{EyeFault, Weighed, What};
+use crate::what::{EyeFault, Weighed, What, curve};
 
 /// The cell's configuration.
 const CONFIG: &str = include_str!("../../config/sim.toml");
@@ -395,10 +394,7 @@ impl Site {
             }
             What::Record(lambda_deg, width_s) => {
                 self.episode += 1;
-                let gamma_per_s2 = 1.0 / (2.0 * width_s * width_s);
-                let beta_s = ((lambda_deg / 0.05).ln() / gamma_per_s2).sqrt();
-                let curve = Curve { lambda_deg: *lambda_deg, gamma_per_s2, beta_s };
-                return Some(Some(Order::Record { episode: self.episode, curve }));
+                return Some(Some(Order::Record { episode: self.episode, curve: curve(*lambda_deg, *width_s) }));
             }
             What::Abort => return Some(Some(Order::Abort)),
             What::Resume => return Some(None),

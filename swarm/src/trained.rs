@@ -1,13 +1,14 @@
 //! The weights that the virtual cell pours with: trained by the real trainer on curves that were recorded in the virtual cell itself.
 //!
-//! Made once in a process; a pair of robot and vessel takes some seconds of one core. Allocates. A training that fails leaves that pair
-//! without weights.
+//! Made once in a process; a pair of robot and vessel takes some seconds of one core. Allocates. A recording that is lost, or a training that
+//! fails, is an error: weights of fewer recordings would show something else.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::{Arc, Mutex, PoisonError};
 
 use rayon::prelude::*;
 use shared::config::Config;
+use shared::control::EndReason;
 use simulator::ur::Series;
 use trainer::data::TrainingEpisode;
 
@@ -25,10 +26,13 @@ const RECORDINGS: [(f64, f64, f32); 5] =
 const FROM_S: f64 = 2.9;
 
 /// What was trained in this process.
-static MADE: Mutex<BTreeMap<Key, Option<Lesson>>> = Mutex::new(BTreeMap::new());
+static MADE: Mutex<BTreeMap<Key, Lesson>> = Mutex::new(BTreeMap::new());
 
 /// Trains what the plans need and was not trained yet. Must not be called from a rayon task, because it uses them under a lock.
-pub fn train_for<'a>(plans: impl IntoIterator<Item = &'a Plan>, config: &Config, say: &dyn Fn(&str)) -> TrainedSet {
+///
+/// # Errors
+/// One line that names the vessel, and the recording that was lost or what the trainer said.
+pub fn train_for<'a>(plans: impl IntoIterator<Item = &'a Plan>, config: &Config, say: &dyn Fn(&str)) -> Result<TrainedSet, String> {
     let mut made = MADE.lock().unwrap_or_else(PoisonError::into_inner);
     let needed: BTreeSet<_> = plans
         .into_iter()
@@ -38,25 +42,27 @@ pub fn train_for<'a>(plans: impl IntoIterator<Item = &'a Plan>, config: &Config,
     if !missing.is_empty() {
         say(&format!("training for {} pairs of robot and vessel", missing.len()));
     }
-    let trained: Vec<_> = missing.into_par_iter().map(|key| (key, train(key, config))).collect();
-    made.extend(trained);
-    TrainedSet(Arc::new(made.iter().filter_map(|(key, lesson)| Some((*key, lesson.clone()?))).collect()))
+    let trained: Result<Vec<_>, String> = missing.into_par_iter().map(|key| Ok((key, train(key, config)?))).collect();
+    made.extend(trained?);
+    Ok(TrainedSet(Arc::new(made.clone())))
 }
 
-/// Records five curves in the virtual cell and trains on those that are over when their run ends: two of them (docs/SWARM.md).
-fn train((is_e_series, vessel, depth): Key, config: &Config) -> Option<Lesson> {
+/// Records five curves in the virtual cell and trains on them.
+fn train((is_e_series, vessel, depth): Key, config: &Config) -> Result<Lesson, String> {
     let series = if is_e_series { Series::ESeries } else { Series::Cb3 };
-    let episodes: Vec<TrainingEpisode> = RECORDINGS
+    let named = VESSELS[vessel].name;
+    let episodes: Result<Vec<TrainingEpisode>, String> = RECORDINGS
         .iter()
-        .filter_map(|&(fill_ml, over_deg, width_s)| {
+        .map(|&(fill_ml, over_deg, width_s)| {
             let lambda_deg = (spill_angle_deg(vessel, fill_ml) + over_deg).min(105.0) as f32;
-            let shown =
-                run::run(&Plan::recording((series, depth), vessel, fill_ml, lambda_deg, width_s), &TrainedSet::default(), config, true);
-            let poured = shown.poured.first()?;
-            let name = format!("{fill_ml} ml in a {}", VESSELS[vessel].name);
+            let plan = Plan::recording((series, depth), vessel, fill_ml, lambda_deg, width_s);
+            let shown = run::run(&plan, &TrainedSet::default(), config, true);
+            let name = format!("{fill_ml} ml in a {named}");
+            let poured = shown.poured.first().filter(|poured| poured.reason == EndReason::Done);
+            let poured = poured.ok_or_else(|| format!("the recording of {name} did not end as done"))?;
             let made = episode(&name, &shown.rows, (FROM_S, poured.at_s), START_NS as f64 / 1e9, poured.true_ml.round());
-            Some(made).filter(|e| e.fault().is_none())
+            made.fault().map_or(Ok(made), |fault| Err(format!("the recording of {name}: {fault}")))
         })
         .collect();
-    Lesson::learn(episodes, &config.limits)
+    Lesson::learn(episodes?, &config.limits).ok_or_else(|| format!("no weights come of the recordings in a {named}"))
 }

@@ -3,6 +3,7 @@
 //! Plain data; allocates for names only; cannot fail.
 
 use serde::Serialize;
+use shared::gaussian_curve::Curve;
 use simulator::camera::faults::FaultKind;
 use simulator::ur::Fault;
 
@@ -90,6 +91,11 @@ pub enum What {
 }
 
 impl What {
+    /// How long it takes by itself, ms: a curve its own time, everything else none.
+    pub fn takes_ms(&self) -> u64 {
+        if let Self::Record(lambda_deg, width_s) = self { (1000.0 * curve(*lambda_deg, *width_s).duration_s()) as u64 } else { 0 }
+    }
+
     /// Whether it is a part of the ordinary course, and not a fault.
     pub fn is_ordinary(&self) -> bool {
         matches!(self, Self::Pour(_) | Self::Record(..) | Self::Refill(_) | Self::Resume | Self::Learn(_))
@@ -105,6 +111,11 @@ impl What {
         };
         text.split(['(', '=']).next().unwrap_or_default().to_lowercase()
     }
+}
+
+/// The curve with this largest angle, degrees, and width, s: the standard deviation of eq. (1)'s bell.
+pub fn curve(lambda_deg: f32, width_s: f32) -> Curve {
+    Curve::from_upright(lambda_deg, 1.0 / (2.0 * width_s * width_s))
 }
 
 /// Whether a person sets something right with it.

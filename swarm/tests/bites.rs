@@ -36,7 +36,7 @@ fn limits_that_are_too_weak_are_found() {
         let only = fault.map(|name| named(name).unwrap());
         // Two vessels do, so that little is trained.
         let plans: Vec<Plan> = (1..=SEEDS).map(|seed| Plan::draw_with(seed, Choice { only, vessels: 2, ..Choice::default() })).collect();
-        let trained = train_for(&plans, &good, &|_| {});
+        let trained = train_for(&plans, &good, &|_| {}).unwrap();
         let found = plans
             .iter()
             .position(|plan| run_checked(plan, &trained, &weak, &good, false).violations.iter().any(|v| invariants.contains(&v.invariant)));

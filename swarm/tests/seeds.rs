@@ -29,7 +29,7 @@ fn assert_none(shown: &[Shown]) {
 /// Protects everything that docs/SWARM.md lists, on seeds that stay the same.
 #[test]
 fn fixed_seeds_keep_every_invariant() {
-    let (shown, summary) = run_many(seeds(FIXED.0, FIXED.1), &config().unwrap(), false);
+    let (shown, summary) = run_many(seeds(FIXED.0, FIXED.1), &config().unwrap(), false).unwrap();
     assert!(summary.pours > 3_000, "{} pours ended", summary.pours);
     assert!(summary.reasons.len() >= 14, "{:?}", summary.reasons);
     assert_none(&shown);
@@ -40,7 +40,7 @@ fn fixed_seeds_keep_every_invariant() {
 fn fresh_seeds_keep_every_invariant() {
     let from = SystemTime::now().duration_since(UNIX_EPOCH).unwrap().as_secs() * 1000;
     println!("fresh seeds from {from}: swarm --seeds {FRESH} --from {from}");
-    assert_none(&run_many(seeds(from, FRESH), &config().unwrap(), false).0);
+    assert_none(&run_many(seeds(from, FRESH), &config().unwrap(), false).unwrap().0);
 }
 
 /// Protects the replay of a violation: the same seeds give the same, to the bit, on one thread and on three.
@@ -49,12 +49,12 @@ fn a_seed_gives_the_same_on_any_number_of_threads() {
     let config = config().unwrap();
     let (from, count) = (42, 12);
     // The training happens first, outside of the threads that are compared.
-    let reference = run_many(seeds(from, count), &config, false).1.sha256;
+    let reference = run_many(seeds(from, count), &config, false).unwrap().1.sha256;
     for threads in [1, 3] {
         let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
-        assert_eq!(pool.install(|| run_many(seeds(from, count), &config, false).1.sha256), reference, "{threads} threads");
+        assert_eq!(pool.install(|| run_many(seeds(from, count), &config, false).unwrap().1.sha256), reference, "{threads} threads");
     }
-    let other = run_many(seeds(from + 1, count), &config, false).1.sha256;
+    let other = run_many(seeds(from + 1, count), &config, false).unwrap().1.sha256;
     assert_ne!(other, reference, "other seeds show something else");
 }
 
@@ -63,7 +63,7 @@ fn a_seed_gives_the_same_on_any_number_of_threads() {
 fn a_story_is_the_same_twice() {
     let config = config().unwrap();
     let plan = Plan::draw(7);
-    let trained = train_for([&plan], &config, &|_| {});
+    let trained = train_for([&plan], &config, &|_| {}).unwrap();
     let (one, two) = (run(&plan, &trained, &config, true), run(&plan, &trained, &config, true));
     assert!(!one.story.is_empty() && !one.rows.is_empty());
     assert_eq!((one.story.clone(), format!("{:?}", one.rows)), (two.story.clone(), format!("{:?}", two.rows)));
