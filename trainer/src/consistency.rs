@@ -2,7 +2,8 @@
 //!
 //! Pure functions of the offline trainer, for any thread; they allocate and do not fail. Each weight is compared with what the camera's
 //! areas say when they are calibrated on all other episodes. The worst one is taken out, and the rest are compared again, so that one wrong
-//! weight does not accuse the others.
+//! weight does not accuse the others. Where either of two may be the wrong one, as the rest agree without the one or without the other, both are
+//! accused.
 //!
 //! Two or three weights leave the exponent of the area open, so each pair of them is compared at the exponent that suits it best. Of three, the
 //! two that are least apart accuse the third. Two that contradict each other accuse both, as nobody knows which one is wrong.
@@ -97,20 +98,40 @@ fn told_by_others(episodes: &[TrainingEpisode], k: usize) -> (f64, f64) {
     (expected_g, READING_SD_G.hypot(expected_g * spread.hypot(log_variance.max(0.0).sqrt())))
 }
 
+/// By how many standard deviations each weight is off what the others say, with what they say, g, and its standard deviation.
+fn apart(episodes: &[TrainingEpisode]) -> Vec<(f64, f64, f64)> {
+    let told = |k: usize| {
+        let (expected_g, sd_g) = told_by_others(episodes, k);
+        ((episodes[k].weight_g - expected_g).abs() / sd_g, expected_g, sd_g)
+    };
+    (0..episodes.len()).map(told).collect()
+}
+
+/// Whether the weights without the one with this index agree.
+fn agree_without(episodes: &[TrainingEpisode], k: usize) -> bool {
+    let others: Vec<TrainingEpisode> = episodes.iter().enumerate().filter(|(j, _)| *j != k).map(|(_, e)| e.clone()).collect();
+    if others.len() < NEEDS { doubtful_of_few(&others).is_empty() } else { apart(&others).iter().all(|(sds, ..)| *sds < DOUBTED_SDS) }
+}
+
 /// Weights that do not fit the others, worst first.
 pub fn doubtful(episodes: &[TrainingEpisode]) -> Vec<DoubtfulWeight> {
     let mut left: Vec<TrainingEpisode> = episodes.to_vec();
     let mut found = Vec::new();
     while left.len() >= NEEDS {
-        let told: Vec<(f64, f64)> = (0..left.len()).map(|k| told_by_others(&left, k)).collect();
-        let sds = |k: usize| (left[k].weight_g - told[k].0).abs() / told[k].1;
-        let Some(worst) = (0..left.len()).max_by(|a, b| sds(*a).total_cmp(&sds(*b))) else { break };
-        if sds(worst) < DOUBTED_SDS {
+        let told = apart(&left);
+        let Some(worst) = (0..left.len()).max_by(|a, b| told[*a].0.total_cmp(&told[*b].0)).filter(|k| told[*k].0 >= DOUBTED_SDS) else {
             break;
+        };
+        let mut accused = vec![worst];
+        if agree_without(&left, worst) {
+            // Those that may be the wrong one in its place: they are off, too, and without them the rest agree.
+            accused.extend((0..left.len()).filter(|k| *k != worst && told[*k].0 >= DOUBTED_SDS && agree_without(&left, *k)));
         }
-        let (e, (expected_g, sd_g)) = (&left[worst], told[worst]);
-        found.push(DoubtfulWeight { name: e.name.clone(), weight_g: e.weight_g, expected_g, sd_g });
-        left.remove(worst);
+        found.extend(accused.iter().map(|k| {
+            let (e, (_, expected_g, sd_g)) = (&left[*k], told[*k]);
+            DoubtfulWeight { name: e.name.clone(), weight_g: e.weight_g, expected_g, sd_g }
+        }));
+        left = left.into_iter().enumerate().filter(|(k, _)| !accused.contains(k)).map(|(_, e)| e).collect();
     }
     if left.len() < NEEDS {
         found.extend(doubtful_of_few(&left));
