@@ -15,12 +15,12 @@ fn seeds_before_a_camera_keep_every_invariant() {
     let config = config().unwrap();
     let choice = Choice { vessels: 1, series: Some(Series::Cb3), depth: Depth::Camera, ..Choice::default() };
     let seeds = Seeds { from: 600_000, count: 6, choice };
-    let (shown, summary) = run_many(seeds, &config, false);
+    let (shown, summary) = run_many(seeds, &config, false).unwrap();
     let bad: Vec<_> = shown.iter().flat_map(|one| one.violations.iter().map(|v| (one.seed, v))).collect();
     assert!(bad.is_empty(), "{bad:?}");
     let done = shown.iter().flat_map(|one| &one.poured).filter(|p| p.reason == EndReason::Done && p.goal_ml.is_some()).count();
     assert!(done > 0, "no pour was done: {:?}", summary.reasons);
     assert!(spent_s().iter().all(|s| *s > 0.0), "no picture was drawn or measured");
-    let again = run_many(Seeds { count: 2, ..seeds }, &config, false).0;
+    let again = run_many(Seeds { count: 2, ..seeds }, &config, false).unwrap().0;
     assert_eq!(format!("{again:?}"), format!("{:?}", &shown[..2]));
 }
