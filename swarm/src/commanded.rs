@@ -125,7 +125,8 @@ impl Commanded {
             ));
         }
         let begins_anew = !goes_on && may_be_anew;
-        findings.extend(self.beyond(alpha_deg, (told_q[joint].to_degrees(), servo_q[joint].to_degrees()), anew_rate, begins_anew));
+        let rate = if begins_anew { anew_rate } else { told_rate };
+        findings.extend(self.beyond(alpha_deg, (told_q[joint].to_degrees(), servo_q[joint].to_degrees()), rate, begins_anew));
         findings.extend(self.again(alpha_deg, told_rate > 0.0, active, begins_anew));
         let rates = match (goes_on, may_be_anew) {
             (true, true) => Rates::two(told_rate, anew_rate),
@@ -139,18 +140,20 @@ impl Commanded {
 
     /// Whether a command is beyond the range, where neither the one before it nor the servo was. A joint that somebody has moved there comes back; one that
     /// somebody is moving, when a program begins anew, has to be braked first.
-    fn beyond(&mut self, alpha_deg: f64, (told_deg, servo_deg): (f64, f64), anew_rate: f64, begins_anew: bool) -> Option<Finding> {
+    fn beyond(&mut self, alpha_deg: f64, (told_deg, servo_deg): (f64, f64), rate: f64, begins_anew: bool) -> Option<Finding> {
         let Limits { alpha_min_deg, alpha_max_deg, acceleration_deg_s2, .. } = self.limits;
         let range = f64::from(alpha_min_deg) - BELOW_DEG..=f64::from(alpha_max_deg) + SLACK_DEG;
         let middle_deg = 0.5 * (range.start() + range.end());
         let beyond_deg = |deg: f64| (deg - range.end()).max(range.start() - deg).max(0.0);
-        if begins_anew {
-            let braked_deg = alpha_deg + anew_rate * (self.cycle_s + anew_rate.abs() / (2.0 * f64::from(acceleration_deg_s2)));
-            self.excused_deg = beyond_deg(alpha_deg).max(beyond_deg(braked_deg));
+        // How far it goes if it is braked from now on.
+        let braked_deg = beyond_deg(alpha_deg + rate * (self.cycle_s + rate.abs() / (2.0 * f64::from(acceleration_deg_s2))));
+        self.excused_deg = if begins_anew {
+            beyond_deg(alpha_deg).max(braked_deg)
         } else if (alpha_deg - middle_deg).abs() <= (told_deg - middle_deg).abs() {
-            // It is braked.
-            self.excused_deg = 0.0;
-        }
+            0.0
+        } else {
+            self.excused_deg.min(braked_deg + SLACK_DEG)
+        };
         let may_be_deg = beyond_deg(told_deg).max(beyond_deg(servo_deg)).max(self.excused_deg);
         (beyond_deg(alpha_deg) > may_be_deg).then(|| ("robot-range", format!("servoj is given {alpha_deg:.3} degrees")))
     }
@@ -244,6 +247,8 @@ mod tests {
         // While a hand moves it on at 15 degrees/s (seed 5039681), a program begins where it is, and brakes it: no harder, and no farther.
         assert_eq!(findings(&[-0.5, -2.59, -2.69, -2.75, -2.77, -2.73], (-2.47, -15.0), false), Vec::<&str>::new());
         assert!(findings(&[-0.5, -2.59, -2.71, -2.83, -2.95, -3.07], (-2.47, -15.0), false).contains(&"robot-range"));
+        // One that is braked at once, and then creeps on, is not braked any more.
+        assert!(findings(&[-0.5, -2.59, -2.65, -2.66, -2.67, -2.68, -2.69, -2.7], (-2.47, -15.0), false).contains(&"robot-range"));
     }
 
     /// Protects the other joints: they stay as told, or where the servo is; every other angle is a motion.

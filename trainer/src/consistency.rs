@@ -1,7 +1,7 @@
 //! Finds weights that do not fit the others: a typo, or a cup that was not tared.
 //!
 //! Pure functions of the offline trainer, for any thread; they allocate and do not fail. Each weight is compared with what the camera's
-//! areas say when they are calibrated on all other episodes. The worst one is taken out, and the rest are compared again, so that one wrong
+//! areas say when they are calibrated on all other episodes, by the least sum of deviations, which one or two wrong ones hardly move. The worst one is taken out, and the rest are compared again, so that one wrong
 //! weight does not accuse the others. Where either of two may be the wrong one, as the rest agree without the one or without the other, both are
 //! accused.
 //!
@@ -10,7 +10,7 @@
 
 use serde::Serialize;
 
-use crate::calibration::{self, Doubted};
+use crate::calibration;
 use crate::data::TrainingEpisode;
 
 /// So many episodes calibrate each other, the exponent included. Chosen by hand; no measurement is recorded.
@@ -27,8 +27,12 @@ const READING_SD_G: f64 = 0.7;
 const SPREAD_LEAST: f64 = 0.03;
 /// The same of few episodes, times their number. Chosen by hand; no measurement is recorded.
 const SPREAD_FEW: f64 = 0.1;
-/// Step of the exponent for a difference quotient.
-const STEP: f64 = 1e-3;
+/// Exponents of the area, in hundredths, among which a calibration of four and more is sought: those of the trainer's own calibration.
+const GRID: std::ops::RangeInclusive<u32> = 80..=170;
+/// Standard deviation of the exponent's prior: that of the trainer's own calibration.
+const EXPONENT_SD: f64 = 0.4;
+/// The standard deviation of a normal error for a mean deviation of 1.
+const ABSOLUTE_SD: f64 = 1.2533;
 
 /// A weight that does not fit.
 #[derive(Debug, Clone, PartialEq, Serialize)]
@@ -83,58 +87,113 @@ fn doubtful_of_few(episodes: &[TrainingEpisode]) -> Vec<DoubtfulWeight> {
     accused.collect()
 }
 
-/// What the other episodes say about the weight of the one with this index, g, with its standard deviation.
-fn told_by_others(episodes: &[TrainingEpisode], k: usize) -> (f64, f64) {
-    let others: Vec<TrainingEpisode> = episodes.iter().enumerate().filter(|(j, _)| *j != k).map(|(_, e)| e.clone()).collect();
-    // Others that contradict each other raise the doubt of their calibration, and so accuse nobody.
-    let Doubted { calibration, covariance, .. } = calibration::with_doubt(&others, false);
-    let (c, q) = (f64::from(calibration.volume_at_1_px2_ml), f64::from(calibration.area_exponent));
-    let expected_g = c * calibration::area_sum(&episodes[k], q);
-    let slope =
-        (calibration::area_sum(&episodes[k], q + STEP) / calibration::area_sum(&episodes[k], q - STEP).max(1e-9)).ln() / (2.0 * STEP);
-    let [[of_c, both], [_, of_q]] = covariance;
-    let log_variance = of_c + 2.0 * both * slope + of_q * slope * slope;
-    let spread = SPREAD_LEAST + SPREAD_FEW / episodes.len() as f64;
+/// Logarithm of an episode's sum of area^q, for each q of [`GRID`].
+fn log_sums(episode: &TrainingEpisode) -> Vec<f64> {
+    GRID.map(|exponent| calibration::area_sum(episode, f64::from(exponent) / 100.0).max(1e-9).ln()).collect()
+}
+
+/// The value below and above which half of the weight lies; the pairs are of value and weight.
+fn weighted_median(mut of: Vec<(f64, f64)>) -> f64 {
+    of.sort_by(|a, b| a.0.total_cmp(&b.0));
+    let half = 0.5 * of.iter().map(|(_, weight)| weight).sum::<f64>();
+    let mut below = 0.0;
+    let reached = of.iter().find(|(_, weight)| {
+        below += weight;
+        below >= half
+    });
+    reached.map_or(0.0, |(value, _)| *value)
+}
+
+/// An episode as it is compared: the logarithms of its weight and of its sums, and its place in what was given.
+struct Compared {
+    log_weight: f64,
+    log_sums: Vec<f64>,
+    place: usize,
+}
+
+impl Compared {
+    /// By how much its weight may be off, as read and as a rule (log), where log c is this and q has this place in [`GRID`].
+    fn log_sd(&self, log_c: f64, at: usize) -> f64 {
+        SPREAD_LEAST.hypot(READING_SD_G / (log_c + self.log_sums[at]).exp().max(READING_SD_G))
+    }
+}
+
+/// The calibration of these episodes that leaves the least sum of deviations (log), so that a wrong weight among them hardly moves it: log c, the
+/// place of q in [`GRID`], and the sum.
+fn robust(others: &[&Compared]) -> (f64, usize, f64) {
+    let at = |at: usize| {
+        let off = |o: &Compared| o.log_weight - o.log_sums[at];
+        let first = weighted_median(others.iter().map(|o| (off(o), 1.0)).collect());
+        let log_c = weighted_median(others.iter().map(|o| (off(o), 1.0 / o.log_sd(first, at))).collect());
+        let sum: f64 = others.iter().map(|o| (off(o) - log_c).abs() / o.log_sd(log_c, at)).sum();
+        let exponent = f64::from(*GRID.start() + at as u32) / 100.0;
+        (log_c, at, sum + 0.5 * ((exponent - calibration::EXPONENT_EXPECTED) / EXPONENT_SD).powi(2))
+    };
+    (1..GRID.count()).map(at).fold(at(0), |best, next| if next.2 < best.2 { next } else { best })
+}
+
+/// What the other episodes say about the weight of `one`, g, with its standard deviation. Others that contradict each other raise it.
+fn told_by_others(one: &Compared, others: &[&Compared]) -> (f64, f64) {
+    let (log_c, at, sum) = robust(others);
+    let last = one.log_sums.len() - 1;
+    let (below, above) = (at.saturating_sub(1), (at + 1).min(last));
+    let slope = |of: &Compared| (of.log_sums[above] - of.log_sums[below]) / (0.01 * (above - below).max(1) as f64);
+    let mut precision = [[0.0, 0.0], [0.0, EXPONENT_SD.powi(-2)]];
+    for o in others {
+        let slopes = [1.0, slope(o)].map(|s| s / o.log_sd(log_c, at));
+        for (row, a) in precision.iter_mut().zip(slopes) {
+            row.iter_mut().zip(slopes).for_each(|(value, b)| *value += a * b);
+        }
+    }
+    let n = others.len() as f64;
+    let contradiction = (ABSOLUTE_SD * sum / n).max(1.0);
+    let ([[cc, cq], [_, qq]], of_q) = (precision, slope(one));
+    let log_variance = contradiction.powi(2) * (qq - 2.0 * cq * of_q + cc * of_q * of_q) / (cc * qq - cq * cq).max(1e-12);
+    let spread = SPREAD_LEAST + SPREAD_FEW / (n + 1.0);
+    let expected_g = (log_c + one.log_sums[at]).exp();
     (expected_g, READING_SD_G.hypot(expected_g * spread.hypot(log_variance.max(0.0).sqrt())))
 }
 
 /// By how many standard deviations each weight is off what the others say, with what they say, g, and its standard deviation.
-fn apart(episodes: &[TrainingEpisode]) -> Vec<(f64, f64, f64)> {
+fn apart(all: &[&Compared]) -> Vec<(f64, f64, f64)> {
     let told = |k: usize| {
-        let (expected_g, sd_g) = told_by_others(episodes, k);
-        ((episodes[k].weight_g - expected_g).abs() / sd_g, expected_g, sd_g)
+        let (expected_g, sd_g) = told_by_others(all[k], &without(all, k));
+        ((all[k].log_weight.exp() - expected_g).abs() / sd_g, expected_g, sd_g)
     };
-    (0..episodes.len()).map(told).collect()
+    (0..all.len()).map(told).collect()
 }
 
-/// Whether the weights without the one with this index agree.
-fn agree_without(episodes: &[TrainingEpisode], k: usize) -> bool {
-    let others: Vec<TrainingEpisode> = episodes.iter().enumerate().filter(|(j, _)| *j != k).map(|(_, e)| e.clone()).collect();
-    if others.len() < NEEDS { doubtful_of_few(&others).is_empty() } else { apart(&others).iter().all(|(sds, ..)| *sds < DOUBTED_SDS) }
+/// All but the one with this index.
+fn without<'a>(all: &[&'a Compared], k: usize) -> Vec<&'a Compared> {
+    all.iter().enumerate().filter(|(j, _)| *j != k).map(|(_, c)| *c).collect()
 }
 
 /// Weights that do not fit the others, worst first.
 pub fn doubtful(episodes: &[TrainingEpisode]) -> Vec<DoubtfulWeight> {
-    let mut left: Vec<TrainingEpisode> = episodes.to_vec();
+    let compared = |(place, e): (usize, &TrainingEpisode)| Compared { log_weight: e.weight_g.ln(), log_sums: log_sums(e), place };
+    let all: Vec<Compared> = if episodes.len() < NEEDS { Vec::new() } else { episodes.iter().enumerate().map(compared).collect() };
+    let of = |left: &[&Compared]| -> Vec<TrainingEpisode> { left.iter().map(|c| episodes[c.place].clone()).collect() };
+    let agree = |left: &[&Compared]| {
+        if left.len() < NEEDS { doubtful_of_few(&of(left)).is_empty() } else { apart(left).iter().all(|(sds, ..)| *sds < DOUBTED_SDS) }
+    };
+    let mut left: Vec<&Compared> = all.iter().collect();
     let mut found = Vec::new();
     while left.len() >= NEEDS {
         let told = apart(&left);
         let Some(worst) = (0..left.len()).max_by(|a, b| told[*a].0.total_cmp(&told[*b].0)).filter(|k| told[*k].0 >= DOUBTED_SDS) else {
-            break;
+            return found;
         };
         let mut accused = vec![worst];
-        if agree_without(&left, worst) {
+        if agree(&without(&left, worst)) {
             // Those that may be the wrong one in its place: they are off, too, and without them the rest agree.
-            accused.extend((0..left.len()).filter(|k| *k != worst && told[*k].0 >= DOUBTED_SDS && agree_without(&left, *k)));
+            accused.extend((0..left.len()).filter(|k| *k != worst && told[*k].0 >= DOUBTED_SDS && agree(&without(&left, *k))));
         }
         found.extend(accused.iter().map(|k| {
-            let (e, (_, expected_g, sd_g)) = (&left[*k], told[*k]);
+            let (e, (_, expected_g, sd_g)) = (&episodes[left[*k].place], told[*k]);
             DoubtfulWeight { name: e.name.clone(), weight_g: e.weight_g, expected_g, sd_g }
         }));
-        left = left.into_iter().enumerate().filter(|(k, _)| !accused.contains(k)).map(|(_, e)| e).collect();
+        left = left.iter().enumerate().filter(|(k, _)| !accused.contains(k)).map(|(_, c)| *c).collect();
     }
-    if left.len() < NEEDS {
-        found.extend(doubtful_of_few(&left));
-    }
+    found.extend(doubtful_of_few(&if all.is_empty() { episodes.to_vec() } else { of(&left) }));
     found
 }
