@@ -28,7 +28,7 @@ use nalgebra::DMatrix;
 use shared::estimator::Calibration;
 use shared::estimator::flow::{DELAY_MAX_FRAMES, FlowModel, FlowNoise, FlowTables, Lateness, WayBack};
 use shared::estimator::fused::{Explanation, FusedEstimator, FusedFrame, FusedModel, TIGHT, WIDE};
-use shared::estimator::verdict::Bounds;
+use shared::estimator::verdict::{AREA_MARGIN, Bounds};
 use shared::estimator::whiteness::Whiteness;
 use shared::limits::Limits;
 
@@ -105,8 +105,6 @@ const TIGHT_SHARE_MIN: f64 = 0.01;
 /// On rigs 100 to 107 and 200 to 207 it was -0.05 to 0.00 for straight vessels, and 0.2 to 0.8 for others.
 const TRUSTED_CORRELATION: (f64, f64) = (0.10, 0.20);
 
-/// An area this many times the episodes' largest is no stream. Chosen by hand: a controlled pour stays far below the largest flow of a curve.
-const AREA_MARGIN: f64 = 3.0;
 /// How far beyond the highest onset of the episodes a container may be tilted without any flow, degrees. Chosen by hand; docs/LEARNING.md has
 /// the false alarms.
 const DRY_MARGIN_DEG: f64 = 25.0;

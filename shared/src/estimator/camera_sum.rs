@@ -10,6 +10,13 @@ const CAMERA_SD_ML: f64 = 0.5;
 /// a degree, at 90 degrees/s it is tilted by 3 degrees in a frame, and a third more is left for others.
 pub(super) const MEASURED_MAX_ML: f64 = 200.0;
 
+/// By how much the exponent of the area may be another one beyond the largest area of the episodes, as a standard deviation. Chosen by hand: between the
+/// eleven vessels of the virtual cell it differs by as much.
+const BEYOND_SD: f64 = 0.15;
+/// By how much a stream that is not seen may have changed for each lost frame in a row, as a share of it and at most all of it. Chosen by hand: one
+/// that is brought back ends within ten frames.
+const LOST_SD: f64 = 0.1;
+
 /// The camera's own sum of the outflow.
 #[derive(Debug, Clone, Copy, Default)]
 pub(super) struct CameraSum {
@@ -25,14 +32,27 @@ pub(super) struct CameraSum {
     newest_log_sd: f64,
     /// Sum of the outflow times that: a line that slips does so for many frames, so these errors add up.
     unsure_ml: f64,
+    /// Sum of the outflow times how far its area may be off beyond those of the episodes (log): these errors add up as well.
+    beyond_ml: f64,
+    /// Number of frames in a row that were lost.
+    lost_frames: u32,
+    /// Sum of the outflow that was counted for lost frames, times how far it may be off.
+    bridged_ml: f64,
+}
+
+/// By how much the outflow of an area may be off because it is larger than the largest of the episodes (log).
+fn beyond_log_sd(area_px2: f64, taught_px2: f64) -> f64 {
+    BEYOND_SD * (area_px2 / taught_px2).ln().max(0.0)
 }
 
 impl CameraSum {
-    /// Adds a frame whose area is off by `log_sd` beyond the frames' noise; the dropout hold bridges what is lost.
-    pub fn add(&mut self, calibration: &Calibration, area_px2: Option<f32>, log_sd: f64, alpha_deg: f64) {
+    /// Adds a frame whose area is off by `log_sd` beyond the frames' noise; the dropout hold bridges what is lost. `taught_px2` is the largest area
+    /// of the episodes.
+    pub fn add(&mut self, calibration: &Calibration, area_px2: Option<f32>, log_sd: f64, alpha_deg: f64, taught_px2: f64) {
         if area_px2.is_some() {
             self.newest_log_sd = log_sd;
         }
+        self.lost_frames = if area_px2.is_some() { 0 } else { self.lost_frames.saturating_add(1) };
         let area_px2 = self.hold.step(area_px2, calibration.hold_above_px2);
         let ml = f64::from(calibration.volume_ml(area_px2, alpha_deg as f32)).min(MEASURED_MAX_ML);
         self.newest_ml = ml;
@@ -41,27 +61,31 @@ impl CameraSum {
             self.squares_ml2 += ml * ml;
             self.log_area_ml += ml * f64::from(area_px2).ln();
             self.unsure_ml += ml * self.newest_log_sd * f64::from(calibration.area_exponent);
+            self.beyond_ml += ml * beyond_log_sd(f64::from(area_px2), taught_px2);
+            self.bridged_ml += ml * (LOST_SD * f64::from(self.lost_frames)).min(1.0);
         }
     }
 
     /// Adds what was withheld of an earlier frame, ml.
-    pub fn add_late(&mut self, ml: f64) {
+    pub fn add_late(&mut self, calibration: &Calibration, ml: f64, taught_px2: f64) {
         let late_ml = ml - self.newest_ml;
-        if self.sum_ml > 0.0 && late_ml > 0.0 {
-            // The mean area so far stands for its own.
-            self.log_area_ml += late_ml * self.log_area_ml / self.sum_ml;
+        if late_ml > 0.0 {
+            let log_area = (ml / f64::from(calibration.volume_at_1_px2_ml)).ln() / f64::from(calibration.area_exponent);
+            self.sum_ml += late_ml;
             self.squares_ml2 += late_ml * late_ml;
+            self.log_area_ml += late_ml * log_area;
+            self.beyond_ml += late_ml * beyond_log_sd(log_area.exp(), taught_px2);
         }
-        self.sum_ml += late_ml.max(0.0);
     }
 
-    /// Standard deviation of the sum, ml: what the calibration leaves open at the areas of this pour, the pour's own gain, the frames' noise, and
-    /// what their confidence leaves open.
+    /// Standard deviation of the sum, ml: what the calibration leaves open at the areas of this pour and beyond those of the episodes, the pour's own
+    /// gain, the frames' noise, and what their confidence and lost frames leave open.
     pub fn sd_ml(&self, camera: &[[f64; 2]; 2], gain_sd: f64, frame_sd: f64) -> f64 {
         let (sum, log) = (self.sum_ml, self.log_area_ml);
         let [[cc, cq], [_, qq]] = camera;
         let calibration_ml2 = sum * sum * cc + 2.0 * sum * log * cq + log * log * qq;
         let noise_ml2 = frame_sd * frame_sd * self.squares_ml2 + self.unsure_ml.powi(2) + CAMERA_SD_ML * CAMERA_SD_ML;
-        (calibration_ml2.max(0.0) + (gain_sd * sum).powi(2) + noise_ml2).sqrt()
+        let unknown_ml2 = self.beyond_ml.powi(2) + self.bridged_ml.powi(2);
+        (calibration_ml2.max(0.0) + (gain_sd * sum).powi(2) + noise_ml2 + unknown_ml2).sqrt()
     }
 }

@@ -240,6 +240,7 @@ impl FusedEstimator {
             shown.follow(&flow.model, angles);
         }
         let area_px2 = frame.area_px2.filter(|a| a.is_finite() && *a >= 0.0);
+        let taught_px2 = self.bounds.taught_px2();
         let may_be = watch.may_be(&self.bounds, area_px2, following[WIDE].shown.tilt.tilt_deg);
         let volume_ml = |a: f32| f64::from(self.calibration.volume_ml(a, alpha_deg as f32));
         let area_px2 = area_px2.filter(|a| may_be && volume_ml(*a) <= MEASURED_MAX_ML);
@@ -250,7 +251,7 @@ impl FusedEstimator {
         let area_px2 = match area_px2.map(|a| watch.leap(volume_ml(a))) {
             Some(Leap::Withheld) => None,
             Some(Leap::Confirmed { withheld_ml }) => {
-                camera.add_late(withheld_ml);
+                camera.add_late(&self.calibration, withheld_ml, taught_px2);
                 area_px2
             }
             Some(Leap::None) | None => area_px2,
@@ -282,10 +283,10 @@ impl FusedEstimator {
         whiteness.add(innovations[TIGHT]);
         let odd = watch.foreseen(innovations[WIDE], area_px2.map(volume_ml));
         if let Leap::Confirmed { withheld_ml } = odd {
-            camera.add_late(withheld_ml);
+            camera.add_late(&self.calibration, withheld_ml, taught_px2);
         }
         let leaps = odd == Leap::Withheld;
-        camera.add(&self.calibration, area_px2.filter(|_| !leaps), log_sd, alpha_deg);
+        camera.add(&self.calibration, area_px2.filter(|_| !leaps), log_sd, alpha_deg, taught_px2);
         *started |= begins;
         if *started {
             for (k, (Explaining { flow, calibration, unknowns }, Following { shown, .. })) in

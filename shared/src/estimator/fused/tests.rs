@@ -307,6 +307,41 @@ fn a_surge_that_ebbs_counts() {
     assert!((said_ml - ebbs.iter().sum::<f64>()).abs() < 1.0, "{said_ml}");
     let (said_ml, sd_ml) = pour(&[0.0, 0.5, 0.6, 26.0, 3.0, 0.3]);
     assert!(said_ml < 6.0 && sd_ml > 25.0, "{said_ml} {sd_ml}");
+    // Two flashes in a row look like a surge that ebbs, until the stream is what it was before.
+    let (_, ebbs_sd_ml) = pour(&ebbs);
+    let (said_ml, sd_ml) = pour(&[0.0, 0.5, 0.6, 26.0, 7.0, 0.6]);
+    assert!(said_ml > 30.0 && sd_ml > 30.0 && ebbs_sd_ml < 10.0, "{said_ml} {sd_ml}; {ebbs_sd_ml}");
+}
+
+/// Protects the operator where a stream is not seen for a second: it is counted as if it went on, and what is said doubts as much. Some lost frames
+/// leave hardly any doubt.
+#[test]
+fn a_stream_that_is_not_seen_for_long_is_doubted() {
+    let sd_ml = |lost: usize| {
+        let mut fused = new(&model(0.0));
+        let stream = [0.0, 1.0].into_iter().chain([1.4; 30]).map(Some).chain(vec![None; lost]);
+        for outflow_ml in stream {
+            let shown = frame(outflow_ml.unwrap_or(0.0), 55.0);
+            fused.step(if outflow_ml.is_some() { shown } else { FusedFrame { area_px2: None, ..shown } });
+        }
+        fused.poured_sd_ml()
+    };
+    let (none, few, many) = (sd_ml(0), sd_ml(3), sd_ml(30));
+    assert!(few < none + 0.5 && many > 30.0, "{none} {few} {many}");
+}
+
+/// Protects the operator from a surge whose areas lie far beyond those of the episodes: how much such an area means is not known as well.
+#[test]
+fn areas_beyond_the_episodes_are_doubted() {
+    let sd_ml = |most_px2: f64| {
+        let model = model(0.0);
+        let mut fused = new(&FusedModel { bounds: Bounds { most_px2, ..model.bounds }, ..model });
+        [0.2, 0.5, 1.0, 3.0, 8.0, 18.0, 36.0, 30.0, 20.0, 9.0, 3.0].iter().for_each(|ml| _ = fused.step(frame(*ml, 55.0)));
+        (fused.poured_ml(), fused.poured_sd_ml())
+    };
+    // The largest area is 18,000 px^2, and the largest of the episodes as large, or a sixth of it.
+    let ((taught_ml, taught_sd_ml), (said_ml, beyond_sd_ml)) = (sd_ml(54_000.0), sd_ml(9_000.0));
+    assert!((taught_ml - said_ml).abs() < 1e-3 && taught_sd_ml < 8.0 && beyond_sd_ml > 20.0, "{said_ml}: {taught_sd_ml} {beyond_sd_ml}");
 }
 
 /// Protects the volume from a surge that the episodes did not show, as a vessel gives it that loses much within a degree: it counts, also where that
