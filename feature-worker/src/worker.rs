@@ -9,7 +9,7 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering::Relaxed};
 
 use crossbeam::queue::ArrayQueue;
-use iceoryx2::port::publisher::Publisher;
+use iceoryx2::port::publisher::{Publisher, PublisherCreateError};
 use shared::config::{CameraConfig, CameraSource, Config, ImageConfig};
 use shared::exit::{self, Failure, OrExit as _, failure};
 use shared::ipc::Cell;
@@ -91,11 +91,15 @@ fn measure_until_stopped(
 ) -> Result<(), Failure> {
     let cell = Cell::join(&config.cell).or_exit(exit::UNREACHABLE)?;
     cell.check_space(shared_memory_bytes(config)).or_exit(exit::UNREACHABLE)?;
-    let publisher = cell.features().or_exit(exit::UNREACHABLE)?.publisher_builder().create().map_err(|e| {
-        failure(
+    let name = &config.cell.name;
+    let publisher = cell.features().or_exit(exit::UNREACHABLE)?.publisher_builder().create().map_err(|e| match e {
+        PublisherCreateError::ExceedsMaxSupportedPublishers => {
+            failure(exit::REFUSED, format!("another feature worker of cell '{name}' is running: stop it first"))
+        }
+        e => failure(
             exit::UNREACHABLE,
-            format!("cell '{}': service 'feature': {e:?}; is another feature worker running? Stop it first", config.cell.name),
-        )
+            format!("cell '{name}': service 'feature': {e:?}; end all programs of the cell and start them again"),
+        ),
     })?;
     cell.reserve().or_exit(exit::UNREACHABLE)?;
     // The republisher comes before the camera is opened: a view that holds the camera sees it and lets go.

@@ -266,6 +266,46 @@ fn parts_share_nothing_and_merge_to_the_whole() {
     assert_eq!(code(&episodes(&["recover", cut.to_str().unwrap()])), 1, "nothing is overwritten");
 }
 
+/// Protects a directory from half a split: names that are taken, by a file, a link to nothing or another episode of the same name, are all said in one
+/// line before anything is written, a directory too.
+#[test]
+fn names_that_are_taken_are_all_said_before_anything_is_written() {
+    let dir = tempfile::tempdir().unwrap();
+    let [monday, tuesday, to] = ["monday", "tuesday", "parts"].map(|name| dir.path().join(name));
+    let files: Vec<PathBuf> = (0..3).map(|n| write(&monday, 50.0 + n as f32)).collect();
+    let name = |k: usize| files[k].file_name().unwrap();
+    let split = |from: &[&Path]| {
+        let from = from.iter().map(|p| p.to_str().unwrap());
+        let words: Vec<&str> = ["split"].into_iter().chain(from).chain(["--to", to.to_str().unwrap(), "--share", "all=1"]).collect();
+        let output = episodes(&words);
+        (code(&output), String::from_utf8_lossy(&output.stderr).into_owned())
+    };
+    // The second day has an episode of the same name as the first day.
+    let other = write(&tuesday, 70.0);
+    std::fs::rename(&other, tuesday.join(name(1))).unwrap();
+    let (ended, said) = split(&[&monday, &tuesday]);
+    assert_eq!((ended, said.lines().count()), (1, 1), "{said}");
+    assert!(said.contains(name(1).to_str().unwrap()) && !said.contains(name(0).to_str().unwrap()), "{said}");
+    assert!(!to.exists(), "nothing was made");
+
+    let all = to.join("all");
+    std::fs::create_dir_all(&all).unwrap();
+    std::fs::write(all.join(name(0)), b"a letter").unwrap();
+    std::os::unix::fs::symlink("nowhere", all.join(name(2))).unwrap();
+    let (ended, said) = split(&[&monday]);
+    assert_eq!((ended, said.lines().count()), (1, 1), "{said}");
+    assert!([0, 2].iter().all(|k| said.contains(name(*k).to_str().unwrap())) && !said.contains(name(1).to_str().unwrap()), "{said}");
+    assert_eq!(std::fs::read_dir(&all).unwrap().count(), 2, "nothing was written");
+    assert_eq!(std::fs::read(all.join(name(0))).unwrap(), b"a letter");
+
+    // Numbers are given above all that are there, and what is in their memory by mistake does not use them up.
+    std::fs::write(all.join(".last-number"), u64::MAX.to_string()).unwrap();
+    let output = episodes(&["merge", monday.to_str().unwrap(), "--to", all.to_str().unwrap()]);
+    assert_eq!(code(&output), 0, "{}", String::from_utf8_lossy(&output.stderr));
+    assert_eq!(std::fs::read(all.join(name(0))).unwrap(), b"a letter");
+    assert!(!all.join("episode-0000.mcap").exists(), "the number after the largest is none");
+}
+
 /// Protects whoever works on a disk that is full: it is called so by every command that writes, the episode is not said to be damaged, and nothing is left
 /// that looks like a result. It takes root, for a small file system of its own.
 #[test]

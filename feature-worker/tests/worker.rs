@@ -193,7 +193,7 @@ fn a_second_worker_is_refused() -> Outcome {
     driver.wake()?;
     let mut second = Program::start("run", &path, &[])?;
     let (code, said) = second.end()?;
-    assert_eq!(code, Some(3), "{said}");
+    assert_eq!(code, Some(5), "as a second controller: {said}");
     assert!(said.contains("another feature worker"), "{said}");
     while driver.feature(Duration::from_millis(300))?.is_some() {}
     driver.pour(5000, 20)?;

@@ -19,7 +19,7 @@ pub const BAD_INPUT: u8 = 2;
 pub const UNREACHABLE: u8 = 3;
 /// The pour or recording ended before it was done.
 pub const ENDED_EARLY: u8 = 4;
-/// The controller refused the request in its present state.
+/// The controller refused the request in its present state, or the cell has a program of this kind already.
 pub const REFUSED: u8 = 5;
 /// Interrupted by Ctrl-C or SIGTERM.
 pub const INTERRUPTED: u8 = 130;

@@ -121,6 +121,22 @@ fn a_prepared_directory_is_refused() {
     }
 }
 
+/// Protects scripts from three numbers for one thing: whichever program of a cell is started twice, the second ends with the same exit code.
+#[test]
+fn whoever_comes_second_ends_with_one_exit_code() {
+    let cell = CellUnderTest::start(|_| {});
+    for (name, word) in [
+        ("rt-controller", "another rt-controller"),
+        ("feature-worker", "another feature worker"),
+        ("simulator", "is already being simulated"),
+    ] {
+        let mut second = Command::new("timeout");
+        let second = second.args(["20"]).arg(program(name)).args(["run", "--config"]).arg(cell.config()).output().expect("coreutils");
+        assert_eq!(second.status.code(), Some(5), "{name}: {}", said(&second));
+        assert!(said(&second).contains(word), "{name}: {}", said(&second));
+    }
+}
+
 /// Protects people from a second controller that is started by mistake, with the same configuration or with one that shares its files: it is
 /// refused before it touches anything, and the journal of the first goes on. Another file in the journal's place is left alone.
 #[test]

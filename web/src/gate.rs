@@ -3,7 +3,8 @@
 //! Pure functions of a request's headers and its connection; they allocate, never wait, and a refusal is a [`Refusal`] with one line.
 //!
 //! 1. `Host` is an address of this connection, or a name that the user has given. A foreign name that was pointed at this machine (DNS
-//!    rebinding) is refused.
+//!    rebinding) is refused. So is a request line with a whole address of another place, whatever its `Host` says: the line comes first (RFC
+//!    9112, 3.2.2).
 //! 2. What another site's page asks is refused: by `Origin`, by `Sec-Fetch-Site`, and because JSON cannot be sent from a form. Only looking
 //!    up the address itself by a link is left.
 //! 3. GET changes nothing; POST needs an `Origin` of its own and a content type.
@@ -13,7 +14,7 @@ use std::net::{IpAddr, SocketAddr};
 use std::sync::OnceLock;
 
 use hyper::header::{self, HeaderMap};
-use hyper::{Method, StatusCode};
+use hyper::{Method, StatusCode, Uri};
 use shared::runtime_dir::own_uid;
 
 use crate::{peer, token};
@@ -80,9 +81,28 @@ fn text(headers: &HeaderMap, name: impl header::AsHeaderName) -> Option<&str> {
 }
 
 /// The host of a request without its port, if it may be asked for under it.
-fn host<'a>(headers: &'a HeaderMap, ends: &Ends, rules: &Rules) -> Result<&'a str, Refusal> {
+fn host<'a>(uri: &Uri, headers: &'a HeaderMap, ends: &Ends, rules: &Rules) -> Result<&'a str, Refusal> {
     let missing = || refused(StatusCode::BAD_REQUEST, "the request names no host");
-    let full = text(headers, header::HOST).ok_or_else(missing)?;
+    let name = known(text(headers, header::HOST).ok_or_else(missing)?, ends, rules)?;
+    if uri.scheme_str().is_some_and(|scheme| scheme != "http") {
+        return Err(misdirected());
+    }
+    if let Some(authority) = uri.authority() {
+        known(authority.as_str(), ends, rules)?;
+    }
+    Ok(name)
+}
+
+/// What is not asked here.
+fn misdirected() -> Refusal {
+    refused(
+        StatusCode::MISDIRECTED_REQUEST,
+        "this page is not known under that name: open the address that its program printed, or start it with --name",
+    )
+}
+
+/// `full`, a name or address with or without a port, without its port, if this server may be asked for under it.
+fn known<'a>(full: &'a str, ends: &Ends, rules: &Rules) -> Result<&'a str, Refusal> {
     let (name, port) = match full.rsplit_once(':').filter(|(_, port)| port.bytes().all(|b| b.is_ascii_digit())) {
         Some((name, port)) => (name, port.parse().unwrap_or(0)),
         None => (full, 80),
@@ -92,14 +112,7 @@ fn host<'a>(headers: &'a HeaderMap, ends: &Ends, rules: &Rules) -> Result<&'a st
     let known = literal.is_some_and(|ip| ip.to_canonical() == own)
         || (own.is_loopback() && name.eq_ignore_ascii_case("localhost"))
         || rules.names.iter().any(|n| n.eq_ignore_ascii_case(name));
-    if known && port == ends.own.port() {
-        Ok(name)
-    } else {
-        Err(refused(
-            StatusCode::MISDIRECTED_REQUEST,
-            "this page is not known under that name: open the address that its program printed, or start it with --name",
-        ))
-    }
+    if known && port == ends.own.port() { Ok(name) } else { Err(misdirected()) }
 }
 
 /// The origin whose pages may ask here.
@@ -107,9 +120,9 @@ pub fn own_origin(name: &str, ends: &Ends, rules: &Rules) -> String {
     format!("http://{name}:{}", rules.pages_port.unwrap_or(ends.own.port()))
 }
 
-/// Judges a request by its method and headers. Gives the host under which it was asked.
-pub fn judge<'a>(method: &Method, headers: &'a HeaderMap, ends: &Ends, rules: &Rules) -> Result<&'a str, Refusal> {
-    let name = host(headers, ends, rules)?;
+/// Judges a request by its method, the address in its first line, and its headers. Gives the host under which it was asked.
+pub fn judge<'a>(method: &Method, uri: &Uri, headers: &'a HeaderMap, ends: &Ends, rules: &Rules) -> Result<&'a str, Refusal> {
+    let name = host(uri, headers, ends, rules)?;
     let own = own_origin(name, ends, rules);
     let same =
         |origin: &str| origin.eq_ignore_ascii_case(&own) || (own.ends_with(":80") && own[..own.len() - 3].eq_ignore_ascii_case(origin));
@@ -186,7 +199,7 @@ mod tests {
     }
 
     fn status(method: &Method, all: &[(&'static str, &str)]) -> u16 {
-        judge(method, &headers(all), &ends(), &rules()).map_or_else(|e| e.status.as_u16(), |_| 200)
+        judge(method, &Uri::from_static("/"), &headers(all), &ends(), &rules()).map_or_else(|e| e.status.as_u16(), |_| 200)
     }
 
     /// Protects the robot from other sites' pages and rebound names: only this server's own names, origin and content type pass.
@@ -233,7 +246,7 @@ mod tests {
         let judge = |origin: &str| {
             let all =
                 headers(&[("host", "127.0.0.1:8643"), ("origin", origin), ("content-type", "text/plain"), ("sec-fetch-site", "same-site")]);
-            super::judge(&Method::POST, &all, &ends(), &rules).is_ok()
+            super::judge(&Method::POST, &Uri::from_static("/"), &all, &ends(), &rules).is_ok()
         };
         assert!(judge("http://127.0.0.1:8000"));
         assert!(!judge("http://127.0.0.1:8643") && !judge("http://127.0.0.1:8001") && !judge("http://localhost:8000"));

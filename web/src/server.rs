@@ -273,7 +273,7 @@ async fn respond(request: hyper::Request<Incoming>, ends: &Ends, place: &Arc<Pla
     let busy = place.busy();
     let rules = &shared.settings.rules;
     let (head, body) = request.into_parts();
-    let judged = gate::judge(&head.method, &head.headers, ends, rules);
+    let judged = gate::judge(&head.method, &head.uri, &head.headers, ends, rules);
     let host = judged.as_ref().map(|name| (*name).to_string()).ok();
     let mut answer = match judged.and_then(|_| enter(&head, ends, rules)) {
         Ok(Some(answer)) => answer,

@@ -125,6 +125,14 @@ fn what_foreign_pages_send_is_refused() {
     assert_eq!(post(&format!("{host}{origin}Content-Type: text/plain\r\n")), "415");
     assert_eq!(post(&format!("Host: evil.example:{}\r\n{origin}{kind}", page.address.port())), "421");
     assert_eq!(page.status("DELETE /a HTTP/1.1\r\nHost: HOST\r\n\r\n"), "405");
+    // An absolute address in the first line counts as the host does, whatever the host says beside it (RFC 9112, 3.2.2).
+    let absolute = |target: &str| page.status(&format!("GET {target} HTTP/1.1\r\nHost: HOST\r\n\r\n"));
+    assert_eq!(absolute("http://HOST/a"), "200", "its own");
+    let port = page.address.port();
+    for target in ["http://evil.example/a", &format!("http://evil.example:{port}/a"), "http://me@HOST/a", "https://HOST/a", "ftp://HOST/a"]
+    {
+        assert_eq!(absolute(target), "421", "{target}");
+    }
     assert_eq!(page.status("GET /a HTTP/1.0\r\n\r\n"), "400");
     assert_eq!(page.status("GET /a HTTP/1.1\r\nHost: HOST\r\nHost: HOST\r\n\r\n"), "400");
 }

@@ -4,6 +4,7 @@
 //! a regular file of its own name, and not under way: the recorder holds a lock on the file that it writes. Copies are compared with the
 //! original before they get their name, and never take the place of a file. A failure names its file, and leaves the rest as it is.
 
+use std::collections::BTreeSet;
 use std::fs::{self, File};
 use std::io::ErrorKind;
 use std::os::unix::fs::MetadataExt;
@@ -137,7 +138,7 @@ pub fn merge(files: &[PathBuf], to: &Path) -> Result<Copied, ExportError> {
 }
 
 /// Copies the episodes of `files` into directories below `to`, one for each of `shares` by name, each episode into one. Which goes where depends
-/// on the measurements and on `seed` alone. What the shares leave is left out.
+/// on the measurements and on `seed` alone. What the shares leave is left out. If a new name is taken, nothing is written, and all are said.
 pub fn split(files: &[PathBuf], to: &Path, shares: &[(String, f64)], seed: u64) -> Result<Copied, ExportError> {
     let mut copied = Copied::default();
     let mut all = distinct(files, &mut copied)?;
@@ -148,26 +149,43 @@ pub fn split(files: &[PathBuf], to: &Path, shares: &[(String, f64)], seed: u64) 
         hex(&hash.finalize())
     });
     let (n, mut share, mut all) = (all.len() as f64, 0.0, all.into_iter());
-    let mut taken = 0;
+    let mut planned = Vec::new();
     for (name, part) in shares {
         share += part;
         let until = (share * n).round() as usize;
-        let directory = to.join(name);
-        fs::create_dir_all(&directory).map_err(|e| disk_error(&directory, &e))?;
-        while taken < until
+        while planned.len() < until
             && let Some((file, episode)) = all.next()
         {
-            let new = directory.join(file.file_name().unwrap_or(file.as_os_str()));
-            copy(&file, &episode, &new)?;
-            copied.files.push((file, new));
-            taken += 1;
+            let new = to.join(name).join(file.file_name().unwrap_or(file.as_os_str()));
+            planned.push((file, episode, new));
         }
+    }
+    all_free(to, planned.iter().map(|(_, _, new)| new))?;
+    for (name, _) in shares {
+        let directory = to.join(name);
+        fs::create_dir_all(&directory).map_err(|e| disk_error(&directory, &e))?;
+    }
+    for (file, episode, new) in planned {
+        copy(&file, &episode, &new)?;
+        copied.files.push((file, new));
     }
     copied.left_out.extend(all.map(|(file, _)| {
         let why = format!("{}: the shares leave it out", file.display());
         LeftOut { file, why }
     }));
     Ok(copied)
+}
+
+/// Whether no name of `new`, files below `to`, is taken: by anything that lies there, or by another one of them. All that are taken are in the error.
+fn all_free<'a>(to: &Path, new: impl Iterator<Item = &'a PathBuf>) -> Result<(), ExportError> {
+    let mut once = BTreeSet::new();
+    let taken: BTreeSet<&Path> =
+        new.filter(|path| !once.insert(*path) || fs::symlink_metadata(path).is_ok()).map(PathBuf::as_path).collect();
+    if taken.is_empty() {
+        return Ok(());
+    }
+    let names: Vec<String> = taken.iter().map(|path| path.strip_prefix(to).unwrap_or(path).display().to_string()).collect();
+    Err(write_error(to, format!("nothing is copied, because these names are taken or come twice: {}", names.join(", "))))
 }
 
 /// Copies an episode to the new file `new`, under a name that no program takes for an episode until it is whole and on the disk.

@@ -4,7 +4,7 @@
 //! waits, and it allocates only when a reader comes or goes. A frame that cannot be published is left out, because no reader is worth
 //! the end of a pour.
 
-use iceoryx2::port::publisher::Publisher;
+use iceoryx2::port::publisher::{Publisher, PublisherCreateError};
 use iceoryx2::service::port_factory::PortFactory as _;
 use shared::config::Config;
 use shared::exit::{self, Failure, OrExit as _, failure};
@@ -27,11 +27,16 @@ impl FrameRepublisher {
     pub fn new(cell: &Cell, config: &Config) -> Result<Self, Failure> {
         let topic = cell.frames().or_exit(exit::UNREACHABLE)?;
         let bytes = config.camera.width_px as usize * config.camera.height_px as usize * PixelFormat::Bgr8.bytes_per_pixel();
-        let publisher = topic.publisher_builder().initial_max_slice_len(bytes).create().map_err(|e| {
-            failure(
+        let name = &config.cell.name;
+        let publisher = topic.publisher_builder().initial_max_slice_len(bytes).create().map_err(|e| match e {
+            PublisherCreateError::ExceedsMaxSupportedPublishers => failure(
+                exit::REFUSED,
+                format!("a camera driver of cell '{name}' is running: stop it first, or let the worker take its frames"),
+            ),
+            e => failure(
                 exit::UNREACHABLE,
-                format!("cell '{}': service 'frame': {e:?}; is a camera driver running? Stop it first", config.cell.name),
-            )
+                format!("cell '{name}': service 'frame': {e:?}; end all programs of the cell and start them again"),
+            ),
         })?;
         Ok(Self { publisher, notifier: cell.frame_notifier().or_exit(exit::UNREACHABLE)?, topic })
     }

@@ -16,7 +16,7 @@ use std::time::{Duration, Instant};
 const WAIT: Duration = Duration::from_secs(5);
 /// How many folders deep episodes are looked for. Chosen by hand: people move episodes into a folder or two.
 const DEPTH: usize = 8;
-/// The largest number that a file's name may say, so that a stray one (`episode-99999999999999.mcap`) cannot use up all numbers.
+/// The largest number that a file's name or `.last-number` may say, so that a stray one (`episode-99999999999999.mcap`) cannot use up all numbers.
 pub(crate) const LARGEST: u64 = 999_999_999;
 
 /// Takes the next number in `directory`, which is made if it is missing. From then on the number is used.
@@ -31,8 +31,11 @@ pub fn take_number(directory: &Path) -> Result<u64> {
     lock(&file)?;
     let mut text = String::new();
     (&file).take(32).read_to_string(&mut text)?;
-    let given: u64 = text.trim().parse().unwrap_or(0);
+    let given: u64 = text.trim().parse().ok().filter(|n| *n <= LARGEST).unwrap_or(0);
     let number = given.max(highest(directory, DEPTH)?) + 1;
+    if number > LARGEST {
+        return Err(Error::other("the numbers of its episodes are used up: look at .last-number and at the files' names"));
+    }
     // The number before is written over, and not taken away first: a disk that is full then leaves it.
     let text = format!("{number}\n");
     file.rewind()?;
@@ -105,6 +108,10 @@ mod tests {
         std::fs::write(dir.path().join("new/.last-number"), b"nonsense").expect("writable");
         put("episode-0030.mcap");
         assert_eq!(take(), 31);
+        std::fs::write(dir.path().join("new/.last-number"), u64::MAX.to_string()).expect("writable");
+        assert_eq!(take(), 31, "a number that cannot be is none");
+        std::fs::write(dir.path().join("new/.last-number"), LARGEST.to_string()).expect("writable");
+        assert!(take_number(&dir.path().join("new")).is_err(), "no number is given twice, and none beyond the largest");
     }
 
     /// Protects two programs that take numbers at once: each gets its own.

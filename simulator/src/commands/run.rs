@@ -5,7 +5,7 @@
 use std::path::PathBuf;
 
 use shared::config::Config;
-use shared::exit::{self, Failure, OrExit as _};
+use shared::exit::{self, Failure, OrExit as _, failure};
 
 use crate::cell::{self, SimulatorConfig};
 
@@ -25,5 +25,10 @@ pub struct Args {
 pub fn run(args: &Args) -> Result<(), Failure> {
     let config = Config::read(&args.config).or_exit(exit::BAD_INPUT)?;
     let simulated = SimulatorConfig::new(&config).map_err(|e| format!("{}: {e}", args.config.display())).or_exit(exit::BAD_INPUT)?;
+    if cell::runs(&config.cell) {
+        let name = &config.cell.name;
+        let what = format!("cell '{name}' is already being simulated; stop that simulator first, or choose another cell.name");
+        return Err(failure(exit::REFUSED, what));
+    }
     cell::simulate(config, simulated).or_exit(exit::FAILED)
 }
