@@ -56,6 +56,9 @@ const SIDE_PICTURES: u32 = 20;
 /// How fast pattern and agreement follow, a picture. Chosen by hand.
 const SIDE_FOLLOWS: f32 = 0.15;
 
+/// The pixels of a row that are looked at, each part by itself: blue, green, red.
+type RowPixels = [[u8; COLUMNS]; 3];
+
 /// What one row shows.
 #[derive(Clone, Copy, Default)]
 struct RowLook {
@@ -75,7 +78,9 @@ pub(crate) struct WholeCheck {
     /// The last row shows the glass.
     reaches_glass: bool,
     /// The pixels of the picture before.
-    before: Vec<[[u8; 3]; COLUMNS]>,
+    before: Vec<RowPixels>,
+    /// Which rows are of one colour in the picture that was looked at last.
+    plain: Vec<bool>,
     /// Which rows were of one colour in the last whole picture.
     plain_before: Vec<bool>,
     /// Pictures in a row that were not whole.
@@ -95,7 +100,8 @@ impl WholeCheck {
             columns: std::array::from_fn(|i| ((i * 2 + 1) * width / (2 * COLUMNS) + (i * 7) % 5).min(width - 1)),
             row_step,
             reaches_glass: height as f32 - 1.0 >= axes.lip_px[1] + BELOW_LIP_PX,
-            before: vec![[[0; 3]; COLUMNS]; height / row_step],
+            before: vec![[[0; COLUMNS]; 3]; height / row_step],
+            plain: vec![false; height / row_step],
             plain_before: vec![false; height / row_step],
             broken: 0,
             seen: 0,
@@ -112,6 +118,7 @@ impl WholeCheck {
         let (mut rows_new, mut rows_other) = (0usize, 0usize);
         for i in 0..self.before.len() {
             let look = look_at(pixels.row(i * self.row_step), &self.columns, &mut self.before[i]);
+            self.plain[i] = look.one_colour;
             plain_run = if look.one_colour { plain_run + 1 } else { 0 };
             new_plain_run = if look.one_colour && !self.plain_before[i] { new_plain_run + 1 } else { 0 };
             most_new_plain = most_new_plain.max(new_plain_run);
@@ -128,41 +135,40 @@ impl WholeCheck {
         let torn = !first && most_old >= part && rows_new > 0 && rows_new as f32 >= NEW_ROWS * rows_other as f32;
         let whole = !missing && !torn && !self.side.is_displaced(pixels);
         if whole || first || self.broken > SCENE_FRAMES {
-            for (i, plain) in self.plain_before.iter_mut().enumerate() {
-                *plain = is_one_colour(&self.before[i]);
-            }
+            self.plain_before.copy_from_slice(&self.plain);
         }
         self.broken = if whole { 0 } else { self.broken.saturating_add(1) };
         whole
     }
 }
 
-/// Looks at a row, and takes it over into `before`.
+/// Looks at a row, and takes it over into `before`. All of its pixels are read before one is judged, so that the processor waits for the
+/// picture's memory once and not for each pixel.
 #[inline(always)]
-fn look_at(row: &[u8], columns: &[usize; COLUMNS], before: &mut [[u8; 3]; COLUMNS]) -> RowLook {
-    let (mut equal, mut count) = (0usize, 0usize);
-    for (column, kept) in columns.iter().zip(before.iter_mut()) {
-        let Some(pixel) = row.get(3 * column..3 * column + 3) else { continue };
-        let pixel = [pixel[0], pixel[1], pixel[2]];
-        // Where the sensor is full or empty, every picture is the same.
-        let tells = pixel.iter().any(|v| *v > 2 && *v < 253);
-        count += usize::from(tells);
-        equal += usize::from(tells && pixel == *kept);
-        *kept = pixel;
+fn look_at(row: &[u8], columns: &[usize; COLUMNS], before: &mut RowPixels) -> RowLook {
+    let mut now = *before;
+    for (i, column) in columns.iter().enumerate() {
+        if let Some(pixel) = row.get(3 * column..3 * column + 3) {
+            (0..3).for_each(|k| now[k][i] = pixel[k]);
+        }
     }
+    let (mut equal, mut count) = (0u8, 0u8);
+    for i in 0..COLUMNS {
+        // Where the sensor is full or empty, every picture is the same.
+        let tells = u8::from((now[0][i].wrapping_sub(3) < 250) | (now[1][i].wrapping_sub(3) < 250) | (now[2][i].wrapping_sub(3) < 250));
+        count += tells;
+        equal += tells & u8::from((now[0][i] == before[0][i]) & (now[1][i] == before[1][i]) & (now[2][i] == before[2][i]));
+    }
+    *before = now;
+    let (equal, count) = (usize::from(equal), usize::from(count));
     RowLook { one_colour: is_one_colour(before), old: count >= COLUMNS / 4 && equal == count, new: 2 * (count - equal) > count }
 }
 
 /// Whether the pixels have one colour.
 #[inline(always)]
-fn is_one_colour(pixels: &[[u8; 3]; COLUMNS]) -> bool {
-    let (mut low, mut high) = (pixels[0], pixels[0]);
-    for pixel in pixels {
-        for k in 0..3 {
-            low[k] = low[k].min(pixel[k]);
-            high[k] = high[k].max(pixel[k]);
-        }
-    }
+fn is_one_colour(pixels: &RowPixels) -> bool {
+    let low = pixels.map(|part| part.iter().fold(255, |low: u8, v| low.min(*v)));
+    let high = pixels.map(|part| part.iter().fold(0, |high: u8, v| high.max(*v)));
     // White may be a wall in bright light, and black the night.
     let saturated = low.iter().all(|v| *v >= 253) || high.iter().all(|v| *v <= 2);
     !saturated && (0..3).all(|k| high[k] - low[k] <= ONE_COLOUR)
@@ -206,7 +212,7 @@ impl SideCheck {
 
     /// The mean steps of brightness across the side, from the outside to the inside, along rows of the picture.
     fn steps(&self, pixels: RegionPixels) -> [f32; SIDE_SAMPLES - 1] {
-        let mut sums = [0.0f32; SIDE_SAMPLES];
+        let mut sums = [0u32; SIDE_SAMPLES];
         for line in 0..SIDE_LINES {
             let [x, y] = self.axes.at(-(SIDE_FROM_PX + SIDE_STEP_PX * line as f32), self.axes.y);
             let row = if y >= 0.0 { pixels.row(y as usize) } else { &[] };
@@ -214,10 +220,10 @@ impl SideCheck {
             for (j, sum) in sums.iter_mut().enumerate() {
                 // Beyond the region the last pixel is repeated, so that its border is no step.
                 let at = 3 * (left + j as isize).clamp(0, last.max(0)) as usize;
-                *sum += row.get(at..at + 3).map_or(0.0, |p| f32::from(p[0]) + f32::from(p[1]) + f32::from(p[2]));
+                *sum += row.get(at..at + 3).map_or(0, |p| u32::from(p[0]) + u32::from(p[1]) + u32::from(p[2]));
             }
         }
-        std::array::from_fn(|j| sums[j + 1] - sums[j])
+        std::array::from_fn(|j| sums[j + 1] as f32 - sums[j] as f32)
     }
 }
 

@@ -105,6 +105,14 @@ fn wrapped(at: usize, side: usize) -> usize {
     if at >= side { at - side } else { at }
 }
 
+/// The grey level of a remembered pixel; negative where it is not known or not fresh.
+#[inline(always)]
+fn fresh_grey(pixel: &Vec4b, age: u8) -> i32 {
+    let [b, g, r, known] = pixel.0;
+    let grey = (29 * i32::from(b) + 150 * i32::from(g) + 77 * i32::from(r)) >> 8;
+    if known > 0 && age <= POINT_AGE { grey } else { -1 }
+}
+
 impl Background {
     /// For small pictures of `size`, px.
     pub(super) fn new(size: Size) -> opencv::Result<Self> {
@@ -324,11 +332,15 @@ impl Background {
             let [first_column, first_row] = [column, row].map(|square| wrapped(square * SQUARE + side - NEIGHBOURHOOD_BEFORE, side));
             for (j, near) in near.iter_mut().enumerate() {
                 let start = wrapped(first_row + j, side) * side;
+                let row = start + first_column..start + first_column + NEIGHBOURHOOD;
+                if first_column + NEIGHBOURHOOD <= side {
+                    let pixels = memory[row.clone()].iter().zip(&self.ages[row]);
+                    near.iter_mut().zip(pixels).for_each(|(near, (pixel, age))| *near = fresh_grey(pixel, *age));
+                    continue;
+                }
                 for (i, near) in near.iter_mut().enumerate() {
                     let at = start + wrapped(first_column + i, side);
-                    let [b, g, r, known] = memory[at].0;
-                    let grey = (29 * i32::from(b) + 150 * i32::from(g) + 77 * i32::from(r)) >> 8;
-                    *near = if known > 0 && self.ages[at] <= POINT_AGE { grey } else { -1 };
+                    *near = fresh_grey(&memory[at], self.ages[at]);
                 }
             }
             self.points[row * squares + column] = MotionPoint::steepest(&near, [column * SQUARE, row * SQUARE], least);

@@ -74,6 +74,7 @@ impl Flicker {
     }
 
     /// Takes note of the next picture. Returns by which factor it is brighter than the last one; 1 where what moves hides it.
+    #[inline(always)]
     pub(super) fn look(&mut self, picture: &Mat) -> opencv::Result<f32> {
         self.read(picture)?;
         let known = self.before.len() == self.now.len();
@@ -93,6 +94,7 @@ impl Flicker {
     }
 
     /// Reads the blocks' mean levels.
+    #[inline(always)]
     fn read(&mut self, picture: &Mat) -> opencv::Result<()> {
         let (width, pixels) = (self.size.width as usize, picture.data_typed::<Vec4b>()?);
         let block = width / BLOCKS;

@@ -51,9 +51,8 @@ pub(super) struct Light {
     uneven: bool,
     // Ratios whose medians are taken.
     ratios: Vec<f32>,
-    /// The places that are known; then how far each is from its row's light, as a share.
+    /// The places that are known.
     places: Vec<Place>,
-    away: Vec<f32>,
 }
 
 /// A place whose ground is known.
@@ -97,12 +96,12 @@ impl Light {
             uneven: false,
             ratios: Vec::with_capacity(places * bands),
             places: Vec::with_capacity(places * bands),
-            away: Vec::with_capacity(places * bands),
         }
     }
 
     /// Finds the light on the picture `now` by the ground that is known, in the air and not wet, and divides it out. Returns whether the
     /// ground tells the light.
+    #[inline(always)]
     pub(super) fn divide_out(
         &mut self,
         now: &mut Mat,
@@ -144,18 +143,16 @@ impl Light {
             return Ok(false);
         }
         (self.differs, self.colours) = (true, [1.0; 3]);
-        self.away.clear();
         // The places lie row by row.
-        let (mut row, mut gain) = (f32::NAN, 1.0);
+        let (mut row, mut gain, mut close) = (f32::NAN, 1.0, 0usize);
         for place in &self.places {
             if place.y != row {
                 (row, gain) = (place.y, self.gains(place.y)[0]);
             }
-            self.away.push((place.ratio / gain - 1.0).abs());
+            close += usize::from((place.ratio / gain - 1.0).abs() <= CLOSE);
         }
         self.differs = false;
-        let most = self.away.len() * 9 / 10;
-        let told = !self.away.is_empty() && *self.away.select_nth_unstable_by(most, f32::total_cmp).1 <= CLOSE;
+        let told = close > self.places.len() * 9 / 10;
         self.uneven = !told && self.spread() > UNEVEN;
         if !told {
             return Ok(false);

@@ -177,9 +177,13 @@ impl Lines {
                 found.edge_share += if value > EDGE_LEAST { weight } else { 0.0 };
             }
             let outer = self.outer(line);
-            let stay = change.bonus();
             found.evidence = found.score;
             let beats = |total: f32| best.is_none_or(|b| total > b.total);
+            // The bonus is no larger than this, so without a chance it is not reckoned.
+            if !beats(outer + found.score + EDGE_WEIGHT * found.edge_share + STAY) {
+                continue;
+            }
+            let stay = change.bonus();
             // The band along the line can only cost, so without a chance it is not read.
             if !beats(outer + found.score + EDGE_WEIGHT * found.edge_share + stay) {
                 continue;

@@ -324,7 +324,7 @@ fn a_stream_that_is_not_seen_for_long_is_doubted() {
             let shown = frame(outflow_ml.unwrap_or(0.0), 55.0);
             fused.step(if outflow_ml.is_some() { shown } else { FusedFrame { area_px2: None, ..shown } });
         }
-        fused.poured_sd_ml()
+        fused.camera_sd_ml()
     };
     let (none, few, many) = (sd_ml(0), sd_ml(3), sd_ml(30));
     assert!(few < none + 0.5 && many > 30.0, "{none} {few} {many}");
