@@ -112,9 +112,13 @@ pub fn shrunk(picture: &Mat, width_max: i32) -> Result<Mat, opencv::Error> {
 pub fn save(picture: &Mat, path: &Path) -> Result<(), String> {
     let ending = path.extension().and_then(|e| e.to_str()).unwrap_or_default();
     let mut bytes = Vector::new();
-    let made = imgcodecs::imencode(&format!(".{ending}"), picture, &mut bytes, &Vector::new());
-    if !made.unwrap_or(false) {
+    // An unknown ending is an error of OpenCV's as well, and so it is looked at before.
+    if !imgcodecs::have_image_writer(&format!("x.{ending}")).unwrap_or(false) {
         return Err(format!("'{ending}' is no ending of a picture that can be written, such as png or jpg"));
+    }
+    let made = imgcodecs::imencode(&format!(".{ending}"), picture, &mut bytes, &Vector::new()).map_err(|e| e.message)?;
+    if !made {
+        return Err(format!("the picture cannot be made a {ending}"));
     }
     // What is replaced begins as it does: a picture of the same format.
     let begins = bytes.as_slice().get(..2).unwrap_or_default();

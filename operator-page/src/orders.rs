@@ -83,7 +83,12 @@ pub fn foresee(site: &Site, goal_ml: f32, fill_ml: Option<f64>) -> Foreseen {
         return Foreseen { possible: true, sd_ml: None, flows_by_deg: None, lines };
     };
     let sd_ml = foreseen::poured_sd_ml(&weights, site.config.limits, goal_ml);
-    let flows_by_deg = fill_ml.or(container.least_fill_ml).and_then(|ml| foreseen::flows_by_deg(&weights, ml, container.holds_ml));
+    let flows_by_deg = foreseen::must_flow_by_deg(&weights, fill_ml, container.least_fill_ml, container.holds_ml);
+    if fill_ml.is_some() && flows_by_deg.is_none() && matches!(weights.estimator, Estimator::Fused { .. }) {
+        return cannot(
+            "The vessel that the weights describe does not hold or give what is said to be in it: say what really is in it.".into(),
+        );
+    }
     if let (None, Some(unseen_ml)) = (flows_by_deg, foreseen::unseen_ml(&weights)) {
         lines.push(format!(
             "It is not known by which tilt it must flow: if the camera sees no stream at all, up to {unseen_ml:.0} ml leave before that is \

@@ -102,6 +102,16 @@ pub fn flows_by_deg(weights: &Weights, fill_ml: f64, holds_ml: Option<f64>) -> O
     (onset_deg < LAST_DEG).then_some((onset_deg + BEYOND_DEG) as f32)
 }
 
+/// The tilt by which a pour must flow, degrees, from what is known of the fill: `fill_ml` where the operator told it, as [`flows_by_deg`] takes it;
+/// otherwise the configured least fill, ml, which counts as a full vessel where it is more than that: so a pour that shows no flow still ends early.
+pub fn must_flow_by_deg(weights: &Weights, fill_ml: Option<f64>, least_fill_ml: Option<f64>, holds_ml: Option<f64>) -> Option<f32> {
+    if fill_ml.is_some() {
+        return flows_by_deg(weights, fill_ml?, holds_ml);
+    }
+    let whole_ml = || Some(FlowTables::new(&explanation(weights)?.model).capacity.lost_ml(LAST_DEG));
+    flows_by_deg(weights, least_fill_ml?.min(holds_ml.or_else(whole_ml)?), holds_ml)
+}
+
 /// What may leave at most before a camera that never sees the stream is noticed, ml, if nobody has told how much is in the vessel: a full one
 /// flows early, and an emptier one than any episode's has to flow before nothing is seen for sure. `None` with the plain sum.
 pub fn unseen_ml(weights: &Weights) -> Option<f64> {
@@ -186,5 +196,20 @@ mod tests {
             assert_eq!((by(wrong), flows_by_deg(&weights(), 20.0 * wrong, None)), (None, None), "{wrong}");
         }
         assert_eq!(flows_by_deg(&Weights { estimator: Estimator::Sum, ..weights() }, 250.0, None), None);
+    }
+
+    /// Protects a pour whose configured least fill is more than the vessel holds: it must flow as out of a full one. What the operator tells counts
+    /// before that, and is not cut.
+    #[test]
+    fn a_least_fill_counts_as_a_full_vessel_at_most() {
+        let by = |fill_ml, least_ml, holds_ml| must_flow_by_deg(&weights(), fill_ml, least_ml, holds_ml);
+        let full = by(Some(520.0), None, Some(520.0));
+        assert!(full.is_some());
+        for holds_ml in [Some(520.0), None] {
+            assert!(by(None, Some(5000.0), holds_ml).is_some(), "{holds_ml:?}");
+        }
+        assert_eq!(by(None, Some(5000.0), Some(520.0)), full);
+        assert_eq!((by(Some(5000.0), Some(250.0), Some(520.0)), by(None, None, Some(520.0))), (None, None));
+        assert_eq!(by(None, Some(250.0), Some(520.0)), flows_by_deg(&weights(), 250.0, Some(520.0)));
     }
 }

@@ -78,22 +78,19 @@ pub fn end_within(stop: &Arc<AtomicBool>, within: Duration, line: &'static str) 
 /// the disk that its output goes to is full or nobody reads it any more, is no defect: it ends the process with one line and [`FAILED`].
 pub fn explain_panics(name: &'static str) {
     std::panic::set_hook(Box::new(move |panic| {
-        if let Some(why) = unprinted(panic) {
-            crate::os::tell(
-                Level::Error,
-                &format!("error: standard output cannot be written: {why}; what was to be said is not all there"),
-            );
+        if let Some((stream, why)) = unprinted(panic) {
+            crate::os::tell(Level::Error, &format!("error: {stream} cannot be written: {why}; what was to be said is not all there"));
             std::process::exit(FAILED.into());
         }
         crate::os::tell(Level::Error, &format!("{name}: this is a defect, please report it: {}", one_line(panic)));
     }));
 }
 
-/// Why standard output or standard error could not be written, if that is what the panic is about: `println!` knows no other way to say it.
-fn unprinted(panic: &PanicHookInfo) -> Option<String> {
+/// Which of the two standard streams could not be written, and why, if that is what the panic is about: `println!` knows no other way to say it.
+fn unprinted(panic: &PanicHookInfo) -> Option<(&'static str, String)> {
     let message = panic.payload().downcast_ref::<String>()?;
-    let (_, why) = message.strip_prefix("failed printing to std")?.split_once(": ")?;
-    Some(why.into())
+    let (stream, why) = message.strip_prefix("failed printing to std")?.split_once(": ")?;
+    Some((if stream == "err" { "standard error" } else { "standard output" }, why.into()))
 }
 
 /// A panic's place and message in one line: Rust puts them on lines of their own, and the message may have several.

@@ -17,12 +17,11 @@ use crate::regular_file;
 pub fn replace(path: &Path, bytes: &[u8], begins: &[u8]) -> Result<()> {
     check(path, begins)?;
     let before = path.metadata().ok();
-    let new = beside(path)?;
-    let put = || {
-        let mut file = OpenOptions::new().write(true).create_new(true).open(&new)?;
+    let (mut file, new) = new_beside(path)?;
+    let mut put = || {
         if let Some(before) = &before {
-            // Only root may give a file away; for everybody else it is their own file in place of another.
-            let _ = fchown(&file, Some(before.uid()), Some(before.gid()));
+            // Only root may give a file away; for everybody else it is their own file in place of another, in the same group if they are in it.
+            let _ = fchown(&file, Some(before.uid()), Some(before.gid())).or_else(|_| fchown(&file, None, Some(before.gid())));
             file.set_permissions(Permissions::from_mode(before.mode() & 0o777))?;
         }
         file.write_all(bytes)?;
@@ -36,9 +35,8 @@ pub fn replace(path: &Path, bytes: &[u8], begins: &[u8]) -> Result<()> {
 
 /// Puts `bytes` into the new file `path`. It is an error if something is there.
 pub fn create(path: &Path, bytes: &[u8]) -> Result<()> {
-    let new = beside(path)?;
-    let put = || {
-        let mut file = OpenOptions::new().write(true).create_new(true).open(&new)?;
+    let (mut file, new) = new_beside(path)?;
+    let mut put = || {
         file.write_all(bytes)?;
         file.sync_all()?;
         give_name(&new, path)
@@ -86,13 +84,20 @@ pub fn give_name(new: &Path, path: &Path) -> Result<()> {
     Ok(())
 }
 
-/// A new name in the directory of `path`, which no program takes for anything of its own.
-pub fn beside(path: &Path) -> Result<PathBuf> {
+/// A new file in the directory of `path`, with its path: its name is one that no program takes for anything of its own, and that was free.
+pub fn new_beside(path: &Path) -> Result<(File, PathBuf)> {
     static NEXT: AtomicU32 = AtomicU32::new(0);
     if path.file_name().is_none() {
         return Err(Error::new(ErrorKind::InvalidInput, "is no file name"));
     }
-    Ok(path.with_file_name(format!(".decant-{}-{}.new", std::process::id(), NEXT.fetch_add(1, Relaxed))))
+    loop {
+        let new = path.with_file_name(format!(".decant-{}-{}.new", std::process::id(), NEXT.fetch_add(1, Relaxed)));
+        match OpenOptions::new().write(true).create_new(true).open(&new) {
+            // That of a process with the same number, in another container or before it was killed.
+            Err(e) if e.kind() == ErrorKind::AlreadyExists => {}
+            opened => return Ok((opened?, new)),
+        }
+    }
 }
 
 /// Nobody needs what is not whole, and it does no harm if it cannot be removed.

@@ -9,6 +9,7 @@ use std::sync::atomic::Ordering;
 
 use clap::Parser;
 use shared::config::Config;
+use shared::exit;
 use simulator::ur::Series;
 use swarm::camera::{Depth, picture_name};
 use swarm::faults::{KINDS, named};
@@ -36,7 +37,7 @@ struct Args {
     /// Runs this seed and prints what happens.
     #[arg(long, conflicts_with = "seeds", required_unless_present = "seeds")]
     seed: Option<u64>,
-    /// Runs so many seeds, on all cores. Ctrl-C ends it with those under way, and prints what it has shown so far.
+    /// Runs so many seeds, on all cores. Ctrl-C ends it with those under way, and prints what it has shown so far; the exit code is then 130.
     #[arg(long, value_parser = clap::value_parser!(u64).range(1..=100_000_000))]
     seeds: Option<u64>,
     /// The first of them.
@@ -96,8 +97,9 @@ fn main() -> ExitCode {
         Err(e) => return bad_input(&one_line(&e.to_string())),
     };
     match swarm::site::config().and_then(|config| start(&args, &config)) {
-        Ok(true) => ExitCode::SUCCESS,
-        Ok(false) => VIOLATED.into(),
+        Ok(Shows::Nothing) => ExitCode::SUCCESS,
+        Ok(Shows::Violation) => VIOLATED.into(),
+        Ok(Shows::Interrupted) => exit::INTERRUPTED.into(),
         Err(line) => bad_input(&line),
     }
 }
@@ -113,8 +115,28 @@ fn bad_input(line: &str) -> ExitCode {
     BAD_INPUT.into()
 }
 
-/// Carries out the command. False if an invariant was violated.
-fn start(args: &Args, config: &Config) -> Result<bool, String> {
+/// What the seeds have shown.
+enum Shows {
+    /// No violation.
+    Nothing,
+    /// At least one.
+    Violation,
+    /// None so far, as a signal has ended it.
+    Interrupted,
+}
+
+impl Shows {
+    fn of(violated: bool, interrupted: bool) -> Self {
+        match (violated, interrupted) {
+            (true, _) => Self::Violation,
+            (false, true) => Self::Interrupted,
+            (false, false) => Self::Nothing,
+        }
+    }
+}
+
+/// Carries out the command.
+fn start(args: &Args, config: &Config) -> Result<Shows, String> {
     let choice = Choice {
         only: args.only.as_deref().map(named).transpose()?,
         vessels: usize::from(args.vessels),
@@ -157,7 +179,7 @@ fn drawn_from(args: &Args) -> String {
 }
 
 /// One seed.
-fn one(args: &Args, drawn: &Plan, config: &Config) -> Result<bool, String> {
+fn one(args: &Args, drawn: &Plan, config: &Config) -> Result<Shows, String> {
     let (mut plan, seed) = (drawn.clone(), drawn.seed);
     let only = drawn_from(args);
     let mut keep = only.clone();
@@ -170,7 +192,7 @@ fn one(args: &Args, drawn: &Plan, config: &Config) -> Result<bool, String> {
         let all = run::run(&plan, &trained, config, false);
         let Some(first) = all.violations.first() else {
             print(&format!("seed {seed}: nothing is violated"));
-            return Ok(true);
+            return Ok(Shows::Nothing);
         };
         let fewest = shrink(&plan, first.invariant, &trained, config);
         let text = fewest.iter().map(usize::to_string).collect::<Vec<_>>().join(",");
@@ -204,7 +226,7 @@ fn one(args: &Args, drawn: &Plan, config: &Config) -> Result<bool, String> {
         plot(&plan, &shown, path)?;
     }
     complain(&shown, &keep);
-    Ok(shown.violations.is_empty())
+    Ok(Shows::of(!shown.violations.is_empty(), false))
 }
 
 /// Prints the violations of a seed, and how to see them again.
@@ -217,7 +239,7 @@ fn complain(shown: &Shown, keep: &str) {
 }
 
 /// Many seeds.
-fn many(args: &Args, seeds: Seeds, config: &Config) -> Result<bool, String> {
+fn many(args: &Args, seeds: Seeds, config: &Config) -> Result<Shows, String> {
     // A file that cannot be written is known before an hour of work.
     let json = JsonOut::open(args.json.as_deref()).map_err(|e| e.what)?;
     let started = std::time::Instant::now();
@@ -239,7 +261,7 @@ fn many(args: &Args, seeds: Seeds, config: &Config) -> Result<bool, String> {
     if json.wanted() {
         json.write(&serde_json::json!({ "summary": summary, "seeds": shown })).map_err(|e| e.what)?;
     }
-    Ok(summary.violations.is_empty())
+    Ok(Shows::of(!summary.violations.is_empty(), stop.load(Ordering::Relaxed)))
 }
 
 /// Median, 99th percentile and largest.

@@ -16,6 +16,9 @@ use crate::drawing::{draw, save, to_bgr};
 use crate::source::{Frame, for_each_frame};
 use crate::vision::{Extractor, Image, Measurement};
 
+/// How its table begins: only one that begins so is replaced.
+const TABLE_BEGINS: &[u8] = b"frame,";
+
 /// Command-line arguments.
 #[derive(Debug, clap::Args)]
 #[command(
@@ -78,7 +81,8 @@ fn inspect(args: &Args, config: &Config) -> Result<(), Failure> {
     let unwritten = |path: &Path, e: &dyn std::fmt::Display| format!("{}: {e}; make room, or give another --out", path.display());
     std::fs::create_dir_all(&args.out).map_err(|e| unwritten(&args.out, &e)).or_exit(exit::FAILED)?;
     let table = args.out.join("features.csv");
-    // The table is kept until it is whole: some hundred bytes a frame.
+    // What may not be replaced is known before the work. The table is kept until it is whole: some hundred bytes a frame.
+    whole_file::check(&table, TABLE_BEGINS).map_err(|e| unwritten(&table, &e)).or_exit(exit::BAD_INPUT)?;
     let mut csv = csv::Writer::from_writer(Vec::new());
     csv.write_record(["frame", "t_s", "area_px2", "confidence", "doubt", "x0", "y0", "x1", "y1", "x2", "y2"]).or_exit(exit::FAILED)?;
     let mut code = exit::BAD_INPUT;
@@ -102,7 +106,7 @@ fn inspect(args: &Args, config: &Config) -> Result<(), Failure> {
     });
     let contents = contents.map_err(|what| failure(code, what))?;
     let rows = csv.into_inner().map_err(|e| e.to_string()).or_exit(exit::FAILED)?;
-    whole_file::replace(&table, &rows, b"frame,").map_err(|e| unwritten(&table, &e)).or_exit(exit::FAILED)?;
+    whole_file::replace(&table, &rows, TABLE_BEGINS).map_err(|e| unwritten(&table, &e)).or_exit(exit::FAILED)?;
     bar.finish_and_clear();
     let Totals { flowing, doubtful, sum_px2 } = totals;
     let frames = contents.frames;

@@ -5,7 +5,7 @@
 //! original before they get their name, and never take the place of a file. A failure names its file, and leaves the rest as it is.
 
 use std::collections::BTreeSet;
-use std::fs::{self, File};
+use std::fs;
 use std::io::ErrorKind;
 use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
@@ -191,8 +191,13 @@ fn all_free<'a>(to: &Path, new: impl Iterator<Item = &'a PathBuf>) -> Result<(),
 /// Copies an episode to the new file `new`, under a name that no program takes for an episode until it is whole and on the disk.
 fn copy(file: &Path, episode: &Episode, new: &Path) -> Result<(), ExportError> {
     let fail = |e: &dyn std::fmt::Display| write_error(new, e);
-    let part = whole_file::beside(new).map_err(|e| fail(&e))?;
-    let made = fs::copy(file, &part).and_then(|_| File::open(&part)?.sync_all()).map_err(|e| disk_error(new, &e)).and_then(|()| {
+    let (mut made, part) = whole_file::new_beside(new).map_err(|e| disk_error(new, &e))?;
+    let copied = regular_file::open(file).and_then(|(mut from, meta)| {
+        made.set_permissions(meta.permissions())?;
+        std::io::copy(&mut from, &mut made)?;
+        made.sync_all()
+    });
+    let result = copied.map_err(|e| disk_error(new, &e)).and_then(|()| {
         let after = Episode { name: episode.name.clone(), ..Episode::read(&part)? };
         // They are compared as text, because NaN is not equal to itself.
         if format!("{after:?}") != format!("{episode:?}") {
@@ -200,7 +205,7 @@ fn copy(file: &Path, episode: &Episode, new: &Path) -> Result<(), ExportError> {
         }
         whole_file::give_name(&part, new).map_err(|e| disk_error(new, &e))
     });
-    // This is only ever our own file.
+    // It is our own file: we have made it.
     let _ = fs::remove_file(&part);
-    made
+    result
 }

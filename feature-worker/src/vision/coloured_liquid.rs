@@ -434,7 +434,7 @@ impl Liquid for ColouredLiquid {
         if !matches!(sighting, Sighting::Dry { .. }) {
             self.beside.forget_kept();
         }
-        // While the ground is not known nothing else is looked for, so only pictures that it is learned from are dry: as many as make it known.
+        // While the ground is not known, only pictures that it is learned from are dry, and those where a stream was just held (`Presence::is_gone` tells).
         let unknown = (self.dry_frames < DRY_FRAMES && self.learn_after > 0).then_some(Doubt::EdgeNotFound);
         self.follow_ground(sighting)?;
         // A liquid in the ground's colours is not seen.

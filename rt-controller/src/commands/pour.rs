@@ -59,11 +59,11 @@ impl Foreseen {
     /// Foresees the pour with the weights that the running controller has.
     fn of(config: &Config, args: &Args) -> Result<Self, Failure> {
         let container = config.container;
-        let fill_ml = args.fill.or(container.least_fill_ml);
         let status = Client::connect_or_end(&config.cell).or_exit(exit::UNREACHABLE)?.status().or_exit(exit::UNREACHABLE)?;
         let weights = Weights::read(&config.controller.weights).ok().filter(|w| w.identity() == status.weights);
         let sd_ml = weights.as_ref().and_then(|w| foreseen::poured_sd_ml(w, config.limits, args.goal_ml));
-        let flows_by_deg = weights.as_ref().zip(fill_ml).and_then(|(w, fill_ml)| foreseen::flows_by_deg(w, fill_ml, container.holds_ml));
+        let flows_by_deg =
+            weights.as_ref().and_then(|w| foreseen::must_flow_by_deg(w, args.fill, container.least_fill_ml, container.holds_ml));
         if args.fill.is_some() && flows_by_deg.is_none() {
             let what = "--fill: the controller's weights do not say by which tilt this fill flows: give what really is in the vessel, or train \
                         with --estimate fused";

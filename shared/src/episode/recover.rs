@@ -23,8 +23,8 @@ const REASON: &str = "its end is missing: it was recovered from a file that was 
 pub fn recover(old: &Path, new: &Path) -> Result<Episode, ChangeError> {
     let original = Episode::read(old)?;
     let fail = |what: String| ChangeError::Write { file: new.display().to_string(), what };
-    let temporary = whole_file::beside(new).map_err(|e| fail(e.to_string()))?;
-    let result = copy(old, &temporary, None, |writer, end| {
+    let (file, temporary) = whole_file::new_beside(new).map_err(|e| fail(error_words(&e)))?;
+    let result = copy(old, (file, &temporary), None, |writer, end| {
         if !matches!(end, NextRecord::Cut) {
             return Err(ChangeError::Whole { file: old.display().to_string() });
         }
@@ -45,7 +45,7 @@ pub fn recover(old: &Path, new: &Path) -> Result<Episode, ChangeError> {
         whole_file::give_name(&temporary, new).map_err(|e| fail(error_words(&e)))?;
         Ok(Episode { name: new.display().to_string(), ..after })
     });
-    // This is only ever our own file.
+    // It is our own file: we have made it.
     let _ = std::fs::remove_file(&temporary);
     result
 }

@@ -4,7 +4,7 @@
 //! Everything is copied into a new file beside the old one, which is read back, compared and put on the disk before it takes the old one's
 //! name in one step. Whenever the machine stops, there is one whole file, the old or the new one.
 
-use std::fs::{File, OpenOptions};
+use std::fs::File;
 use std::io::BufWriter;
 use std::path::Path;
 
@@ -73,9 +73,9 @@ pub(super) fn set_metadata(
     // If the path is a link, the file that it leads to is replaced, and not the link.
     let path = path.canonicalize().map_err(|e| EpisodeError::Read { file: shown.clone(), what: e.to_string() })?;
     let before = Episode::read(&path)?;
-    let temporary = whole_file::beside(&path).map_err(|e| ChangeError::Write { file: shown, what: e.to_string() })?;
+    let (file, temporary) = whole_file::new_beside(&path).map_err(|e| ChangeError::Write { file: shown, what: error_words(&e) })?;
     let fail = |what: String| ChangeError::Write { file: temporary.display().to_string(), what };
-    let result = copy(&path, &temporary, Some(name), |writer, end| {
+    let result = copy(&path, (file, &temporary), Some(name), |writer, end| {
         if !matches!(end, NextRecord::End) {
             return Err(ChangeError::Cut { file: path.display().to_string() });
         }
@@ -96,7 +96,7 @@ pub(super) fn set_metadata(
     match result {
         Ok(()) => Ok(before),
         Err(e) => {
-            // This is only ever our own file. After the rename it is no longer there.
+            // It is our own file: we have made it. After the rename it is no longer there.
             let _ = std::fs::remove_file(&temporary);
             Err(e)
         }
@@ -107,14 +107,13 @@ pub(super) fn set_metadata(
 /// more; it is told how the records ended. Waits until everything is on the disk.
 pub(super) fn copy(
     old: &Path,
-    new: &Path,
+    (file, new): (File, &Path),
     without: Option<&str>,
     last: impl FnOnce(&mut Writer<BufWriter<File>>, NextRecord<()>) -> Result<(), ChangeError>,
 ) -> Result<(), ChangeError> {
     let shown = new.display().to_string();
     let fail = |what: String| ChangeError::Write { file: shown.clone(), what };
     let disk = |e: &std::io::Error| fail(error_words(e));
-    let file = OpenOptions::new().write(true).create_new(true).open(new).map_err(|e| disk(&e))?;
     let permissions = std::fs::metadata(old).map_err(|e| disk(&e))?.permissions();
     file.set_permissions(permissions).map_err(|e| disk(&e))?;
     let mut records = Records::open(old)?;

@@ -5,6 +5,7 @@
 use std::path::{Path, PathBuf};
 
 use serde_json::Value;
+use shared::disk_space::error_words;
 use shared::exit::{self, Failure, OrExit as _};
 use shared::whole_file;
 
@@ -62,5 +63,5 @@ impl JsonOut {
 }
 
 fn words(path: &Path, e: &std::io::Error) -> String {
-    format!("{}: cannot be written: {e}; make room, or give another file", path.display())
+    format!("{}: cannot be written: {}; or give another file", path.display(), error_words(e))
 }
