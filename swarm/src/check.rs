@@ -124,6 +124,11 @@ pub struct Checks {
     features_before: u64,
 }
 
+/// Whether the camera then shows what is not there, or not what is there, without a doubt.
+fn lies(what: &What) -> bool {
+    matches!(what, What::Eye(EyeFault::FalseZero(_) | EyeFault::Stuck(_) | EyeFault::Spike(_)))
+}
+
 /// Whether a stop meets a program of ours. One that is paused is stopped already, and to stop it for good is what the controller asks for; and a
 /// robot that stands behind an open safeguard cannot stop protectively.
 fn stops_ours(what: &What, machine: &Machine) -> bool {
@@ -399,6 +404,12 @@ impl Checks {
         }
     }
 
+    /// Whether a run that ends so is ended by a fault that stood before it began, and by none since.
+    pub fn stood_before(&self, reason: EndReason) -> bool {
+        let names = |since: bool| self.faults.iter().any(|f| (f.at_s >= self.run_since_s) == since && reasons(&f.what).contains(&reason));
+        names(false) && !names(true)
+    }
+
     /// Looks at what a pour says of itself.
     fn says(&mut self, outcome: &Outcome, true_ml: f64, at_s: f64) {
         if u64::from(outcome.bridged_frames) > self.lost {
@@ -411,9 +422,12 @@ impl Checks {
         if !(goal_ml > 0.0 && goal_ml <= most_ml) {
             self.violated("goal-range", at_s, format!("a pour of {goal_ml} ml was begun"));
         }
-        // A pour that ends for another reason has lost its camera or its robot before it was upright, and says only what was seen.
-        let to_the_end = [EndReason::Done, EndReason::Aborted, EndReason::ContainerEmpty, EndReason::StreamLost, EndReason::GoalExceeded];
-        if !to_the_end.contains(&outcome.reason) {
+        // A pour that ends for another reason has lost its camera or its robot before it was upright, and says only what was seen. One that is not
+        // done may end while the camera lies.
+        let seen_to_the_end = [EndReason::Aborted, EndReason::ContainerEmpty, EndReason::GoalExceeded].contains(&outcome.reason);
+        let since_s = at_s - f64::from(outcome.seconds);
+        let lied = || self.faults.iter().any(|f| f.at_s >= since_s && lies(&f.what));
+        if outcome.reason != EndReason::Done && (!seen_to_the_end || lied()) {
             return;
         }
         // What is not a number is near to nothing.

@@ -83,7 +83,7 @@ impl OpenFault {
 #[derive(Debug, Default)]
 pub struct Costs {
     open: Vec<OpenFault>,
-    /// The newest run ended as one without a fault does.
+    /// The newest run ended as one without a fault does, or by one that stood before it.
     went_on: bool,
     /// What is known.
     pub known: Vec<Cost>,
@@ -100,7 +100,7 @@ impl Costs {
         }
     }
 
-    /// A run has ended, as one without a fault does or not.
+    /// A run has ended, as one without a fault does, or by a fault that stood before it; or not.
     pub fn ended(&mut self, ordinary: bool) {
         self.went_on = ordinary;
     }

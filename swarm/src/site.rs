@@ -309,7 +309,7 @@ impl Site {
         self.say(|| format!("ended: {:?}, {:.1} ml believed", outcome.reason, outcome.poured_ml));
         let true_ml = self.container.poured_ml() - self.run_poured_ml;
         self.checks.ended(outcome, true_ml, at_s);
-        self.costs.ended(is_ordinary(outcome.reason));
+        self.costs.ended(is_ordinary(outcome.reason) || self.checks.stood_before(outcome.reason));
         let since_s = at_s - f64::from(outcome.seconds) - 6.0;
         let pictures = self.plan.picture.map(|fault| picture_name(fault.kind));
         let faults = self.fault_times.iter().filter(|(began_s, _)| *began_s >= since_s).map(|(_, name)| *name);

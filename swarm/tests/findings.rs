@@ -264,3 +264,16 @@ fn either_of_two_weights_may_be_wrong() {
         assert!(off_ml < 3.0 * f64::from(pour.sd_ml), "{pour:?}");
     }
 }
+
+/// Protects the check (seed 10027787): a speed limit that stood before the pour ended it, and three lost frames are not held against what it poured.
+#[test]
+fn what_stood_before_ends_a_pour() {
+    let happens = [
+        (2_963, What::Pour(36.701187), None),
+        (2_972, What::Robot(Fault::JointSpeedLimit(38.59108149092471)), Some("joint-speed-limit")),
+        (5_709, What::Eye(EyeFault::Loss(3)), Some("eye-loss")),
+        (9_973, What::Robot(Fault::Clear), Some("joint-speed-limit")),
+    ];
+    let shown = shown(10_027_787, Series::Cb3, 2, (434.67740993211345, (189_353, 354_987)), &happens);
+    assert_eq!(shown.poured[0].reason, EndReason::NotFollowed);
+}
