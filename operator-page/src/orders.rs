@@ -79,15 +79,19 @@ pub fn foresee(site: &Site, goal_ml: f32, fill_ml: Option<f64>) -> Foreseen {
     }
     let weights = Weights::read(&site.config.controller.weights).ok().filter(|w| w.identity() == status.weights);
     let Some(weights) = weights else {
+        if fill_ml.is_some() {
+            return cannot(
+                "The weight file is not the one that the controller has taken, so what is in the vessel cannot be used: leave it out."
+                    .into(),
+            );
+        }
         lines.push("The weight file is not the one that the controller has taken, so it is not said how far off this will be.".into());
         return Foreseen { possible: true, sd_ml: None, flows_by_deg: None, lines };
     };
     let sd_ml = foreseen::poured_sd_ml(&weights, site.config.limits, goal_ml);
     let flows_by_deg = foreseen::must_flow_by_deg(&weights, fill_ml, container.least_fill_ml, container.holds_ml);
-    if fill_ml.is_some() && flows_by_deg.is_none() && matches!(weights.estimator, Estimator::Fused { .. }) {
-        return cannot(
-            "The vessel that the weights describe does not hold or give what is said to be in it: say what really is in it.".into(),
-        );
+    if fill_ml.is_some() && flows_by_deg.is_none() {
+        return cannot("The weights do not say by which tilt this fill flows: say what really is in the vessel, or leave it out.".into());
     }
     if let (None, Some(unseen_ml)) = (flows_by_deg, foreseen::unseen_ml(&weights)) {
         lines.push(format!(

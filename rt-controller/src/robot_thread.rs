@@ -159,7 +159,7 @@ impl Progress {
         self.next_ns = now_ns + RECONNECT.as_nanos() as u64;
         self.before.ran |= matches!(e, LinkError::ProgramRunning { .. } | LinkError::MayNotMove { program_there: true, .. });
         self.before.unpowered = match e {
-            LinkError::ProgramRunning { .. } => false,
+            LinkError::ProgramRunning { .. } | LinkError::MayNotMove { program_there: true, .. } => false,
             LinkError::MayNotMove { unpowered: true, .. } => true,
             _ => self.before.unpowered,
         };

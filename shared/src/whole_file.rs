@@ -17,7 +17,7 @@ use crate::regular_file;
 pub fn replace(path: &Path, bytes: &[u8], begins: &[u8]) -> Result<()> {
     check(path, begins)?;
     let before = path.metadata().ok();
-    let (mut file, new) = new_beside(path)?;
+    let (mut file, new) = new_beside(path).map_err(|e| in_words(&e))?;
     let mut put = || {
         if let Some(before) = &before {
             // Only root may give a file away; for everybody else it is their own file in place of another, in the same group if they are in it.
@@ -35,7 +35,7 @@ pub fn replace(path: &Path, bytes: &[u8], begins: &[u8]) -> Result<()> {
 
 /// Puts `bytes` into the new file `path`. It is an error if something is there.
 pub fn create(path: &Path, bytes: &[u8]) -> Result<()> {
-    let (mut file, new) = new_beside(path)?;
+    let (mut file, new) = new_beside(path).map_err(|e| in_words(&e))?;
     let mut put = || {
         file.write_all(bytes)?;
         file.sync_all()?;
@@ -47,6 +47,11 @@ pub fn create(path: &Path, bytes: &[u8]) -> Result<()> {
 /// The error `e` in words, after what it left at `new` is taken away.
 fn gone(new: &Path, e: &Error) -> Error {
     remove(new);
+    in_words(e)
+}
+
+/// The error `e`, in which a full disk is called so.
+fn in_words(e: &Error) -> Error {
     Error::new(e.kind(), error_words(e))
 }
 

@@ -13,6 +13,7 @@ use simulator::ur::{Fault, Machine, RobotMode, RuntimeState, SafetyMode};
 
 use crate::commanded::{Commanded, SLACK, SLACK_DEG};
 use crate::noticing::{is_ordinary, lasts, leaves_tilted, must_end, reasons, takes_robot};
+use crate::weight_set::RATE_HZ;
 use crate::what::{EyeFault, What};
 
 /// A container nearer to 0 than this is upright, degrees (`robot.start_tolerance_deg` of config/sim.toml, and half a degree of lag).
@@ -124,9 +125,9 @@ pub struct Checks {
     features_before: u64,
 }
 
-/// Whether the camera then shows what is not there, or not what is there, without a doubt.
-fn lies(what: &What) -> bool {
-    matches!(what, What::Eye(EyeFault::FalseZero(_) | EyeFault::Stuck(_) | EyeFault::Spike(_)))
+/// For how long a camera then does not show what leaves, without a doubt, s.
+fn hides_s(what: &What) -> f64 {
+    if let What::Eye(EyeFault::FalseZero(frames) | EyeFault::Stuck(frames)) = what { f64::from(*frames) / RATE_HZ } else { 0.0 }
 }
 
 /// Whether a stop meets a program of ours. One that is paused is stopped already, and to stop it for good is what the controller asks for; and a
@@ -426,7 +427,7 @@ impl Checks {
         // done may end while the camera lies.
         let seen_to_the_end = [EndReason::Aborted, EndReason::ContainerEmpty, EndReason::GoalExceeded].contains(&outcome.reason);
         let since_s = at_s - f64::from(outcome.seconds);
-        let lied = || self.faults.iter().any(|f| f.at_s >= since_s && lies(&f.what));
+        let lied = || self.faults.iter().any(|f| hides_s(&f.what) > 0.0 && f.at_s + hides_s(&f.what) >= since_s);
         if outcome.reason != EndReason::Done && (!seen_to_the_end || lied()) {
             return;
         }

@@ -261,6 +261,9 @@ fn many(args: &Args, seeds: Seeds, config: &Config) -> Result<Shows, String> {
     if json.wanted() {
         json.write(&serde_json::json!({ "summary": summary, "seeds": shown })).map_err(|e| e.what)?;
     }
+    if let Some(line) = summary.lost {
+        return Err(line);
+    }
     Ok(Shows::of(!summary.violations.is_empty(), stop.load(Ordering::Relaxed)))
 }
 

@@ -93,6 +93,8 @@ pub struct Summary {
     pub processor_s: f64,
     /// Processor time that went into drawing pictures and measuring them, without the training, s.
     pub camera_s: [f64; 2],
+    /// The training that failed, so that the seeds after it were left out.
+    pub lost: Option<String>,
     /// Number of violations by invariant, and the seeds of the first ones.
     pub violations: BTreeMap<String, (usize, Vec<u64>)>,
     /// How often pours and recordings ended for each reason.
@@ -171,7 +173,7 @@ pub fn run_until(
     }
     let mut shown: Vec<Shown> = Vec::new();
     let (mut spent_s, mut camera_s) = (0.0, [0.0; 2]);
-    let mut told = Instant::now();
+    let (mut told, mut lost) = (Instant::now(), None);
     for from in (seeds.from..last).step_by(AT_ONCE as usize) {
         if let Some(why) = over() {
             say(&format!("{why}: {} of {} seeds were run", shown.len(), seeds.count));
@@ -183,7 +185,13 @@ pub fn run_until(
             told = Instant::now();
         }
         let plans: Vec<Plan> = (from..last.min(from.saturating_add(AT_ONCE))).map(|seed| Plan::draw_with(seed, seeds.choice)).collect();
-        let trained = train_for(&plans, config, &say)?;
+        let trained = match train_for(&plans, config, &say) {
+            Err(line) if !shown.is_empty() => {
+                lost = Some(line);
+                break;
+            }
+            trained => trained?,
+        };
         let (before_s, [drawn_s, measured_s]) = (processor_s(), camera::spent_s());
         let bar = bar.clone();
         let new: Vec<Shown> = plans.par_iter().progress_with(bar).map(|plan| run::run(plan, &trained, config, false)).collect();
@@ -195,7 +203,7 @@ pub fn run_until(
         }
         shown.extend(new);
     }
-    let summary = Summary { processor_s: spent_s, camera_s, ..sum_up(seeds.from, &shown) };
+    let summary = Summary { processor_s: spent_s, camera_s, lost, ..sum_up(seeds.from, &shown) };
     Ok((shown, summary))
 }
 
@@ -253,6 +261,7 @@ fn sum_up(from: u64, shown: &[Shown]) -> Summary {
         virtual_s: shown.iter().map(|one| one.virtual_s).sum(),
         processor_s: 0.0,
         camera_s: [0.0; 2],
+        lost: None,
         violations,
         reasons,
         done: done.into_iter().filter_map(done_row).collect(),

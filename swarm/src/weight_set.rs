@@ -17,7 +17,7 @@ use crate::camera::Depth;
 use crate::records::Row;
 
 /// Frames a second of the camera.
-const RATE_HZ: f64 = 30.0;
+pub const RATE_HZ: f64 = 30.0;
 
 /// What was learned for a robot and a vessel, and from what.
 #[derive(Debug, Clone)]

@@ -14,7 +14,9 @@ pub const EXPONENT_NEEDS: usize = 4;
 /// The exponent that is expected of a camera, as the prototype's cameras had it.
 pub const EXPONENT_EXPECTED: f64 = 1.15;
 /// Standard deviation of the exponent's prior here. From the prototype; no other measurement is recorded.
-const EXPONENT_SD: f64 = 0.4;
+pub const EXPONENT_SD: f64 = 0.4;
+/// Exponents that are tried, in hundredths: those of the prototype's cameras, and more. Chosen by hand.
+pub const EXPONENTS: std::ops::RangeInclusive<u32> = 80..=170;
 
 /// Standard deviation of a weight as the camera's sum of areas predicts it, g: a constant part and a share of the weight. From the
 /// prototype; no other measurement is recorded.
@@ -56,7 +58,7 @@ pub fn calibrate(episodes: &[TrainingEpisode], exponent: Option<f64>) -> Calibra
         if episodes.len() < EXPONENT_NEEDS {
             return 1.0;
         }
-        let grid = (0..=90).map(|k| 0.8 + 0.01 * f64::from(k));
+        let grid = EXPONENTS.map(|hundredths| f64::from(hundredths) / 100.0);
         grid.min_by(|a, b| factor(episodes, *a).1.total_cmp(&factor(episodes, *b).1)).unwrap_or(1.0)
     });
     Calibration {

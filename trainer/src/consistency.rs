@@ -10,13 +10,11 @@
 
 use serde::Serialize;
 
-use crate::calibration;
+use crate::calibration::{self, EXPONENT_SD, EXPONENTS};
 use crate::data::TrainingEpisode;
 
 /// So many episodes calibrate each other, the exponent included. Chosen by hand; no measurement is recorded.
 const NEEDS: usize = 4;
-/// Exponents of the area at which two weights may agree: those of the prototype's cameras, and more. Chosen by hand.
-const EXPONENTS: std::ops::RangeInclusive<u32> = 80..=170;
 /// By how much two weights may be apart at the best of them (log), as a standard deviation. Chosen by hand: none of 80 right sets of simulated rigs was accused.
 const PAIR_SPREAD: f64 = 0.08;
 /// Standard deviations at which a weight is doubted. Chosen by hand; no measurement is recorded.
@@ -27,10 +25,6 @@ const READING_SD_G: f64 = 0.7;
 const SPREAD_LEAST: f64 = 0.03;
 /// The same of few episodes, times their number. Chosen by hand; no measurement is recorded.
 const SPREAD_FEW: f64 = 0.1;
-/// Exponents of the area, in hundredths, among which a calibration of four and more is sought: those of the trainer's own calibration.
-const GRID: std::ops::RangeInclusive<u32> = 80..=170;
-/// Standard deviation of the exponent's prior: that of the trainer's own calibration.
-const EXPONENT_SD: f64 = 0.4;
 /// The standard deviation of a normal error for a mean deviation of 1.
 const ABSOLUTE_SD: f64 = 1.2533;
 
@@ -87,9 +81,9 @@ fn doubtful_of_few(episodes: &[TrainingEpisode]) -> Vec<DoubtfulWeight> {
     accused.collect()
 }
 
-/// Logarithm of an episode's sum of area^q, for each q of [`GRID`].
+/// Logarithm of an episode's sum of area^q, for each q of [`EXPONENTS`].
 fn log_sums(episode: &TrainingEpisode) -> Vec<f64> {
-    GRID.map(|exponent| calibration::area_sum(episode, f64::from(exponent) / 100.0).max(1e-9).ln()).collect()
+    EXPONENTS.map(|exponent| calibration::area_sum(episode, f64::from(exponent) / 100.0).max(1e-9).ln()).collect()
 }
 
 /// The value below and above which half of the weight lies; the pairs are of value and weight.
@@ -112,24 +106,24 @@ struct Compared {
 }
 
 impl Compared {
-    /// By how much its weight may be off, as read and as a rule (log), where log c is this and q has this place in [`GRID`].
+    /// By how much its weight may be off, as read and as a rule (log), where log c is this and q has this place in [`EXPONENTS`].
     fn log_sd(&self, log_c: f64, at: usize) -> f64 {
         SPREAD_LEAST.hypot(READING_SD_G / (log_c + self.log_sums[at]).exp().max(READING_SD_G))
     }
 }
 
 /// The calibration of these episodes that leaves the least sum of deviations (log), so that a wrong weight among them hardly moves it: log c, the
-/// place of q in [`GRID`], and the sum.
+/// place of q in [`EXPONENTS`], and the sum.
 fn robust(others: &[&Compared]) -> (f64, usize, f64) {
     let at = |at: usize| {
         let off = |o: &Compared| o.log_weight - o.log_sums[at];
         let first = weighted_median(others.iter().map(|o| (off(o), 1.0)).collect());
         let log_c = weighted_median(others.iter().map(|o| (off(o), 1.0 / o.log_sd(first, at))).collect());
         let sum: f64 = others.iter().map(|o| (off(o) - log_c).abs() / o.log_sd(log_c, at)).sum();
-        let exponent = f64::from(*GRID.start() + at as u32) / 100.0;
+        let exponent = f64::from(*EXPONENTS.start() + at as u32) / 100.0;
         (log_c, at, sum + 0.5 * ((exponent - calibration::EXPONENT_EXPECTED) / EXPONENT_SD).powi(2))
     };
-    (1..GRID.count()).map(at).fold(at(0), |best, next| if next.2 < best.2 { next } else { best })
+    (1..EXPONENTS.count()).map(at).fold(at(0), |best, next| if next.2 < best.2 { next } else { best })
 }
 
 /// What the other episodes say about the weight of `one`, g, with its standard deviation. Others that contradict each other raise it.

@@ -202,8 +202,8 @@ fn start_program(
 fn may_not_move((options, before): (&LinkOptions, &Before), state: &RobotState, reason: EndReason) -> LinkError {
     let unpowered = hands::without_power(state);
     // A paused program counts: it goes on when somebody resumes it, and may then be stopped before the next look at the robot.
-    let program_there = state.runtime_state == RUNTIME_PLAYING
-        || (matches!(state.runtime_state, RUNTIME_PAUSING | RUNTIME_PAUSED) && !unpowered && !hands::never_started(before, state));
+    let runs_none = matches!(state.runtime_state, RUNTIME_STOPPING | RUNTIME_STOPPED) || unpowered || hands::never_started(before, state);
+    let program_there = !runs_none;
     LinkError::MayNotMove { address: options.address, reason, unpowered, program_there }
 }
 

@@ -148,13 +148,13 @@ fn left_behind(state: &RobotState) -> Option<Handover> {
 /// Whether a robot that says "paused" was only never started since its boot, so that there is no program which somebody has paused.
 ///
 /// A booted robot says "paused" until its first program (Universal_Robots_Client_Library, issue 123). A program that is paused stands at a line,
-/// or has left its traces in our registers. An arm that had no power meanwhile has no program.
+/// or has left its traces in our registers. Of an arm that had no power meanwhile the registers are old; a line is of a program since.
 pub fn never_started(before: &Before, state: &RobotState) -> bool {
     let paused = matches!(state.runtime_state, RUNTIME_PAUSING | RUNTIME_PAUSED);
     let untouched = state.program_run == 0 && state.program_state == ProgramState::Unknown && state.sequence_echo == 0;
     let nothing_stands =
         state.control_line.is_none_or(|line| line == 0) && state.status_bits.is_none_or(|bits| bits & PROGRAM_RUNNING_BIT == 0);
-    paused && (before.unpowered || (untouched && nothing_stands))
+    paused && nothing_stands && (before.unpowered || untouched)
 }
 
 /// Whether the arm has no power or its brakes on, so that no program can run on it, also none that is paused.

@@ -48,7 +48,11 @@ fn a_robot_that_was_never_started_gets_the_program() {
     // An arm that had no power in between has no paused program, whatever old registers say.
     let used = Robot { registers: (ProgramState::Following, 7, 9), ..booted };
     assert!(Server::new(69, used.clone()).meet().0.is_err());
-    assert!(Server::new(70, used).meet_after(&Before { unpowered: true, asked: true, ..Before::default() }).0.is_ok());
+    let unpowered = Before { unpowered: true, asked: true, ..Before::default() };
+    assert!(Server::new(70, used.clone()).meet_after(&unpowered).0.is_ok());
+    // One that stands at a line came after that.
+    let error = Server::new(77, Robot { control_line: 5, ..used }).meet_after(&unpowered).0.err();
+    assert!(matches!(error, Some(LinkError::ProgramPaused { .. })), "{error:?}");
 }
 
 /// Protects people who have the robot: after a lost connection it is taken again only if our program there says that it has ended by itself

@@ -67,14 +67,14 @@ impl CameraSum {
     }
 
     /// Adds what was withheld of an earlier frame, ml.
-    pub fn add_late(&mut self, calibration: &Calibration, ml: f64, taught_px2: f64) {
+    pub fn add_late(&mut self, calibration: &Calibration, ml: f64, alpha_deg: f64, taught_px2: f64) {
         let late_ml = ml - self.newest_ml;
         if late_ml > 0.0 {
-            let log_area = (ml / f64::from(calibration.volume_at_1_px2_ml)).ln() / f64::from(calibration.area_exponent);
+            let area_px2 = calibration.area_px2(ml, alpha_deg as f32);
             self.sum_ml += late_ml;
             self.squares_ml2 += late_ml * late_ml;
-            self.log_area_ml += late_ml * log_area;
-            self.beyond_ml += late_ml * beyond_log_sd(log_area.exp(), taught_px2);
+            self.log_area_ml += late_ml * area_px2.ln();
+            self.beyond_ml += late_ml * beyond_log_sd(area_px2, taught_px2);
         }
     }
 

@@ -251,7 +251,7 @@ impl FusedEstimator {
         let area_px2 = match area_px2.map(|a| watch.leap(volume_ml(a))) {
             Some(Leap::Withheld) => None,
             Some(Leap::Confirmed { withheld_ml }) => {
-                camera.add_late(&self.calibration, withheld_ml, taught_px2);
+                camera.add_late(&self.calibration, withheld_ml, alpha_deg, taught_px2);
                 area_px2
             }
             Some(Leap::None) | None => area_px2,
@@ -283,7 +283,7 @@ impl FusedEstimator {
         whiteness.add(innovations[TIGHT]);
         let odd = watch.foreseen(innovations[WIDE], area_px2.map(volume_ml));
         if let Leap::Confirmed { withheld_ml } = odd {
-            camera.add_late(&self.calibration, withheld_ml, taught_px2);
+            camera.add_late(&self.calibration, withheld_ml, alpha_deg, taught_px2);
         }
         let leaps = odd == Leap::Withheld;
         camera.add(&self.calibration, area_px2.filter(|_| !leaps), log_sd, alpha_deg, taught_px2);

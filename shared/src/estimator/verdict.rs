@@ -239,8 +239,8 @@ pub(super) struct Watch {
     /// Outflow in the newest two frames, and what of the newest one was withheld, ml.
     recent_ml: [f64; 2],
     withheld_ml: Option<f64>,
-    /// What a surge has let out that ebbed from its first frame on, which the next frame has to show as well, and the stream before it, ml.
-    ebbing_ml: Option<(f64, f64)>,
+    /// What the two frames of a surge have let out so far, which the next frame has to show as well, and the stream before it, ml.
+    surge_ml: Option<(f64, f64)>,
     /// Outflow of the newest frame if it was a lone leap over what was foreseen, and that of the frame before it, ml.
     odd_ml: Option<(f64, f64)>,
     /// What was withheld, and neither confirmed nor refuted by the frame after it, ml.
@@ -308,7 +308,7 @@ impl Watch {
     /// What was withheld and never confirmed nor refuted, the newest frame's included, ml; at least 0. The estimate has to doubt as much.
     pub fn unconfirmed_ml(&self) -> f64 {
         let pending = |of: Option<(f64, f64)>| of.map_or(0.0, |(ml, _)| ml);
-        self.unconfirmed_ml + self.withheld_ml.unwrap_or(0.0) + pending(self.odd_ml) + pending(self.ebbing_ml)
+        self.unconfirmed_ml + self.withheld_ml.unwrap_or(0.0) + pending(self.odd_ml) + pending(self.surge_ml)
     }
 
     /// What was withheld as a lone leap, after which the stream was what it was before, ml; at least 0. A straight vessel gives no such thing, so there
@@ -365,22 +365,22 @@ impl Watch {
     /// Takes a lost frame: what was withheld in the frame before it is forgotten, as a later one says nothing about it, and stays in doubt.
     pub fn lost(&mut self) {
         self.unconfirmed_ml = self.unconfirmed_ml();
-        (self.withheld_ml, self.odd_ml, self.ebbing_ml) = (None, None, None);
+        (self.withheld_ml, self.odd_ml, self.surge_ml) = (None, None, None);
     }
 
     /// Takes the outflow of a frame that may be a measurement, ml, and says whether it counts yet. Of a surge that ebbs, each frame leaps over what
-    /// was before; so a leap after a leap confirms it. If it is over in the frame after that, it may have been two flashes, and stays in doubt.
+    /// was before; so a leap after a leap confirms it. If it is over in the frame after that, it may have been two flashes, and
+    /// stays in doubt.
     pub fn leap(&mut self, measured_ml: f64) -> Leap {
         let [newest_ml, before_ml] = self.recent_ml;
-        if let Some((ebbing_ml, stream_ml)) = self.ebbing_ml.take() {
+        if let Some((surge_ml, stream_ml)) = self.surge_ml.take() {
             let (factor, more_ml) = AS_BEFORE;
-            self.unconfirmed_ml += if measured_ml <= factor * stream_ml + more_ml { ebbing_ml } else { 0.0 };
+            self.unconfirmed_ml += if measured_ml <= factor * stream_ml + more_ml { surge_ml } else { 0.0 };
         }
         let leaps = measured_ml > LEAP_FACTOR * newest_ml.max(before_ml) + LEAP_ML;
         if let Some(withheld_ml) = self.withheld_ml.take() {
-            let stays = measured_ml >= LEAP_STAYS * withheld_ml;
-            if leaps || stays {
-                self.ebbing_ml = (!stays).then_some((withheld_ml + measured_ml, newest_ml));
+            if leaps || measured_ml >= LEAP_STAYS * withheld_ml {
+                self.surge_ml = Some((withheld_ml + measured_ml, newest_ml));
                 self.recent_ml = [measured_ml, withheld_ml];
                 self.leapt = true;
                 return Leap::Confirmed { withheld_ml };
