@@ -240,9 +240,8 @@ impl FusedEstimator {
             shown.follow(&flow.model, angles);
         }
         let area_px2 = frame.area_px2.filter(|a| a.is_finite() && *a >= 0.0);
-        let taught_px2 = self.bounds.taught_px2();
         let may_be = watch.may_be(&self.bounds, area_px2, following[WIDE].shown.tilt.tilt_deg);
-        let volume_ml = |a: f32| f64::from(self.calibration.volume_ml(a, alpha_deg as f32));
+        let (taught_px2, volume_ml) = (self.bounds.taught_px2(), |a: f32| f64::from(self.calibration.volume_ml(a, alpha_deg as f32)));
         let area_px2 = area_px2.filter(|a| may_be && volume_ml(*a) <= MEASURED_MAX_ML);
         if area_px2.is_none() {
             watch.lost();
