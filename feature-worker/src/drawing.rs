@@ -113,7 +113,7 @@ pub fn save(picture: &Mat, path: &Path) -> Result<(), String> {
     let ending = path.extension().and_then(|e| e.to_str()).unwrap_or_default();
     let mut bytes = Vector::new();
     // An unknown ending is an error of OpenCV's as well, and so it is looked at before.
-    if !imgcodecs::have_image_writer(&format!("x.{ending}")).unwrap_or(false) {
+    if !imgcodecs::have_image_writer(format!("x.{ending}")).unwrap_or(false) {
         return Err(format!("'{ending}' is no ending of a picture that can be written, such as png or jpg"));
     }
     let made = imgcodecs::imencode(&format!(".{ending}"), picture, &mut bytes, &Vector::new()).map_err(|e| e.message)?;
