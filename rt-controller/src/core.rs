@@ -453,7 +453,8 @@ impl Core {
             reason,
             goal_ml: run.goal_ml,
             poured_ml: if run.goal_ml.is_some() { self.decision.poured_ml } else { f32::NAN },
-            poured_sd_ml: if run.goal_ml.is_some() { self.decision.poured_sd_ml } else { 0.0 },
+            // What would still leave on the way upright is not seen of a run that ends before.
+            poured_sd_ml: if run.goal_ml.is_some() { self.decision.poured_sd_ml.hypot(self.decision.stop_ml) } else { 0.0 },
             seconds: now_ns.saturating_sub(run.started_at_ns) as f32 / 1e9,
             frames: run.frames,
             bridged_frames: (now.bridged_frames - before.bridged_frames) as u32,
