@@ -140,7 +140,8 @@ def watchdog(series, upper):
         until("servoJ refused", lambda: not c.servoJ(START_Q, 0, 0, 1 / 30, 0.1, 300))
         assert c.reuploadScript()
         until("running again", lambda: r.getRuntimeState() == 2)
-        assert c.servoJ(START_Q, 0, 0, 1 / 30, 0.1, 300)
+        # The client may still wait for the program's first sign.
+        until("servoJ taken again", lambda: c.servoJ(START_Q, 0, 0, 1 / 30, 0.1, 300))
         c.disconnect()
 
 
