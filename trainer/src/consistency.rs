@@ -1,9 +1,9 @@
 //! Finds weights that do not fit the others: a typo, or a cup that was not tared.
 //!
 //! Pure functions of the offline trainer, for any thread; they allocate and do not fail. Each weight is compared with what the camera's
-//! areas say when they are calibrated on all other episodes, by the least sum of deviations, which one or two wrong ones hardly move. The worst one is taken out, and the rest are compared again, so that one wrong
-//! weight does not accuse the others. Where either of two may be the wrong one, as the rest agree without the one or without the other, both are
-//! accused.
+//! areas say when they are calibrated on all other episodes, by the least sum of deviations, which one or two wrong ones hardly move. The
+//! worst one is taken out, and the rest are compared again, so that one wrong weight does not accuse the others. Where either of two may
+//! be the wrong one, as the rest agree without the one or without the other, both are accused.
 //!
 //! Two or three weights leave the exponent of the area open, so each pair of them is compared at the exponent that suits it best. Of three, the
 //! two that are least apart accuse the third. Two that contradict each other accuse both, as nobody knows which one is wrong.
