@@ -36,7 +36,10 @@ pub(super) struct CameraSum {
     beyond_ml: f64,
     /// Number of frames in a row that were lost.
     lost_frames: u32,
-    /// Sum of the outflow that was counted for lost frames, times how far it may be off.
+    /// Number of frames in a row that repeat the outflow of the frame before them, because they were lost or lone zeros.
+    bridged_frames: u32,
+    /// Sum of how far the outflow that was counted for them may be off, ml: by a share of it for each lost frame in a row, and by what the frame
+    /// after them differs from the one before.
     bridged_ml: f64,
 }
 
@@ -55,6 +58,12 @@ impl CameraSum {
         self.lost_frames = if area_px2.is_some() { 0 } else { self.lost_frames.saturating_add(1) };
         let area_px2 = self.hold.step(area_px2, calibration.hold_above_px2);
         let ml = f64::from(calibration.volume_ml(area_px2, alpha_deg as f32)).min(MEASURED_MAX_ML);
+        if self.lost_frames > 0 || self.hold.holds_a_zero {
+            self.bridged_frames = self.bridged_frames.saturating_add(1);
+        } else {
+            self.bridged_ml += f64::from(self.bridged_frames) * (ml - self.newest_ml).abs();
+            self.bridged_frames = 0;
+        }
         self.newest_ml = ml;
         if ml > 0.0 {
             self.sum_ml += ml;
@@ -68,6 +77,7 @@ impl CameraSum {
 
     /// Adds what was withheld of an earlier frame, ml.
     pub fn add_late(&mut self, calibration: &Calibration, ml: f64, alpha_deg: f64, taught_px2: f64) {
+        self.bridged_frames = self.bridged_frames.saturating_sub(1);
         let late_ml = ml - self.newest_ml;
         if late_ml > 0.0 {
             let area_px2 = calibration.area_px2(ml, alpha_deg as f32);

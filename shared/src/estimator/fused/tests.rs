@@ -332,6 +332,24 @@ fn a_stream_that_is_not_seen_for_long_is_doubted() {
     assert!(few < none + 0.5 && many > 30.0, "{none} {few} {many}");
 }
 
+/// Protects the operator where the peak of a surge reads 0, or is lost: it is counted as the frame before it, which the stream after it does not
+/// show to be right. In a stream that stays as it was, the same hardly leaves a doubt.
+#[test]
+fn a_zero_at_the_peak_of_a_surge_is_doubted() {
+    let sds_ml = |stream: &[f64]| {
+        [Some(0.0), None].map(|peak_ml| {
+            let mut fused = new(&model(0.0));
+            for (k, ml) in stream.iter().enumerate() {
+                let shown = frame(if k == 4 { peak_ml.unwrap_or(0.0) } else { *ml }, 55.0);
+                fused.step(if k == 4 && peak_ml.is_none() { FusedFrame { area_px2: None, ..shown } } else { shown });
+            }
+            fused.camera_sd_ml()
+        })
+    };
+    let (surge_ml, steady_ml) = (sds_ml(&[0.0, 1.2, 2.2, 3.5, 16.0, 6.8, 3.5, 2.0]), sds_ml(&[0.0, 1.2, 2.0, 2.1, 2.1, 2.1, 2.1, 2.0]));
+    assert!(surge_ml.iter().all(|sd| *sd > 3.0) && steady_ml.iter().all(|sd| *sd < 1.2), "{surge_ml:?} {steady_ml:?}");
+}
+
 /// Protects the operator from a surge whose areas lie far beyond those of the episodes: how much such an area means is not known as well.
 #[test]
 fn areas_beyond_the_episodes_are_doubted() {
