@@ -201,7 +201,7 @@ impl FusedEstimator {
         };
         let Pour { watch, .. } = &self.pour;
         let unseen_ml2 = watch.unexplained_ml().powi(2) + watch.unshown_ml().powi(2);
-        let withheld_ml = watch.unconfirmed_ml() + if share > STRAIGHT_SHARE { 0.0 } else { watch.lone_ml() };
+        let withheld_ml = watch.unconfirmed_ml() + watch.lone_ml(share > STRAIGHT_SHARE);
         (estimate_ml2.max(0.0) + unseen_ml2 + withheld_ml * withheld_ml).sqrt()
     }
 

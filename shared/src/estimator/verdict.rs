@@ -2,8 +2,8 @@
 //!
 //! It is pure and runs in the controller's loop: its size is fixed, and it does not allocate, panic or fail. A lone odd frame moves nothing; a
 //! row of them is impossible, and then nothing that the camera says is to be believed. What was withheld as odd waits for the very next frame, which
-//! confirms it or not. If it does not, it is forgotten, and the estimate doubts as much (`Watch::unconfirmed_ml`, `Watch::lone_ml`), but for a lone
-//! leap of a stream that goes on as before out of a straight vessel. A large stream that is gone within a frame, or begins so large, or whose area
+//! confirms it or not. If it does not, it is forgotten, and the estimate doubts as much (`Watch::unconfirmed_ml`, `Watch::lone_ml`); of a lone leap of
+//! a stream that goes on as before out of a straight vessel, as much as its balance misses. A large stream that is gone within a frame, or begins so large, or whose area
 //! stays the same to the bit, moves nothing either, as nobody knows whether it was seen; what may have left meanwhile is in doubt
 //! (`Watch::unshown_ml`).
 //!
@@ -30,7 +30,7 @@
 
 use serde::{Deserialize, Serialize};
 
-use super::filter::{EXPLANATIONS, Innovation, Tilt, UnknownsCovariance};
+use super::filter::{EXPLANATIONS, Innovation, TIGHT, Tilt, UnknownsCovariance};
 use super::flow::FlowTables;
 use super::vessel::{KNOTS, TablePlace, knot_place};
 
@@ -143,6 +143,8 @@ struct Balance {
     ahead_ml: f64,
     /// The largest tilt so far, degrees.
     largest_deg: f64,
+    /// By how much the tilt has let out more than was seen, in the newest frame at the largest tilt, ml.
+    off_ml: f64,
     /// By how much the balance was off beyond its doubt in the newest frames at the largest tilt, ml: above 0 behind, below 0 ahead.
     unexplained_ml: [f64; BEHIND_FRAMES as usize],
 }
@@ -187,9 +189,10 @@ impl Balance {
         self.ahead_ml = if ahead { self.ahead_ml + self.newest_ml } else { 0.0 };
         self.largest_deg = self.largest_deg.max(tilt.tilt_deg);
         if tilt.tilt_deg >= self.largest_deg - AT_LARGEST_DEG {
-            let off_ml = self.excess_ml - seen_excess_ml;
+            self.off_ml = self.excess_ml - seen_excess_ml;
             self.unexplained_ml.rotate_left(1);
-            self.unexplained_ml[BEHIND_FRAMES as usize - 1] = off_ml.signum() * (off_ml.abs() - EXPLAINED_DOUBTS * doubt_ml).max(0.0);
+            self.unexplained_ml[BEHIND_FRAMES as usize - 1] =
+                self.off_ml.signum() * (self.off_ml.abs() - EXPLAINED_DOUBTS * doubt_ml).max(0.0);
         }
         self.behind_frames >= BEHIND_FRAMES || self.ahead_ml > FILM_ML
     }
@@ -311,10 +314,12 @@ impl Watch {
         self.unconfirmed_ml + self.withheld_ml.unwrap_or(0.0) + pending(self.odd_ml) + pending(self.surge_ml)
     }
 
-    /// What was withheld as a lone leap, after which the stream was what it was before, ml; at least 0. A straight vessel gives no such thing, so there
-    /// it was none; a steep one whose liquid swings lets 40 ml out in one frame and goes on as before, so there nobody knows.
-    pub fn lone_ml(&self) -> f64 {
-        self.lone_ml
+    /// What was withheld as a lone leap, after which the stream was what it was before, ml; at least 0. A steep vessel whose liquid swings lets 40 ml out
+    /// in one frame and goes on as before, so there nobody knows. A straight one gives such a surge near 90 degrees only, when it is almost empty; there
+    /// the leap may have been real as far as the tilt has let out more than was seen.
+    pub fn lone_ml(&self, straight: bool) -> f64 {
+        let unseen_ml = self.balances[TIGHT].as_ref().map_or(0.0, |balance| balance.off_ml.max(0.0));
+        if straight { self.lone_ml.min(unseen_ml) } else { self.lone_ml }
     }
 
     /// What may have left unseen while a large stream was gone within a frame, always had the same area, or was not there yet, ml; at least 0. The

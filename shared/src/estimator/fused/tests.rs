@@ -5,7 +5,7 @@
 use super::*;
 use crate::estimator::filter::UNKNOWNS;
 use crate::estimator::flow::{CommandHistory, Lateness};
-use crate::estimator::vessel::Vessel;
+use crate::estimator::vessel::{TablePlace, Vessel};
 use proptest::prelude::*;
 
 /// The way back of the shipped configurations.
@@ -348,6 +348,26 @@ fn a_zero_at_the_peak_of_a_surge_is_doubted() {
     };
     let (surge_ml, steady_ml) = (sds_ml(&[0.0, 1.2, 2.2, 3.5, 16.0, 6.8, 3.5, 2.0]), sds_ml(&[0.0, 1.2, 2.0, 2.1, 2.1, 2.1, 2.1, 2.0]));
     assert!(surge_ml.iter().all(|sd| *sd > 3.0) && steady_ml.iter().all(|sd| *sd < 1.2), "{surge_ml:?} {steady_ml:?}");
+}
+
+/// Protects the operator of a straight vessel that is almost empty: near 90 degrees it lets a surge out within one frame, which looks like a flash.
+/// It is in doubt where the tilt has let out more than was seen, and only there.
+#[test]
+fn a_lone_surge_of_a_straight_vessel_is_doubted_as_its_balance_says() {
+    let sd_ml = |flash_ml: f64, surge_ml: f64| {
+        let (mut fused, mut vessel) = (new(&with_wide_bounds(1.0)), ModelVessel::new(50.0));
+        let surge_deg = surge_ml / vessel.flow.capacity.lost_ml_per_deg_at(TablePlace::of(54.0));
+        for k in 0..130 {
+            let alpha_deg = f64::from(k.min(85)) * 0.6 + f64::from((k - 85).max(0)) * 0.12;
+            let outflow_ml = vessel.frame(alpha_deg) + if k == 105 { flash_ml + surge_ml } else { 0.0 };
+            // The surge takes what a faster tilt lets out, and the stream goes on as it would have without both.
+            fused.step(frame(outflow_ml, alpha_deg + surge_deg * f64::from((k - 104).clamp(0, 2)) / 2.0));
+        }
+        assert!(fused.share() > STRAIGHT_SHARE && fused.pour.watch.lone_ml(false) >= flash_ml.max(surge_ml));
+        fused.poured_sd_ml()
+    };
+    let (none_ml, flash_ml, surge_ml) = (sd_ml(0.0, 0.0), sd_ml(14.0, 0.0), sd_ml(0.0, 3.6));
+    assert!(none_ml < 0.5 && flash_ml < 3.0 && surge_ml > 3.0, "{none_ml} {flash_ml} {surge_ml}");
 }
 
 /// Protects the operator from a surge whose areas lie far beyond those of the episodes: how much such an area means is not known as well.
