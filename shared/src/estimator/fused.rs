@@ -188,14 +188,17 @@ impl FusedEstimator {
     /// Standard deviation of [`FusedEstimator::poured_ml`], ml: that of the two estimates' mixture, whose difference counts too, and what the
     /// tilt has let out but was not seen, or the reverse, what may have left behind areas that are doubtful in themselves, and what was withheld and
     /// never confirmed. Where the straight vessel is held near the sum, the part of its correction that is refused counts as well: one of the two is wrong.
+    /// Where the two estimates are further apart than their deviations explain, the straight vessel's deviation grows by that ratio (Birge's), and what
+    /// it corrects of an outflow that left while the container lay counts as well.
     pub fn poured_sd_ml(&self) -> f64 {
         let (share, camera_ml) = (self.share(), self.camera_sd_ml());
         let estimate_ml2 = if share > 0.0 {
             let filter_ml2 = DEVIATION_SHARE * DEVIATION_SHARE * self.pour.following[TIGHT].filter.poured_variance_ml2();
-            let correction_ml = self.correction_ml();
-            let apart_ml2 = share * (1.0 - share) * correction_ml.powi(2);
-            let refused_ml = self.pour.following[TIGHT].filter.poured_ml() - self.pour.camera.sum_ml - correction_ml;
-            share * (filter_ml2 + refused_ml.powi(2)) + (1.0 - share) * camera_ml * camera_ml + apart_ml2
+            let (correction_ml, apart_ml) = (self.correction_ml(), self.pour.following[TIGHT].filter.poured_ml() - self.pour.camera.sum_ml);
+            let filter_ml2 = filter_ml2 * (apart_ml.powi(2) / (camera_ml * camera_ml + filter_ml2)).max(1.0);
+            let (refused_ml, lying_ml) = (apart_ml - correction_ml, self.pour.camera.lying_share() * correction_ml);
+            let mixed_ml2 = share * (1.0 - share) * correction_ml.powi(2);
+            share * (filter_ml2 + refused_ml.powi(2) + lying_ml.powi(2)) + (1.0 - share) * camera_ml * camera_ml + mixed_ml2
         } else {
             camera_ml * camera_ml
         };

@@ -62,11 +62,17 @@ fn frame(outflow_ml: f64, command_deg: f64) -> FusedFrame {
 
 /// A pour whose tilt rises, holds, and returns; the camera's gain is off by the factor `gain`. Gives the true volume and the camera's sum,
 /// ml, and the estimator.
-fn pour_into(mut fused: FusedEstimator, gain: f64) -> (f64, f64, FusedEstimator) {
-    let mut vessel = ModelVessel::new(50.0);
+fn pour_into(fused: FusedEstimator, gain: f64) -> (f64, f64, FusedEstimator) {
+    pour_from(fused, gain, 50.0)
+}
+
+/// The same, out of a container that begins to pour at `onset_deg`.
+fn pour_from(mut fused: FusedEstimator, gain: f64, onset_deg: f64) -> (f64, f64, FusedEstimator) {
+    let mut vessel = ModelVessel::new(onset_deg);
     let (mut alpha, mut summed): (f64, f64) = (0.0, 0.0);
     for k in 0..400 {
-        alpha = if k < 220 { (alpha + if vessel.poured_ml < 1.0 { 0.6 } else { 0.12 }).min(72.0) } else { (alpha - 2.0).max(0.0) };
+        alpha =
+            if k < 220 { (alpha + if vessel.poured_ml < 1.0 { 0.6 } else { 0.12 }).min(onset_deg + 22.0) } else { (alpha - 2.0).max(0.0) };
         let y = gain * vessel.frame(alpha);
         summed += y;
         fused.step(frame(y, alpha));
@@ -368,6 +374,20 @@ fn a_lone_surge_of_a_straight_vessel_is_doubted_as_its_balance_says() {
     };
     let (none_ml, flash_ml, surge_ml) = (sd_ml(0.0, 0.0), sd_ml(14.0, 0.0), sd_ml(0.0, 3.6));
     assert!(none_ml < 0.5 && flash_ml < 3.0 && surge_ml > 3.0, "{none_ml} {flash_ml} {surge_ml}");
+}
+
+/// Protects the operator where tilt and camera tell two things of a straight vessel: the further they are apart, the more what is said doubts. All of
+/// the correction is in doubt where the container lies while it pours, as its flow model says nothing there.
+#[test]
+fn estimates_that_are_apart_are_doubted() {
+    let sure = FusedModel { camera: [[0.01 * 0.01, 0.0], [0.0, 0.0]], gain_sd: 0.005, ..model(1.0) };
+    let pour = |gain: f64, onset_deg: f64| {
+        let fused = pour_from(new(&sure), gain, onset_deg).2;
+        (fused.poured_sd_ml(), fused.correction_ml().abs())
+    };
+    let ((agree_sd_ml, _), (apart_sd_ml, apart_ml), (lies_sd_ml, lies_ml)) = (pour(1.0, 50.0), pour(1.05, 50.0), pour(1.05, 76.0));
+    assert!(apart_sd_ml > 1.2 * agree_sd_ml && apart_sd_ml < apart_ml, "{agree_sd_ml} {apart_sd_ml} {apart_ml}");
+    assert!(lies_sd_ml > lies_ml, "{lies_sd_ml} {lies_ml}");
 }
 
 /// Protects the operator from a surge whose areas lie far beyond those of the episodes: how much such an area means is not known as well.
