@@ -108,7 +108,7 @@ pub fn run(args: &Args) -> Result<(), Failure> {
 /// Says where the page is. A log that others read, as systemd's, gets the token's file instead of the token.
 fn announce(address: SocketAddr, word: &str, (file, made): (&Path, bool), loopback: bool) {
     let say = |level: Level, text: &str| eprintln!("{}", level.marked(&format!("operator-page: {text}")));
-    let logged = std::env::var_os("JOURNAL_STREAM").is_some();
+    let logged = shared::level::to_journal();
     for ip in addresses::to_open(address.ip()) {
         let address = SocketAddr::new(ip, address.port());
         let with_token = if logged {

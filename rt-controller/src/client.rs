@@ -4,7 +4,7 @@
 //! is one line that says what to do.
 
 use std::path::PathBuf;
-use std::sync::atomic::Ordering;
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
 use iceoryx2::port::client::Client as Port;
@@ -139,10 +139,8 @@ pub enum FollowError {
 }
 
 impl Client {
-    /// Shows the progress of `episode` on standard error until it has ended. Ctrl-C aborts it.
-    pub fn follow(&self, episode: u64) -> Result<Outcome, FollowError> {
-        // If this fails, Ctrl-C ends this command and the pour goes on.
-        let interrupted = os::stop_at_signals().unwrap_or_default();
+    /// Shows the progress of `episode` on standard error until it has ended. Once `interrupted` is true, by Ctrl-C, it is aborted.
+    pub fn follow(&self, episode: u64, interrupted: &AtomicBool) -> Result<Outcome, FollowError> {
         let bar = indicatif::ProgressBar::new(1000);
         bar.set_style(ProgressStyle::with_template("{bar:30} {msg}").unwrap_or_else(|_| ProgressStyle::default_bar()));
         let (mut aborted, mut unknown) = (false, 0);

@@ -218,9 +218,10 @@ impl Core {
         match input.robot.hindrance {
             Some(reason) => {
                 self.phase = Phase::NoRobot;
-                let mut run = self.run.take()?;
-                run.ending.end_instead_of_done(reason);
-                Some(self.outcome(&run, run.ending.reason(), input.now_ns))
+                let run = self.run.take()?;
+                // Liquid may go on leaving a container that is not upright, whatever the pour was ending for.
+                let keeps = run.ending.reason() != EndReason::Done && input.robot.alpha_deg.abs() <= self.settings.upright_deg;
+                Some(self.outcome(&run, if keeps { run.ending.reason() } else { reason }, input.now_ns))
             }
             None if self.phase == Phase::NoRobot && input.robot.alpha_deg.abs() <= self.settings.upright_deg => {
                 self.limiter.rest_at(input.robot.alpha_deg.clamp(self.settings.limits.alpha_min_deg, self.settings.limits.alpha_max_deg));
@@ -369,10 +370,9 @@ impl Core {
         let seconds = |since_ns: u64| input.now_ns.saturating_sub(since_ns) as f64 / 1e9;
         let follows = run.following.follows(&input.robot, &self.commanded);
         let age_ns = input.now_ns.saturating_sub(self.usable_at_ns);
-        // What leaves on the way upright is a part of the pour too.
-        if self.phase == Phase::Returning && run.goal_ml.is_some() && age_ns > self.settings.stale_ns {
-            run.ending.end_instead_of_done(EndReason::StaleFeature);
-        }
+        let wrong_rate = self.frame_rate.wrong_hz().map(|_| EndReason::FrameRate);
+        let blind =
+            if age_ns > self.settings.stale_ns { Some(EndReason::StaleFeature) } else { wrong_rate }.filter(|_| run.goal_ml.is_some());
         match self.phase {
             Phase::Pouring | Phase::Recording => {
                 self.counters.stale_features += u64::from(age_ns > STALE_TICK_PERIODS * self.settings.period_ns);
@@ -384,14 +384,14 @@ impl Core {
                     poured_ml: self.decision.poured_ml,
                     follows,
                 };
-                let wrong_rate = self.frame_rate.wrong_hz().map(|_| EndReason::FrameRate);
-                if let Some(reason) = run.ending.due(&moment, &self.settings).or(wrong_rate) {
+                let due = run.ending.due(&moment, &self.settings);
+                if let Some(reason) = wrong_rate.filter(|_| due.is_none_or(|due| due == EndReason::Done)).or(due) {
                     self.give_up(reason);
                 }
                 None
             }
             Phase::Returning => {
-                run.ending.returns(follows);
+                run.ending.returns(follows, blind);
                 if ending::is_commanded_upright(self.limiter.alpha_deg()) {
                     self.phase = Phase::Settling;
                     run.settling_since_ns = input.now_ns;
@@ -400,7 +400,9 @@ impl Core {
                 None
             }
             Phase::Settling => {
-                run.ending.returns(follows);
+                // The last drops are waited for; what leaves before the joint itself is upright is more than that.
+                let is_upright = input.robot.alpha_deg.abs() <= self.settings.upright_deg;
+                run.ending.returns(follows, blind.filter(|_| !is_upright));
                 let settling_s = seconds(run.settling_since_ns);
                 let reason = run.ending.settled(input.robot.alpha_deg, settling_s, self.shutdown, &self.settings)?;
                 let run = self.run.take()?;

@@ -329,13 +329,21 @@ pub fn replay(path: &Path, seen: impl FnMut(&Tick, &crate::core::Output)) -> Res
     replay_from(BufReader::new(reader), &file, seen)
 }
 
+/// Whether all bytes were there; an error of the disk is none of a file that ends.
+fn is_whole(read: std::io::Result<()>) -> std::io::Result<bool> {
+    match read {
+        Err(e) if e.kind() == ErrorKind::UnexpectedEof => Ok(false),
+        read => read.map(|()| true),
+    }
+}
+
 /// Replays a journal through a new [`Core`] and compares every answer bit by bit. `name` is what errors call the journal; `seen` is called with
 /// each tick and the answer that the replay gave.
 pub fn replay_from(mut reader: impl Read, name: &str, mut seen: impl FnMut(&Tick, &crate::core::Output)) -> Result<Replay, JournalError> {
     let file = name.to_owned();
     let read = |e: std::io::Error| JournalError::Read { file: file.clone(), what: e.to_string() };
     let mut magic = [0; 8];
-    if reader.read_exact(&mut magic).is_err() || &magic != MAGIC {
+    if !is_whole(reader.read_exact(&mut magic)).map_err(read)? || &magic != MAGIC {
         return Err(JournalError::Foreign { file });
     }
     let mut rerun = Rerun::new();
@@ -345,7 +353,7 @@ pub fn replay_from(mut reader: impl Read, name: &str, mut seen: impl FnMut(&Tick
         let mut length = [0; 4];
         match reader.read(&mut length[..1]).map_err(read)? {
             0 => return Ok(rerun.result),
-            _ if reader.read_exact(&mut length[1..]).is_err() => break,
+            _ if !is_whole(reader.read_exact(&mut length[1..])).map_err(read)? => break,
             _ => {}
         }
         let length = u32::from_le_bytes(length) as usize;
@@ -354,7 +362,7 @@ pub fn replay_from(mut reader: impl Read, name: &str, mut seen: impl FnMut(&Tick
             return Err(damaged());
         }
         buffer.resize(length, 0);
-        if reader.read_exact(&mut buffer).is_err() {
+        if !is_whole(reader.read_exact(&mut buffer)).map_err(read)? {
             break;
         }
         let entry = postcard::from_bytes(&buffer).map_err(|_| damaged())?;

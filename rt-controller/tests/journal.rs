@@ -76,6 +76,24 @@ fn journal(ticks: u64) -> Vec<u8> {
     whole
 }
 
+/// Protects the reader of a journal on a failing disk: an error is one, and does not look like a journal that was cut.
+#[test]
+fn an_error_of_the_disk_is_no_cut_journal() {
+    use std::io::Read;
+    struct Failing;
+    impl Read for Failing {
+        fn read(&mut self, _: &mut [u8]) -> std::io::Result<usize> {
+            Err(std::io::Error::other("input/output error"))
+        }
+    }
+    let whole = journal(300);
+    for length in [4, 20, whole.len() / 2, whole.len() - 3] {
+        assert!(replay_from(&whole[..length], "cut", |_, _| {}).is_ok_and(|r| r.cut_off) || length < 20, "{length}");
+        let failed = replay_from((&whole[..length]).chain(Failing), "j.bin", |_, _| {}).err().map(|e| e.to_string());
+        assert_eq!(failed.as_deref(), Some("j.bin: input/output error"), "{length}");
+    }
+}
+
 /// Protects a long run's journal: its later part begins with the weights that the loop has, and from its first order on it replays to the bit; a tick
 /// that was changed there is found.
 #[test]

@@ -119,7 +119,7 @@ fn beside(core: usize) -> Vec<Finding> {
 }
 
 /// Whether the kernel's list of cores, such as `2-3,6`, has this one.
-fn in_list(list: &str, core: usize) -> bool {
+pub fn in_list(list: &str, core: usize) -> bool {
     list.split(',').any(|part| {
         let (first, last) = part.split_once('-').unwrap_or((part, part));
         matches!((first.trim().parse::<usize>(), last.trim().parse::<usize>()), (Ok(first), Ok(last)) if (first..=last).contains(&core))

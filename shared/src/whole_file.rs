@@ -170,4 +170,14 @@ mod tests {
         assert_eq!(names(dir.path()), ["new", "other", "path"]);
         assert_eq!(std::fs::read(&path).unwrap(), b"1");
     }
+
+    /// Protects a file of a process with the same number, in another container or before it was killed, whose temporary name would be ours.
+    #[test]
+    fn a_temporary_name_that_is_taken_is_passed_over() {
+        let dir = tempfile::tempdir().unwrap();
+        let taken = |k: u32| dir.path().join(format!(".decant-{}-{k}.new", std::process::id()));
+        (0..500).for_each(|k| std::fs::write(taken(k), "theirs").unwrap());
+        let (_, ours) = new_beside(&dir.path().join("w.bin")).unwrap();
+        assert!((0..500).all(|k| taken(k) != ours && std::fs::read(taken(k)).unwrap() == b"theirs"), "{}", ours.display());
+    }
 }

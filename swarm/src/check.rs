@@ -186,7 +186,8 @@ impl Checks {
             What::Pour(_) | What::Record(..) | What::Resume if lives => {
                 (self.taken, self.asked_s) = (Taken::default(), at_s);
             }
-            What::ControllerKilled(_) => self.taken.controller = false,
+            // Whoever is killed pours nothing, and the robot's program has to bring the container upright by itself.
+            What::ControllerKilled(_) => (self.taken.controller, self.phase) = (false, Phase::NoRobot),
             What::Robot(Fault::Boot) => self.taken.registers = false,
             What::Robot(Fault::Clear) => self.cleared_s.push(at_s),
             what if takes_robot(what) && stops_ours(what, machine) => {

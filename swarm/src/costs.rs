@@ -96,6 +96,8 @@ impl Costs {
         // A robot that is lost is still on its way, as long as the container has not come upright after a fault.
         let is_on_way = matches!(phase, Phase::Settling | Phase::Returning) || (!is_active && !self.open.is_empty());
         if is_on_way || is_active {
+            // How an earlier run ended says nothing about this one.
+            self.went_on = false;
             self.open.push(OpenFault { kind, at_s, at_ml, noticed: None, is_on_way, in_pour });
         }
     }

@@ -4,7 +4,7 @@
 
 use rt_controller::claim;
 use shared::config::Config;
-use shared::machine::{Finding, read};
+use shared::machine::{Finding, in_list, read};
 use shared::runtime_dir::Place;
 
 /// The bit of CAP_IPC_LOCK, which lifts the limit on locked memory (capabilities(7)).
@@ -53,7 +53,7 @@ pub fn look(config: &Config) -> Vec<Finding> {
 
 fn priority(config: &Config, process: &Process) -> Finding {
     let wanted = config.controller.priority.max(config.worker.priority);
-    if wanted == 0 {
+    if config.controller.priority == 0 {
         let advice = "set controller.priority to 80, and worker.priority to 70";
         return Finding::yellow("real-time priority", "0 is configured", "anything that runs can delay the loop", advice);
     }
@@ -84,7 +84,8 @@ fn cores(config: &Config) -> Finding {
     let (controller, worker) = (config.controller.core, config.worker.core);
     let is = format!("loop on {controller}, worker on {worker}");
     let there = std::thread::available_parallelism().map_or(1, usize::from);
-    let online = |core: usize| core < there || !read(&format!("/sys/devices/system/cpu/cpu{core}/topology/core_id")).is_empty();
+    let list = read("/sys/devices/system/cpu/online");
+    let online = |core: usize| if list.trim().is_empty() { core < there } else { in_list(&list, core) };
     if !online(controller) || !online(worker) {
         let advice = "set controller.core and worker.core to cores that there are";
         return Finding::yellow(

@@ -1,15 +1,18 @@
 //! The robot: its ports, versions, mode, registers, payload and speed.
 //!
 //! Called once by an ordinary thread; allocates; waits for up to two seconds for each answer. Nothing fails. Nothing is started or written
-//! on the robot. A robot that a controller of this cell already has is only asked by its dashboard.
+//! on the robot. Of a robot that a controller of this cell already has, ports and dashboard are looked at, and the
+//! controller is asked.
 
 use std::io::{BufRead as _, BufReader, ErrorKind, Write as _};
 use std::net::{IpAddr, SocketAddr, TcpStream};
 use std::time::Duration;
 
-use rt_controller::claim;
+use rt_controller::claim::{self, Running};
+use rt_controller::client::Client;
 use rt_controller::link::{self, LinkError, LinkOptions, RobotState, payload};
 use shared::config::Config;
+use shared::control::RobotLink;
 use shared::machine::Finding;
 use shared::runtime_dir::Place;
 
@@ -53,7 +56,7 @@ pub fn look(config: &Config) -> Vec<Finding> {
     });
     findings.push(dashboard(address));
     if let Some(running) = claim::running(&Place::from(&config.cell).path()) {
-        findings.push(Finding::green("state", format!("rt-controller (process {}) has the robot; `decant status` shows it", running.pid)));
+        findings.push(held(&running, &Place::from(&config.cell)));
         return findings;
     }
     match link::look(&LinkOptions::new(config, address)) {
@@ -73,6 +76,23 @@ pub fn look(config: &Config) -> Vec<Finding> {
         Err(e) => findings.push(refused("RTDE", "", Err(e), "no target can be sent")),
     }
     findings
+}
+
+/// What a controller of this cell says of its robot.
+fn held(running: &Running, place: &Place) -> Finding {
+    let is = format!("rt-controller (process {}) runs", running.pid);
+    match Client::connect(place.clone()).and_then(|client| client.status()) {
+        Ok(status) if status.robot == RobotLink::Connected => {
+            Finding::green("state", format!("{is}, and its program is at work on the robot"))
+        }
+        Ok(status) => {
+            let is = format!("{is}, and has no robot: {}", status.hindrance);
+            let (means, advice) = ("nothing can be poured before that", "`decant status` says more");
+            let connecting = status.robot == RobotLink::Connecting;
+            if connecting { Finding::yellow("state", is, means, advice) } else { Finding::red("state", is, means, advice) }
+        }
+        Err(e) => Finding::yellow("state", format!("{is}: {e}"), "it is not known whether the robot may move", "`decant status`"),
+    }
 }
 
 /// One of three ports takes the program.

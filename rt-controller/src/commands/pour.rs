@@ -4,6 +4,7 @@
 use shared::config::{CellConfig, Config};
 use shared::control::{EndReason, Outcome, Reply, Request};
 use shared::exit::{self, Failure, OrExit as _, failure};
+use shared::os;
 use shared::plural::counted;
 use shared::weights::Weights;
 
@@ -111,12 +112,14 @@ pub(crate) fn order(cell: &CellConfig, request: &Request) -> Result<(Outcome, Op
     let client = Client::connect_or_end(cell).or_exit(exit::UNREACHABLE)?;
     resume::take_back_if_it_waits(&client)?;
     let recorder = client::RecorderReports::open(cell).ok();
+    // From here on Ctrl-C must stop what is ordered. If this fails, it ends this command, and the pour goes on.
+    let interrupted = os::stop_at_signals().unwrap_or_default();
     let episode = match client.ask(request).or_exit(exit::UNREACHABLE)? {
         Reply::Started { episode } => episode,
         Reply::Refused { reason } => return Err(failure(exit::REFUSED, reason)),
         _ => return Err(failure(exit::UNREACHABLE, client::ClientError::Version)),
     };
-    let outcome = client.follow(episode).map_err(|e| match e {
+    let outcome = client.follow(episode, &interrupted).map_err(|e| match e {
         FollowError::Interrupted(o) if matches!(o.reason, EndReason::Aborted | EndReason::Done) => {
             failure(exit::INTERRUPTED, format!("interrupted: {}, the container is upright", o.reason.words()))
         }

@@ -3,7 +3,7 @@
 //! It is pure and runs in the controller's loop; it does not allocate, panic or fail. An ending has three steps. A rule names a reason
 //! while the container is tilted ([`Ending::due`]); the container then comes upright ([`is_commanded_upright`]); the last drops are counted
 //! ([`Ending::settled`]). Reasons that do not come from a rule, such as an operator's abort or a robot that may not move, are given to
-//! [`Ending::end_with`] or [`Ending::end_instead_of_done`]. The first reason other than `Done` stays, unless the joint then does not come
+//! [`Ending::end_with`] or [`Ending::end_instead_of_done`]. The first reason other than `Done` stays, unless the robot is lost, or the joint does not come
 //! upright.
 //!
 //! | rule | reason |
@@ -192,11 +192,11 @@ impl Ending {
         }
     }
 
-    /// Takes whether the joint follows on its way upright, and looks at what was seen meanwhile. The way of a slower robot is waited for, but
-    /// more was then poured than was foreseen when it began, so such a pour is not done.
-    pub fn returns(&mut self, follows: bool) {
-        if !follows {
-            self.end_instead_of_done(EndReason::NotFollowed);
+    /// Takes whether the joint follows on its way upright, and why the camera does not tell what leaves there, if so; and looks at what was seen
+    /// meanwhile. The way of a slower robot is waited for, but more was then poured than was foreseen when it began, so such a pour is not done.
+    pub fn returns(&mut self, follows: bool, blind: Option<EndReason>) {
+        if let Some(reason) = blind.or((!follows).then_some(EndReason::NotFollowed)) {
+            self.end_instead_of_done(reason);
         }
         // A stream that goes on at an upright container was none before either.
         if let Some(impossible) = self.impossible {
@@ -450,10 +450,10 @@ mod tests {
         for (before, after) in [(EndReason::Done, EndReason::ImpossibleFlow), (EndReason::Aborted, EndReason::Aborted)] {
             let mut ending = Ending::of_pour();
             ending.end_with(before);
-            ending.returns(true);
+            ending.returns(true, None);
             assert_eq!(ending.reason(), before);
             ending.decided(&impossible);
-            ending.returns(true);
+            ending.returns(true, None);
             assert_eq!(ending.reason(), after);
         }
     }

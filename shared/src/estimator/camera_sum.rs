@@ -89,6 +89,8 @@ impl CameraSum {
             let area_px2 = calibration.area_px2(ml, alpha_deg as f32);
             self.sum_ml += late_ml;
             self.squares_ml2 += late_ml * late_ml;
+            self.lying_ml += if alpha_deg > LYING_DEG { late_ml } else { 0.0 };
+            self.unsure_ml += late_ml * self.newest_log_sd * f64::from(calibration.area_exponent);
             self.log_area_ml += late_ml * area_px2.ln();
             self.beyond_ml += late_ml * beyond_log_sd(area_px2, taught_px2);
         }
@@ -99,14 +101,18 @@ impl CameraSum {
         if self.sum_ml > 0.0 { (self.lying_ml / self.sum_ml).min(1.0) } else { 0.0 }
     }
 
+    /// What the frames' confidence, areas beyond those of the episodes and lost frames leave open of the sum, ml^2.
+    pub fn unseen_ml2(&self) -> f64 {
+        self.unsure_ml.powi(2) + self.beyond_ml.powi(2) + self.bridged_ml.powi(2)
+    }
+
     /// Standard deviation of the sum, ml: what the calibration leaves open at the areas of this pour and beyond those of the episodes, the pour's own
     /// gain, the frames' noise, and what their confidence and lost frames leave open.
     pub fn sd_ml(&self, camera: &[[f64; 2]; 2], gain_sd: f64, frame_sd: f64) -> f64 {
         let (sum, log) = (self.sum_ml, self.log_area_ml);
         let [[cc, cq], [_, qq]] = camera;
         let calibration_ml2 = sum * sum * cc + 2.0 * sum * log * cq + log * log * qq;
-        let noise_ml2 = frame_sd * frame_sd * self.squares_ml2 + self.unsure_ml.powi(2) + CAMERA_SD_ML * CAMERA_SD_ML;
-        let unknown_ml2 = self.beyond_ml.powi(2) + self.bridged_ml.powi(2);
-        (calibration_ml2.max(0.0) + (gain_sd * sum).powi(2) + noise_ml2 + unknown_ml2).sqrt()
+        let noise_ml2 = frame_sd * frame_sd * self.squares_ml2 + CAMERA_SD_ML * CAMERA_SD_ML;
+        (calibration_ml2.max(0.0) + (gain_sd * sum).powi(2) + noise_ml2 + self.unseen_ml2()).sqrt()
     }
 }

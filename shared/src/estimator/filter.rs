@@ -140,13 +140,16 @@ impl Filter {
         self.state.iter().chain(self.covariance.iter().flatten()).all(|s| s.is_finite())
     }
 
-    /// Begins with the first frame that shows flow: the stream shows how high the liquid stands above the lip.
-    pub fn start(&mut self, flow: &FlowTables, prior: &UnknownsCovariance, tilt: Tilt, measured_ml: f64) {
+    /// Begins with a frame that shows flow: the stream shows how high the liquid stands above the lip. `before` is what has left before it by the
+    /// camera, ml, and its variance, ml^2.
+    pub fn start(&mut self, flow: &FlowTables, prior: &UnknownsCovariance, tilt: Tilt, measured_ml: f64, before: (f64, f64)) {
         let excess_ml = flow.excess_ml_for(tilt.tilt_deg, measured_ml);
         let excess_per_log = excess_ml / flow.model.head_exponent;
         *self = Self::new();
         self.state[EXCESS] = excess_ml;
+        self.state[POURED] = before.0;
         let p = &mut self.covariance;
+        p[POURED][POURED] = before.1;
         for (i, row) in prior.iter().enumerate() {
             p[FIRST_UNKNOWN + i][FIRST_UNKNOWN..].copy_from_slice(row);
             let covariance = -excess_per_log * prior[0][i];

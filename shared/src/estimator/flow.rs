@@ -329,10 +329,10 @@ pub struct WayBack {
 }
 
 impl WayBack {
-    /// The controller's limits, at `rate_hz` frames a second.
+    /// The controller's limits, at `rate_hz` frames a second. The way back is never faster than any other.
     pub fn new(limits: &crate::limits::Limits, rate_hz: f64) -> Self {
         Self {
-            rate_deg: f64::from(limits.return_rate_deg_s) / rate_hz,
+            rate_deg: f64::from(limits.return_rate_deg_s.min(limits.rate_deg_s)) / rate_hz,
             change_deg: f64::from(limits.acceleration_deg_s2) / (rate_hz * rate_hz),
         }
     }

@@ -155,9 +155,9 @@ impl FusedEstimator {
         self.pour = Pour::default();
     }
 
-    /// How much the straight vessel counts now, 0 to 1.
+    /// How much the straight vessel counts now, 0 to 1; not before its filter has begun, as it knows nothing then.
     fn share(&self) -> f64 {
-        if self.tight_share > 0.0 { self.tight_share * self.pour.whiteness.trust() } else { 0.0 }
+        if self.pour.started && self.tight_share > 0.0 { self.tight_share * self.pour.whiteness.trust() } else { 0.0 }
     }
 
     /// How white the straight vessel's innovations are so far.
@@ -271,7 +271,7 @@ impl FusedEstimator {
         {
             let measured_ml = area_px2.map(|a| f64::from(calibration.volume_ml(a, alpha_deg as f32)));
             match measured_ml {
-                Some(measured_ml) if begins => filter.start(flow, unknowns, shown.tilt, measured_ml),
+                Some(measured_ml) if begins => filter.start(flow, unknowns, shown.tilt, measured_ml, (camera.sum_ml, camera.unseen_ml2())),
                 _ if !*started => continue,
                 measured_ml => {
                     filter.tilt(flow, shown.tilt);

@@ -85,6 +85,13 @@ fn recording_doubts(e: &Episode) -> Vec<String> {
     if clipped > SHARE_MAX {
         doubt(format!("{:.0} % of the images are clipped, too dark or blown out: check exposure and [image] region_px", 100.0 * clipped));
     }
+    let unseen = share(|row| !row.lost && !row.area_px2.is_finite());
+    if unseen > SHARE_MAX && clipped <= SHARE_MAX {
+        doubt(format!(
+            "{:.0} % of the images were not measured: `feature-worker episodes list` says why, and docs/FAQ.md what to do",
+            100.0 * unseen
+        ));
+    }
     let tilt_deg = |row: Option<&EpisodeRow>| row.map_or(0.0, |row| row.alpha_commanded_deg);
     let last_deg = tilt_deg(e.rows.last());
     if last_deg > UPRIGHT_DEG {

@@ -19,6 +19,8 @@ use crate::teaching::span::Span;
 const BELOW_LIMIT_DEG: f64 = 5.0;
 /// Range of what a vessel may hold, ml. Chosen by hand: a robot that pours holds no less and carries no more.
 const HOLDS_ML: (f64, f64) = (50.0, 10_000.0);
+/// Largest goal of the pours that are proposed for, where nobody names one, ml. Chosen by hand: a large cup.
+const GOAL_ML: f64 = 250.0;
 /// Largest goal that a plan may have, ml: as controller.goal_max_ml.
 const GOAL_MAX_ML: f64 = 5000.0;
 
@@ -38,11 +40,12 @@ pub struct Args {
     /// What the vessel holds up to its lip, ml. It is needed before the first weighed episode. Later, fills are reckoned from it.
     #[arg(long)]
     holds: Option<f64>,
-    /// Largest goal of the pours to come, ml.
-    #[arg(long, default_value_t = 250.0)]
-    goal_max: f64,
-    /// Configuration of the cell, from which the limits and [container] holds_ml are taken; without it, the limits are the default ones.
+    /// Largest goal of the pours to come, ml; without it, 250 ml, and no more than the configuration allows.
     #[arg(long)]
+    goal_max: Option<f64>,
+    /// Configuration of the cell, from which the limits, [container] holds_ml and the largest goal are taken; without it, the limits are the default
+    /// ones.
+    #[arg(long, env = shared::config::VARIABLE)]
     config: Option<PathBuf>,
     /// Print JSON.
     #[arg(long)]
@@ -53,8 +56,10 @@ pub struct Args {
 pub fn run(args: &Args) -> Result<(), Failure> {
     let config = args.config.as_deref().map(shared::config::Config::read).transpose().or_exit(exit::BAD_INPUT)?;
     let limits = config.as_ref().map_or_else(Limits::default, |c| c.limits);
+    let goal_max_ml =
+        args.goal_max.unwrap_or_else(|| config.as_ref().map_or(GOAL_ML, |c| f64::from(c.controller.goal_max_ml).min(GOAL_ML)));
     let holds_ml = args.holds.or(config.and_then(|c| c.container.holds_ml));
-    if args.holds.is_some_and(|ml| !(HOLDS_ML.0..=HOLDS_ML.1).contains(&ml)) || !(1.0..=GOAL_MAX_ML).contains(&args.goal_max) {
+    if args.holds.is_some_and(|ml| !(HOLDS_ML.0..=HOLDS_ML.1).contains(&ml)) || !(1.0..=GOAL_MAX_ML).contains(&goal_max_ml) {
         let what = format!("--holds is {} to {} ml, and --goal-max 1 to {GOAL_MAX_ML} ml", HOLDS_ML.0, HOLDS_ML.1);
         return Err(failure(exit::BAD_INPUT, what));
     }
@@ -64,7 +69,7 @@ pub fn run(args: &Args) -> Result<(), Failure> {
         Err(DataError::None { .. }) => UsableEpisodes::default(),
         Err(e) => return Err(failure(exit::BAD_INPUT, e)),
     };
-    let wish = wish(&limits, args.goal_max);
+    let wish = wish(&limits, goal_max_ml);
     let found = propose(&usable, holds_ml, &wish)?;
     let Some(first) = found.candidates.first() else {
         let what = "nothing can be proposed for this vessel: give what it really holds with --holds, or a smaller --goal-max";

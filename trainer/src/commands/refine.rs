@@ -67,6 +67,11 @@ fn weighed_pours(episodes: &[Episode]) -> Vec<WeighedPour> {
 /// Runs the command.
 pub fn run(args: &Args) -> Result<(), Failure> {
     let read = args.source.read().or_exit(exit::BAD_INPUT)?;
+    args.weight_file.check()?;
+    if let Some(name) = args.leave_out.iter().chain(&args.accept).find(|name| !read.iter().any(|e| e.name == **name)) {
+        let what = format!("no episode of these is called {name}: give the name that `trainer check` shows");
+        return Err(failure(exit::BAD_INPUT, what));
+    }
     let limits = args.weight_file.limits()?;
     let mut usable = data::usable(&read);
     usable.episodes.retain(|e| !args.leave_out.contains(&e.name));

@@ -53,7 +53,7 @@ pub struct WeightFileArgs {
     #[arg(long, default_value_t = 1)]
     pub seed: u64,
     /// Configuration of the cell, from which the limits are taken; without it, they are the default ones.
-    #[arg(long)]
+    #[arg(long, env = shared::config::VARIABLE)]
     config: Option<PathBuf>,
     /// Where the weight file goes. A file that is there is replaced in one step.
     #[arg(long)]

@@ -326,6 +326,6 @@ fn tell_copied(copied: &Copied, as_json: bool) -> Result<(), Failure> {
     }
     match copied.left_out.iter().filter(|l| shared::episode::Episode::read(&l.file).is_err()).count() {
         0 => Ok(()),
-        n => Err(failure(exit::FAILED, format!("{} cannot be read; the others are copied", counted(n, "episode")))),
+        n => Err(failure(exit::FAILED, format!("{} cannot be read; {} copied", counted(n, "episode"), copied.files.len()))),
     }
 }

@@ -390,6 +390,24 @@ fn estimates_that_are_apart_are_doubted() {
     assert!(lies_sd_ml > lies_ml, "{lies_sd_ml} {lies_ml}");
 }
 
+/// Protects what is said of drops that come one by one, and of a stream that began in a gap: the straight vessel counts what the camera has seen
+/// before its filter begins, and is as unsure of it.
+#[test]
+fn what_left_before_the_filter_began_counts() {
+    let pour = |seen: &[Option<f64>]| {
+        let mut fused = new(&with_wide_bounds(1.0));
+        for outflow_ml in seen {
+            let shown = frame(outflow_ml.unwrap_or(0.0), 55.0);
+            fused.step(if outflow_ml.is_some() { shown } else { FusedFrame { area_px2: None, ..shown } });
+        }
+        (fused.poured_ml(), fused.pour.following[TIGHT].filter.poured_variance_ml2())
+    };
+    let (drops_ml, _) = pour(&[0.0, 0.3, 0.0, 0.0, 0.3, 0.0, 0.0, 0.3, 0.0].map(Some));
+    assert!(drops_ml > 0.8, "{drops_ml}");
+    let (begun_ml, begun_ml2) = pour(&[Some(0.0), Some(2.0), None, None, None, None, Some(2.4), Some(2.4)]);
+    assert!(begun_ml > 10.0 && begun_ml2 > 2.0, "{begun_ml} {begun_ml2}");
+}
+
 /// Protects the operator from a surge whose areas lie far beyond those of the episodes: how much such an area means is not known as well.
 #[test]
 fn areas_beyond_the_episodes_are_doubted() {

@@ -1,0 +1,96 @@
+//! What a camera does to a pour: its rate, its frames, and its loss on the way back. The toy cell is in main.rs.
+//!
+//! Tests only: any thread, may allocate, fails by panicking.
+
+use super::*;
+
+/// Protects the volume from a camera that is not as configured: a pour and a recording are refused with both rates, and a camera that becomes slow in
+/// a pour ends it by name, before it flows.
+#[test]
+fn a_camera_with_another_rate_pours_nothing() {
+    let mut cell = ToyCell::new();
+    cell.settings.frame_ns *= 2;
+    cell.core = Core::new(cell.settings);
+    cell.core.exchange(always(13));
+    (0..20).for_each(|_| _ = cell.tick(None));
+    let Err(refusal @ Refusal::FrameRate(..)) = cell.pour(50.0) else { panic!("not refused") };
+    assert!(refusal.to_string().contains("gives 30.0 frames a second, and camera.fps is 15.0"), "{refusal}");
+
+    let mut cell = ToyCell::new();
+    (0..20).for_each(|_| _ = cell.tick(None));
+    cell.pour(50.0).expect("ready");
+    let ticks = (0..200).find(|k| {
+        cell.camera = k % 2 == 0;
+        cell.tick(None);
+        cell.core.phase() != Phase::Pouring
+    });
+    assert!(ticks.is_some_and(|t| t <= 20), "{ticks:?} ticks");
+    cell.camera = true;
+    let outcome = cell.finish();
+    assert_eq!((outcome.reason, outcome.poured_words().starts_with("at least ")), (EndReason::FrameRate, true));
+}
+
+/// Protects what is said: what leaves on the way upright is a part of the pour, so a camera that dies then, or is another one, leaves no pour
+/// that is done.
+#[test]
+fn a_pour_whose_way_back_is_not_seen_is_not_done() {
+    type Trouble = fn(&mut ToyCell);
+    let troubles: [(Trouble, EndReason); 3] =
+        [(|_| (), EndReason::Done), (|w| w.camera = false, EndReason::StaleFeature), (|w| w.epoch_ns += 1, EndReason::WorkerRestarted)];
+    for (trouble, reason) in troubles {
+        let mut cell = ToyCell::new();
+        cell.pour(20.0).expect("ready");
+        while cell.core.phase() == Phase::Pouring {
+            cell.tick(None);
+        }
+        trouble(&mut cell);
+        let outcome = cell.finish();
+        assert_eq!((outcome.reason, outcome.poured_words().starts_with("at least ")), (reason, reason != EndReason::Done));
+    }
+}
+
+/// Protects what is said: a camera that gives half of its frames on the way upright hides half of what leaves there, and one that dies after the
+/// command is upright hides what leaves while the joint is not.
+#[test]
+fn what_hides_the_end_of_the_way_back_is_named() {
+    let returning = || {
+        let mut cell = ToyCell::new();
+        (0..20).for_each(|_| _ = cell.tick(None));
+        cell.pour(20.0).expect("ready");
+        while cell.core.phase() == Phase::Pouring {
+            cell.tick(None);
+        }
+        cell
+    };
+    let mut slow = returning();
+    for k in 0..20 {
+        slow.camera = k % 2 == 0;
+        slow.tick(None);
+    }
+    slow.camera = true;
+    let mut late = returning();
+    late.joint_deg_s = 50.0;
+    while late.core.phase() == Phase::Returning {
+        late.tick(None);
+    }
+    (late.joint_deg_s, late.camera) = (20.0, false);
+    (0..8).for_each(|_| _ = late.tick(None));
+    (late.joint_deg_s, late.camera) = (f32::INFINITY, true);
+    assert_eq!([slow.finish().reason, late.finish().reason], [EndReason::FrameRate, EndReason::StaleFeature]);
+}
+
+/// Protects d from being counted twice: repeated, older and foreign features are ignored and counted.
+#[test]
+fn repeated_features_count_once() {
+    let mut cell = ToyCell::new();
+    cell.pour(30.0).expect("ready");
+    cell.run_to_flow();
+    cell.now_ns += cell.settings.period_ns;
+    let feature = cell.feature();
+    let once_ml = cell.step(&[feature], None).telemetry.d_ml;
+    cell.now_ns += cell.settings.period_ns;
+    let older = Feature { sequence: 1, ..feature };
+    let foreign = Feature { version: LAYOUT_VERSION + 1, sequence: 1_000_000, ..feature };
+    assert_eq!(cell.step(&[feature, older, foreign], None).telemetry.d_ml, once_ml);
+    assert_eq!(cell.core.counters().ignored_features, 3);
+}
