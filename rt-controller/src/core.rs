@@ -219,9 +219,8 @@ impl Core {
             Some(reason) => {
                 self.phase = Phase::NoRobot;
                 let run = self.run.take()?;
-                // Liquid may go on leaving a container that is not upright, whatever the pour was ending for.
-                let keeps = run.ending.reason() != EndReason::Done && input.robot.alpha_deg.abs() <= self.settings.upright_deg;
-                Some(self.outcome(&run, if keeps { run.ending.reason() } else { reason }, input.now_ns))
+                let is_upright = input.robot.alpha_deg.abs() <= self.settings.upright_deg;
+                Some(self.outcome(&run, reason.after(run.ending.reason(), is_upright), input.now_ns))
             }
             None if self.phase == Phase::NoRobot && input.robot.alpha_deg.abs() <= self.settings.upright_deg => {
                 self.limiter.rest_at(input.robot.alpha_deg.clamp(self.settings.limits.alpha_min_deg, self.settings.limits.alpha_max_deg));

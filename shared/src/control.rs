@@ -160,6 +160,14 @@ pub enum EndReason {
 }
 
 impl EndReason {
+    /// The reason of a run that was ending for `before` when the robot was lost for this one. The first stays, but for done, and where the arm now stands
+    /// although the container is not upright: liquid goes on leaving it.
+    pub fn after(self, before: Self, is_upright: bool) -> Self {
+        let stands =
+            matches!(self, Self::ProtectiveStop | Self::EmergencyStop | Self::SafetyStop | Self::ProgramStopped | Self::RobotNotRunning);
+        if before == Self::Done || (stands && !is_upright) { self } else { before }
+    }
+
     /// Whether liquid may have left that nobody has seen or counted: without a camera, or without a robot whose way upright is known.
     pub fn leaves_unseen(self) -> bool {
         let camera = matches!(self, Self::StaleFeature | Self::WorkerRestarted | Self::FrameRate);

@@ -285,6 +285,6 @@ fn what_still_leaves_is_in_the_deviation() {
     let happens = [(2_771, What::Pour(81.754135), None), (4_535, What::Abort, Some("abort")), (4_701, What::Overrun(180), Some("overrun"))];
     let shown = shown(10_110_927, Series::Cb3, 1, (297.0, (200_000, 400_000)), &happens);
     let pour = &shown.poured[0];
-    assert!(pour.reason == EndReason::ControllerOverrun && pour.true_ml > f64::from(pour.believed_ml) + 3.0, "it is not cut: {pour:?}");
+    assert!(pour.reason == EndReason::Aborted && pour.true_ml > f64::from(pour.believed_ml) + 3.0, "it is not cut: {pour:?}");
     assert!(pour.sd_ml > 2.0, "{pour:?}");
 }

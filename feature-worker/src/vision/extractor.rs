@@ -245,8 +245,10 @@ impl Extractor {
     /// The triangle of a stream whose coarse edge is in `self.edges`.
     fn measure_stream(&mut self, seen_share: f32, doubt: Doubt, pixels: RegionPixels) -> Measurement {
         let Some(first) = self.line.first_line(&self.edges) else { return Measurement::nothing(0.0, Doubt::EdgeNotFound) };
+        // What is too small to be a stream may be the root of one that is doubted.
+        let too_small = Measurement::nothing(if doubt == Doubt::None { seen_share } else { 0.0 }, doubt);
         if self.axes.area_px2(first.legs_px) < self.liquid.rules().first_area_least_px2 {
-            return Measurement::nothing(seen_share, Doubt::None);
+            return too_small;
         }
         let fine = self.line.fine_line(&first, seen_share, &self.edges, pixels, self.liquid.as_ref());
         let fine = match self.liquid.confirm(fine, self.light.mean_level()) {
@@ -255,7 +257,7 @@ impl Extractor {
         };
         let area_px2 = self.axes.area_px2(fine.legs_px);
         if area_px2 < self.area_min_px2 {
-            return Measurement::nothing(seen_share, Doubt::None);
+            return too_small;
         }
         let [a, b] = fine.legs_px;
         let corner = |r: f32, axis: [f32; 2]| self.in_image(self.axes.at(r, axis));

@@ -290,3 +290,19 @@ fn a_thick_jet_is_no_ground_that_goes_on() -> Result<(), ExtractError> {
     }
     Ok(())
 }
+
+/// Protects streams of which only a root at the lip, too small for a stream, has the liquid's own colours: what goes on from it in others is no zero.
+#[test]
+fn a_root_in_own_colours_hides_no_stream() -> Result<(), ExtractError> {
+    let mut extractor = colour()?;
+    for i in 0..60 {
+        let mut picture = dry(0.0, i)?;
+        if i >= 44 {
+            lay_over(&mut picture, &[stream(40.0, 36.0)], OTHER)?;
+            lay_over(&mut picture, &[stream(8.0, 8.0)], Scalar::new(150.0, 62.0, 20.0, 0.0))?;
+        }
+        let measured = measure(&mut extractor, &picture)?;
+        assert!(i < 44 || is_told(&measured), "picture {i}: {measured:?}");
+    }
+    Ok(())
+}

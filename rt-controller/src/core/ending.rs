@@ -3,7 +3,7 @@
 //! It is pure and runs in the controller's loop; it does not allocate, panic or fail. An ending has three steps. A rule names a reason
 //! while the container is tilted ([`Ending::due`]); the container then comes upright ([`is_commanded_upright`]); the last drops are counted
 //! ([`Ending::settled`]). Reasons that do not come from a rule, such as an operator's abort or a robot that may not move, are given to
-//! [`Ending::end_with`] or [`Ending::end_instead_of_done`]. The first reason other than `Done` stays, unless the robot is lost, or the joint does not come
+//! [`Ending::end_with`] or [`Ending::end_instead_of_done`]. The first reason other than `Done` stays, unless the arm is then held tilted, or the joint does not come
 //! upright.
 //!
 //! | rule | reason |
