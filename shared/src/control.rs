@@ -163,19 +163,22 @@ impl EndReason {
     /// The reason of a run that was ending for `before` when the robot was lost for this one. The first stays, but for done, and where the arm now stands
     /// although the container is not upright: liquid goes on leaving it.
     pub fn after(self, before: Self, is_upright: bool) -> Self {
-        let stands =
-            matches!(self, Self::ProtectiveStop | Self::EmergencyStop | Self::SafetyStop | Self::ProgramStopped | Self::RobotNotRunning);
-        if before == Self::Done || (stands && !is_upright) { self } else { before }
+        if before == Self::Done || (self.stops_the_arm() && !is_upright) { self } else { before }
+    }
+
+    /// Whether the arm stands where it is, so that it does not come upright.
+    fn stops_the_arm(self) -> bool {
+        let stopped = matches!(self, Self::ProtectiveStop | Self::EmergencyStop | Self::SafetyStop | Self::ProgramStopped);
+        stopped || self == Self::RobotNotRunning
     }
 
     /// Whether liquid may have left that nobody has seen or counted: without a camera, or without a robot whose way upright is known.
     pub fn leaves_unseen(self) -> bool {
         let camera = matches!(self, Self::StaleFeature | Self::WorkerRestarted | Self::FrameRate);
         let link = matches!(self, Self::RobotLost | Self::RobotStalled | Self::ControllerOverrun | Self::SpeedReduced | Self::InHand);
-        let stopped = matches!(self, Self::ProtectiveStop | Self::EmergencyStop | Self::SafetyStop | Self::ProgramStopped);
         // These end a count that was going on, or say themselves that a stream may not have been seen.
         let unsure = matches!(self, Self::NotUpright | Self::StreamLost | Self::NothingFlows);
-        camera || link || stopped || unsure || self == Self::RobotNotRunning
+        camera || link || unsure || self.stops_the_arm()
     }
 
     /// The reason in words.

@@ -71,14 +71,19 @@ impl CameraSum {
         }
         self.newest_ml = ml;
         if ml > 0.0 {
-            self.sum_ml += ml;
-            self.lying_ml += if alpha_deg > LYING_DEG { ml } else { 0.0 };
-            self.squares_ml2 += ml * ml;
-            self.log_area_ml += ml * f64::from(area_px2).ln();
-            self.unsure_ml += ml * self.newest_log_sd * f64::from(calibration.area_exponent);
-            self.beyond_ml += ml * beyond_log_sd(f64::from(area_px2), taught_px2);
+            self.count(calibration, ml, f64::from(area_px2), alpha_deg, taught_px2);
             self.bridged_ml += ml * (LOST_SD * f64::from(self.lost_frames)).min(1.0);
         }
+    }
+
+    /// Counts an outflow of `ml` that was seen as `area_px2`.
+    fn count(&mut self, calibration: &Calibration, ml: f64, area_px2: f64, alpha_deg: f64, taught_px2: f64) {
+        self.sum_ml += ml;
+        self.lying_ml += if alpha_deg > LYING_DEG { ml } else { 0.0 };
+        self.squares_ml2 += ml * ml;
+        self.log_area_ml += ml * area_px2.ln();
+        self.unsure_ml += ml * self.newest_log_sd * f64::from(calibration.area_exponent);
+        self.beyond_ml += ml * beyond_log_sd(area_px2, taught_px2);
     }
 
     /// Adds what was withheld of an earlier frame, ml.
@@ -86,13 +91,7 @@ impl CameraSum {
         self.bridged_frames = self.bridged_frames.saturating_sub(1);
         let late_ml = ml - self.newest_ml;
         if late_ml > 0.0 {
-            let area_px2 = calibration.area_px2(ml, alpha_deg as f32);
-            self.sum_ml += late_ml;
-            self.squares_ml2 += late_ml * late_ml;
-            self.lying_ml += if alpha_deg > LYING_DEG { late_ml } else { 0.0 };
-            self.unsure_ml += late_ml * self.newest_log_sd * f64::from(calibration.area_exponent);
-            self.log_area_ml += late_ml * area_px2.ln();
-            self.beyond_ml += late_ml * beyond_log_sd(area_px2, taught_px2);
+            self.count(calibration, late_ml, calibration.area_px2(ml, alpha_deg as f32), alpha_deg, taught_px2);
         }
     }
 

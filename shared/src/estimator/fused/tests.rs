@@ -60,6 +60,12 @@ fn frame(outflow_ml: f64, command_deg: f64) -> FusedFrame {
     FusedFrame { area_px2: Some(if area < 5.0 { 0.0 } else { area }), confidence: 1.0, command_deg, measured_deg: f64::NAN }
 }
 
+/// The same, or a lost frame.
+fn frame_or_lost(outflow_ml: Option<f64>, command_deg: f64) -> FusedFrame {
+    let shown = frame(outflow_ml.unwrap_or(0.0), command_deg);
+    if outflow_ml.is_some() { shown } else { FusedFrame { area_px2: None, ..shown } }
+}
+
 /// A pour whose tilt rises, holds, and returns; the camera's gain is off by the factor `gain`. Gives the true volume and the camera's sum,
 /// ml, and the estimator.
 fn pour_into(fused: FusedEstimator, gain: f64) -> (f64, f64, FusedEstimator) {
@@ -264,8 +270,7 @@ fn odd_and_then_lost_is_doubted() {
         let mut fused = new(&with_wide_bounds(tight_share));
         let stream = [0.0, 0.5, 0.6, 0.6, 10.0].map(Some);
         for outflow_ml in stream.iter().chain(after_the_odd) {
-            let shown = frame(outflow_ml.unwrap_or(0.0), 55.0);
-            fused.step(if outflow_ml.is_some() { shown } else { FusedFrame { area_px2: None, ..shown } });
+            fused.step(frame_or_lost(*outflow_ml, 55.0));
         }
         (fused.poured_ml(), fused.poured_sd_ml())
     };
@@ -329,8 +334,7 @@ fn a_stream_that_is_not_seen_for_long_is_doubted() {
         let mut fused = new(&model(0.0));
         let stream = [0.0, 1.0].into_iter().chain([1.4; 30]).map(Some).chain(vec![None; lost]);
         for outflow_ml in stream {
-            let shown = frame(outflow_ml.unwrap_or(0.0), 55.0);
-            fused.step(if outflow_ml.is_some() { shown } else { FusedFrame { area_px2: None, ..shown } });
+            fused.step(frame_or_lost(outflow_ml, 55.0));
         }
         fused.camera_sd_ml()
     };
@@ -346,8 +350,7 @@ fn a_zero_at_the_peak_of_a_surge_is_doubted() {
         [Some(0.0), None].map(|peak_ml| {
             let mut fused = new(&model(0.0));
             for (k, ml) in stream.iter().enumerate() {
-                let shown = frame(if k == 4 { peak_ml.unwrap_or(0.0) } else { *ml }, 55.0);
-                fused.step(if k == 4 && peak_ml.is_none() { FusedFrame { area_px2: None, ..shown } } else { shown });
+                fused.step(frame_or_lost(if k == 4 { peak_ml } else { Some(*ml) }, 55.0));
             }
             fused.camera_sd_ml()
         })
@@ -396,10 +399,7 @@ fn estimates_that_are_apart_are_doubted() {
 fn what_left_before_the_filter_began_counts() {
     let pour = |seen: &[Option<f64>]| {
         let mut fused = new(&with_wide_bounds(1.0));
-        for outflow_ml in seen {
-            let shown = frame(outflow_ml.unwrap_or(0.0), 55.0);
-            fused.step(if outflow_ml.is_some() { shown } else { FusedFrame { area_px2: None, ..shown } });
-        }
+        seen.iter().for_each(|ml| _ = fused.step(frame_or_lost(*ml, 55.0)));
         (fused.poured_ml(), fused.pour.following[TIGHT].filter.poured_variance_ml2())
     };
     let (drops_ml, _) = pour(&[0.0, 0.3, 0.0, 0.0, 0.3, 0.0, 0.0, 0.3, 0.0].map(Some));
