@@ -1,5 +1,7 @@
 //! The page for everybody: by keyboard alone, with a screen reader's names, on a phone, at 200 % zoom, in dark and light.
 
+use std::time::Duration;
+
 use tests::browser::Browser;
 use tests::{CellUnderTest, steady_weights};
 
@@ -117,21 +119,45 @@ fn everybody_can_use_it() {
 
     // Hold to pour: it goes on while the button or Enter is held, and ends when it is let go of, or when the page is lost.
     browser.run("document.getElementById('hold').click()");
-    for (k, key) in [None, Some(ENTER)].into_iter().enumerate() {
-        says(&browser, "Ready to pour");
-        browser.fill("#goal", "90");
-        browser.click("#foresee");
-        browser.wait("the focus on the button that pours", SOON, "return document.activeElement.id === 'go'");
-        browser.hold("#go", key);
-        says(&browser, "Pouring 90 ml");
-        std::thread::sleep(std::time::Duration::from_secs(1));
-        assert_eq!(cell.status().expect("running")["phase"], "pouring", "it is held");
+    for key in [None, Some(ENTER)] {
+        let held = (0..TRIES).any(|_| is_held_for_a_second(&browser, &cell, key));
+        assert!(held, "it goes on while it is held");
+        let before = outcomes(&cell);
         if key.is_none() {
             browser.screenshot(&picture("held"));
             browser.let_go();
         } else {
             browser.go("about:blank");
         }
-        cell.wait("the end", SOON, |s| s["phase"] == "idle" && s["outcomes"][k + 1]["reason"] == "aborted");
+        cell.wait("the end", SOON, |s| s["phase"] == "idle" && s["outcomes"][before]["reason"] == "aborted");
     }
+}
+
+/// A browser that stands still for longer than the page's time to let go ends what it holds, as it shall. A busy machine does that to it now and then,
+/// but not each time.
+const TRIES: usize = 5;
+
+fn outcomes(cell: &CellUnderTest) -> usize {
+    cell.status().expect("running")["outcomes"].as_array().map_or(0, Vec::len)
+}
+
+/// Orders 90 ml, holds the button with the mouse or a key, and tells whether the pour goes on for a second. If not, all is let go of and at rest.
+fn is_held_for_a_second(browser: &Browser, cell: &CellUnderTest, key: Option<&str>) -> bool {
+    let before = outcomes(cell);
+    says(browser, "Ready to pour");
+    browser.fill("#goal", "90");
+    browser.click("#foresee");
+    browser.wait("the focus on the button that pours", SOON, "return document.activeElement.id === 'go'");
+    browser.hold("#go", key);
+    let pours = || cell.status().expect("running")["phase"] == "pouring";
+    let has_ended = || outcomes(cell) > before;
+    cell.wait("a pour or its end", SOON, |s| s["phase"] == "pouring" || s["outcomes"].as_array().is_some_and(|o| o.len() > before));
+    std::thread::sleep(Duration::from_secs(1));
+    if pours() && !has_ended() {
+        says(browser, "Pouring 90 ml");
+        return true;
+    }
+    browser.let_go();
+    cell.wait("the end", SOON, |s| s["phase"] == "idle" && s["outcomes"][before]["reason"] == "aborted");
+    false
 }
