@@ -1,6 +1,7 @@
 //! The extraction on drawn pictures whose triangle is known.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::too_many_lines)]
 
+mod clear;
 mod drawn;
 mod ground;
 

@@ -135,17 +135,22 @@ pub(crate) struct ClearWater {
 }
 
 impl ClearWater {
-    /// For a region of `region_px` (width, height) of a picture `width_px` wide; `axes` are relative to the region.
-    pub(crate) fn new(axes: &Axes, region_px: [i32; 2], width_px: u32) -> opencv::Result<Self> {
+    /// For a region of `region_px` (width, height) of a picture `width_px` wide; `axes` are relative to the region. `None` if no outline that
+    /// is tried lies in the region, so that no stream would ever be seen.
+    pub(crate) fn new(axes: &Axes, region_px: [i32; 2], width_px: u32) -> opencv::Result<Option<Self>> {
         let scale = (width_px as f32 / WIDTH_PX).round().max(1.0);
         let size = Size::new((region_px[0] / scale as i32).max(8), (region_px[1] / scale as i32).max(8));
         let axes = Axes { lip_px: axes.lip_px.map(|v| small(v, scale)), ..*axes };
         let rays = Rays::new(&axes, size);
-        Ok(Self {
+        let lines = Lines::new(axes, &rays, size);
+        if lines.is_empty() {
+            return Ok(None);
+        }
+        Ok(Some(Self {
             scale,
             size,
             axes,
-            lines: Lines::new(axes, &rays, size),
+            lines,
             background: Background::new(size)?,
             light: Light::new(size),
             flicker: Flicker::new(size),
@@ -166,7 +171,7 @@ impl ClearWater {
             unseen: u32::MAX,
             confirmed: 0,
             known_share: 0.0,
-        })
+        }))
     }
 
     /// Height above the rim's light, px.
@@ -206,7 +211,7 @@ impl ClearWater {
             if !told {
                 self.light.divide_out(&mut self.now, &self.background, height_px, wet)?;
             }
-            self.evidence.compare(&self.rays, &self.now, &self.earlier, &self.background, height_px)?;
+            self.evidence.compare(&self.rays, [&self.now, &self.earlier], &self.background, height_px, self.flicker.flickers())?;
             self.looked = true;
             let moved = self.background.moved();
             self.evidence.weigh(&self.rays, &moved, self.water.stream())?;
@@ -234,7 +239,7 @@ impl ClearWater {
             } else {
                 (self.unseen, self.confirmed) = (self.unseen.saturating_add(1), 0);
             }
-            if self.water.is_elsewhere(self.evidence.strange_share()) {
+            if self.water.is_elsewhere(self.evidence.strange_share(), self.held) {
                 self.background.forget()?;
             }
         }
@@ -250,17 +255,22 @@ impl ClearWater {
         self.even_share < EVEN_LEAST
     }
 
+    /// As [`Evidence::shares`], of the triangle with these legs, px.
+    fn shares(&self, legs_px: [f32; 2]) -> [f32; 2] {
+        let [gain, _] = self.background.gains();
+        self.evidence.shares(&self.rays, self.line_share(legs_px), !self.is_pattern(), gain)
+    }
+
     /// Whether ground that is known has changed where a small stream would be.
     fn lip_has_changed(&self) -> bool {
-        let [_, wet] = self.evidence.shares(&self.rays, self.line_share([LIP_PX; 2]));
+        let [_, wet] = self.shares([LIP_PX; 2]);
         wet >= LIP_CHANGED
     }
 
     /// Takes what is dry over into the memory of the background, and chooses the picture with which the next ones are compared.
     #[inline(always)]
     fn remember(&mut self, height_px: LinearField) -> opencv::Result<()> {
-        // An even ground that the stream hid is told by what is around it, so it need not be spared.
-        let spared = self.held && self.is_pattern();
+        let spared = self.held;
         let near = self.water.recent_legs_px(spared).map(|legs_px| {
             let [a, b] = legs_px.map(|v| v.max(1.0));
             // The outline bulges, and a stream grows from frame to frame.
@@ -377,7 +387,12 @@ impl Liquid for ClearWater {
     }
 
     fn dry_share(&self, legs_px: [f32; 2]) -> f32 {
-        let [dry, _] = self.evidence.shares(&self.rays, self.line_share(legs_px.map(|v| v / self.scale)));
+        let legs_px = legs_px.map(|v| v / self.scale);
+        // Inside a stream that is wider than the region there is no edge, and its water takes as little light as a lamp that has dimmed.
+        if self.lines.may_leave(legs_px) {
+            return 0.0;
+        }
+        let [dry, _] = self.shares(legs_px);
         dry
     }
 

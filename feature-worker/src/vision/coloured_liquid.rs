@@ -295,14 +295,15 @@ impl ColouredLiquid {
 
     /// Learns the ground in a picture in which this was seen, or does not. It is forgotten only while it is learned: what hides it for long must not
     /// make all of it foreign.
-    fn follow_ground(&mut self, sighting: Sighting) -> opencv::Result<()> {
+    /// A `drop` at the lip is no stream.
+    fn follow_ground(&mut self, sighting: Sighting, drop: bool) -> opencv::Result<()> {
         match sighting {
             // A lamp's reflection before white squares is no ground. The pictures after it are learned from as ever.
             Sighting::Dry { .. } | Sighting::Stream { doubt: Doubt::None, .. } | Sighting::Unsure(Doubt::BlownOut) if self.half_white => {}
             // A stream that was there before the surroundings of the lip were known may be there still, in other colours.
             Sighting::Dry { .. } if self.learn_after == 0 && self.held && self.dry_frames < DRY_FRAMES => {}
             Sighting::Dry { .. } if self.learn_after == 0 => self.learn(true)?,
-            Sighting::Stream { doubt: Doubt::None, .. } if self.learn_after == 0 => self.learn(false)?,
+            Sighting::Stream { doubt: Doubt::None, .. } if self.learn_after == 0 => self.learn(drop)?,
             // What may be liquid must not be taken for ground.
             Sighting::Dry { .. } | Sighting::Stream { doubt: Doubt::None, .. } => self.learn_after -= 1,
             _ => self.learn_after = LEARN_AFTER,
@@ -436,9 +437,10 @@ impl Liquid for ColouredLiquid {
         }
         // While the ground is not known, only pictures that it is learned from are dry, and those where a stream was just held (`Presence::is_gone` tells).
         let unknown = (self.dry_frames < DRY_FRAMES && self.learn_after > 0).then_some(Doubt::EdgeNotFound);
-        self.follow_ground(sighting)?;
+        let drop = matches!(sighting, Sighting::Stream { doubt: Doubt::None, .. }) && self.axes.fan_px2(edges_px) < self.area_min_px2;
+        self.follow_ground(sighting, drop)?;
         // A liquid in the ground's colours is not seen.
-        let untold = self.wandering.doubt().or(unknown).filter(|_| matches!(sighting, Sighting::Dry { .. }));
+        let untold = self.wandering.doubt().or(unknown).filter(|_| drop || matches!(sighting, Sighting::Dry { .. }));
         Ok(untold.map_or(sighting, Sighting::Unsure))
     }
 

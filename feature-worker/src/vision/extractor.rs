@@ -96,7 +96,10 @@ impl Extractor {
         let edges = Vec::with_capacity(grid.rays.len());
         let liquid: Box<dyn Liquid> = match image.method {
             LiquidMethod::Colour => Box::new(ColouredLiquid::new(image, camera.width_px, axes, grid)?),
-            LiquidMethod::Clear => Box::new(ClearWater::new(&axes, region_px, camera.width_px)?),
+            LiquidMethod::Clear => {
+                let water = ClearWater::new(&axes, region_px, camera.width_px)?;
+                Box::new(water.ok_or_else(|| fail("there is no room for the outline of a stream"))?)
+            }
         };
         Ok(Self {
             size_px: [camera.width_px, camera.height_px],
@@ -263,7 +266,10 @@ impl Extractor {
         let corner = |r: f32, axis: [f32; 2]| self.in_image(self.axes.at(r, axis));
         let ([x0, y0], [x1, y1], [x2, y2]) = (corner(0.0, self.axes.x), corner(a, self.axes.x), corner(b, self.axes.y));
         let doubt = if doubt == Doubt::None && fine.width_px > BLURRED_PX { Doubt::Blurred } else { doubt };
-        self.presence.saw(area_px2, fine.legs_px, self.light_bgr());
+        match doubt {
+            Doubt::ColoursChanged => self.presence.saw_part(area_px2, fine.legs_px, self.light_bgr()),
+            _ => self.presence.saw(area_px2, fine.legs_px, self.light_bgr()),
+        }
         Measurement { area_px2, confidence: fine.confidence, doubt, triangle_px: [x0, y0, x1, y1, x2, y2] }
     }
 }

@@ -116,6 +116,13 @@ impl Axes {
         })
     }
 
+    /// Area of the fan from the lip over `points_px`, which lie in order around it, px^2.
+    pub(crate) fn fan_px2(&self, points_px: &[[f32; 2]]) -> f32 {
+        let from_lip = |p: &[f32; 2]| [p[0] - self.lip_px[0], p[1] - self.lip_px[1]];
+        let pairs = points_px.iter().map(from_lip).zip(points_px.iter().skip(1).map(from_lip));
+        pairs.map(|(p, q)| 0.5 * (p[0] * q[1] - p[1] * q[0]).abs()).sum()
+    }
+
     /// The cuts of a line with the x-axis and the y-axis, px from the lip.
     pub(crate) fn legs_px(&self, line: &Line) -> [f32; 2] {
         [line.cut(self.lip_px, self.x), line.cut(self.lip_px, self.y)]

@@ -79,6 +79,14 @@ impl Presence {
         self.needed = ((self.patience * PICTURES_PER_DOUBLING * doublings) as u32).clamp(1, most.max(1));
     }
 
+    /// A stream was seen of which no more than a part was measured, as [`Self::saw`] says: it is no smaller than what was there before.
+    pub(crate) fn saw_part(&mut self, area_px2: f32, legs_px: [f32; 2], bgr: [f32; 3]) {
+        if self.legs_px.is_none() {
+            self.saw(area_px2, legs_px, bgr);
+        }
+        self.saw_unsure(true);
+    }
+
     /// There may be a stream that was not measured. It `lasts` where something foreign lies at the lip, or the liquid's colours are not told:
     /// then the next pictures have to show none.
     pub(crate) fn saw_unsure(&mut self, lasts: bool) {

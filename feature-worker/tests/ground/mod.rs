@@ -306,3 +306,41 @@ fn a_root_in_own_colours_hides_no_stream() -> Result<(), ExtractError> {
     }
     Ok(())
 }
+
+/// Protects vessels with a drop at the lip from the first picture on: it does not keep the ground from getting known, so a stream in other colours is
+/// never "nothing", nor learned as ground.
+#[test]
+fn a_drop_from_the_first_picture_on_hides_no_stream() -> Result<(), ExtractError> {
+    let mut extractor = colour()?;
+    for i in 0..110 {
+        let mut picture = dry(0.0, i)?;
+        if i >= 44 {
+            lay_over(&mut picture, &[stream(40.0, 36.0)], OTHER)?;
+        } else {
+            lay_over(&mut picture, &[stream(7.0, 7.0)], OWN)?;
+        }
+        let measured = measure(&mut extractor, &picture)?;
+        assert_eq!(is_told(&measured), i >= 44, "picture {i}: {measured:?}");
+    }
+    Ok(())
+}
+
+/// Protects the pictures after a stream of which all but a root has taken other colours: what it leaves is not dry from one picture to the next.
+#[test]
+fn a_root_does_not_stand_for_its_stream() -> Result<(), ExtractError> {
+    let mut extractor = colour()?;
+    for i in 0..100 {
+        let mut picture = dry(0.0, i)?;
+        if (40..50).contains(&i) {
+            lay_over(&mut picture, &[stream(90.0, 80.0)], if i < 46 { OWN } else { OTHER })?;
+            lay_over(&mut picture, &[stream(12.0, 10.0)], OWN)?;
+        }
+        let measured = measure(&mut extractor, &picture)?;
+        match i {
+            40..54 => assert!(is_told(&measured), "picture {i}: {measured:?}"),
+            0..40 | 65.. => assert_eq!((measured.area_px2, measured.doubt), (0.0, Doubt::None), "picture {i}"),
+            _ => {}
+        }
+    }
+    Ok(())
+}

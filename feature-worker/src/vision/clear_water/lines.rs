@@ -138,6 +138,19 @@ impl Lines {
         Self { axes, log_legs: legs_px.iter().map(|l: &[f32; 2]| l.map(f32::ln)).collect(), legs_px, cells, weights }
     }
 
+    /// Whether no line lies in the region.
+    pub(super) fn is_empty(&self) -> bool {
+        self.legs_px.is_empty()
+    }
+
+    /// Whether a stream with these legs, px, is so large that it may leave the region from one picture to the next.
+    pub(super) fn may_leave(&self, legs_px: [f32; 2]) -> bool {
+        (0..2).any(|k| {
+            let most = self.legs_px.iter().map(|legs| legs[k]).fold(0.0, f32::max);
+            legs_px[k] * GROWS_MOST.exp() >= most
+        })
+    }
+
     /// Cuts of a line with the x-axis and the y-axis, px.
     pub(super) fn legs_px(&self, line: usize) -> [f32; 2] {
         self.legs_px[line]

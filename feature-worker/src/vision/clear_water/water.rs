@@ -254,14 +254,15 @@ impl Water {
         self.last_legs_px = legs_px;
     }
 
-    /// Counts frames of another picture. After too many of them the water is forgotten, and true is returned: what stands there now is the
-    /// background.
+    /// Counts frames of another picture. After too many of them true is returned: what stands there now is the background. A stream that is seen,
+    /// or is `held` because its end was not seen, makes another picture itself and must not become the background, so nothing is counted then.
     #[inline(always)]
-    pub(super) fn is_elsewhere(&mut self, strange_share: f32) -> bool {
-        self.strange_frames = if strange_share > STRANGE { self.strange_frames + 1 } else { 0 };
+    pub(super) fn is_elsewhere(&mut self, strange_share: f32, held: bool) -> bool {
+        let strange = strange_share > STRANGE && self.stream.is_none() && !held;
+        self.strange_frames = if strange { self.strange_frames + 1 } else { 0 };
         let elsewhere = self.strange_frames > STRANGE_FRAMES;
         if elsewhere {
-            (self.strange_frames, self.stream, self.dry_frames) = (0, None, AFTERWARDS + 1);
+            (self.strange_frames, self.dry_frames) = (0, AFTERWARDS + 1);
         }
         elsewhere
     }

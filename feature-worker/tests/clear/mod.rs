@@ -1,0 +1,60 @@
+//! What the extraction of clear water says while the ground changes, and of streams that are larger than the region. On drawn pictures.
+
+use super::drawn::{camera, image_config, lay_over, noisy, water};
+use super::measure;
+use feature_worker::vision::{ExtractError, Extractor, Measurement};
+use opencv::core::{Mat, Scalar};
+use shared::config::{ImageConfig, LiquidMethod};
+use shared::messages::Doubt;
+
+fn clear() -> Result<Extractor, ExtractError> {
+    Extractor::new(&camera(), &image_config(LiquidMethod::Clear))
+}
+
+/// Whether the picture is not called dry: something is measured, or there is a doubt.
+fn is_told(measured: &Measurement) -> bool {
+    measured.area_px2 > 0.0 || measured.doubt != Doubt::None
+}
+
+/// Clear water before an even wall, on the right part of which lies a shadow.
+fn shadowed(share: f32, seed: i32) -> Result<Mat, ExtractError> {
+    let mut picture = water(share, None, seed)?;
+    lay_over(&mut picture, &[vec![[300.0, 0.0], [640.0, 0.0], [640.0, 245.0], [300.0, 245.0]]], Scalar::all(110.0))?;
+    Ok(noisy(&picture, seed)?)
+}
+
+/// Protects pours while something is laid behind the container: the new ground is learned, but not the stream with it, so what flows is never
+/// "nothing" within the three seconds after which no pour goes on.
+#[test]
+fn a_stream_is_not_learned_with_new_ground() -> Result<(), ExtractError> {
+    let mut extractor = clear()?;
+    for i in 0..110 {
+        let share = ((i - 5) as f32 / 8.0).clamp(0.0, 1.0);
+        let picture = if i < 24 { water(share, None, i)? } else { shadowed(share, i)? };
+        let measured = measure(&mut extractor, &picture)?;
+        assert!(share < 0.3 || is_told(&measured), "picture {i}: {measured:?}");
+    }
+    Ok(())
+}
+
+/// Protects pours of a stream that grows beyond the region, slowly or fast: it is no dry picture.
+#[test]
+fn a_stream_larger_than_the_region_is_told() -> Result<(), ExtractError> {
+    for grows in [0.15f32, 0.4, 1.0] {
+        let mut extractor = clear()?;
+        for i in 0..90 {
+            let share = ((i - 9) as f32 * grows).clamp(0.0, 4.0);
+            let measured = measure(&mut extractor, &water(share, None, i)?)?;
+            assert!(share < 0.3 || is_told(&measured), "{grows} picture {i}: {measured:?}");
+        }
+    }
+    Ok(())
+}
+
+/// Protects the operator from a region in which no outline of clear water fits: every picture would be dry.
+#[test]
+fn a_region_without_room_for_an_outline_is_refused() {
+    let image = ImageConfig { region_px: [205, 238, 40, 40], ..image_config(LiquidMethod::Clear) };
+    let said = Extractor::new(&camera(), &image).err().expect("refused").to_string();
+    assert!(said.contains("image.region_px") && said.contains("room"), "{said}");
+}
