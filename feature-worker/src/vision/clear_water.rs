@@ -231,7 +231,7 @@ impl ClearWater {
                 _ if self.light.flickers() => Sighting::Unsure(Doubt::LightFlickers),
                 (Verdict::Unsure, _) => Sighting::Unsure(Doubt::EdgeNotFound),
                 _ if self.flicker.flickers() && self.unseen < FLICKER_PICTURES => Sighting::Unsure(Doubt::LightFlickers),
-                _ if self.is_pattern() && self.lip_has_changed() => Sighting::Unsure(Doubt::EdgeNotFound),
+                _ if self.lip_has_changed() => Sighting::Unsure(Doubt::EdgeNotFound),
                 _ => sighting,
             };
             if matches!(sighting, Sighting::Stream { .. }) {
@@ -422,7 +422,8 @@ impl Liquid for ClearWater {
 
     fn confirm(&mut self, line: Option<FineLine>, mean_level: f32) -> Result<FineLine, Doubt> {
         let sine = self.axes.sine().abs();
-        let line = self.water.confirm(line, mean_level, self.scale, sine, self.evidence.even() && !self.held)?;
+        let sure = self.evidence.even() && !self.held && !self.lip_has_changed();
+        let line = self.water.confirm(line, mean_level, self.scale, sine, sure)?;
         // What bands left over is elsewhere in the next picture.
         self.confirmed += 1;
         if self.confirmed < FLICKER_PICTURES && self.flicker.flickers() { Err(Doubt::LightFlickers) } else { Ok(line) }

@@ -1,9 +1,10 @@
 //! What the extraction of clear water says while the ground changes, and of streams that are larger than the region. On drawn pictures.
 
-use super::drawn::{camera, image_config, lay_over, noisy, water};
+use super::drawn::{camera, image_config, lay_over, noisy, stream, water};
 use super::measure;
 use feature_worker::vision::{ExtractError, Extractor, Measurement};
-use opencv::core::{Mat, Scalar};
+use opencv::core::{self, CV_8UC3, Mat, Scalar, Size};
+use opencv::imgproc;
 use shared::config::{ImageConfig, LiquidMethod};
 use shared::messages::Doubt;
 
@@ -46,6 +47,27 @@ fn a_stream_larger_than_the_region_is_told() -> Result<(), ExtractError> {
             let share = ((i - 9) as f32 * grows).clamp(0.0, 4.0);
             let measured = measure(&mut extractor, &water(share, None, i)?)?;
             assert!(share < 0.3 || is_told(&measured), "{grows} picture {i}: {measured:?}");
+        }
+    }
+    Ok(())
+}
+
+/// Protects the first pictures of a stream before an even wall: what makes the ground at the lip darker, but shows no edge yet, is no dry picture.
+#[test]
+fn a_stream_that_begins_without_an_edge_is_told() -> Result<(), ExtractError> {
+    for (legs, level) in [(16.0, 190.0), (24.0, 190.0), (40.0, 215.0)] {
+        let mut extractor = clear()?;
+        let mut shade = Mat::new_rows_cols_with_default(480, 640, CV_8UC3, Scalar::all(255.0))?;
+        lay_over(&mut shade, &[stream(legs, 0.9 * legs)], Scalar::all(level))?;
+        let mut soft = Mat::default();
+        imgproc::gaussian_blur(&shade, &mut soft, Size::new(0, 0), 16.0, 16.0, core::BORDER_REFLECT_101)?;
+        for i in 0..24 {
+            let mut picture = water(0.0, None, i)?;
+            if i >= 12 {
+                core::multiply(&picture.clone(), &soft, &mut picture, 1.0 / 255.0, -1)?;
+            }
+            let measured = measure(&mut extractor, &picture)?;
+            assert_eq!(is_told(&measured), i >= 12, "{legs} picture {i}: {measured:?}");
         }
     }
     Ok(())
