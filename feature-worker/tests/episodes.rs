@@ -194,17 +194,18 @@ fn pruning_deletes_no_more_than_it_must() {
         (code(&output), serde_json::from_slice::<serde_json::Value>(&output.stdout).unwrap())
     };
     let there = |files: &[PathBuf]| files.iter().map(|f| f.exists()).collect::<Vec<_>>();
-    let (ended, said) = prune(&["--budget-episodes", "3"]);
+    // The foreign file and the one that is being written count too.
+    let (ended, said) = prune(&["--budget-episodes", "5"]);
     assert_eq!((ended, said["episodes"].as_array().unwrap().len(), said["deleted"].as_bool()), (0, 2, Some(false)));
     assert_eq!(there(&files), [true; 6], "without --yes nothing is deleted");
-    let (ended, said) = prune(&["--budget-episodes", "3", "--yes"]);
-    assert_eq!((ended, said["stay"]["episodes"].as_u64()), (0, Some(3)));
+    let (ended, said) = prune(&["--budget-episodes", "5", "--yes"]);
+    assert_eq!((ended, said["stay"]["episodes"].as_u64()), (0, Some(5)));
     assert_eq!(there(&files), [true, false, true, false, true, true], "the oldest that is neither weighed nor being written");
     assert_eq!(said["kept"].as_array().unwrap().len(), 3, "a foreign file, a link, one that is being written: {said}");
-    let (ended, said) = prune(&["--budget-episodes", "1", "--yes"]);
+    let (ended, said) = prune(&["--budget-episodes", "3", "--yes"]);
     assert_eq!((ended, said["stay"]["within_budget"].as_bool()), (1, Some(false)), "the weighed one is spared");
     assert_eq!(there(&files), [true, false, true, false, false, true]);
-    let (ended, _) = prune(&["--budget-episodes", "1", "--yes", "--weighed"]);
+    let (ended, _) = prune(&["--budget-episodes", "3", "--yes", "--weighed"]);
     assert_eq!((ended, there(&files)), (0, vec![false, false, true, false, false, true]));
     assert!(foreign.exists() && std::fs::symlink_metadata(dir.path().join("link.mcap")).is_ok());
 
@@ -217,6 +218,57 @@ fn pruning_deletes_no_more_than_it_must() {
     assert_eq!((delete(&files[2], &["--yes"]), files[2].exists()), (2, true), "it is being written");
     drop(held);
     assert_eq!((delete(&files[2], &["--yes"]), files[2].exists()), (0, false));
+}
+
+/// Protects the newest episode, and one that is named twice: a directory counts once by however many ways it is named, and a wrong name is no empty
+/// budget.
+#[test]
+fn a_directory_that_is_named_twice_counts_once() {
+    let dir = tempfile::tempdir().unwrap();
+    let recorded = dir.path().join("recorded");
+    let file = write(&recorded, 50.0);
+    let other = dir.path().join("other");
+    std::os::unix::fs::symlink(&recorded, &other).unwrap();
+    let ways = [recorded.clone(), recorded.join("../recorded"), other, file.clone()].map(|p| p.display().to_string());
+    let [plain, dots, link, name] = ways.each_ref().map(String::as_str);
+    let prune = |words: &[&str]| code(&episodes(&[&["prune", "--budget-mb", "0", "--budget-episodes", "1", "--yes"][..], words].concat()));
+    assert_eq!((prune(&[plain, plain, dots, link, name]), file.exists()), (0, true));
+    assert_eq!(prune(&[plain, "nowhere"]), 2);
+    assert_eq!((code(&episodes(&["delete", name, name, "--yes"])), file.exists()), (0, false), "it is deleted, so nothing is wrong");
+}
+
+/// Protects weights and data sets: of two copies of a measurement the weighed one is taken, whichever comes first, and what is still being written is
+/// left out by name and exit code.
+#[test]
+fn a_merge_keeps_the_weight_and_waits_for_the_end() {
+    let dir = tempfile::tempdir().unwrap();
+    let recorded = dir.path().join("recorded");
+    let first = write(&recorded, 50.0);
+    let [second, third] = ["episode-0007.mcap", "episode-0008.mcap"].map(|name| recorded.join(name));
+    for (copy, weight_g) in [(&second, 104.0), (&third, 105.0)] {
+        std::fs::copy(&first, copy).unwrap();
+        shared::episode::set_weight(copy, weight_g).unwrap();
+    }
+    let copied = |command: &[&str], to: &str| {
+        let to = dir.path().join(to);
+        let output = episodes(&[&[command[0], recorded.to_str().unwrap(), "--to", to.to_str().unwrap()][..], &command[1..]].concat());
+        let to = if command[0] == "split" { to.join("all") } else { to };
+        let files = shared::episode::find_episodes(&[to]).unwrap();
+        let weights: Vec<Option<f64>> = files.iter().map(|f| Episode::read(f).unwrap().weight_g).collect();
+        (code(&output), weights, String::from_utf8(output.stdout).unwrap())
+    };
+    for (command, to) in [(&["merge"][..], "merged"), (&["split", "--share", "all=1"], "parts")] {
+        let (ended, weights, said) = copied(command, to);
+        assert_eq!((ended, weights), (0, vec![Some(104.0)]), "{said}");
+        assert!(said.contains("whose weight is 104 g and not 105 g"), "{said}");
+    }
+    let held = std::fs::File::open(&first).unwrap();
+    held.try_lock().unwrap();
+    let bytes = std::fs::read(write(&dir.path().join("cut"), 60.0)).unwrap();
+    std::fs::write(recorded.join("episode-0009.mcap"), &bytes[..bytes.len() * 2 / 3]).unwrap();
+    let (ended, weights, said) = copied(&["merge"], "later");
+    assert_eq!((ended, weights), (1, vec![Some(104.0)]), "{said}");
+    assert!(said.contains("it is being written") && said.contains("it may be under way"), "{said}");
 }
 
 /// Protects judgements from the data that was trained on: the parts of a split share no measurement, the same seed gives the same parts, and
