@@ -19,27 +19,40 @@ fn grey(n: u64) -> f64 {
     (n * 97 % 200 + 20) as f64
 }
 
+/// Time from frame to frame at 30 frames a second, ns.
+const PERIOD_NS: u64 = 33_333_333;
+
+/// A JPEG of one grey.
+fn picture(width: i32, grey: f64) -> Vec<u8> {
+    let picture = Mat::new_rows_cols_with_default(48, width, opencv::core::CV_8UC3, Scalar::all(grey)).unwrap();
+    let mut bytes = Vector::<u8>::new();
+    opencv::imgcodecs::imencode_def(".jpg", &picture, &mut bytes).unwrap();
+    bytes.to_vec()
+}
+
 /// Writes an episode of 40 frames, each with an image of its own grey. Frames 20 and 21 are lost.
 fn write(directory: &Path, lambda_deg: f32) -> PathBuf {
+    write_with(directory, lambda_deg, PERIOD_NS, |n| picture(64, grey(n)))
+}
+
+/// Writes an episode of 40 frames that are `period_ns` apart, with the images that `image` makes.
+fn write_with(directory: &Path, lambda_deg: f32, period_ns: u64, image: impl Fn(u64) -> Vec<u8>) -> PathBuf {
     let config = Config::read(&Path::new(env!("CARGO_MANIFEST_DIR")).join("../config/sim.toml")).unwrap();
     let kind = EpisodeKind::Recording(Curve { lambda_deg, gamma_per_s2: 0.5, beta_s: 2.0 });
     let start = EpisodeStart { episode: 1, kind, started_at_ns: 1_000_000_000, wall_clock: UNIX_EPOCH, config: &config, weights: "" };
     let mut writer = EpisodeWriter::create(directory, &start).unwrap();
     for n in 0..FRAMES {
-        let at_ns = 1_000_000_000 + n * 33_333_333;
+        let at_ns = 1_000_000_000 + n * period_ns;
         let tick =
             Telemetry { version: LAYOUT_VERSION, tick: n + 1, at_ns, robot_at_ns: at_ns, alpha_deg: lambda_deg, ..Default::default() };
         writer.telemetry(&tick).unwrap();
         if n == 20 || n == 21 {
             continue;
         }
-        let picture = Mat::new_rows_cols_with_default(48, 64, opencv::core::CV_8UC3, Scalar::all(grey(n))).unwrap();
-        let mut bytes = Vector::<u8>::new();
-        opencv::imgcodecs::imencode_def(".jpg", &picture, &mut bytes).unwrap();
         let area_px2 = if n > 10 { 100.0 + n as f32 } else { 0.0 };
         let feature =
             Feature { version: LAYOUT_VERSION, sequence: n + 1, captured_at_ns: at_ns + 5_000_000, area_px2, ..Default::default() };
-        let image = bytes.to_vec();
+        let image = image(n);
         let row =
             FrameRow { feature: &feature, alpha_commanded_deg: lambda_deg, alpha_measured_deg: lambda_deg, image: Some(("jpeg", &image)) };
         writer.frame(&row).unwrap();
@@ -175,6 +188,37 @@ fn a_file_that_cannot_be_read_does_not_stop_an_export() {
     }
     let none = episodes(&["export", recorded.join("episode-0000.mcap").to_str().unwrap(), "--as", "csv", "--to", "x"]);
     assert_eq!((code(&none), Path::new("x").exists()), (2, false), "nothing to export is a wrong input");
+}
+
+/// Protects data sets from episodes that do not fit, and exports from one picture among many: what has a picture that is none, pictures of two sizes or
+/// another rate than the rest is named and left out, and the others are exported.
+#[test]
+fn an_episode_that_does_not_fit_does_not_stop_an_export() {
+    let dir = tempfile::tempdir().unwrap();
+    let recorded = dir.path().join("recorded");
+    write_with(&recorded, 50.0, 2 * PERIOD_NS, |n| picture(64, grey(n)));
+    write_with(&recorded, 51.0, PERIOD_NS, |n| if n == 10 { b"no picture".to_vec() } else { picture(64, grey(n)) });
+    write_with(&recorded, 52.0, PERIOD_NS, |n| if n == 10 { Vec::new() } else { picture(64, grey(n)) });
+    write_with(&recorded, 53.0, PERIOD_NS, |n| picture(if n < 10 { 64 } else { 80 }, grey(n)));
+    for lambda in [54.0, 55.0] {
+        write(&recorded, lambda);
+    }
+    let undecodable = ["0002.mcap: picture 11 cannot be decoded", "0003.mcap: picture 11 cannot be decoded"];
+    let size = "0004.mcap: picture 11 is 80 x 48 px, but those before it are 64 x 48 px";
+    let rate = "0001.mcap: it has 15.0 frames a second, and the data set 30.0";
+    for (format, whys) in [("video", [&undecodable[..], &[size]].concat()), ("lerobot", [&[rate], &undecodable[..], &[size]].concat())] {
+        let to = dir.path().join(format);
+        let output = episodes(&["export", recorded.to_str().unwrap(), "--as", format, "--to", to.to_str().unwrap(), "--json"]);
+        assert_eq!(code(&output), 1, "{format}: {}", String::from_utf8_lossy(&output.stderr));
+        let said: serde_json::Value = serde_json::from_slice(&output.stdout).unwrap();
+        let left_out: Vec<&str> = said["left_out"].as_array().unwrap().iter().map(|l| l["why"].as_str().unwrap()).collect();
+        assert!(left_out.len() == whys.len() && left_out.iter().zip(&whys).all(|(l, why)| l.contains(why)), "{format}: {said}");
+        let written = said["written"].as_array().unwrap().len();
+        assert_eq!(written, if format == "video" { 3 } else { 1 }, "{said}");
+    }
+    let info = std::fs::read(dir.path().join("lerobot/meta/info.json")).unwrap();
+    let info: serde_json::Value = serde_json::from_slice(&info).unwrap();
+    assert_eq!((info["total_episodes"].as_u64(), info["fps"].as_u64()), (Some(2), Some(30)));
 }
 
 /// Protects recordings and everything that lies beside them: pruning says first, spares what is weighed, under way, the newest, or not an

@@ -36,8 +36,8 @@ pub struct Exported {
     pub left_out: Vec<LeftOut>,
 }
 
-/// Writes the episodes of `files` into the directory `to`, which is made if it is missing. A file that cannot be read is left out and
-/// returned. Shows its progress on the terminal.
+/// Writes the episodes of `files` into the directory `to`, which is made if it is missing. A file that cannot be read, or has pictures that
+/// cannot be exported, is left out and returned. Shows its progress on the terminal.
 pub fn export(files: &[PathBuf], format: ExportFormat, to: &Path) -> Result<Exported, ExportError> {
     let (mut episodes, mut left_out) = (Vec::new(), Vec::new());
     for file in files {
@@ -73,9 +73,7 @@ pub fn export(files: &[PathBuf], format: ExportFormat, to: &Path) -> Result<Expo
             };
             match one {
                 Ok(path) => written.push(path),
-                Err(e @ (ExportError::Episode(_) | ExportError::Nothing(_))) => {
-                    left_out.push(LeftOut { file: file.clone(), why: e.to_string() });
-                }
+                Err(e) if e.spares_others() => left_out.push(LeftOut { file: file.clone(), why: e.to_string() }),
                 Err(e) => return Err(e),
             }
         }
@@ -116,10 +114,10 @@ fn video(file: &Path, episode: &Episode, target: &Path, bar: &ProgressBar) -> Re
     if target.exists() {
         return Err(write_error(target, "is there already; name another directory"));
     }
-    let mut video = Video::new(target, mean_rate_hz(episode));
+    let mut video = Video::new(file, target, mean_rate_hz(episode));
     let shown = for_each_row_with_image(file, episode, |image| {
         bar.inc(1);
-        video.push(image)
+        video.push(image).map(|_| ())
     });
     if let Err(e) = shown.and_then(|()| video.finish()) {
         // It was not there before, so it is ours, and half a video would look like a whole one.

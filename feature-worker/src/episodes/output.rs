@@ -24,9 +24,24 @@ pub enum ExportError {
         /// What went wrong.
         what: String,
     },
+    /// An episode cannot be exported for what is in it, although others can.
+    #[error("{file}: {what}")]
+    Unfit {
+        /// The episode's file.
+        file: String,
+        /// What is wrong.
+        what: String,
+    },
     /// There is nothing to export.
     #[error("{0}")]
     Nothing(String),
+}
+
+impl ExportError {
+    /// Whether it is about one episode alone, so that the others can be exported all the same.
+    pub fn spares_others(&self) -> bool {
+        matches!(self, Self::Episode(_) | Self::Unfit { .. })
+    }
 }
 
 /// A file that an export leaves out.
@@ -36,6 +51,11 @@ pub struct LeftOut {
     pub file: PathBuf,
     /// Why, in one line that names it.
     pub why: String,
+}
+
+/// The error of the episode `file`, in which something does not fit.
+pub fn unfit(file: &Path, what: impl std::fmt::Display) -> ExportError {
+    ExportError::Unfit { file: file.display().to_string(), what: what.to_string() }
 }
 
 /// The error of writing `path`.
