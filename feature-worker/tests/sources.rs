@@ -219,3 +219,16 @@ fn another_rate_is_refused() {
     let said = check_rate(30.0, 15.0).expect_err("accepted").to_string();
     assert!(said.contains("camera.fps = 30") && said.contains("camera.fps = 15") && said.lines().count() == 1, "{said}");
 }
+
+/// Protects scripts: a configuration, from the environment too, or an input that cannot be read is exit code 2 of `bench` and `camera` as of every command.
+#[test]
+fn bench_and_camera_refuse_what_cannot_be_read() {
+    let run = |words: &[&str], config: &str| {
+        let mut command = Command::new(env!("CARGO_BIN_EXE_feature-worker"));
+        command.args(words).env(shared::config::VARIABLE, config).output().unwrap().status.code()
+    };
+    let cell = concat!(env!("CARGO_MANIFEST_DIR"), "/../config/sim.toml");
+    assert_eq!(run(&["camera"], "nowhere.toml"), Some(2));
+    assert_eq!(run(&["bench", "--input", "nowhere.mp4"], "nowhere.toml"), Some(2));
+    assert_eq!(run(&["bench", "--no-python", "--input", "nowhere.mp4"], cell), Some(2));
+}
