@@ -1,4 +1,4 @@
-//! `scripts/install` on machines that are not as it wishes: the script itself, with programs of ours in place of apt's and Rust's.
+//! `scripts/install` and `scripts/check-package` on machines that are not as they wish: the scripts themselves, with programs of ours in place of apt's and Rust's.
 //!
 //! It starts short processes, which change nothing outside of a directory of their own.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic)]
@@ -61,4 +61,26 @@ fn ubuntu_goes_on_without_a_browser() {
     // A machine that has a browser of another kind is told nothing.
     let told = String::from_utf8_lossy(&output.stdout).contains("not installed: chromium-driver");
     assert!(told || ["/usr/bin/chromedriver", "/usr/sbin/chromedriver"].iter().any(|p| Path::new(p).exists()));
+}
+
+/// Protects whoever checks the package on a machine whose file systems are closed to setuid programs: it is said at once, not by sudo minutes later. It
+/// takes root, for such a file system.
+#[test]
+fn a_package_is_not_checked_where_sudo_cannot_work() {
+    let dir = tempfile::tempdir().unwrap();
+    program(dir.path(), "mmdebstrap", "exit 0");
+    let closed = |words: &str| {
+        let script = format!("mkdir -p out && mount -t tmpfs -o nosuid tmpfs out && exec {words}");
+        run(dir.path(), &["unshare", "-m", "--propagation", "private", "sh", "-c", &script])
+    };
+    if !closed("true").status.success() {
+        println!("not run: it takes root");
+        return;
+    }
+    program(dir.path(), "dpkg-query", "exit 1");
+    program(dir.path(), "apt-get", "exit 100");
+    let output = closed("scripts/check-package");
+    let said = String::from_utf8_lossy(&output.stderr);
+    assert_eq!((output.status.code(), said.lines().count()), (Some(2), 1), "{said}");
+    assert!(said.contains("mounted nosuid, noexec or nodev"), "{said}");
 }
