@@ -384,6 +384,14 @@ fn names_that_are_taken_are_all_said_before_anything_is_written() {
     assert!(said.contains(name(1).to_str().unwrap()) && !said.contains(name(0).to_str().unwrap()), "{said}");
     assert!(!to.exists(), "nothing was made");
 
+    for format in ["images", "video"] {
+        let from = [&monday, &tuesday, &to].map(|p| p.to_str().unwrap());
+        let output = episodes(&["export", from[0], from[1], "--as", format, "--to", from[2]]);
+        let said = String::from_utf8_lossy(&output.stderr).into_owned();
+        assert_eq!((code(&output), said.lines().count(), std::fs::read_dir(&to).unwrap().count()), (1, 1, 0), "{said}");
+        assert!(said.contains("come twice: episode-0002"), "{said}");
+    }
+
     let all = to.join("all");
     std::fs::create_dir_all(&all).unwrap();
     std::fs::write(all.join(name(0)), b"a letter").unwrap();

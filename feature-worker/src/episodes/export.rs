@@ -11,7 +11,7 @@ use shared::episode::{Episode, EpisodeImages, write_table};
 use shared::plural::counted;
 
 use super::lerobot;
-use super::output::{ExportError, LeftOut, disk_error, write_error};
+use super::output::{ExportError, LeftOut, all_free, disk_error};
 use super::video::{Video, for_each_row_with_image, mean_rate_hz};
 
 /// What an export writes.
@@ -65,11 +65,18 @@ pub fn export(files: &[PathBuf], format: ExportFormat, to: &Path) -> Result<Expo
         left_out.append(&mut lerobot::write(&episodes, to, &bar)?);
         written.push(to.to_path_buf());
     } else {
-        for (file, episode) in &episodes {
-            let target = to.join(file.file_stem().unwrap_or(file.as_os_str()));
+        let ending = if format == ExportFormat::Video { ".mp4" } else { "" };
+        let target = |file: &Path| {
+            let mut name = file.file_stem().unwrap_or(file.as_os_str()).to_os_string();
+            name.push(ending);
+            to.join(name)
+        };
+        let targets: Vec<PathBuf> = episodes.iter().map(|(file, _)| target(file)).collect();
+        all_free(to, targets.iter())?;
+        for ((file, episode), target) in episodes.iter().zip(&targets) {
             let one = match format {
-                ExportFormat::Video => video(file, episode, &target.with_extension("mp4"), &bar),
-                _ => pictures(file, &target, &bar),
+                ExportFormat::Video => video(file, episode, target, &bar),
+                _ => pictures(file, target, &bar),
             };
             match one {
                 Ok(path) => written.push(path),
@@ -111,9 +118,6 @@ fn pictures(file: &Path, target: &Path, bar: &ProgressBar) -> Result<PathBuf, Ex
 
 /// Writes the images of one episode as the new video `target`.
 fn video(file: &Path, episode: &Episode, target: &Path, bar: &ProgressBar) -> Result<PathBuf, ExportError> {
-    if target.exists() {
-        return Err(write_error(target, "is there already; name another directory"));
-    }
     let mut video = Video::new(file, target, mean_rate_hz(episode));
     let shown = for_each_row_with_image(file, episode, |image| {
         bar.inc(1);

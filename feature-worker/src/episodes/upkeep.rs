@@ -4,7 +4,6 @@
 //! a regular file of its own name, and not under way: the recorder holds a lock on the file that it writes. Copies are compared with the
 //! original before they get their name, and never take the place of a file. A failure names its file, and leaves the rest as it is.
 
-use std::collections::BTreeSet;
 use std::fs;
 use std::io::ErrorKind;
 use std::os::unix::fs::MetadataExt;
@@ -16,7 +15,7 @@ use shared::episode::{Episode, hex, take_number};
 use shared::{regular_file, whole_file};
 
 use super::folder::{Budget, Folder};
-use super::output::{ExportError, LeftOut, disk_error, write_error};
+use super::output::{ExportError, LeftOut, all_free, disk_error, write_error};
 
 /// A file without its end that changed more recently than this counts as under way, also where the file system has no locks. Chosen by hand:
 /// the recorder writes twice a second.
@@ -198,18 +197,6 @@ pub fn split(files: &[PathBuf], to: &Path, shares: &[(String, f64)], seed: u64) 
     }
     copied.left_out.extend(all.map(|(file, _)| left_out(&file, "the shares leave it out")));
     Ok(copied)
-}
-
-/// Whether no name of `new`, files below `to`, is taken: by anything that lies there, or by another one of them. All that are taken are in the error.
-fn all_free<'a>(to: &Path, new: impl Iterator<Item = &'a PathBuf>) -> Result<(), ExportError> {
-    let mut once = BTreeSet::new();
-    let taken: BTreeSet<&Path> =
-        new.filter(|path| !once.insert(*path) || fs::symlink_metadata(path).is_ok()).map(PathBuf::as_path).collect();
-    if taken.is_empty() {
-        return Ok(());
-    }
-    let names: Vec<String> = taken.iter().map(|path| path.strip_prefix(to).unwrap_or(path).display().to_string()).collect();
-    Err(write_error(to, format!("nothing is copied, because these names are taken or come twice: {}", names.join(", "))))
 }
 
 /// Copies an episode to the new file `new`, under a name that no program takes for an episode until it is whole and on the disk.
