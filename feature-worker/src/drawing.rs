@@ -122,7 +122,7 @@ pub fn save(picture: &Mat, path: &Path) -> Result<(), String> {
     }
     // What is replaced begins as it does: a picture of the same format.
     let begins = bytes.as_slice().get(..2).unwrap_or_default();
-    whole_file::replace(path, bytes.as_slice(), begins).map_err(|e| e.to_string())
+    whole_file::replace_soon(path, bytes.as_slice(), begins).map_err(|e| e.to_string())
 }
 
 /// Lets OpenCV work in the calling thread alone. The error is one line.

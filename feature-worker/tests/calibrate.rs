@@ -79,6 +79,25 @@ fn coordinates_are_taken_and_nothing_is_written_unasked() -> Outcome {
     Ok(())
 }
 
+/// Protects a pour that was shown: a page's port that is taken is said before anything is looked at, and a picture that cannot be written costs no
+/// section.
+#[test]
+fn nothing_is_lost_to_a_port_or_a_picture() -> Outcome {
+    let directory = tempfile::tempdir()?;
+    let pattern = frames(directory.path())?;
+    let (path, _) = write_config(directory.path(), "kept", |_| {})?;
+    let taken = std::net::TcpListener::bind(("127.0.0.1", 0))?;
+    let port = taken.local_addr()?.port().to_string();
+    let output = calibrate(&path, &directory.path().join("look.png"), &["--page", "--port", &port, &pattern])?;
+    let said = String::from_utf8_lossy(&output.stderr).into_owned();
+    assert_eq!((output.status.code(), output.stdout.len(), said.lines().count()), (Some(1), 0, 1), "{said}");
+    assert!(said.contains("give another --port") && !directory.path().join("look.png").exists(), "{said}");
+    let output = calibrate(&path, &directory.path().join("look.none"), &[&pattern])?;
+    assert_eq!(output.status.code(), Some(1));
+    assert!(String::from_utf8_lossy(&output.stdout).starts_with("[image]"), "{}", String::from_utf8_lossy(&output.stderr));
+    Ok(())
+}
+
 /// Protects people from a calibration that means nothing: frames without edges and a pour without liquid are refused, and the error says
 /// what to do instead.
 #[test]

@@ -19,27 +19,40 @@ fn grey(n: u64) -> f64 {
     (n * 97 % 200 + 20) as f64
 }
 
+/// Time from frame to frame at 30 frames a second, ns.
+const PERIOD_NS: u64 = 33_333_333;
+
+/// A JPEG of one grey.
+fn picture(width: i32, grey: f64) -> Vec<u8> {
+    let picture = Mat::new_rows_cols_with_default(48, width, opencv::core::CV_8UC3, Scalar::all(grey)).unwrap();
+    let mut bytes = Vector::<u8>::new();
+    opencv::imgcodecs::imencode_def(".jpg", &picture, &mut bytes).unwrap();
+    bytes.to_vec()
+}
+
 /// Writes an episode of 40 frames, each with an image of its own grey. Frames 20 and 21 are lost.
 fn write(directory: &Path, lambda_deg: f32) -> PathBuf {
+    write_with(directory, lambda_deg, PERIOD_NS, |n| picture(64, grey(n)))
+}
+
+/// Writes an episode of 40 frames that are `period_ns` apart, with the images that `image` makes.
+fn write_with(directory: &Path, lambda_deg: f32, period_ns: u64, image: impl Fn(u64) -> Vec<u8>) -> PathBuf {
     let config = Config::read(&Path::new(env!("CARGO_MANIFEST_DIR")).join("../config/sim.toml")).unwrap();
     let kind = EpisodeKind::Recording(Curve { lambda_deg, gamma_per_s2: 0.5, beta_s: 2.0 });
     let start = EpisodeStart { episode: 1, kind, started_at_ns: 1_000_000_000, wall_clock: UNIX_EPOCH, config: &config, weights: "" };
     let mut writer = EpisodeWriter::create(directory, &start).unwrap();
     for n in 0..FRAMES {
-        let at_ns = 1_000_000_000 + n * 33_333_333;
+        let at_ns = 1_000_000_000 + n * period_ns;
         let tick =
             Telemetry { version: LAYOUT_VERSION, tick: n + 1, at_ns, robot_at_ns: at_ns, alpha_deg: lambda_deg, ..Default::default() };
         writer.telemetry(&tick).unwrap();
         if n == 20 || n == 21 {
             continue;
         }
-        let picture = Mat::new_rows_cols_with_default(48, 64, opencv::core::CV_8UC3, Scalar::all(grey(n))).unwrap();
-        let mut bytes = Vector::<u8>::new();
-        opencv::imgcodecs::imencode_def(".jpg", &picture, &mut bytes).unwrap();
         let area_px2 = if n > 10 { 100.0 + n as f32 } else { 0.0 };
         let feature =
             Feature { version: LAYOUT_VERSION, sequence: n + 1, captured_at_ns: at_ns + 5_000_000, area_px2, ..Default::default() };
-        let image = bytes.to_vec();
+        let image = image(n);
         let row =
             FrameRow { feature: &feature, alpha_commanded_deg: lambda_deg, alpha_measured_deg: lambda_deg, image: Some(("jpeg", &image)) };
         writer.frame(&row).unwrap();
@@ -177,6 +190,37 @@ fn a_file_that_cannot_be_read_does_not_stop_an_export() {
     assert_eq!((code(&none), Path::new("x").exists()), (2, false), "nothing to export is a wrong input");
 }
 
+/// Protects data sets from episodes that do not fit, and exports from one picture among many: what has a picture that is none, pictures of two sizes or
+/// another rate than the rest is named and left out, and the others are exported.
+#[test]
+fn an_episode_that_does_not_fit_does_not_stop_an_export() {
+    let dir = tempfile::tempdir().unwrap();
+    let recorded = dir.path().join("recorded");
+    write_with(&recorded, 50.0, 2 * PERIOD_NS, |n| picture(64, grey(n)));
+    write_with(&recorded, 51.0, PERIOD_NS, |n| if n == 10 { b"no picture".to_vec() } else { picture(64, grey(n)) });
+    write_with(&recorded, 52.0, PERIOD_NS, |n| if n == 10 { Vec::new() } else { picture(64, grey(n)) });
+    write_with(&recorded, 53.0, PERIOD_NS, |n| picture(if n < 10 { 64 } else { 80 }, grey(n)));
+    for lambda in [54.0, 55.0] {
+        write(&recorded, lambda);
+    }
+    let undecodable = ["0002.mcap: picture 11 cannot be decoded", "0003.mcap: picture 11 cannot be decoded"];
+    let size = "0004.mcap: picture 11 is 80 x 48 px, but those before it are 64 x 48 px";
+    let rate = "0001.mcap: it has 15.0 frames a second, and the data set 30.0";
+    for (format, whys) in [("video", [&undecodable[..], &[size]].concat()), ("lerobot", [&[rate], &undecodable[..], &[size]].concat())] {
+        let to = dir.path().join(format);
+        let output = episodes(&["export", recorded.to_str().unwrap(), "--as", format, "--to", to.to_str().unwrap(), "--json"]);
+        assert_eq!(code(&output), 1, "{format}: {}", String::from_utf8_lossy(&output.stderr));
+        let said: serde_json::Value = serde_json::from_slice(&output.stdout).unwrap();
+        let left_out: Vec<&str> = said["left_out"].as_array().unwrap().iter().map(|l| l["why"].as_str().unwrap()).collect();
+        assert!(left_out.len() == whys.len() && left_out.iter().zip(&whys).all(|(l, why)| l.contains(why)), "{format}: {said}");
+        let written = said["written"].as_array().unwrap().len();
+        assert_eq!(written, if format == "video" { 3 } else { 1 }, "{said}");
+    }
+    let info = std::fs::read(dir.path().join("lerobot/meta/info.json")).unwrap();
+    let info: serde_json::Value = serde_json::from_slice(&info).unwrap();
+    assert_eq!((info["total_episodes"].as_u64(), info["fps"].as_u64()), (Some(2), Some(30)));
+}
+
 /// Protects recordings and everything that lies beside them: pruning says first, spares what is weighed, under way, the newest, or not an
 /// episode of ours, and goes no further than the budget asks.
 #[test]
@@ -194,17 +238,18 @@ fn pruning_deletes_no_more_than_it_must() {
         (code(&output), serde_json::from_slice::<serde_json::Value>(&output.stdout).unwrap())
     };
     let there = |files: &[PathBuf]| files.iter().map(|f| f.exists()).collect::<Vec<_>>();
-    let (ended, said) = prune(&["--budget-episodes", "3"]);
+    // The foreign file and the one that is being written count too.
+    let (ended, said) = prune(&["--budget-episodes", "5"]);
     assert_eq!((ended, said["episodes"].as_array().unwrap().len(), said["deleted"].as_bool()), (0, 2, Some(false)));
     assert_eq!(there(&files), [true; 6], "without --yes nothing is deleted");
-    let (ended, said) = prune(&["--budget-episodes", "3", "--yes"]);
-    assert_eq!((ended, said["stay"]["episodes"].as_u64()), (0, Some(3)));
+    let (ended, said) = prune(&["--budget-episodes", "5", "--yes"]);
+    assert_eq!((ended, said["stay"]["episodes"].as_u64()), (0, Some(5)));
     assert_eq!(there(&files), [true, false, true, false, true, true], "the oldest that is neither weighed nor being written");
     assert_eq!(said["kept"].as_array().unwrap().len(), 3, "a foreign file, a link, one that is being written: {said}");
-    let (ended, said) = prune(&["--budget-episodes", "1", "--yes"]);
+    let (ended, said) = prune(&["--budget-episodes", "3", "--yes"]);
     assert_eq!((ended, said["stay"]["within_budget"].as_bool()), (1, Some(false)), "the weighed one is spared");
     assert_eq!(there(&files), [true, false, true, false, false, true]);
-    let (ended, _) = prune(&["--budget-episodes", "1", "--yes", "--weighed"]);
+    let (ended, _) = prune(&["--budget-episodes", "3", "--yes", "--weighed"]);
     assert_eq!((ended, there(&files)), (0, vec![false, false, true, false, false, true]));
     assert!(foreign.exists() && std::fs::symlink_metadata(dir.path().join("link.mcap")).is_ok());
 
@@ -217,6 +262,57 @@ fn pruning_deletes_no_more_than_it_must() {
     assert_eq!((delete(&files[2], &["--yes"]), files[2].exists()), (2, true), "it is being written");
     drop(held);
     assert_eq!((delete(&files[2], &["--yes"]), files[2].exists()), (0, false));
+}
+
+/// Protects the newest episode, and one that is named twice: a directory counts once by however many ways it is named, and a wrong name is no empty
+/// budget.
+#[test]
+fn a_directory_that_is_named_twice_counts_once() {
+    let dir = tempfile::tempdir().unwrap();
+    let recorded = dir.path().join("recorded");
+    let file = write(&recorded, 50.0);
+    let other = dir.path().join("other");
+    std::os::unix::fs::symlink(&recorded, &other).unwrap();
+    let ways = [recorded.clone(), recorded.join("../recorded"), other, file.clone()].map(|p| p.display().to_string());
+    let [plain, dots, link, name] = ways.each_ref().map(String::as_str);
+    let prune = |words: &[&str]| code(&episodes(&[&["prune", "--budget-mb", "0", "--budget-episodes", "1", "--yes"][..], words].concat()));
+    assert_eq!((prune(&[plain, plain, dots, link, name]), file.exists()), (0, true));
+    assert_eq!(prune(&[plain, "nowhere"]), 2);
+    assert_eq!((code(&episodes(&["delete", name, name, "--yes"])), file.exists()), (0, false), "it is deleted, so nothing is wrong");
+}
+
+/// Protects weights and data sets: of two copies of a measurement the weighed one is taken, whichever comes first, and what is still being written is
+/// left out by name and exit code.
+#[test]
+fn a_merge_keeps_the_weight_and_waits_for_the_end() {
+    let dir = tempfile::tempdir().unwrap();
+    let recorded = dir.path().join("recorded");
+    let first = write(&recorded, 50.0);
+    let [second, third] = ["episode-0007.mcap", "episode-0008.mcap"].map(|name| recorded.join(name));
+    for (copy, weight_g) in [(&second, 104.0), (&third, 105.0)] {
+        std::fs::copy(&first, copy).unwrap();
+        shared::episode::set_weight(copy, weight_g).unwrap();
+    }
+    let copied = |command: &[&str], to: &str| {
+        let to = dir.path().join(to);
+        let output = episodes(&[&[command[0], recorded.to_str().unwrap(), "--to", to.to_str().unwrap()][..], &command[1..]].concat());
+        let to = if command[0] == "split" { to.join("all") } else { to };
+        let files = shared::episode::find_episodes(&[to]).unwrap();
+        let weights: Vec<Option<f64>> = files.iter().map(|f| Episode::read(f).unwrap().weight_g).collect();
+        (code(&output), weights, String::from_utf8(output.stdout).unwrap())
+    };
+    for (command, to) in [(&["merge"][..], "merged"), (&["split", "--share", "all=1"], "parts")] {
+        let (ended, weights, said) = copied(command, to);
+        assert_eq!((ended, weights), (0, vec![Some(104.0)]), "{said}");
+        assert!(said.contains("whose weight is 104 g and not 105 g"), "{said}");
+    }
+    let held = std::fs::File::open(&first).unwrap();
+    held.try_lock().unwrap();
+    let bytes = std::fs::read(write(&dir.path().join("cut"), 60.0)).unwrap();
+    std::fs::write(recorded.join("episode-0009.mcap"), &bytes[..bytes.len() * 2 / 3]).unwrap();
+    let (ended, weights, said) = copied(&["merge"], "later");
+    assert_eq!((ended, weights), (1, vec![Some(104.0)]), "{said}");
+    assert!(said.contains("it is being written") && said.contains("it may be under way"), "{said}");
 }
 
 /// Protects judgements from the data that was trained on: the parts of a split share no measurement, the same seed gives the same parts, and
@@ -287,6 +383,14 @@ fn names_that_are_taken_are_all_said_before_anything_is_written() {
     assert_eq!((ended, said.lines().count()), (1, 1), "{said}");
     assert!(said.contains(name(1).to_str().unwrap()) && !said.contains(name(0).to_str().unwrap()), "{said}");
     assert!(!to.exists(), "nothing was made");
+
+    for format in ["images", "video"] {
+        let from = [&monday, &tuesday, &to].map(|p| p.to_str().unwrap());
+        let output = episodes(&["export", from[0], from[1], "--as", format, "--to", from[2]]);
+        let said = String::from_utf8_lossy(&output.stderr).into_owned();
+        assert_eq!((code(&output), said.lines().count(), std::fs::read_dir(&to).unwrap().count()), (1, 1, 0), "{said}");
+        assert!(said.contains("come twice: episode-0002"), "{said}");
+    }
 
     let all = to.join("all");
     std::fs::create_dir_all(&all).unwrap();

@@ -219,3 +219,35 @@ fn another_rate_is_refused() {
     let said = check_rate(30.0, 15.0).expect_err("accepted").to_string();
     assert!(said.contains("camera.fps = 30") && said.contains("camera.fps = 15") && said.lines().count() == 1, "{said}");
 }
+
+/// Protects scripts: a configuration, from the environment too, or an input that cannot be read is exit code 2 of `bench` and `camera` as of every command.
+#[test]
+fn bench_and_camera_refuse_what_cannot_be_read() {
+    let run = |words: &[&str], config: &str| {
+        let mut command = Command::new(env!("CARGO_BIN_EXE_feature-worker"));
+        command.args(words).env(shared::config::VARIABLE, config).output().unwrap().status.code()
+    };
+    let cell = concat!(env!("CARGO_MANIFEST_DIR"), "/../config/sim.toml");
+    assert_eq!(run(&["camera"], "nowhere.toml"), Some(2));
+    assert_eq!(run(&["bench", "--input", "nowhere.mp4"], "nowhere.toml"), Some(2));
+    assert_eq!(run(&["bench", "--no-python", "--input", "nowhere.mp4"], cell), Some(2));
+}
+
+/// Protects the time of whoever inspects a pour on a slow disk: its pictures are not waited for one by one, but its table is.
+#[test]
+fn pictures_are_not_waited_for() -> Outcome {
+    let dir = tempfile::tempdir()?;
+    let (config, _) = write_config(dir.path(), "soon", |_| {})?;
+    for i in 0..20 {
+        imgcodecs::imwrite(dir.path().join(format!("f_{i:03}.png")), &pour(i)?, &Vector::new())?;
+    }
+    let (log, out) = (dir.path().join("log"), dir.path().join("out"));
+    let mut command = Command::new("strace");
+    command.args(["-f", "-e", "trace=fsync,fdatasync", "-o"]).arg(&log).arg(env!("CARGO_BIN_EXE_feature-worker"));
+    command.args(["inspect", "--config"]).arg(&config).arg("--out").arg(&out).arg(dir.path().join("f_%03d.png"));
+    let output = command.output().map_err(|e| format!("strace is installed (scripts/install strace): {e}"))?;
+    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+    let waits = std::fs::read_to_string(&log)?.matches("sync(").count();
+    assert_eq!((std::fs::read_dir(&out)?.count(), waits), (21, 2), "20 pictures; the table and its directory are put on the disk");
+    Ok(())
+}

@@ -12,6 +12,7 @@ use serde::{Deserialize, Serialize};
 use shared::config::Config;
 use shared::config_paths::is_same;
 use shared::regular_file;
+use shared::runtime_dir::{check_base, own_uid};
 
 use crate::journal::before;
 
@@ -103,8 +104,9 @@ fn check_others(directory: &Path, this: &Running) -> Result<(), String> {
     Ok(())
 }
 
-/// The controller whose runtime directory is `directory`, if it runs.
+/// The controller whose runtime directory is `directory`, if it runs and the directory has an [`owner`].
 pub fn running(directory: &Path) -> Option<Running> {
+    owner(directory)?;
     let bytes = regular_file::read(&directory.join("controller"), FILE_MAX).ok()?;
     let found: Running = serde_json::from_slice(&bytes).ok()?;
     (started(found.pid) == Some(found.started)).then_some(found)
@@ -121,7 +123,13 @@ pub fn started(pid: u32) -> Option<u64> {
     is_ours.then(|| fields.nth(18)?.parse().ok()).flatten()
 }
 
-/// The user who owns the runtime directory of a cell; its controller runs as that user.
+/// The user as whom the controller of a cell runs, who owns its runtime directory. `None` where there is none, and where neither root nor this user
+/// has chosen who: another user could have made it to answer in the cell's place.
 pub fn owner(directory: &Path) -> Option<u32> {
-    directory.symlink_metadata().ok().map(|m| m.uid())
+    let (owner, base) = (directory.symlink_metadata().ok()?.uid(), directory.parent()?);
+    check_base(base).ok()?;
+    let trusted = |uid: u32| [0, own_uid()].contains(&uid);
+    // A link leads where its owner wants, and where all may write anybody may have made the directory.
+    let is_closed = base.metadata().ok()?.mode() & 0o022 == 0;
+    (trusted(base.symlink_metadata().ok()?.uid()) && (is_closed || trusted(owner))).then_some(owner)
 }

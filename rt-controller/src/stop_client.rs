@@ -1,7 +1,8 @@
 //! The clients' side of the stop socket ([`crate::stop`]): finds the controllers that run, and asks them to stop the motion.
 //!
 //! It needs no shared memory. It runs in ordinary threads of other processes, allocates, and waits for an answer a moment at most. Who
-//! answers is checked: the socket's server must be the user whose cell it is, or root.
+//! answers is checked: the socket's server must be the user whose cell it is, or root. Whose it is says the owner of its runtime directory, if
+//! root or this user has chosen where that lies ([`claim::owner`]): so a group may stop the cell of the user `decant`, and nobody can answer for it.
 
 use std::collections::BTreeMap;
 use std::io::{BufRead, BufReader, Write};
@@ -27,7 +28,7 @@ pub struct Target {
     pub name: String,
     /// The user as whom its controller runs.
     uid: u32,
-    /// The cell's runtime directories, those that may be there.
+    /// The cell's runtime directories that are there and have an owner.
     directories: Vec<PathBuf>,
 }
 
@@ -38,6 +39,7 @@ impl From<Place> for Target {
             directories.extend(bases().into_iter().map(|b| b.join(&place.name)));
             directories.dedup();
         }
+        directories.retain(|d| claim::owner(d).is_some());
         let uid = directories.iter().find(|d| d.join("stop").exists()).and_then(|d| claim::owner(d)).unwrap_or_else(own_uid);
         Self { name: place.name, uid, directories }
     }
@@ -99,4 +101,47 @@ fn ask_at(address: &SocketAddr, uid: u32, line: &str) -> Option<StopAnswer> {
     let mut answer = String::new();
     BufReader::new(&stream).read_line(&mut answer).ok()?;
     serde_json::from_str(&answer).ok()
+}
+
+#[cfg(test)]
+mod tests {
+    use std::os::unix::fs::{PermissionsExt, chown, symlink};
+
+    use super::*;
+
+    /// Protects who aborts from an answer of somebody else: a directory that another user may have made tells nothing of a cell, and one in root's
+    /// directory tells whose cell it is, as that of the user `decant` in /run/decant. It takes root, to act for another user.
+    #[test]
+    fn a_strangers_directory_says_nothing() {
+        if own_uid() != 0 {
+            println!("not run: it takes root");
+            return;
+        }
+        let dir = tempfile::tempdir().unwrap();
+        let base = dir.path().join("base");
+        let cell = base.join("lab");
+        std::fs::create_dir_all(&cell).unwrap();
+        std::fs::write(cell.join("stop"), "").unwrap();
+        let found = |base: &std::path::Path| {
+            let target = Target::from(Place { name: "lab".into(), base: Some(base.into()) });
+            (target.uid, target.directories.len())
+        };
+        let mode = |mode| std::fs::set_permissions(&base, std::fs::Permissions::from_mode(mode)).unwrap();
+        mode(0o755);
+        chown(&cell, Some(65534), None).unwrap();
+        assert_eq!(found(&base), (65534, 1), "root has put it there");
+        mode(0o1777);
+        assert_eq!(found(&base), (0, 0), "anybody may have put it there");
+        mode(0o755);
+        chown(&base, Some(65534), None).unwrap();
+        assert_eq!(found(&base), (0, 0), "another user has put it there");
+        chown(&cell, Some(0), None).unwrap();
+        chown(&base, Some(0), None).unwrap();
+        assert_eq!(found(&base), (0, 1), "our own");
+        let link = dir.path().join("link");
+        symlink(&base, &link).unwrap();
+        assert_eq!(found(&link), (0, 1));
+        std::os::unix::fs::lchown(&link, Some(65534), None).unwrap();
+        assert_eq!(found(&link), (0, 0), "another user may lead it elsewhere");
+    }
 }

@@ -47,7 +47,7 @@ mod weight;
 pub mod write;
 
 pub use number::take_number;
-pub use read::{EpisodeImage, EpisodeImages, began_at, find_episodes};
+pub use read::{EpisodeImage, EpisodeImages, began_at, each_once, find_episodes};
 pub use records::EpisodeError;
 pub use recover::recover;
 pub use rewrite::ChangeError;

@@ -323,6 +323,10 @@ fn a_file_is_locked_while_it_is_written() {
     let writer = EpisodeWriter::create(dir.path(), &start(&config)).unwrap();
     let path = writer.path().to_path_buf();
     assert!(std::fs::File::open(&path).unwrap().try_lock().is_err());
+    let new = dir.path().join("new.mcap");
+    for refused in [set_note(&path, "x").map(|_| ()), set_weight(&path, 80.0).map(|_| ()), recover(&path, &new).map(|_| ())] {
+        assert!(matches!(refused, Err(ChangeError::UnderWay { .. })) && !new.exists(), "{refused:?}");
+    }
     writer.finish(&EpisodeEnd { complete: true, reason: "over", disordered_frames: 0 }).unwrap();
     assert!(std::fs::File::open(&path).unwrap().try_lock().is_ok());
 }

@@ -41,7 +41,7 @@ pub struct Args {
     #[arg(long)]
     partial: bool,
     /// The configuration that belongs to --input.
-    #[arg(long)]
+    #[arg(long, env = shared::config::VARIABLE)]
     config: Option<PathBuf>,
     /// Leave Python out.
     #[arg(long)]
@@ -66,30 +66,27 @@ struct BenchRow {
 
 /// Runs the command.
 pub fn run(args: &Args) -> Result<(), Failure> {
-    bench(args).or_exit(exit::FAILED)
-}
-
-fn bench(args: &Args) -> Result<(), String> {
     let words = |e: opencv::Error| e.message;
-    opencv::core::set_num_threads(1).map_err(words)?;
+    opencv::core::set_num_threads(1).map_err(words).or_exit(exit::FAILED)?;
     let mut rows = Vec::new();
     if let (Some(input), Some(file)) = (&args.input, &args.config) {
-        let config = Config::read(file).map_err(|e| e.to_string())?;
+        let config = Config::read(file).or_exit(exit::BAD_INPUT)?;
         let mut frames = Vec::new();
         let contents = for_each_frame(std::slice::from_ref(input), config.camera.fps, args.partial, |frame| {
             if frames.len() < INPUT_FRAMES {
                 frames.push(to_bgr(&frame).map_err(words)?);
             }
             Ok(())
-        })?;
+        });
+        let contents = contents.or_exit(exit::BAD_INPUT)?;
         contents.missing.iter().for_each(|line| eprintln!("bench: {line}"));
-        rows.push(row("input".into(), &config.camera, &config.image, &frames, args)?);
+        rows.push(row("input".into(), &config.camera, &config.image, &frames, args).or_exit(exit::FAILED)?);
     } else {
         for (scale, size) in [(1.0, "640x480"), (2.0, "1280x720")] {
             for (method, name) in [(LiquidMethod::Colour, "colour"), (LiquidMethod::Clear, "clear")] {
                 let (camera, image) = drawn::config(scale, method);
-                let frames = drawn::pictures(&camera, &image).map_err(words)?;
-                rows.push(row(format!("{size} {name}"), &camera, &image, &frames, args)?);
+                let frames = drawn::pictures(&camera, &image).map_err(words).or_exit(exit::FAILED)?;
+                rows.push(row(format!("{size} {name}"), &camera, &image, &frames, args).or_exit(exit::FAILED)?);
             }
         }
     }

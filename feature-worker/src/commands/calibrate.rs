@@ -5,7 +5,7 @@
 //! command-line program that allocates. It changes nothing but the `[image]` table of the configuration, and that only with --write or a
 //! click.
 
-use std::net::IpAddr;
+use std::net::{IpAddr, TcpListener};
 use std::path::PathBuf;
 use std::sync::atomic::Ordering::Relaxed;
 use std::time::{Duration, Instant};
@@ -81,7 +81,7 @@ pub struct Args {
     #[arg(long)]
     page: bool,
     /// The page's port on 127.0.0.1. With 0 any free port is taken.
-    #[arg(long, default_value_t = 8643)]
+    #[arg(long, default_value_t = 8646)]
     port: u16,
     /// End when standard input ends, because the program that started this one has gone.
     #[arg(long, hide = true)]
@@ -116,6 +116,8 @@ struct Proposal {
 
 fn calibrate(args: &Args, mut config: Config) -> Result<(), Failure> {
     let bad = |e: String| failure(exit::BAD_INPUT, e);
+    // A port that is taken is said before anybody pours.
+    let port = if args.page { Some(Server::bind(IpAddr::from([127, 0, 0, 1]), args.port)?) } else { None };
     let pour = if args.input.is_empty() {
         watch(args, &config)?
     } else {
@@ -143,15 +145,21 @@ fn calibrate(args: &Args, mut config: Config) -> Result<(), Failure> {
     };
     if let Some(Proposal { image, remarks }) = &proposal {
         config.image = image.clone();
-        save_picture(args, &config, &pour.pictures)?;
         println!("{}", section::text(&config.image));
         remarks.iter().for_each(|line| eprintln!("calibrate: {line}"));
-        eprintln!("calibrate: look at {}", args.picture.display());
+        match save_picture(args, &config, &pour.pictures) {
+            // The page shows the picture too, and another pour would be needed for it.
+            Err(e) if args.page => eprintln!("calibrate: {}", e.what),
+            saved => {
+                saved?;
+                eprintln!("calibrate: look at {}", args.picture.display());
+            }
+        }
         if args.write {
             section::write(&args.config, &config)?;
         }
     }
-    if args.page { serve(args, config, corner, &pour, proposal.is_some()) } else { Ok(()) }
+    port.map_or(Ok(()), |port| serve(args, port, (config, corner), &pour, proposal.is_some()))
 }
 
 /// Watches the configured camera for a while.
@@ -259,10 +267,11 @@ fn save_picture(args: &Args, config: &Config, pictures: &[Mat]) -> Result<(), Fa
     save(&picture, &args.picture).map_err(|e| fail(format!("{e}; give another --picture")))
 }
 
-/// Serves the page until "Write" or Ctrl-C. `good` tells whether `config` passed all checks; nothing else is written.
-fn serve(args: &Args, mut config: Config, mut corner: Corner, pour: &Pour, mut good: bool) -> Result<(), Failure> {
+/// Serves the page on `port` until "Write" or Ctrl-C. `good` tells whether the configuration passed all checks; nothing else is written.
+fn serve(args: &Args, port: TcpListener, start: (Config, Corner), pour: &Pour, mut good: bool) -> Result<(), Failure> {
+    let (mut config, mut corner) = start;
     let stop = os::stop_at_signals().or_exit(exit::FAILED)?;
-    let server = Server::open(IpAddr::from([127, 0, 0, 1]), args.port, Settings::default())?;
+    let server = Server::on(port, Settings::default())?;
     let pictures = &pour.pictures;
     // Drawing measures every picture of the pour, so it is done once for each corner, however often it is asked for.
     let mut drawn: Option<Vec<u8>> = None;

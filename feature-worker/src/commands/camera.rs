@@ -21,7 +21,7 @@ white_balance_k, focus and mains_hz, each a value or \"locked\". `run` sets them
 )]
 pub struct Args {
     /// Also judge the camera that this configuration names.
-    #[arg(long)]
+    #[arg(long, env = shared::config::VARIABLE)]
     config: Option<PathBuf>,
     /// Print JSON.
     #[arg(long)]

@@ -44,8 +44,8 @@ enum Command {
     /// Writes the scale's reading into an episode.
     #[command(after_help = "Example:\n  feature-worker episodes weigh out/episodes/episode-0001.mcap --weight 104")]
     Weigh(WeighArgs),
-    /// Writes episodes as tables, images, videos or a LeRobot data set. A file that cannot be read is left out and said at the end; the exit
-    /// code is then 1.
+    /// Writes episodes as tables, images, videos or a LeRobot data set. A file that cannot be read, or whose pictures or rate do not fit, is
+    /// left out and said at the end; the exit code is then 1.
     #[command(after_help = "Examples:\n  feature-worker episodes export out/episodes --as csv --to out/table\n  \
         feature-worker episodes export out/episodes/episode-0001.mcap --as video --to out/video")]
     Export(ExportArgs),
@@ -239,7 +239,7 @@ fn weigh(args: &WeighArgs) -> Result<(), Failure> {
 
 fn run_export(args: &ExportArgs) -> Result<(), Failure> {
     let code = |e: &ExportError| match e {
-        ExportError::Episode(_) | ExportError::Nothing(_) => exit::BAD_INPUT,
+        ExportError::Episode(_) | ExportError::Unfit { .. } | ExportError::Nothing(_) => exit::BAD_INPUT,
         ExportError::Table(_) | ExportError::Write { .. } => exit::FAILED,
     };
     let shown = |path: &Path| path.display().to_string();

@@ -11,7 +11,7 @@ use shared::episode::{Episode, EpisodeImages, write_table};
 use shared::plural::counted;
 
 use super::lerobot;
-use super::output::{ExportError, LeftOut, disk_error, write_error};
+use super::output::{ExportError, LeftOut, all_free, disk_error};
 use super::video::{Video, for_each_row_with_image, mean_rate_hz};
 
 /// What an export writes.
@@ -36,8 +36,8 @@ pub struct Exported {
     pub left_out: Vec<LeftOut>,
 }
 
-/// Writes the episodes of `files` into the directory `to`, which is made if it is missing. A file that cannot be read is left out and
-/// returned. Shows its progress on the terminal.
+/// Writes the episodes of `files` into the directory `to`, which is made if it is missing. A file that cannot be read, or has pictures that
+/// cannot be exported, is left out and returned. Shows its progress on the terminal.
 pub fn export(files: &[PathBuf], format: ExportFormat, to: &Path) -> Result<Exported, ExportError> {
     let (mut episodes, mut left_out) = (Vec::new(), Vec::new());
     for file in files {
@@ -65,17 +65,22 @@ pub fn export(files: &[PathBuf], format: ExportFormat, to: &Path) -> Result<Expo
         left_out.append(&mut lerobot::write(&episodes, to, &bar)?);
         written.push(to.to_path_buf());
     } else {
-        for (file, episode) in &episodes {
-            let target = to.join(file.file_stem().unwrap_or(file.as_os_str()));
+        let ending = if format == ExportFormat::Video { ".mp4" } else { "" };
+        let target = |file: &Path| {
+            let mut name = file.file_stem().unwrap_or(file.as_os_str()).to_os_string();
+            name.push(ending);
+            to.join(name)
+        };
+        let targets: Vec<PathBuf> = episodes.iter().map(|(file, _)| target(file)).collect();
+        all_free(to, targets.iter())?;
+        for ((file, episode), target) in episodes.iter().zip(&targets) {
             let one = match format {
-                ExportFormat::Video => video(file, episode, &target.with_extension("mp4"), &bar),
-                _ => pictures(file, &target, &bar),
+                ExportFormat::Video => video(file, episode, target, &bar),
+                _ => pictures(file, target, &bar),
             };
             match one {
                 Ok(path) => written.push(path),
-                Err(e @ (ExportError::Episode(_) | ExportError::Nothing(_))) => {
-                    left_out.push(LeftOut { file: file.clone(), why: e.to_string() });
-                }
+                Err(e) if e.spares_others() => left_out.push(LeftOut { file: file.clone(), why: e.to_string() }),
                 Err(e) => return Err(e),
             }
         }
@@ -113,13 +118,10 @@ fn pictures(file: &Path, target: &Path, bar: &ProgressBar) -> Result<PathBuf, Ex
 
 /// Writes the images of one episode as the new video `target`.
 fn video(file: &Path, episode: &Episode, target: &Path, bar: &ProgressBar) -> Result<PathBuf, ExportError> {
-    if target.exists() {
-        return Err(write_error(target, "is there already; name another directory"));
-    }
-    let mut video = Video::new(target, mean_rate_hz(episode));
+    let mut video = Video::new(file, target, mean_rate_hz(episode));
     let shown = for_each_row_with_image(file, episode, |image| {
         bar.inc(1);
-        video.push(image)
+        video.push(image).map(|_| ())
     });
     if let Err(e) = shown.and_then(|()| video.finish()) {
         // It was not there before, so it is ours, and half a video would look like a whole one.

@@ -46,12 +46,16 @@ pub fn recorded_today(directory: &Path) -> u64 {
 impl Folder {
     /// Looks at `directory`. One that is not there holds no episode.
     pub fn look(directory: &Path) -> Self {
-        let mut folder = Self::default();
-        for (_, meta) in episodes(directory) {
-            folder.episodes += 1;
-            folder.bytes += meta.len();
-        }
-        folder
+        Self::sum(episodes(directory).map(|(_, meta)| meta))
+    }
+
+    /// Looks at `files`. What is no regular file, or not there, is no episode.
+    pub fn of<'a>(files: impl Iterator<Item = &'a Path>) -> Self {
+        Self::sum(files.filter_map(|file| file.symlink_metadata().ok()).filter(Metadata::is_file))
+    }
+
+    fn sum(files: impl Iterator<Item = Metadata>) -> Self {
+        files.fold(Self::default(), |sum, meta| Self { episodes: sum.episodes + 1, bytes: sum.bytes + meta.len() })
     }
 }
 

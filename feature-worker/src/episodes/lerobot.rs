@@ -17,7 +17,7 @@ use serde_json::{Value, json};
 use shared::episode::{Episode, EpisodeKind, EpisodeRow};
 use shared::whole_file;
 
-use super::output::{ExportError, LeftOut, make_parent, write_error};
+use super::output::{ExportError, LeftOut, make_parent, unfit, write_error};
 use super::video::{USUAL_RATE_HZ, Video, for_each_row_with_image, mean_rate_hz};
 
 mod parquet_table;
@@ -33,20 +33,25 @@ const FILES_A_CHUNK: usize = 1000;
 /// Of this many images, one enters the images' statistics. Chosen by hand: neighbouring images are nearly the same.
 const IMAGE_STEP: usize = 10;
 
+/// The part by which an episode's rate may differ from the data set's. Chosen by hand: the rates of one camera scatter less, and the usual rates
+/// (24, 25, 30, 60) differ by more.
+const RATE_TOLERANCE: f64 = 0.03;
+
 /// Writes the data set of `episodes`, each with the file that it was read from, into the new directory `root`. Each image moves `bar` on by
-/// one. Returns what was left out: files without images, with images that cannot be read, or of another size than those before.
+/// one. The data set has the middle one of the episodes' rates. Returns what was left out: files without images, with images that cannot be
+/// read, of another size than those before, or at another rate.
 pub fn write(episodes: &[(PathBuf, Episode)], root: &Path, bar: &ProgressBar) -> Result<Vec<LeftOut>, ExportError> {
     if root.join("meta").exists() {
         return Err(write_error(root, "holds a data set already; name another directory"));
     }
-    let mut set = DataSet::new(episodes.first().map_or(USUAL_RATE_HZ, |(_, e)| mean_rate_hz(e)).round());
+    let mut rates_hz: Vec<f64> = episodes.iter().map(|(_, e)| mean_rate_hz(e)).collect();
+    rates_hz.sort_by(f64::total_cmp);
+    let mut set = DataSet::new(rates_hz.get(rates_hz.len() / 2).copied().unwrap_or(USUAL_RATE_HZ));
     let mut left_out = Vec::new();
     for (file, episode) in episodes {
         match set.add(file, episode, root, bar) {
             Ok(()) => {}
-            Err(e @ (ExportError::Episode(_) | ExportError::Nothing(_))) => {
-                left_out.push(LeftOut { file: file.clone(), why: e.to_string() })
-            }
+            Err(e) if e.spares_others() => left_out.push(LeftOut { file: file.clone(), why: e.to_string() }),
             Err(e) => return Err(e),
         }
     }
@@ -60,6 +65,9 @@ pub fn write(episodes: &[(PathBuf, Episode)], root: &Path, bar: &ProgressBar) ->
 
 /// The data set under way.
 struct DataSet {
+    /// The rate by the episodes' clocks, frames a second.
+    rate_hz: f64,
+    /// It as a whole number, as LeRobot wants it.
     fps: f64,
     tasks: Vec<String>,
     rows: DataTable,
@@ -70,13 +78,22 @@ struct DataSet {
 }
 
 impl DataSet {
-    fn new(fps: f64) -> Self {
+    fn new(rate_hz: f64) -> Self {
         let (rows, list) = (DataTable::default(), EpisodeTable::default());
-        Self { fps, tasks: Vec::new(), rows, list, images: ImageLevels::new(), video: None }
+        Self { rate_hz, fps: rate_hz.round(), tasks: Vec::new(), rows, list, images: ImageLevels::new(), video: None }
     }
 
     /// Writes the video of an episode and takes its rows. On failure the data set is as it was before.
     fn add(&mut self, file: &Path, episode: &Episode, root: &Path, bar: &ProgressBar) -> Result<(), ExportError> {
+        let own_hz = mean_rate_hz(episode);
+        if (own_hz / self.rate_hz - 1.0).abs() > RATE_TOLERANCE {
+            // LeRobot's clock is the row's number, so that rows of another rate would be shown too fast or too slow.
+            let set_hz = self.rate_hz;
+            return Err(unfit(
+                file,
+                format!("it has {own_hz:.1} frames a second, and the data set {set_hz:.1}; export it into another one"),
+            ));
+        }
         let number = self.list.length.len();
         let task = match episode.kind {
             EpisodeKind::Pour { goal_ml } => format!("pour {goal_ml} ml"),
@@ -107,20 +124,20 @@ impl DataSet {
     }
 
     fn write_video(&mut self, file: &Path, episode: &Episode, path: &Path, bar: &ProgressBar) -> Result<ImageLevels, ExportError> {
-        let mut video = Video::new(path, self.fps);
+        let mut video = Video::new(file, path, self.fps);
         let mut levels = ImageLevels::new();
         let mut shown = 0;
         let known = self.video.map(|(width, height, _)| (width, height));
         for_each_row_with_image(file, episode, |image| {
+            bar.inc(1);
+            let picture = video.push(image)?;
             if shown % IMAGE_STEP == 0 {
-                levels.add(image).map_err(|e| unreadable(file, &e.message))?;
+                levels.add(&picture).map_err(|e| unfit(file, e.message))?;
             }
             shown += 1;
-            bar.inc(1);
-            video.push(image)?;
             match (known, video.size()) {
                 (Some(first), Some(size)) if first != size => {
-                    Err(unreadable(file, &format!("its images are {} x {} px, those before {} x {} px", size.0, size.1, first.0, first.1)))
+                    Err(unfit(file, format!("its images are {} x {} px, those before {} x {} px", size.0, size.1, first.0, first.1)))
                 }
                 _ => Ok(()),
             }
@@ -187,11 +204,6 @@ impl DataSet {
             },
         })
     }
-}
-
-/// The error of an episode that cannot be exported, although others can.
-fn unreadable(file: &Path, what: &str) -> ExportError {
-    ExportError::Nothing(format!("{}: {what}", file.display()))
 }
 
 /// Writes the table of tasks. LeRobot reads this one with pandas and expects the task as the index.

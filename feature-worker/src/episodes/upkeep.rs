@@ -4,7 +4,6 @@
 //! a regular file of its own name, and not under way: the recorder holds a lock on the file that it writes. Copies are compared with the
 //! original before they get their name, and never take the place of a file. A failure names its file, and leaves the rest as it is.
 
-use std::collections::BTreeSet;
 use std::fs;
 use std::io::ErrorKind;
 use std::os::unix::fs::MetadataExt;
@@ -15,8 +14,8 @@ use sha2::{Digest, Sha256};
 use shared::episode::{Episode, hex, take_number};
 use shared::{regular_file, whole_file};
 
-use super::folder::Budget;
-use super::output::{ExportError, LeftOut, disk_error, write_error};
+use super::folder::{Budget, Folder};
+use super::output::{ExportError, LeftOut, all_free, disk_error, write_error};
 
 /// A file without its end that changed more recently than this counts as under way, also where the file system has no locks. Chosen by hand:
 /// the recorder writes twice a second.
@@ -37,24 +36,34 @@ pub struct Found {
 
 /// Looks whether `path` is an episode that may be deleted; if not, says why.
 pub fn look(path: &Path) -> Result<Found, LeftOut> {
-    let refuse = |why: &str| LeftOut { file: path.to_path_buf(), why: format!("{}: {why}", path.display()) };
-    let meta = fs::symlink_metadata(path).map_err(|e| refuse(&e.to_string()))?;
+    let meta = fs::symlink_metadata(path).map_err(|e| left_out(path, e))?;
     if !meta.is_file() {
-        return Err(refuse("it is a link or no regular file"));
+        return Err(left_out(path, "it is a link or no regular file"));
     }
-    let (file, _) = regular_file::open(path).map_err(|e| refuse(&e.to_string()))?;
-    match file.try_lock() {
+    let (episode, meta) = at_rest(path)?;
+    Ok(Found { path: path.to_path_buf(), bytes: meta.len(), episode, stamp: (meta.ino(), meta.mtime(), meta.mtime_nsec()) })
+}
+
+/// Reads an episode that nobody writes any more; if it cannot be read or is under way, says so.
+fn at_rest(path: &Path) -> Result<(Episode, fs::Metadata), LeftOut> {
+    let (file, meta) = regular_file::open(path).map_err(|e| left_out(path, e))?;
+    // Shared, so that two who look do not take each other for the recorder.
+    match file.try_lock_shared() {
         Ok(()) => {}
-        Err(fs::TryLockError::WouldBlock) => return Err(refuse("it is being written")),
+        Err(fs::TryLockError::WouldBlock) => return Err(left_out(path, "it is being written")),
         Err(fs::TryLockError::Error(e)) if e.kind() == ErrorKind::Unsupported => {}
-        Err(fs::TryLockError::Error(e)) => return Err(refuse(&e.to_string())),
+        Err(fs::TryLockError::Error(e)) => return Err(left_out(path, e)),
     }
     let episode = Episode::read(path).map_err(|e| LeftOut { file: path.to_path_buf(), why: e.to_string() })?;
     let age = meta.modified().ok().and_then(|t| SystemTime::now().duration_since(t).ok()).unwrap_or_default();
     if episode.info.ended.is_empty() && age < UNDER_WAY {
-        return Err(refuse("its end is missing and it changed within the last minute: it may be under way"));
+        return Err(left_out(path, "its end is missing and it changed within the last minute: it may be under way"));
     }
-    Ok(Found { path: path.to_path_buf(), bytes: meta.len(), episode, stamp: (meta.ino(), meta.mtime(), meta.mtime_nsec()) })
+    Ok((episode, meta))
+}
+
+fn left_out(path: &Path, why: impl std::fmt::Display) -> LeftOut {
+    LeftOut { file: path.to_path_buf(), why: format!("{}: {why}", path.display()) }
 }
 
 /// Deletes an episode, if it is still the one that was looked at.
@@ -67,9 +76,10 @@ pub fn delete(found: &Found) -> Result<(), ExportError> {
     fs::remove_file(&found.path).map_err(|e| fail(&e))
 }
 
-/// What is to go so that the rest is within `budget`: places in `found`, in the order of deletion. First go those that cannot be trained on for
-/// want of their end, then those without a weight, then, only if `weighed`, those with one; the oldest first. The newest of all stays.
-pub fn to_prune(found: &[Found], budget: Budget, weighed: bool) -> Vec<usize> {
+/// What is to go so that the rest, and what is `beside` it and cannot go, are within `budget`: places in `found`, in the order of deletion. First
+/// go those that cannot be trained on for want of their end, then those without a weight, then, only if `weighed`, those with one; the oldest
+/// first. The newest of all stays.
+pub fn to_prune(found: &[Found], beside: Folder, budget: Budget, weighed: bool) -> Vec<usize> {
     let age = |i: &usize| (&found[*i].episode.info.started_at_utc, &found[*i].path);
     let mut order: Vec<usize> = (0..found.len()).collect();
     order.sort_by_key(age);
@@ -81,7 +91,8 @@ pub fn to_prune(found: &[Found], budget: Budget, weighed: bool) -> Vec<usize> {
     };
     order.retain(|i| weighed || rank(i) < 2);
     order.sort_by_key(rank);
-    let (mut episodes, mut bytes) = (found.len(), found.iter().map(|f| f.bytes).sum::<u64>());
+    let mut episodes = found.len() + beside.episodes;
+    let mut bytes = found.iter().map(|f| f.bytes).sum::<u64>() + beside.bytes;
     order
         .into_iter()
         .take_while(|i| {
@@ -100,22 +111,37 @@ pub struct Copied {
     pub files: Vec<(PathBuf, PathBuf)>,
     /// What was left out.
     pub left_out: Vec<LeftOut>,
+    /// How many of `left_out` cannot be read or are under way; the others are copied under another name, or were not asked for.
+    pub missing: usize,
 }
 
-/// Reads `files`. The same measurement twice is taken once. It is an error if there is none.
+/// Reads `files`. The same measurement twice is taken once, from the file that says most. It is an error if there is none.
 fn distinct(files: &[PathBuf], copied: &mut Copied) -> Result<Vec<(PathBuf, Episode)>, ExportError> {
     let mut all: Vec<(PathBuf, Episode)> = Vec::new();
     for file in files {
-        match Episode::read(file) {
-            Ok(episode) => match all.iter().find(|(_, e)| e.content_sha256() == episode.content_sha256()) {
-                Some((first, _)) => {
-                    let why = format!("{}: the same measurement as {}", file.display(), first.display());
-                    copied.left_out.push(LeftOut { file: file.clone(), why });
-                }
-                None => all.push((file.clone(), episode)),
-            },
-            Err(e) => copied.left_out.push(LeftOut { file: file.clone(), why: e.to_string() }),
+        let mut other = match at_rest(file) {
+            Ok((episode, _)) => (file.clone(), episode),
+            Err(why) => {
+                copied.left_out.push(why);
+                copied.missing += 1;
+                continue;
+            }
+        };
+        let sha256 = other.1.content_sha256();
+        let Some(kept) = all.iter_mut().find(|(_, e)| e.content_sha256() == sha256) else {
+            all.push(other);
+            continue;
+        };
+        // A copy that was weighed or noted later would else be lost to the one that it was made of.
+        let says = |(_, e): &(PathBuf, Episode)| (e.weight_g.is_some(), e.complete, !e.info.note.is_empty());
+        if says(&other) > says(kept) {
+            std::mem::swap(kept, &mut other);
         }
+        let weights = match (other.1.weight_g, kept.1.weight_g) {
+            (Some(left), Some(taken)) if left != taken => format!(", whose weight is {taken} g and not {left} g"),
+            _ => String::new(),
+        };
+        copied.left_out.push(left_out(&other.0, format!("the same measurement as {}{weights}", kept.0.display())));
     }
     if all.is_empty() && copied.left_out.is_empty() {
         return Err(ExportError::Nothing("no episodes to copy; name .mcap files or a directory of them".into()));
@@ -169,23 +195,8 @@ pub fn split(files: &[PathBuf], to: &Path, shares: &[(String, f64)], seed: u64) 
         copy(&file, &episode, &new)?;
         copied.files.push((file, new));
     }
-    copied.left_out.extend(all.map(|(file, _)| {
-        let why = format!("{}: the shares leave it out", file.display());
-        LeftOut { file, why }
-    }));
+    copied.left_out.extend(all.map(|(file, _)| left_out(&file, "the shares leave it out")));
     Ok(copied)
-}
-
-/// Whether no name of `new`, files below `to`, is taken: by anything that lies there, or by another one of them. All that are taken are in the error.
-fn all_free<'a>(to: &Path, new: impl Iterator<Item = &'a PathBuf>) -> Result<(), ExportError> {
-    let mut once = BTreeSet::new();
-    let taken: BTreeSet<&Path> =
-        new.filter(|path| !once.insert(*path) || fs::symlink_metadata(path).is_ok()).map(PathBuf::as_path).collect();
-    if taken.is_empty() {
-        return Ok(());
-    }
-    let names: Vec<String> = taken.iter().map(|path| path.strip_prefix(to).unwrap_or(path).display().to_string()).collect();
-    Err(write_error(to, format!("nothing is copied, because these names are taken or come twice: {}", names.join(", "))))
 }
 
 /// Copies an episode to the new file `new`, under a name that no program takes for an episode until it is whole and on the disk.

@@ -11,7 +11,7 @@ use opencv::videoio::{
 };
 use shared::episode::{Episode, EpisodeError, EpisodeImage, EpisodeImages};
 
-use super::output::{ExportError, disk_error, write_error};
+use super::output::{ExportError, disk_error, unfit, write_error};
 
 /// The rate of an episode that is too short to have one, frames a second: that of the usual camera.
 pub const USUAL_RATE_HZ: f64 = 30.0;
@@ -51,20 +51,16 @@ pub fn for_each_row_with_image(
         }
         match &shown {
             Some(image) => take(image)?,
-            None => return Err(ExportError::Nothing(format!("{}: the episode has no images", file.display()))),
+            None => return Err(unfit(file, "the episode has no images")),
         }
     }
     Ok(())
 }
 
-/// An image of an episode as pixels, in OpenCV's order blue, green, red.
-pub fn decode(image: &EpisodeImage) -> opencv::Result<Mat> {
-    let bytes: Vector<u8> = Vector::from_slice(&image.data);
-    imgcodecs::imdecode(&bytes, imgcodecs::IMREAD_COLOR)
-}
-
 /// A video file being written. Its size is that of the first image.
 pub struct Video {
+    /// The episode.
+    file: PathBuf,
     path: PathBuf,
     fps: f64,
     writer: Option<(VideoWriter, Size)>,
@@ -74,15 +70,20 @@ pub struct Video {
 }
 
 impl Video {
-    /// A video that will be written to `path` with `fps` frames a second. The file appears with the first image.
-    pub fn new(path: &Path, fps: f64) -> Self {
-        Self { path: path.into(), fps, writer: None, codec: "", pushed: 0 }
+    /// A video of the episode `file` that will be written to `path` with `fps` frames a second. The file appears with the first image.
+    pub fn new(file: &Path, path: &Path, fps: f64) -> Self {
+        Self { file: file.into(), path: path.into(), fps, writer: None, codec: "", pushed: 0 }
     }
 
-    /// Adds an image.
-    pub fn push(&mut self, image: &EpisodeImage) -> Result<(), ExportError> {
+    /// Adds an image, and returns it as pixels in OpenCV's order blue, green, red.
+    pub fn push(&mut self, image: &EpisodeImage) -> Result<Mat, ExportError> {
         let fail = |e: opencv::Error| write_error(&self.path, e.message);
-        let picture = decode(image).map_err(fail)?;
+        let bytes: Vector<u8> = Vector::from_slice(&image.data);
+        // OpenCV makes an empty picture of most bytes that are none, and an error of some.
+        let picture = imgcodecs::imdecode(&bytes, imgcodecs::IMREAD_COLOR).unwrap_or_default();
+        if picture.empty() {
+            return Err(unfit(&self.file, format!("picture {} cannot be decoded", image.sequence)));
+        }
         let size = picture.size().map_err(fail)?;
         if self.writer.is_none() {
             // OpenCV says no more than that it cannot write, so the disk is asked first.
@@ -100,12 +101,14 @@ impl Video {
         match &mut self.writer {
             Some((writer, first)) if *first == size => {
                 self.pushed += 1;
-                writer.write(&picture).map_err(fail)
+                writer.write(&picture).map_err(fail)?;
+                Ok(picture)
             }
-            Some((_, first)) => Err(write_error(
-                &self.path,
-                format!("one image is {} x {} px, but those before it are {} x {} px", size.width, size.height, first.width, first.height),
-            )),
+            Some((_, first)) => {
+                let (n, Size { width, height }) = (image.sequence, size);
+                let what = format!("picture {n} is {width} x {height} px, but those before it are {} x {} px", first.width, first.height);
+                Err(unfit(&self.file, what))
+            }
             None => Err(write_error(&self.path, "OpenCV cannot write MP4 here; install FFmpeg's libraries")),
         }
     }

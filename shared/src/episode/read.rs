@@ -3,7 +3,8 @@
 //! The file is read once from start to end, record by record, and every checksum in it is compared. A damaged file is an error, never a
 //! panic and never a wrong number. Memory is bounded by one chunk and the rows.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
+use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
 use std::time::{Duration, SystemTime, UNIX_EPOCH};
 
@@ -289,7 +290,8 @@ fn clock_offset_ns(about: &BTreeMap<String, String>) -> Result<i128, String> {
     offset.parse::<i64>().map(i128::from).map_err(|_| format!("metadata 'episode': {} = '{offset}' is not a number", format::CLOCK_OFFSET))
 }
 
-/// The episode files that `paths` name: files as they are, directories as the `*.mcap` in them in order of name.
+/// The episode files that `paths` name: files as they are, directories as the `*.mcap` in them in order of name. What is named twice, also by
+/// another way to the same directory, is there once.
 pub fn find_episodes(paths: &[PathBuf]) -> Result<Vec<PathBuf>, EpisodeError> {
     let mut files = Vec::new();
     for path in paths {
@@ -308,5 +310,17 @@ pub fn find_episodes(paths: &[PathBuf]) -> Result<Vec<PathBuf>, EpisodeError> {
         inside.sort();
         files.append(&mut inside);
     }
-    Ok(files)
+    Ok(each_once(files))
+}
+
+/// `files` without those that are named twice: by the same name in the same directory, whichever way leads there.
+pub fn each_once(mut files: Vec<PathBuf>) -> Vec<PathBuf> {
+    let mut seen = BTreeSet::new();
+    files.retain(|file| {
+        let directory = file.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."));
+        // What is not there is said by whoever opens it.
+        let (Ok(place), Some(name)) = (directory.metadata(), file.file_name()) else { return true };
+        seen.insert((place.dev(), place.ino(), name.to_os_string()))
+    });
+    files
 }

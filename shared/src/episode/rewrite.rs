@@ -4,7 +4,7 @@
 //! Everything is copied into a new file beside the old one, which is read back, compared and put on the disk before it takes the old one's
 //! name in one step. Whenever the machine stops, there is one whole file, the old or the new one.
 
-use std::fs::File;
+use std::fs::{File, TryLockError};
 use std::io::BufWriter;
 use std::path::Path;
 
@@ -16,7 +16,7 @@ use super::records::{EpisodeError, NextRecord, Records};
 use super::weight::WeightError;
 use super::write::mcap_words;
 use crate::disk_space::error_words;
-use crate::whole_file;
+use crate::{regular_file, whole_file};
 
 /// Number of bytes that are written at a time. Chosen by hand; no measurement is recorded.
 const WRITE_BYTES: usize = 1 << 20;
@@ -45,6 +45,12 @@ pub enum ChangeError {
         /// The file.
         file: String,
     },
+    /// The recorder still writes the file.
+    #[error("{file}: it is being written; wait for its end")]
+    UnderWay {
+        /// The file.
+        file: String,
+    },
     /// The file is not cut, so there is nothing to recover.
     #[error("{file}: the file is whole; there is nothing to recover")]
     Whole {
@@ -61,6 +67,16 @@ pub enum ChangeError {
     },
 }
 
+/// Whether nobody writes the file `path`: the recorder holds its lock. A file system without locks knows no better.
+pub(super) fn check_at_rest(path: &Path) -> Result<(), ChangeError> {
+    let file = || path.display().to_string();
+    let (opened, _) = regular_file::open(path).map_err(|e| EpisodeError::Read { file: file(), what: e.to_string() })?;
+    match opened.try_lock_shared() {
+        Err(TryLockError::WouldBlock) => Err(ChangeError::UnderWay { file: file() }),
+        _ => Ok(()),
+    }
+}
+
 /// Sets the metadata record `name` of the episode `path` to one pair, in place of any that was there. `expected` says what the episode then
 /// reads as. Returns the episode as it was.
 pub(super) fn set_metadata(
@@ -72,6 +88,7 @@ pub(super) fn set_metadata(
     let shown = path.display().to_string();
     // If the path is a link, the file that it leads to is replaced, and not the link.
     let path = path.canonicalize().map_err(|e| EpisodeError::Read { file: shown.clone(), what: e.to_string() })?;
+    check_at_rest(&path)?;
     let before = Episode::read(&path)?;
     let (file, temporary) = whole_file::new_beside(&path).map_err(|e| ChangeError::Write { file: shown, what: error_words(&e) })?;
     let fail = |what: String| ChangeError::Write { file: temporary.display().to_string(), what };

@@ -7,13 +7,13 @@ use std::path::{Path, PathBuf};
 
 use serde_json::{Value, json};
 use shared::config::Config;
-use shared::episode::{find_episodes, recover, set_note};
+use shared::episode::{each_once, find_episodes, recover, set_note};
 use shared::exit::{self, Failure, OrExit as _, failure};
 use shared::level::plain;
 use shared::plural::counted;
 
 use super::which::{WhichArgs, change_failure, files, print_json};
-use crate::episodes::folder::{Budget, MEGABYTE};
+use crate::episodes::folder::{Budget, Folder, MEGABYTE};
 use crate::episodes::output::{ExportError, LeftOut};
 use crate::episodes::upkeep::{self, Copied, Found};
 
@@ -30,14 +30,15 @@ pub(super) enum Command {
     #[command(after_help = "Example:\n  feature-worker episodes delete out/episodes/episode-0001.mcap --yes")]
     Delete(DeleteArgs),
     /// Deletes episodes until the rest is within the budget of `[recording]`. Without --yes it only says what it would delete. First go those
-    /// whose end is missing, then those that were never weighed, the oldest first; the newest of all stays. The exit code is 1 if the rest is
-    /// still over the budget.
+    /// whose end is missing, then those that were never weighed, the oldest first; the newest of all stays. Files that are kept because they
+    /// cannot be read or are being written count too. The exit code is 1 if the rest is still over the budget, or one cannot be deleted.
     #[command(after_help = "Examples:\n  feature-worker episodes prune\n  feature-worker episodes prune --budget-mb 20000 --yes")]
     Prune(PruneArgs),
     /// Copies episodes into directories by shares, for example to train and to judge. Each episode goes into one, the same with the same seed.
     #[command(after_help = "Example:\n  feature-worker episodes split out/episodes --to out/parts --share train=0.8 --share check=0.2")]
     Split(SplitArgs),
-    /// Copies the episodes of several directories into one, with new numbers. The same measurement twice is copied once.
+    /// Copies the episodes of several directories into one, with new numbers. The same measurement twice is copied once, with its weight. What
+    /// cannot be read or is being written is left out; the exit code is then 1, as with split.
     #[command(after_help = "Example:\n  feature-worker episodes merge monday tuesday --to week")]
     Merge(MergeArgs),
 }
@@ -244,7 +245,8 @@ fn tell(going: &[&Found], kept: &[LeftOut], yes: bool) {
 }
 
 fn delete(args: &DeleteArgs) -> Result<(), Failure> {
-    let (found, mut kept) = look(&args.files);
+    let files = each_once(args.files.clone());
+    let (found, mut kept) = look(&files);
     let mut going: Vec<&Found> = found.iter().collect();
     let undeleted = delete_all(&mut going, &mut kept, args.yes);
     if args.json {
@@ -256,7 +258,7 @@ fn delete(args: &DeleteArgs) -> Result<(), Failure> {
         0 => Ok(()),
         n => {
             let code = if undeleted > 0 { exit::FAILED } else { exit::BAD_INPUT };
-            Err(failure(code, format!("not deleted: {n} of {}", args.files.len())))
+            Err(failure(code, format!("not deleted: {n} of {}", files.len())))
         }
     }
 }
@@ -271,11 +273,17 @@ fn prune(args: &PruneArgs) -> Result<(), Failure> {
         episodes: args.budget_episodes.or(configured.as_ref().map(|r| r.budget_episodes)).unwrap_or(0),
     };
     let none = budget.is_none();
-    let (found, mut kept) = look(&files(&args.which)?);
-    let mut going: Vec<&Found> = upkeep::to_prune(&found, budget, args.weighed).into_iter().map(|i| &found[i]).collect();
+    let files = files(&args.which)?;
+    // A name that is wrong would else hold every budget, night after night.
+    for file in &files {
+        file.symlink_metadata().map_err(|e| format!("{}: {e}", file.display())).or_exit(exit::BAD_INPUT)?;
+    }
+    let (found, mut kept) = look(&files);
+    let beside = Folder::of(kept.iter().map(|k| k.file.as_path()));
+    let mut going: Vec<&Found> = upkeep::to_prune(&found, beside, budget, args.weighed).into_iter().map(|i| &found[i]).collect();
     let undeleted = delete_all(&mut going, &mut kept, args.yes);
-    let bytes = found.iter().map(|f| f.bytes).sum::<u64>() - going.iter().map(|f| f.bytes).sum::<u64>();
-    let stay = found.len() - going.len();
+    let bytes = found.iter().map(|f| f.bytes).sum::<u64>() - going.iter().map(|f| f.bytes).sum::<u64>() + beside.bytes;
+    let stay = found.len() - going.len() + beside.episodes;
     let holds = budget.holds(stay, bytes);
     if args.which.json {
         let mut value = as_json(&going, &kept, args.yes);
@@ -284,7 +292,8 @@ fn prune(args: &PruneArgs) -> Result<(), Failure> {
         print_json(&value);
     } else {
         tell(&going, &kept, args.yes);
-        println!("{} of {:.1} MB left", counted(stay, "episode"), bytes as f64 / MEGABYTE as f64);
+        let of_them = if beside.episodes > 0 { format!(", {} of them kept for the reasons above", beside.episodes) } else { String::new() };
+        println!("{} of {:.1} MB left{of_them}", counted(stay, "episode"), bytes as f64 / MEGABYTE as f64);
         if none {
             println!("there is no budget: set recording.budget_mb or recording.budget_episodes, or say --budget-mb or --budget-episodes");
         }
@@ -296,7 +305,7 @@ fn prune(args: &PruneArgs) -> Result<(), Failure> {
         return Ok(());
     }
     let weighed = if args.weighed { "" } else { "; weighed ones are kept without --weighed" };
-    Err(failure(exit::FAILED, format!("what stays is over the budget{weighed}, and the newest is kept always")))
+    Err(failure(exit::FAILED, format!("what stays is over the budget{weighed}; the newest, and what is listed as kept, always stay")))
 }
 
 fn split(args: &SplitArgs) -> Result<(), Failure> {
@@ -310,7 +319,7 @@ fn split(args: &SplitArgs) -> Result<(), Failure> {
     tell_copied(&upkeep::split(&files(&args.which)?, &args.to, &args.shares, args.seed).map_err(|e| work_failure(&e))?, args.which.json)
 }
 
-/// Says what was copied. A file that cannot be read makes the exit code 1; one that is there twice does not.
+/// Says what was copied. A file that cannot be read or is under way makes the exit code 1; one that is there twice does not.
 fn tell_copied(copied: &Copied, as_json: bool) -> Result<(), Failure> {
     if as_json {
         let files = copied.files.iter().map(|(from, to)| json!({ "from": shown(from), "to": shown(to) }));
@@ -324,8 +333,8 @@ fn tell_copied(copied: &Copied, as_json: bool) -> Result<(), Failure> {
             println!("left out: {}", plain(&one.why));
         }
     }
-    match copied.left_out.iter().filter(|l| shared::episode::Episode::read(&l.file).is_err()).count() {
+    match copied.missing {
         0 => Ok(()),
-        n => Err(failure(exit::FAILED, format!("{} cannot be read; {} copied", counted(n, "episode"), copied.files.len()))),
+        n => Err(failure(exit::FAILED, format!("{} left out; {} copied", counted(n, "file"), copied.files.len()))),
     }
 }

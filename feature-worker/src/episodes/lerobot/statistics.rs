@@ -1,11 +1,8 @@
-//! The statistics that LeRobot wants of each column and of the images, for each episode and for the whole data set. Pure arithmetic, but for
-//! the decoding of images; allocates. Every number is finite: of no values at all, all are 0.
+//! The statistics that LeRobot wants of each column and of the images, for each episode and for the whole data set. Pure arithmetic;
+//! allocates. Every number is finite: of no values at all, all are 0.
 
 use opencv::core::{self, Mat, MatTraitConstManual, Vector};
 use serde_json::{Value, json};
-use shared::episode::EpisodeImage;
-
-use crate::episodes::video::decode;
 
 /// The quantiles that LeRobot wants, with their names in its files.
 const QUANTILES: [(&str, f64); 5] = [("q01", 0.01), ("q10", 0.1), ("q50", 0.5), ("q90", 0.9), ("q99", 0.99)];
@@ -100,12 +97,10 @@ impl ImageLevels {
         Self { counts: [[0; LEVELS]; 3], images: 0 }
     }
 
-    /// Counts all pixels of an image.
-    pub fn add(&mut self, image: &EpisodeImage) -> opencv::Result<()> {
-        let picture = decode(image)?;
+    /// Counts all pixels of a picture, in OpenCV's order blue, green, red.
+    pub fn add(&mut self, picture: &Mat) -> opencv::Result<()> {
         let mut planes: Vector<Mat> = Vector::new();
-        core::split(&picture, &mut planes)?;
-        // OpenCV's order is blue, green, red.
+        core::split(picture, &mut planes)?;
         for (counts, plane) in self.counts.iter_mut().rev().zip(planes) {
             for level in plane.data_bytes()? {
                 counts[usize::from(*level)] += 1;

@@ -1,0 +1,86 @@
+//! `scripts/install` and `scripts/check-package` on machines that are not as they wish: the scripts themselves, with programs of ours in place of apt's and Rust's.
+//!
+//! It starts short processes, which change nothing outside of a directory of their own.
+#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic)]
+
+use std::os::unix::fs::PermissionsExt;
+use std::path::Path;
+use std::process::{Command, Output};
+
+/// Makes a program `name` in `directory` of one line of shell.
+fn program(directory: &Path, name: &str, line: &str) {
+    let path = directory.join(name);
+    std::fs::write(&path, format!("#!/bin/sh\n{line}\n")).unwrap();
+    std::fs::set_permissions(&path, std::fs::Permissions::from_mode(0o755)).unwrap();
+}
+
+/// Runs a command with the programs of `directory` before those of the system, and none of this user's own.
+fn run(directory: &Path, words: &[&str]) -> Output {
+    let root = Path::new(env!("CARGO_MANIFEST_DIR")).parent().unwrap();
+    let path = format!("{}:/usr/sbin:/usr/bin:/sbin:/bin", directory.display());
+    Command::new(words[0]).args(&words[1..]).current_dir(root).env("PATH", path).env("HOME", directory).output().unwrap()
+}
+
+/// Protects a newcomer from pages of a compiler's errors: a Rust that is too old is said, or updated where rustup can, and a newer one is not called old.
+#[test]
+fn an_old_rust_is_said_or_updated() {
+    let dir = tempfile::tempdir().unwrap();
+    program(dir.path(), "dpkg-query", "echo install ok installed");
+    for (version, ended) in [("1.63.0", 2), ("1.9.0", 2), ("1.95.0", 0), ("1.100.1", 0), ("2.0.0-nightly", 0)] {
+        program(dir.path(), "cargo", &format!("echo 'cargo {version} (c0ffee 2026-01-01)'"));
+        let output = run(dir.path(), &["scripts/install"]);
+        let said = String::from_utf8_lossy(&output.stderr);
+        assert_eq!(output.status.code(), Some(ended), "{version}: {said}");
+        assert!(ended == 0 || said.contains(&format!("cargo {version}")) && said.lines().count() == 1, "{said}");
+    }
+    program(dir.path(), "cargo", "cat $HOME/version");
+    program(dir.path(), "rustup", "echo cargo 1.96.0 > $HOME/version");
+    std::fs::write(dir.path().join("version"), "cargo 1.63.0").unwrap();
+    assert_eq!(run(dir.path(), &["scripts/install"]).status.code(), Some(0));
+}
+
+/// Protects `scripts/test` on Ubuntu, whose archive has no chromium-driver: it goes on without a browser, and says so. It takes root, for another
+/// /etc/os-release.
+#[test]
+fn ubuntu_goes_on_without_a_browser() {
+    let dir = tempfile::tempdir().unwrap();
+    program(dir.path(), "dpkg-query", "[ \"$3\" != chromium-driver ] && echo install ok installed");
+    program(dir.path(), "cargo", "echo cargo 1.95.0");
+    program(dir.path(), "apt-get", "echo \"E: Unable to locate package chromium-driver\" >&2; exit 100");
+    std::fs::write(dir.path().join("os"), "NAME=\"Ubuntu\"\nID=ubuntu\n").unwrap();
+    let as_ubuntu = |words: &str| {
+        let script = format!("mount --bind {}/os /etc/os-release && exec {words}", dir.path().display());
+        run(dir.path(), &["unshare", "-m", "--propagation", "private", "sh", "-c", &script])
+    };
+    if !as_ubuntu("true").status.success() {
+        println!("not run: it takes root");
+        return;
+    }
+    let output = as_ubuntu("scripts/install chromium-driver");
+    assert_eq!(output.status.code(), Some(0), "{}", String::from_utf8_lossy(&output.stderr));
+    // A machine that has a browser of another kind is told nothing.
+    let told = String::from_utf8_lossy(&output.stdout).contains("not installed: chromium-driver");
+    assert!(told || ["/usr/bin/chromedriver", "/usr/sbin/chromedriver"].iter().any(|p| Path::new(p).exists()));
+}
+
+/// Protects whoever checks the package on a machine whose file systems are closed to setuid programs: it is said at once, not by sudo minutes later. It
+/// takes root, for such a file system.
+#[test]
+fn a_package_is_not_checked_where_sudo_cannot_work() {
+    let dir = tempfile::tempdir().unwrap();
+    program(dir.path(), "mmdebstrap", "exit 0");
+    let closed = |words: &str| {
+        let script = format!("mkdir -p out && mount -t tmpfs -o nosuid tmpfs out && exec {words}");
+        run(dir.path(), &["unshare", "-m", "--propagation", "private", "sh", "-c", &script])
+    };
+    if !closed("true").status.success() {
+        println!("not run: it takes root");
+        return;
+    }
+    program(dir.path(), "dpkg-query", "exit 1");
+    program(dir.path(), "apt-get", "exit 100");
+    let output = closed("scripts/check-package");
+    let said = String::from_utf8_lossy(&output.stderr);
+    assert_eq!((output.status.code(), said.lines().count()), (Some(2), 1), "{said}");
+    assert!(said.contains("mounted nosuid, noexec or nodev"), "{said}");
+}
