@@ -81,6 +81,11 @@ fn a_still_picture_and_a_dry_glass_are_refused() -> Outcome {
     let bench = Bench::new()?;
     let still = bench.file("still.png");
     imgcodecs::imwrite(&still, &pour(20)?, &Vector::new())?;
+    let blinded = bench.file("blinded.avi");
+    clip(&blinded, |i| {
+        if (9..33).contains(&i) { pour(i) } else { noisy(&Mat::new_rows_cols_with_default(HEIGHT, WIDTH, CV_8UC3, Scalar::all(255.0))?, i) }
+    })?;
+    bench.refused("a pour that is blinded before and after", &[&blinded], &["--method", "colour"], &["never dry"])?;
     bench.refused("one picture", &[&still], &[], &["too few"])?;
     bench.refused("a picture again and again", &[still.as_path(); 30], &[], &["the same still picture"])?;
     let noise = bench.file("noise.avi");

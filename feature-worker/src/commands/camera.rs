@@ -16,7 +16,7 @@ use crate::source::devices::{self, Device, Trouble};
 #[derive(Debug, clap::Args)]
 #[command(
     after_help = "Examples:\n  feature-worker camera\n  feature-worker camera --json\n  feature-worker camera --config config/cell.toml   (is \
-that camera usable? exit code 2: permission, metadata node, or no camera; 3: missing)\n\nSettings are written into [camera]: exposure_ms, gain, \
+that camera usable? exit code 2: permission, metadata node, or no camera; 3: missing, or another program has it)\n\nSettings are written into [camera]: exposure_ms, gain, \
 white_balance_k, focus and mains_hz, each a value or \"locked\". `run` sets them and reads them back."
 )]
 pub struct Args {
@@ -44,7 +44,8 @@ pub fn run(args: &Args) -> Result<(), Failure> {
     }
     match config {
         Some(config) if config.camera.source == CameraSource::Device => {
-            devices::open(Path::new(&config.camera.path)).map(|_| ()).map_err(|e| failure(e.exit_code(), e))
+            let path = Path::new(&config.camera.path);
+            devices::open(path).and_then(|_| devices::free(Path::new("/"), path)).map_err(|e| failure(e.exit_code(), e))
         }
         _ => Ok(()),
     }

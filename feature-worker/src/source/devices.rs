@@ -65,6 +65,12 @@ pub fn users(root: &Path, path: &Path) -> Vec<String> {
     found
 }
 
+/// Whether no other program has the device at `path` open, by `proc` below `root`. The kernel lets many programs open a camera and only one stream from
+/// it, which is not known before one tries.
+pub fn free(root: &Path, path: &Path) -> Result<(), SourceError> {
+    if users(root, path).is_empty() { Ok(()) } else { Err(error_of(root, path, Trouble::Busy)) }
+}
+
 /// The trouble that a failed opening means.
 fn trouble_of(error: &std::io::Error) -> Trouble {
     // ENODEV and ENXIO: the file is there and the device is not.
@@ -246,8 +252,9 @@ mod tests {
         assert_eq!((found[0].group.as_str(), found[0].users.as_slice()), ("cameras", &["cheese (77)".to_string()][..]));
         assert_eq!((found[0].trouble, found[1].trouble), (None, Some(Trouble::Missing)));
         assert!(found[1].names.is_empty() && found[1].users.is_empty());
-        let said = error_of(root, &root.join("dev/video2"), Trouble::Busy).to_string();
-        assert!(said.contains("cheese (77)"), "{said}");
+        let busy = free(root, &root.join("dev/v4l/by-id/usb-Wrist-index0")).expect_err("another program has it");
+        assert!(busy.exit_code() == 3 && busy.to_string().contains("cheese (77)"), "{busy}");
+        assert!(free(root, &root.join("dev/video10")).is_ok());
         let said = error_of(root, &root.join("dev/video2"), Trouble::Permission).to_string();
         assert!(said.contains("group 'cameras'") && said.contains("usermod"), "{said}");
     }

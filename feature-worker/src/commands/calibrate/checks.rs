@@ -103,6 +103,8 @@ struct Flow {
     dry: u32,
     /// Frames with liquid at the lip in which no edge fits.
     unfit: u32,
+    /// Frames of which nothing is known for another reason.
+    untold: u32,
     /// Unbroken runs of frames with a stream.
     runs: u32,
     /// Whether the last frame had a stream.
@@ -120,13 +122,19 @@ pub(super) fn something_flows(pour: &Pour, camera: &CameraConfig, image: &ImageC
         let unfit = matches!(measured.doubt, Doubt::EdgeNotFound | Doubt::LeavesRegion);
         flow.unfit += u32::from(!flows && unfit);
         // A frame that is a little too sharp or soft for the run time is dry all the same.
-        flow.dry += u32::from(!flows && !unfit);
+        let dry = !flows && matches!(measured.doubt, Doubt::None | Doubt::Blurred);
+        flow.dry += u32::from(dry);
+        flow.untold += u32::from(!flows && !unfit && !dry);
         flow.runs += u32::from(flows && !flow.flows);
         flow.flows = flows;
     })?;
-    let Flow { frames, flowing, dry, unfit, runs, .. } = flow;
+    let Flow { frames, flowing, dry, unfit, untold, runs, .. } = flow;
     let share = |part: u32, of: u32| part as f32 / of.max(1) as f32;
-    let seen = format!("{flowing} of {frames} frames show a stream whose edge fits the axes, {dry} are dry, and in {unfit} no edge fits");
+    let mut seen =
+        format!("{flowing} of {frames} frames show a stream whose edge fits the axes, {dry} are dry, and in {unfit} no edge fits");
+    if untold > 0 {
+        seen += &format!("; {untold} cannot be told (too dark, too bright, not whole, or in other colours)");
+    }
     let advice = match image.method {
         LiquidMethod::Colour => "show one whole pour, check the axes, or use --method clear for water",
         LiquidMethod::Clear => "show one whole pour over this lip, before an even card, and check the axes",
