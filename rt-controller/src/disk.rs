@@ -15,7 +15,7 @@ use shared::config::Config;
 use shared::disk_space::{error_words, free_bytes};
 use shared::episode::take_number;
 use shared::level::Level;
-use shared::messages::Phase;
+use shared::messages::{Phase, Telemetry};
 use shared::os;
 use shared::regular_file;
 use shared::weights::Weights;
@@ -45,6 +45,9 @@ const SPACE_BEAT: Duration = Duration::from_secs(5);
 /// is recorded.
 const RATE_TOLERANCE: f64 = 0.02;
 
+/// A tick on its way to the journal, with its telemetry.
+pub type Told = Box<(Tick, Telemetry)>;
+
 /// The state of the disk's thread.
 pub struct Disk<'a> {
     exchange: &'a Exchange,
@@ -69,7 +72,7 @@ pub struct Disk<'a> {
     at_rest_since_ns: Option<u64>,
     newest_tick_ns: u64,
     space_at: Option<Instant>,
-    ticks: Receiver<Box<Tick>>,
+    ticks: Receiver<Told>,
     /// The weights that were read last, for a journal that begins anew.
     loaded: Option<(u64, Vec<u8>)>,
     /// Directory of the episodes, and the queue of one that the service takes numbers from.
@@ -84,7 +87,7 @@ pub struct Disk<'a> {
 /// The other ends of the disk's queues.
 pub struct Queues {
     /// Takes the ticks for the journal; `None` if none is kept.
-    pub journal: Option<Sender<Box<Tick>>>,
+    pub journal: Option<Sender<Told>>,
     /// Gives numbers for the next episodes.
     pub numbers: Receiver<u64>,
 }
@@ -155,9 +158,10 @@ impl<'a> Disk<'a> {
 
     /// Writes the ticks that wait.
     fn write_ticks(&mut self) {
-        while let Ok(tick) = self.ticks.try_recv() {
+        while let Ok(told) = self.ticks.try_recv() {
+            let (tick, telemetry) = *told;
             self.newest_tick_ns = tick.now_ns;
-            self.write(|journal| journal.tick(tick));
+            self.write(|journal| journal.tick(Box::new(tick), &telemetry));
         }
     }
 
@@ -342,7 +346,7 @@ mod tests {
             let (robot, features) = (Robot::that_may_move(0.0, now_ns), heapless::Vec::new());
             let times = Times::default();
             let tick = Tick { now_ns, features, robot, order: None, agent: None, target_deg: None, d_ml: 0.0, times };
-            sender.send(Box::new(tick)).unwrap();
+            sender.send(Box::new((tick, Telemetry::default()))).unwrap();
             disk.write_ticks();
         };
         let rests = |disk: &mut Disk, phase: Phase| {

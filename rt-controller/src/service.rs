@@ -22,10 +22,9 @@ use shared::supervisor::Supervisor;
 
 use crate::client::MESSAGE_MAX;
 use crate::core::{Counters, Order, Refusal};
-use crate::disk::Queues;
+use crate::disk::{Queues, Told};
 use crate::disk_note::DiskNote;
 use crate::exchange::{Event, Exchange};
-use crate::journal::Tick;
 use crate::robot_thread::RobotNote;
 
 /// Pause between two looks at the queues. Chosen by hand: far below a person's patience, and cheap.
@@ -50,7 +49,7 @@ pub struct Service<'a> {
     /// What lies on disks, and what is wrong with it.
     disk_note: &'a DiskNote,
     /// The queue to the journal; `None` if no journal is kept, or if the disk could not keep up.
-    journal: Option<Sender<Box<Tick>>>,
+    journal: Option<Sender<Told>>,
     latest: Option<(Telemetry, Counters)>,
     outcomes: VecDeque<Outcome>,
     /// The requests whose orders are in the queue, in the same order, each with its episode's number.
@@ -124,7 +123,7 @@ impl<'a> Service<'a> {
         while let Some(event) = self.exchange.events.pop() {
             match event {
                 Event::Tick(tick, telemetry, counters) => {
-                    if self.journal.as_ref().is_some_and(|j| j.try_send(Box::new(tick)).is_err()) {
+                    if self.journal.as_ref().is_some_and(|j| j.try_send(Box::new((tick, telemetry))).is_err()) {
                         (self.say)(
                             Level::Warning,
                             "journal: the disk does not keep up; nothing more is written to it, and the controller goes on",

@@ -141,7 +141,7 @@ fn wake_up(life: &mut Life<'_>, site: &mut Site, now_ns: u64) {
         match event {
             Event::Tick(tick, telemetry, counters) => {
                 site.ticked(&tick, &telemetry, counters.features);
-                life.journal.tick(tick);
+                life.journal.tick(tick, &telemetry);
             }
             Event::Ordered(answer) => site.say(|| format!("order: {answer:?}")),
             Event::Ended(outcome) => ended = Some(outcome),
