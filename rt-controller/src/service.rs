@@ -24,7 +24,7 @@ use crate::client::MESSAGE_MAX;
 use crate::core::{Counters, Order, Refusal};
 use crate::disk::{Queues, Told};
 use crate::disk_note::DiskNote;
-use crate::exchange::{Event, Exchange};
+use crate::exchange::{Asked, Event, Exchange};
 use crate::robot_thread::RobotNote;
 
 /// Pause between two looks at the queues. Chosen by hand: far below a person's patience, and cheap.
@@ -36,7 +36,7 @@ const LAST_RESULT: Duration = Duration::from_millis(400);
 const OUTCOMES: usize = 32;
 
 /// A client's request that waits for its answer.
-type Asked = ActiveRequest<Ipc, [u8], (), [u8], ()>;
+type Client = ActiveRequest<Ipc, [u8], (), [u8], ()>;
 
 /// The state of the controller's ordinary side.
 pub struct Service<'a> {
@@ -53,7 +53,9 @@ pub struct Service<'a> {
     latest: Option<(Telemetry, Counters)>,
     outcomes: VecDeque<Outcome>,
     /// The requests whose orders are in the queue, in the same order, each with its episode's number.
-    waiting: VecDeque<(Asked, u64)>,
+    waiting: VecDeque<(Client, u64)>,
+    /// Number of aborts before the newest look that found no request.
+    aborts: u64,
     /// Numbers that nobody has used, the smallest first; they belong to no file.
     numbers: Receiver<u64>,
     /// Numbers of orders that were refused: the next order takes them.
@@ -95,6 +97,7 @@ impl<'a> Service<'a> {
             latest: None,
             outcomes: VecDeque::new(),
             waiting: VecDeque::new(),
+            aborts: 0,
             numbers: disk.numbers,
             spare: BTreeSet::new(),
         })
@@ -135,8 +138,11 @@ impl<'a> Service<'a> {
                     // It does not matter whether anybody listens.
                     let _ = self.telemetry.send_copy(telemetry);
                 }
-                Event::Ordered(answer) => {
-                    if let Some((asked, episode)) = self.waiting.pop_front() {
+                Event::Ordered(episode, answer) => {
+                    let place = self.waiting.iter().position(|(_, its)| *its == episode);
+                    // Those in front have lost their answers, because the loop could not tell them; their clients learn that they got none.
+                    self.waiting.drain(..place.unwrap_or(0));
+                    if let Some((asked, _)) = place.and_then(|_| self.waiting.pop_front()) {
                         let answer = match answer {
                             Ok(()) => Reply::Started { episode },
                             Err(refusal) => {
@@ -185,7 +191,17 @@ impl<'a> Service<'a> {
 
     /// Answers clients, or passes their orders to the loop.
     fn answer(&mut self) {
-        while let Ok(Some(asked)) = self.server.receive() {
+        loop {
+            // What is received after a look that found nothing was given after that look, and so after the aborts until then.
+            let aborts = self.exchange.aborts.load(SeqCst);
+            let asked = match self.server.receive() {
+                Ok(Some(asked)) => asked,
+                Ok(None) => {
+                    self.aborts = aborts;
+                    return;
+                }
+                Err(_) => return,
+            };
             // Whoever has given up waiting must not find the robot moving later.
             if !asked.is_connected() {
                 continue;
@@ -209,7 +225,7 @@ impl<'a> Service<'a> {
                     continue;
                 }
                 Request::Abort => {
-                    self.exchange.abort.store(true, SeqCst);
+                    self.exchange.abort();
                     reply(&asked, &Reply::Aborting);
                     continue;
                 }
@@ -223,7 +239,7 @@ impl<'a> Service<'a> {
                 reply(&asked, &Reply::Refused { reason: reason.into() });
                 continue;
             };
-            match self.exchange.orders.push(order) {
+            match self.exchange.orders.push(Asked { order, aborts: self.aborts }) {
                 Ok(()) => self.waiting.push_back((asked, episode)),
                 Err(_) => {
                     self.spare.insert(episode);
@@ -301,10 +317,85 @@ impl<'a> Service<'a> {
 }
 
 /// Sends an answer; a client that has gone away is no error.
-fn reply(asked: &Asked, reply: &Reply) {
+fn reply(asked: &Client, reply: &Reply) {
     let mut buffer = vec![0; MESSAGE_MAX];
     let Ok(bytes) = postcard::to_slice(reply, &mut buffer) else { return };
     if let Ok(loan) = asked.loan_slice_uninit(bytes.len()) {
         let _ = loan.write_from_slice(bytes).send();
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use shared::runtime_dir::Place;
+
+    use super::*;
+
+    type Port = iceoryx2::port::client::Client<Ipc, [u8], (), [u8], ()>;
+    type Pending = iceoryx2::pending_response::PendingResponse<Ipc, [u8], (), [u8], ()>;
+
+    /// Runs `check` with a service that no loop answers, the way to give it episodes' numbers, and two clients of it.
+    fn with_service(name: &str, check: impl FnOnce(&Exchange, Service, &Sender<u64>, [Port; 2])) {
+        let base = tempfile::tempdir().unwrap();
+        let place = Place { name: name.into(), base: Some(base.path().into()) };
+        let cell = Cell::join(&place).unwrap();
+        let (exchange, note, connections, disk_note) = (Exchange::default(), RobotNote::default(), AtomicU64::new(0), DiskNote::default());
+        let (give, numbers) = crossbeam::channel::bounded(2);
+        let say = |_: Level, _: &str| {};
+        let queues = Queues { journal: None, numbers };
+        let service = Service::open(&cell, &exchange, (&note, &connections), (&disk_note, queues), &say).unwrap();
+        let port = || cell.control().unwrap().client_builder().initial_max_slice_len(MESSAGE_MAX).create().unwrap();
+        check(&exchange, service, &give, [port(), port()]);
+        shared::ipc::remove_files(place);
+    }
+
+    /// Sends the request for a pour.
+    fn send(port: &Port) -> Pending {
+        let mut buffer = vec![0; MESSAGE_MAX];
+        let bytes = postcard::to_slice(&Request::Pour { goal_ml: 50.0, flows_by_deg: None }, &mut buffer).unwrap();
+        port.loan_slice_uninit(bytes.len()).unwrap().write_from_slice(bytes).send().unwrap()
+    }
+
+    /// Protects people from a pour that begins after an abort has said that the container is upright: a request that still lay in iceoryx2's queue then is passed
+    /// on as one from before the abort, which the loop refuses. The next one is not.
+    #[test]
+    fn a_request_from_before_an_abort_is_known_as_one() {
+        with_service("stopped", |exchange, mut service, give, [port, _]| {
+            give.send(7).unwrap();
+            let mut passed_on = |then: &dyn Fn()| {
+                let _pending = send(&port);
+                then();
+                service.answer();
+                let asked = exchange.orders.pop().unwrap();
+                exchange.events.push(Event::Ordered(7, Err(Refusal::Stopped))).unwrap();
+                service.take_events();
+                (asked.order.episode(), asked.aborts)
+            };
+            assert_eq!(passed_on(&|| exchange.abort()), (7, 0));
+            assert_eq!(exchange.aborts.load(SeqCst), 1);
+            assert_eq!(passed_on(&|| ()), (7, 1), "a refused order's number is the next one's");
+        });
+    }
+
+    /// Protects clients from each other's answers: if the loop could not tell the answer to an order, the next answer goes to its own order all the same, and
+    /// one to an order that nobody knows goes to nobody.
+    #[test]
+    fn a_lost_answer_leaves_the_others_theirs() {
+        with_service("answers", |exchange, mut service, give, ports| {
+            let pending = [7, 8].map(|episode| {
+                give.send(episode).unwrap();
+                let pending = send(&ports[episode as usize - 7]);
+                service.answer();
+                pending
+            });
+            let mut answers_to = |episode: u64| {
+                exchange.events.push(Event::Ordered(episode, Ok(()))).unwrap();
+                service.take_events();
+                let answer = |p: &Pending| p.receive().unwrap().map(|r| postcard::from_bytes::<Reply>(r.payload()).unwrap());
+                [answer(&pending[0]), answer(&pending[1])]
+            };
+            assert_eq!(answers_to(99), [None, None]);
+            assert_eq!(answers_to(8), [None, Some(Reply::Started { episode: 8 })]);
+        });
     }
 }

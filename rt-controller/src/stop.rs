@@ -203,7 +203,7 @@ impl StopThread<'_> {
         let mut answer = self.state();
         match &client.line[..end] {
             b"abort" => {
-                self.exchange.abort.store(true, SeqCst);
+                self.exchange.abort();
                 if !answer.hindrance.is_empty() {
                     answer.refused.clone_from(&answer.hindrance);
                 }
@@ -217,6 +217,8 @@ impl StopThread<'_> {
 
     /// The controller's state, from what the loop left after its newest tick.
     fn state(&self) -> StopAnswer {
+        // An abort that the loop has not obeyed yet is still to move the container. It is looked at before the phase, which then shows what came of it.
+        let obeyed = self.exchange.aborts_obeyed.load(SeqCst) == self.exchange.aborts.load(SeqCst);
         let phase = Phase::from_code(self.exchange.phase.load(SeqCst));
         let alpha_deg = f32::from_bits(self.exchange.alpha_measured.load(SeqCst));
         let note = self.robot_note.get().text;
@@ -227,8 +229,7 @@ impl StopThread<'_> {
             _ => String::new(),
         };
         let at_rest = matches!(phase, Phase::Idle | Phase::Settling);
-        // An abort that the loop has not taken yet is still to move the container.
-        let upright = at_rest && alpha_deg.abs() <= self.tolerance_deg && !self.exchange.abort.load(SeqCst);
+        let upright = obeyed && at_rest && alpha_deg.abs() <= self.tolerance_deg;
         let alpha_deg = alpha_deg.is_finite().then_some(alpha_deg);
         StopAnswer { pid: std::process::id(), phase, alpha_deg, upright, hindrance, refused: String::new() }
     }
