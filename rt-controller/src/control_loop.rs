@@ -199,6 +199,9 @@ impl<'a, O: Outside> LoopState<'a, O> {
         };
         self.tell(Event::Tick(tick, telemetry, self.core.counters()));
         exchange.alpha_measured.store(telemetry.alpha_measured_deg.to_bits(), SeqCst);
+        if telemetry.alpha_measured_deg.is_finite() {
+            exchange.last_alpha.store(telemetry.alpha_measured_deg.to_bits(), SeqCst);
+        }
         exchange.phase.store(telemetry.phase, SeqCst);
         // Only now does the phase say that it was obeyed.
         exchange.aborts_obeyed.store(self.aborts, SeqCst);

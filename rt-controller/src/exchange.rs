@@ -92,6 +92,8 @@ pub struct Exchange {
     pub phase: AtomicU32,
     /// From the loop: the bits of the measured alpha of the newest tick, degrees; NaN without a robot.
     pub alpha_measured: AtomicU32,
+    /// From the loop: the bits of the last alpha that a robot measured, degrees; NaN before the first.
+    pub last_alpha: AtomicU32,
     /// To the loop: orders.
     pub orders: ArrayQueue<Asked>,
     /// From the loop: events.
@@ -146,6 +148,7 @@ impl Default for Exchange {
             shutdown: AtomicBool::new(false),
             phase: AtomicU32::new(0),
             alpha_measured: AtomicU32::new(f32::NAN.to_bits()),
+            last_alpha: AtomicU32::new(f32::NAN.to_bits()),
             orders: ArrayQueue::new(ORDERS),
             events: ArrayQueue::new(EVENTS),
             agents: ArrayQueue::new(1),

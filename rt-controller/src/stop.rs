@@ -19,6 +19,7 @@ use std::time::{Duration, Instant};
 
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
 use serde::{Deserialize, Serialize};
+use shared::exit::{self, Failure, failure};
 use shared::level::Level;
 use shared::messages::Phase;
 use shared::os::peer_uid;
@@ -75,14 +76,16 @@ fn is_taken(uid: u32, name: &str) -> bool {
 }
 
 impl StopSockets {
-    /// Opens the sockets of the cell `name` in `directory`. The error is one line. `say` gets a line if only the file could be had.
+    /// Opens the sockets of the cell `name` in `directory`. Fails if there is no way to stop a motion, or if another controller of the cell is there.
+    /// `say` gets a line if only the file could be had.
     ///
     /// Call it with the controller's lock held, because it takes the place of a socket that a dead controller left.
-    pub fn open(directory: &Path, name: &str, say: &dyn Fn(Level, &str)) -> Result<Self, String> {
+    pub fn open(directory: &Path, name: &str, say: &dyn Fn(Level, &str)) -> Result<Self, Failure> {
         let path = directory.join("stop");
-        let fail = |e: std::io::Error| format!("{}: {e}: no way to stop a motion, so none is begun", path.display());
+        let fail = |e: std::io::Error| failure(exit::FAILED, format!("{}: {e}: no way to stop a motion, so none is begun", path.display()));
         if is_taken(own_uid(), name) {
-            return Err(format!("another rt-controller of cell '{name}' is running: stop it first (its runtime directory was deleted)"));
+            let what = format!("another rt-controller of cell '{name}' is running: stop it first (its runtime directory was deleted)");
+            return Err(failure(exit::REFUSED, what));
         }
         let _ = std::fs::remove_file(&path);
         let file = UnixListener::bind(&path).map_err(fail)?;
