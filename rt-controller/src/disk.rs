@@ -28,8 +28,7 @@ use crate::journal::{Tick, Writer};
 
 /// Pause between two looks at the queue and the weight file. Chosen by hand; no measurement is recorded.
 const BEAT: Duration = Duration::from_millis(40);
-/// Number of ticks that may wait for a slow disk: half a minute at 30 Hz. A journal with a gap cannot be replayed, so a longer wait ends
-/// it.
+/// Number of ticks that may wait for a slow disk: half a minute at 30 Hz. Those that find no room are missing in the journal, which counts them.
 const WAITING_TICKS: usize = 1024;
 
 /// Pause before a journal that could not be written is tried again; it doubles with each failure, up to [`RETRY_MAX`], because each new file moves
@@ -242,7 +241,6 @@ impl<'a> Disk<'a> {
         self.note.set(|n| {
             n.space = space;
             n.journal = match line {
-                _ if n.journal_gave_up => "ended: the disk does not keep up; restart the controller for a new one".into(),
                 Some(line) => line,
                 None => std::mem::take(&mut n.journal),
             };

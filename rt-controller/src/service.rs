@@ -48,8 +48,10 @@ pub struct Service<'a> {
     telemetry: Publisher<Ipc, Telemetry, ()>,
     /// What lies on disks, and what is wrong with it.
     disk_note: &'a DiskNote,
-    /// The queue to the journal; `None` if no journal is kept, or if the disk could not keep up.
+    /// The queue to the journal; `None` if no journal is kept.
     journal: Option<Sender<Told>>,
+    /// Whether the newest tick did not fit into it.
+    journal_lags: bool,
     latest: Option<(Telemetry, Counters)>,
     outcomes: VecDeque<Outcome>,
     /// The requests whose orders are in the queue, in the same order, each with its episode's number.
@@ -94,6 +96,7 @@ impl<'a> Service<'a> {
             started: Instant::now(),
             result_at: None,
             journal: disk.journal,
+            journal_lags: false,
             latest: None,
             outcomes: VecDeque::new(),
             waiting: VecDeque::new(),
@@ -126,14 +129,12 @@ impl<'a> Service<'a> {
         while let Some(event) = self.exchange.events.pop() {
             match event {
                 Event::Tick(tick, telemetry, counters) => {
-                    if self.journal.as_ref().is_some_and(|j| j.try_send(Box::new((tick, telemetry))).is_err()) {
-                        (self.say)(
-                            Level::Warning,
-                            "journal: the disk does not keep up; nothing more is written to it, and the controller goes on",
-                        );
-                        self.disk_note.set(|n| n.journal_gave_up = true);
-                        self.journal = None;
+                    let lost = self.journal.as_ref().is_some_and(|j| j.try_send(Box::new((tick, telemetry))).is_err());
+                    if lost && !self.journal_lags {
+                        let what = "journal: the disk does not keep up; what is missing is counted in it, and the controller goes on";
+                        (self.say)(Level::Warning, what);
                     }
+                    self.journal_lags = lost;
                     self.latest = Some((telemetry, counters));
                     // It does not matter whether anybody listens.
                     let _ = self.telemetry.send_copy(telemetry);
@@ -330,22 +331,40 @@ mod tests {
     use shared::runtime_dir::Place;
 
     use super::*;
+    use crate::journal::Tick;
 
     type Port = iceoryx2::port::client::Client<Ipc, [u8], (), [u8], ()>;
     type Pending = iceoryx2::pending_response::PendingResponse<Ipc, [u8], (), [u8], ()>;
 
-    /// Runs `check` with a service that no loop answers, the way to give it episodes' numbers, and two clients of it.
-    fn with_service(name: &str, check: impl FnOnce(&Exchange, Service, &Sender<u64>, [Port; 2])) {
+    /// What is around a service that no loop answers.
+    struct Around<'a> {
+        exchange: &'a Exchange,
+        /// Gives it numbers of episodes.
+        give: Sender<u64>,
+        /// Two clients.
+        ports: [Port; 2],
+        /// Where one tick for the journal has room.
+        told: Receiver<Told>,
+        /// Number of lines that it has said.
+        said: &'a Count,
+    }
+
+    type Count = std::cell::Cell<u32>;
+
+    /// Runs `check` with a service and what is around it.
+    fn with_service(name: &str, check: impl FnOnce(Service, Around)) {
         let base = tempfile::tempdir().unwrap();
         let place = Place { name: name.into(), base: Some(base.path().into()) };
         let cell = Cell::join(&place).unwrap();
         let (exchange, note, connections, disk_note) = (Exchange::default(), RobotNote::default(), AtomicU64::new(0), DiskNote::default());
         let (give, numbers) = crossbeam::channel::bounded(2);
-        let say = |_: Level, _: &str| {};
-        let queues = Queues { journal: None, numbers };
+        let said = Count::new(0);
+        let say = |_: Level, _: &str| said.set(said.get() + 1);
+        let (journal, told) = crossbeam::channel::bounded(1);
+        let queues = Queues { journal: Some(journal), numbers };
         let service = Service::open(&cell, &exchange, (&note, &connections), (&disk_note, queues), &say).unwrap();
         let port = || cell.control().unwrap().client_builder().initial_max_slice_len(MESSAGE_MAX).create().unwrap();
-        check(&exchange, service, &give, [port(), port()]);
+        check(service, Around { exchange: &exchange, give, ports: [port(), port()], told, said: &said });
         shared::ipc::remove_files(place);
     }
 
@@ -360,7 +379,7 @@ mod tests {
     /// on as one from before the abort, which the loop refuses. The next one is not.
     #[test]
     fn a_request_from_before_an_abort_is_known_as_one() {
-        with_service("stopped", |exchange, mut service, give, [port, _]| {
+        with_service("stopped", |mut service, Around { exchange, give, ports: [port, _], .. }| {
             give.send(7).unwrap();
             let mut passed_on = |then: &dyn Fn()| {
                 let _pending = send(&port);
@@ -381,7 +400,7 @@ mod tests {
     /// one to an order that nobody knows goes to nobody.
     #[test]
     fn a_lost_answer_leaves_the_others_theirs() {
-        with_service("answers", |exchange, mut service, give, ports| {
+        with_service("answers", |mut service, Around { exchange, give, ports, .. }| {
             let pending = [7, 8].map(|episode| {
                 give.send(episode).unwrap();
                 let pending = send(&ports[episode as usize - 7]);
@@ -396,6 +415,27 @@ mod tests {
             };
             assert_eq!(answers_to(99), [None, None]);
             assert_eq!(answers_to(8), [None, Some(Reply::Started { episode: 8 })]);
+        });
+    }
+
+    /// Protects the journal of a long run from a disk that is slow for a while: it loses the ticks that find no room, which it counts by their numbers, and
+    /// not all that come later. It is said once.
+    #[test]
+    fn a_slow_disk_costs_ticks_and_not_the_journal() {
+        with_service("slow", |mut service, Around { exchange, told, said, .. }| {
+            let mut tell = |numbers: std::ops::RangeInclusive<u64>| {
+                for number in numbers {
+                    let telemetry = Telemetry { tick: number, ..Telemetry::default() };
+                    let robot = crate::core::Robot::that_may_move(0.0, number);
+                    let (features, times) = (heapless::Vec::new(), crate::journal::Times::default());
+                    let tick = Tick { now_ns: number, features, robot, order: None, agent: None, target_deg: None, d_ml: 0.0, times };
+                    exchange.events.push(Event::Tick(tick, telemetry, Counters::default())).unwrap();
+                }
+                service.take_events();
+                told.try_recv().map(|told| told.1.tick).ok()
+            };
+            assert_eq!([tell(1..=3), tell(4..=4), tell(5..=5)], [Some(1), Some(4), Some(5)]);
+            assert_eq!(said.get(), 1);
         });
     }
 }
