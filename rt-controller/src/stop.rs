@@ -83,7 +83,9 @@ impl StopSockets {
     pub fn open(directory: &Path, name: &str, say: &dyn Fn(Level, &str)) -> Result<Self, Failure> {
         let path = directory.join("stop");
         let fail = |e: std::io::Error| failure(exit::FAILED, format!("{}: {e}: no way to stop a motion, so none is begun", path.display()));
-        if is_taken(own_uid(), name) {
+        // Of two that start at once, one gets the name.
+        let nameless = SocketAddr::from_abstract_name(abstract_name(own_uid(), name)).and_then(|a| UnixListener::bind_addr(&a));
+        if nameless.is_err() && is_taken(own_uid(), name) {
             let what = format!("another rt-controller of cell '{name}' is running: stop it first (its runtime directory was deleted)");
             return Err(failure(exit::REFUSED, what));
         }
@@ -92,7 +94,6 @@ impl StopSockets {
         // A group that may enter the directory may also stop the robot.
         std::fs::set_permissions(&path, std::fs::Permissions::from_mode(0o660)).map_err(fail)?;
         file.set_nonblocking(true).map_err(fail)?;
-        let nameless = SocketAddr::from_abstract_name(abstract_name(own_uid(), name)).and_then(|a| UnixListener::bind_addr(&a));
         let nameless = nameless.and_then(|l| l.set_nonblocking(true).map(|()| l));
         if let Err(e) = &nameless {
             say(

@@ -193,8 +193,8 @@ fn an_abort_falls_back_to_the_process() {
         });
         timed(abort_of(&cell))
     };
-    let said = String::from_utf8_lossy(&output.stdout).into_owned();
-    assert_eq!(output.status.code(), Some(0), "{said}{}", String::from_utf8_lossy(&output.stderr));
+    let said = String::from_utf8_lossy(&output.stderr).into_owned();
+    assert_eq!(output.status.code(), Some(1), "nobody knows where the container is: {said}{}", String::from_utf8_lossy(&output.stdout));
     assert!(said.contains("SIGTERM"), "{said}");
     assert_eq!(cell.exit_code("rt-controller", Duration::from_secs(10)), Some(0), "{}", cell.log("rt-controller"));
     assert_ne!(pour.wait_with_output().expect("it ran").status.code(), Some(0));
