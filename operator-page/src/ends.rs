@@ -94,6 +94,7 @@ mod tests {
         Outcome {
             episode,
             reason: EndReason::Aborted,
+            unseen: false,
             goal_ml,
             poured_ml: 41.0,
             poured_sd_ml: 1.5,

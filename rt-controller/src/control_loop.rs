@@ -100,6 +100,8 @@ pub struct LoopState<'a, O> {
     period_ns: u64,
     lost_ns: u64,
     shutdown: bool,
+    /// Number of aborts obeyed.
+    aborts: u64,
     /// When the newest tick was done, ns: the time that the next deadline is reckoned with, so that the journal has all that it follows from.
     done_ns: u64,
     /// Allocations and page faults of this thread outside of its ticks: before the first one, and when it met feature workers.
@@ -120,6 +122,7 @@ impl<'a, O: Outside> LoopState<'a, O> {
             period_ns: settings.period_ns,
             lost_ns,
             shutdown: false,
+            aborts: 0,
             done_ns: 0,
             elsewhere: spent(),
         }
@@ -158,7 +161,7 @@ impl<'a, O: Outside> LoopState<'a, O> {
         self.core.prefetch(2);
         let (robot, mut end) = look_at_robot(self.session.as_deref_mut(), woke_ns, self.lost_ns);
         self.core.prefetch(3);
-        let (order, is_asked) = self.next_order();
+        let order = self.next_order();
 
         let output = self.core.step(&Input { now_ns: woke_ns, features: &self.fresh, robot, order });
         let decided_at_ns = self.outside.now_ns();
@@ -171,8 +174,9 @@ impl<'a, O: Outside> LoopState<'a, O> {
         self.give_session_back(end);
 
         let telemetry = Telemetry { weights_id: self.weights_id, ..output.telemetry };
-        if let Some(answer) = output.ordered.filter(|_| is_asked) {
-            self.tell(Event::Ordered(answer));
+        // Nobody waits for the answer to what stops the motion.
+        if let Some((order, answer)) = order.zip(output.ordered).filter(|(order, _)| order.episode() != 0) {
+            self.tell(Event::Ordered(order.episode(), answer));
         }
         if let Some(outcome) = output.ended {
             self.tell(Event::Ended(outcome));
@@ -195,31 +199,37 @@ impl<'a, O: Outside> LoopState<'a, O> {
         };
         self.tell(Event::Tick(tick, telemetry, self.core.counters()));
         exchange.alpha_measured.store(telemetry.alpha_measured_deg.to_bits(), SeqCst);
+        if telemetry.alpha_measured_deg.is_finite() {
+            exchange.last_alpha.store(telemetry.alpha_measured_deg.to_bits(), SeqCst);
+        }
         exchange.phase.store(telemetry.phase, SeqCst);
+        // Only now does the phase say that it was obeyed.
+        exchange.aborts_obeyed.store(self.aborts, SeqCst);
         let upright = matches!(self.core.phase(), Phase::Idle | Phase::NoRobot);
         if self.shutdown && upright { Next::Ended } else { Next::Tick }
     }
 
-    /// The order of this tick, and whether a client waits for its answer. What stops the motion comes before the queue, and refuses what
-    /// waits there.
-    fn next_order(&mut self) -> (Option<Order>, bool) {
+    /// The order of this tick. What stops the motion comes before the queue, and refuses what waits there, and what was given before it and
+    /// comes into the queue only later.
+    fn next_order(&mut self) -> Option<Order> {
         let exchange = self.exchange;
-        let order = if !self.shutdown && exchange.shutdown.load(SeqCst) {
+        let aborts = exchange.aborts.load(SeqCst);
+        let stops = if !self.shutdown && exchange.shutdown.load(SeqCst) {
             self.shutdown = true;
-            Order::Shutdown
-        } else if exchange.abort.swap(false, SeqCst) {
-            Order::Abort
+            Some(Order::Shutdown)
         } else {
-            return (exchange.orders.pop(), true);
+            (aborts != self.aborts).then_some(Order::Abort)
         };
+        self.aborts = aborts;
         // No more than fit into the queue, so that a client that asks and asks cannot hold the loop.
         for _ in 0..exchange.orders.capacity() {
-            if exchange.orders.pop().is_none() {
-                break;
+            let Some(asked) = exchange.orders.pop() else { break };
+            if stops.is_none() && asked.aborts == aborts {
+                return Some(asked.order);
             }
-            self.tell(Event::Ordered(Err(Refusal::Stopped)));
+            self.tell(Event::Ordered(asked.order.episode(), Err(Refusal::Stopped)));
         }
-        (Some(order), false)
+        stops
     }
 
     /// Takes the features that have arrived. If they are more than fit, it keeps the newest, because older ones would be stale.

@@ -16,7 +16,7 @@ use shared::agent::{Agent, Decision, Observation};
 use shared::alpha_track::AngleHistory;
 use shared::control::{EndReason, Outcome};
 use shared::gaussian_curve::Curve;
-use shared::limits::{Clipped, Limiter};
+use shared::limits::Limiter;
 use shared::messages::{Feature, LAYOUT_VERSION, Phase, Telemetry};
 
 use ending::{Ending, Moment, SeenFrame};
@@ -24,6 +24,7 @@ use following::{COMMANDS, Following};
 use frame_rate::FrameRate;
 use intake::Taken;
 use order::Situation;
+use run::Run;
 
 pub mod ending;
 pub mod following;
@@ -31,10 +32,12 @@ mod frame_rate;
 mod intake;
 mod order;
 mod robot;
+mod run;
 mod settings;
 
 pub use order::{Order, Refusal};
 pub use robot::Robot;
+pub use run::Counters;
 pub use settings::Settings;
 
 /// Largest number of features that one tick takes; it takes the newest. More than these come only if the loop is late by a quarter of a
@@ -70,44 +73,6 @@ pub struct Output {
     pub ended: Option<Outcome>,
     /// What an episode records of this tick, without [`Telemetry::weights_id`], which only the caller knows.
     pub telemetry: Telemetry,
-}
-
-/// Counters since the start.
-#[derive(Debug, Clone, Copy, PartialEq, Default)]
-pub struct Counters {
-    /// Number of ticks done.
-    pub ticks: u64,
-    /// Number of features used.
-    pub features: u64,
-    /// Number of ticks during pours and recordings whose newest measurement was stale.
-    pub stale_features: u64,
-    /// Number of lost frames bridged.
-    pub bridged_frames: u64,
-    /// Number of features ignored because they came twice, out of order, or from another layout or clock.
-    pub ignored_features: u64,
-    /// How often each limit changed a request.
-    pub clipped: Clipped,
-    /// The rate at which the camera's frames really come, and the configured one, frames/s, if they differ.
-    pub wrong_rate_hz: Option<(f32, f32)>,
-}
-
-/// A pour or recording under way.
-#[derive(Debug, Clone, Copy)]
-struct Run {
-    episode: u64,
-    started_at_ns: u64,
-    frames: u32,
-    /// Goal volume of a pour, ml.
-    goal_ml: Option<f32>,
-    /// Curve of a recording.
-    curve: Option<Curve>,
-    ending: Ending,
-    following: Following,
-    settling_since_ns: u64,
-    /// Start time of the feature worker that measured when it began, ns.
-    worker_epoch_ns: u64,
-    counters_before: Counters,
-    tick_gaps: u32,
 }
 
 /// The controller's state.
@@ -201,7 +166,9 @@ impl Core {
         }
         let mut ended = self.look_at_robot(input);
         if overran {
-            self.give_up(EndReason::ControllerOverrun);
+            // What leaves an upright container while nobody looks are drops.
+            let is_upright = self.phase == Phase::Settling && input.robot.alpha_deg.abs() <= self.settings.upright_deg;
+            self.give_up(EndReason::ControllerOverrun, !is_upright);
         }
         let ordered = input.order.map(|order| self.obey(order, input));
         let (asked, area) = self.take_features(input);
@@ -218,9 +185,10 @@ impl Core {
         match input.robot.hindrance {
             Some(reason) => {
                 self.phase = Phase::NoRobot;
-                let run = self.run.take()?;
+                let mut run = self.run.take()?;
                 let is_upright = input.robot.alpha_deg.abs() <= self.settings.upright_deg;
-                Some(self.outcome(&run, reason.after(run.ending.reason(), is_upright), input.now_ns))
+                let reason = run.ending.without_robot(reason, is_upright);
+                Some(self.outcome(&run, reason, input.now_ns))
             }
             None if self.phase == Phase::NoRobot && input.robot.alpha_deg.abs() <= self.settings.upright_deg => {
                 self.limiter.rest_at(input.robot.alpha_deg.clamp(self.settings.limits.alpha_min_deg, self.settings.limits.alpha_max_deg));
@@ -247,11 +215,11 @@ impl Core {
         match order {
             Order::Shutdown => {
                 self.shutdown = true;
-                self.give_up(EndReason::Shutdown);
+                self.give_up(EndReason::Shutdown, false);
             }
             Order::Abort => {
                 situation.may_abort()?;
-                self.give_up(EndReason::Aborted);
+                self.give_up(EndReason::Aborted, false);
             }
             Order::Pour { episode, goal_ml, flows_by_deg } => {
                 situation.may_begin(&self.settings)?;
@@ -290,8 +258,12 @@ impl Core {
         self.phase = if curve.is_some() { Phase::Recording } else { Phase::Pouring };
     }
 
-    /// Ends what is under way, for `reason`, and brings the container upright. What is already ending keeps its reason.
-    fn give_up(&mut self, reason: EndReason) {
+    /// Ends what is under way, for `reason`, and brings the container upright. What is already ending keeps its reason; with `undoes`, only unless that is
+    /// that it is done.
+    fn give_up(&mut self, reason: EndReason, undoes: bool) {
+        if let Some(run) = self.run.as_mut().filter(|_| undoes) {
+            run.ending.end_instead_of_done(reason);
+        }
         match self.phase {
             Phase::Pouring | Phase::Recording => {
                 if let Some(run) = &mut self.run {
@@ -308,8 +280,9 @@ impl Core {
     /// newest area, px^2; each is NaN if there is none.
     fn take_features(&mut self, input: &Input) -> (f32, f32) {
         let (mut asked, mut area) = (f32::NAN, f32::NAN);
+        let bridged = self.settings.frames(intake::BRIDGED_S);
         for feature in input.features {
-            let Some(taken) = Taken::new(self.newest, feature, input.now_ns) else {
+            let Some(taken) = Taken::new(self.newest, feature, input.now_ns, bridged) else {
                 self.counters.ignored_features += 1;
                 continue;
             };
@@ -322,8 +295,7 @@ impl Core {
             }
             let Some(run) = &mut self.run else { continue };
             if ending::worker_was_restarted(feature, run.worker_epoch_ns) {
-                run.ending.end_instead_of_done(EndReason::WorkerRestarted);
-                self.give_up(EndReason::WorkerRestarted);
+                self.give_up(EndReason::WorkerRestarted, true);
                 continue;
             }
             self.counters.bridged_frames += u64::from(taken.lost);
@@ -344,11 +316,11 @@ impl Core {
         let (agent, run) = (self.agent.as_mut()?, self.run.as_mut()?);
         run.goal_ml?;
         let alpha_now_deg = self.limiter.alpha_deg();
-        let measured = &self.measured;
+        let (measured, settings) = (&self.measured, &self.settings);
         let mut step = |area_px2, alpha_deg, at_ns| {
             let alpha_measured_deg = measured.at_within_deg(at_ns, MEASURED_HOLD_NS);
             let decision = agent.step(Observation { area_px2, confidence, alpha_deg, alpha_measured_deg, alpha_now_deg });
-            if run.ending.decided(&decision) {
+            if run.ending.decided(&decision, settings) {
                 agent.tilt_back();
             }
             decision
@@ -385,7 +357,7 @@ impl Core {
                 };
                 let due = run.ending.due(&moment, &self.settings);
                 if let Some(reason) = wrong_rate.filter(|_| due.is_none_or(|due| due == EndReason::Done)).or(due) {
-                    self.give_up(reason);
+                    self.give_up(reason, false);
                 }
                 None
             }
@@ -448,26 +420,7 @@ impl Core {
     }
 
     fn outcome(&self, run: &Run, reason: EndReason, now_ns: u64) -> Outcome {
-        let (now, before) = (self.counters(), run.counters_before);
-        Outcome {
-            episode: run.episode,
-            reason,
-            goal_ml: run.goal_ml,
-            poured_ml: if run.goal_ml.is_some() { self.decision.poured_ml } else { f32::NAN },
-            // What would still leave on the way upright is not seen of a run that ends before.
-            poured_sd_ml: if run.goal_ml.is_some() { self.decision.poured_sd_ml.hypot(self.decision.stop_ml) } else { 0.0 },
-            seconds: now_ns.saturating_sub(run.started_at_ns) as f32 / 1e9,
-            frames: run.frames,
-            bridged_frames: (now.bridged_frames - before.bridged_frames) as u32,
-            stale_features: (now.stale_features - before.stale_features) as u32,
-            tick_gaps: run.tick_gaps,
-            clipped: Clipped {
-                angle: now.clipped.angle - before.clipped.angle,
-                rate: now.clipped.rate - before.clipped.rate,
-                acceleration: now.clipped.acceleration - before.clipped.acceleration,
-                not_finite: now.clipped.not_finite - before.clipped.not_finite,
-            },
-        }
+        run.outcome(reason, now_ns, &self.decision, self.counters())
     }
 
     fn telemetry(&self, input: &Input, asked_deg: f32, area_px2: f32) -> Telemetry {

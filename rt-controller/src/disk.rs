@@ -14,11 +14,12 @@ use shared::agent::Agent;
 use shared::config::Config;
 use shared::disk_space::{error_words, free_bytes};
 use shared::episode::take_number;
+use shared::estimator::flow::WayBack;
 use shared::level::Level;
-use shared::messages::Phase;
+use shared::limits::Limits;
+use shared::messages::{Phase, Telemetry};
 use shared::os;
-use shared::regular_file;
-use shared::weights::Weights;
+use shared::weights::{Estimator, Weights};
 
 use crate::core::Settings;
 use crate::disk_note::{DiskNote, space_words};
@@ -27,8 +28,7 @@ use crate::journal::{Tick, Writer};
 
 /// Pause between two looks at the queue and the weight file. Chosen by hand; no measurement is recorded.
 const BEAT: Duration = Duration::from_millis(40);
-/// Number of ticks that may wait for a slow disk: half a minute at 30 Hz. A journal with a gap cannot be replayed, so a longer wait ends
-/// it.
+/// Number of ticks that may wait for a slow disk: half a minute at 30 Hz. Those that find no room are missing in the journal, which counts them.
 const WAITING_TICKS: usize = 1024;
 
 /// Pause before a journal that could not be written is tried again; it doubles with each failure, up to [`RETRY_MAX`], because each new file moves
@@ -41,9 +41,12 @@ const RETRY_SPACE: u64 = 16 << 20;
 /// Pause between two looks at the free space. Chosen by hand; no measurement is recorded.
 const SPACE_BEAT: Duration = Duration::from_secs(5);
 
-/// Largest relative difference between the camera's frame rate and the one that weights are trained for. Chosen by hand; no measurement
-/// is recorded.
-const RATE_TOLERANCE: f64 = 0.02;
+/// Largest relative difference of the camera's frame rate, and of the way back's, from those that weights are trained for. Chosen by hand; no
+/// measurement is recorded.
+const TOLERANCE: f64 = 0.02;
+
+/// A tick on its way to the journal, with its telemetry.
+pub type Told = Box<(Tick, Telemetry)>;
 
 /// The state of the disk's thread.
 pub struct Disk<'a> {
@@ -56,6 +59,8 @@ pub struct Disk<'a> {
     trusted: Option<u32>,
     /// Frames a second of the camera; weights are trained for one rate only.
     fps: f64,
+    /// Limits of this cell; weights are trained for one way back only.
+    limits: Limits,
     /// Time of change, inode and length of the weight file that was read last.
     seen: Option<(std::time::SystemTime, u64, u64)>,
     /// The journal; `None` if none is kept, or while nothing can be written.
@@ -69,7 +74,7 @@ pub struct Disk<'a> {
     at_rest_since_ns: Option<u64>,
     newest_tick_ns: u64,
     space_at: Option<Instant>,
-    ticks: Receiver<Box<Tick>>,
+    ticks: Receiver<Told>,
     /// The weights that were read last, for a journal that begins anew.
     loaded: Option<(u64, Vec<u8>)>,
     /// Directory of the episodes, and the queue of one that the service takes numbers from.
@@ -84,7 +89,7 @@ pub struct Disk<'a> {
 /// The other ends of the disk's queues.
 pub struct Queues {
     /// Takes the ticks for the journal; `None` if none is kept.
-    pub journal: Option<Sender<Box<Tick>>>,
+    pub journal: Option<Sender<Told>>,
     /// Gives numbers for the next episodes.
     pub numbers: Receiver<u64>,
 }
@@ -121,6 +126,7 @@ impl<'a> Disk<'a> {
             path: config.controller.weights.clone(),
             trusted,
             fps: config.camera.fps,
+            limits: config.limits,
             seen: None,
             journal,
             journal_at,
@@ -155,9 +161,10 @@ impl<'a> Disk<'a> {
 
     /// Writes the ticks that wait.
     fn write_ticks(&mut self) {
-        while let Ok(tick) = self.ticks.try_recv() {
+        while let Ok(told) = self.ticks.try_recv() {
+            let (tick, telemetry) = *told;
             self.newest_tick_ns = tick.now_ns;
-            self.write(|journal| journal.tick(tick));
+            self.write(|journal| journal.tick(Box::new(tick), &telemetry));
         }
     }
 
@@ -234,7 +241,6 @@ impl<'a> Disk<'a> {
         self.note.set(|n| {
             n.space = space;
             n.journal = match line {
-                _ if n.journal_gave_up => "ended: the disk does not keep up; restart the controller for a new one".into(),
                 Some(line) => line,
                 None => std::mem::take(&mut n.journal),
             };
@@ -284,7 +290,7 @@ impl<'a> Disk<'a> {
             return;
         }
         self.seen = stamp;
-        match read_weights(&self.path, self.fps, self.trusted) {
+        match read_weights(&self.path, self.fps, &self.limits, self.trusted) {
             Ok(weights) => {
                 refuse(String::new());
                 note.set(|n| n.weights_written = meta.modified().ok());
@@ -306,23 +312,38 @@ impl<'a> Disk<'a> {
     }
 }
 
-/// The weights in `path` if they are for a camera of `fps` frames a second and of an owner who may give some, or why they are refused.
-pub fn read_weights(path: &Path, fps: f64, trusted: Option<u32>) -> Result<Weights, String> {
-    let owned = regular_file::open(path).map_err(|e| e.to_string()).and_then(|(_, meta)| regular_file::check_owner(&meta, trusted));
-    owned.map_err(|e| format!("{}: {e}", path.display()))?;
-    let weights = Weights::read(path).map_err(|e| e.to_string())?;
-    let trained = weights.rate_hz;
-    if (f64::from(trained) / fps - 1.0).abs() < RATE_TOLERANCE {
-        Ok(weights)
-    } else {
-        Err(format!("trained at {trained} frames/s, camera.fps is {fps}: train with episodes of this camera"))
+/// The weights in `path` if they are for this cell's camera and limits, and of an owner who may give some, or why they are refused. `trusted`
+/// is the user number of the configuration's owner.
+pub fn read_weights(path: &Path, fps: f64, limits: &Limits, trusted: Option<u32>) -> Result<Weights, String> {
+    let weights = Weights::read_of_owner(path, trusted).map_err(|e| e.to_string())?;
+    let trained_hz = f64::from(weights.rate_hz);
+    let is_near = |a: f64, b: f64| (a / b - 1.0).abs() < TOLERANCE;
+    if !is_near(trained_hz, fps) {
+        return Err(format!("trained at {trained_hz} frames/s, camera.fps is {fps}: train with episodes of this camera"));
     }
+    if let Estimator::Fused { back, .. } = weights.estimator {
+        let ours = WayBack::new(limits, trained_hz);
+        if !(is_near(back.rate_deg, ours.rate_deg) && is_near(back.change_deg, ours.change_deg)) {
+            let words = |back: WayBack| {
+                let (rate, acceleration) = (back.rate_deg * trained_hz, back.change_deg * trained_hz * trained_hz);
+                format!("{rate:.0} degrees/s and {acceleration:.0} degrees/s^2")
+            };
+            return Err(format!(
+                "trained for a way back with {}, and [limits] give {}: what still flows on the way back would be foreseen wrongly; train again with \
+                 --config of this cell",
+                words(back),
+                words(ours)
+            ));
+        }
+    }
+    Ok(weights)
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
     use crate::core::Robot;
+    use crate::foreseen;
     use crate::journal::Times;
 
     /// Protects the end of a pour from the border between two parts of a journal: the loop has said that the pour is over before its last ticks have come
@@ -342,7 +363,7 @@ mod tests {
             let (robot, features) = (Robot::that_may_move(0.0, now_ns), heapless::Vec::new());
             let times = Times::default();
             let tick = Tick { now_ns, features, robot, order: None, agent: None, target_deg: None, d_ml: 0.0, times };
-            sender.send(Box::new(tick)).unwrap();
+            sender.send(Box::new((tick, Telemetry::default()))).unwrap();
             disk.write_ticks();
         };
         let rests = |disk: &mut Disk, phase: Phase| {
@@ -358,5 +379,72 @@ mod tests {
         tick_at(&mut disk, os::now_ns());
         assert!(rests(&mut disk, Phase::Idle));
         assert!(!rests(&mut disk, Phase::Recording) && !rests(&mut disk, Phase::Idle), "the next one");
+    }
+
+    /// Protects a pour from a model that has become wrong: weights that were trained for another way back foresee wrongly what still flows on it, and are
+    /// refused with both; a difference that is nothing is none.
+    #[test]
+    fn weights_for_another_way_back_are_refused() {
+        let (ours, directory) = (Limits::default(), tempfile::tempdir().unwrap());
+        let path = directory.path().join("weights.bin");
+        let read = |limits: Limits| {
+            let mut weights = foreseen::tests::weights();
+            if let Estimator::Fused { back, .. } = &mut weights.estimator {
+                *back = WayBack::new(&limits, 30.0);
+            }
+            weights.write(&path).unwrap();
+            read_weights(&path, 30.0, &ours, None).map(|_| ())
+        };
+        assert_eq!(read(ours), Ok(()));
+        assert_eq!(read(Limits { return_rate_deg_s: 60.2, ..ours }), Ok(()));
+        assert_eq!(read(Limits { rate_deg_s: 80.0, ..ours }), Ok(()), "the way back is as before");
+        for limits in
+            [Limits { return_rate_deg_s: 30.0, ..ours }, Limits { acceleration_deg_s2: 300.0, ..ours }, Limits { rate_deg_s: 40.0, ..ours }]
+        {
+            let refused = read(limits).unwrap_err();
+            assert!(refused.contains("way back with ") && refused.contains("give 60 degrees/s and 1500 degrees/s^2"), "{refused}");
+        }
+    }
+
+    /// Protects the robot from a file that is exchanged while it is looked at: the bytes that are used are those whose owner and mode were checked. The
+    /// name changes all the time between a file of ours and one that everybody may write.
+    #[test]
+    fn what_is_read_is_what_was_checked() {
+        use std::os::unix::fs::PermissionsExt;
+        let directory = tempfile::tempdir().unwrap();
+        let at = |name: &str| directory.path().join(name);
+        let write = |name: &str, seed: u64, mode: u32| {
+            Weights { seed, ..foreseen::tests::weights() }.write(&at(name)).unwrap();
+            std::fs::set_permissions(at(name), std::fs::Permissions::from_mode(mode)).unwrap();
+        };
+        write("ours", 1, 0o600);
+        write("anybody's", 2, 0o666);
+        let (path, done) = (at("weights.bin"), AtomicBool::new(false));
+        std::thread::scope(|scope| {
+            scope.spawn(|| {
+                while !done.load(Relaxed) {
+                    for name in ["ours", "anybody's"] {
+                        let (new, path) = (at("new"), &path);
+                        std::fs::hard_link(at(name), &new).and_then(|()| std::fs::rename(&new, path)).unwrap();
+                        // Two names of one file are not renamed, and the new one stays.
+                        let _ = std::fs::remove_file(&new);
+                    }
+                }
+            });
+            let (mut ours, mut refused) = (0, 0);
+            let until = Instant::now() + Duration::from_secs(2);
+            while Instant::now() < until {
+                match read_weights(&path, 30.0, &Limits::default(), None) {
+                    Ok(weights) => {
+                        ours += 1;
+                        done.store(weights.seed != 1, Relaxed);
+                        assert_eq!(weights.seed, 1, "read after another one was checked");
+                    }
+                    Err(_) => refused += 1,
+                }
+            }
+            done.store(true, Relaxed);
+            assert!(ours > 0 && refused > 0, "{ours} {refused}");
+        });
     }
 }

@@ -16,8 +16,6 @@ pub struct DiskState {
     pub weights_written: Option<SystemTime>,
     /// The journal, one line: its file and size, or why nothing is written.
     pub journal: String,
-    /// Whether nothing more is given to the journal, because the disk did not keep up.
-    pub journal_gave_up: bool,
     /// Free space where journal and episodes lie, one line.
     pub space: String,
 }

@@ -3,7 +3,7 @@
 //! The loop never blocks on them and never frees what it got: boxes that it no longer needs go back through a queue, and an ordinary
 //! thread drops them. When a queue is full, the loop counts the events that it could not pass on ([`Exchange::events_lost`]).
 
-use std::sync::atomic::{AtomicBool, AtomicU32, AtomicU64};
+use std::sync::atomic::{AtomicBool, AtomicU32, AtomicU64, Ordering::SeqCst};
 
 use crossbeam::queue::ArrayQueue;
 use shared::agent::Agent;
@@ -21,8 +21,8 @@ use crate::timing::Histogram;
 pub enum Event {
     /// A tick: what it saw and answered, its telemetry, and the counters.
     Tick(Tick, Telemetry, Counters),
-    /// The answer to an order.
-    Ordered(Result<(), Refusal>),
+    /// The answer to the order of the pour or recording with this number.
+    Ordered(u64, Result<(), Refusal>),
     /// A pour or recording has ended.
     Ended(Outcome),
 }
@@ -70,18 +70,32 @@ pub struct Timing {
     pub wake_to_written: Histogram,
 }
 
+/// An order, and how many aborts had been asked for when it was certainly not given yet. An abort that came later may have come after the order, which
+/// is then refused: whoever has stopped a robot must not see it begin with what was given before.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Asked {
+    /// The order.
+    pub order: Order,
+    /// Value of [`Exchange::aborts`] then.
+    pub aborts: u64,
+}
+
 /// Everything that the threads share.
 pub struct Exchange {
-    /// To the loop: bring the container upright at once. It comes before every order in the queue.
-    pub abort: AtomicBool,
+    /// To the loop: the number of times that the container was to be brought upright at once. That comes before every order in the queue.
+    pub aborts: AtomicU64,
+    /// From the loop: how many of those it has obeyed, and shown in its phase.
+    pub aborts_obeyed: AtomicU64,
     /// To the loop: bring the container upright, and then end. It comes before everything else.
     pub shutdown: AtomicBool,
     /// From the loop: its phase after the newest tick.
     pub phase: AtomicU32,
     /// From the loop: the bits of the measured alpha of the newest tick, degrees; NaN without a robot.
     pub alpha_measured: AtomicU32,
+    /// From the loop: the bits of the last alpha that a robot measured, degrees; NaN before the first.
+    pub last_alpha: AtomicU32,
     /// To the loop: orders.
-    pub orders: ArrayQueue<Order>,
+    pub orders: ArrayQueue<Asked>,
     /// From the loop: events.
     pub events: ArrayQueue<Event>,
     /// To the loop: an agent with the newest weights, and their identity.
@@ -112,6 +126,13 @@ pub struct Exchange {
     pub resume: AtomicBool,
 }
 
+impl Exchange {
+    /// Has the loop bring the container upright at once.
+    pub fn abort(&self) {
+        self.aborts.fetch_add(1, SeqCst);
+    }
+}
+
 /// Number of orders that may wait for the loop, which takes one a tick. Chosen by hand; no measurement is recorded.
 const ORDERS: usize = 8;
 /// Number of events that may wait for the ordinary thread: half a minute of ticks at 30 Hz.
@@ -122,10 +143,12 @@ const OLD: usize = 4;
 impl Default for Exchange {
     fn default() -> Self {
         Self {
-            abort: AtomicBool::new(false),
+            aborts: AtomicU64::new(0),
+            aborts_obeyed: AtomicU64::new(0),
             shutdown: AtomicBool::new(false),
             phase: AtomicU32::new(0),
             alpha_measured: AtomicU32::new(f32::NAN.to_bits()),
+            last_alpha: AtomicU32::new(f32::NAN.to_bits()),
             orders: ArrayQueue::new(ORDERS),
             events: ArrayQueue::new(EVENTS),
             agents: ArrayQueue::new(1),

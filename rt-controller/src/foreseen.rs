@@ -121,7 +121,7 @@ pub fn unseen_ml(weights: &Weights) -> Option<f64> {
 }
 
 #[cfg(test)]
-mod tests {
+pub(crate) mod tests {
     use shared::actions::{STAY, Selection, action_table};
     use shared::estimator::filter::UNKNOWNS;
     use shared::estimator::flow::{FlowModel, WayBack};
@@ -133,7 +133,7 @@ mod tests {
     use super::*;
 
     /// Weights whose network tilts by 0.2 degrees a frame until the goal is reached, for the usual beaker.
-    fn weights() -> Weights {
+    pub(crate) fn weights() -> Weights {
         let mut network = Mlp::ZERO;
         network.b3[STAY + 2] = 1.0;
         let calibration = Calibration { volume_at_1_px2_ml: 0.0012, area_exponent: 1.2, log_tilt_slope: 0.0, hold_above_px2: 60.0 };

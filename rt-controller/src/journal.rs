@@ -1,7 +1,8 @@
 //! The journal: every tick's inputs and answer, so that a run can be replayed bit for bit.
 //!
 //! The loop hands each [`Tick`] to an ordinary thread through a queue, and that thread writes it ([`Writer`]). Commands and tests read
-//! and replay. Both allocate. A file that was cut off is read up to its last whole entry; every other fault is a [`JournalError`].
+//! and replay. Both allocate. A file that was cut off is read up to its last whole entry, and ticks that could not be told are counted; every other
+//! fault is a [`JournalError`].
 //!
 //! The file begins with the 8 bytes `decantj6`. Then come the entries: a little-endian u32 with the length, and that many bytes of
 //! postcard.
@@ -13,7 +14,7 @@ use std::path::{Path, PathBuf};
 
 use serde::{Deserialize, Serialize};
 use shared::agent::Agent;
-use shared::messages::Feature;
+use shared::messages::{Feature, Telemetry};
 use shared::regular_file;
 use shared::weights::Weights;
 
@@ -32,7 +33,7 @@ const KEPT_BYTES: u64 = 1 << 30;
 const KEPT: u32 = 20;
 /// The first byte of an entry that is a tick: postcard numbers the kinds of [`Entry`] in their order.
 const TICK: u8 = 2;
-/// Number of ticks at the beginning of a later part that are not compared: as many as the core remembers ([`crate::core`]).
+/// Number of ticks at the beginning of a later part, and behind a gap, that are not compared: as many as the core remembers ([`crate::core`]).
 const UNKNOWN_TICKS: u64 = 64;
 
 /// Latest time that a tick may have, ns: 146 years after the machine's start. A later one is damage, and sums with it would overflow.
@@ -85,6 +86,8 @@ enum Entry {
     Tick(Box<Tick>),
     /// The file begins in the middle of a run, outside of pours and recordings; it stands behind the settings.
     Continued,
+    /// So many ticks are missing here: the loop could not tell them, because the ordinary side fell behind.
+    Lost(u64),
 }
 
 /// Why a journal cannot be read.
@@ -122,8 +125,10 @@ pub struct Writer<W: Write = BufWriter<File>> {
     weights: BTreeMap<u64, Vec<u8>>,
     /// Identity of the weights that the loop has.
     taken: Option<u64>,
-    /// Whether the next tick must say which weights the loop has, because it is the first of a later part.
+    /// Whether the next tick must say which weights the loop has, because it is the first of a later part or behind a gap.
     names_weights: bool,
+    /// Number of the newest tick, 0 before a run's first; `None` if a later part begins with an unknown one.
+    newest: Option<u64>,
     /// Where an entry is put together.
     buffer: Vec<u8>,
 }
@@ -212,7 +217,7 @@ impl<W: Write> Writer<W> {
     /// Starts a journal that goes to `to`.
     pub fn begin(to: W, settings: &Settings) -> std::io::Result<Self> {
         let (weights, buffer) = (BTreeMap::new(), vec![0; ENTRY_MAX]);
-        let mut this = Self { to, written: 0, weights, taken: None, names_weights: false, buffer };
+        let mut this = Self { to, written: 0, weights, taken: None, names_weights: false, newest: Some(0), buffer };
         this.to.write_all(MAGIC)?;
         this.entry(&Entry::Settings(*settings))?;
         Ok(this)
@@ -225,7 +230,7 @@ impl<W: Write> Writer<W> {
         for (identity, bytes) in &weights {
             this.entry(&Entry::Weights(*identity, bytes.clone()))?;
         }
-        (this.weights, this.taken, this.names_weights) = (weights, taken, taken.is_some());
+        (this.weights, this.taken, this.names_weights, this.newest) = (weights, taken, taken.is_some(), None);
         Ok(this)
     }
 
@@ -238,8 +243,17 @@ impl<W: Write> Writer<W> {
         self.entry(&Entry::Weights(identity, bytes))
     }
 
-    /// Adds a tick.
-    pub fn tick(&mut self, mut tick: Box<Tick>) -> std::io::Result<()> {
+    /// Adds a tick, and before it how many are missing since the one before, if any are: without that a replay would run on as if they had never been.
+    /// `telemetry` is the tick's own, which has its number and the identity of the loop's weights.
+    pub fn tick(&mut self, mut tick: Box<Tick>, telemetry: &Telemetry) -> std::io::Result<()> {
+        let lost = self.newest.map_or(0, |newest| telemetry.tick.saturating_sub(newest + 1));
+        self.newest = Some(telemetry.tick);
+        if lost > 0 {
+            self.entry(&Entry::Lost(lost))?;
+            // They may have been exchanged meanwhile.
+            self.taken = Some(telemetry.weights_id).filter(|id| *id != 0);
+            self.names_weights = true;
+        }
         self.taken = tick.agent.or(self.taken);
         if std::mem::take(&mut self.names_weights) {
             tick.agent = self.taken;
@@ -318,6 +332,9 @@ pub struct Replay {
     /// Whether the file begins in the middle of a run. Its answers are then compared from its first pour or recording on, because what the core knew before
     /// stands in the part before.
     pub continued: bool,
+    /// Number of ticks that are missing, because the controller's ordinary side fell behind. Behind a gap answers are compared from the next pour or
+    /// recording on, and what was under way when it began has no result.
+    pub lost: u64,
     /// Whether the file ends in the middle of an entry.
     pub cut_off: bool,
 }
@@ -381,6 +398,9 @@ struct Rerun {
     /// The pacer and the deadline that it gave; `None` where it cannot be known.
     pacing: Option<(Pacer, Option<u64>)>,
     core: Option<Core>,
+    settings: Option<Settings>,
+    /// Number of ticks since the beginning of the file, or since the newest gap.
+    connected: u64,
     weights: BTreeMap<u64, Weights>,
     /// When the newest tick woke up, ns.
     before_ns: u64,
@@ -395,9 +415,11 @@ impl Rerun {
             first_different: None,
             different_deadlines: 0,
             continued: false,
+            lost: 0,
             cut_off: false,
         };
-        Self { result, compared: true, pacing: None, core: None, weights: BTreeMap::new(), before_ns: 0 }
+        let weights = BTreeMap::new();
+        Self { result, compared: true, pacing: None, core: None, settings: None, connected: 0, weights, before_ns: 0 }
     }
 
     /// Takes the next entry; `None` if it cannot be right.
@@ -406,15 +428,22 @@ impl Rerun {
             Entry::Settings(settings) => {
                 settings.are_plausible().then_some(())?;
                 self.pacing = Some((Pacer::new(settings.period_ns), None));
-                self.core = Some(Core::new(settings));
+                (self.core, self.settings) = (Some(Core::new(settings)), Some(settings));
             }
             Entry::Continued => (self.result.continued, self.compared, self.pacing) = (true, false, None),
+            Entry::Lost(ticks) => {
+                // What the core knew is not known any more.
+                self.core = Some(Core::new(self.settings?));
+                (self.compared, self.pacing, self.connected) = (false, None, 0);
+                self.result.lost = self.result.lost.saturating_add(ticks);
+            }
             Entry::Weights(identity, bytes) => {
                 self.weights.insert(identity, Weights::from_bytes(&bytes, "").ok()?);
             }
             Entry::Tick(tick) => {
                 let output = self.tick(&tick)?;
                 self.result.ticks += 1;
+                self.connected += 1;
                 self.result.ended.extend(output.ended);
                 seen(&tick, &output);
             }
@@ -436,7 +465,7 @@ impl Rerun {
         let same = output.target_deg.map(f32::to_bits) == tick.target_deg.map(f32::to_bits)
             && output.telemetry.d_ml.to_bits() == tick.d_ml.to_bits();
         let begins = matches!(order, Some(Order::Pour { .. } | Order::Record { .. })) && output.ordered == Some(Ok(()));
-        self.compared |= self.result.ticks >= UNKNOWN_TICKS && begins;
+        self.compared |= self.connected >= UNKNOWN_TICKS && begins;
         if self.compared && !same {
             self.result.different += 1;
             self.result.first_different.get_or_insert(self.result.ticks);

@@ -22,10 +22,9 @@ use shared::supervisor::Supervisor;
 
 use crate::client::MESSAGE_MAX;
 use crate::core::{Counters, Order, Refusal};
-use crate::disk::Queues;
+use crate::disk::{Queues, Told};
 use crate::disk_note::DiskNote;
-use crate::exchange::{Event, Exchange};
-use crate::journal::Tick;
+use crate::exchange::{Asked, Event, Exchange};
 use crate::robot_thread::RobotNote;
 
 /// Pause between two looks at the queues. Chosen by hand: far below a person's patience, and cheap.
@@ -37,7 +36,7 @@ const LAST_RESULT: Duration = Duration::from_millis(400);
 const OUTCOMES: usize = 32;
 
 /// A client's request that waits for its answer.
-type Asked = ActiveRequest<Ipc, [u8], (), [u8], ()>;
+type Client = ActiveRequest<Ipc, [u8], (), [u8], ()>;
 
 /// The state of the controller's ordinary side.
 pub struct Service<'a> {
@@ -49,12 +48,16 @@ pub struct Service<'a> {
     telemetry: Publisher<Ipc, Telemetry, ()>,
     /// What lies on disks, and what is wrong with it.
     disk_note: &'a DiskNote,
-    /// The queue to the journal; `None` if no journal is kept, or if the disk could not keep up.
-    journal: Option<Sender<Box<Tick>>>,
+    /// The queue to the journal; `None` if no journal is kept.
+    journal: Option<Sender<Told>>,
+    /// Whether the newest tick did not fit into it.
+    journal_lags: bool,
     latest: Option<(Telemetry, Counters)>,
     outcomes: VecDeque<Outcome>,
     /// The requests whose orders are in the queue, in the same order, each with its episode's number.
-    waiting: VecDeque<(Asked, u64)>,
+    waiting: VecDeque<(Client, u64)>,
+    /// Number of aborts before the newest look that found no request.
+    aborts: u64,
     /// Numbers that nobody has used, the smallest first; they belong to no file.
     numbers: Receiver<u64>,
     /// Numbers of orders that were refused: the next order takes them.
@@ -93,9 +96,11 @@ impl<'a> Service<'a> {
             started: Instant::now(),
             result_at: None,
             journal: disk.journal,
+            journal_lags: false,
             latest: None,
             outcomes: VecDeque::new(),
             waiting: VecDeque::new(),
+            aborts: 0,
             numbers: disk.numbers,
             spare: BTreeSet::new(),
         })
@@ -124,20 +129,21 @@ impl<'a> Service<'a> {
         while let Some(event) = self.exchange.events.pop() {
             match event {
                 Event::Tick(tick, telemetry, counters) => {
-                    if self.journal.as_ref().is_some_and(|j| j.try_send(Box::new(tick)).is_err()) {
-                        (self.say)(
-                            Level::Warning,
-                            "journal: the disk does not keep up; nothing more is written to it, and the controller goes on",
-                        );
-                        self.disk_note.set(|n| n.journal_gave_up = true);
-                        self.journal = None;
+                    let lost = self.journal.as_ref().is_some_and(|j| j.try_send(Box::new((tick, telemetry))).is_err());
+                    if lost && !self.journal_lags {
+                        let what = "journal: the disk does not keep up; what is missing is counted in it, and the controller goes on";
+                        (self.say)(Level::Warning, what);
                     }
+                    self.journal_lags = lost;
                     self.latest = Some((telemetry, counters));
                     // It does not matter whether anybody listens.
                     let _ = self.telemetry.send_copy(telemetry);
                 }
-                Event::Ordered(answer) => {
-                    if let Some((asked, episode)) = self.waiting.pop_front() {
+                Event::Ordered(episode, answer) => {
+                    let place = self.waiting.iter().position(|(_, its)| *its == episode);
+                    // Those in front have lost their answers, because the loop could not tell them; their clients learn that they got none.
+                    self.waiting.drain(..place.unwrap_or(0));
+                    if let Some((asked, _)) = place.and_then(|_| self.waiting.pop_front()) {
                         let answer = match answer {
                             Ok(()) => Reply::Started { episode },
                             Err(refusal) => {
@@ -186,7 +192,17 @@ impl<'a> Service<'a> {
 
     /// Answers clients, or passes their orders to the loop.
     fn answer(&mut self) {
-        while let Ok(Some(asked)) = self.server.receive() {
+        loop {
+            // What is received after a look that found nothing was given after that look, and so after the aborts until then.
+            let aborts = self.exchange.aborts.load(SeqCst);
+            let asked = match self.server.receive() {
+                Ok(Some(asked)) => asked,
+                Ok(None) => {
+                    self.aborts = aborts;
+                    return;
+                }
+                Err(_) => return,
+            };
             // Whoever has given up waiting must not find the robot moving later.
             if !asked.is_connected() {
                 continue;
@@ -210,7 +226,7 @@ impl<'a> Service<'a> {
                     continue;
                 }
                 Request::Abort => {
-                    self.exchange.abort.store(true, SeqCst);
+                    self.exchange.abort();
                     reply(&asked, &Reply::Aborting);
                     continue;
                 }
@@ -224,7 +240,7 @@ impl<'a> Service<'a> {
                 reply(&asked, &Reply::Refused { reason: reason.into() });
                 continue;
             };
-            match self.exchange.orders.push(order) {
+            match self.exchange.orders.push(Asked { order, aborts: self.aborts }) {
                 Ok(()) => self.waiting.push_back((asked, episode)),
                 Err(_) => {
                     self.spare.insert(episode);
@@ -302,10 +318,124 @@ impl<'a> Service<'a> {
 }
 
 /// Sends an answer; a client that has gone away is no error.
-fn reply(asked: &Asked, reply: &Reply) {
+fn reply(asked: &Client, reply: &Reply) {
     let mut buffer = vec![0; MESSAGE_MAX];
     let Ok(bytes) = postcard::to_slice(reply, &mut buffer) else { return };
     if let Ok(loan) = asked.loan_slice_uninit(bytes.len()) {
         let _ = loan.write_from_slice(bytes).send();
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use shared::runtime_dir::Place;
+
+    use super::*;
+    use crate::journal::Tick;
+
+    type Port = iceoryx2::port::client::Client<Ipc, [u8], (), [u8], ()>;
+    type Pending = iceoryx2::pending_response::PendingResponse<Ipc, [u8], (), [u8], ()>;
+
+    /// What is around a service that no loop answers.
+    struct Around<'a> {
+        exchange: &'a Exchange,
+        /// Gives it numbers of episodes.
+        give: Sender<u64>,
+        /// Two clients.
+        ports: [Port; 2],
+        /// Where one tick for the journal has room.
+        told: Receiver<Told>,
+        /// Number of lines that it has said.
+        said: &'a Count,
+    }
+
+    type Count = std::cell::Cell<u32>;
+
+    /// Runs `check` with a service and what is around it.
+    fn with_service(name: &str, check: impl FnOnce(Service, Around)) {
+        let base = tempfile::tempdir().unwrap();
+        let place = Place { name: name.into(), base: Some(base.path().into()) };
+        let cell = Cell::join(&place).unwrap();
+        let (exchange, note, connections, disk_note) = (Exchange::default(), RobotNote::default(), AtomicU64::new(0), DiskNote::default());
+        let (give, numbers) = crossbeam::channel::bounded(2);
+        let said = Count::new(0);
+        let say = |_: Level, _: &str| said.set(said.get() + 1);
+        let (journal, told) = crossbeam::channel::bounded(1);
+        let queues = Queues { journal: Some(journal), numbers };
+        let service = Service::open(&cell, &exchange, (&note, &connections), (&disk_note, queues), &say).unwrap();
+        let port = || cell.control().unwrap().client_builder().initial_max_slice_len(MESSAGE_MAX).create().unwrap();
+        check(service, Around { exchange: &exchange, give, ports: [port(), port()], told, said: &said });
+        shared::ipc::remove_files(place);
+    }
+
+    /// Sends the request for a pour.
+    fn send(port: &Port) -> Pending {
+        let mut buffer = vec![0; MESSAGE_MAX];
+        let bytes = postcard::to_slice(&Request::Pour { goal_ml: 50.0, flows_by_deg: None }, &mut buffer).unwrap();
+        port.loan_slice_uninit(bytes.len()).unwrap().write_from_slice(bytes).send().unwrap()
+    }
+
+    /// Protects people from a pour that begins after an abort has said that the container is upright: a request that still lay in iceoryx2's queue then is passed
+    /// on as one from before the abort, which the loop refuses. The next one is not.
+    #[test]
+    fn a_request_from_before_an_abort_is_known_as_one() {
+        with_service("stopped", |mut service, Around { exchange, give, ports: [port, _], .. }| {
+            give.send(7).unwrap();
+            let mut passed_on = |then: &dyn Fn()| {
+                let _pending = send(&port);
+                then();
+                service.answer();
+                let asked = exchange.orders.pop().unwrap();
+                exchange.events.push(Event::Ordered(7, Err(Refusal::Stopped))).unwrap();
+                service.take_events();
+                (asked.order.episode(), asked.aborts)
+            };
+            assert_eq!(passed_on(&|| exchange.abort()), (7, 0));
+            assert_eq!(exchange.aborts.load(SeqCst), 1);
+            assert_eq!(passed_on(&|| ()), (7, 1), "a refused order's number is the next one's");
+        });
+    }
+
+    /// Protects clients from each other's answers: if the loop could not tell the answer to an order, the next answer goes to its own order all the same, and
+    /// one to an order that nobody knows goes to nobody.
+    #[test]
+    fn a_lost_answer_leaves_the_others_theirs() {
+        with_service("answers", |mut service, Around { exchange, give, ports, .. }| {
+            let pending = [7, 8].map(|episode| {
+                give.send(episode).unwrap();
+                let pending = send(&ports[episode as usize - 7]);
+                service.answer();
+                pending
+            });
+            let mut answers_to = |episode: u64| {
+                exchange.events.push(Event::Ordered(episode, Ok(()))).unwrap();
+                service.take_events();
+                let answer = |p: &Pending| p.receive().unwrap().map(|r| postcard::from_bytes::<Reply>(r.payload()).unwrap());
+                [answer(&pending[0]), answer(&pending[1])]
+            };
+            assert_eq!(answers_to(99), [None, None]);
+            assert_eq!(answers_to(8), [None, Some(Reply::Started { episode: 8 })]);
+        });
+    }
+
+    /// Protects the journal of a long run from a disk that is slow for a while: it loses the ticks that find no room, which it counts by their numbers, and
+    /// not all that come later. It is said once.
+    #[test]
+    fn a_slow_disk_costs_ticks_and_not_the_journal() {
+        with_service("slow", |mut service, Around { exchange, told, said, .. }| {
+            let mut tell = |numbers: std::ops::RangeInclusive<u64>| {
+                for number in numbers {
+                    let telemetry = Telemetry { tick: number, ..Telemetry::default() };
+                    let robot = crate::core::Robot::that_may_move(0.0, number);
+                    let (features, times) = (heapless::Vec::new(), crate::journal::Times::default());
+                    let tick = Tick { now_ns: number, features, robot, order: None, agent: None, target_deg: None, d_ml: 0.0, times };
+                    exchange.events.push(Event::Tick(tick, telemetry, Counters::default())).unwrap();
+                }
+                service.take_events();
+                told.try_recv().map(|told| told.1.tick).ok()
+            };
+            assert_eq!([tell(1..=3), tell(4..=4), tell(5..=5)], [Some(1), Some(4), Some(5)]);
+            assert_eq!(said.get(), 1);
+        });
     }
 }

@@ -19,6 +19,7 @@ use std::time::{Duration, Instant};
 
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
 use serde::{Deserialize, Serialize};
+use shared::exit::{self, Failure, failure};
 use shared::level::Level;
 use shared::messages::Phase;
 use shared::os::peer_uid;
@@ -75,21 +76,24 @@ fn is_taken(uid: u32, name: &str) -> bool {
 }
 
 impl StopSockets {
-    /// Opens the sockets of the cell `name` in `directory`. The error is one line. `say` gets a line if only the file could be had.
+    /// Opens the sockets of the cell `name` in `directory`. Fails if there is no way to stop a motion, or if another controller of the cell is there.
+    /// `say` gets a line if only the file could be had.
     ///
     /// Call it with the controller's lock held, because it takes the place of a socket that a dead controller left.
-    pub fn open(directory: &Path, name: &str, say: &dyn Fn(Level, &str)) -> Result<Self, String> {
+    pub fn open(directory: &Path, name: &str, say: &dyn Fn(Level, &str)) -> Result<Self, Failure> {
         let path = directory.join("stop");
-        let fail = |e: std::io::Error| format!("{}: {e}: no way to stop a motion, so none is begun", path.display());
-        if is_taken(own_uid(), name) {
-            return Err(format!("another rt-controller of cell '{name}' is running: stop it first (its runtime directory was deleted)"));
+        let fail = |e: std::io::Error| failure(exit::FAILED, format!("{}: {e}: no way to stop a motion, so none is begun", path.display()));
+        // Of two that start at once, one gets the name.
+        let nameless = SocketAddr::from_abstract_name(abstract_name(own_uid(), name)).and_then(|a| UnixListener::bind_addr(&a));
+        if nameless.is_err() && is_taken(own_uid(), name) {
+            let what = format!("another rt-controller of cell '{name}' is running: stop it first (its runtime directory was deleted)");
+            return Err(failure(exit::REFUSED, what));
         }
         let _ = std::fs::remove_file(&path);
         let file = UnixListener::bind(&path).map_err(fail)?;
         // A group that may enter the directory may also stop the robot.
         std::fs::set_permissions(&path, std::fs::Permissions::from_mode(0o660)).map_err(fail)?;
         file.set_nonblocking(true).map_err(fail)?;
-        let nameless = SocketAddr::from_abstract_name(abstract_name(own_uid(), name)).and_then(|a| UnixListener::bind_addr(&a));
         let nameless = nameless.and_then(|l| l.set_nonblocking(true).map(|()| l));
         if let Err(e) = &nameless {
             say(
@@ -203,7 +207,7 @@ impl StopThread<'_> {
         let mut answer = self.state();
         match &client.line[..end] {
             b"abort" => {
-                self.exchange.abort.store(true, SeqCst);
+                self.exchange.abort();
                 if !answer.hindrance.is_empty() {
                     answer.refused.clone_from(&answer.hindrance);
                 }
@@ -217,6 +221,8 @@ impl StopThread<'_> {
 
     /// The controller's state, from what the loop left after its newest tick.
     fn state(&self) -> StopAnswer {
+        // An abort that the loop has not obeyed yet is still to move the container. It is looked at before the phase, which then shows what came of it.
+        let obeyed = self.exchange.aborts_obeyed.load(SeqCst) == self.exchange.aborts.load(SeqCst);
         let phase = Phase::from_code(self.exchange.phase.load(SeqCst));
         let alpha_deg = f32::from_bits(self.exchange.alpha_measured.load(SeqCst));
         let note = self.robot_note.get().text;
@@ -227,8 +233,7 @@ impl StopThread<'_> {
             _ => String::new(),
         };
         let at_rest = matches!(phase, Phase::Idle | Phase::Settling);
-        // An abort that the loop has not taken yet is still to move the container.
-        let upright = at_rest && alpha_deg.abs() <= self.tolerance_deg && !self.exchange.abort.load(SeqCst);
+        let upright = obeyed && at_rest && alpha_deg.abs() <= self.tolerance_deg;
         let alpha_deg = alpha_deg.is_finite().then_some(alpha_deg);
         StopAnswer { pid: std::process::id(), phase, alpha_deg, upright, hindrance, refused: String::new() }
     }

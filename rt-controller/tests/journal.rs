@@ -11,7 +11,7 @@ use rt_controller::core::{Core, Input, Order, Robot, Settings};
 use rt_controller::journal::{Tick, Times, Writer, replay_from};
 use shared::agent::Agent;
 use shared::config::Config;
-use shared::messages::{Feature, LAYOUT_VERSION};
+use shared::messages::{Feature, LAYOUT_VERSION, Telemetry};
 
 fn settings() -> Settings {
     Settings::new(&Config::parse(include_str!("../../config/sim.toml"), "config/sim.toml").expect("the shipped configuration is valid"))
@@ -20,6 +20,11 @@ fn settings() -> Settings {
 /// Two parts of a journal of `ticks` ticks, the second of which begins at `cut`, with pours ordered at `orders` and a wrong answer in the tick `lie`, from a cell in which a stream begins
 /// at 20 degrees.
 fn parts(ticks: u64, cut: u64, orders: &[u64], lie: u64) -> [Vec<u8>; 2] {
+    parts_without(ticks, cut, orders, lie, &(0..0))
+}
+
+/// The same without the ticks `lost`, which the writer was never told.
+fn parts_without(ticks: u64, cut: u64, orders: &[u64], lie: u64, lost: &std::ops::Range<u64>) -> [Vec<u8>; 2] {
     let settings = settings();
     let weights = write_weights::constant_action(3);
     let (mut bytes, mut later) = (Vec::new(), Vec::new());
@@ -56,7 +61,10 @@ fn parts(ticks: u64, cut: u64, orders: &[u64], lie: u64) -> [Vec<u8>; 2] {
         let d_ml = output.telemetry.d_ml + f32::from(u8::from(k == lie));
         let target_deg = output.target_deg;
         let to = if k < cut { &mut writer } else { &mut second };
-        to.tick(Box::new(Tick { now_ns, features, robot, order, agent, target_deg, d_ml, times })).expect("memory");
+        let telemetry = Telemetry { weights_id: u64::from(k >= 1), ..output.telemetry };
+        if !lost.contains(&k) {
+            to.tick(Box::new(Tick { now_ns, features, robot, order, agent, target_deg, d_ml, times }), &telemetry).expect("memory");
+        }
     }
     writer.flush().and_then(|()| second.flush()).expect("memory");
     drop((writer, second));
@@ -115,6 +123,23 @@ fn a_later_part_replays_from_its_first_order_on() {
     }
 }
 
+/// Protects whoever replays a run whose ordinary side fell behind: the ticks that were lost are counted, a pour that they cut has no result and no
+/// differences, and behind them the next pour replays to the bit, with the weights that were exchanged in the gap; a tick that was changed there is found.
+#[test]
+fn lost_ticks_are_said_and_the_next_pour_replays() {
+    for (lost, orders, results) in [(100..140, [20, 600], 1), (0..40, [20, 600], 1), (450..500, [20, 600], 2)] {
+        let [bytes, _] = parts_without(1000, u64::MAX, &orders, u64::MAX, &lost);
+        let replayed = replay_from(&bytes[..], "lost", |_, _| {}).expect("whole");
+        let found = (replayed.ticks, replayed.lost, replayed.different, replayed.ended.len());
+        let missing = lost.end - lost.start;
+        assert_eq!(found, (1000 - missing, missing, 0, results), "{lost:?} {replayed:?}");
+    }
+    for (lie, found) in [(145, 0), (700, 1)] {
+        let [bytes, _] = parts_without(1000, u64::MAX, &[20, 600], lie, &(100..140));
+        assert_eq!(replay_from(&bytes[..], "changed", |_, _| {}).expect("whole").different, found, "a wrong answer in tick {lie}");
+    }
+}
+
 /// Protects a crash from the starts after it: each start keeps the journals before it, the newest first, and more than one; what is no journal in any of
 /// their places is left, and so is everything else.
 #[test]
@@ -125,7 +150,7 @@ fn starts_keep_the_journals_before_them() {
         let mut writer = Writer::create(&path, &settings()).expect("writable");
         let weights = write_weights::constant_action(number as i32 % 10);
         writer.weights(u64::from(number), &weights).expect("space");
-        writer.tick(Box::new(idle_tick())).and_then(|()| writer.flush()).expect("space");
+        writer.tick(Box::new(idle_tick()), &Telemetry::default()).and_then(|()| writer.flush()).expect("space");
     };
     (0..5).for_each(start);
     let begun = |name: &str| rt_controller::journal::replay(&dir.path().join("new").join(name), |_, _| {}).is_ok();
@@ -153,7 +178,7 @@ fn a_journal_without_a_tick_pushes_none_out() {
     let dir = tempfile::tempdir().expect("a directory");
     let path = dir.path().join("j.bin");
     let mut writer = Writer::create(&path, &settings()).expect("writable");
-    writer.tick(Box::new(idle_tick())).and_then(|()| writer.flush()).expect("space");
+    writer.tick(Box::new(idle_tick()), &Telemetry::default()).and_then(|()| writer.flush()).expect("space");
     drop(writer);
     let real = std::fs::read(&path).expect("there");
     for round in 0..50 {

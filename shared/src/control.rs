@@ -10,6 +10,9 @@ use crate::gaussian_curve::Curve;
 use crate::limits::Clipped;
 use crate::messages::Phase;
 
+/// Version of the messages of this module: part of the service's name, so that programs of other versions never connect.
+pub const CONTROL_VERSION: u32 = 4;
+
 /// What a client asks.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub enum Request {
@@ -72,6 +75,8 @@ pub struct Outcome {
     pub episode: u64,
     /// Why it ended.
     pub reason: EndReason,
+    /// Whether liquid may have left that nobody has seen or counted: on the way upright too, whatever the pour ended for.
+    pub unseen: bool,
     /// Goal volume, ml; `None` for a recording.
     pub goal_ml: Option<f32>,
     /// Estimated volume poured, ml.
@@ -101,7 +106,7 @@ impl Outcome {
     /// The volume poured with its standard deviation, where that is known, ml.
     pub fn poured_words(&self) -> String {
         let volume = volume_words(self.poured_ml, self.poured_sd_ml);
-        if self.reason.leaves_unseen() { format!("at least {volume}") } else { volume }
+        if self.unseen { format!("at least {volume}") } else { volume }
     }
 }
 

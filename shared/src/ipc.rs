@@ -1,7 +1,7 @@
 //! The iceoryx2 services of one cell, opened the same way by every process.
 //!
 //! A cell's files lie in its runtime directory ([`crate::runtime_dir`]) and, under a name that nobody can guess, in `/dev/shm`
-//! ([`crate::shared_memory`]), so that cells beside each other never meet. The layouts' version is part of each service's name, so that
+//! ([`crate::shared_memory`]), so that cells beside each other never meet. The messages' version is part of each service's name, so that
 //! programs of other versions never connect. All processes of a cell run under one user, because the shared memory is private to that user.
 //!
 //! Opening a service allocates and belongs in an ordinary thread. Receiving a message, or sending one in loaned memory, neither allocates
@@ -13,6 +13,7 @@ use iceoryx2::port::notifier::Notifier;
 use iceoryx2::prelude::*;
 use iceoryx2::service::port_factory::{publish_subscribe, request_response};
 
+use crate::control::CONTROL_VERSION;
 use crate::messages::{FrameHeader, LAYOUT_VERSION};
 use crate::runtime_dir::{Place, RuntimeDirError};
 use crate::shared_memory::{self, Membership, SharedMemoryError};
@@ -154,9 +155,9 @@ impl Cell {
         shared_memory::check_space(bytes).map_err(|what| IpcError::Memory { cell: self.name.clone(), what })
     }
 
-    /// The full name of a service, with the layouts' version.
-    fn name(&self, service: &str) -> Result<(ServiceName, String), IpcError> {
-        let full = format!("decant/{service}/{LAYOUT_VERSION}");
+    /// The full name of a service, with the version of its messages.
+    fn name(&self, service: &str, version: u32) -> Result<(ServiceName, String), IpcError> {
+        let full = format!("decant/{service}/{version}");
         Ok((ServiceName::new(&full).in_service(&full)?, full))
     }
 
@@ -166,7 +167,7 @@ impl Cell {
         publishers: usize,
         history: usize,
     ) -> Result<Topic<T>, IpcError> {
-        let (name, full) = self.name(service)?;
+        let (name, full) = self.name(service, LAYOUT_VERSION)?;
         self.node
             .service_builder(&name)
             .publish_subscribe::<T>()
@@ -181,7 +182,7 @@ impl Cell {
 
     /// Camera frames, from one driver, or from the feature worker that reads the camera itself. A slow reader loses the oldest ones.
     pub fn frames(&self) -> Result<FrameTopic, IpcError> {
-        let (name, full) = self.name("frame")?;
+        let (name, full) = self.name("frame", LAYOUT_VERSION)?;
         self.node
             .service_builder(&name)
             .publish_subscribe::<[u8]>()
@@ -196,7 +197,7 @@ impl Cell {
     }
 
     fn frame_event(&self) -> Result<iceoryx2::service::port_factory::event::PortFactory<Ipc>, IpcError> {
-        let (name, full) = self.name("frame-event")?;
+        let (name, full) = self.name("frame-event", LAYOUT_VERSION)?;
         self.node.service_builder(&name).event().open_or_create().in_service(&full)
     }
 
@@ -227,7 +228,7 @@ impl Cell {
 
     /// Requests to the controller and its answers.
     pub fn control(&self) -> Result<ControlService, IpcError> {
-        let (name, full) = self.name("control")?;
+        let (name, full) = self.name("control", CONTROL_VERSION)?;
         self.node
             .service_builder(&name)
             .request_response::<[u8], [u8]>()

@@ -11,6 +11,18 @@ use std::path::Path;
 /// Reads the file at `path`, which has at most `bytes_max` bytes.
 pub fn read(path: &Path, bytes_max: u64) -> Result<Vec<u8>> {
     let (file, meta) = open_at_most(path, bytes_max)?;
+    read_open(file, &meta, bytes_max)
+}
+
+/// The same, if [`check_owner`] has nothing against the file. It is opened once, so that what is read is what was checked, whatever is put at
+/// `path` meanwhile.
+pub fn read_of_owner(path: &Path, bytes_max: u64, trusted: Option<u32>) -> Result<Vec<u8>> {
+    let (file, meta) = open_at_most(path, bytes_max)?;
+    check_owner(&meta, trusted).map_err(Error::other)?;
+    read_open(file, &meta, bytes_max)
+}
+
+fn read_open(file: File, meta: &Metadata, bytes_max: u64) -> Result<Vec<u8>> {
     let mut bytes = Vec::with_capacity(meta.len() as usize);
     file.take(bytes_max + 1).read_to_end(&mut bytes)?;
     if bytes.len() as u64 > bytes_max {

@@ -39,6 +39,8 @@ const HEADER: usize = 24;
 const SHAPE: [usize; 4] = [INPUTS, HIDDEN, HIDDEN, ACTIONS];
 /// Largest payload, bytes. Chosen by hand: a usual one has about 24 kB.
 const PAYLOAD_MAX: usize = 64 * 1024;
+/// Largest file, bytes.
+const FILE_MAX: u64 = (HEADER + PAYLOAD_MAX) as u64;
 /// How the checksum at the payload's end is computed.
 const CRC: Crc<u32> = Crc::<u32>::new(&CRC_32_ISO_HDLC);
 
@@ -244,10 +246,17 @@ impl Weights {
 
     /// Reads and checks a weight file.
     pub fn read(path: &Path) -> Result<Self, WeightsError> {
+        Self::from_file(path, regular_file::read(path, FILE_MAX))
+    }
+
+    /// Reads and checks a weight file that nobody but this user, root and `trusted` (a user number) may have written.
+    pub fn read_of_owner(path: &Path, trusted: Option<u32>) -> Result<Self, WeightsError> {
+        Self::from_file(path, regular_file::read_of_owner(path, FILE_MAX, trusted))
+    }
+
+    fn from_file(path: &Path, bytes: std::io::Result<Vec<u8>>) -> Result<Self, WeightsError> {
         let file = path.display().to_string();
-        let bytes = regular_file::read(path, (HEADER + PAYLOAD_MAX) as u64)
-            .map_err(|e| WeightsError::Read { file: file.clone(), what: e.to_string() })?;
-        Self::from_bytes(&bytes, &file)
+        Self::from_bytes(&bytes.map_err(|e| WeightsError::Read { file: file.clone(), what: e.to_string() })?, &file)
     }
 
     /// Checks and writes a weight file, atomically: a reader sees the old file or the new one, whole.
@@ -429,6 +438,30 @@ pub(crate) mod tests {
                 *w = fused_example();
                 if let Estimator::Fused { model, .. } = &mut w.estimator {
                     model.camera[0][0] = f64::NAN;
+                }
+            }),
+            ("the covariance of log c and q", |w| {
+                *w = fused_example();
+                if let Estimator::Fused { model, .. } = &mut w.estimator {
+                    // Each is within its range, and together they would make a mixture of the two vary by less than nothing.
+                    model.camera = [[0.04, -0.02], [-0.02, 0.001]];
+                }
+            }),
+            ("the covariance of log c and q", |w| {
+                *w = fused_example();
+                if let Estimator::Fused { model, .. } = &mut w.estimator {
+                    model.camera[1][0] = 0.0;
+                }
+            }),
+            ("the covariance of the unknowns", |w| {
+                *w = fused_example();
+                if let Estimator::Fused { model, .. } = &mut w.estimator {
+                    // Each pair is possible by itself, and the three together are not.
+                    let unknowns = &mut model.explanations[1].unknowns;
+                    for (j, k, correlation) in [(0usize, 1usize, 0.9), (1, 2, 0.9), (0, 2, -0.9)] {
+                        unknowns[j][k] = correlation * (unknowns[j][j] * unknowns[k][k]).sqrt();
+                        unknowns[k][j] = unknowns[j][k];
+                    }
                 }
             }),
         ] {

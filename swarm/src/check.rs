@@ -459,6 +459,7 @@ mod tests {
         let outcome = Outcome {
             episode: 1,
             reason: EndReason::Done,
+            unseen: false,
             goal_ml: Some(80.0),
             poured_ml: 80.0,
             poured_sd_ml: 2.0,

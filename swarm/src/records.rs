@@ -57,8 +57,8 @@ impl Journal {
     }
 
     /// Adds a tick.
-    pub fn tick(&mut self, tick: Tick) {
-        if self.writer.as_mut().is_some_and(|w| w.tick(Box::new(tick)).is_err()) {
+    pub fn tick(&mut self, tick: Tick, telemetry: &Telemetry) {
+        if self.writer.as_mut().is_some_and(|w| w.tick(Box::new(tick), telemetry).is_err()) {
             self.end();
         }
     }
@@ -72,6 +72,7 @@ impl Journal {
                 let (n, first) = (replay.different, replay.first_different);
                 Some(format!("{n} ticks differ, the first is {first:?}; {} deadlines differ", replay.different_deadlines))
             }
+            Ok(replay) if replay.lost > 0 => Some(format!("{} ticks are lost", replay.lost)),
             Ok(replay) if !self.ended && format!("{:?}", replay.ended) != format!("{outcomes:?}") => {
                 Some(format!("it ended with {:?}, and the replay with {:?}", outcomes, replay.ended))
             }

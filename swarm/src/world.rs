@@ -13,7 +13,7 @@ use std::time::Duration;
 use rt_controller::control_loop::{LoopState, Outside};
 use rt_controller::core::MAX_FEATURES;
 use rt_controller::core::Order;
-use rt_controller::exchange::{Event, Exchange};
+use rt_controller::exchange::{Asked, Event, Exchange};
 use rt_controller::link::network::{Network, Transport};
 use rt_controller::robot_thread::RobotNote;
 use shared::control::RobotLink;
@@ -91,8 +91,13 @@ impl World<'_> {
                     life.note.asked();
                     life.exchange.resume.store(true, Relaxed);
                 }
-                if let Some(order) = order {
-                    let _ = life.exchange.orders.push(order);
+                match order {
+                    Some(Order::Abort) => life.exchange.abort(),
+                    Some(order) => {
+                        let aborts = life.exchange.aborts.load(Relaxed);
+                        let _ = life.exchange.orders.push(Asked { order, aborts });
+                    }
+                    None => {}
                 }
             }
             if let Some((identity, agent)) = site.new_agent.take() {
@@ -141,9 +146,9 @@ fn wake_up(life: &mut Life<'_>, site: &mut Site, now_ns: u64) {
         match event {
             Event::Tick(tick, telemetry, counters) => {
                 site.ticked(&tick, &telemetry, counters.features);
-                life.journal.tick(tick);
+                life.journal.tick(tick, &telemetry);
             }
-            Event::Ordered(answer) => site.say(|| format!("order: {answer:?}")),
+            Event::Ordered(_, answer) => site.say(|| format!("order: {answer:?}")),
             Event::Ended(outcome) => ended = Some(outcome),
         }
     }

@@ -10,7 +10,7 @@ use std::time::{Duration, Instant};
 use assert_no_alloc::{AllocDisabler, assert_no_alloc};
 use rt_controller::control_loop::LoopState;
 use rt_controller::core::{Order, Settings};
-use rt_controller::exchange::{Event, Exchange};
+use rt_controller::exchange::{Asked, Event, Exchange};
 use rt_controller::link::network::System;
 use rt_controller::robot_thread::{RobotNote, keep_robot_connected};
 use shared::agent::Agent;
@@ -81,10 +81,11 @@ fn run(plant: bool) {
                     number += 1;
                     drop(exchange.agents.force_push((number, Box::new(Agent::new(&steady_weights(13))))));
                     poured += 1;
-                    let _ = exchange.orders.push(Order::Pour { episode: poured, goal_ml: 20.0, flows_by_deg: None });
+                    let order = Order::Pour { episode: poured, goal_ml: 20.0, flows_by_deg: None };
+                    let _ = exchange.orders.push(Asked { order, aborts: exchange.aborts.load(Relaxed) });
                 }
                 match sequence {
-                    450 => drop(exchange.orders.push(Order::Abort)),
+                    450 => exchange.abort(),
                     700 => robot.inject(Fault::Reset),
                     _ => {}
                 }

@@ -67,7 +67,8 @@ fn journal(ticks: u64) -> Vec<u8> {
         let output = core.step(&Input { now_ns, features: &features, robot, order });
         let agent = (k == 0).then_some(1);
         let (target_deg, d_ml) = (output.target_deg, output.telemetry.d_ml);
-        writer.tick(Box::new(Tick { now_ns, features, robot, order, agent, target_deg, d_ml, times: Times::default() })).unwrap();
+        let tick = Tick { now_ns, features, robot, order, agent, target_deg, d_ml, times: Times::default() };
+        writer.tick(Box::new(tick), &output.telemetry).unwrap();
     }
     writer.flush().unwrap();
     drop(writer);

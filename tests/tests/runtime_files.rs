@@ -135,6 +135,13 @@ fn whoever_comes_second_ends_with_one_exit_code() {
         assert_eq!(second.status.code(), Some(5), "{name}: {}", said(&second));
         assert!(said(&second).contains(word), "{name}: {}", said(&second));
     }
+    // Nothing is left of the first controller's files, and it still answers.
+    std::fs::remove_dir_all(cell.runtime_dir()).expect("ours");
+    let mut second = Command::new("timeout");
+    let second =
+        second.args(["20"]).arg(program("rt-controller")).args(["run", "--config"]).arg(cell.config()).output().expect("coreutils");
+    assert_eq!(second.status.code(), Some(5), "{}", said(&second));
+    assert!(said(&second).contains("its runtime directory was deleted"), "{}", said(&second));
 }
 
 /// Protects people from a second controller that is started by mistake, with the same configuration or with one that shares its files: it is

@@ -193,8 +193,8 @@ fn an_abort_falls_back_to_the_process() {
         });
         timed(abort_of(&cell))
     };
-    let said = String::from_utf8_lossy(&output.stdout).into_owned();
-    assert_eq!(output.status.code(), Some(0), "{said}{}", String::from_utf8_lossy(&output.stderr));
+    let said = String::from_utf8_lossy(&output.stderr).into_owned();
+    assert_eq!(output.status.code(), Some(1), "nobody knows where the container is: {said}{}", String::from_utf8_lossy(&output.stdout));
     assert!(said.contains("SIGTERM"), "{said}");
     assert_eq!(cell.exit_code("rt-controller", Duration::from_secs(10)), Some(0), "{}", cell.log("rt-controller"));
     assert_ne!(pour.wait_with_output().expect("it ran").status.code(), Some(0));
@@ -210,8 +210,30 @@ fn an_abort_falls_back_to_the_process() {
     other.kill().and_then(|()| other.wait()).expect("ours");
 }
 
+/// Protects whoever stops the controller and reads only how it ended: a robot that holds the container tilted is said with the tilt, and the exit code is not
+/// that of a stop as it should be.
+#[test]
+fn a_controller_that_leaves_the_container_tilted_says_so() {
+    let mut cell = cell();
+    let pour = cell.pour_tilted();
+    assert!(cell.command("simulator", &["operator", "fault", "protective-stop"]).status.success());
+    assert_eq!(pour.wait_with_output().expect("it ran").status.code(), Some(4));
+    assert_eq!(cell.stop("rt-controller"), Some(1), "{}", cell.log("rt-controller"));
+    assert!(cell.log("rt-controller").contains("it was last seen tilted by "), "{}", cell.log("rt-controller"));
+}
+
+/// Protects whoever waits for the controller's end: one whose main thread alone loses its shared memory ends upright, and not as if all were well.
+#[test]
+fn a_controller_whose_main_thread_is_struck_fails() {
+    let mut cell = cell();
+    // The kernel gives a process's signal to its main thread.
+    cell.signal("rt-controller", Signal::BUS);
+    assert_eq!(cell.exit_code("rt-controller", Duration::from_secs(10)), Some(1), "{}", cell.log("rt-controller"));
+    assert!(cell.log("rt-controller").contains("a thread of the controller does not answer"), "{}", cell.log("rt-controller"));
+}
+
 /// Protects the robot's operator from a service thread that hangs, in a client or elsewhere: an abort is obeyed, and SIGTERM ends the controller
-/// with its journal whole.
+/// with what its journal has whole, and not as if all were well.
 #[test]
 fn an_abort_needs_no_service_thread() {
     let mut cell = cell();
@@ -237,7 +259,7 @@ fn an_abort_needs_no_service_thread() {
     }
     // A thread that strace holds is let go before the kernel ends the process.
     strace.kill().and_then(|()| strace.wait()).expect("ours");
-    assert_eq!(cell.exit_code("rt-controller", Duration::from_secs(10)), Some(0), "{}", cell.log("rt-controller"));
+    assert_eq!(cell.exit_code("rt-controller", Duration::from_secs(10)), Some(1), "{}", cell.log("rt-controller"));
     assert_eq!(pour.wait_with_output().expect("it ran").status.code(), Some(3));
     rt_controller::journal::replay(&cell.dir.path().join("journal.bin"), |_, _| {}).expect("a journal");
 }

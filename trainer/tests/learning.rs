@@ -101,6 +101,8 @@ fn the_trained_policies_pour() {
 fn pours(method: MethodName, n: usize, within: f64) {
     let trained = train(&episodes(n, 3), &Options { method, ..Options::default() }, &Silent).unwrap();
     let flow = FlowTables::new(&FlowModel::default());
+    let config = shared::config::Config::parse(include_str!("../../config/sim.toml"), "sim.toml").unwrap();
+    let settings = rt_controller::core::Settings::new(&config);
     for (onset, goal) in [(40.0, 120.0f64), (55.0, 60.0), (65.0, 25.0)] {
         let mut agent = Agent::new(&trained.weights);
         agent.start(goal as f32);
@@ -118,7 +120,7 @@ fn pours(method: MethodName, n: usize, within: f64) {
             let area_px2 = Some(if area < 8.0 { 0.0 } else { area as f32 });
             let decision =
                 agent.step(Observation { area_px2, confidence: 1.0, alpha_deg: alpha, alpha_measured_deg: f32::NAN, alpha_now_deg: alpha });
-            finished |= ending.decided(&decision);
+            finished |= ending.decided(&decision, &settings);
             alpha = if finished { (alpha - 2.0).max(0.0) } else { (alpha + decision.dalpha_deg).clamp(0.0, 110.0) };
         }
         assert!(finished && (poured - goal).abs() < within * goal + 1.0, "{method:?}: goal {goal}, poured {poured}, finished {finished}");

@@ -99,7 +99,7 @@ fn weights(file: &Path, config: &Config) -> Finding {
             train,
         );
     }
-    match disk::read_weights(path, config.camera.fps, trusted) {
+    match disk::read_weights(path, config.camera.fps, &config.limits, trusted) {
         Ok(weights) => {
             let origin = &weights.origin;
             let how = format!("trained from {} by {:?}", counted(origin.episodes, "episode"), origin.method);

@@ -27,7 +27,7 @@ const BEAT: Duration = Duration::from_millis(50);
 Without a configuration it stops every controller of this user that runs (as root: of all users). It does not need shared memory, and\n\
 works while /dev/shm is full or files were deleted. If no controller answers, it sends the process SIGTERM; Ctrl-C in the controller's\n\
 terminal and `kill` do the same. The container then comes upright, and the controller ends.\n\
-Exit codes: 0 upright, 1 not upright, 3 no controller, 5 the robot cannot be moved.")]
+Exit codes: 0 upright, 1 not upright or not known, 3 no controller, 5 the robot cannot be moved.")]
 pub struct Args {
     /// The cell's configuration; without it, every cell that runs.
     #[arg(long, env = VARIABLE)]
@@ -124,10 +124,9 @@ fn wait(target: &Target, asked: Asked) -> Result<String, Failure> {
             },
             Asked::Process(process) => {
                 if claim::started(process.pid) != Some(process.started) {
-                    return Ok(format!(
-                        "rt-controller did not answer and was ended (SIGTERM to process {}): look at the robot",
-                        process.pid
-                    ));
+                    let what =
+                        format!("rt-controller did not answer and was ended (SIGTERM to process {}): look at the robot", process.pid);
+                    return Err(failure(exit::FAILED, what));
                 }
             }
         }

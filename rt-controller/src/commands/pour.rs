@@ -120,13 +120,19 @@ pub(crate) fn order(cell: &CellConfig, request: &Request) -> Result<(Outcome, Op
         _ => return Err(failure(exit::UNREACHABLE, client::ClientError::Version)),
     };
     let outcome = client.follow(episode, &interrupted).map_err(|e| match e {
-        FollowError::Interrupted(o) if matches!(o.reason, EndReason::Aborted | EndReason::Done) => {
-            failure(exit::INTERRUPTED, format!("interrupted: {}, the container is upright", o.reason.words()))
-        }
-        e @ FollowError::Interrupted(_) => failure(exit::INTERRUPTED, format!("{e}; look at the robot")),
+        FollowError::Interrupted(outcome) => failure(exit::INTERRUPTED, interrupted_line(&outcome)),
         FollowError::Client(e) => failure(exit::UNREACHABLE, e),
     })?;
     Ok((outcome, recorder.and_then(|r| r.wait(episode))))
+}
+
+/// What Ctrl-C has led to. A robot that was lost on the way upright leaves a pour aborted too, and nobody knows where it stands.
+fn interrupted_line(outcome: &Outcome) -> String {
+    let words = outcome.reason.words();
+    match outcome.reason {
+        EndReason::Aborted | EndReason::Done if !outcome.unseen => format!("interrupted: {words}, the container is upright"),
+        _ => format!("interrupted: {words}; look at the robot"),
+    }
 }
 
 /// Prints how the pour ended.
@@ -150,6 +156,43 @@ fn report(outcome: &Outcome, recorded: Option<client::Recorded>, foreseen_sd_ml:
             Some(Ok(file)) => println!("recorded: {file}\nread the scale, then: feature-worker episodes weigh {file} --weight GRAMS"),
             Some(Err(e)) => println!("not recorded: {e}"),
             None => println!("not recorded: no recorder answered"),
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use shared::limits::Clipped;
+
+    use super::*;
+
+    /// Protects whoever pressed Ctrl-C at a robot: it is said to be upright only where that is known.
+    #[test]
+    fn upright_is_said_only_where_it_is_known() {
+        let line = |reason: EndReason, unseen: bool| {
+            interrupted_line(&Outcome {
+                episode: 1,
+                reason,
+                unseen,
+                goal_ml: Some(50.0),
+                poured_ml: 20.0,
+                poured_sd_ml: 0.0,
+                seconds: 3.0,
+                frames: 90,
+                bridged_frames: 0,
+                stale_features: 0,
+                tick_gaps: 0,
+                clipped: Clipped::default(),
+            })
+        };
+        for (reason, unseen, upright) in [
+            (EndReason::Aborted, false, true),
+            (EndReason::Done, false, true),
+            (EndReason::Aborted, true, false),
+            (EndReason::NotUpright, true, false),
+        ] {
+            let said = line(reason, unseen);
+            assert_eq!((said.contains("is upright"), said.contains("look at the robot")), (upright, !upright), "{said}");
         }
     }
 }

@@ -45,6 +45,10 @@ pub fn run(args: &Args) -> Result<(), Failure> {
         if replay.continued {
             println!("the file begins in the middle of a run: answers are compared from its first pour or recording on, and no deadlines");
         }
+        if replay.lost > 0 {
+            let lost = counted(replay.lost, "tick");
+            println!("{lost} lost where the controller fell behind: behind a gap answers are compared from the next pour or recording on");
+        }
         if replay.cut_off {
             println!("the file ends in the middle of an entry: the controller was killed, or is still writing");
         }

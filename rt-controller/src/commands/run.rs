@@ -43,7 +43,9 @@ fn no_thread(e: std::io::Error) -> Failure {
 /// Command-line arguments.
 #[derive(Debug, clap::Args)]
 #[command(after_help = "Examples:\n  rt-controller run --config config/sim.toml\n  rt-controller run --config config/cell.toml\n\n\
-Ctrl-C or SIGTERM brings the container upright and stops the controller.")]
+Ctrl-C or SIGTERM brings the container upright and stops the controller.\n\
+Exit codes: 0 stopped, the container upright; 1 failed, or the container was last seen tilted; 2 bad configuration; 5 another controller of the\n\
+cell is running.")]
 pub struct Args {
     /// The cell's configuration.
     #[arg(long, env = shared::config::VARIABLE, default_value = shared::config::DEFAULT_FILE)]
@@ -88,27 +90,31 @@ fn stop_at_signals() -> Result<Arc<AtomicBool>, Failure> {
     Ok(stop)
 }
 
-/// Takes the cell, opens the way to stop a motion, and runs the threads until the loop has ended, upright.
+/// Takes the cell, opens the way to stop a motion, and runs the threads until the loop has ended. Fails if the container is not upright then.
 fn start(config: &Config, file: &Path, stop: &AtomicBool, say: &(dyn Fn(Level, &str) + Sync), speaker: &Speaker) -> Result<(), Failure> {
     let directory = Place::from(&config.cell).directory().or_exit(exit::BAD_INPUT)?;
     let _claim = Claim::take(&directory, file, config).or_exit(exit::REFUSED)?;
-    let sockets = StopSockets::open(&directory, &config.cell.name, say).or_exit(exit::FAILED)?;
+    let sockets = StopSockets::open(&directory, &config.cell.name, say)?;
     let owner = std::fs::metadata(file).ok().map(|m| m.uid());
     let shared = Shared::default();
+    let tolerance_deg = config.robot.start_tolerance_deg as f32;
     let give_up = || {
-        let written = shared.disk_done.load(SeqCst);
-        match written {
-            true => say(Level::Info, "stopped"),
-            false => say(Level::Error, "the disk does not answer: stopped without it, so the end of the journal may be missing"),
+        let held_up = match shared.disk_done.load(SeqCst) {
+            true => "a thread of the controller does not answer: stopped without it, so what it was to say may be missing",
+            false => "the disk does not answer: stopped without it, so the end of the journal may be missing",
+        };
+        say(Level::Error, held_up);
+        if let Err(e) = left_upright(&shared.exchange, tolerance_deg) {
+            say(Level::Error, &e.what);
         }
         speaker.finish();
-        std::process::exit(if written { 0 } else { exit::FAILED.into() });
+        std::process::exit(exit::FAILED.into());
     };
     let stopping = StopThread {
         sockets,
         exchange: &shared.exchange,
         robot_note: &shared.note,
-        tolerance_deg: config.robot.start_tolerance_deg as f32,
+        tolerance_deg,
         stop,
         end: &shared.end,
         done: &shared.done,
@@ -118,8 +124,19 @@ fn start(config: &Config, file: &Path, stop: &AtomicBool, say: &(dyn Fn(Level, &
         thread("stop").spawn_scoped(scope, || stopping.run()).map_err(no_thread)?;
         let result = run_threads(config, owner, &shared, stop, say);
         shared.done.store(true, SeqCst);
-        result
+        result.and_then(|()| left_upright(&shared.exchange, tolerance_deg))
     })
+}
+
+/// Fails if the container was tilted when the loop saw a robot last. Where no robot ever was, nothing was tilted.
+fn left_upright(exchange: &Exchange, tolerance_deg: f32) -> Result<(), Failure> {
+    let alpha_deg = f32::from_bits(exchange.last_alpha.load(SeqCst));
+    if alpha_deg.abs() > tolerance_deg {
+        let what =
+            format!("stopped, and the container is not upright: it was last seen tilted by {alpha_deg:.0} degrees; look at the robot");
+        return Err(failure(exit::FAILED, what));
+    }
+    Ok(())
 }
 
 /// What the threads share besides the queues.

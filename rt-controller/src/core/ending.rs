@@ -21,6 +21,7 @@
 //! | [`worker_was_restarted`]: measurements come from another process | `WorkerRestarted` |
 //! | [`Ending::settled`]: the joint did not come upright | `NotUpright` |
 //! | the same: the goal seemed reached, and then too much of it is missing, or was poured | `StreamLost`, `GoalExceeded` |
+//! | the same: a stream without a pause goes on although the joint has long been upright | `ImpossibleFlow` |
 
 use shared::agent::Decision;
 use shared::control::EndReason;
@@ -31,10 +32,9 @@ use super::settings::Settings;
 
 /// After flow was seen, this much of a way back without flow ends the pour, degrees. Chosen by hand; no measurement is recorded.
 const BROUGHT_BACK_DEG: f32 = 10.0;
-/// After flow was seen, this many frames without progress end the pour: three seconds at 30 Hz. The agent then stands still short of
-/// its goal, while the trickle is too small to be seen, or flickers at the edge of what can be seen. Chosen by hand; no measurement is
-/// recorded.
-const STALLED_FRAMES: u32 = 90;
+/// After flow was seen, this long without progress ends the pour, s. The agent then stands still short of its goal, while the trickle is too
+/// small to be seen, or flickers at the edge of what can be seen. Chosen by hand; no measurement is recorded.
+const STALLED_S: f64 = 3.0;
 /// Forward tilt that counts as progress, degrees. Chosen by hand; no measurement is recorded.
 const PROGRESS_DEG: f32 = 1.0;
 /// Poured volume that counts as progress, ml. Chosen by hand; no measurement is recorded.
@@ -49,8 +49,9 @@ const NOTHING_ML: f64 = 0.05;
 const STREAM_FRAMES: u32 = 5;
 /// Only after this poured volume can a stream be lost, ml: a bead that is taken for a stream gives less. See docs/LEARNING.md.
 const STREAM_ML: f32 = 1.0;
-/// Frames in a row without a stream after which it may be lost: longer than the pauses of a bottle that gurgles. See docs/LEARNING.md.
-const STREAM_LOST_FRAMES: u32 = 10;
+/// Time without a stream after which it may be lost, s: longer than the pauses of a bottle that gurgles. Ten frames at 30 Hz; see
+/// docs/LEARNING.md.
+const STREAM_LOST_S: f64 = 1.0 / 3.0;
 /// Tilt beyond that of the stream at which it counts as lost, degrees: what flows at one tilt flows more at a larger one. See
 /// docs/LEARNING.md.
 const STREAM_LOST_DEG: f32 = 10.0;
@@ -59,8 +60,9 @@ const STREAM_LOST_DEG: f32 = 10.0;
 const LARGEST_TILT_SLACK_DEG: f32 = 0.5;
 /// A commanded alpha nearer to 0 than this is upright, degrees. Chosen by hand: far below what a robot can resolve.
 const COMMANDED_UPRIGHT_DEG: f32 = 0.01;
-/// Frames without flow after which the last drops are counted: half a second at 30 Hz. Chosen by hand; no measurement is recorded.
-const SETTLE_QUIET_FRAMES: u32 = 15;
+/// Time without flow after which the last drops are counted, and of a stream without a pause that is no dripping, s. Chosen by hand; no
+/// measurement is recorded.
+const SETTLE_QUIET_S: f64 = 0.5;
 /// The least way upright that counts as coming nearer, degrees. A joint that is slower than this in [`SETTLE_MAX_S`], 0.33 degrees/s, is held.
 /// Chosen by hand; no measurement is recorded.
 const COMING_DEG: f32 = 1.0;
@@ -69,8 +71,9 @@ const SETTLE_MAX_S: f64 = 3.0;
 
 /// Number of frames in a row with a stream from which on one was seen: a lone flash is none.
 const SEEN_FRAMES: u32 = 2;
-/// Number of frames in a row without any flow at a tilt at which the vessel must flow: longer than a joint follows its command late.
-const DRY_FRAMES: u32 = 10;
+/// Time without any flow at a tilt at which the vessel must flow, s: longer than a joint follows its command late. Ten frames at 30 Hz, chosen by
+/// hand.
+const DRY_S: f64 = 1.0 / 3.0;
 
 /// What one frame showed during a pour.
 #[derive(Debug, Clone, Copy)]
@@ -114,6 +117,8 @@ pub struct Ending {
     /// Length of a recording's curve, s; `None` in a pour.
     curve_s: Option<f64>,
     reason: EndReason,
+    /// Whether liquid may have left that nobody has seen or counted, for whatever reason the pour ends.
+    unseen: bool,
     agent_is_done: bool,
     /// The reason for which the pour is not done as it stands, if it is not.
     not_done: Option<EndReason>,
@@ -146,6 +151,7 @@ impl Ending {
             dry_frames: 0,
             curve_s: None,
             reason: EndReason::Done,
+            unseen: false,
             agent_is_done: false,
             not_done: None,
             impossible: None,
@@ -181,15 +187,28 @@ impl Ending {
 
     /// Gives the reason of the end; call it once, when the container begins to come upright.
     pub fn end_with(&mut self, reason: EndReason) {
+        self.unseen |= reason.leaves_unseen();
         self.reason = reason;
     }
 
     /// Gives a reason for which a pour is not done although its goal seemed reached: the robot may not move any more, or the camera no longer
     /// shows what leaves. A pour that was already ending for another reason keeps that one.
     pub fn end_instead_of_done(&mut self, reason: EndReason) {
+        self.unseen |= reason.leaves_unseen();
         if self.reason == EndReason::Done {
             self.reason = reason;
         }
+    }
+
+    /// Gives the reason of the end when the robot may not move any more, for `reason`. Out of an upright container nothing leaves any more.
+    pub fn without_robot(&mut self, reason: EndReason, is_upright: bool) -> EndReason {
+        self.unseen |= reason.leaves_unseen() && !is_upright;
+        reason.after(self.reason, is_upright)
+    }
+
+    /// Whether liquid may have left that nobody has seen or counted, if it ends for `reason`. An abort does not bring back what a lost camera hid.
+    pub fn leaves_unseen(&self, reason: EndReason) -> bool {
+        self.unseen || reason.leaves_unseen()
     }
 
     /// Takes whether the joint follows on its way upright, and why the camera does not tell what leaves there, if so; and looks at what was seen
@@ -210,13 +229,13 @@ impl Ending {
     }
 
     /// Takes the agent's decision for one frame, lost or not, and returns [`Ending::agent_is_done`].
-    pub fn decided(&mut self, decision: &Decision) -> bool {
+    pub fn decided(&mut self, decision: &Decision, settings: &Settings) -> bool {
         self.impossible = self.impossible.or(decision.impossible);
         self.not_done = not_done(decision);
         self.agent_is_done |= goal_is_reached(decision);
         self.seen_flow |= decision.flowing;
         self.agent_is_done |= self.is_brought_back(decision);
-        self.agent_is_done |= self.stands_still(decision);
+        self.agent_is_done |= self.stands_still(decision, settings);
         self.agent_is_done
     }
 
@@ -229,14 +248,14 @@ impl Ending {
     }
 
     /// Whether the agent has made no progress for so long, neither in tilt nor in volume, that it would stand there for ever.
-    fn stands_still(&mut self, decision: &Decision) -> bool {
+    fn stands_still(&mut self, decision: &Decision, settings: &Settings) -> bool {
         self.advanced_deg += decision.dalpha_deg;
         if self.advanced_deg >= PROGRESS_DEG || decision.poured_ml - self.advanced_from_ml >= PROGRESS_ML {
             (self.stalled_frames, self.advanced_deg, self.advanced_from_ml) = (0, 0.0, decision.poured_ml);
         } else {
             self.stalled_frames = self.stalled_frames.saturating_add(1);
         }
-        self.seen_flow && self.stalled_frames >= STALLED_FRAMES
+        self.seen_flow && self.stalled_frames >= settings.frames(STALLED_S)
     }
 
     /// Takes what a frame showed during a pour.
@@ -272,18 +291,18 @@ impl Ending {
             None if self.impossible.is_some() => self.impossible.map(reason_of),
             None if self.agent_is_done => Some(EndReason::Done),
             None if moment.frames >= settings.max_frames => Some(EndReason::MaxFrames),
-            None if self.dry_frames >= DRY_FRAMES => Some(EndReason::NothingFlows),
+            None if self.dry_frames >= settings.frames(DRY_S) => Some(EndReason::NothingFlows),
             None if self.empty_frames >= settings.empty_frames => Some(EndReason::ContainerEmpty),
-            None if self.stream_is_lost(moment) => Some(EndReason::StreamLost),
+            None if self.stream_is_lost(moment, settings) => Some(EndReason::StreamLost),
             None => None,
         }
     }
 
     /// Whether the stream is lost. What flows at one tilt flows faster at a larger one, so a stream that is gone there has ended, or is no
     /// longer seen.
-    fn stream_is_lost(&self, moment: &Moment) -> bool {
+    fn stream_is_lost(&self, moment: &Moment, settings: &Settings) -> bool {
         moment.poured_ml >= STREAM_ML
-            && self.no_stream_frames >= STREAM_LOST_FRAMES
+            && self.no_stream_frames >= settings.frames(STREAM_LOST_S)
             && self.stream_deg.is_some_and(|deg| moment.alpha_deg > deg + STREAM_LOST_DEG)
     }
 
@@ -296,15 +315,23 @@ impl Ending {
     /// too long. `alpha_deg` is the measured one, because the joint must really be upright.
     pub fn settled(&mut self, alpha_deg: f32, settling_s: f64, shutdown: bool, settings: &Settings) -> Option<EndReason> {
         let upright = alpha_deg.abs() <= settings.upright_deg;
-        let quiet = self.quiet_frames >= SETTLE_QUIET_FRAMES && self.curve_s.is_none();
+        let (is_pour, wait_frames) = (self.curve_s.is_none(), settings.frames(SETTLE_QUIET_S));
+        let quiet = self.quiet_frames >= wait_frames && is_pour;
         if alpha_deg.abs() < self.nearest.0 - COMING_DEG {
             self.nearest = (alpha_deg.abs(), settling_s);
         }
         // A slow robot is waited for as long as it comes nearer.
         let over = settling_s >= SETTLE_MAX_S && (upright || settling_s - self.nearest.1 >= SETTLE_MAX_S);
-        (over || (upright && (quiet || shutdown))).then_some(match self.reason {
+        if !over && !(upright && (quiet || shutdown)) {
+            return None;
+        }
+        // What drips on, or may do so unseen, is not counted any more.
+        self.unseen |= is_pour && !quiet;
+        Some(match self.reason {
             _ if !upright => EndReason::NotUpright,
-            EndReason::Done if self.curve_s.is_none() => self.not_done.unwrap_or(EndReason::Done),
+            // Out of an upright container nothing pours: the eye takes something else for a stream, and has done so before.
+            EndReason::Done if is_pour && over && self.stream_frames >= wait_frames => EndReason::ImpossibleFlow,
+            EndReason::Done if is_pour => self.not_done.unwrap_or(EndReason::Done),
             reason => reason,
         })
     }
@@ -347,153 +374,4 @@ pub fn is_commanded_upright(alpha_deg: f32) -> bool {
 }
 
 #[cfg(test)]
-mod tests {
-    use super::*;
-    use shared::actions::{Selection, action_table};
-    use shared::agent::{Agent, Observation};
-    use shared::estimator::Calibration;
-    use shared::mlp::{InputScale, Mlp};
-    use shared::weights::{Estimator, Method, Origin, Weights};
-
-    /// Valid weights whose network has arbitrary parameters, made by hand.
-    fn example() -> Weights {
-        let mut network = Mlp::ZERO;
-        for (k, p) in network.parameters_mut().enumerate() {
-            *p = (k as f32 * 0.7).sin() * 0.1;
-        }
-        Weights {
-            network,
-            actions_deg: action_table(),
-            selection: Selection::Argmax,
-            scale: InputScale::default(),
-            calibration: Calibration { volume_at_1_px2_ml: 0.002, area_exponent: 1.15, log_tilt_slope: 0.05, hold_above_px2: 60.0 },
-            estimator: Estimator::Sum,
-            rate_hz: 30.0,
-            origin: Origin { method: Method::Handmade, actions: 21, episodes: 0, data_sha256: [7; 32] },
-            seed: 1,
-        }
-    }
-
-    fn observation(area: f32) -> Observation {
-        Observation { area_px2: Some(area), confidence: 1.0, alpha_deg: 50.0, alpha_measured_deg: f32::NAN, alpha_now_deg: 50.0 }
-    }
-
-    /// Protects the idle robot: without a goal nothing ends, whatever is seen.
-    #[test]
-    fn without_a_goal_nothing_ends() {
-        let mut agent = Agent::new(&example());
-        for goal in [f32::NAN, -5.0, 0.0, f32::INFINITY] {
-            agent.start(goal);
-            let mut ending = Ending::of_pour();
-            for area in [0.0, 300.0, f32::NAN] {
-                let decision = agent.step(observation(area));
-                assert_eq!((decision.dalpha_deg, decision.d_ml, ending.decided(&decision)), (0.0, 0.0, false));
-            }
-        }
-    }
-
-    /// Protects eq. (2) and (4): d starts at the goal, falls by each frame's volume, goes below 0, and ends the pour.
-    #[test]
-    fn d_counts_down_and_ends_the_pour() {
-        let weights = example();
-        let (mut agent, mut ending) = (Agent::new(&weights), Ending::of_pour());
-        let v = weights.calibration.volume_ml(200.0, 50.0);
-        agent.start(3.5 * v);
-        for k in 0..5 {
-            let decision = agent.step(observation(200.0));
-            assert_eq!(ending.decided(&decision), k >= 3);
-        }
-        agent.start(10.0);
-        assert!(!Ending::of_pour().decided(&agent.step(observation(0.0))), "a new goal starts anew");
-    }
-
-    /// Protects the end of every pour: an agent that stands still short of its goal has come to its end, also while a trickle
-    /// flickers in and out of sight; one that creeps on, still waits for its first flow, or pours has not.
-    #[test]
-    fn an_agent_that_stands_still_comes_to_its_end() {
-        let mut weights = example();
-        weights.network = Mlp::ZERO;
-        for (action, flow_at_first, flow_later, ends) in
-            [(10, 100.0, 0.0, true), (10, 100.0, 0.1, true), (12, 100.0, 0.0, false), (10, 0.0, 0.0, false), (10, 100.0, 90.0, false)]
-        {
-            weights.network.b3 = [0.0; shared::actions::ACTIONS];
-            weights.network.b3[action] = 1.0;
-            let (mut agent, mut ending) = (Agent::new(&weights), Ending::of_pour());
-            agent.start(5000.0);
-            let first = ending.decided(&agent.step(observation(flow_at_first)));
-            let ended = (0..200).filter(|_| ending.decided(&agent.step(observation(flow_later)))).count();
-            assert_eq!((first, ended > 0), (false, ends), "action {action}, then {flow_later} px^2");
-        }
-    }
-
-    /// Protects the operator from nothing, or a cup that ran over unseen, that is called done. A little off is done, and another reason stays.
-    #[test]
-    fn far_off_the_goal_is_not_done() {
-        use EndReason::{Aborted, Done, GoalExceeded, StreamLost};
-        let settings = Settings::new(&shared::config::Config::parse(include_str!("../../../config/sim.toml"), "sim.toml").unwrap());
-        let after = |d_ml: f32, poured_ml: f32, poured_sd_ml: f32, before| {
-            let mut ending = Ending::of_pour();
-            ending.decided(&Decision { d_ml, poured_ml, poured_sd_ml, tilting_back: true, ..Decision::NOTHING });
-            ending.end_with(before);
-            ending.settled(0.0, 4.0, false, &settings).unwrap()
-        };
-        assert_eq!([after(65.0, 6.0, 0.0, Done), after(65.0, 6.0, 20.0, Done)], [StreamLost; 2]);
-        assert_eq!(after(65.0, 6.0, 0.0, Aborted), Aborted);
-        assert_eq!([after(7.0, 64.0, 0.0, Done), after(15.0, 185.0, 0.0, Done), after(-55.0, 94.0, 20.0, Done)], [Done; 3]);
-        assert_eq!([after(-85.0, 124.0, 20.0, Done), after(-85.0, 124.0, 0.0, Done)], [GoalExceeded, Done]);
-    }
-
-    /// Protects the operator from a false stream: a pour that seemed done is not, if it goes on at an upright container. Another reason stays.
-    #[test]
-    fn what_cannot_be_on_the_way_back_is_named() {
-        let impossible = Decision { impossible: Some(Impossible::Flow), ..Decision::NOTHING };
-        for (before, after) in [(EndReason::Done, EndReason::ImpossibleFlow), (EndReason::Aborted, EndReason::Aborted)] {
-            let mut ending = Ending::of_pour();
-            ending.end_with(before);
-            ending.returns(true, None);
-            assert_eq!(ending.reason(), before);
-            ending.decided(&impossible);
-            ending.returns(true, None);
-            assert_eq!(ending.reason(), after);
-        }
-    }
-
-    /// Protects the operator: the reason that came first is the one that is reported.
-    #[test]
-    fn the_first_reason_stays() {
-        let mut ending = Ending::of_pour();
-        ending.end_with(EndReason::StreamLost);
-        ending.end_instead_of_done(EndReason::ProtectiveStop);
-        assert_eq!(ending.reason(), EndReason::StreamLost);
-        let mut done = Ending::of_pour();
-        done.end_instead_of_done(EndReason::ProtectiveStop);
-        assert_eq!(done.reason(), EndReason::ProtectiveStop);
-    }
-
-    /// Protects a pour whose camera shows nothing: if it is known how much is in the vessel, the pour ends by name soon after the tilt at which
-    /// that would flow, and not at the largest one. Flow that was seen, or an unknown fill, never ends so; a lone flash is no flow.
-    #[test]
-    fn nothing_flows_where_it_must() {
-        let settings = Settings::new(&shared::config::Config::parse(include_str!("../../../config/sim.toml"), "sim.toml").unwrap());
-        let moment = Moment { running_s: 2.0, frames: 60, measurement_age_ns: 0, alpha_deg: 70.0, poured_ml: 0.0, follows: true };
-        let after = |flows_by_deg: Option<f32>, flowed: bool, frames: u32| {
-            let mut ending = Ending::of_pour_that_flows_by(flows_by_deg);
-            ending.seen_stream = flowed;
-            for _ in 0..frames {
-                let frame = SeenFrame { lost: 0, area_px2: Some(0.0), flowing: false, alpha_deg: 62.0, alpha_now_deg: 63.0 };
-                ending.saw(&frame, &settings);
-            }
-            ending.due(&moment, &settings)
-        };
-        assert_eq!(after(Some(60.0), false, DRY_FRAMES), Some(EndReason::NothingFlows));
-        assert_eq!(after(Some(60.0), false, DRY_FRAMES - 1), None);
-        assert_eq!(after(Some(65.0), false, DRY_FRAMES), None);
-        assert_eq!(after(Some(60.0), true, DRY_FRAMES), None);
-        assert_eq!(after(None, false, DRY_FRAMES), None);
-        let mut flashed = Ending::of_pour_that_flows_by(Some(60.0));
-        for area_px2 in std::iter::once(100.0).chain([0.0; DRY_FRAMES as usize]).map(Some) {
-            flashed.saw(&SeenFrame { lost: 0, area_px2, flowing: area_px2 > Some(0.0), alpha_deg: 62.0, alpha_now_deg: 63.0 }, &settings);
-        }
-        assert_eq!(flashed.due(&moment, &settings), Some(EndReason::NothingFlows));
-    }
-}
+mod tests;

@@ -4,9 +4,8 @@
 
 use shared::messages::{Doubt, Feature, LAYOUT_VERSION};
 
-/// Largest number of lost frames that are bridged at once: one second at 30 Hz. A longer gap is older than `controller.stale_feature_ms`
-/// allows.
-const MAX_BRIDGED: u64 = 30;
+/// Longest gap whose lost frames are bridged at once, s. A longer one is older than the largest `controller.stale_feature_ms` allows.
+pub const BRIDGED_S: f64 = 1.0;
 
 /// Whether a feature has another layout, or comes from the future and so from another clock. Its age, on which the endings rest, would mean
 /// nothing.
@@ -31,18 +30,19 @@ pub fn newest_usable_ns(features: &[Feature], before_ns: u64, now_ns: u64) -> u6
 pub struct Taken {
     previous: Option<Feature>,
     feature: Feature,
-    /// Number of frames lost between the two, at most [`MAX_BRIDGED`].
+    /// Number of frames lost between the two, at most as many as are bridged.
     pub lost: u32,
 }
 
 impl Taken {
-    /// Takes `feature` after `previous`; `None` if it must be ignored, because it is foreign, or comes twice or too late.
-    pub fn new(previous: Option<Feature>, feature: &Feature, now_ns: u64) -> Option<Self> {
+    /// Takes `feature` after `previous`; `None` if it must be ignored, because it is foreign, or comes twice or too late. At most `bridged` lost
+    /// frames count.
+    pub fn new(previous: Option<Feature>, feature: &Feature, now_ns: u64, bridged: u32) -> Option<Self> {
         let of_same_worker = previous.filter(|p| p.worker_epoch_ns == feature.worker_epoch_ns);
         if is_foreign(feature, now_ns) || of_same_worker.is_some_and(|p| feature.sequence <= p.sequence) {
             return None;
         }
-        let lost = of_same_worker.map_or(0, |p| (feature.sequence - p.sequence - 1).min(MAX_BRIDGED) as u32);
+        let lost = of_same_worker.map_or(0, |p| (feature.sequence - p.sequence - 1).min(bridged.into()) as u32);
         Some(Self { previous, feature: *feature, lost })
     }
 

@@ -37,6 +37,16 @@ pub enum Order {
     Shutdown,
 }
 
+impl Order {
+    /// Number of the pour or recording that is ordered; 0 if it is none.
+    pub fn episode(&self) -> u64 {
+        match self {
+            Self::Pour { episode, .. } | Self::Record { episode, .. } => *episode,
+            Self::Abort | Self::Shutdown => 0,
+        }
+    }
+}
+
 /// Why an order is refused.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Refusal {

@@ -36,6 +36,11 @@ pub struct Settings {
     pub usual_lag_ns: u64,
 }
 
+/// Time from one frame to the next of most cameras, ns: that of 30 Hz.
+const USUAL_FRAME_NS: u64 = 33_333_333;
+/// The shortest time from one frame to the next, ns: a little less than that of the largest `camera.fps`, 240.
+const SHORTEST_FRAME_NS: u64 = 4_000_000;
+
 /// The longest time in the settings, ns: an hour, far more than any configuration may say.
 const LONGEST_NS: u64 = 3600 * 1_000_000_000;
 
@@ -47,6 +52,7 @@ impl Settings {
         // The ranges are those of the configuration. What is not a number is in none of them.
         (1_000_000..=1_000_000_000).contains(&self.period_ns)
             && times_ns.iter().all(|ns| *ns <= LONGEST_NS)
+            && (self.frame_ns == 0 || self.frame_ns >= SHORTEST_FRAME_NS)
             && (-20.0..=0.0).contains(&alpha_min_deg)
             && (10.0..=180.0).contains(&alpha_max_deg)
             && (0.1..=6.0).contains(&step_deg)
@@ -55,6 +61,12 @@ impl Settings {
             && (1.0..=180.0).contains(&return_rate_deg_s)
             && (0.0..=1e9).contains(&self.goal_max_ml)
             && (0.0..=10.0).contains(&self.upright_deg)
+    }
+
+    /// Number of frames in so many seconds, at least one. Of a camera whose rate is not known it is that at 30 Hz.
+    pub fn frames(&self, seconds: f64) -> u32 {
+        let frame_ns = if self.frame_ns == 0 { USUAL_FRAME_NS } else { self.frame_ns };
+        (seconds * 1e9 / frame_ns as f64).round().max(1.0) as u32
     }
 
     /// Takes the settings out of the cell's configuration.

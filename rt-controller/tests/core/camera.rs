@@ -79,6 +79,57 @@ fn what_hides_the_end_of_the_way_back_is_named() {
     assert_eq!([slow.finish().reason, late.finish().reason], [EndReason::FrameRate, EndReason::StaleFeature]);
 }
 
+/// Protects what is said: a controller that was held up on the way upright has not seen what left meanwhile, and the robot came upright by itself.
+#[test]
+fn a_controller_that_sleeps_on_the_way_back_is_not_done() {
+    for sleeps in [false, true] {
+        let mut cell = ToyCell::new();
+        cell.pour(20.0).expect("ready");
+        while cell.core.phase() == Phase::Pouring {
+            cell.tick(None);
+        }
+        cell.tick(None);
+        if sleeps {
+            cell.now_ns += 5_000_000_000;
+        }
+        let outcome = cell.finish();
+        let expected = if sleeps { EndReason::ControllerOverrun } else { EndReason::Done };
+        assert_eq!((outcome.reason, outcome.poured_words().starts_with("at least ")), (expected, sleeps));
+    }
+}
+
+/// Protects what is said after an abort: a camera that dies on the way upright hides what leaves there, whatever the pour ended for.
+#[test]
+fn an_abort_does_not_hide_that_the_camera_was_lost() {
+    for dies in [false, true] {
+        let mut cell = ToyCell::new();
+        cell.pour(90.0).expect("ready");
+        cell.run_to_flow();
+        cell.tick(Some(Order::Abort));
+        cell.camera = !dies;
+        let outcome = cell.finish();
+        assert_eq!((outcome.reason, outcome.poured_words().starts_with("at least ")), (EndReason::Aborted, dies));
+    }
+}
+
+/// Protects the volume of a fast camera: what flows in a gap of half a second is counted, however many frames that is, and a longer gap than a second
+/// counts as one.
+#[test]
+fn a_gap_is_bridged_by_its_time() {
+    for (hz, gap_frames, bridged) in [(30u64, 15, 15), (30, 90, 30), (120, 60, 60), (120, 500, 120)] {
+        let mut cell = ToyCell::new();
+        cell.settings.frame_ns = 1_000_000_000 / hz;
+        cell.core = Core::new(cell.settings);
+        cell.core.exchange(always(13));
+        cell.tick(None);
+        cell.pour(90.0).expect("ready");
+        let before = cell.core.counters().bridged_frames;
+        cell.sequence += gap_frames;
+        cell.tick(None);
+        assert_eq!(cell.core.counters().bridged_frames - before, bridged, "{gap_frames} frames at {hz} Hz");
+    }
+}
+
 /// Protects d from being counted twice: repeated, older and foreign features are ignored and counted.
 #[test]
 fn repeated_features_count_once() {

@@ -13,13 +13,13 @@ pub fn check_fused(model: &FusedModel, back: WayBack) -> Result<(), String> {
         ("weight of the straight vessel", model.tight_share, 0.0, 1.0),
         ("variance of log c", model.camera[0][0], 0.0, 25.0),
         ("variance of q", model.camera[1][1], 0.0, 25.0),
-        ("covariance of log c and q", model.camera[0][1], -25.0, 25.0),
         ("sd of a pour's gain", model.gain_sd, 0.0, 5.0),
         ("largest area", model.bounds.most_px2, 1.0, 1e12),
         ("tilt by which flow must be seen", model.bounds.dry_deg, 1.0, 200.0),
         ("rate of the way back", back.rate_deg, 0.1, 10.0),
         ("change of that rate in a frame", back.change_deg, 0.01, 100.0),
     ])?;
+    check_covariance("log c and q", &model.camera)?;
     model.explanations.iter().try_for_each(check_explanation)
 }
 
@@ -85,13 +85,34 @@ fn check_explanation(explanation: &Explanation) -> Result<(), String> {
     for shape in log_shape {
         within(&[("shape of the vessel (log)", shape, -10.0, 10.0)])?;
     }
-    let unknowns = &explanation.unknowns;
-    for (k, row) in unknowns.iter().enumerate() {
+    for (k, row) in explanation.unknowns.iter().enumerate() {
         within(&[("variance of an unknown", row[k], 1e-12, 100.0)])?;
-        for (j, covariance) in row.iter().enumerate() {
-            let most = (row[k] * unknowns[j][j]).sqrt() * (1.0 + 1e-9);
-            within(&[("covariance of two unknowns", *covariance, -most, most)])?;
-            within(&[("asymmetry of their covariance", covariance - unknowns[j][k], 0.0, 0.0)])?;
+    }
+    check_covariance("the unknowns", &explanation.unknowns)
+}
+
+/// How much less than nothing a mixture of correlated values may vary by, as a share: the rounding of f64 makes far less. Chosen by hand.
+const ROUNDING: f64 = 1e-6;
+
+/// Refuses what is no covariance of `what`: one that is not symmetric, or by which some mixture of them would vary by less than nothing. A
+/// deviation that follows from it would be 0 or not a number, and a doubtful volume would look certain.
+fn check_covariance<const N: usize>(what: &str, covariance: &[[f64; N]; N]) -> Result<(), String> {
+    let none = || Err(format!("estimator: the covariance of {what} is none: some mixture of them would vary by less than nothing"));
+    // Cholesky's factor of the correlations exists if all is well.
+    let mut factor = [[0.0; N]; N];
+    for k in 0..N {
+        for j in 0..=k {
+            let value = covariance[k][j];
+            let correlation = match value {
+                // What does not vary at all is sure, and goes with nothing.
+                0.0 => f64::from(u8::from(j == k)),
+                _ => value / (covariance[k][k].sqrt() * covariance[j][j].sqrt()),
+            };
+            let rest = correlation - (0..j).map(|i| factor[k][i] * factor[j][i]).sum::<f64>();
+            if value != covariance[j][k] || !rest.is_finite() || (j == k && rest + ROUNDING <= 0.0) {
+                return none();
+            }
+            factor[k][j] = if j == k { (rest + ROUNDING).sqrt() } else { rest / factor[j][j] };
         }
     }
     Ok(())
