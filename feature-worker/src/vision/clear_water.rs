@@ -82,6 +82,12 @@ const LIP_PX: f32 = 10.0;
 /// Before a pattern, it is not known whether something flows where this share of such a stream's place is known ground that has changed.
 /// Tuned on seed 101 of `evaluate-camera --faults`.
 const LIP_CHANGED: f32 = 0.4;
+/// Legs of the largest bead that hangs at the lip, with its blur, px. Chosen by hand: [`Water`] takes less than 24 px^2 for a bead.
+const BEAD_PX: f32 = 8.0;
+/// Its surroundings, px. Chosen by hand: as many samples as the bead itself.
+const BEAD_ROUND_PX: f32 = 13.0;
+/// And before an even ground where this share has. Chosen by hand: a bead that hangs at the lip, which is no stream, covers half of it.
+const EVEN_LIP_CHANGED: f32 = 0.7;
 /// How fast the share of pictures with an even ground grows and shrinks, a picture. Chosen by hand: dim boards look even in some pictures.
 const EVEN_FOLLOWS: [f32; 2] = [0.02, 0.1];
 /// The ground has a pattern below this share. Tuned on seed 101 of `evaluate-camera --faults`.
@@ -120,8 +126,8 @@ pub(crate) struct ClearWater {
     compared: u32,
     /// A picture was compared with the ground.
     looked: bool,
-    /// There may be a stream where the last one was seen.
-    held: bool,
+    /// Legs of a stream that may still be where it was last seen, px.
+    held: Option<[f32; 2]>,
     /// In which share of the pictures without such a doubt the ground was even, the last ones above all.
     even_share: f32,
     /// Pictures of which that is the share, the first ones.
@@ -165,7 +171,7 @@ impl ClearWater {
             earlier: Mat::default(),
             compared: 0,
             looked: false,
-            held: false,
+            held: None,
             even_share: 0.0,
             even_pictures: 0.0,
             unseen: u32::MAX,
@@ -218,7 +224,7 @@ impl ClearWater {
             let best = self.lines.best(&self.evidence, &self.rays, &moved, self.water.stream())?.map(|found| {
                 (found, self.lines.legs_px(found.line), self.lines.earlier_picture(found.line, &self.evidence, &self.rays, &moved))
             });
-            let verdict = self.water.decide(best, self.evidence.strange_share());
+            let verdict = self.water.decide(best, self.evidence.strange_share(), self.held.is_some());
             sighting = match (verdict, best) {
                 // Where bands cannot be divided out, or only now and then, neither a line nor its absence means anything.
                 _ if (!told || self.is_pattern()) && self.flicker.flickers() => Sighting::Unsure(Doubt::LightFlickers),
@@ -239,7 +245,7 @@ impl ClearWater {
             } else {
                 (self.unseen, self.confirmed) = (self.unseen.saturating_add(1), 0);
             }
-            if self.water.is_elsewhere(self.evidence.strange_share(), self.held) {
+            if self.water.is_elsewhere(self.evidence.strange_share(), self.held.is_some()) {
                 self.background.forget()?;
             }
         }
@@ -255,23 +261,25 @@ impl ClearWater {
         self.even_share < EVEN_LEAST
     }
 
-    /// As [`Evidence::shares`], of the triangle with these legs, px.
-    fn shares(&self, legs_px: [f32; 2]) -> [f32; 2] {
+    /// As [`Evidence::shares`], of the triangle with the legs `to`, px, but for what is within that with the legs `from`, if there is one.
+    fn shares(&self, from: Option<[f32; 2]>, to: [f32; 2]) -> [f32; 2] {
         let [gain, _] = self.background.gains();
-        self.evidence.shares(&self.rays, self.line_share(legs_px), !self.is_pattern(), gain)
+        let from = from.map_or(LinearField::constant(1.0), |legs_px| self.line_share(legs_px));
+        self.evidence.shares(&self.rays, [from, self.line_share(to)], !self.is_pattern(), gain)
     }
 
     /// Whether ground that is known has changed where a small stream would be.
     fn lip_has_changed(&self) -> bool {
-        let [_, wet] = self.shares([LIP_PX; 2]);
-        wet >= LIP_CHANGED
+        let [_, wet] = self.shares(None, [LIP_PX; 2]);
+        wet >= if self.is_pattern() { LIP_CHANGED } else { EVEN_LIP_CHANGED }
     }
 
     /// Takes what is dry over into the memory of the background, and chooses the picture with which the next ones are compared.
     #[inline(always)]
     fn remember(&mut self, height_px: LinearField) -> opencv::Result<()> {
-        let spared = self.held;
-        let near = self.water.recent_legs_px(spared).map(|legs_px| {
+        let recent = self.water.recent_legs_px();
+        let spared = recent.into_iter().chain(self.held).reduce(|one, other| [0, 1].map(|k| one[k].max(other[k])));
+        let near = spared.map(|legs_px| {
             let [a, b] = legs_px.map(|v| v.max(1.0));
             // The outline bulges, and a stream grows from frame to frame.
             let bulge = 2.0 + 0.1 * (a * b).sqrt();
@@ -279,7 +287,7 @@ impl ClearWater {
             let outer = self.line_share([1.35 * a + 8.0, 1.35 * b + 8.0]);
             (WetPlaces { line_share: inner, right_px: self.right_px() }, outer)
         });
-        let dry = DryPlaces { height_px, flows: self.water.flows() || spared, near, calm: CALM * self.evidence.noise() };
+        let dry = DryPlaces { height_px, flows: self.water.flows() || self.held.is_some(), near, calm: CALM * self.evidence.noise() };
         let is_new = self.background.is_new();
         self.background.remember(&self.now, dry)?;
         self.compared += 1;
@@ -392,20 +400,22 @@ impl Liquid for ClearWater {
         if self.lines.may_leave(legs_px) {
             return 0.0;
         }
-        let [dry, _] = self.shares(legs_px);
+        // A bead that stays at the lip is no stream, and before an even ground it is told from one.
+        let bead = (!self.is_pattern()).then_some([BEAD_PX; 2]);
+        let [dry, _] = self.shares(bead, legs_px.map(|v| v.max(if bead.is_some() { BEAD_ROUND_PX } else { 0.0 })));
         dry
     }
 
-    fn hold_ground(&mut self, held: bool) {
+    fn hold_ground(&mut self, legs_px: Option<[f32; 2]>) {
         // A ground that was shifted or torn is not known, and what is not known looks even.
-        if !held && self.disturbed.doubt().is_none() {
+        if legs_px.is_none() && self.disturbed.doubt().is_none() {
             let even = self.evidence.even();
             self.even_pictures += 1.0;
             let usual = EVEN_FOLLOWS[usize::from(!even)];
             let follows = if self.even_pictures <= EVEN_PICTURES { usual.max(1.0 / self.even_pictures) } else { usual };
             self.even_share += follows * (f32::from(u8::from(even)) - self.even_share);
         }
-        self.held = held;
+        self.held = legs_px.map(|legs| legs.map(|v| v / self.scale));
     }
 
     fn edge_on(&self, profile: &Profile) -> Option<ProfileEdge> {
@@ -422,7 +432,7 @@ impl Liquid for ClearWater {
 
     fn confirm(&mut self, line: Option<FineLine>, mean_level: f32) -> Result<FineLine, Doubt> {
         let sine = self.axes.sine().abs();
-        let sure = self.evidence.even() && !self.held && !self.lip_has_changed();
+        let sure = self.evidence.even() && self.held.is_none() && !self.lip_has_changed();
         let line = self.water.confirm(line, mean_level, self.scale, sine, sure)?;
         // What bands left over is elsewhere in the next picture.
         self.confirmed += 1;

@@ -273,7 +273,7 @@ impl ColouredLiquid {
                 0 if !dry => continue,
                 end => {
                     // What goes on from the liquid in a foreign colour may be more of it.
-                    let beyond = self.seen().beyond_end(i, end)?.filter(|_| !dry && self.dry_frames >= DRY_FRAMES);
+                    let beyond = self.seen().beyond_end(i, end)?.filter(|_| self.dry_frames >= DRY_FRAMES);
                     if beyond.is_some_and(|colour| self.ground.tell(colour) == Ground::Foreign) {
                         continue;
                     }
@@ -297,16 +297,17 @@ impl ColouredLiquid {
     /// make all of it foreign.
     /// A `drop` at the lip is no stream.
     fn follow_ground(&mut self, sighting: Sighting, drop: bool) -> opencv::Result<()> {
+        let dry = drop || matches!(sighting, Sighting::Dry { .. });
+        let told = dry || matches!(sighting, Sighting::Stream { doubt: Doubt::None, .. });
         match sighting {
             // A lamp's reflection before white squares is no ground. The pictures after it are learned from as ever.
-            Sighting::Dry { .. } | Sighting::Stream { doubt: Doubt::None, .. } | Sighting::Unsure(Doubt::BlownOut) if self.half_white => {}
-            // A stream that was there before the surroundings of the lip were known may be there still, in other colours.
-            Sighting::Dry { .. } if self.learn_after == 0 && self.held && self.dry_frames < DRY_FRAMES => {}
-            Sighting::Dry { .. } if self.learn_after == 0 => self.learn(true)?,
-            Sighting::Stream { doubt: Doubt::None, .. } if self.learn_after == 0 => self.learn(drop)?,
+            _ if self.half_white && (told || sighting == Sighting::Unsure(Doubt::BlownOut)) => {}
             // What may be liquid must not be taken for ground.
-            Sighting::Dry { .. } | Sighting::Stream { doubt: Doubt::None, .. } => self.learn_after -= 1,
-            _ => self.learn_after = LEARN_AFTER,
+            _ if !told => self.learn_after = LEARN_AFTER,
+            _ if self.learn_after > 0 => self.learn_after -= 1,
+            // A stream that was there before the surroundings of the lip were known may be there still, in other colours.
+            _ if dry && self.held && self.dry_frames < DRY_FRAMES => {}
+            _ => self.learn(dry)?,
         }
         Ok(())
     }
@@ -485,8 +486,8 @@ impl Liquid for ColouredLiquid {
     }
 
     /// Once the surroundings of the lip are known, ground is learned far from it only; until then it is not where a stream is held.
-    fn hold_ground(&mut self, held: bool) {
-        self.held = held;
+    fn hold_ground(&mut self, legs_px: Option<[f32; 2]>) {
+        self.held = legs_px.is_some();
     }
 
     fn edge_on(&self, profile: &Profile) -> Option<ProfileEdge> {

@@ -134,8 +134,8 @@ pub(crate) trait Liquid: Send + Sync {
     /// Which share of the triangle with these legs, px from the lip, was seen to be ground in the picture that was looked at, 0 to 1.
     fn dry_share(&self, legs_px: [f32; 2]) -> f32;
 
-    /// Says whether there may be a stream where the last one was seen, so that what is there is not taken for ground.
-    fn hold_ground(&mut self, held: bool);
+    /// Says the legs, px from the lip, of a stream that may still be where it was last seen, so that what is there is not taken for ground.
+    fn hold_ground(&mut self, legs_px: Option<[f32; 2]>);
 
     /// Where on a profile the stream's edge lies.
     fn edge_on(&self, profile: &Profile) -> Option<ProfileEdge>;

@@ -81,7 +81,7 @@ impl Presence {
 
     /// A stream was seen of which no more than a part was measured, as [`Self::saw`] says: it is no smaller than what was there before.
     pub(crate) fn saw_part(&mut self, area_px2: f32, legs_px: [f32; 2], bgr: [f32; 3]) {
-        if self.legs_px.is_none() {
+        if self.legs_px.is_none_or(|before| before[0] * before[1] < legs_px[0] * legs_px[1]) {
             self.saw(area_px2, legs_px, bgr);
         }
         self.saw_unsure(true);
@@ -96,13 +96,13 @@ impl Presence {
         }
     }
 
-    /// Whether a stream was seen and not yet its end. False after some seconds without a stream, when what is seen is the ground.
-    pub(crate) fn holds(&mut self, seen: bool) -> bool {
+    /// Legs of a stream that was seen, and not yet its end, px from the lip. None after some seconds without a stream, when what is seen is the ground.
+    pub(crate) fn holds(&mut self, seen: bool) -> Option<[f32; 2]> {
         self.unseen = if seen { 0 } else { self.unseen.saturating_add(1) };
         if self.unseen > HELD_PICTURES {
             self.legs_px = None;
         }
-        self.legs_px.is_some()
+        self.legs_px
     }
 
     /// No stream was seen in a picture with these mean levels, without other doubts. Returns whether there is none; `dry_share` tells which

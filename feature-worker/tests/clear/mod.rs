@@ -73,6 +73,39 @@ fn a_stream_that_begins_without_an_edge_is_told() -> Result<(), ExtractError> {
     Ok(())
 }
 
+/// Protects pours of a stream as smooth as glass, of water that takes little light: that nothing changes is no end. A worker that sees it for longer than
+/// any pour lasts may call it ground.
+#[test]
+fn a_steady_stream_is_no_ground() -> Result<(), ExtractError> {
+    let mut extractor = clear()?;
+    // The same noise in each picture: nothing changes at all.
+    let faint = |share: f32, seed: i32| -> Result<Mat, ExtractError> {
+        let mut mixed = Mat::default();
+        core::add_weighted(&water(share, None, seed)?, 0.4, &water(0.0, None, seed)?, 0.6, 0.0, &mut mixed, -1)?;
+        Ok(mixed)
+    };
+    let steady = faint(1.0, 77)?;
+    for i in 0..90 {
+        let picture = if i < 14 { faint(((i - 5) as f32 / 8.0).clamp(0.0, 1.0), i)? } else { noisy(&steady, i % 2)? };
+        let measured = measure(&mut extractor, &picture)?;
+        assert!(i < 9 || is_told(&measured), "picture {i}: {measured:?}");
+    }
+    Ok(())
+}
+
+/// Protects the ends of pours from a bead that stays at the lip: it is no stream, and the end is told.
+#[test]
+fn a_bead_at_the_lip_does_not_hide_the_end() -> Result<(), ExtractError> {
+    let mut extractor = clear()?;
+    for i in 0..60 {
+        let share = if i < 30 { ((i - 5) as f32 / 8.0).clamp(0.0, 1.0) } else { ((34 - i) as f32 / 8.0).max(0.14) };
+        let measured = measure(&mut extractor, &water(share, None, i)?)?;
+        assert!(!(9..32).contains(&i) || is_told(&measured), "picture {i}: {measured:?}");
+        assert!(i < 48 || (measured.area_px2, measured.doubt) == (0.0, Doubt::None), "picture {i}: {measured:?}");
+    }
+    Ok(())
+}
+
 /// Protects the operator from a region in which no outline of clear water fits: every picture would be dry.
 #[test]
 fn a_region_without_room_for_an_outline_is_refused() {

@@ -344,3 +344,33 @@ fn a_root_does_not_stand_for_its_stream() -> Result<(), ExtractError> {
     }
     Ok(())
 }
+
+/// Protects streams of which the root alone has the liquid's colours, since the worker's start or after a dry picture: what goes on from it in other
+/// colours is not learned as ground, so a stream in these alone is never "nothing".
+#[test]
+fn a_root_does_not_teach_what_goes_on_from_it() -> Result<(), ExtractError> {
+    let outer = vec![[215.0, 250.0], [215.0, 135.0], [270.4, 184.0]];
+    for dry_first in [true, false] {
+        let mut extractor = with_room()?;
+        for i in 0..110 {
+            let mut picture = dry(0.0, i)?;
+            match (i, dry_first) {
+                (0..44, true) => {}
+                (0..20, false) => lay_over(&mut picture, &[stream(90.0, 80.0)], OWN)?,
+                (44..64, true) => {
+                    lay_over(&mut picture, std::slice::from_ref(&outer), OTHER)?;
+                    lay_over(&mut picture, &[stream(7.0, 7.0)], OWN)?;
+                }
+                (_, true) => lay_over(&mut picture, &[stream(90.0, 80.0)], OTHER)?,
+                (_, false) => {
+                    lay_over(&mut picture, &[stream(90.0, 80.0)], OTHER)?;
+                    lay_over(&mut picture, &[stream(7.0, 7.0)], OWN)?;
+                }
+            }
+            let measured = measure(&mut extractor, &picture)?;
+            let flows = if dry_first { i >= 64 } else { i >= 20 };
+            assert!(!flows || is_told(&measured), "{dry_first} picture {i}: {measured:?}");
+        }
+    }
+    Ok(())
+}

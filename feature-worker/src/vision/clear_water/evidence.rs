@@ -229,10 +229,10 @@ impl Evidence {
         self.even
     }
 
-    /// Which shares of the places with a `line_share` below 1 in the air are ground that is known and as it is remembered, and ground that
+    /// Which shares of the places with a share of the way to the line `to` below 1, and not of that to the line `from`, in the air are ground that is known and as it is remembered, and ground that
     /// is known and is not. Ground of which nothing is remembered is known where it is `even`: it is like what is remembered further out on its ray. `gain`
     /// is the picture's exposure against the memory.
-    pub(super) fn shares(&self, rays: &Rays, line_share: LinearField, even: bool, gain: f32) -> [f32; 2] {
+    pub(super) fn shares(&self, rays: &Rays, [from, to]: [LinearField; 2], even: bool, gain: f32) -> [f32; 2] {
         let (now, memory): (&[Vec4b], &[Vec4b]) =
             (self.ray_now.data_typed().unwrap_or_default(), self.ray_memory.data_typed().unwrap_or_default());
         let (mut dry, mut wet, mut looked) = (0.0f32, 0.0f32, 0.0f32);
@@ -240,14 +240,14 @@ impl Evidence {
             let mut further = None;
             for i in (ray * SAMPLES..(ray + 1) * SAMPLES).rev().filter(|i| rays.air[*i] > 0.0) {
                 let remembered = self.remembered[i] > 0.5;
-                if remembered {
-                    further = memory.get(i).map(|p| each(|k| f32::from(p[k]) * 255.0 * gain / f32::from(p[3].max(1))));
+                if even && remembered {
+                    further = memory.get(i).map(|p| each(|k| (f32::from(p[k]) * 255.0 * gain / f32::from(p[3].max(1))).min(255.0)));
                 }
-                if line_share.at(rays.places[i]) >= 1.0 {
+                if to.at(rays.places[i]) >= 1.0 || from.at(rays.places[i]) < 1.0 {
                     continue;
                 }
                 looked += 1.0;
-                let away = match (remembered, further.filter(|_| even), now.get(i)) {
+                let away = match (remembered, further, now.get(i)) {
                     (true, ..) => self.away[i],
                     (false, Some(ground), Some(now)) => {
                         size_of(&each(|k| if k < 3 { f32::from(now[k]) - ground[k] } else { 0.0 })) / self.noise

@@ -187,16 +187,17 @@ impl Water {
         self.stream.is_some() || self.dry_frames <= 1
     }
 
-    /// Where the stream was, while it may be there still or the place is not taken for background at once: cuts with the axes, px of the
+    /// Where the stream was, while the place is not taken for background at once: cuts with the axes, px of the
     /// small picture.
-    pub(super) fn recent_legs_px(&self, held: bool) -> Option<[f32; 2]> {
-        (held || self.dry_frames <= AFTERWARDS).then_some(self.last_legs_px)
+    pub(super) fn recent_legs_px(&self) -> Option<[f32; 2]> {
+        (self.dry_frames <= AFTERWARDS).then_some(self.last_legs_px)
     }
 
     /// Decides whether there is a stream. `best` is the best line, with its legs in px and what the earlier picture says of it;
-    /// `strange_share` is the share of the background far from the lip that differs from the memory.
+    /// `strange_share` is the share of the background far from the lip that differs from the memory. While a stream is `held`, because its end was not
+    /// seen, a line that stands still may be a stream as smooth as glass.
     #[inline(always)]
-    pub(super) fn decide(&mut self, best: Option<(Candidate, [f32; 2], EarlierPicture)>, strange_share: f32) -> Verdict {
+    pub(super) fn decide(&mut self, best: Option<(Candidate, [f32; 2], EarlierPicture)>, strange_share: f32, held: bool) -> Verdict {
         let mut verdict = Verdict::Dry;
         let mut surely_none = false;
         if let Some((found, legs_px, earlier)) = best {
@@ -210,9 +211,13 @@ impl Water {
             surely_none = background || (found.known > SURELY_KNOWN && found.score < HELD);
             if self.stream.is_none() && strange_share > STRANGE {
                 verdict = Verdict::Unsure;
-            } else if self.is_enough(&found, &earlier) && !background {
-                self.see(&found, legs_px);
-                verdict = Verdict::Stream;
+            } else if self.is_enough(&found, &earlier) {
+                if !background {
+                    self.see(&found, legs_px);
+                    verdict = Verdict::Stream;
+                } else if held && self.stream.is_some() {
+                    verdict = Verdict::Unsure;
+                }
             }
         }
         if verdict == Verdict::Stream {
