@@ -13,8 +13,8 @@
 //!    earlier picture, moved, does not explain.
 //! 4. [`lines`] finds the line from axis to axis with the best evidence, and [`water`] decides whether it is a stream.
 //! 5. The full picture's profiles across that line must confirm it.
-//! 6. What cannot be told is said by name: a lamp's reflection at the lip, and before a pattern light that flickers or wanders,
-//!    pictures that are missing again and again ([`disturbed`]), and what has changed at the lip.
+//! 6. What cannot be told is said by name: a lamp's reflection at the lip, ground that has changed there, and before a pattern light that
+//!    flickers or wanders and pictures that are missing again and again ([`disturbed`]).
 //!
 //! The first frame must be dry, and frames must follow each other. Called on the extraction thread. All pictures and tables are kept, so
 //! nothing is allocated after the second frame. The only failures are OpenCV's.
@@ -82,12 +82,12 @@ const LIP_PX: f32 = 10.0;
 /// Before a pattern, it is not known whether something flows where this share of such a stream's place is known ground that has changed.
 /// Tuned on seed 101 of `evaluate-camera --faults`.
 const LIP_CHANGED: f32 = 0.4;
+/// Before an even ground, it is not known where this share has. Chosen by hand: a bead that hangs at the lip, which is no stream, covers half of it.
+const EVEN_LIP_CHANGED: f32 = 0.7;
 /// Legs of the largest bead that hangs at the lip, with its blur, px. Chosen by hand: [`Water`] takes less than 24 px^2 for a bead.
 const BEAD_PX: f32 = 8.0;
-/// Its surroundings, px. Chosen by hand: as many samples as the bead itself.
+/// Legs of a bead's surroundings, px. Chosen by hand: as many samples as the bead itself.
 const BEAD_ROUND_PX: f32 = 13.0;
-/// And before an even ground where this share has. Chosen by hand: a bead that hangs at the lip, which is no stream, covers half of it.
-const EVEN_LIP_CHANGED: f32 = 0.7;
 /// How fast the share of pictures with an even ground grows and shrinks, a picture. Chosen by hand: dim boards look even in some pictures.
 const EVEN_FOLLOWS: [f32; 2] = [0.02, 0.1];
 /// The ground has a pattern below this share. Tuned on seed 101 of `evaluate-camera --faults`.

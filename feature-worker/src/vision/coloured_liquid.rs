@@ -294,8 +294,7 @@ impl ColouredLiquid {
     }
 
     /// Learns the ground in a picture in which this was seen, or does not. It is forgotten only while it is learned: what hides it for long must not
-    /// make all of it foreign.
-    /// A `drop` at the lip is no stream.
+    /// make all of it foreign. A `drop` at the lip is no stream.
     fn follow_ground(&mut self, sighting: Sighting, drop: bool) -> opencv::Result<()> {
         let dry = drop || matches!(sighting, Sighting::Dry { .. });
         let told = dry || matches!(sighting, Sighting::Stream { doubt: Doubt::None, .. });
@@ -425,10 +424,8 @@ impl Liquid for ColouredLiquid {
         let sighting = match self.find_stream(edges_px)? {
             Sighting::Dry { confidence } => self.look_again(confidence)?,
             Sighting::Stream { seen_share, doubt: Doubt::None } if self.dry_frames >= DRY_FRAMES => {
-                let untold = match self.seen().beyond(&self.ends)? {
-                    Some(beyond) => !self.is_excused(beyond)?,
-                    None => false,
-                };
+                let beyond = self.seen().beyond(&self.ends)?;
+                let untold = beyond.map(|beyond| self.is_excused(beyond)).transpose()? == Some(false);
                 Sighting::Stream { seen_share, doubt: if untold { Doubt::ColoursChanged } else { Doubt::None } }
             }
             other => other,
