@@ -133,7 +133,7 @@ pub(super) fn something_flows(pour: &Pour, camera: &CameraConfig, image: &ImageC
     let mut seen =
         format!("{flowing} of {frames} frames show a stream whose edge fits the axes, {dry} are dry, and in {unfit} no edge fits");
     if untold > 0 {
-        seen += &format!("; {untold} cannot be told (too dark, too bright, not whole, or in other colours)");
+        seen += &format!("; {untold} cannot be told (too dark or bright, frozen, not whole, in other colours, or in light that flickers)");
     }
     let advice = match image.method {
         LiquidMethod::Colour => "show one whole pour, check the axes, or use --method clear for water",
