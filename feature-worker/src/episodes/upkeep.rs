@@ -76,10 +76,20 @@ pub fn delete(found: &Found) -> Result<(), ExportError> {
     fs::remove_file(&found.path).map_err(|e| fail(&e))
 }
 
+/// Whether what is `beside` and cannot go breaks `budget` although of `found` only the newest stayed. No deletion helps there.
+pub fn is_out_of_reach(found: &[Found], beside: Folder, budget: Budget) -> bool {
+    let newest = found.iter().max_by_key(|f| (&f.episode.info.started_at_utc, &f.path));
+    let (episodes, bytes) = newest.map_or((0, 0), |f| (1, f.bytes));
+    beside.episodes > 0 && !budget.holds(beside.episodes + episodes, beside.bytes + bytes)
+}
+
 /// What is to go so that the rest, and what is `beside` it and cannot go, are within `budget`: places in `found`, in the order of deletion. First
 /// go those that cannot be trained on for want of their end, then those without a weight, then, only if `weighed`, those with one; the oldest
-/// first. The newest of all stays.
+/// first. The newest of all stays. Nothing goes where the budget is out of reach ([`is_out_of_reach`]): recordings would be lost for nothing.
 pub fn to_prune(found: &[Found], beside: Folder, budget: Budget, weighed: bool) -> Vec<usize> {
+    if is_out_of_reach(found, beside, budget) {
+        return Vec::new();
+    }
     let age = |i: &usize| (&found[*i].episode.info.started_at_utc, &found[*i].path);
     let mut order: Vec<usize> = (0..found.len()).collect();
     order.sort_by_key(age);
