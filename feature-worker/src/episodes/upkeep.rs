@@ -5,21 +5,15 @@
 //! original before they get their name, and never take the place of a file. A failure names its file, and leaves the rest as it is.
 
 use std::fs;
-use std::io::ErrorKind;
 use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
-use std::time::{Duration, SystemTime};
 
 use sha2::{Digest, Sha256};
-use shared::episode::{Episode, hex, take_number};
+use shared::episode::{Episode, hex, read_at_rest, take_number};
 use shared::{regular_file, whole_file};
 
 use super::folder::{Budget, Folder};
 use super::output::{ExportError, LeftOut, all_free, disk_error, write_error};
-
-/// A file without its end that changed more recently than this counts as under way, also where the file system has no locks. Chosen by hand:
-/// the recorder writes twice a second.
-const UNDER_WAY: Duration = Duration::from_secs(60);
 
 /// An episode that may be deleted.
 #[derive(Debug)]
@@ -46,20 +40,7 @@ pub fn look(path: &Path) -> Result<Found, LeftOut> {
 
 /// Reads an episode that nobody writes any more; if it cannot be read or is under way, says so.
 fn at_rest(path: &Path) -> Result<(Episode, fs::Metadata), LeftOut> {
-    let (file, meta) = regular_file::open(path).map_err(|e| left_out(path, e))?;
-    // Shared, so that two who look do not take each other for the recorder.
-    match file.try_lock_shared() {
-        Ok(()) => {}
-        Err(fs::TryLockError::WouldBlock) => return Err(left_out(path, "it is being written")),
-        Err(fs::TryLockError::Error(e)) if e.kind() == ErrorKind::Unsupported => {}
-        Err(fs::TryLockError::Error(e)) => return Err(left_out(path, e)),
-    }
-    let episode = Episode::read(path).map_err(|e| LeftOut { file: path.to_path_buf(), why: e.to_string() })?;
-    let age = meta.modified().ok().and_then(|t| SystemTime::now().duration_since(t).ok()).unwrap_or_default();
-    if episode.info.ended.is_empty() && age < UNDER_WAY {
-        return Err(left_out(path, "its end is missing and it changed within the last minute: it may be under way"));
-    }
-    Ok((episode, meta))
+    read_at_rest(path).map_err(|e| LeftOut { file: path.to_path_buf(), why: e.to_string() })
 }
 
 fn left_out(path: &Path, why: impl std::fmt::Display) -> LeftOut {
