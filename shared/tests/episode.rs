@@ -180,6 +180,7 @@ fn a_wrong_weight_is_refused_and_the_file_is_as_it_was() {
     }
     assert_eq!(std::fs::read(&path).unwrap(), bytes);
     std::fs::write(&path, &bytes[..bytes.len() / 2]).unwrap();
+    grow_old(&path);
     assert!(matches!(set_weight(&path, 10.0), Err(ChangeError::Incomplete { .. })));
     assert_eq!(std::fs::read(&path).unwrap(), bytes[..bytes.len() / 2], "what could still be read is still there");
     assert_eq!(std::fs::read_dir(dir.path()).unwrap().count(), 1, "no temporary file is left");
