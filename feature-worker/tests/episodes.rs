@@ -264,6 +264,27 @@ fn pruning_deletes_no_more_than_it_must() {
     assert_eq!((delete(&files[2], &["--yes"]), files[2].exists()), (0, false));
 }
 
+/// Protects recordings from a large file of somebody else among them: where what is kept breaks the budget by itself, no episode is deleted for it, and
+/// it is said.
+#[test]
+fn a_foreign_file_costs_no_episode() {
+    let dir = tempfile::tempdir().unwrap();
+    let files: Vec<PathBuf> = (0..3).map(|n| write(dir.path(), 50.0 + n as f32)).collect();
+    let foreign = std::fs::File::create(dir.path().join("mine.mcap")).unwrap();
+    foreign.set_len(1_900_000).unwrap();
+    let prune = |budget: &[&str]| {
+        let output = episodes(&[&["prune", dir.path().to_str().unwrap(), "--yes"][..], budget].concat());
+        (code(&output), String::from_utf8_lossy(&output.stderr).into_owned())
+    };
+    for budget in [["--budget-mb", "1", "--budget-episodes", "0"], ["--budget-mb", "0", "--budget-episodes", "1"]] {
+        let (ended, said) = prune(&budget);
+        assert!(ended == 1 && said.contains("nothing is deleted"), "{said}");
+        assert!(files.iter().all(|f| f.exists()), "{budget:?}");
+    }
+    let (ended, _) = prune(&["--budget-mb", "0", "--budget-episodes", "2"]);
+    assert_eq!((ended, files.iter().filter(|f| f.exists()).count()), (0, 1), "this one can be kept");
+}
+
 /// Protects the newest episode, and one that is named twice: a directory counts once by however many ways it is named, and a wrong name is no empty
 /// budget.
 #[test]

@@ -229,6 +229,9 @@ fn bench_and_camera_refuse_what_cannot_be_read() {
     };
     let cell = concat!(env!("CARGO_MANIFEST_DIR"), "/../config/sim.toml");
     assert_eq!(run(&["camera"], "nowhere.toml"), Some(2));
+    // The list is what a new configuration is written from.
+    let listed = Command::new(env!("CARGO_BIN_EXE_feature-worker")).arg("camera").env(shared::config::VARIABLE, "nowhere.toml").output();
+    assert!(String::from_utf8_lossy(&listed.unwrap().stdout).trim_end().ends_with("devices"));
     assert_eq!(run(&["bench", "--input", "nowhere.mp4"], "nowhere.toml"), Some(2));
     assert_eq!(run(&["bench", "--no-python", "--input", "nowhere.mp4"], cell), Some(2));
 }

@@ -11,7 +11,7 @@ use std::path::{Path, PathBuf};
 use std::sync::Mutex;
 use std::time::{Duration, Instant, SystemTime};
 
-use rt_controller::foreseen;
+use rt_controller::{disk, foreseen};
 use serde_json::{Value, json};
 use shared::limits::Limits;
 use shared::regular_file;
@@ -35,6 +35,8 @@ pub struct Shelf {
     weights: PathBuf,
     limits: Limits,
     goal_max_ml: f32,
+    /// Frames a second of the camera.
+    fps: f64,
     expected: Mutex<BTreeMap<String, Value>>,
 }
 
@@ -50,9 +52,9 @@ fn fault(path: &Path) -> impl Fn(std::io::Error) -> String + '_ {
 }
 
 impl Shelf {
-    /// The files around `weights`.
-    pub fn new(weights: PathBuf, limits: Limits, goal_max_ml: f32) -> Self {
-        Self { weights, limits, goal_max_ml, expected: Mutex::default() }
+    /// The files around `weights`, of a cell with these limits and so many frames a second.
+    pub fn new(weights: PathBuf, limits: Limits, goal_max_ml: f32, fps: f64) -> Self {
+        Self { weights, limits, goal_max_ml, fps, expected: Mutex::default() }
     }
 
     /// Where a training writes what it offers.
@@ -173,6 +175,8 @@ impl Shelf {
         if taken.identity != shown {
             return Err(OTHERS.into());
         }
+        // What the controller refuses would look as if it were in use.
+        disk::check_weights(&taken.weights, self.fps, &self.limits)?;
         let kept = self.kept();
         taken.put(&kept.join(format!("{shown}.bin")))?;
         // Without a readable file in use there is nothing to go back to.
@@ -189,6 +193,7 @@ impl Shelf {
 
 /// A weight file as it was read: what is checked is what is put somewhere else.
 struct Taken {
+    weights: Weights,
     identity: String,
     bytes: Vec<u8>,
     modified: Option<SystemTime>,
@@ -199,7 +204,7 @@ impl Taken {
         let modified = fs::metadata(path).and_then(|m| m.modified()).ok();
         let weights = Weights::read(path).map_err(|e| e.to_string())?;
         let bytes = weights.to_bytes().map_err(|e| e.to_string())?;
-        Ok(Self { identity: weights.identity(), bytes, modified })
+        Ok(Self { identity: weights.identity(), weights, bytes, modified })
     }
 
     fn put(&self, to: &Path) -> Result<(), String> {
@@ -253,7 +258,7 @@ mod tests {
     fn an_offer_is_taken_and_given_back() {
         let dir = tempfile::tempdir().unwrap();
         let file = dir.path().join("weights.bin");
-        let shelf = Shelf::new(file.clone(), Limits::default(), 120.0);
+        let shelf = Shelf::new(file.clone(), Limits::default(), 120.0, 30.0);
         let (one, two) = (weights(1).identity(), weights(2).identity());
         assert!(shelf.back(&one).is_err() && shelf.accept(&two).is_err());
         weights(1).write(&file).unwrap();
@@ -278,7 +283,7 @@ mod tests {
     fn a_stale_page_exchanges_nothing() {
         let dir = tempfile::tempdir().unwrap();
         let file = dir.path().join("weights.bin");
-        let shelf = Shelf::new(file.clone(), Limits::default(), 120.0);
+        let shelf = Shelf::new(file.clone(), Limits::default(), 120.0, 30.0);
         weights(1).write(&file).unwrap();
         weights(3).write(&shelf.offer()).unwrap();
         let (one, two) = (weights(1).identity(), weights(2).identity());
@@ -291,13 +296,26 @@ mod tests {
         shelf.back(&one).unwrap();
     }
 
+    /// Protects the cell from weights that the page says are in use and the controller refuses: they are refused here already, in its words.
+    #[test]
+    fn what_the_controller_refuses_is_not_put_into_use() {
+        let dir = tempfile::tempdir().unwrap();
+        let file = dir.path().join("weights.bin");
+        let shelf = Shelf::new(file.clone(), Limits::default(), 120.0, 30.0);
+        weights(1).write(&file).unwrap();
+        let fast = Weights { rate_hz: 60.0, ..weights(2) };
+        fast.write(&shelf.offer()).unwrap();
+        assert!(shelf.accept(&fast.identity()).unwrap_err().contains("trained at 60 frames/s, camera.fps is 30"));
+        assert_eq!(Weights::read(&file).unwrap().seed, 1);
+    }
+
     /// Protects the one way back from two people who click at the same time: of many exchanges at once, some in another process's place, each
     /// ends whole, and the file in use and the one from before are the two that there are.
     #[test]
     fn exchanges_wait_for_each_other() {
         let dir = tempfile::tempdir().unwrap();
         let file = dir.path().join("weights.bin");
-        let shelves: Vec<Shelf> = (0..4).map(|_| Shelf::new(file.clone(), Limits::default(), 120.0)).collect();
+        let shelves: Vec<Shelf> = (0..4).map(|_| Shelf::new(file.clone(), Limits::default(), 120.0, 30.0)).collect();
         weights(1).write(&file).unwrap();
         weights(2).write(&shelves[0].offer()).unwrap();
         let (one, two) = (weights(1).identity(), weights(2).identity());

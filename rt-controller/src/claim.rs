@@ -5,6 +5,7 @@
 //! Ordinary threads use it at the start; it allocates and looks at the disk. Errors are one line each.
 
 use std::fs::{File, OpenOptions};
+use std::io::ErrorKind;
 use std::os::unix::fs::{MetadataExt, OpenOptionsExt};
 use std::path::{Path, PathBuf};
 
@@ -12,7 +13,7 @@ use serde::{Deserialize, Serialize};
 use shared::config::Config;
 use shared::config_paths::is_same;
 use shared::regular_file;
-use shared::runtime_dir::{check_base, own_uid};
+use shared::runtime_dir::{Place, own_uid};
 
 use crate::journal::before;
 
@@ -106,7 +107,17 @@ fn check_others(directory: &Path, this: &Running) -> Result<(), String> {
 
 /// The controller whose runtime directory is `directory`, if it runs and the directory has an [`owner`].
 pub fn running(directory: &Path) -> Option<Running> {
-    owner(directory)?;
+    owner(directory, false).ok().flatten().and_then(|_| running_in(directory))
+}
+
+/// The controller of the cell `place`, if it runs. Fails, with a line, where its runtime directory is there and is not believed.
+pub fn running_at(place: &Place) -> Result<Option<Running>, String> {
+    let directory = place.path();
+    Ok(owner(&directory, place.base.is_some())?.and_then(|_| running_in(&directory)))
+}
+
+/// The controller that runs by what the runtime directory says, whose owner was looked at.
+pub(crate) fn running_in(directory: &Path) -> Option<Running> {
     let bytes = regular_file::read(&directory.join("controller"), FILE_MAX).ok()?;
     let found: Running = serde_json::from_slice(&bytes).ok()?;
     (started(found.pid) == Some(found.started)).then_some(found)
@@ -123,13 +134,30 @@ pub fn started(pid: u32) -> Option<u64> {
     is_ours.then(|| fields.nth(18)?.parse().ok()).flatten()
 }
 
-/// The user as whom the controller of a cell runs, who owns its runtime directory. `None` where there is none, and where neither root nor this user
-/// has chosen who: another user could have made it to answer in the cell's place.
-pub fn owner(directory: &Path) -> Option<u32> {
-    let (owner, base) = (directory.symlink_metadata().ok()?.uid(), directory.parent()?);
-    check_base(base).ok()?;
-    let trusted = |uid: u32| [0, own_uid()].contains(&uid);
-    // A link leads where its owner wants, and where all may write anybody may have made the directory.
-    let is_closed = base.metadata().ok()?.mode() & 0o022 == 0;
-    (trusted(base.symlink_metadata().ok()?.uid()) && (is_closed || trusted(owner))).then_some(owner)
+/// The user as whom the controller of a cell runs, who owns its runtime directory; `None` where there is none. Fails, with a line, where one is there and
+/// neither root nor this user has chosen whose: another user could have made it to answer in the cell's place. A directory in one of the cell's own user is
+/// believed only if it is `named` by the caller's configuration.
+pub fn owner(directory: &Path, named: bool) -> Result<Option<u32>, String> {
+    let doubted = |why: String| format!("{} is not believed: {why}", directory.display());
+    let owner = match directory.symlink_metadata() {
+        Ok(meta) => meta.uid(),
+        Err(e) if matches!(e.kind(), ErrorKind::NotFound | ErrorKind::NotADirectory) => return Ok(None),
+        Err(e) => return Err(doubted(e.to_string())),
+    };
+    let Some(base) = directory.parent() else { return Ok(None) };
+    let [meta, link] = [base.metadata(), base.symlink_metadata()];
+    let (meta, link) = (meta.map_err(|e| doubted(e.to_string()))?, link.map_err(|e| doubted(e.to_string()))?);
+    let ours = |uid: u32| [0, own_uid()].contains(&uid);
+    // A link leads where its owner wants.
+    for uid in [meta.uid(), link.uid()] {
+        if !(ours(uid) || named && uid == owner) {
+            return Err(doubted(format!("it belongs to user {owner}, and lies in a directory or behind a link of user {uid}")));
+        }
+    }
+    // Where all may write anybody may have made the directory, and put it in another's place unless the sticky bit forbids that.
+    let sticky = meta.mode() & 0o1000 != 0;
+    if meta.mode() & 0o022 != 0 && !(sticky && ours(meta.uid()) && ours(owner)) {
+        return Err(doubted(format!("it belongs to user {owner}, and others may write where it lies (mode {:o})", meta.mode() & 0o7777)));
+    }
+    Ok(Some(owner))
 }

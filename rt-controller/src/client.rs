@@ -127,15 +127,19 @@ impl Client {
     }
 }
 
-/// Why a pour could not be followed to its end.
-#[derive(Debug, thiserror::Error)]
+/// Why a pour could not be followed to its end. The command that follows it finds the words.
+#[derive(Debug)]
 pub enum FollowError {
     /// Somebody pressed Ctrl-C; this is how the pour then ended.
-    #[error("interrupted: {}", .0.reason.words())]
     Interrupted(Outcome),
     /// The controller is no longer there.
-    #[error(transparent)]
-    Client(#[from] ClientError),
+    Client(ClientError),
+}
+
+impl From<ClientError> for FollowError {
+    fn from(e: ClientError) -> Self {
+        Self::Client(e)
+    }
 }
 
 impl Client {

@@ -92,6 +92,8 @@ pub struct Core {
     frame_rate: FrameRate,
     shutdown: bool,
     last_tick_ns: u64,
+    /// Measured alpha in the last tick, degrees.
+    last_alpha_deg: f32,
     commanded: AngleHistory<COMMANDS>,
     measured: AngleHistory<COMMANDS>,
     counters: Counters,
@@ -117,6 +119,7 @@ impl Core {
             frame_rate: FrameRate::new(settings.frame_ns),
             shutdown: false,
             last_tick_ns: 0,
+            last_alpha_deg: f32::NAN,
             commanded,
             measured: AngleHistory::new(),
             counters: Counters::default(),
@@ -161,14 +164,20 @@ impl Core {
             run.tick_gaps += u32::from(gap);
         }
 
+        // Where the joint is after a sleep does not say where it was meanwhile.
+        let was_upright = self.last_alpha_deg.abs() <= self.settings.upright_deg;
+        self.last_alpha_deg = input.robot.alpha_deg;
         if input.robot.at_ns > 0 {
             self.measured.push(input.robot.at_ns, input.robot.alpha_deg);
         }
         let mut ended = self.look_at_robot(input);
         if overran {
             // What leaves an upright container while nobody looks are drops.
-            let is_upright = self.phase == Phase::Settling && input.robot.alpha_deg.abs() <= self.settings.upright_deg;
-            self.give_up(EndReason::ControllerOverrun, !is_upright);
+            let only_drops = self.phase == Phase::Settling && was_upright;
+            if let Some(run) = self.run.as_mut().filter(|_| only_drops) {
+                run.ending.looks_away(&self.settings);
+            }
+            self.give_up(EndReason::ControllerOverrun, !only_drops);
         }
         let ordered = input.order.map(|order| self.obey(order, input));
         let (asked, area) = self.take_features(input);
@@ -187,7 +196,7 @@ impl Core {
                 self.phase = Phase::NoRobot;
                 let mut run = self.run.take()?;
                 let is_upright = input.robot.alpha_deg.abs() <= self.settings.upright_deg;
-                let reason = run.ending.without_robot(reason, is_upright);
+                let reason = run.ending.without_robot(reason, is_upright, &self.settings);
                 Some(self.outcome(&run, reason, input.now_ns))
             }
             None if self.phase == Phase::NoRobot && input.robot.alpha_deg.abs() <= self.settings.upright_deg => {

@@ -316,6 +316,11 @@ impl<'a> Disk<'a> {
 /// is the user number of the configuration's owner.
 pub fn read_weights(path: &Path, fps: f64, limits: &Limits, trusted: Option<u32>) -> Result<Weights, String> {
     let weights = Weights::read_of_owner(path, trusted).map_err(|e| e.to_string())?;
+    check_weights(&weights, fps, limits).map(|()| weights)
+}
+
+/// Whether `weights` are for a camera of `fps` frames a second and for these limits, or why they are refused.
+pub fn check_weights(weights: &Weights, fps: f64, limits: &Limits) -> Result<(), String> {
     let trained_hz = f64::from(weights.rate_hz);
     let is_near = |a: f64, b: f64| (a / b - 1.0).abs() < TOLERANCE;
     if !is_near(trained_hz, fps) {
@@ -336,7 +341,7 @@ pub fn read_weights(path: &Path, fps: f64, limits: &Limits, trusted: Option<u32>
             ));
         }
     }
-    Ok(weights)
+    Ok(())
 }
 
 #[cfg(test)]

@@ -6,6 +6,7 @@ use std::sync::{Mutex, PoisonError};
 use std::time::SystemTime;
 
 use shared::disk_space::file_system;
+use shared::plural::counted;
 
 /// The newest state of what lies on disks.
 #[derive(Debug, Default, Clone)]
@@ -16,8 +17,18 @@ pub struct DiskState {
     pub weights_written: Option<SystemTime>,
     /// The journal, one line: its file and size, or why nothing is written.
     pub journal: String,
+    /// Number of ticks that the journal misses because the disk did not keep up.
+    pub lost: u64,
     /// Free space where journal and episodes lie, one line.
     pub space: String,
+}
+
+impl DiskState {
+    /// The journal with what it misses, one line.
+    pub fn journal_words(&self) -> String {
+        let missing = if self.lost > 0 { format!("{} missing", counted(self.lost, "tick")) } else { String::new() };
+        [self.journal.clone(), missing].into_iter().filter(|part| !part.is_empty()).collect::<Vec<_>>().join(", ")
+    }
 }
 
 /// [`DiskState`], shared.

@@ -4,7 +4,7 @@
 //! and replay. Both allocate. A file that was cut off is read up to its last whole entry, and ticks that could not be told are counted; every other
 //! fault is a [`JournalError`].
 //!
-//! The file begins with the 8 bytes `decantj6`. Then come the entries: a little-endian u32 with the length, and that many bytes of
+//! The file begins with the 8 bytes `decantj7`. Then come the entries: a little-endian u32 with the length, and that many bytes of
 //! postcard.
 
 use std::collections::BTreeMap;
@@ -22,7 +22,7 @@ use crate::core::{Core, Input, MAX_FEATURES, Order, Robot, Settings};
 use crate::pacing::Pacer;
 
 /// The first bytes of a journal, which include its version.
-const MAGIC: &[u8; 8] = b"decantj6";
+const MAGIC: &[u8; 8] = b"decantj7";
 /// Longest entry, bytes: more than ten weight files, which are the largest entries.
 const ENTRY_MAX: usize = 128 * 1024;
 /// Size at which a journal ends and the next part begins, bytes: about 20 h of ticks. Chosen by hand: it is copied and read in a minute.

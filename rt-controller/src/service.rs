@@ -50,7 +50,7 @@ pub struct Service<'a> {
     disk_note: &'a DiskNote,
     /// The queue to the journal; `None` if no journal is kept.
     journal: Option<Sender<Told>>,
-    /// Whether the newest tick did not fit into it.
+    /// Whether a tick did not fit into it since it was last empty.
     journal_lags: bool,
     latest: Option<(Telemetry, Counters)>,
     outcomes: VecDeque<Outcome>,
@@ -129,12 +129,7 @@ impl<'a> Service<'a> {
         while let Some(event) = self.exchange.events.pop() {
             match event {
                 Event::Tick(tick, telemetry, counters) => {
-                    let lost = self.journal.as_ref().is_some_and(|j| j.try_send(Box::new((tick, telemetry))).is_err());
-                    if lost && !self.journal_lags {
-                        let what = "journal: the disk does not keep up; what is missing is counted in it, and the controller goes on";
-                        (self.say)(Level::Warning, what);
-                    }
-                    self.journal_lags = lost;
+                    self.pass_on(Box::new((tick, telemetry)));
                     self.latest = Some((telemetry, counters));
                     // It does not matter whether anybody listens.
                     let _ = self.telemetry.send_copy(telemetry);
@@ -174,6 +169,21 @@ impl<'a> Service<'a> {
                 }
             }
         }
+    }
+
+    /// Passes a tick on to the journal, if one is kept. One that finds no room is counted, and said once until the disk has caught up.
+    fn pass_on(&mut self, told: Told) {
+        let Some(journal) = &self.journal else { return };
+        self.journal_lags &= !journal.is_empty();
+        if journal.try_send(told).is_ok() {
+            return;
+        }
+        self.disk_note.set(|n| n.lost += 1);
+        if !self.journal_lags {
+            let what = "journal: the disk does not keep up; what is missing is counted in it, and the controller goes on";
+            (self.say)(Level::Warning, what);
+        }
+        self.journal_lags = true;
     }
 
     /// Why the newest weight file is not used; empty if it is.
@@ -301,7 +311,7 @@ impl<'a> Service<'a> {
             weights: t.weights(),
             weights_taken: x.agents_taken.load(Relaxed),
             weights_age_s: disk.weights_written.and_then(|at| at.elapsed().ok()).map(|age| age.as_secs_f64()),
-            journal: disk.journal,
+            journal: disk.journal_words(),
             space: disk.space,
             version: env!("CARGO_PKG_VERSION").into(),
             uptime_s: self.started.elapsed().as_secs_f64(),
@@ -343,7 +353,7 @@ mod tests {
         give: Sender<u64>,
         /// Two clients.
         ports: [Port; 2],
-        /// Where one tick for the journal has room.
+        /// Where two ticks for the journal have room.
         told: Receiver<Told>,
         /// Number of lines that it has said.
         said: &'a Count,
@@ -360,7 +370,7 @@ mod tests {
         let (give, numbers) = crossbeam::channel::bounded(2);
         let said = Count::new(0);
         let say = |_: Level, _: &str| said.set(said.get() + 1);
-        let (journal, told) = crossbeam::channel::bounded(1);
+        let (journal, told) = crossbeam::channel::bounded(2);
         let queues = Queues { journal: Some(journal), numbers };
         let service = Service::open(&cell, &exchange, (&note, &connections), (&disk_note, queues), &say).unwrap();
         let port = || cell.control().unwrap().client_builder().initial_max_slice_len(MESSAGE_MAX).create().unwrap();
@@ -434,8 +444,12 @@ mod tests {
                 service.take_events();
                 told.try_recv().map(|told| told.1.tick).ok()
             };
-            assert_eq!([tell(1..=3), tell(4..=4), tell(5..=5)], [Some(1), Some(4), Some(5)]);
-            assert_eq!(said.get(), 1);
+            assert_eq!([tell(1..=3), tell(4..=6), tell(7..=7)], [Some(1), Some(2), Some(4)]);
+            assert_eq!(said.get(), 1, "as long as the disk is behind");
+            assert!(told.try_recv().is_ok());
+            assert_eq!([tell(8..=8), tell(9..=11)], [Some(8), Some(9)]);
+            assert_eq!(said.get(), 2, "the disk had caught up");
+            assert_eq!(service.status().journal, "4 ticks missing");
         });
     }
 }

@@ -2,7 +2,7 @@
 //!
 //! It needs no shared memory. It runs in ordinary threads of other processes, allocates, and waits for an answer a moment at most. Who
 //! answers is checked: the socket's server must be the user whose cell it is, or root. Whose it is says the owner of its runtime directory, if
-//! root or this user has chosen where that lies ([`claim::owner`]): so a group may stop the cell of the user `decant`, and nobody can answer for it.
+//! root or this user has chosen where that lies ([`claim::owner`]), by a configuration too: so a group may stop the cell of the user `decant`, and nobody can answer for it.
 
 use std::collections::BTreeMap;
 use std::io::{BufRead, BufReader, Write};
@@ -30,18 +30,27 @@ pub struct Target {
     uid: u32,
     /// The cell's runtime directories that are there and have an owner.
     directories: Vec<PathBuf>,
+    /// Of a directory that is there and is not believed, why; empty if there is none.
+    pub doubted: String,
 }
 
 impl From<Place> for Target {
     fn from(place: Place) -> Self {
+        let named = place.base.is_some();
         let mut directories = vec![place.path()];
-        if place.base.is_none() {
+        if !named {
             directories.extend(bases().into_iter().map(|b| b.join(&place.name)));
             directories.dedup();
         }
-        directories.retain(|d| claim::owner(d).is_some());
-        let uid = directories.iter().find(|d| d.join("stop").exists()).and_then(|d| claim::owner(d)).unwrap_or_else(own_uid);
-        Self { name: place.name, uid, directories }
+        let (mut believed, mut doubted) = (Vec::new(), String::new());
+        for directory in directories {
+            match claim::owner(&directory, named) {
+                Ok(owner) => believed.extend(owner.map(|uid| (directory, uid))),
+                Err(why) => doubted = why,
+            }
+        }
+        let uid = believed.iter().find(|(d, _)| d.join("stop").exists()).map_or_else(own_uid, |(_, uid)| *uid);
+        Self { name: place.name, uid, directories: believed.into_iter().map(|(d, _)| d).collect(), doubted }
     }
 }
 
@@ -50,7 +59,7 @@ pub fn running_cells() -> Vec<Target> {
     let mut found: BTreeMap<(u32, String), Vec<PathBuf>> = BTreeMap::new();
     for entry in bases().iter().filter_map(|b| std::fs::read_dir(b).ok()).flatten().flatten() {
         if entry.path().join("stop").exists()
-            && let Some(uid) = claim::owner(&entry.path())
+            && let Ok(Some(uid)) = claim::owner(&entry.path(), false)
         {
             found.entry((uid, entry.file_name().to_string_lossy().into_owned())).or_default().push(entry.path());
         }
@@ -62,7 +71,7 @@ pub fn running_cells() -> Vec<Target> {
         }
     }
     let may_stop = |uid: u32, directories: &[PathBuf]| uid == own_uid() || own_uid() == 0 || !directories.is_empty();
-    let targets = found.into_iter().map(|((uid, name), directories)| Target { name, uid, directories });
+    let targets = found.into_iter().map(|((uid, name), directories)| Target { name, uid, directories, doubted: String::new() });
     targets.filter(|t| may_stop(t.uid, &t.directories)).collect()
 }
 
@@ -78,7 +87,8 @@ impl Target {
 
     /// The process of the cell's controller, if it runs and its runtime directory still says so.
     pub fn process(&self) -> Option<claim::Running> {
-        self.directories.iter().find_map(|d| claim::running(d))
+        // They were believed when the target was made.
+        self.directories.iter().find_map(|d| claim::running_in(d))
     }
 }
 
@@ -134,7 +144,17 @@ mod tests {
         assert_eq!(found(&base), (0, 0), "anybody may have put it there");
         mode(0o755);
         chown(&base, Some(65534), None).unwrap();
-        assert_eq!(found(&base), (0, 0), "another user has put it there");
+        assert_eq!(found(&base), (65534, 1), "the caller's configuration names the directory of the cell's own user");
+        mode(0o1777);
+        assert_eq!(found(&base), (0, 0), "there anybody may have put it");
+        assert!(
+            Target::from(Place { name: "lab".into(), base: Some(base.clone()) })
+                .doubted
+                .contains("others may write where it lies (mode 1777)")
+        );
+        mode(0o755);
+        chown(&cell, Some(65533), None).unwrap();
+        assert_eq!(found(&base), (0, 0), "another user has put a third one's there");
         chown(&cell, Some(0), None).unwrap();
         chown(&base, Some(0), None).unwrap();
         assert_eq!(found(&base), (0, 1), "our own");

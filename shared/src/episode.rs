@@ -50,7 +50,7 @@ pub use number::take_number;
 pub use read::{EpisodeImage, EpisodeImages, began_at, each_once, find_episodes};
 pub use records::EpisodeError;
 pub use recover::recover;
-pub use rewrite::ChangeError;
+pub use rewrite::{ChangeError, read_at_rest};
 pub use rows::{EpisodeRow, EpisodeTrack};
 pub use table::{TableError, read_table, write_table};
 pub use weigh::{set_note, set_weight};

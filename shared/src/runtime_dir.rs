@@ -149,7 +149,7 @@ fn make(path: &Path, mode: u32) -> Result<(), String> {
 }
 
 /// Checks the directory that the cell's directory lies in: nobody else may put another in its place. The error is one line.
-pub fn check_base(base: &Path) -> Result<(), String> {
+fn check_base(base: &Path) -> Result<(), String> {
     let meta = std::fs::metadata(base).map_err(|e| e.to_string())?;
     if !meta.is_dir() {
         return Err("is no directory: remove it, or set cell.runtime_dir".into());

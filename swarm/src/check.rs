@@ -47,8 +47,8 @@ const LASTS_S: f64 = 9.0;
 const LEFT_TILTED_S: f64 = 2.0;
 /// For how long a robot still follows the last target that was sent, s: the patience of its program, and what it is behind.
 const FOLLOWED_S: f64 = 0.3;
-/// Most frames that are bridged at once: one second (`MAX_BRIDGED` of the controller's core).
-const MOST_BRIDGED: u64 = 30;
+/// Most frames that are bridged at once: one second (`BRIDGED_S` of the controller's core).
+const MOST_BRIDGED: u64 = RATE_HZ as u64;
 /// Number of violations that are kept for a seed; the first is what counts.
 const MOST: usize = 8;
 

@@ -299,8 +299,13 @@ fn each_configuration_may_come_from_the_environment() {
     for (name, text) in sources().iter().filter(|(name, _)| name.contains("/src/") && !own(name)) {
         let lines: Vec<&str> = text.lines().map(str::trim).collect();
         let named = |line: &str| line.trim_start_matches("pub ").starts_with("config: ") && line.contains("PathBuf");
-        let bare = |pair: &&[&str]| named(pair[1]) && pair[0].starts_with("#[arg(") && !pair[0].contains("VARIABLE");
-        faults.extend(lines.windows(2).filter(bare).map(|_| format!("{name}: --config without shared::config::VARIABLE")));
+        // The attribute may take several lines, and comments may stand between it and the field.
+        let bare = |at: &usize| {
+            let before = &lines[..*at];
+            let attribute = before.iter().rposition(|line| line.starts_with("#[arg(")).map_or(&[][..], |from| &before[from..]);
+            named(lines[*at]) && !attribute.is_empty() && !attribute.iter().any(|line| line.contains("VARIABLE"))
+        };
+        faults.extend((0..lines.len()).filter(bare).map(|_| format!("{name}: --config without shared::config::VARIABLE")));
     }
     none(&faults);
 }

@@ -219,7 +219,26 @@ fn a_controller_that_leaves_the_container_tilted_says_so() {
     assert!(cell.command("simulator", &["operator", "fault", "protective-stop"]).status.success());
     assert_eq!(pour.wait_with_output().expect("it ran").status.code(), Some(4));
     assert_eq!(cell.stop("rt-controller"), Some(1), "{}", cell.log("rt-controller"));
-    assert!(cell.log("rt-controller").contains("it was last seen tilted by "), "{}", cell.log("rt-controller"));
+    assert!(
+        cell.log("rt-controller").contains("stopped; the container may not be upright: it was last seen tilted by "),
+        "{}",
+        cell.log("rt-controller")
+    );
+}
+
+/// Protects who stops the machine, and systemd's word for it, from a robot that takes connections and answers nothing: the controller does not wait for
+/// the attempt, and it was stopped as it should be.
+#[test]
+fn a_controller_that_is_connecting_stops_as_it_should() {
+    let mut cell = CellUnderTest::prepare(|_| {});
+    let silent = std::net::TcpListener::bind((cell.address, 30004)).expect("the address is the test's own");
+    cell.spawn("rt-controller");
+    let held = silent.accept().expect("it connects");
+    let begin = Instant::now();
+    assert_eq!(cell.stop("rt-controller"), Some(0), "{}", cell.log("rt-controller"));
+    assert!(cell.log("rt-controller").trim_end().ends_with("stopped"), "{}", cell.log("rt-controller"));
+    println!("ended after {:?}", begin.elapsed());
+    drop(held);
 }
 
 /// Protects whoever waits for the controller's end: one whose main thread alone loses its shared memory ends upright, and not as if all were well.

@@ -49,10 +49,14 @@ pub fn look(file: &Path, config: &Config) -> Vec<Finding> {
 
 /// Whether a controller of the cell runs.
 fn controller(config: &Config) -> Finding {
-    let directory = Place::from(&config.cell).path();
-    match claim::running(&directory) {
-        Some(running) => Finding::green("controller", format!("process {} runs ({})", running.pid, running.config.display())),
-        None => Finding::green("controller", format!("none runs; its runtime files would be in {}", directory.display())),
+    let place = Place::from(&config.cell);
+    match claim::running_at(&place) {
+        Ok(Some(running)) => Finding::green("controller", format!("process {} runs ({})", running.pid, running.config.display())),
+        Ok(None) => Finding::green("controller", format!("none runs; its runtime files would be in {}", place.path().display())),
+        Err(why) => {
+            let advice = "run this as the cell's own user or as root, and see docs/DEPLOYMENT.md for the mode of runtime directories";
+            Finding::yellow("controller", why, "whether one runs is not known, and `abort` does not reach it from here", advice)
+        }
     }
 }
 

@@ -25,7 +25,7 @@ struct Process {
 impl Process {
     /// The cell's controller if it runs, else this process.
     fn of(config: &Config) -> Self {
-        match claim::running(&Place::from(&config.cell).path()) {
+        match claim::running_at(&Place::from(&config.cell)).ok().flatten() {
             Some(running) => Self { directory: format!("/proc/{}", running.pid), who: format!("the controller (process {})", running.pid) },
             None => Self { directory: "/proc/self".into(), who: "a process started here".into() },
         }

@@ -55,7 +55,7 @@ pub fn look(config: &Config) -> Vec<Finding> {
         }
     });
     findings.push(dashboard(address));
-    if let Some(running) = claim::running(&Place::from(&config.cell).path()) {
+    if let Ok(Some(running)) = claim::running_at(&Place::from(&config.cell)) {
         findings.push(held(&running, &Place::from(&config.cell)));
         return findings;
     }

@@ -1,7 +1,7 @@
 //! `feature-worker camera`: lists the cameras of this machine, what each can do, who uses it, and how it is set.
 //!
 //! An ordinary command-line program that allocates. It sets nothing, and does not disturb a camera that streams. With a configuration it
-//! says what is wrong with the camera that is named there, by the exit code too.
+//! says what is wrong with the camera that is named there, by the exit code too, after the list. Programs of other users that have a camera are seen by root alone.
 
 use std::path::{Path, PathBuf};
 
@@ -17,7 +17,8 @@ use crate::source::devices::{self, Device, Trouble};
 #[command(
     after_help = "Examples:\n  feature-worker camera\n  feature-worker camera --json\n  feature-worker camera --config config/cell.toml   (is \
 that camera usable? exit code 2: permission, metadata node, or no camera; 3: missing, or another program has it)\n\nSettings are written into [camera]: exposure_ms, gain, \
-white_balance_k, focus and mains_hz, each a value or \"locked\". `run` sets them and reads them back."
+white_balance_k, focus and mains_hz, each a value or \"locked\". `run` sets them and reads them back.\n\n\
+The programs of other users that have a camera are seen by root alone."
 )]
 pub struct Args {
     /// Also judge the camera that this configuration names.
@@ -30,7 +31,6 @@ pub struct Args {
 
 /// Runs the command.
 pub fn run(args: &Args) -> Result<(), Failure> {
-    let config = args.config.as_ref().map(|file| Config::read(file).or_exit(exit::BAD_INPUT)).transpose()?;
     let mut found = Vec::new();
     for mut device in devices::list(Path::new("/")) {
         let controls = device.ask().map(|file| controls::list(&file)).unwrap_or_default();
@@ -42,6 +42,8 @@ pub fn run(args: &Args) -> Result<(), Failure> {
         found.iter().for_each(|(device, controls)| print(device, controls));
         println!("{} devices", found.len());
     }
+    // The list comes first: a configuration that is named once for all, and not there yet, is written from it.
+    let config = args.config.as_ref().map(|file| Config::read(file).or_exit(exit::BAD_INPUT)).transpose()?;
     match config {
         Some(config) if config.camera.source == CameraSource::Device => {
             let path = Path::new(&config.camera.path);

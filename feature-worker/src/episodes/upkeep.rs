@@ -5,21 +5,15 @@
 //! original before they get their name, and never take the place of a file. A failure names its file, and leaves the rest as it is.
 
 use std::fs;
-use std::io::ErrorKind;
 use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
-use std::time::{Duration, SystemTime};
 
 use sha2::{Digest, Sha256};
-use shared::episode::{Episode, hex, take_number};
+use shared::episode::{Episode, hex, read_at_rest, take_number};
 use shared::{regular_file, whole_file};
 
 use super::folder::{Budget, Folder};
 use super::output::{ExportError, LeftOut, all_free, disk_error, write_error};
-
-/// A file without its end that changed more recently than this counts as under way, also where the file system has no locks. Chosen by hand:
-/// the recorder writes twice a second.
-const UNDER_WAY: Duration = Duration::from_secs(60);
 
 /// An episode that may be deleted.
 #[derive(Debug)]
@@ -46,20 +40,7 @@ pub fn look(path: &Path) -> Result<Found, LeftOut> {
 
 /// Reads an episode that nobody writes any more; if it cannot be read or is under way, says so.
 fn at_rest(path: &Path) -> Result<(Episode, fs::Metadata), LeftOut> {
-    let (file, meta) = regular_file::open(path).map_err(|e| left_out(path, e))?;
-    // Shared, so that two who look do not take each other for the recorder.
-    match file.try_lock_shared() {
-        Ok(()) => {}
-        Err(fs::TryLockError::WouldBlock) => return Err(left_out(path, "it is being written")),
-        Err(fs::TryLockError::Error(e)) if e.kind() == ErrorKind::Unsupported => {}
-        Err(fs::TryLockError::Error(e)) => return Err(left_out(path, e)),
-    }
-    let episode = Episode::read(path).map_err(|e| LeftOut { file: path.to_path_buf(), why: e.to_string() })?;
-    let age = meta.modified().ok().and_then(|t| SystemTime::now().duration_since(t).ok()).unwrap_or_default();
-    if episode.info.ended.is_empty() && age < UNDER_WAY {
-        return Err(left_out(path, "its end is missing and it changed within the last minute: it may be under way"));
-    }
-    Ok((episode, meta))
+    read_at_rest(path).map_err(|e| LeftOut { file: path.to_path_buf(), why: e.to_string() })
 }
 
 fn left_out(path: &Path, why: impl std::fmt::Display) -> LeftOut {
@@ -76,10 +57,20 @@ pub fn delete(found: &Found) -> Result<(), ExportError> {
     fs::remove_file(&found.path).map_err(|e| fail(&e))
 }
 
+/// Whether what is `beside` and cannot go breaks `budget` although of `found` only the newest stayed. No deletion helps there.
+pub fn is_out_of_reach(found: &[Found], beside: Folder, budget: Budget) -> bool {
+    let newest = found.iter().max_by_key(|f| (&f.episode.info.started_at_utc, &f.path));
+    let (episodes, bytes) = newest.map_or((0, 0), |f| (1, f.bytes));
+    beside.episodes > 0 && !budget.holds(beside.episodes + episodes, beside.bytes + bytes)
+}
+
 /// What is to go so that the rest, and what is `beside` it and cannot go, are within `budget`: places in `found`, in the order of deletion. First
 /// go those that cannot be trained on for want of their end, then those without a weight, then, only if `weighed`, those with one; the oldest
-/// first. The newest of all stays.
+/// first. The newest of all stays. Nothing goes where the budget is out of reach ([`is_out_of_reach`]): recordings would be lost for nothing.
 pub fn to_prune(found: &[Found], beside: Folder, budget: Budget, weighed: bool) -> Vec<usize> {
+    if is_out_of_reach(found, beside, budget) {
+        return Vec::new();
+    }
     let age = |i: &usize| (&found[*i].episode.info.started_at_utc, &found[*i].path);
     let mut order: Vec<usize> = (0..found.len()).collect();
     order.sort_by_key(age);

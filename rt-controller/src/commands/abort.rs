@@ -90,6 +90,13 @@ fn ask(target: &Target) -> Result<Asked, Failure> {
         return if answer.refused.is_empty() { Ok(Asked::Socket) } else { Err(failure(exit::REFUSED, answer.refused)) };
     }
     let absent = || {
+        if !target.doubted.is_empty() {
+            let what = format!(
+                "{}; whether rt-controller runs there is not known: look at the robot, and abort as the cell's own user or as root",
+                target.doubted
+            );
+            return failure(exit::FAILED, what);
+        }
         let what = format!(
             "no rt-controller of cell '{}' is running; a robot that one has left comes upright by its own program (docs/ROBOT.md)",
             target.name

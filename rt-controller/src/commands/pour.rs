@@ -126,12 +126,14 @@ pub(crate) fn order(cell: &CellConfig, request: &Request) -> Result<(Outcome, Op
     Ok((outcome, recorder.and_then(|r| r.wait(episode))))
 }
 
-/// What Ctrl-C has led to. A robot that was lost on the way upright leaves a pour aborted too, and nobody knows where it stands.
+/// What Ctrl-C has led to. A robot or a camera that was lost on the way upright leaves a pour aborted too, and not all is known then; where all was seen,
+/// the container came upright.
 fn interrupted_line(outcome: &Outcome) -> String {
     let words = outcome.reason.words();
     match outcome.reason {
-        EndReason::Aborted | EndReason::Done if !outcome.unseen => format!("interrupted: {words}, the container is upright"),
-        _ => format!("interrupted: {words}; look at the robot"),
+        _ if !outcome.unseen => format!("interrupted: {words}, the container is upright"),
+        EndReason::NotUpright => format!("interrupted: {words}"),
+        _ => format!("interrupted: {words}; the container or the camera could not be watched to the end: look at the robot"),
     }
 }
 
@@ -188,6 +190,7 @@ mod tests {
         for (reason, unseen, upright) in [
             (EndReason::Aborted, false, true),
             (EndReason::Done, false, true),
+            (EndReason::MaxFrames, false, true),
             (EndReason::Aborted, true, false),
             (EndReason::NotUpright, true, false),
         ] {

@@ -47,7 +47,9 @@ pub fn run(args: &Args) -> Result<(), Failure> {
         }
         if replay.lost > 0 {
             let lost = counted(replay.lost, "tick");
-            println!("{lost} lost where the controller fell behind: behind a gap answers are compared from the next pour or recording on");
+            println!(
+                "{lost} lost where the controller fell behind: behind a gap answers are compared from the next pour or recording on, and no deadlines"
+            );
         }
         if replay.cut_off {
             println!("the file ends in the middle of an entry: the controller was killed, or is still writing");

@@ -44,8 +44,8 @@ fn no_thread(e: std::io::Error) -> Failure {
 #[derive(Debug, clap::Args)]
 #[command(after_help = "Examples:\n  rt-controller run --config config/sim.toml\n  rt-controller run --config config/cell.toml\n\n\
 Ctrl-C or SIGTERM brings the container upright and stops the controller.\n\
-Exit codes: 0 stopped, the container upright; 1 failed, or the container was last seen tilted; 2 bad configuration; 5 another controller of the\n\
-cell is running.")]
+Exit codes: 0 stopped, and the container was upright when a robot was last seen, or none was; 1 failed, or the container was last seen tilted;\n\
+2 bad configuration; 5 another controller of the cell is running.")]
 pub struct Args {
     /// The cell's configuration.
     #[arg(long, env = shared::config::VARIABLE, default_value = shared::config::DEFAULT_FILE)]
@@ -99,16 +99,25 @@ fn start(config: &Config, file: &Path, stop: &AtomicBool, say: &(dyn Fn(Level, &
     let shared = Shared::default();
     let tolerance_deg = config.robot.start_tolerance_deg as f32;
     let give_up = || {
-        let held_up = match shared.disk_done.load(SeqCst) {
-            true => "a thread of the controller does not answer: stopped without it, so what it was to say may be missing",
-            false => "the disk does not answer: stopped without it, so the end of the journal may be missing",
+        let held_up = shared.held_up();
+        held_up.iter().for_each(|what| say(Level::Error, what));
+        let code = match left_upright(&shared.exchange, tolerance_deg) {
+            Err(e) => {
+                say(Level::Error, &e.what);
+                e.code
+            }
+            Ok(()) if held_up.is_some() => exit::FAILED,
+            Ok(()) => {
+                say(Level::Info, "stopped");
+                0
+            }
         };
-        say(Level::Error, held_up);
-        if let Err(e) = left_upright(&shared.exchange, tolerance_deg) {
-            say(Level::Error, &e.what);
+        // Nothing is dropped here, and an abort is not to look for this controller any more. Their absence is no fault.
+        for name in ["stop", "controller"] {
+            let _ = std::fs::remove_file(directory.join(name));
         }
         speaker.finish();
-        std::process::exit(exit::FAILED.into());
+        std::process::exit(code.into());
     };
     let stopping = StopThread {
         sockets,
@@ -133,7 +142,7 @@ fn left_upright(exchange: &Exchange, tolerance_deg: f32) -> Result<(), Failure> 
     let alpha_deg = f32::from_bits(exchange.last_alpha.load(SeqCst));
     if alpha_deg.abs() > tolerance_deg {
         let what =
-            format!("stopped, and the container is not upright: it was last seen tilted by {alpha_deg:.0} degrees; look at the robot");
+            format!("stopped; the container may not be upright: it was last seen tilted by {alpha_deg:.0} degrees; look at the robot");
         return Err(failure(exit::FAILED, what));
     }
     Ok(())
@@ -150,8 +159,21 @@ struct Shared {
     end: AtomicBool,
     /// Whether everything is written.
     disk_done: AtomicBool,
+    /// Whether the clients have their last answers.
+    service_done: AtomicBool,
     /// Whether all other threads have ended.
     done: AtomicBool,
+}
+
+impl Shared {
+    /// What keeps the process from its end, although the loop has ended. Nothing that matters if it is only an attempt to connect the robot.
+    fn held_up(&self) -> Option<&'static str> {
+        match (self.disk_done.load(SeqCst), self.service_done.load(SeqCst)) {
+            (true, true) => None,
+            (true, false) => Some("a thread of the controller does not answer: stopped without it, so what it was to say may be missing"),
+            (false, _) => Some("the disk does not answer: stopped without it, so the end of the journal may be missing"),
+        }
+    }
 }
 
 /// Starts the threads, serves clients in this one, and returns when the loop has ended, upright.
@@ -162,7 +184,7 @@ fn run_threads(
     stop: &AtomicBool,
     say: &(dyn Fn(Level, &str) + Sync),
 ) -> Result<(), Failure> {
-    let Shared { exchange, note, connections, disk_note, end, disk_done, .. } = shared;
+    let Shared { exchange, note, connections, disk_note, end, disk_done, service_done, .. } = shared;
     let cell = Cell::join(&config.cell).or_exit(exit::FAILED)?;
     cell.check_space(SHARED_MEMORY).or_exit(exit::FAILED)?;
     let (disk, queues) = Disk::open(config, owner, exchange, disk_note, say).or_exit(exit::BAD_INPUT)?;
@@ -184,6 +206,7 @@ fn run_threads(
             // Without these threads there is no robot and there are no weights: the loop ends at once.
             stop.fetch_or(spawned.is_err(), SeqCst);
             service.run();
+            service_done.store(true, SeqCst);
             end.store(true, SeqCst);
             spawned.map(|_| ()).map_err(no_thread)
         })

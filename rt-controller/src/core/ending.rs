@@ -200,10 +200,21 @@ impl Ending {
         }
     }
 
-    /// Gives the reason of the end when the robot may not move any more, for `reason`. Out of an upright container nothing leaves any more.
-    pub fn without_robot(&mut self, reason: EndReason, is_upright: bool) -> EndReason {
+    /// Gives the reason of the end when the robot may not move any more, for `reason`. Out of an upright container only the last drops leave.
+    pub fn without_robot(&mut self, reason: EndReason, is_upright: bool, settings: &Settings) -> EndReason {
         self.unseen |= reason.leaves_unseen() && !is_upright;
+        self.looks_away(settings);
         reason.after(self.reason, is_upright)
+    }
+
+    /// Takes that nobody looks at an upright container from now on: drops that may still fall are not counted.
+    pub fn looks_away(&mut self, settings: &Settings) {
+        self.unseen |= self.curve_s.is_none() && !self.is_quiet(settings);
+    }
+
+    /// Whether nothing has flowed for so long that the last drops have fallen.
+    fn is_quiet(&self, settings: &Settings) -> bool {
+        self.quiet_frames >= settings.frames(SETTLE_QUIET_S)
     }
 
     /// Whether liquid may have left that nobody has seen or counted, if it ends for `reason`. An abort does not bring back what a lost camera hid.
@@ -316,7 +327,7 @@ impl Ending {
     pub fn settled(&mut self, alpha_deg: f32, settling_s: f64, shutdown: bool, settings: &Settings) -> Option<EndReason> {
         let upright = alpha_deg.abs() <= settings.upright_deg;
         let (is_pour, wait_frames) = (self.curve_s.is_none(), settings.frames(SETTLE_QUIET_S));
-        let quiet = self.quiet_frames >= wait_frames && is_pour;
+        let quiet = self.is_quiet(settings) && is_pour;
         if alpha_deg.abs() < self.nearest.0 - COMING_DEG {
             self.nearest = (alpha_deg.abs(), settling_s);
         }

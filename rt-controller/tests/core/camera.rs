@@ -98,6 +98,42 @@ fn a_controller_that_sleeps_on_the_way_back_is_not_done() {
     }
 }
 
+/// Protects what is said: a controller that sleeps while the last drops are waited for has not seen them, and is done only if the joint was upright when
+/// it fell asleep; where it is when it wakes up says nothing.
+#[test]
+fn a_controller_that_sleeps_while_it_settles_says_what_it_missed() {
+    for (joint_deg, reason) in [(0.0, EndReason::Done), (10.0, EndReason::ControllerOverrun)] {
+        let mut cell = ToyCell::new();
+        cell.pour(20.0).expect("ready");
+        while cell.core.phase() != Phase::Settling {
+            cell.tick(None);
+        }
+        cell.tick_with_joint_at(joint_deg);
+        cell.alpha_deg = 0.0;
+        cell.now_ns += 1_000_000_000;
+        let outcome = cell.finish();
+        assert_eq!((outcome.reason, outcome.poured_words().starts_with("at least ")), (reason, true), "{joint_deg}");
+    }
+}
+
+/// Protects what is said: of a robot that is lost while the last drops are waited for nobody knows how many fell.
+#[test]
+fn a_robot_that_is_lost_among_the_last_drops_leaves_the_volume_open() {
+    for hindrance in [EndReason::RobotLost, EndReason::ProtectiveStop] {
+        let mut cell = ToyCell::new();
+        cell.pour(90.0).expect("ready");
+        cell.run_to_flow();
+        cell.tick(Some(Order::Abort));
+        while cell.core.phase() != Phase::Settling {
+            cell.tick(None);
+        }
+        cell.tick(None);
+        cell.hindrance = Some(hindrance);
+        let outcome = cell.tick(None).ended.expect("ended");
+        assert_eq!((outcome.reason, outcome.poured_words().starts_with("at least ")), (EndReason::Aborted, true));
+    }
+}
+
 /// Protects what is said after an abort: a camera that dies on the way upright hides what leaves there, whatever the pour ended for.
 #[test]
 fn an_abort_does_not_hide_that_the_camera_was_lost() {

@@ -9,7 +9,7 @@ use std::path::Path;
 use mcap::records::Metadata;
 
 use super::records::NextRecord;
-use super::rewrite::{ChangeError, check_at_rest, copy};
+use super::rewrite::{ChangeError, copy, read_at_rest};
 use super::write::mcap_words;
 use super::{Episode, EpisodeInfo, format};
 use crate::disk_space::error_words;
@@ -21,8 +21,7 @@ const REASON: &str = "its end is missing: it was recovered from a file that was 
 /// Writes what is whole in `old` to the new file `new`, and returns it. The episode is complete only if nothing but the file's index was
 /// cut off.
 pub fn recover(old: &Path, new: &Path) -> Result<Episode, ChangeError> {
-    check_at_rest(old)?;
-    let original = Episode::read(old)?;
+    let (original, _) = read_at_rest(old)?;
     let fail = |what: String| ChangeError::Write { file: new.display().to_string(), what };
     let (file, temporary) = whole_file::new_beside(new).map_err(|e| fail(error_words(&e)))?;
     let result = copy(old, (file, &temporary), None, |writer, end| {

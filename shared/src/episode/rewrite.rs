@@ -4,9 +4,10 @@
 //! Everything is copied into a new file beside the old one, which is read back, compared and put on the disk before it takes the old one's
 //! name in one step. Whenever the machine stops, there is one whole file, the old or the new one.
 
-use std::fs::{File, TryLockError};
-use std::io::BufWriter;
+use std::fs::{File, Metadata as FileMetadata, TryLockError};
+use std::io::{BufWriter, ErrorKind};
 use std::path::Path;
+use std::time::{Duration, SystemTime};
 
 use mcap::records::{Metadata, Record};
 use mcap::{McapError, WriteOptions, Writer};
@@ -20,6 +21,10 @@ use crate::{regular_file, whole_file};
 
 /// Number of bytes that are written at a time. Chosen by hand; no measurement is recorded.
 const WRITE_BYTES: usize = 1 << 20;
+
+/// A file without its end that changed more recently than this counts as under way, also where the file system has no locks. Chosen by hand:
+/// the recorder writes twice a second.
+const UNDER_WAY: Duration = Duration::from_secs(60);
 
 /// Why an episode is not changed. The file is as it was.
 #[derive(Debug, thiserror::Error)]
@@ -51,6 +56,12 @@ pub enum ChangeError {
         /// The file.
         file: String,
     },
+    /// The recorder may still write the file, on a file system without locks.
+    #[error("{file}: its end is missing and it changed within the last minute: it may be under way")]
+    MayBeUnderWay {
+        /// The file.
+        file: String,
+    },
     /// The file is not cut, so there is nothing to recover.
     #[error("{file}: the file is whole; there is nothing to recover")]
     Whole {
@@ -67,14 +78,25 @@ pub enum ChangeError {
     },
 }
 
-/// Whether nobody writes the file `path`: the recorder holds its lock. A file system without locks knows no better.
-pub(super) fn check_at_rest(path: &Path) -> Result<(), ChangeError> {
+/// Reads the episode `path`, which nobody writes any more: the recorder holds its file's lock, and a file system without locks has the time of the
+/// last change. Gives it with what the file system says of the file.
+pub fn read_at_rest(path: &Path) -> Result<(Episode, FileMetadata), ChangeError> {
     let file = || path.display().to_string();
-    let (opened, _) = regular_file::open(path).map_err(|e| EpisodeError::Read { file: file(), what: e.to_string() })?;
+    let unread = |e: std::io::Error| EpisodeError::Read { file: file(), what: e.to_string() };
+    let (opened, meta) = regular_file::open(path).map_err(unread)?;
+    // Shared, so that two who look do not take each other for the recorder.
     match opened.try_lock_shared() {
-        Err(TryLockError::WouldBlock) => Err(ChangeError::UnderWay { file: file() }),
-        _ => Ok(()),
+        Ok(()) => {}
+        Err(TryLockError::WouldBlock) => return Err(ChangeError::UnderWay { file: file() }),
+        Err(TryLockError::Error(e)) if e.kind() == ErrorKind::Unsupported => {}
+        Err(TryLockError::Error(e)) => return Err(unread(e).into()),
     }
+    let episode = Episode::read(path)?;
+    let age = meta.modified().ok().and_then(|t| SystemTime::now().duration_since(t).ok()).unwrap_or_default();
+    if episode.info.ended.is_empty() && age < UNDER_WAY {
+        return Err(ChangeError::MayBeUnderWay { file: file() });
+    }
+    Ok((episode, meta))
 }
 
 /// Sets the metadata record `name` of the episode `path` to one pair, in place of any that was there. `expected` says what the episode then
@@ -88,8 +110,7 @@ pub(super) fn set_metadata(
     let shown = path.display().to_string();
     // If the path is a link, the file that it leads to is replaced, and not the link.
     let path = path.canonicalize().map_err(|e| EpisodeError::Read { file: shown.clone(), what: e.to_string() })?;
-    check_at_rest(&path)?;
-    let before = Episode::read(&path)?;
+    let (before, _) = read_at_rest(&path)?;
     let (file, temporary) = whole_file::new_beside(&path).map_err(|e| ChangeError::Write { file: shown, what: error_words(&e) })?;
     let fail = |what: String| ChangeError::Write { file: temporary.display().to_string(), what };
     let result = copy(&path, (file, &temporary), Some(name), |writer, end| {

@@ -304,6 +304,10 @@ fn prune(args: &PruneArgs) -> Result<(), Failure> {
     if holds {
         return Ok(());
     }
+    if upkeep::is_out_of_reach(&found, beside, budget) {
+        let what = "the files that are listed as kept break the budget by themselves, so nothing is deleted: move what is no episode elsewhere, or raise the budget";
+        return Err(failure(exit::FAILED, what));
+    }
     let weighed = if args.weighed { "" } else { "; weighed ones are kept without --weighed" };
     Err(failure(exit::FAILED, format!("what stays is over the budget{weighed}; the newest, and what is listed as kept, always stay")))
 }

@@ -195,7 +195,7 @@ fn what_was_not_seen_is_said_whatever_the_reason() {
             assert_eq!((ending.reason(), ending.leaves_unseen(before)), (before, true));
         }
         let mut ending = ending();
-        assert_eq!(ending.without_robot(EndReason::RobotLost, false), before);
+        assert_eq!(ending.without_robot(EndReason::RobotLost, false, &settings()), before);
         assert!(ending.leaves_unseen(before));
     }
 }
