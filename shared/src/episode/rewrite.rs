@@ -25,6 +25,10 @@ const WRITE_BYTES: usize = 1 << 20;
 /// A file without its end that changed more recently than this counts as under way, also where the file system has no locks. Chosen by hand:
 /// the recorder writes twice a second.
 const UNDER_WAY: Duration = Duration::from_secs(60);
+/// How often a file's lock is tried. Chosen by hand: a program that the recorder's process starts holds all its locks for a moment, until it runs.
+const LOCK_TRIES: u32 = 20;
+/// Pause between two tries. Chosen by hand: a fifth of a second in all, which nobody notices.
+const LOCK_PAUSE: Duration = Duration::from_millis(10);
 
 /// Why an episode is not changed. The file is as it was.
 #[derive(Debug, thiserror::Error)]
@@ -85,7 +89,15 @@ pub fn read_at_rest(path: &Path) -> Result<(Episode, FileMetadata), ChangeError>
     let unread = |e: std::io::Error| EpisodeError::Read { file: file(), what: e.to_string() };
     let (opened, meta) = regular_file::open(path).map_err(unread)?;
     // Shared, so that two who look do not take each other for the recorder.
-    match opened.try_lock_shared() {
+    let mut tries = LOCK_TRIES;
+    let locked = loop {
+        match opened.try_lock_shared() {
+            Err(TryLockError::WouldBlock) if tries > 0 => std::thread::sleep(LOCK_PAUSE),
+            other => break other,
+        }
+        tries -= 1;
+    };
+    match locked {
         Ok(()) => {}
         Err(TryLockError::WouldBlock) => return Err(ChangeError::UnderWay { file: file() }),
         Err(TryLockError::Error(e)) if e.kind() == ErrorKind::Unsupported => {}
