@@ -121,8 +121,9 @@ pub(super) fn something_flows(pour: &Pour, camera: &CameraConfig, image: &ImageC
         flow.flowing += u32::from(flows);
         let unfit = matches!(measured.doubt, Doubt::EdgeNotFound | Doubt::LeavesRegion);
         flow.unfit += u32::from(!flows && unfit);
-        // A frame that is a little too sharp or soft for the run time is dry all the same.
-        let dry = !flows && matches!(measured.doubt, Doubt::None | Doubt::Blurred);
+        // A frame that is a little too sharp or soft for the run time is dry all the same, and so is one of a grey card, which has lost its last colour in a
+        // compressed clip.
+        let dry = !flows && matches!(measured.doubt, Doubt::None | Doubt::Blurred | Doubt::ColoursChanged);
         flow.dry += u32::from(dry);
         flow.untold += u32::from(!flows && !unfit && !dry);
         flow.runs += u32::from(flows && !flow.flows);
@@ -133,7 +134,7 @@ pub(super) fn something_flows(pour: &Pour, camera: &CameraConfig, image: &ImageC
     let mut seen =
         format!("{flowing} of {frames} frames show a stream whose edge fits the axes, {dry} are dry, and in {unfit} no edge fits");
     if untold > 0 {
-        seen += &format!("; {untold} cannot be told (too dark or bright, frozen, not whole, in other colours, or in light that flickers)");
+        seen += &format!("; {untold} cannot be told (too dark or bright, frozen, not whole, or in light that flickers)");
     }
     let advice = match image.method {
         LiquidMethod::Colour => "show one whole pour, check the axes, or use --method clear for water",
