@@ -56,6 +56,17 @@ pub struct Run {
     pub tick_gaps: u32,
 }
 
+/// The share of what is beyond the goal that a pour which exceeds it is uncertain by. Chosen by hand: the vessel gave it, or the eye made it up.
+const SURPRISE: f32 = 0.5;
+
+/// The deviation that a pour's volume is told with, ml.
+fn said_sd_ml(reason: EndReason, decision: &Decision) -> f32 {
+    // What would still leave on the way upright is not seen of a run that ends before.
+    let sd_ml = decision.poured_sd_ml.hypot(decision.stop_ml);
+    // What is far beyond the goal surprised the very estimate that aimed at it.
+    if reason == EndReason::GoalExceeded { sd_ml.max(-SURPRISE * decision.d_ml) } else { sd_ml }
+}
+
 impl Run {
     /// What is told of it when it ends at `now_ns` for `reason`; `decision` is the agent's newest, and `now` the present counters.
     pub fn outcome(&self, reason: EndReason, now_ns: u64, decision: &Decision, now: Counters) -> Outcome {
@@ -66,8 +77,7 @@ impl Run {
             unseen: self.ending.leaves_unseen(reason),
             goal_ml: self.goal_ml,
             poured_ml: if self.goal_ml.is_some() { decision.poured_ml } else { f32::NAN },
-            // What would still leave on the way upright is not seen of a run that ends before.
-            poured_sd_ml: if self.goal_ml.is_some() { decision.poured_sd_ml.hypot(decision.stop_ml) } else { 0.0 },
+            poured_sd_ml: if self.goal_ml.is_some() { said_sd_ml(reason, decision) } else { 0.0 },
             seconds: now_ns.saturating_sub(self.started_at_ns) as f32 / 1e9,
             frames: self.frames,
             bridged_frames: (now.bridged_frames - before.bridged_frames) as u32,
@@ -79,6 +89,24 @@ impl Run {
                 acceleration: now.clipped.acceleration - before.clipped.acceleration,
                 not_finite: now.clipped.not_finite - before.clipped.not_finite,
             },
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Protects whoever reads what was poured of a pour that went far beyond its goal: the estimate that aimed at the goal was wrong once, and does not call
+    /// itself right to 6 ml after that. Of all other pours it says what it knows.
+    #[test]
+    fn a_surprise_is_in_the_deviation() {
+        let decision = Decision { d_ml: -55.6, poured_ml: 201.7, poured_sd_ml: 6.0, stop_ml: 0.8, ..Decision::NOTHING };
+        let said = |reason, d_ml| said_sd_ml(reason, &Decision { d_ml, ..decision });
+        assert!((said(EndReason::GoalExceeded, -55.6) - 27.8).abs() < 0.1);
+        let known = 6.0f32.hypot(0.8);
+        for (reason, d_ml) in [(EndReason::GoalExceeded, -9.0), (EndReason::Done, -55.6), (EndReason::StreamLost, 55.6)] {
+            assert_eq!(said(reason, d_ml), known, "{reason:?}");
         }
     }
 }
