@@ -1,8 +1,9 @@
 //! The clients' side of the stop socket ([`crate::stop`]): finds the controllers that run, and asks them to stop the motion.
 //!
 //! It needs no shared memory. It runs in ordinary threads of other processes, allocates, and waits for an answer a moment at most. Who
-//! answers is checked: the socket's server must be the user whose cell it is, or root. Whose it is says the owner of its runtime directory, if
-//! root or this user has chosen where that lies ([`claim::owner`]), by a configuration too: so a group may stop the cell of the user `decant`, and nobody can answer for it.
+//! answers is checked: the socket's server must be the user whose cell it is, or root. The cell belongs to the owner of its runtime directory, if
+//! root or this user has chosen where that lies ([`claim::owner`]); a configuration is such a choice. So a group may stop the cell of the user
+//! `decant`, and nobody else can answer for it.
 
 use std::collections::BTreeMap;
 use std::io::{BufRead, BufReader, Write};

@@ -1,7 +1,8 @@
 //! `feature-worker camera`: lists the cameras of this machine, what each can do, who uses it, and how it is set.
 //!
 //! An ordinary command-line program that allocates. It sets nothing, and does not disturb a camera that streams. With a configuration it
-//! says what is wrong with the camera that is named there, by the exit code too, after the list. Programs of other users that have a camera are seen by root alone.
+//! says after the list what is wrong with the camera that is named there, by the exit code too. Only root sees which programs of other users
+//! have a camera.
 
 use std::path::{Path, PathBuf};
 

@@ -401,8 +401,8 @@ impl Liquid for ClearWater {
             return 0.0;
         }
         // A bead that stays at the lip is no stream, and before an even ground it is told from one.
-        let bead = (!self.is_pattern()).then_some([BEAD_PX; 2]);
-        let [dry, _] = self.shares(bead, legs_px.map(|v| v.max(if bead.is_some() { BEAD_ROUND_PX } else { 0.0 })));
+        let (from, to) = if self.is_pattern() { (None, legs_px) } else { (Some([BEAD_PX; 2]), legs_px.map(|v| v.max(BEAD_ROUND_PX))) };
+        let [dry, _] = self.shares(from, to);
         dry
     }
 

@@ -229,9 +229,9 @@ impl Evidence {
         self.even
     }
 
-    /// Which shares of the places with a share of the way to the line `to` below 1, and not of that to the line `from`, in the air are ground that is known and as it is remembered, and ground that
-    /// is known and is not. Ground of which nothing is remembered is known where it is `even`: it is like what is remembered further out on its ray. `gain`
-    /// is the picture's exposure against the memory.
+    /// What is known of the ground in the air between the lines `from` and `to`, each given as the share of the way to it from the lip: which shares of
+    /// the places are as they are remembered, and which are not. Where the ground is `even`, a place of which nothing is remembered has to be like what is
+    /// remembered further out on its ray. `gain` is the picture's exposure against the memory.
     pub(super) fn shares(&self, rays: &Rays, [from, to]: [LinearField; 2], even: bool, gain: f32) -> [f32; 2] {
         let (now, memory): (&[Vec4b], &[Vec4b]) =
             (self.ray_now.data_typed().unwrap_or_default(), self.ray_memory.data_typed().unwrap_or_default());
