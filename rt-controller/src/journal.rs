@@ -466,6 +466,9 @@ impl Rerun {
             && output.telemetry.d_ml.to_bits() == tick.d_ml.to_bits();
         let begins = matches!(order, Some(Order::Pour { .. } | Order::Record { .. })) && output.ordered == Some(Ok(()));
         self.compared |= self.connected >= UNKNOWN_TICKS && begins;
+        if let Some(target_deg) = tick.target_deg.filter(|_| !self.compared) {
+            core.rest_at(target_deg);
+        }
         if self.compared && !same {
             self.result.different += 1;
             self.result.first_different.get_or_insert(self.result.ticks);
