@@ -69,7 +69,9 @@ fn a_program_that_starts_while_a_port_is_tried_is_not_replaced() {
 #[test]
 fn a_program_of_ours_that_was_late_is_no_handover() {
     let last = RobotState { program_run: 9, joints_rad: [0.0, 0.0, 0.0, 0.0, 0.0, 1.2], ..RobotState::default() };
-    for (number, uploaded, why) in [(141, Some(10), None), (142, Some(11), Some(Handover::Interrupted)), (143, None, Some(Handover::Interrupted))] {
+    for (number, uploaded, why) in
+        [(141, Some(10), None), (142, Some(11), Some(Handover::Interrupted)), (143, None, Some(Handover::Interrupted))]
+    {
         let before = Before { last: Some(last), uploaded, ..Before::default() };
         let late = Robot { registers: (ProgramState::Unused, 7, 10), ..Robot::default() };
         let (session, _) = Server::new(number, late).meet_after(&before);
