@@ -89,7 +89,7 @@ impl History {
     pub fn keep(&self, stop: &AtomicBool) {
         while !stop.load(Relaxed) {
             let files = find_episodes(std::slice::from_ref(&self.directory)).unwrap_or_default();
-            let files: Vec<PathBuf> = files.into_iter().filter(|f| f.exists()).collect();
+            let files: Vec<PathBuf> = files.into_iter().filter(|f| f.symlink_metadata().is_ok()).collect();
             let known = |file: &PathBuf| locked(&self.table).get(&name_of(file)).is_some_and(|l| l.stamp == stamp(file));
             let new: Vec<&PathBuf> = files.iter().filter(|f| !known(f)).collect();
             for (done, file) in new.iter().enumerate() {

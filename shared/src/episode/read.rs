@@ -304,7 +304,8 @@ pub fn find_episodes(paths: &[PathBuf]) -> Result<Vec<PathBuf>, EpisodeError> {
         let mut inside = Vec::new();
         for entry in std::fs::read_dir(path).map_err(fail)? {
             let file = entry.map_err(fail)?.path();
-            if file.extension().is_some_and(|e| e == "mcap") && file.is_file() {
+            // A link that leads nowhere is an episode that cannot be read, and whoever opens it says so.
+            if file.extension().is_some_and(|e| e == "mcap") && !file.is_dir() {
                 inside.push(file);
             }
         }
