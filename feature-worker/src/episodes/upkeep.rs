@@ -146,12 +146,19 @@ fn distinct(files: &[PathBuf], copied: &mut Copied) -> Result<Vec<(PathBuf, Epis
     Ok(all)
 }
 
-/// Copies all episodes of `files` into the directory `to`, in the order of their start, each with the next number that is free there.
+/// Copies all episodes of `files` into the directory `to`, in the order of their start, each with the next number that is free there. What lies there
+/// already is left out.
 pub fn merge(files: &[PathBuf], to: &Path) -> Result<Copied, ExportError> {
     let mut copied = Copied::default();
     let mut all = distinct(files, &mut copied)?;
     all.sort_by(|a, b| a.1.info.started_at_utc.cmp(&b.1.info.started_at_utc));
+    let lies_there =
+        |file: &Path| std::path::absolute(file).is_ok_and(|file| file.parent().is_some_and(|directory| is_same(directory, to)));
     for (file, episode) in all {
+        if lies_there(&file) {
+            copied.left_out.push(left_out(&file, "it lies there already"));
+            continue;
+        }
         let number = take_number(to).map_err(|e| disk_error(to, &e))?;
         let new = to.join(format!("episode-{number:04}.mcap"));
         copy(&file, &episode, &new)?;
