@@ -189,7 +189,8 @@ pub fn fit(episodes: &[TrainingEpisode]) -> Fit {
     let mut prepared: Vec<PreparedEpisode> =
         episodes.iter().zip(tilts.alpha_deg).map(|(e, alpha_deg)| PreparedEpisode::new(e, alpha_deg)).collect();
     let camera = CameraFacts::new(episodes, &prepared);
-    let priors = |vessel| Priors { vessel, measured: tilts.robot.is_some(), clean: camera.clean };
+    let priors =
+        |vessel| Priors { vessel, measured: tilts.robot.is_some(), clean: camera.clean, slower: crate::data::rate_hz(episodes) / 30.0 };
     let (wide, tight) = (priors(VesselPrior::wide()), priors(VesselPrior::tight()));
     let first = camera.stage(TEMPERS[0], DELAY_KNOWN_FRAMES);
     let mut starts = {
@@ -236,7 +237,9 @@ fn beginning(problem: &Problem<'_>, episodes: &[TrainingEpisode], log_weir: f64,
     let mut shared = [0.0; SHARED];
     (shared[LOG_RADIUS], shared[LOG_SLENDERNESS], shared[TAPER]) = (37f64.ln(), 3f64.ln(), 1.0);
     let (lag, delay) = if problem.priors.measured { (0.3, 1.0) } else { (2.0, 2.0) };
-    (shared[LOG_WEIR], shared[HEAD_EXPONENT], shared[LAG], shared[DELAY], shared[FILM_SHARE]) = (log_weir, 1.5, lag, delay, 0.05);
+    let slower = problem.priors.slower;
+    (shared[LAG], shared[DELAY]) = (lag * slower, delay * slower);
+    (shared[LOG_WEIR], shared[HEAD_EXPONENT], shared[FILM_SHARE]) = (log_weir - slower.ln(), 1.5, 0.05);
     shared[LOG_C] = f64::from(calibration::calibrate(episodes, Some(exponent)).volume_at_1_px2_ml).ln();
     shared[AREA_EXPONENT] = exponent;
     let flow = FlowTables::new(&problem.model_of(&shared));

@@ -12,7 +12,7 @@ use shared::exit::{self, Failure, OrExit as _, failure};
 
 use super::train::WeightFileArgs;
 use crate::consistency;
-use crate::data::{self, EpisodeSource};
+use crate::data::{self, EpisodeSource, TrainingEpisode};
 use crate::training::Options;
 
 /// Command-line arguments of `trainer refine`.
@@ -46,11 +46,10 @@ struct WeighedPour {
     mae_so_far_ml: f64,
 }
 
-/// The weighed pours among `episodes`, in the order in which they were poured.
-fn weighed_pours(episodes: &[Episode]) -> Vec<WeighedPour> {
-    let mut ordered: Vec<&Episode> = episodes.iter().collect();
-    ordered.sort_by(|a, b| (a.info.started_at_utc.as_str(), a.name.as_str()).cmp(&(b.info.started_at_utc.as_str(), b.name.as_str())));
-    let weighed = ordered.into_iter().filter_map(|e| match (e.kind, e.weight_g) {
+/// The weighed pours among the episodes that were read, in the order in which they were poured: those that are trained on, each once.
+fn weighed_pours(read: &[Episode], trained_on: &[TrainingEpisode]) -> Vec<WeighedPour> {
+    let counts = |e: &&Episode| trained_on.iter().any(|own| own.name == e.name);
+    let weighed = read.iter().filter(counts).filter_map(|e| match (e.kind, e.weight_g) {
         (EpisodeKind::Pour { goal_ml }, Some(weight_g)) => Some((f64::from(goal_ml), weight_g)),
         _ => None,
     });
@@ -92,7 +91,7 @@ pub fn run(args: &Args) -> Result<(), Failure> {
             }
         }
     }
-    let history = weighed_pours(&read);
+    let history = weighed_pours(&read, &usable.episodes);
     let options = Options { seed: args.weight_file.seed, limits, ..Options::default() };
     args.weight_file.train_and_write(&usable, &options, serde_json::json!({ "pours": history }))?;
     if !args.weight_file.json && !history.is_empty() {
