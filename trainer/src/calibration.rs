@@ -188,6 +188,15 @@ mod tests {
         }
     }
 
+    /// Protects cameras with a unit of their own, such as square micrometres: c has no floor that their areas reach.
+    #[test]
+    fn the_calibration_has_no_unit_of_its_own() {
+        let episodes = [40.0, 60.0, 80.0, 100.0].map(|weight_g| weighed(1e11 * weight_g, weight_g));
+        let Calibration { volume_at_1_px2_ml, area_exponent, .. } = calibrate(&episodes, None);
+        let ml = f64::from(volume_at_1_px2_ml) * area_sum(&episodes[2], f64::from(area_exponent));
+        assert!((ml - 80.0).abs() < 3.0, "{ml}");
+    }
+
     /// Protects the scatter that the weights show from a light one, which the scale's rounding hides: a gram more or less changes next to nothing.
     #[test]
     fn a_light_weight_hides_no_scatter() {
