@@ -419,7 +419,7 @@ impl Core {
             }
             // What was asked for and not followed is taken back as fast as the limits allow; from there on the way is the usual one.
             Phase::Returning if self.is_ahead_of(input.robot.alpha_deg) => Some(self.limiter.step(input.robot.alpha_deg)),
-            // Nothing moves before somebody asks: a joint that was found within the tolerance of upright stays there.
+            // Nothing moves before somebody asks: a joint that was found within the tolerance of upright and within the range stays there.
             Phase::Idle if self.limiter.rate_deg_s() == 0.0 => Some(self.limiter.step(self.limiter.alpha_deg())),
             Phase::Idle | Phase::Returning | Phase::Settling => {
                 let target = self.limiter.step_upright();

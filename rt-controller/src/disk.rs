@@ -109,7 +109,7 @@ impl<'a> Disk<'a> {
             Some((_, Ok(writer))) => Some(writer),
             Some((_, Err(e))) if e.kind() == ErrorKind::InvalidInput => return Err(format!("controller.journal: {e}")),
             Some((path, Err(e))) => {
-                say(Level::Warning, &format!("{}: no journal: {}; tried again each minute", path.display(), error_words(&e)));
+                say(Level::Warning, &format!("{}: no journal: {}; tried again later", path.display(), error_words(&e)));
                 note.set(|n| n.journal = format!("not written since the start: {}", error_words(&e)));
                 None
             }
@@ -149,6 +149,8 @@ impl<'a> Disk<'a> {
     pub fn run(mut self, end: &AtomicBool) {
         while !end.load(Relaxed) {
             self.write_ticks();
+            // What a crash is looked up for must not be in this process's memory.
+            self.write(Writer::flush);
             self.keep_journal();
             self.look_at_weights();
             self.look_at_space();
@@ -218,6 +220,7 @@ impl<'a> Disk<'a> {
                 (self.journal, self.retry, self.pause) = (Some(journal), None, RETRY);
             }
             Err(e) => {
+                (self.say)(Level::Warning, &format!("{}: no journal: {}; tried again later", path.display(), error_words(&e)));
                 self.note.set(|n| n.journal = format!("not written: {}", error_words(&e)));
                 self.try_later();
             }

@@ -213,11 +213,12 @@ impl<'a> Service<'a> {
                 }
                 Err(_) => return,
             };
-            // Whoever has given up waiting must not find the robot moving later.
-            if !asked.is_connected() {
+            let request = postcard::from_bytes::<Request>(asked.payload());
+            // Whoever has given up waiting must not find the robot moving later. An abort counts whoever waits.
+            if !asked.is_connected() && !matches!(request, Ok(Request::Abort)) {
                 continue;
             }
-            let Ok(request) = postcard::from_bytes::<Request>(asked.payload()) else {
+            let Ok(request) = request else {
                 reply(
                     &asked,
                     &Reply::Refused { reason: "the request comes from another version of Decant: run the same build on both sides".into() },

@@ -131,12 +131,13 @@ impl Limiter {
         self.step(self.alpha_deg + distance.clamp(-far, far))
     }
 
-    /// One period of the way back to upright, at the return rate.
+    /// One period of the way back to upright, at the return rate, braking in time to stop there: beyond upright a range may go on.
     pub fn step_upright(&mut self) -> f32 {
         let goal = 0.0_f32.clamp(self.limits.alpha_min_deg, self.limits.alpha_max_deg);
-        let far = self.limits.return_rate_deg_s * self.period_s;
-        let request = self.alpha_deg + (goal - self.alpha_deg).clamp(-far, far);
-        self.step(request)
+        let distance = goal - self.alpha_deg;
+        let braking = braking_rate(distance.abs(), self.limits.acceleration_deg_s2 * self.period_s, self.period_s);
+        let far = self.limits.return_rate_deg_s.min(braking) * self.period_s;
+        self.step(self.alpha_deg + distance.clamp(-far, far))
     }
 }
 
@@ -186,6 +187,19 @@ mod tests {
             limiter.step_upright();
         }
         assert_eq!(limiter.alpha_deg(), 0.0);
+    }
+
+    /// Protects the table behind the container: where the range goes on beyond upright, the way back ends at upright and does not swing through it.
+    #[test]
+    fn the_way_back_does_not_swing_through() {
+        for (acceleration_deg_s2, return_rate_deg_s, period_s) in
+            [(150.0, 60.0, DT), (450.0, 90.0, DT), (120.0, 90.0, DT / 2.0), (1500.0, 60.0, DT)]
+        {
+            let limits = Limits { alpha_min_deg: -20.0, acceleration_deg_s2, return_rate_deg_s, ..Limits::default() };
+            let mut limiter = Limiter::new(limits, period_s, 80.0);
+            let lowest_deg = (0..300).map(|_| limiter.step_upright()).fold(f32::INFINITY, f32::min);
+            assert!(lowest_deg > -0.01 && limiter.alpha_deg().abs() < 0.01, "{lowest_deg} and {} degrees", limiter.alpha_deg());
+        }
     }
 
     /// Protects the operator's view: what was clipped is counted by cause.

@@ -103,6 +103,15 @@ pub fn stop_at_signals() -> std::io::Result<Arc<AtomicBool>> {
     Ok(stop)
 }
 
+/// From now on Ctrl-C and SIGTERM end the process at once with this exit code, also after [`stop_at_signals`].
+pub fn end_at_signals(code: u8) -> std::io::Result<()> {
+    let always = Arc::new(AtomicBool::new(true));
+    for signal in [signal_hook::consts::SIGINT, signal_hook::consts::SIGTERM] {
+        signal_hook::flag::register_conditional_shutdown(signal, code.into(), Arc::clone(&always))?;
+    }
+    Ok(())
+}
+
 /// Writes one line to standard error if that is possible within half a second, and leaves it out otherwise. For the end of a process that
 /// must end, whatever became of its terminal.
 pub fn tell(level: Level, line: &str) {

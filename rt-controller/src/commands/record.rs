@@ -9,6 +9,7 @@ use shared::control::Request;
 use shared::episode::{WeightError, check_reading, set_weight};
 use shared::exit::{self, Failure, OrExit as _, failure};
 use shared::gaussian_curve::Curve;
+use shared::os;
 
 use super::pour;
 use crate::client::Common;
@@ -76,6 +77,8 @@ fn ask_weight() -> Option<f64> {
     if !stdin.is_terminal() {
         return None;
     }
+    // Nothing moves any more that they would have to stop, and the read would go on over them. The weight can be given later.
+    let _ = os::end_at_signals(exit::INTERRUPTED);
     loop {
         eprint!("weight on the scale in g (empty: later): ");
         let _ = std::io::stderr().flush();

@@ -80,11 +80,13 @@ pub fn run(args: &Args) -> Result<(), Failure> {
 
 /// Becomes true at the first Ctrl-C or SIGTERM; the second one ends the process at once.
 fn stop_at_signals() -> Result<Arc<AtomicBool>, Failure> {
-    let stop = Arc::new(AtomicBool::new(false));
+    use signal_hook::flag::{register, register_conditional_shutdown};
+    // Other reasons to stop must not make the first signal a second one.
+    let (stop, armed) = (Arc::new(AtomicBool::new(false)), Arc::new(AtomicBool::new(false)));
     for signal in [signal_hook::consts::SIGINT, signal_hook::consts::SIGTERM] {
         // It is armed by the first signal, so that only a second one ends the process at once.
-        let second = signal_hook::flag::register_conditional_shutdown(signal, exit::INTERRUPTED.into(), Arc::clone(&stop));
-        let first = signal_hook::flag::register(signal, Arc::clone(&stop));
+        let second = register_conditional_shutdown(signal, exit::INTERRUPTED.into(), Arc::clone(&armed));
+        let first = register(signal, Arc::clone(&armed)).and_then(|_| register(signal, Arc::clone(&stop)));
         second.and(first).map_err(|e| format!("cannot handle signals: {e}")).or_exit(exit::FAILED)?;
     }
     Ok(stop)

@@ -6,6 +6,7 @@
 
 use std::fs::{File, Metadata as FileMetadata, TryLockError};
 use std::io::{BufWriter, ErrorKind};
+use std::os::unix::fs::MetadataExt as _;
 use std::path::Path;
 use std::time::{Duration, SystemTime};
 
@@ -85,16 +86,25 @@ pub enum ChangeError {
 /// Reads the episode `path`, which nobody writes any more: the recorder holds its file's lock, and a file system without locks has the time of the
 /// last change. Gives it with what the file system says of the file.
 pub fn read_at_rest(path: &Path) -> Result<(Episode, FileMetadata), ChangeError> {
+    // Shared, so that two who look do not take each other for the recorder.
+    let (episode, meta, _) = at_rest(path, File::try_lock_shared)?;
+    Ok((episode, meta))
+}
+
+/// The same with the file, which is held by `lock` as long as it is open.
+fn at_rest(path: &Path, lock: impl Fn(&File) -> Result<(), TryLockError>) -> Result<(Episode, FileMetadata, File), ChangeError> {
     let file = || path.display().to_string();
     let unread = |e: std::io::Error| EpisodeError::Read { file: file(), what: e.to_string() };
-    let (opened, meta) = regular_file::open(path).map_err(unread)?;
-    // Shared, so that two who look do not take each other for the recorder.
     let mut tries = LOCK_TRIES;
-    let locked = loop {
-        match opened.try_lock_shared() {
-            Err(TryLockError::WouldBlock) if tries > 0 => std::thread::sleep(LOCK_PAUSE),
-            other => break other,
+    let (opened, meta, locked) = loop {
+        let (opened, meta) = regular_file::open(path).map_err(unread)?;
+        let locked = lock(&opened);
+        // Somebody may have put another file in its place, with what they changed, before the lock was had.
+        let is_it = || std::fs::metadata(path).is_ok_and(|now| (now.dev(), now.ino()) == (meta.dev(), meta.ino()));
+        if tries == 0 || !(matches!(locked, Err(TryLockError::WouldBlock)) || !is_it()) {
+            break (opened, meta, locked);
         }
+        std::thread::sleep(LOCK_PAUSE);
         tries -= 1;
     };
     match locked {
@@ -108,7 +118,7 @@ pub fn read_at_rest(path: &Path) -> Result<(Episode, FileMetadata), ChangeError>
     if episode.info.ended.is_empty() && age < UNDER_WAY {
         return Err(ChangeError::MayBeUnderWay { file: file() });
     }
-    Ok((episode, meta))
+    Ok((episode, meta, opened))
 }
 
 /// Sets the metadata record `name` of the episode `path` to one pair, in place of any that was there. `expected` says what the episode then
@@ -122,7 +132,8 @@ pub(super) fn set_metadata(
     let shown = path.display().to_string();
     // If the path is a link, the file that it leads to is replaced, and not the link.
     let path = path.canonicalize().map_err(|e| EpisodeError::Read { file: shown.clone(), what: e.to_string() })?;
-    let (before, _) = read_at_rest(&path)?;
+    // The file is held until the new one is in its place, so that of two changes at once none is lost.
+    let (before, _, _held) = at_rest(&path, File::try_lock)?;
     let (file, temporary) = whole_file::new_beside(&path).map_err(|e| ChangeError::Write { file: shown, what: error_words(&e) })?;
     let fail = |what: String| ChangeError::Write { file: temporary.display().to_string(), what };
     let result = copy(&path, (file, &temporary), Some(name), |writer, end| {
