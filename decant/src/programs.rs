@@ -29,7 +29,7 @@ const COMMANDS: [(&str, &str, &str, &str); 21] = [
     ("plan", "trainer", "plan", "says what to record or pour next"),
     ("check", "trainer", "check", "says what is wrong with a data set"),
     ("train", "trainer", "train", "trains weights from episodes"),
-    ("refine", "trainer", "refine", "trains again with all weighed pours"),
+    ("refine", "trainer", "refine", "trains again with all weighed episodes"),
     ("weights", "trainer", "inspect", "prints everything in a weight file"),
     ("report", "trainer", "report", "writes a page of a training or evaluation"),
 ];

@@ -28,6 +28,9 @@ function reasonWords(e) {
 
 const valueOf = (e, key) => (key === 'goal' ? e.run?.goal_ml : key === 'what' ? what(e) : key === 'doubts' ? doubtWords(e) : key === 'reason' ? reasonWords(e) : e[key]);
 
+/** As text, the ten thousandth episode would come before the second. */
+const byNumber = new Intl.Collator('en', { numeric: true }).compare;
+
 function shownEpisodes() {
   const kind = $('kind').value, word = $('search').value.trim().toLowerCase();
   const fits = e => (!kind || (kind === 'unweighed' ? !e.error && e.weight_g === null : kind === 'wrong' ? e.error || (e.wrong || []).length : e.run?.kind === kind)) &&
@@ -38,7 +41,7 @@ function shownEpisodes() {
     if (x === y) return 0;
     if (x === null || x === undefined || x === '') return 1;
     if (y === null || y === undefined || y === '') return -1;
-    return (x < y ? -1 : 1) * direction;
+    return (key === 'file' ? byNumber(x, y) : x < y ? -1 : 1) * direction;
   };
   return table.episodes.filter(fits).sort(order);
 }

@@ -9,6 +9,7 @@ use std::path::PathBuf;
 
 use serde::{Deserialize, Serialize};
 use shared::control::Outcome;
+use shared::episode::by_number;
 use shared::{regular_file, whole_file};
 
 /// Number of episodes whose ends are remembered. Chosen by hand: some days of a lab.
@@ -63,7 +64,8 @@ impl Ends {
             }
         }
         while self.by_name.len() > ENDS_MAX {
-            self.by_name.pop_first();
+            let oldest = self.by_name.keys().min_by(|a, b| by_number(a.as_ref(), b.as_ref())).cloned();
+            self.by_name.remove(&oldest.unwrap_or_default());
         }
         if changed {
             self.write();
@@ -128,8 +130,12 @@ mod tests {
         assert_eq!(again.of("episode-0010.mcap").unwrap().poured, None);
         assert!(again.of("episode-0007.mcap").is_none(), "a number is not gone by");
         let mut many = Ends::of_file(file);
-        let files = (1..=ENDS_MAX as u64 + 9).map(|n| (n, Ok(format!("{n:06}.mcap")))).collect();
-        many.remember(&(1..=ENDS_MAX as u64 + 9).map(|n| outcome(n, Some(90.0))).collect::<Vec<_>>(), &files);
-        assert!(many.of("000001.mcap").is_none() && many.of("002009.mcap").is_some());
+        // They end beyond the ten thousandth, which as text is older than the second.
+        let numbers = 10_009 - ENDS_MAX as u64 - 9..10_009;
+        let files = numbers.clone().map(|n| (n, Ok(format!("episode-{n:04}.mcap")))).collect();
+        many.remember(&numbers.map(|n| outcome(n, Some(90.0))).collect::<Vec<_>>(), &files);
+        let kept =
+            ["episode-0009.mcap", "episode-8000.mcap", "episode-9999.mcap", "episode-10008.mcap"].map(|name| many.of(name).is_some());
+        assert_eq!(kept, [false, false, true, true]);
     }
 }

@@ -13,7 +13,7 @@ use std::time::{Duration, SystemTime};
 
 use feature_worker::episodes::summary::{remarks, summary};
 use serde_json::{Value, json};
-use shared::episode::{Episode, EpisodeImages, find_episodes};
+use shared::episode::{Episode, EpisodeImages, by_number, find_episodes};
 use shared::regular_file;
 
 use crate::ends::Ends;
@@ -89,7 +89,7 @@ impl History {
     pub fn keep(&self, stop: &AtomicBool) {
         while !stop.load(Relaxed) {
             let files = find_episodes(std::slice::from_ref(&self.directory)).unwrap_or_default();
-            let files: Vec<PathBuf> = files.into_iter().filter(|f| f.exists()).collect();
+            let files: Vec<PathBuf> = files.into_iter().filter(|f| f.symlink_metadata().is_ok()).collect();
             let known = |file: &PathBuf| locked(&self.table).get(&name_of(file)).is_some_and(|l| l.stamp == stamp(file));
             let new: Vec<&PathBuf> = files.iter().filter(|f| !known(f)).collect();
             for (done, file) in new.iter().enumerate() {
@@ -106,7 +106,7 @@ impl History {
         }
     }
 
-    /// The table in the order of names, and how many files are still to be read. `ends` says how episodes ended.
+    /// The table in the order of the files' numbers, and how many files are still to be read. `ends` says how episodes ended.
     pub fn table(&self, ends: &Ends) -> Value {
         let with_end = |(name, line): (&String, &Line)| {
             let mut value = line.value.clone();
@@ -116,7 +116,10 @@ impl History {
             }
             value
         };
-        let lines: Vec<Value> = locked(&self.table).iter().map(with_end).collect();
+        let table = locked(&self.table);
+        let mut lines: Vec<(&String, &Line)> = table.iter().collect();
+        lines.sort_by(|(a, _), (b, _)| by_number(a.as_ref(), b.as_ref()));
+        let lines: Vec<Value> = lines.into_iter().map(with_end).collect();
         json!({ "episodes": lines, "unread": *locked(&self.unread), "directory": self.directory.display().to_string() })
     }
 
@@ -146,7 +149,7 @@ impl History {
             .filter(|(_, l)| l.value["weight_g"].is_number() && l.value["error"].is_null())
             .map(|(name, l)| (l.value["started_at_utc"].as_str().unwrap_or(""), name.as_str()))
             .collect();
-        lines.sort_unstable();
+        lines.sort_unstable_by(|(at, a), (bt, b)| at.cmp(bt).then_with(|| by_number(a.as_ref(), b.as_ref())));
         let skipped = last.map_or(0, |n| lines.len().saturating_sub(n));
         lines.into_iter().skip(skipped).map(|(_, name)| self.directory.join(name)).collect()
     }
@@ -251,4 +254,24 @@ fn read_pictures(path: &Path, name: &str, stamp: Stamp) -> Result<Pictures, Stri
     }
     all.sort_unstable_by_key(|(sequence, _)| *sequence);
     Ok(Pictures { name: name.into(), stamp, all })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Protects who weighs what was poured last: the page lists the newest first, also beyond the ten thousandth.
+    #[test]
+    fn the_table_is_in_the_order_of_numbers() {
+        let dir = tempfile::tempdir().unwrap();
+        let history = History::new(dir.path().to_path_buf());
+        let names = ["episode-0001.mcap", "episode-9999.mcap", "episode-10000.mcap"];
+        for name in names {
+            fs::write(dir.path().join(name), "no episode").unwrap();
+            history.refresh(name);
+        }
+        let table = history.table(&Ends::default());
+        let listed: Vec<&str> = table["episodes"].as_array().unwrap().iter().map(|e| e["file"].as_str().unwrap()).collect();
+        assert_eq!(listed, names);
+    }
 }

@@ -126,6 +126,13 @@ impl Core {
         }
     }
 
+    /// Lets the joint rest at this command, degrees, if nothing is poured: where a connection found it is not known to a replay that begins later.
+    pub fn rest_at(&mut self, alpha_deg: f32) {
+        if self.phase == Phase::Idle {
+            self.limiter.rest_at(alpha_deg);
+        }
+    }
+
     /// What the controller is doing.
     pub fn phase(&self) -> Phase {
         self.phase
@@ -412,6 +419,8 @@ impl Core {
             }
             // What was asked for and not followed is taken back as fast as the limits allow; from there on the way is the usual one.
             Phase::Returning if self.is_ahead_of(input.robot.alpha_deg) => Some(self.limiter.step(input.robot.alpha_deg)),
+            // Nothing moves before somebody asks: a joint that was found within the tolerance of upright stays there.
+            Phase::Idle if self.limiter.rate_deg_s() == 0.0 => Some(self.limiter.step(self.limiter.alpha_deg())),
             Phase::Idle | Phase::Returning | Phase::Settling => {
                 let target = self.limiter.step_upright();
                 if self.phase == Phase::Returning && self.run.is_none() && ending::is_commanded_upright(target) {

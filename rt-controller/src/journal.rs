@@ -274,19 +274,29 @@ impl<W: Write> Writer<W> {
     }
 }
 
-/// Checks that the file at `path` is a journal of any version, or empty, and that nobody writes it. Gives it, locked.
-fn check_is_journal(path: &Path) -> std::io::Result<File> {
-    let named = |what: &str| std::io::Error::new(ErrorKind::InvalidInput, format!("{} {what}", path.display()));
-    let (mut file, meta) = regular_file::open(path).map_err(|e| named(&e.to_string()))?;
+/// Checks that the file at `path` is a journal of any version, or empty, so that a new one may take its place. Gives it.
+pub fn check_place(path: &Path) -> std::io::Result<File> {
+    let (mut file, meta) = regular_file::open(path).map_err(|e| taken(path, &e.to_string()))?;
     let mut magic = [0; MAGIC.len()];
     let whole = file.read_exact(&mut magic).is_ok();
     // A full disk may have cut the first bytes.
     let there = if whole { MAGIC.len() - 1 } else { usize::try_from(meta.len()).unwrap_or(MAGIC.len()).min(MAGIC.len() - 1) };
     if magic[..there] != MAGIC[..there] {
-        return Err(named("is no journal and is left as it is: choose another controller.journal"));
+        return Err(taken(path, "is no journal and is left as it is: choose another controller.journal"));
     }
+    Ok(file)
+}
+
+/// The error of a `path` at which no journal can be begun.
+fn taken(path: &Path, what: &str) -> std::io::Error {
+    std::io::Error::new(ErrorKind::InvalidInput, format!("{} {what}", path.display()))
+}
+
+/// The same, and that nobody writes it. Gives it, locked.
+fn check_is_journal(path: &Path) -> std::io::Result<File> {
+    let file = check_place(path)?;
     if let Err(std::fs::TryLockError::WouldBlock) = file.try_lock() {
-        return Err(named("is being written by another controller: choose another controller.journal"));
+        return Err(taken(path, "is being written by another controller: choose another controller.journal"));
     }
     Ok(file)
 }
@@ -466,6 +476,9 @@ impl Rerun {
             && output.telemetry.d_ml.to_bits() == tick.d_ml.to_bits();
         let begins = matches!(order, Some(Order::Pour { .. } | Order::Record { .. })) && output.ordered == Some(Ok(()));
         self.compared |= self.connected >= UNKNOWN_TICKS && begins;
+        if let Some(target_deg) = tick.target_deg.filter(|_| !self.compared) {
+            core.rest_at(target_deg);
+        }
         if self.compared && !same {
             self.result.different += 1;
             self.result.first_different.get_or_insert(self.result.ticks);

@@ -117,7 +117,7 @@ pub fn keep_robot_connected(
         if !progress.connected && !progress.waits && now_ns >= progress.next_ns {
             progress.before.asked = progress.wish_until_ns.is_some_and(|until_ns| now_ns < until_ns);
             let named = network.resolve(&config.robot.address).map_err(|what| unknown_name(config, what));
-            let connected = named.and_then(|address| link::connect_over(network, &LinkOptions::new(config, address), &progress.before));
+            let connected = named.and_then(|address| link::connect_over(network, &LinkOptions::new(config, address), &mut progress.before));
             match connected {
                 Ok(session) => {
                     note.warn(payload::warning(session.state(), config.robot.payload_kg).unwrap_or_default(), say);

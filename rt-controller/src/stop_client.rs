@@ -6,10 +6,10 @@
 //! `decant`, and nobody else can answer for it.
 
 use std::collections::BTreeMap;
-use std::io::{BufRead, BufReader, Write};
+use std::io::{BufRead, BufReader, ErrorKind, Write};
 use std::os::linux::net::SocketAddrExt;
 use std::os::unix::net::{SocketAddr, UnixStream};
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::sync::mpsc;
 use std::time::Duration;
 
@@ -46,6 +46,7 @@ impl From<Place> for Target {
         let (mut believed, mut doubted) = (Vec::new(), String::new());
         for directory in directories {
             match claim::owner(&directory, named) {
+                Ok(Some(_)) if is_closed(&directory) => doubted = format!("{} is closed to this user", directory.display()),
                 Ok(owner) => believed.extend(owner.map(|uid| (directory, uid))),
                 Err(why) => doubted = why,
             }
@@ -55,14 +56,22 @@ impl From<Place> for Target {
     }
 }
 
-/// The cells of this user whose controllers run, and for root those of all users.
-pub fn running_cells() -> Vec<Target> {
+/// Whether this user may not look into `directory`, so that a controller may run there unseen.
+fn is_closed(directory: &Path) -> bool {
+    directory.join("stop").symlink_metadata().is_err_and(|e| e.kind() == ErrorKind::PermissionDenied)
+}
+
+/// The cells of this user whose controllers run, and for root those of all users. And of the runtime directories that look like such a cell's and are not
+/// believed, which and why, a line each.
+pub fn running_cells() -> (Vec<Target>, Vec<String>) {
     let mut found: BTreeMap<(u32, String), Vec<PathBuf>> = BTreeMap::new();
+    let mut doubted = Vec::new();
     for entry in bases().iter().filter_map(|b| std::fs::read_dir(b).ok()).flatten().flatten() {
-        if entry.path().join("stop").exists()
-            && let Ok(Some(uid)) = claim::owner(&entry.path(), false)
-        {
-            found.entry((uid, entry.file_name().to_string_lossy().into_owned())).or_default().push(entry.path());
+        let runs = entry.path().join("stop").exists();
+        match claim::owner(&entry.path(), false) {
+            Ok(Some(uid)) if runs => found.entry((uid, entry.file_name().to_string_lossy().into_owned())).or_default().push(entry.path()),
+            Err(why) if runs || is_closed(&entry.path()) => doubted.push(why),
+            _ => {}
         }
     }
     for line in std::fs::read_to_string("/proc/net/unix").unwrap_or_default().lines() {
@@ -73,7 +82,7 @@ pub fn running_cells() -> Vec<Target> {
     }
     let may_stop = |uid: u32, directories: &[PathBuf]| uid == own_uid() || own_uid() == 0 || !directories.is_empty();
     let targets = found.into_iter().map(|((uid, name), directories)| Target { name, uid, directories, doubted: String::new() });
-    targets.filter(|t| may_stop(t.uid, &t.directories)).collect()
+    (targets.filter(|t| may_stop(t.uid, &t.directories)).collect(), doubted)
 }
 
 impl Target {

@@ -1,7 +1,7 @@
 //! How much may leave a vessel after a fault could first be noticed: flow at that moment times reaction, and what flows on the way upright.
 //!
 //! Pure; allocates nothing; cannot fail. The bound is not a number for all vessels: it is reckoned from the liquid as it is at that moment. A copy
-//! of the vessel is tilted as high as the command in force asks for, held there for the longest reaction, and brought upright at the rate of the
+//! of the vessel is tilted as high as the commands that the joint still follows ask for, held there for the longest reaction, and brought upright at the rate of the
 //! way upright. Whoever reacts as fast as the documents say lets no more leave.
 
 use simulator::physics::container::Container;
@@ -28,7 +28,7 @@ pub struct Moment<'a> {
     pub container: &'a Container,
     /// Its tilt, degrees.
     pub alpha_deg: f64,
-    /// The target in force, degrees, and the rate at which targets come, degrees/s, if there is one.
+    /// The highest target that the joint still follows, degrees, and the rate at which targets come, degrees/s, if there is one.
     pub target: Option<(f64, f64)>,
     /// Time constant of the joint's lag, s.
     pub lag_s: f64,

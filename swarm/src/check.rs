@@ -2,6 +2,8 @@
 //!
 //! Pure; allocates for what it finds; cannot fail. docs/SWARM.md lists the invariants by the names that are used here.
 
+use std::collections::VecDeque;
+
 use rt_controller::core::Settings;
 use rt_controller::journal::Tick;
 use rt_controller::link::ProgramState;
@@ -45,7 +47,7 @@ const LOOKS_S: f64 = 0.2;
 const LASTS_S: f64 = 9.0;
 /// How long a container may stand tilted after its program has ended by itself, s: one cycle would do, and the arm needs time to stop.
 const LEFT_TILTED_S: f64 = 2.0;
-/// For how long a robot still follows the last target that was sent, s: the patience of its program, and what it is behind.
+/// For how long a robot still follows a target that was sent, s: the patience of its program, and what it is behind.
 const FOLLOWED_S: f64 = 0.3;
 /// Most frames that are bridged at once: one second (`BRIDGED_S` of the controller's core).
 const MOST_BRIDGED: u64 = RATE_HZ as u64;
@@ -97,8 +99,8 @@ pub struct Checks {
     way_back: (i32, bool),
     /// The newest target, degrees, and the rate at which it came.
     target: Option<(f64, f64)>,
-    /// When the newest target was sent, s, and which, degrees; also when there is none any more.
-    last_target: Option<(f64, f64)>,
+    /// When the targets that the robot may still follow were sent, s, and which, degrees; also when there is none any more.
+    sent_targets: VecDeque<(f64, f64)>,
     pub(crate) phase: Phase,
     /// Since when the robot could have been on its way upright, s.
     free_since_s: Option<f64>,
@@ -154,7 +156,7 @@ impl Checks {
             violations: Vec::new(),
             faults: Vec::new(),
             target: None,
-            last_target: None,
+            sent_targets: VecDeque::new(),
             phase: Phase::NoRobot,
             free_since_s: None,
             sequence: (0, 0),
@@ -219,11 +221,12 @@ impl Checks {
         (self.target, self.phase, self.sequence, self.used, self.features_before) = (None, Phase::NoRobot, (0, 0), 0, 0);
     }
 
-    /// The target in force, degrees, and the rate at which targets come, degrees/s; `None` if there is none. The robot still follows the last one
-    /// of a controller that sends no more.
+    /// The highest target that the robot may still follow, degrees, and the rate at which targets come, degrees/s; `None` if there is none. A joint
+    /// that lags still goes up to a target that has been taken back, and follows the last one of a controller that sends no more.
     pub fn target(&self, at_s: f64) -> Option<(f64, f64)> {
-        let last = self.last_target.filter(|(sent_s, _)| at_s - sent_s < FOLLOWED_S).map(|(_, deg)| (deg, 0.0));
-        self.target.or(last)
+        let followed = self.sent_targets.iter().filter(|(sent_s, _)| at_s - sent_s < FOLLOWED_S);
+        let highest_deg = followed.map(|(_, deg)| *deg).chain(self.target.map(|(deg, _)| deg)).reduce(f64::max)?;
+        Some((highest_deg, self.target.map_or(0.0, |(_, rate)| rate)))
     }
 
     /// The limits on alpha.
@@ -347,7 +350,8 @@ impl Checks {
             self.violated("target-acceleration", at_s, format!("targets change by {acceleration:.0} degrees/s^2"));
         }
         self.target = Some((target_deg, rate));
-        self.last_target = Some((at_s, target_deg));
+        self.sent_targets.retain(|(sent_s, _)| at_s - sent_s < FOLLOWED_S);
+        self.sent_targets.push_back((at_s, target_deg));
         self.noticed(at_s);
     }
 

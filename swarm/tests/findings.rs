@@ -288,3 +288,21 @@ fn what_still_leaves_is_in_the_deviation() {
     assert!(pour.reason == EndReason::Aborted && pour.true_ml > f64::from(pour.believed_ml) + 3.0, "it is not cut: {pour:?}");
     assert!(pour.sd_ml > 2.0, "{pour:?}");
 }
+
+/// Protects the check (seed 12703090): the pour had turned back by a degree before the camera's freeze could be noticed, and the joint, which lags, still
+/// went up to the target that was taken back, where the vessel gave its surge.
+#[test]
+fn a_joint_goes_up_to_a_target_that_was_taken_back() {
+    let happens = [
+        (2_747, What::Pour(54.63589), None),
+        (2_870, What::ControllerKilled(2_568), Some("controller-killed")),
+        (21_340, What::Refill(195.13843694486638), None),
+        (21_440, What::Resume, None),
+        (22_840, What::Pour(157.3873), None),
+        (26_813, What::Eye(EyeFault::Freeze(7)), Some("eye-freeze")),
+    ];
+    let plan = (46.73887463909508, (341_760, 1_191_040));
+    let shown = lagging(12_703_090, (Series::Cb3, 0.04306554955715691), 8, plan, &happens);
+    let cost = shown.costs.iter().find(|cost| cost.fault == "eye-freeze").unwrap();
+    assert!(cost.excess_ml > 60.0 && cost.excess_ml < cost.bound_ml.unwrap(), "{cost:?}");
+}

@@ -8,6 +8,8 @@ mod json;
 mod logs;
 #[path = "doctor/metrics.rs"]
 mod metrics;
+#[path = "doctor/paths.rs"]
+mod paths;
 #[path = "doctor/room.rs"]
 mod room;
 #[path = "doctor/waiting.rs"]

@@ -3,6 +3,8 @@
 
 #[path = "stop/attacks.rs"]
 mod attacks;
+#[path = "stop/others.rs"]
+mod others;
 
 use std::os::linux::net::SocketAddrExt;
 use std::os::unix::fs::PermissionsExt;

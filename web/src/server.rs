@@ -15,7 +15,7 @@ use std::thread::JoinHandle;
 use std::time::Duration;
 
 use crossbeam::channel::{Receiver, Sender, TrySendError, bounded};
-use http_body_util::{BodyExt as _, Limited};
+use http_body_util::{BodyExt as _, LengthLimitError, Limited};
 use hyper::body::{Body as _, Incoming};
 use hyper::header::{self, HeaderValue};
 use hyper::service::service_fn;
@@ -324,7 +324,9 @@ async fn hand_over(head: hyper::http::request::Parts, body: Incoming, peer: Sock
         return Err(too_large());
     }
     let body = timeout(BODY, Limited::new(body, BODY_MAX).collect()).await;
-    let body = body.map_err(|_| refused(StatusCode::REQUEST_TIMEOUT, "the request came too slowly"))?.map_err(|_| too_large())?;
+    let body = body.map_err(|_| refused(StatusCode::REQUEST_TIMEOUT, "the request came too slowly"))?;
+    let unreadable = || refused(StatusCode::BAD_REQUEST, "the request's body cannot be read: its length or its chunks are wrong");
+    let body = body.map_err(|e| if e.is::<LengthLimitError>() { too_large() } else { unreadable() })?;
     let request = Request {
         post: head.method == Method::POST,
         path: head.uri.path().into(),

@@ -124,6 +124,12 @@ fn what_foreign_pages_send_is_refused() {
     assert_eq!(post(&format!("{host}{kind}Origin: http://evil.example\r\n")), "403");
     assert_eq!(post(&format!("{host}{origin}Content-Type: text/plain\r\n")), "415");
     assert_eq!(post(&format!("Host: evil.example:{}\r\n{origin}{kind}", page.address.port())), "421");
+    let chunks = |body: &str| page.status(&format!("POST /a HTTP/1.1\r\n{host}{origin}{kind}Transfer-Encoding: chunked\r\n\r\n{body}"));
+    assert_eq!(
+        (chunks("2\r\n{}\r\n0\r\n\r\n"), chunks("no length\r\n")),
+        ("200".into(), "400".into()),
+        "a body that is none is not too large"
+    );
     assert_eq!(page.status("DELETE /a HTTP/1.1\r\nHost: HOST\r\n\r\n"), "405");
     // An absolute address in the first line counts as the host does, whatever the host says beside it (RFC 9112, 3.2.2).
     let absolute = |target: &str| page.status(&format!("GET {target} HTTP/1.1\r\nHost: HOST\r\n\r\n"));

@@ -2,6 +2,7 @@
 //!
 //! Called once by an ordinary thread; allocates and reads the disk; nothing fails. Nothing is made or changed.
 
+use std::io::ErrorKind;
 use std::os::unix::fs::MetadataExt as _;
 use std::path::{Path, PathBuf};
 
@@ -37,7 +38,7 @@ pub fn look(file: &Path, config: &Config) -> Vec<Finding> {
     findings.push(shared_memory());
     findings.push(strangers());
     findings.push(weights(file, config));
-    findings.extend(config.controller.journal.as_ref().map(|file| journal(file.parent().unwrap_or(file))));
+    findings.extend(config.controller.journal.as_deref().map(journal));
     let folder = Folder::look(&config.recording.directory);
     findings.push(match writable("episodes", &config.recording.directory) {
         Ok((there, free)) => episodes(&there, free, folder, recorded_today(&config.recording.directory)),
@@ -95,7 +96,7 @@ fn weights(file: &Path, config: &Config) -> Finding {
     let path = &config.controller.weights;
     let trusted = std::fs::metadata(file).ok().map(|m| m.uid());
     let train = "record and weigh episodes, and train: README.md, \"Use it on a robot\"";
-    if !path.exists() {
+    if path.metadata().is_err_and(|e| e.kind() == ErrorKind::NotFound) {
         return Finding::yellow(
             "weights",
             format!("{} is not there", path.display()),
@@ -161,7 +162,11 @@ fn budget(budget: Budget, folder: Folder) -> Finding {
 
 /// `directory`, or the first above it that is there, and its free space, bytes, if it may be written.
 fn writable(what: &str, directory: &Path) -> Result<(PathBuf, u64), Finding> {
-    let there: PathBuf = directory.ancestors().find(|d| d.is_dir()).unwrap_or(Path::new("/")).into();
+    let there: PathBuf = directory.ancestors().find(|d| d.symlink_metadata().is_ok()).unwrap_or(Path::new("/")).into();
+    if !there.is_dir() {
+        let is = format!("{} is no directory", there.display());
+        return Err(Finding::red(what, is, "nothing can be written there", "remove it, or configure another place"));
+    }
     let access = rustix::fs::Access::WRITE_OK | rustix::fs::Access::EXEC_OK;
     if let Err(e) = rustix::fs::accessat(rustix::fs::CWD, &there, access, rustix::fs::AtFlags::EACCESS) {
         let advice = format!("give it to this user (user {}), or configure another place", own_uid());
@@ -172,8 +177,14 @@ fn writable(what: &str, directory: &Path) -> Result<(PathBuf, u64), Finding> {
     free_bytes(&there).ok_or_else(unknown).map(|free| (there, free))
 }
 
-/// How long the disk lasts for the journal in `directory`.
-fn journal(directory: &Path) -> Finding {
+/// Whether the controller can begin the journal at `file`, and how long the disk lasts for it.
+fn journal(file: &Path) -> Finding {
+    if file.symlink_metadata().is_ok()
+        && let Err(e) = rt_controller::journal::check_place(file)
+    {
+        return Finding::red("journal", e.to_string(), "the controller does not start", "remove it, or choose another controller.journal");
+    }
+    let directory = file.parent().unwrap_or(file);
     let (there, free) = match writable("journal", directory) {
         Ok(found) => found,
         Err(finding) => return finding,

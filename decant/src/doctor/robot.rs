@@ -4,9 +4,9 @@
 //! on the robot. Of a robot that a controller of this cell already has, ports and dashboard are looked at, and the
 //! controller is asked.
 
-use std::io::{BufRead as _, BufReader, ErrorKind, Write as _};
+use std::io::{ErrorKind, Read as _, Write as _};
 use std::net::{IpAddr, SocketAddr, TcpStream};
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use rt_controller::claim::{self, Running};
 use rt_controller::client::Client;
@@ -22,6 +22,8 @@ const DASHBOARD: u16 = 29999;
 const PORTS: [u16; 4] = [30001, 30002, 30003, 30004];
 /// How long a port may take to answer. Chosen by hand: a robot on the same network answers within milliseconds.
 const ANSWER: Duration = Duration::from_secs(2);
+/// Longest line of the dashboard, bytes. Chosen by hand: its answers are a few words.
+const LINE_MAX: usize = 512;
 /// What the robot's target speed is at least, as a fraction, where its slider stands at full speed: link/health.rs in rt-controller refuses less.
 const FULL_SPEED: f64 = 0.995;
 
@@ -106,19 +108,34 @@ fn program_port(ports: &[(u16, Result<(), String>)]) -> Finding {
     }
 }
 
+/// The next line that comes within [`ANSWER`]. Whatever else listens there may send bytes for ever, fast or slowly, and no line.
+fn line(stream: &mut TcpStream) -> std::io::Result<String> {
+    let until = Instant::now() + ANSWER;
+    let mut line = Vec::new();
+    while line.len() < LINE_MAX {
+        let left = until.saturating_duration_since(Instant::now()).max(Duration::from_millis(1));
+        stream.set_read_timeout(Some(left))?;
+        let mut byte = [0];
+        stream.read_exact(&mut byte)?;
+        match byte {
+            [b'\n'] => return Ok(String::from_utf8_lossy(&line).trim().into()),
+            _ if Instant::now() > until => return Err(ErrorKind::TimedOut.into()),
+            [byte] => line.push(byte),
+        }
+    }
+    Err(std::io::Error::other("what answers there is no dashboard"))
+}
+
 /// What the dashboard says. It is not needed for a pour.
 fn dashboard(address: IpAddr) -> Finding {
     let ask = || -> std::io::Result<Vec<String>> {
-        let stream = TcpStream::connect_timeout(&SocketAddr::new(address, DASHBOARD), ANSWER)?;
-        stream.set_read_timeout(Some(ANSWER))?;
+        let mut stream = TcpStream::connect_timeout(&SocketAddr::new(address, DASHBOARD), ANSWER)?;
         stream.set_write_timeout(Some(ANSWER))?;
-        let mut writer = stream.try_clone()?;
-        let mut reader = BufReader::new(stream).lines();
-        reader.next().transpose()?;
+        line(&mut stream)?;
         let mut answers = Vec::new();
         for question in ["robotmode", "safetystatus", "is in remote control"] {
-            writeln!(writer, "{question}")?;
-            answers.extend(reader.next().transpose()?);
+            writeln!(stream, "{question}")?;
+            answers.push(line(&mut stream)?);
         }
         Ok(answers)
     };
@@ -163,5 +180,31 @@ fn refused(what: &str, good: &str, result: Result<(), LinkError>, means: &str) -
     match result {
         Ok(()) => Finding::green(what, good),
         Err(e) => Finding::red(what, e.to_string(), means, ""),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::net::{Ipv4Addr, TcpListener};
+
+    use shared::machine::Verdict;
+
+    use super::*;
+
+    /// Protects the doctor from what else may listen at a robot's address: what hangs up without an answer is no dashboard that is in order, and what sends
+    /// bytes without end neither holds it nor fills its memory.
+    #[test]
+    fn what_is_no_dashboard_is_not_green() {
+        for (own, flood) in [(Ipv4Addr::new(127, 91, 3, 1), false), (Ipv4Addr::new(127, 91, 3, 2), true)] {
+            let listener = TcpListener::bind((own, DASHBOARD)).unwrap();
+            let serve = std::thread::spawn(move || {
+                let (mut stream, _) = listener.accept().unwrap();
+                while flood && stream.write_all(&[b'x'; 4096]).is_ok() {}
+            });
+            let found = dashboard(own.into());
+            assert_eq!(found.verdict, Verdict::Yellow, "{found:?}");
+            assert!(!flood || found.is.contains("is no dashboard"), "{found:?}");
+            serve.join().unwrap();
+        }
     }
 }

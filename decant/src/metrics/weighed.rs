@@ -9,7 +9,7 @@ use std::sync::atomic::{AtomicBool, Ordering::Relaxed};
 use std::sync::{Mutex, PoisonError};
 use std::time::{Duration, SystemTime};
 
-use shared::episode::{Episode, EpisodeKind, find_episodes};
+use shared::episode::{Episode, EpisodeKind, by_number, find_episodes};
 
 /// Pause between two looks at the episodes. Chosen by hand: weighing takes a person longer.
 const LOOK: Duration = Duration::from_secs(10);
@@ -44,7 +44,10 @@ pub struct Weighed(Mutex<BTreeMap<PathBuf, (Stamp, Option<Pour>)>>);
 impl Weighed {
     /// The weighed pours, the oldest first.
     pub fn pours(&self) -> Vec<Pour> {
-        self.0.lock().unwrap_or_else(PoisonError::into_inner).values().filter_map(|(_, pour)| *pour).collect()
+        let known = self.0.lock().unwrap_or_else(PoisonError::into_inner);
+        let mut pours: Vec<(&PathBuf, Pour)> = known.iter().filter_map(|(path, (_, pour))| Some((path, (*pour)?))).collect();
+        pours.sort_by(|(a, _), (b, _)| by_number(a, b));
+        pours.into_iter().map(|(_, pour)| pour).collect()
     }
 
     /// Looks at the episodes in `directory` again and again, until `stop` is set.
@@ -63,8 +66,7 @@ impl Weighed {
     /// Reads what is new in `directory`.
     pub fn look(&self, directory: &Path, stop: &AtomicBool) {
         let mut paths = find_episodes(&[directory.to_path_buf()]).unwrap_or_default();
-        // Their names begin with their numbers, which only grow.
-        paths.sort();
+        // They are in the order of their numbers, which only grow.
         let newest = paths.split_off(paths.len().saturating_sub(EPISODES));
         let locked = || self.0.lock().unwrap_or_else(PoisonError::into_inner);
         locked().retain(|path, _| newest.contains(path));
@@ -80,5 +82,41 @@ impl Weighed {
             });
             locked().insert(path, (stamp, pour));
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use shared::config::Config;
+    use shared::episode::{EpisodeEnd, EpisodeStart, EpisodeWriter, FrameRow, set_weight};
+    use shared::messages::Feature;
+
+    use super::*;
+
+    /// Protects who watches the errors of a cell that has poured for years: as text, the ten thousandth episode is older than the second, and it must
+    /// neither fall out of the newest ones nor stand before others.
+    #[test]
+    fn the_ten_thousandth_pour_is_the_newest() {
+        let config = Config::read(&Path::new(env!("CARGO_MANIFEST_DIR")).join("../config/sim.toml")).unwrap();
+        let dir = tempfile::tempdir().unwrap();
+        let pour = |episode: u64, weight_g| {
+            let kind = EpisodeKind::Pour { goal_ml: 50.0 };
+            let wall_clock = SystemTime::now();
+            let start = EpisodeStart { episode, kind, started_at_ns: 1, wall_clock, config: &config, weights: "" };
+            let mut writer = EpisodeWriter::create(dir.path(), &start).unwrap();
+            let feature = Feature { captured_at_ns: 2, sequence: 1, ..Default::default() };
+            writer.frame(&FrameRow { feature: &feature, alpha_commanded_deg: 0.0, alpha_measured_deg: 0.0, image: None }).unwrap();
+            let path = writer.finish(&EpisodeEnd { complete: true, reason: "over", disordered_frames: 0 }).unwrap();
+            set_weight(&path, weight_g).unwrap();
+        };
+        pour(9999, 51.0);
+        pour(10_000, 52.0);
+        for number in 0..EPISODES {
+            std::fs::write(dir.path().join(format!("episode-{}.mcap", 9998 - number)), b"no episode").unwrap();
+        }
+        let weighed = Weighed::default();
+        weighed.look(dir.path(), &AtomicBool::new(false));
+        let newest: Vec<f64> = weighed.pours().into_iter().map(Pour::error_ml).collect();
+        assert_eq!(newest, [1.0, 2.0]);
     }
 }

@@ -1,7 +1,7 @@
 //! `experiments jitter`: latency and jitter of the real processes on this machine, beside cyclictest, at rest and under load.
 //!
 //! Ordinary process; allocates and blocks. It runs the simulated cell in rounds, and between them cyclictest with the same priority, core
-//! and interval, and a bare loop that makes only the loop's system calls; all once on the machine as it is and once under stress-ng. It ends
+//! and interval, and a bare loop that makes only the loop's system calls; all on the machine as it is, under stress-ng, and in a storm of it. It ends
 //! with a verdict, a page and its numbers as JSON. With `--against` it is a gate: it fails if the machine or the code became worse. It fails
 //! with one line when a program is missing; what was measured until then is lost. `scripts/jitter` installs what is needed.
 
@@ -31,7 +31,7 @@ pub struct Args {
     /// Weights to pour with.
     #[arg(long)]
     weights: PathBuf,
-    /// Rounds; in each, cell and cyclictest run at rest and under load.
+    /// Rounds; in each, cell, cyclictest and a bare loop run at rest, under load and in a storm.
     #[arg(long, default_value_t = 5)]
     rounds: usize,
     /// Length of each run, s.

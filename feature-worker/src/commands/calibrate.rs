@@ -17,10 +17,11 @@ use shared::exit::{self, Failure, OrExit as _, failure};
 use shared::ipc::Cell;
 use shared::messages::PixelFormat;
 use shared::os;
+use shared::plural::counted;
 use web::{Answer, Server, Settings};
 
 use crate::drawing::{draw, jpeg, save};
-use crate::source::{FrameSource as _, NextFrame, ObserverSource, WAIT};
+use crate::source::{FrameSource, NextFrame, ObserverSource, WAIT};
 use crate::vision::{Axes, AxesError, ColourError, ColourLearner, Corner, Extractor, Image, RoomBeside, find_corner, room_beside};
 use crate::worker::lacks_room;
 
@@ -28,7 +29,7 @@ mod checks;
 mod pour;
 mod section;
 
-use pour::Pour;
+use pour::{FILM_MOST, Pour};
 
 /// The most pictures of one pose from which the colour is learned. Chosen by hand: as many as a turning background leaves in one pose.
 const PICTURES_OF_A_POSE: usize = 4;
@@ -54,7 +55,7 @@ pub struct Args {
     #[arg(long, env = shared::config::VARIABLE, default_value = shared::config::DEFAULT_FILE)]
     config: PathBuf,
     /// How long to watch a live camera.
-    #[arg(long, default_value_t = 15)]
+    #[arg(long, default_value_t = 15, value_parser = clap::value_parser!(u64).range(1..))]
     seconds: u64,
     /// The corner where the top edge and the left side meet, px: X,Y.
     #[arg(long, value_parser = parse_point)]
@@ -168,16 +169,31 @@ fn watch(args: &Args, config: &Config) -> Result<Pour, Failure> {
     let cell = Cell::join(&config.cell).or_exit(exit::UNREACHABLE)?;
     let mut source = ObserverSource::open(&config.camera, &cell).map_err(|e| failure(e.exit_code(), e))?;
     eprintln!("calibrate: watching the camera for {} s; pour once now", args.seconds);
-    let end = Instant::now() + Duration::from_secs(args.seconds);
-    let mut pour = Pour::live();
-    while Instant::now() < end && !pour.is_full() {
+    let (pour, cut) = watch_for(&mut source, Duration::from_secs(args.seconds), Pour::live(FILM_MOST))?;
+    cut.iter().for_each(|line| eprintln!("calibrate: {line}"));
+    if pour.count == 0 { Err(reach("no frame came from the camera; is its driver running?".into())) } else { Ok(pour) }
+}
+
+/// Adds to `pour` what `source` shows `within` this time. Gives also what to say if that was cut short, because no more of it can be kept.
+fn watch_for(source: &mut impl FrameSource, within: Duration, mut pour: Pour) -> Result<(Pour, Option<String>), Failure> {
+    let begin = Instant::now();
+    while begin.elapsed() < within {
+        if pour.is_full() {
+            let (seen_s, of_s) = (begin.elapsed().as_secs_f64(), within.as_secs());
+            let line = format!(
+                "only the first {seen_s:.0} s of {of_s} s were watched ({}), because the memory for pictures is full: what came later is not in it; if \
+                 that was a part of the pour, start again and pour at once, or with a smaller picture",
+                counted(pour.count, "frame")
+            );
+            return Ok((pour, Some(line)));
+        }
         match source.next_frame(WAIT).or_exit(exit::UNREACHABLE)? {
-            NextFrame::Frame(frame) => pour.add(&frame).map_err(reach)?,
+            NextFrame::Frame(frame) => pour.add(&frame).map_err(|e| failure(exit::UNREACHABLE, e))?,
             NextFrame::Nothing => {}
             NextFrame::End => break,
         }
     }
-    if pour.count == 0 { Err(reach("no frame came from the camera; is its driver running?".into())) } else { Ok(pour) }
+    Ok((pour, None))
 }
 
 /// The corner. What the command line leaves open is found in the pictures, which are `width` by `height` px.
@@ -314,4 +330,38 @@ fn try_corner(config: &Config, clicked: &[u8], pour: &Pour) -> Result<(Config, C
     let corner = serde_json::from_slice::<Corner>(clicked).map_err(|e| e.to_string())?;
     let Proposal { image, remarks } = propose(config, corner, pour)?;
     Ok((Config { image, ..config.clone() }, corner, remarks))
+}
+
+#[cfg(test)]
+mod tests {
+    use shared::messages::FrameHeader;
+
+    use super::*;
+    use crate::source::{Frame, SourceError};
+
+    /// A camera that shows noise, which no JPEG makes small.
+    struct Noise(Vec<u8>, u32);
+
+    impl FrameSource for Noise {
+        fn next_frame(&mut self, _: Duration) -> Result<NextFrame<'_>, SourceError> {
+            for byte in &mut self.0 {
+                self.1 = self.1.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
+                *byte = (self.1 >> 24) as u8;
+            }
+            let header = FrameHeader { width_px: 64, height_px: 48, format: PixelFormat::Bgr8 as u32, ..Default::default() };
+            Ok(NextFrame::Frame(Frame { header, pixels: &self.0 }))
+        }
+    }
+
+    /// Protects who pours before a camera for a minute from a calibration of the first seconds that says nothing of it: a watch that ends because no
+    /// more can be kept says how long it was, of how long.
+    #[test]
+    fn a_watch_that_is_cut_short_says_so() {
+        let mut camera = Noise(vec![0; 64 * 48 * 3], 1);
+        let (pour, cut) = watch_for(&mut camera, Duration::from_secs(3600), Pour::live(100_000)).unwrap();
+        let line = cut.unwrap();
+        assert!(pour.count > 3 && line.contains(&format!("0 s of 3600 s were watched ({} frames)", pour.count)), "{line}");
+        let (_, cut) = watch_for(&mut camera, Duration::ZERO, Pour::live(100_000)).unwrap();
+        assert_eq!(cut, None);
+    }
 }

@@ -227,12 +227,14 @@ fn check(files: &[PathBuf], as_json: bool) -> Result<(), Failure> {
 }
 
 fn weigh(args: &WeighArgs) -> Result<(), Failure> {
-    let before = set_weight(&args.file, args.weight).map_err(|e| change_failure(&e))?;
+    // A negative zero is none on any scale.
+    let weight = args.weight + 0.0;
+    let before = set_weight(&args.file, weight).map_err(|e| change_failure(&e))?;
     if args.json {
-        print_json(&json!({ "file": args.file.display().to_string(), "weight_g": args.weight, "before_g": before }));
+        print_json(&json!({ "file": args.file.display().to_string(), "weight_g": weight, "before_g": before }));
     } else {
         let before = before.map_or("had none before".into(), |b| format!("was {b} g"));
-        println!("{}: {} g ({before})", plain(&args.file.display().to_string()), args.weight);
+        println!("{}: {weight} g ({before})", plain(&args.file.display().to_string()));
     }
     Ok(())
 }

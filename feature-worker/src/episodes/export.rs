@@ -11,8 +11,11 @@ use shared::episode::{Episode, EpisodeImages, write_table};
 use shared::plural::counted;
 
 use super::lerobot;
-use super::output::{ExportError, LeftOut, all_free, disk_error};
+use super::output::{ExportError, LeftOut, all_free, disk_error, unfit};
 use super::video::{Video, for_each_row_with_image, mean_rate_hz};
+
+/// The most files that the error of an export names of which nothing was written. Chosen by hand: a person reads the line.
+const NAMED: usize = 8;
 
 /// What an export writes.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
@@ -37,20 +40,24 @@ pub struct Exported {
 }
 
 /// Writes the episodes of `files` into the directory `to`, which is made if it is missing. A file that cannot be read, or has pictures that
-/// cannot be exported, is left out and returned. Shows its progress on the terminal.
+/// cannot be exported, is left out and returned, and so is an incomplete one where the format cannot say that it is. An error says why if nothing is
+/// left. Shows its progress on the terminal.
 pub fn export(files: &[PathBuf], format: ExportFormat, to: &Path) -> Result<Exported, ExportError> {
     let (mut episodes, mut left_out) = (Vec::new(), Vec::new());
+    // Neither can say that an end is missing, and whoever learns from it would take it for a whole one.
+    let whole = matches!(format, ExportFormat::Csv | ExportFormat::Lerobot);
     for file in files {
         match Episode::read(file) {
+            Ok(episode) if whole && !episode.complete => {
+                let why = "it is incomplete, so that its frames do not add up to its weight; export it as images or as a video";
+                left_out.push(LeftOut { file: file.clone(), why: unfit(file, why).to_string() });
+            }
             Ok(episode) => episodes.push((file.clone(), episode)),
             Err(e) => left_out.push(LeftOut { file: file.clone(), why: e.to_string() }),
         }
     }
     if episodes.is_empty() {
-        return Err(ExportError::Nothing(match left_out.first() {
-            None => "no episodes to export; name .mcap files or a directory of them".into(),
-            Some(first) => format!("none of {} can be read; {}", counted(files.len(), "episode"), first.why),
-        }));
+        return Err(nothing(&left_out));
     }
     fs::create_dir_all(to).map_err(|e| disk_error(to, &e))?;
     if format == ExportFormat::Csv {
@@ -62,8 +69,9 @@ pub fn export(files: &[PathBuf], format: ExportFormat, to: &Path) -> Result<Expo
     let bar = progress(episodes.iter().map(|(_, e)| e.rows.len() as u64).sum());
     let mut written = Vec::new();
     if format == ExportFormat::Lerobot {
-        left_out.append(&mut lerobot::write(&episodes, to, &bar)?);
-        written.push(to.to_path_buf());
+        if lerobot::write(&episodes, to, &bar, &mut left_out)? {
+            written.push(to.to_path_buf());
+        }
     } else {
         let ending = if format == ExportFormat::Video { ".mp4" } else { "" };
         let target = |file: &Path| {
@@ -86,7 +94,19 @@ pub fn export(files: &[PathBuf], format: ExportFormat, to: &Path) -> Result<Expo
         }
     }
     bar.finish_and_clear();
-    Ok(Exported { written, left_out })
+    if written.is_empty() { Err(nothing(&left_out)) } else { Ok(Exported { written, left_out }) }
+}
+
+/// The error where no episode is exported, with what was left out and why.
+fn nothing(left_out: &[LeftOut]) -> ExportError {
+    if left_out.is_empty() {
+        return ExportError::Nothing("no episodes to export; name .mcap files or a directory of them".into());
+    }
+    let mut whys: Vec<String> = left_out.iter().take(NAMED).map(|one| one.why.clone()).collect();
+    if left_out.len() > NAMED {
+        whys.push(format!("and {}", counted(left_out.len() - NAMED, "more file")));
+    }
+    ExportError::Nothing(format!("no episode can be exported; {}", whys.join("; ")))
 }
 
 fn progress(total: u64) -> ProgressBar {
@@ -101,14 +121,16 @@ fn progress(total: u64) -> ProgressBar {
 fn pictures(file: &Path, target: &Path, bar: &ProgressBar) -> Result<PathBuf, ExportError> {
     fs::create_dir(target).map_err(|e| disk_error(target, &e))?;
     let write = || {
+        let mut written = 0;
         for image in EpisodeImages::open(file)? {
             let image = image?;
             let extension = if image.format == "png" { "png" } else { "jpg" };
             let path = target.join(format!("frame-{:08}.{extension}", image.sequence));
             fs::write(&path, &image.data).map_err(|e| disk_error(&path, &e))?;
             bar.inc(1);
+            written += 1;
         }
-        Ok(target.to_path_buf())
+        if written == 0 { Err(unfit(file, "the episode has no images")) } else { Ok(target.to_path_buf()) }
     };
     write().inspect_err(|_| {
         // It was not there before, so it is ours, and a part of an episode would look like all of it.

@@ -38,16 +38,15 @@ const IMAGE_STEP: usize = 10;
 const RATE_TOLERANCE: f64 = 0.03;
 
 /// Writes the data set of `episodes`, each with the file that it was read from, into the new directory `root`. Each image moves `bar` on by
-/// one. The data set has the middle one of the episodes' rates. Returns what was left out: files without images, with images that cannot be
-/// read, of another size than those before, or at another rate.
-pub fn write(episodes: &[(PathBuf, Episode)], root: &Path, bar: &ProgressBar) -> Result<Vec<LeftOut>, ExportError> {
+/// one. The data set has the middle one of the episodes' rates. Adds to `left_out` what is not in it: files without images, with images that cannot be
+/// read, of another size than those before, or at another rate. If that is all of them, there is no data set, and it returns false.
+pub fn write(episodes: &[(PathBuf, Episode)], root: &Path, bar: &ProgressBar, left_out: &mut Vec<LeftOut>) -> Result<bool, ExportError> {
     if root.join("meta").exists() {
         return Err(write_error(root, "holds a data set already; name another directory"));
     }
     let mut rates_hz: Vec<f64> = episodes.iter().map(|(_, e)| mean_rate_hz(e)).collect();
     rates_hz.sort_by(f64::total_cmp);
     let mut set = DataSet::new(rates_hz.get(rates_hz.len() / 2).copied().unwrap_or(USUAL_RATE_HZ));
-    let mut left_out = Vec::new();
     for (file, episode) in episodes {
         match set.add(file, episode, root, bar) {
             Ok(()) => {}
@@ -56,11 +55,9 @@ pub fn write(episodes: &[(PathBuf, Episode)], root: &Path, bar: &ProgressBar) ->
         }
     }
     if set.list.length.is_empty() {
-        let first = left_out.first().map_or(String::new(), |l| format!("; {}", l.why));
-        return Err(ExportError::Nothing(format!("no episode can be exported{first}")));
+        return Ok(false);
     }
-    set.finish(root)?;
-    Ok(left_out)
+    set.finish(root).map(|()| true)
 }
 
 /// The data set under way.

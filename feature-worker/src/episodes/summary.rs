@@ -109,7 +109,8 @@ fn kind_json(kind: EpisodeKind) -> Value {
 /// Everything about an episode but its rows and its images, as JSON.
 pub fn summary(episode: &Episode) -> Value {
     let largest = |values: &mut dyn Iterator<Item = f32>| values.filter(|v| v.is_finite()).fold(0.0, f32::max);
-    let area: f64 = episode.rows.iter().filter(|r| !r.area_px2.is_nan()).map(|r| f64::from(r.area_px2)).sum();
+    // The sum of no numbers is -0.
+    let area: f64 = 0.0 + episode.rows.iter().filter(|r| !r.area_px2.is_nan()).map(|r| f64::from(r.area_px2)).sum::<f64>();
     let doubtful = doubts(episode).into_iter().map(|(doubt, n)| (doubt.words().to_string(), json!(n)));
     let info = &episode.info;
     json!({

@@ -4,12 +4,14 @@
 //! a regular file of its own name, and not under way: the recorder holds a lock on the file that it writes. Copies are compared with the
 //! original before they get their name, and never take the place of a file. A failure names its file, and leaves the rest as it is.
 
+use std::cmp::Ordering;
 use std::fs;
 use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
 
 use sha2::{Digest, Sha256};
-use shared::episode::{Episode, hex, read_at_rest, take_number};
+use shared::config_paths::is_same;
+use shared::episode::{Episode, by_number, hex, read_at_rest, take_number};
 use shared::{regular_file, whole_file};
 
 use super::folder::{Budget, Folder};
@@ -57,9 +59,14 @@ pub fn delete(found: &Found) -> Result<(), ExportError> {
     fs::remove_file(&found.path).map_err(|e| fail(&e))
 }
 
+/// The oldest first. Of those that a clock which stands still gives one time, the number says which is older.
+fn by_age(a: &Found, b: &Found) -> Ordering {
+    a.episode.info.started_at_utc.cmp(&b.episode.info.started_at_utc).then_with(|| by_number(&a.path, &b.path))
+}
+
 /// Whether what is `beside` and cannot go breaks `budget` although of `found` only the newest stayed. No deletion helps there.
 pub fn is_out_of_reach(found: &[Found], beside: Folder, budget: Budget) -> bool {
-    let newest = found.iter().max_by_key(|f| (&f.episode.info.started_at_utc, &f.path));
+    let newest = found.iter().max_by(|a, b| by_age(a, b));
     let (episodes, bytes) = newest.map_or((0, 0), |f| (1, f.bytes));
     beside.episodes > 0 && !budget.holds(beside.episodes + episodes, beside.bytes + bytes)
 }
@@ -71,9 +78,8 @@ pub fn to_prune(found: &[Found], beside: Folder, budget: Budget, weighed: bool) 
     if is_out_of_reach(found, beside, budget) {
         return Vec::new();
     }
-    let age = |i: &usize| (&found[*i].episode.info.started_at_utc, &found[*i].path);
     let mut order: Vec<usize> = (0..found.len()).collect();
-    order.sort_by_key(age);
+    order.sort_by(|i, j| by_age(&found[*i], &found[*j]));
     order.pop();
     let rank = |i: &usize| match (&found[*i].episode.weight_g, found[*i].episode.complete) {
         (Some(_), _) => 2,
@@ -140,12 +146,19 @@ fn distinct(files: &[PathBuf], copied: &mut Copied) -> Result<Vec<(PathBuf, Epis
     Ok(all)
 }
 
-/// Copies all episodes of `files` into the directory `to`, in the order of their start, each with the next number that is free there.
+/// Copies all episodes of `files` into the directory `to`, in the order of their start, each with the next number that is free there. What lies there
+/// already is left out.
 pub fn merge(files: &[PathBuf], to: &Path) -> Result<Copied, ExportError> {
     let mut copied = Copied::default();
     let mut all = distinct(files, &mut copied)?;
     all.sort_by(|a, b| a.1.info.started_at_utc.cmp(&b.1.info.started_at_utc));
+    let lies_there =
+        |file: &Path| std::path::absolute(file).is_ok_and(|file| file.parent().is_some_and(|directory| is_same(directory, to)));
     for (file, episode) in all {
+        if lies_there(&file) {
+            copied.left_out.push(left_out(&file, "it lies there already"));
+            continue;
+        }
         let number = take_number(to).map_err(|e| disk_error(to, &e))?;
         let new = to.join(format!("episode-{number:04}.mcap"));
         copy(&file, &episode, &new)?;

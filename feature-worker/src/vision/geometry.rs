@@ -222,3 +222,20 @@ impl RayGrid {
         rays.iter().all(|r| r.samples >= SAMPLES_LEAST).then_some(Self { rays, radii_px, steps_px })
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use shared::config::Config;
+
+    /// Protects whoever adapts a shipped configuration: its axes show the directions that V_e is measured in, from the lip into the mouth, and from the
+    /// container's foot to its rim. Turned around they give areas that are wrong, and few of them.
+    #[test]
+    #[allow(clippy::unwrap_used)]
+    fn the_shipped_axes_point_the_right_way() {
+        for text in [include_str!("../../../config/sim.toml"), include_str!("../../../config/cell.toml")] {
+            let image = Config::parse(text, "shipped").unwrap().image;
+            let ([lip_x, _, mouth_x, _], [_, foot_y, _, rim_y]) = (image.x_axis_px, image.y_axis_px);
+            assert!(lip_x < mouth_x && foot_y > rim_y, "{image:?}");
+        }
+    }
+}

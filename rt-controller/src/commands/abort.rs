@@ -7,6 +7,7 @@
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
+use clap::builder::{OsStringValueParser, TypedValueParser as _};
 use rustix::process::{Pid, PidfdFlags, Signal, pidfd_open, pidfd_send_signal};
 use shared::config::{Config, VARIABLE};
 use shared::exit::{self, Failure, failure};
@@ -30,15 +31,20 @@ terminal and `kill` do the same. The container then comes upright, and the contr
 Exit codes: 0 upright, 1 not upright or not known, 3 no controller, 5 the robot cannot be moved.")]
 pub struct Args {
     /// The cell's configuration; without it, every cell that runs.
-    #[arg(long, env = VARIABLE)]
+    // An empty name, as of a variable that is set to nothing, is a configuration that cannot be read, and no reason not to stop.
+    #[arg(long, env = VARIABLE, value_parser = OsStringValueParser::new().map(PathBuf::from))]
     config: Option<PathBuf>,
 }
 
 /// Runs the command.
 pub fn run(args: &Args) -> Result<(), Failure> {
-    let targets = targets(args.config.as_deref());
+    let (targets, doubted) = targets(args.config.as_deref());
     if targets.is_empty() {
-        return Err(failure(exit::UNREACHABLE, "no rt-controller of this user is running"));
+        let none = || failure(exit::UNREACHABLE, "no rt-controller of this user is running");
+        return Err(if doubted.is_empty() { none() } else { not_known(&doubted.join("; ")) });
+    }
+    for why in doubted {
+        eprintln!("error: {}", not_known(&why).what);
     }
     // Every cell is asked before one is waited for.
     let asked: Vec<(Target, Result<Asked, Failure>)> = targets.into_iter().map(|t| (t.clone(), ask(&t))).collect();
@@ -58,15 +64,23 @@ pub fn run(args: &Args) -> Result<(), Failure> {
     result
 }
 
-/// The cells that are meant. A configuration that cannot be read must not keep anybody from stopping a robot.
-fn targets(config: Option<&Path>) -> Vec<Target> {
+/// The failure where a runtime directory is not believed, for the reasons `why`, so that nobody was asked there.
+fn not_known(why: &str) -> Failure {
+    let what =
+        format!("{why}; whether rt-controller runs there is not known: look at the robot, and abort as the cell's own user or as root");
+    failure(exit::FAILED, what)
+}
+
+/// The cells that are meant, and of the runtime directories that are not believed, why, a line each. A configuration that cannot be read must not keep
+/// anybody from stopping a robot.
+fn targets(config: Option<&Path>) -> (Vec<Target>, Vec<String>) {
     match config.map(Config::read) {
         Some(Ok(config)) => {
             let named = Target::from(Place::from(&config.cell));
             // Root stops a cell whoever runs it.
-            let others = || running_cells().into_iter().filter(|t| t.name == named.name).collect::<Vec<_>>();
+            let others = || running_cells().0.into_iter().filter(|t| t.name == named.name).collect::<Vec<_>>();
             let of_others = if own_uid() == 0 && named.ask("state").is_none() { others() } else { Vec::new() };
-            if of_others.is_empty() { vec![named] } else { of_others }
+            (if of_others.is_empty() { vec![named] } else { of_others }, Vec::new())
         }
         Some(Err(e)) => {
             eprintln!("{e}; every cell that runs is stopped instead");
@@ -91,11 +105,7 @@ fn ask(target: &Target) -> Result<Asked, Failure> {
     }
     let absent = || {
         if !target.doubted.is_empty() {
-            let what = format!(
-                "{}; whether rt-controller runs there is not known: look at the robot, and abort as the cell's own user or as root",
-                target.doubted
-            );
-            return failure(exit::FAILED, what);
+            return not_known(&target.doubted);
         }
         let what = format!(
             "no rt-controller of cell '{}' is running; a robot that one has left comes upright by its own program (docs/ROBOT.md)",

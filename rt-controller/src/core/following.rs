@@ -85,9 +85,9 @@ impl Following {
     }
 }
 
-/// Whether the robot says that it slows the motion by itself.
+/// Whether the robot says that it slows the motion by itself. A share that is not a number counts as slow.
 pub fn is_slowed(robot: &Robot) -> bool {
-    robot.speed_scaling.is_some_and(|share| share < FULL_SPEED)
+    robot.speed_scaling.is_some_and(|share| share.is_nan() || share < FULL_SPEED)
 }
 
 #[cfg(test)]
@@ -170,5 +170,6 @@ mod tests {
         let ticks = (0..20).take_while(|_| watch.follows(&slow, &commanded)).count();
         assert_eq!(ticks, 5);
         assert!(watch.follows(&Robot { speed_scaling: Some(0.99), ..slow }, &commanded));
+        assert!(is_slowed(&Robot { speed_scaling: Some(f32::NAN), ..slow }));
     }
 }

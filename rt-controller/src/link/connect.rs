@@ -42,25 +42,29 @@ pub fn connect(options: &LinkOptions) -> Result<Session, LinkError> {
 
 /// Connects over this machine's network. See [`connect_over`].
 pub fn connect_after(options: &LinkOptions, before: &Before) -> Result<Session, LinkError> {
-    connect_over(&System, options, before)
+    connect_over(&System, options, &mut before.clone())
 }
 
-/// Connects, checks everything that can be checked, starts the program, and gives a session whose program waits for targets.
+/// Connects, checks everything that can be checked, starts the program, and gives a session whose program waits for targets. `before` takes note of the
+/// program.
 ///
 /// The first target is due within two seconds after this returns.
-pub fn connect_over(network: &dyn Network, options: &LinkOptions, before: &Before) -> Result<Session, LinkError> {
+pub fn connect_over(network: &dyn Network, options: &LinkOptions, before: &mut Before) -> Result<Session, LinkError> {
     let (mut dialogue, version, rate_hz) = introduce(network, options)?;
     let run = (network.now_ns() as i32 & i32::MAX).max(1);
     let program = program::text(options, 1.0 / rate_hz, run)?;
 
     let output_recipe = dialogue.agree_outputs(rate_hz, options.register_base)?;
     let input_recipe = dialogue.agree_inputs(&wire::input_names(options.register_base))?;
+    // A port that does not answer takes seconds. Nobody looks at the robot then, and it sends no states yet that would have to be read.
+    let mut upload = Upload::open(network, options.address)?;
     let mut state = first_state(&mut dialogue, options, output_recipe)?;
     ready_for_program(options, before, &state)?;
-    stands_still((network, options), &mut dialogue, output_recipe, &mut state)?;
+    stands_still((network, options), &mut dialogue, &mut upload, output_recipe, &mut state)?;
     ready_for_program(options, before, &state)?;
 
-    start_program((network, options, before), &mut dialogue, output_recipe, &mut state, (&program, run))?;
+    before.uploaded = Some(run);
+    start_program((network, options, before), (&mut dialogue, &mut upload), output_recipe, &mut state, (&program, run))?;
     let now = network.now_ns();
     (state.received_at_ns, state.advanced_at_ns, state.answered_at_ns) = (now, now, now);
     let at = dialogue.at;
@@ -144,6 +148,7 @@ fn ready_for_program(options: &LinkOptions, before: &Before, state: &RobotState)
 fn stands_still(
     (network, options): (&dyn Network, &LinkOptions),
     dialogue: &mut Dialogue<'_>,
+    upload: &mut Upload,
     recipe: OutputRecipe,
     state: &mut RobotState,
 ) -> Result<(), LinkError> {
@@ -152,6 +157,7 @@ fn stands_still(
     loop {
         let left = Duration::from_nanos(deadline_ns.saturating_sub(network.now_ns()));
         dialogue.next_state(recipe, &options.tilt, state, left)?;
+        upload.discard();
         // A program that has started meanwhile may move them; it is found afterwards.
         if let (Some(joint), false) = (hands::moving(&earlier, state), state.runtime_state == RUNTIME_PLAYING) {
             return Err(LinkError::Handover { address: options.address, why: Handover::Moving(joint) });
@@ -165,14 +171,14 @@ fn stands_still(
 /// Uploads the program with its run number, and waits until it shows that it runs. `state` becomes the newest one.
 fn start_program(
     (network, options, before): (&dyn Network, &LinkOptions, &Before),
-    dialogue: &mut Dialogue<'_>,
+    (dialogue, upload): (&mut Dialogue<'_>, &mut Upload),
     recipe: OutputRecipe,
     state: &mut RobotState,
     (program, run): (&str, i32),
 ) -> Result<(), LinkError> {
     let address = options.address;
     let mut again = matches!(state.runtime_state, RUNTIME_PAUSING | RUNTIME_PAUSED);
-    let mut upload = Upload::send(network, address, program)?;
+    upload.send(program)?;
     let mut sent_at_ns = network.now_ns();
     while state.program_run != run || state.runtime_state != RUNTIME_PLAYING {
         upload.discard();
@@ -188,7 +194,7 @@ fn start_program(
         }
         if again && state.runtime_state == RUNTIME_STOPPED && network.now_ns().saturating_sub(sent_at_ns) > AGAIN.as_nanos() as u64 {
             again = false;
-            upload = Upload::send(network, address, program)?;
+            upload.send_again(network, program)?;
             sent_at_ns = network.now_ns();
         }
         if left.is_zero() {
@@ -207,7 +213,14 @@ fn may_not_move((options, before): (&LinkOptions, &Before), state: &RobotState, 
     LinkError::MayNotMove { address: options.address, reason, unpowered, program_there }
 }
 
-/// The error of a joint that is too far from its start angle.
+/// The error of a joint that is too far from its start angle. One that is off by whole turns holds the container upright, but cannot tilt it as far.
 fn too_far(options: &LinkOptions, state: &RobotState) -> LinkError {
-    LinkError::TooFar { address: options.address, alpha_deg: state.alpha_deg, tolerance_deg: options.start_tolerance_deg }
+    let (alpha_deg, tolerance_deg) = (state.alpha_deg, options.start_tolerance_deg);
+    let turns = (f64::from(alpha_deg) / 360.0).round();
+    let remedy = if turns != 0.0 && (f64::from(alpha_deg) - turns * 360.0).abs() <= tolerance_deg {
+        "turn it back by a full turn with the pendant"
+    } else {
+        "bring the container upright with the pendant, or correct robot.start_joint_deg"
+    };
+    LinkError::TooFar { address: options.address, alpha_deg, tolerance_deg, remedy }
 }

@@ -178,7 +178,7 @@ pub enum LinkError {
     /// The container is not upright.
     #[error(
         "robot {address}: the tilting joint is {alpha_deg:.1} degrees from its start angle, at most {tolerance_deg} are allowed; \
-         bring the container upright with the pendant, or correct robot.start_joint_deg"
+         {remedy}"
     )]
     TooFar {
         /// The robot's address.
@@ -187,6 +187,8 @@ pub enum LinkError {
         alpha_deg: f32,
         /// The largest alpha that is allowed, degrees.
         tolerance_deg: f64,
+        /// What to do.
+        remedy: &'static str,
     },
     /// The uploaded program gave no sign of life.
     #[error(

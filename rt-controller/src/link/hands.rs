@@ -90,6 +90,8 @@ pub struct Before {
     pub ran: bool,
     /// Whether the arm was seen without power or with its brakes on since a program was last seen to run: no program can then be paused.
     pub unpowered: bool,
+    /// The run number of the newest program that was uploaded, whether or not a session came of it.
+    pub uploaded: Option<i32>,
 }
 
 /// Why the operator must ask before the robot is taken again, after a session that ended for `reason` with the state `last`; `None` if the
@@ -126,7 +128,9 @@ pub fn since(before: &Before, state: &RobotState, tilt: Joint) -> Option<Handove
     }
     let Some(last) = &before.last else { return left_behind(state) };
     let own_end = matches!(state.program_state, ProgramState::TimedOut | ProgramState::Stopped | ProgramState::Unused);
-    if state.program_run != last.program_run || !own_end {
+    // A program that was uploaded and started too late for a session has ended by itself, and has moved nothing.
+    let is_late = state.program_state == ProgramState::Unused && before.uploaded == Some(state.program_run);
+    if !own_end || (state.program_run != last.program_run && !is_late) {
         return Some(Handover::Interrupted);
     }
     let displaced = |k: usize| k != tilt.index() && (state.joints_rad[k] - last.joints_rad[k]).abs() > DISPLACED_RAD;

@@ -66,7 +66,10 @@ impl Transport for TcpStream {
         match within {
             None => self.set_nonblocking(true),
             // A timeout of zero would mean that there is none.
-            Some(within) => self.set_read_timeout(Some(within.max(Duration::from_millis(1)))),
+            Some(within) => {
+                self.set_nonblocking(false)?;
+                self.set_read_timeout(Some(within.max(Duration::from_millis(1))))
+            }
         }
     }
 

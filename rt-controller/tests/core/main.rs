@@ -167,6 +167,24 @@ fn idle_it_stays_at_the_start() {
     assert_eq!(cell.core.phase(), Phase::Idle);
 }
 
+/// Protects whoever stands beside a robot that has just been connected: a joint that was found within the tolerance of upright stays there until an
+/// operator orders something.
+#[test]
+fn nothing_moves_before_somebody_asks() {
+    let mut cell = ToyCell::new();
+    cell.core = Core::new(cell.settings);
+    cell.core.exchange(always(13));
+    cell.alpha_deg = 1.9;
+    for _ in 0..100 {
+        assert_eq!(cell.tick(None).target_deg, Some(1.9));
+    }
+    cell.tick(Some(Order::Abort));
+    for _ in 0..100 {
+        cell.tick(None);
+    }
+    assert_eq!((cell.alpha_deg, cell.core.phase()), (0.0, Phase::Idle), "an abort brings it upright");
+}
+
 /// Protects the pour: it tilts, counts, returns to the start angle when d reaches 0, and reports what flowed.
 #[test]
 fn a_pour_ends_upright_with_its_volume() {

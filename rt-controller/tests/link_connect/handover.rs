@@ -1,7 +1,14 @@
 //! Which robots get the program: those with few services or few variables, those that were never started, and those that a person has, or had,
 //! in hand. The tests run against the scripted server and panic as tests do.
 
+use std::io::ErrorKind;
+use std::net::SocketAddr;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering::Relaxed};
+use std::time::Duration;
+
 use rt_controller::link::hands::{Before, Handover};
+use rt_controller::link::network::{Network, System, Transport};
 use rt_controller::link::{LinkError, ProgramState, RobotState};
 
 use shared::control::EndReason;
@@ -15,6 +22,60 @@ fn any_script_port_is_enough() {
         let (session, seen) = Server::new(last, Robot { script_ports, ..Robot::default() }).meet();
         assert_eq!(session.unwrap().state().program_state, ProgramState::Ready, "{script_ports:?}");
         assert!(seen.unwrap().program.starts_with("def decant_pour():\n"), "{script_ports:?}");
+    }
+}
+
+/// A network on which one port does not answer for a while, in which somebody starts a program on the robot.
+struct SlowPort {
+    port: u16,
+    other_plays: Arc<AtomicBool>,
+}
+
+impl Network for SlowPort {
+    fn now_ns(&self) -> u64 {
+        System.now_ns()
+    }
+
+    fn sleep(&self, time: Duration) {
+        System.sleep(time);
+    }
+
+    fn open(&self, at: SocketAddr, within: Duration) -> std::io::Result<Box<dyn Transport>> {
+        if at.port() != self.port {
+            return System.open(at, within);
+        }
+        self.other_plays.store(true, Relaxed);
+        System.sleep(Duration::from_millis(100));
+        Err(ErrorKind::TimedOut.into())
+    }
+
+    fn read(&self, from: &mut dyn Transport, buffer: &mut [u8], within: Duration) -> std::io::Result<usize> {
+        System.read(from, buffer, within)
+    }
+}
+
+/// Protects another's program that is started while a port for programs does not answer: the robot is looked at after that, and nothing is uploaded.
+#[test]
+fn a_program_that_starts_while_a_port_is_tried_is_not_replaced() {
+    let robot = Robot { script_ports: &[30001], ..Robot::default() };
+    let network = SlowPort { port: 30002, other_plays: robot.other_plays.clone() };
+    let (session, seen) = Server::new(140, robot).meet_over(&network, &Before::default());
+    assert!(matches!(session, Err(LinkError::ProgramRunning { .. })), "{session:?}");
+    assert!(seen.is_none(), "something was uploaded");
+}
+
+/// Protects a robot whose program started too late for its session, and ended by itself without having moved anything: it is taken again by itself,
+/// but for one that somebody else uploaded.
+#[test]
+fn a_program_of_ours_that_was_late_is_no_handover() {
+    let last = RobotState { program_run: 9, joints_rad: [0.0, 0.0, 0.0, 0.0, 0.0, 1.2], ..RobotState::default() };
+    for (number, uploaded, why) in
+        [(141, Some(10), None), (142, Some(11), Some(Handover::Interrupted)), (143, None, Some(Handover::Interrupted))]
+    {
+        let before = Before { last: Some(last), uploaded, ..Before::default() };
+        let late = Robot { registers: (ProgramState::Unused, 7, 10), ..Robot::default() };
+        let (session, _) = Server::new(number, late).meet_after(&before);
+        assert_eq!(session.err().as_ref().and_then(LinkError::handover), why, "{uploaded:?}");
     }
 }
 

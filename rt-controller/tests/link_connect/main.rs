@@ -100,6 +100,10 @@ fn every_refusal_says_what_to_do() {
              30003: connection refused); switch on Secondary Client Interface under Settings > Security > Services",
         ),
         (Robot { joint_rad: 0.5, ..well() }, "28.6 degrees from its start angle, at most 2 are allowed; bring the container upright"),
+        (
+            Robot { joint_rad: -360f64.to_radians(), ..well() },
+            "-360.0 degrees from its start angle, at most 2 are allowed; turn it back by a full turn",
+        ),
         (Robot { joint_rad: f64::NAN, ..well() }, "degrees from its start angle"),
         (Robot { program: ProgramState::TooFar, ..well() }, "bring the container upright"),
         (Robot { starts: false, ..well() }, "the program did not start within 5 s; on an e-Series choose Remote Control"),

@@ -3,11 +3,14 @@
 
 use std::io::{ErrorKind, Read, Write};
 use std::net::{Ipv4Addr, TcpListener, TcpStream};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering::Relaxed};
 use std::thread;
 use std::time::Duration;
 
 use rt_controller::link::hands::Before;
-use rt_controller::link::{LinkError, LinkOptions, ProgramState, Session, TiltJoint, connect_after};
+use rt_controller::link::network::{Network, System};
+use rt_controller::link::{LinkError, LinkOptions, ProgramState, Session, TiltJoint, connect_over};
 use shared::config::Joint;
 use shared::limits::Limits;
 
@@ -59,6 +62,8 @@ pub struct Robot {
     pub program: ProgramState,
     /// Whether an uploaded program starts.
     pub starts: bool,
+    /// Whether another program has been started.
+    pub other_plays: Arc<AtomicBool>,
 }
 
 impl Default for Robot {
@@ -87,6 +92,7 @@ impl Default for Robot {
             stops_first: false,
             program: ProgramState::Ready,
             starts: true,
+            other_plays: Arc::default(),
         }
     }
 }
@@ -131,7 +137,8 @@ pub fn data(robot: &Robot, timestamp_s: f64, program: ProgramState, echo: i32, r
         payload.extend([base, 0.0, 0.0, 0.0, 0.0, value].map(f64::to_be_bytes).concat());
     }
     payload.extend([robot.robot_mode, robot.safety_mode].map(i32::to_be_bytes).concat());
-    payload.extend([1, robot.runtime_state].map(u32::to_be_bytes).concat());
+    let runtime_state = if robot.other_plays.load(Relaxed) { 2 } else { robot.runtime_state };
+    payload.extend([1, runtime_state].map(u32::to_be_bytes).concat());
     payload.extend([program as i32, echo, run].map(i32::to_be_bytes).concat());
     payload.extend([robot.joint_rad, robot.speed_fraction].map(f64::to_be_bytes).concat());
     let values = [
@@ -174,9 +181,14 @@ impl Server {
 
     /// The same, for a controller that knows the robot from before.
     pub fn meet_after(self, before: &Before) -> (Result<Session, LinkError>, Option<Seen>) {
+        self.meet_over(&System, before)
+    }
+
+    /// The same over another network.
+    pub fn meet_over(self, network: &dyn Network, before: &Before) -> (Result<Session, LinkError>, Option<Seen>) {
         let (options, ports) = (self.options.clone(), self.robot.script_ports);
         let served = thread::spawn(move || self.serve().ok());
-        let session = connect_after(&options, before);
+        let session = connect_over(network, &options, &mut before.clone());
         // This frees a server whose script port was never connected to.
         for port in ports {
             let _ = TcpStream::connect((options.address, *port));
@@ -184,16 +196,23 @@ impl Server {
         (session, served.join().unwrap())
     }
 
-    /// Waits for a program on any of the open ports. While it waits, the robot's state goes on.
+    /// Waits for a connection to any of the open ports, and for a program on it. While it waits, the robot's state goes on.
     fn accept_program(&self, rtde: &mut TcpStream, timestamp_s: &mut f64) -> std::io::Result<TcpStream> {
         for listener in &self.scripts {
             listener.set_nonblocking(true)?;
         }
+        let mut script: Option<TcpStream> = None;
         loop {
-            for listener in &self.scripts {
-                if let Ok((stream, _)) = listener.accept() {
-                    stream.set_nonblocking(false)?;
-                    return Ok(stream);
+            script = script.or_else(|| self.scripts.iter().find_map(|listener| listener.accept().ok()).map(|(stream, _)| stream));
+            if let Some(stream) = &script {
+                stream.set_nonblocking(true)?;
+                match stream.peek(&mut [0]) {
+                    Ok(0) => return Err(ErrorKind::UnexpectedEof.into()),
+                    Ok(_) => {
+                        stream.set_nonblocking(false)?;
+                        return stream.try_clone();
+                    }
+                    Err(_) => {}
                 }
             }
             *timestamp_s += 0.008;

@@ -1,4 +1,5 @@
-//! The number of the next episode, from what lies in the episodes' directory: no number is given twice, whatever the wall clock says.
+//! The number of the next episode, from what lies in the episodes' directory: no number is given twice, whatever the wall clock says. And the
+//! order of episodes by their numbers.
 //!
 //! A number counts as used if a file of any kind, in the directory or below it, begins with `episode-` and that number: an episode that was
 //! moved into a folder, renamed at its end or cut off. The file `.last-number` remembers what was given and has been moved away since. Its
@@ -6,6 +7,7 @@
 //!
 //! Ordinary threads that may wait for the disk use it; it allocates. Errors are those of the system; the caller names the directory.
 
+use std::cmp::Ordering;
 use std::fs::{File, OpenOptions};
 use std::io::{Error, Read, Result, Seek, Write};
 use std::os::unix::fs::OpenOptionsExt;
@@ -43,6 +45,21 @@ pub fn take_number(directory: &Path) -> Result<u64> {
     file.set_len(text.len() as u64)?;
     file.sync_data()?;
     Ok(number)
+}
+
+/// The order of episodes' files: by their names, in which the first number counts as one. As text, `episode-10000.mcap` would come before
+/// `episode-9999.mcap`.
+pub fn by_number(a: &Path, b: &Path) -> Ordering {
+    let name = |path: &Path| path.file_name().unwrap_or_default().to_string_lossy().into_owned();
+    around_number(&name(a)).cmp(&around_number(&name(b))).then_with(|| a.cmp(b))
+}
+
+/// What stands in `name` before its first number, the number, as its length and its digits without leading zeros, and what stands behind it.
+fn around_number(name: &str) -> (&str, (usize, &str), &str) {
+    let (before, rest) = name.split_at(name.find(|c: char| c.is_ascii_digit()).unwrap_or(name.len()));
+    let (digits, after) = rest.split_at(rest.find(|c: char| !c.is_ascii_digit()).unwrap_or(rest.len()));
+    let number = digits.trim_start_matches('0');
+    (before, (number.len(), number), after)
 }
 
 /// Takes the file's lock, which goes when the file is closed.
@@ -112,6 +129,27 @@ mod tests {
         assert_eq!(take(), 31, "a number that cannot be is none");
         std::fs::write(dir.path().join("new/.last-number"), LARGEST.to_string()).expect("writable");
         assert!(take_number(&dir.path().join("new")).is_err(), "no number is given twice, and none beyond the largest");
+    }
+
+    /// Protects who looks for the newest episodes from the order of text, in which the ten thousandth comes before the second.
+    #[test]
+    fn the_ten_thousandth_comes_last() {
+        let order = [
+            "a copy.mcap",
+            "episode-0002.mcap",
+            "episode-9999 (copy).mcap",
+            "episode-9999.mcap",
+            "episode-10000.mcap",
+            "episode-99999999999999999999.mcap",
+            "episode-100000000000000000000.mcap",
+            "episode-x.mcap",
+            "of a friend.mcap",
+        ];
+        let mut files = order.map(Path::new);
+        files.sort();
+        assert_ne!(files, order.map(Path::new));
+        files.sort_by(|a, b| by_number(a, b));
+        assert_eq!(files, order.map(Path::new));
     }
 
     /// Protects two programs that take numbers at once: each gets its own.

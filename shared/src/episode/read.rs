@@ -13,6 +13,7 @@ use prost::Message as _;
 
 use super::format::{self, CompressedImage, RowMessage, TelemetryMessage};
 use super::format_1;
+use super::number::by_number;
 use super::records::{EpisodeError, NextRecord, Records};
 use super::rows::{EpisodeRow, EpisodeTrack, LostFrames, alpha_between_deg};
 use super::weight::check_kept;
@@ -290,7 +291,7 @@ fn clock_offset_ns(about: &BTreeMap<String, String>) -> Result<i128, String> {
     offset.parse::<i64>().map(i128::from).map_err(|_| format!("metadata 'episode': {} = '{offset}' is not a number", format::CLOCK_OFFSET))
 }
 
-/// The episode files that `paths` name: files as they are, directories as the `*.mcap` in them in order of name. What is named twice, also by
+/// The episode files that `paths` name: files as they are, directories as the `*.mcap` in them in the order of [`by_number`]. What is named twice, also by
 /// another way to the same directory, is there once.
 pub fn find_episodes(paths: &[PathBuf]) -> Result<Vec<PathBuf>, EpisodeError> {
     let mut files = Vec::new();
@@ -303,11 +304,12 @@ pub fn find_episodes(paths: &[PathBuf]) -> Result<Vec<PathBuf>, EpisodeError> {
         let mut inside = Vec::new();
         for entry in std::fs::read_dir(path).map_err(fail)? {
             let file = entry.map_err(fail)?.path();
-            if file.extension().is_some_and(|e| e == "mcap") && file.is_file() {
+            // A link that leads nowhere is an episode that cannot be read, and whoever opens it says so.
+            if file.extension().is_some_and(|e| e == "mcap") && !file.is_dir() {
                 inside.push(file);
             }
         }
-        inside.sort();
+        inside.sort_by(|a, b| by_number(a, b));
         files.append(&mut inside);
     }
     Ok(each_once(files))

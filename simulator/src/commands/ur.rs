@@ -25,7 +25,7 @@ pub struct Args {
     #[arg(long, value_enum, default_value = "cb3")]
     series: SeriesArg,
     /// Joint angles at the start in degrees, from the base to wrist 3.
-    #[arg(long, value_delimiter = ',', num_args = 6, allow_negative_numbers = true, default_value = "0,-90,90,-90,-90,0")]
+    #[arg(long, value_delimiter = ',', num_args = 1..=6, allow_negative_numbers = true, default_value = "0,-90,90,-90,-90,0")]
     joints_deg: Vec<f64>,
     /// Fault to inject at the start; this option may be given several times.
     #[arg(long)]
@@ -41,12 +41,13 @@ pub struct Args {
 #[derive(Debug, Clone, Copy, clap::ValueEnum)]
 enum SeriesArg {
     Cb3,
-    E,
+    #[value(alias = "e")]
+    ESeries,
 }
 
 fn help() -> String {
     format!(
-        "Examples:\n  simulator ur\n  simulator ur --address 127.0.0.2 --series e\n  simulator ur --fault in-use=input_int_register_24\n\n\
+        "Examples:\n  simulator ur\n  simulator ur --address 127.0.0.2 --series e-series\n  simulator ur --fault in-use=input_int_register_24\n\n\
          While it runs, each line on standard input is a fault:\n{}\n\n{}",
         fault::HELP,
         exit::HELP
@@ -58,8 +59,11 @@ pub fn run(args: &Args) -> Result<(), Failure> {
     let mut options = ControllerOptions::new(args.address);
     options.series = match args.series {
         SeriesArg::Cb3 => Series::Cb3,
-        SeriesArg::E => Series::ESeries,
+        SeriesArg::ESeries => Series::ESeries,
     };
+    if args.joints_deg.len() != options.start_q_rad.len() {
+        return Err(failure(exit::BAD_INPUT, format!("--joints-deg: six angles are needed, not {}", args.joints_deg.len())));
+    }
     for (to, from) in options.start_q_rad.iter_mut().zip(&args.joints_deg) {
         if !(-360.0..=360.0).contains(from) {
             return Err(failure(exit::BAD_INPUT, format!("--joints-deg: {from} is outside -360 to 360")));

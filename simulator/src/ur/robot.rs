@@ -15,6 +15,9 @@ const START_S: f64 = 60.0;
 /// Time in which the arm's speed changes from full to none when the slider or the controller slows it, in s. Chosen by hand; no
 /// measurement is recorded.
 const RAMP_S: f64 = 0.1;
+/// What the pendant's installation says that the tool carries: mass in kg, and centre of gravity in m from the flange. It is about a holder with
+/// a full glass; chosen by hand.
+const PAYLOAD: (f64, [f64; 3]) = (0.9, [0.0, 0.0, 0.08]);
 
 /// What the clients selected before they write outputs: a value counts only where its mask has a bit set.
 #[derive(Debug, Default)]
@@ -73,7 +76,7 @@ impl Robot {
             speed_slider: 1.0,
             own_scaling: 1.0,
             present: [1.0; 2],
-            payload: (0.0, [0.0; 3]),
+            payload: PAYLOAD,
             masks: Masks::default(),
             steptime_s,
         }

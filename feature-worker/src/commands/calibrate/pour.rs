@@ -20,14 +20,14 @@ const KEEP_PICTURES: usize = 150;
 /// Quality of the frames of a live camera that are kept, 0 to 100. Chosen by hand: no difference in V_e was seen.
 const FILM_QUALITY: i32 = 97;
 /// The most that is kept of a live camera, bytes. Chosen by hand: more than five minutes at 640 x 480 px.
-const FILM_MOST: usize = 1 << 30;
+pub(super) const FILM_MOST: usize = 1 << 30;
 
 /// Where all frames come from once more.
 enum Film {
     /// From these files, of which something may be missing.
     Files(Vec<PathBuf>, bool),
-    /// From memory, each as JPEG with its number and time.
-    Kept(Vec<(Vec<u8>, PictureTime)>, usize),
+    /// From memory, each as JPEG with its number and time, and how many bytes they may take.
+    Kept { frames: Vec<(Vec<u8>, PictureTime)>, bytes: usize, most: usize },
 }
 
 /// What was seen of one pour.
@@ -42,14 +42,18 @@ pub(super) struct Pour {
 }
 
 impl Pour {
-    /// A pour that a live camera shows.
-    pub fn live() -> Self {
-        Self { pictures: Vec::new(), count: 0, stride: 1, film: Film::Kept(Vec::new(), 0) }
+    /// A pour that a live camera shows. At most `most` bytes of it are kept, such as [`FILM_MOST`].
+    pub fn live(most: usize) -> Self {
+        Self::of(Film::Kept { frames: Vec::new(), bytes: 0, most })
+    }
+
+    fn of(film: Film) -> Self {
+        Self { pictures: Vec::new(), count: 0, stride: 1, film }
     }
 
     /// The pour in files. With `partial`, something may be missing. Returns also what is missing, a line each.
     pub fn read(input: &[PathBuf], rate_hz: f64, partial: bool) -> Result<(Self, Vec<String>), String> {
-        let mut pour = Self { film: Film::Files(input.to_vec(), partial), ..Self::live() };
+        let mut pour = Self::of(Film::Files(input.to_vec(), partial));
         let contents = for_each_frame(input, rate_hz, partial, |frame| pour.add(&frame))?;
         Ok((pour, contents.missing))
     }
@@ -63,7 +67,7 @@ impl Pour {
         {
             return Err(format!("frame {} has another size than those before; all must come from one camera", self.count + 1));
         }
-        if let Film::Kept(frames, bytes) = &mut self.film {
+        if let Film::Kept { frames, bytes, .. } = &mut self.film {
             let mut jpeg = Vector::<u8>::new();
             let quality = Vector::from_slice(&[imgcodecs::IMWRITE_JPEG_QUALITY, FILM_QUALITY]);
             imgcodecs::imencode(".jpg", &bgr, &mut jpeg, &quality).map_err(words)?;
@@ -88,7 +92,7 @@ impl Pour {
 
     /// Whether no more can be kept.
     pub fn is_full(&self) -> bool {
-        matches!(self.film, Film::Kept(_, bytes) if bytes > FILM_MOST)
+        matches!(self.film, Film::Kept { bytes, most, .. } if bytes > most)
     }
 
     /// The poses among the kept pictures, those pictures, and their mean.
@@ -112,7 +116,7 @@ impl Pour {
             Film::Files(input, partial) => {
                 for_each_frame(input, camera.fps, *partial, |frame| each(&to_bgr(&frame).map_err(|e| e.message)?, time(&frame))).map(|_| ())
             }
-            Film::Kept(frames, _) => frames.iter().try_for_each(|(jpeg, time)| {
+            Film::Kept { frames, .. } => frames.iter().try_for_each(|(jpeg, time)| {
                 each(&imgcodecs::imdecode(&Vector::<u8>::from_slice(jpeg), imgcodecs::IMREAD_COLOR).map_err(|e| e.message)?, *time)
             }),
         }

@@ -1,0 +1,100 @@
+//! `feature-worker episodes` on directories that are not as they should be: beyond the ten thousandth episode, with links that lead nowhere, incomplete
+//! episodes, and copies into the directory that they come from.
+#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic)]
+
+use std::path::{Path, PathBuf};
+use std::process::{Command, Output};
+use std::time::UNIX_EPOCH;
+
+use serde_json::Value;
+use shared::config::Config;
+use shared::episode::{Episode, EpisodeEnd, EpisodeKind, EpisodeStart, EpisodeWriter, FrameRow, set_weight};
+use shared::messages::Feature;
+
+/// Writes the episode `number`, all at one time of the wall clock; its measurement is its own.
+fn write(directory: &Path, number: u64, complete: bool) -> PathBuf {
+    let config = Config::read(&Path::new(env!("CARGO_MANIFEST_DIR")).join("../config/sim.toml")).unwrap();
+    let kind = EpisodeKind::Pour { goal_ml: 50.0 };
+    let start = EpisodeStart { episode: number, kind, started_at_ns: 1, wall_clock: UNIX_EPOCH, config: &config, weights: "" };
+    let mut writer = EpisodeWriter::create(directory, &start).unwrap();
+    let feature = Feature { captured_at_ns: 2, sequence: 1, area_px2: number as f32, ..Default::default() };
+    writer.frame(&FrameRow { feature: &feature, alpha_commanded_deg: 0.0, alpha_measured_deg: 0.0, image: None }).unwrap();
+    writer.finish(&EpisodeEnd { complete, reason: "over", disordered_frames: 0 }).unwrap()
+}
+
+fn episodes(arguments: &[&str]) -> Output {
+    Command::new(env!("CARGO_BIN_EXE_feature-worker")).arg("episodes").args(arguments).output().unwrap()
+}
+
+fn code(output: &Output) -> i32 {
+    output.status.code().unwrap()
+}
+
+fn text(bytes: &[u8]) -> String {
+    String::from_utf8_lossy(bytes).into_owned()
+}
+
+/// Protects the newest recording of a lab that has made ten thousand, on a machine whose clock stands still: as text it would be the oldest, the first
+/// that is deleted, and the last that is listed.
+#[test]
+fn the_ten_thousandth_is_the_newest() {
+    let dir = tempfile::tempdir().unwrap();
+    let directory = dir.path().to_str().unwrap();
+    let [before, newest] = [9999, 10_000].map(|number| write(dir.path(), number, true));
+    let listed: Value = serde_json::from_slice(&episodes(&["list", directory, "--json"]).stdout).unwrap();
+    let names: Vec<&str> = listed["episodes"].as_array().unwrap().iter().map(|e| e["file"].as_str().unwrap()).collect();
+    assert_eq!(names, [before.to_str().unwrap(), newest.to_str().unwrap()]);
+    assert_eq!(code(&episodes(&["prune", directory, "--budget-mb", "0", "--budget-episodes", "1", "--yes"])), 0);
+    assert_eq!((before.exists(), newest.exists()), (false, true));
+}
+
+/// Protects who counts episodes from a disk that is not mounted: a link that leads nowhere is an episode that cannot be read, and said.
+#[test]
+fn a_link_that_leads_nowhere_is_said() {
+    let dir = tempfile::tempdir().unwrap();
+    write(dir.path(), 1, true);
+    std::os::unix::fs::symlink("/not/mounted/episode-0002.mcap", dir.path().join("episode-0002.mcap")).unwrap();
+    let list = episodes(&["list", dir.path().to_str().unwrap()]);
+    assert_eq!(code(&list), 1);
+    assert!(text(&list.stdout).contains("episode-0002.mcap        UNREADABLE: "), "{}", text(&list.stdout));
+}
+
+/// Protects who learns from a table or a data set: an episode whose end is missing looks whole there, so it is left out by name; and where nothing is
+/// left, each reason is said, and nothing is said to be exported.
+#[test]
+fn an_incomplete_episode_is_no_row_of_a_table() {
+    let dir = tempfile::tempdir().unwrap();
+    let recorded = dir.path().join("recorded");
+    let [whole, cut] = [(1, true), (2, false)].map(|(number, complete)| write(&recorded, number, complete));
+    set_weight(&whole, 104.0).unwrap();
+    let to = |name: &str| dir.path().join(name).display().to_string();
+    let export = |format: &str, to: &str| episodes(&["export", recorded.to_str().unwrap(), "--as", format, "--to", to]);
+    let table = export("csv", &to("table"));
+    assert_eq!(code(&table), 1);
+    assert!(text(&table.stdout).contains(&format!("left out: {}: it is incomplete", cut.display())), "{}", text(&table.stdout));
+    let read = shared::episode::read_table(&dir.path().join("table/features.csv"), &dir.path().join("table/scale.csv")).unwrap();
+    assert_eq!(read.iter().map(|e| e.weight_g).collect::<Vec<_>>(), [Some(104.0)]);
+
+    for format in ["images", "video", "lerobot"] {
+        let none = export(format, &to(format));
+        let said = text(&none.stderr);
+        assert_eq!((code(&none), text(&none.stdout).as_str()), (2, ""), "{format}: {said}");
+        assert!(said.contains("no episode can be exported; ") && said.contains("the episode has no images"), "{format}: {said}");
+        assert!([whole.display(), cut.display()].iter().all(|name| said.contains(&name.to_string())), "{format}: {said}");
+    }
+}
+
+/// Protects a data set from doubles: a merge into one of its own directories leaves what lies there as it is, and adds the others.
+#[test]
+fn a_merge_into_its_own_directory_doubles_nothing() {
+    let dir = tempfile::tempdir().unwrap();
+    let [monday, tuesday] = ["monday", "tuesday"].map(|day| dir.path().join(day));
+    write(&monday, 1, true);
+    write(&tuesday, 2, true);
+    let merged = episodes(&["merge", monday.to_str().unwrap(), tuesday.to_str().unwrap(), "--to", monday.to_str().unwrap()]);
+    assert_eq!(code(&merged), 0, "{}", text(&merged.stderr));
+    assert!(text(&merged.stdout).contains("it lies there already"), "{}", text(&merged.stdout));
+    let there = shared::episode::find_episodes(std::slice::from_ref(&monday)).unwrap();
+    let areas: Vec<f32> = there.iter().map(|file| Episode::read(file).unwrap().rows[0].area_px2).collect();
+    assert_eq!(areas, [1.0, 2.0]);
+}
