@@ -248,7 +248,7 @@ impl ClearWater {
                     Sighting::Unsure(Doubt::LightFlickers)
                 }
                 _ if self.lip_has_changed() => Sighting::Unsure(Doubt::EdgeNotFound),
-                _ if self.vouched.see_none(|| self.evidence.edges_share(&self.rays)) => Sighting::Dry { confidence: 1.0 },
+                _ if self.vouched.see_none(&self.evidence, &self.rays) => Sighting::Dry { confidence: 1.0 },
                 _ => sighting,
             };
             if verdict != Verdict::Dry {

@@ -21,7 +21,7 @@ use super::coloured_edge;
 use super::confidence::Basis;
 use super::foreign::{self, FILLED, GAP_MOST_PX, Seen};
 use super::geometry::{Axes, Line, NEAR_PX, RAYS, RayGrid, distance};
-use super::grey::is_grey;
+use super::grey::{COLOURED_FROM, is_grey};
 use super::ground_beside::{InGlass, Place, Square};
 use super::ground_colours::{Ground, GroundColours};
 use super::hues::ranges;
@@ -71,8 +71,6 @@ const LEARN_BEYOND: usize = 6;
 const LEARN_AFTER: u32 = 15;
 /// The ground is learned beside the container while no more than this share of what is at the lip is foreign or liquid. Chosen by hand.
 const QUIET_SHARE: f32 = 0.3;
-/// A liquid of at least this saturation is not seen in grey pictures. Chosen by hand.
-const COLOURED_FROM: f64 = 20.0;
 
 /// Finds the stream of a coloured liquid in the pictures of one camera.
 pub(crate) struct ColouredLiquid {

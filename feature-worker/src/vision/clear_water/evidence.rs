@@ -54,10 +54,6 @@ const STEP_FROM: f32 = 0.35;
 const STEP_SPAN: f32 = 0.3;
 /// The usual step of a stream that is not known yet, in units of the noise. Tuned.
 const STEP_NOISES: f32 = 6.0;
-/// A step of this size is an edge, in units of the noise. Chosen by hand: noise alone makes 1.
-const EDGE_NOISES: f32 = 3.0;
-/// Nearer to the lip than this, the rim's own light makes edges, px. Chosen by hand: no stream that is measured is smaller.
-const EDGE_FROM_PX: f32 = 8.0;
 /// Weight of a moved picture's evidence where the memory knows nothing, to begin a stream. Tuned.
 const UNKNOWN_WEIGHT: f32 = 0.5;
 /// Weight of what is wet just inside a line. Tuned.
@@ -263,14 +259,6 @@ impl Evidence {
             }
         }
         [dry, wet].map(|part| part / looked.max(1.0))
-    }
-
-    /// On which share of the rays the picture itself has an edge, whatever is remembered: a stream before an even ground has one on most of them.
-    pub(super) fn edges_share(&self, rays: &Rays) -> f32 {
-        let least = EDGE_NOISES * self.noise;
-        let near = rays.first_from(EDGE_FROM_PX);
-        let has_edge = |ray: usize| (ray * SAMPLES + near..(ray + 1) * SAMPLES).any(|i| rays.air[i] > 0.0 && self.steps[i] > least);
-        (0..RAYS).filter(|ray| has_edge(*ray)).count() as f32 / RAYS as f32
     }
 
     /// Compares the memory and the picture `earlier`, both moved, with the picture `now` along the rays. `height_px` is the height above

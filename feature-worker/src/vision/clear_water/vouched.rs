@@ -4,18 +4,23 @@
 //!
 //! Pure; called on the extraction thread. Nothing is allocated and nothing fails.
 
+use super::evidence::Evidence;
+use super::rays::{RAYS, Rays, SAMPLES};
 use crate::vision::pace::Pace;
 
 /// With an edge on this share of the rays, there may be a stream before an even ground. Chosen by hand: a line has to lie on as much of its length
 /// to begin a stream.
 const EDGES_MOST: f32 = 0.5;
+/// A step of this size is an edge, in units of the noise. Chosen by hand: noise alone makes 1.
+const EDGE_NOISES: f32 = 3.0;
+/// Nearer to the lip than this, the rim's own light makes edges, px. Chosen by hand: no stream that is measured is smaller.
+const EDGE_FROM_PX: f32 = 8.0;
 /// So far the background has to move while nothing is seen, px: further than the dark rim of water is wide. Chosen by hand.
 const MOVES_PX: f32 = 4.0;
 /// But one picture tells of no more than this, px: a background that is lost jumps. Chosen by hand.
 const MOVES_MOST_PX: f32 = 1.6;
 /// Or so many pictures in a row have to show nothing new at the lip. Chosen by hand: half a second, in which a stream that ripples shows itself.
 const PICTURES: u32 = 15;
-
 /// An even picture counts for so many of them. Chosen by hand: three of them tell.
 const EVEN_PICTURE: u32 = 5;
 
@@ -51,10 +56,10 @@ impl Vouched {
         self.dry
     }
 
-    /// No stream was seen in a picture; `edges` is the share of the rays that show an edge. Returns whether there is none.
-    pub(super) fn see_none(&mut self, edges: impl FnOnce() -> f32) -> bool {
+    /// No stream was seen in a picture with this `evidence`. Returns whether there is none.
+    pub(super) fn see_none(&mut self, evidence: &Evidence, rays: &Rays) -> bool {
         if !self.dry {
-            self.pictures += if edges() < EDGES_MOST { EVEN_PICTURE } else { 1 };
+            self.pictures += if edges_share(evidence, rays) < EDGES_MOST { EVEN_PICTURE } else { 1 };
             self.dry = self.pictures >= self.pace.pictures(PICTURES) || self.moved_px >= MOVES_PX;
         }
         self.dry
@@ -69,4 +74,12 @@ impl Vouched {
     pub(super) fn moved(&mut self, by_px: f32) {
         self.moved_px += by_px.min(MOVES_MOST_PX);
     }
+}
+
+/// On which share of the rays the picture itself has an edge, whatever is remembered: a stream before an even ground has one on most of them.
+fn edges_share(evidence: &Evidence, rays: &Rays) -> f32 {
+    let (steps, least) = (evidence.steps(), EDGE_NOISES * evidence.noise());
+    let near = rays.first_from(EDGE_FROM_PX);
+    let has_edge = |ray: usize| (ray * SAMPLES + near..(ray + 1) * SAMPLES).any(|i| rays.air[i] > 0.0 && steps[i] > least);
+    (0..RAYS).filter(|ray| has_edge(*ray)).count() as f32 / RAYS as f32
 }
