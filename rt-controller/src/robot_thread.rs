@@ -10,7 +10,7 @@ use std::sync::{Mutex, PoisonError};
 use std::time::Duration;
 
 use shared::config::Config;
-use shared::control::RobotLink;
+use shared::control::{EndReason, RobotLink};
 use shared::level::Level;
 
 use crate::exchange::{Exchange, SessionEnd};
@@ -165,7 +165,10 @@ impl Progress {
         };
         // A tilted container must be brought upright by somebody, who then has the robot in hand. A wish is not kept for ever.
         let wish_is_over = self.wish_until_ns.is_some_and(|until_ns| now_ns >= until_ns);
-        if let Some(why) = e.handover() {
+        // An arm that lost its power since the last session gets it from a person, who then has the robot; the first start of a cell is none of that.
+        let unpowered = matches!(e, LinkError::MayNotMove { reason: EndReason::RobotNotRunning, .. }) && self.before.last.is_some();
+        let why = e.handover().or(unpowered.then_some(Handover::Stopped(EndReason::RobotNotRunning)));
+        if let Some(why) = why {
             self.wait_for_operator(why, config, note, say);
         } else if wish_is_over || matches!(e, LinkError::TooFar { .. }) {
             self.waits = true;

@@ -61,7 +61,7 @@ fn is_closed(directory: &Path) -> bool {
     directory.join("stop").symlink_metadata().is_err_and(|e| e.kind() == ErrorKind::PermissionDenied)
 }
 
-/// The cells of this user whose controllers run, and for root those of all users. And of the runtime directories that look like such a cell's and are not
+/// The cells whose controllers run and that this user may stop: their own, those whose runtime directory lets them in, and for root all. And of the runtime directories that look like such a cell's and are not
 /// believed, which and why, a line each.
 pub fn running_cells() -> (Vec<Target>, Vec<String>) {
     let mut found: BTreeMap<(u32, String), Vec<PathBuf>> = BTreeMap::new();

@@ -152,7 +152,7 @@ pub enum EndReason {
     StreamLost,
     /// The measured tilt does not follow the commanded one: the robot is slower than it is commanded, or something holds or moves it.
     NotFollowed,
-    /// Somebody has the robot in hand: the teach button (freedrive) is pressed.
+    /// Somebody has the robot in hand: the teach button (freedrive) is pressed, which ends the program on the robot.
     InHand,
     /// The camera shows a stream that the container cannot give at its tilt.
     ImpossibleFlow,
@@ -174,13 +174,14 @@ impl EndReason {
     /// Whether the arm stands where it is, so that it does not come upright.
     fn stops_the_arm(self) -> bool {
         let stopped = matches!(self, Self::ProtectiveStop | Self::EmergencyStop | Self::SafetyStop | Self::ProgramStopped);
-        stopped || self == Self::RobotNotRunning
+        // The teach button ends the program too.
+        stopped || matches!(self, Self::RobotNotRunning | Self::InHand)
     }
 
     /// Whether liquid may have left that nobody has seen or counted: without a camera, or without a robot whose way upright is known.
     pub fn leaves_unseen(self) -> bool {
         let camera = matches!(self, Self::StaleFeature | Self::WorkerRestarted | Self::FrameRate);
-        let link = matches!(self, Self::RobotLost | Self::RobotStalled | Self::ControllerOverrun | Self::SpeedReduced | Self::InHand);
+        let link = matches!(self, Self::RobotLost | Self::RobotStalled | Self::ControllerOverrun | Self::SpeedReduced);
         // These end a count that was going on, or say themselves that a stream may not have been seen.
         let unsure = matches!(self, Self::NotUpright | Self::StreamLost | Self::NothingFlows);
         camera || link || unsure || self.stops_the_arm()

@@ -140,8 +140,9 @@ fn stops_ours(what: &What, machine: &Machine) -> bool {
     let is_ours = runs && machine.robot.outputs.int[STATE_REGISTER] != 0;
     is_ours
         && match what {
-            What::Robot(Fault::ProgramStop) => machine.runtime_state() == RuntimeState::Playing,
-            What::Robot(Fault::ProtectiveStop) => machine.safety_mode() == SafetyMode::Normal,
+            What::Robot(Fault::ProgramStop | Fault::Freedrive) => machine.runtime_state() == RuntimeState::Playing,
+            What::Robot(Fault::ProtectiveStop) => machine.safety_mode().lets_move(),
+            What::Robot(Fault::SafetyMode(SafetyMode::Recovery)) => machine.safety_mode().lets_move(),
             _ => true,
         }
 }
@@ -287,7 +288,7 @@ impl Checks {
 
     /// Whether the container comes upright when nothing is poured and the program may bring it there.
     fn upright(&mut self, machine: &Machine, alpha_deg: f64, at_s: f64) {
-        let may = machine.safety_mode() == SafetyMode::Normal
+        let may = machine.safety_mode().lets_move()
             && machine.robot_mode() == RobotMode::Running
             && machine.runtime_state() == RuntimeState::Playing
             && machine.speed_scaling() > 0.99

@@ -5,7 +5,7 @@
 use rand::RngExt;
 use rand_pcg::Pcg64Mcg;
 use shared::config::Joint;
-use simulator::ur::Fault;
+use simulator::ur::{Fault, SafetyMode};
 
 use crate::vessels::VESSELS;
 use crate::what::{EyeFault, What};
@@ -38,7 +38,7 @@ const fn unbounded(name: &'static str, noticed_ms: u32, draw: fn(&mut Pcg64Mcg) 
 }
 
 /// All kinds, by the names of the tables and of `--only`.
-pub const KINDS: [Kind; 49] = [
+pub const KINDS: [Kind; 50] = [
     unbounded("protective-stop", 50, |r| pair(Fault::ProtectiveStop, 5_500 + later(r), Fault::UnlockProtectiveStop)),
     unbounded("emergency-stop", 50, |r| {
         let ms = later(r);
@@ -95,12 +95,19 @@ pub const KINDS: [Kind; 49] = [
     unbounded("remote-control", 0, |r| pair(Fault::LocalControl, later(r), Fault::RemoteControl)),
     unbounded("safeguard-stop", 50, |r| pair(Fault::SafeguardOpen, later(r), Fault::SafeguardClosed)),
     unbounded("hand-move", 50, |r| {
-        // The program comes upright and ends first; then a person moves a joint, and lets go.
+        // The teach button ends the program; then a person moves a joint, and lets go.
         let joint = if r.random_bool(0.5) { Joint::Base } else { Joint::Wrist3 };
         let hand = (3_500, What::Robot(Fault::HandMove(joint, r.random_range(-25.0..25.0))));
         vec![(0, What::Robot(Fault::Freedrive)), hand, (6_000 + later(r), What::Robot(Fault::FreedriveEnd))]
     }),
     unbounded("second-client", 0, |r| vec![(0, What::SecondClient(r.random_range(100..9_000)))]),
+    unbounded("safety-mode", 50, |r| {
+        use SafetyMode::{Recovery, SystemEmergencyStop, Violation};
+        let mode = [Recovery, SystemEmergencyStop, Violation, SafetyMode::Fault][r.random_range(0..4)];
+        let ms = later(r);
+        let remedy = [(ms, What::Robot(Fault::SafetyMode(SafetyMode::Normal))), (ms + 300, What::Robot(Fault::BrakeRelease))];
+        robot(Fault::SafetyMode(mode)).into_iter().chain(remedy).collect()
+    }),
 ];
 
 /// The number of the kind with this name.

@@ -12,6 +12,7 @@ pub fn must_end(what: &What) -> Option<f64> {
     match what {
         What::Robot(Fault::ProtectiveStop | Fault::SafeguardOpen | Fault::EmergencyStop) => Some(0.0),
         What::Robot(Fault::ProgramPause | Fault::ProgramStop | Fault::Freedrive) => Some(0.0),
+        What::Robot(Fault::SafetyMode(mode)) if !mode.lets_move() => Some(0.0),
         What::Robot(Fault::Fin | Fault::Reset | Fault::Boot | Fault::Offline(_)) | What::LinkCut | What::Abort => Some(0.0),
         What::Robot(Fault::SpeedSlider(share)) if *share < 0.9 => Some(0.0),
         What::Robot(Fault::TimeScaling(share)) if *share < 0.9 => Some(0.2),
@@ -37,10 +38,11 @@ pub fn reasons(what: &What) -> &'static [EndReason] {
             Fault::ProtectiveStop => &[ProtectiveStop, NotUpright, ProgramStopped, NotFollowed],
             Fault::SafeguardOpen => &[SafetyStop, NotUpright, ProgramStopped, NotFollowed],
             Fault::EmergencyStop => &[EmergencyStop, ProgramStopped, RobotNotRunning],
+            Fault::SafetyMode(_) => &[SafetyStop, EmergencyStop, ProgramStopped, RobotNotRunning],
             Fault::ProgramPause | Fault::ProgramStop | Fault::ProgramResume | Fault::Jog(..) => &[ProgramStopped, NotFollowed],
             Fault::SpeedSlider(_) | Fault::TimeScaling(_) => &[SpeedReduced, NotFollowed, NotUpright, ProgramStopped],
             Fault::HeldBack(_) | Fault::JointSpeedLimit(_) => &[NotFollowed, NotUpright, ProtectiveStop, ProgramStopped],
-            Fault::Freedrive | Fault::HandMove(..) => &[InHand, NotFollowed],
+            Fault::Freedrive | Fault::HandMove(..) => &[InHand, NotFollowed, ProgramStopped],
             Fault::Boot => &[RobotNotRunning, ProgramStopped],
             _ => &[RobotLost, RobotStalled, ProgramStopped, NotFollowed, NotUpright],
         },
@@ -62,7 +64,10 @@ pub fn lasts(what: &What) -> bool {
 /// Whether a person takes the robot with it, or stops it, so that it must not be taken back unasked.
 pub fn takes_robot(what: &What) -> bool {
     let What::Robot(fault) = what else { return false };
-    matches!(fault, Fault::ProtectiveStop | Fault::EmergencyStop | Fault::ProgramStop)
+    match fault {
+        Fault::SafetyMode(mode) => !mode.lets_move(),
+        _ => matches!(fault, Fault::ProtectiveStop | Fault::EmergencyStop | Fault::ProgramStop | Fault::Freedrive),
+    }
 }
 
 /// Whether the program may end tilted because of it, or the arm be kept from coming upright.
@@ -73,7 +78,6 @@ pub fn leaves_tilted(what: &What) -> bool {
             fault,
             Fault::ProgramPause
                 | Fault::SafeguardOpen
-                | Fault::Freedrive
                 | Fault::HandMove(..)
                 | Fault::Jog(..)
                 | Fault::Boot

@@ -5,7 +5,7 @@
 use serde::Serialize;
 use shared::gaussian_curve::Curve;
 use simulator::camera::faults::FaultKind;
-use simulator::ur::Fault;
+use simulator::ur::{Fault, SafetyMode};
 
 /// What the worker or its camera does wrong.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
@@ -130,4 +130,5 @@ fn is_remedy(fault: &Fault) -> bool {
             | Fault::RemoteControl
             | Fault::SafeguardClosed
     ) || matches!(fault, Fault::SpeedSlider(share) if *share >= 1.0)
+        || *fault == Fault::SafetyMode(SafetyMode::Normal)
 }

@@ -62,7 +62,7 @@ pub fn calibrate(episodes: &[TrainingEpisode], exponent: Option<f64>) -> Calibra
         grid.min_by(|a, b| factor(episodes, *a).1.total_cmp(&factor(episodes, *b).1)).unwrap_or(1.0)
     });
     Calibration {
-        volume_at_1_px2_ml: factor(episodes, exponent).0.max(1e-12) as f32,
+        volume_at_1_px2_ml: factor(episodes, exponent).0.max(f64::from(f32::MIN_POSITIVE)) as f32,
         area_exponent: exponent as f32,
         log_tilt_slope: 0.0,
         hold_above_px2: HOLD_ABOVE_PX2,
@@ -103,9 +103,9 @@ pub fn with_doubt(episodes: &[TrainingEpisode], exact: bool) -> Doubted {
     let few = episodes.len() < EXPONENT_NEEDS;
     let calibration = calibrate(episodes, if exact { Some(1.0) } else { few.then_some(EXPONENT_EXPECTED) });
     let q = f64::from(calibration.area_exponent);
-    let mut precision = [[0.0, 0.0], [0.0, 1.0 / (EXPONENT_SD * EXPONENT_SD)]];
+    let mut data = [[0.0; 2]; 2];
     let mut misfit = MISFIT_EXPECTED;
-    let mut misses = 0.0;
+    let (mut misses, mut told) = (0.0, 0.0);
     for e in episodes {
         let sum_ml = f64::from(calibration.volume_at_1_px2_ml) * area_sum(e, q);
         let step = 1e-3;
@@ -113,25 +113,31 @@ pub fn with_doubt(episodes: &[TrainingEpisode], exact: bool) -> Doubted {
         let sd_g = if exact { READ_SD_G } else { weight_sd_g(e.weight_g) };
         let slopes = [sum_ml / sd_g, slope_ml / sd_g];
         misfit += ((sum_ml - e.weight_g) / sd_g).powi(2);
-        misses += ((sum_ml - e.weight_g) / e.weight_g).powi(2) - (READ_SD_G / e.weight_g).powi(2);
-        for (row, a) in precision.iter_mut().zip(slopes) {
+        let read = (READ_SD_G / e.weight_g).powi(2);
+        // What the scale rounds of a light weight hides how far it is missed, and would count for more than all that the others show.
+        let tells = POUR_SD * POUR_SD / (POUR_SD * POUR_SD + read);
+        misses += tells * (((sum_ml - e.weight_g) / e.weight_g).powi(2) - read);
+        told += tells;
+        for (row, a) in data.iter_mut().zip(slopes) {
             for (value, b) in row.iter_mut().zip(slopes) {
                 *value += a * b;
             }
         }
     }
     let misfit = (misfit / episodes.len().max(1) as f64).max(MISFIT_MIN);
-    let [[cc, cq], [_, qq]] = precision;
+    // The weights' misfit says how much they are worth, and nothing about what was known before them.
+    let [[cc, cq], [_, of_weights]] = data.map(|row| row.map(|v| v / misfit));
+    let qq = of_weights + 1.0 / (EXPONENT_SD * EXPONENT_SD);
     let determinant = (cc * qq - cq * cq).max(1e-12);
     let covariance = if exact {
-        [[misfit / cc.max(1e-12), 0.0], [0.0, 0.0]]
+        [[1.0 / cc.max(1e-12), 0.0], [0.0, 0.0]]
     } else {
-        [[misfit * qq / determinant, -misfit * cq / determinant], [-misfit * cq / determinant, misfit * cc / determinant]]
+        [[qq / determinant, -cq / determinant], [-cq / determinant, cc / determinant]]
     };
     let n = episodes.len() as f64;
     // Two unknowns have met two of the weights.
     let seen = if few { 0.0 } else { misses.max(0.0) * n / (n - 2.0).max(1.0) };
-    let pour_sd = ((POURS_EXPECTED * POUR_SD * POUR_SD + seen) / (POURS_EXPECTED + if few { 0.0 } else { n })).sqrt();
+    let pour_sd = ((POURS_EXPECTED * POUR_SD * POUR_SD + seen) / (POURS_EXPECTED + if few { 0.0 } else { told })).sqrt();
     // Cut as a whole: entries that are cut one by one are no covariance, and leave no doubt at all at the areas of the episodes.
     let largest = covariance.iter().flatten().fold(0.0f64, |most, v| most.max(v.abs()));
     let share = (COVARIANCE_MAX / largest.max(1e-12)).min(1.0);
@@ -161,6 +167,48 @@ mod tests {
                 assert!(sd(0.5 * area) > 0.5 * EXPONENT_SD * 2f64.ln(), "{area} px^2: {}", sd(0.5 * area));
                 assert!(cc <= 25.0 && qq <= 25.0 && cq.abs() <= 25.0, "a weight file holds no more");
             }
+        }
+    }
+
+    /// Sixty frames of an area, weighed.
+    fn weighed(area: f64, weight_g: f64) -> TrainingEpisode {
+        let mut e = TrainingEpisode::empty("x", 30.0);
+        (0..60).for_each(|k| e.push(f64::from(k) / 30.0, 50.0, f64::NAN, area));
+        e.weight_g = weight_g;
+        e
+    }
+
+    /// Protects the doubt of q from weights that say nothing about it: those of streams that are alike leave it as it was known before them, however
+    /// many they are and however well they meet each other.
+    #[test]
+    fn weights_of_like_streams_do_not_tell_the_exponent() {
+        for n in [4, 8, 20] {
+            let [_, [_, qq]] = with_doubt(&vec![weighed(1000.0, 60.0); n], false).covariance;
+            assert!((qq.sqrt() / EXPONENT_SD - 1.0).abs() < 0.01, "{n} weights: {}", qq.sqrt());
+        }
+    }
+
+    /// Protects cameras with a unit of their own, such as square micrometres: c has no floor that their areas reach.
+    #[test]
+    fn the_calibration_has_no_unit_of_its_own() {
+        let episodes = [40.0, 60.0, 80.0, 100.0].map(|weight_g| weighed(1e11 * weight_g, weight_g));
+        let Calibration { volume_at_1_px2_ml, area_exponent, .. } = calibrate(&episodes, None);
+        let ml = f64::from(volume_at_1_px2_ml) * area_sum(&episodes[2], f64::from(area_exponent));
+        assert!((ml - 80.0).abs() < 3.0, "{ml}");
+    }
+
+    /// Protects the scatter that the weights show from a light one, which the scale's rounding hides: a gram more or less changes next to nothing.
+    #[test]
+    fn a_light_weight_hides_no_scatter() {
+        let off = [1.06, 0.95, 1.05, 0.94, 1.07, 0.93, 1.06, 0.95, 1.04, 0.96];
+        let mut episodes: Vec<TrainingEpisode> =
+            off.iter().enumerate().map(|(k, off)| weighed(500.0 * (1 + k) as f64, (30.0 * (1 + k) as f64 * off).round())).collect();
+        let without = with_doubt(&episodes, false).pour_sd;
+        assert!(without > 0.04, "{without}");
+        for weight_g in [1.0, 2.0] {
+            episodes.push(weighed(17.0, weight_g));
+            let with = with_doubt(&episodes, false).pour_sd;
+            assert!((with / without - 1.0).abs() < 0.05, "{weight_g} g: {without} without it, {with} with it");
         }
     }
 }

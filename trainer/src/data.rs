@@ -10,6 +10,10 @@ use shared::plural::counted;
 
 /// Fewer frames than this are no whole curve: one second at 30 frames a second.
 const FRAMES_MIN: usize = 30;
+/// Frames a second that a camera may have: times in ms or us are far from it. Chosen by hand: half and twice what the controller allows.
+const RATES_HZ: std::ops::RangeInclusive<f64> = 1.0..=240.0;
+/// Frame rates that are further apart than this are different ones, Hz. Chosen by hand; no measurement is recorded.
+const RATES_APART_HZ: f64 = 0.5;
 
 /// One experimental episode E = (L_E, w_E). Each camera frame is one row, and all columns have the same length.
 #[derive(Debug, Clone, PartialEq)]
@@ -123,6 +127,9 @@ impl TrainingEpisode {
         if let Some(k) = self.t_s.windows(2).position(|t| t[1] <= t[0]) {
             return Some(format!("frame {}: time does not go forward: sort the frames", k + 1));
         }
+        if !RATES_HZ.contains(&self.rate_hz) {
+            return Some(format!("{} frames a second: t_s must be in seconds", self.rate_hz));
+        }
         if let Some(k) = self.area_px2.iter().position(|a| a.is_infinite() || *a < 0.0) {
             return Some(format!("frame {k}: area {} is not a number >= 0: check the vision", self.area_px2[k]));
         }
@@ -158,6 +165,21 @@ fn frame_rate_hz(e: &Episode) -> f64 {
     (1.0 / median * 10.0).round() / 10.0
 }
 
+/// Takes out the episodes whose frame rate is not that of most others: a delay and a flow in frames mean something else in them. Of two rates that
+/// are as frequent, that of the newest episode counts.
+fn keep_one_rate(found: &mut UsableEpisodes) {
+    let alike = |a: &TrainingEpisode, b: &TrainingEpisode| (a.rate_hz - b.rate_hz).abs() <= RATES_APART_HZ;
+    let frequent = found.episodes.iter().max_by_key(|e| found.episodes.iter().filter(|other| alike(e, other)).count());
+    let Some(rate_hz) = frequent.map(|e| e.rate_hz) else { return };
+    let (kept, others): (Vec<_>, Vec<_>) =
+        std::mem::take(&mut found.episodes).into_iter().partition(|e| (e.rate_hz - rate_hz).abs() <= RATES_APART_HZ);
+    found.episodes = kept;
+    found.left_out.extend(others.into_iter().map(|e| {
+        let what = format!("{} frames a second, and the others have {rate_hz}: train on one frame rate only", e.rate_hz);
+        (e.name, what)
+    }));
+}
+
 /// Frames a second of a data set: those of its first episode, or 30 of an empty set.
 pub fn rate_hz(episodes: &[TrainingEpisode]) -> f64 {
     episodes.first().map_or(30.0, |e| e.rate_hz)
@@ -175,7 +197,8 @@ pub struct EpisodeSource {
 }
 
 impl EpisodeSource {
-    /// Reads the episodes. That they can be read is all that is checked here.
+    /// Reads the episodes. That they can be read is all that is checked here. Recordings come in the order in which they began, because the newest
+    /// ones count where something has changed; tables keep their order.
     pub fn read(&self) -> Result<Vec<Episode>, DataError> {
         let mut episodes = Vec::new();
         if let Some(scale) = &self.scale {
@@ -186,6 +209,8 @@ impl EpisodeSource {
             for file in episode::find_episodes(&self.episodes)? {
                 episodes.push(Episode::read(&file)?);
             }
+            // Those of one time stay in the order of their numbers.
+            episodes.sort_by(|a, b| a.info.started_at_utc.cmp(&b.info.started_at_utc));
         }
         if episodes.is_empty() {
             let places: Vec<String> = self.episodes.iter().map(|p| p.display().to_string()).collect();
@@ -204,7 +229,7 @@ pub struct UsableEpisodes {
     pub left_out: Vec<(String, String)>,
 }
 
-/// Keeps the episodes that can be trained on: complete, weighed and sound ones, and each measurement once.
+/// Keeps the episodes that can be trained on: complete, weighed and sound ones of one frame rate, and each measurement once.
 pub fn usable(episodes: &[Episode]) -> UsableEpisodes {
     let mut result = UsableEpisodes::default();
     let doubles = Episode::duplicates(episodes);
@@ -222,6 +247,7 @@ pub fn usable(episodes: &[Episode]) -> UsableEpisodes {
             None => result.episodes.push(own),
         }
     }
+    keep_one_rate(&mut result);
     result
 }
 

@@ -16,11 +16,16 @@ fn text(bytes: &[u8]) -> String {
 
 /// Writes the CSV pair of `n` episodes; weights pass through `weight`.
 fn tables(dir: &Path, n: usize, weight: impl Fn(usize, f64) -> f64) {
+    tables_timed(dir, n, weight, |_, t_s| t_s);
+}
+
+/// The same; times pass through `time`.
+fn tables_timed(dir: &Path, n: usize, weight: impl Fn(usize, f64) -> f64, time: impl Fn(usize, f64) -> f64) {
     let mut features = String::from("episode,frame,t_s,alpha_deg,area_px2\n");
     let mut scale = String::from("episode,weight_g\n");
     for (k, e) in common::episodes(n, 1).iter().enumerate() {
         for i in 0..e.len() {
-            features += &format!("{},{i},{:.4},{:.4},{:.2}\n", e.name, e.t_s[i], e.alpha_deg[i], e.area_px2[i]);
+            features += &format!("{},{i},{:.4},{:.4},{:.2}\n", e.name, time(k, e.t_s[i]), e.alpha_deg[i], e.area_px2[i]);
         }
         scale += &format!("{},{}\n", e.name, weight(k, e.weight_g));
     }
@@ -67,6 +72,88 @@ fn refine_asks_about_a_wrong_weight() {
     let out = trainer(dir.path(), &["check", "f.csv", "--scale", "s.csv"]);
     assert_eq!(out.status.code(), Some(1));
     assert!(text(&out.stdout).contains("doubtful: 3: weight"), "{}", text(&out.stdout));
+}
+
+/// Protects the controller's estimate from a mixture: of two frame rates only the more frequent one is trained on, and what was left out is named.
+#[test]
+fn another_frame_rate_is_left_out() {
+    let dir = tempfile::tempdir().unwrap();
+    tables_timed(dir.path(), 5, |_, w| w, |k, t_s| if k == 0 { 1.2 * t_s } else { t_s });
+    let out = trainer(dir.path(), &["train", "f.csv", "--scale", "s.csv", "--out", "w.bin"]);
+    let words = "left out: 1: 25 frames a second, and the others have 30: train on one frame rate only";
+    assert!(out.status.success() && text(&out.stderr).contains(words), "{}", text(&out.stderr));
+    let said = text(&trainer(dir.path(), &["inspect", "w.bin", "--json"]).stdout);
+    let all: serde_json::Value = serde_json::from_str(&said).unwrap();
+    assert_eq!(all["weights"]["rate_hz"], 30.0, "{said}");
+    assert_eq!(trainer(dir.path(), &["check", "f.csv", "--scale", "s.csv"]).status.code(), Some(1));
+}
+
+/// Protects the way back from a delay that is cut off: pictures that are later than any modelled delay are not trained on in silence.
+#[test]
+fn a_delay_beyond_the_model_is_said() {
+    let dir = tempfile::tempdir().unwrap();
+    tables(dir.path(), 4, |_, w| w);
+    let features = std::fs::read_to_string(dir.path().join("f.csv")).unwrap();
+    let rows: Vec<Vec<&str>> = features.lines().map(|l| l.split(',').collect()).collect();
+    let area = |k: usize| rows[k.saturating_sub(20)].get(4).filter(|_| k > 20 && rows[k - 20][0] == rows[k][0]).map_or("0", |a| a);
+    let late: String = rows
+        .iter()
+        .enumerate()
+        .map(|(k, r)| format!("{},{},{},{},{}\n", r[0], r[1], r[2], r[3], if k == 0 { r[4] } else { area(k) }))
+        .collect();
+    std::fs::write(dir.path().join("late.csv"), late).unwrap();
+    for (table, says) in [("f.csv", false), ("late.csv", true)] {
+        let out = trainer(dir.path(), &["train", table, "--scale", "s.csv", "--out", "w.bin"]);
+        assert_eq!(
+            text(&out.stderr).contains("doubtful: the pictures seem to be late by 13 frames or more"),
+            says,
+            "{table}: {}",
+            text(&out.stderr)
+        );
+    }
+}
+
+/// Protects people whose own vision counts in ms or us: they are told, and nothing panics.
+#[test]
+fn times_are_in_seconds() {
+    for factor in [1e3, 1e6] {
+        let dir = tempfile::tempdir().unwrap();
+        tables_timed(dir.path(), 4, |_, w| w, |_, t_s| factor * t_s);
+        let out = trainer(dir.path(), &["train", "f.csv", "--scale", "s.csv", "--out", "w.bin"]);
+        let said = text(&out.stderr);
+        assert!(out.status.code() == Some(2) && said.contains("frames a second: t_s must be in seconds"), "{factor}: {said}");
+    }
+}
+
+/// Protects the proposals from a figure that means nothing: goals that show no stream give no deviation of 0 ml, but are refused.
+#[test]
+fn goals_of_a_drop_are_not_planned_for() {
+    let dir = tempfile::tempdir().unwrap();
+    tables(dir.path(), 4, |_, w| w);
+    let out = trainer(dir.path(), &["plan", "f.csv", "--scale", "s.csv", "--holds", "500", "--goal-max", "1"]);
+    assert!(
+        out.status.code() == Some(1) && text(&out.stderr).contains("nothing can be proposed"),
+        "{}{}",
+        text(&out.stdout),
+        text(&out.stderr)
+    );
+}
+
+/// Protects whoever opens a page of somebody else's figures: they are text, and numbers that no plot can hold end nothing.
+#[test]
+fn figures_of_others_are_only_shown() {
+    let dir = tempfile::tempdir().unwrap();
+    let script = "<script>alert(1)</script>";
+    let values = ["sim", "container", "change", "rigs", "first_rig", "seeds", "episodes", "weighed"];
+    let evaluation: serde_json::Map<_, _> = values.iter().map(|key| ((*key).to_owned(), script.into())).collect();
+    let mut evaluation = serde_json::Value::Object(evaluation);
+    evaluation["kind"] = "evaluation".into();
+    std::fs::write(dir.path().join("e.json"), evaluation.to_string()).unwrap();
+    std::fs::write(dir.path().join("t.json"), r#"{"kind":"training","loss":[1e308,-1e308,1e-320]}"#).unwrap();
+    let out = trainer(dir.path(), &["report", "e.json", "t.json", "--out", "r.html"]);
+    assert!(out.status.success(), "{}", text(&out.stderr));
+    let page = std::fs::read_to_string(dir.path().join("r.html")).unwrap();
+    assert!(!page.contains("<script") && page.matches("&lt;script").count() >= values.len(), "{page}");
 }
 
 /// Protects the first hour with a vessel: without anything weighed a curve is proposed if the vessel's volume is known, after curves a pour, as

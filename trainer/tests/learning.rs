@@ -68,6 +68,14 @@ fn the_newest_gain_of_the_camera_counts() {
     assert!(off.abs() < 0.03, "{off} off the camera as it is now");
 }
 
+/// Protects what is said of a pour before a camera whose frames are quiet but whose gain changes from pour to pour: the weights show it.
+#[test]
+fn quiet_frames_hide_no_change_of_the_gain() {
+    let off = [1.06, 0.95, 1.05, 0.94, 1.07, 0.93, 1.06, 0.95, 1.04, 0.96];
+    let found = fit::fit(&episodes_of(&FlowModel::default(), 10, 2, |k| ((CAMERA.0 * off[k], CAMERA.1), 0.01)));
+    assert!(found.fused.gain_sd > 0.04, "{}", found.fused.gain_sd);
+}
+
 /// Protects a camera whose areas add up exactly, as in the paper's simulation: q = 1 is taken as right, not fitted.
 #[test]
 fn a_linear_camera_is_taken_as_linear() {

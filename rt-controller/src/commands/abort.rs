@@ -25,7 +25,8 @@ const BEAT: Duration = Duration::from_millis(50);
 /// Command-line arguments.
 #[derive(Debug, clap::Args)]
 #[command(after_help = "Examples:\n  rt-controller abort\n  rt-controller abort --config config/cell.toml\n\n\
-Without a configuration it stops every controller of this user that runs (as root: of all users). It does not need shared memory, and\n\
+Without a configuration it stops every controller that runs and that this user may stop: their own, and those whose runtime directory\n\
+lets their group in; as root all. It does not need shared memory, and\n\
 works while /dev/shm is full or files were deleted. If no controller answers, it sends the process SIGTERM; Ctrl-C in the controller's\n\
 terminal and `kill` do the same. The container then comes upright, and the controller ends.\n\
 Exit codes: 0 upright, 1 not upright or not known, 3 no controller, 5 the robot cannot be moved.")]
@@ -40,7 +41,7 @@ pub struct Args {
 pub fn run(args: &Args) -> Result<(), Failure> {
     let (targets, doubted) = targets(args.config.as_deref());
     if targets.is_empty() {
-        let none = || failure(exit::UNREACHABLE, "no rt-controller of this user is running");
+        let none = || failure(exit::UNREACHABLE, "no rt-controller that this user may stop is running");
         return Err(if doubted.is_empty() { none() } else { not_known(&doubted.join("; ")) });
     }
     for why in doubted {

@@ -210,7 +210,7 @@ fn may_not_move((options, before): (&LinkOptions, &Before), state: &RobotState, 
     // A paused program counts: it goes on when somebody resumes it, and may then be stopped before the next look at the robot.
     let runs_none = matches!(state.runtime_state, RUNTIME_STOPPING | RUNTIME_STOPPED) || unpowered || hands::never_started(before, state);
     let program_there = !runs_none;
-    LinkError::MayNotMove { address: options.address, reason, unpowered, program_there }
+    LinkError::MayNotMove { address: options.address, reason, safety_mode: state.safety_mode, unpowered, program_there }
 }
 
 /// The error of a joint that is too far from its start angle. One that is off by whole turns holds the container upright, but cannot tilt it as far.

@@ -7,7 +7,7 @@ use std::time::Duration;
 
 use shared::control::EndReason;
 
-use super::hands::{Handover, remedy};
+use super::hands::{Handover, SAFETY_MODE_SAFEGUARD_STOP, remedy};
 
 /// How long a TCP connection, and each answer, may take. Chosen by hand; no measurement is recorded.
 pub(super) const ANSWER: Duration = Duration::from_secs(2);
@@ -150,6 +150,8 @@ pub enum LinkError {
         address: IpAddr,
         /// Why it may not move.
         reason: EndReason,
+        /// The mode of its safety system (RTDE guide).
+        safety_mode: i32,
         /// Whether its arm has no power or its brakes on.
         unpowered: bool,
         /// Whether a program is there nevertheless: it runs, or is paused and can be resumed.
@@ -220,6 +222,10 @@ impl LinkError {
             Self::ProgramPaused { .. } => Some(Handover::Paused),
             Self::MayNotMove { reason: reason @ (EndReason::ProtectiveStop | EndReason::EmergencyStop | EndReason::InHand), .. } => {
                 Some(Handover::Stopped(*reason))
+            }
+            // A violation, a fault or a recovery is cleared by a person, as in a session; only a safeguard that is closed is the word that work goes on.
+            Self::MayNotMove { reason: EndReason::SafetyStop, safety_mode, .. } => {
+                (*safety_mode != SAFETY_MODE_SAFEGUARD_STOP).then_some(Handover::Stopped(EndReason::SafetyStop))
             }
             _ => None,
         }

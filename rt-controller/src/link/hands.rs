@@ -21,7 +21,7 @@ const DISPLACED_RAD: f64 = 0.0087;
 /// The bit of `robot_status_bits` for a running program (RTDE guide).
 const PROGRAM_RUNNING_BIT: u32 = 1 << 1;
 /// `safety_mode` while a safeguard is open (RTDE guide).
-const SAFETY_MODE_SAFEGUARD_STOP: i32 = 5;
+pub(super) const SAFETY_MODE_SAFEGUARD_STOP: i32 = 5;
 /// Names of the joints, base to wrist 3.
 const NAMES: [&str; 6] = ["base", "shoulder", "elbow", "wrist 1", "wrist 2", "wrist 3"];
 

@@ -177,6 +177,20 @@ fn a_new_controller_sees_that_a_program_was_stopped() {
     }
 }
 
+/// Protects people who clear what the safety system has stopped (recovery, violation, fault): a robot that is found so waits for its operator, as one
+/// that is stopped so in a session does. A safeguard that is open is waited for, and one whose arm has no power is, at the first start.
+#[test]
+fn a_robot_that_its_safety_system_stopped_waits_for_its_operator() {
+    for (number, safety_mode) in [(140, 4), (141, 8), (142, 9)] {
+        let error = Server::new(number, Robot { safety_mode, ..Robot::default() }).meet().0.unwrap_err();
+        assert_eq!(error.handover(), Some(Handover::Stopped(EndReason::SafetyStop)), "{safety_mode}: {error}");
+    }
+    for (number, robot_mode, safety_mode) in [(143, 7, 5), (144, 3, 1)] {
+        let error = Server::new(number, Robot { robot_mode, safety_mode, ..Robot::default() }).meet().0.unwrap_err();
+        assert_eq!(error.handover(), None, "{safety_mode}: {error}");
+    }
+}
+
 /// Protects people who stop our program after it stood paused behind an open safeguard: the look at the robot says that a program is there, so that
 /// its stop counts even if it went on and was stopped between two looks. A booted robot, and an arm without power, have none.
 #[test]

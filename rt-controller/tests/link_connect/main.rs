@@ -368,7 +368,13 @@ fn a_stop_during_the_upload_is_named() {
     let error = connect(&options).unwrap_err();
     assert_eq!(
         error,
-        LinkError::MayNotMove { address: options.address, reason: EndReason::EmergencyStop, unpowered: true, program_there: false }
+        LinkError::MayNotMove {
+            address: options.address,
+            reason: EndReason::EmergencyStop,
+            safety_mode: 6,
+            unpowered: true,
+            program_there: false
+        }
     );
     drop(served.join());
 }

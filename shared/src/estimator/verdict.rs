@@ -69,7 +69,8 @@ const SAME_DEG: f64 = 3.0;
 const ABRUPT_ML: f64 = 0.7;
 /// The container is brought back if it is tilted less by this than when the stream was seen last, degrees. Chosen by hand: noise of the tilt is less.
 const BROUGHT_BACK_DEG: f64 = 0.5;
-/// For so many frames a stream that is gone may still run as before: at a tilt that stands, half a second later it has ebbed away.
+/// For so many frames a stream that is gone may still run as before: at a tilt that stands it has ebbed away after half a second, which this is at 30
+/// frames a second.
 const GONE_FRAMES: u32 = 15;
 /// A stream may rise so far within a frame at a tilt that stands, as excess above the lip, ml. Chosen by hand; no measurement is recorded.
 const RISES_ML: f64 = 0.3;

@@ -194,7 +194,7 @@ fn robot_mode_data(machine: &Machine) -> Vec<u8> {
         true, // A real robot is connected.
         true, // A real robot is enabled.
         machine.robot_mode() != RobotMode::PowerOff,
-        machine.safety_mode() == SafetyMode::RobotEmergencyStop,
+        matches!(machine.safety_mode(), SafetyMode::RobotEmergencyStop | SafetyMode::SystemEmergencyStop),
         machine.safety_mode() == SafetyMode::ProtectiveStop,
         machine.runtime_state() == RuntimeState::Playing,
         machine.runtime_state() == RuntimeState::Paused,

@@ -8,6 +8,7 @@ use std::str::FromStr;
 
 use shared::config::Joint;
 
+use super::machine::SafetyMode;
 use super::variables::Input;
 
 /// A fault, or the end of one. Times are in s.
@@ -53,6 +54,8 @@ pub enum Fault {
     EmergencyStop,
     /// The emergency stop button is released.
     EmergencyRelease,
+    /// The safety system goes into this mode, one that no other fault causes; or back to normal, and then an arm without power stays so.
+    SafetyMode(SafetyMode),
     /// Programs start this much later from now on.
     LateStart(f64),
     /// The program is stopped on the pendant.
@@ -67,7 +70,7 @@ pub enum Fault {
     JointSpeedLimit(f64),
     /// The arm is held back to this speed, in degrees/s, and nothing tells.
     HeldBack(f64),
-    /// The teach button is pressed, so that the arm can be moved by hand.
+    /// The teach button is pressed, so that the arm can be moved by hand. The program that runs is ended.
     Freedrive,
     /// The teach button is released.
     FreedriveEnd,
@@ -119,6 +122,7 @@ safeguard-open        open a door or light curtain
 safeguard-closed      close it again, with the automatic reset
 emergency-stop        press the emergency stop
 emergency-release     release it; then 'power on' and 'brake release' on the dashboard
+safety-mode=MODE      reduced, recovery, system-emergency-stop, violation or fault; normal ends it
 late-start=SECONDS    programs start this much later
 program-stop          stop the program on the pendant
 program-pause         pause the program on the pendant
@@ -128,7 +132,7 @@ speed-slider=SHARE    move the pendant's speed slider, 0.01 to 1
 time-scaling=SHARE    the controller slows the arm by itself, 0.01 to 1
 joint-speed-limit=DEG_S  the safety configuration limits the joints' speed
 held-back=DEG_S       the arm follows servoj no faster, and nothing tells
-freedrive             press the teach button
+freedrive             press the teach button, which ends the program
 freedrive-end         release it
 hand-move=JOINT:DEG   move a joint by hand; needs freedrive and no program
 jog=JOINT:DEG         move a joint with the pendant; needs no running program
@@ -186,6 +190,11 @@ impl FromStr for Fault {
             "safeguard-closed" => plain(Fault::SafeguardClosed),
             "emergency-stop" => plain(Fault::EmergencyStop),
             "emergency-release" => plain(Fault::EmergencyRelease),
+            "safety-mode" => {
+                let name = given()?;
+                let mode = SAFETY_MODES.iter().find(|(n, _)| *n == name).map(|(_, mode)| Fault::SafetyMode(*mode));
+                mode.ok_or_else(|| fail("needs normal, reduced, recovery, system-emergency-stop, violation or fault"))
+            }
             "late-start" => seconds().map(Fault::LateStart),
             "program-stop" => plain(Fault::ProgramStop),
             "program-pause" => plain(Fault::ProgramPause),
@@ -227,6 +236,15 @@ const JOINTS: [(&str, Joint); 6] = [
     ("wrist_2", Joint::Wrist2),
     ("wrist_3", Joint::Wrist3),
 ];
+/// The modes of the safety system that no other fault causes, and how they end, by the names of `safety-mode`.
+const SAFETY_MODES: [(&str, SafetyMode); 6] = [
+    ("normal", SafetyMode::Normal),
+    ("reduced", SafetyMode::Reduced),
+    ("recovery", SafetyMode::Recovery),
+    ("system-emergency-stop", SafetyMode::SystemEmergencyStop),
+    ("violation", SafetyMode::Violation),
+    ("fault", SafetyMode::Fault),
+];
 /// The ports of a robot's services (UR's manuals).
 const CLOSABLE_PORTS: [u16; 5] = [29_999, 30_001, 30_002, 30_003, 30_004];
 /// What is wrong with a motion that cannot be read.
@@ -265,6 +283,9 @@ impl fmt::Display for Fault {
             Fault::SafeguardClosed => f.write_str("safeguard-closed"),
             Fault::EmergencyStop => f.write_str("emergency-stop"),
             Fault::EmergencyRelease => f.write_str("emergency-release"),
+            Fault::SafetyMode(mode) => {
+                write!(f, "safety-mode={}", SAFETY_MODES.iter().find(|(_, m)| m == mode).map_or("", |(name, _)| name))
+            }
             Fault::LateStart(s) => write!(f, "late-start={s}"),
             Fault::ProgramStop => f.write_str("program-stop"),
             Fault::ProgramPause => f.write_str("program-pause"),

@@ -24,12 +24,22 @@ const POWER_STEP_S: f64 = 0.5;
 pub enum SafetyMode {
     /// Nothing stops the arm.
     Normal = 1,
+    /// The reduced limits of the safety configuration hold. That they slow the arm is a fault of its own, a limit of the joints' speed.
+    Reduced = 2,
     /// A demand or a collision stopped the arm; somebody must unlock it.
     ProtectiveStop = 3,
+    /// The robot was started outside its safety limits: a person may move the arm back, and no program runs.
+    Recovery = 4,
     /// A safeguard is open: a door, a light curtain.
     SafeguardStop = 5,
+    /// An emergency stop of the cell, and not of the robot, is pressed.
+    SystemEmergencyStop = 6,
     /// The pendant's emergency stop button is pressed.
     RobotEmergencyStop = 7,
+    /// A safety limit was violated; the arm has no power until the safety system is restarted.
+    Violation = 8,
+    /// The safety system itself has a fault; the arm has no power until it is restarted.
+    Fault = 9,
 }
 
 impl SafetyMode {
@@ -37,10 +47,26 @@ impl SafetyMode {
     pub fn name(self) -> &'static str {
         match self {
             SafetyMode::Normal => "NORMAL",
+            SafetyMode::Reduced => "REDUCED",
             SafetyMode::ProtectiveStop => "PROTECTIVE_STOP",
+            SafetyMode::Recovery => "RECOVERY",
             SafetyMode::SafeguardStop => "SAFEGUARD_STOP",
+            SafetyMode::SystemEmergencyStop => "SYSTEM_EMERGENCY_STOP",
             SafetyMode::RobotEmergencyStop => "ROBOT_EMERGENCY_STOP",
+            SafetyMode::Violation => "VIOLATION",
+            SafetyMode::Fault => "FAULT",
         }
+    }
+
+    /// Whether programs may move the arm.
+    pub fn lets_move(self) -> bool {
+        matches!(self, SafetyMode::Normal | SafetyMode::Reduced)
+    }
+
+    /// Whether the arm gets no power.
+    fn withholds_power(self) -> bool {
+        use SafetyMode::*;
+        matches!(self, SystemEmergencyStop | RobotEmergencyStop | Violation | Fault)
     }
 }
 
@@ -154,6 +180,7 @@ impl Machine {
     pub fn step(&mut self) {
         self.robot.cycle += 1;
         self.power.step(self.robot.cycle);
+        self.obey_teach_button();
         self.programs.step(&mut self.robot);
         if let Some(reason) = self.robot.protective_stop.take() {
             self.protective_stop(&reason);
@@ -162,7 +189,7 @@ impl Machine {
     }
 
     fn may_move(&self) -> bool {
-        self.robot_mode() == RobotMode::Running && self.safety == SafetyMode::Normal
+        self.robot_mode() == RobotMode::Running && self.safety.lets_move()
     }
 
     /// Takes a program that arrived on port 30001, 30002 or 30003. What is wrong with it goes to the log.
@@ -243,7 +270,7 @@ impl Machine {
 
     /// Presses the emergency stop button: the program ends, and the arm stops and loses its power.
     pub fn emergency_stop(&mut self) {
-        if self.safety == SafetyMode::RobotEmergencyStop {
+        if self.safety.withholds_power() {
             return;
         }
         self.robot.event("emergency stop pressed");
@@ -259,9 +286,32 @@ impl Machine {
         }
     }
 
-    /// Switches the arm's power on. False when the emergency stop is pressed.
+    /// Puts the safety system into a mode that no button of this robot causes: reduced, recovery, system emergency stop, violation or fault. What
+    /// stops the arm ends the program, and all but recovery take the power. Normal ends any of these, as a person does who restarts the safety
+    /// system, and leaves an arm without power so.
+    pub fn set_safety_mode(&mut self, mode: SafetyMode) {
+        use SafetyMode::*;
+        let may = match mode {
+            Normal => matches!(self.safety, Reduced | Recovery | SystemEmergencyStop | Violation | Fault),
+            Reduced | Recovery => self.may_move(),
+            SystemEmergencyStop | Violation | Fault => true,
+            ProtectiveStop | SafeguardStop | RobotEmergencyStop => false,
+        };
+        if !may {
+            return;
+        }
+        self.robot.event(&format!("safety mode {}", mode.name()));
+        self.safety = mode;
+        if mode == Recovery {
+            self.programs.stop(&mut self.robot);
+        } else if mode.withholds_power() {
+            self.power_off();
+        }
+    }
+
+    /// Switches the arm's power on. False when the emergency stop is pressed, or the safety system withholds it.
     pub fn power_on(&mut self) -> bool {
-        let may = self.safety != SafetyMode::RobotEmergencyStop;
+        let may = !self.safety.withholds_power();
         if may {
             self.power.switch_on(self.robot.cycle);
         }
@@ -275,9 +325,10 @@ impl Machine {
         self.power.switch_off();
     }
 
-    /// Switches the power on and releases the brakes, as somebody does at the pendant. False when the emergency stop is pressed.
+    /// Switches the power on and releases the brakes, as somebody does at the pendant. False when the emergency stop is pressed, or the safety
+    /// system withholds it.
     pub fn start_arm(&mut self) -> bool {
-        let may = self.safety != SafetyMode::RobotEmergencyStop;
+        let may = !self.safety.withholds_power();
         if may {
             self.power.start(self.robot.cycle);
         }
@@ -298,18 +349,28 @@ impl Machine {
         self.freedrive
     }
 
-    /// Presses or releases the teach button. Released, the arm stands.
+    /// Presses or releases the teach button. Pressed, it ends the program that runs, and none starts or goes on; a paused one stays paused. Of
+    /// what is reported of robots this is the harder case (Universal_Robots_ROS_Driver, issue 525; universal_robot, issue 54). Released, the arm
+    /// stands.
     pub fn set_freedrive(&mut self, pressed: bool) {
-        if self.freedrive && !pressed && self.runtime_state() != RuntimeState::Playing {
+        if self.freedrive && !pressed {
             self.robot.servo.stop(servo::STOP_RAD_S2);
         }
         self.freedrive = pressed;
+        self.obey_teach_button();
+    }
+
+    /// Ends whatever runs or is about to, while the teach button is pressed; what is paused stays so.
+    fn obey_teach_button(&mut self) {
+        if self.freedrive && !matches!(self.runtime_state(), RuntimeState::Pausing | RuntimeState::Paused) {
+            self.programs.stop(&mut self.robot);
+        }
     }
 
     /// Lets a person move the joint of this number, 0 to 5, by `by_rad`: with the pendant, or by hand when `by_hand`. That needs a robot
     /// which may move and runs no program, and by hand the teach button; otherwise the log says why nothing moves.
     pub fn move_joint(&mut self, joint: usize, by_rad: f64, by_hand: bool) {
-        let hindrance = if !self.may_move() {
+        let hindrance = if !self.may_move() && self.safety != SafetyMode::Recovery {
             "the robot may not move"
         } else if self.runtime_state() == RuntimeState::Playing {
             "a program runs"
@@ -326,9 +387,9 @@ impl Machine {
         self.robot.event(&format!("no joint is moved: {hindrance}"));
     }
 
-    /// Releases the brakes, switching the power on first where need be. False when the emergency stop is pressed.
+    /// Releases the brakes, switching the power on first where need be. False when the emergency stop is pressed, or the safety system withholds it.
     pub fn brake_release(&mut self) -> bool {
-        let may = self.safety != SafetyMode::RobotEmergencyStop;
+        let may = !self.safety.withholds_power();
         if may {
             self.power.release_brakes(self.robot.cycle);
         }

@@ -41,14 +41,19 @@ impl Machine {
         if self.robot_mode() == RobotMode::Running { self.robot.own_scaling() } else { 0.0 }
     }
 
-    /// RTDE's safety_status_bits: bit 0 is normal, 2 a protective stop, 4 an open safeguard, 6 the robot's emergency stop, 7 any emergency stop, and
-    /// 10 any stop for safety.
+    /// RTDE's safety_status_bits: bit 0 is normal, 1 reduced, 2 a protective stop, 3 recovery, 4 an open safeguard, 5 the system's emergency stop, 6 the
+    /// robot's, 7 any emergency stop, 8 a violation, 9 a fault, and 10 any stop for safety.
     pub fn safety_status_bits(&self) -> u32 {
         match self.safety_mode() {
             SafetyMode::Normal => 1,
+            SafetyMode::Reduced => 1 << 1,
             SafetyMode::ProtectiveStop => 1 << 2 | 1 << 10,
+            SafetyMode::Recovery => 1 << 3,
             SafetyMode::SafeguardStop => 1 << 4 | 1 << 10,
+            SafetyMode::SystemEmergencyStop => 1 << 5 | 1 << 7 | 1 << 10,
             SafetyMode::RobotEmergencyStop => 1 << 6 | 1 << 7 | 1 << 10,
+            SafetyMode::Violation => 1 << 8 | 1 << 10,
+            SafetyMode::Fault => 1 << 9 | 1 << 10,
         }
     }
 

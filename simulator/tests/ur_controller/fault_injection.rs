@@ -24,6 +24,7 @@ fn faults_have_names_and_arrive_over_the_operator_port() {
             Some((name, "PORT")) => format!("{name}=30003"),
             Some((name, "KG")) => format!("{name}=1.5"),
             Some((name, "X:Y:Z")) => format!("{name}=0:-0.01:0.08"),
+            Some((name, "MODE")) => format!("{name}=system-emergency-stop"),
             Some((name, "CYCLES")) => format!("{name}={}", examples[1]),
             Some((name, "INPUT" | "VARIABLE")) => format!("{name}={}", examples[2]),
             Some((name, _)) => format!("{name}={}", examples[3]),
@@ -32,7 +33,7 @@ fn faults_have_names_and_arrive_over_the_operator_port() {
         assert_eq!(fault.to_string(), text);
         seen += 1;
     }
-    assert_eq!(seen, 41);
+    assert_eq!(seen, 42);
     for (text, error) in [
         ("explode", "no such fault"),
         ("stall", "needs a value"),
@@ -43,6 +44,7 @@ fn faults_have_names_and_arrive_over_the_operator_port() {
         ("time-scaling=1.5", "needs a share"),
         ("joint-speed-limit=0", "needs degrees a second"),
         ("jog=elbow", "needs a joint"),
+        ("safety-mode=protective-stop", "needs normal, reduced"),
         ("hand-move=hip:3", "needs a joint"),
         ("close-port=29995", "needs a port of a robot"),
         ("payload-cog=1:2", "needs three numbers"),

@@ -97,6 +97,46 @@ fn a_protective_stop_is_unlocked_and_the_program_played_on() {
     assert_eq!(machine.runtime_state(), RuntimeState::Playing);
 }
 
+// Protects tests of the rarer safety modes: reduced lets programs run; recovery ends the program and keeps the power; a violation, a fault and the
+// system's emergency stop take it, and no button but the safety system's restart gives it back.
+#[test]
+fn safety_modes_stop_what_they_stop() {
+    use SafetyMode::{Fault, Normal, Recovery, Reduced, SystemEmergencyStop, Violation};
+    let mut reduced = following();
+    reduced.set_safety_mode(Reduced);
+    steps(&mut reduced, 10);
+    assert_eq!((reduced.runtime_state(), reduced.safety_mode() as i32, reduced.safety_status_bits()), (RuntimeState::Playing, 2, 1 << 1));
+    for (mode, code, bits) in [
+        (Recovery, 4, 1 << 3),
+        (SystemEmergencyStop, 6, 1 << 5 | 1 << 7 | 1 << 10),
+        (Violation, 8, 1 << 8 | 1 << 10),
+        (Fault, 9, 1 << 9 | 1 << 10),
+    ] {
+        let mut machine = following();
+        machine.set_safety_mode(mode);
+        steps(&mut machine, 2);
+        assert_eq!((machine.safety_mode() as i32, machine.safety_status_bits()), (code, bits));
+        assert_eq!(
+            (machine.runtime_state(), machine.robot_mode() == RobotMode::Running),
+            (RuntimeState::Stopped, mode == Recovery),
+            "{code}"
+        );
+        machine.upload("def other():\n  sync()\nend\n");
+        assert!(machine.take_log().any(|l| l.text.contains("program not started: robot mode")), "{code}");
+        machine.emergency_stop();
+        machine.release_emergency_stop();
+        let presses = if mode == Recovery { Normal } else { mode };
+        assert_eq!((machine.safety_mode(), machine.start_arm()), (presses, mode == Recovery), "{code}");
+        machine.set_safety_mode(Normal);
+        assert!(machine.start_arm());
+        steps(&mut machine, 400);
+        assert_eq!(
+            (machine.robot_mode(), machine.safety_mode(), machine.runtime_state()),
+            (RobotMode::Running, Normal, RuntimeState::Stopped)
+        );
+    }
+}
+
 // Protects recovery from an emergency stop: it takes release, power and brakes, and the program is gone.
 #[test]
 fn an_emergency_stop_ends_the_program_and_takes_the_power() {

@@ -68,6 +68,34 @@ fn own_scaling_and_slider_multiply() {
     }
 }
 
+// Protects tests of people who take the arm in hand: the teach button ends the program that runs, nothing starts while it is pressed, and a program
+// that was paused stays so, and does not go on before the button is released.
+#[test]
+fn the_teach_button_ends_the_program() {
+    let mut machine = machine(Series::Cb3);
+    machine.upload(COUNT);
+    steps(&mut machine, START_CYCLES + 1);
+    assert_eq!(machine.runtime_state(), RuntimeState::Playing);
+    machine.set_freedrive(true);
+    steps(&mut machine, 2);
+    assert_eq!((machine.runtime_state(), machine.robot_status_bits()), (RuntimeState::Stopped, 0b101));
+    machine.upload(COUNT);
+    steps(&mut machine, START_CYCLES + 10);
+    assert_eq!(machine.runtime_state(), RuntimeState::Stopped);
+    machine.set_freedrive(false);
+    machine.upload(COUNT);
+    steps(&mut machine, START_CYCLES + 1);
+    machine.pause();
+    steps(&mut machine, 2);
+    machine.set_freedrive(true);
+    steps(&mut machine, 10);
+    assert_eq!(machine.runtime_state(), RuntimeState::Paused);
+    machine.set_freedrive(false);
+    assert!(machine.resume());
+    steps(&mut machine, 2);
+    assert_eq!(machine.runtime_state(), RuntimeState::Playing);
+}
+
 // Protects tests that move joints by hand: the teach button shows in the status bits, the joint moves while it is pressed and no
 // program runs, and with the pendant also while one is paused.
 #[test]

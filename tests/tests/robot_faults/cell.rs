@@ -59,14 +59,12 @@ pub enum Expected {
     Orphaned,
     /// The pour ends for this reason, the robot stops where it is until its operator has acted, and is then not taken back unasked.
     Stopped(EndReason),
-    /// The pour ends for this reason, the program comes upright by itself, and the robot is not taken back unasked.
-    InHand(EndReason),
 }
 
 impl Expected {
     /// Whether the controller leaves the robot alone afterwards until it is asked for it.
     fn waits(self) -> bool {
-        matches!(self, Self::Stopped(_) | Self::InHand(_))
+        matches!(self, Self::Stopped(_))
     }
 }
 
@@ -227,7 +225,7 @@ impl Cell {
         };
         let wanted = match expected {
             Expected::Nothing | Expected::Orphaned => EndReason::Done,
-            Expected::Upright(reason) | Expected::Slowed(reason, _) | Expected::Stopped(reason) | Expected::InHand(reason) => reason,
+            Expected::Upright(reason) | Expected::Slowed(reason, _) | Expected::Stopped(reason) => reason,
         };
         match expected {
             Expected::Stopped(_) => self.until("stopped", |c| (c.alpha().1.abs() < 0.5).then_some(())),
@@ -286,7 +284,7 @@ impl Cell {
         }
         match expected {
             Expected::Nothing => {}
-            Expected::Upright(_) | Expected::InHand(_) | Expected::Slowed(..) | Expected::Orphaned => {
+            Expected::Upright(_) | Expected::Slowed(..) | Expected::Orphaned => {
                 let share = if let Expected::Slowed(_, share) = expected { share } else { 1.0 };
                 let bound = (UPRIGHT_BOUND_S + motion.peak_deg / RETURN_RATE_DEG_S) / share;
                 assert!(motion.upright_s.is_some_and(|s| s <= bound), "upright within {bound:.2} s\n{}", context());

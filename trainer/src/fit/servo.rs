@@ -9,7 +9,7 @@ use crate::data::TrainingEpisode;
 
 /// Resolution of the delay and the lag, frames: a tenth of what a pour's delay scatters.
 const STEP_FRAMES: f64 = 0.1;
-/// The longest lag that is looked for, frames. Chosen by hand: the joint of a robot that can stop a stream follows within 0.3 s.
+/// The longest lag that is looked for, frames at 30 frames a second. Chosen by hand: the joint of a robot that can stop a stream follows within 0.3 s.
 const LAG_MAX_FRAMES: f64 = 9.0;
 /// Fewer measured angles than this, in frames whose command moves, say nothing: half a second.
 const MOVING_MIN: usize = 15;
@@ -37,8 +37,9 @@ impl Servo {
         }
         let steps = |most: f64| (0..=(most / STEP_FRAMES) as usize).map(|k| k as f64 * STEP_FRAMES);
         let squares = |servo: &Self| episodes.iter().map(|e| servo.squares(e)).sum::<f64>();
-        let all =
-            steps(DELAY_MAX_FRAMES).flat_map(|delay_frames| steps(LAG_MAX_FRAMES).map(move |lag_frames| Self { delay_frames, lag_frames }));
+        let all = steps(DELAY_MAX_FRAMES).flat_map(|delay_frames| {
+            steps(LAG_MAX_FRAMES * crate::data::rate_hz(episodes) / 30.0).map(move |lag_frames| Self { delay_frames, lag_frames })
+        });
         all.map(|servo| (squares(&servo), servo)).min_by(|a, b| a.0.total_cmp(&b.0)).map(|(_, servo)| servo)
     }
 

@@ -39,11 +39,13 @@ fn has_measured(e: &TrainingEpisode) -> bool {
 /// The measured tilts, whose gaps move as the command does, as at run time.
 fn without_gaps(e: &TrainingEpisode) -> Vec<f64> {
     let first = e.alpha_measured_deg.iter().copied().find(|a| a.is_finite()).unwrap_or(0.0);
-    let mut newest = first;
+    let (mut newest, mut was_known) = (first, false);
     (0..e.len())
         .map(|k| {
-            let moved = if k > 0 && newest != first { e.alpha_deg[k] - e.alpha_deg[k - 1] } else { 0.0 };
-            newest = if e.alpha_measured_deg[k].is_finite() { e.alpha_measured_deg[k] } else { newest + moved };
+            let known = e.alpha_measured_deg[k].is_finite();
+            let moved = if was_known { e.alpha_deg[k] - e.alpha_deg[k - 1] } else { 0.0 };
+            newest = if known { e.alpha_measured_deg[k] } else { newest + moved };
+            was_known |= known;
             newest
         })
         .collect()
@@ -58,4 +60,22 @@ fn followed(commands: &[f64], late: Lateness) -> impl Iterator<Item = f64> + '_ 
         tilt_deg = followed_deg(tilt_deg, delayed_deg(history.commands(), 0, late.delay_frames), late.lag_frames);
         tilt_deg
     })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Protects the likeness of training and pouring: a gap of the measured tilt moves with the command from the first measurement on, also while
+    /// the tilt is still the first one; before it, nothing moves.
+    #[test]
+    fn a_gap_moves_as_the_command_does() {
+        let mut e = TrainingEpisode::empty("x", 30.0);
+        let none = f64::NAN;
+        for (k, (command, measured)) in [(0.0, none), (0.0, 1.0), (2.0, none), (5.0, none), (6.0, 6.5), (7.0, none)].into_iter().enumerate()
+        {
+            e.push(k as f64 / 30.0, command, measured, 0.0);
+        }
+        assert_eq!(without_gaps(&e), [1.0, 1.0, 3.0, 6.0, 6.5, 7.5]);
+    }
 }

@@ -1,5 +1,5 @@
 //! The paper's own training, section 3.3, equation by equation; as printed (`literal`), with the clip that Keras adds
-//! (`literal-clipped`), repaired (`paper`), and its plain relative, behaviour cloning (`cloning`).
+//! (`literal-clipped`), repaired (`paper`), and its plain relative (`cloning`). Both of the latter are behaviour cloning.
 //!
 //! Pure functions of the offline trainer, which allocate and do not fail; the same episodes, options and seed give the same weights on any
 //! number of threads.
@@ -10,9 +10,13 @@
 //! | action of state i | alpha(i) - alpha(i-1), the one *before* the image | alpha(i+1) - alpha(i), the one taken in that state |
 //! | d of state i | d_i, from which v_i has yet to be taken | d_{i+1}, as eq. (2) gives it at run time, or what the fused estimate says |
 //! | goals, eq. (6) | kappa = 0.5, 0.6 .. 1.5 | kappa = 1: the volume that was poured is the goal that was met |
-//! | weights, eq. (5), (7), (8) | normalised rewards of either sign | R of eq. (5), never negative |
+//! | weights, eq. (5), (7), (8) | normalised rewards of either sign | R of eq. (5), which is 1, because d ends at 0 for kappa = 1 |
 //! | frames without flow and without motion | all | dropped: they teach to wait for ever |
 //! | at run time | largest output | the expected angle; its remainder is carried on |
+//!
+//! `paper` differs from `cloning` in the estimate of d and in what is done at run time; that its weights are half as large (lambda) changes next to
+//! nothing under Adam. All methods feed the network with asinh of the volumes. Eq. (7) is divided by the root of the variance, where the paper prints
+//! the variance.
 //!
 //! This is why `literal` does not learn to pour: for R^ < 0 the gradient lambda R^ (p - I) does not vanish as p goes to 0, because
 //! the recorded episodes keep presenting the action. The logits run away, and the policy becomes constant.

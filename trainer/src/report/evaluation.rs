@@ -7,7 +7,7 @@ use std::collections::BTreeMap;
 use serde_json::Value;
 
 use super::json::{items, number, numbers, rounded, text};
-use super::page::{figure, table};
+use super::page::{escape, figure, table};
 use super::plot::{PlotSeries, histogram, plot, plot_below};
 
 /// Dots of a method in a plot: with every dot of a large evaluation, a page would be tens of megabytes.
@@ -26,16 +26,17 @@ const SHARE_STEPS: u32 = 60;
 
 /// An evaluation as `experiments evaluate` writes it.
 pub fn evaluation(v: &Value) -> String {
+    let shown = |key: &str| escape(&text(&v[key]));
     let mut html = format!(
         "<h2>Evaluation: simulator {}, container {}, change {}</h2><p>{} rigs from {}, {} data seeds, {} episodes and {} weighed pours. Errors in ml; the interval is 95 % over rigs and seeds.</p>",
-        text(&v["sim"]),
-        text(&v["container"]),
-        text(&v["change"]),
-        v["rigs"],
-        v["first_rig"],
-        v["seeds"],
-        v["episodes"],
-        v["weighed"]
+        shown("sim"),
+        shown("container"),
+        shown("change"),
+        shown("rigs"),
+        shown("first_rig"),
+        shown("seeds"),
+        shown("episodes"),
+        shown("weighed")
     );
     html += &summaries(&v["summaries"]);
     html += "<div class=plots>";

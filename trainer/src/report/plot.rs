@@ -55,6 +55,8 @@ const COLOURS: [RGBColor; 8] = [
     RGBColor(160, 110, 60),
 ];
 
+/// Numbers from here on are not drawn, as those that are not finite: the distance of two of them has to be a number, too.
+const LARGEST: f64 = 1e300;
 /// Height of each plot of several one below the other, px. Chosen by hand: three are as high as wide, and a little more.
 const PANEL_PX: u32 = 190;
 /// Colour of a reference.
@@ -113,6 +115,11 @@ fn draw(svg: &mut String, x_title: &str, y_title: &str, series: &[PlotSeries], f
     Ok(())
 }
 
+/// Whether a point can be drawn.
+fn drawable((x, y): &(f64, f64)) -> bool {
+    x.abs() < LARGEST && y.abs() < LARGEST
+}
+
 /// Draws a plot into an area.
 fn draw_on(
     area: &DrawingArea<SVGBackend<'_>, plotters::coord::Shift>,
@@ -121,7 +128,7 @@ fn draw_on(
     series: &[PlotSeries],
     from_zero: bool,
 ) -> Result<(), Box<dyn std::error::Error>> {
-    let all = || series.iter().flat_map(|s| &s.points).filter(|(x, y)| x.is_finite() && y.is_finite());
+    let all = || series.iter().flat_map(|s| &s.points).filter(|point| drawable(point));
     let bounds = |f: fn(&(f64, f64)) -> f64| {
         let low = all().map(f).fold(f64::INFINITY, f64::min);
         let high = all().map(f).fold(f64::NEG_INFINITY, f64::max);
@@ -155,7 +162,7 @@ fn draw_on(
         .axis_desc_style(("sans-serif", 14))
         .draw()?;
     for (s, colour) in series.iter().zip(colours(series)) {
-        let points = s.points.iter().copied().filter(|(x, y)| x.is_finite() && y.is_finite());
+        let points = s.points.iter().copied().filter(drawable);
         match s.style {
             SeriesStyle::Line => chart.draw_series(LineSeries::new(points, colour.stroke_width(2)))?,
             SeriesStyle::Reference => chart.draw_series(LineSeries::new(points, colour.stroke_width(1)))?,

@@ -9,17 +9,17 @@ use shared::gaussian_curve::Curve;
 
 use super::span::Span;
 
-/// Outflow at which a pour is held, ml a frame: that of controlled pours (docs/LEARNING.md).
+/// Outflow at which a pour is held, ml a frame at [`RATE_HZ`]: that of controlled pours (docs/LEARNING.md).
 const HELD_ML: f64 = 0.7;
-/// Largest step forward of a foreseen pour, degrees a frame. Chosen by hand: the trained policies rarely move faster.
+/// Largest step forward of a foreseen pour, degrees a frame at [`RATE_HZ`]. Chosen by hand: the trained policies rarely move faster.
 const FORWARD_DEG: f64 = 1.0;
-/// Step back of a foreseen pour, degrees a frame: the way back of the shipped configurations.
+/// Step back of a foreseen pour, degrees a frame at [`RATE_HZ`]: the way back of the shipped configurations.
 const BACK_DEG: f64 = 2.0;
 /// Resolution of a foreseen pour's step, degrees.
 const STEP_DEG: f64 = 0.05;
-/// Longest foreseen pour, frames: the controller's own default (`controller.max_frames`).
+/// Longest foreseen pour, frames at [`RATE_HZ`]: the controller's own default (`controller.max_frames`).
 const MAX_FRAMES: usize = 900;
-/// Frames a second at which curves are foreseen.
+/// Frames a second at which the constants above hold, and at which a vessel that was never seen is foreseen: those of the shipped configurations.
 const RATE_HZ: f64 = 30.0;
 /// A curve begins and ends at this tilt, degrees: as `rt-controller record` does.
 const END_DEG: f64 = 0.05;
@@ -35,15 +35,17 @@ pub struct Foresight {
     holds_ml: f64,
     /// The largest tilt that may be commanded, degrees.
     alpha_max_deg: f64,
+    /// Frames a second of the episodes that the model was fitted to: its flow is in ml a frame.
+    rate_hz: f64,
 }
 
 impl Foresight {
-    /// The vessel of a fitted model. `holds_ml` is what it holds, if somebody knows that; the model's own volume rests on tilts at which
+    /// The vessel of a model that was fitted to episodes of `rate_hz` frames a second. `holds_ml` is what it holds, if somebody knows that; the model's own volume rests on tilts at which
     /// nothing was ever seen.
-    pub fn new(model: &FlowModel, calibration: Calibration, holds_ml: Option<f64>, alpha_max_deg: f64) -> Self {
+    pub fn new(model: &FlowModel, calibration: Calibration, holds_ml: Option<f64>, alpha_max_deg: f64, rate_hz: f64) -> Self {
         let flow = FlowTables::new(model);
         let holds_ml = holds_ml.unwrap_or_else(|| flow.capacity.lost_ml(LAST_DEG));
-        Self { flow, calibration, holds_ml, alpha_max_deg }
+        Self { flow, calibration, holds_ml, alpha_max_deg, rate_hz }
     }
 
     /// A vessel of which only the volume is known: a beaker with the usual proportions.
@@ -53,7 +55,7 @@ impl Foresight {
         model.vessel.radius_mm *= factor;
         model.vessel.height_mm *= factor;
         let calibration = Calibration { volume_at_1_px2_ml: 0.0025, area_exponent: 1.0, log_tilt_slope: 0.0, hold_above_px2: 60.0 };
-        Self::new(&model, calibration, Some(holds_ml), alpha_max_deg)
+        Self::new(&model, calibration, Some(holds_ml), alpha_max_deg, RATE_HZ)
     }
 
     /// What the vessel holds, ml.
@@ -77,6 +79,16 @@ impl Foresight {
         self.holds_ml * (1.0 - self.flow.capacity.lost_ml(onset_deg) / self.flow.capacity.lost_ml(LAST_DEG)).clamp(0.0, 1.0)
     }
 
+    /// What a frame at [`RATE_HZ`] lasts, in frames of the episodes' rate.
+    fn slower(&self) -> f64 {
+        self.rate_hz / RATE_HZ
+    }
+
+    /// The longest foreseen pour, frames of the episodes' rate.
+    fn frames_max(&self) -> usize {
+        (MAX_FRAMES as f64 * self.slower()) as usize
+    }
+
     fn start(&self, fill_ml: f64) -> FlowState {
         FlowState { headspace_ml: self.flow.capacity.lost_ml(self.onset_deg(fill_ml)), ..FlowState::default() }
     }
@@ -97,9 +109,9 @@ impl Foresight {
         let beta_s = ((lambda_deg / END_DEG).ln() / gamma_per_s2).sqrt();
         let curve = Curve { lambda_deg: lambda_deg as f32, gamma_per_s2: gamma_per_s2 as f32, beta_s: beta_s as f32 };
         let (mut span, mut state) = (Span::empty(), self.start(fill_ml));
-        let frames = ((2.0 * beta_s * RATE_HZ) as usize).min(MAX_FRAMES);
+        let frames = ((2.0 * beta_s * self.rate_hz) as usize).min(self.frames_max());
         for k in 0..frames {
-            self.frame(&mut state, f64::from(curve.alpha_deg((k as f64 / RATE_HZ) as f32)), &mut span);
+            self.frame(&mut state, f64::from(curve.alpha_deg((k as f64 / self.rate_hz) as f32)), &mut span);
         }
         span
     }
@@ -109,12 +121,13 @@ impl Foresight {
         let (mut span, mut state) = (Span::empty(), self.start(fill_ml));
         let (mut tilt_deg, mut poured_ml): (f64, f64) = (0.0, 0.0);
         let mut back = false;
-        for _ in 0..MAX_FRAMES {
+        let (held_ml, forward_deg, back_deg) = (HELD_ML / self.slower(), FORWARD_DEG / self.slower(), BACK_DEG / self.slower());
+        for _ in 0..self.frames_max() {
             if back {
-                tilt_deg = (tilt_deg - BACK_DEG).max(0.0);
+                tilt_deg = (tilt_deg - back_deg).max(0.0);
             } else {
                 let before_deg = tilt_deg;
-                while tilt_deg < before_deg + FORWARD_DEG && self.flow.over_lip(tilt_deg, state.headspace_ml, 0.0).flow_ml < HELD_ML {
+                while tilt_deg < before_deg + forward_deg && self.flow.over_lip(tilt_deg, state.headspace_ml, 0.0).flow_ml < held_ml {
                     tilt_deg += STEP_DEG;
                 }
             }
@@ -122,7 +135,7 @@ impl Foresight {
                 return None;
             }
             poured_ml += self.frame(&mut state, tilt_deg, &mut span);
-            // Some two frames' flow comes on the way back.
+            // Some two frames' flow at 30 frames a second comes on the way back.
             back |= poured_ml + state.film_ml + 2.0 * HELD_ML >= goal_ml;
             if back && tilt_deg <= 0.0 {
                 return Some(span);
@@ -151,5 +164,22 @@ mod tests {
         assert!(vessel.pour(100.0, 150.0).is_none(), "more than is in it");
         let (low, high) = (vessel.curve(350.0, onsets[1] + 2.0, 0.25), vessel.curve(350.0, onsets[1] + 15.0, 0.25));
         assert!(high.volume_ml() > low.volume_ml() + 10.0);
+    }
+
+    /// Protects whoever fills what is proposed, at any frame rate: the same vessel, whose flow in a frame is half as much at twice the rate, shows the
+    /// same volume.
+    #[test]
+    fn what_is_foreseen_does_not_depend_on_the_frame_rate() {
+        let volumes = [30.0, 60.0, 120.0].map(|rate_hz| {
+            let mut model = FlowModel::default();
+            model.log_weir_coefficient -= (rate_hz / RATE_HZ).ln();
+            let calibration = Calibration { volume_at_1_px2_ml: 0.0025, area_exponent: 1.0, log_tilt_slope: 0.0, hold_above_px2: 60.0 };
+            let vessel = Foresight::new(&model, calibration, Some(500.0), 105.0, rate_hz);
+            let lambda_deg = vessel.onset_deg(300.0) + 12.0;
+            [vessel.curve(300.0, lambda_deg, 0.25), vessel.pour(350.0, 100.0).unwrap()].map(|span| span.volume_ml())
+        });
+        for [curve, pour] in volumes {
+            assert!((curve / volumes[0][0] - 1.0).abs() < 0.05 && (pour - 100.0).abs() < 4.0, "{volumes:?}");
+        }
     }
 }

@@ -6,9 +6,9 @@ use serde::Serialize;
 use shared::estimator::Calibration;
 
 use super::span::Span;
-use crate::data::TrainingEpisode;
+use crate::data::{self, TrainingEpisode};
 
-/// Outflow of controlled pours, ml a frame: between the first and the last tenth of the volume in the demo's pours.
+/// Outflow of controlled pours, ml a frame at 30 frames a second: between the first and the last tenth of the volume in the demo's pours.
 const POURED_AT_ML: (f64, f64) = (0.2, 0.9);
 /// Least volume that has to be seen at such flows, ml: below it, the scale's rounding hides what it says.
 const SEEN_AT_LEAST_ML: f64 = 30.0;
@@ -61,9 +61,11 @@ fn last_tilt_deg(episode: &TrainingEpisode, calibration: &Calibration) -> f64 {
 /// What the episodes span, by a calibration of them; `None` for no episode.
 pub fn spanned(episodes: &[TrainingEpisode], calibration: &Calibration) -> Option<Spanned> {
     let range = |values: &mut dyn Iterator<Item = f64>| values.fold((f64::INFINITY, f64::NEG_INFINITY), |(l, h), v| (l.min(v), h.max(v)));
-    let (c, q) = (f64::from(calibration.volume_at_1_px2_ml).max(1e-12), f64::from(calibration.area_exponent).max(0.2));
+    let (c, q) =
+        (f64::from(calibration.volume_at_1_px2_ml).max(f64::from(f32::MIN_POSITIVE)), f64::from(calibration.area_exponent).max(0.2));
     let area_px2 = |ml: f64| (ml / c).powf(1.0 / q);
-    let poured_at_px2 = (area_px2(POURED_AT_ML.0), area_px2(POURED_AT_ML.1));
+    let slower = data::rate_hz(episodes) / 30.0;
+    let poured_at_px2 = (area_px2(POURED_AT_ML.0 / slower), area_px2(POURED_AT_ML.1 / slower));
     let spans: Vec<Span> = episodes.iter().map(|e| Span::of_episode(e, calibration)).collect();
     episodes.first()?;
     Some(Spanned {
@@ -144,6 +146,10 @@ mod tests {
         let one_fill = [episode(3000.0, 40.0), episode(600.0, 43.0)];
         let said = missing(&one_fill);
         assert!(said.len() == 1 && said[0].contains("between 40 and 43 degrees"), "{said:?}");
+        // Areas that are smaller than any cell's.
+        let small = Calibration { volume_at_1_px2_ml: 0.1, ..CALIBRATION };
+        let said = spanned(&good, &small).unwrap().missing();
+        assert!(said.iter().any(|what| what.starts_with("only 0 ml")), "{said:?}");
         let light = [episode(100.0, 40.0), episode(150.0, 60.0)];
         assert!(missing(&light)[0].contains("no weight is above 9 g"), "{:?}", missing(&light));
     }

@@ -119,19 +119,20 @@ fn pours(vessel: &Foresight, wish: &Wish) -> Vec<(Proposal, Span)> {
     all
 }
 
-/// The streams of the pours to come: small and large goals from every fill.
+/// The streams of the pours to come: small and large goals from every fill. Goals of a few drops, which show no stream, say nothing.
 fn pours_to_come(vessel: &Foresight, wish: &Wish) -> Vec<Span> {
     let goals = GOAL_SHARES.map(|share| share * wish.goal_max_ml);
     FILL_SHARES
         .iter()
         .map(|share| share * vessel.holds_ml())
         .flat_map(|fill_ml| goals.iter().filter_map(move |goal_ml| vessel.pour(fill_ml, goal_ml.min(POURED_SHARE_MAX * fill_ml))))
+        .filter(|span| span.volume_ml() > 0.0)
         .collect()
 }
 
 /// The mean standard deviation of the camera's volumes of some pours, ml.
 fn mean_sd_ml(doubt: &Doubt, pours: &[Span]) -> f64 {
-    pours.iter().map(|span| doubt.sd_ml(span)).sum::<f64>() / pours.len().max(1) as f64
+    pours.iter().map(|span| doubt.sd_ml(span)).sum::<f64>() / pours.len() as f64
 }
 
 /// The doubt that is left by what was weighed.
@@ -142,10 +143,13 @@ pub fn doubt_after(weighed: &[Span]) -> Doubt {
     weighed.iter().fold(Doubt::before(log_area), |doubt, span| doubt.weighed(span))
 }
 
-/// Proposes what to weigh next, after what was weighed. The candidates are empty if the vessel allows none.
+/// Proposes what to weigh next, after what was weighed. The candidates are empty if the vessel allows none, or no pour to come is foreseen.
 pub fn plan(vessel: &Foresight, weighed: &[Span], wish: &Wish) -> Plan {
     let doubt = doubt_after(weighed);
     let to_come = pours_to_come(vessel, wish);
+    if to_come.is_empty() {
+        return Plan { sd_now_ml: 0.0, candidates: Vec::new() };
+    }
     let best = |candidates: Vec<(Proposal, Span)>| -> Option<Candidate> {
         candidates
             .into_iter()

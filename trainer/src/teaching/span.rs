@@ -74,7 +74,7 @@ impl Span {
     /// Volume of the streams with areas in a range, ml; a cell counts if its middle lies there.
     pub fn between_px2_ml(&self, (low_px2, high_px2): (f64, f64)) -> f64 {
         let inside = |k: usize| (low_px2.ln()..high_px2.ln()).contains(&middle(k).0);
-        self.ml.iter().enumerate().filter(|(k, _)| inside(*k)).map(|(_, ml)| ml).sum()
+        self.ml.iter().enumerate().filter(|(k, _)| inside(*k)).fold(0.0, |sum, (_, ml)| sum + ml)
     }
 
     /// The area below which half of the volume flows, px^2; `None` for no volume.

@@ -81,6 +81,7 @@ impl Backend {
             Fault::SafeguardClosed => self.machine.close_safeguard(),
             Fault::EmergencyStop => self.machine.emergency_stop(),
             Fault::EmergencyRelease => self.machine.release_emergency_stop(),
+            Fault::SafetyMode(mode) => self.machine.set_safety_mode(*mode),
             Fault::LateStart(s) => self.machine.set_late_start(*s),
             Fault::ProgramStop => drop(self.machine.stop_program()),
             Fault::ProgramPause => drop(self.machine.pause()),
