@@ -7,13 +7,15 @@
 //! | `whole` | whether a picture is whole: decoded to its end, of one moment, with the glass in its place |
 //! | `reflection` | a lamp's reflection that hides the lip |
 //! | `wandering` | whether colours or brightness wander, so that a coloured liquid may look like the ground |
+//! | `pace` | how many pictures stand for a time, and whether a pause lies between two |
 //! | `presence` | when a stream that is not seen any more is gone |
 //! | `ground_colours`, `ground_beside` | the colours of the ground behind a coloured liquid; what is seen beside the container and in the glass |
+//! | `grey` | whether a picture has no colour |
 //! | `foreign` | what has the colours of neither the ground nor the coloured liquid |
 //! | `hues` | the ranges of hue that are a liquid's |
 //! | `liquid` | what the extractor asks of a liquid; `coloured_liquid` (with `coloured_edge`) and `clear_water` are the two kinds |
 //! | `stream_edge` | the stream's edge as a robust line, then through sub-pixel points of profiles |
-//! | `geometry` | lines, the two axes, and the rays between them |
+//! | `geometry`, `ray_maps` | lines, the two axes, and the rays between them; where the rays' samples lie in the region |
 //! | `picture` | images, their pixels, and samples between pixels |
 //! | `confidence` | what a measurement's confidence means |
 //! | `measurement` | what one image tells |
@@ -30,6 +32,7 @@ mod confidence;
 mod extractor;
 mod foreign;
 mod geometry;
+mod grey;
 mod ground_beside;
 mod ground_colours;
 mod hues;
@@ -40,8 +43,10 @@ mod learn_profile;
 mod learn_steady;
 mod liquid;
 mod measurement;
+mod pace;
 mod picture;
 mod presence;
+mod ray_maps;
 mod reflection;
 mod stream_edge;
 mod wandering;
@@ -55,4 +60,5 @@ pub use learn_colour::{ColourError, ColourLearner, DryBackground};
 pub use learn_poses::Poses;
 pub use learn_steady::Steadiness;
 pub use measurement::{Measurement, Stages};
+pub use pace::PictureTime;
 pub use picture::Image;

@@ -20,7 +20,7 @@ use shared::speaker::Speaker;
 
 use crate::recorder::Recorder;
 use crate::source::{Frame, FrameStream, Source, SourceError, StreamEvent, WAIT};
-use crate::vision::{Extractor, Image, Measurement, RoomBeside, room_beside};
+use crate::vision::{Extractor, Image, Measurement, PictureTime, RoomBeside, room_beside};
 
 mod republisher;
 mod status;
@@ -300,7 +300,8 @@ impl Worker<'_> {
         match PixelFormat::from_code(header.format) {
             Some(format) if header.version == LAYOUT_VERSION => {
                 let image = Image { width_px: header.width_px, height_px: header.height_px, format, pixels: frame.pixels };
-                self.extractor.measure(image).or_exit(exit::BAD_INPUT)
+                let time = PictureTime { sequence: header.sequence, captured_at_ns: header.captured_at_ns };
+                self.extractor.measure_at(image, time).or_exit(exit::BAD_INPUT)
             }
             _ => Ok(Measurement { area_px2: 0.0, confidence: 0.0, doubt: Doubt::WrongFormat, triangle_px: [0.0; 6] }),
         }

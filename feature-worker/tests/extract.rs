@@ -3,6 +3,7 @@
 
 mod clear;
 mod drawn;
+mod gaps;
 mod ground;
 
 use drawn::{HEIGHT, WIDTH, blue, camera, disc, dry, image_config, lay_over, noisy, pour, stream, water};
@@ -348,7 +349,9 @@ fn lost_focus_is_noticed_without_a_stream() -> Result<(), ExtractError> {
         for i in 0..12 {
             let sharp = dry(i as f32 * 0.5, i)?;
             let measured = measure(&mut extractor, &sharp)?;
-            assert_eq!((measured.area_px2, measured.doubt), (0.0, Doubt::None), "{method:?} {i}");
+            // The first ones tell whether the ground is dry.
+            let begins = method == LiquidMethod::Clear && i < 6 && measured.doubt == Doubt::EdgeNotFound;
+            assert!(measured.area_px2 == 0.0 && (begins || measured.doubt == Doubt::None), "{method:?} {i}: {measured:?}");
         }
         for i in 12..24 {
             let mut soft = Mat::default();
@@ -390,6 +393,10 @@ fn focus_is_judged_by_the_glass() -> Result<(), ExtractError> {
 fn clear_water_is_measured() -> Result<(), ExtractError> {
     for turn in [None, Some(11.0)] {
         let mut extractor = Extractor::new(&camera(), &image_config(LiquidMethod::Clear))?;
+        // Until the ground is known to be dry.
+        for i in 0..16 {
+            measure(&mut extractor, &water(0.0, turn, 100 + i)?)?;
+        }
         for i in 0..42 {
             let share = match i {
                 6..14 => (i - 5) as f32 / 8.0,
@@ -425,7 +432,9 @@ fn clear_water_before_a_turning_pattern_is_measured() -> Result<(), ExtractError
             let measured = measure(&mut extractor, &water(share, Some(turn_deg * i as f32), i)?)?;
             let truth = 3600.0 * share * share;
             if i < 8 {
-                assert_eq!((measured.area_px2, measured.doubt), (0.0, Doubt::None), "{turn_deg} frame {i}");
+                // The first ones tell whether the ground is dry.
+                let begins = i < 4 && measured.doubt == Doubt::EdgeNotFound;
+                assert!(measured.area_px2 == 0.0 && (begins || measured.doubt == Doubt::None), "{turn_deg} frame {i}: {measured:?}");
             } else if share == 0.0 {
                 assert_eq!(measured.area_px2, 0.0, "{turn_deg} frame {i}");
             } else if i >= 10 && share > 0.5 {

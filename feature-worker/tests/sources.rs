@@ -4,14 +4,15 @@
 mod drawn;
 
 use std::io::{BufRead as _, BufReader};
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::process::{Command, Output, Stdio};
 
-use drawn::{HEIGHT, Outcome, WIDTH, pour, write_config};
+use drawn::{HEIGHT, Outcome, WIDTH, image_config, pour, water, write_config};
 use feature_worker::source::{Numbering, check_rate};
 use opencv::core::{Mat, Size, Vector};
 use opencv::prelude::*;
 use opencv::{imgcodecs, imgproc, videoio};
+use shared::config::LiquidMethod;
 
 fn inspect(config: &Path, input: &Path, out: &Path, every: &str) -> std::io::Result<Output> {
     let mut command = Command::new(env!("CARGO_BIN_EXE_feature-worker"));
@@ -234,6 +235,33 @@ fn bench_and_camera_refuse_what_cannot_be_read() {
     assert!(String::from_utf8_lossy(&listed.unwrap().stdout).trim_end().ends_with("devices"));
     assert_eq!(run(&["bench", "--input", "nowhere.mp4"], "nowhere.toml"), Some(2));
     assert_eq!(run(&["bench", "--no-python", "--input", "nowhere.mp4"], cell), Some(2));
+}
+
+/// Protects the second of two recordings from what the first one showed: it is a new beginning for the eye, a second after it. Pictures that are named
+/// one by one follow each other at the camera's rate.
+#[test]
+fn each_recording_is_a_new_beginning() -> Outcome {
+    let dir = tempfile::tempdir()?;
+    let (config, _) = write_config(dir.path(), "begins", |config| config.image = image_config(LiquidMethod::Clear))?;
+    let name = |i: i32| dir.path().join(format!("f_{i:03}.png"));
+    for i in 0..8 {
+        imgcodecs::imwrite(name(i), &water(0.0, None, i)?, &Vector::new())?;
+    }
+    let (out, pattern) = (dir.path().join("out"), dir.path().join("f_%03d.png"));
+    let rows = |input: &[PathBuf]| -> Result<Vec<(f64, String)>, Box<dyn std::error::Error>> {
+        let mut command = Command::new(env!("CARGO_BIN_EXE_feature-worker"));
+        let output = command.args(["inspect", "--every", "0", "--config"]).arg(&config).arg("--out").arg(&out).args(input).output()?;
+        assert!(output.status.success(), "{}", text(&output));
+        let mut table = csv::Reader::from_path(out.join("features.csv"))?;
+        table.records().map(|row| row.map_err(Into::into).and_then(|row| Ok((row[1].parse()?, row[4].to_owned())))).collect()
+    };
+    let twice = rows(&[pattern.clone(), pattern])?;
+    assert!((twice[8].0 - twice[7].0 - 1.0 - 1.0 / 30.0).abs() < 1e-3, "{twice:?}");
+    let doubted: Vec<usize> = (0..16).filter(|i| twice[*i].1 != "none").collect();
+    assert!(doubted.contains(&0) && doubted.contains(&8) && !doubted.contains(&7) && !doubted.contains(&15), "{twice:?}");
+    let one_by_one = rows(&(0..8).map(name).collect::<Vec<_>>())?;
+    assert!((one_by_one[7].0 - 7.0 / 30.0).abs() < 1e-3 && one_by_one[7].1 == "none", "{one_by_one:?}");
+    Ok(())
 }
 
 /// Protects the time of whoever inspects a pour on a slow disk: its pictures are not waited for one by one, but its table is.

@@ -14,7 +14,7 @@ use shared::whole_file;
 
 use crate::drawing::{draw, save, to_bgr};
 use crate::source::{Frame, for_each_frame};
-use crate::vision::{Extractor, Image, Measurement};
+use crate::vision::{Extractor, Image, Measurement, PictureTime};
 
 /// How its table begins: only one that begins so is replaced.
 const TABLE_BEGINS: &[u8] = b"frame,";
@@ -130,7 +130,8 @@ fn measure(extractor: &mut Extractor, camera: &CameraConfig, frame: &Frame) -> R
     let header = frame.header;
     let format = PixelFormat::from_code(header.format).unwrap_or(PixelFormat::Bgr8);
     let image = Image { width_px: header.width_px, height_px: header.height_px, format, pixels: frame.pixels };
-    let measured = extractor.measure(image).map_err(words)?;
+    let time = PictureTime { sequence: header.sequence, captured_at_ns: header.captured_at_ns };
+    let measured = extractor.measure_at(image, time).map_err(words)?;
     if measured.doubt == Doubt::WrongFormat {
         return Err(format!(
             "frame {} is {} x {} px, but [camera] says {} x {}; set width_px and height_px to the input's size and calibrate",

@@ -23,7 +23,7 @@ use web::{Answer, Server, Settings};
 
 use crate::drawing::{draw, jpeg, to_bgr};
 use crate::source::{Frame, FrameStream, ObserverSource, StreamEvent};
-use crate::vision::{Extractor, Image};
+use crate::vision::{Extractor, Image, PictureTime};
 
 /// Values of V_e that the page shows. Chosen by hand: ten seconds at 30 frames a second.
 const HISTORY: usize = 300;
@@ -116,7 +116,9 @@ fn show(frame: &Frame, extractor: &mut Extractor, shown: &Mutex<Shown>) -> Resul
     if frame.pixels.len() != width_px as usize * height_px as usize * format.bytes_per_pixel() {
         return Ok(());
     }
-    let measured = extractor.measure(Image { width_px, height_px, format, pixels: frame.pixels }).or_exit(exit::BAD_INPUT)?;
+    let time = PictureTime { sequence: frame.header.sequence, captured_at_ns: frame.header.captured_at_ns };
+    let image = Image { width_px, height_px, format, pixels: frame.pixels };
+    let measured = extractor.measure_at(image, time).or_exit(exit::BAD_INPUT)?;
     let mut picture = to_bgr(frame).or_exit(exit::FAILED)?;
     draw(&mut picture, extractor, &measured).or_exit(exit::FAILED)?;
     let mut shown = lock(shown);

@@ -29,6 +29,11 @@ pub(super) fn is_picture(path: &Path) -> bool {
     ENDINGS.contains(&ending.as_str())
 }
 
+/// Whether `path` is one picture, and no pattern of a sequence.
+pub(super) fn is_single(path: &Path) -> bool {
+    Pattern::of(path).is_none() && is_picture(path)
+}
+
 /// The picture in `bytes` as 8-bit grey or BGR; the error says what is wrong with it.
 pub(super) fn decode(bytes: &[u8], picture: &mut Mat) -> Result<(), String> {
     if let Some(what) = cut_off(bytes) {

@@ -6,6 +6,7 @@
 use shared::messages::Doubt;
 
 use super::geometry::Axes;
+use super::pace::Pace;
 use super::picture::RegionPixels;
 
 /// Mean grey level below which a picture counts as dark. Chosen by hand; `evaluate-camera` raises the doubt on purpose.
@@ -228,7 +229,7 @@ impl LipCheck {
 
     /// Which share of the glass just inside the lip, and of the air just outside, is white light; 0 if the ground further out is as bright,
     /// or while the light is new: a white thing that passes is no reflection.
-    pub(crate) fn white_share(&mut self, pixels: RegionPixels) -> f32 {
+    pub(crate) fn white_share(&mut self, pixels: RegionPixels, pace: Pace) -> f32 {
         // The share of a square with this corner, px along the axes, that reaches a level in all parts.
         let share = |corner: [f32; 2], step: f32, down: f32, level: u8| {
             let (mut bright, mut looked) = (0u32, 0u32);
@@ -250,9 +251,9 @@ impl LipCheck {
         } else if ground() > LIP_GROUND_SHARE {
             return 0.0;
         } else {
-            self.pictures = (self.pictures + 1).min(2 * LIP_PICTURES);
+            self.pictures = (self.pictures + 1).min(2 * pace.pictures(LIP_PICTURES));
         }
-        if self.pictures < LIP_PICTURES { 0.0 } else { at_lip }
+        if self.pictures < pace.pictures(LIP_PICTURES) { 0.0 } else { at_lip }
     }
 }
 

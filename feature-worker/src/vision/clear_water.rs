@@ -16,7 +16,7 @@
 //! 6. What cannot be told is said by name: a lamp's reflection at the lip, ground that has changed there, and before a pattern light that
 //!    flickers or wanders and pictures that are missing again and again ([`disturbed`]).
 //!
-//! The first frame must be dry, and frames must follow each other. Called on the extraction thread. All pictures and tables are kept, so
+//! Until [`vouched`] has evidence that the remembered ground is dry, none is told. Called on the extraction thread. All pictures and tables are kept, so
 //! nothing is allocated after the second frame. The only failures are OpenCV's.
 
 mod background;
@@ -29,6 +29,7 @@ mod lines;
 mod motion;
 mod rays;
 mod rigid;
+mod vouched;
 mod water;
 
 use opencv::boxed_ref::BoxedRef;
@@ -43,10 +44,12 @@ use self::flicker::Flicker;
 use self::light::Light;
 use self::lines::Lines;
 use self::rays::{RIM_PX, Rays};
+use self::vouched::Vouched;
 use self::water::{Verdict, Water};
 use super::confidence::Basis;
 use super::geometry::{Axes, LinearField};
 use super::liquid::{FineLine, LineRules, Liquid, PROFILE_SAMPLES, Profile, ProfileEdge, REACH, Sighting};
+use super::pace::Pace;
 use super::reflection::Reflection;
 
 // "Tuned" below means that the value was tuned on seeds 101 to 104 of `evaluate-camera`; see docs/VISION.md.
@@ -109,9 +112,11 @@ pub(crate) struct ClearWater {
     light: Light,
     flicker: Flicker,
     reflection: Reflection,
+    pace: Pace,
     /// Whether a lamp's reflection hides the lip.
     hidden: bool,
     disturbed: Disturbed,
+    vouched: Vouched,
     evidence: Evidence,
     water: Water,
     // Pictures, kept from frame to frame.
@@ -161,8 +166,10 @@ impl ClearWater {
             light: Light::new(size),
             flicker: Flicker::new(size),
             reflection: Reflection::default(),
+            pace: Pace::CHOSEN,
             hidden: false,
             disturbed: Disturbed::new(),
+            vouched: Vouched::new(),
             evidence: Evidence::new(&rays, size)?,
             rays,
             water: Water::new(),
@@ -203,7 +210,8 @@ impl ClearWater {
     fn look_for_stream(&mut self, edges_px: &mut Vec<[f32; 2]>) -> opencv::Result<Sighting> {
         edges_px.clear();
         let height_px = self.height_px();
-        let mut sighting = Sighting::Dry { confidence: 1.0 };
+        // The first picture is compared with nothing.
+        let mut sighting = Sighting::Unsure(Doubt::EdgeNotFound);
         let exposure = self.flicker.look(&self.now)?;
         if !self.background.is_new() {
             self.background.expect_gain(exposure);
@@ -236,10 +244,16 @@ impl ClearWater {
                 }
                 _ if self.light.flickers() => Sighting::Unsure(Doubt::LightFlickers),
                 (Verdict::Unsure, _) => Sighting::Unsure(Doubt::EdgeNotFound),
-                _ if self.flicker.flickers() && self.unseen < FLICKER_PICTURES => Sighting::Unsure(Doubt::LightFlickers),
+                _ if self.flicker.flickers() && self.unseen < self.pace.pictures(FLICKER_PICTURES) => {
+                    Sighting::Unsure(Doubt::LightFlickers)
+                }
                 _ if self.lip_has_changed() => Sighting::Unsure(Doubt::EdgeNotFound),
+                _ if self.vouched.see_none(&self.evidence, &self.rays) => Sighting::Dry { confidence: 1.0 },
                 _ => sighting,
             };
+            if verdict != Verdict::Dry {
+                self.vouched.see_other();
+            }
             if matches!(sighting, Sighting::Stream { .. }) {
                 self.unseen = 0;
             } else {
@@ -247,6 +261,7 @@ impl ClearWater {
             }
             if self.water.is_elsewhere(self.evidence.strange_share(), self.held.is_some()) {
                 self.background.forget()?;
+                self.vouched.doubt();
             }
         }
         self.remember(height_px)?;
@@ -291,8 +306,11 @@ impl ClearWater {
         let is_new = self.background.is_new();
         self.background.remember(&self.now, dry)?;
         self.compared += 1;
-        if is_new || self.compared >= REFER_FRAMES || self.background.travelled_px() >= REFER_PX {
+        if is_new || self.compared >= self.pace.pictures(REFER_FRAMES) || self.background.travelled_px() >= REFER_PX {
             std::mem::swap(&mut self.now, &mut self.earlier);
+            if !is_new {
+                self.vouched.moved(self.background.travelled_px());
+            }
             self.background.refer();
             self.compared = 0;
         }
@@ -379,7 +397,7 @@ impl Liquid for ClearWater {
     }
 
     fn see_lip(&mut self, white_share: f32) {
-        self.hidden = self.reflection.hides_lip(white_share, 0.0, false);
+        self.hidden = self.reflection.hides_lip(white_share, 0.0, false, self.pace);
     }
 
     fn bears_white(&mut self, half_white: bool) -> bool {
@@ -388,6 +406,26 @@ impl Liquid for ClearWater {
 
     fn lose_picture(&mut self, doubt: Doubt) {
         self.disturbed.lose(doubt);
+    }
+
+    fn set_pace(&mut self, pace: Pace) {
+        self.pace = pace;
+        self.background.set_pace(pace);
+        self.disturbed.set_pace(pace);
+        self.flicker.set_pace(pace);
+        self.vouched.set_pace(pace);
+        self.water.set_pace(pace);
+    }
+
+    /// An even ground is still known. How a pattern lies in the picture is not: what is remembered of it would be compared with other places.
+    fn interrupt(&mut self) -> opencv::Result<()> {
+        if self.is_pattern() {
+            self.background.forget()?;
+        }
+        self.background.rest();
+        self.vouched.doubt();
+        self.water.interrupt();
+        Ok(())
     }
 
     fn ground_bgr(&self) -> Option<[f32; 3]> {
@@ -411,8 +449,8 @@ impl Liquid for ClearWater {
         if legs_px.is_none() && self.disturbed.doubt().is_none() {
             let even = self.evidence.even();
             self.even_pictures += 1.0;
-            let usual = EVEN_FOLLOWS[usize::from(!even)];
-            let follows = if self.even_pictures <= EVEN_PICTURES { usual.max(1.0 / self.even_pictures) } else { usual };
+            let usual = self.pace.follows(EVEN_FOLLOWS[usize::from(!even)]);
+            let follows = if self.even_pictures <= self.pace.parts(EVEN_PICTURES) { usual.max(1.0 / self.even_pictures) } else { usual };
             self.even_share += follows * (f32::from(u8::from(even)) - self.even_share);
         }
         self.held = legs_px.map(|legs| legs.map(|v| v / self.scale));
@@ -432,10 +470,10 @@ impl Liquid for ClearWater {
 
     fn confirm(&mut self, line: Option<FineLine>, mean_level: f32) -> Result<FineLine, Doubt> {
         let sine = self.axes.sine().abs();
-        let sure = self.evidence.even() && self.held.is_none() && !self.lip_has_changed();
+        let sure = self.vouched.is_dry() && self.evidence.even() && self.held.is_none() && !self.lip_has_changed();
         let line = self.water.confirm(line, mean_level, self.scale, sine, sure)?;
         // What bands left over is elsewhere in the next picture.
         self.confirmed += 1;
-        if self.confirmed < FLICKER_PICTURES && self.flicker.flickers() { Err(Doubt::LightFlickers) } else { Ok(line) }
+        if self.confirmed < self.pace.pictures(FLICKER_PICTURES) && self.flicker.flickers() { Err(Doubt::LightFlickers) } else { Ok(line) }
     }
 }

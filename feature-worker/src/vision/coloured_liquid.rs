@@ -11,7 +11,7 @@
 //! The only failures are OpenCV's.
 
 use opencv::boxed_ref::BoxedRef;
-use opencv::core::{self, CV_16SC2, CV_32FC1, Mat, Scalar, Vec3b};
+use opencv::core::{self, Mat, Scalar, Vec3b};
 use opencv::imgproc;
 use opencv::prelude::*;
 use shared::config::ImageConfig;
@@ -21,10 +21,13 @@ use super::coloured_edge;
 use super::confidence::Basis;
 use super::foreign::{self, FILLED, GAP_MOST_PX, Seen};
 use super::geometry::{Axes, Line, NEAR_PX, RAYS, RayGrid, distance};
+use super::grey::{COLOURED_FROM, is_grey};
 use super::ground_beside::{InGlass, Place, Square};
 use super::ground_colours::{Ground, GroundColours};
 use super::hues::ranges;
 use super::liquid::{FineLine, LineRules, Liquid, Profile, ProfileEdge, Sighting};
+use super::pace::Pace;
+use super::ray_maps::ray_maps;
 use super::reflection::Reflection;
 use super::wandering::Wandering;
 
@@ -68,14 +71,6 @@ const LEARN_BEYOND: usize = 6;
 const LEARN_AFTER: u32 = 15;
 /// The ground is learned beside the container while no more than this share of what is at the lip is foreign or liquid. Chosen by hand.
 const QUIET_SHARE: f32 = 0.3;
-/// A picture in which this share of the samples has no colour at all is a grey one. Chosen by hand: a sensor's noise alone makes colour.
-const GREY_SHARE: f32 = 0.99;
-/// A sample has no colour when its parts differ by no more than this, grey levels. Chosen by hand: a level or two of rounding.
-const GREY_LEVELS: u8 = 2;
-/// A liquid of at least this saturation is not seen in grey pictures. Chosen by hand.
-const COLOURED_FROM: f64 = 20.0;
-/// Of this many samples, one is looked at to find out whether a picture is grey. Chosen by hand, for speed.
-const GREY_EVERY: usize = 5;
 
 /// Finds the stream of a coloured liquid in the pictures of one camera.
 pub(crate) struct ColouredLiquid {
@@ -96,9 +91,10 @@ pub(crate) struct ColouredLiquid {
     ground: GroundColours,
     /// Its mean levels of blue, green and red, far from the lip in the last picture.
     ground_bgr: Option<[f32; 3]>,
-    /// Frames that were taken, and those of them without a stream.
+    /// Frames that were learned from, and those without a stream that are left until the surroundings of the lip are known.
     frames: usize,
-    dry_frames: u32,
+    unknown_for: u32,
+    pace: Pace,
     reflection: Reflection,
     wandering: Wandering,
     /// For how many told pictures more the ground is not learned, see [`LEARN_AFTER`].
@@ -133,19 +129,7 @@ pub(crate) struct ColouredLiquid {
 impl ColouredLiquid {
     /// For the colours of `image` in pictures `width_px` wide. `axes` and `grid` are relative to the region.
     pub(crate) fn new(image: &ImageConfig, width_px: u32, axes: Axes, grid: RayGrid) -> opencv::Result<Self> {
-        let shape = (RAYS as i32, grid.radii_px.len() as i32);
-        let mut map_x = Mat::new_rows_cols_with_default(shape.0, shape.1, CV_32FC1, Scalar::all(-1.0))?;
-        let mut map_y = map_x.try_clone()?;
-        for (i, ray) in grid.rays.iter().enumerate() {
-            let row_x = map_x.at_row_mut::<f32>(i as i32)?;
-            let row_y = map_y.at_row_mut::<f32>(i as i32)?;
-            for r in 0..grid.radii_px.len() {
-                // Beyond the region the last sample is repeated and never looked at.
-                [row_x[r], row_y[r]] = axes.at(grid.radii_px[r.min(ray.samples - 1)], ray.along);
-            }
-        }
-        let (mut map_a, mut map_b) = (Mat::default(), Mat::default());
-        imgproc::convert_maps(&map_x, &map_y, &mut map_a, &mut map_b, CV_16SC2, true)?;
+        let [map_a, map_b] = ray_maps(&grid, &axes)?;
         let place = Place::new(axes, image, width_px);
         let (beside, beside_wide) = (Square::beside(&place)?, Square::beside_wide(&place)?);
         let colour = image.colour_hsv.map(f64::from);
@@ -162,7 +146,8 @@ impl ColouredLiquid {
             ground: GroundColours::new(),
             ground_bgr: None,
             frames: 0,
-            dry_frames: 0,
+            unknown_for: DRY_FRAMES,
+            pace: Pace::CHOSEN,
             reflection: Reflection::default(),
             wandering: Wandering::new(),
             learn_after: 0,
@@ -221,17 +206,6 @@ impl ColouredLiquid {
         last.map(|r| (r, best))
     }
 
-    /// Whether the picture has no colour, although the liquid has.
-    fn is_grey(&self) -> opencv::Result<bool> {
-        if !self.needs_colour {
-            return Ok(false);
-        }
-        let pixels: &[Vec3b] = self.sampled.data_typed()?;
-        let grey = |p: &&Vec3b| p[0].abs_diff(p[1]).max(p[1].abs_diff(p[2])).max(p[0].abs_diff(p[2])) <= GREY_LEVELS;
-        let (looked, found) = (pixels.len().div_ceil(GREY_EVERY), pixels.iter().step_by(GREY_EVERY).filter(grey).count());
-        Ok(found as f32 >= GREY_SHARE * looked as f32)
-    }
-
     /// Tells the ground's colours how bright the picture is far from the lip.
     fn expose(&mut self) -> opencv::Result<()> {
         let far = self.grid.radii_px.iter().take_while(|r| **r < LEARN_FROM_PX).count();
@@ -261,8 +235,8 @@ impl ColouredLiquid {
     /// Learns the ground's colours from what lies beyond the liquid and far from the lip, or, while the surroundings of the lip are new and
     /// `dry`, from everything.
     fn learn(&mut self, dry: bool) -> opencv::Result<()> {
-        let new = dry && self.dry_frames < DRY_FRAMES;
-        self.dry_frames = self.dry_frames.saturating_add(u32::from(dry));
+        let new = dry && !self.is_known();
+        self.unknown_for -= u32::from(new);
         self.ground.forget();
         let far = self.grid.radii_px.iter().take_while(|r| **r < LEARN_FROM_PX).count();
         let every = if new { 1 } else { LEARN_EVERY };
@@ -273,7 +247,7 @@ impl ColouredLiquid {
                 0 if !dry => continue,
                 end => {
                     // What goes on from the liquid in a foreign colour may be more of it.
-                    let beyond = self.seen().beyond_end(i, end)?.filter(|_| self.dry_frames >= DRY_FRAMES);
+                    let beyond = self.seen().beyond_end(i, end)?.filter(|_| self.is_known());
                     if beyond.is_some_and(|colour| self.ground.tell(colour) == Ground::Foreign) {
                         continue;
                     }
@@ -302,13 +276,25 @@ impl ColouredLiquid {
             // A lamp's reflection before white squares is no ground. The pictures after it are learned from as ever.
             _ if self.half_white && (told || sighting == Sighting::Unsure(Doubt::BlownOut)) => {}
             // What may be liquid must not be taken for ground.
-            _ if !told => self.learn_after = LEARN_AFTER,
+            _ if !told => self.learn_after = self.pace.pictures(LEARN_AFTER),
             _ if self.learn_after > 0 => self.learn_after -= 1,
             // A stream that was there before the surroundings of the lip were known may be there still, in other colours.
-            _ if dry && self.held && self.dry_frames < DRY_FRAMES => {}
+            _ if dry && self.held && !self.is_known() => {}
             _ => self.learn(dry)?,
         }
         Ok(())
+    }
+
+    /// Whether the surroundings of the lip are known.
+    fn is_known(&self) -> bool {
+        self.unknown_for == 0
+    }
+
+    /// Ground that is known stays so. What was not learned to the end is learned anew.
+    fn learn_anew(&mut self) {
+        if !self.is_known() {
+            self.unknown_for = self.pace.pictures(DRY_FRAMES);
+        }
     }
 
     /// The picture along the rays.
@@ -325,7 +311,7 @@ impl ColouredLiquid {
     /// What is at the lip where no stream is seen.
     fn look_again(&mut self, confidence: f32) -> opencv::Result<Sighting> {
         let dry = Sighting::Dry { confidence };
-        let known = self.dry_frames >= DRY_FRAMES;
+        let known = self.is_known();
         // A lamp's reflection before white squares hides a stream, but not the liquid below the lip, and not what is foreign where the ground is
         // known. It is not learned in such pictures, so there is no end to wait for.
         if self.half_white && (!known || !self.glass.is_empty()?) {
@@ -336,7 +322,7 @@ impl ColouredLiquid {
         }
         self.glass.see_dry()?;
         let [blind, glows, foreign] = self.seen().at_lip()?;
-        if self.reflection.hides_lip(blind.max(self.white_lip), glows, foreign > QUIET_SHARE) {
+        if self.reflection.hides_lip(blind.max(self.white_lip), glows, foreign > QUIET_SHARE, self.pace) {
             return Ok(Sighting::Unsure(Doubt::BlownOut));
         }
         let mut ends = self.ends;
@@ -416,14 +402,14 @@ impl Liquid for ColouredLiquid {
     }
 
     fn look(&mut self, edges_px: &mut Vec<[f32; 2]>) -> opencv::Result<Sighting> {
-        if self.is_grey()? {
+        if self.needs_colour && is_grey(&self.sampled)? {
             return Ok(Sighting::Unsure(Doubt::ColoursChanged));
         }
         self.segment()?;
         self.expose()?;
         let sighting = match self.find_stream(edges_px)? {
             Sighting::Dry { confidence } => self.look_again(confidence)?,
-            Sighting::Stream { seen_share, doubt: Doubt::None } if self.dry_frames >= DRY_FRAMES => {
+            Sighting::Stream { seen_share, doubt: Doubt::None } if self.is_known() => {
                 let beyond = self.seen().beyond(&self.ends)?;
                 let untold = beyond.map(|beyond| self.is_excused(beyond)).transpose()? == Some(false);
                 Sighting::Stream { seen_share, doubt: if untold { Doubt::ColoursChanged } else { Doubt::None } }
@@ -434,7 +420,7 @@ impl Liquid for ColouredLiquid {
             self.beside.forget_kept();
         }
         // While the ground is not known, only pictures that it is learned from are dry, and those where a stream was just held (`Presence::is_gone` tells).
-        let unknown = (self.dry_frames < DRY_FRAMES && self.learn_after > 0).then_some(Doubt::EdgeNotFound);
+        let unknown = (!self.is_known() && self.learn_after > 0).then_some(Doubt::EdgeNotFound);
         let drop = matches!(sighting, Sighting::Stream { doubt: Doubt::None, .. }) && self.axes.fan_px2(edges_px) < self.area_min_px2;
         self.follow_ground(sighting, drop)?;
         // A liquid in the ground's colours is not seen.
@@ -454,6 +440,20 @@ impl Liquid for ColouredLiquid {
 
     /// Each picture is judged by itself.
     fn lose_picture(&mut self, _doubt: Doubt) {}
+
+    fn set_pace(&mut self, pace: Pace) {
+        self.pace = pace;
+        self.learn_anew();
+        self.wandering.set_pace(pace);
+        self.beside.set_pace(pace);
+    }
+
+    fn interrupt(&mut self) -> opencv::Result<()> {
+        self.learn_anew();
+        self.wandering.interrupt();
+        self.beside.forget_kept();
+        Ok(())
+    }
 
     fn basis(&self) -> Basis {
         Basis::Colour
@@ -493,7 +493,7 @@ impl Liquid for ColouredLiquid {
 
     fn confirm(&mut self, line: Option<FineLine>, _mean_level: f32) -> Result<FineLine, Doubt> {
         if line.is_none() {
-            self.learn_after = LEARN_AFTER;
+            self.learn_after = self.pace.pictures(LEARN_AFTER);
         }
         line.ok_or(Doubt::EdgeNotFound)
     }

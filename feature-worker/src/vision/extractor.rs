@@ -26,6 +26,7 @@ use super::confidence;
 use super::geometry::{Axes, RayGrid};
 use super::liquid::{Liquid, Sighting};
 use super::measurement::{Measurement, Stages};
+use super::pace::{Between, PictureTime, Succession};
 use super::picture::{Image, RegionPixels, RegionReader};
 use super::presence::Presence;
 use super::stream_edge::{BLURRED_PX, LineFinder};
@@ -68,6 +69,7 @@ pub struct Extractor {
     rim: RimCheck,
     lip: LipCheck,
     presence: Presence,
+    succession: Succession,
     liquid: Box<dyn Liquid>,
     line: LineFinder,
     /// The coarse outer edge on the rays, px in the region, from the x-axis to the y-axis. Kept from frame to frame.
@@ -94,13 +96,17 @@ impl Extractor {
         let grid = RayGrid::new(&axes, size).ok_or_else(|| fail("there is no room between the axes"))?;
         let region_px = [region.width, region.height];
         let edges = Vec::with_capacity(grid.rays.len());
-        let liquid: Box<dyn Liquid> = match image.method {
+        let succession = Succession::new(camera.fps);
+        let mut liquid: Box<dyn Liquid> = match image.method {
             LiquidMethod::Colour => Box::new(ColouredLiquid::new(image, camera.width_px, axes, grid)?),
             LiquidMethod::Clear => {
                 let water = ClearWater::new(&axes, region_px, camera.width_px)?;
                 Box::new(water.ok_or_else(|| fail("there is no room for the outline of a stream"))?)
             }
         };
+        liquid.set_pace(succession.pace());
+        let mut presence = Presence::new(camera.width_px, 1.0);
+        presence.set_pace(succession.pace());
         Ok(Self {
             size_px: [camera.width_px, camera.height_px],
             region,
@@ -111,7 +117,8 @@ impl Extractor {
             whole: WholeCheck::new(axes, region_px),
             rim: RimCheck::new(axes),
             lip: LipCheck::new(axes, camera.width_px),
-            presence: Presence::new(camera.width_px, 1.0),
+            presence,
+            succession,
             liquid,
             line: LineFinder::new(axes, region_px),
             edges,
@@ -124,6 +131,7 @@ impl Extractor {
     #[must_use]
     pub fn with_patience(mut self, patience: f32) -> Self {
         self.presence = Presence::new(self.size_px[0], patience);
+        self.presence.set_pace(self.succession.pace());
         self
     }
 
@@ -161,9 +169,15 @@ impl Extractor {
         [p[0] + self.region.x as f32, p[1] + self.region.y as f32]
     }
 
-    /// Measures one image. An image of another size than configured, or with missing bytes, gets a doubt and no area. A grey image is an
-    /// error where the liquid is told by its colour; the only other errors are OpenCV's.
+    /// Measures one image that follows the last one without a gap, as [`Self::measure_at`] does.
     pub fn measure(&mut self, image: Image) -> Result<Measurement, ExtractError> {
+        self.measure_at(image, self.succession.next())
+    }
+
+    /// Measures one image with this number and time. An image of another size than configured, or with missing bytes, gets a doubt and no area. A
+    /// grey image is an error where the liquid is told by its colour; the only other errors are OpenCV's.
+    pub fn measure_at(&mut self, image: Image, time: PictureTime) -> Result<Measurement, ExtractError> {
+        self.follow_on(time)?;
         let expected = image.width_px as usize * image.height_px as usize * image.format.bytes_per_pixel();
         if [image.width_px, image.height_px] != self.size_px || image.pixels.len() != expected {
             return Ok(Measurement::nothing(0.0, Doubt::WrongFormat));
@@ -179,11 +193,26 @@ impl Extractor {
         measured
     }
 
+    /// Takes note of when a picture was taken: counts of pictures stand for times, and what was seen before a pause is no evidence of what is there after
+    /// it. A few lost pictures are no pause: clear water before a pattern is measured as well when every third one is lost.
+    fn follow_on(&mut self, time: PictureTime) -> Result<(), ExtractError> {
+        let pace = self.succession.pace();
+        if self.succession.take(time) == Between::Pause {
+            self.presence.interrupt();
+            self.liquid.interrupt()?;
+        }
+        if self.succession.pace() != pace {
+            self.presence.set_pace(self.succession.pace());
+            self.liquid.set_pace(self.succession.pace());
+        }
+        Ok(())
+    }
+
     fn measure_region(&mut self, image: Image, reader: &mut RegionReader) -> Result<Measurement, ExtractError> {
         let start = Instant::now();
         let pixels = reader.read(image, |region| self.liquid.take(region))?;
         let sampled = Instant::now();
-        let whole = self.whole.is_whole(pixels);
+        let whole = self.whole.is_whole(pixels, self.succession.pace());
         let unlit = self.light.doubt(self.liquid.sampled().data_bytes()?, pixels);
         let unlit = unlit.or((!self.liquid.bears_white(self.light.is_half_white())).then_some(Doubt::BlownOut));
         let unusable = unlit.or((!whole).then_some(Doubt::PictureIncomplete));
@@ -194,7 +223,7 @@ impl Extractor {
                 (Measurement::nothing(0.0, doubt), checked)
             }
             None => {
-                self.liquid.see_lip(self.lip.white_share(pixels));
+                self.liquid.see_lip(self.lip.white_share(pixels, self.succession.pace()));
                 let sighting = self.liquid.look(&mut self.edges)?;
                 let segmented = Instant::now();
                 (self.follow(sighting, pixels), segmented)

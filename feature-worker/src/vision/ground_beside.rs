@@ -15,6 +15,7 @@ use shared::config::{CameraConfig, ImageConfig, LiquidMethod};
 
 use super::geometry::Axes;
 use super::ground_colours::{GroundColours, Mean};
+use super::pace::Pace;
 
 /// Width of the picture for which distances were chosen, px.
 const PICTURE_PX: f32 = 640.0;
@@ -33,7 +34,7 @@ const GLASS_PX: [[f32; 2]; 2] = [[6.0, 18.0], [-46.0, -14.0]];
 const TEACH_EVERY: usize = 4;
 /// And only when nothing foreign came to the lip for so many pictures more: a jet of liquid crosses the square before its stream is seen. Chosen by
 /// hand: a stream that begins is seen in 4 pictures, and the ground does not come to the lip much faster.
-const TEACH_AFTER: usize = 4;
+const TEACH_AFTER: u32 = 4;
 /// Samples of a square.
 const SAMPLES: usize = (SQUARE_SAMPLES * SQUARE_SAMPLES) as usize;
 /// Side of the square of samples that are smoothed together, as along the rays. Chosen by hand.
@@ -58,13 +59,16 @@ pub(super) struct Square {
     smooth: Mat,
     /// The last smoothed squares, of quiet pictures in a row, as a ring, and how many there were.
     kept: Vec<Vec3b>,
+    /// How many squares the ring holds.
+    ring: usize,
     quiet: usize,
 }
 
 impl Square {
     fn new(place: &Place, at_px: [[f32; 2]; 2]) -> opencv::Result<Self> {
-        let kept = vec![Vec3b::default(); TEACH_AFTER * SAMPLES];
-        Ok(Self { maps: place.maps(at_px)?, pixels: Mat::default(), smooth: Mat::default(), kept, quiet: 0 })
+        let ring = TEACH_AFTER as usize;
+        let kept = vec![Vec3b::default(); ring * SAMPLES];
+        Ok(Self { maps: place.maps(at_px)?, pixels: Mat::default(), smooth: Mat::default(), kept, ring, quiet: 0 })
     }
 
     /// Beside the container.
@@ -102,13 +106,22 @@ impl Square {
         if self.colours()?.len() != SAMPLES {
             return Ok(());
         }
-        let kept = &mut self.kept[self.quiet % TEACH_AFTER * SAMPLES..][..SAMPLES];
-        if self.quiet >= TEACH_AFTER {
+        let kept = &mut self.kept[self.quiet % self.ring * SAMPLES..][..SAMPLES];
+        if self.quiet >= self.ring {
             kept.iter().skip(frame % TEACH_EVERY).step_by(TEACH_EVERY).for_each(|colour| ground.learn(colour.0, false));
         }
         kept.copy_from_slice(self.smooth.data_typed()?);
         self.quiet = self.quiet.wrapping_add(1);
         Ok(())
+    }
+
+    /// Says how fast pictures follow each other. Allocates when they come faster than before.
+    pub(super) fn set_pace(&mut self, pace: Pace) {
+        let ring = pace.pictures(TEACH_AFTER) as usize;
+        if ring != self.ring {
+            self.kept.resize(ring * SAMPLES, Vec3b::default());
+            (self.ring, self.quiet) = (ring, 0);
+        }
     }
 
     /// Says that something may be at the lip: what the square showed just before it may be a jet of it.

@@ -8,6 +8,7 @@
 //! All calls come from the extraction thread. After the second frame they allocate nothing. The only failures are OpenCV's.
 
 use super::confidence::Basis;
+use super::pace::Pace;
 use opencv::boxed_ref::BoxedRef;
 use opencv::core::Mat;
 use shared::messages::{Doubt, PixelFormat};
@@ -121,6 +122,12 @@ pub(crate) trait Liquid: Send + Sync {
 
     /// Says that the picture that was taken is not looked at, and why.
     fn lose_picture(&mut self, doubt: Doubt);
+
+    /// Says how fast pictures follow each other from now on.
+    fn set_pace(&mut self, pace: Pace);
+
+    /// Says that a pause of unknown length lies before the next picture: what was seen before is no evidence of what is at the lip now.
+    fn interrupt(&mut self) -> opencv::Result<()>;
 
     /// What a measurement in the picture that was looked at rests on.
     fn basis(&self) -> Basis;

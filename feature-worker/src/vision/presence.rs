@@ -1,7 +1,9 @@
 //! When a stream that is not seen any more is gone: a stream of hundreds of px^2 does not end from one picture to the next, so it is not
 //! seen until there is evidence of dry ground where it was.
 //!
-//! Called on the extraction thread. Nothing is allocated and nothing fails.
+//! Counts of pictures are those at 30 Hz; at another rate they stand for the same times. Called on the extraction thread. Nothing is allocated and nothing fails.
+
+use super::pace::Pace;
 
 /// A smaller stream may end between two pictures, px^2 of a picture 640 px wide. Tuned on seeds 1, 5001 to 5003 and 101 to 104 of
 /// `evaluate-camera`, see docs/VISION.md.
@@ -36,6 +38,7 @@ pub(crate) struct Presence {
     lasting_px2: f32,
     /// The pictures that are needed, in units of the usual ones.
     patience: f32,
+    pace: Pace,
     /// Legs of the stream that may still be there, px from the lip.
     legs_px: Option<[f32; 2]>,
     /// Pictures in a row that showed dry ground in its place.
@@ -59,6 +62,7 @@ impl Presence {
         Self {
             lasting_px2: LASTING_PX2 * scale * scale,
             patience,
+            pace: Pace::CHOSEN,
             legs_px: None,
             dry_pictures: 0,
             needed: 1,
@@ -69,14 +73,24 @@ impl Presence {
         }
     }
 
+    /// Says how fast pictures follow each other.
+    pub(crate) fn set_pace(&mut self, pace: Pace) {
+        self.pace = pace;
+    }
+
+    /// Says that a pause of unknown length lies before the next picture. A stream that was seen may be there still, and dry ground may be so no more.
+    pub(crate) fn interrupt(&mut self) {
+        self.dry_pictures = 0;
+    }
+
     /// A stream was measured in a picture with these mean levels of blue, green and red.
     pub(crate) fn saw(&mut self, area_px2: f32, legs_px: [f32; 2], bgr: [f32; 3]) {
         (self.bgr, self.other_light) = (bgr, 0);
         self.legs_px = (area_px2 >= self.lasting_px2).then_some(legs_px);
         (self.dry_pictures, self.foreign) = (0, 0);
         let doublings = (area_px2 / self.lasting_px2).max(1.0).log2();
-        let most = (self.patience * PICTURES_MOST as f32) as u32;
-        self.needed = ((self.patience * PICTURES_PER_DOUBLING * doublings) as u32).clamp(1, most.max(1));
+        let most = self.pace.parts(self.patience * PICTURES_MOST as f32) as u32;
+        self.needed = (self.pace.parts(self.patience * PICTURES_PER_DOUBLING * doublings) as u32).clamp(1, most.max(1));
     }
 
     /// A stream was seen of which no more than a part was measured, as [`Self::saw`] says: it is no smaller than what was there before.
@@ -92,14 +106,14 @@ impl Presence {
     pub(crate) fn saw_unsure(&mut self, lasts: bool) {
         self.dry_pictures = 0;
         if lasts {
-            self.foreign = FOREIGN_PICTURES;
+            self.foreign = self.pace.pictures(FOREIGN_PICTURES);
         }
     }
 
     /// Legs of a stream that was seen, and not yet its end, px from the lip. None after some seconds without a stream, when what is seen is the ground.
     pub(crate) fn holds(&mut self, seen: bool) -> Option<[f32; 2]> {
         self.unseen = if seen { 0 } else { self.unseen.saturating_add(1) };
-        if self.unseen > HELD_PICTURES {
+        if self.unseen > self.pace.pictures(HELD_PICTURES) {
             self.legs_px = None;
         }
         self.legs_px
@@ -112,7 +126,7 @@ impl Presence {
         self.foreign = self.foreign.saturating_sub(1);
         let Some(legs_px) = self.legs_px else { return !foreign };
         self.other_light = if is_other_light(self.bgr, bgr) { self.other_light + 1 } else { 0 };
-        let told = self.other_light == 0 || self.other_light > LIGHT_PICTURES;
+        let told = self.other_light == 0 || self.other_light > self.pace.pictures(LIGHT_PICTURES);
         self.dry_pictures = if told && dry_share(legs_px) >= DRY_SHARE { self.dry_pictures + 1 } else { 0 };
         if self.dry_pictures >= self.needed {
             self.legs_px = None;

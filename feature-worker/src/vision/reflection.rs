@@ -2,6 +2,8 @@
 //!
 //! Called on the extraction thread. Nothing is allocated and nothing fails.
 
+use super::pace::Pace;
+
 /// A lamp's reflection hides the lip when this share of what is there is white light. Chosen by hand.
 const BLIND_SHARE: f32 = 0.5;
 /// Once it does, it still does while this share is white light, because a stream is darker. Chosen by hand.
@@ -26,12 +28,12 @@ pub(super) struct Reflection {
 impl Reflection {
     /// Takes note of the next picture without a stream. `blind` is the share of white light at the lip, `glows` that of its glow, and
     /// `foreign` says whether something lies there that is no ground. Returns whether the reflection hides the lip.
-    pub(super) fn hides_lip(&mut self, blind: f32, glows: f32, foreign: bool) -> bool {
+    pub(super) fn hides_lip(&mut self, blind: f32, glows: f32, foreign: bool, pace: Pace) -> bool {
         let still = self.pictures > 0 && blind > STILL_BLIND_SHARE;
         let covered = self.pictures > 0 && !still && (foreign || glows > GLOWS_SHARE);
         self.covered = if covered { self.covered + 1 } else { 0 };
-        let held = still || (covered && self.covered < COVERED_PICTURES);
-        self.pictures = if blind > BLIND_SHARE || held { BLIND_PICTURES } else { self.pictures.saturating_sub(1) };
+        let held = still || (covered && self.covered < pace.pictures(COVERED_PICTURES));
+        self.pictures = if blind > BLIND_SHARE || held { pace.pictures(BLIND_PICTURES) } else { self.pictures.saturating_sub(1) };
         self.pictures > 0
     }
 }
@@ -44,12 +46,12 @@ mod tests {
     #[test]
     fn what_covers_a_reflection_does_not_end_it() {
         let mut reflection = Reflection::default();
-        assert!(!reflection.hides_lip(0.1, 0.3, true));
-        assert!(reflection.hides_lip(0.9, 1.0, false));
-        assert!((0..40).all(|_| reflection.hides_lip(0.0, 0.0, true)), "covered");
-        assert!((0..40).all(|_| reflection.hides_lip(0.0, 0.3, false)), "it glows");
-        assert!((0..20).any(|_| !reflection.hides_lip(0.0, 0.0, false)), "ground");
-        assert!(reflection.hides_lip(0.9, 1.0, false));
-        assert!((0..120).any(|_| !reflection.hides_lip(0.0, 0.0, true)), "some seconds");
+        assert!(!reflection.hides_lip(0.1, 0.3, true, Pace::CHOSEN));
+        assert!(reflection.hides_lip(0.9, 1.0, false, Pace::CHOSEN));
+        assert!((0..40).all(|_| reflection.hides_lip(0.0, 0.0, true, Pace::CHOSEN)), "covered");
+        assert!((0..40).all(|_| reflection.hides_lip(0.0, 0.3, false, Pace::CHOSEN)), "it glows");
+        assert!((0..20).any(|_| !reflection.hides_lip(0.0, 0.0, false, Pace::CHOSEN)), "ground");
+        assert!(reflection.hides_lip(0.9, 1.0, false, Pace::CHOSEN));
+        assert!((0..120).any(|_| !reflection.hides_lip(0.0, 0.0, true, Pace::CHOSEN)), "some seconds");
     }
 }

@@ -7,6 +7,7 @@
 use shared::messages::Doubt;
 
 use super::geometry::RAYS;
+use super::pace::Pace;
 use super::picture::median;
 
 /// A ray agrees when each of its colours changed by the common factor up to this share. Chosen by hand: noise alone makes 1 to 3 %.
@@ -18,7 +19,7 @@ const RAYS_LEAST: usize = RAYS / 3;
 /// A ray with a brighter or darker part tells nothing: it may be cut off, grey levels. Chosen by hand.
 const TOLD_LEVELS: [f32; 2] = [3.0, 225.0];
 /// Pictures over which the light's way is looked at. Chosen by hand: two seconds, a period of a white balance that hunts.
-const PICTURES: usize = 60;
+const PICTURES: u32 = 60;
 /// Colours wander when the share of one of them in the light changes by this factor. Tuned on seeds 1 to 4 of `evaluate-camera --faults`: gains
 /// of red and blue that wander by 10 % change it by 1.14 to 1.22, and liquids are still told then; by 20 %, by 1.31 to 1.5.
 const COLOURS: f32 = 1.25;
@@ -39,10 +40,11 @@ pub(super) struct Wandering {
     /// Logarithms of the light's blue, green and red against the first picture's, as far as its changes were told.
     light: [f32; 3],
     /// The last of these without a gap, as a ring, and the pictures that they belong to.
-    way: [[f32; 3]; PICTURES],
+    way: Vec<[f32; 3]>,
     pictures: Vec<Ground>,
     /// How many there were; it does not grow beyond twice the ring.
     told: usize,
+    pace: Pace,
     colours_for: u32,
     brightness_for: u32,
     ratios: [Vec<f32>; 3],
@@ -59,14 +61,31 @@ impl Wandering {
     pub(super) fn new() -> Self {
         Self {
             light: [0.0; 3],
-            way: [[0.0; 3]; PICTURES],
-            pictures: vec![[([0.0; 3], 0); RAYS]; PICTURES],
+            way: vec![[0.0; 3]; PICTURES as usize],
+            pictures: vec![[([0.0; 3], 0); RAYS]; PICTURES as usize],
             told: 0,
+            pace: Pace::CHOSEN,
             colours_for: 0,
             brightness_for: 0,
             ratios: std::array::from_fn(|_| Vec::with_capacity(RAYS)),
             scratch: Vec::with_capacity(RAYS),
         }
+    }
+
+    /// Says how fast pictures follow each other. Allocates when they come faster than before.
+    pub(super) fn set_pace(&mut self, pace: Pace) {
+        self.pace = pace;
+        let ring = pace.pictures(PICTURES) as usize;
+        if ring != self.way.len() {
+            self.way.resize(ring, [0.0; 3]);
+            self.pictures.resize(ring, [([0.0; 3], 0); RAYS]);
+            self.told = 0;
+        }
+    }
+
+    /// Says that a pause lies before the next picture: the light's way has a gap.
+    pub(super) fn interrupt(&mut self) {
+        self.told = 0;
     }
 
     /// Takes the next picture.
@@ -80,24 +99,24 @@ impl Wandering {
         }
         self.keep(now);
         if (0..3).any(|k| self.is_far(now, COLOURS, |l| l[k] - mean(l))) {
-            self.colours_for = COUNTS_FOR;
+            self.colours_for = self.pace.pictures(COUNTS_FOR);
         }
         if self.is_far(now, BRIGHTNESS, mean) {
-            self.brightness_for = COUNTS_FOR;
+            self.brightness_for = self.pace.pictures(COUNTS_FOR);
         }
     }
 
     /// Goes on with the light's way, or begins one.
     fn keep(&mut self, now: &Ground) {
-        let at = self.told % PICTURES;
+        let (ring, at) = (self.way.len(), self.told % self.way.len());
         (self.way[at], self.pictures[at]) = (self.light, *now);
-        self.told = if self.told + 1 == 2 * PICTURES { PICTURES } else { self.told + 1 };
+        self.told = if self.told + 1 == 2 * ring { ring } else { self.told + 1 };
     }
 
     /// Whether what `of` makes of the light's logarithms has changed by more than this factor on its way, and the ground shows it. Ground that passes
     /// changes all rays a little from picture to picture, which adds up to a way, and none from its one end to its other: then a new way begins.
     fn is_far(&mut self, now: &Ground, factor: f32, of: impl Fn(&[f32; 3]) -> f32) -> bool {
-        let way = || self.way[..self.told.min(PICTURES)].iter().map(&of).enumerate();
+        let way = || self.way[..self.told.min(self.way.len())].iter().map(&of).enumerate();
         let by_light = |a: &(usize, f32), b: &(usize, f32)| a.1.total_cmp(&b.1);
         let (Some((darkest, low)), Some((brightest, high))) = (way().min_by(by_light), way().max_by(by_light)) else { return false };
         if (high - low).exp() <= factor {
@@ -125,7 +144,7 @@ impl Wandering {
 
     /// The logarithms by which the light's blue, green and red changed since the last picture, if that is told.
     fn change(&mut self, now: &Ground) -> Option<[f32; 3]> {
-        let before = &self.pictures[self.told.checked_sub(1)? % PICTURES];
+        let before = &self.pictures[self.told.checked_sub(1)? % self.way.len()];
         self.ratios.iter_mut().for_each(Vec::clear);
         for ((now, count), (before, count_before)) in now.iter().zip(before) {
             // Another number of samples are other places.

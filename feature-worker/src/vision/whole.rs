@@ -8,6 +8,7 @@
 //! Called on the extraction thread; nothing is allocated after the start and nothing fails.
 
 use super::geometry::Axes;
+use super::pace::Pace;
 use super::picture::RegionPixels;
 
 /// Pixels of a row that are looked at. Chosen by hand, for speed.
@@ -110,7 +111,8 @@ impl WholeCheck {
     }
 
     /// Takes note of the next picture. Returns whether it is whole.
-    pub(crate) fn is_whole(&mut self, pixels: RegionPixels) -> bool {
+    pub(crate) fn is_whole(&mut self, pixels: RegionPixels, pace: Pace) -> bool {
+        let scene_frames = pace.pictures(SCENE_FRAMES);
         let first = self.seen == 0;
         self.seen = self.seen.saturating_add(1);
         let (mut plain_run, mut new_plain_run, mut old_run) = (0usize, 0usize, 0usize);
@@ -131,10 +133,10 @@ impl WholeCheck {
         }
         let part = PART_PX.div_ceil(self.row_step);
         let ends_early = self.reaches_glass && plain_run >= part;
-        let missing = ends_early || (!first && most_new_plain >= part && self.broken <= SCENE_FRAMES);
+        let missing = ends_early || (!first && most_new_plain >= part && self.broken <= scene_frames);
         let torn = !first && most_old >= part && rows_new > 0 && rows_new as f32 >= NEW_ROWS * rows_other as f32;
         let whole = !missing && !torn && !self.side.is_displaced(pixels);
-        if whole || first || self.broken > SCENE_FRAMES {
+        if whole || first || self.broken > scene_frames {
             self.plain_before.copy_from_slice(&self.plain);
         }
         self.broken = if whole { 0 } else { self.broken.saturating_add(1) };

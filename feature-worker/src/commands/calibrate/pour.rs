@@ -13,7 +13,7 @@ use shared::messages::PixelFormat;
 
 use crate::drawing::to_bgr;
 use crate::source::{Frame, for_each_frame};
-use crate::vision::{Extractor, Image, Measurement, Poses};
+use crate::vision::{Extractor, Image, Measurement, PictureTime, Poses};
 
 /// The most pictures that are kept for learning and for the drawn picture. Chosen by hand: about 140 MB at 640 x 480 px.
 const KEEP_PICTURES: usize = 150;
@@ -26,8 +26,8 @@ pub(super) const FILM_MOST: usize = 1 << 30;
 enum Film {
     /// From these files, of which something may be missing.
     Files(Vec<PathBuf>, bool),
-    /// From memory, each as JPEG, and how many bytes they may take.
-    Kept { frames: Vec<Vec<u8>>, bytes: usize, most: usize },
+    /// From memory, each as JPEG with its number and time, and how many bytes they may take.
+    Kept { frames: Vec<(Vec<u8>, PictureTime)>, bytes: usize, most: usize },
 }
 
 /// What was seen of one pour.
@@ -72,7 +72,7 @@ impl Pour {
             let quality = Vector::from_slice(&[imgcodecs::IMWRITE_JPEG_QUALITY, FILM_QUALITY]);
             imgcodecs::imencode(".jpg", &bgr, &mut jpeg, &quality).map_err(words)?;
             *bytes += jpeg.len();
-            frames.push(jpeg.to_vec());
+            frames.push((jpeg.to_vec(), time(frame)));
         }
         if self.count.is_multiple_of(self.stride) {
             self.pictures.push(bgr);
@@ -105,21 +105,27 @@ impl Pour {
 
     /// Measures all frames in their order, and gives each measurement to `take`.
     pub fn measure(&self, camera: &CameraConfig, mut extractor: Extractor, mut take: impl FnMut(Measurement)) -> Result<(), String> {
-        let mut each = |picture: &Mat| {
+        let mut each = |picture: &Mat, time: PictureTime| {
             let pixels = picture.data_bytes().map_err(|e| e.message)?;
             let (width_px, height_px) = (picture.cols() as u32, picture.rows() as u32);
-            take(extractor.measure(Image { width_px, height_px, format: PixelFormat::Bgr8, pixels }).map_err(|e| e.to_string())?);
+            let image = Image { width_px, height_px, format: PixelFormat::Bgr8, pixels };
+            take(extractor.measure_at(image, time).map_err(|e| e.to_string())?);
             Ok(())
         };
         match &self.film {
             Film::Files(input, partial) => {
-                for_each_frame(input, camera.fps, *partial, |frame| each(&to_bgr(&frame).map_err(|e| e.message)?)).map(|_| ())
+                for_each_frame(input, camera.fps, *partial, |frame| each(&to_bgr(&frame).map_err(|e| e.message)?, time(&frame))).map(|_| ())
             }
-            Film::Kept { frames, .. } => frames.iter().try_for_each(|jpeg| {
-                each(&imgcodecs::imdecode(&Vector::<u8>::from_slice(jpeg), imgcodecs::IMREAD_COLOR).map_err(|e| e.message)?)
+            Film::Kept { frames, .. } => frames.iter().try_for_each(|(jpeg, time)| {
+                each(&imgcodecs::imdecode(&Vector::<u8>::from_slice(jpeg), imgcodecs::IMREAD_COLOR).map_err(|e| e.message)?, *time)
             }),
         }
     }
+}
+
+/// Number and time of a frame.
+fn time(frame: &Frame) -> PictureTime {
+    PictureTime { sequence: frame.header.sequence, captured_at_ns: frame.header.captured_at_ns }
 }
 
 /// Whether two pictures are the same to the byte.

@@ -15,6 +15,7 @@ use super::follow::{DrySpans, Following, RUN, SmallPicture, follow};
 use super::motion::{MotionFinder, MotionPoint, NEIGHBOURHOOD, NEIGHBOURHOOD_BEFORE, SQUARE};
 use super::rigid::RigidMap;
 use crate::vision::geometry::LinearField;
+use crate::vision::pace::Pace;
 use crate::vision::picture::bilinear_corner;
 
 // "Tuned" below means that the value was tuned on seeds 101 to 104 of `evaluate-camera`; see docs/VISION.md.
@@ -22,9 +23,9 @@ use crate::vision::picture::bilinear_corner;
 /// Room in the memory around the region, squares. Chosen by hand; no measurement is recorded.
 const ROOM_SQUARES: usize = 3;
 /// In each frame, known ground is looked at in one of this many rows of the memory. Chosen by hand, for speed.
-const REFRESH_ROWS: usize = 4;
+const REFRESH_ROWS: u32 = 4;
 /// In each frame, points for the motion are chosen anew in one of this many rows of squares. Chosen by hand, for speed.
-const POINT_ROWS: usize = 4;
+const POINT_ROWS: u32 = 4;
 /// Points for the motion have been seen within this many of their row's turns. Tuned.
 const POINT_AGE: u8 = 4;
 /// Least change over 2 px at a point for the motion, in units of a calm difference. Tuned.
@@ -87,6 +88,9 @@ pub(super) struct Background {
     reference: Pose,
     /// Number of pictures that were remembered.
     frame: usize,
+    /// See [`REFRESH_ROWS`] and [`POINT_ROWS`].
+    refresh_rows: usize,
+    point_rows: usize,
 }
 
 /// Where a linear function that is `value` at 0 and changes by `slope` a step is at least `least`, cut out of `from..to`.
@@ -131,7 +135,19 @@ impl Background {
             now: home,
             reference: home,
             frame: 0,
+            refresh_rows: REFRESH_ROWS as usize,
+            point_rows: POINT_ROWS as usize,
         })
+    }
+
+    /// Says how fast pictures follow each other: each row's turn comes as often in a second at any rate.
+    pub(super) fn set_pace(&mut self, pace: Pace) {
+        (self.refresh_rows, self.point_rows) = (pace.pictures(REFRESH_ROWS) as usize, pace.pictures(POINT_ROWS) as usize);
+    }
+
+    /// Says that a pause lies before the next picture: how the background moved tells nothing of how it moves.
+    pub(super) fn rest(&mut self) {
+        self.motion.rest();
     }
 
     /// The pose of a picture in the middle of the window.
@@ -244,7 +260,7 @@ impl Background {
         let (right, inner, outer) =
             dry.near.map_or((everywhere, everywhere, everywhere), |(wet, outer)| (wet.right_px, wet.line_share, outer));
         for y in 0..side {
-            let fresh = self.frame == 0 || y % REFRESH_ROWS == self.frame % REFRESH_ROWS;
+            let fresh = self.frame == 0 || y % self.refresh_rows == self.frame % self.refresh_rows;
             let row = MemoryRow::new(y, pose.map, side);
             let Some((x0, x1)) = row.in_picture(dry.height_px, size) else { continue };
             let dry_spans = DrySpans { right: row.dry(right), inner: row.dry(inner), outer: row.dry(outer) };
@@ -271,7 +287,7 @@ impl Background {
                 x += length;
             }
         }
-        let (first, every) = if self.frame == 0 { (0, 1) } else { (self.frame % POINT_ROWS, POINT_ROWS) };
+        let (first, every) = if self.frame == 0 { (0, 1) } else { (self.frame % self.point_rows, self.point_rows) };
         for row in (first..side / SQUARE).step_by(every) {
             self.choose_points(row, STEEP_LEAST * dry.calm)?;
         }

@@ -5,6 +5,8 @@
 
 use shared::messages::Doubt;
 
+use crate::vision::pace::Pace;
+
 /// So many pictures are remembered. Chosen by hand: two seconds.
 const REMEMBERED: u32 = 60;
 /// So many of them may be lost. Chosen by hand: one broken picture is no reason to end a pour.
@@ -20,17 +22,23 @@ const JUMPS_LEAST: u32 = 150;
 /// Remembers what was wrong with the last pictures.
 pub(super) struct Disturbed {
     /// One bit for each picture that could not be looked at, the last one first.
-    lost: u64,
+    lost: u128,
     /// Why the last of them could not be looked at.
     doubt: Doubt,
     /// For how many pictures the light's jumps still count.
     jumps: u32,
+    pace: Pace,
 }
 
 impl Disturbed {
     /// No picture was lost yet.
     pub(super) fn new() -> Self {
-        Self { lost: 0, doubt: Doubt::None, jumps: 0 }
+        Self { lost: 0, doubt: Doubt::None, jumps: 0, pace: Pace::CHOSEN }
+    }
+
+    /// Says how fast pictures follow each other.
+    pub(super) fn set_pace(&mut self, pace: Pace) {
+        self.pace = pace;
     }
 
     /// A picture could not be looked at, for this reason.
@@ -43,14 +51,14 @@ impl Disturbed {
         self.lost <<= 1;
         self.jumps = self.jumps.saturating_sub(1);
         if jumps {
-            self.jumps = (self.jumps + JUMP_PICTURES).min(JUMPS_MOST);
+            self.jumps = (self.jumps + self.pace.pictures(JUMP_PICTURES)).min(self.pace.pictures(JUMPS_MOST));
         }
     }
 
     /// Why clear water is not told before a pattern now, if there is a reason.
     pub(super) fn doubt(&self) -> Option<Doubt> {
-        let remembered = self.lost & ((1 << REMEMBERED) - 1);
-        let wanders = (self.jumps > JUMPS_LEAST).then_some(Doubt::LightFlickers);
+        let remembered = self.lost & (u128::MAX >> u128::BITS.saturating_sub(self.pace.pictures(REMEMBERED)));
+        let wanders = (self.jumps > self.pace.pictures(JUMPS_LEAST)).then_some(Doubt::LightFlickers);
         (remembered.count_ones() > LOST_MOST).then_some(self.doubt).or(wanders)
     }
 }

@@ -6,6 +6,7 @@
 use opencv::core::{Mat, Size, Vec4b};
 use opencv::prelude::*;
 
+use crate::vision::pace::Pace;
 use crate::vision::picture::median;
 
 /// Height of a band, px. Chosen by hand: bands of lamps are ten times as high, and half of it has too much noise (tried on seed 101 of
@@ -53,6 +54,7 @@ pub(super) struct Flicker {
     pictures: u32,
     counts_for: u32,
     jumps: bool,
+    pace: Pace,
 }
 
 impl Flicker {
@@ -70,7 +72,13 @@ impl Flicker {
             pictures: 0,
             counts_for: 0,
             jumps: false,
+            pace: Pace::CHOSEN,
         }
+    }
+
+    /// Says how fast pictures follow each other.
+    pub(super) fn set_pace(&mut self, pace: Pace) {
+        self.pace = pace;
     }
 
     /// Takes note of the next picture. Returns by which factor it is brighter than the last one; 1 where what moves hides it.
@@ -139,7 +147,7 @@ impl Flicker {
         if told {
             let (least, most) = self.bands.iter().fold((f32::MAX, 0.0f32), |(low, high), v| (low.min(*v), high.max(*v)));
             if most / least.max(0.01) > 1.0 + DIFFER {
-                (self.pictures, self.counts_for) = ((self.pictures + 1).min(PICTURES), QUIET_PICTURES);
+                (self.pictures, self.counts_for) = ((self.pictures + 1).min(PICTURES), self.pace.pictures(QUIET_PICTURES));
             } else if self.counts_for > 0 {
                 self.counts_for -= 1;
             } else {

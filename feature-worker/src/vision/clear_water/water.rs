@@ -7,6 +7,7 @@
 
 use super::rays::{Colour, each};
 use crate::vision::liquid::FineLine;
+use crate::vision::pace::Pace;
 use shared::messages::Doubt;
 
 // "Tuned" below means that the value was tuned on seeds 101 to 104 of `evaluate-camera`; see docs/VISION.md.
@@ -169,12 +170,24 @@ pub(super) struct Water {
     strange_frames: u32,
     /// Lines in a row that the full picture did not confirm.
     refuted: u32,
+    pace: Pace,
 }
 
 impl Water {
     /// Before the first frame.
     pub(super) fn new() -> Self {
-        Self { stream: None, last_legs_px: [0.0; 2], dry_frames: AFTERWARDS + 1, still_frames: 0, strange_frames: 0, refuted: 0 }
+        let (dry_frames, pace) = (u32::MAX, Pace::CHOSEN);
+        Self { stream: None, last_legs_px: [0.0; 2], dry_frames, still_frames: 0, strange_frames: 0, refuted: 0, pace }
+    }
+
+    /// Says how fast pictures follow each other.
+    pub(super) fn set_pace(&mut self, pace: Pace) {
+        self.pace = pace;
+    }
+
+    /// Says that a pause lies before the next picture: a stream has to begin anew.
+    pub(super) fn interrupt(&mut self) {
+        (self.stream, self.still_frames, self.strange_frames) = (None, 0, 0);
     }
 
     /// The stream as it was last seen, if there is one.
@@ -190,7 +203,7 @@ impl Water {
     /// Where the stream was, while the place is not taken for background at once: cuts with the axes, px of the
     /// small picture.
     pub(super) fn recent_legs_px(&self) -> Option<[f32; 2]> {
-        (self.dry_frames <= AFTERWARDS).then_some(self.last_legs_px)
+        (self.dry_frames <= self.pace.pictures(AFTERWARDS)).then_some(self.last_legs_px)
     }
 
     /// Decides whether there is a stream. `best` is the best line, with its legs in px and what the earlier picture says of it;
@@ -204,7 +217,7 @@ impl Water {
             self.still_frames = if earlier.is_still() { self.still_frames + 1 } else { 0 };
             let background = match self.stream {
                 // While a stream is seen, lines that move with the background were left out when the best one was chosen.
-                Some(_) => self.still_frames > STILL_FRAMES,
+                Some(_) => self.still_frames > self.pace.pictures(STILL_FRAMES),
                 // In front of a background at rest, no stream begins without a change.
                 None => earlier.shows_line() || self.still_frames > 0,
             };
@@ -265,9 +278,9 @@ impl Water {
     pub(super) fn is_elsewhere(&mut self, strange_share: f32, held: bool) -> bool {
         let strange = strange_share > STRANGE && self.stream.is_none() && !held;
         self.strange_frames = if strange { self.strange_frames + 1 } else { 0 };
-        let elsewhere = self.strange_frames > STRANGE_FRAMES;
+        let elsewhere = self.strange_frames > self.pace.pictures(STRANGE_FRAMES);
         if elsewhere {
-            (self.strange_frames, self.dry_frames) = (0, AFTERWARDS + 1);
+            (self.strange_frames, self.dry_frames) = (0, u32::MAX);
         }
         elsewhere
     }
