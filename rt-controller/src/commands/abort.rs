@@ -78,9 +78,9 @@ fn targets(config: Option<&Path>) -> (Vec<Target>, Vec<String>) {
     match config.map(Config::read) {
         Some(Ok(config)) => {
             let named = Target::from(Place::from(&config.cell));
-            // Root stops a cell whoever runs it.
+            // Root stops a cell whoever runs it. A controller that hangs where the configuration says is that cell's, and is ended.
             let others = || running_cells().0.into_iter().filter(|t| t.name == named.name).collect::<Vec<_>>();
-            let of_others = if own_uid() == 0 && named.ask("state").is_none() { others() } else { Vec::new() };
+            let of_others = if own_uid() == 0 && named.ask("state").is_none() && named.process().is_none() { others() } else { Vec::new() };
             (if of_others.is_empty() { vec![named] } else { of_others }, Vec::new())
         }
         Some(Err(e)) => {
