@@ -128,7 +128,8 @@ function askDoubts(doubts) {
 
 function compare() {
   const w = state.weights || {};
-  const key = JSON.stringify([w, state.table, table.episodes.length]);
+  // An age counts as it is shown: buttons that are made anew each second would swallow clicks.
+  const key = JSON.stringify([w, state.table, table.episodes.length], (name, value) => (name === 'age_s' ? ago(value) : value));
   if (key === compareShown) return;
   compareShown = key;
   // The server exchanges what is shown here, or nothing.
