@@ -460,7 +460,13 @@ fn the_calibration_page_takes_clicks_and_writes() -> Outcome {
     assert!(said.contains("expected"), "{said}");
     assert!(!click(r#"{"lip":[639,2],"rim":[639,479],"foot":[0,0]}"#)?.starts_with("measured again"));
     assert!(click(r#"{"lip":[215,250],"rim":[600,250],"foot":[215,470]}"#)?.starts_with("measured again"));
-    assert!(String::from_utf8(http(&address, "POST", "/write", "")?.1)?.contains("written"));
+    // A page that shows something else, or does not say what it shows, writes nothing.
+    for body in ["", r#"{"section":"[image]"}"#] {
+        assert!(String::from_utf8(http(&address, "POST", "/write", body)?.1)?.contains("changed since it was shown"));
+    }
+    let state: serde_json::Value = serde_json::from_slice(&http(&address, "GET", "/state.json", "")?.1)?;
+    let shown = serde_json::json!({ "section": state["section"] }).to_string();
+    assert!(String::from_utf8(http(&address, "POST", "/write", &shown)?.1)?.contains("written to"));
     assert_eq!(page.end()?.0, Some(0));
     let written = shared::config::Config::read(&path)?;
     assert_eq!(written.image.x_axis_px, [215.0, 250.0, 600.0, 250.0]);

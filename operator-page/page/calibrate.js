@@ -22,7 +22,7 @@ $('watch-cancel').onclick = () => order4('cancel');
 $('curve').onclick = () => attempt(async () => {
   const [height, width] = [typed('curve-height'), typed('curve-width')];
   if (!(height > 0 && width > 0)) throw new Error('Type height and width of the curve, above 0.');
-  await post('/api/record', { lambda_deg: height, gamma_per_s2: width });
+  await postMotion('/api/record', { lambda_deg: height, gamma_per_s2: width });
   mine = true;
 });
 
@@ -40,7 +40,8 @@ async function look() {
     calibrationShown = key;
     const end = now.ended === null ? [] : [el('p', { className: now.ended ? 'good' : 'bad' }, now.ended ? '✓ It is written.' : '✕ It has ended; nothing more is written.')];
     fill($('calibrate-lines'), ...now.lines.map(line => el('p', {}, line)), now.busy && !now.found ? el('progress', { 'aria-label': 'Watching and measuring' }) : null, ...end);
-    if (now.found && !found) show(now.found);
+    // Another page may have measured again: what is shown is what would be written.
+    if (now.found && now.found.section !== found?.section) show(now.found);
     if (!now.found) $('calibrate-write').hidden = $('measure').hidden = true;
   }
   if (calibrationBusy && !$('calibrate').hidden) setTimeout(look, 700);
@@ -100,7 +101,7 @@ async function measure() {
 }
 $('measure').onclick = measure;
 $('calibrate-write').onclick = async () => {
-  const words = await order4('write');
+  const words = await order4('write', { section: found?.section ?? '' });
   if (words !== undefined) { say(words, words.startsWith('written')); look(); }
 };
 addEventListener('tab', event => { if (event.detail === 'calibrate') look(); });

@@ -7,11 +7,13 @@
 const numeric = (value, digits) => (value === null || value === undefined ? '' : shown(value, digits));
 const COLUMNS = [
   ['file', 'Episode', e => e.file], ['started_at_utc', 'Started (UTC)', e => (e.started_at_utc || '').replace('T', ' ').slice(0, 19)],
-  ['what', 'What', e => (e.error ? 'UNREADABLE' : what(e))], ['goal', 'Goal, ml', e => numeric(e.run?.goal_ml, 0), true],
+  ['what', 'What', e => (e.error ? 'UNREADABLE' : what(e))], ['goal', 'Goal, ml', e => (Number.isFinite(e.run?.goal_ml) ? goalWords(e.run.goal_ml) : ''), true],
   ['weight_g', 'Weight, g', e => numeric(e.weight_g, 1), true], ['error_ml', 'Error, ml', e => numeric(e.error_ml, 1), true],
   ['seconds', 'Time, s', e => numeric(e.seconds, 1), true], ['reason', 'How it ended', e => reasonWords(e), false, true],
   ['doubts', 'Doubts', e => doubtWords(e), false, true], ['weights', 'Weights', e => (e.weights || '').slice(0, 8)],
 ];
+/** Most rows that are shown, and exported as what is shown. Chosen by hand: a browser lays them out at once, and their names fit into a request. */
+const ROWS = 500;
 let sorted = ['started_at_utc', -1], chosen = '', rows = null, pictureAt = -1;
 
 function doubtWords(e) {
@@ -49,14 +51,15 @@ function shownEpisodes() {
 function showTable() {
   if ($('history').hidden) return;
   const list = shownEpisodes();
-  $('table-words').textContent = `Episodes: ${list.length} of ${table.episodes.length} in ${table.directory || '…'}${table.unread ? `; still to be read: ${table.unread}` : ''}.`;
+  $('table-words').textContent = `Episodes: ${list.length} of ${table.episodes.length} in ${table.directory || '…'}${table.unread ? `; still to be read: ${table.unread}` : ''}.${list.length > ROWS ? ` The first ${ROWS} of them are shown, in this order.` : ''}${table.fault ? ` ${table.fault}.` : ''}`;
+  $('table-words').className = table.fault ? 'bad' : 'hint';
   fill($('table').tHead, el('tr', {}, ...COLUMNS.map(([key, name, , number]) => {
     const on = sorted[0] === key;
     const head = el('th', { scope: 'col', className: number ? 'number' : '', 'aria-sort': on ? (sorted[1] > 0 ? 'ascending' : 'descending') : 'none' },
       el('button', { type: 'button', onclick: () => { sorted = [key, on ? -sorted[1] : 1]; showTable(); } }, `${name}${on ? (sorted[1] > 0 ? ' ▲' : ' ▼') : ''}`));
     return head;
   }), el('th', { scope: 'col' }, 'Save')));
-  fill($('table').tBodies[0], ...list.slice(0, 500).map(e => {
+  fill($('table').tBodies[0], ...list.slice(0, ROWS).map(e => {
     const look = el('button', { type: 'button', className: 'small look', 'aria-label': `Look at ${e.file}`, onclick: () => open(e.file) }, e.file);
     const cells = COLUMNS.map(([key, , text, number, words]) => el('td', { className: number ? 'number' : words ? 'words' : '' }, key === 'file' && !e.error ? look : text(e)));
     const save = (path, name) => el('a', { href: `${path}?file=${encodeURIComponent(e.file)}`, download: e.file.replace(/\.mcap$/, name), 'aria-label': `Save ${e.file} as ${name}` }, name.slice(1).toUpperCase());
@@ -86,7 +89,7 @@ async function open(file) {
   $('episode').hidden = false;
   $('episode-title').textContent = file;
   const e = table.episodes.find(one => one.file === file) || {};
-  const facts = [['What', what(e)], ['Started', e.started_at_utc], ['Goal', e.run?.goal_ml ? `${shown(e.run.goal_ml)} ml` : '–'], ['Weight', e.weight_g === null ? 'not weighed' : `${shown(e.weight_g)} g`],
+  const facts = [['What', what(e)], ['Started', e.started_at_utc], ['Goal', e.run?.goal_ml ? `${goalWords(e.run.goal_ml)} ml` : '–'], ['Weight', e.weight_g === null ? 'not weighed' : `${shown(e.weight_g)} g`],
     ['Error', Number.isFinite(e.error_ml) ? `${shown(e.error_ml)} ml` : '–'], ['Time', `${shown(e.seconds)} s, ${e.frames} frames`], ['It ended', reasonWords(e)], ['By the estimate', e.estimate || '–'],
     ['Weights', e.weights || 'none'], ['Doubts', doubtWords(e) || 'none'], ['Notes', (e.notes || []).join('; ') || 'none']];
   fill($('episode-facts'), ...facts.flatMap(([name, value]) => [el('dt', {}, name), el('dd', {}, value)]));
@@ -114,17 +117,35 @@ function scrub() {
   if (loading || pictureAt === k) return;
   loading = true;
   pictureAt = k;
-  const image = $('episode-picture');
-  image.onload = image.onerror = () => { loading = false; if (Number($('scrub').value) !== pictureAt) scrub(); };
-  image.alt = `Picture of ${chosen} at ${shown(rows.t_s[k], 2)} s`;
-  image.src = `/api/frame?file=${encodeURIComponent(chosen)}&sequence=${rows.sequence[k]}`;
+  showPicture(k).finally(() => { loading = false; if (Number($('scrub').value) !== pictureAt) scrub(); });
+}
+
+/** Shows the picture of row `k`, and says when it is another frame's or there is none. */
+async function showPicture(k) {
+  const image = $('episode-picture'), words = $('episode-picture-words'), of = chosen, at = `${shown(rows.t_s[k], 2)} s`;
+  const wanted = rows.sequence[k] % 2 ** 32;
+  let picture = '', said = '';
+  try {
+    const response = await fetch(`/api/frame?file=${encodeURIComponent(of)}&sequence=${rows.sequence[k]}`, { signal: within(ANSWER_WAITS) });
+    if (!response.ok) await answered(response);
+    const { sequence } = JSON.parse(response.headers.get('x-frame'));
+    if (sequence !== wanted) said = `There is no picture of this frame; that of frame ${sequence}, the nearest ${sequence < wanted ? 'before' : 'after'} it, is shown.`;
+    picture = URL.createObjectURL(await response.blob());
+  } catch (error) {
+    said = `No picture: ${error instanceof TypeError || error instanceof DOMException ? 'the page\'s server cannot be reached' : error.message}.`;
+  }
+  if (image.src.startsWith('blob:')) URL.revokeObjectURL(image.src);
+  if (picture) image.src = picture; else image.removeAttribute('src');
+  image.hidden = !picture;
+  image.alt = said ? `Picture of ${of}. ${said}` : `Picture of ${of} at ${at}`;
+  words.textContent = said;
 }
 $('scrub').oninput = scrub;
 $('kind').onchange = showTable;
 $('search').oninput = showTable;
 for (const button of document.querySelectorAll('[data-format]')) {
   button.onclick = () => attempt(async () => {
-    const files = shownEpisodes().filter(e => !e.error).map(e => e.file);
+    const files = shownEpisodes().slice(0, ROWS).filter(e => !e.error).map(e => e.file);
     await post('/api/export', { what: button.dataset.format, files });
     mine = true;
   });

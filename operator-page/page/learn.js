@@ -4,14 +4,14 @@
 // fails is said where it was asked for.
 'use strict';
 
-let plannedFrom = null, planned = '', tableShown = '', jobShown = '', compareShown = '', table = { episodes: [] };
+let plannedFrom = null, planned = '', tableShown = '', jobShown = '', compareShown = '', table = { episodes: [], fault: 'the table of episodes has not come yet' };
 /** What a person has said of doubtful episodes: file to true (use it) or false (leave it out). */
 const judged = new Map();
 
 /** A proposal as a person does it. */
 function proposal(candidate, first) {
   const next = candidate.next;
-  const head = next.kind === 'curve' ? `Fill in ${shown(next.fill_ml, 0)} ml and record a curve` : `Fill in ${shown(next.fill_ml, 0)} ml and pour ${shown(next.goal_ml, 0)} ml`;
+  const head = next.kind === 'curve' ? `Fill in ${shown(next.fill_ml, 0)} ml and record a curve` : `Fill in ${shown(next.fill_ml, 0)} ml and pour ${goalWords(next.goal_ml)} ml`;
   const button = el('button', { type: 'button', className: first ? 'primary record' : 'record' }, next.kind === 'curve' ? 'It is filled: record the curve' : 'It is filled: prepare this pour');
   button.onclick = () => (next.kind === 'curve' ? record(next) : prepare(next));
   return el('div', { className: 'proposal' }, el('p', {}, el('b', {}, `${first ? '' : 'Or: '}${head}`)),
@@ -20,7 +20,7 @@ function proposal(candidate, first) {
 }
 
 async function record(next) {
-  const answer = await attempt(() => post('/api/record', { lambda_deg: next.lambda_deg, gamma_per_s2: next.gamma_per_s2 }));
+  const answer = await attempt(() => postMotion('/api/record', { lambda_deg: next.lambda_deg, gamma_per_s2: next.gamma_per_s2 }));
   if (!answer) return;
   mine = true;
   ordered = answer.episode;
@@ -28,8 +28,8 @@ async function record(next) {
 }
 
 function prepare(next) {
-  $('goal').value = next.goal_ml;
-  $('fill').value = next.fill_ml;
+  $('goal').value = Number(next.goal_ml.toFixed(1));
+  $('fill').value = Number(next.fill_ml.toFixed(1));
   choose(tabs[0]);
   $('pour-form').requestSubmit();
 }
@@ -64,7 +64,7 @@ function checked(check) {
 
 $('make-plan').onclick = () => attempt(async () => {
   const holds = typed('holds');
-  if (Number.isNaN(holds)) throw new Error('Type what the vessel holds in ml, or leave it empty.');
+  if (Number.isNaN(holds)) throw new Error(`Type what the vessel holds in ml, or leave it empty. ${PLAIN}`);
   localStorage.setItem('decant-holds', $('holds').value);
   await post('/api/plan', { holds_ml: holds ?? null });
   mine = true;
@@ -106,6 +106,9 @@ function showJob(job) {
   if (job.kind === 'export') { fill(place, el('p', { className: 'good' }, `✓ Written on the robot's computer: ${r.directory}`),
     ...(r.left_out ?? []).map((l) => el('p', { className: 'bad' }, `Left out: ${l.why}`))); return; }
   if (r.doubts) { askDoubts(r.doubts); fill(place, el('p', { className: 'warn' }, '! Nothing was learned yet: judge these episodes first.')); return; }
+  // The next training's doubts are judged anew.
+  judged.clear();
+  fill($('doubts'));
   fill(place, el('p', { className: 'good' }, `✓ Learned from ${many(r.episodes, 'episode')}. The new weights are offered under 4.`),
     ...(r.remarks || []).map(what => remark(what)),
     ...(r.left_out || []).map(([name, what]) => el('p', { className: 'hint' }, `Left out: ${name.split('/').pop()}: ${what}`)));
@@ -114,19 +117,19 @@ function showJob(job) {
 /** Asks of each doubtful episode whether it is used. */
 function askDoubts(doubts) {
   const rows = doubts.map(([name, what]) => {
-    const button = el('button', { type: 'button' });
-    const show = () => { button.textContent = judged.get(name) ? 'Use it all the same' : 'Leave it out'; button.setAttribute('aria-pressed', judged.get(name)); };
     if (!judged.has(name)) judged.set(name, false);
-    button.onclick = () => { judged.set(name, !judged.get(name)); show(); };
-    show();
-    return el('div', { className: 'proposal' }, el('p', {}, el('b', {}, name.split('/').pop()), `: ${what}`), button);
+    const choice = (words, use) => el('label', {}, el('input', { type: 'radio', name: `judged-${name}`, value: use ? 'use' : 'leave', checked: judged.get(name) === use, onchange: () => judged.set(name, use) }), ` ${words}`);
+    const file = name.split('/').pop();
+    return el('div', { className: 'proposal', role: 'radiogroup', 'aria-label': file }, el('p', {}, el('b', {}, file), `: ${what}`),
+      el('p', { className: 'row' }, choice('Leave it out', false), choice('Use it all the same', true)));
   });
   fill($('doubts'), ...rows, el('button', { type: 'button', className: 'primary', id: 'learn-judged', onclick: learn }, 'Learn with these answers'));
 }
 
 function compare() {
   const w = state.weights || {};
-  const key = JSON.stringify([w, state.table, table.episodes.length]);
+  // An age counts as it is shown: buttons that are made anew each second would swallow clicks.
+  const key = JSON.stringify([w, state.table, table.episodes.length], (name, value) => (name === 'age_s' ? ago(value) : value));
   if (key === compareShown) return;
   compareShown = key;
   // The server exchanges what is shown here, or nothing.
@@ -159,25 +162,51 @@ function poursWith(identity) {
   return `${errors.length}, off by ${shown(rms)} ml (root mean square)`;
 }
 
-/** Episodes without a weight, newest first. */
+/** How many episodes without a weight are listed. Chosen by hand: who weighs does it at once. */
+const LISTED = 12;
+/** Rows of episodes without a weight, by file: what is typed there stays while the table changes. */
+const toWeigh = new Map();
+/** Those that are weighed later. */
+const skipped = new Set();
+
+function rowToWeigh(e) {
+  const place = el('div', { className: 'proposal' });
+  fill(place, el('p', {}, el('b', {}, e.file), ` ${e.started_at_utc}, ${what(e)}`), scale(e.file, e.run.goal_ml ?? NaN, grams => {
+    if (grams === null) { skipped.add(e.file); unweighed(); } else reload();
+  }));
+  return place;
+}
+
+/** Episodes without a weight, newest first, and what of them is not listed. */
 function unweighed() {
-  const open = table.episodes.filter(e => !e.error && e.complete && e.weight_g === null).reverse();
+  const open = table.episodes.filter(e => !e.error && e.weight_g === null).reverse();
+  const whole = open.filter(e => e.complete), cut = open.length - whole.length;
   const weighed = table.episodes.filter(e => !e.error && e.weight_g !== null);
   const kinds = kind => weighed.filter(e => e.run.kind === kind).length;
-  $('set-words').textContent = `Weighed so far: ${many(kinds('recording'), 'curve')} and ${many(kinds('pour'), 'pour')}${table.unread ? `; ${many(table.unread, 'file')} still to be read` : ''}.`;
+  $('set-words').textContent = table.fault ? `! ${table.fault}.` : `Weighed so far: ${many(kinds('recording'), 'curve')} and ${many(kinds('pour'), 'pour')}${table.unread ? `; ${many(table.unread, 'file')} still to be read` : ''}.`;
   const old = plannedFrom !== null && plannedFrom !== weighed.length;
   $('plan-old').textContent = old ? `! This was proposed from ${many(plannedFrom, 'weighed episode')}; now there ${weighed.length === 1 ? 'is' : 'are'} ${weighed.length}: propose again.` : '';
-  const rows = open.slice(0, 12).map(e => {
-    const place = el('div', { className: 'proposal' });
-    fill(place, el('p', {}, el('b', {}, e.file), ` ${e.started_at_utc}, ${what(e)}`), scale(e.file, e.run.goal_ml ?? NaN, grams => { if (grams === null) place.remove(); else reload(); }));
-    return place;
-  });
-  fill($('unweighed'), ...(rows.length ? rows : [el('p', { className: 'hint' }, 'Everything that was recorded is weighed.')]));
+  for (const file of toWeigh.keys()) if (!whole.some(e => e.file === file)) toWeigh.delete(file);
+  const asked = whole.filter(e => !skipped.has(e.file)), listed = asked.slice(0, LISTED);
+  for (const e of listed) if (!toWeigh.has(e.file)) toWeigh.set(e.file, rowToWeigh(e));
+  const rest = [table.fault ? `! ${table.fault}.` : null, table.unread ? `${many(table.unread, 'file')} still to be read.` : null,
+    asked.length > LISTED ? `${asked.length - LISTED} older ones are not weighed either: History shows all.` : null,
+    whole.length > asked.length ? `${whole.length - asked.length} skipped: not weighed.` : null,
+    cut ? `${many(cut, 'episode')} without a weight ${cut === 1 ? 'was' : 'were'} cut or ${cut === 1 ? 'is' : 'are'} still being recorded, and cannot be weighed: \`decant episodes recover\` makes a cut one whole.` : null].filter(line => line);
+  const all = !open.length && !rest.length ? [table.episodes.length ? 'Everything that was recorded is weighed.' : 'Nothing has been recorded yet.'] : rest;
+  keepRows($('unweighed'), listed.map(e => toWeigh.get(e.file)), all);
+}
+
+/** Puts rows and lines into `parent`. Rows that are there already are not touched, so that the focus and what is typed stay. */
+function keepRows(parent, rows, lines) {
+  [...parent.children].filter(child => !rows.includes(child)).forEach(child => child.remove());
+  rows.forEach((row, k) => { if (parent.children[k] !== row) parent.insertBefore(row, parent.children[k] ?? null); });
+  parent.append(...lines.map(line => el('p', { className: 'hint' }, line)));
 }
 
 function what(episode) {
   const run = episode.run || {};
-  if (run.kind === 'pour') return `pour of ${shown(run.goal_ml, 0)} ml`;
+  if (run.kind === 'pour') return `pour of ${goalWords(run.goal_ml)} ml`;
   return run.kind === 'recording' ? `curve of ${shown(run.lambda_deg, 0)}°` : 'table';
 }
 
@@ -185,7 +214,7 @@ async function reload() {
   try { table = await get('/api/episodes'); } catch { tableShown = ''; return; }
   dispatchEvent(new CustomEvent('table'));
 }
-addEventListener('table', () => { if (!$('unweighed').contains(document.activeElement) || document.activeElement.value === '') unweighed(); });
+addEventListener('table', unweighed);
 listeners.push(() => {
   showJob(state.job);
   compare();

@@ -12,37 +12,65 @@ let last = 0, source = null, state = null, mine = false, stopPort = 0, announced
 /** The ticks of the last minute, by their place in the rows of the server. */
 let points = [];
 const [TICK, T, ALPHA, MEASURED, AREA, DOUBT, D, POURED, SD, PHASE, EPISODE, GOAL] = [0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11];
-/** After this a way of Stop has failed, ms: longer than the server tries. */
-const STOP_WAITS = 6000;
+/** After this a way of Stop has failed, ms: the server tries for 6 s, and may begin a moment late. */
+const STOP_WAITS = 8000;
 const SIGNS = { ready: '✓', moving: '▶', waiting: '!', lost: '✕' };
 
+/** How often Stop was asked for. An order under way meanwhile is followed by another Stop. */
+let stops = 0;
 /** Stop goes two ways at the same time: with the page's own server, and with a port where nothing else is answered. */
 async function stop() {
+  stops += 1;
   const begin = performance.now();
   const word = $('stop-word');
   word.textContent = 'Stopping …';
   $('stop-said').textContent = '';
-  const ways = [fetch('/api/stop', { method: 'POST', headers: { 'Content-Type': 'application/json' }, body: '{}', signal: AbortSignal.timeout(STOP_WAITS) })];
-  if (stopPort) {
-    const other = `http://${location.hostname}:${stopPort}/stop`;
-    ways.push(fetch(other, { method: 'POST', credentials: 'include', headers: { 'Content-Type': 'text/plain' }, body: '', signal: AbortSignal.timeout(STOP_WAITS) }));
-  }
+  const refused = [];
+  const way = async (url, options) => {
+    try {
+      const answer = await answered(await fetch(url, { method: 'POST', signal: within(STOP_WAITS), ...options }));
+      if (state && answer.stops > state.stops) state.stops = answer.stops;
+      return answer;
+    } catch (error) {
+      // A refusal is said as soon as it comes; if the other way leads through, that takes its place.
+      if (!(error instanceof TypeError || error instanceof DOMException)) {
+        refused.push(error.message);
+        $('stop-said').textContent = `Stop failed: ${error.message}. Use the robot's own stop.`;
+      }
+      throw error;
+    }
+  };
+  const ways = [way('/api/stop', { headers: { 'Content-Type': 'application/json' }, body: '{}' })];
+  if (stopPort) ways.push(way(`http://${location.hostname}:${stopPort}/stop`, { credentials: 'include', headers: { 'Content-Type': 'text/plain' }, body: '' }));
   try {
-    const answer = await Promise.any(ways.map(way => way.then(answered)));
+    const answer = await Promise.any(ways);
     $('stop-said').textContent = `Stop: ${answer.words} (${(performance.now() - begin).toFixed(0)} ms)`;
   } catch (error) {
-    const first = error.errors?.find(e => !(e instanceof TypeError || e instanceof DOMException));
-    $('stop-said').textContent = `Stop failed: ${first ? first.message : 'the page\'s server cannot be reached'}. Use the robot's own stop.`;
+    const late = error.errors?.some(e => e instanceof DOMException);
+    if (!refused.length) $('stop-said').textContent = late ? 'Stop: no answer in time; it is still being tried. Use the robot\'s own stop.' : 'Stop failed: the page\'s server cannot be reached. Use the robot\'s own stop.';
   }
   word.textContent = 'Stop';
   // What was said of this Stop is not taken for an answer to a later one.
   const said = $('stop-said').textContent;
   setTimeout(() => { if ($('stop-said').textContent === said) $('stop-said').textContent = ''; }, 8000);
 }
-// It stops as the button goes down, and not when it comes up again; a click that no pointer made, as a screen reader's, stops too.
+// It stops as the button goes down, and not when it comes up again; a click that no pointer made, as a key's or a screen reader's, stops too.
+// A pointer that slides off makes no click, so what it pressed is forgotten when it comes up. A Stop too many does no harm.
 let pressed = false;
 $('stop').onpointerdown = event => { if (event.button === 0) { pressed = true; stop(); } };
-$('stop').onclick = () => { if (!pressed) stop(); pressed = false; };
+$('stop').onclick = event => { if (event.detail === 0 || !pressed) stop(); pressed = false; };
+for (const kind of ['pointerup', 'pointercancel']) addEventListener(kind, () => setTimeout(() => { pressed = false; }), true);
+
+/** Orders a motion, with what this page has seen last: if somebody has stopped since, or it comes late, the server refuses it. If Stop was asked for
+ *  while the order was under way, it is asked for again after it. */
+async function postMotion(path, order = {}) {
+  const before = stops;
+  try {
+    return await post(path, { ...order, stops: state?.stops, sent_at_ms: state?.sent_at_ms });
+  } finally {
+    if (stops !== before) stop();
+  }
+}
 
 // The space bar stops, wherever the focus is: it never presses another button. In a field for words it is a space.
 function takesSpace(target) { return target.matches?.('input[type="text"], textarea'); }
@@ -61,7 +89,10 @@ function lose() {
   $('lost').hidden = false;
 }
 
+/** When the newest connection was begun. */
+let connected = 0;
 function connect() {
+  connected = performance.now();
   source?.close();
   source = new EventSource('/events');
   // A server that has ended closes its connections, which is noticed at once.
@@ -97,7 +128,12 @@ function headline() {
   document.title = `${state.doing} · Decant`;
 }
 
-$('take').onclick = () => attempt(async () => { mine = (await post(mine ? '/api/leave' : '/api/say')).mine; });
+$('take').onclick = () => attempt(async () => { 
+  const answer = await post(mine ? '/api/leave' : '/api/say');
+  mine = answer.mine;
+  // Taking the say stops what another page has ordered, and what this page orders from now on is meant.
+  if (state && answer.stops > state.stops) state.stops = answer.stops;
+});
 
 // A server that is gone is noticed within a second.
 setInterval(() => {
@@ -105,7 +141,8 @@ setInterval(() => {
   lose();
   if (source?.readyState === EventSource.CLOSED) connect();
 }, LOOKS);
-setInterval(() => { if (!source || (source.readyState !== EventSource.OPEN && performance.now() - last > 3000)) connect(); }, 1500);
+// A connection whose other end is gone without a word stays open for the browser; so what counts is when something came.
+setInterval(() => { if (!source || performance.now() - Math.max(last, connected) > 3000) connect(); }, 1500);
 
 /** Whether this page holds a pour. */
 let holding = false;
@@ -115,8 +152,18 @@ async function here() {
 setInterval(() => { if (mine && !holding) here(); }, 1500);
 // The connection of Stop's own way is kept open, so that a Stop need not make one.
 setInterval(() => {
-  if (stopPort && !document.hidden) fetch(`http://${location.hostname}:${stopPort}/alive`, { credentials: 'include' }).catch(() => {});
+  if (stopPort && !document.hidden) alive();
 }, 3000);
+/** After this Stop's own way is not there, ms. Chosen by hand: it answers at once. */
+const ALIVE_WAITS = 2500;
+async function alive() {
+  let there = false;
+  try {
+    there = (await fetch(`http://${location.hostname}:${stopPort}/alive`, { credentials: 'include', signal: within(ALIVE_WAITS) })).ok;
+  } catch { /* It is said below. */ }
+  $('stop-way').hidden = there;
+  $('stop-way').textContent = there ? '' : `Stop's own port (${stopPort}) cannot be reached: Stop has one way less.`;
+}
 
 async function begin() {
   try {
@@ -131,7 +178,7 @@ async function begin() {
   $('cell').textContent = about.cell;
   $('about').textContent = `Decant ${about.version} · ${about.config}`;
   dispatchEvent(new CustomEvent('known'));
-  fetch(`http://${location.hostname}:${stopPort}/alive`, { credentials: 'include' }).catch(() => {});
+  alive();
   connect();
   // A page that is loaded again may have the say still.
   here();

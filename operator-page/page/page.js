@@ -40,13 +40,23 @@ async function answered(response) {
   return answer;
 }
 
+/** A signal that ends a request after so many ms; older browsers have no AbortSignal.timeout. */
+function within(ms) {
+  if (typeof AbortController !== 'function') return undefined;
+  const controller = new AbortController();
+  setTimeout(() => controller.abort(), ms);
+  return controller.signal;
+}
+/** After this an answer no longer comes, ms: the server gives up after 60 s. */
+const ANSWER_WAITS = 65000;
+
 /** Looks something up. */
-async function get(path) { return answered(await fetch(path)); }
+async function get(path) { return answered(await fetch(path, { signal: within(ANSWER_WAITS) })); }
 
 /** Orders something. */
 async function post(path, order = {}) {
   const body = JSON.stringify({ ...own, ...order });
-  return answered(await fetch(path, { method: 'POST', headers: { 'Content-Type': 'application/json' }, body }));
+  return answered(await fetch(path, { method: 'POST', headers: { 'Content-Type': 'application/json' }, body, signal: within(ANSWER_WAITS) }));
 }
 
 /** Does something that may fail, and says so in one line. Gives undefined then. */
@@ -55,19 +65,30 @@ async function attempt(what) {
     say('');
     return await what();
   } catch (error) {
-    say(error instanceof TypeError ? 'The page\'s server cannot be reached.' : error.message);
+    say(error instanceof DOMException ? 'The page\'s server gave no answer in time.' : error instanceof TypeError ? 'The page\'s server cannot be reached.' : error.message);
     return undefined;
   }
 }
 
+/** A plain decimal as people type it, with a comma or a point; NaN for anything else. 1,250 and 1.250 are a thousand to some and one to others, so
+ *  they are no number. */
+function decimal(text) {
+  const plain = /^[+-]?(\d+([.,]\d*)?|[.,]\d+)$/.test(text), grouped = /^[+-]?[1-9]\d{0,2}[.,]\d{3}$/.test(text);
+  return plain && !grouped ? Number(text.replace(',', '.')) : NaN;
+}
 /** A number as people type it; undefined for an empty field, NaN for what is no number. */
 function typed(id) {
-  const text = $(id).value.trim().replace(',', '.');
-  return text === '' ? undefined : Number(text);
+  const text = $(id).value.trim();
+  return text === '' ? undefined : decimal(text);
 }
+/** What is added where a number is refused. */
+const PLAIN = 'A comma or point before exactly three digits is not understood: leave it out, or give other decimals.';
 
 /** A number as people read it; zero has no sign. */
 const shown = (value, digits = 1) => (Number.isFinite(value) ? value.toFixed(digits).replace(/^-(0(\.0*)?)$/, '$1') : '–');
+
+/** A goal with the decimals that it was given. */
+const goalWords = ml => (Number.isFinite(ml) ? String(Number(ml.toPrecision(6))) : '–');
 
 /** So many of something, in words. */
 const many = (n, one) => `${n} ${one}${n === 1 ? '' : 's'}`;

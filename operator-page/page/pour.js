@@ -98,7 +98,7 @@ function plots() {
   const newest = points[points.length - 1];
   const doubts = [...new Set(seen.filter(p => p[DOUBT] > 0).map(p => about.doubts[p[DOUBT]]))];
   $('plots-words').textContent = `Now: alpha ${shown(newest[ALPHA])}° commanded, ${shown(newest[MEASURED])}° measured` +
-    (under.length ? `; ${shown(newest[POURED])} ± ${shown(newest[SD])} ml poured` : '') + (doubts.length ? `. Doubts in view: ${doubts.join(', ')}.` : '.');
+    (under.length ? `; ${shown(newest[POURED])}${newest[SD] > 0 ? ` ± ${shown(newest[SD])}` : ''} ml poured${newest[SD] > 0 ? '' : ' (how far off that is, is not known)'}` : '') + (doubts.length ? `. Doubts in view: ${doubts.join(', ')}.` : '.');
 }
 
 // A pour: goal, what is foreseen, confirm.
@@ -107,16 +107,16 @@ $('pour-form').onsubmit = event => {
   event.preventDefault();
   attempt(async () => {
     const goal = typed('goal'), inside = typed('fill');
-    if (!Number.isFinite(goal)) throw new Error('Type the goal in ml, for example 75.');
-    if (Number.isNaN(inside)) throw new Error('Type what is in the vessel in ml, or leave it empty.');
+    if (!Number.isFinite(goal)) throw new Error(`Type the goal in ml, for example 75. ${PLAIN}`);
+    if (Number.isNaN(inside)) throw new Error(`Type what is in the vessel in ml, or leave it empty. ${PLAIN}`);
     foreseen = { goal_ml: goal, fill_ml: inside ?? null, ...(await post('/api/foresee', { goal_ml: goal, fill_ml: inside ?? null })) };
     if (!foreseen.possible) { $('confirm').hidden = true; throw new Error(foreseen.lines.join(' ')); }
     const sd = foreseen.sd_ml;
-    fill($('foreseen'), el('span', { className: 'big' }, `Pour ${shown(goal, 0)} ml`),
+    fill($('foreseen'), el('span', { className: 'big' }, `Pour ${goalWords(goal)} ml`),
       el('br'), sd ? `Expected to end within ±${shown(sd)} ml (one standard deviation).` : 'It is not known how far off it will be.',
       foreseen.flows_by_deg ? ` It must flow by ${shown(foreseen.flows_by_deg, 0)}° of tilt.` : null,
       ...foreseen.lines.map(line => el('p', { className: 'warn' }, `! ${line}`)));
-    $('go').textContent = hold ? `Hold to pour ${shown(goal, 0)} ml` : `Pour ${shown(goal, 0)} ml now`;
+    $('go').textContent = hold ? `Hold to pour ${goalWords(goal)} ml` : `Pour ${goalWords(goal)} ml now`;
     $('confirm').hidden = false;
     $('go').focus();
   });
@@ -132,7 +132,7 @@ $('hold').onclick = () => {
 async function order() {
   $('stop-said').textContent = '';
   $('result').hidden = true;
-  const answer = await attempt(() => post('/api/pour', { goal_ml: foreseen.goal_ml, fill_ml: foreseen.fill_ml, hold }));
+  const answer = await attempt(() => postMotion('/api/pour', { goal_ml: foreseen.goal_ml, fill_ml: foreseen.fill_ml, identity: foreseen.identity, lines: foreseen.lines, hold }));
   if (answer) { ordered = answer.episode; mine = true; if (!hold) $('confirm').hidden = true; } else if (holding) letGo(false);
 }
 $('go').onclick = () => { if (!hold) order(); };
@@ -160,21 +160,37 @@ $('go').addEventListener('keydown', event => {
   if (hold && !event.repeat) press();
 });
 $('go').addEventListener('keyup', event => { if (event.key === 'Enter') letGo(); });
-$('resume').onclick = () => attempt(async () => { await post('/api/resume'); say('The robot is connected.', true); });
+$('resume').onclick = () => attempt(async () => { await postMotion('/api/resume'); say('The robot is connected.', true); });
 
-/** Asks for the scale's reading of an episode. `done` gets it. */
-function scale(file, goal, done) {
+/** A weight that is further from the estimate than this share of it is asked for twice. Chosen by hand: a slipped digit is further off. */
+const FAR = 0.5;
+/** Asks for the scale's reading of an episode. `done` gets it. A weight that is there already, or is far from the volume `estimate`, is asked for twice. */
+function scale(file, goal, done, estimate = NaN) {
   const input = el('input', { inputMode: 'decimal', autocomplete: 'off', className: 'grams' });
   const said = el('p', { role: 'status' });
   const form = el('form', { noValidate: true }, el('label', {}, 'The scale says, g ', input),
     el('p', { className: 'row' }, el('button', { type: 'submit', className: 'primary' }, 'Enter the weight'),
       el('button', { type: 'button', className: 'skip-weight', onclick: () => done(null) }, 'Skip')), said);
+  let replaced = null, asked = NaN;
   form.onsubmit = event => {
     event.preventDefault();
-    const grams = Number(input.value.trim().replace(',', '.'));
-    if (input.value.trim() === '' || !Number.isFinite(grams)) { said.textContent = 'Type the scale\'s reading in g, for example 74.'; return; }
+    const grams = decimal(input.value.trim());
+    if (!Number.isFinite(grams)) { said.textContent = `Type the scale's reading in g, for example 74. ${PLAIN}`; return; }
+    if (Math.abs(grams - estimate) > FAR * Math.abs(estimate) && asked !== grams) {
+      asked = grams;
+      said.textContent = `By the estimate it is ${shown(estimate)} ml: if the scale really says ${grams} g, enter it again.`;
+      return;
+    }
     attempt(async () => {
-      await post('/api/weigh', { file, grams });
+      try {
+        await post('/api/weigh', { file, grams, shown_g: replaced });
+      } catch (error) {
+        // If it has a weight already, the refusal says which; entered again, that one is replaced.
+        await reload();
+        replaced = table.episodes.find(e => e.file === file)?.weight_g ?? null;
+        said.textContent = error instanceof TypeError || error instanceof DOMException ? '' : error.message;
+        throw error;
+      }
       done(grams, Number.isFinite(goal) ? grams - goal : null);
     });
   };
@@ -192,7 +208,7 @@ function result() {
   resultOf = newest.episode;
   if (holding) letGo(false);
   const goal = newest.goal_ml, curve = goal === null;
-  const head = curve ? `Curve recorded in ${shown(newest.seconds)} s` : `${newest.poured} ml poured of ${shown(goal, 0)} ml`;
+  const head = curve ? `Curve recorded in ${shown(newest.seconds)} s` : `${newest.poured} ml poured of ${goalWords(goal)} ml`;
   const body = [el('p', { className: 'big' }, head),
     el('p', { className: newest.done ? 'good' : 'bad' }, newest.done ? `✓ Done after ${shown(newest.seconds)} s.` : `✕ It ended early: ${newest.reason}.`)];
   if (!curve) body.push(el('p', {}, `By the estimate it is ${shown(Math.abs(newest.poured_ml - goal))} ml ${newest.poured_ml < goal ? 'short of' : 'over'} the goal.`));
@@ -201,7 +217,7 @@ function result() {
     after.append(scale(newest.file, goal, (grams, error) => {
       fill(after, grams === null ? el('p', { className: 'hint' }, `Not weighed. It can be weighed later, under Record and learn (${newest.file}).`)
         : el('p', { className: 'big' }, error === null ? `Weighed: ${shown(grams)} g.` : `Weighed: ${shown(grams)} g, an error of ${error > 0 ? '+' : ''}${shown(error)} ml.`));
-    }));
+    }, curve ? NaN : newest.poured_ml));
   } else {
     after.append(el('p', { className: 'warn' }, `! It was not recorded: ${newest.no_file || 'no recorder answered; does feature-worker run?'}`));
   }
@@ -238,10 +254,10 @@ function slow() {
     $('late-words').textContent = `Half of ${late.n} ticks were less than ${shown(late.p50_us, 0)} µs late, 99 % less than ${shown(late.p99_us, 0)} µs; the latest ${shown(late.max_us, 0)} µs. ${status.late_ticks} were late by half a period, ${status.skipped_ticks} were skipped.`;
   }
   const rows = (status?.outcomes || []).slice().reverse().map(o => el('tr', {}, el('td', { className: 'number' }, o.episode),
-    el('td', {}, o.goal_ml === null ? 'curve' : `pour of ${shown(o.goal_ml, 0)} ml`), el('td', { className: 'number' }, o.goal_ml === null ? '' : `${o.poured} ml`),
+    el('td', {}, o.goal_ml === null ? 'curve' : `pour of ${goalWords(o.goal_ml)} ml`), el('td', { className: 'number' }, o.goal_ml === null ? '' : `${o.poured} ml`),
     el('td', { className: 'number' }, `${shown(o.seconds)} s`), el('td', { className: 'words' }, `${o.done ? '✓' : '✕'} ${o.reason}`)));
   fill($('outcomes'), rows.length ? el('table', {}, el('thead', {}, el('tr', {}, ...[['Number', 1], ['What'], ['Poured', 1], ['Time', 1], ['How it ended']].map(([h, number]) => el('th', { scope: 'col', className: number ? 'number' : '' }, h)))), el('tbody', {}, ...rows))
-    : el('p', { className: 'hint' }, 'Nothing has been poured since the controller started.'));
+    : el('p', { className: 'hint' }, status ? 'Nothing has been poured since the controller started.' : 'The controller does not answer, so its results are not known.'));
 }
 
 addEventListener('known', () => {

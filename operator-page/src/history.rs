@@ -6,9 +6,11 @@
 
 use std::collections::BTreeMap;
 use std::fs::{self, File};
+use std::hash::{DefaultHasher, Hash as _, Hasher as _};
+use std::io::ErrorKind;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, Ordering::Relaxed};
-use std::sync::{Arc, Mutex};
+use std::sync::{Arc, Mutex, MutexGuard};
 use std::time::{Duration, SystemTime};
 
 use feature_worker::episodes::summary::{remarks, summary};
@@ -48,7 +50,10 @@ pub struct History {
     directory: PathBuf,
     table: Mutex<BTreeMap<String, Line>>,
     unread: Mutex<usize>,
+    /// Why the directory cannot be read; empty if it can.
+    fault: Mutex<String>,
     open: Mutex<Vec<Arc<Pictures>>>,
+    weighing: Mutex<()>,
 }
 
 fn stamp(path: &Path) -> Stamp {
@@ -82,14 +87,23 @@ fn line(path: &Path) -> Value {
 impl History {
     /// The episodes of `directory`.
     pub fn new(directory: PathBuf) -> Self {
-        Self { directory, table: Mutex::default(), unread: Mutex::default(), open: Mutex::default() }
+        Self {
+            directory,
+            table: Mutex::default(),
+            unread: Mutex::default(),
+            fault: Mutex::default(),
+            open: Mutex::default(),
+            weighing: Mutex::default(),
+        }
     }
 
     /// Keeps the table until `stop` is set.
     pub fn keep(&self, stop: &AtomicBool) {
         while !stop.load(Relaxed) {
-            let files = find_episodes(std::slice::from_ref(&self.directory)).unwrap_or_default();
-            let files: Vec<PathBuf> = files.into_iter().filter(|f| f.symlink_metadata().is_ok()).collect();
+            let Some(files) = self.files() else {
+                std::thread::sleep(BEAT);
+                continue;
+            };
             let known = |file: &PathBuf| locked(&self.table).get(&name_of(file)).is_some_and(|l| l.stamp == stamp(file));
             let new: Vec<&PathBuf> = files.iter().filter(|f| !known(f)).collect();
             for (done, file) in new.iter().enumerate() {
@@ -106,6 +120,27 @@ impl History {
         }
     }
 
+    /// The files in the directory. None if it cannot be read: then the table stays as it was, and the reason is kept. A directory that is not there
+    /// yet, because nothing has been recorded, is empty.
+    fn files(&self) -> Option<Vec<PathBuf>> {
+        let fail =
+            |e: &dyn std::fmt::Display| format!("the episodes in {} cannot be read ({e}): look at the disk", self.directory.display());
+        let found = match fs::read_dir(&self.directory) {
+            Err(e) if e.kind() == ErrorKind::NotFound && locked(&self.table).is_empty() => Ok(Vec::new()),
+            Err(e) => Err(fail(&e)),
+            Ok(_) => find_episodes(std::slice::from_ref(&self.directory)).map_err(|e| fail(&e)),
+        };
+        let fault = found.as_ref().err().cloned().unwrap_or_default();
+        *locked(&self.fault) = fault;
+        found.ok().map(|files| files.into_iter().filter(|f| f.symlink_metadata().is_ok()).collect())
+    }
+
+    /// Why nothing can be said of the episodes, if that is so.
+    fn readable(&self) -> Result<(), String> {
+        let fault = locked(&self.fault).clone();
+        if fault.is_empty() { Ok(()) } else { Err(fault) }
+    }
+
     /// The table in the order of the files' numbers, and how many files are still to be read. `ends` says how episodes ended.
     pub fn table(&self, ends: &Ends) -> Value {
         let with_end = |(name, line): (&String, &Line)| {
@@ -120,14 +155,17 @@ impl History {
         let mut lines: Vec<(&String, &Line)> = table.iter().collect();
         lines.sort_by(|(a, _), (b, _)| by_number(a.as_ref(), b.as_ref()));
         let lines: Vec<Value> = lines.into_iter().map(with_end).collect();
-        json!({ "episodes": lines, "unread": *locked(&self.unread), "directory": self.directory.display().to_string() })
+        json!({ "episodes": lines, "unread": *locked(&self.unread), "directory": self.directory.display().to_string(), "fault": *locked(&self.fault) })
     }
 
-    /// A word that changes when the table does: number of lines and the newest stamp.
+    /// A word that changes when the table does: from all names and stamps, how much is unread, and why the directory cannot be read.
     pub fn version(&self) -> String {
-        let table = locked(&self.table);
-        let newest = table.values().filter_map(|l| l.stamp.0).max().and_then(|at| at.duration_since(SystemTime::UNIX_EPOCH).ok());
-        format!("{}-{}", table.len(), newest.map_or(0, |d| d.as_millis()))
+        let mut hash = DefaultHasher::new();
+        for (name, line) in &*locked(&self.table) {
+            (name, line.stamp).hash(&mut hash);
+        }
+        (*locked(&self.unread), &*locked(&self.fault)).hash(&mut hash);
+        format!("{:016x}", hash.finish())
     }
 
     /// The path of the episode that the page calls `name`; an error if there is none.
@@ -154,6 +192,22 @@ impl History {
         lines.into_iter().skip(skipped).map(|(_, name)| self.directory.join(name)).collect()
     }
 
+    /// What a training learns from; an error if the directory cannot be read.
+    pub fn to_learn(&self, last: Option<usize>) -> Result<Vec<PathBuf>, String> {
+        self.readable()?;
+        Ok(self.weighed(last))
+    }
+
+    /// The weight of the episode `name`, g, as it was when it was read last.
+    pub fn weight_g(&self, name: &str) -> Option<f64> {
+        locked(&self.table).get(name).and_then(|l| l.value["weight_g"].as_f64())
+    }
+
+    /// Whoever holds it is the only one who weighs.
+    pub fn turn(&self) -> MutexGuard<'_, ()> {
+        locked(&self.weighing)
+    }
+
     /// By how much the weighed pours with the weights `identity` missed their goals, ml.
     pub fn errors_ml(&self, identity: &str) -> Vec<f64> {
         let table = locked(&self.table);
@@ -169,6 +223,7 @@ impl History {
 
     /// What a plan is made from: the weighed files, or else a directory in which no episode is.
     pub fn for_plan(&self) -> Result<Vec<PathBuf>, String> {
+        self.readable()?;
         let weighed = self.weighed(None);
         if !weighed.is_empty() {
             return Ok(weighed);
@@ -217,8 +272,9 @@ impl History {
         Ok(text)
     }
 
-    /// The picture of the frame `sequence`, or the nearest one before it.
-    pub fn picture(&self, name: &str, sequence: u64) -> Result<Vec<u8>, String> {
+    /// The picture of the frame `sequence`; if it has none, the nearest one before it, or else the first. The number, its low 32 bits, says which
+    /// it is.
+    pub fn picture(&self, name: &str, sequence: u64) -> Result<(u32, Vec<u8>), String> {
         let path = self.path(name)?;
         let now = stamp(&path);
         let found = locked(&self.open).iter().find(|p| p.name == name && p.stamp == now).cloned();
@@ -236,8 +292,7 @@ impl History {
         };
         let sequence = sequence as u32;
         let before = pictures.all.partition_point(|(number, _)| *number <= sequence);
-        let picture = pictures.all.get(before.saturating_sub(1)).ok_or("this episode has no pictures")?;
-        Ok(picture.1.clone())
+        pictures.all.get(before.saturating_sub(1)).cloned().ok_or_else(|| "this episode has no pictures".into())
     }
 }
 
@@ -273,5 +328,65 @@ mod tests {
         let table = history.table(&Ends::default());
         let listed: Vec<&str> = table["episodes"].as_array().unwrap().iter().map(|e| e["file"].as_str().unwrap()).collect();
         assert_eq!(listed, names);
+    }
+
+    /// Protects browsers from a table of yesterday: a file that changes is seen although another one has a time in the future, and so is one that takes
+    /// the place of another.
+    #[test]
+    fn each_change_of_a_file_is_seen() {
+        let dir = tempfile::tempdir().unwrap();
+        let history = History::new(dir.path().to_path_buf());
+        let write = |name: &str, text: &str| {
+            fs::write(dir.path().join(name), text).unwrap();
+            history.refresh(name);
+            history.version()
+        };
+        write("episode-0001.mcap", "from tomorrow");
+        let tomorrow = SystemTime::now() + Duration::from_secs(86400);
+        File::options().append(true).open(dir.path().join("episode-0001.mcap")).unwrap().set_modified(tomorrow).unwrap();
+        history.refresh("episode-0001.mcap");
+        let before = write("episode-0002.mcap", "not weighed");
+        assert_ne!(write("episode-0002.mcap", "weighed now"), before);
+    }
+
+    /// Protects who learns from a disk that has gone: a directory that cannot be read is no empty one, what was known of it stays, and nothing is
+    /// planned or learned. One that is not there yet is empty.
+    #[test]
+    fn a_directory_that_cannot_be_read_is_not_empty() {
+        let dir = tempfile::tempdir().unwrap();
+        let episodes = dir.path().join("episodes");
+        let history = History::new(episodes.clone());
+        let look = || history.files();
+        assert_eq!((look(), history.table(&Ends::default())["fault"].clone()), (Some(Vec::new()), json!("")));
+        fs::create_dir(&episodes).unwrap();
+        fs::write(episodes.join("episode-0001.mcap"), "no episode").unwrap();
+        history.refresh("episode-0001.mcap");
+        assert_eq!(look().map(|files| files.len()), Some(1));
+        let version = history.version();
+        fs::rename(&episodes, dir.path().join("away")).unwrap();
+        assert_eq!(look(), None);
+        assert_ne!(history.version(), version, "browsers hear of it");
+        let table = history.table(&Ends::default());
+        assert_eq!(table["episodes"].as_array().unwrap().len(), 1);
+        assert!(table["fault"].as_str().unwrap().contains("cannot be read"), "{table}");
+        assert!(history.for_plan().unwrap_err().contains("cannot be read") && history.to_learn(None).is_err());
+        assert!(!episodes.exists(), "nobody makes it anew");
+        // A file in its place is no directory either.
+        fs::write(&episodes, "a file").unwrap();
+        assert_eq!(look(), None);
+    }
+
+    /// Protects who looks back from another moment's picture: each picture says of which frame it is.
+    #[test]
+    fn a_picture_says_which_frame_it_is() {
+        let dir = tempfile::tempdir().unwrap();
+        let history = History::new(dir.path().to_path_buf());
+        fs::write(dir.path().join("episode-0001.mcap"), "as if read").unwrap();
+        let stamp = stamp(&dir.path().join("episode-0001.mcap"));
+        let all = vec![(5, vec![5]), (9, vec![9])];
+        locked(&history.open).push(Arc::new(Pictures { name: "episode-0001.mcap".into(), stamp, all }));
+        for (wanted, got) in [(5, 5), (8, 5), (9, 9), (2, 5)] {
+            assert_eq!(history.picture("episode-0001.mcap", wanted), Ok((got, vec![got as u8])), "frame {wanted}");
+        }
     }
 }

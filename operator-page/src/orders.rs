@@ -39,19 +39,22 @@ pub struct Foreseen {
     pub flows_by_deg: Option<f32>,
     /// What the operator should know, a line each.
     pub lines: Vec<String>,
+    /// The weights of which this is said; empty before they are known.
+    pub identity: String,
 }
 
 impl Foreseen {
     /// As the page takes it.
     pub fn json(&self) -> Value {
-        json!({ "possible": self.possible, "sd_ml": self.sd_ml, "flows_by_deg": self.flows_by_deg, "lines": self.lines })
+        json!({ "possible": self.possible, "sd_ml": self.sd_ml, "flows_by_deg": self.flows_by_deg, "lines": self.lines,
+            "identity": self.identity })
     }
 }
 
 /// Foresees a pour of `goal_ml`, with `fill_ml` in the vessel if that is known.
 pub fn foresee(site: &Site, goal_ml: f32, fill_ml: Option<f64>) -> Foreseen {
     let most = site.config.controller.goal_max_ml;
-    let cannot = |line: String| Foreseen { possible: false, sd_ml: None, flows_by_deg: None, lines: vec![line] };
+    let cannot = |line: String| Foreseen { possible: false, sd_ml: None, flows_by_deg: None, lines: vec![line], identity: String::new() };
     if !goal_ml.is_finite() || goal_ml <= 0.0 || goal_ml > most {
         return cannot(format!("The goal must be above 0 and at most {most} ml (controller.goal_max_ml)."));
     }
@@ -86,7 +89,7 @@ pub fn foresee(site: &Site, goal_ml: f32, fill_ml: Option<f64>) -> Foreseen {
             );
         }
         lines.push("The weight file is not the one that the controller has taken, so it is not said how far off this will be.".into());
-        return Foreseen { possible: true, sd_ml: None, flows_by_deg: None, lines };
+        return Foreseen { possible: true, sd_ml: None, flows_by_deg: None, lines, identity: status.weights };
     };
     let sd_ml = foreseen::poured_sd_ml(&weights, site.config.limits, goal_ml);
     let flows_by_deg = foreseen::must_flow_by_deg(&weights, fill_ml, container.least_fill_ml, container.holds_ml);
@@ -111,7 +114,7 @@ pub fn foresee(site: &Site, goal_ml: f32, fill_ml: Option<f64>) -> Foreseen {
         }
         None => lines.push("These weights do not say how far off this pour will be.".into()),
     }
-    Foreseen { possible: true, sd_ml, flows_by_deg, lines }
+    Foreseen { possible: true, sd_ml, flows_by_deg, lines, identity: status.weights }
 }
 
 /// What the operator should know of weights from few episodes: their deviation cannot be taken at its word.
@@ -135,14 +138,24 @@ fn worse_than_expected(errors_ml: &[f64], sd_ml: f32) -> Option<String> {
     })
 }
 
-/// Orders a pour, unless somebody has stopped since `stops`. Gives its number.
-pub fn pour(site: &Site, stops: u64, goal_ml: f32, fill_ml: Option<f64>) -> Result<u64, String> {
+/// Orders a pour, unless somebody has stopped since `stops`, or other weights or lines are foreseen now than the page has `shown`. Gives its
+/// number.
+pub fn pour(site: &Site, stops: u64, goal_ml: f32, fill_ml: Option<f64>, shown: (&str, &[String])) -> Result<u64, String> {
     let foreseen = foresee(site, goal_ml, fill_ml);
     if !foreseen.possible {
         return Err(foreseen.lines.join(" "));
     }
+    as_shown(&foreseen, shown)?;
     take_back_if_it_waits(site)?;
     order(site, stops, Request::Pour { goal_ml, flows_by_deg: foreseen.flows_by_deg })
+}
+
+/// Refuses what is foreseen now if a person has confirmed something else.
+fn as_shown(foreseen: &Foreseen, (identity, lines): (&str, &[String])) -> Result<(), String> {
+    if foreseen.identity == identity && foreseen.lines == lines {
+        return Ok(());
+    }
+    Err("what is foreseen has changed since it was shown, so nothing began: look ahead again".into())
 }
 
 /// Orders the curve of eq. (1), unless somebody has stopped since `stops`. Gives its number.
@@ -207,9 +220,15 @@ fn take_back_if_it_waits(site: &Site) -> Result<(), String> {
     if waits { resume(site) } else { Ok(()) }
 }
 
-/// Writes the scale's reading into an episode.
-pub fn weigh(site: &Site, name: &str, grams: f64) -> Result<Value, String> {
+/// Writes the scale's reading into an episode of which the page shows the weight `shown_g`. Another weight than that is not replaced.
+pub fn weigh(site: &Site, name: &str, grams: f64, shown_g: Option<f64>) -> Result<Value, String> {
     let path = site.history.path(name)?;
+    // Two pages that weigh at the same time take turns.
+    let _turn = site.history.turn();
+    site.history.refresh(name);
+    if let Some(has) = site.history.weight_g(name).filter(|has| shown_g != Some(*has)) {
+        return Err(format!("{name} has a weight already, {has} g: if yours is to replace it, enter it again"));
+    }
     let before = set_weight(&path, grams).map_err(|e| e.to_string())?;
     site.history.refresh(name);
     Ok(json!({ "file": name, "weight_g": grams, "before_g": before }))
@@ -226,5 +245,16 @@ mod tests {
         assert!(worse_than_expected(&[-6.0, 5.0, 0.5], 1.2).unwrap().contains("(3)"));
         assert_eq!(worse_than_expected(&[-2.0, 1.0], 1.2), None);
         assert_eq!(worse_than_expected(&[], 0.0), None);
+    }
+
+    /// Protects whoever has confirmed a pour that the page had foreseen: if other weights have come meanwhile, or something else is to be known of it,
+    /// nothing begins.
+    #[test]
+    fn what_is_confirmed_is_what_was_shown() {
+        let lines = vec!["The robot is taken back first.".to_string()];
+        let now = Foreseen { possible: true, sd_ml: None, flows_by_deg: None, lines: lines.clone(), identity: "new".into() };
+        assert_eq!(as_shown(&now, ("new", &lines)), Ok(()));
+        assert!(as_shown(&now, ("old", &lines)).unwrap_err().contains("look ahead again"));
+        assert!(as_shown(&now, ("new", &[])).is_err());
     }
 }

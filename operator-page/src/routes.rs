@@ -6,6 +6,7 @@
 use serde::Deserialize;
 use serde_json::{Value, json};
 use shared::messages::Doubt;
+use shared::os::now_ns;
 use web::{Answer, Request};
 
 use crate::orders;
@@ -32,6 +33,10 @@ struct Order {
     file: String,
     files: Vec<String>,
     grams: Option<f64>,
+    /// The weight that the page shows of the episode; none if it shows none.
+    shown_g: Option<f64>,
+    /// The section of the configuration that the page shows.
+    section: String,
     holds_ml: Option<f64>,
     last: Option<usize>,
     accept: Vec<String>,
@@ -39,10 +44,20 @@ struct Order {
     what: String,
     /// The weights that the page shows.
     identity: String,
+    /// The number of stops in the newest state that the page had when it ordered a motion.
+    stops: Option<u64>,
+    /// When that state was sent, CLOCK_MONOTONIC ms.
+    sent_at_ms: Option<u64>,
+    /// What the page showed of a pour before it was confirmed.
+    lines: Vec<String>,
     seconds: u64,
     corner: Value,
 }
 
+/// An order of a motion by a page whose newest state is older than this came late, ms: states are sent every 75 ms, so it is 26 of them.
+const LATE_MS: u64 = 2000;
+/// The paths that order a motion.
+const MOTIONS: [&str; 3] = ["/api/pour", "/api/record", "/api/resume"];
 /// The formats of `feature-worker episodes export`.
 const FORMATS: [&str; 4] = ["csv", "images", "video", "lerobot"];
 
@@ -77,18 +92,20 @@ fn get(site: &Site, request: &Request) -> Answer {
         "/api/frame" => {
             let sequence = request.parameter("sequence").and_then(|n| n.parse().ok()).unwrap_or(0);
             match site.history.picture(&file, sequence) {
-                Ok(bytes) if bytes.starts_with(b"\x89PNG") => Answer::bytes("image/png", bytes),
-                Ok(bytes) => Answer::jpeg(bytes),
+                Ok((number, bytes)) => {
+                    let kind = if bytes.starts_with(b"\x89PNG") { "image/png" } else { "image/jpeg" };
+                    Answer::bytes(kind, bytes).header("x-frame", &json!({ "sequence": number }).to_string())
+                }
                 Err(e) => Answer::fault(404, e),
             }
         }
         "/api/calibration" => Answer::json(&site.calibration.about()),
         "/api/calibration.jpg" => site.calibration.picture().map_or_else(|e| Answer::fault(404, e), Answer::jpeg),
         "/api/mcap" => site.history.open_file(&file).map_or_else(|e| Answer::fault(404, e), |open| Answer::file(open, &file)),
-        "/api/csv" => site.history.csv(&file).map_or_else(
-            |e| Answer::fault(404, e),
-            |text| Answer::bytes("text/csv", text).header("content-disposition", "attachment; filename=\"episode.csv\""),
-        ),
+        "/api/csv" => {
+            let name = format!("{}.csv", file.trim_end_matches(".mcap"));
+            site.history.csv(&file).map_or_else(|e| Answer::fault(404, e), |text| Answer::bytes("text/csv", text).saved_as(&name))
+        }
         _ => Answer::not_here(),
     }
 }
@@ -132,7 +149,7 @@ fn post(site: &Site, request: &Request) -> Answer {
             // What the page before ordered, and has not begun, does not begin under another's say.
             site.stopped();
             site.say().take(&who.id, &who.name, &from);
-            return Answer::json(&json!({ "mine": true }));
+            return Answer::json(&json!({ "mine": true, "stops": site.stops() }));
         }
         "/api/leave" => {
             site.say().leave(&who.id);
@@ -142,6 +159,11 @@ fn post(site: &Site, request: &Request) -> Answer {
         _ => {}
     }
     let stops = site.stops();
+    if MOTIONS.contains(&path)
+        && let Err(e) = still_meant(&order, stops, now_ns() / 1_000_000)
+    {
+        return Answer::fault(409, e);
+    }
     if let Err(e) = site.say().act(&who.id, &who.name, &from) {
         return Answer::fault(409, e);
     }
@@ -151,14 +173,29 @@ fn post(site: &Site, request: &Request) -> Answer {
 /// Stops the motion. Whoever asks needs no say.
 pub fn stop(site: &Site) -> Answer {
     site.stopped();
-    line(site.stopper.stop().map(|words| json!({ "words": words })))
+    line(site.stopper.stop().map(|words| json!({ "words": words, "stops": site.stops() })))
+}
+
+/// Whether an order of a motion is still meant: nobody has stopped since the state that its page saw, and that state is not old. Otherwise a Stop
+/// that overtook the order, or a network that held it up, would let the robot begin after the person has turned away.
+fn still_meant(order: &Order, stops: u64, now_ms: u64) -> Result<(), String> {
+    let (Some(seen), Some(sent_at_ms)) = (order.stops, order.sent_at_ms) else {
+        return Err("the page does not say what it has seen: load it again".into());
+    };
+    if seen != stops {
+        return Err("it was stopped before it began".into());
+    }
+    if now_ms.saturating_sub(sent_at_ms) > LATE_MS {
+        return Err("the order came late, so nothing began: look at the robot, and order it again".into());
+    }
+    Ok(())
 }
 
 /// What needs the say. `stops` is the number of stops when it was asked for.
 fn act(site: &Site, stops: u64, path: &str, order: Order) -> Result<Value, String> {
     match path {
         "/api/pour" => {
-            let episode = orders::pour(site, stops, order.goal_ml, order.fill_ml)?;
+            let episode = orders::pour(site, stops, order.goal_ml, order.fill_ml, (&order.identity, &order.lines))?;
             if order.hold {
                 site.hold(episode);
             }
@@ -166,14 +203,14 @@ fn act(site: &Site, stops: u64, path: &str, order: Order) -> Result<Value, Strin
         }
         "/api/record" => orders::record(site, stops, order.lambda_deg, order.gamma_per_s2).map(|episode| json!({ "episode": episode })),
         "/api/resume" => orders::resume(site).map(|()| json!({ "words": "the robot is connected" })),
-        "/api/weigh" => orders::weigh(site, &order.file, order.grams.ok_or("give the scale's reading in g")?),
+        "/api/weigh" => orders::weigh(site, &order.file, order.grams.ok_or("give the scale's reading in g")?, order.shown_g),
         "/api/plan" => {
             let (of, weighed) = (site.history.for_plan()?, site.history.weighed(None).len());
             site.jobs.start_plan((&of, weighed), &site.file, order.holds_ml, site.config.controller.goal_max_ml)?;
             Ok(site.jobs.about())
         }
         "/api/learn" => {
-            let files = site.history.weighed(order.last);
+            let files = site.history.to_learn(order.last)?;
             let (offer, config) = (site.shelf.offer(), &site.file);
             site.jobs.start_learning(&files, order.accept, order.leave_out, &offer, config)?;
             Ok(site.jobs.about())
@@ -203,7 +240,9 @@ fn calibrate(site: &Site, order: &Order) -> Result<Value, String> {
             Ok(json!({ "words": "watching" }))
         }
         "corner" => site.calibration.order("/corner", &order.corner.to_string()).map(|words| json!({ "words": words })),
-        "write" => site.calibration.order("/write", "{}").map(|words| json!({ "words": words })),
+        "write" => {
+            site.calibration.order("/write", &json!({ "section": order.section }).to_string()).map(|words| json!({ "words": words }))
+        }
         "cancel" => {
             site.calibration.cancel();
             Ok(json!({ "words": "cancelled" }))
@@ -220,4 +259,21 @@ fn export(site: &Site, order: &Order) -> Result<Value, String> {
     let to = site.history.exports().join(format!("{kind}-{seconds}"));
     site.jobs.start_export(&files, kind, to)?;
     Ok(site.jobs.about())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Protects whoever has pressed Stop and turned away: an order that the Stop has overtaken, one that was held up on its way, and one of a page that
+    /// does not say what it has seen begin nothing.
+    #[test]
+    fn an_order_from_before_a_stop_is_not_meant_any_more() {
+        let order = |stops, sent_at_ms| Order { stops, sent_at_ms, ..Order::default() };
+        let judged = |order: Order| still_meant(&order, 7, 100_000);
+        assert_eq!(judged(order(Some(7), Some(99_000))), Ok(()));
+        assert_eq!(judged(order(Some(6), Some(99_000))), Err("it was stopped before it began".into()));
+        assert!(judged(order(Some(7), Some(97_000))).unwrap_err().contains("came late"));
+        assert!(judged(order(None, None)).unwrap_err().contains("load it again"));
+    }
 }

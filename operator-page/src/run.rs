@@ -5,7 +5,7 @@
 //! | main | starts the others, and waits for a signal |
 //! | web (two) | all connections, one thread for each port |
 //! | answer | ordinary requests, several at a time |
-//! | stop (three) | Stop alone, from both ports |
+//! | stop (eight) | Stop alone, from both ports |
 //! | link | keeps the link to the cell running, and takes its messages |
 //! | publish, weights, history | the state for all browsers; the weight files; the episodes |
 //!
@@ -30,6 +30,9 @@ use crate::site::Site;
 
 /// Threads that answer ordinary requests. Chosen by hand: some may wait seconds for the controller, and pictures still come.
 const ANSWERING: usize = 6;
+/// Threads of each port that answer Stop. Chosen by hand: while a controller hangs a Stop takes up to 6 s, and a person presses again each second or
+/// two.
+const STOPPING: usize = 4;
 /// Most connections of the port where only Stop is answered. Chosen by hand: one for each page, and room.
 const STOP_CONNECTIONS: usize = 32;
 
@@ -79,7 +82,7 @@ pub fn run(args: &Args) -> Result<(), Failure> {
         for _ in 0..ANSWERING {
             scope.spawn(|| page.serve(stop, |request| routes::answer(site, request)));
         }
-        for _ in 0..2 {
+        for _ in 0..STOPPING {
             scope.spawn(move || {
                 while !stop.load(Relaxed) {
                     if let Some(pending) = page.next_urgent() {
@@ -89,13 +92,15 @@ pub fn run(args: &Args) -> Result<(), Failure> {
                 }
             });
         }
-        scope.spawn(move || {
-            stop_page.serve(stop, |request| match (request.post, request.path.as_str()) {
-                (true, "/stop") => routes::stop(site),
-                (false, "/alive") => web::Answer::text("alive"),
-                _ => web::Answer::not_here(),
+        for _ in 0..STOPPING {
+            scope.spawn(move || {
+                stop_page.serve(stop, |request| match (request.post, request.path.as_str()) {
+                    (true, "/stop") => routes::stop(site),
+                    (false, "/alive") => web::Answer::text("alive"),
+                    _ => web::Answer::not_here(),
+                });
             });
-        });
+        }
         scope.spawn(|| site.cell.keep(stop));
         scope.spawn(|| site.publish(stop));
         scope.spawn(|| site.look_at_weights(stop));

@@ -12,6 +12,7 @@ use serde_json::{Value, json};
 use shared::config::Config;
 use shared::control::{EndReason, Outcome, Status};
 use shared::messages::{Doubt, Phase};
+use shared::os::now_ns;
 use shared::runtime_dir::Place;
 use web::Broadcast;
 
@@ -205,6 +206,7 @@ impl Site {
             "doing": words.doing, "remedy": words.remedy, "kind": words.kind, "may_resume": words.may_resume,
             "live": fast, "say": holder, "held": held, "weights": *locked(&self.weights), "job": self.jobs.about(),
             "table": self.history.version(),
+            "stops": self.stops(), "sent_at_ms": now_ns() / 1_000_000,
         })
     }
 }

@@ -34,11 +34,21 @@ pub fn of(live: &Live) -> Words {
     let Some(point) = live.points.back() else { return words("lost", "The controller does not answer", "") };
     let hindrance = live.status.as_ref().map_or(String::new(), |s| s.hindrance.clone());
     let poured = volume_words(point.poured_ml, point.poured_sd_ml);
+    // A curve has no goal, and nobody counts what it pours.
+    let counted = if point.goal_ml.is_finite() { format!(": {poured} ml poured") } else { String::new() };
     match phase {
-        Phase::Pouring => words("moving", format!("Pouring {:.0} ml: {poured} poured", point.goal_ml), ""),
+        Phase::Pouring => words("moving", format!("Pouring {} ml: {poured} poured", point.goal_ml), ""),
         Phase::Recording => words("moving", format!("Recording a curve: at {:.0} degrees", point.alpha_deg), ""),
-        Phase::Returning => words("moving", format!("Coming upright: {poured} ml poured"), ""),
-        Phase::Settling => words("moving", format!("Upright, counting the last drops: {poured} ml poured"), ""),
+        Phase::Returning => words("moving", format!("Coming upright{counted}"), ""),
+        Phase::Settling => words(
+            "moving",
+            if counted.is_empty() {
+                "Upright, waiting for the last drops".into()
+            } else {
+                format!("Upright, counting the last drops{counted}")
+            },
+            "",
+        ),
         Phase::Idle if hindrance.is_empty() => words("ready", "Ready to pour", ""),
         Phase::Idle => words("waiting", "Ready to record, but not to pour", sentence(&hindrance)),
         Phase::NoRobot => {
@@ -90,6 +100,14 @@ mod tests {
     #[test]
     fn the_first_line_says_what_is_going_on() {
         assert_eq!(of(&live(Phase::Pouring, 0)).doing, "Pouring 110 ml: 64.0 +- 1.8 poured");
+        let mut small = live(Phase::Pouring, 0);
+        small.points[0].goal_ml = 12.5;
+        assert_eq!(of(&small).doing, "Pouring 12.5 ml: 64.0 +- 1.8 poured", "a goal is not rounded");
+        let mut curve = live(Phase::Returning, 0);
+        (curve.points[0].goal_ml, curve.points[0].poured_ml) = (f32::NAN, 0.0);
+        assert_eq!(of(&curve).doing, "Coming upright", "what a curve pours is not counted, and not said to be nothing");
+        curve.points[0].phase = Phase::Settling as u32;
+        assert_eq!(of(&curve).doing, "Upright, waiting for the last drops");
         let old = of(&live(Phase::Pouring, 5));
         assert_eq!((old.kind, old.remedy.as_str()), ("lost", "No answer."));
         assert_eq!(of(&Live::default()).kind, "lost");

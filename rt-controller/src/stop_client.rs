@@ -11,7 +11,7 @@ use std::os::linux::net::SocketAddrExt;
 use std::os::unix::net::{SocketAddr, UnixStream};
 use std::path::{Path, PathBuf};
 use std::sync::mpsc;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use shared::os::peer_uid;
 use shared::runtime_dir::{Place, bases, own_uid};
@@ -82,7 +82,9 @@ pub fn running_cells() -> (Vec<Target>, Vec<String>) {
     }
     let may_stop = |uid: u32, directories: &[PathBuf]| uid == own_uid() || own_uid() == 0 || !directories.is_empty();
     let targets = found.into_iter().map(|((uid, name), directories)| Target { name, uid, directories, doubted: String::new() });
-    (targets.filter(|t| may_stop(t.uid, &t.directories)).collect(), doubted)
+    // Any user may bind a name that says it is of another; only who answers as that user is.
+    let is_real = |t: &Target| !t.directories.is_empty() || t.ask("state").is_some();
+    (targets.filter(|t| may_stop(t.uid, &t.directories) && is_real(t)).collect(), doubted)
 }
 
 impl Target {
@@ -92,7 +94,7 @@ impl Target {
         let mut addresses: Vec<SocketAddr> =
             self.directories.iter().filter_map(|d| SocketAddr::from_pathname(d.join("stop")).ok()).collect();
         addresses.extend(SocketAddr::from_abstract_name(name).ok());
-        addresses.into_iter().find_map(|address| ask_within(address, self.uid, line))
+        ask_all(addresses, self.uid, line)
     }
 
     /// The process of the cell's controller, if it runs and its runtime directory still says so.
@@ -102,14 +104,23 @@ impl Target {
     }
 }
 
-/// Asks at one socket. A thread does it, because a server that was stopped takes no connection and gives no answer.
-fn ask_within(address: SocketAddr, uid: u32, line: &'static str) -> Option<StopAnswer> {
+/// Asks at all sockets at once, and gives the first answer. A thread for each does it, because a server that was stopped takes no connection and
+/// gives no answer; so two sockets of such a server take no longer than one.
+fn ask_all(addresses: Vec<SocketAddr>, uid: u32, line: &'static str) -> Option<StopAnswer> {
+    let until = Instant::now() + ANSWER;
     let (sender, receiver) = mpsc::channel();
-    let asking = std::thread::Builder::new().spawn(move || {
-        let _ = sender.send(ask_at(&address, uid, line));
-    });
-    asking.ok()?;
-    receiver.recv_timeout(ANSWER).ok().flatten()
+    for address in addresses {
+        let sender = sender.clone();
+        // Without a thread this socket is not asked; the others are.
+        let _ = std::thread::Builder::new().spawn(move || sender.send(ask_at(&address, uid, line)));
+    }
+    drop(sender);
+    loop {
+        // It ends when each socket has given no answer, or at the end of the wait.
+        if let Some(answer) = receiver.recv_timeout(until.saturating_duration_since(Instant::now())).ok()? {
+            return Some(answer);
+        }
+    }
 }
 
 fn ask_at(address: &SocketAddr, uid: u32, line: &str) -> Option<StopAnswer> {

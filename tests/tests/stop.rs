@@ -212,6 +212,32 @@ fn an_abort_falls_back_to_the_process() {
     other.kill().and_then(|()| other.wait()).expect("ours");
 }
 
+/// Protects who aborts as root in a cell whose configuration names a runtime directory of its own: a controller that hangs there is found and ended. A
+/// "nothing runs" would leave it pouring.
+#[test]
+fn root_ends_a_controller_that_hangs_in_a_named_directory() {
+    if !rustix::process::geteuid().is_root() {
+        println!("not run: it takes root");
+        return;
+    }
+    let base = tempfile::tempdir().expect("a directory");
+    let mut cell = CellUnderTest::prepare(|c| {
+        c["cell"].as_table_mut().expect("a table").insert("runtime_dir".into(), base.path().display().to_string().into());
+    });
+    cell.spawn("rt-controller");
+    cell.wait("the controller", Duration::from_secs(30), |_| true);
+    cell.signal("rt-controller", Signal::STOP);
+    let mut abort = abort_of(&cell);
+    let abort = abort.stdin(Stdio::null()).stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().expect("it starts");
+    // By then it has asked in vain, and sent its signal, which waits for the process.
+    std::thread::sleep(Duration::from_secs(6));
+    cell.signal("rt-controller", Signal::CONT);
+    let output = abort.wait_with_output().expect("it ran");
+    let said = String::from_utf8_lossy(&output.stderr).into_owned();
+    assert!(output.status.code() == Some(1) && said.contains("SIGTERM"), "{:?} {said}", output.status.code());
+    assert!(cell.exit_code("rt-controller", Duration::from_secs(10)).is_some(), "it has ended");
+}
+
 /// Protects whoever stops the controller and reads only how it ended: a robot that holds the container tilted is said with the tilt, and the exit code is not
 /// that of a stop as it should be.
 #[test]

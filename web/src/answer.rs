@@ -69,10 +69,14 @@ impl Answer {
     /// A file for the reader's disk, under `name`.
     pub fn file(file: File, name: &str) -> Self {
         let bytes = file.metadata().map_or(0, |m| m.len());
+        Self::new(200, "application/octet-stream", Content::File(file, bytes)).saved_as(name)
+    }
+
+    /// The answer as a file for the reader's disk, under `name`.
+    pub fn saved_as(mut self, name: &str) -> Self {
         let safe: String = name.chars().map(|c| if c.is_ascii_alphanumeric() || "-_.".contains(c) { c } else { '_' }).collect();
-        let mut answer = Self::new(200, "application/octet-stream", Content::File(file, bytes));
-        answer.headers.push(("content-disposition", format!("attachment; filename=\"{safe}\"")));
-        answer
+        self.headers.push(("content-disposition", format!("attachment; filename=\"{safe}\"")));
+        self
     }
 
     /// A refusal or failure: its HTTP status, and one line that says what to do.

@@ -29,5 +29,5 @@ document.getElementById('frame').onclick = async event => {
   choose({ lip: 'rim', rim: 'foot', foot: 'lip' }[chosen]);
   if (word.textContent.startsWith('measured again')) load();
 };
-document.getElementById('write').onclick = async () => { word.textContent = await (await fetch('/write', { method: 'POST', headers: { 'Content-Type': 'application/json' }, body: '{}' })).text(); };
+document.getElementById('write').onclick = async () => { word.textContent = await (await fetch('/write', { method: 'POST', headers: { 'Content-Type': 'application/json' }, body: JSON.stringify({ section: state.section }) })).text(); };
 choose('lip'); load();

@@ -315,6 +315,9 @@ fn serve(args: &Args, port: TcpListener, start: (Config, Corner), pour: &Pour, m
         (true, "/write") if !good => {
             Answer::text("nothing is written: no corner has passed the checks yet; click lip, top edge and left side")
         }
+        (true, "/write") if !section::is_shown(&config.image, &request.body) => {
+            Answer::text("nothing is written: what was found has changed since it was shown; look at it, and write again")
+        }
         (true, "/write") => {
             let result = save_picture(args, &config, pictures).and_then(|()| section::write(&args.config, &config));
             stop.store(result.is_ok(), Relaxed);

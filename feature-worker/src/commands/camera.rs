@@ -57,7 +57,10 @@ pub fn run(args: &Args) -> Result<(), Failure> {
 fn as_json(device: &Device, controls: &[(Control, Result<i32, String>)]) -> Value {
     let controls: Vec<Value> = controls
         .iter()
-        .map(|(c, value)| json!({ "name": c.name, "value": value.as_ref().ok(), "least": c.least, "most": c.most, "step": c.step, "inactive": c.inactive }))
+        .map(|(c, value)| {
+            json!({ "name": c.name, "value": value.as_ref().ok(), "least": c.least, "most": c.most, "step": c.step, "inactive": c.inactive,
+            "read_only": c.read_only })
+        })
         .collect();
     let mut value = json!(device);
     value["controls"] = controls.into();
@@ -87,8 +90,12 @@ fn print(device: &Device, controls: &[(Control, Result<i32, String>)]) {
     for format in &device.formats {
         println!("  format   {format}");
     }
-    for (Control { name, least, most, step, inactive, .. }, value) in controls {
+    for (Control { name, least, most, step, inactive, read_only, .. }, value) in controls {
         let value = value.as_ref().map_or_else(|e| format!("cannot be read ({e})"), i32::to_string);
-        println!("  control  {name} = {value} ({least} to {most}, step {step}){}", if *inactive { ", automatic now" } else { "" });
+        println!(
+            "  control  {name} = {value} ({least} to {most}, step {step}){}{}",
+            if *read_only { ", read only" } else { "" },
+            if *inactive { ", automatic now" } else { "" }
+        );
     }
 }

@@ -12,8 +12,9 @@ function plot(values) {
 async function step() {
   try {
     const s = await (await fetch('/state.json')).json();
+    if (s.unshown) state.textContent = `${s.unshown}: look at the camera's driver`;
     if (s.sequence) {
-      state.textContent = (s.silent ? 'no frames for a second; the last one: ' : '') + `frame ${s.sequence}   V_e ${s.area_px2.toFixed(0)} px²   confidence ${s.confidence.toFixed(2)}   doubt: ${s.doubt}`;
+      state.textContent = (s.silent ? 'no frames for a second; the last one: ' : s.unshown ? `${s.unshown}; the last one that could be shown: ` : '') + `frame ${s.sequence}   V_e ${s.area_px2.toFixed(0)} px²   confidence ${s.confidence.toFixed(2)}   doubt: ${s.doubt}`;
       plot(s.history);
       picture.src = '/picture.jpg?' + s.sequence;
     }

@@ -65,6 +65,8 @@ struct Shown {
     history: VecDeque<f32>,
     /// Whether no frame has come for a second.
     silent: bool,
+    /// Why the newest frame is not shown; empty if it is.
+    unshown: &'static str,
 }
 
 /// Runs the command.
@@ -109,13 +111,24 @@ fn watch(mut frames: FrameStream<ObserverSource>, mut extractor: Extractor, show
     }
 }
 
-/// Measures one frame for the browser. A frame that cannot be drawn is left out.
+/// Why a frame cannot be shown; its format otherwise.
+fn format_of(frame: &Frame) -> Result<PixelFormat, &'static str> {
+    let format = PixelFormat::from_code(frame.header.format).ok_or("the frames have a format that is not known")?;
+    let bytes = frame.header.width_px as usize * frame.header.height_px as usize * format.bytes_per_pixel();
+    if frame.pixels.len() == bytes { Ok(format) } else { Err("the frames have another length than they say") }
+}
+
+/// Measures one frame for the browser. Of a frame that cannot be drawn the page says why, so that nobody takes the one before for it.
 fn show(frame: &Frame, extractor: &mut Extractor, shown: &Mutex<Shown>) -> Result<(), Failure> {
-    let Some(format) = PixelFormat::from_code(frame.header.format) else { return Ok(()) };
+    let format = match format_of(frame) {
+        Ok(format) => format,
+        Err(why) => {
+            let mut shown = lock(shown);
+            (shown.silent, shown.unshown) = (false, why);
+            return Ok(());
+        }
+    };
     let (width_px, height_px) = (frame.header.width_px, frame.header.height_px);
-    if frame.pixels.len() != width_px as usize * height_px as usize * format.bytes_per_pixel() {
-        return Ok(());
-    }
     let time = PictureTime { sequence: frame.header.sequence, captured_at_ns: frame.header.captured_at_ns };
     let image = Image { width_px, height_px, format, pixels: frame.pixels };
     let measured = extractor.measure_at(image, time).or_exit(exit::BAD_INPUT)?;
@@ -123,7 +136,7 @@ fn show(frame: &Frame, extractor: &mut Extractor, shown: &Mutex<Shown>) -> Resul
     draw(&mut picture, extractor, &measured).or_exit(exit::FAILED)?;
     let mut shown = lock(shown);
     shown.picture = picture;
-    shown.silent = false;
+    (shown.silent, shown.unshown) = (false, "");
     shown.newest = Newest {
         sequence: frame.header.sequence,
         area_px2: measured.area_px2,
@@ -151,8 +164,34 @@ fn answer(server: &Server, shown: &Mutex<Shown>, stop: &AtomicBool) {
             let shown = lock(shown);
             let Newest { sequence, area_px2, confidence, doubt } = shown.newest;
             Answer::json(&serde_json::json!({ "sequence": sequence, "area_px2": area_px2, "confidence": confidence, "doubt": doubt,
-                "silent": shown.silent, "history": shown.history }))
+                "silent": shown.silent, "unshown": shown.unshown, "history": shown.history }))
         }
         _ => Answer::not_here(),
     });
+}
+
+#[cfg(test)]
+mod tests {
+    use shared::messages::FrameHeader;
+
+    use super::*;
+
+    /// Protects who looks at a camera from an old picture that looks live: of frames that cannot be shown the page says why, until one can be.
+    #[test]
+    fn a_frame_that_is_not_shown_is_said() {
+        let config = Config::parse(include_str!("../../../config/sim.toml"), "sim.toml").unwrap();
+        let mut extractor = Extractor::new(&config.camera, &config.image).unwrap();
+        let shown = Mutex::new(Shown::default());
+        let pixels = vec![90; 640 * 480 * 3];
+        let mut take = |format, bytes| {
+            let header = FrameHeader { width_px: 640, height_px: 480, format, sequence: 7, ..Default::default() };
+            show(&Frame { header, pixels: &pixels[..bytes] }, &mut extractor, &shown).unwrap();
+            lock(&shown).unshown
+        };
+        let good = PixelFormat::Bgr8 as u32;
+        assert_eq!(take(good, pixels.len()), "");
+        assert!(take(99, pixels.len()).contains("not known"));
+        assert!(take(good, pixels.len() - 1).contains("another length"));
+        assert_eq!(take(good, pixels.len()), "");
+    }
 }

@@ -28,8 +28,10 @@ pub struct Control {
     pub most: i32,
     /// Step from value to value.
     pub step: i32,
-    /// Whether the driver takes no value for it now.
+    /// Whether another control, as its automatic, has it now: the driver may take a value, and not use it.
     pub inactive: bool,
+    /// Whether nobody can set it.
+    pub read_only: bool,
 }
 
 /// A device with controls.
@@ -61,7 +63,8 @@ impl Queried {
             least: raw.minimum,
             most: raw.maximum,
             step: raw.step,
-            inactive: raw.flags & (v4l2::V4L2_CTRL_FLAG_INACTIVE | v4l2::V4L2_CTRL_FLAG_READ_ONLY) != 0,
+            inactive: raw.flags & v4l2::V4L2_CTRL_FLAG_INACTIVE != 0,
+            read_only: raw.flags & v4l2::V4L2_CTRL_FLAG_READ_ONLY != 0,
         }
     }
 }
@@ -203,6 +206,10 @@ fn set(device: &mut impl Controls, key: &Key, setting: Setting) -> Result<String
         let unit = |v: i32| f64::from(v) / key.factor;
         return Err(format!("camera.{name} = {}: the camera took {} instead; it takes {}", unit(wanted), unit(got), range()));
     }
+    // A driver may keep the value of an inactive control, and read it back, while the automatic goes on.
+    if device.query(key.id).is_none_or(|control| control.inactive) {
+        return Err(format!("camera.{name}: the camera keeps it under an automatic that cannot be switched off here; leave the key out"));
+    }
     Ok(format!("{name} = {}", f64::from(got) / key.factor))
 }
 
@@ -242,12 +249,13 @@ mod tests {
     struct Fake {
         controls: BTreeMap<u32, [i32; 4]>,
         refuses: Vec<u32>,
+        inactive: Vec<u32>,
     }
 
     impl Controls for Fake {
         fn query(&self, id: u32) -> Option<Control> {
             let [_, least, most, step] = *self.controls.get(&id)?;
-            Some(Control { id, name: String::new(), least, most, step, inactive: false })
+            Some(Control { id, name: String::new(), least, most, step, inactive: self.inactive.contains(&id), read_only: false })
         }
         fn get(&self, id: u32) -> Result<i32, String> {
             self.controls.get(&id).map(|c| c[0]).ok_or("invalid".into())
@@ -271,7 +279,7 @@ mod tests {
             (v4l2::V4L2_CID_WHITE_BALANCE_TEMPERATURE, [4000, 2800, 6500, 10]),
             (v4l2::V4L2_CID_POWER_LINE_FREQUENCY, [2, 0, 2, 1]),
         ]);
-        Fake { controls, refuses: Vec::new() }
+        Fake { controls, ..Fake::default() }
     }
 
     /// Protects the settings: values are set in V4L2's units with the automatic off, "locked" keeps what was there, and what the configuration
@@ -312,6 +320,10 @@ mod tests {
         busy.refuses = vec![v4l2::V4L2_CID_EXPOSURE_AUTO, v4l2::V4L2_CID_GAIN];
         let both = said(&mut busy, CameraConfig { exposure_ms: value(10.0), gain: value(20.0), ..CameraConfig::default() });
         assert!(both.contains("automatic cannot be switched off (busy)") && both.contains("camera.gain = 20: refused (busy)"), "{both}");
+        let mut kept = camera();
+        kept.inactive = vec![v4l2::V4L2_CID_GAIN];
+        let gain = said(&mut kept, CameraConfig { gain: value(20.0), ..CameraConfig::default() });
+        assert!(gain.contains("camera.gain") && gain.contains("under an automatic"), "a value that is kept and not used: {gain}");
         let mut automatic = camera();
         automatic.controls.insert(v4l2::V4L2_CID_POWER_LINE_FREQUENCY, [3, 0, 3, 1]);
         let locked = Some(Setting::Locked(Locked::Locked));

@@ -5,6 +5,7 @@
 mod access;
 mod cost;
 mod path;
+mod rules;
 mod stop;
 mod trouble;
 mod worker_pages;

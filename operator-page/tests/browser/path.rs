@@ -41,7 +41,7 @@ fn take_the_offer(browser: &Browser) {
     let over = "return !!document.querySelector('#compare .accept') || /failed|judge/.test(document.getElementById('job').textContent)";
     browser.wait("the offer", TRAINED, over);
     if browser.text("#job").contains("judge") {
-        browser.run("document.querySelectorAll('#doubts .proposal button').forEach(b => b.click())");
+        browser.run("document.querySelectorAll('#doubts input[value=use]').forEach(b => b.click())");
         browser.click("#learn-judged");
         browser.wait("the offer", TRAINED, "return !!document.querySelector('#compare .accept')");
     }

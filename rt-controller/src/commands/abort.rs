@@ -44,13 +44,13 @@ pub fn run(args: &Args) -> Result<(), Failure> {
         let none = || failure(exit::UNREACHABLE, "no rt-controller that this user may stop is running");
         return Err(if doubted.is_empty() { none() } else { not_known(&doubted.join("; ")) });
     }
-    for why in doubted {
-        eprintln!("error: {}", not_known(&why).what);
+    for why in &doubted {
+        eprintln!("error: {}", not_known(why).what);
     }
     // Every cell is asked before one is waited for.
     let asked: Vec<(Target, Result<Asked, Failure>)> = targets.into_iter().map(|t| (t.clone(), ask(&t))).collect();
-    let several = asked.len() > 1;
-    let mut result = Ok(());
+    let several = asked.len() + doubted.len() > 1;
+    let mut result = if doubted.is_empty() { Ok(()) } else { Err(failure(exit::FAILED, "not every container is known to be upright")) };
     for (target, asked) in asked {
         let cell = if several { format!("cell '{}': ", target.name) } else { String::new() };
         match asked.and_then(|a| wait(&target, a)) {
@@ -78,9 +78,9 @@ fn targets(config: Option<&Path>) -> (Vec<Target>, Vec<String>) {
     match config.map(Config::read) {
         Some(Ok(config)) => {
             let named = Target::from(Place::from(&config.cell));
-            // Root stops a cell whoever runs it.
+            // Root stops a cell whoever runs it. A controller that hangs where the configuration says is that cell's, and is ended.
             let others = || running_cells().0.into_iter().filter(|t| t.name == named.name).collect::<Vec<_>>();
-            let of_others = if own_uid() == 0 && named.ask("state").is_none() { others() } else { Vec::new() };
+            let of_others = if own_uid() == 0 && named.ask("state").is_none() && named.process().is_none() { others() } else { Vec::new() };
             (if of_others.is_empty() { vec![named] } else { of_others }, Vec::new())
         }
         Some(Err(e)) => {

@@ -26,6 +26,17 @@ pub(super) fn text(image: &ImageConfig) -> String {
     )
 }
 
+/// What a page sends when somebody writes.
+#[derive(serde::Deserialize)]
+struct Shown {
+    section: String,
+}
+
+/// Whether a page that writes shows this table: what a person has not seen is not written.
+pub(super) fn is_shown(image: &ImageConfig, body: &[u8]) -> bool {
+    serde_json::from_slice::<Shown>(body).is_ok_and(|shown| shown.section == text(image))
+}
+
 /// Puts the `[image]` table of `config` into the file in one step. The other tables stay as they are.
 pub(super) fn write(path: &Path, config: &Config) -> Result<(), Failure> {
     let fail = |e: String| failure(exit::FAILED, format!("{}: {e}", path.display()));
