@@ -1,5 +1,5 @@
 //! `feature-worker episodes` on directories that are not as they should be: beyond the ten thousandth episode, with links that lead nowhere, incomplete
-//! episodes, and copies into the directory that they come from.
+//! episodes, copies into the directory that they come from, and two changes at once.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic)]
 
 use std::path::{Path, PathBuf};
@@ -97,4 +97,25 @@ fn a_merge_into_its_own_directory_doubles_nothing() {
     let there = shared::episode::find_episodes(std::slice::from_ref(&monday)).unwrap();
     let areas: Vec<f32> = there.iter().map(|file| Episode::read(file).unwrap().rows[0].area_px2).collect();
     assert_eq!(areas, [1.0, 2.0]);
+}
+
+/// Protects a weight from a note that another program writes at the same moment, and the note from it: what was said to be written is there, and
+/// nothing else.
+#[test]
+fn two_changes_at_once_lose_nothing() {
+    let dir = tempfile::tempdir().unwrap();
+    let path = write(dir.path(), 1, true);
+    let file = path.to_str().unwrap();
+    for round in 1..=20u32 {
+        let note = format!("round {round}");
+        let (weighed, noted) = std::thread::scope(|threads| {
+            let weighs = threads.spawn(|| episodes(&["weigh", file, "--weight", &round.to_string()]));
+            let notes = threads.spawn(|| episodes(&["note", file, "--text", &note]));
+            (code(&weighs.join().unwrap()) == 0, code(&notes.join().unwrap()) == 0)
+        });
+        let episode = Episode::read(&path).unwrap();
+        assert!(!weighed || episode.weight_g == Some(f64::from(round)), "round {round}: {:?}", episode.weight_g);
+        assert!(!noted || episode.info.note == note, "round {round}: {}", episode.info.note);
+    }
+    assert_eq!(std::fs::read_dir(dir.path()).unwrap().count(), 1, "no temporary file is left");
 }

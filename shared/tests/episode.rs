@@ -186,25 +186,6 @@ fn a_wrong_weight_is_refused_and_the_file_is_as_it_was() {
     assert_eq!(std::fs::read_dir(dir.path()).unwrap().count(), 1, "no temporary file is left");
 }
 
-/// Protects a weight from a note that another program writes at the same moment, and the note from it: what was said to be written is there, and
-/// nothing else.
-#[test]
-fn two_changes_at_once_lose_nothing() {
-    let dir = tempfile::tempdir().unwrap();
-    let path = write(dir.path(), true);
-    for round in 1..=20u32 {
-        let (grams, note) = (f64::from(round), format!("round {round}"));
-        let (weighed, noted) = std::thread::scope(|threads| {
-            let (weighs, notes) = (threads.spawn(|| set_weight(&path, grams).is_ok()), threads.spawn(|| set_note(&path, &note).is_ok()));
-            (weighs.join().unwrap(), notes.join().unwrap())
-        });
-        let episode = Episode::read(&path).unwrap();
-        assert!(!weighed || episode.weight_g == Some(grams), "round {round}: {:?}", episode.weight_g);
-        assert!(!noted || episode.info.note == note, "round {round}: {}", episode.info.note);
-    }
-    assert_eq!(std::fs::read_dir(dir.path()).unwrap().count(), 1, "no temporary file is left");
-}
-
 /// Protects what people wrote: a note is kept beside everything else, replaced, and taken away; one that is too long is refused.
 #[test]
 fn a_note_is_added_afterwards_and_nothing_else_changes() {
