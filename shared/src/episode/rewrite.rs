@@ -101,7 +101,7 @@ fn at_rest(path: &Path, lock: impl Fn(&File) -> Result<(), TryLockError>) -> Res
         let locked = lock(&opened);
         // Somebody may have put another file in its place, with what they changed, before the lock was had.
         let is_it = || std::fs::metadata(path).is_ok_and(|now| (now.dev(), now.ino()) == (meta.dev(), meta.ino()));
-        if tries == 0 || !(matches!(locked, Err(TryLockError::WouldBlock)) || !is_it()) {
+        if tries == 0 || (!matches!(locked, Err(TryLockError::WouldBlock)) && is_it()) {
             break (opened, meta, locked);
         }
         std::thread::sleep(LOCK_PAUSE);
