@@ -2,7 +2,7 @@
 //!
 //! It asks at the controller's stop socket, which needs no shared memory. If nobody answers there, it starts `rt-controller abort`, which
 //! also ends a controller that hangs; there is one at a time, and whoever stops meanwhile waits for the same. Threads of their own run it; it
-//! allocates and waits at most `rt_controller`'s second and [`FALLBACK`]. A refusal is a line.
+//! allocates and waits at most `rt_controller`'s second and `FALLBACK`. A refusal is a line.
 
 use std::path::PathBuf;
 use std::process::{Command, Output, Stdio};
