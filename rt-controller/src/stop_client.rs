@@ -61,8 +61,8 @@ fn is_closed(directory: &Path) -> bool {
     directory.join("stop").symlink_metadata().is_err_and(|e| e.kind() == ErrorKind::PermissionDenied)
 }
 
-/// The cells whose controllers run and that this user may stop: their own, those whose runtime directory lets them in, and for root all. And of the runtime directories that look like such a cell's and are not
-/// believed, which and why, a line each.
+/// The cells whose controllers run and that this user may stop: their own, those whose runtime directory lets them in, and for root all. Beside them
+/// stands why the runtime directories that look like such a cell's are not believed, a line each.
 pub fn running_cells() -> (Vec<Target>, Vec<String>) {
     let mut found: BTreeMap<(u32, String), Vec<PathBuf>> = BTreeMap::new();
     let mut doubted = Vec::new();

@@ -98,10 +98,10 @@ fn at_rest(path: &Path, lock: impl Fn(&File) -> Result<(), TryLockError>) -> Res
     let mut tries = LOCK_TRIES;
     let (opened, meta, locked) = loop {
         let (opened, meta) = regular_file::open(path).map_err(unread)?;
-        let locked = lock(&opened);
-        // Somebody may have put another file in its place, with what they changed, before the lock was had.
+        // Before the lock was had, somebody may have put another file in its place, with what they changed.
         let is_it = || std::fs::metadata(path).is_ok_and(|now| (now.dev(), now.ino()) == (meta.dev(), meta.ino()));
-        if tries == 0 || (!matches!(locked, Err(TryLockError::WouldBlock)) && is_it()) {
+        let locked = lock(&opened).and_then(|()| if is_it() { Ok(()) } else { Err(TryLockError::WouldBlock) });
+        if tries == 0 || !matches!(locked, Err(TryLockError::WouldBlock)) {
             break (opened, meta, locked);
         }
         std::thread::sleep(LOCK_PAUSE);
