@@ -104,8 +104,9 @@ impl Target {
     }
 }
 
-/// Asks at all sockets at once, and gives the first answer. A thread for each does it, because a server that was stopped takes no connection and
-/// gives no answer; so two sockets of such a server take no longer than one.
+/// Asks at all sockets at once, and gives the first answer that refuses nothing, or else a refusal: the abstract socket refuses a member of the
+/// group whom the file obeys. A thread for each does it, because a server that was stopped takes no connection and gives no answer; so two sockets
+/// of such a server take no longer than one.
 fn ask_all(addresses: Vec<SocketAddr>, uid: u32, line: &'static str) -> Option<StopAnswer> {
     let until = Instant::now() + ANSWER;
     let (sender, receiver) = mpsc::channel();
@@ -115,12 +116,15 @@ fn ask_all(addresses: Vec<SocketAddr>, uid: u32, line: &'static str) -> Option<S
         let _ = std::thread::Builder::new().spawn(move || sender.send(ask_at(&address, uid, line)));
     }
     drop(sender);
-    loop {
-        // It ends when each socket has given no answer, or at the end of the wait.
-        if let Some(answer) = receiver.recv_timeout(until.saturating_duration_since(Instant::now())).ok()? {
-            return Some(answer);
+    let mut refusal = None;
+    // It ends when each socket has answered or has given no answer, or at the end of the wait.
+    while let Ok(answer) = receiver.recv_timeout(until.saturating_duration_since(Instant::now())) {
+        match answer {
+            Some(answer) if answer.refused.is_empty() => return Some(answer),
+            answer => refusal = refusal.or(answer),
         }
     }
+    refusal
 }
 
 fn ask_at(address: &SocketAddr, uid: u32, line: &str) -> Option<StopAnswer> {
@@ -184,5 +188,34 @@ mod tests {
         assert_eq!(found(&link), (0, 1));
         std::os::unix::fs::lchown(&link, Some(65534), None).unwrap();
         assert_eq!(found(&link), (0, 0), "another user may lead it elsewhere");
+    }
+
+    /// Protects a member of the cell's group, whom the controller obeys at the file alone: the refusal of the abstract socket comes first, and must not
+    /// count.
+    #[test]
+    fn a_refusal_waits_for_the_other_socket() {
+        let dir = tempfile::tempdir().unwrap();
+        let serve = |name: &str, refused: &str, after: Duration| {
+            let listener = std::os::unix::net::UnixListener::bind(dir.path().join(name)).unwrap();
+            let answer = StopAnswer {
+                pid: 1,
+                phase: shared::messages::Phase::Idle,
+                alpha_deg: None,
+                upright: true,
+                hindrance: String::new(),
+                refused: refused.into(),
+            };
+            std::thread::spawn(move || {
+                let (mut stream, _) = listener.accept().unwrap();
+                std::thread::sleep(after);
+                stream.write_all(format!("{}\n", serde_json::to_string(&answer).unwrap()).as_bytes()).unwrap();
+            });
+            SocketAddr::from_pathname(dir.path().join(name)).unwrap()
+        };
+        let late = Duration::from_millis(200);
+        let both = vec![serve("refuses", "no", Duration::ZERO), serve("obeys", "", late)];
+        assert_eq!(ask_all(both, own_uid(), "abort").unwrap().refused, "");
+        let both = vec![serve("refuses-1", "no", Duration::ZERO), serve("refuses-2", "no", late)];
+        assert_eq!(ask_all(both, own_uid(), "abort").unwrap().refused, "no");
     }
 }
