@@ -61,9 +61,18 @@ fn is_closed(directory: &Path) -> bool {
     directory.join("stop").symlink_metadata().is_err_and(|e| e.kind() == ErrorKind::PermissionDenied)
 }
 
-/// The cells whose controllers run and that this user may stop: their own, those whose runtime directory lets them in, and for root all. Beside them
-/// stands why the runtime directories that look like such a cell's are not believed, a line each.
-pub fn running_cells() -> (Vec<Target>, Vec<String>) {
+/// What runs on this machine, as this user can see it.
+pub struct Running {
+    /// The cells whose controllers this user may stop: their own, those whose runtime directory lets them in, and for root all.
+    pub targets: Vec<Target>,
+    /// Where a controller may run that cannot be reached from here, and why, a line each.
+    pub doubted: Vec<String>,
+    /// The cells of other users whose controllers run, and whose runtime directories are not among the usual ones: each its user and its name.
+    pub others: Vec<(u32, String)>,
+}
+
+/// Looks for the cells that run.
+pub fn running_cells() -> Running {
     let mut found: BTreeMap<(u32, String), Vec<PathBuf>> = BTreeMap::new();
     let mut doubted = Vec::new();
     for entry in bases().iter().filter_map(|b| std::fs::read_dir(b).ok()).flatten().flatten() {
@@ -80,11 +89,27 @@ pub fn running_cells() -> (Vec<Target>, Vec<String>) {
             found.entry((uid, name.into())).or_default();
         }
     }
-    let may_stop = |uid: u32, directories: &[PathBuf]| uid == own_uid() || own_uid() == 0 || !directories.is_empty();
-    let targets = found.into_iter().map(|((uid, name), directories)| Target { name, uid, directories, doubted: String::new() });
-    // Any user may bind a name that says it is of another; only who answers as that user is.
-    let is_real = |t: &Target| !t.directories.is_empty() || t.ask("state").is_some();
-    (targets.filter(|t| may_stop(t.uid, &t.directories) && is_real(t)).collect(), doubted)
+    let (mut targets, mut others) = (Vec::new(), Vec::new());
+    for ((uid, name), directories) in found {
+        let target = Target { name, uid, directories, doubted: String::new() };
+        // Any user may bind a name that says it is of another; only who listens there as that user is.
+        let only_a_name = target.directories.is_empty();
+        if only_a_name && !target.listens() {
+            continue;
+        }
+        match only_a_name {
+            true if ![0, uid].contains(&own_uid()) => others.push((uid, target.name)),
+            // Where it keeps its process number is not known without the configuration, so a controller that hangs cannot be ended.
+            true if target.ask("state").is_none() => {
+                doubted.push(format!(
+                    "the rt-controller of cell '{}' does not answer: give the cell's --config, which may end it",
+                    target.name
+                ));
+            }
+            _ => targets.push(target),
+        }
+    }
+    Running { targets, doubted, others }
 }
 
 impl Target {
@@ -95,6 +120,19 @@ impl Target {
             self.directories.iter().filter_map(|d| SocketAddr::from_pathname(d.join("stop")).ok()).collect();
         addresses.extend(SocketAddr::from_abstract_name(name).ok());
         ask_all(addresses, self.uid, line)
+    }
+
+    /// Whether its user listens at the abstract socket, by what the kernel says, also if nobody answers there.
+    fn listens(&self) -> bool {
+        let Ok(address) = SocketAddr::from_abstract_name(abstract_name(self.uid, &self.name)) else { return false };
+        let uid = self.uid;
+        let (sender, receiver) = mpsc::channel();
+        // In a thread, because a socket whose places are all taken lets nobody connect.
+        let begun = std::thread::Builder::new().spawn(move || {
+            let peer = UnixStream::connect_addr(&address).ok().and_then(|s| peer_uid(&s));
+            sender.send(peer.is_some_and(|p| p == uid || p == 0))
+        });
+        begun.is_ok() && receiver.recv_timeout(ANSWER).unwrap_or(false)
     }
 
     /// The process of the cell's controller, if it runs and its runtime directory still says so.

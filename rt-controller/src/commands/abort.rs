@@ -15,7 +15,7 @@ use shared::messages::Phase;
 use shared::runtime_dir::{Place, own_uid};
 
 use crate::claim;
-use crate::stop_client::{Target, running_cells};
+use crate::stop_client::{Running, Target, running_cells};
 
 /// How long the command waits for the container to be upright. Chosen by hand: the way back from the largest tilt takes about 2 s.
 const UPRIGHT: Duration = Duration::from_secs(20);
@@ -39,7 +39,12 @@ pub struct Args {
 
 /// Runs the command.
 pub fn run(args: &Args) -> Result<(), Failure> {
-    let (targets, doubted) = targets(args.config.as_deref());
+    let Running { targets, doubted, others } = targets(args.config.as_deref());
+    for (uid, name) in others {
+        eprintln!(
+            "note: an rt-controller of user {uid}, cell '{name}', runs too and was not asked: if its runtime directory lets you in, give the cell's --config"
+        );
+    }
     if targets.is_empty() {
         let none = || failure(exit::UNREACHABLE, "no rt-controller that this user may stop is running");
         return Err(if doubted.is_empty() { none() } else { not_known(&doubted.join("; ")) });
@@ -72,16 +77,16 @@ fn not_known(why: &str) -> Failure {
     failure(exit::FAILED, what)
 }
 
-/// The cells that are meant, and of the runtime directories that are not believed, why, a line each. A configuration that cannot be read must not keep
-/// anybody from stopping a robot.
-fn targets(config: Option<&Path>) -> (Vec<Target>, Vec<String>) {
+/// The cells that are meant, and what cannot be reached. A configuration that cannot be read must not keep anybody from stopping a robot.
+fn targets(config: Option<&Path>) -> Running {
     match config.map(Config::read) {
         Some(Ok(config)) => {
             let named = Target::from(Place::from(&config.cell));
             // Root stops a cell whoever runs it. A controller that hangs where the configuration says is that cell's, and is ended.
-            let others = || running_cells().0.into_iter().filter(|t| t.name == named.name).collect::<Vec<_>>();
+            let others = || running_cells().targets.into_iter().filter(|t| t.name == named.name).collect::<Vec<_>>();
             let of_others = if own_uid() == 0 && named.ask("state").is_none() && named.process().is_none() { others() } else { Vec::new() };
-            (if of_others.is_empty() { vec![named] } else { of_others }, Vec::new())
+            let targets = if of_others.is_empty() { vec![named] } else { of_others };
+            Running { targets, doubted: Vec::new(), others: Vec::new() }
         }
         Some(Err(e)) => {
             eprintln!("{e}; every cell that runs is stopped instead");

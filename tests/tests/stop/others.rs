@@ -185,3 +185,30 @@ fn a_directory_that_is_not_believed_is_named() {
     let (code, said) = told(&timed(with(shared.command(STRANGER, "rt-controller"), &["abort", "--config", ""])).0);
     assert!(code == Some(1) && said.contains("every cell that runs is stopped instead") && said.contains(&reason), "{code:?} {said}");
 }
+
+/// Protects who aborts without a configuration beside a cell whose runtime files lie in a directory of its own: only its socket's name shows that it runs.
+/// Another user is told of it, and a controller that hangs is no "nothing runs".
+#[test]
+fn a_cell_in_a_named_directory_is_told_of() {
+    if !rustix::process::geteuid().is_root() {
+        println!("not run: it takes root to act as other users");
+        return;
+    }
+    let Some(inside) = Namespaces::new(None) else { return };
+    let base = tempfile::tempdir().expect("a directory");
+    let mut cell = CellUnderTest::prepare(|c| {
+        c["cell"].as_table_mut().expect("a table").insert("runtime_dir".into(), base.path().display().to_string().into());
+    });
+    cell.inside = Some(inside);
+    cell.spawn("rt-controller");
+    cell.wait("the controller", Duration::from_secs(30), |_| true);
+    let mut shared = Shared { cell, programs: vec![public_copy("rt-controller")] };
+    let (code, said) = shared.ask(STRANGER, &["abort"]);
+    let note = format!("an rt-controller of user 0, cell '{}', runs too and was not asked", shared.cell.name);
+    assert!(code == Some(3) && said.contains(&note), "{code:?} {said}");
+    shared.cell.signal("rt-controller", rustix::process::Signal::STOP);
+    let (code, said) = shared.ask(0, &["abort"]);
+    shared.cell.signal("rt-controller", rustix::process::Signal::CONT);
+    let doubt = format!("the rt-controller of cell '{}' does not answer: give the cell's --config", shared.cell.name);
+    assert!(code == Some(1) && said.contains(&doubt), "{code:?} {said}");
+}
