@@ -333,6 +333,8 @@ pub struct Replay {
     pub ticks: u64,
     /// Results of the pours and recordings that ended in them.
     pub ended: Vec<shared::control::Outcome>,
+    /// Number of ticks that were compared.
+    pub compared: u64,
     /// Number of ticks whose target or d differs in any bit.
     pub different: u64,
     /// Number of the first of those ticks, counted from 0.
@@ -421,6 +423,7 @@ impl Rerun {
         let result = Replay {
             ticks: 0,
             ended: Vec::new(),
+            compared: 0,
             different: 0,
             first_different: None,
             different_deadlines: 0,
@@ -479,6 +482,7 @@ impl Rerun {
         if let Some(target_deg) = tick.target_deg.filter(|_| !self.compared) {
             core.rest_at(target_deg);
         }
+        self.result.compared += u64::from(self.compared);
         if self.compared && !same {
             self.result.different += 1;
             self.result.first_different.get_or_insert(self.result.ticks);

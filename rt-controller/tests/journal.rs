@@ -6,6 +6,7 @@
 mod write_weights;
 
 use std::panic::{AssertUnwindSafe, catch_unwind};
+use std::process::Command;
 
 use rt_controller::core::{Core, Input, Order, Robot, Settings};
 use rt_controller::journal::{Tick, Times, Writer, replay_from};
@@ -238,4 +239,20 @@ fn a_changed_journal_is_an_answer_or_a_line() {
     let _ = std::panic::take_hook();
     assert!(panics.is_empty(), "{} panics, the first: {:?}", panics.len(), &panics[..panics.len().min(3)]);
     assert!(refused > 300, "{refused} of the changed journals are refused");
+}
+
+/// Protects who trusts the exit code of `replay`: a part in which no pour begins has nothing that can be compared, and that is no "all the same".
+#[test]
+fn a_replay_that_compared_nothing_fails() {
+    let directory = tempfile::tempdir().unwrap();
+    let file = directory.path().join("journal.bin");
+    for (orders, code, compared) in [(&[5, 800][..], 0, 400), (&[5][..], 1, 0)] {
+        let [_, second] = parts(1200, 700, orders, u64::MAX);
+        std::fs::write(&file, second).unwrap();
+        let output = Command::new(env!("CARGO_BIN_EXE_rt-controller")).args(["replay", "--json"]).arg(&file).output().unwrap();
+        let said = String::from_utf8_lossy(&output.stderr).into_owned();
+        let summary: serde_json::Value = serde_json::from_slice(&output.stdout).unwrap();
+        assert_eq!((output.status.code(), summary["compared"].as_u64()), (Some(code), Some(compared)), "{said}");
+        assert_eq!(said.contains("nothing could be compared"), compared == 0, "{said}");
+    }
 }

@@ -10,11 +10,20 @@ use std::process::{Command, Output, Stdio};
 
 /// Runs the filter with weights that always tilt forward, on `areas`.
 fn step(areas: &str) -> Output {
+    step_at("fps = 30.0", areas)
+}
+
+/// The same in a cell whose configuration has the line `fps`.
+fn step_at(fps: &str, areas: &str) -> Output {
     let directory = tempfile::tempdir().unwrap();
     let weights = directory.path().join("w.bin");
     write_weights::constant_action(3).write(&weights).unwrap();
+    let config = directory.path().join("cell.toml");
+    std::fs::write(&config, include_str!("../../config/sim.toml").replace("fps = 30.0", fps)).unwrap();
     let mut child = Command::new(env!("CARGO_BIN_EXE_rt-controller"))
-        .args(["step", "--goal", "20", "--config", concat!(env!("CARGO_MANIFEST_DIR"), "/../config/sim.toml"), "--weights"])
+        .args(["step", "--goal", "20", "--config"])
+        .arg(&config)
+        .arg("--weights")
         .arg(&weights)
         .stdin(Stdio::piped())
         .stdout(Stdio::piped())
@@ -55,4 +64,13 @@ fn an_impossible_area_gets_one_line() {
         assert_eq!(output.status.code(), Some(i32::from(shared::exit::BAD_INPUT)), "{area}: {said}");
         assert!(said.lines().count() == 1 && said.contains("line 2"), "{area}: {said}");
     }
+}
+
+/// Protects who couples a simulator from weights that `run` refuses: those of another camera would give angles that look right.
+#[test]
+fn weights_of_another_camera_are_refused() {
+    let output = step_at("fps = 60.0", "0\n");
+    let said = String::from_utf8_lossy(&output.stderr).trim().to_owned();
+    assert_eq!(output.status.code(), Some(i32::from(shared::exit::BAD_INPUT)), "{said}");
+    assert!(output.stdout.is_empty() && said.contains("trained at 30 frames/s, camera.fps is 60"), "{said}");
 }

@@ -11,7 +11,7 @@ use crate::journal::{self, Replay};
 /// Command-line arguments.
 #[derive(Debug, clap::Args)]
 #[command(after_help = "Examples:\n  rt-controller replay out/journal.bin\n  rt-controller replay out/journal.bin --table > ticks.csv\n\n\
-Exit codes: 0 every answer is the same to the bit, 1 some differ, 2 the file cannot be read.")]
+Exit codes: 0 every answer that could be compared is the same to the bit, 1 some differ or none could be compared, 2 the file cannot be read.")]
 pub struct Args {
     /// The journal (controller.journal of the configuration).
     file: PathBuf,
@@ -39,8 +39,9 @@ pub fn run(args: &Args) -> Result<(), Failure> {
     if args.json {
         println!("{}", serde_json::json!(replay));
     } else if !args.table {
-        let Replay { ticks, ended, different, different_deadlines, .. } = &replay;
-        println!("{} replayed, pours and recordings: {}, different answers: {different}", counted(*ticks, "tick"), ended.len());
+        let Replay { ticks, compared, ended, different, different_deadlines, .. } = &replay;
+        let ticks = counted(*ticks, "tick");
+        println!("{ticks} replayed and {compared} compared, pours and recordings: {}, different answers: {different}", ended.len());
         println!("{} at another time than the pacing gives", counted(*different_deadlines, "tick"));
         if replay.continued {
             println!("the file begins in the middle of a run: answers are compared from its first pour or recording on, and no deadlines");
@@ -59,5 +60,10 @@ pub fn run(args: &Args) -> Result<(), Failure> {
         let what = format!("{}: the replay differs from tick {tick} on: another version of the code?", args.file.display());
         return Err(failure(exit::FAILED, what));
     }
-    Ok(())
+    let why = match (replay.compared, replay.different_deadlines) {
+        (0, _) => "nothing could be compared: the file has no tick of the begin of a run, and no pour or recording begins in it".into(),
+        (_, 0) => return Ok(()),
+        (_, n) => format!("{} at another time than the pacing gives: another version of the code?", counted(n, "tick")),
+    };
+    Err(failure(exit::FAILED, format!("{}: {why}", args.file.display())))
 }

@@ -11,6 +11,7 @@ use shared::messages::{Doubt, Feature, LAYOUT_VERSION, Telemetry};
 use shared::weights::Weights;
 
 use crate::core::{Core, Input, Order, Robot, Settings};
+use crate::disk::check_weights;
 
 /// Command-line arguments.
 #[derive(Debug, clap::Args)]
@@ -35,6 +36,8 @@ pub struct Args {
 pub fn run(args: &Args) -> Result<(), Failure> {
     let config = Config::read(&args.config).or_exit(exit::BAD_INPUT)?;
     let weights = Weights::read(&args.weights).or_exit(exit::BAD_INPUT)?;
+    let fits = check_weights(&weights, config.camera.fps, &config.limits);
+    fits.map_err(|why| failure(exit::BAD_INPUT, format!("{}: {why}", args.weights.display())))?;
     let settings = Settings::new(&config);
     let mut core = Core::new(settings);
     core.exchange(Box::new(Agent::new(&weights)));
