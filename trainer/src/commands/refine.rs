@@ -10,7 +10,7 @@ use serde::Serialize;
 use shared::episode::{Episode, EpisodeKind};
 use shared::exit::{self, Failure, OrExit as _, failure};
 
-use super::train::WeightFileArgs;
+use super::train::{WeightFileArgs, say_doubtful_recordings};
 use crate::consistency;
 use crate::data::{self, EpisodeSource, TrainingEpisode};
 use crate::training::Options;
@@ -91,6 +91,7 @@ pub fn run(args: &Args) -> Result<(), Failure> {
             }
         }
     }
+    say_doubtful_recordings(&read, &usable);
     let history = weighed_pours(&read, &usable.episodes);
     let options = Options { seed: args.weight_file.seed, limits, ..Options::default() };
     args.weight_file.train_and_write(&usable, &options, serde_json::json!({ "pours": history }))?;

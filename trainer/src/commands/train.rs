@@ -8,7 +8,7 @@ use std::path::{Path, PathBuf};
 use std::sync::{Mutex, PoisonError};
 
 use indicatif::{ProgressBar, ProgressStyle};
-use shared::episode;
+use shared::episode::{self, Episode};
 use shared::estimator::flow::DELAY_MAX_FRAMES;
 use shared::exit::{self, Failure, OrExit as _, failure};
 use shared::level::plain;
@@ -17,6 +17,7 @@ use shared::plural::counted;
 use shared::weights::Weights;
 use shared::whole_file;
 
+use super::check::doubtful_recordings;
 use crate::consistency;
 use crate::data::{self, EpisodeSource, UsableEpisodes};
 use crate::method;
@@ -131,11 +132,19 @@ pub fn run(args: &Args) -> Result<(), Failure> {
         return Err(failure(exit::BAD_INPUT, what));
     }
     let usable = data::usable(&read);
+    say_doubtful_recordings(&read, &usable);
     for doubt in consistency::doubtful(&usable.episodes) {
         eprintln!("doubtful: {}", plain(&doubt.to_string()));
     }
     let options = Options { method: args.method, actions: args.actions, estimate, seed: args.weight_file.seed, limits };
     args.weight_file.train_and_write(&usable, &options, serde_json::Value::Null)
+}
+
+/// Says what is doubtful about how the episodes that are trained on were recorded.
+pub fn say_doubtful_recordings(read: &[Episode], usable: &UsableEpisodes) {
+    for (name, what) in doubtful_recordings(read, usable) {
+        eprintln!("doubtful: {}", plain(&format!("{name}: {what}")));
+    }
 }
 
 impl WeightFileArgs {
