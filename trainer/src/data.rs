@@ -108,6 +108,15 @@ impl TrainingEpisode {
         if measured_deg.is_finite() { measured_deg } else { self.alpha_deg[frame] }
     }
 
+    /// The first frame that shows flow: one after which flow is measured again, as a lone area is a speck; without two such frames in a row, the first
+    /// area above 0. `None` if there is none.
+    pub fn first_flow(&self) -> Option<usize> {
+        let measured: Vec<usize> = (0..self.len()).filter(|k| !self.area_px2[*k].is_nan()).collect();
+        let flows = |k: usize| self.area_px2[k] > 0.0;
+        let lasting = measured.windows(2).find(|two| two.iter().all(|k| flows(*k))).map(|two| two[0]);
+        lasting.or_else(|| (0..self.len()).find(|k| flows(*k)))
+    }
+
     /// What makes this episode unusable, and what to do about it; `None` if it can be trained on.
     pub fn fault(&self) -> Option<String> {
         let n = self.len();

@@ -33,6 +33,23 @@ fn the_fit_finds_what_made_the_episodes() {
     assert!((v(c, q) / v(CAMERA.0, CAMERA.1) - 1.0).abs() < 0.05, "{c} {q}");
 }
 
+/// Protects the straight vessel from a speck: one area in one frame of an upright container neither refutes it nor is where flow begins.
+#[test]
+fn a_speck_is_no_onset() {
+    let clean = episodes(5, 1);
+    for frame in [3, 10, 25] {
+        let mut all = clean.clone();
+        all[0].area_px2[frame] = 20.0;
+        assert_eq!(all[0].first_flow(), clean[0].first_flow());
+        // A frame that was lost between the first two that show flow changes nothing.
+        let first = clean[0].first_flow().unwrap();
+        all[0].area_px2[first + 1] = f64::NAN;
+        assert_eq!(all[0].first_flow(), Some(first));
+        let share = fit::fit(&all).fused.tight_share;
+        assert!(share > 0.9, "speck in frame {frame}: the straight vessel counts {share}");
+    }
+}
+
 /// Protects learning after the picture's delay has changed: what counts is what the newest pours show, and not a lag that fits
 /// neither them nor the older ones.
 #[test]
