@@ -21,7 +21,7 @@ use trainer::training::{Estimate, MethodName, Options, Silent};
 #[test]
 fn the_fit_finds_what_made_the_episodes() {
     let fit = fit::fit(&episodes(5, 1));
-    let (found, made) = (FlowTables::new(&fit.model), FlowTables::new(&FlowModel::default()));
+    let (found, made) = (FlowTables::new(&fit.model, 30.0), FlowTables::new(&FlowModel::default(), 30.0));
     for (from, to) in [(40.0, 55.0), (50.0, 65.0), (60.0, 75.0)] {
         let d = |f: &FlowTables| f.capacity.lost_ml(to) - f.capacity.lost_ml(from);
         assert!((d(&found) / d(&made) - 1.0).abs() < 0.05, "{from} to {to}: {} {}", d(&found), d(&made));
@@ -125,7 +125,7 @@ fn the_trained_policies_pour() {
 /// Trains with a method on `n` episodes and pours. Each error is below the share `within` of the goal plus 1 ml.
 fn pours(method: MethodName, n: usize, within: f64) {
     let trained = train(&episodes(n, 3), &Options { method, ..Options::default() }, &Silent).unwrap();
-    let flow = FlowTables::new(&FlowModel::default());
+    let flow = FlowTables::new(&FlowModel::default(), 30.0);
     let config = shared::config::Config::parse(include_str!("../../config/sim.toml"), "sim.toml").unwrap();
     let settings = rt_controller::core::Settings::new(&config);
     for (onset, goal) in [(40.0, 120.0f64), (55.0, 60.0), (65.0, 25.0)] {
