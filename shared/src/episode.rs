@@ -112,6 +112,8 @@ pub struct EpisodeInfo {
     pub ended: String,
     /// What a person wrote about it; mostly empty.
     pub note: String,
+    /// The controller's own estimate of what was poured, at its last tick in the file, ml; `None` without a tick.
+    pub poured_ml: Option<f32>,
     /// Number of the controller's ticks in the file.
     pub ticks: u64,
     /// Number of the controller's ticks that are missing between the first and the last.
