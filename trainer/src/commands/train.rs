@@ -14,7 +14,7 @@ use shared::exit::{self, Failure, OrExit as _, failure};
 use shared::level::plain;
 use shared::limits::Limits;
 use shared::plural::counted;
-use shared::weights::Weights;
+use shared::weights::{Weights, check_way_back};
 use shared::whole_file;
 
 use super::check::doubtful_recordings;
@@ -173,6 +173,9 @@ impl WeightFileArgs {
     pub fn train_and_write(&self, usable: &UsableEpisodes, options: &Options, extra: serde_json::Value) -> Result<(), Failure> {
         for (name, what) in &usable.left_out {
             eprintln!("left out: {}", plain(&format!("{name}: {what}")));
+        }
+        if let (Estimate::Fused, false) = (options.estimate, usable.episodes.is_empty()) {
+            check_way_back(&options.limits, data::rate_hz(&usable.episodes)).or_exit(exit::BAD_INPUT)?;
         }
         let style = ProgressStyle::with_template("{prefix} [{wide_bar}] {pos}/{len} {msg} ({eta} left)");
         let bar = Bar(ProgressBar::new(1).with_style(style.unwrap_or_else(|_| ProgressStyle::default_bar())));
