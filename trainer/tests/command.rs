@@ -124,7 +124,7 @@ fn limits_that_no_weight_file_can_hold_are_refused_before_the_training() {
     let mut slow = String::from("episode,frame,t_s,alpha_deg,area_px2\n");
     for row in features.lines().skip(1).map(|l| l.split(',').collect::<Vec<_>>()) {
         let frame: u64 = row[1].parse().unwrap();
-        if frame % 3 == 0 {
+        if frame.is_multiple_of(3) {
             slow += &format!("{},{},{},{},{}\n", row[0], frame / 3, row[2], row[3], row[4]);
         }
     }
