@@ -8,7 +8,7 @@ use crate::estimator::fused::{Explanation, FusedModel};
 use crate::estimator::vessel::Vessel;
 use crate::limits::Limits;
 
-/// Rate of the way back, degrees a frame. Chosen by hand: half and five times that of the shipped configurations, and more room below.
+/// Rate of the way back, degrees a frame. Chosen by hand: a twentieth and five times that of the shipped configurations.
 const BACK_RATE_DEG: (f64, f64) = (0.1, 10.0);
 /// Change of that rate in a frame, degrees a frame. Chosen by hand: far from those of the shipped configurations.
 const BACK_CHANGE_DEG: (f64, f64) = (0.01, 100.0);
