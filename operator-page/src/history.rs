@@ -179,12 +179,14 @@ impl History {
         }
     }
 
-    /// The files that can be learned from, oldest first: weighed and readable; with `last`, only that many of them.
+    /// The files that can be learned from, oldest first: weighed, readable, and with nothing wrong about them, which the table says of the others; with
+    /// `last`, only that many of them.
     pub fn weighed(&self, last: Option<usize>) -> Vec<PathBuf> {
         let table = locked(&self.table);
+        let wrong = |l: &Line| l.value["wrong"].as_array().is_some_and(|wrong| !wrong.is_empty());
         let mut lines: Vec<(&str, &str)> = table
             .iter()
-            .filter(|(_, l)| l.value["weight_g"].is_number() && l.value["error"].is_null())
+            .filter(|(_, l)| l.value["weight_g"].is_number() && l.value["error"].is_null() && !wrong(l))
             .map(|(name, l)| (l.value["started_at_utc"].as_str().unwrap_or(""), name.as_str()))
             .collect();
         lines.sort_unstable_by(|(at, a), (bt, b)| at.cmp(bt).then_with(|| by_number(a.as_ref(), b.as_ref())));
@@ -313,6 +315,9 @@ fn read_pictures(path: &Path, name: &str, stamp: Stamp) -> Result<Pictures, Stri
 
 #[cfg(test)]
 mod tests {
+    use shared::episode::{EpisodeEnd, EpisodeKind, EpisodeStart, EpisodeWriter, FrameRow, PART_UNSEEN, set_weight};
+    use shared::messages::{Doubt, Feature, LAYOUT_VERSION, Telemetry};
+
     use super::*;
 
     /// Protects who weighs what was poured last: the page lists the newest first, also beyond the ten thousandth.
@@ -374,6 +379,43 @@ mod tests {
         // A file in its place is no directory either.
         fs::write(&episodes, "a file").unwrap();
         assert_eq!(look(), None);
+    }
+
+    /// Protects what is learned on the page from a weighed pour of which the camera missed a part: the table says what is wrong about it, and it is not
+    /// learned from, nor does it count among the last ones.
+    #[test]
+    fn a_pour_that_was_not_seen_whole_is_not_learned_from() {
+        const FRAME_NS: u64 = 33_333_333;
+        let dir = tempfile::tempdir().unwrap();
+        let history = History::new(dir.path().to_path_buf());
+        let config = shared::config::Config::read(&Path::new(env!("CARGO_MANIFEST_DIR")).join("../config/sim.toml")).unwrap();
+        for (k, blind) in [0..0, 40..46, 40..47].into_iter().enumerate() {
+            let kind = EpisodeKind::Pour { goal_ml: 50.0 };
+            let wall_clock = SystemTime::UNIX_EPOCH + Duration::from_secs(k as u64);
+            let start = EpisodeStart { episode: 1, kind, started_at_ns: FRAME_NS, wall_clock, config: &config, weights: "" };
+            let mut writer = EpisodeWriter::create(dir.path(), &start).unwrap();
+            for frame in 1..90 {
+                let at_ns = frame * FRAME_NS;
+                let doubt = if blind.contains(&frame) { Doubt::EdgeNotFound } else { Doubt::None };
+                let area_px2 = if (20..80).contains(&frame) { 500.0 + k as f32 } else { 0.0 };
+                let version = LAYOUT_VERSION;
+                let feature =
+                    Feature { version, sequence: frame, captured_at_ns: at_ns, area_px2, doubt: doubt as u32, ..Default::default() };
+                writer.telemetry(&Telemetry { version, tick: frame, at_ns, ..Default::default() }).unwrap();
+                let row = FrameRow { feature: &feature, alpha_commanded_deg: 40.0, alpha_measured_deg: f32::NAN, image: None };
+                writer.frame(&row).unwrap();
+            }
+            let path = writer.path().to_path_buf();
+            writer.finish(&EpisodeEnd { complete: true, reason: "over", disordered_frames: 0 }).unwrap();
+            set_weight(&path, 50.0).unwrap();
+            history.refresh(&name_of(&path));
+        }
+        let names = |last| history.weighed(last).iter().map(|path| name_of(path)).collect::<Vec<_>>();
+        assert_eq!(names(None), ["episode-0001.mcap", "episode-0002.mcap"]);
+        assert_eq!(names(Some(1)), ["episode-0002.mcap"]);
+        let table = history.table(&Ends::default());
+        let wrong: Vec<&Value> = table["episodes"].as_array().unwrap().iter().map(|e| &e["wrong"]).collect();
+        assert_eq!(wrong, [&json!([]), &json!([]), &json!([PART_UNSEEN])]);
     }
 
     /// Protects who looks back from another moment's picture: each picture says of which frame it is.

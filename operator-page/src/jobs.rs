@@ -40,6 +40,12 @@ fn words(path: &Path) -> String {
     path.display().to_string()
 }
 
+/// The words of a plan. Which goals it is for is left to the command, which takes them from the configuration.
+fn plan_arguments(config: String, of: Vec<String>, holds_ml: Option<f64>) -> Vec<String> {
+    let holds = holds_ml.iter().flat_map(|ml| ["--holds".into(), ml.to_string()]);
+    ["plan".into(), "--json".into(), "--config".into(), config].into_iter().chain(of).chain(holds).collect()
+}
+
 impl Jobs {
     fn newest(&self) -> MutexGuard<'_, Job> {
         locked(&self.newest)
@@ -93,13 +99,7 @@ impl Jobs {
     }
 
     /// Plans what to record next from `of`, of which `weighed` are weighed episodes: what is missing, and the best curve or pour.
-    pub fn start_plan(
-        self: &Arc<Self>,
-        (of, weighed): (&[PathBuf], usize),
-        config: &Path,
-        holds_ml: Option<f64>,
-        goal_max_ml: f32,
-    ) -> Result<(), String> {
+    pub fn start_plan(self: &Arc<Self>, (of, weighed): (&[PathBuf], usize), config: &Path, holds_ml: Option<f64>) -> Result<(), String> {
         let config = words(config);
         let of: Vec<String> = of.iter().map(|f| words(f)).collect();
         self.start(
@@ -112,10 +112,7 @@ impl Jobs {
                     check = programs::run("trainer", &arguments, stop, |_| {})?.0;
                 }
                 step(Step { stage: "planning".into(), ..Step::default() });
-                let mut arguments = [vec!["plan".into(), "--json".into(), "--config".into(), config], of].concat();
-                arguments.extend(["--goal-max".into(), goal_max_ml.to_string()]);
-                arguments.extend(holds_ml.iter().flat_map(|ml| ["--holds".into(), ml.to_string()]));
-                let plan = programs::run("trainer", &arguments, stop, |_| {})?.0;
+                let plan = programs::run("trainer", &plan_arguments(config, of, holds_ml), stop, |_| {})?.0;
                 Ok(json!({ "plan": plan["plan"], "check": check, "episodes": weighed }))
             }),
         )
@@ -178,5 +175,18 @@ impl Jobs {
                 Ok(json!({ "directory": words(&to), "written": written["written"], "left_out": written["left_out"] }))
             }),
         )
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Protects who plans on the page from another proposal than that of the command line: both take the largest goal from the configuration, which may
+    /// be far beyond a cup.
+    #[test]
+    fn a_plan_is_for_the_goals_of_the_command() {
+        let words = plan_arguments("cell.toml".into(), vec!["a.mcap".into()], Some(500.0));
+        assert_eq!(words, ["plan", "--json", "--config", "cell.toml", "a.mcap", "--holds", "500"]);
     }
 }

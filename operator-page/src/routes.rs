@@ -206,7 +206,7 @@ fn act(site: &Site, stops: u64, path: &str, order: Order) -> Result<Value, Strin
         "/api/weigh" => orders::weigh(site, &order.file, order.grams.ok_or("give the scale's reading in g")?, order.shown_g),
         "/api/plan" => {
             let (of, weighed) = (site.history.for_plan()?, site.history.weighed(None).len());
-            site.jobs.start_plan((&of, weighed), &site.file, order.holds_ml, site.config.controller.goal_max_ml)?;
+            site.jobs.start_plan((&of, weighed), &site.file, order.holds_ml)?;
             Ok(site.jobs.about())
         }
         "/api/learn" => {

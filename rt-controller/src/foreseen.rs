@@ -38,7 +38,7 @@ fn explanation(weights: &Weights) -> Option<&Explanation> {
 /// weights carry no deviation, or the vessel cannot give the goal.
 pub fn poured_sd_ml(weights: &Weights, limits: Limits, goal_ml: f32) -> Option<f32> {
     let Explanation { model, calibration, .. } = explanation(weights)?;
-    let flow = FlowTables::new(model);
+    let flow = FlowTables::new(model, weights.rate_hz.into());
     let sds = ONSETS_DEG.iter().filter_map(|onset_deg| foreseen_sd_ml(weights, (&flow, calibration), limits, goal_ml, *onset_deg));
     sds.max_by(f32::total_cmp).filter(|sd_ml| *sd_ml > 0.0)
 }
@@ -92,7 +92,7 @@ fn foreseen_sd_ml(
 /// does not hold it.
 /// `holds_ml` is what the vessel holds, where somebody knows it.
 pub fn flows_by_deg(weights: &Weights, fill_ml: f64, holds_ml: Option<f64>) -> Option<f32> {
-    let capacity = FlowTables::new(&explanation(weights)?.model).capacity;
+    let capacity = FlowTables::new(&explanation(weights)?.model, weights.rate_hz.into()).capacity;
     let whole_ml = capacity.lost_ml(LAST_DEG);
     if !(0.0..=holds_ml.unwrap_or(OVERFULL * whole_ml)).contains(&fill_ml) {
         return None;
@@ -108,7 +108,7 @@ pub fn must_flow_by_deg(weights: &Weights, fill_ml: Option<f64>, least_fill_ml: 
     if fill_ml.is_some() {
         return flows_by_deg(weights, fill_ml?, holds_ml);
     }
-    let whole_ml = || Some(FlowTables::new(&explanation(weights)?.model).capacity.lost_ml(LAST_DEG));
+    let whole_ml = || Some(FlowTables::new(&explanation(weights)?.model, weights.rate_hz.into()).capacity.lost_ml(LAST_DEG));
     flows_by_deg(weights, least_fill_ml?.min(holds_ml.or_else(whole_ml)?), holds_ml)
 }
 
@@ -116,7 +116,7 @@ pub fn must_flow_by_deg(weights: &Weights, fill_ml: Option<f64>, least_fill_ml: 
 /// flows early, and an emptier one than any episode's has to flow before nothing is seen for sure. `None` with the plain sum.
 pub fn unseen_ml(weights: &Weights) -> Option<f64> {
     let Estimator::Fused { model, .. } = &weights.estimator else { return None };
-    let capacity = FlowTables::new(&model.likelier().model).capacity;
+    let capacity = FlowTables::new(&model.likelier().model, weights.rate_hz.into()).capacity;
     Some(capacity.lost_ml(model.bounds.dry_deg.min(LAST_DEG)))
 }
 

@@ -113,7 +113,9 @@ impl Agent {
     pub fn new(weights: &Weights) -> Self {
         let (fused, back_deg) = match &weights.estimator {
             Estimator::Sum => (None, -weights.actions_deg[weights.back_action()]),
-            Estimator::Fused { model, back } => (Some(FusedEstimator::new(model, &weights.calibration, *back)), back.rate_deg as f32),
+            Estimator::Fused { model, back } => {
+                (Some(FusedEstimator::new(model, &weights.calibration, *back, weights.rate_hz.into())), back.rate_deg as f32)
+            }
         };
         Self {
             weights: weights.clone(),

@@ -32,6 +32,11 @@ use sha2::{Digest, Sha256};
 
 use crate::gaussian_curve::Curve;
 
+/// The longest time that a stream may flow unmeasured, s: the shipped configurations end a pour after it (`controller.stale_feature_ms`).
+const UNMEASURED_MAX_S: f64 = 0.2;
+/// What is wrong with an episode of which the camera missed a part, see [`Episode::part_unseen`].
+pub const PART_UNSEEN: &str = "the camera did not see part of this pour; its areas do not add up to its weight";
+
 mod format;
 mod format_1;
 mod number;
@@ -107,6 +112,8 @@ pub struct EpisodeInfo {
     pub ended: String,
     /// What a person wrote about it; mostly empty.
     pub note: String,
+    /// The controller's own estimate of what was poured, at its last tick in the file, ml; `None` without a tick.
+    pub poured_ml: Option<f32>,
     /// Number of the controller's ticks in the file.
     pub ticks: u64,
     /// Number of the controller's ticks that are missing between the first and the last.
@@ -145,6 +152,27 @@ impl Episode {
             }
         }
         pairs
+    }
+
+    /// Frames a second, from the median interval; 30 for an episode that has none.
+    pub fn frame_rate_hz(&self) -> f64 {
+        let mut steps: Vec<f64> = self.rows.windows(2).map(|w| w[1].t_s - w[0].t_s).filter(|s| *s > 0.0).collect();
+        steps.sort_by(f64::total_cmp);
+        let median = steps.get(steps.len() / 2).copied().unwrap_or(1.0 / 30.0);
+        (1.0 / median * 10.0).round() / 10.0
+    }
+
+    /// Whether the camera missed a part of the stream: more than 0.2 s of frames in a row were not measured, right after or right before one that shows
+    /// flow. A shorter gap is bridged by the area before it.
+    pub fn part_unseen(&self) -> bool {
+        let most = (UNMEASURED_MAX_S * self.frame_rate_hz()).round() as usize;
+        let flows = |k: usize| self.rows.get(k).is_some_and(|row| row.area_px2 > 0.0);
+        let mut end = 0;
+        self.rows.chunk_by(|a, b| a.area_px2.is_nan() == b.area_px2.is_nan()).any(|run| {
+            let first = end;
+            end += run.len();
+            run.len() > most && run[0].area_px2.is_nan() && (first > 0 && flows(first - 1) || flows(end))
+        })
     }
 
     /// Time from the first to the last frame, s; 0 without frames.

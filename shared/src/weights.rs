@@ -28,6 +28,8 @@ use crate::{regular_file, whole_file};
 
 mod ranges;
 
+pub use ranges::check_way_back;
+
 /// Version of the file format; files of other versions are refused.
 pub const FORMAT_VERSION: u32 = 4;
 

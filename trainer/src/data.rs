@@ -108,6 +108,15 @@ impl TrainingEpisode {
         if measured_deg.is_finite() { measured_deg } else { self.alpha_deg[frame] }
     }
 
+    /// The first frame that shows flow: one after which flow is measured again, as a lone area is a speck; without two such frames in a row, the first
+    /// area above 0. `None` if there is none.
+    pub fn first_flow(&self) -> Option<usize> {
+        let measured: Vec<usize> = (0..self.len()).filter(|k| !self.area_px2[*k].is_nan()).collect();
+        let flows = |k: usize| self.area_px2[k] > 0.0;
+        let lasting = measured.windows(2).find(|two| two.iter().all(|k| flows(*k))).map(|two| two[0]);
+        lasting.or_else(|| (0..self.len()).find(|k| flows(*k)))
+    }
+
     /// What makes this episode unusable, and what to do about it; `None` if it can be trained on.
     pub fn fault(&self) -> Option<String> {
         let n = self.len();
@@ -148,21 +157,13 @@ impl TrainingEpisode {
     }
 
     fn from_episode(e: &Episode) -> Self {
-        let mut own = Self::empty(&e.name, frame_rate_hz(e));
+        let mut own = Self::empty(&e.name, e.frame_rate_hz());
         for f in &e.rows {
             own.push(f.t_s, f64::from(f.alpha_commanded_deg), f64::from(f.alpha_measured_deg), f64::from(f.area_px2));
         }
         own.weight_g = e.weight_g.unwrap_or(f64::NAN);
         own
     }
-}
-
-/// Frames a second of an episode, from the median interval.
-fn frame_rate_hz(e: &Episode) -> f64 {
-    let mut steps: Vec<f64> = e.rows.windows(2).map(|w| w[1].t_s - w[0].t_s).filter(|s| *s > 0.0).collect();
-    steps.sort_by(f64::total_cmp);
-    let median = steps.get(steps.len() / 2).copied().unwrap_or(1.0 / 30.0);
-    (1.0 / median * 10.0).round() / 10.0
 }
 
 /// Takes out the episodes whose frame rate is not that of most others: a delay and a flow in frames mean something else in them. Of two rates that
@@ -229,7 +230,8 @@ pub struct UsableEpisodes {
     pub left_out: Vec<(String, String)>,
 }
 
-/// Keeps the episodes that can be trained on: complete, weighed and sound ones of one frame rate, and each measurement once.
+/// Keeps the episodes that can be trained on: complete, weighed and sound ones of one frame rate, whose stream the camera saw all the way, and each
+/// measurement once.
 pub fn usable(episodes: &[Episode]) -> UsableEpisodes {
     let mut result = UsableEpisodes::default();
     let doubles = Episode::duplicates(episodes);
@@ -240,7 +242,7 @@ pub fn usable(episodes: &[Episode]) -> UsableEpisodes {
         } else if let Some((first, _)) = doubles.iter().find(|(_, later)| *later == k) {
             Some(format!("the same measurement as {}: leave one of them out", episodes[*first].name))
         } else {
-            own.fault()
+            own.fault().or_else(|| e.part_unseen().then(|| episode::PART_UNSEEN.into()))
         };
         match fault {
             Some(what) => result.left_out.push((e.name.clone(), what)),

@@ -26,14 +26,14 @@
 
 use nalgebra::DMatrix;
 use shared::estimator::Calibration;
-use shared::estimator::flow::{DELAY_MAX_FRAMES, FlowModel, FlowNoise, FlowTables, Lateness, WayBack};
+use shared::estimator::flow::{DELAY_MAX_FRAMES, FlowModel, FlowNoise, Lateness, WayBack};
 use shared::estimator::fused::{Explanation, FusedEstimator, FusedFrame, FusedModel, TIGHT, WIDE};
 use shared::estimator::verdict::{AREA_MARGIN, Bounds};
 use shared::estimator::whiteness::Whiteness;
 use shared::limits::Limits;
 
 use crate::calibration::{self, Doubted};
-use crate::data::TrainingEpisode;
+use crate::data::{self, TrainingEpisode};
 
 mod doubts;
 mod fitted;
@@ -189,8 +189,7 @@ pub fn fit(episodes: &[TrainingEpisode]) -> Fit {
     let mut prepared: Vec<PreparedEpisode> =
         episodes.iter().zip(tilts.alpha_deg).map(|(e, alpha_deg)| PreparedEpisode::new(e, alpha_deg)).collect();
     let camera = CameraFacts::new(episodes, &prepared);
-    let priors =
-        |vessel| Priors { vessel, measured: tilts.robot.is_some(), clean: camera.clean, slower: crate::data::rate_hz(episodes) / 30.0 };
+    let priors = |vessel| Priors { vessel, measured: tilts.robot.is_some(), clean: camera.clean, rate_hz: data::rate_hz(episodes) };
     let (wide, tight) = (priors(VesselPrior::wide()), priors(VesselPrior::tight()));
     let first = camera.stage(TEMPERS[0], DELAY_KNOWN_FRAMES);
     let mut starts = {
@@ -237,12 +236,12 @@ fn beginning(problem: &Problem<'_>, episodes: &[TrainingEpisode], log_weir: f64,
     let mut shared = [0.0; SHARED];
     (shared[LOG_RADIUS], shared[LOG_SLENDERNESS], shared[TAPER]) = (37f64.ln(), 3f64.ln(), 1.0);
     let (lag, delay) = if problem.priors.measured { (0.3, 1.0) } else { (2.0, 2.0) };
-    let slower = problem.priors.slower;
+    let slower = problem.priors.slower();
     (shared[LAG], shared[DELAY]) = (lag * slower, delay * slower);
     (shared[LOG_WEIR], shared[HEAD_EXPONENT], shared[FILM_SHARE]) = (log_weir - slower.ln(), 1.5, 0.05);
     shared[LOG_C] = f64::from(calibration::calibrate(episodes, Some(exponent)).volume_at_1_px2_ml).ln();
     shared[AREA_EXPONENT] = exponent;
-    let flow = FlowTables::new(&problem.model_of(&shared));
+    let flow = problem.flow_of(&shared);
     Unknowns { shared, own: problem.episodes.iter().map(|p| [p.onset_guess_deg(&flow), 0.0, 0.0, 0.0]).collect() }
 }
 
@@ -398,7 +397,8 @@ impl Conclusion<'_> {
         if fused.tight_share <= 0.0 {
             return 0.0;
         }
-        let mut estimator = FusedEstimator::new(fused, calibration, WayBack::new(&Limits::default(), crate::data::rate_hz(self.recorded)));
+        let rate_hz = data::rate_hz(self.recorded);
+        let mut estimator = FusedEstimator::new(fused, calibration, WayBack::new(&Limits::default(), rate_hz), rate_hz);
         let (mut products, mut squares) = (0.0, 0.0);
         for e in self.recorded {
             estimator.restart();

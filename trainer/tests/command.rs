@@ -113,6 +113,35 @@ fn a_delay_beyond_the_model_is_said() {
     }
 }
 
+/// Protects an afternoon of training: limits whose way back no weight file can hold at the episodes' frame rate are refused before the work, by the names
+/// of the keys.
+#[test]
+fn limits_that_no_weight_file_can_hold_are_refused_before_the_training() {
+    let dir = tempfile::tempdir().unwrap();
+    // Ten frames a second: every third frame of thirty.
+    tables(dir.path(), 4, |_, w| w);
+    let features = std::fs::read_to_string(dir.path().join("f.csv")).unwrap();
+    let mut slow = String::from("episode,frame,t_s,alpha_deg,area_px2\n");
+    for row in features.lines().skip(1).map(|l| l.split(',').collect::<Vec<_>>()) {
+        let frame: u64 = row[1].parse().unwrap();
+        if frame.is_multiple_of(3) {
+            slow += &format!("{},{},{},{},{}\n", row[0], frame / 3, row[2], row[3], row[4]);
+        }
+    }
+    std::fs::write(dir.path().join("slow.csv"), slow).unwrap();
+    let config = std::fs::read_to_string(Path::new(env!("CARGO_MANIFEST_DIR")).join("../config/sim.toml")).unwrap();
+    let changed = config.replace("rate_deg_s = 60.0", "rate_deg_s = 150.0").replace("rate_deg_s = 90.0", "rate_deg_s = 150.0");
+    assert_eq!(changed.matches("rate_deg_s = 150.0").count(), 2);
+    std::fs::write(dir.path().join("c.toml"), changed).unwrap();
+    let train = ["train", "slow.csv", "--scale", "s.csv", "--config", "c.toml", "--out", "w.bin"];
+    let out = trainer(dir.path(), &[&train[..], &["--progress"]].concat());
+    let said = text(&out.stderr);
+    let words = "return_rate_deg_s 150 is 15.000 degrees a frame at 10 frames a second, but must be 0.1 to 10: change it or camera.fps";
+    assert!(out.status.code() == Some(2) && said.contains(words) && !said.contains("\"stage\""), "{said}");
+    let out = trainer(dir.path(), &[&train[..], &["--method", "paper", "--estimate", "sum"]].concat());
+    assert!(!text(&out.stderr).contains("camera.fps"), "the plain sum knows no way back: {}", text(&out.stderr));
+}
+
 /// Protects people whose own vision counts in ms or us: they are told, and nothing panics.
 #[test]
 fn times_are_in_seconds() {
@@ -125,18 +154,28 @@ fn times_are_in_seconds() {
     }
 }
 
+/// Protects whoever has a small vessel or a small cup: the least vessel is said, and it is planned for; a cell whose largest goal is below 40 ml gets
+/// pours, too.
+#[test]
+fn small_vessels_and_goals_are_planned_for() {
+    let dir = tempfile::tempdir().unwrap();
+    std::fs::create_dir(dir.path().join("none")).unwrap();
+    let said = text(&trainer(dir.path(), &["plan", "none", "--holds", "60"]).stderr);
+    let least = said.split("take one that holds ").nth(1).and_then(|rest| rest.split(' ').next()).unwrap_or_else(|| panic!("{said}"));
+    let out = trainer(dir.path(), &["plan", "none", "--holds", least]);
+    assert!(out.status.success() && text(&out.stdout).contains("record a curve"), "{}", text(&out.stderr));
+    tables(dir.path(), 3, |_, w| w);
+    let out = trainer(dir.path(), &["plan", "f.csv", "--scale", "s.csv", "--holds", "520", "--goal-max", "30"]);
+    assert!(text(&out.stdout).contains("and pour: rt-controller pour 30"), "{}{}", text(&out.stdout), text(&out.stderr));
+}
+
 /// Protects the proposals from a figure that means nothing: goals that show no stream give no deviation of 0 ml, but are refused.
 #[test]
 fn goals_of_a_drop_are_not_planned_for() {
     let dir = tempfile::tempdir().unwrap();
     tables(dir.path(), 4, |_, w| w);
     let out = trainer(dir.path(), &["plan", "f.csv", "--scale", "s.csv", "--holds", "500", "--goal-max", "1"]);
-    assert!(
-        out.status.code() == Some(1) && text(&out.stderr).contains("nothing can be proposed"),
-        "{}{}",
-        text(&out.stdout),
-        text(&out.stderr)
-    );
+    assert!(out.status.code() == Some(1) && text(&out.stderr).contains("give --goal-max "), "{}{}", text(&out.stdout), text(&out.stderr));
 }
 
 /// Protects whoever opens a page of somebody else's figures: they are text, and numbers that no plot can hold end nothing.

@@ -116,7 +116,7 @@ impl ByLaw {
     pub fn new(law: ControlLaw, calibration: Calibration, estimator: &Estimator, goal_ml: f64) -> Self {
         let fused = match estimator {
             Estimator::Sum => None,
-            Estimator::Fused { model, back } => Some(FusedEstimator::new(model, &calibration, *back)),
+            Estimator::Fused { model, back } => Some(FusedEstimator::new(model, &calibration, *back, RATE_HZ)),
         };
         Self { law, calibration, hold: Hold::default(), fused, v_ml: [0.0; 3], summed_ml: 0.0, goal_ml }
     }

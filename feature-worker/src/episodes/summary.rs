@@ -2,7 +2,7 @@
 //! episode in memory, on any thread; it allocates and cannot fail.
 
 use serde_json::{Value, json};
-use shared::episode::{Episode, EpisodeKind, EpisodeRow, hex};
+use shared::episode::{Episode, EpisodeKind, EpisodeRow, PART_UNSEEN, hex};
 use shared::messages::Doubt;
 use shared::plural::counted;
 
@@ -45,6 +45,9 @@ pub fn remarks(episode: &Episode) -> Vec<Remark> {
         all.push(Remark::wrong(format!("incomplete: {}; the last frame is from {last_s:.1} s; record it again", info.ended)));
     }
     all.extend(about_weight(episode));
+    if episode.part_unseen() {
+        all.push(Remark::wrong(PART_UNSEEN));
+    }
     if info.lost_frames > 0 {
         let runs = episode.rows.chunk_by(|a, b| a.lost == b.lost);
         let longest = runs.filter(|run| run[0].lost).map(<[EpisodeRow]>::len).max().unwrap_or(0);

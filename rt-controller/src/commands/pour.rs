@@ -6,7 +6,7 @@ use shared::control::{EndReason, Outcome, Reply, Request};
 use shared::exit::{self, Failure, OrExit as _, failure};
 use shared::os;
 use shared::plural::counted;
-use shared::weights::Weights;
+use shared::weights::{Estimator, Weights};
 
 use super::resume;
 use crate::client::{self, Client, Common, FollowError};
@@ -54,24 +54,35 @@ struct Foreseen {
     unseen_ml: Option<f64>,
     /// Whether the controller has the weights that lie in the configured file.
     same_weights: bool,
+    /// Whether these weights carry a deviation; then only a goal that the vessel cannot give has none.
+    has_deviation: bool,
 }
 
 impl Foreseen {
     /// Foresees the pour with the weights that the running controller has.
     fn of(config: &Config, args: &Args) -> Result<Self, Failure> {
-        let container = config.container;
         let status = Client::connect_or_end(&config.cell).or_exit(exit::UNREACHABLE)?.status().or_exit(exit::UNREACHABLE)?;
         let weights = Weights::read(&config.controller.weights).ok().filter(|w| w.identity() == status.weights);
-        let sd_ml = weights.as_ref().and_then(|w| foreseen::poured_sd_ml(w, config.limits, args.goal_ml));
-        let flows_by_deg =
-            weights.as_ref().and_then(|w| foreseen::must_flow_by_deg(w, args.fill, container.least_fill_ml, container.holds_ml));
-        if args.fill.is_some() && flows_by_deg.is_none() {
+        let foreseen = Self::with(weights.as_ref(), config, args.goal_ml, args.fill);
+        if args.fill.is_some() && foreseen.flows_by_deg.is_none() {
             let what = "--fill: the controller's weights do not say by which tilt this fill flows: give what really is in the vessel, or train \
                         with --estimate fused";
             return Err(failure(exit::BAD_INPUT, what));
         }
-        let unseen_ml = if flows_by_deg.is_none() { weights.as_ref().and_then(foreseen::unseen_ml) } else { None };
-        Ok(Self { sd_ml, flows_by_deg, unseen_ml, same_weights: weights.is_some() })
+        Ok(foreseen)
+    }
+
+    /// Foresees a pour of `goal_ml` with the controller's weights, if they are known, and `fill_ml` in the vessel, if that is told.
+    fn with(weights: Option<&Weights>, config: &Config, goal_ml: f32, fill_ml: Option<f64>) -> Self {
+        let container = config.container;
+        let flows_by_deg = weights.and_then(|w| foreseen::must_flow_by_deg(w, fill_ml, container.least_fill_ml, container.holds_ml));
+        Self {
+            sd_ml: weights.and_then(|w| foreseen::poured_sd_ml(w, config.limits, goal_ml)),
+            flows_by_deg,
+            unseen_ml: if flows_by_deg.is_none() { weights.and_then(foreseen::unseen_ml) } else { None },
+            same_weights: weights.is_some(),
+            has_deviation: weights.is_some_and(|w| matches!(w.estimator, Estimator::Fused { .. })),
+        }
     }
 
     /// What a camera that sees no stream at all could cost, where nobody has told the fill.
@@ -94,6 +105,9 @@ impl Foreseen {
             None if !self.same_weights => Some(
                 "note: controller.weights is not the file that the controller has taken, so it is not said how far off this will be".into(),
             ),
+            None if self.has_deviation => {
+                Some("note: the vessel, as the weights know it, cannot give this goal from a usual fill: the pour may end early".into())
+            }
             None => Some("note: the weights do not say how far off this pour will be".into()),
         }
     }
@@ -167,6 +181,19 @@ mod tests {
     use shared::limits::Clipped;
 
     use super::*;
+
+    /// Protects whoever asks for more than the vessel can give: that is said, and not that the weights know nothing of how far off a pour will be.
+    #[test]
+    fn a_goal_that_the_vessel_cannot_give_is_named() {
+        let config = Config::read(&std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("../config/sim.toml")).unwrap();
+        let line = |weights: &Weights, goal_ml| Foreseen::with(Some(weights), &config, goal_ml, None).line(goal_ml).unwrap_or_default();
+        let fused = foreseen::tests::weights();
+        let sum = Weights { estimator: Estimator::Sum, ..fused.clone() };
+        assert!(!line(&fused, 30.0).contains("note"), "{}", line(&fused, 30.0));
+        assert!(line(&fused, 2000.0).contains("cannot give this goal"), "{}", line(&fused, 2000.0));
+        assert!(line(&sum, 2000.0).contains("the weights do not say how far off"), "{}", line(&sum, 2000.0));
+        assert!(Foreseen::with(None, &config, 30.0, None).line(30.0).unwrap().contains("is not the file that the controller has taken"));
+    }
 
     /// Protects whoever pressed Ctrl-C at a robot: it is said to be upright only where that is known.
     #[test]

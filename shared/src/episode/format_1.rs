@@ -61,6 +61,7 @@ pub(super) fn tick(data: &[u8]) -> Result<TelemetryMessage, String> {
         robot_at_ns: tick.robot_at_ns,
         alpha_deg: tick.alpha_deg,
         alpha_measured_deg: tick.alpha_measured_deg,
+        poured_ml: f32::NAN,
         ..Default::default()
     })
 }

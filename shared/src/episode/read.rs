@@ -182,6 +182,7 @@ impl Contents {
                 weights: text("weights"),
                 ended: self.text(format::META_END, "reason").into(),
                 note: self.text(format::META_NOTE, "text").into(),
+                poured_ml: self.ticks.last().map(|t| t.poured_ml).filter(|ml| ml.is_finite()),
                 ticks: self.ticks.len() as u64,
                 lost_ticks: last_tick.saturating_sub(first_tick).saturating_add(1).saturating_sub(self.ticks.len() as u64),
                 images: self.images,

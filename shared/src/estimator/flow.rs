@@ -5,7 +5,7 @@
 //! frames.
 //!
 //! ```text
-//! a    += clip((alpha(t - D - delta) - a) / (1 + tau), +-3)            the tilt that this frame shows; alpha is measured or commanded
+//! a    += clip((alpha(t - D - delta) - a) / (1 + tau), +-r)            the tilt that this frame shows; alpha is measured or commanded
 //! e     = max(0, b W(a) - X)                                           liquid above the lip; flow starts where b W(a) = X
 //! v     = min(e/2, exp(lk + lambda + k1 z + k2 z^2) (e / A(a))^p)      a weir under the head e/A, z = clip((a - 60)/30, -1.8, 1.5)
 //! X    += v                                                            headspace: the capacity that is used up
@@ -18,6 +18,7 @@
 //! | a | [`FlowState::tilt_deg`] |
 //! | D, delta | [`FlowModel::delay_frames`], [`FlowState::extra_delay_frames`] |
 //! | tau | [`FlowModel::lag_frames`] |
+//! | r | [`tilt_step_deg`] |
 //! | W, A | [`CapacityCurve`] |
 //! | X | [`FlowState::headspace_ml`] |
 //! | e | [`LipFlow::excess_ml`] |
@@ -33,9 +34,8 @@ use serde::{Deserialize, Serialize};
 
 use super::vessel::{CapacityCurve, ENTRIES, TablePlace, Vessel, entry_deg};
 
-/// The largest change of the tilt in a frame, degrees: no robot turns a full container faster. Chosen by hand; no measurement is
-/// recorded.
-const TILT_STEP_DEG: f64 = 3.0;
+/// The fastest turn of the tilt, degrees/s: no robot turns a full container faster. Chosen by hand; no measurement is recorded.
+const TILT_RATE_DEG_S: f64 = 90.0;
 /// Share of the film that drips in a frame. Chosen by hand; no measurement is recorded.
 pub(super) const DRIP_SHARE: f64 = 1.0 / 9.0;
 /// Number of commanded angles that are remembered, frames: more than the longest delay that can be modelled.
@@ -116,6 +116,8 @@ pub struct FlowTables {
     pub model: FlowModel,
     /// The container.
     pub capacity: CapacityCurve,
+    /// The largest change of the tilt in a frame, degrees, see [`tilt_step_deg`].
+    pub tilt_step_deg: f64,
     /// Logarithm of the flow under an excess of 1 ml, ml a frame.
     log_coefficient: [f64; ENTRIES],
 }
@@ -136,9 +138,10 @@ pub struct LipFlow {
 }
 
 impl FlowTables {
-    /// Builds the tables.
-    pub fn new(model: &FlowModel) -> Self {
-        let mut flow = Self { model: *model, capacity: CapacityCurve::new(&model.vessel), log_coefficient: [0.0; ENTRIES] };
+    /// Builds the tables of a model whose frames come at `rate_hz`.
+    pub fn new(model: &FlowModel, rate_hz: f64) -> Self {
+        let capacity = CapacityCurve::new(&model.vessel);
+        let mut flow = Self { model: *model, capacity, tilt_step_deg: tilt_step_deg(rate_hz), log_coefficient: [0.0; ENTRIES] };
         for (k, (log_coefficient, surface_mm2)) in flow.log_coefficient.iter_mut().zip(&flow.capacity.surface_mm2).enumerate() {
             let z = ((entry_deg(k) - 60.0) / 30.0).clamp(-1.8, 1.5);
             // The head is in mm, the excess in ml.
@@ -183,7 +186,7 @@ impl FlowTables {
     /// The tilt after a frame, from the tilt before it and the delayed command, degrees.
     #[inline]
     pub fn next_tilt_deg(&self, tilt_deg: f64, command_deg: f64) -> f64 {
-        followed_deg(tilt_deg, command_deg, self.model.lag_frames)
+        followed_deg(tilt_deg, command_deg, self.model.lag_frames, self.tilt_step_deg)
     }
 
     /// The command that a picture shows, `ahead` frames after the newest of the history, degrees, linear between two commands.
@@ -218,10 +221,15 @@ impl FlowTables {
     }
 }
 
-/// The tilt after a frame, from the tilt before it and the delayed angle that it follows with a lag, degrees.
+/// The largest change of the tilt in a frame, degrees, at `rate_hz` frames a second; a rate below 1 counts as 1.
+pub fn tilt_step_deg(rate_hz: f64) -> f64 {
+    TILT_RATE_DEG_S / rate_hz.max(1.0)
+}
+
+/// The tilt after a frame, from the tilt before it and the delayed angle that it follows with a lag, by no more than `step_deg`, degrees.
 #[inline]
-pub fn followed_deg(tilt_deg: f64, delayed_deg: f64, lag_frames: f64) -> f64 {
-    tilt_deg + ((delayed_deg - tilt_deg) / (1.0 + lag_frames)).clamp(-TILT_STEP_DEG, TILT_STEP_DEG)
+pub fn followed_deg(tilt_deg: f64, delayed_deg: f64, lag_frames: f64, step_deg: f64) -> f64 {
+    tilt_deg + ((delayed_deg - tilt_deg) / (1.0 + lag_frames)).clamp(-step_deg, step_deg)
 }
 
 /// The angle that was in force `delay_frames` before the one `ahead` frames after the newest of the history, degrees.
@@ -355,5 +363,23 @@ impl WayBack {
             *command = alpha_deg;
         }
         commands
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Protects cells at other frame rates than 30: how fast a tilt can follow is said in seconds. At 30 frames a second it is 3 degrees a frame.
+    #[test]
+    fn a_tilt_follows_as_fast_at_any_frame_rate() {
+        let model = FlowModel { lag_frames: 0.0, delay_frames: 0.0, ..FlowModel::default() };
+        for rate_hz in [10.0, 30.0, 60.0, 120.0] {
+            let flow = FlowTables::new(&model, rate_hz);
+            let after_deg = (0..rate_hz as usize / 2).fold(0.0, |tilt_deg, _| flow.next_tilt_deg(tilt_deg, 90.0));
+            assert!((after_deg - 45.0).abs() < 1e-9, "{rate_hz} Hz: {after_deg} degrees after half a second");
+        }
+        assert_eq!(tilt_step_deg(30.0), 3.0);
+        assert_eq!((tilt_step_deg(0.0), tilt_step_deg(f64::NAN)), (90.0, 90.0), "no rate leads the clamp astray");
     }
 }

@@ -131,10 +131,10 @@ pub struct FusedEstimator {
 }
 
 impl FusedEstimator {
-    /// An estimator for a pour to come; `calibration` is that of the camera's own sum.
-    pub fn new(model: &FusedModel, calibration: &Calibration, way_back: WayBack) -> Self {
+    /// An estimator for a pour to come at `rate_hz` frames a second; `calibration` is that of the camera's own sum.
+    pub fn new(model: &FusedModel, calibration: &Calibration, way_back: WayBack, rate_hz: f64) -> Self {
         let explaining = model.explanations.each_ref().map(|e| Explaining {
-            flow: FlowTables::new(&e.model),
+            flow: FlowTables::new(&e.model, rate_hz),
             calibration: e.calibration,
             unknowns: e.unknowns,
         });
@@ -240,7 +240,7 @@ impl FusedEstimator {
         angles.push(frame.command_deg, frame.measured_deg);
         let alpha_deg = angles.commanded.newest_deg();
         for (Explaining { flow, .. }, Following { shown, .. }) in self.explaining.iter().zip(following.iter_mut()) {
-            shown.follow(&flow.model, angles);
+            shown.follow(flow, angles);
         }
         let area_px2 = frame.area_px2.filter(|a| a.is_finite() && *a >= 0.0);
         let may_be = watch.may_be(&self.bounds, area_px2, following[WIDE].shown.tilt.tilt_deg);

@@ -4,7 +4,7 @@
 //! It is pure and runs in the controller's loop: its size is fixed, and it does not allocate, panic or fail.
 
 use super::filter::Tilt;
-use super::flow::{CommandHistory, FlowModel, Lateness, delayed_deg, followed_deg};
+use super::flow::{CommandHistory, FlowTables, Lateness, delayed_deg, followed_deg};
 
 /// Angles outside of this range are cut to it, degrees. Chosen by hand: no cell tilts that far.
 const RANGE_DEG: (f64, f64) = (-30.0, 200.0);
@@ -70,7 +70,8 @@ impl Default for ShownTilt {
 
 impl ShownTilt {
     /// Takes the angles of a new frame.
-    pub fn follow(&mut self, model: &FlowModel, angles: &Angles) {
+    pub fn follow(&mut self, flow: &FlowTables, angles: &Angles) {
+        let model = &flow.model;
         let commanded = Lateness { lag_frames: model.lag_frames, delay_frames: model.delay_frames };
         let (history, late) = match model.measured {
             Some(late) if angles.has_measured => (&angles.measured, late),
@@ -80,7 +81,7 @@ impl ShownTilt {
         let before = self.tilt;
         let before_deg = if self.begun { before.tilt_deg } else { delayed };
         self.begun = true;
-        let tilt_deg = followed_deg(before_deg, delayed, late.lag_frames);
+        let tilt_deg = followed_deg(before_deg, delayed, late.lag_frames, flow.tilt_step_deg);
         self.tilt = Tilt { tilt_deg, change_deg: tilt_deg - before_deg, change_before_deg: before.change_deg };
     }
 }

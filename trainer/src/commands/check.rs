@@ -12,7 +12,7 @@ use shared::plural::counted;
 
 use crate::calibration::{self, EXPONENT_NEEDS};
 use crate::consistency;
-use crate::data::{self, EpisodeSource, TrainingEpisode};
+use crate::data::{self, EpisodeSource, TrainingEpisode, UsableEpisodes};
 use crate::teaching::gaps::{self, Spanned};
 
 /// An episode that begins or ends below this tilt counts as upright there, degrees. Chosen by hand; no measurement is recorded.
@@ -58,17 +58,18 @@ pub struct Findings {
 /// Looks for faults and doubts in a data set.
 pub fn check(episodes: &[Episode]) -> Findings {
     let usable = data::usable(episodes);
-    let mut doubts = Vec::new();
-    for e in episodes {
-        if !usable.left_out.iter().any(|(name, _)| *name == e.name) {
-            doubts.extend(recording_doubts(e).into_iter().map(|what| (e.name.clone(), what)));
-        }
-    }
+    let mut doubts = doubtful_recordings(episodes, &usable);
     doubts.extend(consistency::doubtful(&usable.episodes).into_iter().map(|d| (d.name.clone(), d.to_string())));
     doubts.extend(set_doubts(&usable.episodes));
     let spanned = gaps::spanned(&usable.episodes, &calibration::calibrate(&usable.episodes, None));
     let missing = spanned.as_ref().map(Spanned::missing).unwrap_or_default();
     Findings { episodes: episodes.len(), usable: usable.episodes.len(), left_out: usable.left_out, doubts, spanned, missing }
+}
+
+/// What is doubtful about how the usable episodes were recorded: the name of each, and what.
+pub fn doubtful_recordings(episodes: &[Episode], usable: &UsableEpisodes) -> Vec<(String, String)> {
+    let used = episodes.iter().filter(|e| usable.episodes.iter().any(|own| own.name == e.name));
+    used.flat_map(|e| recording_doubts(e).into_iter().map(|what| (e.name.clone(), what))).collect()
 }
 
 /// What is doubtful about one recording.

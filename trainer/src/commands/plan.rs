@@ -12,7 +12,7 @@ use shared::limits::Limits;
 use crate::data::{self, DataError, EpisodeSource, UsableEpisodes};
 use crate::fit;
 use crate::teaching::foresight::Foresight;
-use crate::teaching::plan::{Candidate, Plan, Proposal, Wish, plan};
+use crate::teaching::plan::{Candidate, Plan, Proposal, Wish, least_goal_max_ml, least_holds_ml, plan};
 use crate::teaching::span::Span;
 
 /// Curves stay this far below the largest tilt that may be commanded, degrees: the limiter must not cut them off.
@@ -40,7 +40,8 @@ pub struct Args {
     /// What the vessel holds up to its lip, ml. It is needed before the first weighed episode. Later, fills are reckoned from it.
     #[arg(long)]
     holds: Option<f64>,
-    /// Largest goal of the pours to come, ml; without it, 250 ml, and no more than the configuration allows.
+    /// Largest goal of the pours to come, ml; without it, 250 ml, and no more than the configuration allows. Below 25 ml only curves are proposed,
+    /// because a scale rounds what a smaller pour would teach.
     #[arg(long)]
     goal_max: Option<f64>,
     /// Configuration of the cell, from which the limits, [container] holds_ml and the largest goal are taken; without it, the limits are the default
@@ -71,10 +72,8 @@ pub fn run(args: &Args) -> Result<(), Failure> {
     };
     let wish = wish(&limits, goal_max_ml);
     let found = propose(&usable, holds_ml, &wish)?;
-    let Some(first) = found.candidates.first() else {
-        let what = "nothing can be proposed for this vessel: give what it really holds with --holds, or another --goal-max";
-        return Err(failure(exit::FAILED, what));
-    };
+    // There is at least one, or `propose` would have said why not.
+    let [first, others @ ..] = &found.candidates[..] else { return Ok(()) };
     if args.json {
         let all = serde_json::json!({ "episodes": usable.episodes.len(), "left_out": usable.left_out, "plan": found });
         println!("{}", serde_json::to_string_pretty(&all).unwrap_or_default());
@@ -92,7 +91,7 @@ pub fn run(args: &Args) -> Result<(), Failure> {
             found.sd_now_ml, first.sd_after_ml
         );
     }
-    for other in &found.candidates[1..] {
+    for other in others {
         println!("or: {} ({:.1} ml after it)", words(other), other.sd_after_ml);
     }
     Ok(())
@@ -106,7 +105,7 @@ pub fn wish(limits: &Limits, goal_max_ml: f64) -> Wish {
 /// What to weigh next after the usable episodes.
 ///
 /// # Errors
-/// One line, where nothing was weighed yet and nobody says what the vessel holds.
+/// One line, where nothing was weighed yet and nobody says what the vessel holds, or where nothing can be proposed.
 pub fn propose(usable: &UsableEpisodes, holds_ml: Option<f64>, wish: &Wish) -> Result<Plan, Failure> {
     let (vessel, weighed) = if usable.episodes.is_empty() {
         let what = "no episode was weighed yet: say what the vessel holds with --holds ML or [container] holds_ml";
@@ -117,7 +116,24 @@ pub fn propose(usable: &UsableEpisodes, holds_ml: Option<f64>, wish: &Wish) -> R
         let spans = usable.episodes.iter().map(|e| Span::of_episode(e, &fit.calibration)).collect();
         (Foresight::new(&fit.model, fit.calibration, holds_ml, wish.alpha_max_deg, data::rate_hz(&usable.episodes)), spans)
     };
-    Ok(plan(&vessel, &weighed, wish))
+    let found = plan(&vessel, &weighed, wish);
+    if !found.candidates.is_empty() {
+        return Ok(found);
+    }
+    let least_goal_ml = least_goal_max_ml(&vessel, wish).filter(|least_ml| wish.goal_max_ml < *least_ml);
+    let least_vessel_ml = least_holds_ml(wish).filter(|least_ml| usable.episodes.is_empty() && vessel.holds_ml() < *least_ml);
+    let what = match (least_goal_ml, least_vessel_ml) {
+        (Some(least_ml), _) => {
+            format!("no stream is foreseen of pours of up to {} ml: give --goal-max {least_ml} or more", wish.goal_max_ml)
+        }
+        (None, Some(least_ml)) => format!(
+            "nothing can be proposed for a vessel of {} ml, because a scale rounds what its curves would teach: take one that holds {least_ml} ml or \
+             more",
+            vessel.holds_ml()
+        ),
+        (None, None) => "nothing can be proposed for this vessel: give what it really holds with --holds".into(),
+    };
+    Err(failure(exit::FAILED, what))
 }
 
 /// A candidate as a person does it.

@@ -8,15 +8,16 @@ use std::path::{Path, PathBuf};
 use std::sync::{Mutex, PoisonError};
 
 use indicatif::{ProgressBar, ProgressStyle};
-use shared::episode;
+use shared::episode::{self, Episode};
 use shared::estimator::flow::DELAY_MAX_FRAMES;
 use shared::exit::{self, Failure, OrExit as _, failure};
 use shared::level::plain;
 use shared::limits::Limits;
 use shared::plural::counted;
-use shared::weights::Weights;
+use shared::weights::{Weights, check_way_back};
 use shared::whole_file;
 
+use super::check::doubtful_recordings;
 use crate::consistency;
 use crate::data::{self, EpisodeSource, UsableEpisodes};
 use crate::method;
@@ -131,11 +132,19 @@ pub fn run(args: &Args) -> Result<(), Failure> {
         return Err(failure(exit::BAD_INPUT, what));
     }
     let usable = data::usable(&read);
+    say_doubtful_recordings(&read, &usable);
     for doubt in consistency::doubtful(&usable.episodes) {
         eprintln!("doubtful: {}", plain(&doubt.to_string()));
     }
     let options = Options { method: args.method, actions: args.actions, estimate, seed: args.weight_file.seed, limits };
     args.weight_file.train_and_write(&usable, &options, serde_json::Value::Null)
+}
+
+/// Says what is doubtful about how the episodes that are trained on were recorded.
+pub fn say_doubtful_recordings(read: &[Episode], usable: &UsableEpisodes) {
+    for (name, what) in doubtful_recordings(read, usable) {
+        eprintln!("doubtful: {}", plain(&format!("{name}: {what}")));
+    }
 }
 
 impl WeightFileArgs {
@@ -164,6 +173,9 @@ impl WeightFileArgs {
     pub fn train_and_write(&self, usable: &UsableEpisodes, options: &Options, extra: serde_json::Value) -> Result<(), Failure> {
         for (name, what) in &usable.left_out {
             eprintln!("left out: {}", plain(&format!("{name}: {what}")));
+        }
+        if let (Estimate::Fused, false) = (options.estimate, usable.episodes.is_empty()) {
+            check_way_back(&options.limits, data::rate_hz(&usable.episodes)).or_exit(exit::BAD_INPUT)?;
         }
         let style = ProgressStyle::with_template("{prefix} [{wide_bar}] {pos}/{len} {msg} ({eta} left)");
         let bar = Bar(ProgressBar::new(1).with_style(style.unwrap_or_else(|_| ProgressStyle::default_bar())));

@@ -98,7 +98,7 @@ impl PreparedEpisode {
             smooth_max_px2,
             used,
             weight_g: e.weight_g,
-            first: (0..n).find(|k| seen(*k)).unwrap_or(0),
+            first: e.first_flow().unwrap_or(0),
             extra_delay_frames: 0.0,
             log_camera_gain: 0.0,
         }

@@ -78,26 +78,31 @@ pub struct Priors {
     pub measured: bool,
     /// Whether the frames have next to no noise, so that a flow that is no weir's can be told.
     pub clean: bool,
-    /// Frames of the episodes for one at 30 frames a second: what is known in seconds is so many times as many frames, and a flow a frame so many
-    /// times less.
-    pub slower: f64,
+    /// Frames a second of the episodes.
+    pub rate_hz: f64,
 }
 
 impl Priors {
+    /// Frames of the episodes for one at 30 frames a second: what is known in seconds is so many times as many frames, and a flow a frame so many
+    /// times less.
+    pub fn slower(&self) -> f64 {
+        self.rate_hz / 30.0
+    }
+
     /// Radius, slenderness and taper are those of vessels that a gripper holds. The head's exponent is a weir's. The others began as those of
     /// the prototype. Where the frames have no noise, a flow of another kind is found, and its price must not grow without bound.
     fn table(&self) -> [Prior; 11] {
         use Price::{Cauchy, Square};
         let flow = if self.clean { Cauchy } else { Square };
         let (lag, delay) = if self.measured { ((0.3, 0.3), (1.0, 1.0)) } else { ((2.0, 0.8), (2.0, 1.2)) };
-        let [lag, delay] = [lag, delay].map(|(expected, sd)| (expected * self.slower, sd * self.slower));
+        let [lag, delay] = [lag, delay].map(|(expected, sd)| (expected * self.slower(), sd * self.slower()));
         [
             (LOG_RADIUS, RADIUS_MM.ln(), 0.25, Square),
             (LOG_SLENDERNESS, SLENDERNESS.ln(), 0.3, Square),
             (TAPER, 1.0, 0.15, Square),
             (TILT_SLOPE, 0.0, 0.03, Square),
             (HEAD_EXPONENT, 1.5, 0.07, flow),
-            (LOG_WEIR, -3.2 - self.slower.ln(), 1.5, Square),
+            (LOG_WEIR, -3.2 - self.slower().ln(), 1.5, Square),
             (WEIR_SLOPE, 0.0, 0.12, flow),
             (WEIR_CURVATURE, 0.0, 0.1, flow),
             (LAG, lag.0, lag.1, Square),

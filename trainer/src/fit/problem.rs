@@ -77,6 +77,11 @@ impl Problem<'_> {
         model_of(shared, self.priors.vessel.even_share)
     }
 
+    /// The tables of that model.
+    pub fn flow_of(&self, shared: &[f64; SHARED]) -> FlowTables {
+        FlowTables::new(&self.model_of(shared), self.priors.rate_hz)
+    }
+
     /// Whether a knot of the vessel's shape changes what the model says of an episode: it must be near the tilts at which something flowed.
     fn matters(&self, knot: usize, episode: usize, onset_deg: f64) -> bool {
         let (below, above) = (knot_deg(knot.saturating_sub(1)), knot_deg(knot + 1));
@@ -90,7 +95,7 @@ impl Problem<'_> {
 
     /// Sum of all squared residuals; infinite where it is not a number.
     fn cost(&self, at: &Unknowns) -> f64 {
-        let flow = FlowTables::new(&self.model_of(&at.shared));
+        let flow = self.flow_of(&at.shared);
         let parts: Vec<f64> = (0..self.episodes.len())
             .into_par_iter()
             .map(|k| sum_of_squares(&self.episode_residuals(k, &flow, &at.shared, &at.own[k])))
@@ -106,10 +111,10 @@ impl Problem<'_> {
             .map(|k| {
                 let mut shared = at.shared;
                 shared[k] += step(k);
-                (shared, FlowTables::new(&self.model_of(&shared)))
+                (shared, self.flow_of(&shared))
             })
             .collect();
-        let flow = FlowTables::new(&self.model_of(&at.shared));
+        let flow = self.flow_of(&at.shared);
         let blocks: Vec<(DMatrix<f64>, DVector<f64>)> = (0..self.episodes.len())
             .into_par_iter()
             .map(|e| {

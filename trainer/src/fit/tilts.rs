@@ -3,7 +3,7 @@
 //! Pure functions of the offline trainer, which allocate and do not fail. An episode without measured tilt among others that have it gets the
 //! one that its commands would have led to, by the others' delay and lag.
 
-use shared::estimator::flow::{CommandHistory, Lateness, delayed_deg, followed_deg};
+use shared::estimator::flow::{CommandHistory, Lateness, delayed_deg, followed_deg, tilt_step_deg};
 
 use super::servo::Servo;
 use crate::data::TrainingEpisode;
@@ -25,7 +25,9 @@ impl Tilts {
             return Self { alpha_deg: episodes.iter().map(|e| e.alpha_deg.clone()).collect(), robot: None };
         };
         let robot = Lateness { lag_frames, delay_frames };
-        let tilts = |e: &TrainingEpisode| if has_measured(e) { without_gaps(e) } else { followed(&e.alpha_deg, robot).collect() };
+        let tilts = |e: &TrainingEpisode| {
+            if has_measured(e) { without_gaps(e) } else { followed(&e.alpha_deg, robot, tilt_step_deg(e.rate_hz)).collect() }
+        };
         Self { alpha_deg: episodes.iter().map(tilts).collect(), robot: Some(robot) }
     }
 }
@@ -51,13 +53,13 @@ fn without_gaps(e: &TrainingEpisode) -> Vec<f64> {
         .collect()
 }
 
-/// Where a joint is that follows the commands with a delay and a lag, degrees.
-fn followed(commands: &[f64], late: Lateness) -> impl Iterator<Item = f64> + '_ {
+/// Where a joint is that follows the commands with a delay and a lag, by no more than `step_deg` a frame, degrees.
+fn followed(commands: &[f64], late: Lateness, step_deg: f64) -> impl Iterator<Item = f64> + '_ {
     let start = commands.first().copied().unwrap_or(0.0);
     let (mut history, mut tilt_deg) = (CommandHistory::standing_at(start), start);
     commands.iter().map(move |command| {
         history.push(*command);
-        tilt_deg = followed_deg(tilt_deg, delayed_deg(history.commands(), 0, late.delay_frames), late.lag_frames);
+        tilt_deg = followed_deg(tilt_deg, delayed_deg(history.commands(), 0, late.delay_frames), late.lag_frames, step_deg);
         tilt_deg
     })
 }

@@ -120,7 +120,7 @@ impl PossiblePours {
         let [l11, l21, l22] = self.calibration_root;
         let (z_c, z_q) = (normal(), normal());
         let miscalibrated = (l11 * z_c, l21 * z_c + l22 * z_q);
-        let flow = FlowTables::new(&model);
+        let flow = FlowTables::new(&model, self.rate_hz);
         let onset_deg = rng.random_range(self.onset_deg.0..self.onset_deg.1);
         let headspace_ml = flow.capacity.lost_ml(onset_deg);
         let most_ml = GOAL_SHARE_MAX * (flow.capacity.lost_ml(LAST_TILT_DEG) - headspace_ml);

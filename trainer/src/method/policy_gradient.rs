@@ -148,7 +148,7 @@ impl Recipe {
             let volumes = contributions(episode, calibration);
             let poured = match estimator {
                 Estimator::Sum => plain_sums(&volumes),
-                Estimator::Fused { model, back } => fused_sums(episode, FusedEstimator::new(model, calibration, *back)),
+                Estimator::Fused { model, back } => fused_sums(episode, FusedEstimator::new(model, calibration, *back, episode.rate_hz)),
             };
             sequences.extend(kappas.iter().map(|kappa| self.sequence(episode, &volumes, &poured, *kappa)));
         }

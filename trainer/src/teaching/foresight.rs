@@ -43,7 +43,7 @@ impl Foresight {
     /// The vessel of a model that was fitted to episodes of `rate_hz` frames a second. `holds_ml` is what it holds, if somebody knows that; the model's own volume rests on tilts at which
     /// nothing was ever seen.
     pub fn new(model: &FlowModel, calibration: Calibration, holds_ml: Option<f64>, alpha_max_deg: f64, rate_hz: f64) -> Self {
-        let flow = FlowTables::new(model);
+        let flow = FlowTables::new(model, rate_hz);
         let holds_ml = holds_ml.unwrap_or_else(|| flow.capacity.lost_ml(LAST_DEG));
         Self { flow, calibration, holds_ml, alpha_max_deg, rate_hz }
     }
@@ -51,7 +51,7 @@ impl Foresight {
     /// A vessel of which only the volume is known: a beaker with the usual proportions.
     pub fn unknown(holds_ml: f64, alpha_max_deg: f64) -> Self {
         let mut model = FlowModel::default();
-        let factor = (holds_ml / FlowTables::new(&model).capacity.lost_ml(LAST_DEG)).cbrt();
+        let factor = (holds_ml / FlowTables::new(&model, RATE_HZ).capacity.lost_ml(LAST_DEG)).cbrt();
         model.vessel.radius_mm *= factor;
         model.vessel.height_mm *= factor;
         let calibration = Calibration { volume_at_1_px2_ml: 0.0025, area_exponent: 1.0, log_tilt_slope: 0.0, hold_above_px2: 60.0 };

@@ -38,7 +38,7 @@ pub struct Spanned {
 
 /// The tilt at which an episode begins to flow, degrees.
 fn onset_deg(episode: &TrainingEpisode) -> Option<f64> {
-    episode.area_px2.iter().position(|area| *area > 0.0).map(|frame| episode.tilt_deg(frame))
+    episode.first_flow().map(|frame| episode.tilt_deg(frame))
 }
 
 /// The tilt beyond which an episode pours less than [`SHOWN_ML`], degrees.
@@ -136,6 +136,11 @@ mod tests {
         let good = [episode(3000.0, 40.0), episode(600.0, 60.0), episode(500.0, 50.0)];
         assert_eq!(missing(&good), Vec::<String>::new());
         assert_eq!(spanned(&[], &CALIBRATION), None);
+
+        // A speck before an upright vessel is no flow, and hides no gap.
+        let mut specks = good.clone();
+        specks[0].area_px2[5] = 20.0;
+        assert_eq!(spanned(&specks, &CALIBRATION).unwrap().onsets_deg, spanned(&good, &CALIBRATION).unwrap().onsets_deg);
 
         let fast = [episode(3000.0, 40.0), episode(1400.0, 60.0)];
         let said = missing(&fast);

@@ -17,6 +17,10 @@ const FILL_SHARES: [f64; 6] = [0.4, 0.5, 0.6, 0.7, 0.8, 0.9];
 const GOALS_ML: [f64; 8] = [40.0, 60.0, 80.0, 100.0, 130.0, 160.0, 200.0, 250.0];
 /// How far beyond the tilt of the first drop a curve may go, degrees.
 const BEYOND_DEG: [f64; 4] = [8.0, 12.0, 16.0, 20.0];
+/// Fills of a vessel that holds less than this are rounded to 5 ml and not to 10, ml. Chosen by hand: 10 ml are a tenth of it.
+const SMALL_ML: f64 = 100.0;
+/// The least vessel is looked for below this, ml. Chosen by hand: twice what it is with the default limits.
+const HOLDS_LOOKED_FOR_ML: u32 = 200;
 /// Widths of curves, 1/s^2.
 const GAMMAS_PER_S2: [f64; 3] = [0.15, 0.25, 0.5];
 /// Largest share of a fill that is poured: so that a vessel which was misjudged is not poured empty.
@@ -81,16 +85,17 @@ pub struct Wish {
     pub alpha_max_deg: f64,
 }
 
-/// Rounded down to a multiple of `step`: a fill must go in.
-fn rounded(value: f64, step: f64) -> f64 {
-    (value / step).floor() * step
+/// The fills that are considered, ml, rounded down: a fill must go in.
+fn fills_ml(vessel: &Foresight) -> impl Iterator<Item = f64> {
+    let holds_ml = vessel.holds_ml();
+    let step_ml = if holds_ml < SMALL_ML { 5.0 } else { 10.0 };
+    FILL_SHARES.into_iter().map(move |share| (share * holds_ml / step_ml).floor() * step_ml)
 }
 
 /// All curves that are possible, with what they show.
 fn curves(vessel: &Foresight, wish: &Wish) -> Vec<(Proposal, Span)> {
     let mut all = Vec::new();
-    for share in FILL_SHARES {
-        let fill_ml = rounded(share * vessel.holds_ml(), 10.0);
+    for fill_ml in fills_ml(vessel) {
         for beyond_deg in BEYOND_DEG {
             let lambda_deg = (vessel.onset_deg(fill_ml) + beyond_deg).round();
             for gamma_per_s2 in GAMMAS_PER_S2 {
@@ -108,9 +113,11 @@ fn curves(vessel: &Foresight, wish: &Wish) -> Vec<(Proposal, Span)> {
 /// All pours that are possible, with what they show.
 fn pours(vessel: &Foresight, wish: &Wish) -> Vec<(Proposal, Span)> {
     let mut all = Vec::new();
-    for share in FILL_SHARES {
-        let fill_ml = rounded(share * vessel.holds_ml(), 10.0);
-        for goal_ml in GOALS_ML.into_iter().filter(|goal| *goal <= wish.goal_max_ml.min(POURED_SHARE_MAX * fill_ml)) {
+    for fill_ml in fills_ml(vessel) {
+        let most_ml = wish.goal_max_ml.min(POURED_SHARE_MAX * fill_ml);
+        // The largest goal itself, where all of the others are above it and the scale tells it.
+        let largest = Some(most_ml.floor()).filter(|ml| (LEAST_ML..GOALS_ML[0]).contains(ml));
+        for goal_ml in GOALS_ML.into_iter().filter(|goal| *goal <= most_ml).chain(largest) {
             if let Some(span) = vessel.pour(fill_ml, goal_ml) {
                 all.push((Proposal::Pour { fill_ml, goal_ml }, span));
             }
@@ -128,6 +135,20 @@ fn pours_to_come(vessel: &Foresight, wish: &Wish) -> Vec<Span> {
         .flat_map(|fill_ml| goals.iter().filter_map(move |goal_ml| vessel.pour(fill_ml, goal_ml.min(POURED_SHARE_MAX * fill_ml))))
         .filter(|span| span.volume_ml() > 0.0)
         .collect()
+}
+
+/// The least largest goal, in whole ml, of which any pour to come shows a stream; `None` if no goal that is considered does.
+pub fn least_goal_max_ml(vessel: &Foresight, wish: &Wish) -> Option<f64> {
+    (1..=GOALS_ML[0] as u32)
+        .map(f64::from)
+        .find(|goal_max_ml| !pours_to_come(vessel, &Wish { goal_max_ml: *goal_max_ml, ..*wish }).is_empty())
+}
+
+/// The least vessel, in whole ml that it holds, from which on a plan can begin with every vessel; `None` if there is none below
+/// [`HOLDS_LOOKED_FOR_ML`].
+pub fn least_holds_ml(wish: &Wish) -> Option<f64> {
+    let begins = |holds_ml: &f64| !curves(&Foresight::unknown(*holds_ml, wish.alpha_max_deg), wish).is_empty();
+    (1..HOLDS_LOOKED_FOR_ML).rev().map(f64::from).take_while(begins).last()
 }
 
 /// The mean standard deviation of the camera's volumes of some pours, ml.
@@ -225,23 +246,33 @@ mod tests {
     /// Protects the bench: whatever the vessel holds, what is proposed goes in, leaves something behind, and can be commanded.
     #[test]
     fn what_is_proposed_is_possible() {
-        for holds_ml in [150.0, 300.0, 500.0, 1000.0, 2000.0] {
+        let least_ml = least_holds_ml(&WISH).unwrap();
+        assert!((85.0..=95.0).contains(&least_ml), "a curve from a vessel of {least_ml} ml is weighed well enough");
+        let vessels = [50.0, 60.0, 70.0, 80.0, 90.0, least_ml, 150.0, 300.0, 500.0, 1000.0, 2000.0].map(|holds_ml| (holds_ml, WISH));
+        // Cells whose largest goal is below all goals that are considered.
+        let small_goals =
+            [(500.0, 25.0), (500.0, 30.0), (100.0, 39.0)].map(|(holds_ml, goal_max_ml)| (holds_ml, Wish { goal_max_ml, ..WISH }));
+        for (holds_ml, wish) in vessels.into_iter().chain(small_goals) {
             let vessel = Foresight::unknown(holds_ml, 105.0);
-            for (possible, _) in curves(&vessel, &WISH).into_iter().chain(pours(&vessel, &WISH)) {
+            for (possible, _) in curves(&vessel, &wish).into_iter().chain(pours(&vessel, &wish)) {
                 let (Proposal::Curve { fill_ml, .. } | Proposal::Pour { fill_ml, .. }) = possible;
                 assert!(fill_ml <= 0.92 * holds_ml, "{holds_ml}: {possible:?}");
             }
-            let mut weighed = Vec::new();
+            assert!(!pours(&vessel, &wish).is_empty(), "{holds_ml}: {wish:?}");
+            // Smaller ones than the least get pours only, once somebody has weighed two curves of his own.
+            let own = vessel.curve(0.9 * holds_ml, vessel.onset_deg(0.9 * holds_ml) + 12.0, 0.25);
+            let mut weighed = if holds_ml < least_ml { vec![own; CURVES_FIRST] } else { Vec::new() };
             for _ in 0..4 {
-                let (_, first) = next(&vessel, &weighed);
+                let found = plan(&vessel, &weighed, &wish);
+                let first = *found.candidates.first().unwrap_or_else(|| panic!("{holds_ml}: {wish:?} after {}", weighed.len()));
                 let (fill_ml, lambda_deg) = match first.next {
                     Proposal::Curve { fill_ml, lambda_deg, .. } => (fill_ml, lambda_deg),
                     Proposal::Pour { fill_ml, goal_ml } => {
-                        assert!(goal_ml <= POURED_SHARE_MAX * fill_ml && goal_ml <= WISH.goal_max_ml);
+                        assert!(goal_ml <= POURED_SHARE_MAX * fill_ml && goal_ml <= wish.goal_max_ml);
                         (fill_ml, 0.0)
                     }
                 };
-                assert!(fill_ml <= 0.92 * holds_ml && lambda_deg <= WISH.alpha_max_deg, "{holds_ml}: {first:?}");
+                assert!(fill_ml <= 0.92 * holds_ml && lambda_deg <= wish.alpha_max_deg, "{holds_ml}: {first:?}");
                 assert!(first.weight_ml >= 0.8 * LEAST_ML && first.weight_ml <= 0.7 * fill_ml, "{holds_ml}: {first:?}");
                 weighed.push(span_of(&vessel, &first));
             }

@@ -16,7 +16,7 @@ pub fn episodes(n: usize, seed: u64) -> Vec<TrainingEpisode> {
 
 /// The same, made by `model`, seen by the camera (c and q) and with the noise (sd of the logarithm) that `seen` gives for each episode.
 pub fn episodes_of(model: &FlowModel, n: usize, seed: u64, seen: impl Fn(usize) -> ((f64, f64), f64)) -> Vec<TrainingEpisode> {
-    let flow = FlowTables::new(model);
+    let flow = FlowTables::new(model, 30.0);
     let mut rng = Pcg64Mcg::seed_from_u64(seed);
     (0..n)
         .map(|k| {

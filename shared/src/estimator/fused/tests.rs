@@ -42,7 +42,7 @@ struct ModelVessel {
 
 impl ModelVessel {
     fn new(onset_deg: f64) -> Self {
-        let flow = FlowTables::new(&FlowModel::default());
+        let flow = FlowTables::new(&FlowModel::default(), 30.0);
         let state = FlowState { headspace_ml: flow.capacity.lost_ml(onset_deg), ..FlowState::default() };
         Self { flow, state, poured_ml: 0.0, history: CommandHistory::standing_at(0.0) }
     }
@@ -87,7 +87,7 @@ fn pour_from(mut fused: FusedEstimator, gain: f64, onset_deg: f64) -> (f64, f64,
 }
 
 fn new(model: &FusedModel) -> FusedEstimator {
-    FusedEstimator::new(model, &CAMERA, BACK)
+    FusedEstimator::new(model, &CAMERA, BACK, 30.0)
 }
 
 /// Protects the point of fusing: geometry corrects a camera whose gain is off, which the sum cannot.
