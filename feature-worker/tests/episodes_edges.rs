@@ -4,7 +4,7 @@
 
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
-use std::time::UNIX_EPOCH;
+use std::time::{Duration, SystemTime, UNIX_EPOCH};
 
 use serde_json::Value;
 use shared::config::Config;
@@ -13,9 +13,14 @@ use shared::messages::Feature;
 
 /// Writes the episode `number`, all at one time of the wall clock; its measurement is its own.
 fn write(directory: &Path, number: u64, complete: bool) -> PathBuf {
+    write_at(directory, number, complete, UNIX_EPOCH)
+}
+
+/// The same at a time of the wall clock.
+fn write_at(directory: &Path, number: u64, complete: bool, wall_clock: SystemTime) -> PathBuf {
     let config = Config::read(&Path::new(env!("CARGO_MANIFEST_DIR")).join("../config/sim.toml")).unwrap();
     let kind = EpisodeKind::Pour { goal_ml: 50.0 };
-    let start = EpisodeStart { episode: number, kind, started_at_ns: 1, wall_clock: UNIX_EPOCH, config: &config, weights: "" };
+    let start = EpisodeStart { episode: number, kind, started_at_ns: 1, wall_clock, config: &config, weights: "" };
     let mut writer = EpisodeWriter::create(directory, &start).unwrap();
     let feature = Feature { captured_at_ns: 2, sequence: 1, area_px2: number as f32, ..Default::default() };
     writer.frame(&FrameRow { feature: &feature, alpha_commanded_deg: 0.0, alpha_measured_deg: 0.0, image: None }).unwrap();
@@ -46,6 +51,28 @@ fn the_ten_thousandth_is_the_newest() {
     assert_eq!(names, [before.to_str().unwrap(), newest.to_str().unwrap()]);
     assert_eq!(code(&episodes(&["prune", directory, "--budget-mb", "0", "--budget-episodes", "1", "--yes"])), 0);
     assert_eq!((before.exists(), newest.exists()), (false, true));
+}
+
+/// Protects the newest recordings of a machine whose clock went back: they have the largest numbers, so they are not the oldest, and the newest of all is
+/// never pruned. Another directory's episodes are older or newer by the time.
+#[test]
+fn a_clock_that_went_back_makes_nothing_old() {
+    let dir = tempfile::tempdir().unwrap();
+    let [cell, other] = ["cell", "other"].map(|name| dir.path().join(name));
+    let day = |n: u32| UNIX_EPOCH + Duration::from_secs(86_400) * n;
+    let files = [
+        write_at(&cell, 1, true, day(8)),
+        write_at(&cell, 2, true, day(10)),
+        write_at(&cell, 3, true, day(1)),
+        write_at(&cell, 4, true, day(2)),
+        write_at(&other, 5, true, day(9)),
+        write_at(&other, 6, true, day(11)),
+    ];
+    let [cell, other] = [&cell, &other].map(|p| p.to_str().unwrap());
+    for (budget, kept) in [("4", [false, true, true, true, false, true]), ("2", [false, false, false, true, false, true])] {
+        let pruned = episodes(&["prune", cell, other, "--budget-mb", "0", "--budget-episodes", budget, "--yes"]);
+        assert_eq!((code(&pruned), files.each_ref().map(|f| f.exists())), (0, kept), "{}", text(&pruned.stderr));
+    }
 }
 
 /// Protects who counts episodes from a disk that is not mounted: a link that leads nowhere is an episode that cannot be read, and said.
@@ -97,6 +124,26 @@ fn a_merge_into_its_own_directory_doubles_nothing() {
     let there = shared::episode::find_episodes(std::slice::from_ref(&monday)).unwrap();
     let areas: Vec<f32> = there.iter().map(|file| Episode::read(file).unwrap().rows[0].area_px2).collect();
     assert_eq!(areas, [1.0, 2.0]);
+}
+
+/// Protects a collection from doubles: a merge that is done again copies nothing, and what lies there without the weight that its copy has by now is named
+/// with it.
+#[test]
+fn a_merge_that_is_done_again_copies_nothing() {
+    let dir = tempfile::tempdir().unwrap();
+    let [monday, all] = ["monday", "all"].map(|name| dir.path().join(name));
+    let [first, _] = [1, 2].map(|number| write(&monday, number, true));
+    let merge = || {
+        let merged = episodes(&["merge", monday.to_str().unwrap(), "--to", all.to_str().unwrap()]);
+        assert_eq!(code(&merged), 0, "{}", text(&merged.stderr));
+        (shared::episode::find_episodes(std::slice::from_ref(&all)).unwrap().len(), text(&merged.stdout))
+    };
+    assert_eq!(merge().0, 2);
+    set_weight(&first, 104.0).unwrap();
+    let (there, said) = merge();
+    assert_eq!(there, 2, "{said}");
+    let other = all.join("episode-0001.mcap");
+    assert!(said.contains(&format!("it lies there already, as {}, which is not weighed: here it is 104 g", other.display())), "{said}");
 }
 
 /// Protects a weight from a note that another program writes at the same moment, and the note from it: what was said to be written is there, and

@@ -18,7 +18,7 @@ use serde_json::{Value, json};
 use shared::episode::{Episode, EpisodeImages, by_number, find_episodes};
 use shared::regular_file;
 
-use crate::ends::Ends;
+use crate::ends::{End, Ends};
 use crate::lock::locked;
 
 /// Pause between two looks at the directory. Chosen by hand: a person waits for a new episode no longer.
@@ -84,6 +84,11 @@ fn line(path: &Path) -> Value {
     }
 }
 
+/// By how much a weighed pour missed its goal, ml. One that is known to have been cut short, as by a Stop, missed nothing.
+fn error_ml(name: &str, line: &Line, ends: &Ends) -> Option<f64> {
+    line.value["error_ml"].as_f64().filter(|_| ends.of(name).is_none_or(End::at_the_goal))
+}
+
 impl History {
     /// The episodes of `directory`.
     pub fn new(directory: PathBuf) -> Self {
@@ -145,6 +150,7 @@ impl History {
     pub fn table(&self, ends: &Ends) -> Value {
         let with_end = |(name, line): (&String, &Line)| {
             let mut value = line.value.clone();
+            value["error_ml"] = json!(error_ml(name, line, ends));
             if let Some(end) = ends.of(name) {
                 value["reason"] = json!(end.reason);
                 value["estimate"] = json!(end.poured.as_ref().map(|poured| format!("{poured} ml")));
@@ -210,10 +216,11 @@ impl History {
         locked(&self.weighing)
     }
 
-    /// By how much the weighed pours with the weights `identity` missed their goals, ml.
-    pub fn errors_ml(&self, identity: &str) -> Vec<f64> {
+    /// By how much the weighed pours with the weights `identity` missed their goals, ml. `ends` says which were cut short.
+    pub fn errors_ml(&self, identity: &str, ends: &Ends) -> Vec<f64> {
         let table = locked(&self.table);
-        table.values().filter(|l| l.value["weights"] == identity).filter_map(|l| l.value["error_ml"].as_f64()).collect()
+        let with_them = table.iter().filter(|(_, l)| l.value["weights"] == identity);
+        with_them.filter_map(|(name, l)| error_ml(name, l, ends)).collect()
     }
 
     /// Reads the episode `name` again at once, so that what is asked next knows what was just written into it.
@@ -333,6 +340,50 @@ mod tests {
         let table = history.table(&Ends::default());
         let listed: Vec<&str> = table["episodes"].as_array().unwrap().iter().map(|e| e["file"].as_str().unwrap()).collect();
         assert_eq!(listed, names);
+    }
+
+    /// Protects who judges weights by the scale: a pour that was stopped at 10 of 100 ml is no error of 90 ml, in the table and before the next pour.
+    #[test]
+    fn a_pour_that_was_stopped_is_no_error() {
+        use shared::config::Config;
+        use shared::control::{EndReason, Outcome};
+        use shared::episode::{EpisodeEnd, EpisodeKind, EpisodeStart, EpisodeWriter, FrameRow, set_weight};
+        use shared::messages::Feature;
+        let config = Config::read(&Path::new(env!("CARGO_MANIFEST_DIR")).join("../config/sim.toml")).unwrap();
+        let dir = tempfile::tempdir().unwrap();
+        let history = History::new(dir.path().to_path_buf());
+        let mut ends = Ends::default();
+        let pours = [(EndReason::Done, 101.0), (EndReason::Aborted, 12.0), (EndReason::GoalExceeded, 140.0)];
+        for (number, (reason, weight_g)) in (1..).zip(pours) {
+            let (kind, wall_clock) = (EpisodeKind::Pour { goal_ml: 100.0 }, SystemTime::UNIX_EPOCH);
+            let start = EpisodeStart { episode: number, kind, started_at_ns: 1, wall_clock, config: &config, weights: "them" };
+            let mut writer = EpisodeWriter::create(dir.path(), &start).unwrap();
+            let feature = Feature { captured_at_ns: 2, sequence: 1, ..Default::default() };
+            writer.frame(&FrameRow { feature: &feature, alpha_commanded_deg: 0.0, alpha_measured_deg: 0.0, image: None }).unwrap();
+            let path = writer.finish(&EpisodeEnd { complete: true, reason: "over", disordered_frames: 0 }).unwrap();
+            set_weight(&path, weight_g).unwrap();
+            history.refresh(&name_of(&path));
+            let outcome = Outcome {
+                episode: number,
+                reason,
+                unseen: false,
+                goal_ml: Some(100.0),
+                poured_ml: 10.0,
+                poured_sd_ml: 1.0,
+                seconds: 4.0,
+                frames: 120,
+                bridged_frames: 0,
+                stale_features: 0,
+                tick_gaps: 0,
+                clipped: Default::default(),
+            };
+            ends.remember(&[outcome], &[(number, Ok(path.display().to_string()))].into());
+        }
+        assert_eq!(history.errors_ml("them", &ends), [1.0, 40.0]);
+        assert_eq!(history.errors_ml("them", &Ends::default()), [1.0, -88.0, 40.0], "what is not known is not left out");
+        let table = history.table(&ends);
+        let shown: Vec<Option<f64>> = table["episodes"].as_array().unwrap().iter().map(|e| e["error_ml"].as_f64()).collect();
+        assert_eq!(shown, [Some(1.0), None, Some(40.0)]);
     }
 
     /// Protects browsers from a table of yesterday: a file that changes is seen although another one has a time in the future, and so is one that takes

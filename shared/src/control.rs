@@ -165,6 +165,10 @@ pub enum EndReason {
 }
 
 impl EndReason {
+    /// The ends of pours that went all the way to their goal, so that a weight says how far off they were. By what the reasons mean: any other one
+    /// cuts a pour short.
+    pub const AT_THE_GOAL: [Self; 2] = [Self::Done, Self::GoalExceeded];
+
     /// The reason of a run that was ending for `before` when the robot was lost for this one. The first stays, but for done, and where the arm now stands
     /// although the container is not upright: liquid goes on leaving it.
     pub fn after(self, before: Self, is_upright: bool) -> Self {

@@ -6,6 +6,9 @@
 
 use serde::Serialize;
 
+/// The share of a core that Linux leaves to real-time threads by default (sched-rt-group in the kernel's documentation). The loop and the worker need less.
+const USUAL_RT_SHARE: f64 = 0.95;
+
 /// How good something is.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize)]
 #[serde(rename_all = "kebab-case")]
@@ -140,9 +143,25 @@ fn power(core: usize) -> Vec<Finding> {
     vec![
         Finding::judged(steady, "governor", shown(governor), "a tick may start at a low clock", full),
         Finding::judged(alone, "isolated cores", isolated, "other tasks share the loop's core", isolate),
-        Finding::green("RT throttling", format!("{} of 1000000 us", read("/proc/sys/kernel/sched_rt_runtime_us"))),
+        throttling(&read("/proc/sys/kernel/sched_rt_runtime_us"), &read("/proc/sys/kernel/sched_rt_period_us")),
+        time_slices(&read("/proc/sys/kernel/sched_rr_timeslice_ms")),
         Finding::judged(held, "/dev/cpu_dma_latency", latency, "a core that sleeps deeply wakes up 100 us later", hold),
     ]
+}
+
+/// Whether the kernel takes real-time threads off a core before they use what it leaves them by default: `runtime` of each `period`, us, -1 for all.
+fn throttling(runtime: &str, period: &str) -> Finding {
+    let is = format!("{} of {} us", shown(runtime.into()), shown(period.into()));
+    let (Ok(runtime), Ok(period)) = (runtime.parse::<f64>(), period.parse::<f64>()) else { return Finding::green("RT throttling", is) };
+    let good = runtime < 0.0 || runtime >= USUAL_RT_SHARE * period;
+    let means = "where real-time threads use so much of a core, the loop stands still for the rest of the period";
+    Finding::judged(good, "RT throttling", is, means, "sysctl kernel.sched_rt_runtime_us=950000, with a period of 1000000")
+}
+
+/// How long a thread under SCHED_RR runs before its equals do. A fact: loop and worker run under SCHED_FIFO, which has no time slices.
+fn time_slices(timeslice_ms: &str) -> Finding {
+    let slice = if timeslice_ms.is_empty() { shown(String::new()) } else { format!("{timeslice_ms} ms") };
+    Finding::green("time slices", format!("{slice} under SCHED_RR; loop and worker run under SCHED_FIFO, which has none"))
 }
 
 #[cfg(test)]
@@ -154,5 +173,19 @@ mod tests {
     fn the_loops_own_core_is_looked_up() {
         assert!(in_list("2-3,6", 3) && in_list("2-3,6", 6) && in_list("0", 0) && in_list(" 1 ", 1));
         assert!(!in_list("2-3,6", 1) && !in_list("2-3,6", 4) && !in_list("", 0) && !in_list("12", 1));
+    }
+
+    /// Protects the loop from a kernel that was told to throttle real-time threads early: that is yellow, with what to do. The default, and none at
+    /// all, are no reason to worry.
+    #[test]
+    fn early_throttling_is_named() {
+        let judge = |runtime: &str, period: &str| throttling(runtime, period).verdict;
+        for (runtime, period) in [("950000", "1000000"), ("-1", "1000000"), ("1000000", "1000000"), ("", "")] {
+            assert_eq!(judge(runtime, period), Verdict::Green, "{runtime} of {period}");
+        }
+        for (runtime, period) in [("500000", "1000000"), ("0", "1000000"), ("950000", "2000000")] {
+            assert_eq!(judge(runtime, period), Verdict::Yellow, "{runtime} of {period}");
+        }
+        assert!(throttling("0", "1000000").advice.contains("sched_rt_runtime_us"));
     }
 }

@@ -4,7 +4,7 @@
 
 use std::path::Path;
 
-use feature_worker::source::devices;
+use feature_worker::source::{controls, devices};
 use shared::config::{CameraConfig, CameraSource, Config};
 use shared::machine::Finding;
 
@@ -36,9 +36,17 @@ pub fn look(config: &Config) -> Vec<Finding> {
 
 fn device(camera: &CameraConfig) -> Vec<Finding> {
     let path = Path::new(&camera.path);
-    if let Err(e) = devices::open(path) {
-        return vec![Finding::red("device", e.to_string(), "there are no pictures", "`decant camera` lists the cameras of this machine")];
-    }
+    let file = match devices::open(path) {
+        Ok(file) => file,
+        Err(e) => {
+            return vec![Finding::red(
+                "device",
+                e.to_string(),
+                "there are no pictures",
+                "`decant camera` lists the cameras of this machine",
+            )];
+        }
+    };
     let node = std::fs::canonicalize(path).unwrap_or_else(|_| path.into());
     let found = devices::list(Path::new("/")).into_iter().find(|d| d.path == node);
     let Some(mut found) = found else {
@@ -55,6 +63,7 @@ fn device(camera: &CameraConfig) -> Vec<Finding> {
         findings.push(Finding::green("used by", found.users.join(", ")));
     }
     findings.push(format(camera, &found.formats));
+    findings.push(settings(&controls::compare(&file, camera), !found.users.is_empty()));
     let automatic = [("exposure_ms", camera.exposure_ms.is_none()), ("white_balance_k", camera.white_balance_k.is_none())];
     let left: Vec<&str> = automatic.iter().filter(|(_, left)| *left).map(|(name, _)| *name).collect();
     if !left.is_empty() {
@@ -63,6 +72,20 @@ fn device(camera: &CameraConfig) -> Vec<Finding> {
         findings.push(Finding::yellow("automatics", is, "colours and brightness may change during a pour", advice));
     }
     findings
+}
+
+/// Whether the camera's controls are the configured ones; `differ` says where not. The worker sets them when it starts, so before that they may differ.
+fn settings(differ: &[String], used: bool) -> Finding {
+    if differ.is_empty() {
+        return Finding::green("controls", "as configured");
+    }
+    let is = differ.join("; ");
+    if used {
+        let means = "pictures are not as configured, so colours and edges may not be found";
+        Finding::yellow("controls", is, means, "restart the worker, which sets them, and let no other program change them")
+    } else {
+        Finding::green("controls", format!("the worker sets them when it starts: {is}"))
+    }
 }
 
 /// Whether one of the device's formats, a line each, has the size and rate.
@@ -97,6 +120,16 @@ fn format(camera: &CameraConfig, formats: &[String]) -> Finding {
 mod tests {
     use super::*;
     use shared::machine::Verdict;
+
+    /// Protects the colours of a pour: controls that somebody changed while the camera is used are yellow, and those that nobody has set yet are not.
+    #[test]
+    fn controls_that_were_changed_are_named() {
+        let differ = ["camera.gain = 10: the camera has 64".to_owned()];
+        assert_eq!(settings(&[], true).verdict, Verdict::Green);
+        assert_eq!(settings(&differ, false).verdict, Verdict::Green);
+        let used = settings(&differ, true);
+        assert!(used.verdict == Verdict::Yellow && used.is.contains("camera.gain"), "{used:?}");
+    }
 
     /// Protects the operator from a camera that cannot do what is configured: sizes and rates are told apart, in the words of
     /// `feature-worker camera`.

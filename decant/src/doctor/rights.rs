@@ -1,11 +1,15 @@
-//! What the controller may do, or a process of this user if none runs, and whether the cores of the configuration are there.
+//! What the controller may do, or a process of this user if none runs, whether the cores of the configuration are there, and whether a logout takes the
+//! cell's shared memory away.
 //!
 //! Called once by an ordinary thread; allocates; nothing fails.
+
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
 
 use rt_controller::claim;
 use shared::config::Config;
 use shared::machine::{Finding, in_list, read};
-use shared::runtime_dir::Place;
+use shared::runtime_dir::{Place, own_uid};
 
 /// The bit of CAP_IPC_LOCK, which lifts the limit on locked memory (capabilities(7)).
 const CAP_IPC_LOCK: u32 = 14;
@@ -13,6 +17,11 @@ const CAP_IPC_LOCK: u32 = 14;
 const CAP_SYS_NICE: u32 = 23;
 /// Memory that the controller locks, bytes: docs/REALTIME.md measures 18 MiB, and this leaves room.
 const LOCKED_BYTES: u64 = 64 << 20;
+
+/// The largest number of a system's user where /etc/login.defs has no SYS_UID_MAX (its own default).
+const SYS_UID_MAX: u32 = 999;
+/// Where logind's configuration lies, what comes first wins (logind.conf(5)).
+const LOGIND: [&str; 4] = ["/etc/systemd", "/run/systemd", "/usr/local/lib/systemd", "/usr/lib/systemd"];
 
 /// A process whose rights are looked at.
 struct Process {
@@ -48,7 +57,56 @@ impl Process {
 /// Looks at priority, locked memory and cores.
 pub fn look(config: &Config) -> Vec<Finding> {
     let process = Process::of(config);
-    vec![priority(config, &process), memory(&process), cores(config)]
+    vec![priority(config, &process), memory(&process), cores(config), logout(Path::new("/"), own_uid())]
+}
+
+/// Whether logind deletes the files in /dev/shm of the user `uid` at the last logout (RemoveIPC). `root` is the directory that holds /etc, /run and
+/// /var.
+fn logout(root: &Path, uid: u32) -> Finding {
+    let under = |path: &str| root.join(path.trim_start_matches('/'));
+    let text = |path: &str| read(&under(path).to_string_lossy());
+    let defs = text("/etc/login.defs");
+    let value = |line: &str| line.trim().strip_prefix("SYS_UID_MAX").and_then(|n| n.trim().parse().ok());
+    if uid <= defs.lines().find_map(value).unwrap_or(SYS_UID_MAX) {
+        return Finding::green("logout", "this user is a system's user, whose shared memory stays");
+    }
+    if !under("/run/systemd/users").is_dir() {
+        return Finding::green("logout", "logind does not run, so shared memory stays");
+    }
+    if remove_ipc(root).last().is_some_and(|word| ["no", "n", "false", "f", "off", "0"].contains(&word.as_str())) {
+        return Finding::green("logout", "RemoveIPC=no: shared memory stays");
+    }
+    let passwd = text("/etc/passwd");
+    let user = passwd.lines().map(|line| line.split(':').collect::<Vec<_>>()).find(|f| f.get(2).is_some_and(|n| n.parse() == Ok(uid)));
+    let user = user.map_or_else(|| uid.to_string(), |fields| fields[0].to_owned());
+    if under("/var/lib/systemd/linger").join(&user).exists() {
+        return Finding::green("logout", format!("user {user} lingers, so shared memory stays"));
+    }
+    let advice =
+        format!("run the cell by the package's units, or `loginctl enable-linger {user}`, or set RemoveIPC=no in /etc/systemd/logind.conf");
+    let means =
+        "logind then deletes the files in /dev/shm of a cell that this user runs by hand, and no command reaches it any more but `abort`";
+    Finding::yellow("logout", format!("user {user} does not linger, and RemoveIPC is on"), means, advice)
+}
+
+/// The values of RemoveIPC in logind's configuration, the one that counts last.
+fn remove_ipc(root: &Path) -> Vec<String> {
+    let places = LOGIND.map(|place| root.join(place.trim_start_matches('/')));
+    let main = places.iter().map(|place| place.join("logind.conf")).find(|file| file.exists());
+    // Of drop-ins with one name the first place's counts; they are read in the order of their names.
+    let mut more: BTreeMap<_, PathBuf> = BTreeMap::new();
+    for place in places.iter().rev() {
+        for entry in std::fs::read_dir(place.join("logind.conf.d")).into_iter().flatten().flatten() {
+            more.insert(entry.file_name(), entry.path());
+        }
+    }
+    let more = more.into_values().filter(|file| file.extension().is_some_and(|x| x == "conf"));
+    let texts = main.into_iter().chain(more).map(|file| read(&file.to_string_lossy()));
+    let values = |text: String| {
+        let lines = text.lines().filter_map(|l| Some(l.trim().strip_prefix("RemoveIPC")?.trim().strip_prefix('=')?.trim().to_lowercase()));
+        lines.collect::<Vec<_>>()
+    };
+    texts.flat_map(values).collect()
 }
 
 fn priority(config: &Config, process: &Process) -> Finding {
@@ -100,4 +158,38 @@ fn cores(config: &Config) -> Finding {
         return Finding::yellow("cores", is, "the extraction delays the loop", advice);
     }
     Finding::green("cores", is)
+}
+
+#[cfg(test)]
+mod tests {
+    use shared::machine::Verdict;
+
+    use super::*;
+
+    /// Protects a cell that somebody runs by hand over a logout: it is yellow only where logind would delete its shared memory, and says how to keep it.
+    #[test]
+    fn a_logout_that_takes_shared_memory_is_named() {
+        let root = tempfile::tempdir().unwrap();
+        let write = |path: &str, text: &str| {
+            let path = root.path().join(path);
+            std::fs::create_dir_all(path.parent().unwrap()).unwrap();
+            std::fs::write(path, text).unwrap();
+        };
+        let judge = |uid| logout(root.path(), uid);
+        assert_eq!(judge(1000).verdict, Verdict::Green, "no logind runs");
+        std::fs::create_dir_all(root.path().join("run/systemd/users")).unwrap();
+        write("etc/passwd", "root:x:0:0::/:/bin/sh\nada:x:1000:1000::/:/bin/sh\n");
+        write("usr/lib/systemd/logind.conf", "[Login]\n#RemoveIPC=no\n");
+        let found = judge(1000);
+        assert!(found.verdict == Verdict::Yellow && found.advice.contains("enable-linger ada"), "{found:?}");
+        assert_eq!([0, 998].map(|uid| judge(uid).verdict), [Verdict::Green; 2], "a system's users");
+        write("usr/lib/systemd/logind.conf.d/50-lab.conf", "[Login]\nRemoveIPC = no\n");
+        assert_eq!(judge(1000).verdict, Verdict::Green);
+        write("etc/systemd/logind.conf.d/50-lab.conf", "[Login]\nRemoveIPC=yes\n");
+        assert_eq!(judge(1000).verdict, Verdict::Yellow, "the administrator's file counts");
+        write("var/lib/systemd/linger/ada", "");
+        assert_eq!(judge(1000).verdict, Verdict::Green, "who lingers is never logged out");
+        write("etc/login.defs", "# SYS_UID_MAX 5\nSYS_UID_MAX\t\t 500\n");
+        assert_eq!(judge(998).verdict, Verdict::Yellow, "by this machine's own bound, and not lingering");
+    }
 }

@@ -48,7 +48,7 @@ pub fn look(config: &Config) -> Vec<Finding> {
     if named.literal().is_none() {
         findings.push(Finding::green("name", format!("{named} is {address}")));
     }
-    findings.push(program_port(&ports));
+    findings.push(program_port(&ports[..3]));
     findings.push(match &ports[3].1 {
         Ok(()) => Finding::green("RTDE", "port 30004 is open"),
         Err(e) => {
@@ -97,14 +97,15 @@ fn held(running: &Running, place: &Place) -> Finding {
     }
 }
 
-/// One of three ports takes the program.
+/// Whether one of three ports takes the program, and how each of them is.
 fn program_port(ports: &[(u16, Result<(), String>)]) -> Finding {
-    let open: Vec<String> = ports[..3].iter().filter(|(_, answer)| answer.is_ok()).map(|(port, _)| port.to_string()).collect();
+    let each: Vec<String> =
+        ports.iter().map(|(port, answer)| format!("{port} {}", answer.as_ref().map_or_else(String::as_str, |()| "open"))).collect();
     let advice = "enable the secondary client interface (Settings > Security > Services)";
-    if open.is_empty() {
-        Finding::red("program's port", "30001, 30002 and 30003 are closed", "the program cannot be brought to the robot", advice)
+    if ports.iter().all(|(_, answer)| answer.is_err()) {
+        Finding::red("program's port", each.join(", "), "the program cannot be brought to the robot", advice)
     } else {
-        Finding::green("program's port", format!("open: {}", open.join(", ")))
+        Finding::green("program's port", each.join(", "))
     }
 }
 
@@ -190,6 +191,18 @@ mod tests {
     use shared::machine::Verdict;
 
     use super::*;
+
+    /// Protects who opens a firewall: any one of the three ports is enough, and each is told as it is.
+    #[test]
+    fn each_port_is_told() {
+        let ports = |answers: [Result<(), &str>; 3]| {
+            let each = PORTS.iter().zip(answers).map(|(port, answer)| (*port, answer.map_err(String::from)));
+            program_port(&each.collect::<Vec<_>>())
+        };
+        let one = ports([Err("refused"), Ok(()), Err("timed out")]);
+        assert_eq!((one.verdict, one.is.as_str()), (Verdict::Green, "30001 refused, 30002 open, 30003 timed out"));
+        assert_eq!(ports([Err("refused"); 3]).verdict, Verdict::Red);
+    }
 
     /// Protects the doctor from what else may listen at a robot's address: what hangs up without an answer is no dashboard that is in order, and what sends
     /// bytes without end neither holds it nor fills its memory.

@@ -129,11 +129,22 @@ fn times(page: &mut Page, name: &str, help: &str, histogram: &Histogram) -> std:
 
 /// How far the weighed pours were from their goals.
 fn weighed(page: &mut Page, pours: &[Pour]) -> std::fmt::Result {
-    let ml = || Unit::Other("ml".into());
-    let errors = pours.iter().map(|p| (p.error_ml().abs(), 1));
-    page.histogram("decant_weighed_error", "Distance of weighed pours from their goals, of the newest episodes", ml(), &ERRORS_ML, errors)?;
+    // Rounding must not lift a value over the edge that it lies on.
+    let within = |edge_ml: f64| pours.iter().filter(|p| p.error_ml().abs() <= edge_ml * (1.0 + 1e-9)).count() as f64;
+    let edges = ERRORS_ML.iter().map(|edge_ml| (format!("{edge_ml:?}"), within(*edge_ml)));
+    let edges: Vec<(String, f64)> = edges.chain([("+Inf".into(), pours.len() as f64)]).collect();
+    let edges: Vec<(&str, f64)> = edges.iter().map(|(le, n)| (le.as_str(), *n)).collect();
+    // Old episodes leave the newest ones, so these fall too, which a histogram must not.
+    page.gauges(
+        "decant_weighed_pours",
+        "Weighed pours of the newest episodes that were at most le ml off their goals. Those that were cut short are left out, but for what ended \
+         while this program or the controller did not run",
+        None,
+        "le",
+        &edges,
+    )?;
     let newest = pours.last().map_or(f64::NAN, |p| p.error_ml());
-    page.gauge("decant_newest_weighed_error", "What the newest weighed pour had beyond its goal", Some(ml()), newest)
+    page.gauge("decant_newest_weighed_error", "What the newest weighed pour had beyond its goal", Some(Unit::Other("ml".into())), newest)
 }
 
 /// Writes metrics. A value that is no number is left out.
@@ -190,5 +201,25 @@ impl Page<'_> {
         }
         let mut metric = self.0.encode_descriptor(name, help, Some(&unit), MetricType::Histogram)?;
         metric.encode_histogram::<NoLabelSet>(sum, count, &buckets, None)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Protects what is computed of the errors: old episodes leave the newest ones, so the counts of weighed pours fall too, and must be gauges. A pour on
+    /// an edge is within it.
+    #[test]
+    fn what_may_fall_is_a_gauge() {
+        let pour = |weight_g| Pour { goal_ml: 50.0, weight_g };
+        let weighed = vec![pour(50.2), pour(47.0), pour(120.0)];
+        let seen = Seen { cell: "lab".into(), status: None, ended: BTreeMap::new(), weighed, free_bytes: Vec::new() };
+        let text = text(seen).unwrap();
+        assert!(text.contains("# TYPE decant_weighed_pours gauge\n") && !text.contains(" histogram\n"), "{text}");
+        for (le, n) in [("0.5", "1.0"), ("2.0", "1.0"), ("3.0", "2.0"), ("50.0", "2.0"), ("+Inf", "3.0")] {
+            let line = format!("decant_weighed_pours{{cell=\"lab\",le=\"{le}\"}} {n}\n");
+            assert!(text.contains(&line), "{line}: {text}");
+        }
     }
 }

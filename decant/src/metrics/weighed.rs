@@ -3,20 +3,20 @@
 //! A thread of its own reads each episode once, and again when its file has changed; it allocates and waits for the disk. A file that cannot be
 //! read is left out.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, Ordering::Relaxed};
 use std::sync::{Mutex, PoisonError};
 use std::time::{Duration, SystemTime};
 
-use shared::episode::{Episode, EpisodeKind, by_number, find_episodes};
+use shared::episode::{Episode, EpisodeKind, by_number, find_episodes, number_of};
 
 /// Pause between two looks at the episodes. Chosen by hand: weighing takes a person longer.
 const LOOK: Duration = Duration::from_secs(10);
 /// How long one sleep lasts, so that a request to end is seen. Chosen by hand; no measurement is recorded.
 const BEAT: Duration = Duration::from_millis(100);
 /// Number of newest episodes that are looked at. Chosen by hand: a lab's weeks, and some seconds to read.
-const EPISODES: usize = 300;
+pub const EPISODES: usize = 300;
 
 /// One pour that was weighed.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -42,10 +42,11 @@ type Stamp = (Option<SystemTime>, u64);
 pub struct Weighed(Mutex<BTreeMap<PathBuf, (Stamp, Option<Pour>)>>);
 
 impl Weighed {
-    /// The weighed pours, the oldest first.
-    pub fn pours(&self) -> Vec<Pour> {
+    /// The weighed pours but for those whose numbers are in `cut_short`, the oldest first.
+    pub fn pours(&self, cut_short: &BTreeSet<u64>) -> Vec<Pour> {
         let known = self.0.lock().unwrap_or_else(PoisonError::into_inner);
-        let mut pours: Vec<(&PathBuf, Pour)> = known.iter().filter_map(|(path, (_, pour))| Some((path, (*pour)?))).collect();
+        let full = known.iter().filter(|(path, _)| !number_of(path).is_some_and(|number| cut_short.contains(&number)));
+        let mut pours: Vec<(&PathBuf, Pour)> = full.filter_map(|(path, (_, pour))| Some((path, (*pour)?))).collect();
         pours.sort_by(|(a, _), (b, _)| by_number(a, b));
         pours.into_iter().map(|(_, pour)| pour).collect()
     }
@@ -116,7 +117,9 @@ mod tests {
         }
         let weighed = Weighed::default();
         weighed.look(dir.path(), &AtomicBool::new(false));
-        let newest: Vec<f64> = weighed.pours().into_iter().map(Pour::error_ml).collect();
-        assert_eq!(newest, [1.0, 2.0]);
+        let errors_ml =
+            |cut_short: &[u64]| weighed.pours(&cut_short.iter().copied().collect()).into_iter().map(Pour::error_ml).collect::<Vec<_>>();
+        assert_eq!(errors_ml(&[]), [1.0, 2.0]);
+        assert_eq!(errors_ml(&[10_000, 7]), [1.0], "one that was stopped is no error");
     }
 }

@@ -36,9 +36,10 @@ fn episodes(directory: &Path) -> impl Iterator<Item = (PathBuf, Metadata)> {
 }
 
 /// Size of the episodes of `directory` that were recorded within the last [`DAY`], bytes. A weight, a note or a copy gives an old episode's file a new
-/// time, so what is in the file counts; only one that does not say it counts by the file's time.
+/// time, so what is in the file counts; only one that does not say it counts by the file's time. A time in the future, from a clock that went wrong, is
+/// none of today.
 pub fn recorded_today(directory: &Path) -> u64 {
-    let is_today = |at: SystemTime| SystemTime::now().duration_since(at).unwrap_or_default() < DAY;
+    let is_today = |at: SystemTime| SystemTime::now().duration_since(at).is_ok_and(|age| age < DAY);
     let new = |(path, meta): &(PathBuf, Metadata)| meta.modified().is_ok_and(is_today) && began_at(path).is_none_or(is_today);
     episodes(directory).filter(new).map(|(_, meta)| meta.len()).sum()
 }
@@ -111,6 +112,11 @@ mod tests {
             let file = std::fs::File::options().write(true).open(dir.path().join(name)).unwrap();
             file.set_modified(SystemTime::now() - DAY * days as u32).unwrap();
         };
+        write("tomorrow.mcap", 0);
+        let tomorrow = std::fs::File::options().append(true).open(dir.path().join("tomorrow.mcap")).unwrap();
+        tomorrow.set_modified(SystemTime::now() + DAY).unwrap();
+        assert_eq!(recorded_today(dir.path()), 0, "a clock that went wrong");
+        std::fs::remove_file(dir.path().join("tomorrow.mcap")).unwrap();
         for (name, days) in [("a.mcap", 0), ("b.mcap", 3), ("c.mcap", 0), ("notes.txt", 0)] {
             write(name, days);
         }

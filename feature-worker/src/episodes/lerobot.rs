@@ -1,9 +1,9 @@
 //! Writes episodes as one data set in the layout of LeRobot v3.0 (info.json, stats.json, Parquet tables, MP4 videos).
 //!
 //! What a policy sees is `observation.state` (measured alpha and V_e) and `observation.images.camera`. What was done is `action`, the commanded
-//! alpha and its rate. `known` says of each row whether the frame is there, and whether alpha and V_e were measured; where not, they are filled
-//! with the value before. No number is NaN. LeRobot's clock is exact, `frame_index / fps`, so a lost frame becomes a row with the image of the
-//! frame before it. Each episode has its own video, and its own statistics, from which LeRobot makes those of parts. The weight is an extra
+//! alpha and its rate. `known` says of each row whether its image is its own, and whether alpha and V_e were measured; where not, they are filled
+//! with the value before. No number is NaN. LeRobot's clock is exact, `frame_index / fps`, so a frame that was lost becomes a row with the image of
+//! the frame before it, as does one whose image was dropped. Each episode has its own video, and its own statistics, from which LeRobot makes those of parts. The weight is an extra
 //! column of the episodes' table, null where there is none. It runs on the command's thread and allocates: it holds the rows of all episodes,
 //! but only one image at a time. Nothing that exists is overwritten. `scripts/check-lerobot` trains and edits with LeRobot itself.
 
@@ -33,7 +33,7 @@ const FILES_A_CHUNK: usize = 1000;
 /// Of this many images, one enters the images' statistics. Chosen by hand: neighbouring images are nearly the same.
 const IMAGE_STEP: usize = 10;
 
-/// The part by which an episode's rate may differ from the data set's. Chosen by hand: the rates of one camera scatter less, and the usual rates
+/// The part by which an episode's rate may differ from the data set's, and the data set's from a whole number. Chosen by hand: the rates of one camera scatter less, and the usual rates
 /// (24, 25, 30, 60) differ by more.
 const RATE_TOLERANCE: f64 = 0.03;
 
@@ -89,6 +89,14 @@ impl DataSet {
             return Err(unfit(
                 file,
                 format!("it has {own_hz:.1} frames a second, and the data set {set_hz:.1}; export it into another one"),
+            ));
+        }
+        if (self.fps / self.rate_hz - 1.0).abs() > RATE_TOLERANCE {
+            // LeRobot's rate is a whole number, and with another one all its times and rates would be wrong.
+            let (set_hz, fps) = (self.rate_hz, self.fps);
+            return Err(unfit(
+                file,
+                format!("the data set has {set_hz:.1} frames a second, which LeRobot would show as {fps}; record at a whole number"),
             ));
         }
         let number = self.list.length.len();
@@ -249,7 +257,7 @@ impl DataTable {
                 area_px2 = row.area_px2;
             }
             self.state.extend([alpha_deg.unwrap_or(row.alpha_commanded_deg), area_px2]);
-            self.known.extend([!row.lost, alpha_known, area_known]);
+            self.known.extend([row.image, alpha_known, area_known]);
             self.action.extend([row.alpha_commanded_deg, rate_deg_per_s(&episode.rows, n)]);
             self.timestamp.push((n as f64 / fps) as f32);
             self.frame_index.push(n as i64);

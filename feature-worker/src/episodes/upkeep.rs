@@ -4,14 +4,13 @@
 //! a regular file of its own name, and not under way: the recorder holds a lock on the file that it writes. Copies are compared with the
 //! original before they get their name, and never take the place of a file. A failure names its file, and leaves the rest as it is.
 
-use std::cmp::Ordering;
+use std::collections::BTreeMap;
 use std::fs;
 use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
 
 use sha2::{Digest, Sha256};
-use shared::config_paths::is_same;
-use shared::episode::{Episode, by_number, hex, read_at_rest, take_number};
+use shared::episode::{Episode, by_number, find_episodes, hex, number_of, read_at_rest, take_number};
 use shared::{regular_file, whole_file};
 
 use super::folder::{Budget, Folder};
@@ -59,15 +58,30 @@ pub fn delete(found: &Found) -> Result<(), ExportError> {
     fs::remove_file(&found.path).map_err(|e| fail(&e))
 }
 
-/// The oldest first. Of those that a clock which stands still gives one time, the number says which is older.
-fn by_age(a: &Found, b: &Found) -> Ordering {
-    a.episode.info.started_at_utc.cmp(&b.episode.info.started_at_utc).then_with(|| by_number(&a.path, &b.path))
+/// Places in `found`, the oldest first. Within one directory the numbers say which is older: they only grow, and a wall clock may go back. So an
+/// episode counts as begun no sooner than those of its directory with a smaller number. Where there is no number, the time alone counts.
+fn by_age(found: &[Found]) -> Vec<usize> {
+    let directory = |f: &Found| f.path.parent().map(|d| d.canonicalize().unwrap_or(d.to_path_buf()));
+    let mut order: Vec<_> = (0..found.len()).map(|i| (directory(&found[i]), number_of(&found[i].path), i)).collect();
+    order.sort_by(|a, b| (&a.0, a.1).cmp(&(&b.0, b.1)));
+    let mut began = vec![""; found.len()];
+    let mut before: Option<(&Option<PathBuf>, &str)> = None;
+    for (directory, number, i) in &order {
+        began[*i] = found[*i].episode.info.started_at_utc.as_str();
+        if number.is_some() {
+            let latest = before.filter(|(d, _)| *d == directory).map_or("", |(_, at)| at);
+            began[*i] = began[*i].max(latest);
+            before = Some((directory, began[*i]));
+        }
+    }
+    let mut oldest_first: Vec<usize> = (0..found.len()).collect();
+    oldest_first.sort_by(|i, j| began[*i].cmp(began[*j]).then_with(|| by_number(&found[*i].path, &found[*j].path)));
+    oldest_first
 }
 
 /// Whether what is `beside` and cannot go breaks `budget` although of `found` only the newest stayed. No deletion helps there.
 pub fn is_out_of_reach(found: &[Found], beside: Folder, budget: Budget) -> bool {
-    let newest = found.iter().max_by(|a, b| by_age(a, b));
-    let (episodes, bytes) = newest.map_or((0, 0), |f| (1, f.bytes));
+    let (episodes, bytes) = by_age(found).last().map_or((0, 0), |newest| (1, found[*newest].bytes));
     beside.episodes > 0 && !budget.holds(beside.episodes + episodes, beside.bytes + bytes)
 }
 
@@ -78,8 +92,7 @@ pub fn to_prune(found: &[Found], beside: Folder, budget: Budget, weighed: bool) 
     if is_out_of_reach(found, beside, budget) {
         return Vec::new();
     }
-    let mut order: Vec<usize> = (0..found.len()).collect();
-    order.sort_by(|i, j| by_age(&found[*i], &found[*j]));
+    let mut order = by_age(found);
     order.pop();
     let rank = |i: &usize| match (&found[*i].episode.weight_g, found[*i].episode.complete) {
         (Some(_), _) => 2,
@@ -134,10 +147,7 @@ fn distinct(files: &[PathBuf], copied: &mut Copied) -> Result<Vec<(PathBuf, Epis
         if says(&other) > says(kept) {
             std::mem::swap(kept, &mut other);
         }
-        let weights = match (other.1.weight_g, kept.1.weight_g) {
-            (Some(left), Some(taken)) if left != taken => format!(", whose weight is {taken} g and not {left} g"),
-            _ => String::new(),
-        };
+        let weights = other_weight(other.1.weight_g, kept.1.weight_g);
         copied.left_out.push(left_out(&other.0, format!("the same measurement as {}{weights}", kept.0.display())));
     }
     if all.is_empty() && copied.left_out.is_empty() {
@@ -146,17 +156,29 @@ fn distinct(files: &[PathBuf], copied: &mut Copied) -> Result<Vec<(PathBuf, Epis
     Ok(all)
 }
 
-/// Copies all episodes of `files` into the directory `to`, in the order of their start, each with the next number that is free there. What lies there
-/// already is left out.
+/// What is to be said where of one measurement the weight `left_g` stays behind, and `taken_g` is the other file's.
+fn other_weight(left_g: Option<f64>, taken_g: Option<f64>) -> String {
+    match (left_g, taken_g) {
+        (Some(left), Some(taken)) if left != taken => format!(", whose weight is {taken} g and not {left} g"),
+        (Some(left), None) => format!(", which is not weighed: here it is {left} g"),
+        _ => String::new(),
+    }
+}
+
+/// Copies all episodes of `files` into the directory `to`, in the order of their start, each with the next number that is free there. A measurement that
+/// lies there already, under whatever name, is left out.
 pub fn merge(files: &[PathBuf], to: &Path) -> Result<Copied, ExportError> {
     let mut copied = Copied::default();
     let mut all = distinct(files, &mut copied)?;
     all.sort_by(|a, b| a.1.info.started_at_utc.cmp(&b.1.info.started_at_utc));
-    let lies_there =
-        |file: &Path| std::path::absolute(file).is_ok_and(|file| file.parent().is_some_and(|directory| is_same(directory, to)));
+    let there = if to.is_dir() { find_episodes(&[to.to_path_buf()])? } else { Vec::new() };
+    // What cannot be read there is nobody's measurement.
+    let there = there.into_iter().filter_map(|file| Some((Episode::read(&file).ok()?, file)));
+    let there: BTreeMap<_, _> = there.map(|(episode, file)| (episode.content_sha256(), (file, episode.weight_g))).collect();
     for (file, episode) in all {
-        if lies_there(&file) {
-            copied.left_out.push(left_out(&file, "it lies there already"));
+        if let Some((other, weight_g)) = there.get(&episode.content_sha256()) {
+            let weights = other_weight(episode.weight_g, *weight_g);
+            copied.left_out.push(left_out(&file, format!("it lies there already, as {}{weights}", other.display())));
             continue;
         }
         let number = take_number(to).map_err(|e| disk_error(to, &e))?;

@@ -1,7 +1,7 @@
 //! The controls of a V4L2 device that `[camera]` sets: exposure, gain, white balance, focus, and the mains' frequency.
 //!
 //! Called once at the start, on the thread that opens the camera; allocates. What is set is read back, and what differs is a refusal with its
-//! reason. OpenCV has no property for the mains' frequency and none for a control's range, so V4L2 is asked by way of `v4l2r`; the frames
+//! reason. `decant doctor` compares and sets nothing. OpenCV has no property for the mains' frequency and none for a control's range, so V4L2 is asked by way of `v4l2r`; the frames
 //! stay OpenCV's.
 
 use std::fs::File;
@@ -144,12 +144,58 @@ pub struct Outcome {
     pub refused: Vec<String>,
 }
 
+/// The settings of [`KEYS`].
+fn settings(camera: &CameraConfig) -> impl Iterator<Item = (&'static Key, Option<Setting>)> {
+    KEYS.iter().zip([camera.exposure_ms, camera.gain, camera.white_balance_k, camera.focus])
+}
+
+/// Where the device's controls are not what `camera` names, a line each. Nothing is set.
+pub fn compare(device: &impl Controls, camera: &CameraConfig) -> Vec<String> {
+    let mut differ = Vec::new();
+    for (key, setting) in settings(camera) {
+        let (name, Some(setting)) = (key.name, setting) else { continue };
+        if let Some((id, off)) = key.automatic
+            && device.query(id).is_some()
+            && device.get(id) != Ok(off)
+        {
+            differ.push(format!("camera.{name}: its automatic is on"));
+        }
+        let Setting::Value(value) = setting else { continue };
+        let wanted = (value * key.factor).round() as i32;
+        match (device.query(key.id), device.get(key.id)) {
+            (None, _) => differ.push(format!("camera.{name}: the camera has no such control")),
+            (Some(control), Ok(has)) if (has - wanted).abs() >= control.step.max(1) => {
+                differ.push(format!("camera.{name} = {value}: the camera has {}", f64::from(has) / key.factor));
+            }
+            (Some(_), Ok(_)) => {}
+            (Some(_), Err(e)) => differ.push(format!("camera.{name} cannot be read ({e})")),
+        }
+    }
+    if let Some(Setting::Value(hertz)) = camera.mains_hz {
+        match device.get(v4l2::V4L2_CID_POWER_LINE_FREQUENCY) {
+            Ok(has) if mains_code(hertz) == has => {}
+            Ok(has) => differ.push(format!("camera.mains_hz = {hertz}: the camera has {}", mains_word(has))),
+            Err(e) => differ.push(format!("camera.mains_hz cannot be read ({e})")),
+        }
+    }
+    differ
+}
+
+/// V4L2's number of a mains' frequency.
+fn mains_code(hertz: f64) -> i32 {
+    [0.0, 50.0, 60.0].iter().position(|hz| *hz == hertz).unwrap_or(0) as i32
+}
+
+/// The word for V4L2's number of a mains' frequency: off, 50 Hz, 60 Hz, automatic.
+fn mains_word(code: i32) -> &'static str {
+    ["0", "50", "60", "automatic"].get(code as usize).copied().unwrap_or("unknown")
+}
+
 /// Sets the controls that `camera` names, and reads them back.
 pub fn apply(device: &mut impl Controls, camera: &CameraConfig) -> Outcome {
     let mut outcome = Outcome::default();
-    let settings = [camera.exposure_ms, camera.gain, camera.white_balance_k, camera.focus];
     let mut alone = Vec::new();
-    for (key, setting) in KEYS.iter().zip(settings) {
+    for (key, setting) in settings(camera) {
         match setting {
             Some(setting) => match set(device, key, setting) {
                 Ok(said) => outcome.said.push(said),
@@ -219,23 +265,20 @@ fn set_mains(device: &mut impl Controls, setting: Setting) -> Result<String, Str
     if device.query(id).is_none() {
         return Err("camera.mains_hz: the camera has no such control; leave the key out".into());
     }
-    // V4L2's menu: off, 50 Hz, 60 Hz, automatic.
-    let hertz = ["0", "50", "60", "automatic"];
     let read = |device: &mut dyn FnMut() -> Result<i32, String>| device().map_err(|e| format!("camera.mains_hz cannot be read back ({e})"));
     let wanted = match setting {
-        Setting::Value(value) => [0.0, 50.0, 60.0].iter().position(|hz| *hz == value).unwrap_or(0) as i32,
+        Setting::Value(value) => mains_code(value),
         Setting::Locked(_) => read(&mut || device.get(id))?,
     };
-    let word = |v: i32| hertz.get(v as usize).copied().unwrap_or("unknown");
     if matches!(setting, Setting::Locked(_)) && wanted == 3 {
         return Err("camera.mains_hz = \"locked\": it is automatic now; write 50 or 60".into());
     }
-    device.set(id, wanted).map_err(|e| format!("camera.mains_hz = {}: refused ({e})", word(wanted)))?;
+    device.set(id, wanted).map_err(|e| format!("camera.mains_hz = {}: refused ({e})", mains_word(wanted)))?;
     let got = read(&mut || device.get(id))?;
     if got != wanted {
-        return Err(format!("camera.mains_hz = {}: the camera took {} instead", word(wanted), word(got)));
+        return Err(format!("camera.mains_hz = {}: the camera took {} instead", mains_word(wanted), mains_word(got)));
     }
-    Ok(format!("mains_hz = {}", word(got)))
+    Ok(format!("mains_hz = {}", mains_word(got)))
 }
 
 #[cfg(test)]
@@ -329,5 +372,33 @@ mod tests {
         let locked = Some(Setting::Locked(Locked::Locked));
         let mains = said(&mut automatic, CameraConfig { mains_hz: locked, ..CameraConfig::default() });
         assert!(mains.contains("write 50 or 60"), "{mains}");
+    }
+
+    /// Protects the colours that were learned: whoever looks before a pour is told where the camera's controls are not the configured ones, and nothing is
+    /// set. After the worker has set them there is nothing to tell.
+    #[test]
+    fn what_differs_is_told_and_left() {
+        let value = |v: f64| Some(Setting::Value(v));
+        let config = CameraConfig {
+            exposure_ms: value(10.0),
+            gain: value(64.0),
+            white_balance_k: Some(Setting::Locked(Locked::Locked)),
+            mains_hz: value(50.0),
+            ..CameraConfig::default()
+        };
+        let mut device = camera();
+        let told = compare(&device, &config);
+        let expected = [
+            "camera.exposure_ms: its automatic is on",
+            "camera.exposure_ms = 10: the camera has 15.6",
+            "camera.white_balance_k: its automatic is on",
+            "camera.mains_hz = 50: the camera has 60",
+        ];
+        assert_eq!(told, expected);
+        assert_eq!(device.controls, camera().controls, "nothing is set");
+        assert!(apply(&mut device, &config).refused.is_empty());
+        assert_eq!(compare(&device, &config), [""; 0]);
+        let focus = CameraConfig { focus: value(3.0), ..CameraConfig::default() };
+        assert_eq!(compare(&device, &focus), ["camera.focus: the camera has no such control"]);
     }
 }

@@ -50,6 +50,9 @@ pub struct Args {
     /// The cell's configuration.
     #[arg(long, env = shared::config::VARIABLE, default_value = shared::config::DEFAULT_FILE)]
     config: PathBuf,
+    /// Print only what keeps the controller from working.
+    #[arg(long, short)]
+    quiet: bool,
 }
 
 /// Runs the command.
@@ -67,7 +70,11 @@ pub fn run(args: &Args) -> Result<(), Failure> {
     // This comes before the threads are made, so that everything that they need is in memory before the loop starts.
     let unlocked = os::lock_memory().err();
     let speaker = Speaker::start("rt-controller");
-    let say = |level: Level, text: &str| speaker.say(level, text);
+    let say = |level: Level, text: &str| {
+        if !args.quiet || level != Level::Info {
+            speaker.say(level, text);
+        }
+    };
     unlocked.iter().for_each(|line| say(Level::Warning, line));
     let _awake = os::stay_awake().map_err(|line| say(Level::Warning, &line));
     let result = start(&config, &args.config, &stop, &say, &speaker);

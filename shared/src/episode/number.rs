@@ -79,7 +79,7 @@ fn highest(directory: &Path, depth: usize) -> Result<u64> {
     let mut found = 0;
     for entry in std::fs::read_dir(directory)? {
         let entry = entry?;
-        found = found.max(number_in(&entry.file_name().to_string_lossy()));
+        found = found.max(number_of(Path::new(&entry.file_name())).unwrap_or(0));
         if depth > 0 && entry.file_type()?.is_dir() {
             // A folder that may not be read holds nothing that could be overwritten here.
             found = found.max(highest(&entry.path(), depth - 1).unwrap_or(0));
@@ -88,10 +88,11 @@ fn highest(directory: &Path, depth: usize) -> Result<u64> {
     Ok(found)
 }
 
-/// The number that a file's name says; 0 if it says none.
-fn number_in(name: &str) -> u64 {
-    let digits: String = name.strip_prefix("episode-").unwrap_or_default().chars().take_while(char::is_ascii_digit).collect();
-    digits.parse().ok().filter(|n| *n <= LARGEST).unwrap_or(0)
+/// The number that an episode's file has by its name; `None` if it has none.
+pub fn number_of(file: &Path) -> Option<u64> {
+    let name = file.file_name()?.to_string_lossy();
+    let digits: String = name.strip_prefix("episode-")?.chars().take_while(char::is_ascii_digit).collect();
+    digits.parse().ok().filter(|n| *n <= LARGEST)
 }
 
 #[cfg(test)]

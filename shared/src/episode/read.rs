@@ -143,6 +143,7 @@ impl Contents {
                         area_px2: f32::NAN,
                         doubt: Doubt::None,
                         lost: true,
+                        image: false,
                     });
                 }
             }
@@ -155,6 +156,7 @@ impl Contents {
                 area_px2: if doubt.usable(frame.area_px2) { frame.area_px2 } else { f32::NAN },
                 doubt,
                 lost: false,
+                image: frame.image,
             });
         }
         Ok(rows)

@@ -23,8 +23,8 @@ use crate::{regular_file, whole_file};
 /// Number of bytes that are written at a time. Chosen by hand; no measurement is recorded.
 const WRITE_BYTES: usize = 1 << 20;
 
-/// A file without its end that changed more recently than this counts as under way, also where the file system has no locks. Chosen by hand:
-/// the recorder writes twice a second.
+/// Where the file system has no locks, a file without its end that changed more recently than this counts as under way. Chosen by hand: the recorder
+/// writes twice a second.
 const UNDER_WAY: Duration = Duration::from_secs(60);
 /// How often a file's lock is tried. Chosen by hand: a program that the recorder's process starts holds all its locks for a moment, until it runs.
 const LOCK_TRIES: u32 = 20;
@@ -107,15 +107,16 @@ fn at_rest(path: &Path, lock: impl Fn(&File) -> Result<(), TryLockError>) -> Res
         std::thread::sleep(LOCK_PAUSE);
         tries -= 1;
     };
-    match locked {
-        Ok(()) => {}
+    let has_locks = match locked {
+        Ok(()) => true,
         Err(TryLockError::WouldBlock) => return Err(ChangeError::UnderWay { file: file() }),
-        Err(TryLockError::Error(e)) if e.kind() == ErrorKind::Unsupported => {}
+        Err(TryLockError::Error(e)) if e.kind() == ErrorKind::Unsupported => false,
         Err(TryLockError::Error(e)) => return Err(unread(e).into()),
-    }
+    };
     let episode = Episode::read(path)?;
-    let age = meta.modified().ok().and_then(|t| SystemTime::now().duration_since(t).ok()).unwrap_or_default();
-    if episode.info.ended.is_empty() && age < UNDER_WAY {
+    // A time in the future tells of a clock that went wrong, and not of a recorder at work.
+    let is_recent = || meta.modified().is_ok_and(|at| SystemTime::now().duration_since(at).is_ok_and(|age| age < UNDER_WAY));
+    if !has_locks && episode.info.ended.is_empty() && is_recent() {
         return Err(ChangeError::MayBeUnderWay { file: file() });
     }
     Ok((episode, meta, opened))
@@ -228,4 +229,37 @@ fn copy_record(record: Record, to: &mut Writer<BufWriter<File>>, without: Option
         other => return Err(format!("unexpected record with opcode {:#04x}", other.opcode())),
     };
     Ok(written)
+}
+
+#[cfg(test)]
+mod tests {
+    use std::time::UNIX_EPOCH;
+
+    use super::*;
+    use crate::config::Config;
+    use crate::episode::{EpisodeKind, EpisodeStart, EpisodeWriter, FrameRow};
+    use crate::messages::Feature;
+
+    /// Protects episodes under way where the file system has no locks: one without its end that has just changed is left alone, and later it is nobody's.
+    /// A time from tomorrow, by a clock that went wrong, does not keep it from people until then.
+    #[test]
+    fn without_locks_the_time_of_the_last_change_decides() {
+        let config = Config::read(&Path::new(env!("CARGO_MANIFEST_DIR")).join("../config/sim.toml")).unwrap();
+        let dir = tempfile::tempdir().unwrap();
+        let kind = EpisodeKind::Pour { goal_ml: 50.0 };
+        let start = EpisodeStart { episode: 1, kind, started_at_ns: 1, wall_clock: UNIX_EPOCH, config: &config, weights: "" };
+        let mut writer = EpisodeWriter::create(dir.path(), &start).unwrap();
+        let feature = Feature { captured_at_ns: 2, sequence: 1, ..Default::default() };
+        writer.frame(&FrameRow { feature: &feature, alpha_commanded_deg: 0.0, alpha_measured_deg: 0.0, image: None }).unwrap();
+        writer.flush().unwrap();
+        let path = writer.path().to_path_buf();
+        drop(writer);
+        let look = || at_rest(&path, |_| Err(TryLockError::Error(ErrorKind::Unsupported.into())));
+        assert!(matches!(look(), Err(ChangeError::MayBeUnderWay { .. })));
+        let file = File::options().append(true).open(&path).unwrap();
+        for changed in [SystemTime::now() - 2 * UNDER_WAY, SystemTime::now() + 1000 * UNDER_WAY] {
+            file.set_modified(changed).unwrap();
+            assert!(look().is_ok(), "{changed:?}");
+        }
+    }
 }

@@ -32,6 +32,8 @@ pub struct EpisodeRow {
     pub doubt: Doubt,
     /// Whether the frame was never measured, because the camera or the worker dropped it; in tables, whether its area is missing.
     pub lost: bool,
+    /// Whether the frame's picture was recorded; a slow disk drops the picture of a frame that is measured. In tables there are none.
+    pub image: bool,
 }
 
 /// Counts the frames of a file that are there, and those that are lost between them.

@@ -232,6 +232,7 @@ fn episode_row(sequence: u64, t_s: f64, alpha_deg: f32, area_px2: f32) -> Episod
         area_px2,
         doubt: Doubt::None,
         lost: area_px2.is_nan(),
+        image: false,
     }
 }
 
