@@ -1,10 +1,11 @@
 //! The controls of a V4L2 device that `[camera]` sets: exposure, gain, white balance, focus, and the mains' frequency.
 //!
 //! Called once at the start, on the thread that opens the camera; allocates. What is set is read back, and what differs is a refusal with its
-//! reason. OpenCV has no property for the mains' frequency and none for a control's range, so V4L2 is asked by way of `v4l2r`; the frames
+//! reason. What is to be locked is first found by the camera's automatics, for which frames must flow. OpenCV has no property for the mains' frequency and none for a control's range, so V4L2 is asked by way of `v4l2r`; the frames
 //! stay OpenCV's.
 
 use std::fs::File;
+use std::time::{Duration, Instant};
 
 use shared::config::{CameraConfig, Setting};
 use v4l2r::bindings as v4l2;
@@ -14,6 +15,13 @@ use v4l2r::ioctl::{CtrlId, QueryCtrlFlags, g_ctrl, queryctrl, s_ctrl};
 const EXPOSURE_UNIT_MS: f64 = 0.1;
 /// V4L2's "manual mode" of the automatic exposure. (An enumeration of the kernel's interface.)
 const EXPOSURE_MANUAL: i32 = 1;
+/// V4L2's automatic modes of the exposure: with a fixed aperture, as webcams have it, and with both automatic. (An enumeration of the kernel's
+/// interface.)
+const EXPOSURE_AUTOMATIC: [i32; 2] = [3, 0];
+/// The longest that automatics are waited for. Chosen by hand: those of webcams take a second.
+pub const SETTLE_MOST: Duration = Duration::from_secs(2);
+/// Frames between two looks at what the automatics have found. Chosen by hand: an automatic that works moves in a third of a second.
+const LOOK_FRAMES: u32 = 10;
 
 /// What a device says of one control.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -113,6 +121,8 @@ struct Key {
     id: u32,
     /// The automatic's control, and its value for "off".
     automatic: Option<(u32, i32)>,
+    /// The automatic's values for "on", the usual one first.
+    on: &'static [i32],
     /// V4L2's value of a unit of the configuration.
     factor: f64,
 }
@@ -123,16 +133,18 @@ const KEYS: [Key; 4] = [
         name: "exposure_ms",
         id: v4l2::V4L2_CID_EXPOSURE_ABSOLUTE,
         automatic: Some((v4l2::V4L2_CID_EXPOSURE_AUTO, EXPOSURE_MANUAL)),
+        on: &EXPOSURE_AUTOMATIC,
         factor: 1.0 / EXPOSURE_UNIT_MS,
     },
-    Key { name: "gain", id: v4l2::V4L2_CID_GAIN, automatic: Some((v4l2::V4L2_CID_AUTOGAIN, 0)), factor: 1.0 },
+    Key { name: "gain", id: v4l2::V4L2_CID_GAIN, automatic: Some((v4l2::V4L2_CID_AUTOGAIN, 0)), on: &[1], factor: 1.0 },
     Key {
         name: "white_balance_k",
         id: v4l2::V4L2_CID_WHITE_BALANCE_TEMPERATURE,
         automatic: Some((v4l2::V4L2_CID_AUTO_WHITE_BALANCE, 0)),
+        on: &[1],
         factor: 1.0,
     },
-    Key { name: "focus", id: v4l2::V4L2_CID_FOCUS_ABSOLUTE, automatic: Some((v4l2::V4L2_CID_FOCUS_AUTO, 0)), factor: 1.0 },
+    Key { name: "focus", id: v4l2::V4L2_CID_FOCUS_ABSOLUTE, automatic: Some((v4l2::V4L2_CID_FOCUS_AUTO, 0)), on: &[1], factor: 1.0 },
 ];
 
 /// What came of setting the controls, a line each.
@@ -144,12 +156,73 @@ pub struct Outcome {
     pub refused: Vec<String>,
 }
 
+/// What a camera's automatics have found.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct Found {
+    /// The keys of `[camera]` with their values; what the device has not, or refuses, is not among them.
+    pub values: Vec<(&'static str, f64)>,
+    /// What came of setting these.
+    pub outcome: Outcome,
+}
+
+/// What `camera` says of each of [`KEYS`].
+fn settings(camera: &CameraConfig) -> [Option<Setting>; KEYS.len()] {
+    [camera.exposure_ms, camera.gain, camera.white_balance_k, camera.focus]
+}
+
+/// Waits until the automatics of what `camera` locks have found their values: two looks some frames apart that agree, or at most `most`.
+/// `grab` takes a frame, and says whether one came. `false` if they still move.
+pub fn settle(device: &impl Controls, camera: &CameraConfig, most: Duration, mut grab: impl FnMut() -> bool) -> bool {
+    let locked: Vec<&Key> =
+        KEYS.iter().zip(settings(camera)).filter(|(_, setting)| matches!(setting, Some(Setting::Locked(_)))).map(|(key, _)| key).collect();
+    let begin = Instant::now();
+    let mut before: Option<Vec<_>> = None;
+    while !locked.is_empty() {
+        for _ in 0..LOOK_FRAMES {
+            if begin.elapsed() >= most || !grab() {
+                return false;
+            }
+        }
+        let now: Vec<_> = locked.iter().map(|key| device.get(key.id)).collect();
+        if before.replace(now.clone()) == Some(now) {
+            break;
+        }
+    }
+    true
+}
+
+/// Switches all automatics on that the device has.
+pub fn start_automatics(device: &mut impl Controls) {
+    for (id, off, on) in KEYS.iter().filter_map(|key| key.automatic.map(|(id, off)| (id, off, key.on))) {
+        if device.query(id).is_some() && device.get(id) == Ok(off) {
+            // One that cannot be switched on leaves the value that is there, which is found as well.
+            let _ = on.iter().find(|on| device.set(id, **on).is_ok() && device.get(id) == Ok(**on));
+        }
+    }
+}
+
+/// Sets what the automatics have found as values, and reads them back.
+pub fn keep_found(device: &mut impl Controls) -> Found {
+    let mut found = Found::default();
+    for key in KEYS.iter().filter(|key| device.query(key.id).is_some_and(|control| !control.read_only)).collect::<Vec<_>>() {
+        let Ok(value) = device.get(key.id) else { continue };
+        let value = f64::from(value) / key.factor;
+        match set(device, key, Setting::Value(value)) {
+            Ok(said) => {
+                found.values.push((key.name, value));
+                found.outcome.said.push(said);
+            }
+            Err(refused) => found.outcome.refused.push(refused),
+        }
+    }
+    found
+}
+
 /// Sets the controls that `camera` names, and reads them back.
 pub fn apply(device: &mut impl Controls, camera: &CameraConfig) -> Outcome {
     let mut outcome = Outcome::default();
-    let settings = [camera.exposure_ms, camera.gain, camera.white_balance_k, camera.focus];
     let mut alone = Vec::new();
-    for (key, setting) in KEYS.iter().zip(settings) {
+    for (key, setting) in KEYS.iter().zip(settings(camera)) {
         match setting {
             Some(setting) => match set(device, key, setting) {
                 Ok(said) => outcome.said.push(said),
@@ -250,6 +323,16 @@ mod tests {
         controls: BTreeMap<u32, [i32; 4]>,
         refuses: Vec<u32>,
         inactive: Vec<u32>,
+        /// Frames so far, in which its automatics work.
+        frames: std::cell::Cell<i32>,
+    }
+
+    impl Fake {
+        /// Takes a frame: the automatic exposure falls by 10 a frame for 25 frames.
+        fn grab(&self) -> bool {
+            self.frames.set(self.frames.get() + 1);
+            true
+        }
     }
 
     impl Controls for Fake {
@@ -258,7 +341,10 @@ mod tests {
             Some(Control { id, name: String::new(), least, most, step, inactive: self.inactive.contains(&id), read_only: false })
         }
         fn get(&self, id: u32) -> Result<i32, String> {
-            self.controls.get(&id).map(|c| c[0]).ok_or("invalid".into())
+            let value = self.controls.get(&id).map(|c| c[0]).ok_or("invalid")?;
+            let automatic = self.controls.get(&v4l2::V4L2_CID_EXPOSURE_AUTO).is_some_and(|c| c[0] != EXPOSURE_MANUAL);
+            let moves = automatic && id == v4l2::V4L2_CID_EXPOSURE_ABSOLUTE && self.frames.get() > 0;
+            Ok(if moves { 400 - 10 * self.frames.get().min(25) } else { value })
         }
         fn set(&mut self, id: u32, value: i32) -> Result<(), String> {
             if self.refuses.contains(&id) {
@@ -304,6 +390,43 @@ mod tests {
         assert!(
             outcome.said.iter().any(|s| s == "exposure_ms = 10") && outcome.said.iter().any(|s| s.starts_with("gain, focus left alone"))
         );
+    }
+
+    /// Protects from a first picture that is locked: the automatic finds its value before it is switched off, and one that never rests is waited
+    /// for no longer than said. What is not to be locked is not waited for.
+    #[test]
+    fn the_automatic_finds_before_it_is_locked() {
+        let locked = CameraConfig { exposure_ms: Some(Setting::Locked(Locked::Locked)), ..CameraConfig::default() };
+        let mut device = camera();
+        assert!(settle(&device, &locked, SETTLE_MOST, || device.grab()));
+        assert!(apply(&mut device, &locked).refused.is_empty());
+        assert_eq!(device.get(v4l2::V4L2_CID_EXPOSURE_ABSOLUTE), Ok(150));
+        let restless = camera();
+        assert!(!settle(&restless, &locked, Duration::from_millis(50), || {
+            std::thread::sleep(Duration::from_millis(5));
+            restless.grab()
+        }));
+        let value = CameraConfig { gain: Some(Setting::Value(1.0)), ..CameraConfig::default() };
+        let other = camera();
+        assert!(settle(&other, &value, SETTLE_MOST, || other.grab()) && other.frames.get() == 0);
+    }
+
+    /// Protects who lets the camera find its settings once: automatics that were off are on while it looks, and what they found is set as values with
+    /// the automatics off. What the camera has not, or keeps under an automatic, is not among them.
+    #[test]
+    fn what_the_automatics_find_is_kept() {
+        let mut device = camera();
+        device.controls.insert(v4l2::V4L2_CID_EXPOSURE_AUTO, [EXPOSURE_MANUAL, 0, 3, 1]);
+        device.inactive = vec![v4l2::V4L2_CID_GAIN];
+        start_automatics(&mut device);
+        assert_eq!(device.get(v4l2::V4L2_CID_EXPOSURE_AUTO), Ok(3));
+        (0..60).for_each(|_| assert!(device.grab()));
+        let Found { values, outcome } = keep_found(&mut device);
+        assert_eq!(values, [("exposure_ms", 15.0), ("white_balance_k", 4000.0)]);
+        assert!(outcome.refused.len() == 1 && outcome.refused[0].contains("camera.gain"), "{outcome:?}");
+        let at =
+            [v4l2::V4L2_CID_EXPOSURE_AUTO, v4l2::V4L2_CID_EXPOSURE_ABSOLUTE, v4l2::V4L2_CID_AUTO_WHITE_BALANCE].map(|id| device.get(id));
+        assert_eq!(at, [Ok(1), Ok(150), Ok(0)]);
     }
 
     /// Protects from a camera that does something else: a control that it lacks, refuses, or sets to another value is a refusal that names
