@@ -123,6 +123,71 @@ fn a_picture_that_cannot_be_decoded_is_said() -> Outcome {
     Ok(())
 }
 
+/// Protects who records into a pipe, as live recorders do: a Matroska file that does not say its length is taken with a remark, and one that is
+/// cut in the middle of a block is refused, whatever stands before its pictures and whether its clusters say their lengths. A long header hides
+/// no length.
+#[test]
+fn a_recording_without_a_length_is_walked_through() -> Outcome {
+    let directory = tempfile::tempdir()?;
+    let path = directory.path().join("live.mkv");
+    video(&path, ['m', 'p', '4', 'v'], 30.0)?;
+    let whole = std::fs::read(&path)?;
+    let segment = find(&whole, &[0x18, 0x53, 0x80, 0x67], 0) + 4;
+    let cluster = find(&whole, &[0x1f, 0x43, 0xb6, 0x75], 0) + 4;
+    let length = |at: usize| whole[at].leading_zeros() as usize + 1;
+    let unknown = |bytes: &mut [u8], at: usize| {
+        let length = length(at);
+        bytes[at..at + length].fill(0xff);
+        bytes[at] = 0xff >> (length - 1);
+    };
+    for clusters_too in [false, true] {
+        let mut live = whole.clone();
+        unknown(&mut live, segment);
+        if clusters_too {
+            unknown(&mut live, cluster);
+        }
+        std::fs::write(&path, &live)?;
+        let (all, said) = report(&inspect(directory.path(), &[&path], &[])?)?;
+        assert!(all["frames"] == FRAMES && said.contains("live.mkv: the file does not say its length"), "{all} {said}");
+        std::fs::write(&path, &live[..live.len() * 2 / 3])?;
+        refused(&inspect(directory.path(), &[&path], &[])?, &["live.mkv", "ends after frame", "truncated", "--partial"]);
+    }
+    // A header of more than a hundred bytes: its length takes two bytes, and nothing (EBML's Void) follows what it said.
+    let nothing = [&[0xec, 0x80 + 100][..], &[0; 100]].concat();
+    let header = u16::from(whole[4] & 0x7f) + nothing.len() as u16;
+    let padded = [&whole[..4], &(0x4000 | header).to_be_bytes(), &whole[5..segment - 4], &nothing, &whole[segment - 4..]].concat();
+    assert_eq!(length(4), 1);
+    std::fs::write(&path, &padded)?;
+    assert_eq!(report(&inspect(directory.path(), &[&path], &[])?)?.0["frames"], FRAMES);
+    std::fs::write(&path, &padded[..padded.len() * 2 / 3])?;
+    refused(&inspect(directory.path(), &[&path], &[])?, &["live.mkv", "ends after frame", "truncated"]);
+    Ok(())
+}
+
+/// Protects the controller, which counts time in frames: a recording that is played at another rate than `camera.fps`, by more than 5 %, is refused
+/// with the rate to write. One that is nearer is played.
+#[test]
+fn a_recording_at_another_rate_is_not_played() -> Outcome {
+    let directory = tempfile::tempdir()?;
+    for (rate, plays) in [(28.0, false), (29.0, true), (31.0, true), (32.0, false)] {
+        let path = directory.path().join("played.avi");
+        video(&path, ['M', 'J', 'P', 'G'], rate)?;
+        let (config, written) = write_config(directory.path(), "rate", |c| {
+            (c.camera.source, c.camera.path) = (shared::config::CameraSource::Video, path.display().to_string());
+        })?;
+        let output = Command::new(env!("CARGO_BIN_EXE_feature-worker")).args(["run", "--config"]).arg(&config).output()?;
+        shared::ipc::remove_files(&written.cell.name);
+        if plays {
+            assert!(output.status.success(), "{rate}: {}", text(&output));
+        } else {
+            let said = text(&output);
+            assert_eq!(output.status.code(), Some(2), "{rate}: {said}");
+            assert!(said.contains(&format!("played.avi: it has {rate:.2} frames a second, but camera.fps = 30")), "{said}");
+        }
+    }
+    Ok(())
+}
+
 /// Puts the other time steps into an MP4 file whose index is at its end: `steps` of (number of pictures, units).
 fn set_steps(bytes: &[u8], steps: &[(u32, u32)]) -> Vec<u8> {
     let at = find(bytes, b"stts", 0) - 4;

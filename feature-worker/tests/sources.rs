@@ -59,7 +59,7 @@ fn videos_whole_truncated_and_wrong() -> Outcome {
     assert_eq!((picture.cols(), picture.rows()), (WIDTH, HEIGHT));
     assert_eq!(std::fs::read_dir(&out)?.count(), 4, "three pictures and the table");
 
-    let bytes = std::fs::read(&path)?;
+    let (bytes, png) = (std::fs::read(&path)?, std::fs::read(out.join("frame_000013.png"))?);
     for share in [2, 3, 50] {
         let cut = directory.path().join(format!("cut{share}.avi"));
         std::fs::write(&cut, &bytes[..bytes.len() / share])?;
@@ -76,8 +76,45 @@ fn videos_whole_truncated_and_wrong() -> Outcome {
     refused(&inspect(&config, &wrong, &out, "0")?, &["wrong.mp4"]);
     refused(&inspect(&config, &directory.path().join("missing.mp4"), &out, "0")?, &["missing.mp4", "no such file"]);
     let broken = directory.path().join("broken.png");
-    std::fs::write(&broken, &std::fs::read(out.join("frame_000013.png"))?[..30])?;
+    std::fs::write(&broken, &png[..30])?;
     refused(&inspect(&config, &broken, &out, "0")?, &["broken.png"]);
+    Ok(())
+}
+
+/// Protects from results of two recordings side by side: a second run leaves none of the first one's pictures and no table of another, also when it
+/// fails on the way; files of somebody else stay. An input that cannot be opened costs nothing, nor does one that has the results' own names.
+#[test]
+fn a_directory_holds_one_run() -> Outcome {
+    let dir = tempfile::tempdir()?;
+    let (config, _) = write_config(dir.path(), "one-run", |_| {})?;
+    let (out, input) = (dir.path().join("out"), dir.path().join("f_%03d.png"));
+    let save = |i: i32, picture: &Mat| imgcodecs::imwrite(dir.path().join(format!("f_{i:03}.png")), picture, &Vector::new());
+    for i in 0..6 {
+        save(i, &pour(i)?)?;
+    }
+    let names = || -> Result<Vec<String>, std::io::Error> {
+        let mut names: Vec<String> =
+            std::fs::read_dir(&out)?.map(|entry| Ok(entry?.file_name().to_string_lossy().into_owned())).collect::<std::io::Result<_>>()?;
+        names.sort();
+        Ok(names)
+    };
+    let first = inspect(&config, &input, &out, "2")?;
+    assert!(first.status.success(), "{}", text(&first));
+    let whole = ["features.csv", "frame_000001.png", "frame_000003.png", "frame_000005.png"];
+    assert_eq!(names()?, whole);
+    refused(&inspect(&config, &dir.path().join("none.mp4"), &out, "1")?, &["none.mp4"]);
+    assert_eq!(names()?, whole);
+    refused(&inspect(&config, &out.join("frame_%06d.png"), &out, "1")?, &["frame_%06d.png", "another --out"]);
+    assert_eq!(names()?, whole);
+    std::fs::copy(out.join("frame_000003.png"), out.join("frame_000099.png"))?;
+    let second = inspect(&config, &dir.path().join("f_001.png"), &out, "1")?;
+    assert!(second.status.success(), "{}", text(&second));
+    assert_eq!(names()?, ["features.csv", "frame_000001.png", "frame_000099.png"]);
+    let mut small = Mat::default();
+    imgproc::resize(&pour(3)?, &mut small, Size::new(320, 240), 0.0, 0.0, imgproc::INTER_AREA)?;
+    save(3, &small)?;
+    refused(&inspect(&config, &input, &out, "1")?, &["frame 4", "320 x 240"]);
+    assert_eq!(names()?, ["frame_000099.png"]);
     Ok(())
 }
 

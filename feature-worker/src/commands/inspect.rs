@@ -1,7 +1,8 @@
 //! `feature-worker inspect`: writes what is measured in images or a video, as pictures and a CSV file.
 //!
 //! An ordinary command-line program that allocates. An input that cannot be read, or has another size than configured, ends it with one
-//! line that says what to do.
+//! line that says what to do. Table and pictures in a directory are always of one run: those of an earlier one go with the first frame, and
+//! an error takes the pictures that were written before it.
 
 use std::path::{Path, PathBuf};
 
@@ -10,7 +11,7 @@ use shared::config::{CameraConfig, Config};
 use shared::exit::{self, Failure, OrExit as _, failure};
 use shared::messages::{Doubt, FrameHeader, PixelFormat};
 use shared::plural::counted;
-use shared::whole_file;
+use shared::{regular_file, whole_file};
 
 use crate::drawing::{draw, save, to_bgr};
 use crate::source::{Frame, for_each_frame};
@@ -50,6 +51,8 @@ pub struct Args {
 /// What was measured in all frames together.
 #[derive(Default)]
 struct Totals {
+    /// Frames that were measured.
+    frames: u64,
     /// Frames with a stream.
     flowing: u64,
     /// Frames with a doubt.
@@ -60,6 +63,7 @@ struct Totals {
 
 impl Totals {
     fn add(&mut self, measured: &Measurement) {
+        self.frames += 1;
         self.flowing += u64::from(measured.area_px2 > 0.0);
         self.doubtful += u64::from(measured.doubt != Doubt::None);
         self.sum_px2 += f64::from(measured.area_px2);
@@ -76,11 +80,49 @@ fn words(e: impl std::fmt::Display) -> String {
     e.to_string()
 }
 
+/// The picture of the frame with this number in the directory `out`.
+fn picture_of(out: &Path, number: u64) -> PathBuf {
+    out.join(format!("frame_{number:06}.png"))
+}
+
+/// Removes table and pictures of an earlier run from `out`. Its pictures are those of the frames in its table; all others are somebody else's.
+fn remove_earlier(out: &Path) -> std::io::Result<()> {
+    let table = out.join("features.csv");
+    let file = match regular_file::open(&table) {
+        Ok((file, _)) => file,
+        Err(e) if e.kind() == std::io::ErrorKind::NotFound => return Ok(()),
+        Err(e) => return Err(e),
+    };
+    for row in csv::Reader::from_reader(file).records().map_while(Result::ok) {
+        let Some(number) = row.get(0).and_then(|number| number.parse().ok()) else { continue };
+        match std::fs::remove_file(picture_of(out, number)) {
+            Err(e) if e.kind() != std::io::ErrorKind::NotFound => return Err(e),
+            _ => {}
+        }
+    }
+    std::fs::remove_file(table)
+}
+
+/// Whether `input` names pictures that this run may write over in the directory `out`.
+fn is_in_the_way(input: &Path, out: &Path) -> bool {
+    let named = input.file_name().is_some_and(|name| {
+        let name = name.to_string_lossy().to_lowercase();
+        name.starts_with("frame_") && name.ends_with(".png")
+    });
+    let directory = input.parent().filter(|parent| !parent.as_os_str().is_empty()).unwrap_or(Path::new("."));
+    named && directory.canonicalize().ok().is_some_and(|directory| out.canonicalize().ok() == Some(directory))
+}
+
 fn inspect(args: &Args, config: &Config) -> Result<(), Failure> {
     let mut extractor = Extractor::new(&config.camera, &config.image).or_exit(exit::BAD_INPUT)?;
     let unwritten = |path: &Path, e: &dyn std::fmt::Display| format!("{}: {e}; make room, or give another --out", path.display());
     std::fs::create_dir_all(&args.out).map_err(|e| unwritten(&args.out, &e)).or_exit(exit::FAILED)?;
     let table = args.out.join("features.csv");
+    if let Some(input) = args.input.iter().find(|input| is_in_the_way(input, &args.out)) {
+        let what =
+            format!("{}: its pictures have the names of those that are written into this directory; give another --out", input.display());
+        return Err(failure(exit::BAD_INPUT, what));
+    }
     // What may not be replaced is known before the work. The table is kept until it is whole: some hundred bytes a frame.
     whole_file::check(&table, TABLE_BEGINS).map_err(|e| unwritten(&table, &e)).or_exit(exit::BAD_INPUT)?;
     let mut csv = csv::Writer::from_writer(Vec::new());
@@ -88,28 +130,40 @@ fn inspect(args: &Args, config: &Config) -> Result<(), Failure> {
     let mut code = exit::BAD_INPUT;
     let bar = ProgressBar::new_spinner().with_message("frames");
     let mut totals = Totals::default();
+    let mut written = Vec::new();
     let contents = for_each_frame(&args.input, config.camera.fps, args.partial, |frame| {
         let measured = measure(&mut extractor, &config.camera, &frame)?;
+        if totals.frames == 0 {
+            remove_earlier(&args.out).map_err(|e| {
+                code = exit::FAILED;
+                unwritten(&table, &e)
+            })?;
+        }
         totals.add(&measured);
         csv.write_record(row(&frame.header, &measured)).map_err(words)?;
         if args.every > 0 && (frame.header.sequence - 1) % args.every == 0 {
             let mut picture = to_bgr(&frame).map_err(words)?;
             draw(&mut picture, &extractor, &measured).map_err(words)?;
-            let path = args.out.join(format!("frame_{:06}.png", frame.header.sequence));
+            let path = picture_of(&args.out, frame.header.sequence);
             save(&picture, &path).map_err(|e| {
                 code = exit::FAILED;
                 unwritten(&path, &e)
             })?;
+            written.push(path);
         }
         bar.inc(1);
         Ok(())
     });
-    let contents = contents.map_err(|what| failure(code, what))?;
+    // Nobody needs pictures without their table, and it does no harm if one cannot be removed.
+    let undo = |failed: Failure| {
+        written.iter().for_each(|path| drop(std::fs::remove_file(path)));
+        failed
+    };
+    let contents = contents.map_err(|what| undo(failure(code, what)))?;
     let rows = csv.into_inner().map_err(|e| e.to_string()).or_exit(exit::FAILED)?;
-    whole_file::replace(&table, &rows, TABLE_BEGINS).map_err(|e| unwritten(&table, &e)).or_exit(exit::FAILED)?;
+    whole_file::replace(&table, &rows, TABLE_BEGINS).map_err(|e| undo(failure(exit::FAILED, unwritten(&table, &e))))?;
     bar.finish_and_clear();
-    let Totals { flowing, doubtful, sum_px2 } = totals;
-    let frames = contents.frames;
+    let Totals { frames, flowing, doubtful, sum_px2 } = totals;
     contents.missing.iter().for_each(|line| eprintln!("inspect: {line}"));
     if args.json {
         let report = serde_json::json!({ "frames": frames, "flowing": flowing, "doubtful": doubtful, "sum_area_px2": sum_px2,

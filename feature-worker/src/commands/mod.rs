@@ -3,6 +3,7 @@
 pub mod bench;
 pub mod calibrate;
 pub mod camera;
+mod configuration;
 pub mod episodes;
 pub mod inspect;
 pub mod run;

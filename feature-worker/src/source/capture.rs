@@ -3,8 +3,9 @@
 //! Called from the thread that measures. OpenCV decodes into one matrix that is reused. A device is read at the size and the rate that
 //! are configured, or it is refused.
 
+use std::fs::File;
 use std::path::Path;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use opencv::core::{CV_8UC1, CV_8UC3, Mat};
 use opencv::prelude::*;
@@ -14,7 +15,7 @@ use shared::level::Level;
 use shared::messages::{FrameHeader, LAYOUT_VERSION, PixelFormat};
 use shared::os;
 
-use super::controls;
+use super::controls::{self, Found, SETTLE_MOST};
 use super::devices::{self, Trouble};
 use super::frame::{Frame, FrameSource, NextFrame, SourceError};
 use super::numbering::Numbering;
@@ -61,11 +62,11 @@ pub struct Capture {
 }
 
 impl Capture {
-    /// Opens the device that `[camera]` names.
-    pub fn open(camera: &CameraConfig) -> Result<Self, SourceError> {
+    /// Opens the device that `[camera]` names, at its size and rate, and its controls.
+    fn start(camera: &CameraConfig) -> Result<(File, VideoCapture), SourceError> {
         let fail = |what: &str| SourceError::Open { path: camera.path.clone(), what: what.into() };
         // Before OpenCV, which does not tell why it cannot open a device.
-        let mut device = devices::open(Path::new(&camera.path))?;
+        let device = devices::open(Path::new(&camera.path))?;
         let opened = VideoCapture::from_file(&camera.path, videoio::CAP_V4L2);
         let mut capture = opened.map_err(|e| fail(&format!("cannot be opened: {}", e.message)))?;
         if !capture.is_opened()? {
@@ -77,7 +78,30 @@ impl Capture {
             let _ = capture.set(videoio::CAP_PROP_FOURCC, f64::from(mjpeg))?;
             set_mode(&mut capture, camera).map_err(|_| raw)?;
         }
-        // After the mode: some drivers start anew with it.
+        Ok((device, capture))
+    }
+
+    /// What the camera's automatics find in the light of now. It is set, with the automatics off. It takes [`SETTLE_MOST`].
+    pub fn find(camera: &CameraConfig) -> Result<Found, SourceError> {
+        let (mut device, mut capture) = Self::start(camera)?;
+        controls::start_automatics(&mut device);
+        let begin = Instant::now();
+        while begin.elapsed() < SETTLE_MOST {
+            if !capture.grab().unwrap_or(false) {
+                return Err(SourceError::Lost(camera.path.clone()));
+            }
+        }
+        Ok(controls::keep_found(&mut device))
+    }
+
+    /// Opens the device that `[camera]` names.
+    pub fn open(camera: &CameraConfig) -> Result<Self, SourceError> {
+        // Controls come after the mode: some drivers start anew with it.
+        let (mut device, mut capture) = Self::start(camera)?;
+        if !controls::settle(&device, camera, SETTLE_MOST, || capture.grab().unwrap_or(false)) {
+            let line = "camera: its automatics have not come to rest, and what they have now is locked";
+            eprintln!("{}", Level::Warning.marked(line));
+        }
         let outcome = controls::apply(&mut device, camera);
         outcome.said.iter().for_each(|line| eprintln!("{}", Level::Info.marked(&format!("camera: {line}"))));
         if !outcome.refused.is_empty() {

@@ -1,7 +1,7 @@
 //! What a video's container says beside its pictures: how they are turned, when the last one ends, and whether the file is whole.
 //!
 //! OpenCV tells the first in a way that differs between its versions, and the others not at all. Read are MP4 and QuickTime boxes
-//! (ISO/IEC 14496-12), the RIFF chunks of AVI, and the outermost elements of Matroska and WebM (RFC 8794); of other files nothing is said.
+//! (ISO/IEC 14496-12), the RIFF chunks of AVI, and the elements of Matroska and WebM (RFC 8794); of other files nothing is said.
 //! For commands that read files, on their own thread; allocates at most [`INDEX_MOST`] bytes. Damaged files are no errors here: what
 //! cannot be read is left out, and numbers from the file are used in checked arithmetic only.
 
@@ -16,6 +16,13 @@ use shared::regular_file;
 const INDEX_MOST: u64 = 1 << 26;
 /// Part of a matrix's larger numbers below which the others count as zero. Chosen by hand: matrices of cameras are exact.
 const NO_SHEAR: f64 = 0.01;
+
+/// Matroska's element that holds all others but the header (RFC 9559).
+const SEGMENT: u32 = 0x1853_8067;
+/// Matroska's element that holds the blocks of some seconds (RFC 9559).
+const CLUSTER: u32 = 0x1f43_b675;
+/// The longest head of an element of Matroska, bytes: 4 of its number and 8 of its length (RFC 8794).
+const ELEMENT_HEAD: u64 = 12;
 
 /// How the pictures must be turned to be upright.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -95,21 +102,24 @@ pub(super) struct Container {
     pub counts_frames: bool,
     /// Bytes that the file has too few, judged by the sizes in it.
     pub missing_bytes: Option<u64>,
+    /// Whether the file does not say how long it is, as of a recorder that writes into a pipe: its end may be missing all the same.
+    pub open_end: bool,
 }
 
 impl Container {
-    const UNKNOWN: Self = Self { turn: None, end_s: None, period_s: None, fixed_rate: false, counts_frames: false, missing_bytes: None };
+    const UNKNOWN: Self =
+        Self { turn: None, end_s: None, period_s: None, fixed_rate: false, counts_frames: false, missing_bytes: None, open_end: false };
 
     /// What the file at `path` says.
     pub(super) fn read(path: &Path) -> std::io::Result<Self> {
         let (mut file, meta) = regular_file::open(path)?;
         let size = meta.len();
         let mut head = Vec::new();
-        (&mut file).take(64).read_to_end(&mut head)?;
+        (&mut file).take(12).read_to_end(&mut head)?;
         let kind = |at: usize| head.get(at..at + 4).unwrap_or_default();
         match (kind(0), kind(4), kind(8)) {
             (b"RIFF", _, b"AVI ") => avi(&mut file, size),
-            ([0x1a, 0x45, 0xdf, 0xa3], ..) => Ok(matroska(&head, size)),
+            ([0x1a, 0x45, 0xdf, 0xa3], ..) => matroska(&mut file, size),
             (_, b"ftyp" | b"moov" | b"mdat" | b"wide" | b"free" | b"skip", _) => mp4(&mut file, size),
             _ => Ok(Self::UNKNOWN),
         }
@@ -140,26 +150,54 @@ fn avi(file: &mut File, size: u64) -> std::io::Result<Container> {
     Ok(known)
 }
 
-/// A number of Matroska's variable length at `at`, with its length; `None` for one that says "unknown".
-fn variable(bytes: &[u8], at: usize) -> Option<(u64, usize)> {
-    let first = *bytes.get(at)?;
+/// A number of Matroska's variable length, `None` for "unknown", and its own length in bytes; `None` if `bytes` do not hold one.
+fn variable(bytes: &[u8]) -> Option<(Option<u64>, usize)> {
+    let first = *bytes.first()?;
     let length = first.leading_zeros() as usize + 1;
-    let rest = bytes.get(at + 1..at + length)?;
+    let rest = bytes.get(1..length).filter(|_| length <= 8)?;
     let value = rest.iter().fold(u64::from(first) & (0xff >> length), |v, b| v << 8 | u64::from(*b));
-    (length <= 8 && value != (1 << (7 * length)) - 1).then_some((value, length))
+    Some(((value != (1 << (7 * length)) - 1).then_some(value), length))
 }
 
-fn matroska(head: &[u8], size: u64) -> Container {
-    let missing_bytes = || {
-        let (header, length) = variable(head, 4)?;
-        let segment = usize::try_from(header).ok()?.checked_add(4 + length)?;
-        if head.get(segment..segment.checked_add(4)?)? != [0x18, 0x53, 0x80, 0x67] {
-            return None;
+/// Number, length of the head, and length of the contents of the element of Matroska that begins with `bytes`; the last is `None` for
+/// "unknown". `None` if this is no element, or its head is cut.
+fn element_head(bytes: &[u8]) -> Option<(u32, u64, Option<u64>)> {
+    let length = bytes.first()?.leading_zeros() as usize + 1;
+    let number = bytes.get(..length).filter(|_| length <= 4)?.iter().fold(0, |v, b| v << 8 | u32::from(*b));
+    let (contents, more) = variable(&bytes[length..])?;
+    Some((number, (length + more) as u64, contents))
+}
+
+fn matroska(file: &mut File, size: u64) -> std::io::Result<Container> {
+    let mut known = Container::UNKNOWN;
+    let mut at = 0u64;
+    while at < size && known.missing_bytes.is_none() {
+        file.seek(SeekFrom::Start(at))?;
+        let mut head = Vec::new();
+        file.take(ELEMENT_HEAD).read_to_end(&mut head)?;
+        let Some((number, length, contents)) = element_head(&head) else {
+            // At the file's end the head itself is cut.
+            known.missing_bytes = ((head.len() as u64) < ELEMENT_HEAD).then_some(1);
+            break;
+        };
+        let end = contents.and_then(|contents| (at + length).checked_add(contents));
+        match (number, contents) {
+            // Who writes into a pipe cannot come back to write a length, so what is inside is walked through.
+            (SEGMENT | CLUSTER, None) => {
+                known.open_end |= number == SEGMENT;
+                at += length;
+            }
+            (_, None) => break,
+            (_, Some(_)) => {
+                known.missing_bytes = missing(end, size);
+                at = end.unwrap_or(size);
+            }
         }
-        let (body, length) = variable(head, segment + 4)?;
-        missing((segment as u64 + 4 + length as u64).checked_add(body), size)
-    };
-    Container { missing_bytes: missing_bytes(), ..Container::UNKNOWN }
+        if number == SEGMENT && contents.is_some() {
+            break;
+        }
+    }
+    Ok(known)
 }
 
 fn mp4(file: &mut File, size: u64) -> std::io::Result<Container> {
@@ -289,8 +327,9 @@ mod tests {
         let mp4 = [boxed(b"ftyp", b"isom\0\0\0\0"), movie, boxed(b"mdat", &[0; 64])].concat();
         let avi = [&b"RIFF"[..], &200u32.to_le_bytes(), b"AVI ", &[0; 200]].concat();
         let mkv = [&[0x1a, 0x45, 0xdf, 0xa3, 0x84, 1, 2, 3, 4, 0x18, 0x53, 0x80, 0x67, 0x10, 0, 1, 0][..], &[0; 200]].concat();
+        let live = [&mkv[..13], &[0xff, 0x1f, 0x43, 0xb6, 0x75, 0xff, 0xa3, 0x85, 1, 2, 3, 4, 5], &[0xec, 0x81, 7].repeat(50)].concat();
         assert!(movie_period(&mp4, file.path()).is_some(), "the whole file is read");
-        for seed in [mp4, avi, mkv] {
+        for seed in [mp4, avi, mkv, live] {
             for _ in 0..3000 {
                 let mut bytes = seed.clone();
                 for _ in 0..random.random_range(1..5) {

@@ -1,10 +1,12 @@
 //! The controls of a V4L2 device that `[camera]` sets: exposure, gain, white balance, focus, and the mains' frequency.
 //!
 //! Called once at the start, on the thread that opens the camera; allocates. What is set is read back, and what differs is a refusal with its
-//! reason. `decant doctor` compares and sets nothing. OpenCV has no property for the mains' frequency and none for a control's range, so V4L2 is asked by way of `v4l2r`; the frames
+//! reason. What is to be locked is first found by the camera's automatics, for which frames must flow. `decant doctor` compares and sets nothing. OpenCV
+//! has no property for the mains' frequency and none for a control's range, so V4L2 is asked by way of `v4l2r`; the frames
 //! stay OpenCV's.
 
 use std::fs::File;
+use std::time::{Duration, Instant};
 
 use shared::config::{CameraConfig, Setting};
 use v4l2r::bindings as v4l2;
@@ -14,6 +16,13 @@ use v4l2r::ioctl::{CtrlId, QueryCtrlFlags, g_ctrl, queryctrl, s_ctrl};
 const EXPOSURE_UNIT_MS: f64 = 0.1;
 /// V4L2's "manual mode" of the automatic exposure. (An enumeration of the kernel's interface.)
 const EXPOSURE_MANUAL: i32 = 1;
+/// V4L2's automatic modes of the exposure: with a fixed aperture, as webcams have it, and with both automatic. (An enumeration of the kernel's
+/// interface.)
+const EXPOSURE_AUTOMATIC: [i32; 2] = [3, 0];
+/// The longest that automatics are waited for. Chosen by hand: those of webcams take a second.
+pub const SETTLE_MOST: Duration = Duration::from_secs(2);
+/// Frames between two looks at what the automatics have found. Chosen by hand: an automatic that works moves in a third of a second.
+const LOOK_FRAMES: u32 = 10;
 
 /// What a device says of one control.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -113,6 +122,8 @@ struct Key {
     id: u32,
     /// The automatic's control, and its value for "off".
     automatic: Option<(u32, i32)>,
+    /// The automatic's values for "on", the usual one first.
+    on: &'static [i32],
     /// V4L2's value of a unit of the configuration.
     factor: f64,
 }
@@ -123,16 +134,18 @@ const KEYS: [Key; 4] = [
         name: "exposure_ms",
         id: v4l2::V4L2_CID_EXPOSURE_ABSOLUTE,
         automatic: Some((v4l2::V4L2_CID_EXPOSURE_AUTO, EXPOSURE_MANUAL)),
+        on: &EXPOSURE_AUTOMATIC,
         factor: 1.0 / EXPOSURE_UNIT_MS,
     },
-    Key { name: "gain", id: v4l2::V4L2_CID_GAIN, automatic: Some((v4l2::V4L2_CID_AUTOGAIN, 0)), factor: 1.0 },
+    Key { name: "gain", id: v4l2::V4L2_CID_GAIN, automatic: Some((v4l2::V4L2_CID_AUTOGAIN, 0)), on: &[1], factor: 1.0 },
     Key {
         name: "white_balance_k",
         id: v4l2::V4L2_CID_WHITE_BALANCE_TEMPERATURE,
         automatic: Some((v4l2::V4L2_CID_AUTO_WHITE_BALANCE, 0)),
+        on: &[1],
         factor: 1.0,
     },
-    Key { name: "focus", id: v4l2::V4L2_CID_FOCUS_ABSOLUTE, automatic: Some((v4l2::V4L2_CID_FOCUS_AUTO, 0)), factor: 1.0 },
+    Key { name: "focus", id: v4l2::V4L2_CID_FOCUS_ABSOLUTE, automatic: Some((v4l2::V4L2_CID_FOCUS_AUTO, 0)), on: &[1], factor: 1.0 },
 ];
 
 /// What came of setting the controls, a line each.
@@ -189,6 +202,63 @@ fn mains_code(hertz: f64) -> i32 {
 /// The word for V4L2's number of a mains' frequency: off, 50 Hz, 60 Hz, automatic.
 fn mains_word(code: i32) -> &'static str {
     ["0", "50", "60", "automatic"].get(code as usize).copied().unwrap_or("unknown")
+}
+
+/// What a camera's automatics have found.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct Found {
+    /// The keys of `[camera]` with their values; what the device has not, or refuses, is not among them.
+    pub values: Vec<(&'static str, f64)>,
+    /// What came of setting these.
+    pub outcome: Outcome,
+}
+
+/// Waits until the automatics of what `camera` locks have found their values: two looks some frames apart that agree, or at most `most`.
+/// `grab` takes a frame, and says whether one came. `false` if they still move.
+pub fn settle(device: &impl Controls, camera: &CameraConfig, most: Duration, mut grab: impl FnMut() -> bool) -> bool {
+    let locked: Vec<&Key> =
+        settings(camera).filter(|(_, setting)| matches!(setting, Some(Setting::Locked(_)))).map(|(key, _)| key).collect();
+    let begin = Instant::now();
+    let mut before: Option<Vec<_>> = None;
+    while !locked.is_empty() {
+        for _ in 0..LOOK_FRAMES {
+            if begin.elapsed() >= most || !grab() {
+                return false;
+            }
+        }
+        let now: Vec<_> = locked.iter().map(|key| device.get(key.id)).collect();
+        if before.replace(now.clone()) == Some(now) {
+            break;
+        }
+    }
+    true
+}
+
+/// Switches all automatics on that the device has.
+pub fn start_automatics(device: &mut impl Controls) {
+    for (id, off, on) in KEYS.iter().filter_map(|key| key.automatic.map(|(id, off)| (id, off, key.on))) {
+        if device.query(id).is_some() && device.get(id) == Ok(off) {
+            // One that cannot be switched on leaves the value that is there, which is found as well.
+            let _ = on.iter().find(|on| device.set(id, **on).is_ok() && device.get(id) == Ok(**on));
+        }
+    }
+}
+
+/// Sets what the automatics have found as values, and reads them back.
+pub fn keep_found(device: &mut impl Controls) -> Found {
+    let mut found = Found::default();
+    for key in KEYS.iter().filter(|key| device.query(key.id).is_some_and(|control| !control.read_only)).collect::<Vec<_>>() {
+        let Ok(value) = device.get(key.id) else { continue };
+        let value = f64::from(value) / key.factor;
+        match set(device, key, Setting::Value(value)) {
+            Ok(said) => {
+                found.values.push((key.name, value));
+                found.outcome.said.push(said);
+            }
+            Err(refused) => found.outcome.refused.push(refused),
+        }
+    }
+    found
 }
 
 /// Sets the controls that `camera` names, and reads them back.
@@ -282,123 +352,4 @@ fn set_mains(device: &mut impl Controls, setting: Setting) -> Result<String, Str
 }
 
 #[cfg(test)]
-mod tests {
-    use super::*;
-    use shared::config::Locked;
-    use std::collections::BTreeMap;
-
-    /// A camera in memory: value, least, most and step of each control, and which controls are refused.
-    #[derive(Default)]
-    struct Fake {
-        controls: BTreeMap<u32, [i32; 4]>,
-        refuses: Vec<u32>,
-        inactive: Vec<u32>,
-    }
-
-    impl Controls for Fake {
-        fn query(&self, id: u32) -> Option<Control> {
-            let [_, least, most, step] = *self.controls.get(&id)?;
-            Some(Control { id, name: String::new(), least, most, step, inactive: self.inactive.contains(&id), read_only: false })
-        }
-        fn get(&self, id: u32) -> Result<i32, String> {
-            self.controls.get(&id).map(|c| c[0]).ok_or("invalid".into())
-        }
-        fn set(&mut self, id: u32, value: i32) -> Result<(), String> {
-            if self.refuses.contains(&id) {
-                return Err("busy".into());
-            }
-            let [at, least, most, step] = self.controls.get_mut(&id).ok_or("invalid")?;
-            *at = (value.clamp(*least, *most) - *least) / *step * *step + *least;
-            Ok(())
-        }
-    }
-
-    fn camera() -> Fake {
-        let controls = BTreeMap::from([
-            (v4l2::V4L2_CID_EXPOSURE_AUTO, [3, 0, 3, 1]),
-            (v4l2::V4L2_CID_EXPOSURE_ABSOLUTE, [156, 3, 2047, 1]),
-            (v4l2::V4L2_CID_GAIN, [64, 0, 255, 1]),
-            (v4l2::V4L2_CID_AUTO_WHITE_BALANCE, [1, 0, 1, 1]),
-            (v4l2::V4L2_CID_WHITE_BALANCE_TEMPERATURE, [4000, 2800, 6500, 10]),
-            (v4l2::V4L2_CID_POWER_LINE_FREQUENCY, [2, 0, 2, 1]),
-        ]);
-        Fake { controls, ..Fake::default() }
-    }
-
-    /// Protects the settings: values are set in V4L2's units with the automatic off, "locked" keeps what was there, and what the configuration
-    /// does not name is left alone and said.
-    #[test]
-    fn what_is_set_is_read_back_and_the_rest_is_said() {
-        let mut device = camera();
-        let config = CameraConfig {
-            exposure_ms: Some(Setting::Value(10.0)),
-            white_balance_k: Some(Setting::Locked(Locked::Locked)),
-            mains_hz: Some(Setting::Value(50.0)),
-            ..CameraConfig::default()
-        };
-        let outcome = apply(&mut device, &config);
-        assert!(outcome.refused.is_empty(), "{outcome:?}");
-        assert_eq!(device.get(v4l2::V4L2_CID_EXPOSURE_AUTO), Ok(1));
-        assert_eq!(device.get(v4l2::V4L2_CID_EXPOSURE_ABSOLUTE), Ok(100));
-        assert_eq!(device.get(v4l2::V4L2_CID_AUTO_WHITE_BALANCE), Ok(0));
-        assert_eq!(device.get(v4l2::V4L2_CID_WHITE_BALANCE_TEMPERATURE), Ok(4000));
-        assert_eq!(device.get(v4l2::V4L2_CID_POWER_LINE_FREQUENCY), Ok(1));
-        assert_eq!(device.get(v4l2::V4L2_CID_GAIN), Ok(64));
-        assert!(
-            outcome.said.iter().any(|s| s == "exposure_ms = 10") && outcome.said.iter().any(|s| s.starts_with("gain, focus left alone"))
-        );
-    }
-
-    /// Protects from a camera that does something else: a control that it lacks, refuses, or sets to another value is a refusal that names
-    /// the key, the value and the range.
-    #[test]
-    fn a_refusal_names_the_key() {
-        let said = |device: &mut Fake, config: CameraConfig| apply(device, &config).refused.join("\n");
-        let value = |v: f64| Some(Setting::Value(v));
-        let much = said(&mut camera(), CameraConfig { exposure_ms: value(500.0), ..CameraConfig::default() });
-        assert!(much.contains("camera.exposure_ms = 500") && much.contains("204.7 instead") && much.contains("0.3 to 204.7"), "{much}");
-        let none = said(&mut camera(), CameraConfig { focus: value(10.0), ..CameraConfig::default() });
-        assert!(none.contains("camera.focus") && none.contains("no such control"), "{none}");
-        let mut busy = camera();
-        busy.refuses = vec![v4l2::V4L2_CID_EXPOSURE_AUTO, v4l2::V4L2_CID_GAIN];
-        let both = said(&mut busy, CameraConfig { exposure_ms: value(10.0), gain: value(20.0), ..CameraConfig::default() });
-        assert!(both.contains("automatic cannot be switched off (busy)") && both.contains("camera.gain = 20: refused (busy)"), "{both}");
-        let mut kept = camera();
-        kept.inactive = vec![v4l2::V4L2_CID_GAIN];
-        let gain = said(&mut kept, CameraConfig { gain: value(20.0), ..CameraConfig::default() });
-        assert!(gain.contains("camera.gain") && gain.contains("under an automatic"), "a value that is kept and not used: {gain}");
-        let mut automatic = camera();
-        automatic.controls.insert(v4l2::V4L2_CID_POWER_LINE_FREQUENCY, [3, 0, 3, 1]);
-        let locked = Some(Setting::Locked(Locked::Locked));
-        let mains = said(&mut automatic, CameraConfig { mains_hz: locked, ..CameraConfig::default() });
-        assert!(mains.contains("write 50 or 60"), "{mains}");
-    }
-
-    /// Protects the colours that were learned: whoever looks before a pour is told where the camera's controls are not the configured ones, and nothing is
-    /// set. After the worker has set them there is nothing to tell.
-    #[test]
-    fn what_differs_is_told_and_left() {
-        let value = |v: f64| Some(Setting::Value(v));
-        let config = CameraConfig {
-            exposure_ms: value(10.0),
-            gain: value(64.0),
-            white_balance_k: Some(Setting::Locked(Locked::Locked)),
-            mains_hz: value(50.0),
-            ..CameraConfig::default()
-        };
-        let mut device = camera();
-        let told = compare(&device, &config);
-        let expected = [
-            "camera.exposure_ms: its automatic is on",
-            "camera.exposure_ms = 10: the camera has 15.6",
-            "camera.white_balance_k: its automatic is on",
-            "camera.mains_hz = 50: the camera has 60",
-        ];
-        assert_eq!(told, expected);
-        assert_eq!(device.controls, camera().controls, "nothing is set");
-        assert!(apply(&mut device, &config).refused.is_empty());
-        assert_eq!(compare(&device, &config), [""; 0]);
-        let focus = CameraConfig { focus: value(3.0), ..CameraConfig::default() };
-        assert_eq!(compare(&device, &focus), ["camera.focus: the camera has no such control"]);
-    }
-}
+mod tests;

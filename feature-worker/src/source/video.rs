@@ -177,6 +177,8 @@ impl Video {
                 "{}: {came} of its {promised} frames are shown; the others are cut out by its edit list, or damaged",
                 self.path
             ));
+        } else if self.container.open_end {
+            self.remark = Some(format!("{}: the file does not say its length, so whether its end is missing cannot be told", self.path));
         }
         Ok(())
     }

@@ -17,8 +17,6 @@ use super::geometry::Axes;
 const BINS: [usize; 3] = [18, 8, 8];
 /// Pixels with less saturation have no hue that means anything. Chosen by hand: one bin of saturation.
 const NO_HUE: u8 = 32;
-/// The most pixels that are kept of each of the two places. Chosen by hand: three megabytes.
-const KEEP: usize = 1_000_000;
 /// Pixels nearer to the lip than this are near. Tuned.
 const NEAR_PX: f32 = 20.0;
 /// Pixels further from the lip than this are far. Tuned.
@@ -99,12 +97,10 @@ impl Pixels {
     }
 
     fn add(&mut self, hsv: Hsv) {
-        if self.pixels.len() < KEEP {
-            for (place, bins) in self.bins.iter_mut().enumerate() {
-                bins[bin(hsv, place)] += 1;
-            }
-            self.pixels.push(hsv);
+        for (place, bins) in self.bins.iter_mut().enumerate() {
+            bins[bin(hsv, place)] += 1;
         }
+        self.pixels.push(hsv);
     }
 
     /// Number of pixels, at least 1.
@@ -183,7 +179,8 @@ impl ColourLearner {
         Self { axes, near: Pixels::new(), far: Pixels::new(), ends: Vec::new(), hsv: Mat::default() }
     }
 
-    /// Adds one BGR picture of the pour, dry ones included.
+    /// Adds one BGR picture of the pour, dry ones included. Of a large picture as many pixels are taken as of one 640 px wide, so that every
+    /// picture counts alike, and none takes more than 120 kB.
     pub fn add(&mut self, bgr: &impl core::ToInputArray) -> Result<(), ColourError> {
         imgproc::cvt_color_def(bgr, &mut self.hsv, imgproc::COLOR_BGR2HSV)?;
         let (rows, columns) = (self.hsv.rows(), self.hsv.cols());
@@ -191,11 +188,17 @@ impl ColourLearner {
         let scale = columns as f32 / 640.0;
         let [lip_x, lip_y] = self.axes.lip_px;
         let reach = REACH_PX * scale;
-        for y in ((lip_y - reach).max(0.0) as i32)..((lip_y + reach) as i32).min(rows) {
-            for x in ((lip_x - reach).max(0.0) as i32)..((lip_x + reach) as i32).min(columns) {
+        let step = scale.max(1.0);
+        // Where the pixels are, counted in steps, and in px.
+        let places = |lip: f32, most: i32| {
+            let (from, to) = (((lip - reach).max(0.0) / step) as i32, ((lip + reach) / step) as i32);
+            (from..to).map(move |i| (i, (i as f32 * step) as i32)).take_while(move |(_, px)| *px < most)
+        };
+        for (j, y) in places(lip_y, rows) {
+            for (i, x) in places(lip_x, columns) {
                 let at = [x as f32, y as f32];
                 let distance = (at[0] - lip_x).hypot(at[1] - lip_y);
-                let (near, far) = (distance < NEAR_PX * scale, distance > FAR_PX * scale && (x + y) % FAR_EVERY == 0);
+                let (near, far) = (distance < NEAR_PX * scale, distance > FAR_PX * scale && (i + j) % FAR_EVERY == 0);
                 if !(near || far) || self.axes.between(at) < RIM_PX * scale {
                     continue;
                 }

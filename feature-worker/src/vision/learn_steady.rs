@@ -35,8 +35,8 @@ pub struct Steadiness {
     pub left_side: Option<f32>,
     /// Edges outside of the container that stand still, px of length a picture 640 px wide.
     pub still_px: f32,
-    /// Their share of all edges outside of the container.
-    pub still_share: f32,
+    /// All edges outside of the container, in the same unit.
+    pub edges_px: f32,
 }
 
 impl Steadiness {
@@ -56,8 +56,8 @@ impl Steadiness {
             Ok(least)
         };
         let (top_edge, left_side) = (stays(corner.rim, corner.foot)?, stays(corner.foot, corner.rim)?);
-        let (still_px, still_share) = still_edges(corner, &pictures)?;
-        Ok(Self { top_edge, left_side, still_px, still_share })
+        let (still_px, edges_px) = still_edges(corner, &pictures)?;
+        Ok(Self { top_edge, left_side, still_px, edges_px })
     }
 }
 
@@ -101,8 +101,8 @@ fn correlation(a: &[f32], b: &[f32]) -> f32 {
     if norm > 0.0 { dot(a, b) / norm } else { 0.0 }
 }
 
-/// The length of the edges outside of the container that are at the same place in nearly all pictures, px of a picture 640 px wide, and
-/// their share of all edges there.
+/// The length of the edges outside of the container that are at the same place in nearly all pictures, and of all edges there, in the mean of
+/// the pictures, px of a picture 640 px wide.
 fn still_edges(corner: &Corner, pictures: &[Mat]) -> opencv::Result<(f32, f32)> {
     let Some(first) = pictures.first() else { return Ok((0.0, 0.0)) };
     let (width, height) = (first.cols() as usize, first.rows() as usize);
@@ -135,6 +135,6 @@ fn still_edges(corner: &Corner, pictures: &[Mat]) -> opencv::Result<(f32, f32)> 
             }
         }
     }
-    let each = still as f32 / pictures.len() as f32 * 640.0 / width as f32;
-    Ok((each, if all > 0 { still as f32 / all as f32 } else { 0.0 }))
+    let each = |count: u64| count as f32 / pictures.len() as f32 * 640.0 / width as f32;
+    Ok((each(still), each(all)))
 }

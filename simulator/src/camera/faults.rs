@@ -37,7 +37,8 @@ const HIGHLIGHT_PX: [f64; 2] = [18.0, 12.0];
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum FaultKind {
-    /// Lamps at 50 or 60 Hz mains flicker, and a rolling shutter makes bands of it; the strength is their share of the light.
+    /// Lamps at 50 or 60 Hz mains, as the seed draws, flicker, and a rolling shutter makes bands of it, which at 60 Hz stand still in the picture;
+    /// the strength is their share of the light.
     Banding,
     /// The gains of red and blue wander; the strength is how far, as a share.
     WhiteBalance,
@@ -126,7 +127,11 @@ impl CameraFault {
         let wave = |period_s: f64, k: u64| (std::f64::consts::TAU * t_s / period_s + phase(k)).sin();
         let broken_from = || self.broken_from(number, height).map(|row| row * width * 3);
         match self.kind {
-            FaultKind::Banding => self.band(t_s, phase(1), [width, height], pixels),
+            FaultKind::Banding => {
+                // Not a bit of the seed itself: seeds of one run are alike in those.
+                let light_hz = if phase(3) < std::f64::consts::PI { 100.0 } else { 120.0 };
+                self.band(t_s, light_hz, phase(1), [width, height], pixels);
+            }
             FaultKind::WhiteBalance => {
                 let gains = [1.0 + strength * wave(BALANCE_PERIOD_S, 1), 1.0, 1.0 + strength * wave(BALANCE_PERIOD_S, 2)];
                 scale(pixels, gains);
@@ -181,9 +186,8 @@ impl CameraFault {
         (number.wrapping_add(self.seed) % BROKEN_EVERY == BROKEN_EVERY - 1).then_some(row.min(height))
     }
 
-    /// Bands of light, of a hundred a second or of a hundred and twenty.
-    fn band(&self, t_s: f64, phase: f64, [width, height]: [usize; 2], pixels: &mut [u8]) {
-        let light_hz = if self.seed.is_multiple_of(2) { 100.0 } else { 120.0 };
+    /// Bands of light that flickers `light_hz` times a second.
+    fn band(&self, t_s: f64, light_hz: f64, phase: f64, [width, height]: [usize; 2], pixels: &mut [u8]) {
         for (y, row) in pixels.chunks_exact_mut(width * 3).enumerate() {
             let at_s = t_s + READOUT_S * y as f64 / height as f64;
             let gain = 1.0 + self.strength * (std::f64::consts::TAU * light_hz * at_s + phase).sin();
@@ -248,6 +252,24 @@ impl FaultyCamera {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    /// Protects figures of flickering lamps from those of one mains frequency alone: cells whose seeds are all even, or all odd, have both, so
+    /// that bands wander in some and stand still in others.
+    #[test]
+    fn both_mains_frequencies_are_drawn() {
+        for parity in [0, 1] {
+            let still = (0..16).filter(|i| {
+                let fault = CameraFault { kind: FaultKind::Banding, strength: 0.3, seed: 500_000 + 2 * i + parity };
+                let picture = |number| {
+                    let mut pixels = [128; 4 * 48 * 3];
+                    fault.apply(number, [4, 48], [2.0, 20.0], &[], &mut pixels);
+                    pixels
+                };
+                picture(7) == picture(8)
+            });
+            assert!((3..=13).contains(&still.count()), "seeds of parity {parity}");
+        }
+    }
 
     /// Protects reproducible trials: each kind changes the pictures that it is meant to change, the same seed and number in the same way,
     /// and a buffer of another size is left alone.

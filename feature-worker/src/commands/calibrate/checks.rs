@@ -22,7 +22,7 @@ const STAYS_LEAST: f32 = 0.6;
 const STILL_PX_MOST: f32 = 900.0;
 /// ... unless they are less than this share of its edges. By hand.
 const STILL_SHARE_MOST: f32 = 0.5;
-/// Poses from which on a background can be seen to stand still. By hand.
+/// Fewer poses show no background that moves. By hand.
 const POSES_LEAST: usize = 4;
 /// Largest share of the dry background inside the learned colours. By hand: the extraction's targets hold up to about this.
 const BACKGROUND_MOST: f32 = 0.02;
@@ -64,11 +64,20 @@ pub(super) fn axes_stay(corner: &Corner, poses: &[&Mat], mean: &Mat) -> Result<O
              correct them with --lip, --x-axis and --y-axis, or with --page"
         ));
     }
-    if poses.len() >= POSES_LEAST && steady.still_px > STILL_PX_MOST && steady.still_share > STILL_SHARE_MOST {
+    // An even wall has no edges, and gives no poses.
+    if poses.len() < POSES_LEAST && steady.edges_px > STILL_PX_MOST {
+        return Err(
+            "the background does not move: the camera must be fixed to the container, so that the background turns while it pours; \
+                    tilt it with the robot"
+                .into(),
+        );
+    }
+    let still_share = steady.still_px / steady.edges_px.max(1.0);
+    if steady.still_px > STILL_PX_MOST && still_share > STILL_SHARE_MOST {
         return Err(format!(
             "the background stands still ({} of its edges): the camera must be fixed to the container, so that the background turns while it \
              pours; tilt it with the robot",
-            percent(steady.still_share)
+            percent(still_share)
         ));
     }
     let faint = steady.top_edge.is_none() || steady.left_side.is_none();

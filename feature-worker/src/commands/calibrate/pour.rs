@@ -1,7 +1,7 @@
 //! What was seen of one pour: kept pictures to learn from, and all frames once more to measure.
 //!
-//! Runs on the command's thread and allocates: at most [`KEEP_PICTURES`] pictures, and of a live camera each frame as JPEG. Files are read a
-//! second time instead.
+//! Runs on the command's thread and allocates: at most [`KEEP_PICTURES`] pictures and [`KEEP_MOST`] bytes of them, and of a live camera each
+//! frame as JPEG. Files are read a second time instead.
 
 use std::path::PathBuf;
 
@@ -17,9 +17,11 @@ use crate::vision::{Extractor, Image, Measurement, PictureTime, Poses};
 
 /// The most pictures that are kept for learning and for the drawn picture. Chosen by hand: about 140 MB at 640 x 480 px.
 const KEEP_PICTURES: usize = 150;
+/// The most that these pictures take, bytes. Chosen by hand: 150 at 1280 x 720 px, and 21 at 3840 x 2160 px.
+const KEEP_MOST: usize = 1 << 29;
 /// Quality of the frames of a live camera that are kept, 0 to 100. Chosen by hand: no difference in V_e was seen.
 const FILM_QUALITY: i32 = 97;
-/// The most that is kept of a live camera, bytes. Chosen by hand: more than five minutes at 640 x 480 px.
+/// The most that is kept of a live camera, with those pictures, bytes. Chosen by hand: some five minutes at 640 x 480 px.
 pub(super) const FILM_MOST: usize = 1 << 30;
 
 /// Where all frames come from once more.
@@ -38,6 +40,8 @@ pub(super) struct Pour {
     pub count: u64,
     /// Of this many pictures, one is kept.
     stride: u64,
+    /// How many bytes the kept pictures may take.
+    keep_most: usize,
     film: Film,
 }
 
@@ -48,7 +52,7 @@ impl Pour {
     }
 
     fn of(film: Film) -> Self {
-        Self { pictures: Vec::new(), count: 0, stride: 1, film }
+        Self { pictures: Vec::new(), count: 0, stride: 1, keep_most: KEEP_MOST, film }
     }
 
     /// The pour in files. With `partial`, something may be missing. Returns also what is missing, a line each.
@@ -77,7 +81,7 @@ impl Pour {
         if self.count.is_multiple_of(self.stride) {
             self.pictures.push(bgr);
         }
-        if self.pictures.len() > KEEP_PICTURES {
+        if self.pictures.len() > KEEP_PICTURES || self.picture_bytes() > self.keep_most {
             // Every second picture is dropped, and from now on half as many are kept.
             let mut index = 0;
             self.pictures.retain(|_| {
@@ -90,9 +94,15 @@ impl Pour {
         Ok(())
     }
 
+    /// How many bytes the kept pictures take.
+    fn picture_bytes(&self) -> usize {
+        let each = self.pictures.first().map_or(0, |first| first.total() * first.elem_size().unwrap_or(0));
+        self.pictures.len() * each
+    }
+
     /// Whether no more can be kept.
     pub fn is_full(&self) -> bool {
-        matches!(self.film, Film::Kept { bytes, most, .. } if bytes > most)
+        matches!(self.film, Film::Kept { bytes, most, .. } if bytes + self.picture_bytes() > most)
     }
 
     /// The poses among the kept pictures, those pictures, and their mean.
@@ -131,4 +141,32 @@ fn time(frame: &Frame) -> PictureTime {
 /// Whether two pictures are the same to the byte.
 pub(super) fn same(a: &Mat, b: &Mat) -> bool {
     core::norm2(a, b, core::NORM_INF, &core::no_array()).is_ok_and(|difference| difference == 0.0)
+}
+
+#[cfg(test)]
+mod tests {
+    use shared::messages::FrameHeader;
+
+    use super::*;
+
+    /// Protects the memory of whoever calibrates with a large picture or for long: the kept pictures take no more than they may, spread over the whole
+    /// pour, and of a live camera they count with its frames.
+    #[test]
+    fn kept_pictures_are_bounded_in_bytes() {
+        let header = FrameHeader { width_px: 64, height_px: 48, format: PixelFormat::Bgr8 as u32, ..Default::default() };
+        let each = 64 * 48 * 3;
+        let kept = |mut pour: Pour, frames: u8| {
+            for level in 0..frames {
+                pour.add(&Frame { header, pixels: &vec![level; each] }).unwrap();
+            }
+            let levels: Vec<u8> = pour.pictures.iter().map(|p| p.data_bytes().unwrap()[0]).collect();
+            (levels, pour.is_full())
+        };
+        let files = |keep_most| Pour { keep_most, ..Pour::of(Film::Files(Vec::new(), false)) };
+        assert_eq!(kept(files(10 * each), 40).0, (0..40).step_by(4).collect::<Vec<u8>>());
+        assert_eq!(kept(files(usize::MAX), 150).0.len(), 150);
+        assert_eq!(kept(files(usize::MAX), 151).0.len(), 76);
+        let live = || Pour::live(20 * each);
+        assert!(!kept(live(), 10).1 && kept(live(), 21).1);
+    }
 }

@@ -4,9 +4,10 @@
 
 use std::path::Path;
 
-use shared::config::{Config, FILE_MAX, ImageConfig, LiquidMethod};
-use shared::exit::{self, Failure, OrExit as _, failure};
-use shared::{regular_file, whole_file};
+use shared::config::{Config, ImageConfig, LiquidMethod};
+use shared::exit::Failure;
+
+use crate::commands::configuration;
 
 /// The `[image]` table as text.
 pub(super) fn text(image: &ImageConfig) -> String {
@@ -39,22 +40,18 @@ pub(super) fn is_shown(image: &ImageConfig, body: &[u8]) -> bool {
 
 /// Puts the `[image]` table of `config` into the file in one step. The other tables stay as they are.
 pub(super) fn write(path: &Path, config: &Config) -> Result<(), Failure> {
-    let fail = |e: String| failure(exit::FAILED, format!("{}: {e}", path.display()));
-    // If the path is a link, the file that it leads to is replaced, and not the link.
-    let file = path.canonicalize().map_err(|e| fail(e.to_string()))?;
-    let before = regular_file::read_text(&file, FILE_MAX).map_err(|e| fail(e.to_string()))?;
-    let after =
-        replace(&before, &text(&config.image)).ok_or_else(|| fail("has no line [image] of its own; write the table there".into()))?;
-    let checked = Config::parse(&after, &path.display().to_string()).or_exit(exit::FAILED)?;
-    let size = (checked.camera.width_px, checked.camera.height_px);
     let (width, height) = (config.camera.width_px, config.camera.height_px);
-    if size != (width, height) {
-        return Err(fail(format!(
+    let same_size = |checked: &Config| {
+        let size = (checked.camera.width_px, checked.camera.height_px);
+        if size == (width, height) {
+            return Ok(());
+        }
+        Err(format!(
             "[camera] says {} x {} px, but these frames are {width} x {height}; correct width_px and height_px first",
             size.0, size.1
-        )));
-    }
-    whole_file::replace(&file, after.as_bytes(), b"").map_err(|e| fail(e.to_string()))?;
+        ))
+    };
+    configuration::change(path, "image", |before| replace(before, &text(&config.image)), same_size)?;
     eprintln!("calibrate: wrote [image] of {}", path.display());
     Ok(())
 }

@@ -1,0 +1,169 @@
+//! What the camera's controls are held to, with a camera in memory.
+//!
+//! Tests only: they allocate, and a fault of the controls fails them.
+
+use super::*;
+use shared::config::Locked;
+use std::collections::BTreeMap;
+
+/// A camera in memory: value, least, most and step of each control, and which controls are refused.
+#[derive(Default)]
+struct Fake {
+    controls: BTreeMap<u32, [i32; 4]>,
+    refuses: Vec<u32>,
+    inactive: Vec<u32>,
+    /// Frames so far, in which its automatics work.
+    frames: std::cell::Cell<i32>,
+}
+
+impl Fake {
+    /// Takes a frame: the automatic exposure falls by 10 a frame for 25 frames.
+    fn grab(&self) -> bool {
+        self.frames.set(self.frames.get() + 1);
+        true
+    }
+}
+
+impl Controls for Fake {
+    fn query(&self, id: u32) -> Option<Control> {
+        let [_, least, most, step] = *self.controls.get(&id)?;
+        Some(Control { id, name: String::new(), least, most, step, inactive: self.inactive.contains(&id), read_only: false })
+    }
+    fn get(&self, id: u32) -> Result<i32, String> {
+        let value = self.controls.get(&id).map(|c| c[0]).ok_or("invalid")?;
+        let automatic = self.controls.get(&v4l2::V4L2_CID_EXPOSURE_AUTO).is_some_and(|c| c[0] != EXPOSURE_MANUAL);
+        let moves = automatic && id == v4l2::V4L2_CID_EXPOSURE_ABSOLUTE && self.frames.get() > 0;
+        Ok(if moves { 400 - 10 * self.frames.get().min(25) } else { value })
+    }
+    fn set(&mut self, id: u32, value: i32) -> Result<(), String> {
+        if self.refuses.contains(&id) {
+            return Err("busy".into());
+        }
+        let [at, least, most, step] = self.controls.get_mut(&id).ok_or("invalid")?;
+        *at = (value.clamp(*least, *most) - *least) / *step * *step + *least;
+        Ok(())
+    }
+}
+
+fn camera() -> Fake {
+    let controls = BTreeMap::from([
+        (v4l2::V4L2_CID_EXPOSURE_AUTO, [3, 0, 3, 1]),
+        (v4l2::V4L2_CID_EXPOSURE_ABSOLUTE, [156, 3, 2047, 1]),
+        (v4l2::V4L2_CID_GAIN, [64, 0, 255, 1]),
+        (v4l2::V4L2_CID_AUTO_WHITE_BALANCE, [1, 0, 1, 1]),
+        (v4l2::V4L2_CID_WHITE_BALANCE_TEMPERATURE, [4000, 2800, 6500, 10]),
+        (v4l2::V4L2_CID_POWER_LINE_FREQUENCY, [2, 0, 2, 1]),
+    ]);
+    Fake { controls, ..Fake::default() }
+}
+
+/// Protects the settings: values are set in V4L2's units with the automatic off, "locked" keeps what was there, and what the configuration
+/// does not name is left alone and said.
+#[test]
+fn what_is_set_is_read_back_and_the_rest_is_said() {
+    let mut device = camera();
+    let config = CameraConfig {
+        exposure_ms: Some(Setting::Value(10.0)),
+        white_balance_k: Some(Setting::Locked(Locked::Locked)),
+        mains_hz: Some(Setting::Value(50.0)),
+        ..CameraConfig::default()
+    };
+    let outcome = apply(&mut device, &config);
+    assert!(outcome.refused.is_empty(), "{outcome:?}");
+    assert_eq!(device.get(v4l2::V4L2_CID_EXPOSURE_AUTO), Ok(1));
+    assert_eq!(device.get(v4l2::V4L2_CID_EXPOSURE_ABSOLUTE), Ok(100));
+    assert_eq!(device.get(v4l2::V4L2_CID_AUTO_WHITE_BALANCE), Ok(0));
+    assert_eq!(device.get(v4l2::V4L2_CID_WHITE_BALANCE_TEMPERATURE), Ok(4000));
+    assert_eq!(device.get(v4l2::V4L2_CID_POWER_LINE_FREQUENCY), Ok(1));
+    assert_eq!(device.get(v4l2::V4L2_CID_GAIN), Ok(64));
+    assert!(outcome.said.iter().any(|s| s == "exposure_ms = 10") && outcome.said.iter().any(|s| s.starts_with("gain, focus left alone")));
+}
+
+/// Protects from a first picture that is locked: the automatic finds its value before it is switched off, and one that never rests is waited
+/// for no longer than said. What is not to be locked is not waited for.
+#[test]
+fn the_automatic_finds_before_it_is_locked() {
+    let locked = CameraConfig { exposure_ms: Some(Setting::Locked(Locked::Locked)), ..CameraConfig::default() };
+    let mut device = camera();
+    assert!(settle(&device, &locked, SETTLE_MOST, || device.grab()));
+    assert!(apply(&mut device, &locked).refused.is_empty());
+    assert_eq!(device.get(v4l2::V4L2_CID_EXPOSURE_ABSOLUTE), Ok(150));
+    let restless = camera();
+    assert!(!settle(&restless, &locked, Duration::from_millis(50), || {
+        std::thread::sleep(Duration::from_millis(5));
+        restless.grab()
+    }));
+    let value = CameraConfig { gain: Some(Setting::Value(1.0)), ..CameraConfig::default() };
+    let other = camera();
+    assert!(settle(&other, &value, SETTLE_MOST, || other.grab()) && other.frames.get() == 0);
+}
+
+/// Protects who lets the camera find its settings once: automatics that were off are on while it looks, and what they found is set as values with
+/// the automatics off. What the camera has not, or keeps under an automatic, is not among them.
+#[test]
+fn what_the_automatics_find_is_kept() {
+    let mut device = camera();
+    device.controls.insert(v4l2::V4L2_CID_EXPOSURE_AUTO, [EXPOSURE_MANUAL, 0, 3, 1]);
+    device.inactive = vec![v4l2::V4L2_CID_GAIN];
+    start_automatics(&mut device);
+    assert_eq!(device.get(v4l2::V4L2_CID_EXPOSURE_AUTO), Ok(3));
+    (0..60).for_each(|_| assert!(device.grab()));
+    let Found { values, outcome } = keep_found(&mut device);
+    assert_eq!(values, [("exposure_ms", 15.0), ("white_balance_k", 4000.0)]);
+    assert!(outcome.refused.len() == 1 && outcome.refused[0].contains("camera.gain"), "{outcome:?}");
+    let at = [v4l2::V4L2_CID_EXPOSURE_AUTO, v4l2::V4L2_CID_EXPOSURE_ABSOLUTE, v4l2::V4L2_CID_AUTO_WHITE_BALANCE].map(|id| device.get(id));
+    assert_eq!(at, [Ok(1), Ok(150), Ok(0)]);
+}
+
+/// Protects from a camera that does something else: a control that it lacks, refuses, or sets to another value is a refusal that names
+/// the key, the value and the range.
+#[test]
+fn a_refusal_names_the_key() {
+    let said = |device: &mut Fake, config: CameraConfig| apply(device, &config).refused.join("\n");
+    let value = |v: f64| Some(Setting::Value(v));
+    let much = said(&mut camera(), CameraConfig { exposure_ms: value(500.0), ..CameraConfig::default() });
+    assert!(much.contains("camera.exposure_ms = 500") && much.contains("204.7 instead") && much.contains("0.3 to 204.7"), "{much}");
+    let none = said(&mut camera(), CameraConfig { focus: value(10.0), ..CameraConfig::default() });
+    assert!(none.contains("camera.focus") && none.contains("no such control"), "{none}");
+    let mut busy = camera();
+    busy.refuses = vec![v4l2::V4L2_CID_EXPOSURE_AUTO, v4l2::V4L2_CID_GAIN];
+    let both = said(&mut busy, CameraConfig { exposure_ms: value(10.0), gain: value(20.0), ..CameraConfig::default() });
+    assert!(both.contains("automatic cannot be switched off (busy)") && both.contains("camera.gain = 20: refused (busy)"), "{both}");
+    let mut kept = camera();
+    kept.inactive = vec![v4l2::V4L2_CID_GAIN];
+    let gain = said(&mut kept, CameraConfig { gain: value(20.0), ..CameraConfig::default() });
+    assert!(gain.contains("camera.gain") && gain.contains("under an automatic"), "a value that is kept and not used: {gain}");
+    let mut automatic = camera();
+    automatic.controls.insert(v4l2::V4L2_CID_POWER_LINE_FREQUENCY, [3, 0, 3, 1]);
+    let locked = Some(Setting::Locked(Locked::Locked));
+    let mains = said(&mut automatic, CameraConfig { mains_hz: locked, ..CameraConfig::default() });
+    assert!(mains.contains("write 50 or 60"), "{mains}");
+}
+
+/// Protects the colours that were learned: whoever looks before a pour is told where the camera's controls are not the configured ones, and nothing is
+/// set. After the worker has set them there is nothing to tell.
+#[test]
+fn what_differs_is_told_and_left() {
+    let value = |v: f64| Some(Setting::Value(v));
+    let config = CameraConfig {
+        exposure_ms: value(10.0),
+        gain: value(64.0),
+        white_balance_k: Some(Setting::Locked(Locked::Locked)),
+        mains_hz: value(50.0),
+        ..CameraConfig::default()
+    };
+    let mut device = camera();
+    let told = compare(&device, &config);
+    let expected = [
+        "camera.exposure_ms: its automatic is on",
+        "camera.exposure_ms = 10: the camera has 15.6",
+        "camera.white_balance_k: its automatic is on",
+        "camera.mains_hz = 50: the camera has 60",
+    ];
+    assert_eq!(told, expected);
+    assert_eq!(device.controls, camera().controls, "nothing is set");
+    assert!(apply(&mut device, &config).refused.is_empty());
+    assert_eq!(compare(&device, &config), [""; 0]);
+    let focus = CameraConfig { focus: value(3.0), ..CameraConfig::default() };
+    assert_eq!(compare(&device, &focus), ["camera.focus: the camera has no such control"]);
+}
