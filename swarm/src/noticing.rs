@@ -5,7 +5,13 @@
 use shared::control::EndReason;
 use simulator::ur::Fault;
 
+use crate::weight_set::RATE_HZ;
 use crate::what::{EyeFault, What};
+
+/// For how long measurements come late, s: `DRIFT_FRAMES` of eye.rs.
+const LATE_S: f64 = 2.0;
+/// The rate of the slowest robot's control cycles: that of a CB3.
+const SLOWEST_HZ: f64 = 125.0;
 
 /// How long a fault needs that must end any pour, s, besides what any needs; `None` if it need not.
 pub fn must_end(what: &What) -> Option<f64> {
@@ -44,11 +50,18 @@ pub fn reasons(what: &What) -> &'static [EndReason] {
             Fault::HeldBack(_) | Fault::JointSpeedLimit(_) => &[NotFollowed, NotUpright, ProtectiveStop, ProgramStopped],
             Fault::Freedrive | Fault::HandMove(..) => &[InHand, NotFollowed, ProgramStopped],
             Fault::Boot => &[RobotNotRunning, ProgramStopped],
+            // These only keep a program from being started, and nobody pours without one.
+            Fault::InUse(_) | Fault::LateStart(_) | Fault::LocalControl => &[],
             _ => &[RobotLost, RobotStalled, ProgramStopped, NotFollowed, NotUpright],
         },
         What::LinkStall(_) | What::LinkSplit(_) | What::LinkCut => &[RobotLost, RobotStalled, ProgramStopped, NotFollowed, NotUpright],
-        What::Eye(EyeFault::Killed(_) | EyeFault::Two(_)) => &[WorkerRestarted, StaleFeature, FrameRate],
-        What::Eye(_) => &[StaleFeature, WorkerRestarted, FrameRate],
+        What::Eye(EyeFault::Killed(_) | EyeFault::Two(_)) => &[WorkerRestarted, StaleFeature],
+        What::Eye(EyeFault::Loss(_) | EyeFault::Freeze(_) | EyeFault::Late(_) | EyeFault::Hung(_)) => &[StaleFeature],
+        // A picture that nobody can measure is no measurement.
+        What::Eye(EyeFault::Picture(_)) => &[StaleFeature, FrameRate],
+        // Each of these is a measurement, and in time.
+        What::Eye(EyeFault::Duplicate(_) | EyeFault::Reorder | EyeFault::GainDrift(_)) => &[],
+        What::Eye(EyeFault::FalseZero(_) | EyeFault::Spike(_) | EyeFault::Stuck(_)) => &[],
         What::Overrun(_) | What::Suspended(_) => &[ControllerOverrun, StaleFeature, RobotLost, RobotStalled, ProgramStopped, NotFollowed],
         What::ControllerKilled(_) => &[RobotLost],
         _ => &[],
@@ -59,6 +72,51 @@ pub fn reasons(what: &What) -> &'static [EndReason] {
 pub fn lasts(what: &What) -> bool {
     use Fault::*;
     matches!(what, What::Robot(Stall(_) | Freeze(_) | SlowReader(_) | TimeScaling(_) | SpeedSlider(_) | HeldBack(_) | JointSpeedLimit(_)))
+}
+
+/// How long it lasts by itself, s.
+pub fn takes_s(what: &What) -> f64 {
+    use Fault::{Coalesce, Freeze, Offline, SkipOutputs, SlowReader, Split, Stall};
+    let frames_s = |frames: u32| f64::from(frames) / RATE_HZ;
+    let ms_s = |ms: u32| f64::from(ms) / 1000.0;
+    match what {
+        What::Robot(Offline(s) | Stall(s) | Freeze(s) | SlowReader(s) | Coalesce(s) | Split(s)) => *s,
+        What::Robot(SkipOutputs(cycles)) => f64::from(*cycles) / SLOWEST_HZ,
+        What::LinkStall(ms) | What::LinkSplit(ms) | What::SecondClient(ms) => ms_s(*ms),
+        What::Overrun(ms) | What::Suspended(ms) | What::ControllerKilled(ms) => ms_s(*ms),
+        What::Eye(fault) => match fault {
+            EyeFault::Loss(frames) | EyeFault::Freeze(frames) | EyeFault::Duplicate(frames) => frames_s(*frames),
+            EyeFault::FalseZero(frames) | EyeFault::Stuck(frames) => frames_s(*frames),
+            EyeFault::Killed(ms) | EyeFault::Hung(ms) | EyeFault::Two(ms) => ms_s(*ms),
+            EyeFault::Late(_) => LATE_S,
+            EyeFault::GainDrift(_) | EyeFault::Picture(_) => f64::INFINITY,
+            EyeFault::Reorder | EyeFault::Spike(_) => 0.0,
+        },
+        _ => 0.0,
+    }
+}
+
+/// What a fault does to a way upright.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum OnWay {
+    /// Nothing: it is one of the camera, the operator or the disk, or keeps nothing from moving.
+    Nothing,
+    /// The robot's program may wait once for as long as its patience, before it goes on by itself.
+    Delays,
+    /// The arm stands, or is slower than it is commanded.
+    Holds,
+}
+
+/// What a fault does to a way upright that has begun, or is about to.
+pub fn on_way(what: &What) -> OnWay {
+    match what {
+        What::Robot(Fault::InUse(_) | Fault::LateStart(_) | Fault::LocalControl) => OnWay::Nothing,
+        What::Robot(Fault::SpeedSlider(_) | Fault::TimeScaling(_)) => OnWay::Holds,
+        What::Robot(_) if leaves_tilted(what) => OnWay::Holds,
+        What::Robot(_) | What::LinkStall(_) | What::LinkSplit(_) | What::LinkCut => OnWay::Delays,
+        What::Overrun(_) | What::Suspended(_) | What::ControllerKilled(_) => OnWay::Delays,
+        _ => OnWay::Nothing,
+    }
 }
 
 /// Whether a person takes the robot with it, or stops it, so that it must not be taken back unasked.
@@ -90,4 +148,23 @@ pub fn leaves_tilted(what: &What) -> bool {
 pub fn is_ordinary(reason: EndReason) -> bool {
     use EndReason::*;
     matches!(reason, Done | ContainerEmpty | StreamLost | MaxFrames | ImpossibleFlow | NothingFlows | GoalExceeded)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Protects the check of reasons from excuses: a fault names only the ends that it can cause. What is a measurement in time ends nothing, lost frames are
+    /// no other worker, and what keeps programs from being started ends none that runs.
+    #[test]
+    fn a_fault_names_only_what_it_can_cause() {
+        use EyeFault::{Duplicate, FalseZero, GainDrift, Loss, Reorder, Spike, Stuck};
+        for fault in [Duplicate(9), Reorder, Spike(900.0), GainDrift(0.3), Stuck(9), FalseZero(9)] {
+            assert!(reasons(&What::Eye(fault)).is_empty(), "{fault:?}");
+        }
+        assert_eq!(reasons(&What::Eye(Loss(12))), [EndReason::StaleFeature]);
+        for fault in [Fault::LocalControl, Fault::InUse("speed_slider_mask".into()), Fault::LateStart(1.0)] {
+            assert!(reasons(&What::Robot(fault.clone())).is_empty(), "{fault:?}");
+        }
+    }
 }

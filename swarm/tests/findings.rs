@@ -314,3 +314,30 @@ fn a_joint_goes_up_to_a_target_that_was_taken_back() {
     assert_eq!(checks.target(0.1).map(|(deg, _)| deg), Some(84.0));
     assert_eq!(checks.target(1.0).map(|(deg, _)| deg), Some(83.0), "what is no longer followed does not count");
 }
+
+/// Protects the table of docs/SWARM.md: what stays wrong after a fault is one of every later pour too, however long ago it began, so that "none" has only
+/// pours without any. A controller that starts again has the vessel's own weights.
+#[test]
+fn what_stays_wrong_is_a_fault_of_later_pours() {
+    let happens = [
+        (3_000, What::Eye(EyeFault::GainDrift(0.05)), Some("eye-gain-drift")),
+        (3_100, What::Weights(1), Some("weights-of-another-vessel")),
+        (3_500, What::Robot(Fault::LateStart(0.1)), Some("late-start")),
+        (20_000, What::Pour(60.0), None),
+        (40_000, What::ControllerKilled(500), Some("controller-killed")),
+        (41_000, What::Refill(300.0), None),
+        (55_000, What::Pour(60.0), None),
+    ];
+    let shown = shown(9, Series::Cb3, 0, (300.0, (266_117, 645_915)), &happens);
+    let faults: Vec<_> = shown.poured.iter().map(|pour| pour.faults.clone()).collect();
+    assert_eq!(faults, [vec!["eye-gain-drift", "weights-of-another-vessel"], vec!["eye-gain-drift"]]);
+    // The same of weights that were learned with a number that somebody mistyped.
+    let happens = [
+        (3_066, What::Record(80.0, 0.9), None),
+        (18_066, What::Learn(Weighed::Mistyped(1.3)), None),
+        (18_566, What::Refill(300.0), None),
+        (40_066, What::Pour(60.0), None),
+    ];
+    let lesson = self::shown(9, Series::Cb3, 0, (300.0, (266_117, 645_915)), &happens);
+    assert_eq!(lesson.poured[1].faults, ["doubtful-lesson"]);
+}
