@@ -15,13 +15,16 @@ use simulator::ur::{Fault, Machine, RobotMode, RuntimeState, SafetyMode};
 
 use crate::commanded::{Commanded, SLACK, SLACK_DEG};
 use crate::evidence::Evidence;
-use crate::noticing::{lasts, leaves_tilted, must_end, takes_robot, takes_s};
+use crate::noticing::{forbids_runs, hinders, lasts, leaves_tilted, must_end, remedies, takes_robot, takes_s};
 use crate::unshown::Unshown;
+use crate::waits::Waits;
 use crate::weight_set::RATE_HZ;
 use crate::what::What;
 
 /// A container nearer to 0 than this is upright, degrees (`robot.start_tolerance_deg` of config/sim.toml, and half a degree of lag).
 const UPRIGHT_DEG: f64 = 2.5;
+/// A container nearer to 0 than this can be taken, degrees (`robot.start_tolerance_deg` of config/sim.toml, and what its measurement scatters).
+const START_DEG: f64 = 1.9;
 /// The longest way upright of a program that runs, s: 110 degrees at 60 degrees/s, its patience of 100 ms, and 1 s as in docs/ROBOT.md.
 const WAY_UPRIGHT_S: f64 = 110.0 / 60.0 + 0.1 + 1.0;
 /// After this a fault that must end a pour has been noticed, s: `controller.stale_feature_ms` and `lost_robot_ms` of config/sim.toml, three
@@ -39,6 +42,12 @@ const LOOKS_S: f64 = 0.2;
 const LEFT_TILTED_S: f64 = 2.0;
 /// For how long a robot still follows a target that was sent, s: the patience of its program, and what it is behind.
 const FOLLOWED_S: f64 = 0.3;
+/// For how long a joint may be behind its commands, s: 1.25 times the longest lag that is believed, and two ticks (docs/ROBOT.md).
+const FOLLOWS_S: f64 = 0.45;
+/// How far from its commands a joint still follows, degrees: the 2 of docs/ROBOT.md, and as many for how far it goes between two ticks.
+const FOLLOWS_DEG: f64 = 4.0;
+/// After this a controller that stands still is no longer heard, s: the patience of the program, and bytes on their way.
+const SILENT_S: f64 = 0.2;
 /// Most frames that are bridged at once: one second (`BRIDGED_S` of the controller's core).
 const MOST_BRIDGED: u64 = RATE_HZ as u64;
 /// Number of violations that are kept for a seed; the first is what counts.
@@ -70,11 +79,11 @@ pub struct Injected {
 
 /// Who can know that a person stopped our program. A stop that finds no program of ours at work stops nothing, and leaves no sign.
 #[derive(Debug, Clone, Copy, Default)]
-struct Taken {
+pub(crate) struct Taken {
     /// The controller that had a session then, as long as it lives.
-    controller: bool,
+    pub(crate) controller: bool,
     /// The robot's registers, in which our program was still at work, until the robot boots.
-    registers: bool,
+    pub(crate) registers: bool,
 }
 
 /// What the checks keep.
@@ -94,6 +103,13 @@ pub struct Checks {
     /// When the targets that the robot may still follow were sent, s, and which, degrees; also when there is none any more.
     sent_targets: VecDeque<(f64, f64)>,
     pub(crate) phase: Phase,
+    /// From when on a controller that stands still has not been heard, s.
+    silent_from_s: f64,
+    /// When the program that the robot has began, s.
+    program_s: f64,
+    /// The tilt in the newest control cycle, degrees, and since when the joint has not been where it was commanded, s.
+    alpha_deg: f64,
+    elsewhere_since_s: Option<f64>,
     /// Since when the robot could have been on its way upright, s.
     free_since_s: Option<f64>,
     sequence: (u64, u64),
@@ -106,11 +122,13 @@ pub struct Checks {
     sent: i32,
     echoed: i32,
     /// When the operator last asked for the robot, s.
-    asked_s: f64,
+    pub(crate) asked_s: f64,
     /// Who knows that a person stopped our program, and that nobody asked for the robot since.
-    taken: Taken,
+    pub(crate) taken: Taken,
     /// When every fault of the robot that lasts was ended, s.
     cleared_s: Vec<f64>,
+    /// How long the controller has been in what it must leave by itself.
+    pub(crate) waits: Waits,
     /// What the camera did not show of the run under way.
     pub(crate) unshown: Unshown,
     /// What was to be seen when the run under way was ended.
@@ -135,6 +153,12 @@ fn stops_ours(what: &What, machine: &Machine) -> bool {
         }
 }
 
+/// Whether nothing keeps the arm from moving at its full speed.
+pub(crate) fn may_move(machine: &Machine) -> bool {
+    let is_on = machine.safety_mode().lets_move() && machine.robot_mode() == RobotMode::Running;
+    is_on && machine.speed_scaling() > 0.99 && !machine.freedrive()
+}
+
 impl Checks {
     /// Checks of a cell whose robot has control cycles of `cycle_s`.
     pub fn new(settings: Settings, cycle_s: f64) -> Self {
@@ -147,6 +171,10 @@ impl Checks {
             target: None,
             sent_targets: VecDeque::new(),
             phase: Phase::NoRobot,
+            silent_from_s: f64::INFINITY,
+            program_s: f64::NEG_INFINITY,
+            alpha_deg: 0.0,
+            elsewhere_since_s: None,
             free_since_s: None,
             sequence: (0, 0),
             used: 0,
@@ -157,6 +185,7 @@ impl Checks {
             asked_s: f64::NEG_INFINITY,
             taken: Taken::default(),
             cleared_s: Vec::new(),
+            waits: Waits::default(),
             unshown: Unshown::default(),
             evidence: Evidence::default(),
             run_since_s: 0.0,
@@ -181,10 +210,9 @@ impl Checks {
             // Whoever is killed pours nothing, and the robot's program has to bring the container upright by itself.
             What::ControllerKilled(_) => (self.taken.controller, self.phase) = (false, Phase::NoRobot),
             What::Robot(Fault::Boot) => self.taken.registers = false,
-            What::Robot(Fault::Clear) => {
-                self.cleared_s.push(at_s);
-                self.faults.iter_mut().filter(|f| lasts(&f.what)).for_each(|f| f.until_s = f.until_s.min(at_s));
-            }
+            What::Robot(Fault::Clear) => self.cleared_s.push(at_s),
+            // The robot's program soon hears nothing any more, and has to bring the container upright by itself.
+            What::Suspended(_) => self.silent_from_s = self.silent_from_s.min(at_s + SILENT_S),
             what if takes_robot(what) && stops_ours(what, machine) => {
                 let has_session = lives && self.phase != Phase::NoRobot;
                 // Without a session, a stop before the controller has looked at the robot looks like one before the operator asked.
@@ -194,14 +222,19 @@ impl Checks {
             }
             _ => {}
         }
+        if let What::Robot(remedy) = what {
+            self.faults.iter_mut().filter(|f| remedies(remedy, &f.what)).for_each(|f| f.until_s = f.until_s.min(at_s));
+        }
         if !what.is_ordinary() {
             let until_s = remedied_s.max(at_s + takes_s(what));
-            self.faults.push(Injected { what: what.clone(), at_s, until_s, phase: self.phase });
+            let phase = self.phase(at_s);
+            self.faults.push(Injected { what: what.clone(), at_s, until_s, phase });
         }
     }
 
     /// A program begins on the robot.
     pub fn program_started(&mut self, at_s: f64) {
+        self.program_s = at_s;
         if self.taken.controller || self.taken.registers {
             self.violated("taken-unasked", at_s, "a program was started after a person stopped the robot, and nobody asked".into());
         }
@@ -210,7 +243,7 @@ impl Checks {
     /// A new controller begins.
     pub fn controller_started(&mut self) {
         (self.target, self.phase, self.sequence, self.used) = (None, Phase::NoRobot, (0, 0), 0);
-        self.evidence = Evidence::default();
+        (self.evidence, self.silent_from_s) = (Evidence::default(), f64::INFINITY);
     }
 
     /// The highest target that the robot may still follow, degrees, and the rate at which targets come, degrees/s; `None` if there is none. A joint
@@ -230,15 +263,29 @@ impl Checks {
         matches!(self.phase, Phase::Pouring | Phase::Recording)
     }
 
+    /// What the controller does at a time, s, as far as the robot can know: one that stands still for long does nothing.
+    pub fn phase(&self, at_s: f64) -> Phase {
+        if at_s >= self.silent_from_s { Phase::NoRobot } else { self.phase }
+    }
+
     /// Looks at the robot after a control cycle. `joint` is the tilting one, and `alpha_deg` its measured tilt.
     pub fn cycle(&mut self, machine: &Machine, joint: usize, alpha_deg: f64, at_s: f64) {
-        let active = self.is_active();
+        let active = matches!(self.phase(at_s), Phase::Pouring | Phase::Recording);
+        self.alpha_deg = alpha_deg;
         for (invariant, what) in self.commanded.cycle(machine, joint, active) {
             self.violated(invariant, at_s, what);
         }
         self.targets_numbered(machine, at_s);
         self.stays_on_way_back(machine, at_s);
-        self.upright(machine, alpha_deg, at_s);
+        self.upright(machine, alpha_deg, active, at_s);
+        let asked = (!self.taken.controller && !self.taken.registers).then_some(self.asked_s);
+        let stands_until_s = self.faults.iter().filter(|f| hinders(&f.what)).map(|f| f.until_s).fold(0.0, f64::max);
+        // A container that stands tilted, or a paused program, is for the operator to set right.
+        let is_paused = matches!(machine.runtime_state(), RuntimeState::Pausing | RuntimeState::Paused);
+        let may_be_taken = may_move(machine) && alpha_deg.abs() < START_DEG && !is_paused;
+        if let Some(what) = self.waits.cycle(self.phase(at_s), (may_move(machine), may_be_taken), (asked, stands_until_s), at_s) {
+            self.violated("ends", at_s, what);
+        }
         self.left_tilted(machine, alpha_deg, at_s);
     }
 
@@ -272,20 +319,20 @@ impl Checks {
     fn left_tilted(&mut self, machine: &Machine, alpha_deg: f64, at_s: f64) {
         if machine.runtime_state() != RuntimeState::Stopped || alpha_deg.abs() <= UPRIGHT_DEG {
             self.tilted_since_s = None;
-        } else if at_s - *self.tilted_since_s.get_or_insert(at_s) > LEFT_TILTED_S && !self.faults.iter().any(|f| leaves_tilted(&f.what)) {
+        } else if at_s - *self.tilted_since_s.get_or_insert(at_s) > LEFT_TILTED_S && !self.is_left_by_somebody(at_s) {
             self.violated("left-tilted", at_s, format!("the program ended and left the container at {alpha_deg:.1} degrees"));
         }
     }
 
+    /// Whether a fault that stands, or has come since the program began, can have left the container tilted.
+    fn is_left_by_somebody(&self, at_s: f64) -> bool {
+        self.faults.iter().any(|f| leaves_tilted(&f.what) && (f.until_s >= at_s || f.at_s >= self.program_s))
+    }
+
     /// Whether the container comes upright when nothing is poured and the program may bring it there.
-    fn upright(&mut self, machine: &Machine, alpha_deg: f64, at_s: f64) {
-        let may = machine.safety_mode().lets_move()
-            && machine.robot_mode() == RobotMode::Running
-            && machine.runtime_state() == RuntimeState::Playing
-            && machine.speed_scaling() > 0.99
-            && machine.robot.servo.limiting() > 0.99
-            && !machine.freedrive();
-        if !may || self.is_active() {
+    fn upright(&mut self, machine: &Machine, alpha_deg: f64, active: bool, at_s: f64) {
+        let may = may_move(machine) && machine.runtime_state() == RuntimeState::Playing && machine.robot.servo.limiting() > 0.99;
+        if !may || active {
             self.free_since_s = None;
         } else if alpha_deg.abs() > UPRIGHT_DEG {
             let since_s = *self.free_since_s.get_or_insert(at_s);
@@ -309,7 +356,7 @@ impl Checks {
     pub fn tick(&mut self, tick: &Tick, telemetry: &Telemetry, features: u64, at_s: f64) {
         let limits = self.settings.limits;
         let before = self.phase;
-        self.phase = Phase::from_code(telemetry.phase);
+        (self.phase, self.silent_from_s) = (Phase::from_code(telemetry.phase), f64::INFINITY);
         if self.is_active() && !matches!(before, Phase::Pouring | Phase::Recording) {
             (self.run_since_s, self.lost) = (at_s, 0);
             self.unshown.begins();
@@ -344,9 +391,10 @@ impl Checks {
             self.violated("target-acceleration", at_s, format!("targets change by {acceleration:.0} degrees/s^2"));
         }
         self.target = Some((target_deg, rate));
-        self.sent_targets.retain(|(sent_s, _)| at_s - sent_s < FOLLOWED_S);
+        self.sent_targets.retain(|(sent_s, _)| at_s - sent_s < FOLLOWS_S);
         self.sent_targets.push_back((at_s, target_deg));
         self.noticed(at_s);
+        self.followed(at_s);
     }
 
     /// Every frame is counted once: those of a worker that come in order, each a single time.
@@ -369,21 +417,36 @@ impl Checks {
         }
     }
 
-    /// Whether every fault that must end a pour has ended it by now.
+    /// Whether every fault that must end a pour has ended it by now, also one that stood before it began.
     fn noticed(&mut self, at_s: f64) {
         if !self.is_active() {
             return;
         }
         let since_s = self.run_since_s;
         let missed = self.faults.iter().find(|f| {
-            f.at_s > since_s
-                && matches!(f.phase, Phase::Pouring | Phase::Recording)
-                && must_end(&f.what).is_some_and(|s| at_s > f.at_s + NOTICED_S + s)
-                && !(lasts(&f.what) && self.cleared_s.iter().any(|cleared_s| (f.at_s..f.at_s + NOTICED_S).contains(cleared_s)))
+            let began_in_it = f.at_s > since_s && matches!(f.phase, Phase::Pouring | Phase::Recording);
+            let noticed_s = f.at_s.max(since_s) + NOTICED_S;
+            let stands = f.at_s <= since_s && forbids_runs(&f.what) && f.until_s >= at_s;
+            (began_in_it || stands)
+                && must_end(&f.what).is_some_and(|s| at_s > noticed_s + s)
+                && !(lasts(&f.what) && self.cleared_s.iter().any(|cleared_s| (f.at_s..noticed_s).contains(cleared_s)))
         });
         if let Some(fault) = missed {
             let what = format!("{:?} at {:.2} s has not ended the pour", fault.what, fault.at_s);
             self.violated("noticed", at_s, what);
+        }
+    }
+
+    /// Whether the joint is where it was commanded within the longest lag that is believed; a pour whose joint is elsewhere must have ended.
+    fn followed(&mut self, at_s: f64) {
+        let degrees = || self.sent_targets.iter().map(|(_, deg)| *deg);
+        let (least, largest) = (degrees().fold(f64::INFINITY, f64::min), degrees().fold(f64::NEG_INFINITY, f64::max));
+        let is_there = (least - FOLLOWS_DEG..=largest + FOLLOWS_DEG).contains(&self.alpha_deg);
+        if is_there || !self.is_active() {
+            self.elsewhere_since_s = None;
+        } else if at_s - *self.elsewhere_since_s.get_or_insert(at_s) > NOTICED_S {
+            let alpha_deg = self.alpha_deg;
+            self.violated("noticed", at_s, format!("the joint is at {alpha_deg:.1} degrees, and {least:.1} to {largest:.1} was commanded"));
         }
     }
 }

@@ -14,6 +14,8 @@ const SAID: (f64, f64) = (5.0, 3.0);
 const MISSED: (f64, f64) = (8.0, 0.08);
 /// By how many of its own standard deviations it may be farther: it is then said with the number that it may be a pour of the goal or not.
 const MISSED_SDS: f64 = 2.0;
+/// The least goal that may be begun, ml: about two drops of water, as the controller's own bound, which a check must not share.
+const LEAST_GOAL_ML: f64 = 0.1;
 /// How long before a run a fault that is over may still be its end's reason, s: what it did to the robot, the link or the worker is over by then.
 const LATELY_S: f64 = 6.0;
 
@@ -49,7 +51,7 @@ impl Checks {
         let Some(goal_ml) = outcome.goal_ml else { return };
         let most_ml = f64::from(self.settings.goal_max_ml);
         let (goal_ml, said_ml) = (f64::from(goal_ml), f64::from(outcome.poured_ml));
-        if !(goal_ml > 0.0 && goal_ml <= most_ml) {
+        if !(LEAST_GOAL_ML..=most_ml).contains(&goal_ml) {
             self.violated("goal-range", at_s, format!("a pour of {goal_ml} ml was begun"));
         }
         // A run whose outcome says that liquid may have left unseen says only what was seen. These ends have seen all but what is in their deviation.
@@ -143,6 +145,17 @@ mod tests {
         assert!(found(EndReason::Aborted, 20.0, 60.0), "what was not shown cannot be too much");
         assert!(found(EndReason::MaxFrames, 0.0, 96.0), "all was seen");
         assert!(!found(EndReason::RobotLost, 0.0, 96.0), "it says that not all was seen");
+    }
+
+    /// Protects the cup from a goal that is none: what is smaller than the least goal is not begun.
+    #[test]
+    fn a_goal_that_is_too_small_is_found() {
+        let found = |goal_ml: f32| {
+            let mut checks = checks();
+            checks.ended(&Outcome { goal_ml: Some(goal_ml), ..outcome(EndReason::RobotLost) }, 0.0, 20.0);
+            checks.violations.iter().any(|v| v.invariant == "goal-range")
+        };
+        assert!(found(0.05) && found(0.0) && !found(0.1));
     }
 
     /// Protects the check of reasons: an end that by itself would be one without a fault is none where the robot was lost in its tick, whatever else happened.

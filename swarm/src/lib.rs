@@ -22,6 +22,7 @@ pub mod standing;
 pub mod trained;
 pub mod unshown;
 pub mod vessels;
+pub mod waits;
 pub mod weight_set;
 pub mod what;
 pub mod world;

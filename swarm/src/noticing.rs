@@ -3,11 +3,13 @@
 //! Pure; does not allocate; cannot fail.
 
 use shared::control::EndReason;
-use simulator::ur::Fault;
+use simulator::ur::{Fault, SafetyMode};
 
 use crate::weight_set::RATE_HZ;
 use crate::what::{EyeFault, What};
 
+/// The least share of the slider that is full speed: its steps are of 0.01, and docs/ROBOT.md promises an end below 100 %.
+const FULL_SPEED: f64 = 0.995;
 /// For how long measurements come late, s: `DRIFT_FRAMES` of eye.rs.
 const LATE_S: f64 = 2.0;
 /// The rate of the slowest robot's control cycles: that of a CB3.
@@ -20,7 +22,7 @@ pub fn must_end(what: &What) -> Option<f64> {
         What::Robot(Fault::ProgramPause | Fault::ProgramStop | Fault::Freedrive) => Some(0.0),
         What::Robot(Fault::SafetyMode(mode)) if !mode.lets_move() => Some(0.0),
         What::Robot(Fault::Fin | Fault::Reset | Fault::Boot | Fault::Offline(_)) | What::LinkCut | What::Abort => Some(0.0),
-        What::Robot(Fault::SpeedSlider(share)) if *share < 0.9 => Some(0.0),
+        What::Robot(Fault::SpeedSlider(share)) if *share < FULL_SPEED => Some(0.0),
         What::Robot(Fault::TimeScaling(share)) if *share < 0.9 => Some(0.2),
         What::Robot(Fault::Freeze(s) | Fault::Stall(s) | Fault::SlowReader(s)) if *s > 0.3 => Some(0.0),
         What::LinkStall(ms) if *ms > 300 => Some(f64::from(*ms) / 1000.0),
@@ -31,6 +33,8 @@ pub fn must_end(what: &What) -> Option<f64> {
         What::Eye(EyeFault::Two(ms)) if *ms > 600 => Some(0.5),
         What::Eye(EyeFault::Hung(ms)) if *ms > 400 => Some(0.0),
         What::Eye(EyeFault::Loss(frames) | EyeFault::Freeze(frames)) if *frames > 10 => Some(0.0),
+        // Counted from when its picture was taken, each measurement is then too old.
+        What::Eye(EyeFault::Late(ms)) if *ms > 250 => Some(0.0),
         _ => None,
     }
 }
@@ -71,7 +75,7 @@ pub fn reasons(what: &What) -> &'static [EndReason] {
 /// Whether the fault is one of the robot that lasts, until it is over or `Clear` ends it.
 pub fn lasts(what: &What) -> bool {
     use Fault::*;
-    matches!(what, What::Robot(Stall(_) | Freeze(_) | SlowReader(_) | TimeScaling(_) | SpeedSlider(_) | HeldBack(_) | JointSpeedLimit(_)))
+    matches!(what, What::Robot(Stall(_) | Freeze(_) | SlowReader(_) | TimeScaling(_) | HeldBack(_) | JointSpeedLimit(_)))
 }
 
 /// How long it lasts by itself, s.
@@ -94,6 +98,46 @@ pub fn takes_s(what: &What) -> f64 {
         },
         _ => 0.0,
     }
+}
+
+/// Whether a person sets `what` right with `remedy`, whichever fault it was meant for.
+pub fn remedies(remedy: &Fault, what: &What) -> bool {
+    let What::Robot(fault) = what else { return false };
+    match remedy {
+        Fault::Clear => lasts(what),
+        Fault::SpeedSlider(_) => matches!(fault, Fault::SpeedSlider(_)),
+        Fault::UnlockProtectiveStop => *fault == Fault::ProtectiveStop,
+        Fault::SafeguardClosed => *fault == Fault::SafeguardOpen,
+        Fault::FreedriveEnd => *fault == Fault::Freedrive,
+        Fault::EmergencyRelease => *fault == Fault::EmergencyStop,
+        Fault::SafetyMode(SafetyMode::Normal) => matches!(fault, Fault::SafetyMode(_)),
+        Fault::BrakeRelease => *fault == Fault::Boot,
+        _ => false,
+    }
+}
+
+/// Whether no run goes on while it stands, although it began before. The controller refuses to begin one with most of them.
+pub fn forbids_runs(what: &What) -> bool {
+    use Fault::{
+        Boot, EmergencyStop, Freedrive, Freeze, Offline, ProtectiveStop, SafeguardOpen, SlowReader, SpeedSlider, Stall, TimeScaling,
+    };
+    let of_the_arm = |fault: &Fault| {
+        matches!(
+            fault,
+            SafeguardOpen | ProtectiveStop | EmergencyStop | Freedrive | Boot | SpeedSlider(_) | TimeScaling(_) | Fault::SafetyMode(_)
+        )
+    };
+    let of_the_link = |fault: &Fault| matches!(fault, Stall(_) | Freeze(_) | SlowReader(_) | Offline(_));
+    let stands = match what {
+        What::Robot(fault) => of_the_arm(fault) || of_the_link(fault),
+        what => matches!(what, What::Eye(_) | What::LinkStall(_)),
+    };
+    stands && must_end(what).is_some()
+}
+
+/// Whether a run may take longer to end, or a robot to be taken, because of it: whatever happens to robot, link and controller.
+pub fn hinders(what: &What) -> bool {
+    !matches!(what, What::Eye(_) | What::Abort | What::Weights(_) | What::BadWeights | What::DiskFull)
 }
 
 /// What a fault does to a way upright.

@@ -280,7 +280,7 @@ impl Site {
         let (target, lag_s) = (self.checks.target(at_s), self.plan.lag_s);
         let return_deg_s = f64::from(self.checks.limits().return_rate_deg_s);
         let now = Moment { container: &self.container, alpha_deg, target, lag_s, return_deg_s, at_s };
-        if let Some(wrong) = self.costs.settle(self.checks.phase, &now) {
+        if let Some(wrong) = self.costs.settle(self.checks.phase(at_s), &now) {
             self.checks.violated("bound", at_s, wrong);
         }
     }
@@ -303,9 +303,10 @@ impl Site {
         let (at_s, before) = (self.now_s(), self.checks.phase);
         self.checks.tick(tick, telemetry, features, at_s);
         let runs = |phase| matches!(phase, Phase::Pouring | Phase::Recording);
-        if runs(self.checks.phase) && !runs(before) {
+        let phase = self.checks.phase;
+        if runs(phase) && !runs(before) {
             self.run_poured_ml = self.container.poured_ml();
-            self.is_pour = self.checks.phase == Phase::Pouring;
+            self.is_pour = phase == Phase::Pouring;
         }
         let row = Row::new(at_s, tick, telemetry, &self.container);
         if let Some(rows) = &mut self.rows {
@@ -395,7 +396,7 @@ impl Site {
         if !matches!(what, What::Weights(_)) {
             self.standing.begins(kind.name, until_s);
         }
-        self.costs.begins((kind, what), self.checks.phase, self.is_pour, (at_s, at_ml, until_s));
+        self.costs.begins((kind, what), self.checks.phase(at_s), self.is_pour, (at_s, at_ml, until_s));
     }
 
     /// Lets `what` happen. Gives the operator's order, if it is one.
@@ -417,7 +418,7 @@ impl Site {
             What::Resume => return Some(None),
             What::Refill(fill_ml) => {
                 // Nobody fills a vessel that is tilted or poured from.
-                if self.checks.phase == Phase::Idle {
+                if self.checks.phase(at_s) == Phase::Idle {
                     vessels::fill(&self.rig, &mut self.container, *fill_ml, &mut self.random);
                     (self.frame_poured_ml, self.run_poured_ml) = (0.0, 0.0);
                 }

@@ -341,3 +341,20 @@ fn what_stays_wrong_is_a_fault_of_later_pours() {
     let lesson = self::shown(9, Series::Cb3, 0, (300.0, (266_117, 645_915)), &happens);
     assert_eq!(lesson.poured[1].faults, ["doubtful-lesson"]);
 }
+
+/// Protects what a suspended controller is tried with: a process that stands still reads nothing and begins no program, whatever comes meanwhile; and how long
+/// the robot's program needs to bring the container upright by itself is seen on the robot, and not when the controller wakes up.
+#[test]
+fn a_suspended_controller_does_nothing() {
+    for at_ms in (40..500).step_by(60) {
+        let at_s = at_ms as f64 / 1000.0;
+        let happens = [(at_ms, What::Suspended(2_000), Some("suspended")), (3_500, What::Pour(60.0), None)];
+        let frozen = shown(12, Series::Cb3, 0, (300.0, (266_117, 645_915)), &happens);
+        assert!(!tells(&frozen, "robot connected", at_s, at_s + 2.0), "{}", frozen.story.join("\n"));
+        assert!(tells(&frozen, "robot connected", at_s + 2.0, at_s + 3.5), "{}", frozen.story.join("\n"));
+    }
+    let happens = [(3_000, What::Pour(150.0), None), (6_000, What::Suspended(5_000), Some("suspended"))];
+    let suspended = shown(12, Series::Cb3, 0, (300.0, (266_117, 645_915)), &happens);
+    let cost = &suspended.costs[0];
+    assert!((0.2..3.0).contains(&cost.upright_s), "{cost:?}");
+}
