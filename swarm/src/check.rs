@@ -8,47 +8,46 @@ use rt_controller::core::Settings;
 use rt_controller::journal::Tick;
 use rt_controller::link::ProgramState;
 use serde::Serialize;
-use shared::control::{EndReason, Outcome};
+use shared::control::Outcome;
 use shared::limits::Limits;
 use shared::messages::{Phase, Telemetry};
 use simulator::ur::{Fault, Machine, RobotMode, RuntimeState, SafetyMode};
 
 use crate::commanded::{Commanded, SLACK, SLACK_DEG};
-use crate::noticing::{is_ordinary, lasts, leaves_tilted, must_end, reasons, takes_robot};
+use crate::evidence::Evidence;
+use crate::noticing::{forbids_runs, hinders, lasts, leaves_tilted, must_end, remedies, takes_robot, takes_s};
+use crate::unshown::Unshown;
+use crate::waits::Waits;
 use crate::weight_set::RATE_HZ;
-use crate::what::{EyeFault, What};
+use crate::what::What;
 
 /// A container nearer to 0 than this is upright, degrees (`robot.start_tolerance_deg` of config/sim.toml, and half a degree of lag).
 const UPRIGHT_DEG: f64 = 2.5;
+/// A container nearer to 0 than this can be taken, degrees (`robot.start_tolerance_deg` of config/sim.toml, and what its measurement scatters).
+const START_DEG: f64 = 1.9;
 /// The longest way upright of a program that runs, s: 110 degrees at 60 degrees/s, its patience of 100 ms, and 1 s as in docs/ROBOT.md.
 const WAY_UPRIGHT_S: f64 = 110.0 / 60.0 + 0.1 + 1.0;
 /// After this a fault that must end a pour has been noticed, s: `controller.stale_feature_ms` and `lost_robot_ms` of config/sim.toml, three
 /// ticks, and the time that a fault of the loop itself takes is added.
-const NOTICED_S: f64 = 0.5;
-/// How far what left may be from what a pour that is done says: so many of its own standard deviations, and ml. A normal distribution leaves
-/// five in 2 million times; the ml are what no deviation of a small pour goes below.
-const SAID: (f64, f64) = (5.0, 3.0);
-/// By which share the truth may be off for each share by which the gain has drifted: the volume goes with the area to the power of up to 1.2, and
-/// 1 / (1 - 0.3) is what a gain that has fallen by 0.3 hides.
-const DRIFT_HIDES: f64 = 1.2 / 0.7;
+pub const NOTICED_S: f64 = 0.5;
 /// The output register in which the program says what it is doing (`robot.register_base` of config/sim.toml).
 const STATE_REGISTER: usize = 24;
 /// The output register in which the program says which target it took.
 const ECHO_REGISTER: usize = STATE_REGISTER + 1;
 /// The output register in which the program says which upload it is.
 const RUN_REGISTER: usize = STATE_REGISTER + 2;
-/// How far what a pour that is done says may be from its goal, ml, and as a share of it: the last decision counts drops that still fell.
-const MISSED: (f64, f64) = (8.0, 0.08);
-/// By how many of its own standard deviations it may be farther: it is then said with the number that it may be a pour of the goal or not.
-const MISSED_SDS: f64 = 2.0;
 /// After this the controller has looked at the robot for which its operator asked, s: a beat of 0.1 s of its thread, and the dialogue that begins.
 const LOOKS_S: f64 = 0.2;
-/// The longest time for which a fault of the robot lasts before somebody ends it, s (faults.rs).
-const LASTS_S: f64 = 9.0;
 /// How long a container may stand tilted after its program has ended by itself, s: one cycle would do, and the arm needs time to stop.
 const LEFT_TILTED_S: f64 = 2.0;
 /// For how long a robot still follows a target that was sent, s: the patience of its program, and what it is behind.
 const FOLLOWED_S: f64 = 0.3;
+/// For how long a joint may be behind its commands, s: 1.25 times the longest lag that is believed, and two ticks (docs/ROBOT.md).
+const FOLLOWS_S: f64 = 0.45;
+/// How far from its commands a joint still follows, degrees: the 2 of docs/ROBOT.md, and as many for how far it goes between two ticks.
+const FOLLOWS_DEG: f64 = 4.0;
+/// After this a controller that stands still is no longer heard, s: the patience of the program, and bytes on their way.
+const SILENT_S: f64 = 0.2;
 /// Most frames that are bridged at once: one second (`BRIDGED_S` of the controller's core).
 const MOST_BRIDGED: u64 = RATE_HZ as u64;
 /// Number of violations that are kept for a seed; the first is what counts.
@@ -72,23 +71,25 @@ pub struct Injected {
     pub what: What,
     /// When, s.
     pub at_s: f64,
+    /// Until when it may last, s: somebody sets it right, or it is over by itself.
+    pub until_s: f64,
     /// What the controller was doing.
     pub phase: Phase,
 }
 
 /// Who can know that a person stopped our program. A stop that finds no program of ours at work stops nothing, and leaves no sign.
 #[derive(Debug, Clone, Copy, Default)]
-struct Taken {
+pub(crate) struct Taken {
     /// The controller that had a session then, as long as it lives.
-    controller: bool,
+    pub(crate) controller: bool,
     /// The robot's registers, in which our program was still at work, until the robot boots.
-    registers: bool,
+    pub(crate) registers: bool,
 }
 
 /// What the checks keep.
 #[derive(Debug)]
 pub struct Checks {
-    settings: Settings,
+    pub(crate) settings: Settings,
     /// Violations so far.
     pub violations: Vec<Violation>,
     /// Faults so far, the ordinary course left out.
@@ -102,34 +103,39 @@ pub struct Checks {
     /// When the targets that the robot may still follow were sent, s, and which, degrees; also when there is none any more.
     sent_targets: VecDeque<(f64, f64)>,
     pub(crate) phase: Phase,
+    /// From when on a controller that stands still has not been heard, s.
+    silent_from_s: f64,
+    /// When the program that the robot has began, s.
+    program_s: f64,
+    /// The tilt in the newest control cycle, degrees, and since when the joint has not been where it was commanded, s.
+    alpha_deg: f64,
+    elsewhere_since_s: Option<f64>,
     /// Since when the robot could have been on its way upright, s.
     free_since_s: Option<f64>,
     sequence: (u64, u64),
     used: u64,
     /// Number of frames lost between measurements that came, in the run under way.
-    lost: u64,
+    pub(crate) lost: u64,
     /// Since when the container has stood tilted without a program, s.
     tilted_since_s: Option<f64>,
     /// How many targets were sent in the newest session, and the number of the newest one that the robot took.
     sent: i32,
     echoed: i32,
     /// When the operator last asked for the robot, s.
-    asked_s: f64,
+    pub(crate) asked_s: f64,
     /// Who knows that a person stopped our program, and that nobody asked for the robot since.
-    taken: Taken,
+    pub(crate) taken: Taken,
     /// When every fault of the robot that lasts was ended, s.
     cleared_s: Vec<f64>,
-    /// By which share the camera's gain has drifted so far.
-    gain_drift: f64,
-    run_since_s: f64,
+    /// How long the controller has been in what it must leave by itself.
+    pub(crate) waits: Waits,
+    /// What the camera did not show of the run under way.
+    pub(crate) unshown: Unshown,
+    /// What was to be seen when the run under way was ended.
+    pub(crate) evidence: Evidence,
+    pub(crate) run_since_s: f64,
     /// Number of pours and recordings that have ended in this life of the controller.
     pub outcomes: Vec<(f64, Outcome)>,
-    features_before: u64,
-}
-
-/// For how long a camera then does not show what leaves, without a doubt, s.
-fn hides_s(what: &What) -> f64 {
-    if let What::Eye(EyeFault::FalseZero(frames) | EyeFault::Stuck(frames)) = what { f64::from(*frames) / RATE_HZ } else { 0.0 }
 }
 
 /// Whether a stop meets a program of ours. One that is paused is stopped already, and to stop it for good is what the controller asks for; and a
@@ -147,6 +153,12 @@ fn stops_ours(what: &What, machine: &Machine) -> bool {
         }
 }
 
+/// Whether nothing keeps the arm from moving at its full speed.
+pub(crate) fn may_move(machine: &Machine) -> bool {
+    let is_on = machine.safety_mode().lets_move() && machine.robot_mode() == RobotMode::Running;
+    is_on && machine.speed_scaling() > 0.99 && !machine.freedrive()
+}
+
 impl Checks {
     /// Checks of a cell whose robot has control cycles of `cycle_s`.
     pub fn new(settings: Settings, cycle_s: f64) -> Self {
@@ -159,6 +171,10 @@ impl Checks {
             target: None,
             sent_targets: VecDeque::new(),
             phase: Phase::NoRobot,
+            silent_from_s: f64::INFINITY,
+            program_s: f64::NEG_INFINITY,
+            alpha_deg: 0.0,
+            elsewhere_since_s: None,
             free_since_s: None,
             sequence: (0, 0),
             used: 0,
@@ -169,10 +185,11 @@ impl Checks {
             asked_s: f64::NEG_INFINITY,
             taken: Taken::default(),
             cleared_s: Vec::new(),
-            gain_drift: 0.0,
+            waits: Waits::default(),
+            unshown: Unshown::default(),
+            evidence: Evidence::default(),
             run_since_s: 0.0,
             outcomes: Vec::new(),
-            features_before: 0,
         }
     }
 
@@ -183,8 +200,9 @@ impl Checks {
         }
     }
 
-    /// Takes note of something that happens to a cell whose controller lives or not, and whose robot is about to see it.
-    pub fn happens(&mut self, what: &What, machine: &Machine, lives: bool, at_s: f64) {
+    /// Takes note of something that happens to a cell whose controller lives or not, and whose robot is about to see it. Somebody sets it right
+    /// at `remedied_s`.
+    pub fn happens(&mut self, what: &What, machine: &Machine, lives: bool, (at_s, remedied_s): (f64, f64)) {
         match what {
             What::Pour(_) | What::Record(..) | What::Resume if lives => {
                 (self.taken, self.asked_s) = (Taken::default(), at_s);
@@ -193,6 +211,8 @@ impl Checks {
             What::ControllerKilled(_) => (self.taken.controller, self.phase) = (false, Phase::NoRobot),
             What::Robot(Fault::Boot) => self.taken.registers = false,
             What::Robot(Fault::Clear) => self.cleared_s.push(at_s),
+            // The robot's program soon hears nothing any more, and has to bring the container upright by itself.
+            What::Suspended(_) => self.silent_from_s = self.silent_from_s.min(at_s + SILENT_S),
             what if takes_robot(what) && stops_ours(what, machine) => {
                 let has_session = lives && self.phase != Phase::NoRobot;
                 // Without a session, a stop before the controller has looked at the robot looks like one before the operator asked.
@@ -202,16 +222,19 @@ impl Checks {
             }
             _ => {}
         }
-        if let What::Eye(EyeFault::GainDrift(share)) = what {
-            self.gain_drift += share.abs();
+        if let What::Robot(remedy) = what {
+            self.faults.iter_mut().filter(|f| remedies(remedy, &f.what)).for_each(|f| f.until_s = f.until_s.min(at_s));
         }
         if !what.is_ordinary() {
-            self.faults.push(Injected { what: what.clone(), at_s, phase: self.phase });
+            let until_s = remedied_s.max(at_s + takes_s(what));
+            let phase = self.phase(at_s);
+            self.faults.push(Injected { what: what.clone(), at_s, until_s, phase });
         }
     }
 
     /// A program begins on the robot.
     pub fn program_started(&mut self, at_s: f64) {
+        self.program_s = at_s;
         if self.taken.controller || self.taken.registers {
             self.violated("taken-unasked", at_s, "a program was started after a person stopped the robot, and nobody asked".into());
         }
@@ -219,7 +242,8 @@ impl Checks {
 
     /// A new controller begins.
     pub fn controller_started(&mut self) {
-        (self.target, self.phase, self.sequence, self.used, self.features_before) = (None, Phase::NoRobot, (0, 0), 0, 0);
+        (self.target, self.phase, self.sequence, self.used) = (None, Phase::NoRobot, (0, 0), 0);
+        (self.evidence, self.silent_from_s) = (Evidence::default(), f64::INFINITY);
     }
 
     /// The highest target that the robot may still follow, degrees, and the rate at which targets come, degrees/s; `None` if there is none. A joint
@@ -239,15 +263,29 @@ impl Checks {
         matches!(self.phase, Phase::Pouring | Phase::Recording)
     }
 
+    /// What the controller does at a time, s, as far as the robot can know: one that stands still for long does nothing.
+    pub fn phase(&self, at_s: f64) -> Phase {
+        if at_s >= self.silent_from_s { Phase::NoRobot } else { self.phase }
+    }
+
     /// Looks at the robot after a control cycle. `joint` is the tilting one, and `alpha_deg` its measured tilt.
     pub fn cycle(&mut self, machine: &Machine, joint: usize, alpha_deg: f64, at_s: f64) {
-        let active = self.is_active();
+        let active = matches!(self.phase(at_s), Phase::Pouring | Phase::Recording);
+        self.alpha_deg = alpha_deg;
         for (invariant, what) in self.commanded.cycle(machine, joint, active) {
             self.violated(invariant, at_s, what);
         }
         self.targets_numbered(machine, at_s);
         self.stays_on_way_back(machine, at_s);
-        self.upright(machine, alpha_deg, at_s);
+        self.upright(machine, alpha_deg, active, at_s);
+        let asked = (!self.taken.controller && !self.taken.registers).then_some(self.asked_s);
+        let stands_until_s = self.faults.iter().filter(|f| hinders(&f.what)).map(|f| f.until_s).fold(0.0, f64::max);
+        // A container that stands tilted, or a paused program, is for the operator to set right.
+        let is_paused = matches!(machine.runtime_state(), RuntimeState::Pausing | RuntimeState::Paused);
+        let may_be_taken = may_move(machine) && alpha_deg.abs() < START_DEG && !is_paused;
+        if let Some(what) = self.waits.cycle(self.phase(at_s), (may_move(machine), may_be_taken), (asked, stands_until_s), at_s) {
+            self.violated("ends", at_s, what);
+        }
         self.left_tilted(machine, alpha_deg, at_s);
     }
 
@@ -281,20 +319,20 @@ impl Checks {
     fn left_tilted(&mut self, machine: &Machine, alpha_deg: f64, at_s: f64) {
         if machine.runtime_state() != RuntimeState::Stopped || alpha_deg.abs() <= UPRIGHT_DEG {
             self.tilted_since_s = None;
-        } else if at_s - *self.tilted_since_s.get_or_insert(at_s) > LEFT_TILTED_S && !self.faults.iter().any(|f| leaves_tilted(&f.what)) {
+        } else if at_s - *self.tilted_since_s.get_or_insert(at_s) > LEFT_TILTED_S && !self.is_left_by_somebody(at_s) {
             self.violated("left-tilted", at_s, format!("the program ended and left the container at {alpha_deg:.1} degrees"));
         }
     }
 
+    /// Whether a fault that stands, or has come since the program began, can have left the container tilted.
+    fn is_left_by_somebody(&self, at_s: f64) -> bool {
+        self.faults.iter().any(|f| leaves_tilted(&f.what) && (f.until_s >= at_s || f.at_s >= self.program_s))
+    }
+
     /// Whether the container comes upright when nothing is poured and the program may bring it there.
-    fn upright(&mut self, machine: &Machine, alpha_deg: f64, at_s: f64) {
-        let may = machine.safety_mode().lets_move()
-            && machine.robot_mode() == RobotMode::Running
-            && machine.runtime_state() == RuntimeState::Playing
-            && machine.speed_scaling() > 0.99
-            && machine.robot.servo.limiting() > 0.99
-            && !machine.freedrive();
-        if !may || self.is_active() {
+    fn upright(&mut self, machine: &Machine, alpha_deg: f64, active: bool, at_s: f64) {
+        let may = may_move(machine) && machine.runtime_state() == RuntimeState::Playing && machine.robot.servo.limiting() > 0.99;
+        if !may || active {
             self.free_since_s = None;
         } else if alpha_deg.abs() > UPRIGHT_DEG {
             let since_s = *self.free_since_s.get_or_insert(at_s);
@@ -318,14 +356,16 @@ impl Checks {
     pub fn tick(&mut self, tick: &Tick, telemetry: &Telemetry, features: u64, at_s: f64) {
         let limits = self.settings.limits;
         let before = self.phase;
-        self.phase = Phase::from_code(telemetry.phase);
+        (self.phase, self.silent_from_s) = (Phase::from_code(telemetry.phase), f64::INFINITY);
         if self.is_active() && !matches!(before, Phase::Pouring | Phase::Recording) {
             (self.run_since_s, self.lost) = (at_s, 0);
+            self.unshown.begins();
         }
         if tick.agent.is_some() && !matches!(before, Phase::Idle | Phase::NoRobot) {
             self.violated("swap-between-pours", at_s, format!("weights were taken while {before:?}"));
         }
         self.count_frames(tick, features, before, at_s);
+        self.evidence.tick(tick, (before, self.phase), self.sequence.0, &self.settings);
         let Some(target_deg) = tick.target_deg.map(f64::from) else {
             self.target = None;
             return self.noticed(at_s);
@@ -351,9 +391,10 @@ impl Checks {
             self.violated("target-acceleration", at_s, format!("targets change by {acceleration:.0} degrees/s^2"));
         }
         self.target = Some((target_deg, rate));
-        self.sent_targets.retain(|(sent_s, _)| at_s - sent_s < FOLLOWED_S);
+        self.sent_targets.retain(|(sent_s, _)| at_s - sent_s < FOLLOWS_S);
         self.sent_targets.push_back((at_s, target_deg));
         self.noticed(at_s);
+        self.followed(at_s);
     }
 
     /// Every frame is counted once: those of a worker that come in order, each a single time.
@@ -376,17 +417,19 @@ impl Checks {
         }
     }
 
-    /// Whether every fault that must end a pour has ended it by now.
+    /// Whether every fault that must end a pour has ended it by now, also one that stood before it began.
     fn noticed(&mut self, at_s: f64) {
         if !self.is_active() {
             return;
         }
         let since_s = self.run_since_s;
         let missed = self.faults.iter().find(|f| {
-            f.at_s > since_s
-                && matches!(f.phase, Phase::Pouring | Phase::Recording)
-                && must_end(&f.what).is_some_and(|s| at_s > f.at_s + NOTICED_S + s)
-                && !(lasts(&f.what) && self.cleared_s.iter().any(|cleared_s| (f.at_s..f.at_s + NOTICED_S).contains(cleared_s)))
+            let began_in_it = f.at_s > since_s && matches!(f.phase, Phase::Pouring | Phase::Recording);
+            let noticed_s = f.at_s.max(since_s) + NOTICED_S;
+            let stands = f.at_s <= since_s && forbids_runs(&f.what) && f.until_s >= at_s;
+            (began_in_it || stands)
+                && must_end(&f.what).is_some_and(|s| at_s > noticed_s + s)
+                && !(lasts(&f.what) && self.cleared_s.iter().any(|cleared_s| (f.at_s..noticed_s).contains(cleared_s)))
         });
         if let Some(fault) = missed {
             let what = format!("{:?} at {:.2} s has not ended the pour", fault.what, fault.at_s);
@@ -394,97 +437,16 @@ impl Checks {
         }
     }
 
-    /// Looks at how a pour or recording ended. `true_ml` is what left since it began.
-    pub fn ended(&mut self, outcome: &Outcome, true_ml: f64, at_s: f64) {
-        self.outcomes.push((at_s, *outcome));
-        self.says(outcome, true_ml, at_s);
-        let since_s = at_s - f64::from(outcome.seconds) - 6.0;
-        let reason = outcome.reason;
-        let ordinary = is_ordinary(reason);
-        let counts = |f: &Injected| {
-            matches!(f.what, What::Eye(EyeFault::Picture(_))) || f.at_s >= since_s - if lasts(&f.what) { LASTS_S } else { 0.0 }
-        };
-        let named = self.faults.iter().any(|f| counts(f) && reasons(&f.what).contains(&reason));
-        if !ordinary && !named {
-            let faults: Vec<_> = self.faults.iter().filter(|f| f.at_s >= since_s).map(|f| f.what.name()).collect();
-            self.violated("reason", at_s, format!("it ended with {reason:?}, and what happened was {faults:?}"));
+    /// Whether the joint is where it was commanded within the longest lag that is believed; a pour whose joint is elsewhere must have ended.
+    fn followed(&mut self, at_s: f64) {
+        let degrees = || self.sent_targets.iter().map(|(_, deg)| *deg);
+        let (least, largest) = (degrees().fold(f64::INFINITY, f64::min), degrees().fold(f64::NEG_INFINITY, f64::max));
+        let is_there = (least - FOLLOWS_DEG..=largest + FOLLOWS_DEG).contains(&self.alpha_deg);
+        if is_there || !self.is_active() {
+            self.elsewhere_since_s = None;
+        } else if at_s - *self.elsewhere_since_s.get_or_insert(at_s) > NOTICED_S {
+            let alpha_deg = self.alpha_deg;
+            self.violated("noticed", at_s, format!("the joint is at {alpha_deg:.1} degrees, and {least:.1} to {largest:.1} was commanded"));
         }
-    }
-
-    /// Whether a run that ends so is ended by a fault that stood before it began, and by none since.
-    pub fn stood_before(&self, reason: EndReason) -> bool {
-        let names = |since: bool| self.faults.iter().any(|f| (f.at_s >= self.run_since_s) == since && reasons(&f.what).contains(&reason));
-        names(false) && !names(true)
-    }
-
-    /// Looks at what a pour says of itself.
-    fn says(&mut self, outcome: &Outcome, true_ml: f64, at_s: f64) {
-        if u64::from(outcome.bridged_frames) > self.lost {
-            let (bridged, lost) = (outcome.bridged_frames, self.lost);
-            self.violated("frames-once", at_s, format!("{bridged} lost frames were bridged, and {lost} were lost"));
-        }
-        let Some(goal_ml) = outcome.goal_ml else { return };
-        let most_ml = f64::from(self.settings.goal_max_ml);
-        let (goal_ml, said_ml) = (f64::from(goal_ml), f64::from(outcome.poured_ml));
-        if !(goal_ml > 0.0 && goal_ml <= most_ml) {
-            self.violated("goal-range", at_s, format!("a pour of {goal_ml} ml was begun"));
-        }
-        // A pour that ends for another reason has lost its camera or its robot before it was upright, and says only what was seen. One that is not
-        // done may end while the camera lies.
-        let seen_to_the_end = [EndReason::Aborted, EndReason::ContainerEmpty, EndReason::GoalExceeded].contains(&outcome.reason);
-        let since_s = at_s - f64::from(outcome.seconds);
-        let lied = || self.faults.iter().any(|f| hides_s(&f.what) > 0.0 && f.at_s + hides_s(&f.what) >= since_s);
-        if outcome.reason != EndReason::Done && (!seen_to_the_end || lied()) {
-            return;
-        }
-        // What is not a number is near to nothing.
-        let is_near = |a: f64, b: f64, (ml, share): (f64, f64)| (a - b).abs() <= ml + share * a.abs().max(b.abs());
-        let sd_ml = f64::from(outcome.poured_sd_ml);
-        // Nothing in the world tells one camera that its own gain has drifted, so the truth may then be off by what that hides, and no more.
-        let hidden = (SAID.0 * sd_ml + SAID.1, DRIFT_HIDES * self.gain_drift);
-        if !is_near(true_ml, said_ml, hidden) {
-            let reason = outcome.reason.words();
-            self.violated("said", at_s, format!("{reason}, and it says {said_ml:.1} +- {sd_ml:.1} ml where {true_ml:.1} left"));
-        }
-        if outcome.reason == EndReason::Done && !is_near(said_ml, goal_ml, (MISSED.0 + MISSED_SDS * sd_ml, MISSED.1)) {
-            self.violated("done", at_s, format!("done, and it says {said_ml:.1} ml of {goal_ml:.1}"));
-        }
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-    use shared::config::Config;
-    use shared::limits::Clipped;
-
-    /// Protects the check of what a pour says: a gain that drifted excuses as much as it hides, and no more; without it nothing is excused.
-    #[test]
-    fn a_drift_excuses_what_it_hides() {
-        let outcome = Outcome {
-            episode: 1,
-            reason: EndReason::Done,
-            unseen: false,
-            goal_ml: Some(80.0),
-            poured_ml: 80.0,
-            poured_sd_ml: 2.0,
-            seconds: 8.0,
-            frames: 240,
-            bridged_frames: 0,
-            stale_features: 0,
-            tick_gaps: 0,
-            clipped: Clipped::default(),
-        };
-        let found = |drift: f64, true_ml: f64| {
-            let config = Config::parse(include_str!("../../config/sim.toml"), "sim.toml").unwrap();
-            let mut checks = Checks::new(Settings::new(&config), 0.008);
-            checks.gain_drift = drift;
-            checks.ended(&outcome, true_ml, 20.0);
-            checks.violations.first().map(|v| v.invariant)
-        };
-        assert_eq!(found(0.0, 92.0), None, "within five deviations and 3 ml");
-        assert_eq!(found(0.0, 94.0), Some("said"));
-        assert_eq!(found(0.25, 110.0), None);
-        assert_eq!(found(0.25, 220.0), Some("said"));
     }
 }

@@ -43,6 +43,7 @@ pub struct Eye {
     sequence: u64,
     epoch_ns: u64,
     gain: f64,
+    first_gain: f64,
     /// Exponent with which the area grows with the flow.
     area_exponent: f64,
     /// The share by which the gain still drifts in each frame, and for how many frames.
@@ -55,10 +56,17 @@ pub struct Eye {
     late: (u64, u32),
     false_zero: u32,
     spike_px2: Option<f32>,
-    stuck: (u32, f32),
+    /// For how many frames the area stands still, where, px^2, and what left in the frame that showed it, ml.
+    stuck: (u32, f32, f64),
     gone_until_ns: u64,
+    /// The worker that comes back then is a new process.
+    is_killed: bool,
     two_until_ns: u64,
     newest: Feature,
+    /// What left in a frame that shows the newest area, ml.
+    shown_ml: f64,
+    /// How much less than what left the newest frame shows without a doubt, ml.
+    hidden_ml: f64,
     /// Measurements on their way, with the time of their publication.
     pub published: VecDeque<Feature>,
 }
@@ -68,8 +76,10 @@ impl Eye {
     pub fn new(seed: u64, now_ns: u64, area_exponent: f64, camera: Option<Camera>) -> Self {
         let mut random = Pcg64Mcg::seed_from_u64(seed ^ 0xE7E);
         let normal: f64 = StandardNormal.sample(&mut random);
+        let gain = if camera.is_some() { 1.0 } else { 1.0 + GAIN_SD * normal };
         Self {
-            gain: if camera.is_some() { 1.0 } else { 1.0 + GAIN_SD * normal },
+            gain,
+            first_gain: gain,
             camera,
             random,
             sequence: 0,
@@ -84,10 +94,13 @@ impl Eye {
             late: (0, 0),
             false_zero: 0,
             spike_px2: None,
-            stuck: (0, 0.0),
+            stuck: (0, 0.0, 0.0),
             gone_until_ns: 0,
+            is_killed: false,
             two_until_ns: 0,
             newest: Feature::default(),
+            shown_ml: 0.0,
+            hidden_ml: 0.0,
             published: VecDeque::new(),
         }
     }
@@ -108,10 +121,11 @@ impl Eye {
             EyeFault::GainDrift(share) => self.drift = (share / f64::from(DRIFT_FRAMES), DRIFT_FRAMES),
             EyeFault::FalseZero(frames) => self.false_zero = self.false_zero.max(frames),
             EyeFault::Spike(area_px2) => self.spike_px2 = Some(area_px2),
-            EyeFault::Stuck(frames) => self.stuck = (self.stuck.0.max(frames), self.newest.area_px2),
+            EyeFault::Stuck(frames) => self.stuck = (self.stuck.0.max(frames), self.newest.area_px2, self.shown_ml),
             EyeFault::Killed(ms) => {
                 self.gone_until_ns = self.gone_until_ns.max(until_ns(ms));
                 self.epoch_ns = self.gone_until_ns;
+                self.is_killed = true;
                 self.published.clear();
             }
             EyeFault::Hung(ms) => self.gone_until_ns = self.gone_until_ns.max(until_ns(ms)),
@@ -124,7 +138,12 @@ impl Eye {
     /// A frame was exposed at `now_ns`, in which `flow_ml` left the lip since the frame before, and this share of the stream clings to the
     /// wall; a camera saw `scene`. What is measured is added to [`Eye::published`].
     pub fn frame(&mut self, now_ns: u64, flow_ml: f64, clinging: f64, scene: &Scene) {
+        // A new process has opened the camera anew, whose frames begin at 1 again.
+        if now_ns >= self.gone_until_ns && std::mem::take(&mut self.is_killed) {
+            self.sequence = 0;
+        }
         self.sequence += 1;
+        self.hidden_ml = 0.0;
         // The same numbers are drawn in every frame, so that a fault does not shift the noise of later frames.
         let normal: f64 = StandardNormal.sample(&mut self.random);
         let (doubted, missed) = (self.random.random_bool(DOUBTED), self.random.random_bool(MISSED));
@@ -149,19 +168,7 @@ impl Eye {
         }) else {
             return;
         };
-        let (stuck, false_zero) = (counted(&mut self.stuck.0), counted(&mut self.false_zero));
-        if stuck {
-            area_px2 = self.stuck.1;
-        }
-        if false_zero {
-            (area_px2, doubt) = (0.0, Doubt::None);
-        }
-        if let Some(spike_px2) = self.spike_px2.take() {
-            area_px2 = spike_px2;
-        }
-        if frozen && self.camera.is_none() {
-            (area_px2, doubt) = (self.newest.area_px2, Doubt::Frozen);
-        }
+        let shown_ml = self.misread((&mut area_px2, &mut doubt), frozen, flow_ml);
         let mut delay_ns = DELAY_NS + jitter_ns;
         if counted(&mut self.late.1) {
             delay_ns += self.late.0;
@@ -178,7 +185,7 @@ impl Eye {
             confidence,
             ..Feature::default()
         };
-        self.newest = feature;
+        (self.newest, self.shown_ml) = (feature, shown_ml);
         self.publish(feature);
         if counted(&mut self.twice) {
             self.publish(feature);
@@ -186,6 +193,33 @@ impl Eye {
         if now_ns < self.two_until_ns {
             self.publish(Feature { worker_epoch_ns: self.two_until_ns, area_px2: area_px2 * 0.9, ..feature });
         }
+    }
+
+    /// What the faults under way make of an area and its doubt. Gives what leaves in a frame that shows it, ml.
+    fn misread(&mut self, (area_px2, doubt): (&mut f32, &mut Doubt), frozen: bool, flow_ml: f64) -> f64 {
+        let (stuck, false_zero) = (counted(&mut self.stuck.0), counted(&mut self.false_zero));
+        let mut shown_ml = flow_ml;
+        if stuck {
+            (*area_px2, shown_ml) = (self.stuck.1, self.stuck.2);
+        }
+        if false_zero {
+            (*area_px2, *doubt, shown_ml) = (0.0, Doubt::None, 0.0);
+        }
+        self.hidden_ml = flow_ml - shown_ml;
+        if let Some(spike_px2) = self.spike_px2.take() {
+            *area_px2 = spike_px2;
+            shown_ml = (f64::from(spike_px2) / AREA_AT_1_ML_PX2 / self.gain).powf(1.0 / self.area_exponent);
+        }
+        if frozen && self.camera.is_none() {
+            (*area_px2, *doubt) = (self.newest.area_px2, Doubt::Frozen);
+            (shown_ml, self.hidden_ml) = (self.shown_ml, 0.0);
+        }
+        shown_ml
+    }
+
+    /// The camera's gain as a share of that at the start, and how much less the newest frame shows than what left in it, ml. Nothing tells of either.
+    pub fn unshown(&self) -> (f64, f64) {
+        (self.gain / self.first_gain, self.hidden_ml)
     }
 
     /// What vision makes of a flow: area and doubt.
@@ -216,4 +250,51 @@ fn counted(left: &mut u32) -> bool {
     let is_on = *left > 0;
     *left = left.saturating_sub(1);
     is_on
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use simulator::physics::rig::Rig;
+
+    /// Frames of 1 ml each after `faults`, from the 10th on.
+    fn seen(faults: &[EyeFault]) -> (Vec<Feature>, Vec<(f64, f64)>) {
+        let mut eye = Eye::new(1, 0, 1.0, None);
+        let container = Rig::seeded(1).container(300.0);
+        let (mut features, mut unshown) = (Vec::new(), Vec::new());
+        for k in 0..60u64 {
+            if k == 10 {
+                faults.iter().for_each(|fault| eye.inject(*fault, k * 33_340_000));
+            }
+            eye.frame(k * 33_340_000, 1.0, 0.0, &Scene::of(&container, 0.0, 0.0, 0.0));
+            features.extend(eye.published.drain(..));
+            unshown.push(eye.unshown());
+        }
+        (features, unshown)
+    }
+
+    /// Protects what the controller is tried with: the successor of a killed worker is another process, whose frames begin at 1 again, and one that only hung
+    /// goes on with the camera's numbers.
+    #[test]
+    fn a_new_worker_begins_its_numbers_again() {
+        let after = |fault| {
+            let (features, _) = seen(&[fault]);
+            (features[9].worker_epoch_ns, features[10].worker_epoch_ns, features[10].sequence)
+        };
+        let (before, then, sequence) = after(EyeFault::Killed(300));
+        assert!(before != then && sequence == 1, "{before} {then} {sequence}");
+        let (before, then, sequence) = after(EyeFault::Hung(300));
+        assert!(before == then && sequence > 15, "{before} {then} {sequence}");
+    }
+
+    /// Protects the check of what is said from an eye that hides more than it says: the true gain, and frame by frame what was not shown.
+    #[test]
+    fn what_was_not_shown_is_counted() {
+        let (_, unshown) = seen(&[EyeFault::GainDrift(-0.2), EyeFault::FalseZero(3)]);
+        assert_eq!(unshown.iter().map(|(_, ml)| ml).sum::<f64>(), 3.0);
+        let gain = unshown[59].0;
+        assert!((0.83..0.87).contains(&gain), "50 of 60 frames of the drift: {gain}");
+        let (_, unshown) = seen(&[EyeFault::Stuck(5)]);
+        assert_eq!(unshown.iter().map(|(_, ml)| ml.abs()).sum::<f64>(), 0.0, "what stands still at what flows hides nothing");
+    }
 }

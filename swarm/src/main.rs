@@ -64,7 +64,7 @@ struct Args {
     /// Keeps only the faults with these numbers, as in `--keep 0,2`; `--keep none` keeps none.
     #[arg(long, requires = "seed")]
     keep: Option<String>,
-    /// Looks for the fewest faults that still break the first invariant that is broken.
+    /// Looks for faults of which none can be left out for the first invariant that is broken to break.
     #[arg(long, requires = "seed")]
     shrink: bool,
     /// Draws the run to this SVG file.

@@ -161,7 +161,8 @@ pub fn run_until(
     over: &dyn Fn() -> Option<&'static str>,
     progress: bool,
 ) -> Result<(Vec<Shown>, Summary), String> {
-    let last = seeds.from.saturating_add(seeds.count);
+    let last =
+        seeds.from.checked_add(seeds.count).ok_or_else(|| format!("--from {} leaves fewer than {} seeds", seeds.from, seeds.count))?;
     let say = |text: &str| {
         if progress {
             eprintln!("swarm: {text}");
@@ -285,7 +286,7 @@ fn cost_row((fault, in_pour): (&str, bool), costs: &[&Cost]) -> Option<CostRow> 
     })
 }
 
-/// The smallest set of faults of a plan with which `invariant` is still violated, found by leaving out one after the other.
+/// Faults of a plan with which `invariant` is still violated, and of which none can be left out: found by leaving out one after the other.
 pub fn shrink(plan: &Plan, invariant: &str, trained: &TrainedSet, config: &Config) -> Vec<usize> {
     let breaks = |keep: &[usize]| run::run(&plan.keep(keep), trained, config, false).violations.iter().any(|v| v.invariant == invariant);
     let mut keep: Vec<usize> = (0..plan.faults.len()).collect();

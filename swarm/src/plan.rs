@@ -32,6 +32,11 @@ const LAGS_S: (f64, f64) = (0.002, 0.12);
 /// Share of the seeds before a drawn camera whose pictures have a fault.
 const FAULTY_PICTURES: f64 = 0.5;
 
+/// Share of the faults that begin anywhere in the longest run; the others come while most runs go on.
+const LATE_FAULTS: f64 = 0.25;
+/// How long after its order the longest run ends, ms: some pours of 200 ml of syrup take 18 s.
+const LONGEST_RUN_MS: u64 = 18_600;
+
 /// From what seeds draw.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Choice {
@@ -201,7 +206,8 @@ impl Plan {
 
     /// Draws a fault of a kind around the order at `from_ms`.
     fn add_fault(&mut self, random: &mut Pcg64Mcg, from_ms: u64, kind: usize) {
-        let at_ms = (from_ms + random.random_range(0..9_000)).saturating_sub(600);
+        let within_ms = if random.random_bool(LATE_FAULTS) { LONGEST_RUN_MS } else { 9_000 };
+        let at_ms = (from_ms + random.random_range(0..within_ms)).saturating_sub(600);
         let number = self.faults.len();
         self.faults.push(kind);
         for (later_ms, what) in faults::draw(kind, random) {

@@ -24,10 +24,11 @@ use crate::check::Checks;
 use crate::costs::{Costs, Poured};
 use crate::eye::Eye;
 use crate::faults::KINDS;
-use crate::noticing::is_ordinary;
+use crate::noticing::takes_s;
 use crate::pipe::{self, End, Wiring};
-use crate::plan::Plan;
+use crate::plan::{Item, Plan};
 use crate::records::Row;
+use crate::standing::Standing;
 use crate::vessels;
 use crate::weight_set::{Lesson, TrainedSet, episode};
 use crate::what::{EyeFault, Weighed, What, curve};
@@ -99,8 +100,8 @@ pub struct Site {
     pub is_disk_full: bool,
     /// The numbers of the faults that have begun.
     begun: Vec<usize>,
-    /// When they began, s, and their kinds.
-    fault_times: Vec<(f64, &'static str)>,
+    /// Which of them a pour has had.
+    standing: Standing,
     /// What faults cost.
     pub costs: Costs,
     /// The connections of other clients of the robot, and until when they stay, ns.
@@ -136,7 +137,7 @@ impl Site {
             }
         };
         if let Some(fault) = plan.picture {
-            checks.happens(&What::Eye(EyeFault::Picture(fault.kind)), &machine, true, 0.0);
+            checks.happens(&What::Eye(EyeFault::Picture(fault.kind)), &machine, true, (0.0, 0.0));
         }
         // What is learned from needs the rows.
         let learns = plan.items.iter().any(|item| matches!(item.what, What::Learn(_)));
@@ -167,7 +168,7 @@ impl Site {
             new_weights: None,
             is_disk_full: false,
             begun: Vec::new(),
-            fault_times: Vec::new(),
+            standing: Standing::default(),
             costs: Costs::default(),
             second_clients: Vec::new(),
             poured: Vec::new(),
@@ -227,10 +228,11 @@ impl Site {
         if self.now_ns >= self.item_at_ns() {
             let item = self.plan.items[self.next_item].clone();
             self.next_item += 1;
+            let remedied_s = self.remedied_s(&item);
             if let Some(number) = item.fault {
-                self.fault_begins(number);
+                self.fault_begins(number, &item.what, remedied_s);
             }
-            return self.happen(&item.what).into_iter().collect();
+            return self.happen(&item.what, remedied_s).into_iter().collect();
         }
         if self.now_ns >= self.cycle_at_ns {
             self.cycle();
@@ -243,8 +245,16 @@ impl Site {
             let scene = Scene::of(&self.container, self.now_s(), tilt.0, tilt.1);
             self.eye.frame(self.now_ns, poured_ml - self.frame_poured_ml, clinging, &scene);
             self.frame_poured_ml = poured_ml;
+            let (gain, hidden_ml) = self.eye.unshown();
+            self.checks.unshown.frame(gain, hidden_ml);
         }
         Vec::new()
+    }
+
+    /// When the last happens of what an item belongs to, s: somebody sets it right then.
+    fn remedied_s(&self, item: &Item) -> f64 {
+        let of_it = self.plan.items.iter().filter(|other| item.fault.is_some() && other.fault == item.fault);
+        of_it.map(|other| other.at_ms).fold(item.at_ms, u64::max) as f64 / 1000.0
     }
 
     /// A control cycle of the robot.
@@ -270,7 +280,7 @@ impl Site {
         let (target, lag_s) = (self.checks.target(at_s), self.plan.lag_s);
         let return_deg_s = f64::from(self.checks.limits().return_rate_deg_s);
         let now = Moment { container: &self.container, alpha_deg, target, lag_s, return_deg_s, at_s };
-        if let Some(wrong) = self.costs.settle(self.checks.phase, &now) {
+        if let Some(wrong) = self.costs.settle(self.checks.phase(at_s), &now) {
             self.checks.violated("bound", at_s, wrong);
         }
     }
@@ -293,9 +303,10 @@ impl Site {
         let (at_s, before) = (self.now_s(), self.checks.phase);
         self.checks.tick(tick, telemetry, features, at_s);
         let runs = |phase| matches!(phase, Phase::Pouring | Phase::Recording);
-        if runs(self.checks.phase) && !runs(before) {
+        let phase = self.checks.phase;
+        if runs(phase) && !runs(before) {
             self.run_poured_ml = self.container.poured_ml();
-            self.is_pour = self.checks.phase == Phase::Pouring;
+            self.is_pour = phase == Phase::Pouring;
         }
         let row = Row::new(at_s, tick, telemetry, &self.container);
         if let Some(rows) = &mut self.rows {
@@ -309,11 +320,9 @@ impl Site {
         self.say(|| format!("ended: {:?}, {:.1} ml believed", outcome.reason, outcome.poured_ml));
         let true_ml = self.container.poured_ml() - self.run_poured_ml;
         self.checks.ended(outcome, true_ml, at_s);
-        self.costs.ended(is_ordinary(outcome.reason) || self.checks.stood_before(outcome.reason));
-        let since_s = at_s - f64::from(outcome.seconds) - 6.0;
+        self.costs.ended(outcome.reason, self.checks.stood_before(outcome.reason));
         let pictures = self.plan.picture.map(|fault| picture_name(fault.kind));
-        let faults = self.fault_times.iter().filter(|(began_s, _)| *began_s >= since_s).map(|(_, name)| *name);
-        let faults = pictures.into_iter().chain(faults).collect();
+        let faults = pictures.into_iter().chain(self.standing.of_run(at_s - f64::from(outcome.seconds))).collect();
         let (reason, goal_ml, believed_ml) = (outcome.reason, outcome.goal_ml, outcome.poured_ml);
         let sd_ml = outcome.poured_sd_ml;
         self.poured.push(Poured { at_s, seconds: f64::from(outcome.seconds), reason, goal_ml, believed_ml, sd_ml, true_ml, faults });
@@ -321,6 +330,8 @@ impl Site {
 
     /// Gives the loop an agent with the weights for the vessel of this number.
     pub fn give_weights(&mut self, vessel: usize) {
+        let wrong = (vessel != self.plan.vessel).then_some("weights-of-another-vessel");
+        self.standing.weights(wrong, self.now_s());
         if let Some(lesson) = self.trained.get((self.plan.series, self.plan.depth), vessel) {
             let lesson = lesson.clone();
             self.take_weights(lesson);
@@ -354,7 +365,11 @@ impl Site {
         let Some(lesson) = Lesson::learn(kept, &self.checks.limits()) else { return };
         // The controller takes what it can read, so a trainer whose weights it refuses leaves the operator without any.
         match lesson.weights.to_bytes().and_then(|bytes| Weights::from_bytes(&bytes, "weights.bin")) {
-            Ok(_) => self.take_weights(lesson),
+            Ok(_) => {
+                let is_doubtful = weighed != Weighed::Right || !doubtful.is_empty();
+                self.standing.weights(is_doubtful.then_some("doubtful-lesson"), self.now_s());
+                self.take_weights(lesson);
+            }
             Err(e) => {
                 let at_s = self.now_s();
                 self.checks.violated("trained-weights", at_s, format!("the trainer made weights that are refused: {e}"));
@@ -370,23 +385,26 @@ impl Site {
     }
 
     /// The fault of this number begins, or goes on.
-    fn fault_begins(&mut self, number: usize) {
+    fn fault_begins(&mut self, number: usize, what: &What, remedied_s: f64) {
         let (at_s, at_ml) = (self.now_s(), self.container.poured_ml());
         if self.begun.contains(&number) {
             return;
         }
         self.begun.push(number);
-        let kind = KINDS[self.plan.faults[number]];
-        self.fault_times.push((at_s, kind.name));
-        self.costs.begins(kind, self.checks.phase, self.is_pour, (at_s, at_ml));
+        let (kind, until_s) = (KINDS[self.plan.faults[number]], remedied_s.max(at_s + takes_s(what)));
+        // Weights count when they are taken.
+        if !matches!(what, What::Weights(_)) {
+            self.standing.begins(kind.name, until_s);
+        }
+        self.costs.begins((kind, what), self.checks.phase(at_s), self.is_pour, (at_s, at_ml, until_s));
     }
 
     /// Lets `what` happen. Gives the operator's order, if it is one.
-    fn happen(&mut self, what: &What) -> Option<Option<Order>> {
+    fn happen(&mut self, what: &What, remedied_s: f64) -> Option<Option<Order>> {
         let (at_s, ms) = (self.now_s(), 1_000_000);
         self.say(|| format!("{what:?}"));
         let lives = self.restart_at_ns.is_none();
-        self.checks.happens(what, self.robot.machine(), lives, at_s);
+        self.checks.happens(what, self.robot.machine(), lives, (at_s, remedied_s));
         match what {
             What::Pour(goal_ml) => {
                 self.episode += 1;
@@ -400,12 +418,15 @@ impl Site {
             What::Resume => return Some(None),
             What::Refill(fill_ml) => {
                 // Nobody fills a vessel that is tilted or poured from.
-                if self.checks.phase == Phase::Idle {
+                if self.checks.phase(at_s) == Phase::Idle {
                     vessels::fill(&self.rig, &mut self.container, *fill_ml, &mut self.random);
                     (self.frame_poured_ml, self.run_poured_ml) = (0.0, 0.0);
                 }
             }
             What::Robot(fault) => {
+                if *fault == Fault::Clear {
+                    self.costs.cleared(at_s);
+                }
                 if let Fault::Offline(s) = fault {
                     self.offline_until_ns = self.now_ns + (s * 1e9) as u64;
                 }

@@ -196,18 +196,20 @@ impl Network for World<'_> {
             if self.is_over() {
                 return Err(ErrorKind::ConnectionAborted.into());
             }
+            // A process that is suspended reads nothing, whatever comes, and looks when it goes on.
+            let frozen_ns = self.site.borrow().controller_frozen_until_ns;
+            if frozen_ns > self.now_ns() {
+                self.step(frozen_ns);
+                continue;
+            }
             match from.read(buffer) {
                 Err(e) if e.kind() == ErrorKind::WouldBlock => {}
                 result => return result,
             }
-            // A process that is suspended meanwhile looks again when it goes on.
-            let looks_ns = until_ns.max(self.site.borrow().controller_frozen_until_ns);
-            if !self.step(looks_ns) && looks_ns >= self.site.borrow().controller_frozen_until_ns {
-                return match from.read(buffer) {
-                    Err(e) if e.kind() == ErrorKind::WouldBlock => Err(ErrorKind::TimedOut.into()),
-                    result => result,
-                };
+            if self.now_ns() >= until_ns {
+                return Err(ErrorKind::TimedOut.into());
             }
+            self.step(until_ns);
         }
     }
 }

@@ -314,3 +314,47 @@ fn a_joint_goes_up_to_a_target_that_was_taken_back() {
     assert_eq!(checks.target(0.1).map(|(deg, _)| deg), Some(84.0));
     assert_eq!(checks.target(1.0).map(|(deg, _)| deg), Some(83.0), "what is no longer followed does not count");
 }
+
+/// Protects the table of docs/SWARM.md: what stays wrong after a fault is one of every later pour too, however long ago it began, so that "none" has only
+/// pours without any. A controller that starts again has the vessel's own weights.
+#[test]
+fn what_stays_wrong_is_a_fault_of_later_pours() {
+    let happens = [
+        (3_000, What::Eye(EyeFault::GainDrift(0.05)), Some("eye-gain-drift")),
+        (3_100, What::Weights(1), Some("weights-of-another-vessel")),
+        (3_500, What::Robot(Fault::LateStart(0.1)), Some("late-start")),
+        (20_000, What::Pour(60.0), None),
+        (40_000, What::ControllerKilled(500), Some("controller-killed")),
+        (41_000, What::Refill(300.0), None),
+        (55_000, What::Pour(60.0), None),
+    ];
+    let shown = shown(9, Series::Cb3, 0, (300.0, (266_117, 645_915)), &happens);
+    let faults: Vec<_> = shown.poured.iter().map(|pour| pour.faults.clone()).collect();
+    assert_eq!(faults, [vec!["eye-gain-drift", "weights-of-another-vessel"], vec!["eye-gain-drift"]]);
+    // The same of weights that were learned with a number that somebody mistyped.
+    let happens = [
+        (3_066, What::Record(80.0, 0.9), None),
+        (18_066, What::Learn(Weighed::Mistyped(1.3)), None),
+        (18_566, What::Refill(300.0), None),
+        (40_066, What::Pour(60.0), None),
+    ];
+    let lesson = self::shown(9, Series::Cb3, 0, (300.0, (266_117, 645_915)), &happens);
+    assert_eq!(lesson.poured[1].faults, ["doubtful-lesson"]);
+}
+
+/// Protects what a suspended controller is tried with: a process that stands still reads nothing and begins no program, whatever comes meanwhile; and how long
+/// the robot's program needs to bring the container upright by itself is seen on the robot, and not when the controller wakes up.
+#[test]
+fn a_suspended_controller_does_nothing() {
+    for at_ms in (40..500).step_by(60) {
+        let at_s = at_ms as f64 / 1000.0;
+        let happens = [(at_ms, What::Suspended(2_000), Some("suspended")), (3_500, What::Pour(60.0), None)];
+        let frozen = shown(12, Series::Cb3, 0, (300.0, (266_117, 645_915)), &happens);
+        assert!(!tells(&frozen, "robot connected", at_s, at_s + 2.0), "{}", frozen.story.join("\n"));
+        assert!(tells(&frozen, "robot connected", at_s + 2.0, at_s + 3.5), "{}", frozen.story.join("\n"));
+    }
+    let happens = [(3_000, What::Pour(150.0), None), (6_000, What::Suspended(5_000), Some("suspended"))];
+    let suspended = shown(12, Series::Cb3, 0, (300.0, (266_117, 645_915)), &happens);
+    let cost = &suspended.costs[0];
+    assert!((0.2..3.0).contains(&cost.upright_s), "{cost:?}");
+}

@@ -32,6 +32,9 @@ fn fixed_seeds_keep_every_invariant() {
     let (shown, summary) = run_many(seeds(FIXED.0, FIXED.1), &config().unwrap(), false).unwrap();
     assert!(summary.pours > 3_000, "{} pours ended", summary.pours);
     assert!(summary.reasons.len() >= 14, "{:?}", summary.reasons);
+    // Of pours that nothing disturbed, 95 % are to lie within two of their own deviations; the rest of 0.02 is what some 280 of them scatter.
+    let undisturbed = summary.done.iter().find(|row| row.fault == "none").unwrap();
+    assert!(undisturbed.covered >= 0.93, "{undisturbed:?}");
     assert_none(&shown);
 }
 
