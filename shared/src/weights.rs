@@ -27,8 +27,9 @@ use crate::mlp::{HIDDEN, INPUTS, InputScale, Mlp};
 use crate::{regular_file, whole_file};
 
 mod ranges;
+mod way_back;
 
-pub use ranges::check_way_back;
+pub use way_back::check_way_back;
 
 /// Version of the file format; files of other versions are refused.
 pub const FORMAT_VERSION: u32 = 4;

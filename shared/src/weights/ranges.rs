@@ -6,32 +6,7 @@ use crate::estimator::Calibration;
 use crate::estimator::flow::{DELAY_MAX_FRAMES, FlowModel, Lateness, WayBack};
 use crate::estimator::fused::{Explanation, FusedModel};
 use crate::estimator::vessel::Vessel;
-use crate::limits::Limits;
-
-/// Rate of the way back, degrees a frame. Chosen by hand: a twentieth and five times that of the shipped configurations.
-const BACK_RATE_DEG: (f64, f64) = (0.1, 10.0);
-/// Change of that rate in a frame, degrees a frame. Chosen by hand: far from those of the shipped configurations.
-const BACK_CHANGE_DEG: (f64, f64) = (0.01, 100.0);
-
-/// Refuses limits whose way back no weight file can hold at `rate_hz` frames a second, and names the two keys.
-pub fn check_way_back(limits: &Limits, rate_hz: f64) -> Result<(), String> {
-    let back = WayBack::new(limits, rate_hz);
-    let of = |key: &str, value: f32, in_a_frame: f64, (low, high): (f64, f64)| {
-        if (low..=high).contains(&in_a_frame) {
-            return Ok(());
-        }
-        Err(format!(
-            "limits.{key} {value} is {in_a_frame:.3} degrees a frame at {rate_hz} frames a second, but must be {low} to {high}: change it or camera.fps"
-        ))
-    };
-    let (rate_key, rate) = if limits.rate_deg_s < limits.return_rate_deg_s {
-        ("rate_deg_s", limits.rate_deg_s)
-    } else {
-        ("return_rate_deg_s", limits.return_rate_deg_s)
-    };
-    of(rate_key, rate, back.rate_deg, BACK_RATE_DEG)?;
-    of("acceleration_deg_s2", limits.acceleration_deg_s2, back.change_deg, BACK_CHANGE_DEG)
-}
+use crate::weights::way_back::{BACK_CHANGE_DEG, BACK_RATE_DEG};
 
 /// Refuses a fused estimate with a value outside its range, and names it.
 pub fn check_fused(model: &FusedModel, back: WayBack) -> Result<(), String> {
