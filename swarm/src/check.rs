@@ -42,6 +42,8 @@ const LOOKS_S: f64 = 0.2;
 const LEFT_TILTED_S: f64 = 2.0;
 /// For how long a robot still follows a target that was sent, s: the patience of its program, and what it is behind.
 const FOLLOWED_S: f64 = 0.3;
+/// The share of its speed below which a robot must end a pour, whatever else is seen: docs/ROBOT.md promises it below 0.95.
+const SLOWED: f64 = 0.9;
 /// For how long a joint may be behind its commands, s: 1.25 times the longest lag that is believed, and two ticks (docs/ROBOT.md).
 const FOLLOWS_S: f64 = 0.45;
 /// How far from its commands a joint still follows, degrees: the 2 of docs/ROBOT.md, and as many for how far it goes between two ticks.
@@ -110,6 +112,8 @@ pub struct Checks {
     /// The tilt in the newest control cycle, degrees, and since when the joint has not been where it was commanded, s.
     alpha_deg: f64,
     elsewhere_since_s: Option<f64>,
+    /// Since when something has kept the arm from moving at nearly its full speed, s.
+    hindered_since_s: Option<f64>,
     /// Since when the robot could have been on its way upright, s.
     free_since_s: Option<f64>,
     sequence: (u64, u64),
@@ -153,10 +157,14 @@ fn stops_ours(what: &What, machine: &Machine) -> bool {
         }
 }
 
+/// Whether the arm has power, and nobody has stopped it or has it in hand.
+fn is_free(machine: &Machine) -> bool {
+    machine.safety_mode().lets_move() && machine.robot_mode() == RobotMode::Running && !machine.freedrive()
+}
+
 /// Whether nothing keeps the arm from moving at its full speed.
-pub(crate) fn may_move(machine: &Machine) -> bool {
-    let is_on = machine.safety_mode().lets_move() && machine.robot_mode() == RobotMode::Running;
-    is_on && machine.speed_scaling() > 0.99 && !machine.freedrive()
+fn may_move(machine: &Machine) -> bool {
+    is_free(machine) && machine.speed_scaling() > 0.99
 }
 
 impl Checks {
@@ -175,6 +183,7 @@ impl Checks {
             program_s: f64::NEG_INFINITY,
             alpha_deg: 0.0,
             elsewhere_since_s: None,
+            hindered_since_s: None,
             free_since_s: None,
             sequence: (0, 0),
             used: 0,
@@ -272,6 +281,8 @@ impl Checks {
     pub fn cycle(&mut self, machine: &Machine, joint: usize, alpha_deg: f64, at_s: f64) {
         let active = matches!(self.phase(at_s), Phase::Pouring | Phase::Recording);
         self.alpha_deg = alpha_deg;
+        let is_hindered = !is_free(machine) || machine.speed_scaling() < SLOWED;
+        self.hindered_since_s = is_hindered.then_some(self.hindered_since_s.unwrap_or(at_s));
         for (invariant, what) in self.commanded.cycle(machine, joint, active) {
             self.violated(invariant, at_s, what);
         }
@@ -283,7 +294,12 @@ impl Checks {
         // A container that stands tilted, or a paused program, is for the operator to set right.
         let is_paused = matches!(machine.runtime_state(), RuntimeState::Pausing | RuntimeState::Paused);
         let may_be_taken = may_move(machine) && alpha_deg.abs() < START_DEG && !is_paused;
-        if let Some(what) = self.waits.cycle(self.phase(at_s), (may_move(machine), may_be_taken), (asked, stands_until_s), at_s) {
+        if let Some(what) = self.waits.cycle(
+            self.phase(at_s),
+            (may_move(machine), may_be_taken, machine.runtime_state() == RuntimeState::Stopped),
+            (asked, stands_until_s),
+            at_s,
+        ) {
             self.violated("ends", at_s, what);
         }
         self.left_tilted(machine, alpha_deg, at_s);
@@ -437,8 +453,12 @@ impl Checks {
         }
     }
 
-    /// Whether the joint is where it was commanded within the longest lag that is believed; a pour whose joint is elsewhere must have ended.
+    /// Whether the arm may move, and the joint is where it was commanded within the longest lag that is believed; a pour whose joint is elsewhere must have ended.
     fn followed(&mut self, at_s: f64) {
+        let began_s = self.hindered_since_s.map(|since_s| since_s.max(self.run_since_s)).filter(|_| self.is_active());
+        if let Some(began_s) = began_s.filter(|began_s| at_s - began_s > NOTICED_S + SILENT_S) {
+            self.violated("noticed", at_s, format!("the arm may not move, or is slowed, since {began_s:.2} s of a pour"));
+        }
         let degrees = || self.sent_targets.iter().map(|(_, deg)| *deg);
         let (least, largest) = (degrees().fold(f64::INFINITY, f64::min), degrees().fold(f64::NEG_INFINITY, f64::max));
         let is_there = (least - FOLLOWS_DEG..=largest + FOLLOWS_DEG).contains(&self.alpha_deg);

@@ -116,20 +116,12 @@ pub fn remedies(remedy: &Fault, what: &What) -> bool {
     }
 }
 
-/// Whether no run goes on while it stands, although it began before. The controller refuses to begin one with most of them.
+/// Whether no run goes on while it stands, although it began before. What keeps the arm from moving is seen on the robot itself: one safety mode covers
+/// another there.
 pub fn forbids_runs(what: &What) -> bool {
-    use Fault::{
-        Boot, EmergencyStop, Freedrive, Freeze, Offline, ProtectiveStop, SafeguardOpen, SlowReader, SpeedSlider, Stall, TimeScaling,
-    };
-    let of_the_arm = |fault: &Fault| {
-        matches!(
-            fault,
-            SafeguardOpen | ProtectiveStop | EmergencyStop | Freedrive | Boot | SpeedSlider(_) | TimeScaling(_) | Fault::SafetyMode(_)
-        )
-    };
-    let of_the_link = |fault: &Fault| matches!(fault, Stall(_) | Freeze(_) | SlowReader(_) | Offline(_));
+    use Fault::{Freeze, Offline, SlowReader, SpeedSlider, Stall};
     let stands = match what {
-        What::Robot(fault) => of_the_arm(fault) || of_the_link(fault),
+        What::Robot(fault) => matches!(fault, SpeedSlider(_) | Stall(_) | Freeze(_) | SlowReader(_) | Offline(_)),
         what => matches!(what, What::Eye(_) | What::LinkStall(_)),
     };
     stands && must_end(what).is_some()

@@ -23,12 +23,13 @@ pub struct Waits {
 }
 
 impl Waits {
-    /// Takes a control cycle in which the controller is in `phase`, and the arm may move or not, and be taken or not. Somebody asked for the robot at `asked_s`, if a person has
+    /// Takes a control cycle in which the controller is in `phase`, and the arm may move or not, and be taken or not; `no_program` says
+    /// that none runs on the robot. Somebody asked for the robot at `asked_s`, if a person has
     /// not taken it since; the last fault that can keep it from being taken was over at `over_s`. Gives what has lasted for too long.
     pub fn cycle(
         &mut self,
         phase: Phase,
-        (may_move, may_be_taken): (bool, bool),
+        (may_move, may_be_taken, no_program): (bool, bool, bool),
         (asked_s, over_s): (Option<f64>, f64),
         at_s: f64,
     ) -> Option<String> {
@@ -38,8 +39,9 @@ impl Waits {
         } else if at_s - *self.ending_since_s.get_or_insert(at_s) > ENDS_S {
             return Some(format!("a run has been {phase:?} for {ENDS_S} s, and nothing hinders the robot"));
         }
-        // Brakes take their time, and whoever asks before that is told to ask again.
-        self.takable_since_s = may_be_taken.then_some(self.takable_since_s.unwrap_or(at_s));
+        // Brakes take their time, and so does a program that still brings the container upright; whoever asks before that is told to ask again.
+        let since_s = self.takable_since_s.or(no_program.then_some(at_s));
+        self.takable_since_s = since_s.filter(|_| may_be_taken);
         let seen_s = self.takable_since_s?.max(over_s) + SEEN_S;
         let asked_s = asked_s.filter(|asked_s| phase == Phase::NoRobot && *asked_s > seen_s && at_s - asked_s > TAKEN_S)?;
         Some(format!("nothing hinders the robot, and it has not been taken since somebody asked at {asked_s:.1} s"))
@@ -53,7 +55,7 @@ mod tests {
     /// What is found in 12 s of a phase, when it was asked at a time and the last fault was over at another, s.
     fn found(phase: Phase, may_move: bool, asked_s: Option<f64>, over_s: f64) -> bool {
         let mut waits = Waits::default();
-        (0..1500).any(|k| waits.cycle(phase, (may_move, may_move), (asked_s, over_s), 0.008 * f64::from(k)).is_some())
+        (0..1500).any(|k| waits.cycle(phase, (may_move, may_move, may_move), (asked_s, over_s), 0.008 * f64::from(k)).is_some())
     }
 
     /// Protects the operator from a cell that stands still: a run that does not end, and a robot that is not taken, are found where nothing hinders it, and only

@@ -23,13 +23,17 @@ fn machine() -> Machine {
     Machine::new(Series::Cb3, Series::Cb3.default_version(), [0.0, -right, right, -right, -right, 0.0])
 }
 
+/// Pours on a machine that nothing hinders.
+fn poured(checks: Checks, target_deg: f32, alpha_deg: f64) -> Vec<&'static str> {
+    poured_on(&machine(), checks, target_deg, alpha_deg)
+}
+
 /// Pours from 10 s on for 2 s at one target, with the joint at `alpha_deg`. Gives what is violated.
-fn poured(mut checks: Checks, target_deg: f32, alpha_deg: f64) -> Vec<&'static str> {
-    let machine = machine();
+fn poured_on(machine: &Machine, mut checks: Checks, target_deg: f32, alpha_deg: f64) -> Vec<&'static str> {
     for k in 0..60 {
         let at_s = 10.0 + f64::from(k) / 30.0;
         let phase = if k == 0 { Phase::Idle } else { Phase::Pouring };
-        checks.cycle(&machine, TILTING, alpha_deg, at_s);
+        checks.cycle(machine, TILTING, alpha_deg, at_s);
         let times = Times { deadline_ns: 0, decided_at_ns: 0, written_at_ns: 0, done_ns: 0, margin_ns: 0 };
         let (robot, features) = (Robot::that_may_move(target_deg, 1), Default::default());
         let tick = Tick { now_ns: 1, features, robot, order: None, agent: None, target_deg: Some(target_deg), d_ml: 50.0, times };
@@ -80,4 +84,12 @@ fn an_old_stop_does_not_excuse_a_container_that_is_left_tilted() {
         checks.violations.iter().any(|v| v.invariant == "left-tilted")
     };
     assert!(left(5.0) && !left(9.0));
+}
+
+/// Protects pours from a robot that may not move: whatever keeps it from that, and however long ago it began, no pour goes on.
+#[test]
+fn an_arm_that_may_not_move_ends_a_pour() {
+    let mut stopped = machine();
+    stopped.set_safety_mode(simulator::ur::SafetyMode::Recovery);
+    assert_eq!(poured_on(&stopped, checks(), 0.0, 0.0), ["noticed"]);
 }
