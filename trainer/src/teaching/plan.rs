@@ -144,8 +144,7 @@ pub fn least_goal_max_ml(vessel: &Foresight, wish: &Wish) -> Option<f64> {
         .find(|goal_max_ml| !pours_to_come(vessel, &Wish { goal_max_ml: *goal_max_ml, ..*wish }).is_empty())
 }
 
-/// The least vessel, in whole ml that it holds, from which on a plan can begin with every vessel; `None` if there is none below
-/// [`HOLDS_LOOKED_FOR_ML`].
+/// The least vessel, in whole ml that it holds, from which on a plan can begin with every vessel; `None` if there is none below 200 ml.
 pub fn least_holds_ml(wish: &Wish) -> Option<f64> {
     let begins = |holds_ml: &f64| !curves(&Foresight::unknown(*holds_ml, wish.alpha_max_deg), wish).is_empty();
     (1..HOLDS_LOOKED_FOR_ML).rev().map(f64::from).take_while(begins).last()
