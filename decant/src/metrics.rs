@@ -8,14 +8,14 @@
 mod page;
 mod weighed;
 
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::BTreeMap;
 use std::net::{IpAddr, Ipv4Addr};
 use std::path::PathBuf;
 use std::time::{Duration, Instant};
 
 use rt_controller::client::Client;
 use shared::config::Config;
-use shared::control::{EndReason, Outcome, Status};
+use shared::control::Status;
 use shared::disk_space::free_bytes;
 use shared::exit::{self, Failure, OrExit as _};
 use shared::os;
@@ -24,7 +24,7 @@ use web::gate::Rules;
 use web::{Answer, Server, Settings, token};
 
 use page::Seen;
-use weighed::{EPISODES, Weighed};
+use weighed::Weighed;
 
 /// Most connections. Chosen by hand: a scraper has one.
 const CONNECTIONS: usize = 8;
@@ -95,13 +95,11 @@ struct Cell<'a> {
     /// How many pours and recordings ended for which reason since this process started, and the newest one.
     ended: BTreeMap<&'static str, u64>,
     newest: Option<u64>,
-    /// The numbers of pours that did not go to their goals, of those that the controller told of.
-    cut_short: BTreeSet<u64>,
 }
 
 impl<'a> Cell<'a> {
     fn new(config: &'a Config) -> Self {
-        Self { config, client: None, status: None, asked: None, ended: BTreeMap::new(), newest: None, cut_short: BTreeSet::new() }
+        Self { config, client: None, status: None, asked: None, ended: BTreeMap::new(), newest: None }
     }
 
     /// Asks the controller, unless it was asked just now.
@@ -119,7 +117,7 @@ impl<'a> Cell<'a> {
             cell: self.config.cell.name.clone(),
             status: self.status.clone(),
             ended: self.ended.clone(),
-            weighed: weighed.pours(&self.cut_short),
+            weighed: weighed.pours(),
             free_bytes: places.filter_map(|(name, path)| Some((name, free_bytes(path)?))).collect(),
         }
     }
@@ -138,10 +136,9 @@ impl<'a> Cell<'a> {
         status
     }
 
-    /// Counts the results that were not counted yet. Those from before this process started are not its own, but say as well what was cut short.
+    /// Counts the results that were not counted yet. Those from before this process started are not its own.
     fn count(&mut self) {
         let Some(status) = &self.status else { return };
-        remember_cut_short(&mut self.cut_short, &status.outcomes);
         let newest = status.outcomes.iter().map(|o| o.episode).max().unwrap_or(0);
         if let Some(before) = self.newest {
             for outcome in status.outcomes.iter().filter(|o| o.episode > before) {
@@ -149,44 +146,5 @@ impl<'a> Cell<'a> {
             }
         }
         self.newest = self.newest.max(Some(newest));
-    }
-}
-
-/// Adds the numbers of pours that did not go to their goals. No more are kept than episodes are looked at.
-fn remember_cut_short(cut_short: &mut BTreeSet<u64>, outcomes: &[Outcome]) {
-    cut_short.extend(outcomes.iter().filter(|o| !EndReason::AT_THE_GOAL.contains(&o.reason)).map(|o| o.episode));
-    while cut_short.len() > EPISODES {
-        cut_short.pop_first();
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    /// Protects the errors of weighed pours from those that were stopped: what the controller tells of them is remembered, and not without end.
-    #[test]
-    fn what_was_cut_short_is_remembered() {
-        let outcome = |episode, reason| Outcome {
-            episode,
-            reason,
-            unseen: false,
-            goal_ml: Some(100.0),
-            poured_ml: 10.0,
-            poured_sd_ml: 1.0,
-            seconds: 4.0,
-            frames: 120,
-            bridged_frames: 0,
-            stale_features: 0,
-            tick_gaps: 0,
-            clipped: Default::default(),
-        };
-        let mut cut_short = BTreeSet::new();
-        let ends = [(1, EndReason::Done), (2, EndReason::Aborted), (3, EndReason::GoalExceeded), (4, EndReason::StaleFeature)];
-        remember_cut_short(&mut cut_short, &ends.map(|(episode, reason)| outcome(episode, reason)));
-        assert_eq!(cut_short, BTreeSet::from([2, 4]));
-        let many: Vec<Outcome> = (5..=EPISODES as u64 + 5).map(|n| outcome(n, EndReason::Aborted)).collect();
-        remember_cut_short(&mut cut_short, &many);
-        assert_eq!((cut_short.len(), cut_short.first()), (EPISODES, Some(&6)));
     }
 }

@@ -75,6 +75,23 @@ fn a_clock_that_went_back_makes_nothing_old() {
     }
 }
 
+/// Protects the newer recordings of a directory into which older ones were merged later: the number of a copy says nothing of its age.
+#[test]
+fn a_copy_is_as_old_as_its_original() {
+    let dir = tempfile::tempdir().unwrap();
+    let [may, june, all] = ["may", "june", "all"].map(|name| dir.path().join(name));
+    let day = |n: u32| UNIX_EPOCH + Duration::from_secs(86_400) * n;
+    for (directory, number, at) in [(&may, 1, 5), (&may, 2, 6), (&june, 5, 35), (&june, 6, 36)] {
+        write_at(directory, number, true, day(at));
+    }
+    for from in [&june, &may] {
+        assert_eq!(code(&episodes(&["merge", from.to_str().unwrap(), "--to", all.to_str().unwrap()])), 0);
+    }
+    let pruned = episodes(&["prune", all.to_str().unwrap(), "--budget-mb", "0", "--budget-episodes", "2", "--yes"]);
+    let there = [1, 2, 3, 4].map(|number| all.join(format!("episode-000{number}.mcap")).exists());
+    assert_eq!((code(&pruned), there), (0, [true, true, false, false]), "{}", text(&pruned.stderr));
+}
+
 /// Protects who counts episodes from a disk that is not mounted: a link that leads nowhere is an episode that cannot be read, and said.
 #[test]
 fn a_link_that_leads_nowhere_is_said() {

@@ -181,7 +181,8 @@ function rowToWeigh(e) {
 function unweighed() {
   const open = table.episodes.filter(e => !e.error && e.weight_g === null).reverse();
   const whole = open.filter(e => e.complete), cut = open.length - whole.length;
-  const weighed = table.episodes.filter(e => !e.error && e.weight_g !== null);
+  // What is wrong with the others stands in History: they are not learned from.
+  const weighed = table.episodes.filter(e => !e.error && e.weight_g !== null && !(e.wrong || []).length);
   const kinds = kind => weighed.filter(e => e.run.kind === kind).length;
   $('set-words').textContent = table.fault ? `! ${table.fault}.` : `Weighed so far: ${many(kinds('recording'), 'curve')} and ${many(kinds('pour'), 'pour')}${table.unread ? `; ${many(table.unread, 'file')} still to be read` : ''}.`;
   const old = plannedFrom !== null && plannedFrom !== weighed.length;

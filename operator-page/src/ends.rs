@@ -8,7 +8,7 @@ use std::collections::BTreeMap;
 use std::path::PathBuf;
 
 use serde::{Deserialize, Serialize};
-use shared::control::{EndReason, Outcome};
+use shared::control::Outcome;
 use shared::episode::by_number;
 use shared::{regular_file, whole_file};
 
@@ -26,13 +26,6 @@ pub struct End {
     pub reason: String,
     /// The volume poured by the estimate, ml with its deviation; none of a recorded curve.
     pub poured: Option<String>,
-}
-
-impl End {
-    /// Whether it was a pour that went all the way to its goal, so that its weight says how far off it was.
-    pub fn at_the_goal(&self) -> bool {
-        EndReason::AT_THE_GOAL.iter().any(|reason| reason.words() == self.reason)
-    }
 }
 
 /// The file.
@@ -94,6 +87,7 @@ impl Ends {
 
 #[cfg(test)]
 mod tests {
+    use shared::control::EndReason;
     use shared::limits::Clipped;
 
     use super::*;

@@ -18,7 +18,7 @@ use serde_json::{Value, json};
 use shared::episode::{Episode, EpisodeImages, by_number, find_episodes};
 use shared::regular_file;
 
-use crate::ends::{End, Ends};
+use crate::ends::Ends;
 use crate::lock::locked;
 
 /// Pause between two looks at the directory. Chosen by hand: a person waits for a new episode no longer.
@@ -74,19 +74,13 @@ fn line(path: &Path) -> Value {
             let mut all = summary(&episode);
             let about = remarks(&episode);
             let texts = |wrong| about.iter().filter(|r| r.is_wrong == wrong).map(|r| r.text.as_str()).collect::<Vec<_>>();
-            let error_ml = all["run"]["goal_ml"].as_f64().zip(episode.weight_g).map(|(goal, weight)| weight - goal);
             all["file"] = json!(name);
-            all["error_ml"] = json!(error_ml);
+            all["error_ml"] = json!(episode.error_ml());
             all["wrong"] = json!(texts(true));
             all["notes"] = json!(texts(false));
             all
         }
     }
-}
-
-/// By how much a weighed pour missed its goal, ml. One that is known to have been cut short, as by a Stop, missed nothing.
-fn error_ml(name: &str, line: &Line, ends: &Ends) -> Option<f64> {
-    line.value["error_ml"].as_f64().filter(|_| ends.of(name).is_none_or(End::at_the_goal))
 }
 
 impl History {
@@ -150,7 +144,6 @@ impl History {
     pub fn table(&self, ends: &Ends) -> Value {
         let with_end = |(name, line): (&String, &Line)| {
             let mut value = line.value.clone();
-            value["error_ml"] = json!(error_ml(name, line, ends));
             if let Some(end) = ends.of(name) {
                 value["reason"] = json!(end.reason);
                 value["estimate"] = json!(end.poured.as_ref().map(|poured| format!("{poured} ml")));
@@ -216,11 +209,10 @@ impl History {
         locked(&self.weighing)
     }
 
-    /// By how much the weighed pours with the weights `identity` missed their goals, ml. `ends` says which were cut short.
-    pub fn errors_ml(&self, identity: &str, ends: &Ends) -> Vec<f64> {
+    /// By how much the weighed pours with the weights `identity` missed their goals, ml; those that ended early do not count.
+    pub fn errors_ml(&self, identity: &str) -> Vec<f64> {
         let table = locked(&self.table);
-        let with_them = table.iter().filter(|(_, l)| l.value["weights"] == identity);
-        with_them.filter_map(|(name, l)| error_ml(name, l, ends)).collect()
+        table.values().filter(|l| l.value["weights"] == identity).filter_map(|l| l.value["error_ml"].as_f64()).collect()
     }
 
     /// Reads the episode `name` again at once, so that what is asked next knows what was just written into it.
@@ -342,48 +334,29 @@ mod tests {
         assert_eq!(listed, names);
     }
 
-    /// Protects who judges weights by the scale: a pour that was stopped at 10 of 100 ml is no error of 90 ml, in the table and before the next pour.
+    /// Protects who judges weights by the scale: a pour that was stopped at 10 of 100 ml is no error of 90 ml, in the table and before the next pour; one that
+    /// gave more than its goal although its stream was lost is an error.
     #[test]
     fn a_pour_that_was_stopped_is_no_error() {
-        use shared::config::Config;
-        use shared::control::{EndReason, Outcome};
-        use shared::episode::{EpisodeEnd, EpisodeKind, EpisodeStart, EpisodeWriter, FrameRow, set_weight};
-        use shared::messages::Feature;
-        let config = Config::read(&Path::new(env!("CARGO_MANIFEST_DIR")).join("../config/sim.toml")).unwrap();
+        let config = shared::config::Config::read(&Path::new(env!("CARGO_MANIFEST_DIR")).join("../config/sim.toml")).unwrap();
         let dir = tempfile::tempdir().unwrap();
         let history = History::new(dir.path().to_path_buf());
-        let mut ends = Ends::default();
-        let pours = [(EndReason::Done, 101.0), (EndReason::Aborted, 12.0), (EndReason::GoalExceeded, 140.0)];
-        for (number, (reason, weight_g)) in (1..).zip(pours) {
+        for (episode, (poured_ml, weight_g)) in (1..).zip([(99.0, 101.0), (10.0, 12.0), (91.0, 130.0), (130.0, 140.0)]) {
             let (kind, wall_clock) = (EpisodeKind::Pour { goal_ml: 100.0 }, SystemTime::UNIX_EPOCH);
-            let start = EpisodeStart { episode: number, kind, started_at_ns: 1, wall_clock, config: &config, weights: "them" };
+            let start = EpisodeStart { episode, kind, started_at_ns: 1, wall_clock, config: &config, weights: "them" };
             let mut writer = EpisodeWriter::create(dir.path(), &start).unwrap();
-            let feature = Feature { captured_at_ns: 2, sequence: 1, ..Default::default() };
+            let version = LAYOUT_VERSION;
+            writer.telemetry(&Telemetry { version, tick: 1, at_ns: 2, poured_ml, ..Default::default() }).unwrap();
+            let feature = Feature { version, captured_at_ns: 2, sequence: 1, ..Default::default() };
             writer.frame(&FrameRow { feature: &feature, alpha_commanded_deg: 0.0, alpha_measured_deg: 0.0, image: None }).unwrap();
             let path = writer.finish(&EpisodeEnd { complete: true, reason: "over", disordered_frames: 0 }).unwrap();
             set_weight(&path, weight_g).unwrap();
             history.refresh(&name_of(&path));
-            let outcome = Outcome {
-                episode: number,
-                reason,
-                unseen: false,
-                goal_ml: Some(100.0),
-                poured_ml: 10.0,
-                poured_sd_ml: 1.0,
-                seconds: 4.0,
-                frames: 120,
-                bridged_frames: 0,
-                stale_features: 0,
-                tick_gaps: 0,
-                clipped: Default::default(),
-            };
-            ends.remember(&[outcome], &[(number, Ok(path.display().to_string()))].into());
         }
-        assert_eq!(history.errors_ml("them", &ends), [1.0, 40.0]);
-        assert_eq!(history.errors_ml("them", &Ends::default()), [1.0, -88.0, 40.0], "what is not known is not left out");
-        let table = history.table(&ends);
+        assert_eq!(history.errors_ml("them"), [1.0, 30.0, 40.0]);
+        let table = history.table(&Ends::default());
         let shown: Vec<Option<f64>> = table["episodes"].as_array().unwrap().iter().map(|e| e["error_ml"].as_f64()).collect();
-        assert_eq!(shown, [Some(1.0), None, Some(40.0)]);
+        assert_eq!(shown, [Some(1.0), None, Some(30.0), Some(40.0)]);
     }
 
     /// Protects browsers from a table of yesterday: a file that changes is seen although another one has a time in the future, and so is one that takes
@@ -433,14 +406,14 @@ mod tests {
     }
 
     /// Protects what is learned on the page from a weighed pour of which the camera missed a part: the table says what is wrong about it, and it is not
-    /// learned from, nor does it count among the last ones.
+    /// learned from, nor does it count among the last ones. What it misses of an upright container are drops.
     #[test]
     fn a_pour_that_was_not_seen_whole_is_not_learned_from() {
         const FRAME_NS: u64 = 33_333_333;
         let dir = tempfile::tempdir().unwrap();
         let history = History::new(dir.path().to_path_buf());
         let config = shared::config::Config::read(&Path::new(env!("CARGO_MANIFEST_DIR")).join("../config/sim.toml")).unwrap();
-        for (k, blind) in [0..0, 40..46, 40..47].into_iter().enumerate() {
+        for (k, (blind, alpha_commanded_deg)) in [(0..0, 40.0), (40..46, 40.0), (40..47, 40.0), (40..47, 0.5)].into_iter().enumerate() {
             let kind = EpisodeKind::Pour { goal_ml: 50.0 };
             let wall_clock = SystemTime::UNIX_EPOCH + Duration::from_secs(k as u64);
             let start = EpisodeStart { episode: 1, kind, started_at_ns: FRAME_NS, wall_clock, config: &config, weights: "" };
@@ -453,7 +426,7 @@ mod tests {
                 let feature =
                     Feature { version, sequence: frame, captured_at_ns: at_ns, area_px2, doubt: doubt as u32, ..Default::default() };
                 writer.telemetry(&Telemetry { version, tick: frame, at_ns, ..Default::default() }).unwrap();
-                let row = FrameRow { feature: &feature, alpha_commanded_deg: 40.0, alpha_measured_deg: f32::NAN, image: None };
+                let row = FrameRow { feature: &feature, alpha_commanded_deg, alpha_measured_deg: f32::NAN, image: None };
                 writer.frame(&row).unwrap();
             }
             let path = writer.path().to_path_buf();
@@ -462,11 +435,11 @@ mod tests {
             history.refresh(&name_of(&path));
         }
         let names = |last| history.weighed(last).iter().map(|path| name_of(path)).collect::<Vec<_>>();
-        assert_eq!(names(None), ["episode-0001.mcap", "episode-0002.mcap"]);
-        assert_eq!(names(Some(1)), ["episode-0002.mcap"]);
+        assert_eq!(names(None), ["episode-0001.mcap", "episode-0002.mcap", "episode-0004.mcap"]);
+        assert_eq!(names(Some(2)), ["episode-0002.mcap", "episode-0004.mcap"]);
         let table = history.table(&Ends::default());
         let wrong: Vec<&Value> = table["episodes"].as_array().unwrap().iter().map(|e| &e["wrong"]).collect();
-        assert_eq!(wrong, [&json!([]), &json!([]), &json!([PART_UNSEEN])]);
+        assert_eq!(wrong, [&json!([]), &json!([]), &json!([PART_UNSEEN]), &json!([])]);
     }
 
     /// Protects who looks back from another moment's picture: each picture says of which frame it is.

@@ -62,9 +62,9 @@ pub fn foresee(site: &Site, goal_ml: f32, fill_ml: Option<f64>) -> Foreseen {
     if fill_ml.is_some_and(|ml| !ml.is_finite() || ml < f64::from(goal_ml)) {
         return cannot("There is less in the vessel than is to be poured: fill it, or give a smaller goal.".into());
     }
-    let (phase, status, ends) = {
+    let (phase, status) = {
         let live = site.cell.live();
-        (live.phase(), live.status.clone(), live.ends.clone())
+        (live.phase(), live.status.clone())
     };
     let Some(status) = status.filter(|_| phase.is_some()) else { return cannot("The controller does not answer.".into()) };
     if moves(phase) {
@@ -103,8 +103,7 @@ pub fn foresee(site: &Site, goal_ml: f32, fill_ml: Option<f64>) -> Foreseen {
         ));
     }
     lines.extend(few(&weights));
-    let errors_ml = site.history.errors_ml(&status.weights, &ends);
-    lines.extend(sd_ml.and_then(|sd| worse_than_expected(&errors_ml, sd)));
+    lines.extend(sd_ml.and_then(|sd| worse_than_expected(&site.history.errors_ml(&status.weights), sd)));
     match sd_ml {
         Some(sd) if sd > WARNED_SD_ML => {
             lines.push(format!("This is far off: weigh what is proposed under Learn first. Expected deviation {sd:.1} ml."));

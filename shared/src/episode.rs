@@ -30,10 +30,14 @@ use std::collections::btree_map::Entry;
 
 use sha2::{Digest, Sha256};
 
+use crate::control::is_short;
 use crate::gaussian_curve::Curve;
 
 /// The longest time that a stream may flow unmeasured, s: the shipped configurations end a pour after it (`controller.stale_feature_ms`).
 const UNMEASURED_MAX_S: f64 = 0.2;
+/// Up to this commanded tilt the container is to be upright, degrees. Chosen by hand: no vessel pours there, and a controller's way back may leave some
+/// tenths.
+const UPRIGHT_DEG: f32 = 1.0;
 /// What is wrong with an episode of which the camera missed a part, see [`Episode::part_unseen`].
 pub const PART_UNSEEN: &str = "the camera did not see part of this pour; its areas do not add up to its weight";
 
@@ -102,6 +106,8 @@ pub struct EpisodeInfo {
     pub started_at_utc: String,
     /// First tick of the episode, CLOCK_MONOTONIC ns.
     pub started_at_ns: u64,
+    /// The number that the controller gave it. A file that was copied may have another one in its name.
+    pub number: Option<u64>,
     /// The cell's name.
     pub cell: String,
     /// SHA-256 of the configuration, hexadecimal.
@@ -154,6 +160,21 @@ impl Episode {
         pairs
     }
 
+    /// What a pour that ended before its goal had poured by the controller's own estimate, ml, whatever ended it: a stop, or a stream that was lost.
+    /// `None` of one that came to its goal, and where there is no estimate.
+    pub fn ended_early_ml(&self) -> Option<f32> {
+        let EpisodeKind::Pour { goal_ml } = self.kind else { return None };
+        self.info.poured_ml.filter(|poured_ml| is_short(goal_ml - poured_ml, goal_ml))
+    }
+
+    /// By how much a weighed pour missed its goal, ml: what the scale shows less the goal. `None` of one that ended early and gave less than its goal,
+    /// because it tells nothing of how well a goal is met.
+    pub fn error_ml(&self) -> Option<f64> {
+        let EpisodeKind::Pour { goal_ml } = self.kind else { return None };
+        let error_ml = self.weight_g? - f64::from(goal_ml);
+        (error_ml > 0.0 || self.ended_early_ml().is_none()).then_some(error_ml)
+    }
+
     /// Frames a second, from the median interval; 30 for an episode that has none.
     pub fn frame_rate_hz(&self) -> f64 {
         let mut steps: Vec<f64> = self.rows.windows(2).map(|w| w[1].t_s - w[0].t_s).filter(|s| *s > 0.0).collect();
@@ -163,7 +184,7 @@ impl Episode {
     }
 
     /// Whether the camera missed a part of the stream: more than 0.2 s of frames in a row were not measured, right after or right before one that shows
-    /// flow. A shorter gap is bridged by the area before it.
+    /// flow, and not all of them while the container was to be upright, where only drops fall. A shorter gap is bridged by the area before it.
     pub fn part_unseen(&self) -> bool {
         let most = (UNMEASURED_MAX_S * self.frame_rate_hz()).round() as usize;
         let flows = |k: usize| self.rows.get(k).is_some_and(|row| row.area_px2 > 0.0);
@@ -171,7 +192,8 @@ impl Episode {
         self.rows.chunk_by(|a, b| a.area_px2.is_nan() == b.area_px2.is_nan()).any(|run| {
             let first = end;
             end += run.len();
-            run.len() > most && run[0].area_px2.is_nan() && (first > 0 && flows(first - 1) || flows(end))
+            let beside_flow = first > 0 && flows(first - 1) || flows(end);
+            run.len() > most && run[0].area_px2.is_nan() && beside_flow && run.iter().any(|row| row.alpha_commanded_deg > UPRIGHT_DEG)
         })
     }
 

@@ -137,8 +137,8 @@ fn weighed(page: &mut Page, pours: &[Pour]) -> std::fmt::Result {
     // Old episodes leave the newest ones, so these fall too, which a histogram must not.
     page.gauges(
         "decant_weighed_pours",
-        "Weighed pours of the newest episodes that were at most le ml off their goals. Those that were cut short are left out, but for what ended \
-         while this program or the controller did not run",
+        "Weighed pours of the newest episodes that were at most le ml off their goals. Those that ended early are left \
+         out",
         None,
         "le",
         &edges,

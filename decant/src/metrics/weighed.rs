@@ -3,13 +3,13 @@
 //! A thread of its own reads each episode once, and again when its file has changed; it allocates and waits for the disk. A file that cannot be
 //! read is left out.
 
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, Ordering::Relaxed};
 use std::sync::{Mutex, PoisonError};
 use std::time::{Duration, SystemTime};
 
-use shared::episode::{Episode, EpisodeKind, by_number, find_episodes, number_of};
+use shared::episode::{Episode, EpisodeKind, by_number, find_episodes};
 
 /// Pause between two looks at the episodes. Chosen by hand: weighing takes a person longer.
 const LOOK: Duration = Duration::from_secs(10);
@@ -42,11 +42,10 @@ type Stamp = (Option<SystemTime>, u64);
 pub struct Weighed(Mutex<BTreeMap<PathBuf, (Stamp, Option<Pour>)>>);
 
 impl Weighed {
-    /// The weighed pours but for those whose numbers are in `cut_short`, the oldest first.
-    pub fn pours(&self, cut_short: &BTreeSet<u64>) -> Vec<Pour> {
+    /// The weighed pours but for those that ended early, the oldest first.
+    pub fn pours(&self) -> Vec<Pour> {
         let known = self.0.lock().unwrap_or_else(PoisonError::into_inner);
-        let full = known.iter().filter(|(path, _)| !number_of(path).is_some_and(|number| cut_short.contains(&number)));
-        let mut pours: Vec<(&PathBuf, Pour)> = full.filter_map(|(path, (_, pour))| Some((path, (*pour)?))).collect();
+        let mut pours: Vec<(&PathBuf, Pour)> = known.iter().filter_map(|(path, (_, pour))| Some((path, (*pour)?))).collect();
         pours.sort_by(|(a, _), (b, _)| by_number(a, b));
         pours.into_iter().map(|(_, pour)| pour).collect()
     }
@@ -77,7 +76,7 @@ impl Weighed {
             if stop.load(Relaxed) || locked().get(&path).is_some_and(|(seen, _)| *seen == stamp) {
                 continue;
             }
-            let pour = Episode::read(&path).ok().filter(|e| e.complete).and_then(|e| match e.kind {
+            let pour = Episode::read(&path).ok().filter(|e| e.complete && e.error_ml().is_some()).and_then(|e| match e.kind {
                 EpisodeKind::Pour { goal_ml } => Some(Pour { goal_ml: f64::from(goal_ml), weight_g: e.weight_g? }),
                 _ => None,
             });
@@ -117,9 +116,6 @@ mod tests {
         }
         let weighed = Weighed::default();
         weighed.look(dir.path(), &AtomicBool::new(false));
-        let errors_ml =
-            |cut_short: &[u64]| weighed.pours(&cut_short.iter().copied().collect()).into_iter().map(Pour::error_ml).collect::<Vec<_>>();
-        assert_eq!(errors_ml(&[]), [1.0, 2.0]);
-        assert_eq!(errors_ml(&[10_000, 7]), [1.0], "one that was stopped is no error");
+        assert_eq!(weighed.pours().into_iter().map(Pour::error_ml).collect::<Vec<_>>(), [1.0, 2.0]);
     }
 }

@@ -82,7 +82,7 @@ fn about_weight(episode: &Episode) -> Option<Remark> {
         Some(w) if w < NOTHING_POURED_G && flow > CHANCE_FLOW_FRAMES => {
             Some(Remark::wrong(format!("flow in {}, but the scale says {w} g: check weight and [image]", counted(flow, "frame"))))
         }
-        Some(w) if w < NOTHING_POURED_G => Some(Remark::wrong("nothing was poured: there is nothing to learn from it")),
+        Some(w) if w <= 0.0 => Some(Remark::wrong("nothing was poured: there is nothing to learn from it")),
         Some(_) => None,
     }
 }

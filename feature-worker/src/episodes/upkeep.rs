@@ -58,11 +58,13 @@ pub fn delete(found: &Found) -> Result<(), ExportError> {
     fs::remove_file(&found.path).map_err(|e| fail(&e))
 }
 
-/// Places in `found`, the oldest first. Within one directory the numbers say which is older: they only grow, and a wall clock may go back. So an
-/// episode counts as begun no sooner than those of its directory with a smaller number. Where there is no number, the time alone counts.
+/// Places in `found`, the oldest first. Within one directory the recorder's numbers say which is older: they only grow, and a wall clock may go back. So an
+/// episode counts as begun no sooner than those of its directory with a smaller number. Of a copy, whose name has another number than the recorder gave,
+/// and where there is no number, the time alone counts.
 fn by_age(found: &[Found]) -> Vec<usize> {
     let directory = |f: &Found| f.path.parent().map(|d| d.canonicalize().unwrap_or(d.to_path_buf()));
-    let mut order: Vec<_> = (0..found.len()).map(|i| (directory(&found[i]), number_of(&found[i].path), i)).collect();
+    let own_number = |f: &Found| number_of(&f.path).filter(|number| f.episode.info.number == Some(*number));
+    let mut order: Vec<_> = (0..found.len()).map(|i| (directory(&found[i]), own_number(&found[i]), i)).collect();
     order.sort_by(|a, b| (&a.0, a.1).cmp(&(&b.0, b.1)));
     let mut began = vec![""; found.len()];
     let mut before: Option<(&Option<PathBuf>, &str)> = None;

@@ -11,7 +11,7 @@ use crate::journal::{self, Replay};
 /// Command-line arguments.
 #[derive(Debug, clap::Args)]
 #[command(after_help = "Examples:\n  rt-controller replay out/journal.bin\n  rt-controller replay out/journal.bin --table > ticks.csv\n\n\
-Exit codes: 0 every answer that could be compared is the same to the bit, 1 some differ or none could be compared, 2 the file cannot be read.")]
+Exit codes: 0 every answer that could be compared is the same to the bit, 1 some differ, a tick came at another time, or none could be compared, 2 the file cannot be read.")]
 pub struct Args {
     /// The journal (controller.journal of the configuration).
     file: PathBuf,

@@ -50,7 +50,7 @@ pub struct Args {
     /// The cell's configuration.
     #[arg(long, env = shared::config::VARIABLE, default_value = shared::config::DEFAULT_FILE)]
     config: PathBuf,
-    /// Print only what keeps the controller from working.
+    /// Print only warnings and errors.
     #[arg(long, short)]
     quiet: bool,
 }

@@ -24,7 +24,7 @@
 //! | the same: a stream without a pause goes on although the joint has long been upright | `ImpossibleFlow` |
 
 use shared::agent::Decision;
-use shared::control::EndReason;
+use shared::control::{EndReason, OFF_ML, is_short};
 use shared::estimator::verdict::Impossible;
 use shared::messages::Feature;
 
@@ -39,9 +39,6 @@ const STALLED_S: f64 = 3.0;
 const PROGRESS_DEG: f32 = 1.0;
 /// Poured volume that counts as progress, ml. Chosen by hand; no measurement is recorded.
 const PROGRESS_ML: f32 = 0.5;
-/// A pour that ends short of its goal by more than so many ml and this share of it, or of a small goal by half, has lost its stream. One that ends
-/// beyond it by their sum and two of its deviations was not foreseen. Among the fixed seeds of docs/SWARM.md one that was done was shorter.
-const OFF: (f32, f32) = (8.0, 0.08);
 /// If less than this is still to come over the lip, ml, it counts as nothing: this is about one drop of water.
 const NOTHING_ML: f64 = 0.05;
 /// After this many frames in a row with a stream, the tilt of the stream is remembered. None of 10,800 simulated pours ended by mistake
@@ -356,9 +353,8 @@ fn goal_is_reached(decision: &Decision) -> bool {
 /// The reason instead of done, if the goal is missed by so much. An estimate without a deviation foresees nothing that could surprise it.
 fn not_done(decision: &Decision) -> Option<EndReason> {
     let (d_ml, goal_ml) = (decision.d_ml, decision.d_ml + decision.poured_ml);
-    let is_short = d_ml > OFF.0.max(OFF.1 * goal_ml).min(goal_ml / 2.0);
-    let is_beyond = decision.poured_sd_ml > 0.0 && -d_ml > OFF.0 + OFF.1 * decision.poured_ml + 2.0 * decision.poured_sd_ml;
-    is_short.then_some(EndReason::StreamLost).or(is_beyond.then_some(EndReason::GoalExceeded))
+    let is_beyond = decision.poured_sd_ml > 0.0 && -d_ml > OFF_ML.0 + OFF_ML.1 * decision.poured_ml + 2.0 * decision.poured_sd_ml;
+    is_short(d_ml, goal_ml).then_some(EndReason::StreamLost).or(is_beyond.then_some(EndReason::GoalExceeded))
 }
 
 /// The reason for what cannot be.

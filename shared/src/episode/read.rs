@@ -179,6 +179,7 @@ impl Contents {
             info: EpisodeInfo {
                 started_at_utc: text("started_at_utc"),
                 started_at_ns,
+                number: text("episode").parse().ok(),
                 cell: text("cell"),
                 config_sha256: text("config_sha256"),
                 weights: text("weights"),

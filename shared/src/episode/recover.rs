@@ -4,12 +4,13 @@
 //! What stands before the cut in whole chunks, with their checksums, is copied; the rest is left out, because nothing says whether it is right.
 //! The old file stays as it is. A file that is damaged in another way is refused, as everywhere.
 
+use std::fs::File;
 use std::path::Path;
 
 use mcap::records::Metadata;
 
 use super::records::NextRecord;
-use super::rewrite::{ChangeError, copy, read_at_rest};
+use super::rewrite::{ChangeError, at_rest, copy};
 use super::write::mcap_words;
 use super::{Episode, EpisodeInfo, format};
 use crate::disk_space::error_words;
@@ -21,7 +22,8 @@ const REASON: &str = "its end is missing: it was recovered from a file that was 
 /// Writes what is whole in `old` to the new file `new`, and returns it. The episode is complete only if nothing but the file's index was
 /// cut off.
 pub fn recover(old: &Path, new: &Path) -> Result<Episode, ChangeError> {
-    let (original, _) = read_at_rest(old)?;
+    // The old file stays, so one whose recorder was killed just now can be recovered at once.
+    let (original, ..) = at_rest(old, File::try_lock_shared)?;
     let fail = |what: String| ChangeError::Write { file: new.display().to_string(), what };
     let (file, temporary) = whole_file::new_beside(new).map_err(|e| fail(error_words(&e)))?;
     let result = copy(old, (file, &temporary), None, |writer, end| {

@@ -23,8 +23,8 @@ use crate::{regular_file, whole_file};
 /// Number of bytes that are written at a time. Chosen by hand; no measurement is recorded.
 const WRITE_BYTES: usize = 1 << 20;
 
-/// Where the file system has no locks, a file without its end that changed more recently than this counts as under way. Chosen by hand: the recorder
-/// writes twice a second.
+/// A file without its end that changed more recently than this counts as under way where the file system has no locks, or where it is to be deleted or
+/// copied. Chosen by hand: the recorder writes twice a second.
 const UNDER_WAY: Duration = Duration::from_secs(60);
 /// How often a file's lock is tried. Chosen by hand: a program that the recorder's process starts holds all its locks for a moment, until it runs.
 const LOCK_TRIES: u32 = 20;
@@ -61,7 +61,7 @@ pub enum ChangeError {
         /// The file.
         file: String,
     },
-    /// The recorder may still write the file, on a file system without locks.
+    /// Somebody may still write the file, without a lock.
     #[error("{file}: its end is missing and it changed within the last minute: it may be under way")]
     MayBeUnderWay {
         /// The file.
@@ -83,16 +83,25 @@ pub enum ChangeError {
     },
 }
 
-/// Reads the episode `path`, which nobody writes any more: the recorder holds its file's lock, and a file system without locks has the time of the
-/// last change. Gives it with what the file system says of the file.
+/// Reads the episode `path`, which nobody writes any more: the recorder holds its file's lock, and whoever copies one here without a lock changes
+/// its time. Gives it with what the file system says of the file.
 pub fn read_at_rest(path: &Path) -> Result<(Episode, FileMetadata), ChangeError> {
     // Shared, so that two who look do not take each other for the recorder.
     let (episode, meta, _) = at_rest(path, File::try_lock_shared)?;
+    if may_be_under_way(&episode, &meta) {
+        return Err(ChangeError::MayBeUnderWay { file: path.display().to_string() });
+    }
     Ok((episode, meta))
 }
 
-/// The same with the file, which is held by `lock` as long as it is open.
-fn at_rest(path: &Path, lock: impl Fn(&File) -> Result<(), TryLockError>) -> Result<(Episode, FileMetadata, File), ChangeError> {
+/// Whether an episode lacks its end, and has just been changed. A time in the future tells of a clock that went wrong, and not of somebody at work.
+fn may_be_under_way(episode: &Episode, meta: &FileMetadata) -> bool {
+    let is_recent = || meta.modified().is_ok_and(|at| SystemTime::now().duration_since(at).is_ok_and(|age| age < UNDER_WAY));
+    episode.info.ended.is_empty() && is_recent()
+}
+
+/// Reads an episode on which the recorder holds no lock. Gives it with the file, which is held by `lock` as long as it is open.
+pub(super) fn at_rest(path: &Path, lock: impl Fn(&File) -> Result<(), TryLockError>) -> Result<(Episode, FileMetadata, File), ChangeError> {
     let file = || path.display().to_string();
     let unread = |e: std::io::Error| EpisodeError::Read { file: file(), what: e.to_string() };
     let mut tries = LOCK_TRIES;
@@ -114,9 +123,7 @@ fn at_rest(path: &Path, lock: impl Fn(&File) -> Result<(), TryLockError>) -> Res
         Err(TryLockError::Error(e)) => return Err(unread(e).into()),
     };
     let episode = Episode::read(path)?;
-    // A time in the future tells of a clock that went wrong, and not of a recorder at work.
-    let is_recent = || meta.modified().is_ok_and(|at| SystemTime::now().duration_since(at).is_ok_and(|age| age < UNDER_WAY));
-    if !has_locks && episode.info.ended.is_empty() && is_recent() {
+    if !has_locks && may_be_under_way(&episode, &meta) {
         return Err(ChangeError::MayBeUnderWay { file: file() });
     }
     Ok((episode, meta, opened))

@@ -16,12 +16,6 @@ use crate::consistency;
 use crate::data::{self, EpisodeSource, TrainingEpisode};
 use crate::training::Options;
 
-/// A pour that is done has poured its goal by the controller's own estimate, less this share and [`SHORT_ML`] at most. Chosen by hand: the deviation of
-/// a doubtful estimate is not in it.
-const SHORT_SHARE: f64 = 0.1;
-/// See [`SHORT_SHARE`], ml. Chosen by hand: some frames' flow, for goals that are small.
-const SHORT_ML: f64 = 3.0;
-
 /// Command-line arguments of `trainer refine`.
 #[derive(Debug, clap::Args)]
 #[command(after_help = "Examples:
@@ -53,24 +47,17 @@ struct WeighedPour {
     mae_so_far_ml: f64,
 }
 
-/// What the controller held for poured when a pour of `goal_ml` ended before its goal, whatever ended it, ml; `None` of a pour that was done.
-fn ended_early_ml(episode: &Episode, goal_ml: f64) -> Option<f64> {
-    episode.info.poured_ml.map(f64::from).filter(|poured_ml| *poured_ml < (1.0 - SHORT_SHARE) * goal_ml - SHORT_ML)
-}
-
 /// The weighed pours among the episodes that were read, in the order in which they were poured: those that are trained on and came to their goal, each
 /// once. One that ended early tells nothing of how well a goal is met, and is named.
 fn weighed_pours(read: &[Episode], trained_on: &[TrainingEpisode]) -> Vec<WeighedPour> {
     let counts = |e: &&Episode| trained_on.iter().any(|own| own.name == e.name);
     let weighed = read.iter().filter(counts).filter_map(|e| match (e.kind, e.weight_g) {
-        (EpisodeKind::Pour { goal_ml }, Some(weight_g)) => match ended_early_ml(e, goal_ml.into()) {
-            Some(poured_ml) => {
-                let name = &e.name;
-                eprintln!("{}", plain(&format!("{name}: ended early, at {poured_ml:.0} of {goal_ml:.0} ml, so its error does not count")));
-                None
-            }
-            None => Some((f64::from(goal_ml), weight_g)),
-        },
+        (EpisodeKind::Pour { goal_ml }, Some(weight_g)) if e.error_ml().is_some() => Some((f64::from(goal_ml), weight_g)),
+        (EpisodeKind::Pour { goal_ml }, Some(_)) => {
+            let (name, poured_ml) = (&e.name, e.ended_early_ml().unwrap_or_default());
+            eprintln!("{}", plain(&format!("{name}: ended early, at {poured_ml:.0} of {goal_ml:.0} ml, so its error does not count")));
+            None
+        }
         _ => None,
     });
     let mut sum_ml = 0.0;
