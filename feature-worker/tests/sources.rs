@@ -57,7 +57,7 @@ fn videos_whole_truncated_and_wrong() -> Outcome {
     assert!(areas[10] > 0.0 && areas[10] < areas[14] && areas[14] < areas[18], "{areas:?}");
     let picture = imgcodecs::imread(out.join("frame_000013.png"), imgcodecs::IMREAD_COLOR)?;
     assert_eq!((picture.cols(), picture.rows()), (WIDTH, HEIGHT));
-    assert_eq!(std::fs::read_dir(&out)?.count(), 4, "three pictures and the table");
+    assert_eq!(std::fs::read_dir(&out)?.count(), 5, "three pictures, their list and the table");
 
     let (bytes, png) = (std::fs::read(&path)?, std::fs::read(out.join("frame_000013.png"))?);
     for share in [2, 3, 50] {
@@ -82,7 +82,7 @@ fn videos_whole_truncated_and_wrong() -> Outcome {
 }
 
 /// Protects from results of two recordings side by side: a second run leaves none of the first one's pictures and no table of another, also when it
-/// fails on the way; files of somebody else stay. An input that cannot be opened costs nothing, nor does one that has the results' own names.
+/// fails on the way or was killed; files of somebody else stay, and are not written over. An input that cannot be opened costs nothing, nor does one that has the results' own names.
 #[test]
 fn a_directory_holds_one_run() -> Outcome {
     let dir = tempfile::tempdir()?;
@@ -100,21 +100,34 @@ fn a_directory_holds_one_run() -> Outcome {
     };
     let first = inspect(&config, &input, &out, "2")?;
     assert!(first.status.success(), "{}", text(&first));
-    let whole = ["features.csv", "frame_000001.png", "frame_000003.png", "frame_000005.png"];
+    let whole = ["features.csv", "frame_000001.png", "frame_000003.png", "frame_000005.png", "pictures.txt"];
     assert_eq!(names()?, whole);
     refused(&inspect(&config, &dir.path().join("none.mp4"), &out, "1")?, &["none.mp4"]);
     assert_eq!(names()?, whole);
-    refused(&inspect(&config, &out.join("frame_%06d.png"), &out, "1")?, &["frame_%06d.png", "another --out"]);
+    for every in ["1", "0"] {
+        refused(&inspect(&config, &out.join("frame_%06d.png"), &out, every)?, &["frame_%06d.png", "another --out"]);
+    }
     assert_eq!(names()?, whole);
-    std::fs::copy(out.join("frame_000003.png"), out.join("frame_000099.png"))?;
+    // Somebody's own, whose frame is in the table.
+    std::fs::copy(out.join("frame_000003.png"), out.join("frame_000002.png"))?;
+    // A run that is killed has no table.
+    std::fs::remove_file(out.join("features.csv"))?;
     let second = inspect(&config, &dir.path().join("f_001.png"), &out, "1")?;
     assert!(second.status.success(), "{}", text(&second));
-    assert_eq!(names()?, ["features.csv", "frame_000001.png", "frame_000099.png"]);
+    assert_eq!(names()?, ["features.csv", "frame_000001.png", "frame_000002.png", "pictures.txt"]);
+    let over = inspect(&config, &input, &out, "1")?;
+    assert!(over.status.code() == Some(1) && text(&over).contains("frame_000002.png: is there already"), "{}", text(&over));
+    assert_eq!(names()?, ["frame_000002.png"]);
+    assert!(inspect(&config, &out.join("frame_000002.png"), &out, "0")?.status.success(), "pictures that no run writes are an input");
+    assert_eq!(names()?, ["features.csv", "frame_000002.png"]);
     let mut small = Mat::default();
     imgproc::resize(&pour(3)?, &mut small, Size::new(320, 240), 0.0, 0.0, imgproc::INTER_AREA)?;
     save(3, &small)?;
-    refused(&inspect(&config, &input, &out, "1")?, &["frame 4", "320 x 240"]);
-    assert_eq!(names()?, ["frame_000099.png"]);
+    refused(&inspect(&config, &input, &out, "2")?, &["frame 4", "320 x 240"]);
+    assert_eq!(names()?, ["frame_000002.png"]);
+    std::fs::write(out.join("pictures.txt"), "frame_000002.png\n")?;
+    refused(&inspect(&config, &dir.path().join("f_001.png"), &out, "0")?, &["pictures.txt", "another kind"]);
+    assert_eq!(names()?, ["frame_000002.png", "pictures.txt"], "a list of somebody else is none");
     Ok(())
 }
 

@@ -129,7 +129,7 @@ pub struct Costs {
     open: Vec<OpenFault>,
     /// How the newest run ended, if it has.
     end: Option<End>,
-    /// Until when a fault from before a run may hold the arm or slow it, s.
+    /// Until when a fault from before a run may hold the arm or slow it, s: one that began where nothing was open, or in an earlier run.
     held_until_s: f64,
     /// What is known.
     pub known: Vec<Cost>,
@@ -143,7 +143,8 @@ impl Costs {
         if is_active || is_returning {
             // How an earlier run ended says nothing about this one.
             self.end = None;
-        } else if on_way(what) == OnWay::Holds {
+        } else if self.open.is_empty() && on_way(what) == OnWay::Holds {
+            // With a container that is not upright yet it is one of that run, and excuses only what leaves from now on.
             self.held_until_s = self.held_until_s.max(until_s);
         }
         // A robot that is lost is still on its way, as long as the container has not come upright after a fault.
@@ -183,6 +184,9 @@ impl Costs {
         }
         let (open, end) = (std::mem::take(&mut self.open), self.end.take());
         let wrong = self.beyond(&open, end, poured_ml);
+        // After the check: for the next run what still holds the arm stood before it.
+        let holds = open.iter().filter(|fault| fault.on_way == OnWay::Holds).map(|fault| fault.until_s);
+        self.held_until_s = holds.fold(self.held_until_s, f64::max);
         if end.is_some_and(|end| is_ordinary(end.reason) || end.stood_before) {
             return wrong;
         }
@@ -228,14 +232,26 @@ mod tests {
     /// A pour in which faults begin at their times, s, and last for so long; it goes on until `ends_s`, goes upright from there with 60
     /// degrees/s, and stands in `holds`, s. Gives what is wrong.
     fn wrong(faults: &[(f64, &str, What, f64)], ends_s: f64, reason: EndReason, holds: (f64, f64)) -> Option<String> {
+        wrong_in(&mut Costs::default(), Phase::Returning, faults, ends_s, reason, holds)
+    }
+
+    /// The same with what is known of earlier pours, and with the phase in which the container goes upright.
+    fn wrong_in(
+        costs: &mut Costs,
+        upright: Phase,
+        faults: &[(f64, &str, What, f64)],
+        ends_s: f64,
+        reason: EndReason,
+        holds: (f64, f64),
+    ) -> Option<String> {
         let mut container = Container::new(Shape::Cylinder { radius_mm: 38.0, height_mm: 115.0 }, 20.0, 1.0, 300.0);
-        let (mut costs, mut alpha_deg) = (Costs::default(), container.spill_angle_deg());
+        let mut alpha_deg = container.spill_angle_deg();
         for k in 0..3000 {
             let at_s = f64::from(k) * STEP_S;
             let phase = if at_s < ends_s {
                 Phase::Pouring
             } else if alpha_deg > 0.0 {
-                Phase::Returning
+                upright
             } else {
                 Phase::Idle
             };
@@ -288,9 +304,22 @@ mod tests {
         assert_eq!(wrong(&held, 1.1, EndReason::SafetyStop, (1.16, 5.0)), None);
         let late = on_way(2.0, "safeguard-stop", Fault::SafeguardOpen);
         assert!(wrong(&late, 1.96, EndReason::SafetyStop, (2.0, 5.0)).is_some());
+        let lost = on_way(4.0, "safeguard-stop", Fault::SafeguardOpen);
+        let lost = wrong_in(&mut Costs::default(), Phase::NoRobot, &lost, 3.96, EndReason::RobotLost, (4.0, 7.0));
+        assert!(lost.is_some_and(|wrong| wrong.contains("link-cut")), "what left while the robot was lost is not excused");
         let stalled = on_way(1.16, "stall", Fault::Stall(0.2));
         assert_eq!(wrong(&stalled, 1.1, EndReason::RobotLost, (1.16, 1.4)), None);
         assert!(wrong(&stalled, 1.1, EndReason::RobotLost, (1.16, 4.0)).is_some(), "a stall does not hold the arm for 3 s");
+    }
+
+    /// Protects the next pour from what began in the one before: who stands in the robot's way still excuses there.
+    #[test]
+    fn what_holds_the_arm_excuses_in_the_next_pour_too() {
+        let stop = (0.2, "safeguard-stop", What::Robot(Fault::SafeguardOpen), 60.0);
+        let mut costs = Costs::default();
+        assert!(wrong_in(&mut costs, Phase::Returning, &[cut(1.0)], 2.0, EndReason::RobotLost, NEVER).is_some(), "nothing held before");
+        wrong_in(&mut costs, Phase::Returning, &[stop], 0.3, EndReason::SafetyStop, NEVER);
+        assert_eq!(wrong_in(&mut costs, Phase::Returning, &[cut(1.0)], 2.0, EndReason::RobotLost, NEVER), None);
     }
 
     /// Protects from held faults that need not end a pour: one explains an end only if it can be its reason, and a goal that is reached needs none.

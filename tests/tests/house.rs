@@ -60,6 +60,11 @@ const OPENED_OTHERWISE: &[(&str, &str, &str)] = &[
     ("shared/src/os.rs", "OpenOptions::new()", "in /dev"),
     ("shared/src/regular_file.rs", "OpenOptions::new()", "the one way to read"),
     ("shared/src/shared_memory.rs", "OpenOptions::new()", "in the runtime directory, which nobody else may enter"),
+    (
+        "feature-worker/src/commands/inspect.rs",
+        "File::options()",
+        "the list that `create` has made, which grows by a name before each picture",
+    ),
     ("trainer/src/report/json_out.rs", "File::options()", "an empty file of the name, after `check`"),
     ("feature-worker/src/commands/bench/python.rs", "directory.join(", "in a directory that is new"),
 ];

@@ -2,8 +2,11 @@
 //!
 //! An ordinary command-line program that allocates. An input that cannot be read, or has another size than configured, ends it with one
 //! line that says what to do. Table and pictures in a directory are always of one run: those of an earlier one go with the first frame, and
-//! an error takes the pictures that were written before it.
+//! an error takes the pictures that were written before it. A list beside the pictures names them, each before it is written, so that those of a
+//! run that was killed go as well. No picture is deleted or written over that the list does not name.
 
+use std::fs::File;
+use std::io::{ErrorKind, Write as _};
 use std::path::{Path, PathBuf};
 
 use indicatif::ProgressBar;
@@ -19,13 +22,18 @@ use crate::vision::{Extractor, Image, Measurement, PictureTime};
 
 /// How its table begins: only one that begins so is replaced.
 const TABLE_BEGINS: &[u8] = b"frame,";
+/// How the list of its pictures begins: only one that begins so is read and replaced.
+const LIST_BEGINS: &[u8] = b"Pictures that inspect wrote and deletes at its next run:\n";
+/// Most bytes of such a list: 17 each for ten million pictures, which is days of video.
+const LIST_BYTES_MAX: u64 = 170_000_000;
 
 /// Command-line arguments.
 #[derive(Debug, clap::Args)]
 #[command(
     after_help = "Examples:\n  feature-worker inspect pour.mp4 --config config/cell.toml --out out/inspect\n  feature-worker inspect a.png b.png \
 --json\n  feature-worker inspect 'frames/frame_%04d.png' --every 10\n\nWrites features.csv (frame, t_s, area_px2, confidence, doubt, triangle; times \
-are the file's own, and pictures without times are camera.fps apart) and a picture of every N-th frame with region, axes, outline, edge points, line and triangle drawn on it."
+are the file's own, and pictures without times are camera.fps apart) and a picture of every N-th frame with region, axes, outline, edge points, line and triangle drawn on it. pictures.txt names these \
+pictures: the next run deletes them, and no others."
 )]
 pub struct Args {
     /// Images, videos, file name patterns of image sequences, or episodes (.mcap).
@@ -85,32 +93,65 @@ fn picture_of(out: &Path, number: u64) -> PathBuf {
     out.join(format!("frame_{number:06}.png"))
 }
 
-/// Removes table and pictures of an earlier run from `out`. Its pictures are those of the frames in its table; all others are somebody else's.
-fn remove_earlier(out: &Path) -> std::io::Result<()> {
-    let table = out.join("features.csv");
-    let file = match regular_file::open(&table) {
-        Ok((file, _)) => file,
-        Err(e) if e.kind() == std::io::ErrorKind::NotFound => return Ok(()),
-        Err(e) => return Err(e),
-    };
-    for row in csv::Reader::from_reader(file).records().map_while(Result::ok) {
-        let Some(number) = row.get(0).and_then(|number| number.parse().ok()) else { continue };
-        match std::fs::remove_file(picture_of(out, number)) {
-            Err(e) if e.kind() != std::io::ErrorKind::NotFound => return Err(e),
-            _ => {}
-        }
-    }
-    std::fs::remove_file(table)
+/// The list of the pictures in the directory `out`.
+fn list_of(out: &Path) -> PathBuf {
+    out.join("pictures.txt")
 }
 
-/// Whether `input` names pictures that this run may write over in the directory `out`.
-fn is_in_the_way(input: &Path, out: &Path) -> bool {
-    let named = input.file_name().is_some_and(|name| {
-        let name = name.to_string_lossy().to_lowercase();
-        name.starts_with("frame_") && name.ends_with(".png")
-    });
+/// The number of the picture that has this name.
+fn number_of(name: &str) -> Option<u64> {
+    let number = name.strip_prefix("frame_")?.strip_suffix(".png")?.parse().ok()?;
+    (picture_of(Path::new(""), number) == Path::new(name)).then_some(number)
+}
+
+/// Removes table, pictures and list of an earlier run from `out`. Its pictures are those that its list names; all others are somebody else's.
+fn remove_earlier(out: &Path) -> std::io::Result<()> {
+    let gone = |path: &Path| match std::fs::remove_file(path) {
+        Err(e) if e.kind() != ErrorKind::NotFound => Err(e),
+        _ => Ok(()),
+    };
+    let list = list_of(out);
+    let names = match regular_file::read_text(&list, LIST_BYTES_MAX) {
+        Err(e) if e.kind() == ErrorKind::NotFound => String::new(),
+        names => names?,
+    };
+    names.lines().filter_map(number_of).try_for_each(|number| gone(&picture_of(out, number)))?;
+    gone(&out.join("features.csv"))?;
+    gone(&list)
+}
+
+/// The pictures of this run: each is on the list before it is there.
+struct Pictures {
+    out: PathBuf,
+    list: Option<File>,
+}
+
+impl Pictures {
+    /// Names the picture of the frame with this number, and gives its path.
+    fn name(&mut self, number: u64) -> std::io::Result<PathBuf> {
+        let path = picture_of(&self.out, number);
+        if path.symlink_metadata().is_ok() {
+            return Err(std::io::Error::new(ErrorKind::AlreadyExists, "is there already, and is not of an earlier run"));
+        }
+        let list = match &mut self.list {
+            Some(list) => list,
+            none => {
+                whole_file::create(&list_of(&self.out), LIST_BEGINS)?;
+                none.insert(File::options().append(true).open(list_of(&self.out))?)
+            }
+        };
+        writeln!(list, "frame_{number:06}.png")?;
+        Ok(path)
+    }
+}
+
+/// Whether `input` names pictures that a run with a picture of every `every`-th frame may write over in the directory `out`.
+fn is_in_the_way(input: &Path, out: &Path, every: u64) -> bool {
+    let named = input.file_name().and_then(|name| name.to_str()).is_some_and(|name| number_of(&name.replace("%06d", "000001")).is_some());
     let directory = input.parent().filter(|parent| !parent.as_os_str().is_empty()).unwrap_or(Path::new("."));
-    named && directory.canonicalize().ok().is_some_and(|directory| out.canonicalize().ok() == Some(directory))
+    // Without pictures of its own, a run still deletes those on the list.
+    let is_written = every > 0 || list_of(out).exists();
+    is_written && named && directory.canonicalize().ok().is_some_and(|directory| out.canonicalize().ok() == Some(directory))
 }
 
 fn inspect(args: &Args, config: &Config) -> Result<(), Failure> {
@@ -118,19 +159,21 @@ fn inspect(args: &Args, config: &Config) -> Result<(), Failure> {
     let unwritten = |path: &Path, e: &dyn std::fmt::Display| format!("{}: {e}; make room, or give another --out", path.display());
     std::fs::create_dir_all(&args.out).map_err(|e| unwritten(&args.out, &e)).or_exit(exit::FAILED)?;
     let table = args.out.join("features.csv");
-    if let Some(input) = args.input.iter().find(|input| is_in_the_way(input, &args.out)) {
+    if let Some(input) = args.input.iter().find(|input| is_in_the_way(input, &args.out, args.every)) {
         let what =
             format!("{}: its pictures have the names of those that are written into this directory; give another --out", input.display());
         return Err(failure(exit::BAD_INPUT, what));
     }
     // What may not be replaced is known before the work. The table is kept until it is whole: some hundred bytes a frame.
-    whole_file::check(&table, TABLE_BEGINS).map_err(|e| unwritten(&table, &e)).or_exit(exit::BAD_INPUT)?;
+    for (path, begins) in [(&table, TABLE_BEGINS), (&list_of(&args.out), LIST_BEGINS)] {
+        whole_file::check(path, begins).map_err(|e| unwritten(path, &e)).or_exit(exit::BAD_INPUT)?;
+    }
     let mut csv = csv::Writer::from_writer(Vec::new());
     csv.write_record(["frame", "t_s", "area_px2", "confidence", "doubt", "x0", "y0", "x1", "y1", "x2", "y2"]).or_exit(exit::FAILED)?;
     let mut code = exit::BAD_INPUT;
     let bar = ProgressBar::new_spinner().with_message("frames");
     let mut totals = Totals::default();
-    let mut written = Vec::new();
+    let mut pictures = Pictures { out: args.out.clone(), list: None };
     let contents = for_each_frame(&args.input, config.camera.fps, args.partial, |frame| {
         let measured = measure(&mut extractor, &config.camera, &frame)?;
         if totals.frames == 0 {
@@ -144,19 +187,20 @@ fn inspect(args: &Args, config: &Config) -> Result<(), Failure> {
         if args.every > 0 && (frame.header.sequence - 1) % args.every == 0 {
             let mut picture = to_bgr(&frame).map_err(words)?;
             draw(&mut picture, &extractor, &measured).map_err(words)?;
-            let path = picture_of(&args.out, frame.header.sequence);
-            save(&picture, &path).map_err(|e| {
+            let number = frame.header.sequence;
+            let saved = pictures.name(number).map_err(words).and_then(|path| save(&picture, &path));
+            saved.map_err(|e| {
                 code = exit::FAILED;
-                unwritten(&path, &e)
+                unwritten(&picture_of(&args.out, number), &e)
             })?;
-            written.push(path);
         }
         bar.inc(1);
         Ok(())
     });
-    // Nobody needs pictures without their table, and it does no harm if one cannot be removed.
+    let begun = totals.frames > 0;
+    // Nobody needs pictures without their table. It does no harm if one cannot be removed: it stays on the list.
     let undo = |failed: Failure| {
-        written.iter().for_each(|path| drop(std::fs::remove_file(path)));
+        let _ = if begun { remove_earlier(&args.out) } else { Ok(()) };
         failed
     };
     let contents = contents.map_err(|what| undo(failure(code, what)))?;

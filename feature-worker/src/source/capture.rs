@@ -81,24 +81,31 @@ impl Capture {
         Ok((device, capture))
     }
 
+    /// Takes a frame off the camera, which is not looked at.
+    fn grab(capture: &mut VideoCapture, camera: &CameraConfig) -> Result<(), SourceError> {
+        if capture.grab().unwrap_or(false) { Ok(()) } else { Err(SourceError::Lost(camera.path.clone())) }
+    }
+
     /// What the camera's automatics find in the light of now. It is set, with the automatics off. It takes [`SETTLE_MOST`].
     pub fn find(camera: &CameraConfig) -> Result<Found, SourceError> {
         let (mut device, mut capture) = Self::start(camera)?;
-        controls::start_automatics(&mut device);
+        let mains = controls::start_automatics(&mut device, camera);
         let begin = Instant::now();
         while begin.elapsed() < SETTLE_MOST {
-            if !capture.grab().unwrap_or(false) {
-                return Err(SourceError::Lost(camera.path.clone()));
-            }
+            Self::grab(&mut capture, camera)?;
         }
-        Ok(controls::keep_found(&mut device))
+        let mut found = controls::keep_found(&mut device);
+        // Nothing is written of what was configured already, and so only a refusal is told.
+        found.outcome.refused.extend(mains.refused);
+        Ok(found)
     }
 
     /// Opens the device that `[camera]` names.
     pub fn open(camera: &CameraConfig) -> Result<Self, SourceError> {
         // Controls come after the mode: some drivers start anew with it.
         let (mut device, mut capture) = Self::start(camera)?;
-        if !controls::settle(&device, camera, SETTLE_MOST, || capture.grab().unwrap_or(false)) {
+        controls::start_locked(&mut device, camera);
+        if !controls::settle(&device, camera, SETTLE_MOST, || Self::grab(&mut capture, camera))? {
             let line = "camera: its automatics have not come to rest, and what they have now is locked";
             eprintln!("{}", Level::Warning.marked(line));
         }

@@ -21,8 +21,9 @@ const EXPOSURE_MANUAL: i32 = 1;
 const EXPOSURE_AUTOMATIC: [i32; 2] = [3, 0];
 /// The longest that automatics are waited for. Chosen by hand: those of webcams take a second.
 pub const SETTLE_MOST: Duration = Duration::from_secs(2);
-/// Frames between two looks at what the automatics have found. Chosen by hand: an automatic that works moves in a third of a second.
-const LOOK_FRAMES: u32 = 10;
+/// Time between two looks at what the automatics have found, which is at least one frame. Chosen by hand: an automatic that works moves in a
+/// third of a second.
+const LOOK: Duration = Duration::from_millis(333);
 
 /// What a device says of one control.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -213,17 +214,31 @@ pub struct Found {
     pub outcome: Outcome,
 }
 
-/// Waits until the automatics of what `camera` locks have found their values: two looks some frames apart that agree, or at most `most`.
-/// `grab` takes a frame, and says whether one came. `false` if they still move.
-pub fn settle(device: &impl Controls, camera: &CameraConfig, most: Duration, mut grab: impl FnMut() -> bool) -> bool {
-    let locked: Vec<&Key> =
-        settings(camera).filter(|(_, setting)| matches!(setting, Some(Setting::Locked(_)))).map(|(key, _)| key).collect();
+/// The keys that `camera` locks.
+fn locked(camera: &CameraConfig) -> impl Iterator<Item = &'static Key> {
+    settings(camera).filter(|(_, setting)| matches!(setting, Some(Setting::Locked(_)))).map(|(key, _)| key)
+}
+
+/// Waits until the automatics of what `camera` locks have found their values: two looks some time apart that agree, or at most `most`.
+/// `grab` takes a frame, and its error ends the wait. `false` if they still move.
+pub fn settle<E>(
+    device: &impl Controls,
+    camera: &CameraConfig,
+    most: Duration,
+    mut grab: impl FnMut() -> Result<(), E>,
+) -> Result<bool, E> {
+    let locked: Vec<&Key> = locked(camera).collect();
     let begin = Instant::now();
     let mut before: Option<Vec<_>> = None;
     while !locked.is_empty() {
-        for _ in 0..LOOK_FRAMES {
-            if begin.elapsed() >= most || !grab() {
-                return false;
+        let look = Instant::now();
+        loop {
+            if begin.elapsed() >= most {
+                return Ok(false);
+            }
+            grab()?;
+            if look.elapsed() >= LOOK {
+                break;
             }
         }
         let now: Vec<_> = locked.iter().map(|key| device.get(key.id)).collect();
@@ -231,12 +246,23 @@ pub fn settle(device: &impl Controls, camera: &CameraConfig, most: Duration, mut
             break;
         }
     }
-    true
+    Ok(true)
 }
 
-/// Switches all automatics on that the device has.
-pub fn start_automatics(device: &mut impl Controls) {
-    for (id, off, on) in KEYS.iter().filter_map(|key| key.automatic.map(|(id, off)| (id, off, key.on))) {
+/// Sets the mains' frequency, and then switches all automatics on that the device has. The result is of the frequency.
+pub fn start_automatics(device: &mut impl Controls, camera: &CameraConfig) -> Outcome {
+    let mains = apply_mains(device, camera);
+    switch_on(device, KEYS.iter());
+    mains
+}
+
+/// Switches the automatics of what `camera` locks on: whoever locked it before left them off, and then they find nothing.
+pub fn start_locked(device: &mut impl Controls, camera: &CameraConfig) {
+    switch_on(device, locked(camera));
+}
+
+fn switch_on(device: &mut impl Controls, keys: impl Iterator<Item = &'static Key>) {
+    for (id, off, on) in keys.filter_map(|key| key.automatic.map(|(id, off)| (id, off, key.on))) {
         if device.query(id).is_some() && device.get(id) == Ok(off) {
             // One that cannot be switched on leaves the value that is there, which is found as well.
             let _ = on.iter().find(|on| device.set(id, **on).is_ok() && device.get(id) == Ok(**on));
@@ -274,15 +300,25 @@ pub fn apply(device: &mut impl Controls, camera: &CameraConfig) -> Outcome {
             None => alone.push(key.name),
         }
     }
-    match camera.mains_hz {
-        Some(setting) => match set_mains(device, setting) {
-            Ok(said) => outcome.said.push(said),
-            Err(refused) => outcome.refused.push(refused),
-        },
-        None => alone.push("mains_hz"),
+    if camera.mains_hz.is_none() {
+        alone.push("mains_hz");
     }
+    let mains = apply_mains(device, camera);
+    outcome.said.extend(mains.said);
+    outcome.refused.extend(mains.refused);
     if !alone.is_empty() {
         outcome.said.push(format!("{} left alone: the camera may change them during a pour", alone.join(", ")));
+    }
+    outcome
+}
+
+/// Sets the mains' frequency, if `camera` names it, and reads it back. The automatic exposure goes by it.
+fn apply_mains(device: &mut impl Controls, camera: &CameraConfig) -> Outcome {
+    let mut outcome = Outcome::default();
+    match camera.mains_hz.map(|setting| set_mains(device, setting)) {
+        Some(Ok(said)) => outcome.said.push(said),
+        Some(Err(refused)) => outcome.refused.push(refused),
+        None => {}
     }
     outcome
 }
