@@ -329,6 +329,10 @@ fn pictures_are_not_waited_for() -> Outcome {
     let output = command.output().map_err(|e| format!("strace is installed (scripts/install strace): {e}"))?;
     assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
     let waits = std::fs::read_to_string(&log)?.matches("sync(").count();
-    assert_eq!((std::fs::read_dir(&out)?.count(), waits), (21, 2), "20 pictures; the table and its directory are put on the disk");
+    assert_eq!(
+        (std::fs::read_dir(&out)?.count(), waits),
+        (22, 2),
+        "20 pictures and their list; the table and its directory are put on the disk"
+    );
     Ok(())
 }

@@ -63,7 +63,7 @@ const OPENED_OTHERWISE: &[(&str, &str, &str)] = &[
     (
         "feature-worker/src/commands/inspect.rs",
         "File::options()",
-        "the list that `create` has made, which grows by a name before each picture",
+        "the list that `whole_file` has made, which grows by a name before each picture",
     ),
     ("trainer/src/report/json_out.rs", "File::options()", "an empty file of the name, after `check`"),
     ("feature-worker/src/commands/bench/python.rs", "directory.join(", "in a directory that is new"),

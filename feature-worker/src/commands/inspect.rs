@@ -136,7 +136,7 @@ impl Pictures {
         let list = match &mut self.list {
             Some(list) => list,
             none => {
-                whole_file::create(&list_of(&self.out), LIST_BEGINS)?;
+                whole_file::replace_soon(&list_of(&self.out), LIST_BEGINS, LIST_BEGINS)?;
                 none.insert(File::options().append(true).open(list_of(&self.out))?)
             }
         };
