@@ -350,7 +350,6 @@ fn a_merge_keeps_the_weight_and_waits_for_the_end() {
     }
     let held = std::fs::File::open(&first).unwrap();
     held.try_lock().unwrap();
-    // Whoever copies one here holds no lock.
     let bytes = std::fs::read(write(&dir.path().join("cut"), 60.0)).unwrap();
     std::fs::write(recorded.join("episode-0009.mcap"), &bytes[..bytes.len() * 2 / 3]).unwrap();
     let (ended, weights, said) = copied(&["merge"], "later");

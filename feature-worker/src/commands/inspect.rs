@@ -23,7 +23,7 @@ use crate::vision::{Extractor, Image, Measurement, PictureTime};
 /// How its table begins: only one that begins so is replaced.
 const TABLE_BEGINS: &[u8] = b"frame,";
 /// How the list of its pictures begins: only one that begins so is read and replaced.
-const LIST_BEGINS: &[u8] = b"Pictures that inspect wrote and deletes at its next run:\n";
+const LIST_BEGINS: &[u8] = b"inspect: pictures\n";
 /// Most bytes of such a list: 17 each for ten million pictures, which is days of video.
 const LIST_BYTES_MAX: u64 = 170_000_000;
 
