@@ -117,7 +117,7 @@ impl<'a> Cell<'a> {
             cell: self.config.cell.name.clone(),
             status: self.status.clone(),
             ended: self.ended.clone(),
-            weighed: weighed.pours(),
+            errors_ml: weighed.errors_ml(),
             free_bytes: places.filter_map(|(name, path)| Some((name, free_bytes(path)?))).collect(),
         }
     }

@@ -14,8 +14,6 @@ use prometheus_client::registry::{Registry, Unit};
 use shared::control::{Histogram, Status};
 use shared::messages::Phase;
 
-use super::weighed::Pour;
-
 /// The content type. Source: OpenMetrics 1.0, section Protocol Negotiation.
 pub const KIND: &str = "application/openmetrics-text; version=1.0.0; charset=utf-8";
 /// Upper edges of the histograms of times, s. Chosen by hand: three each decade, from below what any machine shows to the longest that a pour bears.
@@ -40,8 +38,8 @@ pub struct Seen {
     pub status: Option<Box<Status>>,
     /// Results since this program started, by reason.
     pub ended: BTreeMap<&'static str, u64>,
-    /// The weighed pours, the oldest first.
-    pub weighed: Vec<Pour>,
+    /// By how much the weighed pours missed their goals, ml, the oldest first.
+    pub errors_ml: Vec<f64>,
     /// Free space, bytes, by what lies there.
     pub free_bytes: Vec<(&'static str, u64)>,
 }
@@ -73,7 +71,7 @@ impl Collector for Seen {
         page.counters("decant_ended", "Pours and recordings that ended since this program started", "reason", &ended)?;
         let free: Vec<(&str, f64)> = self.free_bytes.iter().map(|(name, bytes)| (*name, *bytes as f64)).collect();
         page.gauges("decant_free", "Free space where this lies", Some(Unit::Bytes), "of", &free)?;
-        weighed(&mut page, &self.weighed)
+        weighed(&mut page, &self.errors_ml)
     }
 }
 
@@ -128,11 +126,11 @@ fn times(page: &mut Page, name: &str, help: &str, histogram: &Histogram) -> std:
 }
 
 /// How far the weighed pours were from their goals.
-fn weighed(page: &mut Page, pours: &[Pour]) -> std::fmt::Result {
+fn weighed(page: &mut Page, errors_ml: &[f64]) -> std::fmt::Result {
     // Rounding must not lift a value over the edge that it lies on.
-    let within = |edge_ml: f64| pours.iter().filter(|p| p.error_ml().abs() <= edge_ml * (1.0 + 1e-9)).count() as f64;
+    let within = |edge_ml: f64| errors_ml.iter().filter(|ml| ml.abs() <= edge_ml * (1.0 + 1e-9)).count() as f64;
     let edges = ERRORS_ML.iter().map(|edge_ml| (format!("{edge_ml:?}"), within(*edge_ml)));
-    let edges: Vec<(String, f64)> = edges.chain([("+Inf".into(), pours.len() as f64)]).collect();
+    let edges: Vec<(String, f64)> = edges.chain([("+Inf".into(), errors_ml.len() as f64)]).collect();
     let edges: Vec<(&str, f64)> = edges.iter().map(|(le, n)| (le.as_str(), *n)).collect();
     // Old episodes leave the newest ones, so these fall too, which a histogram must not.
     page.gauges(
@@ -143,7 +141,7 @@ fn weighed(page: &mut Page, pours: &[Pour]) -> std::fmt::Result {
         "le",
         &edges,
     )?;
-    let newest = pours.last().map_or(f64::NAN, |p| p.error_ml());
+    let newest = errors_ml.last().copied().unwrap_or(f64::NAN);
     page.gauge("decant_newest_weighed_error", "What the newest weighed pour had beyond its goal", Some(Unit::Other("ml".into())), newest)
 }
 
@@ -212,9 +210,8 @@ mod tests {
     /// an edge is within it.
     #[test]
     fn what_may_fall_is_a_gauge() {
-        let pour = |weight_g| Pour { goal_ml: 50.0, weight_g };
-        let weighed = vec![pour(50.2), pour(47.0), pour(120.0)];
-        let seen = Seen { cell: "lab".into(), status: None, ended: BTreeMap::new(), weighed, free_bytes: Vec::new() };
+        let errors_ml = vec![50.2 - 50.0, 47.0 - 50.0, 120.0 - 50.0];
+        let seen = Seen { cell: "lab".into(), status: None, ended: BTreeMap::new(), errors_ml, free_bytes: Vec::new() };
         let text = text(seen).unwrap();
         assert!(text.contains("# TYPE decant_weighed_pours gauge\n") && !text.contains(" histogram\n"), "{text}");
         for (le, n) in [("0.5", "1.0"), ("2.0", "1.0"), ("3.0", "2.0"), ("50.0", "2.0"), ("+Inf", "3.0")] {

@@ -9,7 +9,7 @@ use std::sync::atomic::{AtomicBool, Ordering::Relaxed};
 use std::sync::{Mutex, PoisonError};
 use std::time::{Duration, SystemTime};
 
-use shared::episode::{Episode, EpisodeKind, by_number, find_episodes};
+use shared::episode::{Episode, by_number, find_episodes};
 
 /// Pause between two looks at the episodes. Chosen by hand: weighing takes a person longer.
 const LOOK: Duration = Duration::from_secs(10);
@@ -18,36 +18,20 @@ const BEAT: Duration = Duration::from_millis(100);
 /// Number of newest episodes that are looked at. Chosen by hand: a lab's weeks, and some seconds to read.
 pub const EPISODES: usize = 300;
 
-/// One pour that was weighed.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Pour {
-    /// Its goal, ml.
-    pub goal_ml: f64,
-    /// What the scale showed, g; of water as many ml.
-    pub weight_g: f64,
-}
-
-impl Pour {
-    /// Poured beyond the goal, ml of water.
-    pub fn error_ml(self) -> f64 {
-        self.weight_g - self.goal_ml
-    }
-}
-
 /// When a file was written, and its length.
 type Stamp = (Option<SystemTime>, u64);
 
-/// The pours of the newest episodes, shared between threads.
+/// By how much the weighed pours of the newest episodes missed their goals, ml; shared between threads.
 #[derive(Debug, Default)]
-pub struct Weighed(Mutex<BTreeMap<PathBuf, (Stamp, Option<Pour>)>>);
+pub struct Weighed(Mutex<BTreeMap<PathBuf, (Stamp, Option<f64>)>>);
 
 impl Weighed {
-    /// The weighed pours but for those that ended early, the oldest first.
-    pub fn pours(&self) -> Vec<Pour> {
+    /// By how much the weighed pours missed their goals, ml, the oldest first; those that ended early do not count.
+    pub fn errors_ml(&self) -> Vec<f64> {
         let known = self.0.lock().unwrap_or_else(PoisonError::into_inner);
-        let mut pours: Vec<(&PathBuf, Pour)> = known.iter().filter_map(|(path, (_, pour))| Some((path, (*pour)?))).collect();
-        pours.sort_by(|(a, _), (b, _)| by_number(a, b));
-        pours.into_iter().map(|(_, pour)| pour).collect()
+        let mut errors_ml: Vec<(&PathBuf, f64)> = known.iter().filter_map(|(path, (_, error_ml))| Some((path, (*error_ml)?))).collect();
+        errors_ml.sort_by(|(a, _), (b, _)| by_number(a, b));
+        errors_ml.into_iter().map(|(_, error_ml)| error_ml).collect()
     }
 
     /// Looks at the episodes in `directory` again and again, until `stop` is set.
@@ -76,11 +60,8 @@ impl Weighed {
             if stop.load(Relaxed) || locked().get(&path).is_some_and(|(seen, _)| *seen == stamp) {
                 continue;
             }
-            let pour = Episode::read(&path).ok().filter(|e| e.complete && e.error_ml().is_some()).and_then(|e| match e.kind {
-                EpisodeKind::Pour { goal_ml } => Some(Pour { goal_ml: f64::from(goal_ml), weight_g: e.weight_g? }),
-                _ => None,
-            });
-            locked().insert(path, (stamp, pour));
+            let error_ml = Episode::read(&path).ok().filter(|e| e.complete).and_then(|e| e.error_ml());
+            locked().insert(path, (stamp, error_ml));
         }
     }
 }
@@ -88,7 +69,7 @@ impl Weighed {
 #[cfg(test)]
 mod tests {
     use shared::config::Config;
-    use shared::episode::{EpisodeEnd, EpisodeStart, EpisodeWriter, FrameRow, set_weight};
+    use shared::episode::{EpisodeEnd, EpisodeKind, EpisodeStart, EpisodeWriter, FrameRow, set_weight};
     use shared::messages::Feature;
 
     use super::*;
@@ -116,6 +97,6 @@ mod tests {
         }
         let weighed = Weighed::default();
         weighed.look(dir.path(), &AtomicBool::new(false));
-        assert_eq!(weighed.pours().into_iter().map(Pour::error_ml).collect::<Vec<_>>(), [1.0, 2.0]);
+        assert_eq!(weighed.errors_ml(), [1.0, 2.0]);
     }
 }

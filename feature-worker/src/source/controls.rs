@@ -256,8 +256,11 @@ pub fn start_automatics(device: &mut impl Controls, camera: &CameraConfig) -> Ou
     mains
 }
 
-/// Switches the automatics of what `camera` locks on: whoever locked it before left them off, and then they find nothing.
+/// Sets the mains' frequency, by which the automatic exposure goes, and switches the automatics of what `camera` locks on: whoever locked it before left
+/// them off, and then they find nothing.
 pub fn start_locked(device: &mut impl Controls, camera: &CameraConfig) {
+    // What came of it is said when all is set.
+    let _ = apply_mains(device, camera);
     switch_on(device, locked(camera));
 }
 

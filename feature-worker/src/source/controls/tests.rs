@@ -108,15 +108,18 @@ fn the_automatic_finds_before_it_is_locked() {
     assert!(settle(&other, &value, LONG, other.grab(0)) == Ok(true) && other.frames.get() == 0);
 }
 
-/// Protects the second start: it locks what the automatic finds in the light of now, and leaves the automatics of other keys as they are.
+/// Protects the second start: it locks what the automatic finds in the light of now, under lamps of the configured mains, and leaves the automatics of other
+/// keys as they are.
 #[test]
 fn each_start_finds_anew() {
-    let locked = CameraConfig { exposure_ms: Some(Setting::Locked(Locked::Locked)), ..CameraConfig::default() };
+    let (exposure_ms, mains_hz) = (Some(Setting::Locked(Locked::Locked)), Some(Setting::Value(50.0)));
+    let locked = CameraConfig { exposure_ms, mains_hz, ..CameraConfig::default() };
     let mut device = camera();
     device.controls.insert(v4l2::V4L2_CID_AUTO_WHITE_BALANCE, [0, 0, 1, 1]);
     for (light, found) in [(0, 150), (40, 190)] {
         device.light = light;
         start_locked(&mut device, &locked);
+        assert_eq!(device.get(v4l2::V4L2_CID_POWER_LINE_FREQUENCY), Ok(1), "before the automatic finds anything");
         assert_eq!(settle(&device, &locked, LONG, device.grab(2)), Ok(true));
         assert!(apply(&mut device, &locked).refused.is_empty());
         let at =
