@@ -220,7 +220,7 @@ impl EndReason {
             Self::NotFollowed => "the robot does not follow: it is slower than it is commanded, or something holds or moves it",
             Self::InHand => "somebody has the robot in hand (the teach button is pressed)",
             Self::ImpossibleFlow => {
-                "what the camera shows cannot be: the stream does not follow the tilt as in the episodes; look at camera, vessel and liquid"
+                "what the camera shows cannot be: the stream does not follow the tilt as in the episodes; the container is nearly empty, the camera sees something else, or vessel or liquid are others"
             }
             Self::FrameRate => "the camera's frames do not come at camera.fps, so the volume is not known",
             Self::GoalExceeded => {

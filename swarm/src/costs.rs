@@ -50,6 +50,8 @@ pub struct Poured {
     pub reason: EndReason,
     /// The goal, ml.
     pub goal_ml: Option<f32>,
+    /// What the vessel could give at its start, ml: all but what stays in it at the largest tilt.
+    pub givable_ml: f64,
     /// What was believed, ml.
     pub believed_ml: f32,
     /// Its standard deviation as far as it is known, ml.

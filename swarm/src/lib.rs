@@ -20,6 +20,7 @@ pub mod run;
 pub mod site;
 pub mod standing;
 pub mod trained;
+pub mod undisturbed;
 pub mod unshown;
 pub mod vessels;
 pub mod waits;

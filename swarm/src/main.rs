@@ -297,6 +297,14 @@ fn report(summary: &Summary, wall_s: f64) {
         }
     }
     print(&format!("ended: {:?}", summary.reasons));
+    print("| vessel | n undisturbed | done | left - goal, ml: median, p99, largest | ended otherwise |");
+    for row in &summary.undisturbed {
+        let done = row.error_ml.as_ref().map_or(0, |error| error.n);
+        let others: Vec<String> =
+            row.reasons.iter().filter(|(reason, _)| *reason != "Done").map(|(reason, n)| format!("{n} {reason}")).collect();
+        let error = row.error_ml.as_ref().map_or_else(|| "-".into(), spread);
+        print(&format!("| {} | {} | {:.1} % | {error} | {} |", row.vessel, row.n, 100.0 * done as f64 / row.n as f64, others.join(", ")));
+    }
     print("| fault | n done | left - goal, ml: median, p99, largest | left - said, ml: median, p99, largest | within 2 deviations |");
     for row in &summary.done {
         let (error, said) = (spread(&row.error_ml), spread(&row.said_ml));

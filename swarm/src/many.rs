@@ -16,10 +16,11 @@ use simulator::ur::Series;
 use simulator::ur::servo::LAG_S;
 
 use crate::camera;
-use crate::costs::Cost;
+use crate::costs::{Cost, Poured};
 use crate::plan::{Choice, Plan};
 use crate::run::{self, Shown};
 use crate::trained::train_for;
+use crate::undisturbed::is_undisturbed;
 use crate::weight_set::TrainedSet;
 
 /// Median, 99th percentile and largest of some numbers.
@@ -76,6 +77,19 @@ pub struct DoneRow {
     pub covered: f64,
 }
 
+/// How pours ended that nothing disturbed ([`crate::undisturbed`]), over many seeds.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct UndisturbedRow {
+    /// The vessel.
+    pub vessel: String,
+    /// Number of pours.
+    pub n: usize,
+    /// How often they ended for each reason.
+    pub reasons: BTreeMap<String, usize>,
+    /// |left - goal| of those that were done, ml.
+    pub error_ml: Option<Spread>,
+}
+
 /// What many seeds showed.
 #[derive(Debug, Clone, Serialize)]
 pub struct Summary {
@@ -99,6 +113,8 @@ pub struct Summary {
     pub violations: BTreeMap<String, (usize, Vec<u64>)>,
     /// How often pours and recordings ended for each reason.
     pub reasons: BTreeMap<String, usize>,
+    /// How pours ended that nothing disturbed, by vessel.
+    pub undisturbed: Vec<UndisturbedRow>,
     /// How near pours that were done came, where at most one fault happened.
     pub done: Vec<DoneRow>,
     /// What faults cost that ended a pour, where no other fault came with them.
@@ -265,10 +281,27 @@ fn sum_up(from: u64, shown: &[Shown]) -> Summary {
         lost: None,
         violations,
         reasons,
+        undisturbed: undisturbed(shown),
         done: done.into_iter().filter_map(done_row).collect(),
         costs: costs.into_iter().filter_map(|(key, costs)| cost_row(key, &costs)).collect(),
         sha256: digest(shown),
     }
+}
+
+/// How pours ended that nothing disturbed.
+fn undisturbed(shown: &[Shown]) -> Vec<UndisturbedRow> {
+    let mut by_vessel: BTreeMap<&str, Vec<&Poured>> = BTreeMap::new();
+    for one in shown {
+        by_vessel.entry(one.vessel).or_default().extend(one.poured.iter().filter(|p| is_undisturbed(one.lag_s, p)));
+    }
+    let row = |(vessel, poured): (&str, Vec<&Poured>)| {
+        let mut reasons = BTreeMap::new();
+        poured.iter().for_each(|p| *reasons.entry(format!("{:?}", p.reason)).or_insert(0) += 1);
+        let done = poured.iter().filter(|p| p.reason == EndReason::Done);
+        let error_ml = Spread::of(done.filter_map(|p| Some((p.true_ml - f64::from(p.goal_ml?)).abs())).collect());
+        UndisturbedRow { vessel: vessel.to_owned(), n: poured.len(), reasons, error_ml }
+    };
+    by_vessel.into_iter().filter(|(_, poured)| !poured.is_empty()).map(row).collect()
 }
 
 /// What a fault cost.

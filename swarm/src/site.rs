@@ -29,6 +29,7 @@ use crate::pipe::{self, End, Wiring};
 use crate::plan::{Item, Plan};
 use crate::records::Row;
 use crate::standing::Standing;
+use crate::undisturbed;
 use crate::vessels;
 use crate::weight_set::{Lesson, TrainedSet, episode};
 use crate::what::{EyeFault, Weighed, What, curve};
@@ -81,6 +82,8 @@ pub struct Site {
     frame_at_ns: u64,
     frame_poured_ml: f64,
     run_poured_ml: f64,
+    /// What the vessel could give when the newest run began, ml.
+    givable_ml: f64,
     /// The newest run is a pour, and no recording.
     is_pour: bool,
     next_item: usize,
@@ -157,6 +160,7 @@ impl Site {
             frame_at_ns,
             frame_poured_ml: 0.0,
             run_poured_ml: 0.0,
+            givable_ml: 0.0,
             is_pour: true,
             next_item: 0,
             episode: 0,
@@ -306,6 +310,8 @@ impl Site {
         let phase = self.checks.phase;
         if runs(phase) && !runs(before) {
             self.run_poured_ml = self.container.poured_ml();
+            let stays_ml = self.container.retained_ml(self.checks.limits().alpha_max_deg.into());
+            self.givable_ml = (self.container.volume_ml() - stays_ml).max(0.0);
             self.is_pour = phase == Phase::Pouring;
         }
         let row = Row::new(at_s, tick, telemetry, &self.container);
@@ -324,8 +330,12 @@ impl Site {
         let pictures = self.plan.picture.map(|fault| picture_name(fault.kind));
         let faults = pictures.into_iter().chain(self.standing.of_run(at_s - f64::from(outcome.seconds))).collect();
         let (reason, goal_ml, believed_ml) = (outcome.reason, outcome.goal_ml, outcome.poured_ml);
-        let sd_ml = outcome.poured_sd_ml;
-        self.poured.push(Poured { at_s, seconds: f64::from(outcome.seconds), reason, goal_ml, believed_ml, sd_ml, true_ml, faults });
+        let (seconds, sd_ml, givable_ml) = (f64::from(outcome.seconds), outcome.poured_sd_ml, self.givable_ml);
+        let poured = Poured { at_s, seconds, reason, goal_ml, givable_ml, believed_ml, sd_ml, true_ml, faults };
+        if let Some(wrong) = undisturbed::wrong(&self.plan, &poured) {
+            self.checks.violated("undisturbed", at_s, wrong);
+        }
+        self.poured.push(poured);
     }
 
     /// Gives the loop an agent with the weights for the vessel of this number.

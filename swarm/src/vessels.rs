@@ -23,6 +23,13 @@ pub struct Vessel {
     slosh_hz: f64,
 }
 
+impl Vessel {
+    /// Whether it is straight, and its surface does not swing.
+    pub fn is_calm(&self) -> bool {
+        self.kind.is_none() && self.slosh_hz == 0.0
+    }
+}
+
 const fn vessel(name: &'static str, kind: VesselKind, rig_seed: u64, slosh_hz: f64) -> Vessel {
     Vessel { name, kind: Some(kind), rig_seed, slosh_hz }
 }
