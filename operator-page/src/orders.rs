@@ -20,8 +20,8 @@ const CONNECTED: Duration = Duration::from_secs(15);
 const BEAT: Duration = Duration::from_millis(50);
 /// A pour that is expected to be off by more than this is warned of, ml: as `rt-controller pour`.
 const WARNED_SD_ML: f32 = 5.0;
-/// Weights from fewer weighed episodes know little of their own deviation. On rigs 0 to 19 pours were off by 3.2 ml on average with weights from
-/// one curve, and by 1.5 ml with those from five (docs/LEARNING.md, Figures).
+/// Weights from fewer weighed episodes know little of their own deviation. Pours with weights from one curve are off by about twice as much as those
+/// with weights from five (docs/LEARNING.md, Figures).
 const FEW_EPISODES: u32 = 5;
 /// Weighed pours that were off by more than this many expected deviations show that the weights' own deviation is too small. Chosen by hand: by
 /// chance it is so in one of twenty pours.
