@@ -1,6 +1,6 @@
 //! The command line of `rt-controller`: its commands, their arguments, and the text of `--help`, from which the manual pages are made too.
 //!
-//! Plain data for the main thread; nothing here fails.
+//! Plain data for the main thread, which allocates; nothing here fails.
 
 use clap::{Parser, Subcommand};
 

@@ -1,7 +1,8 @@
 //! The fixed-rate loop: absolute deadlines on CLOCK_MONOTONIC; a missed period is skipped and counted, never made up for.
 //!
 //! It runs in the real-time thread. Its ticks do not allocate, lock, log, or call anything that blocks but the sleep itself; `status` shows
-//! how often they allocated. The one exception is [`LoopState::meet_feature_worker`], which runs between ticks and outside of pours.
+//! how often they allocated. The one exception is [`LoopState::meet_feature_worker`], which runs between ticks and outside of
+//! pours; a worker that comes in a pour, which then ends, is met by the tick.
 //! Nothing in it fails: a lost robot is handed back and the core ends the pour, and a lost feature worker shows as stale features.
 
 use std::sync::atomic::{AtomicU64, Ordering::Relaxed, Ordering::SeqCst};

@@ -1,6 +1,6 @@
 //! The controller's decisions: one pure step for each tick. The running controller, replay, tests and evaluations all use this same code.
 //!
-//! [`Core::step`] maps what is known at a tick ([`Input`]) to the angle to command and to what happened ([`Output`]). It has no clock and
+//! It runs in the loop's thread, and in that of whoever replays or evaluates. [`Core::step`] maps what is known at a tick ([`Input`]) to the angle to command and to what happened ([`Output`]). It has no clock and
 //! no device, does not allocate or lock, and does not fail: whatever goes wrong ends the pour, and the container comes upright if the robot
 //! may still move. When and why a pour ends is decided in [`ending`].
 //!

@@ -1,7 +1,7 @@
 //! What passes between the loop and the ordinary threads: bounded lock-free queues and atomics, all made before the loop starts.
 //!
 //! The loop never blocks on them and never frees what it got: boxes that it no longer needs go back through a queue, and an ordinary
-//! thread drops them. When a queue is full, the loop counts the events that it could not pass on ([`Exchange::events_lost`]).
+//! thread drops them. Nothing allocates after the start. When a queue is full, the loop counts the events that it could not pass on ([`Exchange::events_lost`]).
 
 use std::sync::atomic::{AtomicBool, AtomicU32, AtomicU64, Ordering::SeqCst};
 

@@ -17,7 +17,10 @@
 //! | [`journal`] | every tick's inputs, and their replay | ordinary |
 //! | [`foreseen`] | what can be said of a pour before it starts | their own process |
 //! | [`client`] | the clients' side of the service | their own process |
+//! | [`cli`] | the command line | their own process |
 //! | [`commands`] | the subcommands | their own process |
+//!
+//! What the loop runs does not allocate; the other threads may. Whatever fails in one of them ends the pour upright, or is one line on standard error.
 #![forbid(unsafe_code)]
 
 pub mod claim;

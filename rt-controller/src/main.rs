@@ -1,5 +1,5 @@
 //! The command line of `rt-controller`: it reads the arguments, runs the command in the main thread, and turns a failure into one line and
-//! an exit code.
+//! an exit code. It allocates.
 
 use std::process::ExitCode;
 

@@ -13,8 +13,8 @@
 //! It is pure and runs in the real-time thread; it does not allocate or fail. What it sees stands in the journal, so that every deadline
 //! can be computed again.
 
-/// The least margin, ns: what a V_e that comes at its usual time to the microsecond would be given. Chosen by hand: the wake-up of
-/// cyclictest's 99.9th percentile on the machines of docs/REALTIME.md.
+/// The least margin, ns: what a V_e that comes at its usual time to the microsecond would be given. Chosen by hand: nearly
+/// all wake-ups of a quiet machine are nearer (docs/REALTIME.md).
 pub const MARGIN_FLOOR_NS: i64 = 300_000;
 /// The largest margin, ns, and the one before anything is known: more than the jitter of a loaded machine. See docs/REALTIME.md.
 pub const MARGIN_MAX_NS: i64 = 3_000_000;

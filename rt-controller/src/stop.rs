@@ -6,7 +6,7 @@
 //! controller's own user and root, and at the file also whom the directory's mode lets in. The thread "stop" serves them, and passes signals
 //! on to the loop. It allocates, and waits for nobody: a client that says nothing is dropped when others need its place.
 //!
-//! When the loop has ended, upright, the other threads get a moment to end too, and then the process ends without them.
+//! A socket that cannot be made fails the start; a client that cannot be served is dropped. When the loop has ended, upright, the other threads get a moment to end too, and then the process ends without them.
 
 use std::io::{Read, Write};
 use std::os::fd::AsFd;

@@ -3,7 +3,7 @@
 //! It needs no shared memory. It runs in ordinary threads of other processes, allocates, and waits for an answer a moment at most. Who
 //! answers is checked: the socket's server must be the user whose cell it is, or root. The cell belongs to the owner of its runtime directory, if
 //! root or this user has chosen where that lies ([`claim::owner`]); a configuration is such a choice. So a group may stop the cell of the user
-//! `decant`, and nobody else can answer for it.
+//! `decant`, and nobody else can answer for it. Each failure is one line that names the cell.
 
 use std::collections::BTreeMap;
 use std::io::{BufRead, BufReader, ErrorKind, Write};

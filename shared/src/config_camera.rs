@@ -1,6 +1,6 @@
 //! The table `[camera]` of the cell's configuration: where frames come from, and how a device is set.
 //!
-//! Plain data that every process reads once at its start, in an ordinary thread. Values out of range are refused by [`crate::config`].
+//! Plain data that every process reads once at its start, in an ordinary thread; it allocates. Values out of range are refused by [`crate::config`].
 
 use serde::{Deserialize, Serialize};
 

@@ -1,6 +1,6 @@
 //! The table `[container]` of the configuration: what is known of the vessel before any picture. All of it may be left out.
 //!
-//! Plain data, read once at the start in an ordinary thread. Values out of range are refused with the configuration.
+//! Plain data, read once at the start in an ordinary thread; it allocates nothing. Values out of range are refused with the configuration.
 
 use serde::{Deserialize, Serialize};
 

@@ -1,4 +1,5 @@
-//! How much room a disk has, and what its errors are in words. Any ordinary thread may ask; it may wait for the disk. Nothing here fails: what is not known is `None`.
+//! How much room a disk has, and what its errors are in words. Any ordinary thread may ask; it may wait for the disk, and allocates
+//! texts. Nothing here fails: what is not known is `None`.
 
 use std::path::Path;
 

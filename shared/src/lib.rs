@@ -5,6 +5,7 @@
 //! | [`messages`] | fixed-layout messages in shared memory | yes |
 //! | [`ipc`] | the iceoryx2 services that carry them | receive only |
 //! | [`control`] | requests to the controller and its answers | no |
+//! | [`robot_address`] | the robot's address, by number or by name | no |
 //! | [`runtime_dir`] | where a cell keeps its sockets and other files of a run | no |
 //! | [`shared_memory`] | the cell's files in `/dev/shm`: their names, who uses them, space for them | no |
 //! | [`config`], [`config_paths`] | the cell's one TOML file, and what its paths mean | no |
@@ -19,6 +20,8 @@
 //! | [`episode`] | `E = (L_E, w_E)` as MCAP files and CSV tables | no |
 //! | [`regular_file`] | files of which only so much is read as is expected | no |
 //! | [`whole_file`] | files that are written in one step, and never in place of one of another kind | no |
+//! | [`disk_space`] | how much room a disk has | no |
+//! | [`level`], [`plural`] | the priority of a line, and its numbers in words | no |
 //! | [`exit`] | exit codes and one-line errors | no |
 //! | [`speaker`] | lines for people, from threads that must not wait for a terminal | no |
 //! | [`machine`] | what Linux tells about the machine, and what would make it better | no |
@@ -26,7 +29,7 @@
 //! | [`os`] | the operating system: clock, scheduling, locked memory | yes |
 //!
 //! What the loop uses of a module marked "yes" does not allocate, lock or panic after construction; the module's header names the
-//! exceptions that are for other threads.
+//! exceptions that are for other threads. Nothing here panics: what fails is an error of one line for whoever called.
 
 #![deny(unsafe_code)]
 

@@ -9,8 +9,8 @@
 //! that is noisy, or else q would gain by being small. f is a small share of the strongest flow.
 //!
 //! There are two explanations, each fitted in three stages in which the frames count ever more: a vessel of any shape, and one with straight
-//! walls. The evidence for each decides how much it counts at run time. The first stage of the former, in which the weights count for more
-//! than the frames, calibrates the camera's own sum.
+//! walls. The evidence for each decides how much it counts at run time. In the first stage the weights count for more
+//! than the frames. The camera's own sum is calibrated from the weights alone.
 //!
 //! | file | what it holds |
 //! |---|---|

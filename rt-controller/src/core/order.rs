@@ -1,7 +1,7 @@
 //! What an operator may order, when an order is acceptable, and why it is refused otherwise.
 //!
 //! It is pure and runs in the controller's loop, so it does not allocate. Only showing a [`Refusal`] as text, which the service thread
-//! does, writes into the caller's buffer.
+//! does, writes into the caller's buffer. Nothing fails: what is not acceptable is a refusal.
 
 use serde::{Deserialize, Serialize};
 use shared::control::EndReason;

@@ -1,6 +1,6 @@
 //! The part of the cell's configuration that decisions depend on.
 //!
-//! It is read once at the start, from a checked configuration, so nothing fails. Then it is plain data that the loop copies. The journal
+//! It is read once at the start, from a checked configuration, so nothing fails, and nothing is allocated. Then it is plain data that the loop copies. The journal
 //! holds it, so that a replay decides under the same settings.
 
 use serde::{Deserialize, Serialize};

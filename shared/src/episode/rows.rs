@@ -1,4 +1,5 @@
-//! One row of an episode, and the rows of frames that were lost between two others. It is pure, and allocates nothing but error texts.
+//! One row of an episode, and the rows of frames that were lost between two others. It is pure, runs in
+//! ordinary threads, and allocates nothing but error texts.
 
 use crate::alpha_track::AlphaTrack;
 use crate::messages::Doubt;

@@ -1,7 +1,7 @@
 //! The schemas that make an episode's file describe itself: for each topic the FileDescriptorSet that MCAP asks of protobuf messages.
 //!
 //! Foxglove's own messages stand here with all of their fields, by the numbers of its published schemas, also those that are not written. It
-//! allocates, fails never, and runs once for each file. Tests hold the schemas against the messages in [`format`](super::format).
+//! allocates, never fails, and runs once for each file in an ordinary thread. Tests hold the schemas against the messages in [`format`](super::format).
 
 use prost::Message as _;
 use prost_types::field_descriptor_proto::{Label, Type};

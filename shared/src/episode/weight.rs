@@ -1,4 +1,4 @@
-//! Which numbers can be the weight `w_E` of an episode. It is pure and does not allocate; a wrong number is a [`WeightError`].
+//! Which numbers can be the weight `w_E` of an episode. It is pure, for ordinary threads, and does not allocate; a wrong number is a [`WeightError`].
 
 /// Why a number cannot be the weight of an episode. The text follows the number and a colon.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]

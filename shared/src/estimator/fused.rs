@@ -4,7 +4,7 @@
 //! filter on the [flow model](super::flow) weighs the two (`filter.rs`). It runs in the controller's loop and is pure: its size is
 //! fixed, it does not allocate, and it does not panic. It takes about 10 kflop a frame. An impossible measurement counts as a lost frame.
 //!
-//! The filters start with the first frame that shows flow. Before that, only the tilt is followed.
+//! The filters start with the second frame in a row that shows flow. Before that, only the tilt is followed.
 //!
 //! There are two explanations of the episodes, each with its own fit and filter: a vessel of any shape ([`WIDE`]), and one with straight walls
 //! ([`TIGHT`]), whose geometry says much more. The estimate is the camera's own sum S, corrected by the straight vessel as far as that is

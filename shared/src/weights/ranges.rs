@@ -1,6 +1,6 @@
 //! The ranges in which the numbers of a weight file's estimate must be, so that none of them can lead the loop astray.
 //!
-//! Pure functions for ordinary threads; they allocate only the line that names a wrong value.
+//! Pure functions for ordinary threads; they allocate only the line that names a wrong value, which is their error.
 
 use crate::estimator::Calibration;
 use crate::estimator::flow::{DELAY_MAX_FRAMES, FlowModel, Lateness, WayBack};

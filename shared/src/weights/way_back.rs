@@ -1,6 +1,6 @@
 //! Which ways back a weight file may hold, and which limits lead to none of them at a frame rate.
 //!
-//! Pure functions for ordinary threads; they allocate only the line that names what is wrong.
+//! Pure functions for ordinary threads; they allocate only the line that names what is wrong, which is their error.
 
 use crate::estimator::flow::WayBack;
 use crate::limits::Limits;
