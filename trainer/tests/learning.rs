@@ -8,7 +8,9 @@ use rand::SeedableRng;
 use rand_pcg::Pcg64Mcg;
 use shared::agent::{Agent, Observation};
 use shared::estimator::Calibration;
-use shared::estimator::flow::{CommandHistory, FlowModel, FlowState, FlowTables};
+use shared::estimator::flow::{CommandHistory, FlowModel, FlowState, FlowTables, WayBack};
+use shared::estimator::fused::{FusedEstimator, FusedFrame};
+use shared::limits::Limits;
 use trainer::allowed_actions::Actions;
 use trainer::consistency;
 use trainer::data::{self, TrainingEpisode};
@@ -91,6 +93,26 @@ fn quiet_frames_hide_no_change_of_the_gain() {
     let off = [1.06, 0.95, 1.05, 0.94, 1.07, 0.93, 1.06, 0.95, 1.04, 0.96];
     let found = fit::fit(&episodes_of(&FlowModel::default(), 10, 2, |k| ((CAMERA.0 * off[k], CAMERA.1), 0.01)));
     assert!(found.fused.gain_sd > 0.04, "{}", found.fused.gain_sd);
+}
+
+/// Protects what is said of the next pour: a weighed pour that was foreseen badly raises the deviation, and one that was foreseen well does not.
+#[test]
+fn a_pour_that_was_foreseen_badly_raises_the_deviation() {
+    let next = episodes(3, 21).remove(1);
+    let deviation_ml = |n: usize, gain: f64| {
+        let seen = |k| ((if k == 5 { CAMERA.0 / gain } else { CAMERA.0 }, CAMERA.1), 0.06);
+        let fit = fit::fit(&episodes_of(&FlowModel::default(), 6, 2, seen)[..n]);
+        let mut estimator = FusedEstimator::new(&fit.fused, &fit.calibration, WayBack::new(&Limits::default(), 30.0), 30.0);
+        for (area_px2, command_deg) in next.area_px2.iter().zip(&next.alpha_deg) {
+            let frame = FusedFrame { area_px2: Some(*area_px2 as f32), confidence: 1.0, command_deg: *command_deg, measured_deg: f64::NAN };
+            estimator.step(frame);
+        }
+        estimator.poured_sd_ml()
+    };
+    let (before, well, badly) = (deviation_ml(5, 1.0), deviation_ml(6, 1.0), [deviation_ml(6, 1.15), deviation_ml(6, 0.85)]);
+    println!("{before} ml before, {well} ml and {badly:?} ml after");
+    assert!(well < 1.05 * before, "{before} ml, and {well} ml after a pour that was foreseen");
+    assert!(badly.iter().all(|ml| *ml > 1.3 * before), "{before} ml, and {badly:?} ml after one that was not");
 }
 
 /// Protects a camera whose areas add up exactly, as in the paper's simulation: q = 1 is taken as right, not fitted.
