@@ -51,7 +51,7 @@ const ALL_LIQUID: f32 = 0.9;
 /// is recorded.
 const LEAVES_SHARE: f32 = 0.06;
 /// Side of the square of samples that are smoothed together: a fifth of the noise, for a tenth of what smoothing the region would cost.
-/// Tuned; it costs about 25 us more than 3, see docs/VISION.md.
+/// Tuned; it costs about 25 us more than 3, see CHANGELOG.md.
 const SMOOTH: i32 = 5;
 /// There is no line when a smaller share of the profiles than this shows an edge. Tuned.
 const PROFILES_LEAST: f32 = 0.3;
