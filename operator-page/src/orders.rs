@@ -10,7 +10,7 @@ use shared::control::{Reply, Request, RobotLink};
 use shared::episode::set_weight;
 use shared::gaussian_curve::Curve;
 use shared::messages::Phase;
-use shared::weights::{Estimator, Weights};
+use shared::weights::Weights;
 
 use crate::site::{Site, moves};
 
@@ -109,7 +109,7 @@ pub fn foresee(site: &Site, goal_ml: f32, fill_ml: Option<f64>) -> Foreseen {
             lines.push(format!("This is far off: weigh what is proposed under Learn first. Expected deviation {sd:.1} ml."));
         }
         Some(_) => {}
-        None if matches!(weights.estimator, Estimator::Fused { .. }) => {
+        None if foreseen::can_give(&weights, site.config.limits, goal_ml) == Some(false) => {
             lines.push("The vessel, as the weights know it, cannot give this goal from a usual fill: the pour may end early.".into());
         }
         None => lines.push("These weights do not say how far off this pour will be.".into()),

@@ -34,8 +34,19 @@ fn explanation(weights: &Weights) -> Option<&Explanation> {
     }
 }
 
+/// Whether a usual fill of the vessel gives `goal_ml` by the largest tilt; `None` with the plain sum, which knows no vessel.
+pub fn can_give(weights: &Weights, limits: Limits, goal_ml: f32) -> Option<bool> {
+    let flow = FlowTables::new(&explanation(weights)?.model, weights.rate_hz.into());
+    Some(ONSETS_DEG.iter().any(|onset_deg| gives(&flow, limits, *onset_deg) >= f64::from(goal_ml)))
+}
+
+/// What a vessel whose flow begins at `onset_deg` gives by the largest tilt, ml.
+fn gives(flow: &FlowTables, limits: Limits, onset_deg: f32) -> f64 {
+    flow.capacity.lost_ml(limits.alpha_max_deg.into()) - flow.capacity.lost_ml(onset_deg.into())
+}
+
 /// The standard deviation with which a pour of `goal_ml` will end, ml: the largest over fills from which the goal can be reached. `None` if the
-/// weights carry no deviation, or the vessel cannot give the goal.
+/// weights carry no deviation, or the vessel cannot give the goal ([`can_give`]).
 pub fn poured_sd_ml(weights: &Weights, limits: Limits, goal_ml: f32) -> Option<f32> {
     let Explanation { model, calibration, .. } = explanation(weights)?;
     let flow = FlowTables::new(model, weights.rate_hz.into());
@@ -51,10 +62,10 @@ fn foreseen_sd_ml(
     goal_ml: f32,
     onset_deg: f32,
 ) -> Option<f32> {
-    let headspace_ml = flow.capacity.lost_ml(onset_deg.into());
-    if flow.capacity.lost_ml(limits.alpha_max_deg.into()) - headspace_ml < f64::from(goal_ml) {
+    if gives(flow, limits, onset_deg) < f64::from(goal_ml) {
         return None;
     }
+    let headspace_ml = flow.capacity.lost_ml(onset_deg.into());
     let mut agent = Agent::new(weights);
     agent.start(goal_ml);
     let mut limiter = Limiter::new(limits, 1.0 / weights.rate_hz, 0.0);
@@ -169,6 +180,9 @@ pub(crate) mod tests {
         let (small, large) = (sd(30.0).unwrap(), sd(150.0).unwrap());
         assert!(small > 0.05 && large > 1.5 * small && large < 30.0, "{small} {large}");
         assert_eq!(sd(2000.0), None);
+        let can = |weights: &Weights, goal_ml| can_give(weights, Limits::default(), goal_ml);
+        assert_eq!((can(&weights(), 30.0), can(&weights(), 2000.0)), (Some(true), Some(false)));
+        assert_eq!(can(&Weights { estimator: Estimator::Sum, ..weights() }, 30.0), None);
         assert_eq!(poured_sd_ml(&Weights { estimator: Estimator::Sum, ..weights() }, Limits::default(), 30.0), None);
     }
 

@@ -313,7 +313,7 @@ impl Config {
     fn check(&self, file: &str) -> Result<(), ConfigError> {
         let check = Check { file };
         check.rule("cell.name", &self.cell.name, is_cell_name(&self.cell.name), CELL_NAME_RULE)?;
-        check.camera(&self.camera)?;
+        check.camera(&self.camera, self.controller.rate_hz)?;
         check.image(&self.image, &self.camera)?;
         check.robot(&self.robot, &self.limits)?;
         if let Some((key, value, allowed)) = self.container.fault() {
@@ -324,46 +324,20 @@ impl Config {
 }
 
 /// Checks values, and names `file` where one is refused.
-struct Check<'a> {
+pub(crate) struct Check<'a> {
     file: &'a str,
 }
 
 impl Check<'_> {
-    fn rule(&self, key: &str, value: &str, holds: bool, allowed: &str) -> Result<(), ConfigError> {
+    pub(crate) fn rule(&self, key: &str, value: &str, holds: bool, allowed: &str) -> Result<(), ConfigError> {
         if holds {
             return Ok(());
         }
         Err(ConfigError::Range { file: self.file.into(), key: key.into(), value: value.into(), allowed: allowed.into() })
     }
 
-    fn range(&self, key: &str, value: f64, low: f64, high: f64) -> Result<(), ConfigError> {
+    pub(crate) fn range(&self, key: &str, value: f64, low: f64, high: f64) -> Result<(), ConfigError> {
         self.rule(key, &value.to_string(), value >= low && value <= high, &format!("{low} to {high}"))
-    }
-
-    fn camera(&self, camera: &CameraConfig) -> Result<(), ConfigError> {
-        self.range("camera.width_px", camera.width_px.into(), 64.0, 4096.0)?;
-        self.range("camera.height_px", camera.height_px.into(), 64.0, 4096.0)?;
-        self.range("camera.fps", camera.fps, 1.0, 240.0)?;
-        for (key, setting, low, high) in [
-            ("camera.exposure_ms", camera.exposure_ms, 0.01, 1000.0),
-            ("camera.gain", camera.gain, 0.0, 1e6),
-            ("camera.white_balance_k", camera.white_balance_k, 1000.0, 20_000.0),
-            ("camera.focus", camera.focus, 0.0, 1e6),
-        ] {
-            if let Some(Setting::Value(value)) = setting {
-                self.range(key, value, low, high)?;
-            }
-        }
-        if let Some(Setting::Value(value)) = camera.mains_hz {
-            self.rule("camera.mains_hz", &value.to_string(), [0.0, 50.0, 60.0].contains(&value), "50, 60, 0 (off) or \"locked\"")?;
-        }
-        let needs_path = camera.source != CameraSource::SharedMemory;
-        self.rule(
-            "camera.path",
-            &camera.path,
-            !needs_path || !camera.path.is_empty(),
-            "a device, file or pattern (only source = \"shared-memory\" has none)",
-        )
     }
 
     fn image(&self, image: &ImageConfig, camera: &CameraConfig) -> Result<(), ConfigError> {
@@ -464,7 +438,7 @@ mod tests {
     #[test]
     fn mistakes_are_refused_with_file_key_and_range() {
         for (from, to, words) in [
-            ("rate_hz = 30.0", "rate_hz = 3.0", ["controller.rate_hz = 3", "10 to 125"]),
+            ("rate_hz = 30.0", "rate_hz = 9.0", ["controller.rate_hz = 9", "10 to 125"]),
             ("start_joint_deg = 0.0", "start_joint_deg = 300.0", ["robot.start_joint_deg = 300", "limits.alpha_max_deg"]),
             ("rate_hz = 30.0", "rate_hz = \"fast\"", ["rate_hz", "invalid type"]),
             ("rate_hz = 30.0", "rate_hz = nan", ["controller.rate_hz", "10 to 125"]),
@@ -475,6 +449,8 @@ mod tests {
             ("name = \"lab\"", "name = \"../x\"", ["cell.name", "letters"]),
             ("path = \"/dev/video0\"", "path = \"\"", ["camera.path", "device"]),
             ("fps = 30.0", "fps = 30.0\nmains_hz = 55", ["camera.mains_hz = 55", "50, 60, 0"]),
+            ("fps = 30.0", "fps = 241.0", ["camera.fps = 241", "1 to 240, and at most 4 for each tick"]),
+            ("fps = 30.0", "fps = 121.0", ["camera.fps = 121", "at most 4 for each tick"]),
             ("fps = 30.0", "fps = 30.0\nexposure_ms = 0", ["camera.exposure_ms = 0", "0.01 to 1000"]),
             ("fps = 30.0", "fps = 30.0\ngain = \"auto\"", ["gain", "Setting"]),
             ("width_px = 640", "width_px = 320", ["image.region_px", "inside 320"]),

@@ -4,6 +4,13 @@
 
 use serde::{Deserialize, Serialize};
 
+use crate::config::{Check, ConfigError};
+
+/// The highest rate of a camera, frames a second. Chosen by hand: what industrial cameras give at these sizes.
+const FPS_MAX: f64 = 240.0;
+/// Most frames for each tick of the loop: half of what a tick takes (`MAX_FEATURES` of the controller's core), so that a late tick loses none.
+const FRAMES_A_TICK: f64 = 4.0;
+
 /// Where frames come from.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
@@ -99,4 +106,35 @@ pub enum Refused {
     Error,
     /// The worker says so and starts.
     Warning,
+}
+
+impl Check<'_> {
+    /// Checks the table for a loop of `rate_hz`.
+    pub(crate) fn camera(&self, camera: &CameraConfig, rate_hz: f64) -> Result<(), ConfigError> {
+        self.range("camera.width_px", camera.width_px.into(), 64.0, 4096.0)?;
+        self.range("camera.height_px", camera.height_px.into(), 64.0, 4096.0)?;
+        let most_fps = FPS_MAX.min(FRAMES_A_TICK * rate_hz);
+        let allowed = format!("1 to {FPS_MAX}, and at most {FRAMES_A_TICK} for each tick of controller.rate_hz");
+        self.rule("camera.fps", &camera.fps.to_string(), (1.0..=most_fps).contains(&camera.fps), &allowed)?;
+        for (key, setting, low, high) in [
+            ("camera.exposure_ms", camera.exposure_ms, 0.01, 1000.0),
+            ("camera.gain", camera.gain, 0.0, 1e6),
+            ("camera.white_balance_k", camera.white_balance_k, 1000.0, 20_000.0),
+            ("camera.focus", camera.focus, 0.0, 1e6),
+        ] {
+            if let Some(Setting::Value(value)) = setting {
+                self.range(key, value, low, high)?;
+            }
+        }
+        if let Some(Setting::Value(value)) = camera.mains_hz {
+            self.rule("camera.mains_hz", &value.to_string(), [0.0, 50.0, 60.0].contains(&value), "50, 60, 0 (off) or \"locked\"")?;
+        }
+        let needs_path = camera.source != CameraSource::SharedMemory;
+        self.rule(
+            "camera.path",
+            &camera.path,
+            !needs_path || !camera.path.is_empty(),
+            "a device, file or pattern (only source = \"shared-memory\" has none)",
+        )
+    }
 }

@@ -81,9 +81,10 @@ pub enum Doubt {
     WrongFormat = 7,
     /// A part of the picture is missing, shifted, or of another picture.
     PictureIncomplete = 8,
-    /// At the lip is something with the colours of neither the ground nor the liquid, or the picture has no colour.
+    /// At the lip is something with the colours of neither the ground nor the liquid, or the picture has no colour; or the camera's colours
+    /// wander so far that the liquid may look like the ground.
     ColoursChanged = 9,
-    /// The light changes faster than the picture is read, so that it has bands.
+    /// The light changes faster than the picture is read, so that it has bands; or it wanders from picture to picture.
     LightFlickers = 10,
 }
 

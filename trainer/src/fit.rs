@@ -356,13 +356,14 @@ impl Conclusion<'_> {
             self.tempered.found.own.iter().zip(self.episodes).map(|(own, e)| own[CAMERA_GAIN] - e.log_camera_gain).collect();
         let exact = self.camera.linear.is_some();
         let gain_expected = if exact { GAIN_EXACT } else { GAIN_EXPECTED };
-        let straight_doubt = Doubt::tight((self.tight.cost / frames.max(1) as f64).max(1.0), self.episodes.len());
         let Doubted { calibration, covariance, pour_sd } = self.camera();
+        let gain_sd = noise::camera_gain_sd(&gains, gain_expected).max(if exact { 0.0 } else { pour_sd });
+        let straight_doubt = Doubt::tight((self.tight.cost / frames.max(1) as f64).max(1.0), self.episodes.len(), gain_sd);
         let mut fused = FusedModel {
             explanations: [self.explanation(self.wide, Doubt::wide()), self.explanation(self.tight, straight_doubt)],
             tight_share,
             camera: covariance,
-            gain_sd: noise::camera_gain_sd(&gains, gain_expected).max(if exact { 0.0 } else { pour_sd }),
+            gain_sd,
             bounds: self.bounds(),
         };
         fused.tight_share *= self.trust(&fused, &calibration);

@@ -95,24 +95,29 @@ fn quiet_frames_hide_no_change_of_the_gain() {
     assert!(found.fused.gain_sd > 0.04, "{}", found.fused.gain_sd);
 }
 
-/// Protects what is said of the next pour: a weighed pour that was foreseen badly raises the deviation, and one that was foreseen well does not.
+/// Protects what is said of the next pour: a weighed pour that was foreseen badly raises the deviation, and one that was foreseen well does not. It is one
+/// of middling areas, of which the others have told.
 #[test]
 fn a_pour_that_was_foreseen_badly_raises_the_deviation() {
     let next = episodes(3, 21).remove(1);
-    let deviation_ml = |n: usize, gain: f64| {
-        let seen = |k| ((if k == 5 { CAMERA.0 / gain } else { CAMERA.0 }, CAMERA.1), 0.06);
-        let fit = fit::fit(&episodes_of(&FlowModel::default(), 6, 2, seen)[..n]);
+    let told = |gain: Option<f64>| {
+        let seen = |k| ((if k == 3 { CAMERA.0 / gain.unwrap_or(1.0) } else { CAMERA.0 }, CAMERA.1), 0.06);
+        let mut all = episodes_of(&FlowModel::default(), 6, 2, seen);
+        let newest = all.remove(3);
+        all.extend(gain.map(|_| newest));
+        let fit = fit::fit(&all);
         let mut estimator = FusedEstimator::new(&fit.fused, &fit.calibration, WayBack::new(&Limits::default(), 30.0), 30.0);
         for (area_px2, command_deg) in next.area_px2.iter().zip(&next.alpha_deg) {
             let frame = FusedFrame { area_px2: Some(*area_px2 as f32), confidence: 1.0, command_deg: *command_deg, measured_deg: f64::NAN };
             estimator.step(frame);
         }
-        estimator.poured_sd_ml()
+        (estimator.poured_sd_ml(), fit.fused.gain_sd)
     };
-    let (before, well, badly) = (deviation_ml(5, 1.0), deviation_ml(6, 1.0), [deviation_ml(6, 1.15), deviation_ml(6, 0.85)]);
-    println!("{before} ml before, {well} ml and {badly:?} ml after");
-    assert!(well < 1.05 * before, "{before} ml, and {well} ml after a pour that was foreseen");
-    assert!(badly.iter().all(|ml| *ml > 1.3 * before), "{before} ml, and {badly:?} ml after one that was not");
+    let (before, well, badly) = (told(None), told(Some(1.0)), [1.1, 0.9].map(|gain| told(Some(gain))));
+    assert!(well.0 < 1.05 * before.0, "{before:?} before, {well:?} after a pour that was foreseen");
+    // What a pour is off by either way shows how far the camera's gain may change, and the worse of the two is beyond what is expected before any pour.
+    assert!(badly.iter().all(|(_, gain_sd)| *gain_sd > 1.5 * before.1), "{before:?} before, {badly:?} after one that was not");
+    assert!(badly[0].0.max(badly[1].0) > 1.2 * before.0, "{before:?} before, {badly:?} after one that was not");
 }
 
 /// Protects a camera whose areas add up exactly, as in the paper's simulation: q = 1 is taken as right, not fitted.

@@ -6,7 +6,7 @@ use shared::control::{EndReason, Outcome, Reply, Request};
 use shared::exit::{self, Failure, OrExit as _, failure};
 use shared::os;
 use shared::plural::counted;
-use shared::weights::{Estimator, Weights};
+use shared::weights::Weights;
 
 use super::resume;
 use crate::client::{self, Client, Common, FollowError};
@@ -54,8 +54,8 @@ struct Foreseen {
     unseen_ml: Option<f64>,
     /// Whether the controller has the weights that lie in the configured file.
     same_weights: bool,
-    /// Whether these weights carry a deviation; then only a goal that the vessel cannot give has none.
-    has_deviation: bool,
+    /// Whether the vessel can give the goal, if these weights know the vessel.
+    can_give: Option<bool>,
 }
 
 impl Foreseen {
@@ -81,7 +81,7 @@ impl Foreseen {
             flows_by_deg,
             unseen_ml: if flows_by_deg.is_none() { weights.and_then(foreseen::unseen_ml) } else { None },
             same_weights: weights.is_some(),
-            has_deviation: weights.is_some_and(|w| matches!(w.estimator, Estimator::Fused { .. })),
+            can_give: weights.and_then(|w| foreseen::can_give(w, config.limits, goal_ml)),
         }
     }
 
@@ -105,7 +105,7 @@ impl Foreseen {
             None if !self.same_weights => Some(
                 "note: controller.weights is not the file that the controller has taken, so it is not said how far off this will be".into(),
             ),
-            None if self.has_deviation => {
+            None if self.can_give == Some(false) => {
                 Some("note: the vessel, as the weights know it, cannot give this goal from a usual fill: the pour may end early".into())
             }
             None => Some("note: the weights do not say how far off this pour will be".into()),
@@ -179,6 +179,7 @@ fn report(outcome: &Outcome, recorded: Option<client::Recorded>, foreseen_sd_ml:
 #[cfg(test)]
 mod tests {
     use shared::limits::Clipped;
+    use shared::weights::Estimator;
 
     use super::*;
 

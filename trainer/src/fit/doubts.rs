@@ -56,11 +56,13 @@ impl Doubt {
         Self { scale: 1.0, gain_sd: GAIN_SD }
     }
 
-    /// That of the straight vessel, whose frames are met `misfit` times as badly as their noise explains, after so many episodes.
-    pub fn tight(misfit: f64, episodes: usize) -> Self {
+    /// That of the straight vessel, whose frames are met `misfit` times as badly as their noise explains, after so many episodes whose weights show that
+    /// the gain changes by `seen_gain_sd` (log).
+    pub fn tight(misfit: f64, episodes: usize, seen_gain_sd: f64) -> Self {
         let told = (episodes as f64 / FEW - 1.0).clamp(0.0, 1.0);
         let (gain_sd, scale) = WELL_TOLD;
-        Self { scale: misfit * (1.0 + told * (scale - 1.0)), gain_sd: GAIN_SD + told * (gain_sd - GAIN_SD) }
+        let expected_sd = GAIN_SD + told * (gain_sd - GAIN_SD);
+        Self { scale: misfit * (1.0 + told * (scale - 1.0)), gain_sd: expected_sd.max(seen_gain_sd) }
     }
 }
 
@@ -118,7 +120,7 @@ mod tests {
     /// Protects first lessons from a gain that is their vessel's error, and many episodes from less freedom than they bear.
     #[test]
     fn many_episodes_leave_the_gain_more_freedom() {
-        let (few, many, more) = (Doubt::tight(2.0, 5), Doubt::tight(2.0, 10), Doubt::tight(2.0, 40));
+        let (few, many, more) = (Doubt::tight(2.0, 5, 0.01), Doubt::tight(2.0, 10, 0.01), Doubt::tight(2.0, 40, 0.01));
         assert_eq!((few.scale, few.gain_sd), (2.0, Doubt::wide().gain_sd));
         assert!(many.scale < few.scale && many.gain_sd > few.gain_sd);
         assert_eq!((many.scale, many.gain_sd), (more.scale, more.gain_sd));

@@ -1,6 +1,7 @@
 //! Whether there is water: when a stream begins, goes on and ends.
 //!
-//! Beginning a stream takes more evidence than going on. A line that moves with the background, or is at rest with it, is no
+//! Beginning a stream takes a larger score than going on on unknown ground, and ground that is known; on known ground a new line is
+//! easier to tell from what was dry than one that has run for long. A line that moves with the background, or is at rest with it, is no
 //! stream; nor is a line of the small picture that the full picture does not confirm.
 //!
 //! Called on the extraction thread. Nothing is allocated and nothing fails.
