@@ -37,12 +37,12 @@ fn explanation(weights: &Weights) -> Option<&Explanation> {
 /// Whether a usual fill of the vessel gives `goal_ml` by the largest tilt; `None` with the plain sum, which knows no vessel.
 pub fn can_give(weights: &Weights, limits: Limits, goal_ml: f32) -> Option<bool> {
     let flow = FlowTables::new(&explanation(weights)?.model, weights.rate_hz.into());
-    Some(ONSETS_DEG.iter().any(|onset_deg| gives(&flow, limits, *onset_deg) >= f64::from(goal_ml)))
+    Some(ONSETS_DEG.iter().any(|onset_deg| gives(&flow, limits, *onset_deg, goal_ml)))
 }
 
-/// What a vessel whose flow begins at `onset_deg` gives by the largest tilt, ml.
-fn gives(flow: &FlowTables, limits: Limits, onset_deg: f32) -> f64 {
-    flow.capacity.lost_ml(limits.alpha_max_deg.into()) - flow.capacity.lost_ml(onset_deg.into())
+/// Whether a vessel whose flow begins at `onset_deg` gives `goal_ml` by the largest tilt.
+fn gives(flow: &FlowTables, limits: Limits, onset_deg: f32, goal_ml: f32) -> bool {
+    flow.capacity.lost_ml(limits.alpha_max_deg.into()) - flow.capacity.lost_ml(onset_deg.into()) >= f64::from(goal_ml)
 }
 
 /// The standard deviation with which a pour of `goal_ml` will end, ml: the largest over fills from which the goal can be reached. `None` if the
@@ -62,7 +62,7 @@ fn foreseen_sd_ml(
     goal_ml: f32,
     onset_deg: f32,
 ) -> Option<f32> {
-    if gives(flow, limits, onset_deg) < f64::from(goal_ml) {
+    if !gives(flow, limits, onset_deg, goal_ml) {
         return None;
     }
     let headspace_ml = flow.capacity.lost_ml(onset_deg.into());

@@ -313,6 +313,7 @@ impl Config {
     fn check(&self, file: &str) -> Result<(), ConfigError> {
         let check = Check { file };
         check.rule("cell.name", &self.cell.name, is_cell_name(&self.cell.name), CELL_NAME_RULE)?;
+        check.range("controller.rate_hz", self.controller.rate_hz, 10.0, 125.0)?;
         check.camera(&self.camera, self.controller.rate_hz)?;
         check.image(&self.image, &self.camera)?;
         check.robot(&self.robot, &self.limits)?;
@@ -400,7 +401,6 @@ impl Check<'_> {
     }
 
     fn processes(&self, controller: &ControllerConfig, worker: &WorkerConfig, recording: &RecordingConfig) -> Result<(), ConfigError> {
-        self.range("controller.rate_hz", controller.rate_hz, 10.0, 125.0)?;
         self.range("controller.core", controller.core as f64, 0.0, 1023.0)?;
         self.range("controller.priority", controller.priority.into(), 0.0, 99.0)?;
         self.range("controller.stale_feature_ms", controller.stale_feature_ms.into(), 50.0, 1000.0)?;
@@ -438,7 +438,7 @@ mod tests {
     #[test]
     fn mistakes_are_refused_with_file_key_and_range() {
         for (from, to, words) in [
-            ("rate_hz = 30.0", "rate_hz = 9.0", ["controller.rate_hz = 9", "10 to 125"]),
+            ("rate_hz = 30.0", "rate_hz = 3.0", ["controller.rate_hz = 3", "10 to 125"]),
             ("start_joint_deg = 0.0", "start_joint_deg = 300.0", ["robot.start_joint_deg = 300", "limits.alpha_max_deg"]),
             ("rate_hz = 30.0", "rate_hz = \"fast\"", ["rate_hz", "invalid type"]),
             ("rate_hz = 30.0", "rate_hz = nan", ["controller.rate_hz", "10 to 125"]),

@@ -37,6 +37,9 @@ const LATE_FAULTS: f64 = 0.25;
 /// How long after its order the longest run ends, ms: some pours of 200 ml of syrup take 18 s.
 const LONGEST_RUN_MS: u64 = 18_600;
 
+/// Ordinary goals, ml.
+pub const USUAL_GOALS_ML: std::ops::Range<f32> = 15.0..200.0;
+
 /// From what seeds draw.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Choice {
@@ -244,7 +247,7 @@ fn goal_ml(random: &mut Pcg64Mcg) -> f32 {
         let odd = [0.0, -5.0, 1e-3, 0.5, 300.0, 300.1, 1e9, f32::NAN, f32::INFINITY];
         return odd[random.random_range(0..odd.len())];
     }
-    random.random_range(15.0..200.0)
+    random.random_range(USUAL_GOALS_ML)
 }
 
 /// A curve: mostly a legal one.

@@ -7,13 +7,11 @@ use simulator::ur::servo::LAG_S;
 
 use crate::camera::Depth;
 use crate::costs::Poured;
-use crate::plan::Plan;
+use crate::plan::{Plan, USUAL_GOALS_ML};
 use crate::vessels::VESSELS;
 
 /// How much more than its goal a vessel must be able to give, ml: less is for the pour to find out, and the flow then ebbs before the goal is reached.
 const SPARE_ML: f64 = 50.0;
-/// The goals of ordinary pours, ml, as [`crate::plan`] draws them.
-const GOALS_ML: std::ops::RangeInclusive<f64> = 15.0..=200.0;
 /// How far from its goal such a pour may say that it ended, ml. Of 1,490 of the calm cylinder none was off by more than 1.3.
 const OFF_ML: f64 = 3.0;
 
@@ -21,7 +19,7 @@ const OFF_ML: f64 = 3.0;
 /// as the one that was learned with; and a vessel that can give more than the goal.
 pub fn is_undisturbed(lag_s: f64, poured: &Poured) -> bool {
     let goal_ml = poured.goal_ml.map_or(f64::NAN, f64::from);
-    let suffices = GOALS_ML.contains(&goal_ml) && poured.givable_ml >= goal_ml + SPARE_ML;
+    let suffices = USUAL_GOALS_ML.contains(&(goal_ml as f32)) && poured.givable_ml >= goal_ml + SPARE_ML;
     poured.faults.is_empty() && lag_s <= 2.0 * LAG_S && suffices
 }
 
@@ -66,6 +64,7 @@ mod tests {
         assert!(!is_wrong(Poured { faults: vec!["eye-loss"], ..ended.clone() }));
         assert!(!is_wrong(Poured { givable_ml: 100.0, ..ended.clone() }));
         assert!(!is_wrong(Poured { goal_ml: Some(300.0), ..ended.clone() }));
+        assert!(wrong(&Plan { depth: Depth::Camera, ..plan.clone() }, &ended).is_none());
         assert!(wrong(&Plan { lag_s: 0.1, ..plan.clone() }, &ended).is_none());
         assert!(wrong(&Plan { vessel: 1, ..plan }, &ended).is_none());
     }

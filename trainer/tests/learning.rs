@@ -95,10 +95,10 @@ fn quiet_frames_hide_no_change_of_the_gain() {
     assert!(found.fused.gain_sd > 0.04, "{}", found.fused.gain_sd);
 }
 
-/// Protects what is said of the next pour: a weighed pour that was foreseen badly raises the deviation, and one that was foreseen well does not. It is one
-/// of middling areas, of which the others have told.
+/// Protects what is said of the next pour: a weighed pour that was foreseen badly raises what is expected of the camera's gain, and with it the deviation; one
+/// that was foreseen well does not. It is one of middling areas, of which the others have told.
 #[test]
-fn a_pour_that_was_foreseen_badly_raises_the_deviation() {
+fn a_pour_that_was_foreseen_badly_raises_the_doubt() {
     let next = episodes(3, 21).remove(1);
     let told = |gain: Option<f64>| {
         let seen = |k| ((if k == 3 { CAMERA.0 / gain.unwrap_or(1.0) } else { CAMERA.0 }, CAMERA.1), 0.06);
@@ -115,9 +115,9 @@ fn a_pour_that_was_foreseen_badly_raises_the_deviation() {
     };
     let (before, well, badly) = (told(None), told(Some(1.0)), [1.1, 0.9].map(|gain| told(Some(gain))));
     assert!(well.0 < 1.05 * before.0, "{before:?} before, {well:?} after a pour that was foreseen");
-    // What a pour is off by either way shows how far the camera's gain may change, and the worse of the two is beyond what is expected before any pour.
     assert!(badly.iter().all(|(_, gain_sd)| *gain_sd > 1.5 * before.1), "{before:?} before, {badly:?} after one that was not");
-    assert!(badly[0].0.max(badly[1].0) > 1.2 * before.0, "{before:?} before, {badly:?} after one that was not");
+    // Where it has seen too much, q takes a part of the miss, and 2.3 % are left: hardly more than the 2 % that are expected before any pour.
+    assert!(badly[0].0 > 1.02 * well.0 && badly[1].0 > 1.2 * before.0, "{before:?} before, {well:?} and {badly:?} after it");
 }
 
 /// Protects a camera whose areas add up exactly, as in the paper's simulation: q = 1 is taken as right, not fitted.

@@ -303,13 +303,15 @@ mod tests {
         assert_eq!(pours, trial.run(Pourer::Best, &PROTOCOL));
     }
 
-    /// Protects the cup from a surface that swings: a law that was searched on level ones was beyond the goals of this vessel by 41 ml in the mean.
+    /// Protects the cup from a surface that swings: a law that was searched on level ones poured 46 ml more than these goals in the mean on rig 205.
     #[test]
     fn a_swinging_surface_is_poured_with_care() {
-        let trial = Trial::drawn(VesselKind::Slosh, 205, 0, Change::None);
-        let pours = trial.run(Pourer::Best, &Protocol { episodes: 2, weighed: 3, refit_after_each: true, ..PROTOCOL });
-        let summary = Summary::new("best", &[pours]);
-        assert!(summary.n == 45 && summary.control_ml < 1.0 && summary.max_ml < 20.0, "{}", summary.line());
+        for (rig, most_ml) in [(205, 20.0), (206, 12.0)] {
+            let trial = Trial::drawn(VesselKind::Slosh, rig, 0, Change::None);
+            let pours = trial.run(Pourer::Best, &Protocol { episodes: 2, weighed: 3, refit_after_each: true, ..PROTOCOL });
+            let summary = Summary::new("best", &[pours]);
+            assert!(summary.n == 45 && summary.control_ml < 1.0 && summary.max_ml < most_ml, "{rig}: {}", summary.line());
+        }
     }
 
     /// Protects `--through-camera`: what is recorded and poured is seen in rendered pictures, by the feature worker's extraction, and a

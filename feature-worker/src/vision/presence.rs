@@ -20,6 +20,11 @@ const PICTURES_PER_DOUBLING: f32 = 1.5;
 const PICTURES_MOST: u32 = 9;
 /// After something foreign at the lip, so many pictures in a row have to show none. Tuned as [`PICTURES_PER_DOUBLING`] was.
 const FOREIGN_PICTURES: u32 = 5;
+/// So many where no stream was seen for [`LATELY_PICTURES`]: nothing that flows has changed its colours then, and what passes the lip is an edge of ground
+/// that was never seen. With 5 a thin rod that passes ended a pour: one picture and five more are the 0.2 s of `controller.stale_feature_ms`.
+const FOREIGN_DRY_PICTURES: u32 = 2;
+/// A stream that was seen within so many pictures may be there still, in other colours: one second. Chosen by hand: longer than a bottle gurgles.
+const LATELY_PICTURES: u32 = 30;
 
 /// After so many pictures without a stream, what is seen in its place is the ground. Chosen by hand: three seconds, after which a pour
 /// that sees nothing has long ended.
@@ -66,7 +71,7 @@ impl Presence {
             legs_px: None,
             dry_pictures: 0,
             needed: 1,
-            unseen: 0,
+            unseen: u32::MAX,
             foreign: 0,
             bgr: [0.0; 3],
             other_light: 0,
@@ -106,8 +111,14 @@ impl Presence {
     pub(crate) fn saw_unsure(&mut self, lasts: bool) {
         self.dry_pictures = 0;
         if lasts {
-            self.foreign = self.pace.pictures(FOREIGN_PICTURES);
+            let needed = self.pace.pictures(if self.flowed_lately() { FOREIGN_PICTURES } else { FOREIGN_DRY_PICTURES });
+            self.foreign = self.foreign.max(needed);
         }
+    }
+
+    /// Whether a stream was seen within the last second.
+    pub(crate) fn flowed_lately(&self) -> bool {
+        self.unseen <= self.pace.pictures(LATELY_PICTURES)
     }
 
     /// Legs of a stream that was seen, and not yet its end, px from the lip. None after some seconds without a stream, when what is seen is the ground.

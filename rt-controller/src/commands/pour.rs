@@ -193,6 +193,8 @@ mod tests {
         assert!(!line(&fused, 30.0).contains("note"), "{}", line(&fused, 30.0));
         assert!(line(&fused, 2000.0).contains("cannot give this goal"), "{}", line(&fused, 2000.0));
         assert!(line(&sum, 2000.0).contains("the weights do not say how far off"), "{}", line(&sum, 2000.0));
+        // A pour of nothing leaves no deviation, and the vessel can give it.
+        assert!(line(&fused, 0.0).contains("the weights do not say how far off"), "{}", line(&fused, 0.0));
         assert!(Foreseen::with(None, &config, 30.0, None).line(30.0).unwrap().contains("is not the file that the controller has taken"));
     }
 

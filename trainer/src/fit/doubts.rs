@@ -122,6 +122,7 @@ mod tests {
     fn many_episodes_leave_the_gain_more_freedom() {
         let (few, many, more) = (Doubt::tight(2.0, 5, 0.01), Doubt::tight(2.0, 10, 0.01), Doubt::tight(2.0, 40, 0.01));
         assert_eq!((few.scale, few.gain_sd), (2.0, Doubt::wide().gain_sd));
+        assert_eq!(Doubt::tight(2.0, 5, 0.06).gain_sd, 0.06, "what the weights show counts where it is more");
         assert!(many.scale < few.scale && many.gain_sd > few.gain_sd);
         assert_eq!((many.scale, many.gain_sd), (more.scale, more.gain_sd));
     }
