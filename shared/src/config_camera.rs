@@ -38,7 +38,7 @@ pub struct CameraConfig {
     pub width_px: u32,
     /// Height in px.
     pub height_px: u32,
-    /// Frames a second.
+    /// Frames a second, 1 to 240, and at most four for each tick of the loop.
     pub fps: f64,
     /// Exposure time of a device, ms. This and what follows is set at the start and read back; without it, it is left alone.
     #[serde(default)]
