@@ -331,6 +331,17 @@ mod tests {
         assert!(poured.ended && poured.error_ml().abs() < 8.0, "{poured:?}");
     }
 
+    /// Protects recordings of large streams before an even wall: the edge of a coloured stream is no foreign colour, so next to no frame is lost.
+    #[test]
+    fn a_large_stream_before_a_wall_is_measured() {
+        let seen = Trial::new("b", 4, 0, "cylinder", Change::None).through_camera(4, "cylinder", false).unwrap();
+        for episode in seen.bench.record(5, seen.data_seed) {
+            let lost = episode.area_px2.iter().filter(|area| area.is_nan()).count();
+            let flows = episode.area_px2.iter().filter(|area| **area > 0.0).count();
+            assert!(flows > 30 && 20 * lost < flows, "{lost} of {flows} frames with a stream were lost");
+        }
+    }
+
     /// Protects an operator whose camera shows something else than the stream: little more than the goal leaves, and of the pours that end as
     /// done, what is said is near the truth. A camera that sees nothing at all ends by name. docs/LEARNING.md has the bounds over many rigs.
     #[test]

@@ -44,14 +44,11 @@ const HIDDEN_PX: f32 = 14.0;
 const BEHIND_RAYS: f32 = 0.4;
 /// So far from the lip that liquid is looked for, px. Chosen by hand: as far as most streams reach.
 const BEHIND_PX: f32 = 100.0;
-/// With more than this share of rays full of liquid to the region's border, the colour tells nothing in this light. Chosen by hand; no
-/// measurement is recorded.
+/// With more than this share of rays full of liquid to the region's border, the colour tells nothing in this light. Chosen by hand.
 const ALL_LIQUID: f32 = 0.9;
-/// With more than this share of rays full of liquid to the region's border, the area is a lower bound. Chosen by hand; no measurement
-/// is recorded.
+/// With more than this share of rays full of liquid to the region's border, the area is a lower bound. Chosen by hand.
 const LEAVES_SHARE: f32 = 0.06;
-/// Side of the square of samples that are smoothed together: a fifth of the noise, for a tenth of what smoothing the region would cost.
-/// Tuned; it costs about 25 us more than 3, see CHANGELOG.md.
+/// Side of the square of samples that are smoothed together: a fifth of the noise. Tuned; it costs about 25 us more than 3, see CHANGELOG.md.
 const SMOOTH: i32 = 5;
 /// There is no line when a smaller share of the profiles than this shows an edge. Tuned.
 const PROFILES_LEAST: f32 = 0.3;
@@ -302,10 +299,9 @@ impl ColouredLiquid {
         Seen { grid: &self.grid, mask: &self.mask, smooth: &self.smooth, ground: &self.ground }
     }
 
-    /// Whether the liquid is seen in the glass in its own colours, and what is foreign is not like it.
-    fn is_excused(&mut self, foreign: [f32; 3]) -> opencv::Result<bool> {
-        let liquid = self.glass.liquid()?;
-        Ok(liquid.zip(self.ground_bgr).is_some_and(|(liquid, ground)| foreign::is_not_the_liquid(foreign, liquid, ground)))
+    /// Whether the liquid is seen in the glass in its own colours, and these and the ground's mean excuse what is foreign.
+    fn is_excused(&mut self, excuse: impl Fn([f32; 3], [f32; 3]) -> bool) -> opencv::Result<bool> {
+        Ok(self.glass.liquid()?.zip(self.ground_bgr).is_some_and(|(liquid, ground)| excuse(liquid, ground)))
     }
 
     /// What is at the lip where no stream is seen.
@@ -330,7 +326,10 @@ impl ColouredLiquid {
         self.ends = ends;
         if let Some(body) = body {
             let is_ground = match body.colour {
-                Some(colour) => self.is_excused(colour)? || foreign::goes_on_beside(colour, self.beside_wide.colours()?),
+                Some(colour) => {
+                    self.is_excused(|liquid, ground| foreign::is_not_the_liquid(colour, liquid, ground))?
+                        || foreign::goes_on_beside(colour, self.beside_wide.colours()?)
+                }
                 None => false,
             };
             if !is_ground {
@@ -411,7 +410,8 @@ impl Liquid for ColouredLiquid {
             Sighting::Dry { confidence } => self.look_again(confidence)?,
             Sighting::Stream { seen_share, doubt: Doubt::None } if self.is_known() => {
                 let beyond = self.seen().beyond(&self.ends)?;
-                let untold = beyond.map(|beyond| self.is_excused(beyond)).transpose()? == Some(false);
+                let excuse = |b| move |l, g| foreign::is_not_the_liquid(b, l, g) || foreign::is_blur(b, l, g);
+                let untold = beyond.map(|beyond| self.is_excused(excuse(beyond))).transpose()? == Some(false);
                 Sighting::Stream { seen_share, doubt: if untold { Doubt::ColoursChanged } else { Doubt::None } }
             }
             other => other,

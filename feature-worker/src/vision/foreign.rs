@@ -49,6 +49,9 @@ const LIT_SHARE: f32 = 0.4;
 const MIXED_COSINE: f32 = 0.8;
 /// And no further than this share of the way to the liquid's. Chosen by hand: a little beyond it.
 const MIXED_MOST: f32 = 1.15;
+/// Just beyond a stream's edge no more than this share of the way is the edge's blur, and no stream that goes on in other colours. Chosen by hand: before an
+/// even wall 0.13 was seen, and of a stream that is no more of one there is nothing to measure.
+const BLUR_SHARE: f32 = 0.25;
 /// Shares that differ by less than this tell no direction. Chosen by hand: two steps of the ground's table.
 const MIXED_LEAST: f32 = 0.03;
 /// Two mean colours are one when they differ by no more than these levels, and [`ALIKE_SHARE`] of their mean level. Chosen by hand.
@@ -188,12 +191,17 @@ pub(super) fn is_not_the_liquid(foreign: [f32; 3], liquid: [f32; 3], ground: [f3
     let brighter: [f32; 3] = std::array::from_fn(|k| foreign[k] - liquid[k]);
     let (least, most) = brighter.iter().fold((f32::MAX, f32::MIN), |(l, m), v| (l.min(*v), m.max(*v)));
     let lit = least > LIT_LEVELS && least >= LIT_SHARE * most;
-    !glows && !lit && !is_mixed(foreign, liquid, ground) && distance(foreign, liquid) > LIKE_LIQUID * distance(ground, liquid)
+    !glows && !lit && mixed_share(foreign, liquid, ground).is_none() && distance(foreign, liquid) > LIKE_LIQUID * distance(ground, liquid)
 }
 
-/// Whether what is foreign may be the ground seen through a little of the liquid. Brightness tells nothing, because the ground has brighter
-/// and darker places.
-fn is_mixed(foreign: [f32; 3], liquid: [f32; 3], ground: [f32; 3]) -> bool {
+/// Whether what is foreign just beyond a stream's edge is the blur of that edge: ground with a little of the liquid's colour.
+pub(super) fn is_blur(foreign: [f32; 3], liquid: [f32; 3], ground: [f32; 3]) -> bool {
+    mixed_share(foreign, liquid, ground).is_some_and(|share| share <= BLUR_SHARE)
+}
+
+/// How far what is foreign is on the way from the ground's colour to the liquid's, if it may be the ground seen through a little of the liquid.
+/// Brightness tells nothing, because the ground has brighter and darker places.
+fn mixed_share(foreign: [f32; 3], liquid: [f32; 3], ground: [f32; 3]) -> Option<f32> {
     let shares = |c: [f32; 3]| c.map(|level| level / c.iter().sum::<f32>().max(1.0));
     let ground = shares(ground);
     let from_ground = |c: [f32; 3]| -> [f32; 3] { std::array::from_fn(|k| shares(c)[k] - ground[k]) };
@@ -202,10 +210,10 @@ fn is_mixed(foreign: [f32; 3], liquid: [f32; 3], ground: [f32; 3]) -> bool {
     let (seen_length, length) = (dot(seen, seen).sqrt(), dot(whole, whole).sqrt());
     if length < MIXED_LEAST {
         // A liquid without a colour of its own, before ground without one.
-        return seen_length < MIXED_LEAST;
+        return (seen_length < MIXED_LEAST).then_some(1.0);
     }
     let along = dot(seen, whole) / length;
-    along >= MIXED_COSINE * seen_length && along <= MIXED_MOST * length
+    (along >= MIXED_COSINE * seen_length && along <= MIXED_MOST * length).then_some(along / length)
 }
 
 /// Whether what is foreign at the lip goes on outside the container, in the square beside it, as only ground does.
