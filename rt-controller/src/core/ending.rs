@@ -19,7 +19,7 @@
 //! | what the camera shows cannot be, by what was learned of vessel and flow | `ImpossibleFlow`, `NothingFlows` |
 //! | [`controller_overran`]: the controller itself was stopped | `ControllerOverrun` |
 //! | [`worker_was_restarted`]: measurements come from another process | `WorkerRestarted` |
-//! | the camera's frames come at another rate ([`super::frame_rate`]) | `FrameRate` |
+//! | the camera's frames come at another rate (`frame_rate.rs`) | `FrameRate` |
 //! | [`Ending::settled`]: the joint did not come upright | `NotUpright` |
 //! | the same: the goal seemed reached, and then too much of it is missing, or was poured | `StreamLost`, `GoalExceeded` |
 //! | the same: a stream without a pause goes on although the joint has long been upright | `ImpossibleFlow` |
