@@ -125,8 +125,12 @@ fn a_high_curve_gives_what_it_gives() {
 /// Protects the check (seed 500925): a gain that has drifted by a quarter is seen by nobody, and excuses as much as it hides.
 #[test]
 fn a_gain_that_drifts_excuses_what_it_hides() {
-    let happens =
-        [(2_516, What::Eye(EyeFault::GainDrift(-0.2583486932077919)), Some("eye-gain-drift")), (16_800, What::Pour(78.36803), None)];
+    let happens = [
+        (2_516, What::Eye(EyeFault::GainDrift(-0.2583486932077919)), Some("eye-gain-drift")),
+        (16_800, What::Pour(78.36803), None),
+        // The pour has time to end.
+        (30_000, What::Resume, None),
+    ];
     let shown = shown(500_925, Series::Cb3, 9, (193.9489163555821, (124_581, 13_250)), &happens);
     assert!(shown.poured[0].true_ml > 90.0, "the drift is not felt: {:?}", shown.poured[0]);
 }
@@ -236,18 +240,14 @@ fn a_mistyped_weight_among_few_is_doubted() {
     assert!(tells(&shown, "doubted: [DoubtfulWeight { name: \"the new one\"", 18.0, 18.5), "{}", shown.story.join("\n"));
 }
 
-/// Protects the operator from a surge that was not counted (seed 501342): a cone gave 100 ml within three frames, more in one of them than was
-/// taken for a measurement, and "done, 169 +- 5 ml" was said where 210 had left. Which goals end in the surge depends on the weights.
+/// Protects the operator from a surge (seed 501342): with a law that was searched on level surfaces, a cone gave 100 ml within three frames for some of these
+/// goals, so that more than 190 ml left. That such a surge is counted is held by `a_surge_beyond_the_episodes_counts` of the estimate.
 #[test]
-fn a_surge_of_a_hundred_ml_counts() {
-    let poured = |goal_ml| {
+fn a_cone_that_surged_is_poured_with_care() {
+    for goal_ml in [130.0f32, 134.0, 138.0, 142.0, 155.0] {
         let happens = [(2_705, What::Pour(goal_ml), None)];
-        shown(501_342, Series::Cb3, 3, (235.82367592759545, (176_091, 270_224)), &happens).poured[0].clone()
-    };
-    let surged: Vec<_> = [130.0, 134.0, 138.0, 142.0, 155.0].map(poured).into_iter().filter(|pour| pour.true_ml > 190.0).collect();
-    assert!(!surged.is_empty(), "there was no surge");
-    for pour in surged {
-        assert!(f64::from(pour.believed_ml) > 190.0 && pour.reason != EndReason::Done, "{pour:?}");
+        let poured = shown(501_342, Series::Cb3, 3, (235.82367592759545, (176_091, 270_224)), &happens).poured[0].clone();
+        assert!(poured.reason == EndReason::Done && (poured.true_ml - f64::from(goal_ml)).abs() < 25.0, "{poured:?}");
     }
 }
 
