@@ -241,13 +241,28 @@ fn a_mistyped_weight_among_few_is_doubted() {
 }
 
 /// Protects the operator from a surge (seed 501342): with a law that was searched on level surfaces, a cone gave 100 ml within three frames for some of these
-/// goals, so that more than 190 ml left. That such a surge is counted is held by `a_surge_beyond_the_episodes_counts` of the estimate.
+/// goals, so that more than 190 ml left. That such a surge is counted is held by the next test.
 #[test]
 fn a_cone_that_surged_is_poured_with_care() {
     for goal_ml in [130.0f32, 134.0, 138.0, 142.0, 155.0] {
         let happens = [(2_705, What::Pour(goal_ml), None)];
         let poured = shown(501_342, Series::Cb3, 3, (235.82367592759545, (176_091, 270_224)), &happens).poured[0].clone();
         assert!(poured.reason == EndReason::Done && (poured.true_ml - f64::from(goal_ml)).abs() < 25.0, "{poured:?}");
+    }
+}
+
+/// Protects the operator from a surge that was not counted (seed 501342): "done, 169 +- 5 ml" was said where 210 had left. With weights of a cylinder the
+/// cone still gives such a surge; it is counted, and is not done.
+#[test]
+fn a_surge_of_a_hundred_ml_counts() {
+    let poured = |goal_ml| {
+        let happens = [(2_500, What::Weights(0), Some("weights-of-another-vessel")), (2_705, What::Pour(goal_ml), None)];
+        shown(501_342, Series::Cb3, 3, (235.82367592759545, (176_091, 270_224)), &happens).poured[0].clone()
+    };
+    let surged: Vec<_> = (130..=158).step_by(2).map(|goal_ml| poured(goal_ml as f32)).filter(|pour| pour.true_ml > 190.0).collect();
+    assert!(!surged.is_empty(), "there was no surge");
+    for pour in surged {
+        assert!(f64::from(pour.believed_ml) > 190.0 && pour.reason != EndReason::Done, "{pour:?}");
     }
 }
 
