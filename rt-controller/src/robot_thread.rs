@@ -148,7 +148,10 @@ impl Progress {
         self.before.unpowered |= hands::without_power(&last);
         self.before.last = Some(last);
         self.next_ns = now_ns + RECONNECT.as_nanos() as u64;
-        match hands::after_session(end.reason(), &last) {
+        let why = hands::after_session(end.reason(), &last);
+        // The session has seen what a person did. Otherwise the program brings the container upright, and nobody watches it.
+        self.before.looked = why.is_some();
+        match why {
             Some(why) => self.wait_for_operator(why, config, note, say),
             None => note.set(format!("robot: {end}"), RobotLink::Connecting, say),
         }

@@ -209,6 +209,27 @@ fn a_stop_after_a_safeguard_was_closed_has_the_last_word() {
     assert!(stopped > 4, "only {stopped} stops found the program at work");
 }
 
+/// Protects a person who stops our program while the link is cut (seed 13828907): the link went between the program's upload and its session, the
+/// operator asked, and the program was stopped. The controller saw none of it, and took the robot back.
+#[test]
+fn a_stop_that_no_session_saw_has_the_last_word() {
+    let mut stopped = 0;
+    for stop_ms in (22_900..24_600).step_by(100) {
+        let happens = [
+            (3_129, What::Robot(Fault::Boot), Some("boot")),
+            (12_009, What::Robot(Fault::BrakeRelease), Some("boot")),
+            (21_468, What::Resume, None),
+            (22_730, What::LinkCut, Some("link-cut")),
+            (22_868, What::Pour(197.48412), None),
+            (stop_ms, What::Robot(Fault::ProgramStop), Some("program-stop")),
+        ];
+        let shown = shown(13_828_907, Series::Cb3, 1, (348.0, (266_117, 645_915)), &happens);
+        stopped += usize::from(tells(&shown, "stopped on the pendant", 22.8, 24.7));
+        assert!(!tells(&shown, "robot connected", 22.7, 24.6), "{}", shown.story.join("\n"));
+    }
+    assert!(stopped > 10, "only {stopped} stops found the program at work");
+}
+
 /// Protects the check (seed 3037645): a freeze of 44 ms within one of 333 ms ended that too, in the simulated robot, and nothing was left to notice.
 #[test]
 fn a_shorter_fault_does_not_end_a_longer_one_of_its_kind() {

@@ -59,11 +59,13 @@ pub fn connect_over(network: &dyn Network, options: &LinkOptions, before: &mut B
     // A port that does not answer takes seconds. Nobody looks at the robot then, and it sends no states yet that would have to be read.
     let mut upload = Upload::open(network, options.address)?;
     let mut state = first_state(&mut dialogue, options, output_recipe)?;
-    ready_for_program(options, before, &state)?;
+    let ready = ready_for_program(options, before, &state);
+    before.looked = true;
+    ready?;
     stands_still((network, options), &mut dialogue, &mut upload, output_recipe, &mut state)?;
     ready_for_program(options, before, &state)?;
 
-    before.uploaded = Some(run);
+    (before.uploaded, before.looked) = (Some(run), false);
     start_program((network, options, before), (&mut dialogue, &mut upload), output_recipe, &mut state, (&program, run))?;
     let now = network.now_ns();
     (state.received_at_ns, state.advanced_at_ns, state.answered_at_ns) = (now, now, now);

@@ -88,6 +88,8 @@ pub struct Before {
     pub asked: bool,
     /// Whether a program was seen since the operator last asked, running or paused, so that what happens to it afterwards matters after all.
     pub ran: bool,
+    /// Whether the robot was looked at since a program of ours was last left alone at work, so that what had happened to it is known.
+    pub looked: bool,
     /// Whether the arm was seen without power or with its brakes on since a program was last seen to run: no program can then be paused.
     pub unpowered: bool,
     /// The run number of the newest program that was uploaded, whether or not a session came of it.
@@ -121,10 +123,11 @@ pub fn moving(earlier: &RobotState, later: &RobotState) -> Option<&'static str> 
 /// After a lost connection it may be taken if the program that we left there says that it has ended by itself, and if the joints that it does not
 /// move stand where they stood. A controller that has just been started knows nothing from before; it leaves a robot alone on which a program of
 /// ours was stopped in the middle of its work. An operator's wish answers for what was before it, and not for a program that ran after it and was
-/// then stopped: whoever stopped that has the last word.
+/// then stopped: whoever stopped that has the last word. Of a program that nobody has watched since it was at work, it is not known which came first.
 pub fn since(before: &Before, state: &RobotState, tilt: Joint) -> Option<Handover> {
     if before.asked {
-        return if before.ran { left_behind(state) } else { None };
+        let unwatched = !before.looked && before.uploaded.is_none_or(|run| run == state.program_run);
+        return if before.ran || unwatched { left_behind(state) } else { None };
     }
     let Some(last) = &before.last else { return left_behind(state) };
     let own_end = matches!(state.program_state, ProgramState::TimedOut | ProgramState::Stopped | ProgramState::Unused);

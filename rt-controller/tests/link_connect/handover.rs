@@ -109,7 +109,7 @@ fn a_robot_that_was_never_started_gets_the_program() {
     // An arm that had no power in between has no paused program, whatever old registers say.
     let used = Robot { registers: (ProgramState::Following, 7, 9), ..booted };
     assert!(Server::new(69, used.clone()).meet().0.is_err());
-    let unpowered = Before { unpowered: true, asked: true, ..Before::default() };
+    let unpowered = Before { unpowered: true, asked: true, looked: true, ..Before::default() };
     assert!(Server::new(70, used.clone()).meet_after(&unpowered).0.is_ok());
     // One that stands at a line came after that.
     let error = Server::new(77, Robot { control_line: 5, ..used }).meet_after(&unpowered).0.err();
@@ -134,7 +134,8 @@ fn a_robot_that_was_handled_meanwhile_waits_for_its_operator() {
         let (session, _) = Server::new(number, Robot { registers, ..Robot::default() }).meet_after(&before);
         assert_eq!(session.as_ref().err().and_then(LinkError::handover), why, "{registers:?}");
         assert_eq!(session.is_ok(), why.is_none(), "{registers:?}");
-        let (session, _) = Server::new(number + 20, Robot { registers, ..Robot::default() }).meet_after(&Before { asked: true, ..before });
+        let (session, _) =
+            Server::new(number + 20, Robot { registers, ..Robot::default() }).meet_after(&Before { asked: true, looked: true, ..before });
         assert!(session.is_ok(), "{registers:?}");
     }
 }
@@ -149,7 +150,25 @@ fn a_stop_after_the_operator_asked_counts() {
         (133, (ProgramState::Unknown, 0, 0), None),
     ];
     for (number, registers, why) in cases {
-        let before = Before { asked: true, ran: true, ..Before::default() };
+        let before = Before { asked: true, ran: true, looked: true, ..Before::default() };
+        let (session, _) = Server::new(number, Robot { registers, ..Robot::default() }).meet_after(&before);
+        assert_eq!(session.as_ref().err().and_then(LinkError::handover), why, "{registers:?}");
+        assert_eq!(session.is_ok(), why.is_none(), "{registers:?}");
+    }
+}
+
+/// Protects people who stop our program while nobody watches it, because its session was lost or never came, or its controller had ended: a wish of
+/// the same time may have come before, so it does not answer for that program. It answers for an older one, and for one that has ended by itself.
+#[test]
+fn a_stop_that_nobody_watched_counts() {
+    let cases = [
+        (181, (ProgramState::Ready, 7, 9), Some(9), Some(Handover::Interrupted)),
+        (182, (ProgramState::Returning, 7, 9), None, Some(Handover::Interrupted)),
+        (183, (ProgramState::Returning, 7, 9), Some(10), None),
+        (184, (ProgramState::TimedOut, 7, 9), Some(9), None),
+    ];
+    for (number, registers, uploaded, why) in cases {
+        let before = Before { asked: true, uploaded, ..Before::default() };
         let (session, _) = Server::new(number, Robot { registers, ..Robot::default() }).meet_after(&before);
         assert_eq!(session.as_ref().err().and_then(LinkError::handover), why, "{registers:?}");
         assert_eq!(session.is_ok(), why.is_none(), "{registers:?}");
@@ -172,7 +191,7 @@ fn a_new_controller_sees_that_a_program_was_stopped() {
         let (session, _) = Server::new(number, Robot { registers, ..Robot::default() }).meet();
         assert_eq!(session.as_ref().err().and_then(LinkError::handover), why, "{registers:?}");
         assert_eq!(session.is_ok(), why.is_none(), "{registers:?}");
-        let before = Before { asked: true, ..Before::default() };
+        let before = Before { asked: true, looked: true, ..Before::default() };
         assert!(Server::new(number + 20, Robot { registers, ..Robot::default() }).meet_after(&before).0.is_ok(), "{registers:?}");
     }
 }
