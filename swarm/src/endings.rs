@@ -12,8 +12,6 @@ use crate::noticing::{is_ordinary, reasons};
 const SAID: (f64, f64) = (5.0, 3.0);
 /// How far what a pour that is done says may be from its goal, ml, and as a share of it: the last decision counts drops that still fell.
 const MISSED: (f64, f64) = (8.0, 0.08);
-/// By how many of its own standard deviations it may be farther: it is then said with the number that it may be a pour of the goal or not.
-const MISSED_SDS: f64 = 2.0;
 /// The least goal that may be begun, ml: about two drops of water, as the controller's own bound, which a check must not share.
 const LEAST_GOAL_ML: f64 = 0.1;
 /// How long before a run a fault that is over may still be its end's reason, s: what it did to the robot, the link or the worker is over by then.
@@ -72,7 +70,7 @@ impl Checks {
             let reason = outcome.reason.words();
             self.violated("said", at_s, format!("{reason}, and it says {said_ml:.1} +- {sd_ml:.1} ml where {true_ml:.1} left"));
         }
-        let missed_ml = MISSED.0 + MISSED_SDS * sd_ml + MISSED.1 * said_ml.abs().max(goal_ml);
+        let missed_ml = MISSED.0 + MISSED.1 * said_ml.abs().max(goal_ml);
         let is_goal = (goal_ml - missed_ml..=goal_ml + missed_ml).contains(&said_ml);
         if outcome.reason == EndReason::Done && !is_goal {
             self.violated("done", at_s, format!("done, and it says {said_ml:.1} ml of {goal_ml:.1}"));

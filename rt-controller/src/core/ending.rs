@@ -25,7 +25,7 @@
 //! | the same: a stream without a pause goes on although the joint has long been upright | `ImpossibleFlow` |
 
 use shared::agent::Decision;
-use shared::control::{EndReason, OFF_ML, is_short};
+use shared::control::{EndReason, is_beyond, is_short};
 use shared::estimator::verdict::Impossible;
 use shared::messages::Feature;
 
@@ -354,8 +354,8 @@ fn goal_is_reached(decision: &Decision) -> bool {
 /// The reason instead of done, if the goal is missed by so much. An estimate without a deviation foresees nothing that could surprise it.
 fn not_done(decision: &Decision) -> Option<EndReason> {
     let (d_ml, goal_ml) = (decision.d_ml, decision.d_ml + decision.poured_ml);
-    let is_beyond = decision.poured_sd_ml > 0.0 && -d_ml > OFF_ML.0 + OFF_ML.1 * decision.poured_ml + 2.0 * decision.poured_sd_ml;
-    is_short(d_ml, goal_ml).then_some(EndReason::StreamLost).or(is_beyond.then_some(EndReason::GoalExceeded))
+    let has_exceeded = decision.poured_sd_ml > 0.0 && is_beyond(d_ml, goal_ml);
+    is_short(d_ml, goal_ml).then_some(EndReason::StreamLost).or(has_exceeded.then_some(EndReason::GoalExceeded))
 }
 
 /// The reason for what cannot be.
