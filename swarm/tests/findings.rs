@@ -230,6 +230,20 @@ fn a_stop_that_no_session_saw_has_the_last_word() {
     assert!(stopped > 10, "only {stopped} stops found the program at work");
 }
 
+/// Protects a cell whose link held back what the robot sent while it was connected (seed 14111571): the controller saw a program at work that answered no
+/// target, because it had ended unused. Nobody had stopped it, so the robot is taken back without its operator.
+#[test]
+fn a_program_that_ended_behind_a_slow_link_is_taken_back() {
+    let happens = [
+        (17_420, What::LinkSplit(2_837), Some("link-split")),
+        (19_398, What::Resume, None),
+        (20_122, What::Robot(Fault::Stall(0.21559452526566691)), Some("stall")),
+        (20_798, What::Pour(40.712276), None),
+    ];
+    let shown = shown(14_111_571, Series::ESeries, 0, (416.0, (266_117, 645_915)), &happens);
+    assert!(tells(&shown, "no target came", 19.5, 23.0), "{}", shown.story.join("\n"));
+}
+
 /// Protects the check (seed 3037645): a freeze of 44 ms within one of 333 ms ended that too, in the simulated robot, and nothing was left to notice.
 #[test]
 fn a_shorter_fault_does_not_end_a_longer_one_of_its_kind() {

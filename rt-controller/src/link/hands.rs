@@ -105,8 +105,9 @@ pub fn after_session(reason: EndReason, last: &RobotState) -> Option<Handover> {
         // Nobody has stopped anything; a full slider, or a closed safeguard, is the operator's own word that work goes on.
         EndReason::SpeedReduced => true,
         EndReason::SafetyStop => last.safety_mode == SAFETY_MODE_SAFEGUARD_STOP,
-        // The program has ended by itself, because this process was late with its first target.
-        EndReason::ProgramStopped => last.program_state == ProgramState::Unused,
+        // The program has ended by itself, because this process was late with its first target. Or it was last seen at work and answered no target: the
+        // link may show it as it was, and nobody was seen to stop it.
+        EndReason::ProgramStopped => last.program_state == ProgramState::Unused || last.runtime_state == RUNTIME_PLAYING,
         _ => false,
     };
     (!comes_back).then_some(Handover::Stopped(reason))

@@ -7,7 +7,7 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering::Relaxed};
 use std::time::Duration;
 
-use rt_controller::link::hands::{Before, Handover};
+use rt_controller::link::hands::{Before, Handover, after_session};
 use rt_controller::link::network::{Network, System, Transport};
 use rt_controller::link::{LinkError, ProgramState, RobotState};
 
@@ -173,6 +173,15 @@ fn a_stop_that_nobody_watched_counts() {
         assert_eq!(session.as_ref().err().and_then(LinkError::handover), why, "{registers:?}");
         assert_eq!(session.is_ok(), why.is_none(), "{registers:?}");
     }
+}
+
+/// Protects a cell behind a slow link: a program that was last seen at work and answers no target was not seen to be stopped, so the controller may look
+/// again; one that was seen to be stopped waits for its operator.
+#[test]
+fn a_program_that_only_does_not_answer_was_stopped_by_nobody() {
+    let last = |runtime_state| RobotState { runtime_state, program_state: ProgramState::Ready, ..RobotState::default() };
+    assert_eq!(after_session(EndReason::ProgramStopped, &last(2)), None);
+    assert_eq!(after_session(EndReason::ProgramStopped, &last(1)), Some(Handover::Stopped(EndReason::ProgramStopped)));
 }
 
 /// Protects people from a controller that was not there when they pressed stop: a program that was at work when it went away was stopped by
