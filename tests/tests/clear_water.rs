@@ -1,5 +1,7 @@
 //! Clear water as a cell's configuration describes it: rendered from its `[view]`, measured by the feature worker's extraction.
 
+use experiments::camera_evaluation::faults::{Chosen, FaultFrames, measure_cell};
+use experiments::camera_evaluation::figures::figures;
 use experiments::camera_evaluation::measure::measure_pours;
 use experiments::camera_setup::{camera_config, image_config};
 use feature_worker::vision::{Extractor, Image};
@@ -46,5 +48,17 @@ fn whole_pours_are_seen_from_beginning_to_end() -> Result<(), Box<dyn std::error
         assert!(figures.missed_flow_percent <= missed_percent, "{background:?}: {figures:?}");
         assert!(figures.unnoticed_percent <= 0.5, "{background:?}: {figures:?}");
     }
+    Ok(())
+}
+
+/// Protects whole pours before an even wall while the white balance hunts by a tenth: the exposure against the remembered ground does not wander off. It grew
+/// to 2.7 times what it was, the ground was then a pattern, and dry pictures had areas of 20,000 px^2.
+#[test]
+fn a_white_balance_that_hunts_makes_no_stream() -> Result<(), Box<dyn std::error::Error>> {
+    let mut frames = FaultFrames::new();
+    measure_cell(true, 2, 1001, Chosen { only: Some("WhiteBalance 0.1"), patience: 1.0, hardship: None }, &mut frames)?;
+    let figures = figures(frames.get("clear, even wall: WhiteBalance 0.1").ok_or("no such row")?);
+    assert!(figures.wet > 50 && figures.false_flow_percent == 0.0, "{figures:?}");
+    assert!(figures.wrong_percent <= 5.0 && figures.unnoticed_percent == 0.0, "{figures:?}");
     Ok(())
 }

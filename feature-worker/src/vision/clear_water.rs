@@ -221,9 +221,11 @@ impl ClearWater {
             });
             // An even ground tells the light wherever it lies. A pattern tells it where it was found.
             let told = self.light.divide_out(&mut self.now, &self.background, height_px, wet)?;
+            self.background.correct_gain(self.light.exposure());
             self.background.register(&self.now, height_px, wet)?;
             if !told {
                 self.light.divide_out(&mut self.now, &self.background, height_px, wet)?;
+                self.background.correct_gain(self.light.exposure());
             }
             self.evidence.compare(&self.rays, [&self.now, &self.earlier], &self.background, height_px, self.flicker.flickers())?;
             self.looked = true;

@@ -177,8 +177,13 @@ impl Background {
     /// The picture that comes is brighter than the last one by this factor, as far as that is known.
     pub(super) fn expect_gain(&mut self, factor: f32) {
         if (factor - 1.0).abs() > STEP_LEAST {
-            self.now.gain *= factor;
+            self.correct_gain(factor);
         }
+    }
+
+    /// The picture is brighter against the memory than was thought by this factor.
+    pub(super) fn correct_gain(&mut self, factor: f32) {
+        self.now.gain *= factor;
     }
 
     /// The background's motion since the picture with which pictures are compared.
@@ -254,7 +259,8 @@ impl Background {
         let picture = SmallPicture { pixels: now.data_typed()?, width: self.size.width as usize };
         let (pose, side, size, origin) = (self.now, self.side, self.size, self.origin);
         let memory: &mut [Vec4b] = self.memory.data_typed_mut()?;
-        let exposure = (256.0 / pose.gain) as i32;
+        // Rounded: cut off, the memory would grow darker and darker.
+        let exposure = (256.0 / pose.gain).round() as i32;
         let calm = (3.0 * (dry.calm / pose.gain) * (dry.calm / pose.gain)) as i32;
         let everywhere = LinearField::constant(2.0);
         let (right, inner, outer) =

@@ -45,6 +45,8 @@ pub(super) struct Light {
     bands: Vec<(f32, f32)>,
     /// Gains of blue, green and red.
     colours: [f32; 3],
+    /// The exposure against the remembered ground. It is not divided out.
+    exposure: f32,
     /// Whether the gains are not those of an undisturbed picture.
     differs: bool,
     /// Whether there are bands in front of a pattern, so that the light is not told.
@@ -92,6 +94,7 @@ impl Light {
             size,
             bands: Vec::with_capacity(bands),
             colours: [1.0; 3],
+            exposure: 1.0,
             differs: false,
             uneven: false,
             ratios: Vec::with_capacity(places * bands),
@@ -164,14 +167,21 @@ impl Light {
         }
         self.ratios.clear();
         self.ratios.extend(self.bands.iter().map(|(_, gain)| *gain));
-        let all = median(&mut self.ratios);
-        let uneven = self.bands.iter().any(|(_, gain)| (gain / all - 1.0).abs() > BAND_LEAST);
+        self.exposure = median(&mut self.ratios);
+        self.bands.iter_mut().for_each(|(_, gain)| *gain /= self.exposure);
+        let uneven = self.bands.iter().any(|(_, gain)| (gain - 1.0).abs() > BAND_LEAST);
         let tinted = self.colours.iter().any(|colour| (colour - 1.0).abs() > COLOUR_LEAST);
         self.differs = uneven || tinted;
         if self.differs {
             self.divide(now)?;
         }
         Ok(true)
+    }
+
+    /// By what the picture's exposure differs from that which was expected against the remembered ground, where light was divided out. The exposure stays in
+    /// the picture: were it divided out too, nothing would tell the exposure against the memory any more, and it would wander.
+    pub(super) fn exposure(&self) -> f32 {
+        if self.differs { self.exposure } else { 1.0 }
     }
 
     /// Gains of blue, green and red in a row of the small picture.
@@ -210,7 +220,7 @@ impl Light {
         let width = self.size.width as usize;
         for (y, row) in now.data_typed_mut::<Vec4b>()?.chunks_exact_mut(width).enumerate() {
             // 256 is 1.
-            let factors = self.gains(y as f32).map(|gain| (256.0 / gain) as u32);
+            let factors = self.gains(y as f32).map(|gain| (256.0 / gain).round() as u32);
             for pixel in row {
                 for k in 0..3 {
                     pixel[k] = ((u32::from(pixel[k]) * factors[k] + 128) >> 8).min(255) as u8;
