@@ -128,7 +128,11 @@ pub fn keep_robot_connected(
                     note.set(String::new(), RobotLink::Connected, say);
                     say(Level::Info, "robot connected, program running");
                 }
-                Err(e) => progress.failed(network.now_ns(), &e, config, note, say),
+                Err(e) => {
+                    progress.failed(network.now_ns(), &e, config, note, say);
+                    // The operator who asked during the attempt may have done so before what it saw.
+                    progress.before.looked &= !exchange.resume.load(Relaxed);
+                }
             }
         }
         network.sleep(BEAT);
@@ -148,10 +152,9 @@ impl Progress {
         self.before.unpowered |= hands::without_power(&last);
         self.before.last = Some(last);
         self.next_ns = now_ns + RECONNECT.as_nanos() as u64;
-        let why = hands::after_session(end.reason(), &last);
-        // The session has seen what a person did. Otherwise the program brings the container upright, and nobody watches it.
-        self.before.looked = why.is_some();
-        match why {
+        // The program may go on, or bring the container upright, and nobody watches it.
+        self.before.looked = false;
+        match hands::after_session(end.reason(), &last) {
             Some(why) => self.wait_for_operator(why, config, note, say),
             None => note.set(format!("robot: {end}"), RobotLink::Connecting, say),
         }
@@ -160,7 +163,11 @@ impl Progress {
     /// Takes note of an attempt that failed with `e`.
     fn failed(&mut self, now_ns: u64, e: &LinkError, config: &Config, note: &RobotNote, say: &dyn Fn(Level, &str)) {
         self.next_ns = now_ns + RECONNECT.as_nanos() as u64;
-        self.before.ran |= matches!(e, LinkError::ProgramRunning { .. } | LinkError::MayNotMove { program_there: true, .. });
+        let is_there = matches!(e, LinkError::ProgramRunning { .. } | LinkError::MayNotMove { program_there: true, .. });
+        self.before.ran |= is_there;
+        // What a program that is there comes to is not seen yet. Behind a hindrance it is not asked what became of one, so a wish before does not cover it.
+        self.before.looked &= !is_there;
+        self.before.looked |= matches!(e, LinkError::MayNotMove { program_there: false, .. }) && !self.before.asked;
         self.before.unpowered = match e {
             LinkError::ProgramRunning { .. } | LinkError::MayNotMove { program_there: true, .. } => false,
             LinkError::MayNotMove { unpowered: true, .. } => true,
@@ -186,6 +193,8 @@ impl Progress {
     fn wait_for_operator(&mut self, why: Handover, config: &Config, note: &RobotNote, say: &dyn Fn(Level, &str)) {
         self.waits = true;
         self.wish_until_ns = None;
+        // What was seen now comes before whatever the operator asks for later. A program that is off its track is still on its way upright.
+        self.before.looked = why != Handover::Stopped(EndReason::NotFollowed);
         let remedy = why.remedy();
         let line = format!("robot {}: {why}; it is not taken back by itself: {remedy}, then {TAKE_BACK}", config.robot.address);
         note.set(line, RobotLink::WaitsForOperator, say);

@@ -110,8 +110,8 @@ impl Outcome {
     }
 }
 
-/// A pour that ends off its goal by more than so many ml and this share of it, or short of a small goal by half, is not done, however little is known of
-/// what was poured. Among the fixed seeds of docs/SWARM.md one that was done was shorter.
+/// A pour that ends off its goal by more than so many ml and this share of it, or short of a small goal by half, is not done, however large its deviation;
+/// a plain sum, which has none, is only looked at for being short. Among the fixed seeds of docs/SWARM.md one that was done was shorter.
 const OFF_ML: (f32, f32) = (8.0, 0.08);
 
 /// Whether a pour that ends with `d_ml` of `goal_ml` still to pour is too short to be one that is done.
@@ -174,7 +174,7 @@ pub enum EndReason {
     NothingFlows,
     /// The camera's frames do not come at `camera.fps`.
     FrameRate,
-    /// The goal seemed reached, and then far more left than the goal and the deviation allow.
+    /// The goal seemed reached, and then more left than a pour that is done may have ([`is_beyond`]).
     GoalExceeded,
 }
 

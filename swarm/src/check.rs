@@ -127,6 +127,8 @@ pub struct Checks {
     echoed: i32,
     /// When the operator last asked for the robot, s.
     pub(crate) asked_s: f64,
+    /// Whether the controller could not know then that what a person had done came before.
+    is_unclear: bool,
     /// Who knows that a person stopped our program, and that nobody asked for the robot since.
     pub(crate) taken: Taken,
     /// When every fault of the robot that lasts was ended, s.
@@ -192,6 +194,7 @@ impl Checks {
             sent: 0,
             echoed: 0,
             asked_s: f64::NEG_INFINITY,
+            is_unclear: false,
             taken: Taken::default(),
             cleared_s: Vec::new(),
             waits: Waits::default(),
@@ -214,6 +217,7 @@ impl Checks {
     pub fn happens(&mut self, what: &What, machine: &Machine, lives: bool, (at_s, remedied_s): (f64, f64)) {
         match what {
             What::Pour(_) | What::Record(..) | What::Resume if lives => {
+                self.is_unclear = self.taken.controller || self.taken.registers;
                 (self.taken, self.asked_s) = (Taken::default(), at_s);
             }
             // Whoever is killed pours nothing, and the robot's program has to bring the container upright by itself.
@@ -239,6 +243,11 @@ impl Checks {
             let phase = self.phase(at_s);
             self.faults.push(Injected { what: what.clone(), at_s, until_s, phase });
         }
+    }
+
+    /// The operator has asked for the robot. Unless the controller had said that it `waits` for that, it cannot know whether what a person did came before.
+    pub fn asked(&mut self, waits: bool) {
+        self.is_unclear &= !waits;
     }
 
     /// A program begins on the robot.
@@ -289,7 +298,7 @@ impl Checks {
         self.targets_numbered(machine, at_s);
         self.stays_on_way_back(machine, at_s);
         self.upright(machine, alpha_deg, active, at_s);
-        let asked = (!self.taken.controller && !self.taken.registers).then_some(self.asked_s);
+        let asked = (!self.taken.controller && !self.taken.registers && !self.is_unclear).then_some(self.asked_s);
         let stands_until_s = self.faults.iter().filter(|f| hinders(&f.what)).map(|f| f.until_s).fold(0.0, f64::max);
         // A container that stands tilted, or a paused program, is for the operator to set right.
         let is_paused = matches!(machine.runtime_state(), RuntimeState::Pausing | RuntimeState::Paused);

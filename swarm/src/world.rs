@@ -86,8 +86,12 @@ impl World<'_> {
         site.set_now(next_ns);
         if wake_ns > next_ns {
             for order in site.step() {
-                // As the service does: an order that moves asks for the robot, if a person had it; an abort does not.
-                if order != Some(Order::Abort) && life.note.get().link == RobotLink::WaitsForOperator {
+                // As the service and its clients do: `resume` always asks for the robot, an order that moves if a person had it, and an abort never.
+                let waits = life.note.get().link == RobotLink::WaitsForOperator;
+                if order != Some(Order::Abort) {
+                    site.checks.asked(waits);
+                }
+                if order.is_none() || (waits && order != Some(Order::Abort)) {
                     life.note.asked();
                     life.exchange.resume.store(true, Relaxed);
                 }

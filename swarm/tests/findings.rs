@@ -230,6 +230,48 @@ fn a_stop_that_no_session_saw_has_the_last_word() {
     assert!(stopped > 10, "only {stopped} stops found the program at work");
 }
 
+/// Protects a person who stops our program before the controller has seen what became of it, where a hindrance stands at its first look: that look does not
+/// ask for the program, so the operator's wish from before it does not answer for the stop.
+#[test]
+fn a_stop_behind_a_hindrance_has_the_last_word() {
+    let mut stopped = 0;
+    for stop_ms in (22_900..23_700).step_by(100) {
+        let happens = [
+            (3_129, What::Robot(Fault::Boot), Some("boot")),
+            (12_009, What::Robot(Fault::BrakeRelease), Some("boot")),
+            (21_468, What::Resume, None),
+            (22_730, What::LinkCut, Some("link-cut")),
+            (22_868, What::Pour(197.48412), None),
+            (22_880, What::Robot(Fault::SpeedSlider(0.5)), Some("speed-slider")),
+            (stop_ms, What::Robot(Fault::ProgramStop), Some("program-stop")),
+            (25_000, What::Robot(Fault::SpeedSlider(1.0)), Some("speed-slider")),
+        ];
+        let shown = shown(13_828_907, Series::Cb3, 1, (348.0, (266_117, 645_915)), &happens);
+        stopped += usize::from(tells(&shown, "stopped on the pendant", 22.8, 23.8));
+        assert!(!tells(&shown, "robot connected", 22.7, 37.0), "{}", shown.story.join("\n"));
+    }
+    assert!(stopped > 5, "only {stopped} stops found the program at work");
+}
+
+/// Protects a person who stops our program on its way upright while the controller still tries to reach the robot, just after the operator has asked: the attempt
+/// that is under way sees the stop, but not the wish, which came before it.
+#[test]
+fn a_stop_during_an_attempt_has_the_last_word() {
+    let mut stopped = 0;
+    for stop_ms in (8_450..8_640).step_by(30) {
+        let happens = [
+            (3_000, What::Pour(120.0), None),
+            (7_000, What::Robot(Fault::Offline(0.3)), Some("offline")),
+            (8_150, What::LinkStall(500), Some("link-stall")),
+            (stop_ms - 250, What::Resume, None),
+            (stop_ms, What::Robot(Fault::ProgramStop), Some("program-stop")),
+        ];
+        let shown = shown(13_828_907, Series::Cb3, 1, (348.0, (266_117, 645_915)), &happens);
+        stopped += usize::from(tells(&shown, "stopped on the pendant", 8.0, 10.1));
+    }
+    assert!(stopped > 3, "only {stopped} stops found the program at work");
+}
+
 /// Protects a cell whose link held back what the robot sent while it was connected (seed 14111571): the controller saw a program at work that answered no
 /// target, because it had ended unused. Nobody had stopped it, so the robot is taken back without its operator.
 #[test]

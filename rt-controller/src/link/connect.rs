@@ -59,9 +59,7 @@ pub fn connect_over(network: &dyn Network, options: &LinkOptions, before: &mut B
     // A port that does not answer takes seconds. Nobody looks at the robot then, and it sends no states yet that would have to be read.
     let mut upload = Upload::open(network, options.address)?;
     let mut state = first_state(&mut dialogue, options, output_recipe)?;
-    let ready = ready_for_program(options, before, &state);
-    before.looked = true;
-    ready?;
+    ready_for_program(options, before, &state)?;
     stands_still((network, options), &mut dialogue, &mut upload, output_recipe, &mut state)?;
     ready_for_program(options, before, &state)?;
 

@@ -84,11 +84,11 @@ pub(super) fn remedy(reason: EndReason) -> &'static str {
 pub struct Before {
     /// The last session's newest state; `None` before the first session.
     pub last: Option<RobotState>,
-    /// Whether the operator asks for the robot now, so that it does not matter what happened meanwhile.
+    /// Whether the operator asks for the robot now, so that it does not matter what happened before.
     pub asked: bool,
     /// Whether a program was seen since the operator last asked, running or paused, so that what happens to it afterwards matters after all.
     pub ran: bool,
-    /// Whether the robot was looked at since a program of ours was last left alone at work, so that what had happened to it is known.
+    /// Whether it was seen, before the operator last asked, what had become of the newest program of ours.
     pub looked: bool,
     /// Whether the arm was seen without power or with its brakes on since a program was last seen to run: no program can then be paused.
     pub unpowered: bool,
@@ -128,7 +128,7 @@ pub fn moving(earlier: &RobotState, later: &RobotState) -> Option<&'static str> 
 pub fn since(before: &Before, state: &RobotState, tilt: Joint) -> Option<Handover> {
     if before.asked {
         let unwatched = !before.looked && before.uploaded.is_none_or(|run| run == state.program_run);
-        return if before.ran || unwatched { left_behind(state) } else { None };
+        return left_behind(state).filter(|why| before.ran || (unwatched && *why == Handover::Interrupted));
     }
     let Some(last) = &before.last else { return left_behind(state) };
     let own_end = matches!(state.program_state, ProgramState::TimedOut | ProgramState::Stopped | ProgramState::Unused);
