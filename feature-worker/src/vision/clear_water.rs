@@ -131,6 +131,8 @@ pub(crate) struct ClearWater {
     compared: u32,
     /// A picture was compared with the ground.
     looked: bool,
+    /// The present picture was.
+    judged: bool,
     /// Legs of a stream that may still be where it was last seen, px.
     held: Option<[f32; 2]>,
     /// In which share of the pictures without such a doubt the ground was even, the last ones above all.
@@ -178,6 +180,7 @@ impl ClearWater {
             earlier: Mat::default(),
             compared: 0,
             looked: false,
+            judged: false,
             held: None,
             even_share: 0.0,
             even_pictures: 0.0,
@@ -228,7 +231,7 @@ impl ClearWater {
                 self.background.correct_gain(self.light.exposure());
             }
             self.evidence.compare(&self.rays, [&self.now, &self.earlier], &self.background, height_px, self.flicker.flickers())?;
-            self.looked = true;
+            (self.looked, self.judged) = (true, true);
             let moved = self.background.moved();
             self.evidence.weigh(&self.rays, &moved, self.water.stream())?;
             let best = self.lines.best(&self.evidence, &self.rays, &moved, self.water.stream())?.map(|found| {
@@ -447,8 +450,8 @@ impl Liquid for ClearWater {
     }
 
     fn hold_ground(&mut self, legs_px: Option<[f32; 2]>) {
-        // A ground that was shifted or torn is not known, and what is not known looks even.
-        if legs_px.is_none() && self.disturbed.doubt().is_none() {
+        // Of a picture that could not be looked at, nothing is known.
+        if std::mem::take(&mut self.judged) && legs_px.is_none() {
             let even = self.evidence.even();
             self.even_pictures += 1.0;
             let usual = self.pace.follows(EVEN_FOLLOWS[usize::from(!even)]);

@@ -85,7 +85,12 @@ impl Wandering {
 
     /// Says that a pause lies before the next picture: the light's way has a gap.
     pub(super) fn interrupt(&mut self) {
-        self.told = 0;
+        self.begin_anew();
+    }
+
+    /// Begins a new way. A light that only ever adds up would be no number in the end.
+    fn begin_anew(&mut self) {
+        (self.told, self.light) = (0, [0.0; 3]);
     }
 
     /// Takes the next picture.
@@ -95,7 +100,7 @@ impl Wandering {
         match self.change(now) {
             Some(change) => (0..3).for_each(|k| self.light[k] += change[k]),
             // The light's way has a gap that nothing bridges: of a light that rises and falls, only the rise may have been told.
-            None => self.told = 0,
+            None => self.begin_anew(),
         }
         self.keep(now);
         if (0..3).any(|k| self.is_far(now, COLOURS, |l| l[k] - mean(l))) {
@@ -131,7 +136,7 @@ impl Wandering {
         }
         let shown = !self.scratch.is_empty() && median(&mut self.scratch) >= SHOWS * (high - low);
         if !shown {
-            self.told = 0;
+            self.begin_anew();
             self.keep(now);
         }
         shown

@@ -113,7 +113,8 @@ fn wrapped(at: usize, side: usize) -> usize {
 #[inline(always)]
 fn fresh_grey(pixel: &Vec4b, age: u8) -> i32 {
     let [b, g, r, known] = pixel.0;
-    let grey = (29 * i32::from(b) + 150 * i32::from(g) + 77 * i32::from(r)) >> 8;
+    // Rounded, as OpenCV does with the picture: what is half a level too dark here makes the exposure too large, and the memory darker and darker.
+    let grey = (29 * i32::from(b) + 150 * i32::from(g) + 77 * i32::from(r) + 128) >> 8;
     if known > 0 && age <= POINT_AGE { grey } else { -1 }
 }
 

@@ -15,10 +15,12 @@ const FOLLOW: i32 = 90;
 /// How fast the memory follows where it does not fit what is seen, of 256. Tuned as [`FORGOTTEN`] was.
 const FOLLOW_SLOWLY: i32 = 26;
 
-/// A pixel between `a` and `b`, four bytes at once in the low halves of 16 bits; `w` of 256 is the share of `b`.
+/// A pixel between `a` and `b`, four bytes at once in the low halves of 16 bits; `w` of 256 is the share of `b`. What is halfway between two levels is rounded
+/// up in even rows and down in `odd` ones: always up, a background at rest between two pixels would grow brighter and brighter.
 #[inline(always)]
-fn mix(a: u64, b: u64, w: u64) -> u64 {
-    let sum = a.wrapping_mul(256 - w).wrapping_add(b.wrapping_mul(w)).wrapping_add(0x0080_0080_0080_0080);
+fn mix(a: u64, b: u64, w: u64, odd: u64) -> u64 {
+    let half = 0x0080_0080_0080_0080 - odd * 0x0001_0001_0001_0001;
+    let sum = a.wrapping_mul(256 - w).wrapping_add(b.wrapping_mul(w)).wrapping_add(half);
     (sum >> 8) & 0x00ff_00ff_00ff_00ff
 }
 
@@ -50,9 +52,9 @@ impl SmallPicture<'_> {
             let corner = (y >> 16) as usize * self.width + (x >> 16) as usize;
             let rows = (self.pixels.get(corner..corner + 2), self.pixels.get(corner + self.width..corner + self.width + 2));
             if let (Some(upper), Some(lower)) = rows {
-                let (wx, wy) = (u64::from(x as u32 >> 8 & 255), u64::from(y as u32 >> 8 & 255));
-                let top = mix(spread(upper[0].0), spread(upper[1].0), wx);
-                *sample = mix(top, mix(spread(lower[0].0), spread(lower[1].0), wx), wy);
+                let (wx, wy, odd) = (u64::from(x as u32 >> 8 & 255), u64::from(y as u32 >> 8 & 255), u64::from(y as u32 >> 16 & 1));
+                let top = mix(spread(upper[0].0), spread(upper[1].0), wx, odd);
+                *sample = mix(top, mix(spread(lower[0].0), spread(lower[1].0), wx, odd), wy, odd);
             }
             (x, y) = (x + dx, y + dy);
         }

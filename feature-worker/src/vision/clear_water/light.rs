@@ -112,7 +112,7 @@ impl Light {
         height_px: LinearField,
         wet: Option<WetPlaces>,
     ) -> opencv::Result<bool> {
-        self.differs = false;
+        (self.differs, self.uneven) = (false, false);
         if background.is_new() {
             return Ok(false);
         }
