@@ -125,6 +125,8 @@ pub struct Checks {
     /// How many targets were sent in the newest session, and the number of the newest one that the robot took.
     sent: i32,
     echoed: i32,
+    /// Whether the arm lags by so much that the controller may say that it does not follow.
+    pub(crate) is_slow: bool,
     /// When the operator last asked for the robot, s.
     pub(crate) asked_s: f64,
     /// Whether the controller could not know then that what a person had done came before.
@@ -193,6 +195,7 @@ impl Checks {
             tilted_since_s: None,
             sent: 0,
             echoed: 0,
+            is_slow: false,
             asked_s: f64::NEG_INFINITY,
             is_unclear: false,
             taken: Taken::default(),

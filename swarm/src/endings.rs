@@ -25,7 +25,7 @@ impl Checks {
         let since_s = at_s - f64::from(outcome.seconds) - LATELY_S;
         let reason = outcome.reason;
         let lately = || self.faults.iter().filter(|f| f.until_s >= since_s);
-        let named = lately().any(|f| reasons(&f.what).contains(&reason));
+        let named = lately().any(|f| reasons(&f.what).contains(&reason)) || (self.is_slow && reason == EndReason::NotFollowed);
         if !is_ordinary(reason) && !named {
             let faults: Vec<_> = lately().map(|f| f.what.name()).collect();
             self.violated("reason", at_s, format!("it ended with {reason:?}, and what happened was {faults:?}"));

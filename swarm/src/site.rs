@@ -40,6 +40,9 @@ const CONFIG: &str = include_str!("../../config/sim.toml");
 pub const START_NS: u64 = 1_000_000_000;
 /// Period of the camera, ns: 30 Hz, a little off the loop's own.
 const FRAME_NS: u64 = 33_340_000;
+/// An arm that lags by more than this may be called one that does not follow, s: the controller's window is 72 ms longer than the lag that it expects of
+/// servo and program together, of which this is [`simulator::ur::servo::LAG_S`] (docs/ROBOT.md).
+const SLOW_LAG_S: f64 = 0.08;
 /// Longest step of the liquid, ns: that of the simulated cell.
 const PHYSICS_NS: u64 = 4_000_000;
 /// Largest ordinary lateness of a tick, ns (docs/REALTIME.md).
@@ -131,6 +134,7 @@ impl Site {
         let frame_at_ns = START_NS + random.random_range(0..FRAME_NS);
         vessels::fill(&rig, &mut container, plan.fill_ml, &mut random);
         let mut checks = Checks::new(Settings::new(checked), cycle_ns as f64 / 1e9);
+        checks.is_slow = plan.lag_s > SLOW_LAG_S;
         let camera = match plan.depth {
             Depth::Area => None,
             Depth::Camera => {
@@ -438,7 +442,8 @@ impl Site {
                     self.costs.cleared(at_s);
                 }
                 if let Fault::Offline(s) = fault {
-                    self.offline_until_ns = self.now_ns + (s * 1e9) as u64;
+                    // A shorter one does not end a longer one.
+                    self.offline_until_ns = self.offline_until_ns.max(self.now_ns + (s * 1e9) as u64);
                 }
                 self.robot.inject(fault);
             }

@@ -286,6 +286,28 @@ fn a_program_that_ended_behind_a_slow_link_is_taken_back() {
     assert!(tells(&shown, "no target came", 19.5, 23.0), "{}", shown.story.join("\n"));
 }
 
+/// Protects the check (seeds 14722986, 14751143): an arm that lags by ten times what was learned is slower than it is commanded, so that a pour may end
+/// because it does not follow, without a fault.
+#[test]
+fn an_arm_that_lags_by_far_may_not_follow() {
+    let happens = [(2_532, What::Pour(66.97989), None)];
+    let shown = lagging(14_722_986, (Series::ESeries, 0.119), 9, (151.0, (266_117, 645_915)), &happens);
+    println!("{}", shown.story.join("\n"));
+    assert_eq!(shown.poured[0].reason, EndReason::NotFollowed);
+}
+
+/// Protects the check (seed 14770189): a shorter time without the robot does not end a longer one.
+#[test]
+fn a_shorter_time_offline_does_not_end_a_longer_one() {
+    let happens = [
+        (3_000, What::Robot(Fault::Offline(12.8)), Some("offline")),
+        (5_000, What::Robot(Fault::Offline(0.4)), Some("offline")),
+        (12_000, What::Pour(40.0), None),
+    ];
+    let shown = shown(14_770_189, Series::Cb3, 0, (300.0, (266_117, 645_915)), &happens);
+    assert!(!tells(&shown, "robot connected", 3.0, 15.7), "{}", shown.story.join("\n"));
+}
+
 /// Protects the check (seed 3037645): a freeze of 44 ms within one of 333 ms ended that too, in the simulated robot, and nothing was left to notice.
 #[test]
 fn a_shorter_fault_does_not_end_a_longer_one_of_its_kind() {
