@@ -105,10 +105,12 @@ pub fn keep_robot_connected(
         Progress { before: Before::default(), connected: false, waits: false, wish_until_ns: None, next_ns: network.now_ns() };
     while !stop.load(Relaxed) {
         let now_ns = network.now_ns();
+        // Who asks for a robot that the controller has, asks for nothing: if the session is over, that came before or after, and nobody knows.
+        let asked = exchange.resume.swap(false, Relaxed) && !progress.connected;
         while let Some((session, end)) = exchange.old_sessions.pop() {
             progress.take_back(now_ns, &session, end, config, note, say);
         }
-        if exchange.resume.swap(false, Relaxed) && !progress.connected {
+        if asked {
             progress.waits = false;
             progress.wish_until_ns = Some(now_ns + WISH.as_nanos() as u64);
             progress.before.ran = false;

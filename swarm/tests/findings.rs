@@ -272,6 +272,37 @@ fn a_stop_during_an_attempt_has_the_last_word() {
     assert!(stopped > 3, "only {stopped} stops found the program at work");
 }
 
+/// Protects a person who stops our program just after the operator has asked for a robot that the controller has (seed 14810214): the thread that connects took
+/// the wish, which came before the stop, for one that came after it.
+#[test]
+fn a_stop_after_a_needless_wish_has_the_last_word() {
+    for stop_ms in (5_000..5_200).step_by(10) {
+        let happens = [(4_990, What::Resume, None), (stop_ms, What::Robot(Fault::ProgramStop), Some("program-stop"))];
+        let shown = shown(14_810_214, Series::Cb3, 0, (300.0, (266_117, 645_915)), &happens);
+        assert!(
+            tells(&shown, "stopped on the pendant", 4.9, 5.3) && !tells(&shown, "robot connected", 5.0, 20.0),
+            "{}",
+            shown.story.join("\n")
+        );
+    }
+}
+
+/// Protects a person and the operator (seed 14447400): the program was stopped while nobody watched it, and the operator asked half a second later, before the
+/// controller had looked. It cannot know which came first, and asks again; then it takes the robot.
+#[test]
+fn an_ask_that_cannot_be_placed_is_asked_for_again() {
+    let happens = [
+        (2_792, What::Robot(Fault::Stall(0.094)), Some("stall")),
+        (2_938, What::Robot(Fault::ProgramStop), Some("program-stop")),
+        (3_382, What::Pour(50.903122), None),
+        (6_000, What::Resume, None),
+    ];
+    let shown = shown(14_447_400, Series::Cb3, 0, (224.0, (266_117, 645_915)), &happens);
+    let text = shown.story.join("\n");
+    assert!(tells(&shown, "connection to the robot lost", 2.8, 2.938), "{text}");
+    assert!(!tells(&shown, "robot connected", 2.8, 6.0) && tells(&shown, "robot connected", 6.0, 8.0), "{text}");
+}
+
 /// Protects a cell whose link held back what the robot sent while it was connected (seed 14111571): the controller saw a program at work that answered no
 /// target, because it had ended unused. Nobody had stopped it, so the robot is taken back without its operator.
 #[test]
