@@ -135,7 +135,7 @@ pub(crate) struct ClearWater {
     judged: bool,
     /// Legs of a stream that may still be where it was last seen, px.
     held: Option<[f32; 2]>,
-    /// In which share of the pictures without such a doubt the ground was even, the last ones above all.
+    /// In which share of the pictures that were compared with the ground, and in which no stream may still be, it was even, the last ones above all.
     even_share: f32,
     /// Pictures of which that is the share, the first ones.
     even_pictures: f32,

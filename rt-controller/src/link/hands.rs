@@ -124,7 +124,8 @@ pub fn moving(earlier: &RobotState, later: &RobotState) -> Option<&'static str> 
 /// After a lost connection it may be taken if the program that we left there says that it has ended by itself, and if the joints that it does not
 /// move stand where they stood. A controller that has just been started knows nothing from before; it leaves a robot alone on which a program of
 /// ours was stopped in the middle of its work. An operator's wish answers for what was before it, and not for a program that ran after it and was
-/// then stopped: whoever stopped that has the last word. Of a program that nobody has watched since it was at work, it is not known which came first.
+/// then stopped: whoever stopped that has the last word. Of a program that nobody has watched since it was at work, it
+/// is not known whether the stop or the wish came first.
 pub fn since(before: &Before, state: &RobotState, tilt: Joint) -> Option<Handover> {
     if before.asked {
         let unwatched = !before.looked && before.uploaded.is_none_or(|run| run == state.program_run);

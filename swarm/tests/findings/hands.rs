@@ -3,7 +3,19 @@
 use simulator::ur::{Fault, Series};
 use swarm::what::What;
 
-use super::{shown, tells};
+use super::{Happens, shown, tells};
+
+/// A link that goes between the program's upload and its session, after which the operator asks; then what else happens (seed 13828907).
+fn lost_at_upload(then: impl IntoIterator<Item = Happens>) -> Vec<Happens> {
+    let before = [
+        (3_129, What::Robot(Fault::Boot), Some("boot")),
+        (12_009, What::Robot(Fault::BrakeRelease), Some("boot")),
+        (21_468, What::Resume, None),
+        (22_730, What::LinkCut, Some("link-cut")),
+        (22_868, What::Pour(197.48412), None),
+    ];
+    before.into_iter().chain(then).collect()
+}
 
 /// Protects people from a controller that was killed, and started again after they had pressed stop (seed 502373): it took the robot unasked,
 /// although the program's registers say that it was still at work when it went away.
@@ -79,14 +91,7 @@ fn a_stop_after_a_safeguard_was_closed_has_the_last_word() {
 fn a_stop_that_no_session_saw_has_the_last_word() {
     let mut stopped = 0;
     for stop_ms in (22_900..24_600).step_by(100) {
-        let happens = [
-            (3_129, What::Robot(Fault::Boot), Some("boot")),
-            (12_009, What::Robot(Fault::BrakeRelease), Some("boot")),
-            (21_468, What::Resume, None),
-            (22_730, What::LinkCut, Some("link-cut")),
-            (22_868, What::Pour(197.48412), None),
-            (stop_ms, What::Robot(Fault::ProgramStop), Some("program-stop")),
-        ];
+        let happens = lost_at_upload([(stop_ms, What::Robot(Fault::ProgramStop), Some("program-stop"))]);
         let shown = shown(13_828_907, Series::Cb3, 1, (348.0, (266_117, 645_915)), &happens);
         stopped += usize::from(tells(&shown, "stopped on the pendant", 22.8, 24.7));
         assert!(!tells(&shown, "robot connected", 22.7, 24.6), "{}", shown.story.join("\n"));
@@ -100,16 +105,11 @@ fn a_stop_that_no_session_saw_has_the_last_word() {
 fn a_stop_behind_a_hindrance_has_the_last_word() {
     let mut stopped = 0;
     for stop_ms in (22_900..23_700).step_by(100) {
-        let happens = [
-            (3_129, What::Robot(Fault::Boot), Some("boot")),
-            (12_009, What::Robot(Fault::BrakeRelease), Some("boot")),
-            (21_468, What::Resume, None),
-            (22_730, What::LinkCut, Some("link-cut")),
-            (22_868, What::Pour(197.48412), None),
+        let happens = lost_at_upload([
             (22_880, What::Robot(Fault::SpeedSlider(0.5)), Some("speed-slider")),
             (stop_ms, What::Robot(Fault::ProgramStop), Some("program-stop")),
             (25_000, What::Robot(Fault::SpeedSlider(1.0)), Some("speed-slider")),
-        ];
+        ]);
         let shown = shown(13_828_907, Series::Cb3, 1, (348.0, (266_117, 645_915)), &happens);
         stopped += usize::from(tells(&shown, "stopped on the pendant", 22.8, 23.8));
         assert!(!tells(&shown, "robot connected", 22.7, 37.0), "{}", shown.story.join("\n"));
