@@ -18,6 +18,7 @@ mod drawn;
 mod measure;
 mod python;
 
+use drawn::Ground;
 use measure::StageTimes;
 
 /// The most frames that are read from `--input`: four times as many as are drawn without it. All of them are held in memory, so that
@@ -83,9 +84,13 @@ pub fn run(args: &Args) -> Result<(), Failure> {
         rows.push(row("input".into(), &config.camera, &config.image, &frames, args).or_exit(exit::FAILED)?);
     } else {
         for (scale, size) in [(1.0, "640x480"), (2.0, "1280x720")] {
-            for (method, name) in [(LiquidMethod::Colour, "colour"), (LiquidMethod::Clear, "clear")] {
+            for (method, ground, name) in [
+                (LiquidMethod::Colour, Ground::Board, "colour"),
+                (LiquidMethod::Clear, Ground::Card, "clear, card"),
+                (LiquidMethod::Clear, Ground::Board, "clear, board"),
+            ] {
                 let (camera, image) = drawn::config(scale, method);
-                let frames = drawn::pictures(&camera, &image).map_err(words).or_exit(exit::FAILED)?;
+                let frames = drawn::pictures(&camera, &image, ground).map_err(words).or_exit(exit::FAILED)?;
                 rows.push(row(format!("{size} {name}"), &camera, &image, &frames, args).or_exit(exit::FAILED)?);
             }
         }
@@ -114,13 +119,13 @@ fn row(name: String, camera: &CameraConfig, image: &ImageConfig, frames: &[Mat],
 fn print_table(rows: &[BenchRow], frames: usize) {
     println!("us a frame on one thread, {frames} frames each");
     println!(
-        "{:<18}{:>8}{:>8}{:>9}{:>7}{:>12}{:>8}{:>9}{:>12}{:>8}",
+        "{:<22}{:>8}{:>8}{:>9}{:>7}{:>12}{:>8}{:>9}{:>12}{:>8}",
         "", "rays", "checks", "segment", "line", "total p50", "p99", "max", "Python p50", "ratio"
     );
     let optional = |v: Option<f64>, digits: usize| v.map_or("-".to_string(), |v| format!("{v:.digits$}"));
     for BenchRow { name, times, python_p50, times_as_fast } in rows {
         println!(
-            "{name:<18}{:>8.0}{:>8.0}{:>9.0}{:>7.0}{:>12.0}{:>8.0}{:>9.0}{:>12}{:>8}",
+            "{name:<22}{:>8.0}{:>8.0}{:>9.0}{:>7.0}{:>12.0}{:>8.0}{:>9.0}{:>12}{:>8}",
             times.rays.p50,
             times.checks.p50,
             times.segment.p50,

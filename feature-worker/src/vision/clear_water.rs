@@ -12,7 +12,7 @@
 //!    the memory is wet. Where the ground was hidden until now, or is as bright as the water's rim, a step in colour counts that the
 //!    earlier picture, moved, does not explain.
 //! 4. [`lines`] finds the line from axis to axis with the best evidence, and [`water`] decides whether it is a stream.
-//! 5. The full picture's profiles across that line must confirm it.
+//! 5. The full picture's profiles across that line must confirm it ([`profile_edges`]).
 //! 6. What cannot be told is said by name: a lamp's reflection at the lip, ground that has changed there, and before a pattern light that
 //!    flickers or wanders and pictures that are missing again and again ([`disturbed`]).
 //!
@@ -27,6 +27,7 @@ mod follow;
 mod light;
 mod lines;
 mod motion;
+mod profile_edges;
 mod rays;
 mod rigid;
 mod vouched;
@@ -48,7 +49,7 @@ use self::vouched::Vouched;
 use self::water::{Candidate, Verdict, Water};
 use super::confidence::Basis;
 use super::geometry::{Axes, LinearField};
-use super::liquid::{FineLine, LineRules, Liquid, PROFILE_SAMPLES, Profile, ProfileEdge, REACH, Sighting};
+use super::liquid::{FineLine, LineRules, Liquid, PROFILE_SAMPLES, Profile, ProfileEdge, Sighting};
 use super::pace::Pace;
 use super::reflection::Reflection;
 
@@ -66,16 +67,6 @@ const REFER_FRAMES: u32 = 4;
 const PROFILES_LEAST: f32 = 0.2;
 /// Points for the motion keep so far away from the stream's line, on either axis, px. Tuned.
 const KEEP_AWAY_PX: f32 = 5.0;
-/// Water differs from the dry background by at least this much, in units of the small picture's noise. Tuned.
-const WET_NOISES: f32 = 5.0;
-/// Water differs from the dry background by at least this much, grey levels. Tuned.
-const WET_LEAST: f32 = 6.0;
-/// Weight of an edge point in front of ground that is as bright as the water's rim. Tuned.
-const HIDDEN_TRUST: f32 = 0.3;
-/// A step this high, as a share of the steepest step of a profile, is steep. Tuned.
-const STEEP_SHARE: f32 = 0.6;
-/// Least height of a profile's steepest step, grey levels a sample. Tuned.
-const STEEP_LEAST: f32 = 4.0;
 
 /// While lamps flicker, a stream has to be seen in so many pictures, and after it so many may not show none. Tuned on seed 101 of
 /// `evaluate-camera --faults`.
@@ -337,28 +328,6 @@ impl ClearWater {
         }
         Ok(())
     }
-
-    /// The edge on a profile in front of known ground: the outermost place that differs from the dry background, where half of the
-    /// difference is reached. `differs` is the difference from the background at each sample, grey levels.
-    fn edge_on_known_ground(&self, profile: &Profile, differs: &[[f32; 3]; PROFILE_SAMPLES]) -> Option<ProfileEdge> {
-        let size = |d: &[f32; 3]| (d.iter().map(|v| v * v).sum::<f32>() / 3.0).sqrt();
-        let least = (WET_NOISES * self.evidence.noise()).max(WET_LEAST);
-        let j = (1..2 * REACH).rev().find(|&j| size(&differs[j]) >= least && size(&differs[j - 1]) >= least)?;
-        let full = (j.saturating_sub(4)..=j).max_by(|a, b| size(&differs[*a]).total_cmp(&size(&differs[*b])))?;
-        let (full, height) = (differs[full], size(&differs[full]));
-        let share = |d: &[f32; 3]| d.iter().zip(full).map(|(a, b)| a * b).sum::<f32>() / (3.0 * height * height);
-        let i = (0..2 * REACH).rev().find(|&i| share(&differs[i]) >= 0.5)?;
-        let (inner, outer) = (share(&differs[i]), share(&differs[i + 1]));
-        // Ground as bright as the water's rim hides where it begins.
-        let dry: [f32; 3] = std::array::from_fn(|c| profile.colours[i + 1][c] - differs[i + 1][c]);
-        let hidden = self.water.stream().is_some_and(|s| size(&std::array::from_fn(|c| dry[c] - s.band[c])) < 2.0 * least);
-        (outer < 0.5).then(|| ProfileEdge {
-            sample: i as f32 + (inner - 0.5) / (inner - outer),
-            contrast: height,
-            trust: if hidden { HIDDEN_TRUST } else { 1.0 },
-            width_samples: None,
-        })
-    }
 }
 
 /// A coordinate of the full region in the small one, px.
@@ -366,21 +335,19 @@ fn small(v: f32, scale: f32) -> f32 {
     (v + 0.5) / scale - 0.5
 }
 
-/// The edge on a profile in front of ground that is not known: the outermost of the steep steps of brightness.
-fn edge_on_unknown_ground(profile: &Profile) -> Option<ProfileEdge> {
-    let grey = |j: usize| profile.colours[j].iter().sum::<f32>() / 3.0;
-    let step = |j: usize| (grey(j + 1) - grey(j)).abs();
-    let steepest = (0..2 * REACH).map(step).fold(0.0, f32::max);
-    let j = (1..2 * REACH - 1).rev().find(|&j| step(j) >= STEEP_SHARE * steepest && step(j) >= step(j - 1) && step(j) >= step(j + 1))?;
-    if steepest < STEEP_LEAST {
-        return None;
+/// [`ClearWater::look_for_stream`] with the processor's widest registers. A closure would be compiled apart, without them.
+struct Search<'a> {
+    water: &'a mut ClearWater,
+    edges_px: &'a mut Vec<[f32; 2]>,
+}
+
+impl pulp::NullaryFnOnce for Search<'_> {
+    type Output = opencv::Result<Sighting>;
+
+    #[inline(always)]
+    fn call(self) -> Self::Output {
+        self.water.look_for_stream(self.edges_px)
     }
-    // The top of the parabola through the three steps.
-    let (left, middle, right) = (step(j - 1), step(j), step(j + 1));
-    let curvature = left - 2.0 * middle + right;
-    let shift = if curvature < -1e-3 { (0.5 * (left - right) / curvature).clamp(-0.5, 0.5) } else { 0.0 };
-    let contrast = (grey((j + 3).min(2 * REACH)) - grey(j.saturating_sub(2))).abs().max(steepest);
-    Some(ProfileEdge { sample: j as f32 + 0.5 + shift, contrast, trust: 1.0, width_samples: None })
 }
 
 impl Liquid for ClearWater {
@@ -404,8 +371,7 @@ impl Liquid for ClearWater {
     }
 
     fn look(&mut self, edges_px: &mut Vec<[f32; 2]>) -> opencv::Result<Sighting> {
-        // The search runs with the processor's widest registers.
-        pulp::Arch::new().dispatch(|| self.look_for_stream(edges_px))
+        pulp::Arch::new().dispatch(Search { water: self, edges_px })
     }
 
     fn basis(&self) -> Basis {
@@ -482,11 +448,11 @@ impl Liquid for ClearWater {
         let mut differs = [[0.0f32; 3]; PROFILE_SAMPLES];
         for (j, (differs, seen)) in differs.iter_mut().zip(&profile.colours).enumerate() {
             let place = profile.place_px(j as f32).map(|v| small(v, self.scale));
-            let Some(dry) = ground.at(place) else { return edge_on_unknown_ground(profile) };
+            let Some(dry) = ground.at(place) else { return profile_edges::on_unknown_ground(profile) };
             let gains = self.light.gains(place[1]);
             *differs = std::array::from_fn(|c| seen[c] / gains[c] - dry[c]);
         }
-        self.edge_on_known_ground(profile, &differs)
+        profile_edges::on_known_ground(profile, &differs, self.evidence.noise(), self.water.stream().map(|s| s.band))
     }
 
     fn confirm(&mut self, line: Option<FineLine>, mean_level: f32) -> Result<FineLine, Doubt> {

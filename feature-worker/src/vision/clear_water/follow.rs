@@ -15,21 +15,28 @@ const FOLLOW: i32 = 90;
 /// How fast the memory follows where it does not fit what is seen, of 256. Tuned as [`FORGOTTEN`] was.
 const FOLLOW_SLOWLY: i32 = 26;
 
-/// A pixel between `a` and `b`, four bytes at once in the low halves of 16 bits; `w` of 256 is the share of `b`. What is halfway between two levels is rounded
+/// Two of a pixel's bytes, the blue and the red one or the other two, in the halves of 32 bits.
+const HALVES: u32 = 0x00ff_00ff;
+
+/// Two bytes at once between those of `a` and `b`, all in the halves of 32 bits; `w` of 256 is the share of `b`. What is halfway between two levels is rounded
 /// up in even rows and down in `odd` ones: always up, a background at rest between two pixels would grow brighter and brighter.
 #[inline(always)]
-fn mix(a: u64, b: u64, w: u64, odd: u64) -> u64 {
-    let half = 0x0080_0080_0080_0080 - odd * 0x0001_0001_0001_0001;
-    let sum = a.wrapping_mul(256 - w).wrapping_add(b.wrapping_mul(w)).wrapping_add(half);
-    (sum >> 8) & 0x00ff_00ff_00ff_00ff
+fn mix_two(a: u32, b: u32, w: u32, odd: u32) -> u32 {
+    let half = 0x0080_0080 - odd * 0x0001_0001;
+    let sum = (a & HALVES) * (256 - w) + (b & HALVES) * w + half;
+    (sum >> 8) & HALVES
 }
 
-/// A pixel's bytes in the low halves of 16 bits.
+/// A pixel between `a` and `b`, as [`mix_two`] does.
 #[inline(always)]
-fn spread(pixel: [u8; 4]) -> u64 {
-    let x = u64::from(u32::from_le_bytes(pixel));
-    let x = (x | (x << 16)) & 0x0000_ffff_0000_ffff;
-    (x | (x << 8)) & 0x00ff_00ff_00ff_00ff
+fn mix(a: u32, b: u32, w: u32, odd: u32) -> u32 {
+    mix_two(a, b, w, odd) | (mix_two(a >> 8, b >> 8, w, odd) << 8)
+}
+
+/// A pixel's bytes, the first one lowest.
+#[inline(always)]
+pub(super) fn packed(pixel: &Vec4b) -> u32 {
+    u32::from_le_bytes(pixel.0)
 }
 
 /// A small picture, four bytes a pixel.
@@ -41,22 +48,27 @@ pub(super) struct SmallPicture<'a> {
 }
 
 impl SmallPicture<'_> {
-    /// Bilinear samples at the first `count` places from `place` on, a `step` apart, each as four bytes in the low halves of 16 bits.
-    /// Black outside.
+    /// Bilinear samples at the first `count` places from `place` on, a `step` apart, four bytes each. Black outside.
     #[inline(always)]
-    pub(super) fn along(&self, place: [f32; 2], step: [f32; 2], count: usize) -> [u64; RUN] {
+    pub(super) fn along(&self, place: [f32; 2], step: [f32; 2], count: usize) -> [u32; RUN] {
         let fixed = |v: f32| (65536.0 * v) as i32;
-        let ([mut x, mut y], [dx, dy]) = (place.map(fixed), step.map(fixed));
-        let mut samples = [0; RUN];
-        for sample in &mut samples[..count] {
+        let ([x, y], [dx, dy]) = (place.map(fixed), step.map(fixed));
+        let at = |i: usize| (x.wrapping_add(dx.wrapping_mul(i as i32)), y.wrapping_add(dy.wrapping_mul(i as i32)));
+        // Loading is apart from mixing, for the vector registers.
+        let mut four = [[0; RUN]; 4];
+        for i in 0..count.min(RUN) {
+            let (x, y) = at(i);
             let corner = (y >> 16) as usize * self.width + (x >> 16) as usize;
             let rows = (self.pixels.get(corner..corner + 2), self.pixels.get(corner + self.width..corner + self.width + 2));
-            if let (Some(upper), Some(lower)) = rows {
-                let (wx, wy, odd) = (u64::from(x as u32 >> 8 & 255), u64::from(y as u32 >> 8 & 255), u64::from(y as u32 >> 16 & 1));
-                let top = mix(spread(upper[0].0), spread(upper[1].0), wx, odd);
-                *sample = mix(top, mix(spread(lower[0].0), spread(lower[1].0), wx, odd), wy, odd);
+            if let (Some([a, b]), Some([c, d])) = rows {
+                [four[0][i], four[1][i], four[2][i], four[3][i]] = [packed(a), packed(b), packed(c), packed(d)];
             }
-            (x, y) = (x + dx, y + dy);
+        }
+        let mut samples = [0; RUN];
+        for (i, sample) in samples.iter_mut().enumerate() {
+            let (x, y) = at(i);
+            let (wx, wy, odd) = (x as u32 >> 8 & 255, y as u32 >> 8 & 255, y as u32 >> 16 & 1);
+            *sample = mix(mix(four[0][i], four[1][i], wx, odd), mix(four[2][i], four[3][i], wx, odd), wy, odd);
         }
         samples
     }
@@ -90,27 +102,33 @@ pub(super) struct Following {
 
 /// Takes new ground over, lets known ground follow, and lets what is hidden grow older until it is forgotten.
 #[inline(always)]
-pub(super) fn follow(seen: &[u64; RUN], kept: &mut [Vec4b], ages: &mut [u8], f: Following) {
+pub(super) fn follow(seen: &[u32; RUN], kept: &mut [Vec4b], ages: &mut [u8], f: Following) {
+    // Whole runs of numbers of one kind are reckoned with, also where the run is shorter, for the vector registers.
+    let (mut pixels, mut older) = ([0; RUN], [0; RUN]);
+    pixels.iter_mut().zip(kept.iter()).for_each(|(pixel, kept)| *pixel = packed(kept));
+    older.iter_mut().zip(ages.iter()).for_each(|(older, age)| *older = i32::from(*age) + 1);
     let outside = |[from, to]: [i32; 2], x: i32| i32::from(x < from) | i32::from(x >= to);
+    let byte = |pixel: u32, k: u32| (pixel >> (8 * k) & 255) as i32;
     let flows = i32::from(f.flows);
-    for (i, ((sample, kept), age)) in seen.iter().zip(kept).zip(ages).enumerate() {
+    for (i, ((seen, pixel), older)) in seen.iter().zip(&mut pixels).zip(&mut older).enumerate() {
         let x = f.x + i as i32;
-        let kept = &mut kept.0;
-        let level = |k: u32| ((((sample >> (16 * k)) & 255) as i32 * f.exposure + 128) >> 8).min(255);
-        let was = [0, 1, 2].map(|k| i32::from(kept[k]));
+        let level = |k: u32| ((byte(*seen, k) * f.exposure + 128) >> 8).min(255);
+        let was = [byte(*pixel, 0), byte(*pixel, 1), byte(*pixel, 2)];
         let away = [level(0) - was[0], level(1) - was[1], level(2) - was[2]];
         let fits = i32::from(away[0] * away[0] + away[1] * away[1] + away[2] * away[2] < f.calm);
-        let known = i32::from(kept[3] > 0);
+        let known = i32::from(byte(*pixel, 3) > 0);
         let inside = outside(f.dry.right, x) | outside(f.dry.inner, x);
         let close = outside(f.dry.right, x) | outside(f.dry.outer, x);
         let hidden = close & ((1 - fits) | (flows & inside));
         let of_known = (1 - hidden) * (fits * FOLLOW + (1 - fits) * FOLLOW_SLOWLY);
         let of_new = (1 - (flows & close)) * 256;
         let share = known * of_known + (1 - known) * of_new;
-        let older = if share > 0 { 0 } else { i32::from(*age) + 1 };
-        let stays = i32::from(share > 0) | (known & i32::from(older < i32::from(FORGOTTEN)));
-        let new = |k: usize| (stays * (was[k] + ((share * away[k] + 128) >> 8))) as u8;
-        *kept = [new(0), new(1), new(2), (255 * stays) as u8];
-        *age = (stays * older) as u8;
+        *older *= i32::from(share == 0);
+        let stays = i32::from(share > 0) | (known & i32::from(*older < i32::from(FORGOTTEN)));
+        let new = |k: usize| (stays * (was[k] + ((share * away[k] + 128) >> 8))) as u32 & 255;
+        *pixel = new(0) | new(1) << 8 | new(2) << 16 | (255 * stays as u32) << 24;
+        *older *= stays;
     }
+    kept.iter_mut().zip(&pixels).for_each(|(kept, pixel)| kept.0 = pixel.to_le_bytes());
+    ages.iter_mut().zip(&older).for_each(|(age, older)| *age = *older as u8);
 }
