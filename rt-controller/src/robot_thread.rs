@@ -84,6 +84,8 @@ struct Progress {
     connected: bool,
     /// Whether the operator must ask first.
     waits: bool,
+    /// Whether a program was there, running or paused, when the robot was last seen.
+    program_there: bool,
     /// Until when the operator's wish counts, ns.
     wish_until_ns: Option<u64>,
     /// When the next attempt is due, ns.
@@ -101,8 +103,14 @@ pub fn keep_robot_connected(
     stop: &AtomicBool,
     say: &dyn Fn(Level, &str),
 ) {
-    let mut progress =
-        Progress { before: Before::default(), connected: false, waits: false, wish_until_ns: None, next_ns: network.now_ns() };
+    let mut progress = Progress {
+        before: Before::default(),
+        connected: false,
+        waits: false,
+        program_there: false,
+        wish_until_ns: None,
+        next_ns: network.now_ns(),
+    };
     while !stop.load(Relaxed) {
         let now_ns = network.now_ns();
         // Who asks for a robot that the controller has, asks for nothing: if the session is over, that came before or after, and nobody knows.
@@ -156,6 +164,7 @@ impl Progress {
         self.next_ns = now_ns + RECONNECT.as_nanos() as u64;
         // The program may go on, or bring the container upright, and nobody watches it.
         self.before.looked = false;
+        self.program_there = hands::program_there(&self.before, &last);
         match hands::after_session(end.reason(), &last) {
             Some(why) => self.wait_for_operator(why, config, note, say),
             None => note.set(format!("robot: {end}"), RobotLink::Connecting, say),
@@ -167,8 +176,10 @@ impl Progress {
         self.next_ns = now_ns + RECONNECT.as_nanos() as u64;
         let is_there = matches!(e, LinkError::ProgramRunning { .. } | LinkError::MayNotMove { program_there: true, .. });
         self.before.ran |= is_there;
-        // What a program that is there comes to is not seen yet. Behind a hindrance it is not asked what became of one, so a wish before does not cover it.
-        self.before.looked &= !is_there;
+        self.program_there = e.program_there().unwrap_or(self.program_there);
+        // What a program that is there comes to is not seen yet; nor is what became of one that was there, where the robot could not be looked at since the
+        // operator asked. Behind a hindrance it is not asked what became of one, so a wish before does not cover it.
+        self.before.looked &= !is_there && (e.program_there().is_some() || !self.program_there);
         self.before.looked |= matches!(e, LinkError::MayNotMove { program_there: false, .. }) && !self.before.asked;
         self.before.unpowered = match e {
             LinkError::ProgramRunning { .. } | LinkError::MayNotMove { program_there: true, .. } => false,

@@ -74,3 +74,13 @@ fn weights_of_another_camera_are_refused() {
     assert_eq!(output.status.code(), Some(i32::from(shared::exit::BAD_INPUT)), "{said}");
     assert!(output.stdout.is_empty() && said.contains("trained at 30 frames/s, camera.fps is 60"), "{said}");
 }
+
+/// Protects who couples a simulator from a pour that ended early and looks done: the reason is said, and the exit code is that of a pour that ended early.
+#[test]
+fn an_early_end_is_said() {
+    let output = step(&("0\n".repeat(20) + &"nan\n".repeat(120)));
+    let said = String::from_utf8_lossy(&output.stderr).trim().to_owned();
+    assert_eq!(output.status.code(), Some(i32::from(shared::exit::ENDED_EARLY)), "{said}");
+    assert!(said.contains("ended early: ") && said.contains("ml poured (estimate)"), "{said}");
+    assert_eq!(output.stdout.iter().filter(|b| **b == b'\n').count(), 1 + 140);
+}

@@ -38,6 +38,8 @@ const UNMEASURED_MAX_S: f64 = 0.2;
 /// Up to this commanded tilt the container is to be upright, degrees. Chosen by hand: no vessel pours there, and a controller's way back may leave some
 /// tenths.
 const UPRIGHT_DEG: f32 = 1.0;
+/// A frame this near to a gap is beside it. Chosen by hand: the flow model takes as many zeros within the flow for a dropout.
+const BESIDE: usize = 3;
 /// What is wrong with an episode of which the camera missed a part, see [`Episode::part_unseen`].
 pub const PART_UNSEEN: &str = "the camera did not see part of this pour; its areas do not add up to its weight";
 
@@ -183,8 +185,8 @@ impl Episode {
         (1.0 / median * 10.0).round() / 10.0
     }
 
-    /// Whether the camera missed a part of the stream: more than 0.2 s of frames in a row were not measured, right after or right before one that shows
-    /// flow, and not all of them while the container was to be upright, where only drops fall. A shorter gap is bridged by the area before it.
+    /// Whether the camera missed a part of the stream: more than 0.2 s of frames in a row were not measured, at most three frames after or before one
+    /// that shows flow (a lone zero beside a gap is a dropout), and not all of them while the container was to be upright, where only drops fall. A shorter gap is bridged by the area before it.
     pub fn part_unseen(&self) -> bool {
         let most = (UNMEASURED_MAX_S * self.frame_rate_hz()).round() as usize;
         let flows = |k: usize| self.rows.get(k).is_some_and(|row| row.area_px2 > 0.0);
@@ -192,7 +194,7 @@ impl Episode {
         self.rows.chunk_by(|a, b| a.area_px2.is_nan() == b.area_px2.is_nan()).any(|run| {
             let first = end;
             end += run.len();
-            let beside_flow = first > 0 && flows(first - 1) || flows(end);
+            let beside_flow = (first.saturating_sub(BESIDE)..first).chain(end..end + BESIDE).any(flows);
             run.len() > most && run[0].area_px2.is_nan() && beside_flow && run.iter().any(|row| row.alpha_commanded_deg > UPRIGHT_DEG)
         })
     }

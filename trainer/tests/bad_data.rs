@@ -127,7 +127,7 @@ fn said(out: &Output) -> String {
 #[test]
 fn each_fault_of_a_recording_is_named() {
     type Case = (&'static str, i32, fn(&mut Recording));
-    let cases: [Case; 19] = [
+    let cases: [Case; 20] = [
         ("cannot be used: FILE: no weight", 1, |r| r.weight_g = None),
         ("cannot be used: FILE: weight 0 g: nothing was poured", 1, |r| r.weight_g = Some(0.0)),
         ("cannot be used: FILE: no stream was ever seen, but the scale shows", 1, |r| r.rows.iter_mut().for_each(|f| f.area_px2 = 0.0)),
@@ -135,6 +135,12 @@ fn each_fault_of_a_recording_is_named() {
         ("cannot be used: FILE: the recording is incomplete", 1, |r| r.finished = false),
         ("cannot be used: FILE: the same measurement as", 1, |r| r.copies = 2),
         ("cannot be used: FILE: the camera did not see part of this pour; its areas do not add up to its weight", 1, |r| blind(r, 7)),
+        // A dropout on either side of the gap is no evidence that nothing flowed.
+        ("cannot be used: FILE: the camera did not see part of this pour", 1, |r| {
+            blind(r, 7);
+            let first = r.rows.iter().position(|f| f.doubt == Doubt::EdgeNotFound).unwrap();
+            (r.rows[first - 1].area_px2, r.rows[first + 7].area_px2) = (0.0, 0.0);
+        }),
         ("error: FILE: damaged: frame 10: commanded alpha NaN", 2, |r| r.rows[9].alpha_deg = f32::NAN),
         ("error: FILE: damaged: frame 10: commanded alpha 0", 2, |r| r.rows[9].area_px2 = -1.0),
         ("error: FILE: damaged: frame 10 comes after frame 11", 2, |r| (r.rows[9].number, r.rows[10].number) = (11, 10)),

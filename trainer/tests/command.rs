@@ -99,7 +99,11 @@ fn a_delay_beyond_the_model_is_said() {
     let late: String = rows
         .iter()
         .enumerate()
-        .map(|(k, r)| format!("{},{},{},{},{}\n", r[0], r[1], r[2], r[3], if k == 0 { r[4] } else { area(k) }))
+        // The joint is where it was commanded: without its measured angle, the delay may be the joint's.
+        .map(|(k, r)| match k {
+            0 => format!("{},{},{},{},{},alpha_measured_deg\n", r[0], r[1], r[2], r[3], r[4]),
+            _ => format!("{},{},{},{},{},{}\n", r[0], r[1], r[2], r[3], area(k), r[3]),
+        })
         .collect();
     std::fs::write(dir.path().join("late.csv"), late).unwrap();
     for (table, says) in [("f.csv", false), ("late.csv", true)] {
@@ -297,4 +301,54 @@ fn the_trainer_knows_no_simulator() {
     let tree = text(&out.stdout);
     assert!(out.status.success() && tree.contains("shared v"), "{}", text(&out.stderr));
     assert!(!tree.contains("simulator") && !tree.contains("rt-controller"), "{tree}");
+}
+
+/// Writes a cell's configuration in which `from` has become `to`.
+fn cell(dir: &Path, from: &str, to: &str) {
+    let text = include_str!("../../config/cell.toml");
+    assert!(text.contains(from), "{from}");
+    std::fs::write(dir.join("cell.toml"), text.replacen(from, to, 1)).unwrap();
+}
+
+/// Protects everybody from weights that are all wrong by one factor, which do not contradict each other: they are those of another vessel than the one
+/// that is named, and weights in kilograms are none of grams. Right ones are not accused.
+#[test]
+fn weights_that_are_all_wrong_are_doubted() {
+    let dir = tempfile::tempdir().unwrap();
+    cell(dir.path(), "# holds_ml", "holds_ml");
+    for (factor, says) in
+        [(1.0, None), (5.0, Some("but it holds 520 ml")), (10.0, Some("decimal point")), (0.001, Some("are they in grams?"))]
+    {
+        tables(dir.path(), 4, |_, w| factor * w);
+        for command in ["check", "train", "refine", "plan"] {
+            let mut args = vec![command, "f.csv", "--scale", "s.csv", "--config", "cell.toml"];
+            args.extend(if matches!(command, "train" | "refine") { &["--out", "w.bin"][..] } else { &[] });
+            let out = trainer(dir.path(), &args);
+            let said = text(&out.stdout) + &text(&out.stderr);
+            let accused = said.contains("grams?") || said.contains("decimal point");
+            assert_eq!(accused, says.is_some(), "{command}, weights times {factor}: {said}");
+            assert!(says.is_none_or(|words| said.contains(words)), "{command}, weights times {factor}: {said}");
+        }
+    }
+    // One weight above what the vessel holds is named, and nothing is planned from it.
+    tables(dir.path(), 4, |k, w| if k == 2 { 1000.0 + w } else { w });
+    let out = trainer(dir.path(), &["plan", "f.csv", "--scale", "s.csv", "--holds", "520"]);
+    assert!(out.status.code() == Some(2) && text(&out.stderr).contains("but the vessel holds 520 ml"), "{}", text(&out.stderr));
+}
+
+/// Protects who follows a plan: it proposes no curve that the cell's limits refuse, and no goal above the cell's.
+#[test]
+fn what_is_proposed_is_taken() {
+    let dir = tempfile::tempdir().unwrap();
+    std::fs::create_dir(dir.path().join("none")).unwrap();
+    cell(dir.path(), "rate_deg_s = 90.0 ", "rate_deg_s = 20.0 ");
+    let plan = ["plan", "none", "--holds", "500", "--config", "cell.toml"];
+    let out = trainer(dir.path(), &[&plan[..], &["--json"]].concat());
+    let found: serde_json::Value = serde_json::from_str(&text(&out.stdout)).unwrap_or_else(|_| panic!("{}", text(&out.stderr)));
+    for candidate in found["plan"]["candidates"].as_array().unwrap() {
+        let [lambda_deg, gamma_per_s2] = ["lambda_deg", "gamma_per_s2"].map(|key| candidate["next"][key].as_f64().unwrap());
+        assert!(lambda_deg * (2.0 * gamma_per_s2).sqrt() * (-0.5f64).exp() <= 20.0, "{candidate}");
+    }
+    let out = trainer(dir.path(), &[&plan[..], &["--goal-max", "400"]].concat());
+    assert!(out.status.code() == Some(2) && text(&out.stderr).contains("is above controller.goal_max_ml, 300"), "{}", text(&out.stderr));
 }

@@ -6,7 +6,7 @@
 use rand::{RngExt, SeedableRng};
 use rand_pcg::Pcg64Mcg;
 use shared::agent::Agent;
-use trainer::commands::plan::{propose, wish};
+use trainer::commands::plan::{PERIOD_NS, propose, wish};
 use trainer::data::{TrainingEpisode, UsableEpisodes};
 use trainer::teaching::plan::Proposal;
 use trainer::training::{Options, Silent, Trained};
@@ -23,7 +23,7 @@ impl Trial {
     /// Weighs what is proposed, so many times, with a training after each weighing.
     pub(super) fn first_hour(&self, options: &Options, weighings: u64) -> Option<(Trained, Vec<TrainingEpisode>)> {
         let Plan { holds_ml, goal_max_ml, .. } = self.demo_plan()?;
-        let wish = wish(&self.limits, goal_max_ml);
+        let wish = wish(&self.limits, PERIOD_NS, goal_max_ml);
         let mut random = Pcg64Mcg::seed_from_u64(self.data_seed ^ 0xd_0000_0000);
         let mut usable = UsableEpisodes::default();
         let mut trained: Option<Trained> = None;

@@ -6,6 +6,7 @@ use std::path::PathBuf;
 
 use shared::agent::Agent;
 use shared::config::Config;
+use shared::control::EndReason;
 use shared::exit::{self, Failure, OrExit as _, failure};
 use shared::messages::{Doubt, Feature, LAYOUT_VERSION, Telemetry};
 use shared::weights::Weights;
@@ -19,7 +20,7 @@ use crate::disk::check_weights;
 Each line of output is 'dalpha_deg alpha_deg d_ml', flushed at once: the change and the angle commanded now (all limits of the\n\
 configuration applied), and the volume still to pour. The first line comes before any input, because the tick that takes the goal already\n\
 moves, from upright. Then each line of input is one frame's V_e in px^2 (nan: no measurement), and each has one line of output. Each\n\
-alpha_deg is the sum of all dalpha_deg so far.")]
+alpha_deg is the sum of all dalpha_deg so far. How the pour ended is said on standard error, and by exit code 4 where it ended early.")]
 pub struct Args {
     /// The weight file.
     #[arg(long)]
@@ -38,6 +39,13 @@ pub fn run(args: &Args) -> Result<(), Failure> {
     let weights = Weights::read(&args.weights).or_exit(exit::BAD_INPUT)?;
     let fits = check_weights(&weights, config.camera.fps, &config.limits);
     fits.map_err(|why| failure(exit::BAD_INPUT, format!("{}: {why}", args.weights.display())))?;
+    let (rate_hz, fps) = (config.controller.rate_hz, config.camera.fps);
+    if (f64::from(rate_hz) - f64::from(fps)).abs() > 1e-3 {
+        let what = format!(
+            "controller.rate_hz is {rate_hz} and camera.fps {fps}: `step` has one tick for each frame, so give a configuration in which both are alike"
+        );
+        return Err(failure(exit::BAD_INPUT, what));
+    }
     let settings = Settings::new(&config);
     let mut core = Core::new(settings);
     core.exchange(Box::new(Agent::new(&weights)));
@@ -73,14 +81,23 @@ pub fn run(args: &Args) -> Result<(), Failure> {
     if lines.print(&started.telemetry).is_err() {
         return Ok(()); // the reader has gone
     }
+    let mut ended = None;
     for (number, line) in std::io::stdin().lock().lines().enumerate() {
         let area_px2 = line.map_err(|e| e.to_string()).and_then(|text| area_px2(&text));
         let area_px2 = area_px2.map_err(|why| failure(exit::BAD_INPUT, format!("line {}: {why}", number + 1)))?;
-        if lines.print(&frame(area_px2, None).telemetry).is_err() {
+        let output = frame(area_px2, None);
+        if lines.print(&output.telemetry).is_err() {
             return Ok(()); // the reader has gone
         }
+        if let Some(outcome) = output.ended {
+            eprintln!("{} ml poured (estimate), {}", outcome.poured_words(), outcome.reason.words());
+            ended = Some(outcome.reason);
+        }
     }
-    Ok(())
+    match ended {
+        None | Some(EndReason::Done) => Ok(()),
+        Some(reason) => Err(failure(exit::ENDED_EARLY, format!("ended early: {}", reason.words()))),
+    }
 }
 
 /// One frame's V_e as it was written; NaN for one that was not measured.

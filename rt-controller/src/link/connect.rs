@@ -206,10 +206,7 @@ fn start_program(
 
 /// The error of a robot that may not be moved.
 fn may_not_move((options, before): (&LinkOptions, &Before), state: &RobotState, reason: EndReason) -> LinkError {
-    let unpowered = hands::without_power(state);
-    // A paused program counts: it goes on when somebody resumes it, and may then be stopped before the next look at the robot.
-    let runs_none = matches!(state.runtime_state, RUNTIME_STOPPING | RUNTIME_STOPPED) || unpowered || hands::never_started(before, state);
-    let program_there = !runs_none;
+    let (unpowered, program_there) = (hands::without_power(state), hands::program_there(before, state));
     LinkError::MayNotMove { address: options.address, reason, safety_mode: state.safety_mode, unpowered, program_there }
 }
 

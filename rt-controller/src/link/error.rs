@@ -215,6 +215,16 @@ pub enum LinkError {
 }
 
 impl LinkError {
+    /// Whether a program was there, running or paused, in the state that the attempt saw; `None` if it saw none.
+    pub fn program_there(&self) -> Option<bool> {
+        match self {
+            Self::ProgramRunning { .. } | Self::ProgramPaused { .. } => Some(true),
+            Self::MayNotMove { program_there, .. } => Some(*program_there),
+            Self::Handover { .. } | Self::TooFar { .. } => Some(false),
+            _ => None,
+        }
+    }
+
     /// What shows that a person has, or had, the robot in hand, so that it must not be tried again until the operator asks; `None` if it may.
     pub fn handover(&self) -> Option<Handover> {
         match self {

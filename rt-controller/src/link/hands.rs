@@ -6,7 +6,7 @@
 use shared::config::Joint;
 use shared::control::EndReason;
 
-use super::health::{self, RUNTIME_PAUSED, RUNTIME_PAUSING, RUNTIME_PLAYING};
+use super::health::{self, RUNTIME_PAUSED, RUNTIME_PAUSING, RUNTIME_PLAYING, RUNTIME_STOPPED, RUNTIME_STOPPING};
 use super::{ProgramState, RobotState};
 
 /// Rate of a joint above which it moves, rad/s: 1.1 degrees/s, several times the noise of a UR's joint at rest. Chosen by hand; no
@@ -169,6 +169,13 @@ pub fn never_started(before: &Before, state: &RobotState) -> bool {
 /// Whether the arm has no power or its brakes on, so that no program can run on it, also none that is paused.
 pub fn without_power(state: &RobotState) -> bool {
     state.robot_mode != health::ROBOT_MODE_RUNNING && state.runtime_state != RUNTIME_PLAYING
+}
+
+/// Whether a program is there, running or paused. A paused one counts: it goes on when somebody resumes it, and may then be stopped before the next look
+/// at the robot.
+pub fn program_there(before: &Before, state: &RobotState) -> bool {
+    let stopped = matches!(state.runtime_state, RUNTIME_STOPPING | RUNTIME_STOPPED);
+    !(stopped || without_power(state) || never_started(before, state))
 }
 
 /// The name of the first joint for which `is` holds.

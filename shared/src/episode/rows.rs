@@ -25,7 +25,7 @@ pub struct EpisodeRow {
     pub t_s: f64,
     /// Commanded alpha at that time, degrees; finite.
     pub alpha_commanded_deg: f32,
-    /// Measured alpha at that time, degrees; NaN if the robot did not report it. In tables the same as commanded.
+    /// Measured alpha at that time, degrees; NaN if the robot did not report it.
     pub alpha_measured_deg: f32,
     /// V_e, px^2, at least 0; NaN if the frame was lost or its doubt makes it unusable ([`Doubt::usable`]).
     pub area_px2: f32,

@@ -1,4 +1,4 @@
-//! The CSV pair: `features.csv` (`episode, frame, t_s, alpha_deg, area_px2`) and `scale.csv` (`episode, weight_g`), for people
+//! The CSV pair: `features.csv` (`episode, frame, t_s, alpha_deg, area_px2`, and `alpha_measured_deg` if the robot told it) and `scale.csv` (`episode, weight_g`), for people
 //! who measure V_e with software of their own. It allocates and is for ordinary threads only. Each error is one line of text that names the
 //! file and the line in it.
 //!
@@ -17,6 +17,8 @@ use crate::{regular_file, whole_file};
 
 /// The columns of the table of features. Their names are part of the format.
 const FEATURE_COLUMNS: [&str; 5] = ["episode", "frame", "t_s", "alpha_deg", "area_px2"];
+/// The column that need not be there: the joint's measured angle, degrees; `nan` or empty where the robot did not tell it.
+const MEASURED_COLUMN: &str = "alpha_measured_deg";
 /// The columns of the table of weights. Their names are part of the format.
 const SCALE_COLUMNS: [&str; 2] = ["episode", "weight_g"];
 
@@ -52,6 +54,8 @@ struct CsvTable {
     reader: csv::Reader<File>,
     /// Where each wanted column stands in a row.
     columns: Vec<usize>,
+    /// Where the column stands that need not be there.
+    measured: Option<usize>,
 }
 
 /// One row, reduced to the wanted columns.
@@ -59,6 +63,8 @@ struct CsvRow<'a> {
     file: &'a str,
     line: u64,
     fields: Vec<&'a str>,
+    /// The column that need not be there; empty where it is not.
+    measured: &'a str,
 }
 
 impl CsvRow<'_> {
@@ -93,7 +99,8 @@ impl CsvTable {
             };
             return Err(TableError::Row { file: name, line: 1, what });
         }
-        Ok(Self { name, reader, columns })
+        let measured = heading.iter().position(|column| column == MEASURED_COLUMN);
+        Ok(Self { name, reader, columns, measured })
     }
 
     /// Shows each row to `take`.
@@ -106,7 +113,8 @@ impl CsvTable {
                     let line = record.position().map_or(0, csv::Position::line);
                     // The reader refuses rows of another length than the heading's, so every column is there.
                     let fields = self.columns.iter().map(|c| record.get(*c).unwrap_or("")).collect();
-                    take(&CsvRow { file: &self.name, line, fields })?;
+                    let measured = self.measured.and_then(|c| record.get(c)).unwrap_or("");
+                    take(&CsvRow { file: &self.name, line, fields, measured })?;
                 }
                 Err(e) => {
                     let line = e.position().map_or(0, csv::Position::line);
@@ -203,6 +211,14 @@ fn add_row(rows: &mut Vec<EpisodeRow>, lost: &mut LostFrames, row: &CsvRow) -> R
     if area_px2.is_infinite() || area_px2 < 0.0 {
         return Err(row.error(format!("area_px2 '{}': at least 0 and finite is wanted, or nan for no measurement", row.fields[4])));
     }
+    let measured = row.measured;
+    let alpha_measured_deg: f32 = match measured {
+        "" => f32::NAN,
+        text => text.parse().map_err(|_| row.error(format!("{MEASURED_COLUMN} '{text}': degrees, or nan, are wanted")))?,
+    };
+    if alpha_measured_deg.is_infinite() {
+        return Err(row.error(format!("{MEASURED_COLUMN} '{measured}': degrees, or nan, are wanted")));
+    }
     if let Some(last) = rows.last().copied() {
         if sequence == last.sequence {
             return Err(row.error(format!("frame {sequence} is there twice")));
@@ -215,20 +231,23 @@ fn add_row(rows: &mut Vec<EpisodeRow>, lost: &mut LostFrames, row: &CsvRow) -> R
         }
         for (between, share) in lost.between(last.sequence, sequence).map_err(|e| row.error(e))? {
             let alpha_between_deg = alpha_between_deg(last.alpha_commanded_deg, alpha_deg, share);
-            rows.push(episode_row(between, last.t_s + share * (t_s - last.t_s), alpha_between_deg, f32::NAN));
+            // As the joint stood between two frames, it is taken to have moved evenly.
+            let measured_between_deg = last.alpha_measured_deg + share as f32 * (alpha_measured_deg - last.alpha_measured_deg);
+            let between_s = last.t_s + share * (t_s - last.t_s);
+            rows.push(episode_row(between, between_s, [alpha_between_deg, measured_between_deg], f32::NAN));
         }
     }
-    rows.push(episode_row(sequence, t_s, alpha_deg, area_px2));
+    rows.push(episode_row(sequence, t_s, [alpha_deg, alpha_measured_deg], area_px2));
     Ok(())
 }
 
-fn episode_row(sequence: u64, t_s: f64, alpha_deg: f32, area_px2: f32) -> EpisodeRow {
+fn episode_row(sequence: u64, t_s: f64, [alpha_commanded_deg, alpha_measured_deg]: [f32; 2], area_px2: f32) -> EpisodeRow {
     EpisodeRow {
         sequence,
         captured_at_ns: 0,
         t_s,
-        alpha_commanded_deg: alpha_deg,
-        alpha_measured_deg: alpha_deg,
+        alpha_commanded_deg,
+        alpha_measured_deg,
         area_px2,
         doubt: Doubt::None,
         lost: area_px2.is_nan(),
@@ -236,19 +255,24 @@ fn episode_row(sequence: u64, t_s: f64, alpha_deg: f32, area_px2: f32) -> Episod
     }
 }
 
-/// Writes the pair; neither file may exist. The alpha in it is the commanded one, and lost frames are rows without area. Episodes are
+/// A number as the table has it.
+fn number_or_nan(value: f32) -> String {
+    if value.is_nan() { "nan".into() } else { value.to_string() }
+}
+
+/// Writes the pair; neither file may exist. The `alpha_deg` in it is the commanded one, and lost frames are rows without area. Episodes are
 /// numbered from 1 in their order; those without a weight are in `features` only. What cannot be written whole is not written at all.
 pub fn write_table(episodes: &[Episode], features: &Path, scale: &Path) -> Result<(), TableError> {
     let fail = |path: &Path, e: &dyn std::fmt::Display| TableError::File { file: path.display().to_string(), what: e.to_string() };
     let mut rows = csv::Writer::from_writer(Vec::new());
     let mut weights = csv::Writer::from_writer(Vec::new());
-    rows.write_record(FEATURE_COLUMNS).map_err(|e| fail(features, &e))?;
+    rows.write_record(FEATURE_COLUMNS.iter().chain([&MEASURED_COLUMN])).map_err(|e| fail(features, &e))?;
     weights.write_record(SCALE_COLUMNS).map_err(|e| fail(scale, &e))?;
     for (index, episode) in episodes.iter().enumerate() {
         let number = (index + 1).to_string();
         for r in &episode.rows {
-            let area = if r.area_px2.is_nan() { "nan".into() } else { r.area_px2.to_string() };
-            rows.write_record([&number, &r.sequence.to_string(), &r.t_s.to_string(), &r.alpha_commanded_deg.to_string(), &area])
+            let angles = [r.alpha_commanded_deg, r.alpha_measured_deg].map(number_or_nan);
+            rows.write_record([&number, &r.sequence.to_string(), &r.t_s.to_string(), &angles[0], &number_or_nan(r.area_px2), &angles[1]])
                 .map_err(|e| fail(features, &e))?;
         }
         if let Some(weight_g) = episode.weight_g {

@@ -64,6 +64,27 @@ fn a_stop_after_the_operator_asked_has_the_last_word() {
     assert!(stopped > 10, "only {stopped} stops found the program at work");
 }
 
+/// Protects a person who stops a program that stood paused when the operator asked (seed 15386720): a register that was in use kept the controller from
+/// looking at the robot after it was asked, the program was stopped then, and it was taken back. Nothing starts before the operator asks again.
+#[test]
+fn a_stop_of_a_paused_program_behind_a_used_register_has_the_last_word() {
+    let happens = [
+        (3_000, What::Pour(120.0), None),
+        (7_000, What::Robot(Fault::ProtectiveStop), Some("protective-stop")),
+        (13_500, What::Robot(Fault::UnlockProtectiveStop), Some("protective-stop")),
+        (14_000, What::Resume, None),
+        (15_000, What::Robot(Fault::InUse("input_int_register_24".into())), Some("in-use")),
+        (15_300, What::Resume, None),
+        (17_000, What::Robot(Fault::ProgramStop), Some("program-stop")),
+        (19_000, What::Robot(Fault::Clear), Some("in-use")),
+    ];
+    let shown = shown(2_017_372, Series::Cb3, 1, (300.0, (266_117, 645_915)), &happens);
+    assert!(tells(&shown, "a program is paused", 13.9, 14.5) && tells(&shown, "is in use", 15.2, 17.0), "{}", shown.story.join("\n"));
+    assert!(tells(&shown, "stopped on the pendant", 16.9, 17.1), "{}", shown.story.join("\n"));
+    assert!(tells(&shown, "was stopped", 19.0, 23.0), "{}", shown.story.join("\n"));
+    assert!(!tells(&shown, "decant_pour started", 15.0, 99.0), "{}", shown.story.join("\n"));
+}
+
 /// Protects a person who stops our program after it stood paused behind an open safeguard (seed 6092687): the operator had asked for the robot, the
 /// safeguard was closed, the program went on, and was stopped before the controller looked again. Nothing starts before the operator asks again.
 #[test]

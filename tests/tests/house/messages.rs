@@ -68,10 +68,11 @@ const NO_MESSAGES_IN: [&str; 10] = [
 ];
 
 /// Texts that are parts of a protocol or of a longer message, or that tell of nothing wrong.
-const PARTS: [&str; 17] = [
+const PARTS: [&str; 19] = [
     "default-src 'none'",
     "tilt along a curve and back",
     "HttpOnly; SameSite",
+    "application/openmetrics-text",
     "HTTP/1.1\\r",
     "http://…/?token",
     "the request to start",
@@ -84,6 +85,7 @@ const PARTS: [&str; 17] = [
     "the newest file written … ago",
     "goal … ml, poured … ml",
     "the agent ",
+    "… ml poured (estimate), …",
     "an unknown ",
     "Commands of the other programs",
 ];

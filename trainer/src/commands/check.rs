@@ -3,6 +3,8 @@
 //! An offline command on an ordinary thread; it allocates. The command fails if something is wrong with an episode or no episode can be
 //! used, so that scripts can rely on it. What is doubtful about the set as a whole, and what it does not span, is only said.
 
+use std::path::PathBuf;
+
 use serde::Serialize;
 use shared::episode::{Episode, EpisodeRow};
 use shared::exit::{self, Failure, OrExit as _, failure};
@@ -13,6 +15,7 @@ use shared::plural::counted;
 use crate::calibration::{self, EXPONENT_NEEDS};
 use crate::consistency;
 use crate::data::{self, EpisodeSource, TrainingEpisode, UsableEpisodes};
+use crate::fit;
 use crate::teaching::gaps::{self, Spanned};
 
 /// An episode that begins or ends below this tilt counts as upright there, degrees. Chosen by hand; no measurement is recorded.
@@ -29,10 +32,17 @@ const PAPER_NEEDS: usize = 10;
 #[derive(Debug, clap::Args)]
 #[command(after_help = "Examples:
   trainer check out/episodes
+  trainer check out/episodes --holds 520
   trainer check features.csv --scale scale.csv --json")]
 pub struct Args {
     #[command(flatten)]
     source: EpisodeSource,
+    /// What the vessel holds up to its lip, ml: the weights are compared with it.
+    #[arg(long)]
+    holds: Option<f64>,
+    /// Configuration of the cell, from which [container] holds_ml is taken.
+    #[arg(long, env = shared::config::VARIABLE)]
+    config: Option<PathBuf>,
     /// Print JSON.
     #[arg(long)]
     json: bool,
@@ -55,11 +65,14 @@ pub struct Findings {
     pub missing: Vec<String>,
 }
 
-/// Looks for faults and doubts in a data set.
-pub fn check(episodes: &[Episode]) -> Findings {
+/// Looks for faults and doubts in a data set, of a vessel that holds `holds_ml`, if somebody knows that.
+pub fn check(episodes: &[Episode], holds_ml: Option<f64>) -> Findings {
     let usable = data::usable(episodes);
     let mut doubts = doubtful_recordings(episodes, &usable);
     doubts.extend(consistency::doubtful(&usable.episodes).into_iter().map(|d| (d.name.clone(), d.to_string())));
+    if !usable.episodes.is_empty() {
+        doubts.extend(consistency::against_vessel(&usable.episodes, &fit::fit(&usable.episodes), holds_ml));
+    }
     doubts.extend(set_doubts(&usable.episodes));
     let spanned = gaps::spanned(&usable.episodes, &calibration::calibrate(&usable.episodes, None));
     let missing = spanned.as_ref().map(Spanned::missing).unwrap_or_default();
@@ -95,7 +108,8 @@ fn recording_doubts(e: &Episode) -> Vec<String> {
     }
     doubts.extend(angle_doubt(e));
     let mut doubt = |what: String| doubts.push(what);
-    let tilt_deg = |row: Option<&EpisodeRow>| row.map_or(0.0, |row| row.alpha_commanded_deg);
+    // A joint may stay where its command has left it.
+    let tilt_deg = |row: Option<&EpisodeRow>| row.map_or(0.0, |row| row.alpha_commanded_deg.max(row.alpha_measured_deg));
     let last_deg = tilt_deg(e.rows.last());
     if last_deg > UPRIGHT_DEG {
         doubt(format!("the angle never returns ({last_deg:.0} degrees at the end): the last volume is not seen; record until upright"));
@@ -128,7 +142,7 @@ fn angle_doubt(e: &Episode) -> Option<String> {
 /// What is doubtful about the data set as a whole.
 fn set_doubts(episodes: &[TrainingEpisode]) -> Vec<(String, String)> {
     let mut doubts = Vec::new();
-    let mut doubt = |what: String| doubts.push(("data set".to_owned(), what));
+    let mut doubt = |what: String| doubts.push((consistency::DATA_SET.to_owned(), what));
     let n = episodes.len();
     if n == 0 {
         doubt("no episode can be trained on".into());
@@ -148,7 +162,8 @@ fn set_doubts(episodes: &[TrainingEpisode]) -> Vec<(String, String)> {
 /// read.
 pub fn run(args: &Args) -> Result<(), Failure> {
     let episodes = args.source.read().or_exit(exit::BAD_INPUT)?;
-    let findings = check(&episodes);
+    let config = args.config.as_deref().map(shared::config::Config::read).transpose().or_exit(exit::BAD_INPUT)?;
+    let findings = check(&episodes, args.holds.or(config.and_then(|c| c.container.holds_ml)));
     if args.json {
         println!("{}", serde_json::to_string_pretty(&findings).unwrap_or_default());
     } else {
@@ -163,6 +178,7 @@ pub fn run(args: &Args) -> Result<(), Failure> {
             println!("not spanned: {what}");
         }
     }
-    let wrong = !findings.left_out.is_empty() || findings.doubts.iter().any(|(name, _)| name != "data set") || findings.usable == 0;
+    let wrong =
+        !findings.left_out.is_empty() || findings.doubts.iter().any(|(name, _)| name != consistency::DATA_SET) || findings.usable == 0;
     if wrong { Err(failure(exit::FAILED, "the data set is not as it should be; what was found says what to do")) } else { Ok(()) }
 }

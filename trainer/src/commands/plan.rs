@@ -9,6 +9,7 @@ use shared::exit::{self, Failure, OrExit as _, failure};
 use shared::level::plain;
 use shared::limits::Limits;
 
+use crate::consistency;
 use crate::data::{self, DataError, EpisodeSource, UsableEpisodes};
 use crate::fit;
 use crate::teaching::foresight::Foresight;
@@ -23,6 +24,9 @@ const HOLDS_ML: (f64, f64) = (50.0, 10_000.0);
 const GOAL_ML: f64 = 250.0;
 /// Largest goal that a plan may have, ml: as controller.goal_max_ml.
 const GOAL_MAX_ML: f64 = 5000.0;
+
+/// Period of the loop where no configuration is named, ns: 30 Hz.
+pub const PERIOD_NS: u64 = 33_333_333;
 
 /// Command-line arguments of `trainer plan`.
 #[derive(Debug, clap::Args)]
@@ -59,6 +63,13 @@ pub fn run(args: &Args) -> Result<(), Failure> {
     let limits = config.as_ref().map_or_else(Limits::default, |c| c.limits);
     let goal_max_ml =
         args.goal_max.unwrap_or_else(|| config.as_ref().map_or(GOAL_ML, |c| f64::from(c.controller.goal_max_ml).min(GOAL_ML)));
+    if let (Some(goal_ml), Some(most_ml)) = (args.goal_max, config.as_ref().map(|c| f64::from(c.controller.goal_max_ml)))
+        && goal_ml > most_ml
+    {
+        let what = format!("--goal-max {goal_ml} is above controller.goal_max_ml, {most_ml}: no such pour would be taken");
+        return Err(failure(exit::BAD_INPUT, what));
+    }
+    let period_ns = config.as_ref().map_or(PERIOD_NS, |c| (1e9 / c.controller.rate_hz) as u64);
     let holds_ml = args.holds.or(config.and_then(|c| c.container.holds_ml));
     if args.holds.is_some_and(|ml| !(HOLDS_ML.0..=HOLDS_ML.1).contains(&ml)) || !(1.0..=GOAL_MAX_ML).contains(&goal_max_ml) {
         let what = format!("--holds is {} to {} ml, and --goal-max 1 to {GOAL_MAX_ML} ml", HOLDS_ML.0, HOLDS_ML.1);
@@ -70,17 +81,21 @@ pub fn run(args: &Args) -> Result<(), Failure> {
         Err(DataError::None { .. }) => UsableEpisodes::default(),
         Err(e) => return Err(failure(exit::BAD_INPUT, e)),
     };
-    let wish = wish(&limits, goal_max_ml);
+    let doubts = doubts(&usable, holds_ml)?;
+    let wish = wish(&limits, period_ns, goal_max_ml);
     let found = propose(&usable, holds_ml, &wish)?;
     // There is at least one, or `propose` would have said why not.
     let [first, others @ ..] = &found.candidates[..] else { return Ok(()) };
     if args.json {
-        let all = serde_json::json!({ "episodes": usable.episodes.len(), "left_out": usable.left_out, "plan": found });
+        let all = serde_json::json!({ "episodes": usable.episodes.len(), "left_out": usable.left_out, "doubts": doubts, "plan": found });
         println!("{}", serde_json::to_string_pretty(&all).unwrap_or_default());
         return Ok(());
     }
     for (name, what) in &usable.left_out {
         println!("left out: {}", plain(&format!("{name}: {what}")));
+    }
+    for what in &doubts {
+        println!("doubtful: {}", plain(what));
     }
     println!("{}", words(first));
     if usable.episodes.is_empty() {
@@ -97,9 +112,23 @@ pub fn run(args: &Args) -> Result<(), Failure> {
     Ok(())
 }
 
-/// What is asked for by a cell with these limits, whose largest goal is known, ml.
-pub fn wish(limits: &Limits, goal_max_ml: f64) -> Wish {
-    Wish { goal_max_ml, alpha_max_deg: f64::from(limits.alpha_max_deg) - BELOW_LIMIT_DEG }
+/// What is asked for by a cell with these limits and this period of its loop, whose largest goal is known, ml.
+pub fn wish(limits: &Limits, period_ns: u64, goal_max_ml: f64) -> Wish {
+    Wish { goal_max_ml, alpha_max_deg: f64::from(limits.alpha_max_deg) - BELOW_LIMIT_DEG, limits: *limits, period_ns }
+}
+
+/// Weights that do not fit each other, or not the vessel: what is proposed rests on them. A vessel that holds less than was weighed is refused.
+fn doubts(usable: &UsableEpisodes, holds_ml: Option<f64>) -> Result<Vec<String>, Failure> {
+    if usable.episodes.is_empty() {
+        return Ok(Vec::new());
+    }
+    let of_weights = consistency::doubtful(&usable.episodes).into_iter().map(|d| (d.name.clone(), d.to_string()));
+    let of_vessel = consistency::against_vessel(&usable.episodes, &fit::fit(&usable.episodes), holds_ml);
+    if let Some((name, what)) = of_vessel.iter().find(|(name, _)| name != consistency::DATA_SET) {
+        return Err(failure(exit::BAD_INPUT, format!("{name}: {what} Correct the weight, or what the vessel holds")));
+    }
+    let words = |(name, what): (String, String)| if what.starts_with(&name) { what } else { format!("{name}: {what}") };
+    Ok(of_weights.chain(of_vessel).map(words).collect())
 }
 
 /// What to weigh next after the usable episodes.

@@ -78,7 +78,7 @@ pub fn run(args: &Args) -> Result<(), Failure> {
         let what = format!("no episode of these is called {name}: give the name that `trainer check` shows");
         return Err(failure(exit::BAD_INPUT, what));
     }
-    let limits = args.weight_file.limits()?;
+    let config = args.weight_file.config()?;
     let mut usable = data::usable(&read);
     usable.episodes.retain(|e| !args.leave_out.contains(&e.name));
     for doubt in consistency::doubtful(&usable.episodes) {
@@ -100,8 +100,8 @@ pub fn run(args: &Args) -> Result<(), Failure> {
     }
     say_doubtful_recordings(&read, &usable);
     let history = weighed_pours(&read, &usable.episodes);
-    let options = Options { seed: args.weight_file.seed, limits, ..Options::default() };
-    args.weight_file.train_and_write(&usable, &options, serde_json::json!({ "pours": history }))?;
+    let options = Options { seed: args.weight_file.seed, limits: config.limits, ..Options::default() };
+    args.weight_file.train_and_write(&usable, &options, config.holds_ml, serde_json::json!({ "pours": history }))?;
     if !args.weight_file.json && !history.is_empty() {
         println!("pour   goal ml  scale g  error ml  mean |error| so far");
         for WeighedPour { number, goal_ml, weight_g, mae_so_far_ml } in history {

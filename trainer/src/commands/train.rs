@@ -57,7 +57,7 @@ pub struct WeightFileArgs {
     /// Seed: the same seed and data give the same bytes.
     #[arg(long, default_value_t = 1)]
     pub seed: u64,
-    /// Configuration of the cell, from which the limits are taken; without it, they are the default ones.
+    /// Configuration of the cell, from which the limits and [container] holds_ml are taken; without it, the limits are the default ones.
     #[arg(long, env = shared::config::VARIABLE)]
     config: Option<PathBuf>,
     /// Where the weight file goes. A file that is there is replaced in one step.
@@ -69,6 +69,15 @@ pub struct WeightFileArgs {
     /// Say how far it has come in lines of JSON on standard error, for a program that shows it.
     #[arg(long)]
     progress: bool,
+}
+
+/// What a training is told of the cell.
+#[derive(Debug, Default)]
+pub struct KnownCell {
+    /// The limits that the weights are made for.
+    pub limits: Limits,
+    /// What the vessel holds up to its lip, ml.
+    pub holds_ml: Option<f64>,
 }
 
 fn parse_actions(text: &str) -> Result<u8, String> {
@@ -124,7 +133,7 @@ impl Progress for Bar {
 pub fn run(args: &Args) -> Result<(), Failure> {
     args.weight_file.check()?;
     let read = args.source.read().or_exit(exit::BAD_INPUT)?;
-    let limits = args.weight_file.limits()?;
+    let config = args.weight_file.config()?;
     let can_fuse = matches!(args.method, MethodName::Best | MethodName::Paper);
     let estimate = args.estimate.unwrap_or(if can_fuse { Estimate::Fused } else { Estimate::Sum });
     if estimate == Estimate::Fused && !can_fuse {
@@ -136,8 +145,8 @@ pub fn run(args: &Args) -> Result<(), Failure> {
     for doubt in consistency::doubtful(&usable.episodes) {
         eprintln!("doubtful: {}", plain(&doubt.to_string()));
     }
-    let options = Options { method: args.method, actions: args.actions, estimate, seed: args.weight_file.seed, limits };
-    args.weight_file.train_and_write(&usable, &options, serde_json::Value::Null)
+    let options = Options { method: args.method, actions: args.actions, estimate, seed: args.weight_file.seed, limits: config.limits };
+    args.weight_file.train_and_write(&usable, &options, config.holds_ml, serde_json::Value::Null)
 }
 
 /// Says what is doubtful about how the episodes that are trained on were recorded.
@@ -162,15 +171,22 @@ impl WeightFileArgs {
         whole_file::check(&beside, JSON).map_err(|e| format!("{}: {e}", beside.display())).or_exit(exit::BAD_INPUT)
     }
 
-    /// The limits of the configuration, or the default ones; a configuration that cannot be read is bad input.
-    pub fn limits(&self) -> Result<Limits, Failure> {
-        let Some(file) = &self.config else { return Ok(Limits::default()) };
-        shared::config::Config::read(file).map(|c| c.limits).or_exit(exit::BAD_INPUT)
+    /// What is known of the cell; without a configuration, the default limits. One that cannot be read is bad input.
+    pub fn config(&self) -> Result<KnownCell, Failure> {
+        let Some(file) = &self.config else { return Ok(KnownCell::default()) };
+        let config = shared::config::Config::read(file).or_exit(exit::BAD_INPUT)?;
+        Ok(KnownCell { limits: config.limits, holds_ml: config.container.holds_ml })
     }
 
     /// Trains with a progress bar, writes the weight file and, beside it, everything that it came from (`W.json`); `extra` goes
-    /// into that file as it is.
-    pub fn train_and_write(&self, usable: &UsableEpisodes, options: &Options, extra: serde_json::Value) -> Result<(), Failure> {
+    /// into that file as it is. `holds_ml` is what the vessel holds, if somebody knows that.
+    pub fn train_and_write(
+        &self,
+        usable: &UsableEpisodes,
+        options: &Options,
+        holds_ml: Option<f64>,
+        extra: serde_json::Value,
+    ) -> Result<(), Failure> {
         for (name, what) in &usable.left_out {
             eprintln!("left out: {}", plain(&format!("{name}: {what}")));
         }
@@ -184,6 +200,9 @@ impl WeightFileArgs {
         let trained = method::train(&usable.episodes, options, progress).or_exit(exit::BAD_INPUT)?;
         bar.0.finish_and_clear();
         let seconds = begin.elapsed().as_secs_f64();
+        for (name, what) in trained.fit.iter().flat_map(|fit| consistency::against_vessel(&usable.episodes, fit, holds_ml)) {
+            eprintln!("doubtful: {}", plain(&format!("{name}: {what}")));
+        }
         if trained.fit.as_ref().is_some_and(|fit| fit.model.delay_frames >= DELAY_MAX_FRAMES - DELAY_NEAR_FRAMES) {
             eprintln!(
                 "doubtful: the pictures seem to be late by {DELAY_MAX_FRAMES} frames or more, and no longer delay is modelled: check the camera"

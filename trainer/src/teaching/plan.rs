@@ -4,6 +4,8 @@
 //! and the one after whose weighing the camera's volumes of the pours to come are least in doubt, on average, is proposed.
 
 use serde::Serialize;
+use shared::gaussian_curve::Curve;
+use shared::limits::Limits;
 
 use super::doubt::Doubt;
 use super::foresight::Foresight;
@@ -83,6 +85,10 @@ pub struct Wish {
     pub goal_max_ml: f64,
     /// The largest tilt of a curve, degrees.
     pub alpha_max_deg: f64,
+    /// The cell's limits, which a curve has to keep when it is commanded once every [`Self::period_ns`].
+    pub limits: Limits,
+    /// The period of the cell's loop, ns.
+    pub period_ns: u64,
 }
 
 /// The fills that are considered, ml, rounded down: a fill must go in.
@@ -101,7 +107,8 @@ fn curves(vessel: &Foresight, wish: &Wish) -> Vec<(Proposal, Span)> {
             for gamma_per_s2 in GAMMAS_PER_S2 {
                 let span = vessel.curve(fill_ml, lambda_deg, gamma_per_s2);
                 let possible = (LEAST_ML..POURED_SHARE_MAX * fill_ml).contains(&span.volume_ml());
-                if possible && lambda_deg <= wish.alpha_max_deg {
+                let runs = Curve::from_upright(lambda_deg as f32, gamma_per_s2 as f32).fits(&wish.limits, wish.period_ns);
+                if possible && runs && lambda_deg <= wish.alpha_max_deg {
                     all.push((Proposal::Curve { fill_ml, lambda_deg, gamma_per_s2 }, span));
                 }
             }
@@ -190,7 +197,19 @@ pub fn plan(vessel: &Foresight, weighed: &[Span], wish: &Wish) -> Plan {
 mod tests {
     use super::*;
 
-    const WISH: Wish = Wish { goal_max_ml: 250.0, alpha_max_deg: 105.0 };
+    const WISH: Wish = Wish {
+        goal_max_ml: 250.0,
+        alpha_max_deg: 105.0,
+        limits: Limits {
+            alpha_min_deg: 0.0,
+            alpha_max_deg: 110.0,
+            step_deg: 5.0,
+            rate_deg_s: 90.0,
+            acceleration_deg_s2: 1500.0,
+            return_rate_deg_s: 60.0,
+        },
+        period_ns: 33_333_333,
+    };
 
     fn next(vessel: &Foresight, weighed: &[Span]) -> (Plan, Candidate) {
         let plan = plan(vessel, weighed, &WISH);
