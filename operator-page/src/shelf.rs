@@ -7,6 +7,7 @@
 use std::collections::BTreeMap;
 use std::fs::{self, File};
 use std::io::Write as _;
+use std::os::unix::fs::OpenOptionsExt as _;
 use std::path::{Path, PathBuf};
 use std::sync::Mutex;
 use std::time::{Duration, Instant, SystemTime};
@@ -158,7 +159,7 @@ impl Shelf {
         let kept = self.kept();
         fs::create_dir_all(&kept).map_err(fault(&kept))?;
         let path = kept.join("lock");
-        let file = File::options().create(true).append(true).open(&path).map_err(fault(&path))?;
+        let file = File::options().create(true).append(true).mode(0o600).open(&path).map_err(fault(&path))?;
         let until = Instant::now() + TURN;
         while file.try_lock().is_err() {
             if Instant::now() > until {

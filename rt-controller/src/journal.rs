@@ -10,6 +10,7 @@
 use std::collections::BTreeMap;
 use std::fs::{File, OpenOptions};
 use std::io::{BufReader, BufWriter, ErrorKind, Read, Seek, SeekFrom, Write};
+use std::os::unix::fs::OpenOptionsExt as _;
 use std::path::{Path, PathBuf};
 
 use serde::{Deserialize, Serialize};
@@ -202,7 +203,8 @@ fn make_room(path: &Path) -> std::io::Result<File> {
         std::fs::rename(path, before(path, 1))?;
         drop(held);
     }
-    let file = OpenOptions::new().write(true).create_new(true).open(path)?;
+    // Who may read it could hold its lock, and keep the next controller from starting.
+    let file = OpenOptions::new().write(true).create_new(true).mode(0o600).open(path)?;
     // Whoever looks meets the lock; a file system without locks has none to give.
     let _ = file.try_lock();
     Ok(file)

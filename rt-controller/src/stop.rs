@@ -11,7 +11,7 @@
 use std::io::{Read, Write};
 use std::os::fd::AsFd;
 use std::os::linux::net::SocketAddrExt;
-use std::os::unix::fs::{MetadataExt, PermissionsExt};
+use std::os::unix::fs::{FileTypeExt, MetadataExt, PermissionsExt};
 use std::os::unix::net::{SocketAddr, UnixListener, UnixStream};
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, Ordering::SeqCst};
@@ -89,7 +89,10 @@ impl StopSockets {
             let what = format!("another rt-controller of cell '{name}' is running: stop it first (its runtime directory was deleted)");
             return Err(failure(exit::REFUSED, what));
         }
-        let _ = std::fs::remove_file(&path);
+        // What a dead controller has left; anything else is somebody's file, and is left as it is.
+        if path.symlink_metadata().is_ok_and(|m| m.file_type().is_socket()) {
+            let _ = std::fs::remove_file(&path);
+        }
         let file = UnixListener::bind(&path).map_err(fail)?;
         // A group that may enter the directory may also stop the robot.
         std::fs::set_permissions(&path, std::fs::Permissions::from_mode(0o660)).map_err(fail)?;

@@ -6,14 +6,17 @@
 //! `decant`, and nobody else can answer for it. Each failure is one line that names the cell.
 
 use std::collections::BTreeMap;
-use std::io::{BufRead, BufReader, ErrorKind, Write};
+use std::io::{BufRead, BufReader, ErrorKind, Read, Write};
 use std::os::linux::net::SocketAddrExt;
+use std::os::unix::fs::MetadataExt;
 use std::os::unix::net::{SocketAddr, UnixStream};
 use std::path::{Path, PathBuf};
 use std::sync::mpsc;
 use std::time::{Duration, Instant};
 
-use shared::os::peer_uid;
+use rustix::net::{AddressFamily, SocketAddrUnix, SocketFlags, SocketType, connect, socket_with};
+use shared::config::is_cell_name;
+use shared::os::{peer, peer_uid};
 use shared::runtime_dir::{Place, bases, own_uid};
 
 use crate::claim;
@@ -21,6 +24,14 @@ use crate::stop::{StopAnswer, abstract_name};
 
 /// Longest wait for an answer. Chosen by hand: the controller's thread answers at once.
 const ANSWER: Duration = Duration::from_secs(1);
+/// Longest answer that is read, bytes. Chosen by hand: ten times the longest one.
+const ANSWER_MAX: u64 = 4096;
+/// Rounds in which sockets without a free place are tried again. Chosen by hand: a controller frees a place within 1 ms.
+const ROUNDS: u32 = 5;
+/// Pause between these rounds. Chosen by hand: all of them take 20 ms.
+const ROUND: Duration = Duration::from_millis(4);
+/// The most cells that are asked by their names alone. Chosen by hand: a machine has a few, and more would be somebody's names.
+const NAMES_MOST: usize = 64;
 
 /// Where the controller of one cell may be reached.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -28,11 +39,13 @@ pub struct Target {
     /// The cell's name.
     pub name: String,
     /// The user as whom its controller runs.
-    uid: u32,
+    pub uid: u32,
     /// The cell's runtime directories that are there and have an owner.
     directories: Vec<PathBuf>,
     /// Of a directory that is there and is not believed, why; empty if there is none.
     pub doubted: String,
+    /// Who listens at its name is this user, and its runtime directory is not among the usual ones.
+    pub only_a_name: bool,
 }
 
 impl From<Place> for Target {
@@ -52,7 +65,7 @@ impl From<Place> for Target {
             }
         }
         let uid = believed.iter().find(|(d, _)| d.join("stop").exists()).map_or_else(own_uid, |(_, uid)| *uid);
-        Self { name: place.name, uid, directories: believed.into_iter().map(|(d, _)| d).collect(), doubted }
+        Self { name: place.name, uid, directories: believed.into_iter().map(|(d, _)| d).collect(), doubted, only_a_name: false }
     }
 }
 
@@ -76,7 +89,7 @@ pub fn running_cells() -> Running {
     let mut found: BTreeMap<(u32, String), Vec<PathBuf>> = BTreeMap::new();
     let mut doubted = Vec::new();
     for entry in bases().iter().filter_map(|b| std::fs::read_dir(b).ok()).flatten().flatten() {
-        let runs = entry.path().join("stop").exists();
+        let runs = entry.path().join("stop").exists() && entry.file_name().to_str().is_some_and(is_cell_name);
         match claim::owner(&entry.path(), false) {
             Ok(Some(uid)) if runs => found.entry((uid, entry.file_name().to_string_lossy().into_owned())).or_default().push(entry.path()),
             Err(why) if runs || is_closed(&entry.path()) => doubted.push(why),
@@ -85,31 +98,53 @@ pub fn running_cells() -> Running {
     }
     for line in std::fs::read_to_string("/proc/net/unix").unwrap_or_default().lines() {
         let Some((uid, name)) = line.split_once("@decant/").and_then(|(_, rest)| rest.split_once('/')) else { continue };
-        if let Ok(uid) = uid.parse() {
+        // Any user may bind a name, and write into a terminal with it.
+        if let (Ok(uid), true) = (uid.parse(), is_cell_name(name)) {
             found.entry((uid, name.into())).or_default();
         }
     }
-    let (mut targets, mut others) = (Vec::new(), Vec::new());
-    for ((uid, name), directories) in found {
-        let target = Target { name, uid, directories, doubted: String::new() };
-        // Any user may bind a name that says it is of another; only who listens there as that user is.
-        let only_a_name = target.directories.is_empty();
-        if only_a_name && !target.listens() {
-            continue;
-        }
-        match only_a_name {
-            true if ![0, uid].contains(&own_uid()) => others.push((uid, target.name)),
-            // Where it keeps its process number is not known without the configuration, so a controller that hangs cannot be ended.
-            true if target.ask("state").is_none() => {
-                doubted.push(format!(
-                    "the rt-controller of cell '{}' does not answer: give the cell's --config, which may end it",
-                    target.name
-                ));
+    let all = found.into_iter().map(|((uid, name), directories)| {
+        let only_a_name = directories.is_empty();
+        Target { name, uid, directories, doubted: String::new(), only_a_name }
+    });
+    let (named, mut targets): (Vec<Target>, Vec<Target>) = all.partition(|target| target.only_a_name);
+    let own = |target: &Target| [0, target.uid].contains(&own_uid());
+    let (named, others): (Vec<Target>, Vec<Target>) = listening(named).into_iter().partition(own);
+    targets.extend(named.into_iter().take(NAMES_MOST));
+    Running { targets, doubted, others: others.into_iter().map(|target| (target.uid, target.name)).collect() }
+}
+
+/// Those at whose names somebody listens who is the name's user or root. Nobody is waited for: a socket whose places are all taken would let nobody connect.
+fn listening(mut named: Vec<Target>) -> Vec<Target> {
+    let mut found = Vec::new();
+    for _ in 0..ROUNDS {
+        named.retain(|target| match target.listener() {
+            Ok(uid) => {
+                found.extend((uid == target.uid || uid == 0).then(|| target.clone()));
+                false
             }
-            _ => targets.push(target),
+            Err(full) => full,
+        });
+        if named.is_empty() {
+            break;
         }
+        std::thread::sleep(ROUND);
     }
-    Running { targets, doubted, others }
+    found
+}
+
+/// The controllers that run as this user, or for root as anybody, where this process can reach their sockets' names, and that are none of those that `answered`:
+/// process numbers. Unlike a name, no other user can make one of this user's.
+pub fn unreached(answered: &[u32]) -> Vec<u32> {
+    let net = |process: &str| std::fs::read_link(format!("/proc/{process}/ns/net")).ok();
+    let here = net("self");
+    let runs = |pid: u32| {
+        let arguments = std::fs::read(format!("/proc/{pid}/cmdline")).unwrap_or_default();
+        let own = std::fs::metadata(format!("/proc/{pid}")).is_ok_and(|m| own_uid() == 0 || m.uid() == own_uid());
+        own && claim::started(pid).is_some() && arguments.split(|b| *b == 0).nth(1) == Some(b"run") && net(&pid.to_string()) == here
+    };
+    let processes = std::fs::read_dir("/proc").into_iter().flatten().flatten().filter_map(|e| e.file_name().to_str()?.parse().ok());
+    processes.filter(|pid| !answered.contains(pid) && runs(*pid)).collect()
 }
 
 impl Target {
@@ -122,17 +157,14 @@ impl Target {
         ask_all(addresses, self.uid, line)
     }
 
-    /// Whether its user listens at the abstract socket, by what the kernel says, also if nobody answers there.
-    fn listens(&self) -> bool {
-        let Ok(address) = SocketAddr::from_abstract_name(abstract_name(self.uid, &self.name)) else { return false };
-        let uid = self.uid;
-        let (sender, receiver) = mpsc::channel();
-        // In a thread, because a socket whose places are all taken lets nobody connect.
-        let begun = std::thread::Builder::new().spawn(move || {
-            let peer = UnixStream::connect_addr(&address).ok().and_then(|s| peer_uid(&s));
-            sender.send(peer.is_some_and(|p| p == uid || p == 0))
-        });
-        begun.is_ok() && receiver.recv_timeout(ANSWER).unwrap_or(false)
+    /// The user who listens at the abstract socket, or whether its places are all taken, so that nobody can tell.
+    fn listener(&self) -> Result<u32, bool> {
+        let flags = SocketFlags::NONBLOCK | SocketFlags::CLOEXEC;
+        let socket = socket_with(AddressFamily::UNIX, SocketType::STREAM, flags, None).map_err(|_| false)?;
+        let name = abstract_name(self.uid, &self.name);
+        let address = SocketAddrUnix::new_abstract_name(name.as_bytes()).map_err(|_| false)?;
+        connect(&socket, &address).map_err(|e| e == rustix::io::Errno::AGAIN)?;
+        peer_uid(&socket).ok_or(false)
     }
 
     /// The process of the cell's controller, if it runs and its runtime directory still says so.
@@ -167,13 +199,19 @@ fn ask_all(addresses: Vec<SocketAddr>, uid: u32, line: &'static str) -> Option<S
 
 fn ask_at(address: &SocketAddr, uid: u32, line: &str) -> Option<StopAnswer> {
     let mut stream = UnixStream::connect_addr(address).ok()?;
-    if !peer_uid(&stream).is_some_and(|peer| peer == uid || peer == 0) {
-        return None;
-    }
+    let [_, pid] = peer(&stream).filter(|[peer, _]| [uid, 0].contains(peer))?;
     stream.write_all(format!("{line}\n").as_bytes()).ok()?;
     let mut answer = String::new();
-    BufReader::new(&stream).read_line(&mut answer).ok()?;
-    serde_json::from_str(&answer).ok()
+    BufReader::new((&stream).take(ANSWER_MAX)).read_line(&mut answer).ok()?;
+    let answer: StopAnswer = serde_json::from_str(&answer).ok()?;
+    // Its texts are shown on a terminal.
+    let plain = |text: String| shared::level::plain(&text).to_string();
+    Some(StopAnswer {
+        pid: if pid > 0 { pid } else { answer.pid },
+        hindrance: plain(answer.hindrance),
+        refused: plain(answer.refused),
+        ..answer
+    })
 }
 
 #[cfg(test)]

@@ -130,12 +130,18 @@ fn may_be_written(wait_ms: i32) -> bool {
 
 /// User number of the process at the other end of a Unix socket. A process in another PID namespace has one too.
 pub fn peer_uid(socket: &impl AsFd) -> Option<u32> {
+    peer(socket).map(|[uid, _]| uid)
+}
+
+/// User number and process number of the process at the other end of a Unix socket, of a server the one that listens. The process number is 0 where this
+/// process's PID namespace has none for it.
+pub fn peer(socket: &impl AsFd) -> Option<[u32; 2]> {
     let mut credentials = libc::ucred { pid: 0, uid: 0, gid: 0 };
     let mut length = size_of::<libc::ucred>() as libc::socklen_t;
     let fd = socket.as_fd().as_raw_fd();
     // SAFETY: `credentials` is plain data, valid for writes of `length` bytes, and the call writes no more.
     let done = unsafe { libc::getsockopt(fd, libc::SOL_SOCKET, libc::SO_PEERCRED, (&raw mut credentials).cast(), &raw mut length) };
-    (done == 0).then_some(credentials.uid)
+    (done == 0).then_some([credentials.uid, credentials.pid.max(0) as u32])
 }
 
 /// What is done when shared memory vanishes under the process.

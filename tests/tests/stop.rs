@@ -376,6 +376,57 @@ fn strangers_cannot_stop_or_pretend() {
     assert_aborted("own user", &timed(abort(&cell)), pour);
 }
 
+/// A process that is ended with the round.
+struct Ended(Child);
+
+impl Drop for Ended {
+    fn drop(&mut self) {
+        let _ = self.0.kill().and_then(|()| self.0.wait());
+    }
+}
+
+/// Another user's sockets in the names of cells: `SCRIPT KIND NAME...` binds each name and says so, then waits. Those of kind `full` have no free place, and
+/// the others never answer.
+const SOCKETS: &str = "import os,socket,sys,time
+os.setgid(65534); os.setuid(65534)
+kept=[]
+for name in sys.argv[2:]:
+    s=socket.socket(socket.AF_UNIX); s.bind('\\0'+name); s.listen(0); kept.append(s)
+    for _ in range(3 if sys.argv[1]=='full' else 0):
+        c=socket.socket(socket.AF_UNIX); c.setblocking(False); kept.append(c)
+        try: c.connect('\\0'+name)
+        except OSError: pass
+print(1,flush=True)
+time.sleep(300)";
+
+/// Makes such sockets where `cell` is, until what is given is dropped.
+fn sockets(cell: &CellUnderTest, kind: &str, names: &[String]) -> Ended {
+    let mut command = cell.inside.as_ref().expect("apart").command("python3");
+    let mut child = command.args(["-c", SOCKETS, kind]).args(names).stdout(Stdio::piped()).spawn().expect("it starts");
+    std::io::Read::read_exact(child.stdout.as_mut().expect("piped"), &mut [0; 1]).expect("it has bound them");
+    Ended(child)
+}
+
+/// Protects the one who stops a robot from any other user of the machine, who may bind any name: an abort without a configuration asks every cell at once,
+/// whoever does not answer elsewhere, shows no terminal what stands in a name, and takes a stranger's silence for no cell's.
+#[test]
+fn names_of_a_stranger_delay_no_abort() {
+    if !rustix::process::geteuid().is_root() {
+        println!("not run: it takes root to act as another user");
+        return;
+    }
+    let Some(cell) = cell_apart() else { return };
+    let pour = cell.pour_tilted();
+    let full: Vec<String> = (0..40).map(|k| format!("decant/0/a{k:03}")).collect();
+    let silent: Vec<String> = (0..10).map(|k| format!("decant/65534/a{k:03}")).chain(["decant/65534/\u{1b}[2J".into()]).collect();
+    let _kept = (sockets(&cell, "full", &full), sockets(&cell, "silent", &silent));
+    let aborted = timed(abort(&cell));
+    let said = [&aborted.0.stdout[..], &aborted.0.stderr].concat();
+    assert!(!said.contains(&0x1b), "{}", String::from_utf8_lossy(&said).escape_debug());
+    assert_eq!(aborted.0.status.code(), Some(0), "{}", String::from_utf8_lossy(&said));
+    assert!(String::from_utf8_lossy(&pour.wait_with_output().expect("it ran").stdout).contains("\"aborted\""));
+}
+
 /// A copy of a program where every user can run it.
 fn public_copy(name: &str) -> (tempfile::TempDir, PathBuf) {
     let dir = tempfile::tempdir_in("/dev/shm").or_else(|_| tempfile::tempdir()).expect("a directory");

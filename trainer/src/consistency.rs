@@ -37,9 +37,9 @@ pub const DATA_SET: &str = "data set";
 const DENSEST_G_ML: f64 = 1.5;
 /// Weights of which none reaches this are none of grams, g. Chosen by hand: a curve or pour to learn from has 25 g and more.
 const GRAMS_LEAST: f64 = 2.0;
-/// What the weights tell of the vessel's volume may be off by this factor. Chosen by hand: it rests on tilts at which nothing was ever seen; right weights
-/// of simulated rigs told 0.6 to 1.9 times the volume, and a decimal point makes ten.
-const VOLUME_APART: f64 = 3.0;
+/// Right weights tell between this and that share of the vessel's volume. It rests on tilts at which nothing was ever seen: 90 trainings of tuning rigs 200
+/// to 202, all kinds of vessels, with 2, 2+3 and 5 weighings told 0.72 to 5.2 times the volume, and a decimal point makes ten.
+const VOLUME_TOLD: [f64; 2] = [0.25, 6.0];
 /// The tilt up to which a vessel's volume is counted, degrees: the flow model's tables end there.
 const LAST_DEG: f64 = 118.0;
 
@@ -81,7 +81,7 @@ pub fn against_vessel(episodes: &[TrainingEpisode], fit: &Fit, holds_ml: Option<
         doubts.push((e.name.clone(), what));
     }
     let volume_ml = FlowTables::new(&fit.model, data::rate_hz(episodes)).capacity.lost_ml(LAST_DEG);
-    if doubts.is_empty() && !(holds_ml / VOLUME_APART..=holds_ml * VOLUME_APART).contains(&volume_ml) {
+    if doubts.is_empty() && !(VOLUME_TOLD[0]..=VOLUME_TOLD[1]).contains(&(volume_ml / holds_ml)) {
         doubts.push(set(format!(
             "the weights are those of a vessel that holds {volume_ml:.0} ml, but it holds {holds_ml:.0} ml: are they in grams, and is the decimal point right?"
         )));

@@ -317,7 +317,7 @@ fn weights_that_are_all_wrong_are_doubted() {
     let dir = tempfile::tempdir().unwrap();
     cell(dir.path(), "# holds_ml", "holds_ml");
     for (factor, says) in
-        [(1.0, None), (5.0, Some("but it holds 520 ml")), (10.0, Some("decimal point")), (0.001, Some("are they in grams?"))]
+        [(1.0, None), (8.0, Some("but it holds 520 ml")), (10.0, Some("decimal point")), (0.001, Some("are they in grams?"))]
     {
         tables(dir.path(), 4, |_, w| factor * w);
         for command in ["check", "train", "refine", "plan"] {

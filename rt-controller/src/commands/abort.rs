@@ -15,7 +15,7 @@ use shared::messages::Phase;
 use shared::runtime_dir::{Place, own_uid};
 
 use crate::claim;
-use crate::stop_client::{Running, Target, running_cells};
+use crate::stop_client::{Running, Target, running_cells, unreached};
 
 /// How long the command waits for the container to be upright. Chosen by hand: the way back from the largest tilt takes about 2 s.
 const UPRIGHT: Duration = Duration::from_secs(20);
@@ -45,15 +45,56 @@ pub fn run(args: &Args) -> Result<(), Failure> {
             "note: an rt-controller of user {uid}, cell '{name}', runs too and was not asked: if its runtime directory lets you in, give the cell's --config"
         );
     }
+    let missed = |answered: &[u32]| -> Vec<String> {
+        if args.config.as_deref().is_some_and(|file| Config::read(file).is_ok()) {
+            return Vec::new();
+        }
+        unreached(answered)
+            .into_iter()
+            .map(|pid| format!("process {pid} is an rt-controller that was not reached: give its cell's --config"))
+            .collect()
+    };
     if targets.is_empty() {
+        let doubted = [doubted, missed(&[])].concat();
         let none = || failure(exit::UNREACHABLE, "no rt-controller that this user may stop is running");
         return Err(if doubted.is_empty() { none() } else { not_known(&doubted.join("; ")) });
     }
     for why in &doubted {
         eprintln!("error: {}", not_known(why).what);
     }
-    // Every cell is asked before one is waited for.
-    let asked: Vec<(Target, Result<Asked, Failure>)> = targets.into_iter().map(|t| (t.clone(), ask(&t))).collect();
+    // Every cell is asked before one is waited for, and all at once: a socket that does not answer keeps no other cell waiting.
+    let mut asked: Vec<(Target, Result<Asked, Failure>)> = std::thread::scope(|scope| {
+        let ask_in_thread = |target: Target| {
+            let own = target.clone();
+            (target, std::thread::Builder::new().spawn_scoped(scope, move || ask(&own)))
+        };
+        let begun: Vec<_> = targets.into_iter().map(ask_in_thread).collect();
+        let answer = |target: &Target, begun: std::io::Result<std::thread::ScopedJoinHandle<'_, _>>| match begun.map(|b| b.join()) {
+            Ok(Ok(asked)) => asked,
+            _ => ask(target),
+        };
+        begun
+            .into_iter()
+            .map(|(target, begun)| {
+                let asked = answer(&target, begun);
+                (target, asked)
+            })
+            .collect()
+    });
+    // Another user's name at which nobody answers keeps nobody from knowing that the others are upright.
+    asked.retain(|(target, asked)| {
+        let strange = target.only_a_name && target.uid != own_uid() && asked.as_ref().is_err_and(|e| e.code == exit::UNREACHABLE);
+        if strange {
+            eprintln!("note: nobody answers at the socket of cell '{}' of user {}", target.name, target.uid);
+        }
+        !strange
+    });
+    let answered: Vec<u32> = asked.iter().filter_map(|(_, asked)| asked.as_ref().ok().map(Asked::pid)).collect();
+    let missed = missed(&answered);
+    for why in &missed {
+        eprintln!("error: {}", not_known(why).what);
+    }
+    let doubted = [doubted, missed].concat();
     let several = asked.len() + doubted.len() > 1;
     let mut result = if doubted.is_empty() { Ok(()) } else { Err(failure(exit::FAILED, "not every container is known to be upright")) };
     for (target, asked) in asked {
@@ -98,18 +139,37 @@ fn targets(config: Option<&Path>) -> Running {
 
 /// How a controller was reached.
 enum Asked {
-    /// At its socket.
-    Socket,
+    /// At its socket, which this process serves.
+    Socket(u32),
+    /// At its socket, where this process refused, for this reason.
+    Refused(u32, String),
     /// By SIGTERM to this process.
     Process(claim::Running),
+}
+
+impl Asked {
+    /// The controller's process.
+    fn pid(&self) -> u32 {
+        match self {
+            Self::Socket(pid) | Self::Refused(pid, _) => *pid,
+            Self::Process(process) => process.pid,
+        }
+    }
 }
 
 /// Asks the controller of `target` to stop.
 fn ask(target: &Target) -> Result<Asked, Failure> {
     if let Some(answer) = target.ask("abort") {
-        return if answer.refused.is_empty() { Ok(Asked::Socket) } else { Err(failure(exit::REFUSED, answer.refused)) };
+        return Ok(if answer.refused.is_empty() { Asked::Socket(answer.pid) } else { Asked::Refused(answer.pid, answer.refused) });
     }
     let absent = || {
+        if target.only_a_name && target.uid == own_uid() {
+            // Where it keeps its process number is not known without the configuration, so a controller that hangs cannot be ended.
+            return not_known(&format!(
+                "the rt-controller of cell '{}' does not answer: give the cell's --config, which may end it",
+                target.name
+            ));
+        }
         if !target.doubted.is_empty() {
             return not_known(&target.doubted);
         }
@@ -135,7 +195,8 @@ fn wait(target: &Target, asked: Asked) -> Result<String, Failure> {
     let until = Instant::now() + UPRIGHT;
     while Instant::now() < until {
         match &asked {
-            Asked::Socket => match target.ask("state") {
+            Asked::Refused(_, why) => return Err(failure(exit::REFUSED, why)),
+            Asked::Socket(_) => match target.ask("state") {
                 Some(state) if state.upright => return Ok("upright".into()),
                 Some(state) if state.phase == Phase::NoRobot => return Err(failure(exit::FAILED, state.hindrance)),
                 Some(_) => {}

@@ -7,6 +7,7 @@ use std::path::PathBuf;
 use shared::agent::Agent;
 use shared::config::Config;
 use shared::control::EndReason;
+use shared::disk_space::error_words;
 use shared::exit::{self, Failure, OrExit as _, failure};
 use shared::messages::{Doubt, Feature, LAYOUT_VERSION, Telemetry};
 use shared::weights::Weights;
@@ -40,7 +41,7 @@ pub fn run(args: &Args) -> Result<(), Failure> {
     let fits = check_weights(&weights, config.camera.fps, &config.limits);
     fits.map_err(|why| failure(exit::BAD_INPUT, format!("{}: {why}", args.weights.display())))?;
     let (rate_hz, fps) = (config.controller.rate_hz, config.camera.fps);
-    if (f64::from(rate_hz) - f64::from(fps)).abs() > 1e-3 {
+    if (rate_hz - fps).abs() > 1e-3 {
         let what = format!(
             "controller.rate_hz is {rate_hz} and camera.fps {fps}: `step` has one tick for each frame, so give a configuration in which both are alike"
         );
@@ -78,16 +79,16 @@ pub fn run(args: &Args) -> Result<(), Failure> {
         return Err(failure(exit::REFUSED, refusal));
     }
     let mut lines = Lines { out: std::io::stdout().lock(), printed: 0 };
-    if lines.print(&started.telemetry).is_err() {
-        return Ok(()); // the reader has gone
+    if !lines.print(&started.telemetry)? {
+        return Ok(());
     }
     let mut ended = None;
     for (number, line) in std::io::stdin().lock().lines().enumerate() {
         let area_px2 = line.map_err(|e| e.to_string()).and_then(|text| area_px2(&text));
         let area_px2 = area_px2.map_err(|why| failure(exit::BAD_INPUT, format!("line {}: {why}", number + 1)))?;
         let output = frame(area_px2, None);
-        if lines.print(&output.telemetry).is_err() {
-            return Ok(()); // the reader has gone
+        if !lines.print(&output.telemetry)? {
+            return Ok(());
         }
         if let Some(outcome) = output.ended {
             eprintln!("{} ml poured (estimate), {}", outcome.poured_words(), outcome.reason.words());
@@ -121,11 +122,16 @@ struct Lines<W> {
 }
 
 impl<W: Write> Lines<W> {
-    fn print(&mut self, telemetry: &Telemetry) -> std::io::Result<()> {
+    /// Prints a line. Gives whether the reader is still there.
+    fn print(&mut self, telemetry: &Telemetry) -> Result<bool, Failure> {
         let alpha = (f64::from(telemetry.alpha_deg) * PLACES).round() as i64;
         let dalpha = alpha - std::mem::replace(&mut self.printed, alpha);
-        writeln!(self.out, "{:.4} {:.4} {:.4}", dalpha as f64 / PLACES, alpha as f64 / PLACES, telemetry.d_ml)?;
-        self.out.flush()
+        let line = format!("{:.4} {:.4} {:.4}\n", dalpha as f64 / PLACES, alpha as f64 / PLACES, telemetry.d_ml);
+        match self.out.write_all(line.as_bytes()).and_then(|()| self.out.flush()) {
+            Ok(()) => Ok(true),
+            Err(e) if e.kind() == std::io::ErrorKind::BrokenPipe => Ok(false),
+            Err(e) => Err(failure(exit::FAILED, format!("standard output: {}", error_words(&e)))),
+        }
     }
 }
 

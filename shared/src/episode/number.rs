@@ -8,9 +8,9 @@
 //! Ordinary threads that may wait for the disk use it; it allocates. Errors are those of the system; the caller names the directory.
 
 use std::cmp::Ordering;
-use std::fs::{File, OpenOptions};
+use std::fs::{File, OpenOptions, Permissions};
 use std::io::{Error, Read, Result, Seek, Write};
-use std::os::unix::fs::OpenOptionsExt;
+use std::os::unix::fs::{OpenOptionsExt, PermissionsExt};
 use std::path::Path;
 use std::time::{Duration, Instant};
 
@@ -26,10 +26,12 @@ pub fn take_number(directory: &Path) -> Result<u64> {
     std::fs::create_dir_all(directory)?;
     let flags = (rustix::fs::OFlags::NOFOLLOW | rustix::fs::OFlags::NONBLOCK).bits() as i32;
     let path = directory.join(".last-number");
-    let mut file = OpenOptions::new().read(true).write(true).create(true).truncate(false).custom_flags(flags).open(path)?;
+    let mut file = OpenOptions::new().read(true).write(true).create(true).truncate(false).mode(0o600).custom_flags(flags).open(path)?;
     if !file.metadata()?.is_file() {
         return Err(Error::other(".last-number is no file: remove it"));
     }
+    // Who may read it could hold its lock. One that is another user's stays as it is.
+    let _ = file.set_permissions(Permissions::from_mode(0o600));
     lock(&file)?;
     let mut text = String::new();
     (&file).take(32).read_to_string(&mut text)?;

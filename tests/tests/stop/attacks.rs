@@ -6,10 +6,12 @@ use std::io::{Read as _, Write as _};
 use std::os::linux::net::SocketAddrExt as _;
 use std::os::unix::net::{SocketAddr, UnixStream};
 use std::path::PathBuf;
-use std::process::{Child, Command, Stdio};
+use std::process::{Command, Stdio};
 use std::time::{Duration, Instant};
 
 use tests::{CellUnderTest, Namespaces, steady_weights};
+
+use super::Ended;
 
 /// How often each attack is measured.
 const ROUNDS: usize = 3;
@@ -27,15 +29,6 @@ struct Attack {
 
 fn nothing(_: &CellUnderTest) -> Option<Box<dyn Any>> {
     None
-}
-
-/// A process that is ended with the round.
-struct Ended(Child);
-
-impl Drop for Ended {
-    fn drop(&mut self) {
-        let _ = self.0.kill().and_then(|()| self.0.wait());
-    }
 }
 
 /// Answers of the controller at its stop socket, by the file or, where that is gone, the abstract name.

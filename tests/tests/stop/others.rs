@@ -186,6 +186,29 @@ fn a_directory_that_is_not_believed_is_named() {
     assert!(code == Some(1) && said.contains("every cell that runs is stopped instead") && said.contains(&reason), "{code:?} {said}");
 }
 
+/// Protects who aborts without a configuration beside a cell whose runtime files lie in a directory of its own, and whose socket's name another user has
+/// taken before it: a process that runs and was not reached is no "nothing runs".
+#[test]
+fn a_controller_whose_name_is_taken_is_told_of() {
+    if !rustix::process::geteuid().is_root() {
+        println!("not run: it takes root to act as another user");
+        return;
+    }
+    let Some(inside) = Namespaces::new(None) else { return };
+    let base = tempfile::tempdir().expect("a directory");
+    let mut cell = CellUnderTest::prepare(|c| {
+        c["cell"].as_table_mut().expect("a table").insert("runtime_dir".into(), base.path().display().to_string().into());
+    });
+    cell.inside = Some(inside);
+    let _kept = super::sockets(&cell, "silent", &[format!("decant/0/{}", cell.name)]);
+    cell.spawn("rt-controller");
+    cell.wait("the controller", Duration::from_secs(30), |_| true);
+    let pid = cell.pid("rt-controller");
+    let (output, _) = super::timed(super::abort(&cell));
+    let said = String::from_utf8_lossy(&output.stderr).into_owned();
+    assert!(output.status.code() == Some(1) && said.contains(&format!("process {pid} is an rt-controller that was not reached")), "{said}");
+}
+
 /// Protects who aborts without a configuration beside a cell whose runtime files lie in a directory of its own: only its socket's name shows that it runs.
 /// Another user is told of it, and a controller that hangs is no "nothing runs".
 #[test]

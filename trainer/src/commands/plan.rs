@@ -82,6 +82,10 @@ pub fn run(args: &Args) -> Result<(), Failure> {
         Err(e) => return Err(failure(exit::BAD_INPUT, e)),
     };
     let doubts = doubts(&usable, holds_ml)?;
+    if !args.json {
+        usable.left_out.iter().for_each(|(name, what)| println!("left out: {}", plain(&format!("{name}: {what}"))));
+        doubts.iter().for_each(|what| println!("doubtful: {}", plain(what)));
+    }
     let wish = wish(&limits, period_ns, goal_max_ml);
     let found = propose(&usable, holds_ml, &wish)?;
     // There is at least one, or `propose` would have said why not.
@@ -90,12 +94,6 @@ pub fn run(args: &Args) -> Result<(), Failure> {
         let all = serde_json::json!({ "episodes": usable.episodes.len(), "left_out": usable.left_out, "doubts": doubts, "plan": found });
         println!("{}", serde_json::to_string_pretty(&all).unwrap_or_default());
         return Ok(());
-    }
-    for (name, what) in &usable.left_out {
-        println!("left out: {}", plain(&format!("{name}: {what}")));
-    }
-    for what in &doubts {
-        println!("doubtful: {}", plain(what));
     }
     println!("{}", words(first));
     if usable.episodes.is_empty() {

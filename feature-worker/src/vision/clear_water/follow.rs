@@ -55,20 +55,21 @@ impl SmallPicture<'_> {
         let ([x, y], [dx, dy]) = (place.map(fixed), step.map(fixed));
         let at = |i: usize| (x.wrapping_add(dx.wrapping_mul(i as i32)), y.wrapping_add(dy.wrapping_mul(i as i32)));
         // Loading is apart from mixing, for the vector registers.
-        let mut four = [[0; RUN]; 4];
-        for i in 0..count.min(RUN) {
+        let [mut above, mut right, mut below, mut below_right] = [[0; RUN]; 4];
+        let corners = above.iter_mut().zip(&mut right).zip(&mut below).zip(&mut below_right);
+        for (i, (((above, right), below), below_right)) in corners.take(count).enumerate() {
             let (x, y) = at(i);
             let corner = (y >> 16) as usize * self.width + (x >> 16) as usize;
             let rows = (self.pixels.get(corner..corner + 2), self.pixels.get(corner + self.width..corner + self.width + 2));
             if let (Some([a, b]), Some([c, d])) = rows {
-                [four[0][i], four[1][i], four[2][i], four[3][i]] = [packed(a), packed(b), packed(c), packed(d)];
+                (*above, *right, *below, *below_right) = (packed(a), packed(b), packed(c), packed(d));
             }
         }
         let mut samples = [0; RUN];
         for (i, sample) in samples.iter_mut().enumerate() {
             let (x, y) = at(i);
             let (wx, wy, odd) = (x as u32 >> 8 & 255, y as u32 >> 8 & 255, y as u32 >> 16 & 1);
-            *sample = mix(mix(four[0][i], four[1][i], wx, odd), mix(four[2][i], four[3][i], wx, odd), wy, odd);
+            *sample = mix(mix(above[i], right[i], wx, odd), mix(below[i], below_right[i], wx, odd), wy, odd);
         }
         samples
     }
