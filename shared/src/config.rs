@@ -25,7 +25,7 @@ pub const FILE_MAX: u64 = 1 << 20;
 /// The rule for a cell's name, in words; the name becomes part of file names.
 pub(crate) const CELL_NAME_RULE: &str = "1 to 32 letters, digits, '-' or '_'";
 
-/// Whether `name` keeps [`CELL_NAME_RULE`].
+/// Whether `name` is a legal name of a cell: 1 to 32 letters, digits, `-` or `_`.
 pub fn is_cell_name(name: &str) -> bool {
     let legal = |c: char| c.is_ascii_alphanumeric() || c == '-' || c == '_';
     (1..=32).contains(&name.len()) && name.chars().all(legal)
