@@ -85,6 +85,9 @@ const LIP_KNOWN: f32 = 0.5;
 const MAY_BEGIN_SCORE: f32 = 0.35;
 /// And with an edge on a share of its length above this. Tuned on the same seeds.
 const MAY_BEGIN_EDGE: f32 = 0.55;
+/// Where the ground is darker than so many of the least differences that are water, none is told to be there. Chosen by hand: a rim that is black then
+/// differs by twice of it.
+const DARK_LEAST: f32 = 2.0;
 /// Before an even ground, it is not known where this share has. Chosen by hand: a bead that hangs at the lip, which is no stream, covers half of it.
 const EVEN_LIP_CHANGED: f32 = 0.7;
 /// Legs of the largest bead that hangs at the lip, with its blur, px. Chosen by hand: [`Water`] takes less than 24 px^2 for a bead.
@@ -254,6 +257,7 @@ impl ClearWater {
                 }
                 _ if self.lip_has_changed() => Sighting::Unsure(Doubt::EdgeNotFound),
                 (_, Some((found, ..))) if self.may_begin(&found) => Sighting::Unsure(Doubt::EdgeNotFound),
+                _ if self.is_too_dark() => Sighting::Unsure(Doubt::TooDark),
                 _ if self.vouched.see_none(&self.evidence, &self.rays) => Sighting::Dry { confidence: 1.0 },
                 _ => sighting,
             };
@@ -275,6 +279,12 @@ impl ClearWater {
         let hidden = self.hidden.then_some(Doubt::BlownOut);
         let disturbed = self.disturbed.doubt().filter(|_| self.is_pattern());
         Ok(hidden.or(disturbed).map_or(sighting, Sighting::Unsure))
+    }
+
+    /// Whether the ground is so dark that a rim without any light would hardly differ from it as much as water does.
+    fn is_too_dark(&self) -> bool {
+        let level = self.evidence.level();
+        level > 0.0 && level < DARK_LEAST * profile_edges::least_difference(self.evidence.noise())
     }
 
     /// Whether the ground is not even.

@@ -116,6 +116,8 @@ pub(super) struct Evidence {
     steps: Vec<f32>,
     /// Noise of the picture and of what is remembered, grey levels.
     noise: f32,
+    /// Mean brightness of the known background in the picture's light, grey levels.
+    level: f32,
     /// Share of the known background far from the lip that differs from the memory.
     strange_share: f32,
     /// Whether the ground near the lip has no pattern.
@@ -178,6 +180,7 @@ impl Evidence {
             shown_around: cells(),
             steps: cells(),
             noise: NOISE_LEAST,
+            level: 0.0,
             strange_share: 0.0,
             even: false,
             scratch: Vec::with_capacity(CELLS),
@@ -217,6 +220,11 @@ impl Evidence {
     /// Noise of the picture and of what is remembered, grey levels.
     pub(super) fn noise(&self) -> f32 {
         self.noise
+    }
+
+    /// Mean brightness of the known background in the picture's light, grey levels; 0 where none is known.
+    pub(super) fn level(&self) -> f32 {
+        self.level
     }
 
     /// Share of the known background far from the lip that differs from the memory.
@@ -346,7 +354,8 @@ impl Evidence {
         self.scratch.extend(known.map(|i| self.away[i]));
         let noise = if self.scratch.len() > NOISE_SAMPLES { NOISE_MEDIANS * median(&mut self.scratch) } else { NOISE_UNKNOWN };
         let noise = if noise > NOISE_MOST && !flickers { NOISE_UNKNOWN } else { noise };
-        self.noise = noise.max(NOISE_LEAST).max(NOISE_SHARE * level_sum / level_count.max(1.0));
+        self.level = level_sum / level_count.max(1.0);
+        self.noise = noise.max(NOISE_LEAST).max(NOISE_SHARE * self.level);
         let per_noise = 1.0 / self.noise;
         for ((away, away_earlier), slope) in self.away.iter_mut().zip(&mut self.away_earlier).zip(&self.slopes) {
             *away = (*away - SLOPE_SHARE * slope).max(0.0) * per_noise;

@@ -18,6 +18,11 @@ const STEEP_SHARE: f32 = 0.6;
 /// Least height of a profile's steepest step, grey levels a sample. Tuned.
 const STEEP_LEAST: f32 = 4.0;
 
+/// The least difference from the ground that is water, grey levels; `noise` is the small picture's.
+pub(super) fn least_difference(noise: f32) -> f32 {
+    (WET_NOISES * noise).max(WET_LEAST)
+}
+
 /// The edge on a profile in front of known ground: the outermost place that differs from the dry background, where half of the
 /// difference is reached. `differs` is the difference from the background at each sample and `noise` the small picture's, grey levels; `rim` is the
 /// colour of the stream's outline, if one was seen.
@@ -28,7 +33,7 @@ pub(super) fn on_known_ground(
     rim: Option<Colour>,
 ) -> Option<ProfileEdge> {
     let size = |d: &[f32; 3]| (d.iter().map(|v| v * v).sum::<f32>() / 3.0).sqrt();
-    let least = (WET_NOISES * noise).max(WET_LEAST);
+    let least = least_difference(noise);
     let sizes = differs.each_ref().map(size);
     let j = (1..2 * REACH).rev().find(|&j| sizes[j] >= least && sizes[j - 1] >= least)?;
     let full = (j.saturating_sub(4)..=j).max_by(|a, b| sizes[*a].total_cmp(&sizes[*b]))?;
