@@ -6,8 +6,8 @@ use clap::Parser as _;
 use feature_worker::cli::{Cli, Command};
 use feature_worker::commands::{bench, calibrate, camera, episodes, inspect, run, view};
 
-/// Bounds the pictures that OpenCV decodes, and keeps its decoders from writing to the terminal by themselves: every fault that they report is an error of ours, with what to
-/// do. Whoever sets the variables differently gets the messages.
+/// Bounds the pictures that OpenCV decodes, and keeps its decoders from writing to the terminal by themselves: every fault that they report is
+/// an error of ours, with what to do. Whoever sets the variables differently gets the messages.
 fn quiet_libraries() {
     let variables = [
         ("OPENCV_LOG_LEVEL", "SILENT"),

@@ -44,7 +44,7 @@ pub struct Target {
     directories: Vec<PathBuf>,
     /// Of a directory that is there and is not believed, why; empty if there is none.
     pub doubted: String,
-    /// Who listens at its name is this user, and its runtime directory is not among the usual ones.
+    /// Only its socket's name shows that it runs: its runtime directory is not among the usual ones.
     pub only_a_name: bool,
 }
 
