@@ -23,16 +23,21 @@ pub struct Limits {
     pub return_rate_deg_s: f32,
 }
 
+impl Limits {
+    /// The limits where no configuration says others.
+    pub const DEFAULT: Self = Self {
+        alpha_min_deg: 0.0,
+        alpha_max_deg: 110.0,
+        step_deg: 5.0,
+        rate_deg_s: 90.0,
+        acceleration_deg_s2: 1500.0,
+        return_rate_deg_s: 60.0,
+    };
+}
+
 impl Default for Limits {
     fn default() -> Self {
-        Self {
-            alpha_min_deg: 0.0,
-            alpha_max_deg: 110.0,
-            step_deg: 5.0,
-            rate_deg_s: 90.0,
-            acceleration_deg_s2: 1500.0,
-            return_rate_deg_s: 60.0,
-        }
+        Self::DEFAULT
     }
 }
 

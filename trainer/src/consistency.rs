@@ -14,6 +14,7 @@ use shared::estimator::flow::FlowTables;
 use crate::calibration::{self, EXPONENT_SD, EXPONENTS};
 use crate::data::{self, TrainingEpisode};
 use crate::fit::Fit;
+use crate::teaching::foresight::LAST_DEG;
 
 /// So many episodes calibrate each other, the exponent included. Chosen by hand; no measurement is recorded.
 const NEEDS: usize = 4;
@@ -40,8 +41,6 @@ const GRAMS_LEAST: f64 = 2.0;
 /// Right weights tell between this and that share of the vessel's volume. It rests on tilts at which nothing was ever seen: 90 trainings of tuning rigs 200
 /// to 202, all kinds of vessels, with 2, 2+3 and 5 weighings told 0.72 to 5.2 times the volume, and a decimal point makes ten.
 const VOLUME_TOLD: [f64; 2] = [0.25, 6.0];
-/// The tilt up to which a vessel's volume is counted, degrees: the flow model's tables end there.
-const LAST_DEG: f64 = 118.0;
 
 /// A weight that does not fit.
 #[derive(Debug, Clone, PartialEq, Serialize)]

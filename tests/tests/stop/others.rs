@@ -186,6 +186,16 @@ fn a_directory_that_is_not_believed_is_named() {
     assert!(code == Some(1) && said.contains("every cell that runs is stopped instead") && said.contains(&reason), "{code:?} {said}");
 }
 
+/// A cell that no other test meets, whose runtime files lie in the directory `base`; nothing of it runs yet.
+fn cell_in(base: &Path) -> Option<CellUnderTest> {
+    let inside = Namespaces::new(None)?;
+    let mut cell = CellUnderTest::prepare(|c| {
+        c["cell"].as_table_mut().expect("a table").insert("runtime_dir".into(), base.display().to_string().into());
+    });
+    cell.inside = Some(inside);
+    Some(cell)
+}
+
 /// Protects who aborts without a configuration beside a cell whose runtime files lie in a directory of its own, and whose socket's name another user has
 /// taken before it: a process that runs and was not reached is no "nothing runs".
 #[test]
@@ -194,12 +204,8 @@ fn a_controller_whose_name_is_taken_is_told_of() {
         println!("not run: it takes root to act as another user");
         return;
     }
-    let Some(inside) = Namespaces::new(None) else { return };
     let base = tempfile::tempdir().expect("a directory");
-    let mut cell = CellUnderTest::prepare(|c| {
-        c["cell"].as_table_mut().expect("a table").insert("runtime_dir".into(), base.path().display().to_string().into());
-    });
-    cell.inside = Some(inside);
+    let Some(mut cell) = cell_in(base.path()) else { return };
     let _kept = super::sockets(&cell, "silent", &[format!("decant/0/{}", cell.name)]);
     cell.spawn("rt-controller");
     cell.wait("the controller", Duration::from_secs(30), |_| true);
@@ -217,12 +223,8 @@ fn a_cell_in_a_named_directory_is_told_of() {
         println!("not run: it takes root to act as other users");
         return;
     }
-    let Some(inside) = Namespaces::new(None) else { return };
     let base = tempfile::tempdir().expect("a directory");
-    let mut cell = CellUnderTest::prepare(|c| {
-        c["cell"].as_table_mut().expect("a table").insert("runtime_dir".into(), base.path().display().to_string().into());
-    });
-    cell.inside = Some(inside);
+    let Some(mut cell) = cell_in(base.path()) else { return };
     cell.spawn("rt-controller");
     cell.wait("the controller", Duration::from_secs(30), |_| true);
     let mut shared = Shared { cell, programs: vec![public_copy("rt-controller")] };

@@ -24,7 +24,7 @@ const RATE_HZ: f64 = 30.0;
 /// A curve begins and ends at this tilt, degrees: as `rt-controller record` does.
 const END_DEG: f64 = 0.05;
 /// A tilt beyond this is not foreseen, degrees: the flow model's tables end there.
-const LAST_DEG: f64 = 118.0;
+pub const LAST_DEG: f64 = 118.0;
 
 /// A vessel as it was learned, and the camera before it.
 #[derive(Debug, Clone)]

@@ -197,19 +197,7 @@ pub fn plan(vessel: &Foresight, weighed: &[Span], wish: &Wish) -> Plan {
 mod tests {
     use super::*;
 
-    const WISH: Wish = Wish {
-        goal_max_ml: 250.0,
-        alpha_max_deg: 105.0,
-        limits: Limits {
-            alpha_min_deg: 0.0,
-            alpha_max_deg: 110.0,
-            step_deg: 5.0,
-            rate_deg_s: 90.0,
-            acceleration_deg_s2: 1500.0,
-            return_rate_deg_s: 60.0,
-        },
-        period_ns: 33_333_333,
-    };
+    const WISH: Wish = Wish { goal_max_ml: 250.0, alpha_max_deg: 105.0, limits: Limits::DEFAULT, period_ns: 33_333_333 };
 
     fn next(vessel: &Foresight, weighed: &[Span]) -> (Plan, Candidate) {
         let plan = plan(vessel, weighed, &WISH);
