@@ -45,15 +45,19 @@ impl Running {
         stream
     }
 
-    /// The status of the answer to `head`.
-    fn status(&self, head: &str) -> String {
+    /// The status of the answer to `head`, and the connection, from which nothing more is read.
+    fn ask(&self, head: &str) -> (String, TcpStream) {
         let mut answer = String::new();
         let mut stream = self.send(head);
         let mut byte = [0];
         while !answer.ends_with('\n') && stream.read(&mut byte).unwrap_or(0) == 1 {
             answer.push(byte[0].into());
         }
-        answer.split(' ').nth(1).unwrap_or("").into()
+        (answer.split(' ').nth(1).unwrap_or("").into(), stream)
+    }
+
+    fn status(&self, head: &str) -> String {
+        self.ask(head).0
     }
 
     fn answers(&self) -> bool {
@@ -101,8 +105,10 @@ fn nothing_that_is_sent_grows_the_server_or_blocks_it() {
     assert!(page.answers(), "beside long requests");
     drop((half_open, idle));
 
-    let events: Vec<TcpStream> = (0..3).map(|_| page.send("GET /events HTTP/1.1\r\nHost: HOST\r\n\r\n")).collect();
-    assert_eq!(page.status("GET /events HTTP/1.1\r\nHost: HOST\r\n\r\n"), "503", "a fourth listener");
+    // Each is answered before the next one asks: who comes first is not decided by the order of the connections.
+    let (answers, events): (Vec<String>, Vec<TcpStream>) =
+        (0..4).map(|_| page.ask("GET /events HTTP/1.1\r\nHost: HOST\r\n\r\n")).unzip();
+    assert_eq!(answers, ["200", "200", "200", "503"], "a fourth listener");
     for _ in 0..200 {
         assert!(page.answers(), "beside listeners that read nothing");
     }
