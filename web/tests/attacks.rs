@@ -106,8 +106,7 @@ fn nothing_that_is_sent_grows_the_server_or_blocks_it() {
     drop((half_open, idle));
 
     // Each is answered before the next one asks: who comes first is not decided by the order of the connections.
-    let (answers, events): (Vec<String>, Vec<TcpStream>) =
-        (0..4).map(|_| page.ask("GET /events HTTP/1.1\r\nHost: HOST\r\n\r\n")).unzip();
+    let (answers, events): (Vec<String>, Vec<TcpStream>) = (0..4).map(|_| page.ask("GET /events HTTP/1.1\r\nHost: HOST\r\n\r\n")).unzip();
     assert_eq!(answers, ["200", "200", "200", "503"], "a fourth listener");
     for _ in 0..200 {
         assert!(page.answers(), "beside listeners that read nothing");

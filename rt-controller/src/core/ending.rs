@@ -58,8 +58,8 @@ const STREAM_LOST_DEG: f32 = 10.0;
 const LARGEST_TILT_SLACK_DEG: f32 = 0.5;
 /// A commanded alpha nearer to 0 than this is upright, degrees. Chosen by hand: far below what a robot can resolve.
 const COMMANDED_UPRIGHT_DEG: f32 = 0.01;
-/// Time without flow after which the last drops are counted, and of a stream without a pause that is no dripping, s. Chosen by hand; no
-/// measurement is recorded.
+/// Time of measured frames without flow after which the last drops are counted, and of a stream without a pause that is no dripping, s. Chosen by
+/// hand; no measurement is recorded.
 const SETTLE_QUIET_S: f64 = 0.5;
 /// The least way upright that counts as coming nearer, degrees. A joint that is slower than this in [`SETTLE_MAX_S`], 0.33 degrees/s, is held.
 /// Chosen by hand; no measurement is recorded.
@@ -129,6 +129,7 @@ pub struct Ending {
     stalled_frames: u32,
     advanced_deg: f32,
     advanced_from_ml: f32,
+    /// Number of measured frames in a row without flow.
     quiet_frames: u32,
     empty_frames: u32,
     /// Number of frames in a row with a stream.
@@ -270,7 +271,8 @@ impl Ending {
     /// Takes what a frame showed during a pour.
     pub fn saw(&mut self, frame: &SeenFrame, settings: &Settings) {
         let frames = frame.lost + 1;
-        self.quiet_frames = if frame.flowing { 0 } else { self.quiet_frames + frames };
+        // A frame that could not be measured does not say that nothing fell.
+        self.quiet_frames = if frame.flowing { 0 } else { self.quiet_frames + u32::from(frame.area_px2.is_some()) };
         if frame.area_px2.is_some_and(|area_px2| area_px2 > 0.0) {
             (self.stream_frames, self.no_stream_frames) = (self.stream_frames + 1, 0);
             if self.stream_frames >= STREAM_FRAMES {

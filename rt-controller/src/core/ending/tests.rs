@@ -216,3 +216,23 @@ fn a_fast_camera_waits_as_long_as_a_slow_one() {
         assert!(frames.is_some_and(|n| (f64::from(n) / hz - 0.5).abs() < 0.04), "{hz}: {frames:?}");
     }
 }
+
+/// Protects what is said of the last drops from a camera that does not see them: frames that could not be measured are no quiet ones. They are waited
+/// for, and where too few come, it is said that something may have left unseen.
+#[test]
+fn frames_without_a_measurement_are_not_quiet() {
+    let settings = settings();
+    let after = |measured: fn(u32) -> bool| {
+        let mut ending = Ending::of_pour();
+        ending.begin_settling();
+        (1..=200).find_map(|frame| {
+            let area_px2 = measured(frame).then_some(0.0);
+            ending.saw(&SeenFrame { lost: 0, area_px2, flowing: false, alpha_deg: 0.0, alpha_now_deg: 0.0 }, &settings);
+            let reason = ending.settled(0.0, f64::from(frame) / 30.0, false, &settings)?;
+            Some((frame, reason, ending.leaves_unseen(reason)))
+        })
+    };
+    assert_eq!(after(|_| true), Some((15, EndReason::Done, false)));
+    assert_eq!(after(|frame| frame % 3 == 0), Some((45, EndReason::Done, false)));
+    assert_eq!(after(|frame| frame < 10), Some((90, EndReason::Done, true)));
+}
