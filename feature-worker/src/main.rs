@@ -6,16 +6,10 @@ use clap::Parser as _;
 use feature_worker::cli::{Cli, Command};
 use feature_worker::commands::{bench, calibrate, camera, episodes, inspect, run, view};
 
-/// Bounds the pictures that OpenCV decodes, and keeps its decoders from writing to the terminal by themselves: every fault that they report is
-/// an error of ours, with what to do. Whoever sets the variables differently gets the messages.
+/// Keeps OpenCV's decoders from writing to the terminal by themselves: every fault that they report is an error of ours, with what to do. Whoever
+/// sets the variables differently gets the messages.
 fn quiet_libraries() {
-    let variables = [
-        ("OPENCV_LOG_LEVEL", "SILENT"),
-        ("OPENCV_FFMPEG_LOGLEVEL", "-8"),
-        ("OPENCV_VIDEOIO_DEBUG", "0"),
-        // No camera has more pixels (`[camera]`: 4096 x 4096), and a small file may unpack to gigabytes.
-        ("OPENCV_IO_MAX_IMAGE_PIXELS", "16777216"),
-    ];
+    let variables = [("OPENCV_LOG_LEVEL", "SILENT"), ("OPENCV_FFMPEG_LOGLEVEL", "-8"), ("OPENCV_VIDEOIO_DEBUG", "0")];
     for (name, value) in variables {
         if std::env::var_os(name).is_none() {
             // If it cannot be set there is more to read, and nothing is wrong.

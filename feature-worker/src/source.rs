@@ -29,6 +29,7 @@ pub use capture::{Capture, check_rate};
 pub use files::{Contents, for_each_frame};
 pub use frame::{Frame, FrameSource, FrameStream, NextFrame, SourceError, StreamEvent, WAIT};
 pub use numbering::Numbering;
+pub(crate) use pictures::check_size;
 pub use playback::Playback;
 pub use recording::Recording;
 pub use shared_memory::SharedMemory;

@@ -427,3 +427,19 @@ fn an_episode_is_a_recording() -> Outcome {
     assert!(report(&inspect(directory.path(), &[&cut], &["--partial"])?)?.1.contains("its end is missing"));
     Ok(())
 }
+
+/// Protects the memory from a small file that unpacks to much: a picture with more pixels than any camera has is refused, and one of as many is read.
+#[test]
+fn a_picture_of_too_many_pixels_is_refused() -> Outcome {
+    let directory = tempfile::tempdir()?;
+    let draw = |name: &str, side_px: i32| -> Result<PathBuf, Box<dyn std::error::Error>> {
+        let path = directory.path().join(name);
+        let picture = Mat::new_size_with_default(Size::new(side_px, side_px), core::CV_8UC3, Scalar::all(40.0))?;
+        imgcodecs::imwrite(path.to_str().ok_or("path")?, &picture, &Vector::new())?;
+        Ok(path)
+    };
+    let (largest, larger) = (draw("largest.png", 4096)?, draw("larger.png", 4097)?);
+    assert!(!text(&inspect(directory.path(), &[&largest], &[])?).contains("read"), "as many as [camera] allows");
+    refused(&inspect(directory.path(), &[&larger], &[])?, &["larger.png", "4097 x 4097 px are too many"]);
+    Ok(())
+}

@@ -11,6 +11,8 @@ use opencv::videoio::{
 };
 use shared::episode::{Episode, EpisodeError, EpisodeImage, EpisodeImages};
 
+use crate::source::check_size;
+
 use super::output::{ExportError, disk_error, unfit, write_error};
 
 /// The rate of an episode that is too short to have one, frames a second: that of the usual camera.
@@ -78,6 +80,7 @@ impl Video {
     /// Adds an image, and returns it as pixels in OpenCV's order blue, green, red.
     pub fn push(&mut self, image: &EpisodeImage) -> Result<Mat, ExportError> {
         let fail = |e: opencv::Error| write_error(&self.path, e.message);
+        check_size(&image.data).map_err(|what| unfit(&self.file, format!("picture {}: {what}", image.sequence)))?;
         let bytes: Vector<u8> = Vector::from_slice(&image.data);
         // OpenCV makes an empty picture of most bytes that are none, and an error of some.
         let picture = imgcodecs::imdecode(&bytes, imgcodecs::IMREAD_COLOR).unwrap_or_default();

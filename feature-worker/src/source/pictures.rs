@@ -23,6 +23,9 @@ const LIST_MOST: usize = 5;
 /// Largest file of a picture that is read, bytes. Chosen by hand: the largest picture that a camera may have takes 50 MB without compression.
 const FILE_MAX: u64 = 256 << 20;
 
+/// The most pixels of a picture that is read: those of the largest one that `[camera]` allows, 4096 x 4096.
+const PIXELS_MAX: usize = 1 << 24;
+
 /// Whether `path` is a single picture by its name.
 pub(super) fn is_picture(path: &Path) -> bool {
     let ending = path.extension().and_then(|e| e.to_str()).unwrap_or("").to_lowercase();
@@ -39,9 +42,21 @@ pub(super) fn decode(bytes: &[u8], picture: &mut Mat) -> Result<(), String> {
     if let Some(what) = cut_off(bytes) {
         return Err(what.into());
     }
+    check_size(bytes)?;
     // OpenCV says no more about what it cannot read than an empty picture does.
     *picture = imgcodecs::imdecode(&Vector::from_slice(bytes), imgcodecs::IMREAD_ANYCOLOR).unwrap_or_default();
     if picture.empty() { Err("cannot be read as a picture".into()) } else { Ok(()) }
+}
+
+/// Refuses a picture with more pixels than any camera has, by its header: a small file may unpack to gigabytes. What its header does not tell, OpenCV
+/// will find.
+pub(crate) fn check_size(bytes: &[u8]) -> Result<(), String> {
+    match imagesize::blob_size(bytes) {
+        Ok(size) if size.width.saturating_mul(size.height) > PIXELS_MAX => {
+            Err(format!("{} x {} px are too many: no camera has more than {PIXELS_MAX}", size.width, size.height))
+        }
+        _ => Ok(()),
+    }
 }
 
 /// The picture in the file at `path`.
