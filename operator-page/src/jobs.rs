@@ -148,8 +148,8 @@ impl Jobs {
                 }
                 let mut arguments = [vec!["refine".into(), "--json".into(), "--progress".into()], files.clone()].concat();
                 arguments.extend(["--config".into(), config, "--out".into(), out]);
-                arguments.extend(accept.iter().flat_map(|name| ["--accept".into(), name.clone()]));
-                arguments.extend(leave_out.iter().flat_map(|name| ["--leave-out".into(), name.clone()]));
+                arguments.extend(accept.iter().map(|name| format!("--accept={name}")));
+                arguments.extend(leave_out.iter().map(|name| format!("--leave-out={name}")));
                 let (report, _) = programs::run("trainer", &arguments, stop, step)?;
                 let learned = report["episodes"].as_array().map_or(0, Vec::len);
                 Ok(json!({ "identity": report["identity"], "episodes": learned, "left_out": report["left_out"], "remarks": remarks }))

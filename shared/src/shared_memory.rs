@@ -22,6 +22,8 @@ const SHM: &str = "/dev/shm";
 /// Space that must be free before a cell is joined, bytes: what iceoryx2 touches while it makes a client's ports is about 0.5 MB (measured
 /// on a command that asks for the status).
 const JOIN_BYTES: u64 = 1 << 20;
+/// Files that must still fit before a cell is joined. Chosen by hand: more than one program makes.
+const JOIN_FILES: u64 = 32;
 /// Longest wait for another process that is joining the same cell. Chosen by hand: joining takes some milliseconds.
 const JOIN_WAIT: Duration = Duration::from_secs(2);
 
@@ -60,6 +62,9 @@ pub fn check_space(bytes: u64) -> Result<(), SharedMemoryError> {
     let Ok(fs) = rustix::fs::statvfs(SHM) else {
         return Err(failed(Path::new(SHM), "is missing: mount a tmpfs there"));
     };
+    if fs.f_files > 0 && fs.f_favail < JOIN_FILES {
+        return Err(failed(Path::new(SHM), "holds as many files as it may, whatever their size: delete those that fill it"));
+    }
     // A file system without a limit shows a size of zero.
     if fs.f_blocks == 0 || fs.f_bavail.saturating_mul(fs.f_frsize) >= bytes {
         return Ok(());
@@ -110,8 +115,15 @@ impl Membership {
                 return Ok(Self::new(token));
             }
         }
+        // Only a directory with a token is one in which iceoryx2's files are ours to remove.
+        let has_token = file.symlink_metadata().is_ok();
+        let left = left_by_iceoryx2(directory);
+        if let (false, Some(foreign)) = (has_token, left.first()) {
+            let what = "is there, and no cell left it: remove it, or set cell.runtime_dir to a directory of its own";
+            return Err(failed(foreign, what));
+        }
         let (token, lock) = new_token(directory)?;
-        clear_directory(directory);
+        remove_all(&left);
         let new = directory.join("token.new");
         std::fs::write(&new, &token).and_then(|()| std::fs::rename(&new, &file)).map_err(|e| failed(&file, e))?;
         held.insert(token.clone(), (lock, 1));
@@ -202,15 +214,17 @@ fn remove(token: &str) {
     let _ = std::fs::remove_file(lock_path(token));
 }
 
-/// Removes what iceoryx2 left in a cell's directory under an older token.
-fn clear_directory(directory: &Path) {
-    for name in ["services", "nodes"] {
-        let _ = std::fs::remove_dir_all(directory.join(name));
-    }
-    for entry in std::fs::read_dir(directory).into_iter().flatten().flatten() {
-        if entry.path().extension().is_some_and(|e| e == "event") {
-            let _ = std::fs::remove_file(entry.path());
-        }
+/// What has the name of something that iceoryx2 leaves in a cell's directory.
+fn left_by_iceoryx2(directory: &Path) -> Vec<PathBuf> {
+    let entries = std::fs::read_dir(directory).into_iter().flatten().flatten().map(|e| e.path());
+    let is_its = |path: &PathBuf| path.ends_with("services") || path.ends_with("nodes") || path.extension().is_some_and(|e| e == "event");
+    entries.filter(is_its).collect()
+}
+
+/// Removes files, and directories with what is in them.
+fn remove_all(paths: &[PathBuf]) {
+    for path in paths {
+        let _ = std::fs::remove_file(path).or_else(|_| std::fs::remove_dir_all(path));
     }
 }
 

@@ -90,6 +90,33 @@ fn a_start_clears_nothing_of_the_living() {
     assert_eq!(output.status.code(), Some(0), "{}", said(&output));
 }
 
+/// Protects files of other programs in a directory that was named by mistake: what has the names of iceoryx2's files is not removed where no cell has
+/// been, and what a cell left is.
+#[test]
+fn a_cell_removes_nothing_of_others_from_its_directory() {
+    let base = tempfile::Builder::new().prefix("d").tempdir_in("/tmp").expect("a directory");
+    let mut cell = CellUnderTest::prepare(|config| {
+        let dir = base.path().display().to_string();
+        config["cell"].as_table_mut().expect("a table").insert("runtime_dir".into(), dir.into());
+    });
+    let place = base.path().join(&cell.name);
+    let theirs = [place.join("services/accounts.txt"), place.join("party.event")];
+    std::fs::create_dir_all(place.join("services")).expect("writable");
+    std::fs::set_permissions(&place, std::fs::Permissions::from_mode(0o700)).expect("ours");
+    for file in &theirs {
+        std::fs::write(file, b"theirs").expect("writable");
+    }
+    let output = cell.command("feature-worker", &["run"]);
+    assert!(said(&output).contains("no cell left it"), "{}", said(&output));
+    assert!(theirs.iter().all(|file| file.exists()), "they are gone");
+    std::fs::remove_dir_all(&place).expect("ours");
+    cell.spawn_all();
+    for name in ["simulator", "feature-worker", "rt-controller"] {
+        cell.signal(name, Signal::KILL);
+    }
+    cell.spawn_all();
+}
+
 /// Protects a cell from what another user prepared: a link, a directory of another user, and one that is open to others are refused by each
 /// program, with one line and an exit code.
 #[test]

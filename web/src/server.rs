@@ -239,6 +239,8 @@ async fn accept(listener: TcpListener, shared: Arc<Shared>) {
         let (Ok(own), Some(place)) = (stream.local_addr(), shared.connections.enter()) else { continue };
         let _ = stream.set_nodelay(true);
         tokio::spawn(connection(Patient::new(stream), own, peer, place, Arc::clone(&shared)));
+        // What it has sent already is read before others come, so that it is not closed as an idle one where many connect at once.
+        tokio::task::yield_now().await;
     }
 }
 

@@ -1,7 +1,7 @@
 //! `rt-controller step`: runs the controller's core as a filter, so that any other simulator can drive it. It is an ordinary
 //! process, and every failure is one line. A simulator in Rust can call the core itself: see `examples/drive_core.rs`.
 
-use std::io::{BufRead, Write};
+use std::io::{BufRead, Read as _, Write};
 use std::path::PathBuf;
 
 use shared::agent::Agent;
@@ -14,6 +14,9 @@ use shared::weights::Weights;
 
 use crate::core::{Core, Input, Order, Robot, Settings};
 use crate::disk::check_weights;
+
+/// Longest line of input, bytes: no number that anybody writes is longer.
+const LINE_MAX: u64 = 128;
 
 /// Command-line arguments.
 #[derive(Debug, clap::Args)]
@@ -83,8 +86,9 @@ pub fn run(args: &Args) -> Result<(), Failure> {
         return Ok(());
     }
     let mut ended = None;
-    for (number, line) in std::io::stdin().lock().lines().enumerate() {
-        let area_px2 = line.map_err(|e| e.to_string()).and_then(|text| area_px2(&text));
+    let mut input = std::io::stdin().lock();
+    for number in 0.. {
+        let Some(area_px2) = next_line(&mut input).map(|line| line.and_then(|text| area_px2(&text))) else { break };
         let area_px2 = area_px2.map_err(|why| failure(exit::BAD_INPUT, format!("line {}: {why}", number + 1)))?;
         let output = frame(area_px2, None);
         if !lines.print(&output.telemetry)? {
@@ -98,6 +102,19 @@ pub fn run(args: &Args) -> Result<(), Failure> {
     match ended {
         None | Some(EndReason::Done) => Ok(()),
         Some(reason) => Err(failure(exit::ENDED_EARLY, format!("ended early: {}", reason.words()))),
+    }
+}
+
+/// The next line of input; `None` after the last one. A line that is too long, or no text, is an error.
+fn next_line(input: &mut impl BufRead) -> Option<Result<String, String>> {
+    let mut line = Vec::new();
+    match input.take(LINE_MAX + 1).read_until(b'\n', &mut line) {
+        Ok(0) => None,
+        Ok(_) if line.len() as u64 > LINE_MAX => {
+            Some(Err(format!("it is longer than {LINE_MAX} bytes: give one V_e in px^2, or nan, on each line")))
+        }
+        Ok(_) => Some(String::from_utf8(line).map_err(|_| "not a number: give one V_e in px^2, or nan, on each line".into())),
+        Err(e) => Some(Err(e.to_string())),
     }
 }
 

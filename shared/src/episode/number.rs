@@ -112,6 +112,9 @@ mod tests {
             std::fs::write(path, b"").expect("writable");
         };
         assert_eq!((take(), take()), (1, 2));
+        // Whoever may open it may lock it, and no number is taken meanwhile.
+        let mode = std::fs::metadata(dir.path().join("new/.last-number")).expect("there").permissions().mode();
+        assert_eq!(mode & 0o077, 0, "{mode:o}");
         put("moved aside/monday/episode-0017.mcap");
         assert_eq!(take(), 18);
         put("episode-0020.mcap.part");

@@ -31,7 +31,7 @@ pub struct Args {
     #[arg(long)]
     fault: Vec<Fault>,
     /// End after this many seconds.
-    #[arg(long)]
+    #[arg(long, value_parser = parse_seconds)]
     seconds: Option<f64>,
     /// Print the controller's log as JSON, one object a line.
     #[arg(long)]
@@ -52,6 +52,10 @@ fn help() -> String {
         fault::HELP,
         exit::HELP
     )
+}
+
+fn parse_seconds(text: &str) -> Result<f64, String> {
+    text.parse().ok().filter(|s: &f64| s.is_finite() && *s >= 0.0).ok_or_else(|| "give a number of seconds, 0 or more".into())
 }
 
 /// Runs the command.
