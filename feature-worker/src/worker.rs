@@ -12,6 +12,7 @@ use crossbeam::queue::ArrayQueue;
 use iceoryx2::port::publisher::{Publisher, PublisherCreateError};
 use shared::config::{CameraConfig, CameraSource, Config, ImageConfig};
 use shared::exit::{self, Failure, OrExit as _, failure};
+use shared::framing::Framing;
 use shared::ipc::Cell;
 use shared::level::Level;
 use shared::messages::{Doubt, Feature, FrameHeader, LAYOUT_VERSION, PixelFormat};
@@ -129,6 +130,7 @@ fn measure_until_stopped(
         publisher,
         recorder,
         republisher,
+        framing: Framing::new(&config.camera, &config.image),
         epoch_ns: os::now_ns(),
         newest: Newest::default(),
         status: Status { doubt: Doubt::None.words(), ..Status::default() },
@@ -186,6 +188,8 @@ struct Worker<'a> {
     publisher: Publisher<Ipc, Feature, ()>,
     recorder: Recorder,
     republisher: Option<FrameRepublisher>,
+    /// How the lip lies in its pictures, which each measurement says.
+    framing: Framing,
     /// When the present run of frame numbers began, CLOCK_MONOTONIC ns.
     epoch_ns: u64,
     newest: Newest,
@@ -243,6 +247,7 @@ impl Worker<'_> {
             area_px2: measured.area_px2,
             confidence: measured.confidence,
             triangle_px: measured.triangle_px,
+            framing: self.framing,
         };
         let sent = self.publisher.send_copy(feature);
         sent.map_err(|e| failure(exit::FAILED, format!("service 'feature': {e:?}; is /dev/shm full?")))?;

@@ -235,6 +235,7 @@ fn put(bytes: &[u8], modified: Option<SystemTime>, to: &Path) -> Result<(), Stri
 mod tests {
     use shared::actions::{Selection, action_table};
     use shared::estimator::Calibration;
+    use shared::framing::Framing;
     use shared::mlp::{InputScale, Mlp};
     use shared::weights::{Method, Origin};
 
@@ -249,7 +250,7 @@ mod tests {
             calibration: Calibration { volume_at_1_px2_ml: 0.0002, area_exponent: 1.0, log_tilt_slope: 0.0, hold_above_px2: f32::INFINITY },
             estimator: Estimator::Sum,
             rate_hz: 30.0,
-            origin: Origin { method: Method::Handmade, actions: 21, episodes: 5, data_sha256: [1; 32] },
+            origin: Origin { method: Method::Handmade, actions: 21, episodes: 5, data_sha256: [1; 32], framing: Framing::default() },
             seed,
         }
     }

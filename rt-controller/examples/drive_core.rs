@@ -11,6 +11,7 @@ use shared::actions::{Selection, action_table};
 use shared::agent::Agent;
 use shared::control::Outcome;
 use shared::estimator::Calibration;
+use shared::framing::Framing;
 use shared::limits::Limits;
 use shared::messages::{Feature, LAYOUT_VERSION};
 use shared::mlp::{InputScale, Mlp};
@@ -72,7 +73,7 @@ fn weights() -> Weights {
         },
         estimator: Estimator::Sum,
         rate_hz: 30.0,
-        origin: Origin { method: Method::Handmade, actions: 21, episodes: 0, data_sha256: [0; 32] },
+        origin: Origin { method: Method::Handmade, actions: 21, episodes: 0, data_sha256: [0; 32], framing: Framing::default() },
         seed: 0,
     }
 }

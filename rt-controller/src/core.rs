@@ -15,6 +15,7 @@
 use shared::agent::{Agent, Decision, Observation};
 use shared::alpha_track::AngleHistory;
 use shared::control::{EndReason, Outcome};
+use shared::framing::Framing;
 use shared::gaussian_curve::Curve;
 use shared::limits::Limiter;
 use shared::messages::{Feature, LAYOUT_VERSION, Phase, Telemetry};
@@ -240,7 +241,10 @@ impl Core {
             Order::Pour { episode, goal_ml, flows_by_deg } => {
                 situation.may_begin(&self.settings)?;
                 order::goal_is_legal(goal_ml, &self.settings)?;
-                self.agent.as_mut().ok_or(Refusal::NoWeights)?.start(goal_ml);
+                let seen = self.newest_with(input).map_or_else(Framing::default, |feature| feature.framing);
+                let agent = self.agent.as_mut().ok_or(Refusal::NoWeights)?;
+                agent.framing().difference(&seen).map_or(Ok(()), |difference| Err(Refusal::Framing(difference)))?;
+                agent.start(goal_ml);
                 self.decision = Decision { d_ml: goal_ml, ..Decision::NOTHING };
                 self.begin(episode, Some(goal_ml), None, Ending::of_pour_that_flows_by(flows_by_deg), input);
             }
@@ -254,9 +258,14 @@ impl Core {
         Ok(())
     }
 
+    /// The newest measurement, those of this tick included.
+    fn newest_with<'a>(&'a self, input: &'a Input) -> Option<&'a Feature> {
+        input.features.iter().rfind(|f| !intake::is_foreign(f, input.now_ns)).or(self.newest.as_ref())
+    }
+
     /// Begins a recording of `curve`, or else a pour of `goal_ml`; `ending` says when it is over.
     fn begin(&mut self, episode: u64, goal_ml: Option<f32>, curve: Option<Curve>, ending: Ending, input: &Input) {
-        let newest = input.features.iter().rfind(|f| !intake::is_foreign(f, input.now_ns)).or(self.newest.as_ref());
+        let worker_epoch_ns = self.newest_with(input).map_or(0, |f| f.worker_epoch_ns);
         self.run = Some(Run {
             episode,
             started_at_ns: input.now_ns,
@@ -266,7 +275,7 @@ impl Core {
             ending,
             following: Following::new(self.agent.as_ref().and_then(|agent| agent.learned_lag_s()), &self.settings),
             settling_since_ns: 0,
-            worker_epoch_ns: newest.map_or(0, |f| f.worker_epoch_ns),
+            worker_epoch_ns,
             counters_before: self.counters(),
             tick_gaps: 0,
         });

@@ -138,6 +138,7 @@ pub(crate) mod tests {
     use shared::estimator::flow::{FlowModel, WayBack};
     use shared::estimator::fused::{EXPLANATIONS, FusedModel};
     use shared::estimator::verdict::Bounds;
+    use shared::framing::Framing;
     use shared::mlp::{InputScale, Mlp};
     use shared::weights::{Method, Origin};
 
@@ -167,7 +168,7 @@ pub(crate) mod tests {
             calibration,
             estimator: Estimator::Fused { model, back: WayBack::new(&Limits::default(), 30.0) },
             rate_hz: 30.0,
-            origin: Origin { method: Method::Handmade, actions: 21, episodes: 0, data_sha256: [7; 32] },
+            origin: Origin { method: Method::Handmade, actions: 21, episodes: 0, data_sha256: [7; 32], framing: Framing::default() },
             seed: 1,
         }
     }

@@ -23,7 +23,7 @@ use crate::core::{Core, Input, MAX_FEATURES, Order, Robot, Settings};
 use crate::pacing::Pacer;
 
 /// The first bytes of a journal, which include its version.
-const MAGIC: &[u8; 8] = b"decantj7";
+const MAGIC: &[u8; 8] = b"decantj8";
 /// Longest entry, bytes: more than ten weight files, which are the largest entries.
 const ENTRY_MAX: usize = 128 * 1024;
 /// Size at which a journal ends and the next part begins, bytes: about 20 h of ticks. Chosen by hand: it is copied and read in a minute.

@@ -11,6 +11,7 @@ use std::path::Path;
 
 use shared::actions::{STAY, Selection, action_table};
 use shared::estimator::Calibration;
+use shared::framing::Framing;
 use shared::mlp::{InputScale, Mlp};
 use shared::weights::{Estimator, Method, Origin, Weights, WeightsError};
 
@@ -28,7 +29,7 @@ pub fn constant_action(i: i32) -> Weights {
         calibration: Calibration { volume_at_1_px2_ml: 0.002, area_exponent: 1.0, log_tilt_slope: 0.0, hold_above_px2: f32::INFINITY },
         estimator: Estimator::Sum,
         rate_hz: 30.0,
-        origin: Origin { method: Method::Handmade, actions: 21, episodes: 0, data_sha256: [0; 32] },
+        origin: Origin { method: Method::Handmade, actions: 21, episodes: 0, data_sha256: [0; 32], framing: Framing::default() },
         seed: 0,
     }
 }

@@ -10,6 +10,7 @@ use crate::actions::{self, ACTIONS, STAY, Selection};
 use crate::estimator::Hold;
 use crate::estimator::fused::{FusedEstimator, FusedFrame};
 use crate::estimator::verdict::Impossible;
+use crate::framing::Framing;
 use crate::mlp;
 use crate::os;
 use crate::weights::{Estimator, Weights};
@@ -141,6 +142,11 @@ impl Agent {
                 Some((model.delay_frames + model.lag_frames) / f64::from(self.weights.rate_hz))
             }
         }
+    }
+
+    /// How the lip lay in the pictures that the weights were trained on.
+    pub fn framing(&self) -> &Framing {
+        &self.weights.origin.framing
     }
 
     /// Starts a pour: d <- V_G (eq. 4), and everything else is forgotten. A goal that is not a positive number leaves d = 0.

@@ -31,6 +31,7 @@ use std::collections::btree_map::Entry;
 use sha2::{Digest, Sha256};
 
 use crate::control::is_short;
+use crate::framing::Framing;
 use crate::gaussian_curve::Curve;
 
 /// The longest time that a stream may flow unmeasured, s: the shipped configurations end a pour after it (`controller.stale_feature_ms`).
@@ -114,6 +115,8 @@ pub struct EpisodeInfo {
     pub cell: String,
     /// SHA-256 of the configuration, hexadecimal.
     pub config_sha256: String,
+    /// How the lip lay in its pictures, by that configuration.
+    pub framing: Framing,
     /// Identity of the weights that the controller ran; empty if there were none.
     pub weights: String,
     /// How it ended, in words; empty if the recorder was killed.

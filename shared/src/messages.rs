@@ -7,8 +7,10 @@
 
 use iceoryx2::prelude::ZeroCopySend;
 
+use crate::framing::Framing;
+
 /// Version of all layouts in this file. It is part of every service's name, so that programs of other versions never connect.
-pub const LAYOUT_VERSION: u32 = 3;
+pub const LAYOUT_VERSION: u32 = 4;
 
 /// How the pixels of a camera frame are stored.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -161,6 +163,8 @@ pub struct Feature {
     pub confidence: f32,
     /// Corners of the triangle in the image, px, as x0 y0 x1 y1 x2 y2: where the axes cross, on the x-axis, on the y-axis.
     pub triangle_px: [f32; 6],
+    /// How the lip lies in the worker's pictures.
+    pub framing: Framing,
 }
 
 /// What the controller was doing in a tick.
@@ -318,9 +322,10 @@ mod tests {
     fn layouts_have_the_documented_sizes_and_offsets() {
         assert_eq!(size_of::<FrameHeader>(), 40);
         assert_eq!(std::mem::offset_of!(FrameHeader, sequence), 16);
-        assert_eq!(size_of::<Feature>(), 80);
+        assert_eq!(size_of::<Feature>(), 104);
         assert_eq!(std::mem::offset_of!(Feature, area_px2), 48);
         assert_eq!(std::mem::offset_of!(Feature, triangle_px), 56);
+        assert_eq!(std::mem::offset_of!(Feature, framing), 80);
         assert_eq!(size_of::<Telemetry>(), 104);
         assert_eq!(std::mem::offset_of!(Telemetry, weights_id), 48);
         assert_eq!(std::mem::offset_of!(Telemetry, alpha_deg), 56);

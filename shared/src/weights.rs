@@ -23,6 +23,7 @@ use crate::actions::{ACTIONS, BACK_DEG_PER_FRAME, Selection, nearest_action};
 use crate::estimator::Calibration;
 use crate::estimator::flow::WayBack;
 use crate::estimator::fused::FusedModel;
+use crate::framing::Framing;
 use crate::mlp::{HIDDEN, INPUTS, InputScale, Mlp};
 use crate::{regular_file, whole_file};
 
@@ -32,7 +33,7 @@ mod way_back;
 pub use way_back::check_way_back;
 
 /// Version of the file format; files of other versions are refused.
-pub const FORMAT_VERSION: u32 = 4;
+pub const FORMAT_VERSION: u32 = 5;
 
 /// The first bytes of every weight file.
 const MAGIC: &[u8; 8] = b"decant-w";
@@ -96,7 +97,7 @@ impl Estimator {
     }
 }
 
-/// Where weights come from; the controller only shows it.
+/// Where weights come from.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Origin {
     /// How the network was trained.
@@ -107,6 +108,8 @@ pub struct Origin {
     pub episodes: u32,
     /// SHA-256 of the training data as the trainer hashes it.
     pub data_sha256: [u8; 32],
+    /// How the lip lay in the pictures of the episodes; not known of tables.
+    pub framing: Framing,
 }
 
 /// How a network was trained.
@@ -301,6 +304,9 @@ impl Weights {
                 return Err(format!("{name} is {value}, not a positive number"));
             }
         }
+        if !self.origin.framing.is_finite() {
+            return Err("the framing of the episodes is not finite".into());
+        }
         ranges::check_calibration(&self.calibration)?;
         self.estimator.check()
     }
@@ -330,7 +336,7 @@ pub(crate) mod tests {
             calibration: Calibration { volume_at_1_px2_ml: 0.002, area_exponent: 1.15, log_tilt_slope: 0.05, hold_above_px2: 60.0 },
             estimator: Estimator::Sum,
             rate_hz: 30.0,
-            origin: Origin { method: Method::Handmade, actions: 21, episodes: 0, data_sha256: [7; 32] },
+            origin: Origin { method: Method::Handmade, actions: 21, episodes: 0, data_sha256: [7; 32], framing: Framing::default() },
             seed: 1,
         }
     }

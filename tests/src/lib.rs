@@ -20,6 +20,7 @@ use serde_json::Value;
 use shared::actions::{Selection, action_table};
 use shared::config::Joint;
 use shared::estimator::Calibration;
+use shared::framing::Framing;
 use shared::limits::Limits;
 use shared::mlp::{InputScale, Mlp};
 use shared::weights::{Estimator, Method, Origin, Weights};
@@ -39,7 +40,7 @@ pub fn steady_weights(action: usize) -> Weights {
         calibration: Calibration { volume_at_1_px2_ml: 0.0002, area_exponent: 1.0, log_tilt_slope: 0.0, hold_above_px2: f32::INFINITY },
         estimator: Estimator::Sum,
         rate_hz: 30.0,
-        origin: Origin { method: Method::Handmade, actions: 21, episodes: 0, data_sha256: [action as u8; 32] },
+        origin: Origin { method: Method::Handmade, actions: 21, episodes: 0, data_sha256: [action as u8; 32], framing: Framing::default() },
         seed: 1,
     }
 }

@@ -6,12 +6,15 @@ use std::path::PathBuf;
 
 use sha2::{Digest, Sha256};
 use shared::episode::{self, Episode};
+use shared::framing::Framing;
 use shared::plural::counted;
 
 /// Fewer frames than this are no whole curve: one second at 30 frames a second.
 const FRAMES_MIN: usize = 30;
 /// Frames a second that a camera may have: times in ms or us are far from it. Chosen by hand: half and twice what the controller allows.
 const RATES_HZ: std::ops::RangeInclusive<f64> = 1.0..=240.0;
+/// A larger angle is none that a joint turns to, degrees: a UR5's joints turn by a whole turn either way.
+const ANGLE_MAX_DEG: f64 = 360.0;
 /// Frame rates that are further apart than this are different ones, Hz. Chosen by hand; no measurement is recorded.
 const RATES_APART_HZ: f64 = 0.5;
 
@@ -32,6 +35,8 @@ pub struct TrainingEpisode {
     pub area_px2: Vec<f64>,
     /// w_E, g (1 g = 1 ml); NaN where the scale was not read.
     pub weight_g: f64,
+    /// How the lip lay in the pictures; not known of tables.
+    pub framing: Framing,
 }
 
 /// Why data is refused.
@@ -81,6 +86,7 @@ impl TrainingEpisode {
             alpha_measured_deg: column(),
             area_px2: column(),
             weight_g: f64::NAN,
+            framing: Framing::default(),
         }
     }
 
@@ -133,6 +139,10 @@ impl TrainingEpisode {
         if let Some(k) = self.t_s.iter().chain(&self.alpha_deg).position(|v| !v.is_finite()) {
             return Some(format!("frame {}: time or angle is not finite: export the table again", k % n));
         }
+        let angles_deg = self.alpha_deg.iter().chain(&self.alpha_measured_deg);
+        if let Some((k, deg)) = angles_deg.enumerate().find(|(_, deg)| deg.abs() > ANGLE_MAX_DEG) {
+            return Some(format!("frame {}: an angle of {deg:.0} degrees: angles are in degrees from upright", k % n));
+        }
         if let Some(k) = self.t_s.windows(2).position(|t| t[1] <= t[0]) {
             return Some(format!("frame {}: time does not go forward: sort the frames", k + 1));
         }
@@ -162,6 +172,7 @@ impl TrainingEpisode {
             own.push(f.t_s, f64::from(f.alpha_commanded_deg), f64::from(f.alpha_measured_deg), f64::from(f.area_px2));
         }
         own.weight_g = e.weight_g.unwrap_or(f64::NAN);
+        own.framing = e.info.framing;
         own
     }
 }
@@ -179,6 +190,29 @@ fn keep_one_rate(found: &mut UsableEpisodes) {
         let what = format!("{} frames a second, and the others have {rate_hz}: train on one frame rate only", e.rate_hz);
         (e.name, what)
     }));
+}
+
+/// Takes out the episodes whose pictures show the lip otherwise than those of most others: an area is another volume in them. Of two kinds that are as
+/// frequent, the one of the newest episode counts. Episodes that do not say it stay.
+fn keep_one_framing(found: &mut UsableEpisodes) {
+    let known = || found.episodes.iter().map(|e| e.framing).filter(Framing::is_known);
+    let alike = |framing: &Framing| known().filter(|other| framing.difference(other).is_none()).count();
+    let Some(framing) = known().max_by_key(alike) else { return };
+    found.episodes.retain(|e| {
+        let difference = e.framing.difference(&framing);
+        found.left_out.extend(difference.map(|what| {
+            (
+                e.name.clone(),
+                format!("{what}, as the others have it: an area is another volume there; train on episodes of one picture only"),
+            )
+        }));
+        difference.is_none()
+    });
+}
+
+/// How the lip lies in the pictures of a data set; not known if no episode says it.
+pub fn framing(episodes: &[TrainingEpisode]) -> Framing {
+    episodes.iter().rev().map(|e| e.framing).find(Framing::is_known).unwrap_or_default()
 }
 
 /// Frames a second of a data set: those of its first episode, or 30 of an empty set.
@@ -250,6 +284,7 @@ pub fn usable(episodes: &[Episode]) -> UsableEpisodes {
         }
     }
     keep_one_rate(&mut result);
+    keep_one_framing(&mut result);
     result
 }
 

@@ -35,6 +35,8 @@ struct Recording {
     /// What the controller holds for poured in the end, ml.
     poured_ml: f32,
     began: SystemTime,
+    /// Width and height of the pictures, px.
+    size_px: [u32; 2],
 }
 
 /// Recordings as they should be.
@@ -55,13 +57,15 @@ fn recordings(n: usize) -> Vec<Recording> {
             goal_ml: None,
             poured_ml: 0.0,
             began: UNIX_EPOCH,
+            size_px: [640, 480],
         }
     };
     common::episodes(n, 1).iter().map(recording).collect()
 }
 
 fn write(directory: &Path, recording: &Recording) -> PathBuf {
-    let config = Config::read(&Path::new(env!("CARGO_MANIFEST_DIR")).join("../config/sim.toml")).unwrap();
+    let mut config = Config::read(&Path::new(env!("CARGO_MANIFEST_DIR")).join("../config/sim.toml")).unwrap();
+    [config.camera.width_px, config.camera.height_px] = recording.size_px;
     let curve = EpisodeKind::Recording(Curve { lambda_deg: 60.0, gamma_per_s2: 0.3, beta_s: 5.0 });
     let kind = recording.goal_ml.map_or(curve, |goal_ml| EpisodeKind::Pour { goal_ml });
     let start = EpisodeStart { episode: 1, kind, started_at_ns: FRAME_NS, wall_clock: recording.began, config: &config, weights: "" };
@@ -127,7 +131,7 @@ fn said(out: &Output) -> String {
 #[test]
 fn each_fault_of_a_recording_is_named() {
     type Case = (&'static str, i32, fn(&mut Recording));
-    let cases: [Case; 20] = [
+    let cases: [Case; 21] = [
         ("cannot be used: FILE: no weight", 1, |r| r.weight_g = None),
         ("cannot be used: FILE: weight 0 g: nothing was poured", 1, |r| r.weight_g = Some(0.0)),
         ("cannot be used: FILE: no stream was ever seen, but the scale shows", 1, |r| r.rows.iter_mut().for_each(|f| f.area_px2 = 0.0)),
@@ -141,6 +145,7 @@ fn each_fault_of_a_recording_is_named() {
             let first = r.rows.iter().position(|f| f.doubt == Doubt::EdgeNotFound).unwrap();
             (r.rows[first - 1].area_px2, r.rows[first + 7].area_px2) = (0.0, 0.0);
         }),
+        ("cannot be used: FILE: pictures of 960 x 720 px and not of 640 x 480", 1, |r| r.size_px = [960, 720]),
         ("error: FILE: damaged: frame 10: commanded alpha NaN", 2, |r| r.rows[9].alpha_deg = f32::NAN),
         ("error: FILE: damaged: frame 10: commanded alpha 0", 2, |r| r.rows[9].area_px2 = -1.0),
         ("error: FILE: damaged: frame 10 comes after frame 11", 2, |r| (r.rows[9].number, r.rows[10].number) = (11, 10)),

@@ -10,6 +10,7 @@ use feature_worker::episodes::folder::{Budget, Folder, LEAST_FREE, MEGABYTE, rec
 use rt_controller::{claim, disk};
 use shared::config::Config;
 use shared::disk_space::free_bytes;
+use shared::framing::Framing;
 use shared::machine::Finding;
 use shared::plural::counted;
 use shared::runtime_dir::{Place, own_uid};
@@ -107,6 +108,14 @@ fn weights(file: &Path, config: &Config) -> Finding {
     match disk::read_weights(path, config.camera.fps, &config.limits, trusted) {
         Ok(weights) => {
             let origin = &weights.origin;
+            if let Some(difference) = origin.framing.difference(&Framing::new(&config.camera, &config.image)) {
+                return Finding::red(
+                    "weights",
+                    format!("{} trained on {difference}, as [camera] and [image] have it", weights.identity()),
+                    "an area is another volume in these pictures, and every pour is refused",
+                    train,
+                );
+            }
             let how = format!("trained from {} by {:?}", counted(origin.episodes, "episode"), origin.method);
             let age = path.metadata().ok().and_then(|m| m.modified().ok()).and_then(|t| t.elapsed().ok());
             let age = age.map_or(String::new(), |age| format!(", {:.1} days old", age.as_secs_f64() / 86_400.0));

@@ -8,6 +8,7 @@ use serde::Serialize;
 use shared::agent::Agent;
 use shared::control::EndReason;
 use shared::estimator::{Calibration, Hold};
+use shared::framing::Framing;
 use shared::limits::{Limiter, Limits};
 use shared::messages::{Feature, LAYOUT_VERSION};
 use trainer::data::TrainingEpisode;
@@ -107,7 +108,16 @@ impl Trace {
     /// The pour as a weighed episode.
     pub fn weighed(self, name: &str, weight_g: f64) -> TrainingEpisode {
         let Self { t_s, alpha_deg, alpha_measured_deg, area_px2, .. } = self;
-        TrainingEpisode { name: name.into(), rate_hz: RATE_HZ, t_s, alpha_deg, alpha_measured_deg, area_px2, weight_g }
+        TrainingEpisode {
+            name: name.into(),
+            rate_hz: RATE_HZ,
+            t_s,
+            alpha_deg,
+            alpha_measured_deg,
+            area_px2,
+            weight_g,
+            framing: Framing::default(),
+        }
     }
 }
 

@@ -81,9 +81,7 @@ impl Axes {
             [dx / length, dy / length]
         };
         let (x, y) = (unit(image.x_axis_px), unit(image.y_axis_px));
-        let ([x0, y0, ..], [x1, y1, ..]) = (image.x_axis_px, image.y_axis_px);
-        let along = ((x1 - x0) * y[1] - (y1 - y0) * y[0]) / (x[0] * y[1] - x[1] * y[0]);
-        Self { lip_px: [x0 + along * x[0], y0 + along * x[1]], x, y }
+        Self { lip_px: image.lip_px(), x, y }
     }
 
     /// Sine of the angle from x to y. Its sign tells the sense of turning.

@@ -5,6 +5,7 @@
 
 use serde::{Deserialize, Serialize};
 use shared::control::EndReason;
+use shared::framing::Difference;
 use shared::gaussian_curve::Curve;
 use shared::messages::Phase;
 
@@ -62,6 +63,8 @@ pub enum Refusal {
     NoFeature,
     /// The camera gives this many frames a second, and the second number is the configured one.
     FrameRate(f32, f32),
+    /// The weights were trained on other pictures.
+    Framing(Difference),
     /// No valid weights are loaded.
     NoWeights,
     /// The goal is not a number from `LEAST_GOAL_ML` up to this, ml.
@@ -96,6 +99,11 @@ impl std::fmt::Display for Refusal {
                 f,
                 "the camera gives {hz:.1} frames a second, and camera.fps is {configured_hz:.1}: every volume would be wrong; set the camera, or \
                  camera.fps and train anew (low light makes some cameras slower)"
+            ),
+            Self::Framing(difference) => write!(
+                f,
+                "the weights were trained on {difference}, as the worker has it: an area is another volume there; record and train with this picture, or \
+                 set [camera] and [image] as they were"
             ),
             Self::NoWeights => write!(f, "no valid weight file is loaded: train one, or see `rt-controller status`"),
             Self::Goal(max) => write!(f, "the goal must be {LEAST_GOAL_ML} to {max} ml (controller.goal_max_ml)"),

@@ -181,3 +181,26 @@ fn repeated_features_count_once() {
     assert_eq!(cell.step(&[feature, older, foreign], None).telemetry.d_ml, once_ml);
     assert_eq!(cell.core.counters().ignored_features, 3);
 }
+
+/// Protects the operator from 59 ml that are called 150: an area of a larger picture is larger, so weights of other pictures pour nothing, and say what
+/// differs. Where either side does not say its pictures, as weights from tables, the pour begins.
+#[test]
+fn weights_of_another_picture_pour_nothing() {
+    let small = Framing { size_px: [640, 480], lip_px: [300.0, 180.0], axes_deg: [0.0, -80.0] };
+    let large = Framing { size_px: [960, 720], lip_px: [450.0, 270.0], ..small };
+    let poured = |trained: Framing, seen: Framing| {
+        let mut cell = ToyCell::new();
+        cell.framing = seen;
+        cell.core.exchange(always_in(13, trained));
+        cell.tick(None);
+        cell.pour(50.0).map_err(|refusal| refusal.to_string())
+    };
+    let refused = poured(small, large).unwrap_err();
+    assert!(
+        refused.starts_with("the weights were trained on pictures of 640 x 480 px and not of 960 x 720, as the worker has it"),
+        "{refused}"
+    );
+    for (trained, seen) in [(small, small), (small, Framing::default()), (Framing::default(), large)] {
+        assert_eq!(poured(trained, seen), Ok(()));
+    }
+}

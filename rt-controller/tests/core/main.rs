@@ -10,6 +10,7 @@ use shared::agent::Agent;
 use shared::config::Config;
 use shared::control::{EndReason, Outcome};
 use shared::estimator::Calibration;
+use shared::framing::Framing;
 use shared::gaussian_curve::Curve;
 use shared::messages::{Doubt, Feature, LAYOUT_VERSION, Phase};
 use shared::mlp::{InputScale, Mlp};
@@ -17,6 +18,11 @@ use shared::weights::{Estimator, Method, Origin, Weights};
 
 /// An agent that always chooses the action `index`; 1 px^2 is 0.001 ml.
 fn always(index: usize) -> Box<Agent> {
+    always_in(index, Framing::default())
+}
+
+/// The same, trained on pictures in which the lip lies so.
+fn always_in(index: usize, framing: Framing) -> Box<Agent> {
     let mut network = Mlp::ZERO;
     network.b3[index] = 1.0;
     Box::new(Agent::new(&Weights {
@@ -27,7 +33,7 @@ fn always(index: usize) -> Box<Agent> {
         calibration: Calibration { volume_at_1_px2_ml: 0.001, area_exponent: 1.0, log_tilt_slope: 0.0, hold_above_px2: f32::INFINITY },
         estimator: Estimator::Sum,
         rate_hz: 30.0,
-        origin: Origin { method: Method::Handmade, actions: 21, episodes: 0, data_sha256: [0; 32] },
+        origin: Origin { method: Method::Handmade, actions: 21, episodes: 0, data_sha256: [0; 32], framing },
         seed: 1,
     }))
 }
@@ -53,6 +59,8 @@ struct ToyCell {
     largest_rate_deg_s: f32,
     /// How far the camera driver's clock is ahead of the controller's, ns.
     clock_ahead_ns: u64,
+    /// How the lip lies in the camera's pictures.
+    framing: Framing,
     last_ended: Option<Outcome>,
 }
 
@@ -80,6 +88,7 @@ impl ToyCell {
             out_ml: 0.0,
             largest_rate_deg_s: 0.0,
             clock_ahead_ns: 0,
+            framing: Framing::default(),
             last_ended: None,
         };
         cell.tick(None);
@@ -107,6 +116,7 @@ impl ToyCell {
             area_px2,
             confidence: 1.0,
             triangle_px: [0.0; 6],
+            framing: self.framing,
         }
     }
 

@@ -18,6 +18,7 @@ use super::records::{EpisodeError, NextRecord, Records};
 use super::rows::{EpisodeRow, EpisodeTrack, LostFrames, alpha_between_deg};
 use super::weight::check_kept;
 use super::{Episode, EpisodeInfo, EpisodeKind};
+use crate::framing::Framing;
 use crate::gaussian_curve::Curve;
 use crate::messages::Doubt;
 
@@ -182,6 +183,7 @@ impl Contents {
                 number: text("episode").parse().ok(),
                 cell: text("cell"),
                 config_sha256: text("config_sha256"),
+                framing: Framing::of_toml(self.text(format::META_CONFIG, "toml")),
                 weights: text("weights"),
                 ended: self.text(format::META_END, "reason").into(),
                 note: self.text(format::META_NOTE, "text").into(),

@@ -48,6 +48,7 @@ fn print(weights: &Weights) {
     let Weights { network: _, actions_deg, selection, scale, calibration, estimator, rate_hz, origin, seed } = weights;
     println!("trained     method {:?}, {} actions, {}, seed {seed}", origin.method, origin.actions, counted(origin.episodes, "episode"));
     println!("data        sha256 {}", episode::hex(&origin.data_sha256));
+    println!("pictures    {}", origin.framing);
     println!("network     {INPUTS}-{HIDDEN}-{HIDDEN}-{ACTIONS}, ReLU, {PARAMETERS} parameters, action by {selection:?}");
     println!(
         "inputs      asinh({} v) x {} for v_t, v_t-1, v_t-2 in ml a frame; asinh(d / {} ml) x {}",

@@ -66,6 +66,7 @@ pub fn train(episodes: &[TrainingEpisode], options: &Options, progress: &dyn Pro
             actions: options.actions,
             episodes: episodes.len() as u32,
             data_sha256: data::hash(episodes),
+            framing: data::framing(episodes),
         },
         seed: options.seed,
     };

@@ -4,6 +4,7 @@ use super::*;
 use shared::actions::{Selection, action_table};
 use shared::agent::{Agent, Observation};
 use shared::estimator::Calibration;
+use shared::framing::Framing;
 use shared::mlp::{InputScale, Mlp};
 use shared::weights::{Estimator, Method, Origin, Weights};
 
@@ -26,7 +27,7 @@ fn example() -> Weights {
         calibration: Calibration { volume_at_1_px2_ml: 0.002, area_exponent: 1.15, log_tilt_slope: 0.05, hold_above_px2: 60.0 },
         estimator: Estimator::Sum,
         rate_hz: 30.0,
-        origin: Origin { method: Method::Handmade, actions: 21, episodes: 0, data_sha256: [7; 32] },
+        origin: Origin { method: Method::Handmade, actions: 21, episodes: 0, data_sha256: [7; 32], framing: Framing::default() },
         seed: 1,
     }
 }
