@@ -176,6 +176,8 @@ impl Shelf {
         if taken.identity != shown {
             return Err(OTHERS.into());
         }
+        // What is there is replaced only if it is a weight file, also one that is damaged.
+        Weights::may_write(&self.weights).map_err(|e| e.to_string())?;
         // What the controller refuses would look as if it were in use.
         disk::check_weights(&taken.weights, self.fps, &self.limits)?;
         let kept = self.kept();
@@ -309,6 +311,18 @@ mod tests {
         fast.write(&shelf.offer()).unwrap();
         assert!(shelf.accept(&fast.identity()).unwrap_err().contains("trained at 60 frames/s, camera.fps is 30"));
         assert_eq!(Weights::read(&file).unwrap().seed, 1);
+    }
+
+    /// Protects a file that `controller.weights` names by mistake: what is no weight file is left as it is.
+    #[test]
+    fn a_file_of_another_kind_is_not_replaced() {
+        let dir = tempfile::tempdir().unwrap();
+        let file = dir.path().join("notes.txt");
+        let shelf = Shelf::new(file.clone(), Limits::default(), 120.0, 30.0);
+        fs::write(&file, "my notes").unwrap();
+        weights(1).write(&shelf.offer()).unwrap();
+        assert!(shelf.accept(&weights(1).identity()).unwrap_err().contains("another kind"));
+        assert_eq!(fs::read_to_string(&file).unwrap(), "my notes");
     }
 
     /// Protects the one way back from two people who click at the same time: of many exchanges at once, some in another process's place, each

@@ -3,7 +3,7 @@
 //! Only files are replaced that are of the kind that is written: a slip of the finger in `--out` costs no episode, no configuration and no device.
 //! Ordinary threads use it; it allocates and waits for the disk. Errors are those of the system, or say what is in the way.
 
-use std::fs::{File, OpenOptions, Permissions};
+use std::fs::{File, Metadata, OpenOptions, Permissions};
 use std::io::{Error, ErrorKind, Read as _, Result, Write as _};
 use std::os::unix::fs::{MetadataExt as _, PermissionsExt as _, fchown};
 use std::path::{Path, PathBuf};
@@ -32,8 +32,7 @@ fn put_in_place(path: &Path, bytes: &[u8], begins: &[u8], sync: fn(&File) -> Res
     let (mut file, new) = new_beside(path).map_err(|e| in_words(&e))?;
     let mut put = || {
         if let Some(before) = &before {
-            // Only root may give a file away; for everybody else it is their own file in place of another, in the same group if they are in it.
-            let _ = fchown(&file, Some(before.uid()), Some(before.gid())).or_else(|_| fchown(&file, None, Some(before.gid())));
+            give_owner(&file, before);
             file.set_permissions(Permissions::from_mode(before.mode() & 0o777))?;
         }
         file.write_all(bytes)?;
@@ -41,6 +40,12 @@ fn put_in_place(path: &Path, bytes: &[u8], begins: &[u8], sync: fn(&File) -> Res
         std::fs::rename(&new, path)
     };
     put().map_err(|e| gone(&new, &e))
+}
+
+/// Gives `file` the owner and the group of another. Only root may give a file away; for everybody else it is their own file, in the other's group if they
+/// are in it.
+pub fn give_owner(file: &File, of: &Metadata) {
+    let _ = fchown(file, Some(of.uid()), Some(of.gid())).or_else(|_| fchown(file, None, Some(of.gid())));
 }
 
 /// Puts `bytes` into the new file `path`. It is an error if something is there.

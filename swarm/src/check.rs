@@ -131,6 +131,8 @@ pub struct Checks {
     pub(crate) asked_s: f64,
     /// Whether the controller could not know then that what a person had done came before.
     is_unclear: bool,
+    /// Whether a person has moved the arm since the operator last asked for the robot.
+    is_moved: bool,
     /// Who knows that a person stopped our program, and that nobody asked for the robot since.
     pub(crate) taken: Taken,
     /// When every fault of the robot that lasts was ended, s.
@@ -198,6 +200,7 @@ impl Checks {
             is_slow: false,
             asked_s: f64::NEG_INFINITY,
             is_unclear: false,
+            is_moved: false,
             taken: Taken::default(),
             cleared_s: Vec::new(),
             waits: Waits::default(),
@@ -220,13 +223,14 @@ impl Checks {
     pub fn happens(&mut self, what: &What, machine: &Machine, lives: bool, (at_s, remedied_s): (f64, f64)) {
         match what {
             What::Pour(_) | What::Record(..) | What::Resume if lives => {
-                self.is_unclear = self.taken.controller || self.taken.registers;
-                (self.taken, self.asked_s) = (Taken::default(), at_s);
+                self.is_unclear = self.taken.controller || self.taken.registers || self.is_moved;
+                (self.taken, self.is_moved, self.asked_s) = (Taken::default(), false, at_s);
             }
             // Whoever is killed pours nothing, and the robot's program has to bring the container upright by itself.
             What::ControllerKilled(_) => (self.taken.controller, self.phase) = (false, Phase::NoRobot),
             What::Robot(Fault::Boot) => self.taken.registers = false,
             What::Robot(Fault::Clear) => self.cleared_s.push(at_s),
+            What::Robot(Fault::Jog(..) | Fault::HandMove(..)) => self.is_moved = true,
             // The robot's program soon hears nothing any more, and has to bring the container upright by itself.
             What::Suspended(_) => self.silent_from_s = self.silent_from_s.min(at_s + SILENT_S),
             what if takes_robot(what) && stops_ours(what, machine) => {

@@ -59,9 +59,10 @@ impl Checks {
         }
         let sd_ml = f64::from(outcome.poured_sd_ml);
         // Nothing in the world tells one camera that its own gain has drifted, so the truth may then be off by what that hides, and no more. A pour
-        // that is done has looked on, and doubts what single frames did not show; another may end in the middle of them.
+        // that is done has looked on, and doubts what single frames did not show, but for a surge that nothing let expect; another may end in the middle of
+        // them.
         let (low_ml, high_ml) = self.unshown.by_gain_ml(said_ml);
-        let frames_ml = if outcome.reason == EndReason::Done { (0.0, 0.0) } else { self.unshown.by_frames_ml() };
+        let frames_ml = if outcome.reason == EndReason::Done { (0.0, self.unshown.by_surges_ml()) } else { self.unshown.by_frames_ml() };
         let most_ml = SAID.0 * sd_ml + SAID.1;
         let off_ml = true_ml - said_ml;
         // What is not a number is near to nothing.
@@ -115,7 +116,7 @@ mod tests {
     fn a_drift_excuses_what_it_hides() {
         let found = |gain: f64, true_ml: f64| {
             let mut checks = checks();
-            checks.unshown.frame(gain, 0.0);
+            checks.unshown.frame(gain, 0.0, 0.0);
             checks.ended(&outcome(EndReason::Done), true_ml, 20.0);
             checks.violations.first().map(|v| v.invariant)
         };
@@ -132,12 +133,16 @@ mod tests {
     /// its number, and one that does not say so is.
     #[test]
     fn hidden_frames_excuse_what_left_in_them() {
-        let found = |reason, hidden_ml: f64, true_ml: f64| {
+        let found_after = |shown_ml: f64, reason, hidden_ml: f64, true_ml: f64| {
             let mut checks = checks();
-            checks.unshown.frame(1.0, hidden_ml);
+            checks.unshown.frame(1.0, shown_ml, 0.0);
+            checks.unshown.frame(1.0, hidden_ml, hidden_ml);
             checks.ended(&outcome(reason), true_ml, 20.0);
             checks.violations.iter().any(|v| v.invariant == "said")
         };
+        let found = |reason, hidden_ml, true_ml| found_after(0.0, reason, hidden_ml, true_ml);
+        assert!(!found(EndReason::Done, 20.0, 110.0) && found(EndReason::Done, 20.0, 116.0), "a surge that nothing let expect");
+        assert!(found_after(20.0, EndReason::Done, 20.0, 110.0), "as much had been shown before");
         assert!(!found(EndReason::Aborted, 20.0, 110.0) && found(EndReason::Aborted, 20.0, 116.0));
         assert!(found(EndReason::Aborted, 0.1, 96.0), "one hidden frame excuses what left in it only");
         assert!(found(EndReason::Aborted, 20.0, 60.0), "what was not shown cannot be too much");

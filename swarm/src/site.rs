@@ -251,10 +251,11 @@ impl Site {
             let servo = &self.robot.machine().robot.servo;
             let tilt = (servo.actual_q[self.joint].to_degrees(), servo.actual_qd[self.joint].to_degrees());
             let scene = Scene::of(&self.container, self.now_s(), tilt.0, tilt.1);
-            self.eye.frame(self.now_ns, poured_ml - self.frame_poured_ml, clinging, &scene);
+            let left_ml = poured_ml - self.frame_poured_ml;
+            self.eye.frame(self.now_ns, left_ml, clinging, &scene);
             self.frame_poured_ml = poured_ml;
             let (gain, hidden_ml) = self.eye.unshown();
-            self.checks.unshown.frame(gain, hidden_ml);
+            self.checks.unshown.frame(gain, left_ml, hidden_ml);
         }
         Vec::new()
     }

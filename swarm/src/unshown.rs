@@ -14,24 +14,30 @@ pub struct Unshown {
     gains: (f64, f64),
     /// What left in frames that showed too little, and what frames showed that did not leave, ml.
     hidden_ml: (f64, f64),
+    /// The largest outflow that a frame of the run has shown, ml.
+    largest_ml: f64,
+    /// What left in frames that showed too little, beyond the largest outflow that any frame before had shown, ml.
+    surged_ml: f64,
 }
 
 impl Default for Unshown {
     fn default() -> Self {
-        Self { gain: 1.0, gains: (1.0, 1.0), hidden_ml: (0.0, 0.0) }
+        Self { gain: 1.0, gains: (1.0, 1.0), hidden_ml: (0.0, 0.0), largest_ml: 0.0, surged_ml: 0.0 }
     }
 }
 
 impl Unshown {
     /// A run begins.
     pub fn begins(&mut self) {
-        (self.gains, self.hidden_ml) = ((self.gain.min(1.0), self.gain.max(1.0)), (0.0, 0.0));
+        *self = Self { gain: self.gain, gains: (self.gain.min(1.0), self.gain.max(1.0)), ..Self::default() };
     }
 
-    /// A frame was taken with this gain, and showed so much less than what left in it, ml; below 0 it showed more.
-    pub fn frame(&mut self, gain: f64, hidden_ml: f64) {
+    /// A frame was taken with this gain, in which so much left, ml, and which showed so much less than that, ml; below 0 it showed more.
+    pub fn frame(&mut self, gain: f64, left_ml: f64, hidden_ml: f64) {
         self.gain = gain;
         self.gains = (self.gains.0.min(gain), self.gains.1.max(gain));
+        self.surged_ml += (hidden_ml - self.largest_ml).max(0.0);
+        self.largest_ml = self.largest_ml.max(left_ml - hidden_ml);
         self.hidden_ml = (self.hidden_ml.0 + hidden_ml.max(0.0), self.hidden_ml.1 + (-hidden_ml).max(0.0));
     }
 
@@ -39,6 +45,11 @@ impl Unshown {
     pub fn by_gain_ml(&self, said_ml: f64) -> (f64, f64) {
         let share = |gain: f64| (gain.powf(-VOLUME_EXPONENT) - 1.0).abs();
         (share(self.gains.1) * said_ml.abs(), share(self.gains.0) * said_ml.abs())
+    }
+
+    /// By how much the truth may lie above what is said, ml, because frames that showed less hid a surge: more than any picture of the run let expect.
+    pub fn by_surges_ml(&self) -> f64 {
+        self.surged_ml
     }
 
     /// By how much the truth may lie below and above what is said, ml, because single frames showed something else.
@@ -57,13 +68,16 @@ mod tests {
     fn what_was_not_shown_is_what_it_excuses() {
         let mut unshown = Unshown::default();
         unshown.begins();
-        unshown.frame(0.8, 0.0);
+        unshown.frame(0.8, 3.0, 0.0);
         let (below, above) = unshown.by_gain_ml(100.0);
         assert!(below == 0.0 && (above - 30.7).abs() < 0.1, "{below} {above}");
-        unshown.frame(1.0, 2.5);
-        unshown.frame(1.0, -1.0);
-        assert_eq!(unshown.by_frames_ml(), (1.0, 2.5));
+        unshown.frame(1.0, 2.5, 2.5);
+        unshown.frame(1.0, 0.0, -1.0);
+        assert_eq!((unshown.by_frames_ml(), unshown.by_surges_ml()), ((1.0, 2.5), 0.0), "as much had been shown");
+        unshown.frame(1.0, 8.0, 8.0);
+        assert_eq!(unshown.by_surges_ml(), 5.0);
         unshown.begins();
         assert_eq!((unshown.by_gain_ml(100.0), unshown.by_frames_ml()), ((0.0, 0.0), (0.0, 0.0)));
+        assert_eq!(unshown.by_surges_ml(), 0.0);
     }
 }

@@ -62,6 +62,8 @@ fn the_doctor_names_what_is_wrong() {
     for (fault, what, verdict, words) in [
         ("speed-slider=0.4", "speed", "red", "slider"),
         ("speed-slider=1", "speed", "green", "100 %"),
+        ("time-scaling=0.5", "speed", "red", "speed scaling 50 %"),
+        ("time-scaling=1", "speed", "green", "100 %"),
         ("protective-stop", "state", "red", "protective"),
         ("unlock-protective-stop", "state", "green", "upright"),
         ("in-use=input_int_register_24", "registers", "red", "in use"),

@@ -36,8 +36,8 @@ pub const DATA_SET: &str = "data set";
 
 /// No liquid that is poured weighs more, g/ml. From tables: glycerine has 1.26, and syrup 1.4.
 const DENSEST_G_ML: f64 = 1.5;
-/// Weights of which none reaches this are none of grams, g. Chosen by hand: a curve or pour to learn from has 25 g and more.
-const GRAMS_LEAST: f64 = 2.0;
+/// Weights of which none reaches this are none of grams, g: 300 g are 11 ounces or 0.3 kg. Chosen by hand: a curve or pour to learn from has 25 g and more.
+const GRAMS_LEAST: f64 = 15.0;
 /// Right weights tell between this and that share of the vessel's volume. It rests on tilts at which nothing was ever seen: 90 trainings of tuning rigs 200
 /// to 202, all kinds of vessels, with 2, 2+3 and 5 weighings told 0.72 to 5.2 times the volume, and a decimal point makes ten.
 const VOLUME_TOLD: [f64; 2] = [0.25, 6.0];

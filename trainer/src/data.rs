@@ -192,7 +192,7 @@ fn keep_one_rate(found: &mut UsableEpisodes) {
     }));
 }
 
-/// Takes out the episodes whose pictures show the lip otherwise than those of most others: an area is another volume in them. Of two kinds that are as
+/// Takes out the episodes whose pictures show the lip otherwise than those of most others: an area may be another volume in them. Of two kinds that are as
 /// frequent, the one of the newest episode counts. Episodes that do not say it stay.
 fn keep_one_framing(found: &mut UsableEpisodes) {
     let known = || found.episodes.iter().map(|e| e.framing).filter(Framing::is_known);
@@ -203,7 +203,7 @@ fn keep_one_framing(found: &mut UsableEpisodes) {
         found.left_out.extend(difference.map(|what| {
             (
                 e.name.clone(),
-                format!("{what}, as the others have it: an area is another volume there; train on episodes of one picture only"),
+                format!("{what}, as the others have it: an area may be another volume there; train on episodes of one picture only"),
             )
         }));
         difference.is_none()

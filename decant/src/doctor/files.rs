@@ -112,14 +112,24 @@ fn weights(file: &Path, config: &Config) -> Finding {
                 return Finding::red(
                     "weights",
                     format!("{} trained on {difference}, as [camera] and [image] have it", weights.identity()),
-                    "an area is another volume in these pictures, and every pour is refused",
+                    "an area may be another volume in these pictures, and every pour is refused",
                     train,
                 );
             }
             let how = format!("trained from {} by {:?}", counted(origin.episodes, "episode"), origin.method);
             let age = path.metadata().ok().and_then(|m| m.modified().ok()).and_then(|t| t.elapsed().ok());
             let age = age.map_or(String::new(), |age| format!(", {:.1} days old", age.as_secs_f64() / 86_400.0));
-            Finding::green("weights", format!("{} {how}{age}", weights.identity()))
+            let is = format!("{} {how}{age}", weights.identity());
+            if !origin.framing.is_known() && origin.episodes > 0 {
+                let means = "they come from tables, so whether they are for these pictures is not known";
+                return Finding::yellow(
+                    "weights",
+                    is,
+                    means,
+                    "train with recordings of this cell, or make sure that the areas are of such pictures",
+                );
+            }
+            Finding::green("weights", is)
         }
         Err(e) => Finding::red("weights", e, "the controller refuses them, and nothing can be poured", train),
     }

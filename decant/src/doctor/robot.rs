@@ -10,7 +10,8 @@ use std::time::{Duration, Instant};
 
 use rt_controller::claim::{self, Running};
 use rt_controller::client::Client;
-use rt_controller::link::{self, LinkError, LinkOptions, RobotState, payload};
+use rt_controller::core::following;
+use rt_controller::link::{self, LinkError, LinkOptions, RobotState, health, payload};
 use shared::config::Config;
 use shared::control::RobotLink;
 use shared::machine::Finding;
@@ -169,11 +170,16 @@ fn speed(state: &RobotState) -> Finding {
     let slider = state.speed_fraction;
     let scaling = state.speed_scaling.map_or(String::new(), |s| format!(", speed scaling {:.0} %", s * 100.0));
     let is = format!("slider {:.0} %{scaling}", slider * 100.0);
-    if slider >= FULL_SPEED {
-        Finding::green("speed", is)
-    } else {
-        Finding::red("speed", is, "a pour ends before it starts", "set the speed slider on the pendant to 100 %")
+    if slider < FULL_SPEED {
+        return Finding::red("speed", is, "a pour ends before it starts", "set the speed slider on the pendant to 100 %");
     }
+    // A robot that does not run moves at no speed at all; the line on its state says that.
+    let runs = state.robot_mode == health::ROBOT_MODE_RUNNING;
+    if runs && state.speed_scaling.is_some_and(|share| share.is_nan() || share < f64::from(following::FULL_SPEED)) {
+        let advice = "look for speed limits of the safety configuration, reduced mode, or a wrong payload";
+        return Finding::red("speed", is, "the robot slows itself, and every pour is refused", advice);
+    }
+    Finding::green("speed", is)
 }
 
 /// A finding of what the link refuses, in its own words.

@@ -229,7 +229,7 @@ fn measure(extractor: &mut Extractor, camera: &CameraConfig, frame: &Frame) -> R
     let format = PixelFormat::from_code(header.format).unwrap_or(PixelFormat::Bgr8);
     let image = Image { width_px: header.width_px, height_px: header.height_px, format, pixels: frame.pixels };
     let time = PictureTime { sequence: header.sequence, captured_at_ns: header.captured_at_ns };
-    let measured = extractor.measure_at(image, time).map_err(words)?;
+    let measured = extractor.measure_at(image, time).map_err(|e| format!("frame {}: {e}", header.sequence))?;
     if measured.doubt == Doubt::WrongFormat {
         return Err(format!(
             "frame {} is {} x {} px, but [camera] says {} x {}; set width_px and height_px to the input's size and calibrate",

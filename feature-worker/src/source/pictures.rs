@@ -67,7 +67,7 @@ pub(super) fn read(path: &Path, picture: &mut Mat) -> Result<(), String> {
 /// Why a file cannot be read, in words.
 pub(super) fn unreadable(e: &std::io::Error) -> String {
     match e.kind() {
-        std::io::ErrorKind::NotFound => "no such file".to_string(),
+        std::io::ErrorKind::NotFound => "no such file; a sequence of pictures has a name such as frame_%04d.png".to_string(),
         _ => e.to_string(),
     }
 }

@@ -34,7 +34,7 @@ pub const TOLERANCE_DEG: f32 = 2.0;
 pub const MOST_TICKS: u32 = 3;
 /// Share of its speed below which the robot slows the motion by itself (RTDE's `speed_scaling`). Chosen by hand: above it the lag is the usual
 /// one.
-const FULL_SPEED: f32 = 0.95;
+pub const FULL_SPEED: f32 = 0.95;
 /// Number of ticks in a row with less than that share after which the robot counts as slow: a fifth of a second at 30 Hz. Chosen by hand; no
 /// measurement is recorded.
 const MOST_SLOW_TICKS: u32 = 6;

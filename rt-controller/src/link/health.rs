@@ -85,7 +85,7 @@ const FULL_SPEED: f64 = 0.995;
 /// The bit of `robot_status_bits` for a pressed teach button: freedrive (RTDE guide).
 const TEACH_BUTTON_BIT: u32 = 1 << 2;
 /// `robot_mode` while the robot is powered and its brakes are released (RTDE guide).
-pub(crate) const ROBOT_MODE_RUNNING: i32 = 7;
+pub const ROBOT_MODE_RUNNING: i32 = 7;
 /// `runtime_state` while a program is being stopped (RTDE guide).
 pub(crate) const RUNTIME_STOPPING: u32 = 0;
 /// `runtime_state` while no program runs (RTDE guide).

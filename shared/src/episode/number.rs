@@ -14,6 +14,8 @@ use std::os::unix::fs::{OpenOptionsExt, PermissionsExt};
 use std::path::Path;
 use std::time::{Duration, Instant};
 
+use crate::whole_file::give_owner;
+
 /// Longest wait for another program that takes a number. Chosen by hand: it takes milliseconds.
 const WAIT: Duration = Duration::from_secs(5);
 /// How many folders deep episodes are looked for. Chosen by hand: people move episodes into a folder or two.
@@ -26,12 +28,15 @@ pub fn take_number(directory: &Path) -> Result<u64> {
     std::fs::create_dir_all(directory)?;
     let flags = (rustix::fs::OFlags::NOFOLLOW | rustix::fs::OFlags::NONBLOCK).bits() as i32;
     let path = directory.join(".last-number");
-    let mut file = OpenOptions::new().read(true).write(true).create(true).truncate(false).mode(0o600).custom_flags(flags).open(path)?;
+    let open = OpenOptions::new().read(true).write(true).create(true).truncate(false).mode(0o600).custom_flags(flags).open(path);
+    let mut file = open.map_err(|e| Error::new(e.kind(), format!(".last-number: {e}")))?;
     if !file.metadata()?.is_file() {
         return Err(Error::other(".last-number is no file: remove it"));
     }
     // Who may read it could hold its lock. One that is another user's stays as it is.
     let _ = file.set_permissions(Permissions::from_mode(0o600));
+    // Root may take a number for the cell's user, whose file it then is.
+    give_owner(&file, &std::fs::metadata(directory)?);
     lock(&file)?;
     let mut text = String::new();
     (&file).take(32).read_to_string(&mut text)?;

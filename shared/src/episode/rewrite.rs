@@ -183,8 +183,9 @@ pub(super) fn copy(
     let shown = new.display().to_string();
     let fail = |what: String| ChangeError::Write { file: shown.clone(), what };
     let disk = |e: &std::io::Error| fail(error_words(e));
-    let permissions = std::fs::metadata(old).map_err(|e| disk(&e))?.permissions();
-    file.set_permissions(permissions).map_err(|e| disk(&e))?;
+    let before = std::fs::metadata(old).map_err(|e| disk(&e))?;
+    whole_file::give_owner(&file, &before);
+    file.set_permissions(before.permissions()).map_err(|e| disk(&e))?;
     let mut records = Records::open(old)?;
     let mut target: Option<BufWriter<File>> = Some(BufWriter::with_capacity(WRITE_BYTES, file));
     let mut writer: Option<Writer<BufWriter<File>>> = None;

@@ -72,15 +72,16 @@ fn weighed_pours(read: &[Episode], trained_on: &[TrainingEpisode]) -> Vec<Weighe
 
 /// Runs the command.
 pub fn run(args: &Args) -> Result<(), Failure> {
-    let read = args.source.read().or_exit(exit::BAD_INPUT)?;
+    let mut read = args.source.read().or_exit(exit::BAD_INPUT)?;
     args.weight_file.check()?;
     if let Some(name) = args.leave_out.iter().chain(&args.accept).find(|name| !read.iter().any(|e| e.name == **name)) {
         let what = format!("no episode of these is called {name}: give the name that `trainer check` shows");
         return Err(failure(exit::BAD_INPUT, what));
     }
     let config = args.weight_file.config()?;
+    // What is left out has no say in which frame rate or pictures the others must have.
+    read.retain(|e| !args.leave_out.contains(&e.name));
     let mut usable = data::usable(&read);
-    usable.episodes.retain(|e| !args.leave_out.contains(&e.name));
     for doubt in consistency::doubtful(&usable.episodes) {
         if args.accept.contains(&doubt.name) {
             continue;
