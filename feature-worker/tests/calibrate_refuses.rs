@@ -78,6 +78,19 @@ impl Bench {
     }
 }
 
+/// Protects who has a camera without colour: a liquid's colour is not learned from grey pictures, which no other command would measure by it.
+#[test]
+fn grey_pictures_teach_no_colour() -> Outcome {
+    let bench = Bench::new()?;
+    for i in 0..FRAMES {
+        let mut grey = Mat::default();
+        imgproc::cvt_color_def(&pour(i)?, &mut grey, imgproc::COLOR_BGR2GRAY)?;
+        let path = bench.file(&format!("grey_{i:02}.pgm"));
+        imgcodecs::imwrite(path.to_str().ok_or("path")?, &grey, &Vector::new())?;
+    }
+    bench.refused("grey pictures", &[&bench.file("grey_%02d.pgm")], &[], &["needs a colour camera"])
+}
+
 /// Protects from a calibration on nothing: one picture, the same picture many times, and a dry glass that tilts are refused with either
 /// method.
 #[test]

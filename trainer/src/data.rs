@@ -15,6 +15,8 @@ const FRAMES_MIN: usize = 30;
 const RATES_HZ: std::ops::RangeInclusive<f64> = 1.0..=240.0;
 /// A larger angle is none that a joint turns to, degrees: a UR5's joints turn by a whole turn either way.
 const ANGLE_MAX_DEG: f64 = 360.0;
+/// Weights of one measurement that are further apart are two weights, g: a kitchen scale shows whole grams.
+const WEIGHTS_APART_G: f64 = 0.5;
 /// Frame rates that are further apart than this are different ones, Hz. Chosen by hand; no measurement is recorded.
 const RATES_APART_HZ: f64 = 0.5;
 
@@ -273,7 +275,9 @@ pub fn usable(episodes: &[Episode]) -> UsableEpisodes {
         let own = TrainingEpisode::from_episode(e);
         let fault = if !e.complete {
             Some("the recording is incomplete (the recorder was stopped): the areas do not add up to the weight; record it again".into())
-        } else if let Some((first, _)) = doubles.iter().find(|(_, later)| *later == k) {
+        } else if let Some(other) = doubles.iter().find_map(|pair| other_weight(episodes, *pair, k)) {
+            Some(format!("the same measurement as {}, with another weight: correct one of them, or leave it out", episodes[other].name))
+        } else if let Some((first, _)) = doubles.iter().find(|(first, later)| *later == k && episodes[*first].weight_g.is_some()) {
             Some(format!("the same measurement as {}: leave one of them out", episodes[*first].name))
         } else {
             own.fault().or_else(|| e.part_unseen().then(|| episode::PART_UNSEEN.into()))
@@ -286,6 +290,13 @@ pub fn usable(episodes: &[Episode]) -> UsableEpisodes {
     keep_one_rate(&mut result);
     keep_one_framing(&mut result);
     result
+}
+
+/// The other one of a pair that holds the same measurement, if `k` is one of them and both are weighed, and differently.
+fn other_weight(episodes: &[Episode], (first, later): (usize, usize), k: usize) -> Option<usize> {
+    let (a, b) = (episodes[first].weight_g?, episodes[later].weight_g?);
+    let other = if k == first { later } else { first };
+    ([first, later].contains(&k) && (a - b).abs() > WEIGHTS_APART_G).then_some(other)
 }
 
 /// SHA-256 of what is trained on: times, commanded angles, areas and weights of all episodes in order, and the measured angles of those that

@@ -30,6 +30,8 @@ struct Recording {
     weight_g: Option<f64>,
     finished: bool,
     copies: usize,
+    /// What is entered for the copies, if it is something else.
+    copy_weight_g: Option<f64>,
     /// The goal of a pour; none of a recorded curve.
     goal_ml: Option<f32>,
     /// What the controller holds for poured in the end, ml.
@@ -54,6 +56,7 @@ fn recordings(n: usize) -> Vec<Recording> {
             weight_g: Some(e.weight_g),
             finished: true,
             copies: 1,
+            copy_weight_g: None,
             goal_ml: None,
             poured_ml: 0.0,
             began: UNIX_EPOCH,
@@ -116,7 +119,9 @@ fn check(recordings: &[Recording]) -> Output {
     for recording in recordings {
         let path = write(dir.path(), recording);
         for copy in 1..recording.copies {
-            std::fs::copy(&path, path.with_extension(format!("{copy}.mcap"))).unwrap();
+            let to = path.with_extension(format!("{copy}.mcap"));
+            std::fs::copy(&path, &to).unwrap();
+            recording.copy_weight_g.map_or(Ok(()), |weight_g| set_weight(&to, weight_g).map(drop)).unwrap();
         }
     }
     Command::new(env!("CARGO_BIN_EXE_trainer")).arg("check").arg(dir.path()).output().unwrap()
@@ -131,13 +136,15 @@ fn said(out: &Output) -> String {
 #[test]
 fn each_fault_of_a_recording_is_named() {
     type Case = (&'static str, i32, fn(&mut Recording));
-    let cases: [Case; 21] = [
+    let cases: [Case; 22] = [
         ("cannot be used: FILE: no weight", 1, |r| r.weight_g = None),
         ("cannot be used: FILE: weight 0 g: nothing was poured", 1, |r| r.weight_g = Some(0.0)),
         ("cannot be used: FILE: no stream was ever seen, but the scale shows", 1, |r| r.rows.iter_mut().for_each(|f| f.area_px2 = 0.0)),
         ("cannot be used: FILE: only 20 frames", 1, |r| r.rows.truncate(20)),
         ("cannot be used: FILE: the recording is incomplete", 1, |r| r.finished = false),
         ("cannot be used: FILE: the same measurement as", 1, |r| r.copies = 2),
+        // Which of the two is right cannot be known, so neither teaches.
+        ("with another weight: correct one of them, or leave it out", 1, |r| (r.copies, r.copy_weight_g) = (2, Some(200.0))),
         ("cannot be used: FILE: the camera did not see part of this pour; its areas do not add up to its weight", 1, |r| blind(r, 7)),
         // A dropout on either side of the gap is no evidence that nothing flowed.
         ("cannot be used: FILE: the camera did not see part of this pour", 1, |r| {

@@ -22,7 +22,9 @@ use web::{Answer, Server, Settings};
 
 use crate::drawing::{draw, jpeg, save};
 use crate::source::{FrameSource, NextFrame, ObserverSource, WAIT};
-use crate::vision::{Axes, AxesError, ColourError, ColourLearner, Corner, Extractor, Image, RoomBeside, find_corner, room_beside};
+use crate::vision::{
+    Axes, AxesError, ColourError, ColourLearner, Corner, ExtractError, Extractor, Image, RoomBeside, find_corner, room_beside,
+};
 use crate::worker::lacks_room;
 
 mod checks;
@@ -229,6 +231,10 @@ fn propose(config: &Config, corner: Corner, pour: &Pour) -> Result<Proposal, Str
         image.region_px = region_px;
     }
     if image.method == LiquidMethod::Colour {
+        // The worker would refuse such pictures.
+        if pour.is_grey() {
+            return Err(ExtractError::NoColour.to_string());
+        }
         let mut learner = ColourLearner::new(Axes::new(&image));
         let words = |e: ColourError| e.to_string();
         // The background of a pose in which the container rests must not be taken for something that stays at the lip.
