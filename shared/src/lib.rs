@@ -9,7 +9,7 @@
 //! | [`runtime_dir`] | where a cell keeps its sockets and other files of a run | no |
 //! | [`shared_memory`] | the cell's files in `/dev/shm`: their names, who uses them, space for them | no |
 //! | [`config`], [`config_paths`] | the cell's one TOML file, and what its paths mean | no |
-//! | [`framing`] | how the lip lies in the pictures, on which an area depends | no |
+//! | [`framing`] | how the lip lies in the pictures, on which an area depends | yes |
 //! | [`limits`] | the one place that every target passes | yes |
 //! | [`gaussian_curve`] | eq. (1), the movement of an experimental episode | yes |
 //! | [`alpha_track`] | alpha over time: which angle belongs to a picture | yes |

@@ -232,7 +232,7 @@ fn propose(config: &Config, corner: Corner, pour: &Pour) -> Result<Proposal, Str
     }
     if image.method == LiquidMethod::Colour {
         // The worker would refuse such pictures.
-        if pour.is_grey() {
+        if pour.is_grey {
             return Err(ExtractError::NoColour.to_string());
         }
         let mut learner = ColourLearner::new(Axes::new(&image));

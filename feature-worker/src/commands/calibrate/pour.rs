@@ -38,8 +38,8 @@ pub(super) struct Pour {
     pub pictures: Vec<Mat>,
     /// Number of all pictures.
     pub count: u64,
-    /// Number of those that have no colour by their format.
-    grey: u64,
+    /// Whether one of them has no colour by its format, as all of a camera without colour.
+    pub is_grey: bool,
     /// Of this many pictures, one is kept.
     stride: u64,
     /// How many bytes the kept pictures may take.
@@ -54,7 +54,7 @@ impl Pour {
     }
 
     fn of(film: Film) -> Self {
-        Self { pictures: Vec::new(), count: 0, grey: 0, stride: 1, keep_most: KEEP_MOST, film }
+        Self { pictures: Vec::new(), count: 0, is_grey: false, stride: 1, keep_most: KEEP_MOST, film }
     }
 
     /// The pour in files. With `partial`, something may be missing. Returns also what is missing, a line each.
@@ -93,7 +93,7 @@ impl Pour {
             self.stride *= 2;
         }
         self.count += 1;
-        self.grey += u64::from(frame.header.format == PixelFormat::Mono8 as u32);
+        self.is_grey |= frame.header.format == PixelFormat::Mono8 as u32;
         Ok(())
     }
 
@@ -101,11 +101,6 @@ impl Pour {
     fn picture_bytes(&self) -> usize {
         let each = self.pictures.first().map_or(0, |first| first.total() * first.elem_size().unwrap_or(0));
         self.pictures.len() * each
-    }
-
-    /// Whether it comes from a camera without colour.
-    pub fn is_grey(&self) -> bool {
-        self.grey > 0
     }
 
     /// Whether no more can be kept.
