@@ -185,6 +185,7 @@ pub fn compare(device: &impl Controls, camera: &CameraConfig) -> Vec<String> {
             (Some(_), Err(e)) => differ.push(format!("camera.{name} cannot be read ({e})")),
         }
     }
+    differ.extend(doubt_gain(device, camera));
     if let Some(Setting::Value(hertz)) = camera.mains_hz {
         match device.get(v4l2::V4L2_CID_POWER_LINE_FREQUENCY) {
             Ok(has) if mains_code(hertz) == has => {}
@@ -293,11 +294,14 @@ pub fn keep_found(device: &mut impl Controls) -> Found {
 /// Sets the controls that `camera` names, and reads them back.
 pub fn apply(device: &mut impl Controls, camera: &CameraConfig) -> Outcome {
     let mut outcome = Outcome::default();
-    let mut alone = Vec::new();
+    let (mut alone, mut kept) = (Vec::new(), Vec::new());
     for (key, setting) in settings(camera) {
         match setting {
             Some(setting) => match set(device, key, setting) {
-                Ok(said) => outcome.said.push(said),
+                Ok(said) => {
+                    kept.push((key, device.get(key.id)));
+                    outcome.said.push(said);
+                }
                 Err(refused) => outcome.refused.push(refused),
             },
             None => alone.push(key.name),
@@ -309,10 +313,29 @@ pub fn apply(device: &mut impl Controls, camera: &CameraConfig) -> Outcome {
     let mains = apply_mains(device, camera);
     outcome.said.extend(mains.said);
     outcome.refused.extend(mains.refused);
+    // Setting one control may change another that was read back before it.
+    for (key, got) in kept.iter().filter(|(key, got)| device.get(key.id) != *got) {
+        let shown = |v: &Result<i32, String>| v.as_ref().map_or("no value".into(), |v| (f64::from(*v) / key.factor).to_string());
+        let (got, now) = (shown(got), shown(&device.get(key.id)));
+        outcome
+            .refused
+            .push(format!("camera.{}: it was {got}, and is {now} since other controls were set; leave one of them out", key.name));
+    }
+    if let Some(doubt) = doubt_gain(device, camera) {
+        outcome.refused.push(doubt);
+    }
     if !alone.is_empty() {
         outcome.said.push(format!("{} left alone: the camera may change them during a pour", alone.join(", ")));
     }
     outcome
+}
+
+/// Why a gain that is set may not last: where the gain has no automatic of its own, that of the exposure is wont to change it.
+fn doubt_gain(device: &impl Controls, camera: &CameraConfig) -> Option<String> {
+    let own = device.query(v4l2::V4L2_CID_AUTOGAIN).is_some();
+    let automatic = device.get(v4l2::V4L2_CID_EXPOSURE_AUTO).is_ok_and(|mode| EXPOSURE_AUTOMATIC.contains(&mode));
+    let doubted = camera.gain.is_some() && !own && automatic && device.query(v4l2::V4L2_CID_GAIN).is_some();
+    doubted.then(|| "camera.gain: the automatic exposure may change it; set camera.exposure_ms too".into())
 }
 
 /// Sets the mains' frequency, if `camera` names it, and reads it back. The automatic exposure goes by it.

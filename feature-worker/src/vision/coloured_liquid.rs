@@ -19,7 +19,7 @@ use shared::messages::{Doubt, PixelFormat};
 
 use super::coloured_edge;
 use super::confidence::Basis;
-use super::foreign::{self, FILLED, GAP_MOST_PX, Seen};
+use super::foreign::{self, FILLED, Seen};
 use super::geometry::{Axes, Line, NEAR_PX, RAYS, RayGrid, distance};
 use super::grey::{COLOURED_FROM, is_grey};
 use super::ground_beside::{InGlass, Place, Square};
@@ -54,9 +54,13 @@ const SMOOTH: i32 = 5;
 const PROFILES_LEAST: f32 = 0.3;
 /// The ground is learned from samples at least this far from the lip, px, once it was seen dry for [`DRY_FRAMES`]: nearer, a stream
 /// begins. Chosen by hand.
-const LEARN_FROM_PX: f32 = 48.0;
+pub(super) const LEARN_FROM_PX: f32 = 48.0;
 /// Frames without a stream after which the surroundings of the lip are known. Chosen by hand: a third of a second.
 const DRY_FRAMES: u32 = 10;
+/// In the first pictures, what lies beyond this share of a ray is ground. Chosen by hand: few streams reach further.
+const DISTANT_SHARE: f32 = 0.7;
+/// After so many pictures what lies at the lip since the first one counts as ground. Chosen by hand: half a minute, which is longer than a pour.
+const STREAM_MOST: u32 = 900;
 /// Of this many samples, the ground is learned from one a frame, a different one each time. Chosen by hand, for speed.
 const LEARN_EVERY: usize = 7;
 /// Of this many samples far from the lip, one is looked at for the picture's brightness. Chosen by hand, for speed.
@@ -91,6 +95,8 @@ pub(crate) struct ColouredLiquid {
     /// Frames that were learned from, and those without a stream that are left until the surroundings of the lip are known.
     frames: usize,
     unknown_for: u32,
+    /// Pictures in which something foreign was at the lip while its surroundings were not known.
+    unsure_at_first: u32,
     pace: Pace,
     reflection: Reflection,
     wandering: Wandering,
@@ -144,6 +150,7 @@ impl ColouredLiquid {
             ground_bgr: None,
             frames: 0,
             unknown_for: DRY_FRAMES,
+            unsure_at_first: 0,
             pace: Pace::CHOSEN,
             reflection: Reflection::default(),
             wandering: Wandering::new(),
@@ -179,28 +186,6 @@ impl ColouredLiquid {
             self.mask.data_bytes_mut()?.iter_mut().zip(others).for_each(|(mask, other)| *mask |= other);
         }
         Ok(())
-    }
-
-    /// The last sample of liquid on a ray and the score there: px of liquid minus px of background, at its largest. A lamp's reflection
-    /// near the lip counts as neither, and so does white ground that it may be.
-    #[inline(always)]
-    fn last_liquid(&self, mask: &[u8], colours: &[Vec3b]) -> Option<(usize, f32)> {
-        let (mut score, mut best, mut last) = (0.0f32, 0.0f32, None);
-        for (r, (value, step)) in mask.iter().zip(&self.grid.steps_px).enumerate() {
-            if *value != 0 {
-                score += *step;
-            } else if self.grid.radii_px[r] > LEARN_FROM_PX
-                || !(self.ground.is_blind(colours[r].0) || self.seen().is_hidden(r, colours[r].0))
-            {
-                score -= *step;
-            }
-            if score > best {
-                (best, last) = (score, Some(r));
-            } else if score < -GAP_MOST_PX {
-                break;
-            }
-        }
-        last.map(|r| (r, best))
     }
 
     /// Tells the ground's colours how bright the picture is far from the lip.
@@ -304,6 +289,28 @@ impl ColouredLiquid {
         Ok(self.glass.liquid()?.zip(self.ground_bgr).is_some_and(|(liquid, ground)| excuse(liquid, ground)))
     }
 
+    /// Whether something lies at the lip like a stream and may be the liquid in other colours. Writes its ends into `self.ends`.
+    fn has_foreign_body(&mut self) -> opencv::Result<bool> {
+        let mut ends = self.ends;
+        let body = self.seen().body(&mut ends)?;
+        self.ends = ends;
+        let Some(body) = body else { return Ok(false) };
+        let Some(colour) = body.colour else { return Ok(true) };
+        Ok(!self.is_excused(|liquid, ground| foreign::is_not_the_liquid(colour, liquid, ground))?
+            && !foreign::goes_on_beside(colour, self.beside_wide.colours()?))
+    }
+
+    /// Learns the ground's colours from the outer part of each ray, where hardly any stream reaches.
+    fn learn_distant(&mut self) -> opencv::Result<()> {
+        for (i, ray) in self.grid.rays.iter().enumerate() {
+            let (mask, colours) = (self.mask.at_row::<u8>(i as i32)?, self.smooth.at_row::<Vec3b>(i as i32)?);
+            let last_px = self.grid.radii_px[ray.samples.saturating_sub(1)];
+            let from = self.grid.radii_px[..ray.samples].partition_point(|r| *r < DISTANT_SHARE * last_px);
+            (from..ray.samples).filter(|r| mask[*r] == 0).for_each(|r| self.ground.learn(colours[r].0, true));
+        }
+        Ok(())
+    }
+
     /// What is at the lip where no stream is seen.
     fn look_again(&mut self, confidence: f32) -> opencv::Result<Sighting> {
         let dry = Sighting::Dry { confidence };
@@ -313,30 +320,22 @@ impl ColouredLiquid {
         if self.half_white && (!known || !self.glass.is_empty()?) {
             return Ok(Sighting::Unsure(Doubt::BlownOut));
         }
-        if !known {
-            return Ok(dry);
+        if known {
+            self.glass.see_dry()?;
+        } else {
+            // What lies at the lip may be a stream that flowed before the first picture, so it is judged by ground that lies far from it.
+            self.learn_distant()?;
         }
-        self.glass.see_dry()?;
         let [blind, glows, foreign] = self.seen().at_lip()?;
-        if self.reflection.hides_lip(blind.max(self.white_lip), glows, foreign > QUIET_SHARE, self.pace) {
-            return Ok(Sighting::Unsure(Doubt::BlownOut));
+        let body = self.has_foreign_body()?;
+        // Ground that is white at the lip alone may be new, so it is no reflection yet.
+        let hidden = (known || body) && self.reflection.hides_lip(blind.max(self.white_lip), glows, foreign > QUIET_SHARE, self.pace);
+        self.unsure_at_first += u32::from(body && !known);
+        // An untidy place that only the lip shows would be a stream for ever.
+        if (known && (body || hidden)) || (body && self.unsure_at_first <= self.pace.pictures(STREAM_MOST)) {
+            return Ok(Sighting::Unsure(if hidden { Doubt::BlownOut } else { Doubt::ColoursChanged }));
         }
-        let mut ends = self.ends;
-        let body = self.seen().body(&mut ends)?;
-        self.ends = ends;
-        if let Some(body) = body {
-            let is_ground = match body.colour {
-                Some(colour) => {
-                    self.is_excused(|liquid, ground| foreign::is_not_the_liquid(colour, liquid, ground))?
-                        || foreign::goes_on_beside(colour, self.beside_wide.colours()?)
-                }
-                None => false,
-            };
-            if !is_ground {
-                return Ok(Sighting::Unsure(Doubt::ColoursChanged));
-            }
-        }
-        if foreign < QUIET_SHARE && self.learn_after == 0 && !self.half_white {
+        if known && foreign < QUIET_SHARE && self.learn_after == 0 && !self.half_white {
             self.beside.teach(&mut self.ground, self.frames)?;
         } else {
             self.beside.forget_kept();
@@ -350,8 +349,7 @@ impl ColouredLiquid {
         self.ends = [0; RAYS];
         let (mut filled, mut cut_off, mut liquid_px) = (0usize, 0usize, 0.0f32);
         for (i, ray) in self.grid.rays.iter().enumerate() {
-            let colours = self.smooth.at_row::<Vec3b>(i as i32)?;
-            let Some((r, score)) = self.last_liquid(&self.mask.at_row::<u8>(i as i32)?[..ray.samples], colours) else { continue };
+            let Some((r, score)) = self.seen().last_liquid(i)? else { continue };
             // Between the last sample of liquid and the first of background.
             let r_px = self.grid.radii_px[r] + 0.5 * self.grid.steps_px[r];
             if r_px >= NEAR_PX + 1.0 && score >= (2.0 * FILLED - 1.0) * (r_px - NEAR_PX) {

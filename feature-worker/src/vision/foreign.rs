@@ -6,6 +6,7 @@
 use opencv::core::{Mat, Vec3b};
 use opencv::prelude::*;
 
+use super::coloured_liquid::LEARN_FROM_PX;
 use super::geometry::{NEAR_PX, RAYS, RayGrid};
 use super::ground_colours::{Ground, GroundColours, Mean};
 
@@ -18,7 +19,7 @@ const REFLECTION_PX: f32 = 16.0;
 /// A liquid in front of a lamp's reflection is brighter than this in all parts, close to the reflection's middle. Chosen by hand.
 const GLOW_LEVEL: u8 = 180;
 /// More background than this before the first liquid, or the first of a body, ends a ray, px. Tuned.
-pub(super) const GAP_MOST_PX: f32 = 24.0;
+const GAP_MOST_PX: f32 = 24.0;
 /// Least share of liquid, or of a body, between lip and edge on a ray that counts as filled. Tuned.
 pub(super) const FILLED: f32 = 0.55;
 /// Least share of the rays that a body at the lip fills. Tuned.
@@ -79,6 +80,28 @@ pub(super) struct Body {
 }
 
 impl Seen<'_> {
+    /// The last sample of liquid on a ray and the score there: px of liquid minus px of background, at its largest. A lamp's reflection
+    /// near the lip counts as neither, and so does white ground that it may be.
+    #[inline(always)]
+    pub(super) fn last_liquid(&self, ray: usize) -> opencv::Result<Option<(usize, f32)>> {
+        let mask = &self.mask.at_row::<u8>(ray as i32)?[..self.grid.rays[ray].samples];
+        let colours = self.smooth.at_row::<Vec3b>(ray as i32)?;
+        let (mut score, mut best, mut last) = (0.0f32, 0.0f32, None);
+        for (r, (value, step)) in mask.iter().zip(&self.grid.steps_px).enumerate() {
+            if *value != 0 {
+                score += *step;
+            } else if self.grid.radii_px[r] > LEARN_FROM_PX || !(self.ground.is_blind(colours[r].0) || self.is_hidden(r, colours[r].0)) {
+                score -= *step;
+            }
+            if score > best {
+                (best, last) = (score, Some(r));
+            } else if score < -GAP_MOST_PX {
+                break;
+            }
+        }
+        Ok(last.map(|r| (r, best)))
+    }
+
     /// What lies at the lip like a stream and is foreign, if something does. Writes its ends into `ends`.
     pub(super) fn body(&self, ends: &mut [usize; RAYS]) -> opencv::Result<Option<Body>> {
         let (mut filled, mut foreign, mut samples, mut length_px) = (0usize, 0usize, 0usize, 0.0f32);

@@ -107,6 +107,40 @@ fn a_bead_at_the_lip_does_not_hide_the_end() -> Result<(), ExtractError> {
     Ok(())
 }
 
+/// A rim of water that is darker by `by` levels and `width` px wide, of which the share `gaps` is missing, as what it takes of a picture.
+fn faint_rim(by: f64, gaps: f32, width: f32) -> Result<Mat, ExtractError> {
+    let mut rim = Mat::new_rows_cols_with_default(480, 640, CV_8UC3, Scalar::all(0.0))?;
+    lay_over(&mut rim, &[stream(80.0, 72.0)], Scalar::all(by))?;
+    lay_over(&mut rim, &[stream(80.0 - width, 72.0 - width)], Scalar::all(0.0))?;
+    // Pieces of the rim, 24 px from one to the next.
+    for k in 0..40 {
+        let x = 24.0 * k as f32;
+        let gap = vec![[x, 0.0], [x + 24.0 * gaps, 0.0], [x + 24.0 * gaps, 479.0], [x, 479.0]];
+        lay_over(&mut rim, &[gap], Scalar::all(0.0))?;
+    }
+    Ok(rim)
+}
+
+/// Protects pours of water whose rim hardly differs from an even wall, or has gaps: what is too little for a stream is no zero for three seconds, after which no
+/// pour goes on. When it ends, that is told.
+#[test]
+fn a_faint_rim_with_gaps_is_told() -> Result<(), ExtractError> {
+    for (by, gaps, width) in [(10.0, 0.0, 6.0), (14.0, 0.5, 6.0), (14.0, 0.25, 3.0), (20.0, 0.25, 3.0), (20.0, 0.5, 6.0)] {
+        let (mut extractor, rim) = (clear()?, faint_rim(by, gaps, width)?);
+        for i in 0..125 {
+            let (flows, mut picture) = ((20..105).contains(&i), water(0.0, None, i)?);
+            if flows {
+                core::subtract(&picture.clone(), &rim, &mut picture, &core::no_array(), -1)?;
+            }
+            let measured = measure(&mut extractor, &picture)?;
+            assert!(!flows || is_told(&measured), "{by} {gaps} picture {i}: {measured:?}");
+            let surely_dry = (3..20).contains(&i) || i >= 115;
+            assert!(!surely_dry || !is_told(&measured), "{by} {gaps} picture {i}: {measured:?}");
+        }
+    }
+    Ok(())
+}
+
 /// Protects the operator from a region in which no outline of clear water fits: every picture would be dry.
 #[test]
 fn a_region_without_room_for_an_outline_is_refused() {

@@ -16,6 +16,8 @@ struct Fake {
     frames: std::rc::Rc<std::cell::Cell<i32>>,
     /// What the light of now adds to the exposure that its automatic finds.
     light: i32,
+    /// Setting the first of these halves the value of the second, as far as its range goes.
+    couples: Option<[u32; 2]>,
     /// What was set, in order.
     set: Vec<u32>,
 }
@@ -50,6 +52,11 @@ impl Controls for Fake {
         self.set.push(id);
         let [at, least, most, step] = self.controls.get_mut(&id).ok_or("invalid")?;
         *at = (value.clamp(*least, *most) - *least) / *step * *step + *least;
+        if let Some([_, other]) = self.couples.filter(|[first, _]| *first == id)
+            && let Some(control) = self.controls.get_mut(&other)
+        {
+            control[0] /= 2;
+        }
         Ok(())
     }
 }
@@ -86,6 +93,26 @@ fn what_is_set_is_read_back_and_the_rest_is_said() {
     assert_eq!(device.get(v4l2::V4L2_CID_POWER_LINE_FREQUENCY), Ok(1));
     assert_eq!(device.get(v4l2::V4L2_CID_GAIN), Ok(64));
     assert!(outcome.said.iter().any(|s| s == "exposure_ms = 10") && outcome.said.iter().any(|s| s.starts_with("gain, focus left alone")));
+}
+
+/// Protects what is told as set: a value that another control's setting changed is refused, and so is a gain that the automatic exposure has.
+#[test]
+fn what_does_not_last_is_refused() {
+    let (exposure_ms, gain) = (Some(Setting::Value(10.0)), Some(Setting::Value(64.0)));
+    let both = CameraConfig { exposure_ms, gain, ..CameraConfig::default() };
+    let mut device = Fake { couples: Some([v4l2::V4L2_CID_GAIN, v4l2::V4L2_CID_EXPOSURE_ABSOLUTE]), ..camera() };
+    let refused = apply(&mut device, &both).refused;
+    assert_eq!(refused, ["camera.exposure_ms: it was 10, and is 5 since other controls were set; leave one of them out"]);
+    assert!(apply(&mut camera(), &both).refused.is_empty());
+    let alone = CameraConfig { gain, ..CameraConfig::default() };
+    let mut device = camera();
+    let wanted = ["camera.gain: the automatic exposure may change it; set camera.exposure_ms too"];
+    assert_eq!(
+        (apply(&mut device, &alone).refused, compare(&device, &alone)),
+        (wanted.map(String::from).to_vec(), wanted.map(String::from).to_vec())
+    );
+    device.controls.insert(v4l2::V4L2_CID_AUTOGAIN, [0, 0, 1, 1]);
+    assert_eq!((apply(&mut device, &alone).refused, compare(&device, &alone)), (vec![], vec![]));
 }
 
 /// Longer than any automatic here moves on a busy machine.

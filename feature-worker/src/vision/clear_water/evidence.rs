@@ -4,14 +4,14 @@
 //! Called on the extraction thread, within a `pulp` dispatch: what is marked `inline(always)` runs with the processor's widest registers.
 //! All pictures and tables are kept, so nothing is allocated after the second frame. The only failures are OpenCV's.
 
+mod known_ground;
+
 use opencv::core::{self, CV_16SC2, CV_32FC1, Mat, Scalar, Size, Vec4b};
 use opencv::imgproc;
 use opencv::prelude::*;
 
 use super::background::Background;
-use super::rays::{
-    CELLS, Colours, RAYS, Rays, Row, SAMPLES, Window, apart, around, colours, cut_off, each, row, size_of, sizes, sums, whole,
-};
+use super::rays::{CELLS, Colours, RAYS, Rays, Row, SAMPLES, Window, apart, around, colours, cut_off, row, sizes, sums, whole};
 use super::rigid::RigidMap;
 use super::water::Stream;
 use crate::vision::geometry::LinearField;
@@ -235,38 +235,6 @@ impl Evidence {
     /// Whether the ground near the lip has no pattern.
     pub(super) fn even(&self) -> bool {
         self.even
-    }
-
-    /// What is known of the ground in the air between the lines `from` and `to`, each given as the share of the way to it from the lip: which shares of
-    /// the places are as they are remembered, and which are not. Where the ground is `even`, a place of which nothing is remembered has to be like what is
-    /// remembered further out on its ray. `gain` is the picture's exposure against the memory.
-    pub(super) fn shares(&self, rays: &Rays, [from, to]: [LinearField; 2], even: bool, gain: f32) -> [f32; 2] {
-        let (now, memory): (&[Vec4b], &[Vec4b]) =
-            (self.ray_now.data_typed().unwrap_or_default(), self.ray_memory.data_typed().unwrap_or_default());
-        let (mut dry, mut wet, mut looked) = (0.0f32, 0.0f32, 0.0f32);
-        for ray in 0..RAYS {
-            let mut further = None;
-            for i in (ray * SAMPLES..(ray + 1) * SAMPLES).rev().filter(|i| rays.air[*i] > 0.0) {
-                let remembered = self.remembered[i] > 0.5;
-                if even && remembered {
-                    further = memory.get(i).map(|p| each(|k| (f32::from(p[k]) * 255.0 * gain / f32::from(p[3].max(1))).min(255.0)));
-                }
-                if to.at(rays.places[i]) >= 1.0 || from.at(rays.places[i]) < 1.0 {
-                    continue;
-                }
-                looked += 1.0;
-                let away = match (remembered, further, now.get(i)) {
-                    (true, ..) => self.away[i],
-                    (false, Some(ground), Some(now)) => {
-                        size_of(&each(|k| if k < 3 { f32::from(now[k]) - ground[k] } else { 0.0 })) / self.noise
-                    }
-                    _ => continue,
-                };
-                dry += f32::from(u8::from(away < CALM));
-                wet += f32::from(u8::from(away >= CALM));
-            }
-        }
-        [dry, wet].map(|part| part / looked.max(1.0))
     }
 
     /// Compares the memory and the picture `earlier`, both moved, with the picture `now` along the rays. `height_px` is the height above

@@ -154,6 +154,11 @@ impl Lines {
         (0..2).any(|k| legs_px[k] * OUTGROWS >= self.most_px[k])
     }
 
+    /// The largest cuts with the x-axis and the y-axis of any line, px.
+    pub(super) fn most_px(&self) -> [f32; 2] {
+        self.most_px
+    }
+
     /// Cuts of a line with the x-axis and the y-axis, px.
     pub(super) fn legs_px(&self, line: usize) -> [f32; 2] {
         self.legs_px[line]

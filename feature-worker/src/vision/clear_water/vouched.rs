@@ -51,11 +51,6 @@ impl Vouched {
         *self = Self { pace: self.pace, ..Self::new() };
     }
 
-    /// Whether the remembered ground is known to be dry.
-    pub(super) fn is_dry(&self) -> bool {
-        self.dry
-    }
-
     /// No stream was seen in a picture with this `evidence`. Returns whether there is none.
     pub(super) fn see_none(&mut self, evidence: &Evidence, rays: &Rays) -> bool {
         if !self.dry {

@@ -287,22 +287,14 @@ impl Water {
     }
 
     /// Takes note of the full picture's line, whose legs are `scale` times as long as in the small picture; `sine` is that of the angle
-    /// between the axes. What the memory of the background took for water must have its edge in the picture itself. Where the ground is
-    /// `sure`, a stream that would begin without an edge is none.
-    pub(super) fn confirm(
-        &mut self,
-        line: Option<FineLine>,
-        mean_level: f32,
-        scale: f32,
-        sine: f32,
-        sure: bool,
-    ) -> Result<FineLine, Doubt> {
+    /// between the axes. What the memory of the background took for water must have its edge in the picture itself; where it has none, nobody knows.
+    pub(super) fn confirm(&mut self, line: Option<FineLine>, mean_level: f32, scale: f32, sine: f32) -> Result<FineLine, Doubt> {
         let begins = self.stream.is_some_and(|s| s.age <= 1.0);
         let lit = (mean_level / LIT_LEVEL).clamp(LIT_LEAST, 1.0);
         let least = lit * if begins { BEGIN_CONFIDENCE } else { GO_ON_CONFIDENCE };
         let line = line.filter(|line| line.confidence >= least);
         let confirmed = self.is_same(line.as_ref(), scale, sine);
-        line.filter(|_| confirmed).ok_or(if begins && sure { Doubt::None } else { Doubt::EdgeNotFound })
+        line.filter(|_| confirmed).ok_or(Doubt::EdgeNotFound)
     }
 
     /// Whether the full picture's line is that of the stream that was seen: a stream does not lose its contrast, nor change its shape.
