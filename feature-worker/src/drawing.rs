@@ -5,7 +5,7 @@
 
 use std::path::Path;
 
-use opencv::core::{Mat, Point, Rect, Scalar, Vec2b, Vec3b, Vector};
+use opencv::core::{CV_8UC3, Mat, Point, Rect, Scalar, Vec2b, Vec3b, Vector};
 use opencv::prelude::*;
 use opencv::{imgcodecs, imgproc};
 use shared::messages::{Doubt, PixelFormat};
@@ -110,6 +110,22 @@ pub fn shrunk(picture: &Mat, width_max: i32) -> Result<Mat, opencv::Error> {
 
 /// Writes the picture to the file at `path` in one step, in the format that the name's ending says. OpenCV's own writing does not tell of a full disk.
 pub fn save(picture: &Mat, path: &Path) -> Result<(), String> {
+    let bytes = encode(picture, path)?;
+    whole_file::replace_soon(path, bytes.as_slice(), begins(&bytes)).map_err(|e| e.to_string())
+}
+
+/// Whether [`save`] may put a picture at `path`, so that it is known before long work. Its directory may be missing if it can be made.
+pub fn may_save(path: &Path) -> Result<(), String> {
+    let one = Mat::new_rows_cols_with_default(1, 1, CV_8UC3, Scalar::default()).map_err(|e| e.message)?;
+    let bytes = encode(&one, path)?;
+    let above = path.ancestors().skip(1).find(|directory| directory.exists()).unwrap_or(Path::new("."));
+    let is_missing = path.parent().is_some_and(|parent| parent != above && !parent.as_os_str().is_empty());
+    let looked = if is_missing { whole_file::may_make_in(above) } else { whole_file::check(path, begins(&bytes)) };
+    looked.map_err(|e| e.to_string())
+}
+
+/// The picture as a file in the format that the ending of `path` says.
+fn encode(picture: &Mat, path: &Path) -> Result<Vector<u8>, String> {
     let ending = path.extension().and_then(|e| e.to_str()).unwrap_or_default();
     let mut bytes = Vector::new();
     // An unknown ending is an error of OpenCV's as well, and so it is looked at before.
@@ -117,12 +133,12 @@ pub fn save(picture: &Mat, path: &Path) -> Result<(), String> {
         return Err(format!("'{ending}' is no ending of a picture that can be written, such as png or jpg"));
     }
     let made = imgcodecs::imencode(&format!(".{ending}"), picture, &mut bytes, &Vector::new()).map_err(|e| e.message)?;
-    if !made {
-        return Err(format!("the picture cannot be made a {ending}"));
-    }
-    // What is replaced begins as it does: a picture of the same format.
-    let begins = bytes.as_slice().get(..2).unwrap_or_default();
-    whole_file::replace_soon(path, bytes.as_slice(), begins).map_err(|e| e.to_string())
+    if made { Ok(bytes) } else { Err(format!("the picture cannot be made a {ending}")) }
+}
+
+/// How a file begins that a picture may replace: as the picture does, which is of the same format.
+fn begins(bytes: &Vector<u8>) -> &[u8] {
+    bytes.as_slice().get(..2).unwrap_or_default()
 }
 
 /// Lets OpenCV work in the calling thread alone. The error is one line.

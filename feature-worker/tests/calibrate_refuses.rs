@@ -388,6 +388,26 @@ fn an_episode_is_enough() -> Outcome {
     Ok(())
 }
 
+/// Protects a pour that somebody makes for the camera: a place where nothing can be written is known before it, here before an input that is not there.
+#[test]
+fn a_picture_without_a_place_is_refused_before_the_pour() -> Outcome {
+    let bench = Bench::new()?;
+    let config = bench.config.to_str().ok_or("text")?;
+    std::fs::write(bench.file("notes.png"), "mine")?;
+    for (picture, words) in [
+        (format!("{config}/look.png"), "no file can be made in"),
+        (format!("{config}/below/look.png"), "give another --picture"),
+        (bench.file("look.xyz").display().to_string(), "is no ending of a picture"),
+        (bench.file("notes.png").display().to_string(), "is a file of another kind"),
+    ] {
+        let mut command = Command::new(env!("CARGO_BIN_EXE_feature-worker"));
+        let output = command.args(["calibrate", "none.mp4", "--config", config, "--picture", &picture]).output()?;
+        let said = String::from_utf8_lossy(&output.stderr);
+        assert!(output.status.code() == Some(2) && said.lines().count() == 1 && said.contains(words), "{picture}: {said}");
+    }
+    Ok(())
+}
+
 /// Protects the share that is said: of a background that is learned as liquid it is nearly all, of another one nothing.
 #[test]
 fn the_share_of_the_background_is_right() -> Outcome {

@@ -70,9 +70,11 @@ fn in_words(e: &Error) -> Error {
     Error::new(e.kind(), error_words(e))
 }
 
-/// Whether [`replace`] may put a file at `path`, so that it is known before long work: what is there is a regular file, and empty or of the kind
-/// that begins with `begins`.
+/// Whether [`replace`] may put a file at `path`, so that it is known before long work: files can be made in its directory, and what is there is a regular
+/// file, and empty or of the kind that begins with `begins`.
 pub fn check(path: &Path, begins: &[u8]) -> Result<()> {
+    let directory = directory_of(path);
+    may_make_in(directory).map_err(|e| Error::new(e.kind(), format!("no file can be made in {}: {e}", directory.display())))?;
     let file = match regular_file::open(path) {
         Ok((file, _)) => file,
         Err(e) if e.kind() == ErrorKind::NotFound => return Ok(()),
@@ -87,6 +89,12 @@ pub fn check(path: &Path, begins: &[u8]) -> Result<()> {
     } else {
         Err(Error::new(ErrorKind::AlreadyExists, "is a file of another kind and is left as it is: give another name"))
     }
+}
+
+/// Whether this process may make files in `directory`. A mode that permits it does not help where the file system is read-only.
+pub fn may_make_in(directory: &Path) -> Result<()> {
+    use rustix::fs::{Access, AtFlags, CWD, accessat};
+    Ok(accessat(CWD, directory, Access::WRITE_OK | Access::EXEC_OK, AtFlags::EACCESS)?)
 }
 
 /// Gives the file `new` the name `path`, unless something has that name already.
@@ -125,10 +133,14 @@ fn remove(new: &Path) {
     let _ = std::fs::remove_file(new);
 }
 
+/// The directory in which a file at `path` lies.
+fn directory_of(path: &Path) -> &Path {
+    path.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."))
+}
+
 /// Puts the directory of `path` on the disk, so that the file's name stays after a power failure. A file system that cannot do it does without.
 pub fn sync_directory(path: &Path) {
-    let directory = path.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."));
-    let _ = File::open(directory).and_then(|d| d.sync_all());
+    let _ = File::open(directory_of(path)).and_then(|d| d.sync_all());
 }
 
 #[cfg(test)]
@@ -167,7 +179,11 @@ mod tests {
         for other in [&pipe, &device, &place] {
             assert!(replace(other, b"kind 5", b"kind").unwrap_err().to_string().contains("regular"), "{}", other.display());
         }
-        assert!(replace(Path::new("/"), b"", b"").is_err() && replace(&dir.path().join("no/w.bin"), b"", b"").is_err());
+        assert!(replace(Path::new("/"), b"", b"").is_err());
+        for check in [check, |path: &Path, begins: &[u8]| replace(path, b"", begins)] {
+            let refused = check(&dir.path().join("no/w.bin"), b"kind").unwrap_err().to_string();
+            assert!(refused.contains("no file can be made in") && refused.contains("/no: No such file"), "{refused}");
+        }
         assert_eq!(names(dir.path()), ["device", "pipe", "place", "w.bin"]);
     }
 

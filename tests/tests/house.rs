@@ -47,7 +47,7 @@ const OPENED_OTHERWISE: &[(&str, &str, &str)] = &[
     ("web/src/peer.rs", "read_to_string(table)", "in /proc"),
     ("operator-page/src/addresses.rs", "read_to_string(table)", "in /proc"),
     ("operator-page/src/shelf.rs", "File::create(&partial)", "the new file gets the old one's time before its name"),
-    ("shared/src/whole_file.rs", "File::open(directory)", "a directory"),
+    ("shared/src/whole_file.rs", "File::open(directory_of(path))", "a directory"),
     ("shared/src/shared_memory.rs", "std::fs::write(&new, &token)", "in the runtime directory, which nobody else may enter"),
     ("shared/src/shared_memory.rs", "File::open(random)", "the kernel's random numbers"),
     ("rt-controller/src/claim.rs", "std::fs::write(&new, text)", "in the runtime directory, which nobody else may enter"),

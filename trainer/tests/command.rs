@@ -272,6 +272,10 @@ fn a_slip_of_the_finger_costs_nothing() {
         (vec!["check", "f.csv", "--scale", "pipe.csv"], "is not a regular file"),
         (vec!["check", "f.csv", "--scale", "huge.csv"], "bytes are too many"),
         (vec!["report", "pipe.json", "--out", "r.html"], "is not a regular file"),
+        // A place where nothing can be written is known before the work, which here ends at files that are not there.
+        (vec!["train", "none.csv", "--scale", "none.csv", "--out", "no/w.bin"], "no file can be made in no: No such file"),
+        (vec!["refine", "none.csv", "--scale", "none.csv", "--out", "no/w.bin"], "no file can be made in no: No such file"),
+        (vec!["report", "none.json", "--out", "no/r.html"], "no file can be made in no: No such file"),
         (vec!["plan", "f.csv", "--scale", "s.csv", "--goal-max", "inf"], "--goal-max 1 to 5000 ml"),
     ] {
         let out = trainer(dir.path(), &args);

@@ -20,7 +20,8 @@ use shared::os;
 use shared::plural::counted;
 use web::{Answer, Server, Settings};
 
-use crate::drawing::{draw, jpeg, save};
+use crate::commands::configuration;
+use crate::drawing::{draw, jpeg, may_save, save};
 use crate::source::{FrameSource, NextFrame, ObserverSource, WAIT};
 use crate::vision::{
     Axes, AxesError, ColourError, ColourLearner, Corner, ExtractError, Extractor, Image, RoomBeside, find_corner, room_beside,
@@ -107,6 +108,13 @@ pub fn run(args: &Args) -> Result<(), Failure> {
         });
     }
     let config = Config::read(&args.config).or_exit(exit::BAD_INPUT)?;
+    // What cannot be written is said before anybody pours. The page shows the picture too.
+    if args.write {
+        configuration::may_change(&args.config)?;
+    }
+    if !args.page {
+        may_save(&args.picture).map_err(|e| unsaved(args, &e)).or_exit(exit::BAD_INPUT)?;
+    }
     calibrate(args, config)
 }
 
@@ -281,12 +289,13 @@ fn best_picture(config: &Config, pictures: &[Mat]) -> Result<Mat, String> {
 }
 
 fn save_picture(args: &Args, config: &Config, pictures: &[Mat]) -> Result<(), Failure> {
-    let fail = |e: String| failure(exit::FAILED, format!("{}: {e}", args.picture.display()));
-    let picture = best_picture(config, pictures).map_err(fail)?;
-    if let Some(parent) = args.picture.parent() {
-        std::fs::create_dir_all(parent).map_err(|e| fail(e.to_string()))?;
-    }
-    save(&picture, &args.picture).map_err(|e| fail(format!("{e}; give another --picture")))
+    let picture = best_picture(config, pictures).map_err(|e| format!("{}: {e}", args.picture.display())).or_exit(exit::FAILED)?;
+    let made = args.picture.parent().map_or(Ok(()), |parent| std::fs::create_dir_all(parent).map_err(|e| e.to_string()));
+    made.and_then(|()| save(&picture, &args.picture)).map_err(|e| unsaved(args, &e)).or_exit(exit::FAILED)
+}
+
+fn unsaved(args: &Args, e: &str) -> String {
+    format!("{}: {e}; give another --picture", args.picture.display())
 }
 
 /// Serves the page on `port` until "Write" or Ctrl-C. `good` tells whether the configuration passed all checks; nothing else is written.

@@ -25,3 +25,9 @@ pub fn change(
     check(&checked).map_err(fail)?;
     whole_file::replace(&file, after.as_bytes(), b"").map_err(|e| fail(e.to_string()))
 }
+
+/// Whether [`change`] may put a file at `path`, so that it is known before long work.
+pub fn may_change(path: &Path) -> Result<(), Failure> {
+    let may = path.canonicalize().and_then(|file| whole_file::check(&file, b""));
+    may.map_err(|e| format!("{}: {e}", path.display())).or_exit(exit::BAD_INPUT)
+}

@@ -72,8 +72,8 @@ fn weighed_pours(read: &[Episode], trained_on: &[TrainingEpisode]) -> Vec<Weighe
 
 /// Runs the command.
 pub fn run(args: &Args) -> Result<(), Failure> {
-    let mut read = args.source.read().or_exit(exit::BAD_INPUT)?;
     args.weight_file.check()?;
+    let mut read = args.source.read().or_exit(exit::BAD_INPUT)?;
     if let Some(name) = args.leave_out.iter().chain(&args.accept).find(|name| !read.iter().any(|e| e.name == **name)) {
         let what = format!("no episode of these is called {name}: give the name that `trainer check` shows");
         return Err(failure(exit::BAD_INPUT, what));

@@ -42,6 +42,8 @@ fn wanted(name: &str) -> String {
 
 /// Runs the command.
 pub fn run(args: &Args) -> Result<(), Failure> {
+    let unwritten = |e: std::io::Error| format!("{}: {e}", args.out.display());
+    whole_file::check(&args.out, HTML).map_err(unwritten).or_exit(exit::BAD_INPUT)?;
     let mut files = Vec::new();
     for file in &args.files {
         let name = file.display().to_string();
@@ -50,5 +52,5 @@ pub fn run(args: &Args) -> Result<(), Failure> {
         files.push((name, value));
     }
     let html = report::build(&files).or_exit(exit::BAD_INPUT)?;
-    whole_file::replace(&args.out, html.as_bytes(), HTML).map_err(|e| format!("{}: {e}", args.out.display())).or_exit(exit::FAILED)
+    whole_file::replace(&args.out, html.as_bytes(), HTML).map_err(unwritten).or_exit(exit::FAILED)
 }

@@ -164,7 +164,7 @@ impl WeightFileArgs {
         name.into()
     }
 
-    /// Refuses, before the work, names that other files have: a weight file replaces nothing but a weight file.
+    /// Refuses, before the work, places where no file can be made and names that other files have: a weight file replaces nothing but a weight file.
     pub fn check(&self) -> Result<(), Failure> {
         Weights::may_write(&self.out).or_exit(exit::BAD_INPUT)?;
         let beside = self.beside();
