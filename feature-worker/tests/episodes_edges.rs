@@ -75,6 +75,43 @@ fn a_clock_that_went_back_makes_nothing_old() {
     }
 }
 
+/// Protects who tries again after an export of nothing: no directory that it made stays, and one that was there does.
+#[test]
+fn an_export_of_nothing_leaves_no_directory() {
+    let dir = tempfile::tempdir().unwrap();
+    let file = write(dir.path(), 1, true);
+    let own = dir.path().join("own");
+    std::fs::create_dir(&own).unwrap();
+    for format in ["images", "video", "lerobot"] {
+        for to in [&dir.path().join("new/deeper"), &own] {
+            let output = episodes(&["export", file.to_str().unwrap(), "--as", format, "--to", to.to_str().unwrap()]);
+            let said = text(&output.stderr);
+            assert!(code(&output) == 2 && said.contains("no images"), "{format}: {said}");
+            assert!(!dir.path().join("new").exists() && own.read_dir().unwrap().count() == 0, "{format}, {}", to.display());
+        }
+    }
+}
+
+/// Protects who prunes a folder away from any cell: what the command line says in full needs no configuration. One that is named must be there.
+#[test]
+fn a_folder_is_pruned_without_a_configuration() {
+    let dir = tempfile::tempdir().unwrap();
+    let recorded = dir.path().join("recorded");
+    let files = [1, 2, 3].map(|number| write(&recorded, number, true));
+    let prune = |more: &[&str]| {
+        let mut command = Command::new(env!("CARGO_BIN_EXE_feature-worker"));
+        command.env_remove(shared::config::VARIABLE).current_dir(dir.path()).args(["episodes", "prune", "--yes"]).args(more);
+        code(&command.output().unwrap())
+    };
+    assert_eq!(prune(&["recorded"]), 2, "nobody says how much may stay");
+    assert_eq!(prune(&["--budget-episodes", "2"]), 2, "nobody says where");
+    assert_eq!(prune(&["recorded", "--budget-episodes", "2", "--config", "lab.toml"]), 2, "it is not there");
+    assert_eq!(files.each_ref().map(|file| file.exists()), [true; 3]);
+    assert_eq!(prune(&["recorded", "--budget-episodes", "2"]), 0);
+    assert_eq!(files.each_ref().map(|file| file.exists()), [false, true, true]);
+    assert_eq!(prune(&["recorded", "--budget-mb", "1000"]), 0);
+}
+
 /// Protects the newer recordings of a directory into which older ones were merged later: the number of a copy says nothing of its age.
 #[test]
 fn a_copy_is_as_old_as_its_original() {

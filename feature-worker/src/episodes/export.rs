@@ -59,7 +59,17 @@ pub fn export(files: &[PathBuf], format: ExportFormat, to: &Path) -> Result<Expo
     if episodes.is_empty() {
         return Err(nothing(&left_out));
     }
-    fs::create_dir_all(to).map_err(|e| disk_error(to, &e))?;
+    let made: Vec<&Path> = to.ancestors().filter(|directory| directory.symlink_metadata().is_err()).collect();
+    let exported = fs::create_dir_all(to).map_err(|e| disk_error(to, &e)).and_then(|()| write(episodes, left_out, format, to));
+    if exported.is_err() {
+        // The innermost one comes first. What holds something stays.
+        made.iter().for_each(|empty| drop(fs::remove_dir(empty)));
+    }
+    exported
+}
+
+/// Writes `episodes` into the directory `to`, as [`export`] says.
+fn write(episodes: Vec<(PathBuf, Episode)>, mut left_out: Vec<LeftOut>, format: ExportFormat, to: &Path) -> Result<Exported, ExportError> {
     if format == ExportFormat::Csv {
         let pair = [to.join("features.csv"), to.join("scale.csv")];
         let episodes: Vec<Episode> = episodes.into_iter().map(|(_, episode)| episode).collect();

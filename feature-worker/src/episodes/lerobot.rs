@@ -110,8 +110,9 @@ impl DataSet {
         let levels = match self.write_video(file, episode, &path, bar) {
             Ok(levels) => levels,
             Err(e) => {
-                // The file is ours: the directory was new.
+                // The file is ours: the directory was new. A directory with another video in it stays.
                 let _ = fs::remove_file(&path);
+                path.ancestors().skip(1).take_while(|directory| *directory != root).for_each(|empty| drop(fs::remove_dir(empty)));
                 return Err(e);
             }
         };

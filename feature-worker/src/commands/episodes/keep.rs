@@ -264,9 +264,12 @@ fn delete(args: &DeleteArgs) -> Result<(), Failure> {
 }
 
 fn prune(args: &PruneArgs) -> Result<(), Failure> {
+    let which = &args.which;
     let configured = match (args.budget_mb, args.budget_episodes) {
         (Some(_), Some(_)) => None,
-        _ => Some(Config::read(&args.which.config).or_exit(exit::BAD_INPUT)?.recording),
+        // The usual file need not be there for what is said in full: where, and how much.
+        (Some(_), _) | (_, Some(_)) if !which.paths.is_empty() && which.is_unconfigured() => None,
+        _ => Some(Config::read(&which.config).or_exit(exit::BAD_INPUT)?.recording),
     };
     let budget = Budget {
         bytes: args.budget_mb.or(configured.as_ref().map(|r| r.budget_mb)).unwrap_or(0).saturating_mul(MEGABYTE),

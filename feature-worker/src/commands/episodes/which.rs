@@ -1,6 +1,6 @@
 //! Which episodes a command of `feature-worker episodes` is about, and how it says what came of it. On the command's thread; allocates.
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use serde_json::Value;
 use shared::config::Config;
@@ -18,6 +18,13 @@ pub(super) struct WhichArgs {
     /// Print JSON.
     #[arg(long)]
     pub json: bool,
+}
+
+impl WhichArgs {
+    /// Whether nobody named a configuration, and none lies at the usual place.
+    pub fn is_unconfigured(&self) -> bool {
+        self.config == Path::new(shared::config::DEFAULT_FILE) && self.config.symlink_metadata().is_err()
+    }
 }
 
 /// The files that the arguments name.
