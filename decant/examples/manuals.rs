@@ -20,18 +20,19 @@ fn main() -> ExitCode {
 /// Writes the pages and completions of each program.
 fn write_all(directory: &Path) -> Result<(), Failure> {
     std::fs::create_dir_all(directory).or_exit(exit::FAILED)?;
-    let programs = [
-        ("decant", decant::cli::Cli::command()),
-        ("rt-controller", rt_controller::cli::Cli::command()),
-        ("feature-worker", feature_worker::cli::Cli::command()),
-        ("trainer", trainer::cli::Cli::command()),
-        ("operator-page", operator_page::cli::Cli::command()),
+    let mut programs = vec![
+        rt_controller::cli::Cli::command(),
+        feature_worker::cli::Cli::command(),
+        trainer::cli::Cli::command(),
+        operator_page::cli::Cli::command(),
     ];
-    for (name, command) in programs {
+    programs.push(decant::programs::with_commands(decant::cli::Cli::command(), &programs));
+    for command in programs {
         // A page a command: decant(1), rt-controller(1), rt-controller-pour(1) and so on.
-        let mut command: Command = command.name(name).bin_name(name);
+        let name = command.get_name().to_owned();
+        let mut command: Command = command.bin_name(&name);
         for shell in [Shell::Bash, Shell::Zsh, Shell::Fish] {
-            clap_complete::generate_to(shell, &mut command, name, directory).or_exit(exit::FAILED)?;
+            clap_complete::generate_to(shell, &mut command, &name, directory).or_exit(exit::FAILED)?;
         }
         clap_mangen::generate_to(command, directory).or_exit(exit::FAILED)?;
     }

@@ -40,6 +40,16 @@ pub fn help() -> String {
     format!("Commands of the other programs (`decant COMMAND --help` has more):\n{}\n\n{}", lines.join("\n"), shared::exit::HELP)
 }
 
+/// The command line `decant` with the commands of the other `programs` in it, for manual pages and completions. They are not in it when it is read,
+/// because each program reads its own.
+pub fn with_commands(decant: clap::Command, programs: &[clap::Command]) -> clap::Command {
+    let theirs = COMMANDS.iter().filter_map(|(name, program, command, _)| {
+        let program = programs.iter().find(|known| known.get_name() == *program)?;
+        Some(program.find_subcommand(command)?.clone().name(*name))
+    });
+    decant.subcommands(theirs).after_help(shared::exit::HELP)
+}
+
 /// Runs the command whose name is the first of `words`. Returns only when that fails.
 pub fn run(words: &[OsString]) -> Result<(), Failure> {
     let (name, rest) = words.split_first().ok_or_else(|| failure(BAD_INPUT, "give a command; `decant --help` lists them"))?;
@@ -50,4 +60,35 @@ pub fn run(words: &[OsString]) -> Result<(), Failure> {
     let beside = std::env::current_exe().ok().and_then(|own| Some(own.parent()?.join(program))).filter(|path| path.exists());
     let failed = Command::new(beside.unwrap_or_else(|| program.into())).arg(command).args(rest).exec();
     Err(failure(shared::exit::FAILED, format!("{program}: {failed}; it belongs beside decant")))
+}
+
+#[cfg(test)]
+mod tests {
+    use clap::CommandFactory as _;
+
+    use super::*;
+
+    /// Protects who types a command with the shell's help, or reads its manual page: every command of `decant` is there, as the program that has it takes it,
+    /// with what lies below.
+    #[test]
+    fn completions_and_manuals_know_every_command() {
+        let programs = [
+            rt_controller::cli::Cli::command(),
+            feature_worker::cli::Cli::command(),
+            trainer::cli::Cli::command(),
+            operator_page::cli::Cli::command(),
+        ];
+        let mut whole = with_commands(crate::cli::Cli::command(), &programs);
+        whole.build();
+        for (name, program, command, _) in COMMANDS {
+            let ours = whole.find_subcommand(name).unwrap_or_else(|| panic!("decant {name} is missing"));
+            let theirs = programs.iter().find(|p| p.get_name() == program).unwrap().find_subcommand(command).unwrap();
+            assert!(theirs.get_arguments().all(|arg| ours.get_arguments().any(|own| own.get_id() == arg.get_id())), "{name}");
+        }
+        assert!(whole.find_subcommand("doctor").is_some());
+        let mut bash = Vec::new();
+        clap_complete::generate(clap_complete::Shell::Bash, &mut whole, "decant", &mut bash);
+        let bash = String::from_utf8(bash).unwrap();
+        assert!(bash.contains("decant__subcmd__pour") && bash.contains("decant__subcmd__episodes__subcmd__export"), "{bash}");
+    }
 }

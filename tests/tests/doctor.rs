@@ -104,11 +104,17 @@ fn commands_are_those_of_the_programs() {
         let own = cell.program("decant").args([ours, "--help"]).output().expect("runs");
         let other = cell.program(name).args([theirs, "--help"]).output().expect("runs");
         assert_eq!(own.stdout, other.stdout, "{ours}");
+        let help = cell.program("decant").args(["help", ours]).output().expect("runs");
+        assert_eq!((help.status.code(), help.stdout), (Some(0), other.stdout), "help {ours}");
     }
+    let [help, own] = [["help", "doctor"], ["doctor", "--help"]].map(|words| cell.program("decant").args(words).output().expect("runs"));
+    assert!(help.status.success() && help.stdout == own.stdout, "decant's own commands too");
     let status = cell.command("decant", &["status"]);
     assert_eq!(status.status.code(), Some(i32::from(shared::exit::UNREACHABLE)));
-    let unknown = std::process::Command::new(program("decant")).arg("poor").output().expect("runs");
-    let said = String::from_utf8_lossy(&unknown.stderr);
-    assert_eq!((unknown.status.code(), said.lines().count()), (Some(2), 1), "{said}");
-    assert!(said.contains("'poor'"), "{said}");
+    for words in [&["poor"][..], &["help", "poor"]] {
+        let unknown = std::process::Command::new(program("decant")).args(words).output().expect("runs");
+        let said = String::from_utf8_lossy(&unknown.stderr);
+        assert_eq!((unknown.status.code(), said.lines().count()), (Some(2), 1), "{said}");
+        assert!(said.contains("'poor'"), "{said}");
+    }
 }
