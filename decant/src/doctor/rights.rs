@@ -111,9 +111,15 @@ fn remove_ipc(root: &Path) -> Vec<String> {
 
 fn priority(config: &Config, process: &Process) -> Finding {
     let wanted = config.controller.priority.max(config.worker.priority);
-    if config.controller.priority == 0 {
-        let advice = "set controller.priority to 80, and worker.priority to 70";
-        return Finding::yellow("real-time priority", "0 is configured", "anything that runs can delay the loop", advice);
+    let ordinary = match (config.controller.priority, config.worker.priority) {
+        (0, _) => Some(("controller.priority is 0", "anything that runs can delay the loop")),
+        (_, 0) => {
+            Some(("worker.priority is 0", "anything that runs can delay a measurement, and the loop then acts later or ends the pour"))
+        }
+        _ => None,
+    };
+    if let Some((is, means)) = ordinary {
+        return Finding::yellow("real-time priority", is, means, "set controller.priority to 80, and worker.priority to 70");
     }
     let who = &process.who;
     if process.may(CAP_SYS_NICE) {
@@ -165,6 +171,21 @@ mod tests {
     use shared::machine::Verdict;
 
     use super::*;
+
+    /// Protects a pour from ordinary scheduling that somebody left in the configuration: each of the two processes without a priority is named.
+    #[test]
+    fn each_process_without_priority_is_named() {
+        let text = include_str!("../../../config/cell.toml");
+        let judge = |from, to| {
+            let config = Config::parse(&text.replace(from, to), "cell.toml").unwrap();
+            priority(&config, &Process { directory: "/proc/self".into(), who: String::new() })
+        };
+        for (from, name) in [("priority = 80", "controller.priority"), ("priority = 70", "worker.priority")] {
+            let found = judge(from, "priority = 0");
+            assert!(found.verdict == Verdict::Yellow && found.is.contains(name), "{found:?}");
+        }
+        assert!(!judge("priority = 80", "priority = 81").is.contains("is 0"));
+    }
 
     /// Protects a cell that somebody runs by hand over a logout: it is yellow only where logind would delete its shared memory, and says how to keep it.
     #[test]
