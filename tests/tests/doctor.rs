@@ -65,6 +65,7 @@ fn the_doctor_names_what_is_wrong() {
         ("time-scaling=0.5", "speed", "red", "speed scaling 50 %"),
         ("time-scaling=1", "speed", "green", "100 %"),
         ("protective-stop", "state", "red", "protective"),
+        ("protective-stop", "dashboard", "red", "release it on the pendant"),
         ("unlock-protective-stop", "state", "green", "upright"),
         ("in-use=input_int_register_24", "registers", "red", "in use"),
         ("clear", "registers", "green", "free"),

@@ -11,9 +11,9 @@ use std::time::{Duration, Instant};
 use rt_controller::claim::{self, Running};
 use rt_controller::client::Client;
 use rt_controller::core::following;
-use rt_controller::link::{self, LinkError, LinkOptions, RobotState, health, payload};
+use rt_controller::link::{self, LinkError, LinkOptions, RobotState, hands, health, payload};
 use shared::config::Config;
-use shared::control::RobotLink;
+use shared::control::{EndReason, RobotLink};
 use shared::machine::Finding;
 use shared::runtime_dir::Place;
 
@@ -147,7 +147,9 @@ fn dashboard(address: IpAddr) -> Finding {
             // A CB3 knows no remote control, and says that it does not understand.
             let told = if remote.contains("could not understand") { "not known to this robot" } else { remote };
             let is = format!("{}, remote control: {told}", answers[..answers.len().saturating_sub(1)].join(", "));
-            if remote.eq_ignore_ascii_case("false") {
+            if let Some(reason) = hindrance(&answers) {
+                Finding::red("dashboard", is, reason.words(), hands::remedy(reason))
+            } else if remote.eq_ignore_ascii_case("false") {
                 let advice = "switch the pendant to remote control (its upper right corner)";
                 Finding::yellow("dashboard", is, "an e-Series robot in local control takes no program", advice)
             } else {
@@ -162,6 +164,18 @@ fn dashboard(address: IpAddr) -> Finding {
             let advice = "on a robot with PolyScope: enable the dashboard server (Settings > Security > Services)";
             Finding::yellow("dashboard", format!("port {DASHBOARD}: {e}"), "whether it is in remote control is not known", advice)
         }
+    }
+}
+
+/// Why the robot does not move, by the answers of its dashboard, if it does not. A CB3 knows no `safetystatus` before PolyScope 3.11, and says that it does
+/// not understand.
+fn hindrance(answers: &[String]) -> Option<EndReason> {
+    let told = |what| answers.iter().find_map(|answer| answer.strip_prefix(what));
+    match told("Safetystatus: ").unwrap_or("NORMAL") {
+        "NORMAL" | "REDUCED" => told("Robotmode: ").filter(|mode| *mode != "RUNNING").map(|_| EndReason::RobotNotRunning),
+        "PROTECTIVE_STOP" => Some(EndReason::ProtectiveStop),
+        "SYSTEM_EMERGENCY_STOP" | "ROBOT_EMERGENCY_STOP" => Some(EndReason::EmergencyStop),
+        _ => Some(EndReason::SafetyStop),
     }
 }
 
@@ -208,6 +222,25 @@ mod tests {
         let one = ports([Err("refused"), Ok(()), Err("timed out")]);
         assert_eq!((one.verdict, one.is.as_str()), (Verdict::Green, "30001 refused, 30002 open, 30003 timed out"));
         assert_eq!(ports([Err("refused"); 3]).verdict, Verdict::Red);
+    }
+
+    /// Protects who asks why nothing moves while a controller has the robot, or none can: what the dashboard says is judged too, and answers that are none are
+    /// not. The words are those of UR's manual.
+    #[test]
+    fn the_dashboard_is_believed() {
+        for (mode, safety, reason) in [
+            ("Robotmode: RUNNING", "Safetystatus: NORMAL", None),
+            ("Robotmode: RUNNING", "Safetystatus: REDUCED", None),
+            ("Robotmode: RUNNING", "could not understand: 'safetystatus'", None),
+            ("Robotmode: POWER_OFF", "could not understand: 'safetystatus'", Some(EndReason::RobotNotRunning)),
+            ("Robotmode: CONFIRM_SAFETY", "Safetystatus: NORMAL", Some(EndReason::RobotNotRunning)),
+            ("Robotmode: RUNNING", "Safetystatus: PROTECTIVE_STOP", Some(EndReason::ProtectiveStop)),
+            ("Robotmode: POWER_OFF", "Safetystatus: ROBOT_EMERGENCY_STOP", Some(EndReason::EmergencyStop)),
+            ("Robotmode: RUNNING", "Safetystatus: AUTOMATIC_MODE_SAFEGUARD_STOP", Some(EndReason::SafetyStop)),
+            ("Robotmode: IDLE", "Safetystatus: FAULT", Some(EndReason::SafetyStop)),
+        ] {
+            assert_eq!(hindrance(&[mode, safety, "true"].map(String::from)), reason, "{mode}, {safety}");
+        }
     }
 
     /// Protects the doctor from what else may listen at a robot's address: what hangs up without an answer is no dashboard that is in order, and what sends

@@ -64,7 +64,7 @@ impl Handover {
 }
 
 /// What the operator must do about a robot that may not be moved, for `reason`.
-pub(super) fn remedy(reason: EndReason) -> &'static str {
+pub fn remedy(reason: EndReason) -> &'static str {
     match reason {
         EndReason::ProtectiveStop => "find the cause, then release it on the pendant",
         EndReason::EmergencyStop => "release the emergency stop, then switch the robot on and release its brakes",
