@@ -17,6 +17,7 @@ use std::os::unix::fs::{DirBuilderExt, MetadataExt};
 use std::path::{Path, PathBuf};
 
 use crate::config::{CELL_NAME_RULE, CellConfig, is_cell_name};
+use crate::whole_file::may_make_in;
 
 /// Longest path of the directory, bytes. A socket's address holds 107, and iceoryx2 needs 57 of them: a slash, 16 of the prefix, up to 34
 /// digits and `.event`.
@@ -91,12 +92,6 @@ pub fn bases() -> Vec<PathBuf> {
     found
 }
 
-/// Whether this process may make files in `path`.
-fn may_write(path: &Path) -> bool {
-    let wanted = rustix::fs::Access::WRITE_OK | rustix::fs::Access::EXEC_OK;
-    rustix::fs::accessat(rustix::fs::CWD, path, wanted, rustix::fs::AtFlags::EACCESS).is_ok()
-}
-
 impl Place {
     /// Path of the cell's directory; nothing is made or checked.
     pub fn path(&self) -> PathBuf {
@@ -110,9 +105,9 @@ impl Place {
         let system = Path::new("/run/decant");
         let usable = |base: &Path| {
             base != system
-                || may_write(&base.join(&self.name))
-                || may_write(base)
-                || (own_uid() == 0 && !base.exists() && may_write(Path::new("/run")))
+                || may_make_in(&base.join(&self.name)).is_ok()
+                || may_make_in(base).is_ok()
+                || (own_uid() == 0 && !base.exists() && may_make_in(Path::new("/run")).is_ok())
         };
         let base = bases().into_iter().find(|b| usable(b)).unwrap_or_else(|| system.into());
         base.join(&self.name)
@@ -120,6 +115,16 @@ impl Place {
 
     /// The cell's directory, made if it is missing. Owner, kind and mode of it and of the one that it lies in are checked.
     pub fn directory(&self) -> Result<PathBuf, RuntimeDirError> {
+        self.checked(make)
+    }
+
+    /// What [`Place::directory`] would give; nothing is made.
+    pub fn check(&self) -> Result<PathBuf, RuntimeDirError> {
+        self.checked(can_be_made)
+    }
+
+    /// The cell's directory. `make` says whether a directory is there, and of one that is missing whether it can be made.
+    fn checked(&self, make: fn(&Path, u32) -> std::io::Result<bool>) -> Result<PathBuf, RuntimeDirError> {
         if !is_cell_name(&self.name) {
             return Err(RuntimeDirError::Name(self.name.clone()));
         }
@@ -129,23 +134,38 @@ impl Place {
             let what = format!("its path is longer than {PATH_MAX} bytes: shorten cell.name, or set a shorter cell.runtime_dir");
             return Err(wrong(&path, what));
         }
+        let is_there = |directory: &Path, mode| {
+            let unmade = |e| wrong(directory, format!("cannot be made: {e}; set cell.runtime_dir to a directory of your own"));
+            make(directory, mode).map_err(unmade)
+        };
         if let Some(base) = path.parent() {
-            let mode = if base == Path::new("/run/decant") { 0o755 } else { 0o700 };
-            make(base, mode).map_err(|e| wrong(base, e))?;
+            if !is_there(base, if base == Path::new("/run/decant") { 0o755 } else { 0o700 })? {
+                return Ok(path);
+            }
             check_base(base).map_err(|e| wrong(base, e))?;
         }
-        make(&path, 0o700).map_err(|e| wrong(&path, e))?;
-        check(&path).map_err(|e| wrong(&path, e))?;
+        if is_there(&path, 0o700)? {
+            check(&path).map_err(|e| wrong(&path, e))?;
+        }
         Ok(path)
     }
 }
 
 /// Makes the directory `path`, unless something is there.
-fn make(path: &Path, mode: u32) -> Result<(), String> {
+fn make(path: &Path, mode: u32) -> std::io::Result<bool> {
     match DirBuilder::new().mode(mode).create(path) {
-        Err(e) if path.symlink_metadata().is_err() => Err(format!("cannot be made: {e}; set cell.runtime_dir to a directory of your own")),
-        _ => Ok(()),
+        Err(e) if path.symlink_metadata().is_err() => Err(e),
+        _ => Ok(true),
     }
+}
+
+/// Whether something is at `path`. It is an error if nothing is and [`make`] would fail.
+fn can_be_made(path: &Path, _mode: u32) -> std::io::Result<bool> {
+    let is_there = path.symlink_metadata().is_ok();
+    if !is_there {
+        may_make_in(path.parent().unwrap_or(path))?;
+    }
+    Ok(is_there)
 }
 
 /// Checks the directory that the cell's directory lies in: nobody else may put another in its place. The error is one line.
@@ -178,7 +198,7 @@ fn check(path: &Path) -> Result<(), String> {
     if meta.mode() & TOO_OPEN != 0 {
         return Err(format!("is open to others (mode {:o}): chmod 0700, or 0750 for a group that may abort", meta.mode() & 0o7777));
     }
-    if !may_write(path) {
+    if may_make_in(path).is_err() {
         return Err("cannot be written by this user: set cell.runtime_dir to a directory that can".into());
     }
     Ok(())
@@ -190,8 +210,12 @@ mod tests {
 
     use super::*;
 
+    /// Why a directory below `base` is refused. A look from outside says the same.
     fn refusal(base: &Path) -> String {
-        Place { name: "x".into(), base: Some(base.into()) }.directory().expect_err("must be refused").to_string()
+        let place = Place { name: "x".into(), base: Some(base.into()) };
+        let looked = place.check().expect_err("must be refused");
+        assert_eq!(looked, place.directory().expect_err("must be refused"));
+        looked.to_string()
     }
 
     /// Protects the cell from others on the machine: a directory that somebody else prepared is refused, and the line says why.
@@ -201,6 +225,11 @@ mod tests {
         let (base, own) = (dir.path(), dir.path().join("x"));
         let mode = |path: &Path, mode| std::fs::set_permissions(path, std::fs::Permissions::from_mode(mode)).expect("ours");
         let place = Place { name: "x".into(), base: Some(base.into()) };
+        assert!(place.check().expect("can be made") == own && !own.exists(), "a look makes nothing");
+        let below = base.join("new");
+        let deeper = Place { name: "x".into(), base: Some(below.clone()) };
+        assert!(deeper.check().is_ok() && !below.exists(), "base and directory can be made");
+        assert!(refusal(&below.join("newer")).contains("cannot be made: No such file"));
         assert_eq!(place.directory().expect("usable"), own);
         assert_eq!(own.metadata().expect("made").mode() & 0o7777, 0o700);
         for (open, word) in [(0o755, "755"), (0o777, "777"), (0o720, "720")] {
@@ -223,6 +252,8 @@ mod tests {
         if own_uid() == 0 {
             std::os::unix::fs::chown(&own, Some(65534), None).expect("root may");
             assert!(refusal(base).contains("belongs to user 65534"));
+            std::os::unix::fs::chown(base, Some(65534), None).expect("root may");
+            assert!(refusal(base).contains("not to root or this user"));
         }
         let long = Place { name: "a-name-of-thirty-two-characters-x".chars().take(32).collect(), base: Some(base.join("somewhere/deep")) };
         assert!(long.directory().expect_err("too long").to_string().contains("longer than"));

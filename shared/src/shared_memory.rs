@@ -16,6 +16,7 @@ use std::sync::{Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
 use crate::runtime_dir::own_uid;
+use crate::whole_file::may_make_in;
 
 /// Where the system keeps shared memory.
 const SHM: &str = "/dev/shm";
@@ -57,11 +58,14 @@ fn failed(file: &Path, what: impl std::fmt::Display) -> SharedMemoryError {
     SharedMemoryError::File { file: file.display().to_string(), what: what.to_string() }
 }
 
-/// Checks that `bytes` more fit into `/dev/shm`.
+/// Checks that files can be made in `/dev/shm`, and that `bytes` more fit into it.
 pub fn check_space(bytes: u64) -> Result<(), SharedMemoryError> {
     let Ok(fs) = rustix::fs::statvfs(SHM) else {
         return Err(failed(Path::new(SHM), "is missing: mount a tmpfs there"));
     };
+    let unmade =
+        |e| format!("no file can be made there: {e}; it must be writable and have mode 1777 (mount -o remount,rw,mode=1777 /dev/shm)");
+    may_make_in(Path::new(SHM)).map_err(|e| failed(Path::new(SHM), unmade(e)))?;
     if fs.f_files > 0 && fs.f_favail < JOIN_FILES {
         return Err(failed(Path::new(SHM), "holds as many files as it may, whatever their size: delete those that fill it"));
     }

@@ -15,6 +15,7 @@ use shared::machine::Finding;
 use shared::plural::counted;
 use shared::runtime_dir::{Place, own_uid};
 use shared::shared_memory::{self, SharedMemoryError};
+use shared::whole_file::may_make_in;
 
 /// Room in `/dev/shm` for a cell with its frames, bytes. Chosen by hand: the cell of config/sim.toml uses about 9 MB, and a reader of
 /// frames 4 more.
@@ -49,13 +50,17 @@ pub fn look(file: &Path, config: &Config) -> Vec<Finding> {
     findings
 }
 
-/// Whether a controller of the cell runs.
+/// Whether a controller of the cell runs, and if not, whether its runtime files have a place.
 fn controller(config: &Config) -> Finding {
     let place = Place::from(&config.cell);
-    match claim::running_at(&place) {
-        Ok(Some(running)) => Finding::green("controller", format!("process {} runs ({})", running.pid, running.config.display())),
-        Ok(None) => Finding::green("controller", format!("none runs; its runtime files would be in {}", place.path().display())),
-        Err(why) => {
+    let running = claim::running_at(&place);
+    if let Ok(Some(running)) = running {
+        return Finding::green("controller", format!("process {} runs ({})", running.pid, running.config.display()));
+    }
+    match (place.check(), running) {
+        (Err(e), _) => Finding::red("controller", e.to_string(), "no program of the cell starts as this user", ""),
+        (Ok(directory), Ok(_)) => Finding::green("controller", format!("none runs; its runtime files would be in {}", directory.display())),
+        (Ok(_), Err(why)) => {
             let advice = "run this as the cell's own user or as root, and see docs/DEPLOYMENT.md for the mode of runtime directories";
             Finding::yellow("controller", why, "whether one runs is not known, and `abort` does not reach it from here", advice)
         }
@@ -186,8 +191,7 @@ fn writable(what: &str, directory: &Path) -> Result<(PathBuf, u64), Finding> {
         let is = format!("{} is no directory", there.display());
         return Err(Finding::red(what, is, "nothing can be written there", "remove it, or configure another place"));
     }
-    let access = rustix::fs::Access::WRITE_OK | rustix::fs::Access::EXEC_OK;
-    if let Err(e) = rustix::fs::accessat(rustix::fs::CWD, &there, access, rustix::fs::AtFlags::EACCESS) {
+    if let Err(e) = may_make_in(&there) {
         let advice = format!("give it to this user (user {}), or configure another place", own_uid());
         return Err(Finding::red(what, format!("{}: {e}", there.display()), "nothing can be written there", advice));
     }

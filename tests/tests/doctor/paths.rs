@@ -1,6 +1,9 @@
 //! Paths of a configuration at which something lies that cannot be used.
 
-use tests::CellUnderTest;
+use std::os::unix::fs::PermissionsExt as _;
+use std::time::Duration;
+
+use tests::{CellUnderTest, Namespaces};
 
 use super::{examine, line};
 
@@ -33,4 +36,57 @@ fn what_cannot_be_used_is_not_green() {
         assert!(is == verdict && text.contains(words), "{key} = {value}: {is}: {text}");
         assert_eq!(code, Some(if verdict == "red" { 2 } else { 3 }), "{key} = {value}: no robot is there either");
     }
+}
+
+/// Protects who trusts a green line: a place for runtime files that the controller refuses at its start is red before, with the words of that refusal, and
+/// so is shared memory in which no file can be made. A look makes nothing.
+#[test]
+fn runtime_files_without_a_place_are_red() {
+    let mut cell = CellUnderTest::prepare(|_| {});
+    let config: toml::Table = std::fs::read_to_string(cell.config()).expect("just made").parse().expect("TOML");
+    let Some(inside) = Namespaces::new(Some("64m")) else { return };
+    let place = |name: &str| cell.dir.path().join(name);
+    let make = |name: &str, mode: u32| {
+        std::fs::create_dir(place(name)).expect("ours");
+        std::fs::set_permissions(place(name), std::fs::Permissions::from_mode(mode)).expect("ours");
+    };
+    make("open", 0o777);
+    make("good", 0o700);
+    make("others", 0o700);
+    std::os::unix::fs::chown(place("others"), Some(65534), None).expect("root may");
+    make("fixed", 0o700);
+    let mount = inside.command("mount").args(["-t", "tmpfs", "-o", "ro", "tmpfs"]).arg(place("fixed")).status().expect("it runs");
+    assert!(mount.success());
+    std::fs::write(place("file"), "mine").expect("ours");
+    cell.inside = Some(inside);
+    let places = [
+        ("good", ""),
+        ("new", ""),
+        ("new/newer", "cannot be made: No such file"),
+        ("open", "others may write there (mode 777)"),
+        ("others", "belongs to user 65534"),
+        ("fixed", "cannot be made: Read-only file system"),
+        ("file", "is no directory"),
+    ];
+    for (name, words) in places {
+        let mut changed = config.clone();
+        let base = cell.dir.path().join(name).display().to_string();
+        changed["cell"].as_table_mut().expect("a table").insert("runtime_dir".into(), base.into());
+        std::fs::write(cell.config(), toml::to_string(&changed).expect("still TOML")).expect("ours");
+        let (said, code) = examine(&cell);
+        let (is, text) = line(&said, "files", "controller");
+        assert!(is == if words.is_empty() { "green" } else { "red" } && text.contains(words), "{name}: {is}: {text}");
+        assert_eq!(code, Some(if is == "red" { 2 } else { 3 }), "{name}: no robot is there either");
+        if is == "red" {
+            cell.spawn("rt-controller");
+            assert!(cell.exit_code("rt-controller", Duration::from_secs(10)).is_some_and(|code| code > 0), "{name}");
+            assert!(cell.log("rt-controller").contains(words), "{name}: {}", cell.log("rt-controller"));
+        }
+    }
+    assert!(!cell.dir.path().join("new").exists(), "nothing is made");
+
+    let inside = cell.inside.as_ref().expect("there");
+    assert!(inside.command("mount").args(["-o", "remount,ro", "/dev/shm"]).status().expect("it runs").success());
+    let (is, text) = line(&examine(&cell).0, "files", "/dev/shm");
+    assert!(is == "red" && text.contains("remount,rw"), "{is}: {text}");
 }
