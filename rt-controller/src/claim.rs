@@ -15,7 +15,7 @@ use shared::config_paths::is_same;
 use shared::regular_file;
 use shared::runtime_dir::{Place, own_uid};
 
-use crate::journal::before;
+use crate::journal_files::before;
 
 /// Largest file `controller`, bytes: five paths of the longest length, and room for what JSON writes longer.
 const FILE_MAX: u64 = 32 * 1024;

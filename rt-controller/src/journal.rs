@@ -4,14 +4,13 @@
 //! and replay. Both allocate. A file that was cut off is read up to its last whole entry, and ticks that could not be told are counted; every other
 //! fault is a [`JournalError`].
 //!
-//! The file begins with the 8 bytes `decantj7`. Then come the entries: a little-endian u32 with the length, and that many bytes of
+//! The file begins with the 8 bytes `decantj8`. Then come the entries: a little-endian u32 with the length, and that many bytes of
 //! postcard.
 
 use std::collections::BTreeMap;
-use std::fs::{File, OpenOptions};
-use std::io::{BufReader, BufWriter, ErrorKind, Read, Seek, SeekFrom, Write};
-use std::os::unix::fs::OpenOptionsExt as _;
-use std::path::{Path, PathBuf};
+use std::fs::File;
+use std::io::{BufReader, BufWriter, ErrorKind, Read, Write};
+use std::path::Path;
 
 use serde::{Deserialize, Serialize};
 use shared::agent::Agent;
@@ -20,20 +19,13 @@ use shared::regular_file;
 use shared::weights::Weights;
 
 use crate::core::{Core, Input, MAX_FEATURES, Order, Robot, Settings};
+use crate::journal_files::{MAGIC, make_room};
 use crate::pacing::Pacer;
 
-/// The first bytes of a journal, which include its version.
-const MAGIC: &[u8; 8] = b"decantj8";
 /// Longest entry, bytes: more than ten weight files, which are the largest entries.
 const ENTRY_MAX: usize = 128 * 1024;
 /// Size at which a journal ends and the next part begins, bytes: about 20 h of ticks. Chosen by hand: it is copied and read in a minute.
 const FILE_MAX: u64 = 256 << 20;
-/// Size of all journals that are kept beside the one being written, bytes. Chosen by hand: about three days of ticks.
-const KEPT_BYTES: u64 = 1 << 30;
-/// Number of journals that are kept beside the one being written. Chosen by hand: so many starts do not lose a crash.
-const KEPT: u32 = 20;
-/// The first byte of an entry that is a tick: postcard numbers the kinds of [`Entry`] in their order.
-const TICK: u8 = 2;
 /// Number of ticks at the beginning of a later part, and behind a gap, that are not compared: as many as the core remembers ([`crate::core`]).
 const UNKNOWN_TICKS: u64 = 64;
 
@@ -172,49 +164,6 @@ impl Writer {
     }
 }
 
-/// Moves the journals at `path` and beside it one place on, deletes what is beyond the budget, and makes the new file, locked.
-fn make_room(path: &Path) -> std::io::Result<File> {
-    if let Some(parent) = path.parent() {
-        std::fs::create_dir_all(parent)?;
-    }
-    let mut held = if path.symlink_metadata().is_ok() { Some(check_is_journal(path)?) } else { None };
-    if let Some(empty) = held.take_if(|file| !has_ticks(file)) {
-        // Nothing happened in it, as in one that could not be written for want of space: it takes no other's place.
-        std::fs::remove_file(path)?;
-        drop(empty);
-    }
-    if let Some(held) = held {
-        let there = (1..=KEPT).map(|n| before(path, n)).take_while(|p| p.symlink_metadata().is_ok()).collect::<Vec<_>>();
-        let lengths = there.iter().map(|p| check_is_journal(p).and_then(|f| Ok(f.metadata()?.len()))).collect::<Result<Vec<u64>, _>>()?;
-        // The newest come first; the one that has just ended counts too.
-        let mut sum = held.metadata()?.len();
-        let fits = lengths.iter().take_while(|len| {
-            sum += **len;
-            sum <= KEPT_BYTES
-        });
-        let kept = fits.count().min(KEPT as usize - 1);
-        for old in &there[kept..] {
-            std::fs::remove_file(old)?;
-        }
-        for n in (0..kept).rev() {
-            std::fs::rename(&there[n], before(path, n as u32 + 2))?;
-        }
-        // The journal of the run before is wanted most after that run has crashed.
-        std::fs::rename(path, before(path, 1))?;
-        drop(held);
-    }
-    // Who may read it could hold its lock, and keep the next controller from starting.
-    let file = OpenOptions::new().write(true).create_new(true).mode(0o600).open(path)?;
-    // Whoever looks meets the lock; a file system without locks has none to give.
-    let _ = file.try_lock();
-    Ok(file)
-}
-
-/// Where the `n`th journal before the one at `path` is kept, from 1.
-pub fn before(path: &Path, n: u32) -> PathBuf {
-    path.with_extension(if n == 1 { "before.bin".into() } else { format!("before-{n}.bin") })
-}
-
 impl<W: Write> Writer<W> {
     /// Starts a journal that goes to `to`.
     pub fn begin(to: W, settings: &Settings) -> std::io::Result<Self> {
@@ -274,58 +223,6 @@ impl<W: Write> Writer<W> {
         self.to.write_all(&(bytes.len() as u32).to_le_bytes())?;
         self.to.write_all(bytes)
     }
-}
-
-/// Checks that the file at `path` is a journal of any version, or empty, so that a new one may take its place. Gives it.
-pub fn check_place(path: &Path) -> std::io::Result<File> {
-    let (mut file, meta) = regular_file::open(path).map_err(|e| taken(path, &e.to_string()))?;
-    let mut magic = [0; MAGIC.len()];
-    let whole = file.read_exact(&mut magic).is_ok();
-    // A full disk may have cut the first bytes.
-    let there = if whole { MAGIC.len() - 1 } else { usize::try_from(meta.len()).unwrap_or(MAGIC.len()).min(MAGIC.len() - 1) };
-    if magic[..there] != MAGIC[..there] {
-        return Err(taken(path, "is no journal and is left as it is: choose another controller.journal"));
-    }
-    Ok(file)
-}
-
-/// The error of a `path` at which no journal can be begun.
-fn taken(path: &Path, what: &str) -> std::io::Error {
-    std::io::Error::new(ErrorKind::InvalidInput, format!("{} {what}", path.display()))
-}
-
-/// The same, and that nobody writes it. Gives it, locked.
-fn check_is_journal(path: &Path) -> std::io::Result<File> {
-    let file = check_place(path)?;
-    if let Err(std::fs::TryLockError::WouldBlock) = file.try_lock() {
-        return Err(taken(path, "is being written by another controller: choose another controller.journal"));
-    }
-    Ok(file)
-}
-
-/// Whether a journal has a tick. One of another version, or one that cannot be read, counts as if it had.
-fn has_ticks(file: &mut File) -> bool {
-    let mut look = || -> std::io::Result<bool> {
-        let mut start = [0; MAGIC.len()];
-        file.rewind()?;
-        match file.read_exact(&mut start) {
-            Ok(()) if &start == MAGIC => {}
-            Ok(()) => return Ok(true),
-            // Not even its first bytes were written.
-            Err(_) => return Ok(false),
-        }
-        let mut head = [0; 5];
-        // Each entry has its length, and begins with its kind; settings and some weights come before the first tick.
-        while file.read_exact(&mut head).is_ok() {
-            if head[4] == TICK {
-                return Ok(true);
-            }
-            let length = u32::from_le_bytes([head[0], head[1], head[2], head[3]]);
-            file.seek(SeekFrom::Current(i64::from(length) - 1))?;
-        }
-        Ok(false)
-    };
-    look().unwrap_or(true)
 }
 
 /// What a replay found.

@@ -15,6 +15,7 @@
 //! | [`stop_client`] | the clients' side of it | their own process |
 //! | [`claim`] | one controller in a cell, no file in two cells | ordinary |
 //! | [`journal`] | every tick's inputs, and their replay | ordinary |
+//! | [`journal_files`] | where journals lie, and what is left as it is there | ordinary |
 //! | [`foreseen`] | what can be said of a pour before it starts | their own process |
 //! | [`client`] | the clients' side of the service | their own process |
 //! | [`cli`] | the command line | their own process |
@@ -34,6 +35,7 @@ pub mod disk_note;
 pub mod exchange;
 pub mod foreseen;
 pub mod journal;
+pub mod journal_files;
 pub mod link;
 pub mod pacing;
 pub mod robot_thread;

@@ -7,7 +7,7 @@ use std::os::unix::fs::MetadataExt as _;
 use std::path::{Path, PathBuf};
 
 use feature_worker::episodes::folder::{Budget, Folder, LEAST_FREE, MEGABYTE, recorded_today};
-use rt_controller::{claim, disk};
+use rt_controller::{claim, disk, journal_files};
 use shared::config::Config;
 use shared::disk_space::free_bytes;
 use shared::framing::Framing;
@@ -40,7 +40,8 @@ pub fn look(file: &Path, config: &Config) -> Vec<Finding> {
     findings.push(shared_memory());
     findings.push(strangers());
     findings.push(weights(file, config));
-    findings.extend(config.controller.journal.as_deref().map(journal));
+    let runs = matches!(claim::running_at(&Place::from(&config.cell)), Ok(Some(_)));
+    findings.extend(config.controller.journal.as_deref().map(|file| journal(file, runs)));
     let folder = Folder::look(&config.recording.directory);
     findings.push(match writable("episodes", &config.recording.directory) {
         Ok((there, free)) => episodes(&there, free, folder, recorded_today(&config.recording.directory)),
@@ -200,12 +201,11 @@ fn writable(what: &str, directory: &Path) -> Result<(PathBuf, u64), Finding> {
     free_bytes(&there).ok_or_else(unknown).map(|free| (there, free))
 }
 
-/// Whether the controller can begin the journal at `file`, and how long the disk lasts for it.
-fn journal(file: &Path) -> Finding {
-    if file.symlink_metadata().is_ok()
-        && let Err(e) = rt_controller::journal::check_place(file)
-    {
-        return Finding::red("journal", e.to_string(), "the controller does not start", "remove it, or choose another controller.journal");
+/// Whether the controller can begin the journal at `file`, and how long the disk lasts for it. One that `runs` writes there already.
+fn journal(file: &Path, runs: bool) -> Finding {
+    if let Err(e) = journal_files::check(file, !runs) {
+        let advice = "give it to this user, remove it, end what writes it, or choose another controller.journal";
+        return Finding::red("journal", e.to_string(), "the controller does not start", advice);
     }
     let directory = file.parent().unwrap_or(file);
     let (there, free) = match writable("journal", directory) {

@@ -17,6 +17,10 @@ fn what_cannot_be_used_is_not_green() {
     std::fs::write(path("file"), "mine").expect("ours");
     std::fs::create_dir(path("directory")).expect("ours");
     std::os::unix::fs::symlink("nowhere", path("link")).expect("ours");
+    std::fs::create_dir(path("beside.before.bin")).expect("ours");
+    std::fs::create_dir_all(path("foreign/.last-number")).expect("ours");
+    let held = std::fs::File::create(path("held.bin")).expect("ours");
+    held.try_lock().expect("ours");
     for (section, key, value, what, verdict, words) in [
         ("recording", "directory", "file", "episodes", "red", "is no directory"),
         ("recording", "directory", "file/below", "episodes", "red", "is no directory"),
@@ -25,6 +29,8 @@ fn what_cannot_be_used_is_not_green() {
         ("controller", "journal", "directory", "journal", "red", "is not a regular file"),
         ("controller", "journal", "file", "journal", "red", "is no journal"),
         ("controller", "journal", "directory/new.bin", "journal", "green", "free"),
+        ("controller", "journal", "beside.bin", "journal", "red", "beside.before.bin is not a regular file"),
+        ("controller", "journal", "held.bin", "journal", "red", "is being written by another controller"),
         ("controller", "weights", "file/weights.bin", "weights", "red", "Not a directory"),
         ("controller", "weights", "directory/weights.bin", "weights", "yellow", "is not there"),
     ] {
