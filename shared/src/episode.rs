@@ -58,7 +58,7 @@ pub mod weigh;
 mod weight;
 pub mod write;
 
-pub use number::{by_number, number_of, take_number};
+pub use number::{by_number, check_number, number_of, take_number};
 pub use read::{EpisodeImage, EpisodeImages, began_at, each_once, find_episodes};
 pub use records::EpisodeError;
 pub use recover::recover;

@@ -10,6 +10,7 @@ use feature_worker::episodes::folder::{Budget, Folder, LEAST_FREE, MEGABYTE, rec
 use rt_controller::{claim, disk, journal_files};
 use shared::config::Config;
 use shared::disk_space::free_bytes;
+use shared::episode::check_number;
 use shared::framing::Framing;
 use shared::machine::Finding;
 use shared::plural::counted;
@@ -43,9 +44,13 @@ pub fn look(file: &Path, config: &Config) -> Vec<Finding> {
     let runs = matches!(claim::running_at(&Place::from(&config.cell)), Ok(Some(_)));
     findings.extend(config.controller.journal.as_deref().map(|file| journal(file, runs)));
     let folder = Folder::look(&config.recording.directory);
-    findings.push(match writable("episodes", &config.recording.directory) {
-        Ok((there, free)) => episodes(&there, free, folder, recorded_today(&config.recording.directory)),
-        Err(finding) => finding,
+    findings.push(match (writable("episodes", &config.recording.directory), check_number(&config.recording.directory)) {
+        (Err(finding), _) => finding,
+        (Ok((there, _)), Err(e)) => {
+            let advice = "look at .last-number there: give it to this user, or move it away if it is no file of Decant";
+            Finding::red("episodes", format!("{}: {e}", there.display()), "no episode gets a number, so no pour begins", advice)
+        }
+        (Ok((there, free)), Ok(())) => episodes(&there, free, folder, recorded_today(&config.recording.directory)),
     });
     findings.push(budget(Budget::of(&config.recording), folder));
     findings

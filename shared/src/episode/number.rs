@@ -9,7 +9,7 @@
 
 use std::cmp::Ordering;
 use std::fs::{File, OpenOptions, Permissions};
-use std::io::{Error, Read, Result, Seek, Write};
+use std::io::{Error, ErrorKind, Read, Result, Seek, Write};
 use std::os::unix::fs::{OpenOptionsExt, PermissionsExt};
 use std::path::Path;
 use std::time::{Duration, Instant};
@@ -26,31 +26,51 @@ pub(crate) const LARGEST: u64 = 999_999_999;
 /// Takes the next number in `directory`, which is made if it is missing. From then on the number is used.
 pub fn take_number(directory: &Path) -> Result<u64> {
     std::fs::create_dir_all(directory)?;
-    let flags = (rustix::fs::OFlags::NOFOLLOW | rustix::fs::OFlags::NONBLOCK).bits() as i32;
-    let path = directory.join(".last-number");
-    let open = OpenOptions::new().read(true).write(true).create(true).truncate(false).mode(0o600).custom_flags(flags).open(path);
-    let mut file = open.map_err(|e| Error::new(e.kind(), format!(".last-number: {e}")))?;
-    if !file.metadata()?.is_file() {
-        return Err(Error::other(".last-number is no file: remove it"));
-    }
+    let mut file = open(directory, true)?;
     // Who may read it could hold its lock. One that is another user's stays as it is.
     let _ = file.set_permissions(Permissions::from_mode(0o600));
     // Root may take a number for the cell's user, whose file it then is.
     give_owner(&file, &std::fs::metadata(directory)?);
-    lock(&file)?;
-    let mut text = String::new();
-    (&file).take(32).read_to_string(&mut text)?;
-    let given: u64 = text.trim().parse().ok().filter(|n| *n <= LARGEST).unwrap_or(0);
-    let number = given.max(highest(directory, DEPTH)?) + 1;
-    if number > LARGEST {
-        return Err(Error::other("the numbers of its episodes are used up: look at .last-number and at the files' names"));
-    }
+    let number = next(&file, directory)?;
     // The number before is written over, and not taken away first: a disk that is full then leaves it.
     let text = format!("{number}\n");
     file.rewind()?;
     file.write_all(text.as_bytes())?;
     file.set_len(text.len() as u64)?;
     file.sync_data()?;
+    Ok(number)
+}
+
+/// Whether the memory of [`take_number`] in `directory` gives a number, if there is one; nothing is made or changed.
+pub fn check_number(directory: &Path) -> Result<()> {
+    match open(directory, false) {
+        Err(e) if e.kind() == ErrorKind::NotFound => Ok(()),
+        file => next(&file?, directory).map(|_| ()),
+    }
+}
+
+/// The file that remembers the last number.
+fn open(directory: &Path, create: bool) -> Result<File> {
+    let flags = (rustix::fs::OFlags::NOFOLLOW | rustix::fs::OFlags::NONBLOCK).bits() as i32;
+    let path = directory.join(".last-number");
+    let open = OpenOptions::new().read(true).write(true).create(create).truncate(false).mode(0o600).custom_flags(flags).open(path);
+    let file = open.map_err(|e| Error::new(e.kind(), format!(".last-number: {e}")))?;
+    if !file.metadata()?.is_file() {
+        return Err(Error::other(".last-number is no file: remove it"));
+    }
+    Ok(file)
+}
+
+/// The number behind the last one, by `file` and by what lies in `directory`. From then on `file` is locked.
+fn next(file: &File, directory: &Path) -> Result<u64> {
+    lock(file)?;
+    let mut text = Vec::new();
+    file.take(32).read_to_end(&mut text)?;
+    let given: u64 = String::from_utf8_lossy(&text).trim().parse().ok().filter(|n| *n <= LARGEST).unwrap_or(0);
+    let number = given.max(highest(directory, DEPTH)?) + 1;
+    if number > LARGEST {
+        return Err(Error::other("the numbers of its episodes are used up: look at .last-number and at the files' names"));
+    }
     Ok(number)
 }
 
@@ -133,13 +153,39 @@ mod tests {
         assert_eq!(take(), 27, "what was moved out of the directory is remembered");
         std::fs::remove_file(dir.path().join("new/.last-number")).expect("there");
         assert_eq!(take(), 21, "without its memory, what lies there decides");
-        std::fs::write(dir.path().join("new/.last-number"), b"nonsense").expect("writable");
+        std::fs::write(dir.path().join("new/.last-number"), b"nonsense, and no \xff text").expect("writable");
         put("episode-0030.mcap");
         assert_eq!(take(), 31);
         std::fs::write(dir.path().join("new/.last-number"), u64::MAX.to_string()).expect("writable");
         assert_eq!(take(), 31, "a number that cannot be is none");
         std::fs::write(dir.path().join("new/.last-number"), LARGEST.to_string()).expect("writable");
         assert!(take_number(&dir.path().join("new")).is_err(), "no number is given twice, and none beyond the largest");
+    }
+
+    /// Protects who trusts a look before a pour: it says what taking a number would say, and makes and changes nothing.
+    #[test]
+    fn a_look_says_what_taking_would() {
+        let dir = tempfile::tempdir().expect("a directory");
+        let file = dir.path().join(".last-number");
+        check_number(&dir.path().join("new")).expect("it can be made");
+        check_number(dir.path()).expect("nothing is there");
+        assert!(!file.exists());
+        assert_eq!(take_number(dir.path()).expect("writable"), 1);
+        check_number(dir.path()).expect("ours");
+        assert_eq!(std::fs::read(&file).expect("there"), b"1\n");
+        let same = |word: &str| {
+            let looked = check_number(dir.path()).expect_err("must be refused").to_string();
+            assert!(looked.contains(word), "{looked}");
+            assert_eq!(looked, take_number(dir.path()).expect_err("must be refused").to_string());
+        };
+        std::fs::write(&file, LARGEST.to_string()).expect("writable");
+        same("used up");
+        std::fs::remove_file(&file).expect("there");
+        std::os::unix::fs::symlink("elsewhere", &file).expect("a link");
+        same(".last-number: ");
+        std::fs::remove_file(&file).expect("there");
+        std::fs::create_dir(&file).expect("a directory");
+        same(".last-number: ");
     }
 
     /// Protects who looks for the newest episodes from the order of text, in which the ten thousandth comes before the second.

@@ -26,6 +26,7 @@ fn what_cannot_be_used_is_not_green() {
         ("recording", "directory", "file/below", "episodes", "red", "is no directory"),
         ("recording", "directory", "link/below", "episodes", "red", "is no directory"),
         ("recording", "directory", "directory/below", "episodes", "green", "0 episodes"),
+        ("recording", "directory", "foreign", "episodes", "red", ".last-number: Is a directory"),
         ("controller", "journal", "directory", "journal", "red", "is not a regular file"),
         ("controller", "journal", "file", "journal", "red", "is no journal"),
         ("controller", "journal", "directory/new.bin", "journal", "green", "free"),
