@@ -36,7 +36,7 @@ const FAR_OVER: f64 = 1.5;
 
 /// Looks at the cell's files.
 pub fn look(file: &Path, config: &Config) -> Vec<Finding> {
-    let mut findings = vec![Finding::green("configuration", format!("{}, cell '{}'", file.display(), config.cell.name))];
+    let mut findings = vec![configuration(file, &config.cell.name)];
     findings.push(controller(config));
     findings.push(shared_memory());
     findings.push(strangers());
@@ -54,6 +54,18 @@ pub fn look(file: &Path, config: &Config) -> Vec<Finding> {
     });
     findings.push(budget(Budget::of(&config.recording), folder));
     findings
+}
+
+/// Whether the cell that systemd's units know by the name of the configuration's `file` has that name.
+fn configuration(file: &Path, name: &str) -> Finding {
+    let is = format!("{}, cell '{name}'", file.display());
+    let unit = file.file_stem().unwrap_or_default().to_string_lossy();
+    let installed = std::path::absolute(file).is_ok_and(|path| path.parent() == Some(Path::new("/etc/decant")));
+    if !installed || unit == name {
+        return Finding::green("configuration", is);
+    }
+    let means = format!("decant-controller@{unit} keeps its runtime files in /run/decant/{unit}/{name}, where no command finds them");
+    Finding::red("configuration", is, &means, format!("set cell.name to \"{unit}\", or call the file {name}.toml"))
 }
 
 /// Whether a controller of the cell runs, and if not, whether its runtime files have a place.
@@ -223,5 +235,21 @@ fn journal(file: &Path, runs: bool) -> Finding {
         0..JOURNAL_HOUR_BYTES => Finding::red("journal", is, "the disk is full: nothing more is recorded", advice),
         free if free < JOURNAL_HOUR_BYTES * 24 * DAYS => Finding::yellow("journal", is, "the disk will be full soon", advice),
         _ => Finding::green("journal", is),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use shared::machine::Verdict;
+
+    use super::*;
+
+    /// Protects an installed cell whose file was copied and whose name was not changed: its units would run where no command looks.
+    #[test]
+    fn an_installed_cell_has_the_name_of_its_file() {
+        let judge = |file: &str, name| configuration(Path::new(file), name).verdict;
+        assert_eq!(judge("/etc/decant/lab.toml", "lab"), Verdict::Green);
+        assert_eq!(judge("/etc/decant/lab2.toml", "lab"), Verdict::Red);
+        assert_eq!(judge("config/cell.toml", "lab"), Verdict::Green, "no unit reads it");
     }
 }
