@@ -13,7 +13,7 @@
 //!    earlier picture, moved, does not explain.
 //! 4. [`lines`] finds the line from axis to axis with the best evidence, and [`water`] decides whether it is a stream.
 //! 5. The full picture's profiles across that line must confirm it ([`profile_edges`]).
-//! 6. What cannot be told is said by name: a lamp's reflection at the lip, ground that has changed there, and before a pattern light that
+//! 6. What cannot be told is said by name: a rim that is too faint for a line ([`faint`]), a lamp's reflection at the lip, ground that has changed there, and before a pattern light that
 //!    flickers or wanders and pictures that are missing again and again ([`disturbed`]).
 //!
 //! Until [`vouched`] has evidence that the remembered ground is dry, none is told. Called on the extraction thread. All pictures and tables are kept, so
@@ -22,6 +22,7 @@
 mod background;
 mod disturbed;
 mod evidence;
+mod faint;
 mod flicker;
 mod follow;
 mod light;
@@ -41,6 +42,7 @@ use shared::messages::{Doubt, PixelFormat};
 use self::background::{Background, DryPlaces, WetPlaces};
 use self::disturbed::Disturbed;
 use self::evidence::{CALM, Evidence};
+use self::faint::Faint;
 use self::flicker::Flicker;
 use self::light::Light;
 use self::lines::Lines;
@@ -94,11 +96,6 @@ const EVEN_LIP_CHANGED: f32 = 0.7;
 const BEAD_PX: f32 = 8.0;
 /// Legs of a bead's surroundings, px. Chosen by hand: as many samples as the bead itself.
 const BEAD_ROUND_PX: f32 = 13.0;
-/// Before an even ground, a faint band of this height may be a stream's rim, in units of the noise, and after one a lower one. Chosen by hand: dry pictures before a wall show at most 1.3
-/// on seed 101 of `evaluate-camera`, with and without `--faults`, and a rim that is 10 of 165 levels darker than the wall shows 1.7.
-const FAINT_NOISES: [f32; 2] = [1.6, 1.3];
-/// For so many pictures what may be a faint stream is not learned as ground. Chosen by hand: three seconds, after which no pour goes on.
-const FAINT_PICTURES: u32 = 90;
 /// How fast the share of pictures with an even ground grows and shrinks, a picture. Chosen by hand: dim boards look even in some pictures.
 const EVEN_FOLLOWS: [f32; 2] = [0.02, 0.1];
 /// The ground has a pattern below this share. Tuned on seed 101 of `evaluate-camera --faults`.
@@ -153,9 +150,7 @@ pub(crate) struct ClearWater {
     confirmed: u32,
     /// Share of the last stream's line on ground that was seen dry.
     known_share: f32,
-    /// Pictures in a row that show a faint band, and whether the present one is of the first of these, in which no ground is learned where a stream may be.
-    faint_pictures: u32,
-    faint: bool,
+    faint: Faint,
 }
 
 impl ClearWater {
@@ -198,8 +193,7 @@ impl ClearWater {
             unseen: u32::MAX,
             confirmed: 0,
             known_share: 0.0,
-            faint_pictures: 0,
-            faint: false,
+            faint: Faint::new(),
         }))
     }
 
@@ -228,7 +222,7 @@ impl ClearWater {
         let height_px = self.height_px();
         // The first picture is compared with nothing.
         let mut sighting = Sighting::Unsure(Doubt::EdgeNotFound);
-        self.faint = false;
+        self.faint.next_picture();
         let exposure = self.flicker.look(&self.now)?;
         if !self.background.is_new() {
             self.background.expect_gain(exposure);
@@ -269,7 +263,9 @@ impl ClearWater {
                 _ if self.lip_has_changed() => Sighting::Unsure(Doubt::EdgeNotFound),
                 (_, Some((found, ..))) if self.may_begin(&found) => Sighting::Unsure(Doubt::EdgeNotFound),
                 _ if self.is_too_dark() => Sighting::Unsure(Doubt::TooDark),
-                _ if self.shows_faint_band() => Sighting::Unsure(Doubt::EdgeNotFound),
+                _ if !self.is_pattern() && self.faint.sees(self.evidence.faint_band(&self.rays), self.pace) => {
+                    Sighting::Unsure(Doubt::EdgeNotFound)
+                }
                 _ if self.vouched.see_none(&self.evidence, &self.rays) => Sighting::Dry { confidence: 1.0 },
                 _ => sighting,
             };
@@ -323,15 +319,6 @@ impl ClearWater {
         self.is_pattern() && dry < LIP_KNOWN && found.score > MAY_BEGIN_SCORE && found.edge_share > MAY_BEGIN_EDGE
     }
 
-    /// Whether an even ground shows the rim of a stream that is too faint to be one.
-    fn shows_faint_band(&mut self) -> bool {
-        let least = FAINT_NOISES[usize::from(self.faint_pictures > 0)];
-        let shows = !self.is_pattern() && self.evidence.faint_band(&self.rays) >= least;
-        self.faint_pictures = if shows { self.faint_pictures + 1 } else { 0 };
-        self.faint = shows && self.faint_pictures <= self.pace.pictures(FAINT_PICTURES);
-        shows
-    }
-
     /// Takes what is dry over into the memory of the background, and chooses the picture with which the next ones are compared.
     #[inline(always)]
     fn remember(&mut self, height_px: LinearField) -> opencv::Result<()> {
@@ -339,7 +326,7 @@ impl ClearWater {
         let spared = recent
             .into_iter()
             .chain(self.held)
-            .chain(self.faint.then(|| self.lines.most_px()))
+            .chain(self.faint.may_flow().then(|| self.lines.most_px()))
             .reduce(|one, other| [0, 1].map(|k| one[k].max(other[k])));
         let near = spared.map(|legs_px| {
             let [a, b] = legs_px.map(|v| v.max(1.0));
@@ -351,7 +338,7 @@ impl ClearWater {
         });
         let dry = DryPlaces {
             height_px,
-            flows: self.water.flows() || self.held.is_some() || self.faint,
+            flows: self.water.flows() || self.held.is_some() || self.faint.may_flow(),
             near,
             calm: CALM * self.evidence.noise(),
         };

@@ -19,7 +19,7 @@ use shared::messages::{Doubt, PixelFormat};
 
 use super::coloured_edge;
 use super::confidence::Basis;
-use super::foreign::{self, FILLED, Seen};
+use super::foreign::{self, FILLED, LEARN_FROM_PX, Seen};
 use super::geometry::{Axes, Line, NEAR_PX, RAYS, RayGrid, distance};
 use super::grey::{COLOURED_FROM, is_grey};
 use super::ground_beside::{InGlass, Place, Square};
@@ -52,9 +52,6 @@ const LEAVES_SHARE: f32 = 0.06;
 const SMOOTH: i32 = 5;
 /// There is no line when a smaller share of the profiles than this shows an edge. Tuned.
 const PROFILES_LEAST: f32 = 0.3;
-/// The ground is learned from samples at least this far from the lip, px, once it was seen dry for [`DRY_FRAMES`]: nearer, a stream
-/// begins. Chosen by hand.
-pub(super) const LEARN_FROM_PX: f32 = 48.0;
 /// Frames without a stream after which the surroundings of the lip are known. Chosen by hand: a third of a second.
 const DRY_FRAMES: u32 = 10;
 /// In the first pictures, what lies beyond this share of a ray is ground. Chosen by hand: few streams reach further.

@@ -6,7 +6,6 @@
 use opencv::core::{Mat, Vec3b};
 use opencv::prelude::*;
 
-use super::coloured_liquid::LEARN_FROM_PX;
 use super::geometry::{NEAR_PX, RAYS, RayGrid};
 use super::ground_colours::{Ground, GroundColours, Mean};
 
@@ -18,6 +17,9 @@ const AT_LIP_PX: f32 = 12.0;
 const REFLECTION_PX: f32 = 16.0;
 /// A liquid in front of a lamp's reflection is brighter than this in all parts, close to the reflection's middle. Chosen by hand.
 const GLOW_LEVEL: u8 = 180;
+/// The ground is learned from samples at least this far from the lip, px, once it is known: nearer, a stream
+/// begins. Chosen by hand.
+pub(super) const LEARN_FROM_PX: f32 = 48.0;
 /// More background than this before the first liquid, or the first of a body, ends a ray, px. Tuned.
 const GAP_MOST_PX: f32 = 24.0;
 /// Least share of liquid, or of a body, between lip and edge on a ray that counts as filled. Tuned.
