@@ -2,6 +2,7 @@
 //!
 //! Used by offline commands on an ordinary thread; it allocates. Bad data is refused with one line that names the episode ([`DataError`]).
 
+use std::collections::BTreeMap;
 use std::path::PathBuf;
 
 use sha2::{Digest, Sha256};
@@ -55,6 +56,23 @@ pub enum DataError {
     None {
         /// Where they were looked for.
         places: String,
+    },
+    /// The episodes are those of several cells, and nobody has said which count.
+    #[error(
+        "the episodes come from several cells ({cells}), and another camera sees another area of the same stream: give --cell NAME, once for each cell \
+         whose episodes count"
+    )]
+    SeveralCells {
+        /// The cells, and an episode of each.
+        cells: String,
+    },
+    /// A cell was chosen of which there is no episode.
+    #[error("no episode of these comes from cell {cell}; the cells that they name: {cells}")]
+    NoSuchCell {
+        /// The cell.
+        cell: String,
+        /// The cells, and an episode of each.
+        cells: String,
     },
     /// One episode cannot be trained on.
     #[error("{name}: {what}")]
@@ -231,11 +249,14 @@ pub struct EpisodeSource {
     /// Table of weights (`episode, weight_g`); the episodes are then read from a table too.
     #[arg(long)]
     scale: Option<PathBuf>,
+    /// Cells whose episodes count, once for each; without it, all must come from one cell.
+    #[arg(long = "cell", value_name = "NAME")]
+    cells: Vec<String>,
 }
 
 impl EpisodeSource {
-    /// Reads the episodes. That they can be read is all that is checked here. Recordings come in the order in which they began, because the newest
-    /// ones count where something has changed; tables keep their order.
+    /// Reads the episodes. That they can be read and come from the chosen cells, or from one, is all that is checked here. Recordings come in the order in
+    /// which they began, because the newest ones count where something has changed; tables keep their order.
     pub fn read(&self) -> Result<Vec<Episode>, DataError> {
         let mut episodes = Vec::new();
         if let Some(scale) = &self.scale {
@@ -253,7 +274,29 @@ impl EpisodeSource {
             let places: Vec<String> = self.episodes.iter().map(|p| p.display().to_string()).collect();
             return Err(DataError::None { places: places.join(", ") });
         }
+        self.keep_cells(&mut episodes)?;
         Ok(episodes)
+    }
+
+    /// Keeps the episodes of the chosen cells. Where none is chosen, those that name their cell must name the same one: the episodes of two would be
+    /// explained by one camera, whose gain then is that of neither or of the newer ones. No majority decides, as it might be that of the wrong cell.
+    fn keep_cells(&self, episodes: &mut Vec<Episode>) -> Result<(), DataError> {
+        let mut named: BTreeMap<&str, Vec<&Episode>> = BTreeMap::new();
+        for e in episodes.iter().filter(|e| !e.info.cell.is_empty()) {
+            named.entry(&e.info.cell).or_default().push(e);
+        }
+        let cells: Vec<String> =
+            named.iter().map(|(cell, of)| format!("{cell}: {}, as {}", counted(of.len(), "episode"), of[0].name)).collect();
+        let cells = cells.join("; ");
+        if let Some(cell) = self.cells.iter().find(|cell| !named.contains_key(cell.as_str())) {
+            let cells = if named.is_empty() { "none".into() } else { cells };
+            return Err(DataError::NoSuchCell { cell: cell.clone(), cells });
+        }
+        if self.cells.is_empty() && named.len() > 1 {
+            return Err(DataError::SeveralCells { cells });
+        }
+        episodes.retain(|e| self.cells.is_empty() || self.cells.contains(&e.info.cell));
+        Ok(())
     }
 }
 

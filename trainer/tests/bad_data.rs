@@ -39,6 +39,7 @@ struct Recording {
     began: SystemTime,
     /// Width and height of the pictures, px.
     size_px: [u32; 2],
+    cell: &'static str,
 }
 
 /// Recordings as they should be.
@@ -61,6 +62,7 @@ fn recordings(n: usize) -> Vec<Recording> {
             poured_ml: 0.0,
             began: UNIX_EPOCH,
             size_px: [640, 480],
+            cell: "lab",
         }
     };
     common::episodes(n, 1).iter().map(recording).collect()
@@ -69,6 +71,7 @@ fn recordings(n: usize) -> Vec<Recording> {
 fn write(directory: &Path, recording: &Recording) -> PathBuf {
     let mut config = Config::read(&Path::new(env!("CARGO_MANIFEST_DIR")).join("../config/sim.toml")).unwrap();
     [config.camera.width_px, config.camera.height_px] = recording.size_px;
+    config.cell.name = recording.cell.into();
     let curve = EpisodeKind::Recording(Curve { lambda_deg: 60.0, gamma_per_s2: 0.3, beta_s: 5.0 });
     let kind = recording.goal_ml.map_or(curve, |goal_ml| EpisodeKind::Pour { goal_ml });
     let start = EpisodeStart { episode: 1, kind, started_at_ns: FRAME_NS, wall_clock: recording.began, config: &config, weights: "" };
@@ -344,4 +347,36 @@ fn a_training_says_what_is_doubtful_about_a_recording() {
             "{said}"
         );
     }
+}
+
+/// Protects the calibration from a mixture of two cells whose pictures are alike: no command takes them for one, and each cell is named. Those of a chosen
+/// cell are what they would be alone.
+#[test]
+fn episodes_of_several_cells_are_refused_unless_they_are_chosen() {
+    let dir = tempfile::tempdir().unwrap();
+    let run = |args: &[&str]| {
+        let out = Command::new(env!("CARGO_BIN_EXE_trainer")).current_dir(dir.path()).args(args).output().unwrap();
+        (out.status.code(), said(&out))
+    };
+    let weights = || std::fs::read(dir.path().join("w.bin")).unwrap();
+    let mut all = recordings(7);
+    let (lab, mut others) = (all.drain(..4).collect::<Vec<_>>(), all);
+    lab.iter().for_each(|r| drop(write(dir.path(), r)));
+    assert_eq!(run(&["train", ".", "--out", "w.bin"]).0, Some(0));
+    let alone = weights();
+    others.iter_mut().for_each(|r| r.cell = "other");
+    others.iter().for_each(|r| drop(write(dir.path(), r)));
+    std::fs::remove_file(dir.path().join("w.bin")).unwrap();
+    for args in [&["train", ".", "--out", "w.bin"][..], &["refine", ".", "--out", "w.bin"], &["check", "."], &["plan", ".", "--holds", "500"]] {
+        let (code, said) = run(args);
+        let named = ["lab: 4 episodes, as ./episode-0001.mcap", "other: 3 episodes, as ./episode-0005.mcap", "--cell NAME"];
+        assert!(code == Some(2) && named.iter().all(|words| said.contains(words)), "{args:?}: {said}");
+    }
+    assert!(!dir.path().join("w.bin").exists());
+    assert_eq!(run(&["train", ".", "--cell", "lab", "--out", "w.bin"]).0, Some(0));
+    assert!(weights() == alone);
+    let (code, said) = run(&["check", ".", "--cell", "lab", "--cell", "other"]);
+    assert!(code == Some(0) && said.contains("7 episodes, 7 usable"), "{said}");
+    let (code, said) = run(&["train", ".", "--cell", "third", "--out", "w.bin"]);
+    assert!(code == Some(2) && said.contains("no episode of these comes from cell third; the cells that they name: lab: 4"), "{said}");
 }
