@@ -10,10 +10,11 @@
 
 use serde::Serialize;
 use shared::estimator::flow::FlowTables;
+use shared::plural::counted;
 
 use crate::calibration::{self, EXPONENT_SD, EXPONENTS};
 use crate::data::{self, TrainingEpisode};
-use crate::fit::Fit;
+use crate::fit::{Changed, Fit};
 use crate::teaching::foresight::LAST_DEG;
 
 /// So many episodes calibrate each other, the exponent included. Chosen by hand; no measurement is recorded.
@@ -65,9 +66,30 @@ impl std::fmt::Display for DoubtfulWeight {
     }
 }
 
+/// What is doubtful about all episodes together once they are fitted: their weights ([`against_vessel`]), and a camera whose gain has changed. `fit` is made
+/// of the same episodes.
+pub fn doubts_of_set(episodes: &[TrainingEpisode], fit: &Fit, holds_ml: Option<f64>) -> Vec<(String, String)> {
+    against_vessel(episodes, fit, holds_ml).into_iter().chain(changed_camera(episodes, fit)).collect()
+}
+
+/// That the camera's gain has changed along the episodes, if it has: the older ones then teach nothing of it, and a change that nobody knows of is that of
+/// another camera, or of one that was moved while its framing stayed.
+fn changed_camera(episodes: &[TrainingEpisode], fit: &Fit) -> Option<(String, String)> {
+    let Changed { episodes_before, before, after, error } = fit.changed_gain?;
+    let what = format!(
+        "the camera's gain changed by {:+.1} % +- {:.1} % with {}, and only the newest gain counts: if camera, light or liquid were changed there, train \
+         without the {} before it; if not, look at the camera and the weights",
+        100.0 * ((after - before).exp() - 1.0),
+        100.0 * error,
+        episodes.get(episodes_before)?.name,
+        counted(episodes_before, "episode")
+    );
+    Some((DATA_SET.to_owned(), what))
+}
+
 /// What all weights together say against grams, and against the vessel that holds `holds_ml` up to its lip, if somebody knows that: weights that are all
-/// wrong by one factor do not contradict each other. `fit` is made of the same episodes. Each line comes with the episode's name, or [`DATA_SET`].
-pub fn against_vessel(episodes: &[TrainingEpisode], fit: &Fit, holds_ml: Option<f64>) -> Vec<(String, String)> {
+/// wrong by one factor do not contradict each other. Each line comes with the episode's name, or [`DATA_SET`].
+fn against_vessel(episodes: &[TrainingEpisode], fit: &Fit, holds_ml: Option<f64>) -> Vec<(String, String)> {
     let mut doubts = Vec::new();
     let set = |what: String| (DATA_SET.to_owned(), what);
     let heaviest_g = episodes.iter().map(|e| e.weight_g).fold(0.0, f64::max);

@@ -47,7 +47,7 @@ mod unknowns;
 
 use doubts::Doubt;
 use fitted::Fitted;
-use noise::{CHANGE_NEEDS, Changed, FrameNoise};
+use noise::{CHANGE_NEEDS, FrameNoise};
 use prepared::{PreparedEpisode, Stage};
 use priors::{HeldCalibration, Priors, VesselPrior};
 use problem::{Effort, Problem};
@@ -57,6 +57,7 @@ use unknowns::{
     SHARED, TAPER, Unknowns,
 };
 
+pub use noise::Changed;
 pub use unknowns::moved;
 
 /// A calibration v = c area that meets the weights this well (rms, g) is right: the scale cannot tell it from a perfect one. See
@@ -138,6 +139,8 @@ pub struct Fit {
     pub calibration_covariance: [[f64; 2]; 2],
     /// Share of zeros within the flow.
     pub dropouts: f64,
+    /// How the camera's gain (log) has changed between the episodes, if it has: only the newest gain counts then.
+    pub changed_gain: Option<Changed>,
 }
 
 /// What the episodes say about the camera before anything is fitted.
@@ -224,6 +227,7 @@ pub fn fit(episodes: &[TrainingEpisode]) -> Fit {
         episodes: &prepared,
         camera: &camera,
         robot: tilts.robot,
+        changed_gain: changes.gain,
         tempered: &tempered,
         wide: &wide,
         tight: &tight,
@@ -309,6 +313,8 @@ struct Conclusion<'a> {
     camera: &'a CameraFacts,
     /// How the measured tilt follows the commanded one.
     robot: Option<Lateness>,
+    /// The change of the camera's gain that was known before the last stages.
+    changed_gain: Option<Changed>,
     /// The first stage of the vessel of any shape.
     tempered: &'a Fitted,
     wide: &'a Fitted,
@@ -376,6 +382,10 @@ impl Conclusion<'_> {
             covariance: likelier.covariance.view((0, 0), (SHARED, SHARED)).into_owned(),
             calibration_covariance: covariance,
             dropouts: self.camera.noise.dropouts,
+            // Each place that takes the newest gain alone is a change.
+            changed_gain: self.changed_gain.or_else(|| {
+                [self.wide, self.tight].into_iter().find_map(|fitted| noise::changed_gain(&fitted.found.of_episodes(CAMERA_GAIN)))
+            }),
         }
     }
 

@@ -71,7 +71,7 @@ pub fn check(episodes: &[Episode], holds_ml: Option<f64>) -> Findings {
     let mut doubts = doubtful_recordings(episodes, &usable);
     doubts.extend(consistency::doubtful(&usable.episodes).into_iter().map(|d| (d.name.clone(), d.to_string())));
     if !usable.episodes.is_empty() {
-        doubts.extend(consistency::against_vessel(&usable.episodes, &fit::fit(&usable.episodes), holds_ml));
+        doubts.extend(consistency::doubts_of_set(&usable.episodes, &fit::fit(&usable.episodes), holds_ml));
     }
     doubts.extend(set_doubts(&usable.episodes));
     let spanned = gaps::spanned(&usable.episodes, &calibration::calibrate(&usable.episodes, None));

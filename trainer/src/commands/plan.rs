@@ -121,12 +121,12 @@ fn doubts(usable: &UsableEpisodes, holds_ml: Option<f64>) -> Result<Vec<String>,
         return Ok(Vec::new());
     }
     let of_weights = consistency::doubtful(&usable.episodes).into_iter().map(|d| (d.name.clone(), d.to_string()));
-    let of_vessel = consistency::against_vessel(&usable.episodes, &fit::fit(&usable.episodes), holds_ml);
-    if let Some((name, what)) = of_vessel.iter().find(|(name, _)| name != consistency::DATA_SET) {
+    let of_set = consistency::doubts_of_set(&usable.episodes, &fit::fit(&usable.episodes), holds_ml);
+    if let Some((name, what)) = of_set.iter().find(|(name, _)| name != consistency::DATA_SET) {
         return Err(failure(exit::BAD_INPUT, format!("{name}: {what} Correct the weight, or what the vessel holds")));
     }
     let words = |(name, what): (String, String)| if what.starts_with(&name) { what } else { format!("{name}: {what}") };
-    Ok(of_weights.chain(of_vessel).map(words).collect())
+    Ok(of_weights.chain(of_set).map(words).collect())
 }
 
 /// What to weigh next after the usable episodes.

@@ -200,7 +200,7 @@ impl WeightFileArgs {
         let trained = method::train(&usable.episodes, options, progress).or_exit(exit::BAD_INPUT)?;
         bar.0.finish_and_clear();
         let seconds = begin.elapsed().as_secs_f64();
-        for (name, what) in trained.fit.iter().flat_map(|fit| consistency::against_vessel(&usable.episodes, fit, holds_ml)) {
+        for (name, what) in trained.fit.iter().flat_map(|fit| consistency::doubts_of_set(&usable.episodes, fit, holds_ml)) {
             eprintln!("doubtful: {}", plain(&format!("{name}: {what}")));
         }
         if trained.fit.as_ref().is_some_and(|fit| fit.model.delay_frames >= DELAY_MAX_FRAMES - DELAY_NEAR_FRAMES) {

@@ -59,6 +59,8 @@ pub struct Changed {
     pub before: f64,
     /// Mean of the values of those after it.
     pub after: f64,
+    /// Standard error of the difference.
+    pub error: f64,
 }
 
 impl Changed {
@@ -93,9 +95,10 @@ fn changed(values: &[f64], sd_min: f64) -> Option<Changed> {
         let mean = |g: &[f64]| g.iter().sum::<f64>() / g.len() as f64;
         let spread = |g: &[f64]| g.iter().map(|x| (x - mean(g)).powi(2)).sum::<f64>();
         let sd = ((spread(before) + spread(after)) / (n - 2) as f64).sqrt().max(sd_min);
-        let errors = (mean(after) - mean(before)).abs() / (sd * (1.0 / before.len() as f64 + 1.0 / after.len() as f64).sqrt());
+        let error = sd * (1.0 / before.len() as f64 + 1.0 / after.len() as f64).sqrt();
+        let errors = (mean(after) - mean(before)).abs() / error;
         if errors > most_errors {
-            (most_errors, found) = (errors, Some(Changed { episodes_before: k, before: mean(before), after: mean(after) }));
+            (most_errors, found) = (errors, Some(Changed { episodes_before: k, before: mean(before), after: mean(after), error }));
         }
     }
     found
