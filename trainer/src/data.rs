@@ -10,12 +10,17 @@ use shared::episode::{self, Episode};
 use shared::framing::Framing;
 use shared::plural::counted;
 
+use crate::servo;
+
 /// Fewer frames than this are no whole curve: one second at 30 frames a second.
 const FRAMES_MIN: usize = 30;
 /// Frames a second that a camera may have: times in ms or us are far from it. Chosen by hand: half and twice what the controller allows.
 const RATES_HZ: std::ops::RangeInclusive<f64> = 1.0..=240.0;
 /// A larger angle is none that a joint turns to, degrees: a UR5's joints turn by a whole turn either way.
 const ANGLE_MAX_DEG: f64 = 360.0;
+/// A measured tilt that is further off the commanded one than this, at the best delay and lag, does not follow it, root mean square, degrees. Chosen by
+/// hand: a joint that the controller lets pour stays within 2 degrees of where its commands were (`TOLERANCE_DEG` of the controller).
+const FOLLOWS_DEG: f64 = 3.0;
 /// Weights of one measurement that are further apart are two weights, g: a kitchen scale shows whole grams.
 const WEIGHTS_APART_G: f64 = 0.5;
 /// Frame rates that are further apart than this are different ones, Hz. Chosen by hand; no measurement is recorded.
@@ -183,7 +188,13 @@ impl TrainingEpisode {
         if !self.area_px2.iter().any(|a| *a > 0.0) {
             return Some(format!("no stream was ever seen, but the scale shows {} g: check the vision or the weight", self.weight_g));
         }
-        None
+        let off_deg = servo::off_deg((&self.alpha_deg, &self.alpha_measured_deg), self.rate_hz);
+        (off_deg > FOLLOWS_DEG).then(|| {
+            format!(
+                "the measured tilt follows the commanded one at no delay, and is off by {off_deg:.0} degrees (rms): alpha_measured_deg is in degrees, with \
+                 the sign, the zero and the times of alpha_deg; of a recording, look at the joint"
+            )
+        })
     }
 
     fn from_episode(e: &Episode) -> Self {

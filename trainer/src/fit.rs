@@ -15,7 +15,6 @@
 //! | file | what it holds |
 //! |---|---|
 //! | `tilts` | the tilt of each episode, measured or commanded |
-//! | `servo` | how the joint follows its commands, where it was measured |
 //! | `unknowns` | the unknowns in a row, and the model that they stand for |
 //! | `prepared` | an episode made ready, and its residuals |
 //! | `priors` | what is known before any episode |
@@ -41,7 +40,6 @@ mod noise;
 mod prepared;
 mod priors;
 mod problem;
-mod servo;
 mod tilts;
 mod unknowns;
 

@@ -6,6 +6,7 @@
 //! | [`consistency`] | weights that do not fit the others |
 //! | [`calibration`] | area to ml, from the weights alone |
 //! | [`fit`] | the flow model, fitted to the episodes |
+//! | [`servo`] | how the joint follows its commands, where it was measured |
 //! | [`allowed_actions`], [`network`] | the network's actions, and its training |
 //! | [`training`], [`method`] | what a training is told and gives, and the methods |
 //! | [`teaching`] | what episodes teach and leave open, and what to record next |
@@ -23,5 +24,6 @@ pub mod fit;
 pub mod method;
 pub mod network;
 pub mod report;
+pub mod servo;
 pub mod teaching;
 pub mod training;

@@ -356,3 +356,27 @@ fn what_is_proposed_is_taken() {
     let out = trainer(dir.path(), &[&plan[..], &["--goal-max", "400"]].concat());
     assert!(out.status.code() == Some(2) && text(&out.stderr).contains("is above controller.goal_max_ml, 300"), "{}", text(&out.stderr));
 }
+
+/// Protects the camera from an accusation that is the table's: an episode whose measured tilt is in radians is left out by name, and the others
+/// teach.
+#[test]
+fn a_measured_tilt_that_follows_nothing_is_left_out() {
+    let dir = tempfile::tempdir().unwrap();
+    tables(dir.path(), 5, |_, w| w);
+    let features = std::fs::read_to_string(dir.path().join("f.csv")).unwrap();
+    let measured: String = features
+        .lines()
+        .map(|l| match l.split(',').collect::<Vec<_>>()[..] {
+            ["5", _, _, alpha_deg, _] => format!("{l},{}\n", alpha_deg.parse::<f64>().unwrap().to_radians()),
+            [_, _, _, "alpha_deg", _] => format!("{l},alpha_measured_deg\n"),
+            [_, _, _, alpha_deg, _] => format!("{l},{alpha_deg}\n"),
+            _ => panic!("{l}"),
+        })
+        .collect();
+    std::fs::write(dir.path().join("m.csv"), measured).unwrap();
+    let words = "left out: 5: the measured tilt follows the commanded one at no delay";
+    let out = trainer(dir.path(), &["train", "m.csv", "--scale", "s.csv", "--out", "w.bin"]);
+    assert!(out.status.success() && text(&out.stderr).contains(words), "{}", text(&out.stderr));
+    let out = trainer(dir.path(), &["check", "m.csv", "--scale", "s.csv"]);
+    assert!(out.status.code() == Some(1) && text(&out.stdout).contains("5 episodes, 4 usable"), "{}", text(&out.stdout));
+}

@@ -305,13 +305,20 @@ fn a_wrong_weight_is_found_among_few() {
     assert!(wrong.is_empty(), "{}", wrong.join("\n"));
 }
 
+/// What is said of a joint that does not follow.
+const FOLLOWS: &str = "the measured tilt follows the commanded one at no delay, and is off by ";
+
 /// Protects the trainer from bad data: each fault is named in words, before any training.
 #[test]
 fn faults_are_named() {
     let good = episodes(1, 8).remove(0);
     assert_eq!(good.fault(), None);
+    let joint = |delay: usize| (0..good.len()).map(|k| good.alpha_deg[k.saturating_sub(delay)] - 0.3).collect();
+    for delay in [0, 4, 12] {
+        assert_eq!(TrainingEpisode { alpha_measured_deg: joint(delay), ..good.clone() }.fault(), None, "a joint that follows late");
+    }
     type Case = (&'static str, fn(&mut TrainingEpisode));
-    let cases: [Case; 9] = [
+    let cases: [Case; 13] = [
         ("no weight", |e| e.weight_g = f64::NAN),
         ("from 0 to 50000", |e| e.weight_g = -3.0),
         ("nothing was poured", |e| e.weight_g = 0.0),
@@ -320,6 +327,11 @@ fn faults_are_named() {
         ("time does not go forward", |e| e.t_s[5] = e.t_s[4]),
         ("not finite", |e| e.alpha_deg[3] = f64::INFINITY),
         ("is not a number >= 0", |e| e.area_px2[9] = -1.0),
+        // What people with tables of their own mistake: radians, the other sign, another zero, and the times of another clock.
+        (FOLLOWS, |e| e.alpha_measured_deg = e.alpha_deg.iter().map(|deg| deg.to_radians()).collect()),
+        (FOLLOWS, |e| e.alpha_measured_deg = e.alpha_deg.iter().map(|deg| -deg).collect()),
+        (FOLLOWS, |e| e.alpha_measured_deg = e.alpha_deg.iter().map(|deg| 90.0 - deg).collect()),
+        (FOLLOWS, |e| e.alpha_measured_deg = (0..e.len()).map(|k| e.alpha_deg[k.saturating_sub(60)]).collect()),
         ("at least 30", |e| *e = TrainingEpisode::empty("x", 30.0)),
     ];
     let mut wrong = Vec::new();

@@ -5,8 +5,8 @@
 
 use shared::estimator::flow::{CommandHistory, Lateness, delayed_deg, followed_deg, tilt_step_deg};
 
-use super::servo::Servo;
-use crate::data::TrainingEpisode;
+use crate::data::{self, TrainingEpisode};
+use crate::servo::Servo;
 
 /// Share of the frames whose measured tilt must be known. Chosen by hand: the first and last frames may come before or after the robot's states.
 const KNOWN_SHARE: f64 = 0.9;
@@ -21,7 +21,8 @@ pub struct Tilts {
 impl Tilts {
     /// The tilts of usable episodes.
     pub fn of(episodes: &[TrainingEpisode]) -> Self {
-        let Some(Servo { delay_frames, lag_frames }) = Servo::of(episodes) else {
+        let records: Vec<_> = episodes.iter().map(|e| (&e.alpha_deg[..], &e.alpha_measured_deg[..])).collect();
+        let Some(Servo { delay_frames, lag_frames }) = Servo::of(&records, data::rate_hz(episodes)) else {
             return Self { alpha_deg: episodes.iter().map(|e| e.alpha_deg.clone()).collect(), robot: None };
         };
         let robot = Lateness { lag_frames, delay_frames };
