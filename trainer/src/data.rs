@@ -320,7 +320,7 @@ pub struct UsableEpisodes {
     pub left_out: Vec<(String, String)>,
 }
 
-/// Keeps the episodes that can be trained on: complete, weighed and sound ones of one frame rate, whose stream the camera saw all the way, and each
+/// Keeps the episodes that can be trained on: complete, weighed and sound ones of one frame rate, whose stream the camera saw whole and all the way, and each
 /// measurement once.
 pub fn usable(episodes: &[Episode]) -> UsableEpisodes {
     let mut result = UsableEpisodes::default();
@@ -334,7 +334,7 @@ pub fn usable(episodes: &[Episode]) -> UsableEpisodes {
         } else if let Some((first, _)) = doubles.iter().find(|(first, later)| *later == k && episodes[*first].weight_g.is_some()) {
             Some(format!("the same measurement as {}: leave one of them out", episodes[*first].name))
         } else {
-            own.fault().or_else(|| e.part_unseen().then(|| episode::PART_UNSEEN.into()))
+            own.fault().or_else(|| e.part_unseen().then(|| episode::PART_UNSEEN.into())).or_else(|| e.cut_off())
         };
         match fault {
             Some(what) => result.left_out.push((e.name.clone(), what)),

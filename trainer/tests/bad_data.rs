@@ -117,6 +117,16 @@ fn blind(recording: &mut Recording, frames: usize) {
     recording.rows[from..from + frames].iter_mut().for_each(|row| row.doubt = Doubt::EdgeNotFound);
 }
 
+/// Lets the stream leave the region in the frames that `so` names by their area and the largest one.
+fn leaves(recording: &mut Recording, so: fn(f32, f32) -> bool) {
+    let largest_px2 = recording.rows.iter().map(|row| row.area_px2).fold(0.0, f32::max);
+    recording
+        .rows
+        .iter_mut()
+        .filter(|row| row.area_px2 > 0.0 && so(row.area_px2, largest_px2))
+        .for_each(|row| row.doubt = Doubt::LeavesRegion);
+}
+
 fn check(recordings: &[Recording]) -> Output {
     let dir = tempfile::tempdir().unwrap();
     for recording in recordings {
@@ -139,7 +149,7 @@ fn said(out: &Output) -> String {
 #[test]
 fn each_fault_of_a_recording_is_named() {
     type Case = (&'static str, i32, fn(&mut Recording));
-    let cases: [Case; 22] = [
+    let cases: [Case; 23] = [
         ("cannot be used: FILE: no weight", 1, |r| r.weight_g = None),
         ("cannot be used: FILE: weight 0 g: nothing was poured", 1, |r| r.weight_g = Some(0.0)),
         ("cannot be used: FILE: no stream was ever seen, but the scale shows", 1, |r| r.rows.iter_mut().for_each(|f| f.area_px2 = 0.0)),
@@ -163,10 +173,14 @@ fn each_fault_of_a_recording_is_named() {
             let mut k = 0;
             r.rows.retain(|_| (k += 1, k % 10 != 5).1);
         }),
-        ("% of the images are clipped, too dark or blown out", 1, |r| {
+        ("doubtful: FILE: 10 % of the images are too dark or blown out", 1, |r| {
             for (k, row) in r.rows.iter_mut().enumerate() {
-                row.doubt = if k % 10 == 5 { Doubt::LeavesRegion } else { row.doubt };
+                row.doubt = if k % 10 == 5 { Doubt::BlownOut } else { row.doubt };
             }
+        }),
+        // A few frames, in which the most flows.
+        ("cannot be used: FILE: 16 % of the stream's area were seen in pictures that it leaves", 1, |r| {
+            leaves(r, |area_px2, largest_px2| area_px2 > 0.9 * largest_px2)
         }),
         ("doubtful: FILE: the angle never returns", 1, |r| {
             let stays = r.rows.iter().map(|f| f.alpha_deg).fold(0.0, f32::max);
@@ -367,7 +381,9 @@ fn episodes_of_several_cells_are_refused_unless_they_are_chosen() {
     others.iter_mut().for_each(|r| r.cell = "other");
     others.iter().for_each(|r| drop(write(dir.path(), r)));
     std::fs::remove_file(dir.path().join("w.bin")).unwrap();
-    for args in [&["train", ".", "--out", "w.bin"][..], &["refine", ".", "--out", "w.bin"], &["check", "."], &["plan", ".", "--holds", "500"]] {
+    for args in
+        [&["train", ".", "--out", "w.bin"][..], &["refine", ".", "--out", "w.bin"], &["check", "."], &["plan", ".", "--holds", "500"]]
+    {
         let (code, said) = run(args);
         let named = ["lab: 4 episodes, as ./episode-0001.mcap", "other: 3 episodes, as ./episode-0005.mcap", "--cell NAME"];
         assert!(code == Some(2) && named.iter().all(|words| said.contains(words)), "{args:?}: {said}");
@@ -391,7 +407,9 @@ fn a_changed_gain_is_said() {
         let (before, mut after): (Vec<_>, Vec<_>) = recordings(10).into_iter().enumerate().partition(|(k, _)| k % 2 == 0);
         after.iter_mut().flat_map(|(_, r)| &mut r.rows).for_each(|row| row.area_px2 *= gain);
         before.iter().chain(&after).for_each(|(_, r)| drop(write(dir.path(), r)));
-        for args in [&["train", ".", "--out", "w.bin"][..], &["refine", ".", "--out", "w.bin"], &["check", "."], &["plan", ".", "--holds", "500"]] {
+        for args in
+            [&["train", ".", "--out", "w.bin"][..], &["refine", ".", "--out", "w.bin"], &["check", "."], &["plan", ".", "--holds", "500"]]
+        {
             let out = Command::new(env!("CARGO_BIN_EXE_trainer")).current_dir(dir.path()).args(args).output().unwrap();
             let said = said(&out);
             let line = said.lines().find(|l| l.starts_with("doubtful: data set: the camera's gain changed by +"));
@@ -399,4 +417,15 @@ fn a_changed_gain_is_said() {
             assert!(out.status.success() && line.is_some() == says && named == says, "{args:?}: {said}");
         }
     }
+}
+
+/// Protects recordings of which only drops were seen at the region's edge: many frames with next to no area cost nothing.
+#[test]
+fn drops_that_leave_the_region_cost_nothing() {
+    let mut all = recordings(6);
+    leaves(&mut all[5], |area_px2, largest_px2| area_px2 < 0.05 * largest_px2);
+    let doubtful = all[5].rows.iter().filter(|row| row.doubt == Doubt::LeavesRegion).count();
+    let flowing = all[5].rows.iter().filter(|row| row.area_px2 > 0.0).count();
+    let out = check(&all);
+    assert!(10 * doubtful > flowing && out.status.success(), "{doubtful}: {}", said(&out));
 }

@@ -48,6 +48,7 @@ pub fn remarks(episode: &Episode) -> Vec<Remark> {
     if episode.part_unseen() {
         all.push(Remark::wrong(PART_UNSEEN));
     }
+    all.extend(episode.cut_off().map(Remark::wrong));
     if info.lost_frames > 0 {
         let runs = episode.rows.chunk_by(|a, b| a.lost == b.lost);
         let longest = runs.filter(|run| run[0].lost).map(<[EpisodeRow]>::len).max().unwrap_or(0);

@@ -22,7 +22,7 @@ use crate::teaching::gaps::{self, Spanned};
 const UPRIGHT_DEG: f32 = 5.0;
 /// No container flows below this tilt, degrees. Chosen by hand: a beaker that is full to its lip spills on the way to the robot.
 const FLOWS_FROM_DEG: f32 = 2.0;
-/// More than this share of lost or clipped frames is worth a line. Chosen by hand; no measurement is recorded.
+/// More than this share of lost or unseen frames is worth a line. Chosen by hand; no measurement is recorded.
 const SHARE_MAX: f64 = 0.05;
 
 /// Method `paper` needs at least this many episodes. From the prototype's figures for 5 and 10 episodes.
@@ -95,12 +95,12 @@ fn recording_doubts(e: &Episode) -> Vec<String> {
     if lost > SHARE_MAX {
         doubt(format!("{:.0} % of the frames were lost: check the camera's connection and the load of the machine", 100.0 * lost));
     }
-    let clipped = share(|row| matches!(row.doubt, Doubt::LeavesRegion | Doubt::BlownOut | Doubt::TooDark));
-    if clipped > SHARE_MAX {
-        doubt(format!("{:.0} % of the images are clipped, too dark or blown out: check exposure and [image] region_px", 100.0 * clipped));
+    let badly_lit = share(|row| matches!(row.doubt, Doubt::BlownOut | Doubt::TooDark));
+    if badly_lit > SHARE_MAX {
+        doubt(format!("{:.0} % of the images are too dark or blown out: check the exposure", 100.0 * badly_lit));
     }
     let unseen = share(|row| !row.lost && !row.area_px2.is_finite());
-    if unseen > SHARE_MAX && clipped <= SHARE_MAX {
+    if unseen > SHARE_MAX && badly_lit <= SHARE_MAX {
         doubt(format!(
             "{:.0} % of the images were not measured: `feature-worker episodes list` says why, and docs/FAQ.md what to do",
             100.0 * unseen
