@@ -61,6 +61,21 @@ impl Framing {
         named().unwrap_or_default()
     }
 
+    /// The framing as a table has it: [`Framing::numbers`]; `None` if the text is no framing.
+    pub fn of_numbers(text: &str) -> Option<Self> {
+        let numbers: Vec<&str> = text.split_whitespace().collect();
+        let [width, height, x, y, x_deg, y_deg] = numbers[..] else { return None };
+        let size_px = [width.parse().ok()?, height.parse().ok()?];
+        let framing = Self { size_px, lip_px: [x.parse().ok()?, y.parse().ok()?], axes_deg: [x_deg.parse().ok()?, y_deg.parse().ok()?] };
+        (framing.is_finite() && !size_px.contains(&0)).then_some(framing)
+    }
+
+    /// Its six numbers in a row, each to the last bit; empty if it is not known.
+    pub fn numbers(&self) -> String {
+        let ([width, height], [x, y], [x_deg, y_deg]) = (self.size_px, self.lip_px, self.axes_deg);
+        if self.is_known() { format!("{width} {height} {x} {y} {x_deg} {y_deg}") } else { String::new() }
+    }
+
     /// Whether it is known at all.
     pub fn is_known(&self) -> bool {
         self.size_px != [0, 0]
@@ -166,6 +181,17 @@ mod tests {
         assert_eq!(Framing::of_toml(include_str!("../../config/sim.toml")), Framing::new(&camera, &image));
         for text in ["", "[image]\nmethod = 1", "no TOML", "[camera]\nwidth_px = 640"] {
             assert!(!Framing::of_toml(text).is_known(), "{text}");
+        }
+    }
+
+    /// Protects the way through a table: a framing comes back to the last bit, and what is none is no framing.
+    #[test]
+    fn numbers_in_a_row_are_a_framing() {
+        let (camera, image) = cell();
+        let ours = Framing { lip_px: [215.37, 249.1], axes_deg: [0.03, -90.2], ..Framing::new(&camera, &image) };
+        assert_eq!((Framing::of_numbers(&ours.numbers()), Framing::default().numbers()), (Some(ours), String::new()));
+        for text in ["", "640 480 1 2 3", "640 480 1 2 3 4 5", "0 480 1 2 3 4", "-640 480 1 2 3 4", "640 480 nan 2 3 4", "a b c d e f"] {
+            assert_eq!(Framing::of_numbers(text), None, "{text}");
         }
     }
 

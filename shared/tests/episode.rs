@@ -465,6 +465,9 @@ fn faults_in_tables_are_named_with_file_and_line() {
         (features(good), "episode,weight_g\n1,5\n7,6\n", "scale.csv:3: episode 7 is not in"),
         (features(good), "episode,weight_g\n", "features.csv:2: episode 1 has no weight in"),
         (features(good), "episode,weight_g\n1,\n", "scale.csv:2: weight_g ''"),
+        (features(good), "episode,weight_g,framing\n1,5,640 480\n", "scale.csv:2: framing '640 480': six numbers are wanted"),
+        (HEADING.replace('\n', ",doubt\n1,0,0.0,0,0,gloomy\n"), scale, "features.csv:2: doubt 'gloomy': none, or"),
+        (HEADING.replace('\n', ",alpha_measured_deg\n1,0,0.0,0,0,inf\n"), scale, "features.csv:2: alpha_measured_deg 'inf'"),
     ] {
         let said = tables(&features, scale).err().unwrap_or_else(|| "nothing".into());
         if !said.starts_with(expected) || said.contains('\n') {
@@ -474,7 +477,8 @@ fn faults_in_tables_are_named_with_file_and_line() {
     assert!(wrong.is_empty(), "{wrong:#?}");
 }
 
-/// Protects people who take their episodes elsewhere and back: the tables hold the same measurement.
+/// Protects people who take their episodes elsewhere and back: the tables hold the same measurement, and say of which cell and pictures it is, and what is
+/// doubtful about it.
 #[test]
 fn a_table_written_from_an_episode_reads_as_the_same_measurement() {
     let dir = tempfile::tempdir().unwrap();
@@ -485,5 +489,10 @@ fn a_table_written_from_an_episode_reads_as_the_same_measurement() {
     write_table(std::slice::from_ref(&episode), &features, &scale).unwrap();
     let back = read_table(&features, &scale).unwrap();
     assert_eq!((back[0].content_sha256(), back[0].weight_g), (episode.content_sha256(), Some(42.5)));
+    assert!(episode.info.framing.is_known() && !episode.info.cell.is_empty());
+    assert_eq!((back[0].info.framing, &back[0].info.cell), (episode.info.framing, &episode.info.cell));
+    let doubts = |e: &Episode| e.rows.iter().map(|row| (row.doubt, row.lost)).collect::<Vec<_>>();
+    assert!(episode.rows.iter().any(|row| row.doubt != Doubt::None));
+    assert_eq!(doubts(&back[0]), doubts(&episode));
     assert!(write_table(&[episode], &features, &scale).is_err(), "a table that is there is not overwritten");
 }

@@ -1,9 +1,10 @@
-//! The CSV pair: `features.csv` (`episode, frame, t_s, alpha_deg, area_px2`, and `alpha_measured_deg` if the robot told it) and `scale.csv` (`episode, weight_g`), for people
+//! The CSV pair: `features.csv` (`episode, frame, t_s, alpha_deg, area_px2`) and `scale.csv` (`episode, weight_g`), for people
 //! who measure V_e with software of their own. It allocates and is for ordinary threads only. Each error is one line of text that names the
 //! file and the line in it.
 //!
 //! Columns are found by their names, and other columns are ignored. The rows of an episode stand together in order of `frame`. A frame
-//! number that is missing stands for a lost frame; so does an `area_px2` that is `nan` or empty.
+//! number that is missing stands for a lost frame; so does an `area_px2` that is `nan` or empty. What the columns say that need not be there is not known
+//! where they are missing or empty.
 
 use std::collections::BTreeMap;
 use std::fs::File;
@@ -12,15 +13,19 @@ use std::path::Path;
 use super::rows::{EpisodeRow, LostFrames, alpha_between_deg};
 use super::weight::{WeightError, check_poured};
 use super::{Episode, EpisodeInfo, EpisodeKind};
+use crate::framing::Framing;
 use crate::messages::Doubt;
 use crate::{regular_file, whole_file};
 
 /// The columns of the table of features. Their names are part of the format.
 const FEATURE_COLUMNS: [&str; 5] = ["episode", "frame", "t_s", "alpha_deg", "area_px2"];
-/// The column that need not be there: the joint's measured angle, degrees; `nan` or empty where the robot did not tell it.
-const MEASURED_COLUMN: &str = "alpha_measured_deg";
+/// The columns of it that need not be there: the joint's measured angle, degrees, which may be `nan`, and why the area is doubtful, in the words of
+/// [`Doubt::words`].
+const FEATURE_MORE: [&str; 2] = ["alpha_measured_deg", "doubt"];
 /// The columns of the table of weights. Their names are part of the format.
 const SCALE_COLUMNS: [&str; 2] = ["episode", "weight_g"];
+/// The columns of it that need not be there: the cell's name, and how the lip lay in the pictures ([`Framing::numbers`]).
+const SCALE_MORE: [&str; 2] = ["cell", "framing"];
 
 /// Largest table that is read, bytes. Chosen by hand: ten hours of frames take 50 MB.
 const FILE_MAX: u64 = 256 << 20;
@@ -54,8 +59,8 @@ struct CsvTable {
     reader: csv::Reader<File>,
     /// Where each wanted column stands in a row.
     columns: Vec<usize>,
-    /// Where the column stands that need not be there.
-    measured: Option<usize>,
+    /// Where each column stands that need not be there.
+    more: [Option<usize>; 2],
 }
 
 /// One row, reduced to the wanted columns.
@@ -63,8 +68,8 @@ struct CsvRow<'a> {
     file: &'a str,
     line: u64,
     fields: Vec<&'a str>,
-    /// The column that need not be there; empty where it is not.
-    measured: &'a str,
+    /// The columns that need not be there; empty where they are not.
+    more: [&'a str; 2],
 }
 
 impl CsvRow<'_> {
@@ -79,7 +84,7 @@ impl CsvRow<'_> {
 }
 
 impl CsvTable {
-    fn open(path: &Path, wanted: &[&str]) -> Result<Self, TableError> {
+    fn open(path: &Path, wanted: &[&str], more: [&str; 2]) -> Result<Self, TableError> {
         let name = path.display().to_string();
         let fail = |what: String| TableError::File { file: name.clone(), what };
         let (file, _) = regular_file::open_at_most(path, FILE_MAX).map_err(|e| fail(e.to_string()))?;
@@ -99,8 +104,8 @@ impl CsvTable {
             };
             return Err(TableError::Row { file: name, line: 1, what });
         }
-        let measured = heading.iter().position(|column| column == MEASURED_COLUMN);
-        Ok(Self { name, reader, columns, measured })
+        let more = more.map(|wanted| heading.iter().position(|column| column == wanted));
+        Ok(Self { name, reader, columns, more })
     }
 
     /// Shows each row to `take`.
@@ -113,8 +118,8 @@ impl CsvTable {
                     let line = record.position().map_or(0, csv::Position::line);
                     // The reader refuses rows of another length than the heading's, so every column is there.
                     let fields = self.columns.iter().map(|c| record.get(*c).unwrap_or("")).collect();
-                    let measured = self.measured.and_then(|c| record.get(c)).unwrap_or("");
-                    take(&CsvRow { file: &self.name, line, fields, measured })?;
+                    let more = self.more.map(|column| column.and_then(|c| record.get(c)).unwrap_or(""));
+                    take(&CsvRow { file: &self.name, line, fields, more })?;
                 }
                 Err(e) => {
                     let line = e.position().map_or(0, csv::Position::line);
@@ -149,7 +154,7 @@ fn read_features(features: &Path) -> Result<(Vec<Episode>, BTreeMap<String, u64>
     let mut episodes: Vec<Episode> = Vec::new();
     let mut first_line: BTreeMap<String, u64> = BTreeMap::new();
     let mut lost = LostFrames::default();
-    CsvTable::open(features, &FEATURE_COLUMNS)?.for_each_row(|row| {
+    CsvTable::open(features, &FEATURE_COLUMNS, FEATURE_MORE)?.for_each_row(|row| {
         let name = row.fields[0];
         if name.is_empty() {
             return Err(row.error("episode is empty: a name or number is wanted".into()));
@@ -184,17 +189,25 @@ fn read_features(features: &Path) -> Result<(Vec<Episode>, BTreeMap<String, u64>
 /// Enters the weights into the episodes that were read from `features`.
 fn read_weights(scale: &Path, features: &Path, episodes: &mut [Episode]) -> Result<(), TableError> {
     let mut weighed: BTreeMap<String, u64> = BTreeMap::new();
-    CsvTable::open(scale, &SCALE_COLUMNS)?.for_each_row(|row| {
+    CsvTable::open(scale, &SCALE_COLUMNS, SCALE_MORE)?.for_each_row(|row| {
         let (name, weight) = (row.fields[0], row.fields[1]);
         if let Some(line) = weighed.insert(name.into(), row.line) {
             return Err(row.error(format!("episode {name} has a weight in line {line} already")));
         }
         let weight_g = weight.parse().map_err(|_| WeightError::NotAReading).and_then(check_poured);
         let weight_g = weight_g.map_err(|e| row.error(format!("weight_g '{weight}': {e}")))?;
-        match episodes.iter_mut().find(|e| e.name == name) {
-            Some(episode) => episode.weight_g = Some(weight_g),
-            None => return Err(row.error(format!("episode {name} is not in {}", features.display()))),
+        let Some(episode) = episodes.iter_mut().find(|e| e.name == name) else {
+            return Err(row.error(format!("episode {name} is not in {}", features.display())));
+        };
+        let [cell, framing] = row.more;
+        if !framing.is_empty() {
+            episode.info.framing = Framing::of_numbers(framing).ok_or_else(|| {
+                row.error(format!(
+                    "framing '{framing}': six numbers are wanted: width, height and the lip's place, px, and the axes' directions, degrees"
+                ))
+            })?;
         }
+        (episode.weight_g, episode.info.cell) = (Some(weight_g), cell.into());
         Ok(())
     })
 }
@@ -211,14 +224,13 @@ fn add_row(rows: &mut Vec<EpisodeRow>, lost: &mut LostFrames, row: &CsvRow) -> R
     if area_px2.is_infinite() || area_px2 < 0.0 {
         return Err(row.error(format!("area_px2 '{}': at least 0 and finite is wanted, or nan for no measurement", row.fields[4])));
     }
-    let measured = row.measured;
-    let alpha_measured_deg: f32 = match measured {
-        "" => f32::NAN,
-        text => text.parse().map_err(|_| row.error(format!("{MEASURED_COLUMN} '{text}': degrees, or nan, are wanted")))?,
-    };
-    if alpha_measured_deg.is_infinite() {
-        return Err(row.error(format!("{MEASURED_COLUMN} '{measured}': degrees, or nan, are wanted")));
-    }
+    let [measured, doubt] = row.more;
+    let alpha_measured_deg =
+        if measured.is_empty() { Some(f32::NAN) } else { measured.parse::<f32>().ok().filter(|deg| !deg.is_infinite()) };
+    let alpha_measured_deg =
+        alpha_measured_deg.ok_or_else(|| row.error(format!("{} '{measured}': degrees, or nan, are wanted", FEATURE_MORE[0])))?;
+    let doubt = Doubt::ALL.into_iter().find(|d| d.words() == doubt || (doubt.is_empty() && *d == Doubt::None));
+    let doubt = doubt.ok_or_else(|| row.error(format!("doubt '{}': none, or the words for a doubt, are wanted", row.more[1])))?;
     if let Some(last) = rows.last().copied() {
         if sequence == last.sequence {
             return Err(row.error(format!("frame {sequence} is there twice")));
@@ -234,23 +246,23 @@ fn add_row(rows: &mut Vec<EpisodeRow>, lost: &mut LostFrames, row: &CsvRow) -> R
             // As the joint stood between two frames, it is taken to have moved evenly.
             let measured_between_deg = last.alpha_measured_deg + share as f32 * (alpha_measured_deg - last.alpha_measured_deg);
             let between_s = last.t_s + share * (t_s - last.t_s);
-            rows.push(episode_row(between, between_s, [alpha_between_deg, measured_between_deg], f32::NAN));
+            rows.push(episode_row(between, between_s, [alpha_between_deg, measured_between_deg], f32::NAN, Doubt::None));
         }
     }
-    rows.push(episode_row(sequence, t_s, [alpha_deg, alpha_measured_deg], area_px2));
+    rows.push(episode_row(sequence, t_s, [alpha_deg, alpha_measured_deg], area_px2, doubt));
     Ok(())
 }
 
-fn episode_row(sequence: u64, t_s: f64, [alpha_commanded_deg, alpha_measured_deg]: [f32; 2], area_px2: f32) -> EpisodeRow {
+fn episode_row(sequence: u64, t_s: f64, [alpha_commanded_deg, alpha_measured_deg]: [f32; 2], area_px2: f32, doubt: Doubt) -> EpisodeRow {
     EpisodeRow {
         sequence,
         captured_at_ns: 0,
         t_s,
         alpha_commanded_deg,
         alpha_measured_deg,
-        area_px2,
-        doubt: Doubt::None,
-        lost: area_px2.is_nan(),
+        area_px2: if doubt.usable(area_px2) { area_px2 } else { f32::NAN },
+        doubt,
+        lost: area_px2.is_nan() && doubt == Doubt::None,
         image: false,
     }
 }
@@ -266,17 +278,20 @@ pub fn write_table(episodes: &[Episode], features: &Path, scale: &Path) -> Resul
     let fail = |path: &Path, e: &dyn std::fmt::Display| TableError::File { file: path.display().to_string(), what: e.to_string() };
     let mut rows = csv::Writer::from_writer(Vec::new());
     let mut weights = csv::Writer::from_writer(Vec::new());
-    rows.write_record(FEATURE_COLUMNS.iter().chain([&MEASURED_COLUMN])).map_err(|e| fail(features, &e))?;
-    weights.write_record(SCALE_COLUMNS).map_err(|e| fail(scale, &e))?;
+    rows.write_record(FEATURE_COLUMNS.iter().chain(&FEATURE_MORE)).map_err(|e| fail(features, &e))?;
+    weights.write_record(SCALE_COLUMNS.iter().chain(&SCALE_MORE)).map_err(|e| fail(scale, &e))?;
     for (index, episode) in episodes.iter().enumerate() {
         let number = (index + 1).to_string();
         for r in &episode.rows {
-            let angles = [r.alpha_commanded_deg, r.alpha_measured_deg].map(number_or_nan);
-            rows.write_record([&number, &r.sequence.to_string(), &r.t_s.to_string(), &angles[0], &number_or_nan(r.area_px2), &angles[1]])
-                .map_err(|e| fail(features, &e))?;
+            let [alpha, measured, area] = [r.alpha_commanded_deg, r.alpha_measured_deg, r.area_px2].map(number_or_nan);
+            let row = [number.as_str(), &r.sequence.to_string(), &r.t_s.to_string(), &alpha, &area, &measured, r.doubt.words()];
+            rows.write_record(row).map_err(|e| fail(features, &e))?;
         }
         if let Some(weight_g) = episode.weight_g {
-            weights.write_record([number, weight_g.to_string()]).map_err(|e| fail(scale, &e))?;
+            let info = &episode.info;
+            weights
+                .write_record([number.as_str(), &weight_g.to_string(), &info.cell, &info.framing.numbers()])
+                .map_err(|e| fail(scale, &e))?;
         }
     }
     let (rows, weights) = (rows.into_inner().map_err(|e| fail(features, &e))?, weights.into_inner().map_err(|e| fail(scale, &e))?);
