@@ -26,6 +26,14 @@ const BEYOND_DEG: f64 = 10.0;
 /// A vessel whose size was learned may hold so many times more. Chosen by hand: sizes are learned within a tenth.
 const OVERFULL: f64 = 1.25;
 
+/// What is to be said before a pour with weights that do not know their pictures, which pour in any; `None` of others.
+pub fn pictures_line(weights: &Weights) -> Option<&'static str> {
+    weights.origin.pictures_unknown().then_some(
+        "note: the weights do not say on which pictures they were trained, as they come from tables without framing: where these are others, another volume \
+         is poured, and believed to be right",
+    )
+}
+
 /// The likelier explanation of the weights; none with the plain sum.
 fn explanation(weights: &Weights) -> Option<&Explanation> {
     match &weights.estimator {

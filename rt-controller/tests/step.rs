@@ -8,6 +8,9 @@ mod write_weights;
 use std::io::Write as _;
 use std::process::{Command, Output, Stdio};
 
+use shared::framing::Framing;
+use shared::weights::Weights;
+
 /// Runs the filter with weights that always tilt forward, on `areas`.
 fn step(areas: &str) -> Output {
     step_at("fps = 30.0", areas)
@@ -15,9 +18,14 @@ fn step(areas: &str) -> Output {
 
 /// The same in a cell whose configuration has the line `fps`.
 fn step_at(fps: &str, areas: &str) -> Output {
+    step_with(&write_weights::constant_action(3), fps, areas)
+}
+
+/// The same with other weights.
+fn step_with(weights_of: &Weights, fps: &str, areas: &str) -> Output {
     let directory = tempfile::tempdir().unwrap();
     let weights = directory.path().join("w.bin");
-    write_weights::constant_action(3).write(&weights).unwrap();
+    weights_of.write(&weights).unwrap();
     let config = directory.path().join("cell.toml");
     std::fs::write(&config, include_str!("../../config/sim.toml").replace("fps = 30.0", fps)).unwrap();
     let mut child = Command::new(env!("CARGO_BIN_EXE_rt-controller"))
@@ -74,6 +82,28 @@ fn weights_of_another_camera_are_refused() {
     let said = String::from_utf8_lossy(&output.stderr).trim().to_owned();
     assert_eq!(output.status.code(), Some(i32::from(shared::exit::BAD_INPUT)), "{said}");
     assert!(output.stdout.is_empty() && said.contains("trained at 30 frames/s, camera.fps is 60"), "{said}");
+}
+
+/// Protects who couples a simulator from weights of other pictures than the configuration names, in which an area may be another volume; and from taking
+/// weights that do not know their pictures for weights of these.
+#[test]
+fn weights_of_other_pictures_are_refused() {
+    let mut weights = write_weights::constant_action(3);
+    let step = |weights: &Weights| {
+        let output = step_with(weights, "fps = 30.0", "0\n");
+        (output.status.code(), String::from_utf8_lossy(&output.stderr).trim().to_owned(), output.stdout.is_empty())
+    };
+    assert_eq!(step(&weights), (Some(0), String::new(), false), "weights by hand are of no pictures");
+    weights.origin.episodes = 5;
+    let (code, said, _) = step(&weights);
+    assert!(code == Some(0) && said.starts_with("note: the weights do not say on which pictures they were trained"), "{said}");
+    let ours = Framing::of_toml(include_str!("../../config/sim.toml"));
+    weights.origin.framing = ours;
+    assert_eq!(step(&weights), (Some(0), String::new(), false));
+    weights.origin.framing.size_px = [960, 720];
+    let (code, said, silent) = step(&weights);
+    assert!(code == Some(i32::from(shared::exit::REFUSED)) && silent, "{said}");
+    assert!(said.contains("the weights were trained on pictures of 960 x 720 px and not of 640 x 480, as the cell has it"), "{said}");
 }
 
 /// Protects who couples a simulator from a pour that ended early and looks done: the reason is said, and the exit code is that of a pour that ended early.

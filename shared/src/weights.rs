@@ -112,6 +112,13 @@ pub struct Origin {
     pub framing: Framing,
 }
 
+impl Origin {
+    /// Whether the weights were trained on episodes of which nobody knows the pictures. Those that were made by hand were trained on none.
+    pub fn pictures_unknown(&self) -> bool {
+        self.episodes > 0 && !self.framing.is_known()
+    }
+}
+
 /// How a network was trained.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]

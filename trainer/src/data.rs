@@ -241,7 +241,8 @@ fn keep_one_framing(found: &mut UsableEpisodes) {
     });
 }
 
-/// How the lip lies in the pictures of a data set; not known if no episode says it.
+/// How the lip lies in the pictures of a data set: of the newest episode that says it, and not known if none does. Those that do not say it are named as
+/// doubtful.
 pub fn framing(episodes: &[TrainingEpisode]) -> Framing {
     episodes.iter().rev().map(|e| e.framing).find(Framing::is_known).unwrap_or_default()
 }

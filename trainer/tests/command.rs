@@ -380,3 +380,25 @@ fn a_measured_tilt_that_follows_nothing_is_left_out() {
     let out = trainer(dir.path(), &["check", "m.csv", "--scale", "s.csv"]);
     assert!(out.status.code() == Some(1) && text(&out.stdout).contains("5 episodes, 4 usable"), "{}", text(&out.stdout));
 }
+
+/// Protects weights from claiming pictures that not all of their episodes have: those that do not say theirs are named, and the weights keep to the ones that
+/// are known, as they would pour in any otherwise. Where none says them, nothing is claimed.
+#[test]
+fn an_episode_that_does_not_say_its_pictures_is_named() {
+    let dir = tempfile::tempdir().unwrap();
+    tables(dir.path(), 4, |_, w| w);
+    let scale = std::fs::read_to_string(dir.path().join("s.csv")).unwrap();
+    let framed = |k: usize| [",framing", ",640 480 320 100.5 0 90", ",640 480 320 100.5 0 90", ",", ",640 480 321 100.5 0 90"][k];
+    let mixed: String = scale.lines().enumerate().map(|(k, line)| format!("{line}{}\n", framed(k))).collect();
+    std::fs::write(dir.path().join("mixed.csv"), mixed).unwrap();
+    let words = "doubtful: 3: it does not say its pictures, and is taken to be of those of the others";
+    for (scale, named, pictures) in [("s.csv", false, "not known"), ("mixed.csv", true, "pictures of 640 x 480 px, the lip at (321, 10")] {
+        for command in [&["train", "--out", "w.bin"][..], &["refine", "--out", "w.bin"], &["check"]] {
+            let out = trainer(dir.path(), &[command, &["f.csv", "--scale", scale]].concat());
+            let said = text(&out.stdout) + &text(&out.stderr);
+            assert!(said.contains(words) == named && said.matches("does not say its pictures").count() == usize::from(named), "{said}");
+        }
+        let inspected = text(&trainer(dir.path(), &["inspect", "w.bin"]).stdout);
+        assert!(inspected.contains(&format!("pictures    {pictures}")), "{inspected}");
+    }
+}

@@ -143,7 +143,7 @@ fn weights(file: &Path, config: &Config) -> Finding {
             let age = path.metadata().ok().and_then(|m| m.modified().ok()).and_then(|t| t.elapsed().ok());
             let age = age.map_or(String::new(), |age| format!(", {:.1} days old", age.as_secs_f64() / 86_400.0));
             let is = format!("{} {how}{age}", weights.identity());
-            if !origin.framing.is_known() && origin.episodes > 0 {
+            if origin.pictures_unknown() {
                 let means = "they come from tables, so whether they are for these pictures is not known";
                 return Finding::yellow(
                     "weights",

@@ -35,7 +35,7 @@ pub struct Args {
 pub fn run(args: &Args) -> Result<(), Failure> {
     let config = Config::read(&args.common.config).or_exit(exit::BAD_INPUT)?;
     let foreseen = Foreseen::of(&config, args)?;
-    for line in foreseen.line(args.goal_ml).into_iter().chain(foreseen.unseen_line()) {
+    for line in foreseen.lines(args.goal_ml) {
         eprintln!("{line}");
     }
     let request = Request::Pour { goal_ml: args.goal_ml, flows_by_deg: foreseen.flows_by_deg };
@@ -56,6 +56,8 @@ struct Foreseen {
     same_weights: bool,
     /// Whether the vessel can give the goal, if these weights know the vessel.
     can_give: Option<bool>,
+    /// What there is to say of the pictures that the weights were trained on.
+    pictures_line: Option<&'static str>,
 }
 
 impl Foreseen {
@@ -82,7 +84,13 @@ impl Foreseen {
             unseen_ml: if flows_by_deg.is_none() { weights.and_then(foreseen::unseen_ml) } else { None },
             same_weights: weights.is_some(),
             can_give: weights.and_then(|w| foreseen::can_give(w, config.limits, goal_ml)),
+            pictures_line: weights.and_then(foreseen::pictures_line),
         }
+    }
+
+    /// All that is said before the pour.
+    fn lines(&self, goal_ml: f32) -> impl Iterator<Item = String> {
+        self.line(goal_ml).into_iter().chain(self.unseen_line()).chain(self.pictures_line.map(str::to_owned))
     }
 
     /// What a camera that sees no stream at all could cost, where nobody has told the fill.
@@ -196,6 +204,22 @@ mod tests {
         // A pour of nothing leaves no deviation, and the vessel can give it.
         assert!(line(&fused, 0.0).contains("the weights do not say how far off"), "{}", line(&fused, 0.0));
         assert!(Foreseen::with(None, &config, 30.0, None).line(30.0).unwrap().contains("is not the file that the controller has taken"));
+    }
+
+    /// Protects a pour from weights of tables that do not say their pictures: nothing can be compared, and that is said; of others it is not.
+    #[test]
+    fn weights_that_do_not_know_their_pictures_are_named() {
+        let config = Config::read(&std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("../config/sim.toml")).unwrap();
+        let mut weights = foreseen::tests::weights();
+        let named = |weights: &Weights| {
+            let foreseen = Foreseen::with(Some(weights), &config, 30.0, None);
+            foreseen.lines(30.0).any(|line| line.starts_with("note: the weights do not say on which pictures they were trained"))
+        };
+        assert!(!named(&weights), "weights by hand");
+        weights.origin.episodes = 5;
+        assert!(named(&weights));
+        weights.origin.framing = shared::framing::Framing::new(&config.camera, &config.image);
+        assert!(!named(&weights));
     }
 
     /// Protects whoever pressed Ctrl-C at a robot: it is said to be upright only where that is known.

@@ -9,11 +9,13 @@ use shared::config::Config;
 use shared::control::EndReason;
 use shared::disk_space::error_words;
 use shared::exit::{self, Failure, OrExit as _, failure};
+use shared::framing::Framing;
 use shared::messages::{Doubt, Feature, LAYOUT_VERSION, Telemetry};
 use shared::weights::Weights;
 
 use crate::core::{Core, Input, Order, Robot, Settings};
 use crate::disk::check_weights;
+use crate::foreseen;
 
 /// Longest line of input, bytes: no number that anybody writes is longer.
 const LINE_MAX: u64 = 128;
@@ -50,6 +52,11 @@ pub fn run(args: &Args) -> Result<(), Failure> {
         );
         return Err(failure(exit::BAD_INPUT, what));
     }
+    if let Some(line) = foreseen::pictures_line(&weights) {
+        eprintln!("{line}");
+    }
+    // The areas are taken to be of the pictures that the configuration names, so that the core refuses weights of others.
+    let framing = Framing::new(&config.camera, &config.image);
     let settings = Settings::new(&config);
     let mut core = Core::new(settings);
     core.exchange(Box::new(Agent::new(&weights)));
@@ -67,6 +74,7 @@ pub fn run(args: &Args) -> Result<(), Failure> {
             published_at_ns: now_ns,
             area_px2,
             confidence: 1.0,
+            framing,
             ..Feature::default()
         };
         // The robot is taken to be where it was sent; a lag is for the other simulator to add.

@@ -102,7 +102,7 @@ impl std::fmt::Display for Refusal {
             ),
             Self::Framing(difference) => write!(
                 f,
-                "the weights were trained on {difference}, as the worker has it: an area may be another volume there; record and train with this picture, or \
+                "the weights were trained on {difference}, as the cell has it: an area may be another volume there; record and train with this picture, or \
                  set [camera] and [image] as they were"
             ),
             Self::NoWeights => write!(f, "no valid weight file is loaded: train one, or see `rt-controller status`"),

@@ -197,7 +197,7 @@ fn weights_of_another_picture_pour_nothing() {
     };
     let refused = poured(small, large).unwrap_err();
     assert!(
-        refused.starts_with("the weights were trained on pictures of 640 x 480 px and not of 960 x 720, as the worker has it"),
+        refused.starts_with("the weights were trained on pictures of 640 x 480 px and not of 960 x 720, as the cell has it"),
         "{refused}"
     );
     for (trained, seen) in [(small, small), (small, Framing::default()), (Framing::default(), large)] {

@@ -82,7 +82,12 @@ pub fn check(episodes: &[Episode], holds_ml: Option<f64>) -> Findings {
 /// What is doubtful about how the usable episodes were recorded: the name of each, and what.
 pub fn doubtful_recordings(episodes: &[Episode], usable: &UsableEpisodes) -> Vec<(String, String)> {
     let used = episodes.iter().filter(|e| usable.episodes.iter().any(|own| own.name == e.name));
-    used.flat_map(|e| recording_doubts(e).into_iter().map(|what| (e.name.clone(), what))).collect()
+    let of_one = used.flat_map(|e| recording_doubts(e).into_iter().map(|what| (e.name.clone(), what)));
+    // The weights keep the pictures of those that say them: to pour in any pictures would be wrong for these episodes, too.
+    let known = data::framing(&usable.episodes).is_known();
+    let unknown = usable.episodes.iter().filter(|own| known && !own.framing.is_known());
+    let what = "it does not say its pictures, and is taken to be of those of the others: make sure that it is, or leave it out";
+    of_one.chain(unknown.map(|own| (own.name.clone(), what.into()))).collect()
 }
 
 /// What is doubtful about one recording.
