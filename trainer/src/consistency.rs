@@ -66,7 +66,7 @@ impl std::fmt::Display for DoubtfulWeight {
     }
 }
 
-/// What is doubtful about all episodes together once they are fitted: their weights ([`against_vessel`]), and a camera whose gain has changed. `fit` is made
+/// What is doubtful about all episodes together once they are fitted: their weights and a camera whose gain has changed. `fit` is made
 /// of the same episodes.
 pub fn doubts_of_set(episodes: &[TrainingEpisode], fit: &Fit, holds_ml: Option<f64>) -> Vec<(String, String)> {
     against_vessel(episodes, fit, holds_ml).into_iter().chain(changed_camera(episodes, fit)).collect()
