@@ -127,7 +127,8 @@ pub struct Checks {
     echoed: i32,
     /// Whether the arm lags by so much that the controller may say that it does not follow.
     pub(crate) is_slow: bool,
-    /// When the operator last asked for the robot, s.
+    /// When the operator last ordered anything, and when that last asked for the robot, s.
+    pub(crate) ordered_s: f64,
     pub(crate) asked_s: f64,
     /// Whether the controller could not know then that what a person had done came before.
     is_unclear: bool,
@@ -198,6 +199,7 @@ impl Checks {
             sent: 0,
             echoed: 0,
             is_slow: false,
+            ordered_s: f64::NEG_INFINITY,
             asked_s: f64::NEG_INFINITY,
             is_unclear: false,
             is_moved: false,
@@ -224,7 +226,7 @@ impl Checks {
         match what {
             What::Pour(_) | What::Record(..) | What::Resume if lives => {
                 self.is_unclear = self.taken.controller || self.taken.registers || self.is_moved;
-                (self.taken, self.is_moved, self.asked_s) = (Taken::default(), false, at_s);
+                (self.taken, self.is_moved, self.ordered_s) = (Taken::default(), false, at_s);
             }
             // Whoever is killed pours nothing, and the robot's program has to bring the container upright by itself.
             What::ControllerKilled(_) => (self.taken.controller, self.phase) = (false, Phase::NoRobot),
@@ -252,9 +254,13 @@ impl Checks {
         }
     }
 
-    /// The operator has asked for the robot. Unless the controller had said that it `waits` for that, it cannot know whether what a person did came before.
-    pub fn asked(&mut self, waits: bool) {
+    /// The operator has ordered something; `resumes` tells whether that was `resume`, which always asks for the robot. Anything else asks for it only if the
+    /// controller had said that it `waits` for that. Unless it had, it cannot know whether what a person did came before.
+    pub fn asked(&mut self, waits: bool, resumes: bool) {
         self.is_unclear &= !waits;
+        if waits || resumes {
+            self.asked_s = self.ordered_s;
+        }
     }
 
     /// A program begins on the robot.

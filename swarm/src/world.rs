@@ -89,7 +89,7 @@ impl World<'_> {
                 // As the service and its clients do: `resume` always asks for the robot, an order that moves if a person had it, and an abort never.
                 let waits = life.note.get().link == RobotLink::WaitsForOperator;
                 if order != Some(Order::Abort) {
-                    site.checks.asked(waits);
+                    site.checks.asked(waits, order.is_none());
                 }
                 if order.is_none() || (waits && order != Some(Order::Abort)) {
                     life.note.asked();

@@ -334,7 +334,8 @@ pub fn apply(device: &mut impl Controls, camera: &CameraConfig) -> Outcome {
 fn doubt_gain(device: &impl Controls, camera: &CameraConfig) -> Option<String> {
     let own = device.query(v4l2::V4L2_CID_AUTOGAIN).is_some();
     let automatic = device.get(v4l2::V4L2_CID_EXPOSURE_AUTO).is_ok_and(|mode| EXPOSURE_AUTOMATIC.contains(&mode));
-    let doubted = camera.gain.is_some() && !own && automatic && device.query(v4l2::V4L2_CID_GAIN).is_some();
+    let named = camera.gain.is_some() && camera.exposure_ms.is_none();
+    let doubted = named && !own && automatic && device.query(v4l2::V4L2_CID_GAIN).is_some();
     doubted.then(|| "camera.gain: the automatic exposure may change it; set camera.exposure_ms too".into())
 }
 

@@ -188,6 +188,29 @@ fn an_ask_that_cannot_be_placed_is_asked_for_again() {
     assert!(!tells(&shown, "robot connected", 2.8, 6.0) && tells(&shown, "robot connected", 6.0, 8.0), "{text}");
 }
 
+/// Protects the operator (seed 16015290): an order that is refused while the controller tries to connect by itself asks for nothing, so when the last wish is
+/// over, it says that it waits. Then an ask takes the robot.
+#[test]
+fn an_order_while_the_robot_is_tried_asks_for_nothing() {
+    let mut waited = 0;
+    for order_ms in (16_140..16_740).step_by(60) {
+        let happens = [
+            (3_421, What::Pour(32.083717), None),
+            (6_269, What::Robot(Fault::SkipOutputs(22)), Some("skip-outputs")),
+            (6_570, What::Resume, None),
+            (7_768, What::Robot(Fault::Offline(7.6025399160745835)), Some("offline")),
+            (order_ms, What::Record(70.0, 1.0), None),
+            (28_000, What::Resume, None),
+        ];
+        let shown = shown(16_015_290, Series::Cb3, 0, (350.0, (266_117, 645_915)), &happens);
+        if tells(&shown, "then `rt-controller resume`", 16.0, 18.0) {
+            waited += 1;
+            assert!(tells(&shown, "robot connected", 28.0, 30.0), "{}", shown.story.join("\n"));
+        }
+    }
+    assert!(waited > 3, "only {waited} orders came before the wish was over");
+}
+
 /// Protects a cell whose link held back what the robot sent while it was connected (seed 14111571): the controller saw a program at work that answered no
 /// target, because it had ended unused. Nobody had stopped it, so the robot is taken back without its operator.
 #[test]
