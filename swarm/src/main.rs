@@ -10,6 +10,7 @@ use std::sync::atomic::Ordering;
 use clap::Parser;
 use shared::config::Config;
 use shared::exit;
+use shared::plural::counted;
 use simulator::ur::Series;
 use swarm::camera::{Depth, picture_name};
 use swarm::faults::{KINDS, named};
@@ -289,7 +290,7 @@ fn report(summary: &Summary, wall_s: f64) {
     }
     let violating = summary.violations.values().map(|(n, _)| n).sum::<usize>();
     if pours > 0 {
-        let seen = if violating == 0 { "no violation".to_owned() } else { format!("{violating} violations") };
+        let seen = if violating == 0 { "no violation".to_owned() } else { counted(violating, "violation") };
         let rate = |n: usize| at_most(violating) / n as f64;
         print(&format!("{seen} in {pours}: at 95 % fewer than {:.1e} a pour, if pours are drawn as here", rate(pours)));
         if violating == 0 && cb3 > 0 && e_series > 0 {
