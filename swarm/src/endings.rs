@@ -63,10 +63,12 @@ impl Checks {
         // them.
         let (low_ml, high_ml) = self.unshown.by_gain_ml(said_ml);
         let frames_ml = if outcome.reason == EndReason::Done { (0.0, self.unshown.by_surges_ml()) } else { self.unshown.by_frames_ml() };
+        // "At least" so much is right whatever left while the camera was blind, and of no more.
+        let blind_ml = if outcome.unseen { self.unshown.by_blindness_ml() } else { 0.0 };
         let most_ml = SAID.0 * sd_ml + SAID.1;
         let off_ml = true_ml - said_ml;
         // What is not a number is near to nothing.
-        let is_near = (-(most_ml + low_ml + frames_ml.0)..=most_ml + high_ml + frames_ml.1).contains(&off_ml);
+        let is_near = (-(most_ml + low_ml + frames_ml.0)..=most_ml + high_ml + frames_ml.1 + blind_ml).contains(&off_ml);
         if !is_near {
             let reason = outcome.reason.words();
             self.violated("said", at_s, format!("{reason}, and it says {said_ml:.1} +- {sd_ml:.1} ml where {true_ml:.1} left"));
@@ -148,6 +150,19 @@ mod tests {
         assert!(found(EndReason::Aborted, 20.0, 60.0), "what was not shown cannot be too much");
         assert!(found(EndReason::MaxFrames, 0.0, 96.0), "all was seen");
         assert!(!found(EndReason::RobotLost, 0.0, 96.0), "it says that not all was seen");
+    }
+
+    /// Protects the check of a lower bound: "at least" is no excuse but for what left while the camera was blind.
+    #[test]
+    fn a_lower_bound_excuses_what_a_blind_camera_missed() {
+        let found = |unseen, true_ml| {
+            let mut checks = checks();
+            (0..10).for_each(|_| checks.unshown.frame_without_measurement(1.0, 2.0));
+            checks.ended(&Outcome { unseen, ..outcome(EndReason::Aborted) }, true_ml, 20.0);
+            checks.violations.iter().any(|v| v.invariant == "said")
+        };
+        assert!(!found(true, 110.0) && found(true, 114.0), "20 ml left unseen");
+        assert!(found(false, 110.0), "it does not say that anything was not seen");
     }
 
     /// Protects the cup from a goal that is none: what is smaller than the least goal is not begun.

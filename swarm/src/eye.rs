@@ -68,6 +68,8 @@ pub struct Eye {
     shown_ml: f64,
     /// How much less than what left the newest frame shows without a doubt, ml.
     hidden_ml: f64,
+    /// Whether the newest frame gave a measurement that may be used.
+    measured: bool,
     /// Measurements on their way, with the time of their publication.
     pub published: VecDeque<Feature>,
 }
@@ -102,6 +104,7 @@ impl Eye {
             newest: Feature::default(),
             shown_ml: 0.0,
             hidden_ml: 0.0,
+            measured: false,
             published: VecDeque::new(),
         }
     }
@@ -144,7 +147,7 @@ impl Eye {
             self.sequence = 0;
         }
         self.sequence += 1;
-        self.hidden_ml = 0.0;
+        (self.hidden_ml, self.measured) = (0.0, false);
         // The same numbers are drawn in every frame, so that a fault does not shift the noise of later frames.
         let normal: f64 = StandardNormal.sample(&mut self.random);
         let (doubted, missed) = (self.random.random_bool(DOUBTED), self.random.random_bool(MISSED));
@@ -170,6 +173,7 @@ impl Eye {
             return;
         };
         let shown_ml = self.misread((&mut area_px2, &mut doubt), frozen, flow_ml);
+        self.measured = doubt.usable(area_px2);
         let mut delay_ns = DELAY_NS + jitter_ns;
         if counted(&mut self.late.1) {
             delay_ns += self.late.0;
@@ -221,6 +225,11 @@ impl Eye {
     /// The camera's gain as a share of that at the start, and how much less the newest frame shows than what left in it, ml. Nothing tells of either.
     pub fn unshown(&self) -> (f64, f64) {
         (self.gain / self.first_gain, self.hidden_ml)
+    }
+
+    /// Whether the newest frame gave a measurement that may be used.
+    pub fn has_measured(&self) -> bool {
+        self.measured
     }
 
     /// What vision makes of a flow: area and doubt.

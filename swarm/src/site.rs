@@ -255,7 +255,11 @@ impl Site {
             self.eye.frame(self.now_ns, left_ml, clinging, &scene);
             self.frame_poured_ml = poured_ml;
             let (gain, hidden_ml) = self.eye.unshown();
-            self.checks.unshown.frame(gain, left_ml, hidden_ml);
+            if self.eye.has_measured() {
+                self.checks.unshown.frame(gain, left_ml, hidden_ml);
+            } else {
+                self.checks.unshown.frame_without_measurement(gain, left_ml);
+            }
         }
         Vec::new()
     }

@@ -4,6 +4,8 @@
 
 /// The power of the area with which a volume goes at most. Chosen by hand: nothing that a drift hid on the seeds up to 23,299 needs more.
 const VOLUME_EXPONENT: f64 = 1.2;
+/// A camera of which so many frames in a row give no measurement is blind (`controller.stale_feature_ms` of config/sim.toml, at 30 Hz).
+const BLIND_FRAMES: u32 = 6;
 
 /// What is kept of the run under way.
 #[derive(Debug, Clone, Copy)]
@@ -18,11 +20,15 @@ pub struct Unshown {
     largest_ml: f64,
     /// What left in frames that showed too little, beyond the largest outflow that any frame before had shown, ml.
     surged_ml: f64,
+    /// What left in the newest frames without a measurement, ml, and their number.
+    gone: (f64, u32),
+    /// What left while the camera was blind, ml.
+    blind_ml: f64,
 }
 
 impl Default for Unshown {
     fn default() -> Self {
-        Self { gain: 1.0, gains: (1.0, 1.0), hidden_ml: (0.0, 0.0), largest_ml: 0.0, surged_ml: 0.0 }
+        Self { gain: 1.0, gains: (1.0, 1.0), hidden_ml: (0.0, 0.0), largest_ml: 0.0, surged_ml: 0.0, gone: (0.0, 0), blind_ml: 0.0 }
     }
 }
 
@@ -32,13 +38,27 @@ impl Unshown {
         *self = Self { gain: self.gain, gains: (self.gain.min(1.0), self.gain.max(1.0)), ..Self::default() };
     }
 
-    /// A frame was taken with this gain, in which so much left, ml, and which showed so much less than that, ml; below 0 it showed more.
+    /// A frame passed with this gain, in which so much left, ml. It was lost or is doubted: it is known to have shown nothing.
+    pub fn frame_without_measurement(&mut self, gain: f64, left_ml: f64) {
+        self.takes_gain(gain);
+        self.gone = (self.gone.0 + left_ml, self.gone.1 + 1);
+        if self.gone.1 >= BLIND_FRAMES {
+            self.blind_ml += std::mem::take(&mut self.gone.0);
+        }
+    }
+
+    /// A frame was measured with this gain, in which so much left, ml, and which showed so much less than that, ml; below 0 it showed more.
     pub fn frame(&mut self, gain: f64, left_ml: f64, hidden_ml: f64) {
-        self.gain = gain;
-        self.gains = (self.gains.0.min(gain), self.gains.1.max(gain));
+        self.takes_gain(gain);
+        self.gone = (0.0, 0);
         self.surged_ml += (hidden_ml - self.largest_ml).max(0.0);
         self.largest_ml = self.largest_ml.max(left_ml - hidden_ml);
         self.hidden_ml = (self.hidden_ml.0 + hidden_ml.max(0.0), self.hidden_ml.1 + (-hidden_ml).max(0.0));
+    }
+
+    fn takes_gain(&mut self, gain: f64) {
+        self.gain = gain;
+        self.gains = (self.gains.0.min(gain), self.gains.1.max(gain));
     }
 
     /// By how much the truth may lie below and above `said_ml`, ml, because of the gain.
@@ -50,6 +70,11 @@ impl Unshown {
     /// By how much the truth may lie above what is said, ml, because frames that showed less hid a surge: more than any picture of the run let expect.
     pub fn by_surges_ml(&self) -> f64 {
         self.surged_ml
+    }
+
+    /// By how much the truth may lie above what is said to be a lower bound, ml, because the camera was blind.
+    pub fn by_blindness_ml(&self) -> f64 {
+        self.blind_ml
     }
 
     /// By how much the truth may lie below and above what is said, ml, because single frames showed something else.
@@ -79,5 +104,23 @@ mod tests {
         unshown.begins();
         assert_eq!((unshown.by_gain_ml(100.0), unshown.by_frames_ml()), ((0.0, 0.0), (0.0, 0.0)));
         assert_eq!(unshown.by_surges_ml(), 0.0);
+    }
+
+    /// Protects the check of a lower bound: what leaves while the camera is blind is excused from the first frame on, a shorter gap is not, and a lost frame
+    /// shows no outflow.
+    #[test]
+    fn a_blind_camera_is_told_from_a_gap() {
+        let mut unshown = Unshown::default();
+        unshown.begins();
+        let gap = |unshown: &mut Unshown, frames: u32| {
+            (0..frames).for_each(|_| unshown.frame_without_measurement(1.0, 2.0));
+            unshown.frame(1.0, 0.0, 0.0);
+        };
+        gap(&mut unshown, BLIND_FRAMES - 1);
+        assert_eq!(unshown.by_blindness_ml(), 0.0);
+        gap(&mut unshown, BLIND_FRAMES + 1);
+        assert_eq!(unshown.by_blindness_ml(), 14.0);
+        gap(&mut unshown, BLIND_FRAMES - 1);
+        assert_eq!((unshown.by_blindness_ml(), unshown.largest_ml), (14.0, 0.0));
     }
 }

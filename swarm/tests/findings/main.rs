@@ -269,6 +269,21 @@ fn what_still_leaves_is_in_the_deviation() {
     assert!(pour.sd_ml > 2.0, "{pour:?}");
 }
 
+/// Protects the check (seed 16234063): the stream ran only while the camera was blind, and the pour was aborted meanwhile. The controller says "at least
+/// 0.0 ml", which is right.
+#[test]
+fn at_least_so_much_is_no_more() {
+    let happens = [
+        (3_383, What::Pour(38.349022), None),
+        (4_567, What::Eye(EyeFault::Loss(14)), Some("eye-loss")),
+        (4_622, What::Abort, Some("abort")),
+    ];
+    let drawn = (446.6330802883467, (397_973, 510_428));
+    let shown = lagging(16_234_063, (Series::ESeries, 0.012), 9, drawn, &happens);
+    let pour = &shown.poured[0];
+    assert!(pour.reason == EndReason::Aborted && pour.true_ml > 5.0 && pour.believed_ml < 1.0, "it has seen it: {pour:?}");
+}
+
 /// Protects the check (seed 12703090): a pour had turned back by a degree before a camera's freeze could be noticed, and the joint, which lagged, still went
 /// up to the target that was taken back, where the vessel gave its surge. The bound begins from the highest target that is still followed.
 #[test]
