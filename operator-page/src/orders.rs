@@ -10,7 +10,7 @@ use shared::control::{Reply, Request, RobotLink};
 use shared::episode::set_weight;
 use shared::gaussian_curve::Curve;
 use shared::messages::Phase;
-use shared::weights::Weights;
+use shared::weights::{Origin, Weights};
 
 use crate::site::{Site, moves};
 
@@ -103,6 +103,7 @@ pub fn foresee(site: &Site, goal_ml: f32, fill_ml: Option<f64>) -> Foreseen {
         ));
     }
     lines.extend(few(&weights));
+    lines.extend(unknown_pictures(&weights.origin));
     lines.extend(sd_ml.and_then(|sd| worse_than_expected(&site.history.errors_ml(&status.weights), sd)));
     match sd_ml {
         Some(sd) if sd > WARNED_SD_ML => {
@@ -115,6 +116,13 @@ pub fn foresee(site: &Site, goal_ml: f32, fill_ml: Option<f64>) -> Foreseen {
         None => lines.push("These weights do not say how far off this pour will be.".into()),
     }
     Foreseen { possible: true, sd_ml, flows_by_deg, lines, identity: status.weights }
+}
+
+/// What the operator should know of weights that do not know their pictures.
+fn unknown_pictures(origin: &Origin) -> Option<String> {
+    origin.pictures_unknown().then(|| {
+        "These weights do not say on which pictures they were learned: if the camera stood elsewhere, another volume is poured than is said. Weigh it.".into()
+    })
 }
 
 /// What the operator should know of weights from few episodes: their deviation cannot be taken at its word.
@@ -236,7 +244,19 @@ pub fn weigh(site: &Site, name: &str, grams: f64, shown_g: Option<f64>) -> Resul
 
 #[cfg(test)]
 mod tests {
+    use shared::framing::Framing;
+    use shared::weights::Method;
+
     use super::*;
+
+    /// Protects whoever pours with weights from tables: nothing refuses them in other pictures, so it is said. Weights made by hand saw none.
+    #[test]
+    fn weights_that_know_no_pictures_say_so() {
+        let of = |episodes, framing| Origin { method: Method::Handmade, actions: 21, episodes, data_sha256: [0; 32], framing };
+        let known = Framing { size_px: [640, 480], ..Framing::default() };
+        assert!(unknown_pictures(&of(5, Framing::default())).is_some());
+        assert_eq!([unknown_pictures(&of(5, known)), unknown_pictures(&of(0, Framing::default()))], [None, None]);
+    }
 
     /// Protects whoever believes a small deviation: where the scale has shown more, it is said; where it has not, nothing is.
     #[test]

@@ -86,6 +86,8 @@ pub(crate) struct Taken {
     pub(crate) controller: bool,
     /// The robot's registers, in which our program was still at work, until the robot boots.
     pub(crate) registers: bool,
+    /// The program that was at work then was resumed, and has ended by itself, as the registers say now.
+    pub(crate) ended: bool,
 }
 
 /// What the checks keep.
@@ -240,6 +242,7 @@ impl Checks {
                 // Without a session, a stop before the controller has looked at the robot looks like one before the operator asked.
                 let unseen = matches!(what, What::Robot(Fault::ProgramStop)) && !has_session && at_s < self.asked_s + LOOKS_S;
                 self.taken.registers |= !unseen;
+                self.taken.ended = false;
                 self.taken.controller |= has_session;
             }
             _ => {}
@@ -266,7 +269,7 @@ impl Checks {
     /// A program begins on the robot.
     pub fn program_started(&mut self, at_s: f64) {
         self.program_s = at_s;
-        if self.taken.controller || self.taken.registers {
+        if self.taken.controller || (self.taken.registers && !self.taken.ended) {
             self.violated("taken-unasked", at_s, "a program was started after a person stopped the robot, and nobody asked".into());
         }
     }
@@ -325,6 +328,9 @@ impl Checks {
             self.violated("ends", at_s, what);
         }
         self.left_tilted(machine, alpha_deg, at_s);
+        let state = ProgramState::from_code(machine.robot.outputs.int[STATE_REGISTER]);
+        self.taken.ended |=
+            machine.runtime_state() == RuntimeState::Stopped && matches!(state, ProgramState::TimedOut | ProgramState::Stopped);
     }
 
     /// The targets of a session are numbered one by one, so none that the robot takes has a number above how many were sent. (Numbers that repeat

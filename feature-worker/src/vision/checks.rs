@@ -164,6 +164,8 @@ pub(crate) struct RimCheck {
     axes: Axes,
     /// Width of the rim in each bundle that shows it, px. Kept from frame to frame.
     widths_px: Vec<f32>,
+    /// Which bundles showed the rim in the last picture without a stream, all before that. A stream's own edge across the rim tells nothing of the focus.
+    shown: [bool; 2 * RIM_BUNDLES],
     /// Whether the last picture that was judged looked blurred; true before the first.
     looked_blurred: bool,
 }
@@ -171,15 +173,15 @@ pub(crate) struct RimCheck {
 impl RimCheck {
     /// A check for these axes, relative to the region.
     pub(crate) fn new(axes: Axes) -> Self {
-        Self { axes, widths_px: Vec::with_capacity(2 * RIM_BUNDLES), looked_blurred: true }
+        Self { axes, widths_px: Vec::with_capacity(2 * RIM_BUNDLES), shown: [true; 2 * RIM_BUNDLES], looked_blurred: true }
     }
 
-    /// Whether the rim has lost its sharp edges. False when it is not seen well enough to tell: the glass is as bright as what is
-    /// behind it, or the axes lie beside the rim.
-    pub(crate) fn is_blurred(&mut self, pixels: RegionPixels) -> bool {
+    /// Whether the rim has lost its sharp edges in a picture in which a stream `flows` or not. False when it is not seen well enough to tell: the glass
+    /// is as bright as what is behind it, or the axes lie beside the rim.
+    pub(crate) fn is_blurred(&mut self, pixels: RegionPixels, flows: bool) -> bool {
         self.widths_px.clear();
         let axes = self.axes;
-        for (along, across) in [(axes.x, axes.y), ([-axes.y[0], -axes.y[1]], axes.x)] {
+        for (side, (along, across)) in [(axes.x, axes.y), ([-axes.y[0], -axes.y[1]], axes.x)].into_iter().enumerate() {
             // Square to the axis, so that an oblique container does not look soft.
             let skew = across[0] * along[0] + across[1] * along[1];
             let across = [across[0] - skew * along[0], across[1] - skew * along[1]];
@@ -197,8 +199,13 @@ impl RimCheck {
                     })
                 });
                 let (change, steepness) = steepest_change(&profile);
-                if inside && change >= RIM_CONTRAST {
+                let shown = &mut self.shown[side * RIM_BUNDLES + bundle];
+                let shows = inside && change >= RIM_CONTRAST;
+                if shows && (*shown || !flows) {
                     self.widths_px.push(change / steepness);
+                }
+                if !flows {
+                    *shown = shows;
                 }
             }
         }
@@ -269,7 +276,40 @@ fn steepest_change(profile: &[f32; 2 * RIM_REACH + 1]) -> (f32, f32) {
 
 #[cfg(test)]
 mod tests {
+    use opencv::core::Rect;
+    use shared::messages::PixelFormat;
+
+    use super::super::picture::{Image, RegionReader};
     use super::*;
+
+    const SIDE: usize = 240;
+
+    /// Whether the check calls a picture blurred in which the rim is brighter than what is behind it by so many levels, and is so wide, px.
+    fn is_blurred(check: &mut RimCheck, (levels, wide_px): (f32, f32), flows: bool) -> opencv::Result<bool> {
+        let level = |i: usize| {
+            let above_px = 120.0 - (i / SIDE) as f32;
+            (100.0 + levels * (0.5 - above_px / wide_px).clamp(0.0, 1.0)) as u8
+        };
+        let pixels: Vec<u8> = (0..SIDE * SIDE).flat_map(|i| [level(i); 3]).collect();
+        let (format, [width_px, height_px]) = (PixelFormat::Bgr8, [SIDE as u32; 2]);
+        let mut reader = RegionReader::new(Rect::new(0, 0, SIDE as i32, SIDE as i32));
+        let image = Image { width_px, height_px, format, pixels: &pixels };
+        Ok(check.is_blurred(reader.read(image, |_| Ok(()))?, flows))
+    }
+
+    /// Protects streams of clear water before a rim that hardly shows: their own soft edge across it tells nothing of the focus. Where the rim was seen
+    /// without a stream, it does.
+    #[test]
+    fn a_streams_own_edge_tells_no_focus() -> opencv::Result<()> {
+        let axes = Axes { lip_px: [40.0, 120.0], x: [1.0, 0.0], y: [0.0, -1.0] };
+        let mut check = RimCheck::new(axes);
+        assert!(!is_blurred(&mut check, (8.0, 1.0), false)?, "the rim hardly shows");
+        assert!(!(0..5).any(|_| is_blurred(&mut check, (60.0, 12.0), true).unwrap_or(true)), "a stream's edge");
+        assert!(!is_blurred(&mut check, (60.0, 1.0), false)?, "the rim shows");
+        assert!(is_blurred(&mut check, (60.0, 12.0), true)?, "its edge is wide now");
+        assert!(is_blurred(&mut RimCheck::new(axes), (60.0, 12.0), true)?, "nothing was seen without a stream");
+        Ok(())
+    }
 
     /// Protects the check of repeated pictures: a picture that differs in one whole word, wherever it lies, is a new one.
     #[test]

@@ -19,7 +19,7 @@ use shared::messages::{Doubt, PixelFormat};
 
 use super::coloured_edge;
 use super::confidence::Basis;
-use super::foreign::{self, FILLED, LEARN_FROM_PX, Seen};
+use super::foreign::{self, FILLED, LEARN_FROM_PX, LEAVES_SHARE, Outline, Seen};
 use super::geometry::{Axes, Line, NEAR_PX, RAYS, RayGrid, distance};
 use super::grey::{COLOURED_FROM, is_grey};
 use super::ground_beside::{InGlass, Place, Square};
@@ -46,8 +46,6 @@ const BEHIND_RAYS: f32 = 0.4;
 const BEHIND_PX: f32 = 100.0;
 /// With more than this share of rays full of liquid to the region's border, the colour tells nothing in this light. Chosen by hand.
 const ALL_LIQUID: f32 = 0.9;
-/// With more than this share of rays full of liquid to the region's border, the area is a lower bound. Chosen by hand.
-const LEAVES_SHARE: f32 = 0.06;
 /// Side of the square of samples that are smoothed together: a fifth of the noise. Tuned; it costs about 25 us more than 3, see CHANGELOG.md.
 const SMOOTH: i32 = 5;
 /// There is no line when a smaller share of the profiles than this shows an edge. Tuned.
@@ -107,6 +105,7 @@ pub(crate) struct ColouredLiquid {
     half_white: bool,
     /// Number of samples on each ray up to the end of the liquid, or of a body at the lip, in the last picture.
     ends: [usize; RAYS],
+    outline: Outline,
     // Pictures along the rays, one ray a row, kept from frame to frame.
     /// The region in BGR.
     sampled: Mat,
@@ -156,6 +155,7 @@ impl ColouredLiquid {
             white_lip: 0.0,
             half_white: false,
             ends: [0; RAYS],
+            outline: Outline::new(axes, image.region_px),
             sampled: Mat::default(),
             smooth: Mat::default(),
             hsv: Mat::default(),
@@ -324,7 +324,12 @@ impl ColouredLiquid {
             self.learn_distant()?;
         }
         let [blind, glows, foreign] = self.seen().at_lip()?;
-        let body = self.has_foreign_body()?;
+        let ends = self.ends;
+        let mut body = self.has_foreign_body()?;
+        if body && !known && !self.outline.is_streams(&self.grid, &self.ends) {
+            // It is ground, and learned as such.
+            (body, self.ends) = (false, ends);
+        }
         // Ground that is white at the lip alone may be new, so it is no reflection yet.
         let hidden = (known || body) && self.reflection.hides_lip(blind.max(self.white_lip), glows, foreign > QUIET_SHARE, self.pace);
         self.unsure_at_first += u32::from(body && !known);

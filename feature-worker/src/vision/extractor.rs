@@ -231,7 +231,11 @@ impl Extractor {
         };
         let edge_tells_focus = measured.area_px2 > 0.0 && self.liquid.rules().edge_tells_focus;
         let untold = measured.doubt == Doubt::None && !edge_tells_focus;
-        let measured = if untold && self.rim.is_blurred(pixels) { Measurement::nothing(0.0, Doubt::Blurred) } else { measured };
+        let measured = if untold && self.rim.is_blurred(pixels, measured.area_px2 > 0.0) {
+            Measurement::nothing(0.0, Doubt::Blurred)
+        } else {
+            measured
+        };
         let not_told = matches!(measured.doubt, Doubt::EdgeNotFound | Doubt::ColoursChanged | Doubt::BlownOut | Doubt::LightFlickers);
         if not_told && measured.area_px2 == 0.0 {
             self.presence.saw_unsure(measured.doubt == Doubt::ColoursChanged || self.liquid.rules().unsure_lasts);

@@ -6,8 +6,9 @@
 use opencv::core::{Mat, Vec3b};
 use opencv::prelude::*;
 
-use super::geometry::{NEAR_PX, RAYS, RayGrid};
+use super::geometry::{Axes, NEAR_PX, RAYS, RayGrid};
 use super::ground_colours::{Ground, GroundColours, Mean};
+use super::stream_edge::LineFinder;
 
 // "Tuned" below means that the value was tuned on seeds 1 and 5001 to 5003 of `evaluate-camera`; see docs/VISION.md.
 
@@ -24,6 +25,8 @@ pub(super) const LEARN_FROM_PX: f32 = 48.0;
 const GAP_MOST_PX: f32 = 24.0;
 /// Least share of liquid, or of a body, between lip and edge on a ray that counts as filled. Tuned.
 pub(super) const FILLED: f32 = 0.55;
+/// With more than this share of rays full of liquid to the region's border, the area is a lower bound. Chosen by hand.
+pub(super) const LEAVES_SHARE: f32 = 0.06;
 /// Least share of the rays that a body at the lip fills. Tuned.
 const BODY_RAYS: f32 = 0.7;
 /// Least mean length of a body at the lip, px: a bead is shorter. Tuned.
@@ -205,6 +208,33 @@ impl Seen<'_> {
         }
         let share = |part: usize| part as f32 / looked.max(1) as f32;
         Ok([share(blind), share(glows), share(foreign)])
+    }
+}
+
+/// Tells a stream's outline from that of other bodies at the lip.
+pub(super) struct Outline {
+    axes: Axes,
+    /// The ends of the body on the rays, px in the region. Kept from frame to frame.
+    edges_px: Vec<[f32; 2]>,
+    line: LineFinder,
+}
+
+impl Outline {
+    /// For a region of an image (x, y, width and height, px); `axes` are relative to it.
+    pub(super) fn new(axes: Axes, [_, _, width, height]: [u32; 4]) -> Self {
+        Self { axes, edges_px: Vec::with_capacity(RAYS), line: LineFinder::new(axes, [width, height].map(|v| v as i32)) }
+    }
+
+    /// Whether a body that ends so on the rays may be a stream: it ends along a line from axis to axis, or the region cuts it off.
+    pub(super) fn is_streams(&mut self, grid: &RayGrid, ends: &[usize; RAYS]) -> bool {
+        self.edges_px.clear();
+        let mut cut_off = 0usize;
+        for (end, ray) in ends.iter().zip(&grid.rays) {
+            let Some(last) = end.checked_sub(1) else { continue };
+            cut_off += usize::from(*end >= ray.samples);
+            self.edges_px.push(self.axes.at(grid.radii_px[last] + 0.5 * grid.steps_px[last], ray.along));
+        }
+        cut_off as f32 > LEAVES_SHARE * RAYS as f32 || self.line.first_line(&self.edges_px).is_some()
     }
 }
 

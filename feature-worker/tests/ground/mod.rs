@@ -187,6 +187,28 @@ fn a_stream_in_other_colours_from_the_first_picture_on_is_named() -> Result<(), 
     Ok(())
 }
 
+/// Protects the first pictures before an untidy place: what lies at the lip without a stream's outline is ground, and no stream in other colours. The
+/// liquid is measured before it.
+#[test]
+fn an_untidy_place_is_no_stream_in_other_colours() -> Result<(), ExtractError> {
+    let rods =
+        [[0.0, 0.0], [110.0, 0.0], [110.0, 12.0], [24.0, 14.0], [80.0, 86.0], [66.0, 96.0], [12.0, 26.0], [12.0, 100.0], [0.0, 100.0]];
+    let rods: Vec<_> = rods.iter().map(|[u, v]| [215.0 + u, 250.0 - v]).collect();
+    for mut extractor in [colour()?, with_room()?] {
+        for i in 0..60 {
+            let mut picture = dry(0.0, i)?;
+            lay_over(&mut picture, &[rods.clone()], OTHER)?;
+            if i >= 40 {
+                lay_over(&mut picture, &[stream(60.0, 50.0)], OWN)?;
+            }
+            let measured = measure(&mut extractor, &picture)?;
+            let flows = measured.area_px2 > 1200.0;
+            assert!(flows == (i >= 40) && measured.doubt == Doubt::None, "picture {i}: {measured:?}");
+        }
+    }
+    Ok(())
+}
+
 /// Protects thin streams, through which the ground is seen: what is neither in the liquid's range nor ground, but a mixture of both, is the
 /// liquid, although the liquid in the glass is seen in its own colours.
 #[test]

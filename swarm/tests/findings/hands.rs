@@ -224,3 +224,20 @@ fn a_program_that_ended_behind_a_slow_link_is_taken_back() {
     let shown = shown(14_111_571, Series::ESeries, 0, (416.0, (266_117, 645_915)), &happens);
     assert!(tells(&shown, "no target came", 19.5, 23.0), "{}", shown.story.join("\n"));
 }
+
+/// Protects the check (seed 16338853): a person resumes a program that a protective stop had held, it brings the container upright and ends by itself. A new
+/// controller sees no sign of the stop, and takes the robot.
+#[test]
+fn a_resumed_program_that_ended_leaves_no_sign() {
+    let happens = [
+        (3_470, What::Record(78.25531, 1.5956125), None),
+        (10_251, What::Robot(Fault::ProtectiveStop), Some("protective-stop")),
+        (10_992, What::Robot(Fault::ProgramPause), Some("jog")),
+        (18_073, What::Robot(Fault::UnlockProtectiveStop), Some("protective-stop")),
+        (19_416, What::ControllerKilled(3_237), Some("controller-killed")),
+        (19_938, What::Robot(Fault::ProgramResume), Some("jog")),
+    ];
+    let shown = shown(16_338_853, Series::Cb3, 4, (253.0, (266_117, 645_915)), &happens);
+    let text = shown.story.join("\n");
+    assert!(tells(&shown, "container upright", 19.9, 22.6) && tells(&shown, "decant_pour started", 22.6, 24.0), "{text}");
+}
