@@ -173,7 +173,7 @@ function rowToWeigh(e) {
   const place = el('div', { className: 'proposal' });
   fill(place, el('p', {}, el('b', {}, e.file), ` ${e.started_at_utc}, ${what(e)}`), scale(e.file, e.run.goal_ml ?? NaN, grams => {
     if (grams === null) { skipped.add(e.file); unweighed(); } else reload();
-  }));
+  }, e.poured_ml ?? NaN));
   return place;
 }
 

@@ -83,8 +83,9 @@ function plots() {
   const to = points[points.length - 1][T], from = to - SHOWN_S;
   const seen = points.filter(p => p[T] >= from - 1);
   const of = (column, sd) => seen.map(p => [p[T] - to, p[column], sd ? p[sd] : 0]);
-  const under = seen.filter(p => p[EPISODE] > 0);
-  const during = column => seen.map(p => [p[T] - to, p[EPISODE] > 0 || p[PHASE] >= 2 ? p[column] : NaN]);
+  // A curve has no goal, and nobody counts what it pours.
+  const counted = seen.filter(p => Number.isFinite(p[GOAL])), last = counted[counted.length - 1];
+  const during = column => seen.map(p => [p[T] - to, Number.isFinite(p[GOAL]) ? p[column] : NaN]);
   const marks = seen.filter(p => p[DOUBT] > 0).map(p => ({ t: p[T] - to }));
   const list = [
     { title: 'Tilt alpha', unit: 'degrees', low: 0, high: 20, series: [
@@ -92,13 +93,13 @@ function plots() {
     { title: 'Stream V_e', unit: 'px²', low: 0, high: 100, marks, series: [{ name: 'V_e', colour: '--series-3', bridge: true, points: of(AREA) }] },
     { title: 'Volume', unit: 'ml', low: 0, high: 20, series: [
       { name: 'poured (±1 deviation)', colour: '--series-1', points: during(POURED).map(([t, v], k) => [t, v, seen[k][SD]]) },
-      { name: 'still to pour, d', colour: '--series-4', dash: 2, points: during(D).map(([t, v], k) => [t, Number.isFinite(seen[k][GOAL]) ? v : NaN]) }] },
+      { name: 'still to pour, d', colour: '--series-4', dash: 2, points: during(D) }] },
   ];
   panels($('plots'), { from: -SHOWN_S, to: 0, list });
   const newest = points[points.length - 1];
   const doubts = [...new Set(seen.filter(p => p[DOUBT] > 0).map(p => about.doubts[p[DOUBT]]))];
   $('plots-words').textContent = `Now: alpha ${shown(newest[ALPHA])}° commanded, ${shown(newest[MEASURED])}° measured` +
-    (under.length ? `; ${shown(newest[POURED])}${newest[SD] > 0 ? ` ± ${shown(newest[SD])}` : ''} ml poured${newest[SD] > 0 ? '' : ' (how far off that is, is not known)'}` : '') + (doubts.length ? `. Doubts in view: ${doubts.join(', ')}.` : '.');
+    (last ? `; ${shown(last[POURED])}${last[SD] > 0 ? ` ± ${shown(last[SD])}` : ''} ml poured${last[SD] > 0 ? '' : ' (how far off that is, is not known)'}` : '') + (doubts.length ? `. Doubts in view: ${doubts.join(', ')}.` : '.');
 }
 
 // A pour: goal, what is foreseen, confirm.
@@ -197,6 +198,14 @@ function scale(file, goal, done, estimate = NaN) {
   return form;
 }
 
+/** How far a pour is off its goal by the estimate. Where liquid may have left unseen, what is missing is less, or nothing. */
+function offGoal({ poured_ml: poured, poured_sd_ml: sd, goal_ml: goal, unseen }) {
+  const off = shown(Math.abs(poured - goal)), doubt = sd > 0 ? ` ± ${shown(sd)}` : '';
+  if (!unseen) return `By the estimate it is ${off}${doubt} ml ${poured < goal ? 'short of' : 'over'} the goal.`;
+  return poured < goal ? `More may have left than was seen: at most ${off}${doubt} ml are missing. Weigh it before anything is added.`
+    : `It is at least ${off}${doubt} ml over the goal.`;
+}
+
 let resultOf = 0;
 /** The result of the newest pour or recording, once. */
 function result() {
@@ -211,7 +220,7 @@ function result() {
   const head = curve ? `Curve recorded in ${shown(newest.seconds)} s` : `${newest.poured} ml poured of ${goalWords(goal)} ml`;
   const body = [el('p', { className: 'big' }, head),
     el('p', { className: newest.done ? 'good' : 'bad' }, newest.done ? `✓ Done after ${shown(newest.seconds)} s.` : `✕ It ended early: ${newest.reason}.`)];
-  if (!curve) body.push(el('p', {}, `By the estimate it is ${shown(Math.abs(newest.poured_ml - goal))} ml ${newest.poured_ml < goal ? 'short of' : 'over'} the goal.`));
+  if (!curve) body.push(el('p', {}, offGoal(newest)));
   const after = el('div');
   if (newest.file) {
     after.append(scale(newest.file, goal, (grams, error) => {

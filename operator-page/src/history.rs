@@ -76,6 +76,7 @@ fn line(path: &Path) -> Value {
             let texts = |wrong| about.iter().filter(|r| r.is_wrong == wrong).map(|r| r.text.as_str()).collect::<Vec<_>>();
             all["file"] = json!(name);
             all["error_ml"] = json!(episode.error_ml());
+            all["poured_ml"] = json!(episode.info.poured_ml);
             all["wrong"] = json!(texts(true));
             all["notes"] = json!(texts(false));
             all

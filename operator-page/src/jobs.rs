@@ -40,10 +40,17 @@ fn words(path: &Path) -> String {
     path.display().to_string()
 }
 
-/// The words of a plan. Which goals it is for is left to the command, which takes them from the configuration.
-fn plan_arguments(config: String, of: Vec<String>, holds_ml: Option<f64>) -> Vec<String> {
+/// The words of a plan or a check. Which goals it is for, and what the vessel holds if nobody says it, is left to the command, which takes them from the
+/// configuration.
+fn arguments_of(command: &str, config: String, of: Vec<String>, holds_ml: Option<f64>) -> Vec<String> {
     let holds = holds_ml.iter().flat_map(|ml| ["--holds".into(), ml.to_string()]);
-    ["plan".into(), "--json".into(), "--config".into(), config].into_iter().chain(of).chain(holds).collect()
+    [command.into(), "--json".into(), "--config".into(), config].into_iter().chain(of).chain(holds).collect()
+}
+
+/// The names of which there still is a doubt. A weight that was corrected after it was judged is doubted no more, and then nobody has left it out.
+fn standing(doubts: &[Value], mut names: Vec<String>) -> Vec<String> {
+    names.retain(|name| doubts.iter().any(|d| d[0] == name.as_str()));
+    names
 }
 
 impl Jobs {
@@ -108,11 +115,10 @@ impl Jobs {
                 let mut check = Value::Null;
                 if weighed > 0 {
                     step(Step { stage: "looking at the episodes".into(), ..Step::default() });
-                    let arguments = [vec!["check".into(), "--json".into()], of.clone()].concat();
-                    check = programs::run("trainer", &arguments, stop, |_| {})?.0;
+                    check = programs::run("trainer", &arguments_of("check", config.clone(), of.clone(), holds_ml), stop, |_| {})?.0;
                 }
                 step(Step { stage: "planning".into(), ..Step::default() });
-                let plan = programs::run("trainer", &plan_arguments(config, of, holds_ml), stop, |_| {})?.0;
+                let plan = programs::run("trainer", &arguments_of("plan", config, of, holds_ml), stop, |_| {})?.0;
                 Ok(json!({ "plan": plan["plan"], "check": check, "episodes": weighed }))
             }),
         )
@@ -137,10 +143,11 @@ impl Jobs {
             "learn",
             Box::new(move |stop, step| {
                 step(Step { stage: "looking at the episodes".into(), ..Step::default() });
-                let (check, _) = programs::run("trainer", &[vec!["check".into(), "--json".into()], files.clone()].concat(), stop, |_| {})?;
+                let (check, _) = programs::run("trainer", &arguments_of("check", config.clone(), files.clone(), None), stop, |_| {})?;
                 let of_set = |d: &&Value| d[0] == "data set";
-                let judged = |name: &str| name == "data set" || accept.iter().chain(&leave_out).any(|n| n == name);
                 let doubts = check["doubts"].as_array().cloned().unwrap_or_default();
+                let [accept, leave_out] = [accept, leave_out].map(|names| standing(&doubts, names));
+                let judged = |name: &str| name == "data set" || accept.iter().chain(&leave_out).any(|n| n == name);
                 let remarks: Vec<Value> = doubts.iter().filter(of_set).map(|d| d[1].clone()).collect();
                 let open: Vec<Value> = doubts.into_iter().filter(|d| !judged(d[0].as_str().unwrap_or(""))).collect();
                 if !open.is_empty() {
@@ -152,7 +159,9 @@ impl Jobs {
                 arguments.extend(leave_out.iter().map(|name| format!("--leave-out={name}")));
                 let (report, _) = programs::run("trainer", &arguments, stop, step)?;
                 let learned = report["episodes"].as_array().map_or(0, Vec::len);
-                Ok(json!({ "identity": report["identity"], "episodes": learned, "left_out": report["left_out"], "remarks": remarks }))
+                let mut left_out = report["left_out"].as_array().cloned().unwrap_or_default();
+                left_out.extend(leave_out.iter().map(|name| json!([name, "you have answered so"])));
+                Ok(json!({ "identity": report["identity"], "episodes": learned, "left_out": left_out, "remarks": remarks }))
             }),
         )
     }
@@ -182,11 +191,18 @@ impl Jobs {
 mod tests {
     use super::*;
 
+    /// Protects whoever corrects a weight that was doubted: the answer from before leaves the episode out no more.
+    #[test]
+    fn an_answer_counts_while_its_doubt_stands() {
+        let doubts = [json!(["b.mcap", "odd"]), json!(["data set", "few"])];
+        assert_eq!(standing(&doubts, vec!["a.mcap".into(), "b.mcap".into()]), ["b.mcap"]);
+    }
+
     /// Protects who plans on the page from another proposal than that of the command line: both take the largest goal from the configuration, which may
     /// be far beyond a cup.
     #[test]
     fn a_plan_is_for_the_goals_of_the_command() {
-        let words = plan_arguments("cell.toml".into(), vec!["a.mcap".into()], Some(500.0));
+        let words = arguments_of("plan", "cell.toml".into(), vec!["a.mcap".into()], Some(500.0));
         assert_eq!(words, ["plan", "--json", "--config", "cell.toml", "a.mcap", "--holds", "500"]);
     }
 }

@@ -127,47 +127,49 @@ impl Client {
     }
 }
 
-/// Why a pour could not be followed to its end. The command that follows it finds the words.
-#[derive(Debug)]
-pub enum FollowError {
-    /// Somebody pressed Ctrl-C; this is how the pour then ended.
-    Interrupted(Outcome),
-    /// The controller is no longer there.
-    Client(ClientError),
-}
-
-impl From<ClientError> for FollowError {
-    fn from(e: ClientError) -> Self {
-        Self::Client(e)
-    }
-}
-
 impl Client {
-    /// Shows the progress of `episode` on standard error until it has ended. Once `interrupted` is true, by Ctrl-C, it is aborted.
-    pub fn follow(&self, episode: u64, interrupted: &AtomicBool) -> Result<Outcome, FollowError> {
+    /// Asks for an abort at the stop socket, which works where shared memory does not. Whether anybody answers there.
+    pub fn abort_by_socket(&self) -> bool {
+        Target::from(self.place.clone()).ask("abort").is_some()
+    }
+
+    /// Shows the progress of `episode` on standard error until it has ended, and tells how, and whether it was interrupted. Once `interrupted` is true, by
+    /// Ctrl-C, it is aborted. A controller that does not answer once goes on, and is asked again.
+    pub fn follow(&self, episode: u64, interrupted: &AtomicBool) -> Result<(Outcome, bool), ClientError> {
         let bar = indicatif::ProgressBar::new(1000);
         bar.set_style(ProgressStyle::with_template("{bar:30} {msg}").unwrap_or_else(|_| ProgressStyle::default_bar()));
-        let (mut aborted, mut unknown) = (false, 0);
+        let (mut aborted, mut unknown, mut answered) = (false, 0, true);
         loop {
             if interrupted.load(Ordering::Relaxed) && !aborted {
-                // The stop socket works where shared memory does not.
-                if Target::from(self.place.clone()).ask("abort").is_none() {
+                if !self.abort_by_socket() {
                     self.ask(&Request::Abort)?;
                 }
                 aborted = true;
             }
-            let status = self.status()?;
+            let status = match self.status() {
+                Err(ClientError::NoAnswer { .. }) if std::mem::replace(&mut answered, false) => continue,
+                status => status?,
+            };
+            answered = true;
             if let Some(outcome) = status.outcomes.iter().find(|o| o.episode == episode) {
                 bar.finish_and_clear();
-                return if aborted { Err(FollowError::Interrupted(*outcome)) } else { Ok(*outcome) };
+                return Ok((*outcome, aborted));
             }
             // The answer that an episode has started may come a little before the first tick that shows it.
             unknown = if status.episode == episode { 0 } else { unknown + 1 };
             if unknown > UNKNOWN_MAX {
-                return Err(ClientError::Forgotten(episode).into());
+                return Err(ClientError::Forgotten(episode));
             }
             bar.set_position((1000.0 * (status.poured_ml / status.goal_ml).clamp(0.0, 1.0)) as u64);
-            bar.set_message(format!("alpha {:5.1} deg  poured {:5.1} ml  d {:5.1} ml", status.alpha_deg, status.poured_ml, status.d_ml));
+            // A curve has no goal, and nobody counts what it pours.
+            if status.goal_ml.is_finite() {
+                bar.set_message(format!(
+                    "alpha {:5.1} deg  poured {:5.1} ml  d {:5.1} ml",
+                    status.alpha_deg, status.poured_ml, status.d_ml
+                ));
+            } else {
+                bar.set_message(format!("alpha {:5.1} deg", status.alpha_deg));
+            }
             std::thread::sleep(Duration::from_millis(100));
         }
     }

@@ -165,11 +165,57 @@ fn a_dead_or_hanging_process_ends_upright() {
     cell.signal("rt-controller", Signal::STOP);
     std::thread::sleep(Duration::from_millis(3000));
     cell.signal("rt-controller", Signal::CONT);
+    // The command asks again, and says how it ended.
     let output = pour.wait_with_output().expect("it ran");
-    assert_ne!(output.status.code(), Some(0));
+    assert_eq!(output.status.code(), Some(4), "{}", String::from_utf8_lossy(&output.stderr));
     let status = cell.wait("recovery", Duration::from_secs(15), |s| s["phase"] == "idle");
     assert!(status["alpha_measured_deg"].as_f64().is_some_and(|a| a.abs() < 1.0));
     let outcomes = status["outcomes"].as_array().expect("a list");
     let last = &outcomes[outcomes.len() - 1]["reason"];
     assert!(["controller-overrun", "robot-lost", "program-stopped"].iter().any(|r| last == r), "{last}");
+}
+
+/// Protects people where the controller hangs for longer: the command that waits for the pour says that the robot has to be looked at.
+#[test]
+fn an_order_that_nobody_answers_is_no_quiet_end() {
+    let mut cell = CellUnderTest::start(|_| {});
+    cell.take_weights(&steady_weights(TILT_OUT));
+    let pour = cell.pour_tilted();
+    cell.signal("rt-controller", Signal::STOP);
+    let output = pour.wait_with_output().expect("it ran");
+    cell.signal("rt-controller", Signal::CONT);
+    let said = String::from_utf8_lossy(&output.stderr);
+    assert!(output.status.code() == Some(3) && said.contains("look at the robot"), "{said}");
+}
+
+/// Protects whoever presses Ctrl-C, or has given the weight before: what is known of the pour and of its file is said all the same, and that the weight is
+/// not in it. A fill that is less than the goal begins nothing.
+#[test]
+fn what_is_known_of_an_interrupted_order_is_said() {
+    let mut cell = CellUnderTest::start(|_| {});
+    cell.take_weights(&steady_weights(TILT_OUT));
+    let interrupt = |order: &std::process::Child| {
+        let pid = rustix::process::Pid::from_child(order);
+        rustix::process::kill_process(pid, Signal::INT).expect("it runs");
+    };
+    let less = cell.command("rt-controller", &["pour", "20", "--fill", "10"]);
+    let said = String::from_utf8_lossy(&less.stderr);
+    assert!(less.status.code() == Some(2) && said.contains("there is less in the vessel"), "{said}");
+
+    let pour = cell.pour_tilted();
+    interrupt(&pour);
+    let output = pour.wait_with_output().expect("it ran");
+    let result: serde_json::Value = serde_json::from_slice(&output.stdout).expect("JSON");
+    assert_eq!((output.status.code(), &result["outcome"]["reason"]), (Some(130), &"aborted".into()));
+    assert!(result["episode_file"].is_string(), "{result}");
+
+    let curve = cell.begin("rt-controller", &["record", "--lambda", "60", "--gamma", "0.3", "--weight", "83"]);
+    cell.wait("the curve", Duration::from_secs(10), |s| s["phase"] == "recording" && s["alpha_deg"].as_f64() > Some(10.0));
+    interrupt(&curve);
+    let output = curve.wait_with_output().expect("it ran");
+    let [told, said] = [&output.stdout, &output.stderr].map(|text| String::from_utf8_lossy(text).into_owned());
+    assert!(
+        output.status.code() == Some(130) && told.contains("recorded: ") && said.contains("the weight is not written"),
+        "{told} {said}"
+    );
 }

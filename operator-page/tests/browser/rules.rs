@@ -124,6 +124,16 @@ fn what_is_shown_and_typed_is_meant() {
     let deviation = "points = [1, 2].map(k => [k, k, 10, 10, 5, 0, 3, 75, 0, 2, 4, 80]); plots(); return $('plots-words').textContent";
     assert!(text(deviation).contains("75.0 ml poured (how far off that is, is not known)"));
 
+    // A curve has no goal, and nobody counts what it pours. Where liquid may have left unseen, nobody knows what is missing.
+    let curve = "points = [1, 2].map(k => [k, k, 10, 10, 5, 0, 3, 0, 0, 2, 4, NaN]); plots(); return $('plots-words').textContent";
+    assert!(!text(curve).contains("poured"), "{}", text(curve));
+    let off = |poured: f64, unseen: bool| {
+        text(&format!("return offGoal({{ poured_ml: {poured}, poured_sd_ml: 1.2, goal_ml: 75, unseen: {unseen} }})"))
+    };
+    assert!(off(20.0, false).contains("55.0 ± 1.2 ml short of the goal"), "{}", off(20.0, false));
+    assert!(off(20.0, true).contains("at most 55.0 ± 1.2 ml are missing"), "{}", off(20.0, true));
+    assert!(off(90.0, true).contains("at least 15.0 ± 1.2 ml over"), "{}", off(90.0, true));
+
     // A weight is not overwritten, and what is far from the estimate is asked for twice.
     let weigh =
         |shown: &str| text(&format!("return told(post('/api/weigh', {{ file: 'episode-0002.mcap', grams: 75, shown_g: {shown} }}))"));
@@ -135,6 +145,9 @@ fn what_is_shown_and_typed_is_meant() {
     let far = "window.sent = []; const form = scale('episode-0002.mcap', 50, () => {}, 50); form.querySelector('input').value = '5,1'; form.onsubmit(new Event('submit'));
         return form.textContent + window.sent.length";
     assert!(text(far).contains("enter it again") && text(far).ends_with('0'), "{}", text(far));
+    let later = "window.sent = []; const row = rowToWeigh({ file: 'episode-0001.mcap', run: { kind: 'pour', goal_ml: 12.5 }, poured_ml: 12 });
+        row.querySelector('input').value = '120'; row.querySelector('form').onsubmit(new Event('submit')); return row.textContent + window.sent.length";
+    assert!(text(later).contains("enter it again") && text(later).ends_with('0'), "{}", text(later));
 
     // What is typed stays while another episode comes, and what is not listed is said.
     browser.click("#tab-learn");

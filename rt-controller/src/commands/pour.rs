@@ -9,7 +9,7 @@ use shared::plural::counted;
 use shared::weights::Weights;
 
 use super::resume;
-use crate::client::{self, Client, Common, FollowError};
+use crate::client::{self, Client, ClientError, Common};
 use crate::foreseen;
 
 /// A pour that is expected to be off by more than this is warned of, ml: wanted by the users.
@@ -39,9 +39,9 @@ pub fn run(args: &Args) -> Result<(), Failure> {
         eprintln!("{line}");
     }
     let request = Request::Pour { goal_ml: args.goal_ml, flows_by_deg: foreseen.flows_by_deg };
-    let (outcome, recorded) = order(&config.cell, &request)?;
-    report(&outcome, recorded, foreseen.sd_ml, args.common.json);
-    ended(&outcome)
+    let ended = order(&config.cell, &request)?;
+    report(&ended, foreseen.sd_ml, args.common.json);
+    ended.as_result()
 }
 
 /// What is known of a pour before it starts.
@@ -66,6 +66,14 @@ impl Foreseen {
         let status = Client::connect_or_end(&config.cell).or_exit(exit::UNREACHABLE)?.status().or_exit(exit::UNREACHABLE)?;
         let weights = Weights::read(&config.controller.weights).ok().filter(|w| w.identity() == status.weights);
         let foreseen = Self::with(weights.as_ref(), config, args.goal_ml, args.fill);
+        if args.fill.is_some_and(|ml| ml < f64::from(args.goal_ml)) {
+            let what = "--fill: there is less in the vessel than is to be poured: fill it, or give a smaller goal";
+            return Err(failure(exit::BAD_INPUT, what));
+        }
+        if args.fill.is_some() && weights.is_none() {
+            let what = "--fill: controller.weights is not the file that the controller has taken, so what is in the vessel cannot be used: leave it out";
+            return Err(failure(exit::BAD_INPUT, what));
+        }
         if args.fill.is_some() && foreseen.flows_by_deg.is_none() {
             let what = "--fill: the controller's weights do not say by which tilt this fill flows: give what really is in the vessel, or train \
                         with --estimate fused";
@@ -121,31 +129,50 @@ impl Foreseen {
     }
 }
 
-/// Fails unless the pour or recording ended with `Done`.
-pub(crate) fn ended(outcome: &Outcome) -> Result<(), Failure> {
-    match outcome.reason {
-        EndReason::Done => Ok(()),
-        reason => Err(failure(exit::ENDED_EARLY, format!("ended early: {}", reason.words()))),
+/// A pour or recording that has ended.
+pub(crate) struct Ended {
+    pub(crate) outcome: Outcome,
+    /// What the recorder says, if there is one.
+    pub(crate) recorded: Option<client::Recorded>,
+    /// Whether somebody has pressed Ctrl-C.
+    interrupted: bool,
+}
+
+impl Ended {
+    /// Fails unless the pour or recording ended with `Done`, and nobody interrupted it.
+    pub(crate) fn as_result(&self) -> Result<(), Failure> {
+        match self.outcome.reason {
+            _ if self.interrupted => Err(failure(exit::INTERRUPTED, interrupted_line(&self.outcome))),
+            EndReason::Done => Ok(()),
+            reason => Err(failure(exit::ENDED_EARLY, format!("ended early: {}", reason.words()))),
+        }
     }
 }
 
+/// The failure of an order that nobody answers any more. Whether it goes on is not known then, so it is stopped by the way that needs no shared memory.
+fn unanswered(client: &Client, e: ClientError) -> Failure {
+    let what = match e {
+        ClientError::NoAnswer { .. } if client.abort_by_socket() => format!("{e} The robot may move, so it was asked to stop: look at it"),
+        ClientError::NoAnswer { .. } => format!("{e} Nobody answers at its stop socket either: look at the robot"),
+        e => e.to_string(),
+    };
+    failure(exit::UNREACHABLE, what)
+}
+
 /// Gives an order that moves the container, follows it to its end, and waits for the recorder's report, if there is a recorder.
-pub(crate) fn order(cell: &CellConfig, request: &Request) -> Result<(Outcome, Option<client::Recorded>), Failure> {
+pub(crate) fn order(cell: &CellConfig, request: &Request) -> Result<Ended, Failure> {
     let client = Client::connect_or_end(cell).or_exit(exit::UNREACHABLE)?;
     resume::take_back_if_it_waits(&client)?;
     let recorder = client::RecorderReports::open(cell).ok();
     // From here on Ctrl-C must stop what is ordered. If this fails, it ends this command, and the pour goes on.
     let interrupted = os::stop_at_signals().unwrap_or_default();
-    let episode = match client.ask(request).or_exit(exit::UNREACHABLE)? {
+    let episode = match client.ask(request).map_err(|e| unanswered(&client, e))? {
         Reply::Started { episode } => episode,
         Reply::Refused { reason } => return Err(failure(exit::REFUSED, reason)),
         _ => return Err(failure(exit::UNREACHABLE, client::ClientError::Version)),
     };
-    let outcome = client.follow(episode, &interrupted).map_err(|e| match e {
-        FollowError::Interrupted(outcome) => failure(exit::INTERRUPTED, interrupted_line(&outcome)),
-        FollowError::Client(e) => failure(exit::UNREACHABLE, e),
-    })?;
-    Ok((outcome, recorder.and_then(|r| r.wait(episode))))
+    let (outcome, interrupted) = client.follow(episode, &interrupted).map_err(|e| unanswered(&client, e))?;
+    Ok(Ended { outcome, recorded: recorder.and_then(|r| r.wait(episode)), interrupted })
 }
 
 /// What Ctrl-C has led to. A robot or a camera that was lost on the way upright leaves a pour aborted too, and not all is known then; where all was seen,
@@ -160,7 +187,7 @@ fn interrupted_line(outcome: &Outcome) -> String {
 }
 
 /// Prints how the pour ended.
-fn report(outcome: &Outcome, recorded: Option<client::Recorded>, foreseen_sd_ml: Option<f32>, json: bool) {
+fn report(Ended { outcome, recorded, .. }: &Ended, foreseen_sd_ml: Option<f32>, json: bool) {
     if json {
         let file = recorded.as_ref().and_then(|r| r.file.as_ref().ok());
         println!("{}", serde_json::json!({ "outcome": outcome, "episode_file": file, "foreseen_sd_ml": foreseen_sd_ml }));
@@ -176,7 +203,7 @@ fn report(outcome: &Outcome, recorded: Option<client::Recorded>, foreseen_sd_ml:
             counted(outcome.tick_gaps, "gap"),
             counted(outcome.stale_features, "stale feature")
         );
-        match recorded.map(|r| r.file) {
+        match recorded.as_ref().map(|r| &r.file) {
             Some(Ok(file)) => println!("recorded: {file}\nread the scale, then: feature-worker episodes weigh {file} --weight GRAMS"),
             Some(Err(e)) => println!("not recorded: {e}"),
             None => println!("not recorded: no recorder answered"),

@@ -45,8 +45,9 @@ pub fn run(args: &Args) -> Result<(), Failure> {
     let given_g = args.weight.map(|g| check_reading(g).map_err(|e| format!("--weight {g}: {e}"))).transpose().or_exit(exit::BAD_INPUT)?;
     let own = Curve::from_upright(args.lambda, args.gamma);
     let curve = Curve { beta_s: args.beta.unwrap_or(own.beta_s), ..own };
-    let (outcome, recorded) = pour::order(&config.cell, &Request::Record(curve))?;
-    pour::ended(&outcome)?;
+    let ended = pour::order(&config.cell, &Request::Record(curve))?;
+    ended.as_result().inspect_err(|_| report_early(&ended, &curve, given_g, args.common.json))?;
+    let pour::Ended { outcome, recorded, .. } = ended;
     let file = match recorded.map(|r| r.file) {
         Some(Ok(file)) => file,
         Some(Err(e)) => return Err(failure(exit::FAILED, format!("the curve was run, but not recorded: {e}"))),
@@ -71,6 +72,30 @@ pub fn run(args: &Args) -> Result<(), Failure> {
     Ok(())
 }
 
+/// Says what there is of a curve that was not run to its end: its file, if there is one, and that the weight is not in it.
+fn report_early(ended: &pour::Ended, curve: &Curve, given_g: Option<f64>, json: bool) {
+    let file = ended.recorded.as_ref().and_then(|r| r.file.as_ref().ok());
+    if json {
+        let weight_g = None::<f64>;
+        println!("{}", serde_json::json!({ "outcome": ended.outcome, "curve": curve, "episode_file": file, "weight_g": weight_g }));
+    } else if let Some(file) = file {
+        println!("recorded: {file}");
+    }
+    if given_g.is_some() {
+        eprintln!("note: the weight is not written, because the curve was not run to its end: read the scale again");
+    }
+}
+
+/// A plain decimal number as people type it. 1,250 and 1.250 are a thousand to some and one to others, so neither is taken.
+fn reading(text: &str) -> Result<f64, String> {
+    let grouped = text.split_once([',', '.']).is_some_and(|(whole, rest)| rest.len() == 3 && !whole.is_empty() && whole != "0");
+    if grouped {
+        return Err("a comma or point before exactly three digits is not understood: leave it out, or give other decimals".into());
+    }
+    let weight_g = text.replace(',', ".").parse().map_err(|_| WeightError::NotAReading);
+    weight_g.and_then(check_reading).map_err(|e| format!("{e}, for example 83"))
+}
+
 /// Asks a person for the weight on the scale, if there is one at the terminal; an empty line means that it is given later.
 fn ask_weight() -> Option<f64> {
     let stdin = std::io::stdin();
@@ -86,10 +111,23 @@ fn ask_weight() -> Option<f64> {
         if stdin.lock().read_line(&mut line).is_err() || line.trim().is_empty() {
             return None;
         }
-        let weight_g = line.trim().replace(',', ".").parse().map_err(|_| WeightError::NotAReading);
-        match weight_g.and_then(check_reading) {
+        match reading(line.trim()) {
             Ok(weight_g) => return Some(weight_g),
-            Err(e) => eprintln!("weight '{}': {e}, for example 83", line.trim()),
+            Err(e) => eprintln!("weight '{}': {e}", line.trim()),
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Protects whoever types what a scale shows: what is a thousand to some and one to others is asked for again, as on the page.
+    #[test]
+    fn a_reading_has_one_meaning() {
+        assert_eq!(["83", "83,5", "83.5", "0.125"].map(|text| reading(text).unwrap()), [83.0, 83.5, 83.5, 0.125]);
+        for text in ["1,250", "1.250", "", "-3", "many"] {
+            assert!(reading(text).is_err(), "{text}");
         }
     }
 }
