@@ -192,7 +192,7 @@ fn an_order_that_nobody_answers_is_no_quiet_end() {
 /// not in it. A fill that is less than the goal begins nothing.
 #[test]
 fn what_is_known_of_an_interrupted_order_is_said() {
-    let mut cell = CellUnderTest::start(|_| {});
+    let cell = CellUnderTest::start(|_| {});
     cell.take_weights(&steady_weights(TILT_OUT));
     let interrupt = |order: &std::process::Child| {
         let pid = rustix::process::Pid::from_child(order);
