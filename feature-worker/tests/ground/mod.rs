@@ -197,7 +197,7 @@ fn an_untidy_place_is_no_stream_in_other_colours() -> Result<(), ExtractError> {
     for mut extractor in [colour()?, with_room()?] {
         for i in 0..60 {
             let mut picture = dry(0.0, i)?;
-            lay_over(&mut picture, &[rods.clone()], OTHER)?;
+            lay_over(&mut picture, std::slice::from_ref(&rods), OTHER)?;
             if i >= 40 {
                 lay_over(&mut picture, &[stream(60.0, 50.0)], OWN)?;
             }
