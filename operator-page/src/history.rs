@@ -11,7 +11,7 @@ use std::io::ErrorKind;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, Ordering::Relaxed};
 use std::sync::{Arc, Mutex, MutexGuard};
-use std::time::{Duration, SystemTime};
+use std::time::{Duration, Instant, SystemTime};
 
 use feature_worker::episodes::summary::{remarks, summary};
 use serde_json::{Value, json};
@@ -23,6 +23,8 @@ use crate::lock::locked;
 
 /// Pause between two looks at the directory. Chosen by hand: a person waits for a new episode no longer.
 const BEAT: Duration = Duration::from_millis(500);
+/// Longest wait for files that are still to be read, where all of them count. Chosen by hand: a new one takes some ms, and a person waits no longer.
+const READING: Duration = Duration::from_secs(3);
 /// Number of episodes whose pictures are kept. Chosen by hand: two browsers, one each.
 const OPEN: usize = 2;
 /// Largest sum of the pictures that are kept of an episode, bytes. Chosen by hand: 30 s at 640 x 480 px take a quarter.
@@ -49,7 +51,7 @@ struct Pictures {
 pub struct History {
     directory: PathBuf,
     table: Mutex<BTreeMap<String, Line>>,
-    unread: Mutex<usize>,
+    unread: Mutex<Option<usize>>,
     /// Why the directory cannot be read; empty if it can.
     fault: Mutex<String>,
     open: Mutex<Vec<Arc<Pictures>>>,
@@ -107,14 +109,14 @@ impl History {
             let known = |file: &PathBuf| locked(&self.table).get(&name_of(file)).is_some_and(|l| l.stamp == stamp(file));
             let new: Vec<&PathBuf> = files.iter().filter(|f| !known(f)).collect();
             for (done, file) in new.iter().enumerate() {
-                *locked(&self.unread) = new.len() - done;
+                *locked(&self.unread) = Some(new.len() - done);
                 if stop.load(Relaxed) {
                     return;
                 }
                 let (stamp, value) = (stamp(file), line(file));
                 locked(&self.table).insert(name_of(file), Line { stamp, value });
             }
-            *locked(&self.unread) = 0;
+            *locked(&self.unread) = Some(0);
             locked(&self.table).retain(|name, _| files.iter().any(|f| name_of(f) == *name));
             std::thread::sleep(BEAT);
         }
@@ -135,10 +137,24 @@ impl History {
         found.ok().map(|files| files.into_iter().filter(|f| f.symlink_metadata().is_ok()).collect())
     }
 
-    /// Why nothing can be said of the episodes, if that is so.
+    /// Why nothing can be said of the episodes, if that is so. Files that are still to be read are waited for, for a moment.
     fn readable(&self) -> Result<(), String> {
-        let fault = locked(&self.fault).clone();
-        if fault.is_empty() { Ok(()) } else { Err(fault) }
+        let asked = Instant::now();
+        loop {
+            let fault = locked(&self.fault).clone();
+            if !fault.is_empty() {
+                return Err(fault);
+            }
+            let unread = *locked(&self.unread);
+            if unread == Some(0) {
+                return Ok(());
+            }
+            if asked.elapsed() > READING {
+                let files = unread.map_or("all episodes".into(), |n| format!("{n} episodes"));
+                return Err(format!("there are {files} still to be read: try again in a moment"));
+            }
+            std::thread::sleep(BEAT / 10);
+        }
     }
 
     /// The table in the order of the files' numbers, and how many files are still to be read. `ends` says how episodes ended.
@@ -155,7 +171,7 @@ impl History {
         let mut lines: Vec<(&String, &Line)> = table.iter().collect();
         lines.sort_by(|(a, _), (b, _)| by_number(a.as_ref(), b.as_ref()));
         let lines: Vec<Value> = lines.into_iter().map(with_end).collect();
-        json!({ "episodes": lines, "unread": *locked(&self.unread), "directory": self.directory.display().to_string(), "fault": *locked(&self.fault) })
+        json!({ "episodes": lines, "unread": locked(&self.unread).unwrap_or(0), "directory": self.directory.display().to_string(), "fault": *locked(&self.fault) })
     }
 
     /// A word that changes when the table does: from all names and stamps, how much is unread, and why the directory cannot be read.
@@ -333,6 +349,20 @@ mod tests {
         let table = history.table(&Ends::default());
         let listed: Vec<&str> = table["episodes"].as_array().unwrap().iter().map(|e| e["file"].as_str().unwrap()).collect();
         assert_eq!(listed, names);
+    }
+
+    /// Protects who learns just after the start: the newest of the episodes that were read so far are not the newest ones.
+    #[test]
+    fn what_is_half_read_is_not_learned_from() {
+        let dir = tempfile::tempdir().unwrap();
+        let history = History::new(dir.path().to_path_buf());
+        for (unread, says) in [(None, Some("all episodes")), (Some(3), Some("3 episodes")), (Some(0), None)] {
+            *locked(&history.unread) = unread;
+            match says {
+                Some(says) => assert!(history.to_learn(Some(5)).unwrap_err().contains(says)),
+                None => assert!(history.to_learn(Some(5)).is_ok() && history.for_plan().is_ok()),
+            }
+        }
     }
 
     /// Protects who judges weights by the scale: a pour that was stopped at 10 of 100 ml is no error of 90 ml, in the table and before the next pour; one that

@@ -154,7 +154,10 @@ pub fn pour(site: &Site, stops: u64, goal_ml: f32, fill_ml: Option<f64>, shown: 
         return Err(foreseen.lines.join(" "));
     }
     as_shown(&foreseen, shown)?;
-    take_back_if_it_waits(site)?;
+    if take_back_if_it_waits(site)? {
+        // That takes seconds, in which other weights may have come. The line that the robot waited is no longer foreseen.
+        as_shown(&Foreseen { lines: foreseen.lines.clone(), ..foresee(site, goal_ml, fill_ml) }, shown)?;
+    }
     order(site, stops, Request::Pour { goal_ml, flows_by_deg: foreseen.flows_by_deg })
 }
 
@@ -220,12 +223,13 @@ pub fn resume(site: &Site) -> Result<(), String> {
     }
 }
 
-fn take_back_if_it_waits(site: &Site) -> Result<(), String> {
+/// Takes the robot back if it waits for its operator. Whether it did.
+fn take_back_if_it_waits(site: &Site) -> Result<bool, String> {
     let waits = {
         let live = site.cell.live();
         live.phase() == Some(Phase::NoRobot) && live.status.as_ref().is_some_and(|s| s.robot == RobotLink::WaitsForOperator)
     };
-    if waits { resume(site) } else { Ok(()) }
+    if waits { resume(site).map(|()| true) } else { Ok(false) }
 }
 
 /// Writes the scale's reading into an episode of which the page shows the weight `shown_g`. Another weight than that is not replaced.
