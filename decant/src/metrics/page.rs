@@ -38,8 +38,8 @@ pub struct Seen {
     pub status: Option<Box<Status>>,
     /// Results since this program started, by reason.
     pub ended: BTreeMap<&'static str, u64>,
-    /// By how much the weighed pours missed their goals, ml, the oldest first.
-    pub errors_ml: Vec<f64>,
+    /// By how much the weighed pours missed their goals, ml, the oldest first; `None` if the episodes cannot be read.
+    pub errors_ml: Option<Vec<f64>>,
     /// Free space, bytes, by what lies there.
     pub free_bytes: Vec<(&'static str, u64)>,
 }
@@ -71,7 +71,7 @@ impl Collector for Seen {
         page.counters("decant_ended", "Pours and recordings that ended since this program started", "reason", &ended)?;
         let free: Vec<(&str, f64)> = self.free_bytes.iter().map(|(name, bytes)| (*name, *bytes as f64)).collect();
         page.gauges("decant_free", "Free space where this lies", Some(Unit::Bytes), "of", &free)?;
-        weighed(&mut page, &self.errors_ml)
+        self.errors_ml.as_ref().map_or(Ok(()), |errors_ml| weighed(&mut page, errors_ml))
     }
 }
 
@@ -97,7 +97,7 @@ fn state(page: &mut Page, s: &Status) -> std::fmt::Result {
     let volumes = [("goal", s.goal_ml), ("poured", s.poured_ml), ("deviation", s.poured_sd_ml)];
     let known = s.goal_ml.is_finite();
     let volumes: Vec<(&str, f64)> = volumes.iter().filter(|_| known).map(|(name, ml)| (*name, f64::from(*ml))).collect();
-    page.gauges("decant_pour", "The pour under way, or the last one", Some(Unit::Other("ml".into())), "of", &volumes)
+    page.gauges("decant_pour", "The pour under way", Some(Unit::Other("ml".into())), "of", &volumes)
 }
 
 /// Everything that only grows.
@@ -211,7 +211,7 @@ mod tests {
     #[test]
     fn what_may_fall_is_a_gauge() {
         let errors_ml = vec![50.2 - 50.0, 47.0 - 50.0, 120.0 - 50.0];
-        let seen = Seen { cell: "lab".into(), status: None, ended: BTreeMap::new(), errors_ml, free_bytes: Vec::new() };
+        let seen = Seen { cell: "lab".into(), status: None, ended: BTreeMap::new(), errors_ml: Some(errors_ml), free_bytes: Vec::new() };
         let text = text(seen).unwrap();
         assert!(text.contains("# TYPE decant_weighed_pours gauge\n") && !text.contains(" histogram\n"), "{text}");
         for (le, n) in [("0.5", "1.0"), ("2.0", "1.0"), ("3.0", "2.0"), ("50.0", "2.0"), ("+Inf", "3.0")] {

@@ -1,9 +1,10 @@
 //! The pours that somebody weighed: how far each was from its goal.
 //!
 //! A thread of its own reads each episode once, and again when its file has changed; it allocates and waits for the disk. A file that cannot be
-//! read is left out.
+//! read is left out. Of a directory that cannot be read nothing is told.
 
 use std::collections::BTreeMap;
+use std::io::ErrorKind;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, Ordering::Relaxed};
 use std::sync::{Mutex, PoisonError};
@@ -21,17 +22,25 @@ pub const EPISODES: usize = 300;
 /// When a file was written, and its length.
 type Stamp = (Option<SystemTime>, u64);
 
-/// By how much the weighed pours of the newest episodes missed their goals, ml; shared between threads.
+/// The weighed pours of the newest episodes; shared between threads.
 #[derive(Debug, Default)]
-pub struct Weighed(Mutex<BTreeMap<PathBuf, (Stamp, Option<f64>)>>);
+pub struct Weighed {
+    /// By how much each missed its goal, ml.
+    known: Mutex<BTreeMap<PathBuf, (Stamp, Option<f64>)>>,
+    /// Whether the directory cannot be read.
+    unreadable: AtomicBool,
+}
 
 impl Weighed {
-    /// By how much the weighed pours missed their goals, ml, the oldest first; those that ended early do not count.
-    pub fn errors_ml(&self) -> Vec<f64> {
-        let known = self.0.lock().unwrap_or_else(PoisonError::into_inner);
+    /// By how much the weighed pours missed their goals, ml, the oldest first; those that ended early do not count. `None` if the episodes cannot be read.
+    pub fn errors_ml(&self) -> Option<Vec<f64>> {
+        if self.unreadable.load(Relaxed) {
+            return None;
+        }
+        let known = self.known.lock().unwrap_or_else(PoisonError::into_inner);
         let mut errors_ml: Vec<(&PathBuf, f64)> = known.iter().filter_map(|(path, (_, error_ml))| Some((path, (*error_ml)?))).collect();
         errors_ml.sort_by(|(a, _), (b, _)| by_number(a, b));
-        errors_ml.into_iter().map(|(_, error_ml)| error_ml).collect()
+        Some(errors_ml.into_iter().map(|(_, error_ml)| error_ml).collect())
     }
 
     /// Looks at the episodes in `directory` again and again, until `stop` is set.
@@ -49,10 +58,17 @@ impl Weighed {
 
     /// Reads what is new in `directory`.
     pub fn look(&self, directory: &Path, stop: &AtomicBool) {
-        let mut paths = find_episodes(&[directory.to_path_buf()]).unwrap_or_default();
+        let locked = || self.known.lock().unwrap_or_else(PoisonError::into_inner);
+        let found = match directory.read_dir() {
+            // Nothing has been recorded yet.
+            Err(e) if e.kind() == ErrorKind::NotFound && locked().is_empty() => Some(Vec::new()),
+            Err(_) => None,
+            Ok(_) => find_episodes(&[directory.to_path_buf()]).ok(),
+        };
+        self.unreadable.store(found.is_none(), Relaxed);
+        let Some(mut paths) = found else { return };
         // They are in the order of their numbers, which only grow.
         let newest = paths.split_off(paths.len().saturating_sub(EPISODES));
-        let locked = || self.0.lock().unwrap_or_else(PoisonError::into_inner);
         locked().retain(|path, _| newest.contains(path));
         for path in newest {
             let Ok(meta) = path.metadata() else { continue };
@@ -97,6 +113,21 @@ mod tests {
         }
         let weighed = Weighed::default();
         weighed.look(dir.path(), &AtomicBool::new(false));
-        assert_eq!(weighed.errors_ml(), [1.0, 2.0]);
+        assert_eq!(weighed.errors_ml(), Some(vec![1.0, 2.0]));
+    }
+
+    /// Protects who watches a cell whose disk went away: that nothing can be read is not that nothing was weighed.
+    #[test]
+    fn a_directory_that_is_gone_is_not_empty() {
+        let dir = tempfile::tempdir().unwrap();
+        let (weighed, stop, directory) = (Weighed::default(), AtomicBool::new(false), dir.path().join("episodes"));
+        weighed.look(&directory, &stop);
+        assert_eq!(weighed.errors_ml(), Some(Vec::new()), "nothing has been recorded yet");
+        std::fs::create_dir(&directory).unwrap();
+        std::fs::write(directory.join("episode-0001.mcap"), b"no episode").unwrap();
+        weighed.look(&directory, &stop);
+        std::fs::remove_dir_all(&directory).unwrap();
+        weighed.look(&directory, &stop);
+        assert_eq!(weighed.errors_ml(), None);
     }
 }
