@@ -27,7 +27,7 @@ mod video;
 
 pub use capture::{Capture, check_rate};
 pub use files::{Contents, for_each_frame};
-pub use frame::{Frame, FrameSource, FrameStream, NextFrame, SourceError, StreamEvent, WAIT};
+pub use frame::{Frame, FrameSource, FrameStream, NextFrame, SILENT_NS, SourceError, StreamEvent, WAIT};
 pub use numbering::Numbering;
 pub(crate) use pictures::check_size;
 pub use playback::Playback;

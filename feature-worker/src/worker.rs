@@ -20,7 +20,7 @@ use shared::os;
 use shared::speaker::Speaker;
 
 use crate::recorder::Recorder;
-use crate::source::{Frame, FrameStream, Source, SourceError, StreamEvent, WAIT};
+use crate::source::{Frame, FrameStream, SILENT_NS, Source, SourceError, StreamEvent, WAIT};
 use crate::vision::{Extractor, Image, Measurement, PictureTime, RoomBeside, room_beside};
 
 mod republisher;
@@ -209,6 +209,7 @@ struct Worker<'a> {
 struct Newest {
     sequence: u64,
     captured_at_ns: u64,
+    received_at_ns: u64,
 }
 
 impl Worker<'_> {
@@ -233,6 +234,11 @@ impl Worker<'_> {
         let header = frame.header;
         if !self.is_new(&header, received_at_ns) {
             self.status.repeated += 1;
+            // A driver that sends one frame again and again shows nothing, as one that sends none.
+            if !self.status.silent && received_at_ns > self.newest.received_at_ns + SILENT_NS {
+                self.status.silent = true;
+                self.latest.force_push(self.status);
+            }
             return Ok(());
         }
         let measured = self.measure(frame)?;
@@ -296,7 +302,7 @@ impl Worker<'_> {
         if newest.sequence > 0 && header.sequence > newest.sequence + 1 {
             self.status.lost += header.sequence - newest.sequence - 1;
         }
-        self.newest = Newest { sequence: header.sequence, captured_at_ns: header.captured_at_ns };
+        self.newest = Newest { sequence: header.sequence, captured_at_ns: header.captured_at_ns, received_at_ns };
         true
     }
 

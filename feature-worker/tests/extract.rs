@@ -113,17 +113,19 @@ fn each_cause_raises_its_doubt() -> Result<(), ExtractError> {
 /// stream and without one, and the whole pictures between are measured.
 #[test]
 fn a_picture_that_is_not_whole_is_named() -> Result<(), ExtractError> {
-    type Break = fn(&mut [u8], &[u8]);
-    let breaks: [Break; 4] = [
+    type Break = fn(&mut [u8], [&[u8]; 2]);
+    let breaks: [Break; 5] = [
         |rows, _| rows.fill(128),
         |rows, _| rows.chunks_exact_mut(3).for_each(|p| p.copy_from_slice(&[0, 135, 0])),
-        |rows, before| rows.copy_from_slice(before),
+        |rows, [last, _]| rows.copy_from_slice(last),
+        // What a driver's buffer still held.
+        |rows, [_, older]| rows.copy_from_slice(older),
         |rows, _| rows.chunks_exact_mut(640 * 3).for_each(|row| row.rotate_right(24 * 3)),
     ];
     for (kind, broken) in breaks.iter().enumerate() {
         for method in [LiquidMethod::Colour, LiquidMethod::Clear] {
             let mut extractor = Extractor::new(&camera(), &image_config(method))?;
-            let mut before = Vec::new();
+            let mut before = [Vec::new(), Vec::new()];
             for i in 0..44 {
                 let share = ((i - 24) as f32 / 8.0).clamp(0.0, 1.0);
                 let picture = if method == LiquidMethod::Colour { pour((i - 20).max(0))? } else { water(share, None, i)? };
@@ -132,9 +134,9 @@ fn a_picture_that_is_not_whole_is_named() -> Result<(), ExtractError> {
                 let is_broken = i > 22 && i % 3 == 0;
                 if is_broken {
                     let from = 160 * 640 * 3;
-                    broken(&mut pixels[from..], &before[from..]);
+                    broken(&mut pixels[from..], before.each_ref().map(|rows| &rows[from..]));
                 }
-                before = clean;
+                before = [clean, std::mem::take(&mut before[0])];
                 let measured = extractor.measure(Image { width_px: 640, height_px: 480, format: PixelFormat::Bgr8, pixels: &pixels })?;
                 assert_eq!(measured.doubt == Doubt::PictureIncomplete, is_broken, "{kind} {method:?} frame {i}: {measured:?}");
             }

@@ -176,9 +176,16 @@ fn every_frame_becomes_one_feature() -> Outcome {
         let feature = driver.feature(PATIENCE)?.ok_or("no feature")?;
         assert!(feature.sequence == restarted && feature.area_px2 > 0.0, "{feature:?}");
     }
+    // A driver whose camera has stopped, and which sends its last frame again and again, shows nothing.
+    let (begin, at_ns, stopped) = (Instant::now(), now_ns(), pour(20)?);
+    while begin.elapsed() < Duration::from_secs(3) {
+        driver.publish(4, at_ns, bgr, [WIDTH as u32, HEIGHT as u32], stopped.data_bytes()?)?;
+        std::thread::sleep(Duration::from_millis(50));
+    }
     worker.signal("-TERM")?;
     let (code, said) = worker.end()?;
     assert_eq!(code, Some(0), "{said}");
+    assert_eq!(said.matches("no new frames for a second").count(), 1, "{said}");
     assert!(said.contains("image.region_px = [191, 16, 420, 270]") && said.contains("write region_px = [179, 16, 432, 282]"), "{said}");
     Ok(())
 }

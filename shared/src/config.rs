@@ -7,7 +7,7 @@ use std::path::{Path, PathBuf};
 
 use serde::{Deserialize, Serialize};
 
-pub use crate::config_camera::{CameraConfig, CameraSource, Locked, Refused, Setting};
+pub use crate::config_camera::{CameraConfig, CameraSource, Locked, Refused, SETTINGS, Setting};
 pub use crate::config_container::ContainerConfig;
 use crate::config_paths;
 use crate::limits::Limits;
@@ -317,6 +317,7 @@ impl Config {
         check.camera(&self.camera, self.controller.rate_hz)?;
         check.image(&self.image, &self.camera)?;
         check.robot(&self.robot, &self.limits)?;
+        check.way_back(&self.limits, self.controller.rate_hz)?;
         if let Some((key, value, allowed)) = self.container.fault() {
             check.rule(key, &value.to_string(), false, &allowed)?;
         }
@@ -400,6 +401,21 @@ impl Check<'_> {
         )
     }
 
+    /// What still flows on the way back is foreseen for its rate, which a small step of each tick would not reach.
+    fn way_back(&self, limits: &Limits, rate_hz: f64) -> Result<(), ConfigError> {
+        let rate_deg_s = limits.return_rate_deg_s.min(limits.rate_deg_s);
+        let least_deg = f64::from(rate_deg_s) / rate_hz;
+        self.rule(
+            "limits.step_deg",
+            &limits.step_deg.to_string(),
+            f64::from(limits.step_deg) >= least_deg - 1e-3,
+            &format!(
+                "at least {least_deg:.2}: the way upright has {rate_deg_s} degrees/s, the smaller of limits.rate_deg_s and return_rate_deg_s, at \
+                 controller.rate_hz = {rate_hz}"
+            ),
+        )
+    }
+
     fn processes(&self, controller: &ControllerConfig, worker: &WorkerConfig, recording: &RecordingConfig) -> Result<(), ConfigError> {
         self.range("controller.core", controller.core as f64, 0.0, 1023.0)?;
         self.range("controller.priority", controller.priority.into(), 0.0, 99.0)?;
@@ -455,6 +471,7 @@ mod tests {
             ("fps = 30.0", "fps = 30.0\ngain = \"auto\"", ["gain", "Setting"]),
             ("width_px = 640", "width_px = 320", ["image.region_px", "inside 320"]),
             ("register_base = 24", "register_base = 3", ["robot.register_base", "24 to 40"]),
+            ("step_deg = 5.0", "step_deg = 1.0", ["limits.step_deg = 1", "at least 2.00"]),
         ] {
             let said = refusal(from, to);
             for word in ["cell.toml"].iter().chain(&words) {

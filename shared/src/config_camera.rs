@@ -11,6 +11,11 @@ const FPS_MAX: f64 = 240.0;
 /// Most frames for each tick of the loop: half of what a tick takes (`MAX_FEATURES` of the controller's core), so that a late tick loses none.
 const FRAMES_A_TICK: f64 = 4.0;
 
+/// The keys of `[camera]` that set a device's control to a number, and the least and the largest one that is taken. Chosen by hand: wider than those of
+/// cameras, and without what another unit would give.
+pub const SETTINGS: [(&str, [f64; 2]); 4] =
+    [("exposure_ms", [0.01, 1000.0]), ("gain", [0.0, 1e6]), ("white_balance_k", [1000.0, 20_000.0]), ("focus", [0.0, 1e6])];
+
 /// Where frames come from.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
@@ -116,14 +121,10 @@ impl Check<'_> {
         let most_fps = FPS_MAX.min(FRAMES_A_TICK * rate_hz);
         let allowed = format!("1 to {FPS_MAX}, and at most {FRAMES_A_TICK} for each tick of controller.rate_hz");
         self.rule("camera.fps", &camera.fps.to_string(), (1.0..=most_fps).contains(&camera.fps), &allowed)?;
-        for (key, setting, low, high) in [
-            ("camera.exposure_ms", camera.exposure_ms, 0.01, 1000.0),
-            ("camera.gain", camera.gain, 0.0, 1e6),
-            ("camera.white_balance_k", camera.white_balance_k, 1000.0, 20_000.0),
-            ("camera.focus", camera.focus, 0.0, 1e6),
-        ] {
+        let settings = [camera.exposure_ms, camera.gain, camera.white_balance_k, camera.focus];
+        for ((name, [low, high]), setting) in SETTINGS.into_iter().zip(settings) {
             if let Some(Setting::Value(value)) = setting {
-                self.range(key, value, low, high)?;
+                self.range(&format!("camera.{name}"), value, low, high)?;
             }
         }
         if let Some(Setting::Value(value)) = camera.mains_hz {

@@ -8,7 +8,7 @@
 use std::fs::File;
 use std::time::{Duration, Instant};
 
-use shared::config::{CameraConfig, Setting};
+use shared::config::{CameraConfig, SETTINGS, Setting};
 use v4l2r::bindings as v4l2;
 use v4l2r::ioctl::{CtrlId, QueryCtrlFlags, g_ctrl, queryctrl, s_ctrl};
 
@@ -257,11 +257,16 @@ pub fn start_automatics(device: &mut impl Controls, camera: &CameraConfig) -> Ou
     mains
 }
 
-/// Sets the mains' frequency, by which the automatic exposure goes, and switches the automatics of what `camera` locks on: whoever locked it before left
-/// them off, and then they find nothing.
+/// Sets the mains' frequency, by which the automatic exposure goes, and what `camera` gives a value, and switches the automatics of what it locks on: whoever
+/// locked it before left them off, and then they find nothing. A gain is then found for the exposure that is given, and not for another one.
 pub fn start_locked(device: &mut impl Controls, camera: &CameraConfig) {
     // What came of it is said when all is set.
     let _ = apply_mains(device, camera);
+    for (key, setting) in settings(camera) {
+        if let Some(value @ Setting::Value(_)) = setting {
+            let _ = set(device, key, value);
+        }
+    }
     switch_on(device, locked(camera));
 }
 
@@ -276,19 +281,38 @@ fn switch_on(device: &mut impl Controls, keys: impl Iterator<Item = &'static Key
 
 /// Sets what the automatics have found as values, and reads them back.
 pub fn keep_found(device: &mut impl Controls) -> Found {
-    let mut found = Found::default();
+    let (mut found, mut kept) = (Found::default(), Vec::new());
     for key in KEYS.iter().filter(|key| device.query(key.id).is_some_and(|control| !control.read_only)).collect::<Vec<_>>() {
         let Ok(value) = device.get(key.id) else { continue };
         let value = f64::from(value) / key.factor;
+        if let Some((_, [low, high])) = SETTINGS.iter().find(|(name, range)| *name == key.name && !(range[0]..=range[1]).contains(&value)) {
+            found.outcome.refused.push(format!("camera.{} = {value}: the configuration takes {low} to {high}; left as it is", key.name));
+            continue;
+        }
         match set(device, key, Setting::Value(value)) {
-            Ok(said) => {
-                found.values.push((key.name, value));
-                found.outcome.said.push(said);
-            }
+            Ok(said) => kept.push((key, device.get(key.id), value, said)),
             Err(refused) => found.outcome.refused.push(refused),
         }
     }
+    for (key, got, value, said) in kept {
+        match since_changed(device, key, &got) {
+            Some(refused) => found.outcome.refused.push(refused),
+            None => {
+                found.values.push((key.name, value));
+                found.outcome.said.push(said);
+            }
+        }
+    }
     found
+}
+
+/// Why a value that was read back as `got` does not last, if the device has another one now: setting one control may change another.
+fn since_changed(device: &impl Controls, key: &Key, got: &Result<i32, String>) -> Option<String> {
+    let now = device.get(key.id);
+    let shown = |v: &Result<i32, String>| v.as_ref().map_or("no value".into(), |v| (f64::from(*v) / key.factor).to_string());
+    (now != *got).then(|| {
+        format!("camera.{}: it was {}, and is {} since other controls were set; leave one of them out", key.name, shown(got), shown(&now))
+    })
 }
 
 /// Sets the controls that `camera` names, and reads them back.
@@ -313,14 +337,7 @@ pub fn apply(device: &mut impl Controls, camera: &CameraConfig) -> Outcome {
     let mains = apply_mains(device, camera);
     outcome.said.extend(mains.said);
     outcome.refused.extend(mains.refused);
-    // Setting one control may change another that was read back before it.
-    for (key, got) in kept.iter().filter(|(key, got)| device.get(key.id) != *got) {
-        let shown = |v: &Result<i32, String>| v.as_ref().map_or("no value".into(), |v| (f64::from(*v) / key.factor).to_string());
-        let (got, now) = (shown(got), shown(&device.get(key.id)));
-        outcome
-            .refused
-            .push(format!("camera.{}: it was {got}, and is {now} since other controls were set; leave one of them out", key.name));
-    }
+    outcome.refused.extend(kept.iter().filter_map(|(key, got)| since_changed(device, key, got)));
     if let Some(doubt) = doubt_gain(device, camera) {
         outcome.refused.push(doubt);
     }

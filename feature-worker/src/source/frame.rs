@@ -14,7 +14,7 @@ use shared::os;
 /// How long one wait for a frame lasts. Chosen by hand: a request to stop or a silent camera is noticed within a tenth of a second.
 pub const WAIT: Duration = Duration::from_millis(100);
 /// A source without a frame for this long is reported as silent, ns. Chosen by hand: thirty frames of a 30 Hz camera.
-const SILENT_NS: u64 = 1_000_000_000;
+pub const SILENT_NS: u64 = 1_000_000_000;
 
 /// Why there are no frames.
 #[derive(Debug, thiserror::Error)]

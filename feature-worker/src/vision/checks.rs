@@ -53,11 +53,20 @@ const RIM_BLURRED_PX: f32 = 5.6;
 /// background in motion make single pictures look soft. Chosen by hand; tried on the same seeds.
 const RIM_SURELY_BLURRED_PX: f32 = 6.4;
 
-/// Checks the light, and that the picture is not the same as the last one.
+/// So many pictures are remembered to tell one that comes again. Chosen by hand: a driver whose camera has stopped hands out its buffers in turn, and has
+/// no more of them.
+const REMEMBERED: usize = 8;
+/// So many pictures in a row that came before, though not just before, are a camera that has stopped. Chosen by hand: one may be so by chance, where a drawn
+/// scene has no noise.
+const RETURNED: u32 = 3;
+
+/// Checks the light, and that the picture is none that came before.
 #[derive(Default)]
 pub(crate) struct LightCheck {
-    /// Hash of the last picture's bytes; `None` before the first picture.
-    last_hash: Option<u64>,
+    /// Hashes of the last pictures' bytes, the newest first; `None` before the first pictures.
+    hashes: [Option<u64>; REMEMBERED],
+    /// Number of pictures in a row that came before.
+    returned: u32,
     /// Mean levels of blue, green and red in the last picture.
     mean_bgr: [f32; 3],
     /// Whether half of what was read of it is saturated.
@@ -65,11 +74,10 @@ pub(crate) struct LightCheck {
 }
 
 impl LightCheck {
-    /// Why a picture of these BGR pixels cannot be used: it is too dark, blown out, or the same picture as the last one. This is one
+    /// Why a picture of these BGR pixels cannot be used: it is too dark, blown out, or one that came before. This is one
     /// pass, because three OpenCV reductions over the same bytes took longer. `region` is all of the picture that may be read.
     pub(crate) fn doubt(&mut self, bytes: &[u8], region: RegionPixels) -> Option<Doubt> {
-        let hash = hash_of(bytes);
-        let repeated = self.last_hash.replace(hash) == Some(hash);
+        let repeated = self.repeats(hash_of(bytes));
         let (mut sums, mut saturated, mut count) = ([0u32; 3], 0u32, 0u32);
         let mut look = |pixel: &[u8]| {
             let [blue, green, red] = [pixel[0], pixel[1], pixel[2]];
@@ -92,6 +100,22 @@ impl LightCheck {
         } else {
             None
         }
+    }
+
+    /// Takes note of a pause: what comes after it is no buffer that was handed out before, but for the last picture again.
+    pub(crate) fn interrupt(&mut self) {
+        self.hashes[1..].fill(None);
+        self.returned = 0;
+    }
+
+    /// Takes note of a picture with this hash. Returns whether it is the last one again, or one of several in a row that came before.
+    fn repeats(&mut self, hash: u64) -> bool {
+        let came_before = self.hashes.contains(&Some(hash));
+        let just_before = self.hashes[0] == Some(hash);
+        self.returned = if came_before { self.returned + 1 } else { 0 };
+        self.hashes.rotate_right(1);
+        self.hashes[0] = Some(hash);
+        just_before || self.returned >= RETURNED
     }
 
     /// Whether half of what was read of the picture that was checked last is saturated.

@@ -178,6 +178,9 @@ impl Extractor {
     /// grey image is an error where the liquid is told by its colour; the only other errors are OpenCV's.
     pub fn measure_at(&mut self, image: Image, time: PictureTime) -> Result<Measurement, ExtractError> {
         self.follow_on(time)?;
+        // What was seen before is not shown on a picture that is not looked at.
+        self.line.clear();
+        self.edges.clear();
         let expected = image.width_px as usize * image.height_px as usize * image.format.bytes_per_pixel();
         if [image.width_px, image.height_px] != self.size_px || image.pixels.len() != expected {
             return Ok(Measurement::nothing(0.0, Doubt::WrongFormat));
@@ -185,7 +188,6 @@ impl Extractor {
         if !self.liquid.reads(image.format) {
             return Err(ExtractError::NoColour);
         }
-        self.line.clear();
         // The reader lends the region's pixels, so it is taken out of the extractor until the end.
         let mut reader = std::mem::replace(&mut self.reader, RegionReader::new(self.region));
         let measured = self.measure_region(image, &mut reader);
@@ -198,6 +200,7 @@ impl Extractor {
     fn follow_on(&mut self, time: PictureTime) -> Result<(), ExtractError> {
         let pace = self.succession.pace();
         if self.succession.take(time) == Between::Pause {
+            self.light.interrupt();
             self.presence.interrupt();
             self.liquid.interrupt()?;
         }

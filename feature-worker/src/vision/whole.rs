@@ -1,7 +1,7 @@
 //! Whether a picture is whole: decoded to its end, of one moment, and with the glass in its place.
 //!
-//! A picture that was not decoded to its end has rows of one colour. A torn one has rows that are those of the picture before, to the
-//! byte, beside rows that are not. In one whose rows are shifted, the container's left side lies elsewhere, and it never moves in the
+//! A picture that was not decoded to its end has rows of one colour. A torn one has rows that are those of a picture before, to the
+//! byte, beside rows that are not: of the last one, or of an older one where the driver's buffer still held it. In one whose rows are shifted, the container's left side lies elsewhere, and it never moves in the
 //! picture otherwise. Each of them is judged against the pictures before, so that a card without noise or a repeated picture is no reason
 //! for a doubt.
 //!
@@ -24,6 +24,8 @@ const PART_PX: usize = 8;
 const SCENE_FRAMES: u32 = 30;
 /// A picture reaches so far below the lip that its last rows show the glass, px. Chosen by hand.
 const BELOW_LIP_PX: f32 = 20.0;
+/// So many pictures are older than the last one, and may be what a buffer still held. Chosen by hand: drivers have four buffers, seldom more.
+const OLDER: usize = 3;
 /// Of the rows that do not repeat, this share has to be really new for the others to be old ones. Chosen by hand: all of them are where a
 /// sensor's noise is left, and few in a compressed video of a still scene.
 const NEW_ROWS: f32 = 0.8;
@@ -64,9 +66,9 @@ type RowPixels = [[u8; COLUMNS]; 3];
 #[derive(Clone, Copy, Default)]
 struct RowLook {
     one_colour: bool,
-    /// Whether all its pixels are those of the row before, to the byte.
+    /// Whether all its pixels are those of the same row in a picture before, to the byte.
     old: bool,
-    /// Whether most of its pixels are not.
+    /// Whether most of its pixels are not those of the last picture.
     new: bool,
 }
 
@@ -80,6 +82,8 @@ pub(crate) struct WholeCheck {
     reaches_glass: bool,
     /// The pixels of the picture before.
     before: Vec<RowPixels>,
+    /// Hashes of the same rows in the pictures before that one, the newest first.
+    older: Vec<[u64; OLDER]>,
     /// Which rows are of one colour in the picture that was looked at last.
     plain: Vec<bool>,
     /// Which rows were of one colour in the last whole picture.
@@ -102,6 +106,7 @@ impl WholeCheck {
             row_step,
             reaches_glass: height as f32 - 1.0 >= axes.lip_px[1] + BELOW_LIP_PX,
             before: vec![[[0; COLUMNS]; 3]; height / row_step],
+            older: vec![[0; OLDER]; height / row_step],
             plain: vec![false; height / row_step],
             plain_before: vec![false; height / row_step],
             broken: 0,
@@ -119,7 +124,7 @@ impl WholeCheck {
         let (mut most_new_plain, mut most_old) = (0usize, 0usize);
         let (mut rows_new, mut rows_other) = (0usize, 0usize);
         for i in 0..self.before.len() {
-            let look = look_at(pixels.row(i * self.row_step), &self.columns, &mut self.before[i]);
+            let look = look_at(pixels.row(i * self.row_step), &self.columns, &mut self.before[i], &mut self.older[i]);
             self.plain[i] = look.one_colour;
             plain_run = if look.one_colour { plain_run + 1 } else { 0 };
             new_plain_run = if look.one_colour && !self.plain_before[i] { new_plain_run + 1 } else { 0 };
@@ -144,10 +149,18 @@ impl WholeCheck {
     }
 }
 
-/// Looks at a row, and takes it over into `before`. All of its pixels are read before one is judged, so that the processor waits for the
+/// A number that tells rows from each other; never 0, which stands for none.
+#[inline(always)]
+fn hash_of(row: &RowPixels) -> u64 {
+    let mix = |hash: u64, word: u64| (hash ^ word).wrapping_mul(0x9e37_79b9_7f4a_7c15).rotate_left(29);
+    let words = row.as_flattened().as_chunks::<8>().0.iter().map(|bytes| u64::from_le_bytes(*bytes));
+    words.fold(0xcbf2_9ce4_8422_2325, mix) | 1
+}
+
+/// Looks at a row, and takes it over into `before`, and what was there into `older`. All of its pixels are read before one is judged, so that the processor waits for the
 /// picture's memory once and not for each pixel.
 #[inline(always)]
-fn look_at(row: &[u8], columns: &[usize; COLUMNS], before: &mut RowPixels) -> RowLook {
+fn look_at(row: &[u8], columns: &[usize; COLUMNS], before: &mut RowPixels, older: &mut [u64; OLDER]) -> RowLook {
     let mut now = *before;
     for (i, column) in columns.iter().enumerate() {
         if let Some(pixel) = row.get(3 * column..3 * column + 3) {
@@ -161,9 +174,13 @@ fn look_at(row: &[u8], columns: &[usize; COLUMNS], before: &mut RowPixels) -> Ro
         count += tells;
         equal += tells & u8::from((now[0][i] == before[0][i]) & (now[1][i] == before[1][i]) & (now[2][i] == before[2][i]));
     }
+    let held = older.contains(&hash_of(&now));
+    older.rotate_right(1);
+    older[0] = hash_of(before);
     *before = now;
     let (equal, count) = (usize::from(equal), usize::from(count));
-    RowLook { one_colour: is_one_colour(before), old: count >= COLUMNS / 4 && equal == count, new: 2 * (count - equal) > count }
+    let old = count >= COLUMNS / 4 && (equal == count || held);
+    RowLook { one_colour: is_one_colour(before), old, new: !old && 2 * (count - equal) > count }
 }
 
 /// Whether the pixels have one colour.

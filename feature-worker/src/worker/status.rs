@@ -59,7 +59,7 @@ pub struct Status {
     pub took_us: f32,
     /// Time from the newest frame's capture time to publishing its feature, ms.
     pub latency_ms: f32,
-    /// No frame has come for a second.
+    /// No new frame has come for a second.
     pub silent: bool,
 }
 
@@ -143,7 +143,7 @@ impl Changes {
         }
         (self.said, self.at_ns) = (Some(state), now_ns);
         Some(match state {
-            (true, _) => (Level::Warning, "no frames for a second; waiting for the camera driver".into()),
+            (true, _) => (Level::Warning, "no new frames for a second; waiting for the camera driver".into()),
             (false, "none") => (Level::Info, format!("frames are measured, without a doubt; {} were lost so far", status.lost)),
             (false, doubt) => {
                 (Level::Warning, format!("the pictures are doubted: {doubt}; {} of {} so far", status.doubtful, status.frames))

@@ -138,3 +138,22 @@ fn dry_pictures_before_a_pause_do_not_vouch() -> Result<(), ExtractError> {
     core::set_rng_seed(0)?;
     Ok(())
 }
+
+/// Protects the controller from a camera that has stopped while its driver goes on to hand out the buffers in turn: pictures that come again are frozen,
+/// however many there are of them, and so is no dry ground. A new picture ends it, and one that comes again alone is no reason.
+#[test]
+fn buffers_that_come_round_are_frozen() -> Result<(), ExtractError> {
+    for buffers in 1..=8 {
+        let mut extractor = colour()?;
+        let mut doubts = Vec::new();
+        for i in 0..32 {
+            let number = if i < 10 { i } else { 10 - buffers + (i - 10) % buffers };
+            doubts.push(measure(&mut extractor, &blue(&[], number)?)?.doubt);
+        }
+        assert!(doubts[..10].iter().all(|doubt| *doubt != Doubt::Frozen), "{buffers}: {doubts:?}");
+        assert!(doubts[12..].iter().all(|doubt| *doubt == Doubt::Frozen), "{buffers}: {doubts:?}");
+        assert_ne!(measure(&mut extractor, &blue(&[], 100)?)?.doubt, Doubt::Frozen);
+        assert_ne!(measure(&mut extractor, &blue(&[], 9)?)?.doubt, Doubt::Frozen);
+    }
+    Ok(())
+}

@@ -83,9 +83,9 @@ fn the_ground_outlasts_what_hides_it() -> Result<(), ExtractError> {
         }
         // More than the half minute in which what is not seen would be forgotten.
         let pictures: Vec<Mat> =
-            (0..6).map(|i| if white { half_white(i, None) } else { Ok(noisy(&body, i)?) }).collect::<Result<_, ExtractError>>()?;
+            (0..12).map(|i| if white { half_white(i, None) } else { Ok(noisy(&body, i)?) }).collect::<Result<_, ExtractError>>()?;
         for i in 0..1100 {
-            let measured = measure(&mut extractor, &pictures[i % 6])?;
+            let measured = measure(&mut extractor, &pictures[i % 12])?;
             let wanted = if white { Doubt::None } else { Doubt::ColoursChanged };
             assert_eq!((measured.area_px2, measured.doubt), (0.0, wanted), "{white} picture {i} that hides the ground");
         }

@@ -16,6 +16,8 @@ struct Fake {
     frames: std::rc::Rc<std::cell::Cell<i32>>,
     /// What the light of now adds to the exposure that its automatic finds.
     light: i32,
+    /// What its automatic gain finds is so many thousandths of a ms, divided by the exposure in ms.
+    gain_finds: i32,
     /// Setting the first of these halves the value of the second, as far as its range goes.
     couples: Option<[u32; 2]>,
     /// What was set, in order.
@@ -42,6 +44,10 @@ impl Controls for Fake {
     fn get(&self, id: u32) -> Result<i32, String> {
         let value = self.controls.get(&id).map(|c| c[0]).ok_or("invalid")?;
         let automatic = self.controls.get(&v4l2::V4L2_CID_EXPOSURE_AUTO).is_some_and(|c| c[0] != EXPOSURE_MANUAL);
+        let exposure = || self.get(v4l2::V4L2_CID_EXPOSURE_ABSOLUTE).unwrap_or(1);
+        if self.gain_finds > 0 && id == v4l2::V4L2_CID_GAIN && self.controls.get(&v4l2::V4L2_CID_AUTOGAIN).is_some_and(|c| c[0] == 1) {
+            return Ok(self.gain_finds / exposure());
+        }
         let moves = automatic && id == v4l2::V4L2_CID_EXPOSURE_ABSOLUTE && self.frames.get() > 0;
         Ok(if moves { 400 - 10 * self.frames.get().min(25) + self.light } else { value })
     }
@@ -155,6 +161,22 @@ fn each_start_finds_anew() {
     }
 }
 
+/// Protects the colours from start to start: a gain that is locked is found for the exposure that is given, and not for what an automatic had before.
+#[test]
+fn a_locked_gain_is_found_for_the_given_exposure() {
+    let (exposure_ms, gain) = (Some(Setting::Value(8.0)), Some(Setting::Locked(Locked::Locked)));
+    let config = CameraConfig { exposure_ms, gain, ..CameraConfig::default() };
+    for before in [33, 330, 80] {
+        let mut device = Fake { gain_finds: 8000, ..camera() };
+        device.controls.insert(v4l2::V4L2_CID_AUTOGAIN, [0, 0, 1, 1]);
+        device.controls.insert(v4l2::V4L2_CID_EXPOSURE_ABSOLUTE, [before, 3, 2047, 1]);
+        start_locked(&mut device, &config);
+        assert_eq!(settle(&device, &config, LONG, device.grab(2)), Ok(true));
+        assert!(apply(&mut device, &config).refused.is_empty());
+        assert_eq!([v4l2::V4L2_CID_EXPOSURE_ABSOLUTE, v4l2::V4L2_CID_GAIN].map(|id| device.get(id)), [Ok(80), Ok(100)], "{before}");
+    }
+}
+
 /// Protects slow cameras: two looks at a value that rests take a few of their frames, however long these are.
 #[test]
 fn a_slow_camera_comes_to_rest() {
@@ -182,6 +204,21 @@ fn what_the_automatics_find_is_kept() {
     assert!(outcome.refused.len() == 1 && outcome.refused[0].contains("camera.gain"), "{outcome:?}");
     let at = [v4l2::V4L2_CID_EXPOSURE_AUTO, v4l2::V4L2_CID_EXPOSURE_ABSOLUTE, v4l2::V4L2_CID_AUTO_WHITE_BALANCE].map(|id| device.get(id));
     assert_eq!(at, [Ok(1), Ok(150), Ok(0)]);
+}
+
+/// Protects the next start from settings that it would refuse: a value that another one's setting changed, or that the configuration does not take, is not
+/// among what was found.
+#[test]
+fn what_does_not_last_is_not_found() {
+    let mut coupled = Fake { couples: Some([v4l2::V4L2_CID_GAIN, v4l2::V4L2_CID_EXPOSURE_ABSOLUTE]), ..camera() };
+    let Found { values, outcome } = keep_found(&mut coupled);
+    assert_eq!(values, [("gain", 64.0), ("white_balance_k", 4000.0)]);
+    assert!(outcome.refused.len() == 1 && outcome.refused[0].starts_with("camera.exposure_ms: it was 15.6, and is 7.8"), "{outcome:?}");
+    let mut strange = camera();
+    strange.controls.insert(v4l2::V4L2_CID_WHITE_BALANCE_TEMPERATURE, [0, 0, 7, 1]);
+    let Found { values, outcome } = keep_found(&mut strange);
+    assert_eq!(values, [("exposure_ms", 15.6), ("gain", 64.0)]);
+    assert_eq!(outcome.refused, ["camera.white_balance_k = 0: the configuration takes 1000 to 20000; left as it is"]);
 }
 
 /// Protects from a camera that does something else: a control that it lacks, refuses, or sets to another value is a refusal that names

@@ -10,7 +10,7 @@ use crate::vision::pace::Pace;
 /// So many pictures are remembered. Chosen by hand: two seconds.
 const REMEMBERED: u32 = 60;
 /// So many of them may be lost. Chosen by hand: one broken picture is no reason to end a pour.
-const LOST_MOST: u32 = 1;
+const LOST_MOST: usize = 1;
 
 /// For so many pictures a jump of the light counts. Chosen by hand: jumps are told while the background is at rest, and a tilt takes seconds.
 const JUMP_PICTURES: u32 = 100;
@@ -21,8 +21,8 @@ const JUMPS_LEAST: u32 = 150;
 
 /// Remembers what was wrong with the last pictures.
 pub(super) struct Disturbed {
-    /// One bit for each picture that could not be looked at, the last one first.
-    lost: u128,
+    /// How many pictures ago the last ones were that could not be looked at, the newest first.
+    lost_ago: [u32; LOST_MOST + 1],
     /// Why the last of them could not be looked at.
     doubt: Doubt,
     /// For how many pictures the light's jumps still count.
@@ -33,7 +33,7 @@ pub(super) struct Disturbed {
 impl Disturbed {
     /// No picture was lost yet.
     pub(super) fn new() -> Self {
-        Self { lost: 0, doubt: Doubt::None, jumps: 0, pace: Pace::CHOSEN }
+        Self { lost_ago: [u32::MAX; LOST_MOST + 1], doubt: Doubt::None, jumps: 0, pace: Pace::CHOSEN }
     }
 
     /// Says how fast pictures follow each other.
@@ -43,12 +43,14 @@ impl Disturbed {
 
     /// A picture could not be looked at, for this reason.
     pub(super) fn lose(&mut self, doubt: Doubt) {
-        (self.lost, self.doubt) = (self.lost << 1 | 1, doubt);
+        self.pass();
+        self.lost_ago.rotate_right(1);
+        (self.lost_ago[0], self.doubt) = (0, doubt);
     }
 
     /// A picture was looked at; `jumps` says whether its light is another one than that of the picture before.
     pub(super) fn look(&mut self, jumps: bool) {
-        self.lost <<= 1;
+        self.pass();
         self.jumps = self.jumps.saturating_sub(1);
         if jumps {
             self.jumps = (self.jumps + self.pace.pictures(JUMP_PICTURES)).min(self.pace.pictures(JUMPS_MOST));
@@ -57,9 +59,14 @@ impl Disturbed {
 
     /// Why clear water is not told before a pattern now, if there is a reason.
     pub(super) fn doubt(&self) -> Option<Doubt> {
-        let remembered = self.lost & (u128::MAX >> u128::BITS.saturating_sub(self.pace.pictures(REMEMBERED)));
+        let loses = self.lost_ago[LOST_MOST] < self.pace.pictures(REMEMBERED);
         let wanders = (self.jumps > self.pace.pictures(JUMPS_LEAST)).then_some(Doubt::LightFlickers);
-        (remembered.count_ones() > LOST_MOST).then_some(self.doubt).or(wanders)
+        loses.then_some(self.doubt).or(wanders)
+    }
+
+    /// One more picture has passed.
+    fn pass(&mut self) {
+        self.lost_ago.iter_mut().for_each(|ago| *ago = ago.saturating_add(1));
     }
 }
 
@@ -80,6 +87,22 @@ mod tests {
         assert_eq!(disturbed.doubt(), Some(Doubt::Frozen));
         (0..60).for_each(|_| disturbed.look(false));
         assert_eq!(disturbed.doubt(), None);
+    }
+
+    /// Protects fast cameras: one that loses a picture every one and a half seconds is as much in doubt as a slow one.
+    #[test]
+    fn two_seconds_are_two_seconds_for_every_camera() {
+        for hz in [30, 120, 240] {
+            let mut disturbed = Disturbed::new();
+            disturbed.set_pace(Pace::of(hz as f32));
+            for _ in 0..2 {
+                (0..hz * 3 / 2).for_each(|_| disturbed.look(false));
+                disturbed.lose(Doubt::PictureIncomplete);
+            }
+            assert_eq!(disturbed.doubt(), Some(Doubt::PictureIncomplete), "{hz} Hz");
+            (0..hz * 2).for_each(|_| disturbed.look(false));
+            assert_eq!(disturbed.doubt(), None, "{hz} Hz");
+        }
     }
 
     /// Protects pours before a pattern from an exposure that hunts, and not from a lamp that is switched on once.

@@ -163,7 +163,8 @@ impl Light {
         for (k, colour) in self.colours.iter_mut().enumerate() {
             self.ratios.clear();
             self.ratios.extend(self.places.iter().filter_map(|place| place.colour_ratio(k)));
-            *colour = median(&mut self.ratios).max(0.05);
+            // Ground that hardly has a colour does not tell its change.
+            *colour = if self.ratios.len() < PLACES_LEAST { 1.0 } else { median(&mut self.ratios).max(0.05) };
         }
         self.ratios.clear();
         self.ratios.extend(self.bands.iter().map(|(_, gain)| *gain));
