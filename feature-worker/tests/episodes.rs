@@ -51,7 +51,7 @@ fn write_with(directory: &Path, lambda_deg: f32, period_ns: u64, image: impl Fn(
         if n == 20 || n == 21 {
             continue;
         }
-        let area_px2 = if n > 10 { 100.0 + n as f32 } else { 0.0 };
+        let area_px2 = if (11..FRAMES - 4).contains(&n) { 100.0 + n as f32 } else { 0.0 };
         let feature =
             Feature { version: LAYOUT_VERSION, sequence: n + 1, captured_at_ns: at_ns + 5_000_000, area_px2, ..Default::default() };
         let image = (n != DROPPED).then(|| image(n));

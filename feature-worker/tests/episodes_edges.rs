@@ -220,3 +220,18 @@ fn two_changes_at_once_lose_nothing() {
     }
     assert_eq!(std::fs::read_dir(dir.path()).unwrap().count(), 1, "no temporary file is left");
 }
+
+/// Protects what is learned from tables: episodes are in the order in which they began, whatever their numbers, as the newest ones count where something has
+/// changed.
+#[test]
+fn tables_are_in_the_order_of_time() {
+    let dir = tempfile::tempdir().unwrap();
+    let recorded = dir.path().join("recorded");
+    for (number, days) in [(3, 3), (4, 1), (5, 2)] {
+        write_at(&recorded, number, true, UNIX_EPOCH + Duration::from_secs(days * 86_400));
+    }
+    let to = dir.path().join("csv");
+    assert_eq!(code(&episodes(&["export", recorded.to_str().unwrap(), "--as", "csv", "--to", to.to_str().unwrap()])), 0);
+    let tables = shared::episode::read_table(&to.join("features.csv"), &to.join("scale.csv")).unwrap();
+    assert_eq!(tables.iter().map(|e| e.rows[0].area_px2).collect::<Vec<_>>(), [4.0, 5.0, 3.0]);
+}

@@ -366,6 +366,37 @@ fn half_an_episode_is_never_complete() {
     assert_eq!(std::fs::read_dir(dir.path()).unwrap().count(), 2);
 }
 
+/// Protects training from angles that were made up: where the recorder fell behind so far that the controller's ticks are lost, the file is not called
+/// complete, be it in the middle of an episode, at its beginning or at its end. Two lost ticks are bridged.
+#[test]
+fn an_episode_whose_ticks_are_lost_is_never_complete() {
+    const RECORDING: (u64, Phase) = (1, Phase::Recording);
+    let dir = tempfile::tempdir().unwrap();
+    let mut scene = Scene::new(&config("behind", dir.path()));
+    for (lost, before, after) in
+        [(70, RECORDING, RECORDING), (70, (0, Phase::Idle), RECORDING), (70, RECORDING, (0, Phase::Idle)), (2, RECORDING, RECORDING)]
+    {
+        let first = scene.tick;
+        let periods = |scene: &mut Scene, (of, phase): (u64, Phase)| (0..12).for_each(|_| scene.period(of * (first + 1), phase));
+        periods(&mut scene, (0, Phase::Idle));
+        periods(&mut scene, before);
+        scene.tick += lost;
+        periods(&mut scene, after);
+        periods(&mut scene, (0, Phase::Idle));
+        assert_eq!(scene.report().0, RecorderState::Writing);
+        let (state, report) = scene.report();
+        if lost > 2 {
+            assert_eq!(state, RecorderState::Failed, "{before:?} {after:?}");
+            assert!(report.text().contains("fell behind"), "{}", report.text());
+        } else {
+            assert_eq!(state, RecorderState::Complete, "{}", report.text());
+        }
+    }
+    let complete =
+        std::fs::read_dir(dir.path()).unwrap().filter(|entry| Episode::read(&entry.as_ref().unwrap().path()).unwrap().complete).count();
+    assert_eq!(complete, 1);
+}
+
 /// Starts this test binary's [`child`] in a process of its own, after the shell words `before`.
 fn start_child(before: &str, cell: &str, directory: &Path) -> Child {
     Command::new("sh")

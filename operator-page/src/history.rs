@@ -7,7 +7,6 @@
 use std::collections::BTreeMap;
 use std::fs::{self, File};
 use std::hash::{DefaultHasher, Hash as _, Hasher as _};
-use std::io::ErrorKind;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, Ordering::Relaxed};
 use std::sync::{Arc, Mutex, MutexGuard};
@@ -15,7 +14,7 @@ use std::time::{Duration, Instant, SystemTime};
 
 use feature_worker::episodes::summary::{remarks, summary};
 use serde_json::{Value, json};
-use shared::episode::{Episode, EpisodeImages, by_number, find_episodes};
+use shared::episode::{Episode, EpisodeImages, by_number, episodes_so_far};
 use shared::regular_file;
 
 use crate::ends::Ends;
@@ -125,15 +124,10 @@ impl History {
     /// The files in the directory. None if it cannot be read: then the table stays as it was, and the reason is kept. A directory that is not there
     /// yet, because nothing has been recorded, is empty.
     fn files(&self) -> Option<Vec<PathBuf>> {
-        let fail =
-            |e: &dyn std::fmt::Display| format!("the episodes in {} cannot be read ({e}): look at the disk", self.directory.display());
-        let found = match fs::read_dir(&self.directory) {
-            Err(e) if e.kind() == ErrorKind::NotFound && locked(&self.table).is_empty() => Ok(Vec::new()),
-            Err(e) => Err(fail(&e)),
-            Ok(_) => find_episodes(std::slice::from_ref(&self.directory)).map_err(|e| fail(&e)),
-        };
-        let fault = found.as_ref().err().cloned().unwrap_or_default();
-        *locked(&self.fault) = fault;
+        let known = !locked(&self.table).is_empty();
+        let found = episodes_so_far(&self.directory, known);
+        let fault = |e| format!("the episodes in {} cannot be read ({e}): look at the disk", self.directory.display());
+        *locked(&self.fault) = found.as_ref().err().map(fault).unwrap_or_default();
         found.ok().map(|files| files.into_iter().filter(|f| f.symlink_metadata().is_ok()).collect())
     }
 

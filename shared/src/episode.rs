@@ -26,7 +26,6 @@
 //! Format 1, which is still read, had JSON in place of `decant.*`, no annotations, and log times that were CLOCK_MONOTONIC.
 
 use std::collections::BTreeMap;
-use std::collections::btree_map::Entry;
 
 use sha2::{Digest, Sha256};
 
@@ -44,7 +43,12 @@ const UPRIGHT_DEG: f32 = 1.0;
 const BESIDE: usize = 3;
 /// The largest share of a stream's area that pictures may show which the stream leaves. Chosen by hand: where they lack a third of it, the sum of the areas
 /// is then small by 1.7 %, as much as the fit expects the camera's gain to change from pour to pour.
-const CUT_OFF_MAX: f64 = 0.05;
+pub const CUT_OFF_MAX: f64 = 0.05;
+/// From this share of the largest area on a stream in the last frames runs on. Chosen by hand: beads at the lip, which stay, show less.
+const RUNS_ON: f32 = 0.05;
+/// What is wrong with an episode that ends before its stream, see [`Episode::runs_on`].
+const RUNS_ON_WORDS: &str =
+    "the stream was still running in the last frames, so more is on the scale than was seen: record until it has ended";
 /// What is wrong with an episode of which the camera missed a part, see [`Episode::part_unseen`].
 pub const PART_UNSEEN: &str = "the camera did not see part of this pour; its areas do not add up to its weight";
 
@@ -63,7 +67,7 @@ mod weight;
 pub mod write;
 
 pub use number::{by_number, check_number, number_of, take_number};
-pub use read::{EpisodeImage, EpisodeImages, began_at, each_once, find_episodes};
+pub use read::{EpisodeImage, EpisodeImages, began_at, each_once, episodes_so_far, find_episodes};
 pub use records::EpisodeError;
 pub use recover::recover;
 pub use rewrite::{ChangeError, read_at_rest};
@@ -125,6 +129,8 @@ pub struct EpisodeInfo {
     pub weights: String,
     /// How it ended, in words; empty if the recorder was killed.
     pub ended: String,
+    /// Whether it is incomplete only because the file lacks its own end, so that [`recover`] makes a complete one of it.
+    pub recoverable: bool,
     /// What a person wrote about it; mostly empty.
     pub note: String,
     /// The controller's own estimate of what was poured, at its last tick in the file, ml; `None` without a tick.
@@ -154,19 +160,11 @@ impl Episode {
         hash.finalize().into()
     }
 
-    /// Pairs (earlier, later) of indices of `episodes` that hold the same measurement.
-    pub fn duplicates(episodes: &[Episode]) -> Vec<(usize, usize)> {
+    /// For each of `episodes` the index of the first one that holds the same measurement: its own, if none before it does.
+    pub fn first_of_measurement(episodes: &[Episode]) -> Vec<usize> {
         let mut first_with = BTreeMap::new();
-        let mut pairs = Vec::new();
-        for (index, episode) in episodes.iter().enumerate() {
-            match first_with.entry(episode.content_sha256()) {
-                Entry::Occupied(first) => pairs.push((*first.get(), index)),
-                Entry::Vacant(free) => {
-                    free.insert(index);
-                }
-            }
-        }
-        pairs
+        let all = episodes.iter().enumerate();
+        all.map(|(index, episode)| *first_with.entry(episode.content_sha256()).or_insert(index)).collect()
     }
 
     /// What a pour that ended before its goal had poured by the controller's own estimate, ml, whatever ended it: a stop, or a stream that was lost.
@@ -220,6 +218,22 @@ impl Episode {
                 100.0 * share
             )
         })
+    }
+
+    /// Whether the stream still ran in the last frames: what flowed after them is on the scale and not in the areas. A robot that was stopped while it was
+    /// tilted leaves such an episode.
+    fn runs_on(&self) -> bool {
+        // A frame that was not measured does not say that the stream has ended.
+        let areas_px2 = || self.rows.iter().map(|row| row.area_px2).filter(|area_px2| area_px2.is_finite());
+        let largest_px2 = areas_px2().fold(0.0, f32::max);
+        areas_px2().count() > 3 && areas_px2().rev().take(3).all(|area_px2| area_px2 > RUNS_ON * largest_px2)
+    }
+
+    /// Why the areas of the episode do not add up to its weight, each reason in words: a part of the stream was not seen.
+    pub fn stream_faults(&self) -> impl Iterator<Item = String> {
+        let part_unseen = self.part_unseen().then(|| PART_UNSEEN.to_owned());
+        let runs_on = self.runs_on().then(|| RUNS_ON_WORDS.to_owned());
+        part_unseen.into_iter().chain(self.cut_off()).chain(runs_on)
     }
 
     /// Time from the first to the last frame, s; 0 without frames.

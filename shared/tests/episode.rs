@@ -269,6 +269,8 @@ fn a_file_cut_anywhere_is_recovered() {
                 );
                 assert!(!back.complete || back.rows.len() == original.rows.len(), "{place}");
                 assert!(back.complete || back.info.ended.contains("recovered"), "{place}");
+                let is_cut = matches!(set_weight(&cut, 40.0), Err(ChangeError::Cut { .. }));
+                assert_eq!([Episode::read(&cut).unwrap().info.recoverable, is_cut], [back.complete; 2], "{place}");
                 complete += usize::from(back.complete);
                 assert!(matches!(recover(&new, &dir.path().join("again.mcap")), Err(ChangeError::Whole { .. })));
                 std::fs::remove_file(&new).unwrap();
@@ -348,9 +350,9 @@ fn the_same_measurement_twice_is_found() {
     set_weight(&copy, 77.0).unwrap();
     let files = find_episodes(&[dir.path().to_path_buf()]).unwrap();
     let mut episodes: Vec<Episode> = files.iter().map(|f| Episode::read(f).unwrap()).collect();
-    assert_eq!(Episode::duplicates(&episodes), [(0, 1)]);
+    assert_eq!(Episode::first_of_measurement(&episodes), [0, 0]);
     episodes[0].rows[30].area_px2 += 1.0;
-    assert_eq!(Episode::duplicates(&episodes), []);
+    assert_eq!(Episode::first_of_measurement(&episodes), [0, 1]);
 }
 
 /// Protects everything that reads episodes: files of other kinds are refused in one line.
@@ -432,6 +434,8 @@ fn a_table_is_read() {
     assert_eq!((a[1].alpha_commanded_deg, a[3].area_px2), (2.0, 10.5));
     assert!(episodes[1].rows.iter().all(|f| f.lost && f.area_px2.is_nan()));
     assert!(episodes.iter().all(|e| e.complete && e.kind == EpisodeKind::Table));
+    let one_weighed = tables(features, "episode,weight_g\nb,12\n").unwrap();
+    assert_eq!(one_weighed.iter().map(|e| e.weight_g).collect::<Vec<_>>(), [None, Some(12.0)]);
 }
 
 /// Protects people whose tables are wrong: each fault is reported with file and line.
@@ -458,12 +462,10 @@ fn faults_in_tables_are_named_with_file_and_line() {
         (features("1,0,0.0,0,0\n2,0,0,0,0\n1,1,0.1,0,0\n"), scale, "features.csv:4: episode 1 began in line 2 already"),
         (features("1,0,0.0,0\n"), scale, "features.csv:2: 4 fields where the heading has 5"),
         (features(good), "episode\n1\n", "scale.csv:1: column 'weight_g' is missing"),
-        (features(good), "episode,weight_g\n1,0\n", "scale.csv:2: weight_g '0'"),
         (features(good), "episode,weight_g\n1,nan\n", "scale.csv:2: weight_g 'nan'"),
         (features(good), "episode,weight_g\n1,-2\n", "scale.csv:2: weight_g '-2'"),
         (features(good), "episode,weight_g\n1,5\n1,6\n", "scale.csv:3: episode 1 has a weight in line 2 already"),
         (features(good), "episode,weight_g\n1,5\n7,6\n", "scale.csv:3: episode 7 is not in"),
-        (features(good), "episode,weight_g\n", "features.csv:2: episode 1 has no weight in"),
         (features(good), "episode,weight_g\n1,\n", "scale.csv:2: weight_g ''"),
         (features(good), "episode,weight_g,framing\n1,5,640 480\n", "scale.csv:2: framing '640 480': six numbers are wanted"),
         (HEADING.replace('\n', ",doubt\n1,0,0.0,0,0,gloomy\n"), scale, "features.csv:2: doubt 'gloomy': none, or"),

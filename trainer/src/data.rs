@@ -23,8 +23,9 @@ const ANGLE_MAX_DEG: f64 = 360.0;
 const FOLLOWS_DEG: f64 = 3.0;
 /// Weights of one measurement that are further apart are two weights, g: a kitchen scale shows whole grams.
 const WEIGHTS_APART_G: f64 = 0.5;
-/// Frame rates that are further apart than this are different ones, Hz. Chosen by hand; no measurement is recorded.
-const RATES_APART_HZ: f64 = 0.5;
+/// Frame rates of which one is further off the other than this share of it are different ones. Chosen by hand: a volume is then off by as much, and the
+/// controller ends a pour whose frames come at a rate that is off by 2.5 %.
+const RATES_APART: f64 = 0.02;
 
 /// One experimental episode E = (L_E, w_E). Each camera frame is one row, and all columns have the same length.
 #[derive(Debug, Clone, PartialEq)]
@@ -53,6 +54,11 @@ pub enum DataError {
     /// A file cannot be read as an episode.
     #[error(transparent)]
     Episode(#[from] episode::EpisodeError),
+    /// The weights of several tables in one, where one name may stand for several episodes.
+    #[error(
+        "--scale goes with one table of features: put the episodes into one, each under a name of its own, or train from the recordings"
+    )]
+    SeveralTables,
     /// A table cannot be read.
     #[error(transparent)]
     Table(#[from] episode::TableError),
@@ -211,11 +217,11 @@ impl TrainingEpisode {
 /// Takes out the episodes whose frame rate is not that of most others: a delay and a flow in frames mean something else in them. Of two rates that
 /// are as frequent, that of the newest episode counts.
 fn keep_one_rate(found: &mut UsableEpisodes) {
-    let alike = |a: &TrainingEpisode, b: &TrainingEpisode| (a.rate_hz - b.rate_hz).abs() <= RATES_APART_HZ;
+    let alike = |a: &TrainingEpisode, b: &TrainingEpisode| (a.rate_hz - b.rate_hz).abs() <= RATES_APART * b.rate_hz;
     let frequent = found.episodes.iter().max_by_key(|e| found.episodes.iter().filter(|other| alike(e, other)).count());
     let Some(rate_hz) = frequent.map(|e| e.rate_hz) else { return };
     let (kept, others): (Vec<_>, Vec<_>) =
-        std::mem::take(&mut found.episodes).into_iter().partition(|e| (e.rate_hz - rate_hz).abs() <= RATES_APART_HZ);
+        std::mem::take(&mut found.episodes).into_iter().partition(|e| (e.rate_hz - rate_hz).abs() <= RATES_APART * rate_hz);
     found.episodes = kept;
     found.left_out.extend(others.into_iter().map(|e| {
         let what = format!("{} frames a second, and the others have {rate_hz}: train on one frame rate only", e.rate_hz);
@@ -272,9 +278,8 @@ impl EpisodeSource {
     pub fn read(&self) -> Result<Vec<Episode>, DataError> {
         let mut episodes = Vec::new();
         if let Some(scale) = &self.scale {
-            for features in &self.episodes {
-                episodes.extend(episode::read_table(features, scale)?);
-            }
+            let [features] = self.episodes.as_slice() else { return Err(DataError::SeveralTables) };
+            episodes = episode::read_table(features, scale)?;
         } else {
             for file in episode::find_episodes(&self.episodes)? {
                 episodes.push(Episode::read(&file)?);
@@ -325,17 +330,17 @@ pub struct UsableEpisodes {
 /// measurement once.
 pub fn usable(episodes: &[Episode]) -> UsableEpisodes {
     let mut result = UsableEpisodes::default();
-    let doubles = Episode::duplicates(episodes);
+    let first = Episode::first_of_measurement(episodes);
     for (k, e) in episodes.iter().enumerate() {
         let own = TrainingEpisode::from_episode(e);
         let fault = if !e.complete {
             Some("the recording is incomplete (the recorder was stopped): the areas do not add up to the weight; record it again".into())
-        } else if let Some(other) = doubles.iter().find_map(|pair| other_weight(episodes, *pair, k)) {
+        } else if let Some(other) = same(&first, k).find(|other| weights_differ(e, &episodes[*other])) {
             Some(format!("the same measurement as {}, with another weight: correct one of them, or leave it out", episodes[other].name))
-        } else if let Some((first, _)) = doubles.iter().find(|(first, later)| *later == k && episodes[*first].weight_g.is_some()) {
-            Some(format!("the same measurement as {}: leave one of them out", episodes[*first].name))
+        } else if let Some(other) = same(&first, k).find(|other| *other < k && episodes[*other].weight_g.is_some()) {
+            Some(format!("the same measurement as {}: leave one of them out", episodes[other].name))
         } else {
-            own.fault().or_else(|| e.part_unseen().then(|| episode::PART_UNSEEN.into())).or_else(|| e.cut_off())
+            own.fault().or_else(|| e.stream_faults().next())
         };
         match fault {
             Some(what) => result.left_out.push((e.name.clone(), what)),
@@ -347,11 +352,14 @@ pub fn usable(episodes: &[Episode]) -> UsableEpisodes {
     result
 }
 
-/// The other one of a pair that holds the same measurement, if `k` is one of them and both are weighed, and differently.
-fn other_weight(episodes: &[Episode], (first, later): (usize, usize), k: usize) -> Option<usize> {
-    let (a, b) = (episodes[first].weight_g?, episodes[later].weight_g?);
-    let other = if k == first { later } else { first };
-    ([first, later].contains(&k) && (a - b).abs() > WEIGHTS_APART_G).then_some(other)
+/// The other episodes that hold the same measurement as the `k`-th; `first` is that of [`Episode::first_of_measurement`].
+fn same(first: &[usize], k: usize) -> impl Iterator<Item = usize> {
+    (0..first.len()).filter(move |other| *other != k && first[*other] == first[k])
+}
+
+/// Whether both are weighed, and differently.
+fn weights_differ(a: &Episode, b: &Episode) -> bool {
+    a.weight_g.zip(b.weight_g).is_some_and(|(a_g, b_g)| (a_g - b_g).abs() > WEIGHTS_APART_G)
 }
 
 /// SHA-256 of what is trained on: times, commanded angles, areas and weights of all episodes in order, and the measured angles of those that

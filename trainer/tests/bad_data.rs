@@ -144,12 +144,48 @@ fn said(out: &Output) -> String {
     format!("{}{}", String::from_utf8_lossy(&out.stdout), String::from_utf8_lossy(&out.stderr))
 }
 
+/// Protects the fit from a measurement that counts twice, and from one with two weights, wherever among the copies the one without a weight is.
+#[test]
+fn of_copies_one_teaches_and_of_two_weights_none() {
+    let check = |weights_g: [Option<f64>; 3]| {
+        let dir = tempfile::tempdir().unwrap();
+        let mut all = recordings(6);
+        all[5].weight_g = None;
+        for recording in &all[..5] {
+            write(dir.path(), recording);
+        }
+        let path = write(dir.path(), &all[5]);
+        let copies = [1, 2].map(|copy| path.with_extension(format!("{copy}.mcap")));
+        for copy in &copies {
+            std::fs::copy(&path, copy).unwrap();
+        }
+        for (file, weight_g) in std::iter::once(&path).chain(&copies).zip(weights_g) {
+            weight_g.map_or(Ok(()), |weight_g| set_weight(file, weight_g).map(drop)).unwrap();
+        }
+        let said = said(&Command::new(env!("CARGO_BIN_EXE_trainer")).arg("check").arg(dir.path()).output().unwrap());
+        let refused = ["no weight:", ": leave one of them out", "with another weight"].map(|words| said.matches(words).count());
+        (3 - refused.iter().sum::<usize>(), refused[2])
+    };
+    // The copies come before the file itself, by their names.
+    let (one, other) = (Some(80.0), Some(90.0));
+    for (weights_g, expected) in [
+        ([one, one, one], (1, 0)),
+        ([None, one, one], (1, 0)),
+        ([one, None, one], (1, 0)),
+        ([None, one, other], (0, 2)),
+        ([one, one, other], (0, 3)),
+        ([one, None, other], (0, 2)),
+    ] {
+        assert_eq!(check(weights_g), expected, "how many teach, and how many have another weight: {weights_g:?}");
+    }
+}
+
 /// Protects the trainer from bad recordings, and people from guessing: each fault of the last of six recordings is named, and no other
 /// recording is blamed.
 #[test]
 fn each_fault_of_a_recording_is_named() {
     type Case = (&'static str, i32, fn(&mut Recording));
-    let cases: [Case; 23] = [
+    let cases: [Case; 25] = [
         ("cannot be used: FILE: no weight", 1, |r| r.weight_g = None),
         ("cannot be used: FILE: weight 0 g: nothing was poured", 1, |r| r.weight_g = Some(0.0)),
         ("cannot be used: FILE: no stream was ever seen, but the scale shows", 1, |r| r.rows.iter_mut().for_each(|f| f.area_px2 = 0.0)),
@@ -195,7 +231,17 @@ fn each_fault_of_a_recording_is_named() {
         ("doubtful: FILE: a stream is seen from", 1, |r| {
             r.rows[..5].iter_mut().enumerate().for_each(|(k, f)| f.area_px2 = 300.0 + k as f32)
         }),
-        ("doubtful: FILE: still flowing in the last frames", 1, |r| r.rows.iter_mut().rev().take(3).for_each(|f| f.area_px2 = 40.0)),
+        ("cannot be used: FILE: the stream was still running in the last frames", 1, |r| {
+            let largest_px2 = r.rows.iter().map(|f| f.area_px2).fold(0.0, f32::max);
+            r.rows.iter_mut().rev().take(3).for_each(|f| f.area_px2 = 0.1 * largest_px2);
+        }),
+        // A frame that was not measured does not say that it has ended.
+        ("cannot be used: FILE: the stream was still running in the last frames", 1, |r| {
+            let largest_px2 = r.rows.iter().map(|f| f.area_px2).fold(0.0, f32::max);
+            r.rows.iter_mut().rev().take(4).for_each(|f| f.area_px2 = 0.1 * largest_px2);
+            r.rows.iter_mut().rev().skip(1).take(1).for_each(|f| f.doubt = Doubt::EdgeNotFound);
+        }),
+        ("doubtful: FILE: still flowing in the last frames", 1, |r| r.rows.iter_mut().rev().take(3).for_each(|f| f.area_px2 = 4.0)),
     ];
     let mut wrong = Vec::new();
     for (expected, code, spoil) in cases {
@@ -347,7 +393,7 @@ fn a_pour_that_was_not_seen_whole_is_left_out() {
 fn a_training_says_what_is_doubtful_about_a_recording() {
     let dir = tempfile::tempdir().unwrap();
     let mut all = recordings(5);
-    all[1].rows.iter_mut().rev().take(3).for_each(|f| f.area_px2 = 40.0);
+    all[1].rows.iter_mut().rev().take(3).for_each(|f| f.area_px2 = 4.0);
     for recording in &all {
         write(dir.path(), recording);
     }

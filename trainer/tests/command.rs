@@ -88,6 +88,26 @@ fn another_frame_rate_is_left_out() {
     assert_eq!(trainer(dir.path(), &["check", "f.csv", "--scale", "s.csv"]).status.code(), Some(1));
 }
 
+/// Protects whoever exported episodes before all were weighed: those without a weight are left out by name, and the others teach.
+#[test]
+fn an_unweighed_episode_of_a_table_is_left_out() {
+    let dir = tempfile::tempdir().unwrap();
+    tables(dir.path(), 5, |_, w| w);
+    let scale = std::fs::read_to_string(dir.path().join("s.csv")).unwrap();
+    let without_3: String = scale.lines().filter(|line| !line.starts_with("3,")).map(|line| format!("{line}\n")).collect();
+    std::fs::write(dir.path().join("s.csv"), without_3).unwrap();
+    let out = trainer(dir.path(), &["train", "f.csv", "--scale", "s.csv", "--out", "w.bin"]);
+    assert!(out.status.success() && text(&out.stderr).contains("left out: 3: no weight"), "{}", text(&out.stderr));
+    // A curve that poured nothing, and weights that may belong to another table's episodes.
+    tables(dir.path(), 5, |k, w| if k == 1 { 0.0 } else { w });
+    let out = trainer(dir.path(), &["train", "f.csv", "--scale", "s.csv", "--out", "w.bin"]);
+    assert!(out.status.success() && text(&out.stderr).contains("left out: 2: weight 0 g: nothing was poured"), "{}", text(&out.stderr));
+    std::fs::copy(dir.path().join("f.csv"), dir.path().join("g.csv")).unwrap();
+    let out = trainer(dir.path(), &["train", "f.csv", "g.csv", "--scale", "s.csv", "--out", "x.bin"]);
+    assert_eq!(out.status.code(), Some(2));
+    assert!(text(&out.stderr).contains("--scale goes with one table of features"), "{}", text(&out.stderr));
+}
+
 /// Protects the way back from a delay that is cut off: pictures that are later than any modelled delay are not trained on in silence.
 #[test]
 fn a_delay_beyond_the_model_is_said() {

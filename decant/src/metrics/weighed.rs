@@ -4,13 +4,12 @@
 //! read is left out. Of a directory that cannot be read nothing is told.
 
 use std::collections::BTreeMap;
-use std::io::ErrorKind;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, Ordering::Relaxed};
 use std::sync::{Mutex, PoisonError};
 use std::time::{Duration, SystemTime};
 
-use shared::episode::{Episode, by_number, find_episodes};
+use shared::episode::{Episode, began_at, by_number, episodes_so_far};
 
 /// Pause between two looks at the episodes. Chosen by hand: weighing takes a person longer.
 const LOOK: Duration = Duration::from_secs(10);
@@ -22,11 +21,20 @@ pub const EPISODES: usize = 300;
 /// When a file was written, and its length.
 type Stamp = (Option<SystemTime>, u64);
 
+/// What is known of one episode.
+#[derive(Debug)]
+struct Known {
+    stamp: Stamp,
+    /// When it began.
+    began_at: Option<SystemTime>,
+    /// By how much it missed its goal, ml, if it is a weighed pour; `None` as long as it was not read, because it is none of the newest.
+    error_ml: Option<Option<f64>>,
+}
+
 /// The weighed pours of the newest episodes; shared between threads.
 #[derive(Debug, Default)]
 pub struct Weighed {
-    /// By how much each missed its goal, ml.
-    known: Mutex<BTreeMap<PathBuf, (Stamp, Option<f64>)>>,
+    known: Mutex<BTreeMap<PathBuf, Known>>,
     /// Whether the directory cannot be read.
     unreadable: AtomicBool,
 }
@@ -38,9 +46,7 @@ impl Weighed {
             return None;
         }
         let known = self.known.lock().unwrap_or_else(PoisonError::into_inner);
-        let mut errors_ml: Vec<(&PathBuf, f64)> = known.iter().filter_map(|(path, (_, error_ml))| Some((path, (*error_ml)?))).collect();
-        errors_ml.sort_by(|(a, _), (b, _)| by_number(a, b));
-        Some(errors_ml.into_iter().map(|(_, error_ml)| error_ml).collect())
+        Some(by_age(&known).into_iter().filter_map(|(_, known)| known.error_ml.flatten()).collect())
     }
 
     /// Looks at the episodes in `directory` again and again, until `stop` is set.
@@ -59,27 +65,44 @@ impl Weighed {
     /// Reads what is new in `directory`.
     pub fn look(&self, directory: &Path, stop: &AtomicBool) {
         let locked = || self.known.lock().unwrap_or_else(PoisonError::into_inner);
-        let found = match directory.read_dir() {
-            // Nothing has been recorded yet.
-            Err(e) if e.kind() == ErrorKind::NotFound && locked().is_empty() => Some(Vec::new()),
-            Err(_) => None,
-            Ok(_) => find_episodes(&[directory.to_path_buf()]).ok(),
-        };
-        self.unreadable.store(found.is_none(), Relaxed);
-        let Some(mut paths) = found else { return };
-        // They are in the order of their numbers, which only grow.
-        let newest = paths.split_off(paths.len().saturating_sub(EPISODES));
-        locked().retain(|path, _| newest.contains(path));
-        for path in newest {
+        let known = !locked().is_empty();
+        let found = episodes_so_far(directory, known);
+        self.unreadable.store(found.is_err(), Relaxed);
+        let Ok(paths) = found else { return };
+        locked().retain(|path, _| paths.contains(path));
+        for path in paths {
             let Ok(meta) = path.metadata() else { continue };
             let stamp = (meta.modified().ok(), meta.len());
-            if stop.load(Relaxed) || locked().get(&path).is_some_and(|(seen, _)| *seen == stamp) {
+            if stop.load(Relaxed) || locked().get(&path).is_some_and(|known| known.stamp == stamp) {
+                continue;
+            }
+            let began_at = began_at(&path);
+            locked().insert(path, Known { stamp, began_at, error_ml: None });
+        }
+        let (older, newest): (Vec<PathBuf>, Vec<PathBuf>) = {
+            let known = locked();
+            let mut paths: Vec<PathBuf> = by_age(&known).into_iter().map(|(path, _)| path.clone()).collect();
+            let newest = paths.split_off(paths.len().saturating_sub(EPISODES));
+            (paths, newest)
+        };
+        for path in older {
+            locked().entry(path).and_modify(|known| known.error_ml = None);
+        }
+        for path in newest {
+            if stop.load(Relaxed) || locked().get(&path).is_none_or(|known| known.error_ml.is_some()) {
                 continue;
             }
             let error_ml = Episode::read(&path).ok().filter(|e| e.complete).and_then(|e| e.error_ml());
-            locked().insert(path, (stamp, error_ml));
+            locked().entry(path).and_modify(|known| known.error_ml = Some(error_ml));
         }
     }
+}
+
+/// The episodes, the oldest first. A copy of an old one may have a new number, so the start decides, and the number only among those of one start.
+fn by_age(known: &BTreeMap<PathBuf, Known>) -> Vec<(&PathBuf, &Known)> {
+    let mut all: Vec<_> = known.iter().collect();
+    all.sort_by(|(a, of_a), (b, of_b)| of_a.began_at.cmp(&of_b.began_at).then_with(|| by_number(a, b)));
+    all
 }
 
 #[cfg(test)]
@@ -96,9 +119,8 @@ mod tests {
     fn the_ten_thousandth_pour_is_the_newest() {
         let config = Config::read(&Path::new(env!("CARGO_MANIFEST_DIR")).join("../config/sim.toml")).unwrap();
         let dir = tempfile::tempdir().unwrap();
-        let pour = |episode: u64, weight_g| {
+        let pour = |episode: u64, weight_g, wall_clock| {
             let kind = EpisodeKind::Pour { goal_ml: 50.0 };
-            let wall_clock = SystemTime::now();
             let start = EpisodeStart { episode, kind, started_at_ns: 1, wall_clock, config: &config, weights: "" };
             let mut writer = EpisodeWriter::create(dir.path(), &start).unwrap();
             let feature = Feature { captured_at_ns: 2, sequence: 1, ..Default::default() };
@@ -106,14 +128,17 @@ mod tests {
             let path = writer.finish(&EpisodeEnd { complete: true, reason: "over", disordered_frames: 0 }).unwrap();
             set_weight(&path, weight_g).unwrap();
         };
-        pour(9999, 51.0);
-        pour(10_000, 52.0);
+        let now = SystemTime::now();
+        pour(9999, 51.0, now);
+        pour(10_000, 52.0, now);
+        // A copy of an old one has a new number.
+        pour(12_000, 53.0, now - Duration::from_secs(1000));
         for number in 0..EPISODES {
             std::fs::write(dir.path().join(format!("episode-{}.mcap", 9998 - number)), b"no episode").unwrap();
         }
         let weighed = Weighed::default();
         weighed.look(dir.path(), &AtomicBool::new(false));
-        assert_eq!(weighed.errors_ml(), Some(vec![1.0, 2.0]));
+        assert_eq!(weighed.errors_ml(), Some(vec![3.0, 1.0, 2.0]));
     }
 
     /// Protects who watches a cell whose disk went away: that nothing can be read is not that nothing was weighed.

@@ -198,9 +198,9 @@ fn checked(files: &[PathBuf]) -> Vec<CheckedFile> {
             Err(e) => all.push(CheckedFile { name, remarks: vec![Remark::wrong(e.to_string())] }),
         }
     }
-    for (first, second) in Episode::duplicates(&episodes) {
+    for (index, first) in Episode::first_of_measurement(&episodes).into_iter().enumerate().filter(|(index, first)| index != first) {
         let text = format!("the same measurement as {}; keep one of them", episodes[first].name);
-        all[places[second]].remarks.push(Remark::wrong(text));
+        all[places[index]].remarks.push(Remark::wrong(text));
     }
     all
 }

@@ -72,7 +72,9 @@ pub fn export(files: &[PathBuf], format: ExportFormat, to: &Path) -> Result<Expo
 fn write(episodes: Vec<(PathBuf, Episode)>, mut left_out: Vec<LeftOut>, format: ExportFormat, to: &Path) -> Result<Exported, ExportError> {
     if format == ExportFormat::Csv {
         let pair = [to.join("features.csv"), to.join("scale.csv")];
-        let episodes: Vec<Episode> = episodes.into_iter().map(|(_, episode)| episode).collect();
+        let mut episodes: Vec<Episode> = episodes.into_iter().map(|(_, episode)| episode).collect();
+        // A training takes the last ones for the newest, where something has changed.
+        episodes.sort_by(|a, b| a.info.started_at_utc.cmp(&b.info.started_at_utc));
         write_table(&episodes, &pair[0], &pair[1])?;
         return Ok(Exported { written: pair.into(), left_out });
     }

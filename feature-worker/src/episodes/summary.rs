@@ -2,7 +2,7 @@
 //! episode in memory, on any thread; it allocates and cannot fail.
 
 use serde_json::{Value, json};
-use shared::episode::{Episode, EpisodeKind, EpisodeRow, PART_UNSEEN, hex};
+use shared::episode::{Episode, EpisodeKind, EpisodeRow, hex};
 use shared::messages::Doubt;
 use shared::plural::counted;
 
@@ -40,15 +40,14 @@ pub fn remarks(episode: &Episode) -> Vec<Remark> {
     let mut all = Vec::new();
     if info.ended.is_empty() {
         all.push(Remark::wrong("the recorder was killed before the end; record it again"));
+    } else if info.recoverable {
+        all.push(Remark::wrong("the file's end is missing; `feature-worker episodes recover FILE` makes a whole file of it"));
     } else if !episode.complete {
         let last_s = episode.rows.last().map_or(0.0, |r| r.t_s);
         all.push(Remark::wrong(format!("incomplete: {}; the last frame is from {last_s:.1} s; record it again", info.ended)));
     }
     all.extend(about_weight(episode));
-    if episode.part_unseen() {
-        all.push(Remark::wrong(PART_UNSEEN));
-    }
-    all.extend(episode.cut_off().map(Remark::wrong));
+    all.extend(episode.stream_faults().map(Remark::wrong));
     if info.lost_frames > 0 {
         let runs = episode.rows.chunk_by(|a, b| a.lost == b.lost);
         let longest = runs.filter(|run| run[0].lost).map(<[EpisodeRow]>::len).max().unwrap_or(0);

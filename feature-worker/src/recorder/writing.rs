@@ -31,6 +31,11 @@ const BEFORE_NS: u64 = 200_000_000;
 const AFTER_NS: u64 = 500_000_000;
 /// Without telemetry for this long the controller counts as gone, ns. Chosen by hand; no measurement is recorded.
 const SILENCE_NS: u64 = 2_000_000_000;
+/// Ticks between which others are missing and that are further apart than this do not tell the angles between them, ns: as long as a measured angle
+/// counts.
+const GAP_NS: u64 = 100_000_000;
+/// Why a file is incomplete whose episode has such a gap.
+const GAP: &str = "the recorder fell behind, so ticks of the controller are lost";
 /// How often the thread looks for work. Chosen by hand: much shorter than a frame of a 30 Hz camera.
 const PAUSE: Duration = Duration::from_millis(5);
 
@@ -51,9 +56,10 @@ pub struct RecorderThread {
     encoder: Encoder,
     /// Episode of the newest tick; `None` before the first.
     newest_episode: Option<u64>,
-    newest_tick: u64,
-    /// Ticks of the next episode, while frames of the one before are still under way.
-    pending: VecDeque<Telemetry>,
+    /// Number and time of the newest tick, ns; 0 before the first.
+    newest_tick: (u64, u64),
+    /// Ticks of the next episode, while frames of the one before are still under way, each with whether the angles before it are not known.
+    pending: VecDeque<(Telemetry, bool)>,
     current: Option<OpenEpisode>,
     say: Say,
     /// When it was said that the episodes are over their budget, CLOCK_MONOTONIC ns; `None` while they are not.
@@ -69,6 +75,8 @@ struct OpenEpisode {
     started_at_ns: u64,
     /// Set once a tick has come that no longer belongs to the episode.
     ended: Option<EpisodeOver>,
+    /// Whether the angles of a part of it are not known, or its beginning or end.
+    has_gap: bool,
     /// When the newest tick was received, CLOCK_MONOTONIC ns.
     heard_at_ns: u64,
     last_sequence: u64,
@@ -116,7 +124,7 @@ impl RecorderThread {
             kept: VecDeque::with_capacity(KEPT_FRAMES + 1),
             encoder,
             newest_episode: None,
-            newest_tick: 0,
+            newest_tick: (0, 0),
             pending: VecDeque::new(),
             current: None,
             say,
@@ -164,22 +172,25 @@ impl RecorderThread {
     /// Enters a tick into the track of alpha and puts it into the queue.
     fn take_tick(&mut self, tick: &Telemetry) {
         self.track.push(tick.at_ns, tick.alpha_deg, tick.robot_at_ns, tick.alpha_measured_deg);
-        if tick.tick <= self.newest_tick {
+        let (newest, newest_ns) = self.newest_tick;
+        let after_gap = newest != 0 && tick.tick > newest + 1 && tick.at_ns.saturating_sub(newest_ns) > GAP_NS;
+        if tick.tick <= newest {
             self.pending.clear();
             self.close(false, "the controller was restarted");
             self.newest_episode = None;
         }
-        self.newest_tick = tick.tick;
-        self.pending.push_back(*tick);
+        self.newest_tick = (tick.tick, tick.at_ns);
+        self.pending.push_back((*tick, after_gap));
         self.take_due_ticks();
     }
 
     /// Opens and ends episodes as the ticks say, and writes the ticks. Those of the next episode wait until the last frames of the one
     /// before have come.
     fn take_due_ticks(&mut self) {
-        while let Some(tick) = self.pending.front().copied() {
+        while let Some((tick, after_gap)) = self.pending.front().copied() {
             if let Some(current) = &mut self.current {
                 current.heard_at_ns = now_ns();
+                current.has_gap |= after_gap && current.ended.is_none();
                 if tick.episode != current.episode && current.ended.is_none() {
                     current.ended = Some(EpisodeOver { at_ns: tick.at_ns, seen_at_ns: now_ns(), frames_passed: false });
                 }
@@ -201,6 +212,9 @@ impl RecorderThread {
                     continue;
                 }
                 self.open(&tick);
+                if let Some(current) = &mut self.current {
+                    current.has_gap |= after_gap;
+                }
             }
             let write = |c: &mut OpenEpisode| if tick.episode == c.episode { c.writer.telemetry(&tick) } else { Ok(()) };
             self.try_write(write);
@@ -240,6 +254,7 @@ impl RecorderThread {
                     episode: tick.episode,
                     started_at_ns: tick.at_ns,
                     ended: None,
+                    has_gap: false,
                     heard_at_ns: now_ns(),
                     last_sequence: 0,
                     last_captured_at_ns: 0,
@@ -355,6 +370,7 @@ impl RecorderThread {
     fn close(&mut self, complete: bool, reason: &str) {
         self.write_waiting(true);
         let Some(current) = self.current.take() else { return };
+        let (complete, reason) = if complete && current.has_gap { (false, GAP) } else { (complete, reason) };
         let end = EpisodeEnd { complete, reason, disordered_frames: current.disordered };
         let (episode, images, dropped) = (current.episode, current.images, current.dropped);
         match current.writer.finish(&end) {

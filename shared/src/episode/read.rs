@@ -172,11 +172,12 @@ impl Contents {
         let (first_tick, last_tick) = (self.ticks.first().map_or(0, |t| t.tick), self.ticks.last().map_or(0, |t| t.tick));
         let last_at_ns = self.ticks.last().map_or(0, |t| t.at_ns);
         let measured_to_the_end = rows.last().is_some_and(|r| r.captured_at_ns.saturating_add(SILENT_END_NS) >= last_at_ns);
+        let ended_whole = self.text(format::META_END, "complete") == "true" && measured_to_the_end;
         Ok(Episode {
             name: name.into(),
             kind: self.kind()?,
             weight_g: self.weight_g()?,
-            complete: whole && self.text(format::META_END, "complete") == "true" && measured_to_the_end,
+            complete: whole && ended_whole,
             info: EpisodeInfo {
                 started_at_utc: text("started_at_utc"),
                 started_at_ns,
@@ -186,6 +187,7 @@ impl Contents {
                 framing: Framing::of_toml(self.text(format::META_CONFIG, "toml")),
                 weights: text("weights"),
                 ended: self.text(format::META_END, "reason").into(),
+                recoverable: ended_whole && !whole,
                 note: self.text(format::META_NOTE, "text").into(),
                 poured_ml: self.ticks.last().map(|t| t.poured_ml).filter(|ml| ml.is_finite()),
                 ticks: self.ticks.len() as u64,
@@ -319,6 +321,16 @@ pub fn find_episodes(paths: &[PathBuf]) -> Result<Vec<PathBuf>, EpisodeError> {
         files.append(&mut inside);
     }
     Ok(each_once(files))
+}
+
+/// The episode files of a directory that is looked at again and again. One that is not there yet is empty, as long as no episode is `known`: nothing has
+/// been recorded. One that cannot be read, or is gone, fails.
+pub fn episodes_so_far(directory: &Path, known: bool) -> Result<Vec<PathBuf>, EpisodeError> {
+    match std::fs::read_dir(directory) {
+        Err(e) if e.kind() == std::io::ErrorKind::NotFound && !known => Ok(Vec::new()),
+        Err(e) => Err(EpisodeError::Read { file: directory.display().to_string(), what: e.to_string() }),
+        Ok(_) => find_episodes(&[directory.to_path_buf()]),
+    }
 }
 
 /// `files` without those that are named twice: by the same name in the same directory, whichever way leads there.

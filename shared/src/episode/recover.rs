@@ -39,7 +39,7 @@ pub fn recover(old: &Path, new: &Path) -> Result<Episode, ChangeError> {
     .and_then(|()| {
         let after = Episode::read(&temporary)?;
         let ended = if original.info.ended.is_empty() { REASON.to_string() } else { original.info.ended.clone() };
-        let info = EpisodeInfo { ended, ..original.info.clone() };
+        let info = EpisodeInfo { ended, recoverable: false, ..original.info.clone() };
         let expected = Episode { name: after.name.clone(), complete: after.complete, info, ..original.clone() };
         if format!("{after:?}") != format!("{expected:?}") {
             return Err(fail("the copy differs from the original".into()));

@@ -11,7 +11,7 @@ use std::fs::File;
 use std::path::Path;
 
 use super::rows::{EpisodeRow, LostFrames, alpha_between_deg};
-use super::weight::{WeightError, check_poured};
+use super::weight::{WeightError, check_reading};
 use super::{Episode, EpisodeInfo, EpisodeKind};
 use crate::framing::Framing;
 use crate::messages::Doubt;
@@ -137,20 +137,15 @@ impl CsvTable {
     }
 }
 
-/// Reads the pair. The episodes come in the order of their first row in `features`; all of them are complete and have a weight.
+/// Reads the pair. The episodes come in the order of their first row in `features`; all of them are complete. One that `scale` does not name has no weight.
 pub fn read_table(features: &Path, scale: &Path) -> Result<Vec<Episode>, TableError> {
-    let (mut episodes, first_line) = read_features(features)?;
+    let mut episodes = read_features(features)?;
     read_weights(scale, features, &mut episodes)?;
-    if let Some(episode) = episodes.iter().find(|e| e.weight_g.is_none()) {
-        let line = first_line.get(&episode.name).copied().unwrap_or(0);
-        let what = format!("episode {} has no weight in {}", episode.name, scale.display());
-        return Err(TableError::Row { file: features.display().to_string(), line, what });
-    }
     Ok(episodes)
 }
 
-/// The episodes without their weights, and the line in which each begins.
-fn read_features(features: &Path) -> Result<(Vec<Episode>, BTreeMap<String, u64>), TableError> {
+/// The episodes without their weights.
+fn read_features(features: &Path) -> Result<Vec<Episode>, TableError> {
     let mut episodes: Vec<Episode> = Vec::new();
     let mut first_line: BTreeMap<String, u64> = BTreeMap::new();
     let mut lost = LostFrames::default();
@@ -183,7 +178,7 @@ fn read_features(features: &Path) -> Result<(Vec<Episode>, BTreeMap<String, u64>
     for episode in &mut episodes {
         episode.info.lost_frames = episode.rows.iter().filter(|r| r.lost).count() as u64;
     }
-    Ok((episodes, first_line))
+    Ok(episodes)
 }
 
 /// Enters the weights into the episodes that were read from `features`.
@@ -194,7 +189,7 @@ fn read_weights(scale: &Path, features: &Path, episodes: &mut [Episode]) -> Resu
         if let Some(line) = weighed.insert(name.into(), row.line) {
             return Err(row.error(format!("episode {name} has a weight in line {line} already")));
         }
-        let weight_g = weight.parse().map_err(|_| WeightError::NotAReading).and_then(check_poured);
+        let weight_g = weight.parse().map_err(|_| WeightError::NotAReading).and_then(check_reading);
         let weight_g = weight_g.map_err(|e| row.error(format!("weight_g '{weight}': {e}")))?;
         let Some(episode) = episodes.iter_mut().find(|e| e.name == name) else {
             return Err(row.error(format!("episode {name} is not in {}", features.display())));

@@ -18,7 +18,8 @@ pub fn set_weight(path: &Path, grams: f64) -> Result<Option<f64>, ChangeError> {
     let expected = |before| Episode { weight_g: Some(grams), ..before };
     match set_metadata(path, format::META_WEIGHT, ("grams", grams.to_string()), expected) {
         Ok(before) => Ok(before.weight_g),
-        Err(ChangeError::Cut { file }) => Err(ChangeError::Incomplete { file }),
+        // Where the episode itself is whole, the file's end is made anew first.
+        Err(ChangeError::Cut { file }) if !Episode::read(path).is_ok_and(|e| e.info.recoverable) => Err(ChangeError::Incomplete { file }),
         Err(e) => Err(e),
     }
 }

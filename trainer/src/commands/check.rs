@@ -123,7 +123,7 @@ fn recording_doubts(e: &Episode) -> Vec<String> {
     if first_deg > UPRIGHT_DEG {
         doubt(format!("starts at {first_deg:.0} degrees, not upright: what flowed before is on the scale but not in the images"));
     }
-    if e.rows.len() > 3 && e.rows.iter().rev().take(3).all(|row| row.area_px2 > 0.0) {
+    if e.rows.len() > 3 && e.rows.iter().rev().filter(|row| row.area_px2.is_finite()).take(3).all(|row| row.area_px2 > 0.0) {
         doubt("still flowing in the last frames: record until the stream has ended".into());
     }
     doubts
