@@ -156,7 +156,8 @@ impl<'a, O: Outside> LoopState<'a, O> {
         self.receive_features();
         self.core.prefetch(1);
         let taken = self.take_agent();
-        if self.session.is_none() {
+        // A run that began with a session that is gone has to end first: its program has come upright, and must not follow the rest of it.
+        if self.session.is_none() && self.core.phase() == Phase::NoRobot {
             self.session = exchange.sessions.pop();
         }
         self.core.prefetch(2);

@@ -140,8 +140,11 @@ pub fn keep_robot_connected(
                 }
                 Err(e) => {
                     progress.failed(network.now_ns(), &e, config, note, say);
-                    // The operator who asked during the attempt may have done so before what it saw.
-                    progress.before.looked &= !exchange.resume.load(Relaxed);
+                    // The operator who asked during the attempt may have done so before what it saw, and is told what comes of the next one.
+                    if exchange.resume.load(Relaxed) {
+                        progress.before.looked = false;
+                        note.asked();
+                    }
                 }
             }
         }

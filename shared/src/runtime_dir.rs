@@ -175,8 +175,10 @@ fn check_base(base: &Path) -> Result<(), String> {
         return Err("is no directory: remove it, or set cell.runtime_dir".into());
     }
     let sticky = meta.mode() & 0o1000 != 0;
-    if ![0, own_uid()].contains(&meta.uid()) {
-        return Err(format!("belongs to user {}, not to root or this user: remove it, or set cell.runtime_dir", meta.uid()));
+    // A link leads where its owner wants.
+    let link = base.symlink_metadata().map_err(|e| e.to_string())?;
+    if let Some(uid) = [meta.uid(), link.uid()].into_iter().find(|uid| ![0, own_uid()].contains(uid)) {
+        return Err(format!("belongs to user {uid}, not to root or this user: remove it, or set cell.runtime_dir"));
     }
     if meta.mode() & 0o022 != 0 && !sticky {
         return Err(format!("others may write there (mode {:o}): chmod 0755, or set cell.runtime_dir", meta.mode() & 0o7777));
@@ -254,6 +256,16 @@ mod tests {
             assert!(refusal(base).contains("belongs to user 65534"));
             std::os::unix::fs::chown(base, Some(65534), None).expect("root may");
             assert!(refusal(base).contains("not to root or this user"));
+            std::os::unix::fs::chown(base, Some(0), None).expect("root may");
+            std::os::unix::fs::chown(&own, Some(0), None).expect("root may");
+            assert!(place.directory().is_ok());
+            let link = base.with_extension("link");
+            std::os::unix::fs::symlink(base, &link).expect("a link");
+            assert!(Place { base: Some(link.clone()), ..place.clone() }.directory().is_ok(), "a link of ours");
+            std::os::unix::fs::lchown(&link, Some(65534), None).expect("root may");
+            let said = refusal(&link);
+            std::fs::remove_file(&link).expect("root may");
+            assert!(said.contains("belongs to user 65534, not to root or this user"), "{said}");
         }
         let long = Place { name: "a-name-of-thirty-two-characters-x".chars().take(32).collect(), base: Some(base.join("somewhere/deep")) };
         assert!(long.directory().expect_err("too long").to_string().contains("longer than"));

@@ -21,6 +21,8 @@ use crate::stop_client::{Running, Target, running_cells, unreached};
 const UPRIGHT: Duration = Duration::from_secs(20);
 /// Pause between two looks at the controller's state. Chosen by hand; no measurement is recorded.
 const BEAT: Duration = Duration::from_millis(50);
+/// So many looks in a row may remain without an answer of a controller whose process is not seen. Chosen by hand.
+const UNANSWERED: u32 = 3;
 
 /// Command-line arguments.
 #[derive(Debug, clap::Args)]
@@ -193,13 +195,16 @@ fn ask(target: &Target) -> Result<Asked, Failure> {
 /// Waits until the container is upright. Gives the line that says so.
 fn wait(target: &Target, asked: Asked) -> Result<String, Failure> {
     let until = Instant::now() + UPRIGHT;
+    let mut unanswered = 0;
     while Instant::now() < until {
         match &asked {
             Asked::Refused(_, why) => return Err(failure(exit::REFUSED, why)),
-            Asked::Socket(_) => match target.ask("state") {
+            Asked::Socket(pid) => match target.ask("state") {
                 Some(state) if state.upright => return Ok("upright".into()),
                 Some(state) if state.phase == Phase::NoRobot => return Err(failure(exit::FAILED, state.hindrance)),
-                Some(_) => {}
+                Some(_) => unanswered = 0,
+                // One that is busy, or whose other clients take its time, is not gone. Its process may be out of sight, though.
+                None if unanswered < UNANSWERED || claim::started(*pid).is_some() => unanswered += 1,
                 None => {
                     let what =
                         "rt-controller ended meanwhile: the robot's program brings the container upright by itself; look at the robot";

@@ -4,7 +4,7 @@
 use std::io::ErrorKind;
 use std::net::SocketAddr;
 use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, Ordering::Relaxed};
+use std::sync::atomic::{AtomicBool, AtomicU32, AtomicU64, Ordering::Relaxed};
 use std::time::Duration;
 
 use rt_controller::link::hands::{Before, Handover, after_session};
@@ -60,6 +60,53 @@ fn a_program_that_starts_while_a_port_is_tried_is_not_replaced() {
     let robot = Robot { script_ports: &[30001], ..Robot::default() };
     let network = SlowPort { port: 30002, other_plays: robot.other_plays.clone() };
     let (session, seen) = Server::new(140, robot).meet_over(&network, &Before::default());
+    assert!(matches!(session, Err(LinkError::ProgramRunning { .. })), "{session:?}");
+    assert!(seen.is_none(), "something was uploaded");
+}
+
+/// A network on which this process stands still for five seconds while it looks whether the robot moves, and somebody starts a program on the robot meanwhile.
+struct Paused {
+    other_plays: Arc<AtomicBool>,
+    reads: AtomicU32,
+    stood_ns: AtomicU64,
+}
+
+/// The read before which it stands still: among those of the robot's state.
+const PAUSED_AT: u32 = 30;
+
+impl Network for Paused {
+    fn now_ns(&self) -> u64 {
+        System.now_ns() + self.stood_ns.load(Relaxed)
+    }
+
+    fn sleep(&self, time: Duration) {
+        System.sleep(time);
+    }
+
+    fn open(&self, at: SocketAddr, within: Duration) -> std::io::Result<Box<dyn Transport>> {
+        System.open(at, within)
+    }
+
+    fn read(&self, from: &mut dyn Transport, buffer: &mut [u8], within: Duration) -> std::io::Result<usize> {
+        if self.reads.fetch_add(1, Relaxed) == PAUSED_AT {
+            // States from before that program wait first, and then those of it.
+            System.sleep(Duration::from_millis(100));
+            self.other_plays.store(true, Relaxed);
+            System.sleep(Duration::from_millis(100));
+            self.stood_ns.store(5_000_000_000, Relaxed);
+        }
+        System.read(from, buffer, within)
+    }
+}
+
+/// Protects another's program from old news: where this process stood still while it looked at the robot, it looks at what the robot does now, and not at the
+/// states that have waited for it.
+#[test]
+fn a_program_that_starts_while_we_stand_still_is_not_replaced() {
+    let robot = Robot::default();
+    let network = Paused { other_plays: robot.other_plays.clone(), reads: AtomicU32::new(0), stood_ns: AtomicU64::new(0) };
+    let (session, seen) = Server::new(144, robot).meet_over(&network, &Before::default());
+    assert!(network.reads.load(Relaxed) > PAUSED_AT, "it did stand still");
     assert!(matches!(session, Err(LinkError::ProgramRunning { .. })), "{session:?}");
     assert!(seen.is_none(), "something was uploaded");
 }

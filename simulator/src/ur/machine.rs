@@ -78,6 +78,8 @@ pub struct Machine {
     pub(super) programs: Programs,
     power: Power,
     safety: SafetyMode,
+    /// Whether a program ran when the safeguard opened: only that one goes on when it closes, and none that a person had paused.
+    ran_behind_safeguard: bool,
     /// Cycle of the last protective stop.
     stopped_at: u64,
     series: Series,
@@ -98,6 +100,7 @@ impl Machine {
             programs: Programs::default(),
             power,
             safety: SafetyMode::Normal,
+            ran_behind_safeguard: false,
             stopped_at: 0,
             freedrive: false,
             series,
@@ -237,6 +240,7 @@ impl Machine {
             self.robot.event("safeguard opened");
             self.safety = SafetyMode::SafeguardStop;
             self.robot.servo.stop(servo::STOP_RAD_S2);
+            self.ran_behind_safeguard = matches!(self.programs.runtime_state(), RuntimeState::Playing | RuntimeState::Resuming);
             self.programs.pause_for_protective_stop();
         }
     }
@@ -246,7 +250,9 @@ impl Machine {
         if self.safety == SafetyMode::SafeguardStop {
             self.safety = SafetyMode::Normal;
             self.robot.event("safeguard closed");
-            self.programs.resume(&mut self.robot);
+            if self.ran_behind_safeguard {
+                self.programs.resume(&mut self.robot);
+            }
         }
     }
 

@@ -164,6 +164,22 @@ fn an_emergency_stop_ends_the_program_and_takes_the_power() {
     assert_eq!(machine.runtime_state(), RuntimeState::Playing);
 }
 
+// Protects what is tested of who has the robot: a safeguard that closes lets that program go on which ran when it opened, and none that a person had paused.
+#[test]
+fn a_safeguard_resumes_no_program_that_a_person_paused() {
+    for (paused, after) in [(false, RuntimeState::Playing), (true, RuntimeState::Paused)] {
+        let mut machine = following();
+        assert!(!paused || machine.pause());
+        steps(&mut machine, 50);
+        machine.open_safeguard();
+        steps(&mut machine, 50);
+        assert_eq!(machine.runtime_state(), RuntimeState::Paused, "{paused}");
+        machine.close_safeguard();
+        steps(&mut machine, 50);
+        assert_eq!(machine.runtime_state(), after, "{paused}");
+    }
+}
+
 // Protects the way in which a moving arm stops with its program: at a bounded deceleration and not at once.
 #[test]
 fn a_moving_arm_slows_down_when_its_program_ends() {
