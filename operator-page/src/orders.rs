@@ -4,7 +4,7 @@
 
 use std::time::{Duration, Instant};
 
-use rt_controller::foreseen;
+use rt_controller::foreseen::{self, Expected};
 use serde_json::{Value, json};
 use shared::control::{Reply, Request, RobotLink};
 use shared::episode::set_weight;
@@ -91,29 +91,40 @@ pub fn foresee(site: &Site, goal_ml: f32, fill_ml: Option<f64>) -> Foreseen {
         lines.push("The weight file is not the one that the controller has taken, so it is not said how far off this will be.".into());
         return Foreseen { possible: true, sd_ml: None, flows_by_deg: None, lines, identity: status.weights };
     };
-    let sd_ml = foreseen::poured_sd_ml(&weights, site.config.limits, goal_ml);
+    let limits = site.config.limits;
+    let expected = foreseen::expected(&weights, limits, site.config.controller.max_frames, goal_ml);
+    let sd_ml = expected.sd_ml();
     let flows_by_deg = foreseen::must_flow_by_deg(&weights, fill_ml, container.least_fill_ml, container.holds_ml);
     if fill_ml.is_some() && flows_by_deg.is_none() {
         return cannot("The weights do not say by which tilt this fill flows: say what really is in the vessel, or leave it out.".into());
     }
-    if let (None, Some(unseen_ml)) = (flows_by_deg, foreseen::unseen_ml(&weights)) {
-        lines.push(format!(
-            "It is not known by which tilt it must flow: if the camera sees no stream at all, up to {unseen_ml:.0} ml leave before that is \
-             noticed. Say what is in the vessel."
-        ));
+    if let Some(unseen_ml) = foreseen::unseen_ml(&weights, limits, flows_by_deg) {
+        lines.push(match flows_by_deg {
+            Some(_) => format!(
+                "What is said to be in the vessel need not flow before the largest tilt: if the camera sees no stream at all, up to \
+                 {unseen_ml:.0} ml leave before that is noticed."
+            ),
+            None => format!(
+                "It is not known by which tilt it must flow: if the camera sees no stream at all, up to {unseen_ml:.0} ml leave before that is \
+                 noticed. Say what is in the vessel."
+            ),
+        });
     }
     lines.extend(few(&weights));
     lines.extend(unknown_pictures(&weights.origin));
     lines.extend(sd_ml.and_then(|sd| worse_than_expected(&site.history.errors_ml(&status.weights), sd)));
-    match sd_ml {
-        Some(sd) if sd > WARNED_SD_ML => {
+    match expected {
+        Expected::Within(sd) if sd > WARNED_SD_ML => {
             lines.push(format!("This is far off: weigh what is proposed under Learn first. Expected deviation {sd:.1} ml."));
         }
-        Some(_) => {}
-        None if foreseen::can_give(&weights, site.config.limits, goal_ml) == Some(false) => {
+        Expected::Within(_) => {}
+        Expected::TooMuch => {
             lines.push("The vessel, as the weights know it, cannot give this goal from a usual fill: the pour may end early.".into());
         }
-        None => lines.push("These weights do not say how far off this pour will be.".into()),
+        Expected::TooLong => {
+            lines.push("This pour is expected to take longer than it may (controller.max_frames), and then ends short of its goal.".into());
+        }
+        Expected::Unknown => lines.push("These weights do not say how far off this pour will be.".into()),
     }
     Foreseen { possible: true, sd_ml, flows_by_deg, lines, identity: status.weights }
 }

@@ -14,6 +14,7 @@ use std::time::{Duration, Instant, SystemTime};
 
 use rt_controller::{disk, foreseen};
 use serde_json::{Value, json};
+use shared::config::{Config, ControllerConfig};
 use shared::limits::Limits;
 use shared::regular_file;
 use shared::weights::{Estimator, Weights};
@@ -36,6 +37,7 @@ pub struct Shelf {
     weights: PathBuf,
     limits: Limits,
     goal_max_ml: f32,
+    max_frames: u32,
     /// Frames a second of the camera.
     fps: f64,
     expected: Mutex<BTreeMap<String, Value>>,
@@ -53,9 +55,17 @@ fn fault(path: &Path) -> impl Fn(std::io::Error) -> String + '_ {
 }
 
 impl Shelf {
-    /// The files around `weights`, of a cell with these limits and so many frames a second.
-    pub fn new(weights: PathBuf, limits: Limits, goal_max_ml: f32, fps: f64) -> Self {
-        Self { weights, limits, goal_max_ml, fps, expected: Mutex::default() }
+    /// The files around the configured weights.
+    pub fn new(config: &Config) -> Self {
+        let ControllerConfig { weights, goal_max_ml, max_frames, .. } = &config.controller;
+        Self {
+            weights: weights.clone(),
+            limits: config.limits,
+            goal_max_ml: *goal_max_ml,
+            max_frames: *max_frames,
+            fps: config.camera.fps,
+            expected: Mutex::default(),
+        }
     }
 
     /// Where a training writes what it offers.
@@ -106,7 +116,7 @@ impl Shelf {
             return found.clone();
         }
         let goals = GOALS_ML.into_iter().filter(|goal| *goal <= self.goal_max_ml);
-        let one = |goal: f32| json!({ "goal_ml": goal, "sd_ml": foreseen::poured_sd_ml(weights, self.limits, goal) });
+        let one = |goal: f32| json!({ "goal_ml": goal, "sd_ml": foreseen::expected(weights, self.limits, self.max_frames, goal).sd_ml() });
         let value = Value::Array(goals.map(one).collect());
         if known.len() >= REMEMBERED {
             known.clear();
@@ -257,12 +267,20 @@ mod tests {
         }
     }
 
+    /// The files around the weights `file` of a cell with the default limits.
+    fn shelf(file: &Path) -> Shelf {
+        let mut config = Config::parse(include_str!("../../config/sim.toml"), "sim.toml").unwrap();
+        config.controller = ControllerConfig { weights: file.to_owned(), goal_max_ml: 120.0, ..config.controller };
+        config.limits = Limits::default();
+        Shelf::new(&config)
+    }
+
     /// Protects the operator's way back: an offer is taken into use in one click, the old file comes back in one more, and nothing is lost.
     #[test]
     fn an_offer_is_taken_and_given_back() {
         let dir = tempfile::tempdir().unwrap();
         let file = dir.path().join("weights.bin");
-        let shelf = Shelf::new(file.clone(), Limits::default(), 120.0, 30.0);
+        let shelf = shelf(&file);
         let (one, two) = (weights(1).identity(), weights(2).identity());
         assert!(shelf.back(&one).is_err() && shelf.accept(&two).is_err());
         weights(1).write(&file).unwrap();
@@ -287,7 +305,7 @@ mod tests {
     fn a_stale_page_exchanges_nothing() {
         let dir = tempfile::tempdir().unwrap();
         let file = dir.path().join("weights.bin");
-        let shelf = Shelf::new(file.clone(), Limits::default(), 120.0, 30.0);
+        let shelf = shelf(&file);
         weights(1).write(&file).unwrap();
         weights(3).write(&shelf.offer()).unwrap();
         let (one, two) = (weights(1).identity(), weights(2).identity());
@@ -305,7 +323,7 @@ mod tests {
     fn what_the_controller_refuses_is_not_put_into_use() {
         let dir = tempfile::tempdir().unwrap();
         let file = dir.path().join("weights.bin");
-        let shelf = Shelf::new(file.clone(), Limits::default(), 120.0, 30.0);
+        let shelf = shelf(&file);
         weights(1).write(&file).unwrap();
         let fast = Weights { rate_hz: 60.0, ..weights(2) };
         fast.write(&shelf.offer()).unwrap();
@@ -318,7 +336,7 @@ mod tests {
     fn a_file_of_another_kind_is_not_replaced() {
         let dir = tempfile::tempdir().unwrap();
         let file = dir.path().join("notes.txt");
-        let shelf = Shelf::new(file.clone(), Limits::default(), 120.0, 30.0);
+        let shelf = shelf(&file);
         fs::write(&file, "my notes").unwrap();
         weights(1).write(&shelf.offer()).unwrap();
         assert!(shelf.accept(&weights(1).identity()).unwrap_err().contains("another kind"));
@@ -331,7 +349,7 @@ mod tests {
     fn exchanges_wait_for_each_other() {
         let dir = tempfile::tempdir().unwrap();
         let file = dir.path().join("weights.bin");
-        let shelves: Vec<Shelf> = (0..4).map(|_| Shelf::new(file.clone(), Limits::default(), 120.0, 30.0)).collect();
+        let shelves: Vec<Shelf> = (0..4).map(|_| shelf(&file)).collect();
         weights(1).write(&file).unwrap();
         weights(2).write(&shelves[0].offer()).unwrap();
         let (one, two) = (weights(1).identity(), weights(2).identity());

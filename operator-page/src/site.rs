@@ -76,7 +76,7 @@ pub struct Site {
 impl Site {
     /// The page of a cell, of which nothing is known yet.
     pub fn new(config: Config, file: PathBuf, stop_port: u16) -> Self {
-        let shelf = Shelf::new(config.controller.weights.clone(), config.limits, config.controller.goal_max_ml, config.camera.fps);
+        let shelf = Shelf::new(&config);
         Self {
             cell: Arc::new(Cell::new(file.clone(), Ends::of_file(config.recording.directory.join(ENDS_FILE)))),
             say: Mutex::default(),

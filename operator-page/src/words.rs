@@ -32,7 +32,7 @@ pub fn of(live: &Live) -> Words {
         return words("lost", "The controller does not answer", if remedy.is_empty() { sentence(&live.no_status) } else { remedy.into() });
     };
     let Some(point) = live.points.back() else { return words("lost", "The controller does not answer", "") };
-    let hindrance = live.status.as_ref().map_or(String::new(), |s| s.hindrance.clone());
+    let hindrance = live.status.as_ref().map_or_else(|| live.no_status.clone(), |s| s.hindrance.clone());
     let poured = volume_words(point.poured_ml, point.poured_sd_ml);
     // A curve has no goal, and nobody counts what it pours.
     let counted = if point.goal_ml.is_finite() { format!(": {poured} ml poured") } else { String::new() };
@@ -49,8 +49,11 @@ pub fn of(live: &Live) -> Words {
             },
             "",
         ),
-        Phase::Idle if hindrance.is_empty() => words("ready", "Ready to pour", ""),
-        Phase::Idle => words("waiting", "Ready to record, but not to pour", sentence(&hindrance)),
+        Phase::Idle if live.status.as_ref().is_some_and(|s| s.hindrance.is_empty()) => words("ready", "Ready to pour", ""),
+        Phase::Idle if live.status.as_ref().is_some_and(|s| s.may_record) => {
+            words("waiting", "Ready to record, but not to pour", sentence(&hindrance))
+        }
+        Phase::Idle => words("waiting", "Not ready", sentence(&hindrance)),
         Phase::NoRobot => {
             let waits = live.status.as_ref().is_some_and(|s| s.robot == RobotLink::WaitsForOperator);
             let remedy = if hindrance.is_empty() { "Waiting for the robot.".into() } else { sentence(&hindrance) };

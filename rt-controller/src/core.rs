@@ -18,7 +18,7 @@ use shared::control::{EndReason, Outcome};
 use shared::framing::Framing;
 use shared::gaussian_curve::Curve;
 use shared::limits::Limiter;
-use shared::messages::{Feature, LAYOUT_VERSION, Phase, Telemetry};
+use shared::messages::{Doubt, Feature, LAYOUT_VERSION, Phase, Telemetry};
 
 use ending::{Ending, Moment, SeenFrame};
 use following::{COMMANDS, Following};
@@ -141,7 +141,7 @@ impl Core {
 
     /// Counters since the start.
     pub fn counters(&self) -> Counters {
-        Counters { clipped: self.limiter.clipped(), wrong_rate_hz: self.wrong_rate_hz(), ..self.counters }
+        Counters { clipped: self.limiter.clipped(), ..self.counters }
     }
 
     /// Whether a new agent may be taken now: not in the middle of a pour or recording.
@@ -194,6 +194,7 @@ impl Core {
         }
         let target_deg = self.command(input, asked);
         self.commanded.push(input.now_ns, self.limiter.alpha_deg());
+        self.counters.refuses = self.may_pour(input).err();
         Output { target_deg, ordered, ended, telemetry: self.telemetry(input, asked, area) }
     }
 
@@ -220,36 +221,45 @@ impl Core {
         self.frame_rate.wrong_hz().map(|hz| (hz, self.frame_rate.configured_hz()))
     }
 
-    fn obey(&mut self, order: Order, input: &Input) -> Result<(), Refusal> {
+    /// The situation in which an order comes.
+    fn situation(&self, input: &Input) -> Situation {
         let newest_ns = intake::newest_usable_ns(input.features, self.usable_at_ns, input.now_ns);
-        let situation = Situation {
+        Situation {
             phase: self.phase,
             robot: input.robot,
             shutdown: self.shutdown,
             measurement_age_ns: input.now_ns.saturating_sub(newest_ns),
             wrong_rate_hz: self.wrong_rate_hz(),
-        };
+        }
+    }
+
+    /// Whether a pour may begin now, if its goal is legal.
+    fn may_pour(&self, input: &Input) -> Result<(), Refusal> {
+        self.situation(input).may_begin(&self.settings)?;
+        let agent = self.agent.as_ref().ok_or(Refusal::NoWeights)?;
+        let seen = self.newest_with(input).map_or_else(Framing::default, |feature| feature.framing);
+        agent.framing().difference(&seen).map_or(Ok(()), |difference| Err(Refusal::Framing(difference)))
+    }
+
+    fn obey(&mut self, order: Order, input: &Input) -> Result<(), Refusal> {
         match order {
             Order::Shutdown => {
                 self.shutdown = true;
                 self.give_up(EndReason::Shutdown, false);
             }
             Order::Abort => {
-                situation.may_abort()?;
+                self.situation(input).may_abort()?;
                 self.give_up(EndReason::Aborted, false);
             }
             Order::Pour { episode, goal_ml, flows_by_deg } => {
-                situation.may_begin(&self.settings)?;
+                self.may_pour(input)?;
                 order::goal_is_legal(goal_ml, &self.settings)?;
-                let seen = self.newest_with(input).map_or_else(Framing::default, |feature| feature.framing);
-                let agent = self.agent.as_mut().ok_or(Refusal::NoWeights)?;
-                agent.framing().difference(&seen).map_or(Ok(()), |difference| Err(Refusal::Framing(difference)))?;
-                agent.start(goal_ml);
+                self.agent.as_mut().ok_or(Refusal::NoWeights)?.start(goal_ml);
                 self.decision = Decision { d_ml: goal_ml, ..Decision::NOTHING };
                 self.begin(episode, Some(goal_ml), None, Ending::of_pour_that_flows_by(flows_by_deg), input);
             }
             Order::Record { episode, curve } => {
-                situation.may_begin(&self.settings)?;
+                self.situation(input).may_begin(&self.settings)?;
                 order::curve_is_legal(&curve, &self.settings)?;
                 self.decision = Decision::NOTHING;
                 self.begin(episode, None, Some(curve), Ending::of_recording(f64::from(curve.duration_s())), input);
@@ -355,7 +365,8 @@ impl Core {
         }
         let alpha_deg = self.commanded.at_deg(captured_at_ns);
         self.decision = step(area_px2, alpha_deg, captured_at_ns);
-        let frame = SeenFrame { lost: taken.lost, area_px2, flowing: self.decision.flowing, alpha_deg, alpha_now_deg };
+        let cut_off = Doubt::from_code(feature.doubt) == Doubt::LeavesRegion;
+        let frame = SeenFrame { lost: taken.lost, area_px2, cut_off, flowing: self.decision.flowing, alpha_deg, alpha_now_deg };
         run.ending.saw(&frame, &self.settings);
         (self.phase == Phase::Pouring && !run.ending.agent_is_done()).then_some(self.decision.dalpha_deg)
     }

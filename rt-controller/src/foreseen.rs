@@ -12,10 +12,8 @@ use shared::weights::{Estimator, Weights};
 
 /// Tilts at which the flow may begin, degrees: from a nearly full vessel to one that is half empty.
 const ONSETS_DEG: [f32; 3] = [35.0, 50.0, 65.0];
-/// Frames after which a foreseen pour ends in any case: the controller's own default (`controller.max_frames`).
-const MAX_FRAMES: usize = 900;
 /// Frames without flow, on the way back, after which a foreseen pour is over.
-const QUIET_FRAMES: usize = 20;
+const QUIET_FRAMES: u32 = 20;
 /// Below this area no camera shows a stream, px^2. Chosen by hand; no measurement is recorded.
 const VISIBLE_PX2: f32 = 20.0;
 /// The largest tilt of the flow model's tables, degrees.
@@ -42,45 +40,63 @@ fn explanation(weights: &Weights) -> Option<&Explanation> {
     }
 }
 
-/// Whether a usual fill of the vessel gives `goal_ml` by the largest tilt; `None` with the plain sum, which knows no vessel.
-pub fn can_give(weights: &Weights, limits: Limits, goal_ml: f32) -> Option<bool> {
-    let flow = FlowTables::new(&explanation(weights)?.model, weights.rate_hz.into());
-    Some(ONSETS_DEG.iter().any(|onset_deg| gives(&flow, limits, *onset_deg, goal_ml)))
+/// How far off a pour is expected to be.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum Expected {
+    /// By this standard deviation, ml, above 0: the largest over fills from which the goal can be reached.
+    Within(f32),
+    /// The weights carry no deviation, or nothing is to be poured.
+    Unknown,
+    /// The vessel, as the weights know it, does not give the goal by the largest tilt from any usual fill.
+    TooMuch,
+    /// From every fill that gives the goal the pour takes more frames than it may.
+    TooLong,
 }
 
-/// Whether a vessel whose flow begins at `onset_deg` gives `goal_ml` by the largest tilt.
-fn gives(flow: &FlowTables, limits: Limits, onset_deg: f32, goal_ml: f32) -> bool {
-    flow.capacity.lost_ml(limits.alpha_max_deg.into()) - flow.capacity.lost_ml(onset_deg.into()) >= f64::from(goal_ml)
+impl Expected {
+    /// The expected standard deviation, ml, if it is known.
+    pub fn sd_ml(self) -> Option<f32> {
+        if let Self::Within(sd_ml) = self { Some(sd_ml) } else { None }
+    }
 }
 
-/// The standard deviation with which a pour of `goal_ml` will end, ml: the largest over fills from which the goal can be reached. `None` if the
-/// weights carry no deviation, or the vessel cannot give the goal ([`can_give`]).
-pub fn poured_sd_ml(weights: &Weights, limits: Limits, goal_ml: f32) -> Option<f32> {
-    let Explanation { model, calibration, .. } = explanation(weights)?;
+/// How far off a pour of `goal_ml` is expected to be that ends after `max_frames` at the latest.
+pub fn expected(weights: &Weights, limits: Limits, max_frames: u32, goal_ml: f32) -> Expected {
+    // A pour of nothing never begins.
+    let known = explanation(weights).filter(|_| goal_ml > 0.0);
+    let Some(Explanation { model, calibration, .. }) = known else { return Expected::Unknown };
     let flow = FlowTables::new(model, weights.rate_hz.into());
-    let sds = ONSETS_DEG.iter().filter_map(|onset_deg| foreseen_sd_ml(weights, (&flow, calibration), limits, goal_ml, *onset_deg));
-    sds.max_by(f32::total_cmp).filter(|sd_ml| *sd_ml > 0.0)
+    let gives =
+        |onset_deg: f32| flow.capacity.lost_ml(limits.alpha_max_deg.into()) - flow.capacity.lost_ml(onset_deg.into()) >= f64::from(goal_ml);
+    let mut onsets_deg = ONSETS_DEG.into_iter().filter(|onset_deg| gives(*onset_deg)).peekable();
+    if onsets_deg.peek().is_none() {
+        return Expected::TooMuch;
+    }
+    let sds = onsets_deg.filter_map(|onset_deg| foreseen_sd_ml(weights, (&flow, calibration), limits, max_frames, goal_ml, onset_deg));
+    match sds.max_by(f32::total_cmp) {
+        Some(sd_ml) if sd_ml > 0.0 => Expected::Within(sd_ml),
+        Some(_) => Expected::Unknown,
+        None => Expected::TooLong,
+    }
 }
 
-/// The standard deviation at the end of a pour whose flow begins at `onset_deg`; `None` if less than the goal is above the largest tilt.
+/// The standard deviation at the end of a pour whose flow begins at `onset_deg`, ml; `None` if it is not over after `max_frames`.
 fn foreseen_sd_ml(
     weights: &Weights,
     (flow, calibration): (&FlowTables, &Calibration),
     limits: Limits,
+    max_frames: u32,
     goal_ml: f32,
     onset_deg: f32,
 ) -> Option<f32> {
-    if !gives(flow, limits, onset_deg, goal_ml) {
-        return None;
-    }
     let headspace_ml = flow.capacity.lost_ml(onset_deg.into());
     let mut agent = Agent::new(weights);
     agent.start(goal_ml);
     let mut limiter = Limiter::new(limits, 1.0 / weights.rate_hz, 0.0);
     let mut state = FlowState { headspace_ml, ..FlowState::default() };
     let mut history = CommandHistory::standing_at(0.0);
-    let (mut sd_ml, mut quiet) = (0.0, 0);
-    for _ in 0..MAX_FRAMES {
+    let mut quiet = 0;
+    for _ in 0..max_frames {
         let alpha_deg = limiter.alpha_deg();
         history.push(alpha_deg.into());
         let leaves_ml = state.step(flow, history.commands(), 0).leaves_ml;
@@ -93,10 +109,9 @@ fn foreseen_sd_ml(
             alpha_measured_deg: f32::NAN,
             alpha_now_deg: alpha_deg,
         });
-        sd_ml = decision.poured_sd_ml;
         quiet = if decision.tilting_back && area_px2 <= 0.0 { quiet + 1 } else { 0 };
         if quiet >= QUIET_FRAMES {
-            break;
+            return Some(decision.poured_sd_ml);
         }
         if decision.tilting_back {
             limiter.step_upright();
@@ -104,7 +119,7 @@ fn foreseen_sd_ml(
             limiter.step(alpha_deg + decision.dalpha_deg);
         }
     }
-    Some(sd_ml)
+    None
 }
 
 /// The tilt by which a vessel with `fill_ml` in it must flow, degrees; `None` if the weights describe no vessel, the fill reaches no lip, or the vessel
@@ -131,12 +146,15 @@ pub fn must_flow_by_deg(weights: &Weights, fill_ml: Option<f64>, least_fill_ml: 
     flows_by_deg(weights, least_fill_ml?.min(holds_ml.or_else(whole_ml)?), holds_ml)
 }
 
-/// What may leave at most before a camera that never sees the stream is noticed, ml, if nobody has told how much is in the vessel: a full one
-/// flows early, and an emptier one than any episode's has to flow before nothing is seen for sure. `None` with the plain sum.
-pub fn unseen_ml(weights: &Weights) -> Option<f64> {
+/// What may leave at most before a camera that never sees the stream is noticed, ml, where no tilt below the largest one is known by which it must flow
+/// ([`must_flow_by_deg`]): a full vessel flows early, and an emptier one than any episode's has to flow before nothing is seen for sure, or the largest tilt
+/// to be reached. `None` where such a tilt is known, and with the plain sum.
+pub fn unseen_ml(weights: &Weights, limits: Limits, flows_by_deg: Option<f32>) -> Option<f64> {
     let Estimator::Fused { model, .. } = &weights.estimator else { return None };
     let capacity = FlowTables::new(&model.likelier().model, weights.rate_hz.into()).capacity;
-    Some(capacity.lost_ml(model.bounds.dry_deg.min(LAST_DEG)))
+    let noticed_deg = model.bounds.dry_deg.min(limits.alpha_max_deg.into());
+    let is_known = flows_by_deg.is_some_and(|deg| deg < limits.alpha_max_deg);
+    (!is_known).then(|| capacity.lost_ml(noticed_deg))
 }
 
 #[cfg(test)]
@@ -182,31 +200,40 @@ pub(crate) mod tests {
     }
 
     /// Protects whoever orders a pour: the deviation of a large pour is foreseen as larger than that of a small one, one that the vessel cannot
-    /// give has none, and the plain sum has none.
+    /// give, or that takes longer than it may, has none, and the plain sum has none.
     #[test]
     fn a_deviation_is_foreseen() {
-        let sd = |goal_ml| poured_sd_ml(&weights(), Limits::default(), goal_ml);
-        let (small, large) = (sd(30.0).unwrap(), sd(150.0).unwrap());
+        let of = |goal_ml, max_frames| expected(&weights(), Limits::default(), max_frames, goal_ml);
+        let (Expected::Within(small), Expected::Within(large)) = (of(30.0, 900), of(150.0, 900)) else { panic!("no deviation") };
         assert!(small > 0.05 && large > 1.5 * small && large < 30.0, "{small} {large}");
-        assert_eq!(sd(2000.0), None);
-        let can = |weights: &Weights, goal_ml| can_give(weights, Limits::default(), goal_ml);
-        assert_eq!((can(&weights(), 30.0), can(&weights(), 2000.0)), (Some(true), Some(false)));
-        assert_eq!(can(&Weights { estimator: Estimator::Sum, ..weights() }, 30.0), None);
-        assert_eq!(poured_sd_ml(&Weights { estimator: Estimator::Sum, ..weights() }, Limits::default(), 30.0), None);
+        assert_eq!((of(30.0, 150), of(2000.0, 900)), (Expected::TooLong, Expected::TooMuch));
+        let sum = Weights { estimator: Estimator::Sum, ..weights() };
+        assert_eq!(expected(&sum, Limits::default(), 900, 30.0), Expected::Unknown);
+        // A pour that takes longer than the default is foreseen to its end where it may.
+        let slow = Limits { rate_deg_s: 1.5, ..Limits::default() };
+        let of = |max_frames| expected(&weights(), slow, max_frames, 150.0);
+        assert_eq!(of(900), Expected::TooLong);
+        assert!(matches!(of(9000), Expected::Within(sd_ml) if sd_ml > small), "{:?}", of(9000));
     }
 
-    /// Protects whoever pours without telling the fill: what may leave unseen is said, and it grows with the tilt that has to be waited for.
+    /// Protects whoever pours without telling the fill: what may leave unseen is said, and it grows with the tilt that has to be waited for, up to the
+    /// largest one. A tilt beyond that bounds nothing.
     #[test]
     fn what_may_leave_unseen_is_said() {
-        let until = |dry_deg: f64| {
+        let limits = Limits::default();
+        let until = |dry_deg: f64, limits, flows_by_deg| {
             let mut weights = weights();
             if let Estimator::Fused { model, .. } = &mut weights.estimator {
                 model.bounds.dry_deg = dry_deg;
             }
-            unseen_ml(&weights).unwrap()
+            unseen_ml(&weights, limits, flows_by_deg)
         };
-        assert!(until(60.0) > 100.0 && until(60.0) + 50.0 < until(90.0) && until(90.0) <= until(180.0));
-        assert_eq!(unseen_ml(&Weights { estimator: Estimator::Sum, ..weights() }), None);
+        let [early, late, never] = [60.0, 90.0, 180.0].map(|dry_deg| until(dry_deg, limits, None).unwrap());
+        assert!(early > 100.0 && early + 50.0 < late && late <= never, "{early} {late} {never}");
+        assert_eq!(until(180.0, Limits { alpha_max_deg: 60.0, ..limits }, None), Some(early));
+        let told = [limits.alpha_max_deg - 1.0, limits.alpha_max_deg + 1.0].map(|deg| until(90.0, limits, Some(deg)));
+        assert_eq!(told, [None, Some(late)]);
+        assert_eq!(unseen_ml(&Weights { estimator: Estimator::Sum, ..weights() }, limits, None), None);
     }
 
     /// Protects `pour --fill`: a fuller vessel flows earlier, and a fill that the vessel does not reach its lip with says nothing.

@@ -273,18 +273,21 @@ impl<'a> Service<'a> {
         let phase = Phase::from_code(t.phase);
         let note = self.robot_note.get();
         let disk = self.disk_note.get();
-        let wrong_rate = c.wrong_rate_hz.map_or(String::new(), |(hz, configured_hz)| Refusal::FrameRate(hz, configured_hz).to_string());
         let hindrance = match phase {
             Phase::NoRobot if !note.text.is_empty() => note.text,
             Phase::NoRobot if t.alpha_measured_deg.is_finite() => Refusal::NotUpright(t.alpha_measured_deg).to_string(),
             Phase::NoRobot => "waiting for the robot".into(),
-            _ if !wrong_rate.is_empty() => wrong_rate,
-            _ if t.weights_id == 0 => format!("no weights: {}", self.refused()),
-            _ => String::new(),
+            _ => match c.refuses {
+                None | Some(Refusal::Busy) => String::new(),
+                Some(Refusal::NoWeights) => format!("no weights: {}", self.refused()),
+                Some(refusal) => refusal.to_string(),
+            },
         };
+        let may_record = phase == Phase::Idle && !c.refuses.is_some_and(|refusal| refusal.hinders_recording());
         Status {
             phase,
             hindrance,
+            may_record,
             episode: t.episode,
             goal_ml: t.goal_ml,
             d_ml: t.d_ml,

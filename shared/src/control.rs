@@ -11,7 +11,7 @@ use crate::limits::Clipped;
 use crate::messages::Phase;
 
 /// Version of the messages of this module: part of the service's name, so that programs of other versions never connect.
-pub const CONTROL_VERSION: u32 = 4;
+pub const CONTROL_VERSION: u32 = 5;
 
 /// What a client asks.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -134,7 +134,7 @@ pub enum EndReason {
     Aborted,
     /// The configured number of frames was reached.
     MaxFrames,
-    /// Nothing flows although the container is tilted as far as it may be.
+    /// Nothing flows any more although the container is tilted as far as it may be.
     ContainerEmpty,
     /// There was no usable measurement for longer than `controller.stale_feature_ms`.
     StaleFeature,
@@ -170,7 +170,7 @@ pub enum EndReason {
     InHand,
     /// The camera shows a stream that the container cannot give at its tilt.
     ImpossibleFlow,
-    /// The camera shows no stream where even the emptiest container of the episodes would give one.
+    /// The camera never showed a stream, where the told fill or even the emptiest container of the episodes would give one, or at the largest tilt.
     NothingFlows,
     /// The camera's frames do not come at `camera.fps`.
     FrameRate,
@@ -231,9 +231,7 @@ impl EndReason {
             Self::GoalExceeded => {
                 "far more was poured than the goal: the vessel gave more than was learned of it, or its stream was not seen for a while; look at the camera, and weigh"
             }
-            Self::NothingFlows => {
-                "nothing is seen to flow, where even the emptiest vessel of the episodes would: look at the camera, or fill the vessel"
-            }
+            Self::NothingFlows => "nothing is seen to flow at a tilt at which the vessel should: look at the camera, or fill the vessel",
         }
     }
 }
@@ -243,8 +241,10 @@ impl EndReason {
 pub struct Status {
     /// What the controller is doing.
     pub phase: Phase,
-    /// Why it cannot pour now, one line; empty if it can.
+    /// Why it cannot pour now, one line; empty if it can, and while it moves.
     pub hindrance: String,
+    /// Whether a recording can begin now.
+    pub may_record: bool,
     /// Number of the pour or recording under way; 0 if there is none.
     pub episode: u64,
     /// Goal volume of the pour under way, ml.

@@ -59,8 +59,12 @@ fn device(camera: &CameraConfig) -> Vec<Finding> {
         let advice = format!("set camera.path to {name}");
         findings.push(Finding::yellow("name", camera.path.clone(), "node numbers change when another camera is plugged in", advice));
     }
-    if !found.users.is_empty() {
-        findings.push(Finding::green("used by", found.users.join(", ")));
+    let users = found.users.join(", ");
+    if found.users.iter().any(|user| !user.starts_with("feature-worker ")) {
+        let (means, advice) = ("the worker cannot open the camera while another program has it", "end that program");
+        findings.push(Finding::red("used by", users, means, advice));
+    } else if !users.is_empty() {
+        findings.push(Finding::green("used by", users));
     }
     findings.push(format(camera, &found.formats));
     findings.push(settings(&controls::compare(&file, camera), !found.users.is_empty()));

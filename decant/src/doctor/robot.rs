@@ -85,6 +85,14 @@ pub fn look(config: &Config) -> Vec<Finding> {
 fn held(running: &Running, place: &Place) -> Finding {
     let is = format!("rt-controller (process {}) runs", running.pid);
     match Client::connect(place.clone()).and_then(|client| client.status()) {
+        Ok(status) if status.robot == RobotLink::Connected && !status.hindrance.is_empty() => {
+            let is = format!("{is}, has the robot, and would refuse a pour: {}", status.hindrance);
+            let (means, advice) = ("nothing can be poured before that", "`decant status` says more");
+            if status.may_record { Finding::yellow("state", is, means, advice) } else { Finding::red("state", is, means, advice) }
+        }
+        Ok(status) if status.robot == RobotLink::Connected && !status.robot_warning.is_empty() => {
+            Finding::yellow("state", format!("{is}, and has the robot: {}", status.robot_warning), "see the robot's settings", "")
+        }
         Ok(status) if status.robot == RobotLink::Connected => {
             Finding::green("state", format!("{is}, and its program is at work on the robot"))
         }

@@ -10,7 +10,7 @@ use shared::weights::Weights;
 
 use super::resume;
 use crate::client::{self, Client, ClientError, Common};
-use crate::foreseen;
+use crate::foreseen::{self, Expected};
 
 /// A pour that is expected to be off by more than this is warned of, ml: wanted by the users.
 const WARNED_SD_ML: f32 = 5.0;
@@ -34,28 +34,30 @@ pub struct Args {
 /// Runs the command.
 pub fn run(args: &Args) -> Result<(), Failure> {
     let config = Config::read(&args.common.config).or_exit(exit::BAD_INPUT)?;
+    if args.fill.is_some_and(|ml| ml < f64::from(args.goal_ml)) {
+        let what = "--fill: there is less in the vessel than is to be poured: fill it, or give a smaller goal";
+        return Err(failure(exit::BAD_INPUT, what));
+    }
+    // That may take a while, in which the controller may take other weights: what is foreseen is of those that pour.
+    resume::take_back_if_it_waits(&Client::connect_or_end(&config.cell).or_exit(exit::UNREACHABLE)?)?;
     let foreseen = Foreseen::of(&config, args)?;
     for line in foreseen.lines(args.goal_ml) {
         eprintln!("{line}");
     }
     let request = Request::Pour { goal_ml: args.goal_ml, flows_by_deg: foreseen.flows_by_deg };
     let ended = order(&config.cell, &request)?;
-    report(&ended, foreseen.sd_ml, args.common.json);
+    report(&ended, foreseen.expected.and_then(Expected::sd_ml), args.common.json);
     ended.as_result()
 }
 
 /// What is known of a pour before it starts.
 struct Foreseen {
-    /// The standard deviation with which it will end, ml, if the weights tell.
-    sd_ml: Option<f32>,
+    /// How far off it will be; `None` if the controller has other weights than lie in the configured file.
+    expected: Option<Expected>,
     /// The tilt by which it must flow, degrees, if the fill is known.
     flows_by_deg: Option<f32>,
-    /// What may leave before it is noticed that the camera sees nothing, ml, if the fill is not known.
+    /// What may leave before it is noticed that the camera sees nothing, ml, if no tilt bounds it.
     unseen_ml: Option<f64>,
-    /// Whether the controller has the weights that lie in the configured file.
-    same_weights: bool,
-    /// Whether the vessel can give the goal, if these weights know the vessel.
-    can_give: Option<bool>,
     /// What there is to say of the pictures that the weights were trained on.
     pictures_line: Option<&'static str>,
 }
@@ -66,10 +68,6 @@ impl Foreseen {
         let status = Client::connect_or_end(&config.cell).or_exit(exit::UNREACHABLE)?.status().or_exit(exit::UNREACHABLE)?;
         let weights = Weights::read(&config.controller.weights).ok().filter(|w| w.identity() == status.weights);
         let foreseen = Self::with(weights.as_ref(), config, args.goal_ml, args.fill);
-        if args.fill.is_some_and(|ml| ml < f64::from(args.goal_ml)) {
-            let what = "--fill: there is less in the vessel than is to be poured: fill it, or give a smaller goal";
-            return Err(failure(exit::BAD_INPUT, what));
-        }
         if args.fill.is_some() && weights.is_none() {
             let what = "--fill: controller.weights is not the file that the controller has taken, so what is in the vessel cannot be used: leave it out";
             return Err(failure(exit::BAD_INPUT, what));
@@ -87,11 +85,9 @@ impl Foreseen {
         let container = config.container;
         let flows_by_deg = weights.and_then(|w| foreseen::must_flow_by_deg(w, fill_ml, container.least_fill_ml, container.holds_ml));
         Self {
-            sd_ml: weights.and_then(|w| foreseen::poured_sd_ml(w, config.limits, goal_ml)),
+            expected: weights.map(|w| foreseen::expected(w, config.limits, config.controller.max_frames, goal_ml)),
             flows_by_deg,
-            unseen_ml: if flows_by_deg.is_none() { weights.and_then(foreseen::unseen_ml) } else { None },
-            same_weights: weights.is_some(),
-            can_give: weights.and_then(|w| foreseen::can_give(w, config.limits, goal_ml)),
+            unseen_ml: weights.and_then(|w| foreseen::unseen_ml(w, config.limits, flows_by_deg)),
             pictures_line: weights.and_then(foreseen::pictures_line),
         }
     }
@@ -101,31 +97,38 @@ impl Foreseen {
         self.line(goal_ml).into_iter().chain(self.unseen_line()).chain(self.pictures_line.map(str::to_owned))
     }
 
-    /// What a camera that sees no stream at all could cost, where nobody has told the fill.
+    /// What a camera that sees no stream at all could cost, where no tilt bounds it.
     fn unseen_line(&self) -> Option<String> {
-        self.unseen_ml.map(|ml| {
-            format!(
+        self.unseen_ml.map(|ml| match self.flows_by_deg {
+            Some(_) => format!(
+                "note: what is said to be in the vessel need not flow before the largest tilt, so if the camera sees no stream at all, up to {ml:.0} ml \
+                 leave before that is noticed"
+            ),
+            None => format!(
                 "note: nobody said how much is in the vessel, so if the camera sees no stream at all, up to {ml:.0} ml leave before that is \
                  noticed: give --fill, or [container] least_fill_ml"
-            )
+            ),
         })
     }
 
     /// What the operator should know before the pour; `None` if all is well.
     fn line(&self, goal_ml: f32) -> Option<String> {
-        match self.sd_ml {
-            Some(sd_ml) if sd_ml > WARNED_SD_ML => Some(format!(
-                "warning: a pour of {goal_ml:.0} ml is expected to be off by {sd_ml:.1} ml (standard deviation); `trainer plan` says what to weigh"
-            )),
-            Some(_) => None,
-            None if !self.same_weights => Some(
-                "note: controller.weights is not the file that the controller has taken, so it is not said how far off this will be".into(),
-            ),
-            None if self.can_give == Some(false) => {
-                Some("note: the vessel, as the weights know it, cannot give this goal from a usual fill: the pour may end early".into())
+        let note = match self.expected {
+            Some(Expected::Within(sd_ml)) => {
+                return (sd_ml > WARNED_SD_ML).then(|| {
+                    format!("warning: a pour of {goal_ml:.0} ml is expected to be off by {sd_ml:.1} ml (standard deviation); `trainer plan` says what to weigh")
+                });
             }
-            None => Some("note: the weights do not say how far off this pour will be".into()),
-        }
+            None => "note: controller.weights is not the file that the controller has taken, so it is not said how far off this will be",
+            Some(Expected::TooMuch) => {
+                "note: the vessel, as the weights know it, cannot give this goal from a usual fill: the pour may end early"
+            }
+            Some(Expected::TooLong) => {
+                "note: this pour is expected to take more than controller.max_frames, and then ends short of its goal"
+            }
+            Some(Expected::Unknown) => "note: the weights do not say how far off this pour will be",
+        };
+        Some(note.into())
     }
 }
 

@@ -12,7 +12,8 @@
 //! | the curve of a recording was run to its end | `Done` |
 //! | the newest usable measurement is too old | `StaleFeature` |
 //! | the largest number of frames is reached | `MaxFrames` |
-//! | nothing flows at the largest tilt | `ContainerEmpty` |
+//! | nothing flows at the largest tilt, where a stream was seen before | `ContainerEmpty` |
+//! | the same, where none was ever seen: the container is empty, or the camera sees nothing | `NothingFlows` |
 //! | nothing was ever seen to flow, beyond the tilt at which the given fill would | `NothingFlows` |
 //! | a stream was seen before, and is not seen any more although the container is tilted further | `StreamLost` |
 //! | the measured tilt does not follow the commanded one, on the way out or back ([`super::following`]) | `NotFollowed` |
@@ -26,6 +27,7 @@
 
 use shared::agent::Decision;
 use shared::control::{EndReason, is_beyond, is_short};
+use shared::episode::CUT_OFF_MAX;
 use shared::estimator::verdict::Impossible;
 use shared::messages::Feature;
 
@@ -80,6 +82,8 @@ pub struct SeenFrame {
     pub lost: u32,
     /// V_e, px^2; `None` if it could not be measured.
     pub area_px2: Option<f32>,
+    /// Whether that area is a lower bound, because the stream leaves the region.
+    pub cut_off: bool,
     /// Whether the agent sees liquid leave the container.
     pub flowing: bool,
     /// Commanded alpha when the picture was taken, degrees.
@@ -117,6 +121,9 @@ pub struct Ending {
     reason: EndReason,
     /// Whether liquid may have left that nobody has seen or counted, for whatever reason the pour ends.
     unseen: bool,
+    /// Sum of the areas that were measured, and of those among them that are lower bounds, px^2.
+    area_px2: f64,
+    cut_off_px2: f64,
     agent_is_done: bool,
     /// The reason for which the pour is not done as it stands, if it is not.
     not_done: Option<EndReason>,
@@ -151,6 +158,8 @@ impl Ending {
             curve_s: None,
             reason: EndReason::Done,
             unseen: false,
+            area_px2: 0.0,
+            cut_off_px2: 0.0,
             agent_is_done: false,
             not_done: None,
             impossible: None,
@@ -216,9 +225,13 @@ impl Ending {
         self.quiet_frames >= settings.frames(SETTLE_QUIET_S)
     }
 
-    /// Whether liquid may have left that nobody has seen or counted, if it ends for `reason`. An abort does not bring back what a lost camera hid.
+    /// Whether liquid may have left that nobody has seen or counted, if it ends for `reason`. An abort does not bring back what a lost camera hid. Nor
+    /// does what leaves the region come back: a pour of which so much was seen that a file of it would not be trained is a lower bound. And who stands
+    /// tilted until the frames run out and never sees a stream cannot know that there was none.
     pub fn leaves_unseen(&self, reason: EndReason) -> bool {
-        self.unseen || reason.leaves_unseen()
+        let cut_off = self.cut_off_px2 > CUT_OFF_MAX * self.area_px2;
+        let blind = reason == EndReason::MaxFrames && self.curve_s.is_none() && !self.seen_stream;
+        self.unseen || reason.leaves_unseen() || cut_off || blind
     }
 
     /// Takes whether the joint follows on its way upright, and why the camera does not tell what leaves there, if so; and looks at what was seen
@@ -271,6 +284,9 @@ impl Ending {
     /// Takes what a frame showed during a pour.
     pub fn saw(&mut self, frame: &SeenFrame, settings: &Settings) {
         let frames = frame.lost + 1;
+        let area_px2 = frame.area_px2.map_or(0.0, f64::from);
+        self.area_px2 += area_px2;
+        self.cut_off_px2 += if frame.cut_off { area_px2 } else { 0.0 };
         // A frame that could not be measured does not say that nothing fell.
         self.quiet_frames = if frame.flowing { 0 } else { self.quiet_frames + u32::from(frame.area_px2.is_some()) };
         if frame.area_px2.is_some_and(|area_px2| area_px2 > 0.0) {
@@ -303,6 +319,8 @@ impl Ending {
             None if self.agent_is_done => Some(EndReason::Done),
             None if moment.frames >= settings.max_frames => Some(EndReason::MaxFrames),
             None if self.dry_frames >= settings.frames(DRY_S) => Some(EndReason::NothingFlows),
+            // An empty container and a camera that sees nothing look alike.
+            None if self.empty_frames >= settings.empty_frames && !self.seen_stream => Some(EndReason::NothingFlows),
             None if self.empty_frames >= settings.empty_frames => Some(EndReason::ContainerEmpty),
             None if self.stream_is_lost(moment, settings) => Some(EndReason::StreamLost),
             None => None,

@@ -77,6 +77,13 @@ pub enum Refusal {
     Stopped,
 }
 
+impl Refusal {
+    /// Whether a recording would be refused for it as well: what only a pour needs does not hinder it.
+    pub fn hinders_recording(&self) -> bool {
+        !matches!(self, Self::NoWeights | Self::Framing(_) | Self::Goal(_))
+    }
+}
+
 impl std::fmt::Display for Refusal {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         match self {

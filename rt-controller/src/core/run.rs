@@ -9,6 +9,7 @@ use shared::limits::Clipped;
 
 use super::ending::Ending;
 use super::following::Following;
+use super::order::Refusal;
 
 /// Counters since the start.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
@@ -25,8 +26,8 @@ pub struct Counters {
     pub ignored_features: u64,
     /// How often each limit changed a request.
     pub clipped: Clipped,
-    /// The rate at which the camera's frames really come, and the configured one, frames/s, if they differ.
-    pub wrong_rate_hz: Option<(f32, f32)>,
+    /// Why a pour would be refused now, whatever its goal; `None` if it would not.
+    pub refuses: Option<Refusal>,
 }
 
 /// A pour or recording under way.

@@ -204,3 +204,27 @@ fn weights_of_another_picture_pour_nothing() {
         assert_eq!(poured(trained, seen), Ok(()));
     }
 }
+
+/// Protects the operator from "ready": what would refuse an order is known in each tick before one is given, and whether it hinders a recording too.
+#[test]
+fn what_would_refuse_an_order_is_known_before() {
+    let known = |cell: &mut ToyCell| {
+        (0..10).for_each(|_| _ = cell.tick(None));
+        let refuses = cell.core.counters().refuses;
+        assert_eq!(cell.pour(50.0).err(), refuses);
+        (refuses, refuses.is_some_and(|refusal| refusal.hinders_recording()))
+    };
+    assert_eq!(known(&mut ToyCell::new()), (None, false));
+    let mut busy = ToyCell::new();
+    busy.pour(50.0).expect("ready");
+    assert_eq!(known(&mut busy), (Some(Refusal::Busy), true));
+    let mut blank = ToyCell::new();
+    blank.core = Core::new(blank.settings);
+    assert_eq!(known(&mut blank), (Some(Refusal::NoWeights), false));
+    let mut dark = ToyCell::new();
+    dark.doubt = Doubt::TooDark;
+    assert_eq!(known(&mut dark), (Some(Refusal::NoFeature), true));
+    let mut slow = ToyCell::new();
+    slow.speed_scaling = Some(0.4);
+    assert_eq!(known(&mut slow), (Some(Refusal::Slowed(0.4)), true));
+}

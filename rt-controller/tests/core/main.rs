@@ -301,6 +301,13 @@ fn a_lost_stream_ends_the_pour_early_and_an_empty_container_late() {
         empty.tick(None);
     }
     assert_eq!(empty.finish().reason, EndReason::ContainerEmpty);
+
+    // Without even a bead nobody knows whether the container is empty or the camera blind.
+    let mut blind = ToyCell::new();
+    blind.dry = true;
+    blind.pour(200.0).expect("ready");
+    let outcome = blind.finish();
+    assert_eq!((outcome.reason, outcome.unseen), (EndReason::NothingFlows, true));
 }
 
 /// Protects people: when the robot may not move, nothing is commanded, the pour ends at once, and nothing resumes by itself.

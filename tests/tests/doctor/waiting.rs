@@ -35,6 +35,28 @@ fn a_robot_is_found_by_its_name() {
     assert!(output.status.code() == Some(4) && said.contains("shutting down"), "{:?}: {said}", output.status);
 }
 
+/// Protects who asks before a pour whether all is well: a running controller that would refuse it is no green line, and `status` names the same reason.
+#[test]
+fn a_controller_that_would_refuse_is_not_green() {
+    let mut cell = CellUnderTest::start(|_| {});
+    let patience = Duration::from_secs(20);
+    cell.wait("the lack of weights", patience, |s| {
+        s["may_record"] == true && s["hindrance"].as_str().is_some_and(|h| h.starts_with("no weights"))
+    });
+    assert_eq!(line(&examine(&cell).0, "robot", "state").0, "yellow");
+    cell.take_weights(&steady_weights(13));
+    cell.wait("nothing to hinder", patience, |s| s["phase"] == "idle" && s["hindrance"] == "");
+    let (verdict, words) = line(&examine(&cell).0, "robot", "state");
+    assert!(verdict == "green" && words.contains("at work on the robot"), "{verdict}: {words}");
+    assert_eq!(cell.stop("feature-worker"), Some(0), "{}", cell.log("feature-worker"));
+    let status = cell.wait("the lack of measurements", patience, |s| {
+        s["hindrance"].as_str().is_some_and(|h| h.contains("no fresh, usable measurement"))
+    });
+    assert_eq!(status["may_record"], false, "{status}");
+    let (verdict, words) = line(&examine(&cell).0, "robot", "state");
+    assert!(verdict == "red" && words.contains("no fresh, usable measurement"), "{verdict}: {words}");
+}
+
 /// Protects a person who starts the worker before the camera is plugged in: it waits, says so once, and ends at once when it is asked to.
 #[test]
 fn a_missing_camera_is_waited_for() {

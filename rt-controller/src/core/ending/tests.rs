@@ -140,7 +140,7 @@ fn nothing_flows_where_it_must() {
         let mut ending = Ending::of_pour_that_flows_by(flows_by_deg);
         ending.seen_stream = flowed;
         for _ in 0..frames {
-            let frame = SeenFrame { lost: 0, area_px2: Some(0.0), flowing: false, alpha_deg: 62.0, alpha_now_deg: 63.0 };
+            let frame = SeenFrame { lost: 0, area_px2: Some(0.0), cut_off: false, flowing: false, alpha_deg: 62.0, alpha_now_deg: 63.0 };
             ending.saw(&frame, &settings);
         }
         ending.due(&moment, &settings)
@@ -152,7 +152,10 @@ fn nothing_flows_where_it_must() {
     assert_eq!(after(None, false, dry_frames), None);
     let mut flashed = Ending::of_pour_that_flows_by(Some(60.0));
     for area_px2 in std::iter::once(100.0).chain([0.0; 10]).map(Some) {
-        flashed.saw(&SeenFrame { lost: 0, area_px2, flowing: area_px2 > Some(0.0), alpha_deg: 62.0, alpha_now_deg: 63.0 }, &settings);
+        flashed.saw(
+            &SeenFrame { lost: 0, area_px2, cut_off: false, flowing: area_px2 > Some(0.0), alpha_deg: 62.0, alpha_now_deg: 63.0 },
+            &settings,
+        );
     }
     assert_eq!(flashed.due(&moment, &settings), Some(EndReason::NothingFlows));
 }
@@ -170,7 +173,7 @@ fn a_stream_out_of_an_upright_container_is_named() {
         for frame in 1..=200 {
             let flowing = frame % pause != 0;
             let area_px2 = Some(if flowing { 90.0 } else { 0.0 });
-            ending.saw(&SeenFrame { lost: 0, area_px2, flowing, alpha_deg: 0.0, alpha_now_deg: 0.0 }, &settings);
+            ending.saw(&SeenFrame { lost: 0, area_px2, cut_off: false, flowing, alpha_deg: 0.0, alpha_now_deg: 0.0 }, &settings);
             if let Some(reason) = ending.settled(0.0, f64::from(frame) / 30.0, false, &settings) {
                 return (reason, ending.leaves_unseen(reason));
             }
@@ -186,7 +189,7 @@ fn a_stream_out_of_an_upright_container_is_named() {
 fn what_was_not_seen_is_said_whatever_the_reason() {
     for before in [EndReason::Aborted, EndReason::MaxFrames, EndReason::ContainerEmpty] {
         let ending = || {
-            let mut ending = Ending::of_pour();
+            let mut ending = Ending { seen_stream: true, ..Ending::of_pour() };
             ending.end_with(before);
             ending
         };
@@ -202,6 +205,45 @@ fn what_was_not_seen_is_said_whatever_the_reason() {
     }
 }
 
+/// Protects what is said of a stream that leaves the region: its areas are lower bounds, so the volume is one, as soon as they are as large a share as
+/// a file may have that is trained.
+#[test]
+fn what_leaves_the_region_is_a_lower_bound() {
+    let unseen = |cut_off_frames: u32| {
+        let mut ending = Ending::of_pour();
+        for frame in 0..100 {
+            let cut_off = frame < cut_off_frames;
+            let frame = SeenFrame { lost: 0, area_px2: Some(900.0), cut_off, flowing: true, alpha_deg: 50.0, alpha_now_deg: 50.0 };
+            ending.saw(&frame, &settings());
+        }
+        ending.leaves_unseen(EndReason::Done)
+    };
+    assert_eq!([0, 5, 6, 100].map(unseen), [false, false, true, true]);
+}
+
+/// Protects the operator of a pour in which no stream was ever seen: an empty container and a camera that sees nothing look alike, so the volume is
+/// a lower bound, at the largest tilt and when the frames run out. Where a stream was seen, it is not.
+#[test]
+fn a_pour_without_a_stream_may_be_an_unseen_one() {
+    let settings = settings();
+    let alpha_deg = settings.limits.alpha_max_deg;
+    let after = |streamed: bool, frames: u32, alpha_deg: f32| {
+        let mut ending = Ending::of_pour();
+        for frame in 0..frames {
+            let flowing = streamed && frame < 2;
+            let area_px2 = Some(if flowing { 90.0 } else { 0.0 });
+            ending.saw(&SeenFrame { lost: 0, area_px2, cut_off: false, flowing, alpha_deg, alpha_now_deg: alpha_deg }, &settings);
+        }
+        let moment = Moment { running_s: 9.0, frames, measurement_age_ns: 0, alpha_deg, poured_ml: 0.0, follows: true };
+        ending.due(&moment, &settings).map(|reason| (reason, ending.leaves_unseen(reason)))
+    };
+    let empty = settings.empty_frames + 2;
+    assert_eq!(after(false, empty, alpha_deg), Some((EndReason::NothingFlows, true)));
+    assert_eq!(after(true, empty, alpha_deg), Some((EndReason::ContainerEmpty, false)));
+    assert_eq!(after(false, settings.max_frames, 30.0), Some((EndReason::MaxFrames, true)));
+    assert_eq!(after(true, settings.max_frames, 30.0), Some((EndReason::MaxFrames, false)));
+}
+
 /// Protects the last drops of a fast camera's pour: half a second is so many of its frames, and not those of half a second at 30 Hz.
 #[test]
 fn a_fast_camera_waits_as_long_as_a_slow_one() {
@@ -209,7 +251,7 @@ fn a_fast_camera_waits_as_long_as_a_slow_one() {
         let settings = Settings { frame_ns: (1e9 / hz) as u64, ..settings() };
         let mut ending = Ending::of_pour();
         ending.begin_settling();
-        let quiet = SeenFrame { lost: 0, area_px2: Some(0.0), flowing: false, alpha_deg: 0.0, alpha_now_deg: 0.0 };
+        let quiet = SeenFrame { lost: 0, area_px2: Some(0.0), cut_off: false, flowing: false, alpha_deg: 0.0, alpha_now_deg: 0.0 };
         let frames = (1..1000).find(|_| {
             ending.saw(&quiet, &settings);
             ending.settled(0.0, 0.1, false, &settings).is_some()
@@ -228,7 +270,7 @@ fn frames_without_a_measurement_are_not_quiet() {
         ending.begin_settling();
         (1..=200).find_map(|frame| {
             let area_px2 = measured(frame).then_some(0.0);
-            ending.saw(&SeenFrame { lost: 0, area_px2, flowing: false, alpha_deg: 0.0, alpha_now_deg: 0.0 }, &settings);
+            ending.saw(&SeenFrame { lost: 0, area_px2, cut_off: false, flowing: false, alpha_deg: 0.0, alpha_now_deg: 0.0 }, &settings);
             let reason = ending.settled(0.0, f64::from(frame) / 30.0, false, &settings)?;
             Some((frame, reason, ending.leaves_unseen(reason)))
         })
