@@ -16,8 +16,10 @@ struct Fake {
     frames: std::rc::Rc<std::cell::Cell<i32>>,
     /// What the light of now adds to the exposure that its automatic finds.
     light: i32,
-    /// What its automatic gain finds is so many thousandths of a ms, divided by the exposure in ms.
+    /// What its automatic gain finds is this over the exposure of the last frame.
     gain_finds: i32,
+    /// The exposure before the last setting of it, and how many frames there were then.
+    exposure_before: (i32, i32),
     /// Setting the first of these halves the value of the second, as far as its range goes.
     couples: Option<[u32; 2]>,
     /// What was set, in order.
@@ -44,7 +46,8 @@ impl Controls for Fake {
     fn get(&self, id: u32) -> Result<i32, String> {
         let value = self.controls.get(&id).map(|c| c[0]).ok_or("invalid")?;
         let automatic = self.controls.get(&v4l2::V4L2_CID_EXPOSURE_AUTO).is_some_and(|c| c[0] != EXPOSURE_MANUAL);
-        let exposure = || self.get(v4l2::V4L2_CID_EXPOSURE_ABSOLUTE).unwrap_or(1);
+        let (before, frames) = self.exposure_before;
+        let exposure = || if self.frames.get() > frames { self.get(v4l2::V4L2_CID_EXPOSURE_ABSOLUTE).unwrap_or(1) } else { before.max(1) };
         if self.gain_finds > 0 && id == v4l2::V4L2_CID_GAIN && self.controls.get(&v4l2::V4L2_CID_AUTOGAIN).is_some_and(|c| c[0] == 1) {
             return Ok(self.gain_finds / exposure());
         }
@@ -56,6 +59,9 @@ impl Controls for Fake {
             return Err("busy".into());
         }
         self.set.push(id);
+        if id == v4l2::V4L2_CID_EXPOSURE_ABSOLUTE {
+            self.exposure_before = (self.get(id)?, self.frames.get());
+        }
         let [at, least, most, step] = self.controls.get_mut(&id).ok_or("invalid")?;
         *at = (value.clamp(*least, *most) - *least) / *step * *step + *least;
         if let Some([_, other]) = self.couples.filter(|[first, _]| *first == id)
