@@ -113,20 +113,23 @@ pub fn foresee(site: &Site, goal_ml: f32, fill_ml: Option<f64>) -> Foreseen {
     lines.extend(few(&weights));
     lines.extend(unknown_pictures(&weights.origin));
     lines.extend(sd_ml.and_then(|sd| worse_than_expected(&site.history.errors_ml(&status.weights), sd)));
+    lines.extend(expected_line(expected));
+    Foreseen { possible: true, sd_ml, flows_by_deg, lines, identity: status.weights }
+}
+
+/// What the operator should know of how far off the pour will be; `None` if all is well.
+fn expected_line(expected: Expected) -> Option<String> {
     match expected {
-        Expected::Within(sd) if sd > WARNED_SD_ML => {
-            lines.push(format!("This is far off: weigh what is proposed under Learn first. Expected deviation {sd:.1} ml."));
-        }
-        Expected::Within(_) => {}
+        Expected::Within(sd_ml) => (sd_ml > WARNED_SD_ML)
+            .then(|| format!("This is far off: weigh what is proposed under Learn first. Expected deviation {sd_ml:.1} ml.")),
         Expected::TooMuch => {
-            lines.push("The vessel, as the weights know it, cannot give this goal from a usual fill: the pour may end early.".into());
+            Some("The vessel, as the weights know it, cannot give this goal from a usual fill: the pour may end early.".into())
         }
         Expected::TooLong => {
-            lines.push("This pour is expected to take longer than it may (controller.max_frames), and then ends short of its goal.".into());
+            Some("This pour is expected to take longer than it may (controller.max_frames), and then ends short of its goal.".into())
         }
-        Expected::Unknown => lines.push("These weights do not say how far off this pour will be.".into()),
+        Expected::Unknown => Some("These weights do not say how far off this pour will be.".into()),
     }
-    Foreseen { possible: true, sd_ml, flows_by_deg, lines, identity: status.weights }
 }
 
 /// What the operator should know of weights that do not know their pictures.
