@@ -129,7 +129,7 @@ pub struct EpisodeInfo {
     pub weights: String,
     /// How it ended, in words; empty if the recorder was killed.
     pub ended: String,
-    /// Whether it is incomplete only because the file lacks its own end, so that [`recover`] makes a complete one of it.
+    /// Whether it is incomplete only because the file lacks its own end, so that [`recover()`] makes a complete one of it.
     pub recoverable: bool,
     /// What a person wrote about it; mostly empty.
     pub note: String,
