@@ -7,6 +7,10 @@ const VOLUME_EXPONENT: f64 = 1.2;
 /// A camera of which so many frames in a row give no measurement is blind (`controller.stale_feature_ms` of config/sim.toml, at 30 Hz).
 const BLIND_FRAMES: u32 = 6;
 
+/// A stream of so much in a frame may be there at once, ml: the estimate takes a larger one for a stream that has begun before (`ABRUPT_ML` of
+/// shared/src/estimator/verdict.rs).
+const SMALL_ML: f64 = 0.7;
+
 /// What is kept of the run under way.
 #[derive(Debug, Clone, Copy)]
 pub struct Unshown {
@@ -18,7 +22,8 @@ pub struct Unshown {
     hidden_ml: (f64, f64),
     /// The largest outflow that a frame of the run has shown, ml.
     largest_ml: f64,
-    /// What left in frames that showed too little, beyond the largest outflow that any frame before had shown, ml.
+    /// What left in frames that showed nothing, beyond the largest outflow that any frame before had shown, ml; of a stream that had not been shown yet, as long
+    /// as it was small.
     surged_ml: f64,
     /// What left in the newest frames without a measurement, ml, and their number.
     gone: (f64, u32),
@@ -51,8 +56,12 @@ impl Unshown {
     pub fn frame(&mut self, gain: f64, left_ml: f64, hidden_ml: f64) {
         self.takes_gain(gain);
         self.gone = (0.0, 0);
-        self.surged_ml += (hidden_ml - self.largest_ml).max(0.0);
-        self.largest_ml = self.largest_ml.max(left_ml - hidden_ml);
+        let shown_ml = left_ml - hidden_ml;
+        // A stream that stands still, or is there at once, tells by itself that something was not shown, and whoever looks on doubts it; a small one may
+        // begin so.
+        let tells = shown_ml > 0.0 || (self.largest_ml <= 0.0 && hidden_ml > SMALL_ML);
+        self.surged_ml += if tells { 0.0 } else { (hidden_ml - self.largest_ml).max(0.0) };
+        self.largest_ml = self.largest_ml.max(shown_ml);
         self.hidden_ml = (self.hidden_ml.0 + hidden_ml.max(0.0), self.hidden_ml.1 + (-hidden_ml).max(0.0));
     }
 
@@ -67,7 +76,7 @@ impl Unshown {
         (share(self.gains.1) * said_ml.abs(), share(self.gains.0) * said_ml.abs())
     }
 
-    /// By how much the truth may lie above what is said, ml, because frames that showed less hid a surge: more than any picture of the run let expect.
+    /// By how much the truth may lie above what is said, ml, because frames that showed nothing hid a surge: more than any picture of the run let expect.
     pub fn by_surges_ml(&self) -> f64 {
         self.surged_ml
     }
@@ -101,6 +110,13 @@ mod tests {
         assert_eq!((unshown.by_frames_ml(), unshown.by_surges_ml()), ((1.0, 2.5), 0.0), "as much had been shown");
         unshown.frame(1.0, 8.0, 8.0);
         assert_eq!(unshown.by_surges_ml(), 5.0);
+        unshown.frame(1.0, 30.0, 26.0);
+        assert_eq!(unshown.by_surges_ml(), 5.0, "it showed something, which stood still");
+        unshown.begins();
+        unshown.frame(1.0, 8.0, 8.0);
+        assert_eq!(unshown.by_surges_ml(), 0.0, "the stream is there at once afterwards");
+        unshown.frame(1.0, 0.5, 0.5);
+        assert_eq!(unshown.by_surges_ml(), 0.5, "a small one may begin so");
         unshown.begins();
         assert_eq!((unshown.by_gain_ml(100.0), unshown.by_frames_ml()), ((0.0, 0.0), (0.0, 0.0)));
         assert_eq!(unshown.by_surges_ml(), 0.0);
