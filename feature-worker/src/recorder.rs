@@ -10,6 +10,7 @@ use std::sync::{Arc, mpsc};
 use std::thread::JoinHandle;
 
 use shared::config::Config;
+use shared::disk_space::error_words;
 use shared::ipc::IpcError;
 use shared::level::Level;
 use shared::messages::{Feature, FrameHeader};
@@ -51,7 +52,7 @@ impl Recorder {
     /// a thread inherits both. `say` gets a line for what is not recorded, and for what is over its budget.
     pub fn start(config: &Config, say: impl Fn(Level, &str) + Send + 'static) -> Result<Self, RecorderError> {
         let directory = &config.recording.directory;
-        let fail = |e: std::io::Error| RecorderError::Directory { directory: directory.display().to_string(), what: e.to_string() };
+        let fail = |e: std::io::Error| RecorderError::Directory { directory: directory.display().to_string(), what: error_words(&e) };
         std::fs::create_dir_all(directory).map_err(fail)?;
         let directory = directory.canonicalize().map_err(fail)?;
 

@@ -12,6 +12,7 @@ use std::path::{Path, PathBuf};
 use serde::{Deserialize, Serialize};
 use shared::config::Config;
 use shared::config_paths::is_same;
+use shared::disk_space::error_words;
 use shared::regular_file;
 use shared::runtime_dir::{Place, own_uid};
 
@@ -44,10 +45,10 @@ impl Claim {
     /// Takes the cell whose runtime directory is `directory`. The error says who has it, or which file another cell uses.
     pub fn take(directory: &Path, file: &Path, config: &Config) -> Result<Self, String> {
         let lock_path = directory.join("controller.lock");
-        let fail = |e: std::io::Error| format!("{}: {e}", lock_path.display());
+        let fail = |path: &Path, e: &std::io::Error| format!("{}: {}", path.display(), error_words(e));
         let flags = (rustix::fs::OFlags::NOFOLLOW | rustix::fs::OFlags::NONBLOCK).bits() as i32;
-        let lock =
-            OpenOptions::new().write(true).create(true).truncate(false).mode(0o600).custom_flags(flags).open(&lock_path).map_err(fail)?;
+        let lock = OpenOptions::new().write(true).create(true).truncate(false).mode(0o600).custom_flags(flags).open(&lock_path);
+        let lock = lock.map_err(|e| fail(&lock_path, &e))?;
         let name = &config.cell.name;
         if lock.try_lock().is_err() {
             let who = running(directory).map_or(String::new(), |r| format!(" (process {}, {})", r.pid, r.config.display()));
@@ -73,7 +74,7 @@ impl Claim {
         let path = directory.join("controller");
         let new = directory.join("controller.new");
         let text = serde_json::to_string(&this).map_err(|e| e.to_string())?;
-        std::fs::write(&new, text).and_then(|()| std::fs::rename(&new, &path)).map_err(fail)?;
+        std::fs::write(&new, text).and_then(|()| std::fs::rename(&new, &path)).map_err(|e| fail(&new, &e))?;
         Ok(Self { path, _lock: lock })
     }
 }

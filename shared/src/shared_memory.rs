@@ -15,6 +15,7 @@ use std::path::{Path, PathBuf};
 use std::sync::{Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
+use crate::disk_space::error_words;
 use crate::runtime_dir::own_uid;
 use crate::whole_file::may_make_in;
 
@@ -129,7 +130,7 @@ impl Membership {
         let (token, lock) = new_token(directory)?;
         remove_all(&left);
         let new = directory.join("token.new");
-        std::fs::write(&new, &token).and_then(|()| std::fs::rename(&new, &file)).map_err(|e| failed(&file, e))?;
+        std::fs::write(&new, &token).and_then(|()| std::fs::rename(&new, &file)).map_err(|e| failed(&new, error_words(&e)))?;
         held.insert(token.clone(), (lock, 1));
         Ok(Self::new(token))
     }

@@ -8,6 +8,7 @@ use std::os::unix::fs::{OpenOptionsExt as _, PermissionsExt as _};
 use std::path::Path;
 
 use sha2::{Digest as _, Sha256};
+use shared::disk_space::error_words;
 use shared::regular_file;
 
 /// Random bytes of a token: 128 bits cannot be guessed over a network.
@@ -19,7 +20,7 @@ const LEAST: usize = 16;
 
 /// The token in `file`, which is made if it is not there. The second value tells whether it was made now.
 pub fn read_or_make(file: &Path) -> Result<(String, bool), String> {
-    let fail = |e: std::io::Error| format!("{}: {e}", file.display());
+    let fail = |e: std::io::Error| format!("{}: {}", file.display(), error_words(&e));
     match regular_file::open(file) {
         Ok((open, meta)) => {
             let mode = meta.permissions().mode();

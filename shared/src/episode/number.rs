@@ -14,6 +14,7 @@ use std::os::unix::fs::{OpenOptionsExt, PermissionsExt};
 use std::path::Path;
 use std::time::{Duration, Instant};
 
+use crate::disk_space::error_words;
 use crate::whole_file::give_owner;
 
 /// Longest wait for another program that takes a number. Chosen by hand: it takes milliseconds.
@@ -54,7 +55,7 @@ fn open(directory: &Path, create: bool) -> Result<File> {
     let flags = (rustix::fs::OFlags::NOFOLLOW | rustix::fs::OFlags::NONBLOCK).bits() as i32;
     let path = directory.join(".last-number");
     let open = OpenOptions::new().read(true).write(true).create(create).truncate(false).mode(0o600).custom_flags(flags).open(path);
-    let file = open.map_err(|e| Error::new(e.kind(), format!(".last-number: {e}")))?;
+    let file = open.map_err(|e| Error::new(e.kind(), format!(".last-number: {}", error_words(&e))))?;
     if !file.metadata()?.is_file() {
         return Err(Error::other(".last-number is no file: remove it"));
     }

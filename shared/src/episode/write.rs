@@ -120,6 +120,11 @@ impl EpisodeWriter {
     /// or the next free one if that has a file already.
     pub fn create(directory: &Path, start: &EpisodeStart) -> Result<Self, WriteError> {
         let (file, path) = create_file(directory, start.episode)?;
+        // A file in which not even this stands, because the disk or a quota is full, is no episode, and would count as one.
+        Self::begin(file, path.clone(), start).inspect_err(|_| drop(std::fs::remove_file(&path)))
+    }
+
+    fn begin(file: File, path: PathBuf, start: &EpisodeStart) -> Result<Self, WriteError> {
         let fail = |e: McapError| WriteError::File { file: path.display().to_string(), what: mcap_words(&e) };
         let options = WriteOptions::new()
             .compression(None)
@@ -332,6 +337,28 @@ mod tests {
         assert_eq!(rfc3339(951_782_400), "2000-02-29T00:00:00Z");
         assert_eq!(rfc3339(1_735_689_599), "2024-12-31T23:59:59Z");
         assert_eq!(rfc3339(1_795_311_559), "2026-11-22T01:39:19Z");
+    }
+
+    /// Not a test, but a process in which no file may hold anything: it begins an episode, and its exit code says whether nothing is left.
+    #[test]
+    #[ignore = "run by the test below in a process of its own"]
+    fn begins_without_room() {
+        let Some(directory) = std::env::var_os("EPISODE_DIRECTORY").map(PathBuf::from) else { return };
+        let config = Config::parse(include_str!("../../../config/sim.toml"), "sim.toml").unwrap();
+        let (kind, wall_clock) = (EpisodeKind::Pour { goal_ml: 50.0 }, UNIX_EPOCH);
+        let start = EpisodeStart { episode: 1, kind, started_at_ns: 1, wall_clock, config: &config, weights: "" };
+        let begun = EpisodeWriter::create(&directory, &start).is_ok();
+        std::process::exit(i32::from(begun || std::fs::read_dir(&directory).unwrap().next().is_some()));
+    }
+
+    /// Protects the directory from files that are no episodes, and count as some, where a disk or a quota is full.
+    #[test]
+    fn an_episode_that_finds_no_room_leaves_nothing() {
+        let dir = tempfile::tempdir().unwrap();
+        let mut child = std::process::Command::new("sh");
+        child.args(["-c", "trap '' XFSZ; ulimit -f 1; exec \"$0\" --exact episode::write::tests::begins_without_room --ignored"]);
+        child.arg(std::env::current_exe().unwrap()).env("EPISODE_DIRECTORY", dir.path()).stdout(std::process::Stdio::null());
+        assert_eq!(child.status().unwrap().code(), Some(0));
     }
 
     /// Protects earlier episodes: a file is never overwritten, and one whose number is taken gets the next free one.

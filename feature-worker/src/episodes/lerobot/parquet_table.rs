@@ -6,11 +6,13 @@ use std::sync::Arc;
 
 use parquet::basic::Compression;
 use parquet::data_type::{BoolType, ByteArray, ByteArrayType, DoubleType, FloatType, Int64Type};
-use parquet::errors::Result as ParquetResult;
+use parquet::errors::{ParquetError, Result as ParquetResult};
 use parquet::file::metadata::KeyValue;
 use parquet::file::properties::WriterProperties;
 use parquet::file::writer::{SerializedColumnWriter, SerializedFileWriter};
 use parquet::schema::parser::parse_message_type;
+
+use shared::disk_space::error_words;
 
 use crate::episodes::output::{ExportError, disk_error, make_parent, write_error};
 
@@ -131,8 +133,16 @@ pub fn write_parquet(path: &Path, columns: Vec<(String, Column)>, note: Option<K
     write_columns(file, columns, note).map_err(|e| {
         // It was not there before, so it is ours, and nobody needs a part of it.
         let _ = fs::remove_file(path);
-        write_error(path, e)
+        write_error(path, words(&e))
     })
+}
+
+/// An error of the parquet crate in words. What the disk said is inside of it.
+fn words(e: &ParquetError) -> String {
+    match e {
+        ParquetError::External(inner) => inner.downcast_ref().map_or_else(|| e.to_string(), error_words),
+        e => e.to_string(),
+    }
 }
 
 fn write_columns(file: fs::File, columns: Vec<(String, Column)>, note: Option<KeyValue>) -> ParquetResult<()> {
