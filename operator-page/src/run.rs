@@ -16,6 +16,7 @@ use std::net::{IpAddr, Ipv4Addr, SocketAddr};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::sync::atomic::Ordering::Relaxed;
+use std::time::Duration;
 
 use shared::config::Config;
 use shared::exit::{self, Failure, OrExit as _};
@@ -35,6 +36,8 @@ const ANSWERING: usize = 6;
 const STOPPING: usize = 4;
 /// Most connections of the port where only Stop is answered. Chosen by hand: one for each page, and room.
 const STOP_CONNECTIONS: usize = 32;
+/// How long it may take to end. Chosen by hand: longer than any answer waits for the controller, at most 15 s (`CONNECTED` of orders.rs) and a Stop's 6 s.
+const GRACE: Duration = Duration::from_secs(25);
 
 /// Command-line arguments.
 #[derive(Debug, clap::Args)]
@@ -64,6 +67,7 @@ pub fn run(args: &Args) -> Result<(), Failure> {
     let file = std::path::absolute(&args.config).or_exit(exit::BAD_INPUT)?;
     exit::explain_panics("operator-page");
     let stop = os::stop_at_signals().or_exit(exit::FAILED)?;
+    exit::end_within(&stop, GRACE, "operator-page: the disk or the controller does not answer: ended without it");
     let token_file = config.controller.weights.with_file_name(format!("operator-page-{}.token", config.cell.name));
     let (word, made) = token::read_or_make(&token_file).or_exit(exit::FAILED)?;
     let page_port = Server::bind(args.address, args.port)?;

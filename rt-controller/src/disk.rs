@@ -62,7 +62,7 @@ pub struct Disk<'a> {
     /// Limits of this cell; weights are trained for one way back only.
     limits: Limits,
     /// Time of change, inode and length of the weight file that was read last.
-    seen: Option<(std::time::SystemTime, u64, u64)>,
+    seen: Option<(i64, i64, u64, u64)>,
     /// The journal; `None` if none is kept, or while nothing can be written.
     journal: Option<Writer>,
     /// Where the journal is, and the settings that it begins with; `None` if none is kept.
@@ -288,7 +288,8 @@ impl<'a> Disk<'a> {
             }
             return;
         };
-        let stamp = meta.modified().ok().map(|m| (m, meta.ino(), meta.len()));
+        // The time of the inode's last change, which another mode or owner moves too: those are what a refusal may have asked for.
+        let stamp = Some((meta.ctime(), meta.ctime_nsec(), meta.ino(), meta.len()));
         if stamp == self.seen {
             return;
         }

@@ -120,6 +120,8 @@ pub struct Exchange {
     pub agents_taken: AtomicU64,
     /// Number of events that did not fit into the queue.
     pub events_lost: AtomicU64,
+    /// Set when the loop begins; before, nothing can have moved.
+    pub begun: AtomicBool,
     /// Set by the loop when it has ended, upright.
     pub ended: AtomicBool,
     /// To the robot's thread: set when the operator asks for the robot; the thread takes it back.
@@ -162,6 +164,7 @@ impl Default for Exchange {
             skipped_ticks: AtomicU64::new(0),
             agents_taken: AtomicU64::new(0),
             events_lost: AtomicU64::new(0),
+            begun: AtomicBool::new(false),
             ended: AtomicBool::new(false),
             resume: AtomicBool::new(false),
         }

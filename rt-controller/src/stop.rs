@@ -6,7 +6,8 @@
 //! controller's own user and root, and at the file also whom the directory's mode lets in. The thread "stop" serves them, and passes signals
 //! on to the loop. It allocates, and waits for nobody: a client that says nothing is dropped when others need its place.
 //!
-//! A socket that cannot be made fails the start; a client that cannot be served is dropped. When the loop has ended, upright, the other threads get a moment to end too, and then the process ends without them.
+//! A socket that cannot be made fails the start; a client that cannot be served is dropped. When the loop has ended, upright, or is to end before it has begun,
+//! the other threads get a moment to end too, and then the process ends without them.
 
 use std::io::{Read, Write};
 use std::os::fd::AsFd;
@@ -147,12 +148,16 @@ impl StopThread<'_> {
         let mut ended: Option<Instant> = None;
         while !self.done.load(SeqCst) {
             self.exchange.shutdown.fetch_or(self.stop.load(SeqCst), SeqCst);
-            if self.exchange.ended.load(SeqCst) {
+            // A start that a disk or shared memory holds up never comes to a loop that could end.
+            let never_begins = self.stop.load(SeqCst) && !self.exchange.begun.load(SeqCst);
+            if never_begins || self.exchange.ended.load(SeqCst) {
                 let since = ended.get_or_insert_with(Instant::now).elapsed();
                 self.end.fetch_or(since > GRACE / 2, SeqCst);
                 if since > GRACE {
                     return (self.give_up)();
                 }
+            } else {
+                ended = None;
             }
             self.wait(&clients);
             // The file comes first: strangers reach only the other one. One of each a turn, so that neither shuts the other out.

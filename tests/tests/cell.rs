@@ -117,6 +117,38 @@ fn a_stalled_disk_does_not_delay_an_abort() {
     assert_eq!(cell.exit_code("rt-controller", Duration::from_secs(10)), Some(1), "{}", cell.log("rt-controller"));
 }
 
+/// Protects whoever stops a controller whose start a disk holds up: it ends all the same, and says why. Nothing has moved by then.
+#[test]
+fn a_start_that_a_disk_holds_up_can_be_ended() {
+    let mut cell = CellUnderTest::start(|_| {});
+    assert_eq!(cell.stop("rt-controller"), Some(0));
+    let journal = shared::config::Config::read(&cell.config()).expect("valid").controller.journal.expect("it has one");
+    let mut held = std::process::Command::new("strace");
+    held.args(["-D", "-f", "-qq", "-o", "/dev/null", "-e", "trace=openat", "-e", "inject=openat:delay_enter=120s", "-P"]);
+    held.arg(journal).arg(tests::program("rt-controller"));
+    let log = std::fs::File::create(cell.dir.path().join("rt-controller.log")).expect("writable");
+    cell.spawn_with("rt-controller", held, log.into());
+    let until = |what: &str, is: &dyn Fn() -> bool| {
+        let begin = Instant::now();
+        while !is() {
+            assert!(begin.elapsed() < Duration::from_secs(20), "{what}: {}", cell.log("rt-controller"));
+            std::thread::sleep(Duration::from_millis(50));
+        }
+    };
+    until("its stop socket", &|| cell.runtime_dir().join("stop").exists());
+    let pid = cell.pid("rt-controller");
+    let tracer = || {
+        let status = std::fs::read_to_string(format!("/proc/{pid}/status")).unwrap_or_default();
+        status.lines().find_map(|l| l.strip_prefix("TracerPid:")?.trim().parse::<i32>().ok()).unwrap_or(0)
+    };
+    let strace = tracer();
+    rustix::process::kill_process(rustix::process::Pid::from_raw(pid as i32).expect("a number"), Signal::TERM).expect("ours");
+    until("why it ends", &|| cell.log("rt-controller").contains("the start is held up"));
+    // A thread that strace holds is let go before the kernel ends the process.
+    rustix::process::kill_process(rustix::process::Pid::from_raw(strace).expect("it traces"), Signal::KILL).expect("ours");
+    assert_eq!(cell.exit_code("rt-controller", Duration::from_secs(10)), Some(1), "{}", cell.log("rt-controller"));
+}
+
 /// Protects people: when a process dies or hangs at full tilt, the container comes upright, and the result names the reason.
 #[test]
 fn a_dead_or_hanging_process_ends_upright() {

@@ -77,10 +77,11 @@ fn what_is_no_weight_file_is_refused_at_once() {
     assert!(rss < 100_000, "{rss} KiB resident");
     put(&|new| assert!(std::process::Command::new("mkfifo").arg(new).status().expect("coreutils").success()));
     refused("not a regular file");
-    put(&|new| {
+    let open_to_all = |new: &std::path::Path| {
         steady_weights(13).write(new).expect("writable");
         std::fs::set_permissions(new, std::fs::Permissions::from_mode(0o666)).expect("ours");
-    });
+    };
+    put(&open_to_all);
     refused("everybody may write");
     if rustix::process::geteuid().is_root() {
         put(&|new| {
@@ -92,4 +93,10 @@ fn what_is_no_weight_file_is_refused_at_once() {
     put(&|new| assert!(std::process::Command::new("mkfifo").arg(new).status().expect("coreutils").success()));
     refused("not a regular file");
     assert_eq!(cell.stop("rt-controller"), Some(0), "{}", cell.log("rt-controller"));
+    cell.spawn("rt-controller");
+    put(&open_to_all);
+    refused("everybody may write");
+    // What the refusal asks for is enough: neither the file nor its time is another one.
+    std::fs::set_permissions(cell.weights(), std::fs::Permissions::from_mode(0o644)).expect("ours");
+    cell.wait("the weights", Duration::from_secs(5), |s| s["hindrance"] == "");
 }

@@ -12,6 +12,7 @@ use std::net::IpAddr;
 use std::path::PathBuf;
 use std::sync::atomic::{AtomicBool, Ordering::Relaxed};
 use std::sync::{Mutex, MutexGuard, PoisonError};
+use std::time::Duration;
 
 use opencv::core::Mat;
 use shared::config::Config;
@@ -27,6 +28,8 @@ use crate::vision::{Extractor, Image, PictureTime};
 
 /// Values of V_e that the page shows. Chosen by hand: ten seconds at 30 frames a second.
 const HISTORY: usize = 300;
+/// How long it may take to end. Chosen by hand: much longer than a frame is waited for.
+const GRACE: Duration = Duration::from_secs(5);
 
 /// Command-line arguments.
 #[derive(Debug, clap::Args)]
@@ -81,6 +84,7 @@ fn lock(shown: &Mutex<Shown>) -> MutexGuard<'_, Shown> {
 
 fn view(args: &Args, config: &Config) -> Result<(), Failure> {
     let stop = os::stop_at_signals().or_exit(exit::FAILED)?;
+    exit::end_within(&stop, GRACE, "feature-worker view: shared memory or the camera does not answer: ended without it");
     opencv::core::set_num_threads(1).or_exit(exit::FAILED)?;
     let extractor = Extractor::new(&config.camera, &config.image).or_exit(exit::BAD_INPUT)?;
     let cell = Cell::join(&config.cell).or_exit(exit::UNREACHABLE)?;

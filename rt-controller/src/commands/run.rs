@@ -63,7 +63,7 @@ pub fn run(args: &Args) -> Result<(), Failure> {
         os::tell(Level::Error, &format!("rt-controller: this is a defect, please report it: {}", exit::one_line(panic)));
         std::process::abort();
     }));
-    let stop = stop_at_signals()?;
+    let stop = Arc::new(AtomicBool::new(false));
     let lost = "rt-controller: shared memory vanished: /dev/shm is full, or a file there was cut. The container comes upright and the controller ends";
     os::explain_bus_errors(lost, exit::FAILED, Arc::clone(&stop));
 
@@ -85,24 +85,32 @@ pub fn run(args: &Args) -> Result<(), Failure> {
     result
 }
 
-/// Becomes true at the first Ctrl-C or SIGTERM; the second one ends the process at once.
-fn stop_at_signals() -> Result<Arc<AtomicBool>, Failure> {
+/// Makes `stop` true at the first Ctrl-C or SIGTERM; the second one ends the process at once.
+fn stop_at_signals(stop: &Arc<AtomicBool>) -> Result<(), Failure> {
     use signal_hook::flag::{register, register_conditional_shutdown};
     // Other reasons to stop must not make the first signal a second one.
-    let (stop, armed) = (Arc::new(AtomicBool::new(false)), Arc::new(AtomicBool::new(false)));
+    let armed = Arc::new(AtomicBool::new(false));
     for signal in [signal_hook::consts::SIGINT, signal_hook::consts::SIGTERM] {
         // It is armed by the first signal, so that only a second one ends the process at once.
         let second = register_conditional_shutdown(signal, exit::INTERRUPTED.into(), Arc::clone(&armed));
-        let first = register(signal, Arc::clone(&armed)).and_then(|_| register(signal, Arc::clone(&stop)));
+        let first = register(signal, Arc::clone(&armed)).and_then(|_| register(signal, Arc::clone(stop)));
         second.and(first).map_err(|e| format!("cannot handle signals: {e}")).or_exit(exit::FAILED)?;
     }
-    Ok(stop)
+    Ok(())
 }
 
 /// Takes the cell, opens the way to stop a motion, and runs the threads until the loop has ended. Fails if the container is not upright then.
-fn start(config: &Config, file: &Path, stop: &AtomicBool, say: &(dyn Fn(Level, &str) + Sync), speaker: &Speaker) -> Result<(), Failure> {
+fn start(
+    config: &Config,
+    file: &Path,
+    stop: &Arc<AtomicBool>,
+    say: &(dyn Fn(Level, &str) + Sync),
+    speaker: &Speaker,
+) -> Result<(), Failure> {
     let directory = Place::from(&config.cell).directory().or_exit(exit::BAD_INPUT)?;
     let _claim = Claim::take(&directory, file, config).or_exit(exit::REFUSED)?;
+    // Until here a signal ends the process at once: nothing can move yet, and a disk that does not answer holds nobody up.
+    stop_at_signals(stop)?;
     let sockets = StopSockets::open(&directory, &config.cell.name, say)?;
     let owner = std::fs::metadata(file).ok().map(|m| m.uid());
     let shared = Shared::default();
@@ -178,6 +186,9 @@ impl Shared {
     /// What keeps the process from its end, although the loop has ended. Nothing that matters if it is only an attempt to connect the robot.
     fn held_up(&self) -> Option<&'static str> {
         match (self.disk_done.load(SeqCst), self.service_done.load(SeqCst)) {
+            _ if !self.exchange.begun.load(SeqCst) => {
+                Some("the start is held up, by the disk or by shared memory: stopped without it, before any motion")
+            }
             (true, true) => None,
             (true, false) => Some("a thread of the controller does not answer: stopped without it, so what it was to say may be missing"),
             (false, _) => Some("the disk does not answer: stopped without it, so the end of the journal may be missing"),
@@ -237,6 +248,7 @@ fn real_time(config: &Config, exchange: &Exchange, say: &dyn Fn(Level, &str), re
     });
     match opened {
         Ok((_cell, subscriber)) => {
+            exchange.begun.store(true, SeqCst);
             let _ = ready.send(Ok(()));
             let place = control_loop::Place { core: config.controller.core, priority: config.controller.priority };
             let lost_ns = u64::from(config.controller.lost_robot_ms) * 1_000_000;
