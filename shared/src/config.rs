@@ -283,7 +283,8 @@ impl Config {
         if !self.camera.path.is_empty() {
             paths.push(("camera.path", PathBuf::from(&self.camera.path)));
         }
-        paths.extend(self.cell.runtime_dir.clone().map(|d| ("cell.runtime_dir", d)));
+        let own = self.cell.runtime_dir.as_ref().map(|base| base.join(&self.cell.name));
+        paths.extend(self.cell.runtime_dir.clone().map(|base| ("cell.runtime_dir", base)));
         let refused = |key: &str, allowed: String| {
             let value = paths.iter().find(|(k, _)| *k == key).map_or(String::new(), |(_, path)| path.display().to_string());
             ConfigError::Range { file: file.display().to_string(), key: key.into(), value, allowed }
@@ -291,6 +292,9 @@ impl Config {
         // What tells other programs of a path tells it as text.
         if let Some((key, _)) = paths.iter().find(|(_, path)| path.to_str().is_none()) {
             return Err(refused(key, "text in UTF-8: give its directory another name".into()));
+        }
+        if let Some((key, _)) = own.and_then(|own| paths.iter().find(|(_, path)| config_paths::is_in(&own, path))) {
+            return Err(refused(key, "outside of the cell's runtime directory, where other files could take its name".into()));
         }
         match config_paths::clash(&paths) {
             Some((first, second)) => Err(refused(second, format!("another path than {first}: they would overwrite each other"))),
@@ -411,7 +415,7 @@ impl Check<'_> {
             f64::from(limits.step_deg) >= least_deg - 1e-3,
             &format!(
                 "at least {least_deg:.2}: the way upright has {rate_deg_s} degrees/s, the smaller of limits.rate_deg_s and return_rate_deg_s, at \
-                 controller.rate_hz = {rate_hz}"
+                 controller.rate_hz = {rate_hz}; where that is above 6, make these rates smaller"
             ),
         )
     }

@@ -40,10 +40,19 @@ pub fn clash<'a>(paths: &[(&'a str, PathBuf)]) -> Option<(&'a str, &'a str)> {
     })
 }
 
+/// Whether `path` means something in `directory`.
+pub fn is_in(directory: &Path, path: &Path) -> bool {
+    full(path).starts_with(full(directory))
+}
+
+/// `path`, absolute and tidy.
+fn full(path: &Path) -> PathBuf {
+    tidy(&std::path::absolute(path).unwrap_or_else(|_| path.into()))
+}
+
 /// Whether two paths mean the same file or directory.
 pub fn is_same(a: &Path, b: &Path) -> bool {
     let inode = |p: &Path| p.metadata().map(|m| (m.dev(), m.ino())).ok();
-    let full = |p: &Path| tidy(&std::path::absolute(p).unwrap_or_else(|_| p.into()));
     let (a, b) = (full(a), full(b));
     a == b || (inode(&a).is_some() && inode(&a) == inode(&b))
 }

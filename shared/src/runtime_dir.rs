@@ -12,8 +12,8 @@
 //! `/tmp` is never used, because files there are deleted after some days. Ordinary threads call this at their start; it allocates and waits
 //! for the disk. Every failure is a [`RuntimeDirError`] of one line.
 
-use std::fs::{DirBuilder, Metadata};
-use std::os::unix::fs::{DirBuilderExt, MetadataExt};
+use std::fs::{DirBuilder, Metadata, Permissions};
+use std::os::unix::fs::{DirBuilderExt, MetadataExt, PermissionsExt};
 use std::path::{Path, PathBuf};
 
 use crate::config::{CELL_NAME_RULE, CellConfig, is_cell_name};
@@ -155,7 +155,9 @@ impl Place {
 fn make(path: &Path, mode: u32) -> std::io::Result<bool> {
     match DirBuilder::new().mode(mode).create(path) {
         Err(e) if path.symlink_metadata().is_err() => Err(e),
-        _ => Ok(true),
+        Err(_) => Ok(true),
+        // Without what the caller's umask took away, others could not reach their cells in it.
+        Ok(()) => std::fs::set_permissions(path, Permissions::from_mode(mode)).map(|()| true),
     }
 }
 
@@ -208,8 +210,6 @@ fn check(path: &Path) -> Result<(), String> {
 
 #[cfg(test)]
 mod tests {
-    use std::os::unix::fs::PermissionsExt;
-
     use super::*;
 
     /// Why a directory below `base` is refused. A look from outside says the same.
@@ -267,6 +267,11 @@ mod tests {
             std::fs::remove_file(&link).expect("root may");
             assert!(said.contains("belongs to user 65534, not to root or this user"), "{said}");
         }
+        // The umask is the whole process's, so it is another one for a moment only.
+        let umask = rustix::process::umask(rustix::fs::Mode::from_raw_mode(0o077));
+        let made = make(&base.join("open"), 0o755);
+        rustix::process::umask(umask);
+        assert!(made.expect("writable") && base.join("open").metadata().expect("made").mode() & 0o7777 == 0o755);
         let long = Place { name: "a-name-of-thirty-two-characters-x".chars().take(32).collect(), base: Some(base.join("somewhere/deep")) };
         assert!(long.directory().expect_err("too long").to_string().contains("longer than"));
         assert!(matches!(Place::from("../x").directory(), Err(RuntimeDirError::Name(_))));

@@ -27,6 +27,15 @@ fn one_path_for_two_things_is_refused() {
         let said = read(journal).expect_err("must be refused");
         assert!(said.contains("controller.journal") && said.contains(other), "{said}");
     }
+    // Its weights, journal and episodes lie in out/lab: the runtime directory of a cell "lab" may be elsewhere, and not there.
+    for (base, good) in [("run", true), ("../out", false)] {
+        let name = "name = \"lab\"";
+        let text = include_str!("../../config/cell.toml").replacen(name, &format!("{name}\nruntime_dir = \"{base}\""), 1);
+        std::fs::write(&file, text).expect("writable");
+        let said = Config::read(&file).err().map(|e| e.to_string());
+        assert_eq!(said.as_ref().is_none_or(|e| !e.contains("outside of the cell's runtime directory")), good, "{said:?}");
+        assert!(said.is_none() || !good, "{said:?}");
+    }
 }
 
 /// Protects a cell in a directory with an odd name: blanks, line ends and percent signs are a path as any other, and what is no text is refused by name instead
