@@ -123,6 +123,8 @@ pub fn keep_robot_connected(
             progress.wish_until_ns = Some(now_ns + WISH.as_nanos() as u64);
             progress.before.ran = false;
             progress.next_ns = now_ns;
+            // What an attempt said that ended just before must not stand for the one that was asked for.
+            note.asked();
         }
         if !progress.connected && !progress.waits && now_ns >= progress.next_ns {
             progress.before.asked = progress.wish_until_ns.is_some_and(|until_ns| now_ns < until_ns);

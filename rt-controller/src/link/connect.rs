@@ -31,8 +31,8 @@ const GLANCE: Duration = Duration::from_millis(20);
 /// How long the robot must stand still before the program is uploaded. Chosen by hand: in this time also a joint that is jogged at 0.3
 /// degrees/s moves visibly.
 const REST: Duration = Duration::from_millis(400);
-/// Where no state comes within this, none is left that has waited. Chosen by hand: shorter than the cycle of an e-Series robot.
-const GLIMPSE: Duration = Duration::from_millis(1);
+/// A robot whose newest state is older than this does not tell what it does now. Chosen by hand: a dozen cycles of a CB3.
+const SILENT: Duration = Duration::from_millis(100);
 /// A look that takes longer than this does not tell that nothing is left: this process stood still meanwhile. Chosen by hand.
 const STOOD_STILL: Duration = Duration::from_millis(50);
 /// A robot that said "paused" only stops when it gets its first program; if it has stopped and the program has not started after this, it gets it
@@ -148,8 +148,8 @@ fn ready_for_program(options: &LinkOptions, before: &Before, state: &RobotState)
     if f64::from(state.alpha_deg.abs()) <= options.start_tolerance_deg { Ok(()) } else { Err(too_far(options, state)) }
 }
 
-/// Looks at the robot for [`REST`], and fails if a joint moves. `state` becomes the newest one: where this process stood still meanwhile, old states have waited
-/// for it, and they do not tell what the robot does now. So all that have waited are read.
+/// Looks at the robot for [`REST`], and fails if a joint moves, or if the robot falls silent. `state` becomes the newest one: where this process stood still
+/// meanwhile, old states have waited for it, and they do not tell what the robot does now. So all that have waited are read.
 fn stands_still(
     (network, options): (&dyn Network, &LinkOptions),
     dialogue: &mut Dialogue<'_>,
@@ -159,17 +159,24 @@ fn stands_still(
 ) -> Result<(), LinkError> {
     let earlier = *state;
     let begin_ns = network.now_ns();
-    let passed = || Duration::from_nanos(network.now_ns().saturating_sub(begin_ns));
+    let since = |ns: u64| Duration::from_nanos(network.now_ns().saturating_sub(ns));
+    let mut heard_ns = begin_ns;
     loop {
-        let before = passed();
-        let came = dialogue.next_state(recipe, &options.tilt, state, REST.saturating_sub(before).max(GLIMPSE))?.is_some();
+        let before = since(begin_ns);
+        // The last looks wait for nothing: a kernel's shortest wait is longer than the cycle of an e-Series robot, and would never end without a state.
+        let left = REST.saturating_sub(before);
+        let came = dialogue.next_state(recipe, &options.tilt, state, left)?.is_some();
         upload.discard();
         // A program that has started meanwhile may move them; it is found afterwards.
         if let (Some(joint), false) = (hands::moving(&earlier, state), state.runtime_state == RUNTIME_PLAYING) {
             return Err(LinkError::Handover { address: options.address, why: Handover::Moving(joint) });
         }
-        if before >= REST && !came && passed() - before <= STOOD_STILL {
-            return Ok(());
+        if came {
+            heard_ns = network.now_ns();
+        }
+        if left.is_zero() && !came && since(begin_ns) - before <= STOOD_STILL {
+            let hears = since(heard_ns) <= SILENT;
+            return if hears { Ok(()) } else { Err(dialogue.no_answer("the transfer of its state")) };
         }
     }
 }

@@ -120,7 +120,7 @@ impl<'a> Dialogue<'a> {
         if id == 0 { Err(self.unexpected(doing)) } else { Ok(id) }
     }
 
-    /// Waits for the next DATA_PACKAGE and fills `state` from it; `None` if none came in time.
+    /// Waits for the next DATA_PACKAGE and fills `state` from it; `None` if none came in time. `within` nothing, only what has arrived is read.
     pub fn next_state(
         &mut self,
         recipe: OutputRecipe,
@@ -139,7 +139,7 @@ impl<'a> Dialogue<'a> {
         }
     }
 
-    /// Reads packets until `pick` takes one; `None` after `within`. Text packets are remembered and others passed over, because data
+    /// Reads packets until `pick` takes one; `None` after `within`, or, where that is nothing, when no more have arrived. Text packets are remembered and others passed over, because data
     /// and text may come before an answer.
     fn wait<T>(
         &mut self,
@@ -164,10 +164,15 @@ impl<'a> Dialogue<'a> {
                 }
             }
             let left = Duration::from_nanos(deadline_ns.saturating_sub(self.network.now_ns()));
-            if left.is_zero() {
+            if left.is_zero() && !within.is_zero() {
                 return Ok(None);
             }
-            match self.network.read(&mut *self.stream, self.inbox.space(), left) {
+            let read = match left.is_zero() {
+                true => self.stream.set_wait(None).and_then(|()| self.stream.read(self.inbox.space())),
+                false => self.network.read(&mut *self.stream, self.inbox.space(), left),
+            };
+            match read {
+                Err(e) if left.is_zero() && e.kind() == ErrorKind::WouldBlock => return Ok(None),
                 Ok(0) => return Err(self.lost(doing, &ErrorKind::ConnectionAborted.into())),
                 Ok(n) => self.inbox.filled(n),
                 Err(e) if matches!(e.kind(), ErrorKind::WouldBlock | ErrorKind::TimedOut | ErrorKind::Interrupted) => {}

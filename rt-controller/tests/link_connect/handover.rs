@@ -111,6 +111,14 @@ fn a_program_that_starts_while_we_stand_still_is_not_replaced() {
     assert!(seen.is_none(), "something was uploaded");
 }
 
+/// Protects what the robot does now from a link that stands still while it is looked at: silence is no rest, and nothing is uploaded.
+#[test]
+fn a_robot_that_falls_silent_does_not_stand_still() {
+    let (session, seen) = Server::new(145, Robot { cycles: 10, ..Robot::default() }).meet();
+    assert!(matches!(session, Err(LinkError::NoAnswer { .. })), "{session:?}");
+    assert!(seen.is_none(), "something was uploaded");
+}
+
 /// Protects a robot whose program started too late for its session, and ended by itself without having moved anything: it is taken again by itself,
 /// but for one that somebody else uploaded.
 #[test]

@@ -49,7 +49,8 @@ fn connects_through_chatter_and_pieces() {
 /// Protects the frequency: an e-Series is asked for 500 Hz, and gets a program for its cycle.
 #[test]
 fn an_e_series_gets_its_own_cycle() {
-    let (session, seen) = Server::new(5, Robot { version: [5, 11, 0, 1], ..Robot::default() }).meet();
+    // Its states follow each other faster than many a kernel can wait.
+    let (session, seen) = Server::new(5, Robot { version: [5, 11, 0, 1], cycle_ms: 2, ..Robot::default() }).meet();
     let (_session, seen) = (session.unwrap(), seen.unwrap());
     assert!(seen.program.contains("\n  LENGTH = 30\n"));
     assert!(seen.outputs.starts_with(&500f64.to_be_bytes()));

@@ -62,6 +62,9 @@ pub struct Robot {
     pub program: ProgramState,
     /// Whether an uploaded program starts.
     pub starts: bool,
+    /// Length of a control cycle, ms, and how many of them it sends its state for while it waits for a program. Then it falls silent.
+    pub cycle_ms: u64,
+    pub cycles: u32,
     /// Whether another program has been started.
     pub other_plays: Arc<AtomicBool>,
 }
@@ -92,10 +95,15 @@ impl Default for Robot {
             stops_first: false,
             program: ProgramState::Ready,
             starts: true,
+            cycle_ms: 8,
+            cycles: u32::MAX,
             other_plays: Arc::default(),
         }
     }
 }
+
+/// For so many cycles a robot waits for a program: longer than any test needs.
+const WAITS_CYCLES: u32 = 4000;
 
 /// The server while a test runs.
 pub struct Server {
@@ -202,7 +210,7 @@ impl Server {
             listener.set_nonblocking(true)?;
         }
         let mut script: Option<TcpStream> = None;
-        loop {
+        for cycle in 0..WAITS_CYCLES {
             script = script.or_else(|| self.scripts.iter().find_map(|listener| listener.accept().ok()).map(|(stream, _)| stream));
             if let Some(stream) = &script {
                 stream.set_nonblocking(true)?;
@@ -215,11 +223,14 @@ impl Server {
                     Err(_) => {}
                 }
             }
-            *timestamp_s += 0.008;
+            *timestamp_s += self.robot.cycle_ms as f64 / 1000.0;
             let (state, echo, run) = self.robot.registers;
-            send_in_pieces(rtde, &data(&self.robot, *timestamp_s, state, echo, run), self.robot.piece)?;
-            thread::sleep(Duration::from_millis(8));
+            if cycle < self.robot.cycles {
+                send_in_pieces(rtde, &data(&self.robot, *timestamp_s, state, echo, run), self.robot.piece)?;
+            }
+            thread::sleep(Duration::from_millis(self.robot.cycle_ms));
         }
+        Err(ErrorKind::TimedOut.into())
     }
 
     pub fn serve(self) -> std::io::Result<Seen> {
