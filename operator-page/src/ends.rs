@@ -97,6 +97,7 @@ mod tests {
             episode,
             reason: EndReason::Aborted,
             unseen: false,
+            unwatched: false,
             goal_ml,
             poured_ml: 41.0,
             poured_sd_ml: 1.5,

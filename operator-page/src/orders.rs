@@ -4,6 +4,7 @@
 
 use std::time::{Duration, Instant};
 
+use rt_controller::core::Settings;
 use rt_controller::foreseen::{self, Expected};
 use serde_json::{Value, json};
 use shared::control::{Reply, Request, RobotLink};
@@ -92,7 +93,7 @@ pub fn foresee(site: &Site, goal_ml: f32, fill_ml: Option<f64>) -> Foreseen {
         return Foreseen { possible: true, sd_ml: None, flows_by_deg: None, lines, identity: status.weights };
     };
     let limits = site.config.limits;
-    let expected = foreseen::expected(&weights, limits, site.config.controller.max_frames, goal_ml);
+    let expected = foreseen::expected(&weights, &Settings::new(&site.config), goal_ml);
     let sd_ml = expected.sd_ml();
     let flows_by_deg = foreseen::must_flow_by_deg(&weights, fill_ml, container.least_fill_ml, container.holds_ml);
     if fill_ml.is_some() && flows_by_deg.is_none() {

@@ -12,10 +12,11 @@ use std::path::{Path, PathBuf};
 use std::sync::Mutex;
 use std::time::{Duration, Instant, SystemTime};
 
+use rt_controller::core::Settings;
 use rt_controller::{disk, foreseen};
 use serde_json::{Value, json};
-use shared::config::{Config, ControllerConfig};
-use shared::limits::Limits;
+use shared::config::Config;
+use shared::disk_space::error_words;
 use shared::regular_file;
 use shared::weights::{Estimator, Weights};
 
@@ -35,9 +36,7 @@ const OTHERS: &str = "the weight files have changed since this was shown: look a
 /// The weight files of one cell.
 pub struct Shelf {
     weights: PathBuf,
-    limits: Limits,
-    goal_max_ml: f32,
-    max_frames: u32,
+    settings: Settings,
     /// Frames a second of the camera.
     fps: f64,
     expected: Mutex<BTreeMap<String, Value>>,
@@ -51,18 +50,15 @@ fn beside(path: &Path, ending: &str) -> PathBuf {
 }
 
 fn fault(path: &Path) -> impl Fn(std::io::Error) -> String + '_ {
-    move |e| format!("{}: {e}", path.display())
+    move |e| format!("{}: {}", path.display(), error_words(&e))
 }
 
 impl Shelf {
     /// The files around the configured weights.
     pub fn new(config: &Config) -> Self {
-        let ControllerConfig { weights, goal_max_ml, max_frames, .. } = &config.controller;
         Self {
-            weights: weights.clone(),
-            limits: config.limits,
-            goal_max_ml: *goal_max_ml,
-            max_frames: *max_frames,
+            weights: config.controller.weights.clone(),
+            settings: Settings::new(config),
             fps: config.camera.fps,
             expected: Mutex::default(),
         }
@@ -115,8 +111,8 @@ impl Shelf {
         if let Some(found) = known.get(&identity) {
             return found.clone();
         }
-        let goals = GOALS_ML.into_iter().filter(|goal| *goal <= self.goal_max_ml);
-        let one = |goal: f32| json!({ "goal_ml": goal, "sd_ml": foreseen::expected(weights, self.limits, self.max_frames, goal).sd_ml() });
+        let goals = GOALS_ML.into_iter().filter(|goal| *goal <= self.settings.goal_max_ml);
+        let one = |goal: f32| json!({ "goal_ml": goal, "sd_ml": foreseen::expected(weights, &self.settings, goal).sd_ml() });
         let value = Value::Array(goals.map(one).collect());
         if known.len() >= REMEMBERED {
             known.clear();
@@ -189,7 +185,7 @@ impl Shelf {
         // What is there is replaced only if it is a weight file, also one that is damaged.
         Weights::may_write(&self.weights).map_err(|e| e.to_string())?;
         // What the controller refuses would look as if it were in use.
-        disk::check_weights(&taken.weights, self.fps, &self.limits)?;
+        disk::check_weights(&taken.weights, self.fps, &self.settings.limits)?;
         let kept = self.kept();
         taken.put(&kept.join(format!("{shown}.bin")))?;
         // Without a readable file in use there is nothing to go back to.
@@ -270,8 +266,8 @@ mod tests {
     /// The files around the weights `file` of a cell with the default limits.
     fn shelf(file: &Path) -> Shelf {
         let mut config = Config::parse(include_str!("../../config/sim.toml"), "sim.toml").unwrap();
-        config.controller = ControllerConfig { weights: file.to_owned(), goal_max_ml: 120.0, ..config.controller };
-        config.limits = Limits::default();
+        (config.controller.weights, config.controller.goal_max_ml) = (file.to_owned(), 120.0);
+        config.limits = shared::limits::Limits::default();
         Shelf::new(&config)
     }
 

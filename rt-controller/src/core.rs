@@ -36,7 +36,7 @@ mod robot;
 mod run;
 mod settings;
 
-pub use order::{Order, Refusal};
+pub use order::{Order, Refusal, goal_is_legal};
 pub use robot::Robot;
 pub use run::Counters;
 pub use settings::Settings;

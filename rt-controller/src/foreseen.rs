@@ -10,10 +10,15 @@ use shared::estimator::fused::Explanation;
 use shared::limits::{Limiter, Limits};
 use shared::weights::{Estimator, Weights};
 
+use crate::core::Settings;
+use crate::core::ending::Ending;
+
 /// Tilts at which the flow may begin, degrees: from a nearly full vessel to one that is half empty.
 const ONSETS_DEG: [f32; 3] = [35.0, 50.0, 65.0];
 /// Frames without flow, on the way back, after which a foreseen pour is over.
 const QUIET_FRAMES: u32 = 20;
+/// Frames that a way back and its last drops take at most. Chosen by hand: half a minute at 30 Hz, many times what any takes.
+const BACK_FRAMES: u32 = 900;
 /// Below this area no camera shows a stream, px^2. Chosen by hand; no measurement is recorded.
 const VISIBLE_PX2: f32 = 20.0;
 /// The largest tilt of the flow model's tables, degrees.
@@ -43,13 +48,13 @@ fn explanation(weights: &Weights) -> Option<&Explanation> {
 /// How far off a pour is expected to be.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Expected {
-    /// By this standard deviation, ml, above 0: the largest over fills from which the goal can be reached.
+    /// By this standard deviation, ml, above 0: the largest over fills from which the goal can be reached within the frames of a pour.
     Within(f32),
     /// The weights carry no deviation, or nothing is to be poured.
     Unknown,
     /// The vessel, as the weights know it, does not give the goal by the largest tilt from any usual fill.
     TooMuch,
-    /// From every fill that gives the goal the pour takes more frames than it may.
+    /// From every fill that gives the goal the pour takes more frames than it may, way back not counted.
     TooLong,
 }
 
@@ -60,19 +65,19 @@ impl Expected {
     }
 }
 
-/// How far off a pour of `goal_ml` is expected to be that ends after `max_frames` at the latest.
-pub fn expected(weights: &Weights, limits: Limits, max_frames: u32, goal_ml: f32) -> Expected {
+/// How far off a pour of `goal_ml` is expected to be, with a controller of these settings.
+pub fn expected(weights: &Weights, settings: &Settings, goal_ml: f32) -> Expected {
     // A pour of nothing never begins.
     let known = explanation(weights).filter(|_| goal_ml > 0.0);
     let Some(Explanation { model, calibration, .. }) = known else { return Expected::Unknown };
     let flow = FlowTables::new(model, weights.rate_hz.into());
-    let gives =
-        |onset_deg: f32| flow.capacity.lost_ml(limits.alpha_max_deg.into()) - flow.capacity.lost_ml(onset_deg.into()) >= f64::from(goal_ml);
+    let largest_ml = flow.capacity.lost_ml(settings.limits.alpha_max_deg.into());
+    let gives = |onset_deg: f32| largest_ml - flow.capacity.lost_ml(onset_deg.into()) >= f64::from(goal_ml);
     let mut onsets_deg = ONSETS_DEG.into_iter().filter(|onset_deg| gives(*onset_deg)).peekable();
     if onsets_deg.peek().is_none() {
         return Expected::TooMuch;
     }
-    let sds = onsets_deg.filter_map(|onset_deg| foreseen_sd_ml(weights, (&flow, calibration), limits, max_frames, goal_ml, onset_deg));
+    let sds = onsets_deg.filter_map(|onset_deg| foreseen_sd_ml(weights, (&flow, calibration), settings, goal_ml, onset_deg));
     match sds.max_by(f32::total_cmp) {
         Some(sd_ml) if sd_ml > 0.0 => Expected::Within(sd_ml),
         Some(_) => Expected::Unknown,
@@ -80,23 +85,30 @@ pub fn expected(weights: &Weights, limits: Limits, max_frames: u32, goal_ml: f32
     }
 }
 
-/// The standard deviation at the end of a pour whose flow begins at `onset_deg`, ml; `None` if it is not over after `max_frames`.
+/// The standard deviation at the end of a pour whose flow begins at `onset_deg`, ml; `None` if it does not end by itself within its frames.
 fn foreseen_sd_ml(
     weights: &Weights,
     (flow, calibration): (&FlowTables, &Calibration),
-    limits: Limits,
-    max_frames: u32,
+    settings: &Settings,
     goal_ml: f32,
     onset_deg: f32,
 ) -> Option<f32> {
     let headspace_ml = flow.capacity.lost_ml(onset_deg.into());
     let mut agent = Agent::new(weights);
     agent.start(goal_ml);
+    let mut ending = Ending::of_pour();
+    // The loop limits a step in each tick, and here there is one for each frame.
+    let ticks = 1e9 / (settings.period_ns as f32 * weights.rate_hz);
+    let limits = Limits { step_deg: settings.limits.step_deg * ticks, ..settings.limits };
     let mut limiter = Limiter::new(limits, 1.0 / weights.rate_hz, 0.0);
     let mut state = FlowState { headspace_ml, ..FlowState::default() };
     let mut history = CommandHistory::standing_at(0.0);
     let mut quiet = 0;
-    for _ in 0..max_frames {
+    for frame in 0..settings.max_frames.saturating_add(BACK_FRAMES) {
+        // The bound is on the pour. On its way back it goes on to its end.
+        if frame >= settings.max_frames && !ending.agent_is_done() {
+            return None;
+        }
         let alpha_deg = limiter.alpha_deg();
         history.push(alpha_deg.into());
         let leaves_ml = state.step(flow, history.commands(), 0).leaves_ml;
@@ -109,11 +121,15 @@ fn foreseen_sd_ml(
             alpha_measured_deg: f32::NAN,
             alpha_now_deg: alpha_deg,
         });
-        quiet = if decision.tilting_back && area_px2 <= 0.0 { quiet + 1 } else { 0 };
+        // One that stands still short of its goal, or has come back, is over too.
+        if ending.decided(&decision, settings) {
+            agent.tilt_back();
+        }
+        quiet = if ending.agent_is_done() && area_px2 <= 0.0 { quiet + 1 } else { 0 };
         if quiet >= QUIET_FRAMES {
             return Some(decision.poured_sd_ml);
         }
-        if decision.tilting_back {
+        if ending.agent_is_done() {
             limiter.step_upright();
         } else {
             limiter.step(alpha_deg + decision.dalpha_deg);
@@ -170,6 +186,10 @@ pub(crate) mod tests {
 
     use super::*;
 
+    fn settings() -> Settings {
+        Settings::new(&shared::config::Config::parse(include_str!("../../config/sim.toml"), "sim.toml").unwrap())
+    }
+
     /// Weights whose network tilts by 0.2 degrees a frame until the goal is reached, for the usual beaker.
     pub(crate) fn weights() -> Weights {
         let mut network = Mlp::ZERO;
@@ -203,17 +223,35 @@ pub(crate) mod tests {
     /// give, or that takes longer than it may, has none, and the plain sum has none.
     #[test]
     fn a_deviation_is_foreseen() {
-        let of = |goal_ml, max_frames| expected(&weights(), Limits::default(), max_frames, goal_ml);
+        let settings = |max_frames, limits| Settings { max_frames, limits, ..settings() };
+        let of = |goal_ml, max_frames| expected(&weights(), &settings(max_frames, Limits::default()), goal_ml);
         let (Expected::Within(small), Expected::Within(large)) = (of(30.0, 900), of(150.0, 900)) else { panic!("no deviation") };
         assert!(small > 0.05 && large > 1.5 * small && large < 30.0, "{small} {large}");
         assert_eq!((of(30.0, 150), of(2000.0, 900)), (Expected::TooLong, Expected::TooMuch));
         let sum = Weights { estimator: Estimator::Sum, ..weights() };
-        assert_eq!(expected(&sum, Limits::default(), 900, 30.0), Expected::Unknown);
+        assert_eq!(expected(&sum, &settings(900, Limits::default()), 30.0), Expected::Unknown);
         // A pour that takes longer than the default is foreseen to its end where it may.
         let slow = Limits { rate_deg_s: 1.5, ..Limits::default() };
-        let of = |max_frames| expected(&weights(), slow, max_frames, 150.0);
+        let of = |max_frames| expected(&weights(), &settings(max_frames, slow), 150.0);
         assert_eq!(of(900), Expected::TooLong);
         assert!(matches!(of(9000), Expected::Within(sd_ml) if sd_ml > small), "{:?}", of(9000));
+    }
+
+    /// Protects whoever asks for a pour of an agent that stops short of its goal: the controller ends such a pour when it stands still, so it has a deviation,
+    /// and is not said to take too long. The way back is not counted among its frames.
+    #[test]
+    fn a_pour_that_stands_still_has_an_end() {
+        // It tilts as long as more than 20 ml are missing, and stays then.
+        let scale = InputScale::default();
+        let mut network = Mlp::ZERO;
+        (network.w1[3][0], network.w2[0][0], network.w3[0][STAY + 2]) = (1.0, 1.0, 1.0);
+        network.b3[STAY] = scale.apply([0.0; 3], 20.0)[3];
+        let lazy = Weights { network, scale, ..weights() };
+        let of = |max_frames, limits| expected(&lazy, &Settings { max_frames, limits, ..settings() }, 30.0);
+        assert!(matches!(of(900, Limits::default()), Expected::Within(_)), "{:?}", of(900, Limits::default()));
+        let least = |limits| (100..900).find(|frames| of(*frames, limits) != Expected::TooLong);
+        let slow_back = Limits { return_rate_deg_s: 5.0, ..Limits::default() };
+        assert_eq!(least(slow_back), least(Limits::default()), "the way back is not counted");
     }
 
     /// Protects whoever pours without telling the fill: what may leave unseen is said, and it grows with the tilt that has to be waited for, up to the

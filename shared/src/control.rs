@@ -11,7 +11,7 @@ use crate::limits::Clipped;
 use crate::messages::Phase;
 
 /// Version of the messages of this module: part of the service's name, so that programs of other versions never connect.
-pub const CONTROL_VERSION: u32 = 5;
+pub const CONTROL_VERSION: u32 = 6;
 
 /// What a client asks.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -77,6 +77,9 @@ pub struct Outcome {
     pub reason: EndReason,
     /// Whether liquid may have left that nobody has seen or counted: on the way upright too, whatever the pour ended for.
     pub unseen: bool,
+    /// Whether that is because camera or robot were lost, or it still dripped: the container may not be upright. Otherwise the stream left the region, or none
+    /// was ever seen.
+    pub unwatched: bool,
     /// Goal volume, ml; `None` for a recording.
     pub goal_ml: Option<f32>,
     /// Estimated volume poured, ml.

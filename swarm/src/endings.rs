@@ -100,6 +100,7 @@ mod tests {
             episode: 1,
             reason,
             unseen: reason.leaves_unseen(),
+            unwatched: reason.leaves_unseen(),
             goal_ml: Some(80.0),
             poured_ml: 80.0,
             poured_sd_ml: 2.0,
@@ -142,7 +143,8 @@ mod tests {
             checks.ended(&outcome(reason), true_ml, 20.0);
             checks.violations.iter().any(|v| v.invariant == "said")
         };
-        let found = |reason, hidden_ml, true_ml| found_after(0.0, reason, hidden_ml, true_ml);
+        let found = |reason, hidden_ml, true_ml| found_after(0.1, reason, hidden_ml, true_ml);
+        assert!(found_after(0.0, EndReason::Done, 20.0, 110.0), "a stream that is there at once tells by itself");
         assert!(!found(EndReason::Done, 20.0, 110.0) && found(EndReason::Done, 20.0, 116.0), "a surge that nothing let expect");
         assert!(found_after(20.0, EndReason::Done, 20.0, 110.0), "as much had been shown before");
         assert!(!found(EndReason::Aborted, 20.0, 110.0) && found(EndReason::Aborted, 20.0, 116.0));

@@ -10,6 +10,7 @@ use shared::weights::Weights;
 
 use super::resume;
 use crate::client::{self, Client, ClientError, Common};
+use crate::core::{Settings, goal_is_legal};
 use crate::foreseen::{self, Expected};
 
 /// A pour that is expected to be off by more than this is warned of, ml: wanted by the users.
@@ -38,9 +39,13 @@ pub fn run(args: &Args) -> Result<(), Failure> {
         let what = "--fill: there is less in the vessel than is to be poured: fill it, or give a smaller goal";
         return Err(failure(exit::BAD_INPUT, what));
     }
-    // That may take a while, in which the controller may take other weights: what is foreseen is of those that pour.
-    resume::take_back_if_it_waits(&Client::connect_or_end(&config.cell).or_exit(exit::UNREACHABLE)?)?;
-    let foreseen = Foreseen::of(&config, args)?;
+    // What cannot be poured is refused before a robot is taken from somebody for it.
+    goal_is_legal(args.goal_ml, &Settings::new(&config)).or_exit(exit::REFUSED)?;
+    let mut foreseen = Foreseen::of(&config, args)?;
+    if resume::take_back_if_it_waits(&Client::connect_or_end(&config.cell).or_exit(exit::UNREACHABLE)?)? {
+        // That may have taken a while, in which the controller may have taken other weights: what is foreseen is of those that pour.
+        foreseen = Foreseen::of(&config, args)?;
+    }
     for line in foreseen.lines(args.goal_ml) {
         eprintln!("{line}");
     }
@@ -85,7 +90,7 @@ impl Foreseen {
         let container = config.container;
         let flows_by_deg = weights.and_then(|w| foreseen::must_flow_by_deg(w, fill_ml, container.least_fill_ml, container.holds_ml));
         Self {
-            expected: weights.map(|w| foreseen::expected(w, config.limits, config.controller.max_frames, goal_ml)),
+            expected: weights.map(|w| foreseen::expected(w, &Settings::new(config), goal_ml)),
             flows_by_deg,
             unseen_ml: weights.and_then(|w| foreseen::unseen_ml(w, config.limits, flows_by_deg)),
             pictures_line: weights.and_then(foreseen::pictures_line),
@@ -183,7 +188,7 @@ pub(crate) fn order(cell: &CellConfig, request: &Request) -> Result<Ended, Failu
 fn interrupted_line(outcome: &Outcome) -> String {
     let words = outcome.reason.words();
     match outcome.reason {
-        _ if !outcome.unseen => format!("interrupted: {words}, the container is upright"),
+        _ if !outcome.unwatched => format!("interrupted: {words}, the container is upright"),
         EndReason::NotUpright => format!("interrupted: {words}"),
         _ => format!("interrupted: {words}; the container or the camera could not be watched to the end: look at the robot"),
     }
@@ -206,6 +211,9 @@ fn report(Ended { outcome, recorded, .. }: &Ended, foreseen_sd_ml: Option<f32>, 
             counted(outcome.tick_gaps, "gap"),
             counted(outcome.stale_features, "stale feature")
         );
+        if outcome.unseen && !outcome.unwatched {
+            println!("a part of the stream left the region, or none was seen: enlarge [image] region_px, or look at the camera");
+        }
         match recorded.as_ref().map(|r| &r.file) {
             Some(Ok(file)) => println!("recorded: {file}\nread the scale, then: feature-worker episodes weigh {file} --weight GRAMS"),
             Some(Err(e)) => println!("not recorded: {e}"),
@@ -255,11 +263,13 @@ mod tests {
     /// Protects whoever pressed Ctrl-C at a robot: it is said to be upright only where that is known.
     #[test]
     fn upright_is_said_only_where_it_is_known() {
-        let line = |reason: EndReason, unseen: bool| {
+        let line = |reason: EndReason, unwatched: bool| {
             interrupted_line(&Outcome {
                 episode: 1,
                 reason,
-                unseen,
+                // A stream that left the region says nothing of the container.
+                unseen: true,
+                unwatched,
                 goal_ml: Some(50.0),
                 poured_ml: 20.0,
                 poured_sd_ml: 0.0,
@@ -271,14 +281,14 @@ mod tests {
                 clipped: Clipped::default(),
             })
         };
-        for (reason, unseen, upright) in [
+        for (reason, unwatched, upright) in [
             (EndReason::Aborted, false, true),
             (EndReason::Done, false, true),
             (EndReason::MaxFrames, false, true),
             (EndReason::Aborted, true, false),
             (EndReason::NotUpright, true, false),
         ] {
-            let said = line(reason, unseen);
+            let said = line(reason, unwatched);
             assert_eq!((said.contains("is upright"), said.contains("look at the robot")), (upright, !upright), "{said}");
         }
     }

@@ -39,14 +39,14 @@ pub fn run(args: &Args) -> Result<(), Failure> {
     Ok(())
 }
 
-/// Takes the robot back if it waits for its operator: whoever gives an order has asked for it.
-pub(super) fn take_back_if_it_waits(client: &Client) -> Result<(), Failure> {
+/// Takes the robot back if it waits for its operator: whoever gives an order has asked for it. Gives whether it waited.
+pub(super) fn take_back_if_it_waits(client: &Client) -> Result<bool, Failure> {
     let status = client.status().or_exit(exit::UNREACHABLE)?;
     if status.robot != RobotLink::WaitsForOperator || status.phase != Phase::NoRobot {
-        return Ok(());
+        return Ok(false);
     }
     eprintln!("taking the robot back, because you ask for it; it waited: {}", status.hindrance);
-    take_back(client)
+    take_back(client).map(|()| true)
 }
 
 /// Asks for the robot, and waits until it is connected and stands upright.

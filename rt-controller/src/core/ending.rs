@@ -119,8 +119,8 @@ pub struct Ending {
     /// Length of a recording's curve, s; `None` in a pour.
     curve_s: Option<f64>,
     reason: EndReason,
-    /// Whether liquid may have left that nobody has seen or counted, for whatever reason the pour ends.
-    unseen: bool,
+    /// Whether camera or robot were lost, or it still dripped, so that liquid may have left that nobody has seen or counted, for whatever reason the pour ends.
+    unwatched: bool,
     /// Sum of the areas that were measured, and of those among them that are lower bounds, px^2.
     area_px2: f64,
     cut_off_px2: f64,
@@ -157,7 +157,7 @@ impl Ending {
             dry_frames: 0,
             curve_s: None,
             reason: EndReason::Done,
-            unseen: false,
+            unwatched: false,
             area_px2: 0.0,
             cut_off_px2: 0.0,
             agent_is_done: false,
@@ -195,14 +195,14 @@ impl Ending {
 
     /// Gives the reason of the end; call it once, when the container begins to come upright.
     pub fn end_with(&mut self, reason: EndReason) {
-        self.unseen |= reason.leaves_unseen();
+        self.unwatched |= reason.leaves_unseen();
         self.reason = reason;
     }
 
     /// Gives a reason for which a pour is not done although its goal seemed reached: the robot may not move any more, or the camera no longer
     /// shows what leaves. A pour that was already ending for another reason keeps that one.
     pub fn end_instead_of_done(&mut self, reason: EndReason) {
-        self.unseen |= reason.leaves_unseen();
+        self.unwatched |= reason.leaves_unseen();
         if self.reason == EndReason::Done {
             self.reason = reason;
         }
@@ -210,14 +210,14 @@ impl Ending {
 
     /// Gives the reason of the end when the robot may not move any more, for `reason`. Out of an upright container only the last drops leave.
     pub fn without_robot(&mut self, reason: EndReason, is_upright: bool, settings: &Settings) -> EndReason {
-        self.unseen |= reason.leaves_unseen() && !is_upright;
+        self.unwatched |= reason.leaves_unseen() && !is_upright;
         self.looks_away(settings);
         reason.after(self.reason, is_upright)
     }
 
     /// Takes that nobody looks at an upright container from now on: drops that may still fall are not counted.
     pub fn looks_away(&mut self, settings: &Settings) {
-        self.unseen |= self.curve_s.is_none() && !self.is_quiet(settings);
+        self.unwatched |= self.curve_s.is_none() && !self.is_quiet(settings);
     }
 
     /// Whether nothing has flowed for so long that the last drops have fallen.
@@ -225,13 +225,19 @@ impl Ending {
         self.quiet_frames >= settings.frames(SETTLE_QUIET_S)
     }
 
-    /// Whether liquid may have left that nobody has seen or counted, if it ends for `reason`. An abort does not bring back what a lost camera hid. Nor
-    /// does what leaves the region come back: a pour of which so much was seen that a file of it would not be trained is a lower bound. And who stands
-    /// tilted until the frames run out and never sees a stream cannot know that there was none.
+    /// Whether nobody could watch camera and container to the end, if it ends for `reason`. An abort does not bring back what a lost camera hid.
+    pub fn leaves_unwatched(&self, reason: EndReason) -> bool {
+        self.unwatched || reason.leaves_unseen()
+    }
+
+    /// Whether liquid may have left that nobody has seen or counted, if it ends for `reason`. What leaves the region does not come back: a pour of which so
+    /// much was seen that a file of it would not be trained is a lower bound. And whoever ends a pour that never showed a stream cannot know that there was
+    /// none.
     pub fn leaves_unseen(&self, reason: EndReason) -> bool {
         let cut_off = self.cut_off_px2 > CUT_OFF_MAX * self.area_px2;
-        let blind = reason == EndReason::MaxFrames && self.curve_s.is_none() && !self.seen_stream;
-        self.unseen || reason.leaves_unseen() || cut_off || blind
+        let any_time = matches!(reason, EndReason::MaxFrames | EndReason::Aborted | EndReason::Shutdown | EndReason::NotFollowed);
+        let blind = any_time && self.curve_s.is_none() && !self.seen_stream;
+        self.leaves_unwatched(reason) || cut_off || blind
     }
 
     /// Takes whether the joint follows on its way upright, and why the camera does not tell what leaves there, if so; and looks at what was seen
@@ -355,7 +361,7 @@ impl Ending {
             return None;
         }
         // What drips on, or may do so unseen, is not counted any more.
-        self.unseen |= is_pour && !quiet;
+        self.unwatched |= is_pour && !quiet;
         Some(match self.reason {
             _ if !upright => EndReason::NotUpright,
             // Out of an upright container nothing pours: the eye takes something else for a stream, and has done so before.

@@ -76,6 +76,7 @@ impl Run {
             episode: self.episode,
             reason,
             unseen: self.ending.leaves_unseen(reason),
+            unwatched: self.ending.leaves_unwatched(reason),
             goal_ml: self.goal_ml,
             poured_ml: if self.goal_ml.is_some() { decision.poured_ml } else { f32::NAN },
             poured_sd_ml: if self.goal_ml.is_some() { said_sd_ml(reason, decision) } else { 0.0 },

@@ -222,7 +222,8 @@ fn what_leaves_the_region_is_a_lower_bound() {
 }
 
 /// Protects the operator of a pour in which no stream was ever seen: an empty container and a camera that sees nothing look alike, so the volume is
-/// a lower bound, at the largest tilt and when the frames run out. Where a stream was seen, it is not.
+/// a lower bound, at the largest tilt, when the frames run out, and where somebody stops it. Where a stream was seen, it is not. The container is upright all
+/// the same.
 #[test]
 fn a_pour_without_a_stream_may_be_an_unseen_one() {
     let settings = settings();
@@ -235,6 +236,8 @@ fn a_pour_without_a_stream_may_be_an_unseen_one() {
             ending.saw(&SeenFrame { lost: 0, area_px2, cut_off: false, flowing, alpha_deg, alpha_now_deg: alpha_deg }, &settings);
         }
         let moment = Moment { running_s: 9.0, frames, measurement_age_ns: 0, alpha_deg, poured_ml: 0.0, follows: true };
+        let stopped = [EndReason::Aborted, EndReason::Shutdown, EndReason::NotFollowed];
+        assert!(stopped.iter().all(|reason| ending.leaves_unseen(*reason) != streamed && !ending.leaves_unwatched(*reason)));
         ending.due(&moment, &settings).map(|reason| (reason, ending.leaves_unseen(reason)))
     };
     let empty = settings.empty_frames + 2;
