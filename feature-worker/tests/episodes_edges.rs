@@ -221,17 +221,30 @@ fn two_changes_at_once_lose_nothing() {
     assert_eq!(std::fs::read_dir(dir.path()).unwrap().count(), 1, "no temporary file is left");
 }
 
-/// Protects what is learned from tables: episodes are in the order in which they began, whatever their numbers, as the newest ones count where something has
-/// changed.
+/// Protects somebody's files from a data set: a directory with a part of one is left as it is.
 #[test]
-fn tables_are_in_the_order_of_time() {
+fn a_part_of_a_data_set_is_not_written_over() {
+    let dir = tempfile::tempdir().unwrap();
+    let recorded = write(dir.path(), 1, true);
+    let mine = dir.path().join("set/videos/observation.images.camera/chunk-000/file-000.mp4");
+    std::fs::create_dir_all(mine.parent().unwrap()).unwrap();
+    std::fs::write(&mine, "mine").unwrap();
+    let output = episodes(&["export", recorded.to_str().unwrap(), "--as", "lerobot", "--to", dir.path().join("set").to_str().unwrap()]);
+    assert_eq!((code(&output), std::fs::read(&mine).unwrap()), (1, b"mine".to_vec()), "{}", text(&output.stderr));
+}
+
+/// Protects what is learned from tables, of which the newest ones count where something has changed: episodes are in the order of their age. A number tells it where
+/// a clock went back, and the time that of a copy.
+#[test]
+fn tables_are_in_the_order_of_age() {
     let dir = tempfile::tempdir().unwrap();
     let recorded = dir.path().join("recorded");
     for (number, days) in [(3, 3), (4, 1), (5, 2)] {
         write_at(&recorded, number, true, UNIX_EPOCH + Duration::from_secs(days * 86_400));
     }
+    std::fs::rename(recorded.join("episode-0005.mcap"), recorded.join("episode-0009.mcap")).unwrap();
     let to = dir.path().join("csv");
     assert_eq!(code(&episodes(&["export", recorded.to_str().unwrap(), "--as", "csv", "--to", to.to_str().unwrap()])), 0);
     let tables = shared::episode::read_table(&to.join("features.csv"), &to.join("scale.csv")).unwrap();
-    assert_eq!(tables.iter().map(|e| e.rows[0].area_px2).collect::<Vec<_>>(), [4.0, 5.0, 3.0]);
+    assert_eq!(tables.iter().map(|e| e.rows[0].area_px2).collect::<Vec<_>>(), [5.0, 3.0, 4.0]);
 }

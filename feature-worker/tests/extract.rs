@@ -9,8 +9,7 @@ mod ground;
 use drawn::{HEIGHT, WIDTH, blue, camera, disc, dry, image_config, lay_over, noisy, pour, stream, water};
 use feature_worker::vision::{ExtractError, Extractor, Image, Measurement};
 use opencv::core::{self, CV_8UC3, CV_16SC3, Mat, Point, Scalar, Size, Vector};
-use opencv::imgproc;
-use opencv::prelude::*;
+use opencv::{imgproc, prelude::*};
 use shared::config::{ImageConfig, LiquidMethod};
 use shared::messages::{Doubt, PixelFormat};
 

@@ -51,7 +51,8 @@ pub fn describe(file: &Path) -> Result<String, Box<dyn Error>> {
         Some(weight_g) => format!("{} rows, sum of V_e {sum:.1} px^2, weight {weight_g} g\n", episode.rows.len()),
         None => format!("{} rows, sum of V_e {sum:.1} px^2, not weighed yet\n", episode.rows.len()),
     };
-    text += if episode.complete && episode.weight_g.is_some() { "it can be trained on\n" } else { "it cannot be trained on\n" };
+    let sound = episode.complete && episode.weight_g.is_some() && episode.stream_faults().next().is_none();
+    text += if sound { "it can be trained on\n" } else { "it cannot be trained on\n" };
     Ok(text)
 }
 

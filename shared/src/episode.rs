@@ -52,6 +52,7 @@ const RUNS_ON_WORDS: &str =
 /// What is wrong with an episode of which the camera missed a part, see [`Episode::part_unseen`].
 pub const PART_UNSEEN: &str = "the camera did not see part of this pour; its areas do not add up to its weight";
 
+mod age;
 mod format;
 mod format_1;
 mod number;
@@ -66,8 +67,9 @@ pub mod weigh;
 mod weight;
 pub mod write;
 
+pub use age::{Begun, by_age, oldest_first};
 pub use number::{by_number, check_number, number_of, take_number};
-pub use read::{EpisodeImage, EpisodeImages, began_at, each_once, episodes_so_far, find_episodes};
+pub use read::{EpisodeImage, EpisodeImages, beginning, each_once, episodes_so_far, find_episodes};
 pub use records::EpisodeError;
 pub use recover::recover;
 pub use rewrite::{ChangeError, read_at_rest};
@@ -77,6 +79,17 @@ pub use weigh::{set_note, set_weight};
 pub use weight::{WeightError, check_poured, check_reading};
 pub(crate) use write::rfc3339;
 pub use write::{EpisodeEnd, EpisodeStart, EpisodeWriter, FrameRow, WriteError};
+
+/// Ticks between which others are missing and that are further apart than this do not tell the angles between them, ns: as long as a measured angle
+/// counts.
+const GAP_NS: u64 = 100_000_000;
+/// Why an episode is incomplete that has such a gap.
+pub const GAP: &str = "ticks of the controller are lost, because recorder or controller fell behind, so angles are not known";
+
+/// Whether so many ticks are missing between two that follow each other, each with its number and its time, ns, that the angles between them are not known.
+pub fn is_gap((before, before_ns): (u64, u64), (after, after_ns): (u64, u64)) -> bool {
+    after > before.saturating_add(1) && after_ns.saturating_sub(before_ns) > GAP_NS
+}
 
 /// One experimental episode, without its images.
 #[derive(Debug, Clone, PartialEq)]
@@ -148,6 +161,16 @@ pub struct EpisodeInfo {
 }
 
 impl Episode {
+    /// What it lacks to be complete, in words; `None` if nothing.
+    pub fn lacks(&self) -> Option<&str> {
+        match self.info.ended.as_str() {
+            _ if self.complete => None,
+            "" => Some("its end is missing"),
+            _ if self.info.recoverable => Some("only the file's own end is missing, and `feature-worker episodes recover` makes it whole"),
+            ended => Some(ended),
+        }
+    }
+
     /// Hash of what the trainer sees: times, angles and areas, but not name, weight or file. Two episodes with the same hash are one and
     /// the same measurement, be it as a file or as a table.
     pub fn content_sha256(&self) -> [u8; 32] {

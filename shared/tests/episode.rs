@@ -121,8 +121,7 @@ fn an_episode_is_read_as_it_was_written() {
     assert_eq!(episode.rows[25 - 8].doubt, Doubt::TooDark);
 
     let images: Vec<_> = EpisodeImages::open(&path).unwrap().map(Result::unwrap).collect();
-    assert_eq!(images.len(), 57);
-    assert_eq!((images[0].sequence, images[0].format.as_str(), images[0].data[0]), (8, "jpeg", 8));
+    assert_eq!((images.len(), images[0].sequence, images[0].format.as_str(), images[0].data[0]), (57, 8, "jpeg", 8));
     assert_eq!(images[0].captured_at_ns, episode.rows[0].captured_at_ns);
 }
 
@@ -131,25 +130,26 @@ fn an_episode_is_read_as_it_was_written() {
 fn a_file_that_was_never_finished_is_incomplete() {
     let dir = tempfile::tempdir().unwrap();
     let episode = Episode::read(&write(dir.path(), false)).unwrap();
-    assert!(!episode.complete);
-    assert!(!episode.rows.is_empty());
+    assert!(!episode.complete && !episode.rows.is_empty());
 }
 
-/// Protects people from training on an episode whose camera stopped before its end: its areas do not add up to the weight.
+/// Protects people from training on areas that do not add up to the weight, because the camera stopped before the end, and on made-up angles, where ticks are lost.
 #[test]
-fn an_episode_whose_last_second_has_no_frames_is_incomplete() {
+fn an_episode_without_its_last_frames_or_its_ticks_is_incomplete() {
     let dir = tempfile::tempdir().unwrap();
     let config = config();
-    let mut writer = EpisodeWriter::create(dir.path(), &start(&config)).unwrap();
-    for n in 10..60 {
-        writer.telemetry(&tick(n - 10)).unwrap();
-        if n < 30 {
+    for (frames, lost, lacks) in [(30, 0..0, "the camera fell silent"), (60, 30..34, "ticks of the controller are"), (60, 30..31, "")] {
+        let mut writer = EpisodeWriter::create(dir.path(), &start(&config)).unwrap();
+        for n in (10..60).filter(|n| !lost.contains(n)) {
+            writer.telemetry(&tick(n - 10)).unwrap();
             let f = feature(n, Doubt::None);
-            writer.frame(&FrameRow { feature: &f, alpha_commanded_deg: 0.0, alpha_measured_deg: 0.0, image: None }).unwrap();
+            let row = FrameRow { feature: &f, alpha_commanded_deg: 0.0, alpha_measured_deg: 0.0, image: None };
+            (n < frames).then(|| writer.frame(&row).unwrap());
         }
+        let path = writer.finish(&EpisodeEnd { complete: true, reason: "over", disordered_frames: 0 }).unwrap();
+        let episode = Episode::read(&path).unwrap();
+        assert_eq!((episode.complete, episode.lacks().is_some_and(|what| what.starts_with(lacks))), (lacks.is_empty(), !lacks.is_empty()));
     }
-    let path = writer.finish(&EpisodeEnd { complete: true, reason: "over", disordered_frames: 0 }).unwrap();
-    assert!(!Episode::read(&path).unwrap().complete);
 }
 
 /// Protects w_E and all that was recorded: a weight is added and changed, everything else stays, and no other file is left.

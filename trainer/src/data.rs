@@ -26,6 +26,8 @@ const WEIGHTS_APART_G: f64 = 0.5;
 /// Frame rates of which one is further off the other than this share of it are different ones. Chosen by hand: a volume is then off by as much, and the
 /// controller ends a pour whose frames come at a rate that is off by 2.5 %.
 const RATES_APART: f64 = 0.02;
+/// Rates are read off with this precision, frames a second, which is more than that share of a slow camera's.
+const RATE_STEP_HZ: f64 = 0.1;
 
 /// One experimental episode E = (L_E, w_E). Each camera frame is one row, and all columns have the same length.
 #[derive(Debug, Clone, PartialEq)]
@@ -217,11 +219,11 @@ impl TrainingEpisode {
 /// Takes out the episodes whose frame rate is not that of most others: a delay and a flow in frames mean something else in them. Of two rates that
 /// are as frequent, that of the newest episode counts.
 fn keep_one_rate(found: &mut UsableEpisodes) {
-    let alike = |a: &TrainingEpisode, b: &TrainingEpisode| (a.rate_hz - b.rate_hz).abs() <= RATES_APART * b.rate_hz;
+    let are_alike = |a_hz: f64, b_hz: f64| (a_hz - b_hz).abs() <= (RATES_APART * b_hz).max(1.01 * RATE_STEP_HZ);
+    let alike = |a: &TrainingEpisode, b: &TrainingEpisode| are_alike(a.rate_hz, b.rate_hz);
     let frequent = found.episodes.iter().max_by_key(|e| found.episodes.iter().filter(|other| alike(e, other)).count());
     let Some(rate_hz) = frequent.map(|e| e.rate_hz) else { return };
-    let (kept, others): (Vec<_>, Vec<_>) =
-        std::mem::take(&mut found.episodes).into_iter().partition(|e| (e.rate_hz - rate_hz).abs() <= RATES_APART * rate_hz);
+    let (kept, others): (Vec<_>, Vec<_>) = std::mem::take(&mut found.episodes).into_iter().partition(|e| are_alike(e.rate_hz, rate_hz));
     found.episodes = kept;
     found.left_out.extend(others.into_iter().map(|e| {
         let what = format!("{} frames a second, and the others have {rate_hz}: train on one frame rate only", e.rate_hz);
@@ -273,8 +275,8 @@ pub struct EpisodeSource {
 }
 
 impl EpisodeSource {
-    /// Reads the episodes. That they can be read and come from the chosen cells, or from one, is all that is checked here. Recordings come in the order in
-    /// which they began, because the newest ones count where something has changed; tables keep their order.
+    /// Reads the episodes. That they can be read and come from the chosen cells, or from one, is all that is checked here. Recordings come in the order of
+    /// their age ([`episode::oldest_first`]), because the newest ones count where something has changed; tables keep their order.
     pub fn read(&self) -> Result<Vec<Episode>, DataError> {
         let mut episodes = Vec::new();
         if let Some(scale) = &self.scale {
@@ -284,8 +286,7 @@ impl EpisodeSource {
             for file in episode::find_episodes(&self.episodes)? {
                 episodes.push(Episode::read(&file)?);
             }
-            // Those of one time stay in the order of their numbers.
-            episodes.sort_by(|a, b| a.info.started_at_utc.cmp(&b.info.started_at_utc));
+            episodes = episode::oldest_first(episodes);
         }
         if episodes.is_empty() {
             let places: Vec<String> = self.episodes.iter().map(|p| p.display().to_string()).collect();
@@ -333,11 +334,13 @@ pub fn usable(episodes: &[Episode]) -> UsableEpisodes {
     let first = Episode::first_of_measurement(episodes);
     for (k, e) in episodes.iter().enumerate() {
         let own = TrainingEpisode::from_episode(e);
-        let fault = if !e.complete {
-            Some("the recording is incomplete (the recorder was stopped): the areas do not add up to the weight; record it again".into())
-        } else if let Some(other) = same(&first, k).find(|other| weights_differ(e, &episodes[*other])) {
+        // What is incomplete is no measurement.
+        let same = |k| same(&first, k).filter(|other| episodes[*other].complete);
+        let fault = if let Some(what) = e.lacks() {
+            Some(format!("the recording is incomplete: {what}"))
+        } else if let Some(other) = same(k).find(|other| weights_differ(e, &episodes[*other])) {
             Some(format!("the same measurement as {}, with another weight: correct one of them, or leave it out", episodes[other].name))
-        } else if let Some(other) = same(&first, k).find(|other| *other < k && episodes[*other].weight_g.is_some()) {
+        } else if let Some(other) = same(k).find(|other| *other < k && episodes[*other].weight_g.is_some()) {
             Some(format!("the same measurement as {}: leave one of them out", episodes[other].name))
         } else {
             own.fault().or_else(|| e.stream_faults().next())

@@ -180,6 +180,17 @@ fn of_copies_one_teaches_and_of_two_weights_none() {
     }
 }
 
+/// Protects a measurement from a copy of it that was cut: the whole one teaches, whichever comes first.
+#[test]
+fn a_cut_copy_takes_no_measurement_away() {
+    let dir = tempfile::tempdir().unwrap();
+    let paths: Vec<_> = recordings(6).iter().map(|recording| write(dir.path(), recording)).collect();
+    let bytes = std::fs::read(&paths[5]).unwrap();
+    std::fs::write(dir.path().join("a-copy.mcap"), &bytes[..bytes.len() - 20]).unwrap();
+    let said = said(&Command::new(env!("CARGO_BIN_EXE_trainer")).arg("check").arg(dir.path()).output().unwrap());
+    assert!(said.contains("a-copy.mcap: the recording is incomplete") && said.contains("6 usable"), "{said}");
+}
+
 /// Protects the trainer from bad recordings, and people from guessing: each fault of the last of six recordings is named, and no other
 /// recording is blamed.
 #[test]
@@ -286,14 +297,16 @@ fn the_size_of_the_set_is_judged() {
             wrong.push(format!("{n} episodes, {expected:?}:\n{said}"));
         }
     }
-    let mut all = recordings(6);
-    all[5].rows.iter_mut().for_each(|row| row.at_ns *= 2);
-    let out = check(&all);
-    let said = said(&out);
-    let named =
-        said.lines().any(|l| l.starts_with("cannot be used: ") && l.contains("episode-0006.mcap: 15 frames a second, and the others"));
-    if !named || !said.contains("5 usable") || out.status.code() != Some(1) {
-        wrong.push(said);
+    for (slower, hz) in [(2.0, "15 "), (0.975, "30.8 ")] {
+        let mut all = recordings(6);
+        all[5].rows.iter_mut().for_each(|row| row.at_ns = (row.at_ns as f64 * slower) as u64);
+        let out = check(&all);
+        let said = said(&out);
+        let words = format!("episode-0006.mcap: {hz}frames a second, and the others");
+        let named = said.lines().any(|l| l.starts_with("cannot be used: ") && l.contains(&words));
+        if !named || !said.contains("5 usable") || out.status.code() != Some(1) {
+            wrong.push(said);
+        }
     }
     assert!(wrong.is_empty(), "{}", wrong.join("\n"));
 }

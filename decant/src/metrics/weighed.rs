@@ -3,13 +3,13 @@
 //! A thread of its own reads each episode once, and again when its file has changed; it allocates and waits for the disk. A file that cannot be
 //! read is left out. Of a directory that cannot be read nothing is told.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, Ordering::Relaxed};
 use std::sync::{Mutex, PoisonError};
 use std::time::{Duration, SystemTime};
 
-use shared::episode::{Episode, began_at, by_number, episodes_so_far};
+use shared::episode::{Begun, Episode, beginning, by_age, episodes_so_far};
 
 /// Pause between two looks at the episodes. Chosen by hand: weighing takes a person longer.
 const LOOK: Duration = Duration::from_secs(10);
@@ -25,8 +25,8 @@ type Stamp = (Option<SystemTime>, u64);
 #[derive(Debug)]
 struct Known {
     stamp: Stamp,
-    /// When it began.
-    began_at: Option<SystemTime>,
+    /// Its number, and when it began.
+    beginning: (Option<u64>, Option<SystemTime>),
     /// By how much it missed its goal, ml, if it is a weighed pour; `None` as long as it was not read, because it is none of the newest.
     error_ml: Option<Option<f64>>,
 }
@@ -46,7 +46,7 @@ impl Weighed {
             return None;
         }
         let known = self.known.lock().unwrap_or_else(PoisonError::into_inner);
-        Some(by_age(&known).into_iter().filter_map(|(_, known)| known.error_ml.flatten()).collect())
+        Some(oldest_first(&known).into_iter().filter_map(|(_, known)| known.error_ml.flatten()).collect())
     }
 
     /// Looks at the episodes in `directory` again and again, until `stop` is set.
@@ -69,19 +69,20 @@ impl Weighed {
         let found = episodes_so_far(directory, known);
         self.unreadable.store(found.is_err(), Relaxed);
         let Ok(paths) = found else { return };
-        locked().retain(|path, _| paths.contains(path));
+        let there: BTreeSet<&PathBuf> = paths.iter().collect();
+        locked().retain(|path, _| there.contains(path));
         for path in paths {
             let Ok(meta) = path.metadata() else { continue };
             let stamp = (meta.modified().ok(), meta.len());
             if stop.load(Relaxed) || locked().get(&path).is_some_and(|known| known.stamp == stamp) {
                 continue;
             }
-            let began_at = began_at(&path);
-            locked().insert(path, Known { stamp, began_at, error_ml: None });
+            let beginning = beginning(&path);
+            locked().insert(path, Known { stamp, beginning, error_ml: None });
         }
         let (older, newest): (Vec<PathBuf>, Vec<PathBuf>) = {
             let known = locked();
-            let mut paths: Vec<PathBuf> = by_age(&known).into_iter().map(|(path, _)| path.clone()).collect();
+            let mut paths: Vec<PathBuf> = oldest_first(&known).into_iter().map(|(path, _)| path.clone()).collect();
             let newest = paths.split_off(paths.len().saturating_sub(EPISODES));
             (paths, newest)
         };
@@ -98,11 +99,12 @@ impl Weighed {
     }
 }
 
-/// The episodes, the oldest first. A copy of an old one may have a new number, so the start decides, and the number only among those of one start.
-fn by_age(known: &BTreeMap<PathBuf, Known>) -> Vec<(&PathBuf, &Known)> {
-    let mut all: Vec<_> = known.iter().collect();
-    all.sort_by(|(a, of_a), (b, of_b)| of_a.began_at.cmp(&of_b.began_at).then_with(|| by_number(a, b)));
-    all
+/// The episodes, the oldest first.
+fn oldest_first(known: &BTreeMap<PathBuf, Known>) -> Vec<(&PathBuf, &Known)> {
+    let all: Vec<_> = known.iter().collect();
+    let begun: Vec<_> =
+        all.iter().map(|(path, known)| Begun { path: path.as_path(), number: known.beginning.0, at: known.beginning.1 }).collect();
+    by_age(&begun).into_iter().map(|i| all[i]).collect()
 }
 
 #[cfg(test)]
@@ -131,14 +133,16 @@ mod tests {
         let now = SystemTime::now();
         pour(9999, 51.0, now);
         pour(10_000, 52.0, now);
-        // A copy of an old one has a new number.
-        pour(12_000, 53.0, now - Duration::from_secs(1000));
+        // A copy of an old one has a new number, and of a clock that goes back, the number still tells.
+        pour(9998, 53.0, now - Duration::from_secs(1000));
+        std::fs::rename(dir.path().join("episode-9998.mcap"), dir.path().join("episode-12000.mcap")).unwrap();
+        pour(10_001, 54.0, now - Duration::from_secs(2000));
         for number in 0..EPISODES {
-            std::fs::write(dir.path().join(format!("episode-{}.mcap", 9998 - number)), b"no episode").unwrap();
+            std::fs::write(dir.path().join(format!("episode-{}.mcap", 9997 - number)), b"no episode").unwrap();
         }
         let weighed = Weighed::default();
         weighed.look(dir.path(), &AtomicBool::new(false));
-        assert_eq!(weighed.errors_ml(), Some(vec![3.0, 1.0, 2.0]));
+        assert_eq!(weighed.errors_ml(), Some(vec![3.0, 1.0, 2.0, 4.0]));
     }
 
     /// Protects who watches a cell whose disk went away: that nothing can be read is not that nothing was weighed.

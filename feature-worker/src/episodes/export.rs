@@ -7,7 +7,7 @@ use std::path::{Path, PathBuf};
 
 use clap::ValueEnum;
 use indicatif::{ProgressBar, ProgressStyle};
-use shared::episode::{Episode, EpisodeImages, write_table};
+use shared::episode::{Episode, EpisodeImages, oldest_first, write_table};
 use shared::plural::counted;
 
 use super::lerobot;
@@ -48,11 +48,13 @@ pub fn export(files: &[PathBuf], format: ExportFormat, to: &Path) -> Result<Expo
     let whole = matches!(format, ExportFormat::Csv | ExportFormat::Lerobot);
     for file in files {
         match Episode::read(file) {
-            Ok(episode) if whole && !episode.complete => {
-                let why = "it is incomplete, so that its frames do not add up to its weight; export it as images or as a video";
-                left_out.push(LeftOut { file: file.clone(), why: unfit(file, why).to_string() });
-            }
-            Ok(episode) => episodes.push((file.clone(), episode)),
+            Ok(episode) => match episode.lacks().filter(|_| whole) {
+                Some(what) => {
+                    let why = unfit(file, format!("it is incomplete ({what}); export it as images or as a video")).to_string();
+                    left_out.push(LeftOut { file: file.clone(), why });
+                }
+                None => episodes.push((file.clone(), episode)),
+            },
             Err(e) => left_out.push(LeftOut { file: file.clone(), why: e.to_string() }),
         }
     }
@@ -72,9 +74,8 @@ pub fn export(files: &[PathBuf], format: ExportFormat, to: &Path) -> Result<Expo
 fn write(episodes: Vec<(PathBuf, Episode)>, mut left_out: Vec<LeftOut>, format: ExportFormat, to: &Path) -> Result<Exported, ExportError> {
     if format == ExportFormat::Csv {
         let pair = [to.join("features.csv"), to.join("scale.csv")];
-        let mut episodes: Vec<Episode> = episodes.into_iter().map(|(_, episode)| episode).collect();
         // A training takes the last ones for the newest, where something has changed.
-        episodes.sort_by(|a, b| a.info.started_at_utc.cmp(&b.info.started_at_utc));
+        let episodes = oldest_first(episodes.into_iter().map(|(_, episode)| episode).collect());
         write_table(&episodes, &pair[0], &pair[1])?;
         return Ok(Exported { written: pair.into(), left_out });
     }

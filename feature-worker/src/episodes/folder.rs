@@ -8,7 +8,7 @@ use std::path::{Path, PathBuf};
 use std::time::{Duration, SystemTime};
 
 use shared::config::RecordingConfig;
-use shared::episode::began_at;
+use shared::episode::beginning;
 use shared::plural::counted;
 
 /// A megabyte, as in `recording.budget_mb`, bytes (SI).
@@ -40,7 +40,7 @@ fn episodes(directory: &Path) -> impl Iterator<Item = (PathBuf, Metadata)> {
 /// none of today.
 pub fn recorded_today(directory: &Path) -> u64 {
     let is_today = |at: SystemTime| SystemTime::now().duration_since(at).is_ok_and(|age| age < DAY);
-    let new = |(path, meta): &(PathBuf, Metadata)| meta.modified().is_ok_and(is_today) && began_at(path).is_none_or(is_today);
+    let new = |(path, meta): &(PathBuf, Metadata)| meta.modified().is_ok_and(is_today) && beginning(path).1.is_none_or(is_today);
     episodes(directory).filter(new).map(|(_, meta)| meta.len()).sum()
 }
 

@@ -39,11 +39,22 @@ const RATE_TOLERANCE: f64 = 0.03;
 
 /// Writes the data set of `episodes`, each with the file that it was read from, into the new directory `root`. Each image moves `bar` on by
 /// one. The data set has the middle one of the episodes' rates. Adds to `left_out` what is not in it: files without images, with images that cannot be
-/// read, of another size than those before, or at another rate. If that is all of them, there is no data set, and it returns false.
+/// read, of another size than those before, or at another rate. If that is all of them, there is no data set, and it returns false. On failure nothing
+/// of it stays.
 pub fn write(episodes: &[(PathBuf, Episode)], root: &Path, bar: &ProgressBar, left_out: &mut Vec<LeftOut>) -> Result<bool, ExportError> {
-    if root.join("meta").exists() {
-        return Err(write_error(root, "holds a data set already; name another directory"));
+    let parts = ["data", "meta", "videos"].map(|part| root.join(part));
+    if parts.iter().any(|part| part.symlink_metadata().is_ok()) {
+        return Err(write_error(root, "holds a data set already, or a part of one; name another directory"));
     }
+    let written = write_set(episodes, root, bar, left_out);
+    if !matches!(written, Ok(true)) {
+        // They are ours: none was there.
+        parts.iter().for_each(|part| drop(fs::remove_dir_all(part)));
+    }
+    written
+}
+
+fn write_set(episodes: &[(PathBuf, Episode)], root: &Path, bar: &ProgressBar, left_out: &mut Vec<LeftOut>) -> Result<bool, ExportError> {
     let mut rates_hz: Vec<f64> = episodes.iter().map(|(_, e)| mean_rate_hz(e)).collect();
     rates_hz.sort_by(f64::total_cmp);
     let mut set = DataSet::new(rates_hz.get(rates_hz.len() / 2).copied().unwrap_or(USUAL_RATE_HZ));

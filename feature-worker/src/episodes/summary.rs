@@ -135,6 +135,7 @@ pub fn summary(episode: &Episode) -> Value {
         "ticks": info.ticks,
         "lost_ticks": info.lost_ticks,
         "ended": info.ended,
+        "recoverable": info.recoverable,
         "started_at_utc": info.started_at_utc,
         "started_at_ns": info.started_at_ns,
         "cell": info.cell,

@@ -10,7 +10,7 @@ use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
 
 use sha2::{Digest, Sha256};
-use shared::episode::{Episode, by_number, find_episodes, hex, number_of, read_at_rest, take_number};
+use shared::episode::{Begun, Episode, by_age, find_episodes, hex, read_at_rest, take_number};
 use shared::{regular_file, whole_file};
 
 use super::folder::{Budget, Folder};
@@ -58,32 +58,19 @@ pub fn delete(found: &Found) -> Result<(), ExportError> {
     fs::remove_file(&found.path).map_err(|e| fail(&e))
 }
 
-/// Places in `found`, the oldest first. Within one directory the recorder's numbers say which is older: they only grow, and a wall clock may go back. So an
-/// episode counts as begun no sooner than those of its directory with a smaller number. Of a copy, whose name has another number than the recorder gave,
-/// and where there is no number, the time alone counts.
-fn by_age(found: &[Found]) -> Vec<usize> {
-    let directory = |f: &Found| f.path.parent().map(|d| d.canonicalize().unwrap_or(d.to_path_buf()));
-    let own_number = |f: &Found| number_of(&f.path).filter(|number| f.episode.info.number == Some(*number));
-    let mut order: Vec<_> = (0..found.len()).map(|i| (directory(&found[i]), own_number(&found[i]), i)).collect();
-    order.sort_by(|a, b| (&a.0, a.1).cmp(&(&b.0, b.1)));
-    let mut began = vec![""; found.len()];
-    let mut before: Option<(&Option<PathBuf>, &str)> = None;
-    for (directory, number, i) in &order {
-        began[*i] = found[*i].episode.info.started_at_utc.as_str();
-        if number.is_some() {
-            let latest = before.filter(|(d, _)| *d == directory).map_or("", |(_, at)| at);
-            began[*i] = began[*i].max(latest);
-            before = Some((directory, began[*i]));
-        }
-    }
-    let mut oldest_first: Vec<usize> = (0..found.len()).collect();
-    oldest_first.sort_by(|i, j| began[*i].cmp(began[*j]).then_with(|| by_number(&found[*i].path, &found[*j].path)));
-    oldest_first
+/// Places in `found`, the oldest first.
+fn oldest_first(found: &[Found]) -> Vec<usize> {
+    let begun = found.iter().map(|Found { path, episode, .. }| Begun {
+        path,
+        number: episode.info.number,
+        at: episode.info.started_at_utc.as_str(),
+    });
+    by_age(&begun.collect::<Vec<_>>())
 }
 
 /// Whether what is `beside` and cannot go breaks `budget` although of `found` only the newest stayed. No deletion helps there.
 pub fn is_out_of_reach(found: &[Found], beside: Folder, budget: Budget) -> bool {
-    let (episodes, bytes) = by_age(found).last().map_or((0, 0), |newest| (1, found[*newest].bytes));
+    let (episodes, bytes) = oldest_first(found).last().map_or((0, 0), |newest| (1, found[*newest].bytes));
     beside.episodes > 0 && !budget.holds(beside.episodes + episodes, beside.bytes + bytes)
 }
 
@@ -94,7 +81,7 @@ pub fn to_prune(found: &[Found], beside: Folder, budget: Budget, weighed: bool) 
     if is_out_of_reach(found, beside, budget) {
         return Vec::new();
     }
-    let mut order = by_age(found);
+    let mut order = oldest_first(found);
     order.pop();
     let rank = |i: &usize| match (&found[*i].episode.weight_g, found[*i].episode.complete) {
         (Some(_), _) => 2,

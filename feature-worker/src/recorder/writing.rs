@@ -13,7 +13,7 @@ use iceoryx2::port::publisher::Publisher;
 use iceoryx2::port::subscriber::Subscriber;
 use shared::config::Config;
 use shared::disk_space::free_bytes;
-use shared::episode::{EpisodeEnd, EpisodeKind, EpisodeStart, EpisodeTrack, EpisodeWriter, FrameRow, WriteError};
+use shared::episode::{EpisodeEnd, EpisodeKind, EpisodeStart, EpisodeTrack, EpisodeWriter, FrameRow, GAP, WriteError, is_gap};
 use shared::gaussian_curve::Curve;
 use shared::ipc::{Cell, IpcError};
 use shared::level::Level;
@@ -31,11 +31,6 @@ const BEFORE_NS: u64 = 200_000_000;
 const AFTER_NS: u64 = 500_000_000;
 /// Without telemetry for this long the controller counts as gone, ns. Chosen by hand; no measurement is recorded.
 const SILENCE_NS: u64 = 2_000_000_000;
-/// Ticks between which others are missing and that are further apart than this do not tell the angles between them, ns: as long as a measured angle
-/// counts.
-const GAP_NS: u64 = 100_000_000;
-/// Why a file is incomplete whose episode has such a gap.
-const GAP: &str = "the recorder fell behind, so ticks of the controller are lost";
 /// How often the thread looks for work. Chosen by hand: much shorter than a frame of a 30 Hz camera.
 const PAUSE: Duration = Duration::from_millis(5);
 
@@ -173,7 +168,7 @@ impl RecorderThread {
     fn take_tick(&mut self, tick: &Telemetry) {
         self.track.push(tick.at_ns, tick.alpha_deg, tick.robot_at_ns, tick.alpha_measured_deg);
         let (newest, newest_ns) = self.newest_tick;
-        let after_gap = newest != 0 && tick.tick > newest + 1 && tick.at_ns.saturating_sub(newest_ns) > GAP_NS;
+        let after_gap = newest != 0 && is_gap((newest, newest_ns), (tick.tick, tick.at_ns));
         if tick.tick <= newest {
             self.pending.clear();
             self.close(false, "the controller was restarted");

@@ -40,8 +40,8 @@ impl Recorded {
         let images = EpisodeImages::open(path).map_err(unread)?;
         let Some(first) = episode.rows.first() else { return Err(fail("the episode has no frames".into())) };
         let mut missing = Vec::new();
-        if !episode.complete {
-            missing.push(format!("its end is missing; it has {}", counted(episode.rows.len(), "frame")));
+        if let Some(what) = episode.lacks() {
+            missing.push(format!("{what}; it has {}", counted(episode.rows.len(), "frame")));
         }
         if episode.info.dropped_images > 0 {
             missing.push(format!("{} of its images were dropped while it was recorded", episode.info.dropped_images));

@@ -102,7 +102,7 @@ impl LightCheck {
         }
     }
 
-    /// Takes note of a pause: what comes after it is no buffer that was handed out before, but for the last picture again.
+    /// Takes note of a pause, as between two recordings: what comes after it may be the same scene again, but for the last picture.
     pub(crate) fn interrupt(&mut self) {
         self.hashes[1..].fill(None);
         self.returned = 0;

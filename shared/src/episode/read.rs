@@ -17,7 +17,7 @@ use super::number::by_number;
 use super::records::{EpisodeError, NextRecord, Records};
 use super::rows::{EpisodeRow, EpisodeTrack, LostFrames, alpha_between_deg};
 use super::weight::check_kept;
-use super::{Episode, EpisodeInfo, EpisodeKind};
+use super::{Episode, EpisodeInfo, EpisodeKind, GAP, is_gap};
 use crate::framing::Framing;
 use crate::gaussian_curve::Curve;
 use crate::messages::Doubt;
@@ -26,18 +26,22 @@ use crate::messages::Doubt;
 /// been on its way to the recorder.
 const SILENT_END_NS: u64 = 500_000_000;
 
-/// When the episode in the file `path` began, by its own first records; no more of it is read. `None` if they do not say.
-pub fn began_at(path: &Path) -> Option<SystemTime> {
-    let said = |about: &BTreeMap<String, String>| about.get(format::STARTED_AT_UNIX_NS).and_then(|ns| ns.parse().ok());
-    let next = Records::open(path).ok()?.next(|record| {
+/// The number that the recorder gave the episode in the file `path`, and when it began, by the file's own first records; no more of it is read. `None`
+/// where they do not say.
+pub fn beginning(path: &Path) -> (Option<u64>, Option<SystemTime>) {
+    let said = |about: &BTreeMap<String, String>| {
+        let of = |key: &str| about.get(key).and_then(|number| number.parse::<u64>().ok());
+        (of("episode"), of(format::STARTED_AT_UNIX_NS).and_then(|ns| UNIX_EPOCH.checked_add(Duration::from_nanos(ns))))
+    };
+    let Ok(mut records) = Records::open(path) else { return (None, None) };
+    let next = records.next(|record| {
         Ok(match record {
             Record::Metadata(m) if m.name == format::META_EPISODE => Some(said(&m.metadata)),
-            Record::Message { .. } => Some(None),
+            Record::Message { .. } => Some((None, None)),
             _ => None,
         })
     });
-    let Ok(NextRecord::Item(Some(ns))) = next else { return None };
-    UNIX_EPOCH.checked_add(Duration::from_nanos(ns))
+    if let Ok(NextRecord::Item(found)) = next { found } else { (None, None) }
 }
 
 /// Everything in a file except the images themselves.
@@ -172,7 +176,14 @@ impl Contents {
         let (first_tick, last_tick) = (self.ticks.first().map_or(0, |t| t.tick), self.ticks.last().map_or(0, |t| t.tick));
         let last_at_ns = self.ticks.last().map_or(0, |t| t.at_ns);
         let measured_to_the_end = rows.last().is_some_and(|r| r.captured_at_ns.saturating_add(SILENT_END_NS) >= last_at_ns);
-        let ended_whole = self.text(format::META_END, "complete") == "true" && measured_to_the_end;
+        let all_ticks = !self.ticks.windows(2).any(|pair| is_gap((pair[0].tick, pair[0].at_ns), (pair[1].tick, pair[1].at_ns)));
+        let closed_whole = self.text(format::META_END, "complete") == "true";
+        let ended_whole = closed_whole && measured_to_the_end && all_ticks;
+        let ended = match closed_whole {
+            true if !all_ticks => GAP,
+            true if !measured_to_the_end => "the camera fell silent before its end",
+            _ => self.text(format::META_END, "reason"),
+        };
         Ok(Episode {
             name: name.into(),
             kind: self.kind()?,
@@ -186,7 +197,7 @@ impl Contents {
                 config_sha256: text("config_sha256"),
                 framing: Framing::of_toml(self.text(format::META_CONFIG, "toml")),
                 weights: text("weights"),
-                ended: self.text(format::META_END, "reason").into(),
+                ended: ended.into(),
                 recoverable: ended_whole && !whole,
                 note: self.text(format::META_NOTE, "text").into(),
                 poured_ml: self.ticks.last().map(|t| t.poured_ml).filter(|ml| ml.is_finite()),
