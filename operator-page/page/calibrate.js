@@ -55,6 +55,12 @@ function show(state4) {
   pins();
 }
 
+/** The points were moved: what was measured with them elsewhere cannot be written. */
+function moved() {
+  $('calibrate-write').hidden = true;
+  pins();
+}
+
 /** Puts the three points where they are. */
 function pins() {
   $('spot').querySelectorAll('.pin').forEach(p => p.remove());
@@ -74,7 +80,7 @@ document.querySelectorAll('[data-pin]').forEach(b => { b.onclick = () => pick(b.
 $('spot').onclick = event => {
   const box = $('spot-picture').getBoundingClientRect();
   found[pin] = [(event.clientX - box.left) * found.width / box.width, (event.clientY - box.top) * found.height / box.height];
-  pins();
+  moved();
   pick({ lip: 'rim', rim: 'foot', foot: 'lip' }[pin]);
 };
 $('spot').onkeydown = event => {
@@ -84,7 +90,7 @@ $('spot').onkeydown = event => {
   event.preventDefault();
   const by = event.shiftKey ? 10 : 1;
   found[pin] = found[pin].map((v, k) => v + by * move[k]);
-  pins();
+  moved();
   $('announce').textContent = `${pin} at ${found[pin].map(v => v.toFixed(0)).join(', ')}`;
 };
 async function measure() {

@@ -180,7 +180,8 @@ function rowToWeigh(e) {
 /** Episodes without a weight, newest first, and what of them is not listed. */
 function unweighed() {
   const open = table.episodes.filter(e => !e.error && e.weight_g === null).reverse();
-  const whole = open.filter(e => e.complete), cut = open.length - whole.length;
+  const whole = open.filter(e => e.complete), cut = open.filter(e => !e.complete && (!e.ended || e.recoverable)).length;
+  const lacking = open.length - whole.length - cut;
   // What is wrong with the others stands in History: they are not learned from.
   const weighed = table.episodes.filter(e => !e.error && e.weight_g !== null && !(e.wrong || []).length);
   const kinds = kind => weighed.filter(e => e.run.kind === kind).length;
@@ -193,7 +194,8 @@ function unweighed() {
   const rest = [table.fault ? `! ${table.fault}.` : null, table.unread ? `${many(table.unread, 'file')} still to be read.` : null,
     asked.length > LISTED ? `${asked.length - LISTED} older ones are not weighed either: History shows all.` : null,
     whole.length > asked.length ? `${whole.length - asked.length} skipped: not weighed.` : null,
-    cut ? `${many(cut, 'episode')} without a weight ${cut === 1 ? 'was' : 'were'} cut or ${cut === 1 ? 'is' : 'are'} still being recorded, and cannot be weighed: \`decant episodes recover\` makes a cut one whole.` : null].filter(line => line);
+    cut ? `${many(cut, 'episode')} without a weight ${cut === 1 ? 'was' : 'were'} cut or ${cut === 1 ? 'is' : 'are'} still being recorded, and cannot be weighed: \`decant episodes recover\` makes a cut one whole.` : null,
+    lacking ? `${many(lacking, 'episode')} without a weight ${lacking === 1 ? 'lacks' : 'lack'} something, and ${lacking === 1 ? 'teaches' : 'teach'} nothing: History says what.` : null].filter(line => line);
   const all = !open.length && !rest.length ? [table.episodes.length ? 'Everything that was recorded is weighed.' : 'Nothing has been recorded yet.'] : rest;
   keepRows($('unweighed'), listed.map(e => toWeigh.get(e.file)), all);
 }

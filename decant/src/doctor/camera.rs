@@ -60,9 +60,10 @@ fn device(camera: &CameraConfig) -> Vec<Finding> {
         findings.push(Finding::yellow("name", camera.path.clone(), "node numbers change when another camera is plugged in", advice));
     }
     let users = found.users.join(", ");
-    if found.users.iter().any(|user| !user.starts_with("feature-worker ")) {
-        let (means, advice) = ("the worker cannot open the camera while another program has it", "end that program");
-        findings.push(Finding::red("used by", users, means, advice));
+    // Whoever has it open need not read from it, which the kernel does not tell.
+    if !users.is_empty() && !found.users.iter().any(|user| user.starts_with("feature-worker ")) {
+        let (means, advice) = ("if it reads pictures, the worker cannot", "end that program");
+        findings.push(Finding::yellow("used by", users, means, advice));
     } else if !users.is_empty() {
         findings.push(Finding::green("used by", users));
     }

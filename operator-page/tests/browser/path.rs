@@ -76,6 +76,8 @@ fn calibrate(cell: &CellUnderTest, browser: &Browser) {
     // By keys: the lip 2 px to the left and back by 1.
     browser.run("document.getElementById('spot').focus()");
     browser.press(&["\u{E012}", "\u{E012}", "\u{E014}"]);
+    // What was measured with the dots elsewhere is not written.
+    assert_eq!(browser.run("return document.getElementById('calibrate-write').hidden"), true);
     browser.click("#measure");
     wait_for_calibration(browser, "the new measurement", "return document.getElementById('said').textContent.includes('measured again')");
     wait_for_calibration(browser, "the picture with it", "return found !== null");

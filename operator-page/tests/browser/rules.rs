@@ -153,10 +153,15 @@ fn what_is_shown_and_typed_is_meant() {
     browser.click("#tab-learn");
     let typed = "const i = document.querySelector('#unweighed input'); i.value = '74'; i.focus();
         const one = table.episodes[0]; const more = n => ({ ...one, file: `other-${n}.mcap` });
-        table = { ...table, unread: 7, episodes: [...table.episodes, ...Array.from({ length: 14 }, (_, n) => more(n)), { ...one, file: 'cut.mcap', complete: false }] };
+        table = { ...table, unread: 7, episodes: [...table.episodes, ...Array.from({ length: 14 }, (_, n) => more(n)), { ...one, file: 'cut.mcap', complete: false, ended: '' }, { ...one, file: 'gap.mcap', complete: false }] };
         unweighed(); return $('unweighed').textContent";
     let listed = text(typed);
-    for part in ["7 files still to be read", "3 older ones are not weighed", "1 episode without a weight was cut"] {
+    for part in [
+        "7 files still to be read",
+        "3 older ones are not weighed",
+        "1 episode without a weight was cut",
+        "1 episode without a weight lacks",
+    ] {
         assert!(listed.contains(part), "{part}: {listed}");
     }
     let skip = "[...document.querySelectorAll('#unweighed .skip-weight')].slice(0, 12).forEach(b => b.click());
