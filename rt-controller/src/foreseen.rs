@@ -241,11 +241,11 @@ pub(crate) mod tests {
     /// and is not said to take too long. The way back is not counted among its frames.
     #[test]
     fn a_pour_that_stands_still_has_an_end() {
-        // It tilts as long as more than 20 ml are missing, and stays then.
+        // It tilts as long as more than 28 ml are missing, and stays then.
         let scale = InputScale::default();
         let mut network = Mlp::ZERO;
         (network.w1[3][0], network.w2[0][0], network.w3[0][STAY + 2]) = (1.0, 1.0, 1.0);
-        network.b3[STAY] = scale.apply([0.0; 3], 20.0)[3];
+        network.b3[STAY] = scale.apply([0.0; 3], 28.0)[3];
         let lazy = Weights { network, scale, ..weights() };
         let of = |max_frames, limits| expected(&lazy, &Settings { max_frames, limits, ..settings() }, 30.0);
         assert!(matches!(of(900, Limits::default()), Expected::Within(_)), "{:?}", of(900, Limits::default()));
