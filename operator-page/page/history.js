@@ -24,7 +24,8 @@ function doubtWords(e) {
 /** Why a pour ended, as the controller said; a page that was not there only knows what the recorder wrote. */
 function reasonWords(e) {
   if (e.error) return e.error;
-  if (e.reason) return e.reason;
+  if (e.reason) return e.complete || !e.ended ? e.reason : `${e.reason}; incomplete: ${e.ended}`;
+  if (!e.complete && e.ended) return `incomplete: ${e.ended}`;
   return e.ended ? `recorded to its end (${e.ended})` : 'the recorder was killed';
 }
 

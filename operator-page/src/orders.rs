@@ -129,6 +129,9 @@ fn expected_line(expected: Expected) -> Option<String> {
         Expected::TooLong => {
             Some("This pour is expected to take longer than it may (controller.max_frames), and then ends short of its goal.".into())
         }
+        Expected::Short(ml) => {
+            Some(format!("The network is expected to stop {ml:.0} ml short of this goal: learn again, or give another goal."))
+        }
         Expected::Unknown => Some("These weights do not say how far off this pour will be.".into()),
     }
 }

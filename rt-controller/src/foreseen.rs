@@ -4,6 +4,7 @@
 //! agent that will pour, on the vessel that the weights describe, so the deviation is the one that the agent itself will claim.
 
 use shared::agent::{Agent, Observation};
+use shared::control::is_short;
 use shared::estimator::Calibration;
 use shared::estimator::flow::{CommandHistory, FlowState, FlowTables};
 use shared::estimator::fused::Explanation;
@@ -56,6 +57,8 @@ pub enum Expected {
     TooMuch,
     /// From every fill that gives the goal the pour takes more frames than it may, way back not counted.
     TooLong,
+    /// From some fill that gives the goal the network stops this far short of it, ml: too far for a pour that is done.
+    Short(f32),
 }
 
 impl Expected {
@@ -77,22 +80,28 @@ pub fn expected(weights: &Weights, settings: &Settings, goal_ml: f32) -> Expecte
     if onsets_deg.peek().is_none() {
         return Expected::TooMuch;
     }
-    let sds = onsets_deg.filter_map(|onset_deg| foreseen_sd_ml(weights, (&flow, calibration), settings, goal_ml, onset_deg));
-    match sds.max_by(f32::total_cmp) {
+    let ends = onsets_deg.filter_map(|onset_deg| foreseen_end(weights, (&flow, calibration), settings, goal_ml, onset_deg));
+    let ends: Vec<(f32, f32)> = ends.collect();
+    let largest = |of: fn(&(f32, f32)) -> f32| ends.iter().map(of).max_by(f32::total_cmp);
+    match largest(|(sd_ml, _)| *sd_ml) {
+        _ if largest(|(_, d_ml)| *d_ml).is_some_and(|d_ml| is_short(d_ml, goal_ml)) => {
+            Expected::Short(largest(|(_, d_ml)| *d_ml).unwrap_or(goal_ml))
+        }
         Some(sd_ml) if sd_ml > 0.0 => Expected::Within(sd_ml),
         Some(_) => Expected::Unknown,
         None => Expected::TooLong,
     }
 }
 
-/// The standard deviation at the end of a pour whose flow begins at `onset_deg`, ml; `None` if it does not end by itself within its frames.
-fn foreseen_sd_ml(
+/// The standard deviation at the end of a pour whose flow begins at `onset_deg`, and what is then still to pour, ml; `None` if it does not end by itself
+/// within its frames.
+fn foreseen_end(
     weights: &Weights,
     (flow, calibration): (&FlowTables, &Calibration),
     settings: &Settings,
     goal_ml: f32,
     onset_deg: f32,
-) -> Option<f32> {
+) -> Option<(f32, f32)> {
     let headspace_ml = flow.capacity.lost_ml(onset_deg.into());
     let mut agent = Agent::new(weights);
     agent.start(goal_ml);
@@ -127,7 +136,7 @@ fn foreseen_sd_ml(
         }
         quiet = if ending.agent_is_done() && area_px2 <= 0.0 { quiet + 1 } else { 0 };
         if quiet >= QUIET_FRAMES {
-            return Some(decision.poured_sd_ml);
+            return Some((decision.poured_sd_ml, decision.d_ml));
         }
         if ending.agent_is_done() {
             limiter.step_upright();
@@ -237,8 +246,8 @@ pub(crate) mod tests {
         assert!(matches!(of(9000), Expected::Within(sd_ml) if sd_ml > small), "{:?}", of(9000));
     }
 
-    /// Protects whoever asks for a pour of an agent that stops short of its goal: the controller ends such a pour when it stands still, so it has a deviation,
-    /// and is not said to take too long. The way back is not counted among its frames.
+    /// Protects whoever asks for a pour of an agent that stops short of its goal: the controller ends such a pour when it stands still, so it does not take too
+    /// long, and a small deviation would not say how far off it is. The way back is not counted among its frames.
     #[test]
     fn a_pour_that_stands_still_has_an_end() {
         // It tilts as long as more than 28 ml are missing, and stays then.
@@ -248,7 +257,11 @@ pub(crate) mod tests {
         network.b3[STAY] = scale.apply([0.0; 3], 28.0)[3];
         let lazy = Weights { network, scale, ..weights() };
         let of = |max_frames, limits| expected(&lazy, &Settings { max_frames, limits, ..settings() }, 30.0);
-        assert!(matches!(of(900, Limits::default()), Expected::Within(_)), "{:?}", of(900, Limits::default()));
+        assert!(
+            matches!(of(900, Limits::default()), Expected::Short(ml) if (10.0..30.0).contains(&ml)),
+            "{:?}",
+            of(900, Limits::default())
+        );
         let least = |limits| (100..900).find(|frames| of(*frames, limits) != Expected::TooLong);
         let slow_back = Limits { return_rate_deg_s: 5.0, ..Limits::default() };
         assert_eq!(least(slow_back), least(Limits::default()), "the way back is not counted");

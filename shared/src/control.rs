@@ -77,8 +77,8 @@ pub struct Outcome {
     pub reason: EndReason,
     /// Whether liquid may have left that nobody has seen or counted: on the way upright too, whatever the pour ended for.
     pub unseen: bool,
-    /// Whether that is because camera or robot were lost, or it still dripped: the container may not be upright. Otherwise the stream left the region, or none
-    /// was ever seen.
+    /// Whether that is because camera, robot or stream were lost, or it still dripped, so that it is not known how it ended. Otherwise the stream left the
+    /// region, or none was ever seen.
     pub unwatched: bool,
     /// Goal volume, ml; `None` for a recording.
     pub goal_ml: Option<f32>,

@@ -140,7 +140,7 @@ pub struct EpisodeInfo {
     pub framing: Framing,
     /// Identity of the weights that the controller ran; empty if there were none.
     pub weights: String,
-    /// How it ended, in words; empty if the recorder was killed.
+    /// How it ended, or what it lacks although it was closed in good order, in words; empty if the recorder was killed.
     pub ended: String,
     /// Whether it is incomplete only because the file lacks its own end, so that [`recover()`] makes a complete one of it.
     pub recoverable: bool,

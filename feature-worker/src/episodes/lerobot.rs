@@ -17,7 +17,7 @@ use serde_json::{Value, json};
 use shared::episode::{Episode, EpisodeKind, EpisodeRow};
 use shared::whole_file;
 
-use super::output::{ExportError, LeftOut, make_parent, unfit, write_error};
+use super::output::{ExportError, LeftOut, disk_error, make_parent, unfit, write_error};
 use super::video::{USUAL_RATE_HZ, Video, for_each_row_with_image, mean_rate_hz};
 
 mod parquet_table;
@@ -42,14 +42,22 @@ const RATE_TOLERANCE: f64 = 0.03;
 /// read, of another size than those before, or at another rate. If that is all of them, there is no data set, and it returns false. On failure nothing
 /// of it stays.
 pub fn write(episodes: &[(PathBuf, Episode)], root: &Path, bar: &ProgressBar, left_out: &mut Vec<LeftOut>) -> Result<bool, ExportError> {
-    let parts = ["data", "meta", "videos"].map(|part| root.join(part));
-    if parts.iter().any(|part| part.symlink_metadata().is_ok()) {
-        return Err(write_error(root, "holds a data set already, or a part of one; name another directory"));
+    // Whoever makes all three has the data set. Of two exports at once the other one takes nothing away.
+    let mut ours = Vec::new();
+    for part in ["data", "meta", "videos"].map(|part| root.join(part)) {
+        match fs::create_dir(&part) {
+            Ok(()) => ours.push(part),
+            Err(e) => {
+                ours.iter().for_each(|part| drop(fs::remove_dir(part)));
+                let held = e.kind() == std::io::ErrorKind::AlreadyExists;
+                let refused = || write_error(root, "holds a data set already, or a part of one; name another directory");
+                return Err(if held { refused() } else { disk_error(&part, &e) });
+            }
+        }
     }
     let written = write_set(episodes, root, bar, left_out);
     if !matches!(written, Ok(true)) {
-        // They are ours: none was there.
-        parts.iter().for_each(|part| drop(fs::remove_dir_all(part)));
+        ours.iter().for_each(|part| drop(fs::remove_dir_all(part)));
     }
     written
 }

@@ -1,5 +1,5 @@
 //! Why an export fails, and the directories that it makes. Runs on the command's thread and allocates. What was written before a failure
-//! stays.
+//! stays, but for a data set of LeRobot, which is whole or not there.
 
 use std::collections::BTreeSet;
 use std::fs;

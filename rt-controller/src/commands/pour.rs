@@ -131,6 +131,11 @@ impl Foreseen {
             Some(Expected::TooLong) => {
                 "note: this pour is expected to take more than controller.max_frames, and then ends short of its goal"
             }
+            Some(Expected::Short(ml)) => {
+                return Some(format!(
+                    "warning: the network is expected to stop {ml:.0} ml short of this goal: train again, or give another goal"
+                ));
+            }
             Some(Expected::Unknown) => "note: the weights do not say how far off this pour will be",
         };
         Some(note.into())
@@ -212,7 +217,13 @@ fn report(Ended { outcome, recorded, .. }: &Ended, foreseen_sd_ml: Option<f32>, 
             counted(outcome.stale_features, "stale feature")
         );
         if outcome.unseen && !outcome.unwatched {
-            println!("a part of the stream left the region, or none was seen: enlarge [image] region_px, or look at the camera");
+            // Of a pour without a stream nothing was counted.
+            let why = if outcome.poured_ml > 0.0 {
+                "a part of the stream left the region: enlarge [image] region_px"
+            } else {
+                "no stream was seen, so it is not known that there was none"
+            };
+            println!("{why}");
         }
         match recorded.as_ref().map(|r| &r.file) {
             Some(Ok(file)) => println!("recorded: {file}\nread the scale, then: feature-worker episodes weigh {file} --weight GRAMS"),

@@ -109,10 +109,10 @@ fn start(
 ) -> Result<(), Failure> {
     let directory = Place::from(&config.cell).directory().or_exit(exit::BAD_INPUT)?;
     let _claim = Claim::take(&directory, file, config).or_exit(exit::REFUSED)?;
+    let owner = std::fs::metadata(file).ok().map(|m| m.uid());
+    let sockets = StopSockets::open(&directory, &config.cell.name, say)?;
     // Until here a signal ends the process at once: nothing can move yet, and a disk that does not answer holds nobody up.
     stop_at_signals(stop)?;
-    let sockets = StopSockets::open(&directory, &config.cell.name, say)?;
-    let owner = std::fs::metadata(file).ok().map(|m| m.uid());
     let shared = Shared::default();
     let tolerance_deg = config.robot.start_tolerance_deg as f32;
     let give_up = || {

@@ -231,8 +231,8 @@ impl Ending {
     }
 
     /// Whether liquid may have left that nobody has seen or counted, if it ends for `reason`. What leaves the region does not come back: a pour of which so
-    /// much was seen that a file of it would not be trained is a lower bound. And whoever ends a pour that never showed a stream cannot know that there was
-    /// none.
+    /// much was seen that a file of it would not be trained is a lower bound. And where a pour ends, at whatever moment, that never showed a stream,
+    /// nobody knows that there was none.
     pub fn leaves_unseen(&self, reason: EndReason) -> bool {
         let cut_off = self.cut_off_px2 > CUT_OFF_MAX * self.area_px2;
         let any_time = matches!(reason, EndReason::MaxFrames | EndReason::Aborted | EndReason::Shutdown | EndReason::NotFollowed);

@@ -1,6 +1,6 @@
 //! Which episodes are older.
 //!
-//! Pure; ordinary threads use it; it allocates and cannot fail.
+//! Ordinary threads use it; it allocates, and asks the disk what directories are the same. It cannot fail.
 
 use std::path::{Path, PathBuf};
 

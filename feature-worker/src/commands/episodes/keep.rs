@@ -182,7 +182,7 @@ fn run_recover(args: &RecoverArgs) -> Result<(), Failure> {
     if args.json {
         print_json(&json!({ "file": shown(&new), "frames": frames, "seconds": seconds, "complete": episode.complete }));
     } else {
-        let state = if episode.complete { "nothing is missing" } else { "its end is missing, so it cannot be trained on" };
+        let state = episode.lacks().map_or("nothing is missing".into(), |what| format!("{what}, so it cannot be trained on"));
         println!("{}: {} in {seconds:.1} s; {state}", plain(&shown(&new)), counted(frames, "frame"));
     }
     Ok(())
