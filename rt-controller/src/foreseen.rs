@@ -83,13 +83,12 @@ pub fn expected(weights: &Weights, settings: &Settings, goal_ml: f32) -> Expecte
     let ends = onsets_deg.filter_map(|onset_deg| foreseen_end(weights, (&flow, calibration), settings, goal_ml, onset_deg));
     let ends: Vec<(f32, f32)> = ends.collect();
     let largest = |of: fn(&(f32, f32)) -> f32| ends.iter().map(of).max_by(f32::total_cmp);
-    match largest(|(sd_ml, _)| *sd_ml) {
-        _ if largest(|(_, d_ml)| *d_ml).is_some_and(|d_ml| is_short(d_ml, goal_ml)) => {
-            Expected::Short(largest(|(_, d_ml)| *d_ml).unwrap_or(goal_ml))
-        }
-        Some(sd_ml) if sd_ml > 0.0 => Expected::Within(sd_ml),
-        Some(_) => Expected::Unknown,
-        None => Expected::TooLong,
+    let short_ml = largest(|(_, d_ml)| *d_ml).filter(|d_ml| is_short(*d_ml, goal_ml));
+    match (short_ml, largest(|(sd_ml, _)| *sd_ml)) {
+        (Some(d_ml), _) => Expected::Short(d_ml),
+        (None, Some(sd_ml)) if sd_ml > 0.0 => Expected::Within(sd_ml),
+        (None, Some(_)) => Expected::Unknown,
+        (None, None) => Expected::TooLong,
     }
 }
 

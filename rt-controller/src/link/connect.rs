@@ -163,7 +163,8 @@ fn stands_still(
     let mut heard_ns = begin_ns;
     loop {
         let before = since(begin_ns);
-        // The last looks wait for nothing: a kernel's shortest wait is longer than the cycle of an e-Series robot, and would never end without a state.
+        // The last looks wait for nothing: a kernel's shortest wait can be longer than the cycle of an e-Series robot, in which
+        // another state always comes.
         let left = REST.saturating_sub(before);
         let came = dialogue.next_state(recipe, &options.tilt, state, left)?.is_some();
         upload.discard();
