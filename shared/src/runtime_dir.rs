@@ -172,16 +172,18 @@ fn can_be_made(path: &Path, _mode: u32) -> std::io::Result<bool> {
 
 /// Checks the directory that the cell's directory lies in: nobody else may put another in its place. The error is one line.
 fn check_base(base: &Path) -> Result<(), String> {
+    // A link leads where its owner wants, so its owner is judged before it is followed; some kernels do not follow one of a stranger.
+    let owned = |meta: &Metadata| match meta.uid() {
+        uid if [0, own_uid()].contains(&uid) => Ok(()),
+        uid => Err(format!("belongs to user {uid}, not to root or this user: remove it, or set cell.runtime_dir")),
+    };
+    owned(&base.symlink_metadata().map_err(|e| e.to_string())?)?;
     let meta = std::fs::metadata(base).map_err(|e| e.to_string())?;
     if !meta.is_dir() {
         return Err("is no directory: remove it, or set cell.runtime_dir".into());
     }
     let sticky = meta.mode() & 0o1000 != 0;
-    // A link leads where its owner wants.
-    let link = base.symlink_metadata().map_err(|e| e.to_string())?;
-    if let Some(uid) = [meta.uid(), link.uid()].into_iter().find(|uid| ![0, own_uid()].contains(uid)) {
-        return Err(format!("belongs to user {uid}, not to root or this user: remove it, or set cell.runtime_dir"));
-    }
+    owned(&meta)?;
     if meta.mode() & 0o022 != 0 && !sticky {
         return Err(format!("others may write there (mode {:o}): chmod 0755, or set cell.runtime_dir", meta.mode() & 0o7777));
     }
