@@ -19,7 +19,8 @@ use shared::regular_file;
 use shared::weights::Weights;
 
 use crate::core::{Core, Input, MAX_FEATURES, Order, Robot, Settings};
-use crate::journal_files::{MAGIC, make_room};
+pub use crate::journal_files::MAGIC;
+use crate::journal_files::make_room;
 use crate::pacing::Pacer;
 
 /// Longest entry, bytes: more than ten weight files, which are the largest entries.

@@ -11,12 +11,13 @@ use std::sync::OnceLock;
 use std::sync::atomic::AtomicBool;
 use std::time::Duration;
 
+use rt_controller::journal::{MAGIC, replay_from};
 use rt_controller::stop::StopAnswer;
 use shared::config::Config;
 use shared::control::{Reply, Request};
 use shared::episode::{Episode, EpisodeImages, read_table};
 use shared::messages::{Doubt, Phase, RecorderState};
-use shared::weights::Weights;
+use shared::weights::{FORMAT_VERSION, Weights};
 
 /// How long the page's server may take. Chosen by hand: it waits at most 5 s for the rest of a request (web/src/server.rs).
 const HTTP_ANSWER: Duration = Duration::from_secs(20);
@@ -61,10 +62,11 @@ fn whole_weights(bytes: &[u8]) {
 /// The offset of a weight file's contents, which a checksum covers (shared/src/weights.rs).
 const WEIGHTS_HEADER: usize = 24;
 
-/// `bytes` as a weight file whose length and checksum are right, so that what is behind them is reached too.
+/// `bytes` as a weight file whose version, length and checksum are right, so that what is behind them is reached too.
 fn with_checksum(bytes: &[u8]) -> Vec<u8> {
     let mut bytes = bytes.to_vec();
     if bytes.len() >= WEIGHTS_HEADER + 4 {
+        bytes[8..12].copy_from_slice(&FORMAT_VERSION.to_le_bytes());
         let payload = (bytes.len() - WEIGHTS_HEADER) as u32;
         bytes[20..24].copy_from_slice(&payload.to_le_bytes());
         let end = bytes.len() - 4;
@@ -100,9 +102,12 @@ pub fn mcap(bytes: &[u8]) {
     let _ = std::fs::remove_file(path);
 }
 
-/// A journal.
+/// A journal, and what it would be if it were of today's version.
 pub fn journal(bytes: &[u8]) {
-    let _ = rt_controller::journal::replay_from(bytes, "j", |_, _| {});
+    let _ = replay_from(bytes, "j", |_, _| {});
+    if bytes.len() > MAGIC.len() && !bytes.starts_with(MAGIC) {
+        let _ = replay_from(&[MAGIC, &bytes[MAGIC.len()..]].concat()[..], "j", |_, _| {});
+    }
 }
 
 /// What processes tell each other: requests, replies, the stop socket's answer, and the codes in shared memory.

@@ -147,8 +147,10 @@ impl Draw {
 }
 
 /// One of `inputs` with some of its bytes changed, taken away, doubled, or replaced by a piece of another.
-fn mutated(inputs: &[Vec<u8>], draw: &mut Draw) -> Vec<u8> {
-    let mut bytes = inputs[draw.below(inputs.len())].clone();
+fn mutated((whole, inputs): (&[Vec<u8>], &[Vec<u8>]), draw: &mut Draw) -> Vec<u8> {
+    // Half of them begin as whole files, which reach the deepest.
+    let from = if draw.below(2) == 0 { whole } else { inputs };
+    let mut bytes = from[draw.below(from.len())].clone();
     for _ in 0..=draw.below(4) {
         let at = draw.below(bytes.len());
         let end = (at + 1 + draw.below(9)).min(bytes.len());
@@ -175,11 +177,12 @@ fn mutated(inputs: &[Vec<u8>], draw: &mut Draw) -> Vec<u8> {
 
 /// Gives `parser` mutated inputs while `more` says so; how many there were. A panic in it is shown with its input.
 fn mutate((name, parser): (&str, Parser), seed: u64, mut more: impl FnMut(u64) -> bool) -> u64 {
-    let inputs: Vec<Vec<u8>> = seeds(name).into_iter().chain(kept(name)).collect();
+    let whole = seeds(name);
+    let inputs: Vec<Vec<u8>> = whole.iter().cloned().chain(kept(name)).collect();
     let mut draw = Draw(seed);
     let mut tried = 0;
     while more(tried) {
-        let bytes = mutated(&inputs, &mut draw);
+        let bytes = mutated((&whole, &inputs), &mut draw);
         let outcome = std::panic::catch_unwind(|| parser(&bytes));
         assert!(outcome.is_ok(), "{name}, seed {seed}, input {tried}: {:?}", String::from_utf8_lossy(&bytes));
         tried += 1;
