@@ -90,10 +90,10 @@ fn measure_until_stopped(
     speaker: &Arc<Speaker>,
     lines: Lines,
 ) -> Result<(), Failure> {
-    let cell = Cell::join(&config.cell).or_exit(exit::UNREACHABLE)?;
-    cell.check_space(shared_memory_bytes(config)).or_exit(exit::UNREACHABLE)?;
+    let cell = Cell::join(&config.cell)?;
+    cell.check_space(shared_memory_bytes(config))?;
     let name = &config.cell.name;
-    let publisher = cell.features().or_exit(exit::UNREACHABLE)?.publisher_builder().create().map_err(|e| match e {
+    let publisher = cell.features()?.publisher_builder().create().map_err(|e| match e {
         PublisherCreateError::ExceedsMaxSupportedPublishers => {
             failure(exit::REFUSED, format!("another feature worker of cell '{name}' is running: stop it first"))
         }
@@ -102,7 +102,7 @@ fn measure_until_stopped(
             format!("cell '{name}': service 'feature': {e:?}; end all programs of the cell and start them again"),
         ),
     })?;
-    cell.reserve().or_exit(exit::UNREACHABLE)?;
+    cell.reserve()?;
     // The republisher comes before the camera is opened: a view that holds the camera sees it and lets go.
     let republisher = match config.camera.source {
         CameraSource::SharedMemory => None,

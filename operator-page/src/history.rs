@@ -14,7 +14,7 @@ use std::time::{Duration, Instant, SystemTime};
 
 use feature_worker::episodes::summary::{remarks, summary};
 use serde_json::{Value, json};
-use shared::episode::{Episode, EpisodeImages, by_number, episodes_so_far};
+use shared::episode::{Begun, Episode, EpisodeImages, by_age, by_number, episodes_so_far};
 use shared::regular_file;
 
 use crate::ends::Ends;
@@ -194,14 +194,16 @@ impl History {
     pub fn weighed(&self, last: Option<usize>) -> Vec<PathBuf> {
         let table = locked(&self.table);
         let wrong = |l: &Line| l.value["wrong"].as_array().is_some_and(|wrong| !wrong.is_empty());
-        let mut lines: Vec<(&str, &str)> = table
-            .iter()
-            .filter(|(_, l)| l.value["weight_g"].is_number() && l.value["error"].is_null() && !wrong(l))
-            .map(|(name, l)| (l.value["started_at_utc"].as_str().unwrap_or(""), name.as_str()))
-            .collect();
-        lines.sort_unstable_by(|(at, a), (bt, b)| at.cmp(bt).then_with(|| by_number(a.as_ref(), b.as_ref())));
-        let skipped = last.map_or(0, |n| lines.len().saturating_sub(n));
-        lines.into_iter().skip(skipped).map(|(_, name)| self.directory.join(name)).collect()
+        let lines = table.iter().filter(|(_, l)| l.value["weight_g"].is_number() && l.value["error"].is_null() && !wrong(l));
+        let (mut paths, lines): (Vec<_>, Vec<_>) = lines.map(|(name, line)| (self.directory.join(name), &line.value)).unzip();
+        let begun = paths.iter().zip(&lines).map(|(path, line)| Begun {
+            path,
+            number: line["number"].as_u64(),
+            at: line["started_at_utc"].as_str().unwrap_or(""),
+        });
+        let order = by_age(&begun.collect::<Vec<_>>());
+        let skipped = last.map_or(0, |n| order.len().saturating_sub(n));
+        order.into_iter().skip(skipped).map(|i| std::mem::take(&mut paths[i])).collect()
     }
 
     /// What a training learns from; an error if the directory cannot be read.
@@ -343,6 +345,19 @@ mod tests {
         let table = history.table(&Ends::default());
         let listed: Vec<&str> = table["episodes"].as_array().unwrap().iter().map(|e| e["file"].as_str().unwrap()).collect();
         assert_eq!(listed, names);
+    }
+
+    /// Protects who learns from the newest episodes on a machine whose clock was put right: the numbers tell which they are.
+    #[test]
+    fn the_newest_are_those_with_the_largest_numbers() {
+        let dir = tempfile::tempdir().unwrap();
+        let history = History::new(dir.path().to_path_buf());
+        for (number, started_at_utc) in [(1, "2026-11-26T10:00:00Z"), (2, "2031-01-01T00:00:00Z"), (3, "2026-11-26T11:00:00Z")] {
+            let value = json!({ "number": number, "started_at_utc": started_at_utc, "weight_g": 50.0, "wrong": [] });
+            locked(&history.table).insert(format!("episode-{number:04}.mcap"), Line { stamp: (None, 0), value });
+        }
+        let newest: Vec<_> = ["episode-0002.mcap", "episode-0003.mcap"].map(|name| dir.path().join(name)).into();
+        assert_eq!(history.weighed(Some(2)), newest);
     }
 
     /// Protects who learns just after the start: the newest of the episodes that were read so far are not the newest ones.

@@ -90,6 +90,7 @@ pub fn foresee(site: &Site, goal_ml: f32, fill_ml: Option<f64>) -> Foreseen {
             );
         }
         lines.push("The weight file is not the one that the controller has taken, so it is not said how far off this will be.".into());
+        lines.extend(foreseen::unbounded_line(None, container.least_fill_ml).map(str::to_owned));
         return Foreseen { possible: true, sd_ml: None, flows_by_deg: None, lines, identity: status.weights };
     };
     let limits = site.config.limits;
@@ -111,6 +112,7 @@ pub fn foresee(site: &Site, goal_ml: f32, fill_ml: Option<f64>) -> Foreseen {
             ),
         });
     }
+    lines.extend(foreseen::unbounded_line(Some(&weights), container.least_fill_ml).map(str::to_owned));
     lines.extend(few(&weights));
     lines.extend(unknown_pictures(&weights.origin));
     lines.extend(sd_ml.and_then(|sd| worse_than_expected(&site.history.errors_ml(&status.weights), sd)));

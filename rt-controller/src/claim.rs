@@ -21,6 +21,9 @@ use crate::journal_files::before;
 /// Largest file `controller`, bytes: five paths of the longest length, and room for what JSON writes longer.
 const FILE_MAX: u64 = 32 * 1024;
 
+/// Name of the file that a controller holds locked.
+const LOCK: &str = "controller.lock";
+
 /// A controller that runs, as its file says.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Running {
@@ -44,7 +47,7 @@ pub struct Claim {
 impl Claim {
     /// Takes the cell whose runtime directory is `directory`. The error says who has it, or which file another cell uses.
     pub fn take(directory: &Path, file: &Path, config: &Config) -> Result<Self, String> {
-        let lock_path = directory.join("controller.lock");
+        let lock_path = directory.join(LOCK);
         let fail = |path: &Path, e: &std::io::Error| format!("{}: {}", path.display(), error_words(e));
         let flags = (rustix::fs::OFlags::NOFOLLOW | rustix::fs::OFlags::NONBLOCK).bits() as i32;
         let lock = OpenOptions::new().write(true).create(true).truncate(false).mode(0o600).custom_flags(flags).open(&lock_path);
@@ -56,27 +59,34 @@ impl Claim {
                 "another rt-controller of cell '{name}' is running{who}: stop it first, or give this cell another cell.name"
             ));
         }
-        let mut files = vec![
-            ("controller.weights".to_string(), config.controller.weights.clone()),
-            ("recording.directory".to_string(), config.recording.directory.clone()),
-        ];
-        if let Some(journal) = &config.controller.journal {
-            files.push(("controller.journal".to_string(), journal.clone()));
-            files.push(("the journal before, controller.journal".to_string(), before(journal, 1)));
-        }
         let this = Running {
             pid: std::process::id(),
             started: started(std::process::id()).unwrap_or(0),
             config: std::path::absolute(file).unwrap_or_else(|_| file.into()),
-            files,
+            files: files(config),
         };
-        check_others(directory, &this)?;
         let path = directory.join("controller");
         let new = directory.join("controller.new");
         let text = serde_json::to_string(&this).map_err(|e| e.to_string())?;
         std::fs::write(&new, text).and_then(|()| std::fs::rename(&new, &path)).map_err(|e| fail(&new, &e))?;
-        Ok(Self { path, _lock: lock })
+        let claim = Self { path, _lock: lock };
+        // Whoever looks first has been written: of two that start at once, none goes on with the other's file.
+        check_others(directory, &this)?;
+        Ok(claim)
     }
+}
+
+/// The files that only one cell may use: the configuration's key, and the path.
+pub fn files(config: &Config) -> Vec<(String, PathBuf)> {
+    let mut files = vec![
+        ("controller.weights".to_string(), config.controller.weights.clone()),
+        ("recording.directory".to_string(), config.recording.directory.clone()),
+    ];
+    if let Some(journal) = &config.controller.journal {
+        files.push(("controller.journal".to_string(), journal.clone()));
+        files.push(("the journal before, controller.journal".to_string(), before(journal, 1)));
+    }
+    files
 }
 
 impl Drop for Claim {
@@ -85,16 +95,16 @@ impl Drop for Claim {
     }
 }
 
-/// Refuses files that the controller of another cell uses. Cells in other runtime directories are not seen.
+/// Refuses files that the controller of another cell uses: of one whose runtime directory lies beside `directory`, and of any that runs as this user.
 fn check_others(directory: &Path, this: &Running) -> Result<(), String> {
-    for entry in directory.parent().and_then(|base| std::fs::read_dir(base).ok()).into_iter().flatten().flatten() {
-        if entry.path() == directory {
-            continue;
-        }
-        let Some(other) = running(&entry.path()) else { continue };
+    let beside = directory.parent().and_then(|base| std::fs::read_dir(base).ok()).into_iter().flatten().flatten();
+    let beside = beside.map(|entry| entry.path()).filter_map(|found| running(&found).map(|other| (found, other)));
+    // A process of this user is believed, wherever its directory lies.
+    let elsewhere = claimed().into_iter().filter_map(|found| running_in(&found).map(|other| (found, other)));
+    for (found, other) in beside.chain(elsewhere).filter(|(_, other)| other.pid != this.pid) {
         for (key, path) in &this.files {
             if let Some((its, _)) = other.files.iter().find(|(_, p)| is_same(p, path)) {
-                let cell = entry.file_name().to_string_lossy().into_owned();
+                let cell = found.file_name().unwrap_or_default().to_string_lossy();
                 return Err(format!(
                     "{key} = {}: cell '{cell}' uses it as {its} ({}); give each cell files of its own",
                     path.display(),
@@ -104,6 +114,17 @@ fn check_others(directory: &Path, this: &Running) -> Result<(), String> {
         }
     }
     Ok(())
+}
+
+/// The runtime directories of the controllers that run as this user: a controller keeps the lock in its own open.
+fn claimed() -> Vec<PathBuf> {
+    let entries = |directory: &str| std::fs::read_dir(directory).into_iter().flatten().flatten().map(|entry| entry.path());
+    let controllers = entries("/proc").filter(|process| {
+        let pid = process.file_name().and_then(|name| name.to_str()?.parse().ok());
+        pid.and_then(started).is_some() && std::fs::metadata(process).is_ok_and(|m| m.uid() == own_uid())
+    });
+    let open = controllers.flat_map(|process| entries(&process.join("fd").to_string_lossy()).filter_map(|fd| fd.read_link().ok()));
+    open.filter(|file| file.ends_with(LOCK)).filter_map(|file| file.parent().map(Path::to_path_buf)).collect()
 }
 
 /// The controller whose runtime directory is `directory`, if it runs and the directory has an [`owner`].

@@ -9,9 +9,10 @@ use std::time::{Duration, Instant};
 
 use iceoryx2::port::client::Client as Port;
 use iceoryx2::service::ipc::Service as Ipc;
+use iceoryx2::service::port_factory::PortFactory as _;
 use indicatif::ProgressStyle;
 use shared::control::{Outcome, Reply, Request, Status};
-use shared::exit;
+use shared::exit::{self, Failure, failure};
 use shared::ipc::{Cell, InService as _, IpcError};
 use shared::level::Level;
 use shared::messages::{RecorderReport, RecorderState};
@@ -64,11 +65,20 @@ pub enum ClientError {
     Version,
 }
 
+impl From<ClientError> for Failure {
+    fn from(e: ClientError) -> Self {
+        match e {
+            ClientError::Ipc(e) => e.into(),
+            e => failure(exit::UNREACHABLE, e),
+        }
+    }
+}
+
 /// A connection to the running controller.
 pub struct Client {
     port: Port<Ipc, [u8], (), [u8], ()>,
     place: Place,
-    _cell: Cell,
+    cell: Cell,
 }
 
 impl Client {
@@ -78,7 +88,7 @@ impl Client {
         let cell = Cell::join(&place)?;
         let port = cell.control()?.client_builder().initial_max_slice_len(MESSAGE_MAX).create().in_service("control")?;
         cell.reserve()?;
-        Ok(Self { port, place, _cell: cell })
+        Ok(Self { port, place, cell })
     }
 
     /// Connects as a command does: it ends the process with a line if iceoryx2 does not come back, as it does not when somebody cut the cell's
@@ -116,6 +126,11 @@ impl Client {
             std::thread::sleep(Duration::from_millis(5));
         }
         Err(no_answer())
+    }
+
+    /// Whether a feature worker was there to record when this client connected.
+    pub fn has_recorder(&self) -> Result<bool, ClientError> {
+        Ok(self.cell.recorder()?.dynamic_config().number_of_publishers() > 0)
     }
 
     /// The controller's state.

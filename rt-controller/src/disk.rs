@@ -198,7 +198,7 @@ impl<'a> Disk<'a> {
         self.newest_tick_ns > since_ns
     }
 
-    /// Begins the journal's next part when the file is large, or a new one when the last could not be written; never in a pour or recording.
+    /// Begins the journal's next part when the file is large or old, or a new one when the last could not be written; never in a pour or recording.
     fn keep_journal(&mut self) {
         let at_rest = self.is_at_rest();
         let Some((path, settings)) = &self.journal_at else { return };

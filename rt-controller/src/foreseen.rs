@@ -181,6 +181,22 @@ pub fn unseen_ml(weights: &Weights, limits: Limits, flows_by_deg: Option<f32>) -
     (!is_known).then(|| capacity.lost_ml(noticed_deg))
 }
 
+/// What to say before a pour that a least fill, which the configuration tells, cannot bound: it takes weights that know the vessel.
+pub fn unbounded_line(weights: Option<&Weights>, least_fill_ml: Option<f64>) -> Option<&'static str> {
+    least_fill_ml?;
+    match weights {
+        None => Some(
+            "[container] least_fill_ml bounds nothing in this pour, because controller.weights is not the file that the controller has taken: \
+             if the camera sees no stream at all, that is noticed late",
+        ),
+        Some(w) if explanation(w).is_none() => Some(
+            "[container] least_fill_ml bounds nothing in this pour, because weights of the plain sum know no vessel: if the camera sees no \
+             stream at all, that is noticed late",
+        ),
+        Some(_) => None,
+    }
+}
+
 #[cfg(test)]
 pub(crate) mod tests {
     use shared::actions::{STAY, Selection, action_table};
@@ -296,6 +312,15 @@ pub(crate) mod tests {
             assert_eq!((by(wrong), flows_by_deg(&weights(), 20.0 * wrong, None)), (None, None), "{wrong}");
         }
         assert_eq!(flows_by_deg(&Weights { estimator: Estimator::Sum, ..weights() }, 250.0, None), None);
+    }
+
+    /// Protects who relies on the least fill that the configuration tells: where it bounds nothing, that is said before the pour.
+    #[test]
+    fn a_least_fill_that_bounds_nothing_is_said() {
+        let (fused, sum) = (weights(), Weights { estimator: Estimator::Sum, ..weights() });
+        let said = |weights, least_fill_ml| unbounded_line(weights, least_fill_ml).is_some();
+        assert!(said(None, Some(150.0)) && said(Some(&sum), Some(150.0)));
+        assert!(!said(Some(&fused), Some(150.0)) && !said(None, None) && !said(Some(&sum), None));
     }
 
     /// Protects a pour whose configured least fill is more than the vessel holds: it must flow as out of a full one. What the operator tells counts

@@ -27,6 +27,8 @@ use crate::pacing::Pacer;
 const ENTRY_MAX: usize = 128 * 1024;
 /// Size at which a journal ends and the next part begins, bytes: about 20 h of ticks. Chosen by hand: it is copied and read in a minute.
 const FILE_MAX: u64 = 256 << 20;
+/// Time of ticks after which it does so too, ns: a day. Chosen by hand: whoever looks for yesterday opens one file, whatever the rate.
+const FILE_MAX_NS: u64 = 24 * 3600 * 1_000_000_000;
 /// Number of ticks at the beginning of a later part, and behind a gap, that are not compared: as many as the core remembers ([`crate::core`]).
 const UNKNOWN_TICKS: u64 = 64;
 
@@ -115,6 +117,8 @@ pub enum JournalError {
 pub struct Writer<W: Write = BufWriter<File>> {
     to: W,
     written: u64,
+    /// When the first tick woke up, and the newest one; `None` before the first.
+    span_ns: Option<[u64; 2]>,
     /// Weights that the loop has, or may take next, by their identity; the next part begins with them.
     weights: BTreeMap<u64, Vec<u8>>,
     /// Identity of the weights that the loop has.
@@ -138,11 +142,6 @@ impl Writer {
     /// Begins a later part of a run at `path`, as [`Writer::continued`] says; the journals that are there are kept as by [`Writer::create`].
     pub fn continue_at(path: &Path, settings: &Settings, weights: BTreeMap<u64, Vec<u8>>, taken: Option<u64>) -> std::io::Result<Self> {
         Self::continued(BufWriter::new(make_room(path)?), settings, weights, taken)
-    }
-
-    /// Whether the file has become so large that the next part should begin.
-    pub fn is_full(&self) -> bool {
-        self.written > FILE_MAX
     }
 
     /// Number of bytes written.
@@ -169,7 +168,7 @@ impl<W: Write> Writer<W> {
     /// Starts a journal that goes to `to`.
     pub fn begin(to: W, settings: &Settings) -> std::io::Result<Self> {
         let (weights, buffer) = (BTreeMap::new(), vec![0; ENTRY_MAX]);
-        let mut this = Self { to, written: 0, weights, taken: None, names_weights: false, newest: Some(0), buffer };
+        let mut this = Self { to, written: 0, span_ns: None, weights, taken: None, names_weights: false, newest: Some(0), buffer };
         this.to.write_all(MAGIC)?;
         this.entry(&Entry::Settings(*settings))?;
         Ok(this)
@@ -206,11 +205,18 @@ impl<W: Write> Writer<W> {
             self.taken = Some(telemetry.weights_id).filter(|id| *id != 0);
             self.names_weights = true;
         }
+        let [first, _] = self.span_ns.unwrap_or([tick.now_ns; 2]);
+        self.span_ns = Some([first, tick.now_ns]);
         self.taken = tick.agent.or(self.taken);
         if std::mem::take(&mut self.names_weights) {
             tick.agent = self.taken;
         }
         self.entry(&Entry::Tick(tick))
+    }
+
+    /// Whether the file has become so large, or so old, that the next part should begin.
+    pub fn is_full(&self) -> bool {
+        self.written > FILE_MAX || self.span_ns.is_some_and(|[first, newest]| newest.saturating_sub(first) > FILE_MAX_NS)
     }
 
     /// Passes everything that was added on to the operating system.

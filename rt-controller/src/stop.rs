@@ -19,6 +19,7 @@ use std::sync::atomic::{AtomicBool, Ordering::SeqCst};
 use std::time::{Duration, Instant};
 
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
+use rustix::net::{AddressFamily, SocketAddrUnix, SocketFlags, SocketType, connect, socket_with};
 use serde::{Deserialize, Serialize};
 use shared::exit::{self, Failure, failure};
 use shared::level::Level;
@@ -38,12 +39,14 @@ const LINE_MAX: usize = 64;
 /// How long the other threads may take to end once the loop has ended. Chosen by hand: a disk that works is done much sooner.
 const GRACE: Duration = Duration::from_secs(2);
 
-/// What the controller answers at its stop socket.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+/// What the controller answers at its stop socket. An abort works across versions: what an answer lacks, or has too much, is no reason not to understand it.
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
+#[serde(default)]
 pub struct StopAnswer {
     /// Process number of the controller, as it sees it itself.
     pub pid: u32,
     /// What the controller is doing.
+    #[serde(deserialize_with = "known_phase")]
     pub phase: Phase,
     /// Measured alpha, degrees; `None` without a robot.
     pub alpha_deg: Option<f32>,
@@ -53,6 +56,12 @@ pub struct StopAnswer {
     pub hindrance: String,
     /// Why the request was not obeyed, one line; empty if it was.
     pub refused: String,
+}
+
+/// A phase by its name. A controller of another version may be in one that is not known here, and may move in it.
+fn known_phase<'de, D: serde::Deserializer<'de>>(from: D) -> Result<Phase, D::Error> {
+    let name = serde_json::Value::deserialize(from)?;
+    Ok(Phase::deserialize(name).unwrap_or(Phase::Pouring))
 }
 
 /// Name of the abstract socket of user `uid`'s cell `name`.
@@ -69,11 +78,15 @@ pub struct StopSockets {
     nameless: Option<UnixListener>,
 }
 
-/// Whether the controller of user `uid`'s cell `name` answers at its abstract socket.
-fn is_taken(uid: u32, name: &str) -> bool {
-    let address = SocketAddr::from_abstract_name(abstract_name(uid, name));
-    let stream = address.and_then(|a| UnixStream::connect_addr(&a));
-    stream.is_ok_and(|s| peer_uid(&s) == Some(own_uid()))
+/// The user who listens at the abstract socket of user `uid`'s cell `name`, or whether its places are all taken, so that nobody can tell. Nobody is waited
+/// for.
+pub(crate) fn listener(uid: u32, name: &str) -> Result<u32, bool> {
+    let flags = SocketFlags::NONBLOCK | SocketFlags::CLOEXEC;
+    let socket = socket_with(AddressFamily::UNIX, SocketType::STREAM, flags, None).map_err(|_| false)?;
+    let name = abstract_name(uid, name);
+    let address = SocketAddrUnix::new_abstract_name(name.as_bytes()).map_err(|_| false)?;
+    connect(&socket, &address).map_err(|e| e == rustix::io::Errno::AGAIN)?;
+    peer_uid(&socket).ok_or(false)
 }
 
 impl StopSockets {
@@ -86,7 +99,7 @@ impl StopSockets {
         let fail = |e: std::io::Error| failure(exit::FAILED, format!("{}: {e}: no way to stop a motion, so none is begun", path.display()));
         // Of two that start at once, one gets the name.
         let nameless = SocketAddr::from_abstract_name(abstract_name(own_uid(), name)).and_then(|a| UnixListener::bind_addr(&a));
-        if nameless.is_err() && is_taken(own_uid(), name) {
+        if nameless.is_err() && listener(own_uid(), name) == Ok(own_uid()) {
             let what = format!("another rt-controller of cell '{name}' is running: stop it first (its runtime directory was deleted)");
             return Err(failure(exit::REFUSED, what));
         }

@@ -14,13 +14,12 @@ use std::path::{Path, PathBuf};
 use std::sync::mpsc;
 use std::time::{Duration, Instant};
 
-use rustix::net::{AddressFamily, SocketAddrUnix, SocketFlags, SocketType, connect, socket_with};
 use shared::config::is_cell_name;
-use shared::os::{peer, peer_uid};
+use shared::os::peer;
 use shared::runtime_dir::{Place, bases, own_uid};
 
 use crate::claim;
-use crate::stop::{StopAnswer, abstract_name};
+use crate::stop::{StopAnswer, abstract_name, listener};
 
 /// Longest wait for an answer. Chosen by hand: the controller's thread answers at once.
 const ANSWER: Duration = Duration::from_secs(1);
@@ -118,7 +117,7 @@ pub fn running_cells() -> Running {
 fn listening(mut named: Vec<Target>) -> Vec<Target> {
     let mut found = Vec::new();
     for _ in 0..ROUNDS {
-        named.retain(|target| match target.listener() {
+        named.retain(|target| match listener(target.uid, &target.name) {
             Ok(uid) => {
                 found.extend((uid == target.uid || uid == 0).then(|| target.clone()));
                 false
@@ -155,16 +154,6 @@ impl Target {
             self.directories.iter().filter_map(|d| SocketAddr::from_pathname(d.join("stop")).ok()).collect();
         addresses.extend(SocketAddr::from_abstract_name(name).ok());
         ask_all(addresses, self.uid, line)
-    }
-
-    /// The user who listens at the abstract socket, or whether its places are all taken, so that nobody can tell.
-    fn listener(&self) -> Result<u32, bool> {
-        let flags = SocketFlags::NONBLOCK | SocketFlags::CLOEXEC;
-        let socket = socket_with(AddressFamily::UNIX, SocketType::STREAM, flags, None).map_err(|_| false)?;
-        let name = abstract_name(self.uid, &self.name);
-        let address = SocketAddrUnix::new_abstract_name(name.as_bytes()).map_err(|_| false)?;
-        connect(&socket, &address).map_err(|e| e == rustix::io::Errno::AGAIN)?;
-        peer_uid(&socket).ok_or(false)
     }
 
     /// The process of the cell's controller, if it runs and its runtime directory still says so.
@@ -264,6 +253,15 @@ mod tests {
         assert_eq!(found(&link), (0, 1));
         std::os::unix::fs::lchown(&link, Some(65534), None).unwrap();
         assert_eq!(found(&link), (0, 0), "another user may lead it elsewhere");
+    }
+
+    /// Protects who aborts after an upgrade: the answer of a controller of another version is understood, and what it does not say is not taken as rest.
+    #[test]
+    fn answers_of_other_versions_are_understood() {
+        let older: StopAnswer = serde_json::from_str(r#"{"pid":7,"phase":"returning","alpha_deg":3.0}"#).unwrap();
+        assert_eq!((older.pid, older.phase, older.upright, &*older.refused), (7, shared::messages::Phase::Returning, false, ""));
+        let newer: StopAnswer = serde_json::from_str(r#"{"pid":7,"phase":"stirring","upright":true,"speed":[1,2]}"#).unwrap();
+        assert_eq!((newer.phase, newer.upright), (shared::messages::Phase::Pouring, true));
     }
 
     /// Protects a member of the cell's group, whom the controller obeys at the file alone: the refusal of the abstract socket comes first, and must not

@@ -85,6 +85,17 @@ fn journal(ticks: u64) -> Vec<u8> {
     whole
 }
 
+/// Protects who looks for yesterday: a journal's file ends after a day, however little was written into it.
+#[test]
+fn a_journal_ends_after_a_day() {
+    let mut writer = Writer::begin(Vec::new(), &settings()).expect("memory");
+    for (hour, is_full) in [(100, false), (112, false), (124, false), (125, true)] {
+        let now_ns = hour * 3600 * 1_000_000_000;
+        writer.tick(Box::new(Tick { now_ns, ..idle_tick() }), &Telemetry::default()).expect("memory");
+        assert_eq!(writer.is_full(), is_full, "hour {hour}");
+    }
+}
+
 /// Protects the reader of a journal on a failing disk: an error is one, and does not look like a journal that was cut.
 #[test]
 fn an_error_of_the_disk_is_no_cut_journal() {

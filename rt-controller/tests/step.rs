@@ -106,6 +106,18 @@ fn weights_of_other_pictures_are_refused() {
     assert!(said.contains("the weights were trained on pictures of 960 x 720 px and not of 640 x 480, as the cell has it"), "{said}");
 }
 
+/// Protects the estimate of who drives the controller with a simulator of their own: a joint that is not where it was sent is believed where the
+/// simulator says so, one that stands still is found out, and without a word nobody takes the commanded alpha for a measured one.
+#[test]
+fn the_measured_alpha_is_what_the_simulator_says() {
+    let output = step(&"0 0\n".repeat(40));
+    let said = String::from_utf8_lossy(&output.stderr).trim().to_owned();
+    assert_eq!(output.status.code(), Some(i32::from(shared::exit::ENDED_EARLY)), "{said}");
+    assert!(said.contains("does not follow"), "{said}");
+    let output = step(&"0\n".repeat(40));
+    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+}
+
 /// Protects who couples a simulator from a pour that ended early and looks done: the reason is said, and the exit code is that of a pour that ended early.
 #[test]
 fn an_early_end_is_said() {

@@ -67,7 +67,7 @@ pub mod weigh;
 mod weight;
 pub mod write;
 
-pub use age::{Begun, by_age, oldest_first};
+pub use age::{Begun, by_age, oldest_first, oldest_first_of};
 pub use number::{by_number, check_number, number_of, take_number};
 pub use read::{EpisodeImage, EpisodeImages, beginning, each_once, episodes_so_far, find_episodes};
 pub use records::EpisodeError;

@@ -14,6 +14,7 @@ use iceoryx2::prelude::*;
 use iceoryx2::service::port_factory::{publish_subscribe, request_response};
 
 use crate::control::CONTROL_VERSION;
+use crate::exit::{self, Failure, failure};
 use crate::messages::{FrameHeader, LAYOUT_VERSION};
 use crate::runtime_dir::{Place, RuntimeDirError};
 use crate::shared_memory::{self, Membership, SharedMemoryError};
@@ -54,6 +55,14 @@ pub enum IpcError {
         /// iceoryx2's name of the error.
         what: String,
     },
+}
+
+impl From<IpcError> for Failure {
+    /// The failure of whichever program meets this error: all of them end with one exit code for one cause.
+    fn from(e: IpcError) -> Self {
+        let code = if matches!(e, IpcError::Directory(_)) { exit::BAD_INPUT } else { exit::UNREACHABLE };
+        failure(code, e)
+    }
 }
 
 /// Turns an error of iceoryx2 into an [`IpcError`].

@@ -211,6 +211,33 @@ fn clear_dead() {
     }
 }
 
+/// What cells have in `/dev/shm`.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Kept {
+    /// The user whose it is.
+    pub uid: u32,
+    /// Whether a process of the cell runs, as far as this process can see its locks.
+    pub in_use: bool,
+    /// Its size, bytes.
+    pub bytes: u64,
+}
+
+/// What all users' cells have in `/dev/shm`: for each user at most what is in use, and what dead processes left.
+pub fn kept() -> Vec<Kept> {
+    // Everybody may read which files are locked; the inode stands in it as MAJOR:MINOR:INODE (proc_locks(5)).
+    let locks = std::fs::read_to_string("/proc/locks").unwrap_or_default();
+    let locked: BTreeSet<u64> = locks.split_whitespace().filter_map(|word| word.rsplit_once(':')?.1.parse().ok()).collect();
+    let mut all: BTreeMap<(u32, bool), u64> = BTreeMap::new();
+    for lock in files("decant-") {
+        let name = lock.file_name().unwrap_or_default().to_string_lossy().into_owned();
+        let Some(token) = name.strip_prefix("decant-").and_then(|n| n.strip_suffix(".lock")) else { continue };
+        let Ok(meta) = lock.symlink_metadata() else { continue };
+        let its = files(&prefix(token)).into_iter().filter_map(|file| file.symlink_metadata().ok());
+        *all.entry((meta.uid(), locked.contains(&meta.ino()))).or_default() += its.map(|m| m.len()).sum::<u64>();
+    }
+    all.into_iter().map(|((uid, in_use), bytes)| Kept { uid, in_use, bytes }).collect()
+}
+
 /// Removes the files of a token, the lock last.
 fn remove(token: &str) {
     for file in files(&prefix(token)) {

@@ -118,7 +118,7 @@ fn a_cell_removes_nothing_of_others_from_its_directory() {
 }
 
 /// Protects a cell from what another user prepared: a link, a directory of another user, and one that is open to others are refused by each
-/// program, with one line and an exit code.
+/// program, with one line and the same exit code.
 #[test]
 fn a_prepared_directory_is_refused() {
     let base = tempfile::Builder::new().prefix("d").tempdir_in("/tmp").expect("a directory");
@@ -128,10 +128,16 @@ fn a_prepared_directory_is_refused() {
     });
     let place = base.path().join(&cell.name);
     let refused = |word: &str| {
-        for (name, words, code) in [("rt-controller", ["run"], 2), ("feature-worker", ["run"], 3), ("rt-controller", ["status"], 3)] {
-            let output = cell.command(name, &words);
+        for (name, words) in [
+            ("rt-controller", &["run"][..]),
+            ("rt-controller", &["status"]),
+            ("rt-controller", &["pour", "50"]),
+            ("feature-worker", &["run"]),
+            ("operator-page", &["run"]),
+        ] {
+            let output = cell.command(name, words);
             let text = said(&output);
-            assert_eq!(output.status.code(), Some(code), "{name}: {text}");
+            assert_eq!(output.status.code(), Some(2), "{name}: {text}");
             assert!(text.contains("runtime directory") && text.contains(word), "{name}: {text}");
         }
     };
@@ -366,18 +372,18 @@ fn paths_belong_to_the_configuration() {
 }
 
 /// Protects the files of a cell that runs from a second one that names them by accident, in whatever words: through a link, a hard link or a detour, or as
-/// the place to which its own journal moves.
+/// the place to which its own journal moves; and wherever the runtime files of the two lie.
 #[test]
 fn two_cells_share_no_file() {
-    let base = tempfile::Builder::new().prefix("d").tempdir_in("/tmp").expect("a directory");
-    let prepare = |name: &'static str| {
+    let [base, other_base] = [(); 2].map(|()| tempfile::Builder::new().prefix("d").tempdir_in("/tmp").expect("a directory"));
+    let prepare = |name: &'static str, base: &tempfile::TempDir| {
         CellUnderTest::prepare(|config| {
             let cell = config["cell"].as_table_mut().expect("a table");
             cell.insert("name".into(), name.into());
             cell.insert("runtime_dir".into(), base.path().display().to_string().into());
         })
     };
-    let mut first = prepare("first");
+    let mut first = prepare("first", &base);
     steady_weights(TILT_OUT).write(&first.weights()).expect("writable");
     first.spawn("rt-controller");
     let until = std::time::Instant::now() + Duration::from_secs(20);
@@ -386,7 +392,7 @@ fn two_cells_share_no_file() {
         std::thread::sleep(Duration::from_millis(20));
     }
     let its = first.dir.path().canonicalize().expect("there");
-    let second = prepare("second");
+    let (second, third) = (prepare("second", &base), prepare("third", &other_base));
     let own = second.dir.path();
     std::os::unix::fs::symlink(its.join("weights.bin"), own.join("link.bin")).expect("a link");
     std::fs::hard_link(its.join("weights.bin"), own.join("hard.bin")).expect("a link");
@@ -410,6 +416,13 @@ fn two_cells_share_no_file() {
         assert_eq!(output.status.code(), Some(5), "{}: {said}", path.display());
         assert!(said.contains(&format!("error: {key} = ")) && said.contains("cell 'first' uses it as"), "{}: {said}", path.display());
     }
+    let text = std::fs::read_to_string(third.config()).expect("there");
+    let other = text.replace(&third.weights().display().to_string(), &its.join("weights.bin").display().to_string());
+    assert_ne!(other, text);
+    std::fs::write(third.config(), other).expect("writable");
+    let output = third.command("rt-controller", &["run"]);
+    assert_eq!(output.status.code(), Some(5), "{}", said(&output));
+    assert!(said(&output).contains("error: controller.weights = ") && said(&output).contains("cell 'first' uses it as"), "{}", said(&output));
     assert_eq!(first.stop("rt-controller"), Some(0), "the first has not noticed anything");
 }
 

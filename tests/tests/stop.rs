@@ -436,7 +436,28 @@ fn public_copy(name: &str) -> (tempfile::TempDir, PathBuf) {
     (dir, copy)
 }
 
-/// Protects the stop of a cell whose name another user has taken at the abstract socket: the controller says so and the file works.
+/// Takes a name as another user, and all places at it, so that whoever connects and waits would wait for ever.
+const SQUATTER: &str = r"
+import os, socket, sys, time
+name = '\0' + sys.argv[1]
+squatter = socket.socket(socket.AF_UNIX)
+squatter.bind(name)
+os.setgid(65534)
+os.setuid(65534)
+squatter.listen(1)
+kept = []
+try:
+    while True:
+        kept.append(socket.socket(socket.AF_UNIX))
+        kept[-1].setblocking(False)
+        kept[-1].connect(name)
+except BlockingIOError:
+    print(1, flush=True)
+time.sleep(300)
+";
+
+/// Protects the start and the stop of a cell whose name another user has taken at the abstract socket: the controller waits for nobody there, says so, and
+/// the file works.
 #[test]
 fn a_taken_name_leaves_the_file() {
     let mut cell = CellUnderTest::prepare(|_| {});
@@ -445,9 +466,8 @@ fn a_taken_name_leaves_the_file() {
         println!("not run: it takes root to act as another user");
         return;
     }
-    let script = "import os,socket,sys,time\ns=socket.socket(socket.AF_UNIX)\ns.bind('\\0'+sys.argv[1])\nos.setgid(65534)\nos.setuid(65534)\ns.listen(1)\nprint(1,flush=True)\ntime.sleep(300)";
     let mut squatter =
-        Command::new("python3").args(["-c", script, &format!("decant/0/{}", cell.name)]).stdout(Stdio::piped()).spawn().expect("python3");
+        Command::new("python3").args(["-c", SQUATTER, &format!("decant/0/{}", cell.name)]).stdout(Stdio::piped()).spawn().expect("python3");
     std::io::Read::read_exact(squatter.stdout.as_mut().expect("piped"), &mut [0; 1]).expect("it listens");
     for name in ["simulator", "feature-worker", "rt-controller"] {
         cell.spawn(name);

@@ -9,6 +9,7 @@ use std::path::{Path, PathBuf};
 use feature_worker::episodes::folder::{Budget, Folder, LEAST_FREE, MEGABYTE, recorded_today};
 use rt_controller::{claim, disk, journal_files};
 use shared::config::Config;
+use shared::config_paths::is_same;
 use shared::disk_space::free_bytes;
 use shared::episode::check_number;
 use shared::framing::Framing;
@@ -37,9 +38,10 @@ const FAR_OVER: f64 = 1.5;
 /// Looks at the cell's files.
 pub fn look(file: &Path, config: &Config) -> Vec<Finding> {
     let mut findings = vec![configuration(file, &config.cell.name)];
+    findings.extend(shared_files(file, config));
     findings.push(controller(config));
     findings.push(shared_memory());
-    findings.push(strangers());
+    findings.push(kept());
     findings.push(weights(file, config));
     let runs = matches!(claim::running_at(&Place::from(&config.cell)), Ok(Some(_)));
     findings.extend(config.controller.journal.as_deref().map(|file| journal(file, runs)));
@@ -66,6 +68,25 @@ fn configuration(file: &Path, name: &str) -> Finding {
     }
     let means = format!("decant-controller@{unit} keeps its runtime files in /run/decant/{unit}/{name}, where no command finds them");
     Finding::red("configuration", is, &means, format!("set cell.name to \"{unit}\", or call the file {name}.toml"))
+}
+
+/// Another cell's configuration beside this one that uses a file of this one. Nobody notices it while only one of the two runs.
+fn shared_files(file: &Path, config: &Config) -> Option<Finding> {
+    let directory = file.parent().filter(|d| !d.as_os_str().is_empty()).unwrap_or(Path::new("."));
+    let mut beside: Vec<PathBuf> = std::fs::read_dir(directory).ok()?.flatten().map(|e| e.path()).collect();
+    beside.retain(|other| other.extension().is_some_and(|e| e == "toml"));
+    beside.sort();
+    let others = beside.iter().filter_map(|other| Some((other, Config::read(other).ok()?)));
+    for (other, theirs) in others.filter(|(_, theirs)| theirs.cell.name != config.cell.name) {
+        for (key, path) in claim::files(config) {
+            if let Some((its, _)) = claim::files(&theirs).iter().find(|(_, p)| is_same(p, &path)) {
+                let is = format!("{key} = {}, which {} has as {its}", path.display(), other.display());
+                let means = "each cell exchanges the other's weights, or moves and deletes the other's files";
+                return Some(Finding::red("configuration", is, means, "give each cell files of its own"));
+            }
+        }
+    }
+    None
 }
 
 /// Whether a controller of the cell runs, and if not, whether its runtime files have a place.
@@ -95,25 +116,19 @@ fn shared_memory() -> Finding {
     }
 }
 
-/// Files in `/dev/shm` that other users' cells have there. Those of this user's dead processes go by themselves at the next start.
-fn strangers() -> Finding {
-    let mut owners: Vec<(u32, u64)> = Vec::new();
-    for entry in std::fs::read_dir("/dev/shm").into_iter().flatten().flatten() {
-        let Ok(meta) = entry.metadata() else { continue };
-        if !entry.file_name().to_string_lossy().starts_with("decant-") || meta.uid() == own_uid() {
-            continue;
-        }
-        match owners.iter_mut().find(|(uid, _)| *uid == meta.uid()) {
-            Some((_, bytes)) => *bytes += meta.len(),
-            None => owners.push((meta.uid(), meta.len())),
-        }
+/// What cells have in `/dev/shm`, whose it is, and whether it is in use.
+fn kept() -> Finding {
+    let all = shared_memory::kept();
+    let words = |k: &shared_memory::Kept| {
+        format!("user {}: {} KiB {}", k.uid, k.bytes / 1024, if k.in_use { "in use" } else { "left by dead processes" })
+    };
+    let list = if all.is_empty() { "none".into() } else { all.iter().map(words).collect::<Vec<_>>().join(", ") };
+    if all.iter().all(|k| k.uid == own_uid()) {
+        // What this user's dead processes left goes by itself at the next start.
+        return Finding::green("cells' shared memory", list);
     }
-    if owners.is_empty() {
-        return Finding::green("others' shared memory", "none");
-    }
-    let list: Vec<String> = owners.iter().map(|(uid, bytes)| format!("user {uid}: {} KiB", bytes / 1024)).collect();
-    let advice = "if no cell of theirs runs, that user or root may delete /dev/shm/decant-*";
-    Finding::yellow("others' shared memory", list.join(", "), "it takes room, and a cell of one name is another user's", advice)
+    let advice = "where no cell of theirs runs, that user or root may delete /dev/shm/decant-*";
+    Finding::yellow("cells' shared memory", list, "others' takes room, and a cell of one name is another user's", advice)
 }
 
 fn weights(file: &Path, config: &Config) -> Finding {
@@ -251,5 +266,31 @@ mod tests {
         assert_eq!(judge("/etc/decant/lab.toml", "lab"), Verdict::Green);
         assert_eq!(judge("/etc/decant/lab2.toml", "lab"), Verdict::Red);
         assert_eq!(judge("config/cell.toml", "lab"), Verdict::Green, "no unit reads it");
+    }
+
+    /// Protects two cells' weights where only one runs at a time: a configuration that was copied for a second cell, and has the first one's files, is
+    /// found.
+    #[test]
+    fn two_configurations_with_one_file_are_found() {
+        let dir = tempfile::tempdir().unwrap();
+        let text = std::fs::read_to_string(Path::new(env!("CARGO_MANIFEST_DIR")).join("../config/sim.toml")).unwrap();
+        let [first, second] = ["first", "second"].map(|name| dir.path().join(format!("{name}.toml")));
+        let write = |file: &Path, name: &str, weights: &str| {
+            let mut config: toml::Table = text.parse().unwrap();
+            config["cell"]["name"] = toml::Value::from(name);
+            config["controller"]["weights"] = toml::Value::from(weights);
+            config["controller"]["journal"] = toml::Value::from(format!("{name}-journal.bin"));
+            config["recording"]["directory"] = toml::Value::from(format!("{name}-episodes"));
+            std::fs::write(file, config.to_string()).unwrap();
+        };
+        let found = || shared_files(&second, &Config::read(&second).unwrap());
+        write(&first, "first", "a.bin");
+        write(&second, "second", "b.bin");
+        assert_eq!(found().map(|f| f.is), None);
+        write(&second, "first", "a.bin");
+        assert_eq!(found().map(|f| f.is), None, "two configurations of one cell");
+        write(&second, "second", "./x/../a.bin");
+        let red = found().unwrap();
+        assert!(red.verdict == Verdict::Red && red.is.starts_with("controller.weights = "), "{}", red.is);
     }
 }

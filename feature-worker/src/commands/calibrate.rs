@@ -176,7 +176,7 @@ fn calibrate(args: &Args, mut config: Config) -> Result<(), Failure> {
 /// Watches the configured camera for a while.
 fn watch(args: &Args, config: &Config) -> Result<Pour, Failure> {
     let reach = |e: String| failure(exit::UNREACHABLE, e);
-    let cell = Cell::join(&config.cell).or_exit(exit::UNREACHABLE)?;
+    let cell = Cell::join(&config.cell)?;
     let mut source = ObserverSource::open(&config.camera, &cell).map_err(|e| failure(e.exit_code(), e))?;
     eprintln!("calibrate: watching the camera for {} s; pour once now", args.seconds);
     let (pour, cut) = watch_for(&mut source, Duration::from_secs(args.seconds), Pour::live(FILM_MOST))?;

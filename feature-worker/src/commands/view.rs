@@ -87,7 +87,7 @@ fn view(args: &Args, config: &Config) -> Result<(), Failure> {
     exit::end_within(&stop, GRACE, "feature-worker view: shared memory or the camera does not answer: ended without it");
     opencv::core::set_num_threads(1).or_exit(exit::FAILED)?;
     let extractor = Extractor::new(&config.camera, &config.image).or_exit(exit::BAD_INPUT)?;
-    let cell = Cell::join(&config.cell).or_exit(exit::UNREACHABLE)?;
+    let cell = Cell::join(&config.cell)?;
     let source = ObserverSource::open(&config.camera, &cell).map_err(|e| failure(e.exit_code(), e))?;
     let server = Server::open(IpAddr::from([127, 0, 0, 1]), args.port, Settings::default())?;
     println!("http://{}", server.address());

@@ -118,6 +118,7 @@ pub fn summary(episode: &Episode) -> Value {
     let info = &episode.info;
     json!({
         "file": episode.name,
+        "number": info.number,
         "complete": episode.complete,
         "run": kind_json(episode.kind),
         "weight_g": episode.weight_g,

@@ -10,7 +10,7 @@ use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
 
 use sha2::{Digest, Sha256};
-use shared::episode::{Begun, Episode, by_age, find_episodes, hex, read_at_rest, take_number};
+use shared::episode::{Begun, Episode, by_age, find_episodes, hex, oldest_first_of, read_at_rest, take_number};
 use shared::{regular_file, whole_file};
 
 use super::folder::{Budget, Folder};
@@ -158,8 +158,7 @@ fn other_weight(left_g: Option<f64>, taken_g: Option<f64>) -> String {
 /// lies there already, under whatever name, is left out.
 pub fn merge(files: &[PathBuf], to: &Path) -> Result<Copied, ExportError> {
     let mut copied = Copied::default();
-    let mut all = distinct(files, &mut copied)?;
-    all.sort_by(|a, b| a.1.info.started_at_utc.cmp(&b.1.info.started_at_utc));
+    let all = oldest_first_of(distinct(files, &mut copied)?, |(path, episode)| (path, episode));
     let there = if to.is_dir() { find_episodes(&[to.to_path_buf()])? } else { Vec::new() };
     // What cannot be read there is nobody's measurement.
     let there = there.into_iter().filter_map(|file| Some((Episode::read(&file).ok()?, file)));

@@ -7,7 +7,7 @@
 use iceoryx2::port::publisher::{Publisher, PublisherCreateError};
 use iceoryx2::service::port_factory::PortFactory as _;
 use shared::config::Config;
-use shared::exit::{self, Failure, OrExit as _, failure};
+use shared::exit::{self, Failure, failure};
 use shared::ipc::{Cell, FrameNotifier, FrameTopic};
 use shared::messages::{FrameHeader, PixelFormat};
 use shared::os;
@@ -25,7 +25,7 @@ pub struct FrameRepublisher {
 impl FrameRepublisher {
     /// Takes the place of the camera driver in `cell`.
     pub fn new(cell: &Cell, config: &Config) -> Result<Self, Failure> {
-        let topic = cell.frames().or_exit(exit::UNREACHABLE)?;
+        let topic = cell.frames()?;
         let bytes = config.camera.width_px as usize * config.camera.height_px as usize * PixelFormat::Bgr8.bytes_per_pixel();
         let name = &config.cell.name;
         let publisher = topic.publisher_builder().initial_max_slice_len(bytes).create().map_err(|e| match e {
@@ -38,7 +38,7 @@ impl FrameRepublisher {
                 format!("cell '{name}': service 'frame': {e:?}; end all programs of the cell and start them again"),
             ),
         })?;
-        Ok(Self { publisher, notifier: cell.frame_notifier().or_exit(exit::UNREACHABLE)?, topic })
+        Ok(Self { publisher, notifier: cell.frame_notifier()?, topic })
     }
 
     /// Publishes a frame if somebody subscribes. The cost is one copy into shared memory that was made at the start. A reader that is

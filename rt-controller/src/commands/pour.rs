@@ -42,7 +42,7 @@ pub fn run(args: &Args) -> Result<(), Failure> {
     // What cannot be poured is refused before a robot is taken from somebody for it.
     goal_is_legal(args.goal_ml, &Settings::new(&config)).or_exit(exit::REFUSED)?;
     let mut foreseen = Foreseen::of(&config, args)?;
-    if resume::take_back_if_it_waits(&Client::connect_or_end(&config.cell).or_exit(exit::UNREACHABLE)?)? {
+    if resume::take_back_if_it_waits(&Client::connect_or_end(&config.cell)?)? {
         // That may have taken a while, in which the controller may have taken other weights: what is foreseen is of those that pour.
         foreseen = Foreseen::of(&config, args)?;
     }
@@ -63,6 +63,8 @@ struct Foreseen {
     flows_by_deg: Option<f32>,
     /// What may leave before it is noticed that the camera sees nothing, ml, if no tilt bounds it.
     unseen_ml: Option<f64>,
+    /// What there is to say where weights know no vessel, or are not known here.
+    unbounded_line: Option<&'static str>,
     /// What there is to say of the pictures that the weights were trained on.
     pictures_line: Option<&'static str>,
 }
@@ -70,7 +72,7 @@ struct Foreseen {
 impl Foreseen {
     /// Foresees the pour with the weights that the running controller has.
     fn of(config: &Config, args: &Args) -> Result<Self, Failure> {
-        let status = Client::connect_or_end(&config.cell).or_exit(exit::UNREACHABLE)?.status().or_exit(exit::UNREACHABLE)?;
+        let status = Client::connect_or_end(&config.cell)?.status()?;
         let weights = Weights::read(&config.controller.weights).ok().filter(|w| w.identity() == status.weights);
         let foreseen = Self::with(weights.as_ref(), config, args.goal_ml, args.fill);
         if args.fill.is_some() && weights.is_none() {
@@ -92,6 +94,7 @@ impl Foreseen {
         Self {
             expected: weights.map(|w| foreseen::expected(w, &Settings::new(config), goal_ml)),
             flows_by_deg,
+            unbounded_line: foreseen::unbounded_line(weights, container.least_fill_ml),
             unseen_ml: weights.and_then(|w| foreseen::unseen_ml(w, config.limits, flows_by_deg)),
             pictures_line: weights.and_then(foreseen::pictures_line),
         }
@@ -99,7 +102,7 @@ impl Foreseen {
 
     /// All that is said before the pour.
     fn lines(&self, goal_ml: f32) -> impl Iterator<Item = String> {
-        self.line(goal_ml).into_iter().chain(self.unseen_line()).chain(self.pictures_line.map(str::to_owned))
+        self.line(goal_ml).into_iter().chain(self.unseen_line()).chain(self.unbounded_line.map(|line| format!("warning: {line}"))).chain(self.pictures_line.map(str::to_owned))
     }
 
     /// What a camera that sees no stream at all could cost, where no tilt bounds it.
@@ -174,7 +177,7 @@ fn unanswered(client: &Client, e: ClientError) -> Failure {
 
 /// Gives an order that moves the container, follows it to its end, and waits for the recorder's report, if there is a recorder.
 pub(crate) fn order(cell: &CellConfig, request: &Request) -> Result<Ended, Failure> {
-    let client = Client::connect_or_end(cell).or_exit(exit::UNREACHABLE)?;
+    let client = Client::connect_or_end(cell)?;
     resume::take_back_if_it_waits(&client)?;
     let recorder = client::RecorderReports::open(cell).ok();
     // From here on Ctrl-C must stop what is ordered. If this fails, it ends this command, and the pour goes on.

@@ -30,8 +30,8 @@ pub struct Args {
 /// Runs the command.
 pub fn run(args: &Args) -> Result<(), Failure> {
     let config = Config::read(&args.config).or_exit(exit::BAD_INPUT)?;
-    let client = Client::connect_or_end(&config.cell).or_exit(exit::UNREACHABLE)?;
-    let status = client.status().or_exit(exit::UNREACHABLE)?;
+    let client = Client::connect_or_end(&config.cell)?;
+    let status = client.status()?;
     if status.phase == Phase::NoRobot {
         take_back(&client)?;
     }
@@ -41,7 +41,7 @@ pub fn run(args: &Args) -> Result<(), Failure> {
 
 /// Takes the robot back if it waits for its operator: whoever gives an order has asked for it. Gives whether it waited.
 pub(super) fn take_back_if_it_waits(client: &Client) -> Result<bool, Failure> {
-    let status = client.status().or_exit(exit::UNREACHABLE)?;
+    let status = client.status()?;
     if status.robot != RobotLink::WaitsForOperator || status.phase != Phase::NoRobot {
         return Ok(false);
     }
@@ -51,7 +51,7 @@ pub(super) fn take_back_if_it_waits(client: &Client) -> Result<bool, Failure> {
 
 /// Asks for the robot, and waits until it is connected and stands upright.
 fn take_back(client: &Client) -> Result<(), Failure> {
-    match client.ask(&Request::Resume).or_exit(exit::UNREACHABLE)? {
+    match client.ask(&Request::Resume)? {
         Reply::Resuming => {}
         Reply::Refused { reason } => return Err(failure(exit::REFUSED, reason)),
         _ => return Err(failure(exit::UNREACHABLE, ClientError::Version)),
@@ -59,7 +59,7 @@ fn take_back(client: &Client) -> Result<(), Failure> {
     let until = Instant::now() + CONNECTED;
     loop {
         std::thread::sleep(BEAT);
-        let Status { phase, robot, hindrance, .. } = *client.status().or_exit(exit::UNREACHABLE)?;
+        let Status { phase, robot, hindrance, .. } = *client.status()?;
         match (phase, robot) {
             (Phase::NoRobot, RobotLink::WaitsForOperator) => return Err(failure(exit::REFUSED, hindrance)),
             (Phase::NoRobot, _) if Instant::now() < until => {}

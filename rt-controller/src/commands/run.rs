@@ -45,7 +45,7 @@ fn no_thread(e: std::io::Error) -> Failure {
 #[command(after_help = "Examples:\n  rt-controller run --config config/sim.toml\n  rt-controller run --config config/cell.toml\n\n\
 Ctrl-C or SIGTERM brings the container upright and stops the controller.\n\
 Exit codes: 0 stopped, and the container was upright when a robot was last seen, or none was; 1 failed, or the container was last seen tilted;\n\
-2 bad configuration; 5 another controller of the cell is running.")]
+2 bad configuration or runtime directory; 3 shared memory cannot be used; 5 another controller of the cell is running.")]
 pub struct Args {
     /// The cell's configuration.
     #[arg(long, env = shared::config::VARIABLE, default_value = shared::config::DEFAULT_FILE)]
@@ -205,15 +205,15 @@ fn run_threads(
     say: &(dyn Fn(Level, &str) + Sync),
 ) -> Result<(), Failure> {
     let Shared { exchange, note, connections, disk_note, end, disk_done, service_done, .. } = shared;
-    let cell = Cell::join(&config.cell).or_exit(exit::FAILED)?;
-    cell.check_space(SHARED_MEMORY).or_exit(exit::FAILED)?;
+    let cell = Cell::join(&config.cell)?;
+    cell.check_space(SHARED_MEMORY)?;
     let (disk, queues) = Disk::open(config, owner, exchange, disk_note, say).or_exit(exit::BAD_INPUT)?;
-    let service = Service::open(&cell, exchange, (note, connections), (disk_note, queues), say).or_exit(exit::FAILED)?;
-    cell.reserve().or_exit(exit::FAILED)?;
+    let service = Service::open(&cell, exchange, (note, connections), (disk_note, queues), say)?;
+    cell.reserve()?;
     std::thread::scope(|scope| {
         let (ready_sender, ready) = std::sync::mpsc::channel();
         thread("loop").spawn_scoped(scope, move || real_time(config, exchange, say, &ready_sender)).map_err(no_thread)?;
-        ready.recv().unwrap_or(Ok(())).or_exit(exit::FAILED)?;
+        ready.recv().unwrap_or(Ok(()))?;
         std::thread::scope(|inner| {
             let robot = || robot_thread::keep_robot_connected(&System, config, exchange, note, connections, end, say);
             let spawned = thread("robot").spawn_scoped(inner, robot);

@@ -22,20 +22,35 @@ pub struct Args {
     watch: bool,
 }
 
+/// What is shown: what the controller says, and what is found beside it.
+#[derive(serde::Serialize)]
+struct Shown<'a> {
+    #[serde(flatten)]
+    status: &'a Status,
+    /// Who records, one line.
+    recorder: &'a str,
+}
+
 /// Runs the command.
 pub fn run(args: &Args) -> Result<(), Failure> {
     let config = Config::read(&args.common.config).or_exit(exit::BAD_INPUT)?;
-    let client = Client::connect_or_end(&config.cell).or_exit(exit::UNREACHABLE)?;
     loop {
-        let status = client.status().or_exit(exit::UNREACHABLE)?;
+        // Each look connects anew, because what dead programs left is cleared then: a worker that was killed is not there any more.
+        let client = Client::connect_or_end(&config.cell)?;
+        let status = client.status()?;
+        let recorder = match client.has_recorder()? {
+            true => format!("a feature worker is there; episodes go to {}", config.recording.directory.display()),
+            false => "none: no feature worker runs, so nothing is recorded".to_string(),
+        };
+        let shown = Shown { status: &status, recorder: &recorder };
         match (args.common.json, args.watch) {
-            (true, false) => println!("{}", serde_json::to_string_pretty(&status).or_exit(exit::FAILED)?),
-            (true, true) => println!("{}", serde_json::to_string(&status).or_exit(exit::FAILED)?),
-            (false, false) => print(&status),
+            (true, false) => println!("{}", serde_json::to_string_pretty(&shown).or_exit(exit::FAILED)?),
+            (true, true) => println!("{}", serde_json::to_string(&shown).or_exit(exit::FAILED)?),
+            (false, false) => print(&status, &recorder),
             (false, true) => {
                 // These clear a terminal and go to its first place (ECMA-48).
                 print!("\x1b[2J\x1b[H");
-                print(&status);
+                print(&status, &recorder);
             }
         }
         if !args.watch {
@@ -62,7 +77,7 @@ fn age(seconds: f64) -> String {
 }
 
 /// Prints the status for people.
-fn print(s: &Status) {
+fn print(s: &Status, recorder: &str) {
     println!("version    {}, running for {}", s.version, age(s.uptime_s));
     println!("phase      {}", name(&s.phase));
     if !s.hindrance.is_empty() {
@@ -90,6 +105,7 @@ fn print(s: &Status) {
     println!("clipped    angle {}, rate {}, acceleration {}, not finite {}", c.angle, c.rate, c.acceleration, c.not_finite);
     println!("loop       {} allocations, {} page faults, {} events lost", s.loop_allocations, s.loop_page_faults, s.events_lost);
     println!("journal    {}", s.journal);
+    println!("recorder   {recorder}");
     println!("space      {}", s.space);
     println!("robot      {}, {} connections", name(&s.robot), s.robot_connections);
     if !s.robot_warning.is_empty() {

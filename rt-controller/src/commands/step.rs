@@ -20,13 +20,17 @@ use crate::foreseen;
 /// Longest line of input, bytes: no number that anybody writes is longer.
 const LINE_MAX: u64 = 128;
 
+/// Largest measured angle that is believed, degrees: no wrist of a UR5 turns farther than a turn either way.
+const ANGLE_MAX_DEG: f32 = 360.0;
+
 /// Command-line arguments.
 #[derive(Debug, clap::Args)]
 #[command(after_help = "Example:\n  printf '0\\n0\\n350\\nnan\\n410\\n' | rt-controller step --weights out/weights.bin --goal 75\n\n\
 Each line of output is 'dalpha_deg alpha_deg d_ml', flushed at once: the change and the angle commanded now (all limits of the\n\
 configuration applied), and the volume still to pour. The first line comes before any input, because the tick that takes the goal already\n\
-moves, from upright. Then each line of input is one frame's V_e in px^2 (nan: no measurement), and each has one line of output. Each\n\
-alpha_deg is the sum of all dalpha_deg so far. How the pour ended is said on standard error, and by exit code 4 where it ended early.")]
+moves, from upright. Then each line of input is one frame's V_e in px^2 (nan: no measurement), and each has one line of output. Behind V_e\n\
+may stand the alpha that the robot measured when the frame was taken, in degrees, as in '350 12.5'. Each alpha_deg is the sum of all\n\
+dalpha_deg so far. How the pour ended is said on standard error, and by exit code 4 where it ended early.")]
 pub struct Args {
     /// The weight file.
     #[arg(long)]
@@ -61,7 +65,7 @@ pub fn run(args: &Args) -> Result<(), Failure> {
     let mut core = Core::new(settings);
     core.exchange(Box::new(Agent::new(&weights)));
     let (mut alpha_deg, mut now_ns, mut sequence) = (0.0, 0, 0);
-    let mut frame = |area_px2: f32, order: Option<Order>| {
+    let mut frame = |Line { area_px2, alpha_measured_deg }: Line, order: Option<Order>| {
         now_ns += settings.period_ns;
         sequence += 1;
         let doubt = if area_px2.is_finite() { Doubt::None } else { Doubt::EdgeNotFound };
@@ -77,15 +81,17 @@ pub fn run(args: &Args) -> Result<(), Failure> {
             framing,
             ..Feature::default()
         };
-        // The robot is taken to be where it was sent; a lag is for the other simulator to add.
-        let robot = Robot::that_may_move(alpha_deg, now_ns);
+        // Where the robot is not measured it is not taken to be measured where it was sent: the agent then reckons with the joint's lag.
+        let robot = alpha_measured_deg.map_or(Robot::that_may_move(alpha_deg, 0), |deg| Robot::that_may_move(deg, now_ns));
         let output = core.step(&Input { now_ns, features: &[feature], robot, order });
         alpha_deg = output.telemetry.alpha_deg;
         output
     };
     // Two frames come before the first line of input: in one the robot becomes ready, in the other the goal is set.
-    frame(0.0, None);
-    let started = frame(0.0, Some(Order::Pour { episode: 1, goal_ml: args.goal, flows_by_deg: None }));
+    let container = config.container;
+    let flows_by_deg = foreseen::must_flow_by_deg(&weights, None, container.least_fill_ml, container.holds_ml);
+    frame(Line::default(), None);
+    let started = frame(Line::default(), Some(Order::Pour { episode: 1, goal_ml: args.goal, flows_by_deg }));
     if let Some(Err(refusal)) = started.ordered {
         return Err(failure(exit::REFUSED, refusal));
     }
@@ -96,9 +102,9 @@ pub fn run(args: &Args) -> Result<(), Failure> {
     let mut ended = None;
     let mut input = std::io::stdin().lock();
     for number in 0.. {
-        let Some(area_px2) = next_line(&mut input).map(|line| line.and_then(|text| area_px2(&text))) else { break };
-        let area_px2 = area_px2.map_err(|why| failure(exit::BAD_INPUT, format!("line {}: {why}", number + 1)))?;
-        let output = frame(area_px2, None);
+        let Some(line) = next_line(&mut input).map(|line| line.and_then(|text| parse(&text))) else { break };
+        let line = line.map_err(|why| failure(exit::BAD_INPUT, format!("line {}: {why}", number + 1)))?;
+        let output = frame(line, None);
         if !lines.print(&output.telemetry)? {
             return Ok(());
         }
@@ -126,14 +132,34 @@ fn next_line(input: &mut impl BufRead) -> Option<Result<String, String>> {
     }
 }
 
-/// One frame's V_e as it was written; NaN for one that was not measured.
-fn area_px2(text: &str) -> Result<f32, String> {
-    let text = text.trim();
-    match text.parse::<f32>() {
-        Ok(area_px2) if area_px2.is_nan() || (0.0..f32::INFINITY).contains(&area_px2) => Ok(area_px2),
-        Ok(_) => Err(format!("{text} is no area: give a finite V_e of at least 0 px^2, or nan for no measurement")),
-        Err(_) => Err("not a number: give one V_e in px^2, or nan, on each line".into()),
+/// What a line of input says of one frame.
+#[derive(Debug, Clone, Copy, Default, PartialEq)]
+struct Line {
+    /// V_e, px^2; NaN for a frame that was not measured.
+    area_px2: f32,
+    /// The alpha that the robot measured when the frame was taken, degrees, if the line says it.
+    alpha_measured_deg: Option<f32>,
+}
+
+/// One frame's line as it was written.
+fn parse(text: &str) -> Result<Line, String> {
+    let mut words = text.split_whitespace();
+    let wrong = || "not a number: give one V_e in px^2, or nan, on each line".to_string();
+    let (area, angle, None) = (words.next().ok_or_else(wrong)?, words.next(), words.next()) else {
+        return Err("more than two numbers: give V_e in px^2, or nan, and behind it at most the measured alpha in degrees".into());
+    };
+    let area_px2 = area.parse().map_err(|_| wrong())?;
+    if !(f32::is_nan(area_px2) || (0.0..f32::INFINITY).contains(&area_px2)) {
+        return Err(format!("{area} is no area: give a finite V_e of at least 0 px^2, or nan for no measurement"));
     }
+    let alpha_measured_deg = match angle.map(|angle| (angle, angle.parse::<f32>())) {
+        None => None,
+        // As in a table: nan where the robot said nothing.
+        Some((_, Ok(deg))) if deg.is_nan() => None,
+        Some((_, Ok(deg))) if deg.abs() <= ANGLE_MAX_DEG => Some(deg),
+        Some((angle, _)) => return Err(format!("{angle} is no angle: give the measured alpha in degrees, or leave it out")),
+    };
+    Ok(Line { area_px2, alpha_measured_deg })
 }
 
 /// Places of a printed angle: its last digit is 0.0001 degrees.
@@ -167,11 +193,17 @@ mod tests {
     /// Protects the filter from areas that no camera gives: a negative or endless one is refused in one line that says what to give.
     #[test]
     fn areas_that_cannot_be_are_refused() {
-        assert_eq!(area_px2(" 350 "), Ok(350.0));
-        assert_eq!(area_px2("0"), Ok(0.0));
-        assert!(area_px2("nan").is_ok_and(f32::is_nan));
-        for text in ["-1", "1e999", "inf", "-inf", "-0.001", "", "3 4", "much"] {
-            assert!(area_px2(text).is_err_and(|why| why.contains("px^2") && !why.contains('\n')), "{text}");
+        let line = |area_px2, alpha_measured_deg| Ok(Line { area_px2, alpha_measured_deg });
+        assert_eq!(parse(" 350 "), line(350.0, None));
+        assert_eq!(parse("0"), line(0.0, None));
+        assert_eq!(parse("350 -12.5\r"), line(350.0, Some(-12.5)));
+        assert_eq!(parse("350 nan"), line(350.0, None), "the robot said nothing");
+        assert!(parse("nan").is_ok_and(|line| line.area_px2.is_nan()));
+        for text in ["-1", "1e999", "inf", "-inf", "-0.001", "", "3 4 5", "much"] {
+            assert!(parse(text).is_err_and(|why| why.contains("px^2") && !why.contains('\n')), "{text}");
+        }
+        for text in ["350 inf", "350 1e6", "350 up"] {
+            assert!(parse(text).is_err_and(|why| why.contains("the measured alpha in degrees, or leave it out")), "{text}");
         }
     }
 }

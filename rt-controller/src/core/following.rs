@@ -69,8 +69,8 @@ impl Following {
     /// Takes the robot's newest state and gives whether it follows what was `commanded`. Call it once a tick.
     pub fn follows(&mut self, robot: &Robot, commanded: &AngleHistory<COMMANDS>) -> bool {
         let (least, largest) = commanded.range_deg(robot.at_ns.saturating_sub(self.window_ns), robot.at_ns);
-        // Written so that an angle that is not a number is elsewhere.
-        let there = robot.alpha_deg >= least - TOLERANCE_DEG && robot.alpha_deg <= largest + TOLERANCE_DEG;
+        // Written so that an angle that is not a number is elsewhere. A robot that never told a state, as a simulator's need not, is not judged by it.
+        let there = robot.at_ns == 0 || (robot.alpha_deg >= least - TOLERANCE_DEG && robot.alpha_deg <= largest + TOLERANCE_DEG);
         self.elsewhere_ticks = if there { 0 } else { self.elsewhere_ticks.saturating_add(1) };
         self.slow_ticks = if is_slowed(robot) { self.slow_ticks.saturating_add(1) } else { 0 };
         self.elsewhere_ticks < MOST_TICKS && self.slow_ticks < MOST_SLOW_TICKS

@@ -11,7 +11,7 @@ pub struct Robot {
     pub hindrance: Option<EndReason>,
     /// Measured alpha, degrees; NaN before the first state.
     pub alpha_deg: f32,
-    /// When that state arrived, CLOCK_MONOTONIC ns; 0 before the first.
+    /// When that state arrived, CLOCK_MONOTONIC ns; 0 before the first, and where a simulator measures no alpha: the agent then goes by the command.
     pub at_ns: u64,
     /// The share of its speed that the robot leaves by itself, 0 to 1 (RTDE's `speed_scaling`); `None` if it does not say.
     pub speed_scaling: Option<f32>,

@@ -19,11 +19,18 @@ pub struct Begun<'a, T> {
 
 /// Episodes that were read from files, the oldest first.
 pub fn oldest_first(episodes: Vec<Episode>) -> Vec<Episode> {
-    let begun = |e: &Episode| (PathBuf::from(&e.name), e.info.number, e.info.started_at_utc.clone());
-    let begun: Vec<_> = episodes.iter().map(begun).collect();
-    let begun: Vec<_> = begun.iter().map(|(path, number, at)| Begun { path, number: *number, at: at.as_str() }).collect();
-    let mut episodes: Vec<_> = episodes.into_iter().map(Some).collect();
-    by_age(&begun).into_iter().filter_map(|i| episodes[i].take()).collect()
+    oldest_first_of(episodes, |e| (e.name.as_ref(), e))
+}
+
+/// The elements of `all`, the oldest first. `file` gives of each its path and what was read from there.
+pub fn oldest_first_of<T>(all: Vec<T>, file: impl Fn(&T) -> (&Path, &Episode)) -> Vec<T> {
+    let begun = all.iter().map(|one| {
+        let (path, Episode { info, .. }) = file(one);
+        Begun { path, number: info.number, at: info.started_at_utc.as_str() }
+    });
+    let order = by_age(&begun.collect::<Vec<_>>());
+    let mut all: Vec<_> = all.into_iter().map(Some).collect();
+    order.into_iter().filter_map(|i| all[i].take()).collect()
 }
 
 /// Places in `found`, the oldest first. Within one directory the recorder's numbers say which is older: they only grow, and a wall clock may go back. So an

@@ -11,7 +11,7 @@ use std::time::{Duration, Instant};
 
 use tests::{CellUnderTest, Namespaces, steady_weights};
 
-use super::Ended;
+use super::{Ended, SQUATTER};
 
 /// How often each attack is measured.
 const ROUNDS: usize = 3;
@@ -81,15 +81,14 @@ const ATTACKS: [Attack; 10] = [
         },
     },
     Attack {
-        what: "directories and links of another user wherever runtime files may lie, and the socket's name taken, before the start",
+        what: "a link of another user in `/tmp`, and the socket's name and all places at it taken, before the start",
         shm: None,
         before: |cell| {
             let link = PathBuf::from(format!("/tmp/decant_{}", cell.name));
             std::os::unix::fs::symlink("/dev/null", &link).unwrap();
             std::os::unix::fs::lchown(&link, Some(65534), Some(65534)).unwrap();
-            let script = "import os,socket,sys,time\ns=socket.socket(socket.AF_UNIX)\ns.bind('\\0'+sys.argv[1])\nos.setgid(65534)\nos.setuid(65534)\ns.listen(1)\nprint(1,flush=True)\ntime.sleep(300)";
             let mut squatter = Command::new("python3");
-            squatter.args(["-c", script, &format!("decant/0/{}", cell.name)]).stdout(Stdio::piped());
+            squatter.args(["-c", SQUATTER, &format!("decant/0/{}", cell.name)]).stdout(Stdio::piped());
             let mut squatter = squatter.spawn().unwrap();
             squatter.stdout.as_mut().unwrap().read_exact(&mut [0; 1]).unwrap();
             Some(Box::new((Ended(squatter), Removed(link))))
