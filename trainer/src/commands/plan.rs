@@ -143,7 +143,8 @@ pub fn propose(usable: &UsableEpisodes, holds_ml: Option<f64>, wish: &Wish) -> R
         let spans = usable.episodes.iter().map(|e| Span::of_episode(e, &fit.calibration)).collect();
         (Foresight::new(&fit.model, fit.calibration, holds_ml, wish.alpha_max_deg, data::rate_hz(&usable.episodes)), spans)
     };
-    let found = plan(&vessel, &weighed, wish);
+    let weights_g: Vec<f64> = usable.episodes.iter().map(|e| e.weight_g).collect();
+    let found = plan(&vessel, &weighed, &weights_g, wish);
     if !found.candidates.is_empty() {
         return Ok(found);
     }

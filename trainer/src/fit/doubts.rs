@@ -10,11 +10,11 @@ use shared::estimator::vessel::{CapacityCurve, KNOTS, Vessel, knot_deg};
 use super::fitted::Fitted;
 use super::unknowns::{AREA_EXPONENT, DELAY, LOG_C, LOG_WEIR, SHARED, VESSEL, model_of};
 
-/// Outflow at which the camera's gain is judged, ml a frame: that of controlled pours. From the prototype's simulations; the demos pour as fast.
+/// Outflow at which the camera's gain is judged, ml a frame at 30 frames a second: that of controlled pours. From the prototype's simulations; the demos pour as fast.
 const JUDGED_AT_ML: f64 = 0.7;
 /// How much the flow factor changes from pour to pour (log). From the prototype; no other measurement is recorded.
 const FLOW_FACTOR_SD: f64 = 0.1;
-/// How much the delay changes from pour to pour. From the prototype; no other measurement is recorded.
+/// How much the delay changes from pour to pour, frames at 30 a second. From the prototype; no other measurement is recorded.
 const DELAY_SD_FRAMES: f64 = 0.3;
 /// How much the gain may change from pour to pour (log). From the prototype; no other measurement is recorded.
 const GAIN_SD: f64 = 0.02;
@@ -38,7 +38,7 @@ const NUDGE: f64 = 1e-4;
 
 /// The logarithm of the area that shows [`JUDGED_AT_ML`].
 fn log_area_judged(fitted: &Fitted) -> f64 {
-    (JUDGED_AT_ML.ln() - fitted.found.shared[LOG_C]) / fitted.found.shared[AREA_EXPONENT].max(0.2)
+    ((JUDGED_AT_ML / fitted.slower).ln() - fitted.found.shared[LOG_C]) / fitted.found.shared[AREA_EXPONENT].max(0.2)
 }
 
 /// How far an explanation is doubted.
@@ -90,7 +90,7 @@ pub fn unknowns(fitted: &Fitted, doubt: Doubt) -> UnknownsCovariance {
     }
     let shared = fitted.covariance.view((0, 0), (SHARED, SHARED));
     let mut covariance = &slopes * (shared * doubt.scale) * slopes.transpose();
-    for (k, sd) in [(FLOW_FACTOR, FLOW_FACTOR_SD), (GAIN, doubt.gain_sd), (EXTRA_DELAY, DELAY_SD_FRAMES)] {
+    for (k, sd) in [(FLOW_FACTOR, FLOW_FACTOR_SD), (GAIN, doubt.gain_sd), (EXTRA_DELAY, DELAY_SD_FRAMES * fitted.slower)] {
         covariance[(k, k)] += sd * sd;
     }
     // In the camera's ml, capacity and flow carry its gain.

@@ -19,10 +19,12 @@ pub struct Fitted {
     pub covariance: DMatrix<f64>,
     /// The model of the unknowns that all episodes share.
     pub model: FlowModel,
-    /// Logarithm of the evidence, up to a constant that both explanations share.
+    /// Logarithm of the evidence, up to a constant that both explanations share; minus infinity for a solution whose doubt cannot be told.
     pub log_evidence: f64,
     /// Sum of the squared residuals.
     pub cost: f64,
+    /// Frames of the episodes for one at 30 frames a second.
+    pub slower: f64,
 }
 
 impl Fitted {
@@ -36,6 +38,7 @@ impl Fitted {
             model: problem.model_of(&found.shared),
             log_evidence: -0.5 * cost + problem.priors.vessel.half_log_precision - half_log_det,
             cost,
+            slower: problem.priors.slower(),
         }
     }
 
@@ -52,20 +55,35 @@ impl Fitted {
     }
 }
 
-/// Half of the logarithm of a positive definite matrix's determinant.
+/// Half of the logarithm of a positive definite matrix's determinant; infinite for any other.
 fn half_log_determinant(matrix: &DMatrix<f64>) -> f64 {
     let mut damped = matrix.clone();
     for k in 0..damped.nrows() {
         damped[(k, k)] += 1e-9;
     }
-    damped.cholesky().map_or(0.0, |c| c.l_dirty().diagonal().iter().map(|d| d.ln()).sum())
+    damped.cholesky().map_or(f64::INFINITY, |c| c.l_dirty().diagonal().iter().map(|d| d.ln()).sum())
 }
 
-/// The inverse of a matrix J'J, or a wide diagonal matrix where it has none.
+/// The inverse of a matrix J'J. Where it has none nothing is known: each logarithm may be off by a factor of e.
 fn inverse(matrix: &DMatrix<f64>) -> DMatrix<f64> {
     let mut damped = matrix.clone();
     for k in 0..damped.nrows() {
         damped[(k, k)] += 1e-9;
     }
-    damped.cholesky().map_or_else(|| DMatrix::identity(matrix.nrows(), matrix.ncols()) * 0.01, |c| c.inverse())
+    damped.cholesky().map_or_else(|| DMatrix::identity(matrix.nrows(), matrix.ncols()), |c| c.inverse())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Protects the choice between two vessels: a solution whose matrix is none of a sum of squares has no evidence and is in doubt, instead of the most
+    /// evidence and next to no doubt.
+    #[test]
+    fn a_solution_that_cannot_be_doubted_has_no_evidence() {
+        let good = DMatrix::from_diagonal_element(3, 3, 100.0);
+        let failed = DMatrix::from_diagonal_element(3, 3, -1.0);
+        assert!(half_log_determinant(&good).is_finite() && half_log_determinant(&failed) == f64::INFINITY);
+        assert!(inverse(&failed)[(0, 0)] > 50.0 * inverse(&good)[(0, 0)]);
+    }
 }

@@ -7,7 +7,7 @@ use serde::Serialize;
 use shared::gaussian_curve::Curve;
 use shared::limits::Limits;
 
-use super::doubt::Doubt;
+use super::doubt::{Doubt, gain_sd};
 use super::foresight::Foresight;
 use super::span::Span;
 
@@ -162,17 +162,24 @@ fn mean_sd_ml(doubt: &Doubt, pours: &[Span]) -> f64 {
     pours.iter().map(|span| doubt.sd_ml(span)).sum::<f64>() / pours.len() as f64
 }
 
-/// The doubt that is left by what was weighed.
-pub fn doubt_after(weighed: &[Span]) -> Doubt {
+/// The logarithm of the area at which most was weighed.
+fn log_area(weighed: &[Span]) -> f64 {
     let mut areas: Vec<f64> = weighed.iter().filter_map(Span::median_area_px2).map(f64::ln).collect();
     areas.sort_by(f64::total_cmp);
-    let log_area = areas.get(areas.len() / 2).copied().unwrap_or(LOG_AREA_UNSEEN);
-    weighed.iter().fold(Doubt::before(log_area), |doubt, span| doubt.weighed(span))
+    areas.get(areas.len() / 2).copied().unwrap_or(LOG_AREA_UNSEEN)
 }
 
-/// Proposes what to weigh next, after what was weighed. The candidates are empty if the vessel allows none, or no pour to come is foreseen.
-pub fn plan(vessel: &Foresight, weighed: &[Span], wish: &Wish) -> Plan {
-    let doubt = doubt_after(weighed);
+/// The doubt that is left by what was weighed, g each.
+fn doubt_after(weighed: &[Span], weights_g: &[f64]) -> Doubt {
+    let log_area = log_area(weighed);
+    let before = Doubt::before(log_area, gain_sd(log_area, weighed, weights_g));
+    weighed.iter().fold(before, |doubt, span| doubt.weighed(span))
+}
+
+/// Proposes what to weigh next, after streams that were weighed with `weights_g`. The candidates are empty if the vessel allows none, or no pour to come
+/// is foreseen.
+pub fn plan(vessel: &Foresight, weighed: &[Span], weights_g: &[f64], wish: &Wish) -> Plan {
+    let doubt = doubt_after(weighed, weights_g);
     let to_come = pours_to_come(vessel, wish);
     if to_come.is_empty() {
         return Plan { sd_now_ml: 0.0, candidates: Vec::new() };
@@ -199,8 +206,13 @@ mod tests {
 
     const WISH: Wish = Wish { goal_max_ml: 250.0, alpha_max_deg: 105.0, limits: Limits::DEFAULT, period_ns: 33_333_333 };
 
+    /// Weights that say just what the streams show, g.
+    fn volumes(weighed: &[Span]) -> Vec<f64> {
+        weighed.iter().map(Span::volume_ml).collect()
+    }
+
     fn next(vessel: &Foresight, weighed: &[Span]) -> (Plan, Candidate) {
-        let plan = plan(vessel, weighed, &WISH);
+        let plan = plan(vessel, weighed, &volumes(weighed), &WISH);
         let first = plan.candidates[0];
         (plan, first)
     }
@@ -223,7 +235,7 @@ mod tests {
             let (plan, first) = next(&vessel, &weighed);
             sds.push(plan.sd_now_ml);
             assert!(first.sd_after_ml < plan.sd_now_ml, "{plan:?}");
-            let (doubt, to_come) = (doubt_after(&weighed), pours_to_come(&vessel, &WISH));
+            let (doubt, to_come) = (doubt_after(&weighed, &volumes(&weighed)), pours_to_come(&vessel, &WISH));
             let possible = if weighed.len() < CURVES_FIRST { curves(&vessel, &WISH) } else { pours(&vessel, &WISH) };
             let least = possible.iter().map(|(_, span)| mean_sd_ml(&doubt.weighed(span), &to_come)).fold(f64::MAX, f64::min);
             assert!(first.sd_after_ml < least + 1e-9, "another one leaves {least} ml: {plan:?}");
@@ -244,8 +256,8 @@ mod tests {
         let (low, high) = fills.iter().fold((f64::MAX, 0.0f64), |(l, h), f| (l.min(*f), h.max(*f)));
         assert!(high - low >= 100.0, "{fills:?}");
         let alike: Vec<Span> = (0..5).map(|_| vessel.curve(450.0, vessel.onset_deg(450.0) + 12.0, 0.25)).collect();
-        let by_plan = mean_sd_ml(&doubt_after(&weighed), &pours_to_come(&vessel, &WISH));
-        let by_habit = mean_sd_ml(&doubt_after(&alike), &pours_to_come(&vessel, &WISH));
+        let by_plan = mean_sd_ml(&doubt_after(&weighed, &volumes(&weighed)), &pours_to_come(&vessel, &WISH));
+        let by_habit = mean_sd_ml(&doubt_after(&alike, &volumes(&alike)), &pours_to_come(&vessel, &WISH));
         assert!(by_plan < 0.8 * by_habit, "{by_plan} {by_habit} {sds:?}");
     }
 
@@ -269,7 +281,7 @@ mod tests {
             let own = vessel.curve(0.9 * holds_ml, vessel.onset_deg(0.9 * holds_ml) + 12.0, 0.25);
             let mut weighed = if holds_ml < least_ml { vec![own; CURVES_FIRST] } else { Vec::new() };
             for _ in 0..4 {
-                let found = plan(&vessel, &weighed, &wish);
+                let found = plan(&vessel, &weighed, &volumes(&weighed), &wish);
                 let first = *found.candidates.first().unwrap_or_else(|| panic!("{holds_ml}: {wish:?} after {}", weighed.len()));
                 let (fill_ml, lambda_deg) = match first.next {
                     Proposal::Curve { fill_ml, lambda_deg, .. } => (fill_ml, lambda_deg),
