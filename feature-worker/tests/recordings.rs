@@ -164,6 +164,59 @@ fn a_recording_without_a_length_is_walked_through() -> Outcome {
     Ok(())
 }
 
+/// Where the pictures of a Matroska file lie: of each its element's first byte, and its contents.
+fn blocks(bytes: &[u8]) -> Vec<(usize, std::ops::Range<usize>)> {
+    let mut at = find(bytes, &[0x1f, 0x43, 0xb6, 0x75], 0);
+    let mut all = Vec::new();
+    while at < bytes.len() {
+        let id = bytes[at].leading_zeros() as usize + 1;
+        let size = bytes[at + id].leading_zeros() as usize + 1;
+        let first = u64::from(bytes[at + id]) & (0xff >> size);
+        let length = bytes[at + id + 1..at + id + size].iter().fold(first, |v, b| v << 8 | u64::from(*b)) as usize;
+        let begin = at + id + size;
+        match bytes[at..at + id] {
+            // A cluster is walked into.
+            [0x1f, 0x43, 0xb6, 0x75] => at = begin,
+            [0xa3] => {
+                all.push((at, begin..begin + length));
+                at = begin + length;
+            }
+            _ => at = begin + length,
+        }
+    }
+    all
+}
+
+/// Protects who measures a Matroska file that is as long as it says and has holes all the same: one that ends before its own duration is refused, and so is
+/// one in which pictures that cannot be decoded, or that are gone, are missing between others.
+#[test]
+fn a_matroska_file_with_holes_is_said() -> Outcome {
+    let directory = tempfile::tempdir()?;
+    let path = directory.path().join("holes.mkv");
+    video(&path, ['m', 'p', '4', 'v'], 30.0)?;
+    let whole = std::fs::read(&path)?;
+    let pictures = blocks(&whole);
+    assert_eq!(pictures.len() as i32, FRAMES);
+    // EBML's Void takes an element's place.
+    let without = |gone: &[usize]| {
+        let mut bytes = whole.clone();
+        gone.iter().for_each(|k| bytes[pictures[*k].0] = 0xec);
+        bytes
+    };
+    let mut damaged = whole.clone();
+    damaged[pictures[9].1.clone()].fill(0);
+    let between = "frames are missing between its";
+    for (bytes, says) in
+        [(damaged, between), (without(&(12..FRAMES as usize).collect::<Vec<_>>()), "ends after frame 12"), (without(&[9, 10]), between)]
+    {
+        std::fs::write(&path, &bytes)?;
+        refused(&inspect(directory.path(), &[&path], &[])?, &["holes.mkv", says, "--partial"]);
+        let (part, said) = report(&inspect(directory.path(), &[&path], &["--partial"])?)?;
+        assert!(part["frames"].as_i64() < Some(i64::from(FRAMES)) && said.contains(says), "{part} {said}");
+    }
+    Ok(())
+}
+
 /// Protects the controller, which counts time in frames: a recording that is played at another rate than `camera.fps`, by more than 5 %, is refused
 /// with the rate to write. One that is nearer is played.
 #[test]

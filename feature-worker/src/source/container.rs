@@ -21,6 +21,12 @@ const NO_SHEAR: f64 = 0.01;
 const SEGMENT: u32 = 0x1853_8067;
 /// Matroska's element that holds the blocks of some seconds (RFC 9559).
 const CLUSTER: u32 = 0x1f43_b675;
+/// Matroska's element that says how long the file is (RFC 9559).
+const INFO: u32 = 0x1549_a966;
+/// Matroska's element that says what tracks there are (RFC 9559).
+const TRACKS: u32 = 0x1654_ae6b;
+/// The largest of these two that is read, bytes. Chosen by hand: they have some hundred.
+const ABOUT_MOST: u64 = 1 << 20;
 /// The longest head of an element of Matroska, bytes: 4 of its number and 8 of its length (RFC 8794).
 const ELEMENT_HEAD: u64 = 12;
 
@@ -96,6 +102,8 @@ pub(super) struct Container {
     pub end_s: Option<f64>,
     /// Time from one picture to the next where it is always the same, s.
     pub period_s: Option<f64>,
+    /// The usual time from one picture to the next, s, where the file says no more: it may be a mean.
+    pub usual_period_s: Option<f64>,
     /// Whether it is always the same, and OpenCV tells it as the rate.
     pub fixed_rate: bool,
     /// Whether OpenCV's number of frames is written in the file, and is not an estimate from its duration.
@@ -107,8 +115,16 @@ pub(super) struct Container {
 }
 
 impl Container {
-    const UNKNOWN: Self =
-        Self { turn: None, end_s: None, period_s: None, fixed_rate: false, counts_frames: false, missing_bytes: None, open_end: false };
+    const UNKNOWN: Self = Self {
+        turn: None,
+        end_s: None,
+        period_s: None,
+        usual_period_s: None,
+        fixed_rate: false,
+        counts_frames: false,
+        missing_bytes: None,
+        open_end: false,
+    };
 
     /// What the file at `path` says.
     pub(super) fn read(path: &Path) -> std::io::Result<Self> {
@@ -121,7 +137,7 @@ impl Container {
             (b"RIFF", _, b"AVI ") => avi(&mut file, size),
             ([0x1a, 0x45, 0xdf, 0xa3], ..) => matroska(&mut file, size),
             (_, b"ftyp" | b"moov" | b"mdat" | b"wide" | b"free" | b"skip", _) => mp4(&mut file, size),
-            _ => Ok(Self::UNKNOWN),
+            _ => Ok(Self { open_end: true, ..Self::UNKNOWN }),
         }
     }
 }
@@ -168,8 +184,51 @@ fn element_head(bytes: &[u8]) -> Option<(u32, u64, Option<u64>)> {
     Some((number, (length + more) as u64, contents))
 }
 
+/// The elements in `bytes`: number and contents. One that is cut ends them.
+fn elements(mut bytes: &[u8]) -> impl Iterator<Item = (u32, &[u8])> {
+    std::iter::from_fn(move || {
+        let (number, head, contents) = element_head(bytes)?;
+        let (head, contents) = (head as usize, usize::try_from(contents?).ok()?);
+        let inside = bytes.get(head..head.checked_add(contents)?)?;
+        bytes = &bytes[head + contents..];
+        Some((number, inside))
+    })
+}
+
+/// The contents of the first element with this number.
+fn element(bytes: &[u8], wanted: u32) -> Option<&[u8]> {
+    elements(bytes).find(|(number, _)| *number == wanted).map(|(_, contents)| contents)
+}
+
+/// A whole number of Matroska.
+fn whole(bytes: &[u8]) -> Option<u64> {
+    (bytes.len() <= 8).then(|| bytes.iter().fold(0, |value, byte| value << 8 | u64::from(*byte)))
+}
+
+/// How long the file is, s, by its element [`INFO`].
+fn matroska_end_s(info: &[u8]) -> Option<f64> {
+    // TimestampScale, ns, and Duration, in units of it.
+    let scale_ns = element(info, 0x2a_d7b1).map_or(Some(1_000_000), whole)?;
+    let duration = match *element(info, 0x4489)? {
+        [a, b, c, d] => f64::from(f32::from_be_bytes([a, b, c, d])),
+        [a, b, c, d, e, f, g, h] => f64::from_be_bytes([a, b, c, d, e, f, g, h]),
+        _ => return None,
+    };
+    Some(duration * scale_ns as f64 / 1e9).filter(|s| s.is_finite() && *s > 0.0)
+}
+
+/// Whether there is one track and no other that could be longer, and the usual time between its pictures, s.
+fn matroska_track(tracks: &[u8]) -> (bool, Option<f64>) {
+    // TrackEntry, TrackType (1 is video) and DefaultDuration, ns.
+    let all: Vec<&[u8]> = elements(tracks).filter(|(number, _)| *number == 0xae).map(|(_, track)| track).collect();
+    let Some(video) = all.iter().find(|track| element(track, 0x83).and_then(whole) == Some(1)) else { return (false, None) };
+    let period_s = element(video, 0x23_e383).and_then(whole).filter(|ns| *ns > 0).map(|ns| ns as f64 / 1e9);
+    (all.len() == 1, period_s)
+}
+
 fn matroska(file: &mut File, size: u64) -> std::io::Result<Container> {
     let mut known = Container::UNKNOWN;
+    let (mut end_s, mut alone, mut whole_segment) = (None, false, false);
     let mut at = 0u64;
     while at < size && known.missing_bytes.is_none() {
         file.seek(SeekFrom::Start(at))?;
@@ -187,16 +246,31 @@ fn matroska(file: &mut File, size: u64) -> std::io::Result<Container> {
                 known.open_end |= number == SEGMENT;
                 at += length;
             }
+            // The file is as long as it says; its first elements say more.
+            (SEGMENT, Some(_)) if missing(end, size).is_none() => {
+                whole_segment = true;
+                at += length;
+            }
+            (CLUSTER, Some(_)) if whole_segment => break,
             (_, None) => break,
-            (_, Some(_)) => {
+            (_, Some(contents)) => {
+                if matches!(number, INFO | TRACKS) && contents <= ABOUT_MOST {
+                    let mut about = Vec::new();
+                    file.seek(SeekFrom::Start(at + length))?;
+                    file.take(contents).read_to_end(&mut about)?;
+                    if number == INFO {
+                        end_s = matroska_end_s(&about);
+                    } else {
+                        (alone, known.usual_period_s) = matroska_track(&about);
+                    }
+                }
                 known.missing_bytes = missing(end, size);
                 at = end.unwrap_or(size);
             }
         }
-        if number == SEGMENT && contents.is_some() {
-            break;
-        }
     }
+    // A track of sound may last longer than the pictures.
+    known.end_s = end_s.filter(|_| alone);
     Ok(known)
 }
 
@@ -290,6 +364,18 @@ fn movie(moov: &[u8]) -> Container {
         known.end_s = scale.zip(duration.filter(|d| *d > 0)).map(|(scale, duration)| duration as f64 / scale);
     }
     known.period_s = period_s(track);
+    // In a file of fragments the index holds no pictures, and the length stands elsewhere, if anywhere.
+    if let Some(fragments) = inside(moov, &[b"mvex"]) {
+        let alone = boxes(moov).filter(|(kind, _)| kind == b"trak").count() == 1;
+        let scale = inside(moov, &[b"mvhd"]).and_then(scale_and_duration).map(|(scale, _)| scale);
+        let duration = inside(fragments, &[b"mehd"]).and_then(|header| match header.first()? {
+            0 => u32_at(header, 4).map(u64::from),
+            _ => u64_at(header, 4),
+        });
+        let told_s = scale.zip(duration.filter(|d| *d > 0 && alone)).map(|(scale, duration)| duration as f64 / scale);
+        known = Container { counts_frames: false, end_s: known.end_s.or(told_s), ..known };
+        known.open_end = known.end_s.is_none();
+    }
     known
 }
 

@@ -18,6 +18,11 @@ const END_PERIODS: f64 = 2.5;
 /// Periods between two pictures from which on one is missing where all periods are the same. Half way to the second.
 const GAP_PERIODS: f64 = 1.5;
 
+/// Steps from picture to picture of so many usual ones count as usual: a file's times are whole ms. Chosen by hand.
+const USUAL: (f64, f64) = (0.85, 1.15);
+/// Share of usual steps from which on a longer one is a gap, and not one of a rate that varies. Chosen by hand.
+const MOST_USUAL: f64 = 0.8;
+
 /// The times of a video's pictures.
 #[derive(Debug, Clone, Copy)]
 struct Times {
@@ -31,6 +36,11 @@ struct Times {
     step_ms: f64,
     /// Pictures so far, those that are missing too.
     count: u64,
+    /// What the file calls the usual time from picture to picture, ms; it may be a mean.
+    usual_ms: Option<f64>,
+    /// Number of steps of that time, and of those, for each that lasted longer, that would have fitted in between.
+    usual_steps: u64,
+    left_out: u64,
 }
 
 impl Times {
@@ -46,9 +56,19 @@ impl Times {
         let at_ms = if at_ms > self.last_ms && at_ms.is_finite() { at_ms } else { self.last_ms + usual_ms };
         let periods = self.period_ms.map_or(1.0, |period| (at_ms - self.last_ms) / period);
         let missing = if periods > GAP_PERIODS { periods.round() as u64 - 1 } else { 0 };
+        if let Some(periods) = self.usual_ms.map(|usual_ms| (at_ms - self.last_ms) / usual_ms) {
+            self.usual_steps += u64::from((USUAL.0..USUAL.1).contains(&periods));
+            self.left_out += if periods > GAP_PERIODS { periods.round() as u64 - 1 } else { 0 };
+        }
         (self.step_ms, self.last_ms) = (at_ms - self.last_ms, at_ms);
         self.count += 1 + missing;
         missing
+    }
+
+    /// Number of pictures that are missing between others, as far as the steps tell it: most are of the usual time, and some of several times that.
+    fn left_out(&self) -> u64 {
+        let steps = self.count.saturating_sub(1);
+        if self.usual_steps as f64 >= MOST_USUAL * steps as f64 { self.left_out } else { 0 }
     }
 
     /// The mean time from picture to picture, ms.
@@ -106,7 +126,9 @@ impl Video {
         let promised = (container.counts_frames && count >= 1.0).then_some(count as u64);
         let own_period = (rate_hz > 0.0).then(|| 1.0 / rate_hz).filter(|_| container.fixed_rate);
         let period_ms = container.period_s.or(own_period).map(|s| 1e3 * s);
-        let times = Times { period_ms, base_ms: 0.0, last_ms: 0.0, step_ms: 0.0, count: 0 };
+        let usual_ms = container.usual_period_s.map(|s| 1e3 * s);
+        let times =
+            Times { period_ms, base_ms: 0.0, last_ms: 0.0, step_ms: 0.0, count: 0, usual_ms, usual_steps: 0, left_out: 0 };
         let (picture, spare) = (Mat::default(), Mat::default());
         let path = path.into();
         Ok(Self { path, capture, container, turn, promised, rate_hz, times, decoded: 0, partial, remark: None, picture, spare })
@@ -177,6 +199,12 @@ impl Video {
                 "{}: {came} of its {promised} frames are shown; the others are cut out by its edit list, or damaged",
                 self.path
             ));
+        } else if self.times.left_out() > 0 {
+            let what = format!("{} frames are missing between its {came}: never recorded, or damaged", self.times.left_out());
+            if !self.partial {
+                return Err(self.incomplete(what));
+            }
+            self.remark = Some(format!("{}: {what}", self.path));
         } else if self.container.open_end {
             self.remark = Some(format!("{}: the file does not say its length, so whether its end is missing cannot be told", self.path));
         }

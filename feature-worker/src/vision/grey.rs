@@ -9,7 +9,9 @@ use opencv::prelude::*;
 const GREY_SHARE: f32 = 0.99;
 /// A sample has no colour when its parts differ by no more than this, grey levels. Chosen by hand: a level or two of rounding.
 const GREY_LEVELS: u8 = 2;
-/// A liquid of at least this saturation is not seen in grey pictures. Chosen by hand.
+/// The largest hue, OpenCV's: a liquid of any hue has those from 0 to this one. One that has a hue is not seen in grey pictures, however pale it is.
+pub(super) const ALL_HUES: f64 = 179.0;
+/// A liquid of any hue with at least this saturation is not seen there either. Chosen by hand.
 pub(super) const COLOURED_FROM: f64 = 20.0;
 /// Of this many samples, one is looked at to find out whether a picture is grey. Chosen by hand, for speed.
 const GREY_EVERY: usize = 5;

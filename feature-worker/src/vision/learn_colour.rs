@@ -9,6 +9,7 @@ use opencv::imgproc;
 use opencv::prelude::*;
 
 use super::geometry::Axes;
+use super::hues::ranges;
 
 // "Tuned" below means that the value was tuned on seeds 1 and 5001 to 5003 of `evaluate-camera`; see docs/VISION.md.
 // Lengths are px of a picture 640 px wide.
@@ -297,11 +298,14 @@ impl ColourLearner {
 
     /// What of the background lies inside `range` in the pictures in which nothing of these colours is at the lip but the rim's own light.
     pub fn dry_background(&self, range: Range) -> DryBackground {
+        // As the extractor judges it, which takes a liquid's colours to go on where light cuts them off.
+        let ranges = ranges(range.map(f64::from));
+        let is_liquid = |p: &Hsv| ranges.iter().any(|(low, high)| (0..3).all(|k| (low[k]..=high[k]).contains(&f64::from(p[k]))));
         // Of each picture: the share of the near pixels that is inside, and of how many far pixels how many are.
         let mut seen = Vec::new();
         let mut begins = [0, 0];
         for ends in &self.ends {
-            let inside = |pixels: &[Hsv]| pixels.iter().filter(|p| contains(range, **p)).count();
+            let inside = |pixels: &[Hsv]| pixels.iter().filter(|p| is_liquid(p)).count();
             let (near, far) = (&self.near.pixels[begins[0]..ends[0]], &self.far.pixels[begins[1]..ends[1]]);
             seen.push((inside(near) as f32 / near.len().max(1) as f32, inside(far), far.len()));
             begins = *ends;
@@ -341,4 +345,29 @@ fn mean_hue(pixels: &[Hsv]) -> f32 {
         (sin, cos) = (sin + a * f32::from(*s), cos + b * f32::from(*s));
     }
     sin.atan2(cos) * 180.0 / std::f32::consts::TAU
+}
+
+#[cfg(test)]
+mod tests {
+    use shared::config::Config;
+
+    use super::*;
+
+    /// Protects who calibrates before a bright background: what the extractor takes for the liquid where light cuts its colour off, as bright yellow for
+    /// orange, is told as background in the liquid's colours.
+    #[test]
+    fn background_in_the_colours_of_bright_liquid_counts() {
+        let config = Config::parse(include_str!("../../../config/sim.toml"), "config/sim.toml").expect("the shipped one");
+        let inside = |background: Hsv| {
+            let mut learner = ColourLearner::new(Axes::new(&config.image));
+            for _ in 0..10 {
+                (0..100).for_each(|_| learner.near.add([0, 0, 120]));
+                (0..100).for_each(|_| learner.far.add(background));
+                learner.ends.push([learner.near.pixels.len(), learner.far.pixels.len()]);
+            }
+            learner.near_background([8, 194, 54, 22, 255, 255]).inside
+        };
+        assert_eq!([inside([27, 239, 253]), inside([15, 239, 180])], [1.0, 1.0], "as bright orange, and as orange");
+        assert_eq!([inside([27, 239, 180]), inside([60, 239, 253])], [0.0, 0.0], "too dark for it, and green");
+    }
 }

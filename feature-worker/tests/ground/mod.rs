@@ -422,3 +422,20 @@ fn a_root_does_not_teach_what_goes_on_from_it() -> Result<(), ExtractError> {
     }
     Ok(())
 }
+
+/// Protects pours that a camera without colour sees: a liquid that has a hue is not "nothing" there, however pale it is. The colours are those that
+/// calibration gives for pale juice.
+#[test]
+fn a_pale_liquid_in_grey_pictures_is_not_called_absent() -> Result<(), ExtractError> {
+    let colour_hsv = [5, 15, 40, 25, 255, 255];
+    let mut extractor = Extractor::new(&camera(), &ImageConfig { colour_hsv, ..image_config(LiquidMethod::Colour) })?;
+    for i in 0..50 {
+        let picture = if i < 20 { dry(0.0, i)? } else { blue(&[stream(4.0 * (i - 15) as f32, 60.0)], i)? };
+        let (mut grey, mut shown) = (Mat::default(), Mat::default());
+        imgproc::cvt_color_def(&picture, &mut grey, imgproc::COLOR_BGR2GRAY)?;
+        imgproc::cvt_color_def(&grey, &mut shown, imgproc::COLOR_GRAY2BGR)?;
+        let measured = measure(&mut extractor, &shown)?;
+        assert_eq!((measured.area_px2, measured.doubt), (0.0, Doubt::ColoursChanged), "picture {i}");
+    }
+    Ok(())
+}
