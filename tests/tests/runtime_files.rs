@@ -422,7 +422,11 @@ fn two_cells_share_no_file() {
     std::fs::write(third.config(), other).expect("writable");
     let output = third.command("rt-controller", &["run"]);
     assert_eq!(output.status.code(), Some(5), "{}", said(&output));
-    assert!(said(&output).contains("error: controller.weights = ") && said(&output).contains("cell 'first' uses it as"), "{}", said(&output));
+    assert!(
+        said(&output).contains("error: controller.weights = ") && said(&output).contains("cell 'first' uses it as"),
+        "{}",
+        said(&output)
+    );
     assert_eq!(first.stop("rt-controller"), Some(0), "the first has not noticed anything");
 }
 

@@ -127,8 +127,7 @@ impl Video {
         let own_period = (rate_hz > 0.0).then(|| 1.0 / rate_hz).filter(|_| container.fixed_rate);
         let period_ms = container.period_s.or(own_period).map(|s| 1e3 * s);
         let usual_ms = container.usual_period_s.map(|s| 1e3 * s);
-        let times =
-            Times { period_ms, base_ms: 0.0, last_ms: 0.0, step_ms: 0.0, count: 0, usual_ms, usual_steps: 0, left_out: 0 };
+        let times = Times { period_ms, base_ms: 0.0, last_ms: 0.0, step_ms: 0.0, count: 0, usual_ms, usual_steps: 0, left_out: 0 };
         let (picture, spare) = (Mat::default(), Mat::default());
         let path = path.into();
         Ok(Self { path, capture, container, turn, promised, rate_hz, times, decoded: 0, partial, remark: None, picture, spare })

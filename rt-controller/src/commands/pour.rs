@@ -102,7 +102,11 @@ impl Foreseen {
 
     /// All that is said before the pour.
     fn lines(&self, goal_ml: f32) -> impl Iterator<Item = String> {
-        self.line(goal_ml).into_iter().chain(self.unseen_line()).chain(self.unbounded_line.map(|line| format!("warning: {line}"))).chain(self.pictures_line.map(str::to_owned))
+        self.line(goal_ml)
+            .into_iter()
+            .chain(self.unseen_line())
+            .chain(self.unbounded_line.map(|line| format!("warning: {line}")))
+            .chain(self.pictures_line.map(str::to_owned))
     }
 
     /// What a camera that sees no stream at all could cost, where no tilt bounds it.
