@@ -19,7 +19,7 @@ use shared::messages::{Doubt, Feature, FrameHeader, LAYOUT_VERSION, PixelFormat}
 use shared::os;
 use shared::speaker::Speaker;
 
-use crate::recorder::Recorder;
+use crate::recorder::{Recorder, RecorderError};
 use crate::source::{Frame, FrameStream, SILENT_NS, Source, SourceError, StreamEvent, WAIT};
 use crate::vision::{Extractor, Image, Measurement, PictureTime, RoomBeside, room_beside};
 
@@ -110,7 +110,10 @@ fn measure_until_stopped(
     };
     // Threads inherit the core and the priority, so the other threads start first.
     let its = Arc::clone(speaker);
-    let recorder = Recorder::start(config, move |level, text| its.say(level, text)).or_exit(exit::FAILED)?;
+    let recorder = Recorder::start(config, move |level, text| its.say(level, text)).map_err(|e| match e {
+        RecorderError::Ipc(e) => e.into(),
+        e => failure(exit::FAILED, e),
+    })?;
     let latest = Arc::new(ArrayQueue::new(1));
     let looks = Arc::new(AtomicU64::new(0));
     let printer =

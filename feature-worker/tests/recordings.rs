@@ -3,6 +3,7 @@
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::too_many_lines, clippy::type_complexity)]
 
 mod drawn;
+mod matroska;
 
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
@@ -120,100 +121,6 @@ fn a_picture_that_cannot_be_decoded_is_said() -> Outcome {
     std::fs::write(&path, &gone)?;
     refused(&inspect(directory.path(), &[&path], &[])?, &["hole.avi", "frame 22 of 24", "--partial"]);
     assert_eq!(report(&inspect(directory.path(), &[&path], &["--partial"])?)?.0["frames"], FRAMES - 2);
-    Ok(())
-}
-
-/// Protects who records into a pipe, as live recorders do: a Matroska file that does not say its length is taken with a remark, and one that is
-/// cut in the middle of a block is refused, whatever stands before its pictures and whether its clusters say their lengths. A long header hides
-/// no length.
-#[test]
-fn a_recording_without_a_length_is_walked_through() -> Outcome {
-    let directory = tempfile::tempdir()?;
-    let path = directory.path().join("live.mkv");
-    video(&path, ['m', 'p', '4', 'v'], 30.0)?;
-    let whole = std::fs::read(&path)?;
-    let segment = find(&whole, &[0x18, 0x53, 0x80, 0x67], 0) + 4;
-    let cluster = find(&whole, &[0x1f, 0x43, 0xb6, 0x75], 0) + 4;
-    let length = |at: usize| whole[at].leading_zeros() as usize + 1;
-    let unknown = |bytes: &mut [u8], at: usize| {
-        let length = length(at);
-        bytes[at..at + length].fill(0xff);
-        bytes[at] = 0xff >> (length - 1);
-    };
-    for clusters_too in [false, true] {
-        let mut live = whole.clone();
-        unknown(&mut live, segment);
-        if clusters_too {
-            unknown(&mut live, cluster);
-        }
-        std::fs::write(&path, &live)?;
-        let (all, said) = report(&inspect(directory.path(), &[&path], &[])?)?;
-        assert!(all["frames"] == FRAMES && said.contains("live.mkv: the file does not say its length"), "{all} {said}");
-        std::fs::write(&path, &live[..live.len() * 2 / 3])?;
-        refused(&inspect(directory.path(), &[&path], &[])?, &["live.mkv", "ends after frame", "truncated", "--partial"]);
-    }
-    // A header of more than a hundred bytes: its length takes two bytes, and nothing (EBML's Void) follows what it said.
-    let nothing = [&[0xec, 0x80 + 100][..], &[0; 100]].concat();
-    let header = u16::from(whole[4] & 0x7f) + nothing.len() as u16;
-    let padded = [&whole[..4], &(0x4000 | header).to_be_bytes(), &whole[5..segment - 4], &nothing, &whole[segment - 4..]].concat();
-    assert_eq!(length(4), 1);
-    std::fs::write(&path, &padded)?;
-    assert_eq!(report(&inspect(directory.path(), &[&path], &[])?)?.0["frames"], FRAMES);
-    std::fs::write(&path, &padded[..padded.len() * 2 / 3])?;
-    refused(&inspect(directory.path(), &[&path], &[])?, &["live.mkv", "ends after frame", "truncated"]);
-    Ok(())
-}
-
-/// Where the pictures of a Matroska file lie: of each its element's first byte, and its contents.
-fn blocks(bytes: &[u8]) -> Vec<(usize, std::ops::Range<usize>)> {
-    let mut at = find(bytes, &[0x1f, 0x43, 0xb6, 0x75], 0);
-    let mut all = Vec::new();
-    while at < bytes.len() {
-        let id = bytes[at].leading_zeros() as usize + 1;
-        let size = bytes[at + id].leading_zeros() as usize + 1;
-        let first = u64::from(bytes[at + id]) & (0xff >> size);
-        let length = bytes[at + id + 1..at + id + size].iter().fold(first, |v, b| v << 8 | u64::from(*b)) as usize;
-        let begin = at + id + size;
-        match bytes[at..at + id] {
-            // A cluster is walked into.
-            [0x1f, 0x43, 0xb6, 0x75] => at = begin,
-            [0xa3] => {
-                all.push((at, begin..begin + length));
-                at = begin + length;
-            }
-            _ => at = begin + length,
-        }
-    }
-    all
-}
-
-/// Protects who measures a Matroska file that is as long as it says and has holes all the same: one that ends before its own duration is refused, and so is
-/// one in which pictures that cannot be decoded, or that are gone, are missing between others.
-#[test]
-fn a_matroska_file_with_holes_is_said() -> Outcome {
-    let directory = tempfile::tempdir()?;
-    let path = directory.path().join("holes.mkv");
-    video(&path, ['m', 'p', '4', 'v'], 30.0)?;
-    let whole = std::fs::read(&path)?;
-    let pictures = blocks(&whole);
-    assert_eq!(pictures.len() as i32, FRAMES);
-    // EBML's Void takes an element's place.
-    let without = |gone: &[usize]| {
-        let mut bytes = whole.clone();
-        gone.iter().for_each(|k| bytes[pictures[*k].0] = 0xec);
-        bytes
-    };
-    let mut damaged = whole.clone();
-    damaged[pictures[9].1.clone()].fill(0);
-    let between = "frames are missing between its";
-    for (bytes, says) in
-        [(damaged, between), (without(&(12..FRAMES as usize).collect::<Vec<_>>()), "ends after frame 12"), (without(&[9, 10]), between)]
-    {
-        std::fs::write(&path, &bytes)?;
-        refused(&inspect(directory.path(), &[&path], &[])?, &["holes.mkv", says, "--partial"]);
-        let (part, said) = report(&inspect(directory.path(), &[&path], &["--partial"])?)?;
-        assert!(part["frames"].as_i64() < Some(i64::from(FRAMES)) && said.contains(says), "{part} {said}");
-    }
     Ok(())
 }
 

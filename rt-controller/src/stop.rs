@@ -34,6 +34,10 @@ use crate::robot_thread::RobotNote;
 const BEAT: Timespec = Timespec { tv_sec: 0, tv_nsec: 20_000_000 };
 /// Number of clients that may be connected at once. Chosen by hand; one more replaces the oldest, so that an abort always gets in.
 const CLIENTS: usize = 16;
+/// Rounds in which a socket without a free place is tried again. Chosen by hand: a controller frees a place within 1 ms.
+pub(crate) const ROUNDS: u32 = 5;
+/// Pause between these rounds. Chosen by hand: all of them take 20 ms.
+pub(crate) const ROUND: Duration = Duration::from_millis(4);
 /// Longest line from a client, bytes.
 const LINE_MAX: usize = 64;
 /// How long the other threads may take to end once the loop has ended. Chosen by hand: a disk that works is done much sooner.
@@ -46,7 +50,7 @@ pub struct StopAnswer {
     /// Process number of the controller, as it sees it itself.
     pub pid: u32,
     /// What the controller is doing.
-    #[serde(deserialize_with = "known_phase")]
+    #[serde(default = "moving", deserialize_with = "known_phase")]
     pub phase: Phase,
     /// Measured alpha, degrees; `None` without a robot.
     pub alpha_deg: Option<f32>,
@@ -58,10 +62,15 @@ pub struct StopAnswer {
     pub refused: String,
 }
 
+/// The phase of an answer that does not say it.
+fn moving() -> Phase {
+    Phase::Pouring
+}
+
 /// A phase by its name. A controller of another version may be in one that is not known here, and may move in it.
 fn known_phase<'de, D: serde::Deserializer<'de>>(from: D) -> Result<Phase, D::Error> {
     let name = serde_json::Value::deserialize(from)?;
-    Ok(Phase::deserialize(name).unwrap_or(Phase::Pouring))
+    Ok(Phase::deserialize(name).unwrap_or_else(|_| moving()))
 }
 
 /// Name of the abstract socket of user `uid`'s cell `name`.
@@ -89,6 +98,18 @@ pub(crate) fn listener(uid: u32, name: &str) -> Result<u32, bool> {
     peer_uid(&socket).ok_or(false)
 }
 
+/// Whether a controller of this user listens at the abstract socket of its cell `name`. One frees a place within 1 ms, so a socket whose places stay taken
+/// is no controller's that works.
+fn is_ours(name: &str) -> bool {
+    for _ in 0..ROUNDS {
+        match listener(own_uid(), name) {
+            Err(true) => std::thread::sleep(ROUND),
+            other => return other == Ok(own_uid()),
+        }
+    }
+    false
+}
+
 impl StopSockets {
     /// Opens the sockets of the cell `name` in `directory`. Fails if there is no way to stop a motion, or if another controller of the cell is there.
     /// `say` gets a line if only the file could be had.
@@ -99,7 +120,7 @@ impl StopSockets {
         let fail = |e: std::io::Error| failure(exit::FAILED, format!("{}: {e}: no way to stop a motion, so none is begun", path.display()));
         // Of two that start at once, one gets the name.
         let nameless = SocketAddr::from_abstract_name(abstract_name(own_uid(), name)).and_then(|a| UnixListener::bind_addr(&a));
-        if nameless.is_err() && listener(own_uid(), name) == Ok(own_uid()) {
+        if nameless.is_err() && is_ours(name) {
             let what = format!("another rt-controller of cell '{name}' is running: stop it first (its runtime directory was deleted)");
             return Err(failure(exit::REFUSED, what));
         }

@@ -19,16 +19,12 @@ use shared::os::peer;
 use shared::runtime_dir::{Place, bases, own_uid};
 
 use crate::claim;
-use crate::stop::{StopAnswer, abstract_name, listener};
+use crate::stop::{ROUND, ROUNDS, StopAnswer, abstract_name, listener};
 
 /// Longest wait for an answer. Chosen by hand: the controller's thread answers at once.
 const ANSWER: Duration = Duration::from_secs(1);
 /// Longest answer that is read, bytes. Chosen by hand: ten times the longest one.
 const ANSWER_MAX: u64 = 4096;
-/// Rounds in which sockets without a free place are tried again. Chosen by hand: a controller frees a place within 1 ms.
-const ROUNDS: u32 = 5;
-/// Pause between these rounds. Chosen by hand: all of them take 20 ms.
-const ROUND: Duration = Duration::from_millis(4);
 /// The most cells that are asked by their names alone. Chosen by hand: a machine has a few, and more would be somebody's names.
 const NAMES_MOST: usize = 64;
 
@@ -260,6 +256,8 @@ mod tests {
     fn answers_of_other_versions_are_understood() {
         let older: StopAnswer = serde_json::from_str(r#"{"pid":7,"phase":"returning","alpha_deg":3.0}"#).unwrap();
         assert_eq!((older.pid, older.phase, older.upright, &*older.refused), (7, shared::messages::Phase::Returning, false, ""));
+        let silent: StopAnswer = serde_json::from_str(r#"{"pid":7}"#).unwrap();
+        assert_eq!(silent.phase, shared::messages::Phase::Pouring, "it may move");
         let newer: StopAnswer = serde_json::from_str(r#"{"pid":7,"phase":"stirring","upright":true,"speed":[1,2]}"#).unwrap();
         assert_eq!((newer.phase, newer.upright), (shared::messages::Phase::Pouring, true));
     }

@@ -58,7 +58,7 @@ pub enum IpcError {
 }
 
 impl From<IpcError> for Failure {
-    /// The failure of whichever program meets this error: all of them end with one exit code for one cause.
+    /// The failure of a command that meets this error: all of them end with one exit code for one cause.
     fn from(e: IpcError) -> Self {
         let code = if matches!(e, IpcError::Directory(_)) { exit::BAD_INPUT } else { exit::UNREACHABLE };
         failure(code, e)

@@ -355,8 +355,8 @@ impl Conclusion<'_> {
     fn fit(&self) -> Fit {
         let frames: usize = self.episodes.iter().map(PreparedEpisode::frames_with_flow).sum();
         let odds = (self.tight.log_evidence - self.wide.log_evidence).clamp(-50.0, 50.0);
-        let shares = self.wide.log_evidence.is_finite().then_some(1.0 / (1.0 + (-odds).exp()));
-        let tight_share = shares.filter(|share| *share >= TIGHT_SHARE_MIN).unwrap_or(0.0);
+        // Where neither has evidence the odds are no number, and the straight vessel has no weight.
+        let tight_share = Some(1.0 / (1.0 + (-odds).exp())).filter(|share| *share >= TIGHT_SHARE_MIN).unwrap_or(0.0);
         let gains: Vec<f64> =
             self.tempered.found.own.iter().zip(self.episodes).map(|(own, e)| own[CAMERA_GAIN] - e.log_camera_gain).collect();
         let exact = self.camera.linear.is_some();

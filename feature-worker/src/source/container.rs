@@ -27,6 +27,8 @@ const INFO: u32 = 0x1549_a966;
 const TRACKS: u32 = 0x1654_ae6b;
 /// The largest of these two that is read, bytes. Chosen by hand: they have some hundred.
 const ABOUT_MOST: u64 = 1 << 20;
+/// Part of a cluster that is read for its time, bytes. Chosen by hand: it takes ten, and a checksum before it six.
+const CLUSTER_HEAD: u64 = 32;
 /// The longest head of an element of Matroska, bytes: 4 of its number and 8 of its length (RFC 8794).
 const ELEMENT_HEAD: u64 = 12;
 
@@ -205,8 +207,8 @@ fn whole(bytes: &[u8]) -> Option<u64> {
     (bytes.len() <= 8).then(|| bytes.iter().fold(0, |value, byte| value << 8 | u64::from(*byte)))
 }
 
-/// How long the file is, s, by its element [`INFO`].
-fn matroska_end_s(info: &[u8]) -> Option<f64> {
+/// When the file ends, by its element [`INFO`], in units of so many s.
+fn matroska_end(info: &[u8]) -> Option<(f64, f64)> {
     // TimestampScale, ns, and Duration, in units of it.
     let scale_ns = element(info, 0x2a_d7b1).map_or(Some(1_000_000), whole)?;
     let duration = match *element(info, 0x4489)? {
@@ -214,7 +216,15 @@ fn matroska_end_s(info: &[u8]) -> Option<f64> {
         [a, b, c, d, e, f, g, h] => f64::from_be_bytes([a, b, c, d, e, f, g, h]),
         _ => return None,
     };
-    Some(duration * scale_ns as f64 / 1e9).filter(|s| s.is_finite() && *s > 0.0)
+    Some((duration, scale_ns as f64 / 1e9)).filter(|(duration, _)| duration.is_finite() && *duration > 0.0)
+}
+
+/// When the cluster whose contents begin at `at` starts, in the file's units: its first element says it, or stands behind a checksum.
+fn cluster_start(file: &mut File, at: u64) -> std::io::Result<Option<u64>> {
+    let mut head = Vec::new();
+    file.seek(SeekFrom::Start(at))?;
+    file.take(CLUSTER_HEAD).read_to_end(&mut head)?;
+    Ok(element(&head, 0xe7).and_then(whole))
 }
 
 /// Whether there is one track and no other that could be longer, and the usual time between its pictures, s.
@@ -228,7 +238,7 @@ fn matroska_track(tracks: &[u8]) -> (bool, Option<f64>) {
 
 fn matroska(file: &mut File, size: u64) -> std::io::Result<Container> {
     let mut known = Container::UNKNOWN;
-    let (mut end_s, mut alone, mut whole_segment) = (None, false, false);
+    let (mut about_end, mut alone, mut whole_segment, mut start) = (None, false, false, None);
     let mut at = 0u64;
     while at < size && known.missing_bytes.is_none() {
         file.seek(SeekFrom::Start(at))?;
@@ -251,7 +261,10 @@ fn matroska(file: &mut File, size: u64) -> std::io::Result<Container> {
                 whole_segment = true;
                 at += length;
             }
-            (CLUSTER, Some(_)) if whole_segment => break,
+            (CLUSTER, Some(_)) if whole_segment => {
+                start = cluster_start(file, at + length)?;
+                break;
+            }
             (_, None) => break,
             (_, Some(contents)) => {
                 if matches!(number, INFO | TRACKS) && contents <= ABOUT_MOST {
@@ -259,7 +272,7 @@ fn matroska(file: &mut File, size: u64) -> std::io::Result<Container> {
                     file.seek(SeekFrom::Start(at + length))?;
                     file.take(contents).read_to_end(&mut about)?;
                     if number == INFO {
-                        end_s = matroska_end_s(&about);
+                        about_end = matroska_end(&about);
                     } else {
                         (alone, known.usual_period_s) = matroska_track(&about);
                     }
@@ -269,8 +282,8 @@ fn matroska(file: &mut File, size: u64) -> std::io::Result<Container> {
             }
         }
     }
-    // A track of sound may last longer than the pictures.
-    known.end_s = end_s.filter(|_| alone);
+    // A track of sound may last longer than the pictures. A recording that was cut out of another one does not begin at 0.
+    known.end_s = about_end.zip(start).filter(|_| alone).map(|((end, scale_s), start)| (end - start as f64) * scale_s);
     Ok(known)
 }
 
@@ -373,8 +386,8 @@ fn movie(moov: &[u8]) -> Container {
             _ => u64_at(header, 4),
         });
         let told_s = scale.zip(duration.filter(|d| *d > 0 && alone)).map(|(scale, duration)| duration as f64 / scale);
-        known = Container { counts_frames: false, end_s: known.end_s.or(told_s), ..known };
-        known.open_end = known.end_s.is_none();
+        // The track's own duration may be that of the first fragment alone.
+        known = Container { counts_frames: false, end_s: told_s, open_end: told_s.is_none(), ..known };
     }
     known
 }

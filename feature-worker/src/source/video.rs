@@ -199,11 +199,9 @@ impl Video {
                 self.path
             ));
         } else if self.times.left_out() > 0 {
-            let what = format!("{} frames are missing between its {came}: never recorded, or damaged", self.times.left_out());
-            if !self.partial {
-                return Err(self.incomplete(what));
-            }
-            self.remark = Some(format!("{}: {what}", self.path));
+            // A camera may have dropped them; the times of the others are right.
+            let left_out = self.times.left_out();
+            self.remark = Some(format!("{}: {left_out} frames are missing between its {came}: never recorded, or damaged", self.path));
         } else if self.container.open_end {
             self.remark = Some(format!("{}: the file does not say its length, so whether its end is missing cannot be told", self.path));
         }

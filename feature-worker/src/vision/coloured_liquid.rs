@@ -21,7 +21,7 @@ use super::coloured_edge;
 use super::confidence::Basis;
 use super::foreign::{self, FILLED, LEARN_FROM_PX, LEAVES_SHARE, Outline, Seen};
 use super::geometry::{Axes, Line, NEAR_PX, RAYS, RayGrid, distance};
-use super::grey::{ALL_HUES, COLOURED_FROM, is_grey};
+use super::grey::{is_grey, is_unseen_in_grey};
 use super::ground_beside::{InGlass, Place, Square};
 use super::ground_colours::{Ground, GroundColours};
 use super::hues::ranges;
@@ -140,7 +140,7 @@ impl ColouredLiquid {
             map_a,
             map_b,
             ranges,
-            needs_colour: colour[1] >= COLOURED_FROM || colour[0] != 0.0 || colour[3] != ALL_HUES,
+            needs_colour: is_unseen_in_grey(colour),
             area_min_px2: image.area_min_px2,
             ground: GroundColours::new(),
             ground_bgr: None,

@@ -134,16 +134,19 @@ fn doubts(usable: &UsableEpisodes, holds_ml: Option<f64>) -> Result<Vec<String>,
 /// # Errors
 /// One line, where nothing was weighed yet and nobody says what the vessel holds, or where nothing can be proposed.
 pub fn propose(usable: &UsableEpisodes, holds_ml: Option<f64>, wish: &Wish) -> Result<Plan, Failure> {
-    let (vessel, weighed) = if usable.episodes.is_empty() {
+    let (vessel, weighed, weights_g) = if usable.episodes.is_empty() {
         let what = "no episode was weighed yet: say what the vessel holds with --holds ML or [container] holds_ml";
         let holds_ml = holds_ml.ok_or_else(|| failure(exit::BAD_INPUT, what))?;
-        (Foresight::unknown(holds_ml, wish.alpha_max_deg), Vec::new())
+        (Foresight::unknown(holds_ml, wish.alpha_max_deg), Vec::new(), Vec::new())
     } else {
         let fit = fit::fit(&usable.episodes);
         let spans = usable.episodes.iter().map(|e| Span::of_episode(e, &fit.calibration)).collect();
-        (Foresight::new(&fit.model, fit.calibration, holds_ml, wish.alpha_max_deg, data::rate_hz(&usable.episodes)), spans)
+        // A gain that has changed is known, and no scatter: the spans are in the newest one's ml.
+        let gained = |k: usize| fit.changed_gain.map_or(0.0, |changed| changed.at(k) - changed.after).exp();
+        let weights_g = usable.episodes.iter().enumerate().map(|(k, e)| e.weight_g * gained(k)).collect();
+        let vessel = Foresight::new(&fit.model, fit.calibration, holds_ml, wish.alpha_max_deg, data::rate_hz(&usable.episodes));
+        (vessel, spans, weights_g)
     };
-    let weights_g: Vec<f64> = usable.episodes.iter().map(|e| e.weight_g).collect();
     let found = plan(&vessel, &weighed, &weights_g, wish);
     if !found.candidates.is_empty() {
         return Ok(found);
