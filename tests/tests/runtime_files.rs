@@ -133,7 +133,6 @@ fn a_prepared_directory_is_refused() {
             ("rt-controller", &["status"]),
             ("rt-controller", &["pour", "50"]),
             ("feature-worker", &["run"]),
-            ("operator-page", &["run"]),
         ] {
             let output = cell.command(name, words);
             let text = said(&output);
