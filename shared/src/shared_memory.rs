@@ -199,16 +199,22 @@ pub fn remove_of(directory: &Path) {
 
 /// Removes what dead processes of this user left in `/dev/shm`, of any cell.
 fn clear_dead() {
-    for lock in files("decant-") {
-        let name = lock.file_name().unwrap_or_default().to_string_lossy().into_owned();
-        let Some(token) = name.strip_prefix("decant-").and_then(|n| n.strip_suffix(".lock")) else { continue };
+    for (token, lock) in tokens() {
         if lock.symlink_metadata().is_ok_and(|m| m.uid() == own_uid())
             && let Ok(file) = open(&lock, false)
             && file.try_lock().is_ok()
         {
-            remove(token);
+            remove(&token);
         }
     }
+}
+
+/// The tokens of all cells of all users, each with its lock.
+fn tokens() -> impl Iterator<Item = (String, PathBuf)> {
+    files("decant-").into_iter().filter_map(|lock| {
+        let token = lock.file_name()?.to_str()?.strip_prefix("decant-")?.strip_suffix(".lock")?.to_owned();
+        Some((token, lock))
+    })
 }
 
 /// What cells have in `/dev/shm`.
@@ -228,11 +234,9 @@ pub fn kept() -> Vec<Kept> {
     let locks = std::fs::read_to_string("/proc/locks").unwrap_or_default();
     let locked: BTreeSet<u64> = locks.split_whitespace().filter_map(|word| word.rsplit_once(':')?.1.parse().ok()).collect();
     let mut all: BTreeMap<(u32, bool), u64> = BTreeMap::new();
-    for lock in files("decant-") {
-        let name = lock.file_name().unwrap_or_default().to_string_lossy().into_owned();
-        let Some(token) = name.strip_prefix("decant-").and_then(|n| n.strip_suffix(".lock")) else { continue };
+    for (token, lock) in tokens() {
         let Ok(meta) = lock.symlink_metadata() else { continue };
-        let its = files(&prefix(token)).into_iter().filter_map(|file| file.symlink_metadata().ok());
+        let its = files(&prefix(&token)).into_iter().filter_map(|file| file.symlink_metadata().ok());
         *all.entry((meta.uid(), locked.contains(&meta.ino()))).or_default() += its.map(|m| m.len()).sum::<u64>();
     }
     all.into_iter().map(|((uid, in_use), bytes)| Kept { uid, in_use, bytes }).collect()

@@ -25,7 +25,7 @@ const ROUGH_LOG_AREA: f64 = 1.0;
 const ROUGH_DEG: f64 = 15.0;
 /// How much the camera's gain changes from pour to pour at least (log): as in the fit.
 const GAIN_SD: f64 = 0.017;
-/// How much it changes at most (log): weights that scatter by more are no measurement.
+/// How much it changes at most (log): weights that scatter by more are no measurement. Chosen by hand.
 const GAIN_SD_MAX: f64 = 0.7;
 /// So many weights that scatter as expected are taken to have been there before the first: few weights scatter by chance. Chosen by hand.
 const EXPECTED_BEFORE: f64 = 2.0;

@@ -169,7 +169,7 @@ fn log_area(weighed: &[Span]) -> f64 {
     areas.get(areas.len() / 2).copied().unwrap_or(LOG_AREA_UNSEEN)
 }
 
-/// The doubt that is left by what was weighed, g each.
+/// The doubt that is left by streams that were weighed with `weights_g`.
 fn doubt_after(weighed: &[Span], weights_g: &[f64]) -> Doubt {
     let log_area = log_area(weighed);
     let before = Doubt::before(log_area, gain_sd(log_area, weighed, weights_g));
