@@ -120,7 +120,8 @@ pub struct CellUnderTest {
 impl CellUnderTest {
     /// Prepares a cell in which nothing runs yet. `adapt` may change the configuration, which is that of `config/sim.toml`.
     pub fn prepare(adapt: impl FnOnce(&mut toml::Table)) -> Self {
-        let number = std::process::id() % 15_000 * 16 + NEXT.fetch_add(1, Ordering::Relaxed) % 16;
+        // So many that none of a process comes again while its first one runs.
+        let number = std::process::id() % 100_000 * 128 + NEXT.fetch_add(1, Ordering::Relaxed) % 128;
         let name = format!("test-{}-{number}", std::process::id());
         let address = std::net::IpAddr::from([127, 20 + (number / 62_500) as u8, (number / 250 % 250) as u8, 1 + (number % 250) as u8]);
         let dir = tempfile::tempdir().expect("a directory for the test");
