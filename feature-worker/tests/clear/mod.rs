@@ -5,6 +5,7 @@ use super::measure;
 use feature_worker::vision::{ExtractError, Extractor, Measurement};
 use opencv::core::{self, CV_8UC3, Mat, Scalar, Size};
 use opencv::imgproc;
+use opencv::prelude::*;
 use shared::config::{ImageConfig, LiquidMethod};
 use shared::messages::Doubt;
 
@@ -47,6 +48,28 @@ fn a_stream_larger_than_the_region_is_told() -> Result<(), ExtractError> {
             let share = ((i - 9) as f32 * grows).clamp(0.0, 4.0);
             let measured = measure(&mut extractor, &water(share, None, i)?)?;
             assert!(share < 0.3 || is_told(&measured), "{grows} picture {i}: {measured:?}");
+        }
+    }
+    Ok(())
+}
+
+/// Protects a pour after a camera's exposure took a step: a stream that grew while pictures were blown out is measured in the first picture that is not,
+/// and no false line that is nearer to what it was before.
+#[test]
+fn a_stream_that_grew_while_nothing_was_seen_is_measured() -> Result<(), ExtractError> {
+    let mut extractor = clear()?;
+    for i in 0..54 {
+        let share = if i < 40 { ((i - 19) as f32 / 20.0).clamp(0.0, 0.35) } else { 1.0 };
+        let mut picture = water(share, None, i)?;
+        if (30..44).contains(&i) {
+            let seen = picture.clone();
+            seen.convert_to(&mut picture, -1, 1.0, 200.0)?;
+        }
+        let measured = measure(&mut extractor, &picture)?;
+        if i >= 44 {
+            assert!((measured.area_px2 / 3600.0 - 1.0).abs() < 0.15, "picture {i}: {measured:?}");
+        } else if i >= 30 {
+            assert_eq!(measured.doubt, Doubt::BlownOut, "picture {i}");
         }
     }
     Ok(())

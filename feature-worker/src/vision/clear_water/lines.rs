@@ -81,9 +81,10 @@ struct Change {
 }
 
 impl Change {
+    /// `since` is for how many pictures nothing was seen of the stream, as a factor on what it may change.
     #[inline(always)]
-    fn new([p, q]: [f32; 2], [a, b]: [f32; 2], turns: f32) -> Self {
-        Self { grown: 0.5 * (p + q - a - b), turned: p - q - a + b, turns }
+    fn new([p, q]: [f32; 2], [a, b]: [f32; 2], turns: f32, since: f32) -> Self {
+        Self { grown: 0.5 * (p + q - a - b) / since, turned: (p - q - a + b) / since, turns }
     }
 
     #[inline(always)]
@@ -170,7 +171,8 @@ impl Lines {
         self.cells[line].iter().map(|at| usize::from(*at)).zip(self.weights[line])
     }
 
-    /// The best line and what was found along it. `moved` is the background's motion since the earlier picture.
+    /// The best line and what was found along it. `moved` is the background's motion since the earlier picture. Since the `stream` was last looked for,
+    /// so many pictures were `lost`.
     #[inline(always)]
     pub(super) fn best(
         &self,
@@ -178,15 +180,18 @@ impl Lines {
         rays: &Rays,
         moved: &RigidMap,
         stream: Option<&Stream>,
+        lost: u32,
     ) -> opencv::Result<Option<Candidate>> {
         let seen = evidence.seen()?;
         let Some(stream) = stream else { return Ok(self.best_begin(evidence, seen)) };
         let before = stream.legs_px.map(f32::ln);
         let turns = TURNS + TURNS_YOUNG / stream.age;
+        // Independent changes add up as their squares do.
+        let since = (1.0 + lost as f32).sqrt();
         let mut best: Option<Candidate> = None;
         for line in 0..self.legs_px.len() {
             // A stream grows and shrinks fast, but hardly changes its shape from frame to frame.
-            let change = Change::new(self.log_legs[line], before, turns);
+            let change = Change::new(self.log_legs[line], before, turns, since);
             if change.is_too_large() {
                 continue;
             }
