@@ -54,7 +54,7 @@ mod whole;
 
 pub use extractor::{ExtractError, Extractor};
 pub use geometry::Axes;
-pub use ground_beside::{RoomBeside, room_beside};
+pub use ground_beside::{InGlass, RoomBeside, room_beside};
 pub use learn_axes::{AxesError, Corner, find_corner};
 pub use learn_colour::{ColourError, ColourLearner, DryBackground};
 pub use learn_poses::Poses;

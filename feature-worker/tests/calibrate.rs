@@ -7,7 +7,7 @@ use std::process::{Command, Output};
 
 use drawn::{Outcome, pour, write_config};
 use feature_worker::vision::{Axes, ColourLearner, Extractor, Image, RoomBeside, find_corner, room_beside};
-use opencv::core::{Mat, Vector};
+use opencv::core::{Mat, Rect, Vector};
 use opencv::imgcodecs;
 use opencv::prelude::*;
 use shared::config::{Config, LiquidMethod};
@@ -76,6 +76,28 @@ fn coordinates_are_taken_and_nothing_is_written_unasked() -> Outcome {
     assert_eq!(std::fs::read(&path)?, before);
     let output = calibrate(&path, &directory.path().join("look.png"), &["--lip", "somewhere", &pattern])?;
     assert_eq!(output.status.code(), Some(2));
+    Ok(())
+}
+
+/// Protects from a hand in a glove over a dry glass, which has edge and colour of a stream: what the glass below the lip does not hold is said. With
+/// the liquid in it, nothing is.
+#[test]
+fn a_stream_that_the_glass_does_not_hold_is_said() -> Outcome {
+    let directory = tempfile::tempdir()?;
+    let (path, _) = write_config(directory.path(), "glove", |_| {})?;
+    for holds in [true, false] {
+        let pattern = frames(directory.path())?;
+        for i in (0..40).filter(|_| !holds) {
+            let (mut picture, dry) = (pour(i)?, drawn::dry(i as f32, i)?);
+            let inside = Rect::new(218, 253, 400, 220);
+            dry.roi(inside)?.copy_to(&mut picture.roi_mut(inside)?)?;
+            imgcodecs::imwrite(directory.path().join(format!("f_{i:03}.png")), &picture, &Vector::new())?;
+        }
+        let output = calibrate(&path, &directory.path().join("look.png"), &[&pattern])?;
+        let said = String::from_utf8_lossy(&output.stderr).into_owned();
+        assert!(output.status.success(), "{said}");
+        assert_eq!(said.contains("of the glass below the lip while something flows"), !holds, "{said}");
+    }
     Ok(())
 }
 

@@ -250,7 +250,7 @@ fn propose(config: &Config, corner: Corner, pour: &Pour) -> Result<Proposal, Str
         image.colour_hsv = learner.range().map_err(words)?;
         remarks.push(checks::background_differs(learner.near_background(image.colour_hsv))?);
     }
-    remarks.push(checks::something_flows(pour, camera, &image)?);
+    remarks.extend(checks::something_flows(pour, camera, &image)?);
     remarks.extend(lacks_room(camera, &image));
     Ok(Proposal { image, remarks })
 }

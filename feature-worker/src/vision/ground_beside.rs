@@ -15,6 +15,7 @@ use shared::config::{CameraConfig, ImageConfig, LiquidMethod};
 
 use super::geometry::Axes;
 use super::ground_colours::{GroundColours, Mean};
+use super::hues::ranges;
 use super::pace::Pace;
 
 /// Width of the picture for which distances were chosen, px.
@@ -82,7 +83,7 @@ impl Square {
     }
 
     /// Takes the next picture's square.
-    pub(super) fn take(&mut self, region: &BoxedRef<Mat>) -> opencv::Result<()> {
+    pub(super) fn take(&mut self, region: &impl core::ToInputArray) -> opencv::Result<()> {
         let [map_a, map_b] = &self.maps;
         if map_a.empty() {
             return Ok(());
@@ -131,7 +132,7 @@ impl Square {
 }
 
 /// The inside of the glass just below the lip.
-pub(super) struct InGlass {
+pub struct InGlass {
     square: Square,
     hsv: Mat,
     ranges: Vec<(Scalar, Scalar)>,
@@ -145,6 +146,18 @@ impl InGlass {
     pub(super) fn new(place: &Place, ranges: &[(Scalar, Scalar)]) -> opencv::Result<Self> {
         let square = Square::new(place, GLASS_PX)?;
         Ok(Self { square, hsv: Mat::default(), ranges: ranges.to_vec(), empty_pictures: 0, turn: 0 })
+    }
+
+    /// For whole pictures of `camera` and the coloured liquid of `image`.
+    pub fn of_pictures(camera: &CameraConfig, image: &ImageConfig) -> opencv::Result<Self> {
+        let all = ImageConfig { region_px: [0, 0, camera.width_px, camera.height_px], ..image.clone() };
+        Self::new(&Place::new(Axes::new(image), &all, camera.width_px), &ranges(image.colour_hsv.map(f64::from)))
+    }
+
+    /// The share of the square in a picture that has the liquid's colours, 0 to 1; none if the picture ends before the square.
+    pub fn share(&mut self, picture: &Mat) -> opencv::Result<Option<f32>> {
+        self.square.take(picture)?;
+        Ok(self.look()?.0)
     }
 
     /// Takes the next picture's square.

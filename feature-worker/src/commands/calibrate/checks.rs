@@ -9,7 +9,7 @@ use shared::config::{CameraConfig, ImageConfig, LiquidMethod};
 use shared::messages::Doubt;
 
 use super::pour::{Pour, same};
-use crate::vision::{Corner, DryBackground, Extractor, Steadiness};
+use crate::vision::{Corner, DryBackground, Extractor, InGlass, Steadiness};
 
 // "By hand" below means that the value was chosen by hand between what 20 rendered pours gave and what clips of other things gave; see
 // docs/VISION.md.
@@ -32,6 +32,8 @@ const DRY_LEAST: f32 = 0.05;
 const FLOWING_LEAST: f32 = 0.03;
 /// Least share of the frames with liquid at the lip in which the triangle fits. By hand.
 const FITS_LEAST: f32 = 0.5;
+/// Where the liquid's colours fill less of the glass below the lip while something flows, what flows may be none. By hand: as at run time.
+const GLASS_LEAST: f32 = 0.2;
 /// Least mean length of a run of frames with a stream. By hand: a stream does not flicker; pours gave 26 frames and more, false streams
 /// before clutter 4.
 const RUN_LEAST: f32 = 8.0;
@@ -118,13 +120,17 @@ struct Flow {
     runs: u32,
     /// Whether the last frame had a stream.
     flows: bool,
+    /// The sum of the shares of the glass below the lip that had the liquid's colours in frames with a stream, and of how many frames it is.
+    glass: (f32, u32),
 }
 
-/// Refuses a clip in which nothing flows over the lip between the axes, or nothing is ever dry. Returns what was seen.
-pub(super) fn something_flows(pour: &Pour, camera: &CameraConfig, image: &ImageConfig) -> Result<String, String> {
+/// Refuses a clip in which nothing flows over the lip between the axes, or nothing is ever dry. Returns what was seen, and a remark where the
+/// glass does not hold what flows.
+pub(super) fn something_flows(pour: &Pour, camera: &CameraConfig, image: &ImageConfig) -> Result<Vec<String>, String> {
     let extractor = Extractor::new(camera, image).map_err(|e| e.to_string())?;
+    let mut glass = InGlass::of_pictures(camera, image).map_err(|e| e.message)?;
     let mut flow = Flow::default();
-    pour.measure(camera, extractor, |measured| {
+    pour.measure(camera, extractor, |measured, picture| {
         let flows = measured.area_px2 > 0.0;
         flow.frames += 1;
         flow.flowing += u32::from(flows);
@@ -137,6 +143,10 @@ pub(super) fn something_flows(pour: &Pour, camera: &CameraConfig, image: &ImageC
         flow.untold += u32::from(!flows && !unfit && !dry);
         flow.runs += u32::from(flows && !flow.flows);
         flow.flows = flows;
+        if flows && image.method == LiquidMethod::Colour {
+            flow.glass = glass.share(picture)?.map_or(flow.glass, |share| (flow.glass.0 + share, flow.glass.1 + 1));
+        }
+        Ok(())
     })?;
     let Flow { frames, flowing, dry, unfit, untold, runs, .. } = flow;
     let share = |part: u32, of: u32| part as f32 / of.max(1) as f32;
@@ -158,7 +168,17 @@ pub(super) fn something_flows(pour: &Pour, camera: &CameraConfig, image: &ImageC
     } else if share(dry, frames) < DRY_LEAST {
         "the container is never dry"
     } else {
-        return Ok(seen);
+        let (shares, looked) = flow.glass;
+        let filled = shares / looked.max(1) as f32;
+        // A container of metal or clay shows nothing, so this cannot refuse.
+        let strange = (looked > 0 && filled < GLASS_LEAST).then(|| {
+            format!(
+                "the liquid's colours fill {} of the glass below the lip while something flows; if the container is clear, what flows is not the \
+                 liquid: look at the picture",
+                percent(filled)
+            )
+        });
+        return Ok([seen].into_iter().chain(strange).collect());
     };
     Err(format!("{fault}: {seen}; {advice}"))
 }

@@ -116,14 +116,18 @@ impl Pour {
         Ok((poses, chosen, mean))
     }
 
-    /// Measures all frames in their order, and gives each measurement to `take`.
-    pub fn measure(&self, camera: &CameraConfig, mut extractor: Extractor, mut take: impl FnMut(Measurement)) -> Result<(), String> {
+    /// Measures all frames in their order, and gives each measurement to `take`, with its picture in BGR.
+    pub fn measure(
+        &self,
+        camera: &CameraConfig,
+        mut extractor: Extractor,
+        mut take: impl FnMut(Measurement, &Mat) -> opencv::Result<()>,
+    ) -> Result<(), String> {
         let mut each = |picture: &Mat, time: PictureTime| {
             let pixels = picture.data_bytes().map_err(|e| e.message)?;
             let (width_px, height_px) = (picture.cols() as u32, picture.rows() as u32);
             let image = Image { width_px, height_px, format: PixelFormat::Bgr8, pixels };
-            take(extractor.measure_at(image, time).map_err(|e| e.to_string())?);
-            Ok(())
+            take(extractor.measure_at(image, time).map_err(|e| e.to_string())?, picture).map_err(|e| e.message)
         };
         match &self.film {
             Film::Files(input, partial) => {
