@@ -16,7 +16,7 @@ use std::time::{Duration, Instant};
 use rt_controller::client::Client;
 use shared::config::Config;
 use shared::control::Status;
-use shared::disk_space::free_bytes;
+use shared::disk_space::room;
 use shared::exit::{self, Failure, OrExit as _};
 use shared::os;
 use shared::runtime_dir::Place;
@@ -118,7 +118,7 @@ impl<'a> Cell<'a> {
             status: self.status.clone(),
             ended: self.ended.clone(),
             errors_ml: weighed.errors_ml(),
-            free_bytes: places.filter_map(|(name, path)| Some((name, free_bytes(path)?))).collect(),
+            room: places.filter_map(|(name, path)| Some((name, room(path)?))).collect(),
         }
     }
 

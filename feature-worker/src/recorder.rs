@@ -3,8 +3,8 @@
 //! The worker hands each frame over with [`Recorder::offer`], which never waits. The recorder's thread (`writing`) follows the
 //! controller's telemetry, opens a file when an episode begins, compresses and writes its frames, and closes the file when the last
 //! frame of the episode has come. It reports on the service `recorder`. A full or slow disk costs that episode's file or some of its
-//! images and nothing else: the next episode tries again. None is begun when the disk has less free than `LEAST_FREE`. Nothing is ever deleted here;
-//! what is not recorded, and a directory over its budget, is said.
+//! images and nothing else: the next episode tries again. None is begun when the disk has less free than `LEAST_FREE`, or takes no more files. Nothing is
+//! ever deleted here; what is not recorded, and a directory over its budget, is said.
 
 use std::sync::{Arc, mpsc};
 use std::thread::JoinHandle;

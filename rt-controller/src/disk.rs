@@ -12,7 +12,7 @@ use std::time::{Duration, Instant};
 use crossbeam::channel::{Receiver, Sender, TrySendError, bounded};
 use shared::agent::Agent;
 use shared::config::Config;
-use shared::disk_space::{error_words, free_bytes};
+use shared::disk_space::{error_words, room};
 use shared::episode::take_number;
 use shared::estimator::flow::WayBack;
 use shared::level::Level;
@@ -205,7 +205,7 @@ impl<'a> Disk<'a> {
         let due = self.retry.is_some_and(|at| Instant::now() >= at);
         let part = match self.journal.take() {
             Some(full) if full.is_full() && at_rest => full.next_part(path, settings),
-            None if due && at_rest && free_bytes(path).is_none_or(|free| free >= RETRY_SPACE) => {
+            None if due && at_rest && room(path).is_none_or(|room| room.bytes >= RETRY_SPACE && !room.lacks_files()) => {
                 let weights = self.loaded.iter().cloned().collect();
                 Writer::continue_at(path, settings, weights, self.loaded.as_ref().map(|(identity, _)| *identity))
             }

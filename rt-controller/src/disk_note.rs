@@ -1,11 +1,12 @@
 //! What the disk's thread has to say to operators: the journal's state, free space, and the weight file. Ordinary threads share it; it
 //! allocates and never fails.
 
+use std::os::unix::fs::MetadataExt as _;
 use std::path::Path;
 use std::sync::{Mutex, PoisonError};
 use std::time::SystemTime;
 
-use shared::disk_space::file_system;
+use shared::disk_space::room_at;
 use shared::plural::counted;
 
 /// The newest state of what lies on disks.
@@ -52,11 +53,12 @@ pub fn space_words(paths: &[&Path]) -> String {
     let mut seen = Vec::new();
     let mut words = Vec::new();
     for path in paths {
-        let Some((there, fs)) = file_system(path) else { continue };
-        if !seen.contains(&fs.f_fsid) {
-            seen.push(fs.f_fsid);
-            let free_gb = fs.f_bavail as f64 * fs.f_frsize as f64 / 1e9;
-            words.push(format!("{free_gb:.1} GB free in {}", there.display()));
+        let Some((there, room)) = room_at(path) else { continue };
+        let Ok(device) = there.metadata().map(|meta| meta.dev()) else { continue };
+        if !seen.contains(&device) {
+            seen.push(device);
+            let but = if room.lacks_files() { ", but no room for more files," } else { "" };
+            words.push(format!("{:.1} GB free{but} in {}", room.bytes as f64 / 1e9, there.display()));
         }
     }
     words.join(", ")

@@ -3,15 +3,45 @@
 
 use std::path::Path;
 
-/// The free space where `path` is or will be, bytes; `None` if it is not known.
-pub fn free_bytes(path: &Path) -> Option<u64> {
-    let (_, fs) = file_system(path)?;
-    Some(fs.f_bavail.saturating_mul(fs.f_frsize))
+use rustix::fs::{StatVfs, statvfs};
+
+/// Number of files that must still fit before one is begun. Chosen by hand: some episodes, a part of the journal, and what is written beside a file
+/// before it takes its place.
+pub const LEAST_FILES: u64 = 16;
+
+/// What a disk still takes. Many file systems are made for a number of files; when it is reached they take no more, however many bytes are free.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Room {
+    /// Free space, bytes.
+    pub bytes: u64,
+    /// Number of files that may still be made; `u64::MAX` where the file system has no such bound.
+    pub files: u64,
 }
 
-/// The file system where `path` is or will be: a directory that is not made yet lies on that of the one above it.
-pub fn file_system(path: &Path) -> Option<(&Path, rustix::fs::StatVfs)> {
-    path.ancestors().find_map(|p| rustix::fs::statvfs(p).ok().map(|fs| (p, fs)))
+impl Room {
+    /// What `fs` still takes for an ordinary user.
+    pub fn of(fs: &StatVfs) -> Self {
+        // Those that make room for files as they come, such as btrfs, show a number of 0 in all.
+        let files = if fs.f_files == 0 { u64::MAX } else { fs.f_favail };
+        Self { bytes: fs.f_bavail.saturating_mul(fs.f_frsize), files }
+    }
+
+    /// Whether so few files may still be made that none is begun.
+    pub fn lacks_files(self) -> bool {
+        self.files < LEAST_FILES
+    }
+}
+
+/// The room where `path` is or will be; `None` if it is not known.
+pub fn room(path: &Path) -> Option<Room> {
+    room_at(path).map(|(_, room)| room)
+}
+
+/// The same with the part of `path` that is there: a directory that is not made yet lies on the disk of the one above it.
+pub fn room_at(path: &Path) -> Option<(&Path, Room)> {
+    let (there, fs) = path.ancestors().find_map(|p| statvfs(p).ok().map(|fs| (p, fs)))?;
+    // One without a size, such as a tmpfs without a bound, does not say what it takes.
+    (fs.f_blocks > 0).then(|| (there, Room::of(&fs)))
 }
 
 /// An error of the disk in words: a full one is called so. One that has words of its own, such as these, stays as it is.
@@ -30,6 +60,18 @@ mod tests {
     use std::io::{Error, ErrorKind};
 
     use super::*;
+
+    /// Protects an episode from a disk on which no file can be made although gigabytes are free, and every cell on a file system that counts no files, such as
+    /// btrfs: there 0 files of 0 are not "none left".
+    #[test]
+    fn files_are_counted_where_they_are_bounded() {
+        let shown = statvfs("/").unwrap();
+        let of = |f_files, f_favail| Room::of(&StatVfs { f_bavail: 1 << 20, f_frsize: 4096, f_files, f_favail, ..shown });
+        assert_eq!(of(1000, 0), Room { bytes: 4 << 30, files: 0 });
+        assert!(of(1000, 0).lacks_files() && of(1000, LEAST_FILES - 1).lacks_files() && !of(1000, LEAST_FILES).lacks_files());
+        assert_eq!(of(0, 0), Room { bytes: 4 << 30, files: u64::MAX });
+        assert!(!of(0, 0).lacks_files());
+    }
 
     /// Protects the one line of a full disk, which passes several hands on its way to a person: it is said once.
     #[test]

@@ -15,7 +15,7 @@ use std::path::{Path, PathBuf};
 use std::sync::{Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
-use crate::disk_space::error_words;
+use crate::disk_space::{Room, error_words};
 use crate::runtime_dir::own_uid;
 use crate::whole_file::may_make_in;
 
@@ -67,11 +67,12 @@ pub fn check_space(bytes: u64) -> Result<(), SharedMemoryError> {
     let unmade =
         |e| format!("no file can be made there: {e}; it must be writable and have mode 1777 (mount -o remount,rw,mode=1777 /dev/shm)");
     may_make_in(Path::new(SHM)).map_err(|e| failed(Path::new(SHM), unmade(e)))?;
-    if fs.f_files > 0 && fs.f_favail < JOIN_FILES {
+    let room = Room::of(&fs);
+    if room.files < JOIN_FILES {
         return Err(failed(Path::new(SHM), "holds as many files as it may, whatever their size: delete those that fill it"));
     }
     // A file system without a limit shows a size of zero.
-    if fs.f_blocks == 0 || fs.f_bavail.saturating_mul(fs.f_frsize) >= bytes {
+    if fs.f_blocks == 0 || room.bytes >= bytes {
         return Ok(());
     }
     let kib = |blocks: u64| blocks.saturating_mul(fs.f_frsize) / 1024;

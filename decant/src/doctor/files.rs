@@ -10,7 +10,7 @@ use feature_worker::episodes::folder::{Budget, Folder, LEAST_FREE, MEGABYTE, rec
 use rt_controller::{claim, disk, journal_files};
 use shared::config::Config;
 use shared::config_paths::is_same;
-use shared::disk_space::free_bytes;
+use shared::disk_space::{Room, room};
 use shared::episode::check_number;
 use shared::framing::Framing;
 use shared::machine::Finding;
@@ -34,6 +34,8 @@ const EPISODES: u64 = 200;
 const LASTS_DAYS: [f64; 2] = [7.0, 2.0];
 /// Share of the budget from which on nobody seems to prune. Chosen by hand.
 const FAR_OVER: f64 = 1.5;
+/// What a disk without room for files means, in words; `df -i` shows it, and `df` free space.
+const NO_FILES: &str = "the disk holds as many files as it may, whatever their size: nothing more is recorded";
 
 /// Looks at the cell's files.
 pub fn look(file: &Path, config: &Config) -> Vec<Finding> {
@@ -52,7 +54,7 @@ pub fn look(file: &Path, config: &Config) -> Vec<Finding> {
             let advice = "look at .last-number there: give it to this user, or move it away if it is no file of Decant";
             Finding::red("episodes", format!("{}: {e}", there.display()), "no episode gets a number, so no pour begins", advice)
         }
-        (Ok((there, free)), Ok(())) => episodes(&there, free, folder, recorded_today(&config.recording.directory)),
+        (Ok((there, room)), Ok(())) => episodes(&there, room, folder, recorded_today(&config.recording.directory)),
     });
     findings.push(budget(Budget::of(&config.recording), folder));
     findings
@@ -174,12 +176,12 @@ fn weights(file: &Path, config: &Config) -> Finding {
 }
 
 /// How long the disk lasts: at the rate of the last day, or for how many episodes if there was none.
-fn episodes(there: &Path, free: u64, folder: Folder, today: u64) -> Finding {
-    let left = free.saturating_sub(LEAST_FREE);
+fn episodes(there: &Path, room: Room, folder: Folder, today: u64) -> Finding {
+    let left = room.bytes.saturating_sub(LEAST_FREE);
     let one = folder.bytes.checked_div(folder.episodes as u64).map_or(EPISODE_BYTES, |mean| mean.max(1));
     let days = left as f64 / today as f64;
     let lasts = match today {
-        0 => format!("room for {} more", left / one),
+        0 => format!("room for {} more", (left / one).min(room.files)),
         new => format!("{days:.1} days at today's {} MB a day", new.div_ceil(MEGABYTE)),
     };
     let is = format!(
@@ -187,15 +189,16 @@ fn episodes(there: &Path, free: u64, folder: Folder, today: u64) -> Finding {
         there.display(),
         counted(folder.episodes, "episode"),
         folder.bytes / MEGABYTE,
-        free / MEGABYTE
+        room.bytes / MEGABYTE
     );
     let advice = "delete or move what is no longer needed (`decant episodes prune`)";
     let soon = "the disk will be full soon, and then nothing is recorded";
     match left {
+        _ if room.lacks_files() => Finding::red("episodes", is, NO_FILES, advice),
         0 => Finding::red("episodes", is, "the disk is full: nothing more is recorded", advice),
         _ if today > 0 && days < LASTS_DAYS[1] => Finding::red("episodes", is, soon, advice),
         _ if today > 0 && days < LASTS_DAYS[0] => Finding::yellow("episodes", is, soon, advice),
-        _ if left < EPISODES * one => Finding::yellow("episodes", is, soon, advice),
+        _ if left < EPISODES * one || room.files < EPISODES => Finding::yellow("episodes", is, soon, advice),
         _ => Finding::green("episodes", is),
     }
 }
@@ -217,8 +220,8 @@ fn budget(budget: Budget, folder: Folder) -> Finding {
     }
 }
 
-/// `directory`, or the first above it that is there, and its free space, bytes, if it may be written.
-fn writable(what: &str, directory: &Path) -> Result<(PathBuf, u64), Finding> {
+/// `directory`, or the first above it that is there, and what its disk still takes, if it may be written.
+fn writable(what: &str, directory: &Path) -> Result<(PathBuf, Room), Finding> {
     let there: PathBuf = directory.ancestors().find(|d| d.symlink_metadata().is_ok()).unwrap_or(Path::new("/")).into();
     if !there.is_dir() {
         let is = format!("{} is no directory", there.display());
@@ -230,7 +233,7 @@ fn writable(what: &str, directory: &Path) -> Result<(PathBuf, u64), Finding> {
     }
     let unknown =
         || Finding::yellow(what, format!("{}: its free space is not shown", there.display()), "it may be full", "look at it with df");
-    free_bytes(&there).ok_or_else(unknown).map(|free| (there, free))
+    room(&there).ok_or_else(unknown).map(|room| (there, room))
 }
 
 /// Whether the controller can begin the journal at `file`, and how long the disk lasts for it. One that `runs` writes there already.
@@ -240,13 +243,20 @@ fn journal(file: &Path, runs: bool) -> Finding {
         return Finding::red("journal", e.to_string(), "the controller does not start", advice);
     }
     let directory = file.parent().unwrap_or(file);
-    let (there, free) = match writable("journal", directory) {
+    let (there, room) = match writable("journal", directory) {
         Ok(found) => found,
         Err(finding) => return finding,
     };
+    journal_lasts(&there, room)
+}
+
+/// How long a disk with so much `room` lasts for the journal `there`.
+fn journal_lasts(there: &Path, room: Room) -> Finding {
+    let free = room.bytes;
     let is = format!("{}: {} MB free, room for {}", there.display(), free / MEGABYTE, counted(free / (JOURNAL_HOUR_BYTES * 24), "day"));
     let advice = "delete or move what is no longer needed";
     match free {
+        _ if room.lacks_files() => Finding::red("journal", is, NO_FILES, advice),
         0..JOURNAL_HOUR_BYTES => Finding::red("journal", is, "the disk is full: nothing more is recorded", advice),
         free if free < JOURNAL_HOUR_BYTES * 24 * DAYS => Finding::yellow("journal", is, "the disk will be full soon", advice),
         _ => Finding::green("journal", is),
@@ -255,9 +265,23 @@ fn journal(file: &Path, runs: bool) -> Finding {
 
 #[cfg(test)]
 mod tests {
+    use shared::disk_space::LEAST_FILES;
     use shared::machine::Verdict;
 
     use super::*;
+
+    /// Protects who trusts a green line before a day of pours: a disk on which no file can be made is red however many bytes are free, and one that counts no
+    /// files is judged by its bytes alone.
+    #[test]
+    fn a_disk_without_room_for_files_is_red() {
+        let verdicts = |files| {
+            let room = Room { bytes: 1 << 40, files };
+            [episodes(Path::new("/"), room, Folder::default(), 0).verdict, journal_lasts(Path::new("/"), room).verdict]
+        };
+        assert_eq!(verdicts(LEAST_FILES - 1), [Verdict::Red; 2]);
+        assert_eq!(verdicts(LEAST_FILES), [Verdict::Yellow, Verdict::Green], "each episode takes one");
+        assert_eq!(verdicts(u64::MAX), [Verdict::Green; 2]);
+    }
 
     /// Protects an installed cell whose file was copied and whose name was not changed: its units would run where no command looks.
     #[test]

@@ -12,6 +12,7 @@ use prometheus_client::metrics::counter::ConstCounter;
 use prometheus_client::metrics::gauge::ConstGauge;
 use prometheus_client::registry::{Registry, Unit};
 use shared::control::{Histogram, Status};
+use shared::disk_space::Room;
 use shared::messages::Phase;
 
 /// The content type. Source: OpenMetrics 1.0, section Protocol Negotiation.
@@ -40,8 +41,8 @@ pub struct Seen {
     pub ended: BTreeMap<&'static str, u64>,
     /// By how much the weighed pours missed their goals, ml, the oldest first; `None` if the episodes cannot be read.
     pub errors_ml: Option<Vec<f64>>,
-    /// Free space, bytes, by what lies there.
-    pub free_bytes: Vec<(&'static str, u64)>,
+    /// What the disks still take, by what lies there.
+    pub room: Vec<(&'static str, Room)>,
 }
 
 /// The page's text.
@@ -69,8 +70,11 @@ impl Collector for Seen {
         }
         let ended: Vec<(&str, u64)> = self.ended.iter().map(|(reason, n)| (*reason, *n)).collect();
         page.counters("decant_ended", "Pours and recordings that ended since this program started", "reason", &ended)?;
-        let free: Vec<(&str, f64)> = self.free_bytes.iter().map(|(name, bytes)| (*name, *bytes as f64)).collect();
+        let free: Vec<(&str, f64)> = self.room.iter().map(|(name, room)| (*name, room.bytes as f64)).collect();
         page.gauges("decant_free", "Free space where this lies", Some(Unit::Bytes), "of", &free)?;
+        let bounded = self.room.iter().filter(|(_, room)| room.files < u64::MAX);
+        let files: Vec<(&str, f64)> = bounded.map(|(name, room)| (*name, room.files as f64)).collect();
+        page.gauges("decant_free_files", "Files that may still be made where this lies, if their number is bounded", None, "of", &files)?;
         self.errors_ml.as_ref().map_or(Ok(()), |errors_ml| weighed(&mut page, errors_ml))
     }
 }
@@ -211,7 +215,7 @@ mod tests {
     #[test]
     fn what_may_fall_is_a_gauge() {
         let errors_ml = vec![50.2 - 50.0, 47.0 - 50.0, 120.0 - 50.0];
-        let seen = Seen { cell: "lab".into(), status: None, ended: BTreeMap::new(), errors_ml: Some(errors_ml), free_bytes: Vec::new() };
+        let seen = Seen { cell: "lab".into(), status: None, ended: BTreeMap::new(), errors_ml: Some(errors_ml), room: Vec::new() };
         let text = text(seen).unwrap();
         assert!(text.contains("# TYPE decant_weighed_pours gauge\n") && !text.contains(" histogram\n"), "{text}");
         for (le, n) in [("0.5", "1.0"), ("2.0", "1.0"), ("3.0", "2.0"), ("50.0", "2.0"), ("+Inf", "3.0")] {

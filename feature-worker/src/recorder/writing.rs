@@ -12,7 +12,7 @@ use std::time::{Duration, SystemTime};
 use iceoryx2::port::publisher::Publisher;
 use iceoryx2::port::subscriber::Subscriber;
 use shared::config::Config;
-use shared::disk_space::free_bytes;
+use shared::disk_space::room;
 use shared::episode::{EpisodeEnd, EpisodeKind, EpisodeStart, EpisodeTrack, EpisodeWriter, FrameRow, GAP, WriteError, is_gap};
 use shared::gaussian_curve::Curve;
 use shared::ipc::{Cell, IpcError};
@@ -218,13 +218,7 @@ impl RecorderThread {
 
     /// Opens the file of the episode that begins with `tick`, and gives it the frames that were kept.
     fn open(&mut self, tick: &Telemetry) {
-        if let Some(free) = free_bytes(&self.directory).filter(|free| *free < LEAST_FREE) {
-            let what = format!(
-                "{}: only {} MB are free, and below {} MB no episode is begun: nothing is recorded. Delete what is not needed (`episodes prune`)",
-                self.directory.display(),
-                free / MEGABYTE,
-                LEAST_FREE / MEGABYTE
-            );
+        if let Some(what) = self.no_room() {
             return self.report(RecorderState::Failed, tick.episode, 0, 0, &what);
         }
         let kind = if tick.goal_ml.is_nan() {
@@ -265,6 +259,24 @@ impl RecorderThread {
             }
             Err(e) => self.report(RecorderState::Failed, tick.episode, 0, 0, &e.to_string()),
         }
+    }
+
+    /// Why no episode is begun on the disk as it is; `None` if one is.
+    fn no_room(&self) -> Option<String> {
+        let room = room(&self.directory)?;
+        let directory = self.directory.display();
+        if room.lacks_files() {
+            return Some(format!(
+                "{directory}: the disk holds as many files as it may, whatever their size: nothing is recorded. Delete what is not needed (`episodes prune`)"
+            ));
+        }
+        (room.bytes < LEAST_FREE).then(|| {
+            format!(
+                "{directory}: only {} MB are free, and below {} MB no episode is begun: nothing is recorded. Delete what is not needed (`episodes prune`)",
+                room.bytes / MEGABYTE,
+                LEAST_FREE / MEGABYTE
+            )
+        })
     }
 
     /// Puts a frame into the episode under way if it belongs there, and keeps it otherwise.

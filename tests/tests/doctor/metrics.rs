@@ -83,6 +83,7 @@ fn a_cell_is_measured() {
     assert_eq!(value(&first, "decant_phase", "phase=\"idle\""), Some(1.0));
     assert_eq!(value(&first, "decant_phase", "phase=\"pouring\""), Some(0.0));
     assert!(value(&first, "decant_free_bytes", "of=\"episodes\"").unwrap() > 0.0);
+    assert_ne!(value(&first, "decant_free_files", "of=\"episodes\""), Some(0.0), "none are told where their number is not bounded");
 
     assert!(cell.command("rt-controller", &["pour", "20"]).status.code().is_some_and(|c| c == 0 || c == 4));
     std::thread::sleep(Duration::from_secs(1));

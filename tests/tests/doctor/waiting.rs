@@ -73,7 +73,7 @@ fn a_missing_camera_is_waited_for() {
 }
 
 /// A process that ends with the test, however that ends.
-struct Ends(Child);
+pub(super) struct Ends(pub(super) Child);
 
 impl Drop for Ends {
     fn drop(&mut self) {
