@@ -19,6 +19,7 @@ use shared::level::Level;
 use shared::limits::Limits;
 use shared::messages::{Phase, Telemetry};
 use shared::os;
+use shared::regular_file::ASTRAY;
 use shared::weights::{Estimator, Weights};
 
 use crate::core::Settings;
@@ -67,6 +68,8 @@ pub struct Disk<'a> {
     journal: Option<Writer>,
     /// Where the journal is, and the settings that it begins with; `None` if none is kept.
     journal_at: Option<(PathBuf, Settings)>,
+    /// Whether the journal's file was deleted or moved away; what is written is kept nowhere then, or where nobody looks.
+    astray: bool,
     /// When a journal that could not be written is tried again, and when free space is looked at again.
     retry: Option<Instant>,
     pause: Duration,
@@ -130,6 +133,7 @@ impl<'a> Disk<'a> {
             seen: None,
             journal,
             journal_at,
+            astray: false,
             retry,
             pause: RETRY,
             at_rest_since_ns: None,
@@ -198,13 +202,14 @@ impl<'a> Disk<'a> {
         self.newest_tick_ns > since_ns
     }
 
-    /// Begins the journal's next part when the file is large or old, or a new one when the last could not be written; never in a pour or recording.
+    /// Begins the journal's next part when the file is large or old, or not at its place any more, or a new one when the last could not be written; never in
+    /// a pour or recording.
     fn keep_journal(&mut self) {
         let at_rest = self.is_at_rest();
         let Some((path, settings)) = &self.journal_at else { return };
         let due = self.retry.is_some_and(|at| Instant::now() >= at);
         let part = match self.journal.take() {
-            Some(full) if full.is_full() && at_rest => full.next_part(path, settings),
+            Some(full) if (full.is_full() || self.astray) && at_rest => full.next_part(path, settings),
             None if due && at_rest && room(path).is_none_or(|room| room.bytes >= RETRY_SPACE && !room.lacks_files()) => {
                 let weights = self.loaded.iter().cloned().collect();
                 Writer::continue_at(path, settings, weights, self.loaded.as_ref().map(|(identity, _)| *identity))
@@ -214,6 +219,7 @@ impl<'a> Disk<'a> {
                 return;
             }
         };
+        self.astray = false;
         match part {
             Ok(journal) => {
                 (self.say)(Level::Info, &format!("journal: {} begins a new part", path.display()));
@@ -227,7 +233,7 @@ impl<'a> Disk<'a> {
         }
     }
 
-    /// Looks at the journal's size and the free space, now and then.
+    /// Looks at the journal's place and size and the free space, now and then.
     fn look_at_space(&mut self) {
         if self.space_at.is_some_and(|at| at.elapsed() < SPACE_BEAT) {
             return;
@@ -238,6 +244,13 @@ impl<'a> Disk<'a> {
         let space = space_words(&paths);
         let line = match (&self.journal, journal) {
             (_, None) => Some("none (controller.journal is not set)".to_owned()),
+            (Some(writer), Some(path)) if !writer.is_at(path) => {
+                let why = format!("{} {ASTRAY}", path.display());
+                if !std::mem::replace(&mut self.astray, true) {
+                    (self.say)(Level::Warning, &format!("journal: {why}: a new part begins when nothing is poured or recorded"));
+                }
+                Some(format!("not written: {why}"))
+            }
             (Some(writer), Some(path)) => Some(format!("{}, {:.1} MB", path.display(), writer.len() as f64 / 1e6)),
             (None, Some(_)) => None,
         };

@@ -149,6 +149,11 @@ impl Writer {
         self.written
     }
 
+    /// Whether the file that is written is still the one at `path`.
+    pub fn is_at(&self, path: &Path) -> bool {
+        regular_file::is_at(self.to.get_ref(), path)
+    }
+
     /// Whether nothing was written yet.
     pub fn is_empty(&self) -> bool {
         self.written == 0

@@ -4,7 +4,7 @@
 //! bound. Errors are those of the system, or say what is wrong with the file.
 
 use std::fs::{File, Metadata, OpenOptions};
-use std::io::{Error, Read, Result};
+use std::io::{Error, ErrorKind, Read, Result};
 use std::os::unix::fs::{MetadataExt, OpenOptionsExt};
 use std::path::Path;
 
@@ -52,6 +52,20 @@ pub fn open(path: &Path) -> Result<(File, Metadata)> {
     if meta.is_file() { Ok((file, meta)) } else { Err(Error::other("is not a regular file")) }
 }
 
+/// What is said of a file for which [`is_at`] no longer holds. Chosen by hand: from here nobody can tell which of the two it was.
+pub const ASTRAY: &str = "was deleted or moved while it was written";
+
+/// Whether `path` still leads to the open `file`: whoever deletes or moves a file does not end what writes it, and nobody finds what is written then. A
+/// disk that does not say it is believed to have it.
+pub fn is_at(file: &File, path: &Path) -> bool {
+    let identity = |meta: Metadata| (meta.dev(), meta.ino());
+    match (file.metadata().map(identity), path.symlink_metadata().map(identity)) {
+        (Ok(ours), Ok(there)) => ours == there,
+        (_, Err(e)) => !matches!(e.kind(), ErrorKind::NotFound | ErrorKind::NotADirectory),
+        (Err(_), _) => true,
+    }
+}
+
 /// Checks that nobody but this user, root and `trusted` (a user number) may have written the file that `meta` describes.
 pub fn check_owner(meta: &Metadata, trusted: Option<u32>) -> std::result::Result<(), String> {
     if ![Some(0), Some(rustix::process::geteuid().as_raw()), trusted].contains(&Some(meta.uid())) {
@@ -68,6 +82,23 @@ mod tests {
     use std::os::unix::fs::PermissionsExt;
 
     use super::*;
+
+    /// Protects who looks for what was recorded: a file that was deleted, moved, or exchanged while it is open is known as such.
+    #[test]
+    fn a_file_that_is_no_longer_at_its_path_is_noticed() {
+        let dir = tempfile::tempdir().expect("a directory");
+        let (path, other) = (dir.path().join("in/file"), dir.path().join("other"));
+        std::fs::create_dir(dir.path().join("in")).expect("ours");
+        std::fs::write(&path, "1").expect("writable");
+        let (file, _) = open(&path).expect("there");
+        assert!(is_at(&file, &path));
+        std::fs::rename(&path, &other).expect("ours");
+        assert!(!is_at(&file, &path) && is_at(&file, &other));
+        std::fs::write(&path, "2").expect("writable");
+        assert!(!is_at(&file, &path), "another one");
+        std::fs::remove_dir_all(dir.path().join("in")).expect("ours");
+        assert!(!is_at(&file, &path), "not even its directory is there");
+    }
 
     /// Protects the controller's memory and its end: a huge file, a pipe and a directory are refused at once; so are files of strangers.
     #[test]

@@ -16,6 +16,7 @@ use std::sync::{Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
 use crate::disk_space::{Room, error_words};
+use crate::regular_file::is_at;
 use crate::runtime_dir::own_uid;
 use crate::whole_file::may_make_in;
 
@@ -291,8 +292,7 @@ fn open(path: &Path, create: bool) -> std::io::Result<File> {
 
 /// Takes a share of the lock at `path`, if it is still there: somebody who took it for a dead one may just have removed it.
 fn share(lock: &File, path: &Path) -> bool {
-    let inode = |m: std::io::Result<std::fs::Metadata>| m.map(|m| m.ino()).ok();
-    lock.try_lock_shared().is_ok() && inode(lock.metadata()) == inode(path.symlink_metadata())
+    lock.try_lock_shared().is_ok() && is_at(lock, path)
 }
 
 /// The token in `file`, if there is a whole one.

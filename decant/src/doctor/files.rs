@@ -13,7 +13,7 @@ use shared::config_paths::is_same;
 use shared::disk_space::{Room, room};
 use shared::episode::check_number;
 use shared::framing::Framing;
-use shared::machine::Finding;
+use shared::machine::{Finding, Verdict};
 use shared::plural::counted;
 use shared::runtime_dir::{Place, own_uid};
 use shared::shared_memory::{self, SharedMemoryError};
@@ -247,7 +247,13 @@ fn journal(file: &Path, runs: bool) -> Finding {
         Ok(found) => found,
         Err(finding) => return finding,
     };
-    journal_lasts(&there, room)
+    let finding = journal_lasts(&there, room);
+    // A controller makes it at its start; one that is deleted is made anew within seconds of rest.
+    if runs && finding.verdict != Verdict::Red && file.symlink_metadata().is_err_and(|e| e.kind() == ErrorKind::NotFound) {
+        let advice = "look at its line in `decant status`, and do not delete it while a controller runs";
+        return Finding::yellow("journal", format!("{} is not there", file.display()), "a controller runs, and writes none", advice);
+    }
+    finding
 }
 
 /// How long a disk with so much `room` lasts for the journal `there`.
@@ -266,7 +272,6 @@ fn journal_lasts(there: &Path, room: Room) -> Finding {
 #[cfg(test)]
 mod tests {
     use shared::disk_space::LEAST_FILES;
-    use shared::machine::Verdict;
 
     use super::*;
 
@@ -281,6 +286,17 @@ mod tests {
         assert_eq!(verdicts(LEAST_FILES - 1), [Verdict::Red; 2]);
         assert_eq!(verdicts(LEAST_FILES), [Verdict::Yellow, Verdict::Green], "each episode takes one");
         assert_eq!(verdicts(u64::MAX), [Verdict::Green; 2]);
+    }
+
+    /// Protects who looks for a crash in the journal: one that was deleted under a controller that runs is not green.
+    #[test]
+    fn a_journal_that_was_deleted_is_not_green() {
+        let dir = tempfile::tempdir().unwrap();
+        let file = dir.path().join("journal.bin");
+        let judge = |runs| journal(&file, runs).is.contains("is not there");
+        assert!(judge(true) && !judge(false));
+        std::fs::write(&file, journal_files::MAGIC).unwrap();
+        assert!(!judge(true));
     }
 
     /// Protects an installed cell whose file was copied and whose name was not changed: its units would run where no command looks.

@@ -21,6 +21,7 @@ use super::{EpisodeKind, hex, schema};
 use crate::config::Config;
 use crate::disk_space::error_words;
 use crate::messages::{Doubt, Feature, Telemetry};
+use crate::regular_file::{ASTRAY, is_at};
 
 /// A chunk is closed when it is this old, ns. Chosen by hand: a killed recorder loses at most half a second.
 const CHUNK_NS: u64 = 500_000_000;
@@ -49,6 +50,12 @@ pub enum WriteError {
         file: String,
         /// The operating system's message.
         what: String,
+    },
+    /// The file is not at its path any more, so that nobody finds the episode.
+    #[error("{file} {ASTRAY}")]
+    Astray {
+        /// The path.
+        file: String,
     },
 }
 
@@ -275,6 +282,9 @@ impl EpisodeWriter {
         let buffered = writer.into_inner();
         let file = buffered.into_inner().map_err(|e| file_error(&path, e.error()))?;
         file.sync_all().map_err(|e| file_error(&path, &e))?;
+        if !is_at(&file, &path) {
+            return Err(WriteError::Astray { file: path.display().to_string() });
+        }
         Ok(path)
     }
 }
@@ -359,6 +369,23 @@ mod tests {
         child.args(["-c", "trap '' XFSZ; ulimit -f 1; exec \"$0\" --exact episode::write::tests::begins_without_room --ignored"]);
         child.arg(std::env::current_exe().unwrap()).env("EPISODE_DIRECTORY", dir.path()).stdout(std::process::Stdio::null());
         assert_eq!(child.status().unwrap().code(), Some(0));
+    }
+
+    /// Protects who is told where a pour lies: an episode whose file was deleted while it was recorded is not reported as there.
+    #[test]
+    fn an_episode_that_was_deleted_is_not_whole() {
+        let dir = tempfile::tempdir().unwrap();
+        let config = Config::parse(include_str!("../../../config/sim.toml"), "sim.toml").unwrap();
+        let finish = |number, after: fn(&Path)| {
+            let kind = EpisodeKind::Pour { goal_ml: 50.0 };
+            let start = EpisodeStart { episode: number, kind, started_at_ns: 1, wall_clock: UNIX_EPOCH, config: &config, weights: "" };
+            let writer = EpisodeWriter::create(dir.path(), &start).unwrap();
+            after(writer.path());
+            writer.finish(&EpisodeEnd { complete: true, reason: "over", disordered_frames: 0 }).map_err(|e| e.to_string())
+        };
+        assert!(finish(1, |_| ()).unwrap().ends_with("episode-0001.mcap"));
+        let deleted = finish(2, |path| std::fs::remove_file(path).unwrap()).unwrap_err();
+        assert!(deleted.contains("was deleted or moved"), "{deleted}");
     }
 
     /// Protects earlier episodes: a file is never overwritten, and one whose number is taken gets the next free one.

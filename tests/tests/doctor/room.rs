@@ -97,6 +97,24 @@ fn a_disk_that_takes_no_more_files_is_told() {
     assert_eq!(in_episodes(&cell, "ls $EPISODES/*.mcap | wc -l"), "0");
 }
 
+/// Protects who looks for a crash in the journal: one that is deleted while the controller writes it is said, once, and begun anew as soon as nothing is
+/// poured.
+#[test]
+fn a_journal_that_is_deleted_is_begun_anew() {
+    let cell = CellUnderTest::start(|_| {});
+    let journal = cell.dir.path().join("journal.bin");
+    std::fs::remove_file(&journal).expect("it is written");
+    let until = Instant::now() + Duration::from_secs(20);
+    while !journal.exists() {
+        assert!(Instant::now() < until, "{}", cell.log("rt-controller"));
+        std::thread::sleep(Duration::from_millis(50));
+    }
+    let log = cell.log("rt-controller");
+    assert_eq!(log.matches("was deleted or moved while it was written").count(), 1, "{log}");
+    cell.wait("the journal", Duration::from_secs(10), |s| s["journal"].as_str().is_some_and(|words| words.ends_with(" MB")));
+    assert!(journal.metadata().expect("there").len() > 0);
+}
+
 /// An empty disk of so many GiB at a directory, `SCRIPT DIRECTORY GIB`, that says no number of its own (`f_fsid` is 0), as those over NFS and FUSE. It is one
 /// over FUSE: the numbers are those of the protocol's version 7.31 (linux/fuse.h).
 const NAMELESS_DISK: &str = "import ctypes,os,struct,sys
