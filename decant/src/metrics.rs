@@ -15,7 +15,7 @@ use std::time::{Duration, Instant};
 
 use rt_controller::client::Client;
 use shared::config::Config;
-use shared::control::Status;
+use shared::control::{EndReason, Status};
 use shared::disk_space::room;
 use shared::exit::{self, Failure, OrExit as _};
 use shared::os;
@@ -74,6 +74,8 @@ pub fn run(args: &Args) -> Result<(), Failure> {
     std::thread::scope(|scope| {
         scope.spawn(|| weighed.keep(&config.recording.directory, &stop));
         let mut cell = Cell::new(&config);
+        // What ends before Prometheus first asks counts too.
+        cell.look(&weighed);
         server.serve(&stop, |request| match (request.post, request.path.as_str()) {
             (false, "/metrics") => match page::text(cell.look(&weighed)) {
                 Ok(text) => Answer::bytes(page::KIND, text),
@@ -92,14 +94,18 @@ struct Cell<'a> {
     /// The newest answer, and when it was asked for.
     status: Option<Box<Status>>,
     asked: Option<Instant>,
-    /// How many pours and recordings ended for which reason since this process started, and the newest one.
+    /// When this process began to look.
+    since: Instant,
+    /// How many pours and recordings ended for which reason since then, and the newest one.
     ended: BTreeMap<&'static str, u64>,
     newest: Option<u64>,
 }
 
 impl<'a> Cell<'a> {
     fn new(config: &'a Config) -> Self {
-        Self { config, client: None, status: None, asked: None, ended: BTreeMap::new(), newest: None }
+        // Prometheus sees growth only of what it has seen before, so each reason is there from the start.
+        let ended = EndReason::all().map(|reason| (reason.words(), 0)).collect();
+        Self { config, client: None, status: None, asked: None, since: Instant::now(), ended, newest: None }
     }
 
     /// Asks the controller, unless it was asked just now.
@@ -136,11 +142,12 @@ impl<'a> Cell<'a> {
         status
     }
 
-    /// Counts the results that were not counted yet. Those from before this process started are not its own.
+    /// Counts the results that were not counted yet. Those from before this process started are not its own; a controller that started later has none.
     fn count(&mut self) {
         let Some(status) = &self.status else { return };
         let newest = status.outcomes.iter().map(|o| o.episode).max().unwrap_or(0);
-        if let Some(before) = self.newest {
+        let is_younger = status.uptime_s < self.since.elapsed().as_secs_f64();
+        if let Some(before) = self.newest.or(is_younger.then_some(0)) {
             for outcome in status.outcomes.iter().filter(|o| o.episode > before) {
                 *self.ended.entry(outcome.reason.words()).or_default() += 1;
             }

@@ -182,6 +182,12 @@ pub enum EndReason {
 }
 
 impl EndReason {
+    /// All reasons.
+    pub fn all() -> impl Iterator<Item = Self> {
+        // Postcard numbers the kinds of an enumeration in their order, so that no second list of them can miss one.
+        (0..=u8::MAX).map_while(|kind| postcard::from_bytes(&[kind]).ok())
+    }
+
     /// The reason of a run that was ending for `before` when the robot was lost for this one. The first stays, but for done, and where the arm now stands
     /// although the container is not upright: liquid goes on leaving it.
     pub fn after(self, before: Self, is_upright: bool) -> Self {
@@ -333,4 +339,19 @@ pub struct Histogram {
     pub max_us: f64,
     /// Upper edges (us) and counts of the non-empty bins.
     pub bins: Vec<(f64, u64)>,
+}
+
+#[cfg(test)]
+mod tests {
+    use std::collections::BTreeSet;
+
+    use super::*;
+
+    /// Protects who counts by reasons: all are there, each with words of its own.
+    #[test]
+    fn all_reasons_are_listed() {
+        let all: Vec<EndReason> = EndReason::all().collect();
+        assert_eq!((all.first(), all.last()), (Some(&EndReason::Done), Some(&EndReason::GoalExceeded)));
+        assert_eq!(all.iter().map(|reason| reason.words()).collect::<BTreeSet<_>>().len(), EndReason::GoalExceeded as usize + 1);
+    }
 }
