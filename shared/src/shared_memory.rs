@@ -8,7 +8,7 @@
 //! joining too. Every failure is a [`SharedMemoryError`] of one line.
 
 use std::collections::{BTreeMap, BTreeSet};
-use std::fs::{File, OpenOptions};
+use std::fs::{File, Metadata, OpenOptions};
 use std::io::{Read, Write};
 use std::os::unix::fs::{MetadataExt, OpenOptionsExt, PermissionsExt};
 use std::path::{Path, PathBuf};
@@ -27,6 +27,10 @@ const SHM: &str = "/dev/shm";
 const JOIN_BYTES: u64 = 1 << 20;
 /// Files that must still fit before a cell is joined. Chosen by hand: more than one program makes.
 const JOIN_FILES: u64 = 32;
+/// Number of characters of a token: 32 bits in hexadecimal, which few cells do not draw twice.
+const TOKEN_LEN: usize = 8;
+/// The most files of cells that are looked at, for who asks whose they are. Chosen by hand: a cell has about a hundred.
+const LOOKED_MOST: usize = 10_000;
 /// Longest wait for another process that is joining the same cell. Chosen by hand: joining takes some milliseconds.
 const JOIN_WAIT: Duration = Duration::from_secs(2);
 
@@ -201,7 +205,7 @@ pub fn remove_of(directory: &Path) {
 
 /// Removes what dead processes of this user left in `/dev/shm`, of any cell.
 fn clear_dead() {
-    for (token, lock) in tokens() {
+    for (token, lock) in of_cells().filter_map(|(token, file, is_lock)| is_lock.then_some((token, file))) {
         if lock.symlink_metadata().is_ok_and(|m| m.uid() == own_uid())
             && let Ok(file) = open(&lock, false)
             && file.try_lock().is_ok()
@@ -211,12 +215,32 @@ fn clear_dead() {
     }
 }
 
-/// The tokens of all cells of all users, each with its lock.
-fn tokens() -> impl Iterator<Item = (String, PathBuf)> {
-    files("decant-").into_iter().filter_map(|lock| {
-        let token = lock.file_name()?.to_str()?.strip_prefix("decant-")?.strip_suffix(".lock")?.to_owned();
-        Some((token, lock))
+/// The files of all cells of all users: each with its token, and whether it is the token's lock.
+fn of_cells() -> impl Iterator<Item = (String, PathBuf, bool)> {
+    std::fs::read_dir(SHM).into_iter().flatten().flatten().filter_map(|entry| {
+        let name = entry.file_name().into_string().ok()?;
+        let (token, rest) = name.strip_prefix("decant-")?.split_at_checked(TOKEN_LEN)?;
+        let is_lock = rest == ".lock";
+        (is_token(token) && (is_lock || rest.starts_with('_'))).then(|| (token.to_owned(), entry.path(), is_lock))
     })
+}
+
+/// The files that somebody has locked, as far as this process can see: device and inode; `None` if the system does not tell.
+fn locked() -> Option<BTreeSet<(u64, u64)>> {
+    // Everybody may read which files are locked; the file stands in it as MAJOR:MINOR:INODE, the first two in hexadecimal (proc_locks(5)).
+    let locks = std::fs::read_to_string("/proc/locks").ok()?;
+    let file = |word: &str| {
+        let mut parts = word.split(':');
+        let [major, minor] = [parts.next()?, parts.next()?].map(|number| u32::from_str_radix(number, 16));
+        Some((rustix::fs::makedev(major.ok()?, minor.ok()?), parts.next()?.parse().ok()?))
+    };
+    Some(locks.split_whitespace().filter_map(file).collect())
+}
+
+/// Whether a process of the cell runs whose runtime directory is `directory`, as far as this process can see its lock. Nothing is made or changed.
+pub fn is_in_use(directory: &Path) -> bool {
+    let lock = read_token(&directory.join("token")).and_then(|token| lock_path(&token).symlink_metadata().ok());
+    lock.is_some_and(|meta| locked().is_none_or(|locked| locked.contains(&(meta.dev(), meta.ino()))))
 }
 
 /// What cells have in `/dev/shm`.
@@ -230,18 +254,25 @@ pub struct Kept {
     pub bytes: u64,
 }
 
-/// What all users' cells have in `/dev/shm`: for each user at most what is in use, and what dead processes left.
-pub fn kept() -> Vec<Kept> {
-    // Everybody may read which files are locked; the inode stands in it as MAJOR:MINOR:INODE (proc_locks(5)).
-    let locks = std::fs::read_to_string("/proc/locks").unwrap_or_default();
-    let locked: BTreeSet<u64> = locks.split_whitespace().filter_map(|word| word.rsplit_once(':')?.1.parse().ok()).collect();
+/// What all users' cells have in `/dev/shm`: for each user at most what is in use, and what dead processes left. The second value tells whether all files
+/// were looked at: any user may make as many as there is room for.
+pub fn kept() -> (Vec<Kept>, bool) {
+    let locked = locked().unwrap_or_default();
+    let mut files = of_cells();
+    let looked: Vec<(String, Metadata, bool)> = files
+        .by_ref()
+        .take(LOOKED_MOST)
+        .filter_map(|(token, file, is_lock)| Some((token, file.symlink_metadata().ok()?, is_lock)))
+        .collect();
+    let locks = looked.iter().filter(|(_, _, is_lock)| *is_lock);
+    let in_use: BTreeMap<&str, bool> = locks.map(|(token, meta, _)| (token.as_str(), locked.contains(&(meta.dev(), meta.ino())))).collect();
     let mut all: BTreeMap<(u32, bool), u64> = BTreeMap::new();
-    for (token, lock) in tokens() {
-        let Ok(meta) = lock.symlink_metadata() else { continue };
-        let its = files(&prefix(&token)).into_iter().filter_map(|file| file.symlink_metadata().ok());
-        *all.entry((meta.uid(), locked.contains(&meta.ino()))).or_default() += its.map(|m| m.len()).sum::<u64>();
+    for (token, meta, _) in &looked {
+        if let Some(in_use) = in_use.get(token.as_str()) {
+            *all.entry((meta.uid(), *in_use)).or_default() += meta.len();
+        }
     }
-    all.into_iter().map(|((uid, in_use), bytes)| Kept { uid, in_use, bytes }).collect()
+    (all.into_iter().map(|((uid, in_use), bytes)| Kept { uid, in_use, bytes }).collect(), files.next().is_none())
 }
 
 /// Removes the files of a token, the lock last.
@@ -299,7 +330,12 @@ fn share(lock: &File, path: &Path) -> bool {
 fn read_token(file: &Path) -> Option<String> {
     let mut text = String::new();
     open(file, false).ok()?.take(64).read_to_string(&mut text).ok()?;
-    (text.len() == 8 && text.bytes().all(|c| c.is_ascii_hexdigit())).then_some(text)
+    is_token(&text).then_some(text)
+}
+
+/// Whether a cell may have drawn `text` as its token.
+fn is_token(text: &str) -> bool {
+    text.len() == TOKEN_LEN && text.bytes().all(|c| c.is_ascii_hexdigit())
 }
 
 /// Draws a token that nobody uses and takes its lock.
@@ -323,5 +359,21 @@ fn new_token(directory: &Path) -> Result<(String, File), SharedMemoryError> {
             Err(e) if e.kind() == std::io::ErrorKind::AlreadyExists => {}
             Err(e) => return Err(failed(&path, format!("{e}: is /dev/shm full?"))),
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Protects who is told what dead processes left: a lock counts by its device and its inode, because files of two disks may have one number.
+    #[test]
+    fn a_lock_counts_on_its_own_device() {
+        let file = tempfile::tempfile_in(SHM).unwrap();
+        let meta = file.metadata().unwrap();
+        let is_locked = |device: u64| locked().unwrap().contains(&(device, meta.ino()));
+        assert!(!is_locked(meta.dev()));
+        file.lock_shared().unwrap();
+        assert!(is_locked(meta.dev()) && !is_locked(meta.dev() + 1));
     }
 }

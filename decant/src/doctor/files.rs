@@ -120,12 +120,14 @@ fn shared_memory() -> Finding {
 
 /// What cells have in `/dev/shm`, whose it is, and whether it is in use.
 fn kept() -> Finding {
-    let all = shared_memory::kept();
+    let (all, is_whole) = shared_memory::kept();
     let words = |k: &shared_memory::Kept| {
         format!("user {}: {} KiB {}", k.uid, k.bytes / 1024, if k.in_use { "in use" } else { "left by dead processes" })
     };
-    let list = if all.is_empty() { "none".into() } else { all.iter().map(words).collect::<Vec<_>>().join(", ") };
-    if all.iter().all(|k| k.uid == own_uid()) {
+    let more = (!is_whole).then(|| "and more files than were looked at".to_owned());
+    let list: Vec<String> = all.iter().map(words).chain(more).collect();
+    let list = if list.is_empty() { "none".into() } else { list.join(", ") };
+    if is_whole && all.iter().all(|k| k.uid == own_uid()) {
         // What this user's dead processes left goes by itself at the next start.
         return Finding::green("cells' shared memory", list);
     }

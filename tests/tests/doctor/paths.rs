@@ -97,3 +97,17 @@ fn runtime_files_without_a_place_are_red() {
     let (is, text) = line(&examine(&cell).0, "files", "/dev/shm");
     assert!(is == "red" && text.contains("remount,rw"), "{is}: {text}");
 }
+
+/// Protects who asks the doctor beside another user who makes files without end: what is there under cells' names is looked at once, up to a bound, and it is
+/// said that there is more.
+#[test]
+fn files_without_end_are_told_and_not_read() {
+    let mut cell = CellUnderTest::prepare(|_| {});
+    let Some(inside) = Namespaces::new(Some("64m")) else { return };
+    let script = "seq -f /dev/shm/decant-%08g.lock 10100 | xargs touch && chown -R 65534 /dev/shm";
+    assert!(inside.command("sh").args(["-c", script]).status().expect("it runs").success());
+    cell.inside = Some(inside);
+    let (is, text) = line(&examine(&cell).0, "files", "cells' shared memory");
+    let words = ["user 65534: 0 KiB left by dead processes", "and more files than were looked at"];
+    assert!(is == "yellow" && words.iter().all(|w| text.contains(w)), "{is}: {text}");
+}
