@@ -25,7 +25,8 @@ use crate::stop::{ROUND, ROUNDS, StopAnswer, abstract_name, listener};
 const ANSWER: Duration = Duration::from_secs(1);
 /// Longest answer that is read, bytes. Chosen by hand: ten times the longest one.
 const ANSWER_MAX: u64 = 4096;
-/// The most cells that are asked by their names alone. Chosen by hand: a machine has a few, and more would be somebody's names.
+/// The most cells that are asked, or told of, by their names alone, in turns of each user's. Chosen by hand: a machine has a few, and more would be
+/// somebody's names.
 const NAMES_MOST: usize = 64;
 
 /// Where the controller of one cell may be reached.
@@ -105,8 +106,22 @@ pub fn running_cells() -> Running {
     let (named, mut targets): (Vec<Target>, Vec<Target>) = all.partition(|target| target.only_a_name);
     let own = |target: &Target| [0, target.uid].contains(&own_uid());
     let (named, others): (Vec<Target>, Vec<Target>) = listening(named).into_iter().partition(own);
-    targets.extend(named.into_iter().take(NAMES_MOST));
-    Running { targets, doubted, others: others.into_iter().map(|target| (target.uid, target.name)).collect() }
+    targets.extend(shared_out(named).into_iter().take(NAMES_MOST));
+    let others = shared_out(others).into_iter().take(NAMES_MOST).map(|target| (target.uid, target.name)).collect();
+    Running { targets, doubted, others }
+}
+
+/// The same in turns: each user's first, then each one's second, and so on. So a user who makes many names crowds out nobody else's cell.
+fn shared_out(named: Vec<Target>) -> Vec<Target> {
+    let mut of_user: BTreeMap<u32, usize> = BTreeMap::new();
+    let in_turn = |target: Target| {
+        let turn = of_user.entry(target.uid).or_default();
+        *turn += 1;
+        (*turn, target)
+    };
+    let mut named: Vec<(usize, Target)> = named.into_iter().map(in_turn).collect();
+    named.sort_by_key(|(turn, _)| *turn);
+    named.into_iter().map(|(_, target)| target).collect()
 }
 
 /// Those at whose names somebody listens who is the name's user or root. Nobody is waited for: a socket whose places are all taken would let nobody connect.

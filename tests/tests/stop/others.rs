@@ -215,6 +215,37 @@ fn a_controller_whose_name_is_taken_is_told_of() {
     assert!(output.status.code() == Some(1) && said.contains(&format!("process {pid} is an rt-controller that was not reached")), "{said}");
 }
 
+/// Protects who aborts as root without a configuration from a user who makes many names: the cell of another one, whose runtime files lie in a directory of
+/// its own, is asked all the same, although that user's number is the larger one.
+#[test]
+fn many_names_of_one_user_hide_no_cell() {
+    /// A user with a larger number than the one who makes the names.
+    const LATER: u32 = 65_600;
+    if !rustix::process::geteuid().is_root() {
+        println!("not run: it takes root to act as other users");
+        return;
+    }
+    let base = tempfile::tempdir().expect("a directory");
+    let Some(cell) = cell_in(base.path()) else { return };
+    for path in [base.path(), cell.dir.path(), &cell.config()] {
+        chown(path, Some(LATER), Some(LATER)).expect("root may");
+    }
+    let names: Vec<String> = (0..70).map(|k| format!("decant/65534/a{k:03}")).collect();
+    let _kept = super::sockets(&cell, "silent", &names);
+    let mut shared = Shared { cell, programs: vec![public_copy("rt-controller")] };
+    let command = shared.command(LATER, "rt-controller");
+    let log = std::fs::File::create(shared.cell.dir.path().join("rt-controller.log")).expect("writable");
+    shared.cell.spawn_with("rt-controller", command, log.into());
+    let config = shared.cell.config().display().to_string();
+    let begin = Instant::now();
+    while shared.ask(LATER, &["status", "--config", &config]).0 != Some(0) {
+        assert!(begin.elapsed() < Duration::from_secs(30), "{}", shared.cell.log("rt-controller"));
+        std::thread::sleep(Duration::from_millis(50));
+    }
+    let said = shared.ask(0, &["abort"]).1;
+    assert!(said.contains("nobody answers at the socket of cell 'a000'") && !said.contains("was not reached"), "{said}");
+}
+
 /// Protects who aborts without a configuration beside a cell whose runtime files lie in a directory of its own: only its socket's name shows that it runs.
 /// Another user is told of it, and a controller that hangs is no "nothing runs".
 #[test]
