@@ -121,6 +121,28 @@ pub fn remove_files(place: impl Into<Place>) {
     let _ = std::fs::remove_dir_all(directory);
 }
 
+/// Who publishes in a cell that runs.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Publishers {
+    /// A camera driver, a simulated camera, or a worker with a camera of its own.
+    pub frames: bool,
+    /// A feature worker.
+    pub features: bool,
+}
+
+/// Who publishes in the cell `place`; `None` if no process of it is seen to run. Such a cell is not joined, so that a look makes no files.
+pub fn publishers(place: impl Into<Place>) -> Result<Option<Publishers>, IpcError> {
+    let place = place.into();
+    if !shared_memory::is_in_use(&place.check()?) {
+        return Ok(None);
+    }
+    // Joining clears what dead programs left, so that one that was killed does not count.
+    let cell = Cell::join(place)?;
+    let frames = cell.frames()?.dynamic_config().number_of_publishers() > 0;
+    let features = cell.features()?.dynamic_config().number_of_publishers() > 0;
+    Ok(Some(Publishers { frames, features }))
+}
+
 /// One cell's services.
 pub struct Cell {
     node: CellNode,

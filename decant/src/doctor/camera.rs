@@ -1,21 +1,37 @@
-//! The camera that the configuration names: whether it can be opened, and gives pictures of that size and rate.
+//! The camera that the configuration names: whether it can be opened, and gives pictures of that size and rate; and whether the worker runs that measures
+//! in them.
 //!
-//! Called once by an ordinary thread; allocates; nothing fails. A camera that streams is not disturbed.
+//! Called once by an ordinary thread; allocates; nothing fails. A camera that streams is not disturbed, and a cell that does not run is not joined.
 
 use std::path::Path;
 
 use feature_worker::source::{controls, devices};
+use rt_controller::claim;
 use shared::config::{CameraConfig, CameraSource, Config};
+use shared::ipc::{IpcError, Publishers, publishers};
 use shared::machine::Finding;
+use shared::runtime_dir::Place;
 
-/// Looks at the camera.
+/// What to do where a cell cannot be joined: its shared memory is private to its user (ARCHITECTURE.md).
+const OWN_USER: &str = "run this as the cell's own user, and see what is red";
+
+/// Who publishes in the cell, if it runs.
+type Published = Result<Option<Publishers>, IpcError>;
+
+/// Looks at the camera and the worker.
 pub fn look(config: &Config) -> Vec<Finding> {
-    let camera = &config.camera;
+    let published = publishers(&config.cell);
+    let mut findings = source(&config.camera, &published);
+    let controlled = matches!(claim::running_at(&Place::from(&config.cell)), Ok(Some(_)));
+    findings.push(worker(&published, controlled));
+    findings
+}
+
+/// Whether there are pictures.
+fn source(camera: &CameraConfig, published: &Published) -> Vec<Finding> {
     match camera.source {
         CameraSource::Device => device(camera),
-        CameraSource::SharedMemory => {
-            vec![Finding::green("source", "another program publishes the frames in shared memory; the worker waits for it")]
-        }
+        CameraSource::SharedMemory => vec![frames(published)],
         CameraSource::Video | CameraSource::Images => {
             let pattern = camera.path.contains('%');
             let there = Path::new(&camera.path);
@@ -31,6 +47,32 @@ pub fn look(config: &Config) -> Vec<Finding> {
                 vec![Finding::red("source", format!("{}: no such file", camera.path), "there are no pictures", "set camera.path")]
             }
         }
+    }
+}
+
+/// Whether another program publishes the frames that the worker reads.
+fn frames(published: &Published) -> Finding {
+    let (means, advice) = ("there are no pictures", "start the program that publishes the camera's frames in this cell");
+    match published {
+        Ok(Some(Publishers { frames: true, .. })) => Finding::green("source", "another program publishes the frames in shared memory"),
+        Ok(Some(_)) => Finding::red("source", "no program publishes frames in shared memory", means, advice),
+        Ok(None) => {
+            Finding::red("source", "no program of the cell is seen to run, so none publishes frames in shared memory", means, advice)
+        }
+        Err(e) => Finding::yellow("source", e.to_string(), "whether a program publishes frames is not known", OWN_USER),
+    }
+}
+
+/// Whether a feature worker runs. Without a controller (`controlled`) nobody waits for one.
+fn worker(published: &Published, controlled: bool) -> Finding {
+    match published {
+        Ok(Some(Publishers { features: true, .. })) => Finding::green("worker", "a feature worker runs"),
+        Ok(_) if controlled => {
+            let means = "the controller gets no measurements, and refuses every pour and recording";
+            Finding::red("worker", "no feature worker runs", means, "start it: `feature-worker run`, or decant-feature-worker@CELL")
+        }
+        Ok(_) => Finding::green("worker", "none runs"),
+        Err(e) => Finding::yellow("worker", e.to_string(), "whether a feature worker runs is not known", OWN_USER),
     }
 }
 
@@ -125,6 +167,21 @@ fn format(camera: &CameraConfig, formats: &[String]) -> Finding {
 mod tests {
     use super::*;
     use shared::machine::Verdict;
+
+    /// Protects who asks why nothing is measured: frames that nobody publishes, and a worker that a controller waits for, are red; what cannot be known is
+    /// yellow.
+    #[test]
+    fn who_publishes_is_told() {
+        let judge = |published: Published, controlled| [frames(&published).verdict, worker(&published, controlled).verdict];
+        let of = |frames, features| Ok(Some(Publishers { frames, features }));
+        assert_eq!(judge(of(true, true), true), [Verdict::Green; 2]);
+        assert_eq!(judge(of(false, true), true), [Verdict::Red, Verdict::Green]);
+        assert_eq!(judge(of(true, false), true), [Verdict::Green, Verdict::Red]);
+        assert_eq!(judge(of(true, false), false), [Verdict::Green; 2], "nobody waits for it");
+        assert_eq!(judge(Ok(None), false), [Verdict::Red, Verdict::Green]);
+        let unknown = IpcError::Node { cell: "lab".into(), what: "Refused".into() };
+        assert_eq!(judge(Err(unknown), true), [Verdict::Yellow; 2]);
+    }
 
     /// Protects the colours of a pour: controls that somebody changed while the camera is used are yellow, and those that nobody has set yet are not.
     #[test]

@@ -3,6 +3,7 @@
 use std::process::{Child, Stdio};
 use std::time::Duration;
 
+use serde_json::Value;
 use tests::{CellUnderTest, Namespaces, steady_weights};
 
 use super::{examine, line};
@@ -35,7 +36,8 @@ fn a_robot_is_found_by_its_name() {
     assert!(output.status.code() == Some(4) && said.contains("shutting down"), "{:?}: {said}", output.status);
 }
 
-/// Protects who asks before a pour whether all is well: a running controller that would refuse it is no green line, and `status` names the same reason.
+/// Protects who asks before a pour whether all is well: a running controller that would refuse it is no green line, and `status` names the same reason. That
+/// no worker runs, or nobody publishes the frames, is a line of its own.
 #[test]
 fn a_controller_that_would_refuse_is_not_green() {
     let mut cell = CellUnderTest::start(|_| {});
@@ -46,15 +48,23 @@ fn a_controller_that_would_refuse_is_not_green() {
     assert_eq!(line(&examine(&cell).0, "robot", "state").0, "yellow");
     cell.take_weights(&steady_weights(13));
     cell.wait("nothing to hinder", patience, |s| s["phase"] == "idle" && s["hindrance"] == "");
-    let (verdict, words) = line(&examine(&cell).0, "robot", "state");
+    let said = examine(&cell).0;
+    let (verdict, words) = line(&said, "robot", "state");
     assert!(verdict == "green" && words.contains("at work on the robot"), "{verdict}: {words}");
+    let camera = |said: &Value| ["source", "worker"].map(|what| line(said, "camera", what).0);
+    assert_eq!(camera(&said), ["green", "green"], "{said:#}");
     assert_eq!(cell.stop("feature-worker"), Some(0), "{}", cell.log("feature-worker"));
     let status = cell.wait("the lack of measurements", patience, |s| {
         s["hindrance"].as_str().is_some_and(|h| h.contains("no fresh, usable measurement"))
     });
     assert_eq!(status["may_record"], false, "{status}");
-    let (verdict, words) = line(&examine(&cell).0, "robot", "state");
+    let said = examine(&cell).0;
+    let (verdict, words) = line(&said, "robot", "state");
     assert!(verdict == "red" && words.contains("no fresh, usable measurement"), "{verdict}: {words}");
+    assert_eq!(camera(&said), ["green", "red"], "{said:#}");
+    assert_eq!(cell.stop("simulator"), Some(0), "{}", cell.log("simulator"));
+    let said = examine(&cell).0;
+    assert_eq!(camera(&said), ["red", "red"], "{said:#}");
 }
 
 /// Protects a person who starts the worker before the camera is plugged in: it waits, says so once, and ends at once when it is asked to.
