@@ -5,12 +5,15 @@
 
 use std::fs::{File, Metadata, OpenOptions, Permissions};
 use std::io::{Error, ErrorKind, Read as _, Result, Write as _};
-use std::os::unix::fs::{MetadataExt as _, PermissionsExt as _, fchown};
+use std::os::unix::fs::{MetadataExt as _, OpenOptionsExt as _, PermissionsExt as _, fchown};
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicU32, Ordering::Relaxed};
 
 use crate::disk_space::error_words;
 use crate::regular_file;
+
+/// Mode of a new file before the user's umask takes of it. Source: POSIX, what `creat` of the standard tools gives.
+const USUAL_MODE: u32 = 0o666;
 
 /// Puts `bytes` into the file at `path`, which keeps its mode and owner if it is there. `begins` is how every file of this kind begins: a file
 /// that begins otherwise is left as it is. If `path` is a link, the new file takes the link's place.
@@ -29,11 +32,12 @@ pub fn replace_soon(path: &Path, bytes: &[u8], begins: &[u8]) -> Result<()> {
 fn put_in_place(path: &Path, bytes: &[u8], begins: &[u8], sync: fn(&File) -> Result<()>) -> Result<()> {
     check(path, begins)?;
     let before = path.metadata().ok();
-    let (mut file, new) = new_beside(path).map_err(|e| in_words(&e))?;
+    let mode = before.as_ref().map(|before| before.mode() & 0o777);
+    let (mut file, new) = open_beside(path, mode.unwrap_or(USUAL_MODE)).map_err(|e| in_words(&e))?;
     let mut put = || {
-        if let Some(before) = &before {
+        if let (Some(before), Some(mode)) = (&before, mode) {
             give_owner(&file, before);
-            file.set_permissions(Permissions::from_mode(before.mode() & 0o777))?;
+            file.set_permissions(Permissions::from_mode(mode))?;
         }
         file.write_all(bytes)?;
         sync(&file)?;
@@ -50,7 +54,16 @@ pub fn give_owner(file: &File, of: &Metadata) {
 
 /// Puts `bytes` into the new file `path`. It is an error if something is there.
 pub fn create(path: &Path, bytes: &[u8]) -> Result<()> {
-    let (mut file, new) = new_beside(path).map_err(|e| in_words(&e))?;
+    create_of_mode(path, bytes, USUAL_MODE)
+}
+
+/// As [`create`], in a file that nobody but this user may read, also while it is made.
+pub fn create_secret(path: &Path, bytes: &[u8]) -> Result<()> {
+    create_of_mode(path, bytes, 0o600)
+}
+
+fn create_of_mode(path: &Path, bytes: &[u8], mode: u32) -> Result<()> {
+    let (mut file, new) = open_beside(path, mode).map_err(|e| in_words(&e))?;
     let mut put = || {
         file.write_all(bytes)?;
         file.sync_all()?;
@@ -114,13 +127,18 @@ pub fn give_name(new: &Path, path: &Path) -> Result<()> {
 
 /// A new file in the directory of `path`, with its path: its name is one that no program takes for anything of its own, and that was free.
 pub fn new_beside(path: &Path) -> Result<(File, PathBuf)> {
+    open_beside(path, USUAL_MODE)
+}
+
+/// The same with a mode. Whoever may not read the file at the end could else open it before, and read what is written.
+fn open_beside(path: &Path, mode: u32) -> Result<(File, PathBuf)> {
     static NEXT: AtomicU32 = AtomicU32::new(0);
     if path.file_name().is_none() {
         return Err(Error::new(ErrorKind::InvalidInput, "is no file name"));
     }
     loop {
         let new = path.with_file_name(format!(".decant-{}-{}.new", std::process::id(), NEXT.fetch_add(1, Relaxed)));
-        match OpenOptions::new().write(true).create_new(true).open(&new) {
+        match OpenOptions::new().write(true).create_new(true).mode(mode).open(&new) {
             // That of a process with the same number, in another container or before it was killed.
             Err(e) if e.kind() == ErrorKind::AlreadyExists => {}
             opened => return Ok((opened?, new)),
@@ -198,7 +216,9 @@ mod tests {
         assert_eq!(give_name(&new, &path).unwrap_err().kind(), ErrorKind::AlreadyExists);
         assert_eq!(create(&path, b"3").unwrap_err().kind(), ErrorKind::AlreadyExists);
         create(&dir.path().join("other"), b"3").unwrap();
-        assert_eq!(names(dir.path()), ["new", "other", "path"]);
+        create_secret(&dir.path().join("secret"), b"4").unwrap();
+        assert_eq!(dir.path().join("secret").metadata().unwrap().mode() & 0o777, 0o600);
+        assert_eq!(names(dir.path()), ["new", "other", "path", "secret"]);
         assert_eq!(std::fs::read(&path).unwrap(), b"1");
     }
 
