@@ -102,10 +102,10 @@ fn device(camera: &CameraConfig) -> Vec<Finding> {
         findings.push(Finding::yellow("name", camera.path.clone(), "node numbers change when another camera is plugged in", advice));
     }
     let users = found.users.join(", ");
-    // Whoever has it open need not read from it, which the kernel does not tell.
-    if !users.is_empty() && !found.users.iter().any(|user| user.starts_with("feature-worker ")) {
-        let (means, advice) = ("if it reads pictures, the worker cannot", "end that program");
-        findings.push(Finding::yellow("used by", users, means, advice));
+    // Whoever has it open need not stream from it. What other users run is not seen: it may be the worker.
+    let worker = found.users.iter().any(|user| user.starts_with("feature-worker "));
+    if !users.is_empty() && !worker && devices::is_taken(&file) {
+        findings.push(Finding::yellow("used by", users, "it reads pictures, so the worker cannot", "end that program"));
     } else if !users.is_empty() {
         findings.push(Finding::green("used by", users));
     }

@@ -55,7 +55,8 @@ pub fn run(args: &Args) -> Result<(), Failure> {
     match (config, &args.config) {
         (Some(config), Some(file)) if config.camera.source == CameraSource::Device => {
             let path = Path::new(&config.camera.path);
-            devices::open(path).and_then(|_| devices::free(Path::new("/"), path)).map_err(|e| failure(e.exit_code(), e))?;
+            let free = |device| devices::free(&device, Path::new("/"), path);
+            devices::open(path).and_then(free).map_err(|e| failure(e.exit_code(), e))?;
             if args.find { find(&config.camera, file) } else { Ok(()) }
         }
         _ if args.find => {
@@ -123,6 +124,7 @@ fn words(device: &Device) -> String {
         Some(Trouble::Busy) => "busy".into(),
         Some(Trouble::Metadata) => "a metadata node, without pictures".into(),
         Some(Trouble::NotACamera) => "no camera".into(),
+        Some(Trouble::Failing) => "its driver cannot open it".into(),
     }
 }
 

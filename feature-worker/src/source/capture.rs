@@ -1,7 +1,7 @@
 //! Frames of a V4L2 device through OpenCV.
 //!
 //! Called from the thread that measures. OpenCV decodes into one matrix that is reused. A device is read at the size and the rate that
-//! are configured, or it is refused.
+//! are configured, or it is refused. Where OpenCV fails, which does not tell why, the kernel is asked.
 
 use std::fs::File;
 use std::path::Path;
@@ -16,7 +16,7 @@ use shared::messages::{FrameHeader, LAYOUT_VERSION, PixelFormat};
 use shared::os;
 
 use super::controls::{self, Found, SETTLE_MOST};
-use super::devices::{self, Trouble};
+use super::devices;
 use super::frame::{Frame, FrameSource, NextFrame, SourceError};
 use super::numbering::Numbering;
 
@@ -67,10 +67,18 @@ impl Capture {
         let fail = |what: &str| SourceError::Open { path: camera.path.clone(), what: what.into() };
         // Before OpenCV, which does not tell why it cannot open a device.
         let device = devices::open(Path::new(&camera.path))?;
-        let opened = VideoCapture::from_file(&camera.path, videoio::CAP_V4L2);
-        let mut capture = opened.map_err(|e| fail(&format!("cannot be opened: {}", e.message)))?;
+        let open = || {
+            let opened = VideoCapture::from_file(&camera.path, videoio::CAP_V4L2);
+            opened.map_err(|e| fail(&format!("cannot be opened: {}", e.message)))
+        };
+        let mut capture = open()?;
         if !capture.is_opened()? {
-            return Err(devices::error_of(Path::new("/"), Path::new(&camera.path), Trouble::Busy));
+            devices::free(&device, Path::new("/"), Path::new(&camera.path))?;
+            // Whoever had it may have let go of it since.
+            capture = open()?;
+        }
+        if !capture.is_opened()? {
+            return Err(fail("OpenCV cannot open it, and no other program streams from it; `feature-worker camera` shows its formats"));
         }
         // OpenCV takes raw pictures where it can. Many cameras give a large size at the full rate only as MJPEG.
         if let Err(raw) = set_mode(&mut capture, camera) {
@@ -83,7 +91,15 @@ impl Capture {
 
     /// Takes a frame off the camera, which is not looked at.
     fn grab(capture: &mut VideoCapture, camera: &CameraConfig) -> Result<(), SourceError> {
-        if capture.grab().unwrap_or(false) { Ok(()) } else { Err(SourceError::Lost(camera.path.clone())) }
+        if capture.grab().unwrap_or(false) { Ok(()) } else { Err(Self::gone(&camera.path)) }
+    }
+
+    /// Why the device at `path` gives no more frames.
+    fn gone(path: &str) -> SourceError {
+        match devices::open(Path::new(path)) {
+            Err(SourceError::Missing(_)) => SourceError::Lost(path.into()),
+            _ => SourceError::Failed(path.into()),
+        }
     }
 
     /// What the camera's automatics find in the light of now. It is set, with the automatics off. It takes [`SETTLE_MOST`].
@@ -130,7 +146,7 @@ impl FrameSource for Capture {
         let read = grabbed && self.capture.retrieve_def(&mut self.picture).unwrap_or(false);
         let now_ns = os::now_ns();
         if !grabbed {
-            return Err(SourceError::Lost(self.path.clone()));
+            return Err(Self::gone(&self.path));
         }
         // A damaged MJPEG picture is left out, and the next frame's number shows the gap. (OpenCV 4.6 repeats the last picture instead.)
         if !read || self.picture.empty() {

@@ -1,14 +1,16 @@
 //! V4L2 devices: which there are, what each can do, who uses it, and why one cannot be opened.
 //!
 //! Called at the start and by `feature-worker camera`, on their own thread; allocates. What is read of /dev, /sys, /proc and /etc is read below
-//! a root, so that a test can give another one. Only [`open`] and [`Device::ask`] touch a device, and neither disturbs one that streams.
+//! a root, so that a test can give another one. Only [`open`], [`is_taken`] and [`Device::ask`] touch a device, and none disturbs one that streams.
 
 use std::fs::{File, OpenOptions};
 use std::os::unix::fs::{MetadataExt as _, OpenOptionsExt as _};
 use std::path::{Path, PathBuf};
 
 use serde::Serialize;
-use v4l2r::ioctl::{self, Capabilities, Capability, FmtDesc, FormatIterator, FrmIvalTypes, FrmSizeTypes};
+use v4l2r::ioctl::{self, Capabilities, Capability, FmtDesc, FormatIterator, FrmIvalTypes, FrmSizeTypes, ReqbufsError};
+use v4l2r::memory::MemoryType;
+use v4l2r::nix::errno::Errno;
 use v4l2r::{PixelFormat, QueueType, bindings as v4l2};
 
 use super::frame::SourceError;
@@ -32,6 +34,8 @@ pub enum Trouble {
     Metadata,
     /// It is no V4L2 device that gives pictures.
     NotACamera,
+    /// Its driver fails.
+    Failing,
 }
 
 /// The group of a file, by its name in `etc/group` below `root`, else by its number.
@@ -65,20 +69,30 @@ pub fn users(root: &Path, path: &Path) -> Vec<String> {
     found
 }
 
-/// Whether no other program has the device at `path` open, by `proc` below `root`. The kernel lets many programs open a camera and only one stream from
-/// it, which is not known before one tries.
-pub fn free(root: &Path, path: &Path) -> Result<(), SourceError> {
-    if users(root, path).is_empty() { Ok(()) } else { Err(error_of(root, path, Trouble::Busy)) }
+/// Whether another program streams from the opened device. The kernel lets many programs open a camera and only one stream from it; who asks for no
+/// buffers at all is told that they belong to another one, and disturbs nobody.
+pub fn is_taken(device: &File) -> bool {
+    let abilities = ioctl::querycap::<Capability>(device).map_or(Capabilities::VIDEO_CAPTURE, |abilities| abilities.device_caps());
+    let queue = if abilities.contains(Capabilities::VIDEO_CAPTURE) { QueueType::VideoCapture } else { QueueType::VideoCaptureMplane };
+    let asked = ioctl::reqbufs::<()>(device, queue, MemoryType::Mmap, 0);
+    matches!(asked, Err(ReqbufsError::IoctlError(Errno::EBUSY)))
 }
 
-/// The trouble that a failed opening means.
+/// Whether no other program streams from the device that was opened at `path`; the error names those that have it open, by `proc` below `root`.
+pub fn free(device: &File, root: &Path, path: &Path) -> Result<(), SourceError> {
+    if is_taken(device) { Err(error_of(root, path, Trouble::Busy)) } else { Ok(()) }
+}
+
+/// The trouble that a failed opening, or a failed look at the abilities, means.
 fn trouble_of(error: &std::io::Error) -> Trouble {
-    // ENODEV and ENXIO: the file is there and the device is not.
     match (error.kind(), error.raw_os_error()) {
         (std::io::ErrorKind::PermissionDenied, _) => Trouble::Permission,
         (std::io::ErrorKind::ResourceBusy, _) => Trouble::Busy,
+        // ENODEV and ENXIO: the file is there and the device is not.
         (std::io::ErrorKind::NotFound, _) | (_, Some(6 | 19)) => Trouble::Missing,
-        _ => Trouble::NotACamera,
+        // EINVAL and ENOTTY: whatever it is, it knows no such question.
+        (std::io::ErrorKind::IsADirectory, _) | (_, Some(22 | 25)) => Trouble::NotACamera,
+        _ => Trouble::Failing,
     }
 }
 
@@ -91,6 +105,7 @@ pub(super) fn error_of(root: &Path, path: &Path, trouble: Trouble) -> SourceErro
         Trouble::Busy => SourceError::Busy { users: users(root, path).join(", "), path: name },
         Trouble::Metadata => SourceError::Metadata(name),
         Trouble::NotACamera => SourceError::NotACamera(name),
+        Trouble::Failing => SourceError::Failing(name),
     }
 }
 
@@ -109,7 +124,7 @@ fn trouble_with(abilities: Capabilities) -> Option<Trouble> {
 pub fn open(path: &Path) -> Result<File, SourceError> {
     let fail = |trouble| error_of(Path::new("/"), path, trouble);
     let file = OpenOptions::new().read(true).write(true).custom_flags(NONBLOCK).open(path).map_err(|e| fail(trouble_of(&e)))?;
-    let abilities: Capability = ioctl::querycap(&file).map_err(|_| fail(Trouble::NotACamera))?;
+    let abilities: Capability = ioctl::querycap(&file).map_err(|e| fail(trouble_of(&Errno::from(e).into())))?;
     trouble_with(abilities.device_caps()).map_or(Ok(file), |trouble| Err(fail(trouble)))
 }
 
@@ -168,7 +183,7 @@ impl Device {
         let file = opened.map_err(|e| self.trouble = Some(trouble_of(&e))).ok()?;
         self.trouble = match ioctl::querycap::<Capability>(&file) {
             Ok(abilities) => trouble_with(abilities.device_caps()),
-            Err(_) => Some(Trouble::NotACamera),
+            Err(e) => Some(trouble_of(&Errno::from(e).into())),
         };
         if self.trouble.is_some() {
             return None;
@@ -252,29 +267,40 @@ mod tests {
         assert_eq!((found[0].group.as_str(), found[0].users.as_slice()), ("cameras", &["cheese (77)".to_string()][..]));
         assert_eq!((found[0].trouble, found[1].trouble), (None, Some(Trouble::Missing)));
         assert!(found[1].names.is_empty() && found[1].users.is_empty());
-        let busy = free(root, &root.join("dev/v4l/by-id/usb-Wrist-index0")).expect_err("another program has it");
+        let busy = error_of(root, &root.join("dev/v4l/by-id/usb-Wrist-index0"), Trouble::Busy);
         assert!(busy.exit_code() == 3 && busy.to_string().contains("cheese (77)"), "{busy}");
-        assert!(free(root, &root.join("dev/video10")).is_ok());
+        let held = File::open(&target).expect("opened");
+        assert!(free(&held, root, &target).is_ok(), "a program that has it open, and does not stream, takes it from nobody");
         let said = error_of(root, &root.join("dev/video2"), Trouble::Permission).to_string();
         assert!(said.contains("group 'cameras'") && said.contains("usermod"), "{said}");
     }
 
-    /// Protects the reasons: a permission, a metadata node, a busy device, a missing one and a file that is no device are told apart, each with
+    /// Protects the reasons: a permission, a metadata node, a busy device, a missing one, a driver that fails and a file that is no device are told apart, each with
     /// its exit code.
     #[test]
     fn troubles_are_told_apart() {
         let error = |number: i32| trouble_of(&std::io::Error::from_raw_os_error(number));
         assert_eq!(
-            [13, 16, 2, 6, 19, 22].map(error),
-            [Trouble::Permission, Trouble::Busy, Trouble::Missing, Trouble::Missing, Trouble::Missing, Trouble::NotACamera]
+            [13, 16, 2, 6, 19, 22, 25].map(error),
+            [
+                Trouble::Permission,
+                Trouble::Busy,
+                Trouble::Missing,
+                Trouble::Missing,
+                Trouble::Missing,
+                Trouble::NotACamera,
+                Trouble::NotACamera
+            ]
         );
+        assert_eq!([5, 71, 110].map(error), [Trouble::Failing; 3], "input or output, protocol, and time");
+        assert!(matches!(open(Path::new("/")), Err(SourceError::NotACamera(_))));
         let with = |flags| trouble_with(flags);
         assert_eq!(with(Capabilities::VIDEO_CAPTURE | Capabilities::STREAMING), None);
         assert_eq!(with(Capabilities::META_CAPTURE | Capabilities::STREAMING), Some(Trouble::Metadata));
         assert_eq!(with(Capabilities::VIDEO_OUTPUT), Some(Trouble::NotACamera));
-        let codes = [Trouble::Missing, Trouble::Busy, Trouble::Permission, Trouble::Metadata, Trouble::NotACamera]
+        let codes = [Trouble::Missing, Trouble::Busy, Trouble::Failing, Trouble::Permission, Trouble::Metadata, Trouble::NotACamera]
             .map(|t| error_of(Path::new("/nowhere"), Path::new("/nowhere/video0"), t).exit_code());
-        assert_eq!(codes, [3, 3, 2, 2, 2]);
+        assert_eq!(codes, [3, 3, 3, 2, 2, 2]);
         let file = tempfile::NamedTempFile::new().expect("a file");
         assert!(matches!(open(file.path()), Err(SourceError::NotACamera(_))));
         assert!(matches!(open(Path::new("/dev/no-such-camera")), Err(SourceError::Missing(_))));

@@ -51,7 +51,7 @@ pub enum SourceError {
         group: String,
     },
     /// Another program uses the device.
-    #[error("camera.path = \"{path}\": cannot be opened; does another program use it? {users}")]
+    #[error("camera.path = \"{path}\": another program streams from it; end that program first. {users}")]
     Busy {
         /// `[camera] path`.
         path: String,
@@ -64,6 +64,9 @@ pub enum SourceError {
     /// The file is no device that gives pictures.
     #[error("camera.path = \"{0}\": this is no camera; `feature-worker camera` lists what there is")]
     NotACamera(String),
+    /// The device's driver fails when it is opened.
+    #[error("camera.path = \"{0}\": its driver cannot open it, and the kernel's log may say why; plug it in anew")]
+    Failing(String),
     /// The device refuses settings.
     #[error("{0}; correct it, leave the key out, or write camera.refused = \"warning\"")]
     Refused(String),
@@ -111,6 +114,11 @@ pub enum SourceError {
     /// The camera has stopped giving pictures.
     #[error("camera \"{0}\" gives no more frames; is it unplugged? Plug it in and start again")]
     Lost(String),
+    /// The camera has stopped giving pictures and is there.
+    #[error(
+        "camera \"{0}\" gives no more frames, and is not unplugged: its driver has failed, and the kernel's log may say why; start again"
+    )]
+    Failed(String),
     /// The cell's shared memory cannot be used.
     #[error(transparent)]
     Ipc(#[from] IpcError),
@@ -126,7 +134,8 @@ impl SourceError {
     /// The exit code that fits: bad input where a person must change something, else unreachable.
     pub fn exit_code(&self) -> u8 {
         match self {
-            Self::Missing(_) | Self::Busy { .. } | Self::Lost(_) | Self::Ipc(_) | Self::Broken(_) | Self::OpenCv(_) => exit::UNREACHABLE,
+            Self::Missing(_) | Self::Busy { .. } | Self::Failing(_) | Self::Lost(_) | Self::Failed(_) => exit::UNREACHABLE,
+            Self::Ipc(_) | Self::Broken(_) | Self::OpenCv(_) => exit::UNREACHABLE,
             _ => exit::BAD_INPUT,
         }
     }
