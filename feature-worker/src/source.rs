@@ -11,12 +11,14 @@ use iceoryx2::service::port_factory::PortFactory as _;
 use shared::config::{CameraConfig, CameraSource};
 use shared::ipc::{Cell, FrameTopic};
 
+mod about_picture;
 mod capture;
 mod container;
 pub mod controls;
 pub mod devices;
 mod files;
 mod frame;
+mod jpeg;
 mod numbering;
 mod pictures;
 mod playback;

@@ -4,6 +4,7 @@
 
 mod drawn;
 mod matroska;
+mod pictures;
 
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output};

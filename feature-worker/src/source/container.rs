@@ -79,6 +79,22 @@ impl Turn {
 
     /// `picture` upright; `spare` is a buffer that is used again.
     pub(super) fn apply(self, picture: &mut Mat, spare: &mut Mat) -> opencv::Result<()> {
+    /// The turn that EXIF's orientation asks for; `None` if it is none of its eight numbers.
+    pub(super) fn of_exif(orientation: u64) -> Option<Self> {
+        let (mirrored, quarters) = match orientation {
+            1 => (false, 0),
+            2 => (true, 0),
+            3 => (false, 2),
+            4 => (true, 2),
+            5 => (true, 3),
+            6 => (false, 1),
+            7 => (true, 1),
+            8 => (false, 3),
+            _ => return None,
+        };
+        Some(Self { mirrored, quarters })
+    }
+
         if self.mirrored {
             core::flip(picture, spare, 1)?;
             std::mem::swap(picture, spare);

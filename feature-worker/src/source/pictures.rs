@@ -1,22 +1,23 @@
 //! Single pictures and numbered sequences of pictures.
 //!
 //! For commands that read files and for the worker when it plays a sequence; on their own thread. Allocates. All pictures go through
-//! [`decode`], so a picture is read alike alone, in a sequence and in an episode: turned by its EXIF orientation, without its alpha, 16 bits
-//! a channel as 8. A picture that is cut off is an error, and none is shown half.
+//! [`decode`], so a picture is read alike alone, in a sequence and in an episode: turned by its EXIF orientation, without its alpha, other depths
+//! as 8 bits a channel. A picture that is cut off or damaged, and a file of several pictures, are errors.
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
-use opencv::core::{Mat, Vector};
+use opencv::core::{CV_8U, Mat, Vector};
 use opencv::imgcodecs;
 use opencv::prelude::*;
 use shared::plural::counted;
 use shared::regular_file;
 
+use super::about_picture::{About, about};
 use super::frame::SourceError;
 
 /// Endings of the names of picture files.
-const ENDINGS: [&str; 9] = ["png", "jpg", "jpeg", "bmp", "tif", "tiff", "pgm", "ppm", "webp"];
+const ENDINGS: [&str; 11] = ["png", "jpg", "jpeg", "bmp", "tif", "tiff", "pbm", "pgm", "pnm", "ppm", "webp"];
 /// The most numbers that an error lists. Chosen by hand: the line stays readable.
 const LIST_MOST: usize = 5;
 
@@ -39,13 +40,25 @@ pub(super) fn is_single(path: &Path) -> bool {
 
 /// The picture in `bytes` as 8-bit grey or BGR; the error says what is wrong with it.
 pub(super) fn decode(bytes: &[u8], picture: &mut Mat) -> Result<(), String> {
-    if let Some(what) = cut_off(bytes) {
-        return Err(what.into());
-    }
     check_size(bytes)?;
+    let About { bytes, turn, white } = about(bytes)?;
+    // We turn pictures ourselves, because OpenCV does it for some formats only.
+    let flags = imgcodecs::IMREAD_ANYCOLOR | imgcodecs::IMREAD_IGNORE_ORIENTATION;
+    let flags = if white.is_some() { flags | imgcodecs::IMREAD_ANYDEPTH } else { flags };
     // OpenCV says no more about what it cannot read than an empty picture does.
-    *picture = imgcodecs::imdecode(&Vector::from_slice(bytes), imgcodecs::IMREAD_ANYCOLOR).unwrap_or_default();
-    if picture.empty() { Err("cannot be read as a picture".into()) } else { Ok(()) }
+    let mut read = imgcodecs::imdecode(&Vector::from_slice(&bytes), flags).unwrap_or_default();
+    if read.empty() {
+        return Err("cannot be read as a picture".into());
+    }
+    match white {
+        Some(white) => read.convert_to(picture, CV_8U, 255.0 / white, 0.0),
+        None => {
+            std::mem::swap(picture, &mut read);
+            Ok(())
+        }
+    }
+    .and_then(|()| turn.apply(picture, &mut read))
+    .map_err(|e| e.message)
 }
 
 /// Refuses a picture with more pixels than any camera has, by its header: a small file may unpack to gigabytes. What its header does not tell, OpenCV
@@ -70,34 +83,6 @@ pub(super) fn unreadable(e: &std::io::Error) -> String {
         std::io::ErrorKind::NotFound => "no such file; a sequence of pictures has a name such as frame_%04d.png".to_string(),
         _ => e.to_string(),
     }
-}
-
-/// What is missing at the end of a JPEG or PNG. OpenCV shows the first part of such a JPEG as a picture.
-fn cut_off(bytes: &[u8]) -> Option<&'static str> {
-    let whole = match bytes {
-        [] => return Some("is empty"),
-        [0xff, 0xd8, ..] => jpeg_is_whole(bytes),
-        [0x89, b'P', b'N', b'G', ..] => bytes.windows(4).any(|w| w == b"IEND"),
-        _ => true,
-    };
-    (!whole).then_some("the picture is cut off")
-}
-
-/// Whether a JPEG has its end marker after its pixels. (A thumbnail in its header has one too.)
-fn jpeg_is_whole(bytes: &[u8]) -> bool {
-    let mut at = 2;
-    while let Some([0xff, marker]) = bytes.get(at..at + 2) {
-        match marker {
-            0xff => at += 1,
-            // The start of the pixels; in them 0xff is never followed by the end marker's byte by chance.
-            0xda => return bytes[at..].windows(2).any(|w| w == [0xff, 0xd9]),
-            _ => match bytes.get(at + 2..at + 4) {
-                Some([high, low]) => at += 2 + usize::from(*high) * 256 + usize::from(*low),
-                _ => return false,
-            },
-        }
-    }
-    false
 }
 
 /// A file name with a number in it, such as `frame_%04d.png`.

@@ -1,0 +1,451 @@
+//! Whether the pixels of a JPEG are whole: its Huffman codes are walked through and must add up to the blocks of a picture of its size.
+//!
+//! OpenCV's decoder makes a picture of what is damaged too, and says nothing. No rule about single bytes would tell it: with tables that are
+//! made for the picture, an even ground may be a long run of zero bytes. Walked are the sequential and the progressive codes of ITU-T T.81; of arithmetic
+//! and lossless codes, which OpenCV hardly reads, only the end is looked for. Damage that keeps the number of codes, as in the low bits of a
+//! coefficient, cannot be told. For commands that read files and for the worker when it plays pictures, on their own thread; allocates eight
+//! bytes a block. Any bytes are survived: what does not fit is [`DAMAGED`].
+
+/// What is said of a picture that ends too early.
+pub(super) const CUT: &str = "the picture is cut off";
+/// What is said of a picture whose data cannot be right.
+pub(super) const DAMAGED: &str = "the picture is damaged: its data do not add up";
+/// The most blocks of a component that are walked through: those of the largest picture that is read, 4096 x 4096 px, and as many again for filling up.
+const BLOCKS_MAX: usize = 1 << 19;
+/// The most scans of a picture. Chosen by hand: encoders write about ten.
+const SCANS_MAX: usize = 500;
+/// Zero bytes behind a scan that are taken for filling. Chosen by hand: hardware fills up to whole words of up to 16 bytes.
+const FILLING_MOST: usize = 16;
+
+/// Why a walk ends before the picture does.
+enum Stop {
+    /// With this fault.
+    Fault(&'static str),
+    /// The codes are of a kind that is not walked through.
+    Unjudged,
+}
+
+/// The codes of a Huffman table.
+struct Table {
+    /// Number of codes of each length, from 1 bit on.
+    counts: [u8; 16],
+    values: Vec<u8>,
+}
+
+/// The bits of a scan, from byte `at` on, up to the next marker.
+struct Bits<'a> {
+    bytes: &'a [u8],
+    at: usize,
+    held: u8,
+    left: u32,
+}
+
+impl Bits<'_> {
+    fn bit(&mut self) -> Result<u32, Stop> {
+        if self.left == 0 {
+            let byte = *self.bytes.get(self.at).ok_or(Stop::Fault(CUT))?;
+            // In pixels a byte 0xff has a zero behind it; with anything else it is a marker, and the codes have ended too early.
+            let escaped = byte == 0xff;
+            if escaped && self.bytes.get(self.at + 1) != Some(&0) {
+                return Err(Stop::Fault(if self.at + 1 < self.bytes.len() { DAMAGED } else { CUT }));
+            }
+            self.at += 1 + usize::from(escaped);
+            (self.held, self.left) = (byte, 8);
+        }
+        self.left -= 1;
+        Ok(u32::from(self.held >> self.left) & 1)
+    }
+
+    fn bits(&mut self, count: u8) -> Result<u32, Stop> {
+        (0..count).try_fold(0, |value, _| Ok(value << 1 | self.bit()?))
+    }
+
+    /// The next value by `table`.
+    fn value(&mut self, table: &Table) -> Result<u8, Stop> {
+        let (mut code, mut first, mut before) = (0, 0, 0);
+        for count in table.counts.map(u32::from) {
+            code = code << 1 | self.bit()?;
+            if code < first + count {
+                return table.values.get((before + code - first) as usize).copied().ok_or(Stop::Fault(DAMAGED));
+            }
+            before += count;
+            first = (first + count) << 1;
+        }
+        Err(Stop::Fault(DAMAGED))
+    }
+
+    /// Goes on behind the marker of a restart, if one is here.
+    fn restart(&mut self) -> bool {
+        let fill = self.bytes[self.at.min(self.bytes.len())..].iter().take_while(|byte| **byte == 0xff).count();
+        let is_one = fill > 0 && self.bytes.get(self.at + fill).is_some_and(|marker| (0xd0..=0xd7).contains(marker));
+        if is_one {
+            (self.at, self.left) = (self.at + fill + 1, 0);
+        }
+        is_one
+    }
+}
+
+/// A component: brightness, or a colour.
+struct Component {
+    id: u8,
+    /// Blocks of it in one unit of several components, across and down.
+    across: usize,
+    down: usize,
+    /// Blocks that it has by itself, across and down.
+    own: [usize; 2],
+    /// Blocks in a row, those that fill the last unit up too.
+    row: usize,
+    /// Which coefficients of each block are not zero so far, a bit each; only of a progressive picture.
+    set: Vec<u64>,
+    seen: bool,
+}
+
+/// What a frame header says.
+struct Picture {
+    progressive: bool,
+    /// Units of all components together, across and down.
+    units: [usize; 2],
+    components: Vec<Component>,
+}
+
+impl Picture {
+    fn of(marker: u8, header: &[u8]) -> Result<Self, Stop> {
+        let [8, h1, h0, w1, w0, count, parts @ ..] = header else { return Err(Stop::Unjudged) };
+        let size = [usize::from(*w1) << 8 | usize::from(*w0), usize::from(*h1) << 8 | usize::from(*h0)];
+        let parts: Vec<&[u8]> = parts.chunks_exact(3).take(usize::from(*count)).collect();
+        let samples = |part: &[u8]| [usize::from(part[1] >> 4), usize::from(part[1] & 15)];
+        let largest = parts.iter().fold([0, 0], |most: [usize; 2], part| [0, 1].map(|i| most[i].max(samples(part)[i])));
+        if size.contains(&0)
+            || parts.len() != usize::from(*count)
+            || parts.iter().any(|part| samples(part).contains(&0))
+            || parts.is_empty()
+        {
+            return Err(Stop::Unjudged);
+        }
+        let units = [0, 1].map(|i| size[i].div_ceil(8 * largest[i]));
+        let progressive = marker == 0xc2;
+        let component = |part: &&[u8]| {
+            let [across, down] = samples(part);
+            let own = [0, 1].map(|i| (size[i] * samples(part)[i]).div_ceil(largest[i]).div_ceil(8));
+            let (row, rows) = (units[0] * across, units[1] * down);
+            let set = if progressive && row * rows <= BLOCKS_MAX { vec![0; row * rows] } else { Vec::new() };
+            (row * rows <= BLOCKS_MAX).then_some(Component { id: part[0], across, down, own, row, set, seen: false })
+        };
+        let components = parts.iter().map(component).collect::<Option<Vec<_>>>().ok_or(Stop::Unjudged)?;
+        Ok(Self { progressive, units, components })
+    }
+}
+
+/// What is known behind the headers so far.
+#[derive(Default)]
+struct Walk {
+    picture: Option<Picture>,
+    /// Tables of means and of the other coefficients.
+    tables: [[Option<Table>; 4]; 2],
+    /// Units from one restart to the next; 0 if there is none.
+    interval: usize,
+}
+
+/// What one scan tells.
+struct Scan<'a> {
+    /// First and last coefficient.
+    band: [u8; 2],
+    refines: bool,
+    progressive: bool,
+    /// Blocks that end before the band does, still to come.
+    ended: u32,
+    bits: Bits<'a>,
+}
+
+impl Scan<'_> {
+    /// Walks through one block. `set` is what is known of it if the picture is progressive.
+    fn block(&mut self, means: Option<&Table>, others: Option<&Table>, set: &mut u64) -> Result<(), Stop> {
+        let mut first = self.band[0];
+        if first == 0 {
+            if self.refines {
+                return self.bits.bit().map(drop);
+            }
+            let length = self.bits.value(means.ok_or(Stop::Unjudged)?)?;
+            self.bits.bits(length.min(16))?;
+            first = 1;
+        }
+        if self.progressive && self.band[1] == 0 {
+            return Ok(());
+        }
+        let table = others.ok_or(Stop::Unjudged)?;
+        if self.refines { self.refine(first, table, set) } else { self.coefficients(first, table, set) }
+    }
+
+    /// Coefficients from `first` on, whose values come for the first time.
+    fn coefficients(&mut self, first: u8, table: &Table, set: &mut u64) -> Result<(), Stop> {
+        if self.ended > 0 {
+            self.ended -= 1;
+            return Ok(());
+        }
+        let mut at = first;
+        while at <= self.band[1] {
+            let value = self.bits.value(table)?;
+            let (zeros, length) = (value >> 4, value & 15);
+            if length == 0 && zeros < 15 {
+                // In a sequential picture the end of a block is that of one block.
+                self.ended = if self.progressive { (1 << zeros) + self.bits.bits(zeros)? - 1 } else { 0 };
+                return Ok(());
+            }
+            at += zeros;
+            if at > self.band[1] {
+                return Err(Stop::Fault(DAMAGED));
+            }
+            self.bits.bits(length)?;
+            *set |= u64::from(length > 0) << at;
+            at += 1;
+        }
+        Ok(())
+    }
+
+    /// Coefficients from `first` on, which become more exact: each that is not zero has a bit, and others become so.
+    fn refine(&mut self, first: u8, table: &Table, set: &mut u64) -> Result<(), Stop> {
+        let last = self.band[1];
+        let mut at = first;
+        while self.ended == 0 && at <= last {
+            let value = self.bits.value(table)?;
+            let (mut zeros, length) = (value >> 4, value & 15);
+            match length {
+                0 if zeros < 15 => {
+                    self.ended = (1 << zeros) + self.bits.bits(zeros)?;
+                    break;
+                }
+                0 => {}
+                1 => {
+                    self.bits.bit()?;
+                }
+                _ => return Err(Stop::Fault(DAMAGED)),
+            }
+            while at <= last {
+                if *set >> at & 1 == 1 {
+                    self.bits.bit()?;
+                } else if zeros == 0 {
+                    break;
+                } else {
+                    zeros -= 1;
+                }
+                at += 1;
+            }
+            if at > last && length > 0 {
+                return Err(Stop::Fault(DAMAGED));
+            }
+            *set |= u64::from(length) << at.min(63);
+            at += 1;
+        }
+        if self.ended > 0 {
+            self.bits.bits((at..=last).filter(|at| *set >> at & 1 == 1).count() as u8)?;
+            self.ended -= 1;
+        }
+        Ok(())
+    }
+}
+
+impl Walk {
+    fn take_tables(&mut self, mut contents: &[u8]) -> Result<(), Stop> {
+        while let Some((head, rest)) = contents.split_first() {
+            let (class, place) = (usize::from(head >> 4), usize::from(head & 15));
+            let counts: [u8; 16] = rest.get(..16).and_then(|counts| counts.try_into().ok()).ok_or(Stop::Fault(DAMAGED))?;
+            let length = counts.iter().map(|count| usize::from(*count)).sum::<usize>();
+            let values = rest.get(16..16 + length).ok_or(Stop::Fault(DAMAGED))?.to_vec();
+            let slot = self.tables.get_mut(class).and_then(|tables| tables.get_mut(place)).ok_or(Stop::Fault(DAMAGED))?;
+            *slot = Some(Table { counts, values });
+            contents = &rest[16 + length..];
+        }
+        Ok(())
+    }
+
+    /// Walks through the scan whose header has these contents and whose pixels begin at `at`. Returns where the next marker is.
+    fn scan(&mut self, header: &[u8], bytes: &[u8], at: usize) -> Result<usize, Stop> {
+        let picture = self.picture.as_mut().ok_or(Stop::Fault(DAMAGED))?;
+        let count = usize::from(*header.first().ok_or(Stop::Fault(DAMAGED))?);
+        let (Some(parts), Some([first, last, exactness])) = (header.get(1..1 + 2 * count), header.get(1 + 2 * count..4 + 2 * count)) else {
+            return Err(Stop::Fault(DAMAGED));
+        };
+        let band = if picture.progressive { [*first, *last] } else { [0, 63] };
+        if band[1] > 63 || band[0] > band[1] || count == 0 || (picture.progressive && band[0] == 0 && band[1] > 0) {
+            return Err(Stop::Fault(DAMAGED));
+        }
+        let refines = picture.progressive && exactness >> 4 > 0;
+        let bits = Bits { bytes, at, held: 0, left: 0 };
+        let mut scan = Scan { band, refines, progressive: picture.progressive, ended: 0, bits };
+        let places: Vec<(usize, [usize; 2])> = parts
+            .chunks_exact(2)
+            .map(|part| {
+                let place = picture.components.iter().position(|component| component.id == part[0]);
+                place.map(|place| (place, [usize::from(part[1] >> 4), usize::from(part[1] & 15)]))
+            })
+            .collect::<Option<_>>()
+            .ok_or(Stop::Fault(DAMAGED))?;
+        // One component alone has its own blocks one by one, and several have units of some blocks of each.
+        let alone = count == 1;
+        let units = if alone { picture.components[places[0].0].own } else { picture.units };
+        for unit in 0..units[0] * units[1] {
+            if self.interval > 0 && unit > 0 && unit % self.interval == 0 {
+                scan.ended = 0;
+                if !scan.bits.restart() {
+                    return Err(Stop::Fault(if scan.bits.at < bytes.len() { DAMAGED } else { CUT }));
+                }
+            }
+            let (x, y) = (unit % units[0], unit / units[0]);
+            for (place, [means, others]) in &places {
+                let component = &mut picture.components[*place];
+                component.seen = true;
+                let (across, down) = if alone { (1, 1) } else { (component.across, component.down) };
+                let tables = (self.tables[0].get(*means).and_then(Option::as_ref), self.tables[1].get(*others).and_then(Option::as_ref));
+                for block in 0..across * down {
+                    let place = (y * down + block / across) * component.row + x * across + block % across;
+                    let mut none = 0;
+                    scan.block(tables.0, tables.1, component.set.get_mut(place).unwrap_or(&mut none))?;
+                }
+            }
+        }
+        // Some encoders write a restart behind the last interval too.
+        let _ = self.interval > 0 && scan.bits.restart();
+        let at = scan.bits.at.min(bytes.len());
+        Ok(at + bytes[at..].iter().take(FILLING_MOST).take_while(|byte| **byte == 0).count())
+    }
+}
+
+/// The EXIF data in a JPEG's header, if there are any; the error says how its pixels are not whole.
+pub(super) fn judge(bytes: &[u8]) -> Result<Option<&[u8]>, &'static str> {
+    let mut exif = None;
+    let (mut walk, mut at, mut scans) = (Walk::default(), 2, 0);
+    loop {
+        let Some([0xff, marker]) = bytes.get(at..at + 2) else {
+            return Err(if bytes.len() < at + 2 { CUT } else { DAMAGED });
+        };
+        // A byte 0xff before a marker is filling.
+        at += if *marker == 0xff { 1 } else { 2 };
+        match marker {
+            0xff | 0x01 | 0xd0..=0xd7 => continue,
+            0xd9 => {
+                let all = walk.picture.is_some_and(|picture| picture.components.iter().all(|component| component.seen));
+                return if all { Ok(exif) } else { Err(DAMAGED) };
+            }
+            _ => {}
+        }
+        let Some([high, low]) = bytes.get(at..at + 2) else { return Err(CUT) };
+        let end = at + usize::from(*high) * 256 + usize::from(*low);
+        let Some(contents) = bytes.get(at + 2..end) else { return Err(if end < at + 2 { DAMAGED } else { CUT }) };
+        let done = match marker {
+            0xc0..=0xc2 => Picture::of(*marker, contents).map(|picture| walk.picture = Some(picture)),
+            0xc4 => walk.take_tables(contents),
+            0xdd => {
+                walk.interval = contents.iter().take(2).fold(0, |value, byte| value << 8 | usize::from(*byte));
+                Ok(())
+            }
+            0xda if scans >= SCANS_MAX => Err(Stop::Fault(DAMAGED)),
+            0xda => {
+                scans += 1;
+                walk.scan(contents, bytes, end).map(|next| at = next)
+            }
+            0xc3 | 0xc5..=0xc7 | 0xc9..=0xcb | 0xcd..=0xcf => Err(Stop::Unjudged),
+            0xe1 => {
+                exif = exif.or(contents.strip_prefix(b"Exif\0\0"));
+                Ok(())
+            }
+            0xc8 | 0xcc | 0xd8 | 0xdb..=0xe0 | 0xe2..=0xef | 0xfe => Ok(()),
+            _ => Err(Stop::Fault(DAMAGED)),
+        };
+        match done {
+            Ok(()) if *marker == 0xda => {}
+            Ok(()) => at = end,
+            Err(Stop::Fault(fault)) => return Err(fault),
+            // In pixels 0xff is never followed by the end marker's byte by chance.
+            Err(Stop::Unjudged) => return if bytes[end..].windows(2).any(|w| w == [0xff, 0xd9]) { Ok(exif) } else { Err(CUT) },
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use opencv::core::{self, Mat, Vector};
+    use opencv::prelude::*;
+    use opencv::{imgcodecs, imgproc};
+    use rand::{Rng as _, RngExt as _};
+
+    /// Pictures of all kinds that OpenCV's encoder writes: in colour and grey, sequential and progressive, with tables of their own, with restarts, and of sizes
+    /// that fill no whole block.
+    fn encoded() -> Vec<(String, Vec<u8>)> {
+        let mut all = Vec::new();
+        for (width, height) in [(160, 120), (201, 77), (7, 5)] {
+            let mut picture = Mat::new_rows_cols_with_default(height, width, core::CV_8UC3, core::Scalar::all(120.0)).expect("made");
+            core::set_rng_seed(width).expect("set");
+            core::randn(&mut picture, &core::Scalar::all(120.0), &core::Scalar::new(30.0, 60.0, 90.0, 0.0)).expect("drawn");
+            let mut soft = Mat::default();
+            imgproc::gaussian_blur_def(&picture, &mut soft, core::Size::new(0, 0), 2.0).expect("blurred");
+            imgproc::rectangle_def(&mut soft, core::Rect::new(2, 2, width / 2, height / 2), core::Scalar::all(250.0)).expect("drawn");
+            let mut grey = Mat::default();
+            imgproc::cvt_color_def(&soft, &mut grey, imgproc::COLOR_BGR2GRAY).expect("grey");
+            for (picture, colours) in [(&soft, "colour"), (&grey, "grey")] {
+                for (progressive, optimised, restarts) in [(0, 0, 0), (0, 1, 0), (1, 0, 0), (1, 1, 0), (0, 0, 3), (1, 0, 5), (0, 1, 1)] {
+                    let flags = Vector::from_slice(&[
+                        imgcodecs::IMWRITE_JPEG_QUALITY,
+                        85,
+                        imgcodecs::IMWRITE_JPEG_PROGRESSIVE,
+                        progressive,
+                        imgcodecs::IMWRITE_JPEG_OPTIMIZE,
+                        optimised,
+                        imgcodecs::IMWRITE_JPEG_RST_INTERVAL,
+                        restarts,
+                    ]);
+                    let mut bytes = Vector::new();
+                    imgcodecs::imencode(".jpg", picture, &mut bytes, &flags).expect("encoded");
+                    all.push((format!("{width} x {height} {colours} {progressive} {optimised} {restarts}"), bytes.to_vec()));
+                }
+            }
+        }
+        all
+    }
+
+    /// Where the first scan's pixels begin.
+    fn pixels(bytes: &[u8]) -> usize {
+        let header = bytes.windows(2).position(|w| w == [0xff, 0xda]).expect("a scan");
+        header + 2 + usize::from(bytes[header + 2]) * 256 + usize::from(bytes[header + 3])
+    }
+
+    /// Protects whole pictures from a refusal, and measurements from damaged ones: each kind of JPEG adds up, and none of which a part was overwritten,
+    /// taken out, or doubled does.
+    #[test]
+    fn whole_pictures_add_up_and_damaged_ones_do_not() {
+        for (name, whole) in encoded() {
+            assert!(judge(&whole).is_ok(), "{name}: {:?}", judge(&whole));
+            assert_eq!(judge(&whole[..whole.len() - 2]), Err(CUT), "{name}");
+            let (begin, end) = (pixels(&whole), whole.len() - 2);
+            if end - begin < 600 {
+                continue;
+            }
+            let middle = begin + (end - begin) / 2;
+            for (byte, length) in [(0, 256), (0xff, 40), (0x55, 256)] {
+                let mut damaged = whole.clone();
+                damaged[middle..middle + length].fill(byte);
+                assert!(judge(&damaged).is_err(), "{name}: {length} times {byte}");
+            }
+            let gone = [&whole[..middle], &whole[middle + 200..]].concat();
+            let twice = [&whole[..middle + 200], &whole[middle..]].concat();
+            assert!(judge(&gone).is_err() && judge(&twice).is_err(), "{name}");
+        }
+    }
+
+    /// Protects the commands from files that others made: whatever is in them, the walk ends, and never in a panic.
+    #[test]
+    fn any_bytes_are_survived() {
+        let mut random = rand_pcg::Pcg32::new(1, 1);
+        for (_, whole) in encoded() {
+            for _ in 0..100 {
+                let mut bytes = whole.clone();
+                for _ in 0..random.random_range(1..6) {
+                    let at = random.random_range(0..bytes.len());
+                    bytes[at] = [0, 1, 0xff, 0x7f, random.next_u32() as u8][random.random_range(0..5)];
+                }
+                bytes.truncate(random.random_range(2..=bytes.len()));
+                let _ = judge(&bytes);
+            }
+        }
+    }
+}
