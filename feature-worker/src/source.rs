@@ -24,6 +24,7 @@ mod pictures;
 mod playback;
 mod recorded;
 mod recording;
+mod rhythm;
 mod shared_memory;
 mod video;
 

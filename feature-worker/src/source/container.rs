@@ -12,6 +12,8 @@ use std::path::Path;
 use opencv::core::{self, Mat};
 use shared::regular_file;
 
+use super::rhythm::Rhythm;
+
 /// The largest index of an MP4 file that is read, bytes. Chosen by hand: an hour at 60 frames a second has about 3 MB.
 const INDEX_MOST: u64 = 1 << 26;
 /// Part of a matrix's larger numbers below which the others count as zero. Chosen by hand: matrices of cameras are exact.
@@ -77,8 +79,6 @@ impl Turn {
         (quarters.fract() == 0.0).then(|| Self { mirrored: false, quarters: quarters.rem_euclid(4.0) as u8 })
     }
 
-    /// `picture` upright; `spare` is a buffer that is used again.
-    pub(super) fn apply(self, picture: &mut Mat, spare: &mut Mat) -> opencv::Result<()> {
     /// The turn that EXIF's orientation asks for; `None` if it is none of its eight numbers.
     pub(super) fn of_exif(orientation: u64) -> Option<Self> {
         let (mirrored, quarters) = match orientation {
@@ -95,6 +95,8 @@ impl Turn {
         Some(Self { mirrored, quarters })
     }
 
+    /// `picture` upright; `spare` is a buffer that is used again.
+    pub(super) fn apply(self, picture: &mut Mat, spare: &mut Mat) -> opencv::Result<()> {
         if self.mirrored {
             core::flip(picture, spare, 1)?;
             std::mem::swap(picture, spare);
@@ -118,12 +120,12 @@ pub(super) struct Container {
     pub turn: Option<Option<Turn>>,
     /// When the last picture ends, s from the first one.
     pub end_s: Option<f64>,
-    /// Time from one picture to the next where it is always the same, s.
-    pub period_s: Option<f64>,
-    /// The usual time from one picture to the next, s, where the file says no more: it may be a mean.
-    pub usual_period_s: Option<f64>,
-    /// Whether it is always the same, and OpenCV tells it as the rate.
+    /// How the pictures follow each other, if the file says it of each.
+    pub rhythm: Option<Rhythm>,
+    /// Whether the time from one to the next is always the same, and OpenCV tells it as the rate.
     pub fixed_rate: bool,
+    /// Whether this is a stream without a container, which has no times; what OpenCV tells of its rate is made up.
+    pub raw: bool,
     /// Whether OpenCV's number of frames is written in the file, and is not an estimate from its duration.
     pub counts_frames: bool,
     /// Bytes that the file has too few, judged by the sizes in it.
@@ -136,9 +138,9 @@ impl Container {
     const UNKNOWN: Self = Self {
         turn: None,
         end_s: None,
-        period_s: None,
-        usual_period_s: None,
+        rhythm: None,
         fixed_rate: false,
+        raw: false,
         counts_frames: false,
         missing_bytes: None,
         open_end: false,
@@ -155,6 +157,9 @@ impl Container {
             (b"RIFF", _, b"AVI ") => avi(&mut file, size),
             ([0x1a, 0x45, 0xdf, 0xa3], ..) => matroska(&mut file, size),
             (_, b"ftyp" | b"moov" | b"mdat" | b"wide" | b"free" | b"skip", _) => mp4(&mut file, size),
+            // MJPEG one after the other or with the borders of a mail, and the start codes of MPEG and H.26x but for MPEG's own container.
+            ([0xff, 0xd8, 0xff, _] | [b'-', b'-', ..] | [0, 0, 0, 1], ..) => Ok(Self { raw: true, open_end: true, ..Self::UNKNOWN }),
+            ([0, 0, 1, code], ..) => Ok(Self { raw: *code != 0xba, open_end: true, ..Self::UNKNOWN }),
             _ => Ok(Self { open_end: true, ..Self::UNKNOWN }),
         }
     }
@@ -243,13 +248,11 @@ fn cluster_start(file: &mut File, at: u64) -> std::io::Result<Option<u64>> {
     Ok(element(&head, 0xe7).and_then(whole))
 }
 
-/// Whether there is one track and no other that could be longer, and the usual time between its pictures, s.
-fn matroska_track(tracks: &[u8]) -> (bool, Option<f64>) {
-    // TrackEntry, TrackType (1 is video) and DefaultDuration, ns.
-    let all: Vec<&[u8]> = elements(tracks).filter(|(number, _)| *number == 0xae).map(|(_, track)| track).collect();
-    let Some(video) = all.iter().find(|track| element(track, 0x83).and_then(whole) == Some(1)) else { return (false, None) };
-    let period_s = element(video, 0x23_e383).and_then(whole).filter(|ns| *ns > 0).map(|ns| ns as f64 / 1e9);
-    (all.len() == 1, period_s)
+/// Whether there is one track of pictures, and no other that could be longer.
+fn is_alone(tracks: &[u8]) -> bool {
+    // TrackEntry, and TrackType (1 is video).
+    let mut all = elements(tracks).filter(|(number, _)| *number == 0xae).map(|(_, track)| track);
+    all.next().is_some_and(|track| element(track, 0x83).and_then(whole) == Some(1)) && all.next().is_none()
 }
 
 fn matroska(file: &mut File, size: u64) -> std::io::Result<Container> {
@@ -290,7 +293,7 @@ fn matroska(file: &mut File, size: u64) -> std::io::Result<Container> {
                     if number == INFO {
                         about_end = matroska_end(&about);
                     } else {
-                        (alone, known.usual_period_s) = matroska_track(&about);
+                        alone = is_alone(&about);
                     }
                 }
                 known.missing_bytes = missing(end, size);
@@ -392,7 +395,7 @@ fn movie(moov: &[u8]) -> Container {
             if wide { u64_at(header, 28).filter(|d| *d != u64::MAX) } else { u32_at(header, 20).filter(|d| *d != u32::MAX).map(u64::from) };
         known.end_s = scale.zip(duration.filter(|d| *d > 0)).map(|(scale, duration)| duration as f64 / scale);
     }
-    known.period_s = period_s(track);
+    known.rhythm = rhythm(track);
     // In a file of fragments the index holds no pictures, and the length stands elsewhere, if anywhere.
     if let Some(fragments) = inside(moov, &[b"mvex"]) {
         let alone = boxes(moov).filter(|(kind, _)| kind == b"trak").count() == 1;
@@ -408,18 +411,17 @@ fn movie(moov: &[u8]) -> Container {
     known
 }
 
-/// Time from one picture to the next, s, if a track has the same for all of them but the last.
-fn period_s(track: &[u8]) -> Option<f64> {
+/// The rhythm of a track by its index: so many pictures, and how long each is shown.
+fn rhythm(track: &[u8]) -> Option<Rhythm> {
     let (scale, _) = inside(track, &[b"mdia", b"mdhd"]).and_then(scale_and_duration)?;
     let times = inside(track, &[b"mdia", b"minf", b"stbl", b"stts"])?;
-    let entry = |i: usize| Some((u32_at(times, 8 + 8 * i)?, u32_at(times, 12 + 8 * i)?));
-    let (_, delta) = entry(0)?;
-    let same = match u32_at(times, 4)? {
-        1 => true,
-        2 => entry(1)?.0 <= 1,
-        _ => false,
-    };
-    (same && delta > 0).then(|| f64::from(delta) / scale)
+    let entry = |i: usize| Some((u64::from(u32_at(times, 8 + 8 * i)?), 1e3 * f64::from(u32_at(times, 12 + 8 * i)?) / scale));
+    let mut steps: Vec<(u64, f64)> = (0..u32_at(times, 4)? as usize).map_while(entry).collect();
+    // No picture follows the last one.
+    if let Some((count, _)) = steps.last_mut() {
+        *count = count.saturating_sub(1);
+    }
+    Rhythm::of(&steps)
 }
 
 #[cfg(test)]
@@ -443,7 +445,7 @@ mod tests {
         let avi = [&b"RIFF"[..], &200u32.to_le_bytes(), b"AVI ", &[0; 200]].concat();
         let mkv = [&[0x1a, 0x45, 0xdf, 0xa3, 0x84, 1, 2, 3, 4, 0x18, 0x53, 0x80, 0x67, 0x10, 0, 1, 0][..], &[0; 200]].concat();
         let live = [&mkv[..13], &[0xff, 0x1f, 0x43, 0xb6, 0x75, 0xff, 0xa3, 0x85, 1, 2, 3, 4, 5], &[0xec, 0x81, 7].repeat(50)].concat();
-        assert!(movie_period(&mp4, file.path()).is_some(), "the whole file is read");
+        assert!(rhythm_in(&mp4, file.path()).is_some(), "the whole file is read");
         for seed in [mp4, avi, mkv, live] {
             for _ in 0..3000 {
                 let mut bytes = seed.clone();
@@ -452,13 +454,13 @@ mod tests {
                     bytes[at] = [0, 1, 0xff, 0x7f, random.next_u32() as u8][random.random_range(0..5)];
                 }
                 bytes.truncate(random.random_range(0..=bytes.len()));
-                movie_period(&bytes, file.path());
+                rhythm_in(&bytes, file.path());
             }
         }
     }
 
-    fn movie_period(bytes: &[u8], file: &Path) -> Option<f64> {
+    fn rhythm_in(bytes: &[u8], file: &Path) -> Option<Rhythm> {
         std::fs::write(file, bytes).expect("written");
-        Container::read(file).expect("read").period_s
+        Container::read(file).expect("read").rhythm
     }
 }

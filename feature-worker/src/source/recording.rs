@@ -31,7 +31,7 @@ pub struct Recording {
 
 impl Recording {
     /// Opens what `path` names: an episode (`.mcap`), one picture, a pattern such as `frame_%04d.png`, or a video. `rate_hz` is that of
-    /// pictures, which have no times of their own. Without `partial`, whatever is missing is an error, here or at its place.
+    /// pictures and of streams without a container, which have no times of their own. Without `partial`, whatever is missing is an error, here or at its place.
     pub fn open(path: &Path, rate_hz: f64, partial: bool) -> Result<Self, SourceError> {
         let kind = if let Some(pattern) = Pattern::of(path) {
             Kind::Sequence(Sequence::open(path, &pattern, partial)?)
@@ -44,7 +44,7 @@ impl Recording {
                 path: path.display().to_string(),
                 what: "its name is no text in UTF-8, so OpenCV cannot open it: give it another name".into(),
             })?;
-            Kind::Video(Box::new(Video::open(name, partial)?))
+            Kind::Video(Box::new(Video::open(name, rate_hz, partial)?))
         };
         Ok(Self { path: path.display().to_string(), kind, rate_hz })
     }

@@ -2,7 +2,8 @@
 //!
 //! For commands that read files and for the worker when it plays one; on their own thread. OpenCV's FFmpeg decodes into one matrix that is
 //! reused. The pictures are turned as the file's metadata say, by our own code, because OpenCV 4.6 turns them the wrong way round. Pictures
-//! that the file promises and that do not come are an error that names the first of them, or they are counted. What a decoder patches up
+//! that the file promises and that do not come, and gaps in a file of one rate, are an error that names the first of them, or they are counted. Where the
+//! container does not say how its pictures follow each other, it is decoded once for their times alone. What a decoder patches up
 //! by itself (a damaged block in the middle of a picture) cannot be seen here.
 
 use opencv::core::Mat;
@@ -12,22 +13,27 @@ use opencv::videoio::{self, VideoCapture};
 use super::container::{Container, Turn};
 use super::frame::SourceError;
 use super::pictures::unreadable;
+use super::rhythm::{GAP_PERIODS, Rhythm};
 
 /// Periods that the end of the last picture may lie before the end of the video. Chosen by hand: rounding, and a sound track's padding.
 const END_PERIODS: f64 = 2.5;
-/// Periods between two pictures from which on one is missing where all periods are the same. Half way to the second.
-const GAP_PERIODS: f64 = 1.5;
+/// Pictures in a row that cannot be decoded and after which a file is over. Chosen by hand: half a minute, and a thousand looks beyond the end take a
+/// moment.
+const UNDECODED_MOST: u64 = 1000;
 
-/// Steps from picture to picture of so many usual ones count as usual: a file's times are whole ms. Chosen by hand.
-const USUAL: (f64, f64) = (0.85, 1.15);
-/// Share of usual steps from which on a longer one is a gap, and not one of a rate that varies. Chosen by hand.
-const MOST_USUAL: f64 = 0.8;
+/// Takes the next picture that can be decoded, and returns how many tries failed before it; `None` at the end. OpenCV reports damage in the middle of a file
+/// as it does the end, and goes on when it is asked again.
+fn advance(capture: &mut VideoCapture) -> Option<u64> {
+    (0..UNDECODED_MOST).find(|_| capture.grab().unwrap_or(false))
+}
 
 /// The times of a video's pictures.
 #[derive(Debug, Clone, Copy)]
 struct Times {
-    /// The same time from picture to picture, ms; `None` where it varies.
+    /// The same time from picture to picture, ms; `None` where it varies or is not known.
     period_ms: Option<f64>,
+    /// What it may be as long as no step was seen, ms.
+    guess_ms: f64,
     /// OpenCV's time of the first picture, ms.
     base_ms: f64,
     /// Time of the last picture from the first, ms.
@@ -36,44 +42,42 @@ struct Times {
     step_ms: f64,
     /// Pictures so far, those that are missing too.
     count: u64,
-    /// What the file calls the usual time from picture to picture, ms; it may be a mean.
-    usual_ms: Option<f64>,
-    /// Number of steps of that time, and of those, for each that lasted longer, that would have fitted in between.
-    usual_steps: u64,
-    left_out: u64,
 }
 
 impl Times {
-    /// Takes the time of the next picture. Returns how many pictures are missing before it.
-    fn add(&mut self, stamp_ms: f64) -> u64 {
+    fn new(period_ms: Option<f64>, guess_ms: f64) -> Self {
+        Self { period_ms, guess_ms, base_ms: 0.0, last_ms: 0.0, step_ms: 0.0, count: 0 }
+    }
+
+    /// Takes OpenCV's time of the next picture, `None` where it is made up, and how many could not be decoded before it. Returns how many pictures are
+    /// missing before it.
+    fn add(&mut self, stamp_ms: Option<f64>, undecoded: u64) -> u64 {
         if self.count == 0 {
-            (self.base_ms, self.count) = (stamp_ms, 1);
-            return 0;
+            self.last_ms = undecoded as f64 * self.mean_ms();
+            (self.base_ms, self.count) = (stamp_ms.unwrap_or(0.0).max(0.0) - self.last_ms, 1 + undecoded);
+            return undecoded;
         }
-        let at_ms = stamp_ms - self.base_ms;
-        // OpenCV has no times for the last pictures of a stream that are decoded late.
+        // OpenCV takes a first time of 0 for none, and gives another one of the file in its place.
+        if self.count == 1 && stamp_ms.is_some_and(|stamp| stamp < self.base_ms) {
+            self.base_ms = 0.0;
+        }
+        // It has no times for the last pictures of a stream that are decoded late.
         let usual_ms = if self.step_ms > 0.0 && self.step_ms < GAP_PERIODS * self.mean_ms() { self.step_ms } else { self.mean_ms() };
-        let at_ms = if at_ms > self.last_ms && at_ms.is_finite() { at_ms } else { self.last_ms + usual_ms };
+        let told_ms = stamp_ms.map(|stamp| stamp - self.base_ms).filter(|at| *at > self.last_ms && at.is_finite());
+        let at_ms = told_ms.unwrap_or(self.last_ms + (1 + undecoded) as f64 * usual_ms);
         let periods = self.period_ms.map_or(1.0, |period| (at_ms - self.last_ms) / period);
-        let missing = if periods > GAP_PERIODS { periods.round() as u64 - 1 } else { 0 };
-        if let Some(periods) = self.usual_ms.map(|usual_ms| (at_ms - self.last_ms) / usual_ms) {
-            self.usual_steps += u64::from((USUAL.0..USUAL.1).contains(&periods));
-            self.left_out += if periods > GAP_PERIODS { periods.round() as u64 - 1 } else { 0 };
-        }
+        let by_time = if periods > GAP_PERIODS { periods.round() as u64 - 1 } else { 0 };
+        // Not every try that fails is a picture, and where the times tell how many are missing, they are right.
+        let missing = if self.period_ms.is_some() { by_time } else { undecoded };
         (self.step_ms, self.last_ms) = (at_ms - self.last_ms, at_ms);
         self.count += 1 + missing;
         missing
     }
 
-    /// Number of pictures that are missing between others, as far as the steps tell it: most are of the usual time, and some of several times that.
-    fn left_out(&self) -> u64 {
-        let steps = self.count.saturating_sub(1);
-        if self.usual_steps as f64 >= MOST_USUAL * steps as f64 { self.left_out } else { 0 }
-    }
-
     /// The mean time from picture to picture, ms.
     fn mean_ms(&self) -> f64 {
-        self.period_ms.unwrap_or(if self.count > 1 { self.last_ms / (self.count - 1) as f64 } else { 0.0 })
+        let mean_ms = if self.count > 1 { self.last_ms / (self.count - 1) as f64 } else { 0.0 };
+        self.period_ms.unwrap_or(if mean_ms > 0.0 { mean_ms } else { self.guess_ms })
     }
 }
 
@@ -85,8 +89,10 @@ pub(super) struct Video {
     turn: Turn,
     /// Number of pictures that the file has by its own word.
     promised: Option<u64>,
-    /// Frames a second by the file's own word.
+    /// Frames a second by the file's own word; 0 if it has none.
     rate_hz: f64,
+    /// How the pictures follow each other, where that was looked at.
+    rhythm: Option<Rhythm>,
     times: Times,
     decoded: u64,
     partial: bool,
@@ -96,19 +102,12 @@ pub(super) struct Video {
 }
 
 impl Video {
-    /// Opens the video at `path`. With `partial`, what is missing is counted and is no error.
-    pub(super) fn open(path: &str, partial: bool) -> Result<Self, SourceError> {
+    /// Opens the video at `path`. A stream without times has `rate_hz` pictures a second. With `partial`, what is missing is counted and is no
+    /// error.
+    pub(super) fn open(path: &str, rate_hz: f64, partial: bool) -> Result<Self, SourceError> {
         let fail = |what: String| SourceError::File { path: path.into(), what };
         let container = Container::read(path.as_ref()).map_err(|e| fail(unreadable(&e)))?;
-        let opened = VideoCapture::from_file(path, videoio::CAP_FFMPEG).map_err(|e| fail(format!("cannot be opened: {}", e.message)))?;
-        let mut capture = opened;
-        if !capture.is_opened()? {
-            return Err(fail(match container.missing_bytes {
-                Some(_) => "is truncated: its index is missing, so that nothing of it can be read; copy it again".into(),
-                None => "is no video that OpenCV's FFmpeg can read, or it is truncated".into(),
-            }));
-        }
-        let _ = capture.set(videoio::CAP_PROP_ORIENTATION_AUTO, 0.0)?;
+        let mut capture = opened(path, &container)?;
         let degrees = capture.get(videoio::CAP_PROP_ORIENTATION_META)?;
         let turn = match container.turn {
             Some(turn) => turn,
@@ -121,16 +120,37 @@ impl Video {
                     .into(),
             )
         })?;
-        let rate_hz = capture.get(videoio::CAP_PROP_FPS)?;
+        let told_hz = Some(capture.get(videoio::CAP_PROP_FPS)?).filter(|hz| !container.raw && hz.is_finite() && *hz > 0.0);
         let count = capture.get(videoio::CAP_PROP_FRAME_COUNT)?;
         let promised = (container.counts_frames && count >= 1.0).then_some(count as u64);
-        let own_period = (rate_hz > 0.0).then(|| 1.0 / rate_hz).filter(|_| container.fixed_rate);
-        let period_ms = container.period_s.or(own_period).map(|s| 1e3 * s);
-        let usual_ms = container.usual_period_s.map(|s| 1e3 * s);
-        let times = Times { period_ms, base_ms: 0.0, last_ms: 0.0, step_ms: 0.0, count: 0, usual_ms, usual_steps: 0, left_out: 0 };
-        let (picture, spare) = (Mat::default(), Mat::default());
-        let path = path.into();
-        Ok(Self { path, capture, container, turn, promised, rate_hz, times, decoded: 0, partial, remark: None, picture, spare })
+        let guess_ms = 1e3 / told_hz.unwrap_or(rate_hz);
+        let fixed_ms = (container.raw || container.fixed_rate).then_some(guess_ms);
+        let rhythm = match container.rhythm {
+            None if fixed_ms.is_none() => {
+                let steps = steps(&mut capture, guess_ms)?;
+                capture = opened(path, &container)?;
+                Rhythm::of(&steps)
+            }
+            rhythm => rhythm,
+        };
+        let period_ms = fixed_ms.or(rhythm.and_then(|rhythm| rhythm.period_ms()));
+        // FFmpeg guesses the rate of some containers, and their pictures' own times are no guess.
+        let told_hz = period_ms.filter(|_| !container.raw).map(|ms| 1e3 / ms).or(told_hz);
+        Ok(Self {
+            path: path.into(),
+            capture,
+            container,
+            turn,
+            promised,
+            rate_hz: told_hz.unwrap_or(0.0),
+            rhythm,
+            times: Times::new(period_ms, guess_ms),
+            decoded: 0,
+            partial,
+            remark: None,
+            picture: Mat::default(),
+            spare: Mat::default(),
+        })
     }
 
     /// Frames a second by the file's own word; 0 or less if it does not say.
@@ -141,17 +161,15 @@ impl Video {
     /// The next picture, its number counted from 0, and its time from the first, ns; `None` after the last.
     pub(super) fn next(&mut self) -> Result<Option<(&Mat, u64, u64)>, SourceError> {
         loop {
-            // OpenCV's decoder reports some damage in the middle of a file as an error, but the end of a file is not an error.
-            if !self.capture.grab().unwrap_or(false) {
-                return self.end().map(|()| None);
-            }
+            let Some(undecoded) = advance(&mut self.capture) else { return self.end().map(|()| None) };
             let read = self.capture.retrieve_def(&mut self.picture).unwrap_or(false) && !self.picture.empty();
-            let missing = self.times.add(self.capture.get(videoio::CAP_PROP_POS_MSEC)?);
+            let stamp_ms = self.capture.get(videoio::CAP_PROP_POS_MSEC)?;
+            let missing = self.times.add((!self.container.raw).then_some(stamp_ms), undecoded);
             let number = self.times.count;
             if (missing > 0 || !read) && !self.partial {
                 let first = if missing > 0 { number - missing } else { number };
                 let seconds = first.saturating_sub(1) as f64 * self.times.mean_ms() / 1e3;
-                return Err(self.incomplete(format!("frame {first} (at {seconds:.2} s) cannot be decoded")));
+                return Err(self.incomplete(format!("frame {first} (at {seconds:.2} s) is missing, or cannot be decoded")));
             }
             if read {
                 self.decoded += 1;
@@ -183,6 +201,10 @@ impl Video {
         // The count in an AVI's header may be one off. An MP4 may show fewer than it counts, by its edit list.
         let fewer = self.container.fixed_rate && self.promised.is_some_and(|promised| came + 1 < promised);
         let cut = self.container.missing_bytes.is_some();
+        let mut said = Vec::new();
+        if missing > 0 {
+            said.push(format!("{missing} of {came} frames are missing, or cannot be decoded, and are left out"));
+        }
         if short && (early || fewer || cut) {
             let of = self.promised.map_or(String::new(), |promised| format!(" of {promised}"));
             let why = if cut { "the file is truncated" } else { "what follows cannot be decoded, or is missing" };
@@ -190,21 +212,25 @@ impl Video {
             if !self.partial {
                 return Err(self.incomplete(what));
             }
-            self.remark = Some(format!("{}: {what}", self.path));
-        } else if missing > 0 {
-            self.remark = Some(format!("{}: {missing} of {came} frames cannot be decoded and are left out", self.path));
+            said.push(what);
         } else if let Some(promised) = self.promised.filter(|promised| came < *promised) {
-            self.remark = Some(format!(
-                "{}: {came} of its {promised} frames are shown; the others are cut out by its edit list, or damaged",
-                self.path
-            ));
-        } else if self.times.left_out() > 0 {
-            // A camera may have dropped them; the times of the others are right.
-            let left_out = self.times.left_out();
-            self.remark = Some(format!("{}: {left_out} frames are missing between its {came}: never recorded, or damaged", self.path));
-        } else if self.container.open_end {
-            self.remark = Some(format!("{}: the file does not say its length, so whether its end is missing cannot be told", self.path));
+            said.push(format!("{came} of its {promised} frames are shown; the others are cut out by its edit list, or damaged"));
         }
+        if let Some(Rhythm { steps, long, usual_ms, .. }) = self.rhythm.filter(|rhythm| !rhythm.fixed && rhythm.long > 0) {
+            // A camera may have dropped them; the times of the others are right.
+            said.push(format!(
+                "its rate varies, and {long} of {steps} steps are longer than usual ({usual_ms:.0} ms), so whether frames are missing cannot be told"
+            ));
+        }
+        if self.container.raw {
+            let rate_hz = (1e7 / self.times.guess_ms).round() / 1e4;
+            said.push(format!(
+                "a stream without times of its own, taken at camera.fps = {rate_hz}; whether frames are missing cannot be told"
+            ));
+        } else if self.container.open_end && !cut {
+            said.push("the file does not say its length, so whether its end is missing cannot be told".into());
+        }
+        self.remark = (!said.is_empty()).then(|| format!("{}: {}", self.path, said.join("; ")));
         Ok(())
     }
 
@@ -212,4 +238,30 @@ impl Video {
     pub(super) fn remark(&self) -> Option<String> {
         self.remark.clone()
     }
+}
+
+/// OpenCV's reader of the video at `path`, which does not turn the pictures.
+fn opened(path: &str, container: &Container) -> Result<VideoCapture, SourceError> {
+    let fail = |what: String| SourceError::File { path: path.into(), what };
+    let opened = VideoCapture::from_file(path, videoio::CAP_FFMPEG);
+    let mut capture = opened.map_err(|e| fail(format!("cannot be opened: {}", e.message)))?;
+    if !capture.is_opened()? {
+        return Err(fail(match container.missing_bytes {
+            Some(_) => "is truncated: its index is missing, so that nothing of it can be read; copy it again".into(),
+            None => "is no video that OpenCV's FFmpeg can read, or it is truncated".into(),
+        }));
+    }
+    let _ = capture.set(videoio::CAP_PROP_ORIENTATION_AUTO, 0.0)?;
+    Ok(capture)
+}
+
+/// The steps from picture to picture of the whole file, one after the other, each as one step of so many ms.
+fn steps(capture: &mut VideoCapture, guess_ms: f64) -> Result<Vec<(u64, f64)>, SourceError> {
+    let mut times = Times::new(None, guess_ms);
+    let mut steps = Vec::new();
+    while let Some(undecoded) = advance(capture) {
+        times.add(Some(capture.get(videoio::CAP_PROP_POS_MSEC)?), undecoded);
+        steps.push((1, times.step_ms));
+    }
+    Ok(steps)
 }
