@@ -54,14 +54,10 @@ impl Times {
     fn add(&mut self, stamp_ms: Option<f64>, undecoded: u64) -> u64 {
         if self.count == 0 {
             self.last_ms = undecoded as f64 * self.mean_ms();
-            (self.base_ms, self.count) = (stamp_ms.unwrap_or(0.0).max(0.0) - self.last_ms, 1 + undecoded);
+            (self.base_ms, self.count) = (stamp_ms.unwrap_or(0.0) - self.last_ms, 1 + undecoded);
             return undecoded;
         }
-        // OpenCV takes a first time of 0 for none, and gives another one of the file in its place.
-        if self.count == 1 && stamp_ms.is_some_and(|stamp| stamp < self.base_ms) {
-            self.base_ms = 0.0;
-        }
-        // It has no times for the last pictures of a stream that are decoded late.
+        // OpenCV has no times for the last pictures of a stream that are decoded late.
         let usual_ms = if self.step_ms > 0.0 && self.step_ms < GAP_PERIODS * self.mean_ms() { self.step_ms } else { self.mean_ms() };
         let told_ms = stamp_ms.map(|stamp| stamp - self.base_ms).filter(|at| *at > self.last_ms && at.is_finite());
         let at_ms = told_ms.unwrap_or(self.last_ms + (1 + undecoded) as f64 * usual_ms);

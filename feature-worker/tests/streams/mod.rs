@@ -40,6 +40,8 @@ fn pictures_that_are_decoded_late_have_their_times() -> Outcome {
     for name in ["late.mkv", "late.mp4"] {
         let path = directory.path().join(name);
         video(&path, ['H', '2', '6', '4'], 30.0)?;
+        let reordered = std::fs::read(&path)?.windows(4).any(|word| word == b"ctts");
+        assert_eq!(reordered, name.ends_with("mp4"), "an MP4 says by how much each picture is shown later than it is decoded");
         let (all, said) = report(&inspect(directory.path(), &[&path], &[])?)?;
         assert!(all["frames"] == FRAMES && said.is_empty(), "{name}: {all} {said}");
         for (number, t_s) in times(directory.path())? {
