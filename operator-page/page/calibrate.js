@@ -50,9 +50,16 @@ async function look() {
 function show(state4) {
   found = state4;
   $('calibrate-section').textContent = found.section;
-  $('spot-picture').src = `/api/calibration.jpg?${Date.now()}`;
+  showSpot(found);
   $('spot').hidden = $('measure').hidden = $('calibrate-write').hidden = false;
   pins();
+}
+
+/** Shows the picture of what was found, unless something else was found meanwhile. */
+async function showSpot(of) {
+  let picture = null;
+  try { picture = await (await getPicture('/api/calibration.jpg')).blob(); } catch { /* Then there is none to be seen. */ }
+  if (found === of) put($('spot-picture'), picture);
 }
 
 /** The points were moved: what was measured with them elsewhere cannot be written. */

@@ -63,9 +63,10 @@ function showTable() {
   fill($('table').tBodies[0], ...list.slice(0, ROWS).map(e => {
     const look = el('button', { type: 'button', className: 'small look', 'aria-label': `Look at ${e.file}`, onclick: () => open(e.file) }, e.file);
     const cells = COLUMNS.map(([key, , text, number, words]) => el('td', { className: number ? 'number' : words ? 'words' : '' }, key === 'file' && !e.error ? look : text(e)));
-    const save = (path, name) => el('a', { href: `${path}?file=${encodeURIComponent(e.file)}`, download: e.file.replace(/\.mcap$/, name), 'aria-label': `Save ${e.file} as ${name}` }, name.slice(1).toUpperCase());
+    const saved = (path, ending) => el('button', { type: 'button', className: 'small', 'aria-label': `Save ${e.file} as ${ending}`,
+      onclick: () => attempt(() => save(`${path}?file=${encodeURIComponent(e.file)}`, e.file.replace(/\.mcap$/, ending))) }, ending.slice(1).toUpperCase());
     const tr = el('tr', { className: e.file === chosen ? 'chosen' : '' }, ...cells,
-      el('td', {}, save('/api/mcap', '.mcap'), ' ', e.error ? null : save('/api/csv', '.csv')));
+      el('td', {}, saved('/api/mcap', '.mcap'), ' ', e.error ? null : saved('/api/csv', '.csv')));
     return tr;
   }));
   drift();
@@ -125,18 +126,16 @@ function scrub() {
 async function showPicture(k) {
   const image = $('episode-picture'), words = $('episode-picture-words'), of = chosen, at = `${shown(rows.t_s[k], 2)} s`;
   const wanted = rows.sequence[k] % 2 ** 32;
-  let picture = '', said = '';
+  let picture = null, said = '';
   try {
-    const response = await fetch(`/api/frame?file=${encodeURIComponent(of)}&sequence=${rows.sequence[k]}`, { signal: within(ANSWER_WAITS) });
-    if (!response.ok) await answered(response);
+    const response = await getPicture(`/api/frame?file=${encodeURIComponent(of)}&sequence=${rows.sequence[k]}`);
     const { sequence } = JSON.parse(response.headers.get('x-frame'));
     if (sequence !== wanted) said = `There is no picture of this frame; that of frame ${sequence}, the nearest ${sequence < wanted ? 'before' : 'after'} it, is shown.`;
-    picture = URL.createObjectURL(await response.blob());
+    picture = await response.blob();
   } catch (error) {
     said = `No picture: ${error instanceof TypeError || error instanceof DOMException ? 'the page\'s server cannot be reached' : error.message}.`;
   }
-  if (image.src.startsWith('blob:')) URL.revokeObjectURL(image.src);
-  if (picture) image.src = picture; else image.removeAttribute('src');
+  put(image, picture);
   image.hidden = !picture;
   image.alt = said ? `Picture of ${of}. ${said}` : `Picture of ${of} at ${at}`;
   words.textContent = said;

@@ -8,7 +8,7 @@
 const SILENT = 750;
 /** How often it is looked, ms. */
 const LOOKS = 100;
-let last = 0, source = null, state = null, mine = false, stopPort = 0, announced = '';
+let last = 0, stream = null, state = null, mine = false, stopPort = 0, announced = '';
 /** The ticks of the last minute, by their place in the rows of the server. */
 let points = [];
 const [TICK, T, ALPHA, MEASURED, AREA, DOUBT, D, POURED, SD, PHASE, EPISODE, GOAL] = [0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11];
@@ -28,7 +28,7 @@ async function stop() {
   const refused = [];
   const way = async (url, options) => {
     try {
-      const answer = await answered(await fetch(url, { method: 'POST', signal: within(STOP_WAITS), ...options }));
+      const answer = await answered(await ask(url, { method: 'POST', signal: within(STOP_WAITS), ...options }));
       if (state && answer.stops > state.stops) state.stops = answer.stops;
       return answer;
     } catch (error) {
@@ -41,7 +41,7 @@ async function stop() {
     }
   };
   const ways = [way('/api/stop', { headers: { 'Content-Type': 'application/json' }, body: '{}' })];
-  if (stopPort) ways.push(way(`http://${location.hostname}:${stopPort}/stop`, { credentials: 'include', headers: { 'Content-Type': 'text/plain' }, body: '' }));
+  if (stopPort) ways.push(way(`http://${location.hostname}:${stopPort}/stop`, { headers: { 'Content-Type': 'text/plain' }, body: '' }));
   try {
     const answer = await Promise.any(ways);
     $('stop-said').textContent = `Stop: ${answer.words} (${(performance.now() - begin).toFixed(0)} ms)`;
@@ -91,27 +91,44 @@ function lose() {
 
 /** When the newest connection was begun. */
 let connected = 0;
-function connect() {
+/** Takes states as long as they come. The browser's own way to a stream of events (EventSource) sends no token. */
+async function connect() {
   connected = performance.now();
-  source?.close();
-  source = new EventSource('/events');
+  stream?.abort();
+  const begun = stream = new AbortController();
+  try {
+    const response = await ask('/events', { signal: begun.signal });
+    if (!response.ok) await answered(response);
+    const reader = response.body.getReader(), decoder = new TextDecoder();
+    let text = '';
+    for (let part = await reader.read(); !part.done; part = await reader.read()) {
+      const events = (text + decoder.decode(part.value, { stream: true })).split('\n\n');
+      text = events.pop();
+      // Each by itself, so that one which the page cannot show ends nothing.
+      events.forEach(event => queueMicrotask(() => take(event.slice('data: '.length))));
+    }
+  } catch (error) {
+    if (begun === stream && !(error instanceof TypeError || error instanceof DOMException)) say(error.message);
+  }
   // A server that has ended closes its connections, which is noticed at once.
-  source.onerror = lose;
-  source.onmessage = event => {
-    last = performance.now();
-    document.body.classList.remove('lost');
-    $('lost').hidden = true;
-    let next;
-    try { next = JSON.parse(event.data); } catch { return; }
-    state = next;
-    const newest = points.length ? points[points.length - 1][TICK] : -1;
-    const fresh = state.live.points;
-    if (fresh.length && fresh[fresh.length - 1][TICK] < newest) points = [];
-    points.push(...fresh.filter(p => !points.length || p[TICK] > points[points.length - 1][TICK]));
-    if (points.length > 1800) points.splice(0, points.length - 1800);
-    headline();
-    listeners.forEach(listener => listener(state));
-  };
+  if (begun === stream) { stream = null; lose(); }
+}
+
+/** Takes a state as the server sends it. */
+function take(text) {
+  last = performance.now();
+  document.body.classList.remove('lost');
+  $('lost').hidden = true;
+  let next;
+  try { next = JSON.parse(text); } catch { return; }
+  state = next;
+  const newest = points.length ? points[points.length - 1][TICK] : -1;
+  const fresh = state.live.points;
+  if (fresh.length && fresh[fresh.length - 1][TICK] < newest) points = [];
+  points.push(...fresh.filter(p => !points.length || p[TICK] > points[points.length - 1][TICK]));
+  if (points.length > 1800) points.splice(0, points.length - 1800);
+  headline();
+  listeners.forEach(listener => listener(state));
 }
 
 function headline() {
@@ -137,12 +154,10 @@ $('take').onclick = () => attempt(async () => {
 
 // A server that is gone is noticed within a second.
 setInterval(() => {
-  if (performance.now() - last < SILENT) return;
-  lose();
-  if (source?.readyState === EventSource.CLOSED) connect();
+  if (performance.now() - last >= SILENT) lose();
 }, LOOKS);
 // A connection whose other end is gone without a word stays open for the browser; so what counts is when something came.
-setInterval(() => { if (!source || performance.now() - Math.max(last, connected) > 3000) connect(); }, 1500);
+setInterval(() => { if (!stream || performance.now() - Math.max(last, connected) > 3000) connect(); }, 1500);
 
 /** Whether this page holds a pour. */
 let holding = false;
@@ -150,7 +165,7 @@ async function here() {
   try { mine = (await post('/api/here', { holding })).mine; } catch { mine = false; }
 }
 setInterval(() => { if (mine && !holding) here(); }, 1500);
-// The connection of Stop's own way is kept open, so that a Stop need not make one.
+// The connection of Stop's own way is kept open, and the browser knows that it may send the token there, so that a Stop waits for neither.
 setInterval(() => {
   if (stopPort && !document.hidden) alive();
 }, 3000);
@@ -159,7 +174,7 @@ const ALIVE_WAITS = 2500;
 async function alive() {
   let there = false;
   try {
-    there = (await fetch(`http://${location.hostname}:${stopPort}/alive`, { credentials: 'include', signal: within(ALIVE_WAITS) })).ok;
+    there = (await ask(`http://${location.hostname}:${stopPort}/stop`, { signal: within(ALIVE_WAITS) })).ok;
   } catch { /* It is said below. */ }
   $('stop-way').hidden = there;
   $('stop-way').textContent = there ? '' : `Stop's own port (${stopPort}) cannot be reached: Stop has one way less.`;

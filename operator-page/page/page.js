@@ -28,6 +28,25 @@ if (!own.id) own.id = [...crypto.getRandomValues(new Uint8Array(16))].map(b => b
 addEventListener('pagehide', () => sessionStorage.setItem('decant-id', own.id));
 addEventListener('pageshow', () => sessionStorage.removeItem('decant-id'));
 
+/** Where this browser keeps the token: in a storage of this port's pages. A cookie would go to every port of the host, whoever listens there. */
+const TOKEN = 'decant-token';
+/** Takes the token from the address's fragment, which no browser sends, and takes it out of the address. */
+function takeToken() {
+  const given = /^#token=([0-9A-Za-z]+)$/.exec(location.hash);
+  if (!given) return;
+  localStorage.setItem(TOKEN, given[1]);
+  window.history.replaceState(null, '', location.pathname);
+}
+takeToken();
+// Into a page that is open already, an address with a token is only a jump.
+addEventListener('hashchange', takeToken);
+
+/** Asks the server, with the token if this browser has one. */
+function ask(url, options = {}) {
+  const token = localStorage.getItem(TOKEN);
+  return fetch(url, token ? { ...options, headers: { ...options.headers, Authorization: `Bearer ${token}` } } : options);
+}
+
 /** Says one line above the content; an empty line takes it away. */
 function say(line, good = false) {
   $('said').textContent = line;
@@ -51,12 +70,38 @@ function within(ms) {
 const ANSWER_WAITS = 65000;
 
 /** Looks something up. */
-async function get(path) { return answered(await fetch(path, { signal: within(ANSWER_WAITS) })); }
+async function get(path) { return answered(await ask(path, { signal: within(ANSWER_WAITS) })); }
 
 /** Orders something. */
 async function post(path, order = {}) {
   const body = JSON.stringify({ ...own, ...order });
-  return answered(await fetch(path, { method: 'POST', headers: { 'Content-Type': 'application/json' }, body, signal: within(ANSWER_WAITS) }));
+  return answered(await ask(path, { method: 'POST', headers: { 'Content-Type': 'application/json' }, body, signal: within(ANSWER_WAITS) }));
+}
+
+/** Looks a picture up; an image that loads by itself sends no token. */
+async function getPicture(path) {
+  const response = await ask(path, { signal: within(ANSWER_WAITS) });
+  if (!response.ok) await answered(response);
+  return response;
+}
+
+/** Puts a picture in the place of the one that the image shows; without one it shows none. */
+function put(image, picture) {
+  if (image.src.startsWith('blob:')) URL.revokeObjectURL(image.src);
+  if (picture) image.src = URL.createObjectURL(picture); else image.removeAttribute('src');
+}
+
+/** After this a file that was saved is on the browser's disk, ms. Chosen by hand: it only has to be copied there. */
+const SAVED = 60000;
+/** Saves a file of the server on the browser's disk, as a link would, which sends no token. However long it is under way, it is waited for. */
+async function save(path, name) {
+  say(`${name} is on its way …`, true);
+  const response = await ask(path);
+  if (!response.ok) await answered(response);
+  const href = URL.createObjectURL(await response.blob());
+  el('a', { href, download: name }).click();
+  setTimeout(() => URL.revokeObjectURL(href), SAVED);
+  say('');
 }
 
 /** Does something that may fail, and says so in one line. Gives undefined then. */

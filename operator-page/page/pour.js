@@ -41,8 +41,8 @@ async function picture() {
   const begin = performance.now();
   if (about && state && !document.hidden && !$('pour').hidden && !document.body.classList.contains('lost')) {
     try {
-      const response = await fetch('/picture.jpg');
-      if (!response.ok) throw new Error((await response.json()).error);
+      const response = await ask('/picture.jpg');
+      if (!response.ok) await answered(response);
       const found = JSON.parse(response.headers.get('x-frame'));
       if (!frame || frame.sequence !== found.sequence) {
         const bitmap = await createImageBitmap(await response.blob());

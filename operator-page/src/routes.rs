@@ -58,6 +58,19 @@ struct Order {
 const LATE_MS: u64 = 2000;
 /// The paths that order a motion.
 const MOTIONS: [&str; 3] = ["/api/pour", "/api/record", "/api/resume"];
+/// The page itself. It holds nothing of the cell, so it needs no token: what it shows it asks for with the token that it has from its address.
+pub const PAGE: &[(&str, &str, &str)] = &[
+    ("/", "text/html; charset=utf-8", include_str!("../page/index.html")),
+    ("/page.css", "text/css", include_str!("../page/page.css")),
+    ("/page.js", "text/javascript", include_str!("../page/page.js")),
+    ("/plot.js", "text/javascript", include_str!("../page/plot.js")),
+    ("/live.js", "text/javascript", include_str!("../page/live.js")),
+    ("/pour.js", "text/javascript", include_str!("../page/pour.js")),
+    ("/learn.js", "text/javascript", include_str!("../page/learn.js")),
+    ("/calibrate.js", "text/javascript", include_str!("../page/calibrate.js")),
+    ("/history.js", "text/javascript", include_str!("../page/history.js")),
+    ("/icon.svg", "image/svg+xml", include_str!("../page/icon.svg")),
+];
 /// The formats of `feature-worker episodes export`.
 const FORMATS: [&str; 4] = ["csv", "images", "video", "lerobot"];
 
@@ -69,16 +82,6 @@ pub fn answer(site: &Site, request: &Request) -> Answer {
 fn get(site: &Site, request: &Request) -> Answer {
     let file = request.parameter("file").unwrap_or_default();
     match request.path.as_str() {
-        "/" => Answer::html(include_str!("../page/index.html")),
-        "/page.css" => Answer::bytes("text/css", include_str!("../page/page.css")),
-        "/page.js" => Answer::bytes("text/javascript", include_str!("../page/page.js")),
-        "/plot.js" => Answer::bytes("text/javascript", include_str!("../page/plot.js")),
-        "/live.js" => Answer::bytes("text/javascript", include_str!("../page/live.js")),
-        "/pour.js" => Answer::bytes("text/javascript", include_str!("../page/pour.js")),
-        "/learn.js" => Answer::bytes("text/javascript", include_str!("../page/learn.js")),
-        "/calibrate.js" => Answer::bytes("text/javascript", include_str!("../page/calibrate.js")),
-        "/history.js" => Answer::bytes("text/javascript", include_str!("../page/history.js")),
-        "/icon.svg" => Answer::bytes("image/svg+xml", include_str!("../page/icon.svg")),
         "/events" => site.events.stream(),
         "/picture.jpg" => picture(site),
         "/api/about" => Answer::json(&site.about()),

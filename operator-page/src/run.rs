@@ -76,7 +76,8 @@ pub fn run(args: &Args) -> Result<(), Failure> {
     let second_port = stop_port.local_addr().or_exit(exit::FAILED)?.port();
     let rules = Rules { names: args.names.clone(), token: Some(word.clone()), pages_port: None, content_type: "application/json" };
     let of_stop = Rules { pages_port: Some(port), content_type: "text/plain", ..rules.clone() };
-    let page = Server::on(page_port, Settings { rules, urgent: &["/api/stop"], second_port: Some(second_port), ..Settings::default() })?;
+    let (urgent, open) = (&["/api/stop"], routes::PAGE);
+    let page = Server::on(page_port, Settings { rules, urgent, open, second_port: Some(second_port), ..Settings::default() })?;
     let stop_settings = Settings { rules: of_stop, connections: STOP_CONNECTIONS, listeners: 0, ..Settings::default() };
     let stop_page = Server::on(stop_port, stop_settings)?;
     let site = Arc::new(Site::new(config, file, second_port));
@@ -100,7 +101,8 @@ pub fn run(args: &Args) -> Result<(), Failure> {
             scope.spawn(move || {
                 stop_page.serve(stop, |request| match (request.post, request.path.as_str()) {
                     (true, "/stop") => routes::stop(site),
-                    (false, "/alive") => web::Answer::text("alive"),
+                    // What the browser has asked for here before, it sends as Stop without asking again.
+                    (false, "/stop") => web::Answer::text("alive"),
                     _ => web::Answer::not_here(),
                 });
             });
@@ -121,9 +123,9 @@ fn announce(address: SocketAddr, word: &str, (file, made): (&Path, bool), loopba
     for ip in addresses::to_open(address.ip()) {
         let address = SocketAddr::new(ip, address.port());
         let with_token = if logged {
-            format!("http://{address}/?token=... (it is in {})", file.display())
+            format!("http://{address}/#token=... (it is in {})", file.display())
         } else {
-            format!("http://{address}/?token={word}")
+            format!("http://{address}/#token={word}")
         };
         if loopback {
             println!("http://{address}");

@@ -42,20 +42,21 @@ fn figure(pid: u32, name: &str) -> usize {
 }
 
 /// What another user of this machine gets; none where this user may not become another one.
-fn as_another_user(address: &str) -> Option<String> {
+fn as_another_user(address: &str, path: &str) -> Option<String> {
     let (host, port) = address.rsplit_once(':').expect("host and port");
-    let ask = format!("exec 3<>/dev/tcp/{host}/{port}; printf 'GET / HTTP/1.1\\r\\nHost: {address}\\r\\n\\r\\n' >&3; head -n1 <&3");
+    let ask = format!("exec 3<>/dev/tcp/{host}/{port}; printf 'GET {path} HTTP/1.1\\r\\nHost: {address}\\r\\n\\r\\n' >&3; head -n1 <&3");
     let mut command = Command::new("setpriv");
     command.args(["--reuid=65534", "--regid=65534", "--clear-groups", "bash", "-c", &ask]);
     let output = command.output().ok().filter(|o| o.status.success())?;
     Some(String::from_utf8_lossy(&output.stdout).split(' ').nth(1).unwrap_or("").into())
 }
 
-/// Attacks the page at `address`, which the process `pid` serves. It must answer its own user meanwhile, answer nobody else, and not grow.
-pub fn attack(address: &str, pid: u32) {
+/// Attacks the page at `address`, which the process `pid` serves. It must answer `path`, which the program itself answers, to its own user meanwhile,
+/// answer it to nobody else, and not grow.
+pub fn attack(address: &str, path: &str, pid: u32) {
     let answers = |what: &str| {
         let began = Instant::now();
-        assert_eq!(status(address, "GET / HTTP/1.1\r\nHost: HOST\r\n\r\n"), "200", "{what}");
+        assert_eq!(status(address, &format!("GET {path} HTTP/1.1\r\nHost: HOST\r\n\r\n")), "200", "{what}");
         println!("{address}: answered after {:?} {what}", began.elapsed());
     };
     answers("undisturbed");
@@ -106,7 +107,7 @@ pub fn attack(address: &str, pid: u32) {
     assert!(threads_now <= threads + THREADS, "{threads} threads to {threads_now}");
     assert!(memory_now < memory + GROWTH_KIB, "{memory} KiB to {memory_now} KiB");
     drop(slow);
-    match as_another_user(address) {
+    match as_another_user(address, path) {
         Some(got) => assert!(["401", "403"].contains(&got.as_str()), "another user's process got {got}"),
         None => println!("not run: this user may not become another one (it takes root, setpriv and bash)"),
     }

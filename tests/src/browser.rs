@@ -24,9 +24,26 @@ pub struct Browser {
 impl Browser {
     /// Opens a window of `width` by `height` px; `None`, with a printed line, where there is no chromedriver.
     pub fn open(width: u32, height: u32) -> Option<Self> {
-        let mut command = Command::new("chromedriver");
+        Self::begin(Command::new("chromedriver"), (width, height))
+    }
+
+    /// Opens a window of another user of this machine, with the number `user`, who keeps everything in `home`; `None`, with a printed line, where that is
+    /// not possible.
+    pub fn open_as(user: u32, home: &Path) -> Option<Self> {
+        if !rustix::process::geteuid().is_root() || std::os::unix::fs::chown(home, Some(user), Some(user)).is_err() {
+            println!("not run: it takes root to act as another user");
+            return None;
+        }
+        let mut command = Command::new("setpriv");
+        command.arg(format!("--reuid={user}")).arg(format!("--regid={user}")).args(["--clear-groups", "chromedriver"]);
+        command.current_dir(home).env("HOME", home).env("TMPDIR", home).env_remove("XDG_RUNTIME_DIR");
+        Self::begin(command, (1280, 1000))
+    }
+
+    fn begin(mut command: Command, (width, height): (u32, u32)) -> Option<Self> {
         command.arg("--port=0").stdin(Stdio::null()).stdout(Stdio::piped()).stderr(Stdio::null());
-        let Ok(mut driver) = command.spawn() else {
+        let begun = Command::new("chromedriver").arg("--version").stdout(Stdio::null()).status().and_then(|_| command.spawn());
+        let Ok(mut driver) = begun else {
             println!("not run: there is no chromedriver (scripts/install chromium-driver)");
             return None;
         };

@@ -90,12 +90,6 @@ impl Answer {
         Self::fault(404, "there is no such page")
     }
 
-    /// The answer with another status.
-    pub fn status(mut self, status: u16) -> Self {
-        self.status = status;
-        self
-    }
-
     /// The answer with another header. Line ends in `value` are dropped.
     pub fn header(mut self, name: &'static str, value: &str) -> Self {
         self.headers.push((name, value.chars().filter(|c| !c.is_control()).collect()));

@@ -137,6 +137,8 @@ pub fn judge<'a>(method: &Method, uri: &Uri, headers: &'a HeaderMap, ends: &Ends
     }
     match *method {
         Method::GET => Ok(name),
+        // A browser asks beforehand whether a page may send the token to another port (Fetch Standard, "CORS-preflight fetch").
+        Method::OPTIONS if rules.pages_port.is_some() && headers.contains_key(header::ORIGIN) => Ok(name),
         Method::POST => {
             if !headers.contains_key(header::ORIGIN) {
                 return Err(refused(StatusCode::FORBIDDEN, "a request that changes something must say from which page it comes (Origin)"));
@@ -152,12 +154,8 @@ pub fn judge<'a>(method: &Method, uri: &Uri, headers: &'a HeaderMap, ends: &Ends
     }
 }
 
-/// The name of the cookie that holds the token of the pages of `port`.
-pub fn cookie_name(port: u16) -> String {
-    format!("decant-{port}")
-}
-
-/// Whether the other side may ask at all: its user is trusted, or it has the token.
+/// Whether the other side may ask at all: its user is trusted, or it sends the token in the header `Authorization`. A cookie does not count: browsers send
+/// it to every port of a host, and so to whoever listens there, while no other site's page can send this header.
 pub fn admitted(headers: &HeaderMap, ends: &Ends, rules: &Rules) -> Result<(), Refusal> {
     let Some(token) = &rules.token else {
         if ends.trusted() {
@@ -165,15 +163,11 @@ pub fn admitted(headers: &HeaderMap, ends: &Ends, rules: &Rules) -> Result<(), R
         }
         return Err(refused(StatusCode::FORBIDDEN, "this page belongs to another user of this machine"));
     };
-    let cookie = cookie_name(rules.pages_port.unwrap_or(ends.own.port()));
-    let given = headers.get_all(header::COOKIE).iter().filter_map(|c| c.to_str().ok()).flat_map(|c| c.split(';'));
-    let mut given = given.filter_map(|c| c.trim().split_once('=')).filter(|(name, _)| *name == cookie);
-    // Programs that keep no cookies, as Prometheus, say it in a header that no other site's page can send.
-    let bearer = text(headers, header::AUTHORIZATION).and_then(|value| value.strip_prefix("Bearer "));
-    if given.any(|(_, value)| token::same(value, token)) || bearer.is_some_and(|word| token::same(word, token)) || ends.trusted() {
+    let given = text(headers, header::AUTHORIZATION).and_then(|value| value.strip_prefix("Bearer "));
+    if given.is_some_and(|word| token::same(word, token)) || ends.trusted() {
         Ok(())
     } else {
-        let line = "this browser has no token: open the whole address that the page's program printed in its terminal, with ?token=";
+        let line = "this browser has no token, or an old one: open the page's address with #token= and the token behind it";
         Err(refused(StatusCode::UNAUTHORIZED, line))
     }
 }
@@ -243,24 +237,31 @@ mod tests {
     #[test]
     fn the_other_ports_pages_may_ask() {
         let rules = Rules { pages_port: Some(8000), content_type: "text/plain", ..rules() };
-        let judge = |origin: &str| {
-            let all =
-                headers(&[("host", "127.0.0.1:8643"), ("origin", origin), ("content-type", "text/plain"), ("sec-fetch-site", "same-site")]);
-            super::judge(&Method::POST, &Uri::from_static("/"), &all, &ends(), &rules).is_ok()
-        };
-        assert!(judge("http://127.0.0.1:8000"));
-        assert!(!judge("http://127.0.0.1:8643") && !judge("http://127.0.0.1:8001") && !judge("http://localhost:8000"));
+        // A browser asks before it sends the token there (OPTIONS).
+        for method in [Method::POST, Method::OPTIONS] {
+            let judge = |origin: &str| {
+                let all = headers(&[
+                    ("host", "127.0.0.1:8643"),
+                    ("origin", origin),
+                    ("content-type", "text/plain"),
+                    ("sec-fetch-site", "same-site"),
+                ]);
+                super::judge(&method, &Uri::from_static("/"), &all, &ends(), &rules).is_ok()
+            };
+            assert!(judge("http://127.0.0.1:8000"), "{method}");
+            assert!(!judge("http://127.0.0.1:8643") && !judge("http://127.0.0.1:8001") && !judge("http://localhost:8000"), "{method}");
+        }
+        let no_origin = headers(&[("host", "127.0.0.1:8643")]);
+        assert!(super::judge(&Method::OPTIONS, &Uri::from_static("/"), &no_origin, &ends(), &rules).is_err());
     }
 
-    /// Protects a cell on a shared machine or a network: a stranger needs the token, in a cookie of this port.
+    /// Protects a cell on a shared machine or a network: a stranger needs the token, in the one header that a browser sends to nobody by itself.
     #[test]
     fn a_stranger_needs_the_token() {
         let rules = Rules { token: Some("secret".into()), ..rules() };
         let stranger = ends_of(false);
         let with = |cookie: &str| admitted(&headers(&[("cookie", cookie)]), &stranger, &rules).map_err(|e| e.status.as_u16());
-        assert_eq!(with("a=b; decant-8643=secret"), Ok(()));
-        assert_eq!(with("decant-8643=wrong"), Err(401));
-        assert_eq!(with("decant-1=secret"), Err(401));
+        assert_eq!(with("decant-8643=secret"), Err(401), "a cookie goes to every port of the host");
         let says = |word: &str| admitted(&headers(&[("authorization", word)]), &stranger, &rules).is_ok();
         assert!(says("Bearer secret") && !says("Bearer wrong") && !says("Bearer ") && !says("secret") && !says("Basic secret"));
         assert_eq!(admitted(&HeaderMap::new(), &ends(), &rules), Ok(()));

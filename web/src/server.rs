@@ -18,6 +18,7 @@ use crossbeam::channel::{Receiver, Sender, TrySendError, bounded};
 use http_body_util::{BodyExt as _, LengthLimitError, Limited};
 use hyper::body::{Body as _, Incoming};
 use hyper::header::{self, HeaderValue};
+use hyper::http::request::Parts;
 use hyper::service::service_fn;
 use hyper::{Method, Response, StatusCode};
 use hyper_util::rt::{TokioIo, TokioTimer};
@@ -29,7 +30,6 @@ use crate::answer::{Answer, Content, Sending};
 use crate::connections::{Connections, Place};
 use crate::gate::{self, Ends, Refusal, Rules};
 use crate::patient::Patient;
-use crate::token;
 
 /// Longest time for a request's headers, and of an idle connection. Chosen by hand: a browser sends them at once.
 const HEADERS: Duration = Duration::from_secs(5);
@@ -49,6 +49,8 @@ const WAITING: usize = 64;
 const WAIT: Duration = Duration::from_millis(100);
 /// How long a server that ends lets its last answers leave. Chosen by hand: they are short, and most browsers are near.
 const LAST_ANSWERS: Duration = Duration::from_millis(100);
+/// How long a browser need not ask again whether it may send the token to another port, s. Source: Chromium takes no more than 2 hours.
+const ASKED_BEFORE_S: &str = "7200";
 /// Pause after a connection that could not be taken, as when no more files may be opened.
 const PAUSE: Duration = Duration::from_millis(50);
 
@@ -65,12 +67,15 @@ pub struct Settings {
     pub urgent: &'static [&'static str],
     /// A second port of this host that the pages may ask.
     pub second_port: Option<u16>,
+    /// What everybody gets who asks under a good name: the path, the content type, and the text, in which nothing is of the cell. A browser that
+    /// loads a page cannot send the token yet.
+    pub open: &'static [(&'static str, &'static str, &'static str)],
 }
 
 impl Default for Settings {
     fn default() -> Self {
         let rules = Rules { content_type: "application/json", ..Rules::default() };
-        Self { rules, connections: 64, listeners: 16, urgent: &[], second_port: None }
+        Self { rules, connections: 64, listeners: 16, urgent: &[], second_port: None, open: &[] }
     }
 }
 
@@ -277,11 +282,11 @@ async fn respond(request: hyper::Request<Incoming>, ends: &Ends, place: &Arc<Pla
     let (head, body) = request.into_parts();
     let judged = gate::judge(&head.method, &head.uri, &head.headers, ends, rules);
     let host = judged.as_ref().map(|name| (*name).to_string()).ok();
-    let mut answer = match judged.and_then(|_| enter(&head, ends, rules)) {
-        Ok(Some(answer)) => answer,
-        Ok(None) => hand_over(head, body, ends.peer, shared).await.unwrap_or_else(|refusal| fault(&refusal)),
-        Err(refusal) => fault(&refusal),
+    let answered = match judged {
+        Ok(_) => let_in(head, body, ends, shared).await,
+        Err(refusal) => Err(refusal),
     };
+    let mut answer = answered.unwrap_or_else(|refusal| Answer::fault(refusal.status.as_u16(), refusal.line));
     let mut listener = None;
     if matches!(answer.content, Content::Events(_)) {
         listener = Arc::clone(&shared.listeners).try_acquire_owned().ok();
@@ -302,24 +307,22 @@ async fn respond(request: hyper::Request<Incoming>, ends: &Ends, place: &Arc<Pla
     response
 }
 
-fn fault(refusal: &Refusal) -> Answer {
-    Answer::fault(refusal.status.as_u16(), refusal.line.clone())
-}
-
-/// Lets a request in, or takes the token from its query: then the answer leads to the same page without the token in its address.
-fn enter(head: &hyper::http::request::Parts, ends: &Ends, rules: &Rules) -> Result<Option<Answer>, Refusal> {
-    let given = head.uri.query().unwrap_or("").split('&').find_map(|p| p.strip_prefix("token="));
-    if let (Some(given), Some(token), &Method::GET) = (given, &rules.token, &head.method)
-        && token::same(given, token)
-    {
-        let cookie = format!("{}={token}; HttpOnly; SameSite=Strict; Path=/; Max-Age=31536000", gate::cookie_name(ends.own.port()));
-        return Ok(Some(Answer::text("").status(303).header("location", "/").header("set-cookie", &cookie)));
+/// The answer to a request that may be asked: at once to what is open to everybody, and to what a browser asks before it sends the token to another
+/// port; otherwise only to who is admitted.
+async fn let_in(head: Parts, body: Incoming, ends: &Ends, shared: &Shared) -> Result<Answer, Refusal> {
+    if head.method == Method::OPTIONS {
+        return Ok(Answer::text(""));
     }
-    gate::admitted(&head.headers, ends, rules).map(|()| None)
+    let open = shared.settings.open.iter().find(|(path, ..)| head.method == Method::GET && *path == head.uri.path());
+    if let Some((_, kind, text)) = open {
+        return Ok(Answer::bytes(kind, *text));
+    }
+    gate::admitted(&head.headers, ends, &shared.settings.rules)?;
+    hand_over(head, body, ends.peer, shared).await
 }
 
 /// Reads the body, hands the request to the caller, and waits for the answer.
-async fn hand_over(head: hyper::http::request::Parts, body: Incoming, peer: SocketAddr, shared: &Shared) -> Result<Answer, Refusal> {
+async fn hand_over(head: Parts, body: Incoming, peer: SocketAddr, shared: &Shared) -> Result<Answer, Refusal> {
     let refused = |status, line: &str| Refusal { status, line: line.into() };
     let too_large = || refused(StatusCode::PAYLOAD_TOO_LARGE, "the request is too large");
     if body.size_hint().lower() > BODY_MAX as u64 {
@@ -366,11 +369,12 @@ fn protect(headers: &mut header::HeaderMap, host: Option<&str>, ends: &Ends, set
     headers.insert(header::REFERRER_POLICY, HeaderValue::from_static("no-referrer"));
     headers.insert(header::CACHE_CONTROL, HeaderValue::from_static("no-store"));
     match (host, settings.rules.pages_port) {
-        // The pages of the other port may read what is answered here.
+        // The pages of the other port may send the token here, and read what is answered.
         (Some(host), Some(_)) => {
             if let Ok(origin) = HeaderValue::from_str(&gate::own_origin(host, ends, &settings.rules)) {
                 headers.insert(header::ACCESS_CONTROL_ALLOW_ORIGIN, origin);
-                headers.insert(header::ACCESS_CONTROL_ALLOW_CREDENTIALS, HeaderValue::from_static("true"));
+                headers.insert(header::ACCESS_CONTROL_ALLOW_HEADERS, HeaderValue::from_static("authorization"));
+                headers.insert(header::ACCESS_CONTROL_MAX_AGE, HeaderValue::from_static(ASKED_BEFORE_S));
             }
         }
         _ => {

@@ -7,6 +7,7 @@ mod cost;
 mod path;
 mod rules;
 mod stop;
+mod token;
 mod trouble;
 mod worker_pages;
 

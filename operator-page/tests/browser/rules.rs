@@ -95,15 +95,14 @@ fn stop_is_sent_and_what_it_overtakes_is_refused() {
     said(refusal, "no such robot");
     let late = "window.answers['/stop'] = window.answers['/api/stop'] = () => Promise.reject(new DOMException('late', 'AbortError'))";
     said(late, "it is still being tried");
-    browser.run("window.answers['/alive'] = () => Promise.reject(new TypeError('gone')); alive()");
+    browser.run("window.answers['/stop'] = () => Promise.reject(new TypeError('gone')); alive()");
     browser.wait("the word of the port", SOON, "return !$('stop-way').hidden && $('stop-way').textContent.includes('cannot be reached')");
-    browser.run("delete window.answers['/alive']; alive()");
+    browser.run("delete window.answers['/stop']; alive()");
     browser.wait("that it is back", SOON, "return $('stop-way').hidden");
 
     // A connection that stays open, and from which nothing comes any more.
-    let silent = "window.made = 0; source.close();
-        window.EventSource = class { constructor() { window.made += 1; this.readyState = 1; } close() {} };
-        window.EventSource.OPEN = 1; window.EventSource.CLOSED = 2; connect(); const now = performance.now.bind(performance); performance.now = () => now() + 10000";
+    let silent = "window.made = 0; window.answers['/events'] = () => { window.made += 1; return new Promise(() => {}); };
+        connect(); const now = performance.now.bind(performance); performance.now = () => now() + 10000";
     browser.run(silent);
     browser.wait("a new connection", SOON, "return window.made > 1");
 }
@@ -185,6 +184,10 @@ fn what_is_shown_and_typed_is_meant() {
     assert!(look(1).contains("that of frame 1, the nearest before it, is shown"), "{}", look(1));
     let name = text("return fetch('/api/csv?file=episode-0001.mcap').then(r => r.headers.get('content-disposition'))");
     assert!(name.contains("episode-0001.csv"), "{name}");
+    let saved = "const made = URL.createObjectURL; showTable();
+        return new Promise(end => { URL.createObjectURL = file => { URL.createObjectURL = made; file.text().then(end); return made.call(URL, file); };
+            document.querySelector('[aria-label=\"Save episode-0001.mcap as .csv\"]').click(); })";
+    assert!(text(saved).lines().count() > 3, "{}", text(saved));
     let many = "const one = table.episodes[0]; table.episodes = Array.from({ length: 700 }, (_, n) => ({ ...one, file: `e-${n}.mcap` })); showTable();
         window.answers['/api/export'] = (url, o) => { window.exported = JSON.parse(o.body).files.length; return Promise.resolve(new Response('{}')); };
         document.querySelector('[data-format=csv]').click(); return $('table-words').textContent + document.querySelectorAll('#table tbody tr').length + ' ' + window.exported";

@@ -64,7 +64,7 @@ fn others_move_nothing_and_losses_are_said() {
     cell.json("simulator", &["operator", "fill", "300", "--json"]);
     cell.wait_idle();
     let page = Page::open(&cell);
-    attack(&page.address, page.process.id());
+    attack(&page.address, "/api/about", page.process.id());
 
     browser.go(&other_site(&page.address));
     browser.wait("the other site's requests", SOON, "return document.title !== '' && !document.title.startsWith('http')");

@@ -22,7 +22,7 @@ pub fn stand_attacks(cell: &CellUnderTest) {
     let mut view = Serving(cell.begin("feature-worker", &["view", "--port", "0"]));
     let mut line = String::new();
     BufReader::new(view.0.stdout.take().expect("piped")).read_line(&mut line).expect("it says where");
-    attack(line.trim().strip_prefix("http://").expect("an address"), view.0.id());
+    attack(line.trim().strip_prefix("http://").expect("an address"), "/state.json", view.0.id());
     drop(view);
 
     let episodes = std::fs::read_dir(cell.dir.path().join("episodes")).expect("there").flatten().map(|e| e.path());
@@ -33,6 +33,6 @@ pub fn stand_attacks(cell: &CellUnderTest) {
     let before = std::fs::read(cell.config()).expect("there");
     let mut said = BufReader::new(calibrate.0.stderr.take().expect("piped")).lines().map_while(Result::ok);
     let address = said.find_map(|line| Some(line.split_once("open http://")?.1.split_whitespace().next()?.to_string()));
-    attack(&address.expect("it says where"), calibrate.0.id());
+    attack(&address.expect("it says where"), "/state.json", calibrate.0.id());
     assert_eq!(std::fs::read(cell.config()).expect("there"), before, "nobody has written the configuration");
 }

@@ -68,13 +68,12 @@ const NO_MESSAGES_IN: [&str; 10] = [
 ];
 
 /// Texts that are parts of a protocol or of a longer message, or that tell of nothing wrong.
-const PARTS: [&str; 19] = [
+const PARTS: [&str; 18] = [
     "default-src 'none'",
     "tilt along a curve and back",
-    "HttpOnly; SameSite",
     "application/openmetrics-text",
     "HTTP/1.1\\r",
-    "http://…/?token",
+    "http://…/#token",
     "the request to start",
     "the request for",
     "the program's upload",

@@ -1,0 +1,101 @@
+//! The token: who needs it, where a browser keeps it, and to whom it sends it.
+
+use std::io::{Read as _, Write as _};
+use std::net::TcpListener;
+use std::sync::mpsc::{Receiver, channel};
+
+use tests::browser::Browser;
+use tests::{CellUnderTest, steady_weights};
+
+use super::{LIVE, Page, SOON, TILT_OUT, says};
+
+/// A user of this machine who is neither this one nor root.
+const STRANGER: u32 = 65_534;
+
+/// The file in which the page's token lies.
+fn token_file(cell: &CellUnderTest) -> std::path::PathBuf {
+    cell.weights().with_file_name(format!("operator-page-{}.token", cell.name))
+}
+
+/// The token, once the page has made it.
+fn token(cell: &CellUnderTest) -> String {
+    std::fs::read_to_string(token_file(cell)).expect("the page has made it").trim().into()
+}
+
+/// Another user's server on another port of this host: its address, and the heads of the requests that it gets.
+fn neighbour() -> (String, Receiver<String>) {
+    let listener = TcpListener::bind("127.0.0.1:0").expect("a port");
+    let address = listener.local_addr().expect("an address");
+    let (sender, heads) = channel();
+    std::thread::spawn(move || {
+        for mut stream in listener.incoming().flatten() {
+            let mut head = vec![0; 4096];
+            let got = stream.read(&mut head).unwrap_or(0);
+            let _ = sender.send(String::from_utf8_lossy(&head[..got]).into_owned());
+            let _ = stream.write_all(b"HTTP/1.1 200 OK\r\nContent-Type: text/html\r\nContent-Length: 0\r\nConnection: close\r\n\r\n");
+        }
+    });
+    (format!("http://{address}/"), heads)
+}
+
+/// Protects a cell on a shared machine: another user's browser needs the token, takes it from the address, shows everything and stops with it by both
+/// ports, keeps it, and sends it to no other port of the host.
+#[test]
+fn another_users_browser_sends_the_token_to_this_page_alone() {
+    let home = tempfile::tempdir().expect("a directory");
+    let Some(browser) = Browser::open_as(STRANGER, home.path()) else { return };
+    let cell = CellUnderTest::start(|_| {});
+    cell.take_weights(&steady_weights(TILT_OUT));
+    cell.json("simulator", &["operator", "fill", "300", "--json"]);
+    cell.wait_idle();
+    let page = Page::open(&cell);
+    browser.go(&page.url());
+    browser.wait("that the token is missing", SOON, "return $('said').textContent.includes('has no token')");
+    assert_eq!(browser.run("return ask('/picture.jpg').then(answer => answer.status)"), 401);
+
+    // In a window that has the page already, this is only a jump within it.
+    browser.go(&format!("{}#token={}", page.url(), token(&cell)));
+    browser.wait("the live picture", SOON, LIVE);
+    assert_eq!(browser.run("return location.href"), page.url(), "the token stands in the address no more");
+    says(&browser, "Ready to pour");
+    browser.fill("#goal", "100");
+    browser.click("#foresee");
+    browser.wait("what is foreseen", SOON, "return !document.getElementById('confirm').hidden");
+    browser.click("#go");
+    says(&browser, "Pouring 100 ml");
+    // By the second port alone, the first time and with what the browser has asked before.
+    let second = "const url = `http://${location.hostname}:${stopPort}/stop`;";
+    let ways = format!(
+        "{second} const bare = fetch(url, {{ method: 'POST', headers: {{ 'Content-Type': 'text/plain' }}, body: '' }});
+         const own = ask(url, {{ method: 'POST', headers: {{ 'Content-Type': 'text/plain' }}, body: '' }});
+         return Promise.all([bare, own].map(asked => asked.then(answer => answer.status))).then(all => all.join())"
+    );
+    assert_eq!(browser.run(&ways), "401,200", "without the token, and with it");
+    cell.wait("the end", SOON, |s| s["phase"] == "idle" && s["outcomes"][0]["reason"] == "aborted");
+    browser.run("return alive()");
+    assert_eq!(browser.run("return $('stop-way').hidden"), true, "Stop's own way is there");
+
+    let (other, heads) = neighbour();
+    browser.go(&other);
+    let head = heads.recv_timeout(SOON).expect("the browser asks");
+    assert!(head.starts_with("GET / ") && !head.contains(&token(&cell)), "{head}");
+    assert_eq!(browser.run("return document.cookie + localStorage.length"), "0");
+    browser.go(&page.url());
+    browser.wait("the live picture, with the token that was kept", SOON, LIVE);
+}
+
+/// Protects the browsers that need the token from a part of the page that is shown only without it: each request goes the one way that sends it.
+#[test]
+fn each_request_of_the_page_sends_the_token() {
+    let directory = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("page");
+    let scripts: Vec<_> = std::fs::read_dir(directory).expect("there").flatten().map(|e| e.path()).collect();
+    let mut asked = 0;
+    for path in scripts.iter().filter(|p| p.extension().is_some_and(|e| e == "js")) {
+        let text = std::fs::read_to_string(path).expect("text");
+        asked += text.matches("fetch(").count();
+        for other in ["EventSource(", "XMLHttpRequest", "sendBeacon", "src = `/", "href: `/", "src: `/"] {
+            assert!(!text.contains(other), "{}: {other}", path.display());
+        }
+    }
+    assert_eq!(asked, 1, "places that ask the server");
+}
