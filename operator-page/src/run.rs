@@ -9,9 +9,10 @@
 //! | link | keeps the link to the cell running, and takes its messages |
 //! | publish, weights, history | the state for all browsers; the weight files; the episodes |
 //!
-//! None of them is in the loop's process, and none touches shared memory: the link does, as a process of its own. A port that is in use, an
-//! address without a token, or a configuration that cannot be read ends the command with one line.
+//! None of them is in the loop's process, and none touches shared memory: the link does, as a process of its own. A port that is in use, a
+//! token that others may read, or a configuration that cannot be read ends the command with one line.
 
+use std::io::IsTerminal as _;
 use std::net::{IpAddr, Ipv4Addr, SocketAddr};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -44,7 +45,7 @@ const GRACE: Duration = Duration::from_secs(25);
 #[command(
     after_help = "Examples:\n  operator-page run --config config/sim.toml\n  operator-page run --config config/cell.toml --address 192.168.1.20\n\n\
 Open the address that it prints in a browser. Ctrl-C ends it; a pour goes on. On another address than 127.0.0.1 a browser needs the\n\
-token, which is made at the first start and printed with the address; see docs/OPERATOR.md."
+token, which is made at the first start and stands in a terminal behind the address; see docs/OPERATOR.md."
 )]
 pub struct Args {
     /// The cell's configuration.
@@ -116,27 +117,27 @@ pub fn run(args: &Args) -> Result<(), Failure> {
     Ok(())
 }
 
-/// Says where the page is. A log that others read, as systemd's, gets the token's file instead of the token.
+/// Says where the page is. Only a terminal gets the token: what else takes the output may be a log that others read, and is told the token's file.
 fn announce(address: SocketAddr, word: &str, (file, made): (&Path, bool), loopback: bool) {
     let say = |level: Level, text: &str| eprintln!("{}", level.marked(&format!("operator-page: {text}")));
-    let logged = shared::level::to_journal();
     for ip in addresses::to_open(address.ip()) {
         let address = SocketAddr::new(ip, address.port());
-        let with_token = if logged {
-            format!("http://{address}/#token=... (it is in {})", file.display())
-        } else {
-            format!("http://{address}/#token={word}")
-        };
-        if loopback {
+        let whole = format!("http://{address}/#token={word}");
+        let hidden = format!("http://{address}/#token=... (it is in {})", file.display());
+        let told = if std::io::stderr().is_terminal() { &whole } else { &hidden };
+        if loopback || !std::io::stdout().is_terminal() {
             println!("http://{address}");
-            say(Level::Info, &format!("open http://{address} on this machine; another user of it needs {with_token}"));
         } else {
-            println!("{with_token}");
-            say(Level::Info, &format!("open {with_token}"));
+            println!("{whole}");
+        }
+        if loopback {
+            say(Level::Info, &format!("open http://{address} on this machine; another user of it needs {told}"));
+        } else {
+            say(Level::Info, &format!("open {told}"));
         }
     }
     if !loopback {
-        say(Level::Warning, "whoever has this address can move the robot; it is not encrypted, so use a network that you trust");
+        say(Level::Warning, "whoever has the token can move the robot; it is not encrypted, so use a network that you trust");
     }
     if made {
         say(Level::Info, "the token was made now, and stays the same until its file is deleted");

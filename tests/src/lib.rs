@@ -10,12 +10,14 @@ pub mod browser;
 pub mod parsers;
 
 use std::net::IpAddr;
+use std::os::fd::OwnedFd;
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Output, Stdio};
 use std::sync::atomic::{AtomicU32, Ordering};
 use std::time::{Duration, Instant};
 
 use rt_controller::link::{LinkOptions, TiltJoint};
+use rustix::pty::{OpenptFlags, grantpt, openpt, ptsname, unlockpt};
 use serde_json::Value;
 use shared::actions::{Selection, action_table};
 use shared::config::Joint;
@@ -66,6 +68,14 @@ pub fn program(name: &str) -> PathBuf {
     let path = dir.join(name);
     assert!(path.exists(), "{} is missing: build with `cargo build --release --workspace`", path.display());
     path
+}
+
+/// A terminal of its own for a program under test: a person's side, and the program's.
+pub fn terminal() -> (OwnedFd, std::fs::File) {
+    let master = openpt(OpenptFlags::RDWR | OpenptFlags::NOCTTY).expect("a terminal");
+    grantpt(&master).and_then(|()| unlockpt(&master)).expect("ours");
+    let name = ptsname(&master, Vec::new()).expect("a name").into_string().expect("a path");
+    (master, std::fs::File::options().read(true).write(true).open(name).expect("it opens"))
 }
 
 /// Namespaces of their own for a cell's processes, so that nobody else meets them: network, `/run/decant`, and on demand a `/dev/shm` of a

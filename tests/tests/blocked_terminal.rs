@@ -6,9 +6,8 @@ use std::os::fd::OwnedFd;
 use std::process::Command;
 use std::time::Duration;
 
-use rustix::pty::{OpenptFlags, grantpt, openpt, ptsname, unlockpt};
 use rustix::termios::{Action, tcflow};
-use tests::{CellUnderTest, program, steady_weights};
+use tests::{CellUnderTest, program, steady_weights, terminal};
 
 const TILT_OUT: usize = 13;
 
@@ -24,10 +23,7 @@ fn full_pipe() -> (std::io::PipeReader, std::io::PipeWriter) {
 
 /// A terminal whose output was stopped, as Ctrl-S does, and its other side.
 fn stopped_terminal() -> (OwnedFd, std::fs::File) {
-    let master = openpt(OpenptFlags::RDWR | OpenptFlags::NOCTTY).expect("a terminal");
-    grantpt(&master).and_then(|()| unlockpt(&master)).expect("ours");
-    let name = ptsname(&master, Vec::new()).expect("a name").into_string().expect("a path");
-    let slave = std::fs::File::options().read(true).write(true).open(name).expect("it opens");
+    let (master, slave) = terminal();
     tcflow(&slave, Action::OOff).expect("it stops");
     (master, slave)
 }

@@ -1,11 +1,13 @@
-//! The token: who needs it, where a browser keeps it, and to whom it sends it.
+//! The token: who needs it, where a browser keeps it, to whom it sends it, and who is shown it.
 
-use std::io::{Read as _, Write as _};
+use std::io::{BufRead as _, BufReader, Read as _, Write as _};
 use std::net::TcpListener;
+use std::process::{Command, Stdio};
 use std::sync::mpsc::{Receiver, channel};
 
+use rustix::process::{Pid, Signal, kill_process};
 use tests::browser::Browser;
-use tests::{CellUnderTest, steady_weights};
+use tests::{CellUnderTest, steady_weights, terminal};
 
 use super::{LIVE, Page, SOON, TILT_OUT, says};
 
@@ -98,4 +100,36 @@ fn each_request_of_the_page_sends_the_token() {
         }
     }
     assert_eq!(asked, 1, "places that ask the server");
+}
+
+/// Protects the token from whoever reads a log: where the output goes to anything but a terminal, the token's file is named, and the token is not.
+#[test]
+fn only_a_terminal_is_shown_the_token() {
+    for address in ["127.0.0.1", "0.0.0.0"] {
+        let cell = CellUnderTest::prepare(|_| {});
+        let words = ["run", "--port", "0", "--address", address];
+        let mut logged = cell.begin("operator-page", &words);
+        let mut printed = String::new();
+        let mut stdout = BufReader::new(logged.stdout.take().expect("piped"));
+        stdout.read_line(&mut printed).expect("it says where");
+        kill_process(Pid::from_child(&logged), Signal::TERM).expect("it is ours");
+        stdout.read_to_string(&mut printed).expect("text");
+        let said = logged.wait_with_output().expect("it ends").stderr;
+        printed.push_str(&String::from_utf8_lossy(&said));
+        assert!(!printed.contains(&token(&cell)), "{printed}");
+        assert!(printed.contains(&format!("it is in {}", token_file(&cell).display())), "{printed}");
+
+        let (person, programs) = terminal();
+        let mut command: Command = cell.program("operator-page");
+        command.args(words).arg("--config").arg(cell.config()).stdin(Stdio::null());
+        let mut shown = command.stdout(programs.try_clone().expect("a copy")).stderr(programs).spawn().expect("it starts");
+        // The command holds the program's side too.
+        drop(command);
+        // It stands in the first two lines, or not at all.
+        let lines = BufReader::new(std::fs::File::from(person)).lines().map_while(Result::ok).take(2);
+        let whole = lines.into_iter().any(|line| line.contains(&format!("/#token={}", token(&cell))));
+        let _ = kill_process(Pid::from_child(&shown), Signal::TERM);
+        let _ = shown.wait();
+        assert!(whole, "{address}: a terminal gets the whole address");
+    }
 }
