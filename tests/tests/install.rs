@@ -1,4 +1,5 @@
-//! `scripts/install` and `scripts/check-package` on machines that are not as they wish: the scripts themselves, with programs of ours in place of apt's and Rust's.
+//! `scripts/install` and `scripts/check-package` on machines that are not as they wish, and what the package says to other programs: the scripts
+//! themselves, with programs of ours in place of apt's and Rust's.
 //!
 //! It starts short processes, which change nothing outside of a directory of their own.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic)]
@@ -85,4 +86,30 @@ fn a_package_is_not_checked_where_sudo_cannot_work() {
     let said = String::from_utf8_lossy(&output.stderr);
     assert_eq!((output.status.code(), said.lines().count()), (Some(2), 1), "{said}");
     assert!(said.contains("mounted nosuid, noexec or nodev"), "{said}");
+}
+
+/// The names of the package's units, such as `decant-page`.
+fn units() -> Vec<String> {
+    let packaging = std::fs::read_dir(concat!(env!("CARGO_MANIFEST_DIR"), "/../packaging")).unwrap();
+    let names = packaging.map(|e| e.unwrap().file_name().to_string_lossy().into_owned());
+    let units: Vec<String> = names.filter_map(|n| Some(n.strip_suffix("@.service")?.to_owned())).collect();
+    assert!(units.len() >= 4, "{units:?}");
+    units
+}
+
+/// Protects a pour from the upgrade of a library: needrestart, which reads its files as Perl and takes the first pattern that a unit's name fits, restarts none
+/// of the package's units, and still restarts others.
+#[test]
+fn needrestart_leaves_the_units_alone() {
+    let file = concat!(env!("CARGO_MANIFEST_DIR"), "/../packaging/decant.needrestart");
+    let script = "our %nrconf; local $/; open(my $f, '<', shift); eval <$f>; die $@ if $@;
+        for my $unit (@ARGV) { my @of = grep { $unit =~ /$_/ } keys %{$nrconf{override_rc}}; print @of ? $nrconf{override_rc}{$of[0]} : 'restarted', qq(\\n) }";
+    let names: Vec<String> = units().iter().map(|unit| format!("{unit}@lab.service")).collect();
+    let Ok(output) = Command::new("perl").args(["-we", script, file, "ssh.service"]).args(&names).output() else {
+        println!("not run: there is no perl");
+        return;
+    };
+    let said = String::from_utf8_lossy(&output.stdout).into_owned();
+    let expected: Vec<&str> = std::iter::once("restarted").chain(names.iter().map(|_| "0")).collect();
+    assert_eq!(said.lines().collect::<Vec<_>>(), expected, "{}", String::from_utf8_lossy(&output.stderr));
 }
