@@ -113,3 +113,38 @@ fn needrestart_leaves_the_units_alone() {
     let expected: Vec<&str> = std::iter::once("restarted").chain(names.iter().map(|_| "0")).collect();
     assert_eq!(said.lines().collect::<Vec<_>>(), expected, "{}", String::from_utf8_lossy(&output.stderr));
 }
+
+/// Protects an administrator's own units from a purge: what `systemctl enable`, `edit` and `mask` made of the package's units goes, and nothing else. The
+/// script itself runs, with a directory in place of the system's.
+#[test]
+fn a_purge_takes_the_packages_units_alone() {
+    let dir = tempfile::tempdir().unwrap();
+    let system = dir.path().join("etc/systemd/system");
+    let own = ["decant-backup@.service", "decant-backup@lab.service", "decant-log.service", "decant-page.service"];
+    let own = own.into_iter().flat_map(|n| [n.to_owned(), format!("multi-user.target.wants/{n}"), format!("{n}.d/override.conf")]);
+    let own: Vec<String> = own.chain(["decant-log-.service.d/override.conf".into()]).collect();
+    let packages = units().into_iter().flat_map(|unit| {
+        let instance = format!("{unit}@lab.service");
+        [
+            instance.clone(),
+            format!("multi-user.target.wants/{instance}"),
+            format!("{instance}.d/override.conf"),
+            format!("{unit}@.service.d/override.conf"),
+        ]
+    });
+    let packages: Vec<String> = packages.collect();
+    for name in own.iter().chain(&packages) {
+        let path = system.join(name);
+        std::fs::create_dir_all(path.parent().unwrap()).unwrap();
+        std::fs::write(path, "").unwrap();
+    }
+    let mut script = std::fs::read_to_string(concat!(env!("CARGO_MANIFEST_DIR"), "/../packaging/postrm")).unwrap();
+    for place in ["/etc/", "/var/lib/", "/run/", "/dev/shm"] {
+        script = script.replace(place, &format!("{}{place}", dir.path().display()));
+    }
+    program(dir.path(), "getent", "exit 2");
+    let output = run(dir.path(), &["sh", "-c", &script, "postrm", "purge"]);
+    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+    let stays = |names: &[String]| names.iter().filter(|n| system.join(n).exists()).cloned().collect::<Vec<_>>();
+    assert_eq!((stays(&own), stays(&packages)), (own.clone(), Vec::new()));
+}
