@@ -3,17 +3,23 @@
 //! Only files are replaced that are of the kind that is written: a slip of the finger in `--out` costs no episode, no configuration and no device.
 //! Ordinary threads use it; it allocates and waits for the disk. Errors are those of the system, or say what is in the way.
 
+use std::ffi::OsStr;
 use std::fs::{File, Metadata, OpenOptions, Permissions};
 use std::io::{Error, ErrorKind, Read as _, Result, Write as _};
 use std::os::unix::fs::{MetadataExt as _, OpenOptionsExt as _, PermissionsExt as _, fchown};
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicU32, Ordering::Relaxed};
+use std::time::Duration;
 
 use crate::disk_space::error_words;
 use crate::regular_file;
 
 /// Mode of a new file before the user's umask takes of it. Source: POSIX, what `creat` of the standard tools gives.
 const USUAL_MODE: u32 = 0o666;
+/// How a temporary name begins and ends; the numbers of the process and of the file stand between, with a hyphen.
+const TEMPORARY: (&str, &str) = (".decant-", ".new");
+/// Nothing was written into a temporary file for so long where its process has been killed. Chosen by hand: no file is written for as long.
+const LEFT_AFTER: Duration = Duration::from_secs(24 * 3600);
 
 /// Puts `bytes` into the file at `path`, which keeps its mode and owner if it is there. `begins` is how every file of this kind begins: a file
 /// that begins otherwise is left as it is. If `path` is a link, the new file takes the link's place.
@@ -137,13 +143,28 @@ fn open_beside(path: &Path, mode: u32) -> Result<(File, PathBuf)> {
         return Err(Error::new(ErrorKind::InvalidInput, "is no file name"));
     }
     loop {
-        let new = path.with_file_name(format!(".decant-{}-{}.new", std::process::id(), NEXT.fetch_add(1, Relaxed)));
+        let (begins, ends) = TEMPORARY;
+        let new = path.with_file_name(format!("{begins}{}-{}{ends}", std::process::id(), NEXT.fetch_add(1, Relaxed)));
         match OpenOptions::new().write(true).create_new(true).mode(mode).open(&new) {
             // That of a process with the same number, in another container or before it was killed.
             Err(e) if e.kind() == ErrorKind::AlreadyExists => {}
             opened => return Ok((opened?, new)),
         }
     }
+}
+
+/// The temporary files of `directory` that nobody gives a name any more: their processes were killed over them, a day ago or more. What cannot be looked at
+/// is none.
+pub fn left_over(directory: &Path) -> Vec<PathBuf> {
+    let is_temporary = |name: &OsStr| {
+        let numbers = name.to_str().and_then(|name| name.strip_prefix(TEMPORARY.0)?.strip_suffix(TEMPORARY.1)?.split_once('-'));
+        let is_number = |text: &str| !text.is_empty() && text.bytes().all(|b| b.is_ascii_digit());
+        numbers.is_some_and(|(process, file)| is_number(process) && is_number(file))
+    };
+    let is_old = |meta: &Metadata| meta.modified().is_ok_and(|at| at.elapsed().is_ok_and(|age| age > LEFT_AFTER));
+    let found = std::fs::read_dir(directory).into_iter().flatten().flatten().filter(|entry| is_temporary(&entry.file_name()));
+    let found = found.filter_map(|entry| Some((entry.path(), entry.metadata().ok()?)));
+    found.filter(|(_, meta)| meta.is_file() && is_old(meta)).map(|(path, _)| path).collect()
 }
 
 /// Nobody needs what is not whole, and it does no harm if it cannot be removed.
@@ -230,5 +251,28 @@ mod tests {
         (0..500).for_each(|k| std::fs::write(taken(k), "theirs").unwrap());
         let (_, ours) = new_beside(&dir.path().join("w.bin")).unwrap();
         assert!((0..500).all(|k| taken(k) != ours && std::fs::read(taken(k)).unwrap() == b"theirs"), "{}", ours.display());
+    }
+
+    /// Protects files that are being written, and those of others: only what nothing was written into for a day, and has a temporary name, is left over.
+    #[test]
+    fn what_a_killed_process_left_is_told_from_what_is_written() {
+        let dir = tempfile::tempdir().unwrap();
+        let days_ago = |days: u32| std::time::SystemTime::now() - LEFT_AFTER * days;
+        let make = |name: &str, days: u32| {
+            let file = File::create(dir.path().join(name)).unwrap();
+            file.set_modified(days_ago(days)).unwrap();
+        };
+        let (_, under_way) = new_beside(&dir.path().join("w.bin")).unwrap();
+        for name in [".decant-12.new", ".decant-a-1.new", ".decant-1-.new", "decant-1-1.new", ".decant-1-1.newer", "w.bin"] {
+            make(name, 2);
+        }
+        make(".decant-12-345.new", 2);
+        make(".decant-12-346.new", 0);
+        std::fs::create_dir(dir.path().join(".decant-1-1.new")).unwrap();
+        std::os::unix::fs::symlink(".decant-12-345.new", dir.path().join(".decant-1-2.new")).unwrap();
+        assert_eq!(left_over(dir.path()), [dir.path().join(".decant-12-345.new")]);
+        std::fs::rename(dir.path().join(".decant-12-345.new"), &under_way).unwrap();
+        assert_eq!(left_over(dir.path()), [under_way], "the names are those of new_beside");
+        assert!(left_over(&dir.path().join("no")).is_empty());
     }
 }

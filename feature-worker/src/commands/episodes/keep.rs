@@ -11,8 +11,9 @@ use shared::episode::{each_once, find_episodes, recover, set_note};
 use shared::exit::{self, Failure, OrExit as _, failure};
 use shared::level::plain;
 use shared::plural::counted;
+use shared::whole_file;
 
-use super::which::{WhichArgs, change_failure, files, print_json};
+use super::which::{WhichArgs, change_failure, files, places, print_json};
 use crate::episodes::folder::{Budget, Folder, MEGABYTE};
 use crate::episodes::output::{ExportError, LeftOut};
 use crate::episodes::upkeep::{self, Copied, Found};
@@ -31,7 +32,8 @@ pub(super) enum Command {
     Delete(DeleteArgs),
     /// Deletes episodes until the rest is within the budget of `[recording]`. Without --yes it only says what it would delete. First go those
     /// whose end is missing, then those that were never weighed, the oldest first; the newest of all stays. Files that are kept because they
-    /// cannot be read or are being written count too. The exit code is 1 if the rest is still over the budget, or one cannot be deleted.
+    /// cannot be read or are being written count too. What a program that was killed has left in the directories goes as well, a day later. The exit
+    /// code is 1 if the rest is still over the budget, or one cannot be deleted.
     #[command(after_help = "Examples:\n  feature-worker episodes prune\n  feature-worker episodes prune --budget-mb 20000 --yes")]
     Prune(PruneArgs),
     /// Copies episodes into directories by shares, for example to train and to judge. Each episode goes into one, the same with the same seed.
@@ -216,19 +218,35 @@ fn delete_all(going: &mut Vec<&Found>, kept: &mut Vec<LeftOut>, yes: bool) -> us
     kept.len() - before
 }
 
-fn as_json(going: &[&Found], kept: &[LeftOut], yes: bool) -> Value {
+/// The same for what programs that were killed have left.
+fn delete_left_over(left_over: &mut Vec<PathBuf>, kept: &mut Vec<LeftOut>, yes: bool) -> usize {
+    let before = kept.len();
+    if yes {
+        left_over.retain(|path| match std::fs::remove_file(path) {
+            Ok(()) => true,
+            Err(e) => {
+                kept.push(LeftOut { file: path.clone(), why: format!("{}: {e}", path.display()) });
+                false
+            }
+        });
+    }
+    kept.len() - before
+}
+
+fn as_json(going: &[&Found], left_over: &[PathBuf], kept: &[LeftOut], yes: bool) -> Value {
     let gone = |f: &&Found| json!({ "file": shown(&f.path), "bytes": f.bytes, "weight_g": f.episode.weight_g });
     json!({
-        "deleted": yes && !going.is_empty(),
+        "deleted": yes && (!going.is_empty() || !left_over.is_empty()),
         "episodes": going.iter().map(gone).collect::<Vec<_>>(),
+        "left_over": left_over.iter().map(|path| shown(path)).collect::<Vec<_>>(),
         "kept": kept.iter().map(|k| json!({ "file": shown(&k.file), "why": k.why })).collect::<Vec<_>>(),
     })
 }
 
-fn tell(going: &[&Found], kept: &[LeftOut], yes: bool) {
+fn tell(going: &[&Found], left_over: &[PathBuf], kept: &[LeftOut], yes: bool) {
+    let what = if yes { "deleted" } else { "would delete" };
     for one in going {
         let weight = one.episode.weight_g.map_or("never weighed".into(), |w| format!("{w} g"));
-        let what = if yes { "deleted" } else { "would delete" };
         println!(
             "{what} {} ({:.1} MB, {weight}, {})",
             plain(&shown(&one.path)),
@@ -236,10 +254,14 @@ fn tell(going: &[&Found], kept: &[LeftOut], yes: bool) {
             plain(&one.episode.info.started_at_utc)
         );
     }
+    for path in left_over {
+        println!("{what} {} (left by a program that was killed)", plain(&shown(path)));
+    }
     for one in kept {
         println!("kept: {}", plain(&one.why));
     }
-    if !yes && !going.is_empty() {
+    let something = !going.is_empty() || !left_over.is_empty();
+    if something && !yes {
         println!("nothing was deleted; say --yes to do it");
     }
 }
@@ -250,9 +272,9 @@ fn delete(args: &DeleteArgs) -> Result<(), Failure> {
     let mut going: Vec<&Found> = found.iter().collect();
     let undeleted = delete_all(&mut going, &mut kept, args.yes);
     if args.json {
-        print_json(&as_json(&going, &kept, args.yes));
+        print_json(&as_json(&going, &[], &kept, args.yes));
     } else {
-        tell(&going, &kept, args.yes);
+        tell(&going, &[], &kept, args.yes);
     }
     match kept.len() {
         0 => Ok(()),
@@ -285,16 +307,18 @@ fn prune(args: &PruneArgs) -> Result<(), Failure> {
     let beside = Folder::of(kept.iter().map(|k| k.file.as_path()));
     let mut going: Vec<&Found> = upkeep::to_prune(&found, beside, budget, args.weighed).into_iter().map(|i| &found[i]).collect();
     let undeleted = delete_all(&mut going, &mut kept, args.yes);
+    let mut left_over = each_once(places(which)?.iter().flat_map(|place| whole_file::left_over(place)).collect());
+    let undeleted = undeleted + delete_left_over(&mut left_over, &mut kept, args.yes);
     let bytes = found.iter().map(|f| f.bytes).sum::<u64>() - going.iter().map(|f| f.bytes).sum::<u64>() + beside.bytes;
     let stay = found.len() - going.len() + beside.episodes;
     let holds = budget.holds(stay, bytes);
     if args.which.json {
-        let mut value = as_json(&going, &kept, args.yes);
+        let mut value = as_json(&going, &left_over, &kept, args.yes);
         value["stay"] = json!({ "episodes": stay, "bytes": bytes, "within_budget": holds });
         value["budget"] = json!({ "episodes": budget.episodes, "bytes": budget.bytes });
         print_json(&value);
     } else {
-        tell(&going, &kept, args.yes);
+        tell(&going, &left_over, &kept, args.yes);
         let of_them = if beside.episodes > 0 { format!(", {} of them kept for the reasons above", beside.episodes) } else { String::new() };
         println!("{} of {:.1} MB left{of_them}", counted(stay, "episode"), bytes as f64 / MEGABYTE as f64);
         if none {
@@ -302,7 +326,7 @@ fn prune(args: &PruneArgs) -> Result<(), Failure> {
         }
     }
     if undeleted > 0 {
-        return Err(failure(exit::FAILED, format!("{} could not be deleted", counted(undeleted, "episode"))));
+        return Err(failure(exit::FAILED, format!("{} could not be deleted", counted(undeleted, "file"))));
     }
     if holds {
         return Ok(());
@@ -343,5 +367,30 @@ fn tell_copied(copied: &Copied, as_json: bool) -> Result<(), Failure> {
     match copied.missing {
         0 => Ok(()),
         n => Err(failure(exit::FAILED, format!("{} left out; {} copied", counted(n, "file"), copied.files.len()))),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::time::{Duration, SystemTime};
+
+    use super::*;
+
+    /// Protects the disk from what killed programs leave, which is as large as an episode: it goes where it is wanted, and what is being written stays.
+    #[test]
+    fn what_killed_programs_have_left_is_pruned() {
+        let dir = tempfile::tempdir().unwrap();
+        let [left, written] = ["1", "2"].map(|n| dir.path().join(format!(".decant-12-{n}.new")));
+        for (path, hours) in [(&left, 25), (&written, 1)] {
+            std::fs::write(path, "a part").unwrap();
+            let file = std::fs::File::open(path).unwrap();
+            file.set_modified(SystemTime::now() - Duration::from_secs(hours * 3600)).unwrap();
+        }
+        for yes in [false, true] {
+            let which = WhichArgs { paths: vec![dir.path().into()], config: "none.toml".into(), json: false };
+            let args = PruneArgs { which, budget_mb: Some(0), budget_episodes: Some(0), weighed: false, yes };
+            assert!(prune(&args).is_ok());
+            assert_eq!((left.exists(), written.exists()), (!yes, true));
+        }
     }
 }

@@ -27,13 +27,17 @@ impl WhichArgs {
     }
 }
 
+/// The files and directories that the arguments name.
+pub(super) fn places(which: &WhichArgs) -> Result<Vec<PathBuf>, Failure> {
+    match which.paths.as_slice() {
+        [] => Ok(vec![Config::read(&which.config).or_exit(exit::BAD_INPUT)?.recording.directory]),
+        given => Ok(given.to_vec()),
+    }
+}
+
 /// The files that the arguments name.
 pub(super) fn files(which: &WhichArgs) -> Result<Vec<PathBuf>, Failure> {
-    let paths = match which.paths.as_slice() {
-        [] => vec![Config::read(&which.config).or_exit(exit::BAD_INPUT)?.recording.directory],
-        given => given.to_vec(),
-    };
-    find_episodes(&paths).or_exit(exit::BAD_INPUT)
+    find_episodes(&places(which)?).or_exit(exit::BAD_INPUT)
 }
 
 pub(super) fn print_json(value: &Value) {
