@@ -1,6 +1,7 @@
 //! Whether the pixels of a JPEG are whole: its Huffman codes are walked through and must add up to the blocks of a picture of its size.
 //!
-//! OpenCV's decoder makes a picture of what is damaged too, and says nothing. No rule about single bytes would tell it: with tables that are
+//! OpenCV's decoder makes a picture of what is damaged too, and says nothing, and so does zune-jpeg 0.5 in its strict mode for most of what the tests
+//! below damage. No rule about single bytes would tell it: with tables that are
 //! made for the picture, an even ground may be a long run of zero bytes. Walked are the sequential and the progressive codes of ITU-T T.81; of arithmetic
 //! and lossless codes, which OpenCV hardly reads, only the end is looked for. Damage that keeps the number of codes, as in the low bits of a
 //! coefficient, cannot be told. For commands that read files and for the worker when it plays pictures, on their own thread; allocates eight
