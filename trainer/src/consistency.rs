@@ -89,7 +89,7 @@ fn changed_camera(episodes: &[TrainingEpisode], fit: &Fit) -> Option<(String, St
 
 /// What all weights together say against grams, and against the vessel that holds `holds_ml` up to its lip, if somebody knows that: weights that are all
 /// wrong by one factor do not contradict each other. Each line comes with the episode's name, or [`DATA_SET`].
-fn against_vessel(episodes: &[TrainingEpisode], fit: &Fit, holds_ml: Option<f64>) -> Vec<(String, String)> {
+pub fn against_vessel(episodes: &[TrainingEpisode], fit: &Fit, holds_ml: Option<f64>) -> Vec<(String, String)> {
     let mut doubts = Vec::new();
     let set = |what: String| (DATA_SET.to_owned(), what);
     let heaviest_g = episodes.iter().map(|e| e.weight_g).fold(0.0, f64::max);

@@ -352,6 +352,14 @@ fn weights_that_are_all_wrong_are_doubted() {
             let accused = said.contains("grams?") || said.contains("decimal point");
             assert_eq!(accused, says.is_some(), "{command}, weights times {factor}: {said}");
             assert!(says.is_none_or(|words| said.contains(words)), "{command}, weights times {factor}: {said}");
+            // What is refined goes to a controller unasked, so nothing is written until somebody accepts it.
+            let is_written = || std::fs::remove_file(dir.path().join("w.bin")).is_ok();
+            assert_eq!(is_written(), command == "train" || command == "refine" && says.is_none(), "{command}, weights times {factor}");
+            if command == "refine" && said.contains("of data set") {
+                args.extend(["--accept", "data set"]);
+                let out = trainer(dir.path(), &args);
+                assert!(out.status.success() && is_written(), "{}", text(&out.stderr));
+            }
         }
     }
     // One weight above what the vessel holds is named, and nothing is planned from it.

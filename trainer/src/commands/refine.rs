@@ -25,7 +25,7 @@ use crate::training::Options;
 pub struct Args {
     #[command(flatten)]
     source: EpisodeSource,
-    /// Episodes whose weight is right although it does not fit the others.
+    /// Episodes whose weight is right although it does not fit the others or the vessel; 'data set' for all of them together.
     #[arg(long)]
     accept: Vec<String>,
     /// Episodes to leave out.
@@ -74,7 +74,8 @@ fn weighed_pours(read: &[Episode], trained_on: &[TrainingEpisode]) -> Vec<Weighe
 pub fn run(args: &Args) -> Result<(), Failure> {
     args.weight_file.check()?;
     let mut read = args.source.read().or_exit(exit::BAD_INPUT)?;
-    if let Some(name) = args.leave_out.iter().chain(&args.accept).find(|name| !read.iter().any(|e| e.name == **name)) {
+    let of_episodes = args.accept.iter().filter(|name| *name != consistency::DATA_SET);
+    if let Some(name) = args.leave_out.iter().chain(of_episodes).find(|name| !read.iter().any(|e| e.name == **name)) {
         let what = format!("no episode of these is called {name}: give the name that `trainer check` shows");
         return Err(failure(exit::BAD_INPUT, what));
     }
@@ -102,7 +103,7 @@ pub fn run(args: &Args) -> Result<(), Failure> {
     say_doubtful_recordings(&read, &usable);
     let history = weighed_pours(&read, &usable.episodes);
     let options = Options { seed: args.weight_file.seed, limits: config.limits, ..Options::default() };
-    args.weight_file.train_and_write(&usable, &options, config.holds_ml, serde_json::json!({ "pours": history }))?;
+    args.weight_file.train_and_write(&usable, &options, config.holds_ml, Some(&args.accept), serde_json::json!({ "pours": history }))?;
     if !args.weight_file.json && !history.is_empty() {
         println!("pour   goal ml  scale g  error ml  mean |error| so far");
         for WeighedPour { number, goal_ml, weight_g, mae_so_far_ml } in history {

@@ -146,7 +146,7 @@ pub fn run(args: &Args) -> Result<(), Failure> {
         eprintln!("doubtful: {}", plain(&doubt.to_string()));
     }
     let options = Options { method: args.method, actions: args.actions, estimate, seed: args.weight_file.seed, limits: config.limits };
-    args.weight_file.train_and_write(&usable, &options, config.holds_ml, serde_json::Value::Null)
+    args.weight_file.train_and_write(&usable, &options, config.holds_ml, None, serde_json::Value::Null)
 }
 
 /// Says what is doubtful about how the episodes that are trained on were recorded.
@@ -179,12 +179,14 @@ impl WeightFileArgs {
     }
 
     /// Trains with a progress bar, writes the weight file and, beside it, everything that it came from (`W.json`); `extra` goes
-    /// into that file as it is. `holds_ml` is what the vessel holds, if somebody knows that.
+    /// into that file as it is. `holds_ml` is what the vessel holds, if somebody knows that. Weights that cannot be those of this vessel are said; where
+    /// `accepted` names some, or nothing, the others are refused.
     pub fn train_and_write(
         &self,
         usable: &UsableEpisodes,
         options: &Options,
         holds_ml: Option<f64>,
+        accepted: Option<&[String]>,
         extra: serde_json::Value,
     ) -> Result<(), Failure> {
         for (name, what) in &usable.left_out {
@@ -202,6 +204,14 @@ impl WeightFileArgs {
         let seconds = begin.elapsed().as_secs_f64();
         for (name, what) in trained.fit.iter().flat_map(|fit| consistency::doubts_of_set(&usable.episodes, fit, holds_ml)) {
             eprintln!("doubtful: {}", plain(&format!("{name}: {what}")));
+        }
+        let open = |name: &String| accepted.is_some_and(|accepted| !accepted.contains(name));
+        let mut wrong = trained.fit.iter().flat_map(|fit| consistency::against_vessel(&usable.episodes, fit, holds_ml));
+        if let Some((name, _)) = wrong.find(|(name, _)| open(name)) {
+            let what = format!(
+                "no weights are written: correct what is doubtful of {name} with `feature-worker episodes`, or give --accept '{name}'"
+            );
+            return Err(failure(exit::BAD_INPUT, what));
         }
         if trained.fit.as_ref().is_some_and(|fit| fit.model.delay_frames >= DELAY_MAX_FRAMES - DELAY_NEAR_FRAMES) {
             eprintln!(
