@@ -22,7 +22,7 @@ const WARNED_SD_ML: f32 = 5.0;
 Ctrl-C aborts the pour: the container comes upright.\n\
 Exit codes: 0 poured, 3 no controller, 4 ended early (the reason is printed), 5 refused, 130 interrupted.")]
 pub struct Args {
-    /// Goal volume V_G in ml.
+    /// Goal volume V_G in ml, each of which is a g on the scale: of a liquid that is not as dense as water, give the weight in g.
     goal_ml: f32,
     /// What is in the vessel at least, ml: a pour in which nothing flows where this would flow ends at once. Without it, [container]
     /// least_fill_ml counts, if it is given.
