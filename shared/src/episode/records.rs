@@ -74,6 +74,10 @@ pub struct Records {
     file: File,
     name: String,
     reader: LinearReader,
+    /// The records of the chunk that is read.
+    chunk: Option<LinearReader>,
+    /// A record may be so large, bytes.
+    record_limit: usize,
     data_ended: bool,
     /// So many bytes of records may still come.
     bytes_left: u64,
@@ -86,13 +90,15 @@ impl Records {
         let read_error = |e: std::io::Error| EpisodeError::Read { file: name.clone(), what: e.to_string() };
         let (file, meta) = regular_file::open(path).map_err(read_error)?;
         let bytes_left = meta.len().saturating_mul(EXPANSION).saturating_add(EXPANSION_BYTES);
+        let record_limit = usize::try_from(bytes_left).unwrap_or(usize::MAX).clamp(RECORD_ALWAYS, RECORD_LIMIT);
         let options = LinearReaderOptions::default()
+            .with_emit_chunks(true)
             .with_check_finishes_after_end_magic(true)
-            .with_prevalidate_chunk_crcs(true)
             .with_validate_data_section_crc(true)
             .with_validate_summary_section_crc(true)
-            .with_record_length_limit(usize::try_from(bytes_left).unwrap_or(usize::MAX).clamp(RECORD_ALWAYS, RECORD_LIMIT));
-        Ok(Self { file, name, reader: LinearReader::new_with_options(options), data_ended: false, bytes_left })
+            .with_record_length_limit(record_limit);
+        let reader = LinearReader::new_with_options(options);
+        Ok(Self { file, name, reader, chunk: None, record_limit, data_ended: false, bytes_left })
     }
 
     /// The file's name.
@@ -109,14 +115,26 @@ impl Records {
     pub fn next<T>(&mut self, mut visit: impl FnMut(Record) -> Result<Option<T>, String>) -> Result<NextRecord<T>, EpisodeError> {
         let damaged = |what: String| EpisodeError::Damaged { file: self.name.clone(), what };
         loop {
-            match self.reader.next_event() {
+            let in_chunk = self.chunk.is_some();
+            let event = match &mut self.chunk {
+                Some(chunk) => chunk.next_event(),
+                None => self.reader.next_event(),
+            };
+            match event {
+                None if in_chunk => self.chunk = None,
                 None => return Ok(NextRecord::End),
+                Some(Err(McapError::UnexpectedEof)) if in_chunk => return Err(damaged("a chunk ends within a record".into())),
                 Some(Err(McapError::UnexpectedEof)) => return Ok(NextRecord::Cut),
                 Some(Err(McapError::BadMagic)) if !self.data_ended => {
                     return Err(EpisodeError::NotAnEpisode { file: self.name.clone(), what: "this is no MCAP file".into() });
                 }
                 Some(Err(e)) => return Err(damaged(e.to_string())),
                 Some(Ok(LinearReadEvent::ReadRequest(want))) => {
+                    if let Some(chunk) = &mut self.chunk {
+                        // It has all that there is of the chunk.
+                        chunk.notify_read(0);
+                        continue;
+                    }
                     // The file is read in pieces, so that a wrong length never asks for more memory than the file fills.
                     let buffer = self.reader.insert(want.min(READ_BYTES));
                     let got = self.file.read(buffer).map_err(|e| EpisodeError::Read { file: self.name.clone(), what: e.to_string() })?;
@@ -131,10 +149,18 @@ impl Records {
                     if self.data_ended {
                         continue;
                     }
+                    if opcode == op::CHUNK && !in_chunk {
+                        self.chunk =
+                            Some(chunk_reader(data, self.record_limit).ok_or_else(|| damaged("its records do not fill a chunk".into()))?);
+                        continue;
+                    }
                     self.bytes_left = self
                         .bytes_left
                         .checked_sub(data.len() as u64)
                         .ok_or_else(|| damaged(format!("its records are more than {EXPANSION} times larger than the file")))?;
+                    if opcode == op::CHUNK {
+                        return Err(damaged("a chunk lies within another one".into()));
+                    }
                     if INDEXES.contains(&opcode) {
                         return Err(damaged(format!("a record of its index (opcode {opcode:#04x}) stands among the measurements")));
                     }
@@ -149,6 +175,31 @@ impl Records {
             }
         }
     }
+}
+
+/// A reader of the records in a chunk with this content; `None` if they do not fill it, which the library would take for granted and panic.
+fn chunk_reader(chunk: &[u8], record_limit: usize) -> Option<LinearReader> {
+    // Its times, its size, and its checksum stand before its compression (MCAP specification, section Chunk).
+    let (length, rest) = chunk.get(28..)?.split_first_chunk::<4>()?;
+    let (compression, rest) = rest.split_at_checked(u32::from_le_bytes(*length) as usize)?;
+    let (length, mut rest) = rest.split_first_chunk::<8>()?;
+    if u64::from_le_bytes(*length) != rest.len() as u64 {
+        return None;
+    }
+    while compression.is_empty() && !rest.is_empty() {
+        let (length, behind) = rest.get(1..)?.split_first_chunk::<8>()?;
+        rest = behind.get(usize::try_from(u64::from_le_bytes(*length)).ok()?..)?;
+    }
+    let options = LinearReaderOptions::default()
+        .with_skip_start_magic(true)
+        .with_skip_end_magic(true)
+        .with_prevalidate_chunk_crcs(true)
+        .with_record_length_limit(record_limit);
+    let mut reader = LinearReader::new_with_options(options);
+    let record = [&[op::CHUNK][..], &(chunk.len() as u64).to_le_bytes(), chunk].concat();
+    reader.insert(record.len()).copy_from_slice(&record);
+    reader.notify_read(record.len());
+    Some(reader)
 }
 
 /// Whether the texts and maps in a record are no longer than the record: the library sets memory aside for what their lengths say, up to 4 GiB, before it
@@ -202,6 +253,35 @@ mod tests {
             bytes.extend(data);
         }
         bytes
+    }
+
+    /// Protects whoever opens a file of others: records that go beyond their chunk, or leave something of it over, are damage, before the library panics. It
+    /// is so without a checksum too, which other programs may leave out.
+    #[test]
+    fn records_fill_their_chunk() {
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("e.mcap");
+        let metadata = [&[op::METADATA][..], &9_u64.to_le_bytes(), &1_u32.to_le_bytes(), b"n", &0_u32.to_le_bytes()].concat();
+        let read = |records: &[u8], length: usize| {
+            let chunk = [&[0; 32][..], &(length as u64).to_le_bytes(), records].concat();
+            std::fs::write(&path, file(op::CHUNK, &chunk)).unwrap();
+            let mut found = 0;
+            let end = Records::open(&path).and_then(|mut r| {
+                r.next(|record| {
+                    found += usize::from(matches!(record, Record::Metadata(_)));
+                    Ok(None::<()>)
+                })
+            });
+            (found, matches!(end, Ok(NextRecord::Cut)), matches!(end, Err(EpisodeError::Damaged { .. })))
+        };
+        let two = metadata.repeat(2);
+        assert_eq!(read(&two, two.len()), (2, true, false), "they are read, and the file ends behind the chunk");
+        assert_eq!(read(&[], 0), (0, true, false));
+        for (records, length) in
+            [(&two[..two.len() - 1], two.len() - 1), (&two[..20], 20), (&two[..], two.len() + 1), (&two[..], two.len() - 1)]
+        {
+            assert_eq!(read(records, length), (0, false, true), "{} of {length} bytes", records.len());
+        }
     }
 
     /// Protects whoever opens a file of others: a text that says to be longer than its record is damage, before gigabytes are set aside for it or the
