@@ -148,8 +148,6 @@ pub(crate) struct ClearWater {
     unseen: u32,
     /// Pictures in a row in which the full picture confirmed a stream.
     confirmed: u32,
-    /// Pictures in a row that were not looked at.
-    lost: u32,
     /// Share of the last stream's line on ground that was seen dry.
     known_share: f32,
     faint: Faint,
@@ -194,7 +192,6 @@ impl ClearWater {
             even_pictures: 0.0,
             unseen: u32::MAX,
             confirmed: 0,
-            lost: 0,
             known_share: 0.0,
             faint: Faint::new(),
         }))
@@ -245,10 +242,9 @@ impl ClearWater {
             (self.looked, self.judged) = (true, true);
             let moved = self.background.moved();
             self.evidence.weigh(&self.rays, &moved, self.water.stream())?;
-            let best =
-                self.lines.best(&self.evidence, &self.rays, &moved, self.water.stream(), std::mem::take(&mut self.lost))?.map(|found| {
-                    (found, self.lines.legs_px(found.line), self.lines.earlier_picture(found.line, &self.evidence, &self.rays, &moved))
-                });
+            let best = self.lines.best(&self.evidence, &self.rays, &moved, self.water.stream())?.map(|found| {
+                (found, self.lines.legs_px(found.line), self.lines.earlier_picture(found.line, &self.evidence, &self.rays, &moved))
+            });
             let verdict = self.water.decide(best, self.evidence.strange_share(), self.held.is_some());
             sighting = match (verdict, best) {
                 // Where bands cannot be divided out, or only now and then, neither a line nor its absence means anything.
@@ -427,7 +423,7 @@ impl Liquid for ClearWater {
 
     fn lose_picture(&mut self, doubt: Doubt) {
         self.disturbed.lose(doubt);
-        self.lost = self.lost.saturating_add(1);
+        self.water.lose_picture();
     }
 
     fn set_pace(&mut self, pace: Pace) {

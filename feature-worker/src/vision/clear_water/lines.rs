@@ -41,6 +41,8 @@ const GROWS_MOST: f32 = 0.7;
 /// A stream that is not far from leaving the region may have done so in the next picture if its legs grow by this factor. Chosen by hand: one that begins
 /// grows faster, and is small.
 const OUTGROWS: f32 = 1.55;
+/// What a stream may change grows with the pictures in which it was not seen, up to so many. Chosen by hand: then it may have grown ten times as long.
+const LOST_MOST: u32 = 10;
 /// A stream changes its shape by about this from frame to frame: the logarithm of the legs' ratio. Tuned; in the renderer the ratio changes
 /// by no more than 15 % a frame.
 const TURNS: f32 = 0.2;
@@ -171,8 +173,7 @@ impl Lines {
         self.cells[line].iter().map(|at| usize::from(*at)).zip(self.weights[line])
     }
 
-    /// The best line and what was found along it. `moved` is the background's motion since the earlier picture. Since the `stream` was last looked for,
-    /// so many pictures were `lost`.
+    /// The best line and what was found along it. `moved` is the background's motion since the earlier picture.
     #[inline(always)]
     pub(super) fn best(
         &self,
@@ -180,14 +181,13 @@ impl Lines {
         rays: &Rays,
         moved: &RigidMap,
         stream: Option<&Stream>,
-        lost: u32,
     ) -> opencv::Result<Option<Candidate>> {
         let seen = evidence.seen()?;
         let Some(stream) = stream else { return Ok(self.best_begin(evidence, seen)) };
         let before = stream.legs_px.map(f32::ln);
         let turns = TURNS + TURNS_YOUNG / stream.age;
         // Independent changes add up as their squares do.
-        let since = (1.0 + lost as f32).sqrt();
+        let since = (1.0 + stream.lost.min(LOST_MOST) as f32).sqrt();
         let mut best: Option<Candidate> = None;
         for line in 0..self.legs_px.len() {
             // A stream grows and shrinks fast, but hardly changes its shape from frame to frame.

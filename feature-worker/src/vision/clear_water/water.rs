@@ -48,6 +48,8 @@ const SHOWN_LEAST: f32 = 0.5;
 const STRANGE: f32 = 0.3;
 /// After more than this many frames of another picture, that picture becomes the background. Tuned.
 const STRANGE_FRAMES: u32 = 15;
+/// After more than this many pictures that were not looked at a stream is another one. Chosen by hand: a second, in which a pour ends by itself.
+const LOST_FRAMES: u32 = 30;
 /// For this many frames after a stream, the place where it was is not taken for background at once. Tuned.
 const AFTERWARDS: u32 = 3;
 /// How fast the colour of the band along the outline follows, a frame. Tuned.
@@ -81,6 +83,8 @@ pub(super) struct Stream {
     pub(super) legs_px: [f32; 2],
     /// Frames for which it has been seen.
     pub(super) age: f32,
+    /// Pictures in a row, up to now, in which it was not seen, or that were not looked at.
+    pub(super) lost: u32,
     /// Height of the step along it in the full picture, grey levels.
     height: f32,
     /// Mean colour of the band along its outline, and last the mean step there, grey levels.
@@ -186,6 +190,16 @@ impl Water {
         self.pace = pace;
     }
 
+    /// Says that the next picture is not looked at. After too many of them a stream has to begin anew.
+    pub(super) fn lose_picture(&mut self) {
+        if let Some(stream) = &mut self.stream {
+            stream.lost += 1;
+            if stream.lost > self.pace.pictures(LOST_FRAMES) {
+                self.interrupt();
+            }
+        }
+    }
+
     /// Says that a pause lies before the next picture: a stream has to begin anew.
     pub(super) fn interrupt(&mut self) {
         (self.stream, self.still_frames, self.strange_frames) = (None, 0, 0);
@@ -239,6 +253,9 @@ impl Water {
             return verdict;
         }
         self.dry_frames = self.dry_frames.saturating_add(1);
+        if let Some(stream) = &mut self.stream {
+            stream.lost += 1;
+        }
         if verdict == Verdict::Unsure {
             return verdict;
         }
@@ -266,8 +283,8 @@ impl Water {
         let mix = |before: f32, now: f32, share: f32| before + share * (now - before);
         let follow = |k: usize| if k < 3 { BAND_FOLLOWS } else { STEP_FOLLOWS };
         let stream = match self.stream {
-            Some(s) => Stream { legs_px, age: s.age + 1.0, band: each(|k| mix(s.band[k], found.band[k], follow(k))), ..s },
-            None => Stream { legs_px, age: 1.0, band: found.band, height: 0.0 },
+            Some(s) => Stream { legs_px, lost: 0, age: s.age + 1.0, band: each(|k| mix(s.band[k], found.band[k], follow(k))), ..s },
+            None => Stream { legs_px, lost: 0, age: 1.0, band: found.band, height: 0.0 },
         };
         self.stream = Some(stream);
         self.last_legs_px = legs_px;
