@@ -14,6 +14,10 @@ use shared::runtime_dir::Place;
 
 /// What to do where a cell cannot be joined: its shared memory is private to its user (ARCHITECTURE.md).
 const OWN_USER: &str = "run this as the cell's own user, and see what is red";
+/// What there is to do about a cell that may be stopped.
+const START_OR_USER: &str = "start the cell and the program that publishes its camera's frames, or run this as the cell's own user";
+/// What is said of a cell that is stopped, or runs where this process cannot see it.
+const UNSEEN: &str = "no program of the cell is seen to run";
 
 /// Who publishes in the cell, if it runs.
 type Published = Result<Option<Publishers>, IpcError>;
@@ -56,9 +60,8 @@ fn frames(published: &Published) -> Finding {
     match published {
         Ok(Some(Publishers { frames: true, .. })) => Finding::green("source", "another program publishes the frames in shared memory"),
         Ok(Some(_)) => Finding::red("source", "no program publishes frames in shared memory", means, advice),
-        Ok(None) => {
-            Finding::red("source", "no program of the cell is seen to run, so none publishes frames in shared memory", means, advice)
-        }
+        // It may be stopped, or run where this process cannot see its lock: as another user, or in another container.
+        Ok(None) => Finding::yellow("source", UNSEEN, "whether a program publishes frames in shared memory is not known", START_OR_USER),
         Err(e) => Finding::yellow("source", e.to_string(), "whether a program publishes frames is not known", OWN_USER),
     }
 }
@@ -67,6 +70,8 @@ fn frames(published: &Published) -> Finding {
 fn worker(published: &Published, controlled: bool) -> Finding {
     match published {
         Ok(Some(Publishers { features: true, .. })) => Finding::green("worker", "a feature worker runs"),
+        Ok(None) if controlled => Finding::yellow("worker", UNSEEN, "whether a feature worker runs is not known", OWN_USER),
+        Ok(None) => Finding::green("worker", UNSEEN),
         Ok(_) if controlled => {
             let means = "the controller gets no measurements, and refuses every pour and recording";
             Finding::red("worker", "no feature worker runs", means, "start it: `feature-worker run`, or decant-feature-worker@CELL")
@@ -178,7 +183,8 @@ mod tests {
         assert_eq!(judge(of(false, true), true), [Verdict::Red, Verdict::Green]);
         assert_eq!(judge(of(true, false), true), [Verdict::Green, Verdict::Red]);
         assert_eq!(judge(of(true, false), false), [Verdict::Green; 2], "nobody waits for it");
-        assert_eq!(judge(Ok(None), false), [Verdict::Red, Verdict::Green]);
+        assert_eq!(judge(Ok(None), false), [Verdict::Yellow, Verdict::Green]);
+        assert_eq!(judge(Ok(None), true), [Verdict::Yellow; 2], "the controller answers, so its cell cannot be seen from here");
         let unknown = IpcError::Node { cell: "lab".into(), what: "Refused".into() };
         assert_eq!(judge(Err(unknown), true), [Verdict::Yellow; 2]);
     }
