@@ -113,18 +113,23 @@ impl Outcome {
     }
 }
 
-/// A pour that ends off its goal by more than so many ml and this share of it, or short of a small goal by half, is not done, however large its deviation;
-/// a plain sum, which has none, is only looked at for being short. Among the fixed seeds of docs/SWARM.md one that was done was shorter.
+/// A pour that ends off its goal by more than so many ml and this share of it, or off a small goal by half, is not done, however large its deviation; a
+/// plain sum, which has none, is only looked at for being short. Among the fixed seeds of docs/SWARM.md one that was done was shorter.
 const OFF_ML: (f32, f32) = (8.0, 0.08);
+
+/// How far off `goal_ml` a pour that is done may be, ml.
+fn off_ml(goal_ml: f32) -> f32 {
+    OFF_ML.0.max(OFF_ML.1 * goal_ml).min(goal_ml / 2.0)
+}
 
 /// Whether a pour that ends with `d_ml` of `goal_ml` still to pour is too short to be one that is done.
 pub fn is_short(d_ml: f32, goal_ml: f32) -> bool {
-    d_ml > OFF_ML.0.max(OFF_ML.1 * goal_ml).min(goal_ml / 2.0)
+    d_ml > off_ml(goal_ml)
 }
 
 /// Whether a pour that ends with `d_ml` of `goal_ml` still to pour has poured too much to be one that is done.
 pub fn is_beyond(d_ml: f32, goal_ml: f32) -> bool {
-    -d_ml > OFF_ML.0.max(OFF_ML.1 * goal_ml)
+    -d_ml > off_ml(goal_ml)
 }
 
 /// Why a pour or recording ended.

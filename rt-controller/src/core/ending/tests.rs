@@ -99,6 +99,7 @@ fn far_off_the_goal_is_not_done() {
     assert_eq!(after(65.0, 6.0, 0.0, Aborted), Aborted);
     assert_eq!([after(7.0, 64.0, 0.0, Done), after(15.0, 185.0, 0.0, Done), after(-7.0, 46.0, 20.0, Done)], [Done; 3]);
     assert_eq!([after(-85.0, 124.0, 20.0, Done), after(-46.0, 210.0, 25.0, Done)], [GoalExceeded; 2], "its deviation is no excuse");
+    assert_eq!([after(-4.5, 12.5, 3.0, Done), after(-3.5, 11.5, 3.0, Done)], [GoalExceeded, Done], "half of a small goal");
     assert_eq!(after(-85.0, 124.0, 0.0, Done), Done, "a plain sum foresees nothing");
 }
 
