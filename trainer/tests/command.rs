@@ -362,6 +362,12 @@ fn weights_that_are_all_wrong_are_doubted() {
             }
         }
     }
+    // What was learned of the vessel is no measure of what goes in, and that is said with right weights too.
+    tables(dir.path(), 4, |_, w| w);
+    for (holds, unknown) in [(&[][..], true), (&["--holds", "520"][..], false)] {
+        let out = trainer(dir.path(), &[&["plan", "f.csv", "--scale", "s.csv"], holds].concat());
+        assert_eq!(text(&out.stdout).contains("nobody says what the vessel holds"), unknown, "{}", text(&out.stdout));
+    }
     // One weight above what the vessel holds is named, and nothing is planned from it.
     tables(dir.path(), 4, |k, w| if k == 2 { 1000.0 + w } else { w });
     let out = trainer(dir.path(), &["plan", "f.csv", "--scale", "s.csv", "--holds", "520"]);

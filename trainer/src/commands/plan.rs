@@ -126,7 +126,12 @@ fn doubts(usable: &UsableEpisodes, holds_ml: Option<f64>) -> Result<Vec<String>,
         return Err(failure(exit::BAD_INPUT, format!("{name}: {what} Correct the weight, or what the vessel holds")));
     }
     let words = |(name, what): (String, String)| if what.starts_with(&name) { what } else { format!("{name}: {what}") };
-    Ok(of_weights.chain(of_set).map(words).collect())
+    let unheld = holds_ml.is_none().then(|| {
+        let what = "nobody says what the vessel holds, and what the episodes tell of it may be wrong several times over: fill in no more than goes in, and \
+                    give --holds or [container] holds_ml";
+        (consistency::DATA_SET.to_owned(), what.to_owned())
+    });
+    Ok(of_weights.chain(of_set).chain(unheld).map(words).collect())
 }
 
 /// What to weigh next after the usable episodes.
