@@ -21,9 +21,6 @@ const CONNECTED: Duration = Duration::from_secs(15);
 const BEAT: Duration = Duration::from_millis(50);
 /// A pour that is expected to be off by more than this is warned of, ml: as `rt-controller pour`.
 const WARNED_SD_ML: f32 = 5.0;
-/// Weights from fewer weighed episodes know little of their own deviation. Pours with weights from one curve are off by about twice as much as those
-/// with weights from five (docs/LEARNING.md, Figures).
-const FEW_EPISODES: u32 = 5;
 /// Weighed pours that were off by more than this many expected deviations show that the weights' own deviation is too small. Chosen by hand: by
 /// chance it is so in one of twenty pours.
 const BEYOND_SD: f64 = 2.0;
@@ -147,9 +144,7 @@ fn unknown_pictures(origin: &Origin) -> Option<String> {
 
 /// What the operator should know of weights from few episodes: their deviation cannot be taken at its word.
 fn few(weights: &Weights) -> Option<String> {
-    let n = weights.origin.episodes;
-    let few = (1..FEW_EPISODES).contains(&n);
-    few.then(|| {
+    foreseen::few_episodes(weights).map(|n| {
         format!(
             "These weights were learned from few weighed episodes ({n}): this pour may be off by far more than they say. Weigh it, and learn again."
         )

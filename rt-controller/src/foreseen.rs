@@ -30,6 +30,15 @@ const BEYOND_DEG: f64 = 10.0;
 /// A vessel whose size was learned may hold so many times more. Chosen by hand: sizes are learned within a tenth.
 const OVERFULL: f64 = 1.25;
 
+/// Weights from fewer weighed episodes know little of their own deviation. Pours with weights from one curve are off by about twice as much as those
+/// with weights from five (docs/LEARNING.md, Figures).
+const FEW_EPISODES: u32 = 5;
+
+/// How many weighed episodes the weights were learned from, if they are too few for their deviation to be taken at its word.
+pub fn few_episodes(weights: &Weights) -> Option<u32> {
+    Some(weights.origin.episodes).filter(|n| (1..FEW_EPISODES).contains(n))
+}
+
 /// What is to be said before a pour with weights that do not know their pictures, which pour in any; `None` of others.
 pub fn pictures_line(weights: &Weights) -> Option<&'static str> {
     weights.origin.pictures_unknown().then_some(

@@ -65,6 +65,8 @@ struct Foreseen {
     unseen_ml: Option<f64>,
     /// What there is to say where weights know no vessel, or are not known here.
     unbounded_line: Option<&'static str>,
+    /// How many episodes the weights were learned from, if they are few.
+    few_episodes: Option<u32>,
     /// What there is to say of the pictures that the weights were trained on.
     pictures_line: Option<&'static str>,
 }
@@ -96,6 +98,7 @@ impl Foreseen {
             flows_by_deg,
             unbounded_line: foreseen::unbounded_line(weights, container.least_fill_ml),
             unseen_ml: weights.and_then(|w| foreseen::unseen_ml(w, config.limits, flows_by_deg)),
+            few_episodes: weights.and_then(foreseen::few_episodes),
             pictures_line: weights.and_then(foreseen::pictures_line),
         }
     }
@@ -106,6 +109,9 @@ impl Foreseen {
             .into_iter()
             .chain(self.unseen_line())
             .chain(self.unbounded_line.map(|line| format!("warning: {line}")))
+            .chain(self.few_episodes.map(|n| {
+                format!("warning: the weights were learned from few weighed episodes ({n}): this pour may be off by far more than they say; weigh it, and refine")
+            }))
             .chain(self.pictures_line.map(str::to_owned))
     }
 
@@ -276,6 +282,18 @@ mod tests {
         assert!(named(&weights));
         weights.origin.framing = shared::framing::Framing::new(&config.camera, &config.image);
         assert!(!named(&weights));
+    }
+
+    /// Protects whoever takes a small deviation at its word: weights from few weighed episodes hardly know their own, and that is said, as on the page.
+    #[test]
+    fn weights_from_few_episodes_are_named() {
+        let config = Config::read(&std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("../config/sim.toml")).unwrap();
+        let mut weights = foreseen::tests::weights();
+        for (episodes, few) in [(0, false), (1, true), (4, true), (5, false)] {
+            weights.origin.episodes = episodes;
+            let said = Foreseen::with(Some(&weights), &config, 30.0, None).lines(30.0).any(|line| line.contains("few weighed episodes"));
+            assert_eq!(said, few, "{episodes} episodes");
+        }
     }
 
     /// Protects whoever pressed Ctrl-C at a robot: it is said to be upright only where that is known.
