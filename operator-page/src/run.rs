@@ -140,6 +140,6 @@ fn announce(address: SocketAddr, word: &str, (file, made): (&Path, bool), loopba
         say(Level::Warning, "whoever has the token can move the robot; it is not encrypted, so use a network that you trust");
     }
     if made {
-        say(Level::Info, "the token was made now, and stays the same until its file is deleted");
+        say(Level::Info, "the token was made now, and stays the same until its file is deleted and the page is started again");
     }
 }

@@ -314,8 +314,11 @@ async fn let_in(head: Parts, body: Incoming, ends: &Ends, shared: &Shared) -> Re
         return Ok(Answer::text(""));
     }
     let open = shared.settings.open.iter().find(|(path, ..)| head.method == Method::GET && *path == head.uri.path());
-    if let Some((_, kind, text)) = open {
-        return Ok(Answer::bytes(kind, *text));
+    if let Some((path, kind, text)) = open {
+        let answer = Answer::bytes(kind, *text);
+        // Browsers that were here while the token was in a cookie would send it for a year to every port of this host: they drop it.
+        let port = ends.own.port();
+        return Ok(if *path == "/" { answer.header("set-cookie", &format!("decant-{port}=; Max-Age=0; Path=/")) } else { answer });
     }
     gate::admitted(&head.headers, ends, &shared.settings.rules)?;
     hand_over(head, body, ends.peer, shared).await
