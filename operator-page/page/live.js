@@ -89,6 +89,15 @@ function lose() {
   $('lost').hidden = false;
 }
 
+/** What the connection has said last; empty while all is well. */
+let trouble = '';
+/** Says once what is wrong with the connection, and takes it back when all is well; another line that stands there by then stays. */
+function sayOfConnection(line) {
+  if (line === trouble) return;
+  if (line || $('said').textContent === trouble) say(line);
+  trouble = line;
+}
+
 /** When the newest connection was begun. */
 let connected = 0;
 /** Takes states as long as they come. The browser's own way to a stream of events (EventSource) sends no token. */
@@ -99,6 +108,7 @@ async function connect() {
   try {
     const response = await ask('/events', { signal: begun.signal });
     if (!response.ok) await answered(response);
+    sayOfConnection('');
     const reader = response.body.getReader(), decoder = new TextDecoder();
     let text = '';
     for (let part = await reader.read(); !part.done; part = await reader.read()) {
@@ -108,7 +118,7 @@ async function connect() {
       events.forEach(event => queueMicrotask(() => take(event.slice('data: '.length))));
     }
   } catch (error) {
-    if (begun === stream && !(error instanceof TypeError || error instanceof DOMException)) say(error.message);
+    if (begun === stream && !(error instanceof TypeError || error instanceof DOMException)) sayOfConnection(error.message);
   }
   // A server that has ended closes its connections, which is noticed at once.
   if (begun === stream) { stream = null; lose(); }
@@ -185,10 +195,11 @@ async function begin() {
     about = await get('/api/about');
     points = await get('/api/minute');
   } catch (error) {
-    say(error.message);
+    sayOfConnection(reason(error));
     setTimeout(begin, 1500);
     return;
   }
+  sayOfConnection('');
   stopPort = about.stop_port;
   $('cell').textContent = about.cell;
   $('about').textContent = `Decant ${about.version} · ${about.config}`;

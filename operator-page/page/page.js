@@ -104,13 +104,19 @@ async function save(path, name) {
   say('');
 }
 
+/** Why a request failed, in words. */
+function reason(error) {
+  if (error instanceof DOMException) return 'The page\'s server gave no answer in time.';
+  return error instanceof TypeError ? 'The page\'s server cannot be reached.' : error.message;
+}
+
 /** Does something that may fail, and says so in one line. Gives undefined then. */
 async function attempt(what) {
   try {
     say('');
     return await what();
   } catch (error) {
-    say(error instanceof DOMException ? 'The page\'s server gave no answer in time.' : error instanceof TypeError ? 'The page\'s server cannot be reached.' : error.message);
+    say(reason(error));
     return undefined;
   }
 }
