@@ -65,7 +65,7 @@ function checked(check) {
 $('make-plan').onclick = () => attempt(async () => {
   const holds = typed('holds');
   if (Number.isNaN(holds)) throw new Error(`Type what the vessel holds in ml, or leave it empty. ${PLAIN}`);
-  localStorage.setItem('decant-holds', $('holds').value);
+  keep('decant-holds', $('holds').value);
   await post('/api/plan', { holds_ml: holds ?? null });
   mine = true;
 });
@@ -228,4 +228,4 @@ addEventListener('tab', async event => {
   unweighed();
   try { showPlan(await get('/api/plan')); } catch { return; }
 });
-addEventListener('known', () => { $('holds').value = about.holds_ml ?? localStorage.getItem('decant-holds') ?? ''; });
+addEventListener('known', () => { $('holds').value = about.holds_ml ?? kept('decant-holds'); });

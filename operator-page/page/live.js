@@ -191,6 +191,7 @@ async function alive() {
 }
 
 async function begin() {
+  await taken;
   try {
     about = await get('/api/about');
     points = await get('/api/minute');

@@ -21,30 +21,36 @@ function el(tag, properties = {}, ...children) {
 /** Puts `children` in the place of what is in `parent`. */
 function fill(parent, ...children) { parent.replaceChildren(...children.filter(c => c !== null && c !== undefined)); }
 
+/** The token as this page knows it. It is here, and not looked up when it is needed: a Stop waits for no storage. */
+let token = '';
+
+/** What this browser keeps of the page under a name; empty if it keeps nothing, as where its user has forbidden that. */
+function kept(name, storage = 'localStorage') {
+  try { return window[storage].getItem(name) || ''; } catch { return ''; }
+}
+/** Keeps a value; an empty one is forgotten. Where nothing may be kept, it lasts as long as the page. */
+function keep(name, value, storage = 'localStorage') {
+  try {
+    if (value) window[storage].setItem(name, value); else window[storage].removeItem(name);
+  } catch { /* The page works without. */ }
+}
+
 /** This page's own name for itself, by which the server knows who has the say. It lies in the session's storage only while the page is loaded
  *  anew: a tab that is duplicated gets a copy of the storage, and must not get the say with it. */
-const own = { id: sessionStorage.getItem('decant-id') || '', name: localStorage.getItem('decant-name') || '' };
+const own = { id: kept('decant-id', 'sessionStorage'), name: kept('decant-name') };
 if (!own.id) own.id = [...crypto.getRandomValues(new Uint8Array(16))].map(b => b.toString(16).padStart(2, '0')).join('');
-addEventListener('pagehide', () => sessionStorage.setItem('decant-id', own.id));
-addEventListener('pageshow', () => sessionStorage.removeItem('decant-id'));
+addEventListener('pagehide', () => keep('decant-id', own.id, 'sessionStorage'));
+addEventListener('pageshow', () => keep('decant-id', '', 'sessionStorage'));
 
 /** Where this browser keeps the token: in a storage of this port's pages. A cookie would go to every port of the host, whoever listens there. */
 const TOKEN = 'decant-token';
-/** Takes the token from the address's fragment, which no browser sends, and takes it out of the address. */
-function takeToken() {
-  const given = /^#token=([0-9A-Za-z]+)$/.exec(location.hash);
-  if (!given) return;
-  localStorage.setItem(TOKEN, given[1]);
-  window.history.replaceState(null, '', location.pathname);
-}
-takeToken();
-// Into a page that is open already, an address with a token is only a jump.
-addEventListener('hashchange', takeToken);
+token = kept(TOKEN);
+// Another tab has taken a new one.
+addEventListener('storage', event => { if (event.key === TOKEN) token = event.newValue || token; });
 
 /** Asks the server, with the token if this browser has one. */
-function ask(url, options = {}) {
-  const token = localStorage.getItem(TOKEN);
-  return fetch(url, token ? { ...options, headers: { ...options.headers, Authorization: `Bearer ${token}` } } : options);
+function ask(url, options = {}, word = token) {
+  return fetch(url, word ? { ...options, headers: { ...options.headers, Authorization: `Bearer ${word}` } } : options);
 }
 
 /** Says one line above the content; an empty line takes it away. */
@@ -68,6 +74,32 @@ function within(ms) {
 }
 /** After this an answer no longer comes, ms: the server gives up after 60 s. */
 const ANSWER_WAITS = 65000;
+
+/** Takes the token out of the address's fragment, which no browser sends. */
+async function takeToken() {
+  if (!location.hash.startsWith('#token=')) return;
+  const given = location.hash.slice('#token='.length);
+  window.history.replaceState(null, '', location.pathname);
+  if (!/^[0-9A-Za-z]+$/.test(given)) return;
+  // Without one there is nothing to lose, and a Stop needs it at once.
+  token ||= given;
+  await judge(given);
+}
+/** Keeps a token that the server takes. Anybody can write a link to this page, so one that it refuses takes no other's place. */
+async function judge(given) {
+  let answer;
+  try { answer = await ask('/api/about', { signal: within(ANSWER_WAITS) }, given); } catch { setTimeout(judge, 1500, given); return; }
+  if (answer.status !== 401) {
+    token = given;
+    keep(TOKEN, given);
+  } else if (token !== given) {
+    say('The server refuses the token in that address: the one from before stays in use.');
+  }
+}
+/** The token of the address with which the page was opened, once it is judged. */
+const taken = takeToken();
+// Into a page that is open already, an address with a token is only a jump.
+addEventListener('hashchange', takeToken);
 
 /** Looks something up. */
 async function get(path) { return answered(await ask(path, { signal: within(ANSWER_WAITS) })); }
@@ -181,12 +213,12 @@ tabs.forEach((tab, k) => {
 });
 
 $('name').value = own.name;
-$('name').onchange = () => { own.name = $('name').value.trim(); localStorage.setItem('decant-name', own.name); };
-$('theme').value = localStorage.getItem('decant-theme') || '';
+$('name').onchange = () => { own.name = $('name').value.trim(); keep('decant-name', own.name); };
+$('theme').value = kept('decant-theme');
 function theme() {
   if ($('theme').value) document.documentElement.dataset.theme = $('theme').value;
   else delete document.documentElement.dataset.theme;
-  localStorage.setItem('decant-theme', $('theme').value);
+  keep('decant-theme', $('theme').value);
 }
 $('theme').onchange = theme;
 theme();

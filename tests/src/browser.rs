@@ -191,6 +191,15 @@ impl Browser {
         shown.map(|n| (text(&n["role"]), text(&n["name"]))).collect()
     }
 
+    /// From now on this window refuses what its pages would keep or look up, as where its user has forbidden that.
+    pub fn forbid_storage(&self) {
+        let refused = "get() { throw new DOMException('', 'SecurityError'); }";
+        let source = format!("for (const name of ['localStorage', 'sessionStorage']) Object.defineProperty(window, name, {{ {refused} }})");
+        self.run(&source);
+        let command = json!({ "cmd": "Page.addScriptToEvaluateOnNewDocument", "params": { "source": source } });
+        self.post("/goog/cdp/execute", &command);
+    }
+
     /// Sets the window's size, px.
     pub fn resize(&self, width: u32, height: u32) {
         self.post("/window/rect", &json!({ "width": width, "height": height }));

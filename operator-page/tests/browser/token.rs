@@ -86,6 +86,60 @@ fn another_users_browser_sends_the_token_to_this_page_alone() {
     browser.wait("the live picture, with the token that was kept", SOON, LIVE);
 }
 
+/// Protects whoever presses Stop from a link that somebody else has written, and from a browser that keeps nothing: a wrong token takes no good one's
+/// place, in no tab and after no new load; a new one is in force in all tabs; and Stop stops where each look into the storage fails.
+#[test]
+fn stop_keeps_its_token() {
+    let home = tempfile::tempdir().expect("a directory");
+    let Some(browser) = Browser::open_as(STRANGER, home.path()) else { return };
+    let cell = CellUnderTest::start(|_| {});
+    let page = Page::open(&cell);
+    let with = |word: &str| format!("{}#token={word}", page.url());
+    let stops = |how: &str| {
+        browser.run("$('stop-said').textContent = ''");
+        browser.click("#stop");
+        browser.wait(how, SOON, "return $('stop-said').textContent !== ''");
+        let said = browser.text("#stop-said");
+        assert!(said.starts_with("Stop: ") && said.ends_with(" ms)"), "{how}: {said}");
+    };
+    browser.go(&page.url());
+    browser.wait("that the token is missing", SOON, "return $('said').textContent.includes('has no token')");
+    let [first, second] = browser.windows();
+    // It was in a cookie, which browsers keep for a year.
+    browser.run("document.cookie = `decant-${location.port}=${'0'.repeat(32)}; Path=/; Max-Age=31536000`");
+    browser.enter(&second);
+    browser.go(&with(&token(&cell)));
+    browser.wait("the live picture", SOON, LIVE);
+    assert_eq!(browser.run("return document.cookie"), "", "the cookie from before is dropped");
+    browser.enter(&first);
+    browser.wait("the live picture in the first tab", SOON, LIVE);
+    assert_eq!(browser.text("#said"), "", "nothing is missing any more");
+    stops("with the token that the other tab has taken");
+
+    for (word, said) in [("AAAA", true), ("", false), ("%41", false)] {
+        browser.go(&with(word));
+        if said {
+            browser.wait("that it is refused", SOON, "return $('said').textContent.includes('refuses the token')");
+        }
+        browser.wait("that it stands in the address no more", SOON, &format!("return location.href === '{}'", page.url()));
+        stops(&format!("after the jump to '{word}'"));
+        browser.go("about:blank");
+        browser.go(&with(word));
+        browser.wait("the live picture", SOON, LIVE);
+        assert_eq!(browser.run("return location.href"), page.url(), "'{word}' stands in the address no more");
+        stops(&format!("opened with '{word}'"));
+        assert_eq!(browser.run("return localStorage.getItem('decant-token')"), token(&cell).as_str(), "after '{word}'");
+    }
+
+    browser.forbid_storage();
+    stops("in a page whose storage is forbidden");
+    browser.go("about:blank");
+    browser.go(&with(&token(&cell)));
+    browser.wait("the live picture without a storage", SOON, LIVE);
+    assert_eq!(browser.run("try { return localStorage.length } catch (error) { return error.name }"), "SecurityError");
+    stops("without a storage");
+}
+
 /// Protects the browsers that need the token from a part of the page that is shown only without it: each request goes the one way that sends it.
 #[test]
 fn each_request_of_the_page_sends_the_token() {
