@@ -105,7 +105,7 @@ function showJob(job) {
   if (job.kind === 'plan') { fill(place); showPlan(r); return; }
   if (job.kind === 'export') { fill(place, el('p', { className: 'good' }, `✓ Written on the robot's computer: ${r.directory}`),
     ...(r.left_out ?? []).map((l) => el('p', { className: 'bad' }, `Left out: ${l.why}`))); return; }
-  if (r.doubts) { askDoubts(r.doubts); fill(place, el('p', { className: 'warn' }, '! Nothing was learned yet: judge these episodes first.')); return; }
+  if (r.doubts) { askDoubts(r.doubts); fill(place, el('p', { className: 'warn' }, '! Nothing was learned yet: judge these doubts first.')); return; }
   // The next training's doubts are judged anew.
   judged.clear();
   fill($('doubts'));
@@ -114,14 +114,14 @@ function showJob(job) {
     ...(r.left_out || []).map(([name, what]) => el('p', { className: 'hint' }, `Left out: ${name.split('/').pop()}: ${what}`)));
 }
 
-/** Asks of each doubtful episode whether it is used. */
+/** Asks of each doubtful episode whether it is used. All of them together are used, or nothing is learned. */
 function askDoubts(doubts) {
   const rows = doubts.map(([name, what]) => {
     if (!judged.has(name)) judged.set(name, false);
     const choice = (words, use) => el('label', {}, el('input', { type: 'radio', name: `judged-${name}`, value: use ? 'use' : 'leave', checked: judged.get(name) === use, onchange: () => judged.set(name, use) }), ` ${words}`);
-    const file = name.split('/').pop();
+    const all = name === 'data set', file = all ? 'All episodes' : name.split('/').pop();
     return el('div', { className: 'proposal', role: 'radiogroup', 'aria-label': file }, el('p', {}, el('b', {}, file), `: ${what}`),
-      el('p', { className: 'row' }, choice('Leave it out', false), choice('Use it all the same', true)));
+      el('p', { className: 'row' }, choice(all ? 'Learn nothing: correct the weights in History first' : 'Leave it out', false), choice(all ? 'Use them all the same' : 'Use it all the same', true)));
   });
   fill($('doubts'), ...rows, el('button', { type: 'button', className: 'primary', id: 'learn-judged', onclick: learn }, 'Learn with these answers'));
 }

@@ -47,10 +47,37 @@ fn arguments_of(command: &str, config: String, of: Vec<String>, holds_ml: Option
     [command.into(), "--json".into(), "--config".into(), config].into_iter().chain(of).chain(holds).collect()
 }
 
+/// What `trainer` calls all episodes together.
+const DATA_SET: &str = "data set";
+
 /// The names of which there still is a doubt. A weight that was corrected after it was judged is doubted no more, and then nobody has left it out.
 fn standing(doubts: &[Value], mut names: Vec<String>) -> Vec<String> {
     names.retain(|name| doubts.iter().any(|d| d[0] == name.as_str()));
     names
+}
+
+/// What a person has answered to the doubts of a check.
+#[derive(Debug, PartialEq)]
+struct Judged {
+    accept: Vec<String>,
+    leave_out: Vec<String>,
+    /// Doubts without an answer.
+    open: Vec<Value>,
+    /// What is only said of all episodes together.
+    remarks: Vec<Value>,
+}
+
+/// Holds what a person has answered against what `check` doubts. All episodes together are a question where they would be refused; they cannot be left out.
+fn judge(check: &Value, accept: Vec<String>, leave_out: Vec<String>) -> Judged {
+    let list = |key: &str| check[key].as_array().cloned().unwrap_or_default();
+    let (of_set, questions): (Vec<Value>, Vec<Value>) = list("doubts").into_iter().partition(|d| d[0] == DATA_SET);
+    let refused: Vec<Value> = list("refused").into_iter().filter(|d| d[0] == DATA_SET).collect();
+    let asked = [refused, questions.clone()].concat();
+    let (accept, leave_out) = (standing(&asked, accept), standing(&questions, leave_out));
+    let judged = |d: &Value| accept.iter().chain(&leave_out).any(|name| d[0] == name.as_str());
+    let open = asked.iter().filter(|d| !judged(d)).cloned().collect();
+    let remarks = of_set.iter().map(|d| d[1].clone()).collect();
+    Judged { accept, leave_out, open, remarks }
 }
 
 impl Jobs {
@@ -124,7 +151,7 @@ impl Jobs {
         )
     }
 
-    /// Learns from `files`, and writes the weights to `out`. `accept` and `leave_out` are the doubtful episodes that a person has judged; if
+    /// Learns from `files`, and writes the weights to `out`. `accept` and `leave_out` are the doubts that a person has judged, by their names; if
     /// there are others, nothing is learned and they are told.
     pub fn start_learning(
         self: &Arc<Self>,
@@ -143,13 +170,15 @@ impl Jobs {
             "learn",
             Box::new(move |stop, step| {
                 step(Step { stage: "looking at the episodes".into(), ..Step::default() });
-                let (check, _) = programs::run("trainer", &arguments_of("check", config.clone(), files.clone(), None), stop, |_| {})?;
-                let of_set = |d: &&Value| d[0] == "data set";
-                let doubts = check["doubts"].as_array().cloned().unwrap_or_default();
-                let [accept, leave_out] = [accept, leave_out].map(|names| standing(&doubts, names));
-                let judged = |name: &str| name == "data set" || accept.iter().chain(&leave_out).any(|n| n == name);
-                let remarks: Vec<Value> = doubts.iter().filter(of_set).map(|d| d[1].clone()).collect();
-                let open: Vec<Value> = doubts.into_iter().filter(|d| !judged(d[0].as_str().unwrap_or(""))).collect();
+                let check =
+                    |of: &[String]| programs::run("trainer", &arguments_of("check", config.clone(), of.to_vec(), None), stop, |_| {});
+                let mut judged = judge(&check(&files)?.0, accept.clone(), leave_out);
+                let rest: Vec<String> = files.iter().filter(|file| !judged.leave_out.contains(file)).cloned().collect();
+                if !rest.is_empty() && rest.len() < files.len() {
+                    // Without those that are left out, others may be doubtful, and all together may be refused, or no longer.
+                    judged = Judged { leave_out: judged.leave_out, ..judge(&check(&rest)?.0, accept, Vec::new()) };
+                }
+                let Judged { accept, leave_out, open, remarks } = judged;
                 if !open.is_empty() {
                     return Ok(json!({ "doubts": open }));
                 }
@@ -196,6 +225,23 @@ mod tests {
     fn an_answer_counts_while_its_doubt_stands() {
         let doubts = [json!(["b.mcap", "odd"]), json!(["data set", "few"])];
         assert_eq!(standing(&doubts, vec!["a.mcap".into(), "b.mcap".into()]), ["b.mcap"]);
+    }
+
+    /// Protects a new cell's first training from ending where nobody can answer: what would be refused of all episodes together is asked, once it is
+    /// accepted that is passed on while it stands, it cannot be left out, and what is only said of them is no question.
+    #[test]
+    fn what_would_be_refused_of_the_set_is_asked() {
+        let [few, kilograms, odd] = [["data set", "few"], ["data set", "in grams?"], ["b.mcap", "odd"]].map(|d| json!(d));
+        let refusing = json!({ "doubts": [odd, kilograms, few], "refused": [kilograms] });
+        let names = |names: &[&str]| names.iter().map(|n| (*n).to_owned()).collect::<Vec<_>>();
+        let set = names(&["data set"]);
+        let unanswered = judge(&refusing, Vec::new(), set.clone());
+        assert_eq!((unanswered.open, unanswered.leave_out), (vec![kilograms.clone(), odd.clone()], Vec::new()));
+        let answered = judge(&refusing, set.clone(), names(&["b.mcap"]));
+        let remarks = vec![json!("in grams?"), json!("few")];
+        assert_eq!(answered, Judged { accept: set.clone(), leave_out: names(&["b.mcap"]), open: Vec::new(), remarks });
+        let said = judge(&json!({ "doubts": [few], "refused": [] }), set, Vec::new());
+        assert_eq!(said, Judged { accept: Vec::new(), leave_out: Vec::new(), open: Vec::new(), remarks: vec![json!("few")] });
     }
 
     /// Protects who plans on the page from another proposal than that of the command line: both take the largest goal from the configuration, which may

@@ -355,7 +355,22 @@ fn weights_that_are_all_wrong_are_doubted() {
             // What is refined goes to a controller unasked, so nothing is written until somebody accepts it.
             let is_written = || std::fs::remove_file(dir.path().join("w.bin")).is_ok();
             assert_eq!(is_written(), command == "train" || command == "refine" && says.is_none(), "{command}, weights times {factor}");
-            if command == "refine" && said.contains("of data set") {
+            if command == "check" {
+                // The page asks what it finds here, and answers with `--accept`.
+                let found: serde_json::Value =
+                    serde_json::from_slice(&trainer(dir.path(), &[&args[..], &["--json"]].concat()).stdout).unwrap();
+                let refused = found["refused"].as_array().unwrap();
+                assert_eq!(!refused.is_empty(), says.is_some(), "weights times {factor}: {found}");
+                assert!(refused.iter().all(|d| found["doubts"].as_array().unwrap().contains(d)), "weights times {factor}: {found}");
+            }
+            if let ("refine", Some(words)) = (command, says) {
+                // Its last line, the only one that the page shows, says what is wrong, with all that is accused, and how to answer.
+                let last = text(&out.stderr).lines().last().unwrap_or_default().to_owned();
+                assert!(last.starts_with("error: no weights are written. ") && last.contains(words), "{last}");
+                let of = |what: &str| last.matches(what).count();
+                assert_eq!(of("--accept '"), of("but the vessel holds").max(1), "{last}");
+            }
+            if command == "refine" && said.contains("--accept 'data set'") {
                 args.extend(["--accept", "data set"]);
                 let out = trainer(dir.path(), &args);
                 assert!(out.status.success() && is_written(), "{}", text(&out.stderr));

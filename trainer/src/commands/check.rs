@@ -59,6 +59,8 @@ pub struct Findings {
     pub left_out: Vec<(String, String)>,
     /// What is doubtful about episodes that can be used, or about the set.
     pub doubts: Vec<(String, String)>,
+    /// Those of them with which `trainer refine` writes no weights until a person has judged them.
+    pub refused: Vec<(String, String)>,
     /// What the episodes span; none without a usable episode.
     pub spanned: Option<Spanned>,
     /// Which areas, weights and fills they do not span, and what to record.
@@ -68,15 +70,16 @@ pub struct Findings {
 /// Looks for faults and doubts in a data set, of a vessel that holds `holds_ml`, if somebody knows that.
 pub fn check(episodes: &[Episode], holds_ml: Option<f64>) -> Findings {
     let usable = data::usable(episodes);
+    let fit = (!usable.episodes.is_empty()).then(|| fit::fit(&usable.episodes));
+    let mut refused: Vec<_> = consistency::doubtful(&usable.episodes).into_iter().map(|d| (d.name.clone(), d.to_string())).collect();
     let mut doubts = doubtful_recordings(episodes, &usable);
-    doubts.extend(consistency::doubtful(&usable.episodes).into_iter().map(|d| (d.name.clone(), d.to_string())));
-    if !usable.episodes.is_empty() {
-        doubts.extend(consistency::doubts_of_set(&usable.episodes, &fit::fit(&usable.episodes), holds_ml));
-    }
+    doubts.extend(refused.iter().cloned());
+    doubts.extend(fit.iter().flat_map(|fit| consistency::doubts_of_set(&usable.episodes, fit, holds_ml)));
+    refused.extend(fit.iter().flat_map(|fit| consistency::against_vessel(&usable.episodes, fit, holds_ml)));
     doubts.extend(set_doubts(&usable.episodes));
     let spanned = gaps::spanned(&usable.episodes, &calibration::calibrate(&usable.episodes, None));
     let missing = spanned.as_ref().map(Spanned::missing).unwrap_or_default();
-    Findings { episodes: episodes.len(), usable: usable.episodes.len(), left_out: usable.left_out, doubts, spanned, missing }
+    Findings { episodes: episodes.len(), usable: usable.episodes.len(), left_out: usable.left_out, doubts, refused, spanned, missing }
 }
 
 /// What is doubtful about how the usable episodes were recorded: the name of each, and what.

@@ -205,13 +205,8 @@ impl WeightFileArgs {
         for (name, what) in trained.fit.iter().flat_map(|fit| consistency::doubts_of_set(&usable.episodes, fit, holds_ml)) {
             eprintln!("doubtful: {}", plain(&format!("{name}: {what}")));
         }
-        let open = |name: &String| accepted.is_some_and(|accepted| !accepted.contains(name));
-        let mut wrong = trained.fit.iter().flat_map(|fit| consistency::against_vessel(&usable.episodes, fit, holds_ml));
-        if let Some((name, _)) = wrong.find(|(name, _)| open(name)) {
-            let what = format!(
-                "no weights are written: correct what is doubtful of {name} with `feature-worker episodes`, or give --accept '{name}'"
-            );
-            return Err(failure(exit::BAD_INPUT, what));
+        if let (Some(fit), Some(accepted)) = (&trained.fit, accepted) {
+            refuse_open(&consistency::against_vessel(&usable.episodes, fit, holds_ml), accepted)?;
         }
         if trained.fit.as_ref().is_some_and(|fit| fit.model.delay_frames >= DELAY_MAX_FRAMES - DELAY_NEAR_FRAMES) {
             eprintln!(
@@ -234,6 +229,21 @@ impl WeightFileArgs {
         }
         Ok(())
     }
+}
+
+/// Refuses weights that the vessel cannot have held, but for those that are `accepted`: one line has all of them, as whoever starts this from another
+/// program sees no other line.
+fn refuse_open(of_vessel: &[(String, String)], accepted: &[String]) -> Result<(), Failure> {
+    let open: Vec<_> = of_vessel.iter().filter(|(name, _)| !accepted.contains(name)).collect();
+    if open.is_empty() {
+        return Ok(());
+    }
+    let all: Vec<String> = open.iter().map(|(name, what)| format!("{name}: {what}")).collect();
+    let mut answers: Vec<String> = open.iter().map(|(name, _)| format!("--accept '{name}'")).collect();
+    answers.dedup();
+    let (all, answers) = (all.join(" "), answers.join(" "));
+    let what = format!("no weights are written. {all} Correct that with `feature-worker episodes`, or give {answers}");
+    Err(failure(exit::BAD_INPUT, plain(&what)))
 }
 
 /// Everything that a weight file came from, as JSON for people and for `trainer report`.
