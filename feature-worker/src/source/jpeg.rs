@@ -13,10 +13,9 @@ pub(super) const CUT: &str = "the picture is cut off";
 pub(super) const DAMAGED: &str = "the picture is damaged: its data do not add up";
 /// The most blocks of a component that are walked through: those of the largest picture that is read, 4096 x 4096 px, and as many again for filling up.
 const BLOCKS_MAX: usize = 1 << 19;
-/// The most scans of a picture. Chosen by hand: encoders write about ten.
-const SCANS_MAX: usize = 500;
-/// Zero bytes behind a scan that are taken for filling. Chosen by hand: hardware fills up to whole words of up to 16 bytes.
-const FILLING_MOST: usize = 16;
+/// The most bytes before a marker that are passed over. Chosen by hand: webcams (Logitech's C270, C310 and C910) leave 1 to 9, and hardware fills up to whole
+/// words of up to 16 bytes.
+const STRAY_MOST: usize = 16;
 
 /// Why a walk ends before the picture does.
 enum Stop {
@@ -75,15 +74,31 @@ impl Bits<'_> {
         Err(Stop::Fault(DAMAGED))
     }
 
-    /// Goes on behind the marker of a restart, if one is here.
-    fn restart(&mut self) -> bool {
-        let fill = self.bytes[self.at.min(self.bytes.len())..].iter().take_while(|byte| **byte == 0xff).count();
-        let is_one = fill > 0 && self.bytes.get(self.at + fill).is_some_and(|marker| (0xd0..=0xd7).contains(marker));
-        if is_one {
-            (self.at, self.left) = (self.at + fill + 1, 0);
+    /// Goes on behind the marker of the restart that is due after `before` others, if it is the next marker.
+    fn restart(&mut self, before: usize) -> Result<(), Stop> {
+        let (number, behind) = marker(self.bytes, self.at).map_err(Stop::Fault)?;
+        // They count from 0 to 7, and again.
+        if usize::from(number) != 0xd0 + before % 8 {
+            return Err(Stop::Fault(DAMAGED));
         }
-        is_one
+        (self.at, self.left) = (behind, 0);
+        Ok(())
     }
+}
+
+/// The next marker's number from byte `from` on, and where what follows it begins. A few stray bytes before it are passed over, as libjpeg does.
+fn marker(bytes: &[u8], from: usize) -> Result<(u8, usize), &'static str> {
+    let mut at = from;
+    while at <= from + STRAY_MOST {
+        // Bytes 0xff before a marker are filling, and with a zero behind them they are none.
+        let fill = bytes.get(at..).unwrap_or_default().iter().take_while(|byte| **byte == 0xff).count();
+        match bytes.get(at + fill) {
+            None => return Err(CUT),
+            Some(number) if fill > 0 && *number > 0 => return Ok((*number, at + fill + 1)),
+            Some(_) => at += fill + 1,
+        }
+    }
+    Err(DAMAGED)
 }
 
 /// A component: brightness, or a colour.
@@ -287,9 +302,7 @@ impl Walk {
         for unit in 0..units[0] * units[1] {
             if self.interval > 0 && unit > 0 && unit % self.interval == 0 {
                 scan.ended = 0;
-                if !scan.bits.restart() {
-                    return Err(Stop::Fault(if scan.bits.at < bytes.len() { DAMAGED } else { CUT }));
-                }
+                scan.bits.restart(unit / self.interval - 1)?;
             }
             let (x, y) = (unit % units[0], unit / units[0]);
             for (place, [means, others]) in &places {
@@ -305,24 +318,24 @@ impl Walk {
             }
         }
         // Some encoders write a restart behind the last interval too.
-        let _ = self.interval > 0 && scan.bits.restart();
-        let at = scan.bits.at.min(bytes.len());
-        Ok(at + bytes[at..].iter().take(FILLING_MOST).take_while(|byte| **byte == 0).count())
+        if self.interval > 0 {
+            let _ = scan.bits.restart((units[0] * units[1] - 1) / self.interval);
+        }
+        Ok(scan.bits.at)
     }
 }
 
 /// The EXIF data in a JPEG's header, if there are any; the error says how its pixels are not whole.
 pub(super) fn judge(bytes: &[u8]) -> Result<Option<&[u8]>, &'static str> {
     let mut exif = None;
-    let (mut walk, mut at, mut scans) = (Walk::default(), 2, 0);
+    let (mut walk, mut at) = (Walk::default(), 2);
     loop {
-        let Some([0xff, marker]) = bytes.get(at..at + 2) else {
-            return Err(if bytes.len() < at + 2 { CUT } else { DAMAGED });
-        };
-        // A byte 0xff before a marker is filling.
-        at += if *marker == 0xff { 1 } else { 2 };
-        match marker {
-            0xff | 0x01 | 0xd0..=0xd7 => continue,
+        let (number, behind) = marker(bytes, at)?;
+        at = behind;
+        match number {
+            0x01 => continue,
+            // No restart is due here.
+            0xd0..=0xd7 => return Err(DAMAGED),
             0xd9 => {
                 let all = walk.picture.is_some_and(|picture| picture.components.iter().all(|component| component.seen));
                 return if all { Ok(exif) } else { Err(DAMAGED) };
@@ -332,18 +345,14 @@ pub(super) fn judge(bytes: &[u8]) -> Result<Option<&[u8]>, &'static str> {
         let Some([high, low]) = bytes.get(at..at + 2) else { return Err(CUT) };
         let end = at + usize::from(*high) * 256 + usize::from(*low);
         let Some(contents) = bytes.get(at + 2..end) else { return Err(if end < at + 2 { DAMAGED } else { CUT }) };
-        let done = match marker {
-            0xc0..=0xc2 => Picture::of(*marker, contents).map(|picture| walk.picture = Some(picture)),
+        let done = match number {
+            0xc0..=0xc2 => Picture::of(number, contents).map(|picture| walk.picture = Some(picture)),
             0xc4 => walk.take_tables(contents),
             0xdd => {
                 walk.interval = contents.iter().take(2).fold(0, |value, byte| value << 8 | usize::from(*byte));
                 Ok(())
             }
-            0xda if scans >= SCANS_MAX => Err(Stop::Fault(DAMAGED)),
-            0xda => {
-                scans += 1;
-                walk.scan(contents, bytes, end).map(|next| at = next)
-            }
+            0xda => walk.scan(contents, bytes, end).map(|next| at = next),
             0xc3 | 0xc5..=0xc7 | 0xc9..=0xcb | 0xcd..=0xcf => Err(Stop::Unjudged),
             0xe1 => {
                 exif = exif.or(contents.strip_prefix(b"Exif\0\0"));
@@ -353,7 +362,7 @@ pub(super) fn judge(bytes: &[u8]) -> Result<Option<&[u8]>, &'static str> {
             _ => Err(Stop::Fault(DAMAGED)),
         };
         match done {
-            Ok(()) if *marker == 0xda => {}
+            Ok(()) if number == 0xda => {}
             Ok(()) => at = end,
             Err(Stop::Fault(fault)) => return Err(fault),
             // In pixels 0xff is never followed by the end marker's byte by chance.
@@ -430,6 +439,39 @@ mod tests {
             let gone = [&whole[..middle], &whole[middle + 200..]].concat();
             let twice = [&whole[..middle + 200], &whole[middle..]].concat();
             assert!(judge(&gone).is_err() && judge(&twice).is_err(), "{name}");
+        }
+    }
+
+    /// Where the markers with one of these numbers begin.
+    fn markers(bytes: &[u8], wanted: std::ops::RangeInclusive<u8>) -> Vec<usize> {
+        (0..bytes.len() - 1).filter(|at| bytes[*at] == 0xff && wanted.contains(&bytes[at + 1])).collect()
+    }
+
+    /// Protects the pictures of common webcams, which leave some bytes before a restart, the end or a header and are decoded well. A restart that is not the next in turn,
+    /// and one that is not due, are damage all the same.
+    #[test]
+    fn stray_bytes_before_a_marker_are_no_damage() {
+        let stray = [&[0x5a; 9][..], &[0; 9], &[0xff, 0, 0x12, 0xff, 0, 0xff, 0, 0xff, 0]];
+        for (name, whole) in encoded() {
+            let restarts: Vec<usize> = markers(&whole[pixels(&whole)..], 0xd0..=0xd7).iter().map(|at| at + pixels(&whole)).collect();
+            let headers = [markers(&whole, 0xda..=0xda)[0], whole.len() - 2];
+            for at in headers.into_iter().chain(restarts.iter().take(9).copied()) {
+                for (bytes, count) in stray.iter().flat_map(|bytes| (1..=9).map(move |count| (bytes, count))) {
+                    // A lone 0xff is filling.
+                    let with = [&whole[..at], &bytes[..count], &whole[at..]].concat();
+                    assert!(judge(&with).is_ok(), "{name}: {count} of {bytes:?} at {at}: {:?}", judge(&with));
+                }
+                let many = [&whole[..at], &[0x5a; 60], &whole[at..]].concat();
+                assert_eq!(judge(&many), Err(DAMAGED), "{name} at {at}");
+            }
+            for at in restarts.into_iter().take(9) {
+                let mut other = whole.clone();
+                other[at + 1] ^= 1;
+                let twice = [&whole[..at], &whole[at..at + 2], &whole[at..]].concat();
+                assert_eq!((judge(&other), judge(&twice)), (Err(DAMAGED), Err(DAMAGED)), "{name} at {at}");
+            }
+            let undue = [&whole[..whole.len() - 2], &[0xff, 0xd7, 0xff, 0xd3], &whole[whole.len() - 2..]].concat();
+            assert_eq!(judge(&undue), Err(DAMAGED), "{name}");
         }
     }
 
