@@ -19,6 +19,7 @@ pub mod devices;
 mod files;
 mod frame;
 mod jpeg;
+mod jpeg_codes;
 mod numbering;
 mod pictures;
 mod playback;

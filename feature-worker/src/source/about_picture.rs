@@ -12,7 +12,8 @@ use crc::{CRC_32_ISO_HDLC, Crc, Table};
 use shared::plural::counted;
 
 use super::container::Turn;
-use super::jpeg::{self, CUT, DAMAGED};
+use super::jpeg;
+use super::jpeg_codes::{CUT, DAMAGED};
 
 /// The checksum of PNG's chunks (its specification, 5.5).
 const PNG_CHECKSUM: Crc<u32, Table<16>> = Crc::<u32, Table<16>>::new(&CRC_32_ISO_HDLC);

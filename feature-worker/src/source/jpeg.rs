@@ -2,105 +2,15 @@
 //!
 //! OpenCV's decoder makes a picture of what is damaged too, and says nothing, and so does zune-jpeg 0.5 in its strict mode for most of what the tests
 //! below damage. No rule about single bytes would tell it: with tables that are
-//! made for the picture, an even ground may be a long run of zero bytes. Walked are the sequential and the progressive codes of ITU-T T.81; of arithmetic
-//! and lossless codes, which OpenCV hardly reads, only the end is looked for. Damage that keeps the number of codes, as in the low bits of a
+//! made for the picture, an even ground may be a long run of zero bytes. Walked are the sequential and the progressive Huffman codes of ITU-T T.81, with
+//! its standard tables where a picture has none; arithmetic and lossless codes, which OpenCV hardly reads, are judged by their end alone. Damage that keeps the number of codes, as in the low bits of a
 //! coefficient, cannot be told. For commands that read files and for the worker when it plays pictures, on their own thread; allocates eight
 //! bytes a block. Any bytes are survived: what does not fit is [`DAMAGED`].
 
-/// What is said of a picture that ends too early.
-pub(super) const CUT: &str = "the picture is cut off";
-/// What is said of a picture whose data cannot be right.
-pub(super) const DAMAGED: &str = "the picture is damaged: its data do not add up";
+use super::jpeg_codes::{Bits, CUT, DAMAGED, Stop, Table, Tables, marker};
+
 /// The most blocks of a component that are walked through: those of the largest picture that is read, 4096 x 4096 px, and as many again for filling up.
 const BLOCKS_MAX: usize = 1 << 19;
-/// The most bytes before a marker that are passed over. Chosen by hand: webcams (Logitech's C270, C310 and C910) leave 1 to 9, and hardware fills up to whole
-/// words of up to 16 bytes.
-const STRAY_MOST: usize = 16;
-
-/// Why a walk ends before the picture does.
-enum Stop {
-    /// With this fault.
-    Fault(&'static str),
-    /// The codes are of a kind that is not walked through.
-    Unjudged,
-}
-
-/// The codes of a Huffman table.
-struct Table {
-    /// Number of codes of each length, from 1 bit on.
-    counts: [u8; 16],
-    values: Vec<u8>,
-}
-
-/// The bits of a scan, from byte `at` on, up to the next marker.
-struct Bits<'a> {
-    bytes: &'a [u8],
-    at: usize,
-    held: u8,
-    left: u32,
-}
-
-impl Bits<'_> {
-    fn bit(&mut self) -> Result<u32, Stop> {
-        if self.left == 0 {
-            let byte = *self.bytes.get(self.at).ok_or(Stop::Fault(CUT))?;
-            // In pixels a byte 0xff has a zero behind it; with anything else it is a marker, and the codes have ended too early.
-            let escaped = byte == 0xff;
-            if escaped && self.bytes.get(self.at + 1) != Some(&0) {
-                return Err(Stop::Fault(if self.at + 1 < self.bytes.len() { DAMAGED } else { CUT }));
-            }
-            self.at += 1 + usize::from(escaped);
-            (self.held, self.left) = (byte, 8);
-        }
-        self.left -= 1;
-        Ok(u32::from(self.held >> self.left) & 1)
-    }
-
-    fn bits(&mut self, count: u8) -> Result<u32, Stop> {
-        (0..count).try_fold(0, |value, _| Ok(value << 1 | self.bit()?))
-    }
-
-    /// The next value by `table`.
-    fn value(&mut self, table: &Table) -> Result<u8, Stop> {
-        let (mut code, mut first, mut before) = (0, 0, 0);
-        for count in table.counts.map(u32::from) {
-            code = code << 1 | self.bit()?;
-            if code < first + count {
-                return table.values.get((before + code - first) as usize).copied().ok_or(Stop::Fault(DAMAGED));
-            }
-            before += count;
-            first = (first + count) << 1;
-        }
-        Err(Stop::Fault(DAMAGED))
-    }
-
-    /// Goes on behind the marker of the restart that is due after `before` others, if it is the next marker.
-    fn restart(&mut self, before: usize) -> Result<(), Stop> {
-        let (number, behind) = marker(self.bytes, self.at).map_err(Stop::Fault)?;
-        // They count from 0 to 7, and again.
-        if usize::from(number) != 0xd0 + before % 8 {
-            return Err(Stop::Fault(DAMAGED));
-        }
-        (self.at, self.left) = (behind, 0);
-        Ok(())
-    }
-}
-
-/// The next marker's number from byte `from` on, and where what follows it begins. A few stray bytes before it are passed over, as libjpeg does.
-fn marker(bytes: &[u8], from: usize) -> Result<(u8, usize), &'static str> {
-    let mut at = from;
-    while at <= from + STRAY_MOST {
-        // Bytes 0xff before a marker are filling, and with a zero behind them they are none.
-        let fill = bytes.get(at..).unwrap_or_default().iter().take_while(|byte| **byte == 0xff).count();
-        match bytes.get(at + fill) {
-            None => return Err(CUT),
-            Some(number) if fill > 0 && *number > 0 => return Ok((*number, at + fill + 1)),
-            Some(_) => at += fill + 1,
-        }
-    }
-    Err(DAMAGED)
-}
-
 /// A component: brightness, or a colour.
 struct Component {
     id: u8,
@@ -153,11 +63,9 @@ impl Picture {
 }
 
 /// What is known behind the headers so far.
-#[derive(Default)]
 struct Walk {
     picture: Option<Picture>,
-    /// Tables of means and of the other coefficients.
-    tables: [[Option<Table>; 4]; 2],
+    tables: Tables,
     /// Units from one restart to the next; 0 if there is none.
     interval: usize,
 }
@@ -181,14 +89,14 @@ impl Scan<'_> {
             if self.refines {
                 return self.bits.bit().map(drop);
             }
-            let length = self.bits.value(means.ok_or(Stop::Unjudged)?)?;
+            let length = self.bits.value(means.ok_or(Stop::Fault(DAMAGED))?)?;
             self.bits.bits(length.min(16))?;
             first = 1;
         }
         if self.progressive && self.band[1] == 0 {
             return Ok(());
         }
-        let table = others.ok_or(Stop::Unjudged)?;
+        let table = others.ok_or(Stop::Fault(DAMAGED))?;
         if self.refines { self.refine(first, table, set) } else { self.coefficients(first, table, set) }
     }
 
@@ -261,19 +169,6 @@ impl Scan<'_> {
 }
 
 impl Walk {
-    fn take_tables(&mut self, mut contents: &[u8]) -> Result<(), Stop> {
-        while let Some((head, rest)) = contents.split_first() {
-            let (class, place) = (usize::from(head >> 4), usize::from(head & 15));
-            let counts: [u8; 16] = rest.get(..16).and_then(|counts| counts.try_into().ok()).ok_or(Stop::Fault(DAMAGED))?;
-            let length = counts.iter().map(|count| usize::from(*count)).sum::<usize>();
-            let values = rest.get(16..16 + length).ok_or(Stop::Fault(DAMAGED))?.to_vec();
-            let slot = self.tables.get_mut(class).and_then(|tables| tables.get_mut(place)).ok_or(Stop::Fault(DAMAGED))?;
-            *slot = Some(Table { counts, values });
-            contents = &rest[16 + length..];
-        }
-        Ok(())
-    }
-
     /// Walks through the scan whose header has these contents and whose pixels begin at `at`. Returns where the next marker is.
     fn scan(&mut self, header: &[u8], bytes: &[u8], at: usize) -> Result<usize, Stop> {
         let picture = self.picture.as_mut().ok_or(Stop::Fault(DAMAGED))?;
@@ -286,8 +181,7 @@ impl Walk {
             return Err(Stop::Fault(DAMAGED));
         }
         let refines = picture.progressive && exactness >> 4 > 0;
-        let bits = Bits { bytes, at, held: 0, left: 0 };
-        let mut scan = Scan { band, refines, progressive: picture.progressive, ended: 0, bits };
+        let mut scan = Scan { band, refines, progressive: picture.progressive, ended: 0, bits: Bits::new(bytes, at) };
         let places: Vec<(usize, [usize; 2])> = parts
             .chunks_exact(2)
             .map(|part| {
@@ -309,7 +203,7 @@ impl Walk {
                 let component = &mut picture.components[*place];
                 component.seen = true;
                 let (across, down) = if alone { (1, 1) } else { (component.across, component.down) };
-                let tables = (self.tables[0].get(*means).and_then(Option::as_ref), self.tables[1].get(*others).and_then(Option::as_ref));
+                let tables = (self.tables.at(0, *means), self.tables.at(1, *others));
                 for block in 0..across * down {
                     let place = (y * down + block / across) * component.row + x * across + block % across;
                     let mut none = 0;
@@ -328,7 +222,7 @@ impl Walk {
 /// The EXIF data in a JPEG's header, if there are any; the error says how its pixels are not whole.
 pub(super) fn judge(bytes: &[u8]) -> Result<Option<&[u8]>, &'static str> {
     let mut exif = None;
-    let (mut walk, mut at) = (Walk::default(), 2);
+    let (mut walk, mut at) = (Walk { picture: None, tables: Tables::standard(), interval: 0 }, 2);
     loop {
         let (number, behind) = marker(bytes, at)?;
         at = behind;
@@ -347,7 +241,7 @@ pub(super) fn judge(bytes: &[u8]) -> Result<Option<&[u8]>, &'static str> {
         let Some(contents) = bytes.get(at + 2..end) else { return Err(if end < at + 2 { DAMAGED } else { CUT }) };
         let done = match number {
             0xc0..=0xc2 => Picture::of(number, contents).map(|picture| walk.picture = Some(picture)),
-            0xc4 => walk.take_tables(contents),
+            0xc4 => walk.tables.take(contents),
             0xdd => {
                 walk.interval = contents.iter().take(2).fold(0, |value, byte| value << 8 | usize::from(*byte));
                 Ok(())
@@ -472,6 +366,31 @@ mod tests {
             }
             let undue = [&whole[..whole.len() - 2], &[0xff, 0xd7, 0xff, 0xd3], &whole[whole.len() - 2..]].concat();
             assert_eq!(judge(&undue), Err(DAMAGED), "{name}");
+        }
+    }
+
+    /// Protects frames of MJPEG, which have no Huffman tables: whole ones are taken, and damaged ones refused, as those with the tables are. One whose codes
+    /// are those of a table that nobody said is damaged.
+    #[test]
+    fn a_picture_without_tables_has_the_standard_ones() {
+        for (name, whole) in encoded().into_iter().filter(|(name, _)| name.contains(" 0 0 ")) {
+            let mut bare = whole;
+            while let Some(at) = markers(&bare, 0xc4..=0xc4).first().copied() {
+                bare.drain(at..at + 2 + usize::from(bare[at + 3]) + 256 * usize::from(bare[at + 2]));
+            }
+            assert!(judge(&bare).is_ok(), "{name}: {:?}", judge(&bare));
+            let read = imgcodecs::imdecode(&Vector::from_slice(&bare), imgcodecs::IMREAD_COLOR).expect("read");
+            assert!(!read.empty(), "{name}: OpenCV reads it too");
+            let mut elsewhere = bare.clone();
+            // The first component's tables.
+            let scan = markers(&bare, 0xda..=0xda)[0];
+            elsewhere[scan + 6] = 0x22;
+            assert_eq!(judge(&elsewhere), Err(DAMAGED), "{name}");
+            let (begin, end) = (pixels(&bare), bare.len() - 2);
+            if end - begin > 600 {
+                bare[begin + (end - begin) / 2..][..256].fill(0x55);
+                assert_eq!(judge(&bare), Err(DAMAGED), "{name}");
+            }
         }
     }
 
