@@ -92,8 +92,11 @@ fn png(bytes: &[u8]) -> Result<Png<'_>, &'static str> {
 /// The EXIF data of a WebP, and how many pictures it has.
 fn webp(bytes: &[u8]) -> Result<(Option<&[u8]>, u64), &'static str> {
     let (mut exif, mut pictures, mut at) = (None, 0, 12);
+    // What stands behind the file's own end is none of it.
+    let end = 8 + number(bytes, 4, 4, true).ok_or(CUT)? as usize;
+    let bytes = bytes.get(..end).ok_or(CUT)?;
     while let (Some(kind), Some(length)) = (bytes.get(at..at + 4), number(bytes, at + 4, 4, true)) {
-        let contents = bytes.get(at + 8..at + 8 + length as usize).ok_or(CUT)?;
+        let contents = bytes.get(at + 8..at + 8 + length as usize).ok_or(DAMAGED)?;
         match kind {
             // Some writers put the head of JPEG's before it.
             b"EXIF" => exif = Some(contents.strip_prefix(b"Exif\0\0").unwrap_or(contents)),
@@ -225,6 +228,21 @@ mod tests {
     use super::*;
     use rand::{Rng as _, RngExt as _};
 
+    /// Protects whole WebP files, behind which a program left something, from a refusal, and measurements from those that are cut, also between two chunks.
+    #[test]
+    fn a_webp_ends_where_it_says() {
+        let whole = b"RIFF\x16\0\0\0WEBPVP8 \x02\0\0\0\0\0EXIF\0\0\0\0";
+        assert_eq!(webp(whole), Ok((Some(&[][..]), 0)));
+        for behind in [&b"ANMF\x40\0\0\0 and more"[..], &[0; 3]] {
+            assert_eq!(webp(&[whole, behind].concat()), Ok((Some(&[][..]), 0)), "{behind:?}");
+        }
+        // The last chunk begins at byte 22.
+        (12..whole.len()).for_each(|length| assert_eq!(webp(&whole[..length]), Err(CUT), "{length}"));
+        let mut longer = *whole;
+        longer[26] = 1;
+        assert_eq!(webp(&longer), Err(DAMAGED));
+    }
+
     /// Protects the commands from files that others made: whatever the numbers in them say, reading ends, and never in a panic.
     #[test]
     fn any_bytes_are_survived() {
@@ -239,7 +257,7 @@ mod tests {
             &[0; 14],
         ]
         .concat();
-        let webp = [&b"RIFF\x40\0\0\0WEBPEXIF\x10\0\0\0"[..], &tiff[..16], b"ANMF\x02\0\0\0\0\0"].concat();
+        let webp = [&b"RIFF\x26\0\0\0WEBPEXIF\x10\0\0\0"[..], &tiff[..16], b"ANMF\x02\0\0\0\0\0"].concat();
         let png =
             [&b"\x89PNG\r\n\x1a\n"[..], &16u32.to_be_bytes(), b"eXIf", &tiff[..16], &[0; 4], &[0; 4], b"IEND", &[0xae, 0x42, 0x60, 0x82]]
                 .concat();
