@@ -21,6 +21,10 @@ const PNG_CHECKSUM: Crc<u32, Table<16>> = Crc::<u32, Table<16>>::new(&CRC_32_ISO
 const ORIENTATION: u16 = 274;
 /// TIFF's tag of what a picture is for (TIFF 6.0, NewSubfileType): bit 0 says that it is smaller, bit 2 that it is a mask.
 const PURPOSE: u16 = 254;
+/// The most directories of a TIFF that are looked at. Chosen by hand: five minutes of pictures in one file.
+const DIRECTORIES_MOST: usize = 10_000;
+/// The most entries of a directory: as many as a TIFF can say (TIFF 6.0); BigTIFF could say more.
+const ENTRIES_MOST: u64 = 65_535;
 /// The largest values that OpenCV itself takes for white (its file `grfmt_pxm.cpp`).
 const KNOWN_WHITE: [f64; 2] = [255.0, 65535.0];
 
@@ -184,7 +188,8 @@ impl<'a> Directories<'a> {
     /// Where the entries of the directory at `at` begin, how many there are, and the length of one, bytes.
     fn entries(&self, at: u64) -> Option<(usize, usize, usize)> {
         let (at, head) = (usize::try_from(at).ok()?, self.wide * self.wide / 8);
-        Some((at.checked_add(head)?, usize::try_from(self.number(at, head)?).ok()?, 4 + 2 * self.wide))
+        let count = self.number(at, head).filter(|count| *count <= ENTRIES_MOST)?;
+        Some((at.checked_add(head)?, count as usize, 4 + 2 * self.wide))
     }
 
     /// The value of the tag in the directory at `at`, if it is one whole number.
@@ -212,7 +217,7 @@ impl<'a> Directories<'a> {
     /// How many pictures there are beside smaller copies and masks; the first always is one.
     fn pictures(&self) -> u64 {
         let (mut seen, mut at, mut pictures) = (BTreeSet::new(), self.first, 0);
-        while at > 0 && seen.insert(at) {
+        while at > 0 && seen.len() < DIRECTORIES_MOST && seen.insert(at) {
             let Some((begin, count, length)) = self.entries(at) else { break };
             let copy = self.value_in(at, PURPOSE).is_some_and(|purpose| purpose & 0b101 > 0);
             pictures += u64::from(seen.len() == 1 || !copy);
@@ -241,6 +246,22 @@ mod tests {
         let mut longer = *whole;
         longer[26] = 1;
         assert_eq!(webp(&longer), Err(DAMAGED));
+    }
+
+    /// Protects the commands from files that take hours: a chain of directories, and the entries of one, have a bound.
+    #[test]
+    fn a_tiff_without_end_is_left() {
+        // Each directory has no entry, and the next one lies behind it.
+        let mut chain = b"II*\0\x08\0\0\0".to_vec();
+        (0..30_000u32).for_each(|i| chain.extend([&[0, 0][..], &(8 + 6 * (i + 1)).to_le_bytes()].concat()));
+        assert_eq!(Directories::read(&chain).map(|all| all.pictures()), Some(DIRECTORIES_MOST as u64));
+        for (count, pictures, turn) in [(ENTRIES_MOST, 2, Some(6)), (ENTRIES_MOST + 1, 1, None)] {
+            let entry = [&b"\x12\x01\x03\0"[..], &1u64.to_le_bytes(), &[6, 0, 0, 0, 0, 0, 0, 0]].concat();
+            let head = [&b"II\x2b\0\x08\0\0\0"[..], &16u64.to_le_bytes(), &count.to_le_bytes()].concat();
+            let bytes = [head, entry.repeat(count as usize), (32 + 20 * count).to_le_bytes().to_vec(), vec![0; 16]].concat();
+            let all = Directories::read(&bytes).expect("a TIFF");
+            assert_eq!((all.pictures(), all.value(ORIENTATION)), (pictures, turn), "{count}");
+        }
     }
 
     /// Protects the commands from files that others made: whatever the numbers in them say, reading ends, and never in a panic.

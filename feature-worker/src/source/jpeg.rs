@@ -11,6 +11,12 @@ use super::jpeg_codes::{Bits, CUT, DAMAGED, Stop, Table, Tables, marker};
 
 /// The most blocks of a component that are walked through: those of the largest picture that is read, 4096 x 4096 px, and as many again for filling up.
 const BLOCKS_MAX: usize = 1 << 19;
+/// The most components of a picture (ITU-T T.81, B.2.3, for a scan); cameras have 1 or 3, and printers 4.
+const COMPONENTS_MOST: usize = 4;
+/// The most blocks that are walked through in all scans together. Chosen by hand: a picture has about ten scans, and this is 16 times the largest picture of all its
+/// components.
+const WALKED_MOST: usize = 16 * COMPONENTS_MOST * BLOCKS_MAX;
+
 /// A component: brightness, or a colour.
 struct Component {
     id: u8,
@@ -38,6 +44,9 @@ impl Picture {
     fn of(marker: u8, header: &[u8]) -> Result<Self, Stop> {
         let [8, h1, h0, w1, w0, count, parts @ ..] = header else { return Err(Stop::Unjudged) };
         let size = [usize::from(*w1) << 8 | usize::from(*w0), usize::from(*h1) << 8 | usize::from(*h0)];
+        if usize::from(*count) > COMPONENTS_MOST {
+            return Err(Stop::Fault(DAMAGED));
+        }
         let parts: Vec<&[u8]> = parts.chunks_exact(3).take(usize::from(*count)).collect();
         let samples = |part: &[u8]| [usize::from(part[1] >> 4), usize::from(part[1] & 15)];
         let largest = parts.iter().fold([0, 0], |most: [usize; 2], part| [0, 1].map(|i| most[i].max(samples(part)[i])));
@@ -68,6 +77,8 @@ struct Walk {
     tables: Tables,
     /// Units from one restart to the next; 0 if there is none.
     interval: usize,
+    /// Blocks of all scans so far.
+    walked: usize,
 }
 
 /// What one scan tells.
@@ -177,7 +188,11 @@ impl Walk {
             return Err(Stop::Fault(DAMAGED));
         };
         let band = if picture.progressive { [*first, *last] } else { [0, 63] };
-        if band[1] > 63 || band[0] > band[1] || count == 0 || (picture.progressive && band[0] == 0 && band[1] > 0) {
+        if band[1] > 63
+            || band[0] > band[1]
+            || !(1..=COMPONENTS_MOST).contains(&count)
+            || (picture.progressive && band[0] == 0 && band[1] > 0)
+        {
             return Err(Stop::Fault(DAMAGED));
         }
         let refines = picture.progressive && exactness >> 4 > 0;
@@ -193,6 +208,11 @@ impl Walk {
         // One component alone has its own blocks one by one, and several have units of some blocks of each.
         let alone = count == 1;
         let units = if alone { picture.components[places[0].0].own } else { picture.units };
+        let blocks = |place: usize| if alone { 1 } else { picture.components[place].across * picture.components[place].down };
+        self.walked += units[0] * units[1] * places.iter().map(|(place, _)| blocks(*place)).sum::<usize>();
+        if self.walked > WALKED_MOST {
+            return Err(Stop::Fault(DAMAGED));
+        }
         for unit in 0..units[0] * units[1] {
             if self.interval > 0 && unit > 0 && unit % self.interval == 0 {
                 scan.ended = 0;
@@ -222,7 +242,7 @@ impl Walk {
 /// The EXIF data in a JPEG's header, if there are any; the error says how its pixels are not whole.
 pub(super) fn judge(bytes: &[u8]) -> Result<Option<&[u8]>, &'static str> {
     let mut exif = None;
-    let (mut walk, mut at) = (Walk { picture: None, tables: Tables::standard(), interval: 0 }, 2);
+    let (mut walk, mut at) = (Walk { picture: None, tables: Tables::standard(), interval: 0, walked: 0 }, 2);
     loop {
         let (number, behind) = marker(bytes, at)?;
         at = behind;
@@ -240,6 +260,7 @@ pub(super) fn judge(bytes: &[u8]) -> Result<Option<&[u8]>, &'static str> {
         let end = at + usize::from(*high) * 256 + usize::from(*low);
         let Some(contents) = bytes.get(at + 2..end) else { return Err(if end < at + 2 { DAMAGED } else { CUT }) };
         let done = match number {
+            0xc0..=0xc2 if walk.picture.is_some() => Err(Stop::Fault(DAMAGED)),
             0xc0..=0xc2 => Picture::of(number, contents).map(|picture| walk.picture = Some(picture)),
             0xc4 => walk.tables.take(contents),
             0xdd => {
@@ -392,6 +413,38 @@ mod tests {
                 assert_eq!(judge(&bare), Err(DAMAGED), "{name}");
             }
         }
+    }
+
+    /// Protects the commands from files that take hours or gigabytes: a second frame, more components than a picture has, and more blocks in all scans together than
+    /// encoders write are damage.
+    #[test]
+    fn more_than_any_picture_has_is_refused() {
+        let header = |number: u8, contents: &[u8]| [&[0xff, number, 0, contents.len() as u8 + 2][..], contents].concat();
+        let frame = |side_px: u16, parts: u8| {
+            let [high, low] = side_px.to_be_bytes();
+            let parts_of = (1..=parts).flat_map(|id| [id, 0x11, 0]).collect::<Vec<_>>();
+            header(0xc2, &[&[8, high, low, high, low, parts][..], &parts_of].concat())
+        };
+        let scan = |parts: u8, band: [u8; 2]| {
+            let parts_of = (1..=parts).flat_map(|id| [id, 0]).collect::<Vec<_>>();
+            header(0xda, &[&[parts][..], &parts_of, &[band[0], band[1], 0]].concat())
+        };
+        let picture = |parts: &[Vec<u8>]| [&[0xff, 0xd8][..], &parts.concat(), &[0xff, 0xd9]].concat();
+        // The first code of the standard table of means, 00, is a mean of no length: 8 x 8 px of up to 4 components are a byte.
+        for parts in [1, 3, 4] {
+            assert!(judge(&picture(&[frame(8, parts), scan(parts, [0, 0]), vec![0]])).is_ok(), "{parts}");
+        }
+        assert_eq!(judge(&picture(&[frame(8, 5), scan(4, [0, 0]), vec![0]])), Err(DAMAGED), "five components");
+        assert_eq!(judge(&picture(&[frame(8, 1), scan(1, [0, 0]), vec![0], frame(8, 1)])), Err(DAMAGED), "two frames");
+        assert_eq!(
+            judge(&picture(&[frame(8, 1), [scan(1, [0, 0]), vec![0]].concat(), header(0xda, &[5, 1, 0, 1, 0, 1, 0, 1, 0, 1, 0, 0, 0, 0])])),
+            Err(DAMAGED)
+        );
+        // A table with one code: 16384 blocks that end, and as many more as 14 bits say. 4096 x 4096 px have 16 times as many.
+        let ends = header(0xc4, &[&[0x10, 1][..], &[0; 15], &[0xe0]].concat());
+        let pass = [scan(1, [1, 63]), vec![0; 16 * 15 / 8]].concat();
+        let scans = |count: usize| picture(&[frame(4096, 1), scan(1, [0, 0]), vec![0; (1 << 18) / 4], ends.clone(), pass.repeat(count)]);
+        assert_eq!((judge(&scans(100)).is_ok(), judge(&scans(200))), (true, Err(DAMAGED)));
     }
 
     /// Protects the commands from files that others made: whatever is in them, the walk ends, and never in a panic.
