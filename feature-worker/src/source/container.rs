@@ -2,7 +2,7 @@
 //!
 //! OpenCV tells the first in a way that differs between its versions, and the others not at all. Read are MP4 and QuickTime boxes
 //! (ISO/IEC 14496-12), the RIFF chunks of AVI, and the elements of Matroska and WebM (RFC 8794); of other files nothing is said.
-//! For commands that read files, on their own thread; allocates at most [`INDEX_MOST`] bytes. Damaged files are no errors here: what
+//! For commands that read files, on their own thread; allocates at most [`INDEX_MOST`] bytes and eight for each of [`PICTURES_MOST`] pictures. Damaged files are no errors here: what
 //! cannot be read is left out, and numbers from the file are used in checked arithmetic only.
 
 use std::fs::File;
@@ -16,6 +16,8 @@ use super::rhythm::Rhythm;
 
 /// The largest index of an MP4 file that is read, bytes. Chosen by hand: an hour at 60 frames a second has about 3 MB.
 const INDEX_MOST: u64 = 1 << 26;
+/// The most pictures of an index whose times are read. Chosen by hand: 19 hours at 60 frames a second.
+const PICTURES_MOST: usize = 1 << 22;
 /// Part of a matrix's larger numbers below which the others count as zero. Chosen by hand: matrices of cameras are exact.
 const NO_SHEAR: f64 = 0.01;
 
@@ -114,7 +116,7 @@ impl Turn {
 }
 
 /// What a container says.
-#[derive(Debug, Clone, Copy, PartialEq)]
+#[derive(Debug, Clone, PartialEq)]
 pub(super) struct Container {
     /// How the pictures are turned: `None` if this container does not say, `Some(None)` if it says an odd angle.
     pub turn: Option<Option<Turn>>,
@@ -122,6 +124,8 @@ pub(super) struct Container {
     pub end_s: Option<f64>,
     /// How the pictures follow each other, if the file says it of each.
     pub rhythm: Option<Rhythm>,
+    /// When each picture is shown, in their order, ms from the first one; empty if no index of the whole file says it.
+    pub index_ms: Vec<f64>,
     /// Whether the time from one to the next is always the same, and OpenCV tells it as the rate.
     pub fixed_rate: bool,
     /// Whether this is a stream without a container, which has no times; what OpenCV tells of its rate is made up.
@@ -139,6 +143,7 @@ impl Container {
         turn: None,
         end_s: None,
         rhythm: None,
+        index_ms: Vec::new(),
         fixed_rate: false,
         raw: false,
         counts_frames: false,
@@ -395,7 +400,7 @@ fn movie(moov: &[u8]) -> Container {
             if wide { u64_at(header, 28).filter(|d| *d != u64::MAX) } else { u32_at(header, 20).filter(|d| *d != u32::MAX).map(u64::from) };
         known.end_s = scale.zip(duration.filter(|d| *d > 0)).map(|(scale, duration)| duration as f64 / scale);
     }
-    known.rhythm = rhythm(track);
+    (known.rhythm, known.index_ms) = (rhythm(track), index_ms(track).unwrap_or_default());
     // In a file of fragments the index holds no pictures, and the length stands elsewhere, if anywhere.
     if let Some(fragments) = inside(moov, &[b"mvex"]) {
         let alone = boxes(moov).filter(|(kind, _)| kind == b"trak").count() == 1;
@@ -406,7 +411,7 @@ fn movie(moov: &[u8]) -> Container {
         });
         let told_s = scale.zip(duration.filter(|d| *d > 0 && alone)).map(|(scale, duration)| duration as f64 / scale);
         // The track's own duration may be that of the first fragment alone.
-        known = Container { counts_frames: false, end_s: told_s, open_end: told_s.is_none(), ..known };
+        known = Container { counts_frames: false, end_s: told_s, open_end: told_s.is_none(), index_ms: Vec::new(), ..known };
     }
     known
 }
@@ -424,6 +429,30 @@ fn rhythm(track: &[u8]) -> Option<Rhythm> {
     Rhythm::of(&steps)
 }
 
+/// When a track's pictures are shown, by its index; `None` also where its edit list has more than one part.
+fn index_ms(track: &[u8]) -> Option<Vec<f64>> {
+    let (scale, _) = inside(track, &[b"mdia", b"mdhd"]).and_then(scale_and_duration)?;
+    let tables = inside(track, &[b"mdia", b"minf", b"stbl"])?;
+    let each = |kind| {
+        let runs = inside(tables, &[kind]).unwrap_or_default();
+        let run = move |i: usize| Some((u32_at(runs, 8 + 8 * i)?, u32_at(runs, 12 + 8 * i)?));
+        (0..u32_at(runs, 4).unwrap_or(0) as usize).map_while(run).flat_map(|(count, value)| std::iter::repeat_n(value, count as usize))
+    };
+    // Each is decoded so long after the one before, and shown so much later.
+    let later = each(b"ctts").map(|units| i64::from(units as i32)).chain(std::iter::repeat(0));
+    let decoded = each(b"stts").take(PICTURES_MOST + 1).scan(0, |at, step| Some(std::mem::replace(at, *at + i64::from(step))));
+    let mut shown: Vec<i64> = decoded.zip(later).map(|(at, later)| at + later).collect();
+    shown.sort_unstable();
+    let edits = inside(track, &[b"edts", b"elst"]).unwrap_or_default();
+    let long = |i: usize| Some(u64_at(edits, 16 + 20 * i)? as i64);
+    let edit = |i: usize| if edits[0] > 0 { long(i) } else { Some(i64::from(u32_at(edits, 12 + 12 * i)? as i32)) };
+    // A negative one is a pause before the first picture.
+    let mut begins = (0..u32_at(edits, 4).unwrap_or(0) as usize).map_while(edit).filter(|at| *at >= 0);
+    let begin = begins.next().unwrap_or(i64::MIN);
+    let shown = shown.get(shown.partition_point(|at| *at < begin)..).filter(|_| begins.next().is_none() && shown.len() <= PICTURES_MOST)?;
+    Some(shown.iter().map(|at| (at - shown[0]) as f64 * 1e3 / scale).collect())
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -436,7 +465,10 @@ mod tests {
         let mut random = rand_pcg::Pcg32::new(1, 1);
         let boxed = |kind: &[u8], inner: &[u8]| [&(inner.len() as u32 + 8).to_be_bytes(), kind, inner].concat();
         let mut track = boxed(b"tkhd", &[0; 84]);
-        let times = [boxed(b"stts", &[0, 0, 0, 0, 0, 0, 0, 1, 0, 0, 0, 9, 0, 0, 0, 5]), Vec::new()].concat();
+        let run = |kind: &[u8], count: u8, value: u8| boxed(kind, &[0, 0, 0, 0, 0, 0, 0, 1, 0, 0, 0, count, 0, 0, 0, value]);
+        // The first is decoded first, shown third, and cut out with the first that is shown.
+        let times = [run(b"stts", 5, 5), run(b"ctts", 1, 11)].concat();
+        track.extend(boxed(b"edts", &boxed(b"elst", &[0, 0, 0, 0, 0, 0, 0, 1, 0, 0, 0, 9, 0, 0, 0, 6, 0, 1, 0, 0])));
         let media =
             [boxed(b"mdhd", &[7; 24]), boxed(b"hdlr", b"\0\0\0\0\0\0\0\0vide\0\0\0\0"), boxed(b"minf", &boxed(b"stbl", &times))].concat();
         track.extend(boxed(b"mdia", &media));
@@ -445,7 +477,9 @@ mod tests {
         let avi = [&b"RIFF"[..], &200u32.to_le_bytes(), b"AVI ", &[0; 200]].concat();
         let mkv = [&[0x1a, 0x45, 0xdf, 0xa3, 0x84, 1, 2, 3, 4, 0x18, 0x53, 0x80, 0x67, 0x10, 0, 1, 0][..], &[0; 200]].concat();
         let live = [&mkv[..13], &[0xff, 0x1f, 0x43, 0xb6, 0x75, 0xff, 0xa3, 0x85, 1, 2, 3, 4, 5], &[0xec, 0x81, 7].repeat(50)].concat();
-        assert!(rhythm_in(&mp4, file.path()).is_some(), "the whole file is read");
+        let whole = read_in(&mp4, file.path());
+        let shown_ms = [0.0, 1.0, 5.0, 10.0].map(|units| units * 1e3 / f64::from(0x0707_0707)).to_vec();
+        assert_eq!((whole.rhythm.is_some(), whole.index_ms), (true, shown_ms));
         for seed in [mp4, avi, mkv, live] {
             for _ in 0..3000 {
                 let mut bytes = seed.clone();
@@ -454,13 +488,13 @@ mod tests {
                     bytes[at] = [0, 1, 0xff, 0x7f, random.next_u32() as u8][random.random_range(0..5)];
                 }
                 bytes.truncate(random.random_range(0..=bytes.len()));
-                rhythm_in(&bytes, file.path());
+                read_in(&bytes, file.path());
             }
         }
     }
 
-    fn rhythm_in(bytes: &[u8], file: &Path) -> Option<Rhythm> {
+    fn read_in(bytes: &[u8], file: &Path) -> Container {
         std::fs::write(file, bytes).expect("written");
-        Container::read(file).expect("read").rhythm
+        Container::read(file).expect("read")
     }
 }

@@ -232,8 +232,8 @@ impl Walk {
             }
         }
         // Some encoders write a restart behind the last interval too.
-        if self.interval > 0 {
-            let _ = scan.bits.restart((units[0] * units[1] - 1) / self.interval);
+        if let Some(before) = (units[0] * units[1] - 1).checked_div(self.interval) {
+            let _ = scan.bits.restart(before);
         }
         Ok(scan.bits.at)
     }

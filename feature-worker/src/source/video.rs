@@ -2,7 +2,8 @@
 //!
 //! For commands that read files and for the worker when it plays one; on their own thread. OpenCV's FFmpeg decodes into one matrix that is
 //! reused. The pictures are turned as the file's metadata say, by our own code, because OpenCV 4.6 turns them the wrong way round. Pictures
-//! that the file promises and that do not come, and gaps in a file of one rate, are an error that names the first of them, or they are counted. Where the
+//! that the file promises and that do not come, and gaps in a file of one rate, are an error that names the first of them, or they are counted; a gap that the
+//! file's own index says was never recorded, and is said. Where the
 //! container does not say how its pictures follow each other, it is decoded once for their times alone. What a decoder patches up
 //! by itself (a damaged block in the middle of a picture) cannot be seen here.
 
@@ -91,6 +92,10 @@ pub(super) struct Video {
     rhythm: Option<Rhythm>,
     times: Times,
     decoded: u64,
+    /// Pictures that the file promises, up to the last one that came, and that did not.
+    lost: u64,
+    /// Pictures that the file's own index leaves out.
+    unrecorded: u64,
     partial: bool,
     remark: Option<String>,
     picture: Mat,
@@ -142,6 +147,8 @@ impl Video {
             rhythm,
             times: Times::new(period_ms, guess_ms),
             decoded: 0,
+            lost: 0,
+            unrecorded: 0,
             partial,
             remark: None,
             picture: Mat::default(),
@@ -160,9 +167,13 @@ impl Video {
             let Some(undecoded) = advance(&mut self.capture) else { return self.end().map(|()| None) };
             let read = self.capture.retrieve_def(&mut self.picture).unwrap_or(false) && !self.picture.empty();
             let stamp_ms = self.capture.get(videoio::CAP_PROP_POS_MSEC)?;
+            let before = self.times;
             let missing = self.times.add((!self.container.raw).then_some(stamp_ms), undecoded);
             let number = self.times.count;
-            if (missing > 0 || !read) && !self.partial {
+            let lost = self.promised_between(before).map_or(missing, |promised| missing.min(promised));
+            self.lost += lost + u64::from(!read);
+            self.unrecorded += missing - lost;
+            if (lost > 0 || !read) && !self.partial {
                 let first = if missing > 0 { number - missing } else { number };
                 let seconds = first.saturating_sub(1) as f64 * self.times.mean_ms() / 1e3;
                 return Err(self.incomplete(format!("frame {first} (at {seconds:.2} s) is missing, or cannot be decoded")));
@@ -175,6 +186,14 @@ impl Video {
         }
     }
 
+    /// How many pictures the index has between the last one and that of `before`; `None` where no index says it.
+    fn promised_between(&self, before: Times) -> Option<u64> {
+        let half_ms = self.times.period_ms? / 2.0;
+        let index_ms = Some(&self.container.index_ms).filter(|index| !index.is_empty() && before.count > 0)?;
+        let [from, to] = [before.last_ms + half_ms, self.times.last_ms - half_ms].map(|end| index_ms.partition_point(|at| *at < end));
+        Some(to.saturating_sub(from) as u64)
+    }
+
     fn incomplete(&self, what: String) -> SourceError {
         SourceError::Incomplete { path: self.path.clone(), what }
     }
@@ -185,32 +204,39 @@ impl Video {
             let what = "holds no frame that can be decoded; is it truncated?".into();
             return Err(SourceError::File { path: self.path.clone(), what });
         }
-        let came = self.times.count;
-        let short = self.promised.is_none_or(|promised| came < promised);
+        let (came, missing) = (self.times.count, self.lost);
+        // An index counts no pictures that it leaves out.
+        let found = came - self.unrecorded;
+        let short = self.promised.is_none_or(|promised| found < promised);
         let end_s = self.container.end_s.or_else(|| {
             let promised = self.promised.filter(|_| self.container.fixed_rate)?;
             Some(promised as f64 * self.times.mean_ms() / 1e3)
         });
         let seconds = (self.times.last_ms + self.times.mean_ms()) / 1e3;
         let early = end_s.is_some_and(|end| seconds + END_PERIODS * self.times.mean_ms() / 1e3 < end);
-        let missing = came - self.decoded;
         // The count in an AVI's header may be one off. An MP4 may show fewer than it counts, by its edit list.
-        let fewer = self.container.fixed_rate && self.promised.is_some_and(|promised| came + 1 < promised);
+        let fewer = self.container.fixed_rate && self.promised.is_some_and(|promised| found + 1 < promised);
         let cut = self.container.missing_bytes.is_some();
         let mut said = Vec::new();
         if missing > 0 {
             said.push(format!("{missing} of {came} frames are missing, or cannot be decoded, and are left out"));
         }
-        if short && (early || fewer || cut) {
-            let of = self.promised.map_or(String::new(), |promised| format!(" of {promised}"));
+        if self.unrecorded > 0 {
+            said.push(format!(
+                "{} of {came} frames were never recorded, by the file's own index, and are gaps in the numbers",
+                self.unrecorded
+            ));
+        }
+        if cut || (short && (early || fewer)) {
+            let of = self.promised.map_or(String::new(), |promised| format!(" of {}", promised + self.unrecorded));
             let why = if cut { "the file is truncated" } else { "what follows cannot be decoded, or is missing" };
             let what = format!("ends after frame {came}{of} ({seconds:.2} s): {why}");
-            if !self.partial {
+            if short && !self.partial {
                 return Err(self.incomplete(what));
             }
             said.push(what);
-        } else if let Some(promised) = self.promised.filter(|promised| came < *promised) {
-            said.push(format!("{came} of its {promised} frames are shown; the others are cut out by its edit list, or damaged"));
+        } else if let Some(promised) = self.promised.filter(|promised| found < *promised) {
+            said.push(format!("{found} of its {promised} frames are shown; the others are cut out by its edit list, or damaged"));
         }
         if let Some(Rhythm { steps, long, usual_ms, .. }) = self.rhythm.filter(|rhythm| !rhythm.fixed && rhythm.long > 0) {
             // A camera may have dropped them; the times of the others are right.

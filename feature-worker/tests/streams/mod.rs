@@ -1,21 +1,20 @@
 //! Videos with gaps in their times, with a rate that varies, and streams that have no times at all.
 
+use std::path::Path;
+use std::process::Command;
+
 use feature_worker::source::Recording;
 use opencv::core::Vector;
 use opencv::imgcodecs;
 use opencv::prelude::*;
 
 use super::matroska::blocks;
-use super::{FRAMES, Outcome, find, inspect, pour, refused, report, set_steps, times, video};
+use super::{FRAMES, Outcome, find, inspect, pour, refused, report, set_steps, text, times, video, write_config};
 
-/// Protects the numbers of frames of an MP4: a picture that is longer than the others in a file of one rate is followed by a gap, which is refused with its number, and numbered
-/// with --partial.
-#[test]
-fn a_gap_in_an_index_is_named() -> Outcome {
-    let directory = tempfile::tempdir()?;
-    let path = directory.path().join("gap.mp4");
-    video(&path, ['m', 'p', '4', 'v'], 25.0)?;
-    let bytes = std::fs::read(&path)?;
+/// An MP4 at 25 Hz whose index leaves out two pictures behind the eleventh.
+fn with_gap(path: &Path) -> Result<Vec<u8>, Box<dyn std::error::Error>> {
+    video(path, ['m', 'p', '4', 'v'], 25.0)?;
+    let bytes = std::fs::read(path)?;
     let at = find(&bytes, b"stts", 0);
     let step = u32::from_be_bytes(bytes[at + 16..at + 20].try_into()?);
     let mut gap = set_steps(&bytes, &[(10, step), (1, 3 * step), (FRAMES as u32 - 11, step)]);
@@ -23,13 +22,78 @@ fn a_gap_in_an_index_is_named() -> Outcome {
     for at in [find(&gap, b"elst", 0) + 12, find(&gap, b"tkhd", 0) + 24] {
         gap[at..at + 4].copy_from_slice(&((FRAMES as u32 + 2) * 40).to_be_bytes());
     }
-    std::fs::write(&path, &gap)?;
-    refused(&inspect(directory.path(), &[&path], &[])?, &["gap.mp4", "frame 12 (at 0.44 s) is missing", "--partial"]);
-    let (part, said) = report(&inspect(directory.path(), &[&path], &["--partial"])?)?;
-    assert!(part["frames"] == FRAMES && said.contains("2 of 26 frames are missing"), "{part} {said}");
+    Ok(gap)
+}
+
+/// A number of an MP4's index.
+fn number(bytes: &[u8], at: usize) -> usize {
+    u32::from_be_bytes(bytes[at..at + 4].try_into().expect("four bytes")) as usize
+}
+
+/// Where the pictures of an MP4 lie that has them one behind the other.
+fn samples(bytes: &[u8]) -> Vec<std::ops::Range<usize>> {
+    let (chunks, sizes) = (find(bytes, b"stco", 0), find(bytes, b"stsz", 0));
+    assert_eq!(number(bytes, chunks + 8), 1, "one chunk");
+    let mut at = number(bytes, chunks + 12);
+    let lengths = (0..number(bytes, sizes + 12)).map(|i| number(bytes, sizes + 16 + 4 * i));
+    lengths.map(|length| (at, at += length).0..at).collect()
+}
+
+/// Protects who films with a telephone or a recorder that drops a picture: where the file's own index says the long step, the file is taken and played, the gap is in
+/// the numbers, and it is said.
+#[test]
+fn a_gap_of_the_index_is_numbered() -> Outcome {
+    let directory = tempfile::tempdir()?;
+    let path = directory.path().join("gap.mp4");
+    let gap = with_gap(&path)?;
+    std::fs::write(&path, gap)?;
+    let words = "gap.mp4: 2 of 26 frames were never recorded";
+    let (all, said) = report(&inspect(directory.path(), &[&path], &[])?)?;
+    assert!(all["frames"] == FRAMES && said.contains(words) && said.lines().count() == 1, "{all} {said}");
     let all = times(directory.path())?;
     assert_eq!(all.iter().map(|(number, _)| *number).collect::<Vec<_>>(), (1..=26).filter(|n| ![12, 13].contains(n)).collect::<Vec<_>>());
     assert!(all.iter().all(|(number, t_s)| (t_s - (number - 1) as f64 * 0.04).abs() < 2e-3), "{all:?}");
+    let (config, written) = write_config(directory.path(), "gap", |c| {
+        (c.camera.source, c.camera.path, c.camera.fps) = (shared::config::CameraSource::Video, path.display().to_string(), 25.0);
+    })?;
+    let played = Command::new(env!("CARGO_BIN_EXE_feature-worker")).args(["run", "--config"]).arg(&config).output()?;
+    shared::ipc::remove_files(&written.cell.name);
+    assert!(played.status.success() && text(&played).contains(words), "{}", text(&played));
+    Ok(())
+}
+
+/// Protects measurements from pictures that the index has and that cannot be decoded, or lie behind a file's end: they are refused also in a file whose index leaves others
+/// out, and with --partial neither is hidden by the other.
+#[test]
+fn what_an_index_promises_is_looked_for() -> Outcome {
+    let directory = tempfile::tempdir()?;
+    let path = directory.path().join("gap.mp4");
+    let gap = with_gap(&path)?;
+    let places = samples(&gap);
+    assert_eq!(places.len() as i32, FRAMES);
+    let mut damaged = gap.clone();
+    damaged[places[5].clone()].fill(0);
+    std::fs::write(&path, &damaged)?;
+    refused(&inspect(directory.path(), &[&path], &[])?, &["gap.mp4", "frame 6 (at 0.20 s) is missing", "--partial"]);
+    let (part, said) = report(&inspect(directory.path(), &[&path], &["--partial"])?)?;
+    let missing = FRAMES as u64 - part["frames"].as_u64().unwrap_or(0);
+    assert!(missing > 0 && said.contains(&format!("{missing} of 26 frames are missing")), "{part} {said}");
+    // The index before the pictures, as a file is that may be played while it is copied; the last two were not.
+    let (data, index) = (find(&gap, b"mdat", 0) - 4, find(&gap, b"moov", 0) - 4);
+    let mut moved = gap[index..].to_vec();
+    let place = find(&moved, b"stco", 0) + 12;
+    let begin = number(&moved, place) + moved.len();
+    moved[place..place + 4].copy_from_slice(&(begin as u32).to_be_bytes());
+    let front = [&gap[..data], &moved, &gap[data..index]].concat();
+    std::fs::write(&path, &front)?;
+    assert_eq!(report(&inspect(directory.path(), &[&path], &[])?)?.0["frames"], FRAMES);
+    std::fs::write(&path, &front[..places[22].start + moved.len()])?;
+    refused(&inspect(directory.path(), &[&path], &[])?, &["gap.mp4", "ends after frame 24 of 26 (0.96 s)", "truncated", "--partial"]);
+    let (part, said) = report(&inspect(directory.path(), &[&path], &["--partial"])?)?;
+    assert!(
+        part["frames"] == FRAMES - 2 && said.contains("2 of 24 frames were never") && said.contains("ends after frame 24 of 26"),
+        "{part} {said}"
+    );
     Ok(())
 }
 
