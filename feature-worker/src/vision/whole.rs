@@ -66,7 +66,7 @@ const SIDE_FOLLOWS: f32 = 0.15;
 type RowPixels = [[u8; COLUMNS]; 3];
 
 /// Least and largest level of a row, each part by itself.
-#[derive(Clone, Copy, PartialEq)]
+#[derive(Clone, Copy)]
 struct Levels {
     low: [u8; 3],
     high: [u8; 3],
@@ -133,7 +133,6 @@ impl WholeCheck {
         self.seen = self.seen.saturating_add(1);
         let (mut plain_run, mut new_plain_run, mut old_run) = (0usize, 0usize, 0usize);
         let (mut most_new_plain, mut most_old) = (0usize, 0usize);
-        let (mut fill_run, mut most_fill) = (0usize, 0usize);
         let (mut rows_new, mut rows_other) = (0usize, 0usize);
         for i in 0..self.before.len() {
             let look = look_at(pixels.row(i * self.row_step), &self.columns, &mut self.before[i], &mut self.older[i]);
@@ -142,23 +141,17 @@ impl WholeCheck {
             let newly = look.one_colour && !self.levels_before[i].could_become(look.levels);
             new_plain_run = if newly { new_plain_run + 1 } else { 0 };
             most_new_plain = most_new_plain.max(new_plain_run);
-            // A decoder fills up with one level, the card's own if that came last.
-            let alike = look.levels.span() == 0 && i > 0 && look.levels == self.levels[i - 1];
-            let is_fill = look.one_colour && alike && self.levels_before[i].span() > ONE_COLOUR;
-            fill_run = if is_fill { fill_run + 1 } else { 0 };
-            most_fill = most_fill.max(fill_run);
             let tells = look.levels.span() > COMPRESSED;
             old_run = if look.old && tells { old_run + 1 } else { 0 };
             most_old = most_old.max(old_run);
-            if !look.old && !look.one_colour {
+            if !look.old && tells {
                 rows_other += 1;
                 rows_new += usize::from(look.new);
             }
         }
         let part = PART_PX.div_ceil(self.row_step);
         let ends_early = self.reaches_glass && plain_run >= part;
-        let lacks = most_new_plain >= part || most_fill >= 2 * part;
-        let missing = ends_early || (!first && lacks && self.broken <= scene_frames);
+        let missing = ends_early || (!first && most_new_plain >= part && self.broken <= scene_frames);
         let torn = !first && most_old >= part && rows_new > 0 && rows_new as f32 >= NEW_ROWS * rows_other as f32;
         let whole = !missing && !torn && !self.side.is_displaced(pixels);
         if whole || first || self.broken > scene_frames {
@@ -344,9 +337,7 @@ mod tests {
             let is_cut = i >= 88;
             if is_cut {
                 let row = 3 * SIZE_PX[0] as usize;
-                // Another colour, and the card's own.
-                let fill = if i == 88 { [110; 3] } else { [140, 150, 163] };
-                picture.data_bytes_mut()?[100 * row..180 * row].chunks_exact_mut(3).for_each(|pixel| pixel.copy_from_slice(&fill));
+                picture.data_bytes_mut()?[100 * row..180 * row].fill(110);
             }
             let image = Image {
                 width_px: SIZE_PX[0] as u32,
