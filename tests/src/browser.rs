@@ -7,6 +7,7 @@ use std::io::{BufRead as _, BufReader, Read as _, Write as _};
 use std::net::TcpStream;
 use std::path::Path;
 use std::process::{Child, Command, Stdio};
+use std::sync::{Condvar, Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
 use serde_json::{Value, json};
@@ -14,8 +15,35 @@ use serde_json::{Value, json};
 /// The key under which WebDriver passes elements. Source: WebDriver, section "Elements".
 const ELEMENT: &str = "element-6066-11e4-a52e-4f735466cecf";
 
+/// How many browsers of this process are open. A browser keeps a core busy, so there are never more than cores (and two): what a page does to
+/// a running pour would come too late.
+static OPEN: Mutex<usize> = Mutex::new(0);
+static CLOSED: Condvar = Condvar::new();
+
+/// One of the browsers that may be open at once.
+struct Place;
+
+impl Place {
+    /// Waits until there is a place.
+    fn take() -> Self {
+        // At least two: a test that watches one page from another opens both.
+        let places = std::thread::available_parallelism().map_or(1, std::num::NonZero::get).max(2);
+        let open = OPEN.lock().unwrap_or_else(PoisonError::into_inner);
+        *CLOSED.wait_while(open, |open| *open >= places).unwrap_or_else(PoisonError::into_inner) += 1;
+        Self
+    }
+}
+
+impl Drop for Place {
+    fn drop(&mut self) {
+        *OPEN.lock().unwrap_or_else(PoisonError::into_inner) -= 1;
+        CLOSED.notify_one();
+    }
+}
+
 /// A browser with one window.
 pub struct Browser {
+    _place: Place,
     driver: Child,
     port: u16,
     session: String,
@@ -42,6 +70,7 @@ impl Browser {
 
     fn begin(mut command: Command, (width, height): (u32, u32)) -> Option<Self> {
         command.arg("--port=0").stdin(Stdio::null()).stdout(Stdio::piped()).stderr(Stdio::null());
+        let place = Place::take();
         let begun = Command::new("chromedriver").arg("--version").stdout(Stdio::null()).status().and_then(|_| command.spawn());
         let Ok(mut driver) = begun else {
             println!("not run: there is no chromedriver (scripts/install chromium-driver)");
@@ -52,7 +81,7 @@ impl Browser {
         let port = lines.by_ref().map_while(Result::ok).find_map(said);
         // What it says more is not wanted, and must not hold it up.
         std::thread::spawn(move || lines.map_while(Result::ok).for_each(drop));
-        let mut this = Self { driver, port: port.expect("chromedriver says its port"), session: String::new() };
+        let mut this = Self { _place: place, driver, port: port.expect("chromedriver says its port"), session: String::new() };
         let arguments = [
             "--headless=new".into(),
             "--no-sandbox".into(),
