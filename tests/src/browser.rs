@@ -18,6 +18,7 @@ const ELEMENT: &str = "element-6066-11e4-a52e-4f735466cecf";
 /// How many browsers of this process are open. A browser keeps a core busy, so there are never more than cores (and two): what a page does to
 /// a running pour would come too late.
 static OPEN: Mutex<usize> = Mutex::new(0);
+/// Woken when one of them closes.
 static CLOSED: Condvar = Condvar::new();
 
 /// One of the browsers that may be open at once.
