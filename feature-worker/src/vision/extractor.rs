@@ -32,6 +32,10 @@ use super::presence::Presence;
 use super::stream_edge::{BLURRED_PX, LineFinder};
 use super::whole::WholeCheck;
 
+/// No stream's triangle is longer along the container's side than so many times its length along the mouth. Chosen by hand: 7,400 rendered streams had 0.24
+/// to 1.15, and what was measured with more than 4 was a wall in the liquid's colours beside the container.
+const LEGS_STEEP: f32 = 4.0;
+
 /// Why an extractor cannot be made, or why an image cannot be measured.
 #[derive(Debug, thiserror::Error)]
 pub enum ExtractError {
@@ -299,6 +303,9 @@ impl Extractor {
             return too_small;
         }
         let [a, b] = fine.legs_px;
+        if b > LEGS_STEEP * a {
+            return Measurement::nothing(0.0, Doubt::EdgeNotFound);
+        }
         let corner = |r: f32, axis: [f32; 2]| self.in_image(self.axes.at(r, axis));
         let ([x0, y0], [x1, y1], [x2, y2]) = (corner(0.0, self.axes.x), corner(a, self.axes.x), corner(b, self.axes.y));
         let doubt = if doubt == Doubt::None && fine.width_px > BLURRED_PX { Doubt::Blurred } else { doubt };

@@ -26,6 +26,22 @@ fn half_white(seed: i32, liquid: Option<Scalar>) -> Result<Mat, ExtractError> {
     Ok(picture)
 }
 
+/// Protects pours before a wall in the liquid's colours that ends beside the container: the sliver that is seen of it along the side is no stream's triangle,
+/// and no dry ground either.
+#[test]
+fn a_sliver_along_the_container_is_no_stream() -> Result<(), ExtractError> {
+    let mut extractor = colour()?;
+    for i in 0..30 {
+        let measured = measure(&mut extractor, &dry(0.0, i)?)?;
+        assert_eq!((measured.area_px2, measured.doubt), (0.0, Doubt::None), "picture {i}");
+    }
+    for i in 30..60 {
+        let measured = measure(&mut extractor, &blue(&[stream(20.0, 200.0)], i)?)?;
+        assert_eq!((measured.area_px2, measured.doubt), (0.0, Doubt::EdgeNotFound), "picture {i}: {measured:?}");
+    }
+    Ok(())
+}
+
 /// Protects pours before a ground that is half white from the start, always or now and then: a stream in other colours is never "nothing", and
 /// one in the liquid's own is measured.
 #[test]
