@@ -5,7 +5,7 @@
 use std::time::{Duration, Instant};
 
 use rt_controller::core::Settings;
-use rt_controller::foreseen::{self, Expected};
+use rt_controller::foreseen::{self, Expected, WARNED_SD_ML};
 use serde_json::{Value, json};
 use shared::control::{Reply, Request, RobotLink};
 use shared::episode::set_weight;
@@ -19,8 +19,6 @@ use crate::site::{Site, moves};
 const CONNECTED: Duration = Duration::from_secs(15);
 /// Pause between two looks at the cell. Chosen by hand; no measurement is recorded.
 const BEAT: Duration = Duration::from_millis(50);
-/// A pour that is expected to be off by more than this is warned of, ml: as `rt-controller pour`.
-const WARNED_SD_ML: f32 = 5.0;
 /// Weighed pours that were off by more than this many expected deviations show that the weights' own deviation is too small. Chosen by hand: by
 /// chance it is so in one of twenty pours.
 const BEYOND_SD: f64 = 2.0;

@@ -27,9 +27,12 @@ const LAST_DEG: f64 = 120.0;
 /// How far beyond the tilt of a fill's first drop it must flow, degrees: where capacity curves of real vessels were known least, they were off
 /// by 10 % of the vessel, which is some 8 degrees.
 const BEYOND_DEG: f64 = 10.0;
-/// A vessel whose size was learned may hold so many times more. Chosen by hand: sizes are learned within a tenth.
+/// A vessel whose size was learned may hold so many times more. Chosen by hand: curves alone tell a size badly, so a fill beyond this is refused, and
+/// `[container] holds_ml` tells the size where it is known.
 const OVERFULL: f64 = 1.25;
 
+/// A pour that is expected to be off by more than this is warned of, ml: wanted by the users.
+pub const WARNED_SD_ML: f32 = 5.0;
 /// Weights from fewer weighed episodes know little of their own deviation. Pours with weights from one curve are off by about twice as much as those
 /// with weights from five (docs/LEARNING.md, Figures).
 const FEW_EPISODES: u32 = 5;

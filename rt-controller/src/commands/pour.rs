@@ -11,10 +11,7 @@ use shared::weights::Weights;
 use super::resume;
 use crate::client::{self, Client, ClientError, Common};
 use crate::core::{Settings, goal_is_legal};
-use crate::foreseen::{self, Expected};
-
-/// A pour that is expected to be off by more than this is warned of, ml: wanted by the users.
-const WARNED_SD_ML: f32 = 5.0;
+use crate::foreseen::{self, Expected, WARNED_SD_ML};
 
 /// Command-line arguments.
 #[derive(Debug, clap::Args)]
