@@ -9,7 +9,7 @@ use std::time::{Duration, SystemTime, UNIX_EPOCH};
 use serde_json::Value;
 use shared::config::Config;
 use shared::episode::{Episode, EpisodeEnd, EpisodeKind, EpisodeStart, EpisodeWriter, FrameRow, set_weight};
-use shared::messages::Feature;
+use shared::messages::{Feature, LAYOUT_VERSION, Telemetry};
 
 /// Writes the episode `number`, all at one time of the wall clock; its measurement is its own.
 fn write(directory: &Path, number: u64, complete: bool) -> PathBuf {
@@ -25,6 +25,31 @@ fn write_at(directory: &Path, number: u64, complete: bool, wall_clock: SystemTim
     let feature = Feature { captured_at_ns: 2, sequence: 1, area_px2: number as f32, ..Default::default() };
     writer.frame(&FrameRow { feature: &feature, alpha_commanded_deg: 0.0, alpha_measured_deg: 0.0, image: None }).unwrap();
     writer.finish(&EpisodeEnd { complete, reason: "over", disordered_frames: 0 }).unwrap()
+}
+
+/// Protects who types a weight: one that is far from the pour's own estimate, as by a slipped decimal point, is taken and remarked, by `weigh` and by
+/// `check`; one that is near is not.
+#[test]
+fn a_slipped_decimal_point_is_remarked() {
+    let dir = tempfile::tempdir().unwrap();
+    let config = Config::read(&Path::new(env!("CARGO_MANIFEST_DIR")).join("../config/sim.toml")).unwrap();
+    let kind = EpisodeKind::Pour { goal_ml: 80.0 };
+    let start = EpisodeStart { episode: 1, kind, started_at_ns: 1, wall_clock: UNIX_EPOCH, config: &config, weights: "" };
+    let mut writer = EpisodeWriter::create(dir.path(), &start).unwrap();
+    writer.telemetry(&Telemetry { version: LAYOUT_VERSION, tick: 1, at_ns: 2, poured_ml: 82.0, ..Default::default() }).unwrap();
+    for sequence in 1..40 {
+        let area_px2 = if (10..20).contains(&sequence) { 100.0 } else { 0.0 };
+        let feature = Feature { version: LAYOUT_VERSION, captured_at_ns: 2 + sequence, sequence, area_px2, ..Default::default() };
+        writer.frame(&FrameRow { feature: &feature, alpha_commanded_deg: 0.0, alpha_measured_deg: 0.0, image: None }).unwrap();
+    }
+    let file = writer.finish(&EpisodeEnd { complete: true, reason: "over", disordered_frames: 0 }).unwrap();
+    let file = file.to_str().unwrap();
+    for (weight, far) in [("820", true), ("8.2", true), ("90", false)] {
+        let weighed = episodes(&["weigh", file, "--weight", weight]);
+        assert_eq!((code(&weighed), text(&weighed.stderr).contains("ml by the pour's own estimate")), (0, far), "{}", text(&weighed.stderr));
+        let checked = text(&episodes(&["check", file]).stdout);
+        assert_eq!(checked.contains("82.0 ml by the pour's own estimate"), far, "{checked}");
+    }
 }
 
 fn episodes(arguments: &[&str]) -> Output {

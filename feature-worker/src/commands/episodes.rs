@@ -14,7 +14,7 @@ use shared::plural::counted;
 
 use crate::episodes::export::{ExportFormat, Exported, export};
 use crate::episodes::output::ExportError;
-use crate::episodes::summary::{Remark, remarks, summary};
+use crate::episodes::summary::{Remark, about_weight, remarks, summary};
 
 mod keep;
 mod which;
@@ -235,6 +235,9 @@ fn weigh(args: &WeighArgs) -> Result<(), Failure> {
     } else {
         let before = before.map_or("had none before".into(), |b| format!("was {b} g"));
         println!("{}: {weight} g ({before})", plain(&args.file.display().to_string()));
+    }
+    if let Some(remark) = Episode::read(&args.file).ok().as_ref().and_then(about_weight) {
+        eprintln!("{}: {}", if remark.is_wrong { "warning" } else { "note" }, remark.text);
     }
     Ok(())
 }

@@ -12,6 +12,9 @@ const SURELY_POURED_G: f64 = 3.0;
 const NOTHING_POURED_G: f64 = 1.0;
 /// More frames with flow than this contradict a weight of nothing. Chosen by hand: a few drops may look like flow.
 const CHANCE_FLOW_FRAMES: usize = 5;
+/// A weight that is further from the controller's own estimate than this share of it is remarked. Chosen by hand, as on the page: a slipped digit is
+/// further off.
+const FAR: f64 = 0.5;
 
 /// One remark about an episode.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -71,8 +74,8 @@ pub fn remarks(episode: &Episode) -> Vec<Remark> {
     all
 }
 
-/// Whether the weight fits what the vision saw.
-fn about_weight(episode: &Episode) -> Option<Remark> {
+/// Whether the weight fits what the vision saw, and what the controller made of it.
+pub fn about_weight(episode: &Episode) -> Option<Remark> {
     let flow = flow_frames(episode);
     match episode.weight_g {
         None => Some(Remark::wrong("no weight yet: `feature-worker episodes weigh FILE --weight G`")),
@@ -83,7 +86,14 @@ fn about_weight(episode: &Episode) -> Option<Remark> {
             Some(Remark::wrong(format!("flow in {}, but the scale says {w} g: check weight and [image]", counted(flow, "frame"))))
         }
         Some(w) if w <= 0.0 => Some(Remark::wrong("nothing was poured: there is nothing to learn from it")),
-        Some(_) => None,
+        Some(w) => {
+            let estimate_ml = f64::from(episode.info.poured_ml.filter(|_| matches!(episode.kind, EpisodeKind::Pour { .. }))?);
+            ((w - estimate_ml).abs() > FAR * estimate_ml.abs()).then(|| {
+                Remark::note(format!(
+                    "{w} g on the scale, but {estimate_ml:.1} ml by the pour's own estimate: look whether the reading and its decimal point are right"
+                ))
+            })
+        }
     }
 }
 
