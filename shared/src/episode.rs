@@ -39,9 +39,6 @@ const UNMEASURED_MAX_S: f64 = 0.2;
 /// Up to this commanded tilt the container is to be upright, degrees. Chosen by hand: no vessel pours there, and a controller's way back may leave some
 /// tenths.
 const UPRIGHT_DEG: f32 = 1.0;
-/// Frames that follow each other by their numbers are so many usual intervals apart at most. Chosen by hand: a camera's times may lie off by half an interval,
-/// and a longer step holds frames that have no numbers.
-const HOLE_INTERVALS: f64 = 2.5;
 /// A frame this near to a gap is beside it. Chosen by hand: the flow model takes as many zeros within the flow for a dropout.
 const BESIDE: usize = 3;
 /// The largest share of a stream's area that pictures may show which the stream leaves. Chosen by hand: where they lack a third of it, the sum of the areas
@@ -217,22 +214,8 @@ impl Episode {
     }
 
     /// Whether the camera missed a part of the stream: more than 0.2 s of frames in a row were not measured, at most three frames after or before one
-    /// that shows flow (a lone zero beside a gap is a dropout), and not all of them while the container was to be upright, where only drops fall. A shorter gap
-    /// is bridged by the area before it. Where not even the numbers of the missing frames are there, nothing is bridged.
+    /// that shows flow (a lone zero beside a gap is a dropout), and not all of them while the container was to be upright, where only drops fall. A shorter gap is bridged by the area before it.
     pub fn part_unseen(&self) -> bool {
-        self.has_hole() || self.is_blind()
-    }
-
-    /// Whether frames are missing beside the flow without a gap in the numbers: their time has passed.
-    fn has_hole(&self) -> bool {
-        let most_s = HOLE_INTERVALS / self.frame_rate_hz();
-        let flows = |k: usize| self.rows.get(k).is_some_and(|row| row.area_px2 > 0.0);
-        let is_hole = |(k, pair): (usize, &[EpisodeRow])| pair[1].t_s - pair[0].t_s > most_s && (k.saturating_sub(BESIDE)..=k + 1 + BESIDE).any(flows);
-        self.rows.windows(2).enumerate().any(is_hole)
-    }
-
-    /// Whether the stream was not measured for more than 0.2 s.
-    fn is_blind(&self) -> bool {
         let most = (UNMEASURED_MAX_S * self.frame_rate_hz()).round() as usize;
         let flows = |k: usize| self.rows.get(k).is_some_and(|row| row.area_px2 > 0.0);
         let mut end = 0;

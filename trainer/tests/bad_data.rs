@@ -196,7 +196,7 @@ fn a_cut_copy_takes_no_measurement_away() {
 #[test]
 fn each_fault_of_a_recording_is_named() {
     type Case = (&'static str, i32, fn(&mut Recording));
-    let cases: [Case; 26] = [
+    let cases: [Case; 25] = [
         ("cannot be used: FILE: no weight", 1, |r| r.weight_g = None),
         ("cannot be used: FILE: weight 0 g: nothing was poured", 1, |r| r.weight_g = Some(0.0)),
         ("cannot be used: FILE: no stream was ever seen, but the scale shows", 1, |r| r.rows.iter_mut().for_each(|f| f.area_px2 = 0.0)),
@@ -211,12 +211,6 @@ fn each_fault_of_a_recording_is_named() {
             blind(r, 7);
             let first = r.rows.iter().position(|f| f.doubt == Doubt::EdgeNotFound).unwrap();
             (r.rows[first - 1].area_px2, r.rows[first + 7].area_px2) = (0.0, 0.0);
-        }),
-        // As of rows that somebody took out before the frames were numbered.
-        ("cannot be used: FILE: the camera did not see part of this pour", 1, |r| {
-            let flows = r.rows.iter().position(|f| f.area_px2 > 0.0).unwrap();
-            r.rows.drain(flows + 5..flows + 9);
-            r.rows.iter_mut().zip(1..).for_each(|(f, number)| f.number = number);
         }),
         ("cannot be used: FILE: pictures of 960 x 720 px and not of 640 x 480", 1, |r| r.size_px = [960, 720]),
         ("error: FILE: damaged: frame 10: commanded alpha NaN", 2, |r| r.rows[9].alpha_deg = f32::NAN),
