@@ -21,6 +21,14 @@ const ANGLE_MAX_DEG: f64 = 360.0;
 /// A measured tilt that is further off the commanded one than this, at the best delay and lag, does not follow it, root mean square, degrees. Chosen by
 /// hand: a joint that the controller lets pour stays within 2 degrees of where its commands were (`TOLERANCE_DEG` of the controller).
 const FOLLOWS_DEG: f64 = 3.0;
+/// A joint whose measured tilt follows the commanded one within this is none, s: the column was copied, or one of the two was written into both. Chosen by
+/// hand: the joints of all tuning rigs are late by 0.06 s and more, and no robot moves before it has read its target.
+const FOLLOWS_AT_ONCE_S: f64 = 0.005;
+/// By how many frames the times of a stream may be off their numbers: times that jitter are off by one at either end.
+const UNNUMBERED_FRAMES: f64 = 2.0;
+/// By which share of its frames as well. Chosen by hand: its sum is then off by as much, and the controller ends a pour whose frames come at a rate that is
+/// off by 2.5 %.
+const UNNUMBERED_SHARE: f64 = 0.025;
 /// Weights of one measurement that are further apart are two weights, g: a kitchen scale shows whole grams.
 const WEIGHTS_APART_G: f64 = 0.5;
 /// Frame rates of which one is further off the other than this share of it are different ones. Chosen by hand: a volume is then off by as much, and the
@@ -185,6 +193,12 @@ impl TrainingEpisode {
         if let Some(k) = self.area_px2.iter().position(|a| a.is_infinite() || *a < 0.0) {
             return Some(format!("frame {k}: area {} is not a number >= 0: check the vision", self.area_px2[k]));
         }
+        if let Some((frames, periods)) = self.unnumbered() {
+            return Some(format!(
+                "its stream lasts {periods:.0} frames by their times and {frames} by their numbers: give each frame the number and the time at which \
+                 the camera took it, so that a lost one leaves its number out"
+            ));
+        }
         if self.weight_g.is_nan() {
             return Some(
                 "no weight: read the scale and enter it with `feature-worker episodes weigh FILE --weight G`, or in scale.csv".into(),
@@ -196,6 +210,13 @@ impl TrainingEpisode {
         if !self.area_px2.iter().any(|a| *a > 0.0) {
             return Some(format!("no stream was ever seen, but the scale shows {} g: check the vision or the weight", self.weight_g));
         }
+        if self.measured_is_commanded() {
+            return Some(
+                "the measured tilt is the commanded one, which no joint follows at once: give what the robot measured, or leave alpha_measured_deg out; \
+                 alpha_deg is the commanded tilt"
+                    .into(),
+            );
+        }
         let off_deg = servo::off_deg((&self.alpha_deg, &self.alpha_measured_deg), self.rate_hz);
         (off_deg > FOLLOWS_DEG).then(|| {
             format!(
@@ -203,6 +224,29 @@ impl TrainingEpisode {
                  the sign, the zero and the times of alpha_deg; of a recording, look at the joint"
             )
         })
+    }
+
+    /// How many frames there are from the first of the stream to the last, and how many there were by their times, where the two are not the same: lost
+    /// frames whose numbers were given to others. What flowed in them is in the weight alone.
+    fn unnumbered(&self) -> Option<(usize, f64)> {
+        let (first, last) = (self.first_flow()?, self.area_px2.iter().rposition(|a| *a > 0.0)?);
+        let mut steps_s: Vec<f64> = self.t_s.windows(2).map(|t| t[1] - t[0]).collect();
+        steps_s.sort_by(f64::total_cmp);
+        let period_s = *steps_s.get(steps_s.len() / 2)?;
+        let frames = last.saturating_sub(first);
+        let periods = (self.t_s[last] - self.t_s[first]) / period_s;
+        let apart = (periods - frames as f64).abs();
+        (apart > UNNUMBERED_FRAMES && apart > UNNUMBERED_SHARE * frames as f64).then_some((frames, periods))
+    }
+
+    /// Whether the measured tilt says nothing of its own, wherever both move.
+    fn measured_is_commanded(&self) -> bool {
+        let (mut apart, mut moved) = (0.0, 0.0);
+        for (commanded, measured) in self.alpha_deg.windows(2).zip(self.alpha_measured_deg.iter().skip(1)).filter(|(_, m)| m.is_finite()) {
+            apart += (measured - commanded[1]).powi(2);
+            moved += ((commanded[1] - commanded[0]) * self.rate_hz * FOLLOWS_AT_ONCE_S).powi(2);
+        }
+        moved > 0.0 && apart <= moved
     }
 
     fn from_episode(e: &Episode) -> Self {

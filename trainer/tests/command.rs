@@ -119,10 +119,13 @@ fn a_delay_beyond_the_model_is_said() {
     let late: String = rows
         .iter()
         .enumerate()
-        // The joint is where it was commanded: without its measured angle, the delay may be the joint's.
-        .map(|(k, r)| match k {
-            0 => format!("{},{},{},{},{},alpha_measured_deg\n", r[0], r[1], r[2], r[3], r[4]),
-            _ => format!("{},{},{},{},{},{}\n", r[0], r[1], r[2], r[3], area(k), r[3]),
+        // The joint follows its commands half a frame late: without its measured angle, the delay may be the joint's.
+        .map(|(k, r)| {
+            let deg = |k: usize| rows[k.max(1)][3].parse::<f64>().unwrap();
+            match k {
+                0 => format!("{},{},{},{},{},alpha_measured_deg\n", r[0], r[1], r[2], r[3], r[4]),
+                _ => format!("{},{},{},{},{},{:.4}\n", r[0], r[1], r[2], r[3], area(k), 0.5 * (deg(k) + deg(k - 1))),
+            }
         })
         .collect();
     std::fs::write(dir.path().join("late.csv"), late).unwrap();
@@ -413,12 +416,14 @@ fn a_measured_tilt_that_follows_nothing_is_left_out() {
     let dir = tempfile::tempdir().unwrap();
     tables(dir.path(), 5, |_, w| w);
     let features = std::fs::read_to_string(dir.path().join("f.csv")).unwrap();
+    let mut before = String::from("0");
     let measured: String = features
         .lines()
         .map(|l| match l.split(',').collect::<Vec<_>>()[..] {
             ["5", _, _, alpha_deg, _] => format!("{l},{}\n", alpha_deg.parse::<f64>().unwrap().to_radians()),
             [_, _, _, "alpha_deg", _] => format!("{l},alpha_measured_deg\n"),
-            [_, _, _, alpha_deg, _] => format!("{l},{alpha_deg}\n"),
+            // The joint follows a frame late.
+            [_, _, _, alpha_deg, _] => format!("{l},{}\n", std::mem::replace(&mut before, alpha_deg.to_owned())),
             _ => panic!("{l}"),
         })
         .collect();
