@@ -15,6 +15,7 @@ use shared::plural::counted;
 use crate::calibration::{self, EXPONENT_SD, EXPONENTS};
 use crate::data::{self, TrainingEpisode};
 use crate::fit::{Changed, Fit};
+use crate::tare;
 use crate::teaching::foresight::LAST_DEG;
 
 /// So many episodes calibrate each other, the exponent included. Chosen by hand; no measurement is recorded.
@@ -87,8 +88,8 @@ fn changed_camera(episodes: &[TrainingEpisode], fit: &Fit) -> Option<(String, St
     Some((DATA_SET.to_owned(), what))
 }
 
-/// What all weights together say against grams, and against the vessel that holds `holds_ml` up to its lip, if somebody knows that: weights that are all
-/// wrong by one factor do not contradict each other. Each line comes with the episode's name, or [`DATA_SET`].
+/// What all weights together say against grams, a tared cup, and the vessel that holds `holds_ml` up to its lip, if somebody knows that: weights that are all
+/// wrong by one factor, or by as many grams, do not contradict each other. Each line comes with the episode's name, or [`DATA_SET`].
 pub fn against_vessel(episodes: &[TrainingEpisode], fit: &Fit, holds_ml: Option<f64>) -> Vec<(String, String)> {
     let mut doubts = Vec::new();
     let set = |what: String| (DATA_SET.to_owned(), what);
@@ -96,6 +97,14 @@ pub fn against_vessel(episodes: &[TrainingEpisode], fit: &Fit, holds_ml: Option<
     if heaviest_g < GRAMS_LEAST {
         doubts.push(set(format!("no weight is above {heaviest_g} g: are they in grams?")));
     }
+    doubts.extend(tare::common_g(episodes).map(|tare_g| {
+        let side = if tare_g > 0.0 { "more" } else { "less" };
+        set(format!(
+            "the weights fit the areas only if each is {:.0} g {side} than what flowed: was the cup tared, with nothing else on the scale, and is the camera \
+             the same in all episodes?",
+            tare_g.abs()
+        ))
+    }));
     let Some(holds_ml) = holds_ml else { return doubts };
     for e in episodes.iter().filter(|e| e.weight_g > DENSEST_G_ML * holds_ml) {
         let what = format!("weight {:.0} g, but the vessel holds {holds_ml:.0} ml: is the decimal point right?", e.weight_g);

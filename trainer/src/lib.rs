@@ -3,7 +3,7 @@
 //! | module | what it holds |
 //! |---|---|
 //! | [`data`] | the episodes, read and checked |
-//! | [`consistency`] | weights that do not fit the others |
+//! | [`consistency`], [`tare`] | weights that do not fit the others, and all of them that have the cup's |
 //! | [`calibration`] | area to ml, from the weights alone |
 //! | [`fit`] | the flow model, fitted to the episodes |
 //! | [`servo`] | how the joint follows its commands, where it was measured |
@@ -25,5 +25,6 @@ pub mod method;
 pub mod network;
 pub mod report;
 pub mod servo;
+pub mod tare;
 pub mod teaching;
 pub mod training;
