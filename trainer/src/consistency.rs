@@ -14,7 +14,7 @@ use shared::plural::counted;
 
 use crate::calibration::{self, EXPONENT_SD, EXPONENTS};
 use crate::data::{self, TrainingEpisode};
-use crate::fit::{Changed, Fit};
+use crate::fit::{CHANGE_NEEDS, Changed, Fit};
 use crate::tare;
 use crate::teaching::foresight::LAST_DEG;
 
@@ -70,7 +70,24 @@ impl std::fmt::Display for DoubtfulWeight {
 /// What is doubtful about all episodes together once they are fitted: their weights and a camera whose gain has changed. `fit` is made
 /// of the same episodes.
 pub fn doubts_of_set(episodes: &[TrainingEpisode], fit: &Fit, holds_ml: Option<f64>) -> Vec<(String, String)> {
-    against_vessel(episodes, fit, holds_ml).into_iter().chain(changed_camera(episodes, fit)).collect()
+    against_vessel(episodes, fit, holds_ml)
+        .into_iter()
+        .chain(changed_camera(episodes, fit))
+        .chain(suspected_camera(episodes, fit))
+        .collect()
+}
+
+/// That the newest episodes alone have another gain, if they have: they are too few to tell a camera that was moved from a weight or a light of their own.
+fn suspected_camera(episodes: &[TrainingEpisode], fit: &Fit) -> Option<(String, String)> {
+    let Changed { episodes_before, before, after, error } = fit.suspected_gain?;
+    let what = format!(
+        "the camera's gain may have changed by {:+.1} % +- {:.1} % with {}, but fewer than {CHANGE_NEEDS} episodes do not tell: if camera, light or liquid were \
+         changed there, pours are off by up to as much until {CHANGE_NEEDS} are weighed; if not, look at what it weighed",
+        100.0 * ((after - before).exp() - 1.0),
+        100.0 * error,
+        episodes.get(episodes_before)?.name,
+    );
+    Some((DATA_SET.to_owned(), what))
 }
 
 /// That the camera's gain has changed along the episodes, if it has: the older ones then teach nothing of it, and a change that nobody knows of is that of

@@ -45,7 +45,7 @@ mod unknowns;
 
 use doubts::Doubt;
 use fitted::Fitted;
-use noise::{CHANGE_NEEDS, FrameNoise};
+use noise::FrameNoise;
 use prepared::{PreparedEpisode, Stage};
 use priors::{HeldCalibration, Priors, VesselPrior};
 use problem::{Effort, Problem};
@@ -55,7 +55,7 @@ use unknowns::{
     SHARED, TAPER, Unknowns,
 };
 
-pub use noise::Changed;
+pub use noise::{CHANGE_NEEDS, Changed};
 pub use unknowns::moved;
 
 /// A calibration v = c area that meets the weights this well (rms, g) is right: the scale cannot tell it from a perfect one. See
@@ -139,6 +139,8 @@ pub struct Fit {
     pub dropouts: f64,
     /// How the camera's gain (log) has changed between the episodes, if it has: only the newest gain counts then.
     pub changed_gain: Option<Changed>,
+    /// How it may have changed with the newest episodes, which are too few for it to count, if nothing else has changed it.
+    pub suspected_gain: Option<Changed>,
 }
 
 /// What the episodes say about the camera before anything is fitted.
@@ -226,6 +228,7 @@ pub fn fit(episodes: &[TrainingEpisode]) -> Fit {
         camera: &camera,
         robot: tilts.robot,
         changed_gain: changes.gain,
+        suspected_gain: changes.suspected,
         tempered: &tempered,
         wide: &wide,
         tight: &tight,
@@ -269,12 +272,14 @@ struct Changes {
     delays: Option<Vec<f64>>,
     /// The camera's gain (log), if it has changed.
     gain: Option<Changed>,
+    /// The camera's gain (log), if the newest episodes alone have another one.
+    suspected: Option<Changed>,
 }
 
 impl Changes {
     /// Lets the episodes differ freely, and looks for a change.
     fn of(problem: &Problem<'_>, found: &Unknowns) -> Self {
-        if found.own.len() < 2 * CHANGE_NEEDS {
+        if found.own.len() <= CHANGE_NEEDS {
             return Self::default();
         }
         let freed = |stage| {
@@ -282,9 +287,13 @@ impl Changes {
             Problem { stage, ..*problem }.solve(&mut free, FIRST_EFFORT);
             free
         };
-        let delays = freed(Stage { extra_delay_sd_frames: DELAY_FREE_FRAMES, ..problem.stage }).of_episodes(EXTRA_DELAY);
         let gains = freed(Stage { camera_gain_sd: GAIN_FREE, ..problem.stage }).of_episodes(CAMERA_GAIN);
-        Self { delays: (noise::newest_delay_frames(&delays) != 0.0).then_some(delays), gain: noise::changed_gain(&gains) }
+        let suspected = noise::suspected_gain(&gains);
+        if found.own.len() < 2 * CHANGE_NEEDS {
+            return Self { suspected, ..Self::default() };
+        }
+        let delays = freed(Stage { extra_delay_sd_frames: DELAY_FREE_FRAMES, ..problem.stage }).of_episodes(EXTRA_DELAY);
+        Self { delays: (noise::newest_delay_frames(&delays) != 0.0).then_some(delays), gain: noise::changed_gain(&gains), suspected }
     }
 }
 
@@ -313,6 +322,8 @@ struct Conclusion<'a> {
     robot: Option<Lateness>,
     /// The change of the camera's gain that was known before the last stages.
     changed_gain: Option<Changed>,
+    /// What it may have changed by with the newest episodes.
+    suspected_gain: Option<Changed>,
     /// The first stage of the vessel of any shape.
     tempered: &'a Fitted,
     wide: &'a Fitted,
@@ -362,7 +373,14 @@ impl Conclusion<'_> {
         let exact = self.camera.linear.is_some();
         let gain_expected = if exact { GAIN_EXACT } else { GAIN_EXPECTED };
         let Doubted { calibration, covariance, pour_sd } = self.camera();
-        let gain_sd = noise::camera_gain_sd(&gains, gain_expected).max(if exact { 0.0 } else { pour_sd });
+        // Each place that takes the newest gain alone is a change.
+        let changed_gain = self
+            .changed_gain
+            .or_else(|| [self.wide, self.tight].into_iter().find_map(|fitted| noise::changed_gain(&fitted.found.of_episodes(CAMERA_GAIN))));
+        let suspected_gain = self.suspected_gain.filter(|_| changed_gain.is_none());
+        // The pours to come may have the one gain or the other.
+        let apart = suspected_gain.map_or(0.0, |suspected| (suspected.after - suspected.before).abs());
+        let gain_sd = noise::camera_gain_sd(&gains, gain_expected).max(if exact { 0.0 } else { pour_sd }).max(apart);
         let straight_doubt = Doubt::tight((self.tight.cost / frames.max(1) as f64).max(1.0), self.episodes.len(), gain_sd);
         let mut fused = FusedModel {
             explanations: [self.explanation(self.wide, Doubt::wide()), self.explanation(self.tight, straight_doubt)],
@@ -381,10 +399,8 @@ impl Conclusion<'_> {
             covariance: likelier.covariance.view((0, 0), (SHARED, SHARED)).into_owned(),
             calibration_covariance: covariance,
             dropouts: self.camera.noise.dropouts,
-            // Each place that takes the newest gain alone is a change.
-            changed_gain: self.changed_gain.or_else(|| {
-                [self.wide, self.tight].into_iter().find_map(|fitted| noise::changed_gain(&fitted.found.of_episodes(CAMERA_GAIN)))
-            }),
+            changed_gain,
+            suspected_gain,
         }
     }
 

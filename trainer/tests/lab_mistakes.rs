@@ -108,3 +108,20 @@ fn a_measured_tilt_that_was_copied_is_named() {
         }
     }
 }
+
+/// Protects the pours after a camera was moved from the gain that it had before: one or two newest episodes are too few for another gain to count, and that is
+/// said. Where nothing was moved, nothing is.
+#[test]
+fn a_gain_that_only_the_newest_episodes_have_is_suspected() {
+    for (newest, gain) in [(0, 1.0), (1, 0.8), (2, 0.85), (2, 1.2)] {
+        for n in [5, 8] {
+            let mut all = common::episodes(n, 4);
+            all.iter_mut().skip(n - newest).flat_map(|e| &mut e.area_px2).for_each(|area_px2| *area_px2 *= gain);
+            let (_, said, _) = run(&all, "train");
+            let line = said.lines().find(|l| l.contains("the camera's gain may have changed by "));
+            let side = if gain > 1.0 { "by +" } else { "by -" };
+            let named = line.is_some_and(|l| l.contains(side) && l.contains(&format!(" % with {}, but", n - newest + 1)));
+            assert_eq!((line.is_some(), named), (newest > 0, newest > 0), "{n}, the newest {newest} times {gain}: {said}");
+        }
+    }
+}

@@ -8,6 +8,9 @@ use super::prepared::PreparedEpisode;
 pub const CHANGE_NEEDS: usize = 3;
 /// Standard errors beyond which the newest episodes' values count as changed. Chosen by hand; see docs/LEARNING.md.
 const CHANGE_ERRORS: f64 = 3.5;
+/// Standard errors beyond which one or two newest episodes are suspected of another gain. Of 75 right sets of tuning rigs (4 to 10 episodes, all kinds of
+/// vessels) the largest was 4.5.
+const SUSPECT_ERRORS: f64 = 5.0;
 /// How much a camera's gain changes from pour to pour at least (log). Tuned on rigs 100 to 123, see docs/LEARNING.md.
 const CAMERA_GAIN_SD_MIN: f64 = 0.012;
 /// How much an episode's delay scatters at least when it is looked for, frames. Tuned on rigs 100 to 123, see docs/LEARNING.md.
@@ -85,12 +88,24 @@ pub fn newest_delay_frames(extra_delays: &[f64]) -> f64 {
     changed(extra_delays, EXTRA_DELAY_SD_MIN_FRAMES).map_or(0.0, |c| c.after)
 }
 
+/// A change of the camera's gain (log) with one of the newest episodes that has too few after it to count: so few may also be off by a weight or a light
+/// of their own, and the gain of the older ones still counts.
+pub fn suspected_gain(log_camera_gains: &[f64]) -> Option<Changed> {
+    let n = log_camera_gains.len();
+    largest(log_camera_gains, CAMERA_GAIN_SD_MIN, n.saturating_sub(CHANGE_NEEDS - 1).max(CHANGE_NEEDS)..n, SUSPECT_ERRORS)
+}
+
 /// The change between the episodes, if there is one. [`CHANGE_NEEDS`] of them at least are on either side of it, and their values scatter by
 /// `sd_min` at least.
 fn changed(values: &[f64], sd_min: f64) -> Option<Changed> {
+    largest(values, sd_min, CHANGE_NEEDS..(values.len() + 1).saturating_sub(CHANGE_NEEDS), CHANGE_ERRORS)
+}
+
+/// The change by the most standard errors among those before which `places` episodes are, if it is one by more than `most_errors`.
+fn largest(values: &[f64], sd_min: f64, places: std::ops::Range<usize>, mut most_errors: f64) -> Option<Changed> {
     let n = values.len();
-    let (mut most_errors, mut found) = (CHANGE_ERRORS, None);
-    for k in CHANGE_NEEDS..(n + 1).saturating_sub(CHANGE_NEEDS) {
+    let mut found = None;
+    for k in places {
         let (before, after) = values.split_at(k);
         let mean = |g: &[f64]| g.iter().sum::<f64>() / g.len() as f64;
         let spread = |g: &[f64]| g.iter().map(|x| (x - mean(g)).powi(2)).sum::<f64>();
@@ -125,5 +140,9 @@ mod tests {
         assert!((newest_gain(&changed(3, -0.06)) + 0.06).abs() < 0.01);
         assert_eq!(newest_gain(&changed(5, 0.06)), 0.0, "two episodes say nothing");
         assert_eq!(newest_gain(&changed(4, 0.02)), 0.0, "within the scatter");
+        // What says nothing alone is suspected, and nothing else is.
+        let places = |gains: &[f64]| suspected_gain(gains).map(|c| c.episodes_before);
+        assert_eq!((places(&changed(5, 0.12)), places(&changed(6, -0.12))), (Some(5), Some(6)));
+        assert_eq!((places(&scatter), places(&changed(5, 0.02)), places(&[0.2, 0.0, 0.0]), places(&[])), (None, None, None, None));
     }
 }
