@@ -5,6 +5,9 @@ use std::path::Path;
 
 use rustix::fs::{StatVfs, statvfs};
 
+/// With less free on the episodes' disk than this, bytes, none is begun; one that was begun may take of it. Chosen by hand: some episodes, hours of the
+/// journal, and weights many times.
+pub const LEAST_FREE: u64 = 64_000_000;
 /// Number of files that must still fit before one is begun. Chosen by hand: some episodes, a part of the journal, and what is written beside a file
 /// before it takes its place.
 pub const LEAST_FILES: u64 = 16;

@@ -6,11 +6,11 @@ use std::io::ErrorKind;
 use std::os::unix::fs::MetadataExt as _;
 use std::path::{Path, PathBuf};
 
-use feature_worker::episodes::folder::{Budget, Folder, LEAST_FREE, MEGABYTE, recorded_today};
+use feature_worker::episodes::folder::{Budget, Folder, MEGABYTE, recorded_today};
 use rt_controller::{claim, disk, journal_files};
 use shared::config::Config;
 use shared::config_paths::is_same;
-use shared::disk_space::{Room, room};
+use shared::disk_space::{LEAST_FREE, Room, room};
 use shared::episode::check_number;
 use shared::framing::Framing;
 use shared::machine::{Finding, Verdict};

@@ -13,9 +13,6 @@ use shared::plural::counted;
 
 /// A megabyte, as in `recording.budget_mb`, bytes (SI).
 pub const MEGABYTE: u64 = 1_000_000;
-/// With less free on their disk than this, bytes, no episode is begun; one that was begun may take of it. Chosen by hand: some episodes, hours of the
-/// journal, and weights many times.
-pub const LEAST_FREE: u64 = 64 * MEGABYTE;
 /// The time over which the present rate of recording is measured.
 pub const DAY: Duration = Duration::from_secs(86_400);
 

@@ -12,7 +12,7 @@ use std::time::{Duration, SystemTime};
 use iceoryx2::port::publisher::Publisher;
 use iceoryx2::port::subscriber::Subscriber;
 use shared::config::Config;
-use shared::disk_space::room;
+use shared::disk_space::{LEAST_FREE, room};
 use shared::episode::{EpisodeEnd, EpisodeKind, EpisodeStart, EpisodeTrack, EpisodeWriter, FrameRow, GAP, WriteError, is_gap};
 use shared::gaussian_curve::Curve;
 use shared::ipc::{Cell, IpcError};
@@ -23,7 +23,7 @@ use shared::plural::counted;
 
 use super::encoder::Encoder;
 use super::handover::{Handover, KEPT_FRAMES, OfferedFrame};
-use crate::episodes::folder::{Budget, DAY, Folder, LEAST_FREE, MEGABYTE};
+use crate::episodes::folder::{Budget, DAY, Folder, MEGABYTE};
 
 /// Frames from up to this long before an episode's first tick belong to its file, ns. Chosen by hand: they show that nothing flows yet.
 const BEFORE_NS: u64 = 200_000_000;

@@ -1,10 +1,14 @@
 //! `rt-controller status`: shows the running controller's state, counters and histograms. It is a short, ordinary process,
 //! and every failure is one line.
 
+use std::path::Path;
+
 use shared::config::Config;
 use shared::control::Status;
 use shared::control::volume_words;
+use shared::disk_space::{LEAST_FREE, room};
 use shared::exit::{self, Failure, OrExit as _};
+use shared::whole_file::may_make_in;
 
 use crate::client::{Client, Common};
 
@@ -17,7 +21,7 @@ const WATCH_BEAT: std::time::Duration = std::time::Duration::from_secs(1);
 pub struct Args {
     #[command(flatten)]
     common: Common,
-    /// Shows it again each second, until Ctrl-C; with --json, one line each.
+    /// Shows it again each second, until Ctrl-C, also while the controller is started again; with --json, one line each.
     #[arg(long)]
     watch: bool,
 }
@@ -34,14 +38,22 @@ struct Shown<'a> {
 /// Runs the command.
 pub fn run(args: &Args) -> Result<(), Failure> {
     let config = Config::read(&args.common.config).or_exit(exit::BAD_INPUT)?;
+    let mut seen = false;
     loop {
-        // Each look connects anew, because what dead programs left is cleared then: a worker that was killed is not there any more.
-        let client = Client::connect_or_end(&config.cell)?;
-        let status = client.status()?;
-        let recorder = match client.has_recorder()? {
-            true => format!("a feature worker is there; episodes go to {}", config.recording.directory.display()),
-            false => "none: no feature worker runs, so nothing is recorded".to_string(),
+        let (status, recorder) = match look(&config) {
+            Ok(found) => found,
+            // Whoever watches, watches a controller that is started again too.
+            Err(e) if args.watch && seen => {
+                match args.common.json {
+                    true => println!("{}", serde_json::json!({ "error": e.what })),
+                    false => println!("\x1b[2J\x1b[H{}", e.what),
+                }
+                std::thread::sleep(WATCH_BEAT);
+                continue;
+            }
+            Err(e) => return Err(e),
         };
+        seen = true;
         let shown = Shown { status: &status, recorder: &recorder };
         match (args.common.json, args.watch) {
             (true, false) => println!("{}", serde_json::to_string_pretty(&shown).or_exit(exit::FAILED)?),
@@ -58,6 +70,40 @@ pub fn run(args: &Args) -> Result<(), Failure> {
         }
         std::thread::sleep(WATCH_BEAT);
     }
+}
+
+/// What the controller says, and who records.
+fn look(config: &Config) -> Result<(Box<Status>, String), Failure> {
+    // Each look connects anew, because what dead programs left is cleared then: a worker that was killed is not there any more.
+    let client = Client::connect_or_end(&config.cell)?;
+    let status = client.status()?;
+    let directory = &config.recording.directory;
+    let recorder = match client.has_recorder()? {
+        false => "none: no feature worker runs, so nothing is recorded".to_string(),
+        true => match no_place(directory) {
+            None => format!("a feature worker is there; episodes go to {}", directory.display()),
+            Some(why) => format!("a feature worker is there, and records nothing: {}: {why}", directory.display()),
+        },
+    };
+    Ok((status, recorder))
+}
+
+/// Why the worker, which runs as this user, records nothing in `directory`; `None` if it does, as far as can be seen from here.
+fn no_place(directory: &Path) -> Option<String> {
+    if let Some(room) = room(directory) {
+        if room.lacks_files() {
+            return Some("the disk holds as many files as it may, whatever their size".into());
+        }
+        if room.bytes < LEAST_FREE {
+            return Some(format!(
+                "only {} MB are free, and below {} MB no episode is begun",
+                room.bytes / 1_000_000,
+                LEAST_FREE / 1_000_000
+            ));
+        }
+    }
+    // The worker makes a directory that is not there.
+    directory.is_dir().then(|| may_make_in(directory).err()).flatten().map(|e| e.to_string())
 }
 
 /// The name that JSON has for a value.

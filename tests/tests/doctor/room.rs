@@ -74,6 +74,8 @@ fn the_disk_is_not_filled_in_silence() {
     let said = record(&cell);
     assert!(said.contains("nothing is recorded"), "{said}");
     wait_for(&cell, "nothing is recorded");
+    let recorder = cell.status().expect("it answers")["recorder"].to_string();
+    assert!(recorder.contains("records nothing") && recorder.contains("below 64 MB no episode is begun"), "{recorder}");
     let (verdict, words) = line(&examine(&cell).0, "files", "episodes");
     assert!(verdict == "red" && words.contains("nothing more is recorded"), "{words}");
     assert_eq!(count(), "2");

@@ -1,5 +1,6 @@
 //! What is not there yet is waited for, by name, and a cell that is asked to end ends and says so.
 
+use std::io::{BufRead as _, BufReader};
 use std::process::{Child, Stdio};
 use std::time::Duration;
 
@@ -65,6 +66,24 @@ fn a_controller_that_would_refuse_is_not_green() {
     assert_eq!(cell.stop("simulator"), Some(0), "{}", cell.log("simulator"));
     let said = examine(&cell).0;
     assert_eq!(camera(&said), ["red", "red"], "{said:#}");
+}
+
+/// Protects who leaves `status --watch` open on a wall: it shows that the controller is gone, and the controller that is started next.
+#[test]
+fn a_watch_goes_on_with_the_next_controller() {
+    let mut cell = CellUnderTest::prepare(|_| {});
+    cell.spawn("rt-controller");
+    cell.wait("the controller", Duration::from_secs(20), |_| true);
+    let mut watch = cell.begin("rt-controller", &["status", "--watch", "--json"]);
+    let mut lines = BufReader::new(watch.stdout.take().expect("piped")).lines().map_while(Result::ok);
+    let mut shown = |words: &str| assert!(lines.by_ref().take(20).any(|line| line.contains(words)), "{words} is not shown");
+    shown("\"phase\":");
+    assert_eq!(cell.stop("rt-controller"), Some(0), "{}", cell.log("rt-controller"));
+    shown("{\"error\":\"no answer from rt-controller");
+    cell.spawn("rt-controller");
+    shown("\"phase\":");
+    watch.kill().expect("it runs");
+    watch.wait().expect("it ends");
 }
 
 /// Protects a person who starts the worker before the camera is plugged in: it waits, says so once, and ends at once when it is asked to.
