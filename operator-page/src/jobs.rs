@@ -7,7 +7,9 @@ use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, Ordering::Relaxed};
 use std::sync::{Arc, Mutex, MutexGuard};
 
+use feature_worker::episodes::folder::{Folder, MEGABYTE};
 use serde_json::{Value, json};
+use shared::disk_space::{LEAST_FREE, Room, room};
 
 use crate::lock::locked;
 use crate::programs::{self, Step};
@@ -78,6 +80,21 @@ fn judge(check: &Value, accept: Vec<String>, leave_out: Vec<String>) -> Judged {
     let open = asked.iter().filter(|d| !judged(d)).cloned().collect();
     let remarks = of_set.iter().map(|d| d[1].clone()).collect();
     Judged { accept, leave_out, open, remarks }
+}
+
+/// Whether a disk with this `room` may take an export of episodes of `bytes`. Nobody deletes old exports, which lie beside the episodes in `beside`, and what
+/// they leave free is for episodes, journal and weights. An export is about as large as what it is made of.
+fn may_take(bytes: u64, room: Option<Room>, beside: &Path) -> Result<(), String> {
+    let short = |room: &Room| room.bytes < bytes.saturating_add(LEAST_FREE) || room.lacks_files();
+    match room.filter(short) {
+        None => Ok(()),
+        Some(Room { bytes: free, .. }) => Err(format!(
+            "the disk has {} MB free, and the export of {} MB would leave too little for episodes, journal and weights: delete old exports in {}",
+            free / MEGABYTE,
+            bytes.div_ceil(MEGABYTE),
+            beside.display()
+        )),
+    }
 }
 
 impl Jobs {
@@ -200,6 +217,8 @@ impl Jobs {
         if files.is_empty() {
             return Err("there is nothing to export".into());
         }
+        let beside = to.parent().unwrap_or(&to);
+        may_take(Folder::of(files.iter().map(PathBuf::as_path)).bytes, room(beside), beside)?;
         let files: Vec<String> = files.iter().map(|f| words(f)).collect();
         self.start(
             "export",
@@ -219,6 +238,22 @@ impl Jobs {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    /// Protects pours from exports, which nobody deletes: one that would leave less room than episodes need is refused, and the line says where the old ones
+    /// lie. A disk that does not say its room refuses nothing.
+    #[test]
+    fn an_export_leaves_room_for_episodes() {
+        let may = |bytes, room| may_take(bytes, room, Path::new("/lab/episodes/exports"));
+        let room = |megabytes: u64, files| Some(Room { bytes: megabytes * MEGABYTE, files });
+        assert_eq!(may(900 * MEGABYTE, room(1000, u64::MAX)), Ok(()));
+        assert_eq!(may(900 * MEGABYTE, None), Ok(()));
+        let refused = may(950 * MEGABYTE, room(1000, u64::MAX)).unwrap_err();
+        assert!(
+            refused.contains("the disk has 1000 MB free, and the export of 950 MB") && refused.contains("/lab/episodes/exports"),
+            "{refused}"
+        );
+        assert!(may(1, room(1000, 3)).is_err(), "no more files");
+    }
 
     /// Protects whoever corrects a weight that was doubted: the answer from before leaves the episode out no more.
     #[test]

@@ -188,7 +188,8 @@ fn still_meant(order: &Order, stops: u64, now_ms: u64) -> Result<(), String> {
     if seen != stops {
         return Err("it was stopped before it began".into());
     }
-    if now_ms.saturating_sub(sent_at_ms) > LATE_MS {
+    // One from the future was sent before this machine was started.
+    if now_ms.abs_diff(sent_at_ms) > LATE_MS {
         return Err("the order came late, so nothing began: look at the robot, and order it again".into());
     }
     Ok(())
@@ -277,6 +278,7 @@ mod tests {
         assert_eq!(judged(order(Some(7), Some(99_000))), Ok(()));
         assert_eq!(judged(order(Some(6), Some(99_000))), Err("it was stopped before it began".into()));
         assert!(judged(order(Some(7), Some(97_000))).unwrap_err().contains("came late"));
+        assert!(judged(order(Some(7), Some(5_000_000))).unwrap_err().contains("came late"), "before the machine was started again");
         assert!(judged(order(None, None)).unwrap_err().contains("load it again"));
     }
 }
