@@ -132,7 +132,7 @@ impl<'a> Cell<'a> {
     fn ask(&mut self) -> Option<Box<Status>> {
         if self.client.is_none() {
             // Nothing is joined for a controller that does not run: that would make its files in shared memory.
-            rt_controller::claim::running_at(&Place::from(&self.config.cell)).ok().flatten()?;
+            rt_controller::stop_client::running_at(&Place::from(&self.config.cell)).ok().flatten()?;
             self.client = Client::connect_or_end(&self.config.cell).ok();
         }
         let status = self.client.as_ref()?.status().ok();

@@ -132,7 +132,7 @@ pub fn running(directory: &Path) -> Option<Running> {
     owner(directory, false).ok().flatten().and_then(|_| running_in(directory))
 }
 
-/// The controller of the cell `place`, if it runs. Fails, with a line, where its runtime directory is there and is not believed.
+/// The controller of the cell `place`, if its process is seen to run. Fails, with a line, where its runtime directory is there and is not believed.
 pub fn running_at(place: &Place) -> Result<Option<Running>, String> {
     let directory = place.path();
     Ok(owner(&directory, place.base.is_some())?.and_then(|_| running_in(&directory)))
@@ -140,9 +140,13 @@ pub fn running_at(place: &Place) -> Result<Option<Running>, String> {
 
 /// The controller that runs by what the runtime directory says, whose owner was looked at.
 pub(crate) fn running_in(directory: &Path) -> Option<Running> {
+    said_in(directory).filter(|found| started(found.pid) == Some(found.started))
+}
+
+/// What the runtime directory, whose owner was looked at, says of a controller, which may have ended since without a word.
+pub(crate) fn said_in(directory: &Path) -> Option<Running> {
     let bytes = regular_file::read(&directory.join("controller"), FILE_MAX).ok()?;
-    let found: Running = serde_json::from_slice(&bytes).ok()?;
-    (started(found.pid) == Some(found.started)).then_some(found)
+    serde_json::from_slice(&bytes).ok()
 }
 
 /// When the process `pid` started, in the kernel's ticks; `None` if there is none, or if it is no rt-controller.

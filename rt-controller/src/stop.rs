@@ -87,14 +87,16 @@ pub struct StopSockets {
     nameless: Option<UnixListener>,
 }
 
-/// The user who listens at the abstract socket of user `uid`'s cell `name`, or whether its places are all taken, so that nobody can tell. Nobody is waited
-/// for.
-pub(crate) fn listener(uid: u32, name: &str) -> Result<u32, bool> {
+/// The user who listens at the abstract socket of user `uid`'s cell `name`; otherwise as [`listener`].
+pub(crate) fn named_listener(uid: u32, name: &str) -> Result<u32, bool> {
+    listener(&SocketAddrUnix::new_abstract_name(abstract_name(uid, name).as_bytes()).map_err(|_| false)?)
+}
+
+/// The user who listens at `address`, or whether its places are all taken, so that nobody can tell. Nobody is waited for.
+pub(crate) fn listener(address: &SocketAddrUnix) -> Result<u32, bool> {
     let flags = SocketFlags::NONBLOCK | SocketFlags::CLOEXEC;
     let socket = socket_with(AddressFamily::UNIX, SocketType::STREAM, flags, None).map_err(|_| false)?;
-    let name = abstract_name(uid, name);
-    let address = SocketAddrUnix::new_abstract_name(name.as_bytes()).map_err(|_| false)?;
-    connect(&socket, &address).map_err(|e| e == rustix::io::Errno::AGAIN)?;
+    connect(&socket, address).map_err(|e| e == rustix::io::Errno::AGAIN)?;
     peer_uid(&socket).ok_or(false)
 }
 
@@ -102,7 +104,7 @@ pub(crate) fn listener(uid: u32, name: &str) -> Result<u32, bool> {
 /// is no controller's that works.
 fn is_ours(name: &str) -> bool {
     for _ in 0..ROUNDS {
-        match listener(own_uid(), name) {
+        match named_listener(own_uid(), name) {
             Err(true) => std::thread::sleep(ROUND),
             other => return other == Ok(own_uid()),
         }

@@ -14,12 +14,14 @@ use std::path::{Path, PathBuf};
 use std::sync::mpsc;
 use std::time::{Duration, Instant};
 
+use rustix::net::SocketAddrUnix;
 use shared::config::is_cell_name;
 use shared::os::peer;
+use shared::regular_file;
 use shared::runtime_dir::{Place, bases, own_uid};
 
 use crate::claim;
-use crate::stop::{ROUND, ROUNDS, StopAnswer, abstract_name, listener};
+use crate::stop::{ROUND, ROUNDS, StopAnswer, abstract_name, listener, named_listener};
 
 /// Longest wait for an answer. Chosen by hand: the controller's thread answers at once.
 const ANSWER: Duration = Duration::from_secs(1);
@@ -28,6 +30,10 @@ const ANSWER_MAX: u64 = 4096;
 /// The most cells that are asked, or told of, by their names alone, in turns of each user's. Chosen by hand: a machine has a few, and more would be
 /// somebody's names.
 const NAMES_MOST: usize = 64;
+/// Which user numbers the administrator has lent to whom, as for containers: lines `LENT_TO:FIRST:COUNT` (subuid(5)).
+const LENT: &str = "/etc/subuid";
+/// Largest such file that is read, bytes. Chosen by hand: some ten thousand users.
+const LENT_MAX: u64 = 1 << 20;
 
 /// Where the controller of one cell may be reached.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -106,16 +112,28 @@ pub fn running_cells() -> Running {
     let (named, mut targets): (Vec<Target>, Vec<Target>) = all.partition(|target| target.only_a_name);
     let own = |target: &Target| [0, target.uid].contains(&own_uid());
     let (named, others): (Vec<Target>, Vec<Target>) = listening(named).into_iter().partition(own);
-    targets.extend(shared_out(named).into_iter().take(NAMES_MOST));
-    let others = shared_out(others).into_iter().take(NAMES_MOST).map(|target| (target.uid, target.name)).collect();
+    let lent = regular_file::read_text(Path::new(LENT), LENT_MAX).unwrap_or_default();
+    targets.extend(shared_out(named, &lent).into_iter().take(NAMES_MOST));
+    let others = shared_out(others, &lent).into_iter().take(NAMES_MOST).map(|target| (target.uid, target.name)).collect();
     Running { targets, doubted, others }
 }
 
-/// The same in turns: each user's first, then each one's second, and so on. So a user who makes many names crowds out nobody else's cell.
-fn shared_out(named: Vec<Target>) -> Vec<Target> {
-    let mut of_user: BTreeMap<u32, usize> = BTreeMap::new();
+/// The same in turns: each user's first, then each one's second, and so on. So a user who makes many names crowds out nobody else's cell. The numbers that
+/// one user has been lent are one user's, because whoever has them can act as each of them: `lent` is the text of [`LENT`].
+fn shared_out(named: Vec<Target>, lent: &str) -> Vec<Target> {
+    let ranges: Vec<(&str, u32, u32)> = lent
+        .lines()
+        .filter_map(|line| {
+            let mut parts = line.split(':').map(str::trim);
+            let (to, first, count) = (parts.next()?, parts.next()?.parse().ok()?, parts.next()?.parse().ok()?);
+            Some((to, first, count))
+        })
+        .collect();
+    let lent_to =
+        |uid: u32| ranges.iter().find(|(_, first, count)| uid.checked_sub(*first).is_some_and(|n| n < *count)).map(|(to, ..)| *to);
+    let mut of_user: BTreeMap<Result<&str, u32>, usize> = BTreeMap::new();
     let in_turn = |target: Target| {
-        let turn = of_user.entry(target.uid).or_default();
+        let turn = of_user.entry(lent_to(target.uid).ok_or(target.uid)).or_default();
         *turn += 1;
         (*turn, target)
     };
@@ -128,7 +146,7 @@ fn shared_out(named: Vec<Target>) -> Vec<Target> {
 fn listening(mut named: Vec<Target>) -> Vec<Target> {
     let mut found = Vec::new();
     for _ in 0..ROUNDS {
-        named.retain(|target| match listener(target.uid, &target.name) {
+        named.retain(|target| match named_listener(target.uid, &target.name) {
             Ok(uid) => {
                 found.extend((uid == target.uid || uid == 0).then(|| target.clone()));
                 false
@@ -157,7 +175,26 @@ pub fn unreached(answered: &[u32]) -> Vec<u32> {
     processes.filter(|pid| !answered.contains(pid) && runs(*pid)).collect()
 }
 
+/// The controller of the cell `place`, if it runs. One whose process is out of sight, as from within a container, counts if it answers. Fails, with a line,
+/// where its runtime directory is there and is not believed.
+pub fn running_at(place: &Place) -> Result<Option<claim::Running>, String> {
+    if let Some(seen) = claim::running_at(place)? {
+        return Ok(Some(seen));
+    }
+    let target = Target::from(place.clone());
+    let said = target.directories.first().filter(|d| **d == place.path()).and_then(|d| claim::said_in(d));
+    Ok(said.filter(|_| target.ask("state").is_some()))
+}
+
 impl Target {
+    /// Whether somebody who is the cell's user or root listens at one of its sockets, whether or not an answer comes. Nobody is waited for.
+    pub fn is_heard(&self) -> bool {
+        let files = self.directories.iter().filter_map(|d| SocketAddrUnix::new(d.join("stop")).ok());
+        let name = SocketAddrUnix::new_abstract_name(abstract_name(self.uid, &self.name).as_bytes()).ok();
+        // One whose places are all taken has a listener, and whose it is stays unknown.
+        files.chain(name).any(|address| listener(&address).map_or_else(|full| full, |uid| [self.uid, 0].contains(&uid)))
+    }
+
     /// Sends `line` to the controller and gives its answer; `None` if no controller answers at either socket.
     pub fn ask(&self, line: &'static str) -> Option<StopAnswer> {
         let name = abstract_name(self.uid, &self.name);
@@ -264,6 +301,18 @@ mod tests {
         assert_eq!(found(&link), (0, 1));
         std::os::unix::fs::lchown(&link, Some(65534), None).unwrap();
         assert_eq!(found(&link), (0, 0), "another user may lead it elsewhere");
+    }
+
+    /// Protects who aborts as root beside a user who was lent many numbers, as for containers, and makes a name with each: all of them are one user's turn.
+    #[test]
+    fn lent_numbers_are_one_users() {
+        let named = |uid| Target { name: "a".into(), uid, directories: Vec::new(), doubted: String::new(), only_a_name: true };
+        let crowd = (100_000..100_100).chain([3_000_000_000]);
+        let uids = |lent| shared_out(crowd.clone().map(named).collect(), lent).iter().map(|t| t.uid).collect::<Vec<_>>();
+        let lent = "anna:100000:65536\n# nonsense\n:\notto:165536:x\n";
+        assert_eq!(uids(lent)[..3], [100_000, 3_000_000_000, 100_001]);
+        assert_eq!(uids("")[100], 3_000_000_000, "each is a user of its own, as far as it is known");
+        assert_eq!(uids(lent).len(), 101);
     }
 
     /// Protects who aborts after an upgrade: the answer of a controller of another version is understood, and what it does not say is not taken as rest.

@@ -31,6 +31,8 @@ const JOIN_FILES: u64 = 32;
 const TOKEN_LEN: usize = 8;
 /// The most files of cells that are looked at, for who asks whose they are. Chosen by hand: a cell has about a hundred.
 const LOOKED_MOST: usize = 10_000;
+/// The namespace of processes from which all are seen, as the kernel names it (PROC_PID_INIT_INO in include/linux/proc_ns.h).
+const FIRST_PROCESSES: &str = "pid:[4026531836]";
 /// Longest wait for another process that is joining the same cell. Chosen by hand: joining takes some milliseconds.
 const JOIN_WAIT: Duration = Duration::from_secs(2);
 
@@ -225,22 +227,49 @@ fn of_cells() -> impl Iterator<Item = (String, PathBuf, bool)> {
     })
 }
 
-/// The files that somebody has locked, as far as this process can see: device and inode; `None` if the system does not tell.
-fn locked() -> Option<BTreeSet<(u64, u64)>> {
-    // Everybody may read which files are locked; the file stands in it as MAJOR:MINOR:INODE, the first two in hexadecimal (proc_locks(5)).
-    let locks = std::fs::read_to_string("/proc/locks").ok()?;
-    let file = |word: &str| {
-        let mut parts = word.split(':');
-        let [major, minor] = [parts.next()?, parts.next()?].map(|number| u32::from_str_radix(number, 16));
-        Some((rustix::fs::makedev(major.ok()?, minor.ok()?), parts.next()?.parse().ok()?))
-    };
-    Some(locks.split_whitespace().filter_map(file).collect())
+/// The files that somebody has locked.
+struct Locked {
+    /// Those that this process sees: device and inode.
+    seen: BTreeSet<(u64, u64)>,
+    /// Whether there are no others.
+    is_all: bool,
 }
 
-/// Whether a process of the cell runs whose runtime directory is `directory`, as far as this process can see its lock. Nothing is made or changed.
+impl Locked {
+    /// Looks for them.
+    fn look() -> Self {
+        // Everybody may read which files are locked; the file stands in it as MAJOR:MINOR:INODE, the first two in hexadecimal (proc_locks(5)).
+        let locks = std::fs::read_to_string("/proc/locks");
+        // Locks of processes that are out of sight are left out there.
+        let sees_all = std::fs::read_link("/proc/self/ns/pid").is_ok_and(|name| name.as_os_str() == FIRST_PROCESSES);
+        let is_all = locks.is_ok() && sees_all;
+        let file = |word: &str| {
+            let mut parts = word.split(':');
+            let [major, minor] = [parts.next()?, parts.next()?].map(|number| u32::from_str_radix(number, 16));
+            Some((rustix::fs::makedev(major.ok()?, minor.ok()?), parts.next()?.parse().ok()?))
+        };
+        Self { seen: locks.unwrap_or_default().split_whitespace().filter_map(file).collect(), is_all }
+    }
+
+    /// Whether the file is locked; `None` if this process cannot see that.
+    fn has(&self, meta: &Metadata) -> Option<bool> {
+        let seen = self.seen.contains(&(meta.dev(), meta.ino()));
+        (seen || self.is_all).then_some(seen)
+    }
+}
+
+/// Whether a process of the cell runs whose runtime directory is `directory`. Nothing is made or changed.
 pub fn is_in_use(directory: &Path) -> bool {
-    let lock = read_token(&directory.join("token")).and_then(|token| lock_path(&token).symlink_metadata().ok());
-    lock.is_some_and(|meta| locked().is_none_or(|locked| locked.contains(&(meta.dev(), meta.ino()))))
+    let lock = read_token(&directory.join("token")).map(|token| lock_path(&token));
+    let Some((lock, meta)) = lock.and_then(|path| path.symlink_metadata().ok().map(|meta| (path, meta))) else { return false };
+    Locked::look().has(&meta).unwrap_or_else(|| !can_be_had_alone(directory, &lock))
+}
+
+/// Whether nobody holds the lock of the cell whose runtime directory is `directory`. It is taken for a moment, in which nobody joins the cell: who joined
+/// would not get a share, and would take the cell for a dead one.
+fn can_be_had_alone(directory: &Path, lock: &Path) -> bool {
+    let Ok(joining) = open(&directory.join("lock"), false) else { return false };
+    joining.try_lock().is_ok() && open(lock, false).is_ok_and(|lock| lock.try_lock().is_ok())
 }
 
 /// What cells have in `/dev/shm`.
@@ -248,16 +277,16 @@ pub fn is_in_use(directory: &Path) -> bool {
 pub struct Kept {
     /// The user whose it is.
     pub uid: u32,
-    /// Whether a process of the cell runs, as far as this process can see its locks.
-    pub in_use: bool,
+    /// Whether a process of the cell runs; `None` if this process cannot see that.
+    pub in_use: Option<bool>,
     /// Its size, bytes.
     pub bytes: u64,
 }
 
-/// What all users' cells have in `/dev/shm`: for each user at most what is in use, and what dead processes left. The second value tells whether all files
+/// What all users' cells have in `/dev/shm`: for each user at most what is in use, what dead processes left, and what may be either. The second value tells whether all files
 /// were looked at: any user may make as many as there is room for.
 pub fn kept() -> (Vec<Kept>, bool) {
-    let locked = locked().unwrap_or_default();
+    let locked = Locked::look();
     let mut files = of_cells();
     let looked: Vec<(String, Metadata, bool)> = files
         .by_ref()
@@ -265,8 +294,8 @@ pub fn kept() -> (Vec<Kept>, bool) {
         .filter_map(|(token, file, is_lock)| Some((token, file.symlink_metadata().ok()?, is_lock)))
         .collect();
     let locks = looked.iter().filter(|(_, _, is_lock)| *is_lock);
-    let in_use: BTreeMap<&str, bool> = locks.map(|(token, meta, _)| (token.as_str(), locked.contains(&(meta.dev(), meta.ino())))).collect();
-    let mut all: BTreeMap<(u32, bool), u64> = BTreeMap::new();
+    let in_use: BTreeMap<&str, Option<bool>> = locks.map(|(token, meta, _)| (token.as_str(), locked.has(meta))).collect();
+    let mut all: BTreeMap<(u32, Option<bool>), u64> = BTreeMap::new();
     for (token, meta, _) in &looked {
         if let Some(in_use) = in_use.get(token.as_str()) {
             *all.entry((meta.uid(), *in_use)).or_default() += meta.len();
@@ -371,9 +400,33 @@ mod tests {
     fn a_lock_counts_on_its_own_device() {
         let file = tempfile::tempfile_in(SHM).unwrap();
         let meta = file.metadata().unwrap();
-        let is_locked = |device: u64| locked().unwrap().contains(&(device, meta.ino()));
+        let is_locked = |device: u64| Locked::look().seen.contains(&(device, meta.ino()));
         assert!(!is_locked(meta.dev()));
         file.lock_shared().unwrap();
         assert!(is_locked(meta.dev()) && !is_locked(meta.dev() + 1));
+    }
+
+    /// Protects who asks from within a container whether a cell runs: a lock of a process that is out of sight is no lock that nobody has, and what cannot
+    /// be seen is asked of the lock itself, which is free again at once.
+    #[test]
+    fn a_lock_out_of_sight_is_not_taken_for_a_free_one() {
+        let dir = tempfile::tempdir().unwrap();
+        let lock = dir.path().join("x.lock");
+        let held = File::options().read(true).write(true).create(true).truncate(false).open(&lock).unwrap();
+        let meta = held.metadata().unwrap();
+        let seen = BTreeSet::from([(meta.dev(), meta.ino())]);
+        let other = dir.path().metadata().unwrap();
+        for (is_all, of_other) in [(true, Some(false)), (false, None)] {
+            let locked = Locked { seen: seen.clone(), is_all };
+            assert_eq!((locked.has(&meta), locked.has(&other)), (Some(true), of_other));
+        }
+        assert!(!can_be_had_alone(dir.path(), &lock), "nobody knows, without the lock of those that join");
+        let joining = File::create(dir.path().join("lock")).unwrap();
+        assert!(can_be_had_alone(dir.path(), &lock) && can_be_had_alone(dir.path(), &lock));
+        joining.lock().unwrap();
+        assert!(!can_be_had_alone(dir.path(), &lock), "somebody joins");
+        joining.unlock().unwrap();
+        held.lock_shared().unwrap();
+        assert!(!can_be_had_alone(dir.path(), &lock));
     }
 }

@@ -301,8 +301,18 @@ fn pid_namespaces_share_a_cell() {
     let pour = cell.pour_tilted();
     let status = apart("rt-controller").args(["status", "--config"]).arg(cell.config()).output().expect("it runs");
     assert_eq!(status.status.code(), Some(0), "{}", said(&status));
+    let doctor = apart("decant").args(["doctor", "--config"]).arg(cell.config()).output().expect("it runs");
+    let runs = format!("process {} runs", cell.pid("rt-controller"));
+    for seen in [&*runs, "a feature worker runs", "publishes the frames"] {
+        assert!(said(&doctor).contains(seen), "{seen}: {}", said(&doctor));
+    }
     let abort = apart("rt-controller").args(["abort", "--config"]).arg(cell.config()).output().expect("it runs");
     assert_eq!(abort.status.code(), Some(0), "{}", said(&abort));
+    cell.signal("rt-controller", rustix::process::Signal::STOP);
+    let deaf = apart("rt-controller").args(["abort", "--config"]).arg(cell.config()).output().expect("it runs");
+    cell.signal("rt-controller", rustix::process::Signal::CONT);
+    assert_eq!(deaf.status.code(), Some(1), "{}", said(&deaf));
+    assert!(said(&deaf).contains("does not answer, and its process is out of sight"), "{}", said(&deaf));
     assert!(said(&pour.wait_with_output().expect("it ran")).contains("\"aborted\""));
 }
 

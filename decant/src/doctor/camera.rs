@@ -6,7 +6,7 @@
 use std::path::Path;
 
 use feature_worker::source::{controls, devices};
-use rt_controller::claim;
+use rt_controller::stop_client;
 use shared::config::{CameraConfig, CameraSource, Config};
 use shared::ipc::{IpcError, Publishers, publishers};
 use shared::machine::Finding;
@@ -26,7 +26,7 @@ type Published = Result<Option<Publishers>, IpcError>;
 pub fn look(config: &Config) -> Vec<Finding> {
     let published = publishers(&config.cell);
     let mut findings = source(&config.camera, &published);
-    let controlled = matches!(claim::running_at(&Place::from(&config.cell)), Ok(Some(_)));
+    let controlled = matches!(stop_client::running_at(&Place::from(&config.cell)), Ok(Some(_)));
     findings.push(worker(&published, controlled));
     findings
 }

@@ -7,7 +7,7 @@ use std::os::unix::fs::MetadataExt as _;
 use std::path::{Path, PathBuf};
 
 use feature_worker::episodes::folder::{Budget, Folder, MEGABYTE, recorded_today};
-use rt_controller::{claim, disk, journal_files};
+use rt_controller::{claim, disk, journal_files, stop_client};
 use shared::config::Config;
 use shared::config_paths::is_same;
 use shared::disk_space::{LEAST_FREE, Room, room};
@@ -45,7 +45,7 @@ pub fn look(file: &Path, config: &Config) -> Vec<Finding> {
     findings.push(shared_memory());
     findings.push(kept());
     findings.push(weights(file, config));
-    let runs = matches!(claim::running_at(&Place::from(&config.cell)), Ok(Some(_)));
+    let runs = matches!(stop_client::running_at(&Place::from(&config.cell)), Ok(Some(_)));
     findings.extend(config.controller.journal.as_deref().map(|file| journal(file, runs)));
     let folder = Folder::look(&config.recording.directory);
     findings.push(match (writable("episodes", &config.recording.directory), check_number(&config.recording.directory)) {
@@ -94,7 +94,7 @@ fn shared_files(file: &Path, config: &Config) -> Option<Finding> {
 /// Whether a controller of the cell runs, and if not, whether its runtime files have a place.
 fn controller(config: &Config) -> Finding {
     let place = Place::from(&config.cell);
-    let running = claim::running_at(&place);
+    let running = stop_client::running_at(&place);
     if let Ok(Some(running)) = running {
         return Finding::green("controller", format!("process {} runs ({})", running.pid, running.config.display()));
     }
@@ -122,7 +122,12 @@ fn shared_memory() -> Finding {
 fn kept() -> Finding {
     let (all, is_whole) = shared_memory::kept();
     let words = |k: &shared_memory::Kept| {
-        format!("user {}: {} KiB {}", k.uid, k.bytes / 1024, if k.in_use { "in use" } else { "left by dead processes" })
+        let use_of_it = match k.in_use {
+            Some(true) => "in use",
+            Some(false) => "left by dead processes",
+            None => "of which it cannot be seen from here whether it is in use",
+        };
+        format!("user {}: {} KiB {use_of_it}", k.uid, k.bytes / 1024)
     };
     let more = (!is_whole).then(|| "and more files than were looked at".to_owned());
     let list: Vec<String> = all.iter().map(words).chain(more).collect();

@@ -8,10 +8,11 @@ use std::io::{ErrorKind, Read as _, Write as _};
 use std::net::{IpAddr, SocketAddr, TcpStream};
 use std::time::{Duration, Instant};
 
-use rt_controller::claim::{self, Running};
+use rt_controller::claim::Running;
 use rt_controller::client::Client;
 use rt_controller::core::following;
 use rt_controller::link::{self, LinkError, LinkOptions, RobotState, hands, health, payload};
+use rt_controller::stop_client;
 use shared::config::Config;
 use shared::control::{EndReason, RobotLink};
 use shared::machine::Finding;
@@ -58,7 +59,7 @@ pub fn look(config: &Config) -> Vec<Finding> {
         }
     });
     findings.push(dashboard(address));
-    if let Ok(Some(running)) = claim::running_at(&Place::from(&config.cell)) {
+    if let Ok(Some(running)) = stop_client::running_at(&Place::from(&config.cell)) {
         findings.push(held(&running, &Place::from(&config.cell)));
         return findings;
     }

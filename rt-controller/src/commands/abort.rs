@@ -175,6 +175,14 @@ fn ask(target: &Target) -> Result<Asked, Failure> {
         if !target.doubted.is_empty() {
             return not_known(&target.doubted);
         }
+        // Of a name alone anybody could say so.
+        if !target.only_a_name && target.is_heard() {
+            let what = format!(
+                "the rt-controller of cell '{}' does not answer, and its process is out of sight, as from within a container: look at the robot, and abort outside",
+                target.name
+            );
+            return failure(exit::FAILED, what);
+        }
         let what = format!(
             "no rt-controller of cell '{}' is running; a robot that one has left comes upright by its own program (docs/ROBOT.md)",
             target.name
