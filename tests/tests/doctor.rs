@@ -57,7 +57,14 @@ fn the_doctor_names_what_is_wrong() {
     for what in ["program's port", "RTDE", "dashboard", "version", "registers", "state", "speed"] {
         assert_eq!(line(&said, "robot", what).0, "green", "{what}");
     }
-    assert!(line(&said, "files", "weights").1.contains("Handmade"));
+    assert!(line(&said, "files", "weights").1.contains("by method handmade"));
+    let mut few = steady_weights(10);
+    few.origin.episodes = 1;
+    let config = shared::config::Config::read(&cell.config()).expect("valid");
+    few.origin.framing = shared::framing::Framing::new(&config.camera, &config.image);
+    few.write(&cell.weights()).expect("writable");
+    let (verdict, words) = line(&examine(&cell).0, "files", "weights");
+    assert!(verdict == "yellow" && words.contains("from 1 episode by method handmade") && words.contains("weigh five episodes"), "{words}");
 
     for (fault, what, verdict, words) in [
         ("speed-slider=0.4", "speed", "red", "slider"),

@@ -7,6 +7,7 @@ use std::os::unix::fs::MetadataExt as _;
 use std::path::{Path, PathBuf};
 
 use feature_worker::episodes::folder::{Budget, Folder, MEGABYTE, recorded_today};
+use rt_controller::foreseen::few_episodes;
 use rt_controller::{claim, disk, journal_files, stop_client};
 use shared::config::Config;
 use shared::config_paths::is_same;
@@ -163,7 +164,8 @@ fn weights(file: &Path, config: &Config) -> Finding {
                     train,
                 );
             }
-            let how = format!("trained from {} by {:?}", counted(origin.episodes, "episode"), origin.method);
+            let method = serde_json::to_value(origin.method).ok().and_then(|name| Some(name.as_str()?.to_owned())).unwrap_or_default();
+            let how = format!("trained from {} by method {method}", counted(origin.episodes, "episode"));
             let age = path.metadata().ok().and_then(|m| m.modified().ok()).and_then(|t| t.elapsed().ok());
             let age = age.map_or(String::new(), |age| format!(", {:.1} days old", age.as_secs_f64() / 86_400.0));
             let is = format!("{} {how}{age}", weights.identity());
@@ -175,6 +177,10 @@ fn weights(file: &Path, config: &Config) -> Finding {
                     means,
                     "train with recordings of this cell, or make sure that the areas are of such pictures",
                 );
+            }
+            if few_episodes(&weights).is_some() {
+                let means = "a pour may be off by far more than the weights say";
+                return Finding::yellow("weights", is, means, "weigh five episodes or more, and refine");
             }
             Finding::green("weights", is)
         }
