@@ -46,7 +46,12 @@ fn a_slipped_decimal_point_is_remarked() {
     let file = file.to_str().unwrap();
     for (weight, far) in [("820", true), ("8.2", true), ("90", false)] {
         let weighed = episodes(&["weigh", file, "--weight", weight]);
-        assert_eq!((code(&weighed), text(&weighed.stderr).contains("ml by the pour's own estimate")), (0, far), "{}", text(&weighed.stderr));
+        assert_eq!(
+            (code(&weighed), text(&weighed.stderr).contains("ml by the pour's own estimate")),
+            (0, far),
+            "{}",
+            text(&weighed.stderr)
+        );
         let checked = text(&episodes(&["check", file]).stdout);
         assert_eq!(checked.contains("82.0 ml by the pour's own estimate"), far, "{checked}");
     }
