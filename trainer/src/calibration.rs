@@ -69,8 +69,8 @@ pub fn calibrate(episodes: &[TrainingEpisode], exponent: Option<f64>) -> Calibra
     }
 }
 
-/// Noise of a weight that a calibration without doubt would leave, g: what the scale rounds, and who reads it.
-const READ_SD_G: f64 = 0.7;
+/// Noise of a weight that a calibration without doubt would leave, g: what the scale rounds, and who reads it. Chosen by hand; no measurement is recorded.
+pub const READING_SD_G: f64 = 0.7;
 /// The least that the misfit of the weights lowers the doubt by, as a variance: few weights may meet each other by chance. Chosen by hand;
 /// docs/LEARNING.md has the coverage.
 const MISFIT_MIN: f64 = 0.25;
@@ -110,10 +110,10 @@ pub fn with_doubt(episodes: &[TrainingEpisode], exact: bool) -> Doubted {
         let sum_ml = f64::from(calibration.volume_at_1_px2_ml) * area_sum(e, q);
         let step = 1e-3;
         let slope_ml = f64::from(calibration.volume_at_1_px2_ml) * (area_sum(e, q + step) - area_sum(e, q - step)) / (2.0 * step);
-        let sd_g = if exact { READ_SD_G } else { weight_sd_g(e.weight_g) };
+        let sd_g = if exact { READING_SD_G } else { weight_sd_g(e.weight_g) };
         let slopes = [sum_ml / sd_g, slope_ml / sd_g];
         misfit += ((sum_ml - e.weight_g) / sd_g).powi(2);
-        let read = (READ_SD_G / e.weight_g).powi(2);
+        let read = (READING_SD_G / e.weight_g).powi(2);
         // What the scale rounds of a light weight hides how far it is missed, and would count for more than all that the others show.
         let tells = POUR_SD * POUR_SD / (POUR_SD * POUR_SD + read);
         misses += tells * (((sum_ml - e.weight_g) / e.weight_g).powi(2) - read);

@@ -12,7 +12,7 @@ use serde::Serialize;
 use shared::estimator::flow::FlowTables;
 use shared::plural::counted;
 
-use crate::calibration::{self, EXPONENT_SD, EXPONENTS};
+use crate::calibration::{self, EXPONENT_SD, EXPONENTS, READING_SD_G};
 use crate::data::{self, TrainingEpisode};
 use crate::fit::{CHANGE_NEEDS, Changed, Fit};
 use crate::tare;
@@ -24,8 +24,6 @@ const NEEDS: usize = 4;
 const PAIR_SPREAD: f64 = 0.08;
 /// Standard deviations at which a weight is doubted. Chosen by hand; no measurement is recorded.
 const DOUBTED_SDS: f64 = 4.0;
-/// Standard deviation of reading the scale, g. Chosen by hand; no measurement is recorded.
-const READING_SD_G: f64 = 0.7;
 /// By how much a right weight may be off what the others say beyond the doubt of their calibration (log), as a standard deviation. Chosen by hand.
 const SPREAD_LEAST: f64 = 0.03;
 /// The same of few episodes, times their number. Chosen by hand; no measurement is recorded.

@@ -4,13 +4,11 @@
 //! other enough to accuse one of them: another exponent of the area takes most of it. But a stream of no area weighs nothing. So the weights are met once by
 //! `w_E = c sum area^q`, and once by `w_E = c sum area^q + tare`, and the second must not be the better one.
 
-use crate::calibration::{self, EXPONENT_EXPECTED, EXPONENT_SD, EXPONENTS};
+use crate::calibration::{self, EXPONENT_EXPECTED, EXPONENT_SD, EXPONENTS, READING_SD_G};
 use crate::data::TrainingEpisode;
 
 /// Three unknowns are met by three weights, however wrong they are.
 const NEEDS: usize = 4;
-/// Standard deviation of reading the scale, g, as in `consistency`.
-const READING_SD_G: f64 = 0.7;
 /// By how much a right weight is off the sum of its areas (log), as a standard deviation, as in `consistency`.
 const SPREAD: f64 = 0.03;
 /// How much better the weights must be met with a tare than without, as a difference of squares in variances of a weight. Chosen by hand, above the 6.9 that
