@@ -37,6 +37,9 @@ pub struct Steadiness {
     pub still_px: f32,
     /// All edges outside of the container, in the same unit.
     pub edges_px: f32,
+    /// Of two pictures, which share of the edges outside of the container lie on one another, beyond what lies there by chance: the median over all
+    /// pairs. Something large that passes by hides the background in a few pictures of each place only.
+    pub pairs: f32,
 }
 
 impl Steadiness {
@@ -56,8 +59,8 @@ impl Steadiness {
             Ok(least)
         };
         let (top_edge, left_side) = (stays(corner.rim, corner.foot)?, stays(corner.foot, corner.rim)?);
-        let (still_px, edges_px) = still_edges(corner, &pictures)?;
-        Ok(Self { top_edge, left_side, still_px, edges_px })
+        let (still_px, edges_px, pairs) = still_edges(corner, &pictures)?;
+        Ok(Self { top_edge, left_side, still_px, edges_px, pairs })
     }
 }
 
@@ -102,39 +105,51 @@ fn correlation(a: &[f32], b: &[f32]) -> f32 {
 }
 
 /// The length of the edges outside of the container that are at the same place in nearly all pictures, and of all edges there, in the mean of
-/// the pictures, px of a picture 640 px wide.
-fn still_edges(corner: &Corner, pictures: &[Mat]) -> opencv::Result<(f32, f32)> {
-    let Some(first) = pictures.first() else { return Ok((0.0, 0.0)) };
+/// the pictures, px of a picture 640 px wide; and [`Steadiness::pairs`].
+fn still_edges(corner: &Corner, pictures: &[Mat]) -> opencv::Result<(f32, f32, f32)> {
+    let Some(first) = pictures.first() else { return Ok((0.0, 0.0, 0.0)) };
     let (width, height) = (first.cols() as usize, first.rows() as usize);
-    let mut edges = Vec::new();
-    let mut counts = vec![0u16; width * height];
-    let kernel = imgproc::get_structuring_element(imgproc::MORPH_RECT, Size::new(3, 3), Point::new(-1, -1))?;
-    for picture in pictures {
-        let (mut edge, mut wide) = (Mat::default(), Mat::default());
-        imgproc::canny(picture, &mut edge, CANNY[0], CANNY[1], 3, true)?;
-        imgproc::dilate_def(&edge, &mut wide, &kernel)?;
-        wide.data_bytes()?.iter().zip(&mut counts).for_each(|(v, count)| *count += u16::from(*v > 0));
-        edges.push(edge);
-    }
     // A band around the container belongs to its rim and wall.
     let band = 0.03 * width as f32;
-    let outside = |x: f32, y: f32| {
+    let outside = |i: usize| {
+        let (x, y) = ((i % width) as f32, (i / width) as f32);
         let beyond = |end: [f32; 2], inner: [f32; 2]| {
             let piece = Piece::new(corner.lip, end, [0.0, 1.0], inner);
             piece.outside[0] * (x - corner.lip[0]) + piece.outside[1] * (y - corner.lip[1])
         };
         beyond(corner.rim, corner.foot).max(beyond(corner.foot, corner.rim)) > band
     };
+    let outside: Vec<usize> = (0..width * height).filter(|i| outside(*i)).collect();
+    let mut counts = vec![0u16; outside.len()];
+    let (mut edges, mut wides) = (Vec::new(), Vec::new());
+    let kernel = imgproc::get_structuring_element(imgproc::MORPH_RECT, Size::new(3, 3), Point::new(-1, -1))?;
+    for picture in pictures {
+        let (mut edge, mut wide) = (Mat::default(), Mat::default());
+        imgproc::canny(picture, &mut edge, CANNY[0], CANNY[1], 3, true)?;
+        imgproc::dilate_def(&edge, &mut wide, &kernel)?;
+        let (edge, wide) = (edge.data_bytes()?, wide.data_bytes()?);
+        let near: Vec<bool> = outside.iter().map(|i| wide[*i] > 0).collect();
+        near.iter().zip(&mut counts).for_each(|(near, count)| *count += u16::from(*near));
+        wides.push(near);
+        edges.push(outside.iter().enumerate().filter(|(_, i)| edge[**i] > 0).map(|(k, _)| k).collect::<Vec<usize>>());
+    }
     let needed = (STILL_SHARE * pictures.len() as f32).ceil() as u16;
-    let (mut all, mut still) = (0u64, 0u64);
-    for edge in &edges {
-        for (i, _) in edge.data_bytes()?.iter().enumerate().filter(|(_, v)| **v > 0) {
-            if outside((i % width) as f32, (i / width) as f32) {
-                all += 1;
-                still += u64::from(counts[i] >= needed);
-            }
+    let still: usize = edges.iter().map(|edge| edge.iter().filter(|k| counts[**k] >= needed).count()).sum();
+    let all: usize = edges.iter().map(Vec::len).sum();
+    let each = |count: usize| count as f32 / pictures.len() as f32 * 640.0 / width as f32;
+    Ok((each(still), each(all), median_of_pairs(&edges, &wides)))
+}
+
+/// See [`Steadiness::pairs`]; `edges` are the places of each picture's edges, and `wides` says which places are on or beside them.
+fn median_of_pairs(edges: &[Vec<usize>], wides: &[Vec<bool>]) -> f32 {
+    let chance: Vec<f32> = wides.iter().map(|wide| wide.iter().filter(|near| **near).count() as f32 / wide.len().max(1) as f32).collect();
+    let mut shares = Vec::new();
+    for (k, edge) in edges.iter().enumerate() {
+        for (wide, chance) in wides.iter().zip(&chance).take(k) {
+            let on = edge.iter().filter(|at| wide[**at]).count() as f32 / edge.len().max(1) as f32;
+            shares.push((on - chance) / (1.0 - chance).max(f32::EPSILON));
         }
     }
-    let each = |count: u64| count as f32 / pictures.len() as f32 * 640.0 / width as f32;
-    Ok((each(still), each(all)))
+    shares.sort_by(f32::total_cmp);
+    shares.get(shares.len() / 2).copied().unwrap_or(0.0)
 }
