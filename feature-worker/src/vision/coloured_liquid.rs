@@ -363,7 +363,7 @@ impl ColouredLiquid {
             }
         }
         let share = filled as f32 / RAYS as f32;
-        if cut_off as f32 > ALL_LIQUID * RAYS as f32 {
+        if cut_off as f32 > ALL_LIQUID * RAYS as f32 || (share >= STREAM_RAYS && self.seen().is_cut(&self.ends)?) {
             return Ok(Sighting::Unsure(Doubt::EdgeNotFound));
         }
         if share < STREAM_RAYS {

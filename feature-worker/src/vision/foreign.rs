@@ -41,6 +41,12 @@ const BEYOND_PX: f32 = 8.0;
 const BEYOND_SAMPLES: usize = 4;
 /// With this share of foreign colours beside the stream, its edge is not where the liquid ends. Tuned.
 const BEYOND_FOREIGN: f32 = 0.5;
+/// With more than this much liquid beyond a stream's edge, px, ... Chosen by hand: more than specks.
+const CUT_PX: f32 = 6.0;
+/// ... no further from the edge than this, px, ... Chosen by hand: a streak of 40 px, and a part beyond it.
+const CUT_WITHIN_PX: f32 = 48.0;
+/// ... on more than this share of the rays, something cuts the stream in two. Chosen by hand: more than a drop beside it.
+const CUT_RAYS: f32 = 0.4;
 /// What is foreign may be the liquid when it is no further from its colour than this share of the distance from there to the ground's mean
 /// colour: a thin stream shows the ground through itself. Chosen by hand.
 const LIKE_LIQUID: f32 = 0.5;
@@ -178,6 +184,23 @@ impl Seen<'_> {
             }
         }
         Ok((foreign as f32 > BEYOND_FOREIGN * looked.max(RAYS / 4) as f32).then(|| mean.levels()))
+    }
+
+    /// Whether more of the liquid lies beyond the ends of a stream: something in other colours, as a lamp's or a wall's reflection along the stream, cuts it
+    /// in two, and only the part at the lip would be measured.
+    pub(super) fn is_cut(&self, ends: &[usize; RAYS]) -> opencv::Result<bool> {
+        let (mut more, mut filled) = (0usize, 0usize);
+        for (i, end) in ends.iter().enumerate() {
+            let Some(last) = end.checked_sub(1) else { continue };
+            filled += 1;
+            let within =
+                self.grid.radii_px.partition_point(|r| *r <= self.grid.radii_px[last] + CUT_WITHIN_PX).min(self.grid.rays[i].samples);
+            let beyond = &self.mask.at_row::<u8>(i as i32)?[*end..within.max(*end)];
+            let liquid_px: f32 =
+                beyond.iter().zip(&self.grid.steps_px[*end..]).map(|(value, step)| if *value != 0 { *step } else { 0.0 }).sum();
+            more += usize::from(liquid_px > CUT_PX);
+        }
+        Ok(more as f32 > CUT_RAYS * filled as f32)
     }
 
     /// How many rays have more than so much liquid on them, wherever it lies up to this distance from the lip, px.
