@@ -95,7 +95,7 @@ fn each_cause_raises_its_doubt() -> Result<(), ExtractError> {
     assert_eq!(measure(&mut extractor, &changed)?.doubt, Doubt::TooDark);
     good.convert_to(&mut changed, -1, 1.0, 240.0)?;
     assert_eq!(measure(&mut extractor, &changed)?.doubt, Doubt::BlownOut);
-    imgproc::gaussian_blur(&good, &mut changed, Size::new(0, 0), 4.5, 4.5, core::BORDER_REFLECT_101)?;
+    imgproc::gaussian_blur_def(&good, &mut changed, Size::new(0, 0), 4.5)?;
     assert_eq!(measure(&mut extractor, &changed)?.doubt, Doubt::Blurred);
     let full = blue(&[vec![[0.0, 0.0], [640.0, 0.0], [640.0, 480.0], [0.0, 480.0]]], 2)?;
     assert_eq!(measure(&mut extractor, &full)?.doubt, Doubt::EdgeNotFound);
@@ -356,7 +356,7 @@ fn lost_focus_is_noticed_without_a_stream() -> Result<(), ExtractError> {
         }
         for i in 12..24 {
             let mut soft = Mat::default();
-            imgproc::gaussian_blur(&dry(i as f32 * 0.5, i)?, &mut soft, Size::new(0, 0), 5.0, 5.0, core::BORDER_REFLECT_101)?;
+            imgproc::gaussian_blur_def(&dry(i as f32 * 0.5, i)?, &mut soft, Size::new(0, 0), 5.0)?;
             let measured = measure(&mut extractor, &drawn::noisy(&soft, i)?)?;
             // To clear water's memory of the background, a picture that turns soft all at once is first of all another picture.
             let noticed = measured.doubt == Doubt::Blurred || (method == LiquidMethod::Clear && measured.doubt == Doubt::EdgeNotFound);
@@ -372,7 +372,7 @@ fn lost_focus_is_noticed_without_a_stream() -> Result<(), ExtractError> {
 fn focus_is_judged_by_the_glass() -> Result<(), ExtractError> {
     let soft = |picture: &Mat, deviation_px: f64| -> Result<Mat, opencv::Error> {
         let mut soft = Mat::default();
-        imgproc::gaussian_blur(picture, &mut soft, Size::new(0, 0), deviation_px, deviation_px, core::BORDER_REFLECT_101)?;
+        imgproc::gaussian_blur_def(picture, &mut soft, Size::new(0, 0), deviation_px)?;
         Ok(soft)
     };
     let even = Mat::new_rows_cols_with_default(HEIGHT, WIDTH, CV_8UC3, Scalar::all(140.0))?;

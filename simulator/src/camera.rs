@@ -29,7 +29,7 @@ mod stream_outline;
 pub mod view;
 mod water;
 
-use opencv::core::{self, BORDER_REFLECT_101, CV_8UC3, Mat, Rect, Scalar, Size};
+use opencv::core::{self, CV_8UC3, Mat, Rect, Scalar, Size};
 use opencv::imgproc;
 use rand::{RngExt, SeedableRng};
 use rand_pcg::Pcg64Mcg;
@@ -123,7 +123,7 @@ impl Renderer {
         self.glass.lay(&mut self.frame)?;
         let blur_px = self.view.blur_px;
         if blur_px > 0.0 {
-            imgproc::gaussian_blur(&self.frame, &mut self.blurred, Size::new(0, 0), blur_px, blur_px, BORDER_REFLECT_101)?;
+            imgproc::gaussian_blur_def(&self.frame, &mut self.blurred, Size::new(0, 0), blur_px)?;
             std::mem::swap(&mut self.frame, &mut self.blurred);
         }
         self.sensor.expose(&self.view, &self.frame, &mut self.random, out)?;

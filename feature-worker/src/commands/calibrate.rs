@@ -145,7 +145,8 @@ fn calibrate(args: &Args, mut config: Config) -> Result<(), Failure> {
     };
     checks::moves(&pour).map_err(|e| failure(exit::FAILED, e))?;
     let corner = choose_corner(args, &pour, [first.cols() as f32, first.rows() as f32])?;
-    let proposal = match propose(&config, corner, &pour) {
+    let given = args.x_axis.is_some() && args.y_axis.is_some();
+    let proposal = match propose(&config, (corner, given), &pour) {
         Ok(proposal) => Some(proposal),
         // In the page the corner can still be corrected.
         Err(e) if args.page => {
@@ -227,12 +228,13 @@ fn choose_corner(args: &Args, pour: &Pour, [width, height]: [f32; 2]) -> Result<
     }
 }
 
-/// The `[image]` table for a corner, after all checks: the region over the mouth, the axes, and the colour learned from the pictures.
-fn propose(config: &Config, corner: Corner, pour: &Pour) -> Result<Proposal, String> {
+/// The `[image]` table for a corner and whether its axes were given, after all checks: the region over the mouth, the axes, and the colour learned from the
+/// pictures.
+fn propose(config: &Config, (corner, given): (Corner, bool), pour: &Pour) -> Result<Proposal, String> {
     let mut remarks = Vec::new();
     let camera = &config.camera;
     let (poses, chosen, mean) = pour.poses().map_err(|e| e.message)?;
-    remarks.extend(checks::axes_stay(&corner, &chosen, &mean)?);
+    remarks.extend(checks::axes_stay(&corner, given, &chosen, &mean)?);
     let mut image = table(camera, corner, &config.image);
     if let RoomBeside::Wanted(region_px) = room_beside(camera, &image) {
         // The camera is turned about its own axis, so that what is beside the lip lies lower or higher.
@@ -346,7 +348,7 @@ fn serve(args: &Args, port: TcpListener, start: (Config, Corner), pour: &Pour, m
 /// The configuration for a corner that was clicked, if it passes all checks, and what was seen.
 fn try_corner(config: &Config, clicked: &[u8], pour: &Pour) -> Result<(Config, Corner, Vec<String>), String> {
     let corner = serde_json::from_slice::<Corner>(clicked).map_err(|e| e.to_string())?;
-    let Proposal { image, remarks } = propose(config, corner, pour)?;
+    let Proposal { image, remarks } = propose(config, (corner, true), pour)?;
     Ok((Config { image, ..config.clone() }, corner, remarks))
 }
 

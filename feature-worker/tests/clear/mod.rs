@@ -83,7 +83,7 @@ fn a_stream_that_begins_without_an_edge_is_told() -> Result<(), ExtractError> {
         let mut shade = Mat::new_rows_cols_with_default(480, 640, CV_8UC3, Scalar::all(255.0))?;
         lay_over(&mut shade, &[stream(legs, 0.9 * legs)], Scalar::all(level))?;
         let mut soft = Mat::default();
-        imgproc::gaussian_blur(&shade, &mut soft, Size::new(0, 0), 16.0, 16.0, core::BORDER_REFLECT_101)?;
+        imgproc::gaussian_blur_def(&shade, &mut soft, Size::new(0, 0), 16.0)?;
         for i in 0..24 {
             let mut picture = water(0.0, None, i)?;
             if i >= 12 {

@@ -85,7 +85,7 @@ pub fn board(turn_deg: f32) -> Result<Mat, opencv::Error> {
     let turn = imgproc::get_rotation_matrix_2d(Point2f::new(700.0, 520.0), f64::from(turn_deg), 1.0)?;
     let (mut turned, mut soft) = (Mat::default(), Mat::default());
     imgproc::warp_affine(&large, &mut turned, &turn, Size::new(WIDTH, HEIGHT), imgproc::INTER_LINEAR, 0, Scalar::default())?;
-    imgproc::gaussian_blur(&turned, &mut soft, Size::new(0, 0), 1.8, 1.8, core::BORDER_REFLECT_101)?;
+    imgproc::gaussian_blur_def(&turned, &mut soft, Size::new(0, 0), 1.8)?;
     Ok(soft)
 }
 

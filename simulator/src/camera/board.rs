@@ -94,7 +94,7 @@ fn paint(kind: Background, side: i32, random: &mut Pcg64Mcg) -> opencv::Result<M
     // The board is behind the plane of focus.
     let mut soft = Mat::default();
     let sigma = 1.0;
-    imgproc::gaussian_blur(&board, &mut soft, Size::new(0, 0), sigma, sigma, BORDER_REFLECT_101)?;
+    imgproc::gaussian_blur_def(&board, &mut soft, Size::new(0, 0), sigma)?;
     Ok(soft)
 }
 

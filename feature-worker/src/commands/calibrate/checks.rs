@@ -9,7 +9,7 @@ use shared::config::{CameraConfig, ImageConfig, LiquidMethod};
 use shared::messages::Doubt;
 
 use super::pour::{Pour, same};
-use crate::vision::{Corner, DryBackground, Extractor, InGlass, Steadiness};
+use crate::vision::{AxesError, Corner, DryBackground, Extractor, InGlass, Steadiness};
 
 // "By hand" below means that the value was chosen by hand between what 20 rendered pours gave and what clips of other things gave; see
 // docs/VISION.md.
@@ -58,9 +58,12 @@ pub(super) fn moves(pour: &Pour) -> Result<(), String> {
 }
 
 /// Refuses axes that do not stay while the background moves, and a background that stands still while something else moves. Returns a
-/// remark where an axis is too faint to tell.
-pub(super) fn axes_stay(corner: &Corner, poses: &[&Mat], mean: &Mat) -> Result<Option<String>, String> {
+/// remark where an axis is too faint to tell. Of axes that nobody gave, one at least has to be seen to stay.
+pub(super) fn axes_stay(corner: &Corner, given: bool, poses: &[&Mat], mean: &Mat) -> Result<Option<String>, String> {
     let steady = Steadiness::judge(corner, poses, mean).map_err(|e| e.message)?;
+    if !given && steady.top_edge.is_none() && steady.left_side.is_none() {
+        return Err(AxesError::NoCorner.to_string());
+    }
     let share = |stays: Option<f32>| stays.map_or("cannot be told".into(), percent);
     let line = format!("top edge {}, left side {}", share(steady.top_edge), share(steady.left_side));
     if [steady.top_edge, steady.left_side].iter().flatten().any(|stays| *stays < STAYS_LEAST) {
@@ -186,4 +189,22 @@ pub(super) fn something_flows(pour: &Pour, camera: &CameraConfig, image: &ImageC
         return Ok([seen].into_iter().chain(strange).collect());
     };
     Err(format!("{fault}: {seen}; {advice}"))
+}
+
+#[cfg(test)]
+mod tests {
+    use opencv::core::{CV_8UC3, Scalar};
+
+    use super::*;
+
+    /// Protects from axes on things that show no edge there, as on plates: what was found and cannot be judged on either side was not found. Who gives axes
+    /// by hand knows them, and is told that they cannot be judged.
+    #[test]
+    fn axes_that_cannot_be_judged_are_taken_from_people_alone() {
+        let even = Mat::new_rows_cols_with_default(480, 640, CV_8UC3, Scalar::all(120.0)).expect("made");
+        let corner = Corner { lip: [220.0, 240.0], rim: [560.0, 240.0], foot: [220.0, 440.0] };
+        let poses = [&even; POSES_LEAST];
+        assert!(axes_stay(&corner, true, &poses, &even).is_ok_and(|remark| remark.is_some_and(|r| r.contains("too faint"))));
+        assert_eq!(axes_stay(&corner, false, &poses, &even), Err(AxesError::NoCorner.to_string()));
+    }
 }
