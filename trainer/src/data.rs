@@ -8,6 +8,7 @@ use std::path::PathBuf;
 use sha2::{Digest, Sha256};
 use shared::episode::{self, Episode};
 use shared::framing::Framing;
+use shared::level::plain;
 use shared::plural::counted;
 
 use crate::servo;
@@ -357,8 +358,21 @@ impl EpisodeSource {
         if self.cells.is_empty() && named.len() > 1 {
             return Err(DataError::SeveralCells { cells });
         }
-        episodes.retain(|e| self.cells.is_empty() || self.cells.contains(&e.info.cell));
+        if !self.cells.is_empty() {
+            say_without_cell(episodes);
+            episodes.retain(|e| self.cells.contains(&e.info.cell));
+        }
         Ok(())
+    }
+}
+
+/// Says which episodes do not name their cell, and so are of none that was chosen: nobody has said that these do not count.
+fn say_without_cell(episodes: &[Episode]) {
+    let unnamed: Vec<&str> = episodes.iter().filter(|e| e.info.cell.is_empty()).map(|e| e.name.as_str()).collect();
+    if !unnamed.is_empty() {
+        let (n, names) = (counted(unnamed.len(), "episode"), unnamed.join(", "));
+        let what = format!("{n} without the name of a cell, and --cell takes only those that name theirs: {names}");
+        eprintln!("left out: {}", plain(&what));
     }
 }
 

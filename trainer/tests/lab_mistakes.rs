@@ -125,3 +125,24 @@ fn a_gain_that_only_the_newest_episodes_have_is_suspected() {
         }
     }
 }
+
+/// Protects whoever chooses a cell from a data set that shrinks without a word: episodes that do not name theirs are counted and named, as nobody said that
+/// they do not count. Those of the other cells are left out as it was asked.
+#[test]
+fn episodes_without_a_cell_are_named_where_a_cell_is_chosen() {
+    let dir = tempfile::tempdir().unwrap();
+    let all = common::episodes(7, 1);
+    tables(dir.path(), &all);
+    let cells = ["lab", "", "lab", "lab", "other", "", "lab"];
+    let rows = all.iter().zip(cells).map(|(e, cell)| format!("{},{},{cell}\n", e.name, e.weight_g));
+    std::fs::write(dir.path().join("s.csv"), format!("episode,weight_g,cell\n{}", rows.collect::<String>())).unwrap();
+    let words = "left out: 2 episodes without the name of a cell, and --cell takes only those that name theirs: 2, 6";
+    for (more, named) in [(&["--cell", "lab"][..], true), (&["--cell", "lab", "--cell", "other"], true)] {
+        for command in [&["train", "--out", "w.bin"][..], &["refine", "--out", "w.bin"], &["check"], &["plan", "--holds", "500"]] {
+            let args = [command, more, &["f.csv", "--scale", "s.csv"]].concat();
+            let out = Command::new(env!("CARGO_BIN_EXE_trainer")).current_dir(dir.path()).args(&args).output().unwrap();
+            let said = String::from_utf8_lossy(&out.stderr);
+            assert_eq!((out.status.success(), said.matches(words).count() == 1), (true, named), "{args:?}: {said}");
+        }
+    }
+}
