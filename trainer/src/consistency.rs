@@ -14,6 +14,7 @@ use shared::plural::counted;
 
 use crate::calibration::{self, EXPONENT_SD, EXPONENTS, READING_SD_G};
 use crate::data::{self, TrainingEpisode};
+use crate::exchanged;
 use crate::fit::{CHANGE_NEEDS, Changed, Fit};
 use crate::tare;
 use crate::teaching::foresight::LAST_DEG;
@@ -103,7 +104,7 @@ fn changed_camera(episodes: &[TrainingEpisode], fit: &Fit) -> Option<(String, St
     Some((DATA_SET.to_owned(), what))
 }
 
-/// What all weights together say against grams, a tared cup, and the vessel that holds `holds_ml` up to its lip, if somebody knows that: weights that are all
+/// What all weights together say against grams, a tared cup, the order in which they were entered, and the vessel that holds `holds_ml` up to its lip, if somebody knows that: weights that are all
 /// wrong by one factor, or by as many grams, do not contradict each other. Each line comes with the episode's name, or [`DATA_SET`].
 pub fn against_vessel(episodes: &[TrainingEpisode], fit: &Fit, holds_ml: Option<f64>) -> Vec<(String, String)> {
     let mut doubts = Vec::new();
@@ -119,6 +120,14 @@ pub fn against_vessel(episodes: &[TrainingEpisode], fit: &Fit, holds_ml: Option<
              the same in all episodes?",
             tare_g.abs()
         ))
+    }));
+    doubts.extend(exchanged::pair(episodes).map(|(first, second)| {
+        let (one, other) = (&episodes[first], &episodes[second]);
+        let what = format!(
+            "weight {:.0} g, and that of {} is {:.0} g: exchanged, these two fit the areas far better: was each entered for the other?",
+            one.weight_g, other.name, other.weight_g
+        );
+        (one.name.clone(), what)
     }));
     let Some(holds_ml) = holds_ml else { return doubts };
     for e in episodes.iter().filter(|e| e.weight_g > DENSEST_G_ML * holds_ml) {

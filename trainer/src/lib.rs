@@ -3,7 +3,7 @@
 //! | module | what it holds |
 //! |---|---|
 //! | [`data`] | the episodes, read and checked |
-//! | [`consistency`], [`tare`] | weights that do not fit the others, and all of them that have the cup's |
+//! | [`consistency`], [`exchanged`], [`tare`] | weights that do not fit the others, two that were entered for each other, and all that have the cup's |
 //! | [`calibration`] | area to ml, from the weights alone |
 //! | [`fit`] | the flow model, fitted to the episodes |
 //! | [`servo`] | how the joint follows its commands, where it was measured |
@@ -20,6 +20,7 @@ pub mod cli;
 pub mod commands;
 pub mod consistency;
 pub mod data;
+pub mod exchanged;
 pub mod fit;
 pub mod method;
 pub mod network;
