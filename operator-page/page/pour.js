@@ -219,7 +219,8 @@ function result() {
   const goal = newest.goal_ml, curve = goal === null;
   const head = curve ? `Curve recorded in ${shown(newest.seconds)} s` : `${newest.poured} ml poured of ${goalWords(goal)} ml`;
   const body = [el('p', { className: 'big' }, head),
-    el('p', { className: newest.done ? 'good' : 'bad' }, newest.done ? `✓ Done after ${shown(newest.seconds)} s.` : `✕ It ended early: ${newest.reason}.`)];
+    newest.unsure ? el('p', { className: 'warn' }, `! After ${shown(newest.seconds)} s it is ${newest.reason}.`)
+      : el('p', { className: newest.done ? 'good' : 'bad' }, newest.done ? `✓ Done after ${shown(newest.seconds)} s.` : `✕ It ended early: ${newest.reason}.`)];
   if (!curve) body.push(el('p', {}, offGoal(newest)));
   const after = el('div');
   if (newest.file) {
@@ -264,7 +265,7 @@ function slow() {
   }
   const rows = (status?.outcomes || []).slice().reverse().map(o => el('tr', {}, el('td', { className: 'number' }, o.episode),
     el('td', {}, o.goal_ml === null ? 'curve' : `pour of ${goalWords(o.goal_ml)} ml`), el('td', { className: 'number' }, o.goal_ml === null ? '' : `${o.poured} ml`),
-    el('td', { className: 'number' }, `${shown(o.seconds)} s`), el('td', { className: 'words' }, `${o.done ? '✓' : '✕'} ${o.reason}`)));
+    el('td', { className: 'number' }, `${shown(o.seconds)} s`), el('td', { className: 'words' }, `${o.unsure ? '!' : o.done ? '✓' : '✕'} ${o.reason}`)));
   fill($('outcomes'), rows.length ? el('table', {}, el('thead', {}, el('tr', {}, ...[['Number', 1], ['What'], ['Poured', 1], ['Time', 1], ['How it ended']].map(([h, number]) => el('th', { scope: 'col', className: number ? 'number' : '' }, h)))), el('tbody', {}, ...rows))
     : el('p', { className: 'hint' }, status ? 'Nothing has been poured since the controller started.' : 'The controller does not answer, so its results are not known.'));
 }

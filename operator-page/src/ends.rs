@@ -57,7 +57,7 @@ impl Ends {
         for o in outcomes {
             let file = files.get(&o.episode).and_then(|f| f.as_ref().ok()).and_then(|path| path.rsplit('/').next());
             let Some(name) = file else { continue };
-            let end = End { reason: o.reason.words().into(), poured: o.goal_ml.is_some().then(|| o.poured_words()) };
+            let end = End { reason: o.words().into(), poured: o.goal_ml.is_some().then(|| o.poured_words()) };
             if self.by_name.get(name) != Some(&end) {
                 self.by_name.insert(name.into(), end);
                 changed = true;

@@ -259,7 +259,7 @@ fn outcome(o: &Outcome, live: &Live) -> Value {
     let recorded = live.files.get(&o.episode);
     let file = recorded.and_then(|r| r.as_ref().ok()).and_then(|path| path.rsplit('/').next());
     json!({
-        "episode": o.episode, "done": o.reason == EndReason::Done, "reason": o.reason.words(), "goal_ml": o.goal_ml,
+        "episode": o.episode, "done": o.reason == EndReason::Done, "unsure": o.is_unsure(), "reason": o.words(), "goal_ml": o.goal_ml,
         "poured_ml": o.poured_ml, "poured_sd_ml": o.poured_sd_ml, "poured": o.poured_words(), "unseen": o.unseen, "seconds": o.seconds,
         "file": file, "no_file": recorded.and_then(|r| r.as_ref().err()),
     })

@@ -150,14 +150,15 @@ impl<'a> Service<'a> {
                     }
                 }
                 Event::Ended(outcome) => {
-                    let level = if outcome.reason == EndReason::Done { Level::Info } else { Level::Warning };
+                    let is_right = outcome.reason == EndReason::Done && !outcome.is_unsure();
+                    let level = if is_right { Level::Info } else { Level::Warning };
                     let line = format!(
                         "episode {}: {}, {} after {:.1} s",
                         outcome.episode,
                         outcome
                             .goal_ml
                             .map_or("curve".into(), |g| format!("goal {g:.1} ml, {} ml poured (estimate)", outcome.poured_words())),
-                        outcome.reason.words(),
+                        outcome.words(),
                         outcome.seconds
                     );
                     (self.say)(level, &line);

@@ -106,12 +106,25 @@ pub fn volume_words(volume_ml: f32, sd_ml: f32) -> String {
 }
 
 impl Outcome {
+    /// Whether it is done by an estimate whose deviation is larger than what a pour that is done may be off: nobody knows then that it is.
+    pub fn is_unsure(&self) -> bool {
+        self.reason == EndReason::Done && self.goal_ml.is_some_and(|goal_ml| self.poured_sd_ml > off_ml(goal_ml))
+    }
+
+    /// How it ended, in words.
+    pub fn words(&self) -> &'static str {
+        if self.is_unsure() { UNSURE } else { self.reason.words() }
+    }
+
     /// The volume poured with its standard deviation, where that is known, ml.
     pub fn poured_words(&self) -> String {
         let volume = volume_words(self.poured_ml, self.poured_sd_ml);
         if self.unseen { format!("at least {volume}") } else { volume }
     }
 }
+
+/// How a pour ended whose goal was reached by an estimate that is no more sure of it than this ([`Outcome::is_unsure`]).
+const UNSURE: &str = "done by an estimate that hardly knows how much was poured: weigh it; vessel, liquid or camera may be others than in the episodes, or these were too few";
 
 /// A pour that ends off its goal by more than so many ml and this share of it, or off a small goal by half, is not done, however large its deviation; a
 /// plain sum, which has none, is only looked at for being short. Among the fixed seeds of docs/SWARM.md one that was done was shorter.
@@ -245,7 +258,9 @@ impl EndReason {
             Self::GoalExceeded => {
                 "far more was poured than the goal: the vessel gave more than was learned of it, or its stream was not seen for a while; look at the camera, and weigh"
             }
-            Self::NothingFlows => "nothing is seen to flow at a tilt at which the vessel should: look at the camera, or fill the vessel",
+            Self::NothingFlows => {
+                "nothing is seen to flow at a tilt at which the vessel should: look at the camera, fill the vessel, or say less of what is in it"
+            }
         }
     }
 }
@@ -351,6 +366,39 @@ mod tests {
     use std::collections::BTreeSet;
 
     use super::*;
+
+    /// Protects whoever takes "done" at its word: where the deviation is larger than what a pour that is done may be off, that is said in its place. A pour
+    /// that ended for another reason keeps that one, and a plain sum, which has no deviation, and a recording are just done.
+    #[test]
+    fn a_pour_that_hardly_knows_its_volume_is_not_just_done() {
+        let unsure = |reason, goal_ml, poured_sd_ml| {
+            let clipped = Clipped::default();
+            let counts = (1, 900, 0, 0, 0);
+            let (episode, frames, bridged_frames, stale_features, tick_gaps) = counts;
+            let (unseen, unwatched, poured_ml, seconds) = (false, false, 100.0, 9.0);
+            let outcome = Outcome {
+                episode,
+                reason,
+                unseen,
+                unwatched,
+                goal_ml,
+                poured_ml,
+                poured_sd_ml,
+                seconds,
+                frames,
+                bridged_frames,
+                stale_features,
+                tick_gaps,
+                clipped,
+            };
+            assert_eq!(outcome.words() == reason.words(), !outcome.is_unsure());
+            outcome.is_unsure()
+        };
+        let done = |goal_ml, sd_ml| unsure(EndReason::Done, Some(goal_ml), sd_ml);
+        assert!(done(100.0, 40.0) && done(100.0, 8.1) && done(6.0, 3.1) && done(200.0, 17.0));
+        assert!(!done(100.0, 7.9) && !done(6.0, 2.9) && !done(200.0, 15.0) && !done(100.0, 0.0));
+        assert!(!unsure(EndReason::GoalExceeded, Some(100.0), 40.0) && !unsure(EndReason::Done, None, 0.0));
+    }
 
     /// Protects who counts by reasons: all are there, each with words of its own.
     #[test]

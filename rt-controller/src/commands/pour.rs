@@ -213,11 +213,12 @@ fn interrupted_line(outcome: &Outcome) -> String {
 fn report(Ended { outcome, recorded, .. }: &Ended, foreseen_sd_ml: Option<f32>, json: bool) {
     if json {
         let file = recorded.as_ref().and_then(|r| r.file.as_ref().ok());
-        println!("{}", serde_json::json!({ "outcome": outcome, "episode_file": file, "foreseen_sd_ml": foreseen_sd_ml }));
+        let unsure = outcome.is_unsure();
+        println!("{}", serde_json::json!({ "outcome": outcome, "unsure": unsure, "episode_file": file, "foreseen_sd_ml": foreseen_sd_ml }));
     } else {
         println!(
             "{}: {} ml poured (estimate) for a goal of {:.1} ml in {:.1} s; {} ({} bridged), {} between ticks, {}",
-            outcome.reason.words(),
+            outcome.words(),
             outcome.poured_words(),
             outcome.goal_ml.unwrap_or(f32::NAN),
             outcome.seconds,

@@ -166,6 +166,6 @@ fn print(s: &Status, recorder: &str) {
     }
     for o in &s.outcomes {
         let what = o.goal_ml.map_or("recording".into(), |g| format!("goal {g:6.1} ml, poured {:>14} ml", o.poured_words()));
-        println!("{:>12}  {what}  {:5.1} s  {}", o.episode, o.seconds, o.reason.words());
+        println!("{:>12}  {what}  {:5.1} s  {}", o.episode, o.seconds, o.words());
     }
 }

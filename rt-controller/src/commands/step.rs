@@ -109,7 +109,7 @@ pub fn run(args: &Args) -> Result<(), Failure> {
             return Ok(());
         }
         if let Some(outcome) = output.ended {
-            eprintln!("{} ml poured (estimate), {}", outcome.poured_words(), outcome.reason.words());
+            eprintln!("{} ml poured (estimate), {}", outcome.poured_words(), outcome.words());
             ended = Some(outcome.reason);
         }
     }
