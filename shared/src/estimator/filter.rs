@@ -111,6 +111,8 @@ pub(super) struct Innovation {
 pub(super) struct Filter {
     state: [f64; STATES],
     covariance: [[f64; STATES]; STATES],
+    /// Capacity that the tilt has taken on its way out, by knot, ml.
+    taken_ml: [f64; KNOTS],
     /// Number of zeros seen in a row.
     zeros: u32,
 }
@@ -132,7 +134,7 @@ impl Default for Filter {
 impl Filter {
     /// A filter that has seen nothing.
     pub fn new() -> Self {
-        Self { state: [0.0; STATES], covariance: [[0.0; STATES]; STATES], zeros: 0 }
+        Self { state: [0.0; STATES], covariance: [[0.0; STATES]; STATES], taken_ml: [0.0; KNOTS], zeros: 0 }
     }
 
     /// Whether all states and their covariance are finite numbers.
@@ -169,6 +171,8 @@ impl Filter {
         let shape = (1.0 - share) * self.state[SHAPE + knot] + share * self.state[SHAPE + knot + 1];
         let lost_ml_per_deg = flow.capacity.lost_ml_per_deg_at(TablePlace::of(middle_deg)) * shape.exp();
         let gained_ml = lost_ml_per_deg * change_deg;
+        self.taken_ml[knot] += (1.0 - share) * gained_ml.max(0.0);
+        self.taken_ml[knot + 1] += share * gained_ml.max(0.0);
         self.state[EXCESS] += gained_ml;
         let row = [
             (EXCESS, 1.0),
@@ -292,6 +296,14 @@ impl Filter {
         let (volume, p) = (self.state[POURED], &self.covariance);
         let seen = p[POURED][POURED] - 2.0 * volume * p[POURED][CAMERA_GAIN] + volume * volume * p[CAMERA_GAIN][CAMERA_GAIN];
         self.true_per_seen().powi(2) * seen.max(0.0)
+    }
+
+    /// By how many of its standard deviations the vessel looks larger or smaller to the camera than was learned, where the tilt has been; 0 before any.
+    pub fn other_vessel_sds(&self, prior: &UnknownsCovariance) -> f64 {
+        let first = SHAPE - FIRST_UNKNOWN;
+        let sum = |of: &[f64]| of.iter().zip(&self.taken_ml).map(|(value, ml)| value * ml).sum::<f64>();
+        let variance: f64 = prior[first..].iter().zip(&self.taken_ml).map(|(row, ml)| ml * sum(&row[first..])).sum();
+        if variance > 0.0 { sum(&self.state[SHAPE..]).abs() / variance.sqrt() } else { 0.0 }
     }
 
     /// True ml for each ml that the camera sees.

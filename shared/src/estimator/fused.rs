@@ -185,11 +185,22 @@ impl FusedEstimator {
         (self.pour.camera.sum_ml + correction_ml).max(0.0)
     }
 
+    /// By how many standard deviations the straight vessel, where the trainer trusts it, looks larger or smaller in this pour than was learned: another vessel,
+    /// or another gain of the camera.
+    fn other_vessel_sds(&self) -> f64 {
+        if self.tight_share > STRAIGHT_SHARE {
+            self.pour.following[TIGHT].filter.other_vessel_sds(&self.explaining[TIGHT].unknowns)
+        } else {
+            0.0
+        }
+    }
+
     /// Standard deviation of [`FusedEstimator::poured_ml`], ml: that of the two estimates' mixture, whose difference counts too, and what the
     /// tilt has let out but was not seen, or the reverse, what may have left behind areas that are doubtful in themselves, and what was withheld and
     /// never confirmed. Where the straight vessel is held near the sum, the part of its correction that is refused counts as well: one of the two is wrong.
     /// Where the two estimates are further apart than their deviations explain, the straight vessel's deviation grows by that ratio (Birge's), and what
-    /// it corrects of an outflow that left while the container lay counts as well.
+    /// it corrects of an outflow that left while the container lay counts as well. Where the vessel looks like another one by more than its deviation, so that
+    /// nobody knows whether vessel or camera changed, the whole grows by that ratio, too.
     pub fn poured_sd_ml(&self) -> f64 {
         let (share, camera_ml) = (self.share(), self.camera_sd_ml());
         let estimate_ml2 = if share > 0.0 {
@@ -202,6 +213,7 @@ impl FusedEstimator {
         } else {
             camera_ml * camera_ml
         };
+        let estimate_ml2 = estimate_ml2 * self.other_vessel_sds().max(1.0).powi(2);
         let Pour { watch, .. } = &self.pour;
         let unseen_ml2 = watch.unexplained_ml().powi(2) + watch.unshown_ml().powi(2);
         let withheld_ml = watch.unconfirmed_ml() + watch.lone_ml(share > STRAIGHT_SHARE);

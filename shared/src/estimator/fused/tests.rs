@@ -2,10 +2,10 @@
 //!
 //! Tests only: any thread, may allocate, fails by panicking.
 
+mod other_vessel;
 use super::*;
-use crate::estimator::filter::UNKNOWNS;
-use crate::estimator::flow::{CommandHistory, Lateness};
 use crate::estimator::vessel::{TablePlace, Vessel};
+use crate::estimator::{filter::UNKNOWNS, flow::CommandHistory, flow::Lateness};
 use proptest::prelude::*;
 
 /// The way back of the shipped configurations.
