@@ -26,6 +26,10 @@ const FOREIGN_DRY_PICTURES: u32 = 2;
 /// A stream that was seen within so many pictures may be there still, in other colours: one second. Chosen by hand: longer than a bottle gurgles.
 const LATELY_PICTURES: u32 = 30;
 
+/// A smaller stream than the last one, after pictures without any, is what is left of it once it was seen in so many pictures in a row. Chosen by hand: a
+/// false line inside a stream that has left the region lasts for one or two.
+const RETURN_PICTURES: u32 = 5;
+
 /// After so many pictures without a stream, what is seen in its place is the ground. Chosen by hand: three seconds, after which a pour
 /// that sees nothing has long ended.
 const HELD_PICTURES: u32 = 90;
@@ -50,8 +54,9 @@ pub(crate) struct Presence {
     dry_pictures: u32,
     /// So many of them are needed.
     needed: u32,
-    /// Pictures in a row without a stream.
+    /// Pictures in a row without a stream, and with one.
     unseen: u32,
+    seen: u32,
     /// Pictures that still have to show nothing foreign at the lip.
     foreign: u32,
     /// Mean levels of blue, green and red in the last picture with a stream.
@@ -72,6 +77,7 @@ impl Presence {
             dry_pictures: 0,
             needed: 1,
             unseen: u32::MAX,
+            seen: 0,
             foreign: 0,
             bgr: [0.0; 3],
             other_light: 0,
@@ -91,8 +97,12 @@ impl Presence {
     /// A stream was measured in a picture with these mean levels of blue, green and red.
     pub(crate) fn saw(&mut self, area_px2: f32, legs_px: [f32; 2], bgr: [f32; 3]) {
         (self.bgr, self.other_light) = (bgr, 0);
-        self.legs_px = (area_px2 >= self.lasting_px2).then_some(legs_px);
         (self.dry_pictures, self.foreign) = (0, 0);
+        let shrinks = self.legs_px.is_some_and(|before| before[0] * before[1] > legs_px[0] * legs_px[1]);
+        if shrinks && self.seen < self.pace.pictures(RETURN_PICTURES) {
+            return;
+        }
+        self.legs_px = (area_px2 >= self.lasting_px2).then_some(legs_px);
         let doublings = (area_px2 / self.lasting_px2).max(1.0).log2();
         let most = self.pace.parts(self.patience * PICTURES_MOST as f32) as u32;
         self.needed = (self.pace.parts(self.patience * PICTURES_PER_DOUBLING * doublings) as u32).clamp(1, most.max(1));
@@ -123,7 +133,7 @@ impl Presence {
 
     /// Legs of a stream that was seen, and not yet its end, px from the lip. None after some seconds without a stream, when what is seen is the ground.
     pub(crate) fn holds(&mut self, seen: bool) -> Option<[f32; 2]> {
-        self.unseen = if seen { 0 } else { self.unseen.saturating_add(1) };
+        (self.seen, self.unseen) = if seen { (self.seen.saturating_add(1), 0) } else { (0, self.unseen.saturating_add(1)) };
         if self.unseen > self.pace.pictures(HELD_PICTURES) {
             self.legs_px = None;
         }
@@ -152,4 +162,36 @@ fn is_other_light(before: [f32; 3], now: [f32; 3]) -> bool {
     let all = changes.iter().sum::<f32>() / 3.0;
     let off = |change: f32, most: f32| change.max(1.0 / change) > most;
     off(all, LIGHT_CHANGE) || changes.iter().any(|change| off(change / all, COLOUR_CHANGE))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Protects pours of a stream that has left the region: a false line inside it, in a picture or two, is not all that is left of it, so its end is none of
+    /// the stream's. A stream that really came back smaller is known after some pictures.
+    #[test]
+    fn a_false_line_in_a_large_stream_is_not_its_end() {
+        let (large, small, light) = ([200.0, 150.0], [60.0, 50.0], [90.0; 3]);
+        // Evidence of dry ground, where only the small one was.
+        let dry = |legs_px: [f32; 2]| f32::from(u8::from(legs_px[0] < 100.0));
+        for (pictures, gone) in [(1, false), (2, false), (RETURN_PICTURES + 1, true)] {
+            let mut presence = Presence::new(640, 1.0);
+            let see = |presence: &mut Presence, area_px2: f32, legs_px: [f32; 2]| {
+                presence.saw(area_px2, legs_px, light);
+                presence.holds(true);
+            };
+            (0..20).for_each(|_| see(&mut presence, 15_000.0, large));
+            for _ in 0..10 {
+                assert!(!presence.is_gone(light, dry));
+                presence.holds(false);
+            }
+            (0..pictures).for_each(|_| see(&mut presence, 1_500.0, small));
+            let seen_to_end = (0..2 * PICTURES_MOST).any(|_| {
+                presence.holds(false);
+                presence.is_gone(light, dry)
+            });
+            assert_eq!(seen_to_end, gone, "{pictures}");
+        }
+    }
 }
