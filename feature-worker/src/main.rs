@@ -6,15 +6,19 @@ use clap::Parser as _;
 use feature_worker::cli::{Cli, Command};
 use feature_worker::commands::{bench, calibrate, camera, episodes, inspect, run, view};
 
+/// OpenCV's variable for how much it writes to the terminal; the library reads it before `main` begins.
+const LOG_LEVEL: &str = "OPENCV_LOG_LEVEL";
+/// The same for its FFmpeg, which is read when a video is opened.
+const FFMPEG_LOG_LEVEL: &str = "OPENCV_FFMPEG_LOGLEVEL";
+
 /// Keeps OpenCV's decoders from writing to the terminal by themselves: every fault that they report is an error of ours, with what to do. Whoever
-/// sets the variables differently gets the messages.
+/// sets the variables gets the messages. If it fails there is more to read, and nothing is wrong.
 fn quiet_libraries() {
-    let variables = [("OPENCV_LOG_LEVEL", "SILENT"), ("OPENCV_FFMPEG_LOGLEVEL", "-8"), ("OPENCV_VIDEOIO_DEBUG", "0")];
-    for (name, value) in variables {
-        if std::env::var_os(name).is_none() {
-            // If it cannot be set there is more to read, and nothing is wrong.
-            let _ = shared::os::set_variable(name, value);
-        }
+    if std::env::var_os(LOG_LEVEL).is_none() {
+        let _ = opencv::core::set_log_level(opencv::core::LogLevel::LOG_LEVEL_SILENT);
+    }
+    if std::env::var_os(FFMPEG_LOG_LEVEL).is_none() {
+        let _ = shared::os::set_variable(FFMPEG_LOG_LEVEL, "-8");
     }
 }
 
