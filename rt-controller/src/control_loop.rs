@@ -67,8 +67,10 @@ pub fn run(settings: Settings, place: Place, lost_ns: u64, features: &Features, 
         say(Level::Warning, &line);
     }
     os::cannot_be_held_up();
-    let mut state = LoopState::new(settings, lost_ns, features, exchange);
+    // Before the state, which counts allocations from then on: the first look at the clock finds out where the kernel keeps it, and allocates for that where
+    // the kernel is older than Linux 6.4.
     let mut deadline_ns = os::now_ns() + settings.period_ns;
+    let mut state = LoopState::new(settings, lost_ns, features, exchange);
     loop {
         os::sleep_until_ns(deadline_ns);
         let Some(next_ns) = state.wake_up(deadline_ns) else { break };
