@@ -71,6 +71,8 @@ pub fn calibrate(episodes: &[TrainingEpisode], exponent: Option<f64>) -> Calibra
 
 /// Noise of a weight that a calibration without doubt would leave, g: what the scale rounds, and who reads it. Chosen by hand; no measurement is recorded.
 pub const READING_SD_G: f64 = 0.7;
+/// By how much a right weight is off the sum of its areas beyond that (log), as a standard deviation. Chosen by hand; no measurement is recorded.
+pub const WEIGHT_SPREAD: f64 = 0.03;
 /// The least that the misfit of the weights lowers the doubt by, as a variance: few weights may meet each other by chance. Chosen by hand;
 /// docs/LEARNING.md has the coverage.
 const MISFIT_MIN: f64 = 0.25;

@@ -12,7 +12,7 @@ use serde::Serialize;
 use shared::estimator::flow::FlowTables;
 use shared::plural::counted;
 
-use crate::calibration::{self, EXPONENT_SD, EXPONENTS, READING_SD_G};
+use crate::calibration::{self, EXPONENT_SD, EXPONENTS, READING_SD_G, WEIGHT_SPREAD};
 use crate::data::{self, TrainingEpisode};
 use crate::exchanged;
 use crate::fit::{CHANGE_NEEDS, Changed, Fit};
@@ -25,9 +25,7 @@ const NEEDS: usize = 4;
 const PAIR_SPREAD: f64 = 0.08;
 /// Standard deviations at which a weight is doubted. Chosen by hand; no measurement is recorded.
 const DOUBTED_SDS: f64 = 4.0;
-/// By how much a right weight may be off what the others say beyond the doubt of their calibration (log), as a standard deviation. Chosen by hand.
-const SPREAD_LEAST: f64 = 0.03;
-/// The same of few episodes, times their number. Chosen by hand; no measurement is recorded.
+/// By how much more a right weight may be off what few others say (log), as a standard deviation times their number. Chosen by hand; no measurement is recorded.
 const SPREAD_FEW: f64 = 0.1;
 /// The standard deviation of a normal error for a mean deviation of 1.
 const ABSOLUTE_SD: f64 = 1.2533;
@@ -200,7 +198,7 @@ struct Compared {
 impl Compared {
     /// By how much its weight may be off, as read and as a rule (log), where log c is this and q has this place in [`EXPONENTS`].
     fn log_sd(&self, log_c: f64, at: usize) -> f64 {
-        SPREAD_LEAST.hypot(READING_SD_G / (log_c + self.log_sums[at]).exp().max(READING_SD_G))
+        WEIGHT_SPREAD.hypot(READING_SD_G / (log_c + self.log_sums[at]).exp().max(READING_SD_G))
     }
 }
 
@@ -235,7 +233,7 @@ fn told_by_others(one: &Compared, others: &[&Compared]) -> (f64, f64) {
     let contradiction = (ABSOLUTE_SD * sum / n).max(1.0);
     let ([[cc, cq], [_, qq]], of_q) = (precision, slope(one));
     let log_variance = contradiction.powi(2) * (qq - 2.0 * cq * of_q + cc * of_q * of_q) / (cc * qq - cq * cq).max(1e-12);
-    let spread = SPREAD_LEAST + SPREAD_FEW / (n + 1.0);
+    let spread = WEIGHT_SPREAD + SPREAD_FEW / (n + 1.0);
     let expected_g = (log_c + one.log_sums[at]).exp();
     (expected_g, READING_SD_G.hypot(expected_g * spread.hypot(log_variance.max(0.0).sqrt())))
 }

@@ -4,13 +4,11 @@
 //! then within what the others leave in doubt. Together they are not: where `w_E = c sum area^q` is met far better once the two are exchanged back, with no
 //! unknown more, they were exchanged.
 
-use crate::calibration::{self, EXPONENT_EXPECTED, EXPONENT_SD, EXPONENTS, READING_SD_G};
+use crate::calibration::{self, EXPONENT_EXPECTED, EXPONENT_SD, EXPONENTS, READING_SD_G, WEIGHT_SPREAD};
 use crate::data::TrainingEpisode;
 
 /// Fewer weights are met by c and q, however they are exchanged.
 const NEEDS: usize = 4;
-/// By how much a right weight is off the sum of its areas (log), as a standard deviation, as in `consistency`.
-const SPREAD: f64 = 0.03;
 /// How much better the weights must be met once two are exchanged back, as a difference of squares in variances of a weight. Chosen by hand, above the 9.1
 /// that the largest of 216 right sets of tuning rigs showed (4, 5, 8 and 10 curves; cylinders 100 to 123, other vessels 200 to 202).
 const BETTER: f64 = 12.0;
@@ -34,7 +32,8 @@ pub fn pair(episodes: &[TrainingEpisode]) -> Option<(usize, usize)> {
     if episodes.len() < NEEDS {
         return None;
     }
-    let mut weights: Vec<Weight> = episodes.iter().map(|e| (e.weight_g, READING_SD_G.powi(2) + (SPREAD * e.weight_g).powi(2))).collect();
+    let mut weights: Vec<Weight> =
+        episodes.iter().map(|e| (e.weight_g, READING_SD_G.powi(2) + (WEIGHT_SPREAD * e.weight_g).powi(2))).collect();
     let exponents = EXPONENTS.step_by(5).map(|hundredths| f64::from(hundredths) / 100.0);
     let at: Vec<(f64, Vec<f64>)> = exponents
         .map(|exponent| {

@@ -4,13 +4,11 @@
 //! other enough to accuse one of them: another exponent of the area takes most of it. But a stream of no area weighs nothing. So the weights are met once by
 //! `w_E = c sum area^q`, and once by `w_E = c sum area^q + tare`, and the second must not be the better one.
 
-use crate::calibration::{self, EXPONENT_EXPECTED, EXPONENT_SD, EXPONENTS, READING_SD_G};
+use crate::calibration::{self, EXPONENT_EXPECTED, EXPONENT_SD, EXPONENTS, READING_SD_G, WEIGHT_SPREAD};
 use crate::data::TrainingEpisode;
 
 /// Three unknowns are met by three weights, however wrong they are.
 const NEEDS: usize = 4;
-/// By how much a right weight is off the sum of its areas (log), as a standard deviation, as in `consistency`.
-const SPREAD: f64 = 0.03;
 /// How much better the weights must be met with a tare than without, as a difference of squares in variances of a weight. Chosen by hand, above the 6.9 that
 /// the largest of 76 right sets of tuning rigs showed.
 const BETTER: f64 = 12.0;
@@ -32,7 +30,7 @@ impl Sums {
     fn of(episodes: &[TrainingEpisode], exponent: f64) -> Self {
         let mut sums = Self::default();
         for e in episodes {
-            let precision = READING_SD_G.hypot(SPREAD * e.weight_g).powi(-2);
+            let precision = READING_SD_G.hypot(WEIGHT_SPREAD * e.weight_g).powi(-2);
             let area = calibration::area_sum(e, exponent);
             sums.one += precision;
             sums.area += precision * area;

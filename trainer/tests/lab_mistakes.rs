@@ -137,12 +137,12 @@ fn episodes_without_a_cell_are_named_where_a_cell_is_chosen() {
     let rows = all.iter().zip(cells).map(|(e, cell)| format!("{},{},{cell}\n", e.name, e.weight_g));
     std::fs::write(dir.path().join("s.csv"), format!("episode,weight_g,cell\n{}", rows.collect::<String>())).unwrap();
     let words = "left out: 2 episodes without the name of a cell, and --cell takes only those that name theirs: 2, 6";
-    for (more, named) in [(&["--cell", "lab"][..], true), (&["--cell", "lab", "--cell", "other"], true)] {
+    for more in [&["--cell", "lab"][..], &["--cell", "lab", "--cell", "other"]] {
         for command in [&["train", "--out", "w.bin"][..], &["refine", "--out", "w.bin"], &["check"], &["plan", "--holds", "500"]] {
             let args = [command, more, &["f.csv", "--scale", "s.csv"]].concat();
             let out = Command::new(env!("CARGO_BIN_EXE_trainer")).current_dir(dir.path()).args(&args).output().unwrap();
             let said = String::from_utf8_lossy(&out.stderr);
-            assert_eq!((out.status.success(), said.matches(words).count() == 1), (true, named), "{args:?}: {said}");
+            assert!(out.status.success() && said.matches(words).count() == 1, "{args:?}: {said}");
         }
     }
 }
