@@ -4,7 +4,7 @@
 //! and replay. Both allocate. A file that was cut off is read up to its last whole entry, and ticks that could not be told are counted; every other
 //! fault is a [`JournalError`].
 //!
-//! The file begins with the 8 bytes `decantj8`. Then come the entries: a little-endian u32 with the length, and that many bytes of
+//! The file begins with the 8 bytes `decantj9`. Then come the entries: a little-endian u32 with the length, and that many bytes of
 //! postcard.
 
 use std::collections::BTreeMap;

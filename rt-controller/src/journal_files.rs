@@ -11,7 +11,7 @@ use std::path::{Path, PathBuf};
 use shared::regular_file;
 
 /// The first bytes of a journal, which include its version.
-pub const MAGIC: &[u8; 8] = b"decantj8";
+pub const MAGIC: &[u8; 8] = b"decantj9";
 /// Size of all journals that are kept beside the one being written, bytes. Chosen by hand: about three days of ticks.
 const KEPT_BYTES: u64 = 1 << 30;
 /// Number of journals that are kept beside the one being written. Chosen by hand: so many starts do not lose a crash.

@@ -10,7 +10,7 @@ use iceoryx2::prelude::ZeroCopySend;
 use crate::framing::Framing;
 
 /// Version of all layouts in this file. It is part of every service's name, so that programs of other versions never connect.
-pub const LAYOUT_VERSION: u32 = 4;
+pub const LAYOUT_VERSION: u32 = 5;
 
 /// How the pixels of a camera frame are stored.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]

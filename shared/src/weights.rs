@@ -33,7 +33,7 @@ mod way_back;
 pub use way_back::check_way_back;
 
 /// Version of the file format; files of other versions are refused.
-pub const FORMAT_VERSION: u32 = 5;
+pub const FORMAT_VERSION: u32 = 6;
 
 /// The first bytes of every weight file.
 const MAGIC: &[u8; 8] = b"decant-w";

@@ -186,7 +186,7 @@ fn repeated_features_count_once() {
 /// differs. Where either side does not say its pictures, as weights from tables, the pour begins.
 #[test]
 fn weights_of_another_picture_pour_nothing() {
-    let small = Framing { size_px: [640, 480], lip_px: [300.0, 180.0], axes_deg: [0.0, -80.0] };
+    let small = Framing { size_px: [640, 480], method_code: 1, lip_px: [300.0, 180.0], axes_deg: [0.0, -80.0] };
     let large = Framing { size_px: [960, 720], lip_px: [450.0, 270.0], ..small };
     let poured = |trained: Framing, seen: Framing| {
         let mut cell = ToyCell::new();
@@ -200,7 +200,13 @@ fn weights_of_another_picture_pour_nothing() {
         refused.starts_with("the weights were trained on pictures of 640 x 480 px and not of 960 x 720, as the cell has it"),
         "{refused}"
     );
-    for (trained, seen) in [(small, small), (small, Framing::default()), (Framing::default(), large)] {
+    let (clear, either) = (Framing { method_code: 2, ..small }, Framing { method_code: 0, ..small });
+    let refused = poured(small, clear).unwrap_err();
+    assert!(
+        refused.starts_with("the weights were trained on areas by the method 'colour' and not by 'clear', as the cell has it"),
+        "{refused}"
+    );
+    for (trained, seen) in [(small, small), (small, Framing::default()), (Framing::default(), large), (either, clear)] {
         assert_eq!(poured(trained, seen), Ok(()));
     }
 }

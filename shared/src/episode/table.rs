@@ -24,7 +24,7 @@ const FEATURE_COLUMNS: [&str; 5] = ["episode", "frame", "t_s", "alpha_deg", "are
 const FEATURE_MORE: [&str; 2] = ["alpha_measured_deg", "doubt"];
 /// The columns of the table of weights. Their names are part of the format.
 const SCALE_COLUMNS: [&str; 2] = ["episode", "weight_g"];
-/// The columns of it that need not be there: the cell's name, and how the lip lay in the pictures ([`Framing::numbers`]).
+/// The columns of it that need not be there: the cell's name, and how the lip lay in the pictures ([`Framing::text`]).
 const SCALE_MORE: [&str; 2] = ["cell", "framing"];
 
 /// Largest table that is read, bytes. Chosen by hand: ten hours of frames take 50 MB.
@@ -196,9 +196,9 @@ fn read_weights(scale: &Path, features: &Path, episodes: &mut [Episode]) -> Resu
         };
         let [cell, framing] = row.more;
         if !framing.is_empty() {
-            episode.info.framing = Framing::of_numbers(framing).ok_or_else(|| {
+            episode.info.framing = Framing::of_text(framing).ok_or_else(|| {
                 row.error(format!(
-                    "framing '{framing}': six numbers are wanted: width, height and the lip's place, px, and the axes' directions, degrees"
+                    "framing '{framing}': width, height and the lip's place, px, the axes' directions, degrees, and colour or clear are wanted"
                 ))
             })?;
         }
@@ -285,7 +285,7 @@ pub fn write_table(episodes: &[Episode], features: &Path, scale: &Path) -> Resul
         if let Some(weight_g) = episode.weight_g {
             let info = &episode.info;
             weights
-                .write_record([number.as_str(), &weight_g.to_string(), &info.cell, &info.framing.numbers()])
+                .write_record([number.as_str(), &weight_g.to_string(), &info.cell, &info.framing.text()])
                 .map_err(|e| fail(scale, &e))?;
         }
     }
