@@ -361,6 +361,28 @@ fn each_constant_has_its_own_sentence() {
     none(&faults);
 }
 
+/// Protects tests from never being run: `scripts/test` builds neither a program's `main.rs` nor an example of the documentation as a test.
+#[test]
+fn tests_stand_where_they_are_run() {
+    let mut faults = Vec::new();
+    for (name, text) in sources() {
+        let is_program = name.ends_with("/src/main.rs") || name.contains("/examples/");
+        if is_program && text.contains("#[test]") {
+            faults.push(format!("{name}: tests belong in the library or in tests/"));
+        }
+        let mut inside = false;
+        for line in text.lines().map(str::trim_start).filter(|line| line.starts_with("//")) {
+            let fence = line.trim_start_matches(['/', '!', ' ']);
+            if fence.starts_with("```") {
+                inside = !inside;
+                let plain = !inside || fence == "```text";
+                faults.extend((!plain).then(|| format!("{name}: `{fence}` would be a test, and none such is run: write ```text")));
+            }
+        }
+    }
+    none(&faults);
+}
+
 /// Protects memory: unsafe code stands in one small file.
 #[test]
 fn unsafe_code_stands_in_one_file() {
