@@ -13,7 +13,7 @@ use crossbeam::channel::{Receiver, Sender, TrySendError, bounded};
 use shared::agent::Agent;
 use shared::config::Config;
 use shared::disk_space::{error_words, room};
-use shared::episode::take_number;
+use shared::episode::take_number_above;
 use shared::estimator::flow::WayBack;
 use shared::level::Level;
 use shared::limits::Limits;
@@ -85,6 +85,8 @@ pub struct Disk<'a> {
     numbers: Sender<u64>,
     /// A number that the queue had no room for.
     spare_number: Option<u64>,
+    /// The newest number that was taken. One that came again, from a directory that was moved away and made anew, would have an older episode's outcome.
+    newest_number: u64,
     /// Why no number could be taken; empty if one could.
     no_number: String,
 }
@@ -144,6 +146,7 @@ impl<'a> Disk<'a> {
             episodes: config.recording.directory.clone(),
             numbers: number_sender,
             spare_number: None,
+            newest_number: 0,
             no_number: String::new(),
         };
         Ok((disk, Queues { journal: sender, numbers }))
@@ -268,9 +271,10 @@ impl<'a> Disk<'a> {
         if self.numbers.is_full() {
             return;
         }
-        let taken = self.spare_number.take().map_or_else(|| take_number(&self.episodes), Ok);
+        let taken = self.spare_number.take().map_or_else(|| take_number_above(&self.episodes, self.newest_number), Ok);
         match taken {
             Ok(number) => {
+                self.newest_number = number;
                 self.no_number.clear();
                 if let Err(TrySendError::Full(number)) = self.numbers.try_send(number) {
                     self.spare_number = Some(number);

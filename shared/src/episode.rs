@@ -68,7 +68,7 @@ mod weight;
 pub mod write;
 
 pub use age::{Begun, by_age, oldest_first, oldest_first_of};
-pub use number::{by_number, check_number, number_of, take_number};
+pub use number::{by_number, check_number, number_of, take_number, take_number_above};
 pub use read::{EpisodeImage, EpisodeImages, beginning, each_once, episodes_so_far, find_episodes};
 pub use records::EpisodeError;
 pub use recover::recover;

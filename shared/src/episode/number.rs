@@ -26,13 +26,19 @@ pub(crate) const LARGEST: u64 = 999_999_999;
 
 /// Takes the next number in `directory`, which is made if it is missing. From then on the number is used.
 pub fn take_number(directory: &Path) -> Result<u64> {
+    take_number_above(directory, 0)
+}
+
+/// The same, and larger than `known`, the largest number that the caller has had: what the directory remembers goes when it is moved away or deleted while
+/// a program runs that still knows its episodes.
+pub fn take_number_above(directory: &Path, known: u64) -> Result<u64> {
     std::fs::create_dir_all(directory)?;
     let mut file = open(directory, true)?;
     // Who may read it could hold its lock. One that is another user's stays as it is.
     let _ = file.set_permissions(Permissions::from_mode(0o600));
     // Root may take a number for the cell's user, whose file it then is.
     give_owner(&file, &std::fs::metadata(directory)?);
-    let number = next(&file, directory)?;
+    let number = next(&file, directory, known)?;
     // The number before is written over, and not taken away first: a disk that is full then leaves it.
     let text = format!("{number}\n");
     file.rewind()?;
@@ -46,7 +52,7 @@ pub fn take_number(directory: &Path) -> Result<u64> {
 pub fn check_number(directory: &Path) -> Result<()> {
     match open(directory, false) {
         Err(e) if e.kind() == ErrorKind::NotFound => Ok(()),
-        file => next(&file?, directory).map(|_| ()),
+        file => next(&file?, directory, 0).map(|_| ()),
     }
 }
 
@@ -62,13 +68,13 @@ fn open(directory: &Path, create: bool) -> Result<File> {
     Ok(file)
 }
 
-/// The number behind the last one, by `file` and by what lies in `directory`. From then on `file` is locked.
-fn next(file: &File, directory: &Path) -> Result<u64> {
+/// The number behind the last one, by `file`, by what lies in `directory` and by what is `known`. From then on `file` is locked.
+fn next(file: &File, directory: &Path, known: u64) -> Result<u64> {
     lock(file)?;
     let mut text = Vec::new();
     file.take(32).read_to_end(&mut text)?;
     let given: u64 = String::from_utf8_lossy(&text).trim().parse().ok().filter(|n| *n <= LARGEST).unwrap_or(0);
-    let number = given.max(highest(directory, DEPTH)?) + 1;
+    let number = given.max(highest(directory, DEPTH)?).max(known) + 1;
     if number > LARGEST {
         return Err(Error::other("the numbers of its episodes are used up: look at .last-number and at the files' names"));
     }
@@ -161,6 +167,9 @@ mod tests {
         assert_eq!(take(), 31, "a number that cannot be is none");
         std::fs::write(dir.path().join("new/.last-number"), LARGEST.to_string()).expect("writable");
         assert!(take_number(&dir.path().join("new")).is_err(), "no number is given twice, and none beyond the largest");
+        std::fs::remove_dir_all(dir.path().join("new")).expect("there");
+        let above = |known| take_number_above(&dir.path().join("new"), known).expect("writable");
+        assert_eq!((above(31), above(7)), (32, 33), "what the directory forgot with it, a program that runs still knows");
     }
 
     /// Protects who trusts a look before a pour: it says what taking a number would say, and makes and changes nothing.
