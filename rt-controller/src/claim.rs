@@ -151,13 +151,23 @@ pub(crate) fn said_in(directory: &Path) -> Option<Running> {
 
 /// When the process `pid` started, in the kernel's ticks; `None` if there is none, or if it is no rt-controller.
 pub fn started(pid: u32) -> Option<u64> {
+    stat(pid).map(|(_, started)| started)
+}
+
+/// Whether the process `pid` is an rt-controller that a signal has stopped, as SIGSTOP, so that none of its threads goes on. A debugger may stop one alone.
+pub fn is_stopped(pid: u32) -> bool {
+    stat(pid).is_some_and(|(state, _)| state == 'T')
+}
+
+/// The state of the process `pid`, and when it started, in the kernel's ticks; `None` if there is none, or if it is no rt-controller.
+fn stat(pid: u32) -> Option<(char, u64)> {
     let stat = std::fs::read_to_string(format!("/proc/{pid}/stat")).ok()?;
     let (before, after) = stat.rsplit_once(')')?;
     // The fields are those of proc(5); the 22nd is the start. What ended and was not waited for does not run.
     let mut fields = after.split_whitespace();
-    let state = fields.next()?;
-    let is_ours = before.ends_with("(rt-controller") && !matches!(state, "Z" | "X");
-    is_ours.then(|| fields.nth(18)?.parse().ok()).flatten()
+    let state = fields.next()?.chars().next()?;
+    let is_ours = before.ends_with("(rt-controller") && !matches!(state, 'Z' | 'X');
+    is_ours.then(|| Some((state, fields.nth(18)?.parse().ok()?))).flatten()
 }
 
 /// The user as whom the controller of a cell runs, who owns its runtime directory; `None` where there is none. Fails, with a line, where one is there and

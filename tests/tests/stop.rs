@@ -176,7 +176,7 @@ fn cut_shared_memory_ends_upright_and_with_a_word() {
 }
 
 /// Protects the robot from a controller that nobody can ask any more: SIGTERM to its process is the last way, and `abort` takes it by itself
-/// when neither socket answers. The pid is checked, so that a number that another process got is left alone.
+/// when neither socket answers, also of one that was stopped, which does not take the signal before it goes on. The pid is checked, so that a number that another process got is left alone.
 #[test]
 fn an_abort_falls_back_to_the_process() {
     let mut cell = cell();
@@ -186,15 +186,9 @@ fn an_abort_falls_back_to_the_process() {
     std::fs::remove_file(&stop).expect("there");
     let silent = UnixListener::bind(&stop).expect("free");
     cell.signal("rt-controller", Signal::STOP);
-    let (output, _) = {
-        let running = cell.pid("rt-controller");
-        std::thread::spawn(move || {
-            std::thread::sleep(Duration::from_secs(6));
-            let pid = rustix::process::Pid::from_raw(running as i32).expect("a number");
-            let _ = rustix::process::kill_process(pid, Signal::CONT);
-        });
-        timed(abort_of(&cell))
-    };
+    // Nobody lets it go on but the abort itself.
+    let (output, took) = timed(abort_of(&cell));
+    println!("abort of a stopped controller: {took:?}");
     let said = String::from_utf8_lossy(&output.stderr).into_owned();
     assert_eq!(output.status.code(), Some(1), "nobody knows where the container is: {said}{}", String::from_utf8_lossy(&output.stdout));
     assert!(said.contains("SIGTERM"), "{said}");
@@ -227,12 +221,7 @@ fn root_ends_a_controller_that_hangs_in_a_named_directory() {
     cell.spawn("rt-controller");
     cell.wait("the controller", Duration::from_secs(30), |_| true);
     cell.signal("rt-controller", Signal::STOP);
-    let mut abort = abort_of(&cell);
-    let abort = abort.stdin(Stdio::null()).stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().expect("it starts");
-    // By then it has asked in vain, and sent its signal, which waits for the process.
-    std::thread::sleep(Duration::from_secs(6));
-    cell.signal("rt-controller", Signal::CONT);
-    let output = abort.wait_with_output().expect("it ran");
+    let (output, _) = timed(abort_of(&cell));
     let said = String::from_utf8_lossy(&output.stderr).into_owned();
     assert!(output.status.code() == Some(1) && said.contains("SIGTERM"), "{:?} {said}", output.status.code());
     assert!(cell.exit_code("rt-controller", Duration::from_secs(10)).is_some(), "it has ended");
@@ -309,6 +298,29 @@ fn an_abort_needs_no_service_thread() {
     assert_eq!(cell.exit_code("rt-controller", Duration::from_secs(10)), Some(1), "{}", cell.log("rt-controller"));
     assert_eq!(pour.wait_with_output().expect("it ran").status.code(), Some(3));
     rt_controller::journal::replay(&cell.dir.path().join("journal.bin"), |_, _| {}).expect("a journal");
+}
+
+/// Protects the robot from a controller whose thread for aborts hangs: nobody answers at its sockets, no signal reaches the loop, and the loop pours on. It
+/// is killed, after which the robot's program brings the container upright by itself.
+#[test]
+fn an_abort_kills_a_controller_that_takes_no_signal() {
+    let mut cell = cell();
+    let pour = cell.pour_tilted();
+    let tasks = std::fs::read_dir(format!("/proc/{}/task", cell.pid("rt-controller"))).expect("it runs").flatten();
+    let is_stop = |task: &std::fs::DirEntry| std::fs::read_to_string(task.path().join("comm")).is_ok_and(|name| name == "stop\n");
+    let thread = tasks.into_iter().find(is_stop).expect("it has one").file_name();
+    let mut strace = Command::new("strace");
+    strace.args(["-q", "-e", "trace=poll,ppoll", "-e", "inject=poll,ppoll:delay_enter=120s", "-o", "/dev/null", "-p"]).arg(thread);
+    let mut strace = strace.spawn().expect("strace is installed (scripts/install strace)");
+    std::thread::sleep(Duration::from_millis(500));
+    let (output, took) = timed(abort_of(&cell));
+    println!("abort of a controller that takes no signal: {took:?}");
+    let said = String::from_utf8_lossy(&output.stderr).into_owned();
+    strace.kill().and_then(|()| strace.wait()).expect("ours");
+    assert!(output.status.code() == Some(1) && said.contains("nor end by SIGTERM, and was killed"), "{said}");
+    assert_eq!(cell.exit_code("rt-controller", Duration::from_secs(10)), None, "a signal ended it");
+    // Whether the pour had come to its goal by then is not what is tested.
+    pour.wait_with_output().expect("it ran");
 }
 
 /// Protects the operator from silent and endless clients at the stop socket: they lose their places, and an abort is obeyed.

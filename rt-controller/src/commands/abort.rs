@@ -2,8 +2,10 @@
 //! is one line.
 //!
 //! It asks at the controller's stop socket, which needs neither shared memory nor a configuration. If nobody answers there, it sends the
-//! controller's process SIGTERM, which brings the container upright too and ends the controller.
+//! controller's process SIGTERM, which brings the container upright too and ends the controller, and SIGCONT, without which a process that was
+//! stopped does not take it. One that does not end by them is killed: the robot's program then brings the container upright by itself.
 
+use std::os::fd::OwnedFd;
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
@@ -21,6 +23,9 @@ use crate::stop_client::{Running, Target, running_cells, unreached};
 const UPRIGHT: Duration = Duration::from_secs(20);
 /// Pause between two looks at the controller's state. Chosen by hand; no measurement is recorded.
 const BEAT: Duration = Duration::from_millis(50);
+/// How long a controller may take to end after SIGTERM before it is killed. Chosen by hand: the way back from the largest tilt takes about 2 s, and the
+/// end of its threads 2 s at most. One that hangs may pour on meanwhile.
+const ENDS: Duration = Duration::from_secs(5);
 /// So many looks in a row may remain without an answer of a controller whose process is not seen. Chosen by hand.
 const UNANSWERED: u32 = 3;
 
@@ -30,7 +35,7 @@ const UNANSWERED: u32 = 3;
 Without a configuration it stops every controller that runs and that this user may stop: their own, and those whose runtime directory\n\
 lets their group in; as root all. It does not need shared memory, and\n\
 works while /dev/shm is full or files were deleted. If no controller answers, it sends the process SIGTERM; Ctrl-C in the controller's\n\
-terminal and `kill` do the same. The container then comes upright, and the controller ends.\n\
+terminal and `kill` do the same. The container then comes upright, and the controller ends. One that does not end within 5 s is killed.\n\
 Exit codes: 0 upright, 1 not upright or not known, 3 no controller, 5 the robot cannot be moved.")]
 pub struct Args {
     /// The cell's configuration; without it, every cell that runs.
@@ -127,7 +132,7 @@ fn targets(config: Option<&Path>) -> Running {
             let named = Target::from(Place::from(&config.cell));
             // Root stops a cell whoever runs it. A controller that hangs where the configuration says is that cell's, and is ended.
             let others = || running_cells().targets.into_iter().filter(|t| t.name == named.name).collect::<Vec<_>>();
-            let of_others = if own_uid() == 0 && named.ask("state").is_none() && named.process().is_none() { others() } else { Vec::new() };
+            let of_others = if own_uid() == 0 && named.process().is_none() && named.ask("state").is_none() { others() } else { Vec::new() };
             let targets = if of_others.is_empty() { vec![named] } else { of_others };
             Running { targets, doubted: Vec::new(), others: Vec::new() }
         }
@@ -145,8 +150,8 @@ enum Asked {
     Socket(u32),
     /// At its socket, where this process refused, for this reason.
     Refused(u32, String),
-    /// By SIGTERM to this process.
-    Process(claim::Running),
+    /// By SIGTERM to this process, which the descriptor means.
+    Process(claim::Running, OwnedFd),
 }
 
 impl Asked {
@@ -154,14 +159,16 @@ impl Asked {
     fn pid(&self) -> u32 {
         match self {
             Self::Socket(pid) | Self::Refused(pid, _) => *pid,
-            Self::Process(process) => process.pid,
+            Self::Process(process, _) => process.pid,
         }
     }
 }
 
 /// Asks the controller of `target` to stop.
 fn ask(target: &Target) -> Result<Asked, Failure> {
-    if let Some(answer) = target.ask("abort") {
+    // One that was stopped answers nobody, so nobody waits for it.
+    let stopped = target.process().is_some_and(|process| claim::is_stopped(process.pid));
+    if let Some(answer) = (!stopped).then(|| target.ask("abort")).flatten() {
         return Ok(if answer.refused.is_empty() { Asked::Socket(answer.pid) } else { Asked::Refused(answer.pid, answer.refused) });
     }
     let absent = || {
@@ -196,14 +203,25 @@ fn ask(target: &Target) -> Result<Asked, Failure> {
     if claim::started(process.pid) != Some(process.started) {
         return Err(absent());
     }
-    pidfd_send_signal(&held, Signal::TERM).map_err(|e| failure(exit::FAILED, format!("rt-controller, process {}: {e}", process.pid)))?;
-    Ok(Asked::Process(process))
+    let refused = |e| {
+        let what = format!(
+            "rt-controller, process {}, does not answer, and this user cannot end it: {e}: look at the robot, and abort as the cell's own user or as root",
+            process.pid
+        );
+        failure(exit::FAILED, what)
+    };
+    pidfd_send_signal(&held, Signal::TERM).map_err(refused)?;
+    // As systemd does: the signal to end waits for a process that was stopped until that goes on.
+    let _ = pidfd_send_signal(&held, Signal::CONT);
+    Ok(Asked::Process(process, held))
 }
 
 /// Waits until the container is upright. Gives the line that says so.
 fn wait(target: &Target, asked: Asked) -> Result<String, Failure> {
-    let until = Instant::now() + UPRIGHT;
+    let begun = Instant::now();
+    let until = begun + UPRIGHT;
     let mut unanswered = 0;
+    let mut killed = false;
     while Instant::now() < until {
         match &asked {
             Asked::Refused(_, why) => return Err(failure(exit::REFUSED, why)),
@@ -219,11 +237,18 @@ fn wait(target: &Target, asked: Asked) -> Result<String, Failure> {
                     return Err(failure(exit::UNREACHABLE, what));
                 }
             },
-            Asked::Process(process) => {
-                if claim::started(process.pid) != Some(process.started) {
-                    let what =
-                        format!("rt-controller did not answer and was ended (SIGTERM to process {}): look at the robot", process.pid);
+            Asked::Process(claim::Running { pid, started, .. }, held) => {
+                if claim::started(*pid) != Some(*started) {
+                    let what = match killed {
+                        false => format!("rt-controller did not answer and was ended (SIGTERM to process {pid}): look at the robot"),
+                        true => {
+                            format!("rt-controller did not answer, nor end by SIGTERM, and was killed (process {pid}): look at the robot")
+                        }
+                    };
                     return Err(failure(exit::FAILED, what));
+                }
+                if !killed && begun.elapsed() > ENDS {
+                    killed = pidfd_send_signal(held, Signal::KILL).is_ok();
                 }
             }
         }
