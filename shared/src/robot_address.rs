@@ -4,7 +4,7 @@
 //! never the loop. A name that cannot be one is refused when the configuration is read; one that is not known is one line.
 
 use std::fmt::{Display, Formatter};
-use std::net::{IpAddr, SocketAddr, ToSocketAddrs as _};
+use std::net::{IpAddr, ToSocketAddrs as _};
 
 use serde::{Deserialize, Serialize};
 
@@ -24,15 +24,26 @@ impl RobotAddress {
         self.0.parse().ok()
     }
 
-    /// The address now. Of a name's addresses it is the first of IPv4, which is what UR robots have, else the first.
+    /// The address now. Of a name's addresses it is the only one of IPv4, which is what UR robots have, else the first.
     pub fn resolve(&self) -> Result<IpAddr, String> {
         if let Some(address) = self.literal() {
             return Ok(address);
         }
-        let found: Vec<SocketAddr> = (self.0.as_str(), 0).to_socket_addrs().map_err(|e| e.to_string())?.collect();
-        let first = found.iter().find(|a| a.is_ipv4()).or(found.first());
-        first.map(SocketAddr::ip).ok_or_else(|| "the name has no address".into())
+        one_of((self.0.as_str(), 0).to_socket_addrs().map_err(|e| e.to_string())?.map(|a| a.ip()))
     }
+}
+
+/// The address among those of one name. Several of IPv4 may be several robots', and a resolver gives them in turns, so that none is taken: it would be
+/// another one each time.
+fn one_of(addresses: impl Iterator<Item = IpAddr>) -> Result<IpAddr, String> {
+    let (mut v4, others): (Vec<IpAddr>, Vec<IpAddr>) = addresses.partition(IpAddr::is_ipv4);
+    v4.sort();
+    v4.dedup();
+    if v4.len() > 1 {
+        let all = v4.iter().map(IpAddr::to_string).collect::<Vec<_>>().join(", ");
+        return Err(format!("the name has several addresses ({all}), which may be those of several robots: give the robot's own"));
+    }
+    v4.first().or(others.first()).copied().ok_or_else(|| "the name has no address".into())
 }
 
 impl TryFrom<String> for RobotAddress {
@@ -77,6 +88,20 @@ impl Display for RobotAddress {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    /// Protects whoever stands at one robot from the other one: a name of two robots, which a resolver gives in turns, is refused, and one address told twice is
+    /// one.
+    #[test]
+    fn a_name_of_two_robots_is_refused() {
+        let of = |all: &[&str]| one_of(all.iter().map(|a| a.parse().unwrap()));
+        let [a, b, six] = ["192.168.1.10", "192.168.1.11", "fe80::1"];
+        for all in [&[a, b][..], &[b, six, a]] {
+            assert!(of(all).unwrap_err().contains("several addresses (192.168.1.10, 192.168.1.11)"));
+        }
+        assert_eq!(of(&[six, b, b]), Ok(b.parse().unwrap()));
+        assert_eq!(of(&[six, "fe80::2"]), Ok(six.parse().unwrap()));
+        assert_eq!(of(&[]), Err("the name has no address".into()));
+    }
 
     /// Protects the operator: an address stays one, a name is looked up, and what is neither is refused with what to write.
     #[test]
