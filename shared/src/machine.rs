@@ -81,17 +81,24 @@ fn processor() -> Vec<Finding> {
     let cpuinfo = read("/proc/cpuinfo");
     let cpu = cpuinfo.lines().find_map(|l| l.strip_prefix("model name")).map_or("", |m| m.trim_matches([' ', '\t', ':']));
     let cores = cpuinfo.lines().filter(|l| l.starts_with("processor")).count();
-    let virtualised = cpuinfo.contains(" hypervisor");
     let version = read("/proc/sys/kernel/version");
     let realtime = version.contains("PREEMPT_RT") || read("/sys/kernel/realtime") == "1";
     let kernel = format!("{} {version}", read("/proc/sys/kernel/osrelease"));
-    let guest = if virtualised { "yes" } else { "no" };
     let rt = "a PREEMPT_RT kernel bounds the wake-up (Debian: apt install linux-image-rt-amd64)";
     vec![
         Finding::green("processor", format!("{cores} x {cpu}")),
-        Finding::judged(!virtualised, "virtual machine", guest, "the host's other guests can hold the loop", "run on the robot's own PC"),
+        guest(&cpuinfo),
         Finding::judged(realtime, "kernel", kernel, "drivers can delay the loop by milliseconds", rt),
     ]
+}
+
+/// Whether this is a virtual machine, by the text of `/proc/cpuinfo`. A processor whose list of what it can do has no word for it, as of arm64, does not say.
+fn guest(cpuinfo: &str) -> Finding {
+    let what = "virtual machine";
+    let Some(flags) = cpuinfo.lines().find(|line| line.starts_with("flags")) else { return Finding::green(what, shown(String::new())) };
+    let virtualised = flags.split_whitespace().any(|flag| flag == "hypervisor");
+    let is = if virtualised { "yes" } else { "no" };
+    Finding::judged(!virtualised, what, is, "the host's other guests can hold the loop", "run on the robot's own PC")
 }
 
 /// Who shares the loop's core with it, and by which clock it sleeps.
@@ -99,7 +106,8 @@ fn beside(core: usize) -> Vec<Finding> {
     let siblings = read(&format!("/sys/devices/system/cpu/cpu{core}/topology/thread_siblings_list"));
     let alone = !siblings.contains([',', '-']);
     let clock = read("/sys/devices/system/clocksource/clocksource0/current_clocksource");
-    let fast = clock == "tsc" || clock == "kvm-clock";
+    // Those that the kernel lets a program read without a system call; the last one is that of arm64.
+    let fast = ["tsc", "kvm-clock", "arch_sys_counter"].contains(&clock.as_str());
     let interrupts = read("/proc/irq/default_smp_affinity");
     // The mask is hexadecimal, in groups of 32 cores; the last group has the lowest ones.
     let mask = interrupts.rsplit(',').next().and_then(|m| u32::from_str_radix(m, 16).ok());
@@ -173,6 +181,21 @@ mod tests {
     fn the_loops_own_core_is_looked_up() {
         assert!(in_list("2-3,6", 3) && in_list("2-3,6", 6) && in_list("0", 0) && in_list(" 1 ", 1));
         assert!(!in_list("2-3,6", 1) && !in_list("2-3,6", 4) && !in_list("", 0) && !in_list("12", 1));
+    }
+
+    /// Protects who reads a plain "no" on a machine that does not say it: only a list of flags without the word means that this is no virtual machine.
+    #[test]
+    fn a_virtual_machine_is_denied_only_where_it_is_known() {
+        let x86 = "processor : 0\nmodel name : X\nflags : fpu tsc";
+        for (cpuinfo, verdict, is) in [
+            (format!("{x86} hypervisor lahf_lm\n"), Verdict::Yellow, "yes"),
+            (format!("{x86} lahf_lm\n"), Verdict::Green, "no"),
+            ("processor : 0\nFeatures : fp asimd\n".into(), Verdict::Green, "not shown by this machine"),
+            (String::new(), Verdict::Green, "not shown by this machine"),
+        ] {
+            let found = guest(&cpuinfo);
+            assert_eq!((found.verdict, found.is.as_str()), (verdict, is), "{cpuinfo}");
+        }
     }
 
     /// Protects the loop from a kernel that was told to throttle real-time threads early: that is yellow, with what to do. The default, and none at
