@@ -467,7 +467,7 @@ fn faults_in_tables_are_named_with_file_and_line() {
         (features(good), "episode,weight_g\n1,5\n1,6\n", "scale.csv:3: episode 1 has a weight in line 2 already"),
         (features(good), "episode,weight_g\n1,5\n7,6\n", "scale.csv:3: episode 7 is not in"),
         (features(good), "episode,weight_g\n1,\n", "scale.csv:2: weight_g ''"),
-        (features(good), "episode,weight_g,framing\n1,5,640 480\n", "scale.csv:2: framing '640 480': six numbers are wanted"),
+        (features(good), "episode,weight_g,framing\n1,5,640 480\n", "scale.csv:2: framing '640 480': width, height"),
         (HEADING.replace('\n', ",doubt\n1,0,0.0,0,0,gloomy\n"), scale, "features.csv:2: doubt 'gloomy': none, or"),
         (HEADING.replace('\n', ",alpha_measured_deg\n1,0,0.0,0,0,inf\n"), scale, "features.csv:2: alpha_measured_deg 'inf'"),
     ] {
