@@ -93,6 +93,8 @@ pub struct OwnCell {
     pub bin: PathBuf,
     /// When it was prepared.
     pub started: Instant,
+    /// What of the directory the next experiment replaces.
+    results: Vec<String>,
     config_file: PathBuf,
     table: toml::Table,
     stop: Arc<AtomicBool>,
@@ -101,7 +103,7 @@ pub struct OwnCell {
 
 impl OwnCell {
     /// Makes the directory and the configuration; nothing runs yet. `results` of an earlier experiment there are removed, with its weights and
-    /// logs. `kind` becomes part of the cell's name. From here on Ctrl-C ends what waits.
+    /// logs, and what somebody else put among them is moved aside. `kind` becomes part of the cell's name. From here on Ctrl-C ends what waits.
     ///
     /// # Errors
     /// When the configuration is bad, the directory is not an experiment's ([`own_folder::claim`]), or a file cannot be written.
@@ -111,7 +113,10 @@ impl OwnCell {
         let text = std::fs::read_to_string(config).map_err(|e| file(config, e))?;
         Config::parse(&text, &config.display().to_string()).map_err(|e| bad(&e))?;
         let mut table: toml::Table = text.parse().map_err(|e| bad(&format!("{}: {e}", config.display())))?;
-        own_folder::claim(out, &[results, &["logs", "weights.bin"]].concat())?;
+        let results = [results, &["logs", "weights.bin"]].concat();
+        if let Some(aside) = own_folder::claim(out, &results)? {
+            eprintln!("experiments: what no experiment made, or somebody changed, is in {} now", aside.display());
+        }
         std::fs::create_dir_all(out.join("logs")).map_err(|e| file(out, e))?;
         let mut set = |section: &str, key: &str, value: toml::Value| {
             if let Some(toml::Value::Table(t)) = table.get_mut(section) {
@@ -135,7 +140,17 @@ impl OwnCell {
         let stop = os::stop_at_signals().map_err(|e| OwnCellError::Other(e.to_string()))?;
         let exe = std::env::current_exe().map_err(|e| file(Path::new("own program"), e))?;
         let bin = exe.parent().unwrap_or(Path::new(".")).to_path_buf();
-        Ok(Self { config, out: out.into(), bin, started: Instant::now(), config_file, table, stop, processes: Vec::new() })
+        Ok(Self {
+            config,
+            out: out.into(),
+            bin,
+            started: Instant::now(),
+            results: results.iter().map(ToString::to_string).collect(),
+            config_file,
+            table,
+            stop,
+            processes: Vec::new(),
+        })
     }
 
     /// Gives the next start another key of `[simulator]`, or the configuration's own again.
@@ -304,6 +319,10 @@ impl Drop for OwnCell {
         self.stop();
         // This also removes what a killed process left.
         shared::ipc::remove_files(&self.config.cell);
+        let results: Vec<&str> = self.results.iter().map(String::as_str).collect();
+        if let Err(e) = own_folder::remember(&self.out, &results) {
+            eprintln!("experiments: {e}");
+        }
     }
 }
 

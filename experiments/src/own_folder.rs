@@ -1,7 +1,10 @@
 //! A folder of results that an experiment may write to: an empty or new one, or one that an experiment made.
 //!
-//! Ordinary process; allocates. What it did not make is never deleted; a folder of somebody else is refused with one line.
+//! Ordinary process; allocates. Only what an experiment made, and nobody has changed since, is ever deleted; all else is moved aside. A folder of somebody
+//! else is refused with one line.
 
+use std::collections::HashSet;
+use std::os::unix::fs::MetadataExt as _;
 use std::path::{Path, PathBuf};
 
 /// Why a folder cannot be used.
@@ -22,14 +25,16 @@ pub enum FolderError {
 
 /// The file that says that an experiment made the folder.
 const MARKER: &str = ".decant-experiment";
-/// What the marker says to whoever finds it.
-const MARKER_TEXT: &str = "An experiment of Decant made this folder. The next run with the same --out replaces its results.\n";
+/// What the marker says to whoever finds it. Behind it is a line for each result: its size, when it was last changed, and its name.
+const MARKER_TEXT: &str =
+    "An experiment of Decant made this folder. The next run with the same --out replaces the results that are named here:\n";
 
-/// Makes `out` if it is not there, and marks it. Of a folder that an experiment made, `results` are removed.
+/// Makes `out` if it is not there, and marks it. Of a folder that an experiment made, the `results` that it left are removed. What is among them and was made
+/// or changed by somebody else, or by a run that was killed, is moved into a new folder of `out`, which is the answer.
 ///
 /// # Errors
 /// When the folder holds something and was not made by an experiment, or cannot be written.
-pub fn claim(out: &Path, results: &[&str]) -> Result<(), FolderError> {
+pub fn claim(out: &Path, results: &[&str]) -> Result<Option<PathBuf>, FolderError> {
     let file = |path: &Path, error| FolderError::File { path: path.into(), error };
     std::fs::create_dir_all(out).map_err(|e| file(out, e))?;
     let marker = out.join(MARKER);
@@ -37,16 +42,58 @@ pub fn claim(out: &Path, results: &[&str]) -> Result<(), FolderError> {
     if !empty && !marker.is_file() {
         return Err(FolderError::NotOurs(out.into()));
     }
-    std::fs::write(&marker, MARKER_TEXT).map_err(|e| file(&marker, e))?;
-    for result in results {
-        let old = out.join(result);
-        let removed = if old.is_dir() { std::fs::remove_dir_all(&old) } else { std::fs::remove_file(&old) };
-        match removed {
-            Err(e) if e.kind() != std::io::ErrorKind::NotFound => return Err(file(&old, e)),
-            _ => {}
-        }
+    let listed = if empty { String::new() } else { std::fs::read_to_string(&marker).map_err(|e| file(&marker, e))? };
+    let listed: HashSet<&str> = listed.lines().collect();
+    let aside = (1..).map(|n| out.join(format!("kept-{n}"))).find(|folder| !folder.exists()).unwrap_or_default();
+    for path in results.iter().flat_map(|result| files_below(&out.join(result))) {
+        let done = if listed.contains(line(out, &path).as_str()) {
+            std::fs::remove_file(&path)
+        } else {
+            let kept = aside.join(path.strip_prefix(out).unwrap_or(&path));
+            std::fs::create_dir_all(kept.parent().unwrap_or(&aside)).and_then(|()| std::fs::rename(&path, kept))
+        };
+        done.map_err(|e| file(&path, e))?;
     }
-    Ok(())
+    results.iter().for_each(|result| remove_empty(&out.join(result)));
+    std::fs::write(&marker, MARKER_TEXT).map_err(|e| file(&marker, e))?;
+    Ok(aside.exists().then_some(aside))
+}
+
+/// Writes down which of the `results` in `out` are there, once an experiment has ended: the next one deletes these alone.
+///
+/// # Errors
+/// When the list cannot be written.
+pub fn remember(out: &Path, results: &[&str]) -> Result<(), FolderError> {
+    let mut text = MARKER_TEXT.to_string();
+    for path in results.iter().flat_map(|result| files_below(&out.join(result))) {
+        text.push_str(&line(out, &path));
+        text.push('\n');
+    }
+    let marker = out.join(MARKER);
+    std::fs::write(&marker, text).map_err(|error| FolderError::File { path: marker, error })
+}
+
+/// The line of a file in the list. A file that was written since has another one.
+fn line(out: &Path, path: &Path) -> String {
+    let (size, changed) = path.symlink_metadata().map_or((0, (0, 0)), |about| (about.len(), (about.mtime(), about.mtime_nsec())));
+    format!("{size} {}.{:09} {}", changed.0, changed.1, path.strip_prefix(out).unwrap_or(path).display())
+}
+
+/// The file `path`, or all files below the directory `path`; links are files. What cannot be read is left where it is.
+fn files_below(path: &Path) -> Vec<PathBuf> {
+    match path.symlink_metadata() {
+        Err(_) => Vec::new(),
+        Ok(about) if !about.is_dir() => vec![path.into()],
+        Ok(_) => std::fs::read_dir(path).into_iter().flatten().flatten().flat_map(|entry| files_below(&entry.path())).collect(),
+    }
+}
+
+/// Removes the directory `path` with those in it, as far as nothing is in them.
+fn remove_empty(path: &Path) {
+    if path.symlink_metadata().is_ok_and(|about| about.is_dir()) {
+        std::fs::read_dir(path).into_iter().flatten().flatten().for_each(|entry| remove_empty(&entry.path()));
+        let _ = std::fs::remove_dir(path);
+    }
 }
 
 #[cfg(test)]
@@ -68,13 +115,39 @@ mod tests {
         assert!(out.join("episodes").is_dir() && std::fs::read_to_string(out.join("weights.bin")).unwrap() == "precious");
 
         let own = folder.join("new");
-        claim(&own, &results).unwrap();
+        assert_eq!(claim(&own, &results).unwrap(), None);
         std::fs::create_dir_all(own.join("episodes")).unwrap();
+        std::fs::write(own.join("episodes/1.mcap"), "an episode").unwrap();
+        std::fs::write(own.join("weights.bin"), "weights").unwrap();
+        remember(&own, &results).unwrap();
         std::fs::write(own.join("notes.txt"), "kept").unwrap();
-        claim(&own, &results).unwrap();
-        assert!(!own.join("episodes").exists(), "results of the run before are replaced");
-        assert!(own.join("notes.txt").is_file(), "what no experiment made stays");
+        assert_eq!(claim(&own, &results).unwrap(), None);
+        assert!(!own.join("episodes").exists() && !own.join("weights.bin").exists(), "results of the run before are replaced");
+        assert!(own.join("notes.txt").is_file(), "what has no result's name stays");
         std::fs::remove_dir_all(&folder).unwrap();
+    }
+
+    /// Protects what a person has put among a demo's results, or has changed there, and what a run left that was killed: it is moved aside and not deleted.
+    #[test]
+    fn what_no_experiment_left_is_moved_aside() {
+        let out = std::env::temp_dir().join(format!("decant-own-folder-kept-{}", std::process::id()));
+        let results = ["episodes", "weights.bin"];
+        claim(&out, &results).unwrap();
+        let write = |name: &str, text: &str| std::fs::write(out.join(name), text).unwrap();
+        std::fs::create_dir_all(out.join("episodes/lab")).unwrap();
+        ["episodes/1.mcap", "episodes/2.mcap", "weights.bin"].iter().for_each(|name| write(name, "result"));
+        remember(&out, &results).unwrap();
+        write("episodes/lab/own.mcap", "precious");
+        write("episodes/2.mcap", "result with a note");
+        let aside = claim(&out, &results).unwrap().unwrap();
+        let read = |name: &str| std::fs::read_to_string(aside.join(name)).ok();
+        assert_eq!(read("episodes/lab/own.mcap").as_deref(), Some("precious"));
+        assert_eq!(read("episodes/2.mcap").as_deref(), Some("result with a note"));
+        assert_eq!((read("episodes/1.mcap"), read("weights.bin"), out.join("episodes").exists()), (None, None, false));
+        write("weights.bin", "of a run that was killed");
+        let later = claim(&out, &results).unwrap().unwrap();
+        assert!(later != aside && later.join("weights.bin").is_file());
+        std::fs::remove_dir_all(&out).unwrap();
     }
 
     /// Protects scripts: a folder that cannot be written is no bad command line, and a folder of somebody else is one.
