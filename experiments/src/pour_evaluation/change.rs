@@ -24,6 +24,16 @@ pub enum Change {
     GainLow,
     /// Camera gain + 5 %.
     GainHigh,
+    /// Camera gain - 20 %.
+    GainLower,
+    /// Camera gain + 20 %.
+    GainHigher,
+    /// Nothing, and somebody has told how much is in the vessel.
+    Fill,
+    /// Nothing, and somebody has told that a fifth more is in the vessel than is.
+    FillMore,
+    /// Nothing, and somebody has told that a fifth less is in the vessel than is.
+    FillLess,
     /// The camera never sees a stream.
     EyeBlind,
     /// The same, and somebody has told how much is in the vessel.
@@ -57,14 +67,21 @@ impl Change {
             Self::Dropouts => rig.dropouts = 0.10,
             Self::GainLow => rig.gain *= 0.95,
             Self::GainHigh => rig.gain *= 1.05,
+            Self::GainLower => rig.gain *= 0.8,
+            Self::GainHigher => rig.gain *= 1.2,
             _ => {}
         }
         rig
     }
 
-    /// Whether somebody tells the controller how much is in the vessel.
-    pub fn tells_fill(self) -> bool {
-        self == Self::EyeBlindFill
+    /// How many times what is in the vessel the controller is told; `None` if nobody tells.
+    pub fn told_fill(self) -> Option<f64> {
+        match self {
+            Self::Fill | Self::EyeBlindFill => Some(1.0),
+            Self::FillMore => Some(1.2),
+            Self::FillLess => Some(0.8),
+            _ => None,
+        }
     }
 
     /// The fault that the eye has with this change.

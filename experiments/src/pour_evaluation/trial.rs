@@ -57,8 +57,8 @@ pub struct Trial {
     pub test: Bench,
     /// The fault of the eye in the test's pours, if there is one.
     pub eye: Option<EyeFault>,
-    /// Whether somebody tells the controller how much is in the vessel.
-    pub fill_told: bool,
+    /// How many times what is in the vessel somebody tells the controller, if anybody does.
+    pub told_fill: Option<f64>,
     /// Where trained weights are kept, and taken from the next time: the beginning of their files' names.
     pub keep: Option<PathBuf>,
     /// Seed of the episodes.
@@ -82,7 +82,7 @@ impl Trial {
             bench: benches.0,
             test: benches.1,
             eye: change.eye(),
-            fill_told: change.tells_fill(),
+            told_fill: change.told_fill(),
             keep: None,
             data_seed,
             pour_seed,
@@ -98,7 +98,7 @@ impl Trial {
             bench: benches.0,
             test: benches.1,
             eye: change.eye(),
-            fill_told: change.tells_fill(),
+            told_fill: change.told_fill(),
             ..Self::new("a", rig, seed, "cylinder", Change::None)
         }
     }
@@ -139,7 +139,7 @@ impl Trial {
     pub fn judge(&self, weights: &Weights, repeats: u64, by_plan: bool) -> Vec<PourResult> {
         let agent = Agent::new(weights);
         let pour = |(init, goal, k): (f64, f64, u64)| {
-            let flows_by_deg = self.fill_told.then(|| foreseen::flows_by_deg(weights, init, self.test.full_ml())).flatten();
+            let flows_by_deg = self.told_fill.and_then(|times| foreseen::flows_by_deg(weights, times * init, self.test.full_ml()));
             let asked = Asked { flows_by_deg, calibration: Some(weights.calibration), ..Asked::new(init, goal) };
             by_core(&agent, &mut self.test_pour(init, k), self.limits, asked, None)
         };
