@@ -7,12 +7,17 @@ use shared::agent::{Agent, Observation};
 use shared::control::is_short;
 use shared::estimator::Calibration;
 use shared::estimator::flow::{CommandHistory, FlowState, FlowTables};
-use shared::estimator::fused::Explanation;
+use shared::estimator::fused::{Explanation, TIGHT, WIDE};
+use shared::estimator::vessel::CapacityCurve;
 use shared::limits::{Limiter, Limits};
 use shared::weights::{Estimator, Weights};
 
 use crate::core::Settings;
 use crate::core::ending::Ending;
+
+mod onset;
+
+use onset::{LAST_DEG, Shape};
 
 /// Tilts at which the flow may begin, degrees: from a nearly full vessel to one that is half empty.
 const ONSETS_DEG: [f32; 3] = [35.0, 50.0, 65.0];
@@ -22,11 +27,16 @@ const QUIET_FRAMES: u32 = 20;
 const BACK_FRAMES: u32 = 900;
 /// Below this area no camera shows a stream, px^2. Chosen by hand; no measurement is recorded.
 const VISIBLE_PX2: f32 = 20.0;
-/// The largest tilt of the flow model's tables, degrees.
-const LAST_DEG: f64 = 120.0;
-/// How far beyond the tilt of a fill's first drop it must flow, degrees: where capacity curves of real vessels were known least, they were off
+/// How far beyond the tilt of a fill's first drop a straight vessel must flow, degrees: where capacity curves of real vessels were known least, they were off
 /// by 10 % of the vessel, which is some 8 degrees.
 const BEYOND_DEG: f64 = 10.0;
+/// By how many standard deviations of what the weights leave open of its shape a vessel of any shape may flow later. Tuned on rigs 200 to 202 of each kind of
+/// vessel with five curves: with one, no right pour was ended, and as much as a half more is left for others.
+const LATER_SDS: f64 = 1.5;
+/// How far beyond that it must flow, degrees: the first drops are too few to be seen. Tuned together with [`LATER_SDS`].
+const LATER_DEG: f64 = 2.0;
+/// An explanation that is less likely than this does not count for the tilt by which a fill must flow. Chosen by hand: as many right pours may be ended.
+const UNLIKELY: f64 = 0.01;
 /// A vessel whose size was learned may hold so many times more. Chosen by hand: curves alone tell a size badly, so a fill beyond this is refused, and
 /// `[container] holds_ml` tells the size where it is known.
 const OVERFULL: f64 = 1.25;
@@ -158,18 +168,36 @@ fn foreseen_end(
     None
 }
 
-/// The tilt by which a vessel with `fill_ml` in it must flow, degrees; `None` if the weights describe no vessel, the fill reaches no lip, or the vessel
-/// does not hold it.
-/// `holds_ml` is what the vessel holds, where somebody knows it.
-pub fn flows_by_deg(weights: &Weights, fill_ml: f64, holds_ml: Option<f64>) -> Option<f32> {
-    let capacity = FlowTables::new(&explanation(weights)?.model, weights.rate_hz.into()).capacity;
-    let whole_ml = capacity.lost_ml(LAST_DEG);
+/// The tilt at which a vessel with `fill_ml` in it begins to flow by a learned curve, as a share of what it holds; `None` if the vessel does not hold it, or it
+/// reaches no lip.
+fn learned_onset_deg(capacity: &CapacityCurve, fill_ml: f64, holds_ml: Option<f64>) -> Option<f64> {
+    let whole_ml = capacity.lost_ml(LAST_DEG.into());
     if !(0.0..=holds_ml.unwrap_or(OVERFULL * whole_ml)).contains(&fill_ml) {
         return None;
     }
     let empty_ml = whole_ml * (1.0 - fill_ml / holds_ml.unwrap_or(whole_ml)).clamp(0.0, 1.0);
-    let onset_deg = (0..=LAST_DEG as u32).map(f64::from).find(|deg| capacity.lost_ml(*deg) >= empty_ml)?;
-    (onset_deg < LAST_DEG).then_some((onset_deg + BEYOND_DEG) as f32)
+    (0..LAST_DEG).map(f64::from).find(|deg| capacity.lost_ml(*deg) >= empty_ml)
+}
+
+/// The tilt by which a vessel with `fill_ml` in it must flow, degrees; `None` if the weights describe no vessel, the fill reaches no lip, or the vessel
+/// does not hold it. Each explanation that may be right counts, that of any shape as far as the weights know it (`onset.rs`); a tilt beyond the largest one
+/// bounds nothing. `holds_ml` is what the vessel holds, where somebody knows it.
+pub fn flows_by_deg(weights: &Weights, fill_ml: f64, holds_ml: Option<f64>) -> Option<f32> {
+    let Estimator::Fused { model, .. } = &weights.estimator else { return None };
+    learned_onset_deg(&CapacityCurve::new(&model.likelier().model.vessel), fill_ml, holds_ml)?;
+    let straight_deg = || {
+        let onset_deg = learned_onset_deg(&CapacityCurve::new(&model.explanations[TIGHT].model.vessel), fill_ml, holds_ml);
+        onset_deg.unwrap_or(LAST_DEG.into()) + BEYOND_DEG
+    };
+    let any_deg = || {
+        let shape = Shape::learned(&model.explanations[WIDE]);
+        let shape = if let Some(holds_ml) = holds_ml { shape.that_holds(holds_ml) } else { shape };
+        let deg = shape.flows_by_deg(fill_ml, holds_ml, LATER_SDS).unwrap_or(LAST_DEG);
+        (f64::from(deg) + LATER_DEG).max(BEYOND_DEG)
+    };
+    let straight_deg = if model.tight_share > UNLIKELY { straight_deg() } else { 0.0 };
+    let any_deg = if model.tight_share < 1.0 - UNLIKELY { any_deg() } else { 0.0 };
+    Some(straight_deg.max(any_deg) as f32)
 }
 
 /// The tilt by which a pour must flow, degrees, from what is known of the fill: `fill_ml` where the operator told it, as [`flows_by_deg`] takes it;
@@ -178,7 +206,7 @@ pub fn must_flow_by_deg(weights: &Weights, fill_ml: Option<f64>, least_fill_ml: 
     if fill_ml.is_some() {
         return flows_by_deg(weights, fill_ml?, holds_ml);
     }
-    let whole_ml = || Some(FlowTables::new(&explanation(weights)?.model, weights.rate_hz.into()).capacity.lost_ml(LAST_DEG));
+    let whole_ml = || Some(FlowTables::new(&explanation(weights)?.model, weights.rate_hz.into()).capacity.lost_ml(LAST_DEG.into()));
     flows_by_deg(weights, least_fill_ml?.min(holds_ml.or_else(whole_ml)?), holds_ml)
 }
 
@@ -216,6 +244,7 @@ pub(crate) mod tests {
     use shared::estimator::flow::{FlowModel, WayBack};
     use shared::estimator::fused::{EXPLANATIONS, FusedModel};
     use shared::estimator::verdict::Bounds;
+    use shared::estimator::vessel::{KNOTS, knot_deg};
     use shared::framing::Framing;
     use shared::mlp::{InputScale, Mlp};
     use shared::weights::{Method, Origin};
@@ -324,6 +353,38 @@ pub(crate) mod tests {
             assert_eq!((by(wrong), flows_by_deg(&weights(), 20.0 * wrong, None)), (None, None), "{wrong}");
         }
         assert_eq!(flows_by_deg(&Weights { estimator: Estimator::Sum, ..weights() }, 250.0, None), None);
+    }
+
+    /// Protects right pours from what nobody has learned of their vessel: the parts that no episode reached make its bound as wide as they are in doubt, what it
+    /// holds makes that less, and a well known one is bounded nearly as a straight one is. That one's bound does not change.
+    #[test]
+    fn what_is_not_known_of_a_vessel_widens_its_bound() {
+        let by = |tight_share: f64, open_sd: f64, holds_ml| {
+            let mut weights = weights();
+            let Estimator::Fused { model, .. } = &mut weights.estimator else { panic!("no model") };
+            model.tight_share = tight_share;
+            for (knot, row) in model.explanations[WIDE].unknowns[UNKNOWNS - KNOTS..].iter_mut().enumerate() {
+                let is_open = !(40.0..80.0).contains(&knot_deg(knot));
+                row[UNKNOWNS - KNOTS + knot] = if is_open { open_sd * open_sd } else { 0.05 * 0.05 };
+            }
+            flows_by_deg(&weights, 300.0, holds_ml).unwrap()
+        };
+        let holds_ml = Some(520.0);
+        let (straight, known, open, unheld) = (by(1.0, 1.4, holds_ml), by(0.0, 0.05, holds_ml), by(0.0, 1.4, holds_ml), by(0.0, 1.4, None));
+        assert_eq!(straight, by(1.0, 0.0, holds_ml));
+        assert!((known - straight).abs() < 10.0 && open > known + 3.0 && unheld > open + 2.0, "{straight} {known} {open} {unheld}");
+        // Where both may be right, the later one counts.
+        assert_eq!(by(0.5, 1.4, holds_ml), open.max(straight));
+    }
+
+    /// Protects the pour of a vessel that is as full as it can be: it may be tilted a little all the same, whatever its shape.
+    #[test]
+    fn a_brimful_vessel_may_be_tilted() {
+        let mut weights = weights();
+        if let Estimator::Fused { model, .. } = &mut weights.estimator {
+            model.tight_share = 0.0;
+        }
+        assert_eq!(flows_by_deg(&weights, 520.0, Some(520.0)), Some(BEYOND_DEG as f32));
     }
 
     /// Protects who relies on the least fill that the configuration tells: where it bounds nothing, that is said before the pour.
