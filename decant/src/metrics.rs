@@ -5,17 +5,17 @@
 //! Allocates. A controller that is away is no failure but `decant_up 0`; a port that is in use, or shared memory that does not come back, ends
 //! it with one line.
 
+mod ended;
 mod page;
 mod weighed;
 
-use std::collections::BTreeMap;
 use std::net::{IpAddr, Ipv4Addr};
 use std::path::PathBuf;
 use std::time::{Duration, Instant};
 
 use rt_controller::client::Client;
 use shared::config::Config;
-use shared::control::{EndReason, Status};
+use shared::control::Status;
 use shared::disk_space::room;
 use shared::exit::{self, Failure, OrExit as _};
 use shared::os;
@@ -23,6 +23,7 @@ use shared::runtime_dir::Place;
 use web::gate::Rules;
 use web::{Answer, Server, Settings, token};
 
+use ended::Ended;
 use page::Seen;
 use weighed::Weighed;
 
@@ -96,16 +97,13 @@ struct Cell<'a> {
     asked: Option<Instant>,
     /// When this process began to look.
     since: Instant,
-    /// How many pours and recordings ended for which reason since then, and the newest one.
-    ended: BTreeMap<&'static str, u64>,
-    newest: Option<u64>,
+    /// How the pours and recordings ended since then.
+    ended: Ended,
 }
 
 impl<'a> Cell<'a> {
     fn new(config: &'a Config) -> Self {
-        // Prometheus sees growth only of what it has seen before, so each reason is there from the start.
-        let ended = EndReason::all().map(|reason| (reason.words(), 0)).collect();
-        Self { config, client: None, status: None, asked: None, since: Instant::now(), ended, newest: None }
+        Self { config, client: None, status: None, asked: None, since: Instant::now(), ended: Ended::new() }
     }
 
     /// Asks the controller, unless it was asked just now.
@@ -122,7 +120,7 @@ impl<'a> Cell<'a> {
         Seen {
             cell: self.config.cell.name.clone(),
             status: self.status.clone(),
-            ended: self.ended.clone(),
+            ended: self.ended.counts.clone(),
             errors_ml: weighed.errors_ml(),
             room: places.filter_map(|(name, path)| Some((name, room(path)?))).collect(),
         }
@@ -145,13 +143,6 @@ impl<'a> Cell<'a> {
     /// Counts the results that were not counted yet. Those from before this process started are not its own; a controller that started later has none.
     fn count(&mut self) {
         let Some(status) = &self.status else { return };
-        let newest = status.outcomes.iter().map(|o| o.episode).max().unwrap_or(0);
-        let is_younger = status.uptime_s < self.since.elapsed().as_secs_f64();
-        if let Some(before) = self.newest.or(is_younger.then_some(0)) {
-            for outcome in status.outcomes.iter().filter(|o| o.episode > before) {
-                *self.ended.entry(outcome.reason.words()).or_default() += 1;
-            }
-        }
-        self.newest = self.newest.max(Some(newest));
+        self.ended.count(&status.outcomes, status.uptime_s < self.since.elapsed().as_secs_f64());
     }
 }
