@@ -29,6 +29,8 @@ mod stream_outline;
 pub mod view;
 mod water;
 
+use std::sync::Once;
+
 use opencv::core::{self, CV_8UC3, Mat, Rect, Scalar, Size};
 use opencv::imgproc;
 use rand::{RngExt, SeedableRng};
@@ -66,6 +68,14 @@ pub struct Renderer {
     last_s: Option<f64>,
 }
 
+/// Lets OpenCV work in the calling threads alone. That is done once in a process: OpenCV crashes where two threads set the number of its own at a time.
+fn one_thread() -> opencv::Result<()> {
+    static DONE: Once = Once::new();
+    let mut done = Ok(());
+    DONE.call_once(|| done = core::set_num_threads(1));
+    done
+}
+
 impl Renderer {
     /// A renderer of `view`; `seed` decides background, noise, drops, drift and the room that water reflects.
     ///
@@ -73,7 +83,7 @@ impl Renderer {
     /// When OpenCV refuses, for instance for want of memory.
     pub fn new(view: &View, seed: u64) -> Result<Self, RenderError> {
         // One thread: what is drawn does not depend on the machine, and the other core is left to the controller.
-        core::set_num_threads(1)?;
+        one_thread()?;
         let mut random = Pcg64Mcg::seed_from_u64(seed);
         let board = Board::new(view, &mut random)?;
         let sensor = Sensor::new(view, &mut random);
@@ -158,6 +168,16 @@ mod tests {
             println!();
         }
         Ok(())
+    }
+
+    /// Protects evaluations and the swarm, which draw on every core, from a crash that takes all their results with it.
+    #[test]
+    fn many_threads_may_begin_to_draw_at_once() {
+        std::thread::scope(|scope| {
+            for _ in 0..8 {
+                scope.spawn(|| (0..20_000).for_each(|_| assert!(one_thread().is_ok())));
+            }
+        });
     }
 
     /// Protects reproducible evaluation: the same view, seed and scenes give the same bytes.
