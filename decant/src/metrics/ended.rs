@@ -7,23 +7,23 @@ use std::collections::{BTreeMap, BTreeSet};
 use shared::control::{EndReason, Outcome};
 
 /// How many pours and recordings ended for which reason.
-pub(super) struct Ended {
+pub struct Ended {
     /// By the reason's words.
-    pub(super) counts: BTreeMap<&'static str, u64>,
+    pub counts: BTreeMap<&'static str, u64>,
     /// The numbers of the outcomes that the controller told last; `None` before it told any.
     told: Option<BTreeSet<u64>>,
 }
 
 impl Ended {
     /// Nothing was counted yet. Prometheus sees growth only of what it has seen before, so each reason is there from the start.
-    pub(super) fn new() -> Self {
+    pub fn new() -> Self {
         Self { counts: EndReason::all().map(|reason| (reason.words(), 0)).collect(), told: None }
     }
 
     /// Counts those of the controller's newest outcomes that it did not tell last time. Their numbers may fall: a controller that starts anew may begin at 1
     /// again, and the number of an order that was refused is given to a later one. The first that are told at all count only if `is_younger`, so that the
     /// controller has none from before this program began.
-    pub(super) fn count(&mut self, outcomes: &[Outcome], is_younger: bool) {
+    pub fn count(&mut self, outcomes: &[Outcome], is_younger: bool) {
         if let Some(told) = self.told.take().or_else(|| is_younger.then(BTreeSet::new)) {
             for outcome in outcomes.iter().filter(|outcome| !told.contains(&outcome.episode)) {
                 *self.counts.entry(outcome.reason.words()).or_default() += 1;
