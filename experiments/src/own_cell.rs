@@ -94,7 +94,7 @@ pub struct OwnCell {
     /// When it was prepared.
     pub started: Instant,
     /// What of the directory the next experiment replaces.
-    results: Vec<String>,
+    results: Vec<&'static str>,
     config_file: PathBuf,
     table: toml::Table,
     stop: Arc<AtomicBool>,
@@ -107,7 +107,7 @@ impl OwnCell {
     ///
     /// # Errors
     /// When the configuration is bad, the directory is not an experiment's ([`own_folder::claim`]), or a file cannot be written.
-    pub fn prepare(kind: &str, config: &Path, (out, results): (&Path, &[&str]), seed: u64) -> Result<Self, OwnCellError> {
+    pub fn prepare(kind: &str, config: &Path, (out, results): (&Path, &[&'static str]), seed: u64) -> Result<Self, OwnCellError> {
         let file = |what: &Path, error| OwnCellError::File { what: what.display().to_string(), error };
         let bad = |e: &dyn std::fmt::Display| OwnCellError::Config(e.to_string());
         let text = std::fs::read_to_string(config).map_err(|e| file(config, e))?;
@@ -140,17 +140,7 @@ impl OwnCell {
         let stop = os::stop_at_signals().map_err(|e| OwnCellError::Other(e.to_string()))?;
         let exe = std::env::current_exe().map_err(|e| file(Path::new("own program"), e))?;
         let bin = exe.parent().unwrap_or(Path::new(".")).to_path_buf();
-        Ok(Self {
-            config,
-            out: out.into(),
-            bin,
-            started: Instant::now(),
-            results: results.iter().map(ToString::to_string).collect(),
-            config_file,
-            table,
-            stop,
-            processes: Vec::new(),
-        })
+        Ok(Self { config, out: out.into(), bin, started: Instant::now(), results, config_file, table, stop, processes: Vec::new() })
     }
 
     /// Gives the next start another key of `[simulator]`, or the configuration's own again.
@@ -319,8 +309,7 @@ impl Drop for OwnCell {
         self.stop();
         // This also removes what a killed process left.
         shared::ipc::remove_files(&self.config.cell);
-        let results: Vec<&str> = self.results.iter().map(String::as_str).collect();
-        if let Err(e) = own_folder::remember(&self.out, &results) {
+        if let Err(e) = own_folder::remember(&self.out, &self.results) {
             eprintln!("experiments: {e}");
         }
     }
