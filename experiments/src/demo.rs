@@ -3,7 +3,7 @@
 //!
 //! Ordinary process; allocates and blocks; one thread of its own listens to the controller while a pour runs. A step that fails ends it.
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::process::Command;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -135,6 +135,7 @@ pub fn perform(cell: &mut OwnCell, seed: u64) -> Result<DemoSummary, OwnCellErro
     let summary = DemoSummary { pours, weighed_pours, episodes, weights, seconds, out: cell.out.clone() };
     let file = cell.out.join("summary.json");
     std::fs::write(&file, summary.json() + "\n").map_err(|error| OwnCellError::File { what: file.display().to_string(), error })?;
+    cell.made("summary.json");
     Ok(summary)
 }
 
@@ -148,7 +149,7 @@ struct FirstHour {
 
 impl FirstHour {
     /// Asks what teaches most, does it, and weighs it; `nth` counts from 0.
-    fn weigh_next(&mut self, cell: &OwnCell, plan: &Plan, nth: usize) -> Result<(), OwnCellError> {
+    fn weigh_next(&mut self, cell: &mut OwnCell, plan: &Plan, nth: usize) -> Result<(), OwnCellError> {
         let number = format!("{} of {WEIGHINGS}", nth + 1);
         match proposal(cell, plan)? {
             Proposed::Curve { fill_ml, lambda_deg, gamma_per_s2: gamma } => {
@@ -183,10 +184,18 @@ fn proposal(cell: &OwnCell, plan: &Plan) -> Result<Proposed, OwnCellError> {
 }
 
 /// Enters an episode's weight; returns its entry for `summary.json`.
-fn weigh(cell: &OwnCell, file: &Value, weight_g: f64, fill_ml: f64) -> Result<Value, OwnCellError> {
-    let file = file.as_str().unwrap_or_default();
-    cell.command("feature-worker", &["episodes", "weigh", file, "--weight", &weight_g.to_string()])?;
-    Ok(json!({ "file": file, "weight_g": weight_g, "v_init_ml": fill_ml }))
+fn weigh(cell: &mut OwnCell, file: &Value, weight_g: f64, fill_ml: f64) -> Result<Value, OwnCellError> {
+    let name = file.as_str().unwrap_or_default();
+    cell.command("feature-worker", &["episodes", "weigh", name, "--weight", &weight_g.to_string()])?;
+    made_episode(cell, file);
+    Ok(json!({ "file": name, "weight_g": weight_g, "v_init_ml": fill_ml }))
+}
+
+/// Says that the demo has written the episode `file`.
+fn made_episode(cell: &mut OwnCell, file: &Value) {
+    if let Some(name) = file.as_str().and_then(|file| Path::new(file).file_name()) {
+        cell.made(&format!("episodes/{}", name.to_string_lossy()));
+    }
 }
 
 /// Trains, and waits until the running controller has taken the weights; returns their identity.
@@ -204,6 +213,8 @@ fn train(cell: &mut OwnCell, client: &Client, seed: u64) -> Result<String, OwnCe
         .map_err(|error| OwnCellError::File { what: "trainer".into(), error })?;
     let _ = std::fs::write(&log, [output.stdout.as_slice(), output.stderr.as_slice()].concat());
     cell.succeeded("trainer train", output.status, &String::from_utf8_lossy(&output.stderr))?;
+    cell.made("weights.bin");
+    cell.made("weights.bin.json");
     let taken = cell.until("the weight swap", 10, || match client.status() {
         Ok(s) if s.weights_taken > before => Ok(s.weights.clone()),
         Ok(s) => Err(s.weights_refused.clone()),
@@ -214,15 +225,18 @@ fn train(cell: &mut OwnCell, client: &Client, seed: u64) -> Result<String, OwnCe
 }
 
 /// Pours once into an empty cup, and draws the pour.
-fn pour(cell: &OwnCell, kind: &str, number: usize, planned: PlannedPour) -> Result<DemoPour, OwnCellError> {
+fn pour(cell: &mut OwnCell, kind: &str, number: usize, planned: PlannedPour) -> Result<DemoPour, OwnCellError> {
     let PlannedPour { fill_ml, goal_ml } = planned;
     cell.command("simulator", &["operator", "fill", &fill_ml.to_string()])?;
     let listener = Listener::start(&cell.config.cell)?;
     let result = cell.command("rt-controller", &["pour", "--json", &goal_ml.to_string()])?;
     let ticks = listener.finish();
     let poured_ml = cell.scale()?;
-    let plot = cell.out.join(PICTURES).join(format!("{kind}-{number}-{goal_ml:.0}ml.svg"));
+    made_episode(cell, &result["episode_file"]);
+    let name = format!("{PICTURES}/{kind}-{number}-{goal_ml:.0}ml.svg");
+    let plot = cell.out.join(&name);
     plots::pour::draw(&plot, &ticks, goal_ml as f32, poured_ml).map_err(|e| OwnCellError::Other(format!("{}: {e}", plot.display())))?;
+    cell.made(&name);
     cell.note(&format!("  poured {poured_ml} g on the scale"));
     Ok(DemoPour {
         filled_ml: fill_ml,

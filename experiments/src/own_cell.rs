@@ -17,7 +17,12 @@ use shared::exit::{self, Failure, failure};
 use shared::messages::Phase;
 use shared::os;
 
-use crate::own_folder::{self, FolderError};
+use crate::own_folder::{self, FolderError, Made};
+
+/// The cell's configuration, in its directory.
+const CONFIG: &str = "sim.toml";
+/// The programs whose words are in `logs`.
+const LOGGED: [&str; 4] = ["simulator", "feature-worker", "rt-controller", "trainer"];
 
 /// Why the cell, or an operator's command in it, did not do what it was asked to.
 #[derive(Debug, thiserror::Error)]
@@ -93,8 +98,8 @@ pub struct OwnCell {
     pub bin: PathBuf,
     /// When it was prepared.
     pub started: Instant,
-    /// What of the directory the next experiment replaces.
-    results: Vec<&'static str>,
+    /// What of the directory the next experiment deletes.
+    made: Made,
     config_file: PathBuf,
     table: toml::Table,
     stop: Arc<AtomicBool>,
@@ -113,7 +118,7 @@ impl OwnCell {
         let text = std::fs::read_to_string(config).map_err(|e| file(config, e))?;
         Config::parse(&text, &config.display().to_string()).map_err(|e| bad(&e))?;
         let mut table: toml::Table = text.parse().map_err(|e| bad(&format!("{}: {e}", config.display())))?;
-        let results = [results, &["logs", "weights.bin"]].concat();
+        let results = [results, &["logs", CONFIG, "weights.bin", "weights.bin.json"]].concat();
         if let Some(aside) = own_folder::claim(out, &results)? {
             eprintln!("experiments: what no experiment made, or somebody changed, is in {} now", aside.display());
         }
@@ -134,25 +139,29 @@ impl OwnCell {
         set("controller", "journal", path("journal.bin"));
         set("recording", "directory", path("episodes"));
         set("simulator", "seed", toml::Value::Integer(seed as i64));
-        let config_file = out.join("sim.toml");
+        let config_file = out.join(CONFIG);
         write_table(&config_file, &table)?;
         let config = Config::read(&config_file).map_err(|e| bad(&e))?;
         let stop = os::stop_at_signals().map_err(|e| OwnCellError::Other(e.to_string()))?;
         let exe = std::env::current_exe().map_err(|e| file(Path::new("own program"), e))?;
         let bin = exe.parent().unwrap_or(Path::new(".")).to_path_buf();
-        Ok(Self { config, out: out.into(), bin, started: Instant::now(), results, config_file, table, stop, processes: Vec::new() })
+        let mut made = Made::default();
+        made.add(out, Path::new(CONFIG));
+        Ok(Self { config, out: out.into(), bin, started: Instant::now(), made, config_file, table, stop, processes: Vec::new() })
     }
 
     /// Gives the next start another key of `[simulator]`, or the configuration's own again.
     ///
     /// # Errors
     /// When the configuration cannot be written.
-    pub fn simulate(&self, other: Option<(&str, toml::Value)>) -> Result<(), OwnCellError> {
+    pub fn simulate(&mut self, other: Option<(&str, toml::Value)>) -> Result<(), OwnCellError> {
         let mut table = self.table.clone();
         if let (Some((key, value)), Some(toml::Value::Table(simulator))) = (other, table.get_mut("simulator")) {
             simulator.insert(key.into(), value);
         }
-        write_table(&self.config_file, &table)
+        write_table(&self.config_file, &table)?;
+        self.made(CONFIG);
+        Ok(())
     }
 
     /// Starts simulator, feature worker and controller, and waits until they are ready to pour.
@@ -204,6 +213,12 @@ impl OwnCell {
     /// The process id of one of its processes, if it runs.
     pub fn pid(&self, name: &str) -> Option<u32> {
         self.processes.iter().find(|(n, _)| *n == name).map(|(_, child)| child.id())
+    }
+
+    /// Says that the experiment has just written the file `name` of its directory, or written it anew: the next experiment there deletes it, if nobody
+    /// changes it until then. What a person puts there meanwhile is never said so, and is moved aside.
+    pub fn made(&mut self, name: &str) {
+        self.made.add(&self.out, Path::new(name));
     }
 
     /// Writes one line of progress to standard error.
@@ -309,7 +324,10 @@ impl Drop for OwnCell {
         self.stop();
         // This also removes what a killed process left.
         shared::ipc::remove_files(&self.config.cell);
-        if let Err(e) = own_folder::remember(&self.out, &self.results) {
+        for program in LOGGED {
+            self.made(&format!("logs/{program}.log"));
+        }
+        if let Err(e) = self.made.remember(&self.out) {
             eprintln!("experiments: {e}");
         }
     }

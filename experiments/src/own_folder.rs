@@ -3,7 +3,7 @@
 //! Ordinary process; allocates. Only what an experiment made, and nobody has changed since, is ever deleted; all else is moved aside. A folder of somebody
 //! else is refused with one line.
 
-use std::collections::HashSet;
+use std::collections::{BTreeMap, HashSet};
 use std::os::unix::fs::MetadataExt as _;
 use std::path::{Path, PathBuf};
 
@@ -59,18 +59,26 @@ pub fn claim(out: &Path, results: &[&str]) -> Result<Option<PathBuf>, FolderErro
     Ok(aside.exists().then_some(aside))
 }
 
-/// Writes down which of the `results` in `out` are there, once an experiment has ended: the next one deletes these alone.
-///
-/// # Errors
-/// When the list cannot be written.
-pub fn remember(out: &Path, results: &[&str]) -> Result<(), FolderError> {
-    let mut text = MARKER_TEXT.to_string();
-    for path in results.iter().flat_map(|result| files_below(&out.join(result))) {
-        text.push_str(&line(out, &path));
-        text.push('\n');
+/// The results that an experiment itself has made, as they were then.
+#[derive(Debug, Default)]
+pub struct Made(BTreeMap<PathBuf, String>);
+
+impl Made {
+    /// Adds the file `name` of `out`, which the experiment has just written, or written anew.
+    pub fn add(&mut self, out: &Path, name: &Path) {
+        self.0.insert(name.into(), line(out, &out.join(name)));
     }
-    let marker = out.join(MARKER);
-    std::fs::write(&marker, text).map_err(|error| FolderError::File { path: marker, error })
+
+    /// Writes them down, once the experiment has ended: the next one deletes these alone, as far as nobody has changed them.
+    ///
+    /// # Errors
+    /// When the list cannot be written.
+    pub fn remember(&self, out: &Path) -> Result<(), FolderError> {
+        let lines = self.0.values().map(|line| format!("{line}\n"));
+        let text = std::iter::once(MARKER_TEXT.to_string()).chain(lines).collect::<String>();
+        let marker = out.join(MARKER);
+        std::fs::write(&marker, text).map_err(|error| FolderError::File { path: marker, error })
+    }
 }
 
 /// The line of a file in the list. A file that was written since has another one.
@@ -117,9 +125,12 @@ mod tests {
         let own = folder.join("new");
         assert_eq!(claim(&own, &results).unwrap(), None);
         std::fs::create_dir_all(own.join("episodes")).unwrap();
-        std::fs::write(own.join("episodes/1.mcap"), "an episode").unwrap();
-        std::fs::write(own.join("weights.bin"), "weights").unwrap();
-        remember(&own, &results).unwrap();
+        let mut made = Made::default();
+        for name in ["episodes/1.mcap", "weights.bin"] {
+            std::fs::write(own.join(name), "a result").unwrap();
+            made.add(&own, Path::new(name));
+        }
+        made.remember(&own).unwrap();
         std::fs::write(own.join("notes.txt"), "kept").unwrap();
         assert_eq!(claim(&own, &results).unwrap(), None);
         assert!(!own.join("episodes").exists() && !own.join("weights.bin").exists(), "results of the run before are replaced");
@@ -127,7 +138,8 @@ mod tests {
         std::fs::remove_dir_all(&folder).unwrap();
     }
 
-    /// Protects what a person has put among a demo's results, or has changed there, and what a run left that was killed: it is moved aside and not deleted.
+    /// Protects what a person has put among a demo's results, or has changed there, while it ran or afterwards, and what a run left that was killed: it is
+    /// moved aside and not deleted.
     #[test]
     fn what_no_experiment_left_is_moved_aside() {
         let out = std::env::temp_dir().join(format!("decant-own-folder-kept-{}", std::process::id()));
@@ -135,15 +147,23 @@ mod tests {
         claim(&out, &results).unwrap();
         let write = |name: &str, text: &str| std::fs::write(out.join(name), text).unwrap();
         std::fs::create_dir_all(out.join("episodes/lab")).unwrap();
-        ["episodes/1.mcap", "episodes/2.mcap", "weights.bin"].iter().for_each(|name| write(name, "result"));
-        remember(&out, &results).unwrap();
+        let mut made = Made::default();
+        for name in ["episodes/1.mcap", "episodes/2.mcap", "weights.bin"] {
+            write(name, "result");
+            made.add(&out, Path::new(name));
+        }
+        write("episodes/while-it-ran.mcap", "precious");
+        write("weights.bin", "of a person, while it ran");
+        made.remember(&out).unwrap();
         write("episodes/lab/own.mcap", "precious");
         write("episodes/2.mcap", "result with a note");
         let aside = claim(&out, &results).unwrap().unwrap();
         let read = |name: &str| std::fs::read_to_string(aside.join(name)).ok();
         assert_eq!(read("episodes/lab/own.mcap").as_deref(), Some("precious"));
+        assert_eq!(read("episodes/while-it-ran.mcap").as_deref(), Some("precious"));
         assert_eq!(read("episodes/2.mcap").as_deref(), Some("result with a note"));
-        assert_eq!((read("episodes/1.mcap"), read("weights.bin"), out.join("episodes").exists()), (None, None, false));
+        assert_eq!(read("weights.bin").as_deref(), Some("of a person, while it ran"));
+        assert_eq!((read("episodes/1.mcap"), out.join("episodes").exists()), (None, false));
         write("weights.bin", "of a run that was killed");
         let later = claim(&out, &results).unwrap().unwrap();
         assert!(later != aside && later.join("weights.bin").is_file());

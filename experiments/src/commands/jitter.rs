@@ -60,6 +60,7 @@ pub fn run(args: &Args) -> Result<(), Failure> {
     let earlier = args.against.as_deref().map(read_earlier).transpose()?;
     let mut cell = OwnCell::prepare("jitter", &args.config, (&args.out, &[]), 1)?;
     std::fs::copy(&args.weights, args.out.join("weights.bin")).map_err(file_error(&args.weights))?;
+    cell.made("weights.bin");
     let machine = ThisMachine::look(&cell);
     let result = match args.hours {
         Some(hours) => soak::measure(&mut cell, hours)?,
