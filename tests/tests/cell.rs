@@ -233,6 +233,9 @@ fn what_is_known_of_an_interrupted_order_is_said() {
     let less = cell.command("rt-controller", &["pour", "20", "--fill", "10"]);
     let said = String::from_utf8_lossy(&less.stderr);
     assert!(less.status.code() == Some(2) && said.contains("there is less in the vessel"), "{said}");
+    let none = cell.command("rt-controller", &["pour", "20", "--fill", "nan"]);
+    let said = String::from_utf8_lossy(&none.stderr);
+    assert!(none.status.code() == Some(2) && said.contains("this is no volume"), "{said}");
 
     let pour = cell.pour_tilted();
     interrupt(&pour);

@@ -32,6 +32,9 @@ pub struct Args {
 /// Runs the command.
 pub fn run(args: &Args) -> Result<(), Failure> {
     let config = Config::read(&args.common.config).or_exit(exit::BAD_INPUT)?;
+    if args.fill.is_some_and(|ml| !ml.is_finite()) {
+        return Err(failure(exit::BAD_INPUT, "--fill: this is no volume: give what is in the vessel at least, in ml"));
+    }
     if args.fill.is_some_and(|ml| ml < f64::from(args.goal_ml)) {
         let what = "--fill: there is less in the vessel than is to be poured: fill it, or give a smaller goal";
         return Err(failure(exit::BAD_INPUT, what));
