@@ -14,12 +14,23 @@ const LIP_MOVED: f32 = 0.003;
 /// An axis may be turned by this, degrees: a leg of such a stream is then longer by up to 4 %. Chosen by hand.
 const AXIS_TURNED_DEG: f32 = 2.0;
 
-/// The methods by which liquid is told, with their names in a configuration; a code is a method's place from 1, and 0 is none that is known.
-const METHODS: [(LiquidMethod, &str); 2] = [(LiquidMethod::Colour, "colour"), (LiquidMethod::Clear, "clear")];
+/// The methods by which liquid is told.
+const METHODS: [LiquidMethod; 2] = [LiquidMethod::Colour, LiquidMethod::Clear];
 
 /// A method's name in a configuration.
 fn name(method: LiquidMethod) -> &'static str {
-    METHODS[method as usize].1
+    match method {
+        LiquidMethod::Colour => "colour",
+        LiquidMethod::Clear => "clear",
+    }
+}
+
+/// A method's code in a framing; 0 is none that is known.
+fn code(method: LiquidMethod) -> u32 {
+    match method {
+        LiquidMethod::Colour => 1,
+        LiquidMethod::Clear => 2,
+    }
 }
 
 /// How the lip lies in the camera's pictures, and how liquid is told in them; all 0 where that is not known.
@@ -58,7 +69,7 @@ impl Framing {
         Self {
             // A checked configuration has at most 4,096.
             size_px: [camera.width_px, camera.height_px].map(|px| u16::try_from(px).unwrap_or(u16::MAX)),
-            method_code: image.method as u32 + 1,
+            method_code: code(image.method),
             lip_px: image.lip_px(),
             axes_deg: [image.x_axis_px, image.y_axis_px].map(direction_deg),
         }
@@ -80,7 +91,9 @@ impl Framing {
     pub fn of_text(text: &str) -> Option<Self> {
         let words: Vec<&str> = text.split_whitespace().collect();
         let (numbers, method_code) = match words[..] {
-            [ref numbers @ .., name] if numbers.len() == 6 => (numbers, METHODS.iter().position(|(_, known)| *known == name)? as u32 + 1),
+            [ref numbers @ .., name] if numbers.len() == 6 => {
+                (numbers, METHODS.into_iter().find(|method| self::name(*method) == name).map(code)?)
+            }
             ref numbers => (numbers, 0),
         };
         let [width, height, x, y, x_deg, y_deg] = *numbers else { return None };
@@ -99,7 +112,7 @@ impl Framing {
 
     /// How liquid is told; `None` if it is not known.
     pub fn method(&self) -> Option<LiquidMethod> {
-        METHODS.iter().map(|(method, _)| *method).find(|method| *method as u32 + 1 == self.method_code)
+        METHODS.into_iter().find(|method| code(*method) == self.method_code)
     }
 
     /// Whether it is known at all.
