@@ -20,7 +20,7 @@ use crate::source::devices::{self, Device, Trouble};
 #[derive(Debug, clap::Args)]
 #[command(
     after_help = "Examples:\n  feature-worker camera\n  feature-worker camera --json\n  feature-worker camera --config config/cell.toml   (is \
-that camera usable? exit code 2: permission, metadata node, or no camera; 3: missing, or another program has it)\n\nSettings are written into [camera]: exposure_ms, gain, \
+that camera usable? exit code 2: permission, metadata node, or no camera; 3: missing, its driver fails, or another program streams from it)\n\nSettings are written into [camera]: exposure_ms, gain, \
 white_balance_k, focus and mains_hz, each a value or \"locked\". `run` sets them and reads them back. --find lets the automatics of a camera that sees \
 the cell in its light find the first four once, and writes them down.\n\n\
 The programs of other users that have a camera are seen by root alone."
