@@ -47,7 +47,9 @@ pub(super) fn is_grey(sampled: &Mat) -> opencv::Result<bool> {
     }
     let (mut blue, mut red, mut level) = (Counts::new(), Counts::new(), Counts::new());
     for [b, g, r] in parts() {
-        (blue.add(b - g), red.add(r - g), level.add(g));
+        blue.add(b - g);
+        red.add(r - g);
+        level.add(g);
     }
     Ok(level.at(1.0 - TINT_SHARE) - level.at(TINT_SHARE) >= TINT_LEVELS && have([blue.at(0.5), red.at(0.5)]))
 }
