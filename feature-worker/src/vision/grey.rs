@@ -89,7 +89,7 @@ mod tests {
     fn one_tint_is_no_colour() {
         let grey = |samples: &[[i16; 3]]| {
             let bytes: Vec<Vec3b> = samples.iter().cycle().take(5000).map(|p| Vec3b::from(p.map(|part| part as u8))).collect();
-            is_grey(&Mat::from_slice(&bytes).unwrap()).unwrap()
+            is_grey(&Mat::from_slice(&bytes).unwrap().clone_pointee()).unwrap()
         };
         let levels: Vec<i16> = (40..200).collect();
         let tinted = |[b, r]: [i16; 2]| levels.iter().map(|&v| [v + b, v, v + r]).collect::<Vec<_>>();
