@@ -21,6 +21,8 @@ use crate::own_folder::{self, FolderError, Made};
 
 /// The cell's configuration, in its directory.
 const CONFIG: &str = "sim.toml";
+/// Where the controller keeps the number of the last episode.
+const LAST_NUMBER: &str = "episodes/.last-number";
 /// The programs whose words are in `logs`.
 const LOGGED: [&str; 4] = ["simulator", "feature-worker", "rt-controller", "trainer"];
 
@@ -327,6 +329,7 @@ impl Drop for OwnCell {
         for program in LOGGED {
             self.made(&format!("logs/{program}.log"));
         }
+        self.made(LAST_NUMBER);
         if let Err(e) = self.made.remember(&self.out) {
             eprintln!("experiments: {e}");
         }
