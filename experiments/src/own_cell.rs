@@ -21,8 +21,8 @@ use crate::own_folder::{self, FolderError, Made};
 
 /// The cell's configuration, in its directory.
 const CONFIG: &str = "sim.toml";
-/// Where the controller keeps the number of the last episode.
-const LAST_NUMBER: &str = "episodes/.last-number";
+/// What controller and page keep beside the episodes: the number of the last one, and how they ended.
+const BESIDE_EPISODES: [&str; 2] = ["episodes/.last-number", "episodes/operator-page-ends.json"];
 /// The programs whose words are in `logs`.
 const LOGGED: [&str; 4] = ["simulator", "feature-worker", "rt-controller", "trainer"];
 
@@ -329,7 +329,7 @@ impl Drop for OwnCell {
         for program in LOGGED {
             self.made(&format!("logs/{program}.log"));
         }
-        self.made(LAST_NUMBER);
+        BESIDE_EPISODES.iter().for_each(|name| self.made(name));
         if let Err(e) = self.made.remember(&self.out) {
             eprintln!("experiments: {e}");
         }
