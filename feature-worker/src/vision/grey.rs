@@ -7,8 +7,8 @@ use opencv::prelude::*;
 
 /// A picture in which this share of the samples has no colour at all is a grey one. Chosen by hand: a sensor's noise alone makes colour.
 const GREY_SHARE: f32 = 0.99;
-/// A sample has no colour when its parts differ by no more than this, and that of most when they differ by no more than this from how those of most do, grey
-/// levels. Chosen by hand: a level or two of rounding.
+/// A sample has no colour when its parts differ from each other by no more than this, grey levels, and it has the picture's tint when they do once that tint
+/// is taken off. Chosen by hand: a level or two of rounding.
 const GREY_LEVELS: i16 = 2;
 /// So many grey levels lie between the darkest and the brightest twentieth of a picture that has one tint everywhere because its camera gives no colour, and
 /// not because there is nothing but a card in the light of one lamp. Chosen by hand.
