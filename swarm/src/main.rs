@@ -2,6 +2,7 @@
 //!
 //! Ordinary threads; allocates. Bad input is one line and exit code 2; a violation is one line for each and exit code 1.
 
+use std::collections::BTreeMap;
 use std::io::Write;
 use std::path::PathBuf;
 use std::process::ExitCode;
@@ -13,9 +14,9 @@ use shared::exit;
 use shared::plural::counted;
 use simulator::ur::Series;
 use swarm::camera::{Depth, picture_name};
-use swarm::faults::{KINDS, named};
+use swarm::faults::KINDS;
 use swarm::many::{Seeds, Spread, Summary, at_most, run_until, shrink};
-use swarm::plan::{Choice, Plan};
+use swarm::plan::{Choice, Only, Plan};
 use swarm::plot::plot;
 use swarm::run::{self, Shown};
 use swarm::trained::train_for;
@@ -44,7 +45,8 @@ struct Args {
     /// The first of them.
     #[arg(long, default_value_t = 1, requires = "seeds")]
     from: u64,
-    /// Draws in each pour one fault of this kind, and no other, as in `--only link-cut`.
+    /// Draws in each pour one fault of this kind, and no other, as in `--only link-cut`; a fault of the pictures is there from start to end, as in
+    /// `--eye camera --only picture-banding`.
     #[arg(long, value_name = "FAULT")]
     only: Option<String>,
     /// Draws from the first so many vessels only, so that little is trained.
@@ -139,7 +141,7 @@ impl Shows {
 /// Carries out the command.
 fn start(args: &Args, config: &Config) -> Result<Shows, String> {
     let choice = Choice {
-        only: args.only.as_deref().map(named).transpose()?,
+        only: args.only.as_deref().map(|name| Only::named(name, args.eye)).transpose()?,
         vessels: usize::from(args.vessels),
         series: args.robot.map(Robot::series),
         depth: args.eye,
@@ -273,6 +275,12 @@ fn spread(of: &Spread) -> String {
     format!("{:.1}, {:.1}, {:.1}", of.p50, of.p99, of.largest)
 }
 
+/// How often pours ended for another reason than their goal.
+fn otherwise(reasons: &BTreeMap<String, usize>) -> String {
+    let others = reasons.iter().filter(|(reason, _)| *reason != "Done");
+    others.map(|(reason, n)| format!("{n} {reason}")).collect::<Vec<_>>().join(", ")
+}
+
 /// Prints what many seeds showed.
 fn report(summary: &Summary, wall_s: f64) {
     let last = (summary.from + summary.seeds).saturating_sub(1);
@@ -301,15 +309,18 @@ fn report(summary: &Summary, wall_s: f64) {
     print("| vessel | n undisturbed | done | left - goal, ml: median, p99, largest | ended otherwise |");
     for row in &summary.undisturbed {
         let done = row.error_ml.as_ref().map_or(0, |error| error.n);
-        let others: Vec<String> =
-            row.reasons.iter().filter(|(reason, _)| *reason != "Done").map(|(reason, n)| format!("{n} {reason}")).collect();
+        let others = otherwise(&row.reasons);
         let error = row.error_ml.as_ref().map_or_else(|| "-".into(), spread);
-        print(&format!("| {} | {} | {:.1} % | {error} | {} |", row.vessel, row.n, 100.0 * done as f64 / row.n as f64, others.join(", ")));
+        print(&format!("| {} | {} | {:.1} % | {error} | {others} |", row.vessel, row.n, 100.0 * done as f64 / row.n as f64));
     }
-    print("| fault | n done | left - goal, ml: median, p99, largest | left - said, ml: median, p99, largest | within 2 deviations |");
+    print(
+        "| fault | n done | left - goal, ml: median, p99, largest | left - said, ml: median, p99, largest | within 2 deviations | ended otherwise |",
+    );
     for row in &summary.done {
-        let (error, said) = (spread(&row.error_ml), spread(&row.said_ml));
-        print(&format!("| {} | {} | {error} | {said} | {:.0} % |", row.fault, row.error_ml.n, 100.0 * row.covered));
+        let n = row.error_ml.map_or(0, |error| error.n);
+        let [error, said] = [row.error_ml, row.said_ml].map(|of| of.map_or_else(|| "-".into(), |of| spread(&of)));
+        let covered = row.covered.map_or_else(|| "-".into(), |share| format!("{:.0} %", 100.0 * share));
+        print(&format!("| {} | {n} | {error} | {said} | {covered} | {} |", row.fault, otherwise(&row.reasons)));
     }
     print(
         "| fault | in a | n ended | ml after it could be noticed: median, p99, largest | bound, ml | largest share of its bound | \

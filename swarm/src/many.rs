@@ -64,17 +64,19 @@ pub struct CostRow {
     pub upright_s: Spread,
 }
 
-/// How near pours that were done came, over many seeds.
+/// How pours with at most one fault ended, and how near those that were done came, over many seeds.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct DoneRow {
     /// The one fault that happened, "none", or [`OTHER_LAG`].
     pub fault: String,
-    /// |left - goal|, ml.
-    pub error_ml: Spread,
-    /// |left - said|, ml.
-    pub said_ml: Spread,
-    /// The share of them whose truth lies within two of their own standard deviations of what they say; 0.95 is claimed.
-    pub covered: f64,
+    /// How often they ended for each reason.
+    pub reasons: BTreeMap<String, usize>,
+    /// |left - goal| of those that were done, ml; `None` if none was.
+    pub error_ml: Option<Spread>,
+    /// |left - said| of those, ml.
+    pub said_ml: Option<Spread>,
+    /// The share of those whose truth lies within two of their own standard deviations of what they say; 0.95 is claimed.
+    pub covered: Option<f64>,
 }
 
 /// How pours ended that nothing disturbed ([`crate::undisturbed`]), over many seeds.
@@ -115,7 +117,7 @@ pub struct Summary {
     pub reasons: BTreeMap<String, usize>,
     /// How pours ended that nothing disturbed, by vessel.
     pub undisturbed: Vec<UndisturbedRow>,
-    /// How near pours that were done came, where at most one fault happened.
+    /// How pours ended where at most one fault happened.
     pub done: Vec<DoneRow>,
     /// What faults cost that ended a pour, where no other fault came with them.
     pub costs: Vec<CostRow>,
@@ -249,22 +251,14 @@ fn sum_up(from: u64, shown: &[Shown]) -> Summary {
         }
     }
     let poured = || shown.iter().flat_map(|one| &one.poured);
-    let mut reasons = BTreeMap::new();
-    poured().for_each(|p| *reasons.entry(format!("{:?}", p.reason)).or_insert(0) += 1);
-    let mut done: BTreeMap<&str, (Vec<f64>, Vec<f64>, usize)> = BTreeMap::new();
+    let reasons = reasons(&poured().collect::<Vec<_>>());
+    let mut done: BTreeMap<&str, Vec<&Poured>> = BTreeMap::new();
     for (one, p) in shown.iter().flat_map(|one| one.poured.iter().map(move |p| (one, p))) {
-        let Some(goal_ml) = p.goal_ml.filter(|_| p.faults.len() <= 1 && p.reason == EndReason::Done) else { continue };
-        let none = if one.lag_s > 2.0 * LAG_S { OTHER_LAG } else { "none" };
-        let entry = done.entry(p.faults.first().copied().unwrap_or(none)).or_default();
-        entry.0.push((p.true_ml - f64::from(goal_ml)).abs());
-        let off_ml = (p.true_ml - f64::from(p.believed_ml)).abs();
-        entry.1.push(off_ml);
-        entry.2 += usize::from(off_ml <= 2.0 * f64::from(p.sd_ml));
+        if p.goal_ml.is_some() && p.faults.len() <= 1 {
+            let none = if one.lag_s > 2.0 * LAG_S { OTHER_LAG } else { "none" };
+            done.entry(p.faults.first().copied().unwrap_or(none)).or_default().push(p);
+        }
     }
-    let done_row = |(fault, (error, said, covered)): (&str, (Vec<f64>, Vec<f64>, usize))| {
-        let covered = covered as f64 / said.len() as f64;
-        Some(DoneRow { fault: fault.to_owned(), error_ml: Spread::of(error)?, said_ml: Spread::of(said)?, covered })
-    };
     let mut costs: BTreeMap<(&str, bool), Vec<&Cost>> = BTreeMap::new();
     for cost in shown.iter().filter(|one| one.costs.len() == 1).flat_map(|one| &one.costs) {
         costs.entry((cost.fault, cost.in_pour)).or_default().push(cost);
@@ -282,7 +276,7 @@ fn sum_up(from: u64, shown: &[Shown]) -> Summary {
         violations,
         reasons,
         undisturbed: undisturbed(shown),
-        done: done.into_iter().filter_map(done_row).collect(),
+        done: done.into_iter().map(done_row).collect(),
         costs: costs.into_iter().filter_map(|(key, costs)| cost_row(key, &costs)).collect(),
         sha256: digest(shown),
     }
@@ -295,13 +289,32 @@ fn undisturbed(shown: &[Shown]) -> Vec<UndisturbedRow> {
         by_vessel.entry(one.vessel).or_default().extend(one.poured.iter().filter(|p| is_undisturbed(one.lag_s, p)));
     }
     let row = |(vessel, poured): (&str, Vec<&Poured>)| {
-        let mut reasons = BTreeMap::new();
-        poured.iter().for_each(|p| *reasons.entry(format!("{:?}", p.reason)).or_insert(0) += 1);
-        let done = poured.iter().filter(|p| p.reason == EndReason::Done);
-        let error_ml = Spread::of(done.filter_map(|p| Some((p.true_ml - f64::from(p.goal_ml?)).abs())).collect());
-        UndisturbedRow { vessel: vessel.to_owned(), n: poured.len(), reasons, error_ml }
+        let error_ml = error_ml(poured.iter().filter(|p| p.reason == EndReason::Done));
+        UndisturbedRow { vessel: vessel.to_owned(), n: poured.len(), reasons: reasons(&poured), error_ml }
     };
     by_vessel.into_iter().filter(|(_, poured)| !poured.is_empty()).map(row).collect()
+}
+
+/// How pours with one fault ended, or with none.
+fn done_row((fault, poured): (&str, Vec<&Poured>)) -> DoneRow {
+    let done = || poured.iter().filter(|p| p.reason == EndReason::Done);
+    let off_ml = |p: &&Poured| (p.true_ml - f64::from(p.believed_ml)).abs();
+    let covered = done().filter(|p| off_ml(p) <= 2.0 * f64::from(p.sd_ml)).count();
+    let said_ml = Spread::of(done().map(off_ml).collect());
+    let covered = said_ml.map(|said| covered as f64 / said.n as f64);
+    DoneRow { fault: fault.to_owned(), reasons: reasons(&poured), error_ml: error_ml(done()), said_ml, covered }
+}
+
+/// How often pours ended for each reason.
+fn reasons(poured: &[&Poured]) -> BTreeMap<String, usize> {
+    let mut reasons = BTreeMap::new();
+    poured.iter().for_each(|p| *reasons.entry(format!("{:?}", p.reason)).or_insert(0) += 1);
+    reasons
+}
+
+/// |left - goal| of pours, ml.
+fn error_ml<'a>(poured: impl Iterator<Item = &'a &'a Poured>) -> Option<Spread> {
+    Spread::of(poured.filter_map(|p| Some((p.true_ml - f64::from(p.goal_ml?)).abs())).collect())
 }
 
 /// What a fault cost.

@@ -10,7 +10,7 @@ use simulator::camera::faults::{CameraFault, FaultKind};
 use simulator::ur::Series;
 use simulator::ur::servo::LAG_S;
 
-use crate::camera::Depth;
+use crate::camera::{Depth, picture_name};
 use crate::faults::{self, KINDS};
 use crate::vessels::{VESSELS, spill_angle_deg};
 use crate::what::{Weighed, What};
@@ -40,11 +40,37 @@ const LONGEST_RUN_MS: u64 = 18_600;
 /// Ordinary goals, ml.
 pub const USUAL_GOALS_ML: std::ops::Range<f32> = 15.0..200.0;
 
+/// The one kind of fault that is drawn.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Only {
+    /// Once in each pour, one of this kind, as an index into [`KINDS`].
+    Kind(usize),
+    /// Every picture of a drawn camera has this one, as strong as usual.
+    Picture(FaultKind),
+}
+
+impl Only {
+    /// The fault with this name, before an eye of this depth.
+    ///
+    /// # Errors
+    /// One line with the names that there are, or that pictures have to be drawn.
+    pub fn named(name: &str, depth: Depth) -> Result<Self, String> {
+        let picture = FaultKind::ALL.into_iter().find(|kind| picture_name(*kind) == name);
+        match (picture, depth) {
+            (Some(kind), Depth::Camera) => Ok(Self::Picture(kind)),
+            (Some(_), Depth::Area) => Err(format!("--only {name} is a fault of pictures, and none are drawn: add --eye camera")),
+            (None, _) => faults::named(name)
+                .map(Self::Kind)
+                .map_err(|line| format!("{line}; and with --eye camera {}", FaultKind::ALL.map(picture_name).join(", "))),
+        }
+    }
+}
+
 /// From what seeds draw.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Choice {
-    /// The kind of the one fault in each pour, as an index into [`KINDS`]; otherwise none to four of all kinds.
-    pub only: Option<usize>,
+    /// The one fault, and no other; otherwise none to four of all kinds in each pour, and half of the drawn cameras have a fault of their pictures.
+    pub only: Option<Only>,
     /// How many of the [`VESSELS`], from the first on. With few of them little is trained.
     pub vessels: usize,
     /// The robot's generation, if not that which a seed draws.
@@ -120,7 +146,7 @@ impl Plan {
             delay_ns,
             lag_s: lag_s(seed),
             depth: choice.depth,
-            picture: if choice.depth == Depth::Camera { picture(seed) } else { None },
+            picture: if choice.depth == Depth::Camera { picture(seed, choice.only) } else { None },
             items: Vec::new(),
             faults: Vec::new(),
             until_ms: 0,
@@ -135,7 +161,8 @@ impl Plan {
             plan.push(at_ms, what, None);
             let faults = if random.random_bool(0.1) { 0 } else { random.random_range(1..=4) };
             match choice.only {
-                Some(kind) => plan.add_fault(&mut random, at_ms, kind),
+                Some(Only::Kind(kind)) => plan.add_fault(&mut random, at_ms, kind),
+                Some(Only::Picture(_)) => (),
                 None => plan.draw_faults(&mut random, at_ms, faults),
             }
             at_ms += random.random_range(14_000..22_000);
@@ -234,11 +261,16 @@ fn lag_s(seed: u64) -> f64 {
 
 /// What is wrong with a camera's pictures: one of the faults that people report, as strong as usual, or nothing. The weights were learned with
 /// pictures that have none.
-fn picture(seed: u64) -> Option<CameraFault> {
+fn picture(seed: u64, only: Option<Only>) -> Option<CameraFault> {
     let mut random = Pcg64Mcg::seed_from_u64(seed ^ 0xCA3E7A);
-    let kind = FaultKind::ALL[random.random_range(0..FaultKind::ALL.len())];
-    let fault = CameraFault { kind, strength: kind.usual_strength(), seed: random.random() };
-    random.random_bool(FAULTY_PICTURES).then_some(fault)
+    let drawn = FaultKind::ALL[random.random_range(0..FaultKind::ALL.len())];
+    let fault = |kind: FaultKind, seed| CameraFault { kind, strength: kind.usual_strength(), seed };
+    let (seed, is_faulty) = (random.random(), random.random_bool(FAULTY_PICTURES));
+    match only {
+        Some(Only::Picture(kind)) => Some(fault(kind, seed)),
+        Some(Only::Kind(_)) => None,
+        None => is_faulty.then_some(fault(drawn, seed)),
+    }
 }
 
 /// A goal, ml: mostly an ordinary one, sometimes at or beyond its bounds.

@@ -4,8 +4,8 @@
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::too_many_lines)]
 
 use shared::config::Config;
-use swarm::faults::named;
-use swarm::plan::{Choice, Plan};
+use swarm::camera::Depth;
+use swarm::plan::{Choice, Only, Plan};
 use swarm::run::run_checked;
 use swarm::site::config;
 use swarm::trained::train_for;
@@ -33,7 +33,7 @@ fn limits_that_are_too_weak_are_found() {
     for (what, fault, invariants, weaken) in WEAK {
         let mut weak = good.clone();
         weaken(&mut weak);
-        let only = fault.map(|name| named(name).unwrap());
+        let only = fault.map(|name| Only::named(name, Depth::Area).unwrap());
         // Two vessels do, so that little is trained.
         let plans: Vec<Plan> = (1..=SEEDS).map(|seed| Plan::draw_with(seed, Choice { only, vessels: 2, ..Choice::default() })).collect();
         let trained = train_for(&plans, &good, &|_| {}).unwrap();

@@ -11,12 +11,16 @@ fn swarm(args: &[&str]) -> Output {
 /// Protects an operator who mistypes: one line that names the mistake, on the error stream, and exit code 2.
 #[test]
 fn bad_input_is_one_line() {
-    let cases: [(&[&str], &str); 9] = [
+    let cases: [(&[&str], &str); 10] = [
         (&["--seed", "seven"], "seven"),
         (&["--seed", "-1"], "-1"),
         (&["--seeds", "0"], "--seeds"),
         (&[], "--seed"),
         (&["--seed", "1", "--only", "earthquake"], "no fault is called earthquake; there are protective-stop, "),
+        (
+            &["--seed", "1", "--only", "picture-banding"],
+            "--only picture-banding is a fault of pictures, and none are drawn: add --eye camera",
+        ),
         (&["--seed", "1", "--keep", "99"], "--keep 99: seed 1 has "),
         (&["--seeds", "10", "--from", "18446744073709551615"], "--from 18446744073709551615 leaves fewer than 10 seeds"),
         (&["--seeds", "1", "--json", "/nowhere/at/all.json"], "/nowhere/at/all.json: cannot be written"),
