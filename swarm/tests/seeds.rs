@@ -10,10 +10,10 @@ use swarm::run::{Shown, run};
 use swarm::site::config;
 use swarm::trained::train_for;
 
-/// The first of the fixed seeds, and how many they are. They are not those of the figures in docs/SWARM.md.
-const FIXED: (u64, u64) = (500_000, 3_000);
-/// How many fresh seeds are run.
-const FRESH: u64 = 300;
+/// The first of the fixed seeds, and how many they are: some 3,050 pours and recordings. They are not those of the figures in docs/SWARM.md.
+const FIXED: (u64, u64) = (500_000, 2_600);
+/// How many fresh seeds are run: some 300 pours and recordings.
+const FRESH: u64 = 260;
 
 fn seeds(from: u64, count: u64) -> Seeds {
     Seeds { from, count, choice: Choice::default() }
@@ -34,7 +34,7 @@ fn fixed_seeds_keep_every_invariant() {
     assert!(summary.reasons.len() >= 14, "{:?}", summary.reasons);
     // Of pours that nothing disturbed, 95 % are to lie within two of their own deviations; the rest of 0.02 is what some 280 of them scatter.
     let undisturbed = summary.done.iter().find(|row| row.fault == "none").unwrap();
-    assert!(undisturbed.covered >= 0.93, "{undisturbed:?}");
+    assert!(undisturbed.covered.is_some_and(|share| share >= 0.93), "{undisturbed:?}");
     // A controller that ends every pour in doubt violates nothing else.
     let calm = summary.undisturbed.iter().find(|row| row.vessel == "calm cylinder").unwrap();
     assert!(calm.n >= 10 && calm.error_ml.as_ref().is_some_and(|error| error.n == calm.n), "{calm:?}");
