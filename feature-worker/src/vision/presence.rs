@@ -39,8 +39,7 @@ const HELD_PICTURES: u32 = 90;
 const LIGHT_CHANGE: f32 = 1.25;
 /// Where a colour's share of the light is not what it was, by this factor, colours are no evidence either. Chosen by hand.
 const COLOUR_CHANGE: f32 = 1.1;
-/// After this many pictures in other light that stays as it is, that is the light. Chosen by hand: the end of a pour must not be late. While the light goes
-/// on changing, a stream may take the ground's colours on.
+/// After this many pictures in other light, that is the light. Chosen by hand: the end of a pour must not be late.
 const LIGHT_PICTURES: u32 = 6;
 
 /// Remembers the stream until its end was seen.
@@ -62,9 +61,8 @@ pub(crate) struct Presence {
     foreign: u32,
     /// Mean levels of blue, green and red in the last picture with a stream.
     bgr: [f32; 3],
-    /// Pictures in a row in other light, and the mean levels of the first of them.
+    /// Pictures in a row in other light.
     other_light: u32,
-    other_bgr: [f32; 3],
 }
 
 impl Presence {
@@ -83,7 +81,6 @@ impl Presence {
             foreign: 0,
             bgr: [0.0; 3],
             other_light: 0,
-            other_bgr: [0.0; 3],
         }
     }
 
@@ -149,13 +146,7 @@ impl Presence {
         let foreign = self.foreign > 0;
         self.foreign = self.foreign.saturating_sub(1);
         let Some(legs_px) = self.legs_px else { return !foreign };
-        if !is_other_light(self.bgr, bgr) {
-            self.other_light = 0;
-        } else if self.other_light == 0 || is_other_light(self.other_bgr, bgr) {
-            (self.other_light, self.other_bgr) = (1, bgr);
-        } else {
-            self.other_light += 1;
-        }
+        self.other_light = if is_other_light(self.bgr, bgr) { self.other_light + 1 } else { 0 };
         let told = self.other_light == 0 || self.other_light > self.pace.pictures(LIGHT_PICTURES);
         self.dry_pictures = if told && dry_share(legs_px) >= DRY_SHARE { self.dry_pictures + 1 } else { 0 };
         if self.dry_pictures >= self.needed {
@@ -176,24 +167,6 @@ fn is_other_light(before: [f32; 3], now: [f32; 3]) -> bool {
 #[cfg(test)]
 mod tests {
     use super::*;
-
-    /// Protects pours before a camera whose exposure hunts: in light that goes on changing what looks like the ground is no evidence that the stream is gone,
-    /// for as long as that lasts; in other light that stays it is, soon.
-    #[test]
-    fn light_that_goes_on_changing_is_no_evidence() {
-        let growth_after = |pictures: u32, growth: f32| {
-            let mut presence = Presence::new(640, 1.0);
-            presence.saw(2_000.0, [80.0, 50.0], [90.0; 3]);
-            presence.holds(true);
-            (1..=pictures).find(|picture| {
-                presence.holds(false);
-                presence.is_gone([90.0 * 1.3 * growth.powi(*picture as i32); 3], |_| 1.0)
-            })
-        };
-        // A factor of eight in a second.
-        assert_eq!(growth_after(60, 8f32.powf(1.0 / 30.0)), None);
-        assert!(growth_after(60, 1.0).is_some_and(|pictures| pictures > LIGHT_PICTURES && pictures < LIGHT_PICTURES + PICTURES_MOST));
-    }
 
     /// Protects pours of a stream that has left the region: a false line inside it, in a picture or two, is not all that is left of it, so its end is none of
     /// the stream's. A stream that really came back smaller is known after some pictures.
