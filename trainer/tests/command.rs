@@ -347,7 +347,9 @@ fn weights_that_are_all_wrong_are_doubted() {
         [(1.0, None), (8.0, Some("but it holds 520 ml")), (10.0, Some("decimal point")), (0.001, Some("are they in grams?"))]
     {
         tables(dir.path(), 4, |_, w| factor * w);
-        for command in ["check", "train", "refine", "plan"] {
+        // A training takes seconds, and writes whatever the factor is.
+        let trains = matches!(says, None | Some("decimal point"));
+        for command in ["check", "train", "refine", "plan"].into_iter().filter(|command| trains || *command != "train") {
             let mut args = vec![command, "f.csv", "--scale", "s.csv", "--config", "cell.toml"];
             args.extend(if matches!(command, "train" | "refine") { &["--out", "w.bin"][..] } else { &[] });
             let out = trainer(dir.path(), &args);

@@ -39,6 +39,11 @@ fn run(episodes: &[TrainingEpisode], command: &str) -> (Option<i32>, String, boo
     (run.status.code(), said, dir.path().join("w.bin").exists())
 }
 
+/// The commands that say what is wrong. All of them for the first seed: a training takes seconds, and says what `check` does.
+fn commands(seed: u64) -> impl Iterator<Item = &'static str> {
+    ["check", "plan", "train", "refine"].into_iter().take(if seed == 1 { 4 } else { 2 })
+}
+
 /// Protects the pours from the weight of the cup: as many grams in every weight do not contradict each other, and made pours of 100 ml small by 10 to 70 ml.
 /// They are said by every command, and nothing is refined from them.
 #[test]
@@ -47,7 +52,7 @@ fn a_cup_that_was_never_tared_is_named() {
     for (cup_g, seed) in [(0.0, 1), (0.0, 2), (0.0, 3), (30.0, 1), (30.0, 2), (150.0, 3), (-15.0, 1)] {
         let mut all = common::episodes(10, seed);
         all.iter_mut().for_each(|e| e.weight_g += cup_g);
-        for command in ["check", "train", "refine", "plan"] {
+        for command in commands(seed) {
             let (code, said, is_written) = run(&all, command);
             let side = if cup_g > 0.0 { "more" } else { "less" };
             let named = said.lines().filter(|l| l.contains(words) && l.contains(&format!(" g {side} than what flowed: was the cup tared")));
@@ -113,16 +118,14 @@ fn a_measured_tilt_that_was_copied_is_named() {
 /// said. Where nothing was moved, nothing is.
 #[test]
 fn a_gain_that_only_the_newest_episodes_have_is_suspected() {
-    for (newest, gain) in [(0, 1.0), (1, 0.8), (2, 0.85), (2, 1.2)] {
-        for n in [5, 8] {
-            let mut all = common::episodes(n, 4);
-            all.iter_mut().skip(n - newest).flat_map(|e| &mut e.area_px2).for_each(|area_px2| *area_px2 *= gain);
-            let (_, said, _) = run(&all, "train");
-            let line = said.lines().find(|l| l.contains("the camera's gain may have changed by "));
-            let side = if gain > 1.0 { "by +" } else { "by -" };
-            let named = line.is_some_and(|l| l.contains(side) && l.contains(&format!(" % with {}, but", n - newest + 1)));
-            assert_eq!((line.is_some(), named), (newest > 0, newest > 0), "{n}, the newest {newest} times {gain}: {said}");
-        }
+    for (n, newest, gain) in [(5, 0, 1.0), (8, 0, 1.0), (5, 1, 0.8), (8, 2, 0.85), (5, 2, 1.2)] {
+        let mut all = common::episodes(n, 4);
+        all.iter_mut().skip(n - newest).flat_map(|e| &mut e.area_px2).for_each(|area_px2| *area_px2 *= gain);
+        let (_, said, _) = run(&all, "train");
+        let line = said.lines().find(|l| l.contains("the camera's gain may have changed by "));
+        let side = if gain > 1.0 { "by +" } else { "by -" };
+        let named = line.is_some_and(|l| l.contains(side) && l.contains(&format!(" % with {}, but", n - newest + 1)));
+        assert_eq!((line.is_some(), named), (newest > 0, newest > 0), "{n}, the newest {newest} times {gain}: {said}");
     }
 }
 
@@ -161,7 +164,7 @@ fn weights_that_were_entered_for_each_other_are_named() {
             (all[one].weight_g, all[other].weight_g) = (all[other].weight_g, all[one].weight_g);
             (all[one].name.clone(), all[other].name.clone())
         });
-        for command in ["check", "train", "refine", "plan"] {
+        for command in commands(seed) {
             let (_, said, is_written) = run(&all, command);
             let is_named = names.as_ref().is_some_and(|(one, other)| {
                 said.lines().any(|l| l.contains(&format!("{one}: weight ")) && l.contains(&format!(" g, and that of {other} is ")))
