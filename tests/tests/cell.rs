@@ -43,8 +43,7 @@ fn a_pour_is_followed_to_its_end_and_recorded() {
 #[test]
 fn a_recording_becomes_an_episode() {
     let cell = CellUnderTest::start(|_| {});
-    cell.json("simulator", &["operator", "fill", "300", "--json"]);
-    let result = cell.json("rt-controller", &["record", "--lambda", "60", "--gamma", "0.8", "--weight", "33", "--json"]);
+    let result = cell.order(&["record", "--lambda", "60", "--gamma", "0.8", "--weight", "33", "--json"]);
     let file = result["episode_file"].as_str().expect("recorded");
     let episode = shared::episode::Episode::read(std::path::Path::new(file)).expect("readable");
     assert!(matches!(episode.kind, shared::episode::EpisodeKind::Recording(c) if c.lambda_deg == 60.0 && c.gamma_per_s2 == 0.8));
@@ -64,8 +63,7 @@ fn weights_are_swapped_while_running() {
     std::fs::write(cell.weights(), b"decant-w but not really").expect("writable");
     let status = cell.wait("the refusal", Duration::from_secs(5), |s| s["weights_refused"] != "");
     assert_eq!(status["weights"], first);
-    cell.json("simulator", &["operator", "fill", "300", "--json"]);
-    let pour = cell.json("rt-controller", &["pour", "20", "--json"]);
+    let pour = cell.order(&["pour", "20", "--json"]);
     let file = pour["episode_file"].as_str().expect("the pour was recorded");
     let episode = shared::episode::Episode::read(std::path::Path::new(file)).expect("readable");
     assert_eq!(episode.info.weights.as_str(), first);

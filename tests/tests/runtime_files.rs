@@ -82,12 +82,9 @@ fn a_start_clears_nothing_of_the_living() {
     assert!(base.path().join("own/stop").exists());
     cell.take_weights(&steady_weights(TILT_OUT));
     let other = CellUnderTest::start(|_| {});
-    cell.json("simulator", &["operator", "fill", "300", "--json"]);
-    assert_eq!(cell.command("rt-controller", &["pour", "20"]).status.code(), Some(0));
+    cell.order(&["pour", "20", "--json"]);
     drop(other);
-    cell.json("simulator", &["operator", "fill", "300", "--json"]);
-    let output = cell.command("rt-controller", &["pour", "20"]);
-    assert_eq!(output.status.code(), Some(0), "{}", said(&output));
+    cell.order(&["pour", "20", "--json"]);
 }
 
 /// Protects files of other programs in a directory that was named by mistake: what has the names of iceoryx2's files is not removed where no cell has
@@ -339,8 +336,7 @@ fn leftovers_of_others_and_limits_do_not_matter() {
     cell.spawn_with("rt-controller", command, log.into());
     cell.wait_idle();
     cell.take_weights(&steady_weights(TILT_OUT));
-    cell.json("simulator", &["operator", "fill", "300", "--json"]);
-    assert_eq!(cell.json("rt-controller", &["pour", "20", "--json"])["outcome"]["reason"], "done");
+    assert_eq!(cell.order(&["pour", "20", "--json"])["outcome"]["reason"], "done");
     assert!(left.iter().all(|f| f.exists()), "what belongs to others is not removed");
     for file in &left {
         std::fs::remove_file(file).expect("root may");
