@@ -17,16 +17,14 @@ fn a_pour_is_followed_to_its_end_and_recorded() {
     assert!(String::from_utf8_lossy(&refused.stderr).contains("no valid weight file"));
 
     cell.take_weights(&steady_weights(TILT_OUT));
-    cell.json("simulator", &["operator", "fill", "300", "--json"]);
     let before = cell.wait_idle();
-    let pour = cell.begin("rt-controller", &["pour", "20", "--json"]);
-    cell.wait("the pour", Duration::from_secs(5), |s| s["phase"] == "pouring");
+    let pour = cell.pour_tilted();
     let second = cell.command("rt-controller", &["pour", "30"]);
     assert_eq!(second.status.code(), Some(5));
     assert!(String::from_utf8_lossy(&second.stderr).contains("under way"));
-    let output = pour.wait_with_output().expect("it ran");
-    assert_eq!(output.status.code(), Some(0), "{}", String::from_utf8_lossy(&output.stderr));
-    let result: serde_json::Value = serde_json::from_slice(&output.stdout).expect("JSON");
+    assert_eq!(cell.command("rt-controller", &["abort"]).status.code(), Some(0));
+    assert_eq!(pour.wait_with_output().expect("it ran").status.code(), Some(4));
+    let result = cell.order(&["pour", "20", "--json"]);
     assert_eq!(result["outcome"]["reason"], "done");
     let file = result["episode_file"].as_str().expect("the pour was recorded");
     let episode = shared::episode::Episode::read(std::path::Path::new(file)).expect("readable");
