@@ -178,13 +178,13 @@ pub fn by_ground(frames: &FaultFrames) -> BTreeMap<String, Vec<Comparison>> {
 /// Prints a line for each fault, in the order of the names.
 pub fn print(frames: &FaultFrames) {
     println!(
-        "{:<34}{:>6}{:>9}{:>8}{:>9}{:>8}{:>9}{:>9}{:>9}{:>10}{:>9}  doubts on frames with a stream / without",
-        "fault", "wet", "median %", "p95 %", "silent %", "wrong %", "doubt %", "false %", "dry d. %", "calm d. %", "dry s"
+        "{:<34}{:>6}{:>9}{:>8}{:>9}{:>8}{:>9}{:>9}{:>9}{:>10}{:>10}{:>9}  doubts on frames with a stream / without",
+        "fault", "wet", "median %", "p95 %", "silent %", "wrong %", "doubt %", "false %", "dry d. %", "undist. %", "settled %", "dry s"
     );
     for (row, all) in frames {
         let f = super::figures::figures(all);
         println!(
-            "{row:<34}{:>6}{:>9.2}{:>8.1}{:>9.2}{:>8.2}{:>9.2}{:>9.2}{:>9.2}{:>10.2}{:>9.2}  {}",
+            "{row:<34}{:>6}{:>9.2}{:>8.1}{:>9.2}{:>8.2}{:>9.2}{:>9.2}{:>9.2}{:>10.2}{:>10.2}{:>9.2}  {}",
             f.wet,
             f.median_error_percent,
             f.p95_error_percent,
@@ -193,7 +193,8 @@ pub fn print(frames: &FaultFrames) {
             f.wet_unusable_percent,
             f.false_flow_percent,
             f.dry_doubt_percent,
-            f.calm_doubt_percent,
+            f.undisturbed_doubt_percent,
+            f.settled_doubt_percent,
             f.dry_after_p95_s,
             f.doubts
         );

@@ -12,6 +12,9 @@ pub const WRONG_PERCENT: f64 = 20.0;
 
 /// Frames without a stream after which it has ended for good: half a second.
 pub const DRY_FRAMES: usize = 15;
+/// Frames in which an eye that has just started may not know the ground yet, so that no pour begins: a sixth of a second. Clear water takes three
+/// before an even wall and four before a pattern.
+pub const START_FRAMES: usize = 5;
 /// Frames a second of what is measured here.
 const RATE_HZ: f64 = 30.0;
 
@@ -47,7 +50,9 @@ pub struct CameraFigures {
     /// Share of the frames without a stream that have a doubt, per cent.
     pub dry_doubt_percent: f64,
     /// Share of the frames without a stream now and in the [`DRY_FRAMES`] before that have a doubt, per cent.
-    pub calm_doubt_percent: f64,
+    pub undisturbed_doubt_percent: f64,
+    /// The same, without the first [`START_FRAMES`] of each eye, per cent.
+    pub settled_doubt_percent: f64,
     /// Number of streams that ended for good: at least [`DRY_FRAMES`] without one follow.
     pub ends: usize,
     /// 95th percentile of the time from their last frame to the first one that the controller uses and in which nothing flows, s.
@@ -114,7 +119,9 @@ pub fn figures(frames: &[Comparison]) -> CameraFigures {
     errors.iter_mut().for_each(|e| *e = e.abs());
     errors.sort_by(f64::total_cmp);
     let dry: Vec<&Comparison> = frames.iter().filter(|s| s.truth_px2 == 0.0).collect();
-    let calm = calm_frames(frames);
+    let undisturbed = undisturbed_frames(frames);
+    let settled: Vec<&Comparison> = undisturbed.iter().copied().filter(|s| s.number >= START_FRAMES).collect();
+    let doubted = |some: &[&Comparison]| some.iter().filter(|s| s.doubt != Doubt::None).count();
     let mut ends_s = times_to_dry_s(frames);
     ends_s.sort_by(f64::total_cmp);
     let percent = |part: usize, whole: usize| 100.0 * part as f64 / whole.max(1) as f64;
@@ -132,8 +139,9 @@ pub fn figures(frames: &[Comparison]) -> CameraFigures {
         doubt_percent: percent(frames.iter().filter(|s| s.doubt != Doubt::None).count(), frames.len()),
         wet_unusable_percent: percent(wet.iter().filter(|s| !s.usable).count(), wet.len()),
         wrong_percent: percent(wrong, wet.len()),
-        dry_doubt_percent: percent(dry.iter().filter(|s| s.doubt != Doubt::None).count(), dry.len()),
-        calm_doubt_percent: percent(calm.iter().filter(|s| s.doubt != Doubt::None).count(), calm.len()),
+        dry_doubt_percent: percent(doubted(&dry), dry.len()),
+        undisturbed_doubt_percent: percent(doubted(&undisturbed), undisturbed.len()),
+        settled_doubt_percent: percent(doubted(&settled), settled.len()),
         ends: ends_s.len(),
         dry_after_p95_s: quantile_of(&ends_s, 0.95),
         doubts: doubts_in_words(frames),
@@ -141,8 +149,8 @@ pub fn figures(frames: &[Comparison]) -> CameraFigures {
 }
 
 /// The frames without a stream before which there was none for [`DRY_FRAMES`] either, or that many are not there yet: nothing disturbs them.
-fn calm_frames(frames: &[Comparison]) -> Vec<&Comparison> {
-    let (mut since, mut calm) = (usize::MAX, Vec::new());
+fn undisturbed_frames(frames: &[Comparison]) -> Vec<&Comparison> {
+    let (mut since, mut undisturbed) = (usize::MAX, Vec::new());
     for frame in frames {
         since = match (frame.number, frame.truth_px2 > 0.0) {
             (_, true) => 0,
@@ -150,10 +158,10 @@ fn calm_frames(frames: &[Comparison]) -> Vec<&Comparison> {
             _ => since.saturating_add(1),
         };
         if since > DRY_FRAMES {
-            calm.push(frame);
+            undisturbed.push(frame);
         }
     }
-    calm
+    undisturbed
 }
 
 /// The quantile of sorted figures; NaN without any.

@@ -190,7 +190,7 @@ fn print_reliability(groups: &BTreeMap<String, Vec<Comparison>>) {
 /// Prints the table of the conditions.
 fn print(figures: &BTreeMap<&str, CameraFigures>) {
     println!(
-        "{:<32}{:>7}{:>9}{:>8}{:>8}{:>8}{:>9}{:>12}{:>8}{:>8}{:>8}{:>9}{:>8}",
+        "{:<32}{:>7}{:>9}{:>8}{:>8}{:>8}{:>9}{:>12}{:>8}{:>8}{:>9}{:>10}{:>10}{:>8}",
         "condition",
         "frames",
         "median %",
@@ -202,12 +202,13 @@ fn print(figures: &BTreeMap<&str, CameraFigures>) {
         "doubt %",
         "wrong %",
         "dry d. %",
-        "calm d. %",
+        "undist. %",
+        "settled %",
         "dry s"
     );
     for (name, f) in figures {
         println!(
-            "{name:<32}{:>7}{:>9.2}{:>8.2}{:>8.2}{:>8.2}{:>9.2}{:>12.2}{:>8.2}{:>8.2}{:>8.2}{:>9.2}{:>8.2}  {}",
+            "{name:<32}{:>7}{:>9.2}{:>8.2}{:>8.2}{:>8.2}{:>9.2}{:>12.2}{:>8.2}{:>8.2}{:>9.2}{:>10.2}{:>10.2}{:>8.2}  {}",
             f.frames,
             f.median_error_percent,
             f.p95_error_percent,
@@ -218,7 +219,8 @@ fn print(figures: &BTreeMap<&str, CameraFigures>) {
             f.doubt_percent,
             f.wrong_percent,
             f.dry_doubt_percent,
-            f.calm_doubt_percent,
+            f.undisturbed_doubt_percent,
+            f.settled_doubt_percent,
             f.dry_after_p95_s,
             f.doubts
         );
