@@ -210,6 +210,8 @@ impl OwnCell {
                 std::thread::sleep(Duration::from_millis(20));
             }
         }
+        // What its page let people in with: no other cell ever has this name.
+        let _ = std::fs::remove_file(self.out.join(format!("operator-page-{}.token", self.config.cell.name)));
     }
 
     /// The process id of one of its processes, if it runs.

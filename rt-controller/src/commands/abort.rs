@@ -217,8 +217,8 @@ fn ask(target: &Target) -> Result<Asked, Failure> {
 }
 
 /// Waits until the container is upright. Gives the line that says so.
-fn wait(target: &Target, asked: Asked) -> Result<String, Failure> {
-    let begun = Instant::now();
+fn wait(target: &Target, mut asked: Asked) -> Result<String, Failure> {
+    let mut begun = Instant::now();
     let until = begun + UPRIGHT;
     let mut unanswered = 0;
     let mut killed = false;
@@ -229,6 +229,10 @@ fn wait(target: &Target, asked: Asked) -> Result<String, Failure> {
                 Some(state) if state.upright => return Ok("upright".into()),
                 Some(state) if state.phase == Phase::NoRobot => return Err(failure(exit::FAILED, state.hindrance)),
                 Some(_) => unanswered = 0,
+                // One that a signal has stopped since is ended, as one that was stopped before.
+                None if target.process().is_some_and(|process| claim::is_stopped(process.pid)) => {
+                    (asked, begun) = (ask(target)?, Instant::now());
+                }
                 // One that is busy, or whose other clients take its time, is not gone. Its process may be out of sight, though.
                 None if unanswered < UNANSWERED || claim::started(*pid).is_some() => unanswered += 1,
                 None => {
