@@ -386,8 +386,10 @@ impl Liquid for ClearWater {
     }
 
     fn rules(&self) -> LineRules {
-        // How small a stream may be is decided when its line is confirmed, and water's own edge tells nothing of focus.
-        LineRules { profiles_least: PROFILES_LEAST, first_area_least_px2: 0.0, edge_tells_focus: false, unsure_lasts: false }
+        // How small a stream may be is decided when its line is confirmed, and water's own edge tells nothing of focus. Before a pattern single pictures
+        // of water that was not told for long look dry.
+        let unsure_lasts = self.even_pictures > 0.0 && self.is_pattern();
+        LineRules { profiles_least: PROFILES_LEAST, first_area_least_px2: 0.0, edge_tells_focus: false, unsure_lasts }
     }
 
     /// The middle four of each block's pixels are averaged, so half of the memory of a large picture is never read.
