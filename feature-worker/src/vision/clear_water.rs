@@ -51,7 +51,7 @@ use self::vouched::Vouched;
 use self::water::{Candidate, Verdict, Water};
 use super::confidence::Basis;
 use super::geometry::{Axes, LinearField};
-use super::liquid::{FineLine, LineRules, Liquid, PROFILE_SAMPLES, Profile, ProfileEdge, Sighting};
+use super::liquid::{FineLine, LineRules, Liquid, PROFILE_SAMPLES, Profile, ProfileEdge, Sighting, Unsure};
 use super::pace::Pace;
 use super::reflection::Reflection;
 
@@ -388,8 +388,8 @@ impl Liquid for ClearWater {
     fn rules(&self) -> LineRules {
         // How small a stream may be is decided when its line is confirmed, and water's own edge tells nothing of focus. Before a pattern single pictures
         // of water that was not told for long look dry.
-        let unsure_lasts = self.even_pictures > 0.0 && self.is_pattern();
-        LineRules { profiles_least: PROFILES_LEAST, first_area_least_px2: 0.0, edge_tells_focus: false, unsure_lasts }
+        let unsure = if self.is_pattern() { Unsure::LastsOnceDry } else { Unsure::Passes };
+        LineRules { profiles_least: PROFILES_LEAST, first_area_least_px2: 0.0, edge_tells_focus: false, unsure }
     }
 
     /// The middle four of each block's pixels are averaged, so half of the memory of a large picture is never read.

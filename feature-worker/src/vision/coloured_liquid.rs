@@ -25,7 +25,7 @@ use super::grey::{is_grey, is_unseen_in_grey};
 use super::ground_beside::{InGlass, Place, Square};
 use super::ground_colours::{Ground, GroundColours};
 use super::hues::ranges;
-use super::liquid::{FineLine, LineRules, Liquid, Profile, ProfileEdge, Sighting};
+use super::liquid::{FineLine, LineRules, Liquid, Profile, ProfileEdge, Sighting, Unsure};
 use super::pace::Pace;
 use super::ray_maps::ray_maps;
 use super::reflection::Reflection;
@@ -385,7 +385,7 @@ impl Liquid for ColouredLiquid {
     }
 
     fn rules(&self) -> LineRules {
-        LineRules { profiles_least: PROFILES_LEAST, first_area_least_px2: self.area_min_px2, edge_tells_focus: true, unsure_lasts: true }
+        LineRules { profiles_least: PROFILES_LEAST, first_area_least_px2: self.area_min_px2, edge_tells_focus: true, unsure: Unsure::Lasts }
     }
 
     fn take(&mut self, region: &BoxedRef<Mat>) -> opencv::Result<()> {

@@ -24,7 +24,7 @@ use super::clear_water::ClearWater;
 use super::coloured_liquid::ColouredLiquid;
 use super::confidence;
 use super::geometry::{Axes, RayGrid};
-use super::liquid::{Liquid, Sighting};
+use super::liquid::{Liquid, Sighting, Unsure};
 use super::measurement::{Measurement, Stages};
 use super::pace::{Between, PictureTime, Succession};
 use super::picture::{Image, RegionPixels, RegionReader};
@@ -245,7 +245,12 @@ impl Extractor {
         };
         let not_told = matches!(measured.doubt, Doubt::EdgeNotFound | Doubt::ColoursChanged | Doubt::BlownOut | Doubt::LightFlickers);
         if not_told && measured.area_px2 == 0.0 {
-            self.presence.saw_unsure(measured.doubt == Doubt::ColoursChanged || self.liquid.rules().unsure_lasts);
+            let lasts = match self.liquid.rules().unsure {
+                Unsure::Lasts => true,
+                Unsure::LastsOnceDry => self.presence.was_dry(),
+                Unsure::Passes => false,
+            };
+            self.presence.saw_unsure(lasts || measured.doubt == Doubt::ColoursChanged);
         }
         let seen_dry = measured.doubt == Doubt::None && measured.area_px2 == 0.0;
         let measured = if seen_dry && !self.presence.is_gone(self.light_bgr(), |legs_px| self.liquid.dry_share(legs_px)) {

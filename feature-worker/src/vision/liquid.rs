@@ -91,8 +91,19 @@ pub(crate) struct LineRules {
     pub(crate) first_area_least_px2: f32,
     /// Whether the width of the stream's own edge tells that the picture is out of focus.
     pub(crate) edge_tells_focus: bool,
-    /// Whether a picture in which it was not told what flows leaves a doubt on those that follow.
-    pub(crate) unsure_lasts: bool,
+    /// What a picture in which it was not told what flows leaves on those that follow.
+    pub(crate) unsure: Unsure,
+}
+
+/// What a picture in which it was not told what flows leaves on those that follow.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Unsure {
+    /// Nothing.
+    Passes,
+    /// A doubt, once the ground was told dry since the start or the last pause. Until then the first dry picture is not held up.
+    LastsOnceDry,
+    /// A doubt.
+    Lasts,
 }
 
 /// A way to tell a liquid from what stands behind it.

@@ -63,6 +63,8 @@ pub(crate) struct Presence {
     bgr: [f32; 3],
     /// Pictures in a row in other light.
     other_light: u32,
+    /// Whether there was no stream for sure in a picture since the start or the last pause.
+    was_dry: bool,
 }
 
 impl Presence {
@@ -81,6 +83,7 @@ impl Presence {
             foreign: 0,
             bgr: [0.0; 3],
             other_light: 0,
+            was_dry: false,
         }
     }
 
@@ -91,7 +94,7 @@ impl Presence {
 
     /// Says that a pause of unknown length lies before the next picture. A stream that was seen may be there still, and dry ground may be so no more.
     pub(crate) fn interrupt(&mut self) {
-        self.dry_pictures = 0;
+        (self.dry_pictures, self.was_dry) = (0, false);
     }
 
     /// A stream was measured in a picture with these mean levels of blue, green and red.
@@ -126,6 +129,11 @@ impl Presence {
         }
     }
 
+    /// Whether there was no stream for sure in a picture since the start or the last pause.
+    pub(crate) fn was_dry(&self) -> bool {
+        self.was_dry
+    }
+
     /// Whether a stream was seen within the last second.
     pub(crate) fn flowed_lately(&self) -> bool {
         self.unseen <= self.pace.pictures(LATELY_PICTURES)
@@ -145,7 +153,10 @@ impl Presence {
     pub(crate) fn is_gone(&mut self, bgr: [f32; 3], dry_share: impl FnOnce([f32; 2]) -> f32) -> bool {
         let foreign = self.foreign > 0;
         self.foreign = self.foreign.saturating_sub(1);
-        let Some(legs_px) = self.legs_px else { return !foreign };
+        let Some(legs_px) = self.legs_px else {
+            self.was_dry |= !foreign;
+            return !foreign;
+        };
         self.other_light = if is_other_light(self.bgr, bgr) { self.other_light + 1 } else { 0 };
         let told = self.other_light == 0 || self.other_light > self.pace.pictures(LIGHT_PICTURES);
         self.dry_pictures = if told && dry_share(legs_px) >= DRY_SHARE { self.dry_pictures + 1 } else { 0 };
