@@ -248,7 +248,7 @@ impl CellUnderTest {
     }
 
     /// Fills the container and waits until the robot is ready.
-    fn fill(&self) {
+    pub fn fill(&self) {
         self.json("simulator", &["operator", "fill", "300", "--json"]);
         self.wait_idle();
     }

@@ -10,8 +10,7 @@ use tests::{CellUnderTest, steady_weights};
 
 /// Records one short curve and gives its number and its file. It has both, however it ends: what a machine that stalls ends early, too.
 fn record(cell: &CellUnderTest) -> (u64, PathBuf) {
-    cell.json("simulator", &["operator", "fill", "300", "--json"]);
-    cell.wait_idle();
+    cell.fill();
     let output = cell.command("rt-controller", &["record", "--lambda", "30", "--gamma", "2", "--json"]);
     let said = String::from_utf8_lossy(&output.stderr);
     assert!(matches!(output.status.code(), Some(0 | 4)), "{said}");

@@ -245,12 +245,8 @@ impl Extractor {
         };
         let not_told = matches!(measured.doubt, Doubt::EdgeNotFound | Doubt::ColoursChanged | Doubt::BlownOut | Doubt::LightFlickers);
         if not_told && measured.area_px2 == 0.0 {
-            let lasts = match self.liquid.rules().unsure {
-                Unsure::Lasts => true,
-                Unsure::LastsOnceDry => self.presence.was_dry(),
-                Unsure::Passes => false,
-            };
-            self.presence.saw_unsure(lasts || measured.doubt == Doubt::ColoursChanged);
+            let unsure = if measured.doubt == Doubt::ColoursChanged { Unsure::Lasts } else { self.liquid.rules().unsure };
+            self.presence.saw_unsure(unsure);
         }
         let seen_dry = measured.doubt == Doubt::None && measured.area_px2 == 0.0;
         let measured = if seen_dry && !self.presence.is_gone(self.light_bgr(), |legs_px| self.liquid.dry_share(legs_px)) {

@@ -100,7 +100,7 @@ pub(crate) struct LineRules {
 pub(crate) enum Unsure {
     /// Nothing.
     Passes,
-    /// A doubt, once the ground was told dry since the start or the last pause. Until then the first dry picture is not held up.
+    /// A doubt, once the ground was told dry since the start or the last pause; a pause ends it. So the first dry picture is not held up.
     LastsOnceDry,
     /// A doubt.
     Lasts,

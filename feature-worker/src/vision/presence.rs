@@ -3,6 +3,7 @@
 //!
 //! Counts of pictures are those at 30 Hz; at another rate they stand for the same times. Called on the extraction thread. Nothing is allocated and nothing fails.
 
+use super::liquid::Unsure;
 use super::pace::Pace;
 
 /// A smaller stream may end between two pictures, px^2 of a picture 640 px wide. Tuned on seeds 1, 5001 to 5003 and 101 to 104 of
@@ -63,8 +64,9 @@ pub(crate) struct Presence {
     bgr: [f32; 3],
     /// Pictures in a row in other light.
     other_light: u32,
-    /// Whether there was no stream for sure in a picture since the start or the last pause.
-    was_dry: bool,
+    /// Pictures that still have to look dry after one in which it was not told, see [`Unsure::LastsOnceDry`]; none until the ground was told dry, since the
+    /// start or the last pause.
+    unsure: Option<u32>,
 }
 
 impl Presence {
@@ -83,7 +85,7 @@ impl Presence {
             foreign: 0,
             bgr: [0.0; 3],
             other_light: 0,
-            was_dry: false,
+            unsure: None,
         }
     }
 
@@ -94,13 +96,13 @@ impl Presence {
 
     /// Says that a pause of unknown length lies before the next picture. A stream that was seen may be there still, and dry ground may be so no more.
     pub(crate) fn interrupt(&mut self) {
-        (self.dry_pictures, self.was_dry) = (0, false);
+        (self.dry_pictures, self.unsure) = (0, None);
     }
 
     /// A stream was measured in a picture with these mean levels of blue, green and red.
     pub(crate) fn saw(&mut self, area_px2: f32, legs_px: [f32; 2], bgr: [f32; 3]) {
         (self.bgr, self.other_light) = (bgr, 0);
-        (self.dry_pictures, self.foreign) = (0, 0);
+        (self.dry_pictures, self.foreign, self.unsure) = (0, 0, self.unsure.map(|_| 0));
         let shrinks = self.legs_px.is_some_and(|before| before[0] * before[1] > legs_px[0] * legs_px[1]);
         if shrinks && self.seen < self.pace.pictures(RETURN_PICTURES) {
             return;
@@ -116,22 +118,19 @@ impl Presence {
         if self.legs_px.is_none_or(|before| before[0] * before[1] < legs_px[0] * legs_px[1]) {
             self.saw(area_px2, legs_px, bgr);
         }
-        self.saw_unsure(true);
+        self.saw_unsure(Unsure::Lasts);
     }
 
-    /// There may be a stream that was not measured. It `lasts` where something foreign lies at the lip, or the liquid's colours are not told:
-    /// then the next pictures have to show none.
-    pub(crate) fn saw_unsure(&mut self, lasts: bool) {
+    /// There may be a stream that was not measured. Where something foreign lies at the lip, or the liquid's colours are not told, this lasts: then the
+    /// next pictures have to show none.
+    pub(crate) fn saw_unsure(&mut self, unsure: Unsure) {
         self.dry_pictures = 0;
-        if lasts {
-            let needed = self.pace.pictures(if self.flowed_lately() { FOREIGN_PICTURES } else { FOREIGN_DRY_PICTURES });
-            self.foreign = self.foreign.max(needed);
+        let needed = self.pace.pictures(if self.flowed_lately() { FOREIGN_PICTURES } else { FOREIGN_DRY_PICTURES });
+        match unsure {
+            Unsure::Passes => {}
+            Unsure::LastsOnceDry => self.unsure = self.unsure.map(|pictures| pictures.max(needed)),
+            Unsure::Lasts => self.foreign = self.foreign.max(needed),
         }
-    }
-
-    /// Whether there was no stream for sure in a picture since the start or the last pause.
-    pub(crate) fn was_dry(&self) -> bool {
-        self.was_dry
     }
 
     /// Whether a stream was seen within the last second.
@@ -151,11 +150,14 @@ impl Presence {
     /// No stream was seen in a picture with these mean levels, without other doubts. Returns whether there is none; `dry_share` tells which
     /// share of a triangle with these legs was seen to be ground.
     pub(crate) fn is_gone(&mut self, bgr: [f32; 3], dry_share: impl FnOnce([f32; 2]) -> f32) -> bool {
-        let foreign = self.foreign > 0;
+        let doubted = self.foreign > 0 || self.unsure.is_some_and(|pictures| pictures > 0);
         self.foreign = self.foreign.saturating_sub(1);
+        self.unsure = self.unsure.map(|pictures| pictures.saturating_sub(1));
         let Some(legs_px) = self.legs_px else {
-            self.was_dry |= !foreign;
-            return !foreign;
+            if !doubted {
+                self.unsure.get_or_insert(0);
+            }
+            return !doubted;
         };
         self.other_light = if is_other_light(self.bgr, bgr) { self.other_light + 1 } else { 0 };
         let told = self.other_light == 0 || self.other_light > self.pace.pictures(LIGHT_PICTURES);
@@ -163,7 +165,7 @@ impl Presence {
         if self.dry_pictures >= self.needed {
             self.legs_px = None;
         }
-        self.legs_px.is_none() && !foreign
+        self.legs_px.is_none() && !doubted
     }
 }
 
