@@ -104,6 +104,18 @@ fn single_dry_pictures_of_a_stream_that_is_not_told_are_no_end() -> Result<(), B
     Ok(())
 }
 
+/// Protects a pour before dim boards in warm light, whose motion the picture does not tell: where the memory has slipped along them nothing is told. A third of
+/// its pictures without a stream had areas of up to 30,000 px^2, nearly all with a stream were wrong, and their confidence was up to 0.97.
+#[test]
+fn a_memory_that_slips_makes_no_stream() -> Result<(), Box<dyn std::error::Error>> {
+    let figures = whole_pour(3, 160_291, "WarmLight 0.3")?;
+    assert!(
+        figures.wet > 50 && figures.false_flow_percent < 3.0 && figures.wrong_percent < 5.0 && figures.unnoticed_percent == 0.0,
+        "{figures:?}"
+    );
+    Ok(())
+}
+
 /// Protects a pour before a curtain in a dark room, where water hardly differs from the ground: it is not called dry. In 6 pictures of this one it was, and in
 /// dim light a whole pour was missed without a doubt.
 #[test]

@@ -14,9 +14,9 @@
 //! 4. [`lines`] finds the line from axis to axis with the best evidence, and [`water`] decides whether it is a stream.
 //! 5. The full picture's profiles across that line must confirm it ([`profile_edges`]).
 //! 6. What cannot be told is said by name: a rim that is too faint for a line ([`faint`]), a lamp's reflection at the lip, ground that has changed there, and before a pattern light that
-//!    flickers or wanders and pictures that are missing again and again ([`disturbed`]).
+//!    flickers or wanders, pictures that are missing again and again ([`disturbed`]) and a memory that has slipped ([`ground`]).
 //!
-//! Until [`vouched`] has evidence that the remembered ground is dry, none is told. Called on the extraction thread. All pictures and tables are kept, so
+//! Until [`vouched`] has evidence that the remembered ground is dry, neither a stream before a pattern nor its absence is told. Called on the extraction thread. All pictures and tables are kept, so
 //! nothing is allocated after the second frame. The only failures are OpenCV's.
 
 mod background;
@@ -25,6 +25,7 @@ mod evidence;
 mod faint;
 mod flicker;
 mod follow;
+mod ground;
 mod light;
 mod lines;
 mod motion;
@@ -44,6 +45,7 @@ use self::disturbed::Disturbed;
 use self::evidence::{CALM, Evidence};
 use self::faint::Faint;
 use self::flicker::Flicker;
+use self::ground::Ground;
 use self::light::Light;
 use self::lines::Lines;
 use self::rays::{RIM_PX, Rays};
@@ -96,12 +98,6 @@ const EVEN_LIP_CHANGED: f32 = 0.7;
 const BEAD_PX: f32 = 8.0;
 /// Legs of a bead's surroundings, px. Chosen by hand: as many samples as the bead itself.
 const BEAD_ROUND_PX: f32 = 13.0;
-/// How fast the share of pictures with an even ground grows and shrinks, a picture. Chosen by hand: dim boards look even in some pictures.
-const EVEN_FOLLOWS: [f32; 2] = [0.02, 0.1];
-/// The ground has a pattern below this share. Tuned on seed 101 of `evaluate-camera --faults`.
-const EVEN_LEAST: f32 = 0.5;
-/// In the first pictures the share is their mean. Chosen by hand: a third of a second.
-const EVEN_PICTURES: f32 = 10.0;
 
 /// Finds the stream of clear water in the pictures of one camera.
 pub(crate) struct ClearWater {
@@ -140,10 +136,8 @@ pub(crate) struct ClearWater {
     judged: bool,
     /// Legs of a stream that may still be where it was last seen, px.
     held: Option<[f32; 2]>,
-    /// In which share of the pictures that were compared with the ground, and in which no stream may still be, it was even, the last ones above all.
-    even_share: f32,
-    /// Pictures of which that is the share, the first ones.
-    even_pictures: f32,
+    /// What is known of the ground as a whole.
+    ground: Ground,
     /// Pictures since a stream was seen.
     unseen: u32,
     /// Pictures in a row in which the full picture confirmed a stream.
@@ -188,8 +182,7 @@ impl ClearWater {
             looked: false,
             judged: false,
             held: None,
-            even_share: 0.0,
-            even_pictures: 0.0,
+            ground: Ground::new(),
             unseen: u32::MAX,
             confirmed: 0,
             known_share: 0.0,
@@ -240,8 +233,9 @@ impl ClearWater {
             }
             self.evidence.compare(&self.rays, [&self.now, &self.earlier], &self.background, height_px, self.flicker.flickers())?;
             (self.looked, self.judged) = (true, true);
+            let worthless = !self.flicker.flickers() && self.ground.differs_by(self.evidence.noise());
             let moved = self.background.moved();
-            self.evidence.weigh(&self.rays, &moved, self.water.stream())?;
+            self.evidence.weigh(&self.rays, &moved, self.water.stream(), self.ground.is_known_pattern())?;
             let best = self.lines.best(&self.evidence, &self.rays, &moved, self.water.stream())?.map(|found| {
                 (found, self.lines.legs_px(found.line), self.lines.earlier_picture(found.line, &self.evidence, &self.rays, &moved))
             });
@@ -252,11 +246,15 @@ impl ClearWater {
                 _ if (!told || self.is_pattern() || !self.evidence.even()) && self.flicker.flickers() => {
                     Sighting::Unsure(Doubt::LightFlickers)
                 }
+                // Before an even ground nothing can slip, and a line needs no memory.
+                _ if self.is_pattern() && self.ground.has_slipped() => Sighting::Unsure(Doubt::EdgeNotFound),
                 (Verdict::Stream, Some((found, ..))) => {
                     self.known_share = found.known;
                     let scale = self.scale;
                     self.lines.edges(found.line, &self.evidence, &self.rays, |v| (v + 0.5) * scale - 0.5, edges_px);
-                    Sighting::Stream { seen_share: found.edge_share.min(1.0), doubt: Doubt::None }
+                    // Before a pattern that was not seen dry, the line may be the pattern's own. It is followed all the same.
+                    let doubt = if self.is_pattern() && !self.vouched.is_dry() { Doubt::EdgeNotFound } else { Doubt::None };
+                    Sighting::Stream { seen_share: found.edge_share.min(1.0), doubt }
                 }
                 _ if self.light.flickers() => Sighting::Unsure(Doubt::LightFlickers),
                 (Verdict::Unsure, _) => Sighting::Unsure(Doubt::EdgeNotFound),
@@ -280,8 +278,9 @@ impl ClearWater {
             } else {
                 (self.unseen, self.confirmed) = (self.unseen.saturating_add(1), 0);
             }
-            if self.water.is_elsewhere(self.evidence.strange_share(), self.held.is_some()) {
+            if self.water.is_elsewhere(self.evidence.strange_share(), self.held.is_some()) || (worthless && self.is_pattern()) {
                 self.background.forget()?;
+                self.ground.forget();
                 self.vouched.doubt();
             }
         }
@@ -300,7 +299,7 @@ impl ClearWater {
 
     /// Whether the ground is not even.
     fn is_pattern(&self) -> bool {
-        self.even_share < EVEN_LEAST
+        self.ground.is_pattern()
     }
 
     /// As [`Evidence::shares`], of the triangle with the legs `to`, px, but for what is within that with the legs `from`, if there is one.
@@ -433,6 +432,7 @@ impl Liquid for ClearWater {
         self.background.set_pace(pace);
         self.disturbed.set_pace(pace);
         self.flicker.set_pace(pace);
+        self.ground.set_pace(pace);
         self.vouched.set_pace(pace);
         self.water.set_pace(pace);
     }
@@ -441,6 +441,7 @@ impl Liquid for ClearWater {
     fn interrupt(&mut self) -> opencv::Result<()> {
         if self.is_pattern() {
             self.background.forget()?;
+            self.ground.forget();
         }
         self.background.rest();
         self.vouched.doubt();
@@ -467,11 +468,7 @@ impl Liquid for ClearWater {
     fn hold_ground(&mut self, legs_px: Option<[f32; 2]>) {
         // Of a picture that could not be looked at, nothing is known.
         if std::mem::take(&mut self.judged) && legs_px.is_none() {
-            let even = self.evidence.even();
-            self.even_pictures += 1.0;
-            let usual = self.pace.follows(EVEN_FOLLOWS[usize::from(!even)]);
-            let follows = if self.even_pictures <= self.pace.parts(EVEN_PICTURES) { usual.max(1.0 / self.even_pictures) } else { usual };
-            self.even_share += follows * (f32::from(u8::from(even)) - self.even_share);
+            self.ground.see(self.evidence.seems_even());
         }
         self.held = legs_px.map(|legs| legs.map(|v| v / self.scale));
     }

@@ -60,6 +60,11 @@ impl Vouched {
         self.dry
     }
 
+    /// Whether the ground is known to be dry.
+    pub(super) fn is_dry(&self) -> bool {
+        self.dry
+    }
+
     /// A stream was seen in a picture, or it was not told whether there is one.
     pub(super) fn see_other(&mut self) {
         (self.pictures, self.moved_px) = (0, 0.0);
