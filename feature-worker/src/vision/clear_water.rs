@@ -209,6 +209,26 @@ impl ClearWater {
         LinearField::from_zero(self.axes.lip_px, (y[1] / a - x[1] / b) / sine, (x[0] / b - y[0] / a) / sine)
     }
 
+    /// Finds the light of the present picture, and how the memory lies in it; `exposure` is how its light differs from that of the last one. Returns whether
+    /// the light was told.
+    #[inline(always)]
+    fn follow_ground(&mut self, exposure: f32, height_px: LinearField) -> opencv::Result<bool> {
+        self.background.expect_gain(exposure);
+        let wet = self.water.stream().map(|s| {
+            let line_share = self.line_share(s.legs_px.map(|v| v + KEEP_AWAY_PX));
+            WetPlaces { line_share, right_px: self.right_px() }
+        });
+        // An even ground tells the light wherever it lies. A pattern tells it where it was found.
+        let told = self.light.divide_out(&mut self.now, &self.background, height_px, wet)?;
+        self.background.correct_gain(self.light.exposure());
+        self.background.register(&self.now, height_px, wet)?;
+        if !told {
+            self.light.divide_out(&mut self.now, &self.background, height_px, wet)?;
+            self.background.correct_gain(self.light.exposure());
+        }
+        Ok(told)
+    }
+
     #[inline(always)]
     fn look_for_stream(&mut self, edges_px: &mut Vec<[f32; 2]>) -> opencv::Result<Sighting> {
         edges_px.clear();
@@ -218,19 +238,7 @@ impl ClearWater {
         self.faint.next_picture();
         let exposure = self.flicker.look(&self.now)?;
         if !self.background.is_new() {
-            self.background.expect_gain(exposure);
-            let wet = self.water.stream().map(|s| {
-                let line_share = self.line_share(s.legs_px.map(|v| v + KEEP_AWAY_PX));
-                WetPlaces { line_share, right_px: self.right_px() }
-            });
-            // An even ground tells the light wherever it lies. A pattern tells it where it was found.
-            let told = self.light.divide_out(&mut self.now, &self.background, height_px, wet)?;
-            self.background.correct_gain(self.light.exposure());
-            self.background.register(&self.now, height_px, wet)?;
-            if !told {
-                self.light.divide_out(&mut self.now, &self.background, height_px, wet)?;
-                self.background.correct_gain(self.light.exposure());
-            }
+            let told = self.follow_ground(exposure, height_px)?;
             self.evidence.compare(&self.rays, [&self.now, &self.earlier], &self.background, height_px, self.flicker.flickers())?;
             (self.looked, self.judged) = (true, true);
             let worthless = !self.flicker.flickers() && self.ground.differs_by(self.evidence.noise());
@@ -243,17 +251,17 @@ impl ClearWater {
             sighting = match (verdict, best) {
                 // Where bands cannot be divided out, or only now and then, neither a line nor its absence means anything.
                 // So it is where they left a pattern in the memory of an even ground.
-                _ if (!told || self.is_pattern() || !self.evidence.even()) && self.flicker.flickers() => {
+                _ if (!told || self.ground.is_pattern() || !self.evidence.even()) && self.flicker.flickers() => {
                     Sighting::Unsure(Doubt::LightFlickers)
                 }
                 // Before an even ground nothing can slip, and a line needs no memory.
-                _ if self.is_pattern() && self.ground.has_slipped() => Sighting::Unsure(Doubt::EdgeNotFound),
+                _ if self.ground.is_pattern() && self.ground.has_slipped() => Sighting::Unsure(Doubt::EdgeNotFound),
                 (Verdict::Stream, Some((found, ..))) => {
                     self.known_share = found.known;
                     let scale = self.scale;
                     self.lines.edges(found.line, &self.evidence, &self.rays, |v| (v + 0.5) * scale - 0.5, edges_px);
                     // Before a pattern that was not seen dry, the line may be the pattern's own. It is followed all the same.
-                    let doubt = if self.is_pattern() && !self.vouched.is_dry() { Doubt::EdgeNotFound } else { Doubt::None };
+                    let doubt = if self.ground.is_pattern() && !self.vouched.is_dry() { Doubt::EdgeNotFound } else { Doubt::None };
                     Sighting::Stream { seen_share: found.edge_share.min(1.0), doubt }
                 }
                 _ if self.light.flickers() => Sighting::Unsure(Doubt::LightFlickers),
@@ -264,7 +272,7 @@ impl ClearWater {
                 _ if self.lip_has_changed() => Sighting::Unsure(Doubt::EdgeNotFound),
                 (_, Some((found, ..))) if self.may_begin(&found) => Sighting::Unsure(Doubt::EdgeNotFound),
                 _ if self.is_too_dark() => Sighting::Unsure(Doubt::TooDark),
-                _ if !self.is_pattern() && self.faint.sees(self.evidence.faint_band(&self.rays), self.pace) => {
+                _ if !self.ground.is_pattern() && self.faint.sees(self.evidence.faint_band(&self.rays), self.pace) => {
                     Sighting::Unsure(Doubt::EdgeNotFound)
                 }
                 _ if self.vouched.see_none(&self.evidence, &self.rays) => Sighting::Dry { confidence: 1.0 },
@@ -278,7 +286,7 @@ impl ClearWater {
             } else {
                 (self.unseen, self.confirmed) = (self.unseen.saturating_add(1), 0);
             }
-            if self.water.is_elsewhere(self.evidence.strange_share(), self.held.is_some()) || (worthless && self.is_pattern()) {
+            if self.water.is_elsewhere(self.evidence.strange_share(), self.held.is_some()) || (worthless && self.ground.is_pattern()) {
                 self.background.forget()?;
                 self.ground.forget();
                 self.vouched.doubt();
@@ -287,7 +295,7 @@ impl ClearWater {
         self.remember(height_px)?;
         self.disturbed.look(self.flicker.jumps());
         let hidden = self.hidden.then_some(Doubt::BlownOut);
-        let disturbed = self.disturbed.doubt().filter(|_| self.is_pattern());
+        let disturbed = self.disturbed.doubt().filter(|_| self.ground.is_pattern());
         Ok(hidden.or(disturbed).map_or(sighting, Sighting::Unsure))
     }
 
@@ -297,28 +305,23 @@ impl ClearWater {
         level > 0.0 && level < DARK_LEAST * profile_edges::least_difference(self.evidence.noise())
     }
 
-    /// Whether the ground is not even.
-    fn is_pattern(&self) -> bool {
-        self.ground.is_pattern()
-    }
-
     /// As [`Evidence::shares`], of the triangle with the legs `to`, px, but for what is within that with the legs `from`, if there is one.
     fn shares(&self, from: Option<[f32; 2]>, to: [f32; 2]) -> [f32; 2] {
         let [gain, _] = self.background.gains();
         let from = from.map_or(LinearField::constant(1.0), |legs_px| self.line_share(legs_px));
-        self.evidence.shares(&self.rays, [from, self.line_share(to)], !self.is_pattern(), gain)
+        self.evidence.shares(&self.rays, [from, self.line_share(to)], !self.ground.is_pattern(), gain)
     }
 
     /// Whether ground that is known has changed where a small stream would be. Before a pattern little of it may be known: then most of that counts.
     fn lip_has_changed(&self) -> bool {
         let [dry, wet] = self.shares(None, [LIP_PX; 2]);
-        if self.is_pattern() { wet >= LIP_CHANGED || (wet >= LIP_CHANGED_LEAST && wet > dry) } else { wet >= EVEN_LIP_CHANGED }
+        if self.ground.is_pattern() { wet >= LIP_CHANGED || (wet >= LIP_CHANGED_LEAST && wet > dry) } else { wet >= EVEN_LIP_CHANGED }
     }
 
     /// Whether a stream may begin along the line that was `found`, of too little evidence for one, on a pattern that has just come out from behind the glass.
     fn may_begin(&self, found: &Candidate) -> bool {
         let [dry, _] = self.shares(None, [LIP_PX; 2]);
-        self.is_pattern() && dry < LIP_KNOWN && found.score > MAY_BEGIN_SCORE && found.edge_share > MAY_BEGIN_EDGE
+        self.ground.is_pattern() && dry < LIP_KNOWN && found.score > MAY_BEGIN_SCORE && found.edge_share > MAY_BEGIN_EDGE
     }
 
     /// Takes what is dry over into the memory of the background, and chooses the picture with which the next ones are compared.
@@ -387,7 +390,7 @@ impl Liquid for ClearWater {
     fn rules(&self) -> LineRules {
         // How small a stream may be is decided when its line is confirmed, and water's own edge tells nothing of focus. Before a pattern single pictures
         // of water that was not told for long look dry.
-        let unsure = if self.is_pattern() { Unsure::LastsOnceDry } else { Unsure::Passes };
+        let unsure = if self.ground.is_pattern() { Unsure::LastsOnceDry } else { Unsure::Passes };
         LineRules { profiles_least: PROFILES_LEAST, first_area_least_px2: 0.0, edge_tells_focus: false, unsure }
     }
 
@@ -439,7 +442,7 @@ impl Liquid for ClearWater {
 
     /// An even ground is still known. How a pattern lies in the picture is not: what is remembered of it would be compared with other places.
     fn interrupt(&mut self) -> opencv::Result<()> {
-        if self.is_pattern() {
+        if self.ground.is_pattern() {
             self.background.forget()?;
             self.ground.forget();
         }
@@ -460,7 +463,8 @@ impl Liquid for ClearWater {
             return 0.0;
         }
         // A bead that stays at the lip is no stream, and before an even ground it is told from one.
-        let (from, to) = if self.is_pattern() { (None, legs_px) } else { (Some([BEAD_PX; 2]), legs_px.map(|v| v.max(BEAD_ROUND_PX))) };
+        let (from, to) =
+            if self.ground.is_pattern() { (None, legs_px) } else { (Some([BEAD_PX; 2]), legs_px.map(|v| v.max(BEAD_ROUND_PX))) };
         let [dry, _] = self.shares(from, to);
         dry
     }
