@@ -260,7 +260,9 @@ impl Extractor {
             Doubt::None => confidence::of_nothing(measured.confidence),
             _ => 0.0,
         };
-        let measured = Measurement { confidence, ..measured };
+        // A line that is followed without being told is no measurement.
+        let told = measured.doubt != Doubt::EdgeNotFound;
+        let measured = if told { Measurement { confidence, ..measured } } else { Measurement::nothing(0.0, measured.doubt) };
         let done = Instant::now();
         let ns = |from: Instant, to: Instant| to.duration_since(from).as_nanos() as u64;
         self.stages = Stages {
