@@ -16,8 +16,8 @@
 //! 6. What cannot be told is said by name: a rim that is too faint for a line ([`faint`]), a lamp's reflection at the lip, ground that has changed there, and before a pattern light that
 //!    flickers or wanders, pictures that are missing again and again ([`disturbed`]) and a memory that has slipped ([`ground`]).
 //!
-//! Until [`vouched`] has evidence that the remembered ground is dry, neither a stream before a pattern nor its absence is told. Called on the extraction thread. All pictures and tables are kept, so
-//! nothing is allocated after the second frame. The only failures are OpenCV's.
+//! Until [`vouched`] has evidence that the remembered ground is dry, neither a stream before a pattern is told, nor anywhere that none flows. Called on the
+//! extraction thread. All pictures and tables are kept, so nothing is allocated after the second frame. The only failures are OpenCV's.
 
 mod background;
 mod disturbed;

@@ -41,7 +41,7 @@ const EVEN_ROUNDING: f32 = 0.6;
 /// covers more, and was taken for a stream before a background that only seemed even. Seen on seed 160291.
 const STEEP_ONE_IN: usize = 100;
 /// How much steeper that one sample may be than the bound near the lip. Chosen by hand: walls show at most 1.3, with bands of 20 %, and dim wood in warm
-/// light at least 2.2.
+/// light, at rest, 6.
 const STEEP_MOST: f32 = 2.0;
 /// Fewer samples of even background than this tell no noise. Chosen by hand; no measurement is recorded.
 const NOISE_SAMPLES: usize = 25;
