@@ -42,6 +42,7 @@ mod learn_poses;
 mod learn_profile;
 mod learn_steady;
 mod liquid;
+mod liquid_mask;
 mod measurement;
 mod pace;
 mod picture;

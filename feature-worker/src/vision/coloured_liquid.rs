@@ -26,6 +26,7 @@ use super::ground_beside::{InGlass, Place, Square};
 use super::ground_colours::{Ground, GroundColours};
 use super::hues::ranges;
 use super::liquid::{FineLine, LineRules, Liquid, Profile, ProfileEdge, Sighting, Unsure};
+use super::liquid_mask::{LimitedMask, LiquidMask};
 use super::pace::Pace;
 use super::ray_maps::ray_maps;
 use super::reflection::Reflection;
@@ -78,8 +79,6 @@ pub(crate) struct ColouredLiquid {
     map_a: Mat,
     /// The second of these maps.
     map_b: Mat,
-    /// Least and largest hue, saturation and value of what is the liquid.
-    ranges: Vec<(Scalar, Scalar)>,
     /// Whether the liquid is not to be seen in a picture without colour.
     needs_colour: bool,
     /// A smaller triangle is no stream, px^2.
@@ -111,12 +110,9 @@ pub(crate) struct ColouredLiquid {
     sampled: Mat,
     /// The same, smoothed.
     smooth: Mat,
-    /// The same in hue, saturation and value.
-    hsv: Mat,
-    /// Not 0 where there is liquid.
-    mask: Mat,
-    /// The mask of one range of hues.
-    half_mask: Mat,
+    /// Where these have the liquid's colours, and where they have them in a limited range.
+    liquid: LiquidMask,
+    limited: LimitedMask,
     /// The ground beside the container.
     beside: Square,
     /// More of it, to tell what goes on there from what is at the lip.
@@ -139,7 +135,6 @@ impl ColouredLiquid {
             grid,
             map_a,
             map_b,
-            ranges,
             needs_colour: is_unseen_in_grey(colour),
             area_min_px2: image.area_min_px2,
             ground: GroundColours::new(),
@@ -158,31 +153,19 @@ impl ColouredLiquid {
             outline: Outline::new(axes, image.region_px),
             sampled: Mat::default(),
             smooth: Mat::default(),
-            hsv: Mat::default(),
-            mask: Mat::default(),
-            half_mask: Mat::default(),
+            liquid: LiquidMask::new(ranges.clone()),
+            limited: LimitedMask::new(ranges)?,
             beside,
             beside_wide,
             glass,
         })
     }
 
-    /// Tells liquid from background into `self.mask`. A dark liquid in dim light is only noise and a little colour, so neighbouring
-    /// samples are taken together.
+    /// Tells liquid from background. A dark liquid in dim light is only noise and a little colour, so neighbouring samples are taken together.
     fn segment(&mut self) -> opencv::Result<()> {
         let size = core::Size::new(SMOOTH, SMOOTH);
         imgproc::blur(&self.sampled, &mut self.smooth, size, core::Point::new(-1, -1), core::BORDER_REPLICATE)?;
-        imgproc::cvt_color_def(&self.smooth, &mut self.hsv, imgproc::COLOR_BGR2HSV)?;
-        for (i, (low, high)) in self.ranges.iter().enumerate() {
-            if i == 0 {
-                core::in_range(&self.hsv, low, high, &mut self.mask)?;
-                continue;
-            }
-            core::in_range(&self.hsv, low, high, &mut self.half_mask)?;
-            let others = self.half_mask.data_bytes()?;
-            self.mask.data_bytes_mut()?.iter_mut().zip(others).for_each(|(mask, other)| *mask |= other);
-        }
-        Ok(())
+        self.liquid.take(&self.smooth)
     }
 
     /// Tells the ground's colours how bright the picture is far from the lip.
@@ -191,7 +174,7 @@ impl ColouredLiquid {
         let (mut sums, mut count) = ([0u32; 3], 0u32);
         let mut rays = [([0.0f32; 3], 0u32); RAYS];
         for (i, ray) in self.grid.rays.iter().enumerate() {
-            let (mask, colours) = (self.mask.at_row::<u8>(i as i32)?, self.smooth.at_row::<Vec3b>(i as i32)?);
+            let (mask, colours) = (self.liquid.mask().at_row::<u8>(i as i32)?, self.smooth.at_row::<Vec3b>(i as i32)?);
             let (mut own, mut looked) = ([0u32; 3], 0u32);
             for r in (far + i % EXPOSURE_EVERY..ray.samples).step_by(EXPOSURE_EVERY).filter(|r| mask[*r] == 0) {
                 (0..3).for_each(|k| own[k] += u32::from(colours[r][k]));
@@ -233,7 +216,7 @@ impl ColouredLiquid {
                     (end + LEARN_BEYOND).max(far)
                 }
             };
-            let (mask, colours) = (self.mask.at_row::<u8>(i as i32)?, self.smooth.at_row::<Vec3b>(i as i32)?);
+            let (mask, colours) = (self.liquid.mask().at_row::<u8>(i as i32)?, self.smooth.at_row::<Vec3b>(i as i32)?);
             let first = from + (self.frames + 3 * i) % every;
             for r in (first..ray.samples).step_by(every) {
                 let beside = [r.saturating_sub(3), r, (r + 3).min(ray.samples - 1)];
@@ -278,7 +261,7 @@ impl ColouredLiquid {
 
     /// The picture along the rays.
     fn seen(&self) -> Seen<'_> {
-        Seen { grid: &self.grid, mask: &self.mask, smooth: &self.smooth, ground: &self.ground }
+        Seen { grid: &self.grid, mask: self.liquid.mask(), smooth: &self.smooth, ground: &self.ground }
     }
 
     /// Whether the liquid is seen in the glass in its own colours, and these and the ground's mean excuse what is foreign.
@@ -288,8 +271,17 @@ impl ColouredLiquid {
 
     /// Whether something lies at the lip like a stream and may be the liquid in other colours. Writes its ends into `self.ends`.
     fn has_foreign_body(&mut self) -> opencv::Result<bool> {
-        let mut ends = self.ends;
-        let body = self.seen().body(&mut ends)?;
+        let own_ends = self.ends;
+        let mut ends = own_ends;
+        let mut body = self.seen().body(&mut ends, None)?;
+        // Liquid in the glass that has its own colours shows that the camera's levels are as ever.
+        if body.is_none() && self.glass.liquid()?.is_none() && self.limited.take(&self.smooth)? {
+            let mut limited_ends = own_ends;
+            body = self.seen().body(&mut limited_ends, Some(self.limited.mask()))?;
+            // Ground in such colours is no stream if it does not end like one.
+            body = body.filter(|_| self.outline.is_streams(&self.grid, &limited_ends));
+            ends = if body.is_some() { limited_ends } else { ends };
+        }
         self.ends = ends;
         let Some(body) = body else { return Ok(false) };
         let Some(colour) = body.colour else { return Ok(true) };
@@ -300,7 +292,7 @@ impl ColouredLiquid {
     /// Learns the ground's colours from the outer part of each ray, where hardly any stream reaches.
     fn learn_distant(&mut self) -> opencv::Result<()> {
         for (i, ray) in self.grid.rays.iter().enumerate() {
-            let (mask, colours) = (self.mask.at_row::<u8>(i as i32)?, self.smooth.at_row::<Vec3b>(i as i32)?);
+            let (mask, colours) = (self.liquid.mask().at_row::<u8>(i as i32)?, self.smooth.at_row::<Vec3b>(i as i32)?);
             let last_px = self.grid.radii_px[ray.samples.saturating_sub(1)];
             let from = self.grid.radii_px[..ray.samples].partition_point(|r| *r < DISTANT_SHARE * last_px);
             (from..ray.samples).filter(|r| mask[*r] == 0).for_each(|r| self.ground.learn(colours[r].0, true));
@@ -473,7 +465,9 @@ impl Liquid for ColouredLiquid {
         let (mut dry, mut looked) = (0usize, 0usize);
         for (i, ray) in self.grid.rays.iter().enumerate() {
             let edge_px = line.cut(self.axes.lip_px, ray.along);
-            let (Ok(mask), Ok(colours)) = (self.mask.at_row::<u8>(i as i32), self.smooth.at_row::<Vec3b>(i as i32)) else { continue };
+            let (Ok(mask), Ok(colours)) = (self.liquid.mask().at_row::<u8>(i as i32), self.smooth.at_row::<Vec3b>(i as i32)) else {
+                continue;
+            };
             for r in (0..ray.samples).take_while(|r| self.grid.radii_px[*r] < edge_px) {
                 looked += 1;
                 dry += usize::from(mask[r] == 0 && self.ground.tell(colours[r].0) == Ground::Known);

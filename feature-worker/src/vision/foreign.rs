@@ -113,18 +113,22 @@ impl Seen<'_> {
         Ok(last.map(|r| (r, best)))
     }
 
-    /// What lies at the lip like a stream and is foreign, if something does. Writes its ends into `ends`.
-    pub(super) fn body(&self, ends: &mut [usize; RAYS]) -> opencv::Result<Option<Body>> {
+    /// What lies at the lip like a stream and is foreign, if something does. Writes its ends into `ends`. Where `limited` is not 0, ground has the
+    /// liquid's colours in a limited range of levels, and is foreign too.
+    pub(super) fn body(&self, ends: &mut [usize; RAYS], limited: Option<&Mat>) -> opencv::Result<Option<Body>> {
         let (mut filled, mut foreign, mut samples, mut length_px) = (0usize, 0usize, 0usize, 0.0f32);
         let (mut shown, mut mean) = (0usize, Mean::default());
         for (i, ray) in self.grid.rays.iter().enumerate() {
             let mask = self.mask.at_row::<u8>(i as i32)?;
             let colours = self.smooth.at_row::<Vec3b>(i as i32)?;
+            let limited = limited.map(|limited| limited.at_row::<u8>(i as i32)).transpose()?;
+            let tell =
+                |r: usize| if limited.is_some_and(|limited| limited[r] != 0) { Ground::Foreign } else { self.ground.tell(colours[r].0) };
             let (mut score, mut best, mut end, mut strange, mut strange_at_end) = (0.0f32, 0.0f32, 0usize, 0usize, 0usize);
             let (mut own, mut own_at_end) = (Mean::default(), Mean::default());
             for r in 0..ray.samples {
                 let step = self.grid.steps_px[r];
-                match if mask[r] != 0 { None } else { Some(self.ground.tell(colours[r].0)) } {
+                match if mask[r] != 0 { None } else { Some(tell(r)) } {
                     None => score += step,
                     Some(Ground::Foreign) => {
                         (score, strange) = (score + step, strange + 1);
@@ -346,7 +350,7 @@ mod tests {
             }
         }
         let seen = Seen { grid: &grid, mask: &mask, smooth: &smooth, ground: &ground };
-        Ok(seen.body(&mut [0; RAYS])?.map(|body| body.colour))
+        Ok(seen.body(&mut [0; RAYS], None)?.map(|body| body.colour))
     }
 
     /// Protects pours from a body at the lip that is excused by a colour that it does not have: where its first px are white light or look like

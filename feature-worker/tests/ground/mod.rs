@@ -1,6 +1,8 @@
 //! What the extraction of a coloured liquid says of ground: half white, never known, seen through a thin stream, and in front of a stream. On drawn
 //! pictures.
 
+mod limited;
+
 use super::drawn::{HEIGHT, WIDTH, blue, camera, dry, glass, image_config, lay_over, noisy, stream};
 use super::{colour, measure};
 use feature_worker::vision::{ExtractError, Extractor, Measurement};

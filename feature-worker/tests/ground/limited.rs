@@ -1,0 +1,63 @@
+//! What the extraction says of pictures whose camera mixes up its range of levels, 16 to 235 in place of 0 to 255. On drawn pictures.
+
+use opencv::core::{CV_8UC3, Mat, Rect, Scalar};
+use opencv::imgproc;
+use opencv::prelude::*;
+
+use super::super::drawn::{HEIGHT, WIDTH, camera, glass, image_config, lay_over, noisy, stream};
+use super::super::measure;
+use feature_worker::vision::{ExtractError, Extractor};
+use shared::config::{ImageConfig, LiquidMethod};
+use shared::messages::Doubt;
+
+/// A liquid as dark as cola, and the joints between the boards.
+const COLA: Scalar = Scalar::new(12.0, 20.0, 40.0, 0.0);
+const JOINT: Scalar = Scalar::new(12.0, 23.0, 40.0, 0.0);
+
+/// Between the left ends of the joints, px.
+const JOINTS_EVERY: i32 = 60;
+
+/// Where the first joint lies, px; the background moves by 1 px a picture.
+fn first_joint(picture: i32) -> i32 {
+    (10 + picture) % JOINTS_EVERY
+}
+
+/// Boards with dark joints, and liquid over the lip if it `flows`, in a `limited` range or in the full one.
+fn boards(flows: bool, limited: bool, seed: i32) -> Result<Mat, ExtractError> {
+    let mut picture = Mat::new_rows_cols_with_default(HEIGHT, WIDTH, CV_8UC3, Scalar::new(70.0, 95.0, 120.0, 0.0))?;
+    for x in (first_joint(seed)..WIDTH).step_by(JOINTS_EVERY as usize) {
+        imgproc::rectangle(&mut picture, Rect::new(x, 0, 9, HEIGHT), JOINT, imgproc::FILLED, 8, 0)?;
+    }
+    if flows {
+        lay_over(&mut picture, &[stream(60.0, 50.0)], COLA)?;
+    }
+    glass(&mut picture)?;
+    let mut picture = noisy(&picture, seed)?;
+    if limited {
+        picture.data_bytes_mut()?.iter_mut().for_each(|level| *level = (16.0 + f32::from(*level) * 219.0 / 255.0) as u8);
+    }
+    Ok(picture)
+}
+
+/// Protects pours of a dark liquid through a camera that was calibrated in the full range and runs in a limited one: the liquid then looks like dark
+/// joints of the ground, and is not "nothing". Boards and joints beside the lip are dry; a joint at the lip may be a stream. The liquid in its own colours is
+/// measured.
+#[test]
+fn a_dark_liquid_in_a_limited_range_is_named() -> Result<(), ExtractError> {
+    let image = ImageConfig { region_px: [171, 14, 440, 296], colour_hsv: [2, 120, 12, 10, 255, 90], ..image_config(LiquidMethod::Colour) };
+    for limited in [false, true] {
+        let mut extractor = Extractor::new(&camera(), &image)?;
+        for i in 0..75 {
+            let measured = measure(&mut extractor, &boards(i >= 45, limited, i)?)?;
+            // The lip is at 215 px, and a joint 9 px wide.
+            let at_lip = (215 - 9 - 12..=215 + 12).any(|x| x % JOINTS_EVERY == first_joint(i));
+            match (i, limited) {
+                (0..45, _) if at_lip => assert_eq!(measured.area_px2, 0.0, "picture {i}"),
+                (0..45, _) => assert_eq!((measured.area_px2, measured.doubt), (0.0, Doubt::None), "dry picture {i}, limited: {limited}"),
+                (_, false) => assert!((1300.0..1700.0).contains(&measured.area_px2), "picture {i}: {measured:?}"),
+                (_, true) => assert_eq!((measured.area_px2, measured.doubt), (0.0, Doubt::ColoursChanged), "picture {i}: {measured:?}"),
+            }
+        }
+    }
+    Ok(())
+}
