@@ -2,6 +2,8 @@
 //! edge cuts the axes at known distances. Nothing here knows how the extraction works.
 #![allow(dead_code)]
 
+use std::cell::RefCell;
+
 use opencv::core::{self, CV_8UC3, Mat, Point, Point2f, Rect, Scalar, Size, Vector};
 use opencv::imgproc;
 use opencv::prelude::*;
@@ -61,7 +63,7 @@ fn polygon(shape: &[[f32; 2]], scale: f32) -> Vector<Point> {
 }
 
 /// Liquid in the glass and over the lip whose outer edge cuts the axes at `a` and `b` px from the lip.
-pub fn stream(a: f32, b: f32) -> Vec<[f32; 2]> {
+pub fn stream(a: f32, b: f32) -> Shape {
     let [x, y] = LIP;
     let beyond = y - b - 95.0 * b / a;
     let right = x + 1.5 * a;
@@ -69,12 +71,41 @@ pub fn stream(a: f32, b: f32) -> Vec<[f32; 2]> {
 }
 
 /// A round shape.
-pub fn disc(x: f32, y: f32, radius: f32) -> Vec<[f32; 2]> {
+pub fn disc(x: f32, y: f32, radius: f32) -> Shape {
     (0..24).map(|k| (k as f32 * std::f32::consts::TAU / 24.0).sin_cos()).map(|(s, c)| [x + radius * c, y + radius * s]).collect()
+}
+
+thread_local! {
+    /// The last board and the last cover, which most tests draw many times in a row: the tests would take twice as long without.
+    static BOARD: RefCell<Option<(f32, Mat)>> = const { RefCell::new(None) };
+    static COVER: RefCell<Option<(Vec<Shape>, Mat)>> = const { RefCell::new(None) };
+}
+
+/// The corners of a shape, px.
+pub type Shape = Vec<[f32; 2]>;
+
+/// What is kept for `key`, or else what `draw` draws, which is kept then.
+fn kept<K: PartialEq>(
+    last: &'static std::thread::LocalKey<RefCell<Option<(K, Mat)>>>,
+    key: K,
+    draw: impl FnOnce(&K) -> Result<Mat, opencv::Error>,
+) -> Result<Mat, opencv::Error> {
+    last.with_borrow_mut(|last| match last {
+        Some((of, picture)) if *of == key => Ok(picture.clone()),
+        _ => {
+            let picture = draw(&key)?;
+            *last = Some((key, picture.clone()));
+            Ok(picture)
+        }
+    })
 }
 
 /// A chess board that is turned by `turn_deg` about a point outside of the picture, and is out of focus.
 pub fn board(turn_deg: f32) -> Result<Mat, opencv::Error> {
+    kept(&BOARD, turn_deg, |turn_deg| draw_board(*turn_deg))
+}
+
+fn draw_board(turn_deg: f32) -> Result<Mat, opencv::Error> {
     let side = 1600;
     let mut large = Mat::new_rows_cols_with_default(side, side, CV_8UC3, Scalar::all(185.0))?;
     for row in 0..20 {
@@ -100,7 +131,11 @@ pub fn noisy(picture: &Mat, seed: i32) -> Result<Mat, opencv::Error> {
 }
 
 /// The share of each pixel that `shapes` cover, 0 to 255.
-fn cover(shapes: &[Vec<[f32; 2]>]) -> Result<Mat, opencv::Error> {
+fn cover(shapes: &[Shape]) -> Result<Mat, opencv::Error> {
+    kept(&COVER, shapes.to_vec(), |shapes| draw_cover(shapes))
+}
+
+fn draw_cover(shapes: &[Shape]) -> Result<Mat, opencv::Error> {
     let mut large = Mat::new_rows_cols_with_default(HEIGHT * FINE, WIDTH * FINE, core::CV_8UC1, Scalar::all(0.0))?;
     for shape in shapes {
         imgproc::fill_poly(&mut large, &polygon(shape, FINE as f32), Scalar::all(255.0), imgproc::LINE_8, 0, Point::default())?;
@@ -111,15 +146,15 @@ fn cover(shapes: &[Vec<[f32; 2]>]) -> Result<Mat, opencv::Error> {
 }
 
 /// `picture` with `shapes` of blue liquid over it.
-fn pour_over(picture: &mut Mat, shapes: &[Vec<[f32; 2]>]) -> Result<(), opencv::Error> {
+fn pour_over(picture: &mut Mat, shapes: &[Shape]) -> Result<(), opencv::Error> {
     lay_over(picture, shapes, BLUE)
 }
 
 /// `picture` with `shapes` of a liquid of this colour (blue, green, red) over it.
-pub fn lay_over(picture: &mut Mat, shapes: &[Vec<[f32; 2]>], colour: Scalar) -> Result<(), opencv::Error> {
+pub fn lay_over(picture: &mut Mat, shapes: &[Shape], colour: Scalar) -> Result<(), opencv::Error> {
     let cover = cover(shapes)?;
     let cover = cover.data_bytes()?;
-    for (pixel, share) in picture.data_typed_mut::<core::Vec3b>()?.iter_mut().zip(cover) {
+    for (pixel, share) in picture.data_typed_mut::<core::Vec3b>()?.iter_mut().zip(cover).filter(|(_, share)| **share > 0) {
         for c in 0..3 {
             let share = f64::from(*share) / 255.0;
             pixel[c] = (f64::from(pixel[c]) * (1.0 - share) + colour[c] * share).round() as u8;
@@ -142,7 +177,7 @@ pub fn glass(picture: &mut Mat) -> Result<(), opencv::Error> {
 }
 
 /// Blue liquid over a board, without a glass. `seed` gives each picture its own noise.
-pub fn blue(shapes: &[Vec<[f32; 2]>], seed: i32) -> Result<Mat, opencv::Error> {
+pub fn blue(shapes: &[Shape], seed: i32) -> Result<Mat, opencv::Error> {
     let mut picture = board(seed as f32)?;
     pour_over(&mut picture, shapes)?;
     noisy(&picture, seed)
