@@ -45,7 +45,7 @@ use self::disturbed::Disturbed;
 use self::evidence::{CALM, Evidence};
 use self::faint::Faint;
 use self::flicker::Flicker;
-use self::ground::Ground;
+use self::ground::{DARK_CONFIDENCE, Ground};
 use self::light::Light;
 use self::lines::Lines;
 use self::rays::{RIM_PX, Rays};
@@ -89,9 +89,6 @@ const LIP_KNOWN: f32 = 0.5;
 const MAY_BEGIN_SCORE: f32 = 0.35;
 /// And with an edge on a share of its length above this. Tuned on the same seeds.
 const MAY_BEGIN_EDGE: f32 = 0.55;
-/// Where the ground is darker than so many of the least differences that are water, none is told to be there. Chosen by hand: a rim that is black then
-/// differs by twice of it.
-const DARK_LEAST: f32 = 2.0;
 /// Before an even ground, it is not known where this share has. Chosen by hand: a bead that hangs at the lip, which is no stream, covers half of it.
 const EVEN_LIP_CHANGED: f32 = 0.7;
 /// Legs of the largest bead that hangs at the lip, with its blur, px. Chosen by hand: [`Water`] takes less than 24 px^2 for a bead.
@@ -241,6 +238,7 @@ impl ClearWater {
             let told = self.follow_ground(exposure, height_px)?;
             self.evidence.compare(&self.rays, [&self.now, &self.earlier], &self.background, height_px, self.flicker.flickers())?;
             (self.looked, self.judged) = (true, true);
+            self.ground.see_light(self.evidence.level(), profile_edges::least_difference(self.evidence.noise()));
             let worthless = !self.flicker.flickers() && self.ground.differs_by(self.evidence.noise());
             let moved = self.background.moved();
             self.evidence.weigh(&self.rays, &moved, self.water.stream(), self.ground.is_known_pattern())?;
@@ -271,7 +269,7 @@ impl ClearWater {
                 }
                 _ if self.lip_has_changed() => Sighting::Unsure(Doubt::EdgeNotFound),
                 (_, Some((found, ..))) if self.may_begin(&found) => Sighting::Unsure(Doubt::EdgeNotFound),
-                _ if self.is_too_dark() => Sighting::Unsure(Doubt::TooDark),
+                _ if self.ground.is_too_dark() => Sighting::Unsure(Doubt::TooDark),
                 _ if !self.ground.is_pattern() && self.faint.sees(self.evidence.faint_band(&self.rays), self.pace) => {
                     Sighting::Unsure(Doubt::EdgeNotFound)
                 }
@@ -297,12 +295,6 @@ impl ClearWater {
         let hidden = self.hidden.then_some(Doubt::BlownOut);
         let disturbed = self.disturbed.doubt().filter(|_| self.ground.is_pattern());
         Ok(hidden.or(disturbed).map_or(sighting, Sighting::Unsure))
-    }
-
-    /// Whether the ground is so dark that a rim without any light would hardly differ from it as much as water does.
-    fn is_too_dark(&self) -> bool {
-        let level = self.evidence.level();
-        level > 0.0 && level < DARK_LEAST * profile_edges::least_difference(self.evidence.noise())
     }
 
     /// As [`Evidence::shares`], of the triangle with the legs `to`, px, but for what is within that with the legs `from`, if there is one.
@@ -492,6 +484,9 @@ impl Liquid for ClearWater {
     fn confirm(&mut self, line: Option<FineLine>, mean_level: f32) -> Result<FineLine, Doubt> {
         let sine = self.axes.sine().abs();
         let line = self.water.confirm(line, mean_level, self.scale, sine)?;
+        if self.ground.is_too_dark() && line.confidence < DARK_CONFIDENCE {
+            return Err(Doubt::TooDark);
+        }
         // What bands left over is elsewhere in the next picture.
         self.confirmed += 1;
         if self.confirmed < self.pace.pictures(FLICKER_PICTURES) && self.flicker.flickers() { Err(Doubt::LightFlickers) } else { Ok(line) }

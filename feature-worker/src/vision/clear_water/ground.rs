@@ -1,4 +1,4 @@
-//! What is known of the remembered ground as a whole: whether it has a pattern, and whether the memory lies where it belongs.
+//! What is known of the remembered ground as a whole: whether it has a pattern, is too dark, and whether the memory lies where it belongs.
 //!
 //! A dim or worn pattern looks even in some pictures, so the last ones count together. And along boards the picture does not tell how far the ground has
 //! moved: a memory that has slipped differs from the picture everywhere, which looks like noise, and then joints of boards pass for a stream's edge.
@@ -23,6 +23,14 @@ const NOISE_FOLLOWS: [f32; 2] = [0.1, 0.005];
 const SLIPPED: f32 = 2.0;
 /// After so many such pictures in a row the memory begins anew. Chosen by hand: a second.
 const SLIPPED_PICTURES: u32 = 30;
+/// Where the ground is darker than so many of the least differences that are water, none is told to be there. Chosen by hand: a rim that is black then
+/// differs by twice of it.
+const DARK_LEAST: f32 = 2.0;
+/// And so it is for so many pictures more. Chosen by hand: a second, because a curtain has brighter and darker folds.
+const DARK_PICTURES: u32 = 30;
+/// A line before such a ground needs this confidence, because a fold of a dark curtain or a glint in the water has less. Chosen by hand: as much as a stream
+/// needs to begin in good light.
+pub(super) const DARK_CONFIDENCE: f32 = 0.25;
 
 /// Remembers what the pictures told of the ground.
 pub(super) struct Ground {
@@ -36,13 +44,15 @@ pub(super) struct Ground {
     noise_pictures: f32,
     /// Pictures in a row with far more than it.
     slipped: u32,
+    /// For how many pictures more the ground is too dark.
+    dark_for: u32,
     pace: Pace,
 }
 
 impl Ground {
     /// Nothing was seen yet.
     pub(super) fn new() -> Self {
-        Self { even_share: 0.0, even_pictures: 0.0, noise: 0.0, noise_pictures: 0.0, slipped: 0, pace: Pace::CHOSEN }
+        Self { even_share: 0.0, even_pictures: 0.0, noise: 0.0, noise_pictures: 0.0, slipped: 0, dark_for: 0, pace: Pace::CHOSEN }
     }
 
     /// Says how fast pictures follow each other.
@@ -73,6 +83,17 @@ impl Ground {
             self.slipped = 0;
         }
         self.slipped > self.pace.pictures(SLIPPED_PICTURES)
+    }
+
+    /// The known ground has this mean level in a picture, 0 where none is known, and what differs from it by less than this is no water, grey levels.
+    pub(super) fn see_light(&mut self, level: f32, least_difference: f32) {
+        let dark = level > 0.0 && level < DARK_LEAST * least_difference;
+        self.dark_for = if dark { self.pace.pictures(DARK_PICTURES) } else { self.dark_for.saturating_sub(1) };
+    }
+
+    /// Whether the ground is so dark that a rim without any light would hardly differ from it as much as water does.
+    pub(super) fn is_too_dark(&self) -> bool {
+        self.dark_for > 0
     }
 
     /// The memory is a new one.
@@ -111,6 +132,21 @@ mod tests {
         assert_eq!(pictures, SLIPPED_PICTURES as usize);
         ground.forget();
         assert!(!ground.has_slipped() && !ground.differs_by(3.0) && !ground.has_slipped());
+    }
+
+    /// Protects pours before a dark curtain: between two of its darkest folds it is too dark as well, where lines of folds were areas a tenth as large as
+    /// the stream. Once it is lit, that ends within a second.
+    #[test]
+    fn a_curtain_is_dark_between_its_folds_too() {
+        let mut ground = Ground::new();
+        ground.see_light(0.0, 6.0);
+        assert!(!ground.is_too_dark(), "none is known");
+        for i in 0..60 {
+            ground.see_light(if i % 20 == 0 { 11.0 } else { 14.0 }, 6.0);
+            assert!(ground.is_too_dark(), "picture {i}");
+        }
+        (0..DARK_PICTURES).for_each(|_| ground.see_light(20.0, 6.0));
+        assert!(!ground.is_too_dark());
     }
 
     /// Protects pours before dim boards: that they look even in some pictures while they move makes no wall of them.
