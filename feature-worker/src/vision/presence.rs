@@ -67,6 +67,8 @@ pub(crate) struct Presence {
     /// Pictures that still have to look dry after one in which it was not told, see [`Unsure::LastsOnceDry`]; none until the ground was told dry, since the
     /// start or the last pause.
     unsure: Option<u32>,
+    /// Pictures in which it was not told, less those that looked dry since.
+    untold: u32,
 }
 
 impl Presence {
@@ -86,6 +88,7 @@ impl Presence {
             bgr: [0.0; 3],
             other_light: 0,
             unsure: None,
+            untold: 0,
         }
     }
 
@@ -96,13 +99,13 @@ impl Presence {
 
     /// Says that a pause of unknown length lies before the next picture. A stream that was seen may be there still, and dry ground may be so no more.
     pub(crate) fn interrupt(&mut self) {
-        (self.dry_pictures, self.unsure) = (0, None);
+        (self.dry_pictures, self.unsure, self.untold) = (0, None, 0);
     }
 
     /// A stream was measured in a picture with these mean levels of blue, green and red.
     pub(crate) fn saw(&mut self, area_px2: f32, legs_px: [f32; 2], bgr: [f32; 3]) {
         (self.bgr, self.other_light) = (bgr, 0);
-        (self.dry_pictures, self.foreign, self.unsure) = (0, 0, self.unsure.map(|_| 0));
+        (self.dry_pictures, self.foreign, self.unsure, self.untold) = (0, 0, self.unsure.map(|_| 0), 0);
         let shrinks = self.legs_px.is_some_and(|before| before[0] * before[1] > legs_px[0] * legs_px[1]);
         if shrinks && self.seen < self.pace.pictures(RETURN_PICTURES) {
             return;
@@ -125,10 +128,15 @@ impl Presence {
     /// next pictures have to show none.
     pub(crate) fn saw_unsure(&mut self, unsure: Unsure) {
         self.dry_pictures = 0;
+        self.untold = (self.untold + 1).min(self.pace.pictures(LATELY_PICTURES));
         let needed = self.pace.pictures(if self.flowed_lately() { FOREIGN_PICTURES } else { FOREIGN_DRY_PICTURES });
         match unsure {
             Unsure::Passes => {}
-            Unsure::LastsOnceDry => self.unsure = self.unsure.map(|pictures| pictures.max(needed)),
+            // An edge of ground that passes is not told in a few pictures, and a stream in many.
+            Unsure::LastsOnceDry => {
+                let needed = needed.max(self.untold.min(self.pace.pictures(FOREIGN_PICTURES)));
+                self.unsure = self.unsure.map(|pictures| pictures.max(needed));
+            }
             Unsure::Lasts => self.foreign = self.foreign.max(needed),
         }
     }
@@ -152,6 +160,7 @@ impl Presence {
     pub(crate) fn is_gone(&mut self, bgr: [f32; 3], dry_share: impl FnOnce([f32; 2]) -> f32) -> bool {
         let doubted = self.foreign > 0 || self.unsure.is_some_and(|pictures| pictures > 0);
         self.foreign = self.foreign.saturating_sub(1);
+        self.untold = self.untold.saturating_sub(1);
         self.unsure = self.unsure.map(|pictures| pictures.saturating_sub(1));
         let Some(legs_px) = self.legs_px else {
             if !doubted {
