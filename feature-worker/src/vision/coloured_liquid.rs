@@ -19,7 +19,7 @@ use shared::messages::{Doubt, PixelFormat};
 
 use super::coloured_edge;
 use super::confidence::Basis;
-use super::foreign::{self, FILLED, LEARN_FROM_PX, LEAVES_SHARE, Outline, Seen};
+use super::foreign::{self, FILLED, LEARN_FROM_PX, LEAVES_SHARE, Otherwise, Outline, Seen};
 use super::geometry::{Axes, Line, NEAR_PX, RAYS, RayGrid, distance};
 use super::grey::{is_grey, is_unseen_in_grey};
 use super::ground_beside::{InGlass, Place, Square};
@@ -68,6 +68,9 @@ const LEARN_BEYOND: usize = 6;
 const LEARN_AFTER: u32 = 15;
 /// The ground is learned beside the container while no more than this share of what is at the lip is foreign or liquid. Chosen by hand.
 const QUIET_SHARE: f32 = 0.3;
+/// Before ground that is brighter than this in the mean, the sum of three levels, what is black at the lip may be the liquid. Chosen by hand: three times what
+/// counts as black, so that in a dark room it is ground.
+const BRIGHT_SUM: f32 = 90.0;
 
 /// Finds the stream of a coloured liquid in the pictures of one camera.
 pub(crate) struct ColouredLiquid {
@@ -273,14 +276,16 @@ impl ColouredLiquid {
     fn has_foreign_body(&mut self) -> opencv::Result<bool> {
         let own_ends = self.ends;
         let mut ends = own_ends;
-        let mut body = self.seen().body(&mut ends, None)?;
+        let mut body = self.seen().body(&mut ends, &Otherwise::default())?;
         // Liquid in the glass that has its own colours shows that the camera's levels are as ever.
-        if body.is_none() && self.glass.liquid()?.is_none() && self.limited.take(&self.smooth)? {
-            let mut limited_ends = own_ends;
-            body = self.seen().body(&mut limited_ends, Some(self.limited.mask()))?;
+        if body.is_none() && self.glass.liquid()?.is_none() {
+            let limited = self.limited.take(&self.smooth)?.then(|| self.limited.mask());
+            let black = self.ground_bgr.is_some_and(|ground| ground.iter().sum::<f32>() > BRIGHT_SUM);
+            let mut other_ends = own_ends;
+            body = self.seen().body(&mut other_ends, &Otherwise { limited, black })?;
             // Ground in such colours is no stream if it does not end like one.
-            body = body.filter(|_| self.outline.is_streams(&self.grid, &limited_ends));
-            ends = if body.is_some() { limited_ends } else { ends };
+            body = body.filter(|_| self.outline.is_streams(&self.grid, &other_ends));
+            ends = if body.is_some() { other_ends } else { ends };
         }
         self.ends = ends;
         let Some(body) = body else { return Ok(false) };

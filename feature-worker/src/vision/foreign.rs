@@ -84,6 +84,15 @@ pub(super) struct Seen<'a> {
     pub(super) ground: &'a GroundColours,
 }
 
+/// What a liquid in other colours may look like although the ground has these colours too.
+#[derive(Default)]
+pub(super) struct Otherwise<'a> {
+    /// Not 0 where the picture has the liquid's colours in a limited range of levels.
+    pub(super) limited: Option<&'a Mat>,
+    /// Whether it may be black.
+    pub(super) black: bool,
+}
+
 /// Something foreign that lies at the lip like a stream.
 pub(super) struct Body {
     /// Its mean colour close to the lip, if it shows it there.
@@ -113,17 +122,21 @@ impl Seen<'_> {
         Ok(last.map(|r| (r, best)))
     }
 
-    /// What lies at the lip like a stream and is foreign, if something does. Writes its ends into `ends`. Where `limited` is not 0, ground has the
-    /// liquid's colours in a limited range of levels, and is foreign too.
-    pub(super) fn body(&self, ends: &mut [usize; RAYS], limited: Option<&Mat>) -> opencv::Result<Option<Body>> {
+    /// What lies at the lip like a stream and is foreign, if something does. Writes its ends into `ends`.
+    pub(super) fn body(&self, ends: &mut [usize; RAYS], otherwise: &Otherwise) -> opencv::Result<Option<Body>> {
         let (mut filled, mut foreign, mut samples, mut length_px) = (0usize, 0usize, 0usize, 0.0f32);
         let (mut shown, mut mean) = (0usize, Mean::default());
         for (i, ray) in self.grid.rays.iter().enumerate() {
             let mask = self.mask.at_row::<u8>(i as i32)?;
             let colours = self.smooth.at_row::<Vec3b>(i as i32)?;
-            let limited = limited.map(|limited| limited.at_row::<u8>(i as i32)).transpose()?;
-            let tell =
-                |r: usize| if limited.is_some_and(|limited| limited[r] != 0) { Ground::Foreign } else { self.ground.tell(colours[r].0) };
+            let limited = otherwise.limited.map(|limited| limited.at_row::<u8>(i as i32)).transpose()?;
+            let tell = |r: usize| match self.ground.tell(colours[r].0) {
+                // Only white light may be a lamp's reflection.
+                Ground::Blind if !GroundColours::is_white(colours[r].0) => Ground::Foreign,
+                _ if limited.is_some_and(|limited| limited[r] != 0) => Ground::Foreign,
+                _ if otherwise.black && GroundColours::is_dark(colours[r].0) => Ground::Foreign,
+                ground => ground,
+            };
             let (mut score, mut best, mut end, mut strange, mut strange_at_end) = (0.0f32, 0.0f32, 0usize, 0usize, 0usize);
             let (mut own, mut own_at_end) = (Mean::default(), Mean::default());
             for r in 0..ray.samples {
@@ -228,7 +241,7 @@ impl Seen<'_> {
             for r in 0..near.min(ray.samples) {
                 let ground = self.ground.tell(colours[r].0);
                 looked += 1;
-                blind += usize::from(ground == Ground::Blind);
+                blind += usize::from(self.ground.is_blind(colours[r].0));
                 glows += usize::from(colours[r].0.iter().all(|v| *v >= GLOW_LEVEL));
                 foreign += usize::from(mask[r] != 0 || ground != Ground::Known);
             }
@@ -350,7 +363,7 @@ mod tests {
             }
         }
         let seen = Seen { grid: &grid, mask: &mask, smooth: &smooth, ground: &ground };
-        Ok(seen.body(&mut [0; RAYS], None)?.map(|body| body.colour))
+        Ok(seen.body(&mut [0; RAYS], &Otherwise::default())?.map(|body| body.colour))
     }
 
     /// Protects pours from a body at the lip that is excused by a colour that it does not have: where its first px are white light or look like

@@ -159,6 +159,12 @@ impl GroundColours {
         }
     }
 
+    /// Whether a colour is too dark to be one, whatever the ground is.
+    #[inline(always)]
+    pub(super) fn is_dark(colour: [u8; 3]) -> bool {
+        colour.iter().map(|v| usize::from(*v)).sum::<usize>() < DARK_SUM
+    }
+
     /// Whether a colour is white light, whatever the ground is.
     #[inline(always)]
     pub(crate) fn is_white(colour: [u8; 3]) -> bool {

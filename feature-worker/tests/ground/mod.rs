@@ -1,7 +1,7 @@
 //! What the extraction of a coloured liquid says of ground: half white, never known, seen through a thin stream, and in front of a stream. On drawn
 //! pictures.
 
-mod limited;
+mod levels;
 
 use super::drawn::{HEIGHT, WIDTH, blue, camera, dry, glass, image_config, lay_over, noisy, stream};
 use super::{colour, measure};

@@ -1,4 +1,4 @@
-//! What the extraction says of pictures whose camera mixes up its range of levels, 16 to 235 in place of 0 to 255. On drawn pictures.
+//! What the extraction says of a liquid whose levels are others than those that were learned, as those of ground are too. On drawn pictures.
 
 use opencv::core::{CV_8UC3, Mat, Rect, Scalar};
 use opencv::imgproc;
@@ -56,6 +56,35 @@ fn a_dark_liquid_in_a_limited_range_is_named() -> Result<(), ExtractError> {
                 (0..45, _) => assert_eq!((measured.area_px2, measured.doubt), (0.0, Doubt::None), "dry picture {i}, limited: {limited}"),
                 (_, false) => assert!((1300.0..1700.0).contains(&measured.area_px2), "picture {i}: {measured:?}"),
                 (_, true) => assert_eq!((measured.area_px2, measured.doubt), (0.0, Doubt::ColoursChanged), "picture {i}: {measured:?}"),
+            }
+        }
+    }
+    Ok(())
+}
+
+/// Protects pours of a liquid that the camera shows black, as one does whose exposure becomes short: that something black was seen elsewhere makes no ground
+/// of it, neither where it flows black from the start nor where it becomes so. The black thing itself is no doubt while it is not at the lip.
+#[test]
+fn a_stream_that_becomes_black_is_named() -> Result<(), ExtractError> {
+    let image = ImageConfig { region_px: [171, 14, 440, 296], ..image_config(LiquidMethod::Colour) };
+    for (thing, black_from) in [(true, 45), (true, 60), (false, 45), (false, 60)] {
+        let mut extractor = Extractor::new(&camera(), &image)?;
+        for i in 0..90 {
+            let mut picture = Mat::new_rows_cols_with_default(HEIGHT, WIDTH, CV_8UC3, Scalar::all(165.0))?;
+            if thing {
+                imgproc::rectangle(&mut picture, Rect::new(430, 40, 70, 50), Scalar::all(3.0), imgproc::FILLED, 8, 0)?;
+            }
+            if i >= 45 {
+                let colour = if i >= black_from { Scalar::new(8.0, 4.0, 2.0, 0.0) } else { Scalar::new(150.0, 62.0, 20.0, 0.0) };
+                lay_over(&mut picture, &[stream(60.0, 50.0)], colour)?;
+            }
+            glass(&mut picture)?;
+            let measured = measure(&mut extractor, &noisy(&picture, i)?)?;
+            let what = format!("thing: {thing}, black from {black_from}, picture {i}: {measured:?}");
+            match i {
+                0..45 => assert_eq!((measured.area_px2, measured.doubt), (0.0, Doubt::None), "{what}"),
+                _ if i < black_from => assert!((1300.0..1700.0).contains(&measured.area_px2), "{what}"),
+                _ => assert_eq!((measured.area_px2, measured.doubt), (0.0, Doubt::ColoursChanged), "{what}"),
             }
         }
     }
