@@ -284,11 +284,10 @@ impl ClearWater {
             } else {
                 (self.unseen, self.confirmed) = (self.unseen.saturating_add(1), 0);
             }
-            let elsewhere = self.water.is_elsewhere(self.evidence.strange_share(), self.held.is_some());
-            if elsewhere || (worthless && self.ground.is_pattern()) {
+            if self.water.is_elsewhere(self.evidence.strange_share(), self.held.is_some()) || (worthless && self.ground.is_pattern()) {
                 self.background.forget()?;
+                self.ground.forget();
                 self.vouched.doubt();
-                if elsewhere { self.ground.forget() } else { self.ground.begin_anew() }
             }
         }
         self.remember(height_px)?;

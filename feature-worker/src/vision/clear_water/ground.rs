@@ -23,9 +23,6 @@ const NOISE_FOLLOWS: [f32; 2] = [0.1, 0.005];
 const SLIPPED: f32 = 2.0;
 /// After so many such pictures in a row the memory begins anew. Chosen by hand: a second.
 const SLIPPED_PICTURES: u32 = 30;
-/// By so much the usual noise grows when it does. Chosen by hand: what made the memory slip, as bands of lamps over boards that move, is still there, and must
-/// not be usual for the new one. A room that has become noisier is known again after some seconds.
-const RENEWED: f32 = 1.1;
 /// Where the ground is darker than so many of the least differences that are water, none is told to be there. Chosen by hand: a rim that is black then
 /// differs by twice of it.
 const DARK_LEAST: f32 = 2.0;
@@ -99,12 +96,7 @@ impl Ground {
         self.dark_for > 0
     }
 
-    /// The memory has slipped, and is a new one.
-    pub(super) fn begin_anew(&mut self) {
-        (self.noise, self.slipped) = (self.noise * RENEWED, 0);
-    }
-
-    /// The memory is a new one, of another ground.
+    /// The memory is a new one.
     pub(super) fn forget(&mut self) {
         (self.noise, self.noise_pictures, self.slipped) = (0.0, 0.0, 0);
     }
@@ -138,13 +130,8 @@ mod tests {
         }
         let pictures = (0..100).take_while(|_| !ground.differs_by(3.0) && ground.has_slipped()).count();
         assert_eq!(pictures, SLIPPED_PICTURES as usize);
-        // What slips again at once was not usual meanwhile; after some seconds it is.
-        ground.begin_anew();
-        assert!(!ground.has_slipped() && !ground.differs_by(3.0) && ground.has_slipped());
-        (0..8).for_each(|_| ground.begin_anew());
-        assert!(!ground.differs_by(3.0) && !ground.has_slipped());
         ground.forget();
-        assert!(!ground.differs_by(9.0) && !ground.has_slipped(), "another ground");
+        assert!(!ground.has_slipped() && !ground.differs_by(3.0) && !ground.has_slipped());
     }
 
     /// Protects pours before a dark curtain: between two of its darkest folds it is too dark as well, where lines of folds were areas a tenth as large as
