@@ -216,4 +216,18 @@ mod tests {
             assert_eq!(seen_to_end, gone, "{pictures}");
         }
     }
+
+    /// Protects pours of clear water before a pattern that was not told for long: the longer, the more pictures have to look dry in a row. An edge of ground that
+    /// passes asks for two.
+    #[test]
+    fn what_was_not_told_for_long_is_not_dry_at_once() {
+        let light = [90.0; 3];
+        for (untold, needed) in [(1, 2), (3, 3), (20, 5)] {
+            let mut presence = Presence::new(640, 1.0);
+            assert!(presence.is_gone(light, |_| 1.0), "told dry");
+            (0..untold).for_each(|_| presence.saw_unsure(Unsure::LastsOnceDry));
+            let doubted = (0..20).take_while(|_| !presence.is_gone(light, |_| 1.0)).count();
+            assert_eq!(doubted, needed, "after {untold}");
+        }
+    }
 }

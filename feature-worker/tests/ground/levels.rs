@@ -1,4 +1,5 @@
-//! What the extraction says of a liquid whose levels are others than those that were learned, as those of ground are too. On drawn pictures.
+//! What the extraction says of a liquid that the camera shows in other levels than those that were learned, so that it looks like dark ground. On drawn
+//! pictures.
 
 use opencv::core::{CV_8UC3, Mat, Rect, Scalar};
 use opencv::imgproc;
